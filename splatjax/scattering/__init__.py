@@ -1,0 +1,3 @@
+"""Media, interfaces and reference profiles."""
+
+from ._medium import Medium as Medium

@@ -1,0 +1,9 @@
+"""Plain records: what is drawn, what with, and what comes out. No algorithms."""
+
+from ._camera import Camera as Camera
+from ._frame import Frame as Frame
+from ._lights import AbstractLight as AbstractLight, DirectionalLight as DirectionalLight
+from ._lights import GaussianBeam as GaussianBeam, PointLight as PointLight
+from ._material import Material as Material
+from ._scene import Scene as Scene
+from ._splats import Splats as Splats

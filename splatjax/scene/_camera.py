@@ -1,0 +1,59 @@
+"""A pinhole camera."""
+
+import math
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+
+class Camera(eqx.Module):
+    r"""A pinhole camera.
+
+    Pixel centers lie at half integers, the origin of the picture is its top left corner. In camera coordinates x goes
+    right, y goes down, z goes into the picture.
+
+    **Attributes:**
+
+    - `position`: the pinhole, mm. Differentiable.
+    - `rotation`: world to camera; its rows are the camera's right, down and forward axes, orthonormal. Differentiable.
+    - `focal_length`: in heights of the picture: `1 / (2 tan(fov / 2))` for a vertical field of view `fov`. Differentiable.
+    - `width`, `height`: of the picture, pixels. Static.
+    - `near`: splats whose center is nearer than this, along the forward axis, are not drawn; mm. Static.
+    """
+
+    position: Float[Array, "3"]
+    rotation: Float[Array, "3 3"]
+    focal_length: Float[Array, ""]
+    width: int = eqx.field(static=True)
+    height: int = eqx.field(static=True)
+    near: float = eqx.field(static=True, default=1e-2)
+
+    @classmethod
+    def look_at(
+        cls,
+        eye: Float[Array, "3"],
+        target: Float[Array, "3"],
+        *,
+        up: Float[Array, "3"] | None = None,
+        fov: float = 30.0,
+        width: int = 512,
+        height: int = 512,
+        near: float = 1e-2,
+    ) -> "Camera":
+        """Place a camera at `eye` (mm) that looks at `target` (mm), with vertical field of view `fov` in degrees.
+
+        **Raises:** `ValueError` when the field of view or the size of the picture is out of range.
+        """
+        if not 0 < fov < 180:
+            raise ValueError(f"fov must lie between 0 and 180 degrees, not {fov}")
+        if width < 1 or height < 1:
+            raise ValueError(f"a picture of {width} x {height} pixels has no pixel; width and height must be at least 1")
+        up = jnp.asarray([0.0, 1.0, 0.0], eye.dtype) if up is None else up
+        forward = target - eye
+        forward = forward / jnp.linalg.norm(forward)
+        right = jnp.cross(forward, up)
+        right = right / jnp.linalg.norm(right)
+        down = jnp.cross(forward, right)
+        focal_length = jnp.asarray(0.5 / math.tan(math.radians(fov) / 2), eye.dtype)
+        return cls(eye, jnp.stack([right, down, forward]), focal_length, width, height, near)

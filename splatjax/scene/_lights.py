@@ -1,0 +1,92 @@
+"""Lights. Directions point the way the light travels; `wi` points back, from the surface towards the light."""
+
+import abc
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from splatjax.gaussians import gaussian
+
+
+class AbstractLight(eqx.Module):
+    """A light. Whether it casts shadows is static: a light that casts none costs no shadow map."""
+
+    cast_shadows: eqx.AbstractVar[bool]
+
+    @abc.abstractmethod
+    def incidence(self, points: Float[Array, "*points 3"]) -> tuple[Float[Array, "*points 3"], Float[Array, "*points channels"]]:
+        """Give, at points in mm, the unit direction `wi` towards the light and the irradiance on a surface facing it."""
+
+
+def _per_channel(value: Float[Array, " channels"], points: Float[Array, "*points 3"]) -> Float[Array, "*points channels"]:
+    return jnp.broadcast_to(value, (*points.shape[:-1], *value.shape))
+
+
+class DirectionalLight(AbstractLight):
+    r"""Parallel light from infinitely far away.
+
+    **Attributes:**
+
+    - `direction`: the way the light travels, any length but zero. Differentiable.
+    - `irradiance`: on a surface that faces the light; pi on a white diffuser gives radiance 1. Differentiable.
+    - `cast_shadows`: static.
+    """
+
+    direction: Float[Array, "3"]
+    irradiance: Float[Array, " channels"]
+    cast_shadows: bool = eqx.field(static=True, default=True)
+
+    def incidence(self, points: Float[Array, "*points 3"]) -> tuple[Float[Array, "*points 3"], Float[Array, "*points channels"]]:
+        wi = -self.direction / jnp.linalg.norm(self.direction)
+        return jnp.broadcast_to(wi, points.shape), _per_channel(self.irradiance, points)
+
+
+class PointLight(AbstractLight):
+    r"""Light from a point, falling off with the square of the distance.
+
+    A point that coincides with the light receives none: the limit diverges, so value and gradient are cut to zero there.
+
+    **Attributes:**
+
+    - `position`: mm. Differentiable.
+    - `intensity`: power per solid angle; the irradiance is `intensity cos / d^2`, d in mm. Differentiable.
+    - `cast_shadows`: static.
+    """
+
+    position: Float[Array, "3"]
+    intensity: Float[Array, " channels"]
+    cast_shadows: bool = eqx.field(static=True, default=True)
+
+    def incidence(self, points: Float[Array, "*points 3"]) -> tuple[Float[Array, "*points 3"], Float[Array, "*points channels"]]:
+        to_light = jnp.broadcast_to(self.position, points.shape) - points
+        squared = jnp.sum(to_light * to_light, axis=-1, keepdims=True)
+        apart = squared > 0
+        squared = jnp.where(apart, squared, 1.0)
+        wi = jnp.where(apart, to_light / jnp.sqrt(squared), 0.0)
+        return wi, jnp.where(apart, _per_channel(self.intensity, points) / squared, 0.0)
+
+
+class GaussianBeam(AbstractLight):
+    r"""A laser: parallel light whose power falls off as a Gaussian with the distance from its axis. It casts no shadows.
+
+    **Attributes:**
+
+    - `origin`: a point on the axis, mm. Differentiable.
+    - `direction`: the way the light travels, any length but zero. Differentiable.
+    - `power`: of the whole beam. Differentiable.
+    - `variance`: per axis, mm^2. Differentiable.
+    """
+
+    origin: Float[Array, "3"]
+    direction: Float[Array, "3"]
+    power: Float[Array, " channels"]
+    variance: Float[Array, ""]
+    cast_shadows: bool = eqx.field(static=True, default=False, init=False)
+
+    def incidence(self, points: Float[Array, "*points 3"]) -> tuple[Float[Array, "*points 3"], Float[Array, "*points channels"]]:
+        axis = jnp.broadcast_to(self.direction / jnp.linalg.norm(self.direction), points.shape)
+        offset = points - jnp.broadcast_to(self.origin, points.shape)
+        across = offset - jnp.sum(offset * axis, axis=-1, keepdims=True) * axis
+        squared = jnp.sum(across * across, axis=-1, keepdims=True)
+        return -axis, _per_channel(self.power, points) * gaussian(self.variance, squared)

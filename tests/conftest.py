@@ -1,0 +1,46 @@
+"""Strict modes for the whole suite. Precision comes from JAX_ENABLE_X64: the suite runs once in each."""
+
+import os
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+jax.config.update("jax_numpy_rank_promotion", "raise")
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+
+@pytest.fixture
+def x64() -> bool:
+    """Whether the suite runs in float64."""
+    return bool(jax.config.jax_enable_x64)
+
+
+@pytest.fixture
+def dtype():
+    """The precision under test."""
+    return jnp.zeros(()).dtype
+
+
+def shared_folder() -> Path | None:
+    """The folder named by SPLATJAX_SHARED, where the scanned head and the yardsticks lie."""
+    folder = os.environ.get("SPLATJAX_SHARED")
+    return Path(folder) if folder and Path(folder).is_dir() else None
+
+
+def pytest_collection_modifyitems(config, items):
+    """Leave out, and say so, what needs shared files that are not there."""
+    if shared_folder() is not None:
+        return
+    left_out = [item for item in items if item.get_closest_marker("shared")]
+    if left_out:
+        items[:] = [item for item in items if not item.get_closest_marker("shared")]
+        config.hook.pytest_deselected(items=left_out)
+
+
+def pytest_report_header():
+    precision = "float64" if jax.config.jax_enable_x64 else "float32"
+    folder = shared_folder()
+    where = f"shared files from {folder}" if folder else "tests marked `shared` are left out: SPLATJAX_SHARED names no folder"
+    return f"splatjax in {precision}; {where}"

@@ -1,0 +1,30 @@
+"""Laws of the shared basis."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from splatjax.gaussians import SumOfGaussians, gaussian
+
+
+def test_gaussian_has_unit_integral_and_variance_per_axis(dtype):
+    variance = jnp.asarray(0.7, dtype)
+    r = jnp.linspace(0.0, 12.0, 4001, dtype=dtype)
+    values = gaussian(variance, r * r)
+    ring = 2 * np.pi * r * values
+    step = float(r[1])
+    np.testing.assert_allclose(float(jnp.sum(ring)) * step, 1.0, rtol=1e-5)
+    np.testing.assert_allclose(float(jnp.sum(ring * r * r)) * step, 2 * 0.7, rtol=1e-5)
+
+
+def test_gaussian_is_smooth_at_the_origin(dtype):
+    offset = jnp.zeros(3, dtype)
+    gradient = jax.grad(lambda x: gaussian(jnp.asarray(0.5, dtype), jnp.sum(x * x)))(offset)
+    np.testing.assert_array_equal(np.asarray(gradient), 0.0)
+
+
+def test_sum_of_gaussians_is_a_profile_whose_weights_are_energies(dtype):
+    profile = SumOfGaussians(jnp.asarray([0.04, 1.0], dtype), jnp.asarray([[0.2, 0.1], [0.5, 0.3]], dtype))
+    assert profile(jnp.zeros((4, 5), dtype)).shape == (4, 5, 2)
+    np.testing.assert_allclose(np.asarray(profile.total_reflectance()), [0.7, 0.4], rtol=1e-6)
+    np.testing.assert_allclose(np.asarray(profile.white().total_reflectance()), 1.0, rtol=1e-6)
