@@ -1,1 +1,3 @@
 
+
+from ._atomic import atomic_path as atomic_path
