@@ -3,6 +3,7 @@
 import abc
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -90,3 +91,21 @@ class GaussianBeam(AbstractLight):
         across = offset - jnp.sum(offset * axis, axis=-1, keepdims=True) * axis
         squared = jnp.sum(across * across, axis=-1, keepdims=True)
         return -axis, _per_channel(self.power, points) * gaussian(self.variance, squared)
+
+
+class StackedLights(eqx.Module):
+    """Lights of one kind, their leaves stacked, and their places in the scene's tuple."""
+
+    lights: AbstractLight
+    places: tuple[int, ...] = eqx.field(static=True)
+
+
+def stack_lights(lights: tuple[AbstractLight, ...]) -> list[StackedLights]:
+    """Stack lights of equal kind, so that any number of them is computed by one loop."""
+    kinds: dict[object, list[int]] = {}
+    for place, light in enumerate(lights):
+        kinds.setdefault(jax.tree.structure(light), []).append(place)
+    return [
+        StackedLights(jax.tree.map(lambda *leaves: jnp.stack(leaves), *[lights[i] for i in places]), tuple(places))
+        for places in kinds.values()
+    ]

@@ -1,0 +1,51 @@
+"""What a diffuser does, whichever way: the diffusion integral of every layer at surface points (pass 4, section 4.2)."""
+
+import abc
+from collections.abc import Sequence
+
+import equinox as eqx
+from jaxtyping import Array, Bool, Float
+
+from splatjax.scene import Splats
+from splatjax.splatting import AbstractView
+
+
+class Sources(eqx.Module):
+    """The splats as sources of diffused light."""
+
+    centers: Float[Array, "3 splats"]
+    areas: Float[Array, " splats"]
+    irradiance: Float[Array, "channels splats"]
+
+
+class Diffused(eqx.Module):
+    """The diffusion integrals, and what capacity they needed over what was planned."""
+
+    layers: Float[Array, "gaussians channels height width"]
+    needed: Float[Array, ""]
+
+
+class AbstractDiffuser(eqx.Module):
+    r"""The diffusion integral at surface points `x`, over all splats near `x` in object space, whichever way they face:
+
+        L_k(x) = sum_j A_j G(v_k, |x - p_j|) E_j / sum_j A_j G(v_k, |x - p_j|)
+
+    It keeps constants, lies between the least and the greatest E, and is linear in E.
+    """
+
+    @abc.abstractmethod
+    def planned(
+        self, splats: Splats, variances: Float[Array, " gaussians"], interval: Float[Array, "2"], views: Sequence[AbstractView]
+    ) -> "AbstractDiffuser":
+        """Give a diffuser with room for these splats, variances and views; `interval` tells which layers are handed over."""
+
+    @abc.abstractmethod
+    def diffuse(
+        self,
+        sources: Sources,
+        variances: Float[Array, " gaussians"],
+        points: Float[Array, "3 height width"],
+        covered: Bool[Array, "height width"],
+        view: AbstractView,
+    ) -> Diffused:
+        """Evaluate every layer at every covered point; where no splat is within reach the layer is 0."""

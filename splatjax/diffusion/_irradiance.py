@@ -1,0 +1,42 @@
+"""Light that enters the surface at every splat."""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from splatjax.scene import StackedLights
+
+
+def entering_irradiance(
+    points: Float[Array, "splats 3"],
+    normals: Float[Array, "splats 3"],
+    groups: list[StackedLights],
+    lit: list[Float[Array, "lights splats"] | None],
+    entering: Callable[[Float[Array, " splats"]], Float[Array, " splats"]],
+    channels: int,
+) -> Float[Array, "channels splats"]:
+    r"""Give the irradiance that enters the surface, `sum_lights irradiance max(n . wi, 0) lit entering(n . wi)`.
+
+    **Arguments:**
+
+    - `lit`: for each group the share of each light that reaches each splat; `None` for lights that cast no shadows.
+    - `entering`: the share that is not reflected by the surface, as a function of the cosine.
+
+    **Returns:** linear in the lights. Differentiable in everything; the horizon is a kink.
+    """
+    total = jnp.zeros((channels, points.shape[0]), points.dtype)
+    for group, shares in zip(groups, lit, strict=True):
+
+        @jax.checkpoint
+        def add(total, light_and_share):
+            light, share = light_and_share
+            wi, irradiance = light.incidence(points)
+            cosine = jnp.maximum(jnp.sum(wi * normals, axis=-1), 0)
+            received = cosine * entering(cosine)
+            received = received if share is None else received * share
+            return total + irradiance.T * received[None], None
+
+        total, _ = jax.lax.scan(add, total, (group.lights, shares))
+    return total

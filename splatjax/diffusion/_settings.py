@@ -1,0 +1,14 @@
+"""What pass 4 leaves to choose."""
+
+import equinox as eqx
+
+
+class DiffusionSettings(eqx.Module):
+    r"""Where a layer is too narrow for the splats. All static; lengths in spacings (the root of a splat's area).
+
+    Below `begin` standard deviations per spacing a layer is the surface's own irradiance, from `end` on it is the diffusion
+    integral, in between a smooth blend. Splats on a regular grid carry narrower layers than scattered ones.
+    """
+
+    regular: tuple[float, float] = eqx.field(static=True, default=(0.4, 0.8))
+    scattered: tuple[float, float] = eqx.field(static=True, default=(1.0, 2.0))

@@ -1,0 +1,59 @@
+"""Pass 5: deferred shading of one visible surface (section 4.1)."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from splatjax.scene import StackedLights
+
+from ._composition import diffuse_transmission
+from ._specular import specular_lobe
+
+
+class SurfacePoints(eqx.Module):
+    """What the pixels see of one surface: blended attributes, ready to be shaded."""
+
+    positions: Float[Array, "height width 3"]
+    normals: Float[Array, "height width 3"]
+    """Unit, or zero where there is no surface."""
+    outgoing: Float[Array, "height width 3"]
+    """`wo`: unit, towards the eye."""
+    specular: Float[Array, "height width"] | Float[Array, ""]
+    roughness: Float[Array, "height width"] | Float[Array, ""]
+    lit: list[Float[Array, "lights height width"] | None]
+    """Per group of lights, as the splats received it."""
+
+
+def unit_normals(normals: Float[Array, "height width 3"]) -> Float[Array, "height width 3"]:
+    """Give blended normals unit length; zero stays zero, with a zero gradient: no direction is better than another."""
+    squared = jnp.sum(normals * normals, axis=-1, keepdims=True)
+    there = squared > 0
+    return jnp.where(there, normals / jnp.sqrt(jnp.where(there, squared, 1.0)), 0.0)
+
+
+def leaving_share(points: SurfacePoints, f0: Float[Array, ""]) -> Float[Array, "height width"]:
+    """Give the share of diffused light that leaves towards the eye, `(1 - rho(wo)) / (1 - rho_avg)`: on average 1."""
+    cosine = jnp.maximum(jnp.sum(points.normals * points.outgoing, axis=-1), 0)
+    return diffuse_transmission(cosine, f0, points.specular, points.roughness)
+
+
+def reflected_radiance(
+    points: SurfacePoints, groups: list[StackedLights], f0: Float[Array, ""], channels: int
+) -> Float[Array, "height width channels"]:
+    """Give the specular radiance towards the eye: Kelemen / Szirmay-Kalos, each light in its own shadow."""
+    total = jnp.zeros((*points.positions.shape[:-1], channels), points.positions.dtype)
+    for group, shares in zip(groups, points.lit, strict=True):
+
+        @jax.checkpoint
+        def add(total, light_and_share):
+            light, share = light_and_share
+            wi, irradiance = light.incidence(points.positions)
+            lobe = specular_lobe(points.normals, wi, points.outgoing, f0=f0, specular=points.specular, roughness=points.roughness)
+            cosine = jnp.maximum(jnp.sum(wi * points.normals, axis=-1), 0)
+            received = lobe * cosine
+            received = received if share is None else received * share
+            return total + received[..., None] * irradiance, None
+
+        total, _ = jax.lax.scan(add, total, (group.lights, shares))
+    return total

@@ -1,0 +1,230 @@
+"""Lists of items per tile of the picture, laid out so that sweeps over them read contiguous memory.
+
+Tiles are ordered by the length of their list and swept `lanes` at a time, a *chunk*; the lists of a chunk are stored as
+*blocks* of `[lanes, slots]`. Nothing is dropped: the only limits are the planned numbers of pairs and of blocks, and needing
+more than either is reported.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+_ROW = 1024  # pairs sorted together; their place in the row takes the low 10 bits of a key
+_ROW_BITS = 10
+
+
+class TileGrid(eqx.Module):
+    """A picture cut into square tiles; the last ones may reach beyond it."""
+
+    width: int = eqx.field(static=True)
+    height: int = eqx.field(static=True)
+    side: int = eqx.field(static=True, default=8)
+    lanes: int = eqx.field(static=True, default=64)
+    slots: int = eqx.field(static=True, default=32)
+
+    @property
+    def across(self) -> int:
+        return -(-self.width // self.side)
+
+    @property
+    def down(self) -> int:
+        return -(-self.height // self.side)
+
+    @property
+    def tiles(self) -> int:
+        """Tiles of the picture, and a few empty ones that fill the last chunk."""
+        return -(-self.across * self.down // self.lanes) * self.lanes
+
+    def cut(self, planes: Float[Array, "planes height width"], fill: float) -> Float[Array, "planes tiles pixels"]:
+        """Cut a picture into tiles."""
+        side, (count, height, width) = self.side, planes.shape
+        padding = ((0, 0), (0, self.down * side - height), (0, self.across * side - width))
+        padded = jnp.pad(planes, padding, constant_values=fill)
+        tiles = padded.reshape(count, self.down, side, self.across, side).transpose(0, 1, 3, 2, 4)
+        tiles = tiles.reshape(count, self.down * self.across, side * side)
+        return jnp.pad(tiles, ((0, 0), (0, self.tiles - tiles.shape[1]), (0, 0)), constant_values=fill)
+
+    def join(self, tiles: Float[Array, "tiles planes pixels"]) -> Float[Array, "planes height width"]:
+        """Put a picture together from its tiles."""
+        side, count = self.side, tiles.shape[1]
+        picture = tiles[: self.down * self.across].reshape(self.down, self.across, count, side, side)
+        picture = picture.transpose(2, 0, 3, 1, 4).reshape(count, self.down * side, self.across * side)
+        return picture[:, : self.height, : self.width]
+
+
+class TileRanges(eqx.Module):
+    """The rectangle of tiles that each item touches."""
+
+    left: Int[Array, " items"]
+    top: Int[Array, " items"]
+    across: Int[Array, " items"]
+    down: Int[Array, " items"]
+    """0 for an item that touches none."""
+
+    @classmethod
+    def of(
+        cls,
+        left: Float[Array, " items"],
+        right: Float[Array, " items"],
+        top: Float[Array, " items"],
+        bottom: Float[Array, " items"],
+        visible: Bool[Array, " items"],
+        grid: TileGrid,
+    ) -> "TileRanges":
+        """Find the tiles with a pixel center inside each box (pixels)."""
+        first_x, last_x = jnp.clip(jnp.ceil(left - 0.5), 0, grid.width), jnp.clip(jnp.floor(right - 0.5), -1, grid.width - 1)
+        first_y, last_y = jnp.clip(jnp.ceil(top - 0.5), 0, grid.height), jnp.clip(jnp.floor(bottom - 0.5), -1, grid.height - 1)
+        touched = visible & (first_x <= last_x) & (first_y <= last_y)
+        i0, i1, j0, j1 = (edge.astype(jnp.int32) // grid.side for edge in (first_x, last_x, first_y, last_y))
+        return cls(i0, j0, jnp.where(touched, i1 - i0 + 1, 0), jnp.where(touched, j1 - j0 + 1, 0))
+
+    def per_tile(self, grid: TileGrid) -> Int[Array, " tiles"]:
+        """Count the items of every tile, from the corners of their rectangles."""
+        one = jnp.where(self.across * self.down > 0, 1, 0)
+        corners = jnp.zeros((grid.down + 1, grid.across + 1), jnp.int32)
+        i0, j0 = jnp.minimum(self.left, grid.across), jnp.minimum(self.top, grid.down)
+        i1, j1 = jnp.minimum(self.left + self.across, grid.across), jnp.minimum(self.top + self.down, grid.down)
+        corners = corners.at[j0, i0].add(one).at[j1, i1].add(one).at[j0, i1].add(-one).at[j1, i0].add(-one)
+        counts = jnp.cumsum(jnp.cumsum(corners, axis=0), axis=1)[:-1, :-1].reshape(-1)
+        return jnp.pad(counts, (0, grid.tiles - counts.shape[0]))
+
+
+class BinCapacity(eqx.Module):
+    """How many pairs of item and tile, and how many blocks, there is room for. Static."""
+
+    pairs: int = eqx.field(static=True)
+    blocks: int = eqx.field(static=True)
+
+    @classmethod
+    def for_ranges(cls, ranges: list[TileRanges], grid: TileGrid) -> "BinCapacity":
+        """Give room for each of these sets of items, rounded up so that nearby ones need no other program."""
+        pairs = blocks = 1
+        for item_ranges in ranges:
+            counts = np.asarray(_per_tile(item_ranges, grid), np.int64)
+            longest = np.sort(-(-counts // grid.slots))[::-1][:: grid.lanes]
+            pairs, blocks = max(pairs, int(counts.sum())), max(blocks, int(longest.sum()))
+        return cls(_round_up(pairs, _ROW), _round_up(blocks, 4))
+
+
+_per_tile = eqx.filter_jit(TileRanges.per_tile)
+
+
+def _round_up(count: int, step: int) -> int:
+    """Round up to the next of sixteen steps per octave, and to a multiple of `step`, with 3% to spare."""
+    count = int(count * 1.03) + 1
+    grain = max(1 << max(count.bit_length() - 5, 0), step)
+    return -(-count // grain) * grain
+
+
+class Bins(eqx.Module):
+    """Items per tile. An empty slot holds the number of items, which is no item."""
+
+    ids: Int[Array, "blocks lanes slots"]
+    order: Int[Array, " tiles"]
+    """The tile of each lane, chunk after chunk."""
+    first_block: Int[Array, " chunks_and_one"]
+    needed: Float[Array, ""]
+
+    @property
+    def chunks(self) -> Int[Array, ""]:
+        """How many chunks have anything in them: longer lists come first, so these lead."""
+        return jnp.sum(self.first_block[1:] > self.first_block[:-1])
+
+    def inverse_order(self) -> Int[Array, " tiles"]:
+        """The lane of each tile."""
+        return jnp.zeros_like(self.order).at[self.order].set(jnp.arange(self.order.shape[0], dtype=jnp.int32))
+
+
+def _running_max(values: Int[Array, " pairs"]) -> Int[Array, " pairs"]:
+    """Give the running maximum: columns in sequence, side by side."""
+    columns = values.reshape(_ROW, -1).T
+
+    def step(carry, value):
+        carry = jnp.maximum(carry, value)
+        return carry, carry
+
+    last, columns = lax.scan(step, jnp.zeros(_ROW, values.dtype), columns)
+    before = jnp.concatenate([jnp.zeros(1, values.dtype), lax.cummax(last)[:-1]])
+    return jnp.maximum(columns, before[None]).T.reshape(-1)
+
+
+def _pairs(ranges: TileRanges, grid: TileGrid, capacity: int):
+    """List all pairs of item and tile, item after item; `grid.tiles` where there is none."""
+    counts = ranges.across * ranges.down
+    ends = jnp.cumsum(counts)
+    begins, total = ends - counts, ends[-1]
+    items = jnp.arange(counts.shape[0], dtype=jnp.int32)
+    marks = jnp.zeros(capacity, jnp.int32).at[jnp.where(counts > 0, begins, capacity)].max(items, mode="drop")
+    item = _running_max(marks)
+    pair = jnp.arange(capacity, dtype=jnp.int32)
+
+    def of_item(values):
+        return values.at[item].get(mode="promise_in_bounds")
+
+    local, across = pair - of_item(begins), jnp.maximum(of_item(ranges.across), 1)
+    down = ((local.astype(jnp.float32) + 0.5) / across.astype(jnp.float32)).astype(jnp.int32)  # exact below 4 million
+    tile = (of_item(ranges.top) + down) * grid.across + of_item(ranges.left) + local - down * across
+    return item, jnp.where(pair < total, tile, grid.tiles), jnp.sum(counts.astype(jnp.float32))
+
+
+def _ranks(tile: Int[Array, " pairs"], tiles: int):
+    """Number the pairs of each tile in order: rows are sorted apart, and counts carried from row to row."""
+    place = jnp.arange(_ROW, dtype=jnp.uint32)[None]
+    keys = (tile.astype(jnp.uint32).reshape(-1, _ROW) << _ROW_BITS) | place
+    keys = lax.sort(keys, dimension=1, is_stable=False)
+    sorted_tile, source = (keys >> _ROW_BITS).astype(jnp.int32), (keys & (_ROW - 1)).astype(jnp.int32)
+    rows = keys.shape[0]
+    starts = jnp.concatenate([jnp.ones((rows, 1), bool), sorted_tile[:, 1:] != sorted_tile[:, :-1]], axis=1)
+    position = jnp.arange(_ROW, dtype=jnp.int32)[None]
+
+    def latest(carry, value):
+        carry = jnp.maximum(carry, value)
+        return carry, carry
+
+    run_start = lax.scan(latest, jnp.zeros(rows, jnp.int32), jnp.where(starts, position, 0).T)[1].T
+
+    def count_on(counts, row):
+        tiles_of_row, rank = row
+        before = counts.at[tiles_of_row].get(mode="promise_in_bounds")
+        return counts.at[tiles_of_row].add(1, mode="promise_in_bounds"), before + rank
+
+    counts, rank = lax.scan(count_on, jnp.zeros(tiles + 1, jnp.int32), (sorted_tile, position - run_start))
+    return sorted_tile, source, rank, counts[:tiles]
+
+
+def bin_items(ranges: TileRanges, grid: TileGrid, capacity: BinCapacity) -> Bins:
+    """List the items of every tile, in their order. Not differentiated."""
+    items, lanes, slots, tiles = ranges.left.shape[0], grid.lanes, grid.slots, grid.tiles
+    room = capacity.blocks * lanes * slots
+    item, tile, total = _pairs(ranges, grid, capacity.pairs)
+    tile, source, rank, counts = _ranks(tile, tiles)
+    item = jnp.take_along_axis(item.reshape(-1, _ROW), source, axis=1, mode="promise_in_bounds")
+
+    # Longest lists first; equal ones in scan order, so that the lanes of a chunk are neighbors.
+    lengths = -(-counts // slots)
+    bits = (tiles - 1).bit_length()
+    longest = (1 << (31 - bits)) - 1
+    keys = ((longest - jnp.minimum(lengths, longest)) << bits) | jnp.arange(tiles, dtype=jnp.int32)
+    order = lax.sort(keys, is_stable=False) & ((1 << bits) - 1)
+    first_block = jnp.concatenate([jnp.zeros(1, jnp.int32), jnp.cumsum(lengths[order[::lanes]])])
+    lane = jnp.arange(tiles, dtype=jnp.int32)
+    begins = first_block[lane // lanes] * (lanes * slots) + (lane % lanes) * slots
+    begin_of_tile = jnp.full(tiles + 1, room, jnp.int32).at[order].set(begins)
+    target = begin_of_tile.at[tile].get(mode="promise_in_bounds") + (rank // slots) * (lanes * slots) + rank % slots
+    ids = jnp.full(room, items, jnp.int32).at[target.reshape(-1)].set(item.reshape(-1), mode="drop")
+    blocks = first_block[-1].astype(jnp.float32) / capacity.blocks
+    return Bins(ids.reshape(capacity.blocks, lanes, slots), order, first_block, jnp.maximum(total / capacity.pairs, blocks))
+
+
+def slot_planes(
+    planes: Float[Array, "planes items"], fill: tuple[float, ...], bins: Bins
+) -> list[Float[Array, "blocks lanes slots"]]:
+    """Gather numbers of the items into their slots, plane by plane; `fill` in empty slots."""
+    return [plane.at[bins.ids].get(mode="fill", fill_value=value) for plane, value in zip(planes, fill, strict=True)]
+
+
+def scatter_slots(slots: Float[Array, "blocks lanes slots"], bins: Bins, items: int) -> Float[Array, " items"]:
+    """Add the slots of every item: the transpose of the gather."""
+    return jnp.zeros(items, slots.dtype).at[bins.ids.reshape(-1)].add(slots.reshape(-1), mode="drop")

@@ -1,0 +1,50 @@
+"""The plain rasterizer: every splat against every pixel, a row at a time. The reference; it has every derivative."""
+
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+from jax.lax import stop_gradient
+from jaxtyping import Array, Float
+
+from ._kernel import fragment_weight
+from ._rasterizer import AbstractRasterizer, SurfaceSums
+from ._settings import SplattingSettings
+from ._views import AbstractView, Footprints
+
+
+class DenseRasterizer(AbstractRasterizer):
+    """Tries every splat at every pixel. Slow and plain; forward mode and second order work."""
+
+    def planned(self, footprints: Sequence[Footprints], view: AbstractView) -> "DenseRasterizer":
+        return self
+
+    def sums(
+        self, footprints: Footprints, rows: Float[Array, "rows splats"], view: AbstractView, settings: SplattingSettings
+    ) -> SurfaceSums:
+        dtype = rows.dtype
+        columns = jnp.arange(view.width, dtype=dtype) + 0.5
+
+        def picture_row(y: Float[Array, ""]):
+            dx, dy = columns[:, None] - footprints.x[None], (y - footprints.y)[None]
+            nearness = footprints.nearness[None] + footprints.slope_x[None] * dx + footprints.slope_y[None] * dy
+            quadric = dx * (footprints.a[None] * dx + footprints.b[None] * dy) + footprints.c[None] * dy * dy
+            inside = footprints.visible[None] & view.inside(nearness, quadric)
+            squared_radius = jnp.where(inside, view.squared_radius(jnp.where(inside, nearness, 1.0), quadric), 1.0)
+            weight = jnp.where(inside, fragment_weight(squared_radius), 0.0)
+            shifted = view.shifted(nearness, footprints.shift[None])
+
+            limit = jnp.max(jnp.where(inside, shifted, -jnp.inf), axis=1)
+            front = inside & (nearness > limit[:, None])
+            front_sums = jnp.where(front, weight, 0.0) @ rows.T
+            open_pixel = stop_gradient(front_sums[:, -1]) < settings.full_coverage
+            rest = inside & ~front & open_pixel[:, None]
+            limit_behind = jnp.max(jnp.where(rest, shifted, -jnp.inf), axis=1)
+            behind = rest & (nearness > limit_behind[:, None])
+            return front_sums.T, (jnp.where(behind, weight, 0.0) @ rows.T).T
+
+        if rows.shape[1] == 0:
+            empty = jnp.zeros((rows.shape[0], view.height, view.width), dtype)
+            return SurfaceSums(empty, empty, jnp.zeros((), dtype))
+        front, behind = jax.lax.map(picture_row, jnp.arange(view.height, dtype=dtype) + 0.5)
+        return SurfaceSums(front.transpose(1, 0, 2), behind.transpose(1, 0, 2), jnp.zeros((), dtype))

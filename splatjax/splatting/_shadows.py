@@ -1,0 +1,163 @@
+"""Pass 1: shadow maps. The scene's surfaces as a light sees them, and how much of the light reaches each splat."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.lax import stop_gradient
+from jaxtyping import Array, Float
+
+from splatjax.scene import Splats
+
+from ._rasterizer import AbstractRasterizer
+from ._settings import SplattingSettings
+from ._surfaces import Surfaces, splat_surfaces
+from ._views import AbstractView, OrthographicView, PerspectiveView
+
+_NEAR = 1e-3  # mm
+
+
+class ShadowSettings(eqx.Module):
+    r"""How shadow maps are made and compared. All static.
+
+    **Attributes:**
+
+    - `resolution`: pixels along a side of each map.
+    - `bias`: a surface less than this far behind the map's, in mm, is still fully lit: keeps a surface from shadowing itself.
+    - `softness`: over this many more mm the light fades; with it shadows have gradients in depth. Across the shadow's edge,
+      light fades over about two pixels of the map.
+    - `largest_slope`: the slope up to which the receiver's own plane is followed from pixel to pixel of the map.
+    """
+
+    resolution: int = eqx.field(static=True, default=1024)
+    bias: float = eqx.field(static=True, default=0.4)
+    softness: float = eqx.field(static=True, default=0.8)
+    largest_slope: float = eqx.field(static=True, default=4.0)
+
+
+class Bounds(eqx.Module):
+    """A sphere around all discs. Not differentiated."""
+
+    center: Float[Array, "3"]
+    radius: Float[Array, ""]
+
+    @classmethod
+    def of(cls, splats: Splats) -> "Bounds":
+        if splats.count == 0:
+            return cls(jnp.zeros(3, splats.centers.dtype), jnp.ones((), splats.centers.dtype))
+        centers = stop_gradient(splats.centers)
+        center = 0.5 * (jnp.min(centers, axis=0) + jnp.max(centers, axis=0))
+        offset = centers - center[None]
+        reach = jnp.sqrt(jnp.max(jnp.sum(offset * offset, axis=1)))
+        return cls(center, reach + stop_gradient(jnp.max(splats.radii)))
+
+
+def _facing(forward: Float[Array, "3"]) -> Float[Array, "3 3"]:
+    """Give a rotation whose third row is `forward`; the other two are smooth in it wherever it is not along an axis' flip."""
+    helper = jnp.where(
+        jnp.abs(stop_gradient(forward[1])) < 0.9,
+        jnp.asarray([0.0, 1.0, 0.0], forward.dtype),
+        jnp.asarray([1.0, 0.0, 0.0], forward.dtype),
+    )
+    right = jnp.cross(forward, helper)
+    right = right / jnp.linalg.norm(right)
+    return jnp.stack([right, jnp.cross(forward, right), forward])
+
+
+def distant_view(direction: Float[Array, "3"], bounds: Bounds, settings: ShadowSettings) -> OrthographicView:
+    """Give what a directional light sees: the bounding sphere, in parallel."""
+    size = settings.resolution
+    scale = 0.5 * (size - 4) / bounds.radius
+    rotation = _facing(direction / jnp.linalg.norm(direction))
+    return OrthographicView(position=bounds.center, rotation=rotation, scale=scale, width=size, height=size)
+
+
+def near_view(position: Float[Array, "3"], bounds: Bounds, settings: ShadowSettings) -> PerspectiveView:
+    """Give what a point light outside the bounding sphere sees: a frustum around the sphere."""
+    to_center = bounds.center - position
+    distance = jnp.linalg.norm(to_center)
+    closest = stop_gradient(distance * distance - bounds.radius * bounds.radius)
+    tangent = bounds.radius / jnp.sqrt(jnp.maximum(closest, 1e-6 * bounds.radius * bounds.radius))
+    size = settings.resolution
+    return PerspectiveView(
+        position=position,
+        rotation=_facing(to_center / distance),
+        focal_length=0.5 * (size - 4) / stop_gradient(tangent),
+        width=size,
+        height=size,
+        near=_NEAR,
+    )
+
+
+def cube_views(position: Float[Array, "3"], settings: ShadowSettings) -> list[PerspectiveView]:
+    """Give what a point light inside the bounding sphere sees: six faces of a cube."""
+    size, dtype = settings.resolution, position.dtype
+    axes = jnp.concatenate([jnp.eye(3, dtype=dtype), -jnp.eye(3, dtype=dtype)])
+    focal_length = jnp.asarray(0.5 * (size - 4), dtype)  # two pixels beyond each edge, for the filter
+    return [
+        PerspectiveView(position=position, rotation=_facing(axis), focal_length=focal_length, width=size, height=size, near=_NEAR)
+        for axis in axes
+    ]
+
+
+def in_cube_face(view: PerspectiveView, points: Float[Array, "3 splats"]) -> Float[Array, " splats"]:
+    """Say (1 or 0) which points belong to a face of the cube: those whose largest coordinate is along its axis."""
+    offset = points - view.position[:, None]
+    along = jnp.tensordot(view.rotation[2], offset, 1)
+    return (along >= jnp.max(jnp.abs(offset), axis=0) * (1 - 1e-6)).astype(points.dtype)
+
+
+def light_surfaces(splats: Splats, view: AbstractView, splatting: SplattingSettings, rasterizer: AbstractRasterizer) -> Surfaces:
+    """Make a shadow map (4.1): the surfaces that a light sees, by the camera's own passes 2 and 3."""
+    footprints = view.footprints(splats, splatting)
+    return splat_surfaces(footprints, jnp.zeros((0, splats.count), splats.centers.dtype), view, splatting, rasterizer)
+
+
+def _spline(t: Float[Array, " splats"]) -> tuple[Float[Array, " splats"], ...]:
+    """Give the quadratic B-spline's weights of the three pixels around a place; `t` in [-1/2, 1/2] from the middle one."""
+    return 0.5 * (0.5 - t) ** 2, 0.75 - t * t, 0.5 * (0.5 + t) ** 2
+
+
+def lit_share(splats: Splats, view: AbstractView, surfaces: Surfaces, settings: ShadowSettings) -> Float[Array, " splats"]:
+    r"""Give the share of a light that reaches each splat, by soft comparison with its shadow map.
+
+    Nine pixels are compared and averaged with a smooth spline; at each, the splat's depth is continued along its own plane.
+    Light is held up by the front surface with its coverage, and by the one behind it with what is left.
+
+    **Returns:** in [0, 1]; 1 outside the map. Differentiable in the splats, the view and the map.
+    """
+    x, y, depth = view.project(splats.centers.T)
+    across, down, facing = view.slant(x, y, depth, splats.normals.T)
+    facing = jnp.maximum(facing, 1 / settings.largest_slope)
+    slope_x, slope_y = across / facing, down / facing
+
+    column, row = jnp.floor(stop_gradient(x)), jnp.floor(stop_gradient(y))
+    tx, ty = x - column - 0.5, y - row - 0.5
+    flat = jnp.stack([s.reshape(-1) for s in (surfaces.front.depth, surfaces.front.coverage)])
+    flat_behind = jnp.stack([s.reshape(-1) for s in (surfaces.behind.depth, surfaces.behind.coverage)])
+
+    def held_up(step_x: int, step_y: int):
+        at_x, at_y = column.astype(jnp.int32) + step_x, row.astype(jnp.int32) + step_y
+        index = jnp.clip(at_y, 0, view.height - 1) * view.width + jnp.clip(at_x, 0, view.width - 1)
+        outside = (at_x < 0) | (at_y < 0) | (at_x >= view.width) | (at_y >= view.height)
+        here = depth + slope_x * (step_x - tx) + slope_y * (step_y - ty)
+
+        def hidden(plane):
+            t = jnp.clip((here - plane[0][index] - settings.bias) / settings.softness, 0, 1)
+            return plane[1][index] * t * t * (3 - 2 * t)
+
+        blocked = hidden(flat) + (1 - flat[1][index]) * hidden(flat_behind)
+        return jnp.where(outside, 0.0, blocked)
+
+    blocked = sum(
+        wx * wy * held_up(i, j)
+        for i, wx in zip((-1, 0, 1), _spline(tx), strict=True)
+        for j, wy in zip((-1, 0, 1), _spline(ty), strict=True)
+    )
+    return jnp.maximum(1 - blocked, 0)  # rounding must not make light negative
+
+
+def stack_views(views: Sequence[AbstractView]) -> AbstractView:
+    """Stack views of one kind and size, for `lax.map`."""
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *views)

@@ -1,0 +1,316 @@
+"""Where splats land in a picture: perspective for the camera, orthographic for distant lights.
+
+A splat is a disc. In the picture its rim is an ellipse, and a fragment of it is described by numbers that are
+polynomials in the offset `d` (pixels) from the projected center:
+
+    nearness  e(d)  = nearness + slope . d          1 / z in perspective, -z without
+    quadric   n(d)  = a dx^2 + b dx dy + c dy^2
+    rho^2           = n / e^2 in perspective, n without: 1 on the rim
+
+so that the surface in front has the largest nearness and no fragment needs a square root.
+"""
+
+import abc
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax.lax import stop_gradient
+from jaxtyping import Array, Bool, Float
+
+from splatjax.scene import Camera, Splats
+
+from ._settings import SplattingSettings
+
+
+class Footprints(eqx.Module):
+    """Where every splat lands, planar: one array per number. Pixels, origin top left, unless said otherwise."""
+
+    x: Float[Array, " splats"]
+    y: Float[Array, " splats"]
+    slope_x: Float[Array, " splats"]
+    slope_y: Float[Array, " splats"]
+    a: Float[Array, " splats"]
+    b: Float[Array, " splats"]
+    c: Float[Array, " splats"]
+    nearness: Float[Array, " splats"]
+    shift: Float[Array, " splats"]
+    """How the surface is moved away by epsilon (4.1); not differentiated."""
+    opacity: Float[Array, " splats"]
+    """What the screen filter leaves of the peak weight: 1 for large frontal splats, 0 edge on."""
+    left: Float[Array, " splats"]
+    right: Float[Array, " splats"]
+    top: Float[Array, " splats"]
+    bottom: Float[Array, " splats"]
+    """The rim's bounding box. Not differentiated."""
+    visible: Bool[Array, " splats"]
+
+
+class AbstractView(eqx.Module):
+    """A projection of the world onto pixels."""
+
+    width: eqx.AbstractVar[int]
+    height: eqx.AbstractVar[int]
+
+    @abc.abstractmethod
+    def footprints(self, splats: Splats, settings: SplattingSettings) -> Footprints:
+        """Project splats. Splats that face away, or lie before the near plane, are not visible."""
+
+    @staticmethod
+    @abc.abstractmethod
+    def inside(nearness: Float[Array, "..."], quadric: Float[Array, "..."]) -> Bool[Array, "..."]:
+        """Say whether a fragment lies within the rim."""
+
+    @staticmethod
+    @abc.abstractmethod
+    def squared_radius(nearness: Float[Array, "..."], quadric: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Give `rho^2`, in units of the splat's radius, for a fragment inside."""
+
+    @staticmethod
+    @abc.abstractmethod
+    def squared_radius_vjp(
+        nearness: Float[Array, "..."], squared_radius: Float[Array, "..."], cotangent: Float[Array, "..."]
+    ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+        """Give the cotangents of nearness and quadric for one of `rho^2`."""
+
+    @staticmethod
+    @abc.abstractmethod
+    def shifted(nearness: Float[Array, "..."], shift: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Give the nearness of a fragment moved away from the eye by epsilon."""
+
+    @staticmethod
+    @abc.abstractmethod
+    def depth(nearness: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Give the depth (mm along the forward axis) of a nearness."""
+
+    @abc.abstractmethod
+    def project(self, points: Float[Array, "3 *points"]) -> tuple[Float[Array, "*points"], ...]:
+        """Give column, row (pixels) and depth (mm) of points."""
+
+    @abc.abstractmethod
+    def slant(
+        self,
+        x: Float[Array, "*points"],
+        y: Float[Array, "*points"],
+        depth: Float[Array, "*points"],
+        normals: Float[Array, "3 *points"],
+    ) -> tuple[Float[Array, "*points"], Float[Array, "*points"], Float[Array, "*points"]]:
+        """Give, for planes at projected points, two numbers and a third whose quotients are the depth's slope, mm per pixel.
+
+        The third is the cosine-like factor that vanishes where a plane is seen edge on."""
+
+    @abc.abstractmethod
+    def unproject(
+        self, x: Float[Array, "*points"], y: Float[Array, "*points"], depth: Float[Array, "*points"]
+    ) -> Float[Array, "3 *points"]:
+        """Give the point in the world at a depth under a pixel."""
+
+
+def _rows(matrix: Float[Array, "3 3"], vectors: Float[Array, "3 splats"]) -> tuple[Float[Array, " splats"], ...]:
+    """Multiply by a matrix, as three planes."""
+    x, y, z = vectors
+    return tuple(matrix[i, 0] * x + matrix[i, 1] * y + matrix[i, 2] * z for i in range(3))
+
+
+def _filtered(xx, xy, yy, vx, vy, filter_radius):
+    """Widen the rim's ellipse by the screen filter and invert it: a, b, c, slope and root of the determinant.
+
+    The ellipse `d^T S^-1 d = 1` grows to `S + f^2 I`. The hit moves to where the widened splat's light comes from,
+    `S (S + f^2 I)^-1 d`, so the plane's slope becomes `(S + f^2 I)^-1 (S slope)`; `(vx, vy)` is `S slope`.
+    """
+    xx, yy = xx + filter_radius**2, yy + filter_radius**2
+    determinant = xx * yy - xy * xy
+    inverse = 1 / determinant
+    a, b, c = yy * inverse, -2 * xy * inverse, xx * inverse
+    slope_x, slope_y = a * vx + 0.5 * b * vy, 0.5 * b * vx + c * vy
+    return a, b, c, slope_x, slope_y, xx, yy, jnp.sqrt(determinant)
+
+
+class PerspectiveView(AbstractView):
+    """What a pinhole camera sees."""
+
+    position: Float[Array, "3"]
+    rotation: Float[Array, "3 3"]
+    focal_length: Float[Array, ""]
+    """In pixels."""
+    width: int = eqx.field(static=True)
+    height: int = eqx.field(static=True)
+    near: float = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, camera: Camera) -> "PerspectiveView":
+        focal_length = camera.focal_length * camera.height
+        return cls(
+            position=camera.position,
+            rotation=camera.rotation,
+            focal_length=focal_length,
+            width=camera.width,
+            height=camera.height,
+            near=camera.near,
+        )
+
+    def footprints(self, splats: Splats, settings: SplattingSettings) -> Footprints:
+        px, py, pz = _rows(self.rotation, (splats.centers - self.position[None]).T)
+        nx, ny, nz = _rows(self.rotation, splats.normals.T)
+        in_front = pz > self.near
+        pz = jnp.where(in_front, pz, 1.0)
+        u, v = px / pz, py / pz
+        facing = -(nx * u + ny * v + nz)
+        visible = in_front & (facing > 0)
+        # The disc's ellipse: S = (r f / z)^2 P (I - n n^T) P^T, with P = [[1, 0, -u], [0, 1, -v]].
+        scale = self.focal_length / pz
+        squared = (splats.radii * scale) ** 2
+        an, bn = nx - u * nz, ny - v * nz
+        xx = squared * (1 + u * u - an * an)
+        xy = squared * (u * v - an * bn)
+        yy = squared * (1 + v * v - bn * bn)
+        along = splats.radii * splats.radii * scale / pz
+        vx, vy = along * (u + an * nz), along * (v + bn * nz)
+        a, b, c, gx, gy, xx, yy, root = _filtered(xx, xy, yy, vx, vy, settings.filter_radius)
+        opacity = jnp.where(visible, squared * facing / root, 0.0)
+        inverse = 1 / pz
+        square = inverse * inverse
+        # The rim is a conic; its box is exact while the splat does not reach the plane of the pinhole.
+        kappa = stop_gradient(1 - (gx * vx + gy * vy))
+        bounded = kappa > 1e-3
+        kappa = jnp.where(bounded, kappa, 1.0)
+        x, y = self.width / 2 + self.focal_length * u, self.height / 2 + self.focal_length * v
+        half_x = jnp.where(bounded, jnp.sqrt((xx + vx * vx / kappa) / kappa), jnp.inf)
+        half_y = jnp.where(bounded, jnp.sqrt((yy + vy * vy / kappa) / kappa), jnp.inf)
+        mid_x, mid_y = x + vx / kappa, y + vy / kappa
+        cosine = facing / jnp.sqrt(1 + u * u + v * v)
+        epsilon = _epsilon(splats.radii, settings.filter_radius / scale, cosine, settings)
+        return Footprints(
+            x=x,
+            y=y,
+            slope_x=gx * inverse,
+            slope_y=gy * inverse,
+            a=a * square,
+            b=b * square,
+            c=c * square,
+            nearness=inverse,
+            shift=stop_gradient(1 / (1 + epsilon * inverse)),
+            opacity=opacity,
+            left=stop_gradient(mid_x - half_x),
+            right=stop_gradient(mid_x + half_x),
+            top=stop_gradient(mid_y - half_y),
+            bottom=stop_gradient(mid_y + half_y),
+            visible=visible,
+        )
+
+    @staticmethod
+    def inside(nearness, quadric):
+        return (quadric < nearness * nearness) & (nearness > 0)
+
+    @staticmethod
+    def squared_radius(nearness, quadric):
+        return quadric / (nearness * nearness)
+
+    @staticmethod
+    def squared_radius_vjp(nearness, squared_radius, cotangent):
+        z = 1 / nearness
+        return -2 * cotangent * squared_radius * z, cotangent * z * z
+
+    @staticmethod
+    def shifted(nearness, shift):
+        return nearness * shift
+
+    @staticmethod
+    def depth(nearness):
+        return 1 / nearness
+
+    def project(self, points):
+        offset = points - self.position.reshape(3, *[1] * (points.ndim - 1))
+        x, y, z = jnp.tensordot(self.rotation, offset, 1)
+        safe = jnp.where(z > self.near, z, 1.0)
+        column, row = self.width / 2 + self.focal_length * x / safe, self.height / 2 + self.focal_length * y / safe
+        return column, row, z
+
+    def slant(self, x, y, depth, normals):
+        nx, ny, nz = jnp.tensordot(self.rotation, normals, 1)
+        u, v = (x - self.width / 2) / self.focal_length, (y - self.height / 2) / self.focal_length
+        mm = jnp.where(depth > self.near, depth, 1.0) / self.focal_length
+        return nx * mm, ny * mm, -(nz + nx * u + ny * v)
+
+    def unproject(self, x, y, depth):
+        u, v = (x - self.width / 2) / self.focal_length, (y - self.height / 2) / self.focal_length
+        along = jnp.stack([u * depth, v * depth, depth])
+        return jnp.tensordot(self.rotation.T, along, 1) + self.position.reshape(3, *[1] * depth.ndim)
+
+
+class OrthographicView(AbstractView):
+    """What a light at infinity sees. `position` is seen at the center of the picture, at depth 0."""
+
+    position: Float[Array, "3"]
+    rotation: Float[Array, "3 3"]
+    scale: Float[Array, ""]
+    """Pixels per mm."""
+    width: int = eqx.field(static=True)
+    height: int = eqx.field(static=True)
+
+    def footprints(self, splats: Splats, settings: SplattingSettings) -> Footprints:
+        px, py, pz = _rows(self.rotation, (splats.centers - self.position[None]).T)
+        nx, ny, nz = _rows(self.rotation, splats.normals.T)
+        visible = nz < 0
+        squared = (splats.radii * self.scale) ** 2
+        xx, xy, yy = squared * (1 - nx * nx), squared * (-nx * ny), squared * (1 - ny * ny)
+        along = -splats.radii * splats.radii * self.scale * nz
+        a, b, c, gx, gy, xx, yy, root = _filtered(xx, xy, yy, along * nx, along * ny, settings.filter_radius)
+        x, y = self.width / 2 + self.scale * px, self.height / 2 + self.scale * py
+        half_x, half_y = jnp.sqrt(xx), jnp.sqrt(yy)
+        filter_radius = jnp.broadcast_to(settings.filter_radius / self.scale, splats.radii.shape)
+        return Footprints(
+            x=x,
+            y=y,
+            slope_x=-gx,
+            slope_y=-gy,
+            a=a,
+            b=b,
+            c=c,
+            nearness=-pz,
+            shift=stop_gradient(_epsilon(splats.radii, filter_radius, -nz, settings)),
+            opacity=jnp.where(visible, -squared * nz / root, 0.0),
+            left=stop_gradient(x - half_x),
+            right=stop_gradient(x + half_x),
+            top=stop_gradient(y - half_y),
+            bottom=stop_gradient(y + half_y),
+            visible=visible,
+        )
+
+    @staticmethod
+    def inside(nearness, quadric):
+        return quadric < 1
+
+    @staticmethod
+    def squared_radius(nearness, quadric):
+        return quadric
+
+    @staticmethod
+    def squared_radius_vjp(nearness, squared_radius, cotangent):
+        return jnp.zeros_like(nearness), cotangent
+
+    @staticmethod
+    def shifted(nearness, shift):
+        return nearness - shift
+
+    @staticmethod
+    def depth(nearness):
+        return -nearness
+
+    def project(self, points):
+        offset = points - self.position.reshape(3, *[1] * (points.ndim - 1))
+        x, y, z = jnp.tensordot(self.rotation, offset, 1)
+        return self.width / 2 + self.scale * x, self.height / 2 + self.scale * y, z
+
+    def slant(self, x, y, depth, normals):
+        nx, ny, nz = jnp.tensordot(self.rotation, normals, 1)
+        return nx / self.scale, ny / self.scale, -nz
+
+    def unproject(self, x, y, depth):
+        along = jnp.stack([(x - self.width / 2) / self.scale, (y - self.height / 2) / self.scale, depth])
+        return jnp.tensordot(self.rotation.T, along, 1) + self.position.reshape(3, *[1] * depth.ndim)
+
+
+def _epsilon(radii, filter_radius, cosine, settings: SplattingSettings):
+    """Give the depth (mm) within which fragments belong to one surface: in radii, more on slanted splats."""
+    reach = jnp.sqrt(radii * radii + filter_radius * filter_radius)
+    return settings.epsilon_z * reach / jnp.maximum(cosine, 1 / settings.largest_slope)
