@@ -16,12 +16,17 @@ def test_file_takes_its_name_when_the_block_ends_well(tmp_path):
     assert list(tmp_path.iterdir()) == [target]
 
 
+def _write_half(target):
+    with atomic_path(target) as temporary:
+        temporary.write_text("ha")
+        raise RuntimeError("midway")
+
+
 def test_failure_leaves_what_stood_there_before(tmp_path):
     target = tmp_path / "a.txt"
     target.write_text("before")
-    with pytest.raises(RuntimeError, match="midway"), atomic_path(target) as temporary:
-        temporary.write_text("ha")
-        raise RuntimeError("midway")
+    with pytest.raises(RuntimeError, match="midway"):
+        _write_half(target)
     assert target.read_text() == "before"
     assert list(tmp_path.iterdir()) == [target]
 

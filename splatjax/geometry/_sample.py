@@ -1,0 +1,73 @@
+"""From a triangle mesh to splats."""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from splatjax.scene import Splats
+
+from ._cells import Cells, surface_cells
+from ._mesh import Mesh
+from ._scatter import SurfacePoints, faces_beyond, mirrored, scatter
+from ._textures import Textures, lookup, perturbed_normals, texture_coordinates
+
+
+def sample_mesh(mesh: Mesh, count: int, *, textures: Textures | None = None, seed: int = 0) -> Splats:
+    r"""Cover a mesh with splats, spread evenly, its textures baked in.
+
+    **Arguments:**
+
+    - `mesh`: mm, with positive area.
+    - `count`: of splats, at least 1.
+    - `textures`: looked up bilinearly at every splat; `None` for a plain surface.
+    - `seed`: another spread of the same quality; the same seed gives the same splats.
+
+    **Returns:** splats in Morton order, in JAX's default precision. Their areas are those of their Voronoi cells on the
+    surface, all scaled by one factor so that they add up to the mesh's area; their radii are `1.5 sqrt(area)`, and at
+    least 1.2 times the way to the farthest corner of the cell, so that the discs leave no hole.
+
+    **Raises:** `ValueError` for a count below 1, a mesh without area, or textures on a mesh without UVs.
+    """
+    points = scatter(mesh, count, seed=seed)
+    return splats_at(mesh, points, textures)
+
+
+def splats_at(mesh: Mesh, points: SurfacePoints, textures: Textures | None = None) -> Splats:
+    """Make splats of points on a mesh, its textures baked in; areas and radii as `sample_mesh` has them."""
+    centers, normals = points.positions(mesh), points.normals(mesh)
+    spacing = float(np.sqrt(mesh.area() / len(centers)))
+    cells = surface_cells(centers, normals, limit=spacing, ghosts=mirrored(mesh, faces_beyond(mesh), centers, normals, spacing))
+    areas = cells.areas * (mesh.area() / cells.areas.sum())
+    radii = _radii(areas, cells)
+    albedo = specular = roughness = None
+    if textures is not None:
+        uvs = texture_coordinates(mesh, points)
+        albedo, specular, roughness, tangent_space = (
+            None if picture is None else lookup(picture, uvs)
+            for picture in (textures.albedo, textures.specular, textures.roughness, textures.normal)
+        )
+        if tangent_space is not None:
+            normals = perturbed_normals(mesh, points, normals, tangent_space)
+    return make_splats(centers, normals, radii, areas, albedo, specular, roughness)
+
+
+def covering(
+    centers: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Give areas (mm^2) and radii (mm) of splats that cover a surface of which no more is known than these points."""
+    cells = surface_cells(centers, normals)
+    return cells.areas, _radii(cells.areas, cells)
+
+
+def _radii(areas: Float[np.ndarray, " n"], cells: Cells) -> Float[np.ndarray, " n"]:
+    return np.maximum(1.5 * np.sqrt(areas), 1.2 * cells.reaches)
+
+
+def make_splats(centers, normals, radii, areas, albedo=None, specular=None, roughness=None) -> Splats:
+    """Put host arrays into a record, in JAX's default precision."""
+
+    def there(array):
+        return jnp.asarray(np.asarray(array, np.float64), dtype=float)
+
+    maps = (None if array is None else there(array) for array in (albedo, specular, roughness))
+    return Splats(there(centers), there(normals), there(radii), there(areas), *maps)

@@ -1,0 +1,155 @@
+"""Points spread evenly over a triangle mesh."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.spatial import KDTree
+
+from ._cells import Ghosts, surface_cells
+from ._mesh import Mesh, unit
+from ._morton import morton_order
+
+_PLASTIC = 1.32471795724474602596  # of the R2 sequence
+_EDGE_TOLERANCE = 1e-9
+_WALK = 64
+
+
+class SurfacePoints(NamedTuple):
+    """Points on a mesh: the face of each, and its barycentric coordinates there (non-negative, adding up to 1)."""
+
+    faces: Int[np.ndarray, " n"]
+    barycentrics: Float[np.ndarray, "n 3"]
+
+    def positions(self, mesh: Mesh) -> Float[np.ndarray, "n 3"]:
+        """Give the points, mm."""
+        return np.einsum("nc,nci->ni", self.barycentrics, mesh.vertices[mesh.faces[self.faces]])
+
+    def normals(self, mesh: Mesh) -> Float[np.ndarray, "n 3"]:
+        """Give unit normals, interpolated between those of the vertices."""
+        return unit(np.einsum("nc,nci->ni", self.barycentrics, mesh.normals[mesh.faces[self.faces]]))
+
+    def take(self, order: Int[np.ndarray, " m"]) -> "SurfacePoints":
+        """Give some of the points, or all in another order."""
+        return SurfacePoints(self.faces[order], self.barycentrics[order])
+
+
+def scatter(mesh: Mesh, count: int, *, seed: int = 0, relaxations: int = 4) -> SurfacePoints:
+    r"""Spread points over a mesh, one density everywhere, each far from its neighbours (blue noise).
+
+    Points are dealt out evenly along a Morton curve of the triangles, by a low-discrepancy sequence inside each, then moved
+    `relaxations` times to the centroids of their Voronoi cells (Lloyd), along the surface.
+
+    **Arguments:**
+
+    - `mesh`: with positive area.
+    - `count`: of points, at least 1.
+    - `seed`: another spread of the same quality; the same seed gives the same points.
+
+    **Returns:** the points, in Morton order.
+
+    **Raises:** `ValueError` when `count` is below 1 or the mesh has no area.
+    """
+    if count < 1:
+        raise ValueError(f"count is {count}; at least one splat is needed")
+    areas = mesh.face_areas() if len(mesh.faces) else np.zeros(0)
+    if not areas.sum() > 0:
+        raise ValueError("the mesh has no area; it needs at least one triangle that is not degenerate")
+    points = _deal(mesh, areas, count, np.random.default_rng(seed))
+    points = points.take(morton_order(points.positions(mesh)))
+    if relaxations and count > 1:
+        beyond = faces_beyond(mesh)
+        spacing = float(np.sqrt(areas.sum() / count))
+        for _ in range(relaxations):
+            positions, normals = points.positions(mesh), points.normals(mesh)
+            ghosts = mirrored(mesh, beyond, positions, normals, spacing)
+            cells = surface_cells(positions, normals, neighbors=10, directions=12, limit=spacing, ghosts=ghosts)
+            points = _settle(mesh, beyond, points.faces, positions + 1.3 * cells.to_centroids)
+    return points.take(morton_order(points.positions(mesh).astype(np.float32)))  # as it will be seen in single precision
+
+
+def _deal(mesh: Mesh, areas: np.ndarray, count: int, random: np.random.Generator) -> SurfacePoints:
+    along = morton_order(mesh.corners().mean(axis=1))
+    ends = np.cumsum(areas[along])
+    positions = (np.arange(count) + random.uniform()) * (ends[-1] / count)
+    faces = along[np.minimum(np.searchsorted(ends, positions, side="right"), len(ends) - 1)]
+    index = np.arange(1, count + 1)
+    u, v = ((random.uniform() + index / _PLASTIC**k) % 1.0 for k in (1, 2))
+    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
+    return SurfacePoints(faces, np.stack([1 - u - v, u, v], axis=-1))
+
+
+def faces_beyond(mesh: Mesh) -> Int[np.ndarray, "faces 3"]:
+    """Give, per face and corner, the face beyond the edge opposite to the corner; -1 at an open edge."""
+    place = _merged(mesh)[mesh.faces]
+    edges = np.sort(place[:, [[1, 2], [2, 0], [0, 1]]].reshape(-1, 2), axis=-1)
+    key = edges[:, 0] * np.int64(place.max() + 1) + edges[:, 1]
+    order = np.argsort(key, kind="stable")
+    same = key[order][1:] == key[order][:-1]
+    beyond = np.full(len(key), -1)
+    first, second = order[:-1][same], order[1:][same]
+    beyond[first], beyond[second] = second // 3, first // 3
+    return beyond.reshape(-1, 3)
+
+
+def mirrored(
+    mesh: Mesh,
+    beyond: Int[np.ndarray, "faces 3"],
+    points: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"],
+    spacing: float,
+) -> Ghosts | None:
+    """Mirror points at the open border of a mesh, those within 1.5 spacings of it; `None` where the mesh is closed."""
+    faces, corners = np.nonzero(beyond < 0)
+    if not len(faces):
+        return None
+    starts, ends = (mesh.vertices[mesh.faces[faces, (corners + step) % 3]] for step in (1, 2))
+    lengths = np.linalg.norm(ends - starts, axis=1)
+    pieces = np.maximum(np.ceil(lengths / (0.1 * spacing)).astype(np.int64), 1)
+    edge = np.repeat(np.arange(len(faces)), pieces)
+    share = (np.arange(len(edge)) - np.repeat(np.cumsum(pieces) - pieces, pieces) + 0.5) / pieces[edge]
+    marks = starts[edge] + share[:, None] * (ends - starts)[edge]
+    distance, mark = KDTree(marks).query(points, distance_upper_bound=1.5 * spacing, workers=-1)
+    near = np.flatnonzero(np.isfinite(distance))
+    edge = edge[mark[near]]
+    along = (ends - starts)[edge] / lengths[edge, None]
+    offset = points[near] - starts[edge]
+    share = np.clip(np.einsum("ni,ni->n", offset, along), 0.0, lengths[edge])
+    foot = starts[edge] + share[:, None] * along
+    gap = np.linalg.norm(foot - points[near], axis=1)
+    near, foot = near[gap > 1e-3 * spacing], foot[gap > 1e-3 * spacing]  # on the border itself a point is its own image
+    return Ghosts(2 * foot - points[near], normals[near])
+
+
+def _merged(mesh: Mesh) -> Int[np.ndarray, " vertices"]:
+    """Give vertices at one place one number: textures cut meshes open along their seams."""
+    return np.unique(mesh.vertices, axis=0, return_inverse=True)[1].reshape(-1)
+
+
+def _barycentrics(mesh: Mesh, faces: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Give the barycentric coordinates of the points' projections to the planes of their faces."""
+    a, b, c = np.moveaxis(mesh.vertices[mesh.faces[faces]], 1, 0)
+    ab, ac, ap = b - a, c - a, points - a
+    d00, d01, d11 = (np.einsum("ni,ni->n", x, y) for x, y in ((ab, ab), (ab, ac), (ac, ac)))
+    d20, d21 = (np.einsum("ni,ni->n", ap, x) for x in (ab, ac))
+    determinant = np.maximum(d00 * d11 - d01 * d01, 1e-30)
+    v = (d11 * d20 - d01 * d21) / determinant
+    w = (d00 * d21 - d01 * d20) / determinant
+    return np.stack([1 - v - w, v, w], axis=-1)
+
+
+def _settle(mesh: Mesh, beyond: np.ndarray, faces: np.ndarray, points: np.ndarray) -> SurfacePoints:
+    """Put points that left their faces back onto the mesh, by walking across edges towards them."""
+    faces = faces.copy()
+    barycentrics = _barycentrics(mesh, faces, points)
+    outside = np.flatnonzero(barycentrics.min(axis=1) < -_EDGE_TOLERANCE)
+    for _ in range(_WALK):
+        if not len(outside):
+            break
+        across = beyond[faces[outside], barycentrics[outside].argmin(axis=1)]
+        outside, across = outside[across >= 0], across[across >= 0]
+        faces[outside] = across
+        barycentrics[outside] = _barycentrics(mesh, across, points[outside])
+        outside = outside[barycentrics[outside].min(axis=1) < -_EDGE_TOLERANCE]
+    barycentrics = np.maximum(barycentrics, 0)
+    return SurfacePoints(faces, barycentrics / barycentrics.sum(axis=1, keepdims=True))

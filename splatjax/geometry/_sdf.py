@@ -1,0 +1,56 @@
+"""Signed distances of soft clay: primitives, and the ways to join them. Negative inside; mm; arrays of one shape."""
+
+import numpy as np
+
+Point = tuple[np.ndarray, np.ndarray, np.ndarray]
+Size = float | int
+
+
+def ball(p: Point, center, radius: Size) -> np.ndarray:
+    """Give the distance to a sphere."""
+    return np.sqrt(sum((x - c) ** 2 for x, c in zip(p, center, strict=True))) - radius
+
+
+def ellipsoid(p: Point, center, radii) -> np.ndarray:
+    """Give the distance to an ellipsoid, to first order (exact on it): `k (k - 1) / |grad k^2 / 2|`, `k = |p / r|`."""
+    scaled = [(x - c) / r for x, c, r in zip(p, center, radii, strict=True)]
+    k = np.sqrt(sum(s * s for s in scaled))
+    slope = np.sqrt(sum((s / r) ** 2 for s, r in zip(scaled, radii, strict=True)))
+    return np.where(slope > 1e-6, k * (k - 1) / np.maximum(slope, 1e-6), -min(radii))
+
+
+def limb(p: Point, start, end, start_radius: Size, end_radius: Size) -> np.ndarray:
+    """Give the distance to a capsule whose radius changes linearly from `start` to `end` (to first order)."""
+    axis = [e - s for s, e in zip(start, end, strict=True)]
+    length = sum(a * a for a in axis)
+    share = sum((x - s) * a for x, s, a in zip(p, start, axis, strict=True)) / length
+    share = np.clip(share, 0.0, 1.0)
+    squared = sum((x - s - share * a) ** 2 for x, s, a in zip(p, start, axis, strict=True))
+    return np.sqrt(squared) - (start_radius + (end_radius - start_radius) * share)
+
+
+def join(a: np.ndarray, b: np.ndarray, softness: Size) -> np.ndarray:
+    """Unite two bodies; where both are within `softness`, a fillet fills the corner (quadratic smooth minimum)."""
+    blend = np.maximum(softness - np.abs(a - b), 0.0)
+    return np.minimum(a, b) - blend * blend * (0.25 / softness)
+
+
+def carve(a: np.ndarray, b: np.ndarray, softness: Size) -> np.ndarray:
+    """Take the second body away from the first; the edge is rounded over `softness`."""
+    return -join(-a, b, softness)
+
+
+def keep(a: np.ndarray, b: np.ndarray, softness: Size) -> np.ndarray:
+    """Keep what two bodies have in common; the edge is rounded over `softness`."""
+    return -join(-a, -b, softness)
+
+
+def bump(x: np.ndarray, center: Size | np.ndarray, width: Size | np.ndarray) -> np.ndarray:
+    """Give `exp(-(x - center)^2 / width^2)`: clay put on, or taken off."""
+    return np.exp(-(((x - center) / width) ** 2))
+
+
+def smooth_step(x: np.ndarray, low: Size | np.ndarray, high: Size | np.ndarray) -> np.ndarray:
+    """Give 0 below `low`, 1 above `high`, a cubic between; reversed when `low > high`."""
+    t = np.clip((x - low) / (high - low), 0.0, 1.0)
+    return t * t * (3 - 2 * t)

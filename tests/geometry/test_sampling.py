@@ -1,0 +1,165 @@
+"""Laws of splats on a mesh: areas, coverage, evenness, order."""
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial import cKDTree
+
+from splatjax.geometry import Mesh, Textures, cut_below, sample_mesh
+from splatjax.geometry._cells import surface_cells
+from splatjax.geometry._morton import morton_order
+
+COUNT = 3000
+SINGLE = 2e-6  # relative: a sum of thousands of float32
+
+
+def sphere(radius=50.0, subdivisions=3) -> Mesh:
+    ball = trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius)
+    vertices = np.array(ball.vertices)
+    return Mesh(vertices, np.array(ball.faces), vertices / radius)
+
+
+def square(side=10.0) -> Mesh:
+    """A square in the xy plane, u along x and v along y, facing +z."""
+    vertices = np.asarray([[0, 0, 0], [side, 0, 0], [side, side, 0], [0, side, 0]], float)
+    faces = np.asarray([[0, 1, 2], [0, 2, 3]])
+    return Mesh(vertices, faces, np.tile([0.0, 0.0, 1.0], (4, 1)), vertices[faces][..., :2] / side)
+
+
+@pytest.fixture(scope="module")
+def splats():
+    return sample_mesh(sphere(), COUNT)
+
+
+def test_areas_add_up_to_the_surface(splats, dtype):
+    assert splats.count == COUNT
+    assert splats.areas.dtype == dtype
+    np.testing.assert_allclose(float(np.asarray(splats.areas, np.float64).sum()), sphere().area(), rtol=SINGLE)
+    assert float(splats.areas.min()) > 0
+
+
+def test_areas_are_those_of_voronoi_cells(splats):
+    """On a sheet the cells are compared with exact counts of a fine grid of nearest neighbours."""
+    sheet = sample_mesh(square(), 400)
+    grid = (np.stack(np.meshgrid(np.arange(600), np.arange(600)), -1).reshape(-1, 2) + 0.5) / 60
+    centers = np.asarray(sheet.centers)
+    owner = cKDTree(centers[:, :2]).query(grid)[1]
+    exact = np.bincount(owner, minlength=400) / 3600
+    inner = (np.abs(centers[:, :2] - 5) < 4).all(axis=1)
+    error = np.asarray(sheet.areas)[inner] / exact[inner] - 1
+    assert np.abs(error).max() < 0.06  # 600^2 points are 900 a cell: 1 % noise
+
+
+def test_normals_are_unit_and_outward(splats):
+    normals, centers = np.asarray(splats.normals), np.asarray(splats.centers)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-6)
+    assert ((normals * centers).sum(axis=1) > 0.99 * 49).all()
+
+
+def test_discs_leave_no_hole(splats):
+    """Every point of the surface lies within 0.9 of the radius of some splat."""
+    fine = sample_mesh(sphere(), 20 * COUNT)
+    distance, near = cKDTree(np.asarray(splats.centers)).query(np.asarray(fine.centers), k=4)
+    assert (distance / np.asarray(splats.radii)[near]).min(axis=1).max() < 0.9
+
+
+def test_points_are_spread_as_blue_noise(splats):
+    """Nearest neighbours: 0.5 of the spacing on average when random, 1.07 in a hexagonal grid."""
+    spacing = np.sqrt(sphere().area() / COUNT)
+    nearest = cKDTree(np.asarray(splats.centers)).query(np.asarray(splats.centers), k=2)[0][:, 1] / spacing
+    assert nearest.mean() > 0.83
+    assert nearest.min() > 0.45
+    assert nearest.std() < 0.12
+
+
+def test_density_is_even_over_large_and_small_triangles():
+    """Half of the sphere subdivided twice more gets as many splats as the other half."""
+    coarse, fine = sphere(subdivisions=2), sphere(subdivisions=4)
+    upper = cut_below(fine, 0.0)
+    lower_faces = coarse.select(coarse.corners()[..., 1].mean(axis=1) < 0)
+    both = Mesh(
+        np.concatenate([upper.vertices, lower_faces.vertices]),
+        np.concatenate([upper.faces, lower_faces.faces + len(upper.vertices)]),
+        np.concatenate([upper.normals, lower_faces.normals]),
+    )
+    centers = np.asarray(sample_mesh(both, COUNT).centers)
+    share = upper.area() / both.area()
+    assert abs((centers[:, 1] > 0).mean() - share) < 0.02
+
+
+def test_same_seed_same_splats_and_another_seed_others(splats):
+    again, other = sample_mesh(sphere(), COUNT), sample_mesh(sphere(), COUNT, seed=1)
+    np.testing.assert_array_equal(np.asarray(again.centers), np.asarray(splats.centers))
+    assert not np.array_equal(np.asarray(other.centers), np.asarray(splats.centers))
+
+
+def test_nearby_splats_are_near_in_memory(splats):
+    centers = np.asarray(splats.centers)
+    np.testing.assert_array_equal(morton_order(centers.astype(np.float32)), np.arange(COUNT))
+    step = np.linalg.norm(np.diff(centers, axis=0), axis=1)
+    assert np.median(step) < 3 * np.sqrt(sphere().area() / COUNT)
+
+
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_a_handful_of_splats(count):
+    splats = sample_mesh(sphere(), count)
+    assert splats.count == count
+    np.testing.assert_allclose(float(splats.areas.sum()), sphere().area(), rtol=SINGLE)
+
+
+def test_cut_keeps_what_is_above_the_plane():
+    upper = cut_below(sphere(subdivisions=4), 20.0)
+    assert upper.vertices[upper.faces, 1].min() >= 20 - 1e-9
+    np.testing.assert_allclose(upper.area(), 2 * np.pi * 50 * 30, rtol=3e-3)  # Archimedes; the mesh has 5120 faces
+
+
+def test_open_border_has_no_clumps():
+    splats = sample_mesh(cut_below(sphere(), 0.0), COUNT)
+    radii = np.asarray(splats.radii)
+    assert radii.max() < 1.6 * np.median(radii)
+
+
+def test_cells_that_coincide_share_their_area():
+    points = np.stack(np.meshgrid(np.arange(20.0), np.arange(20.0), [0.0]), -1).reshape(-1, 3)
+    double = np.concatenate([points, points])
+    cells = surface_cells(double, np.tile([0.0, 0.0, 1.0], (len(double), 1)))
+    inner = (np.abs(double[:, :2] - 9.5) < 8).all(axis=1)
+    np.testing.assert_allclose(cells.areas[inner], 0.5, rtol=0.02)
+
+
+def test_textures_land_where_their_coordinates_say():
+    """Row 0 of the picture is at the top, v = 1; bilinear lookup gives back a picture that is linear in x and y."""
+    size = 32
+    rows, columns = np.meshgrid((np.arange(size) + 0.5) / size, (np.arange(size) + 0.5) / size, indexing="ij")
+    picture = np.stack([columns, 1 - rows, np.full_like(rows, 0.25)], axis=-1)
+    splats = sample_mesh(square(), 500, textures=Textures(albedo=picture, specular=columns, roughness=rows))
+    xy = np.asarray(splats.centers)[:, :2] / 10
+    inner = (np.abs(xy - 0.5) < 0.48).all(axis=1)
+    assert splats.albedo is not None
+    assert splats.specular is not None
+    assert splats.roughness is not None
+    np.testing.assert_allclose(np.asarray(splats.albedo)[inner, :2], xy[inner], atol=1e-5)
+    np.testing.assert_allclose(np.asarray(splats.specular)[inner], xy[inner, 0], atol=1e-5)
+    np.testing.assert_allclose(np.asarray(splats.roughness)[inner], 1 - xy[inner, 1], atol=1e-5)
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_normal_map_tilts_along_u_and_v(mirrored):
+    mesh = square()
+    assert mesh.uvs is not None
+    uvs = mesh.uvs * [-1, 1] if mirrored else mesh.uvs
+    tilt = np.asarray([0.6, 0.0, 0.8]) * np.ones((2, 2, 1)), np.asarray([0.0, 0.6, 0.8]) * np.ones((2, 2, 1))
+    worn = Mesh(mesh.vertices, mesh.faces, mesh.normals, uvs)
+    along_u, along_v = (np.asarray(sample_mesh(worn, 20, textures=Textures(normal=n)).normals) for n in tilt)
+    np.testing.assert_allclose(along_u, np.tile([-0.6 if mirrored else 0.6, 0, 0.8], (20, 1)), atol=1e-6)
+    np.testing.assert_allclose(along_v, np.tile([0, 0.6, 0.8], (20, 1)), atol=1e-6)
+
+
+def test_what_cannot_be_sampled_is_refused():
+    flat = Mesh(np.zeros((3, 3)), np.asarray([[0, 1, 2]]), np.tile([0.0, 1.0, 0.0], (3, 1)))
+    with pytest.raises(ValueError, match="count is 0"):
+        sample_mesh(sphere(), 0)
+    with pytest.raises(ValueError, match="no area"):
+        sample_mesh(flat, 10)
+    with pytest.raises(ValueError, match="no texture coordinates"):
+        sample_mesh(sphere(), 10, textures=Textures(albedo=np.ones((2, 2, 3))))
