@@ -18,7 +18,7 @@ class RenderSettings(eqx.Module):
     shadows: _splatting.ShadowSettings = _splatting.ShadowSettings()
     diffusion: _diffusion.DiffusionSettings = _diffusion.DiffusionSettings()
     rasterizer: _splatting.AbstractRasterizer = _splatting.TileRasterizer()
-    diffuser: _diffusion.AbstractDiffuser = _diffusion.DenseDiffuser()
+    diffuser: _diffusion.AbstractDiffuser = _diffusion.ClusterDiffuser()
 
 
 class ShadowPlan(eqx.Module):
@@ -130,16 +130,19 @@ def _render(scene: Scene, camera: Camera, settings: RenderSettings, plan: Plan) 
     # Passes 4 and 5, on the surface in front and on the one that shows behind its silhouettes.
     sources = _diffusion.Sources(splats.centers.T, splats.areas, source)
 
-    def shade(surface):
-        named = _by_name(attributes, surface.attributes)
-        layers = _diffusion.diffusion_layers(
-            sources, material.gaussians.variances, surface, named["source"], named["area"][0], plan.interval, view, plan.diffuser
-        )
-        return _shade(scene, camera, view, groups, f0, surface, named, layers)
-
-    both = jax.tree.map(lambda *planes: jnp.stack(planes), surfaces.front, surfaces.behind)
-    front, behind = _unstack(jax.lax.map(shade, both))
-    needed = jnp.stack([surfaces.needed, front.needed, behind.needed, *shadow_needs])
+    seen = [(surface, _by_name(attributes, surface.attributes)) for surface in (surfaces.front, surfaces.behind)]
+    layers, diffusion_need = _diffusion.diffusion_layers(
+        sources,
+        material.gaussians.variances,
+        tuple(_diffusion.SeenSurface(surface, named["source"], named["area"][0]) for surface, named in seen),
+        plan.interval,
+        view,
+        plan.diffuser,
+    )
+    front, behind = (
+        _shade(scene, view, groups, f0, surface, named, layer) for (surface, named), layer in zip(seen, layers, strict=True)
+    )
+    needed = jnp.stack([surfaces.needed, diffusion_need, *shadow_needs])
     return _compose(front, behind, material.gaussians.weights, jnp.max(needed))
 
 
@@ -156,19 +159,16 @@ class _Shaded(eqx.Module):
     layers: Float[Array, "gaussians height width channels"]
     specular: Float[Array, "height width channels"]
     resolved: Float[Array, "gaussians height width"]
-    needed: Float[Array, ""]
 
 
-def _shade(scene, camera, view, groups, f0, surface, named, layers) -> _Shaded:
+def _shade(scene, view, groups, f0, surface, named, layers) -> _Shaded:
     """Pass 5 on one surface."""
     splats, material = scene.splats, scene.material
     covered = surface.weight_sum > 0
     dtype = surface.depth.dtype
     shape = surface.depth.shape
-    x = jnp.broadcast_to(jnp.arange(view.width, dtype=dtype)[None] + 0.5, shape)
-    y = jnp.broadcast_to(jnp.arange(view.height, dtype=dtype)[:, None] + 0.5, shape)
-    position = view.unproject(x, y, surface.depth)
-    to_eye = jnp.broadcast_to(camera.position[:, None, None], position.shape) - position
+    position = _diffusion.pixel_points(view, surface.depth)
+    to_eye = jnp.broadcast_to(view.position[:, None, None], position.shape) - position
     outgoing = to_eye / jnp.sqrt(jnp.sum(to_eye * to_eye, axis=0))[None]
     points = _shading.SurfacePoints(
         positions=position.transpose(1, 2, 0),
@@ -197,7 +197,6 @@ def _shade(scene, camera, view, groups, f0, surface, named, layers) -> _Shaded:
         layers=post[None] * layers.layers.transpose(0, 2, 3, 1),
         specular=jnp.where(covered[..., None], specular, 0.0),
         resolved=layers.resolved,
-        needed=layers.needed,
     )
 
 
@@ -311,10 +310,6 @@ def _shadows_in_order(lit, groups: list[StackedLights], shape, dtype) -> Float[A
             for row, place in enumerate(group.places):
                 planes[place] = shares[row]
     return jnp.stack(planes) if planes else jnp.zeros((0, *shape), dtype)
-
-
-def _unstack(stacked):
-    return (jax.tree.map(lambda leaf, i=i: leaf[i], stacked) for i in range(2))
 
 
 def _in_one_dtype(scene: Scene, *rest):

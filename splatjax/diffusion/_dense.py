@@ -25,8 +25,8 @@ class DenseDiffuser(AbstractDiffuser):
         self,
         sources: Sources,
         variances: Float[Array, " gaussians"],
-        points: Float[Array, "3 height width"],
-        covered: Bool[Array, "height width"],
+        points: Float[Array, "surfaces 3 height width"],
+        covered: Bool[Array, "surfaces height width"],
         view: AbstractView,
     ) -> Diffused:
         def picture_row(row):
@@ -42,10 +42,12 @@ class DenseDiffuser(AbstractDiffuser):
 
             return jnp.where(covered[None, None], jax.lax.map(layer, variances), 0.0)
 
-        height, width = covered.shape
+        surfaces, height, width = covered.shape
         channels = sources.irradiance.shape[0]
         none = jnp.zeros((), points.dtype)
         if sources.areas.shape[0] == 0:
-            return Diffused(jnp.zeros((variances.shape[0], channels, height, width), points.dtype), none)
-        layers = jax.lax.map(picture_row, (points.transpose(1, 0, 2), covered))
-        return Diffused(layers.transpose(1, 2, 0, 3), none)
+            return Diffused(jnp.zeros((variances.shape[0], surfaces, channels, height, width), points.dtype), none)
+        rows = points.transpose(0, 2, 1, 3).reshape(surfaces * height, 3, width), covered.reshape(surfaces * height, width)
+        layers = jax.lax.map(picture_row, rows)
+        layers = layers.reshape(surfaces, height, *layers.shape[1:])
+        return Diffused(layers.transpose(2, 0, 3, 1, 4), none)

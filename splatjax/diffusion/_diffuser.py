@@ -21,7 +21,7 @@ class Sources(eqx.Module):
 class Diffused(eqx.Module):
     """The diffusion integrals, and what capacity they needed over what was planned."""
 
-    layers: Float[Array, "gaussians channels height width"]
+    layers: Float[Array, "gaussians surfaces channels height width"]
     needed: Float[Array, ""]
 
 
@@ -44,8 +44,8 @@ class AbstractDiffuser(eqx.Module):
         self,
         sources: Sources,
         variances: Float[Array, " gaussians"],
-        points: Float[Array, "3 height width"],
-        covered: Bool[Array, "height width"],
+        points: Float[Array, "surfaces 3 height width"],
+        covered: Bool[Array, "surfaces height width"],
         view: AbstractView,
     ) -> Diffused:
-        """Evaluate every layer at every covered point; where no splat is within reach the layer is 0."""
+        """Evaluate every layer at the covered points of the surface in front and of the one behind it; 0 elsewhere."""

@@ -17,41 +17,53 @@ class DiffusionLayers(eqx.Module):
 
     layers: Float[Array, "gaussians channels height width"]
     resolved: Float[Array, "gaussians height width"]
-    needed: Float[Array, ""]
+
+
+class SeenSurface(eqx.Module):
+    """A surface as the pixels see it, with what pass 3 blended for the layers that the splats are too far apart to carry."""
+
+    surface: Surface
+    irradiance: Float[Array, "channels height width"]
+    area: Float[Array, "height width"]
+    """Of a splat, mm^2."""
+
+
+def pixel_points(view: AbstractView, depth: Float[Array, "height width"]) -> Float[Array, "3 height width"]:
+    """Give the points (mm) that the pixels see at a depth (mm)."""
+    x = jnp.arange(view.width, dtype=depth.dtype)[None] + 0.5
+    y = jnp.arange(view.height, dtype=depth.dtype)[:, None] + 0.5
+    return view.unproject(jnp.broadcast_to(x, depth.shape), jnp.broadcast_to(y, depth.shape), depth)
 
 
 def diffusion_layers(
     sources: Sources,
     variances: Float[Array, " gaussians"],
-    surface: Surface,
-    surface_irradiance: Float[Array, "channels height width"],
-    surface_area: Float[Array, "height width"],
+    seen: tuple[SeenSurface, SeenSurface],
     interval: Float[Array, "2"],
     view: AbstractView,
     diffuser: AbstractDiffuser,
-) -> DiffusionLayers:
+) -> tuple[tuple[DiffusionLayers, DiffusionLayers], Float[Array, ""]]:
     r"""Diffuse the irradiance of the splats to the points that the pixels see.
 
     **Arguments:**
 
     - `sources`: centers (mm), areas (mm^2) and irradiance of the splats. Differentiable.
     - `variances`: mm^2, one per layer. Differentiable.
-    - `surface`: where the pixels see the surface. Differentiable.
-    - `surface_irradiance`, `surface_area`: of the splats, blended by pass 3: the layer where the splats are too far apart to
-      carry it, and how far apart they are.
+    - `seen`: the surface in front, and the one that shows behind its silhouettes. Differentiable.
     - `interval`: from `handover_interval`.
 
-    **Returns:** layers without weights. Constants are kept, and `min E <= L_k <= max E`.
+    **Returns:** the layers of both, without weights, and what capacity was needed over what was planned. Constants are kept,
+    and `min E <= L_k <= max E`.
 
     **Source:** Kim et al. 2010, section 4.2.
     """
-    covered = stop_gradient(surface.weight_sum) > 0
-    x = jnp.arange(view.width, dtype=variances.dtype)[None] + 0.5
-    y = jnp.arange(view.height, dtype=variances.dtype)[:, None] + 0.5
-    shape = covered.shape
-    points = view.unproject(jnp.broadcast_to(x, shape), jnp.broadcast_to(y, shape), surface.depth)
+    covered = jnp.stack([stop_gradient(each.surface.weight_sum) > 0 for each in seen])
+    points = jnp.stack([pixel_points(view, each.surface.depth) for each in seen])
     diffused = diffuser.diffuse(sources, variances, points, covered, view)
-    area = jnp.where(covered, surface_area, 1.0)
-    resolved = jax.vmap(lambda variance: resolved_share(variance, area, interval))(variances)
-    own = surface_irradiance[None]
-    return DiffusionLayers(own + resolved[:, None] * (diffused.layers - own), resolved, diffused.needed)
+    found = []
+    for place, each in enumerate(seen):
+        area = jnp.where(covered[place], each.area, 1.0)
+        resolved = jax.vmap(lambda variance, area=area: resolved_share(variance, area, interval))(variances)
+        own = each.irradiance[None]
+        found.append(DiffusionLayers(own + resolved[:, None] * (diffused.layers[:, place] - own), resolved))
+    return (found[0], found[1]), diffused.needed

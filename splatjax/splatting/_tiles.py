@@ -6,6 +6,7 @@ pixel that the front leaves open are swept twice more for what lies behind. The 
 only. Fragments are computed relative to their tile, so that float32 suffices at any resolution.
 """
 
+from collections.abc import Sequence
 from functools import partial
 
 import equinox as eqx

@@ -99,6 +99,16 @@ class AbstractView(eqx.Module):
         The third is the cosine-like factor that vanishes where a plane is seen edge on."""
 
     @abc.abstractmethod
+    def pixels_per_mm(self, depth: Float[Array, "*points"]) -> Float[Array, "*points"]:
+        """Give the size of a millimetre across the line of sight, pixels."""
+
+    @abc.abstractmethod
+    def sphere_box(
+        self, centers: Float[Array, "3 spheres"], radii: Float[Array, " spheres"]
+    ) -> tuple[Float[Array, " spheres"], ...]:
+        """Give left, right, top and bottom (pixels) of boxes around spheres, and their centers' depth (mm)."""
+
+    @abc.abstractmethod
     def unproject(
         self, x: Float[Array, "*points"], y: Float[Array, "*points"], depth: Float[Array, "*points"]
     ) -> Float[Array, "3 *points"]:
@@ -231,6 +241,19 @@ class PerspectiveView(AbstractView):
         mm = jnp.where(depth > self.near, depth, 1.0) / self.focal_length
         return nx * mm, ny * mm, -(nz + nx * u + ny * v)
 
+    def pixels_per_mm(self, depth):
+        return self.focal_length / jnp.maximum(depth, self.near)
+
+    def sphere_box(self, centers, radii):
+        x, y, depth = self.project(centers)
+        bounded = depth > 1.01 * radii + self.near
+        stretch = radii / jnp.where(bounded, depth - radii, 1.0)
+        half_x = jnp.where(bounded, stretch * (self.focal_length + jnp.abs(x - self.width / 2)), jnp.inf)
+        half_y = jnp.where(bounded, stretch * (self.focal_length + jnp.abs(y - self.height / 2)), jnp.inf)
+        behind = depth + radii < self.near
+        half_x = jnp.where(behind, -1.0, half_x)
+        return x - half_x, x + half_x, y - half_y, y + half_y, depth
+
     def unproject(self, x, y, depth):
         u, v = (x - self.width / 2) / self.focal_length, (y - self.height / 2) / self.focal_length
         along = jnp.stack([u * depth, v * depth, depth])
@@ -304,6 +327,14 @@ class OrthographicView(AbstractView):
     def slant(self, x, y, depth, normals):
         nx, ny, nz = jnp.tensordot(self.rotation, normals, 1)
         return nx / self.scale, ny / self.scale, -nz
+
+    def pixels_per_mm(self, depth):
+        return jnp.broadcast_to(self.scale, depth.shape)
+
+    def sphere_box(self, centers, radii):
+        x, y, depth = self.project(centers)
+        half = radii * self.scale
+        return x - half, x + half, y - half, y + half, depth
 
     def unproject(self, x, y, depth):
         along = jnp.stack([(x - self.width / 2) / self.scale, (y - self.height / 2) / self.scale, depth])
