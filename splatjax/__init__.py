@@ -4,9 +4,14 @@ From a few optical coefficients to a translucent picture, and back; lengths in m
 """
 
 from .gaussians import AbstractProfile as AbstractProfile, SumOfGaussians as SumOfGaussians
+from .geometry import bust as bust, bust_mesh as bust_mesh
+from .io import read_exr as read_exr, read_splats as read_splats, sample_mesh as sample_mesh
+from .io import write_exr as write_exr, write_png as write_png, write_splats as write_splats
 from .scattering import Medium as Medium
 from .scene import Camera as Camera, DirectionalLight as DirectionalLight, Frame as Frame
 from .scene import GaussianBeam as GaussianBeam, Material as Material, PointLight as PointLight
 from .scene import Scene as Scene, Splats as Splats
+
+from .render import Plan as Plan, plan as plan, render as render, RenderSettings as RenderSettings
 
 __version__ = "0.1.0"

@@ -1,5 +1,7 @@
 """The only room that touches files: splats, meshes, pictures, materials."""
 
 from ._atomic import atomic_path as atomic_path
+from ._exr import read_exr as read_exr, write_exr as write_exr
 from ._mesh import sample_mesh as sample_mesh
 from ._ply import read_splats as read_splats, write_splats as write_splats
+from ._png import write_png as write_png
