@@ -1,6 +1,9 @@
 """Meshes from GLB and OBJ files, with their maps."""
 
+import json
 import os
+import struct
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -86,7 +89,8 @@ def read_mesh(path: Name, *, mm_per_unit: float, v_up: bool | None = None) -> tu
     if path.suffix.lower() not in _KINDS:
         raise ValueError(f"{path}: {path.suffix or 'no suffix'} is no mesh format known here; give one of {', '.join(_KINDS)}")
     try:
-        scene = trimesh.load_scene(str(path), process=False)
+        whole = BytesIO(_with_materials(path.read_bytes())) if path.suffix.lower() == ".glb" else str(path)
+        scene = trimesh.load_scene(whole, file_type=path.suffix.lower()[1:], process=False)
         pieces = [piece for piece in scene.dump() if isinstance(piece, trimesh.Trimesh) and len(piece.faces)]
     except Exception as error:  # each reader of trimesh fails in its own way
         raise ValueError(f"{path}: cannot be read as a mesh ({error}); it is cut short or of another format") from error
@@ -99,6 +103,25 @@ def read_mesh(path: Name, *, mm_per_unit: float, v_up: bool | None = None) -> tu
     textures = [picture for piece in pieces if (picture := _base_color(piece)) is not None]
     own = textures[0] if len(pieces) == 1 and textures else None
     return mesh, Textures(albedo=None if own is None else srgb_to_linear(_values(own, "RGB")))
+
+
+def _with_materials(glb: bytes) -> bytes:
+    """Give the same GLB with a material on everything: trimesh passes over the texture coordinates of what has none."""
+    length, kind = struct.unpack_from("<I4s", glb, 12)
+    if kind != b"JSON":
+        return glb
+    content = json.loads(glb[20 : 20 + length])
+    bare = [part for mesh in content.get("meshes", []) for part in mesh["primitives"] if "material" not in part]
+    if not bare:
+        return glb
+    materials = content.setdefault("materials", [])
+    for part in bare:
+        part["material"] = len(materials)
+    materials.append({})
+    text = json.dumps(content).encode()
+    text += b" " * (-len(text) % 4)
+    rest = glb[20 + length :]
+    return struct.pack("<4sII", b"glTF", 2, 20 + len(text) + len(rest)) + struct.pack("<I4s", len(text), b"JSON") + text + rest
 
 
 def _piece(path: Path, piece: trimesh.Trimesh, upside_down: bool) -> Mesh:
@@ -132,9 +155,14 @@ def _base_color(piece: trimesh.Trimesh) -> Image.Image | None:
     material = getattr(piece.visual, "material", None)
     for name in ("baseColorTexture", "image"):
         picture = getattr(material, name, None)
-        if isinstance(picture, Image.Image):
+        if isinstance(picture, Image.Image) and not _stands_in(picture):
             return picture
     return None
+
+
+def _stands_in(picture: Image.Image) -> bool:
+    """Tell the 2 x 2 pixels of one gray that trimesh makes up where there is no texture."""
+    return picture.size == (2, 2) and len(np.unique(np.asarray(picture).reshape(4, -1), axis=0)) == 1
 
 
 def _read_picture(path: Name, mode: str) -> Float[np.ndarray, "..."]:
