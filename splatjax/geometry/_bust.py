@@ -16,20 +16,20 @@ from ._surface_nets import surface_nets
 _MIDDLE = np.asarray([0.0, -30.0, -10.0])
 
 
-def bust_mesh(*, spacing: float = 1.6) -> Mesh:
+def bust_mesh(*, spacing: float = 1.4) -> Mesh:
     r"""Give a head with neck and shoulders as a closed mesh, life-size: mm, +y up, facing +z, eyes near y = 0.
 
     **Arguments:**
 
-    - `spacing`: of the grid that the mesh is made on, mm: about the length of its edges.
+    - `spacing`: of the grid that the mesh is made on, mm: about the length of its edges, from 0.5 to 1.6.
 
     **Returns:** the mesh, with normals and texture coordinates: u is the longitude around the vertical axis (0.5 the face, the
     seam at the back), v the angle from the bottom, both seen from a point inside the head.
 
-    **Raises:** `ValueError` when the spacing is not between 0.5 and 4 mm.
+    **Raises:** `ValueError` for another spacing.
     """
-    if not 0.5 <= spacing <= 4:
-        raise ValueError(f"spacing is {spacing}; it must lie between 0.5 and 4 mm, or the face is lost")
+    if not 0.5 <= spacing <= 1.6:
+        raise ValueError(f"spacing is {spacing}; it must lie between 0.5 and 1.6 mm, or the ears grow onto the head")
     mesh = surface_nets(head_distance, LOW, HIGH, spacing)
     return Mesh(mesh.vertices, mesh.faces, mesh.normals, _coordinates(mesh.corners()))
 

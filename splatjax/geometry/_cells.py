@@ -1,12 +1,13 @@
 """The share of the surface that belongs to each of a set of points: Voronoi cells in their tangent planes."""
 
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial import KDTree
 
-_CHUNK = 1 << 14
+_CHUNK = 1 << 11  # small enough to stay in cache
 _OPEN_END = 0.75
 
 
@@ -79,27 +80,32 @@ def surface_cells(
     distances, near = tree.query(points, k=neighbors + 1, workers=-1)
     angles = (np.arange(directions) + 0.5) * (2 * np.pi / directions)
     fan = np.stack([np.cos(angles), np.sin(angles)]).astype(np.float32)
-    areas, reaches, to_centroids = np.empty(count), np.empty(count), np.empty((count, 3))
-    for start in range(0, count, _CHUNK):
+
+    def measure(start: int) -> Cells:
         part = slice(start, min(start + _CHUNK, count))
-        own = single[part]
-        tangent, bitangent = tangent_frames(own)
         others = near[part, 1:]
         offsets = (everyone[others] - points[part, None]).astype(np.float32)
-        across = np.stack([np.einsum("nki,ni->nk", offsets, axis) for axis in (tangent, bitangent)], axis=-1)
-        squared = np.square(distances[part, 1:]).astype(np.float32)
-        coincident = squared == 0
-        same_side = np.einsum("nki,ni->nk", single[others], own) > 0.1
-        squared = np.where(same_side & ~coincident, squared, np.inf)
-        nearest = distances[part, 1:7]
-        around = nearest.sum(axis=1) / np.maximum((nearest > 0).sum(axis=1), 1)
-        end = np.full(len(own), limit) if limit is not None else _OPEN_END * around
-        inverse = (across @ fan) * (2 / squared)[..., None]  # of the distance to the border; negative behind the point
-        border = 1 / np.maximum(inverse.max(axis=1), 1 / np.maximum(end, 1e-12)[:, None])
-        step = 2 * np.pi / directions
-        area = 0.5 * step * np.einsum("nd,nd->n", border, border)
-        moment = (step / 3) * (border**3 @ fan.T) / np.maximum(area, 1e-30)[:, None]
-        areas[part] = area / (1 + coincident.sum(axis=1))
-        reaches[part] = border.max(axis=1)
-        to_centroids[part] = moment[:, :1] * tangent + moment[:, 1:] * bitangent
-    return Cells(areas, reaches, to_centroids)
+        return _measure(offsets, distances[part, 1:], single[part], single[others], fan, limit)
+
+    with ThreadPoolExecutor() as pool:
+        return Cells(*map(np.concatenate, zip(*pool.map(measure, range(0, count, _CHUNK)), strict=True)))
+
+
+def _measure(offsets, distances, own, theirs, fan, limit: float | None) -> Cells:
+    """Measure cells from the way to their neighbours, the normals of both, and a fan of directions."""
+    tangent, bitangent = tangent_frames(own)
+    across = np.stack([np.einsum("nki,ni->nk", offsets, axis) for axis in (tangent, bitangent)], axis=-1)
+    squared = np.square(distances).astype(np.float32)
+    coincident = squared == 0
+    same_side = np.einsum("nki,ni->nk", theirs, own) > 0.1
+    squared = np.where(same_side & ~coincident, squared, np.inf)
+    nearest = distances[:, :6]
+    around = nearest.sum(axis=1) / np.maximum((nearest > 0).sum(axis=1), 1)
+    end = np.full(len(own), limit) if limit is not None else _OPEN_END * around
+    inverse = (across @ fan) * (2 / squared)[..., None]  # of the distance to the border; negative behind the point
+    border = 1 / np.maximum(inverse.max(axis=1), 1 / np.maximum(end, 1e-12)[:, None])
+    step = 2 * np.pi / fan.shape[1]
+    area = 0.5 * step * np.einsum("nd,nd->n", border, border)
+    moment = (step / 3) * (border**3 @ fan.T) / np.maximum(area, 1e-30)[:, None]
+    to_centroid = moment[:, :1] * tangent + moment[:, 1:] * bitangent
+    return Cells(area / (1 + coincident.sum(axis=1)), border.max(axis=1), to_centroid)

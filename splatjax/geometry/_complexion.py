@@ -30,7 +30,7 @@ def complexion(
     albedo = _mix(albedo, _SCALP, 0.55 * _scalp(x, y, z) * (1 + 0.12 * _mottling(points, 1.6, 13)))
     lips = _lips(side, y, z)
     albedo = _mix(albedo, _LIPS, 0.85 * lips)
-    albedo = _mix(albedo, _HAIR, 0.62 * _brows(points, side, y, z))
+    albedo = _mix(albedo, _HAIR, 0.75 * _brows(points, side, y, z))
     albedo = _mix(albedo, _HAIR, 0.8 * _lashes(side, y, z))
     oily = bump(x, 0, 26) * smooth_step(y, -60, -10) * front
     specular = 1 + 0.25 * oily + 0.5 * lips + 0.12 * _mottling(points, 2.2, 17)
@@ -63,7 +63,7 @@ def _brows(points, side, y, z):
     arch = 25.5 + 6.0 * np.sin(np.clip((side - 12) / 44, 0, 1) * np.pi * 0.62) - 0.16 * np.maximum(side - 42, 0)
     width = 4.4 - 0.06 * np.clip(side - 14, 0, 42)
     shape = bump(y, arch, width) * smooth_step(side, 9, 17) * smooth_step(side, 57, 46) * smooth_step(z, 30, 45)
-    hairs = 0.5 + 0.5 * np.sin(2.1 * side + 1.4 * (y - arch) + 2.5 * _mottling(points, 5.0, 19))
+    hairs = 0.5 + 0.5 * np.sin(3.1 * side + 2.2 * (y - arch) + 2.0 * _mottling(points, 2.5, 19))
     return shape * (0.65 + 0.35 * hairs)
 
 

@@ -29,10 +29,12 @@ def _masses(x, y, z, side):
     skull = join(skull, ellipsoid(p, (0, 36, -40), (75, 62, 64)), 20)
     skull = join(skull, ellipsoid(p, (0, 44, 20), (62, 58, 62)), 24)
     face = ellipsoid(p, (0, -30, 16), (57, 78, 62))
-    jaw = limb(q, (44, -58, -4), (13, -95, 61), 14, 14)
+    jaw = limb(q, (42, -58, -4), (13, -95, 61), 14, 14)
     jaw = join(jaw, ellipsoid(p, (0, -97, 66), (19, 15, 17)), 14)
     face = join(face, jaw, 28)
     face = join(face, ellipsoid(q, (40, -42, 22), (21, 36, 34)), 22)
+    head_side = ellipsoid(q, (47, 4, 26), (15, 24, 26))
+    skull = join(skull, head_side, 16)
     cheek = limb(q, (43, -19, 55), (63, -12, 6), 12, 8)
     head = join(join(skull, face, 24), cheek, 24)
     neck = limb(p, (0, -40, -36), (0, -205, -44), 49, 54)
@@ -67,9 +69,9 @@ def _nose(body, p, q):
     flank = limb(p, (0, 4, 70), (0, -38, 86), 9, 14.5)
     nose = join(join(ridge, flank, 10), ellipsoid(p, (0, -37, 101), (9.5, 8.8, 9.5)), 8)
     nose = join(nose, ellipsoid(q, (13, -41.5, 91), (6, 7.2, 9.5)), 5)
-    nose = join(nose, limb(p, (0, -45, 86), (0, -43.5, 101), 4, 4), 4)
+    nose = join(nose, limb(p, (0, -46, 84), (0, -43.5, 101), 4.6, 4.2), 4)
     body = join(body, nose, 9)
-    return carve(body, limb(q, (7.6, -50, 96), (6.8, -40, 92), 3, 1.8), 2)
+    return carve(body, limb(q, (8.2, -50.5, 94.5), (7.0, -41, 93), 2.6, 1.6), 2)
 
 
 def _eyes(body, x, y, z, side):
@@ -84,7 +86,7 @@ def _eyes(body, x, y, z, side):
     body = join(body, lids, 6)
     fold = 7.2 - 0.018 * across**2
     front = smooth_step(z, 58, 68)
-    return body + front * 1.3 * bump(y, fold, 1.5) * smooth_step(np.abs(across), 18, 11)
+    return body + front * 1.3 * bump(y, fold, 1.9) * smooth_step(np.abs(across), 18, 11)
 
 
 def _lips(body, x, y, z, side):
@@ -97,7 +99,7 @@ def _lips(body, x, y, z, side):
     body = join(body, upper, 3.2)
     body = join(body, lower, 3.2)
     reach = smooth_step(side, 29, 23) * smooth_step(z, 60, 72)
-    body = body + reach * 2.2 * bump(y, parting, 1.1)
+    body = body + reach * 2.2 * bump(y, parting, 1.3)
     front = smooth_step(z, 55, 70)
     body = body + front * 1.4 * bump(x, 0, 3.6) * bump(y, -54.5, 6)
     body = body - front * 0.8 * bump(side, 5, 2.6) * bump(y, -55.5, 6)
@@ -115,20 +117,20 @@ def _ear(body, y, z, side):
     half_width = 17.5 + 0.13 * t
     k = np.sqrt((s / half_width) ** 2 + (t / 32) ** 2)
     inward = (1 - k) * 18  # mm from the outline, about
-    sheet = out - 5 + 2.0 * smooth_step(inward, 2, 14)
+    sheet = out - 5 + 3.0 * smooth_step(inward, 2, 13)
     pinna = keep(np.abs(sheet) - 1.5, -inward, 2)
     spared = smooth_step(t, -22, -10)
-    helix = np.sqrt((inward - 2.2) ** 2 + (sheet - 1.4) ** 2) - 2.4 * (0.55 + 0.45 * spared)
+    helix = np.sqrt((inward - 2.2) ** 2 + (sheet - 1.9) ** 2) - 2.7 * (0.55 + 0.45 * spared)
     pinna = join(pinna, helix, 2)
     ridge = np.sqrt((s / (half_width * 0.56) - 0.05) ** 2 + ((t + 1) / 19) ** 2)
-    anti = np.sqrt(((1 - ridge) * 10) ** 2 + (sheet - 1.0) ** 2) - 1.9
+    anti = np.sqrt(((1 - ridge) * 10) ** 2 + (sheet - 1.6) ** 2) - 2.1
     anti = anti + 6 * smooth_step(s, -1, -5)
     pinna = join(pinna, anti, 3)
-    concha = ellipsoid((s, t, out), (-3, -4, 8.5), (8.5, 12, 7.5))
+    concha = ellipsoid((s, t, out), (-3.5, -4, 7), (8.5, 12.5, 7.5))
     lobe = ellipsoid((s, t, out), (-2, -27, 4.5), (8.5, 7.5, 2.6))
     pinna = join(pinna, lobe, 4)
     root = ellipsoid((s, t, out), (-7, -3, -5), (12, 20, 8))
-    body = join(join(body, root, 10), pinna, 6)
+    body = join(join(body, root, 10), pinna, 4)
     body = carve(body, concha, 3)
     tragus = ellipsoid((s, t, out), (-11.5, -7, 4.5), (4, 5.5, 3))
     return join(body, tragus, 3)

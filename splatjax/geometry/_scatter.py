@@ -81,9 +81,15 @@ def _deal(mesh: Mesh, areas: np.ndarray, count: int, random: np.random.Generator
 
 def faces_beyond(mesh: Mesh) -> Int[np.ndarray, "faces 3"]:
     """Give, per face and corner, the face beyond the edge opposite to the corner; -1 at an open edge."""
-    place = _merged(mesh)[mesh.faces]
-    edges = np.sort(place[:, [[1, 2], [2, 0], [0, 1]]].reshape(-1, 2), axis=-1)
-    key = edges[:, 0] * np.int64(place.max() + 1) + edges[:, 1]
+    beyond = _beyond(mesh.faces)
+    if (beyond < 0).any():  # textures cut meshes open along their seams: vertices at one place are one
+        beyond = _beyond(np.unique(mesh.vertices, axis=0, return_inverse=True)[1].reshape(-1)[mesh.faces])
+    return beyond
+
+
+def _beyond(faces: Int[np.ndarray, "faces 3"]) -> Int[np.ndarray, "faces 3"]:
+    edges = faces[:, [[1, 2], [2, 0], [0, 1]]].reshape(-1, 2)
+    key = edges.min(axis=1) * np.int64(faces.max() + 1) + edges.max(axis=1)
     order = np.argsort(key, kind="stable")
     same = key[order][1:] == key[order][:-1]
     beyond = np.full(len(key), -1)
@@ -119,11 +125,6 @@ def mirrored(
     gap = np.linalg.norm(foot - points[near], axis=1)
     near, foot = near[gap > 1e-3 * spacing], foot[gap > 1e-3 * spacing]  # on the border itself a point is its own image
     return Ghosts(2 * foot - points[near], normals[near])
-
-
-def _merged(mesh: Mesh) -> Int[np.ndarray, " vertices"]:
-    """Give vertices at one place one number: textures cut meshes open along their seams."""
-    return np.unique(mesh.vertices, axis=0, return_inverse=True)[1].reshape(-1)
 
 
 def _barycentrics(mesh: Mesh, faces: np.ndarray, points: np.ndarray) -> np.ndarray:

@@ -11,9 +11,31 @@ from ._mesh import Mesh, unit
 Distance = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, " n"]]
 _CHUNK = 1 << 14
 _CORNERS = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(-1, 3)
-_EDGES = [
-    (a, b) for a in range(8) for b in range(8) if (_CORNERS[b] - _CORNERS[a]).sum() == 1 and (_CORNERS[b] >= _CORNERS[a]).all()
-]
+_EDGES = [(a, a | bit) for bit in (4, 2, 1) for a in range(8) if not a & bit]  # corners are numbered 4 x + 2 y + z
+_SIDES = [(0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 2, 6, 4), (1, 3, 7, 5)]  # around each
+
+
+def _sheets() -> Int[np.ndarray, "256 12"]:
+    """Give, for each set of corners inside, which sheet of the surface crosses each edge of a cell; -1 for none.
+
+    Sheets are told apart so that no two of them share a vertex: on a side whose inner corners lie across from each other, the
+    surface goes around each of them.
+    """
+    table = np.full((256, 12), -1, np.int64)
+    for corners in range(256):
+        sheet = [edge if (corners >> a & 1) != (corners >> b & 1) else -1 for edge, (a, b) in enumerate(_EDGES)]
+        for side in _SIDES:
+            around = [_EDGES.index((min(pair), max(pair))) for pair in zip(side, (*side[1:], side[0]), strict=True)]
+            crossed = [edge for edge in around if sheet[edge] >= 0]
+            pairs = [tuple(crossed)] if len(crossed) == 2 else []
+            if len(crossed) == 4:
+                pairs = [(around[k - 1], around[k]) for k in range(4) if corners >> side[k] & 1]
+            for first, second in pairs:
+                old, new = sheet[second], sheet[first]
+                sheet = [new if label == old else label for label in sheet]
+        labels = sorted({label for label in sheet if label >= 0})
+        table[corners] = [labels.index(label) if label >= 0 else -1 for label in sheet]
+    return table
 
 
 def in_chunks(distance: Distance, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
@@ -25,7 +47,8 @@ def in_chunks(distance: Distance, points: Float[np.ndarray, "n 3"]) -> Float[np.
 
 
 def surface_nets(distance: Distance, low, high, spacing: float, *, slack: float = 4.0) -> Mesh:
-    r"""Mesh the zero level of a distance: one vertex per grid cell that it crosses, one quadrilateral per grid edge.
+    r"""Mesh the zero level of a distance: one vertex per grid cell and sheet of it
+    that crosses the cell, one quadrilateral per grid edge.
 
     Cells are sought from coarse to fine, so that only those near the surface are looked at; the vertices are then drawn onto
     the surface by Newton's method, and their normals are its gradient.
@@ -50,16 +73,19 @@ def surface_nets(distance: Distance, low, high, spacing: float, *, slack: float 
     at = np.stack([keys // stride[0], keys % stride[0] // stride[1], keys % stride[1]], axis=-1)
     values = in_chunks(distance, low + spacing * at)
     values[values == 0] = 1e-6
-    inside = values < 0
-    crossed = inside[where].any(axis=1) & ~inside[where].all(axis=1)
-    cells, where = cells[crossed], where[crossed]
-    vertices = low + spacing * (cells + _crossings(values[where]))
-    faces = _faces(cells, cells @ stride, stride, inside[where], vertices)
+    inside = (values < 0)[where]
+    crossed = inside.any(axis=1) & ~inside.all(axis=1)
+    cells, where, inside = cells[crossed], where[crossed], inside[crossed]
+    sheets = _sheets()[inside @ (1 << np.arange(8))]
+    first = np.cumsum(sheets.max(axis=1) + 1) - (sheets.max(axis=1) + 1)
+    owner, within = _crossings(values[where], sheets)
+    vertices = low + spacing * (cells[owner] + within)
+    faces = _faces(cells, cells @ stride, stride, inside, first[:, None] + sheets, vertices)
     normals = np.zeros_like(vertices)
-    for _ in range(3):
+    for _ in range(2):
         normals, level = _gradient(distance, vertices)
         vertices = vertices - np.clip(level, -0.3 * spacing, 0.3 * spacing)[:, None] * normals
-    return Mesh(vertices, faces, unit(_gradient(distance, vertices)[0]))
+    return Mesh(vertices, faces, unit(normals))  # those of the second step, which is tiny
 
 
 def _cells_near(distance: Distance, low, shape, spacing: float, slack: float) -> Int[np.ndarray, "n 3"]:
@@ -77,32 +103,34 @@ def _cells_near(distance: Distance, low, shape, spacing: float, slack: float) ->
         cells = (2 * cells[:, None] + _CORNERS).reshape(-1, 3)
 
 
-def _crossings(values: Float[np.ndarray, "n 8"]) -> Float[np.ndarray, "n 3"]:
-    """Give the mean of the points where the edges of each cell cross zero, in cells."""
-    total, number = np.zeros((len(values), 3)), np.zeros(len(values))
-    for a, b in _EDGES:
-        crossing = (values[:, a] < 0) != (values[:, b] < 0)
-        share = np.where(crossing, values[:, a] / np.where(crossing, values[:, a] - values[:, b], 1.0), 0.0)
-        total += np.where(crossing[:, None], _CORNERS[a] + share[:, None] * (_CORNERS[b] - _CORNERS[a]), 0.0)
-        number += crossing
-    return total / number[:, None]
+def _crossings(values: Float[np.ndarray, "n 8"], sheets: Int[np.ndarray, "n 12"]):
+    """Give the cell of each vertex, and the mean of the points where its sheet crosses the edges of that cell, in cells."""
+    a, b = np.asarray(_EDGES).T
+    crossing = sheets >= 0
+    share = np.where(crossing, values[:, a] / np.where(crossing, values[:, a] - values[:, b], 1.0), 0.0)
+    points = _CORNERS[a] + share[..., None] * (_CORNERS[b] - _CORNERS[a])
+    owners, sheet = np.nonzero(np.arange(4) <= sheets.max(axis=1, keepdims=True))
+    mine = (sheets[owners] == sheet[:, None]).astype(np.float64)
+    return owners, np.einsum("ve,vei->vi", mine, points[owners]) / mine.sum(axis=1, keepdims=True)
 
 
-def _faces(cells, keys, stride, inside, vertices) -> Int[np.ndarray, "f 3"]:
+def _faces(cells, keys, stride, inside, vertex, vertices) -> Int[np.ndarray, "f 3"]:
     """Make two triangles of the four cells around each grid edge that the surface crosses, split along the shorter diagonal."""
     order = np.argsort(keys)
     ordered = keys[order]
     triangles = []
     for axis in range(3):
-        second, third = np.eye(3, dtype=np.int64)[[(axis + 1) % 3, (axis + 2) % 3]]
-        end = int(4 >> axis)  # the corner one step along the axis from corner 0
-        start_inside, end_inside = inside[:, 0], inside[:, end]
-        chosen = np.flatnonzero(start_inside != end_inside)
-        around = [keys[chosen] - offset @ stride for offset in (0 * second, second, second + third, third)]
-        found = [np.minimum(np.searchsorted(ordered, key), len(ordered) - 1) for key in around]
-        if not all((ordered[place] == key).all() for place, key in zip(found, around, strict=True)):
-            raise ValueError("the surface leaves the box, or its distance is too far from true; widen the box or the slack")
-        quad = np.stack([order[place] for place in found], axis=-1)
+        bit, second, third = (4 >> (axis + step) % 3 for step in range(3))
+        start_inside = inside[:, 0]
+        chosen = np.flatnonzero(start_inside != inside[:, bit])
+        around = []
+        for corner in (0, second, second | third, third):  # of the cell, where the edge begins
+            key = keys[chosen] - _CORNERS[corner] @ stride
+            place = np.minimum(np.searchsorted(ordered, key), len(ordered) - 1)
+            if not (ordered[place] == key).all():
+                raise ValueError("the surface leaves the box, or its distance is too far from true; widen the box or the slack")
+            around.append(vertex[order[place], _EDGES.index((corner, corner | bit))])
+        quad = np.stack(around, axis=-1)
         quad = np.where(start_inside[chosen, None], quad, quad[:, ::-1])
         a, b, c, d = (vertices[quad[:, corner]] for corner in range(4))
         first = ((a - c) ** 2).sum(axis=1) <= ((b - d) ** 2).sum(axis=1)

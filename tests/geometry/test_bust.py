@@ -19,6 +19,7 @@ def test_bust_is_closed_and_faces_outward(mesh):
     assert len(np.unique(key)) == len(key)
     np.testing.assert_array_equal(np.sort(key), np.sort(reverse))
     assert mesh.volume() > 0
+    assert len(mesh.vertices) - len(key) // 2 + len(mesh.faces) == 2  # Euler: one body without a hole
 
 
 def test_bust_is_life_size(mesh):
@@ -65,6 +66,6 @@ def test_splats_of_the_bust(dtype):
     assert float(splats.albedo.max()) < 1
 
 
-def test_bust_refuses_a_spacing_that_loses_the_face():
+def test_bust_refuses_a_spacing_that_loses_the_ears():
     with pytest.raises(ValueError, match="spacing is 9"):
         bust_mesh(spacing=9.0)

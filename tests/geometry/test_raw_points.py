@@ -9,7 +9,7 @@ from splatjax.geometry._scatter import scatter
 
 @pytest.fixture(scope="module")
 def on_the_bust():
-    mesh = bust_mesh(spacing=2.5)
+    mesh = bust_mesh(spacing=1.6)
     points = scatter(mesh, 12_000)
     return mesh, points.positions(mesh), points.normals(mesh)
 
