@@ -27,7 +27,7 @@ class _Sweep(eqx.Module):
         return weight, (dx, dy, dz), squared, rate
 
     def points(self, tiles, bins: Bins, chunk):
-        lanes = lax.dynamic_slice(bins.order, (chunk * self.grid.lanes,), (self.grid.lanes,))
+        lanes = lax.dynamic_slice_in_dim(bins.order, chunk * self.grid.lanes, self.grid.lanes)
         return tiles[lanes]
 
 
@@ -50,10 +50,10 @@ def _forward(sweep: _Sweep, bins: Bins, tiles, sources, rows):
 
         start = jnp.zeros((lanes, count, points.shape[2]), points.dtype)
         sums = lax.fori_loop(bins.first_block[i], bins.first_block[i + 1], add, start)
-        return lax.dynamic_update_slice(out, sums, (i * lanes, 0, 0))
+        return lax.dynamic_update_slice_in_dim(out, sums, i * lanes, 0)
 
     out = jnp.zeros((sweep.grid.tiles, count, tiles.shape[2]), tiles.dtype)
-    return lax.fori_loop(0, bins.chunks, chunk, out)[bins.inverse_order()]
+    return lax.fori_loop(jnp.int32(0), bins.chunks, chunk, out)[bins.inverse_order()]
 
 
 def _backward(sweep: _Sweep, bins: Bins, tiles, sources, rows, cotangents):
@@ -63,7 +63,7 @@ def _backward(sweep: _Sweep, bins: Bins, tiles, sources, rows, cotangents):
 
     def chunk(i, carry):
         points = sweep.points(tiles, bins, i)
-        cotangent = lax.dynamic_slice(cotangents, (i * lanes, 0, 0), (lanes, *cotangents.shape[1:]))
+        cotangent = lax.dynamic_slice_in_dim(cotangents, i * lanes, lanes)
 
         def add(block, carry):
             d_points, gradients = carry
@@ -84,10 +84,10 @@ def _backward(sweep: _Sweep, bins: Bins, tiles, sources, rows, cotangents):
         d_tiles, gradients = carry
         start = jnp.zeros_like(points), gradients
         d_points, gradients = lax.fori_loop(bins.first_block[i], bins.first_block[i + 1], add, start)
-        return lax.dynamic_update_slice(d_tiles, d_points, (i * lanes, 0, 0)), gradients
+        return lax.dynamic_update_slice_in_dim(d_tiles, d_points, i * lanes, 0), gradients
 
     slots = tuple(jnp.zeros(bins.ids.shape, tiles.dtype) for _ in range(4 + count))
-    d_tiles, slots = lax.fori_loop(0, bins.chunks, chunk, (jnp.zeros_like(tiles), slots))
+    d_tiles, slots = lax.fori_loop(jnp.int32(0), bins.chunks, chunk, (jnp.zeros_like(tiles), slots))
     per_source = [scatter_slots(plane, bins, sources.shape[1]) for plane in slots]
     return d_tiles[bins.inverse_order()], jnp.stack(per_source[:4]), jnp.stack(per_source[4:])
 

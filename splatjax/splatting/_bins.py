@@ -130,7 +130,7 @@ class Bins(eqx.Module):
     @property
     def chunks(self) -> Int[Array, ""]:
         """How many chunks have anything in them: longer lists come first, so these lead."""
-        return jnp.sum(self.first_block[1:] > self.first_block[:-1])
+        return jnp.sum(self.first_block[1:] > self.first_block[:-1], dtype=jnp.int32)
 
     def inverse_order(self) -> Int[Array, " tiles"]:
         """The lane of each tile."""

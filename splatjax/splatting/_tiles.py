@@ -13,16 +13,17 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from ._bins import BinCapacity, Bins, TileGrid, TileRanges, bin_items, scatter_slots, slot_planes
-from ._kernel import fragment_weight, fragment_weight_derivative
+from ._kernel import fast_fragment_weight, fragment_weight_derivative
 from ._rasterizer import AbstractRasterizer, SurfaceSums
 from ._settings import SplattingSettings
 from ._views import AbstractView, Footprints
 
 _EMPTY = (0.0, 0.0, 0.0, 0.0, 1e12, 0.0, 1e12, 1.0, 0.0)  # covers no pixel center
 _GEOMETRY = len(_EMPTY)
+_PICKED = 16  # open tiles swept together
 
 
 class TileRasterizer(AbstractRasterizer):
@@ -70,6 +71,33 @@ def _ranges(f: Footprints, grid: TileGrid) -> TileRanges:
     return TileRanges.of(f.left, f.right, f.top, f.bottom, f.visible, grid)
 
 
+class _Lanes(eqx.Module):
+    """Tiles that are swept together: where their lists begin in the slots, and their corners."""
+
+    row: Int[Array, " lanes"]
+    """Of the first block, in slots cut into rows of one lane each; the next block is `stride` rows on."""
+    blocks: Int[Array, ""]
+    x: Float[Array, "lanes 1"]
+    y: Float[Array, "lanes 1"]
+    stride: int = eqx.field(static=True)
+
+    def read(self, plane: Float[Array, "rows slots"], block) -> Float[Array, "lanes slots"]:
+        return plane.at[self.row + block * self.stride].get(mode="promise_in_bounds")
+
+    def add(self, plane: Float[Array, "rows slots"], block, part: Float[Array, "lanes slots"]) -> Float[Array, "rows slots"]:
+        return plane.at[self.row + block * self.stride].add(part, mode="promise_in_bounds")
+
+
+class _ChunkLanes(_Lanes):
+    """The tiles of one chunk: their rows follow one another."""
+
+    def read(self, plane: Float[Array, "rows slots"], block) -> Float[Array, "lanes slots"]:
+        return lax.dynamic_slice_in_dim(plane, self.row[0] + block * self.stride, self.stride)
+
+    def add(self, plane: Float[Array, "rows slots"], block, part: Float[Array, "lanes slots"]) -> Float[Array, "rows slots"]:
+        return lax.dynamic_update_slice_in_dim(plane, self.read(plane, block) + part, self.row[0] + block * self.stride, 0)
+
+
 class _Sweep(eqx.Module):
     """What is static in a sweep."""
 
@@ -83,134 +111,170 @@ class _Sweep(eqx.Module):
         side = jnp.arange(self.grid.side, dtype=dtype) + 0.5
         return jnp.tile(side, self.grid.side), jnp.repeat(side, self.grid.side)
 
-    def corners(self, bins: Bins, chunk, dtype) -> tuple[Float[Array, "lanes 1"], Float[Array, "lanes 1"]]:
-        tiles = lax.dynamic_slice(bins.order, (chunk * self.grid.lanes,), (self.grid.lanes,))
-        x, y = tiles % self.grid.across, tiles // self.grid.across
-        return (x * self.grid.side).astype(dtype)[:, None], (y * self.grid.side).astype(dtype)[:, None]
+    def _lanes(self, kind: type[_Lanes], bins: Bins, places, blocks, dtype) -> _Lanes:
+        lanes, grid = self.grid.lanes, self.grid
+        tiles = bins.order[places]
+        row = bins.first_block[places // lanes] * lanes + places % lanes
+        x, y = ((each * grid.side).astype(dtype)[:, None] for each in (tiles % grid.across, tiles // grid.across))
+        return kind(row, blocks, x, y, lanes)
 
-    def fragments(self, planes, block, corners):
+    def chunk(self, bins: Bins, i, dtype) -> _Lanes:
+        """Give the tiles of a chunk."""
+        places = i * self.grid.lanes + jnp.arange(self.grid.lanes, dtype=jnp.int32)
+        return self._lanes(_ChunkLanes, bins, places, bins.first_block[i + 1] - bins.first_block[i], dtype)
+
+    def picked(self, bins: Bins, places: Int[Array, " lanes"], dtype) -> _Lanes:
+        """Give tiles by their places in the order; places beyond the last are the last one's, with nothing in them."""
+        chunk = places // self.grid.lanes
+        return self._lanes(_Lanes, bins, places, jnp.max(bins.first_block[chunk + 1] - bins.first_block[chunk]), dtype)
+
+    def fragments(self, planes, block, lanes: _Lanes):
         """Give nearness, quadric and shift of a block's fragments, `[lanes, slots, pixels]`, and the block's geometry."""
-        x, y, sx, sy, a, b, c, e, shift = (lax.dynamic_index_in_dim(p, block, 0, keepdims=False) for p in planes)
-        x, y = x - corners[0], y - corners[1]
+        x, y, sx, sy, a, b, c, e, shift = (lanes.read(plane, block) for plane in planes)
+        x, y = x - lanes.x, y - lanes.y
         geometry = (x, y, sx, sy, a, b, c, e)
         px, py = (p[None, None] for p in self.pixels(x.dtype))
         x, y, sx, sy, a, b, c, e, shift = (p[:, :, None] for p in (*geometry, shift))
         dx, dy = px - x, py - y
         return e + sx * dx + sy * dy, dx * (a * dx + b * dy) + c * dy * dy, shift, geometry
 
-    def limits(self, planes, blocks, corners, below, shape, dtype):
+    def limits(self, planes, lanes: _Lanes, below):
         """Find per pixel the nearest shifted fragment among those at most `below`: the back end of a surface."""
 
         def nearest(block, limit):
-            nearness, quadric, shift, _ = self.fragments(planes, block, corners)
+            nearness, quadric, shift, _ = self.fragments(planes, block, lanes)
             candidate = self.view.inside(nearness, quadric)
             if below is not None:
                 candidate &= nearness <= below[:, None]
             return jnp.maximum(limit, jnp.max(jnp.where(candidate, self.view.shifted(nearness, shift), -jnp.inf), axis=1))
 
-        return lax.fori_loop(*blocks, nearest, jnp.full(shape, -jnp.inf, dtype))
+        start = jnp.full((lanes.row.shape[0], self.grid.side**2), -jnp.inf, lanes.x.dtype)
+        return lax.fori_loop(jnp.int32(0), lanes.blocks, nearest, start)
 
     def weights(self, nearness, quadric, beyond, upto):
-        """Give the weights of the fragments between two limits, and `rho^2` where they count."""
+        """Give the weights of the fragments between two limits, `rho^2`, and which fragments count."""
         chosen = self.view.inside(nearness, quadric) & (nearness > beyond[:, None])
         if upto is not None:
             chosen &= nearness <= upto[:, None]
-        squared_radius = self.view.squared_radius(jnp.where(chosen, nearness, 1.0), quadric)
-        squared_radius = jnp.where(chosen, squared_radius, 1.0)
-        return jnp.where(chosen, fragment_weight(squared_radius), 0.0), squared_radius, chosen
+        squared_radius = self.view.squared_radius(nearness, quadric)
+        return jnp.where(chosen, fast_fragment_weight(squared_radius), 0.0), squared_radius, chosen
 
-    def sum_rows(self, planes, rows, blocks, corners, beyond, upto):
+    def sum_rows(self, planes, rows, lanes: _Lanes, beyond, upto):
+        """Sum weighted rows over the fragments between two limits."""
+
         def add(block, sums):
-            nearness, quadric, _, _ = self.fragments(planes, block, corners)
+            nearness, quadric, _, _ = self.fragments(planes, block, lanes)
             weight, _, _ = self.weights(nearness, quadric, beyond, upto)
-            block_rows = jnp.stack([lax.dynamic_index_in_dim(row, block, 0, keepdims=False) for row in rows], axis=1)
+            block_rows = jnp.stack([lanes.read(row, block) for row in rows], axis=1)
             return sums + jnp.einsum("trs,tsp->trp", block_rows, weight)
 
-        shape = (beyond.shape[0], len(rows), beyond.shape[1])
-        return lax.fori_loop(*blocks, add, jnp.zeros(shape, beyond.dtype))
+        start = jnp.zeros((beyond.shape[0], len(rows), beyond.shape[1]), beyond.dtype)
+        return lax.fori_loop(jnp.int32(0), lanes.blocks, add, start)
+
+    def add_cotangents(self, planes, rows, lanes: _Lanes, beyond, upto, cotangent, gradients):
+        """Add the cotangents of geometry and rows, per slot, for the fragments between two limits."""
+        px, py = self.pixels(beyond.dtype)
+        monomials = jnp.stack([jnp.ones_like(px), px, py, px * px, px * py, py * py], axis=1)
+
+        def add(block, gradients):
+            nearness, quadric, _, geometry = self.fragments(planes, block, lanes)
+            weight, squared_radius, chosen = self.weights(nearness, quadric, beyond, upto)
+            block_rows = jnp.stack([lanes.read(row, block) for row in rows], axis=1)
+            d_rows = jnp.einsum("tsp,trp->trs", weight, cotangent)
+            d_weight = jnp.einsum("trs,trp->tsp", block_rows, cotangent)
+            squared_radius = jnp.where(chosen, squared_radius, 1.0)
+            d_squared = fragment_weight_derivative(squared_radius, weight) * d_weight
+            nearness = jnp.where(chosen, nearness, 1.0)
+            d_nearness, d_quadric = self.view.squared_radius_vjp(nearness, squared_radius, d_squared)
+            # Both are polynomials in the pixel: their moments over the tile are all that is needed.
+            quad, near = d_quadric @ monomials, d_nearness @ monomials[:, :3]
+            d_geometry = _geometry_cotangent(geometry, jnp.moveaxis(quad, 2, 0), jnp.moveaxis(near, 2, 0))
+            parts = [*d_geometry, *(d_rows[:, r] for r in range(len(rows)))]
+            return tuple(lanes.add(whole, block, part) for whole, part in zip(gradients, parts, strict=True))
+
+        return lax.fori_loop(jnp.int32(0), lanes.blocks, add, gradients)
+
+
+def _rows_of_lanes(planes: list[Float[Array, "blocks lanes slots"]]) -> list[Float[Array, "rows slots"]]:
+    return [plane.reshape(-1, plane.shape[2]) for plane in planes]
+
+
+def _planes(geometry, rows, bins: Bins):
+    row_planes = slot_planes(rows, (0.0,) * rows.shape[0], bins)
+    return _rows_of_lanes(slot_planes(geometry, _EMPTY, bins)), _rows_of_lanes(row_planes)
+
+
+def _open_tiles(sweep: _Sweep, front, limit):
+    """Find the tiles with pixels that the front leaves open: their places first, and how many there are."""
+    gaps = (front[:, -1] < sweep.full_coverage) & (limit > -jnp.inf) & (limit < jnp.inf)
+    is_open = jnp.any(gaps, axis=1)
+    places = jnp.nonzero(is_open, size=is_open.shape[0] + _PICKED, fill_value=0)[0].astype(jnp.int32)
+    return gaps, places, jnp.sum(is_open, dtype=jnp.int32)
 
 
 def _forward(sweep: _Sweep, bins: Bins, geometry, rows):
     """Sweep all chunks: sums in lane order, and per pixel the limits of both surfaces."""
-    planes = slot_planes(geometry, _EMPTY, bins)
-    row_planes = slot_planes(rows, (0.0,) * rows.shape[0], bins)
-    lanes, pixels, dtype = sweep.grid.lanes, sweep.grid.side**2, geometry.dtype
-    tiles, count = sweep.grid.tiles, rows.shape[0]
-    shape = (lanes, pixels)
+    planes, row_planes = _planes(geometry, rows, bins)
+    lanes, dtype = sweep.grid.lanes, geometry.dtype
 
     def chunk(i, out):
-        corners = sweep.corners(bins, i, dtype)
-        blocks = bins.first_block[i], bins.first_block[i + 1]
-        limit = sweep.limits(planes, blocks, corners, None, shape, dtype)
-        front = sweep.sum_rows(planes, row_planes, blocks, corners, limit, None)
-        gaps = (front[:, -1] < sweep.full_coverage) & (limit > -jnp.inf)
-
-        def look_behind():
-            below = jnp.where(gaps, limit, -jnp.inf)
-            second = sweep.limits(planes, blocks, corners, below, shape, dtype)
-            second = jnp.where(gaps & (second > -jnp.inf), second, jnp.inf)
-            return sweep.sum_rows(planes, row_planes, blocks, corners, second, limit), second
-
-        def nothing():
-            return jnp.zeros((lanes, count, pixels), dtype), jnp.full(shape, jnp.inf, dtype)
-
-        behind, second = lax.cond(jnp.any(gaps), look_behind, nothing)
-        place = i * lanes
-        return tuple(
-            lax.dynamic_update_slice(whole, part, (place,) + (0,) * (part.ndim - 1))
-            for whole, part in zip(out, (front, behind, limit, second), strict=True)
+        tiles = sweep.chunk(bins, i, dtype)
+        limit = sweep.limits(planes, tiles, None)
+        sums = sweep.sum_rows(planes, row_planes, tiles, limit, None)
+        front, limits = out
+        return lax.dynamic_update_slice_in_dim(front, sums, i * lanes, 0), lax.dynamic_update_slice_in_dim(
+            limits, limit, i * lanes, 0
         )
 
-    sums, limits = jnp.zeros((tiles, count, pixels), dtype), jnp.full((tiles, pixels), jnp.inf, dtype)
-    return lax.fori_loop(0, bins.chunks, chunk, (sums, sums, limits, limits))
+    empty = jnp.zeros((sweep.grid.tiles, rows.shape[0], sweep.grid.side**2), dtype)
+    never = jnp.full(empty.shape[::2], jnp.inf, dtype)
+    front, limits = lax.fori_loop(jnp.int32(0), bins.chunks, chunk, (empty, never))
+    gaps, places, count = _open_tiles(sweep, front, limits)
+
+    def look_behind(i, out):
+        picked = lax.dynamic_slice_in_dim(places, i * _PICKED, _PICKED)
+        real = (i * _PICKED + jnp.arange(_PICKED) < count)[:, None]
+        tiles = sweep.picked(bins, picked, dtype)
+        limit = limits[picked]
+        below = jnp.where(gaps[picked] & real, limit, -jnp.inf)
+        second = sweep.limits(planes, tiles, below)
+        second = jnp.where(second > -jnp.inf, second, jnp.inf)
+        sums = sweep.sum_rows(planes, row_planes, tiles, second, limit)
+        behind, seconds = out
+        return behind.at[picked].add(sums), seconds.at[picked].min(second)
+
+    behind, seconds = lax.fori_loop(jnp.int32(0), -(-count // _PICKED), look_behind, (empty, never))
+    return front, behind, limits, seconds
 
 
 def _backward(sweep: _Sweep, bins: Bins, geometry, rows, limits, cotangents):
     """Sweep all chunks again: the cotangents of geometry and rows, per slot, then summed per splat."""
-    planes = slot_planes(geometry, _EMPTY, bins)
-    row_planes = slot_planes(rows, (0.0,) * rows.shape[0], bins)
-    lanes, pixels, dtype = sweep.grid.lanes, sweep.grid.side**2, geometry.dtype
-    px, py = sweep.pixels(dtype)
-    monomials = jnp.stack([jnp.ones_like(px), px, py, px * px, px * py, py * py], axis=1)
-    count = rows.shape[0]
-
-    def add_surface(blocks, corners, beyond, upto, cotangent, gradients):
-        def add(block, gradients):
-            nearness, quadric, _, g = sweep.fragments(planes, block, corners)
-            weight, squared_radius, chosen = sweep.weights(nearness, quadric, beyond, upto)
-            block_rows = jnp.stack([lax.dynamic_index_in_dim(row, block, 0, keepdims=False) for row in row_planes], axis=1)
-            d_rows = jnp.einsum("tsp,trp->trs", weight, cotangent)
-            d_weight = jnp.einsum("trs,trp->tsp", block_rows, cotangent)
-            d_squared = jnp.where(chosen, fragment_weight_derivative(squared_radius) * d_weight, 0.0)
-            safe = jnp.where(chosen, nearness, 1.0)
-            d_nearness, d_quadric = sweep.view.squared_radius_vjp(safe, squared_radius, d_squared)
-            # Both are polynomials in the pixel: their moments over the tile are all that is needed.
-            quad = jnp.einsum("tsp,pm->mts", d_quadric, monomials)
-            near = jnp.einsum("tsp,pm->mts", d_nearness, monomials[:, :3])
-            d_geometry = _geometry_cotangent(g, quad, near)
-            parts = [*d_geometry, *(d_rows[:, r] for r in range(count))]
-            return tuple(
-                lax.dynamic_update_index_in_dim(whole, lax.dynamic_index_in_dim(whole, block, 0, keepdims=False) + part, block, 0)
-                for whole, part in zip(gradients, parts, strict=True)
-            )
-
-        return lax.fori_loop(*blocks, add, gradients)
+    planes, row_planes = _planes(geometry, rows, bins)
+    lanes, dtype, count = sweep.grid.lanes, geometry.dtype, rows.shape[0]
+    limits, seconds = limits
+    d_front, d_behind = cotangents
 
     def chunk(i, gradients):
-        corners = sweep.corners(bins, i, dtype)
-        blocks = bins.first_block[i], bins.first_block[i + 1]
-        limit, second = (lax.dynamic_slice(each, (i * lanes, 0), (lanes, pixels)) for each in limits)
-        front, behind = (lax.dynamic_slice(each, (i * lanes, 0, 0), (lanes, count, pixels)) for each in cotangents)
-        gradients = add_surface(blocks, corners, limit, None, front, gradients)
-        return lax.cond(
-            jnp.any(second < jnp.inf),
-            partial(add_surface, blocks, corners, second, limit, behind),
-            lambda gradients: gradients,
-            gradients,
-        )
+        limit = lax.dynamic_slice_in_dim(limits, i * lanes, lanes)
+        cotangent = lax.dynamic_slice_in_dim(d_front, i * lanes, lanes)
+        tiles = sweep.chunk(bins, i, dtype)
+        return sweep.add_cotangents(planes, row_planes, tiles, limit, None, cotangent, gradients)
 
-    start = tuple(jnp.zeros(bins.ids.shape, dtype) for _ in range(_GEOMETRY - 1 + count))
-    slots = lax.fori_loop(0, bins.chunks, chunk, start)
+    start = tuple(jnp.zeros(planes[0].shape, dtype) for _ in range(_GEOMETRY - 1 + count))
+    slots = lax.fori_loop(jnp.int32(0), bins.chunks, chunk, start)
+
+    is_open = jnp.any(seconds < jnp.inf, axis=1)
+    places = jnp.nonzero(is_open, size=is_open.shape[0] + _PICKED, fill_value=0)[0].astype(jnp.int32)
+    open_count = jnp.sum(is_open, dtype=jnp.int32)
+
+    def behind(i, gradients):
+        picked = lax.dynamic_slice_in_dim(places, i * _PICKED, _PICKED)
+        real = (i * _PICKED + jnp.arange(_PICKED) < open_count)[:, None]
+        beyond = jnp.where(real, seconds[picked], jnp.inf)
+        tiles = sweep.picked(bins, picked, dtype)
+        return sweep.add_cotangents(planes, row_planes, tiles, beyond, limits[picked], d_behind[picked], gradients)
+
+    slots = lax.fori_loop(jnp.int32(0), -(-open_count // _PICKED), behind, slots)
     per_splat = [scatter_slots(plane, bins, geometry.shape[1]) for plane in slots]
     d_geometry = jnp.stack([*per_splat[: _GEOMETRY - 1], jnp.zeros_like(per_splat[0])])
     return d_geometry, jnp.stack(per_splat[_GEOMETRY - 1 :])
