@@ -3,11 +3,16 @@
 From a few optical coefficients to a translucent picture, and back; lengths in millimetres throughout.
 """
 
+from .fitting import FitResult as FitResult, fit_gaussians as fit_gaussians, relative_error as relative_error
+from .fitting import FreeWeights as FreeWeights, TotalReflectanceHeld as TotalReflectanceHeld
+from .fitting import SharedVariances as SharedVariances, VariancesPerChannel as VariancesPerChannel
 from .gaussians import AbstractProfile as AbstractProfile, SumOfGaussians as SumOfGaussians
 from .geometry import bust as bust, bust_mesh as bust_mesh
 from .io import read_exr as read_exr, read_splats as read_splats, sample_mesh as sample_mesh
 from .io import write_exr as write_exr, write_png as write_png, write_splats as write_splats
-from .scattering import Medium as Medium
+from .scattering import Dipole as Dipole, EganFresnel as EganFresnel, ExactFresnel as ExactFresnel, Medium as Medium
+from .io import load_material as load_material, load_medium as load_medium
+from .io import materials as materials, save_material as save_material
 from .scene import Camera as Camera, DirectionalLight as DirectionalLight, Frame as Frame
 from .scene import GaussianBeam as GaussianBeam, Material as Material, PointLight as PointLight
 from .scene import Scene as Scene, Splats as Splats

@@ -38,6 +38,10 @@ class AbstractProfile(eqx.Module):
     def total_reflectance(self) -> Float[Array, " channels"]:
         """Give `2 pi` times the integral of `r profile(r)`: the share of the entering power that leaves."""
 
+    @abc.abstractmethod
+    def length_scale(self) -> Float[Array, " channels"]:
+        """Give the distance (mm) over which the core of the profile changes: quadrature counts radii in it."""
+
 
 class SumOfGaussians(AbstractProfile):
     r"""A profile as a sum of Gaussians, `sum_i w_i G(v_i, r)` (Eq. 2).
@@ -60,6 +64,10 @@ class SumOfGaussians(AbstractProfile):
 
     def total_reflectance(self) -> Float[Array, " channels"]:
         return jnp.sum(self.weights, axis=0)
+
+    def length_scale(self) -> Float[Array, " channels"]:
+        """Give the standard deviation of the narrowest Gaussian, mm."""
+        return jnp.full_like(self.weights[0], jnp.sqrt(jnp.min(self.variances)))
 
     def white(self) -> "SumOfGaussians":
         """Give the same profile with the weights of each channel divided by their sum."""

@@ -1,1 +1,8 @@
+"""From a profile to the sum of Gaussians that stands for it: Eq. 3 and Eq. 4."""
 
+from ._errors import relative_error as relative_error, squared_error as squared_error
+from ._fit import FitResult as FitResult, fit_gaussians as fit_gaussians
+from ._spread import AbstractSpread as AbstractSpread
+from ._spread import SharedVariances as SharedVariances, VariancesPerChannel as VariancesPerChannel
+from ._weights import AbstractWeights as AbstractWeights
+from ._weights import FreeWeights as FreeWeights, TotalReflectanceHeld as TotalReflectanceHeld

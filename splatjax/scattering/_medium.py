@@ -1,6 +1,9 @@
 """The optical coefficients of a homogeneous scattering medium."""
 
 import equinox as eqx
+import jax
+import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 
@@ -12,11 +15,18 @@ class Medium(eqx.Module):
     - `sigma_a`: absorption coefficient, 1/mm, at least 0.
     - `sigma_s_prime`: reduced scattering coefficient, 1/mm, positive.
     - `eta`: index of refraction relative to air.
+
+    **Raises:** `ValueError` for a value out of these ranges. Under `jit` values are unknown, and not checked.
     """
 
     sigma_a: Float[Array, " channels"]
     sigma_s_prime: Float[Array, " channels"]
     eta: Float[Array, " channels"]
+
+    def __check_init__(self):
+        _check("sigma_a", self.sigma_a, "at least 0 (1/mm)", lambda x: x >= 0)
+        _check("sigma_s_prime", self.sigma_s_prime, "positive (1/mm)", lambda x: x > 0)
+        _check("eta", self.eta, "positive", lambda x: x > 0)
 
     @property
     def sigma_t_prime(self) -> Float[Array, " channels"]:
@@ -27,3 +37,17 @@ class Medium(eqx.Module):
     def albedo_prime(self) -> Float[Array, " channels"]:
         """Reduced single-scattering albedo."""
         return self.sigma_s_prime / self.sigma_t_prime
+
+    @property
+    def squared_sigma_tr(self) -> Float[Array, " channels"]:
+        """Square of the effective transport coefficient, `3 sigma_a sigma_t'`, 1/mm^2: smooth where `sigma_a = 0`."""
+        return 3 * self.sigma_a * self.sigma_t_prime
+
+
+def _check(name: str, value, expected: str, holds) -> None:
+    """Raise if a known value is out of range; a traced one passes."""
+    if isinstance(value, Tracer) or not isinstance(value, (jax.Array, np.ndarray)):
+        return
+    known = np.asarray(value)
+    if known.dtype.kind == "f" and not np.all(np.isfinite(known) & holds(known)):
+        raise ValueError(f"{name} must be finite and {expected}; got {known.tolist()}")

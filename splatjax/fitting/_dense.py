@@ -1,0 +1,74 @@
+"""Least squares with a handful of unknowns, in plain array operations.
+
+The fit solves thousands of tiny systems at once inside a loop. Batched LAPACK calls there were seen to wait for each other's threads
+for good on a machine of two cores; elimination in six columns needs none. Columns are scaled to unit length, so that the normal
+equations are benign (their condition number stays below 2000 for eight Gaussians), and one step of refinement makes up for having
+squared it.
+"""
+
+import jax
+import jax.numpy as jnp
+import lineax as lx
+from jaxtyping import Array, Float
+from lineax.internal import pack_structures, ravel_vector, unravel_solution
+
+
+@jax.custom_jvp
+def invert(matrix: Float[Array, "columns columns"]) -> Float[Array, "columns columns"]:
+    """Invert a positive definite matrix by Gauss and Jordan's elimination, without pivoting."""
+    count = matrix.shape[0]
+    for column in range(count):
+        here = jnp.arange(count) == column
+        pivot = matrix[column, column]
+        zeros = jnp.zeros_like(pivot)
+        left = jnp.where(here, zeros, matrix[:, column]) / pivot
+        row = jnp.where(here, zeros, matrix[column])
+        others = matrix - left[:, None] * row[None, :]
+        at_row = jnp.broadcast_to(here[:, None], matrix.shape)
+        at_column = jnp.broadcast_to(here[None, :], matrix.shape)
+        unit = jnp.where(here, 1 / pivot, zeros)
+        matrix = jnp.where(at_column, (unit - left)[:, None], jnp.where(at_row, (row / pivot)[None, :], others))
+    return matrix
+
+
+@invert.defjvp
+def _invert_jvp(primals, tangents):
+    inverse = invert(*primals)
+    return inverse, -inverse @ tangents[0] @ inverse
+
+
+def normal_inverse(matrix: Float[Array, "rows columns"]) -> Float[Array, "columns columns"]:
+    """Give the inverse of `matrix^T matrix`."""
+    return invert(matrix.T @ matrix)
+
+
+def least_squares(
+    matrix: Float[Array, "rows columns"], right: Float[Array, " rows"], inverse: Float[Array, "columns columns"]
+) -> Float[Array, " columns"]:
+    """Give the `x` of the least `|matrix x - right|`; `inverse` is that of the normal equations."""
+    solution = inverse @ (matrix.T @ right)
+    return solution + inverse @ (matrix.T @ (right - matrix @ solution))
+
+
+class NormalEquations(lx.AbstractLinearSolver):
+    """A lineax solver for tall systems of full column rank. Nothing is differentiated through it."""
+
+    def init(self, operator, options):
+        del options
+        matrix = operator.as_matrix()
+        return matrix, normal_inverse(matrix), pack_structures(operator)
+
+    def compute(self, state, vector, options):
+        del options
+        matrix, inverse, structures = state
+        solution = least_squares(matrix, ravel_vector(vector, structures), inverse)
+        return unravel_solution(solution, structures), lx.RESULTS.successful, {}
+
+    def transpose(self, state, options):
+        raise NotImplementedError("a tall system has no transpose that this solver can solve")
+
+    def conj(self, state, options):
+        return state, options
+
+    def assume_full_rank(self):
+        return True

@@ -1,0 +1,43 @@
+"""What a fit minimizes (Eq. 3) and what it reports (Eq. 4)."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from splatjax.gaussians import AbstractProfile, SumOfGaussians
+from splatjax.scattering import NORM_RULE, RadialRule, at_own_radii
+
+
+def squared_error(profile: AbstractProfile, gaussians: SumOfGaussians, rule: RadialRule = NORM_RULE) -> Float[Array, " channels"]:
+    r"""Give the error that a fit minimizes, the integral over r of `r (R(r) - sum_i w_i G(v_i, r))^2` (Eq. 3).
+
+    **Arguments:**
+
+    - `profile`: the reference, 1/mm^2. Differentiable.
+    - `gaussians`: with as many channels. Differentiable.
+    - `rule`: radii of the integral, in length scales of `profile`.
+
+    **Returns:** [channels], 1/mm^2, at least 0.
+
+    **Source:** Kim et al. 2010, Eq. 3 (d'Eon, Luebke and Enderton 2007).
+    """
+    r, dr = rule.radii(profile)
+    difference = at_own_radii(profile, r) - at_own_radii(gaussians, r)
+    return jnp.sum(dr * r * difference * difference, axis=0)
+
+
+def relative_error(
+    profile: AbstractProfile, gaussians: SumOfGaussians, rule: RadialRule = NORM_RULE
+) -> Float[Array, " channels"]:
+    r"""Give the relative error of a fit, the root of Eq. 3 over that of the integral of `r R(r)^2` (Eq. 4).
+
+    It sees the core of a profile and hardly its tail: see `FitResult.energy_error` for the energy.
+
+    **Arguments:** as for `squared_error`, whose radii and norm it takes. Differentiable where the fit is not perfect.
+
+    **Returns:** [channels], at least 0; it depends on neither the unit of length nor the scale of the profile.
+
+    **Source:** Kim et al. 2010, Eq. 4.
+    """
+    r, dr = rule.radii(profile)
+    values = at_own_radii(profile, r)
+    return jnp.sqrt(squared_error(profile, gaussians, rule) / jnp.sum(dr * r * values * values, axis=0))

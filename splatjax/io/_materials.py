@@ -1,0 +1,237 @@
+"""Materials as TOML files: optical coefficients, where they come from, and the Gaussians fitted to them."""
+
+import difflib
+import os
+import re
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import tomli_w
+
+from splatjax.gaussians import SumOfGaussians
+from splatjax.scattering import Medium
+from splatjax.scene import Material
+
+from ._atomic import atomic_path
+
+COEFFICIENT_UNIT = "1/mm"
+VARIANCE_UNIT = "mm^2"
+_TABLES = ("medium", "surface", "source", "fit")
+
+
+def profiles_folder() -> Path:
+    """Give the folder of the materials that come with the package: inside the wheel, or at the top of a checkout."""
+    package = Path(__file__).resolve().parents[1]
+    in_wheel = package / "_profiles"
+    return in_wheel if in_wheel.is_dir() else package.parent / "profiles"
+
+
+def materials() -> tuple[str, ...]:
+    """Give the names of the materials that come with the package, in alphabetical order."""
+    return tuple(sorted(path.stem for path in profiles_folder().glob("*.toml")))
+
+
+def load_material(name_or_path: str | os.PathLike[str]) -> Material:
+    r"""Load a material: its fitted Gaussians and its surface.
+
+    **Arguments:**
+
+    - `name_or_path`: one of `materials()`, or the path of a TOML file.
+
+    **Returns:** a `Material` in JAX's default precision; variances in mm^2, ascending.
+
+    **Raises:** `ValueError` for an unknown name, and for a file that is no material: what is wrong, and what would be right.
+    """
+    path, tables = _read(name_or_path)
+    if "fit" not in tables:
+        raise ValueError(f"{path}: has no [fit]; fit its [medium] first: `splatjax fit {path} --output {path}`")
+    fit = _Table(path, "fit", tables["fit"])
+    fit.unit(VARIANCE_UNIT)
+    variances = fit.numbers("variances", "positive (mm^2)", lambda x: x > 0)
+    if np.any(np.diff(variances) <= 0):
+        raise ValueError(f"{path}: [fit] variances must ascend, each once; got {variances.tolist()}")
+    weights = fit.matrix("weights", len(variances))
+    surface = _Table(path, "surface", tables.get("surface", {}))
+    eta = surface.number("eta", "positive", lambda x: x > 0, 1.4)
+    specular = surface.number("specular", "at least 0", lambda x: x >= 0, 0.18)
+    roughness = surface.number("roughness", "in (0, 1]", lambda x: 0 < x <= 1, 0.3)
+    return Material(SumOfGaussians(_array(variances), _array(weights)), eta, specular, roughness)
+
+
+def load_medium(name_or_path: str | os.PathLike[str]) -> Medium:
+    r"""Load the optical coefficients of a material.
+
+    **Arguments:**
+
+    - `name_or_path`: one of `materials()`, or the path of a TOML file.
+
+    **Returns:** a `Medium` in JAX's default precision; coefficients in 1/mm.
+
+    **Raises:** `ValueError` as `load_material` does, and for a material that was published without coefficients.
+    """
+    path, tables = _read(name_or_path)
+    if "medium" not in tables:
+        raise ValueError(f"{path}: has no [medium]; only its Gaussians are known, which `load_material` gives")
+    return _medium(path, tables["medium"])
+
+
+def save_material(
+    material: Material,
+    path: str | os.PathLike[str],
+    *,
+    medium: Medium | None = None,
+    source: Mapping[str, Any] | None = None,
+    fit: Mapping[str, Any] | None = None,
+) -> None:
+    r"""Write a material to a TOML file, whole or not at all.
+
+    **Arguments:**
+
+    - `material`: one material (no batch); written with the digits it needs to be read back as it was.
+    - `path`: of the file; its folder must exist.
+    - `medium`: the coefficients that the Gaussians were fitted to.
+    - `source`: where the numbers come from: `citation`, `provenance`, ...
+    - `fit`: more to be kept in [fit]: `profile`, `error`, `energy_error`, ...
+
+    **Raises:** `OSError` if the file cannot be written.
+    """
+    tables: dict[str, Any] = {}
+    if medium is not None:
+        tables["medium"] = {
+            "unit": COEFFICIENT_UNIT,
+            "sigma_a": _plain(medium.sigma_a),
+            "sigma_s_prime": _plain(medium.sigma_s_prime),
+            "eta": _plain(medium.eta),
+        }
+    surface = {"eta": material.eta, "specular": material.specular, "roughness": material.roughness}
+    tables["surface"] = {name: _plain(value) for name, value in surface.items()}
+    tables["source"] = dict(source or {})
+    gaussians = material.gaussians
+    tables["fit"] = {
+        "unit": VARIANCE_UNIT,
+        "variances": _plain(gaussians.variances),
+        "weights": _plain(gaussians.weights),
+        **{name: value if isinstance(value, str | int | float) else _plain(value) for name, value in (fit or {}).items()},
+    }
+    with atomic_path(path) as temporary:
+        temporary.write_text(_one_line_arrays(tomli_w.dumps(tables)), encoding="utf-8")
+
+
+def _medium(path: Path, table: Any) -> Medium:
+    medium = _Table(path, "medium", table)
+    medium.unit(COEFFICIENT_UNIT)
+    sigma_a = medium.numbers("sigma_a", "at least 0 (1/mm)", lambda x: x >= 0)
+    sigma_s_prime = medium.numbers("sigma_s_prime", "positive (1/mm)", lambda x: x > 0)
+    eta = medium.numbers("eta", "positive", lambda x: x > 0, channels=len(sigma_a))
+    if not len(sigma_a) == len(sigma_s_prime) == len(eta):
+        counts = f"{len(sigma_a)}, {len(sigma_s_prime)} and {len(eta)}"
+        raise ValueError(f"{path}: [medium] sigma_a, sigma_s_prime and eta must have one number per channel; they have {counts}")
+    return Medium(_array(sigma_a), _array(sigma_s_prime), _array(eta))
+
+
+def _read(name_or_path: str | os.PathLike[str]) -> tuple[Path, dict[str, Any]]:
+    path = _resolve(name_or_path)
+    try:
+        tables = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ValueError(
+            f"{path}: cannot be read ({error.strerror}); name one of {', '.join(materials())}, or a TOML file"
+        ) from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path}: is no TOML file: {error}") from None
+    unknown = sorted(set(tables) - set(_TABLES))
+    if unknown:
+        raise ValueError(f"{path}: has an unknown entry {unknown[0]!r}; a material has [medium], [surface], [source] and [fit]")
+    if "medium" not in tables and "fit" not in tables:
+        raise ValueError(f"{path}: has neither [medium] nor [fit]; a material needs at least one of them")
+    if "medium" in tables:
+        _medium(path, tables["medium"])
+    return path, tables
+
+
+def _resolve(name_or_path: str | os.PathLike[str]) -> Path:
+    path = Path(name_or_path)
+    if not isinstance(name_or_path, str) or path.suffix or len(path.parts) != 1:
+        return path
+    known = materials()
+    if name_or_path in known:
+        return profiles_folder() / f"{name_or_path}.toml"
+    near = difflib.get_close_matches(name_or_path.lower(), known, n=1)
+    hint = f"did you mean {near[0]!r}?" if near else f"known are {', '.join(known)}"
+    raise ValueError(f"{name_or_path}: is no known material; {hint} (a file is named by its path: ./{name_or_path}.toml)")
+
+
+class _Table:
+    """One table of a file, and what its entries must be."""
+
+    def __init__(self, path: Path, name: str, table: Any):
+        if not isinstance(table, dict):
+            raise ValueError(f"{path}: [{name}] must be a table; it is {table!r}")
+        self.where, self.table = f"{path}: [{name}]", table
+
+    def unit(self, expected: str) -> None:
+        found = self.table.get("unit")
+        if found != expected:
+            raise ValueError(f'{self.where} unit must be "{expected}"; it is {found!r}: convert the numbers, then name the unit')
+
+    def numbers(self, name: str, expected: str, holds, channels: int | None = None) -> np.ndarray:
+        """Give a list of numbers; a single one stands for all channels, if their number is given."""
+        found = self._entry(name, f"a list of numbers, {expected}")
+        if channels is not None and _is_number(found):
+            found = [found] * channels
+        if not isinstance(found, list) or not found or not all(_is_number(x) for x in found):
+            raise ValueError(f"{self.where} {name} must be a list of numbers, {expected}; it is {found!r}")
+        values = np.asarray(found, np.float64)
+        if not np.all(np.isfinite(values) & holds(values)):
+            raise ValueError(f"{self.where} {name} must be finite and {expected}; it is {found!r}")
+        return values
+
+    def number(self, name: str, expected: str, holds, default: float) -> float:
+        found = self.table.get(name, default)
+        if not _is_number(found) or not np.isfinite(found) or not holds(found):
+            raise ValueError(f"{self.where} {name} must be a number, {expected}; it is {found!r}")
+        return float(found)
+
+    def matrix(self, name: str, rows: int) -> np.ndarray:
+        found = self._entry(name, "a list of numbers per Gaussian, one per channel")
+        regular = isinstance(found, list) and all(isinstance(row, list) and row for row in found)
+        if not regular or not all(_is_number(x) and np.isfinite(x) for row in found for x in row):
+            raise ValueError(
+                f"{self.where} {name} must be a list of finite numbers per Gaussian, one per channel; it is {found!r}"
+            )
+        if len(found) != rows or len({len(row) for row in found}) != 1:
+            lengths = [len(row) for row in found]
+            raise ValueError(
+                f"{self.where} {name} must have {rows} rows, one per variance, of equal length; its rows have {lengths}"
+            )
+        return np.asarray(found, np.float64)
+
+    def _entry(self, name: str, expected: str) -> Any:
+        if name not in self.table:
+            raise ValueError(f"{self.where} has no {name}; it must be {expected}")
+        return self.table[name]
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _array(values: np.ndarray):
+    return jnp.asarray(values, jnp.result_type(float))
+
+
+def _plain(values: Any) -> Any:
+    """Python numbers, as short as they can be and still be read back the same."""
+    values = np.asarray(values)
+    if values.dtype == np.float32:
+        return np.vectorize(lambda x: float(str(x)), otypes=[object])(values).tolist()
+    return values.tolist()
+
+
+def _one_line_arrays(text: str) -> str:
+    number = r"-?(?:[\d.]+(?:e[+-]?\d+)?|inf|nan)"
+    return re.sub(rf"\[\s+((?:{number},\s+)+)\]", lambda m: "[" + ", ".join(m[1].replace(",", " ").split()) + "]", text)
