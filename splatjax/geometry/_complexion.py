@@ -19,8 +19,8 @@ def complexion(
     x, y, z = points.T
     side = np.abs(x)
     front = smooth_step(z, 20, 60)
-    blood = 0.75 * bump(side, 44, 18) * bump(y, -26, 17) * front  # cheeks
-    blood = blood + 0.8 * bump(x, 0, 15) * bump(y, -40, 15) * smooth_step(z, 78, 104)  # nose
+    blood = 0.6 * bump(side, 44, 18) * bump(y, -26, 17) * front  # cheeks
+    blood = blood + 0.6 * bump(x, 0, 15) * bump(y, -40, 15) * smooth_step(z, 78, 104)  # nose
     blood = blood + 0.25 * bump(x, 0, 18) * bump(y, -98, 12) * front  # chin
     blood = blood + 0.9 * smooth_step(side, 72, 84) * bump(y, -10, 42) * bump(z, -14, 34)  # ears
     blood = blood + 0.35 * bump(side, 31, 17) * bump(y, -3, 10) * smooth_step(z, 55, 66)  # lids
@@ -29,8 +29,8 @@ def complexion(
     albedo = albedo * (1 + 0.02 * _mottling(points, 28.0, 7) + 0.025 * _mottling(points, 2.2, 11))[:, None]
     albedo = _mix(albedo, _SCALP, 0.55 * _scalp(x, y, z) * (1 + 0.12 * _mottling(points, 1.6, 13)))
     lips = _lips(side, y, z)
-    albedo = _mix(albedo, _LIPS, 0.85 * lips)
-    albedo = _mix(albedo, _HAIR, 0.75 * _brows(points, side, y, z))
+    albedo = _mix(albedo, _LIPS, 0.95 * lips)
+    albedo = _mix(albedo, _HAIR, 0.85 * _brows(points, side, y, z))
     albedo = _mix(albedo, _HAIR, 0.8 * _lashes(side, y, z))
     oily = bump(x, 0, 26) * smooth_step(y, -60, -10) * front
     specular = 1 + 0.25 * oily + 0.5 * lips + 0.12 * _mottling(points, 2.2, 17)
