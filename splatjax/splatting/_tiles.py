@@ -12,6 +12,7 @@ from functools import partial
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
@@ -106,10 +107,10 @@ class _Sweep(eqx.Module):
     grid: TileGrid
     full_coverage: float = eqx.field(static=True)
 
-    def pixels(self, dtype) -> tuple[Float[Array, " pixels"], Float[Array, " pixels"]]:
-        """Pixel centers of a tile, from its corner."""
-        side = jnp.arange(self.grid.side, dtype=dtype) + 0.5
-        return jnp.tile(side, self.grid.side), jnp.repeat(side, self.grid.side)
+    def pixels(self, dtype) -> tuple[np.ndarray, np.ndarray]:
+        """Pixel centers of a tile, from its corner. Constants: made by NumPy, or the compiler computes them per fragment."""
+        side = np.arange(self.grid.side, dtype=dtype) + np.asarray(0.5, dtype)
+        return np.tile(side, self.grid.side), np.repeat(side, self.grid.side)
 
     def _lanes(self, kind: type[_Lanes], bins: Bins, places, blocks, dtype) -> _Lanes:
         lanes, grid = self.grid.lanes, self.grid
@@ -133,7 +134,7 @@ class _Sweep(eqx.Module):
         x, y, sx, sy, a, b, c, e, shift = (lanes.read(plane, block) for plane in planes)
         x, y = x - lanes.x, y - lanes.y
         geometry = (x, y, sx, sy, a, b, c, e)
-        px, py = (p[None, None] for p in self.pixels(x.dtype))
+        px, py = (jnp.asarray(p)[None, None] for p in self.pixels(x.dtype))
         x, y, sx, sy, a, b, c, e, shift = (p[:, :, None] for p in (*geometry, shift))
         dx, dy = px - x, py - y
         return e + sx * dx + sy * dy, dx * (a * dx + b * dy) + c * dy * dy, shift, geometry
@@ -174,7 +175,7 @@ class _Sweep(eqx.Module):
     def add_cotangents(self, planes, rows, lanes: _Lanes, beyond, upto, cotangent, gradients):
         """Add the cotangents of geometry and rows, per slot, for the fragments between two limits."""
         px, py = self.pixels(beyond.dtype)
-        monomials = jnp.stack([jnp.ones_like(px), px, py, px * px, px * py, py * py], axis=1)
+        monomials = jnp.asarray(np.stack([np.ones_like(px), px, py, px * px, px * py, py * py], axis=1))
 
         def add(block, gradients):
             nearness, quadric, _, geometry = self.fragments(planes, block, lanes)
