@@ -18,6 +18,7 @@ from ._resample import Samples, block_samples, resample
 from ._tree import Clusters, ClusterTree
 
 _FAR = -1e6
+_FINEST = 0.01  # share of the splats that may be fine enough for a layer that is handed over everywhere
 
 
 class LayerPlan(eqx.Module):
@@ -66,7 +67,7 @@ class ClusterDiffuser(AbstractDiffuser):
             layers = tuple(LayerPlan(0, 1, 0.0, math.inf, None) for _ in values)
             return eqx.tree_at(_parts, self, (ClusterTree((), (), ()), layers), is_leaf=_is_none)
         spacing = math.sqrt(areas.mean())
-        narrowest = float(interval[0]) ** 2 * areas.min()
+        narrowest = float(interval[0]) ** 2 * np.quantile(areas, _FINEST)
         edges = [self._cell(math.sqrt(v / self.margin), spacing) for v in values]
         cells = sorted({edge for edge, v in zip(edges, values, strict=True) if edge > 0 and v * self.margin > narrowest})
         tree = ClusterTree.build(splats.centers, cells)
@@ -128,7 +129,8 @@ class ClusterDiffuser(AbstractDiffuser):
                 needed.append(need)
             needed.append(jnp.maximum(layer.smallest / variance, variance / layer.largest) * (1 - 1e-6))
         needed = stop_gradient(jnp.max(jnp.stack(needed))) if needed else jnp.zeros((), points.dtype)
-        return Diffused(jnp.stack(layers), needed)
+        carried = jnp.asarray([layer.capacity is not None for layer in self.layers], points.dtype)
+        return Diffused(jnp.stack(layers), carried, needed)
 
     def _layer(self, clusters: Clusters, variance, layer: LayerPlan, points, covered, view: AbstractView):
         """Evaluate one layer at the samples of both surfaces and resample it to the pixels of both."""

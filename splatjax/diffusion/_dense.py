@@ -44,10 +44,10 @@ class DenseDiffuser(AbstractDiffuser):
 
         surfaces, height, width = covered.shape
         channels = sources.irradiance.shape[0]
-        none = jnp.zeros((), points.dtype)
+        none, carried = jnp.zeros((), points.dtype), jnp.ones(variances.shape, points.dtype)
         if sources.areas.shape[0] == 0:
-            return Diffused(jnp.zeros((variances.shape[0], surfaces, channels, height, width), points.dtype), none)
+            return Diffused(jnp.zeros((variances.shape[0], surfaces, channels, height, width), points.dtype), carried, none)
         rows = points.transpose(0, 2, 1, 3).reshape(surfaces * height, 3, width), covered.reshape(surfaces * height, width)
         layers = jax.lax.map(picture_row, rows)
         layers = layers.reshape(surfaces, height, *layers.shape[1:])
-        return Diffused(layers.transpose(2, 0, 3, 1, 4), none)
+        return Diffused(layers.transpose(2, 0, 3, 1, 4), carried, none)

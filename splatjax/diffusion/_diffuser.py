@@ -22,6 +22,8 @@ class Diffused(eqx.Module):
     """The diffusion integrals, and what capacity they needed over what was planned."""
 
     layers: Float[Array, "gaussians surfaces channels height width"]
+    carried: Float[Array, " gaussians"]
+    """1, or 0 for a layer that was not evaluated, being too narrow for nearly all splats."""
     needed: Float[Array, ""]
 
 

@@ -64,6 +64,7 @@ def diffusion_layers(
     for place, each in enumerate(seen):
         area = jnp.where(covered[place], each.area, 1.0)
         resolved = jax.vmap(lambda variance, area=area: resolved_share(variance, area, interval))(variances)
+        resolved = resolved * diffused.carried[:, None, None]
         own = each.irradiance[None]
         found.append(DiffusionLayers(own + resolved[:, None] * (diffused.layers[:, place] - own), resolved))
     return (found[0], found[1]), diffused.needed

@@ -1,7 +1,9 @@
 """From a coarse grid of surface points to the pixels, across the surface and not across its silhouettes."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 
@@ -45,34 +47,44 @@ def resample(
     """
     height, width = points.shape[1:]
     rows, columns = samples.there.shape
-    at = (jnp.arange(stride, dtype=points.dtype) + 0.5) / stride - 0.5
-    spline = jnp.stack([0.5 * (0.5 - at) ** 2, 0.75 - at * at, 0.5 * (0.5 + at) ** 2])
-    planes = jnp.concatenate(
-        [
-            samples.points,
-            samples.there[None].astype(points.dtype),
-            samples.values,
-            samples.slopes.reshape(-1, rows, columns),
-        ]
-    )
-    around = jnp.pad(planes, ((0, 0), (1, 1), (1, 1)))
     channels = samples.values.shape[0]
-    padded = jnp.pad(points, ((0, 0), (0, rows * stride - height), (0, columns * stride - width)), mode="edge")
-    pixel = padded.reshape(3, rows, stride, columns, stride)
-    total = jnp.zeros((channels, rows, stride, columns, stride), points.dtype)
-    weights = jnp.zeros((rows, stride, columns, stride), points.dtype)
-    for i in range(3):
-        for j in range(3):
-            near = around[:, i : i + rows, j : j + columns][:, :, None, :, None]
-            offset = pixel - near[:3]
-            squared = jnp.sum(offset * offset, axis=0) / variance
-            close = 1 / (1 + squared * squared)
-            close = close * close
-            weight = spline[i][None, :, None, None] * spline[j][None, None, None] * near[3] * (close + 1e-12)
-            slopes = near[4 + channels :].reshape(3, channels, rows, 1, columns, 1)
-            value = near[4 : 4 + channels] + 0.5 * close[None] * jnp.sum(slopes * offset[:, None], axis=0)
-            total = total + weight[None] * value
-            weights = weights + weight
+    at = (np.arange(stride) + 0.5) / stride - 0.5
+    spline = jnp.asarray(np.stack([0.5 * (0.5 - at) ** 2, 0.75 - at * at, 0.5 * (0.5 + at) ** 2]), points.dtype)
+    low = [samples.points, samples.there[None].astype(points.dtype), samples.values, samples.slopes.reshape(-1, rows, columns)]
+    around = jnp.pad(jnp.concatenate(low), ((0, 0), (1, 1), (1, 1)))
+    # One picture per place in the block, columns last, so that a block's neighbors are a shift of whole rows.
+    pixel = [_phases(axis, rows, columns, stride) for axis in points]
+
+    @jax.checkpoint
+    def add_neighbor(sums, tap):
+        total, weights = sums
+        i, j = tap // 3, tap % 3
+        near = jax.lax.dynamic_slice(around, (jnp.zeros_like(i), i, j), (around.shape[0], rows, columns))[:, None, None]
+        offset = [axis - center for axis, center in zip(pixel, near[:3], strict=True)]
+        squared = (offset[0] ** 2 + offset[1] ** 2 + offset[2] ** 2) / variance
+        close = 1 / (1 + squared * squared)
+        close = close * close
+        across = spline[i][:, None, None, None] * spline[j][None, :, None, None]
+        weight = across * near[3] * (close + 1e-12)
+        half = 0.5 * close
+        added = []
+        for channel in range(channels):
+            slope = near[4 + channels + channel :: channels]
+            along = slope[0] * offset[0] + slope[1] * offset[1] + slope[2] * offset[2]
+            added.append(total[channel] + weight * (near[4 + channel] + half * along))
+        return (tuple(added), weights + weight), None
+
+    start = (jnp.zeros_like(pixel[0]),) * channels, jnp.zeros_like(pixel[0])
+    (total, weights), _ = jax.lax.scan(add_neighbor, start, jnp.arange(9, dtype=jnp.int32))
     there = weights > 0
-    blended = jnp.where(there[None], total / jnp.where(there, weights, 1.0)[None], 0.0)
-    return blended.reshape(channels, rows * stride, columns * stride)[:, :height, :width]
+    inverse = jnp.where(there, 1 / jnp.where(there, weights, 1.0), 0.0)
+    blended = [(each * inverse).transpose(2, 0, 3, 1).reshape(rows * stride, columns * stride) for each in total]
+    return jnp.stack(blended)[:, :height, :width]
+
+
+def _phases(
+    plane: Float[Array, "height width"], rows: int, columns: int, stride: int
+) -> Float[Array, "stride stride rows columns"]:
+    height, width = plane.shape
+    padded = jnp.pad(plane, ((0, rows * stride - height), (0, columns * stride - width)), mode="edge")
+    return padded.reshape(rows, stride, columns, stride).transpose(1, 3, 0, 2)
