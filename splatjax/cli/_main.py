@@ -1,0 +1,52 @@
+"""From words on a command line to a command, and from an error to one clear line."""
+
+import sys
+from collections.abc import Sequence
+from typing import Annotated
+
+import equinox as eqx
+import tyro
+
+from ._environment import prepare_jax
+from ._fit import Fit
+from ._materials import Materials
+from ._render import Render
+from ._sample import Sample
+
+_Command = (
+    Annotated[Materials, tyro.conf.subcommand("materials")]
+    | Annotated[Fit, tyro.conf.subcommand("fit")]
+    | Annotated[Sample, tyro.conf.subcommand("sample")]
+    | Annotated[Render, tyro.conf.subcommand("render")]
+)
+_DESCRIPTION = """Render translucent materials, and find the sums of Gaussians that stand for them. Lengths are in mm.
+
+`splatjax COMMAND --help` explains a command."""
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run one command.
+
+    **Arguments:**
+
+    - `args`: the words after `splatjax`; those of the process when not given.
+
+    **Returns:** the exit status: 0, or 2 after one line on stderr that says what is wrong; 130 when interrupted.
+    """
+    command = tyro.cli(_Command, prog="splatjax", description=_DESCRIPTION, args=args)
+    try:
+        prepare_jax()
+        command.run()
+    except (ValueError, OSError, eqx.EquinoxRuntimeError) as error:
+        print(f"splatjax: {_one_line(error)}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("splatjax: interrupted", file=sys.stderr)
+        return 130
+    return 0
+
+
+def _one_line(error: Exception) -> str:
+    if isinstance(error, OSError) and error.strerror and error.filename is not None:
+        return f"{error.filename}: {error.strerror}"
+    return " ".join(str(error).split()) or type(error).__name__

@@ -1,0 +1,18 @@
+"""Outputs are checked before the work begins: nobody should wait for a picture that cannot be written."""
+
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+OptionalPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH")]
+
+
+def check_output(path: Path, suffixes: tuple[str, ...]) -> None:
+    """Raise `ValueError` for a name with another suffix or a folder in its place, `FileNotFoundError` for a missing folder."""
+    if path.suffix.lower() not in suffixes:
+        raise ValueError(f"{path}: the name of this output must end in {' or '.join(suffixes)}")
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"{path}: there is no folder {path.parent}; make it first")
+    if path.is_dir():
+        raise ValueError(f"{path}: is a folder; give the name of a file")

@@ -1,0 +1,219 @@
+"""The command line, run in process on tiny inputs."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.experimental.compilation_cache import compilation_cache
+from PIL import Image
+
+import splatjax as sj
+from splatjax.cli import main
+from splatjax.cli._environment import cache_folder, prepare_jax
+from splatjax.cli._render import frame_all, towards
+
+PLY_HEAD = "ply\nformat ascii 1.0\nelement vertex {count}\n{properties}end_header\n"
+SKIN = """[medium]
+unit = "1/mm"
+sigma_a = [{sigma_a}, 0.17, 0.48]
+sigma_s_prime = [0.74, 0.88, 1.01]
+eta = 1.3
+"""
+
+
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path, monkeypatch):
+    """Compiled code goes to a folder of the test, and the program's settings are taken back."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    before = {name: getattr(jax.config, name) for name in ("jax_compilation_cache_dir", "jax_platforms")}
+    yield
+    for name, value in before.items():
+        jax.config.update(name, value)
+    compilation_cache.reset_cache()
+
+
+def write_ply(path, rows, names):
+    properties = "".join(f"property float {name}\n" for name in names)
+    lines = [" ".join(f"{value}" for value in row) for row in rows]
+    path.write_text(PLY_HEAD.format(count=len(rows), properties=properties) + "\n".join(lines) + "\n")
+    return path
+
+
+def plate(path, radius=1.5):
+    """Write an even plate of 20 x 20 mm that faces +z, without albedo."""
+    places = np.linspace(-9.5, 9.5, 20)
+    rows = [(x, y, 0, 0, 0, 1, radius, 1) for x in places for y in places]
+    return write_ply(path, rows, ("x", "y", "z", "nx", "ny", "nz", "radius", "area"))
+
+
+def failure(args, capsys, outputs=()):
+    """Run a command that must fail; give its one line on stderr."""
+    status = main([str(word) for word in args])
+    captured = capsys.readouterr()
+    assert status == 2
+    assert captured.out == ""
+    assert captured.err.startswith("splatjax: ")
+    assert captured.err.count("\n") == 1
+    for output in outputs:
+        assert not output.exists()
+    return captured.err
+
+
+def test_materials_lists_the_library(capsys):
+    assert main(["materials"]) == 0
+    listed = [line.split()[0] for line in capsys.readouterr().out.splitlines()[1:]]
+    assert listed == list(sj.materials())
+    assert "skin" in listed
+
+
+def test_fit_prints_and_writes_a_material_that_loads(tmp_path, capsys):
+    output = tmp_path / "mine.toml"
+    assert main(["fit", "skin1", "--count", "2", "--output", str(output)]) == 0
+    printed = capsys.readouterr().out
+    assert "error (Eq. 4)" in printed
+    assert printed.splitlines()[-1] == str(output)
+    material, medium = sj.load_material(output), sj.load_medium("skin1")
+    assert material.gaussians.weights.shape == (2, 3)
+    total = sj.Dipole(medium).total_reflectance()
+    np.testing.assert_allclose(np.asarray(material.gaussians.total_reflectance()), np.asarray(total), rtol=1e-5)
+
+
+def test_sample_covers_a_mesh(tmp_path, capsys):
+    mesh, output = tmp_path / "square.obj", tmp_path / "square.ply"
+    mesh.write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3\nf 1 3 4\n")
+    command = ["sample", str(mesh), "--mm-per-unit", "10", "--count", "50", "--crop-min-y", "0.5", "--output", str(output)]
+    assert main(command) == 0
+    splats = sj.read_splats(output)
+    assert splats.count == 50
+    np.testing.assert_allclose(float(jnp.sum(splats.areas)), 50.0, rtol=1e-3)
+    assert float(jnp.min(splats.centers[:, 1])) >= 5 - 1e-4
+    assert "50 mm^2" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_render_shows_the_bust_and_says_what_it_does(tmp_path, capsys):
+    output = tmp_path / "bust.exr"
+    assert main(["render", "--count", "5000", "--width", "64", "--height", "64", "--output", str(output)]) == 0
+    captured = capsys.readouterr()
+    picture = output.with_suffix(".png")
+    assert captured.out.splitlines() == [str(output), str(picture)]
+    assert "divided by their sums" in captured.err
+    frame = sj.read_exr(output)
+    np.testing.assert_allclose(np.sum(np.asarray(frame.weights), axis=0), 1.0, rtol=1e-5)
+    assert 0.1 < np.mean(np.asarray(frame.coverage)) < 0.9
+    with Image.open(picture) as shown:
+        assert shown.size == (64, 64)
+        assert np.asarray(shown).max() > 100
+
+
+@pytest.mark.slow
+def test_render_without_scattering_is_lambertian(tmp_path, capsys):
+    splats, output = plate(tmp_path / "plate.ply"), tmp_path / "plate.exr"
+    view = ["--width", "32", "--height", "32", "--azimuth", "0", "--light-azimuth", "0", "--light-elevation", "60"]
+    command = ["render", str(splats), "--material", "marble", "--no-scattering", *view, "--output", str(output)]
+    assert main(command) == 0
+    assert "albedo" not in capsys.readouterr().err
+    frame = sj.read_exr(output)
+    total = np.asarray(sj.load_material("marble").gaussians.total_reflectance())
+    middle = np.asarray(frame.diffuse)[16, 16]
+    # radiance = reflectance x irradiance / pi, with irradiance pi cos 60 degrees; the interface takes and gives a few per cent
+    np.testing.assert_allclose(middle, 0.5 * total, rtol=0.03)
+    np.testing.assert_allclose(np.asarray(frame.weights), total[None], rtol=1e-5)
+
+
+XYZ = ("x", "y", "z")
+BAD_SPLATS = {
+    "empty": ([], XYZ, "empty"),
+    "nan": ([(0, 0, 0), (1, "nan", 0)], XYZ, "not finite"),
+    "zero radius": ([(0, 0, 0, 0), (1, 0, 0, 1)], (*XYZ, "radius"), "positive"),
+    "negative radius": ([(0, 0, 0, -1), (1, 0, 0, 1)], (*XYZ, "radius"), "positive"),
+}
+
+
+@pytest.mark.parametrize("kind", BAD_SPLATS)
+def test_bad_splats_are_one_line(kind, tmp_path, capsys):
+    rows, names, said = BAD_SPLATS[kind]
+    splats, output = write_ply(tmp_path / "bad.ply", rows, names), tmp_path / "out.exr"
+    line = failure(["render", splats, "--output", output], capsys, [output, output.with_suffix(".png")])
+    assert str(splats) in line
+    assert said in line
+
+
+@pytest.mark.parametrize("command", ["render", "sample", "fit"])
+def test_missing_input_is_one_line(command, tmp_path, capsys):
+    absent = tmp_path / {"render": "no.ply", "sample": "no.glb", "fit": "no.toml"}[command]
+    output = tmp_path / {"render": "o.exr", "sample": "o.ply", "fit": "o.toml"}[command]
+    more = ["--mm-per-unit", "1"] if command == "sample" else []
+    assert absent.name in failure([command, absent, *more, "--output", output], capsys, [output])
+
+
+def test_unknown_material_is_one_line(tmp_path, capsys):
+    output = tmp_path / "o.exr"
+    assert "marbel" in failure(["render", "--material", "marbel", "--output", output], capsys, [output])
+    assert "marbel" in failure(["fit", "marbel"], capsys)
+
+
+@pytest.mark.parametrize("command", ["render", "fit"])
+def test_negative_coefficient_is_one_line(command, tmp_path, capsys):
+    material = tmp_path / "bad.toml"
+    material.write_text(SKIN.format(sigma_a=-0.03))
+    output = tmp_path / {"render": "o.exr", "fit": "o.toml"}[command]
+    given = ["--material", material] if command == "render" else [material]
+    line = failure([command, *given, "--output", output], capsys, [output])
+    assert "bad.toml" in line
+    assert "sigma_a" in line
+
+
+def test_outputs_are_refused_before_the_work(tmp_path, capsys):
+    assert "no folder" in failure(["render", "--output", tmp_path / "none" / "o.exr"], capsys)
+    assert ".exr" in failure(["render", "--output", tmp_path / "o.png"], capsys)
+    assert ".toml" in failure(["fit", "skin1", "--output", tmp_path / "o.txt"], capsys)
+
+
+@pytest.mark.parametrize(("option", "value"), [("elevation", 90), ("fov", 180), ("fov", -5), ("width", 0), ("height", -3)])
+def test_impossible_cameras_are_one_line(option, value, tmp_path, capsys):
+    splats, output = plate(tmp_path / "plate.ply"), tmp_path / "o.exr"
+    args = ["render", splats, "--material", "marble", f"--{option}", value, "--output", output]
+    status = main([str(word) for word in args])
+    lines = capsys.readouterr().err.splitlines()
+    assert status == 2
+    assert sum(line.startswith("splatjax: ") for line in lines) == 1
+    assert option in lines[-1]
+    assert not output.exists()
+
+
+def test_a_word_too_many_exits_with_two(capsys):
+    with pytest.raises(SystemExit) as left:
+        main(["render", "--no-such-option"])
+    assert left.value.code == 2
+    assert "no-such-option" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("width", "height"), [(64, 64), (128, 64), (64, 128)])
+def test_camera_frames_the_bounding_sphere(width, height, dtype):
+    places = np.random.default_rng(3).normal(size=(500, 3))
+    places = 40 * places / np.linalg.norm(places, axis=1, keepdims=True) + np.asarray([5.0, -20.0, 3.0])
+    count = len(places)
+    centers = jnp.asarray(places, dtype)
+    ones = jnp.ones(count, dtype)
+    splats = sj.Splats(centers, jnp.broadcast_to(jnp.asarray([0.0, 0.0, 1.0], dtype), (count, 3)), ones, ones)
+    camera = frame_all(splats, towards(30.0, 20.0), 25.0, width, height)
+    local = np.asarray((centers - camera.position[None]) @ camera.rotation.T)
+    x = local[:, 0] / local[:, 2] * float(camera.focal_length) * height / width
+    y = local[:, 1] / local[:, 2] * float(camera.focal_length)
+    reach = max(np.abs(x).max(), np.abs(y).max())
+    assert 0.4 < reach < 0.5
+
+
+def test_azimuth_turns_from_the_front_to_the_side():
+    np.testing.assert_allclose(np.asarray(towards(0.0, 0.0)), [0, 0, 1], atol=1e-6)
+    np.testing.assert_allclose(np.asarray(towards(90.0, 0.0)), [1, 0, 0], atol=1e-6)
+    np.testing.assert_allclose(np.asarray(towards(0.0, 30.0)), [0, 0.5, np.sqrt(0.75)], atol=1e-6)
+
+
+def test_cache_folder_follows_the_environment(tmp_path, monkeypatch):
+    prepare_jax()
+    assert jax.config.jax_compilation_cache_dir == str(tmp_path / "cache" / "splatjax" / "jax")
+    monkeypatch.setenv("XDG_CACHE_HOME", "relative")
+    assert cache_folder().is_absolute()
+    assert cache_folder().parts[-3:] == (".cache", "splatjax", "jax")
