@@ -17,6 +17,6 @@ from .scene import Camera as Camera, DirectionalLight as DirectionalLight, Frame
 from .scene import GaussianBeam as GaussianBeam, Material as Material, PointLight as PointLight
 from .scene import Scene as Scene, Splats as Splats
 
-from .render import Plan as Plan, plan as plan, render as render, RenderSettings as RenderSettings
+from .render import diffuse as diffuse, Plan as Plan, plan as plan, render as render, RenderSettings as RenderSettings
 
 __version__ = "0.1.0"

@@ -80,15 +80,63 @@ def render(scene: Scene, camera: Camera, settings: RenderSettings | None = None,
     """
     settings = RenderSettings() if settings is None else settings
     _check_channels(scene)
-    if plan is None:
-        leaves = jax.tree.leaves((scene, camera))
-        if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
-            raise ValueError("under jit, grad or vmap, render needs plan=splatjax.plan(scene, camera, settings), made outside")
-        plan = _make_plan(scene, camera, settings)
+    plan = _plan_unless_traced(scene, camera, settings, plan)
     return _render(scene, camera, settings, plan)
 
 
 _make_plan = plan  # `plan` is also an argument of `render`
+
+
+def diffuse(
+    scene: Scene,
+    irradiance: Float[Array, "splats channels"],
+    camera: Camera,
+    settings: RenderSettings | None = None,
+    plan: Plan | None = None,
+) -> Float[Array, "gaussians height width channels"]:
+    r"""Diffuse any irradiance of the splats below the surface: pass 4 alone, the plain layers `L_k` (section 4.2).
+
+    **Arguments:** as for `render`; of the scene only the splats' geometry and the material's variances matter.
+
+    - `irradiance`: that enters at each splat. Differentiable.
+
+    **Returns:** one layer per Gaussian on the front surface, 0 where there is none; NaN where the plan does not suffice.
+    Weighted by `material.gaussians.weights` and summed they are the radiant exitance.
+    """
+    settings = RenderSettings() if settings is None else settings
+    plan = _plan_unless_traced(scene, camera, settings, plan)
+    return _diffuse(scene, irradiance, camera, settings, plan)
+
+
+@eqx.filter_jit
+def _diffuse(scene: Scene, irradiance, camera: Camera, settings: RenderSettings, plan: Plan):
+    scene, camera, irradiance = _in_one_dtype(scene, camera, irradiance)
+    splats, view = scene.splats, _splatting.PerspectiveView.of(camera)
+    attributes = {"area": splats.areas[None], "source": irradiance.T}
+    _, (layers, _), needed = _see_and_diffuse(scene, attributes, view, settings, plan)
+    return jnp.where(needed <= 1, layers.layers.transpose(0, 2, 3, 1), jnp.nan)
+
+
+def _see_and_diffuse(scene: Scene, attributes: dict[str, Array], view, settings: RenderSettings, plan: Plan):
+    """Passes 2 to 4: the surface in front and the one that shows behind its silhouettes, with their diffused light."""
+    splats = scene.splats
+    footprints = view.footprints(splats, settings.splatting)
+    stacked = jnp.concatenate(list(attributes.values()))
+    surfaces = _splatting.splat_surfaces(footprints, stacked, view, settings.splatting, plan.camera)
+    front, behind = ((each, _by_name(attributes, each.attributes)) for each in (surfaces.front, surfaces.behind))
+    seen = [_diffusion.SeenSurface(each, named["source"], named["area"][0]) for each, named in (front, behind)]
+    sources = _diffusion.Sources(splats.centers.T, splats.areas, attributes["source"])
+    variances = scene.material.gaussians.variances
+    layers, needed = _diffusion.diffusion_layers(sources, variances, seen, plan.interval, view, plan.diffuser)
+    return (front, behind), layers, jnp.maximum(surfaces.needed, needed)
+
+
+def _plan_unless_traced(scene: Scene, camera: Camera, settings: RenderSettings, plan: Plan | None) -> Plan:
+    if plan is not None:
+        return plan
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((scene, camera))):
+        raise ValueError("under jit, grad or vmap a plan is needed: plan=splatjax.plan(scene, camera, settings), made outside")
+    return _make_plan(scene, camera, settings)
 
 
 @eqx.filter_jit
@@ -111,7 +159,7 @@ def _render(scene: Scene, camera: Camera, settings: RenderSettings, plan: Plan) 
     root = None if splats.albedo is None else _shading.albedo_root(splats.albedo).T
     source = irradiance if root is None else irradiance * root
 
-    # Passes 2 and 3: what the camera sees, with blended attributes.
+    # Passes 2 to 4: what the camera sees, with blended attributes, and the light diffused to there.
     attributes = {
         "normal": splats.normals.T,
         "area": splats.areas[None],
@@ -123,26 +171,13 @@ def _render(scene: Scene, camera: Camera, settings: RenderSettings, plan: Plan) 
     }
     attributes = {name: rows for name, rows in attributes.items() if rows is not None}
     attributes |= {f"lit {i}": shares for i, shares in enumerate(lit) if shares is not None}
-    footprints = view.footprints(splats, settings.splatting)
-    stacked = jnp.concatenate(list(attributes.values()))
-    surfaces = _splatting.splat_surfaces(footprints, stacked, view, settings.splatting, plan.camera)
+    seen, layers, need = _see_and_diffuse(scene, attributes, view, settings, plan)
 
-    # Passes 4 and 5, on the surface in front and on the one that shows behind its silhouettes.
-    sources = _diffusion.Sources(splats.centers.T, splats.areas, source)
-
-    seen = [(surface, _by_name(attributes, surface.attributes)) for surface in (surfaces.front, surfaces.behind)]
-    layers, diffusion_need = _diffusion.diffusion_layers(
-        sources,
-        material.gaussians.variances,
-        tuple(_diffusion.SeenSurface(surface, named["source"], named["area"][0]) for surface, named in seen),
-        plan.interval,
-        view,
-        plan.diffuser,
-    )
+    # Pass 5 on both, and the front laid over what shows behind it.
     front, behind = (
         _shade(scene, view, groups, f0, surface, named, layer) for (surface, named), layer in zip(seen, layers, strict=True)
     )
-    needed = jnp.stack([surfaces.needed, diffusion_need, *shadow_needs])
+    needed = jnp.stack([need, *shadow_needs])
     return _compose(front, behind, material.gaussians.weights, jnp.max(needed))
 
 

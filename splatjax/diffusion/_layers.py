@@ -1,5 +1,7 @@
 """Pass 4: splat-based diffusion (section 4.2), one layer per Gaussian."""
 
+from collections.abc import Sequence
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -38,11 +40,11 @@ def pixel_points(view: AbstractView, depth: Float[Array, "height width"]) -> Flo
 def diffusion_layers(
     sources: Sources,
     variances: Float[Array, " gaussians"],
-    seen: tuple[SeenSurface, SeenSurface],
+    seen: Sequence[SeenSurface],
     interval: Float[Array, "2"],
     view: AbstractView,
     diffuser: AbstractDiffuser,
-) -> tuple[tuple[DiffusionLayers, DiffusionLayers], Float[Array, ""]]:
+) -> tuple[list[DiffusionLayers], Float[Array, ""]]:
     r"""Diffuse the irradiance of the splats to the points that the pixels see.
 
     **Arguments:**
@@ -67,4 +69,4 @@ def diffusion_layers(
         resolved = resolved * diffused.carried[:, None, None]
         own = each.irradiance[None]
         found.append(DiffusionLayers(own + resolved[:, None] * (diffused.layers[:, place] - own), resolved))
-    return (found[0], found[1]), diffused.needed
+    return found, diffused.needed

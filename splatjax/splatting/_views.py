@@ -121,18 +121,22 @@ def _rows(matrix: Float[Array, "3 3"], vectors: Float[Array, "3 splats"]) -> tup
     return tuple(matrix[i, 0] * x + matrix[i, 1] * y + matrix[i, 2] * z for i in range(3))
 
 
-def _filtered(xx, xy, yy, vx, vy, filter_radius):
-    """Widen the rim's ellipse by the screen filter and invert it: a, b, c, slope and root of the determinant.
+_SLOPE_FILTER = 0.25  # pixels; see _filtered
 
-    The ellipse `d^T S^-1 d = 1` grows to `S + f^2 I`. The hit moves to where the widened splat's light comes from,
-    `S (S + f^2 I)^-1 d`, so the plane's slope becomes `(S + f^2 I)^-1 (S slope)`; `(vx, vy)` is `S slope`.
+
+def _filtered(xx, xy, yy, vx, vy, filter_radius):
+    """Widen the rim's ellipse by the screen filter: its inverse, the plane's slope, the ellipse, its determinant's root.
+
+    The ellipse `d^T S^-1 d = 1` grows to `S + f^2 I`. `(vx, vy)` is `S slope`: the slope itself is infinite edge on, so a
+    quarter of a pixel is added before it is divided by `S`. Hits stay on the plane of every splat that a pixel can resolve.
     """
+    sxx, syy = xx + _SLOPE_FILTER**2, yy + _SLOPE_FILTER**2
+    inverse = 1 / (sxx * syy - xy * xy)
+    slope_x, slope_y = (syy * vx - xy * vy) * inverse, (sxx * vy - xy * vx) * inverse
     xx, yy = xx + filter_radius**2, yy + filter_radius**2
     determinant = xx * yy - xy * xy
     inverse = 1 / determinant
-    a, b, c = yy * inverse, -2 * xy * inverse, xx * inverse
-    slope_x, slope_y = a * vx + 0.5 * b * vy, 0.5 * b * vx + c * vy
-    return a, b, c, slope_x, slope_y, xx, yy, jnp.sqrt(determinant)
+    return yy * inverse, -2 * xy * inverse, xx * inverse, slope_x, slope_y, xx, yy, jnp.sqrt(determinant)
 
 
 class PerspectiveView(AbstractView):
@@ -180,13 +184,14 @@ class PerspectiveView(AbstractView):
         inverse = 1 / pz
         square = inverse * inverse
         # The rim is a conic; its box is exact while the splat does not reach the plane of the pinhole.
-        kappa = stop_gradient(1 - (gx * vx + gy * vy))
+        ux, uy = xx * gx + xy * gy, xy * gx + yy * gy
+        kappa = stop_gradient(1 - (gx * ux + gy * uy))
         bounded = kappa > 1e-3
         kappa = jnp.where(bounded, kappa, 1.0)
         x, y = self.width / 2 + self.focal_length * u, self.height / 2 + self.focal_length * v
-        half_x = jnp.where(bounded, jnp.sqrt((xx + vx * vx / kappa) / kappa), jnp.inf)
-        half_y = jnp.where(bounded, jnp.sqrt((yy + vy * vy / kappa) / kappa), jnp.inf)
-        mid_x, mid_y = x + vx / kappa, y + vy / kappa
+        half_x = jnp.where(bounded, jnp.sqrt((xx + ux * ux / kappa) / kappa), jnp.inf)
+        half_y = jnp.where(bounded, jnp.sqrt((yy + uy * uy / kappa) / kappa), jnp.inf)
+        mid_x, mid_y = x + ux / kappa, y + uy / kappa
         cosine = facing / jnp.sqrt(1 + u * u + v * v)
         epsilon = _epsilon(splats.radii, settings.filter_radius / scale, cosine, settings)
         return Footprints(
