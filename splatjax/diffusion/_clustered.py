@@ -39,15 +39,15 @@ class ClusterDiffuser(AbstractDiffuser):
 
     **Attributes:** (static; lengths in standard deviations of the layer)
 
-    - `support`: sources farther away are left out. 4 leaves out 3e-4 of a Gaussian's power.
+    - `support`: sources farther away are left out. 4.5 leaves out 4e-5 of a Gaussian's power.
     - `cluster_size`: the edge of the cells in which splats are merged is at most this; 0 merges none.
     - `pixel_size`: the distance between the points of the coarse grid is at most this; 0 evaluates every pixel.
     - `margin`: a plan holds while the variances stay within this factor of those that it was made for.
     """
 
-    support: float = eqx.field(static=True, default=4.0)
+    support: float = eqx.field(static=True, default=4.5)
     cluster_size: float = eqx.field(static=True, default=1.0)
-    pixel_size: float = eqx.field(static=True, default=0.5)
+    pixel_size: float = eqx.field(static=True, default=0.35)
     margin: float = eqx.field(static=True, default=1.25)
     lanes: int = eqx.field(static=True, default=32)
     slots: int = eqx.field(static=True, default=32)
@@ -142,7 +142,7 @@ class ClusterDiffuser(AbstractDiffuser):
                 for surface in zip(points, covered, strict=True)
             ]
             return jnp.stack([values for values, _, _ in each]), jnp.max(jnp.stack([need for _, _, need in each]))
-        where, there = block_samples(points[0], covered[0], layer.stride)
+        where, there = block_samples(points[0], covered[0], layer.stride, stop_gradient(variance))
         values, slopes, need = self._integrals(clusters, variance, layer, where, there, grid, view, 1)
         samples = Samples(where, there, values, slopes)
         pixels = [resample(samples, surface, variance, layer.stride) for surface in points]
@@ -150,15 +150,22 @@ class ClusterDiffuser(AbstractDiffuser):
 
     def _integrals(self, clusters: Clusters, variance, layer: LayerPlan, points, there, grid: TileGrid, view, order: int):
         """Give numerator over denominator at points, and for `order` 1 its slope in space."""
-        # A merged cluster is as wide as its splats are spread.
+        # A cluster is as wide as its splats are spread.
         wide = variance + clusters.spread
         mass = clusters.areas * variance / wide
-        energy = mass[None] * clusters.irradiance
-        rows = jnp.concatenate([energy, mass[None]])
-        count = rows.shape[0]
         middle = stop_gradient(jnp.mean(clusters.centers, axis=1))[:, None]
+        centers = clusters.centers - middle
+        rows = [mass[None] * clusters.irradiance, mass[None]]
+        count = clusters.irradiance.shape[0] + 1
+        if clusters.moments is not None:
+            # Energy off the center, to first order: G(x - p - o) = G(x - p) (1 + o (x - p) / v).
+            moments = clusters.moments * (variance / (wide * wide))[None, None]
+            rows[0] = rows[0] - jnp.sum(moments * centers[None], axis=1)
+            rows.append(moments.reshape(-1, mass.shape[0]))
         if order:
-            rows = jnp.concatenate([rows, *(rows * axis[None] for axis in clusters.centers - middle)])
+            plain = jnp.concatenate([mass[None] * clusters.irradiance, mass[None]])
+            rows += [plain * axis[None] for axis in centers]
+        rows = jnp.concatenate(rows)
         x, y, depth = view.project(points)
         depth = jnp.where(there, stop_gradient(depth), -jnp.inf).reshape(-1)
         far = _farthest(stop_gradient(x).reshape(-1) / layer.stride, stop_gradient(y).reshape(-1) / layer.stride, depth, grid)
@@ -166,16 +173,27 @@ class ClusterDiffuser(AbstractDiffuser):
         bins = bin_items(ranges, grid, layer.capacity)
         where = jnp.where(there[None], points, _FAR)
         sums = gaussian_sums(where, clusters.centers, 0.5 / wide, rows, bins, grid, self.support)
-        reached = there & (sums[count - 1] > 0)
-        inverse = 1 / jnp.where(reached, sums[count - 1], 1.0)
-        values = jnp.where(reached[None], sums[: count - 1] * inverse[None], 0.0)
+        energy, sums = _energy_and_rest(sums, count, points - middle[:, :, None], clusters.moments is not None)
+        reached = there & (sums[0] > 0)
+        inverse = 1 / jnp.where(reached, sums[0], 1.0)
+        values = jnp.where(reached[None], energy * inverse[None], 0.0)
         slopes = None
         if order:
             # grad N = sum w (p - x) / v, so grad (N / D) = (mean of E p - L mean of p) / v.
-            moments = sums[count:].reshape(3, count, *there.shape)
+            moments = sums[1:].reshape(3, count, *there.shape)
             slopes = (moments[:, :-1] - values[None] * moments[:, -1:]) * (inverse / variance)[None, None]
             slopes = jnp.where(reached[None, None], slopes, 0.0)
         return values, slopes, bins.needed.astype(points.dtype)
+
+
+def _energy_and_rest(sums, count: int, points, has_moments: bool):
+    """Split the sums: the energy, with its first moments put in, and the area with what follows."""
+    energy, rest = sums[: count - 1], sums[count - 1 :]
+    if not has_moments:
+        return energy, rest
+    moments = rest[1 : 1 + 3 * (count - 1)].reshape(count - 1, 3, *sums.shape[1:])
+    energy = energy + jnp.sum(moments * points[None], axis=1)
+    return energy, jnp.concatenate([rest[:1], rest[1 + 3 * (count - 1) :]])
 
 
 def _parts(diffuser: ClusterDiffuser):

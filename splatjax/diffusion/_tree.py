@@ -17,13 +17,15 @@ class Clusters(eqx.Module):
     irradiance: Float[Array, "channels clusters"]
     spread: Float[Array, " clusters"]
     """Half the mean squared distance of the splats from the center: the variance per axis of a flat cluster, mm^2."""
+    moments: Float[Array, "channels 3 clusters"] | None
+    """Where the energy lies: the sum of area, irradiance and offset from the center. `None` for single splats: nothing."""
 
     @classmethod
     def of(cls, sources: Sources) -> "Clusters":
-        return cls(sources.centers, sources.areas, sources.irradiance, jnp.zeros_like(sources.areas))
+        return cls(sources.centers, sources.areas, sources.irradiance, jnp.zeros_like(sources.areas), None)
 
     def merged(self, parents: Int[Array, " clusters"], count: int) -> "Clusters":
-        """Merge clusters into `count` parents. Area, energy and first moments are kept. Differentiable."""
+        """Merge clusters into `count` parents. Area, energy and the first moments of both are kept. Differentiable."""
 
         def total(values):
             return jax.ops.segment_sum(values, parents, count)
@@ -38,7 +40,12 @@ class Clusters(eqx.Module):
         irradiance = jnp.stack([mean(channel) for channel in self.irradiance])
         offset = self.centers - centers[:, parents]
         spread = mean(self.spread + 0.5 * jnp.sum(offset * offset, axis=0))
-        return Clusters(centers, areas, irradiance, spread)
+        channels = range(self.irradiance.shape[0])
+        moments = [[self.areas * self.irradiance[c] * offset[axis] for axis in range(3)] for c in channels]
+        if self.moments is not None:
+            moments = [[moments[c][axis] + self.moments[c, axis] for axis in range(3)] for c in channels]
+        moments = jnp.stack([jnp.stack([total(axis) for axis in each]) for each in moments])
+        return Clusters(centers, areas, irradiance, spread, moments)
 
 
 class ClusterTree(eqx.Module):

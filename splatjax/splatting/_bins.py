@@ -225,6 +225,6 @@ def slot_planes(
     return [plane.at[bins.ids].get(mode="fill", fill_value=value) for plane, value in zip(planes, fill, strict=True)]
 
 
-def scatter_slots(slots: Float[Array, "blocks lanes slots"], bins: Bins, items: int) -> Float[Array, " items"]:
+def scatter_slots(slots: Float[Array, "*blocks slots"], bins: Bins, items: int) -> Float[Array, " items"]:
     """Add the slots of every item: the transpose of the gather."""
     return jnp.zeros(items, slots.dtype).at[bins.ids.reshape(-1)].add(slots.reshape(-1), mode="drop")

@@ -34,7 +34,7 @@ def blend_attributes(
 
     **Source:** Kim et al. 2010, Eq. 1.
     """
-    covered = weight_sum > 0
+    covered = weight_sum != 0  # it is never negative, and NaN must stay
     return jnp.where(covered[None], sums / jnp.where(covered, weight_sum, 1.0)[None], 0.0)
 
 
@@ -67,7 +67,7 @@ def splat_surfaces(
     def surface(sums: Float[Array, "rows height width"]) -> Surface:
         weight_sum = sums[-1]
         blended = blend_attributes(sums[:-1], weight_sum)
-        nearness = jnp.where(weight_sum > 0, blended[-3] + blended[-2] * x + blended[-1] * y, 1.0)
+        nearness = jnp.where(weight_sum != 0, blended[-3] + blended[-2] * x + blended[-1] * y, 1.0)
         depth = view.depth(nearness)
         return Surface(blended[:-3], depth, weight_sum, coverage(weight_sum, settings.full_coverage))
 

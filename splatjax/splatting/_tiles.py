@@ -234,7 +234,7 @@ def _forward(sweep: _Sweep, bins: Bins, geometry, rows):
 
     def look_behind(i, out):
         picked = lax.dynamic_slice_in_dim(places, i * _PICKED, _PICKED)
-        real = (i * _PICKED + jnp.arange(_PICKED) < count)[:, None]
+        real = (i * _PICKED + jnp.arange(_PICKED, dtype=jnp.int32) < count)[:, None]
         tiles = sweep.picked(bins, picked, dtype)
         limit = limits[picked]
         below = jnp.where(gaps[picked] & real, limit, -jnp.inf)
@@ -270,7 +270,7 @@ def _backward(sweep: _Sweep, bins: Bins, geometry, rows, limits, cotangents):
 
     def behind(i, gradients):
         picked = lax.dynamic_slice_in_dim(places, i * _PICKED, _PICKED)
-        real = (i * _PICKED + jnp.arange(_PICKED) < open_count)[:, None]
+        real = (i * _PICKED + jnp.arange(_PICKED, dtype=jnp.int32) < open_count)[:, None]
         beyond = jnp.where(real, seconds[picked], jnp.inf)
         tiles = sweep.picked(bins, picked, dtype)
         return sweep.add_cotangents(planes, row_planes, tiles, beyond, limits[picked], d_behind[picked], gradients)
