@@ -1,9 +1,9 @@
 """Least squares with a handful of unknowns, in plain array operations.
 
-The fit solves thousands of tiny systems at once inside a loop. Batched LAPACK calls there were seen to wait for each other's threads
-for good on a machine of two cores; elimination in six columns needs none. Columns are scaled to unit length, so that the normal
-equations are benign (their condition number stays below 2000 for eight Gaussians), and one step of refinement makes up for having
-squared it.
+The fit solves thousands of tiny systems at once inside a loop. Batched LAPACK calls there were seen to wait for each other for
+good on a machine of two cores; elimination in six columns needs none. Columns are scaled to unit length, so that the normal
+equations are benign (their condition number stays below 2000 for eight Gaussians), and one step of refinement makes up for
+having squared it.
 """
 
 import jax
@@ -16,19 +16,21 @@ from lineax.internal import pack_structures, ravel_vector, unravel_solution
 @jax.custom_jvp
 def invert(matrix: Float[Array, "columns columns"]) -> Float[Array, "columns columns"]:
     """Invert a positive definite matrix by Gauss and Jordan's elimination, without pivoting."""
-    count = matrix.shape[0]
-    for column in range(count):
-        here = jnp.arange(count) == column
+    index = jnp.arange(matrix.shape[0])
+
+    def eliminate(column, matrix):
+        here = index == column
         pivot = matrix[column, column]
-        zeros = jnp.zeros_like(pivot)
+        zeros = jnp.zeros_like(matrix[column])
         left = jnp.where(here, zeros, matrix[:, column]) / pivot
         row = jnp.where(here, zeros, matrix[column])
         others = matrix - left[:, None] * row[None, :]
         at_row = jnp.broadcast_to(here[:, None], matrix.shape)
         at_column = jnp.broadcast_to(here[None, :], matrix.shape)
         unit = jnp.where(here, 1 / pivot, zeros)
-        matrix = jnp.where(at_column, (unit - left)[:, None], jnp.where(at_row, (row / pivot)[None, :], others))
-    return matrix
+        return jnp.where(at_column, (unit - left)[:, None], jnp.where(at_row, (row / pivot)[None, :], others))
+
+    return jax.lax.fori_loop(0, matrix.shape[0], eliminate, matrix)
 
 
 @invert.defjvp

@@ -39,13 +39,13 @@ def fit_gaussians(
 ) -> FitResult:
     r"""Fit a sum of Gaussians to a profile: the least Eq. 3 over variances and weights.
 
-    Variable projection: for given variances the best weights are a linear problem, solved inside; Levenberg and Marquardt's method
-    moves the logarithms of the variances. A fit with one Gaussian more starts from the best fit before, with a Gaussian inserted in
-    each gap and at both ends. Compiles once for each count and kind of profile.
+    Variable projection: for given variances the best weights are a linear problem, solved inside; Levenberg and Marquardt's
+    method moves the logarithms of the variances. A fit with one Gaussian more starts from the best fit before, with a Gaussian
+    inserted in each gap and at both ends. Compiles once for each count and kind of profile.
 
-    The result is differentiable in every float of the profile, by the implicit function theorem with the full Hessian of Eq. 3, in
-    forward and reverse mode; to first order. The precision follows the profile. In float32 errors below about 1e-5 are rounding,
-    and reaching that floor counts as success.
+    The result is differentiable in every float of the profile, by the implicit function theorem with the full Hessian of Eq. 3,
+    in forward and reverse mode; to first order. The precision follows the profile. In float32 errors below about 1e-5 are
+    rounding, and reaching that floor counts as success.
 
     **Arguments:**
 

@@ -12,7 +12,7 @@ from splatjax.scattering import RadialRule
 
 from ._problem import Problem, make_problem
 from ._search import search
-from ._stationary import has_converged, stationary
+from ._stationary import refine, stationary
 from ._weights import AbstractWeights
 
 
@@ -60,8 +60,9 @@ class VariancesPerChannel(AbstractSpread):
 
 
 def _fit(problem: Problem, count: int) -> tuple[SumOfGaussians, Float[Array, " channels"], Bool[Array, ""]]:
-    log_variances = stationary(problem, search(problem, count))
+    found, converged = refine(problem, search(problem, count))
+    log_variances = stationary(problem, found)
     gaussians = SumOfGaussians(problem.variances(log_variances), problem.energies(log_variances))
     residuals = problem.residuals(log_variances)
     error = jnp.sqrt(jnp.sum(residuals * residuals, axis=1))
-    return gaussians, error, has_converged(problem, log_variances)
+    return gaussians, error, converged

@@ -4,14 +4,18 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from ._dense import invert
+from ._dense import invert, normal_inverse
 from ._problem import Problem
 
 _GAIN = 1e-6
-"""A fit has converged when a Newton step would lower the sum of squares by less than this share of it,"""
+"""A fit has converged when a step of Gauss and Newton would lower the sum of squares by less than this share of it,"""
 
 _FLOOR = 100.0
 """or by less than the square of this many units of rounding of the profile's norm: there is no more in the numbers."""
+
+_STEPS = 32
+_STEP = 10.0
+"""A step in log variance below this many units of rounding is none."""
 
 
 def stationary(problem: Problem, found: Float[Array, " gaussians"]) -> Float[Array, " gaussians"]:
@@ -29,12 +33,34 @@ def stationary(problem: Problem, found: Float[Array, " gaussians"]) -> Float[Arr
     return jax.lax.custom_root(lambda point: problem.gradient(point), found, lambda _, guess: guess, tangent_solve)
 
 
-def has_converged(problem: Problem, found: Float[Array, " gaussians"]) -> Bool[Array, ""]:
-    """Give whether no small step could improve the fit by more than rounding or a millionth."""
-    problem, found = jax.lax.stop_gradient((problem, found))
-    gradient = problem.gradient(found)
-    hessian = jax.jacfwd(problem.gradient)(found)
-    gain = 0.5 * gradient @ invert(hessian) @ gradient
-    cost = jnp.sum(problem.residuals(found) ** 2)
+def refine(problem: Problem, start: Float[Array, " gaussians"]) -> tuple[Float[Array, " gaussians"], Bool[Array, ""]]:
+    """Finish a fit by Newton's method with the full Hessian; also give whether no small step could improve it any more."""
+    problem, start = jax.lax.stop_gradient((problem, start))
+
+    def cost_of(point):
+        return jnp.sum(problem.residuals(point) ** 2)
+
+    def step(state):
+        point, cost, _, steps = state
+        gradient = problem.gradient(point)
+        newton = invert(jax.jacfwd(problem.gradient)(point)) @ gradient
+        trial = point - newton
+        trial_cost = cost_of(trial)
+        # Once the steps are rounding, so are their gains and losses: they end the search, and are not taken.
+        better = (trial_cost < cost) & (jnp.max(jnp.abs(newton)) > _STEP * float(jnp.finfo(cost.dtype).eps))
+        return jnp.where(better, trial, point), jnp.where(better, trial_cost, cost), better, steps + 1
+
+    state = (start, cost_of(start), jnp.asarray(True), jnp.asarray(0))
+    found, cost, *_ = jax.lax.while_loop(lambda state: state[2] & (state[3] < _STEPS), step, state)
     floor = (_FLOOR * float(jnp.finfo(cost.dtype).eps)) ** 2
-    return jnp.isfinite(gain) & (jnp.abs(gain) <= _GAIN * cost + floor)
+    return found, _gain(problem, found) <= _GAIN * cost + floor
+
+
+def _gain(problem: Problem, point: Float[Array, " gaussians"]) -> Float[Array, ""]:
+    """Give by how much the sum of squares would fall if the residuals were linear: sound in float32, where the Hessian is not."""
+    residuals = problem.residuals(point).ravel()
+    slopes = jax.jacfwd(problem.residuals)(point).reshape(residuals.shape[0], -1)
+    lengths = jnp.sqrt(jnp.sum(slopes * slopes, axis=0))
+    slopes = slopes / jnp.broadcast_to(lengths, slopes.shape)
+    along = slopes.T @ residuals
+    return along @ normal_inverse(slopes) @ along

@@ -1,1 +1,3 @@
+"""Pictures of profiles, fits and errors."""
 
+from ._fit import plot_fit as plot_fit

@@ -63,7 +63,8 @@ class EganFresnel(AbstractFresnel):
     r"""The polynomial fits that published profiles were computed with.
 
     The first moment is that of Egan and Hilgeman as Donner and Jensen print it, the second that of d'Eon and Irving.
-    Differentiable except at `eta = 1`, where the fits step by 0.0017; there the moments are set to 0, so that A = 1.
+    Made for `eta` between about 0.5 and 2. Differentiable except at `eta = 1`, where the fits step by 0.0017; there the
+    moments are set to 0, so that A = 1.
 
     **Source:** Egan and Hilgeman 1979; Donner and Jensen 2005; d'Eon and Irving 2011.
     """

@@ -43,8 +43,12 @@ class RadialRule(eqx.Module):
         return jnp.broadcast_to(nodes[:, None], shape) * scale, jnp.broadcast_to(weights[:, None], shape) * scale
 
 
-NORM_RULE = RadialRule(smallest=1e-3, largest=1e4, count=128)
-"""For integrals of `r R^2` (Eq. 3 and Eq. 4): the neglected tail of a medium without absorption is 1e-16 of the whole."""
+NORM_RULE = RadialRule(smallest=1e-3, largest=1e4, count=192)
+"""For integrals of `r R^2` (Eq. 3 and Eq. 4): the neglected tail of a medium without absorption is 1e-16 of the whole.
+
+A fit is trusted to the square of its error, so that the nodes are many: with 128 an error of 1e-5 is wrong by a tenth,
+with 192 by 1e-7.
+"""
 
 TOTAL_RULE = RadialRule(smallest=1e-3, largest=1e7, count=256)
 """For integrals of `r R`, whose tails are long: without absorption they fall like 1/r, and 1e-7 is left out."""

@@ -1,0 +1,91 @@
+"""A profile, the Gaussians fitted to it, and what they leave."""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from matplotlib.figure import Figure
+
+from splatjax.fitting import relative_error
+from splatjax.gaussians import AbstractProfile, SumOfGaussians, gaussian
+
+_RGB = ("#c0392b", "#27853f", "#2c5aa0")
+_POINTS = 400
+_TAIL = 1e-7
+"""Share of its peak down to which a profile is drawn."""
+
+
+def plot_fit(profile: AbstractProfile, gaussians: SumOfGaussians, *, title: str | None = None) -> Figure:
+    r"""Draw a profile and its fit, on linear and on logarithmic axes, and the difference between them.
+
+    Three channels are drawn in red, green and blue; the single
+    Gaussians of the fit, with the mean weight of the channels, in gray.
+    The legend gives the error (Eq. 4) and the energy of the fit relative to the profile's, minus 1.
+
+    **Arguments:**
+
+    - `profile`: the reference, 1/mm^2.
+    - `gaussians`: the fit, with as many channels.
+    - `title`: of the figure.
+
+    **Returns:** a matplotlib `Figure`, which no window shows; `figure.savefig(path)` writes it.
+    """
+    r = _radii(profile)
+    reference, fitted = (np.asarray(model(r), np.float64) for model in (profile, gaussians))
+    error = np.asarray(relative_error(profile, gaussians))
+    energy = np.asarray(gaussians.total_reflectance() / profile.total_reflectance() - 1)
+    radii = np.asarray(r)
+    colors = _RGB if len(error) == 3 else [f"C{channel}" for channel in range(len(error))]
+
+    figure = Figure(figsize=(10, 7.5), layout="constrained")
+    grid = figure.add_gridspec(2, 2, height_ratios=(3, 2))
+    linear, log, residual = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[0, 1]), figure.add_subplot(grid[1, :])
+
+    parts = _parts(gaussians, r)
+    for part in parts.T:
+        log.loglog(radii, part, color="0.75", linewidth=0.8, zorder=1)
+    for channel, color in enumerate(colors):
+        label = f"E = {error[channel]:.2e}, energy {energy[channel]:+.2e}"
+        linear.plot(radii, radii * reference[:, channel], color=color, linewidth=3, alpha=0.35)
+        linear.plot(radii, radii * fitted[:, channel], color=color, linewidth=1.2, label=label)
+        log.loglog(radii, reference[:, channel], color=color, linewidth=3, alpha=0.35)
+        log.loglog(radii, fitted[:, channel], color=color, linewidth=1.2)
+        difference = radii * (fitted[:, channel] - reference[:, channel])
+        residual.semilogx(radii, difference / np.max(radii * reference[:, channel]), color=color, linewidth=1.2)
+
+    linear.set(xlabel="r (mm)", ylabel="r R(r) (1/mm)", xlim=(0, _core(radii, reference)), ylim=(0, None))
+    linear.set_title("profile (wide) and fit (narrow)", fontsize="medium")
+    linear.legend(fontsize="small", frameon=False)
+    bottom = _TAIL * reference.max()
+    log.set(
+        xlabel="r (mm)", ylabel="R(r) (1/mm²)", xlim=(radii[0], radii[-1]), ylim=(bottom, 3 * max(reference.max(), fitted.max()))
+    )
+    log.set_title("logarithmic, with each Gaussian (gray)", fontsize="medium")
+    residual.axhline(0, color="0.6", linewidth=0.8)
+    residual.set(xlabel="r (mm)", ylabel="r (fit - R) / max r R", xlim=(radii[0], radii[-1]))
+    residual.set_title("residual", fontsize="medium")
+    if title is not None:
+        figure.suptitle(title)
+    return figure
+
+
+def _radii(profile: AbstractProfile) -> Float[Array, " radii"]:
+    """From a hundredth of the smallest length scale to where every channel has fallen to the tail."""
+    scale = np.asarray(profile.length_scale(), np.float64)
+    r = jnp.geomspace(0.02 * scale.min(), 1e3 * scale.max(), 4 * _POINTS, dtype=profile.length_scale().dtype)
+    values = np.asarray(profile(r))
+    visible = np.any(values > _TAIL * values.max(), axis=1)
+    last = np.flatnonzero(visible)[-1]
+    return jnp.geomspace(r[0], r[last], _POINTS, dtype=r.dtype)
+
+
+def _core(radii: np.ndarray, reference: np.ndarray) -> float:
+    """The radius within which a channel keeps four fifths of the energy that is drawn, of the widest channel."""
+    ring = np.cumsum(np.gradient(radii)[:, None] * radii[:, None] * reference, axis=0)
+    within = np.argmax(ring >= 0.8 * ring[-1], axis=0)
+    return float(radii[within.max()])
+
+
+def _parts(gaussians: SumOfGaussians, r: Float[Array, " radii"]) -> np.ndarray:
+    shape = (*r.shape, *gaussians.variances.shape)
+    values = gaussian(jnp.broadcast_to(gaussians.variances, shape), jnp.broadcast_to((r * r)[:, None], shape))
+    return np.asarray(values * jnp.broadcast_to(jnp.mean(gaussians.weights, axis=1), shape))

@@ -1,0 +1,152 @@
+"""Materials as files: what is shipped, what comes back, what is refused."""
+
+import importlib.util
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from splatjax.gaussians import SumOfGaussians
+from splatjax.io import load_material, load_medium, materials, profiles_folder, save_material
+from splatjax.scattering import Dipole, Medium
+from splatjax.scene import Material
+
+REPRODUCED = 1e-5
+"""Eight digits are shipped; the rest is the freedom of an optimum."""
+
+HELD = 5e-7
+"""Sums of weights with eight digits, in float32."""
+
+JENSEN = tuple(name for name in materials() if name != "skin")
+GOOD_MEDIUM = '[medium]\nunit = "1/mm"\nsigma_a = [0.1]\nsigma_s_prime = [1.0]\neta = 1.3\n'
+GOOD_FIT = '[fit]\nunit = "mm^2"\nvariances = [0.1, 2.0]\nweights = [[0.2], [0.3]]\n'
+
+
+def tool():
+    path = Path(__file__).parents[2] / "tools" / "make_profiles.py"
+    spec = importlib.util.spec_from_file_location("make_profiles", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_twelve_of_jensen_and_skin_are_shipped():
+    expected = "apple chicken1 chicken2 cream ketchup marble potato skimmilk skin skin1 skin2 spectralon wholemilk"
+    assert materials() == tuple(expected.split())
+
+
+@pytest.mark.parametrize("name", materials())
+def test_every_material_loads_and_has_its_source(dtype, name):
+    material = load_material(name)
+    assert material.gaussians.variances.shape == (6,)
+    assert material.gaussians.weights.shape == (6, 3)
+    assert {leaf.dtype for leaf in jax.tree.leaves(material)} == {jnp.dtype(dtype)}
+    text = (profiles_folder() / f"{name}.toml").read_text(encoding="utf-8")
+    assert "citation = " in text
+    assert "provenance = " in text
+
+
+def test_skin_is_as_published():
+    skin = load_material("skin")
+    np.testing.assert_allclose(skin.gaussians.total_reflectance(), 1.0, rtol=1e-6)
+    mean_squared_radius = 2 * skin.gaussians.variances @ skin.gaussians.weights
+    np.testing.assert_allclose(mean_squared_radius, [2.7657, 0.13626, 0.049544], rtol=1e-4)
+    np.testing.assert_allclose([skin.eta, skin.roughness, skin.specular], [1.4, 0.3, 0.18], rtol=1e-6)
+    with pytest.raises(ValueError, match=r"skin.toml: has no \[medium\]"):
+        load_medium("skin")
+
+
+@pytest.mark.parametrize("name", JENSEN)
+def test_shipped_weights_sum_to_the_total_reflectance(name):
+    totals = load_material(name).gaussians.total_reflectance()
+    np.testing.assert_allclose(totals, Dipole(load_medium(name)).total_reflectance(), atol=HELD)
+
+
+def reproduce(name: str) -> None:
+    fitted = tool().fit_material(name)
+    with jax.enable_x64(True):
+        shipped = load_material(name).gaussians
+    np.testing.assert_allclose(fitted.gaussians.variances, shipped.variances, rtol=REPRODUCED)
+    np.testing.assert_allclose(fitted.gaussians.weights, shipped.weights, rtol=REPRODUCED, atol=REPRODUCED)
+
+
+@pytest.mark.parametrize("name", ["marble", "skin1", "ketchup"])
+def test_shipped_fits_are_reproduced(name):
+    reproduce(name)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [name for name in JENSEN if name not in ("marble", "skin1", "ketchup")])
+def test_the_other_shipped_fits_are_reproduced(name):
+    reproduce(name)
+
+
+def test_a_saved_material_comes_back_bit_for_bit(dtype, tmp_path):
+    weights = jnp.asarray([[1 / 3, 1e-9], [0.1, -0.2]], dtype)
+    material = Material(SumOfGaussians(jnp.asarray([1e-5, 2 / 3], dtype), weights), eta=1.37, specular=0.1, roughness=1.0)
+    medium = Medium(*(jnp.asarray(x, dtype) for x in ([0.0, 1 / 7], [1.0, 1e5], [1.3, 1.1])))
+    path = tmp_path / "mine.toml"
+    save_material(material, path, medium=medium, source={"citation": 'Me, "2024"'}, fit={"error": [0.1, 0.2], "count": 2})
+    for ours, theirs in zip(
+        jax.tree.leaves((material, medium)), jax.tree.leaves((load_material(path), load_medium(path))), strict=True
+    ):
+        np.testing.assert_array_equal(ours, theirs)
+    assert [file.name for file in tmp_path.iterdir()] == ["mine.toml"]
+
+
+def test_one_index_stands_for_all_channels(tmp_path):
+    path = tmp_path / "gray.toml"
+    path.write_text(GOOD_MEDIUM.replace("[0.1]", "[0.1, 0.2]").replace("[1.0]", "[1, 2]"))
+    np.testing.assert_allclose(load_medium(str(path)).eta, [1.3, 1.3], rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "hint"),
+    [("marbel", "did you mean 'marble'"), ("Skin", "did you mean 'skin'"), ("xyzzy", "known are apple, chicken1")],
+)
+def test_an_unknown_name_suggests_the_nearest(name, hint):
+    with pytest.raises(ValueError, match=rf"{name}: is no known material; {hint}"):
+        load_material(name)
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        (GOOD_MEDIUM.replace("[0.1]", "[-0.1]"), r"\[medium\] sigma_a must be finite and at least 0 \(1/mm\); it is \[-0.1\]"),
+        (GOOD_MEDIUM.replace("[1.0]", "[0.0]"), r"\[medium\] sigma_s_prime must be finite and positive"),
+        (GOOD_MEDIUM.replace("[1.0]", "[nan]"), r"\[medium\] sigma_s_prime must be finite and positive"),
+        (GOOD_MEDIUM.replace("[1.0]", '["1"]'), r"\[medium\] sigma_s_prime must be a list of numbers"),
+        (GOOD_MEDIUM.replace("[1.0]", "[true]"), r"\[medium\] sigma_s_prime must be a list of numbers"),
+        (GOOD_MEDIUM.replace("[1.0]", "[1.0, 2.0]"), r"one number per channel; they have 1, 2 and 1"),
+        (GOOD_MEDIUM.replace("1/mm", "1/cm"), r'\[medium\] unit must be "1/mm"; it is \'1/cm\''),
+        (GOOD_MEDIUM.replace('unit = "1/mm"\n', ""), r'\[medium\] unit must be "1/mm"; it is None'),
+        (GOOD_MEDIUM.replace("eta = 1.3\n", ""), r"\[medium\] has no eta"),
+        (GOOD_MEDIUM, r"has no \[fit\]"),
+        (GOOD_MEDIUM.replace("eta", "=eta"), r"is no TOML file"),
+        ('[source]\ncitation = "none"\n', r"has neither \[medium\] nor \[fit\]"),
+        ("medium = 3\n", r"\[medium\] must be a table"),
+        (GOOD_FIT + "[colour]\n", r"unknown entry 'colour'"),
+        (GOOD_FIT.replace("0.1, 2.0", "2.0, 0.1"), r"\[fit\] variances must ascend"),
+        (GOOD_FIT.replace("0.1, 2.0", "0.0, 2.0"), r"\[fit\] variances must be finite and positive"),
+        (GOOD_FIT.replace("mm^2", "mm"), r'\[fit\] unit must be "mm\^2"'),
+        (GOOD_FIT.replace("[[0.2], [0.3]]", "[[0.2]]"), r"\[fit\] weights must have 2 rows"),
+        (GOOD_FIT.replace("[[0.2], [0.3]]", "[0.2, 0.3]"), r"\[fit\] weights must be a list of finite numbers per Gaussian"),
+        (GOOD_FIT.replace("[0.2]", "[inf]"), r"\[fit\] weights must be a list of finite numbers"),
+        (GOOD_FIT + "[surface]\nroughness = 1.5\n", r"\[surface\] roughness must be a number, in \(0, 1\]; it is 1.5"),
+    ],
+)
+def test_a_bad_file_is_refused_with_the_remedy(tmp_path, text, complaint):
+    path = tmp_path / "bad.toml"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=rf"bad.toml: .*{complaint}") as raised:
+        load_material(path)
+    assert "\n" not in str(raised.value)
+
+
+def test_a_missing_file_is_refused_by_name(tmp_path):
+    with pytest.raises(ValueError, match=r"none.toml: cannot be read \(No such file or directory\)"):
+        load_material(tmp_path / "none.toml")

@@ -1,0 +1,43 @@
+"""What a plot of a fit must show."""
+
+import jax.numpy as jnp
+import matplotlib.pyplot
+import numpy as np
+import pytest
+
+from splatjax.gaussians import SumOfGaussians
+from splatjax.io import load_material, load_medium
+from splatjax.plots import plot_fit
+from splatjax.scattering import Dipole
+
+
+@pytest.fixture
+def figure():
+    return plot_fit(Dipole(load_medium("marble")), load_material("marble").gaussians, title="marble")
+
+
+def test_axes_have_names_and_units(figure):
+    assert len(figure.axes) == 3
+    for axes in figure.axes:
+        assert "(mm)" in axes.get_xlabel()
+        assert axes.get_ylabel()
+    assert "1/mm²" in figure.axes[1].get_ylabel()
+
+
+def test_legend_gives_error_and_energy(figure):
+    labels = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
+    assert len(labels) == 3
+    assert labels[0].startswith("E = 4.2")
+    assert "energy" in labels[0]
+
+
+def test_it_is_drawn_outside_of_pyplot_and_written(figure, tmp_path):
+    assert matplotlib.pyplot.get_fignums() == []
+    figure.savefig(tmp_path / "fit.png")
+    assert (tmp_path / "fit.png").stat().st_size > 10_000
+
+
+def test_one_channel_and_a_perfect_fit(dtype):
+    gaussians = SumOfGaussians(jnp.asarray([0.1, 2.0], dtype), jnp.asarray([[0.3], [0.4]], dtype))
+    residual = plot_fit(gaussians, gaussians).axes[2].lines[0].get_ydata()
+    np.testing.assert_array_equal(residual, 0)

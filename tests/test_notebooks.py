@@ -1,0 +1,24 @@
+"""Every notebook runs from top to bottom, and ends with what it claims."""
+
+import sys
+from pathlib import Path
+
+import jupytext
+import nbformat
+import pytest
+from nbclient import NotebookClient
+
+NOTEBOOKS = Path(__file__).parents[1] / "notebooks"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", sorted(NOTEBOOKS.glob("*.py")), ids=lambda path: path.stem)
+def test_notebook_runs_and_proves_its_claim(path, tmp_path):
+    notebook = jupytext.read(path)
+    assert "assert" in notebook.cells[-1].source
+    # The interpreter of the tests, whatever kernels are installed.
+    notebook.metadata.kernelspec = {"name": "python3", "display_name": sys.version, "language": "python"}
+    NotebookClient(notebook, timeout=600, resources={"metadata": {"path": str(tmp_path)}}).execute()
+    nbformat.validate(notebook)
+    pictures = [out for cell in notebook.cells for out in cell.get("outputs", []) if "image/png" in out.get("data", {})]
+    assert pictures
