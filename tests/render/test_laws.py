@@ -1,0 +1,161 @@
+"""Energy, white, interfaces, limits, and what silhouettes cover."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scenes import camera_over, sheet, skin, sphere
+
+import splatjax as sj
+from splatjax.diffusion import ClusterDiffuser
+from splatjax.io import load_material
+from splatjax.splatting import ShadowSettings
+
+EXITANCE_TOLERANCE = 1e-3
+EXACT = sj.RenderSettings(diffuser=ClusterDiffuser(cluster_size=0.0, pixel_size=0.0))
+
+
+def lamp(irradiance=(1.0, 1.0, 1.0), direction=(0.0, 0.0, -1.0), cast_shadows=False) -> sj.DirectionalLight:
+    return sj.DirectionalLight(jnp.asarray(direction, float), jnp.asarray(irradiance, float), cast_shadows)
+
+
+def matte(material: sj.Material) -> sj.Material:
+    return eqx.tree_at(lambda m: m.specular, material, jnp.zeros_like(material.specular))
+
+
+def middle(picture: jnp.ndarray) -> np.ndarray:
+    height, width = picture.shape[:2]
+    return np.asarray(picture[height // 4 : -height // 4, width // 4 : -width // 4])
+
+
+def test_exitance_over_irradiance_is_the_total_reflectance_of_marble():
+    material = matte(load_material("marble"))
+    scene = sj.Scene(sheet(1.0, 30.0), (lamp(),), material)
+    frame = sj.render(scene, camera_over(8.0, 32))
+    exitance = np.pi * middle(frame.diffuse)
+    reflectance = np.asarray(material.gaussians.total_reflectance())
+    np.testing.assert_allclose(exitance, np.broadcast_to(reflectance, exitance.shape), rtol=EXITANCE_TOLERANCE)
+    held = np.asarray(sj.Dipole(sj.load_medium("marble")).total_reflectance())
+    np.testing.assert_allclose(reflectance, held, rtol=EXITANCE_TOLERANCE)
+
+
+def test_white_material_with_an_albedo_map_gives_the_albedo():
+    albedo = jnp.asarray([0.8, 0.4, 0.1], float)
+    splats = sheet(1.0, 20.0)
+    splats = eqx.tree_at(lambda s: s.albedo, splats, jnp.tile(albedo, (splats.count, 1)), is_leaf=lambda leaf: leaf is None)
+    scene = sj.Scene(splats, (lamp(),), matte(load_material("marble")).white())
+    frame = sj.render(scene, camera_over(5.0, 32))
+    exitance = np.pi * middle(frame.diffuse)
+    np.testing.assert_allclose(exitance, np.broadcast_to(albedo, exitance.shape), rtol=EXITANCE_TOLERANCE)
+
+
+def test_a_white_diffuser_facing_pi_has_radiance_one():
+    gaussians = sj.SumOfGaussians(jnp.ones(1), jnp.ones((1, 3)))
+    scene = sj.Scene(sheet(1.0, 20.0), (lamp((np.pi,) * 3),), sj.Material(gaussians, specular=0.0))
+    np.testing.assert_allclose(middle(sj.render(scene, camera_over(5.0, 32)).beauty), 1.0, rtol=EXITANCE_TOLERANCE)
+
+
+@pytest.mark.slow
+def test_white_furnace():
+    count = 1024  # with 512 the lobe is summed too coarsely at the very rim: 1.0054 at most, 1.0006 with 2048
+    i = np.arange(count) + 0.5
+    z = 1 - 2 * i / count
+    turn, across = np.pi * (1 + 5**0.5) * i, np.sqrt(1 - z * z)
+    directions = np.stack([np.cos(turn) * across, np.sin(turn) * across, z], 1)
+    # radiance 1 from everywhere: each light stands for its share of the sphere
+    lights = tuple(lamp((4 * np.pi / count,) * 3, tuple(direction)) for direction in directions)
+    scene = sj.Scene(sphere(4000), lights, sj.Material(skin().white()))
+    camera = sj.Camera.look_at(jnp.asarray([0.0, 0.0, 400.0], float), jnp.zeros(3), fov=16.0, width=48, height=48)
+    frame = sj.render(scene, camera)
+    covered = np.asarray(frame.coverage) > 0.999
+    radiance = np.asarray(frame.beauty)[covered]
+    assert covered.sum() > 1000
+    assert radiance.max() <= 1.005
+    assert radiance.min() >= 0.98
+
+
+@pytest.mark.slow
+def test_energy_does_not_depend_on_how_finely_half_the_sheet_is_splatted():
+    coarse, fine = sheet(0.4, 16.0), sheet(0.2, 16.0)
+    # cells of the coarse sheet end at x = 0.2, and there those of the shifted fine one begin
+    fine = eqx.tree_at(lambda s: s.centers, fine, fine.centers + jnp.asarray([[0.1, 0.1, 0.0]], float))
+    left, right = np.asarray(coarse.centers)[:, 0] < 0.1, np.asarray(fine.centers)[:, 0] > 0.25
+    mixed = sj.Splats(
+        *(
+            jnp.concatenate([getattr(coarse, name)[left], getattr(fine, name)[right]])
+            for name in ("centers", "normals", "radii", "areas")
+        )
+    )
+    gaussians = sj.SumOfGaussians(jnp.asarray([2.0, 5.0], float), jnp.full((2, 1), 0.5, float))
+    beam = sj.GaussianBeam(jnp.asarray([0.0, 0.0, 10.0], float), jnp.asarray([0.0, 0.0, -1.0], float), jnp.ones(1), jnp.ones(()))
+    camera = camera_over(5.0, 32)
+    pictures = []
+    for splats in (coarse, mixed):
+        scene = sj.Scene(splats, (beam,), sj.Material(gaussians, specular=0.0))
+        pictures.append(np.asarray(sj.render(scene, camera, EXACT).diffuse)[..., 0])
+    seen = pictures[0] > 1e-2 * pictures[0].max()
+    assert np.max(np.abs(pictures[1] / pictures[0] - 1)[seen]) < 0.01
+
+
+def test_layers_add_up_to_the_diffuse_picture_and_that_to_beauty(bumpy_frame):
+    frame = bumpy_frame
+    total = np.einsum("kc,khwc->hwc", np.asarray(frame.weights, np.float64), np.asarray(frame.layers, np.float64))
+    np.testing.assert_allclose(np.asarray(frame.diffuse), total, atol=1e-6)
+    np.testing.assert_allclose(np.asarray(frame.beauty), np.asarray(frame.diffuse + frame.specular), atol=1e-6)
+
+
+def test_a_closed_surface_has_no_hole(bumpy_frame):
+    coverage = np.asarray(bumpy_frame.coverage)
+    y, x = np.mgrid[0 : coverage.shape[0], 0 : coverage.shape[1]] + 0.5
+    radius = np.hypot(x - coverage.shape[1] / 2, y - coverage.shape[0] / 2)
+    outline = radius[coverage > 0.5].max()
+    assert np.all(coverage[radius < outline - 2] == 1)
+    assert np.all(coverage[radius > outline + 2] == 0)
+
+
+@pytest.fixture(scope="module")
+def bumpy_frame() -> sj.Frame:
+    """A sphere of skin lit from the side."""
+    scene = sj.Scene(sphere(3000), (lamp((3.0, 3.0, 3.0), (-1.0, -0.3, -0.5), cast_shadows=True),), sj.Material(skin()))
+    camera = sj.Camera.look_at(jnp.asarray([0.0, 0.0, 400.0], float), jnp.zeros(3), fov=18.0, width=64, height=64)
+    settings = sj.RenderSettings(shadows=ShadowSettings(resolution=256))
+    return sj.render(scene, camera, settings)
+
+
+def test_light_is_added_linearly():
+    splats, material = sphere(1500), sj.Material(skin())
+    camera = sj.Camera.look_at(jnp.asarray([0.0, 0.0, 400.0], float), jnp.zeros(3), fov=18.0, width=32, height=32)
+    lights = lamp((1.0, 2.0, 3.0), (-1.0, 0.0, -0.2)), lamp((3.0, 1.0, 0.5), (0.5, -1.0, -0.7))
+    both, *single = (sj.render(sj.Scene(splats, each, material), camera).beauty for each in (lights, lights[:1], lights[1:]))
+    np.testing.assert_allclose(np.asarray(both), np.asarray(single[0] + single[1]), atol=2e-6)
+
+
+def test_no_splats_and_no_lights_give_an_empty_and_a_black_picture():
+    material = sj.Material(skin())
+    camera = camera_over(5.0, 16)
+    nothing = sj.Splats(jnp.zeros((0, 3)), jnp.zeros((0, 3)), jnp.zeros(0), jnp.zeros(0))
+    empty = sj.render(sj.Scene(nothing, (lamp(),), material), camera)
+    assert np.all(np.asarray(empty.coverage) == 0)
+    assert np.all(np.asarray(empty.beauty) == 0)
+    assert np.all(np.isinf(np.asarray(empty.depth)))
+    dark = sj.render(sj.Scene(sheet(1.0, 5.0), (), material), camera)
+    assert np.all(np.asarray(dark.beauty) == 0)
+    assert dark.shadow.shape == (0, 16, 16)
+
+
+def test_a_plan_that_does_not_suffice_poisons_the_picture_and_says_so():
+    material = sj.Material(skin())
+    camera = camera_over(5.0, 32)
+    few, many = (sj.Scene(sheet(spacing, 6.0), (lamp(),), material) for spacing in (2.0, 0.25))
+    plan = sj.plan(many, camera)
+    wider = eqx.tree_at(lambda s: s.material.gaussians.variances, many, many.material.gaussians.variances * 2)
+    frame = sj.render(wider, camera, plan=plan)
+    assert float(frame.overflow) > 1
+    assert np.all(np.isnan(np.asarray(frame.beauty)))
+    assert float(sj.render(few, camera).overflow) == 0
+
+
+def test_channels_that_disagree_are_refused():
+    scene = sj.Scene(sheet(1.0, 3.0), (lamp((1.0,)),), sj.Material(skin()))
+    with pytest.raises(ValueError, match=r"lights\[0\] has 1 channels"):
+        sj.render(scene, camera_over(2.0, 8))
