@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from . import diffusion as _diffusion, shading as _shading, splatting as _splatting
@@ -134,7 +135,7 @@ def _see_and_diffuse(scene: Scene, attributes: dict[str, Array], view, settings:
 def _plan_unless_traced(scene: Scene, camera: Camera, settings: RenderSettings, plan: Plan | None) -> Plan:
     if plan is not None:
         return plan
-    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((scene, camera))):
+    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((scene, camera))):
         raise ValueError("under jit, grad or vmap a plan is needed: plan=splatjax.plan(scene, camera, settings), made outside")
     return _make_plan(scene, camera, settings)
 

@@ -134,7 +134,6 @@ class ClusterDiffuser(AbstractDiffuser):
 
     def _layer(self, clusters: Clusters, variance, layer: LayerPlan, points, covered, view: AbstractView):
         """Evaluate one layer at the samples of both surfaces and resample it to the pixels of both."""
-        assert layer.capacity is not None
         grid = self._grid(view.width, view.height, layer.stride)
         if layer.stride == 1:
             each = [
@@ -150,6 +149,7 @@ class ClusterDiffuser(AbstractDiffuser):
 
     def _integrals(self, clusters: Clusters, variance, layer: LayerPlan, points, there, grid: TileGrid, view, order: int):
         """Give numerator over denominator at points, and for `order` 1 its slope in space."""
+        assert layer.capacity is not None
         # A cluster is as wide as its splats are spread.
         wide = variance + clusters.spread
         mass = clusters.areas * variance / wide
