@@ -17,6 +17,7 @@
 # renderer wants it as a sum of Gaussians, $R(r) \approx \sum_i w_i\, G(v_i, r)$: one blurred layer for each. Here we fit one.
 
 # %%
+# %matplotlib inline
 import jax
 import numpy as np
 

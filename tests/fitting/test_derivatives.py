@@ -18,9 +18,8 @@ STEP = 1e-4
 IN_FLOAT32 = 1e-3
 """The Hessian of a fit with an error of 1e-2 loses some three of float32's seven digits."""
 
-SIGMA_A = np.asarray([0.0021, 0.0071])
-SIGMA_S_PRIME = np.asarray([2.19, 3.0])
-ETA = np.asarray([1.5, 1.5])
+POINT = np.log([0.0021, 0.0071, 2.19, 3.0, 1.5, 1.5])
+"""Logarithms of sigma_a, sigma_s' and eta of marble's red and blue."""
 
 
 def fit(point, spread, weights):
@@ -31,38 +30,25 @@ def fit(point, spread, weights):
     return jnp.concatenate([jnp.log(gaussians.variances).ravel(), jnp.log(gaussians.weights).ravel(), fitted.error])
 
 
-@pytest.mark.parametrize(
-    ("spread", "weights"),
-    [
-        (SharedVariances(), TotalReflectanceHeld()),
-        pytest.param(SharedVariances(), FreeWeights(), marks=pytest.mark.slow),
-        pytest.param(VariancesPerChannel(), FreeWeights(), marks=pytest.mark.slow),
-        pytest.param(VariancesPerChannel(), TotalReflectanceHeld(), marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("weights", [FreeWeights(), TotalReflectanceHeld()])
+@pytest.mark.parametrize("spread", [SharedVariances(), VariancesPerChannel()])
 def test_derivative_of_a_fit_is_that_of_refits(float64, spread, weights):
-    point = jnp.log(jnp.asarray(np.concatenate([SIGMA_A, SIGMA_S_PRIME, ETA])))
     run = eqx.filter_jit(fit)
-    forward = eqx.filter_jit(jax.jacfwd(fit))(point, spread, weights)
-    steps = STEP * np.eye(6)
-    differences = np.stack(
-        [np.asarray(run(point + step, spread, weights) - run(point - step, spread, weights)) / (2 * STEP) for step in steps],
-        axis=1,
-    )
+    forward = eqx.filter_jit(jax.jacfwd(fit))(POINT, spread, weights)
+    differences = [(run(POINT + h, spread, weights) - run(POINT - h, spread, weights)) / (2 * STEP) for h in STEP * np.eye(6)]
     assert np.max(np.abs(forward)) > 0.5
-    np.testing.assert_allclose(forward, differences, rtol=REFITS, atol=REFITS)
+    np.testing.assert_allclose(forward, np.stack(differences, axis=1), rtol=REFITS, atol=REFITS)
 
 
-def test_reverse_mode_is_the_transpose_of_forward_mode(float64):
-    point = jnp.log(jnp.asarray(np.concatenate([SIGMA_A, SIGMA_S_PRIME, ETA])))
+def test_reverse_mode_gives_the_derivative_of_refits(float64):
+    @jax.jit
+    def run(point):
+        return jnp.sum(jnp.sin(fit(point, SharedVariances(), TotalReflectanceHeld())))
 
-    def run(x):
-        return fit(x, SharedVariances(), TotalReflectanceHeld())
-
-    direction = jnp.asarray([0.3, -0.2, 0.5, 0.1, -0.4, 0.2])
-    value, pushed = jax.jit(lambda x: jax.jvp(run, (x,), (direction,)))(point)
-    reverse = jax.jit(jax.grad(lambda x: jnp.sum(jnp.sin(run(x)))))(point)
-    np.testing.assert_allclose(reverse @ direction, np.cos(value) @ pushed, rtol=1e-9)
+    reverse = jax.jit(jax.grad(run))(POINT)
+    differences = [(run(POINT + h) - run(POINT - h)) / (2 * STEP) for h in STEP * np.eye(6)]
+    np.testing.assert_allclose(reverse, differences, rtol=REFITS, atol=REFITS)
 
 
 @pytest.mark.slow

