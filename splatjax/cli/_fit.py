@@ -20,7 +20,7 @@ class Fit:
     Double precision. Variances are shared by the channels. The sum of the weights is held at the total reflectance of the
     profile, so that the picture keeps its energy, unless --free is given.
 
-    Example: splatjax fit marble --count 6 --output marble.toml
+    Example: splatjax fit marble --count 6 --output marble.toml --plot marble.png
     """
 
     medium: tyro.conf.Positional[str]
@@ -31,11 +31,15 @@ class Fit:
     """Leave the sum of the weights free: the least error of Eq. 3, which may miss some of the energy."""
     output: OptionalPath = None
     """TOML file to write the material to."""
+    plot: OptionalPath = None
+    """Picture to write of profile, fit and error: .png, .pdf or .svg."""
 
     def run(self) -> None:
         """Fit, print, write."""
         if self.output is not None:
             check_output(self.output, (".toml",))
+        if self.plot is not None:
+            check_output(self.plot, (".png", ".pdf", ".svg"))
         with jax.enable_x64(True):
             self._run()
 
@@ -52,6 +56,14 @@ class Fit:
             source = {"provenance": f"fitted by splatjax {sj.__version__} to the coefficients of {self.medium}"}
             sj.save_material(material, self.output, medium=medium, source=source, fit=self._how(fitted))
             print(self.output)
+        if self.plot is not None:
+            from splatjax.io import atomic_path
+            from splatjax.plots import plot_fit  # loads matplotlib
+
+            figure = plot_fit(profile, fitted.gaussians, title=f"{self.medium}, {self.count} Gaussians")
+            with atomic_path(self.plot) as written:
+                figure.savefig(written)
+            print(self.plot)
 
     def _how(self, fitted: sj.FitResult) -> dict[str, object]:
         return {

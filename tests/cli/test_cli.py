@@ -67,11 +67,12 @@ def test_materials_lists_the_library(capsys):
 
 
 def test_fit_prints_and_writes_a_material_that_loads(tmp_path, capsys):
-    output = tmp_path / "mine.toml"
-    assert main(["fit", "skin1", "--count", "2", "--output", str(output)]) == 0
+    output, plot = tmp_path / "mine.toml", tmp_path / "mine.png"
+    assert main(["fit", "skin1", "--count", "2", "--output", str(output), "--plot", str(plot)]) == 0
     printed = capsys.readouterr().out
     assert "error (Eq. 4)" in printed
-    assert printed.splitlines()[-1] == str(output)
+    assert printed.splitlines()[-2:] == [str(output), str(plot)]
+    assert min(Image.open(plot).size) > 400
     material, medium = sj.load_material(output), sj.load_medium("skin1")
     assert material.gaussians.weights.shape == (2, 3)
     total = sj.Dipole(medium).total_reflectance()
