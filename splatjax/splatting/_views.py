@@ -11,6 +11,7 @@ so that the surface in front has the largest nearness and no fragment needs a sq
 """
 
 import abc
+import math
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -124,18 +125,19 @@ def _rows(matrix: Float[Array, "3 3"], vectors: Float[Array, "3 splats"]) -> tup
 _SLOPE_FILTER = 0.25  # pixels; see _filtered
 
 
-def _filtered(xx, xy, yy, vx, vy, filter_radius):
+def _filtered(xx, xy, yy, root, dx, dy, vx, vy, filter_radius):
     """Widen the rim's ellipse by the screen filter: its inverse, the plane's slope, the ellipse, its determinant's root.
 
-    The ellipse `d^T S^-1 d = 1` grows to `S + f^2 I`. `(vx, vy)` is `S slope`: the slope itself is infinite edge on, so a
-    quarter of a pixel is added before it is divided by `S`. Hits stay on the plane of every splat that a pixel can resolve.
+    The ellipse `d^T S^-1 d = 1` grows to `S + f^2 I`; `root` is that of `det S`, `(dx, dy)` is `det S slope` and `(vx, vy)` is
+    `S slope`: the slope itself is infinite edge on, so a quarter of a pixel is added to `S` before it is divided by it. Hits
+    stay on the plane of every splat that a pixel can resolve. No term cancels another: float32 holds however slanted the splat.
     """
-    sxx, syy = xx + _SLOPE_FILTER**2, yy + _SLOPE_FILTER**2
-    inverse = 1 / (sxx * syy - xy * xy)
-    slope_x, slope_y = (syy * vx - xy * vy) * inverse, (sxx * vy - xy * vx) * inverse
-    xx, yy = xx + filter_radius**2, yy + filter_radius**2
-    determinant = xx * yy - xy * xy
-    inverse = 1 / determinant
+    determinant, trace, fine = root * root, xx + yy, _SLOPE_FILTER**2
+    inverse = 1 / (determinant + fine * (trace + fine))
+    slope_x, slope_y = (dx + fine * vx) * inverse, (dy + fine * vy) * inverse
+    wide = filter_radius**2
+    determinant = determinant + wide * (trace + wide)
+    xx, yy, inverse = xx + wide, yy + wide, 1 / determinant
     return yy * inverse, -2 * xy * inverse, xx * inverse, slope_x, slope_y, xx, yy, jnp.sqrt(determinant)
 
 
@@ -169,18 +171,19 @@ class PerspectiveView(AbstractView):
         pz = jnp.where(in_front, pz, 1.0)
         u, v = px / pz, py / pz
         facing = -(nx * u + ny * v + nz)
-        visible = in_front & (facing > 0)
+        visible = in_front & (facing > 0) & self._in_cone(px, py, pz, splats.radii)
         # The disc's ellipse: S = (r f / z)^2 P (I - n n^T) P^T, with P = [[1, 0, -u], [0, 1, -v]].
         scale = self.focal_length / pz
         squared = (splats.radii * scale) ** 2
-        an, bn = nx - u * nz, ny - v * nz
-        xx = squared * (1 + u * u - an * an)
-        xy = squared * (u * v - an * bn)
-        yy = squared * (1 + v * v - bn * bn)
-        along = splats.radii * splats.radii * scale / pz
-        vx, vy = along * (u + an * nz), along * (v + bn * nz)
-        a, b, c, gx, gy, xx, yy, root = _filtered(xx, xy, yy, vx, vy, settings.filter_radius)
-        opacity = jnp.where(visible, squared * facing / root, 0.0)
+        an, bn = u * nx + nz, v * ny + nz
+        xx = squared * (ny * ny * (1 + u * u) + an * an)
+        xy = squared * (u * ny * bn + v * nx * an - nx * ny)
+        yy = squared * (nx * nx * (1 + v * v) + bn * bn)
+        across, along = squared * facing, squared / self.focal_length
+        dx, dy = -across * along * nx, -across * along * ny
+        vx, vy = along * (u + (nx - u * nz) * nz), along * (v + (ny - v * nz) * nz)
+        a, b, c, gx, gy, xx, yy, root = _filtered(xx, xy, yy, across, dx, dy, vx, vy, settings.filter_radius)
+        opacity = jnp.where(visible, across / root, 0.0)
         inverse = 1 / pz
         square = inverse * inverse
         # The rim is a conic; its box is exact while the splat does not reach the plane of the pinhole.
@@ -211,6 +214,12 @@ class PerspectiveView(AbstractView):
             bottom=stop_gradient(mid_y + half_y),
             visible=visible,
         )
+
+    def _in_cone(self, x, y, z, radii):
+        """Say which spheres touch the cone around the picture. Others, far to the side, are beyond what float32 projects."""
+        corner = 0.5 * math.hypot(self.width, self.height) + 8  # pixels; the filter reaches beyond a sphere
+        off_axis = jnp.sqrt(stop_gradient(x * x + y * y))
+        return off_axis * self.focal_length - z * corner < radii * jnp.sqrt(self.focal_length**2 + corner**2)
 
     @staticmethod
     def inside(nearness, quadric):
@@ -280,9 +289,11 @@ class OrthographicView(AbstractView):
         nx, ny, nz = _rows(self.rotation, splats.normals.T)
         visible = nz < 0
         squared = (splats.radii * self.scale) ** 2
-        xx, xy, yy = squared * (1 - nx * nx), squared * (-nx * ny), squared * (1 - ny * ny)
-        along = -splats.radii * splats.radii * self.scale * nz
-        a, b, c, gx, gy, xx, yy, root = _filtered(xx, xy, yy, along * nx, along * ny, settings.filter_radius)
+        xx, xy, yy = squared * (ny * ny + nz * nz), squared * (-nx * ny), squared * (nx * nx + nz * nz)
+        across, along = -squared * nz, squared / self.scale
+        dx, dy = across * along * nx, across * along * ny
+        vx, vy = -along * nz * nx, -along * nz * ny
+        a, b, c, gx, gy, xx, yy, root = _filtered(xx, xy, yy, across, dx, dy, vx, vy, settings.filter_radius)
         x, y = self.width / 2 + self.scale * px, self.height / 2 + self.scale * py
         half_x, half_y = jnp.sqrt(xx), jnp.sqrt(yy)
         filter_radius = jnp.broadcast_to(settings.filter_radius / self.scale, splats.radii.shape)
@@ -296,7 +307,7 @@ class OrthographicView(AbstractView):
             c=c,
             nearness=-pz,
             shift=stop_gradient(_epsilon(splats.radii, filter_radius, -nz, settings)),
-            opacity=jnp.where(visible, -squared * nz / root, 0.0),
+            opacity=jnp.where(visible, across / root, 0.0),
             left=stop_gradient(x - half_x),
             right=stop_gradient(x + half_x),
             top=stop_gradient(y - half_y),

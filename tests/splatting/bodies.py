@@ -1,0 +1,86 @@
+"""Bodies and views to splat: normals and areas are those of the surface."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from splatjax.scene import Camera, Splats
+from splatjax.splatting import OrthographicView, PerspectiveView
+
+
+def splats(centers, normals, radii, areas=None) -> Splats:
+    """Make splats in JAX's default precision from NumPy arrays of any."""
+    normals = np.asarray(normals, float)
+    normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    radii = np.broadcast_to(np.asarray(radii, float), len(normals))
+    areas = (radii / 1.5) ** 2 if areas is None else areas
+    return Splats(*(jnp.asarray(each, float) for each in (centers, normals, radii, areas)))
+
+
+def directions(count: int, jitter: float = 0.35, seed: int = 0) -> np.ndarray:
+    """Spread directions over the sphere; `jitter` in spacings."""
+    i = np.arange(count) + 0.5
+    z, turn = 1 - 2 * i / count, np.pi * (1 + 5**0.5) * i
+    across = np.sqrt(1 - z * z)
+    u = np.stack([np.cos(turn) * across, np.sin(turn) * across, z], 1)
+    u += np.random.default_rng(seed).normal(size=u.shape) * jitter * np.sqrt(4 * np.pi / count)
+    return u / np.linalg.norm(u, axis=1, keepdims=True)
+
+
+def sphere(count: int, radius: float = 10.0, center=(0.0, 0.0, 0.0), jitter: float = 0.35, seed: int = 0) -> Splats:
+    u = directions(count, jitter, seed)
+    area = 4 * np.pi * radius**2 / count
+    return splats(np.asarray(center) + radius * u, u, 1.5 * np.sqrt(area), np.full(count, area))
+
+
+def bumpy(count: int, radius: float = 10.0, seed: int = 0) -> Splats:
+    """A closed body with bumps, its normals from the tangents of the surface."""
+
+    def surface(u):
+        bump = 0.08 * np.sin(4 * u[:, 0] + 1) * np.cos(3 * u[:, 1]) + 0.04 * np.sin(7 * u[:, 1] + 2 * u[:, 2])
+        return radius * u * (1 + bump)[:, None]
+
+    u = directions(count, seed=seed)
+    helper = np.where(np.abs(u[:, :1]) < 0.9, [[1.0, 0, 0]], [[0, 1.0, 0]])
+    a = np.cross(u, helper)
+    a /= np.linalg.norm(a, axis=1, keepdims=True)
+    step = 1e-5
+
+    def tangent(t):
+        ends = [surface(each / np.linalg.norm(each, axis=1, keepdims=True)) for each in (u + step * t, u - step * t)]
+        return (ends[0] - ends[1]) / (2 * step)
+
+    normal = np.cross(tangent(a), tangent(np.cross(u, a)))
+    density = np.linalg.norm(normal, axis=1)
+    normal *= np.sign(np.sum(normal * u, axis=1))[:, None]
+    areas = density * 4 * np.pi / count
+    return splats(surface(u), normal, 1.5 * np.sqrt(areas), areas)
+
+
+def joined(*bodies: Splats) -> Splats:
+    return Splats(*(jnp.concatenate([getattr(b, name) for b in bodies]) for name in ("centers", "normals", "radii", "areas")))
+
+
+def sheet(half_width: float, spacing: float, normal=(0.0, 0.0, 1.0), center=(0.0, 0.0, 0.0)) -> Splats:
+    """A flat sheet of splats on a grid."""
+    normal = np.asarray(normal, float) / np.linalg.norm(normal)
+    a = np.cross(normal, [1.0, 0, 0] if abs(normal[0]) < 0.9 else [0, 1.0, 0])
+    a /= np.linalg.norm(a)
+    line = np.arange(-half_width, half_width + 1e-9, spacing)
+    x, y = (each.reshape(-1, 1) for each in np.meshgrid(line, line))
+    centers = np.asarray(center) + x * a + y * np.cross(normal, a)
+    return splats(centers, np.tile(normal, (len(x), 1)), 1.5 * spacing)
+
+
+def perspective(eye=(0.0, 0.0, 40.0), target=(0.0, 0.0, 0.0), fov=35.0, width=40, height=32) -> PerspectiveView:
+    eye, target = (jnp.asarray(each, float) for each in (eye, target))
+    return PerspectiveView.of(Camera.look_at(eye, target, fov=fov, width=width, height=height))
+
+
+def orthographic(scale=1.2, width=40, height=32) -> OrthographicView:
+    """Look along a slanted axis at the origin."""
+    forward = np.asarray([0.2, -0.3, -1.0])
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, [0, 1.0, 0])
+    right /= np.linalg.norm(right)
+    rotation = jnp.asarray(np.stack([right, np.cross(forward, right), forward]), float)
+    return OrthographicView(jnp.zeros(3), rotation, jnp.asarray(scale, float), width, height)

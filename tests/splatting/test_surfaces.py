@@ -1,0 +1,96 @@
+"""Laws of Eq. 1 and of coverage."""
+
+import bodies
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from splatjax.splatting import DenseRasterizer, SplattingSettings, TileRasterizer, splat_surfaces
+
+SETTINGS = SplattingSettings()
+VIEWS = {"perspective": bodies.perspective, "orthographic": bodies.orthographic}
+PLANE = 1e-5  # of the distance: float32's rounding, and what the quarter pixel in the slopes leaves
+DISTANCE = 40.0
+
+
+def drawn(view, body, rows, rasterizer=None):
+    """Draw with the plain rasterizer, unless another is given."""
+    rasterizer = DenseRasterizer() if rasterizer is None else rasterizer
+    return jax.jit(lambda s, r: splat_surfaces(view.footprints(s, SETTINGS), r, view, SETTINGS, rasterizer))(body, rows)
+
+
+@pytest.mark.parametrize("kind", VIEWS)
+def test_a_constant_is_kept_and_a_plane_stays_a_plane(kind, dtype):
+    """Large enough splats: a quarter of a pixel is added to the ellipse that a slope is divided by."""
+    normal = np.asarray([0.4, 0.3, 1.0]) / np.linalg.norm([0.4, 0.3, 1.0])
+    view = VIEWS[kind]()
+    if kind == "orthographic":
+        normal = -np.asarray(view.rotation, float)[2] + [0.3, 0.3, 0.0]
+        normal /= np.linalg.norm(normal)
+    body = bodies.sheet(30.0, 2.0, normal)
+    surfaces = drawn(view, body, jnp.full((1, body.count), 0.3))
+    assert float(jnp.min(surfaces.front.coverage)) == 1
+    rounding = 4 * float(jnp.finfo(dtype).eps)
+    np.testing.assert_allclose(np.asarray(surfaces.front.attributes), 0.3, rtol=rounding)
+    x, y = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
+    x, y = (jnp.asarray(each, dtype) for each in (x, y))
+    points = np.asarray(view.unproject(x, y, surfaces.front.depth), float)
+    off_plane = np.abs(np.tensordot(normal, points, 1))
+    assert off_plane.max() < PLANE * DISTANCE
+
+
+def seen_sphere(view, radius, share):
+    """Say which pixels see a sphere around the origin within `share` of its silhouette's radius."""
+    column, row = np.meshgrid(np.arange(view.width) + 0.5 - view.width / 2, np.arange(view.height) + 0.5 - view.height / 2)
+    tangent = np.hypot(column, row) / float(view.focal_length)
+    return tangent < share * radius / np.sqrt(DISTANCE**2 - radius**2)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_coverage_is_one_inside_a_closed_surface(seed):
+    view, radius = bodies.perspective(width=48, height=48), 11.0
+    surfaces = drawn(view, bodies.sphere(1500, radius, seed=seed), jnp.zeros((0, 1500)))
+    inside, outside = seen_sphere(view, radius, 0.93), ~seen_sphere(view, radius, 1.15)
+    front = np.asarray(surfaces.front.coverage)
+    assert inside.sum() > 600
+    assert np.min(front[inside]) == 1
+    assert np.max(front[outside]) == 0
+
+
+@pytest.mark.parametrize("rasterizer", ["plain", "tiles"])
+def test_an_inner_silhouette_leaves_no_gap(rasterizer):
+    """A small sphere before a large one: where the small one ends, the large one shows."""
+    view, radius = bodies.perspective(width=48, height=48), 12.0
+    body = bodies.joined(bodies.sphere(1400, radius), bodies.sphere(300, 3.0, (1.5, -1.0, 17.0), seed=1))
+    near = jnp.concatenate([jnp.zeros((1, 1400)), jnp.ones((1, 300))], axis=1)
+    tiles = TileRasterizer(lanes=8, slots=16).planned([jax.jit(lambda s: view.footprints(s, SETTINGS))(body)], view)
+    surfaces = drawn(view, body, near, DenseRasterizer() if rasterizer == "plain" else tiles)
+    front, behind = np.asarray(surfaces.front.coverage), np.asarray(surfaces.behind.coverage)
+    inside = seen_sphere(view, radius, 0.9)
+    edge = inside & (front < 1)
+    assert edge.sum() >= 8, "the silhouette lies between pixels"
+    assert np.min((front + (1 - front) * behind)[inside]) > 1 - 1e-6
+    assert np.all(np.asarray(surfaces.front.attributes[0])[edge] > 0.99)
+    assert np.all(np.asarray(surfaces.behind.attributes[0])[edge] < 0.01)
+
+
+def test_coverage_of_a_silhouette_is_differentiable():
+    """Moving a disc before nothing changes its coverage by central differences."""
+    with jax.enable_x64(True):
+        view = bodies.perspective(width=24, height=24)
+        body = bodies.sphere(200, 6.0)
+
+        @jax.jit
+        def covered(shift):
+            moved = eqx.tree_at(lambda s: s.centers, body, body.centers + shift[None])
+            surfaces = splat_surfaces(view.footprints(moved, SETTINGS), jnp.zeros((0, 200)), view, SETTINGS, DenseRasterizer())
+            ramp = jnp.arange(24, dtype=float)
+            return jnp.sum(surfaces.front.coverage * (ramp[None] + 2 * ramp[:, None]))
+
+        shift, step = jnp.asarray([0.1, -0.2, 0.3]), 1e-6
+        gradient = np.asarray(jax.jit(jax.grad(covered))(shift))
+        steps = step * jnp.eye(3)
+        differences = [float(covered(shift + d) - covered(shift - d)) / (2 * step) for d in steps]
+    np.testing.assert_allclose(gradient, differences, rtol=1e-5)
