@@ -72,7 +72,8 @@ def test_fit_prints_and_writes_a_material_that_loads(tmp_path, capsys):
     printed = capsys.readouterr().out
     assert "error (Eq. 4)" in printed
     assert printed.splitlines()[-2:] == [str(output), str(plot)]
-    assert min(Image.open(plot).size) > 400
+    with Image.open(plot) as picture:
+        assert min(picture.size) > 400
     material, medium = sj.load_material(output), sj.load_medium("skin1")
     assert material.gaussians.weights.shape == (2, 3)
     total = sj.Dipole(medium).total_reflectance()
