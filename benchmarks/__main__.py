@@ -1,0 +1,202 @@
+"""How fast the passes are, beside the yardstick: `python -m benchmarks`. Writes out/bench.json."""
+
+import argparse
+import json
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import splatjax as sj
+from splatjax import diffusion, shading, splatting
+from splatjax.scene import stack_lights
+
+from .yardstick import FOCAL_LENGTH, Yardstick, make_scene
+
+SKIN = (0.0064, 0.0484, 0.187, 0.567, 1.99, 7.41)  # mm^2
+# Times of the yardstick, for 683,549 splats at 1024^2.
+GOALS = {"passes 2+3": 1.8, "passes 2+3 with gradients": 5.0, "all five passes": 5.0, "all five passes with gradients": 14.0}
+
+
+def arguments():
+    parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
+    parser.add_argument("--splats", type=int, default=683_549, help="on the prototype's head (default %(default)s)")
+    parser.add_argument("--width", type=int, default=1024, help="of the square picture, pixels (default %(default)s)")
+    parser.add_argument("--repeats", type=int, default=7, help="rounds; medians are given (default %(default)s)")
+    parser.add_argument("--no-gradients", action="store_true", help="forward passes only")
+    return parser.parse_args()
+
+
+def head(data: dict[str, np.ndarray], width: int) -> tuple[sj.Scene, sj.Camera]:
+    """The prototype's scene under one directional light, in skin."""
+    array = {name: jnp.asarray(values) for name, values in data.items()}
+    splats = sj.Splats(array["p"], array["n"], array["r"], array["area"], array["col"])
+    weights = jnp.full((len(SKIN), 3), 1 / len(SKIN))
+    material = sj.Material(sj.SumOfGaussians(jnp.asarray(SKIN), weights))
+    light = sj.DirectionalLight(jnp.asarray([0.5, 0.6, 0.65]), jnp.full(3, jnp.pi))
+    camera = sj.Camera(jnp.zeros(3), jnp.eye(3), jnp.asarray(FOCAL_LENGTH), width, width)
+    return sj.Scene(splats, (light,), material), camera
+
+
+def rasterization(scene: sj.Scene, camera: sj.Camera, plan: sj.Plan, settings: sj.RenderSettings):
+    """Passes 2 and 3 with normals and albedo, and the gradient of a picture's mean squares in all that they read."""
+    areas = scene.splats.areas
+
+    def surfaces(centers, normals, radii, albedo):
+        view = splatting.PerspectiveView.of(camera)
+        footprints = view.footprints(sj.Splats(centers, normals, radii, areas), settings.splatting)
+        rows = jnp.concatenate([normals.T, albedo.T])
+        return splatting.splat_surfaces(footprints, rows, view, settings.splatting, plan.camera)
+
+    def loss(*inputs):
+        seen = surfaces(*inputs)
+        return jnp.mean(seen.front.attributes**2) + jnp.mean(seen.front.coverage) + jnp.mean(seen.behind.attributes**2)
+
+    s = scene.splats
+    return surfaces, jax.grad(loss, argnums=(0, 1, 2, 3)), (s.centers, s.normals, s.radii, s.albedo)
+
+
+def passes(scene: sj.Scene, camera: sj.Camera, plan: sj.Plan, settings: sj.RenderSettings) -> dict[str, tuple]:
+    """Each pass alone, fed with what the one before gave: name to function and arguments."""
+    splats, groups = scene.splats, stack_lights(scene.lights)
+    view = splatting.PerspectiveView.of(camera)
+    light, rasterizer = scene.lights[0], plan.shadows[0].rasterizer
+
+    def shadow(splats):
+        from_light = splatting.distant_view(light.direction, splatting.Bounds.of(splats), settings.shadows)
+        surfaces = splatting.light_surfaces(splats, from_light, settings.splatting, rasterizer)
+        return splatting.lit_share(splats, from_light, surfaces, settings.shadows)
+
+    def irradiance(splats, lit):
+        f0, material = shading.fresnel_f0(scene.material.eta), scene.material
+
+        def entering(cosine):
+            return 1 - shading.directional_albedo(cosine, f0, material.specular, material.roughness)
+
+        return diffusion.entering_irradiance(splats.centers, splats.normals, groups, [lit[None]], entering, 3)
+
+    def visible(splats, irradiance):
+        rows = jnp.concatenate([splats.normals.T, splats.areas[None], splats.albedo.T, irradiance, irradiance])
+        footprints = view.footprints(splats, settings.splatting)
+        return splatting.splat_surfaces(footprints, rows, view, settings.splatting, plan.camera)
+
+    def layers(splats, irradiance, surfaces):
+        sources = diffusion.Sources(splats.centers.T, splats.areas, irradiance)
+        seen = tuple(
+            diffusion.SeenSurface(each, each.attributes[7:10], each.attributes[3]) for each in (surfaces.front, surfaces.behind)
+        )
+        variances = scene.material.gaussians.variances
+        return diffusion.diffusion_layers(sources, variances, seen, plan.interval, view, plan.diffuser)
+
+    lit = jax.jit(shadow)(splats)
+    entering = jax.jit(irradiance)(splats, lit)
+    surfaces = jax.jit(visible)(splats, entering)
+    return {
+        "pass 1, shadow map": (shadow, (splats,)),
+        "irradiance": (irradiance, (splats, lit)),
+        "passes 2+3, all attributes": (visible, (splats, entering)),
+        "pass 4, six layers": (layers, (splats, entering, surfaces)),
+    }
+
+
+def timed(function: Callable, inputs: tuple) -> float:
+    start = time.perf_counter()
+    jax.block_until_ready(function(*inputs))
+    return 1e3 * (time.perf_counter() - start)
+
+
+def measure(cases: dict[str, tuple[Callable, tuple]], yardstick: Yardstick | None, repeats: int):
+    """Compile all cases, then time them in rounds, the yardstick among them: medians in milliseconds."""
+    compiled, seconds = {}, {}
+    for name, (function, inputs) in cases.items():
+        start = time.perf_counter()
+        compiled[name] = jax.jit(function).lower(*inputs).compile(), inputs
+        seconds[name] = time.perf_counter() - start
+        timed(*compiled[name])
+        print(f"  {name}: compiled in {seconds[name]:.1f} s", flush=True)
+    times = {name: [] for name in cases}
+    yard = []
+    for _ in range(repeats):
+        if yardstick is not None:
+            yard.append(yardstick.milliseconds())
+        for name, case in compiled.items():
+            times[name].append(timed(*case))
+    return {name: float(np.median(each)) for name, each in times.items()}, seconds, float(np.median(yard)) if yard else None
+
+
+def report(milliseconds, seconds, yard, options) -> list[dict]:
+    """Print a table and give its rows."""
+    full_size = (options.splats, options.width) == (683_549, 1024)
+    print(f"\n{options.splats:,} splats at {options.width}^2, medians of {options.repeats} rounds")
+    print(f"yardstick, passes 2+3 in C on one thread: {f'{yard:.0f} ms' if yard else 'none'}\n")
+    print(f"{'':34}{'ms':>9}{'ratio':>8}{'goal':>7}{'compile, s':>12}")
+    rows = []
+    for name, value in milliseconds.items():
+        ratio, goal = value / yard if yard else None, GOALS.get(name) if full_size else None
+        print(f"{name:34}{value:9.0f}{_number(ratio):>8}{_number(goal):>7}{_number(seconds[name]):>12}")
+        rows.append(
+            {
+                "name": name,
+                "splats": options.splats,
+                "width": options.width,
+                "milliseconds": value,
+                "yardstick_milliseconds": yard,
+                "ratio": ratio,
+                "goal": goal,
+            }
+        )
+    return rows
+
+
+def _number(value: float | None) -> str:
+    """Write a number; nothing for none, and for the compile time of what was compiled to make the others' input."""
+    return "" if value is None or value < 0.05 else f"{value:.2f}"
+
+
+def shares(parts: dict[str, float], whole: float) -> None:
+    print("\nOf a frame, each pass run alone:")
+    rest = whole - sum(parts.values())
+    for name, value in [*parts.items(), ("pass 5 and the rest (difference)", rest)]:
+        print(f"{name:34}{value:9.0f} ms{value / whole:8.0%}")
+
+
+def main() -> None:
+    options = arguments()
+    data = make_scene(options.splats)
+    scene, camera = head(data, options.width)
+    settings = sj.RenderSettings()
+    start = time.perf_counter()
+    plan = sj.plan(scene, camera, settings)
+    print(f"planned in {time.perf_counter() - start:.1f} s")
+    forward, backward, inputs = rasterization(scene, camera, plan, settings)
+
+    def frame(scene):
+        return sj.render(scene, camera, settings, plan)
+
+    def mean(scene):
+        return jnp.mean(frame(scene).beauty)
+
+    parts = passes(scene, camera, plan, settings)
+    cases = {"passes 2+3": (forward, inputs), "all five passes": (frame, (scene,)), **parts}
+    if not options.no_gradients:
+        cases["passes 2+3 with gradients"] = backward, inputs
+        cases["all five passes with gradients"] = jax.grad(mean), (scene,)
+    if float(frame(scene).overflow) > 0:
+        raise SystemExit("the plan does not hold its own scene: the figures would be those of an empty picture")
+    with tempfile.TemporaryDirectory() as folder:
+        yardstick = Yardstick.build(Path(folder), data, options.width)
+        milliseconds, seconds, yard = measure(cases, yardstick, options.repeats)
+    rows = report(milliseconds, seconds, yard, options)
+    shares({name: milliseconds[name] for name in parts}, milliseconds["all five passes"])
+    out = Path("out/bench.json")
+    out.parent.mkdir(exist_ok=True)
+    out.write_text(json.dumps(rows, indent=1) + "\n")
+    print(f"\nwritten: {out}")
+
+
+if __name__ == "__main__":
+    main()
