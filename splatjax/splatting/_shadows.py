@@ -37,7 +37,7 @@ class ShadowSettings(eqx.Module):
 
 
 class Bounds(eqx.Module):
-    """A sphere around all discs. Not differentiated."""
+    """A sphere around all discs. Shadow maps are laid around it, so it is differentiated as they are."""
 
     center: Float[Array, "3"]
     radius: Float[Array, ""]
@@ -46,11 +46,12 @@ class Bounds(eqx.Module):
     def of(cls, splats: Splats) -> "Bounds":
         if splats.count == 0:
             return cls(jnp.zeros(3, splats.centers.dtype), jnp.ones((), splats.centers.dtype))
-        centers = stop_gradient(splats.centers)
-        center = 0.5 * (jnp.min(centers, axis=0) + jnp.max(centers, axis=0))
-        offset = centers - center[None]
-        reach = jnp.sqrt(jnp.max(jnp.sum(offset * offset, axis=1)))
-        return cls(center, reach + stop_gradient(jnp.max(splats.radii)))
+        center = 0.5 * (jnp.min(splats.centers, axis=0) + jnp.max(splats.centers, axis=0))
+        offset = splats.centers - center[None]
+        squared = jnp.max(jnp.sum(offset * offset, axis=1))
+        apart = squared > 0  # a single splat lies in its center, wherever it moves
+        reach = jnp.where(apart, jnp.sqrt(jnp.where(apart, squared, 1.0)), 0.0)
+        return cls(center, reach + jnp.max(splats.radii))
 
 
 def _facing(forward: Float[Array, "3"]) -> Float[Array, "3 3"]:
@@ -77,13 +78,13 @@ def near_view(position: Float[Array, "3"], bounds: Bounds, settings: ShadowSetti
     """Give what a point light outside the bounding sphere sees: a frustum around the sphere."""
     to_center = bounds.center - position
     distance = jnp.linalg.norm(to_center)
-    closest = stop_gradient(distance * distance - bounds.radius * bounds.radius)
+    closest = distance * distance - bounds.radius * bounds.radius
     tangent = bounds.radius / jnp.sqrt(jnp.maximum(closest, 1e-6 * bounds.radius * bounds.radius))
     size = settings.resolution
     return PerspectiveView(
         position=position,
         rotation=_facing(to_center / distance),
-        focal_length=0.5 * (size - 4) / stop_gradient(tangent),
+        focal_length=0.5 * (size - 4) / tangent,
         width=size,
         height=size,
         near=_NEAR,
