@@ -1,0 +1,84 @@
+"""Merged splats keep what the far field needs, and their tree is nested."""
+
+import bodies
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from splatjax.diffusion import Sources
+from splatjax.diffusion._tree import Clusters, ClusterTree
+
+CELLS = [2.0, 4.0, 16.0]
+
+
+def sources():
+    body = bodies.bumpy(800)
+    irradiance = np.random.default_rng(2).uniform(size=(2, 800))
+    return Sources(body.centers.T, body.areas, jnp.asarray(irradiance, float))
+
+
+def of_splats(tree, level):
+    """The cluster of every splat at a level."""
+    place = np.arange(800)
+    for parents in tree.parents[: level + 1]:
+        place = np.asarray(parents)[place]
+    return place
+
+
+def test_merging_keeps_area_energy_and_first_moments():
+    given = sources()
+    tree = ClusterTree.build(given.centers.T, CELLS)
+    levels = jax.jit(lambda s: tree.levels(s))(given)
+    centers, areas, irradiance = (np.asarray(each, float) for each in (given.centers, given.areas, given.irradiance))
+    for level, clusters in enumerate(levels[1:]):
+        place, count = of_splats(tree, level), tree.counts[level]
+
+        def total(values, place=place, count=count):
+            return np.bincount(place, values, count)
+
+        area = total(areas)
+        full = area > 0
+        mean = np.stack([total(areas * axis) for axis in centers])[:, full] / area[full]
+        np.testing.assert_allclose(np.asarray(clusters.areas), area, rtol=1e-5)
+        np.testing.assert_allclose(np.asarray(clusters.centers)[:, full], mean, atol=1e-4)
+        for channel, values in enumerate(irradiance):
+            energy = np.asarray(clusters.areas * clusters.irradiance[channel])
+            np.testing.assert_allclose(energy, total(areas * values), rtol=1e-5)
+            for axis in range(3):
+                expected = total(areas * values * centers[axis])
+                found = energy * np.asarray(clusters.centers[axis]) + np.asarray(clusters.moments[channel, axis])
+                np.testing.assert_allclose(found, expected, atol=1e-5 * np.max(areas) * 800 * 10)
+        offset = centers - np.asarray(clusters.centers, float)[:, place]
+        spread = total(areas * 0.5 * np.sum(offset**2, axis=0))[full] / area[full]
+        np.testing.assert_allclose(np.asarray(clusters.spread)[full], spread, rtol=1e-3, atol=1e-5)
+
+
+def test_merging_twice_is_merging_once():
+    given = sources()
+    tree = ClusterTree.build(given.centers.T, CELLS)
+    step_by_step = tree.levels(given)[-1]
+    at_once = Clusters.of(given).merged(jnp.asarray(of_splats(tree, 2), jnp.int32), tree.counts[2])
+    for ours, theirs in zip(jax.tree.leaves(step_by_step), jax.tree.leaves(at_once), strict=True):
+        np.testing.assert_allclose(np.asarray(ours), np.asarray(theirs), atol=2e-4 * float(jnp.max(jnp.abs(theirs))))
+
+
+def test_a_cluster_fills_no_more_than_its_cell():
+    given = sources()
+    tree = ClusterTree.build(given.centers.T, CELLS)
+    centers = np.asarray(given.centers)
+    numbers = []
+    for level, cell in enumerate(CELLS):
+        place = of_splats(tree, level)
+        numbers.append(len(np.unique(place)))
+        assert numbers[-1] <= tree.counts[level] <= 1.2 * numbers[-1] + 1
+        for cluster in np.unique(place)[::7]:
+            assert np.all(np.ptp(centers[:, place == cluster], axis=1) <= cell * (1 + 1e-5))
+    assert 800 > numbers[0] > numbers[1] > numbers[2] >= 1
+
+
+def test_no_cells_merge_nothing():
+    given = sources()
+    tree = ClusterTree.build(given.centers.T, [])
+    (only,) = tree.levels(given)
+    np.testing.assert_array_equal(np.asarray(only.areas), np.asarray(given.areas))
+    assert not np.any(np.asarray(only.spread))
