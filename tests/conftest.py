@@ -29,13 +29,18 @@ def shared_folder() -> Path | None:
     return Path(folder) if folder and Path(folder).is_dir() else None
 
 
+def _left_out(item) -> bool:
+    """Whether a test needs shared files that are not there, or shows nothing more in float64."""
+    if item.get_closest_marker("shared") and shared_folder() is None:
+        return True
+    return bool(item.get_closest_marker("once") and jax.config.jax_enable_x64)
+
+
 def pytest_collection_modifyitems(config, items):
-    """Leave out, and say so, what needs shared files that are not there."""
-    if shared_folder() is not None:
-        return
-    left_out = [item for item in items if item.get_closest_marker("shared")]
+    """Leave out, and say so, what cannot run or need not run twice."""
+    left_out = [item for item in items if _left_out(item)]
     if left_out:
-        items[:] = [item for item in items if not item.get_closest_marker("shared")]
+        items[:] = [item for item in items if item not in left_out]
         config.hook.pytest_deselected(items=left_out)
 
 

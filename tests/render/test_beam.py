@@ -56,12 +56,14 @@ def test_a_beam_on_a_sheet_is_the_gaussian_of_each_layer(kind, slant):
 
 
 @pytest.mark.slow
+@pytest.mark.once
 @pytest.mark.parametrize("variance", sorted({*SKIN_VARIANCES[::2], *MARBLE_VARIANCES[1::2]}))
 def test_every_layer_of_skin_and_marble_is_its_gaussian(variance):
     assert layer_error(variance, "jittered", 0.0) < BEAM_TOLERANCE
 
 
 @pytest.mark.slow
+@pytest.mark.once
 def test_the_sum_of_layers_is_the_profile():
     # wide enough that what the widest layer loses beyond the border does not come back in the normalization
     splats = sheet(0.05, 10.5)
@@ -76,6 +78,8 @@ def test_the_sum_of_layers_is_the_profile():
     assert np.max(np.abs(total / truth - 1)[seen]) < BEAM_TOLERANCE
 
 
+@pytest.mark.slow
+@pytest.mark.once
 @pytest.mark.parametrize("name", ["skin", "marble"])
 def test_a_wide_beam_with_default_settings_is_the_widened_profile(name):
     material = load_material(name)

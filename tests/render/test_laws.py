@@ -56,6 +56,7 @@ def test_a_white_diffuser_facing_pi_has_radiance_one():
 
 
 @pytest.mark.slow
+@pytest.mark.once
 def test_white_furnace():
     count = 1024  # with 512 the lobe is summed too coarsely at the very rim: 1.0054 at most, 1.0006 with 2048
     i = np.arange(count) + 0.5
@@ -75,6 +76,7 @@ def test_white_furnace():
 
 
 @pytest.mark.slow
+@pytest.mark.once
 def test_energy_does_not_depend_on_how_finely_half_the_sheet_is_splatted():
     coarse, fine = sheet(0.4, 16.0), sheet(0.2, 16.0)
     # cells of the coarse sheet end at x = 0.2, and there those of the shifted fine one begin
