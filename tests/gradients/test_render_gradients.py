@@ -17,7 +17,7 @@ import splatjax as sj
 from splatjax.diffusion import DenseDiffuser
 from splatjax.splatting import DenseRasterizer, ShadowSettings, TileRasterizer
 
-pytestmark = pytest.mark.slow  # compiles five renderers
+pytestmark = [pytest.mark.slow, pytest.mark.once]  # compiles five renderers, in float64 whatever the precision of the run
 
 COUNT, SIZE = 300, 24
 STEP = 1e-6  # of a parameter's own scale
