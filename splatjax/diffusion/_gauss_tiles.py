@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from splatjax.splatting import Bins, TileGrid, scatter_slots, slot_planes
+from splatjax.splatting import Bins, TileGrid, scatter_slots, slot_plane
 
 _FAR = 1e6  # mm from anything, yet with a square that float32 holds
 
@@ -33,7 +33,7 @@ class _Sweep(eqx.Module):
 
 def _planes(sources, rows, bins: Bins):
     fill = (_FAR, _FAR, _FAR, 1.0)
-    return slot_planes(sources, fill, bins), slot_planes(rows, (0.0,) * rows.shape[0], bins)
+    return [slot_plane(*each, bins) for each in zip(sources, fill, strict=True)], [slot_plane(row, 0.0, bins) for row in rows]
 
 
 def _forward(sweep: _Sweep, bins: Bins, tiles, sources, rows):
@@ -126,5 +126,4 @@ def gaussian_sums(
     - `support`: terms farther than this many standard deviations are left out, whatever the lists hold. Not differentiated.
     """
     sweep = _Sweep(grid, 0.5 * support * support)
-    tiles = grid.cut(points, -_FAR).transpose(1, 0, 2)
-    return grid.join(_sweep_tiles(sweep, bins, tiles, jnp.concatenate([centers, rates[None]]), rows))
+    return grid.join(_sweep_tiles(sweep, bins, grid.cut(points, -_FAR), jnp.concatenate([centers, rates[None]]), rows))

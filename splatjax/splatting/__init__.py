@@ -1,7 +1,7 @@
 """Passes 1 to 3 of the paper: shadow maps, visibility and attributes (Eq. 1). Knows nothing of scattering."""
 
 from ._bins import BinCapacity as BinCapacity, bin_items as bin_items, Bins as Bins
-from ._bins import scatter_slots as scatter_slots, slot_planes as slot_planes, TileGrid as TileGrid, TileRanges as TileRanges
+from ._bins import scatter_slots as scatter_slots, slot_plane as slot_plane, TileGrid as TileGrid, TileRanges as TileRanges
 from ._dense import DenseRasterizer as DenseRasterizer
 from ._kernel import coverage as coverage, fragment_weight as fragment_weight
 from ._rasterizer import AbstractRasterizer as AbstractRasterizer, SurfaceSums as SurfaceSums

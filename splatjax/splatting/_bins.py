@@ -37,21 +37,38 @@ class TileGrid(eqx.Module):
         """Tiles of the picture, and a few empty ones that fill the last chunk."""
         return -(-self.across * self.down // self.lanes) * self.lanes
 
-    def cut(self, planes: Float[Array, "planes height width"], fill: float) -> Float[Array, "planes tiles pixels"]:
-        """Cut a picture into tiles."""
-        side, (count, height, width) = self.side, planes.shape
+    def tiled(self, picture: Float[Array, "rows height width"], fill: float = 0.0) -> Float[Array, "rows down side across side"]:
+        """Show a picture as tiles, every pixel in its place; beyond the picture's edges tiles hold `fill`."""
+        side, (rows, height, width) = self.side, picture.shape
         padding = ((0, 0), (0, self.down * side - height), (0, self.across * side - width))
-        padded = jnp.pad(planes, padding, constant_values=fill)
-        tiles = padded.reshape(count, self.down, side, self.across, side).transpose(0, 1, 3, 2, 4)
-        tiles = tiles.reshape(count, self.down * self.across, side * side)
-        return jnp.pad(tiles, ((0, 0), (0, self.tiles - tiles.shape[1]), (0, 0)), constant_values=fill)
+        return jnp.pad(picture, padding, constant_values=fill).reshape(rows, self.down, side, self.across, side)
 
-    def join(self, tiles: Float[Array, "tiles planes pixels"]) -> Float[Array, "planes height width"]:
+    def picture(self, tiled: Float[Array, "rows down side across side"]) -> Float[Array, "rows height width"]:
+        """Give the picture back that `tiled` shows."""
+        rows = tiled.shape[0]
+        return tiled.reshape(rows, self.down * self.side, self.across * self.side)[:, : self.height, : self.width]
+
+    def place(self, tiles: Int[Array, " some"]) -> tuple:
+        """Give the index of tiles in what `tiled` shows; it selects `[some, rows, side, side]`."""
+        return slice(None), tiles // self.across, slice(None), tiles % self.across, slice(None)
+
+    def squares(self, pixels: Float[Array, "some rows pixels"]) -> Float[Array, "some rows side side"]:
+        return pixels.reshape(*pixels.shape[:2], self.side, self.side)
+
+    def lines(self, squares: Float[Array, "some rows side side"]) -> Float[Array, "some rows pixels"]:
+        return squares.reshape(*squares.shape[:2], self.side**2)
+
+    def cut(self, picture: Float[Array, "rows height width"], fill: float) -> Float[Array, "tiles rows pixels"]:
+        """Cut a picture into tiles."""
+        tiled = self.tiled(picture, fill).transpose(1, 3, 0, 2, 4)
+        tiles = tiled.reshape(self.down * self.across, picture.shape[0], self.side**2)
+        return jnp.pad(tiles, ((0, self.tiles - tiles.shape[0]), (0, 0), (0, 0)), constant_values=fill)
+
+    def join(self, tiles: Float[Array, "tiles rows pixels"]) -> Float[Array, "rows height width"]:
         """Put a picture together from its tiles."""
-        side, count = self.side, tiles.shape[1]
-        picture = tiles[: self.down * self.across].reshape(self.down, self.across, count, side, side)
-        picture = picture.transpose(2, 0, 3, 1, 4).reshape(count, self.down * side, self.across * side)
-        return picture[:, : self.height, : self.width]
+        side, rows = self.side, tiles.shape[1]
+        tiles = tiles[: self.down * self.across].reshape(self.down, self.across, rows, side, side)
+        return self.picture(tiles.transpose(2, 0, 3, 1, 4))
 
 
 class TileRanges(eqx.Module):
@@ -173,7 +190,8 @@ def _ranks(tile: Int[Array, " pairs"], tiles: int):
     """Number the pairs of each tile in order: rows are sorted apart, and counts carried from row to row."""
     place = jnp.arange(_ROW, dtype=jnp.uint32)[None]
     keys = (tile.astype(jnp.uint32).reshape(-1, _ROW) << _ROW_BITS) | place
-    keys = lax.sort(keys, dimension=1, is_stable=False)
+    halves = jnp.split(keys, [keys.shape[0] // 2])  # a sort runs on one core; two run side by side
+    keys = jnp.concatenate([lax.sort(half, dimension=1, is_stable=False) for half in halves])
     sorted_tile, source = (keys >> _ROW_BITS).astype(jnp.int32), (keys & (_ROW - 1)).astype(jnp.int32)
     rows = keys.shape[0]
     starts = jnp.concatenate([jnp.ones((rows, 1), bool), sorted_tile[:, 1:] != sorted_tile[:, :-1]], axis=1)
@@ -218,11 +236,9 @@ def bin_items(ranges: TileRanges, grid: TileGrid, capacity: BinCapacity) -> Bins
     return Bins(ids.reshape(capacity.blocks, lanes, slots), order, first_block, jnp.maximum(total / capacity.pairs, blocks))
 
 
-def slot_planes(
-    planes: Float[Array, "planes items"], fill: tuple[float, ...], bins: Bins
-) -> list[Float[Array, "blocks lanes slots"]]:
-    """Gather numbers of the items into their slots, plane by plane; `fill` in empty slots."""
-    return [plane.at[bins.ids].get(mode="fill", fill_value=value) for plane, value in zip(planes, fill, strict=True)]
+def slot_plane(plane: Float[Array, " items"], fill: float, bins: Bins) -> Float[Array, "blocks lanes slots"]:
+    """Gather a number of the items into their slots; `fill` in empty slots."""
+    return plane.at[bins.ids].get(mode="fill", fill_value=fill)
 
 
 def scatter_slots(slots: Float[Array, "*blocks slots"], bins: Bins, items: int) -> Float[Array, " items"]:

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import jax
 import jax.numpy as jnp
 from jax.lax import stop_gradient
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from ._kernel import fragment_weight
 from ._rasterizer import AbstractRasterizer, SurfaceSums
@@ -20,9 +20,9 @@ class DenseRasterizer(AbstractRasterizer):
         return self
 
     def sums(
-        self, footprints: Footprints, rows: Float[Array, "rows splats"], view: AbstractView, settings: SplattingSettings
+        self, footprints: Footprints, attributes: Float[Array, "attributes splats"], view: AbstractView, settings: SplattingSettings
     ) -> SurfaceSums:
-        dtype = rows.dtype
+        dtype, rows = attributes.dtype, attributes.shape[0] + 2
         columns = jnp.arange(view.width, dtype=dtype) + 0.5
 
         def picture_row(y: Float[Array, ""]):
@@ -31,20 +31,24 @@ class DenseRasterizer(AbstractRasterizer):
             quadric = dx * (footprints.a[None] * dx + footprints.b[None] * dy) + footprints.c[None] * dy * dy
             inside = footprints.visible[None] & view.inside(nearness, quadric)
             squared_radius = jnp.where(inside, view.squared_radius(jnp.where(inside, nearness, 1.0), quadric), 1.0)
-            weight = jnp.where(inside, fragment_weight(squared_radius), 0.0)
+            weight = jnp.where(inside, footprints.opacity[None] * fragment_weight(squared_radius), 0.0)
             shifted = view.shifted(nearness, footprints.shift[None])
 
             limit = jnp.max(jnp.where(inside, shifted, -jnp.inf), axis=1)
             front = inside & (nearness > limit[:, None])
-            front_sums = jnp.where(front, weight, 0.0) @ rows.T
-            open_pixel = stop_gradient(front_sums[:, -1]) < settings.full_coverage
+
+            def sums(chosen: Bool[Array, "columns splats"]) -> Float[Array, "rows columns"]:
+                weights, hits = jnp.where(chosen, weight, 0.0), jnp.where(chosen, nearness, 0.0)
+                return jnp.concatenate([attributes @ weights.T, jnp.sum(weights * hits, axis=1)[None], jnp.sum(weights, axis=1)[None]])
+
+            front_sums = sums(front)
+            open_pixel = stop_gradient(front_sums[-1]) < settings.full_coverage
             rest = inside & ~front & open_pixel[:, None]
             limit_behind = jnp.max(jnp.where(rest, shifted, -jnp.inf), axis=1)
-            behind = rest & (nearness > limit_behind[:, None])
-            return front_sums.T, (jnp.where(behind, weight, 0.0) @ rows.T).T
+            return front_sums, sums(rest & (nearness > limit_behind[:, None]))
 
-        if rows.shape[1] == 0:
-            empty = jnp.zeros((rows.shape[0], view.height, view.width), dtype)
+        if footprints.count == 0:
+            empty = jnp.zeros((rows, view.height, view.width), dtype)
             return SurfaceSums(empty, empty, jnp.zeros((), dtype))
         front, behind = jax.lax.map(picture_row, jnp.arange(view.height, dtype=dtype) + 0.5)
         return SurfaceSums(front.transpose(1, 0, 2), behind.transpose(1, 0, 2), jnp.zeros((), dtype))

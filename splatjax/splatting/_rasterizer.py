@@ -11,7 +11,10 @@ from ._views import AbstractView, Footprints
 
 
 class SurfaceSums(eqx.Module):
-    """Sums of weighted rows per pixel: over the front surface, and over the surface behind it where the front leaves a gap."""
+    """Sums of weighted fragments per pixel: over the front surface, and over the surface behind it where the front leaves a gap.
+
+    One row per attribute, then the nearness of the ray's hits with the fragments' planes, then the weights themselves.
+    """
 
     front: Float[Array, "rows height width"]
     behind: Float[Array, "rows height width"]
@@ -20,11 +23,11 @@ class SurfaceSums(eqx.Module):
 
 
 class AbstractRasterizer(eqx.Module):
-    r"""Passes 2 and 3. Fragments are weighted with `fragment_weight`.
+    r"""Passes 2 and 3. Fragments are weighted with `fragment_weight`, times the opacity of their footprint.
 
     The *front* of a pixel are the fragments within epsilon of the nearest one (3.1). *Behind* are, in pixels that the front
     does not cover in full, the fragments within epsilon of the nearest one that is not in front.
-    The choice of fragments is piecewise constant: it has no derivative. The last row is the weight itself.
+    The choice of fragments is piecewise constant: it has no derivative.
     """
 
     @abc.abstractmethod
@@ -33,6 +36,6 @@ class AbstractRasterizer(eqx.Module):
 
     @abc.abstractmethod
     def sums(
-        self, footprints: Footprints, rows: Float[Array, "rows splats"], view: AbstractView, settings: SplattingSettings
+        self, footprints: Footprints, attributes: Float[Array, "attributes splats"], view: AbstractView, settings: SplattingSettings
     ) -> SurfaceSums:
-        """Sum `weight * rows` over the fragments of every pixel."""
+        """Sum weighted attributes, nearness and weights over the fragments of every pixel."""

@@ -47,8 +47,7 @@ def splat_surfaces(
 ) -> Surfaces:
     r"""Find the visible surfaces and blend the attributes of their splats (passes 2 and 3).
 
-    The nearness of each ray's hit with each splat's plane is blended like an attribute; it is linear in the pixel, so it
-    costs three rows and a plane stays a plane.
+    The nearness of each ray's hit with each splat's plane is blended like an attribute, so that a plane stays a plane.
 
     **Arguments:**
 
@@ -57,18 +56,12 @@ def splat_surfaces(
 
     **Returns:** `Surfaces`; NaN where the rasterizer's capacity was exceeded.
     """
-    f = footprints
-    plane = jnp.stack([f.nearness - f.slope_x * f.x - f.slope_y * f.y, f.slope_x, f.slope_y, jnp.ones_like(f.x)])
-    rows = jnp.concatenate([attributes, plane]) * f.opacity[None]
-    sums = rasterizer.sums(footprints, rows, view, settings)
-    x = jnp.arange(view.width, dtype=rows.dtype)[None] + 0.5
-    y = jnp.arange(view.height, dtype=rows.dtype)[:, None] + 0.5
+    sums = rasterizer.sums(footprints, attributes, view, settings)
 
     def surface(sums: Float[Array, "rows height width"]) -> Surface:
         weight_sum = sums[-1]
         blended = blend_attributes(sums[:-1], weight_sum)
-        nearness = jnp.where(weight_sum != 0, blended[-3] + blended[-2] * x + blended[-1] * y, 1.0)
-        depth = view.depth(nearness)
-        return Surface(blended[:-3], depth, weight_sum, coverage(weight_sum, settings.full_coverage))
+        depth = view.depth(jnp.where(weight_sum != 0, blended[-1], 1.0))
+        return Surface(blended[:-1], depth, weight_sum, coverage(weight_sum, settings.full_coverage))
 
     return Surfaces(surface(sums.front), surface(sums.behind), sums.needed)

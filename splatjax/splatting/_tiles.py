@@ -14,16 +14,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jax.lax import stop_gradient
+from jaxtyping import Array, Bool, Float, Int
 
-from ._bins import BinCapacity, Bins, TileGrid, TileRanges, bin_items, scatter_slots, slot_planes
+from ._bins import BinCapacity, Bins, TileGrid, TileRanges, bin_items, scatter_slots, slot_plane
 from ._kernel import fast_fragment_weight, fragment_weight_derivative
 from ._rasterizer import AbstractRasterizer, SurfaceSums
 from ._settings import SplattingSettings
 from ._views import AbstractView, Footprints
 
+_PLANES = ("x", "y", "slope_x", "slope_y", "a", "b", "c", "nearness", "opacity")  # of the footprints, that sums depend on
 _EMPTY = (0.0, 0.0, 0.0, 0.0, 1e12, 0.0, 1e12, 1.0, 0.0)  # covers no pixel center
-_GEOMETRY = len(_EMPTY)
 _PICKED = 16  # open tiles swept together
 
 
@@ -50,21 +51,21 @@ class TileRasterizer(AbstractRasterizer):
         return TileRasterizer(self.side, self.lanes, self.slots, BinCapacity.for_ranges(ranges, grid))
 
     def sums(
-        self, footprints: Footprints, rows: Float[Array, "rows splats"], view: AbstractView, settings: SplattingSettings
+        self, footprints: Footprints, attributes: Float[Array, "attributes splats"], view: AbstractView, settings: SplattingSettings
     ) -> SurfaceSums:
         if self.capacity is None:
             raise ValueError("this TileRasterizer has no capacity yet; take one from a plan (splatjax.plan) or from `planned`")
-        if rows.shape[1] == 0:
-            empty = jnp.zeros((rows.shape[0], view.height, view.width), rows.dtype)
-            return SurfaceSums(empty, empty, jnp.zeros((), rows.dtype))
+        dtype = attributes.dtype
+        if footprints.count == 0:
+            empty = jnp.zeros((attributes.shape[0] + 2, view.height, view.width), dtype)
+            return SurfaceSums(empty, empty, jnp.zeros((), dtype))
         grid = self._grid(view)
         bins = bin_items(_ranges(footprints, grid), grid, self.capacity)
-        f = footprints
-        geometry = jnp.stack([f.x, f.y, f.slope_x, f.slope_y, f.a, f.b, f.c, f.nearness, f.shift])
-        front, behind = _sweep_tiles(_Sweep(type(view), grid, settings.full_coverage), bins, geometry, rows)
-        needed = bins.needed.astype(rows.dtype)
-        fits = needed <= 1
-        front, behind = (jnp.where(fits, grid.join(tiles), jnp.nan) for tiles in (front, behind))
+        planes = tuple(getattr(footprints, name) for name in _PLANES)
+        sweep = _Sweep(type(view), grid, settings.full_coverage)
+        front, behind = _sweep_tiles(sweep, bins, stop_gradient(footprints.shift), planes, attributes)
+        needed = bins.needed.astype(dtype)
+        front, behind = (jnp.where(needed <= 1, sums, jnp.nan) for sums in (front, behind))
         return SurfaceSums(front, behind, needed)
 
 
@@ -129,25 +130,28 @@ class _Sweep(eqx.Module):
         chunk = places // self.grid.lanes
         return self._lanes(_Lanes, bins, places, jnp.max(bins.first_block[chunk + 1] - bins.first_block[chunk]), dtype)
 
-    def fragments(self, planes, block, lanes: _Lanes):
-        """Give nearness, quadric and shift of a block's fragments, `[lanes, slots, pixels]`, and the block's geometry."""
-        x, y, sx, sy, a, b, c, e, shift = (lanes.read(plane, block) for plane in planes)
-        x, y = x - lanes.x, y - lanes.y
-        geometry = (x, y, sx, sy, a, b, c, e)
-        px, py = (jnp.asarray(p)[None, None] for p in self.pixels(x.dtype))
-        x, y, sx, sy, a, b, c, e, shift = (p[:, :, None] for p in (*geometry, shift))
-        dx, dy = px - x, py - y
-        return e + sx * dx + sy * dy, dx * (a * dx + b * dy) + c * dy * dy, shift, geometry
+    def splats(self, planes, block, lanes: _Lanes):
+        """Read a block's splats, `[lanes, slots]` each, placed relative to their tile's corner."""
+        x, y, *rest = (lanes.read(plane, block) for plane in planes)
+        return x - lanes.x, y - lanes.y, *rest
 
-    def limits(self, planes, lanes: _Lanes, below):
+    def fragments(self, splats):
+        """Give nearness and quadric of a block's fragments, `[lanes, slots, pixels]`."""
+        x, y, sx, sy, a, b, c, e = (p[:, :, None] for p in splats[:8])
+        px, py = (jnp.asarray(p)[None, None] for p in self.pixels(x.dtype))
+        dx, dy = px - x, py - y
+        return e + sx * dx + sy * dy, dx * (a * dx + b * dy) + c * dy * dy
+
+    def limits(self, slots: "_Slots", lanes: _Lanes, below):
         """Find per pixel the nearest shifted fragment among those at most `below`: the back end of a surface."""
 
         def nearest(block, limit):
-            nearness, quadric, shift, _ = self.fragments(planes, block, lanes)
+            nearness, quadric = self.fragments(self.splats(slots.planes, block, lanes))
+            shifted = self.view.shifted(nearness, lanes.read(slots.shift, block)[:, :, None])
             candidate = self.view.inside(nearness, quadric)
             if below is not None:
                 candidate &= nearness <= below[:, None]
-            return jnp.maximum(limit, jnp.max(jnp.where(candidate, self.view.shifted(nearness, shift), -jnp.inf), axis=1))
+            return jnp.maximum(limit, jnp.max(jnp.where(candidate, shifted, -jnp.inf), axis=1))
 
         start = jnp.full((lanes.row.shape[0], self.grid.side**2), -jnp.inf, lanes.x.dtype)
         return lax.fori_loop(jnp.int32(0), lanes.blocks, nearest, start)
@@ -160,166 +164,172 @@ class _Sweep(eqx.Module):
         squared_radius = self.view.squared_radius(nearness, quadric)
         return jnp.where(chosen, fast_fragment_weight(squared_radius), 0.0), squared_radius, chosen
 
-    def sum_rows(self, planes, rows, lanes: _Lanes, beyond, upto):
-        """Sum weighted rows over the fragments between two limits."""
+    def rows(self, splats, attributes, block, lanes: _Lanes):
+        """Give what is summed, `[lanes, rows, slots]`: attributes, the plane of nearness (three numbers), and 1."""
+        x, y, sx, sy, _, _, _, e, _ = splats
+        return jnp.stack([*(lanes.read(row, block) for row in attributes), e - sx * x - sy * y, sx, sy, jnp.ones_like(e)], axis=1)
+
+    def sums(self, slots: "_Slots", lanes: _Lanes, beyond, upto):
+        """Sum weighted attributes, nearness and weights, `[lanes, rows, pixels]`, over the fragments between two limits."""
 
         def add(block, sums):
-            nearness, quadric, _, _ = self.fragments(planes, block, lanes)
-            weight, _, _ = self.weights(nearness, quadric, beyond, upto)
-            block_rows = jnp.stack([lanes.read(row, block) for row in rows], axis=1)
-            return sums + jnp.einsum("trs,tsp->trp", block_rows, weight)
+            splats = self.splats(slots.planes, block, lanes)
+            weight, _, _ = self.weights(*self.fragments(splats), beyond, upto)
+            rows = self.rows(splats, slots.attributes, block, lanes) * splats[-1][:, None]
+            return sums + jnp.einsum("trs,tsp->trp", rows, weight)
 
-        start = jnp.zeros((beyond.shape[0], len(rows), beyond.shape[1]), beyond.dtype)
-        return lax.fori_loop(jnp.int32(0), lanes.blocks, add, start)
+        start = jnp.zeros((beyond.shape[0], len(slots.attributes) + 4, beyond.shape[1]), beyond.dtype)
+        sums = lax.fori_loop(jnp.int32(0), lanes.blocks, add, start)
+        px, py = self.pixels(beyond.dtype)
+        nearness = sums[:, -4] + sums[:, -3] * px[None] + sums[:, -2] * py[None]
+        return jnp.concatenate([sums[:, :-4], nearness[:, None], sums[:, -1:]], axis=1)
 
-    def add_cotangents(self, planes, rows, lanes: _Lanes, beyond, upto, cotangent, gradients):
-        """Add the cotangents of geometry and rows, per slot, for the fragments between two limits."""
+    def add_cotangents(self, slots: "_Slots", lanes: _Lanes, beyond, upto, cotangent, gradients):
+        """Add the cotangents of planes and attributes, per slot, for the fragments between two limits."""
         px, py = self.pixels(beyond.dtype)
         monomials = jnp.asarray(np.stack([np.ones_like(px), px, py, px * px, px * py, py * py], axis=1))
+        nearness = cotangent[:, -2]
+        plane = jnp.stack([nearness, nearness * px[None], nearness * py[None]], axis=1)
+        cotangent = jnp.concatenate([cotangent[:, :-2], plane, cotangent[:, -1:]], axis=1)
 
         def add(block, gradients):
-            nearness, quadric, _, geometry = self.fragments(planes, block, lanes)
+            splats = self.splats(slots.planes, block, lanes)
+            nearness, quadric = self.fragments(splats)
             weight, squared_radius, chosen = self.weights(nearness, quadric, beyond, upto)
-            block_rows = jnp.stack([lanes.read(row, block) for row in rows], axis=1)
+            rows, opacity = self.rows(splats, slots.attributes, block, lanes), splats[-1]
             d_rows = jnp.einsum("tsp,trp->trs", weight, cotangent)
-            d_weight = jnp.einsum("trs,trp->tsp", block_rows, cotangent)
+            d_weight = jnp.einsum("trs,trp->tsp", rows * opacity[:, None], cotangent)
             squared_radius = jnp.where(chosen, squared_radius, 1.0)
             d_squared = fragment_weight_derivative(squared_radius, weight) * d_weight
             nearness = jnp.where(chosen, nearness, 1.0)
             d_nearness, d_quadric = self.view.squared_radius_vjp(nearness, squared_radius, d_squared)
             # Both are polynomials in the pixel: their moments over the tile are all that is needed.
-            quad, near = d_quadric @ monomials, d_nearness @ monomials[:, :3]
-            d_geometry = _geometry_cotangent(geometry, jnp.moveaxis(quad, 2, 0), jnp.moveaxis(near, 2, 0))
-            parts = [*d_geometry, *(d_rows[:, r] for r in range(len(rows)))]
+            quad = jnp.moveaxis(d_quadric @ monomials, 2, 0)
+            near = jnp.moveaxis(d_nearness @ monomials[:, :3], 2, 0)
+            d_opacity = jnp.sum(rows * d_rows, axis=1)
+            d_rows = d_rows * opacity[:, None]
+            count = len(slots.attributes)
+            d_planes = _plane_cotangents(splats, quad, near + jnp.moveaxis(d_rows[:, count : count + 3], 1, 0))
+            parts = [*d_planes, d_opacity, *(d_rows[:, r] for r in range(count))]
             return tuple(lanes.add(whole, block, part) for whole, part in zip(gradients, parts, strict=True))
 
         return lax.fori_loop(jnp.int32(0), lanes.blocks, add, gradients)
 
 
-def _rows_of_lanes(planes: list[Float[Array, "blocks lanes slots"]]) -> list[Float[Array, "rows slots"]]:
-    return [plane.reshape(-1, plane.shape[2]) for plane in planes]
+class _Slots(eqx.Module):
+    """What the sweeps read, gathered into slots; rows of one lane each."""
+
+    planes: list[Float[Array, "rows slots"]]
+    shift: Float[Array, "rows slots"]
+    attributes: list[Float[Array, "rows slots"]]
+
+    @classmethod
+    def gathered(cls, shift, planes, attributes, bins: Bins) -> "_Slots":
+        def slots(plane, fill):
+            return slot_plane(plane, fill, bins).reshape(-1, bins.ids.shape[2])
+
+        filled = zip(planes, _EMPTY, strict=True)
+        return cls([slots(*each) for each in filled], slots(shift, 0.0), [slots(row, 0.0) for row in attributes])
 
 
-def _planes(geometry, rows, bins: Bins):
-    row_planes = slot_planes(rows, (0.0,) * rows.shape[0], bins)
-    return _rows_of_lanes(slot_planes(geometry, _EMPTY, bins)), _rows_of_lanes(row_planes)
+def _picked(is_open: Bool[Array, " tiles"]):
+    """Find the places of open tiles, `_PICKED` at a time, and in how many rounds; the rest of the last round is empty."""
+    places = jnp.nonzero(is_open, size=is_open.shape[0] + _PICKED, fill_value=is_open.shape[0])[0].astype(jnp.int32)
+    count = jnp.sum(is_open, dtype=jnp.int32)
+
+    def pick(i):
+        picked = lax.dynamic_slice_in_dim(places, i * _PICKED, _PICKED)
+        real = picked < is_open.shape[0]
+        return jnp.where(real, picked, 0), real[:, None]
+
+    return pick, -(-count // _PICKED)
 
 
-def _open_tiles(sweep: _Sweep, front, limit):
-    """Find the tiles with pixels that the front leaves open: their places first, and how many there are."""
-    gaps = (front[:, -1] < sweep.full_coverage) & (limit > -jnp.inf) & (limit < jnp.inf)
-    is_open = jnp.any(gaps, axis=1)
-    places = jnp.nonzero(is_open, size=is_open.shape[0] + _PICKED, fill_value=0)[0].astype(jnp.int32)
-    return gaps, places, jnp.sum(is_open, dtype=jnp.int32)
-
-
-def _forward(sweep: _Sweep, bins: Bins, geometry, rows):
-    """Sweep all chunks: sums in lane order, and per pixel the limits of both surfaces."""
-    planes, row_planes = _planes(geometry, rows, bins)
-    lanes, dtype = sweep.grid.lanes, geometry.dtype
+def _forward(sweep: _Sweep, bins: Bins, shift, planes, attributes):
+    """Sweep all chunks: the pictures of both surfaces, and per pixel their limits, in lane order."""
+    slots, grid = _Slots.gathered(shift, planes, attributes, bins), sweep.grid
+    dtype, count = attributes.dtype, attributes.shape[0] + 2
 
     def chunk(i, out):
         tiles = sweep.chunk(bins, i, dtype)
-        limit = sweep.limits(planes, tiles, None)
-        sums = sweep.sum_rows(planes, row_planes, tiles, limit, None)
-        front, limits = out
-        return lax.dynamic_update_slice_in_dim(front, sums, i * lanes, 0), lax.dynamic_update_slice_in_dim(
-            limits, limit, i * lanes, 0
-        )
+        limit = sweep.limits(slots, tiles, None)
+        parts = sweep.sums(slots, tiles, limit, None), limit
+        return tuple(lax.dynamic_update_slice_in_dim(whole, part, i * grid.lanes, 0) for whole, part in zip(out, parts, strict=True))
 
-    empty = jnp.zeros((sweep.grid.tiles, rows.shape[0], sweep.grid.side**2), dtype)
-    never = jnp.full(empty.shape[::2], jnp.inf, dtype)
+    never = jnp.full((grid.tiles, grid.side**2), jnp.inf, dtype)
+    empty = jnp.zeros((grid.tiles, count, grid.side**2), dtype)
     front, limits = lax.fori_loop(jnp.int32(0), bins.chunks, chunk, (empty, never))
-    gaps, places, count = _open_tiles(sweep, front, limits)
+    gaps = (front[:, -1] < sweep.full_coverage) & (limits > -jnp.inf) & (limits < jnp.inf)
+    pick, rounds = _picked(jnp.any(gaps, axis=1))
 
     def look_behind(i, out):
-        picked = lax.dynamic_slice_in_dim(places, i * _PICKED, _PICKED)
-        real = (i * _PICKED + jnp.arange(_PICKED, dtype=jnp.int32) < count)[:, None]
-        tiles = sweep.picked(bins, picked, dtype)
-        limit = limits[picked]
-        below = jnp.where(gaps[picked] & real, limit, -jnp.inf)
-        second = sweep.limits(planes, tiles, below)
-        second = jnp.where(second > -jnp.inf, second, jnp.inf)
-        sums = sweep.sum_rows(planes, row_planes, tiles, second, limit)
         behind, seconds = out
-        return behind.at[picked].add(sums), seconds.at[picked].min(second)
+        places, real = pick(i)
+        tiles, limit = sweep.picked(bins, places, dtype), limits[places]
+        second = sweep.limits(slots, tiles, jnp.where(gaps[places] & real, limit, -jnp.inf))
+        second = jnp.where(second > -jnp.inf, second, jnp.inf)
+        sums = sweep.sums(slots, tiles, second, limit)
+        at = bins.order[places]
+        return behind.at[*grid.place(at)].add(grid.squares(sums)), seconds.at[places].min(second)
 
-    behind, seconds = lax.fori_loop(jnp.int32(0), -(-count // _PICKED), look_behind, (empty, never))
-    return front, behind, limits, seconds
+    behind = jnp.zeros((count, grid.down, grid.side, grid.across, grid.side), dtype)
+    behind, seconds = lax.fori_loop(jnp.int32(0), rounds, look_behind, (behind, never))
+    return grid.join(front[bins.inverse_order()]), grid.picture(behind), (limits, seconds)
 
 
-def _backward(sweep: _Sweep, bins: Bins, geometry, rows, limits, cotangents):
-    """Sweep all chunks again: the cotangents of geometry and rows, per slot, then summed per splat."""
-    planes, row_planes = _planes(geometry, rows, bins)
-    lanes, dtype, count = sweep.grid.lanes, geometry.dtype, rows.shape[0]
+def _backward(sweep: _Sweep, bins: Bins, shift, planes, attributes, limits, cotangents):
+    """Sweep all chunks again: the cotangents of planes and attributes, per slot, then summed per splat."""
+    slots, grid = _Slots.gathered(shift, planes, attributes, bins), sweep.grid
+    dtype, count = attributes.dtype, len(planes) + attributes.shape[0]
     limits, seconds = limits
-    d_front, d_behind = cotangents
+    d_front, d_behind = grid.cut(cotangents[0], 0.0)[bins.order], grid.tiled(cotangents[1])
 
     def chunk(i, gradients):
-        limit = lax.dynamic_slice_in_dim(limits, i * lanes, lanes)
-        cotangent = lax.dynamic_slice_in_dim(d_front, i * lanes, lanes)
-        tiles = sweep.chunk(bins, i, dtype)
-        return sweep.add_cotangents(planes, row_planes, tiles, limit, None, cotangent, gradients)
+        limit, cotangent = (lax.dynamic_slice_in_dim(each, i * grid.lanes, grid.lanes) for each in (limits, d_front))
+        return sweep.add_cotangents(slots, sweep.chunk(bins, i, dtype), limit, None, cotangent, gradients)
 
-    start = tuple(jnp.zeros(planes[0].shape, dtype) for _ in range(_GEOMETRY - 1 + count))
-    slots = lax.fori_loop(jnp.int32(0), bins.chunks, chunk, start)
-
-    is_open = jnp.any(seconds < jnp.inf, axis=1)
-    places = jnp.nonzero(is_open, size=is_open.shape[0] + _PICKED, fill_value=0)[0].astype(jnp.int32)
-    open_count = jnp.sum(is_open, dtype=jnp.int32)
+    start = tuple(jnp.zeros_like(slots.shift) for _ in range(count))
+    gradients = lax.fori_loop(jnp.int32(0), bins.chunks, chunk, start)
+    pick, rounds = _picked(jnp.any(seconds < jnp.inf, axis=1))
 
     def behind(i, gradients):
-        picked = lax.dynamic_slice_in_dim(places, i * _PICKED, _PICKED)
-        real = (i * _PICKED + jnp.arange(_PICKED, dtype=jnp.int32) < open_count)[:, None]
-        beyond = jnp.where(real, seconds[picked], jnp.inf)
-        tiles = sweep.picked(bins, picked, dtype)
-        return sweep.add_cotangents(planes, row_planes, tiles, beyond, limits[picked], d_behind[picked], gradients)
+        places, real = pick(i)
+        beyond = jnp.where(real, seconds[places], jnp.inf)
+        cotangent = grid.lines(d_behind.at[*grid.place(bins.order[places])].get(mode="promise_in_bounds"))
+        return sweep.add_cotangents(slots, sweep.picked(bins, places, dtype), beyond, limits[places], cotangent, gradients)
 
-    slots = lax.fori_loop(jnp.int32(0), -(-open_count // _PICKED), behind, slots)
-    per_splat = [scatter_slots(plane, bins, geometry.shape[1]) for plane in slots]
-    d_geometry = jnp.stack([*per_splat[: _GEOMETRY - 1], jnp.zeros_like(per_splat[0])])
-    return d_geometry, jnp.stack(per_splat[_GEOMETRY - 1 :])
+    gradients = lax.fori_loop(jnp.int32(0), rounds, behind, gradients)
+    per_splat = [scatter_slots(plane, bins, attributes.shape[1]) for plane in gradients]
+    return tuple(per_splat[: len(planes)]), jnp.stack(per_splat[len(planes) :]) if attributes.shape[0] else jnp.zeros_like(attributes)
 
 
-def _geometry_cotangent(geometry, quad, near):
+def _plane_cotangents(splats, quad, near):
     """Turn moments of the cotangents over the pixels into cotangents of a splat's numbers."""
-    x, y, sx, sy, a, b, c, _ = geometry
+    x, y, sx, sy, a, b, c, _, _ = splats
     m, mx, my, mxx, mxy, myy = quad
     n, nx, ny = near
     dx, dy = mx - x * m, my - y * m
     dxx = mxx - 2 * x * mx + x * x * m
     dxy = mxy - x * my - y * mx + x * y * m
     dyy = myy - 2 * y * my + y * y * m
-    return (
-        -(2 * a * dx + b * dy + sx * n),
-        -(b * dx + 2 * c * dy + sy * n),
-        nx - x * n,
-        ny - y * n,
-        dxx,
-        dxy,
-        dyy,
-        n,
-    )
+    d_x = -(2 * a * dx + b * dy + sx * n)
+    d_y = -(b * dx + 2 * c * dy + sy * n)
+    return d_x, d_y, nx - x * n, ny - y * n, dxx, dxy, dyy, n
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0,))
-def _sweep_tiles(sweep: _Sweep, bins: Bins, geometry, rows):
-    front, behind, _, _ = _forward(sweep, bins, geometry, rows)
-    lanes = bins.inverse_order()
-    return front[lanes], behind[lanes]
+def _sweep_tiles(sweep: _Sweep, bins: Bins, shift, planes, attributes):
+    front, behind, _ = _forward(sweep, bins, shift, planes, attributes)
+    return front, behind
 
 
-def _sweep_tiles_fwd(sweep: _Sweep, bins: Bins, geometry, rows):
-    front, behind, limit, second = _forward(sweep, bins, geometry, rows)
-    lanes = bins.inverse_order()
-    return (front[lanes], behind[lanes]), (bins, geometry, rows, limit, second)
+def _sweep_tiles_fwd(sweep: _Sweep, bins: Bins, shift, planes, attributes):
+    front, behind, limits = _forward(sweep, bins, shift, planes, attributes)
+    return (front, behind), (bins, shift, planes, attributes, limits)
 
 
 def _sweep_tiles_bwd(sweep: _Sweep, residuals, cotangents):
-    bins, geometry, rows, limit, second = residuals
-    in_lane_order = tuple(each[bins.order] for each in cotangents)
-    d_geometry, d_rows = _backward(sweep, bins, geometry, rows, (limit, second), in_lane_order)
-    return None, d_geometry, d_rows
+    return (None, None, *_backward(sweep, *residuals, cotangents))
 
 
 _sweep_tiles.defvjp(_sweep_tiles_fwd, _sweep_tiles_bwd)

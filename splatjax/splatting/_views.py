@@ -45,6 +45,10 @@ class Footprints(eqx.Module):
     """The rim's bounding box. Not differentiated."""
     visible: Bool[Array, " splats"]
 
+    @property
+    def count(self) -> int:
+        return self.x.shape[0]
+
 
 class AbstractView(eqx.Module):
     """A projection of the world onto pixels."""
@@ -54,7 +58,7 @@ class AbstractView(eqx.Module):
 
     @abc.abstractmethod
     def footprints(self, splats: Splats, settings: SplattingSettings) -> Footprints:
-        """Project splats. Splats that face away, or lie before the near plane, are not visible."""
+        """Project splats. Splats that face away or are seen edge on, or lie before the near plane, are not visible."""
 
     @staticmethod
     @abc.abstractmethod
@@ -123,6 +127,7 @@ def _rows(matrix: Float[Array, "3 3"], vectors: Float[Array, "3 splats"]) -> tup
 
 
 _SLOPE_FILTER = 0.25  # pixels; see _filtered
+_EDGE_ON = 1e-5  # cosine to the line of sight, below which float32 does not know which side of a splat is seen
 
 
 def _filtered(xx, xy, yy, root, dx, dy, vx, vy, filter_radius):
@@ -133,12 +138,12 @@ def _filtered(xx, xy, yy, root, dx, dy, vx, vy, filter_radius):
     stay on the plane of every splat that a pixel can resolve. No term cancels another: float32 holds however slanted the splat.
     """
     determinant, trace, fine = root * root, xx + yy, _SLOPE_FILTER**2
-    inverse = 1 / (determinant + fine * (trace + fine))
-    slope_x, slope_y = (dx + fine * vx) * inverse, (dy + fine * vy) * inverse
+    slanted = determinant + fine * (trace + fine)
+    slope_x, slope_y = (dx + fine * vx) / slanted, (dy + fine * vy) / slanted
     wide = filter_radius**2
     determinant = determinant + wide * (trace + wide)
-    xx, yy, inverse = xx + wide, yy + wide, 1 / determinant
-    return yy * inverse, -2 * xy * inverse, xx * inverse, slope_x, slope_y, xx, yy, jnp.sqrt(determinant)
+    xx, yy = xx + wide, yy + wide
+    return yy / determinant, -2 * xy / determinant, xx / determinant, slope_x, slope_y, xx, yy, jnp.sqrt(determinant)
 
 
 class PerspectiveView(AbstractView):
@@ -166,22 +171,23 @@ class PerspectiveView(AbstractView):
 
     def footprints(self, splats: Splats, settings: SplattingSettings) -> Footprints:
         px, py, pz = _rows(self.rotation, (splats.centers - self.position[None]).T)
-        nx, ny, nz = _rows(self.rotation, splats.normals.T)
         in_front = pz > self.near
         pz = jnp.where(in_front, pz, 1.0)
-        u, v = px / pz, py / pz
+        u, v, scale = px / pz, py / pz, self.focal_length / pz
+        # All below is homogeneous in the normal and the radius (pixels): the normal is taken that long.
+        radius = splats.radii * self.focal_length / pz
+        nx, ny, nz = (n * splats.radii * self.focal_length / pz for n in _rows(self.rotation, splats.normals.T))
         facing = -(nx * u + ny * v + nz)
-        visible = in_front & (facing > 0) & self._in_cone(px, py, pz, splats.radii)
-        # The disc's ellipse: S = (r f / z)^2 P (I - n n^T) P^T, with P = [[1, 0, -u], [0, 1, -v]].
-        scale = self.focal_length / pz
-        squared = (splats.radii * scale) ** 2
+        visible = in_front & (facing > _EDGE_ON * radius) & self._in_cone(px, py, pz, splats.radii)
+        # The disc's ellipse: S = r^2 P (I - n n^T) P^T, with P = [[1, 0, -u], [0, 1, -v]].
         an, bn = u * nx + nz, v * ny + nz
-        xx = squared * (ny * ny * (1 + u * u) + an * an)
-        xy = squared * (u * ny * bn + v * nx * an - nx * ny)
-        yy = squared * (nx * nx * (1 + v * v) + bn * bn)
-        across, along = squared * facing, squared / self.focal_length
-        dx, dy = -across * along * nx, -across * along * ny
-        vx, vy = along * (u + (nx - u * nz) * nz), along * (v + (ny - v * nz) * nz)
+        xx = ny * ny * (1 + u * u) + an * an
+        xy = u * ny * bn + v * nx * an - nx * ny
+        yy = nx * nx * (1 + v * v) + bn * bn
+        across, along = radius * facing, radius * radius
+        dx, dy = -facing * along * nx / self.focal_length, -facing * along * ny / self.focal_length
+        vx = (along * u + (nx - u * nz) * nz) / self.focal_length
+        vy = (along * v + (ny - v * nz) * nz) / self.focal_length
         a, b, c, gx, gy, xx, yy, root = _filtered(xx, xy, yy, across, dx, dy, vx, vy, settings.filter_radius)
         opacity = jnp.where(visible, across / root, 0.0)
         inverse = 1 / pz
@@ -195,7 +201,7 @@ class PerspectiveView(AbstractView):
         half_x = jnp.where(bounded, jnp.sqrt((xx + ux * ux / kappa) / kappa), jnp.inf)
         half_y = jnp.where(bounded, jnp.sqrt((yy + uy * uy / kappa) / kappa), jnp.inf)
         mid_x, mid_y = x + ux / kappa, y + uy / kappa
-        cosine = facing / jnp.sqrt(1 + u * u + v * v)
+        cosine = facing / (radius * jnp.sqrt(1 + u * u + v * v))
         epsilon = _epsilon(splats.radii, settings.filter_radius / scale, cosine, settings)
         return Footprints(
             x=x,
@@ -287,7 +293,7 @@ class OrthographicView(AbstractView):
     def footprints(self, splats: Splats, settings: SplattingSettings) -> Footprints:
         px, py, pz = _rows(self.rotation, (splats.centers - self.position[None]).T)
         nx, ny, nz = _rows(self.rotation, splats.normals.T)
-        visible = nz < 0
+        visible = nz < -_EDGE_ON
         squared = (splats.radii * self.scale) ** 2
         xx, xy, yy = squared * (ny * ny + nz * nz), squared * (-nx * ny), squared * (nx * nx + nz * nz)
         across, along = -squared * nz, squared / self.scale

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from splatjax.splatting import BinCapacity, TileGrid, TileRanges, bin_items, scatter_slots, slot_planes
+from splatjax.splatting import BinCapacity, TileGrid, TileRanges, bin_items, scatter_slots, slot_plane
 
 GRID = TileGrid(61, 45, side=8, lanes=4, slots=4)
 COUNT = 900
@@ -92,7 +92,7 @@ def test_scatter_is_the_transpose_of_the_gather(dtype):
     @jax.jit
     def both_ways(values, slots):
         bins = bin_items(ranges[0], GRID, capacity)
-        gathered = slot_planes(values[None], (0.0,), bins)[0]
+        gathered = slot_plane(values, 0.0, bins)
         return jnp.vdot(gathered, slots), jnp.vdot(values, scatter_slots(slots, bins, COUNT))
 
     rng = np.random.default_rng(1)
@@ -104,6 +104,6 @@ def test_scatter_is_the_transpose_of_the_gather(dtype):
 def test_tiles_are_cut_and_joined():
     picture = jnp.asarray(np.random.default_rng(2).normal(size=(3, GRID.height, GRID.width)), float)
     tiles = GRID.cut(picture, 7.0)
-    assert tiles.shape == (3, GRID.tiles, 64)
-    np.testing.assert_array_equal(np.asarray(GRID.join(tiles.transpose(1, 0, 2))), np.asarray(picture))
+    assert tiles.shape == (GRID.tiles, 3, 64)
+    np.testing.assert_array_equal(np.asarray(GRID.join(tiles)), np.asarray(picture))
     assert float(jnp.sum(tiles == 7.0)) == tiles.size - picture.size
