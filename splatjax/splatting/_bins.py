@@ -91,10 +91,11 @@ class TileRanges(eqx.Module):
         grid: TileGrid,
     ) -> "TileRanges":
         """Find the tiles with a pixel center inside each box (pixels)."""
-        first_x, last_x = jnp.clip(jnp.ceil(left - 0.5), 0, grid.width), jnp.clip(jnp.floor(right - 0.5), -1, grid.width - 1)
-        first_y, last_y = jnp.clip(jnp.ceil(top - 0.5), 0, grid.height), jnp.clip(jnp.floor(bottom - 0.5), -1, grid.height - 1)
-        touched = visible & (first_x <= last_x) & (first_y <= last_y)
-        i0, i1, j0, j1 = (edge.astype(jnp.int32) // grid.side for edge in (first_x, last_x, first_y, last_y))
+        across, down = (0, grid.width - 1), (0, grid.height - 1)
+        i0, i1 = _first(left, *across) / grid.side, _last(right, *across) / grid.side
+        j0, j1 = _first(top, *down) / grid.side, _last(bottom, *down) / grid.side
+        touched = visible & (i0 <= i1) & (j0 <= j1)
+        i0, i1, j0, j1 = (jnp.floor(edge).astype(jnp.int32) for edge in (i0, i1, j0, j1))
         return cls(i0, j0, jnp.where(touched, i1 - i0 + 1, 0), jnp.where(touched, j1 - j0 + 1, 0))
 
     def per_tile(self, grid: TileGrid) -> Int[Array, " tiles"]:
@@ -106,6 +107,16 @@ class TileRanges(eqx.Module):
         corners = corners.at[j0, i0].add(one).at[j1, i1].add(one).at[j0, i1].add(-one).at[j1, i0].add(-one)
         counts = jnp.cumsum(jnp.cumsum(corners, axis=0), axis=1)[:-1, :-1].reshape(-1)
         return jnp.pad(counts, (0, grid.tiles - counts.shape[0]))
+
+
+def _first(edge: Float[Array, " items"], first: int, last: int) -> Float[Array, " items"]:
+    """Give the first pixel whose center is not before an edge; `last + 1` if none is."""
+    return jnp.clip(jnp.ceil(edge - 0.5), first, last + 1)
+
+
+def _last(edge: Float[Array, " items"], first: int, last: int) -> Float[Array, " items"]:
+    """Give the last pixel whose center is not behind an edge; `first - 1` if none is."""
+    return jnp.clip(jnp.floor(edge - 0.5), first - 1, last)
 
 
 class BinCapacity(eqx.Module):
@@ -190,8 +201,8 @@ def _ranks(tile: Int[Array, " pairs"], tiles: int):
     """Number the pairs of each tile in order: rows are sorted apart, and counts carried from row to row."""
     place = jnp.arange(_ROW, dtype=jnp.uint32)[None]
     keys = (tile.astype(jnp.uint32).reshape(-1, _ROW) << _ROW_BITS) | place
-    halves = jnp.split(keys, [keys.shape[0] // 2])  # a sort runs on one core; two run side by side
-    keys = jnp.concatenate([lax.sort(half, dimension=1, is_stable=False) for half in halves])
+    parts = jnp.array_split(keys, 4)  # a sort runs on one core; several run side by side
+    keys = jnp.concatenate([lax.sort(part, dimension=1, is_stable=False) for part in parts])
     sorted_tile, source = (keys >> _ROW_BITS).astype(jnp.int32), (keys & (_ROW - 1)).astype(jnp.int32)
     rows = keys.shape[0]
     starts = jnp.concatenate([jnp.ones((rows, 1), bool), sorted_tile[:, 1:] != sorted_tile[:, :-1]], axis=1)

@@ -8,7 +8,7 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float
 
 from ._kernel import fragment_weight
-from ._rasterizer import AbstractRasterizer, SurfaceSums
+from ._rasterizer import AbstractRasterizer, Blended, blend_fragments
 from ._settings import SplattingSettings
 from ._views import AbstractView, Footprints
 
@@ -19,9 +19,9 @@ class DenseRasterizer(AbstractRasterizer):
     def planned(self, footprints: Sequence[Footprints], view: AbstractView) -> "DenseRasterizer":
         return self
 
-    def sums(
+    def blended(
         self, footprints: Footprints, attributes: Float[Array, "attributes splats"], view: AbstractView, settings: SplattingSettings
-    ) -> SurfaceSums:
+    ) -> Blended:
         dtype, rows = attributes.dtype, attributes.shape[0] + 2
         columns = jnp.arange(view.width, dtype=dtype) + 0.5
 
@@ -37,18 +37,19 @@ class DenseRasterizer(AbstractRasterizer):
             limit = jnp.max(jnp.where(inside, shifted, -jnp.inf), axis=1)
             front = inside & (nearness > limit[:, None])
 
-            def sums(chosen: Bool[Array, "columns splats"]) -> Float[Array, "rows columns"]:
+            def blend(chosen: Bool[Array, "columns splats"]) -> Float[Array, "rows columns"]:
                 weights, hits = jnp.where(chosen, weight, 0.0), jnp.where(chosen, nearness, 0.0)
-                return jnp.concatenate([attributes @ weights.T, jnp.sum(weights * hits, axis=1)[None], jnp.sum(weights, axis=1)[None]])
+                last = jnp.stack([jnp.sum(weights * hits, axis=1), jnp.sum(weights, axis=1)])
+                return blend_fragments(jnp.concatenate([attributes @ weights.T, last]))
 
-            front_sums = sums(front)
-            open_pixel = stop_gradient(front_sums[-1]) < settings.full_coverage
+            blended = blend(front)
+            open_pixel = stop_gradient(blended[-1]) < settings.full_coverage
             rest = inside & ~front & open_pixel[:, None]
             limit_behind = jnp.max(jnp.where(rest, shifted, -jnp.inf), axis=1)
-            return front_sums, sums(rest & (nearness > limit_behind[:, None]))
+            return blended, blend(rest & (nearness > limit_behind[:, None]))
 
         if footprints.count == 0:
             empty = jnp.zeros((rows, view.height, view.width), dtype)
-            return SurfaceSums(empty, empty, jnp.zeros((), dtype))
+            return Blended(empty, empty, jnp.zeros((), dtype))
         front, behind = jax.lax.map(picture_row, jnp.arange(view.height, dtype=dtype) + 0.5)
-        return SurfaceSums(front.transpose(1, 0, 2), behind.transpose(1, 0, 2), jnp.zeros((), dtype))
+        return Blended(front.transpose(1, 0, 2), behind.transpose(1, 0, 2), jnp.zeros((), dtype))

@@ -1,25 +1,39 @@
-"""What a rasterizer does, whichever way: weighted sums over the front surface and over what lies right behind it."""
+"""What a rasterizer does, whichever way: blends attributes over the front surface and over what lies right behind it."""
 
 import abc
 from collections.abc import Sequence
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ._settings import SplattingSettings
 from ._views import AbstractView, Footprints
 
 
-class SurfaceSums(eqx.Module):
-    """Sums of weighted fragments per pixel: over the front surface, and over the surface behind it where the front leaves a gap.
+def blend_fragments(sums: Float[Array, "*tiles rows pixels"]) -> Float[Array, "*tiles rows pixels"]:
+    r"""Blend the fragments of each pixel, `c(f) = sum_i w_i c_i / sum_i w_i` (Eq. 1); 0 where there is none.
 
-    One row per attribute, then the nearness of the ray's hits with the fragments' planes, then the weights themselves.
+    **Arguments:** `sums`: of `w_i c_i`, one row each; the last row is of the weights `w_i` themselves, and is kept.
+
+    **Source:** Kim et al. 2010, Eq. 1.
+    """
+    weight_sum = sums[..., -1:, :]
+    covered = weight_sum != 0  # it is never negative, and NaN must stay
+    blended = jnp.where(covered, sums[..., :-1, :] / jnp.where(covered, weight_sum, 1.0), 0.0)
+    return jnp.concatenate([blended, weight_sum], axis=-2)
+
+
+class Blended(eqx.Module):
+    """Fragments blended per pixel (Eq. 1): those of the front surface, and of the surface behind it where the front leaves a gap.
+
+    One row per attribute, then the nearness of the ray's hits with the fragments' planes, then the sum of the weights.
     """
 
     front: Float[Array, "rows height width"]
     behind: Float[Array, "rows height width"]
     needed: Float[Array, ""]
-    """The largest of needed over planned capacity; above 1 the sums are NaN."""
+    """The largest of needed over planned capacity; above 1 all is NaN."""
 
 
 class AbstractRasterizer(eqx.Module):
@@ -35,7 +49,7 @@ class AbstractRasterizer(eqx.Module):
         """Give a rasterizer with room for each of these sets of footprints in views of this size. Not for traced arrays."""
 
     @abc.abstractmethod
-    def sums(
+    def blended(
         self, footprints: Footprints, attributes: Float[Array, "attributes splats"], view: AbstractView, settings: SplattingSettings
-    ) -> SurfaceSums:
-        """Sum weighted attributes, nearness and weights over the fragments of every pixel."""
+    ) -> Blended:
+        """Blend attributes and nearness over the fragments of every pixel."""

@@ -27,17 +27,6 @@ class Surfaces(eqx.Module):
     needed: Float[Array, ""]
 
 
-def blend_attributes(
-    sums: Float[Array, "rows height width"], weight_sum: Float[Array, "height width"]
-) -> Float[Array, "rows height width"]:
-    r"""Blend the fragments of a pixel, `c(f) = sum_i w_i c_i / sum_i w_i` (Eq. 1); 0 where there is no fragment.
-
-    **Source:** Kim et al. 2010, Eq. 1.
-    """
-    covered = weight_sum != 0  # it is never negative, and NaN must stay
-    return jnp.where(covered[None], sums / jnp.where(covered, weight_sum, 1.0)[None], 0.0)
-
-
 def splat_surfaces(
     footprints: Footprints,
     attributes: Float[Array, "attributes splats"],
@@ -56,12 +45,11 @@ def splat_surfaces(
 
     **Returns:** `Surfaces`; NaN where the rasterizer's capacity was exceeded.
     """
-    sums = rasterizer.sums(footprints, attributes, view, settings)
+    blended = rasterizer.blended(footprints, attributes, view, settings)
 
-    def surface(sums: Float[Array, "rows height width"]) -> Surface:
-        weight_sum = sums[-1]
-        blended = blend_attributes(sums[:-1], weight_sum)
-        depth = view.depth(jnp.where(weight_sum != 0, blended[-1], 1.0))
-        return Surface(blended[:-1], depth, weight_sum, coverage(weight_sum, settings.full_coverage))
+    def surface(rows: Float[Array, "rows height width"]) -> Surface:
+        weight_sum = rows[-1]
+        depth = view.depth(jnp.where(weight_sum != 0, rows[-2], 1.0))
+        return Surface(rows[:-2], depth, weight_sum, coverage(weight_sum, settings.full_coverage))
 
-    return Surfaces(surface(sums.front), surface(sums.behind), sums.needed)
+    return Surfaces(surface(blended.front), surface(blended.behind), blended.needed)

@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ._bins import BinCapacity, Bins, TileGrid, TileRanges, bin_items, scatter_slots, slot_plane
 from ._kernel import fast_fragment_weight, fragment_weight_derivative
-from ._rasterizer import AbstractRasterizer, SurfaceSums
+from ._rasterizer import AbstractRasterizer, blend_fragments, Blended
 from ._settings import SplattingSettings
 from ._views import AbstractView, Footprints
 
@@ -50,23 +50,23 @@ class TileRasterizer(AbstractRasterizer):
         ranges = [_ranges(each, grid) for each in footprints]
         return TileRasterizer(self.side, self.lanes, self.slots, BinCapacity.for_ranges(ranges, grid))
 
-    def sums(
+    def blended(
         self, footprints: Footprints, attributes: Float[Array, "attributes splats"], view: AbstractView, settings: SplattingSettings
-    ) -> SurfaceSums:
+    ) -> Blended:
         if self.capacity is None:
             raise ValueError("this TileRasterizer has no capacity yet; take one from a plan (splatjax.plan) or from `planned`")
         dtype = attributes.dtype
         if footprints.count == 0:
             empty = jnp.zeros((attributes.shape[0] + 2, view.height, view.width), dtype)
-            return SurfaceSums(empty, empty, jnp.zeros((), dtype))
+            return Blended(empty, empty, jnp.zeros((), dtype))
         grid = self._grid(view)
         bins = bin_items(_ranges(footprints, grid), grid, self.capacity)
         planes = tuple(getattr(footprints, name) for name in _PLANES)
         sweep = _Sweep(type(view), grid, settings.full_coverage)
         front, behind = _sweep_tiles(sweep, bins, stop_gradient(footprints.shift), planes, attributes)
         needed = bins.needed.astype(dtype)
-        front, behind = (jnp.where(needed <= 1, sums, jnp.nan) for sums in (front, behind))
-        return SurfaceSums(front, behind, needed)
+        front, behind = (jnp.where(needed <= 1, rows, jnp.nan) for rows in (front, behind))
+        return Blended(front, behind, needed)
 
 
 def _ranges(f: Footprints, grid: TileGrid) -> TileRanges:
@@ -156,36 +156,37 @@ class _Sweep(eqx.Module):
         start = jnp.full((lanes.row.shape[0], self.grid.side**2), -jnp.inf, lanes.x.dtype)
         return lax.fori_loop(jnp.int32(0), lanes.blocks, nearest, start)
 
-    def weights(self, nearness, quadric, beyond, upto):
-        """Give the weights of the fragments between two limits, `rho^2`, and which fragments count."""
+    def squared_radii(self, nearness, quadric, beyond, upto):
+        """Give `rho^2`, below 1 for the fragments between two limits; 1, where the weight is 0, for all others."""
         chosen = self.view.inside(nearness, quadric) & (nearness > beyond[:, None])
         if upto is not None:
             chosen &= nearness <= upto[:, None]
-        squared_radius = self.view.squared_radius(nearness, quadric)
-        return jnp.where(chosen, fast_fragment_weight(squared_radius), 0.0), squared_radius, chosen
+        return jnp.where(chosen, self.view.squared_radius(nearness, quadric), 1.0)
 
     def rows(self, splats, attributes, block, lanes: _Lanes):
-        """Give what is summed, `[lanes, rows, slots]`: attributes, the plane of nearness (three numbers), and 1."""
+        """Give what is summed, `[lanes, slots]` each: attributes, the plane of nearness (three numbers), and 1."""
         x, y, sx, sy, _, _, _, e, _ = splats
-        return jnp.stack([*(lanes.read(row, block) for row in attributes), e - sx * x - sy * y, sx, sy, jnp.ones_like(e)], axis=1)
+        return [*(lanes.read(row, block) for row in attributes), e - sx * x - sy * y, sx, sy, jnp.ones_like(e)]
 
-    def sums(self, slots: "_Slots", lanes: _Lanes, beyond, upto):
-        """Sum weighted attributes, nearness and weights, `[lanes, rows, pixels]`, over the fragments between two limits."""
+    def blend(self, slots: "_Slots", lanes: _Lanes, beyond, upto):
+        """Blend attributes and nearness over the fragments between two limits, `[lanes, rows, pixels]`; the weights' sum last."""
 
         def add(block, sums):
             splats = self.splats(slots.planes, block, lanes)
-            weight, _, _ = self.weights(*self.fragments(splats), beyond, upto)
-            rows = self.rows(splats, slots.attributes, block, lanes) * splats[-1][:, None]
+            squared_radius = self.squared_radii(*self.fragments(splats), beyond, upto)
+            weight = fast_fragment_weight(squared_radius)
+            rows = jnp.stack([row * splats[-1] for row in self.rows(splats, slots.attributes, block, lanes)], axis=1)
             return sums + jnp.einsum("trs,tsp->trp", rows, weight)
 
         start = jnp.zeros((beyond.shape[0], len(slots.attributes) + 4, beyond.shape[1]), beyond.dtype)
         sums = lax.fori_loop(jnp.int32(0), lanes.blocks, add, start)
         px, py = self.pixels(beyond.dtype)
         nearness = sums[:, -4] + sums[:, -3] * px[None] + sums[:, -2] * py[None]
-        return jnp.concatenate([sums[:, :-4], nearness[:, None], sums[:, -1:]], axis=1)
+        return blend_fragments(jnp.concatenate([sums[:, :-4], nearness[:, None], sums[:, -1:]], axis=1))
 
-    def add_cotangents(self, slots: "_Slots", lanes: _Lanes, beyond, upto, cotangent, gradients):
+    def add_cotangents(self, slots: "_Slots", lanes: _Lanes, beyond, upto, blended, cotangent, gradients):
         """Add the cotangents of planes and attributes, per slot, for the fragments between two limits."""
+        cotangent = _blend_cotangent(blended, cotangent)
         px, py = self.pixels(beyond.dtype)
         monomials = jnp.asarray(np.stack([np.ones_like(px), px, py, px * px, px * py, py * py], axis=1))
         nearness = cotangent[:, -2]
@@ -195,22 +196,22 @@ class _Sweep(eqx.Module):
         def add(block, gradients):
             splats = self.splats(slots.planes, block, lanes)
             nearness, quadric = self.fragments(splats)
-            weight, squared_radius, chosen = self.weights(nearness, quadric, beyond, upto)
-            rows, opacity = self.rows(splats, slots.attributes, block, lanes), splats[-1]
-            d_rows = jnp.einsum("tsp,trp->trs", weight, cotangent)
-            d_weight = jnp.einsum("trs,trp->tsp", rows * opacity[:, None], cotangent)
-            squared_radius = jnp.where(chosen, squared_radius, 1.0)
+            squared_radius = self.squared_radii(nearness, quadric, beyond, upto)
+            weight = fast_fragment_weight(squared_radius)
+            rows, opacity = jnp.stack(self.rows(splats, slots.attributes, block, lanes), axis=2), splats[-1]
+            d_rows = jnp.einsum("tsp,trp->tsr", weight, cotangent)
+            d_weight = jnp.einsum("tsr,trp->tsp", rows * opacity[:, :, None], cotangent)
             d_squared = fragment_weight_derivative(squared_radius, weight) * d_weight
-            nearness = jnp.where(chosen, nearness, 1.0)
+            nearness = jnp.where(squared_radius < 1, nearness, 1.0)
             d_nearness, d_quadric = self.view.squared_radius_vjp(nearness, squared_radius, d_squared)
             # Both are polynomials in the pixel: their moments over the tile are all that is needed.
             quad = jnp.moveaxis(d_quadric @ monomials, 2, 0)
             near = jnp.moveaxis(d_nearness @ monomials[:, :3], 2, 0)
-            d_opacity = jnp.sum(rows * d_rows, axis=1)
-            d_rows = d_rows * opacity[:, None]
+            d_opacity = jnp.sum(rows * d_rows, axis=2)
+            d_rows = jnp.moveaxis(d_rows * opacity[:, :, None], 2, 0)
             count = len(slots.attributes)
-            d_planes = _plane_cotangents(splats, quad, near + jnp.moveaxis(d_rows[:, count : count + 3], 1, 0))
-            parts = [*d_planes, d_opacity, *(d_rows[:, r] for r in range(count))]
+            d_planes = _plane_cotangents(splats, quad, near + d_rows[count : count + 3])
+            parts = [*d_planes, d_opacity, *d_rows[:count]]
             return tuple(lanes.add(whole, block, part) for whole, part in zip(gradients, parts, strict=True))
 
         return lax.fori_loop(jnp.int32(0), lanes.blocks, add, gradients)
@@ -253,7 +254,7 @@ def _forward(sweep: _Sweep, bins: Bins, shift, planes, attributes):
     def chunk(i, out):
         tiles = sweep.chunk(bins, i, dtype)
         limit = sweep.limits(slots, tiles, None)
-        parts = sweep.sums(slots, tiles, limit, None), limit
+        parts = sweep.blend(slots, tiles, limit, None), limit
         return tuple(lax.dynamic_update_slice_in_dim(whole, part, i * grid.lanes, 0) for whole, part in zip(out, parts, strict=True))
 
     never = jnp.full((grid.tiles, grid.side**2), jnp.inf, dtype)
@@ -268,39 +269,48 @@ def _forward(sweep: _Sweep, bins: Bins, shift, planes, attributes):
         tiles, limit = sweep.picked(bins, places, dtype), limits[places]
         second = sweep.limits(slots, tiles, jnp.where(gaps[places] & real, limit, -jnp.inf))
         second = jnp.where(second > -jnp.inf, second, jnp.inf)
-        sums = sweep.sums(slots, tiles, second, limit)
-        at = bins.order[places]
-        return behind.at[*grid.place(at)].add(grid.squares(sums)), seconds.at[places].min(second)
+        rows = grid.squares(sweep.blend(slots, tiles, second, limit))
+        return behind.at[*grid.place(bins.order[places])].add(rows), seconds.at[places].min(second)
 
     behind = jnp.zeros((count, grid.down, grid.side, grid.across, grid.side), dtype)
     behind, seconds = lax.fori_loop(jnp.int32(0), rounds, look_behind, (behind, never))
-    return grid.join(front[bins.inverse_order()]), grid.picture(behind), (limits, seconds)
+    return grid.join(front[bins.inverse_order()]), grid.picture(behind), (front, limits, seconds)
 
 
-def _backward(sweep: _Sweep, bins: Bins, shift, planes, attributes, limits, cotangents):
+def _backward(sweep: _Sweep, bins: Bins, shift, planes, attributes, behind, swept, cotangents):
     """Sweep all chunks again: the cotangents of planes and attributes, per slot, then summed per splat."""
     slots, grid = _Slots.gathered(shift, planes, attributes, bins), sweep.grid
     dtype, count = attributes.dtype, len(planes) + attributes.shape[0]
-    limits, seconds = limits
-    d_front, d_behind = grid.cut(cotangents[0], 0.0)[bins.order], grid.tiled(cotangents[1])
+    front, limits, seconds = swept
+    d_front, behind, d_behind = grid.cut(cotangents[0], 0.0)[bins.order], grid.tiled(behind), grid.tiled(cotangents[1])
 
     def chunk(i, gradients):
-        limit, cotangent = (lax.dynamic_slice_in_dim(each, i * grid.lanes, grid.lanes) for each in (limits, d_front))
-        return sweep.add_cotangents(slots, sweep.chunk(bins, i, dtype), limit, None, cotangent, gradients)
+        limit, *rows = (lax.dynamic_slice_in_dim(each, i * grid.lanes, grid.lanes) for each in (limits, front, d_front))
+        return sweep.add_cotangents(slots, sweep.chunk(bins, i, dtype), limit, None, *rows, gradients)
 
     start = tuple(jnp.zeros_like(slots.shift) for _ in range(count))
     gradients = lax.fori_loop(jnp.int32(0), bins.chunks, chunk, start)
     pick, rounds = _picked(jnp.any(seconds < jnp.inf, axis=1))
 
-    def behind(i, gradients):
+    def look_behind(i, gradients):
         places, real = pick(i)
         beyond = jnp.where(real, seconds[places], jnp.inf)
-        cotangent = grid.lines(d_behind.at[*grid.place(bins.order[places])].get(mode="promise_in_bounds"))
-        return sweep.add_cotangents(slots, sweep.picked(bins, places, dtype), beyond, limits[places], cotangent, gradients)
+        at = grid.place(bins.order[places])
+        rows = (grid.lines(each.at[*at].get(mode="promise_in_bounds")) for each in (behind, d_behind))
+        return sweep.add_cotangents(slots, sweep.picked(bins, places, dtype), beyond, limits[places], *rows, gradients)
 
-    gradients = lax.fori_loop(jnp.int32(0), rounds, behind, gradients)
+    gradients = lax.fori_loop(jnp.int32(0), rounds, look_behind, gradients)
     per_splat = [scatter_slots(plane, bins, attributes.shape[1]) for plane in gradients]
     return tuple(per_splat[: len(planes)]), jnp.stack(per_splat[len(planes) :]) if attributes.shape[0] else jnp.zeros_like(attributes)
+
+
+def _blend_cotangent(blended, cotangent):
+    """Give the cotangent of the sums that `blend_fragments` had."""
+    weight_sum = blended[:, -1:]
+    inverse = jnp.where(weight_sum != 0, 1 / jnp.where(weight_sum != 0, weight_sum, 1.0), 0.0)
+    rows = cotangent[:, :-1] * inverse
+    weight = cotangent[:, -1:] - jnp.sum(rows * blended[:, :-1], axis=1, keepdims=True)
+    return jnp.concatenate([rows, weight], axis=1)
 
 
 def _plane_cotangents(splats, quad, near):
@@ -324,8 +334,8 @@ def _sweep_tiles(sweep: _Sweep, bins: Bins, shift, planes, attributes):
 
 
 def _sweep_tiles_fwd(sweep: _Sweep, bins: Bins, shift, planes, attributes):
-    front, behind, limits = _forward(sweep, bins, shift, planes, attributes)
-    return (front, behind), (bins, shift, planes, attributes, limits)
+    front, behind, swept = _forward(sweep, bins, shift, planes, attributes)
+    return (front, behind), (bins, shift, planes, attributes, behind, swept)
 
 
 def _sweep_tiles_bwd(sweep: _Sweep, residuals, cotangents):

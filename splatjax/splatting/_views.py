@@ -198,9 +198,9 @@ class PerspectiveView(AbstractView):
         bounded = kappa > 1e-3
         kappa = jnp.where(bounded, kappa, 1.0)
         x, y = self.width / 2 + self.focal_length * u, self.height / 2 + self.focal_length * v
-        half_x = jnp.where(bounded, jnp.sqrt((xx + ux * ux / kappa) / kappa), jnp.inf)
-        half_y = jnp.where(bounded, jnp.sqrt((yy + uy * uy / kappa) / kappa), jnp.inf)
-        mid_x, mid_y = x + ux / kappa, y + uy / kappa
+        mid_x, mid_y = stop_gradient(ux / kappa), stop_gradient(uy / kappa)
+        half_x = stop_gradient(jnp.sqrt(jnp.where(bounded, (xx + ux * mid_x) / kappa, jnp.inf)))
+        half_y = stop_gradient(jnp.sqrt(jnp.where(bounded, (yy + uy * mid_y) / kappa, jnp.inf)))
         cosine = facing / (radius * jnp.sqrt(1 + u * u + v * v))
         epsilon = _epsilon(splats.radii, settings.filter_radius / scale, cosine, settings)
         return Footprints(
@@ -214,10 +214,10 @@ class PerspectiveView(AbstractView):
             nearness=inverse,
             shift=stop_gradient(1 / (1 + epsilon * inverse)),
             opacity=opacity,
-            left=stop_gradient(mid_x - half_x),
-            right=stop_gradient(mid_x + half_x),
-            top=stop_gradient(mid_y - half_y),
-            bottom=stop_gradient(mid_y + half_y),
+            left=stop_gradient(x) + mid_x - half_x,
+            right=stop_gradient(x) + mid_x + half_x,
+            top=stop_gradient(y) + mid_y - half_y,
+            bottom=stop_gradient(y) + mid_y + half_y,
             visible=visible,
         )
 
