@@ -46,18 +46,17 @@ def rasterization(scene: sj.Scene, camera: sj.Camera, plan: sj.Plan, settings: s
     """Passes 2 and 3 with normals and albedo, and the gradient of a picture's mean squares in all that they read."""
     areas = scene.splats.areas
 
-    def surfaces(centers, normals, radii, albedo):
-        view = splatting.PerspectiveView.of(camera)
-        footprints = view.footprints(sj.Splats(centers, normals, radii, areas), settings.splatting)
+    def surfaces(camera, centers, normals, radii, albedo):
+        view, splats = splatting.PerspectiveView.of(camera), sj.Splats(centers, normals, radii, areas)
         rows = jnp.concatenate([normals.T, albedo.T])
-        return splatting.splat_surfaces(footprints, rows, view, settings.splatting, plan.camera)
+        return splatting.splat_surfaces(splats, rows, view, settings.splatting, plan.camera)
 
     def loss(*inputs):
         seen = surfaces(*inputs)
         return jnp.mean(seen.front.attributes**2) + jnp.mean(seen.front.coverage) + jnp.mean(seen.behind.attributes**2)
 
     s = scene.splats
-    return surfaces, jax.grad(loss, argnums=(0, 1, 2, 3)), (s.centers, s.normals, s.radii, s.albedo)
+    return surfaces, jax.grad(loss, argnums=(1, 2, 3, 4)), (camera, s.centers, s.normals, s.radii, s.albedo)
 
 
 def passes(scene: sj.Scene, camera: sj.Camera, plan: sj.Plan, settings: sj.RenderSettings) -> dict[str, tuple]:
@@ -81,8 +80,7 @@ def passes(scene: sj.Scene, camera: sj.Camera, plan: sj.Plan, settings: sj.Rende
 
     def visible(splats, irradiance):
         rows = jnp.concatenate([splats.normals.T, splats.areas[None], splats.albedo.T, irradiance, irradiance])
-        footprints = view.footprints(splats, settings.splatting)
-        return splatting.splat_surfaces(footprints, rows, view, settings.splatting, plan.camera)
+        return splatting.splat_surfaces(splats, rows, view, settings.splatting, plan.camera)
 
     def layers(splats, irradiance, surfaces):
         sources = diffusion.Sources(splats.centers.T, splats.areas, irradiance)

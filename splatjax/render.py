@@ -58,7 +58,7 @@ def plan(scene: Scene, cameras: Camera | Sequence[Camera], settings: RenderSetti
     bounds = _splatting.Bounds.of(scene.splats)
     interval = _diffusion.handover_interval(_diffusion.irregularity(scene.splats), settings.diffusion)
     return Plan(
-        camera=_planned(settings.rasterizer, scene.splats, views, settings),
+        camera=settings.rasterizer.planned(scene.splats, views, settings.splatting),
         shadows=tuple(_plan_shadows(group, scene.splats, bounds, settings) for group in stack_lights(scene.lights)),
         diffuser=settings.diffuser.planned(scene.splats, scene.material.gaussians.variances, interval, views),
         interval=interval,
@@ -121,9 +121,8 @@ def _diffuse(scene: Scene, irradiance, camera: Camera, settings: RenderSettings,
 def _see_and_diffuse(scene: Scene, attributes: dict[str, Array], view, settings: RenderSettings, plan: Plan):
     """Passes 2 to 4: the surface in front and the one that shows behind its silhouettes, with their diffused light."""
     splats = scene.splats
-    footprints = view.footprints(splats, settings.splatting)
     stacked = jnp.concatenate(list(attributes.values()))
-    surfaces = _splatting.splat_surfaces(footprints, stacked, view, settings.splatting, plan.camera)
+    surfaces = _splatting.splat_surfaces(splats, stacked, view, settings.splatting, plan.camera)
     front, behind = ((each, _by_name(attributes, each.attributes)) for each in (surfaces.front, surfaces.behind))
     seen = [_diffusion.SeenSurface(each, named["source"], named["area"][0]) for each, named in (front, behind)]
     sources = _diffusion.Sources(splats.centers.T, splats.areas, attributes["source"])
@@ -316,11 +315,7 @@ def _plan_shadows(group: StackedLights, splats: Splats, bounds, settings: Render
         cube = bool(jnp.any(distance < 1.05 * bounds.radius))
     lights = [jax.tree.map(lambda leaf, i=i: leaf[i], group.lights) for i in range(len(group.places))]
     views = [view for light in lights for view in _shadow_views(light, bounds, settings, cube)]
-    return ShadowPlan(_planned(settings.rasterizer, splats, views, settings), cube)
-
-
-def _planned(rasterizer, splats: Splats, views, settings: RenderSettings) -> _splatting.AbstractRasterizer:
-    return rasterizer.planned([view.footprints(splats, settings.splatting) for view in views], views[0])
+    return ShadowPlan(settings.rasterizer.planned(splats, views, settings.splatting), cube)
 
 
 def _surface_parameters(splats: Splats, scene: Scene):

@@ -71,8 +71,8 @@ class ClusterDiffuser(AbstractDiffuser):
         edges = [self._cell(math.sqrt(v / self.margin), spacing) for v in values]
         cells = sorted({edge for edge, v in zip(edges, values, strict=True) if edge > 0 and v * self.margin > narrowest})
         tree = ClusterTree.build(splats.centers, cells)
-        levels = _levels(tree, Sources(splats.centers.T, splats.areas, splats.areas[None]))
-        centers, normals = splats.centers.T, splats.normals.T
+        levels = tree.levels(Sources(splats.centers.T, splats.areas, splats.areas[None]))
+        centers = splats.centers.T
         layers = []
         for v, edge in zip(values, edges, strict=True):
             level = cells.index(edge) + 1 if edge in cells else 0
@@ -80,15 +80,8 @@ class ClusterDiffuser(AbstractDiffuser):
             capacity = None
             if v * self.margin > narrowest:
                 largest = jnp.asarray(v * self.margin, splats.areas.dtype)
-                ranges = []
-                for view in views:
-                    grid = self._grid(view.width, view.height, stride)
-                    x, y, depth = view.project(centers)
-                    _, _, facing = view.slant(x, y, depth, normals)
-                    depth = jnp.where(facing > 0, depth + 2 * splats.radii, -jnp.inf)
-                    far = _farthest(x / stride, y / stride, depth, grid)
-                    ranges.append(_ranges(levels[level], largest, self.support, view, grid, stride, far))
-                capacity = BinCapacity.for_ranges(ranges, self._grid(views[0].width, views[0].height, stride))
+                counts = [_demand(self, splats, levels[level], largest, stride, view) for view in views]
+                capacity = BinCapacity.for_counts(counts, self._grid(views[0].width, views[0].height, stride))
             layers.append(LayerPlan(level, stride, float(v) / self.margin, float(v) * self.margin, capacity))
         return eqx.tree_at(_parts, self, (tree, tuple(layers)), is_leaf=_is_none)
 
@@ -118,7 +111,7 @@ class ClusterDiffuser(AbstractDiffuser):
         if variances.shape[0] != len(self.layers):
             raise ValueError(f"this plan is for {len(self.layers)} Gaussians, not {variances.shape[0]}; make it anew")
         channels = sources.irradiance.shape[0]
-        levels = _levels(self.tree, sources)
+        levels = self.tree.levels(sources)
         layers, needed = [], []
         for variance, layer in zip(variances, self.layers, strict=True):
             if layer.capacity is None:
@@ -204,8 +197,15 @@ def _is_none(leaf) -> bool:
     return leaf is None
 
 
-def _levels(tree: ClusterTree, sources: Sources) -> list[Clusters]:
-    return tree.levels(sources)
+@eqx.filter_jit
+def _demand(diffuser: ClusterDiffuser, splats: Splats, clusters: Clusters, variance, stride: int, view: AbstractView):
+    """Count the clusters that every tile needs, for a surface as far away as the splats that face the eye."""
+    grid = diffuser._grid(view.width, view.height, stride)
+    x, y, depth = view.project(splats.centers.T)
+    _, _, facing = view.slant(x, y, depth, splats.normals.T)
+    depth = jnp.where(facing > 0, depth + 2 * splats.radii, -jnp.inf)
+    far = _farthest(x / stride, y / stride, depth, grid)
+    return _ranges(clusters, variance, diffuser.support, view, grid, stride, far).per_tile(grid)
 
 
 def _farthest(x, y, depth, grid: TileGrid) -> Float[Array, "down across"]:

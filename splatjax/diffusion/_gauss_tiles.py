@@ -27,6 +27,7 @@ class _Sweep(eqx.Module):
         return weight, (dx, dy, dz), squared, rate
 
     def points(self, tiles, bins: Bins, chunk):
+        """Give what belongs to the tiles of a chunk."""
         lanes = lax.dynamic_slice_in_dim(bins.order, chunk * self.grid.lanes, self.grid.lanes)
         return tiles[lanes]
 
@@ -52,18 +53,16 @@ def _forward(sweep: _Sweep, bins: Bins, tiles, sources, rows):
         sums = lax.fori_loop(bins.first_block[i], bins.first_block[i + 1], add, start)
         return lax.dynamic_update_slice_in_dim(out, sums, i * lanes, 0)
 
-    out = jnp.zeros((sweep.grid.tiles, count, tiles.shape[2]), tiles.dtype)
-    return lax.fori_loop(jnp.int32(0), bins.chunks, chunk, out)[bins.inverse_order()]
+    out = jnp.zeros((bins.places, count, tiles.shape[2]), tiles.dtype)
+    return bins.by_tile(lax.fori_loop(jnp.int32(0), bins.chunks, chunk, out), 0.0)
 
 
 def _backward(sweep: _Sweep, bins: Bins, tiles, sources, rows, cotangents):
     planes, row_planes = _planes(sources, rows, bins)
     lanes, count = sweep.grid.lanes, rows.shape[0]
-    cotangents = cotangents[bins.order]
 
     def chunk(i, carry):
-        points = sweep.points(tiles, bins, i)
-        cotangent = lax.dynamic_slice_in_dim(cotangents, i * lanes, lanes)
+        points, cotangent = sweep.points(tiles, bins, i), sweep.points(cotangents, bins, i)
 
         def add(block, carry):
             d_points, gradients = carry
@@ -87,9 +86,10 @@ def _backward(sweep: _Sweep, bins: Bins, tiles, sources, rows, cotangents):
         return lax.dynamic_update_slice_in_dim(d_tiles, d_points, i * lanes, 0), gradients
 
     slots = tuple(jnp.zeros(bins.ids.shape, tiles.dtype) for _ in range(4 + count))
-    d_tiles, slots = lax.fori_loop(jnp.int32(0), bins.chunks, chunk, (jnp.zeros_like(tiles), slots))
+    d_tiles = jnp.zeros((bins.places, *tiles.shape[1:]), tiles.dtype)
+    d_tiles, slots = lax.fori_loop(jnp.int32(0), bins.chunks, chunk, (d_tiles, slots))
     per_source = [scatter_slots(plane, bins, sources.shape[1]) for plane in slots]
-    return d_tiles[bins.inverse_order()], jnp.stack(per_source[:4]), jnp.stack(per_source[4:])
+    return bins.by_tile(d_tiles, 0.0), jnp.stack(per_source[:4]), jnp.stack(per_source[4:])
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0,))

@@ -11,6 +11,6 @@ from ._shadows import in_cube_face as in_cube_face, light_surfaces as light_surf
 from ._shadows import near_view as near_view, ShadowSettings as ShadowSettings, stack_views as stack_views
 from ._surfaces import splat_surfaces as splat_surfaces
 from ._surfaces import Surface as Surface, Surfaces as Surfaces
-from ._tiles import TileRasterizer as TileRasterizer
+from ._tiles import TileCapacity as TileCapacity, TileRasterizer as TileRasterizer
 from ._views import AbstractView as AbstractView, Footprints as Footprints
 from ._views import OrthographicView as OrthographicView, PerspectiveView as PerspectiveView

@@ -5,6 +5,8 @@ Tiles are ordered by the length of their list and swept `lanes` at a time, a *ch
 more than either is reported.
 """
 
+from collections.abc import Sequence
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -51,12 +53,6 @@ class TileGrid(eqx.Module):
     def place(self, tiles: Int[Array, " some"]) -> tuple:
         """Give the index of tiles in what `tiled` shows; it selects `[some, rows, side, side]`."""
         return slice(None), tiles // self.across, slice(None), tiles % self.across, slice(None)
-
-    def squares(self, pixels: Float[Array, "some rows pixels"]) -> Float[Array, "some rows side side"]:
-        return pixels.reshape(*pixels.shape[:2], self.side, self.side)
-
-    def lines(self, squares: Float[Array, "some rows side side"]) -> Float[Array, "some rows pixels"]:
-        return squares.reshape(*squares.shape[:2], self.side**2)
 
     def cut(self, picture: Float[Array, "rows height width"], fill: float) -> Float[Array, "tiles rows pixels"]:
         """Cut a picture into tiles."""
@@ -120,26 +116,25 @@ def _last(edge: Float[Array, " items"], first: int, last: int) -> Float[Array, "
 
 
 class BinCapacity(eqx.Module):
-    """How many pairs of item and tile, and how many blocks, there is room for. Static."""
+    """How many pairs of item and tile, blocks, and chunks with anything in them there is room for. Static."""
 
     pairs: int = eqx.field(static=True)
     blocks: int = eqx.field(static=True)
+    chunks: int = eqx.field(static=True)
 
     @classmethod
-    def for_ranges(cls, ranges: list[TileRanges], grid: TileGrid) -> "BinCapacity":
-        """Give room for each of these sets of items, rounded up so that nearby ones need no other program."""
-        pairs = blocks = 1
-        for item_ranges in ranges:
-            counts = np.asarray(_per_tile(item_ranges, grid), np.int64)
+    def for_counts(cls, per_tile: Sequence[Int[Array, " tiles"]], grid: TileGrid) -> "BinCapacity":
+        """Give room for each of these numbers of items per tile, rounded up so that nearby ones need no other program."""
+        pairs = blocks = chunks = 1
+        for tiles in per_tile:
+            counts = np.asarray(tiles, np.int64)
             longest = np.sort(-(-counts // grid.slots))[::-1][:: grid.lanes]
             pairs, blocks = max(pairs, int(counts.sum())), max(blocks, int(longest.sum()))
-        return cls(_round_up(pairs, _ROW), _round_up(blocks, 4))
+            chunks = max(chunks, int((longest > 0).sum()))
+        return cls(round_up(pairs, _ROW), round_up(blocks, 4), min(round_up(chunks, 4), grid.tiles // grid.lanes))
 
 
-_per_tile = eqx.filter_jit(TileRanges.per_tile)
-
-
-def _round_up(count: int, step: int) -> int:
+def round_up(count: int, step: int) -> int:
     """Round up to the next of sixteen steps per octave, and to a multiple of `step`, with 3% to spare."""
     count = int(count * 1.03) + 1
     grain = max(1 << max(count.bit_length() - 5, 0), step)
@@ -154,15 +149,22 @@ class Bins(eqx.Module):
     """The tile of each lane, chunk after chunk."""
     first_block: Int[Array, " chunks_and_one"]
     needed: Float[Array, ""]
+    places: int = eqx.field(static=True)
+    """How many lanes, of the leading chunks, there is room for; what lies beyond has an empty list."""
 
     @property
     def chunks(self) -> Int[Array, ""]:
         """How many chunks have anything in them: longer lists come first, so these lead."""
-        return jnp.sum(self.first_block[1:] > self.first_block[:-1], dtype=jnp.int32)
+        return jnp.minimum(_occupied(self.first_block), self.places // self.ids.shape[1])
 
-    def inverse_order(self) -> Int[Array, " tiles"]:
-        """The lane of each tile."""
-        return jnp.zeros_like(self.order).at[self.order].set(jnp.arange(self.order.shape[0], dtype=jnp.int32))
+    def by_tile(self, swept: Float[Array, "places ..."], fill: float) -> Float[Array, "tiles ..."]:
+        """Put what was found lane by lane in the order of the tiles; `fill` for empty ones."""
+        lane = jnp.zeros_like(self.order).at[self.order].set(jnp.arange(self.order.shape[0], dtype=jnp.int32))
+        return swept.at[lane].get(mode="fill", fill_value=fill)
+
+
+def _occupied(first_block: Int[Array, " chunks_and_one"]) -> Int[Array, ""]:
+    return jnp.sum(first_block[1:] > first_block[:-1], dtype=jnp.int32)
 
 
 def _running_max(values: Int[Array, " pairs"]) -> Int[Array, " pairs"]:
@@ -191,9 +193,10 @@ def _pairs(ranges: TileRanges, grid: TileGrid, capacity: int):
     def of_item(values):
         return values.at[item].get(mode="promise_in_bounds")
 
+    corner = ranges.top * grid.across + ranges.left
     local, across = pair - of_item(begins), jnp.maximum(of_item(ranges.across), 1)
     down = ((local.astype(jnp.float32) + 0.5) / across.astype(jnp.float32)).astype(jnp.int32)  # exact below 4 million
-    tile = (of_item(ranges.top) + down) * grid.across + of_item(ranges.left) + local - down * across
+    tile = of_item(corner) + local + down * (grid.across - across)
     return item, jnp.where(pair < total, tile, grid.tiles), jnp.sum(counts.astype(jnp.float32))
 
 
@@ -243,8 +246,9 @@ def bin_items(ranges: TileRanges, grid: TileGrid, capacity: BinCapacity) -> Bins
     begin_of_tile = jnp.full(tiles + 1, room, jnp.int32).at[order].set(begins)
     target = begin_of_tile.at[tile].get(mode="promise_in_bounds") + (rank // slots) * (lanes * slots) + rank % slots
     ids = jnp.full(room, items, jnp.int32).at[target.reshape(-1)].set(item.reshape(-1), mode="drop")
-    blocks = first_block[-1].astype(jnp.float32) / capacity.blocks
-    return Bins(ids.reshape(capacity.blocks, lanes, slots), order, first_block, jnp.maximum(total / capacity.pairs, blocks))
+    blocks, chunks = first_block[-1].astype(jnp.float32), _occupied(first_block).astype(jnp.float32)
+    needed = jnp.maximum(total / capacity.pairs, jnp.maximum(blocks / capacity.blocks, chunks / capacity.chunks))
+    return Bins(ids.reshape(capacity.blocks, lanes, slots), order, first_block, needed, capacity.chunks * lanes)
 
 
 def slot_plane(plane: Float[Array, " items"], fill: float, bins: Bins) -> Float[Array, "blocks lanes slots"]:

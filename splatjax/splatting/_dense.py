@@ -7,22 +7,24 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float
 
+from splatjax.scene import Splats
+
 from ._kernel import fragment_weight
 from ._rasterizer import AbstractRasterizer, Blended, blend_fragments
 from ._settings import SplattingSettings
-from ._views import AbstractView, Footprints
+from ._views import AbstractView
 
 
 class DenseRasterizer(AbstractRasterizer):
     """Tries every splat at every pixel. Slow and plain; forward mode and second order work."""
 
-    def planned(self, footprints: Sequence[Footprints], view: AbstractView) -> "DenseRasterizer":
+    def planned(self, splats: Splats, views: Sequence[AbstractView], settings: SplattingSettings) -> "DenseRasterizer":
         return self
 
     def blended(
-        self, footprints: Footprints, attributes: Float[Array, "attributes splats"], view: AbstractView, settings: SplattingSettings
+        self, splats: Splats, attributes: Float[Array, "attributes splats"], view: AbstractView, settings: SplattingSettings
     ) -> Blended:
-        dtype, rows = attributes.dtype, attributes.shape[0] + 2
+        dtype, rows, footprints = attributes.dtype, attributes.shape[0] + 2, view.footprints(splats, settings)
         columns = jnp.arange(view.width, dtype=dtype) + 0.5
 
         def picture_row(y: Float[Array, ""]):
@@ -48,7 +50,7 @@ class DenseRasterizer(AbstractRasterizer):
             limit_behind = jnp.max(jnp.where(rest, shifted, -jnp.inf), axis=1)
             return blended, blend(rest & (nearness > limit_behind[:, None]))
 
-        if footprints.count == 0:
+        if splats.count == 0:
             empty = jnp.zeros((rows, view.height, view.width), dtype)
             return Blended(empty, empty, jnp.zeros((), dtype))
         front, behind = jax.lax.map(picture_row, jnp.arange(view.height, dtype=dtype) + 0.5)

@@ -7,8 +7,10 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from splatjax.scene import Splats
+
 from ._settings import SplattingSettings
-from ._views import AbstractView, Footprints
+from ._views import AbstractView
 
 
 def blend_fragments(sums: Float[Array, "*tiles rows pixels"]) -> Float[Array, "*tiles rows pixels"]:
@@ -45,11 +47,11 @@ class AbstractRasterizer(eqx.Module):
     """
 
     @abc.abstractmethod
-    def planned(self, footprints: Sequence[Footprints], view: AbstractView) -> "AbstractRasterizer":
-        """Give a rasterizer with room for each of these sets of footprints in views of this size. Not for traced arrays."""
+    def planned(self, splats: Splats, views: Sequence[AbstractView], settings: SplattingSettings) -> "AbstractRasterizer":
+        """Give a rasterizer with room for these splats in each of these views, all of one size. Not for traced arrays."""
 
     @abc.abstractmethod
     def blended(
-        self, footprints: Footprints, attributes: Float[Array, "attributes splats"], view: AbstractView, settings: SplattingSettings
+        self, splats: Splats, attributes: Float[Array, "attributes splats"], view: AbstractView, settings: SplattingSettings
     ) -> Blended:
         """Blend attributes and nearness over the fragments of every pixel."""

@@ -111,8 +111,7 @@ def in_cube_face(view: PerspectiveView, points: Float[Array, "3 splats"]) -> Flo
 
 def light_surfaces(splats: Splats, view: AbstractView, splatting: SplattingSettings, rasterizer: AbstractRasterizer) -> Surfaces:
     """Make a shadow map (4.1): the surfaces that a light sees, by the camera's own passes 2 and 3."""
-    footprints = view.footprints(splats, splatting)
-    return splat_surfaces(footprints, jnp.zeros((0, splats.count), splats.centers.dtype), view, splatting, rasterizer)
+    return splat_surfaces(splats, jnp.zeros((0, splats.count), splats.centers.dtype), view, splatting, rasterizer)
 
 
 def _spline(t: Float[Array, " splats"]) -> tuple[Float[Array, " splats"], ...]:

@@ -4,10 +4,12 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from splatjax.scene import Splats
+
 from ._kernel import coverage
 from ._rasterizer import AbstractRasterizer
 from ._settings import SplattingSettings
-from ._views import AbstractView, Footprints
+from ._views import AbstractView
 
 
 class Surface(eqx.Module):
@@ -28,7 +30,7 @@ class Surfaces(eqx.Module):
 
 
 def splat_surfaces(
-    footprints: Footprints,
+    splats: Splats,
     attributes: Float[Array, "attributes splats"],
     view: AbstractView,
     settings: SplattingSettings,
@@ -40,12 +42,13 @@ def splat_surfaces(
 
     **Arguments:**
 
-    - `footprints`: the splats in this view. Differentiable; which fragments count is not.
+    - `splats`: differentiable; which fragments count is not.
     - `attributes`: one row per attribute. Differentiable.
+    - `view`: differentiable.
 
     **Returns:** `Surfaces`; NaN where the rasterizer's capacity was exceeded.
     """
-    blended = rasterizer.blended(footprints, attributes, view, settings)
+    blended = rasterizer.blended(splats, attributes, view, settings)
 
     def surface(rows: Float[Array, "rows height width"]) -> Surface:
         weight_sum = rows[-1]

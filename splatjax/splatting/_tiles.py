@@ -1,12 +1,12 @@
 """The fast rasterizer: tile by tile, only the splats that touch the tile, with a derivative that recomputes the weights.
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 It gives what `DenseRasterizer` gives. A chunk of tiles is swept twice: for the front's depth, then for the sums; chunks with a
 pixel that the front leaves open are swept twice more for what lies behind. The backward sweep needs the fragments' limits
 only. Fragments are computed relative to their tile, so that float32 suffices at any resolution.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import partial
 
 import equinox as eqx
@@ -17,15 +17,25 @@ from jax import lax
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
-from ._bins import BinCapacity, Bins, TileGrid, TileRanges, bin_items, scatter_slots, slot_plane
+from splatjax.scene import Splats
+
+from ._bins import BinCapacity, Bins, TileGrid, TileRanges, bin_items, round_up, scatter_slots, slot_plane
 from ._kernel import fast_fragment_weight, fragment_weight_derivative
-from ._rasterizer import AbstractRasterizer, blend_fragments, Blended
+from ._rasterizer import AbstractRasterizer, Blended, blend_fragments
 from ._settings import SplattingSettings
 from ._views import AbstractView, Footprints
 
 _PLANES = ("x", "y", "slope_x", "slope_y", "a", "b", "c", "nearness", "opacity")  # of the footprints, that sums depend on
 _EMPTY = (0.0, 0.0, 0.0, 0.0, 1e12, 0.0, 1e12, 1.0, 0.0)  # covers no pixel center
+_STEP = 1024  # of the planned number of splats
 _PICKED = 16  # open tiles swept together
+
+
+class TileCapacity(eqx.Module):
+    """What there is room for: splats that may be seen, and their lists. Static."""
+
+    splats: int = eqx.field(static=True)
+    bins: BinCapacity
 
 
 class TileRasterizer(AbstractRasterizer):
@@ -40,33 +50,58 @@ class TileRasterizer(AbstractRasterizer):
     side: int = eqx.field(static=True, default=8)
     lanes: int = eqx.field(static=True, default=64)
     slots: int = eqx.field(static=True, default=32)
-    capacity: BinCapacity | None = eqx.field(default=None)
+    capacity: TileCapacity | None = eqx.field(default=None)
 
     def _grid(self, view: AbstractView) -> TileGrid:
         return TileGrid(view.width, view.height, self.side, self.lanes, self.slots)
 
-    def planned(self, footprints: Sequence[Footprints], view: AbstractView) -> "TileRasterizer":
-        grid = self._grid(view)
-        ranges = [_ranges(each, grid) for each in footprints]
-        return TileRasterizer(self.side, self.lanes, self.slots, BinCapacity.for_ranges(ranges, grid))
+    def planned(self, splats: Splats, views: Sequence[AbstractView], settings: SplattingSettings) -> "TileRasterizer":
+        grid = self._grid(views[0])
+        counts = [_demand(splats, view, settings, grid) for view in views]
+        seen = round_up(max(int(seen) for seen, _ in counts), _STEP)
+        bins = BinCapacity.for_counts([per_tile for _, per_tile in counts], grid)
+        return TileRasterizer(self.side, self.lanes, self.slots, TileCapacity(min(seen, splats.count), bins))
 
     def blended(
-        self, footprints: Footprints, attributes: Float[Array, "attributes splats"], view: AbstractView, settings: SplattingSettings
+        self, splats: Splats, attributes: Float[Array, "attributes splats"], view: AbstractView, settings: SplattingSettings
     ) -> Blended:
         if self.capacity is None:
             raise ValueError("this TileRasterizer has no capacity yet; take one from a plan (splatjax.plan) or from `planned`")
         dtype = attributes.dtype
-        if footprints.count == 0:
+        if splats.count == 0:
             empty = jnp.zeros((attributes.shape[0] + 2, view.height, view.width), dtype)
             return Blended(empty, empty, jnp.zeros((), dtype))
-        grid = self._grid(view)
-        bins = bin_items(_ranges(footprints, grid), grid, self.capacity)
+        ids, seen = _compacted(view.may_see(splats), self.capacity.splats)
+        splats = jax.tree.map(
+            lambda leaf: jnp.stack(_taken(leaf.T, ids), axis=-1) if leaf.ndim == 2 else _taken([leaf], ids)[0], splats
+        )
+        footprints, grid = view.footprints(splats, settings), self._grid(view)
+        bins = bin_items(_ranges(footprints, grid), grid, self.capacity.bins)
         planes = tuple(getattr(footprints, name) for name in _PLANES)
         sweep = _Sweep(type(view), grid, settings.full_coverage)
-        front, behind = _sweep_tiles(sweep, bins, stop_gradient(footprints.shift), planes, attributes)
-        needed = bins.needed.astype(dtype)
+        front, behind = _sweep_tiles(sweep, bins, stop_gradient(footprints.shift), planes, tuple(_taken(attributes, ids)))
+        needed = jnp.maximum(bins.needed.astype(dtype), seen.astype(dtype) / self.capacity.splats)
         front, behind = (jnp.where(needed <= 1, rows, jnp.nan) for rows in (front, behind))
         return Blended(front, behind, needed)
+
+
+@eqx.filter_jit
+def _demand(splats: Splats, view: AbstractView, settings: SplattingSettings, grid: TileGrid):
+    """Count the splats that may be seen, and the splats of every tile."""
+    return jnp.sum(view.may_see(splats)), _ranges(view.footprints(splats, settings), grid).per_tile(grid)
+
+
+def _compacted(chosen: Bool[Array, " splats"], room: int) -> tuple[Int[Array, " room"], Int[Array, ""]]:
+    """List the chosen ones in order, then the number of all, which is none; and count them."""
+    ends = jnp.cumsum(chosen.astype(jnp.int32))
+    count = chosen.shape[0]
+    target = jnp.where(chosen, ends - 1, room)
+    return jnp.full(room, count, jnp.int32).at[target].set(jnp.arange(count, dtype=jnp.int32), mode="drop"), ends[-1]
+
+
+def _taken(rows: Iterable[Float[Array, " splats"]], ids: Int[Array, " room"]) -> list[Float[Array, " room"]]:
+    """Take columns, 0 for those that are none; row by row, so that derivatives are planes too."""
+    return [row.at[ids].get(mode="fill", fill_value=0, indices_are_sorted=True) for row in rows]
 
 
 def _ranges(f: Footprints, grid: TileGrid) -> TileRanges:
@@ -198,20 +233,19 @@ class _Sweep(eqx.Module):
             nearness, quadric = self.fragments(splats)
             squared_radius = self.squared_radii(nearness, quadric, beyond, upto)
             weight = fast_fragment_weight(squared_radius)
-            rows, opacity = jnp.stack(self.rows(splats, slots.attributes, block, lanes), axis=2), splats[-1]
-            d_rows = jnp.einsum("tsp,trp->tsr", weight, cotangent)
-            d_weight = jnp.einsum("tsr,trp->tsp", rows * opacity[:, :, None], cotangent)
+            rows, opacity = self.rows(splats, slots.attributes, block, lanes), splats[-1]
+            d_rows = jnp.moveaxis(jnp.einsum("trp,tsp->trs", cotangent, weight), 1, 0)
+            d_weight = jnp.einsum("tsr,trp->tsp", jnp.stack([row * opacity for row in rows], axis=2), cotangent)
             d_squared = fragment_weight_derivative(squared_radius, weight) * d_weight
             nearness = jnp.where(squared_radius < 1, nearness, 1.0)
             d_nearness, d_quadric = self.view.squared_radius_vjp(nearness, squared_radius, d_squared)
             # Both are polynomials in the pixel: their moments over the tile are all that is needed.
             quad = jnp.moveaxis(d_quadric @ monomials, 2, 0)
             near = jnp.moveaxis(d_nearness @ monomials[:, :3], 2, 0)
-            d_opacity = jnp.sum(rows * d_rows, axis=2)
-            d_rows = jnp.moveaxis(d_rows * opacity[:, :, None], 2, 0)
-            count = len(slots.attributes)
-            d_planes = _plane_cotangents(splats, quad, near + d_rows[count : count + 3])
-            parts = [*d_planes, d_opacity, *d_rows[:count]]
+            d_opacity = sum(row * d_row for row, d_row in zip(rows, d_rows, strict=True))
+            d_rows = d_rows * opacity[None]
+            d_planes = _plane_cotangents(splats, quad, near + d_rows[-4:-1])
+            parts = [*d_planes, d_opacity, *d_rows[:-4]]
             return tuple(lanes.add(whole, block, part) for whole, part in zip(gradients, parts, strict=True))
 
         return lax.fori_loop(jnp.int32(0), lanes.blocks, add, gradients)
@@ -249,16 +283,18 @@ def _picked(is_open: Bool[Array, " tiles"]):
 def _forward(sweep: _Sweep, bins: Bins, shift, planes, attributes):
     """Sweep all chunks: the pictures of both surfaces, and per pixel their limits, in lane order."""
     slots, grid = _Slots.gathered(shift, planes, attributes, bins), sweep.grid
-    dtype, count = attributes.dtype, attributes.shape[0] + 2
+    dtype, count = planes[0].dtype, len(attributes) + 2
 
     def chunk(i, out):
         tiles = sweep.chunk(bins, i, dtype)
         limit = sweep.limits(slots, tiles, None)
         parts = sweep.blend(slots, tiles, limit, None), limit
-        return tuple(lax.dynamic_update_slice_in_dim(whole, part, i * grid.lanes, 0) for whole, part in zip(out, parts, strict=True))
+        return tuple(
+            lax.dynamic_update_slice_in_dim(whole, part, i * grid.lanes, 0) for whole, part in zip(out, parts, strict=True)
+        )
 
-    never = jnp.full((grid.tiles, grid.side**2), jnp.inf, dtype)
-    empty = jnp.zeros((grid.tiles, count, grid.side**2), dtype)
+    never = jnp.full((bins.places, grid.side**2), jnp.inf, dtype)
+    empty = jnp.zeros((bins.places, count, grid.side**2), dtype)
     front, limits = lax.fori_loop(jnp.int32(0), bins.chunks, chunk, (empty, never))
     gaps = (front[:, -1] < sweep.full_coverage) & (limits > -jnp.inf) & (limits < jnp.inf)
     pick, rounds = _picked(jnp.any(gaps, axis=1))
@@ -269,24 +305,27 @@ def _forward(sweep: _Sweep, bins: Bins, shift, planes, attributes):
         tiles, limit = sweep.picked(bins, places, dtype), limits[places]
         second = sweep.limits(slots, tiles, jnp.where(gaps[places] & real, limit, -jnp.inf))
         second = jnp.where(second > -jnp.inf, second, jnp.inf)
-        rows = grid.squares(sweep.blend(slots, tiles, second, limit))
+        rows = sweep.blend(slots, tiles, second, limit).reshape(_PICKED, count, grid.side, grid.side)
         return behind.at[*grid.place(bins.order[places])].add(rows), seconds.at[places].min(second)
 
     behind = jnp.zeros((count, grid.down, grid.side, grid.across, grid.side), dtype)
     behind, seconds = lax.fori_loop(jnp.int32(0), rounds, look_behind, (behind, never))
-    return grid.join(front[bins.inverse_order()]), grid.picture(behind), (front, limits, seconds)
+    return grid.join(bins.by_tile(front, 0.0)), grid.picture(behind), (front, limits, seconds)
 
 
 def _backward(sweep: _Sweep, bins: Bins, shift, planes, attributes, behind, swept, cotangents):
     """Sweep all chunks again: the cotangents of planes and attributes, per slot, then summed per splat."""
     slots, grid = _Slots.gathered(shift, planes, attributes, bins), sweep.grid
-    dtype, count = attributes.dtype, len(planes) + attributes.shape[0]
+    dtype, count = planes[0].dtype, len(planes) + len(attributes)
     front, limits, seconds = swept
-    d_front, behind, d_behind = grid.cut(cotangents[0], 0.0)[bins.order], grid.tiled(behind), grid.tiled(cotangents[1])
+    d_front, behind, d_behind = grid.cut(cotangents[0], 0.0), grid.tiled(behind), grid.tiled(cotangents[1])
 
     def chunk(i, gradients):
-        limit, *rows = (lax.dynamic_slice_in_dim(each, i * grid.lanes, grid.lanes) for each in (limits, front, d_front))
-        return sweep.add_cotangents(slots, sweep.chunk(bins, i, dtype), limit, None, *rows, gradients)
+        limit, blended, tiles = (
+            lax.dynamic_slice_in_dim(each, i * grid.lanes, grid.lanes) for each in (limits, front, bins.order)
+        )
+        cotangent = d_front.at[tiles].get(mode="promise_in_bounds")
+        return sweep.add_cotangents(slots, sweep.chunk(bins, i, dtype), limit, None, blended, cotangent, gradients)
 
     start = tuple(jnp.zeros_like(slots.shift) for _ in range(count))
     gradients = lax.fori_loop(jnp.int32(0), bins.chunks, chunk, start)
@@ -296,12 +335,12 @@ def _backward(sweep: _Sweep, bins: Bins, shift, planes, attributes, behind, swep
         places, real = pick(i)
         beyond = jnp.where(real, seconds[places], jnp.inf)
         at = grid.place(bins.order[places])
-        rows = (grid.lines(each.at[*at].get(mode="promise_in_bounds")) for each in (behind, d_behind))
+        rows = (each.at[*at].get(mode="promise_in_bounds").reshape(_PICKED, -1, grid.side**2) for each in (behind, d_behind))
         return sweep.add_cotangents(slots, sweep.picked(bins, places, dtype), beyond, limits[places], *rows, gradients)
 
     gradients = lax.fori_loop(jnp.int32(0), rounds, look_behind, gradients)
-    per_splat = [scatter_slots(plane, bins, attributes.shape[1]) for plane in gradients]
-    return tuple(per_splat[: len(planes)]), jnp.stack(per_splat[len(planes) :]) if attributes.shape[0] else jnp.zeros_like(attributes)
+    per_splat = tuple(scatter_slots(plane, bins, planes[0].shape[0]) for plane in gradients)
+    return per_splat[: len(planes)], per_splat[len(planes) :]
 
 
 def _blend_cotangent(blended, cotangent):

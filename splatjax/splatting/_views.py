@@ -11,7 +11,6 @@ so that the surface in front has the largest nearness and no fragment needs a sq
 """
 
 import abc
-import math
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -45,10 +44,6 @@ class Footprints(eqx.Module):
     """The rim's bounding box. Not differentiated."""
     visible: Bool[Array, " splats"]
 
-    @property
-    def count(self) -> int:
-        return self.x.shape[0]
-
 
 class AbstractView(eqx.Module):
     """A projection of the world onto pixels."""
@@ -59,6 +54,10 @@ class AbstractView(eqx.Module):
     @abc.abstractmethod
     def footprints(self, splats: Splats, settings: SplattingSettings) -> Footprints:
         """Project splats. Splats that face away or are seen edge on, or lie before the near plane, are not visible."""
+
+    @abc.abstractmethod
+    def may_see(self, splats: Splats) -> Bool[Array, " splats"]:
+        """Say which splats face the eye, with spheres that touch the picture: cheap, and never too few."""
 
     @staticmethod
     @abc.abstractmethod
@@ -126,6 +125,7 @@ def _rows(matrix: Float[Array, "3 3"], vectors: Float[Array, "3 splats"]) -> tup
     return tuple(matrix[i, 0] * x + matrix[i, 1] * y + matrix[i, 2] * z for i in range(3))
 
 
+_MARGIN = 8.0  # pixels around the picture; the screen filter reaches beyond a sphere
 _SLOPE_FILTER = 0.25  # pixels; see _filtered
 _EDGE_ON = 1e-5  # cosine to the line of sight, below which float32 does not know which side of a splat is seen
 
@@ -171,14 +171,14 @@ class PerspectiveView(AbstractView):
 
     def footprints(self, splats: Splats, settings: SplattingSettings) -> Footprints:
         px, py, pz = _rows(self.rotation, (splats.centers - self.position[None]).T)
-        in_front = pz > self.near
-        pz = jnp.where(in_front, pz, 1.0)
+        in_sight = self._in_sight(px, py, pz, splats.radii)
+        pz = jnp.where(in_sight, pz, 1.0)
         u, v, scale = px / pz, py / pz, self.focal_length / pz
         # All below is homogeneous in the normal and the radius (pixels): the normal is taken that long.
         radius = splats.radii * self.focal_length / pz
         nx, ny, nz = (n * splats.radii * self.focal_length / pz for n in _rows(self.rotation, splats.normals.T))
         facing = -(nx * u + ny * v + nz)
-        visible = in_front & (facing > _EDGE_ON * radius) & self._in_cone(px, py, pz, splats.radii)
+        visible = in_sight & (facing > _EDGE_ON * radius)
         # The disc's ellipse: S = r^2 P (I - n n^T) P^T, with P = [[1, 0, -u], [0, 1, -v]].
         an, bn = u * nx + nz, v * ny + nz
         xx = ny * ny * (1 + u * u) + an * an
@@ -221,11 +221,19 @@ class PerspectiveView(AbstractView):
             visible=visible,
         )
 
-    def _in_cone(self, x, y, z, radii):
-        """Say which spheres touch the cone around the picture. Others, far to the side, are beyond what float32 projects."""
-        corner = 0.5 * math.hypot(self.width, self.height) + 8  # pixels; the filter reaches beyond a sphere
-        off_axis = jnp.sqrt(stop_gradient(x * x + y * y))
-        return off_axis * self.focal_length - z * corner < radii * jnp.sqrt(self.focal_length**2 + corner**2)
+    def may_see(self, splats):
+        px, py, pz = _rows(self.rotation, (splats.centers - self.position[None]).T)
+        nx, ny, nz = _rows(self.rotation, splats.normals.T)
+        return self._in_sight(px, py, pz, splats.radii) & (nx * px + ny * py + nz * pz < 0)
+
+    def _in_sight(self, x, y, z, radii):
+        """Say which spheres touch the pyramid of the picture. Others, far to the side, are beyond what float32 projects."""
+
+        def beside(offset, size):
+            half = 0.5 * size + _MARGIN
+            return jnp.abs(offset) * self.focal_length - z * half < radii * jnp.sqrt(self.focal_length**2 + half**2)
+
+        return (z > self.near) & beside(x, self.width) & beside(y, self.height)
 
     @staticmethod
     def inside(nearness, quadric):
@@ -320,6 +328,12 @@ class OrthographicView(AbstractView):
             bottom=stop_gradient(y + half_y),
             visible=visible,
         )
+
+    def may_see(self, splats):
+        x, y, _ = _rows(self.rotation, (splats.centers - self.position[None]).T)
+        _, _, facing = _rows(self.rotation, splats.normals.T)
+        inside_x = jnp.abs(x) < 0.5 * (self.width + 2 * _MARGIN) / self.scale + splats.radii
+        return inside_x & (jnp.abs(y) < 0.5 * (self.height + 2 * _MARGIN) / self.scale + splats.radii) & (facing < 0)
 
     @staticmethod
     def inside(nearness, quadric):

@@ -28,11 +28,7 @@ def scene(x64: bool):
     """A bumpy body lit from the side, and the points that a view sees of it; in the precision under test."""
     body = bodies.bumpy(COUNT)
     view = bodies.perspective(fov=FOV, width=SIZE, height=SIZE)
-    surfaces = jax.jit(
-        lambda s: splat_surfaces(
-            view.footprints(s, SplattingSettings()), jnp.zeros((0, COUNT)), view, SplattingSettings(), DenseRasterizer()
-        )
-    )(body)
+    surfaces = jax.jit(lambda s: splat_surfaces(s, jnp.zeros((0, COUNT)), view, SplattingSettings(), DenseRasterizer()))(body)
     seen = (surfaces.front, surfaces.behind)
     points = jnp.stack([pixel_points(view, each.depth) for each in seen])
     covered = jnp.stack([each.weight_sum > 0 for each in seen])

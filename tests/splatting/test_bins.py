@@ -62,7 +62,7 @@ def every_kind():
 
 def test_lists_hold_exactly_the_pairs_of_brute_force_in_order():
     given, ranges = every_kind()
-    capacity = BinCapacity.for_ranges(ranges, GRID)
+    capacity = BinCapacity.for_counts([each.per_tile(GRID) for each in ranges], GRID)
     binned = jax.jit(lambda r: bin_items(r, GRID, capacity))
     for kind, box, item_ranges in zip(KINDS, given, ranges, strict=True):
         bins = binned(item_ranges)
@@ -76,18 +76,18 @@ def test_lists_hold_exactly_the_pairs_of_brute_force_in_order():
         assert [len(lists[tile]) for tile in range(GRID.tiles)] == counts.tolist(), kind
 
 
-@pytest.mark.parametrize("short", ["pairs", "blocks"])
+@pytest.mark.parametrize("short", [{"pairs": 1024}, {"blocks": 1}, {"chunks": 1}], ids=lambda short: next(iter(short)))
 def test_too_small_a_capacity_is_reported(short):
     _, ranges = every_kind()
-    enough = BinCapacity.for_ranges(ranges, GRID)
-    capacity = BinCapacity(1024, enough.blocks) if short == "pairs" else BinCapacity(enough.pairs, 1)
+    enough = BinCapacity.for_counts([each.per_tile(GRID) for each in ranges], GRID)
+    capacity = BinCapacity(**({"pairs": enough.pairs, "blocks": enough.blocks, "chunks": enough.chunks} | short))
     needed = float(jax.jit(lambda r: bin_items(r, GRID, capacity))(ranges[3]).needed)
     assert needed > 1
 
 
 def test_scatter_is_the_transpose_of_the_gather(dtype):
     _, ranges = every_kind()
-    capacity = BinCapacity.for_ranges(ranges[:1], GRID)
+    capacity = BinCapacity.for_counts([ranges[0].per_tile(GRID)], GRID)
 
     @jax.jit
     def both_ways(values, slots):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from splatjax.scene import Splats
-from splatjax.splatting import BinCapacity, DenseRasterizer, SplattingSettings, TileRasterizer, splat_surfaces
+from splatjax.splatting import BinCapacity, DenseRasterizer, SplattingSettings, TileCapacity, TileRasterizer, splat_surfaces
 
 SETTINGS = SplattingSettings()
 TILES = TileRasterizer(lanes=8, slots=16)
@@ -37,8 +37,7 @@ def both(view, body, rows, rasterizer):
     """Give the picture, and the gradients of a fixed random functional of it."""
 
     def picture(body, rows):
-        footprints = view.footprints(body, SETTINGS)
-        surfaces = splat_surfaces(footprints, rows, view, SETTINGS, rasterizer)
+        surfaces = splat_surfaces(body, rows, view, SETTINGS, rasterizer)
         return flat(surfaces), surfaces.needed
 
     planes, pullback, needed = jax.vjp(picture, body, rows, has_aux=True)
@@ -57,10 +56,16 @@ def compared(views, scenes, rows, tiles):
     return jax.lax.map(one, scenes)
 
 
+def roomy(planned: list[TileRasterizer]) -> TileRasterizer:
+    """Give a rasterizer with room for what each of these has room for."""
+    each = [tiles.capacity for tiles in planned]
+    bins = {name: max(getattr(capacity.bins, name) for capacity in each) for name in ("pairs", "blocks", "chunks")}
+    return TileRasterizer(TILES.side, TILES.lanes, TILES.slots, TileCapacity(max(c.splats for c in each), BinCapacity(**bins)))
+
+
 def compare(view, scenes: dict[str, Splats], x64):
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *scenes.values())
-    footprints = [jax.jit(lambda s: view.footprints(s, SETTINGS))(scene) for scene in scenes.values()]
-    tiles = TILES.planned(footprints, view)
+    tiles = roomy([TILES.planned(scene, [view], SETTINGS) for scene in scenes.values()])
     count = next(iter(scenes.values())).count
     results = compared(view, stacked, attributes(count), tiles)
     for i, name in enumerate(scenes):
@@ -126,21 +131,22 @@ def test_tiles_draw_what_the_plain_rasterizer_draws(kind, x64):
     assert np.sum(pictures["one sphere before another"][-1] > 0.5) > 2, "no inner silhouette was seen"
 
 
-@pytest.mark.parametrize("rasterizer", [DenseRasterizer(), TileRasterizer(capacity=BinCapacity(1024, 4))])
+@pytest.mark.parametrize("rasterizer", [DenseRasterizer(), TileRasterizer(capacity=TileCapacity(1, BinCapacity(1024, 4, 1)))])
 def test_no_splat_gives_an_empty_picture(rasterizer):
     view, nothing = bodies.perspective(), bodies.splats(np.zeros((0, 3)), np.zeros((0, 3)), 1.0)
-    surfaces = splat_surfaces(view.footprints(nothing, SETTINGS), jnp.zeros((2, 0)), view, SETTINGS, rasterizer)
+    surfaces = splat_surfaces(nothing, jnp.zeros((2, 0)), view, SETTINGS, rasterizer)
     assert not np.any(flat(surfaces))
     assert float(surfaces.needed) == 0
 
 
-def test_too_small_a_capacity_poisons_the_picture_and_says_so():
+@pytest.mark.parametrize("capacity", [TileCapacity(500, BinCapacity(1024, 4, 4)), TileCapacity(100, BinCapacity(8192, 400, 8))])
+def test_too_small_a_capacity_poisons_the_picture_and_says_so(capacity):
     view, body = bodies.perspective(), bodies.bumpy(500)
 
     @jax.jit
     def picture(body):
-        tiles = TileRasterizer(lanes=8, slots=16, capacity=BinCapacity(1024, 4))
-        return splat_surfaces(view.footprints(body, SETTINGS), attributes(500), view, SETTINGS, tiles)
+        tiles = TileRasterizer(lanes=8, slots=16, capacity=capacity)
+        return splat_surfaces(body, attributes(500), view, SETTINGS, tiles)
 
     surfaces = picture(body)
     assert float(surfaces.needed) > 1
@@ -151,4 +157,4 @@ def test_too_small_a_capacity_poisons_the_picture_and_says_so():
 def test_a_rasterizer_without_capacity_says_what_to_do():
     view, body = bodies.perspective(), bodies.splats(np.zeros((1, 3)), [[0.0, 0, 1]], 1.0)
     with pytest.raises(ValueError, match="plan"):
-        splat_surfaces(view.footprints(body, SETTINGS), attributes(1), view, SETTINGS, TileRasterizer())
+        splat_surfaces(body, attributes(1), view, SETTINGS, TileRasterizer())

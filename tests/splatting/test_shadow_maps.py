@@ -40,8 +40,7 @@ def shares(view, body, rasterizer):
 
 
 def tiles_for(view, body):
-    footprints = jax.jit(lambda s: view.footprints(s, SPLATTING))(body)
-    return TileRasterizer(lanes=8, slots=16).planned([footprints], view)
+    return TileRasterizer(lanes=8, slots=16).planned(body, [view], SPLATTING)
 
 
 LIGHTS = {

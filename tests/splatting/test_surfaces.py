@@ -18,7 +18,7 @@ DISTANCE = 40.0
 def drawn(view, body, rows, rasterizer=None):
     """Draw with the plain rasterizer, unless another is given."""
     rasterizer = DenseRasterizer() if rasterizer is None else rasterizer
-    return jax.jit(lambda s, r: splat_surfaces(view.footprints(s, SETTINGS), r, view, SETTINGS, rasterizer))(body, rows)
+    return jax.jit(lambda s, r: splat_surfaces(s, r, view, SETTINGS, rasterizer))(body, rows)
 
 
 @pytest.mark.parametrize("kind", VIEWS)
@@ -65,7 +65,7 @@ def test_an_inner_silhouette_leaves_no_gap(rasterizer):
     view, radius = bodies.perspective(width=48, height=48), 12.0
     body = bodies.joined(bodies.sphere(1400, radius), bodies.sphere(300, 3.0, (1.5, -1.0, 17.0), seed=1))
     near = jnp.concatenate([jnp.zeros((1, 1400)), jnp.ones((1, 300))], axis=1)
-    tiles = TileRasterizer(lanes=8, slots=16).planned([jax.jit(lambda s: view.footprints(s, SETTINGS))(body)], view)
+    tiles = TileRasterizer(lanes=8, slots=16).planned(body, [view], SETTINGS)
     surfaces = drawn(view, body, near, DenseRasterizer() if rasterizer == "plain" else tiles)
     front, behind = np.asarray(surfaces.front.coverage), np.asarray(surfaces.behind.coverage)
     inside = seen_sphere(view, radius, 0.9)
@@ -85,7 +85,7 @@ def test_coverage_of_a_silhouette_is_differentiable():
         @jax.jit
         def covered(shift):
             moved = eqx.tree_at(lambda s: s.centers, body, body.centers + shift[None])
-            surfaces = splat_surfaces(view.footprints(moved, SETTINGS), jnp.zeros((0, 200)), view, SETTINGS, DenseRasterizer())
+            surfaces = splat_surfaces(moved, jnp.zeros((0, 200)), view, SETTINGS, DenseRasterizer())
             ramp = jnp.arange(24, dtype=float)
             return jnp.sum(surfaces.front.coverage * (ramp[None] + 2 * ramp[:, None]))
 
