@@ -43,20 +43,25 @@ def head(data: dict[str, np.ndarray], width: int) -> tuple[sj.Scene, sj.Camera]:
 
 
 def rasterization(scene: sj.Scene, camera: sj.Camera, plan: sj.Plan, settings: sj.RenderSettings):
-    """Passes 2 and 3 with normals and albedo, and the gradient of a picture's mean squares in all that they read."""
+    """Passes 2 and 3 with normals and albedo, and the gradient of the picture's mean square in all that they read.
+
+    The picture is what the yardstick makes, and coverage: the front laid over what shows behind it.
+    """
     areas = scene.splats.areas
 
-    def surfaces(camera, centers, normals, radii, albedo):
+    def picture(camera, centers, normals, radii, albedo):
         view, splats = splatting.PerspectiveView.of(camera), sj.Splats(centers, normals, radii, areas)
         rows = jnp.concatenate([normals.T, albedo.T])
-        return splatting.splat_surfaces(splats, rows, view, settings.splatting, plan.camera)
+        seen = splatting.splat_surfaces(splats, rows, view, settings.splatting, plan.camera)
+        front = seen.front.coverage
+        behind = (1 - front) * seen.behind.coverage
+        return [*(front * a + behind * b for a, b in zip(seen.front.attributes, seen.behind.attributes)), front + behind]
 
     def loss(*inputs):
-        seen = surfaces(*inputs)
-        return jnp.mean(seen.front.attributes**2) + jnp.mean(seen.front.coverage) + jnp.mean(seen.behind.attributes**2)
+        return sum(jnp.mean(plane**2) for plane in picture(*inputs))
 
     s = scene.splats
-    return surfaces, jax.grad(loss, argnums=(1, 2, 3, 4)), (camera, s.centers, s.normals, s.radii, s.albedo)
+    return picture, jax.grad(loss, argnums=(1, 2, 3, 4)), (camera, s.centers, s.normals, s.radii, s.albedo)
 
 
 def passes(scene: sj.Scene, camera: sj.Camera, plan: sj.Plan, settings: sj.RenderSettings) -> dict[str, tuple]:

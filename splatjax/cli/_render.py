@@ -13,12 +13,13 @@ import splatjax as sj
 from ._outputs import OptionalPath, check_output
 from ._report import note, stage
 
+_FILL_SIDE, _FILL_ELEVATION = 25.0, 10.0  # degrees: beside the camera, away from the light
 _NARROW = 1e-6  # mm^2: far below any splat, so that the surface's own light stands for the layer
 
 
 @dataclass(frozen=True, kw_only=True)
 class Render:
-    """Render splats, or the built-in bust, under one light: an EXR file with every layer, and a PNG file beside it.
+    """Render splats, or the built-in bust, under a light and a weak fill: an EXR file with every layer, and a PNG file beside it.
 
     The camera looks at the middle of the splats from far enough to see all of them. Angles are in degrees: azimuth turns
     about the vertical axis, 0 is the front (+z) and 90 the side of +x; elevation rises above the horizon. If the splats carry
@@ -47,6 +48,8 @@ class Render:
     """Of the place the light comes from; beyond 90 it stands behind."""
     light_elevation: float = 30.0
     """Of the place the light comes from."""
+    fill: float = 0.1
+    """Of a second light, without shadows, from beside the camera: its share of the first one's strength. 0 for none."""
     exposure: float = 0.0
     """Of the PNG, in stops: each doubles its brightness. The EXR is never changed by it."""
     scattering: bool = True
@@ -57,6 +60,8 @@ class Render:
     def run(self) -> None:
         """Load, render, write."""
         check_output(self.output, (".exr",))
+        if not 0 <= self.fill < math.inf:
+            raise ValueError(f"--fill is {self.fill:g}; it is a share of the light's strength: 0 or more")
         if not -90 < self.elevation < 90:
             raise ValueError(f"--elevation is {self.elevation:g}; it must lie between -90 and 90 degrees, both excluded")
         material = sj.load_material(self.material)
@@ -66,10 +71,7 @@ class Render:
             note(f"the splats carry albedo: the weights of {self.material} are divided by their sums")
         if not self.scattering:
             material = without_scattering(material)
-        # On a white diffuser that faces it, this light gives radiance 1.
-        irradiance = jnp.full(material.gaussians.weights.shape[1], jnp.pi)
-        light = sj.DirectionalLight(direction=-towards(self.light_azimuth, self.light_elevation), irradiance=irradiance)
-        scene = sj.Scene(splats, (light,), material)
+        scene = sj.Scene(splats, self._lights(material.gaussians.weights.shape[1]), material)
         camera = frame_all(splats, towards(self.azimuth, self.elevation), self.fov, self.width, self.height)
         with stage("planning"):
             plan = sj.plan(scene, camera)
@@ -84,6 +86,15 @@ class Render:
             sj.write_exr(self.output, frame, variances=material.gaussians.variances.tolist())
             sj.write_png(picture, frame, exposure=self.exposure)
         print(self.output, picture, sep="\n")
+
+    def _lights(self, channels: int) -> tuple[sj.DirectionalLight, ...]:
+        # On a white diffuser that faces it, the first light gives radiance 1.
+        irradiance = jnp.full(channels, jnp.pi)
+        key = sj.DirectionalLight(-towards(self.light_azimuth, self.light_elevation), irradiance)
+        if self.fill == 0:
+            return (key,)
+        side = math.copysign(_FILL_SIDE, self.azimuth - self.light_azimuth)
+        return key, sj.DirectionalLight(-towards(self.azimuth + side, _FILL_ELEVATION), self.fill * irradiance, cast_shadows=False)
 
     def _splats(self) -> sj.Splats:
         if self.splats is None:

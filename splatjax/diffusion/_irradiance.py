@@ -13,7 +13,7 @@ def entering_irradiance(
     points: Float[Array, "splats 3"],
     normals: Float[Array, "splats 3"],
     groups: list[StackedLights],
-    lit: list[Float[Array, "lights splats"] | None],
+    lit: list[Float[Array, "_lights splats"] | None],
     entering: Callable[[Float[Array, " splats"]], Float[Array, " splats"]],
     channels: int,
 ) -> Float[Array, "channels splats"]:

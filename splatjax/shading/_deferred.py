@@ -21,7 +21,7 @@ class SurfacePoints(eqx.Module):
     """`wo`: unit, towards the eye."""
     specular: Float[Array, "height width"] | Float[Array, ""]
     roughness: Float[Array, "height width"] | Float[Array, ""]
-    lit: list[Float[Array, "lights height width"] | None]
+    lit: list[Float[Array, "_lights height width"] | None]
     """Per group of lights, as the splats received it."""
 
 
