@@ -55,7 +55,10 @@ def rasterization(scene: sj.Scene, camera: sj.Camera, plan: sj.Plan, settings: s
         seen = splatting.splat_surfaces(splats, rows, view, settings.splatting, plan.camera)
         front = seen.front.coverage
         behind = (1 - front) * seen.behind.coverage
-        return [*(front * a + behind * b for a, b in zip(seen.front.attributes, seen.behind.attributes)), front + behind]
+        return [
+            *(front * a + behind * b for a, b in zip(seen.front.attributes, seen.behind.attributes, strict=True)),
+            front + behind,
+        ]
 
     def loss(*inputs):
         return sum(jnp.mean(plane**2) for plane in picture(*inputs))

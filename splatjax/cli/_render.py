@@ -94,7 +94,9 @@ class Render:
         if self.fill == 0:
             return (key,)
         side = math.copysign(_FILL_SIDE, self.azimuth - self.light_azimuth)
-        return key, sj.DirectionalLight(-towards(self.azimuth + side, _FILL_ELEVATION), self.fill * irradiance, cast_shadows=False)
+        return key, sj.DirectionalLight(
+            -towards(self.azimuth + side, _FILL_ELEVATION), self.fill * irradiance, cast_shadows=False
+        )
 
     def _splats(self) -> sj.Splats:
         if self.splats is None:

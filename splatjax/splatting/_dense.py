@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 from splatjax.scene import Splats
 
 from ._kernel import fragment_weight
-from ._rasterizer import AbstractRasterizer, Blended, blend_fragments
+from ._rasterizer import LEAST_WEIGHT, AbstractRasterizer, Blended, blend_fragments
 from ._settings import SplattingSettings
 from ._views import AbstractView
 
@@ -47,7 +47,9 @@ class DenseRasterizer(AbstractRasterizer):
             blended = blend(front)
             open_pixel = stop_gradient(blended[-1]) < settings.full_coverage
             rest = inside & ~front & open_pixel[:, None]
-            limit_behind = jnp.max(jnp.where(rest, shifted, -jnp.inf), axis=1)
+            weighty = jnp.max(jnp.where(rest & (weight > LEAST_WEIGHT), shifted, -jnp.inf), axis=1)
+            of_any = jnp.max(jnp.where(rest, shifted, -jnp.inf), axis=1)
+            limit_behind = jnp.where(weighty > -jnp.inf, weighty, of_any)
             return blended, blend(rest & (nearness > limit_behind[:, None]))
 
         if splats.count == 0:

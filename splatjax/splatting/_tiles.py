@@ -21,7 +21,7 @@ from splatjax.scene import Splats
 
 from ._bins import BinCapacity, Bins, TileGrid, TileRanges, bin_items, round_up, scatter_slots, slot_plane
 from ._kernel import fast_fragment_weight, fragment_weight_derivative
-from ._rasterizer import AbstractRasterizer, Blended, blend_fragments
+from ._rasterizer import LEAST_WEIGHT, AbstractRasterizer, Blended, blend_fragments
 from ._settings import SplattingSettings
 from ._views import AbstractView, Footprints
 
@@ -177,19 +177,35 @@ class _Sweep(eqx.Module):
         dx, dy = px - x, py - y
         return e + sx * dx + sy * dy, dx * (a * dx + b * dy) + c * dy * dy
 
-    def limits(self, slots: "_Slots", lanes: _Lanes, below):
-        """Find per pixel the nearest shifted fragment among those at most `below`: the back end of a surface."""
+    def limits(self, slots: "_Slots", lanes: _Lanes):
+        """Find per pixel the nearest shifted fragment: the back end of the front."""
 
         def nearest(block, limit):
             nearness, quadric = self.fragments(self.splats(slots.planes, block, lanes))
             shifted = self.view.shifted(nearness, lanes.read(slots.shift, block)[:, :, None])
-            candidate = self.view.inside(nearness, quadric)
-            if below is not None:
-                candidate &= nearness <= below[:, None]
-            return jnp.maximum(limit, jnp.max(jnp.where(candidate, shifted, -jnp.inf), axis=1))
+            return jnp.maximum(limit, jnp.max(jnp.where(self.view.inside(nearness, quadric), shifted, -jnp.inf), axis=1))
 
-        start = jnp.full((lanes.row.shape[0], self.grid.side**2), -jnp.inf, lanes.x.dtype)
-        return lax.fori_loop(jnp.int32(0), lanes.blocks, nearest, start)
+        return lax.fori_loop(jnp.int32(0), lanes.blocks, nearest, self._nothing(lanes))
+
+    def limits_behind(self, slots: "_Slots", lanes: _Lanes, front):
+        """Find the same for what lies behind the front's limits: of the fragments that weigh something, or of any."""
+
+        def nearest(block, limits):
+            splats = self.splats(slots.planes, block, lanes)
+            nearness, quadric = self.fragments(splats)
+            shifted = self.view.shifted(nearness, lanes.read(slots.shift, block)[:, :, None])
+            squared_radius = self.squared_radii(nearness, quadric, jnp.full_like(front, -jnp.inf), front)
+            weight = splats[-1][:, :, None] * fast_fragment_weight(squared_radius)
+            each = weight > LEAST_WEIGHT, squared_radius < 1
+            found = (jnp.max(jnp.where(candidate, shifted, -jnp.inf), axis=1) for candidate in each)
+            return tuple(jnp.maximum(limit, new) for limit, new in zip(limits, found, strict=True))
+
+        start = self._nothing(lanes), self._nothing(lanes)
+        weighty, of_any = lax.fori_loop(jnp.int32(0), lanes.blocks, nearest, start)
+        return jnp.where(weighty > -jnp.inf, weighty, of_any)
+
+    def _nothing(self, lanes: _Lanes):
+        return jnp.full((lanes.row.shape[0], self.grid.side**2), -jnp.inf, lanes.x.dtype)
 
     def squared_radii(self, nearness, quadric, beyond, upto):
         """Give `rho^2`, below 1 for the fragments between two limits; 1, where the weight is 0, for all others."""
@@ -287,7 +303,7 @@ def _forward(sweep: _Sweep, bins: Bins, shift, planes, attributes):
 
     def chunk(i, out):
         tiles = sweep.chunk(bins, i, dtype)
-        limit = sweep.limits(slots, tiles, None)
+        limit = sweep.limits(slots, tiles)
         parts = sweep.blend(slots, tiles, limit, None), limit
         return tuple(
             lax.dynamic_update_slice_in_dim(whole, part, i * grid.lanes, 0) for whole, part in zip(out, parts, strict=True)
@@ -303,7 +319,7 @@ def _forward(sweep: _Sweep, bins: Bins, shift, planes, attributes):
         behind, seconds = out
         places, real = pick(i)
         tiles, limit = sweep.picked(bins, places, dtype), limits[places]
-        second = sweep.limits(slots, tiles, jnp.where(gaps[places] & real, limit, -jnp.inf))
+        second = sweep.limits_behind(slots, tiles, jnp.where(gaps[places] & real, limit, -jnp.inf))
         second = jnp.where(second > -jnp.inf, second, jnp.inf)
         rows = sweep.blend(slots, tiles, second, limit).reshape(_PICKED, count, grid.side, grid.side)
         return behind.at[*grid.place(bins.order[places])].add(rows), seconds.at[places].min(second)
