@@ -1,7 +1,6 @@
 """The fast rasterizer: tile by tile, only the splats that touch the tile, with a derivative that recomputes the weights.
 
-from collections.abc import Iterable, Sequence
-It gives what `DenseRasterizer` gives. A chunk of tiles is swept twice: for the front's depth, then for the sums; chunks with a
+It gives what `DenseRasterizer` gives. A chunk of tiles is swept twice: for the front's depth, then for the sums; tiles with a
 pixel that the front leaves open are swept twice more for what lies behind. The backward sweep needs the fragments' limits
 only. Fragments are computed relative to their tile, so that float32 suffices at any resolution.
 """

@@ -93,6 +93,7 @@ def test_sample_covers_a_mesh(tmp_path, capsys):
 
 
 @pytest.mark.slow
+@pytest.mark.once
 def test_render_shows_the_bust_and_says_what_it_does(tmp_path, capsys):
     output = tmp_path / "bust.exr"
     assert main(["render", "--count", "5000", "--width", "64", "--height", "64", "--output", str(output)]) == 0
@@ -109,9 +110,10 @@ def test_render_shows_the_bust_and_says_what_it_does(tmp_path, capsys):
 
 
 @pytest.mark.slow
+@pytest.mark.once
 def test_render_without_scattering_is_lambertian(tmp_path, capsys):
     splats, output = plate(tmp_path / "plate.ply"), tmp_path / "plate.exr"
-    view = ["--width", "32", "--height", "32", "--azimuth", "0", "--light-azimuth", "0", "--light-elevation", "60"]
+    view = ["--width", "32", "--height", "32", "--azimuth", "0", "--light-azimuth", "0", "--light-elevation", "60", "--fill", "0"]
     command = ["render", str(splats), "--material", "marble", "--no-scattering", *view, "--output", str(output)]
     assert main(command) == 0
     assert "albedo" not in capsys.readouterr().err

@@ -169,6 +169,7 @@ def test_other_counts_reach_the_best_known_errors(float64, count):
     assert all(ratio < bar for ratio, bar in ratios.values()), ratios
 
 
+@pytest.mark.once
 def test_float32_reaches_its_floor_and_calls_it_success():
     for name in QUICK:
         with jax.enable_x64(True):
@@ -180,6 +181,7 @@ def test_float32_reaches_its_floor_and_calls_it_success():
         assert np.all(np.asarray(fitted.error) < IN_FLOAT32 * best + FLOAT32_FLOOR)
 
 
+@pytest.mark.once
 def test_float32_holds_the_energy():
     with jax.enable_x64(False):
         fitted = fit_gaussians(media("marble"), 4, weights=TotalReflectanceHeld())

@@ -21,6 +21,11 @@ def skin() -> sj.SumOfGaussians:
     return sj.SumOfGaussians(jnp.asarray(SKIN_VARIANCES, float), jnp.asarray(SKIN_WEIGHTS, float))
 
 
+def two_gaussians() -> sj.SumOfGaussians:
+    """A material of two layers, for laws that hold for any number: each more takes its time to compile."""
+    return sj.SumOfGaussians(jnp.asarray([0.5, 3.0], float), jnp.asarray([[0.3, 0.2, 0.1], [0.4, 0.3, 0.2]], float))
+
+
 def sheet(spacing: float, half_width: float, kind: str = "grid") -> sj.Splats:
     """A flat sheet at z = 0 that faces +z; a splat at the origin. Areas are exact but for `jittered`, where they are the mean."""
     count = round(half_width / spacing)

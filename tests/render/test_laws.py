@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import camera_over, sheet, skin, sphere
+from scenes import camera_over, sheet, skin, sphere, two_gaussians
 
 import splatjax as sj
 from splatjax.diffusion import ClusterDiffuser
@@ -43,7 +43,7 @@ def test_white_material_with_an_albedo_map_gives_the_albedo():
     albedo = jnp.asarray([0.8, 0.4, 0.1], float)
     splats = sheet(1.0, 20.0)
     splats = eqx.tree_at(lambda s: s.albedo, splats, jnp.tile(albedo, (splats.count, 1)), is_leaf=lambda leaf: leaf is None)
-    scene = sj.Scene(splats, (lamp(),), matte(load_material("marble")).white())
+    scene = sj.Scene(splats, (lamp(),), matte(sj.Material(two_gaussians())).white())
     frame = sj.render(scene, camera_over(5.0, 32))
     exitance = np.pi * middle(frame.diffuse)
     np.testing.assert_allclose(exitance, np.broadcast_to(albedo, exitance.shape), rtol=EXITANCE_TOLERANCE)
@@ -127,7 +127,7 @@ def bumpy_frame() -> sj.Frame:
 
 
 def test_light_is_added_linearly():
-    splats, material = sphere(1500), sj.Material(skin())
+    splats, material = sphere(1500), sj.Material(two_gaussians())
     camera = sj.Camera.look_at(jnp.asarray([0.0, 0.0, 400.0], float), jnp.zeros(3), fov=18.0, width=32, height=32)
     lights = lamp((1.0, 2.0, 3.0), (-1.0, 0.0, -0.2)), lamp((3.0, 1.0, 0.5), (0.5, -1.0, -0.7))
     both, *single = (sj.render(sj.Scene(splats, each, material), camera).beauty for each in (lights, lights[:1], lights[1:]))
@@ -135,7 +135,7 @@ def test_light_is_added_linearly():
 
 
 def test_no_splats_and_no_lights_give_an_empty_and_a_black_picture():
-    material = sj.Material(skin())
+    material = sj.Material(two_gaussians())
     camera = camera_over(5.0, 16)
     nothing = sj.Splats(jnp.zeros((0, 3)), jnp.zeros((0, 3)), jnp.zeros(0), jnp.zeros(0))
     empty = sj.render(sj.Scene(nothing, (lamp(),), material), camera)
@@ -148,7 +148,7 @@ def test_no_splats_and_no_lights_give_an_empty_and_a_black_picture():
 
 
 def test_a_plan_that_does_not_suffice_poisons_the_picture_and_says_so():
-    material = sj.Material(skin())
+    material = sj.Material(two_gaussians())
     camera = camera_over(5.0, 32)
     few, many = (sj.Scene(sheet(spacing, 6.0), (lamp(),), material) for spacing in (2.0, 0.25))
     plan = sj.plan(many, camera)
