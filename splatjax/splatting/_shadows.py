@@ -15,7 +15,7 @@ from ._settings import SplattingSettings
 from ._surfaces import Surfaces, splat_surfaces
 from ._views import AbstractView, OrthographicView, PerspectiveView
 
-_NEAR = 1e-3  # mm
+_NEAR = 1e-2  # mm: nearer, a splat is so large in pixels that float32 overflows
 
 
 class ShadowSettings(eqx.Module):
