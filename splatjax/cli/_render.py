@@ -90,13 +90,12 @@ class Render:
     def _lights(self, channels: int) -> tuple[sj.DirectionalLight, ...]:
         # On a white diffuser that faces it, the first light gives radiance 1.
         irradiance = jnp.full(channels, jnp.pi)
-        key = sj.DirectionalLight(-towards(self.light_azimuth, self.light_elevation), irradiance)
+        key = sj.DirectionalLight(direction=-towards(self.light_azimuth, self.light_elevation), irradiance=irradiance)
         if self.fill == 0:
             return (key,)
         side = math.copysign(_FILL_SIDE, self.azimuth - self.light_azimuth)
-        return key, sj.DirectionalLight(
-            -towards(self.azimuth + side, _FILL_ELEVATION), self.fill * irradiance, cast_shadows=False
-        )
+        beside = towards(self.azimuth + side, _FILL_ELEVATION)
+        return key, sj.DirectionalLight(direction=-beside, irradiance=self.fill * irradiance, cast_shadows=False)
 
     def _splats(self) -> sj.Splats:
         if self.splats is None:

@@ -174,7 +174,9 @@ def test_outputs_are_refused_before_the_work(tmp_path, capsys):
     assert ".toml" in failure(["fit", "skin1", "--output", tmp_path / "o.txt"], capsys)
 
 
-@pytest.mark.parametrize(("option", "value"), [("elevation", 90), ("fov", 180), ("fov", -5), ("width", 0), ("height", -3)])
+@pytest.mark.parametrize(
+    ("option", "value"), [("elevation", 90), ("fov", 180), ("fov", -5), ("width", 0), ("height", -3), ("fill", -1)]
+)
 def test_impossible_cameras_are_one_line(option, value, tmp_path, capsys):
     splats, output = plate(tmp_path / "plate.ply"), tmp_path / "o.exr"
     args = ["render", splats, "--material", "marble", f"--{option}", value, "--output", output]
