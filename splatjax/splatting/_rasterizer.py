@@ -12,7 +12,7 @@ from splatjax.scene import Splats
 from ._settings import SplattingSettings
 from ._views import AbstractView
 
-LEAST_WEIGHT = 0.03  # of a fragment that says where the surface behind the front is
+LEAST_WEIGHT = 0.06  # of a fragment that says where the surface behind the front is
 
 
 def blend_fragments(sums: Float[Array, "*tiles rows pixels"]) -> Float[Array, "*tiles rows pixels"]:
@@ -44,7 +44,7 @@ class AbstractRasterizer(eqx.Module):
     r"""Passes 2 and 3. Fragments are weighted with `fragment_weight`, times the opacity of their footprint.
 
     The *front* of a pixel are the fragments within epsilon of the nearest one (3.1). *Behind* are, in pixels that the front
-    does not cover in full, the fragments within epsilon of the nearest one that is not in front and weighs at least 0.03: the
+    does not cover in full, the fragments within epsilon of the nearest one that is not in front and weighs at least 0.06: the
     rims of splats that are seen nearly edge on do not hide the surface behind them. Where none does, the nearest one counts.
     The choice of fragments is piecewise constant: it has no derivative.
     """

@@ -60,6 +60,26 @@ def test_coverage_is_one_inside_a_closed_surface(seed):
 
 
 @pytest.mark.parametrize("rasterizer", ["plain", "tiles"])
+def test_two_silhouettes_in_one_pixel_leave_no_gap(rasterizer):
+    """Two small spheres whose outlines coincide, before a large one: neither rim may hide what lies behind both."""
+    view, radius = bodies.perspective(width=64, height=64), 12.0
+    near, far, small = 20.0, 15.0, 3.0
+    along = np.asarray([0.02, -0.03, 1.0])
+    twin = small * (DISTANCE - far) / (DISTANCE - near)
+    places = [along * [DISTANCE - z, DISTANCE - z, z] for z in (near, far)]
+    body = bodies.joined(
+        bodies.joined(bodies.sphere(1400, radius), bodies.sphere(400, small, places[0], seed=1)),
+        bodies.sphere(400, twin, places[1], seed=2),
+    )
+    tiles = TileRasterizer(lanes=8, slots=16).planned(body, [view], SETTINGS)
+    surfaces = drawn(view, body, jnp.zeros((0, body.count)), DenseRasterizer() if rasterizer == "plain" else tiles)
+    front, behind = np.asarray(surfaces.front.coverage), np.asarray(surfaces.behind.coverage)
+    inside = seen_sphere(view, radius, 0.9)
+    assert (inside & (front < 1)).sum() >= 8, "the silhouettes lie between pixels"
+    assert np.min((front + (1 - front) * behind)[inside]) > 1 - 1e-6
+
+
+@pytest.mark.parametrize("rasterizer", ["plain", "tiles"])
 def test_an_inner_silhouette_leaves_no_gap(rasterizer):
     """A small sphere before a large one: where the small one ends, the large one shows."""
     view, radius = bodies.perspective(width=48, height=48), 12.0
