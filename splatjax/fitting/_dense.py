@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import lineax as lx
 from jaxtyping import Array, Float
-from lineax.internal import pack_structures, ravel_vector, unravel_solution
+from lineax.internal import pack_structures, ravel_vector, transpose_packed_structures, unravel_solution
 
 
 @jax.custom_jvp
@@ -53,21 +53,24 @@ def least_squares(
 
 
 class NormalEquations(lx.AbstractLinearSolver):
-    """A lineax solver for tall systems of full column rank. Nothing is differentiated through it."""
+    """A lineax solver for tall systems of full column rank, and for their transposes."""
 
     def init(self, operator, options):
         del options
         matrix = operator.as_matrix()
-        return matrix, normal_inverse(matrix), pack_structures(operator)
+        return matrix, normal_inverse(matrix), False, pack_structures(operator)
 
     def compute(self, state, vector, options):
         del options
-        matrix, inverse, structures = state
-        solution = least_squares(matrix, ravel_vector(vector, structures), inverse)
+        matrix, inverse, transposed, structures = state
+        right = ravel_vector(vector, structures)
+        # The transposed system is wide: its shortest solution.
+        solution = matrix @ (inverse @ right) if transposed else least_squares(matrix, right, inverse)
         return unravel_solution(solution, structures), lx.RESULTS.successful, {}
 
     def transpose(self, state, options):
-        raise NotImplementedError("a tall system has no transpose that this solver can solve")
+        matrix, inverse, transposed, structures = state
+        return (matrix, inverse, not transposed, transpose_packed_structures(structures)), options
 
     def conj(self, state, options):
         return state, options
