@@ -204,25 +204,26 @@ def _ranks(tile: Int[Array, " pairs"], tiles: int):
     """Number the pairs of each tile in order: rows are sorted apart, and counts carried from row to row."""
     place = jnp.arange(_ROW, dtype=jnp.uint32)[None]
     keys = (tile.astype(jnp.uint32).reshape(-1, _ROW) << _ROW_BITS) | place
-    parts = jnp.array_split(keys, 4)  # a sort runs on one core; several run side by side
+    parts = jnp.array_split(keys, 2)  # a sort runs on one core; several run side by side
     keys = jnp.concatenate([lax.sort(part, dimension=1, is_stable=False) for part in parts])
     sorted_tile, source = (keys >> _ROW_BITS).astype(jnp.int32), (keys & (_ROW - 1)).astype(jnp.int32)
     rows = keys.shape[0]
-    starts = jnp.concatenate([jnp.ones((rows, 1), bool), sorted_tile[:, 1:] != sorted_tile[:, :-1]], axis=1)
+    ends = jnp.concatenate([sorted_tile[:, 1:] != sorted_tile[:, :-1], jnp.ones((rows, 1), bool)], axis=1)
     position = jnp.arange(_ROW, dtype=jnp.int32)[None]
 
-    def latest(carry, value):
-        carry = jnp.maximum(carry, value)
+    def earliest(carry, value):
+        carry = jnp.minimum(carry, value)
         return carry, carry
 
-    run_start = lax.scan(latest, jnp.zeros(rows, jnp.int32), jnp.where(starts, position, 0).T)[1].T
+    candidates = jnp.where(ends, position, _ROW).T
+    run_end = lax.scan(earliest, jnp.full(rows, _ROW, jnp.int32), candidates, reverse=True)[1].T
 
     def count_on(counts, row):
-        tiles_of_row, rank = row
-        before = counts.at[tiles_of_row].get(mode="promise_in_bounds")
-        return counts.at[tiles_of_row].add(1, mode="promise_in_bounds"), before + rank
+        tiles_of_row, from_end = row
+        counts = counts.at[tiles_of_row].add(1, mode="promise_in_bounds")
+        return counts, counts.at[tiles_of_row].get(mode="promise_in_bounds") - from_end
 
-    counts, rank = lax.scan(count_on, jnp.zeros(tiles + 1, jnp.int32), (sorted_tile, position - run_start))
+    counts, rank = lax.scan(count_on, jnp.zeros(tiles + 1, jnp.int32), (sorted_tile, run_end - position + 1))
     return sorted_tile, source, rank, counts[:tiles]
 
 

@@ -27,7 +27,7 @@ from ._views import AbstractView, Footprints
 _PLANES = ("x", "y", "slope_x", "slope_y", "a", "b", "c", "nearness", "opacity")  # of the footprints, that sums depend on
 _EMPTY = (0.0, 0.0, 0.0, 0.0, 1e12, 0.0, 1e12, 1.0, 0.0)  # covers no pixel center
 _STEP = 1024  # of the planned number of splats
-_PICKED = 16  # open tiles swept together
+_PICKED = 64  # open tiles swept together
 
 
 class TileCapacity(eqx.Module):
@@ -76,12 +76,11 @@ class TileRasterizer(AbstractRasterizer):
         )
         footprints, grid = view.footprints(splats, settings), self._grid(view)
         bins = bin_items(_ranges(footprints, grid), grid, self.capacity.bins)
+        bins = eqx.tree_at(lambda b: b.needed, bins, jnp.maximum(bins.needed, seen / self.capacity.splats))
         planes = tuple(getattr(footprints, name) for name in _PLANES)
         sweep = _Sweep(type(view), grid, settings.full_coverage)
         front, behind = _sweep_tiles(sweep, bins, stop_gradient(footprints.shift), planes, tuple(_taken(attributes, ids)))
-        needed = jnp.maximum(bins.needed.astype(dtype), seen.astype(dtype) / self.capacity.splats)
-        front, behind = (jnp.where(needed <= 1, rows, jnp.nan) for rows in (front, behind))
-        return Blended(front, behind, needed)
+        return Blended(front, behind, bins.needed.astype(dtype))
 
 
 @eqx.filter_jit
@@ -224,8 +223,8 @@ class _Sweep(eqx.Module):
         def add(block, sums):
             splats = self.splats(slots.planes, block, lanes)
             squared_radius = self.squared_radii(*self.fragments(splats), beyond, upto)
-            weight = fast_fragment_weight(squared_radius)
-            rows = jnp.stack([row * splats[-1] for row in self.rows(splats, slots.attributes, block, lanes)], axis=1)
+            weight = splats[-1][:, :, None] * fast_fragment_weight(squared_radius)
+            rows = jnp.stack(self.rows(splats, slots.attributes, block, lanes), axis=1)
             return sums + jnp.einsum("trs,tsp->trp", rows, weight)
 
         start = jnp.zeros((beyond.shape[0], len(slots.attributes) + 4, beyond.shape[1]), beyond.dtype)
@@ -250,7 +249,7 @@ class _Sweep(eqx.Module):
             weight = fast_fragment_weight(squared_radius)
             rows, opacity = self.rows(splats, slots.attributes, block, lanes), splats[-1]
             d_rows = jnp.moveaxis(jnp.einsum("trp,tsp->trs", cotangent, weight), 1, 0)
-            d_weight = jnp.einsum("tsr,trp->tsp", jnp.stack([row * opacity for row in rows], axis=2), cotangent)
+            d_weight = opacity[:, :, None] * jnp.einsum("tsr,trp->tsp", jnp.stack(rows, axis=2), cotangent)
             d_squared = fragment_weight_derivative(squared_radius, weight) * d_weight
             nearness = jnp.where(squared_radius < 1, nearness, 1.0)
             d_nearness, d_quadric = self.view.squared_radius_vjp(nearness, squared_radius, d_squared)
@@ -323,9 +322,10 @@ def _forward(sweep: _Sweep, bins: Bins, shift, planes, attributes):
         rows = sweep.blend(slots, tiles, second, limit).reshape(_PICKED, count, grid.side, grid.side)
         return behind.at[*grid.place(bins.order[places])].add(rows), seconds.at[places].min(second)
 
-    behind = jnp.zeros((count, grid.down, grid.side, grid.across, grid.side), dtype)
+    poison = jnp.where(bins.needed <= 1, 0.0, jnp.nan).astype(dtype)
+    behind = jnp.full((count, grid.down, grid.side, grid.across, grid.side), poison)
     behind, seconds = lax.fori_loop(jnp.int32(0), rounds, look_behind, (behind, never))
-    return grid.join(bins.by_tile(front, 0.0)), grid.picture(behind), (front, limits, seconds)
+    return grid.join(bins.by_tile(front, 0.0)) + poison, grid.picture(behind), (front, limits, seconds)
 
 
 def _backward(sweep: _Sweep, bins: Bins, shift, planes, attributes, behind, swept, cotangents):
