@@ -10,7 +10,10 @@ from .gaussians import AbstractProfile as AbstractProfile, SumOfGaussians as Sum
 from .geometry import bust as bust, bust_mesh as bust_mesh
 from .io import read_exr as read_exr, read_splats as read_splats, sample_mesh as sample_mesh
 from .io import write_exr as write_exr, write_png as write_png, write_splats as write_splats
-from .scattering import Dipole as Dipole, EganFresnel as EganFresnel, ExactFresnel as ExactFresnel, Medium as Medium
+from .scattering import BetterDipole as BetterDipole, Burley as Burley, Dipole as Dipole, PhotonBeam as PhotonBeam
+from .scattering import EganFresnel as EganFresnel, ExactFresnel as ExactFresnel, Medium as Medium
+from .scattering import Film as Film, Layer as Layer, LayeredMultipole as LayeredMultipole, Multipole as Multipole
+from .scattering import NORM_RULE as NORM_RULE, RadialRule as RadialRule, Tabulated as Tabulated
 from .io import load_material as load_material, load_medium as load_medium
 from .io import materials as materials, save_material as save_material
 from .scene import Camera as Camera, DirectionalLight as DirectionalLight, Frame as Frame

@@ -1,6 +1,7 @@
 """The normalized Gaussian, profiles, and the one sum of Gaussians that fitter and renderer share."""
 
 import abc
+from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -29,6 +30,9 @@ class AbstractProfile(eqx.Module):
 
     Lengths are in mm, `profile(r)` in 1/mm^2. Fresnel transmission at entry and exit is not part of it.
     """
+
+    singular: ClassVar[bool] = False
+    """Whether the profile goes to infinity at the origin like 1/r: the integrals of Eq. 3 and 4 then exist beyond a cut only."""
 
     @abc.abstractmethod
     def __call__(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:

@@ -18,6 +18,12 @@ def x64() -> bool:
 
 
 @pytest.fixture
+def float64(x64):
+    """Numbers that float32 cannot show: such tests belong to the float64 run, and are left out of the other."""
+    assert x64
+
+
+@pytest.fixture
 def dtype():
     """The precision under test."""
     return jnp.zeros(()).dtype
@@ -33,7 +39,9 @@ def _left_out(item) -> bool:
     """Whether a test needs shared files that are not there, or shows nothing more in float64."""
     if item.get_closest_marker("shared") and shared_folder() is None:
         return True
-    return bool(item.get_closest_marker("once") and jax.config.jax_enable_x64)
+    if jax.config.jax_enable_x64:
+        return item.get_closest_marker("once") is not None
+    return "float64" in item.fixturenames
 
 
 def pytest_collection_modifyitems(config, items):

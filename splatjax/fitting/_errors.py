@@ -7,6 +7,18 @@ from splatjax.gaussians import AbstractProfile, SumOfGaussians
 from splatjax.scattering import NORM_RULE, RadialRule, at_own_radii
 
 
+def norm_radii(
+    profile: AbstractProfile, rule: RadialRule
+) -> tuple[Float[Array, "nodes channels"], Float[Array, "nodes channels"]]:
+    """Give radii and weights of integrals of `r R^2`, or say that there is none."""
+    if profile.singular and rule.near > 0:
+        raise ValueError(
+            f"{type(profile).__name__} goes to infinity like 1/r, so that the integral of r R^2 from 0 (Eq. 3) does not exist; "
+            "state where it starts, in length scales of the profile: rule=NORM_RULE.beyond(1.0)"
+        )
+    return rule.radii(profile)
+
+
 def squared_error(profile: AbstractProfile, gaussians: SumOfGaussians, rule: RadialRule = NORM_RULE) -> Float[Array, " channels"]:
     r"""Give the error that a fit minimizes, the integral over r of `r (R(r) - sum_i w_i G(v_i, r))^2` (Eq. 3).
 
@@ -18,9 +30,11 @@ def squared_error(profile: AbstractProfile, gaussians: SumOfGaussians, rule: Rad
 
     **Returns:** [channels], 1/mm^2, at least 0.
 
+    **Raises:** `ValueError` for a profile that is infinite at the origin, unless the rule starts beyond it.
+
     **Source:** Kim et al. 2010, Eq. 3 (d'Eon, Luebke and Enderton 2007).
     """
-    r, dr = rule.radii(profile)
+    r, dr = norm_radii(profile, rule)
     difference = at_own_radii(profile, r) - at_own_radii(gaussians, r)
     return jnp.sum(dr * r * difference * difference, axis=0)
 
@@ -38,6 +52,6 @@ def relative_error(
 
     **Source:** Kim et al. 2010, Eq. 4.
     """
-    r, dr = rule.radii(profile)
+    r, dr = norm_radii(profile, rule)
     values = at_own_radii(profile, r)
     return jnp.sqrt(squared_error(profile, gaussians, rule) / jnp.sum(dr * r * values * values, axis=0))

@@ -58,7 +58,8 @@ def fit_gaussians(
 
     **Returns:** a `FitResult`; neither `error` nor `weights` depends on the unit of length.
 
-    **Raises:** `ValueError` for a count below 1; an error with the message of `result` if `throw`.
+    **Raises:** `ValueError` for a count below 1, and for a profile that is infinite at the origin unless the rule starts beyond
+    it (`NORM_RULE.beyond`); an error with the message of `result` if `throw`.
 
     **Source:** Kim et al. 2010, Eq. 3; variable projection: Golub and Pereyra 1973.
     """

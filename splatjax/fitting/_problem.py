@@ -8,6 +8,7 @@ from jaxtyping import Array, Bool, Float
 from splatjax.gaussians import AbstractProfile, gaussian
 from splatjax.scattering import RadialRule, at_own_radii
 
+from ._errors import norm_radii
 from ._weights import AbstractWeights
 
 
@@ -88,7 +89,7 @@ class Problem(eqx.Module):
 
 def make_problem(profile: AbstractProfile, weights: AbstractWeights, rule: RadialRule) -> Problem:
     """State the fit of all channels of a profile."""
-    r, dr = rule.radii(profile)
+    r, dr = norm_radii(profile, rule)
     values = at_own_radii(profile, r)
     norm = jnp.sqrt(jnp.sum(dr * r * values * values, axis=0))
     root_weights = jnp.sqrt(dr * r)

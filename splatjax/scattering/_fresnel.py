@@ -108,6 +108,11 @@ def _integral(integrand, lower: Float[Array, " channels"]) -> Float[Array, " cha
     return jnp.sum(weights * length * integrand(1 - length * (1 - nodes)), axis=0)
 
 
+def moment_outside(eta: Float[Array, " channels"]) -> Float[Array, " channels"]:
+    """Give twice the integral of `mu F(mu)` over the cosine on the rarer side of the interface; nothing is reflected totally."""
+    return _first_outside(_denser_over_rarer(eta))
+
+
 def _first_outside(ratio: Float[Array, " channels"]) -> Float[Array, " channels"]:
     """Twice the integral of `mu_o F` over the cosine on the rarer side, for `ratio >= 1`."""
     s0 = (ratio - 1) / (ratio + 1)

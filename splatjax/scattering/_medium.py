@@ -24,9 +24,9 @@ class Medium(eqx.Module):
     eta: Float[Array, " channels"]
 
     def __check_init__(self):
-        _check("sigma_a", self.sigma_a, "at least 0 (1/mm)", lambda x: x >= 0)
-        _check("sigma_s_prime", self.sigma_s_prime, "positive (1/mm)", lambda x: x > 0)
-        _check("eta", self.eta, "positive", lambda x: x > 0)
+        check_range("sigma_a", self.sigma_a, "at least 0 (1/mm)", lambda x: x >= 0)
+        check_range("sigma_s_prime", self.sigma_s_prime, "positive (1/mm)", lambda x: x > 0)
+        check_range("eta", self.eta, "positive", lambda x: x > 0)
 
     @property
     def sigma_t_prime(self) -> Float[Array, " channels"]:
@@ -44,10 +44,11 @@ class Medium(eqx.Module):
         return 3 * self.sigma_a * self.sigma_t_prime
 
 
-def _check(name: str, value, expected: str, holds) -> None:
+def check_range(name: str, value, expected: str, holds, finite: bool = True) -> None:
     """Raise if a known value is out of range; a traced one passes."""
     if isinstance(value, Tracer) or not isinstance(value, (jax.Array, np.ndarray)):
         return
     known = np.asarray(value)
-    if known.dtype.kind == "f" and not np.all(np.isfinite(known) & holds(known)):
-        raise ValueError(f"{name} must be finite and {expected}; got {known.tolist()}")
+    possible = np.isfinite(known) if finite else ~np.isnan(known)
+    if known.dtype.kind == "f" and not np.all(possible & holds(known)):
+        raise ValueError(f"{name} must be {'finite and ' if finite else ''}{expected}; got {known.tolist()}")

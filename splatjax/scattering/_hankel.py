@@ -1,0 +1,119 @@
+r"""The Hankel transform of order 0 and its inverse, by a digital filter: no oscillating integral, no Bessel function.
+
+In the logarithm of the radius the transform is a convolution. The kernel's Mellin transform has modulus 1, and what is
+transformed is analytic in a strip, so that sampling both at equal steps of the logarithm leaves errors of rounding only: about
+1e-15 of the largest value, whatever the shape. All is a plain sum over samples of the function, which differentiates.
+"""
+
+import functools
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scipy.special import erfc, loggamma
+
+_STEP = 0.06  # of the logarithm: the Nyquist frequency is 52
+_PASSED = 22.0  # frequency up to which nothing is damped: exp(-pi/2 * 22) = 1e-15 bounds what lies above
+_FIRST, _LAST = -20.0, 8.0  # logarithms of the abscissas
+_NEAR = 0.05  # in units of the decay: below this radius a series about the origin takes over
+_TERMS = 8  # of that series; the ratio of two is below 0.0025
+_NEAR_NODES = 120
+
+
+def hankel_transform(
+    function: Callable[[Float[Array, "..."]], Float[Array, "..."]], k: Float[Array, "*frequencies channels"]
+) -> Float[Array, "*frequencies channels"]:
+    r"""Give `2 pi` times the integral of `r J0(k r) f(r)`: the two-dimensional Fourier transform of a round function.
+
+    **Arguments:**
+
+    - `function`: takes radii (mm) whose last axis is the channels, gives `f` of the same shape; smooth in the logarithm of
+        `r`, with `r f(r)` bounded and vanishing at infinity.
+    - `k`: 1/mm, positive. Differentiable.
+
+    **Returns:** with f in 1/mm^2, no unit; about 1e-15 of the largest of `r f(r)` times `1/k`.
+
+    **Source:** Johansen and Soerensen 1979, "Fast Hankel transforms"; the filter is our own.
+    """
+    return 2 * jnp.pi * _filtered(function, k)
+
+
+def inverse_hankel_transform(
+    transform: Callable[[Float[Array, "..."]], Float[Array, "..."]],
+    r: Float[Array, "*radii"],
+    decay: Float[Array, " channels"],
+) -> Float[Array, "*radii channels"]:
+    r"""Give `1 / 2 pi` times the integral of `k J0(k r) F(k)`.
+
+    **Arguments:**
+
+    - `transform`: takes `k` (1/mm) whose last axis is the channels, gives `F` of the same shape; falls at
+        least like `exp(-decay k)`.
+    - `r`: mm, at least 0. Differentiable, at 0 too.
+    - `decay`: mm, positive: places the nodes near the origin. Not differentiated.
+
+    **Returns:** 1/mm^2. Its error is about 1e-15 of the value at `r = 0` or, farther out, of `1 / (decay r)`: a tail that
+    has fallen below that is rounding.
+    """
+    decay = jax.lax.stop_gradient(decay)
+    shape = (*r.shape, *decay.shape)
+    radius, scale = jnp.broadcast_to(r[..., None], shape), jnp.broadcast_to(decay, shape)
+    near = radius < _NEAR * scale
+    far = _filtered(transform, jnp.where(near, scale, radius))
+    coefficients = _series(transform, decay)
+    squared = jnp.where(near, 0.25 * radius * radius / (scale * scale), 0.0)
+    about_origin = jnp.zeros(shape, far.dtype)
+    for coefficient in coefficients[::-1]:
+        about_origin = about_origin * squared + jnp.broadcast_to(coefficient, shape)
+    return jnp.where(near, about_origin, far) / (2 * jnp.pi)
+
+
+def _filtered(function, at: Float[Array, "*some"]) -> Float[Array, "*some"]:
+    """Give the integral of `x J0(x at) function(x)`."""
+    abscissas, weights = (_along(each, at) for each in _filter())
+    x = abscissas / at[None]
+    return jnp.sum(weights * x * function(x), axis=0) / at
+
+
+def _series(transform, decay: Float[Array, " channels"]) -> list[Float[Array, " channels"]]:
+    """Give the coefficients of the integral of `k J0(k r) F(k)` in powers of `(r / 2 decay)^2`."""
+    nodes, weights = (_along(each, decay) for each in _half_line())
+    terms = weights * transform(nodes / decay[None]) / (decay * decay)[None]
+    coefficients = []
+    for power in range(_TERMS):
+        coefficients.append(jnp.sum(terms, axis=0))
+        terms = terms * nodes * nodes * (-1 / (power + 1) ** 2)
+    return coefficients
+
+
+def _along(values: np.ndarray, like: Float[Array, "*some"]) -> Float[Array, "nodes *some"]:
+    """Lay constants along a new first axis."""
+    return jnp.broadcast_to(jnp.asarray(values, like.dtype).reshape(-1, *[1] * like.ndim), (len(values), *like.shape))
+
+
+@functools.cache
+def _filter() -> tuple[np.ndarray, np.ndarray]:
+    """Abscissas `x` and weights, such that the sum of `w x f(x)` is the integral of `x J0(x) f(x)`.
+
+    With `u = log x` the kernel `exp(u) J0(exp(u))` has the Fourier transform `2^(i w) Gamma((1 + i w)/2) / Gamma((1 - i w)/2)`.
+    """
+    nyquist = np.pi / _STEP
+    frequency = np.linspace(-nyquist, nyquist, 8001)
+    width = (nyquist - _PASSED) / 12
+    taper = 0.5 * erfc((np.abs(frequency) - 0.5 * (nyquist + _PASSED)) / width)
+    half = 0.5 + 0.5j * frequency
+    response = np.exp(1j * frequency * np.log(2) + loggamma(half) - loggamma(half.conj()))
+    logarithms = np.arange(round(_FIRST / _STEP), round(_LAST / _STEP) + 1) * _STEP
+    waves = np.exp(-1j * logarithms[:, None] * frequency)
+    weights = np.trapezoid(taper * response * waves, frequency, axis=1).real * _STEP / (2 * np.pi)
+    return np.exp(logarithms), weights
+
+
+@functools.cache
+def _half_line() -> tuple[np.ndarray, np.ndarray]:
+    """Nodes and weights for the integral of `k f(k)` over k > 0, f like `exp(-k)`: `log k = t - exp(-t)`, equal steps of t."""
+    t, step = np.linspace(-2.6, 3.65, _NEAR_NODES, retstep=True)
+    nodes = np.exp(t - np.exp(-t))
+    return nodes, step * nodes * nodes * (1 + np.exp(-t))

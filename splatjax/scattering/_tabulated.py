@@ -1,0 +1,62 @@
+"""Measured profiles."""
+
+from itertools import pairwise
+
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Float
+
+from splatjax.gaussians import AbstractProfile
+
+from ._medium import check_range
+
+
+class Tabulated(AbstractProfile):
+    r"""A profile given at radii, linear in between: constant within the first radius, 0 beyond the last.
+
+    Nothing is invented: what leaves beyond the last radius is not in the total. Differentiable in values, radii, and `r`.
+
+    **Attributes:**
+
+    - `radii`: mm, at least two; they ascend from at least 0.
+    - `values`: 1/mm^2, one row per radius. May be negative, as noise is.
+
+    **Raises:** `ValueError` for radii that do not ascend, for values that are not finite, and for shapes that do not match.
+    """
+
+    radii: Float[Array, " samples"]
+    values: Float[Array, "samples channels"]
+
+    def __init__(self, radii: Float[Array, " samples"], values: Float[Array, " samples_"] | Float[Array, "samples_ channels"]):
+        self.radii = radii
+        self.values = values if values.ndim == 2 else values[:, None]
+
+    def __check_init__(self):
+        samples, rows = self.radii.shape[0], self.values.shape[0]
+        if samples < 2 or rows != samples:
+            raise ValueError(f"a table needs at least two radii, and a row of values for each; got {samples} and {rows} rows")
+        check_range("radii", self.radii, "at least 0 (mm)", lambda x: x >= 0)
+        check_range("values", self.values, "numbers (1/mm^2)", lambda x: x == x)
+        if not isinstance(self.radii, Tracer):
+            radii = np.asarray(self.radii)
+            for before, radius in pairwise(radii):
+                if radius <= before:
+                    raise ValueError(f"radii must ascend, each once; got {radius} mm after {before} mm")
+
+    def __call__(self, r: Float[Array, "*radii_"]) -> Float[Array, "*radii_ channels"]:
+        flat = r.reshape(-1)
+        columns = [jnp.interp(flat, self.radii, column, right=0.0) for column in self.values.T]
+        return jnp.stack(columns, axis=-1).reshape(*r.shape, -1)
+
+    def total_reflectance(self) -> Float[Array, " channels"]:
+        """Give `2 pi` times the integral of `r R(r)`, exactly that of the straight lines."""
+        a, b = self.radii[:-1], self.radii[1:]
+        lines = ((b - a) * (2 * a + b) / 6) @ self.values[:-1] + ((b - a) * (a + 2 * b) / 6) @ self.values[1:]
+        return 2 * jnp.pi * (0.5 * self.radii[0] ** 2 * self.values[0] + lines)
+
+    def length_scale(self) -> Float[Array, " channels"]:
+        """Give the radius, mm, within which half of the integral of `r |R|` lies, by the table's own steps."""
+        share = jnp.cumsum(jnp.abs(self.values) * (self.radii * jnp.diff(self.radii, append=self.radii[-1:]))[:, None], axis=0)
+        index = jnp.argmax(share >= 0.5 * share[-1][None], axis=0)
+        return jnp.maximum(self.radii[index], self.radii[1])

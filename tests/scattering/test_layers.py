@@ -1,0 +1,206 @@
+"""Slabs and stacks: the image sum, energy, limits, adding, the seam, what is refused."""
+
+from functools import reduce
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.special import expn
+
+from splatjax.scattering import Dipole, EganFresnel, ExactFresnel, Film, Layer, LayeredMultipole, Medium, Multipole
+from splatjax.scattering._adding import Response, diffuse_transmittance, hyperbolic_ratio
+
+INFINITE = float("inf")
+MARBLE_GREEN = (0.0041, 2.62, 1.5)
+
+
+def layer(sigma_a, sigma_s_prime, eta, thickness, dtype=None) -> Layer:
+    one = (jnp.asarray([each], dtype or jnp.result_type(float)) for each in (sigma_a, sigma_s_prime, eta))
+    return Layer(Medium(*one), jnp.asarray(thickness))
+
+
+def image_sum(slab: Layer, eta_above: float, eta_below: float, r: np.ndarray, images: int):
+    """Donner and Jensen's multipole, source by source: reflectance and transmittance of one channel."""
+    medium, d = slab.medium, float(slab.thickness)
+    length, sigma_tr = float(1 / medium.sigma_t_prime[0]), float(jnp.sqrt(medium.squared_sigma_tr[0]))
+    above, below = (2 / 3 * length * float(ExactFresnel().boundary(medium.eta / eta)[0]) for eta in (eta_above, eta_below))
+    period = 2 * (d + above + below)
+
+    def field(z):
+        q = np.hypot(r, z)
+        return z * (1 + sigma_tr * q) * np.exp(-sigma_tr * q) / q**3
+
+    reflected = transmitted = 0.0
+    for i in range(-images, images + 1):
+        real, virtual = i * period + length, i * period - length - 2 * above
+        reflected = reflected + field(real) - field(virtual)
+        transmitted = transmitted + field(d - real) - field(d - virtual)
+    scale = float(medium.albedo_prime[0]) / (4 * np.pi)
+    return scale * reflected, scale * transmitted
+
+
+@pytest.mark.parametrize("thickness", [1.35, 2.0, 8.0])
+def test_closed_form_is_the_image_sum(float64, thickness):
+    slab = layer(0.032, 0.74, 1.3, thickness)
+    r = np.array([0.0, 0.03, 0.3, 1.0, 4.0, 10.0])
+    reflected, transmitted = image_sum(slab, 1.1, 1.0, r, 200)
+    profile = Multipole(slab, 1.1, 1.0)
+    np.testing.assert_allclose(profile(jnp.asarray(r))[:, 0], reflected, rtol=1e-10)
+    np.testing.assert_allclose(profile.transmittance(jnp.asarray(r))[:, 0], transmitted, rtol=1e-10)
+
+
+def test_a_slab_without_absorption_keeps_all_light(float64):
+    profile = Multipole(layer(0.0, 2.0, 1.4, 3.0), 1.1, 1.5)
+    np.testing.assert_allclose(profile.total_reflectance() + profile.total_transmittance(), 1, rtol=1e-14)
+    lossy = Multipole(layer(1e-9, 2.0, 1.4, 3.0), 1.1, 1.5)
+    np.testing.assert_allclose(lossy.total_reflectance(), profile.total_reflectance(), rtol=1e-7)
+
+
+def test_a_thick_slab_is_the_half_space(float64):
+    dipole = Dipole(layer(*MARBLE_GREEN, INFINITE).medium)
+    r = jnp.asarray([0.0, 0.1, 1.0, 10.0])
+    for thickness in (300.0, INFINITE):
+        slab = Multipole(layer(*MARBLE_GREEN, thickness))
+        np.testing.assert_allclose(slab(r), dipole(r), rtol=1e-10)
+        np.testing.assert_allclose(slab.total_reflectance(), dipole.total_reflectance(), rtol=1e-14)
+    np.testing.assert_array_equal(slab.total_transmittance(), 0)
+    np.testing.assert_array_equal(slab.transmittance(r), 0)
+
+
+def test_the_sum_of_images_has_its_derivatives_where_it_is_expanded(float64):
+    """The even function of s, expanded about 0 and computed: values and derivatives meet at the border, `s H = 0.05`."""
+    a, b, fall = jnp.asarray(1.3), jnp.asarray(0.4), jnp.asarray(0.6)
+
+    def ratio(u):
+        return hyperbolic_ratio(u, a, b, fall, a + b + fall)
+
+    border = 0.05**2 / 2.3**2
+    below, above = (jax.value_and_grad(ratio)(jnp.asarray(border * side)) for side in (1 - 1e-9, 1 + 1e-9))
+    np.testing.assert_allclose(below[0], above[0], rtol=1e-12)
+    np.testing.assert_allclose(below[1], above[1], rtol=1e-7)
+    s = 0.7
+    exact = np.sinh(s * 1.3) * np.cosh(s * 0.4) / np.sinh(s * 2.3)
+    np.testing.assert_allclose(ratio(jnp.asarray(s * s)), exact, rtol=1e-14)
+    np.testing.assert_allclose(ratio(jnp.asarray(0.0)), 1.3 / 2.3, rtol=1e-14)
+
+
+def random_response(key) -> Response:
+    return Response(*jax.random.uniform(key, (4, 7), minval=0.0, maxval=0.45))
+
+
+def test_adding_is_associative(float64):
+    a, b, c = (random_response(key) for key in jax.random.split(jax.random.key(3), 3))
+    left, right = a.over(b).over(c), a.over(b.over(c))
+    for one, other in zip(jax.tree.leaves(left), jax.tree.leaves(right), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-12)
+
+
+def test_adding_sums_the_series(float64):
+    a, b = (random_response(key) for key in jax.random.split(jax.random.key(5), 2))
+    bounces = [(b.reflectance_above * a.reflectance_below) ** n for n in range(60)]
+    series = reduce(jnp.add, bounces)
+    both = a.over(b)
+    np.testing.assert_allclose(both.transmittance_down, a.transmittance_down * b.transmittance_down * series, rtol=1e-12)
+    inner = a.transmittance_down * b.reflectance_above * a.transmittance_up * series
+    np.testing.assert_allclose(both.reflectance_above, a.reflectance_above + inner, rtol=1e-12)
+
+
+def test_a_stack_of_one_is_its_layer(float64):
+    slab = layer(*MARBLE_GREEN, 2.0)
+    r = jnp.asarray([0.0, 1.0])
+    np.testing.assert_allclose(LayeredMultipole([slab], 1.2, 1.1)(r), Multipole(slab, 1.2, 1.1)(r), rtol=1e-14)
+
+
+def test_a_film_of_no_depth_changes_nothing(float64):
+    stack = [layer(0.1, 3.0, 1.4, 0.8), layer(0.02, 2.0, 1.3, INFINITE)]
+    film = Film(jnp.zeros(1))
+    r = jnp.asarray([0.0, 0.5, 3.0])
+    for places in ([film, *stack], [stack[0], film, stack[1]]):
+        np.testing.assert_allclose(LayeredMultipole(places)(r), LayeredMultipole(stack)(r), rtol=1e-12)
+
+
+def test_films_on_each_other_are_one(float64):
+    slab = layer(0.1, 3.0, 1.4, INFINITE)
+    thin, thick = Film(jnp.asarray([0.125])), Film(jnp.asarray([0.25]))
+    two, one = LayeredMultipole([thin, thin, slab]), LayeredMultipole([thick, slab])
+    np.testing.assert_allclose(two.total_reflectance(), one.total_reflectance(), rtol=1e-14)
+    bare = LayeredMultipole([slab]).total_reflectance()
+    # In as a beam, out as diffuse light: 0.779 and 0.649 of it at an optical depth of a quarter.
+    np.testing.assert_allclose(one.total_reflectance() / bare, np.exp(-0.25) * 2 * expn(3, 0.25), rtol=1e-12)
+    np.testing.assert_allclose([np.exp(-0.25), 2 * expn(3, 0.25)], [0.779, 0.649], atol=5e-4)
+
+
+def test_diffuse_transmittance_is_an_exponential_integral(float64):
+    t = np.array([0.0, 1e-12, 1e-3, 0.25, 1.0, 5.0, 50.0])
+    np.testing.assert_allclose(diffuse_transmittance(jnp.asarray(t)), 2 * expn(3, t), rtol=1e-12)
+    slope = jax.vmap(jax.grad(diffuse_transmittance))(jnp.asarray(t))
+    np.testing.assert_allclose(slope, -2 * expn(2, t), rtol=1e-9)
+
+
+@pytest.mark.parametrize(("free_paths", "growth"), [(4, 0.069), (10, 0.034), (20, 0.023)])
+def test_the_seam_between_matched_halves(float64, free_paths, growth):
+    """Each half keeps its own extrapolated boundary: transmittance grows by a known amount."""
+    sigma_a, sigma_s_prime, eta = MARBLE_GREEN
+    thickness = free_paths / (sigma_a + sigma_s_prime)
+    whole = LayeredMultipole([layer(*MARBLE_GREEN, thickness)], eta, eta)
+    halves = LayeredMultipole([layer(*MARBLE_GREEN, thickness / 2)] * 2, eta, eta)
+    found = halves.total_transmittance()[0] / whole.total_transmittance()[0] - 1
+    assert abs(found - growth) < 5.1e-4
+    if free_paths == 4:
+        assert abs(halves.total_reflectance()[0] / whole.total_reflectance()[0] - 0.97) < 5e-3
+
+
+def test_the_seam_without_absorption(float64):
+    """Matched everywhere, `T = (l + z_b) / (d + 3 z_b - l)`."""
+    d, length, boundary = 6.0, 0.5, 2 / 3 * 0.5
+    halves = LayeredMultipole([layer(0.0, 2.0, 1.0, d / 2)] * 2)
+    np.testing.assert_allclose(halves.total_transmittance(), (length + boundary) / (d + 3 * boundary - length), rtol=1e-13)
+
+
+def test_three_layers_of_skin(float64):
+    """Donner and Jensen's skin with the thicknesses and the index that we chose; reference: the same sums in another program."""
+    per_cm = (
+        ((2.1, 2.1, 5.0), (48.0, 60.0, 65.0), 0.25),
+        ((0.16, 0.19, 0.30), (32.0, 40.0, 46.0), 2.0),
+        ((0.085, 1.0, 25.0), (4.5, 4.7, 4.8), INFINITE),
+    )
+    stack = [Layer(Medium(jnp.asarray(a) / 10, jnp.asarray(s) / 10, jnp.full(3, 1.4)), jnp.asarray(d)) for a, s, d in per_cm]
+    profile = LayeredMultipole(stack, fresnel=EganFresnel())
+    np.testing.assert_allclose(profile.total_reflectance(), [0.5377, 0.5348, 0.4093], atol=6e-5)
+
+
+def test_too_thin_is_refused(dtype):
+    with pytest.raises(ValueError, match=r"at least 1 in every channel: diffusion does not hold.*got \[0\.78"):
+        layer(0.0041, 2.62, 1.5, 0.3)
+
+    @jax.jit
+    def traced(thickness):
+        return Multipole(layer(0.0041, 2.62, 1.5, thickness)).total_reflectance()
+
+    assert np.isnan(traced(jnp.asarray(0.3))[0])
+    assert np.isfinite(traced(jnp.asarray(0.5))[0])
+
+
+def test_stacks_that_cannot_be_are_refused(dtype):
+    half_space = layer(0.1, 1.0, 1.3, INFINITE)
+    with pytest.raises(ValueError, match="layer 1 of 2 is infinitely thick"):
+        LayeredMultipole([half_space, half_space])
+    with pytest.raises(ValueError, match="none of which is a Layer"):
+        LayeredMultipole([Film(jnp.zeros(1))])
+    with pytest.raises(ValueError, match="optical_depth must be finite and at least 0"):
+        Film(jnp.asarray([-0.1]))
+
+
+@pytest.mark.shared
+def test_slab_against_monte_carlo(float64, monte_carlo):
+    data = monte_carlo("slab_marbleG_d2.0")
+    slab = Multipole(layer(*MARBLE_GREEN, 2.0))
+    entering = 1 - data["Rsp"]
+    np.testing.assert_allclose(slab.total_reflectance(), data["Rd"] / entering, rtol=2e-3)
+    np.testing.assert_allclose(slab.total_transmittance(), data["Tt"] / entering, rtol=1.2e-2)
+    # Beyond the spike of light that was not scattered, ring by ring.
+    r = np.asarray(data["r_opt"])[3:40]
+    found = np.asarray(slab.transmittance(jnp.asarray(r)))[:, 0]
+    reference = np.asarray(data["Tt_r"])[3:40] / entering
+    assert np.sqrt(np.sum(r * (found - reference) ** 2) / np.sum(r * reference**2)) < 0.06

@@ -1,0 +1,215 @@
+"""Laws that every model obeys: energy, units, sign, derivatives and their one-sided limits."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+
+from splatjax.scattering import (
+    BetterDipole,
+    Burley,
+    DiffuseMeanFreePath,
+    DiffuseTransmission,
+    Dipole,
+    Film,
+    Layer,
+    LayeredMultipole,
+    Medium,
+    Multipole,
+    PhotonBeam,
+    RadialRule,
+    Searchlight,
+    Tabulated,
+    integrated_reflectance,
+)
+
+UNITS = 1e-12
+LIMIT = 1e-4
+"""Extrapolated one-sided quotients."""
+
+
+def medium(sigma_a=(0.0041, 0.17), sigma_s_prime=(2.62, 0.88), eta=(1.5, 1.3), scale=1.0) -> Medium:
+    a, s, n = (jnp.asarray(each) for each in (sigma_a, sigma_s_prime, eta))
+    return Medium(a * scale, s * scale, n)
+
+
+def layers(m: Medium, scale=1.0):
+    lower = Medium(0.5 * m.sigma_a, 1.5 * m.sigma_s_prime, jnp.full_like(m.eta, 1.4))
+    film = Film(jnp.full_like(m.eta, 0.1))
+    return LayeredMultipole([film, Layer(m, jnp.asarray(2.0 / scale)), Layer(lower, jnp.asarray(jnp.inf))])
+
+
+MODELS = {
+    "dipole": lambda m, scale: Dipole(m),
+    "better dipole": lambda m, scale: BetterDipole(m),
+    "photon beam": lambda m, scale: PhotonBeam(m),
+    "multipole": lambda m, scale: Multipole(Layer(m, jnp.asarray(2.5 / scale)), 1.2, 1.0),
+    "transmitted": lambda m, scale: Multipole(Layer(m, jnp.asarray(2.5 / scale))).transmitted(),
+    "layered": layers,
+}
+SINGULAR = ("photon beam",)
+models = pytest.mark.parametrize("model", MODELS.values(), ids=MODELS.keys())
+
+
+@models
+def test_total_is_the_integral(float64, model):
+    profile = model(medium(), 1.0)
+    # Hankel transforms leave 1e-16 / r: an end at 3000 free paths keeps that out, and what absorption leaves there is nothing.
+    total = jax.jit(integrated_reflectance, static_argnums=1)(profile, RadialRule(smallest=1e-3, largest=3e3, count=256))
+    np.testing.assert_allclose(total, profile.total_reflectance(), rtol=1e-9)
+    assert np.all(np.asarray(total) < 1)
+
+
+@models
+def test_nothing_depends_on_the_unit_of_length(float64, model):
+    r = jnp.geomspace(1e-2, 5, 12)
+    in_mm, in_cm = model(medium(), 1.0), model(medium(scale=10.0), 10.0)
+    np.testing.assert_allclose(in_cm(r / 10) / 100, in_mm(r), rtol=UNITS)
+    np.testing.assert_allclose(in_cm.total_reflectance(), in_mm.total_reflectance(), rtol=UNITS)
+
+
+@models
+def test_positive_and_falling(dtype, model):
+    r = jnp.geomspace(0.05, 4, 40, dtype=dtype)
+    values = np.asarray(jax.jit(lambda r: model(medium(), 1.0)(r))(r))
+    assert values.dtype == dtype
+    assert np.all(values > 0)
+    assert np.all(np.diff(values, axis=0) < 0)
+
+
+@pytest.mark.parametrize("name", [name for name in MODELS if name not in ("dipole", "multipole")])
+def test_derivatives(float64, name):
+    def values(sigma_a, sigma_s_prime, eta, r):
+        profile = MODELS[name](medium(sigma_a, sigma_s_prime, eta), 1.0)
+        return profile(r), profile.total_reflectance()
+
+    m = medium()
+    check_grads(jax.jit(values), (m.sigma_a, m.sigma_s_prime, m.eta, jnp.asarray([0.1, 1.0, 4.0])), order=1, rtol=1e-5, eps=1e-6)
+
+
+@models
+def test_derivative_without_absorption_is_the_one_sided_limit(float64, model):
+    @jax.jit
+    def values(sigma_a):
+        return model(medium(sigma_a[None], (1.4,), (1.3,)), 1.0)(jnp.asarray([0.3, 1.5]))[:, 0]
+
+    zero, h = jnp.asarray(0.0), 1e-7
+    # A profile goes as sigma_a and sigma_a^(3/2): two quotients, extrapolated in the root of the step.
+    quotients = [(values(jnp.asarray(step)) - values(zero)) / step for step in (h, 4 * h)]
+    exact = jax.jacfwd(values)(zero)
+    assert np.all(exact != 0)
+    np.testing.assert_allclose(exact, 2 * quotients[0] - quotients[1], rtol=LIMIT)
+
+
+@models
+def test_derivative_at_equal_indices_is_the_limit_from_above(float64, model):
+    @jax.jit
+    def values(eta):
+        return model(medium((0.1,), (1.4,), eta[None]), 1.0)(jnp.asarray([0.3, 1.5]))[:, 0]
+
+    # The neighbor above the multipole has 1.2. Moments of the Fresnel reflectance go as (eta - 1)^(3/2).
+    one, h = jnp.asarray(1.2 if model is MODELS["multipole"] else 1.0), 1e-7
+    quotients = [(values(one + step) - values(one)) / step for step in (h, 4 * h)]
+    np.testing.assert_allclose(jax.jacfwd(values)(one), 2 * quotients[0] - quotients[1], rtol=LIMIT)
+
+
+@pytest.mark.parametrize("name", [name for name in MODELS if name not in SINGULAR])
+def test_flat_at_the_axis(dtype, name):
+    slope = jax.jit(jax.jacfwd(MODELS[name](medium(), 1.0)))(jnp.asarray(0.0, dtype))
+    np.testing.assert_array_equal(slope, 0)
+
+
+@pytest.mark.parametrize("scaling", [Searchlight(), DiffuseTransmission(), DiffuseMeanFreePath()])
+def test_burley_keeps_its_albedo_and_its_units(float64, scaling):
+    profile = Burley(jnp.asarray([0.8, 0.3]), jnp.asarray([1.0, 2.0]), scaling)
+    np.testing.assert_allclose(integrated_reflectance(profile), [0.8, 0.3], rtol=1e-9)
+    r = jnp.asarray([0.2, 3.0])
+    within = [integrated_reflectance(profile) - integrated_reflectance_beyond(profile, float(end)) for end in r]
+    np.testing.assert_allclose(profile.reflectance_within(r), within, rtol=1e-9)
+    in_cm = Burley(profile.albedo, profile.free_path / 10, scaling)
+    np.testing.assert_allclose(in_cm(r / 10) / 100, profile(r), rtol=UNITS)
+
+
+def integrated_reflectance_beyond(profile, end: float):
+    """Integrate from one radius (mm) on, a substitution of its own: Gauss-Legendre in the square root of the distance."""
+    nodes, weights = np.polynomial.legendre.leggauss(200)
+    t = 4.5 * (nodes + 1)
+    r = jnp.asarray(end + t**2)
+    return 2 * jnp.pi * jnp.sum((jnp.asarray(4.5 * weights * 2 * t) * r)[:, None] * profile(r), axis=0)
+
+
+def test_burley_values():
+    """By hand: A = 0.8 makes s = 1.05 of a beam's free path, 1.1 of diffuse light's."""
+    albedo, path = jnp.asarray([0.8]), jnp.asarray([1.0])
+    np.testing.assert_allclose(Searchlight()(albedo), 1.05, rtol=1e-6)
+    np.testing.assert_allclose(DiffuseTransmission()(albedo), 1.1, rtol=1e-6)
+    np.testing.assert_allclose(DiffuseMeanFreePath()(albedo), 3.5 + 100 * 0.47**4, rtol=1e-5)
+    d = 1 / 1.05
+    expected = 0.8 * (np.exp(-0.5 / d) + np.exp(-0.5 / (3 * d))) / (8 * np.pi * d * 0.5)
+    np.testing.assert_allclose(Burley(albedo, path)(jnp.asarray([0.5]))[0, 0], expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("albedo", "path", "message"), [(1.2, 1.0, r"albedo must .*in \[0, 1\]; got \[1.2"), (0.5, 0.0, "free_path")]
+)
+def test_burley_refuses(dtype, albedo, path, message):
+    with pytest.raises(ValueError, match=message):
+        Burley(jnp.asarray([albedo], dtype), jnp.asarray([path], dtype))
+
+
+def test_a_table_gives_what_it_holds(float64):
+    r = jnp.asarray([0.5, 1.0, 2.0, 4.0])
+    table = Tabulated(r, jnp.asarray([4.0, 3.0, 1.0, 0.0]))
+    np.testing.assert_allclose(table(jnp.asarray([0.0, 0.5, 0.75, 3.0, 5.0]))[:, 0], [4, 4, 3.5, 0.5, 0])
+    cells = np.linspace(0, 4, 400_001)
+    middle = 0.5 * (cells[1:] + cells[:-1])
+    sums = 2 * np.pi * np.sum(middle * np.asarray(table(jnp.asarray(middle)))[:, 0]) * (cells[1] - cells[0])
+    np.testing.assert_allclose(table.total_reflectance(), sums, rtol=1e-9)
+    fine = jnp.linspace(0.0, 60.0, 4000)
+    dipole = Dipole(medium())
+    np.testing.assert_allclose(Tabulated(fine, dipole(fine)).total_reflectance()[1], dipole.total_reflectance()[1], rtol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("radii", "values", "message"),
+    [
+        ([0.0, 1.0, 1.0], [1.0, 1.0, 1.0], "ascend, each once; got 1.0 mm after 1.0 mm"),
+        ([-1.0, 1.0], [1.0, 1.0], "radii must be finite and at least 0"),
+        ([0.0, 1.0], [1.0, np.nan], "values must be finite"),
+        ([0.0, 1.0], [1.0], "got 2 and 1 rows"),
+        ([0.0], [1.0], "at least two radii"),
+    ],
+)
+def test_a_table_refuses(dtype, radii, values, message):
+    with pytest.raises(ValueError, match=message):
+        Tabulated(jnp.asarray(radii, dtype), jnp.asarray(values, dtype))
+
+
+@pytest.mark.shared
+@pytest.mark.parametrize(
+    ("run", "coefficients", "distances"),
+    [
+        ("marble_G_near", (0.0041, 2.62, 1.5), (0.273, 0.123, 0.025)),
+        ("skin1_R_near", (0.032, 0.74, 1.3), (0.324, 0.243, 0.078)),
+        ("skin1_G_near", (0.17, 0.88, 1.3), (0.683, 0.427, 0.100)),
+    ],
+)
+def test_distances_from_monte_carlo(float64, monte_carlo, run, coefficients, distances):
+    """Eq. 4 beyond one mean free path against MCML, as measured for the dipole, the better dipole and the photon beam."""
+    data = monte_carlo(run)
+    m = Medium(*(jnp.asarray([each]) for each in coefficients))
+    r = np.asarray(data["r_opt"])[:-1]
+    reference = np.asarray(data["Rd_r"])[:-1] / (1 - data["Rsp"])
+    chosen = r > float(1 / m.sigma_t_prime[0])
+    r, reference = r[chosen], reference[chosen]
+    for model, distance in zip((Dipole, BetterDipole, PhotonBeam), distances, strict=True):
+        found = np.asarray(model(m)(jnp.asarray(r)))[:, 0]
+        error = np.sqrt(np.sum(r * (found - reference) ** 2) / np.sum(r * reference**2))
+        assert abs(error - distance) < 0.1 * distance + 0.005, (model.__name__, error)
+    if run.startswith("marble"):
+        found = np.asarray(PhotonBeam(m)(jnp.asarray(r)))[:, 0]
+        ring = np.digitize(r * float(m.sigma_t_prime[0]), np.geomspace(1, 16, 9))
+        for number in range(1, 9):
+            ratio = np.sum((r * found)[ring == number]) / np.sum((r * reference)[ring == number])
+            assert abs(ratio - 1) < 0.05, (number, ratio)
