@@ -1,8 +1,9 @@
 """Fit the materials in profiles/ anew: `python tools/make_profiles.py [name ...]`, all of them by default.
 
-Each file keeps its [medium], [surface] and [source]; [fit] is written anew: six Gaussians for the dipole with exact Fresnel
-moments, their variances shared by the channels, the weights of each channel summing to its total reflectance; fitted in float64.
-A material without [medium] was published as Gaussians, and is left as it is.
+Each file keeps its coefficients, [surface] and [source]; [fit] is written anew: six Gaussians for the dipole, or the multipole
+of the layers, with exact Fresnel moments, their variances shared by the channels, the weights of each channel non-negative and
+summing to its total reflectance; fitted in float64.
+A material without coefficients was published as Gaussians, and is left as it is.
 """
 
 import sys
@@ -11,25 +12,23 @@ import tomllib
 import jax
 import numpy as np
 
-from splatjax.fitting import FitResult, TotalReflectanceHeld, fit_gaussians
+from splatjax.fitting import FitResult, NonNegativeWeights, TotalReflectanceHeld, fit_gaussians
 from splatjax.gaussians import SumOfGaussians
-from splatjax.io import load_medium, materials, profiles_folder, save_material
-from splatjax.scattering import Dipole
+from splatjax.io import load_profile, materials, profiles_folder, save_material
 from splatjax.scene import Material
 
 COUNT = 6
 DIGITS = 8
 SETTINGS = {
-    "profile": "classical dipole, exact Fresnel moments",
     "variances_of": "all channels",
-    "weights_of": "sum held to the total reflectance",
+    "weights_of": "non-negative, sum held to the total reflectance",
 }
 
 
 def fit_material(name: str) -> FitResult:
     """Give the fit that a material is shipped with."""
     with jax.enable_x64(True):
-        return fit_gaussians(Dipole(load_medium(name)), COUNT, weights=TotalReflectanceHeld())
+        return fit_gaussians(load_profile(name), COUNT, weights=NonNegativeWeights(TotalReflectanceHeld()))
 
 
 def write(name: str) -> FitResult:
@@ -41,8 +40,8 @@ def write(name: str) -> FitResult:
         gaussians = SumOfGaussians(_rounded(fitted.gaussians.variances), _rounded(fitted.gaussians.weights))
         found = {"error": _rounded(fitted.error, 4)}
         material = Material(gaussians, **tables["surface"])
-        medium = load_medium(name)
-    save_material(material, path, medium=medium, source=tables["source"], fit=SETTINGS | found)
+        profile = load_profile(name)
+    save_material(material, path, profile=profile, source=tables["source"], fit=SETTINGS | found)
     return fitted
 
 
@@ -52,7 +51,7 @@ def _rounded(values: jax.Array, digits: int = DIGITS) -> jax.Array:
 
 def main(names: list[str]) -> None:
     for name in names or materials():
-        if "[medium]" not in (profiles_folder() / f"{name}.toml").read_text(encoding="utf-8"):
+        if not {"medium", "layers"} & set(tomllib.loads((profiles_folder() / f"{name}.toml").read_text(encoding="utf-8"))):
             print(f"{name}: as published")
             continue
         print(f"{name}: E = {', '.join(f'{x:.2e}' for x in write(name).error)}")

@@ -15,20 +15,21 @@ from ._report import stage
 
 @dataclass(frozen=True, kw_only=True)
 class Fit:
-    """Fit a sum of Gaussians to the diffusion profile of a medium (the dipole), and print it with its errors.
+    """Fit a sum of Gaussians to the diffusion profile of a medium (the dipole) or of layers (multipoles), and print it with its
+    errors.
 
-    Double precision. Variances are shared by the channels. The sum of the weights is held at the total reflectance of the
-    profile, so that the picture keeps its energy, unless --free is given.
+    Double precision. Variances are shared by the channels. Weights are not negative, and their sum is held at the total
+    reflectance of the profile, so that the picture keeps its energy, unless --free is given.
 
     Example: splatjax fit marble --count 6 --output marble.toml --plot marble.png
     """
 
     medium: tyro.conf.Positional[str]
-    """Name of a medium (`splatjax materials`), or path of a TOML file with a [medium]."""
+    """Name of a material (`splatjax materials`), or path of a TOML file with a [medium] or [[layers]]."""
     count: int = 6
     """Number of Gaussians."""
     free: bool = False
-    """Leave the sum of the weights free: the least error of Eq. 3, which may miss some of the energy."""
+    """Leave the weights free: the least error of Eq. 3, which may miss some of the energy."""
     output: OptionalPath = None
     """TOML file to write the material to."""
     plot: OptionalPath = None
@@ -44,17 +45,17 @@ class Fit:
             self._run()
 
     def _run(self) -> None:
-        medium = sj.load_medium(self.medium)
-        profile = sj.Dipole(medium)
-        weights = sj.FreeWeights() if self.free else sj.TotalReflectanceHeld()
+        profile = sj.load_profile(self.medium)
+        weights = sj.FreeWeights() if self.free else sj.NonNegativeWeights(sj.TotalReflectanceHeld())
         with stage(f"fitting {self.count} Gaussians to {self.medium}"):
             fitted = jax.block_until_ready(sj.fit_gaussians(profile, self.count, weights=weights))
         _print(fitted)
         if self.output is not None:
-            # The surface keeps the library's defaults; its index is that of the medium.
+            # The surface keeps the library's defaults; its index is that of the medium it bounds.
+            medium = profile.medium if isinstance(profile, sj.Dipole) else profile.top.medium
             material = sj.Material(fitted.gaussians, eta=medium.eta[0])
             source = {"provenance": f"fitted by splatjax {sj.__version__} to the coefficients of {self.medium}"}
-            sj.save_material(material, self.output, medium=medium, source=source, fit=self._how(fitted))
+            sj.save_material(material, self.output, profile=profile, source=source, fit=self._how(fitted))
             print(self.output)
         if self.plot is not None:
             from splatjax.io import atomic_path
@@ -67,9 +68,8 @@ class Fit:
 
     def _how(self, fitted: sj.FitResult) -> dict[str, object]:
         return {
-            "profile": "classical dipole, exact Fresnel moments",
             "variances_of": "all channels",
-            "weights_of": "free" if self.free else "sum held to the total reflectance",
+            "weights_of": "free" if self.free else "non-negative, sum held to the total reflectance",
             "error": fitted.error,
             "energy_error": fitted.energy_error,
         }

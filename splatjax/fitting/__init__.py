@@ -5,4 +5,5 @@ from ._fit import FitResult as FitResult, fit_gaussians as fit_gaussians
 from ._spread import AbstractSpread as AbstractSpread
 from ._spread import SharedVariances as SharedVariances, VariancesPerChannel as VariancesPerChannel
 from ._weights import AbstractWeights as AbstractWeights
-from ._weights import FreeWeights as FreeWeights, TotalReflectanceHeld as TotalReflectanceHeld
+from ._weights import FreeWeights as FreeWeights, NonNegativeWeights as NonNegativeWeights
+from ._weights import TotalReflectanceHeld as TotalReflectanceHeld

@@ -52,7 +52,7 @@ def fit_gaussians(
     - `profile`: 1/mm^2; the integral of `r R(r)^2` must exist. Differentiable.
     - `count`: number of Gaussians, at least 1.
     - `spread`: `SharedVariances()` (default) or `VariancesPerChannel()`.
-    - `weights`: `FreeWeights()` (default) or `TotalReflectanceHeld()`.
+    - `weights`: `FreeWeights()` (default), `TotalReflectanceHeld()`, or `NonNegativeWeights()` among either.
     - `rule`: radii of the integral, in length scales of the profile.
     - `throw`: raise if the search has not converged; otherwise `result` says so.
 

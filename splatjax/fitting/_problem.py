@@ -9,7 +9,7 @@ from splatjax.gaussians import AbstractProfile, gaussian
 from splatjax.scattering import RadialRule, at_own_radii
 
 from ._errors import norm_radii
-from ._weights import AbstractWeights
+from ._weights import AbstractWeights, without_idle
 
 
 class Problem(eqx.Module):
@@ -44,17 +44,14 @@ class Problem(eqx.Module):
         """Give the basis and each channel's best coefficients. Gaussians that are not active count for nothing."""
         basis = self.basis(log_variances)
         energies = self._energies(self.variances(log_variances))
-        rows, target = basis, self.target
-        if active is not None:
-            basis = jnp.where(jnp.broadcast_to(active, basis.shape), basis, jnp.zeros_like(basis))
-            energies = jnp.where(active, energies, jnp.zeros_like(energies))
-            # One more row for each inactive column keeps the rank full and the coefficient zero.
-            idle = jnp.diag(jnp.where(active, jnp.zeros_like(energies), jnp.ones_like(energies)))
-            rows = jnp.concatenate([basis, jnp.broadcast_to(idle, (basis.shape[0], *idle.shape))], axis=1)
-            target = jnp.concatenate([target, jnp.zeros((target.shape[0], idle.shape[0]), target.dtype)], axis=1)
-        energies = jnp.broadcast_to(energies, (basis.shape[0], *energies.shape))
-        total = self.total / self.norm
-        return basis, jax.vmap(self.weights.solve)(rows, target, energies, total)
+        everything = jnp.ones(energies.shape, bool) if active is None else active
+
+        def solve(rows, target, total):
+            problem = (rows, target, energies) if active is None else without_idle(rows, target, energies, everything)
+            return self.weights.solve(*problem, total)
+
+        basis = jnp.where(jnp.broadcast_to(everything, basis.shape), basis, jnp.zeros_like(basis))
+        return basis, jax.vmap(solve)(basis, self.target, self.total / self.norm)
 
     def residuals(
         self, log_variances: Float[Array, " gaussians"], active: Bool[Array, " gaussians"] | None = None

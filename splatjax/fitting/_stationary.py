@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from ._dense import invert, normal_inverse
+from ._dense import invert
 from ._problem import Problem
 
 _GAIN = 1e-6
@@ -27,7 +27,7 @@ def stationary(problem: Problem, found: Float[Array, " gaussians"]) -> Float[Arr
 
     def tangent_solve(linear, tangent):
         hessian = jax.vmap(linear, out_axes=1)(jnp.eye(tangent.shape[0], dtype=tangent.dtype))
-        return invert(hessian) @ tangent
+        return _invert_moving(hessian) @ tangent
 
     found = jax.lax.stop_gradient(found)
     return jax.lax.custom_root(lambda point: problem.gradient(point), found, lambda _, guess: guess, tangent_solve)
@@ -43,7 +43,7 @@ def refine(problem: Problem, start: Float[Array, " gaussians"]) -> tuple[Float[A
     def step(state):
         point, cost, _, steps = state
         gradient = problem.gradient(point)
-        newton = invert(jax.jacfwd(problem.gradient)(point)) @ gradient
+        newton = _invert_moving(jax.jacfwd(problem.gradient)(point)) @ gradient
         trial = point - newton
         trial_cost = cost_of(trial)
         # Once the steps are rounding, so are their gains and losses: they end the search, and are not taken.
@@ -56,11 +56,17 @@ def refine(problem: Problem, start: Float[Array, " gaussians"]) -> tuple[Float[A
     return found, _gain(problem, found) <= _GAIN * cost + floor
 
 
+def _invert_moving(hessian: Float[Array, "gaussians gaussians"]) -> Float[Array, "gaussians gaussians"]:
+    """Invert a Hessian; a Gaussian of weight zero in all channels changes nothing, and stays where it is."""
+    still = jnp.diagonal(hessian) == 0
+    return invert(hessian + jnp.diag(still.astype(hessian.dtype)))
+
+
 def _gain(problem: Problem, point: Float[Array, " gaussians"]) -> Float[Array, ""]:
     """Give by how much the sum of squares would fall if the residuals were linear: sound in float32, where the Hessian is not."""
     residuals = problem.residuals(point).ravel()
     slopes = jax.jacfwd(problem.residuals)(point).reshape(residuals.shape[0], -1)
     lengths = jnp.sqrt(jnp.sum(slopes * slopes, axis=0))
-    slopes = slopes / jnp.broadcast_to(lengths, slopes.shape)
+    slopes = slopes / jnp.broadcast_to(jnp.where(lengths > 0, lengths, 1.0), slopes.shape)
     along = slopes.T @ residuals
-    return along @ normal_inverse(slopes) @ along
+    return along @ _invert_moving(slopes.T @ slopes) @ along

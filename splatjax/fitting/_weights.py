@@ -3,7 +3,9 @@
 import abc
 
 import equinox as eqx
-from jaxtyping import Array, Float
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
 
 from ._dense import least_squares, normal_inverse
 
@@ -59,3 +61,71 @@ class TotalReflectanceHeld(AbstractWeights):
         # The way from the free optimum to the constraint that adds least to the error.
         direction = inverse @ energies
         return free + direction * ((total - energies @ free) / (energies @ direction))
+
+
+class NonNegativeWeights(AbstractWeights):
+    """None of the weights is below zero, as that of a mixture; otherwise as `among` has it.
+
+    Fits of single channels of a dipole have no negative weights anyway. Where variances are shared, some may become 0.
+
+    **Attributes:**
+
+    - `among`: `FreeWeights()` (default) or `TotalReflectanceHeld()`.
+
+    **Source:** the conditions are those of Kuhn and Tucker; one index at a time is exchanged, the last first (Murty 1974), which
+    ends for every positive definite problem.
+    """
+
+    among: AbstractWeights = FreeWeights()
+
+    def solve(
+        self,
+        basis: Float[Array, "rows gaussians"],
+        target: Float[Array, " rows"],
+        energies: Float[Array, " gaussians"],
+        total: Float[Array, ""],
+    ) -> Float[Array, " gaussians"]:
+        count = basis.shape[1]
+        tolerance = _ROUNDING * float(jnp.finfo(basis.dtype).eps)
+
+        def solved(positive):
+            return self.among.solve(*without_idle(basis, target, energies, positive), total)
+
+        def wrong(positive):
+            coefficients = solved(positive)
+            slope = basis.T @ (basis @ coefficients - target)
+            # What a held sum costs is the same slope for all that are not zero.
+            share = jnp.where(positive, energies, 0.0)
+            slope = slope - energies * (slope @ share) / jnp.maximum(share @ share, tolerance)
+            return jnp.where(positive, coefficients < 0, slope < -tolerance)
+
+        def exchange(state):
+            positive, wrongs, steps = state
+            last = jnp.max(jnp.where(wrongs, jnp.arange(count), -1))
+            positive = positive ^ (jnp.arange(count) == last)
+            return positive, wrong(positive), steps + 1
+
+        everything = jnp.ones(count, bool)
+        start = everything, wrong(everything), jnp.asarray(0)
+        positive, *_ = jax.lax.while_loop(lambda state: jnp.any(state[1]) & (state[2] < _EXCHANGES), exchange, start)
+        return solved(jax.lax.stop_gradient(positive))
+
+
+_ROUNDING = 100.0
+_EXCHANGES = 64
+
+
+def without_idle(
+    basis: Float[Array, "rows gaussians"],
+    target: Float[Array, " rows"],
+    energies: Float[Array, " gaussians"],
+    active: Bool[Array, " gaussians"],
+) -> tuple[Float[Array, "more_rows gaussians"], Float[Array, " more_rows"], Float[Array, " gaussians"]]:
+    """Give the problem in which only the active Gaussians count: the others' coefficients are zero.
+
+    One more row for each idle column keeps the rank full.
+    """
+    idle = jnp.diag(jnp.where(active, jnp.zeros_like(energies), jnp.ones_like(energies)))
+    columns = jnp.where(jnp.broadcast_to(active, basis.shape), basis, jnp.zeros_like(basis))
+    rows = jnp.concatenate([columns, idle])
+    return rows, jnp.concatenate([target, jnp.zeros_like(energies)]), jnp.where(active, energies, jnp.zeros_like(energies))

@@ -2,7 +2,7 @@
 
 from ._atomic import atomic_path as atomic_path
 from ._exr import read_exr as read_exr, write_exr as write_exr
-from ._materials import load_material as load_material, load_medium as load_medium
+from ._materials import load_material as load_material, load_medium as load_medium, load_profile as load_profile
 from ._materials import materials as materials, profiles_folder as profiles_folder, save_material as save_material
 from ._mesh import sample_mesh as sample_mesh
 from ._ply import read_splats as read_splats, write_splats as write_splats

@@ -13,14 +13,15 @@ import numpy as np
 import tomli_w
 
 from splatjax.gaussians import SumOfGaussians
-from splatjax.scattering import Medium
+from splatjax.scattering import Dipole, ExactFresnel, Film, Layer, LayeredMultipole, Medium
 from splatjax.scene import Material
 
 from ._atomic import atomic_path
 
 COEFFICIENT_UNIT = "1/mm"
 VARIANCE_UNIT = "mm^2"
-_TABLES = ("medium", "surface", "source", "fit")
+THICKNESS_UNIT = "mm"
+_TABLES = ("medium", "layers", "surface", "source", "fit")
 
 
 def profiles_folder() -> Path:
@@ -48,7 +49,7 @@ def load_material(name_or_path: str | os.PathLike[str]) -> Material:
     """
     path, tables = _read(name_or_path)
     if "fit" not in tables:
-        raise ValueError(f"{path}: has no [fit]; fit its [medium] first: `splatjax fit {path} --output {path}`")
+        raise ValueError(f"{path}: has no [fit]; fit its coefficients first: `splatjax fit {path} --output {path}`")
     fit = _Table(path, "fit", tables["fit"])
     fit.unit(VARIANCE_UNIT)
     variances = fit.numbers("variances", "positive (mm^2)", lambda x: x > 0)
@@ -75,15 +76,33 @@ def load_medium(name_or_path: str | os.PathLike[str]) -> Medium:
     """
     path, tables = _read(name_or_path)
     if "medium" not in tables:
-        raise ValueError(f"{path}: has no [medium]; only its Gaussians are known, which `load_material` gives")
-    return _medium(path, tables["medium"])
+        have = "its layers, which `load_profile` gives" if "layers" in tables else "its Gaussians, which `load_material` gives"
+        raise ValueError(f"{path}: has no [medium]; known are only {have}")
+    return _medium(_Table(path, "medium", tables["medium"]))
+
+
+def load_profile(name_or_path: str | os.PathLike[str]) -> Dipole | LayeredMultipole:
+    r"""Load the coefficients of a material as the profile that its Gaussians stand for.
+
+    **Arguments:**
+
+    - `name_or_path`: one of `materials()`, or the path of a TOML file.
+
+    **Returns:** the `Dipole` of a [medium], or the `LayeredMultipole` of [[layers]], in JAX's default precision.
+
+    **Raises:** `ValueError` as `load_material` does, and for a material that was published without coefficients.
+    """
+    path, tables = _read(name_or_path)
+    if "layers" in tables:
+        return _layered(path, tables["layers"])
+    return Dipole(load_medium(path))
 
 
 def save_material(
     material: Material,
     path: str | os.PathLike[str],
     *,
-    medium: Medium | None = None,
+    profile: Dipole | LayeredMultipole | None = None,
     source: Mapping[str, Any] | None = None,
     fit: Mapping[str, Any] | None = None,
 ) -> None:
@@ -93,20 +112,17 @@ def save_material(
 
     - `material`: one material (no batch); written with the digits it needs to be read back as it was.
     - `path`: of the file; its folder must exist.
-    - `medium`: the coefficients that the Gaussians were fitted to.
+    - `profile`: what the Gaussians were fitted to; its coefficients are written, and in [fit] what it is.
     - `source`: where the numbers come from: `citation`, `provenance`, ...
-    - `fit`: more to be kept in [fit]: `profile`, `error`, `energy_error`, ...
+    - `fit`: more to be kept in [fit]: `error`, `energy_error`, ...
 
     **Raises:** `OSError` if the file cannot be written.
     """
     tables: dict[str, Any] = {}
-    if medium is not None:
-        tables["medium"] = {
-            "unit": COEFFICIENT_UNIT,
-            "sigma_a": _plain(medium.sigma_a),
-            "sigma_s_prime": _plain(medium.sigma_s_prime),
-            "eta": _plain(medium.eta),
-        }
+    if isinstance(profile, Dipole):
+        tables["medium"] = _plain_medium(profile.medium)
+    if isinstance(profile, LayeredMultipole):
+        tables["layers"] = [_plain_layer(layer) for layer in profile.layers]
     surface = {"eta": material.eta, "specular": material.specular, "roughness": material.roughness}
     tables["surface"] = {name: _plain(value) for name, value in surface.items()}
     tables["source"] = dict(source or {})
@@ -115,21 +131,64 @@ def save_material(
         "unit": VARIANCE_UNIT,
         "variances": _plain(gaussians.variances),
         "weights": _plain(gaussians.weights),
+        **({} if profile is None else {"profile": _description(profile)}),
         **{name: value if isinstance(value, str | int | float) else _plain(value) for name, value in (fit or {}).items()},
     }
     with atomic_path(path) as temporary:
         temporary.write_text(_one_line_arrays(tomli_w.dumps(tables)), encoding="utf-8")
 
 
-def _medium(path: Path, table: Any) -> Medium:
-    medium = _Table(path, "medium", table)
+def _description(profile: Dipole | LayeredMultipole) -> str:
+    moments = "exact Fresnel moments" if isinstance(profile.fresnel, ExactFresnel) else "fitted Fresnel moments"
+    model = "classical dipole" if isinstance(profile, Dipole) else f"multipole of {len(profile.layers)} layers"
+    return f"{model}, {moments}"
+
+
+def _plain_medium(medium: Medium) -> dict[str, Any]:
+    coefficients = {"sigma_a": medium.sigma_a, "sigma_s_prime": medium.sigma_s_prime, "eta": medium.eta}
+    return {"unit": COEFFICIENT_UNIT, **{name: _plain(values) for name, values in coefficients.items()}}
+
+
+def _plain_layer(layer: Layer | Film) -> dict[str, Any]:
+    if isinstance(layer, Film):
+        return {"optical_depth": _plain(layer.optical_depth)}
+    return {"thickness": _plain(layer.thickness), "thickness_unit": THICKNESS_UNIT, **_plain_medium(layer.medium)}
+
+
+def _layered(path: Path, found: Any) -> LayeredMultipole:
+    if not isinstance(found, list) or not found:
+        raise ValueError(f"{path}: [[layers]] must be one table or more, from the top; it is {found!r}")
+    layers = [_layer(_Table(path, f"layers {number}", table)) for number, table in enumerate(found, start=1)]
+    counts = {layer.optical_depth.shape[0] if isinstance(layer, Film) else layer.medium.eta.shape[0] for layer in layers}
+    if len(counts) != 1:
+        raise ValueError(f"{path}: [[layers]] must all have one number per channel; they have {sorted(counts)} channels")
+    try:
+        return LayeredMultipole(layers)
+    except ValueError as error:
+        raise ValueError(f"{path}: [[layers]]: {error}") from None
+
+
+def _layer(table: "_Table") -> Layer | Film:
+    if "optical_depth" in table.table:
+        return Film(_array(table.numbers("optical_depth", "at least 0", lambda x: x >= 0)))
+    table.unit(THICKNESS_UNIT, "thickness_unit")
+    thickness = table.thickness("thickness")
+    try:
+        return Layer(_medium(table), _array(thickness))
+    except ValueError as error:
+        if str(error).startswith(table.where):
+            raise
+        raise ValueError(f"{table.where} {error}") from None
+
+
+def _medium(medium: "_Table") -> Medium:
     medium.unit(COEFFICIENT_UNIT)
     sigma_a = medium.numbers("sigma_a", "at least 0 (1/mm)", lambda x: x >= 0)
     sigma_s_prime = medium.numbers("sigma_s_prime", "positive (1/mm)", lambda x: x > 0)
     eta = medium.numbers("eta", "positive", lambda x: x > 0, channels=len(sigma_a))
     if not len(sigma_a) == len(sigma_s_prime) == len(eta):
         counts = f"{len(sigma_a)}, {len(sigma_s_prime)} and {len(eta)}"
-        raise ValueError(f"{path}: [medium] sigma_a, sigma_s_prime and eta must have one number per channel; they have {counts}")
+        raise ValueError(f"{medium.where} sigma_a, sigma_s_prime and eta must have one number per channel; they have {counts}")
     return Medium(_array(sigma_a), _array(sigma_s_prime), _array(eta))
 
 
@@ -145,11 +204,16 @@ def _read(name_or_path: str | os.PathLike[str]) -> tuple[Path, dict[str, Any]]:
         raise ValueError(f"{path}: is no TOML file: {error}") from None
     unknown = sorted(set(tables) - set(_TABLES))
     if unknown:
-        raise ValueError(f"{path}: has an unknown entry {unknown[0]!r}; a material has [medium], [surface], [source] and [fit]")
-    if "medium" not in tables and "fit" not in tables:
-        raise ValueError(f"{path}: has neither [medium] nor [fit]; a material needs at least one of them")
+        known = "[medium] or [[layers]], [surface], [source] and [fit]"
+        raise ValueError(f"{path}: has an unknown entry {unknown[0]!r}; a material has {known}")
+    if not {"medium", "layers", "fit"} & set(tables):
+        raise ValueError(f"{path}: has neither [medium] nor [[layers]] nor [fit]; a material needs one of them")
+    if {"medium", "layers"} <= set(tables):
+        raise ValueError(f"{path}: has both [medium] and [[layers]]; a material is one or the other")
     if "medium" in tables:
-        _medium(path, tables["medium"])
+        _medium(_Table(path, "medium", tables["medium"]))
+    if "layers" in tables:
+        _layered(path, tables["layers"])
     return path, tables
 
 
@@ -173,10 +237,11 @@ class _Table:
             raise ValueError(f"{path}: [{name}] must be a table; it is {table!r}")
         self.where, self.table = f"{path}: [{name}]", table
 
-    def unit(self, expected: str) -> None:
-        found = self.table.get("unit")
+    def unit(self, expected: str, name: str = "unit") -> None:
+        found = self.table.get(name)
         if found != expected:
-            raise ValueError(f'{self.where} unit must be "{expected}"; it is {found!r}: convert the numbers, then name the unit')
+            remedy = "convert the numbers, then name the unit"
+            raise ValueError(f'{self.where} {name} must be "{expected}"; it is {found!r}: {remedy}')
 
     def numbers(self, name: str, expected: str, holds, channels: int | None = None) -> np.ndarray:
         """Give a list of numbers; a single one stands for all channels, if their number is given."""
@@ -189,6 +254,12 @@ class _Table:
         if not np.all(np.isfinite(values) & holds(values)):
             raise ValueError(f"{self.where} {name} must be finite and {expected}; it is {found!r}")
         return values
+
+    def thickness(self, name: str) -> np.ndarray:
+        found = self._entry(name, "a number of mm, or inf")
+        if not _is_number(found) or not found > 0:
+            raise ValueError(f"{self.where} {name} must be positive (mm), or inf; it is {found!r}")
+        return np.asarray(found, np.float64)
 
     def number(self, name: str, expected: str, holds, default: float) -> float:
         found = self.table.get(name, default)

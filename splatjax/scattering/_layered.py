@@ -62,7 +62,12 @@ class LayeredMultipole(AbstractSlabProfile):
 
     def length_scale(self) -> Float[Array, " channels"]:
         """Give the mean free path of the uppermost layer that scatters, mm."""
-        return 1 / self._scattering()[0].medium.sigma_t_prime
+        return 1 / self.top.medium.sigma_t_prime
+
+    @property
+    def top(self) -> Layer:
+        """The uppermost layer that scatters."""
+        return self._scattering()[0]
 
     def response(self, k: Float[Array, "*frequencies channels"]) -> Response:
         etas = [self.eta_above, *(layer.medium.eta for layer in self._scattering()), self.eta_below]

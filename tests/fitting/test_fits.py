@@ -10,6 +10,7 @@ from attainable import PER_CHANNEL, SHARED_FREE, SHARED_HELD
 
 from splatjax.fitting import (
     FreeWeights,
+    NonNegativeWeights,
     SharedVariances,
     TotalReflectanceHeld,
     VariancesPerChannel,
@@ -22,8 +23,8 @@ from splatjax.fitting._problem import make_problem
 from splatjax.fitting._search import search
 from splatjax.fitting._stationary import refine
 from splatjax.gaussians import SumOfGaussians
-from splatjax.io import load_medium
-from splatjax.scattering import NORM_RULE, Dipole, EganFresnel, Medium
+from splatjax.io import load_medium, load_profile
+from splatjax.scattering import NORM_RULE, Dipole, EganFresnel, LayeredMultipole, Medium, PhotonBeam
 
 BAR = 1.01
 """Errors may exceed the best known ones by a hundredth, variances shared by a fiftieth (their tables have three digits)."""
@@ -99,11 +100,10 @@ def test_variances_ascend_and_more_gaussians_fit_better(float64):
     assert errors[0] > 4 * errors[1]
 
 
-@pytest.mark.parametrize("spread", [SharedVariances(), VariancesPerChannel()])
-def test_held_energy_is_held_at_little_cost(float64, spread):
+def test_held_energy_is_held_at_little_cost(float64):
     profile = media("marble")
-    free = fit_gaussians(profile, 4, spread=spread)
-    held = fit_gaussians(profile, 4, spread=spread, weights=TotalReflectanceHeld())
+    free = fit_gaussians(profile, 4)
+    held = fit_gaussians(profile, 4, weights=TotalReflectanceHeld())
     assert np.max(np.abs(held.energy_error)) < HELD
     assert np.max(np.abs(free.energy_error)) > 0.01
     assert together(free.error) < together(held.error) < 1.5 * together(free.error)
@@ -138,6 +138,9 @@ def test_green_marble_is_the_published_fit(float64):
     np.testing.assert_allclose(fitted.gaussians.weights[:, 0], [0.0704, 0.1839, 0.2060, 0.2882], rtol=PUBLISHED)
 
 
+HELD_ABOVE_ZERO = NonNegativeWeights(TotalReflectanceHeld())
+
+
 def worst_ratio(names, count: int, spread, weights) -> float:
     """The worst error over the best known one."""
     ratios = []
@@ -146,7 +149,7 @@ def worst_ratio(names, count: int, spread, weights) -> float:
         if isinstance(spread, VariancesPerChannel):
             ratios += [error[channel] / PER_CHANNEL[name][channel][count - 1] for channel in range(3)]
         else:
-            table = SHARED_HELD if isinstance(weights, TotalReflectanceHeld) else SHARED_FREE
+            table = SHARED_FREE if isinstance(weights, FreeWeights) else SHARED_HELD
             ratios.append(together(error) / table[name][count - 1])
     return float(np.max(ratios))
 
@@ -154,19 +157,43 @@ def worst_ratio(names, count: int, spread, weights) -> float:
 def test_six_gaussians_reach_the_best_known_errors(float64):
     assert worst_ratio(PER_CHANNEL, 6, VariancesPerChannel(), FreeWeights()) < BAR
     assert worst_ratio(PER_CHANNEL, 6, SharedVariances(), FreeWeights()) < SHARED_BAR
-    assert worst_ratio(PER_CHANNEL, 6, SharedVariances(), TotalReflectanceHeld()) < SHARED_BAR
+    assert worst_ratio(PER_CHANNEL, 6, SharedVariances(), HELD_ABOVE_ZERO) < SHARED_BAR
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("count", [2, 4, 8])
+@pytest.mark.parametrize("count", [2, 8])
 def test_other_counts_reach_the_best_known_errors(float64, count):
     ratios = {
         "per channel": (worst_ratio(PER_CHANNEL, count, VariancesPerChannel(), FreeWeights()), BAR),
         "shared": (worst_ratio(PER_CHANNEL, count, SharedVariances(), FreeWeights()), SHARED_BAR),
-        "shared, held": (worst_ratio(PER_CHANNEL, count, SharedVariances(), TotalReflectanceHeld()), SHARED_BAR),
+        "shared, held": (worst_ratio(PER_CHANNEL, count, SharedVariances(), HELD_ABOVE_ZERO), SHARED_BAR),
     }
     print(f"k = {count}: worst error over the best known:", {name: round(ratio, 4) for name, (ratio, _) in ratios.items()})
     assert all(ratio < bar for ratio, bar in ratios.values()), ratios
+
+
+def test_layers_reach_the_best_known_errors(float64):
+    skin = LayeredMultipole(load_profile("skin_layers").layers, fresnel=EganFresnel())
+    own = fit_gaussians(skin, 6, spread=VariancesPerChannel())
+    np.testing.assert_allclose(own.error, [1.837e-3, 1.199e-3, 8.899e-4], rtol=1e-3)
+
+
+def test_a_profile_without_a_norm_is_refused(dtype):
+    """Single scattering is infinite at the origin: Eq. 3 needs to be told where to start."""
+    medium = Medium(*(jnp.asarray([x], dtype) for x in (0.0041, 2.62, 1.5)))
+    for function in (fit_gaussians, lambda profile: relative_error(profile, SumOfGaussians(jnp.ones(1), jnp.ones((1, 1))))):
+        with pytest.raises(ValueError, match=r"PhotonBeam goes to infinity like 1/r.*NORM_RULE.beyond"):
+            function(PhotonBeam(medium))
+    with pytest.raises(ValueError, match=r"cut must be between 0 and .* length scales; got 0"):
+        NORM_RULE.beyond(0.0)
+
+
+def test_beyond_a_cut_a_photon_beam_is_fitted(float64):
+    beam = PhotonBeam(Medium(*(jnp.asarray([x]) for x in (0.0041, 2.62, 1.5))))
+    fitted = fit_gaussians(beam, 4, rule=NORM_RULE.beyond(1.0))
+    assert fitted.error[0] < 0.02
+    r = jnp.linspace(0.5, 4, 20)
+    np.testing.assert_allclose(fitted.gaussians(r), beam(r), atol=0.02 * float(beam(r)[0, 0]))
 
 
 @pytest.mark.once

@@ -1,0 +1,97 @@
+"""Weights for given variances, against solvers of others, by hand and by trying all subsets."""
+
+from itertools import combinations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import pytest
+from scipy.optimize import nnls
+
+from splatjax.fitting import FreeWeights, NonNegativeWeights, TotalReflectanceHeld, fit_gaussians
+from splatjax.io import load_medium
+from splatjax.scattering import (
+    Dipole,
+    EganFresnel,
+    Medium,
+)
+
+SOLVED = 1e-9
+
+
+def problem(seed: int):
+    """Columns of unit length that overlap, and a target that no mixture of them reaches."""
+    noise = np.random.default_rng(seed)
+    x = np.linspace(-2, 2, 40)[:, None]
+    basis = np.exp(-((x - np.linspace(-1.5, 1.5, 6)) ** 2))
+    basis /= np.linalg.norm(basis, axis=0)
+    target = noise.normal(size=40)
+    return basis, target / np.linalg.norm(target), noise.uniform(0.5, 2, 6), 1.3
+
+
+def solve(weights, basis, target, energies, total):
+    return np.asarray(weights.solve(*(jnp.asarray(each) for each in (basis, target, energies)), jnp.asarray(total)))
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_non_negative_weights_are_those_of_lawson_and_hanson(float64, seed):
+    basis, target, energies, total = problem(seed)
+    found = solve(NonNegativeWeights(), basis, target, energies, total)
+    np.testing.assert_allclose(found, nnls(basis, target)[0], atol=SOLVED)
+    assert np.all(found >= 0)
+    assert np.any(solve(FreeWeights(), basis, target, energies, total) < 0)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_non_negative_weights_of_a_held_sum_are_the_best_of_all_subsets(float64, seed):
+    basis, target, energies, total = problem(seed)
+    best = np.inf
+    for size in range(1, 7):
+        for subset in map(list, combinations(range(6), size)):
+            # Lagrange's equations of the equality alone.
+            gram = basis[:, subset].T @ basis[:, subset]
+            edge = energies[subset]
+            system = np.block([[gram, edge[:, None]], [edge[None], np.zeros((1, 1))]])
+            weights = np.linalg.solve(system, np.append(basis[:, subset].T @ target, total))[:-1]
+            if np.all(weights >= 0):
+                best = min(best, np.linalg.norm(target - basis[:, subset] @ weights))
+    found = solve(NonNegativeWeights(TotalReflectanceHeld()), basis, target, energies, total)
+    assert np.all(found >= 0)
+    np.testing.assert_allclose(energies @ found, total, rtol=SOLVED)
+    np.testing.assert_allclose(np.linalg.norm(target - basis @ found), best, rtol=SOLVED)
+
+
+def test_derivatives_of_non_negative_weights(float64):
+    basis, target, energies, total = problem(2)
+
+    def value(target):
+        return NonNegativeWeights().solve(jnp.asarray(basis), target, jnp.asarray(energies), jnp.asarray(total))
+
+    target = jnp.asarray(target)
+    slopes = jax.jacrev(value)(target)
+    step = 1e-6 * np.eye(40)[7]
+    np.testing.assert_allclose(slopes[:, 7], (value(target + step) - value(target - step)) / 2e-6, atol=1e-8)
+    np.testing.assert_array_equal(slopes[np.asarray(value(target)) == 0], 0)
+
+
+def test_a_fit_with_weights_at_zero_converges_and_has_the_derivative_of_refits(float64):
+    """Ketchup's channels lie so far apart that some weights vanish."""
+    medium = load_medium("ketchup")
+
+    def fit(scale):
+        moved = Medium(medium.sigma_a * scale, medium.sigma_s_prime, medium.eta)
+        return fit_gaussians(Dipole(moved, EganFresnel()), 3, weights=NonNegativeWeights(), throw=False)
+
+    @jax.jit
+    def fit_and_slope(scale):
+        fitted, slope = jax.jvp(fit, (scale,), (jnp.ones_like(scale),))
+        return fitted.gaussians, slope.gaussians.variances, fitted.result == optx.RESULTS.successful
+
+    gaussians, slope, converged = fit_and_slope(jnp.asarray(1.0))
+    assert bool(converged)
+    assert np.all(gaussians.weights >= 0)
+    assert np.sum(np.asarray(gaussians.weights) == 0) >= 1
+    step = 1e-4
+    there, back = (fit_and_slope(jnp.asarray(1 + h))[0].variances for h in (step, -step))
+    np.testing.assert_allclose(slope, (there - back) / (2 * step), rtol=1e-4)
