@@ -6,6 +6,7 @@ From a few optical coefficients to a translucent picture, and back; lengths in m
 from .fitting import FitResult as FitResult, fit_gaussians as fit_gaussians, relative_error as relative_error
 from .fitting import FreeWeights as FreeWeights, NonNegativeWeights as NonNegativeWeights
 from .fitting import TotalReflectanceHeld as TotalReflectanceHeld
+from .fitting import GivenVariances as GivenVariances, InsertedGaussians as InsertedGaussians
 from .fitting import SharedVariances as SharedVariances, VariancesPerChannel as VariancesPerChannel
 from .gaussians import AbstractProfile as AbstractProfile, SumOfGaussians as SumOfGaussians
 from .geometry import bust as bust, bust_mesh as bust_mesh
@@ -15,7 +16,12 @@ from .scattering import BetterDipole as BetterDipole, Burley as Burley, Dipole a
 from .scattering import EganFresnel as EganFresnel, ExactFresnel as ExactFresnel, Medium as Medium
 from .scattering import Film as Film, Layer as Layer, LayeredMultipole as LayeredMultipole, Multipole as Multipole
 from .scattering import NORM_RULE as NORM_RULE, RadialRule as RadialRule, Tabulated as Tabulated
-from .io import load_material as load_material, load_medium as load_medium, load_profile as load_profile
+from .io import (
+    dipole_starts as dipole_starts,
+    load_material as load_material,
+    load_medium as load_medium,
+    load_profile as load_profile,
+)
 from .io import materials as materials, save_material as save_material
 from .scene import Camera as Camera, DirectionalLight as DirectionalLight, Frame as Frame
 from .scene import GaussianBeam as GaussianBeam, Material as Material, PointLight as PointLight

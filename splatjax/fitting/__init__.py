@@ -2,8 +2,11 @@
 
 from ._errors import relative_error as relative_error, squared_error as squared_error
 from ._fit import FitResult as FitResult, fit_gaussians as fit_gaussians
+from ._search import AbstractStart as AbstractStart
+from ._search import GivenVariances as GivenVariances, InsertedGaussians as InsertedGaussians
 from ._spread import AbstractSpread as AbstractSpread
 from ._spread import SharedVariances as SharedVariances, VariancesPerChannel as VariancesPerChannel
+from ._starts import DipoleStarts as DipoleStarts
 from ._weights import AbstractWeights as AbstractWeights
 from ._weights import FreeWeights as FreeWeights, NonNegativeWeights as NonNegativeWeights
 from ._weights import TotalReflectanceHeld as TotalReflectanceHeld

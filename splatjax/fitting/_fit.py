@@ -7,6 +7,7 @@ from jaxtyping import Array, Float
 from splatjax.gaussians import AbstractProfile, SumOfGaussians
 from splatjax.scattering import NORM_RULE, RadialRule
 
+from ._search import AbstractStart, InsertedGaussians
 from ._spread import AbstractSpread, SharedVariances
 from ._weights import AbstractWeights, FreeWeights
 
@@ -34,14 +35,15 @@ def fit_gaussians(
     *,
     spread: AbstractSpread | None = None,
     weights: AbstractWeights | None = None,
+    start: AbstractStart | None = None,
     rule: RadialRule = NORM_RULE,
     throw: bool = True,
 ) -> FitResult:
     r"""Fit a sum of Gaussians to a profile: the least Eq. 3 over variances and weights.
 
     Variable projection: for given variances the best weights are a linear problem, solved inside; Levenberg and Marquardt's
-    method moves the logarithms of the variances. A fit with one Gaussian more starts from the best fit before, with a Gaussian
-    inserted in each gap and at both ends. Compiles once for each count and kind of profile.
+    method moves the logarithms of the variances. Unless told otherwise, a fit with one Gaussian more starts from the best fit
+    before, with a Gaussian inserted in each gap and at both ends. Compiles once for each count and kind of profile.
 
     The result is differentiable in every float of the profile, by the implicit function theorem with the full Hessian of Eq. 3,
     in forward and reverse mode; to first order. The precision follows the profile. In float32 errors below about 1e-5 are
@@ -53,6 +55,7 @@ def fit_gaussians(
     - `count`: number of Gaussians, at least 1.
     - `spread`: `SharedVariances()` (default) or `VariancesPerChannel()`.
     - `weights`: `FreeWeights()` (default), `TotalReflectanceHeld()`, or `NonNegativeWeights()` among either.
+    - `start`: `InsertedGaussians()` (default), which finds the best fit; or `GivenVariances(...)` near it, which is fast.
     - `rule`: radii of the integral, in length scales of the profile.
     - `throw`: raise if the search has not converged; otherwise `result` says so.
 
@@ -67,7 +70,8 @@ def fit_gaussians(
         raise ValueError(f"count must be a whole number of Gaussians, at least 1; got {count!r}")
     spread = SharedVariances() if spread is None else spread
     weights = FreeWeights() if weights is None else weights
-    fitted = _fit_compiled(profile, count, spread, weights, rule)
+    start = InsertedGaussians() if start is None else start
+    fitted = _fit_compiled(profile, count, spread, weights, rule, start)
     if throw:
         fitted = fitted.result.error_if(fitted, fitted.result != optx.RESULTS.successful)
     return fitted
@@ -75,8 +79,13 @@ def fit_gaussians(
 
 @eqx.filter_jit
 def _fit_compiled(
-    profile: AbstractProfile, count: int, spread: AbstractSpread, weights: AbstractWeights, rule: RadialRule
+    profile: AbstractProfile,
+    count: int,
+    spread: AbstractSpread,
+    weights: AbstractWeights,
+    rule: RadialRule,
+    start: AbstractStart,
 ) -> FitResult:
-    gaussians, error, energy, converged = spread.fit(profile, count, weights, rule)
+    gaussians, error, energy, converged = spread.fit(profile, count, weights, rule, start)
     result = optx.RESULTS.where(converged, optx.RESULTS.successful, optx.RESULTS.nonlinear_max_steps_reached)
     return FitResult(gaussians, error, energy / profile.total_reflectance() - 1, result)

@@ -7,3 +7,4 @@ from ._materials import materials as materials, profiles_folder as profiles_fold
 from ._mesh import sample_mesh as sample_mesh
 from ._ply import read_splats as read_splats, write_splats as write_splats
 from ._png import write_png as write_png
+from ._starts import dipole_starts as dipole_starts
