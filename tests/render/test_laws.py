@@ -28,6 +28,7 @@ def middle(picture: jnp.ndarray) -> np.ndarray:
     return np.asarray(picture[height // 4 : -height // 4, width // 4 : -width // 4])
 
 
+@pytest.mark.once
 def test_exitance_over_irradiance_is_the_total_reflectance_of_marble():
     material = matte(load_material("marble"))
     scene = sj.Scene(sheet(1.0, 30.0), (lamp(),), material)
@@ -39,6 +40,7 @@ def test_exitance_over_irradiance_is_the_total_reflectance_of_marble():
     np.testing.assert_allclose(reflectance, held, rtol=EXITANCE_TOLERANCE)
 
 
+@pytest.mark.once
 def test_white_material_with_an_albedo_map_gives_the_albedo():
     albedo = jnp.asarray([0.8, 0.4, 0.1], float)
     splats = sheet(1.0, 20.0)
@@ -126,6 +128,7 @@ def bumpy_frame() -> sj.Frame:
     return sj.render(scene, camera, settings)
 
 
+@pytest.mark.once
 def test_light_is_added_linearly():
     splats, material = sphere(1500), sj.Material(two_gaussians())
     camera = sj.Camera.look_at(jnp.asarray([0.0, 0.0, 400.0], float), jnp.zeros(3), fov=18.0, width=32, height=32)
@@ -134,6 +137,7 @@ def test_light_is_added_linearly():
     np.testing.assert_allclose(np.asarray(both), np.asarray(single[0] + single[1]), atol=2e-6)
 
 
+@pytest.mark.once
 def test_no_splats_and_no_lights_give_an_empty_and_a_black_picture():
     material = sj.Material(two_gaussians())
     camera = camera_over(5.0, 16)
@@ -147,6 +151,7 @@ def test_no_splats_and_no_lights_give_an_empty_and_a_black_picture():
     assert dark.shadow.shape == (0, 16, 16)
 
 
+@pytest.mark.once
 def test_a_plan_that_does_not_suffice_poisons_the_picture_and_says_so():
     material = sj.Material(two_gaussians())
     camera = camera_over(5.0, 32)

@@ -104,6 +104,7 @@ def test_a_sphere_does_not_shadow_itself(kind):
         assert np.max(lit[cosine < -0.3]) < 0.01
 
 
+@pytest.mark.once
 def test_edge_has_the_gradient_of_central_differences():
     """In the direction of the light, and in where the occluder stands."""
     with jax.enable_x64(True):
