@@ -34,7 +34,7 @@ def residuals(problem: Problem, point):
 
 @eqx.filter_jit
 def jacobian(problem: Problem, point):
-    return jax.jacfwd(lambda point: problem.residuals(point)[0])(point)
+    return problem.expand(point).jacobian[0]
 
 
 def scipy_fit(problem: Problem, start: np.ndarray):

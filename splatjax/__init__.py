@@ -4,6 +4,7 @@ From a few optical coefficients to a translucent picture, and back; lengths in m
 """
 
 from .fitting import FitResult as FitResult, fit_gaussians as fit_gaussians, relative_error as relative_error
+from .fitting import error_by_count as error_by_count, LeastCount as LeastCount
 from .fitting import FreeWeights as FreeWeights, NonNegativeWeights as NonNegativeWeights
 from .fitting import TotalReflectanceHeld as TotalReflectanceHeld
 from .fitting import GivenVariances as GivenVariances, InsertedGaussians as InsertedGaussians

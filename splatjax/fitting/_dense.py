@@ -39,6 +39,12 @@ def _invert_jvp(primals, tangents):
     return inverse, -inverse @ tangents[0] @ inverse
 
 
+def invert_moving(hessian: Float[Array, "gaussians gaussians"]) -> Float[Array, "gaussians gaussians"]:
+    """Invert a Hessian; a Gaussian of weight zero in all channels changes nothing, and stays where it is."""
+    still = jnp.diagonal(hessian) == 0
+    return invert(hessian + jnp.diag(still.astype(hessian.dtype)))
+
+
 def normal_inverse(matrix: Float[Array, "rows columns"]) -> Float[Array, "columns columns"]:
     """Give the inverse of `matrix^T matrix`."""
     return invert(matrix.T @ matrix)

@@ -39,16 +39,7 @@ class InsertedGaussians(AbstractStart):
     """From the best fit with one Gaussian fewer, and so on down to one: one is inserted at every place, and the best is kept."""
 
     def search(self, problem: Problem, count: int) -> Float[Array, " gaussians"]:
-        dtype = problem.target.dtype
-
-        def stage(best, active_count):
-            active = jnp.arange(count) < active_count
-            starts = jax.vmap(lambda place: _insert(best, active_count, place))(jnp.arange(count))
-            found = jax.vmap(lambda start: _descend(problem, start, active))(starts)
-            costs = jax.vmap(lambda point: _cost(problem, point, active))(found)
-            return _sorted(found[jnp.argmin(costs)], active), None
-
-        return jax.lax.scan(stage, jnp.zeros(count, dtype), jnp.arange(1, count + 1))[0]
+        return ladder(problem, count)[-1]
 
 
 class GivenVariances(AbstractStart):
@@ -73,16 +64,32 @@ class GivenVariances(AbstractStart):
             raise ValueError(f"a fit of {count} Gaussians starts from as many variances, shared by the channels; got {shape}")
         variances = jax.lax.stop_gradient(self.variances).astype(problem.target.dtype)
         start = jnp.log(variances / (problem.unit * problem.unit))
-        return jnp.sort(_descend(problem, start, jnp.ones(count, bool)))
+        return jnp.sort(_descend(problem, start, None)[0])
 
 
 def search(problem: Problem, count: int, start: AbstractStart) -> Float[Array, " gaussians"]:
     """Give nearly the best log variances, ascending. No derivative goes through it."""
-    given = problem.target.dtype
-    # optimistix damps in JAX's default precision, whatever it is given.
-    dtype = jnp.result_type(float)
-    problem = jax.tree.map(lambda leaf: jax.lax.stop_gradient(leaf).astype(dtype), problem)
-    return start.search(problem, count).astype(given)
+    return start.search(constant(problem), count).astype(problem.target.dtype)
+
+
+def constant(problem: Problem) -> Problem:
+    """Give a problem through which no derivative goes, in JAX's default precision: optimistix damps in it, whatever it is
+    given."""
+    return jax.tree.map(lambda leaf: jax.lax.stop_gradient(leaf).astype(jnp.result_type(float)), problem)
+
+
+def ladder(problem: Problem, largest: int) -> Float[Array, "counts gaussians"]:
+    """Give nearly the best log variances of 1 to so many Gaussians, each ascending, with zeros behind."""
+    dtype = problem.target.dtype
+
+    def rung(best, active_count):
+        active = jnp.arange(largest) < active_count
+        starts = jax.vmap(lambda place: _insert(best, active_count, place))(jnp.arange(largest))
+        found, costs = jax.vmap(lambda start: _descend(problem, start, active))(starts)
+        best = _sorted(found[jnp.argmin(costs)], active)
+        return best, best
+
+    return jax.lax.scan(rung, jnp.zeros(largest, dtype), jnp.arange(1, largest + 1))[1]
 
 
 def _insert(best: Float[Array, " gaussians"], active_count: Int[Array, ""], place: Int[Array, ""]) -> Float[Array, " gaussians"]:
@@ -102,20 +109,37 @@ def _insert(best: Float[Array, " gaussians"], active_count: Int[Array, ""], plac
 
 
 def _descend(
-    problem: Problem, start: Float[Array, " gaussians"], active: Bool[Array, " gaussians"]
-) -> Float[Array, " gaussians"]:
+    problem: Problem, start: Float[Array, " gaussians"], active: Bool[Array, " gaussians"] | None
+) -> tuple[Float[Array, " gaussians"], Float[Array, ""]]:
+    """Give where a descent ends, and the sum of squares there."""
     # In units of the start's own residual, so that damping and tolerances mean the same for a good fit as for a poor one.
-    unit = jnp.sqrt(_cost(problem, start, active))
+    unit = jnp.sqrt(_cost(problem.residuals(start, active)))
 
     def residuals(point, _):
-        return problem.residuals(point, active) / unit
+        return _projected(problem, active, point) / unit
 
     solver = optx.LevenbergMarquardt(rtol=_TOLERANCE, atol=_TOLERANCE, linear_solver=NormalEquations())
-    return optx.least_squares(residuals, solver, start, max_steps=_STEPS, throw=False).value
+    found = optx.least_squares(residuals, solver, start, max_steps=_STEPS, throw=False).value
+    return found, _cost(problem.residuals(found, active))
 
 
-def _cost(problem: Problem, point: Float[Array, " gaussians"], active: Bool[Array, " gaussians"]) -> Float[Array, ""]:
-    cost = jnp.sum(problem.residuals(point, active) ** 2)
+@jax.custom_jvp
+def _projected(
+    problem: Problem, active: Bool[Array, " gaussians"] | None, point: Float[Array, " gaussians"]
+) -> Float[Array, "channels nodes"]:
+    return problem.residuals(point, active)
+
+
+@_projected.defjvp
+def _projected_jvp(primals, tangents):
+    """The closed form; the problem is a constant of a search."""
+    problem, active, point = primals
+    expansion = problem.expand(point, active)
+    return expansion.residuals, jnp.einsum("cnk,k->cn", expansion.jacobian, tangents[2])
+
+
+def _cost(residuals: Float[Array, "channels nodes"]) -> Float[Array, ""]:
+    cost = jnp.sum(residuals**2)
     return jnp.where(jnp.isfinite(cost), cost, jnp.full_like(cost, jnp.inf))
 
 

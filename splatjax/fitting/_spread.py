@@ -1,29 +1,30 @@
 """Which channels share their variances."""
 
 import abc
+from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
 
-from splatjax.gaussians import AbstractProfile, SumOfGaussians
+from splatjax.gaussians import AbstractProfile
 from splatjax.scattering import RadialRule
 
 from ._problem import Problem, make_problem
-from ._search import AbstractStart, search
-from ._stationary import refine, stationary
+from ._search import AbstractStart
 from ._weights import AbstractWeights
 
 
 class AbstractSpread(eqx.Module):
-    """Which channels of a fit share their variances."""
+    """Which channels of a fit share their variances: the problem of a profile is one, or one for each channel."""
 
     @abc.abstractmethod
-    def fit(
-        self, profile: AbstractProfile, count: int, weights: AbstractWeights, rule: RadialRule, start: AbstractStart
-    ) -> tuple[SumOfGaussians, Float[Array, " channels"], Float[Array, " channels"], Bool[Array, ""]]:
-        """Give the Gaussians, Eq. 4 and the energy of each channel, and whether the search has converged."""
+    def problem(self, profile: AbstractProfile, weights: AbstractWeights, rule: RadialRule) -> Problem:
+        """State what is to be fitted, with a leading axis if there is more than one problem."""
+
+    @abc.abstractmethod
+    def over(self, function: Callable[[Problem, AbstractStart], Any], problem: Problem, start: AbstractStart) -> Any:
+        """Give what a function of one problem and its start gives for each: with a leading axis, if `problem` has one."""
 
 
 class SharedVariances(AbstractSpread):
@@ -32,45 +33,21 @@ class SharedVariances(AbstractSpread):
     The fit minimizes the sum over the channels of the square of Eq. 4.
     """
 
-    def fit(
-        self, profile: AbstractProfile, count: int, weights: AbstractWeights, rule: RadialRule, start: AbstractStart
-    ) -> tuple[SumOfGaussians, Float[Array, " channels"], Float[Array, " channels"], Bool[Array, ""]]:
-        problem = make_problem(profile, weights, rule)
-        gaussians, error, converged = _fit(problem, count, start)
-        return gaussians, error, gaussians.total_reflectance(), converged
+    def problem(self, profile: AbstractProfile, weights: AbstractWeights, rule: RadialRule) -> Problem:
+        return make_problem(profile, weights, rule)
+
+    def over(self, function: Callable[[Problem, AbstractStart], Any], problem: Problem, start: AbstractStart) -> Any:
+        return function(problem, start)
 
 
 class VariancesPerChannel(AbstractSpread):
     """Variances of its own for each channel: one `SumOfGaussians` of one channel for each, batched along a leading axis."""
 
-    def fit(
-        self, profile: AbstractProfile, count: int, weights: AbstractWeights, rule: RadialRule, start: AbstractStart
-    ) -> tuple[SumOfGaussians, Float[Array, " channels"], Float[Array, " channels"], Bool[Array, ""]]:
+    def problem(self, profile: AbstractProfile, weights: AbstractWeights, rule: RadialRule) -> Problem:
         shared = make_problem(profile, weights, rule)
-        scale = jax.lax.stop_gradient(profile.length_scale())
+        fields = (shared.squared_radii, shared.root_weights, shared.target, shared.norm, shared.total)
+        unit = jax.lax.stop_gradient(profile.length_scale())
+        return Problem(*(field[:, None] for field in fields), unit=unit, weights=weights)
 
-        def fit_channel(squared_radii, root_weights, target, norm, total, unit, start):
-            one = (leaf[None] for leaf in (squared_radii, root_weights, target, norm, total))
-            gaussians, error, converged = _fit(Problem(*one, unit=unit, weights=weights), count, start)
-            return gaussians, error[0], gaussians.total_reflectance()[0], converged
-
-        fitted = jax.vmap(fit_channel)(
-            shared.squared_radii,
-            shared.root_weights,
-            shared.target,
-            shared.norm,
-            shared.total,
-            scale,
-            start.of_channels(len(scale)),
-        )
-        gaussians, error, energy, converged = fitted
-        return gaussians, error, energy, jnp.all(converged)
-
-
-def _fit(problem: Problem, count: int, start: AbstractStart) -> tuple[SumOfGaussians, Float[Array, " channels"], Bool[Array, ""]]:
-    found, converged = refine(problem, search(problem, count, start))
-    log_variances = stationary(problem, found)
-    gaussians = SumOfGaussians(problem.variances(log_variances), problem.energies(log_variances))
-    residuals = problem.residuals(log_variances)
-    error = jnp.sqrt(jnp.sum(residuals * residuals, axis=1))
-    return gaussians, error, converged
+    def over(self, function: Callable[[Problem, AbstractStart], Any], problem: Problem, start: AbstractStart) -> Any:
+        return jax.vmap(function)(problem, start.of_channels(problem.unit.shape[0]))

@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from ._dense import invert
-from ._problem import Problem
+from ._dense import invert_moving
+from ._problem import Expansion, Problem
 
 _GAIN = 1e-6
 """A fit has converged when a step of Gauss and Newton would lower the sum of squares by less than this share of it,"""
@@ -27,7 +27,7 @@ def stationary(problem: Problem, found: Float[Array, " gaussians"]) -> Float[Arr
 
     def tangent_solve(linear, tangent):
         hessian = jax.vmap(linear, out_axes=1)(jnp.eye(tangent.shape[0], dtype=tangent.dtype))
-        return _invert_moving(hessian) @ tangent
+        return invert_moving(hessian) @ tangent
 
     found = jax.lax.stop_gradient(found)
     return jax.lax.custom_root(lambda point: problem.gradient(point), found, lambda _, guess: guess, tangent_solve)
@@ -37,36 +37,27 @@ def refine(problem: Problem, start: Float[Array, " gaussians"]) -> tuple[Float[A
     """Finish a fit by Newton's method with the full Hessian; also give whether no small step could improve it any more."""
     problem, start = jax.lax.stop_gradient((problem, start))
 
-    def cost_of(point):
-        return jnp.sum(problem.residuals(point) ** 2)
+    def at(point):
+        expansion = problem.expand(point)
+        return point, expansion.cost, invert_moving(expansion.hessian) @ expansion.gradient, _gain(expansion)
 
     def step(state):
-        point, cost, _, steps = state
-        gradient = problem.gradient(point)
-        newton = _invert_moving(jax.jacfwd(problem.gradient)(point)) @ gradient
-        trial = point - newton
-        trial_cost = cost_of(trial)
+        (point, cost, newton, _), _, steps = state
+        trial = at(point - newton)
         # Once the steps are rounding, so are their gains and losses: they end the search, and are not taken.
-        better = (trial_cost < cost) & (jnp.max(jnp.abs(newton)) > _STEP * float(jnp.finfo(cost.dtype).eps))
-        return jnp.where(better, trial, point), jnp.where(better, trial_cost, cost), better, steps + 1
+        better = (trial[1] < cost) & (jnp.max(jnp.abs(newton)) > _STEP * float(jnp.finfo(cost.dtype).eps))
+        return jax.tree.map(lambda new, old: jnp.where(better, new, old), trial, state[0]), better, steps + 1
 
-    state = (start, cost_of(start), jnp.asarray(True), jnp.asarray(0))
-    found, cost, *_ = jax.lax.while_loop(lambda state: state[2] & (state[3] < _STEPS), step, state)
+    state = (at(start), jnp.asarray(True), jnp.asarray(0))
+    (found, cost, _, gain), *_ = jax.lax.while_loop(lambda state: state[1] & (state[2] < _STEPS), step, state)
     floor = (_FLOOR * float(jnp.finfo(cost.dtype).eps)) ** 2
-    return found, _gain(problem, found) <= _GAIN * cost + floor
+    return found, gain <= _GAIN * cost + floor
 
 
-def _invert_moving(hessian: Float[Array, "gaussians gaussians"]) -> Float[Array, "gaussians gaussians"]:
-    """Invert a Hessian; a Gaussian of weight zero in all channels changes nothing, and stays where it is."""
-    still = jnp.diagonal(hessian) == 0
-    return invert(hessian + jnp.diag(still.astype(hessian.dtype)))
-
-
-def _gain(problem: Problem, point: Float[Array, " gaussians"]) -> Float[Array, ""]:
+def _gain(expansion: Expansion) -> Float[Array, ""]:
     """Give by how much the sum of squares would fall if the residuals were linear: sound in float32, where the Hessian is not."""
-    residuals = problem.residuals(point).ravel()
-    slopes = jax.jacfwd(problem.residuals)(point).reshape(residuals.shape[0], -1)
-    lengths = jnp.sqrt(jnp.sum(slopes * slopes, axis=0))
-    slopes = slopes / jnp.broadcast_to(jnp.where(lengths > 0, lengths, 1.0), slopes.shape)
-    along = slopes.T @ residuals
-    return along @ _invert_moving(slopes.T @ slopes) @ along
+    normal = expansion.normal()
+    squared = jnp.diagonal(normal)
+    lengths = jnp.sqrt(jnp.where(squared > 0, squared, jnp.ones_like(squared)))
+    along = 0.5 * expansion.gradient / lengths
+    return along @ invert_moving(normal / (lengths[:, None] * lengths[None])) @ along

@@ -20,8 +20,8 @@ class AbstractWeights(eqx.Module):
         target: Float[Array, " rows"],
         energies: Float[Array, " gaussians"],
         total: Float[Array, ""],
-    ) -> Float[Array, " gaussians"]:
-        """Give the coefficients in the set with the least `|target - basis @ coefficients|`.
+    ) -> tuple[Float[Array, " gaussians"], Float[Array, "gaussians gaussians"]]:
+        """Give the coefficients in the set with the least `|target - basis @ coefficients|`, and their response.
 
         **Arguments:** (all differentiable)
 
@@ -29,6 +29,8 @@ class AbstractWeights(eqx.Module):
         - `target`: the profile there.
         - `energies`: weight of a unit coefficient; `energies @ coefficients` is the energy of the sum.
         - `total`: the energy of the profile.
+
+        **Returns:** the coefficients, and their derivative in `basis^T target`, which is symmetric.
         """
 
 
@@ -41,9 +43,10 @@ class FreeWeights(AbstractWeights):
         target: Float[Array, " rows"],
         energies: Float[Array, " gaussians"],
         total: Float[Array, ""],
-    ) -> Float[Array, " gaussians"]:
+    ) -> tuple[Float[Array, " gaussians"], Float[Array, "gaussians gaussians"]]:
         del energies, total
-        return least_squares(basis, target, normal_inverse(basis))
+        inverse = normal_inverse(basis)
+        return least_squares(basis, target, inverse), inverse
 
 
 class TotalReflectanceHeld(AbstractWeights):
@@ -55,12 +58,14 @@ class TotalReflectanceHeld(AbstractWeights):
         target: Float[Array, " rows"],
         energies: Float[Array, " gaussians"],
         total: Float[Array, ""],
-    ) -> Float[Array, " gaussians"]:
+    ) -> tuple[Float[Array, " gaussians"], Float[Array, "gaussians gaussians"]]:
         inverse = normal_inverse(basis)
         free = least_squares(basis, target, inverse)
         # The way from the free optimum to the constraint that adds least to the error.
         direction = inverse @ energies
-        return free + direction * ((total - energies @ free) / (energies @ direction))
+        length = energies @ direction
+        held = free + direction * ((total - energies @ free) / length)
+        return held, inverse - direction[:, None] * direction[None, :] / length
 
 
 class NonNegativeWeights(AbstractWeights):
@@ -84,7 +89,7 @@ class NonNegativeWeights(AbstractWeights):
         target: Float[Array, " rows"],
         energies: Float[Array, " gaussians"],
         total: Float[Array, ""],
-    ) -> Float[Array, " gaussians"]:
+    ) -> tuple[Float[Array, " gaussians"], Float[Array, "gaussians gaussians"]]:
         count = basis.shape[1]
         tolerance = _ROUNDING * float(jnp.finfo(basis.dtype).eps)
 
@@ -92,7 +97,7 @@ class NonNegativeWeights(AbstractWeights):
             return self.among.solve(*without_idle(basis, target, energies, positive), total)
 
         def wrong(positive):
-            coefficients = solved(positive)
+            coefficients, _ = solved(positive)
             slope = basis.T @ (basis @ coefficients - target)
             # What a held sum costs is the same slope for all that are not zero.
             share = jnp.where(positive, energies, 0.0)
@@ -108,7 +113,9 @@ class NonNegativeWeights(AbstractWeights):
         everything = jnp.ones(count, bool)
         start = everything, wrong(everything), jnp.asarray(0)
         positive, *_ = jax.lax.while_loop(lambda state: jnp.any(state[1]) & (state[2] < _EXCHANGES), exchange, start)
-        return solved(jax.lax.stop_gradient(positive))
+        positive = jax.lax.stop_gradient(positive)
+        coefficients, response = solved(positive)
+        return coefficients, jnp.where(positive[:, None] & positive[None], response, jnp.zeros_like(response))
 
 
 _ROUNDING = 100.0
