@@ -46,6 +46,13 @@ class AbstractProfile(eqx.Module):
     def length_scale(self) -> Float[Array, " channels"]:
         """Give the distance (mm) over which the core of the profile changes: quadrature counts radii in it."""
 
+    def known_radii(self) -> tuple[Float[Array, " samples"], Float[Array, " samples"]] | None:
+        """Give the radii at which alone a measured profile is known, and their weights `dr` (mm); None for one known everywhere.
+
+        Integrals of the profile are then sums over these.
+        """
+        return None
+
 
 class SumOfGaussians(AbstractProfile):
     r"""A profile as a sum of Gaussians, `sum_i w_i G(v_i, r)` (Eq. 2).
@@ -72,6 +79,10 @@ class SumOfGaussians(AbstractProfile):
     def length_scale(self) -> Float[Array, " channels"]:
         """Give the standard deviation of the narrowest Gaussian, mm."""
         return jnp.full_like(self.weights[0], jnp.sqrt(jnp.min(self.variances)))
+
+    def blurred(self, variance: Float[Array, ""] | float) -> "SumOfGaussians":
+        """Give what a Gaussian beam of a variance (mm^2 per axis) makes of the profile: the variances add (its convolution)."""
+        return SumOfGaussians(self.variances + variance, self.weights)
 
     def white(self) -> "SumOfGaussians":
         """Give the same profile with the weights of each channel divided by their sum."""

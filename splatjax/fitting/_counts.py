@@ -55,7 +55,7 @@ def error_by_count(
 ) -> ErrorByCount:
     r"""Find the best sums of 1, 2, ... Gaussians in one search, and what error each leaves.
 
-    One compilation serves all of them; the errors are those of the best fits to about 1e-5 of themselves, from above.
+    One compilation serves all of them; their sums of squares are those of the best fits to about 1e-5.
 
     **Arguments:** as `fit_gaussians` has them.
 

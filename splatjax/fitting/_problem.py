@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from splatjax.gaussians import AbstractProfile, gaussian
+from splatjax.gaussians import AbstractProfile, SumOfGaussians, gaussian
 from splatjax.scattering import RadialRule, at_own_radii
 
 from ._dense import invert_moving
@@ -32,6 +32,14 @@ class Expansion(eqx.Module):
     def normal(self) -> Float[Array, "gaussians gaussians"]:
         """Give half the Hessian of Gauss and Newton."""
         return jnp.einsum("cni,cnj->ij", self.jacobian, self.jacobian)
+
+
+class Outcome(eqx.Module):
+    """The Gaussians of a problem's optimum, Eq. 4 of its channels, and the covariance that `FitResult` has."""
+
+    gaussians: SumOfGaussians
+    error: Float[Array, " channels"]
+    covariance: Float[Array, "parameters parameters"]
 
 
 class Problem(eqx.Module):
@@ -114,24 +122,29 @@ class Problem(eqx.Module):
         slopes = basis * (self._reach(log_variances) - 1)
         return -2 * jnp.einsum("ck,cnk,cn->k", coefficients, slopes, residuals)
 
-    def energies(self, log_variances: Float[Array, " gaussians"]) -> Float[Array, "gaussians channels"]:
-        """Give the best weights."""
-        _, coefficients, _ = self.solve(log_variances)
-        return (coefficients * self._scale(log_variances)).T
-
-    def covariance(self, log_variances: Float[Array, " gaussians"]) -> Float[Array, "parameters parameters"]:
-        """Give that of the variances and then of the weights of one channel after the other, of `FitResult.covariance`."""
+    def outcome(self, log_variances: Float[Array, " gaussians"]) -> "Outcome":
+        """Give what a fit reports of an optimum."""
         basis, coefficients, response = self.solve(log_variances)
         residuals = self.target - jnp.einsum("cnk,ck->cn", basis, coefficients)
+        squared = jnp.sum(residuals * residuals, axis=1)
         slopes, _, moved = self._slopes(log_variances, basis, coefficients, response)
         steep = slopes * coefficients[:, None, :] + jnp.einsum("cni,cij->cnj", basis, moved)
-        ours = invert_moving(jnp.einsum("cni,cnj->ij", steep, steep))
-        variances, scale = self.variances(log_variances), self._scale(log_variances)
-        channels, count = coefficients.shape
+        normal = jnp.einsum("cni,cnj->ij", steep, steep)
+        ours = invert_moving(normal)
         # To the variances themselves, and from coefficients to weights.
+        variances, (channels, count) = self.variances(log_variances), coefficients.shape
+        scale = self.norm[:, None] * self._energies(variances)[None]
         follow = jnp.concatenate([jnp.diag(variances), (moved * scale[..., None]).reshape(channels * count, count)])
         own = jax.scipy.linalg.block_diag(jnp.zeros_like(ours), *(response * scale[..., None] * scale[:, None, :]))
-        return jnp.sum(residuals * residuals) * (follow @ ours @ follow.T + own)
+        covariance = jnp.sum(squared) * (follow @ ours @ follow.T + own)
+        # The variance of a Gaussian without weight in any channel is anything.
+        idle = jnp.append(jnp.diagonal(normal) == 0, jnp.zeros(channels * count, bool))
+        anything = jnp.diag(jnp.where(idle, jnp.inf, 0.0).astype(covariance.dtype))
+        return Outcome(
+            gaussians=SumOfGaussians(variances, (coefficients * scale).T),
+            error=jnp.sqrt(squared),
+            covariance=jnp.where(idle[:, None] | idle[None], anything, covariance),
+        )
 
     def _slopes(self, log_variances, basis, coefficients, response):
         """Give the first and second derivative of the basis at fixed weights, and how the coefficients follow if nothing is
@@ -151,10 +164,6 @@ class Problem(eqx.Module):
     def _energies(self, variances: Float[Array, " gaussians"]) -> Float[Array, " gaussians"]:
         """The weight of a Gaussian of unit norm: the integral of r G(v, r)^2 is 1 / (8 pi^2 v)."""
         return jnp.sqrt(8 * jnp.pi**2 * variances)
-
-    def _scale(self, log_variances: Float[Array, " gaussians"]) -> Float[Array, "channels gaussians"]:
-        """Give the weight of a unit coefficient."""
-        return self.norm[:, None] * self._energies(self.variances(log_variances))[None]
 
 
 def make_problem(profile: AbstractProfile, weights: AbstractWeights, rule: RadialRule) -> Problem:

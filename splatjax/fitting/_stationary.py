@@ -1,5 +1,6 @@
 """The derivative of a fit, and whether it is one: the point where the gradient of Eq. 3 vanishes."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
@@ -37,21 +38,28 @@ def refine(problem: Problem, start: Float[Array, " gaussians"]) -> tuple[Float[A
     """Finish a fit by Newton's method with the full Hessian; also give whether no small step could improve it any more."""
     problem, start = jax.lax.stop_gradient((problem, start))
 
-    def at(point):
-        expansion = problem.expand(point)
-        return point, expansion.cost, invert_moving(expansion.hessian) @ expansion.gradient, _gain(expansion)
-
     def step(state):
-        (point, cost, newton, _), _, steps = state
-        trial = at(point - newton)
+        best, newton, _, steps = state
+        trial = best.point - newton
+        expansion = problem.expand(trial)
         # Once the steps are rounding, so are their gains and losses: they end the search, and are not taken.
-        better = (trial[1] < cost) & (jnp.max(jnp.abs(newton)) > _STEP * float(jnp.finfo(cost.dtype).eps))
-        return jax.tree.map(lambda new, old: jnp.where(better, new, old), trial, state[0]), better, steps + 1
+        moved = (steps == 0) | (jnp.max(jnp.abs(newton)) > _STEP * float(jnp.finfo(trial.dtype).eps))
+        better = moved & (expansion.cost < best.cost)
+        reached = _Reached(trial, expansion.cost, _gain(expansion))
+        best = jax.tree.map(lambda new, old: jnp.where(better, new, old), reached, best)
+        return best, invert_moving(expansion.hessian) @ expansion.gradient, better, steps + 1
 
-    state = (at(start), jnp.asarray(True), jnp.asarray(0))
-    (found, cost, _, gain), *_ = jax.lax.while_loop(lambda state: state[1] & (state[2] < _STEPS), step, state)
-    floor = (_FLOOR * float(jnp.finfo(cost.dtype).eps)) ** 2
-    return found, gain <= _GAIN * cost + floor
+    nowhere = jnp.full((), jnp.inf, start.dtype)
+    state = (_Reached(start, nowhere, nowhere), jnp.zeros_like(start), jnp.asarray(True), jnp.asarray(0))
+    best, *_ = jax.lax.while_loop(lambda state: state[2] & (state[3] <= _STEPS), step, state)
+    floor = (_FLOOR * float(jnp.finfo(start.dtype).eps)) ** 2
+    return best.point, best.gain <= _GAIN * best.cost + floor
+
+
+class _Reached(eqx.Module):
+    point: Float[Array, " gaussians"]
+    cost: Float[Array, ""]
+    gain: Float[Array, ""]
 
 
 def _gain(expansion: Expansion) -> Float[Array, ""]:
@@ -59,5 +67,6 @@ def _gain(expansion: Expansion) -> Float[Array, ""]:
     normal = expansion.normal()
     squared = jnp.diagonal(normal)
     lengths = jnp.sqrt(jnp.where(squared > 0, squared, jnp.ones_like(squared)))
-    along = 0.5 * expansion.gradient / lengths
+    # Not half the gradient: the Jacobian is orthogonal to the basis, so that the rounding of the weights does not count.
+    along = jnp.einsum("cnk,cn->k", expansion.jacobian, expansion.residuals) / lengths
     return along @ invert_moving(normal / (lengths[:, None] * lengths[None])) @ along

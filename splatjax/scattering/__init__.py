@@ -7,6 +7,7 @@ from ._burley import Searchlight as Searchlight
 from ._dipole import Dipole as Dipole
 from ._fresnel import AbstractFresnel as AbstractFresnel, EganFresnel as EganFresnel, ExactFresnel as ExactFresnel
 from ._hankel import hankel_transform as hankel_transform, inverse_hankel_transform as inverse_hankel_transform
+from ._laser_dot import LaserDot as LaserDot, measure_laser_dot as measure_laser_dot
 from ._layered import LayeredMultipole as LayeredMultipole
 from ._layers import Film as Film, Layer as Layer
 from ._medium import Medium as Medium

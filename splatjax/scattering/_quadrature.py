@@ -44,11 +44,19 @@ class RadialRule(eqx.Module):
         return jnp.asarray(nodes, dtype), jnp.asarray(weights, dtype)
 
     def radii(self, profile: AbstractProfile) -> tuple[Float[Array, "nodes channels"], Float[Array, "nodes channels"]]:
-        """Give the radii and weights for each channel, mm. They are constants of every derivative: an integral has no nodes."""
+        """Give the radii and weights for each channel, mm. They are constants of every derivative: an integral has no nodes.
+
+        A measured profile has its own; those outside of the rule weigh nothing.
+        """
         scale = jax.lax.stop_gradient(profile.length_scale())
-        nodes, weights = self.nodes(scale.dtype)
+        known = jax.lax.stop_gradient(profile.known_radii())
+        nodes, weights = self.nodes(scale.dtype) if known is None else known
         shape = (*nodes.shape, *scale.shape)
         scale = jnp.broadcast_to(scale, shape)
+        if known is not None:
+            radii, weights = (jnp.broadcast_to(each[:, None], shape) for each in known)
+            first = 0.0 if self.near else self.smallest
+            return radii, jnp.where((radii >= first * scale) & (radii <= self.largest * scale), weights, jnp.zeros_like(weights))
         return jnp.broadcast_to(nodes[:, None], shape) * scale, jnp.broadcast_to(weights[:, None], shape) * scale
 
 

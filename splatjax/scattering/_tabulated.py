@@ -15,7 +15,8 @@ from ._medium import check_range
 class Tabulated(AbstractProfile):
     r"""A profile given at radii, linear in between: constant within the first radius, 0 beyond the last.
 
-    Nothing is invented: what leaves beyond the last radius is not in the total. Differentiable in values, radii, and `r`.
+    Nothing is invented: what leaves beyond the last radius is not in the total, and integrals of the profile, those of a fit as
+    well, are sums over its radii. Differentiable in values, radii, and `r`.
 
     **Attributes:**
 
@@ -60,3 +61,9 @@ class Tabulated(AbstractProfile):
         share = jnp.cumsum(jnp.abs(self.values) * (self.radii * jnp.diff(self.radii, append=self.radii[-1:]))[:, None], axis=0)
         index = jnp.argmax(share >= 0.5 * share[-1][None], axis=0)
         return jnp.maximum(self.radii[index], self.radii[1])
+
+    def known_radii(self) -> tuple[Float[Array, " samples"], Float[Array, " samples"]]:
+        """Give the radii and the trapezoidal rule's weights; the first also stands for the disc within it."""
+        steps = jnp.diff(self.radii)
+        weights = 0.5 * (jnp.append(steps, 0.0) + jnp.insert(steps, 0, self.radii[0]))
+        return self.radii, weights
