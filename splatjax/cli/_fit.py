@@ -1,6 +1,7 @@
 """`splatjax fit`: from optical coefficients to a sum of Gaussians."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import jax
 import tyro
@@ -8,6 +9,9 @@ from rich.console import Console
 from rich.table import Table
 
 import splatjax as sj
+from splatjax.fitting import AbstractWeights
+from splatjax.io import read_picture
+from splatjax.scattering import measure_laser_dot
 
 from ._outputs import OptionalPath, check_output
 from ._report import stage
@@ -15,21 +19,31 @@ from ._report import stage
 
 @dataclass(frozen=True, kw_only=True)
 class Fit:
-    """Fit a sum of Gaussians to the diffusion profile of a medium (the dipole) or of layers (multipoles), and print it with its
-    errors.
+    """Fit a sum of Gaussians to a diffusion profile, and print it with its errors: to that of a medium (the dipole) or of layers
+    (multipoles), to a measured one, or to that of a laser dot in a photograph.
 
     Double precision. Variances are shared by the channels. Weights are not negative, and their sum is held at the total
-    reflectance of the profile, so that the picture keeps its energy, unless --free is given.
+    reflectance of the profile, so that the picture keeps its energy, unless --free is given. To measured profiles, whose totals
+    are not known, weights are fitted freely, but not below zero.
 
     Example: splatjax fit marble --count 6 --output marble.toml --plot marble.png
     """
 
     medium: tyro.conf.Positional[str]
-    """Name of a material (`splatjax materials`), or path of a TOML file with a [medium] or [[layers]]."""
+    """Name of a material (`splatjax materials`), or path: of a TOML file with a [medium] or [[layers]], of a CSV file with radii
+    and a column per channel, or of an EXR file with a linear photograph of a laser dot."""
     count: int = 6
     """Number of Gaussians."""
+    error: float | None = None
+    """Take the least number of Gaussians, up to 12, that leaves no channel a larger error (Eq. 4), instead of --count."""
     free: bool = False
     """Leave the weights free: the least error of Eq. 3, which may miss some of the energy."""
+    mm_per_unit: float = 1.0
+    """Of a CSV file: its unit of length."""
+    mm_per_pixel: float | None = None
+    """Of a photograph: the size of a pixel on the surface."""
+    power: float = 1.0
+    """Of a photograph: the light that enters the material, in W if the picture is in W/(mm^2 sr)."""
     output: OptionalPath = None
     """TOML file to write the material to."""
     plot: OptionalPath = None
@@ -45,34 +59,67 @@ class Fit:
             self._run()
 
     def _run(self) -> None:
-        profile = sj.load_profile(self.medium)
-        weights = sj.FreeWeights() if self.free else sj.NonNegativeWeights(sj.TotalReflectanceHeld())
-        with stage(f"fitting {self.count} Gaussians to {self.medium}"):
-            fitted = jax.block_until_ready(sj.fit_gaussians(profile, self.count, weights=weights))
+        profile = self._profile()
+        count = self.count if self.error is None else sj.LeastCount(self.error)
+        title = f"{self.count} Gaussians" if self.error is None else f"Gaussians to an error of {self.error:g}"
+        with stage(f"fitting {title} to {self.medium}"):
+            fitted = jax.block_until_ready(sj.fit_gaussians(profile, count, weights=self._weights(profile)))
         _print(fitted)
         if self.output is not None:
-            # The surface keeps the library's defaults; its index is that of the medium it bounds.
-            medium = profile.medium if isinstance(profile, sj.Dipole) else profile.top.medium
-            material = sj.Material(fitted.gaussians, eta=medium.eta[0])
-            source = {"provenance": f"fitted by splatjax {sj.__version__} to the coefficients of {self.medium}"}
-            sj.save_material(material, self.output, profile=profile, source=source, fit=self._how(fitted))
+            self._save(self.output, profile, fitted)
             print(self.output)
         if self.plot is not None:
             from splatjax.io import atomic_path
             from splatjax.plots import plot_fit  # loads matplotlib
 
-            figure = plot_fit(profile, fitted.gaussians, title=f"{self.medium}, {self.count} Gaussians")
+            found = len(fitted.gaussians.variances)
+            figure = plot_fit(profile, fitted.gaussians, title=f"{self.medium}, {found} Gaussians")
             with atomic_path(self.plot) as written:
                 figure.savefig(written)
             print(self.plot)
 
-    def _how(self, fitted: sj.FitResult) -> dict[str, object]:
-        return {
+    def _profile(self) -> sj.Dipole | sj.LayeredMultipole | sj.Tabulated:
+        match Path(self.medium).suffix.lower():
+            case ".csv":
+                return sj.read_profile(self.medium, mm_per_unit=self.mm_per_unit)
+            case ".exr":
+                if self.mm_per_pixel is None:
+                    raise ValueError(f"{self.medium}: how large is a pixel on the surface? give --mm-per-pixel")
+                image = read_picture(self.medium)
+                try:
+                    return measure_laser_dot(image, self.mm_per_pixel, power=self.power).profile
+                except ValueError as error:
+                    raise ValueError(f"{self.medium}: {error}") from None
+            case _:
+                return sj.load_profile(self.medium)
+
+    def _weights(self, profile: sj.AbstractProfile) -> AbstractWeights:
+        if self.free:
+            return sj.FreeWeights()
+        return sj.NonNegativeWeights(sj.FreeWeights() if isinstance(profile, sj.Tabulated) else sj.TotalReflectanceHeld())
+
+    def _save(self, output: Path, profile: sj.Dipole | sj.LayeredMultipole | sj.Tabulated, fitted: sj.FitResult) -> None:
+        # The surface keeps the library's defaults; its index is that of the medium it bounds, if one is known.
+        measured = isinstance(profile, sj.Tabulated)
+        fitted_to = f"{'profile' if measured else 'coefficients'} of {self.medium}"
+        source = {"provenance": f"fitted by splatjax {sj.__version__} to the {fitted_to}"}
+        how = {
             "variances_of": "all channels",
-            "weights_of": "free" if self.free else "non-negative, sum held to the total reflectance",
+            "weights_of": self._weights_of(measured),
             "error": fitted.error,
             "energy_error": fitted.energy_error,
         }
+        if measured:
+            sj.save_material(sj.Material(fitted.gaussians), output, source=source, fit={"profile": "measured"} | how)
+        else:
+            medium = profile.medium if isinstance(profile, sj.Dipole) else profile.top.medium
+            material = sj.Material(fitted.gaussians, eta=medium.eta[0])
+            sj.save_material(material, output, profile=profile, source=source, fit=how)
+
+    def _weights_of(self, measured: bool) -> str:
+        if self.free:
+            return "free"
+        return "non-negative" if measured else "non-negative, sum held to the total reflectance"
 
 
 def _print(fitted: sj.FitResult) -> None:

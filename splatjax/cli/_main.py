@@ -8,6 +8,7 @@ import equinox as eqx
 import tyro
 
 from ._environment import prepare_jax
+from ._export import Export
 from ._fit import Fit
 from ._materials import Materials
 from ._render import Render
@@ -16,6 +17,7 @@ from ._sample import Sample
 _Command = (
     Annotated[Materials, tyro.conf.subcommand("materials")]
     | Annotated[Fit, tyro.conf.subcommand("fit")]
+    | Annotated[Export, tyro.conf.subcommand("export")]
     | Annotated[Sample, tyro.conf.subcommand("sample")]
     | Annotated[Render, tyro.conf.subcommand("render")]
 )

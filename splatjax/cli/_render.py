@@ -69,6 +69,7 @@ class Render:
         if splats.albedo is not None:
             material = material.white()
             note(f"the splats carry albedo: the weights of {self.material} are divided by their sums")
+        material = in_color(material)
         if not self.scattering:
             material = without_scattering(material)
         scene = sj.Scene(splats, self._lights(material.gaussians.weights.shape[1]), material)
@@ -111,6 +112,15 @@ class Render:
         )
         if widths:
             note(f"narrower than the splats, so that the surface's own light stands for them: the Gaussians of {widths} mm")
+
+
+def in_color(material: sj.Material) -> sj.Material:
+    """Give a material of one channel the same weights for red, green and blue."""
+    gaussians = material.gaussians
+    if gaussians.weights.shape[1] != 1:
+        return material
+    weights = jnp.broadcast_to(gaussians.weights, (len(gaussians.variances), 3))
+    return sj.Material(sj.SumOfGaussians(gaussians.variances, weights), material.eta, material.specular, material.roughness)
 
 
 def without_scattering(material: sj.Material) -> sj.Material:

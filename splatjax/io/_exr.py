@@ -60,18 +60,36 @@ def read_exr(path: str | os.PathLike[str]) -> Frame:
     **Raises:** `FileNotFoundError`, or `ValueError` when the file cannot be read or lacks the layers of a frame.
     """
     path = Path(path)
-    if not path.exists():
-        raise FileNotFoundError(f"{path}: there is no such file; check the path")
-    try:
-        with OpenEXR.File(str(path), separate_channels=True) as file:
-            header = dict(file.header())
-            planes = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
-    except Exception as error:  # the package raises whatever its C++ side throws
-        raise ValueError(f"{path}: cannot be read as OpenEXR ({error}); it is cut short or of another format") from error
+    header, planes = _read(path)
     try:
         return _frame(header, planes)
     except KeyError as error:
         raise ValueError(f"{path}: lacks {error.args[0]}, so it is no frame; give a file written by write_exr") from error
+
+
+def read_picture(path: str | os.PathLike[str]) -> np.ndarray:
+    r"""Read the colors of an OpenEXR file of any origin: R, G and B, or Y alone.
+
+    **Returns:** [height, width, channels], as they stand in the file, in double precision.
+
+    **Raises:** `FileNotFoundError`, or `ValueError` when the file cannot be read or has neither.
+    """
+    path = Path(path)
+    _, planes = _read(path)
+    for names in ("RGB", "Y"):
+        if set(names) <= set(planes):
+            return np.stack([planes[name] for name in names], axis=-1).astype(np.float64)
+    raise ValueError(f"{path}: has neither R, G and B nor Y; it has {', '.join(sorted(planes))}")
+
+
+def _read(path: Path) -> tuple[dict, dict[str, np.ndarray]]:
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: there is no such file; check the path")
+    try:
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            return dict(file.header()), {name: np.array(channel.pixels) for name, channel in file.channels().items()}
+    except Exception as error:  # the package raises whatever its C++ side throws
+        raise ValueError(f"{path}: cannot be read as OpenEXR ({error}); it is cut short or of another format") from error
 
 
 def _own_version() -> str:

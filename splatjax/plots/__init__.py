@@ -1,3 +1,4 @@
 """Pictures of profiles, fits and errors."""
 
+from ._counts import plot_error_by_count as plot_error_by_count
 from ._fit import plot_fit as plot_fit

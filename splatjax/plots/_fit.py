@@ -1,5 +1,7 @@
 """A profile, the Gaussians fitted to it, and what they leave."""
 
+from collections.abc import Sequence
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -34,7 +36,7 @@ def plot_fit(profile: AbstractProfile, gaussians: SumOfGaussians, *, title: str 
     error = np.asarray(relative_error(profile, gaussians))
     energy = np.asarray(gaussians.total_reflectance() / profile.total_reflectance() - 1)
     radii = np.asarray(r)
-    colors = _RGB if len(error) == 3 else [f"C{channel}" for channel in range(len(error))]
+    colors = colors_of(len(error))
 
     figure = Figure(figsize=(10, 7.5), layout="constrained")
     grid = figure.add_gridspec(2, 2, height_ratios=(3, 2))
@@ -68,8 +70,17 @@ def plot_fit(profile: AbstractProfile, gaussians: SumOfGaussians, *, title: str 
     return figure
 
 
+def colors_of(channels: int) -> Sequence[str]:
+    """Give a color for each channel: red, green and blue for three."""
+    return _RGB if channels == 3 else [f"C{channel}" for channel in range(channels)]
+
+
 def _radii(profile: AbstractProfile) -> Float[Array, " radii"]:
-    """From a hundredth of the smallest length scale to where every channel has fallen to the tail."""
+    """Those of a measured profile; else from a hundredth of the smallest length scale to where every channel has fallen to the
+    tail."""
+    known = profile.known_radii()
+    if known is not None:
+        return known[0][known[0] > 0]
     scale = np.asarray(profile.length_scale(), np.float64)
     r = jnp.geomspace(0.02 * scale.min(), 1e3 * scale.max(), 4 * _POINTS, dtype=profile.length_scale().dtype)
     values = np.asarray(profile(r))

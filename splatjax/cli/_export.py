@@ -1,0 +1,33 @@
+"""`splatjax export`: a material in the terms of other renderers."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax
+import tyro
+
+import splatjax as sj
+from splatjax.io import save_exports
+
+from ._outputs import check_output
+
+
+@dataclass(frozen=True, kw_only=True)
+class Export:
+    """Write a material's Gaussians as JSON for other renderers, each with formula, unit and source: GPU Gems weights, a kernel
+    for separable subsurface scattering, Burley's d, the shape parameter of Unity's HDRP, Blender's radius.
+
+    Example: splatjax export skin --output skin.json
+    """
+
+    material: tyro.conf.Positional[str]
+    """Name of a material (`splatjax materials`), or path of a TOML file with a [fit]."""
+    output: Path
+    """JSON file to write."""
+
+    def run(self) -> None:
+        """Load, write."""
+        check_output(self.output, (".json",))
+        with jax.enable_x64(True):
+            save_exports(sj.load_material(self.material), self.output)
+        print(self.output)

@@ -1,0 +1,83 @@
+"""Measured profiles, and fits for other programs."""
+
+import csv
+import json
+import math
+import os
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+
+from splatjax.exports import data_sheet
+from splatjax.scattering import Tabulated
+from splatjax.scene import Material
+
+from ._atomic import atomic_path
+
+
+def read_profile(path: str | os.PathLike[str], *, mm_per_unit: float = 1.0) -> Tabulated:
+    r"""Read a measured profile from a CSV file: a column of radii, and one of values for each channel.
+
+    Empty lines and those that begin with `#` are left out; a first line of names may stand above. Radii ascend.
+
+    **Arguments:**
+
+    - `path`: of the file.
+    - `mm_per_unit`: of the file's unit of length, in which the radii are; values are counted in one over its square.
+
+    **Returns:** a `Tabulated` in JAX's default precision, mm and 1/mm^2.
+
+    **Raises:** `FileNotFoundError`, and `ValueError` for what is no such table: file, line and what is wrong.
+    """
+    path = Path(path)
+    if not mm_per_unit > 0:
+        raise ValueError(f"mm_per_unit must be positive; got {mm_per_unit:g}")
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: there is no such file; check the path")
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path}: is no text file: {error}; a profile is a CSV of radii and values") from None
+    rows: list[list[float]] = []
+    named = False
+    for number, line in enumerate(lines, start=1):
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        cells = [cell.strip() for cell in next(csv.reader([line]))]
+        if not rows and not named and not _is_number(cells[0]):
+            named = True
+            continue
+        bad = next((cell for cell in cells if not _is_number(cell) or not math.isfinite(float(cell))), None)
+        if bad is not None:
+            raise ValueError(f"{path}: line {number}: {bad!r} is no number; give a radius and a value for each channel")
+        if len(cells) < 2 or (rows and len(cells) != len(rows[0])):
+            wanted = f"{len(rows[0])} as above" if rows else "a radius and at least one value"
+            raise ValueError(f"{path}: line {number}: has {len(cells)} numbers; expected {wanted}")
+        rows.append([float(cell) for cell in cells])
+    if len(rows) < 2:
+        raise ValueError(f"{path}: has {len(rows)} lines of numbers; a profile needs two radii at least")
+    table = np.asarray(rows)
+    dtype = jnp.result_type(float)
+    try:
+        return Tabulated(jnp.asarray(table[:, 0] * mm_per_unit, dtype), jnp.asarray(table[:, 1:] / mm_per_unit**2, dtype))
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+
+
+def save_exports(material: Material, path: str | os.PathLike[str]) -> None:
+    r"""Write a material's Gaussians in the terms of other renderers to a JSON file (`splatjax.exports.data_sheet`), whole or not
+    at all.
+
+    **Raises:** `OSError` if the file cannot be written.
+    """
+    with atomic_path(path) as temporary:
+        temporary.write_text(json.dumps(data_sheet(material.gaussians), indent=2) + "\n", encoding="utf-8")
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True

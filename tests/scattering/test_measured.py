@@ -1,0 +1,109 @@
+"""Profiles that were measured: from a table, and from a photograph."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from splatjax.fitting import NonNegativeWeights, fit_gaussians, relative_error
+from splatjax.gaussians import SumOfGaussians
+from splatjax.scattering import NORM_RULE, Tabulated, integrated_reflectance, measure_laser_dot
+
+TRUTH = ([0.3, 2.0], [[0.3, 0.2], [0.4, 0.1]])
+MM_PER_PIXEL = 0.1
+
+
+def truth() -> SumOfGaussians:
+    return SumOfGaussians(*(jnp.asarray(each, float) for each in TRUTH))
+
+
+def photograph(pixels: int = 121, noise: float = 0.0, power: float = 2.0, center=(60.2, 61.3)) -> np.ndarray:
+    y, x = (np.mgrid[:pixels, :pixels] + 0.5) * MM_PER_PIXEL
+    squared = (x - center[0] * MM_PER_PIXEL) ** 2 + (y - center[1] * MM_PER_PIXEL) ** 2
+    variances, weights = (np.asarray(each) for each in TRUTH)
+    exitance = (np.exp(-squared[..., None] / (2 * variances)) / (2 * np.pi * variances)) @ weights
+    image = power * exitance / np.pi
+    return image + noise * image.max() * np.random.default_rng(3).normal(size=image.shape)
+
+
+def test_integrals_of_a_table_are_sums_over_its_radii(float64):
+    r = jnp.linspace(0.1, 6.0, 300)
+    table = Tabulated(r, truth()(r))
+    np.testing.assert_allclose(integrated_reflectance(table), table.total_reflectance(), rtol=1e-3)
+    beyond = NORM_RULE.beyond(1.0)
+    radii, weights = beyond.radii(table)
+    np.testing.assert_array_equal(np.asarray(weights) > 0, np.asarray(radii) >= np.asarray(table.length_scale()))
+
+
+def test_a_table_is_fitted_over_its_own_radii_alone(float64):
+    """A table that ends early says nothing of the tail: the Gaussians behind it come back all the same."""
+    r = jnp.linspace(0.05, 3.0, 60)
+    fitted = fit_gaussians(Tabulated(r, truth()(r)), 2)
+    np.testing.assert_allclose(fitted.gaussians.variances, truth().variances, rtol=1e-6)
+    np.testing.assert_allclose(fitted.gaussians.weights, truth().weights, rtol=1e-6)
+
+
+def test_covariance_of_a_measured_fit_is_the_scatter_of_its_repetitions(float64):
+    """Noise of equal weight in Eq. 3: the residuals' sum over the degrees of freedom scales the covariance."""
+    r = jnp.linspace(0.05, 5.0, 80)
+    deviation = 0.002 / jnp.sqrt(r)
+    noise = np.random.default_rng(0).normal(size=(200, 80, 1))
+    values = jnp.asarray(np.asarray(truth()(r))[:, :1] + np.asarray(deviation)[:, None] * noise)
+    fitted = eqx.filter_jit(eqx.filter_vmap(lambda values: fit_gaussians(Tabulated(r, values), 2, throw=False)))(values)
+    found = np.concatenate([fitted.gaussians.variances, fitted.gaussians.weights[..., 0]], axis=1)
+    stated = np.asarray(fitted.covariance) / (80 - 4)
+    np.testing.assert_allclose(np.cov(found.T), np.median(stated, axis=0), rtol=0.3, atol=2e-7)
+
+
+def test_a_photograph_gives_the_profile_and_its_noise(float64):
+    noise = 0.01
+    dot = measure_laser_dot(photograph(noise=noise), MM_PER_PIXEL, power=2.0)
+    np.testing.assert_allclose(dot.center, [60.2, 61.3], atol=0.1)
+    away = (dot.profile.values - truth()(dot.profile.radii)) / dot.deviation
+    assert np.max(np.abs(away)) < 4.5
+    np.testing.assert_allclose(np.std(away), 1, atol=0.25)
+
+
+def test_power_and_pixel_scale_what_a_photograph_gives(float64):
+    one = measure_laser_dot(photograph(), MM_PER_PIXEL, power=2.0)
+    other = measure_laser_dot(photograph(), 2 * MM_PER_PIXEL, power=4.0)
+    np.testing.assert_allclose(other.profile.radii, 2 * one.profile.radii, rtol=1e-12)
+    np.testing.assert_allclose(other.profile.values, one.profile.values / 2, rtol=1e-12)
+
+
+def test_saturated_rings_are_left_out(float64):
+    image = photograph()
+    limit = 0.5 * image.max()
+    dot = measure_laser_dot(np.minimum(image, limit), MM_PER_PIXEL, power=2.0, saturation=limit)
+    np.testing.assert_allclose(dot.profile.values, truth()(dot.profile.radii), rtol=0.03)
+    assert float(jnp.max(dot.profile.values)) < np.pi * limit / 2
+    with pytest.raises(ValueError, match=r"at least two rings; 0 of \d+ are inside and not saturated"):
+        measure_laser_dot(image, MM_PER_PIXEL, power=2.0, saturation=0.0)
+
+
+def test_a_measured_profile_is_fitted_without_negative_weights(dtype):
+    dot = measure_laser_dot(photograph(noise=0.02), MM_PER_PIXEL, power=2.0)
+    fitted = fit_gaussians(dot.profile, 3, weights=NonNegativeWeights(), throw=False)
+    assert np.all(np.asarray(fitted.gaussians.weights) >= 0)
+    assert np.max(np.asarray(relative_error(dot.profile, fitted.gaussians))) < 0.05
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        ({"mm_per_pixel": 0.0}, "mm_per_pixel must be positive; got 0"),
+        ({"power": -1.0}, "power must be positive; got -1"),
+        ({"step": 0.5}, "step must be at least 1 pixel; got 0.5"),
+        ({"center": (-3.0, 4.0)}, "center -3, 4 is outside of the picture of 121 x 121 pixels"),
+    ],
+)
+def test_bad_arguments_of_a_measurement_are_refused(change, complaint):
+    with pytest.raises(ValueError, match=complaint):
+        measure_laser_dot(photograph(), **({"mm_per_pixel": MM_PER_PIXEL, "power": 1.0} | change))
+
+
+def test_a_pixel_that_is_no_number_is_named():
+    image = photograph()
+    image[7, 9, 1] = np.nan
+    with pytest.raises(ValueError, match="pixel 9, 7 is not finite"):
+        measure_laser_dot(image, MM_PER_PIXEL, power=1.0)
