@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 
 from splatjax.fitting import relative_error
 from splatjax.gaussians import AbstractProfile, SumOfGaussians, gaussian
@@ -65,6 +66,8 @@ def plot_fit(profile: AbstractProfile, gaussians: SumOfGaussians, *, title: str 
     residual.axhline(0, color="0.6", linewidth=0.8)
     residual.set(xlabel="r (mm)", ylabel="r (fit - R) / max r R", xlim=(radii[0], radii[-1]))
     residual.set_title("residual", fontsize="medium")
+    for axis in (log.xaxis, residual.xaxis):
+        axis.set_minor_formatter(NullFormatter())  # over less than a decade their labels would overlap
     if title is not None:
         figure.suptitle(title)
     return figure

@@ -55,8 +55,9 @@ def measure_laser_dot(
     - `largest`: radius of the last ring, mm; by default that of the largest circle inside the picture.
     - `step`: width of a ring, pixels, at least 1.
 
-    **Returns:** a `LaserDot`. A ring's radius is the mean of its pixels'; the scatter that the slope across it makes is taken
-    out of its standard error. Rings of fewer than twelve pixels are joined to the next.
+    **Returns:** a `LaserDot`. A ring's radius is the root mean square of its pixels', as the middle of a profile is flat; the
+    scatter that the slope across it makes is taken out of its standard error. Rings of fewer than twelve pixels are joined to
+    the next.
 
     **Raises:** `ValueError` for pixels that are not finite, a length or power that is not positive, a center outside of the
     picture, and if fewer than two rings are left.
@@ -81,11 +82,11 @@ def measure_laser_dot(
     values = pixels[radius <= last] * (np.pi / entering)
     distrusted = np.zeros(len(values), bool) if saturation is None else (pixels[radius <= last] >= saturation).any(axis=1)
 
-    samples = []
+    squared, samples = radius[radius <= last] ** 2, []
     for ring in rings:
         if not distrusted[ring].any():
-            mean, error = _mean(values[ring], radius[radius <= last][ring])
-            samples.append((radius[radius <= last][ring].mean() * mm_per_pixel, mean, error))
+            mean, error = _mean(values[ring], squared[ring])
+            samples.append((mm_per_pixel * np.sqrt(squared[ring].mean()), mean, error))
     if len(samples) < 2:
         raise ValueError(f"a profile needs at least two rings; {len(samples)} of {len(rings)} are inside and not saturated")
     dtype = jnp.result_type(float)
@@ -112,9 +113,9 @@ def _rings(radius: np.ndarray, step: float) -> list[np.ndarray]:
     return rings
 
 
-def _mean(values: np.ndarray, radius: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _mean(values: np.ndarray, squared_radius: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Give the mean of each channel and its standard error, with the slope across the ring taken out."""
-    mean, offset = values.mean(axis=0), radius - radius.mean()
+    mean, offset = values.mean(axis=0), squared_radius - squared_radius.mean()
     slope = offset @ (values - mean) / max(offset @ offset, np.finfo(float).tiny)
     left = values - mean - offset[:, None] * slope
     free = max(len(values) - 2, 1)

@@ -1,8 +1,11 @@
 """The command line, run in process on tiny inputs."""
 
+import json
+
 import jax
 import jax.numpy as jnp
 import numpy as np
+import OpenEXR
 import pytest
 from jax.experimental.compilation_cache import compilation_cache
 from PIL import Image
@@ -79,6 +82,42 @@ def test_fit_prints_and_writes_a_material_that_loads(tmp_path, capsys):
     assert material.gaussians.weights.shape == (2, 3)
     total = sj.Dipole(medium).total_reflectance()
     np.testing.assert_allclose(np.asarray(material.gaussians.total_reflectance()), np.asarray(total), rtol=1e-5)
+
+
+@pytest.mark.once
+def test_fit_takes_a_table_and_the_least_count(tmp_path, capsys):
+    table, output = tmp_path / "measured.csv", tmp_path / "measured.toml"
+    r = np.linspace(0.01, 0.5, 40)
+    np.savetxt(table, np.column_stack([r, np.exp(-((10 * r) ** 2) / 4)]), delimiter=",", header="r (cm), R (1/cm^2)")
+    command = ["fit", str(table), "--mm-per-unit", "10", "--error", "1e-4", "--output", str(output)]
+    assert main(command) == 0
+    assert "error (Eq. 4)" in capsys.readouterr().out
+    gaussians = sj.load_material(output).gaussians
+    np.testing.assert_allclose(gaussians.variances, [2.0], rtol=1e-5)
+    np.testing.assert_allclose(gaussians.weights, [[4 * np.pi / 100]], rtol=1e-5)
+
+
+@pytest.mark.once
+def test_fit_takes_a_photograph_that_any_program_wrote(tmp_path, capsys):
+    photograph, output = tmp_path / "dot.exr", tmp_path / "dot.toml"
+    y, x = (np.mgrid[:60, :60] - 29.5) * 0.2
+    radiance = 3 / np.pi * np.exp(-(x * x + y * y) / 4) / (4 * np.pi)
+    with OpenEXR.File({"type": OpenEXR.scanlineimage}, {"Y": radiance.astype(np.float32)}) as file:
+        file.write(str(photograph))
+    command = ["fit", str(photograph), "--count", "1", "--power", "3", "--output", str(output)]
+    assert "how large is a pixel on the surface? give --mm-per-pixel" in failure(command, capsys, [output])
+    assert main([*command, "--mm-per-pixel", "0.2"]) == 0
+    gaussians = sj.load_material(output).gaussians
+    np.testing.assert_allclose(gaussians.variances, [2.0], rtol=0.01)
+    np.testing.assert_allclose(gaussians.weights, [[1.0]], rtol=0.01)
+
+
+def test_export_writes_what_other_renderers_take(tmp_path, capsys):
+    output = tmp_path / "skin.json"
+    assert main(["export", "skin", "--output", str(output)]) == 0
+    assert capsys.readouterr().out == f"{output}\n"
+    assert set(json.loads(output.read_text())) >= {"gpu_gems", "separable_kernel", "burley", "unity", "blender"}
+    assert "must end in .json" in failure(["export", "skin", "--output", "skin.txt"], capsys)
 
 
 def test_sample_covers_a_mesh(tmp_path, capsys):

@@ -1,0 +1,99 @@
+# ---
+# jupyter:
+#   jupytext:
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+#   kernelspec:
+#     display_name: Python 3
+#     language: python
+#     name: python3
+# ---
+
+# %% [markdown]
+# # A material from a measurement
+#
+# A profile $R(r)$ that was measured is a table of radii and values. A photograph of a laser dot, linear and from straight above,
+# is as good: means over rings around its center are the profile, and their scatter says how well it is known.
+
+# %%
+# %matplotlib inline
+import json
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.figure import Figure
+
+import splatjax as sj
+from splatjax.fitting import fit_medium
+from splatjax.io import save_exports
+from splatjax.plots import plot_fit
+from splatjax.scattering import measure_laser_dot
+
+# %% [markdown]
+# Here is such a photograph, of something like potato, with the noise of a camera. The beam has a variance of 0.25 mm² along each
+# axis, so that what is seen is the profile blurred by it: the variances add.
+
+# %%
+with jax.enable_x64(True):
+    potato = sj.Medium(jnp.asarray([0.009]), jnp.asarray([0.70]), jnp.asarray([1.3]))
+    beam_variance, power, mm_per_pixel = 0.25, 5.0, 0.1
+    seen = sj.fit_gaussians(sj.Dipole(potato), 4).gaussians.blurred(beam_variance)
+    y, x = (np.mgrid[:200, :200] - 99.5) * mm_per_pixel
+    radiance = power / np.pi * np.asarray(seen(jnp.hypot(x, y)))
+noise = np.random.default_rng(5).normal(size=radiance.shape)
+photograph = radiance + 0.01 * np.sqrt(radiance.max() * (radiance + 0.1 * radiance.max())) * noise
+
+figure = Figure(figsize=(4, 4), layout="constrained")
+axes = figure.add_subplot(xlabel="mm", ylabel="mm", title="logarithm of radiance")
+axes.imshow(np.log10(np.maximum(photograph[..., 0], 1e-4)), cmap="magma", extent=(-10, 10, -10, 10))
+figure  # noqa: B018
+
+# %% [markdown]
+# Which absorption and scattering explain it? `fit_medium` goes the way of the picture, from coefficients to Gaussians to the
+# blurred profile, and back along its derivatives. The error bars come from the scatter of the pixels.
+
+# %%
+with jax.enable_x64(True):
+    dot = measure_laser_dot(photograph, mm_per_pixel, power=power)
+    guess = sj.Medium(jnp.asarray([0.05]), jnp.asarray([2.0]), potato.eta)
+    found = fit_medium(dot.profile, dot.deviation, guess, beam_variance=beam_variance, count=4)
+    bars = np.sqrt(np.diagonal(np.asarray(found.covariance)[0]))
+    values = np.asarray([found.medium.sigma_a[0], found.medium.sigma_s_prime[0]])
+    chi_squared = float(found.chi_squared[0])
+for name, value, bar in zip(("sigma_a ", "sigma_s'"), values, bars, strict=True):
+    print(f"{name} {value:.4f} 1/mm, known to {100 * bar:.1f}%")
+print(f"chi squared per degree of freedom {chi_squared:.2f}")
+
+# %% [markdown]
+# Where no model is wanted, the table itself is fitted, over its own radii and no further. In a file it is a CSV of radii and a
+# column for each channel; `splatjax fit potato.csv --output potato.toml` does the same.
+
+# %%
+with jax.enable_x64(True):
+    rows = np.column_stack([dot.profile.radii, dot.profile.values])
+    np.savetxt("potato.csv", rows, delimiter=",", header="radius (mm), R (1/mm^2)")
+    table = sj.read_profile("potato.csv")
+    fitted = sj.fit_gaussians(table, 3, weights=sj.NonNegativeWeights())
+    error = float(fitted.error[0])
+    figure = plot_fit(table, fitted.gaussians, title="potato, measured, three Gaussians")
+figure  # noqa: B018
+
+# %% [markdown]
+# Colleagues with other renderers get the same material as JSON, each number with its formula and source.
+
+# %%
+with jax.enable_x64(True):
+    save_exports(sj.Material(fitted.gaussians, eta=1.3), "potato.json")
+sheet = json.loads(Path("potato.json").read_text())
+for name in ("burley", "unity", "blender"):
+    print(name, sheet[name])
+
+# %%
+assert np.all(np.abs(np.log(values / [0.009, 0.70])) < 3 * bars)
+assert np.all(bars < 0.1)
+assert 0.5 < chi_squared < 1.6
+assert error < 0.05
+assert sheet["burley"]["d"][0] > 0
