@@ -15,5 +15,6 @@ from ._multipole import Multipole as Multipole
 from ._photon_beam import PhotonBeam as PhotonBeam
 from ._quadrature import NORM_RULE as NORM_RULE, TOTAL_RULE as TOTAL_RULE, RadialRule as RadialRule
 from ._quadrature import at_own_radii as at_own_radii, integrated_reflectance as integrated_reflectance
+from ._rough import RoughFresnel as RoughFresnel
 from ._slab import AbstractSlabProfile as AbstractSlabProfile, Transmitted as Transmitted
 from ._tabulated import Tabulated as Tabulated

@@ -51,7 +51,8 @@ def slab_response(
     layer: Layer,
     eta_above: Float[Array, " channels"],
     eta_below: Float[Array, " channels"],
-    fresnel: AbstractFresnel,
+    fresnel_above: AbstractFresnel,
+    fresnel_below: AbstractFresnel,
     k: Float[Array, "*shape"],
 ) -> Response:
     r"""Give the response of a slab: the infinite series of Donner and Jensen's multipole, summed.
@@ -67,6 +68,7 @@ def slab_response(
     **Arguments:**
 
     - `eta_above`, `eta_below`: indices of the neighbors relative to air.
+    - `fresnel_above`, `fresnel_below`: the diffuse Fresnel moments of either side.
     - `k`: 1/mm, at least 0; the last axis is the channels.
 
     **Source:** image positions: Donner and Jensen 2005; the sum is our own.
@@ -75,7 +77,8 @@ def slab_response(
     depth = 1 / medium.sigma_t_prime
     thickness = jnp.broadcast_to(layer.thickness.astype(depth.dtype), depth.shape)
     thickness = jnp.where(thickness >= (1 - 1e-6) * depth, thickness, jnp.nan)
-    above, below = (2 / 3 * fresnel.boundary(medium.eta / eta) * depth for eta in (eta_above, eta_below))
+    above = 2 / 3 * fresnel_above.boundary(medium.eta / eta_above) * depth
+    below = 2 / 3 * fresnel_below.boundary(medium.eta / eta_below) * depth
     beneath, height = thickness - depth, thickness + above + below
     albedo, depth, above, below, beneath, height, squared_sigma_tr = (
         jnp.broadcast_to(each, k.shape)

@@ -27,6 +27,7 @@ class LayeredMultipole(AbstractSlabProfile):
     - `layers`: `Layer` and `Film`, from the top; at least one scatters. Only the lowest may be infinite.
     - `eta_above`, `eta_below`: indices of the neighbors relative to air, [channels].
     - `fresnel`: the diffuse Fresnel moments.
+    - `surface`: those of the topmost interface, if it is another: `RoughFresnel(...)`.
 
     **Raises:** `ValueError` for no scattering layer, and for an infinite layer with something below.
 
@@ -37,6 +38,7 @@ class LayeredMultipole(AbstractSlabProfile):
     eta_above: Float[Array, " channels"]
     eta_below: Float[Array, " channels"]
     fresnel: AbstractFresnel
+    surface: AbstractFresnel
 
     def __init__(
         self,
@@ -44,6 +46,7 @@ class LayeredMultipole(AbstractSlabProfile):
         eta_above: Float[Array, " channels"] | float = 1.0,
         eta_below: Float[Array, " channels"] | float = 1.0,
         fresnel: AbstractFresnel | None = None,
+        surface: AbstractFresnel | None = None,
     ):
         scattering = [layer for layer in layers if isinstance(layer, Layer)]
         if not scattering:
@@ -54,6 +57,7 @@ class LayeredMultipole(AbstractSlabProfile):
             jnp.broadcast_to(jnp.asarray(eta, like.dtype), like.shape) for eta in (eta_above, eta_below)
         )
         self.fresnel = ExactFresnel() if fresnel is None else fresnel
+        self.surface = self.fresnel if surface is None else surface
 
     def __check_init__(self):
         for number, layer in enumerate(self.layers[:-1], start=1):
@@ -76,7 +80,8 @@ class LayeredMultipole(AbstractSlabProfile):
             if isinstance(layer, Film):
                 responses.append(film_response(layer, passed == 0, k.shape))
             else:
-                responses.append(slab_response(layer, etas[passed], etas[passed + 2], self.fresnel, k))
+                above = self.surface if passed == 0 else self.fresnel
+                responses.append(slab_response(layer, etas[passed], etas[passed + 2], above, self.fresnel, k))
                 passed += 1
         return reduce(Response.over, responses)
 

@@ -19,6 +19,7 @@ class Multipole(AbstractSlabProfile):
     - `layer`: medium and thickness.
     - `eta_above`, `eta_below`: indices of the neighbors relative to air, [channels].
     - `fresnel`: the diffuse Fresnel moments.
+    - `surface`: those of the upper side, if it is another: `RoughFresnel(...)`.
 
     **Source:** Donner and Jensen 2005, "Light diffusion in multi-layered translucent materials".
     """
@@ -27,6 +28,7 @@ class Multipole(AbstractSlabProfile):
     eta_above: Float[Array, " channels"]
     eta_below: Float[Array, " channels"]
     fresnel: AbstractFresnel
+    surface: AbstractFresnel
 
     def __init__(
         self,
@@ -34,6 +36,7 @@ class Multipole(AbstractSlabProfile):
         eta_above: Float[Array, " channels"] | float = 1.0,
         eta_below: Float[Array, " channels"] | float = 1.0,
         fresnel: AbstractFresnel | None = None,
+        surface: AbstractFresnel | None = None,
     ):
         like = layer.medium.eta
         self.layer = layer
@@ -41,9 +44,10 @@ class Multipole(AbstractSlabProfile):
             jnp.broadcast_to(jnp.asarray(eta, like.dtype), like.shape) for eta in (eta_above, eta_below)
         )
         self.fresnel = ExactFresnel() if fresnel is None else fresnel
+        self.surface = self.fresnel if surface is None else surface
 
     def response(self, k: Float[Array, "*frequencies channels"]) -> Response:
-        return slab_response(self.layer, self.eta_above, self.eta_below, self.fresnel, k)
+        return slab_response(self.layer, self.eta_above, self.eta_below, self.surface, self.fresnel, k)
 
     def falls(self) -> tuple[Float[Array, " channels"], Float[Array, " channels"]]:
         return slab_falls(self.layer)

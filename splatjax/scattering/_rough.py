@@ -1,0 +1,109 @@
+"""A rough interface."""
+
+import functools
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ._fresnel import AbstractFresnel, ExactFresnel
+from ._medium import check_range
+
+_COSINES, _SLOPES, _STEEPEST = 24, 64, 4.0
+"""Nodes on each side of the critical angle; nodes of either slope, which end where they are 1e-7 as frequent as none."""
+
+
+class RoughFresnel(AbstractFresnel):
+    r"""The moments of an interface of microfacets: a rough surface over a material.
+
+    Light from inside meets a facet with the probability that it sees it (Smith's masking, Beckmann's slopes), and is reflected
+    by it or leaves; what it meets afterwards is neglected. With all facets reflecting everything the moments are 1, and without
+    roughness they are those of `smooth`.
+
+    Differentiable in `eta` and `roughness`, and in the latter to first order at 0, where the derivative is 0.
+
+    **Attributes:**
+
+    - `roughness`: root mean square slope m, in [0, 1], as `Material` has it.
+    - `smooth`: moments of the smooth interface; by default the exact ones.
+
+    **Source:** that a rough surface changes the diffuse reflectance of the boundary condition: Donner and Jensen 2005; visible
+    facets: Heitz 2014.
+    """
+
+    roughness: Float[Array, ""]
+    smooth: AbstractFresnel
+
+    def __init__(self, roughness: Float[Array, ""] | float, smooth: AbstractFresnel | None = None):
+        self.roughness = jnp.asarray(roughness)
+        self.smooth = ExactFresnel() if smooth is None else smooth
+
+    def __check_init__(self):
+        check_range("roughness", self.roughness, "in [0, 1]", lambda x: (x >= 0) & (x <= 1))
+
+    def first_moment(self, eta: Float[Array, " channels"]) -> Float[Array, " channels"]:
+        return self.smooth.first_moment(eta) + self._excess(eta, power=1)
+
+    def second_moment(self, eta: Float[Array, " channels"]) -> Float[Array, " channels"]:
+        return self.smooth.second_moment(eta) + self._excess(eta, power=2)
+
+    def _excess(self, eta: Float[Array, " channels"], power: int) -> Float[Array, " channels"]:
+        """Give what roughness adds to a moment: the difference of two sums over the same cosines."""
+        cosine, share = _cosines(eta)
+        along, across, weights = (jnp.asarray(each, eta.dtype)[..., None] for each in _slopes(len(cosine)))
+        slope, shape = self.roughness.astype(eta.dtype), (*along.shape[:2], len(eta))
+        # How much of a facet of slope (p, q) a direction in the plane of p sees, and at what cosine it meets it.
+        across_it = jnp.broadcast_to(jnp.sqrt(1 - cosine * cosine)[:, None], shape)
+        seen = jnp.maximum(jnp.broadcast_to(cosine[:, None], shape) + jnp.broadcast_to(slope * along, shape) * across_it, 0)
+        met = seen / jnp.broadcast_to(jnp.sqrt(1 + slope * slope * (along * along + across * across)), shape)
+        counted = jnp.broadcast_to(weights, shape) * seen
+        rough = jnp.sum(counted * _internal_reflectance(met, eta), axis=1) / jnp.sum(counted, axis=1)
+        excess = rough - _internal_reflectance(cosine, eta)
+        return jnp.sum((power + 1) * share * cosine**power * excess, axis=0)
+
+
+def _internal_reflectance(
+    cosine: Float[Array, "*shape channels"], eta: Float[Array, " channels"]
+) -> Float[Array, "*shape channels"]:
+    """Give the unpolarized Fresnel reflectance at a cosine inside, where the index is `eta` times that outside."""
+    eta = jnp.broadcast_to(eta, cosine.shape)
+    squared = 1 - eta * eta * (1 - cosine * cosine)
+    leaves = squared > 0
+    outside = jnp.sqrt(jnp.where(leaves, squared, jnp.ones_like(squared)))
+    across = (eta * cosine - outside) / (eta * cosine + outside)
+    along = (cosine - eta * outside) / (cosine + eta * outside)
+    return jnp.where(leaves, 0.5 * (across * across + along * along), jnp.ones_like(squared))
+
+
+def _cosines(eta: Float[Array, " channels"]) -> tuple[Float[Array, "cosines channels"], Float[Array, "cosines channels"]]:
+    """Give nodes and weights over the cosine inside, on either side of the critical angle, beyond which it is as a root."""
+    t, dt = (jnp.asarray(each, eta.dtype)[:, None] for each in _unit_nodes(_COSINES))
+    denser = eta > 1
+    critical = jnp.sqrt(jnp.where(denser, 1 - 1 / jnp.where(denser, eta * eta, 2), 0.0))
+    shape = (_COSINES, len(eta))
+    t, dt, critical = (jnp.broadcast_to(each, shape) for each in (t, dt, critical))
+    # Below as well: what a rough interface lets through begins as a root there.
+    below, above = jnp.where(critical > 0, critical * (1 - t * t), t), critical + (1 - critical) * t * t
+    return jnp.concatenate([below, above]), jnp.concatenate([critical * 2 * t * dt, (1 - critical) * 2 * t * dt])
+
+
+@functools.cache
+def _unit_nodes(count: int) -> tuple[np.ndarray, np.ndarray]:
+    nodes, weights = np.polynomial.legendre.leggauss(count)
+    return 0.5 * (nodes + 1), 0.5 * weights
+
+
+@functools.cache
+def _slopes(cosines: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Give slopes of unit roughness along and across, and their weights: [cosines, slopes].
+
+    Equally spaced, which for a Gaussian is exact from whatever offset; each cosine has its own, so that what the critical angle
+    does to single sums averages out.
+    """
+    step = 2 * _STEEPEST / _SLOPES
+    offsets = np.modf(np.outer(np.arange(1, cosines + 1), (0.7548776662, 0.5698402910)))[0]  # of an even sequence in the plane
+    lines = step * (np.arange(_SLOPES) + offsets[..., None]) - _STEEPEST
+    p = np.repeat(lines[:, 0], _SLOPES, axis=1)
+    q = np.tile(lines[:, 1], (1, _SLOPES))
+    weights = np.exp(-p * p - q * q)
+    return p, q, weights / weights.sum(axis=1, keepdims=True)
