@@ -40,7 +40,7 @@ from splatjax.scattering import measure_laser_dot
 with jax.enable_x64(True):
     potato = sj.Medium(jnp.asarray([0.009]), jnp.asarray([0.70]), jnp.asarray([1.3]))
     beam_variance, power, mm_per_pixel = 0.25, 5.0, 0.1
-    seen = sj.fit_gaussians(sj.Dipole(potato), 4).gaussians.blurred(beam_variance)
+    seen = sj.fit_gaussians(sj.Dipole(potato), 3).gaussians.blurred(beam_variance)
     y, x = (np.mgrid[:200, :200] - 99.5) * mm_per_pixel
     radiance = power / np.pi * np.asarray(seen(jnp.hypot(x, y)))
 noise = np.random.default_rng(5).normal(size=radiance.shape)
@@ -59,7 +59,7 @@ figure  # noqa: B018
 with jax.enable_x64(True):
     dot = measure_laser_dot(photograph, mm_per_pixel, power=power)
     guess = sj.Medium(jnp.asarray([0.05]), jnp.asarray([2.0]), potato.eta)
-    found = fit_medium(dot.profile, dot.deviation, guess, beam_variance=beam_variance, count=4)
+    found = fit_medium(dot.profile, dot.deviation, guess, beam_variance=beam_variance, count=3)
     bars = np.sqrt(np.diagonal(np.asarray(found.covariance)[0]))
     values = np.asarray([found.medium.sigma_a[0], found.medium.sigma_s_prime[0]])
     chi_squared = float(found.chi_squared[0])

@@ -26,7 +26,7 @@ import splatjax as sj
 from splatjax.plots import plot_error_by_count, plot_fit
 
 # %%
-weights = sj.NonNegativeWeights(sj.TotalReflectanceHeld())
+weights = sj.TotalReflectanceHeld()
 with jax.enable_x64(True):
     stone = sj.Medium(
         sigma_a=jnp.asarray([0.020, 0.006, 0.015]), sigma_s_prime=jnp.asarray([1.1, 1.3, 1.5]), eta=jnp.full(3, 1.6)
@@ -39,7 +39,8 @@ figure  # noqa: B018
 # %% [markdown]
 # Each further Gaussian divides the error by two to three. One layer is drawn for each, so take as many as the picture deserves:
 # the least, say, that leaves no channel more than two hundredths. (`fit_gaussians(profile, LeastCount(0.02))` does it at once.)
-# The sum of the weights is held at the total reflectance, which keeps the energy of the picture, and none of them is negative.
+# The sum of the weights is held at the total reflectance, which keeps the energy of the picture. (Where channels differ more,
+# some weights come out slightly negative; `NonNegativeWeights(TotalReflectanceHeld())` forbids it: the library is fitted so.)
 
 # %%
 with jax.enable_x64(True):
@@ -65,7 +66,7 @@ print("  known to     ", (np.sqrt(np.diag(covariance))[:count] / variances).roun
 with jax.enable_x64(True):
     glaze = sj.Medium(jnp.asarray([0.02, 0.3, 0.3]), jnp.full(3, 4.0), jnp.full(3, 1.5))
     glazed = sj.LayeredMultipole([sj.Layer(glaze, jnp.asarray(0.5)), sj.Layer(stone, jnp.asarray(jnp.inf))])
-    fitted_glaze = sj.fit_gaussians(glazed, 5)
+    fitted_glaze = sj.fit_gaussians(glazed, 4)
     figure = plot_fit(glazed, fitted_glaze.gaussians, title="stone under a red glaze")
 figure  # noqa: B018
 
@@ -87,6 +88,6 @@ print("                  glazed ", totals[1].round(3))
 assert np.max(np.asarray(fitted.error)) < 0.0201
 assert np.max(np.asarray(by_count.error)[count - 2]) > 0.02
 assert np.max(np.abs(np.asarray(fitted.energy_error))) < 1e-12
-assert np.max(np.asarray(fitted_glaze.error)) < 0.01
+assert np.max(np.asarray(fitted_glaze.error)) < 0.03
 assert same
 assert np.all(totals[1][1:] < totals[0][1:])

@@ -92,8 +92,7 @@ def _fit_compiled(measured, deviation, start, beam_variance, model, count, gauss
         solver = optx.LevenbergMarquardt(rtol=_TOLERANCE, atol=_TOLERANCE, linear_solver=NormalEquations())
         point = jnp.log(jnp.stack([sigma_a, sigma_s_prime]))
         found = optx.least_squares(residuals, solver, point, max_steps=_STEPS, throw=False)
-        left = residuals(found.value, None)
-        slopes = jax.jacfwd(lambda point: residuals(point, None))(found.value)
+        slopes, left = jax.jacfwd(lambda point: (residuals(point, None),) * 2, has_aux=True)(found.value)
         freedom = max(len(values) - len(point), 1)
         return jnp.exp(found.value), invert(slopes.T @ slopes), left @ left / freedom, found.result == optx.RESULTS.successful
 

@@ -14,7 +14,7 @@ POWER = 3.0
 BEAM = 1.0
 HALF_WIDTH = 9.0
 PIXELS = 144
-COUNT = 4
+COUNT = 3
 NOISE = 1e-2
 """Of a pixel, in shares of the peak, beside shot noise of the same size at the peak."""
 
@@ -26,7 +26,7 @@ def photograph(medium: sj.Medium) -> np.ndarray:
     beam = sj.GaussianBeam(
         jnp.asarray([0.0, 0.0, 10.0]), jnp.asarray([0.0, 0.0, -1.0]), jnp.full(channels, POWER), jnp.asarray(BEAM)
     )
-    scene = sj.Scene(sheet(0.25, 30.0), (beam,), sj.Material(gaussians, specular=0.0))
+    scene = sj.Scene(sheet(0.25, 24.0), (beam,), sj.Material(gaussians, specular=0.0))
     image = np.asarray(sj.render(scene, camera_over(HALF_WIDTH, PIXELS)).diffuse, np.float64)
     noise = np.random.default_rng(0).normal(size=image.shape)
     peak = image.max(axis=(0, 1))

@@ -81,7 +81,7 @@ def test_saturated_rings_are_left_out(float64):
         measure_laser_dot(image, MM_PER_PIXEL, power=2.0, saturation=0.0)
 
 
-def test_a_measured_profile_is_fitted_without_negative_weights(dtype):
+def test_a_measured_profile_is_fitted_without_negative_weights(float64):
     dot = measure_laser_dot(photograph(noise=0.02), MM_PER_PIXEL, power=2.0)
     fitted = fit_gaussians(dot.profile, 3, weights=NonNegativeWeights(), throw=False)
     assert np.all(np.asarray(fitted.gaussians.weights) >= 0)
