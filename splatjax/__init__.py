@@ -28,6 +28,9 @@ from .io import materials as materials, save_material as save_material
 from .scene import Camera as Camera, DirectionalLight as DirectionalLight, Frame as Frame
 from .scene import GaussianBeam as GaussianBeam, Material as Material, PointLight as PointLight
 from .scene import Scene as Scene, Splats as Splats
+from .transport import DiffuseIncidence as DiffuseIncidence, NormalIncidence as NormalIncidence
+from .transport import HenyeyGreenstein as HenyeyGreenstein, Isotropic as Isotropic
+from .transport import monte_carlo as monte_carlo, MonteCarlo as MonteCarlo, path_derivatives as path_derivatives
 
 from .render import diffuse as diffuse, Plan as Plan, plan as plan, render as render, RenderSettings as RenderSettings
 

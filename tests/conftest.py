@@ -1,5 +1,6 @@
 """Strict modes for the whole suite. Precision comes from JAX_ENABLE_X64: the suite runs once in each."""
 
+import json
 import os
 from pathlib import Path
 
@@ -24,9 +25,26 @@ def float64(x64):
 
 
 @pytest.fixture
+def float32(x64):
+    """Long sums that need a compiler's whole effort, as users have it: such tests belong to the float32 run alone."""
+    assert not x64
+
+
+@pytest.fixture
 def dtype():
     """The precision under test."""
     return jnp.zeros(()).dtype
+
+
+@pytest.fixture
+def monte_carlo():
+    """Read a run of the public Monte Carlo code, of tests marked `shared`."""
+
+    def read(name: str) -> dict:
+        folder = Path(os.environ["SPLATJAX_SHARED"]) / "monte_carlo"
+        return json.loads((folder / f"{name}.json").read_text())
+
+    return read
 
 
 def shared_folder() -> Path | None:
@@ -40,7 +58,7 @@ def _left_out(item) -> bool:
     if item.get_closest_marker("shared") and shared_folder() is None:
         return True
     if jax.config.jax_enable_x64:
-        return item.get_closest_marker("once") is not None
+        return item.get_closest_marker("once") is not None or "float32" in item.fixturenames
     return "float64" in item.fixturenames
 
 

@@ -174,11 +174,13 @@ def _layer(table: "_Table") -> Layer | Film:
     table.unit(THICKNESS_UNIT, "thickness_unit")
     thickness = table.thickness("thickness")
     try:
-        return Layer(_medium(table), _array(thickness))
+        layer = Layer(_medium(table), _array(thickness))
+        layer.check_diffusion()
     except ValueError as error:
         if str(error).startswith(table.where):
             raise
         raise ValueError(f"{table.where} {error}") from None
+    return layer
 
 
 def _medium(medium: "_Table") -> Medium:

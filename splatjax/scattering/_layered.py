@@ -29,7 +29,8 @@ class LayeredMultipole(AbstractSlabProfile):
     - `fresnel`: the diffuse Fresnel moments.
     - `surface`: those of the topmost interface, if it is another: `RoughFresnel(...)`.
 
-    **Raises:** `ValueError` for no scattering layer, and for an infinite layer with something below.
+    **Raises:** `ValueError` for no scattering layer, for an infinite layer with something below, and for a layer thinner than one
+    mean free path `1 / sigma_t'` in any channel. Under `jit` that is unknown, and the profile NaN.
 
     **Source:** Donner and Jensen 2005, "Light diffusion in multi-layered translucent materials".
     """
@@ -63,6 +64,8 @@ class LayeredMultipole(AbstractSlabProfile):
         for number, layer in enumerate(self.layers[:-1], start=1):
             if isinstance(layer, Layer) and _is_infinite(layer):
                 raise ValueError(f"layer {number} of {len(self.layers)} is infinitely thick; only the lowest may be")
+        for layer in self._scattering():
+            layer.check_diffusion()
 
     def length_scale(self) -> Float[Array, " channels"]:
         """Give the mean free path of the uppermost layer that scatters, mm."""

@@ -13,10 +13,9 @@ class Layer(eqx.Module):
     **Attributes:** (differentiable)
 
     - `medium`: its coefficients, [channels].
-    - `thickness`: mm; infinite for the lowest layer of a half space. At least one mean free path `1 / sigma_t'` in every
-        channel: diffusion does not know thinner slabs, of which the light would come from outside.
+    - `thickness`: mm; infinite for the lowest layer of a half space.
 
-    **Raises:** `ValueError` for a layer that is too thin. Under `jit` that is unknown: profiles of such a layer are NaN.
+    **Raises:** `ValueError` for a negative thickness.
     """
 
     medium: Medium
@@ -24,10 +23,14 @@ class Layer(eqx.Module):
 
     def __check_init__(self):
         check_range("thickness", self.thickness, "at least 0 (mm)", lambda x: x >= 0, finite=False)
+
+    def check_diffusion(self) -> None:
+        """Raise if diffusion does not know such a slab: the light would come from outside of it. A traced one passes."""
         check_range(
             "thickness in mean free paths, thickness * sigma_t',",
             self.thickness.astype(self.medium.sigma_a.dtype) * self.medium.sigma_t_prime,
-            "at least 1 in every channel: diffusion does not hold in a thinner layer (a Film absorbs, and scatters nothing)",
+            "at least 1 in every channel: diffusion does not hold in a thinner layer; monte_carlo does, and a Film absorbs "
+            "and scatters nothing",
             lambda x: x >= 1 - 1e-6,
             finite=False,
         )

@@ -21,6 +21,9 @@ class Multipole(AbstractSlabProfile):
     - `fresnel`: the diffuse Fresnel moments.
     - `surface`: those of the upper side, if it is another: `RoughFresnel(...)`.
 
+    **Raises:** `ValueError` for a layer thinner than one mean free path `1 / sigma_t'` in any channel: its light would come from
+    outside of it. Under `jit` that is unknown, and the profile NaN.
+
     **Source:** Donner and Jensen 2005, "Light diffusion in multi-layered translucent materials".
     """
 
@@ -45,6 +48,9 @@ class Multipole(AbstractSlabProfile):
         )
         self.fresnel = ExactFresnel() if fresnel is None else fresnel
         self.surface = self.fresnel if surface is None else surface
+
+    def __check_init__(self):
+        self.layer.check_diffusion()
 
     def response(self, k: Float[Array, "*frequencies channels"]) -> Response:
         return slab_response(self.layer, self.eta_above, self.eta_below, self.surface, self.fresnel, k)

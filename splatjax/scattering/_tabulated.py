@@ -22,16 +22,24 @@ class Tabulated(AbstractProfile):
 
     - `radii`: mm, at least two; they ascend from at least 0.
     - `values`: 1/mm^2, one row per radius. May be negative, as noise is.
+    - `deviation`: standard errors of the values, of their shape, or None where they are unknown. Constants of every derivative.
 
     **Raises:** `ValueError` for radii that do not ascend, for values that are not finite, and for shapes that do not match.
     """
 
     radii: Float[Array, " samples"]
     values: Float[Array, "samples channels"]
+    deviation: Float[Array, "samples channels"] | None
 
-    def __init__(self, radii: Float[Array, " samples"], values: Float[Array, " samples_"] | Float[Array, "samples_ channels"]):
+    def __init__(
+        self,
+        radii: Float[Array, " samples"],
+        values: Float[Array, " samples_"] | Float[Array, "samples_ channels"],
+        deviation: Float[Array, " samples_"] | Float[Array, "samples_ channels"] | None = None,
+    ):
         self.radii = radii
         self.values = values if values.ndim == 2 else values[:, None]
+        self.deviation = deviation if deviation is None or deviation.ndim == 2 else deviation[:, None]
 
     def __check_init__(self):
         samples, rows = self.radii.shape[0], self.values.shape[0]
@@ -39,6 +47,8 @@ class Tabulated(AbstractProfile):
             raise ValueError(f"a table needs at least two radii, and a row of values for each; got {samples} and {rows} rows")
         check_range("radii", self.radii, "at least 0 (mm)", lambda x: x >= 0)
         check_range("values", self.values, "numbers (1/mm^2)", lambda x: x == x)
+        if self.deviation is not None:
+            check_range("deviation", self.deviation, "at least 0 (1/mm^2)", lambda x: x >= 0)
         if not isinstance(self.radii, Tracer):
             radii = np.asarray(self.radii)
             for before, radius in pairwise(radii):

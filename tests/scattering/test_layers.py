@@ -172,7 +172,9 @@ def test_three_layers_of_skin(float64):
 
 def test_too_thin_is_refused(dtype):
     with pytest.raises(ValueError, match=r"at least 1 in every channel: diffusion does not hold.*got \[0\.78"):
-        layer(0.0041, 2.62, 1.5, 0.3)
+        Multipole(layer(0.0041, 2.62, 1.5, 0.3))
+    with pytest.raises(ValueError, match=r"at least 1 in every channel: diffusion does not hold.*got \[0\.78"):
+        LayeredMultipole([layer(0.0041, 2.62, 1.5, 0.3), layer(0.0041, 2.62, 1.5, INFINITE)])
 
     @jax.jit
     def traced(thickness):

@@ -1,0 +1,164 @@
+"""Photons by the lane: each lane takes the next photon when it is done with one."""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.core import Tracer
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from ._incidence import AbstractIncidence
+from ._phase import AbstractPhaseFunction
+from ._random import evenly, uniforms
+from ._stack import Stack
+from ._tally import Tally
+from ._walk import IDLE, INSIDE, Optics, PathWeights, Photons, fly, weigh
+
+LANES = 8192
+"""Photons on their way at once: their state stays in the cache of a core or two."""
+
+_FLIGHTS = 8
+"""Flights between two looks at who is done."""
+
+_ROUNDS = 128
+"""Rounds of one compiled call: a second or so, after which progress is told."""
+
+_LEAST, _SURVIVING = 1e-4, 0.1
+"""A photon that carries less than this is given up, except for this share, which carries more instead (Russian roulette)."""
+
+
+class Walk(eqx.Module):
+    r"""What does not change while photons walk.
+
+    **Attributes:**
+
+    - `optics`: of the channels that walk along; `slopes` are its derivatives in each parameter.
+    - `edges`: of the rings, in free paths of the stack, for each channel.
+    - `photons`: how many, `flights`: at most so many each.
+    """
+
+    stack: Stack
+    phase: AbstractPhaseFunction
+    incidence: AbstractIncidence
+    optics: Optics
+    slopes: Optics
+    edges: Float[Array, "channels edges"]
+    photons: Int[Array, ""]
+    flights: Int[Array, ""]
+    key: Key[Array, ""]
+
+
+class _State(eqx.Module):
+    photons: Photons
+    weights: PathWeights
+    slopes: PathWeights
+    tally: Tally
+    started: Int[Array, ""]
+    round: Int[Array, ""]
+
+    def unfinished(self, walk: Walk) -> Bool[Array, ""]:
+        return (self.started < walk.photons) | jnp.any(self.photons.place == INSIDE)
+
+
+def finish(walk: Walk, progress: Callable[[int, int], None] | None) -> Tally:
+    """Walk all photons to their end. Under `jit` in one loop, else call by call, telling progress in between."""
+    state = _start(walk)
+    if isinstance(state.started, Tracer):
+        return jax.lax.while_loop(lambda state: state.unfinished(walk), lambda state: _round(walk, state), state).tally
+    while bool(state.unfinished(walk)):
+        state = _advance(walk, state)
+        if progress is not None:
+            under_way = int(jnp.sum(state.photons.place == INSIDE))
+            progress(int(state.started) - under_way, int(walk.photons))
+    return state.tally
+
+
+@eqx.filter_jit
+def _start(walk: Walk) -> _State:
+    dtype, (layers, channels) = walk.edges.dtype, walk.optics.absorption.shape
+    parameters, rings = walk.slopes.absorption.shape[0], walk.edges.shape[1] - 1
+    nothing, nowhere = jnp.zeros(LANES, dtype), jnp.zeros(LANES, jnp.int32)
+    down = (nothing, nothing, nothing + 1)
+    photons = Photons(nothing, nothing, nothing, down, nothing, nowhere, nowhere + IDLE, nowhere)
+    weights = PathWeights(jnp.zeros((channels, LANES), dtype), jnp.zeros((layers, channels, LANES), dtype))
+    slopes = jax.tree.map(lambda each: jnp.zeros((parameters, *each.shape), dtype), weights)
+    tally = Tally.empty(rings, layers, channels, parameters, dtype)
+    state = _State(photons, weights, slopes, tally, jnp.zeros((), jnp.int32), jnp.zeros((), jnp.int32))
+    return _launch(walk, state, photons.place == IDLE)
+
+
+@eqx.filter_jit
+def _advance(walk: Walk, state: _State) -> _State:
+    return jax.lax.fori_loop(0, _ROUNDS, lambda _, state: _round(walk, state), state)
+
+
+def _round(walk: Walk, state: _State) -> _State:
+    """Fly, find who is done, count them, and start others in their places."""
+    draws = state.round * (_FLIGHTS + 2)
+
+    def path(optics, weights):
+        def flight(number, carry):
+            photons, weights = carry
+            xi = uniforms(walk.key, draws + number, LANES, weights.carried.dtype)
+            photons, flown = fly(walk.stack, walk.phase, photons, xi)
+            return photons, weigh(optics, weights, flown)
+
+        photons, weights = jax.lax.fori_loop(0, _FLIGHTS, flight, (state.photons, weights))
+        return weights, photons
+
+    if walk.slopes.absorption.shape[0]:
+
+        def push(optics, weights):
+            return jax.jvp(path, (walk.optics, state.weights), (optics, weights), has_aux=True)
+
+        weights, slopes, photons = jax.vmap(push, out_axes=(None, 0, None))(walk.slopes, state.slopes)
+    else:
+        (weights, photons), slopes = path(walk.optics, state.weights), state.slopes
+
+    inside = photons.place == INSIDE
+    faint = inside & (jnp.max(weights.carried, axis=0) < _LEAST)
+    chance = uniforms(walk.key, draws + _FLIGHTS, LANES, walk.edges.dtype)[0]
+    dropped = faint & (chance > _SURVIVING)
+    boost = jnp.where(faint & ~dropped, 1 / _SURVIVING, jnp.ones_like(chance))
+    weights, slopes = (
+        PathWeights(each.carried * jnp.broadcast_to(boost, each.carried.shape), each.absorbed) for each in (weights, slopes)
+    )
+    done = ((photons.place != INSIDE) & (photons.place != IDLE)) | dropped | (inside & (photons.flights >= walk.flights))
+    tally = state.tally.plus(photons, weights, slopes, done, dropped, walk.edges)
+    after = _State(photons, weights, slopes, tally, state.started, state.round + 1)
+    return _launch(walk, after, done | (photons.place == IDLE))
+
+
+def _launch(walk: Walk, state: _State, free: Bool[Array, " photons"]) -> _State:
+    """Start photons in lanes that are free, as long as there are any left to start."""
+    dtype = walk.edges.dtype
+    turn = jnp.cumsum(free.astype(jnp.int32))
+    begins = free & (state.started + turn <= walk.photons)
+    xi = uniforms(walk.key, state.round * (_FLIGHTS + 2) + _FLIGHTS + 1, LANES, dtype)
+    spread = evenly(walk.key, state.started + turn, dtype)
+    direction, weight = walk.incidence.enter(spread, xi[1], walk.stack.eta[:2])
+
+    def fresh(new, old):
+        return jnp.where(begins, new, old)
+
+    old, zero = state.photons, jnp.zeros(LANES, dtype)
+    photons = Photons(
+        x=fresh(zero, old.x),
+        y=fresh(zero, old.y),
+        depth=fresh(zero, old.depth),
+        direction=tuple(fresh(new, each) for new, each in zip(direction, old.direction, strict=True)),
+        to_scatter=fresh(-jnp.log(xi[2]), old.to_scatter),
+        layer=fresh(jnp.zeros_like(old.layer), old.layer),
+        place=fresh(jnp.full_like(old.place, INSIDE), jnp.where(free, IDLE, old.place).astype(jnp.int32)),
+        flights=fresh(jnp.zeros_like(old.flights), old.flights),
+    )
+
+    def cleared(each):
+        return jnp.where(jnp.broadcast_to(free, each.shape), jnp.zeros_like(each), each)
+
+    weights, slopes = (jax.tree.map(cleared, each) for each in (state.weights, state.slopes))
+    carried = weights.carried + jnp.broadcast_to(jnp.where(begins, weight, zero), weights.carried.shape)
+    weights = PathWeights(carried, weights.absorbed)
+    started = state.started + jnp.sum(begins, dtype=jnp.int32)
+    return _State(photons, weights, slopes, state.tally, started, state.round)

@@ -1,0 +1,158 @@
+"""One flight of many photons: to the next scattering or to the next interface, whichever comes first."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from ._interface import fresnel
+from ._lookup import of_layer
+from ._phase import AbstractPhaseFunction
+from ._stack import Stack
+
+INSIDE, ABOVE, BELOW, IDLE = 0, 1, 2, 3
+"""Where a photon is; one that is idle is not on its way at all."""
+
+
+class Photons(eqx.Module):
+    """Where photons are, in free paths of the stack; depth counts from the top of their layer. No derivative passes here."""
+
+    x: Float[Array, " photons"]
+    y: Float[Array, " photons"]
+    depth: Float[Array, " photons"]
+    direction: tuple[Float[Array, " photons"], Float[Array, " photons"], Float[Array, " photons"]]
+    to_scatter: Float[Array, " photons"]
+    layer: Int[Array, " photons"]
+    place: Int[Array, " photons"]
+    flights: Int[Array, " photons"]
+
+
+class Flight(eqx.Module):
+    """What a flight means for weights: its length in a layer, 0 for a photon that does not fly, and how it ended."""
+
+    length: Float[Array, " photons"]
+    layer: Int[Array, " photons"]
+    scattered: Bool[Array, " photons"]
+
+
+class PathWeights(eqx.Module):
+    r"""What photons carry and have left, in each channel that walks along.
+
+    **Attributes:**
+
+    - `carried`: the share of the entering power; 1 at the start, on average.
+    - `absorbed`: what each layer has taken of it.
+
+    Derivatives of both have a leading axis.
+    """
+
+    carried: Float[Array, "*slopes channels photons"]
+    absorbed: Float[Array, "*slopes layers channels photons"]
+
+
+class Optics(eqx.Module):
+    r"""What turns flights into weights, per free path of the stack. Differentiable: the only place where coefficients are.
+
+    **Attributes:**
+
+    - `absorption`: absorption coefficients.
+    - `removal`: absorption, and scattering in excess of that by which flights are drawn.
+    - `ratio`: scattering over that by which flights are drawn. 1 in value.
+
+    The likelihood of a path under other coefficients than those it was drawn by is a product over its flights and scatterings:
+    its derivative is the path's share in that of every mean.
+    """
+
+    absorption: Float[Array, "*slopes layers channels"]
+    removal: Float[Array, "*slopes layers channels"]
+    ratio: Float[Array, "*slopes layers channels"]
+
+    @classmethod
+    def of(cls, sigma_a: Float[Array, "layers channels"], sigma_s: Float[Array, "layers channels"], unit) -> "Optics":
+        """State coefficients (1/mm) in free paths of `unit` mm, [channels]."""
+        drawn, unit = jax.lax.stop_gradient(sigma_s), jax.lax.stop_gradient(unit)[None]
+        return cls(
+            sigma_a * unit,
+            sigma_a * unit + (sigma_s - drawn) * unit,
+            jnp.where(drawn > 0, sigma_s / jnp.where(drawn > 0, drawn, 1.0), 1.0),
+        )
+
+
+def fly(stack: Stack, phase: AbstractPhaseFunction, photons: Photons, xi: Float[Array, "four photons"]) -> tuple[Photons, Flight]:
+    """Move photons by one flight. Uniform random numbers: cosine or reflection, angle, and the next free path."""
+    ux, uy, uz = photons.direction
+    layer, inside = photons.layer, photons.place == INSIDE
+    sigma_s, thickness = of_layer(stack.sigma_s, layer), of_layer(stack.thickness, layer)
+    down = uz > 0
+    ahead = jnp.where(down, thickness - photons.depth, photons.depth)
+    to_interface = jnp.maximum(ahead, 0.0) / jnp.maximum(jnp.abs(uz), jnp.finfo(uz.dtype).tiny)
+    to_scatter = jnp.where(sigma_s > 0, photons.to_scatter / jnp.where(sigma_s > 0, sigma_s, 1.0), jnp.inf)
+    scattered = to_scatter < to_interface
+    length = jnp.where(inside, jnp.minimum(to_scatter, to_interface), 0.0)
+
+    turned = phase.scatter(photons.direction, layer, xi[0], xi[1])
+    from_eta, to_eta = (
+        of_layer(stack.eta[1:-1], layer),
+        jnp.where(down, of_layer(stack.eta[2:], layer), of_layer(stack.eta[:-2], layer)),
+    )
+    reflectance, onward = fresnel(jnp.abs(uz), from_eta, to_eta)
+    crosses = ~scattered & (xi[0] > reflectance)
+    bent = jnp.where(crosses, from_eta / to_eta, 1.0)
+    after = jnp.where(crosses, layer + jnp.where(down, 1, -1), layer)
+    left = jnp.where(after < 0, ABOVE, jnp.where(after >= stack.sigma_s.shape[0], BELOW, INSIDE))
+    stays = left == INSIDE
+    up_again = jnp.where(crosses, jnp.where(down, onward, -onward), -uz)
+    # At an interface the depth is 0 or that of the layer now entered, or met from inside, exactly.
+    arrives_on_top = jnp.where(crosses, down, ~down)
+    at_interface = jnp.where(arrives_on_top, 0.0, of_layer(stack.thickness, jnp.where(stays, after, layer)))
+
+    def now(new, old):
+        return jnp.where(inside, new, old)
+
+    moved = Photons(
+        x=photons.x + ux * length,
+        y=photons.y + uy * length,
+        depth=now(jnp.where(scattered, photons.depth + uz * length, at_interface), photons.depth),
+        direction=(
+            now(jnp.where(scattered, turned[0], ux * bent), ux),
+            now(jnp.where(scattered, turned[1], uy * bent), uy),
+            now(jnp.where(scattered, turned[2], up_again), uz),
+        ),
+        to_scatter=now(jnp.where(scattered, -jnp.log(xi[2]), photons.to_scatter - to_interface * sigma_s), photons.to_scatter),
+        layer=now(jnp.where(scattered | ~stays, layer, after), layer),
+        place=now(jnp.where(scattered, INSIDE, left), photons.place),
+        flights=photons.flights + inside.astype(jnp.int32),
+    )
+    return moved, Flight(length, layer, scattered & inside)
+
+
+def weigh(optics: Optics, weights: PathWeights, flight: Flight) -> PathWeights:
+    """Carry weights along a flight: absorption on its way is its mean, not drawn."""
+    length = jnp.broadcast_to(flight.length, weights.carried.shape)
+    removal = of_layer(optics.removal, flight.layer) * length
+    taken = weights.carried * _taken(of_layer(optics.absorption, flight.layer) * length, removal)
+    scattered = jnp.broadcast_to(flight.scattered, weights.carried.shape)
+    ratio = jnp.where(scattered, of_layer(optics.ratio, flight.layer), 1.0)
+    layers = jnp.broadcast_to(jnp.arange(weights.absorbed.shape[0], dtype=jnp.int32)[:, None, None], weights.absorbed.shape)
+    here = jnp.broadcast_to(flight.layer, layers.shape) == layers
+    return PathWeights(
+        weights.carried * jnp.exp(-removal) * ratio,
+        weights.absorbed + jnp.where(here, jnp.broadcast_to(taken, here.shape), 0.0),
+    )
+
+
+@jax.custom_jvp
+def _taken(
+    absorption: Float[Array, "channels photons"], removal: Float[Array, "channels photons"]
+) -> Float[Array, "channels photons"]:
+    """Give `(1 - exp(-removal)) absorption / removal`, where both are equal in value, as they are on the path drawn."""
+    return -jnp.expm1(-absorption)
+
+
+@_taken.defjvp
+def _taken_jvp(primals, tangents):
+    absorption, _ = primals
+    absorbing, removing = tangents
+    taken = -jnp.expm1(-absorption)
+    mean = jnp.where(absorption > 0, taken / jnp.where(absorption > 0, absorption, 1.0), 1.0)
+    return taken, jnp.exp(-absorption) * removing + mean * (absorbing - removing)
