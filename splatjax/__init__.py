@@ -16,7 +16,12 @@ from .io import write_exr as write_exr, write_png as write_png, write_splats as 
 from .scattering import BetterDipole as BetterDipole, Burley as Burley, Dipole as Dipole, PhotonBeam as PhotonBeam
 from .scattering import EganFresnel as EganFresnel, ExactFresnel as ExactFresnel, Medium as Medium
 from .scattering import Film as Film, Layer as Layer, LayeredMultipole as LayeredMultipole, Multipole as Multipole
-from .scattering import NORM_RULE as NORM_RULE, RadialRule as RadialRule, Tabulated as Tabulated
+from .scattering import (
+    InverseVariance as InverseVariance,
+    NORM_RULE as NORM_RULE,
+    RadialRule as RadialRule,
+    Tabulated as Tabulated,
+)
 from .io import (
     dipole_starts as dipole_starts,
     load_material as load_material,

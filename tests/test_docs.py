@@ -39,7 +39,9 @@ def test_the_function_of_an_equation_names_it(equation):
     assert f"Eq. {equation}" in getattr(importlib.import_module(module), attribute).__doc__
 
 
-@pytest.mark.parametrize("page", ["README.md", "CHANGELOG.md", "docs/conventions.md", "docs/equations.md"])
+@pytest.mark.parametrize(
+    "page", ["README.md", "CHANGELOG.md", "docs/conventions.md", "docs/equations.md", "docs/which_profile.md"]
+)
 def test_links_lead_to_files(page):
     place = ROOT / page
     for target in re.findall(r"\]\(([^)#]+)\)", place.read_text(encoding="utf-8")):

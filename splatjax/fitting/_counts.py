@@ -8,7 +8,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from splatjax.gaussians import AbstractProfile
-from splatjax.scattering import NORM_RULE, RadialRule
+from splatjax.scattering import NORM_RULE, AbstractRadialRule
 
 from ._search import GivenVariances, InsertedGaussians, constant, ladder
 from ._spread import AbstractSpread, SharedVariances
@@ -51,7 +51,7 @@ def error_by_count(
     *,
     spread: AbstractSpread | None = None,
     weights: AbstractWeights | None = None,
-    rule: RadialRule = NORM_RULE,
+    rule: AbstractRadialRule = NORM_RULE,
 ) -> ErrorByCount:
     r"""Find the best sums of 1, 2, ... Gaussians in one search, and what error each leaves.
 
@@ -91,7 +91,7 @@ def check_count(name: str, count: int) -> None:
 
 @eqx.filter_jit
 def _error_by_count(
-    profile: AbstractProfile, largest: int, spread: AbstractSpread, weights: AbstractWeights, rule: RadialRule
+    profile: AbstractProfile, largest: int, spread: AbstractSpread, weights: AbstractWeights, rule: AbstractRadialRule
 ) -> ErrorByCount:
     def climb(problem, start):
         del start

@@ -4,14 +4,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from splatjax.gaussians import AbstractProfile, SumOfGaussians
-from splatjax.scattering import NORM_RULE, RadialRule, at_own_radii
+from splatjax.scattering import NORM_RULE, AbstractRadialRule, at_own_radii
 
 
 def norm_radii(
-    profile: AbstractProfile, rule: RadialRule
+    profile: AbstractProfile, rule: AbstractRadialRule
 ) -> tuple[Float[Array, "nodes channels"], Float[Array, "nodes channels"]]:
     """Give radii and weights of integrals of `r R^2`, or say that there is none."""
-    if profile.singular and rule.near > 0:
+    if profile.singular and rule.reaches_origin:
         raise ValueError(
             f"{type(profile).__name__} goes to infinity like 1/r, so that the integral of r R^2 from 0 (Eq. 3) does not exist; "
             "state where it starts, in length scales of the profile: rule=NORM_RULE.beyond(1.0)"
@@ -19,7 +19,9 @@ def norm_radii(
     return rule.radii(profile)
 
 
-def squared_error(profile: AbstractProfile, gaussians: SumOfGaussians, rule: RadialRule = NORM_RULE) -> Float[Array, " channels"]:
+def squared_error(
+    profile: AbstractProfile, gaussians: SumOfGaussians, rule: AbstractRadialRule = NORM_RULE
+) -> Float[Array, " channels"]:
     r"""Give the error that a fit minimizes, the integral over r of `r (R(r) - sum_i w_i G(v_i, r))^2` (Eq. 3).
 
     **Arguments:**
@@ -40,7 +42,7 @@ def squared_error(profile: AbstractProfile, gaussians: SumOfGaussians, rule: Rad
 
 
 def relative_error(
-    profile: AbstractProfile, gaussians: SumOfGaussians, rule: RadialRule = NORM_RULE
+    profile: AbstractProfile, gaussians: SumOfGaussians, rule: AbstractRadialRule = NORM_RULE
 ) -> Float[Array, " channels"]:
     r"""Give the relative error of a fit, the root of Eq. 3 over that of the integral of `r R(r)^2` (Eq. 4).
 

@@ -8,7 +8,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
 from splatjax.gaussians import AbstractProfile, SumOfGaussians
-from splatjax.scattering import NORM_RULE, RadialRule
+from splatjax.scattering import NORM_RULE, AbstractRadialRule
 
 from ._counts import LeastCount, check_count, error_by_count
 from ._problem import Outcome, Problem
@@ -46,7 +46,7 @@ def fit_gaussians(
     spread: AbstractSpread | None = None,
     weights: AbstractWeights | None = None,
     start: AbstractStart | None = None,
-    rule: RadialRule = NORM_RULE,
+    rule: AbstractRadialRule = NORM_RULE,
     throw: bool = True,
 ) -> FitResult:
     r"""Fit a sum of Gaussians to a profile: the least Eq. 3 over variances and weights.
@@ -66,7 +66,7 @@ def fit_gaussians(
     - `spread`: `SharedVariances()` (default) or `VariancesPerChannel()`.
     - `weights`: `FreeWeights()` (default), `TotalReflectanceHeld()`, or `NonNegativeWeights()` among either.
     - `start`: `InsertedGaussians()` (default), which finds the best fit; or `GivenVariances(...)` near it, which is fast.
-    - `rule`: radii of the integral, in length scales of the profile.
+    - `rule`: radii of the integral, in length scales of the profile; or `InverseVariance()`, for one with standard errors.
     - `throw`: raise if the search has not converged; otherwise `result` says so.
 
     **Returns:** a `FitResult`; neither `error` nor `weights` depends on the unit of length.
@@ -102,7 +102,7 @@ def _fit_compiled(
     count: int,
     spread: AbstractSpread,
     weights: AbstractWeights,
-    rule: RadialRule,
+    rule: AbstractRadialRule,
     start: AbstractStart,
 ) -> FitResult:
     problem = spread.problem(profile, weights, rule)

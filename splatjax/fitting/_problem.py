@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from splatjax.gaussians import AbstractProfile, SumOfGaussians, gaussian
-from splatjax.scattering import RadialRule, at_own_radii
+from splatjax.scattering import AbstractRadialRule, at_own_radii
 
 from ._dense import invert_moving
 from ._errors import norm_radii
@@ -166,7 +166,7 @@ class Problem(eqx.Module):
         return jnp.sqrt(8 * jnp.pi**2 * variances)
 
 
-def make_problem(profile: AbstractProfile, weights: AbstractWeights, rule: RadialRule) -> Problem:
+def make_problem(profile: AbstractProfile, weights: AbstractWeights, rule: AbstractRadialRule) -> Problem:
     """State the fit of all channels of a profile."""
     r, dr = norm_radii(profile, rule)
     values = at_own_radii(profile, r)

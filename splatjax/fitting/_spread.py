@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 
 from splatjax.gaussians import AbstractProfile
-from splatjax.scattering import RadialRule
+from splatjax.scattering import AbstractRadialRule
 
 from ._problem import Problem, make_problem
 from ._search import AbstractStart
@@ -19,7 +19,7 @@ class AbstractSpread(eqx.Module):
     """Which channels of a fit share their variances: the problem of a profile is one, or one for each channel."""
 
     @abc.abstractmethod
-    def problem(self, profile: AbstractProfile, weights: AbstractWeights, rule: RadialRule) -> Problem:
+    def problem(self, profile: AbstractProfile, weights: AbstractWeights, rule: AbstractRadialRule) -> Problem:
         """State what is to be fitted, with a leading axis if there is more than one problem."""
 
     @abc.abstractmethod
@@ -33,7 +33,7 @@ class SharedVariances(AbstractSpread):
     The fit minimizes the sum over the channels of the square of Eq. 4.
     """
 
-    def problem(self, profile: AbstractProfile, weights: AbstractWeights, rule: RadialRule) -> Problem:
+    def problem(self, profile: AbstractProfile, weights: AbstractWeights, rule: AbstractRadialRule) -> Problem:
         return make_problem(profile, weights, rule)
 
     def over(self, function: Callable[[Problem, AbstractStart], Any], problem: Problem, start: AbstractStart) -> Any:
@@ -43,7 +43,7 @@ class SharedVariances(AbstractSpread):
 class VariancesPerChannel(AbstractSpread):
     """Variances of its own for each channel: one `SumOfGaussians` of one channel for each, batched along a leading axis."""
 
-    def problem(self, profile: AbstractProfile, weights: AbstractWeights, rule: RadialRule) -> Problem:
+    def problem(self, profile: AbstractProfile, weights: AbstractWeights, rule: AbstractRadialRule) -> Problem:
         shared = make_problem(profile, weights, rule)
         fields = (shared.squared_radii, shared.root_weights, shared.target, shared.norm, shared.total)
         unit = jax.lax.stop_gradient(profile.length_scale())

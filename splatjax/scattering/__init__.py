@@ -14,6 +14,7 @@ from ._layers import Film as Film, Layer as Layer
 from ._medium import check_range as check_range, Medium as Medium
 from ._multipole import Multipole as Multipole
 from ._photon_beam import PhotonBeam as PhotonBeam
+from ._quadrature import AbstractRadialRule as AbstractRadialRule, InverseVariance as InverseVariance
 from ._quadrature import NORM_RULE as NORM_RULE, TOTAL_RULE as TOTAL_RULE, RadialRule as RadialRule
 from ._quadrature import at_own_radii as at_own_radii, integrated_reflectance as integrated_reflectance
 from ._rough import RoughFresnel as RoughFresnel

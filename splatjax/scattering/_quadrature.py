@@ -1,5 +1,6 @@
 """Radial integrals of profiles: one rule in units of a profile's own length, the same for every medium."""
 
+import abc
 import functools
 
 import equinox as eqx
@@ -11,7 +12,20 @@ from jaxtyping import Array, Float
 from splatjax.gaussians import AbstractProfile
 
 
-class RadialRule(eqx.Module):
+class AbstractRadialRule(eqx.Module):
+    """How integrals over r weigh a profile's radii."""
+
+    @abc.abstractmethod
+    def radii(self, profile: AbstractProfile) -> tuple[Float[Array, "nodes channels"], Float[Array, "nodes channels"]]:
+        """Give the radii and weights `dr` for each channel, mm."""
+
+    @property
+    @abc.abstractmethod
+    def reaches_origin(self) -> bool:
+        """Whether the integral starts at 0, where some profiles are infinite."""
+
+
+class RadialRule(AbstractRadialRule):
     r"""Nodes and weights for integrals over r in [0, inf), in units of a profile's `length_scale()`.
 
     One Gauss-Legendre panel in log r from `smallest` to `largest`, and a linear one from 0 to `smallest`. Equally spaced radii
@@ -38,6 +52,10 @@ class RadialRule(eqx.Module):
             raise ValueError(f"cut must be between 0 and {self.largest} length scales; got {cut}")
         return RadialRule(float(cut), self.largest, self.count, near=0)
 
+    @property
+    def reaches_origin(self) -> bool:
+        return self.near > 0
+
     def nodes(self, dtype) -> tuple[Float[Array, " nodes"], Float[Array, " nodes"]]:
         """Give radii and weights `dr`, in length scales, ascending."""
         nodes, weights = _nodes(self.smallest, self.largest, self.count, self.near)
@@ -58,6 +76,40 @@ class RadialRule(eqx.Module):
             first = 0.0 if self.near else self.smallest
             return radii, jnp.where((radii >= first * scale) & (radii <= self.largest * scale), weights, jnp.zeros_like(weights))
         return jnp.broadcast_to(nodes[:, None], shape) * scale, jnp.broadcast_to(weights[:, None], shape) * scale
+
+
+class InverseVariance(AbstractRadialRule):
+    r"""The radii of a table, each weighed by its standard error: integrals of `r f(r)^2` become sums of `f^2 / deviation^2`.
+
+    A fit by it has the least chi-squared, and its `error` is the root of that over the sum of `(R / deviation)^2`. Radii without
+    an error, which no photon reached, are left out.
+
+    **Attributes:**
+
+    - `among`: which radii count, in length scales of the profile: by default all, `NORM_RULE.beyond(1.0)` for a cut.
+
+    **Raises:** `ValueError`, when used, for a profile that has no `deviation`.
+    """
+
+    among: RadialRule
+
+    def __init__(self, among: RadialRule | None = None):
+        self.among = NORM_RULE if among is None else among
+
+    @property
+    def reaches_origin(self) -> bool:
+        return self.among.reaches_origin
+
+    def radii(self, profile):
+        deviation = getattr(profile, "deviation", None)
+        if deviation is None:
+            raise ValueError(
+                f"{type(profile).__name__} has no standard errors to weigh by; Tabulated(radii, values, deviation) and "
+                "monte_carlo(...).profile() have"
+            )
+        r, dr = self.among.radii(profile)
+        known = (dr > 0) & (deviation > 0) & (r > 0)
+        return r, jnp.where(known, 1 / jnp.where(known, deviation * deviation * r, 1.0), 0.0)
 
 
 NORM_RULE = RadialRule(smallest=1e-3, largest=1e4, count=192)

@@ -15,14 +15,15 @@ from ._medium import check_range
 class Tabulated(AbstractProfile):
     r"""A profile given at radii, linear in between: constant within the first radius, 0 beyond the last.
 
-    Nothing is invented: what leaves beyond the last radius is not in the total, and integrals of the profile, those of a fit as
-    well, are sums over its radii. Differentiable in values, radii, and `r`.
+    Nothing is invented: what leaves beyond the last radius is not in the total unless that is given, and integrals of the
+    profile, those of a fit as well, are sums over its radii. Differentiable in values, radii, `r`, and the total.
 
     **Attributes:**
 
     - `radii`: mm, at least two; they ascend from at least 0.
     - `values`: 1/mm^2, one row per radius. May be negative, as noise is.
     - `deviation`: standard errors of the values, of their shape, or None where they are unknown. Constants of every derivative.
+    - `total`: the total reflectance of each channel, or None: then it is the integral of the lines.
 
     **Raises:** `ValueError` for radii that do not ascend, for values that are not finite, and for shapes that do not match.
     """
@@ -30,16 +31,19 @@ class Tabulated(AbstractProfile):
     radii: Float[Array, " samples"]
     values: Float[Array, "samples channels"]
     deviation: Float[Array, "samples channels"] | None
+    total: Float[Array, " channels"] | None
 
     def __init__(
         self,
         radii: Float[Array, " samples"],
         values: Float[Array, " samples_"] | Float[Array, "samples_ channels"],
         deviation: Float[Array, " samples_"] | Float[Array, "samples_ channels"] | None = None,
+        total: Float[Array, " channels"] | None = None,
     ):
         self.radii = radii
         self.values = values if values.ndim == 2 else values[:, None]
         self.deviation = deviation if deviation is None or deviation.ndim == 2 else deviation[:, None]
+        self.total = total
 
     def __check_init__(self):
         samples, rows = self.radii.shape[0], self.values.shape[0]
@@ -61,7 +65,9 @@ class Tabulated(AbstractProfile):
         return jnp.stack(columns, axis=-1).reshape(*r.shape, -1)
 
     def total_reflectance(self) -> Float[Array, " channels"]:
-        """Give `2 pi` times the integral of `r R(r)`, exactly that of the straight lines."""
+        """Give the total, or else `2 pi` times the integral of `r R(r)`, exactly that of the straight lines."""
+        if self.total is not None:
+            return self.total
         a, b = self.radii[:-1], self.radii[1:]
         lines = ((b - a) * (2 * a + b) / 6) @ self.values[:-1] + ((b - a) * (a + 2 * b) / 6) @ self.values[1:]
         return 2 * jnp.pi * (0.5 * self.radii[0] ** 2 * self.values[0] + lines)

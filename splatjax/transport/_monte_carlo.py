@@ -59,12 +59,12 @@ class MonteCarlo(eqx.Module):
         return 2 / 3 * (a * a + a * b + b * b) / (a + b)
 
     def profile(self) -> Tabulated:
-        """Give the reflectance as a profile."""
-        return Tabulated(self.radii, self.reflected.value, self.reflected.deviation)
+        """Give the reflectance as a profile; its total is that of all that leaves, farther out than the last ring too."""
+        return Tabulated(self.radii, self.reflected.value, self.reflected.deviation, self.total_reflectance.value)
 
     def transmitted_profile(self) -> Tabulated:
         """Give the transmittance as a profile."""
-        return Tabulated(self.radii, self.transmitted.value, self.transmitted.deviation)
+        return Tabulated(self.radii, self.transmitted.value, self.transmitted.deviation, self.total_transmittance.value)
 
     def balance(self) -> Float[Array, " channels"]:
         """Give all that is accounted for, less 1: rounding, and the chance by which faint photons are given up."""

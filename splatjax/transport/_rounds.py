@@ -15,13 +15,13 @@ from ._stack import Stack
 from ._tally import Tally
 from ._walk import IDLE, INSIDE, Optics, PathWeights, Photons, fly, weigh
 
-LANES = 8192
+LANES = 16384
 """Photons on their way at once: their state stays in the cache of a core or two."""
 
-_FLIGHTS = 8
+_FLIGHTS = 4
 """Flights between two looks at who is done."""
 
-_ROUNDS = 128
+_ROUNDS = 256
 """Rounds of one compiled call: a second or so, after which progress is told."""
 
 _LEAST, _SURVIVING = 1e-4, 0.1

@@ -45,7 +45,7 @@ class Tally(eqx.Module):
 
         def leave(carried, slope, edges):
             # Within the first edge and beyond the last is farther out too: no ring knows it.
-            ring = jnp.searchsorted(edges, radius, side="right") - 1
+            ring = jnp.searchsorted(edges, radius, side="right", method="scan_unrolled") - 1
             ring = jnp.where((ring < 0) | (ring >= rings), rings, ring)
             ring = jnp.where(photons.place == ABOVE, ring, jnp.where(photons.place == BELOW, ring + rings + 1, 2 * rings + 2))
             counts = (done & ~dropped).astype(carried.dtype)

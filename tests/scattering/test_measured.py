@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from splatjax.fitting import NonNegativeWeights, fit_gaussians, relative_error
+from splatjax.fitting import NonNegativeWeights, TotalReflectanceHeld, fit_gaussians, relative_error
 from splatjax.gaussians import SumOfGaussians
-from splatjax.scattering import NORM_RULE, Tabulated, integrated_reflectance, measure_laser_dot
+from splatjax.scattering import NORM_RULE, InverseVariance, Tabulated, integrated_reflectance, measure_laser_dot
 
 TRUTH = ([0.3, 2.0], [[0.3, 0.2], [0.4, 0.1]])
 MM_PER_PIXEL = 0.1
@@ -53,6 +53,48 @@ def test_covariance_of_a_measured_fit_is_the_scatter_of_its_repetitions(float64)
     found = np.concatenate([fitted.gaussians.variances, fitted.gaussians.weights[..., 0]], axis=1)
     stated = np.asarray(fitted.covariance) / (80 - 4)
     np.testing.assert_allclose(np.cov(found.T), np.median(stated, axis=0), rtol=0.3, atol=2e-7)
+
+
+def test_a_fit_weighed_by_its_errors_is_the_likeliest(float64):
+    """Noise of very different sizes: the scatter of repetitions is as stated, and less than by the integral's weights."""
+    r = jnp.linspace(0.05, 5.0, 80)
+    clean = np.asarray(truth()(r))[:, :1]
+    deviation = jnp.asarray(0.03 * clean + 1e-5)
+    noise = np.random.default_rng(1).normal(size=(200, 80, 1))
+    values = jnp.asarray(clean + np.asarray(deviation) * noise)
+
+    def fit(values, rule):
+        return fit_gaussians(Tabulated(r, values, deviation), 2, rule=rule, throw=False)
+
+    fits = eqx.filter_jit(eqx.filter_vmap(fit, in_axes=(0, None)))
+    found, plain = fits(values, InverseVariance()), fits(values, NORM_RULE)
+    parameters = np.concatenate([found.gaussians.variances, found.gaussians.weights[..., 0]], axis=1)
+    stated = np.asarray(found.covariance) / (80 - 4)
+    np.testing.assert_allclose(np.cov(parameters.T), np.median(stated, axis=0), rtol=0.3, atol=1e-6)
+    chi_squared = np.asarray(found.error)[:, 0] ** 2 * np.sum((np.asarray(values) / np.asarray(deviation)) ** 2, axis=(1, 2))
+    assert abs(np.mean(chi_squared) - (80 - 4)) < 3
+    assert np.std(found.gaussians.weights[:, 1, 0]) < 0.7 * np.std(plain.gaussians.weights[:, 1, 0])
+
+
+def test_weighing_needs_errors(float64):
+    r = jnp.linspace(0.05, 5.0, 30)
+    with pytest.raises(ValueError, match="Tabulated has no standard errors to weigh by"):
+        fit_gaussians(Tabulated(r, truth()(r)), 2, rule=InverseVariance())
+    with pytest.raises(ValueError, match="SumOfGaussians has no standard errors"):
+        fit_gaussians(truth(), 2, rule=InverseVariance())
+    # Radii that nothing was counted at say nothing.
+    deviation = jnp.where(r < 4, 1e-3, 0.0)
+    radii, weights = InverseVariance().radii(Tabulated(r, truth()(r)[:, 0], deviation))
+    np.testing.assert_array_equal(np.asarray(weights)[:, 0] > 0, np.asarray(r) < 4)
+    np.testing.assert_allclose((weights * radii)[:5, 0], 1e6, rtol=1e-12)
+
+
+def test_a_total_that_is_known_is_held(float64):
+    r = jnp.linspace(0.05, 2.0, 60)
+    table = Tabulated(r, truth()(r), total=truth().total_reflectance())
+    assert Tabulated(r, truth()(r)).total_reflectance()[0] < 0.85 * table.total_reflectance()[0]
+    fitted = fit_gaussians(table, 2, weights=TotalReflectanceHeld())
+    np.testing.assert_allclose(fitted.gaussians.weights, truth().weights, rtol=1e-6)
 
 
 def test_a_photograph_gives_the_profile_and_its_noise(float64):
