@@ -13,6 +13,7 @@ from splatjax.fitting import AbstractWeights
 from splatjax.io import read_picture
 from splatjax.scattering import measure_laser_dot
 
+from ._models import Model, Reference, reference
 from ._outputs import OptionalPath, check_output
 from ._report import stage
 
@@ -26,6 +27,9 @@ class Fit:
     reflectance of the profile, so that the picture keeps its energy, unless --free is given. To measured profiles, whose totals
     are not known, weights are fitted freely, but not below zero.
 
+    A medium is taken for what --model says: the dipole, which publications use, or one that comes nearer to the truth, or the
+    truth itself (docs/which_profile.md).
+
     Example: splatjax fit marble --count 6 --output marble.toml --plot marble.png
     """
 
@@ -36,6 +40,12 @@ class Fit:
     """Number of Gaussians."""
     error: float | None = None
     """Take the least number of Gaussians, up to 12, that leaves no channel a larger error (Eq. 4), instead of --count."""
+    model: tyro.conf.EnumChoicesFromValues[Model] = Model.DIPOLE
+    """Of coefficients: what makes a profile of them. The layers of a material are multipoles, or are walked by Monte Carlo."""
+    cut: float = 0.2
+    """Of photon beams and Monte Carlo, which are infinite at the origin: where the fit begins, in mean free paths."""
+    photons: int = 1_000_000
+    """Of Monte Carlo: how many walk."""
     free: bool = False
     """Leave the weights free: the least error of Eq. 3, which may miss some of the energy."""
     mm_per_unit: float = 1.0
@@ -59,14 +69,19 @@ class Fit:
             self._run()
 
     def _run(self) -> None:
-        profile = self._profile()
+        coefficients = self._coefficients()
+        if isinstance(coefficients, sj.Tabulated):
+            made = Reference(coefficients, sj.NORM_RULE)
+        else:
+            made = reference(coefficients, self.model, self.cut, self.photons)
+        profile = made.profile
         count = self.count if self.error is None else sj.LeastCount(self.error)
         title = f"{self.count} Gaussians" if self.error is None else f"Gaussians to an error of {self.error:g}"
         with stage(f"fitting {title} to {self.medium}"):
-            fitted = jax.block_until_ready(sj.fit_gaussians(profile, count, weights=self._weights(profile)))
+            fitted = jax.block_until_ready(sj.fit_gaussians(profile, count, weights=self._weights(coefficients), rule=made.rule))
         _print(fitted)
         if self.output is not None:
-            self._save(self.output, profile, fitted)
+            self._save(self.output, coefficients, made, fitted)
             print(self.output)
         if self.plot is not None:
             from splatjax.io import atomic_path
@@ -78,7 +93,7 @@ class Fit:
                 figure.savefig(written)
             print(self.plot)
 
-    def _profile(self) -> sj.Dipole | sj.LayeredMultipole | sj.Tabulated:
+    def _coefficients(self) -> sj.Dipole | sj.LayeredMultipole | sj.Tabulated:
         match Path(self.medium).suffix.lower():
             case ".csv":
                 return sj.read_profile(self.medium, mm_per_unit=self.mm_per_unit)
@@ -98,9 +113,15 @@ class Fit:
             return sj.FreeWeights()
         return sj.NonNegativeWeights(sj.FreeWeights() if isinstance(profile, sj.Tabulated) else sj.TotalReflectanceHeld())
 
-    def _save(self, output: Path, profile: sj.Dipole | sj.LayeredMultipole | sj.Tabulated, fitted: sj.FitResult) -> None:
+    def _save(
+        self,
+        output: Path,
+        coefficients: sj.Dipole | sj.LayeredMultipole | sj.Tabulated,
+        made: Reference,
+        fitted: sj.FitResult,
+    ) -> None:
         # The surface keeps the library's defaults; its index is that of the medium it bounds, if one is known.
-        measured = isinstance(profile, sj.Tabulated)
+        measured = isinstance(coefficients, sj.Tabulated)
         fitted_to = f"{'profile' if measured else 'coefficients'} of {self.medium}"
         source = {"provenance": f"fitted by splatjax {sj.__version__} to the {fitted_to}"}
         how = {
@@ -112,9 +133,13 @@ class Fit:
         if measured:
             sj.save_material(sj.Material(fitted.gaussians), output, source=source, fit={"profile": "measured"} | how)
         else:
-            medium = profile.medium if isinstance(profile, sj.Dipole) else profile.top.medium
+            medium = coefficients.medium if isinstance(coefficients, sj.Dipole) else coefficients.top.medium
             material = sj.Material(fitted.gaussians, eta=medium.eta[0])
-            sj.save_material(material, output, profile=profile, source=source, fit=how)
+            if isinstance(made.profile, sj.Tabulated):
+                walked = {"profile": f"Monte Carlo, {self.photons} photons"}
+                sj.save_material(material, output, profile=coefficients, source=source, fit=how | walked)
+            else:
+                sj.save_material(material, output, profile=made.profile, source=source, fit=how)
 
     def _weights_of(self, measured: bool) -> str:
         if self.free:

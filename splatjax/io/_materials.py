@@ -13,7 +13,7 @@ import numpy as np
 import tomli_w
 
 from splatjax.gaussians import SumOfGaussians
-from splatjax.scattering import Dipole, ExactFresnel, Film, Layer, LayeredMultipole, Medium
+from splatjax.scattering import BetterDipole, Dipole, ExactFresnel, Film, Layer, LayeredMultipole, Medium, PhotonBeam
 from splatjax.scene import Material
 
 from ._atomic import atomic_path
@@ -102,7 +102,7 @@ def save_material(
     material: Material,
     path: str | os.PathLike[str],
     *,
-    profile: Dipole | LayeredMultipole | None = None,
+    profile: Dipole | BetterDipole | PhotonBeam | LayeredMultipole | None = None,
     source: Mapping[str, Any] | None = None,
     fit: Mapping[str, Any] | None = None,
 ) -> None:
@@ -119,10 +119,10 @@ def save_material(
     **Raises:** `OSError` if the file cannot be written.
     """
     tables: dict[str, Any] = {}
-    if isinstance(profile, Dipole):
-        tables["medium"] = _plain_medium(profile.medium)
     if isinstance(profile, LayeredMultipole):
         tables["layers"] = [_plain_layer(layer) for layer in profile.layers]
+    elif profile is not None:
+        tables["medium"] = _plain_medium(profile.medium)
     surface = {"eta": material.eta, "specular": material.specular, "roughness": material.roughness}
     tables["surface"] = {name: _plain(value) for name, value in surface.items()}
     tables["source"] = dict(source or {})
@@ -138,9 +138,17 @@ def save_material(
         temporary.write_text(_one_line_arrays(tomli_w.dumps(tables)), encoding="utf-8")
 
 
-def _description(profile: Dipole | LayeredMultipole) -> str:
+def _description(profile: Dipole | BetterDipole | PhotonBeam | LayeredMultipole) -> str:
     moments = "exact Fresnel moments" if isinstance(profile.fresnel, ExactFresnel) else "fitted Fresnel moments"
-    model = "classical dipole" if isinstance(profile, Dipole) else f"multipole of {len(profile.layers)} layers"
+    match profile:
+        case Dipole():
+            model = "classical dipole"
+        case BetterDipole():
+            model = "better dipole"
+        case PhotonBeam():
+            model = "photon beam with single scattering"
+        case LayeredMultipole():
+            model = f"multipole of {len(profile.layers)} layers"
     return f"{model}, {moments}"
 
 

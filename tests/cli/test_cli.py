@@ -98,6 +98,27 @@ def test_fit_takes_a_table_and_the_least_count(tmp_path, capsys):
 
 
 @pytest.mark.once
+@pytest.mark.parametrize(
+    ("model", "said"),
+    [
+        ("better-dipole", "better dipole, exact"),
+        ("photon-beam", "photon beam with"),
+        ("monte-carlo", "Monte Carlo, 20000 photons"),
+    ],
+)
+def test_fit_takes_the_model_that_is_asked_for(model, said, tmp_path, capsys):
+    output = tmp_path / "skin.toml"
+    command = ["fit", "skin1", "--model", model, "--photons", "20000", "--count", "3", "--output", str(output)]
+    assert main(command) == 0
+    assert str(output) in capsys.readouterr().out
+    assert said in output.read_text()
+    total = np.asarray(sj.load_material(output).gaussians.total_reflectance())
+    # What leaves skin, by Monte Carlo (MCML), and by how much each model misses it.
+    np.testing.assert_allclose(total, [0.4395, 0.2133, 0.1155], rtol={"better-dipole": 0.12, "photon-beam": 0.1}.get(model, 0.05))
+    assert "this material has layers" in failure(["fit", "skin_layers", "--model", "photon-beam"], capsys)
+
+
+@pytest.mark.once
 def test_fit_takes_a_photograph_that_any_program_wrote(tmp_path, capsys):
     photograph, output = tmp_path / "dot.exr", tmp_path / "dot.toml"
     y, x = (np.mgrid[:60, :60] - 29.5) * 0.2

@@ -113,10 +113,10 @@ def test_rings_are_where_they_say(dtype):
 
 def test_progress_is_told(float32):
     told = []
-    sj.monte_carlo([layer([0.1, 0.1], 1.0, 1.0)], 500_000, KEY, progress=lambda done, photons: told.append((done, photons)))
+    sj.monte_carlo([layer([0.1, 0.1], 1.0, 1.0)], 2_000_000, KEY, progress=lambda done, photons: told.append((done, photons)))
     assert len(told) > 1
     assert told == sorted(told)
-    assert told[-1] == (500_000, 500_000)
+    assert told[-1] == (2_000_000, 2_000_000)
 
 
 def test_bad_arguments_are_refused():

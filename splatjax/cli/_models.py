@@ -1,0 +1,61 @@
+"""What `splatjax fit` makes of coefficients: the models of `docs/which_profile.md` by name."""
+
+import sys
+from dataclasses import dataclass
+from enum import Enum
+
+import jax
+import jax.numpy as jnp
+from rich.progress import Progress
+
+import splatjax as sj
+from splatjax.scattering import AbstractRadialRule
+
+
+class Model(Enum):
+    """Names of the models."""
+
+    DIPOLE = "dipole"
+    BETTER_DIPOLE = "better-dipole"
+    PHOTON_BEAM = "photon-beam"
+    MONTE_CARLO = "monte-carlo"
+
+
+@dataclass(frozen=True)
+class Reference:
+    """A profile to be fitted, and where its fit begins."""
+
+    profile: sj.Dipole | sj.BetterDipole | sj.PhotonBeam | sj.LayeredMultipole | sj.Tabulated
+    rule: AbstractRadialRule
+
+
+def reference(coefficients: sj.Dipole | sj.LayeredMultipole, model: Model, cut: float, photons: int) -> Reference:
+    """Give what a model makes of a medium or of layers; `cut` is in mean free paths.
+
+    **Raises:** `ValueError` for layers and a model that knows a half space alone.
+    """
+    layered = isinstance(coefficients, sj.LayeredMultipole)
+    if model is Model.DIPOLE:
+        return Reference(coefficients, sj.NORM_RULE)
+    if model is Model.MONTE_CARLO:
+        layers = coefficients.layers if layered else (sj.Layer(coefficients.medium, jnp.asarray(jnp.inf)),)
+        return Reference(_walked(layers, photons), sj.NORM_RULE.beyond(cut))
+    if layered:
+        raise ValueError(f"--model {model.value} knows a half space, and this material has layers; take dipole or monte-carlo")
+    if model is Model.BETTER_DIPOLE:
+        return Reference(sj.BetterDipole(coefficients.medium), sj.NORM_RULE)
+    return Reference(sj.PhotonBeam(coefficients.medium), sj.NORM_RULE.beyond(cut))
+
+
+def _walked(layers: tuple[sj.Layer | sj.Film, ...], photons: int) -> sj.Tabulated:
+    """Walk in single precision, which is what photons need; the profile is then fitted in double."""
+    single = jax.tree.map(lambda each: each.astype(jnp.float32), list(layers))
+    with Progress(console=None, disable=not sys.stderr.isatty(), transient=True) as progress:
+        task = progress.add_task("walking photons", total=1.0)
+        found = sj.monte_carlo(
+            single,
+            photons,
+            jax.random.key(0),
+            progress=lambda done, photons: progress.update(task, completed=done / photons),
+        )
+    return jax.tree.map(lambda each: each.astype(jnp.float64), found.profile())
