@@ -88,7 +88,7 @@ class Fit:
             from splatjax.plots import plot_fit  # loads matplotlib
 
             found = len(fitted.gaussians.variances)
-            figure = plot_fit(profile, fitted.gaussians, title=f"{self.medium}, {found} Gaussians")
+            figure = plot_fit(profile, fitted.gaussians, rule=made.rule, title=f"{self.medium}, {found} Gaussians")
             with atomic_path(self.plot) as written:
                 figure.savefig(written)
             print(self.plot)

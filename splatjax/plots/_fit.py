@@ -5,11 +5,13 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 from splatjax.fitting import relative_error
 from splatjax.gaussians import AbstractProfile, SumOfGaussians, gaussian
+from splatjax.scattering import NORM_RULE, AbstractRadialRule
 
 _RGB = ("#c0392b", "#27853f", "#2c5aa0")
 _POINTS = 400
@@ -17,7 +19,9 @@ _TAIL = 1e-7
 """Share of its peak down to which a profile is drawn."""
 
 
-def plot_fit(profile: AbstractProfile, gaussians: SumOfGaussians, *, title: str | None = None) -> Figure:
+def plot_fit(
+    profile: AbstractProfile, gaussians: SumOfGaussians, *, rule: AbstractRadialRule = NORM_RULE, title: str | None = None
+) -> Figure:
     r"""Draw a profile and its fit, on linear and on logarithmic axes, and the difference between them.
 
     Three channels are drawn in red, green and blue; the single
@@ -28,13 +32,14 @@ def plot_fit(profile: AbstractProfile, gaussians: SumOfGaussians, *, title: str 
 
     - `profile`: the reference, 1/mm^2.
     - `gaussians`: the fit, with as many channels.
+    - `rule`: that of the fit. Radii before it begins are shaded, and do not count.
     - `title`: of the figure.
 
     **Returns:** a matplotlib `Figure`, which no window shows; `figure.savefig(path)` writes it.
     """
     r = _radii(profile)
     reference, fitted = (np.asarray(model(r), np.float64) for model in (profile, gaussians))
-    error = np.asarray(relative_error(profile, gaussians))
+    error = np.asarray(relative_error(profile, gaussians, rule))
     energy = np.asarray(gaussians.total_reflectance() / profile.total_reflectance() - 1)
     radii = np.asarray(r)
     colors = colors_of(len(error))
@@ -66,11 +71,30 @@ def plot_fit(profile: AbstractProfile, gaussians: SumOfGaussians, *, title: str 
     residual.axhline(0, color="0.6", linewidth=0.8)
     residual.set(xlabel="r (mm)", ylabel="r (fit - R) / max r R", xlim=(radii[0], radii[-1]))
     residual.set_title("residual", fontsize="medium")
+    if not rule.reaches_origin:
+        _shade(rule, profile, (log, residual))
+        counts = radii >= _begin(rule, profile)
+        left = radii[:, None] * (fitted - reference) / np.max(radii[:, None] * reference, axis=0)
+        residual.set_ylim(1.3 * min(left[counts].min(), -1e-3), 1.3 * max(left[counts].max(), 1e-3))
     for axis in (log.xaxis, residual.xaxis):
         axis.set_minor_formatter(NullFormatter())  # over less than a decade their labels would overlap
     if title is not None:
         figure.suptitle(title)
     return figure
+
+
+def _begin(rule: AbstractRadialRule, profile: AbstractProfile) -> float:
+    """The radius, mm, from which on some channel is fitted."""
+    r, dr = (np.asarray(each) for each in rule.radii(profile))
+    return float(r[dr > 0].min())
+
+
+def _shade(rule: AbstractRadialRule, profile: AbstractProfile, axes: Sequence[Axes]) -> None:
+    for each in axes:
+        each.axvspan(each.get_xlim()[0], _begin(rule, profile), color="0.93", zorder=0)
+    axes[-1].text(
+        _begin(rule, profile), 0.03, "not fitted ", ha="right", transform=axes[-1].get_xaxis_transform(), fontsize="small"
+    )
 
 
 def colors_of(channels: int) -> Sequence[str]:

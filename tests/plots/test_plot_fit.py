@@ -5,6 +5,7 @@ import matplotlib.pyplot
 import numpy as np
 import pytest
 
+import splatjax as sj
 from splatjax.gaussians import SumOfGaussians
 from splatjax.io import load_material, load_medium
 from splatjax.plots import plot_fit
@@ -41,3 +42,18 @@ def test_one_channel_and_a_perfect_fit(dtype):
     gaussians = SumOfGaussians(jnp.asarray([0.1, 2.0], dtype), jnp.asarray([[0.3], [0.4]], dtype))
     residual = plot_fit(gaussians, gaussians).axes[2].lines[0].get_ydata()
     np.testing.assert_array_equal(residual, 0)
+
+
+def test_what_was_not_fitted_is_shaded_and_not_counted(dtype):
+    """A photon beam is infinite at the origin: only a rule with a cut has an error at all."""
+    beam = sj.PhotonBeam(sj.Medium(*(jnp.asarray([x], dtype) for x in (0.0041, 2.62, 1.5))))
+    rule = sj.NORM_RULE.beyond(0.5)
+    fitted = sj.fit_gaussians(beam, 2, rule=rule)
+    figure = plot_fit(beam, fitted.gaussians, rule=rule)
+    legend = figure.axes[0].get_legend().get_texts()[0].get_text()
+    assert f"E = {float(fitted.error[0]):.2e}" in legend
+    for axes in figure.axes[1:]:
+        (shade,) = [patch for patch in axes.patches if patch.get_facecolor()[:3] == (0.93, 0.93, 0.93)]
+        np.testing.assert_allclose(shade.get_x() + shade.get_width(), 0.5 / 2.6241, rtol=0.05)
+    with pytest.raises(ValueError, match="infinity like 1/r"):
+        plot_fit(beam, fitted.gaussians)
