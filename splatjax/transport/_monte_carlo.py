@@ -13,7 +13,7 @@ from splatjax.scattering import Film, Layer, Tabulated
 
 from ._incidence import AbstractIncidence, NormalIncidence
 from ._phase import AbstractPhaseFunction, Isotropic
-from ._rounds import Walk, finish
+from ._rounds import Walk, finish, lanes_for
 from ._stack import LayeredMedia
 from ._walk import Optics
 
@@ -262,6 +262,7 @@ def _walk_all(media: LayeredMedia, setup: _Setup, with_derivatives: bool, progre
             photons=jnp.asarray(setup.photons, jnp.int32),
             flights=jnp.asarray(setup.flights, jnp.int32),
             key=jax.random.fold_in(setup.key, number),
+            lanes=lanes_for(setup.photons),
         )
         share = None if progress is None else _share_of(progress, number, len(groups))
         parts.append(finish(walk, share))

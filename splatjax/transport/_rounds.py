@@ -15,14 +15,17 @@ from ._stack import Stack
 from ._tally import Tally
 from ._walk import IDLE, INSIDE, Optics, PathWeights, Photons, fly, weigh
 
-LANES = 16384
-"""Photons on their way at once: their state stays in the cache of a core or two."""
+_MOST_LANES, _LEAST_LANES, _PHOTONS_A_LANE = 16384, 1024, 8
+"""Photons on their way at once: their state stays in the cache of a core or two, and few lanes wait for the last photon."""
 
 _FLIGHTS = 4
 """Flights between two looks at who is done."""
 
 _ROUNDS = 256
 """Rounds of one compiled call: a second or so, after which progress is told."""
+
+_UNWATCHED = 8
+"""Rounds between two looks at whether all are done."""
 
 _LEAST, _SURVIVING = 1e-4, 0.1
 """A photon that carries less than this is given up, except for this share, which carries more instead (Russian roulette)."""
@@ -47,6 +50,12 @@ class Walk(eqx.Module):
     photons: Int[Array, ""]
     flights: Int[Array, ""]
     key: Key[Array, ""]
+    lanes: int = eqx.field(static=True)
+
+
+def lanes_for(photons: int) -> int:
+    """Give how many photons to have on their way at once."""
+    return min(_MOST_LANES, max(_LEAST_LANES, 1 << (photons // _PHOTONS_A_LANE).bit_length()))
 
 
 class _State(eqx.Module):
@@ -78,10 +87,10 @@ def finish(walk: Walk, progress: Callable[[int, int], None] | None) -> Tally:
 def _start(walk: Walk) -> _State:
     dtype, (layers, channels) = walk.edges.dtype, walk.optics.absorption.shape
     parameters, rings = walk.slopes.absorption.shape[0], walk.edges.shape[1] - 1
-    nothing, nowhere = jnp.zeros(LANES, dtype), jnp.zeros(LANES, jnp.int32)
+    nothing, nowhere = jnp.zeros(walk.lanes, dtype), jnp.zeros(walk.lanes, jnp.int32)
     down = (nothing, nothing, nothing + 1)
     photons = Photons(nothing, nothing, nothing, down, nothing, nowhere, nowhere + IDLE, nowhere)
-    weights = PathWeights(jnp.zeros((channels, LANES), dtype), jnp.zeros((layers, channels, LANES), dtype))
+    weights = PathWeights(jnp.zeros((channels, walk.lanes), dtype), jnp.zeros((layers, channels, walk.lanes), dtype))
     slopes = jax.tree.map(lambda each: jnp.zeros((parameters, *each.shape), dtype), weights)
     tally = Tally.empty(rings, layers, channels, parameters, dtype)
     state = _State(photons, weights, slopes, tally, jnp.zeros((), jnp.int32), jnp.zeros((), jnp.int32))
@@ -90,7 +99,15 @@ def _start(walk: Walk) -> _State:
 
 @eqx.filter_jit
 def _advance(walk: Walk, state: _State) -> _State:
-    return jax.lax.fori_loop(0, _ROUNDS, lambda _, state: _round(walk, state), state)
+    last = state.round + _ROUNDS
+
+    def goes_on(state):
+        return (state.round < last) & state.unfinished(walk)
+
+    def some(state):
+        return jax.lax.fori_loop(0, _UNWATCHED, lambda _, state: _round(walk, state), state)
+
+    return jax.lax.while_loop(goes_on, some, state)
 
 
 def _round(walk: Walk, state: _State) -> _State:
@@ -100,7 +117,7 @@ def _round(walk: Walk, state: _State) -> _State:
     def path(optics, weights):
         def flight(number, carry):
             photons, weights = carry
-            xi = uniforms(walk.key, draws + number, LANES, weights.carried.dtype)
+            xi = uniforms(walk.key, draws + number, walk.lanes, weights.carried.dtype)
             photons, flown = fly(walk.stack, walk.phase, photons, xi)
             return photons, weigh(optics, weights, flown)
 
@@ -118,7 +135,7 @@ def _round(walk: Walk, state: _State) -> _State:
 
     inside = photons.place == INSIDE
     faint = inside & (jnp.max(weights.carried, axis=0) < _LEAST)
-    chance = uniforms(walk.key, draws + _FLIGHTS, LANES, walk.edges.dtype)[0]
+    chance = uniforms(walk.key, draws + _FLIGHTS, walk.lanes, walk.edges.dtype)[0]
     dropped = faint & (chance > _SURVIVING)
     boost = jnp.where(faint & ~dropped, 1 / _SURVIVING, jnp.ones_like(chance))
     weights, slopes = (
@@ -135,14 +152,14 @@ def _launch(walk: Walk, state: _State, free: Bool[Array, " photons"]) -> _State:
     dtype = walk.edges.dtype
     turn = jnp.cumsum(free.astype(jnp.int32))
     begins = free & (state.started + turn <= walk.photons)
-    xi = uniforms(walk.key, state.round * (_FLIGHTS + 2) + _FLIGHTS + 1, LANES, dtype)
+    xi = uniforms(walk.key, state.round * (_FLIGHTS + 2) + _FLIGHTS + 1, walk.lanes, dtype)
     spread = evenly(walk.key, state.started + turn, dtype)
     direction, weight = walk.incidence.enter(spread, xi[1], walk.stack.eta[:2])
 
     def fresh(new, old):
         return jnp.where(begins, new, old)
 
-    old, zero = state.photons, jnp.zeros(LANES, dtype)
+    old, zero = state.photons, jnp.zeros(walk.lanes, dtype)
     photons = Photons(
         x=fresh(zero, old.x),
         y=fresh(zero, old.y),

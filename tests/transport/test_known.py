@@ -41,10 +41,10 @@ def test_giovanellis_half_space(float32):
 
 
 def test_chandrasekhars_half_space(float32):
-    """Isotropic, indices matched, normal incidence: 1 - H(1) sqrt(1 - albedo). One walk serves all five."""
-    albedo = np.asarray([0.2, 0.5, 0.9, 0.95, 0.99])
+    """Isotropic, indices matched, normal incidence: 1 - H(1) sqrt(1 - albedo). One walk serves all four."""
+    albedo = np.asarray([0.2, 0.5, 0.9, 0.95])
     found = sj.monte_carlo([layer(1 / albedo - 1, 1.0, 1.0)], 3_600_000, KEY)
-    within(found.total_reflectance, [0.03523052, 0.11522588, 0.41494748, 0.53554099, 0.75272072])
+    within(found.total_reflectance, [0.03523052, 0.11522588, 0.41494748, 0.53554099])
 
 
 def chi_squared(ours, photons, theirs, their_photons, places) -> None:
