@@ -89,7 +89,7 @@ def monte_carlo(
 
     Photons fly from scattering to scattering; absorption lessens what they carry; interfaces reflect or refract them by
     Fresnel's formulas. Channels that differ in absorption alone, or in scale alone (a half space of one index), share their
-    walks: their errors then go together, and a hundred of them cost little more than one.
+    walks: the flights are made once, and their errors go together.
 
     Differentiable in `sigma_a`, `sigma_s_prime` and the optical depth of films, in forward and reverse mode, by the likelihood
     of each path. The standard errors are constants; those of derivatives: `path_derivatives`.
@@ -109,8 +109,8 @@ def monte_carlo(
 
     **Returns:** a `MonteCarlo`.
 
-    **Raises:** `ValueError` for no scattering layer, for an infinite layer above another, for a number of photons below 2, for
-    edges that do not ascend, and for derivatives in other arguments.
+    **Raises:** `ValueError` for no scattering layer, for an infinite layer above another, for a number of photons below 2 or not
+    below 2^30, for edges that do not ascend, and for derivatives in other arguments.
 
     **Source:** Wang, Jacques and Zheng 1995 (MCML); one walk for many absorptions: Kienle and Patterson 1996; path weights:
     Hayakawa et al. 2001.
@@ -175,8 +175,8 @@ class _Setup(eqx.Module):
 def _set_up(layers, photons, key, edges, incidence, phase, eta_above, eta_below, flights) -> tuple[LayeredMedia, _Setup]:
     """Check and complete the arguments of `monte_carlo`."""
     for name, number, least in (("photons", photons, 2), ("flights", flights, 1)):
-        if not least <= number < 2**31:
-            raise ValueError(f"{name} must be at least {least}, and below 2^31; got {number}")
+        if not least <= number < 2**30:
+            raise ValueError(f"{name} must be at least {least}, and below 2^30; got {number}")
     phase = Isotropic() if phase is None else phase
     dtype = next((each.medium.sigma_a.dtype for each in layers if isinstance(each, Layer)), jnp.zeros(()).dtype)
     anisotropy = phase.anisotropy(len(layers), dtype)

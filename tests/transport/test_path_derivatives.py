@@ -104,6 +104,19 @@ def test_without_absorption_it_is_the_limit(float64):
     np.testing.assert_allclose(2 * quotients[1] - quotients[0], slope, rtol=1e-5)
 
 
+def test_the_depth_of_a_film(float64):
+    """It absorbs and turns nothing: differences of the same walks again."""
+
+    def reflectance(depth):
+        stack = [sj.Film(depth), layer(0.1, 2.0, 1.4, 1.0)]
+        return sj.monte_carlo(stack, 2_000, KEY).total_reflectance.value[0]
+
+    at, step = jnp.asarray([0.2]), 1e-4
+    slope = jax.grad(reflectance)(at)[0]
+    np.testing.assert_allclose(slope, (reflectance(at + step) - reflectance(at - step)) / (2 * step), rtol=1e-3)
+    assert slope < -0.3
+
+
 def test_what_paths_do_not_know_is_refused(dtype):
     def thicker(thickness):
         one = sj.Layer(medium(jnp.asarray(0.2, dtype), jnp.asarray(2.0, dtype)), thickness)
