@@ -57,10 +57,12 @@ def plan(scene: Scene, cameras: Camera | Sequence[Camera], settings: RenderSetti
     views = [_splatting.PerspectiveView.of(camera) for camera in cameras]
     bounds = _splatting.Bounds.of(scene.splats)
     interval = _diffusion.handover_interval(_diffusion.irregularity(scene.splats), settings.diffusion)
+    variances = scene.material.gaussians.variances
+    kernels = _diffusion.Kernels(variances, settings.diffusion.normalization.depths(variances))
     return Plan(
         camera=settings.rasterizer.planned(scene.splats, views, settings.splatting),
         shadows=tuple(_plan_shadows(group, scene.splats, bounds, settings) for group in stack_lights(scene.lights)),
-        diffuser=settings.diffuser.planned(scene.splats, scene.material.gaussians.variances, interval, views),
+        diffuser=settings.diffuser.planned(scene.splats, kernels, interval, views),
         interval=interval,
     )
 
@@ -85,6 +87,7 @@ def render(scene: Scene, camera: Camera, settings: RenderSettings | None = None,
     return _render(scene, camera, settings, plan)
 
 
+_SAME = "give both the same number"
 _make_plan = plan  # `plan` is also an argument of `render`
 
 
@@ -97,14 +100,19 @@ def diffuse(
 ) -> Float[Array, "gaussians height width channels"]:
     r"""Diffuse any irradiance of the splats below the surface: pass 4 alone, the plain layers `L_k` (section 4.2).
 
-    **Arguments:** as for `render`; of the scene only the splats' geometry and the material's variances matter.
+    **Arguments:** as for `render`; of the scene only the splats' geometry and albedo and the material's Gaussians matter.
 
-    - `irradiance`: that enters at each splat. Differentiable.
+    - `irradiance`: that enters at each splat, in the channels of the material's weights. Differentiable.
 
     **Returns:** one layer per Gaussian on the front surface, 0 where there is none; NaN where the plan does not suffice.
     Weighted by `material.gaussians.weights` and summed they are the radiant exitance.
+
+    **Raises:** `ValueError` when a plan is needed and not given, or when the channels disagree.
     """
     settings = RenderSettings() if settings is None else settings
+    channels = scene.material.gaussians.weights.shape[1]
+    if irradiance.shape[1] != channels:
+        raise ValueError(f"irradiance has {irradiance.shape[1]} channels, material.gaussians.weights has {channels}: {_SAME}")
     plan = _plan_unless_traced(scene, camera, settings, plan)
     return _diffuse(scene, irradiance, camera, settings, plan)
 
@@ -114,6 +122,8 @@ def _diffuse(scene: Scene, irradiance, camera: Camera, settings: RenderSettings,
     scene, camera, irradiance = _in_one_dtype(scene, camera, irradiance)
     splats, view = scene.splats, _splatting.PerspectiveView.of(camera)
     attributes = {"area": splats.areas[None], "source": irradiance.T}
+    if splats.albedo is not None:
+        attributes["albedo"] = splats.albedo.T
     _, (layers, _), needed = _see_and_diffuse(scene, attributes, view, settings, plan)
     return jnp.where(needed <= 1, layers.layers.transpose(0, 2, 3, 1), jnp.nan)
 
@@ -124,10 +134,14 @@ def _see_and_diffuse(scene: Scene, attributes: dict[str, Array], view, settings:
     stacked = jnp.concatenate(list(attributes.values()))
     surfaces = _splatting.splat_surfaces(splats, stacked, view, settings.splatting, plan.camera)
     front, behind = ((each, _by_name(attributes, each.attributes)) for each in (surfaces.front, surfaces.behind))
-    seen = [_diffusion.SeenSurface(each, named["source"], named["area"][0]) for each, named in (front, behind)]
-    sources = _diffusion.Sources(splats.centers.T, splats.areas, attributes["source"])
-    variances = scene.material.gaussians.variances
-    layers, needed = _diffusion.diffusion_layers(sources, variances, seen, plan.interval, view, plan.diffuser)
+    seen = [
+        _diffusion.SeenSurface(each, named["source"], named["area"][0], named.get("albedo", jnp.ones_like(named["source"])))
+        for each, named in (front, behind)
+    ]
+    sources = _diffusion.Sources(splats.centers.T, splats.normals.T, splats.areas, attributes["source"])
+    layers, needed = _diffusion.diffusion_layers(
+        sources, scene.material.gaussians, seen, plan.interval, view, plan.diffuser, settings.diffusion.normalization
+    )
     return (front, behind), layers, jnp.maximum(surfaces.needed, needed)
 
 
@@ -364,4 +378,4 @@ def _check_channels(scene: Scene) -> None:
         found[f"lights[{i}]"] = eqx.filter_eval_shape(lambda light, x: light.incidence(x)[1], light, point).shape[1]
     for name, count in found.items():
         if count != channels:
-            raise ValueError(f"{name} has {count} channels, material.gaussians.weights has {channels}: give both the same number")
+            raise ValueError(f"{name} has {count} channels, material.gaussians.weights has {channels}: {_SAME}")

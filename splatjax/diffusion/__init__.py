@@ -2,10 +2,12 @@
 
 from ._clustered import ClusterDiffuser as ClusterDiffuser
 from ._dense import DenseDiffuser as DenseDiffuser
-from ._diffuser import AbstractDiffuser as AbstractDiffuser, Diffused as Diffused, Sources as Sources
+from ._diffuser import AbstractDiffuser as AbstractDiffuser, Diffused as Diffused
+from ._diffuser import Kernels as Kernels, Sources as Sources
 from ._handover import handover_interval as handover_interval, irregularity as irregularity
 from ._handover import resolved_share as resolved_share
 from ._irradiance import entering_irradiance as entering_irradiance
 from ._layers import diffusion_layers as diffusion_layers, DiffusionLayers as DiffusionLayers
 from ._layers import pixel_points as pixel_points, SeenSurface as SeenSurface
+from ._normalization import AbstractNormalization as AbstractNormalization, ExitOdds as ExitOdds, PlainMean as PlainMean
 from ._settings import DiffusionSettings as DiffusionSettings

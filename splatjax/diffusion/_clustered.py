@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 from splatjax.scene import Splats
 from splatjax.splatting import AbstractView, BinCapacity, TileGrid, TileRanges, bin_items
 
-from ._diffuser import AbstractDiffuser, Diffused, Sources
+from ._diffuser import AbstractDiffuser, Diffused, Kernels, Sources
 from ._gauss_tiles import gaussian_sums
 from ._resample import Samples, block_samples, resample
 from ._tree import Clusters, ClusterTree
@@ -57,11 +57,11 @@ class ClusterDiffuser(AbstractDiffuser):
     def planned(
         self,
         splats: Splats,
-        variances: Float[Array, " gaussians"],
+        kernels: Kernels,
         interval: Float[Array, "2"],
         views: Sequence[AbstractView],
     ) -> "ClusterDiffuser":
-        values = np.asarray(variances, np.float64)
+        values = np.asarray(kernels.variances, np.float64)
         areas = np.asarray(splats.areas, np.float64)
         if areas.size == 0:
             layers = tuple(LayerPlan(0, 1, 0.0, math.inf, None) for _ in values)
@@ -71,16 +71,17 @@ class ClusterDiffuser(AbstractDiffuser):
         edges = [self._cell(math.sqrt(v / self.margin), spacing) for v in values]
         cells = sorted({edge for edge, v in zip(edges, values, strict=True) if edge > 0 and v * self.margin > narrowest})
         tree = ClusterTree.build(splats.centers, cells)
-        levels = tree.levels(Sources(splats.centers.T, splats.areas, splats.areas[None]))
+        levels = tree.levels(Sources(splats.centers.T, splats.normals.T, splats.areas, splats.areas[None]))
         centers = splats.centers.T
         layers = []
-        for v, edge in zip(values, edges, strict=True):
+        for v, depth, edge in zip(values, kernels.depths, edges, strict=True):
             level = cells.index(edge) + 1 if edge in cells else 0
             stride = min(self._stride(math.sqrt(v / self.margin), view, centers) for view in views)
             capacity = None
             if v * self.margin > narrowest:
                 largest = jnp.asarray(v * self.margin, splats.areas.dtype)
-                counts = [_demand(self, splats, levels[level], largest, stride, view) for view in views]
+                sources = levels[level].lowered(jnp.asarray(depth, largest.dtype))
+                counts = [_demand(self, splats, sources, largest, stride, view) for view in views]
                 capacity = BinCapacity.for_counts(counts, self._grid(views[0].width, views[0].height, stride))
             layers.append(LayerPlan(level, stride, float(v) / self.margin, float(v) * self.margin, capacity))
         return eqx.tree_at(_parts, self, (tree, tuple(layers)), is_leaf=_is_none)
@@ -101,58 +102,61 @@ class ClusterDiffuser(AbstractDiffuser):
     def diffuse(
         self,
         sources: Sources,
-        variances: Float[Array, " gaussians"],
+        kernels: Kernels,
         points: Float[Array, "surfaces 3 height width"],
         covered: Bool[Array, "surfaces height width"],
         view: AbstractView,
     ) -> Diffused:
         if self.tree is None or self.layers is None:
             raise ValueError("this ClusterDiffuser has no clusters yet; take one from a plan (splatjax.plan) or from `planned`")
-        if variances.shape[0] != len(self.layers):
-            raise ValueError(f"this plan is for {len(self.layers)} Gaussians, not {variances.shape[0]}; make it anew")
+        if kernels.variances.shape[0] != len(self.layers):
+            raise ValueError(f"this plan is for {len(self.layers)} Gaussians, not {kernels.variances.shape[0]}; make it anew")
         channels = sources.irradiance.shape[0]
         levels = self.tree.levels(sources)
         layers, needed = [], []
-        for variance, layer in zip(variances, self.layers, strict=True):
+        for variance, depth, layer in zip(kernels.variances, kernels.depths, self.layers, strict=True):
             if layer.capacity is None:
-                layers.append(jnp.zeros((2, channels, *covered.shape[1:]), points.dtype))
+                layers.append(jnp.zeros((2, channels + 1, *covered.shape[1:]), points.dtype))
             else:
-                values, need = self._layer(levels[layer.level], variance, layer, points, covered, view)
+                clusters = levels[layer.level].lowered(depth)
+                values, need = self._layer(clusters, variance, depth, layer, points, covered, view)
                 layers.append(values)
                 needed.append(need)
             needed.append(jnp.maximum(layer.smallest / variance, variance / layer.largest) * (1 - 1e-6))
         needed = stop_gradient(jnp.max(jnp.stack(needed))) if needed else jnp.zeros((), points.dtype)
         carried = jnp.asarray([layer.capacity is not None for layer in self.layers], points.dtype)
-        return Diffused(jnp.stack(layers), carried, needed)
+        found = jnp.stack(layers) if layers else jnp.zeros((0, 2, channels + 1, *covered.shape[1:]), points.dtype)
+        return Diffused(found[:, :, :channels], found[:, :, channels], carried, needed)
 
-    def _layer(self, clusters: Clusters, variance, layer: LayerPlan, points, covered, view: AbstractView):
-        """Evaluate one layer at the samples of both surfaces and resample it to the pixels of both."""
+    def _layer(self, clusters: Clusters, variance, depth, layer: LayerPlan, points, covered, view: AbstractView):
+        """Evaluate one layer, and last its exits, at the samples of both surfaces and resample them to the pixels of both."""
         grid = self._grid(view.width, view.height, layer.stride)
         if layer.stride == 1:
             each = [
-                self._integrals(clusters, variance, layer, *surface, grid, view, 0)
+                self._integrals(clusters, variance, depth, layer, *surface, grid, view, 0)
                 for surface in zip(points, covered, strict=True)
             ]
             return jnp.stack([values for values, _, _ in each]), jnp.max(jnp.stack([need for _, _, need in each]))
         where, there = block_samples(points[0], covered[0], layer.stride, stop_gradient(variance))
-        values, slopes, need = self._integrals(clusters, variance, layer, where, there, grid, view, 1)
+        values, slopes, need = self._integrals(clusters, variance, depth, layer, where, there, grid, view, 1)
         samples = Samples(where, there, values, slopes)
         pixels = [resample(samples, surface, variance, layer.stride) for surface in points]
         return jnp.where(covered[:, None], jnp.stack(pixels), 0.0), need
 
-    def _integrals(self, clusters: Clusters, variance, layer: LayerPlan, points, there, grid: TileGrid, view, order: int):
-        """Give numerator over denominator at points, and for `order` 1 its slope in space."""
+    def _integrals(self, clusters: Clusters, variance, depth, layer: LayerPlan, points, there, grid: TileGrid, view, order: int):
+        """Give the means and the exits at points, and for `order` 1 their slopes in space."""
         assert layer.capacity is not None
         # A cluster is as wide as its splats are spread.
         wide = variance + clusters.spread
-        mass = clusters.areas * variance / wide
+        flat = jnp.exp(0.5 * depth * depth / wide) / (2 * jnp.pi * wide)  # what makes a flat sheet one exit
+        mass = clusters.areas * flat
         middle = stop_gradient(jnp.mean(clusters.centers, axis=1))[:, None]
         centers = clusters.centers - middle
         rows = [mass[None] * clusters.irradiance, mass[None]]
         count = clusters.irradiance.shape[0] + 1
         if clusters.moments is not None:
             # Energy off the center, to first order: G(x - p - o) = G(x - p) (1 + o (x - p) / v).
-            moments = clusters.moments * (variance / (wide * wide))[None, None]
+            moments = clusters.moments * (flat / wide)[None, None]
             rows[0] = rows[0] - jnp.sum(moments * centers[None], axis=1)
             rows.append(moments.reshape(-1, mass.shape[0]))
         if order:
@@ -169,12 +173,15 @@ class ClusterDiffuser(AbstractDiffuser):
         energy, sums = _energy_and_rest(sums, count, points - middle[:, :, None], clusters.moments is not None)
         reached = there & (sums[0] > 0)
         inverse = 1 / jnp.where(reached, sums[0], 1.0)
-        values = jnp.where(reached[None], energy * inverse[None], 0.0)
+        means = energy * inverse[None]
+        values = jnp.where(reached[None], jnp.concatenate([means, sums[:1]]), 0.0)
         slopes = None
         if order:
-            # grad N = sum w (p - x) / v, so grad (N / D) = (mean of E p - L mean of p) / v.
+            # grad N = sum w (q - x) / v, so grad (N / D) = (mean of E q - mean of E times mean of q) / v.
             moments = sums[1:].reshape(3, count, *there.shape)
-            slopes = (moments[:, :-1] - values[None] * moments[:, -1:]) * (inverse / variance)[None, None]
+            of_means = (moments[:, :-1] - means[None] * moments[:, -1:]) * inverse[None, None]
+            of_exits = moments[:, -1] - (points - middle[:, :, None]) * sums[:1]
+            slopes = jnp.concatenate([of_means, of_exits[:, None]], axis=1) / variance
             slopes = jnp.where(reached[None, None], slopes, 0.0)
         return values, slopes, bins.needed.astype(points.dtype)
 

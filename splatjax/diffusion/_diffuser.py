@@ -14,14 +14,23 @@ class Sources(eqx.Module):
     """The splats as sources of diffused light."""
 
     centers: Float[Array, "3 splats"]
+    normals: Float[Array, "3 splats"]
     areas: Float[Array, " splats"]
     irradiance: Float[Array, "channels splats"]
+
+
+class Kernels(eqx.Module):
+    """How the layers spread light: variances (mm^2), and how far below its splat each layer's source lies (mm)."""
+
+    variances: Float[Array, " gaussians"]
+    depths: Float[Array, " gaussians"]
 
 
 class Diffused(eqx.Module):
     """The diffusion integrals, and what capacity they needed over what was planned."""
 
-    layers: Float[Array, "gaussians surfaces channels height width"]
+    means: Float[Array, "gaussians surfaces channels height width"]
+    exits: Float[Array, "gaussians surfaces height width"]
     carried: Float[Array, " gaussians"]
     """1, or 0 for a layer that was not evaluated, being too narrow for nearly all splats."""
     needed: Float[Array, ""]
@@ -30,22 +39,23 @@ class Diffused(eqx.Module):
 class AbstractDiffuser(eqx.Module):
     r"""The diffusion integral at surface points `x`, over all splats near `x` in object space, whichever way they face:
 
-        L_k(x) = sum_j A_j G(v_k, |x - p_j|) E_j / sum_j A_j G(v_k, |x - p_j|)
+        mean_k(x) = sum_j A_j G(v_k, |x - q_j|) E_j / sum_j A_j G(v_k, |x - q_j|),   q_j = p_j - depth_k n_j
 
-    It keeps constants, lies between the least and the greatest E, and is linear in E.
+    The mean keeps constants, lies between the least and the greatest E, and is linear in E. `exits` is the denominator over
+    what it is on a flat sheet, `exp(-depth_k^2 / 2 v_k)`.
     """
 
     @abc.abstractmethod
     def planned(
-        self, splats: Splats, variances: Float[Array, " gaussians"], interval: Float[Array, "2"], views: Sequence[AbstractView]
+        self, splats: Splats, kernels: Kernels, interval: Float[Array, "2"], views: Sequence[AbstractView]
     ) -> "AbstractDiffuser":
-        """Give a diffuser with room for these splats, variances and views; `interval` tells which layers are handed over."""
+        """Give a diffuser with room for these splats, kernels and views; `interval` tells which layers are handed over."""
 
     @abc.abstractmethod
     def diffuse(
         self,
         sources: Sources,
-        variances: Float[Array, " gaussians"],
+        kernels: Kernels,
         points: Float[Array, "surfaces 3 height width"],
         covered: Bool[Array, "surfaces height width"],
         view: AbstractView,

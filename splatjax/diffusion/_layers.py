@@ -8,10 +8,12 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Float
 
+from splatjax.gaussians import SumOfGaussians
 from splatjax.splatting import AbstractView, Surface
 
-from ._diffuser import AbstractDiffuser, Sources
+from ._diffuser import AbstractDiffuser, Kernels, Sources
 from ._handover import resolved_share
+from ._normalization import AbstractNormalization
 
 
 class DiffusionLayers(eqx.Module):
@@ -28,6 +30,8 @@ class SeenSurface(eqx.Module):
     irradiance: Float[Array, "channels height width"]
     area: Float[Array, "height width"]
     """Of a splat, mm^2."""
+    albedo: Float[Array, "channels height width"]
+    """What colors the surface, besides the Gaussians' weights."""
 
 
 def pixel_points(view: AbstractView, depth: Float[Array, "height width"]) -> Float[Array, "3 height width"]:
@@ -39,34 +43,43 @@ def pixel_points(view: AbstractView, depth: Float[Array, "height width"]) -> Flo
 
 def diffusion_layers(
     sources: Sources,
-    variances: Float[Array, " gaussians"],
+    gaussians: SumOfGaussians,
     seen: Sequence[SeenSurface],
     interval: Float[Array, "2"],
     view: AbstractView,
     diffuser: AbstractDiffuser,
+    normalization: AbstractNormalization,
 ) -> tuple[list[DiffusionLayers], Float[Array, ""]]:
     r"""Diffuse the irradiance of the splats to the points that the pixels see.
 
     **Arguments:**
 
-    - `sources`: centers (mm), areas (mm^2) and irradiance of the splats. Differentiable.
-    - `variances`: mm^2, one per layer. Differentiable.
+    - `sources`: centers (mm), normals, areas (mm^2) and irradiance of the splats. Differentiable.
+    - `gaussians`: one per layer. Their weights tell how much light is absorbed, for the normalization; the layers are not
+      multiplied by them. Differentiable.
     - `seen`: the surface in front, and the one that shows behind its silhouettes. Differentiable.
     - `interval`: from `handover_interval`.
 
-    **Returns:** the layers of both, without weights, and what capacity was needed over what was planned. Constants are kept,
-    and `min E <= L_k <= max E`.
+    **Returns:** the layers of both, without weights, and what capacity was needed over what was planned. They are linear in the
+    light. Summed with the weights they return no more than the greatest irradiance. Constants are kept, and
+    `min E <= L_k <= max E`, where the normalization's gain is 1: everywhere for `PlainMean`; for `ExitOdds` on flat pieces, at
+    open edges, and by what absorbs nothing.
 
-    **Source:** Kim et al. 2010, section 4.2.
+    **Source:** Kim et al. 2010, section 4.2; the normalization's own.
     """
     covered = jnp.stack([stop_gradient(each.surface.weight_sum) > 0 for each in seen])
     points = jnp.stack([pixel_points(view, each.surface.depth) for each in seen])
-    diffused = diffuser.diffuse(sources, variances, points, covered, view)
+    variances = gaussians.variances
+    kernels = Kernels(variances, normalization.depths(variances))
+    diffused = diffuser.diffuse(sources, kernels, points, covered, view)
     found = []
     for place, each in enumerate(seen):
         area = jnp.where(covered[place], each.area, 1.0)
         resolved = jax.vmap(lambda variance, area=area: resolved_share(variance, area, interval))(variances)
         resolved = resolved * diffused.carried[:, None, None]
         own = each.irradiance[None]
-        found.append(DiffusionLayers(own + resolved[:, None] * (diffused.layers[:, place] - own), resolved))
+        # Splats too far apart to carry a layer do not count its exits either.
+        exits = 1 + resolved * (diffused.exits[:, place] - 1)
+        layers = normalization.gain(exits, gaussians, each.albedo) * diffused.means[:, place]
+        found.append(DiffusionLayers(own + resolved[:, None] * (layers - own), resolved))
     return found, diffused.needed

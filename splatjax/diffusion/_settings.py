@@ -2,9 +2,11 @@
 
 import equinox as eqx
 
+from ._normalization import AbstractNormalization, ExitOdds
+
 
 class DiffusionSettings(eqx.Module):
-    r"""Where a layer is too narrow for the splats. All static; lengths in spacings (the root of a splat's area).
+    r"""How layers are normalized, and where one is too narrow for the splats. Lengths in spacings (the root of a splat's area).
 
     Below `begin` standard deviations per spacing a layer is the surface's own irradiance, from `end` on it is the diffusion
     integral, in between a smooth blend. Splats on a regular grid carry narrower layers than scattered ones.
@@ -12,3 +14,4 @@ class DiffusionSettings(eqx.Module):
 
     regular: tuple[float, float] = eqx.field(static=True, default=(0.4, 0.8))
     scattered: tuple[float, float] = eqx.field(static=True, default=(1.0, 2.0))
+    normalization: AbstractNormalization = ExitOdds()

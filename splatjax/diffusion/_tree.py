@@ -13,16 +13,33 @@ class Clusters(eqx.Module):
     """Sources that stand for one or more splats. An empty one has no area."""
 
     centers: Float[Array, "3 clusters"]
+    normals: Float[Array, "3 clusters"]
+    """Mean over the area: shorter than one where the surface bends."""
     areas: Float[Array, " clusters"]
     irradiance: Float[Array, "channels clusters"]
     spread: Float[Array, " clusters"]
     """Half the mean squared distance of the splats from the center: the variance per axis of a flat cluster, mm^2."""
     moments: Float[Array, "channels 3 clusters"] | None
     """Where the energy lies: the sum of area, irradiance and offset from the center. `None` for single splats: nothing."""
+    turns: Float[Array, "channels 3 clusters"] | None
+    """The same of the offset from the mean normal."""
+    opening: Float[Array, " clusters"]
+    """Mean product of both offsets, mm: positive where the surface is convex."""
+    bending: Float[Array, " clusters"]
+    """Mean square of the offset from the mean normal."""
 
     @classmethod
     def of(cls, sources: Sources) -> "Clusters":
-        return cls(sources.centers, sources.areas, sources.irradiance, jnp.zeros_like(sources.areas), None)
+        none = jnp.zeros_like(sources.areas)
+        return cls(sources.centers, sources.normals, sources.areas, sources.irradiance, none, None, None, none, none)
+
+    def lowered(self, depth: Float[Array, ""]) -> "Clusters":
+        """Give the clusters of the same splats, each moved so far (mm) against its normal."""
+        spread = jnp.maximum(self.spread - depth * self.opening + 0.5 * depth * depth * self.bending, 0)
+        moments = None if self.moments is None or self.turns is None else self.moments - depth * self.turns
+        opening = self.opening - depth * self.bending
+        centers = self.centers - depth * self.normals
+        return Clusters(centers, self.normals, self.areas, self.irradiance, spread, moments, self.turns, opening, self.bending)
 
     def merged(self, parents: Int[Array, " clusters"], count: int) -> "Clusters":
         """Merge clusters into `count` parents. Area, energy and the first moments of both are kept. Differentiable."""
@@ -37,15 +54,27 @@ class Clusters(eqx.Module):
             return total(self.areas * values) * inverse
 
         centers = jnp.stack([mean(axis) for axis in self.centers])
+        normals = jnp.stack([mean(axis) for axis in self.normals])
         irradiance = jnp.stack([mean(channel) for channel in self.irradiance])
         offset = self.centers - centers[:, parents]
+        turn = self.normals - normals[:, parents]
         spread = mean(self.spread + 0.5 * jnp.sum(offset * offset, axis=0))
-        channels = range(self.irradiance.shape[0])
-        moments = [[self.areas * self.irradiance[c] * offset[axis] for axis in range(3)] for c in channels]
-        if self.moments is not None:
-            moments = [[moments[c][axis] + self.moments[c, axis] for axis in range(3)] for c in channels]
-        moments = jnp.stack([jnp.stack([total(axis) for axis in each]) for each in moments])
-        return Clusters(centers, areas, irradiance, spread, moments)
+        opening = mean(self.opening + jnp.sum(offset * turn, axis=0))
+        bending = mean(self.bending + jnp.sum(turn * turn, axis=0))
+
+        def energy_off(offset, own):
+            """Give the first moments of energy, those that the children bring included."""
+            energy = self.areas[None] * self.irradiance
+            brought = (lambda c, axis: 0.0) if own is None else (lambda c, axis: own[c, axis])
+            return jnp.stack(
+                [
+                    jnp.stack([total(energy[c] * offset[axis] + brought(c, axis)) for axis in range(3)])
+                    for c in range(energy.shape[0])
+                ]
+            )
+
+        moments, turns = energy_off(offset, self.moments), energy_off(turn, self.turns)
+        return Clusters(centers, normals, areas, irradiance, spread, moments, turns, opening, bending)
 
 
 class ClusterTree(eqx.Module):

@@ -14,7 +14,7 @@ CELLS = [2.0, 4.0, 16.0]
 def sources():
     body = bodies.bumpy(800)
     irradiance = np.random.default_rng(2).uniform(size=(2, 800))
-    return Sources(body.centers.T, body.areas, jnp.asarray(irradiance, float))
+    return Sources(body.centers.T, body.normals.T, body.areas, jnp.asarray(irradiance, float))
 
 
 def of_splats(tree, level):
@@ -60,6 +60,17 @@ def test_merging_twice_is_merging_once():
     at_once = Clusters.of(given).merged(jnp.asarray(of_splats(tree, 2), jnp.int32), tree.counts[2])
     for ours, theirs in zip(jax.tree.leaves(step_by_step), jax.tree.leaves(at_once), strict=True):
         np.testing.assert_allclose(np.asarray(ours), np.asarray(theirs), atol=2e-4 * float(jnp.max(jnp.abs(theirs))))
+
+
+def test_lowering_clusters_is_merging_lowered_splats():
+    given, depth = sources(), 1.7
+    tree = ClusterTree.build(given.centers.T, CELLS)
+    below = Sources(given.centers - depth * given.normals, given.normals, given.areas, given.irradiance)
+    for ours, theirs in zip(tree.levels(given), tree.levels(below), strict=True):
+        lowered = ours.lowered(jnp.asarray(depth))
+        for found, expected in zip(jax.tree.leaves(lowered), jax.tree.leaves(theirs), strict=True):
+            scale = max(float(jnp.max(jnp.abs(expected))), 1e-3)
+            np.testing.assert_allclose(np.asarray(found), np.asarray(expected), atol=3e-4 * scale)
 
 
 def test_a_cluster_fills_no_more_than_its_cell():
