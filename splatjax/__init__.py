@@ -20,6 +20,7 @@ from .scattering import (
     InverseVariance as InverseVariance,
     NORM_RULE as NORM_RULE,
     RadialRule as RadialRule,
+    SingleScattering as SingleScattering,
     Tabulated as Tabulated,
 )
 from .io import (

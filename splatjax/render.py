@@ -140,7 +140,7 @@ def _see_and_diffuse(scene: Scene, attributes: dict[str, Array], view, settings:
     ]
     sources = _diffusion.Sources(splats.centers.T, splats.normals.T, splats.areas, attributes["source"])
     layers, needed = _diffusion.diffusion_layers(
-        sources, scene.material.gaussians, seen, plan.interval, view, plan.diffuser, settings.diffusion.normalization
+        sources, scene.material, seen, plan.interval, view, plan.diffuser, settings.diffusion.normalization
     )
     return (front, behind), layers, jnp.maximum(surfaces.needed, needed)
 
@@ -207,6 +207,7 @@ class _Shaded(eqx.Module):
     irradiance: Float[Array, "height width channels"]
     layers: Float[Array, "gaussians height width channels"]
     specular: Float[Array, "height width channels"]
+    single_scattering: Float[Array, "height width channels"] | None
     resolved: Float[Array, "gaussians height width"]
 
 
@@ -235,6 +236,11 @@ def _shade(scene, view, groups, f0, surface, named, layers) -> _Shaded:
     if splats.albedo is not None:
         albedo = named["albedo"].transpose(1, 2, 0)
         post = post * _shading.albedo_root(albedo)
+    single = None
+    if material.single_scattering is not None:
+        single = _shading.single_scattered_radiance(points, groups, f0, material.single_scattering)
+        if splats.albedo is not None:
+            single = single * _shading.albedo_root(albedo) ** 2
     return _Shaded(
         coverage=surface.coverage,
         depth=jnp.where(covered, surface.depth, jnp.inf),
@@ -245,6 +251,7 @@ def _shade(scene, view, groups, f0, surface, named, layers) -> _Shaded:
         irradiance=named.get("irradiance", named["source"]).transpose(1, 2, 0),
         layers=post[None] * layers.layers.transpose(0, 2, 3, 1),
         specular=jnp.where(covered[..., None], specular, 0.0),
+        single_scattering=None if single is None else jnp.where(covered[..., None], single, 0.0),
         resolved=layers.resolved,
     )
 
@@ -261,10 +268,11 @@ def _compose(front: _Shaded, behind: _Shaded, weights: Float[Array, "gaussians c
     layers = front.coverage[None, ..., None] * front.layers + through[None, ..., None] * behind.layers
     diffuse = jnp.sum(weights[:, None, None] * layers, axis=0)
     specular = over("specular")
+    single = None if front.single_scattering is None else over("single_scattering")
     drawn = (front.coverage > 0).astype(front.depth.dtype)
     handed_over = jnp.sum((1 - front.resolved) * drawn[None], axis=(1, 2)) / jnp.maximum(jnp.sum(drawn), 1)
     frame = Frame(
-        beauty=diffuse + specular,
+        beauty=diffuse + specular if single is None else diffuse + single + specular,
         coverage=front.coverage + through,
         depth=front.depth,
         position=front.position,
@@ -278,6 +286,7 @@ def _compose(front: _Shaded, behind: _Shaded, weights: Float[Array, "gaussians c
         specular=specular,
         handed_over=handed_over,
         overflow=jnp.where(needed > 1, needed, 0.0),
+        single_scattering=single,
     )
     fits = needed <= 1
     poisoned = jax.tree.map(lambda leaf: jnp.where(fits, leaf, jnp.nan), frame)
@@ -373,6 +382,8 @@ def _check_channels(scene: Scene) -> None:
     found = {}
     if scene.splats.albedo is not None:
         found["splats.albedo"] = scene.splats.albedo.shape[1]
+    if scene.material.single_scattering is not None:
+        found["material.single_scattering.medium"] = scene.material.single_scattering.medium.sigma_a.shape[0]
     point = jax.ShapeDtypeStruct((1, 3), scene.splats.centers.dtype)
     for i, light in enumerate(scene.lights):
         found[f"lights[{i}]"] = eqx.filter_eval_shape(lambda light, x: light.incidence(x)[1], light, point).shape[1]

@@ -100,6 +100,11 @@ class Truth(NamedTuple):
     """Of the picture."""
     seconds: float
 
+    def sound(self) -> np.ndarray:
+        """Tell which pixels count: not the few that one stray path in a hundred million makes brighter than all light."""
+        deviation, bright = np.sqrt(self.variance), np.quantile(self.picture, 0.98, axis=(0, 1))
+        return np.all(deviation < 0.25 * bright, axis=-1)
+
 
 def read_truth(body: Body, folder: Path) -> Truth:
     """Read what `tools/path_traced_bodies.py` wrote."""
@@ -113,22 +118,22 @@ def read_truth(body: Body, folder: Path) -> Truth:
         return Truth(mean, np.maximum(variance, 0), float(found["seconds"]) * passes)
 
 
-def profile() -> sj.MonteCarlo:
-    """Walk through the half space of the bodies' medium."""
+def medium() -> sj.Medium:
+    """Give the medium of the bodies."""
     albedo = jnp.asarray(ALBEDO)
-    medium = sj.Medium(SIGMA_T * (1 - albedo), SIGMA_T * albedo, jnp.ones(len(ALBEDO)))
-    return sj.monte_carlo([sj.Layer(medium, jnp.asarray(jnp.inf))], PHOTONS, jax.random.key(4))
+    return sj.Medium(SIGMA_T * (1 - albedo), SIGMA_T * albedo, jnp.ones(len(ALBEDO)))
 
 
-def material(found: sj.MonteCarlo) -> sj.Material:
+def material(profile: sj.Tabulated, single: sj.SingleScattering | None = None) -> sj.Material:
     """Fit six Gaussians to a reflectance, its total held; nothing is reflected by the surface itself."""
+    profile = profile if single is None else profile.without(single)
     with jax.enable_x64(True):
-        reference = jax.tree.map(lambda leaf: leaf.astype(jnp.float64), found.profile())
+        reference = jax.tree.map(lambda leaf: leaf.astype(jnp.float64), profile)
         fit = sj.fit_gaussians(
             reference, 6, weights=sj.NonNegativeWeights(sj.TotalReflectanceHeld()), rule=sj.NORM_RULE.beyond(0.2 / SIGMA_T)
         )
         gaussians = jax.tree.map(np.asarray, fit.gaussians)
-    return sj.Material(jax.tree.map(jnp.asarray, gaussians), eta=1.0, specular=0.0)
+    return sj.Material(jax.tree.map(jnp.asarray, gaussians), eta=1.0, specular=0.0, single_scattering=single)
 
 
 def splats_of(body: Body) -> sj.Splats:
@@ -164,12 +169,13 @@ def splatted(body: Body, splats: sj.Splats, material: sj.Material, settings: sj.
 
 def errors(picture: np.ndarray, truth: Truth) -> tuple[list[float], float]:
     """Give per channel the root mean square error over that of the truth, the truth's noise taken out; and the FLIP error."""
-    noise = truth.variance.mean((0, 1))
-    squared = ((picture - truth.picture) ** 2).mean((0, 1)) - noise
-    rms = np.sqrt(np.maximum(squared, 0) / (truth.picture**2).mean((0, 1)))
+    sound = truth.sound()
+    noise = truth.variance[sound].mean(0)
+    squared = ((picture - truth.picture)[sound] ** 2).mean(0) - noise
+    rms = np.sqrt(np.maximum(squared, 0) / (truth.picture[sound] ** 2).mean(0))
     import flip_evaluator
 
-    shown = [(encode(each)).astype(np.float32) for each in (truth.picture, picture)]
+    shown = [encode(np.where(sound[..., None], each, 0)).astype(np.float32) for each in (truth.picture, picture)]
     return rms.tolist(), float(flip_evaluator.evaluate(*shown, "LDR")[1])
 
 
@@ -179,19 +185,24 @@ def encode(linear: np.ndarray) -> np.ndarray:
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
 
 
-def models(found: sj.MonteCarlo) -> dict[str, tuple[sj.Material, sj.RenderSettings]]:
+def models() -> dict[str, tuple[sj.Material, sj.RenderSettings]]:
     """Give what is compared: material and settings, by name."""
-    whole = material(found)
+    found = sj.monte_carlo([sj.Layer(medium(), jnp.asarray(jnp.inf))], PHOTONS, jax.random.key(4)).profile()
+    whole, parted = material(found), material(found, sj.SingleScattering(medium()))
     even = SplattingSettings(full_coverage=EVEN)
     plain = sj.RenderSettings(even, diffusion=DiffusionSettings(normalization=PlainMean()))
-    return {"the paper's mean": (whole, plain), "exit odds": (whole, sj.RenderSettings(even))}
+    return {
+        "the paper's mean": (whole, plain),
+        "exit odds": (whole, sj.RenderSettings(even)),
+        "and single scattering": (parted, sj.RenderSettings(even)),
+    }
 
 
 def row(body: Body, name: str, truth: Truth, picture: np.ndarray, seconds: float) -> str:
     """Give a row of the table."""
     rms, flip = errors(picture, truth)
-    power = (truth.picture**2).mean((0, 1))
-    noise = (truth.variance.mean((0, 1)) / power).mean()
+    sound = truth.sound()
+    noise = (truth.variance[sound].mean(0) / (truth.picture[sound] ** 2).mean(0)).mean()
     equal = truth.seconds * noise / np.mean(np.square(rms))
     channels = " | ".join(f"{100 * value:.1f}%" for value in rms)
     return f"| {body.what} | {name} | {channels} | {flip:.3f} | {seconds:.2f} | {equal:.1f} |"
@@ -218,10 +229,11 @@ def draw(shown: list[tuple[Body, Truth, dict[str, np.ndarray]]], path: Path) -> 
 def main() -> None:
     folder = Path(sys.argv[1] if len(sys.argv) > 1 else "out/bodies")
     chosen = [body for body in BODIES if len(sys.argv) < 3 or body.name in sys.argv[2:]]
-    compared = models(profile())
+    compared = models()
     rows, shown = [], []
     for body in chosen:
         truth, splats, pictures = read_truth(body, folder), splats_of(body), {}
+        print(f"{body.name}: {np.sum(~truth.sound())} pixels of the truth left out", flush=True)
         for name, (material, settings) in compared.items():
             pictures[name], seconds = splatted(body, splats, material, settings)
             rows.append(row(body, name, truth, pictures[name], seconds))

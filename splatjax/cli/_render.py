@@ -120,15 +120,18 @@ def in_color(material: sj.Material) -> sj.Material:
     if gaussians.weights.shape[1] != 1:
         return material
     weights = jnp.broadcast_to(gaussians.weights, (len(gaussians.variances), 3))
-    return sj.Material(sj.SumOfGaussians(gaussians.variances, weights), material.eta, material.specular, material.roughness)
+    single = material.single_scattering
+    if single is not None:
+        single = jax.tree.map(lambda values: jnp.broadcast_to(values, 3), single)
+    gaussians = sj.SumOfGaussians(gaussians.variances, weights)
+    return sj.Material(gaussians, material.eta, material.specular, material.roughness, single)
 
 
 def without_scattering(material: sj.Material) -> sj.Material:
     """Give the same surface and color with light that leaves where it enters: one Gaussian, narrower than any splat."""
     gaussians = material.gaussians
     variances = jnp.full_like(gaussians.variances, _NARROW, shape=(1,))
-    narrow = sj.SumOfGaussians(variances, gaussians.total_reflectance()[None])
-    return sj.Material(narrow, material.eta, material.specular, material.roughness)
+    return material.with_gaussians(sj.SumOfGaussians(variances, material.total_reflectance()[None]))
 
 
 def towards(azimuth: float, elevation: float) -> jax.Array:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Float
 
-from splatjax.gaussians import SumOfGaussians
+from splatjax.scene import Material
 from splatjax.splatting import AbstractView, Surface
 
 from ._diffuser import AbstractDiffuser, Kernels, Sources
@@ -43,7 +43,7 @@ def pixel_points(view: AbstractView, depth: Float[Array, "height width"]) -> Flo
 
 def diffusion_layers(
     sources: Sources,
-    gaussians: SumOfGaussians,
+    material: Material,
     seen: Sequence[SeenSurface],
     interval: Float[Array, "2"],
     view: AbstractView,
@@ -55,8 +55,8 @@ def diffusion_layers(
     **Arguments:**
 
     - `sources`: centers (mm), normals, areas (mm^2) and irradiance of the splats. Differentiable.
-    - `gaussians`: one per layer. Their weights tell how much light is absorbed, for the normalization; the layers are not
-      multiplied by them. Differentiable.
+    - `material`: its Gaussians, one per layer. Their weights tell the normalization how much light is absorbed; the layers are
+      not multiplied by them. Differentiable.
     - `seen`: the surface in front, and the one that shows behind its silhouettes. Differentiable.
     - `interval`: from `handover_interval`.
 
@@ -69,7 +69,7 @@ def diffusion_layers(
     """
     covered = jnp.stack([stop_gradient(each.surface.weight_sum) > 0 for each in seen])
     points = jnp.stack([pixel_points(view, each.surface.depth) for each in seen])
-    variances = gaussians.variances
+    variances = material.gaussians.variances
     kernels = Kernels(variances, normalization.depths(variances))
     diffused = diffuser.diffuse(sources, kernels, points, covered, view)
     found = []
@@ -80,6 +80,6 @@ def diffusion_layers(
         own = each.irradiance[None]
         # Splats too far apart to carry a layer do not count its exits either.
         exits = 1 + resolved * (diffused.exits[:, place] - 1)
-        layers = normalization.gain(exits, gaussians, each.albedo) * diffused.means[:, place]
+        layers = normalization.gain(exits, material, each.albedo) * diffused.means[:, place]
         found.append(DiffusionLayers(own + resolved[:, None] * (layers - own), resolved))
     return found, diffused.needed

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from splatjax.gaussians import SumOfGaussians
+from splatjax.scene import Material
 
 _ROUNDING = 0.05  # of a flat sheet's exits: below this excess the gain rises from 1 quadratically
 
@@ -31,7 +31,7 @@ class AbstractNormalization(eqx.Module):
     def gain(
         self,
         exits: Float[Array, "gaussians *points"],
-        gaussians: SumOfGaussians,
+        material: Material,
         albedo: Float[Array, "channels *points"],
     ) -> Float[Array, "gaussians channels *points"]:
         r"""Give by how much each layer passes the mean over the splats around.
@@ -49,7 +49,7 @@ class PlainMean(AbstractNormalization):
 
     depth: float = eqx.field(static=True, default=0.0)
 
-    def gain(self, exits, gaussians, albedo):
+    def gain(self, exits, material, albedo):
         return jnp.ones((exits.shape[0], *albedo.shape), exits.dtype)
 
 
@@ -57,8 +57,9 @@ class ExitOdds(AbstractNormalization):
     r"""Light leaves a thin or convex part sooner, so less of it is absorbed: twice the ways out, twice the odds of leaving.
 
     Light spreads from layer to layer, the narrow ones first. Of what is still inside, the share `p_k = w_k / (W_k + 1 - W)`
-    leaves a flat surface as layer k, where `W_k` is the energy of the layers as wide or wider and `W` that of all, each times
-    the albedo. With `S_k` exits for one the odds `p_k / (1 - p_k)` grow S_k-fold, and the wider layers have what is left:
+    leaves a flat surface as layer k, where `W_k` is the energy of the layers as wide or wider and `W` that of all and of single
+    scattering, each times the albedo. With `S_k` exits for one the odds `p_k / (1 - p_k)` grow S_k-fold, and the wider layers
+    have what is left:
 
         gain_k = S_k / prod_(j <= k) (1 + p_j (S_j - 1))    where S > 1; S counts as 1 elsewhere
 
@@ -73,11 +74,12 @@ class ExitOdds(AbstractNormalization):
 
     depth: float = eqx.field(static=True, default=0.75)
 
-    def gain(self, exits, gaussians, albedo):
+    def gain(self, exits, material, albedo):
+        gaussians = material.gaussians
         order = jnp.argsort(gaussians.variances)
         points = (None,) * (albedo.ndim - 1)
         energies = jnp.maximum(gaussians.weights[order][:, :, *points] * albedo[None], 0)
-        absorbed = jnp.maximum(1 - jnp.sum(energies, axis=0, keepdims=True), 0)
+        absorbed = jnp.maximum(1 - material.total_reflectance()[:, *points] * albedo, 0)[None]
         inside = jnp.cumsum(energies[::-1], axis=0)[::-1] + absorbed
         leaving = energies / jnp.where(inside > 0, inside, 1.0)
         more = jnp.maximum(exits[order][:, None] - 1, 0)

@@ -15,6 +15,7 @@ from ._atomic import atomic_path
 
 _REC709_D65 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 _WEIGHTS = "splatjax.weights.{}"
+_SINGLE = "single_scattering"
 _VARIANCES, _HANDED_OVER, _OVERFLOW = "splatjax.variances", "splatjax.handed_over", "splatjax.overflow"
 
 
@@ -27,6 +28,7 @@ def write_exr(path: str | os.PathLike[str], frame: Frame, *, variances: Sequence
     | `Z` | depth, mm; inf where there is nothing |
     | `position.X Y Z`, `normal.X Y Z` | of the front surface, world space, mm |
     | `albedo.R G B`, `irradiance.R G B`, `diffuse.R G B`, `specular.R G B` | premultiplied |
+    | `single_scattering.R G B` | premultiplied; only when the material has such a term |
     | `shadow.1`, `shadow.2`, ... | per light |
     | `diffusion.1.R G B`, `diffusion.2.R G B`, ... | per Gaussian, so that `diffuse = sum_k weights_k diffusion.k` |
 
@@ -124,6 +126,8 @@ def _planes(frame: Frame) -> Iterator[tuple[str, np.ndarray]]:
         yield from split([f"{layer}.{axis}" for axis in "XYZ"], getattr(frame, layer))
     for layer in ("albedo", "irradiance", "diffuse", "specular"):
         yield from split(_names(layer, channels), getattr(frame, layer))
+    if frame.single_scattering is not None:
+        yield from split(_names(_SINGLE, channels), frame.single_scattering)
     for number, shadow in enumerate(np.asarray(frame.shadow), 1):
         yield f"shadow.{number}", shadow
     for number, picture in enumerate(np.asarray(frame.layers), 1):
@@ -159,6 +163,8 @@ def _frame(header: dict, planes: dict[str, np.ndarray]) -> Frame:
         "handed_over": np.asarray(header[_HANDED_OVER], np.float32),
         "overflow": np.asarray(header[_OVERFLOW], np.float32),
     }
+    if _names(_SINGLE, channels)[0] in planes:
+        arrays[_SINGLE] = picture(_names(_SINGLE, channels))
     return Frame(**{name: jnp.asarray(array) for name, array in arrays.items()})
 
 

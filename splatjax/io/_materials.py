@@ -13,7 +13,17 @@ import numpy as np
 import tomli_w
 
 from splatjax.gaussians import SumOfGaussians
-from splatjax.scattering import BetterDipole, Dipole, ExactFresnel, Film, Layer, LayeredMultipole, Medium, PhotonBeam
+from splatjax.scattering import (
+    BetterDipole,
+    Dipole,
+    ExactFresnel,
+    Film,
+    Layer,
+    LayeredMultipole,
+    Medium,
+    PhotonBeam,
+    SingleScattering,
+)
 from splatjax.scene import Material
 
 from ._atomic import atomic_path
@@ -21,7 +31,7 @@ from ._atomic import atomic_path
 COEFFICIENT_UNIT = "1/mm"
 VARIANCE_UNIT = "mm^2"
 THICKNESS_UNIT = "mm"
-_TABLES = ("medium", "layers", "surface", "source", "fit")
+_TABLES = ("medium", "layers", "surface", "single_scattering", "source", "fit")
 
 
 def profiles_folder() -> Path:
@@ -60,7 +70,10 @@ def load_material(name_or_path: str | os.PathLike[str]) -> Material:
     eta = surface.number("eta", "positive", lambda x: x > 0, 1.4)
     specular = surface.number("specular", "at least 0", lambda x: x >= 0, 0.18)
     roughness = surface.number("roughness", "in (0, 1]", lambda x: 0 < x <= 1, 0.3)
-    return Material(SumOfGaussians(_array(variances), _array(weights)), eta, specular, roughness)
+    single = None
+    if "single_scattering" in tables:
+        single = _single_scattering(_Table(path, "single_scattering", tables["single_scattering"]), weights.shape[1])
+    return Material(SumOfGaussians(_array(variances), _array(weights)), eta, specular, roughness, single)
 
 
 def load_medium(name_or_path: str | os.PathLike[str]) -> Medium:
@@ -125,6 +138,9 @@ def save_material(
         tables["medium"] = _plain_medium(profile.medium)
     surface = {"eta": material.eta, "specular": material.specular, "roughness": material.roughness}
     tables["surface"] = {name: _plain(value) for name, value in surface.items()}
+    if material.single_scattering is not None:
+        strength = _plain(material.single_scattering.strength)
+        tables["single_scattering"] = {**_plain_medium(material.single_scattering.medium), "strength": strength}
     tables["source"] = dict(source or {})
     gaussians = material.gaussians
     tables["fit"] = {
@@ -191,6 +207,19 @@ def _layer(table: "_Table") -> Layer | Film:
     return layer
 
 
+def _single_scattering(table: "_Table", channels: int) -> SingleScattering:
+    medium = _medium(table)
+    strength = np.ones(len(medium.eta))
+    if "strength" in table.table:
+        strength = table.numbers("strength", "at least 0", lambda x: x >= 0, channels=len(strength))
+    if not len(medium.eta) == len(strength) == channels:
+        counts = f"{len(medium.eta)} and {len(strength)}"
+        raise ValueError(
+            f"{table.where} coefficients and strength must have {channels} channels, as [fit] has; they have {counts}"
+        )
+    return SingleScattering(medium, _array(strength))
+
+
 def _medium(medium: "_Table") -> Medium:
     medium.unit(COEFFICIENT_UNIT)
     sigma_a = medium.numbers("sigma_a", "at least 0 (1/mm)", lambda x: x >= 0)
@@ -214,7 +243,7 @@ def _read(name_or_path: str | os.PathLike[str]) -> tuple[Path, dict[str, Any]]:
         raise ValueError(f"{path}: is no TOML file: {error}") from None
     unknown = sorted(set(tables) - set(_TABLES))
     if unknown:
-        known = "[medium] or [[layers]], [surface], [source] and [fit]"
+        known = "[medium] or [[layers]], [surface], [single_scattering], [source] and [fit]"
         raise ValueError(f"{path}: has an unknown entry {unknown[0]!r}; a material has {known}")
     if not {"medium", "layers", "fit"} & set(tables):
         raise ValueError(f"{path}: has neither [medium] nor [[layers]] nor [fit]; a material needs one of them")

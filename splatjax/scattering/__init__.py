@@ -18,5 +18,6 @@ from ._quadrature import AbstractRadialRule as AbstractRadialRule, InverseVarian
 from ._quadrature import NORM_RULE as NORM_RULE, TOTAL_RULE as TOTAL_RULE, RadialRule as RadialRule
 from ._quadrature import at_own_radii as at_own_radii, integrated_reflectance as integrated_reflectance
 from ._rough import RoughFresnel as RoughFresnel
+from ._single_scattering import SingleScattering as SingleScattering
 from ._slab import AbstractSlabProfile as AbstractSlabProfile, Transmitted as Transmitted
 from ._tabulated import Tabulated as Tabulated

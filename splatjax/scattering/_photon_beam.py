@@ -5,15 +5,15 @@ from typing import ClassVar
 
 import jax.numpy as jnp
 import numpy as np
-from jax.lax import stop_gradient
 from jaxtyping import Array, Float
 
 from splatjax.gaussians import AbstractProfile
 
 from ._better_dipole import exitance_of_source
-from ._fresnel import AbstractFresnel, ExactFresnel, moment_outside
+from ._fresnel import AbstractFresnel, ExactFresnel
 from ._medium import Medium
-from ._quadrature import integrated_reflectance, unit_interval
+from ._quadrature import integrated_reflectance
+from ._single_scattering import SingleScattering
 
 _NODES = 128
 
@@ -66,45 +66,18 @@ class PhotonBeam(AbstractProfile):
 
     def single(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
         """Give what was scattered once, 1/mm^2."""
-        medium = self.medium
-        scattering = medium.albedo_prime * medium.sigma_t_prime
-        half_angle, share = self._escaping()
-        shape = (half_angle.shape[0], *r.shape, *scattering.shape)
-        middle = tuple(range(1, 1 + r.ndim))
-        half_angle, share = (jnp.broadcast_to(jnp.expand_dims(each, middle), shape) for each in (half_angle, share))
-        path = jnp.broadcast_to(r[None, ..., None], shape) * jnp.broadcast_to(medium.sigma_t_prime, shape)
-        total = jnp.sum(share * jnp.exp(-path / half_angle), axis=0)
-        return jnp.broadcast_to(scattering, total.shape) * total / (4 * jnp.pi * jnp.broadcast_to(r[..., None], total.shape))
+        return SingleScattering(self.medium)(r)
 
     def total_reflectance(self) -> Float[Array, " channels"]:
         """Give `2 pi` times the integral of `r R(r)`: single scattering exactly, multiple scattering by quadrature."""
-        half_angle, share = self._escaping()
-        single = 0.5 * self.medium.albedo_prime * jnp.sum(share * half_angle, axis=0)
-        return single + integrated_reflectance(_Multiple(self))
+        return SingleScattering(self.medium).total_reflectance() + integrated_reflectance(_Multiple(self))
+
+    def multiply_scattered(self) -> AbstractProfile:
+        """Give what was scattered more than once as a profile: for a material with a `SingleScattering` of its own."""
+        return _Multiple(self)
 
     def length_scale(self) -> Float[Array, " channels"]:
         return 1 / self.medium.sigma_t_prime
-
-    def _escaping(self) -> tuple[Float[Array, "angles channels"], Float[Array, "angles channels"]]:
-        """Give `tan(theta / 2)` of the angles at which light leaves, and their weights `(1 - F) cos(theta) d theta`.
-
-        The angle is measured on the rarer side, where it takes all values: `sin(theta) = min(1, 1 / eta) sin(psi)`.
-        """
-        eta = self.medium.eta
-        x, beyond, weights = (_over(each, (len(each), *eta.shape), eta.dtype) for each in unit_interval())
-        sine, cosine = jnp.sin(0.5 * jnp.pi * x), jnp.sin(0.5 * jnp.pi * beyond)
-        eta = jnp.broadcast_to(eta, x.shape)
-        inside, outside = jnp.where(eta < 1, 1.0, 1 / eta), jnp.where(eta < 1, eta, 1.0)
-        cos_in, cos_out = (jnp.sqrt(cosine**2 + (1 - scale**2) * sine**2) for scale in (inside, outside))
-        across = (eta * cos_in - cos_out) / (eta * cos_in + cos_out)
-        along = (cos_in - eta * cos_out) / (cos_in + eta * cos_out)
-        reflected, weights = 0.5 * (across**2 + along**2), 0.5 * jnp.pi * weights * cosine
-        # As eta goes to 1, all that is reflected is so at grazing angles, which get infinitely few nodes: the quadrature keeps
-        # its value and loses its derivative. One more node, at the grazing angle, adds what the closed form has.
-        missed = jnp.sum(weights * reflected * sine, axis=0) - 0.5 * moment_outside(self.medium.eta)
-        grazing = stop_gradient(inside[0] / (1 + jnp.sqrt(1 - inside[0] ** 2)))
-        half_angle = jnp.concatenate([inside * sine / (1 + cos_in), grazing[None]])
-        return half_angle, jnp.concatenate([weights * (1 - reflected) * inside, (inside[0] * missed)[None]])
 
 
 class _Multiple(AbstractProfile):

@@ -64,6 +64,11 @@ class Tabulated(AbstractProfile):
         columns = [jnp.interp(flat, self.radii, column, right=0.0) for column in self.values.T]
         return jnp.stack(columns, axis=-1).reshape(*r.shape, -1)
 
+    def without(self, profile: AbstractProfile) -> "Tabulated":
+        """Give what is left when a profile is taken away: of R(r) what was scattered more than once, say."""
+        total = None if self.total is None else self.total - profile.total_reflectance()
+        return Tabulated(self.radii, self.values - profile(self.radii), self.deviation, total)
+
     def total_reflectance(self) -> Float[Array, " channels"]:
         """Give the total, or else `2 pi` times the integral of `r R(r)`, exactly that of the straight lines."""
         if self.total is not None:

@@ -12,7 +12,7 @@ class Frame(eqx.Module):
 
     **Attributes:**
 
-    - `beauty`: `diffuse + specular`, radiance.
+    - `beauty`: `diffuse + specular`, and `single_scattering` where there is one; radiance.
     - `coverage`: in [0, 1].
     - `depth`: along the camera's forward axis, mm; inf where there is nothing.
     - `position`: world space, mm; 0 where there is nothing.
@@ -25,6 +25,7 @@ class Frame(eqx.Module):
     - `diffuse`, `specular`: radiance.
     - `handed_over`: per Gaussian, the share of the covered pixels for which the splats are too far apart to carry the
       layer, so that it is the surface's own irradiance.
+    - `single_scattering`: radiance, premultiplied; `None` when the material has none.
     - `overflow`: what the plan lacks: 0 when the picture fits, else the largest of needed over planned, and the picture is NaN.
     """
 
@@ -42,3 +43,4 @@ class Frame(eqx.Module):
     specular: Float[Array, "height width channels"]
     handed_over: Float[Array, " gaussians"]
     overflow: Float[Array, ""]
+    single_scattering: Float[Array, "height width channels"] | None = None

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from splatjax.gaussians import SumOfGaussians
+from splatjax.scattering import SingleScattering
 
 
 class Material(eqx.Module):
@@ -16,20 +17,46 @@ class Material(eqx.Module):
     - `eta`: index of refraction relative to air, for the Fresnel term of the specular lobe.
     - `specular`: strength of the specular lobe (rho_s).
     - `roughness`: of the specular lobe (m, root mean square slope), in (0, 1].
+    - `single_scattering`: light that scatters once, as a term of its own; the Gaussians then stand for the rest. `None`: they
+      stand for all.
     """
 
     gaussians: SumOfGaussians
     eta: Float[Array, ""]
     specular: Float[Array, ""]
     roughness: Float[Array, ""]
+    single_scattering: SingleScattering | None
 
-    def __init__(self, gaussians: SumOfGaussians, eta=1.4, specular=0.18, roughness=0.3):
+    def __init__(
+        self,
+        gaussians: SumOfGaussians,
+        eta=1.4,
+        specular=0.18,
+        roughness=0.3,
+        single_scattering: SingleScattering | None = None,
+    ):
         dtype = gaussians.variances.dtype
         self.gaussians = gaussians
         self.eta = jnp.asarray(eta, dtype)
         self.specular = jnp.asarray(specular, dtype)
         self.roughness = jnp.asarray(roughness, dtype)
+        self.single_scattering = single_scattering
+
+    def total_reflectance(self) -> Float[Array, " channels"]:
+        """Give the share of the light that enters along the normal of a flat piece and leaves it again."""
+        total = self.gaussians.total_reflectance()
+        return total if self.single_scattering is None else total + self.single_scattering.total_reflectance()
+
+    def with_gaussians(self, gaussians: SumOfGaussians) -> "Material":
+        """Give the same surface with other Gaussians, and no single scattering besides."""
+        return Material(gaussians, self.eta, self.specular, self.roughness)
 
     def white(self) -> "Material":
-        """Give the material with weights that sum to one per channel, so that an albedo map alone carries color."""
-        return Material(self.gaussians.white(), self.eta, self.specular, self.roughness)
+        """Give the material with a total reflectance of one per channel, so that an albedo map alone carries color."""
+        single = self.single_scattering
+        if single is None:
+            return self.with_gaussians(self.gaussians.white())
+        total = self.total_reflectance()
+        gaussians = SumOfGaussians(self.gaussians.variances, self.gaussians.weights / total[None])
+        single = SingleScattering(single.medium, single.strength / total)
+        return Material(gaussians, self.eta, self.specular, self.roughness, single)

@@ -5,8 +5,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from splatjax.scattering import SingleScattering
 from splatjax.scene import StackedLights
 
+from ._albedo import directional_albedo
 from ._composition import diffuse_transmission
 from ._specular import specular_lobe
 
@@ -54,6 +56,31 @@ def reflected_radiance(
             received = lobe * cosine
             received = received if share is None else received * share
             return total + received[..., None] * irradiance, None
+
+        total, _ = jax.lax.scan(add, total, (group.lights, shares))
+    return total
+
+
+def single_scattered_radiance(
+    points: SurfacePoints, groups: list[StackedLights], f0: Float[Array, ""], single: SingleScattering
+) -> Float[Array, "height width channels"]:
+    """Give the radiance of light that entered where it leaves and scattered once, each light in its own shadow.
+
+    What the specular lobe reflects does not enter. The surface counts as flat and evenly lit over a mean free path.
+    """
+    channels = single.medium.sigma_a.shape[0]
+    total = jnp.zeros((*points.positions.shape[:-1], channels), points.positions.dtype)
+    towards_eye = jnp.maximum(jnp.sum(points.normals * points.outgoing, axis=-1), 0)
+    for group, shares in zip(groups, points.lit, strict=True):
+
+        @jax.checkpoint
+        def add(total, light_and_share):
+            light, share = light_and_share
+            wi, irradiance = light.incidence(points.positions)
+            cosine = jnp.maximum(jnp.sum(wi * points.normals, axis=-1), 0)
+            entered = cosine * (1 - directional_albedo(cosine, f0, points.specular, points.roughness))
+            entered = entered if share is None else entered * share
+            return total + single.reflected(cosine, towards_eye) * entered[..., None] * irradiance, None
 
         total, _ = jax.lax.scan(add, total, (group.lights, shares))
     return total

@@ -8,6 +8,8 @@ import pytest
 
 from splatjax.diffusion import DenseDiffuser, ExitOdds, Kernels, PlainMean, Sources
 from splatjax.gaussians import SumOfGaussians
+from splatjax.scattering import Medium, SingleScattering
+from splatjax.scene import Material
 
 # Six Gaussians on the reflectance of half spaces of sigma_t = 1/mm, isotropic scattering, no change of index; albedo 0.9, 0.98
 # and 0.998. `fit_gaussians` on four million walks, non-negative, totals held.
@@ -25,13 +27,14 @@ THROUGH = {2.0: [0.2198, 0.3138, 0.3433], 4.0: [0.1096, 0.2290, 0.2828], 8.0: [0
 
 
 def material(weights=WEIGHTS):
-    return SumOfGaussians(jnp.asarray(VARIANCES), jnp.asarray(weights))
+    return Material(SumOfGaussians(jnp.asarray(VARIANCES), jnp.asarray(weights)))
 
 
-def gain(exits, gaussians, albedo=1.0):
+def gain(exits, material, albedo=1.0):
+    gaussians = material.gaussians
     channels = gaussians.weights.shape[1]
     exits = jnp.broadcast_to(jnp.asarray(exits), (gaussians.variances.shape[0], 1))
-    return np.asarray(ExitOdds().gain(exits, gaussians, jnp.full((channels, 1), albedo)))[..., 0]
+    return np.asarray(ExitOdds().gain(exits, material, jnp.full((channels, 1), albedo)))[..., 0]
 
 
 @pytest.mark.parametrize("exits", [0.0, 0.4, 1.0])
@@ -42,18 +45,19 @@ def test_flat_pieces_and_open_edges_keep_their_mean(exits):
 def test_what_absorbs_nothing_returns_all_whatever_the_shape():
     white = material().white()
     for exits in (3.0, np.linspace(1.1, 2.5, 6)[:, None]):
-        np.testing.assert_allclose(np.sum(np.asarray(white.weights) * gain(exits, white), axis=0), 1, rtol=1e-5)
+        np.testing.assert_allclose(np.sum(np.asarray(white.gaussians.weights) * gain(exits, white), axis=0), 1, rtol=1e-5)
     np.testing.assert_array_equal(np.asarray(PlainMean().gain(jnp.full((6, 2), 3.0), material(), jnp.ones((3, 2)))), 1)
 
 
 def test_odds_of_leaving_grow_as_the_exits():
     """For one Gaussian that is all there is: far above the rounded corner."""
-    one = SumOfGaussians(jnp.asarray([1.0]), jnp.asarray([[0.3, 0.8]]))
+    one = Material(SumOfGaussians(jnp.asarray([1.0]), jnp.asarray([[0.3, 0.8]])))
     for exits in (40.0, 200.0):
         leaving = np.asarray([0.3, 0.8]) * gain(exits, one)[0]
         odds = leaving / (1 - leaving)
         np.testing.assert_allclose(odds, exits * np.asarray([3 / 7, 4.0]), rtol=0.05)
-    np.testing.assert_allclose(gain(2.0, one, albedo=0.5), gain(2.0, SumOfGaussians(one.variances, 0.5 * one.weights)), rtol=1e-6)
+    darker = Material(SumOfGaussians(one.gaussians.variances, 0.5 * one.gaussians.weights))
+    np.testing.assert_allclose(gain(2.0, one, albedo=0.5), gain(2.0, darker), rtol=1e-6)
 
 
 def test_nothing_returns_more_than_it_receives():
@@ -77,9 +81,19 @@ def test_more_exits_let_out_more_and_leave_less_for_wider_layers():
 
 
 def test_layers_need_no_order():
-    turned = SumOfGaussians(jnp.asarray(VARIANCES)[::-1], jnp.asarray(WEIGHTS)[::-1])
+    turned = Material(SumOfGaussians(jnp.asarray(VARIANCES)[::-1], jnp.asarray(WEIGHTS)[::-1]))
     exits = np.linspace(1.1, 2.5, 6)[:, None]
     np.testing.assert_allclose(gain(exits[::-1], turned)[::-1], gain(exits, material()), rtol=1e-6)
+
+
+def test_what_scattered_once_is_not_absorbed():
+    """With single scattering as a term of its own and the rest in the Gaussians, nothing absorbed still returns all."""
+    single = SingleScattering(Medium(jnp.zeros(1), jnp.ones(1), jnp.full(1, 1.4)))
+    rest = 1 - float(single.total_reflectance()[0])
+    gaussians = SumOfGaussians(jnp.asarray([1.0, 4.0]), jnp.asarray([[0.4 * rest], [0.6 * rest]]))
+    found = gain(2.5, Material(gaussians, single_scattering=single))
+    np.testing.assert_allclose(np.sum(np.asarray(gaussians.weights) * found, axis=0), rest, rtol=1e-5)
+    assert np.all(np.sum(np.asarray(gaussians.weights) * gain(2.5, Material(gaussians)), axis=0) > 1.01 * rest)
 
 
 def test_the_corner_is_rounded():
@@ -105,7 +119,7 @@ def through_a_sheet(thickness: float, normalization) -> np.ndarray:
     centers = np.concatenate([flat, flat - thickness * up], axis=1)
     entering = np.repeat([0.0, 1.0], x.size)[None]
     sources = Sources(*map(jnp.asarray, (centers, np.concatenate([up, -up], axis=1), np.full(2 * x.size, spacing**2), entering)))
-    gaussians = material()
+    gaussians = material().gaussians
     kernels = Kernels(gaussians.variances, normalization.depths(gaussians.variances))
     points, covered = jnp.zeros((1, 3, 1, 1)), jnp.ones((1, 1, 1), bool)
     view = bodies.perspective(width=1, height=1)  # unused by the plain diffuser
@@ -113,7 +127,7 @@ def through_a_sheet(thickness: float, normalization) -> np.ndarray:
     carried = (gaussians.variances > spacing**2)[:, None, None]  # the others are too narrow for the splats, and do not reach
     exits = jnp.where(carried, found.exits[:, 0], 1.0)
     means = jnp.where(carried[:, None], found.means[:, 0], 0.0)
-    layers = normalization.gain(exits, gaussians, jnp.ones((3, 1, 1))) * means
+    layers = normalization.gain(exits, material(), jnp.ones((3, 1, 1))) * means
     return np.asarray(jnp.sum(gaussians.weights * layers[:, :, 0, 0], axis=0))
 
 
