@@ -46,6 +46,8 @@ class Fit:
     """Of photon beams and Monte Carlo, which are infinite at the origin: where the fit begins, in mean free paths."""
     photons: int = 1_000_000
     """Of Monte Carlo: how many walk."""
+    single_scattering: bool = False
+    """Of photon beams and Monte Carlo: keep light that scatters once as a term of its own, and fit Gaussians to the rest."""
     free: bool = False
     """Leave the weights free: the least error of Eq. 3, which may miss some of the energy."""
     mm_per_unit: float = 1.0
@@ -73,7 +75,7 @@ class Fit:
         if isinstance(coefficients, sj.Tabulated):
             made = Reference(coefficients, sj.NORM_RULE)
         else:
-            made = reference(coefficients, self.model, self.cut, self.photons)
+            made = reference(coefficients, self.model, self.cut, self.photons, self.single_scattering)
         profile = made.profile
         count = self.count if self.error is None else sj.LeastCount(self.error)
         title = f"{self.count} Gaussians" if self.error is None else f"Gaussians to an error of {self.error:g}"
@@ -134,12 +136,13 @@ class Fit:
             sj.save_material(sj.Material(fitted.gaussians), output, source=source, fit={"profile": "measured"} | how)
         else:
             medium = coefficients.medium if isinstance(coefficients, sj.Dipole) else coefficients.top.medium
-            material = sj.Material(fitted.gaussians, eta=medium.eta[0])
-            if isinstance(made.profile, sj.Tabulated):
-                walked = {"profile": f"Monte Carlo, {self.photons} photons"}
-                sj.save_material(material, output, profile=coefficients, source=source, fit=how | walked)
-            else:
-                sj.save_material(material, output, profile=made.profile, source=source, fit=how)
+            material = sj.Material(fitted.gaussians, eta=medium.eta[0], single_scattering=made.single)
+            known = (sj.Dipole, sj.BetterDipole, sj.PhotonBeam, sj.LayeredMultipole)
+            if not isinstance(made.profile, known):
+                model = "photon beam" if self.model is Model.PHOTON_BEAM else f"Monte Carlo, {self.photons} photons"
+                how["profile"] = model if made.single is None else f"{model}, without single scattering"
+            profile = made.profile if isinstance(made.profile, known) else coefficients
+            sj.save_material(material, output, profile=profile, source=source, fit=how)
 
     def _weights_of(self, measured: bool) -> str:
         if self.free:

@@ -23,18 +23,24 @@ class Model(Enum):
 
 @dataclass(frozen=True)
 class Reference:
-    """A profile to be fitted, and where its fit begins."""
+    """A profile to be fitted, and where its fit begins; and what light that scatters once does beside it."""
 
-    profile: sj.Dipole | sj.BetterDipole | sj.PhotonBeam | sj.LayeredMultipole | sj.Tabulated
+    profile: sj.AbstractProfile
     rule: AbstractRadialRule
+    single: sj.SingleScattering | None = None
 
 
-def reference(coefficients: sj.Dipole | sj.LayeredMultipole, model: Model, cut: float, photons: int) -> Reference:
+def reference(coefficients: sj.Dipole | sj.LayeredMultipole, model: Model, cut: float, photons: int, apart: bool) -> Reference:
     """Give what a model makes of a medium or of layers; `cut` is in mean free paths.
 
-    **Raises:** `ValueError` for layers and a model that knows a half space alone.
+    With `apart` light that scatters once is taken out of the profile.
+
+    **Raises:** `ValueError` for layers and a model that knows a half space alone, and for single scattering taken out of layers
+    or of a dipole.
     """
     layered = isinstance(coefficients, sj.LayeredMultipole)
+    if apart:
+        return _apart(coefficients, model, cut, photons)
     if model is Model.DIPOLE:
         return Reference(coefficients, sj.NORM_RULE)
     if model is Model.MONTE_CARLO:
@@ -45,6 +51,20 @@ def reference(coefficients: sj.Dipole | sj.LayeredMultipole, model: Model, cut: 
     if model is Model.BETTER_DIPOLE:
         return Reference(sj.BetterDipole(coefficients.medium), sj.NORM_RULE)
     return Reference(sj.PhotonBeam(coefficients.medium), sj.NORM_RULE.beyond(cut))
+
+
+def _apart(coefficients: sj.Dipole | sj.LayeredMultipole, model: Model, cut: float, photons: int) -> Reference:
+    if isinstance(coefficients, sj.LayeredMultipole):
+        raise ValueError("--single-scattering knows a half space, and this material has layers; leave it out")
+    single = sj.SingleScattering(coefficients.medium)
+    match model:
+        case Model.PHOTON_BEAM:
+            return Reference(sj.PhotonBeam(coefficients.medium).multiply_scattered(), sj.NORM_RULE, single)
+        case Model.MONTE_CARLO:
+            found = reference(coefficients, model, cut, photons, apart=False)
+            assert isinstance(found.profile, sj.Tabulated)
+            return Reference(found.profile.without(single), found.rule, single)
+    raise ValueError(f"--single-scattering is no part of --model {model.value}; take photon-beam or monte-carlo")
 
 
 def _walked(layers: tuple[sj.Layer | sj.Film, ...], photons: int) -> sj.Tabulated:

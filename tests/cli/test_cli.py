@@ -119,6 +119,34 @@ def test_fit_takes_the_model_that_is_asked_for(model, said, tmp_path, capsys):
 
 
 @pytest.mark.once
+@pytest.mark.parametrize("model", ["photon-beam", "monte-carlo"])
+def test_fit_keeps_single_scattering_apart(model, tmp_path, capsys):
+    output = tmp_path / "skin.toml"
+    command = [
+        "fit",
+        "skin1",
+        "--model",
+        model,
+        "--single-scattering",
+        "--photons",
+        "20000",
+        "--count",
+        "3",
+        "--output",
+        str(output),
+    ]
+    assert main(command) == 0
+    assert "without single scattering" in output.read_text()
+    material = sj.load_material(output)
+    single, rest = (np.asarray(each.total_reflectance()) for each in (material.single_scattering, material.gaussians))
+    assert np.all((single > 0.03) & (single < rest))
+    np.testing.assert_allclose(single + rest, [0.4395, 0.2133, 0.1155], rtol=0.1)
+    capsys.readouterr()
+    for more in (["skin1"], ["skin_layers", "--model", "monte-carlo"]):
+        assert "--single-scattering" in failure(["fit", *more, "--single-scattering"], capsys)
+
+
+@pytest.mark.once
 def test_fit_takes_a_photograph_that_any_program_wrote(tmp_path, capsys):
     photograph, output = tmp_path / "dot.exr", tmp_path / "dot.toml"
     y, x = (np.mgrid[:60, :60] - 29.5) * 0.2
