@@ -22,7 +22,7 @@ from splatjax.splatting import SplattingSettings
 
 SIZE = 192
 """Pixels along a side."""
-SAMPLES, PASSES = 256, 8
+SAMPLES, PASSES = 256, 9
 """Paths per pixel of a pass, and passes."""
 ALBEDO = (0.9, 0.98, 0.998)
 SIGMA_T = 1.0
