@@ -110,6 +110,7 @@ def diffuse(
     **Raises:** `ValueError` when a plan is needed and not given, or when the channels disagree.
     """
     settings = RenderSettings() if settings is None else settings
+    _check_channels(scene)
     channels = scene.material.gaussians.weights.shape[1]
     if irradiance.shape[1] != channels:
         raise ValueError(f"irradiance has {irradiance.shape[1]} channels, material.gaussians.weights has {channels}: {_SAME}")
@@ -167,7 +168,8 @@ def _render(scene: Scene, camera: Camera, settings: RenderSettings, plan: Plan) 
     specular, roughness = _surface_parameters(splats, scene)
 
     def entering(cosine):
-        return 1 - _shading.directional_albedo(cosine, f0, specular, roughness)
+        share = 1 - _shading.directional_albedo(cosine, f0, specular, roughness)
+        return share[None] if material.single_scattering is None else share[None] * material.left_to_diffuse(cosine).T
 
     irradiance = _diffusion.entering_irradiance(splats.centers, splats.normals, groups, lit, entering, channels)
     root = None if splats.albedo is None else _shading.albedo_root(splats.albedo).T

@@ -105,6 +105,10 @@ class Truth(NamedTuple):
         deviation, bright = np.sqrt(self.variance), np.quantile(self.picture, 0.98, axis=(0, 1))
         return np.all(deviation < 0.25 * bright, axis=-1)
 
+    def exposure(self) -> float:
+        """Give the factor at which the picture is shown: its bright parts are 0.8."""
+        return 0.8 / float(np.quantile(self.picture, 0.98))
+
 
 def read_truth(body: Body, folder: Path) -> Truth:
     """Read what `tools/path_traced_bodies.py` wrote."""
@@ -175,7 +179,8 @@ def errors(picture: np.ndarray, truth: Truth) -> tuple[list[float], float]:
     rms = np.sqrt(np.maximum(squared, 0) / (truth.picture[sound] ** 2).mean(0))
     import flip_evaluator
 
-    shown = [encode(np.where(sound[..., None], each, 0)).astype(np.float32) for each in (truth.picture, picture)]
+    pictures = (np.where(sound[..., None], truth.exposure() * each, 0) for each in (truth.picture, picture))
+    shown = [encode(each).astype(np.float32) for each in pictures]
     return rms.tolist(), float(flip_evaluator.evaluate(*shown, "LDR")[1])
 
 
@@ -214,7 +219,7 @@ def draw(shown: list[tuple[Body, Truth, dict[str, np.ndarray]]], path: Path) -> 
     columns = ["path traced", *names, *(f"{name}, difference" for name in names)]
     figure, axes = plt.subplots(len(shown), len(columns), figsize=(2.2 * len(columns), 2.25 * len(shown)), squeeze=False)
     for axes_row, (body, truth, pictures) in zip(axes, shown, strict=True):
-        exposure = 0.8 / np.quantile(truth.picture, 0.98)
+        exposure = truth.exposure()
         images = [encode(exposure * truth.picture), *(encode(exposure * each) for each in pictures.values())]
         images += [np.clip(0.5 + exposure * (each - truth.picture), 0, 1) for each in pictures.values()]
         for axis, image, title in zip(axes_row, images, columns, strict=True):

@@ -54,8 +54,11 @@ def trace(mi, body: Body, folder: Path) -> None:
     """Add passes to the body's file until there are enough."""
     path = folder / f"{body.name}.npz"
     total, squares, seconds, passes = 0.0, 0.0, np.inf, 0
+    made_of = repr((body, SIZE, SAMPLES, ALBEDO, SIGMA_T, IRRADIANCE))
     if path.exists():
         with np.load(path) as found:
+            if str(found["made_of"]) != made_of:
+                raise ValueError(f"{path}: is the picture of another body or setting; remove it, or take another folder")
             total, squares, seconds, passes = found["total"], found["squares"], float(found["seconds"]), int(found["passes"])
     mesh = folder / f"{body.name}.ply"
     mesh_of(body).export(mesh)
@@ -68,7 +71,7 @@ def trace(mi, body: Body, folder: Path) -> None:
             raise ValueError(f"{path}: pass {number} has values that are not finite")
         total, squares = total + picture, squares + picture**2
         beside = path.with_suffix(".part.npz")
-        np.savez(beside, total=total, squares=squares, seconds=seconds, passes=number + 1)
+        np.savez(beside, total=total, squares=squares, seconds=seconds, passes=number + 1, made_of=made_of)
         os.replace(beside, path)
 
 

@@ -73,6 +73,10 @@ class Fit:
     def _run(self) -> None:
         coefficients = self._coefficients()
         if isinstance(coefficients, sj.Tabulated):
+            if self.single_scattering:
+                raise ValueError(
+                    f"{self.medium}: --single-scattering needs coefficients, and this is a measured profile; leave it out"
+                )
             made = Reference(coefficients, sj.NORM_RULE)
         else:
             made = reference(coefficients, self.model, self.cut, self.photons, self.single_scattering)

@@ -21,7 +21,7 @@ class Materials:
         for name in sj.materials():
             material = sj.load_material(name)
             gaussians = material.gaussians
-            reflectance = "  ".join(f"{float(share):.3f}" for share in gaussians.total_reflectance())
+            reflectance = "  ".join(f"{float(share):.3f}" for share in material.total_reflectance())
             widest = float(gaussians.variances.max()) ** 0.5
             table.add_row(name, str(len(gaussians.variances)), f"{widest:.3g}", reflectance, f"{float(material.eta):.3g}")
         Console(highlight=False).print(table)

@@ -131,7 +131,7 @@ def without_scattering(material: sj.Material) -> sj.Material:
     """Give the same surface and color with light that leaves where it enters: one Gaussian, narrower than any splat."""
     gaussians = material.gaussians
     variances = jnp.full_like(gaussians.variances, _NARROW, shape=(1,))
-    return material.with_gaussians(sj.SumOfGaussians(variances, material.total_reflectance()[None]))
+    return material.surface_of(sj.SumOfGaussians(variances, material.total_reflectance()[None]))
 
 
 def towards(azimuth: float, elevation: float) -> jax.Array:

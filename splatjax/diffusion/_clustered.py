@@ -163,9 +163,9 @@ class ClusterDiffuser(AbstractDiffuser):
             plain = jnp.concatenate([mass[None] * clusters.irradiance, mass[None]])
             rows += [plain * axis[None] for axis in centers]
         rows = jnp.concatenate(rows)
-        x, y, depth = view.project(points)
-        depth = jnp.where(there, stop_gradient(depth), -jnp.inf).reshape(-1)
-        far = _farthest(stop_gradient(x).reshape(-1) / layer.stride, stop_gradient(y).reshape(-1) / layer.stride, depth, grid)
+        x, y, away = (stop_gradient(each).reshape(-1) for each in view.project(points))
+        away = jnp.where(there.reshape(-1), away, -jnp.inf)
+        far = _farthest(x / layer.stride, y / layer.stride, away, grid)
         ranges = _ranges(clusters, stop_gradient(variance), self.support, view, grid, layer.stride, far)
         bins = bin_items(ranges, grid, layer.capacity)
         where = jnp.where(there[None], points, _FAR)

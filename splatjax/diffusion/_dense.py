@@ -40,9 +40,10 @@ class DenseDiffuser(AbstractDiffuser):
                 nearest = stop_gradient(jnp.min(squared, axis=1, keepdims=True))
                 weight = sources.areas[None] * jnp.exp(-0.5 * (squared - nearest) / variance)
                 gathered = jnp.sum(weight, axis=1)
-                flat = 2 * jnp.pi * variance * jnp.exp(0.5 * (nearest[:, 0] - depth * depth) / variance)
+                # What a flat sheet gathers is one exit; far from everything this underflows, cleanly.
+                scale = jnp.exp(-0.5 * (nearest[:, 0] - depth * depth) / variance) / (2 * jnp.pi * variance)
                 means = (sources.irradiance @ weight.T) / gathered[None]
-                return jnp.concatenate([means, (gathered / flat)[None]])
+                return jnp.concatenate([means, (gathered * scale)[None]])
 
             found = jax.lax.map(layer, (kernels.variances, kernels.depths))
             return jnp.where(covered[None, None], found, 0.0)

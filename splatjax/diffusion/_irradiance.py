@@ -14,7 +14,7 @@ def entering_irradiance(
     normals: Float[Array, "splats 3"],
     groups: list[StackedLights],
     lit: list[Float[Array, "_lights splats"] | None],
-    entering: Callable[[Float[Array, " splats"]], Float[Array, " splats"]],
+    entering: Callable[[Float[Array, " splats"]], Float[Array, "#channels splats"]],
     channels: int,
 ) -> Float[Array, "channels splats"]:
     r"""Give the irradiance that enters the surface, `sum_lights irradiance max(n . wi, 0) lit entering(n . wi)`.
@@ -22,7 +22,7 @@ def entering_irradiance(
     **Arguments:**
 
     - `lit`: for each group the share of each light that reaches each splat; `None` for lights that cast no shadows.
-    - `entering`: the share that is not reflected by the surface, as a function of the cosine.
+    - `entering`: the share that is left to diffuse, as a function of the cosine; one row for all channels, or one for each.
 
     **Returns:** linear in the lights. Differentiable in everything; the horizon is a kink.
     """
@@ -34,9 +34,8 @@ def entering_irradiance(
             light, share = light_and_share
             wi, irradiance = light.incidence(points)
             cosine = jnp.maximum(jnp.sum(wi * normals, axis=-1), 0)
-            received = cosine * entering(cosine)
-            received = received if share is None else received * share
-            return total + irradiance.T * received[None], None
+            received = cosine if share is None else cosine * share
+            return total + irradiance.T * (received[None] * entering(cosine)), None
 
         total, _ = jax.lax.scan(add, total, (group.lights, shares))
     return total

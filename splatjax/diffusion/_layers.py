@@ -61,9 +61,9 @@ def diffusion_layers(
     - `interval`: from `handover_interval`.
 
     **Returns:** the layers of both, without weights, and what capacity was needed over what was planned. They are linear in the
-    light. Summed with the weights they return no more than the greatest irradiance. Constants are kept, and
-    `min E <= L_k <= max E`, where the normalization's gain is 1: everywhere for `PlainMean`; for `ExitOdds` on flat pieces, at
-    open edges, and by what absorbs nothing.
+    light. For weights that are not negative and sum to one or less, their weighted sum is at most the greatest irradiance; where
+    they sum to one it keeps constants. Each layer keeps constants, and `min E <= L_k <= max E`, where the normalization's gain
+    is 1: everywhere for `PlainMean`; for `ExitOdds` on flat pieces and at open edges.
 
     **Source:** Kim et al. 2010, section 4.2; the normalization's own.
     """
@@ -80,6 +80,6 @@ def diffusion_layers(
         own = each.irradiance[None]
         # Splats too far apart to carry a layer do not count its exits either.
         exits = 1 + resolved * (diffused.exits[:, place] - 1)
-        layers = normalization.gain(exits, material, each.albedo) * diffused.means[:, place]
-        found.append(DiffusionLayers(own + resolved[:, None] * (layers - own), resolved))
+        means = own + resolved[:, None] * (diffused.means[:, place] - own)
+        found.append(DiffusionLayers(normalization.gain(exits, material, each.albedo) * means, resolved))
     return found, diffused.needed

@@ -8,6 +8,7 @@ from jaxtyping import Array, Float
 
 from splatjax.scene import Material
 
+_SLACK = 1e-5
 _ROUNDING = 0.05  # of a flat sheet's exits: below this excess the gain rises from 1 quadratically
 
 
@@ -63,8 +64,9 @@ class ExitOdds(AbstractNormalization):
 
         gain_k = S_k / prod_(j <= k) (1 + p_j (S_j - 1))    where S > 1; S counts as 1 elsewhere
 
-    On flat pieces and at open edges the gain is 1. Never does more leave than came, `sum_k w_k gain_k <= 1`, and from what
-    absorbs nothing (`W = 1`) all of it. The corner at `S = 1` is rounded over 0.05.
+    On flat pieces and at open edges the gain is 1. Of weights that are not negative and sum to one or less never more leaves than
+    came, `sum_k w_k gain_k <= 1`, and from what absorbs nothing (`W = 1`) all of it. Negative weights, as a free fit may have,
+    count as none. The corner at `S = 1` is rounded over 0.05.
 
     The source lies below its splat, since the light that leaves has been inside: what faces away is nearer through a thin
     part, and what lies across a gap of air is farther.
@@ -78,8 +80,11 @@ class ExitOdds(AbstractNormalization):
         gaussians = material.gaussians
         order = jnp.argsort(gaussians.variances)
         points = (None,) * (albedo.ndim - 1)
-        energies = jnp.maximum(gaussians.weights[order][:, :, *points] * albedo[None], 0)
-        absorbed = jnp.maximum(1 - material.total_reflectance()[:, *points] * albedo, 0)[None]
+        energies = gaussians.weights[order][:, :, *points] * albedo[None]
+        energies = jnp.where(energies >= 0, energies, 0.0)
+        once = material.total_reflectance() - gaussians.total_reflectance()
+        absorbed = 1 - jnp.sum(energies, axis=0) - once[:, *points] * albedo
+        absorbed = jnp.where(absorbed >= -_SLACK, absorbed, 0.0)[None]  # white is white to rounding: not at a corner
         inside = jnp.cumsum(energies[::-1], axis=0)[::-1] + absorbed
         leaving = energies / jnp.where(inside > 0, inside, 1.0)
         more = jnp.maximum(exits[order][:, None] - 1, 0)

@@ -14,6 +14,7 @@ from ._medium import Medium
 from ._quadrature import unit_interval
 
 _LEAST_COSINE = 1e-4
+_COSINES = 10
 
 
 class SingleScattering(AbstractProfile):
@@ -79,11 +80,21 @@ class SingleScattering(AbstractProfile):
         shape = (*mu_i.shape, *eta.shape)
         eta, scattered = (jnp.broadcast_to(each, shape) for each in (eta, self.strength * self.medium.albedo_prime))
         mu_i, mu_o = (jnp.broadcast_to(jnp.maximum(mu, _LEAST_COSINE)[..., None], shape) for mu in (mu_i, mu_o))
-        inside_i, inside_o = (jnp.sqrt(jnp.maximum(1 - (1 - mu * mu) / (eta * eta), _LEAST_COSINE**2)) for mu in (mu_i, mu_o))
+        inside_i, inside_o = (jnp.sqrt(jnp.maximum(mu * mu + (eta * eta - 1), _LEAST_COSINE**2)) / eta for mu in (mu_i, mu_o))
         across = (mu_o - eta * inside_o) / (mu_o + eta * inside_o)
         along = (inside_o - eta * mu_o) / (inside_o + eta * mu_o)
         transmitted = 1 - 0.5 * (across * across + along * along)
         return scattered * transmitted / (4 * jnp.pi * eta * eta * (inside_i + inside_o))
+
+    def leaving(self, mu_i: Float[Array, "*points"]) -> Float[Array, "*points channels"]:
+        """Give the share of the light that has entered under a cosine `mu_i` and leaves after one scattering; right to 1e-3."""
+        nodes, weights = np.polynomial.legendre.leggauss(_COSINES)
+        share = jnp.zeros((*mu_i.shape, *self.strength.shape), mu_i.dtype)
+        for node, weight in zip(0.5 * (nodes + 1), 0.5 * weights, strict=True):
+            # mu = t^2: the radiance has a root at grazing angles.
+            radiance = self.reflected(mu_i, jnp.full_like(mu_i, node * node))
+            share = share + float(4 * np.pi * weight * node**3) * radiance
+        return share
 
     def _escaping(self) -> tuple[Float[Array, "angles channels"], Float[Array, "angles channels"]]:
         """Give `tan(theta / 2)` of the angles at which light leaves, and their weights `(1 - F) cos(theta) d theta`.

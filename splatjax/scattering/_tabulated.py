@@ -66,6 +66,11 @@ class Tabulated(AbstractProfile):
 
     def without(self, profile: AbstractProfile) -> "Tabulated":
         """Give what is left when a profile is taken away: of R(r) what was scattered more than once, say."""
+        if profile.singular and not isinstance(self.radii, Tracer) and self.radii[0] == 0:
+            name = type(profile).__name__
+            raise ValueError(
+                f"{name} is infinite at r = 0, so it cannot be taken from a table that begins there; leave that row out"
+            )
         total = None if self.total is None else self.total - profile.total_reflectance()
         return Tabulated(self.radii, self.values - profile(self.radii), self.deviation, total)
 

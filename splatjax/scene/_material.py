@@ -47,15 +47,28 @@ class Material(eqx.Module):
         total = self.gaussians.total_reflectance()
         return total if self.single_scattering is None else total + self.single_scattering.total_reflectance()
 
-    def with_gaussians(self, gaussians: SumOfGaussians) -> "Material":
-        """Give the same surface with other Gaussians, and no single scattering besides."""
+    def left_to_diffuse(self, mu_i: Float[Array, "*points"]) -> Float[Array, "*points channels"]:
+        """Give what the Gaussians have of the light that enters under a cosine `mu_i`, over what they have along the normal.
+
+        Light that grazes scatters out again at once, more of it than along the normal. Where that and the Gaussians' total would
+        be more than all, the Gaussians have what is left.
+        """
+        if self.single_scattering is None:
+            return jnp.ones((*mu_i.shape, self.gaussians.weights.shape[1]), mu_i.dtype)
+        total = self.gaussians.total_reflectance()
+        rest = jnp.maximum(1 - self.single_scattering.leaving(mu_i), 0)
+        total = jnp.broadcast_to(total, rest.shape)
+        return jnp.where(rest < total, rest / jnp.where(rest < total, total, 1.0), 1.0)
+
+    def surface_of(self, gaussians: SumOfGaussians) -> "Material":
+        """Give other Gaussians, and nothing besides, the surface of this material."""
         return Material(gaussians, self.eta, self.specular, self.roughness)
 
     def white(self) -> "Material":
         """Give the material with a total reflectance of one per channel, so that an albedo map alone carries color."""
         single = self.single_scattering
         if single is None:
-            return self.with_gaussians(self.gaussians.white())
+            return self.surface_of(self.gaussians.white())
         total = self.total_reflectance()
         gaussians = SumOfGaussians(self.gaussians.variances, self.gaussians.weights / total[None])
         single = SingleScattering(single.medium, single.strength / total)

@@ -161,6 +161,19 @@ def test_fast_gradient_is_the_plain_one():
         np.testing.assert_allclose(np.asarray(ours), np.asarray(theirs), atol=1e-6 * scale)
 
 
+def test_far_from_every_source_gradients_are_finite(x64):
+    """As in a layer that is handed over: nothing reaches a point between splats."""
+    _, view, sources, points, covered = scene(x64)
+    narrow = jnp.asarray([1e-6, 1e-3])
+
+    def total(kernels):
+        found = DenseDiffuser().diffuse(sources, kernels, points[:1], covered[:1], view)
+        return jnp.sum(found.exits) + jnp.sum(found.means)
+
+    gradient = jax.jit(jax.grad(total))(Kernels(narrow, DEPTH * jnp.sqrt(narrow)))
+    assert all(np.all(np.isfinite(np.asarray(leaf))) for leaf in jax.tree.leaves(gradient))
+
+
 def test_outside_its_plan_the_diffuser_says_so(x64):
     body, view, sources, points, covered = scene(x64)
     diffuser = planned(body, view)

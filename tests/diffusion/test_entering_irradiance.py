@@ -38,7 +38,7 @@ def test_irradiance_is_the_sum_of_the_formulas(count, dtype):
     share = {place: lit[i][row] for i, g in enumerate(groups) if lit[i] is not None for row, place in enumerate(g.places)}
 
     found = jax.jit(
-        lambda points, normals, lit: entering_irradiance(points, normals, groups, lit, lambda c: 0.9 - 0.2 * c, 3),
+        lambda points, normals, lit: entering_irradiance(points, normals, groups, lit, lambda c: (0.9 - 0.2 * c)[None], 3),
     )(body.centers, body.normals, [None if each is None else array(each) for each in lit])
 
     def received(wi):
@@ -58,6 +58,6 @@ def test_irradiance_is_the_sum_of_the_formulas(count, dtype):
 
 def test_no_light_is_dark():
     body = bodies.bumpy(20)
-    found = entering_irradiance(body.centers, body.normals, [], [], lambda c: c, 3)
+    found = entering_irradiance(body.centers, body.normals, [], [], lambda c: c[None], 3)
     assert found.shape == (3, 20)
     assert not np.any(np.asarray(found))

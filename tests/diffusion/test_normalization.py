@@ -6,10 +6,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from splatjax.diffusion import DenseDiffuser, ExitOdds, Kernels, PlainMean, Sources
+from splatjax.diffusion import DenseDiffuser, ExitOdds, Kernels, PlainMean, SeenSurface, Sources, diffusion_layers
 from splatjax.gaussians import SumOfGaussians
 from splatjax.scattering import Medium, SingleScattering
 from splatjax.scene import Material
+from splatjax.splatting import Surface
 
 # Six Gaussians on the reflectance of half spaces of sigma_t = 1/mm, isotropic scattering, no change of index; albedo 0.9, 0.98
 # and 0.998. `fit_gaussians` on four million walks, non-negative, totals held.
@@ -94,6 +95,53 @@ def test_what_scattered_once_is_not_absorbed():
     found = gain(2.5, Material(gaussians, single_scattering=single))
     np.testing.assert_allclose(np.sum(np.asarray(gaussians.weights) * found, axis=0), rest, rtol=1e-5)
     assert np.all(np.sum(np.asarray(gaussians.weights) * gain(2.5, Material(gaussians)), axis=0) > 1.01 * rest)
+
+
+def test_negative_weights_count_as_none():
+    """A free fit may have some: what is left is shared as if they were not there."""
+    weights = np.asarray([[0.5], [-0.2], [0.3]])
+    signed, without = (
+        Material(SumOfGaussians(jnp.asarray([1.0, 2.0, 3.0]), jnp.asarray(w))) for w in (weights, np.maximum(weights, 0))
+    )
+    np.testing.assert_allclose(gain(2.0, signed), gain(2.0, without), rtol=1e-6)
+
+
+def test_slope_in_a_weight_of_zero_is_the_limit_from_above():
+    def out(w):
+        lit = Material(SumOfGaussians(jnp.asarray([1.0, 4.0]), jnp.stack([w, jnp.asarray(0.4)])[:, None]))
+        return jnp.sum(lit.gaussians.weights[:, 0] * ExitOdds().gain(jnp.full((2, 1), 2.0), lit, jnp.ones((1, 1)))[:, 0, 0])
+
+    step = 2e-3
+    w = jnp.asarray(0.0)
+    np.testing.assert_allclose(float(jax.grad(out)(w)), float(out(w + step) - out(w)) / step, rtol=1e-2)
+
+
+@pytest.mark.parametrize("ends", [(0.1, 0.2), (0.5, 3.0), (1.0, 5.0)])
+def test_a_thin_white_sheet_returns_what_it_receives_whatever_is_handed_over(ends):
+    """Lit evenly from both sides: layers that are diffused, handed over, and in between."""
+    spacing, half = 0.5, 10.0
+    x, y = np.meshgrid(np.arange(-half, half + 0.1, spacing), np.arange(-half, half + 0.1, spacing))
+    flat = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)])
+    up = np.zeros_like(flat) + np.asarray([[0.0], [0.0], [1.0]])
+    centers, normals = np.concatenate([flat, flat - 0.5 * up], axis=1), np.concatenate([up, -up], axis=1)
+    sources = Sources(*map(jnp.asarray, (centers, normals, np.full(2 * x.size, spacing**2), np.ones((1, 2 * x.size)))))
+    view = bodies.perspective(width=1, height=1)
+    one = jnp.ones((1, 1))
+    depth = view.project(jnp.zeros((3, 1, 1)))[2]
+    seen = SeenSurface(Surface(jnp.zeros((0, 1, 1)), depth, one, one), one[None], jnp.full((1, 1), spacing**2), one[None])
+    gaussians = SumOfGaussians(jnp.asarray([0.3, 1.0, 4.0]), jnp.asarray([[0.3], [0.3], [0.4]]))
+
+    def returned(gaussians):
+        (layers,), _ = diffusion_layers(
+            sources, Material(gaussians), [seen], jnp.asarray(ends), view, DenseDiffuser(), ExitOdds()
+        )
+        return layers
+
+    layers = returned(gaussians)
+    assert np.any(np.asarray(layers.resolved) > 0)
+    np.testing.assert_allclose(float(jnp.sum(gaussians.weights * layers.layers[:, 0, 0])), 1, rtol=1e-4)
+    darker = SumOfGaussians(gaussians.variances, 0.5 * gaussians.weights)
+    assert 0.5 < float(jnp.sum(darker.weights * returned(darker).layers[:, 0, 0])) < 1
 
 
 def test_the_corner_is_rounded():

@@ -39,7 +39,7 @@ def test_it_is_its_formula_and_part_of_the_beauty():
     np.testing.assert_allclose(np.asarray(frame.single_scattering)[2, 2], expected, rtol=1e-3)
     parts = frame.diffuse + frame.specular + frame.single_scattering
     np.testing.assert_allclose(np.asarray(frame.beauty), np.asarray(parts), rtol=1e-6)
-    plain = picture(lit.with_gaussians(lit.gaussians))
+    plain = picture(lit.surface_of(lit.gaussians))
     assert plain.single_scattering is None
     np.testing.assert_allclose(np.asarray(plain.diffuse), np.asarray(frame.diffuse), rtol=1e-5)
 
@@ -57,6 +57,24 @@ def test_white_returns_all():
     np.testing.assert_allclose(np.asarray(white.total_reflectance()), 1, rtol=1e-5)
     ratio = np.asarray(material().total_reflectance())
     np.testing.assert_allclose(np.asarray(white.single_scattering.strength), 1 / ratio, rtol=1e-5)
+
+
+@pytest.mark.parametrize("eta", [1.0, 1.3])
+def test_no_more_leaves_than_came_however_the_light_grazes(eta):
+    """What scatters once and what diffuses add up to one at most, and to one where nothing is absorbed or reflected."""
+    mu = jnp.asarray([1.0, 0.5, 0.2, 0.05, 0.0])
+    for absorbing in (0.0, 0.002, 0.1):
+        medium = sj.Medium(jnp.full(1, absorbing), jnp.full(1, 1 - absorbing), jnp.full(1, eta))
+        single = SingleScattering(medium)
+        rest = 0.95 * (1 - float(single.total_reflectance()[0])) if absorbing else 1 - float(single.total_reflectance()[0])
+        lit = sj.Material(sj.SumOfGaussians(jnp.asarray([1.0]), jnp.asarray([[rest]])), single_scattering=single)
+        for each in (lit, lit.white()):
+            diffused = each.gaussians.total_reflectance()[None] * each.left_to_diffuse(mu)
+            leaving = each.single_scattering.leaving(mu) + diffused
+            assert np.all(np.asarray(leaving) <= 1 + 2e-3)
+            if absorbing == 0:
+                np.testing.assert_allclose(np.asarray(leaving), 1, atol=2e-3)
+        np.testing.assert_allclose(np.asarray(lit.left_to_diffuse(mu[:1])), 1, atol=2e-3)
 
 
 def test_it_has_derivatives_through_a_picture():

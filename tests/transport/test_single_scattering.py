@@ -67,7 +67,17 @@ def test_it_is_reciprocal():
     np.testing.assert_allclose(float(there) * enters(0.9), float(back) * enters(0.2), rtol=1e-5)
 
 
-def test_gradients_at_matched_indices_and_at_grazing_angles_are_the_limits():
+def test_the_share_that_leaves_is_the_integral_of_the_radiance():
+    for eta in ETAS:
+        ours, mu_i = single(eta=eta), jnp.asarray([1.0, 0.3, 0.0])
+        nodes, weights = np.polynomial.legendre.leggauss(400)
+        mu, weights = 0.25 * (nodes + 1) ** 2, 0.5 * (nodes + 1) * weights
+        for each, found in zip(mu_i, ours.leaving(mu_i), strict=True):
+            radiance = np.asarray(ours.reflected(jnp.full(len(mu), each), jnp.asarray(mu)))[:, 0]
+            np.testing.assert_allclose(float(found[0]), 2 * np.pi * np.sum(weights * mu * radiance), rtol=2e-3)
+
+
+def test_gradients_at_matched_indices_are_the_limits_and_finite_at_grazing_angles():
     with jax.enable_x64(True):
         for mu in ((0.7, 0.4), (1.0, 1.0), (0.0, 0.5), (0.5, 0.0), (0.0, 0.0)):
             mu_i, mu_o = (jnp.asarray(each) for each in mu)
@@ -89,6 +99,12 @@ def test_a_table_without_it_is_the_rest():
     table = sj.Tabulated(radii, 2 * ours(radii), total=2 * ours.total_reflectance()).without(ours)
     np.testing.assert_allclose(np.asarray(table.values), np.asarray(ours(radii)), rtol=1e-5)
     np.testing.assert_allclose(np.asarray(table.total), np.asarray(ours.total_reflectance()), rtol=1e-5)
+
+
+def test_a_table_from_zero_is_refused():
+    table = sj.Tabulated(jnp.asarray([0.0, 1.0]), jnp.ones((2, 1)))
+    with pytest.raises(ValueError, match="infinite at r = 0"):
+        table.without(single())
 
 
 def test_photon_beam_is_it_and_the_rest():
