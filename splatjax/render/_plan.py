@@ -1,0 +1,91 @@
+"""What `jit`, `grad` and loops need to know of shapes, found once."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.core import Tracer
+from jaxtyping import Array, Float
+
+from splatjax import diffusion as _diffusion, splatting as _splatting
+from splatjax.scene import Camera, PointLight, Scene, Splats, StackedLights, stack_lights
+
+from ._inputs import in_one_dtype
+from ._settings import RenderSettings
+
+
+class ShadowPlan(eqx.Module):
+    """Shadow maps for one group of lights. A point light among the splats needs the six faces of a cube."""
+
+    rasterizer: _splatting.AbstractRasterizer
+    cube: bool = eqx.field(static=True)
+
+
+class Plan(eqx.Module):
+    r"""What `jit`, `grad` and loops need to know of shapes; made by `plan` from concrete arrays.
+
+    Capacities are static, indices are arrays. A picture that needs more than its plan holds is NaN, and says so in `overflow`.
+    """
+
+    camera: _splatting.AbstractRasterizer
+    shadows: tuple[ShadowPlan | None, ...]
+    diffuser: _diffusion.AbstractDiffuser
+    interval: Float[Array, "2"]
+
+
+def plan(scene: Scene, cameras: Camera | Sequence[Camera], settings: RenderSettings | None = None) -> Plan:
+    r"""Find the capacities and orders that rendering a scene with these cameras needs.
+
+    **Arguments:** `scene`, `cameras`: concrete (not traced); all cameras have pictures of one size.
+
+    **Returns:** a `Plan` that serves every one of the cameras, and scenes and materials near this one.
+    """
+    return _plan(scene, cameras, RenderSettings() if settings is None else settings)
+
+
+def _plan(scene: Scene, cameras: Camera | Sequence[Camera], settings: RenderSettings) -> Plan:
+    cameras = [cameras] if isinstance(cameras, Camera) else list(cameras)
+    scene, *cameras = in_one_dtype(scene, *cameras)
+    if len({(camera.width, camera.height) for camera in cameras}) != 1:
+        sizes = sorted({(camera.width, camera.height) for camera in cameras})
+        raise ValueError(f"cameras of one plan must have pictures of one size, not {sizes}")
+    views = [_splatting.PerspectiveView.of(camera) for camera in cameras]
+    bounds = _splatting.Bounds.of(scene.splats)
+    interval = _diffusion.handover_interval(_diffusion.irregularity(scene.splats), settings.diffusion)
+    variances = scene.material.gaussians.variances
+    kernels = _diffusion.Kernels(variances, settings.diffusion.normalization.depths(variances))
+    return Plan(
+        camera=settings.rasterizer.planned(scene.splats, views, settings.splatting),
+        shadows=tuple(_plan_shadows(group, scene.splats, bounds, settings) for group in stack_lights(scene.lights)),
+        diffuser=settings.diffuser.planned(scene.splats, kernels, interval, views),
+        interval=interval,
+    )
+
+
+def plan_unless_traced(scene: Scene, camera: Camera, settings: RenderSettings, plan: Plan | None) -> Plan:
+    if plan is not None:
+        return plan
+    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((scene, camera))):
+        raise ValueError("under jit, grad or vmap a plan is needed: plan=splatjax.plan(scene, camera, settings), made outside")
+    return _plan(scene, camera, settings)
+
+
+def shadow_views(light, bounds, settings: RenderSettings, cube: bool) -> Sequence[_splatting.AbstractView]:
+    if not isinstance(light, PointLight):
+        return [_splatting.distant_view(light.direction, bounds, settings.shadows)]
+    if cube:
+        return _splatting.cube_views(light.position, settings.shadows)
+    return [_splatting.near_view(light.position, bounds, settings.shadows)]
+
+
+def _plan_shadows(group: StackedLights, splats: Splats, bounds, settings: RenderSettings) -> ShadowPlan | None:
+    if not group.lights.cast_shadows:
+        return None
+    cube = False
+    if isinstance(group.lights, PointLight):
+        distance = jnp.linalg.norm(group.lights.position - bounds.center[None], axis=1)
+        cube = bool(jnp.any(distance < 1.05 * bounds.radius))
+    lights = [jax.tree.map(lambda leaf, i=i: leaf[i], group.lights) for i in range(len(group.places))]
+    views = [view for light in lights for view in shadow_views(light, bounds, settings, cube)]
+    return ShadowPlan(settings.rasterizer.planned(splats, views, settings.splatting), cube)

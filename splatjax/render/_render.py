@@ -1,0 +1,101 @@
+"""A picture with all its layers, and pass 4 alone."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from splatjax import diffusion as _diffusion, splatting as _splatting
+from splatjax.scene import Camera, Frame, Scene
+
+from ._inputs import SAME, check_channels, in_one_dtype
+from ._passes import compose, light_splats, see_surfaces, shade_surfaces, sources_of, surface_attributes
+from ._plan import Plan, plan_unless_traced
+from ._settings import RenderSettings
+
+
+def render(scene: Scene, camera: Camera, settings: RenderSettings | None = None, plan: Plan | None = None) -> Frame:
+    r"""Render a picture with all its layers: shadow maps, visibility, attributes, diffusion, shading.
+
+    **Arguments:**
+
+    - `scene`: splats (mm), lights and material. Differentiable; which splats are visible is not.
+    - `camera`: Differentiable.
+    - `settings`: how each pass works.
+    - `plan`: from `splatjax.plan`; needed under `jit`, `grad` and `vmap`, made here otherwise.
+
+    **Returns:** a `Frame` in the dtype of `splats.centers`.
+
+    **Raises:** `ValueError` when a plan is needed and not given, or when the scene's channels disagree.
+    """
+    settings = RenderSettings() if settings is None else settings
+    check_channels(scene)
+    plan = plan_unless_traced(scene, camera, settings, plan)
+    return _render(scene, camera, settings, plan)
+
+
+@eqx.filter_jit
+def _render(scene: Scene, camera: Camera, settings: RenderSettings, plan: Plan) -> Frame:
+    scene, camera = in_one_dtype(scene, camera)
+    view = _splatting.PerspectiveView.of(camera)
+    lit = light_splats(scene, settings, plan)
+    seen = see_surfaces(scene.splats, surface_attributes(scene, lit), view, settings, plan)
+    layers, needed = _diffusion.diffusion_layers(
+        sources_of(scene.splats, lit.source),
+        scene.material,
+        seen.as_receivers(),
+        plan.interval,
+        view,
+        plan.diffuser,
+        settings.diffusion.normalization,
+    )
+    front, behind = shade_surfaces(scene, view, lit.groups, seen, layers)
+    needed = jnp.max(jnp.stack([needed, seen.needed, lit.needed]))
+    return compose(front, behind, scene.material.gaussians.weights, needed)
+
+
+def diffuse(
+    scene: Scene,
+    irradiance: Float[Array, "splats channels"],
+    camera: Camera,
+    settings: RenderSettings | None = None,
+    plan: Plan | None = None,
+) -> Float[Array, "gaussians height width channels"]:
+    r"""Diffuse any irradiance of the splats below the surface: pass 4 alone, the plain layers `L_k` (section 4.2).
+
+    **Arguments:** as for `render`; of the scene only the splats' geometry and albedo and the material's Gaussians matter.
+
+    - `irradiance`: that enters at each splat, in the channels of the material's weights. Differentiable.
+
+    **Returns:** one layer per Gaussian on the front surface, 0 where there is none; NaN where the plan does not suffice.
+    Weighted by `material.gaussians.weights` and summed they are the radiant exitance.
+
+    **Raises:** `ValueError` when a plan is needed and not given, or when the channels disagree.
+    """
+    settings = RenderSettings() if settings is None else settings
+    check_channels(scene)
+    channels = scene.material.gaussians.weights.shape[1]
+    if irradiance.shape[1] != channels:
+        raise ValueError(f"irradiance has {irradiance.shape[1]} channels, material.gaussians.weights has {channels}: {SAME}")
+    plan = plan_unless_traced(scene, camera, settings, plan)
+    return _diffuse(scene, irradiance, camera, settings, plan)
+
+
+@eqx.filter_jit
+def _diffuse(scene: Scene, irradiance, camera: Camera, settings: RenderSettings, plan: Plan):
+    scene, camera, irradiance = in_one_dtype(scene, camera, irradiance)
+    splats, view = scene.splats, _splatting.PerspectiveView.of(camera)
+    attributes = {"area": splats.areas[None], "source": irradiance.T}
+    if splats.albedo is not None:
+        attributes["albedo"] = splats.albedo.T
+    seen = see_surfaces(splats, attributes, view, settings, plan)
+    (front, _), needed = _diffusion.diffusion_layers(
+        sources_of(splats, irradiance.T),
+        scene.material,
+        seen.as_receivers(),
+        plan.interval,
+        view,
+        plan.diffuser,
+        settings.diffusion.normalization,
+    )
+    fits = jnp.maximum(needed, seen.needed) <= 1
+    return jnp.where(fits, front.layers.transpose(0, 2, 3, 1), jnp.nan)
