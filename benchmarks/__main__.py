@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import splatjax as sj
-from splatjax import diffusion, shading, splatting
-from splatjax.scene import stack_lights
+from splatjax import diffusion, splatting
+from splatjax.render import _passes as wiring
 
 from .yardstick import FOCAL_LENGTH, Yardstick, make_scene
 
@@ -69,43 +69,28 @@ def rasterization(scene: sj.Scene, camera: sj.Camera, plan: sj.Plan, settings: s
 
 def passes(scene: sj.Scene, camera: sj.Camera, plan: sj.Plan, settings: sj.RenderSettings) -> dict[str, tuple]:
     """Each pass alone, fed with what the one before gave: name to function and arguments."""
-    splats, groups = scene.splats, stack_lights(scene.lights)
     view = splatting.PerspectiveView.of(camera)
-    light, rasterizer = scene.lights[0], plan.shadows[0].rasterizer
 
-    def shadow(splats):
-        from_light = splatting.distant_view(light.direction, splatting.Bounds.of(splats), settings.shadows)
-        surfaces = splatting.light_surfaces(splats, from_light, settings.splatting, rasterizer)
-        return splatting.lit_share(splats, from_light, surfaces, settings.shadows)
+    def shadow(scene):
+        return wiring.cast_shadows(scene, settings, plan)
 
-    def irradiance(splats, lit):
-        f0, material = shading.fresnel_f0(scene.material.eta), scene.material
+    def visible(scene, light, entering):
+        attributes = wiring.surface_attributes(scene, light, entering)
+        return wiring.see_surfaces(scene.splats, attributes, view, settings, plan)
 
-        def entering(cosine):
-            return 1 - shading.directional_albedo(cosine, f0, material.specular, material.roughness)
+    def layers(scene, entering, seen):
+        sources = wiring.sources_of(scene.splats, entering.source)
+        rest = plan.interval, view, plan.diffuser, settings.diffusion.normalization
+        return diffusion.diffusion_layers(sources, scene.material, seen.receivers(), *rest)
 
-        return diffusion.entering_irradiance(splats.centers, splats.normals, groups, [lit[None]], entering, 3)
-
-    def visible(splats, irradiance):
-        rows = jnp.concatenate([splats.normals.T, splats.areas[None], splats.albedo.T, irradiance, irradiance])
-        return splatting.splat_surfaces(splats, rows, view, settings.splatting, plan.camera)
-
-    def layers(splats, irradiance, surfaces):
-        sources = diffusion.Sources(splats.centers.T, splats.areas, irradiance)
-        seen = tuple(
-            diffusion.SeenSurface(each, each.attributes[7:10], each.attributes[3]) for each in (surfaces.front, surfaces.behind)
-        )
-        variances = scene.material.gaussians.variances
-        return diffusion.diffusion_layers(sources, variances, seen, plan.interval, view, plan.diffuser)
-
-    lit = jax.jit(shadow)(splats)
-    entering = jax.jit(irradiance)(splats, lit)
-    surfaces = jax.jit(visible)(splats, entering)
+    light = jax.jit(shadow)(scene)
+    entering = jax.jit(wiring.let_light_in)(scene, light)
+    seen = jax.jit(visible)(scene, light, entering)
     return {
-        "pass 1, shadow map": (shadow, (splats,)),
-        "irradiance": (irradiance, (splats, lit)),
-        "passes 2+3, all attributes": (visible, (splats, entering)),
-        "pass 4, six layers": (layers, (splats, entering, surfaces)),
+        "pass 1, shadow map": (shadow, (scene,)),
+        "irradiance": (wiring.let_light_in, (scene, light)),
+        "passes 2+3, all attributes": (visible, (scene, light, entering)),
+        "pass 4, six layers": (layers, (scene, entering, seen)),
     }
 
 
@@ -117,11 +102,13 @@ def timed(function: Callable, inputs: tuple) -> float:
 
 def measure(cases: dict[str, tuple[Callable, tuple]], yardstick: Yardstick | None, repeats: int):
     """Compile all cases, then time them in rounds, the yardstick among them: medians in milliseconds."""
-    compiled, seconds = {}, {}
+    compiled, seconds, gigabytes = {}, {}, {}
     for name, (function, inputs) in cases.items():
         start = time.perf_counter()
         compiled[name] = jax.jit(function).lower(*inputs).compile(), inputs
         seconds[name] = time.perf_counter() - start
+        held = compiled[name][0].memory_analysis()
+        gigabytes[name] = 1e-9 * (held.temp_size_in_bytes + held.argument_size_in_bytes + held.output_size_in_bytes)
         timed(*compiled[name])
         print(f"  {name}: compiled in {seconds[name]:.1f} s", flush=True)
     times = {name: [] for name in cases}
@@ -131,19 +118,21 @@ def measure(cases: dict[str, tuple[Callable, tuple]], yardstick: Yardstick | Non
             yard.append(yardstick.milliseconds())
         for name, case in compiled.items():
             times[name].append(timed(*case))
-    return {name: float(np.median(each)) for name, each in times.items()}, seconds, float(np.median(yard)) if yard else None
+    milliseconds = {name: float(np.median(each)) for name, each in times.items()}
+    return milliseconds, seconds, gigabytes, float(np.median(yard)) if yard else None
 
 
-def report(milliseconds, seconds, yard, options) -> list[dict]:
+def report(milliseconds, seconds, gigabytes, yard, options) -> list[dict]:
     """Print a table and give its rows."""
     full_size = (options.splats, options.width) == (683_549, 1024)
     print(f"\n{options.splats:,} splats at {options.width}^2, medians of {options.repeats} rounds")
     print(f"yardstick, passes 2+3 in C on one thread: {f'{yard:.0f} ms' if yard else 'none'}\n")
-    print(f"{'':34}{'ms':>9}{'ratio':>8}{'goal':>7}{'compile, s':>12}")
+    print(f"{'':50}{'ms':>9}{'ratio':>8}{'goal':>7}{'compile, s':>12}{'memory, GB':>12}")
     rows = []
     for name, value in milliseconds.items():
         ratio, goal = value / yard if yard else None, GOALS.get(name) if full_size else None
-        print(f"{name:34}{value:9.0f}{_number(ratio):>8}{_number(goal):>7}{_number(seconds[name]):>12}")
+        numbers = f"{_number(ratio):>8}{_number(goal):>7}{_number(seconds[name]):>12}{gigabytes[name]:12.2f}"
+        print(f"{name:50}{value:9.0f}{numbers}")
         rows.append(
             {
                 "name": name,
@@ -152,6 +141,7 @@ def report(milliseconds, seconds, yard, options) -> list[dict]:
                 "milliseconds": value,
                 "yardstick_milliseconds": yard,
                 "ratio": ratio,
+                "gigabytes": gigabytes[name],
                 "goal": goal,
             }
         )
@@ -167,7 +157,7 @@ def shares(parts: dict[str, float], whole: float) -> None:
     print("\nOf a frame, each pass run alone:")
     rest = whole - sum(parts.values())
     for name, value in [*parts.items(), ("pass 5 and the rest (difference)", rest)]:
-        print(f"{name:34}{value:9.0f} ms{value / whole:8.0%}")
+        print(f"{name:50}{value:9.0f} ms{value / whole:8.0%}")
 
 
 def main() -> None:
@@ -186,17 +176,24 @@ def main() -> None:
     def mean(scene):
         return jnp.mean(frame(scene).beauty)
 
+    def jacobian(scene):
+        return sj.picture_jacobian(scene, camera, settings, plan)
+
     parts = passes(scene, camera, plan, settings)
     cases = {"passes 2+3": (forward, inputs), "all five passes": (frame, (scene,)), **parts}
     if not options.no_gradients:
         cases["passes 2+3 with gradients"] = backward, inputs
         cases["all five passes with gradients"] = jax.grad(mean), (scene,)
+        cases["all five passes with the Jacobian in the material"] = jacobian, (scene,)
     if float(frame(scene).overflow) > 0:
         raise SystemExit("the plan does not hold its own scene: the figures would be those of an empty picture")
     with tempfile.TemporaryDirectory() as folder:
         yardstick = Yardstick.build(Path(folder), data, options.width)
-        milliseconds, seconds, yard = measure(cases, yardstick, options.repeats)
-    rows = report(milliseconds, seconds, yard, options)
+        milliseconds, seconds, gigabytes, yard = measure(cases, yardstick, options.repeats)
+    rows = report(milliseconds, seconds, gigabytes, yard, options)
+    frame_time = milliseconds["all five passes"]
+    for name in [name for name in milliseconds if name.startswith("all five passes with")]:
+        print(f"{name}, over a frame: {milliseconds[name] / frame_time:.2f}")
     shares({name: milliseconds[name] for name in parts}, milliseconds["all five passes"])
     out = Path("out/bench.json")
     out.parent.mkdir(exist_ok=True)

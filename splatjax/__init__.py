@@ -38,6 +38,7 @@ from .transport import DiffuseIncidence as DiffuseIncidence, NormalIncidence as 
 from .transport import HenyeyGreenstein as HenyeyGreenstein, Isotropic as Isotropic
 from .transport import monte_carlo as monte_carlo, MonteCarlo as MonteCarlo, path_derivatives as path_derivatives
 
-from .render import diffuse as diffuse, Plan as Plan, plan as plan, render as render, RenderSettings as RenderSettings
+from .render import diffuse as diffuse, picture_jacobian as picture_jacobian, PictureJacobian as PictureJacobian
+from .render import Plan as Plan, plan as plan, render as render, RenderSettings as RenderSettings
 
 __version__ = "0.1.0"

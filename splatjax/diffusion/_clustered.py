@@ -1,9 +1,10 @@
 """The fast diffuser: clusters instead of splats, a coarse grid of points instead of pixels, for wide layers."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.lax import stop_gradient
@@ -13,7 +14,7 @@ from splatjax.scene import Splats
 from splatjax.splatting import AbstractView, BinCapacity, TileGrid, TileRanges, bin_items
 
 from ._diffuser import AbstractDiffuser, Diffused, Kernels, Sources
-from ._gauss_tiles import gaussian_sums
+from ._gauss_tiles import gaussian_sums, gaussian_sums_forward
 from ._resample import Samples, block_samples, resample
 from ._tree import Clusters, ClusterTree
 
@@ -107,6 +108,23 @@ class ClusterDiffuser(AbstractDiffuser):
         covered: Bool[Array, "surfaces height width"],
         view: AbstractView,
     ) -> Diffused:
+        return self._diffuse(sources, kernels, points, covered, view, gaussian_sums)
+
+    def with_derivative(
+        self,
+        sources: Sources,
+        kernels: Kernels,
+        change: Kernels,
+        points: Float[Array, "surfaces 3 height width"],
+        covered: Bool[Array, "surfaces height width"],
+        view: AbstractView,
+    ) -> tuple[Diffused, Diffused]:
+        def diffuse(moved: Kernels) -> Diffused:
+            return self._diffuse(sources, moved, points, covered, view, gaussian_sums_forward)
+
+        return jax.jvp(diffuse, (kernels,), (change,))
+
+    def _diffuse(self, sources: Sources, kernels: Kernels, points, covered, view: AbstractView, gather: Callable) -> Diffused:
         if self.tree is None or self.layers is None:
             raise ValueError("this ClusterDiffuser has no clusters yet; take one from a plan (splatjax.plan) or from `planned`")
         if kernels.variances.shape[0] != len(self.layers):
@@ -119,7 +137,7 @@ class ClusterDiffuser(AbstractDiffuser):
                 layers.append(jnp.zeros((2, channels + 1, *covered.shape[1:]), points.dtype))
             else:
                 clusters = levels[layer.level].lowered(depth)
-                values, need = self._layer(clusters, variance, depth, layer, points, covered, view)
+                values, need = self._layer(clusters, variance, depth, layer, points, covered, view, gather)
                 layers.append(values)
                 needed.append(need)
             needed.append(jnp.maximum(layer.smallest / variance, variance / layer.largest) * (1 - 1e-6))
@@ -128,22 +146,36 @@ class ClusterDiffuser(AbstractDiffuser):
         found = jnp.stack(layers) if layers else jnp.zeros((0, 2, channels + 1, *covered.shape[1:]), points.dtype)
         return Diffused(found[:, :, :channels], found[:, :, channels], carried, needed)
 
-    def _layer(self, clusters: Clusters, variance, depth, layer: LayerPlan, points, covered, view: AbstractView):
+    def _layer(
+        self, clusters: Clusters, variance, depth, layer: LayerPlan, points, covered, view: AbstractView, gather: Callable
+    ):
         """Evaluate one layer, and last its exits, at the samples of both surfaces and resample them to the pixels of both."""
         grid = self._grid(view.width, view.height, layer.stride)
         if layer.stride == 1:
             each = [
-                self._integrals(clusters, variance, depth, layer, *surface, grid, view, 0)
+                self._integrals(clusters, variance, depth, layer, *surface, grid, view, 0, gather)
                 for surface in zip(points, covered, strict=True)
             ]
             return jnp.stack([values for values, _, _ in each]), jnp.max(jnp.stack([need for _, _, need in each]))
         where, there = block_samples(points[0], covered[0], layer.stride, stop_gradient(variance))
-        values, slopes, need = self._integrals(clusters, variance, depth, layer, where, there, grid, view, 1)
+        values, slopes, need = self._integrals(clusters, variance, depth, layer, where, there, grid, view, 1, gather)
         samples = Samples(where, there, values, slopes)
         pixels = [resample(samples, surface, variance, layer.stride) for surface in points]
         return jnp.where(covered[:, None], jnp.stack(pixels), 0.0), need
 
-    def _integrals(self, clusters: Clusters, variance, depth, layer: LayerPlan, points, there, grid: TileGrid, view, order: int):
+    def _integrals(
+        self,
+        clusters: Clusters,
+        variance,
+        depth,
+        layer: LayerPlan,
+        points,
+        there,
+        grid: TileGrid,
+        view,
+        order: int,
+        gather: Callable,
+    ):
         """Give the means and the exits at points, and for `order` 1 their slopes in space."""
         assert layer.capacity is not None
         # A cluster is as wide as its splats are spread.
@@ -169,7 +201,7 @@ class ClusterDiffuser(AbstractDiffuser):
         ranges = _ranges(clusters, stop_gradient(variance), self.support, view, grid, layer.stride, far)
         bins = bin_items(ranges, grid, layer.capacity)
         where = jnp.where(there[None], points, _FAR)
-        sums = gaussian_sums(where, clusters.centers, 0.5 / wide, rows, bins, grid, self.support)
+        sums = gather(where, clusters.centers, 0.5 / wide, rows, bins, grid, self.support)
         energy, sums = _energy_and_rest(sums, count, points - middle[:, :, None], clusters.moments is not None)
         reached = there & (sums[0] > 0)
         inverse = 1 / jnp.where(reached, sums[0], 1.0)

@@ -57,6 +57,36 @@ def _forward(sweep: _Sweep, bins: Bins, tiles, sources, rows):
     return bins.by_tile(lax.fori_loop(jnp.int32(0), bins.chunks, chunk, out), 0.0)
 
 
+def _derivative(sweep: _Sweep, bins: Bins, tiles, sources, rows, d_sources, d_rows):
+    """Give the sums, and how they change with sources and rows; one look at each weight serves both."""
+    planes, row_planes = _planes(sources, rows, bins)
+    d_planes, d_row_planes = [slot_plane(each, 0.0, bins) for each in d_sources], [slot_plane(row, 0.0, bins) for row in d_rows]
+    lanes, count = sweep.grid.lanes, rows.shape[0]
+
+    def block_of(planes, block):
+        return jnp.stack([lax.dynamic_index_in_dim(plane, block, 0, keepdims=False) for plane in planes], axis=1)
+
+    def chunk(i, out):
+        points = sweep.points(tiles, bins, i)
+
+        def add(block, sums):
+            weight, (dx, dy, dz), squared, rate = sweep.block(planes, block, points)
+            moved_x, moved_y, moved_z, d_rate = (each[:, :, None] for each in jnp.unstack(block_of(d_planes, block), axis=1))
+            nearer = dx * moved_x + dy * moved_y + dz * moved_z
+            d_weight = weight * (2 * rate * nearer - d_rate * squared)
+            block_rows, d_block_rows = block_of(row_planes, block), block_of(d_row_planes, block)
+            both = jnp.einsum("trs,tsp->trp", jnp.concatenate([block_rows, d_block_rows], axis=1), weight)
+            return sums + both.at[:, count:].add(jnp.einsum("trs,tsp->trp", block_rows, d_weight))
+
+        start = jnp.zeros((lanes, 2 * count, points.shape[2]), points.dtype)
+        sums = lax.fori_loop(bins.first_block[i], bins.first_block[i + 1], add, start)
+        return lax.dynamic_update_slice_in_dim(out, sums, i * lanes, 0)
+
+    out = jnp.zeros((bins.places, 2 * count, tiles.shape[2]), tiles.dtype)
+    out = bins.by_tile(lax.fori_loop(jnp.int32(0), bins.chunks, chunk, out), 0.0)
+    return out[:, :count], out[:, count:]
+
+
 def _backward(sweep: _Sweep, bins: Bins, tiles, sources, rows, cotangents):
     planes, row_planes = _planes(sources, rows, bins)
     lanes, count = sweep.grid.lanes, rows.shape[0]
@@ -108,6 +138,17 @@ def _sweep_tiles_bwd(sweep: _Sweep, residuals, cotangents):
 _sweep_tiles.defvjp(_sweep_tiles_fwd, _sweep_tiles_bwd)
 
 
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _sweep_tiles_forward(sweep: _Sweep, bins: Bins, tiles, sources, rows):
+    return _forward(sweep, bins, tiles, sources, rows)
+
+
+@_sweep_tiles_forward.defjvp
+def _sweep_tiles_jvp(sweep: _Sweep, primals, tangents):
+    _, _, d_sources, d_rows = tangents
+    return _derivative(sweep, *primals, d_sources, d_rows)
+
+
 def gaussian_sums(
     points: Float[Array, "3 height width"],
     centers: Float[Array, "3 sources"],
@@ -127,3 +168,18 @@ def gaussian_sums(
     """
     sweep = _Sweep(grid, 0.5 * support * support)
     return grid.join(_sweep_tiles(sweep, bins, grid.cut(points, -_FAR), jnp.concatenate([centers, rates[None]]), rows))
+
+
+def gaussian_sums_forward(
+    points: Float[Array, "3 height width"],
+    centers: Float[Array, "3 sources"],
+    rates: Float[Array, " sources"],
+    rows: Float[Array, "rows sources"],
+    bins: Bins,
+    grid: TileGrid,
+    support: float,
+) -> Float[Array, "rows height width"]:
+    """Give what `gaussian_sums` gives, with forward mode in the sources and not reverse mode; the points are constants."""
+    sweep = _Sweep(grid, 0.5 * support * support)
+    tiles = grid.cut(lax.stop_gradient(points), -_FAR)
+    return grid.join(_sweep_tiles_forward(sweep, bins, tiles, jnp.concatenate([centers, rates[None]]), rows))

@@ -39,9 +39,7 @@ def handover_interval(unevenness: Float[Array, ""], settings: DiffusionSettings)
     return regular + scattered * (jnp.asarray(settings.scattered, unevenness.dtype) - regular)
 
 
-def resolved_share(
-    variance: Float[Array, ""], area: Float[Array, "*points"], interval: Float[Array, "2"]
-) -> Float[Array, "*points"]:
+def resolved_share(variance: Float[Array, "..."], area: Float[Array, "..."], interval: Float[Array, "2"]) -> Float[Array, "..."]:
     """Give how much of a layer is the diffusion integral: a smooth step of variance over area per splat."""
     begin, end = interval[0] ** 2, interval[1] ** 2
     t = jnp.clip((variance / area - begin) / (end - begin), 0, 1)

@@ -6,8 +6,6 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from splatjax.scene import Material
-
 _SLACK = 1e-5
 _ROUNDING = 0.05  # of a flat sheet's exits: below this excess the gain rises from 1 quadratically
 
@@ -31,17 +29,20 @@ class AbstractNormalization(eqx.Module):
     @abc.abstractmethod
     def gain(
         self,
-        exits: Float[Array, "gaussians *points"],
-        material: Material,
-        albedo: Float[Array, "channels *points"],
-    ) -> Float[Array, "gaussians channels *points"]:
+        exits: Float[Array, "gaussians #channels *points"],
+        variances: Float[Array, " gaussians"],
+        energies: Float[Array, "gaussians channels *points"],
+        once: Float[Array, "channels *points"],
+    ) -> Float[Array, "gaussians #channels *points"]:
         r"""Give by how much each layer passes the mean over the splats around.
 
         **Arguments:**
 
         - `exits`: `sum_j A_j G(v_k, |x - q_j|)` over what it is on a flat sheet: 1 there, 2 in a sheet much thinner than the
           layer is wide, less at open edges.
-        - `albedo`: what colors the surface there, in [0, 1].
+        - `variances`: mm^2; only their order counts.
+        - `energies`: weights times the albedo there: the share of the light that leaves a flat piece as each layer.
+        - `once`: the share that leaves as single scattering.
         """
 
 
@@ -50,8 +51,8 @@ class PlainMean(AbstractNormalization):
 
     depth: float = eqx.field(static=True, default=0.0)
 
-    def gain(self, exits, material, albedo):
-        return jnp.ones((exits.shape[0], *albedo.shape), exits.dtype)
+    def gain(self, exits, variances, energies, once):
+        return jnp.ones_like(exits)
 
 
 class ExitOdds(AbstractNormalization):
@@ -76,17 +77,14 @@ class ExitOdds(AbstractNormalization):
 
     depth: float = eqx.field(static=True, default=0.75)
 
-    def gain(self, exits, material, albedo):
-        gaussians = material.gaussians
-        order = jnp.argsort(gaussians.variances)
-        points = (None,) * (albedo.ndim - 1)
-        energies = gaussians.weights[order][:, :, *points] * albedo[None]
+    def gain(self, exits, variances, energies, once):
+        order = jnp.argsort(variances)
+        energies = energies[order]
         energies = jnp.where(energies >= 0, energies, 0.0)
-        once = material.total_reflectance() - gaussians.total_reflectance()
-        absorbed = 1 - jnp.sum(energies, axis=0) - once[:, *points] * albedo
+        absorbed = 1 - jnp.sum(energies, axis=0) - once
         absorbed = jnp.where(absorbed >= -_SLACK, absorbed, 0.0)[None]  # white is white to rounding: not at a corner
         inside = jnp.cumsum(energies[::-1], axis=0)[::-1] + absorbed
         leaving = energies / jnp.where(inside > 0, inside, 1.0)
-        more = jnp.maximum(exits[order][:, None] - 1, 0)
+        more = jnp.maximum(exits[order] - 1, 0)
         more = more * more / (more + _ROUNDING)
         return ((1 + more) / jnp.cumprod(1 + leaving * more, axis=0))[jnp.argsort(order)]

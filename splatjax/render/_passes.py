@@ -12,24 +12,34 @@ from ._plan import Plan, shadow_views
 from ._settings import RenderSettings
 
 
-class LitSplats(eqx.Module):
-    """The splats after pass 1: what the light leaves below the surface of each."""
+class LightOnSplats(eqx.Module):
+    """Pass 1: what of each light reaches each splat."""
 
     groups: list[StackedLights]
-    lit: list[Float[Array, "_lights splats"] | None]
-    """Per group of lights the share of each that reaches each splat; `None` for lights that cast no shadows."""
+    shares: list[Float[Array, "_lights splats"] | None]
+    """Per group of lights; `None` for lights that cast no shadows."""
+    needed: Float[Array, ""]
+
+
+def cast_shadows(scene: Scene, settings: RenderSettings, plan: Plan) -> LightOnSplats:
+    """Pass 1."""
+    groups = stack_lights(scene.lights)
+    shares, needs = _lit_shares(scene.splats, groups, settings, plan)
+    return LightOnSplats(groups, shares, jnp.max(jnp.stack(needs)) if needs else jnp.zeros((), scene.splats.centers.dtype))
+
+
+class EnteringLight(eqx.Module):
+    """What the light leaves below the surface of each splat."""
+
     irradiance: Float[Array, "channels splats"]
     """That enters the surface."""
     source: Float[Array, "channels splats"]
     """That spreads: times the root of the albedo."""
-    needed: Float[Array, ""]
 
 
-def light_splats(scene: Scene, settings: RenderSettings, plan: Plan) -> LitSplats:
-    """Pass 1, and the irradiance that enters at every splat."""
+def let_light_in(scene: Scene, light: LightOnSplats) -> EnteringLight:
+    """The irradiance that enters at every splat."""
     splats, material = scene.splats, scene.material
-    groups = stack_lights(scene.lights)
-    lit, needs = _lit_shares(splats, groups, settings, plan)
     f0 = _shading.fresnel_f0(material.eta)
     specular, roughness = _surface_parameters(scene)
 
@@ -38,26 +48,24 @@ def light_splats(scene: Scene, settings: RenderSettings, plan: Plan) -> LitSplat
         return share[None] if material.single_scattering is None else share[None] * material.left_to_diffuse(cosine).T
 
     channels = material.gaussians.weights.shape[1]
-    irradiance = _diffusion.entering_irradiance(splats.centers, splats.normals, groups, lit, entering, channels)
-    source = irradiance if splats.albedo is None else irradiance * _shading.albedo_root(splats.albedo).T
-    needed = jnp.max(jnp.stack(needs)) if needs else jnp.zeros((), splats.centers.dtype)
-    return LitSplats(groups, lit, irradiance, source, needed)
+    irradiance = _diffusion.entering_irradiance(splats.centers, splats.normals, light.groups, light.shares, entering, channels)
+    return EnteringLight(irradiance, irradiance if splats.albedo is None else irradiance * _shading.albedo_root(splats.albedo).T)
 
 
-def surface_attributes(scene: Scene, lit: LitSplats) -> dict[str, Float[Array, "_rows splats"]]:
+def surface_attributes(scene: Scene, light: LightOnSplats, entering: EnteringLight) -> dict[str, Float[Array, "_rows splats"]]:
     """What passes 2 and 3 blend for the passes that follow, by name."""
     splats = scene.splats
     specular, roughness = _surface_parameters(scene)
     attributes = {
         "normal": splats.normals.T,
         "area": splats.areas[None],
-        "source": lit.source,
+        "source": entering.source,
         "albedo": None if splats.albedo is None else splats.albedo.T,
-        "irradiance": None if splats.albedo is None else lit.irradiance,
+        "irradiance": None if splats.albedo is None else entering.irradiance,
         "specular": None if splats.specular is None else specular[None],
         "roughness": None if splats.roughness is None else roughness[None],
     }
-    attributes |= {f"lit {i}": shares for i, shares in enumerate(lit.lit)}
+    attributes |= {f"lit {i}": shares for i, shares in enumerate(light.shares)}
     return {name: rows for name, rows in attributes.items() if rows is not None}
 
 
@@ -69,10 +77,10 @@ class SeenSurfaces(eqx.Module):
     """Their blended attributes."""
     needed: Float[Array, ""]
 
-    def as_receivers(self) -> list[_diffusion.SeenSurface]:
-        """Give what pass 4 asks of them."""
+    def receivers(self, source: str = "source") -> list[_diffusion.SeenSurface]:
+        """Give what pass 4 asks of them, of the light of that name."""
         return [
-            _diffusion.SeenSurface(each, named["source"], named["area"][0], named.get("albedo", jnp.ones_like(named["source"])))
+            _diffusion.SeenSurface(each, named[source], named["area"][0], named.get("albedo", jnp.ones_like(named[source])))
             for each, named in zip(self.surfaces, self.named, strict=True)
         ]
 

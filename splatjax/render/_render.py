@@ -8,7 +8,7 @@ from splatjax import diffusion as _diffusion, splatting as _splatting
 from splatjax.scene import Camera, Frame, Scene
 
 from ._inputs import SAME, check_channels, in_one_dtype
-from ._passes import compose, light_splats, see_surfaces, shade_surfaces, sources_of, surface_attributes
+from ._passes import cast_shadows, compose, let_light_in, see_surfaces, shade_surfaces, sources_of, surface_attributes
 from ._plan import Plan, plan_unless_traced
 from ._settings import RenderSettings
 
@@ -37,19 +37,20 @@ def render(scene: Scene, camera: Camera, settings: RenderSettings | None = None,
 def _render(scene: Scene, camera: Camera, settings: RenderSettings, plan: Plan) -> Frame:
     scene, camera = in_one_dtype(scene, camera)
     view = _splatting.PerspectiveView.of(camera)
-    lit = light_splats(scene, settings, plan)
-    seen = see_surfaces(scene.splats, surface_attributes(scene, lit), view, settings, plan)
+    light = cast_shadows(scene, settings, plan)
+    entering = let_light_in(scene, light)
+    seen = see_surfaces(scene.splats, surface_attributes(scene, light, entering), view, settings, plan)
     layers, needed = _diffusion.diffusion_layers(
-        sources_of(scene.splats, lit.source),
+        sources_of(scene.splats, entering.source),
         scene.material,
-        seen.as_receivers(),
+        seen.receivers(),
         plan.interval,
         view,
         plan.diffuser,
         settings.diffusion.normalization,
     )
-    front, behind = shade_surfaces(scene, view, lit.groups, seen, layers)
-    needed = jnp.max(jnp.stack([needed, seen.needed, lit.needed]))
+    front, behind = shade_surfaces(scene, view, light.groups, seen, layers)
+    needed = jnp.max(jnp.stack([needed, seen.needed, light.needed]))
     return compose(front, behind, scene.material.gaussians.weights, needed)
 
 
@@ -91,7 +92,7 @@ def _diffuse(scene: Scene, irradiance, camera: Camera, settings: RenderSettings,
     (front, _), needed = _diffusion.diffusion_layers(
         sources_of(splats, irradiance.T),
         scene.material,
-        seen.as_receivers(),
+        seen.receivers(),
         plan.interval,
         view,
         plan.diffuser,

@@ -31,11 +31,17 @@ def material(weights=WEIGHTS):
     return Material(SumOfGaussians(jnp.asarray(VARIANCES), jnp.asarray(weights)))
 
 
-def gain(exits, material, albedo=1.0):
+def gains(exits, material, albedo=1.0, normalization=None):
+    """Of a point with exits [gaussians]: [gaussians, channels]."""
+    normalization = ExitOdds() if normalization is None else normalization
     gaussians = material.gaussians
-    channels = gaussians.weights.shape[1]
-    exits = jnp.broadcast_to(jnp.asarray(exits), (gaussians.variances.shape[0], 1))
-    return np.asarray(ExitOdds().gain(exits, material, jnp.full((channels, 1), albedo)))[..., 0]
+    exits = jnp.broadcast_to(jnp.asarray(exits), gaussians.variances.shape)[:, None]
+    once = (material.total_reflectance() - gaussians.total_reflectance()) * albedo
+    return normalization.gain(exits, gaussians.variances, gaussians.weights * albedo, once)
+
+
+def gain(exits, material, albedo=1.0):
+    return np.asarray(gains(exits, material, albedo))
 
 
 @pytest.mark.parametrize("exits", [0.0, 0.4, 1.0])
@@ -45,9 +51,9 @@ def test_flat_pieces_and_open_edges_keep_their_mean(exits):
 
 def test_what_absorbs_nothing_returns_all_whatever_the_shape():
     white = material().white()
-    for exits in (3.0, np.linspace(1.1, 2.5, 6)[:, None]):
+    for exits in (3.0, np.linspace(1.1, 2.5, 6)):
         np.testing.assert_allclose(np.sum(np.asarray(white.gaussians.weights) * gain(exits, white), axis=0), 1, rtol=1e-5)
-    np.testing.assert_array_equal(np.asarray(PlainMean().gain(jnp.full((6, 2), 3.0), material(), jnp.ones((3, 2)))), 1)
+    np.testing.assert_array_equal(np.asarray(gains(3.0, material(), normalization=PlainMean())), 1)
 
 
 def test_odds_of_leaving_grow_as_the_exits():
@@ -66,8 +72,7 @@ def test_nothing_returns_more_than_it_receives():
     for _ in range(20):
         weights = rng.exponential(size=(6, 2))
         weights *= rng.uniform(0.1, 1, size=2) / weights.sum(0)
-        exits = jnp.asarray(1 + 3 * rng.exponential(size=(6, 1)))
-        factors = np.asarray(ExitOdds().gain(exits, material(weights), jnp.ones((2, 1))))[..., 0]
+        factors = gain(1 + 3 * rng.exponential(size=6), material(weights))
         assert np.all(np.sum(weights * factors, axis=0) <= 1 + 1e-5)
 
 
@@ -83,7 +88,7 @@ def test_more_exits_let_out_more_and_leave_less_for_wider_layers():
 
 def test_layers_need_no_order():
     turned = Material(SumOfGaussians(jnp.asarray(VARIANCES)[::-1], jnp.asarray(WEIGHTS)[::-1]))
-    exits = np.linspace(1.1, 2.5, 6)[:, None]
+    exits = np.linspace(1.1, 2.5, 6)
     np.testing.assert_allclose(gain(exits[::-1], turned)[::-1], gain(exits, material()), rtol=1e-6)
 
 
@@ -109,7 +114,7 @@ def test_negative_weights_count_as_none():
 def test_slope_in_a_weight_of_zero_is_the_limit_from_above():
     def out(w):
         lit = Material(SumOfGaussians(jnp.asarray([1.0, 4.0]), jnp.stack([w, jnp.asarray(0.4)])[:, None]))
-        return jnp.sum(lit.gaussians.weights[:, 0] * ExitOdds().gain(jnp.full((2, 1), 2.0), lit, jnp.ones((1, 1)))[:, 0, 0])
+        return jnp.sum(lit.gaussians.weights * gains(2.0, lit))
 
     step = 2e-3
     w = jnp.asarray(0.0)
@@ -145,16 +150,14 @@ def test_a_thin_white_sheet_returns_what_it_receives_whatever_is_handed_over(end
 
 
 def test_the_corner_is_rounded():
-    slope = jax.grad(lambda s: jnp.sum(ExitOdds().gain(jnp.full((6, 1), s), material(), jnp.ones((3, 1)))))
+    slope = jax.grad(lambda s: jnp.sum(gains(s, material()) * jnp.ones((6, 3))))
     assert float(slope(jnp.asarray(1.0))) == 0
     assert 0 < float(slope(jnp.asarray(1.001))) < 0.05 * float(slope(jnp.asarray(1.2)))
 
 
 def test_no_weights_at_all_have_finite_gradients():
     for weights in (np.zeros((6, 1)), np.eye(6)[:, :1]):
-        found = jax.grad(lambda w: jnp.sum(ExitOdds().gain(jnp.full((6, 1), 2.0), material(w), jnp.ones((1, 1)))))(
-            jnp.asarray(weights)
-        )
+        found = jax.grad(lambda w: jnp.sum(gains(2.0, material(w))))(jnp.asarray(weights))
         assert np.all(np.isfinite(np.asarray(found)))
 
 
@@ -175,8 +178,8 @@ def through_a_sheet(thickness: float, normalization) -> np.ndarray:
     carried = (gaussians.variances > spacing**2)[:, None, None]  # the others are too narrow for the splats, and do not reach
     exits = jnp.where(carried, found.exits[:, 0], 1.0)
     means = jnp.where(carried[:, None], found.means[:, 0], 0.0)
-    layers = normalization.gain(exits, material(), jnp.ones((3, 1, 1))) * means
-    return np.asarray(jnp.sum(gaussians.weights * layers[:, :, 0, 0], axis=0))
+    layers = np.asarray(gains(exits[:, 0, 0], material(), normalization=normalization)) * np.asarray(means[:, :, 0, 0])
+    return np.sum(np.asarray(gaussians.weights) * layers, axis=0)
 
 
 @pytest.mark.parametrize("thickness", list(THROUGH))
