@@ -14,8 +14,10 @@ NOTEBOOKS = Path(__file__).parents[1] / "notebooks"
 @pytest.mark.slow
 @pytest.mark.once
 @pytest.mark.parametrize("path", sorted(NOTEBOOKS.glob("*.py")), ids=lambda path: path.stem)
-def test_notebook_runs_and_proves_its_claim(path, tmp_path):
+def test_notebook_runs_and_proves_its_claim(path, tmp_path, monkeypatch):
     notebook = jupytext.read(path)
+    if any("monte_carlo" in cell.source for cell in notebook.cells):
+        monkeypatch.delenv("XLA_FLAGS", raising=False)  # compiled as users have it: walks run longer than they compile
     assert "assert" in notebook.cells[-1].source
     # The interpreter of the tests, whatever kernels are installed.
     notebook.metadata.kernelspec = {"name": "python3", "display_name": sys.version, "language": "python"}

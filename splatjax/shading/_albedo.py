@@ -92,7 +92,16 @@ def _table(key: tuple[int, int, int], x: Float[Array, "..."], t: Float[Array, ".
     if t.ndim == 0:
         over_mu = _chebyshev(list(jnp.asarray(coefficients.T, t.dtype)), jnp.broadcast_to(t, (len(coefficients),)))
         return _chebyshev(list(over_mu), x)
-    return _chebyshev([_chebyshev(row, t) for row in coefficients.tolist()], x)
+    x, t = jnp.broadcast_arrays(x, t)
+    rows = jnp.asarray(coefficients, t.dtype)
+
+    def clenshaw(carry, row):
+        last, before = carry
+        return (2 * x * last - before + _chebyshev(list(row), t), last), None
+
+    # A loop over the rows: written out, they would be a thousand operations for every use.
+    (last, before), _ = jax.lax.scan(clenshaw, (jnp.zeros_like(x), jnp.zeros_like(x)), rows[1:], reverse=True)
+    return x * last - before + _chebyshev(list(rows[0]), t)
 
 
 @_table.defjvp

@@ -80,8 +80,8 @@ def test_more_exits_let_out_more_and_leave_less_for_wider_layers():
     weights = np.asarray(WEIGHTS)
     out = [np.sum(weights * gain(exits, material()), axis=0) for exits in (1.0, 1.5, 2.0)]
     assert np.all(np.diff(out, axis=0) > 0.02)
-    narrow_too = gain(np.asarray([[2.0]] * 6), material())
-    wide_alone = gain(np.asarray([[1.0]] * 3 + [[2.0]] * 3), material())
+    narrow_too = gain(np.asarray([2.0] * 6), material())
+    wide_alone = gain(np.asarray([1.0] * 3 + [2.0] * 3), material())
     assert np.all(narrow_too[3:] < wide_alone[3:])
     assert np.all(gain(2.0, material(), albedo=0.5) > gain(2.0, material())), "the darker gains more of what it would lose"
 
