@@ -8,7 +8,7 @@ WORKERS ?= 2
 PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
 LEAST_OPTIMIZATION := --xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false
 
-.PHONY: setup demo test test-float32 test-x64 test-once lint bench lock
+.PHONY: setup demo test test-float32 test-x64 test-once random-scenes lint bench lock
 
 setup: $(VENV)/ready
 
@@ -42,6 +42,11 @@ test-x64: setup
 # Long tests that say the same in both precisions.
 test-once: setup
 	XLA_FLAGS="$(LEAST_OPTIMIZATION) $$XLA_FLAGS" $(PYTEST) -m once
+
+# Ten thousand scenes and losses, in both precisions: no gradient of a finite loss may be infinite or no number.
+random-scenes: setup
+	SPLATJAX_RANDOM_SCENES=10000 XLA_FLAGS="$(LEAST_OPTIMIZATION) $$XLA_FLAGS" \
+	    $(BIN)/python -m pytest -n $(WORKERS) --dist load -q tests/gradients/test_random_scenes.py
 
 bench: setup
 	$(BIN)/python -m benchmarks

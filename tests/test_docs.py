@@ -40,7 +40,8 @@ def test_the_function_of_an_equation_names_it(equation):
 
 
 @pytest.mark.parametrize(
-    "page", ["README.md", "CHANGELOG.md", "docs/conventions.md", "docs/equations.md", "docs/which_profile.md"]
+    "page",
+    ["README.md", "CHANGELOG.md", "docs/conventions.md", "docs/equations.md", "docs/gradients.md", "docs/which_profile.md"],
 )
 def test_links_lead_to_files(page):
     place = ROOT / page

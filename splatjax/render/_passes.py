@@ -247,7 +247,7 @@ def _lit_shares(splats: Splats, groups: list[StackedLights], settings: RenderSet
                 return shares, surfaces.needed
 
             shares, needed = jax.lax.map(one_view, _splatting.stack_views(views))
-            return jnp.sum(shares, axis=0), jnp.max(needed)
+            return jnp.sum(shares, axis=0), jnp.maximum(jnp.max(needed), shadow.closeness(light, bounds))
 
         shares, needed = jax.lax.map(share, group.lights)
         lit.append(shares)

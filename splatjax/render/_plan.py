@@ -9,7 +9,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from splatjax import diffusion as _diffusion, splatting as _splatting
-from splatjax.scene import Camera, PointLight, Scene, Splats, StackedLights, stack_lights
+from splatjax.scene import AbstractLight, Camera, PointLight, Scene, Splats, StackedLights, stack_lights
 
 from ._inputs import in_one_dtype
 from ._settings import RenderSettings
@@ -20,6 +20,12 @@ class ShadowPlan(eqx.Module):
 
     rasterizer: _splatting.AbstractRasterizer
     cube: bool = eqx.field(static=True)
+
+    def closeness(self, light: AbstractLight, bounds: _splatting.Bounds) -> Float[Array, ""]:
+        """Give above 1 for a point light that was planned outside the splats' bounding sphere and has come into it."""
+        if self.cube or not isinstance(light, PointLight):
+            return jnp.zeros_like(bounds.radius)
+        return jax.lax.stop_gradient(bounds.radius / jnp.linalg.norm(light.position - bounds.center))
 
 
 class Plan(eqx.Module):

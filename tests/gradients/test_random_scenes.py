@@ -6,6 +6,7 @@
 import dataclasses
 import math
 import os
+from collections.abc import Callable
 from functools import cache
 
 import equinox as eqx
@@ -15,7 +16,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, Phase, given, settings, strategies as st
 from hypothesis.extra.numpy import arrays
-from worlds import World, named
+from worlds import World, named, with_leaf
 
 import splatjax as sj
 from splatjax.diffusion import ClusterDiffuser, DenseDiffuser
@@ -78,7 +79,7 @@ SHAPES = [
 
 
 def number(low: float, high: float):
-    return st.floats(low, high, width=32)
+    return st.floats(float(np.float32(low)), float(np.float32(high)), width=32)
 
 
 def rows(shape: tuple[int, ...], low: float, high: float):
@@ -86,8 +87,8 @@ def rows(shape: tuple[int, ...], low: float, high: float):
 
 
 @st.composite
-def worlds(draw, shape: Shape) -> World:
-    """A scene of a shape; places on each other, lights on splats, black texels, tiny and huge radii are as likely as anything."""
+def worlds(draw, shape: Shape) -> Callable[[], World]:
+    """What makes a scene of a shape; splats on each other, lights on splats, black texels and huge discs are likely."""
     count, channels = shape.splats, shape.channels
 
     def directions(*leading: int) -> np.ndarray:
@@ -101,8 +102,7 @@ def worlds(draw, shape: Shape) -> World:
     albedo = draw(rows((count, channels), 0, 1)) if "a" in shape.maps else None
     specular = draw(rows((count,), 0, 2)) if "s" in shape.maps else None
     roughness = draw(rows((count,), 0, 2)) if "r" in shape.maps else None
-    arrays_ = (centers, directions(count), radii, areas, albedo, specular, roughness)
-    splats = sj.Splats(*(None if each is None else jnp.asarray(each) for each in arrays_))
+    discs = (centers, directions(count), radii, areas, albedo, specular, roughness)
 
     def position() -> np.ndarray:
         if count and draw(st.booleans()):
@@ -110,23 +110,20 @@ def worlds(draw, shape: Shape) -> World:
         return draw(rows((3,), -30, 30))
 
     def light(letter: str):
-        power = jnp.asarray(draw(rows((channels,), 0, 100)))
+        power = draw(rows((channels,), 0, 100))
         if letter in "ds":
-            return sj.DirectionalLight(jnp.asarray(directions()), power, cast_shadows=letter == "s")
-        if letter in "pqc":
-            return sj.PointLight(jnp.asarray(position()), power, cast_shadows=letter != "p")
-        variance = jnp.asarray(math.exp(draw(number(-5, 5))))
-        return sj.GaussianBeam(jnp.asarray(position()), jnp.asarray(directions()), power, variance)
+            return letter, directions(), power
+        if letter == "q":  # outside, as planned
+            return letter, (60 + 40 * draw(number(0, 1))) * directions(), power
+        if letter in "pc":
+            return letter, position(), power
+        return letter, position(), directions(), power, math.exp(draw(number(-5, 5)))
 
-    single = None
-    if shape.single:
-        low, high = draw(rows((channels,), 0, 2)), draw(rows((channels,), 0, 2))
-        eta = 1 + draw(rows((channels,), 0, 1))
-        medium = sj.Medium(*(jnp.asarray(each) for each in (low, high + 1e-3, eta)))
-        single = sj.SingleScattering(medium, jnp.asarray(draw(rows((channels,), 0, 1))))
+    lamps = [light(letter) for letter in shape.lights]
+    medium = [draw(rows((channels,), 0, high)) for high in (2, 2, 1, 1)] if shape.single else None
     variances = np.exp(draw(rows((shape.gaussians,), math.log(1e-3), math.log(1e3))))
-    gaussians = sj.SumOfGaussians(jnp.asarray(variances), jnp.asarray(draw(rows((shape.gaussians, channels), -0.2, 1))))
-    material = sj.Material(gaussians, 1 + draw(number(0, 1)), draw(number(0, 1)), draw(number(0, 1.2)), single)
+    weights = draw(rows((shape.gaussians, channels), -0.2, 1))
+    surface = [1 + draw(number(0, 1)), draw(number(0, 1)), draw(number(0, 1.2))]
 
     eye, forward = draw(rows((3,), -40, 40)), directions()
     helper = np.eye(3)[np.argmin(np.abs(forward))]
@@ -135,9 +132,26 @@ def worlds(draw, shape: Shape) -> World:
     rotation = np.stack([right, np.cross(forward, right), forward])
     if draw(st.booleans()):  # towards the splats
         eye = -(5 + 35 * draw(number(0, 1))) * forward
-    camera = sj.Camera(*(jnp.asarray(each) for each in (eye, rotation, 0.3 + draw(number(0, 3)))), shape.width, shape.height)
-    made = World(sj.Scene(splats, tuple(light(letter) for letter in shape.lights), material), camera)
-    return jax.tree.map(lambda leaf: leaf.astype(shape.precision), made)
+    focal_length = 0.3 + draw(number(0, 3))
+
+    def made() -> World:
+        def numbers(*drawn):
+            return [None if each is None else jnp.asarray(each, shape.precision) for each in drawn]
+
+        def lamp(letter, *drawn):
+            if letter == "b":
+                return sj.GaussianBeam(*numbers(*drawn))
+            return (sj.DirectionalLight if letter in "ds" else sj.PointLight)(*numbers(*drawn), cast_shadows=letter in "sqc")
+
+        single = None
+        if medium is not None:
+            sigma_a, sigma_s_prime, more, strength = numbers(*medium)
+            single = sj.SingleScattering(sj.Medium(sigma_a, sigma_s_prime + 1e-3, 1 + more), strength)
+        material = sj.Material(sj.SumOfGaussians(*numbers(variances, weights)), *numbers(*surface), single)
+        camera = sj.Camera(*numbers(eye, rotation, focal_length), shape.width, shape.height)
+        return World(sj.Scene(sj.Splats(*numbers(*discs)), tuple(lamp(*each) for each in lamps), material), camera)
+
+    return made
 
 
 LAYERS = ("beauty", "coverage", "depth", "position", "normal", "albedo", "shadow", "irradiance", "layers", "specular")
@@ -237,15 +251,70 @@ def test_gradients_of_a_finite_loss_are_finite(shape):
         phases=[Phase.generate, Phase.shrink],
         suppress_health_check=list(HealthCheck),
     )
-    @given(world=worlds(shape), factors=arrays(np.float64, len(LAYERS), elements=st.sampled_from([0.0, 1.0, -2.0])))
-    def check(world, factors):
+    @given(make=worlds(shape), factors=arrays(np.float64, len(LAYERS), elements=st.sampled_from([0.0, 1.0, -2.0])))
+    def check(make, factors):
+        world = make()
         loss, gradient = loss_and_gradient(shape)(world, jnp.asarray(factors, shape.precision))
         finite.append(bool(jnp.isfinite(loss)))
         if finite[-1]:
             wrong = [name for name, leaf in named(gradient).items() if not np.all(np.isfinite(np.asarray(leaf)))]
-            assert not wrong, f"gradient of a loss of {float(loss):g} is not finite in {wrong}"
+            shown = eqx.tree_pformat(world, short_arrays=False) if wrong else ""
+            assert not wrong, f"the gradient of a loss of {float(loss):g} is not finite in {wrong}, of {shown}"
 
     with jax.enable_x64(shape.precision == "float64"):
         check()
     print(f"{len(finite)} scenes, {np.mean(finite):.0%} with a finite loss")
     assert np.mean(finite) > 0.9
+
+
+SHAPE = SHAPES[0]  # in float32, on the fast path, a point light with a shadow map
+DEGENERATE = {
+    "empty picture": {"camera.rotation": [[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]},
+    "grazing splats": {"scene.splats.normals": np.cross([1.0, 1.0, 1.0], [0.3, -1.0, 0.2]) / np.sqrt(3 * 1.13 - 0.25)},
+    "splats seen from behind": {"scene.splats.normals": -np.ones(3) / np.sqrt(3)},
+    "all splats in one place": {"scene.splats.centers": [0.0, 0.0, 0.0]},
+    "black texels": {"scene.splats.albedo": [0.0]},
+    "no light": {"scene.lights.0.intensity": [0.0]},
+    "splats smaller than anything": {"scene.splats.radii": 1e-6},
+    "a splat larger than the picture": {"scene.splats.radii": 40.0},
+    "no weight": {"scene.material.gaussians.weights": 0.0},
+    "white": {"scene.material.gaussians.weights": 1.0},
+    "equal indices": {"scene.material.eta": 1.0},
+    "mirror": {"scene.material.roughness": 0.0},
+    "a very narrow layer": {"scene.material.gaussians.variances": 1e-8},
+    "a very wide layer": {"scene.material.gaussians.variances": 1e8},
+    "the camera in a splat": {"camera.position": [0.0, 0.0, 0.0], "scene.splats.centers": [0.0, 0.0, 0.02]},
+}
+
+
+def degenerate(case: str) -> World:
+    world = World(*typical(SHAPE))
+    for name, value in DEGENERATE[case].items():
+        leaf = named(world)[name]
+        world = with_leaf(world, name, jnp.broadcast_to(jnp.asarray(value, leaf.dtype), leaf.shape))
+    return world
+
+
+@pytest.mark.parametrize("case", DEGENERATE)
+def test_gradients_are_finite_at_degenerate_places(case):
+    loss, gradient = loss_and_gradient(SHAPE)(degenerate(case), jnp.ones(10))
+    assert np.isfinite(float(loss))
+    for name, leaf in named(gradient).items():
+        assert np.all(np.isfinite(np.asarray(leaf))), name
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_gradients_are_finite_with_one_splat_and_with_none(count):
+    shape = Shape(count, 1, "s", fast=False)
+    loss, gradient = loss_and_gradient(shape)(World(*typical(shape)), jnp.ones(10))
+    assert np.isfinite(float(loss))
+    assert all(np.all(np.isfinite(np.asarray(leaf))) for leaf in jax.tree.leaves(gradient))
+
+
+def test_gradients_are_finite_with_a_light_on_the_surface():
+    shape = SHAPES[2]
+    world = World(*typical(shape))
+    world = with_leaf(world, "scene.lights.0.position", world.scene.splats.centers[3])
+    loss, gradient = loss_and_gradient(shape)(world, jnp.ones(10))
+    assert np.isfinite(float(loss))
+    assert all(np.all(np.isfinite(np.asarray(leaf))) for leaf in jax.tree.leaves(gradient))

@@ -7,11 +7,12 @@ import pytest
 from scenes import camera_over, sheet, skin, sphere, two_gaussians
 
 import splatjax as sj
-from splatjax.diffusion import ClusterDiffuser
+from splatjax.diffusion import ClusterDiffuser, DenseDiffuser
 from splatjax.io import load_material
-from splatjax.splatting import ShadowSettings
+from splatjax.splatting import DenseRasterizer, ShadowSettings
 
 EXITANCE_TOLERANCE = 1e-3
+PLAIN = sj.RenderSettings(shadows=ShadowSettings(resolution=32), rasterizer=DenseRasterizer(), diffuser=DenseDiffuser())
 EXACT = sj.RenderSettings(diffuser=ClusterDiffuser(cluster_size=0.0, pixel_size=0.0))
 
 
@@ -162,6 +163,22 @@ def test_a_plan_that_does_not_suffice_poisons_the_picture_and_says_so():
     assert float(frame.overflow) > 1
     assert np.all(np.isnan(np.asarray(frame.beauty)))
     assert np.all(np.isnan(np.asarray(frame.coverage)))
+
+
+def test_a_light_that_has_come_among_the_splats_needs_another_plan():
+    """Its map was planned as one frustum around them all."""
+    splats, camera = sheet(1.0, 3.0), camera_over(2.0, 8)
+
+    def scene(height: float):
+        light = sj.PointLight(jnp.asarray([0.0, 0.0, height]), jnp.ones(3))
+        return sj.Scene(splats, (light,), sj.Material(two_gaussians()))
+
+    plan = sj.plan(scene(20.0), camera, PLAIN)
+    assert float(sj.render(scene(12.0), camera, PLAIN, plan).overflow) == 0
+    for height in (1.0, 0.0):
+        frame = sj.render(scene(height), camera, PLAIN, plan)
+        assert float(frame.overflow) > 1
+        assert np.all(np.isnan(np.asarray(frame.beauty)))
 
 
 def test_channels_that_disagree_are_refused():

@@ -1,0 +1,163 @@
+"""The Jacobian of a picture in its material: equal to reverse mode row by row, and to the fit's own derivative behind it."""
+
+from functools import cache
+
+import bodies
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from worlds import FAST, PLAIN, view
+
+import splatjax as sj
+from splatjax.diffusion import DiffusionSettings, PlainMean
+
+pytestmark = [pytest.mark.slow, pytest.mark.once]
+
+SIZE = 32
+ROW_BY_ROW = 1e-5  # asked; 1e-12 measured
+
+
+def scene(single: bool) -> sj.Scene:
+    """A bumpy ball with albedo; a layer handed over, one of splats, one of clusters on coarse points."""
+    body = bodies.bumpy(300)
+    albedo = jnp.asarray(np.random.default_rng(12).uniform(0.2, 0.9, (body.count, 2)))
+    splats = sj.Splats(body.centers, body.normals, body.radii, body.areas, albedo)
+    gaussians = sj.SumOfGaussians(jnp.asarray([1.3, 12.0, 150.0]), jnp.asarray([[0.3, 0.2], [0.2, 0.3], [0.2, 0.2]]))
+    once = None
+    if single:
+        medium = sj.Medium(jnp.asarray([0.1, 0.05]), jnp.asarray([0.9, 1.2]), jnp.asarray([1.3, 1.0]))
+        once = sj.SingleScattering(medium)
+    light = sj.DirectionalLight(jnp.asarray([-1.0, -0.4, -0.1]), jnp.asarray([2.0, 3.0]), cast_shadows=False)
+    return sj.Scene(splats, (light,), sj.Material(gaussians, single_scattering=once))
+
+
+CAMERA = ((6.0, 4.0, 40.0), 32.0, SIZE)
+CASES = {"fast": (FAST, False), "fast, scattered once": (FAST, True), "plain": (PLAIN, False)}
+
+
+@cache
+def rendered(case: str):
+    settings, single = CASES[case]
+    start, camera = scene(single), view(*CAMERA)
+    plan = sj.plan(start, camera, settings)
+
+    def beauty(gaussians):
+        return sj.render(eqx.tree_at(lambda s: s.material.gaussians, start, gaussians), camera, settings, plan).beauty
+
+    return start, beauty, sj.picture_jacobian(start, camera, settings, plan)
+
+
+@pytest.mark.parametrize("case", ["fast", "fast, scattered once"])
+def test_it_is_reverse_mode_row_by_row(case):
+    with jax.enable_x64(True):
+        start, beauty, jacobian = rendered(case)
+        assert float(jacobian.frame.overflow) == 0
+        gaussians = start.material.gaussians
+
+        @jax.jit
+        def some_rows(gaussians, places):
+            picture, pull = jax.vjp(beauty, gaussians)
+
+            def row(place):
+                return pull(jnp.zeros(picture.size).at[place].set(1.0).reshape(picture.shape))[0]
+
+            return picture, jax.lax.map(row, places)
+
+        lit = np.flatnonzero(np.asarray(jacobian.frame.beauty).reshape(-1))
+        places = jnp.asarray(np.random.default_rng(2).choice(lit, 300, replace=False))
+        picture, expected = some_rows(gaussians, places)
+    np.testing.assert_allclose(jacobian.frame.beauty, picture, rtol=1e-12, atol=1e-15)
+    y, x, channel = np.unravel_index(np.asarray(places), picture.shape)
+    weights = np.zeros(expected.weights.shape)
+    weights[np.arange(300), :, channel] = np.asarray(jacobian.weights)[:, y, x, channel].T
+    variances = np.asarray(jacobian.variances)[:, y, x, channel].T
+    for ours, theirs in ((weights, expected.weights), (variances, expected.variances)):
+        norm = np.linalg.norm(np.asarray(theirs).reshape(300, -1), axis=1)
+        error = np.linalg.norm((ours - np.asarray(theirs)).reshape(300, -1), axis=1)
+        assert np.all(norm > 0)
+        assert np.max(error / norm) < ROW_BY_ROW
+
+
+def test_single_scattering_leaves_less_to_the_gaussians_where_light_grazes():
+    """Then a weight moves the light that enters, which the row-by-row test would miss if no light grazed."""
+    with jax.enable_x64(True):
+        start, _, jacobian = rendered("fast, scattered once")
+        left = start.material.left_to_diffuse(jnp.asarray([0.05]))
+    assert np.min(np.asarray(left)) < 0.97
+    assert np.min(np.asarray(jacobian.weights)) < 0
+
+
+def test_along_a_change_it_is_the_forward_derivative_of_the_plain_path():
+    rng = np.random.default_rng(5)
+    with jax.enable_x64(True):
+        start, beauty, jacobian = rendered("plain")
+        change = jax.tree.map(lambda leaf: jnp.asarray(rng.normal(size=leaf.shape)), start.material.gaussians)
+        expected = jax.jit(lambda g, c: jax.jvp(beauty, (g,), (c,))[1])(start.material.gaussians, change)
+        found = jacobian.along(change)
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12 * np.max(np.abs(expected)))
+
+
+def medium_of(coefficients):
+    sigma_a, sigma_s_prime = coefficients["sigma_a"], coefficients["sigma_s_prime"]
+    return sj.Medium(sigma_a, sigma_s_prime, jnp.full_like(sigma_a, 1.3))
+
+
+def gaussians_of(coefficients):
+    return sj.fit_gaussians(sj.Dipole(medium_of(coefficients)), 3, throw=False).gaussians
+
+
+def test_through_the_fit_it_is_the_derivative_in_the_coefficients():
+    """Against reverse mode through profile, fit and picture at once, pixel by pixel."""
+    with jax.enable_x64(True):
+        coefficients = {"sigma_a": jnp.asarray([0.02, 0.05]), "sigma_s_prime": jnp.asarray([0.4, 0.6])}
+        start, camera = scene(False), view(*CAMERA)
+        start = eqx.tree_at(lambda s: s.material.gaussians, start, gaussians_of(coefficients))
+        plan = sj.plan(start, camera, FAST)
+
+        def beauty(coefficients):
+            moved = eqx.tree_at(lambda s: s.material.gaussians, start, gaussians_of(coefficients))
+            return sj.render(moved, camera, FAST, plan).beauty
+
+        jacobian = sj.picture_jacobian(start, camera, FAST, plan).through(gaussians_of, coefficients)
+        places = [(16, 16, 0), (12, 20, 1), (20, 12, 1)]
+
+        @jax.jit
+        def rows(coefficients):
+            picture, pull = jax.vjp(beauty, coefficients)
+            return [pull(jnp.zeros_like(picture).at[place].set(1.0))[0] for place in places]
+
+        expected = rows(coefficients)
+    assert jacobian["sigma_a"].shape == (SIZE, SIZE, 2, 2)
+    for place, row in zip(places, expected, strict=True):
+        for name, each in row.items():
+            assert np.max(np.abs(each)) > 0
+            np.testing.assert_allclose(jacobian[name][place], each, rtol=ROW_BY_ROW, atol=1e-9 * np.max(np.abs(each)))
+
+
+def test_with_the_plain_mean_the_layers_are_the_derivative_in_the_weights():
+    settings = sj.RenderSettings(
+        rasterizer=PLAIN.rasterizer, diffuser=PLAIN.diffuser, diffusion=DiffusionSettings(normalization=PlainMean())
+    )
+    with jax.enable_x64(True):
+        jacobian = sj.picture_jacobian(scene(False), view(*CAMERA), settings)
+    np.testing.assert_allclose(jacobian.weights, jacobian.frame.layers, rtol=1e-12, atol=1e-15)
+
+
+def test_a_function_of_other_gaussians_is_refused():
+    with jax.enable_x64(True):
+        _, _, jacobian = rendered("plain")
+        with pytest.raises(ValueError, match=r"has \[2, 2\] Gaussians and channels, the picture was made with \[3, 2\]"):
+            jacobian.through(lambda w: sj.SumOfGaussians(jnp.ones(2), w), jnp.ones((2, 2)))
+
+
+def test_a_plan_that_does_not_suffice_makes_it_nan_and_says_so():
+    with jax.enable_x64(True):
+        start, camera = scene(False), view(*CAMERA)
+        plan = sj.plan(start, camera, FAST)
+        wider = eqx.tree_at(lambda s: s.material.gaussians.variances, start, 4 * start.material.gaussians.variances)
+        jacobian = sj.picture_jacobian(wider, camera, FAST, plan)
+    assert float(jacobian.frame.overflow) > 1
+    assert np.all(np.isnan(jacobian.weights))
+    assert np.all(np.isnan(jacobian.variances))
