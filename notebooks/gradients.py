@@ -140,9 +140,8 @@ figure  # noqa: B018
 with jax.enable_x64(True):
     moved = [eqx.tree_at(lambda m: m.sigma_a, medium, medium.sigma_a * factor) for factor in (1.01, 0.99)]
     ends = [jax.tree.map(lambda leaf: leaf.astype(jnp.float32), gaussians_of(each)) for each in moved]
-pictures = [
-    np.asarray(sj.render(eqx.tree_at(lambda s: s.material.gaussians, scene, end), camera, plan=plan).beauty) for end in ends
-]
+frames = [sj.picture_jacobian(eqx.tree_at(lambda s: s.material.gaussians, scene, end), camera, plan=plan).frame for end in ends]
+pictures = [np.asarray(frame.beauty) for frame in frames]
 difference = (pictures[0] - pictures[1]) / 2
 error = np.linalg.norm(change("sigma_a") - difference) / np.linalg.norm(difference)
 print(f"derivative picture against finite differences: {error:.1e} of its norm")

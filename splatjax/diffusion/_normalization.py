@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 _SLACK = 1e-5
+_NOTHING = 1e-12  # of the light: what is left for the widest layers, when their odds are not asked for
 _ROUNDING = 0.05  # of a flat sheet's exits: below this excess the gain rises from 1 quadratically
 
 
@@ -84,7 +85,7 @@ class ExitOdds(AbstractNormalization):
         absorbed = 1 - jnp.sum(energies, axis=0) - once
         absorbed = jnp.where(absorbed >= -_SLACK, absorbed, 0.0)[None]  # white is white to rounding: not at a corner
         inside = jnp.cumsum(energies[::-1], axis=0)[::-1] + absorbed
-        leaving = energies / jnp.where(inside > 0, inside, 1.0)
+        leaving = energies / jnp.where(inside > _NOTHING, inside, 1.0)
         more = jnp.maximum(exits[order] - 1, 0)
         more = more * more / (more + _ROUNDING)
         return ((1 + more) / jnp.cumprod(1 + leaving * more, axis=0))[jnp.argsort(order)]

@@ -9,6 +9,8 @@ from jaxtyping import Array, Float
 
 from splatjax.gaussians import gaussian
 
+_TOUCHING = 1e-6  # mm
+
 
 class AbstractLight(eqx.Module):
     """A light. Whether it casts shadows is static: a light that casts none costs no shadow map."""
@@ -46,7 +48,7 @@ class DirectionalLight(AbstractLight):
 class PointLight(AbstractLight):
     r"""Light from a point, falling off with the square of the distance.
 
-    A point that coincides with the light receives none: the limit diverges, so value and gradient are cut to zero there.
+    A point within 1e-6 mm of the light receives none: the limit diverges, so value and gradient are cut to zero there.
 
     **Attributes:**
 
@@ -62,7 +64,7 @@ class PointLight(AbstractLight):
     def incidence(self, points: Float[Array, "*points 3"]) -> tuple[Float[Array, "*points 3"], Float[Array, "*points channels"]]:
         to_light = jnp.broadcast_to(self.position, points.shape) - points
         squared = jnp.sum(to_light * to_light, axis=-1, keepdims=True)
-        apart = squared > 0
+        apart = squared > _TOUCHING**2
         squared = jnp.where(apart, squared, 1.0)
         wi = jnp.where(apart, to_light / jnp.sqrt(squared), 0.0)
         return wi, jnp.where(apart, _per_channel(self.intensity, points) / squared, 0.0)

@@ -101,7 +101,7 @@ def test_plain_integral_is_the_formula(x64):
 
 
 @pytest.mark.parametrize("approximation", ["support alone", "default"])
-def test_fast_diffuser_is_the_plain_one_within_its_stated_error(approximation, x64):
+def test_fast_diffuser_is_the_plain_one_within_its_stated_error(float32, approximation, x64):
     body, view, sources, _, covered = scene(x64)
     exact = approximation == "support alone"
     diffuser = planned(body, view, **({"cluster_size": 0.0, "pixel_size": 0.0} if exact else {}))

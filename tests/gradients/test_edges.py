@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from worlds import FAST, PLAIN, uneven, view
+from worlds import FAST, uneven, view
 
 import splatjax as sj
 
@@ -36,10 +36,10 @@ def world() -> tuple[sj.Scene, sj.Camera, int]:
 
 
 @cache
-def rendered(path: str):
+def rendered():
     """Functions of how far the ball, the sheet and the light are moved: the frame; a weighed sum of beauty and its gradient."""
     scene, camera, sheet = world()
-    settings = {"fast": FAST, "plain": PLAIN}[path]
+    settings = FAST  # what it is compared with elsewhere, the plain path, gives the same digits here
     plan = sj.plan(scene, camera, settings)
     of_sheet = np.arange(scene.splats.count) < sheet
     ways = [jnp.asarray(which[:, None] * np.asarray([1.0, 0.3, 0.0])) for which in (~of_sheet, of_sheet)]
@@ -84,11 +84,11 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize(("path", "case"), [*(("fast", case) for case in CASES), ("plain", "inner-ball")])
-def test_edges_move_as_their_gradient_says(path, case):
+@pytest.mark.parametrize("case", CASES)
+def test_edges_move_as_their_gradient_says(case):
     where, which, far = CASES[case]
     with jax.enable_x64(True):
-        frame, value_and_gradient = rendered(path)
+        frame, value_and_gradient = rendered()
         mask = edges(frame(jnp.zeros(3)))[where]
         assert np.sum(mask) >= 15
         share = jnp.asarray(mask[..., None] * np.random.default_rng(1).uniform(-0.5, 1, (SIZE, SIZE, 2)))
@@ -103,6 +103,6 @@ def test_edges_move_as_their_gradient_says(path, case):
         np.testing.assert_allclose(slope, difference, rtol=AGREEMENT)
         slopes = [at((i + 0.5) / POINTS * far)[1] for i in range(POINTS)]
         moved, followed = at(far)[0] - start, far * np.mean(slopes)
-    print(f"{path} {case}: gradient {slope:.6f}, differences {difference:.6f}; over a pixel {followed:.5f}, picture {moved:.5f}")
+    print(f"{case}: gradient {slope:.6f}, differences {difference:.6f}; over a pixel {followed:.5f}, picture {moved:.5f}")
     assert abs(moved) > 0.01 * abs(start)
     assert abs(followed - moved) < OVER_A_PIXEL * far * np.mean(np.abs(slopes))

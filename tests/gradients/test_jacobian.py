@@ -34,7 +34,7 @@ def scene(single: bool) -> sj.Scene:
 
 
 CAMERA = ((6.0, 4.0, 40.0), 32.0, SIZE)
-CASES = {"fast": (FAST, False), "fast, scattered once": (FAST, True), "plain": (PLAIN, False)}
+CASES = {"fast": (FAST, True), "plain": (PLAIN, False)}
 
 
 @cache
@@ -49,10 +49,10 @@ def rendered(case: str):
     return start, beauty, sj.picture_jacobian(start, camera, settings, plan)
 
 
-@pytest.mark.parametrize("case", ["fast", "fast, scattered once"])
-def test_it_is_reverse_mode_row_by_row(case):
+def test_it_is_reverse_mode_row_by_row():
+    """With every part that a material can have."""
     with jax.enable_x64(True):
-        start, beauty, jacobian = rendered(case)
+        start, beauty, jacobian = rendered("fast")
         assert float(jacobian.frame.overflow) == 0
         gaussians = start.material.gaussians
 
@@ -83,7 +83,7 @@ def test_it_is_reverse_mode_row_by_row(case):
 def test_single_scattering_leaves_less_to_the_gaussians_where_light_grazes():
     """Then a weight moves the light that enters, which the row-by-row test would miss if no light grazed."""
     with jax.enable_x64(True):
-        start, _, jacobian = rendered("fast, scattered once")
+        start, _, jacobian = rendered("fast")
         left = start.material.left_to_diffuse(jnp.asarray([0.05]))
     assert np.min(np.asarray(left)) < 0.97
     assert np.min(np.asarray(jacobian.weights)) < 0
@@ -114,13 +114,13 @@ def test_through_the_fit_it_is_the_derivative_in_the_coefficients():
         coefficients = {"sigma_a": jnp.asarray([0.02, 0.05]), "sigma_s_prime": jnp.asarray([0.4, 0.6])}
         start, camera = scene(False), view(*CAMERA)
         start = eqx.tree_at(lambda s: s.material.gaussians, start, gaussians_of(coefficients))
-        plan = sj.plan(start, camera, FAST)
+        plan = sj.plan(start, camera, PLAIN)
 
         def beauty(coefficients):
             moved = eqx.tree_at(lambda s: s.material.gaussians, start, gaussians_of(coefficients))
-            return sj.render(moved, camera, FAST, plan).beauty
+            return sj.render(moved, camera, PLAIN, plan).beauty
 
-        jacobian = sj.picture_jacobian(start, camera, FAST, plan).through(gaussians_of, coefficients)
+        jacobian = sj.picture_jacobian(start, camera, PLAIN, plan).through(gaussians_of, coefficients)
         places = [(16, 16, 0), (12, 20, 1), (20, 12, 1)]
 
         @jax.jit

@@ -311,10 +311,14 @@ def test_gradients_are_finite_with_one_splat_and_with_none(count):
     assert all(np.all(np.isfinite(np.asarray(leaf))) for leaf in jax.tree.leaves(gradient))
 
 
-def test_gradients_are_finite_with_a_light_on_the_surface():
+@pytest.mark.parametrize("above", [0.0, 1e-14, 1e-7, 1e-5])
+def test_gradients_are_finite_with_a_light_on_the_surface(above):
     shape = SHAPES[2]
     world = World(*typical(shape))
-    world = with_leaf(world, "scene.lights.0.position", world.scene.splats.centers[3])
+    splats = world.scene.splats
+    splats = eqx.tree_at(lambda s: s.centers, splats, splats.centers.at[3].set(0.0))
+    world = eqx.tree_at(lambda w: w.scene.splats, world, splats)
+    world = with_leaf(world, "scene.lights.0.position", above * splats.normals[3])
     loss, gradient = loss_and_gradient(shape)(world, jnp.ones(10))
     assert np.isfinite(float(loss))
     assert all(np.all(np.isfinite(np.asarray(leaf))) for leaf in jax.tree.leaves(gradient))
