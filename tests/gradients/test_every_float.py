@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from evidence import write_evidence
+from PIL import Image
 from worlds import PLAIN, WORLDS, World, covered, declared, named, with_leaf
 
 import splatjax as sj
@@ -125,3 +126,17 @@ def test_forward_mode_of_the_plain_path_is_its_reverse_mode():
         products = jax.tree.map(lambda g, t: float(jnp.vdot(g, t)), gradient, tangent)
         found, expected = float(forward(start, tangent)), sum(jax.tree.leaves(products))
     np.testing.assert_allclose(found, expected, rtol=1e-9)
+
+
+def test_a_wrong_gradient_leaves_pictures(tmp_path, monkeypatch):
+    """Derivatives by differences and in forward mode look alike: what is between them is blank."""
+    monkeypatch.chdir(tmp_path)
+    with jax.enable_x64(True):
+        start = WORLDS["sun and beam"].make()
+        name = "scene.lights.0.direction"
+        path = write_evidence("sun", start, name, direction_of(name, named(start)[name]), STEP)
+    picture, by_differences, forward, between = np.split(np.asarray(Image.open(path), float), 4)
+    assert np.ptp(picture) > 200
+    assert np.ptp(by_differences) > 200
+    assert np.max(np.abs(by_differences - forward)) <= 1
+    assert np.min(between) >= 254

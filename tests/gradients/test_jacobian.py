@@ -95,6 +95,14 @@ def test_along_a_change_it_is_the_forward_derivative_of_the_plain_path():
         start, beauty, jacobian = rendered("plain")
         change = jax.tree.map(lambda leaf: jnp.asarray(rng.normal(size=leaf.shape)), start.material.gaussians)
         expected = jax.jit(lambda g, c: jax.jvp(beauty, (g,), (c,))[1])(start.material.gaussians, change)
+        plan = sj.plan(start, view(*CAMERA), PLAIN)
+
+        @jax.jit
+        def along(gaussians):
+            moved = eqx.tree_at(lambda s: s.material.gaussians, start, gaussians)
+            return sj.picture_jacobian(moved, view(*CAMERA), PLAIN, plan).along(change)
+
+        np.testing.assert_allclose(along(start.material.gaussians), jacobian.along(change), rtol=1e-9, atol=1e-12)
         found = jacobian.along(change)
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12 * np.max(np.abs(expected)))
 
