@@ -133,7 +133,7 @@ def test_fast_diffuser_is_the_plain_one_within_its_stated_error(float32, approxi
             assert ours.max() <= values.max() + slack
 
 
-def test_fast_gradient_is_the_plain_one():
+def test_fast_gradient_is_the_plain_one(float64):
     """Without clusters and coarse points, and with so wide a support that nothing is left out."""
     with jax.enable_x64(True):
         body, view, _, points, covered = scene.__wrapped__(True)

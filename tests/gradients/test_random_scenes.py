@@ -26,7 +26,7 @@ from splatjax.splatting import BinCapacity, DenseRasterizer, ShadowSettings, Til
 pytestmark = [pytest.mark.slow, pytest.mark.once]
 
 SCENES = int(os.environ.get("SPLATJAX_RANDOM_SCENES", "200"))
-IN_SUITE = 4
+IN_SUITE = 3
 SHADOWS = ShadowSettings(resolution=12, bias=0.4, softness=0.8)
 
 
