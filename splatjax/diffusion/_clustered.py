@@ -1,10 +1,10 @@
 """The fast diffuser: clusters instead of splats, a coarse grid of points instead of pixels, for wide layers."""
 
+import dataclasses
 import math
 from collections.abc import Callable, Sequence
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.lax import stop_gradient
@@ -43,6 +43,7 @@ class ClusterDiffuser(AbstractDiffuser):
     - `support`: sources farther away are left out. 4.5 leaves out 4e-5 of a Gaussian's power.
     - `cluster_size`: the edge of the cells in which splats are merged is at most this; 0 merges none.
     - `pixel_size`: the distance between the points of the coarse grid is at most this; 0 evaluates every pixel.
+    - `sums`: `gaussian_sums`, which has reverse mode, or `gaussian_sums_forward`.
     - `margin`: a plan holds while the variances stay within this factor of those that it was made for.
     """
 
@@ -52,6 +53,7 @@ class ClusterDiffuser(AbstractDiffuser):
     margin: float = eqx.field(static=True, default=1.25)
     lanes: int = eqx.field(static=True, default=32)
     slots: int = eqx.field(static=True, default=32)
+    sums: Callable[..., Array] = eqx.field(static=True, default=gaussian_sums)
     tree: ClusterTree | None = None
     layers: tuple[LayerPlan, ...] | None = None
 
@@ -100,6 +102,9 @@ class ClusterDiffuser(AbstractDiffuser):
     def _grid(self, width: int, height: int, stride: int) -> TileGrid:
         return TileGrid(-(-width // stride), -(-height // stride), 8, self.lanes, self.slots)
 
+    def in_forward_mode(self) -> "ClusterDiffuser":
+        return dataclasses.replace(self, sums=gaussian_sums_forward)
+
     def diffuse(
         self,
         sources: Sources,
@@ -108,23 +113,6 @@ class ClusterDiffuser(AbstractDiffuser):
         covered: Bool[Array, "surfaces height width"],
         view: AbstractView,
     ) -> Diffused:
-        return self._diffuse(sources, kernels, points, covered, view, gaussian_sums)
-
-    def with_derivative(
-        self,
-        sources: Sources,
-        kernels: Kernels,
-        change: Kernels,
-        points: Float[Array, "surfaces 3 height width"],
-        covered: Bool[Array, "surfaces height width"],
-        view: AbstractView,
-    ) -> tuple[Diffused, Diffused]:
-        def diffuse(moved: Kernels) -> Diffused:
-            return self._diffuse(sources, moved, points, covered, view, gaussian_sums_forward)
-
-        return jax.jvp(diffuse, (kernels,), (change,))
-
-    def _diffuse(self, sources: Sources, kernels: Kernels, points, covered, view: AbstractView, gather: Callable) -> Diffused:
         if self.tree is None or self.layers is None:
             raise ValueError("this ClusterDiffuser has no clusters yet; take one from a plan (splatjax.plan) or from `planned`")
         if kernels.variances.shape[0] != len(self.layers):
@@ -137,7 +125,7 @@ class ClusterDiffuser(AbstractDiffuser):
                 layers.append(jnp.zeros((2, channels + 1, *covered.shape[1:]), points.dtype))
             else:
                 clusters = levels[layer.level].lowered(depth)
-                values, need = self._layer(clusters, variance, depth, layer, points, covered, view, gather)
+                values, need = self._layer(clusters, variance, depth, layer, points, covered, view)
                 layers.append(values)
                 needed.append(need)
             needed.append(jnp.maximum(layer.smallest / variance, variance / layer.largest) * (1 - 1e-6))
@@ -146,36 +134,22 @@ class ClusterDiffuser(AbstractDiffuser):
         found = jnp.stack(layers) if layers else jnp.zeros((0, 2, channels + 1, *covered.shape[1:]), points.dtype)
         return Diffused(found[:, :, :channels], found[:, :, channels], carried, needed)
 
-    def _layer(
-        self, clusters: Clusters, variance, depth, layer: LayerPlan, points, covered, view: AbstractView, gather: Callable
-    ):
+    def _layer(self, clusters: Clusters, variance, depth, layer: LayerPlan, points, covered, view: AbstractView):
         """Evaluate one layer, and last its exits, at the samples of both surfaces and resample them to the pixels of both."""
         grid = self._grid(view.width, view.height, layer.stride)
         if layer.stride == 1:
             each = [
-                self._integrals(clusters, variance, depth, layer, *surface, grid, view, 0, gather)
+                self._integrals(clusters, variance, depth, layer, *surface, grid, view, 0)
                 for surface in zip(points, covered, strict=True)
             ]
             return jnp.stack([values for values, _, _ in each]), jnp.max(jnp.stack([need for _, _, need in each]))
         where, there = block_samples(points[0], covered[0], layer.stride, stop_gradient(variance))
-        values, slopes, need = self._integrals(clusters, variance, depth, layer, where, there, grid, view, 1, gather)
+        values, slopes, need = self._integrals(clusters, variance, depth, layer, where, there, grid, view, 1)
         samples = Samples(where, there, values, slopes)
         pixels = [resample(samples, surface, variance, layer.stride) for surface in points]
         return jnp.where(covered[:, None], jnp.stack(pixels), 0.0), need
 
-    def _integrals(
-        self,
-        clusters: Clusters,
-        variance,
-        depth,
-        layer: LayerPlan,
-        points,
-        there,
-        grid: TileGrid,
-        view,
-        order: int,
-        gather: Callable,
-    ):
+    def _integrals(self, clusters: Clusters, variance, depth, layer: LayerPlan, points, there, grid: TileGrid, view, order: int):
         """Give the means and the exits at points, and for `order` 1 their slopes in space."""
         assert layer.capacity is not None
         # A cluster is as wide as its splats are spread.
@@ -201,7 +175,7 @@ class ClusterDiffuser(AbstractDiffuser):
         ranges = _ranges(clusters, stop_gradient(variance), self.support, view, grid, layer.stride, far)
         bins = bin_items(ranges, grid, layer.capacity)
         where = jnp.where(there[None], points, _FAR)
-        sums = gather(where, clusters.centers, 0.5 / wide, rows, bins, grid, self.support)
+        sums = self.sums(where, clusters.centers, 0.5 / wide, rows, bins, grid, self.support)
         energy, sums = _energy_and_rest(sums, count, points - middle[:, :, None], clusters.moments is not None)
         reached = there & (sums[0] > 0)
         inverse = 1 / jnp.where(reached, sums[0], 1.0)

@@ -60,13 +60,5 @@ class DenseDiffuser(AbstractDiffuser):
         layers = layers.transpose(2, 0, 3, 1, 4)
         return Diffused(layers[:, :, :channels], layers[:, :, channels], carried, none)
 
-    def with_derivative(
-        self,
-        sources: Sources,
-        kernels: Kernels,
-        change: Kernels,
-        points: Float[Array, "surfaces 3 height width"],
-        covered: Bool[Array, "surfaces height width"],
-        view: AbstractView,
-    ) -> tuple[Diffused, Diffused]:
-        return jax.jvp(lambda moved: self.diffuse(sources, moved, points, covered, view), (kernels,), (change,))
+    def in_forward_mode(self) -> "DenseDiffuser":
+        return self

@@ -63,13 +63,5 @@ class AbstractDiffuser(eqx.Module):
         """Evaluate every layer at the covered points of the surface in front and of the one behind it; 0 elsewhere."""
 
     @abc.abstractmethod
-    def with_derivative(
-        self,
-        sources: Sources,
-        kernels: Kernels,
-        change: Kernels,
-        points: Float[Array, "surfaces 3 height width"],
-        covered: Bool[Array, "surfaces height width"],
-        view: AbstractView,
-    ) -> tuple[Diffused, Diffused]:
-        """Evaluate every layer, and its derivative along a change of its kernel; all else is constant."""
+    def in_forward_mode(self) -> "AbstractDiffuser":
+        """Give a diffuser of the same values that has forward mode in the kernels; it may have no reverse mode."""

@@ -107,8 +107,12 @@ def exitance_jacobian(
     """
     points, covered = _receivers(seen, view)
     variances = material.gaussians.variances
-    kernels, change = jax.jvp(lambda v: _kernels(v, normalization), (variances,), (jnp.ones_like(variances),))
-    diffused, slopes = diffuser.with_derivative(sources, kernels, change, points, covered, view)
+    forward = diffuser.in_forward_mode()
+
+    def diffuse(variances):
+        return forward.diffuse(sources, _kernels(variances, normalization), points, covered, view)
+
+    diffused, slopes = jax.jvp(diffuse, (variances,), (jnp.ones_like(variances),))
     layers, jacobians = [], []
     for place, each in enumerate(seen):
         at = _Point.of(material, each, diffused, covered, place).per_channel()
