@@ -1,58 +1,95 @@
-"""The fast diffuser: clusters instead of splats, a coarse grid of points instead of pixels, for wide layers."""
+"""The fast diffuser: clusters instead of splats, and for wide layers some points of the body instead of every pixel."""
 
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float
 
 from splatjax.scene import Splats
-from splatjax.splatting import AbstractView, BinCapacity, TileGrid, TileRanges, bin_items
+from splatjax.splatting import AbstractView, BinCapacity, Bins
 
 from ._diffuser import AbstractDiffuser, Diffused, Kernels, Sources
-from ._gauss_tiles import gaussian_sums, gaussian_sums_forward
-from ._resample import Samples, block_samples, resample
+from ._gathering import Gathering, blended_nodes, nodes_table
+from ._gaussian_sums import Steps, as_they_are, cut_off, gaussian_sums, gaussian_sums_forward, tapered
+from ._neighbors import Boxes, Neighbors
+from ._order import BLOCK
+from ._pixels import FAR, Pixels, block_ranges, tile_grid
 from ._tree import Clusters, ClusterTree
 
-_FAR = -1e6
 _FINEST = 0.01  # share of the splats that may be fine enough for a layer that is handed over everywhere
+_LANES = 32
+_SOURCES = 16  # of a block that gathers into points, and how many blocks a step holds
+_SOURCE_SLOTS = 4
+_NODES = 8  # the same of nodes that are blended into pixels
+_NODE_SLOTS = 8
+_CELL = 0.6  # edge of the cells, in standard deviations, for an error of 2e-3, which grows with its third power
+_WORTHWHILE = 2.0  # edge of the cells, in spacings, from which on clusters are so few that they pay
+_SMOOTHING = 0.5  # standard deviation of the blend of nodes, in edges of their cells, at least
+_BLENDED = 3.0  # support of the blend, standard deviations
+
+
+class NodePlan(eqx.Module):
+    """Points of the body at which a layer is evaluated, to be blended into the pixels: the clusters themselves."""
+
+    neighbors: Neighbors
+    deviations: Float[Array, " nodes"]
+    """Of the blend, mm: within `_BLENDED` of them of some node there is every pixel."""
+
+    def blocks(self, rows: Float[Array, "rows nodes"]) -> Float[Array, "blocks rows _"]:
+        """Cut what belongs to the nodes into the blocks that are swept, and some that are far from everything."""
+        steps = self.neighbors.steps
+        blocks = rows.reshape(rows.shape[0], -1, BLOCK).transpose(1, 0, 2)
+        return jnp.pad(blocks, ((0, steps.order.shape[0] - blocks.shape[0]), (0, 0), (0, 0)), constant_values=FAR)
+
+    def in_row(self, blocks: Float[Array, "blocks rows _"], nodes: int) -> Float[Array, "rows nodes"]:
+        """Undo `blocks`."""
+        return blocks[: nodes // BLOCK].transpose(1, 0, 2).reshape(blocks.shape[1], nodes)
+
+    def asked(self, bins: Bins, nodes: int) -> Steps:
+        """Leave out the sweeps none of whose nodes any tile lists."""
+        steps, blocks = self.neighbors.steps, nodes // BLOCK
+        lanes, sweeps = steps.ids.shape[1], steps.begins.shape[0]
+        listed = jnp.zeros(2 * nodes // _NODES + 1, bool).at[bins.ids.reshape(-1)].set(True)[:-1]
+        asked = jnp.any(listed.reshape(2, blocks, -1), axis=(0, 2))
+        asked = jnp.any(jnp.pad(asked, (0, sweeps * lanes - blocks)).reshape(sweeps, lanes), axis=1)
+        return Steps(steps.ids, steps.begins, jnp.where(asked, steps.ends, steps.begins), steps.order)
 
 
 class LayerPlan(eqx.Module):
-    """How one layer is evaluated. Static; it holds while the variance stays within the range."""
+    """How one layer is evaluated. It holds while the variance stays within the range."""
 
     level: int = eqx.field(static=True)
-    stride: int = eqx.field(static=True)
     smallest: float = eqx.field(static=True)
     largest: float = eqx.field(static=True)
     capacity: BinCapacity | None
-    """None for a layer that is handed over to the surface at every variance of the range."""
+    """Of the tiles' lists; None for a layer that is handed over to the surface at every variance of the range."""
+    nodes: NodePlan | None
+    """None for a layer that every pixel gathers for itself."""
 
 
 class ClusterDiffuser(AbstractDiffuser):
-    r"""Sums over clusters of splats, at a coarse grid of surface points, and resamples to the pixels.
+    r"""Sums over clusters of splats, at points of the body close enough to be blended, or at every pixel.
 
-    A setting of 0 switches an approximation off; what is left of the error then is the support's.
+    **Attributes:** (static)
 
-    **Attributes:** (static; lengths in standard deviations of the layer)
-
-    - `support`: sources farther away are left out. 4.5 leaves out 4e-5 of a Gaussian's power.
-    - `cluster_size`: the edge of the cells in which splats are merged is at most this; 0 merges none.
-    - `pixel_size`: the distance between the points of the coarse grid is at most this; 0 evaluates every pixel.
-    - `sums`: `gaussian_sums`, which has reverse mode, or `gaussian_sums_forward`.
+    - `error`: what half of the pixels of a layer may be off, of the layer's root mean square, where light changes much within its
+      width; one pixel in a hundred is off by five times as much. 0 merges no splats, and every pixel gathers for itself: what is
+      left then is the support's.
+    - `support`: sources farther away, in standard deviations of the layer, are left out. 4.5 leaves out 4e-5 of the power.
     - `margin`: a plan holds while the variances stay within this factor of those that it was made for.
+    - `sums`: `gaussian_sums`, which has reverse mode, or `gaussian_sums_forward`.
     """
 
+    error: float = eqx.field(static=True, default=2e-3)
     support: float = eqx.field(static=True, default=4.5)
-    cluster_size: float = eqx.field(static=True, default=1.0)
-    pixel_size: float = eqx.field(static=True, default=0.35)
     margin: float = eqx.field(static=True, default=1.25)
-    lanes: int = eqx.field(static=True, default=32)
-    slots: int = eqx.field(static=True, default=32)
     sums: Callable[..., Array] = eqx.field(static=True, default=gaussian_sums)
     tree: ClusterTree | None = None
     layers: tuple[LayerPlan, ...] | None = None
@@ -67,40 +104,61 @@ class ClusterDiffuser(AbstractDiffuser):
         values = np.asarray(kernels.variances, np.float64)
         areas = np.asarray(splats.areas, np.float64)
         if areas.size == 0:
-            layers = tuple(LayerPlan(0, 1, 0.0, math.inf, None) for _ in values)
-            return eqx.tree_at(_parts, self, (ClusterTree((), (), ()), layers), is_leaf=_is_none)
+            layers = tuple(LayerPlan(0, 0.0, math.inf, None, None) for _ in values)
+            none = ClusterTree(jnp.zeros(0, jnp.int32), (), (), ())
+            return eqx.tree_at(_parts, self, (none, layers), is_leaf=_is_none)
         spacing = math.sqrt(areas.mean())
-        narrowest = float(interval[0]) ** 2 * np.quantile(areas, _FINEST)
-        edges = [self._cell(math.sqrt(v / self.margin), spacing) for v in values]
-        cells = sorted({edge for edge, v in zip(edges, values, strict=True) if edge > 0 and v * self.margin > narrowest})
+        begin = float(interval[0]) ** 2
+        carried = values * self.margin > begin * np.quantile(areas, _FINEST)
+        edges = _CELL * (self.error / 2e-3) ** (1 / 3) * np.sqrt(values / self.margin)
+        edges = np.where(carried & (edges > _WORTHWHILE * spacing), edges, 0.0)
+        cells = sorted({float(edge) for edge in edges if edge > 0})
         tree = ClusterTree.build(splats.centers, cells)
-        levels = tree.levels(Sources(splats.centers.T, splats.normals.T, splats.areas, splats.areas[None]))
-        centers = splats.centers.T
+        origin = jnp.mean(splats.centers, axis=0)
+        levels = tree.levels(Sources(splats.centers.T - origin[:, None], splats.normals.T, splats.areas, splats.areas[None]))
         layers = []
-        for v, depth, edge in zip(values, kernels.depths, edges, strict=True):
-            level = cells.index(edge) + 1 if edge in cells else 0
-            stride = min(self._stride(math.sqrt(v / self.margin), view, centers) for view in views)
-            capacity = None
-            if v * self.margin > narrowest:
-                largest = jnp.asarray(v * self.margin, splats.areas.dtype)
-                sources = levels[level].lowered(jnp.asarray(depth, largest.dtype))
-                counts = [_demand(self, splats, sources, largest, stride, view) for view in views]
-                capacity = BinCapacity.for_counts(counts, self._grid(views[0].width, views[0].height, stride))
-            layers.append(LayerPlan(level, stride, float(v) / self.margin, float(v) * self.margin, capacity))
+        for v, depth, edge, is_carried in zip(values, kernels.depths, edges, carried, strict=True):
+            level = cells.index(edge) + 1 if edge > 0 else 0
+            nodes = capacity = None
+            if is_carried:
+                largest = v * self.margin
+                if edge > 0 and self._in_pixels(float(edge), views, splats) > 1:
+                    radii = jnp.where(splats.areas * begin < largest, splats.radii, 0.0)  # of splats that carry the layer
+                    nodes = self._plan_nodes(levels[level], largest, depth, float(edge), tree.largest(radii, level))
+                capacity = self._capacity(splats, origin, levels[level], nodes, largest, depth, views)
+            layers.append(LayerPlan(level, float(v) / self.margin, float(v) * self.margin, capacity, nodes))
         return eqx.tree_at(_parts, self, (tree, tuple(layers)), is_leaf=_is_none)
 
-    def _cell(self, deviation: float, spacing: float) -> float:
-        """The largest power of two that is small enough; 0 where cells would hold a splat or two."""
-        largest = self.cluster_size * deviation
-        return 2.0 ** math.floor(math.log2(largest)) if largest > 1.5 * spacing else 0.0
+    def _in_pixels(self, edge: float, views: Sequence[AbstractView], splats: Splats) -> float:
+        """Give the length of an edge amid the splats, in pixels of the closest view."""
+        depths = (view.project(jnp.mean(splats.centers, axis=0)[:, None])[2] for view in views)
+        return max(edge * float(view.pixels_per_mm(depth)[0]) for view, depth in zip(views, depths, strict=True))
 
-    def _stride(self, deviation: float, view: AbstractView, centers: Float[Array, "3 splats"]) -> int:
-        depth = view.project(centers)[2]
-        pixels = deviation * float(view.pixels_per_mm(jnp.max(depth))) * self.pixel_size
-        return 2 ** min(max(math.floor(math.log2(pixels)), 0), 5) if pixels > 1 else 1
+    def _plan_nodes(self, clusters: Clusters, variance: float, depth: Float[Array, ""], edge: float, radii) -> NodePlan:
+        """Find what nodes gather from. Pixels are within a radius of a splat's center, and that within 0.87 edges of a node."""
+        below = clusters.lowered(depth)
+        boxes = Boxes.around(clusters.centers, clusters.areas > 0, BLOCK)
+        sources = Boxes.around(below.centers, clusters.areas > 0, _SOURCES)
+        # Sources of a wider layer lie deeper, where clusters may be wider too.
+        spread = max(float(jnp.max(clusters.lowered(d).spread)) for d in (depth, depth * math.sqrt(self.margin)))
+        sinking = math.sqrt(3) * float(depth) * (math.sqrt(self.margin) - 1)
+        reach = self.support * math.sqrt(variance + spread) + sinking
+        neighbors = Neighbors.find(boxes, sources, reach, min(_LANES, boxes.low.shape[1]), _SOURCE_SLOTS)
+        return NodePlan(neighbors, jnp.maximum(_SMOOTHING * edge, (radii + 0.87 * edge) / _BLENDED))
 
-    def _grid(self, width: int, height: int, stride: int) -> TileGrid:
-        return TileGrid(-(-width // stride), -(-height // stride), 8, self.lanes, self.slots)
+    def _capacity(
+        self, splats: Splats, origin, clusters: Clusters, nodes: NodePlan | None, variance: float, depth, views
+    ) -> BinCapacity:
+        """Find how much the lists of tiles must hold: sources, or nodes."""
+        if nodes is None:
+            clusters = clusters.lowered(depth)
+            reach = self.support * jnp.sqrt(jnp.asarray(variance, clusters.spread.dtype) + clusters.spread)
+            size = _SOURCES, _SOURCE_SLOTS
+        else:
+            reach = _BLENDED * nodes.deviations
+            size = _NODES, _NODE_SLOTS
+        counts = [_demand(clusters, origin, reach, *size, splats, view) for view in views]
+        return BinCapacity.for_counts(counts, tile_grid(views[0].width, views[0].height, size[1]))
 
     def in_forward_mode(self) -> "ClusterDiffuser":
         return dataclasses.replace(self, sums=gaussian_sums_forward)
@@ -118,88 +176,57 @@ class ClusterDiffuser(AbstractDiffuser):
         if kernels.variances.shape[0] != len(self.layers):
             raise ValueError(f"this plan is for {len(self.layers)} Gaussians, not {kernels.variances.shape[0]}; make it anew")
         channels = sources.irradiance.shape[0]
-        levels = self.tree.levels(sources)
+        carried = jnp.asarray([layer.capacity is not None for layer in self.layers], points.dtype)
+        empty = jnp.zeros((2, channels + 1, *covered.shape[1:]), points.dtype)
         layers, needed = [], []
-        for variance, depth, layer in zip(kernels.variances, kernels.depths, self.layers, strict=True):
+        if any(layer.capacity is not None for layer in self.layers):
+            origin = stop_gradient(jnp.mean(sources.centers, axis=1))
+            pixels = Pixels.of(points, covered, origin, view)
+            levels = self.tree.levels(dataclasses.replace(sources, centers=sources.centers - origin[:, None]))
+        plans = jax.tree.map(lambda leaf: leaf.astype(points.dtype) if eqx.is_inexact_array(leaf) else leaf, self.layers)
+        for variance, depth, layer in zip(kernels.variances, kernels.depths, plans, strict=True):
             if layer.capacity is None:
-                layers.append(jnp.zeros((2, channels + 1, *covered.shape[1:]), points.dtype))
+                layers.append(empty)
             else:
-                clusters = levels[layer.level].lowered(depth)
-                values, need = self._layer(clusters, variance, depth, layer, points, covered, view)
-                layers.append(values)
-                needed.append(need)
+                gathering = Gathering.of(levels[layer.level], variance, depth)
+                if layer.nodes is None:
+                    values, need = self._at_pixels(gathering, layer.capacity, pixels)
+                else:
+                    values, need = self._through_nodes(levels[layer.level], gathering, layer.nodes, layer.capacity, pixels)
+                layers.append(jnp.where(covered[:, None], values, 0.0))
+                needed.append(need.astype(points.dtype))
             needed.append(jnp.maximum(layer.smallest / variance, variance / layer.largest) * (1 - 1e-6))
         needed = stop_gradient(jnp.max(jnp.stack(needed))) if needed else jnp.zeros((), points.dtype)
-        carried = jnp.asarray([layer.capacity is not None for layer in self.layers], points.dtype)
-        found = jnp.stack(layers) if layers else jnp.zeros((0, 2, channels + 1, *covered.shape[1:]), points.dtype)
+        found = jnp.stack(layers) if layers else jnp.zeros((0, *empty.shape), points.dtype)
         return Diffused(found[:, :, :channels], found[:, :, channels], carried, needed)
 
-    def _layer(self, clusters: Clusters, variance, depth, layer: LayerPlan, points, covered, view: AbstractView):
-        """Evaluate one layer, and last its exits, at the samples of both surfaces and resample them to the pixels of both."""
-        grid = self._grid(view.width, view.height, layer.stride)
-        if layer.stride == 1:
-            each = [
-                self._integrals(clusters, variance, depth, layer, *surface, grid, view, 0)
-                for surface in zip(points, covered, strict=True)
-            ]
-            return jnp.stack([values for values, _, _ in each]), jnp.max(jnp.stack([need for _, _, need in each]))
-        where, there = block_samples(points[0], covered[0], layer.stride, stop_gradient(variance))
-        values, slopes, need = self._integrals(clusters, variance, depth, layer, where, there, grid, view, 1)
-        samples = Samples(where, there, values, slopes)
-        pixels = [resample(samples, surface, variance, layer.stride) for surface in points]
-        return jnp.where(covered[:, None], jnp.stack(pixels), 0.0), need
+    def _at_pixels(self, gathering: Gathering, capacity: BinCapacity, pixels: Pixels):
+        """Let every pixel gather for itself."""
+        clusters = gathering.clusters
+        reach = self.support * jnp.sqrt(gathering.wide)
+        bins = pixels.bins(clusters.centers, clusters.areas > 0, reach, _SOURCES, _SOURCE_SLOTS, capacity)
+        table = gathering.table(_SOURCES, slopes=False)
+        values = self.sums(pixels.tiles, table, pixels.steps(bins, table.shape[0] - 1), cut_off(self.support), gathering.finish)
+        return pixels.surfaces(values), bins.needed
 
-    def _integrals(self, clusters: Clusters, variance, depth, layer: LayerPlan, points, there, grid: TileGrid, view, order: int):
-        """Give the means and the exits at points, and for `order` 1 their slopes in space."""
-        assert layer.capacity is not None
-        # A cluster is as wide as its splats are spread.
-        wide = variance + clusters.spread
-        flat = jnp.exp(0.5 * depth * depth / wide) / (2 * jnp.pi * wide)  # what makes a flat sheet one exit
-        mass = clusters.areas * flat
-        middle = stop_gradient(jnp.mean(clusters.centers, axis=1))[:, None]
-        centers = clusters.centers - middle
-        rows = [mass[None] * clusters.irradiance, mass[None]]
-        count = clusters.irradiance.shape[0] + 1
-        if clusters.moments is not None:
-            # Energy off the center, to first order: G(x - p - o) = G(x - p) (1 + o (x - p) / v).
-            moments = clusters.moments * (flat / wide)[None, None]
-            rows[0] = rows[0] - jnp.sum(moments * centers[None], axis=1)
-            rows.append(moments.reshape(-1, mass.shape[0]))
-        if order:
-            plain = jnp.concatenate([mass[None] * clusters.irradiance, mass[None]])
-            rows += [plain * axis[None] for axis in centers]
-        rows = jnp.concatenate(rows)
-        x, y, away = (stop_gradient(each).reshape(-1) for each in view.project(points))
-        away = jnp.where(there.reshape(-1), away, -jnp.inf)
-        far = _farthest(x / layer.stride, y / layer.stride, away, grid)
-        ranges = _ranges(clusters, stop_gradient(variance), self.support, view, grid, layer.stride, far)
-        bins = bin_items(ranges, grid, layer.capacity)
-        where = jnp.where(there[None], points, _FAR)
-        sums = self.sums(where, clusters.centers, 0.5 / wide, rows, bins, grid, self.support)
-        energy, sums = _energy_and_rest(sums, count, points - middle[:, :, None], clusters.moments is not None)
-        reached = there & (sums[0] > 0)
-        inverse = 1 / jnp.where(reached, sums[0], 1.0)
-        means = energy * inverse[None]
-        values = jnp.where(reached[None], jnp.concatenate([means, sums[:1]]), 0.0)
-        slopes = None
-        if order:
-            # grad N = sum w (q - x) / v, so grad (N / D) = (mean of E q - mean of E times mean of q) / v.
-            moments = sums[1:].reshape(3, count, *there.shape)
-            of_means = (moments[:, :-1] - means[None] * moments[:, -1:]) * inverse[None, None]
-            of_exits = moments[:, -1] - (points - middle[:, :, None]) * sums[:1]
-            slopes = jnp.concatenate([of_means, of_exits[:, None]], axis=1) / variance
-            slopes = jnp.where(reached[None, None], slopes, 0.0)
-        return values, slopes, bins.needed.astype(points.dtype)
-
-
-def _energy_and_rest(sums, count: int, points, has_moments: bool):
-    """Split the sums: the energy, with its first moments put in, and the area with what follows."""
-    energy, rest = sums[: count - 1], sums[count - 1 :]
-    if not has_moments:
-        return energy, rest
-    moments = rest[1 : 1 + 3 * (count - 1)].reshape(count - 1, 3, *sums.shape[1:])
-    energy = energy + jnp.sum(moments * points[None], axis=1)
-    return energy, jnp.concatenate([rest[:1], rest[1 + 3 * (count - 1) :]])
+    def _through_nodes(self, nodes: Clusters, gathering: Gathering, plan: NodePlan, capacity: BinCapacity, pixels: Pixels):
+        """Let the nodes gather, and blend them into the pixels."""
+        there, count = nodes.areas > 0, nodes.areas.shape[0]
+        bins = pixels.bins(nodes.centers, there, _BLENDED * plan.deviations, _NODES, _NODE_SLOTS, capacity)
+        blocks = plan.blocks(jnp.where(there, nodes.centers, FAR))
+        sums = self.sums(
+            blocks, gathering.table(_SOURCES, slopes=True), plan.asked(bins, count), cut_off(self.support), as_they_are
+        )
+        at = jnp.where(there, nodes.centers, 0.0)
+        values, slopes = gathering.slopes_and_values(plan.in_row(sums, count), at)
+        table = nodes_table(at, nodes.areas, values, slopes, 0.5 / plan.deviations**2, _NODES)
+        found = self.sums(pixels.tiles, table, pixels.steps(bins, table.shape[0] - 1), tapered(_BLENDED), blended_nodes)
+        moved = plan.neighbors.needed(
+            Boxes.around(nodes.centers, there, BLOCK),
+            Boxes.around(gathering.clusters.centers, there, _SOURCES),
+            self.support * jnp.sqrt(jnp.max(stop_gradient(gathering.wide))),
+        )
+        return pixels.surfaces(found), jnp.maximum(bins.needed.astype(moved.dtype), moved)
 
 
 def _parts(diffuser: ClusterDiffuser):
@@ -211,53 +238,20 @@ def _is_none(leaf) -> bool:
 
 
 @eqx.filter_jit
-def _demand(diffuser: ClusterDiffuser, splats: Splats, clusters: Clusters, variance, stride: int, view: AbstractView):
-    """Count the clusters that every tile needs, for a surface as far away as the splats that face the eye."""
-    grid = diffuser._grid(view.width, view.height, stride)
+def _demand(clusters: Clusters, origin, reach, block: int, slots: int, splats: Splats, view: AbstractView):
+    """Count what every tile lists, for a surface as far away as the splats that face the eye."""
     x, y, depth = view.project(splats.centers.T)
     _, _, facing = view.slant(x, y, depth, splats.normals.T)
     depth = jnp.where(facing > 0, depth + 2 * splats.radii, -jnp.inf)
-    far = _farthest(x / stride, y / stride, depth, grid)
-    return _ranges(clusters, variance, diffuser.support, view, grid, stride, far).per_tile(grid)
-
-
-def _farthest(x, y, depth, grid: TileGrid) -> Float[Array, "down across"]:
-    """Give the farthest depth that is seen in every tile: clusters well behind it are not needed there."""
-    tiles_x = jnp.clip(jnp.floor(x / grid.side), 0, grid.across - 1).astype(jnp.int32)
-    tiles_y = jnp.clip(jnp.floor(y / grid.side), 0, grid.down - 1).astype(jnp.int32)
-    return jnp.full((grid.down, grid.across), -jnp.inf, depth.dtype).at[tiles_y, tiles_x].max(depth)
-
-
-def _ranges(clusters: Clusters, variance, support: float, view: AbstractView, grid: TileGrid, stride: int, far) -> TileRanges:
-    """Find the tiles within the support of each cluster. Not differentiated."""
-    clusters = stop_gradient(clusters)
-    reach = support * jnp.sqrt(variance + clusters.spread)
-    left, right, top, bottom, depth = (
-        edge / scale
-        for edge, scale in zip(view.sphere_box(clusters.centers, reach), (stride, stride, stride, stride, 1), strict=True)
+    grid = tile_grid(view.width, view.height, slots)
+    i, j = (
+        jnp.clip(jnp.floor(each / grid.side), 0, last - 1).astype(jnp.int32)
+        for each, last in ((x, grid.across), (y, grid.down // 2))
     )
-    wanted = clusters.areas > 0
-    ranges = TileRanges.of(left, right, top, bottom, wanted, grid)
-    # The farthest depth seen anywhere in the rectangle, by a pyramid of maxima two tiles apart per level.
-    seen = _farthest_in(ranges, far)
-    keep = depth - reach <= seen
-    return TileRanges(ranges.left, ranges.top, ranges.across, jnp.where(keep, ranges.down, 0))
-
-
-def _farthest_in(ranges: TileRanges, far: Float[Array, "down across"]):
-    """Give the maximum over each rectangle: the smallest power of two that spans it, four overlapping looks at that level."""
-    span = jnp.maximum(ranges.across, ranges.down)
-    pyramid, size = [far], 1
-    while size < max(far.shape):
-        last = pyramid[-1]
-        shifted = jnp.pad(last, ((0, size), (0, size)), constant_values=-jnp.inf)
-        h, w = last.shape
-        pyramid.append(
-            jnp.maximum(
-                jnp.maximum(last, shifted[size : size + h, :w]), jnp.maximum(shifted[:h, size : size + w], shifted[size:, size:])
-            )
-        )
-        size *= 2
-    stack = jnp.stack(pyramid)  # level l: maximum over the 2^l tiles right of and below each
-    level = jnp.clip(jnp.ceil(jnp.log2(jnp.maximum(span, 1).astype(jnp.float32))).astype(jnp.int32), 0, stack.shape[0] - 1)
-    return stack[level, jnp.minimum(ranges.top, far.shape[0] - 1), jnp.minimum(ranges.left, far.shape[1] - 1)]
+    farthest = jnp.full((grid.down // 2, grid.across), -jnp.inf, depth.dtype).at[j, i].max(depth)
+    nearest = jnp.full_like(farthest, jnp.inf).at[j, i].min(jnp.where(facing > 0, depth, jnp.inf))
+    # A surface shows behind another only where splats that face the eye lie at several depths.
+    several = farthest - nearest > jnp.mean(splats.radii)
+    several = lax.reduce_window(several, False, jnp.logical_or, (3, 3), (1, 1), "SAME")
+    both = jnp.stack([farthest, jnp.where(several, farthest, -jnp.inf)])
+    return block_ranges(clusters.centers + origin[:, None], clusters.areas > 0, reach, block, view, both).per_tile(grid)

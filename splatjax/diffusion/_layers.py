@@ -175,6 +175,7 @@ class _Point(eqx.Module):
         self, interval: Float[Array, "2"], normalization: AbstractNormalization, order: Float[Array, " gaussians"]
     ) -> tuple[Float[Array, "gaussians channels height width"], Float[Array, "gaussians #channels height width"]]:
         resolved = resolved_share(self.variances, self.area[None, None], interval) * self.carried[:, None, None, None]
+        resolved = jnp.where(self.exits > 0, resolved, 0.0)  # no splat within reach
         own = self.surface.irradiance[None]
         # Splats too far apart to carry a layer do not count its exits either.
         exits = 1 + resolved * (self.exits - 1)

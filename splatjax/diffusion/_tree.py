@@ -1,5 +1,7 @@
 """Splats merged into clusters: fewer sources for wider layers (section 4.2, Figure 5)."""
 
+from collections.abc import Sequence
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -7,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ._diffuser import Sources
+from ._order import BLOCK, compact_order
 
 
 class Clusters(eqx.Module):
@@ -78,44 +81,68 @@ class Clusters(eqx.Module):
 
 
 class ClusterTree(eqx.Module):
-    """One nested tree of cubic cells per geometry, finest level first. Which splats share a cell is not differentiated."""
+    """Splats in a compact order, and cells in cells around them. Which splats share a cell is not differentiated."""
 
+    order: Int[Array, " places"]
+    """The splat at each place; the number of splats, which is none, at the places that fill the last block."""
     parents: tuple[Int[Array, " _"], ...]
-    """For each level, the cell of every cluster of the level before (of every splat, for the first)."""
+    """For each level, the cell of every cluster of the level before (of the splat at every place, for the first)."""
     counts: tuple[int, ...] = eqx.field(static=True)
     cells: tuple[float, ...] = eqx.field(static=True)
     """Edge of the cells of each level, mm."""
 
     @classmethod
-    def build(cls, centers: Float[Array, "splats 3"], cells: list[float]) -> "ClusterTree":
-        """Sort splats into cells; each edge in `cells` (ascending) is a multiple of the one before."""
+    def build(cls, centers: Float[Array, "splats 3"], cells: Sequence[float]) -> "ClusterTree":
+        """Sort splats, and the clusters of each level, into cells of the edges `cells` (mm, ascending) by their centers."""
         positions = np.asarray(centers, np.float64)
+        splats = len(positions)
+        order = compact_order(positions)
+        positions, members = positions[order], np.ones(splats)
         parents, counts = [], []
-        if cells:
-            index = np.floor((positions - positions.min(axis=0)) / cells[0]).astype(np.int64)
-            for level, cell in enumerate(cells):
-                if level:
-                    index = index // round(cell / cells[level - 1])
-                extent = index.max(axis=0) + 1
-                key = (index[:, 0] * extent[1] + index[:, 1]) * extent[2] + index[:, 2]
-                _, first, parent = np.unique(key, return_index=True, return_inverse=True)
-                count = _round_up(len(first))
-                kept = np.zeros(count, np.int64)
-                kept[: len(first)] = first
-                parents.append(jnp.asarray(parent.reshape(-1), jnp.int32))
-                counts.append(count)
-                index = index[kept]  # rows beyond the cells repeat the first: they have no area
-        return cls(tuple(parents), tuple(counts), tuple(cells))
+        for cell in cells:
+            found = np.floor((positions - positions.min(axis=0)) / cell).astype(np.int64)
+            extent = found.max(axis=0) + 1
+            key = (found[:, 0] * extent[1] + found[:, 1]) * extent[2] + found[:, 2]
+            kept, parent = np.unique(key, return_inverse=True)
+            parent = parent.reshape(-1)
+            inside = np.bincount(parent, members)
+            middle = np.stack([np.bincount(parent, members * axis) for axis in positions.T], axis=1) / inside[:, None]
+            place = compact_order(middle)
+            rank = np.empty(len(kept), np.int64)
+            rank[place] = np.arange(len(kept))
+            before = counts[-1] if counts else _blocks(splats)
+            parents.append(jnp.asarray(np.pad(rank[parent], (0, before - len(parent))), jnp.int32))
+            counts.append(_round_up(len(kept)))
+            positions, members = middle[place], inside[place]
+        order = np.pad(order, (0, _blocks(splats) - splats), constant_values=splats)
+        return cls(jnp.asarray(order, jnp.int32), tuple(parents), tuple(counts), tuple(cells))
 
     def levels(self, sources: Sources) -> list[Clusters]:
         """Give the clusters of every level, the splats themselves first."""
-        found = [Clusters.of(sources)]
+
+        def placed(values):
+            return values.at[self.order].get(mode="fill", fill_value=0)
+
+        rows = [sources.centers, sources.normals, sources.irradiance]
+        centers, normals, irradiance = (jnp.stack([placed(row) for row in each]) for each in rows)
+        found = [Clusters.of(Sources(centers, normals, placed(sources.areas), irradiance))]
         for parents, count in zip(self.parents, self.counts, strict=True):
             found.append(found[-1].merged(parents, count))
         return found
 
+    def largest(self, values: Float[Array, " splats"], level: int) -> Float[Array, " clusters"]:
+        """Give the largest value, 0 or above, of the splats in each cluster of a level."""
+        found = values.at[self.order].get(mode="fill", fill_value=0)
+        for parents, count in zip(self.parents[:level], self.counts[:level], strict=True):
+            found = jnp.zeros(count, found.dtype).at[parents].max(found)
+        return found
+
+
+def _blocks(count: int) -> int:
+    """Round up to whole blocks."""
+    return max(-(-count // BLOCK), 1) * BLOCK
+
 
 def _round_up(count: int) -> int:
-    """Round up to the next of sixteen steps per octave, so that a moving surface needs no other program."""
-    grain = max(1 << max(count.bit_length() - 5, 0), 1)
-    return -(-count // grain) * grain
+    """Round up to the next of sixteen steps per octave and to whole blocks, so that a moving surface needs no other program."""
+    return _blocks(-(-count // (grain := max(1 << max(count.bit_length() - 5, 0), 1))) * grain)

@@ -5,7 +5,7 @@ Tiles are ordered by the length of their list and swept `lanes` at a time, a *ch
 more than either is reported.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -227,11 +227,18 @@ def _ranks(tile: Int[Array, " pairs"], tiles: int):
     return sorted_tile, source, rank, counts[:tiles]
 
 
-def bin_items(ranges: TileRanges, grid: TileGrid, capacity: BinCapacity) -> Bins:
-    """List the items of every tile, in their order. Not differentiated."""
+def bin_items(
+    ranges: TileRanges,
+    grid: TileGrid,
+    capacity: BinCapacity,
+    meet: Callable[[Int[Array, " pairs"], Int[Array, " pairs"]], Bool[Array, " pairs"]] | None = None,
+) -> Bins:
+    """List the items of every tile, in their order; if asked, only those that `meet` says the tile meets. Not differentiated."""
     items, lanes, slots, tiles = ranges.left.shape[0], grid.lanes, grid.slots, grid.tiles
     room = capacity.blocks * lanes * slots
     item, tile, total = _pairs(ranges, grid, capacity.pairs)
+    if meet is not None:
+        tile = jnp.where(meet(item, jnp.minimum(tile, tiles - 1)), tile, tiles)
     tile, source, rank, counts = _ranks(tile, tiles)
     item = jnp.take_along_axis(item.reshape(-1, _ROW), source, axis=1, mode="promise_in_bounds")
 

@@ -6,7 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from splatjax.diffusion import Sources
-from splatjax.diffusion._tree import Clusters, ClusterTree
+from splatjax.diffusion._order import BLOCK
+from splatjax.diffusion._tree import ClusterTree
 
 CELLS = [2.0, 4.0, 16.0]
 
@@ -19,7 +20,9 @@ def sources():
 
 def of_splats(tree, level):
     """The cluster of every splat at a level."""
-    place = np.arange(800)
+    place = np.empty(800, int)
+    order = np.asarray(tree.order)
+    place[order[order < 800]] = np.flatnonzero(order < 800)
     for parents in tree.parents[: level + 1]:
         place = np.asarray(parents)[place]
     return place
@@ -53,11 +56,18 @@ def test_merging_keeps_area_energy_and_first_moments():
         np.testing.assert_allclose(np.asarray(clusters.spread)[full], spread, rtol=1e-3, atol=1e-5)
 
 
+def _whole(tree):
+    place = np.arange(len(tree.order))
+    for parents in tree.parents:
+        place = np.asarray(parents)[place]
+    return jnp.asarray(place, jnp.int32)
+
+
 def test_merging_twice_is_merging_once():
     given = sources()
     tree = ClusterTree.build(given.centers.T, CELLS)
     step_by_step = tree.levels(given)[-1]
-    at_once = Clusters.of(given).merged(jnp.asarray(of_splats(tree, 2), jnp.int32), tree.counts[2])
+    at_once = tree.levels(given)[0].merged(_whole(tree), tree.counts[2])
     for ours, theirs in zip(jax.tree.leaves(step_by_step), jax.tree.leaves(at_once), strict=True):
         np.testing.assert_allclose(np.asarray(ours), np.asarray(theirs), atol=2e-4 * float(jnp.max(jnp.abs(theirs))))
 
@@ -78,12 +88,13 @@ def test_a_cluster_fills_no_more_than_its_cell():
     tree = ClusterTree.build(given.centers.T, CELLS)
     centers = np.asarray(given.centers)
     numbers = []
-    for level, cell in enumerate(CELLS):
+    for level in range(len(CELLS)):
         place = of_splats(tree, level)
         numbers.append(len(np.unique(place)))
-        assert numbers[-1] <= tree.counts[level] <= 1.2 * numbers[-1] + 1
+        assert numbers[-1] <= tree.counts[level] <= 1.2 * numbers[-1] + BLOCK
+        edge = sum(CELLS[: level + 1])  # a cell takes in all of the clusters whose centers it holds
         for cluster in np.unique(place)[::7]:
-            assert np.all(np.ptp(centers[:, place == cluster], axis=1) <= cell * (1 + 1e-5))
+            assert np.all(np.ptp(centers[:, place == cluster], axis=1) <= edge * (1 + 1e-5))
     assert 800 > numbers[0] > numbers[1] > numbers[2] >= 1
 
 
@@ -91,5 +102,8 @@ def test_no_cells_merge_nothing():
     given = sources()
     tree = ClusterTree.build(given.centers.T, [])
     (only,) = tree.levels(given)
-    np.testing.assert_array_equal(np.asarray(only.areas), np.asarray(given.areas))
+    order = np.asarray(tree.order)
+    np.testing.assert_array_equal(np.sort(order[order < 800]), np.arange(800))
+    np.testing.assert_array_equal(np.asarray(only.areas)[order < 800], np.asarray(given.areas)[order[order < 800]])
+    assert not np.any(np.asarray(only.areas)[order == 800])
     assert not np.any(np.asarray(only.spread))

@@ -11,9 +11,9 @@ import pytest
 from splatjax.diffusion import ClusterDiffuser, DenseDiffuser, Kernels, Sources, pixel_points
 from splatjax.splatting import DenseRasterizer, SplattingSettings, splat_surfaces
 
-COUNT, SIZE = 1500, 64
-VARIANCES = (1.0, 4.0, 12.0)
-FOV = 32.0  # degrees; narrow enough that the widest layer has a coarse grid
+COUNT, SIZE = 3000, 64
+VARIANCES = (1.0, 9.0, 20.0)
+FOV = 32.0  # degrees; narrow enough that wide layers go through nodes
 DEPTH = 0.75  # of a layer's source below its splat, in standard deviations
 RESOLVED = (0.0, 0.0)  # an interval that hands no layer over
 # All of the root mean square of a layer.
@@ -46,7 +46,7 @@ def kernels(factor=1.0):
 
 
 def planned(body, view, **settings):
-    return ClusterDiffuser(lanes=8, slots=16, **settings).planned(body, kernels(), jnp.asarray(RESOLVED), [view])
+    return ClusterDiffuser(**settings).planned(body, kernels(), jnp.asarray(RESOLVED), [view])
 
 
 def layers(diffuser, x64, irradiance=None):
@@ -104,11 +104,11 @@ def test_plain_integral_is_the_formula(x64):
 def test_fast_diffuser_is_the_plain_one_within_its_stated_error(float32, approximation, x64):
     body, view, sources, _, covered = scene(x64)
     exact = approximation == "support alone"
-    diffuser = planned(body, view, **({"cluster_size": 0.0, "pixel_size": 0.0} if exact else {}))
+    diffuser = planned(body, view, **({"error": 0.0} if exact else {}))
     assert diffuser.layers is not None
     if not exact:
         assert max(layer.level for layer in diffuser.layers) >= 2, "nothing is merged"
-        assert max(layer.stride for layer in diffuser.layers) >= 2, "no coarse grid"
+        assert sum(layer.nodes is not None for layer in diffuser.layers) >= 2, "no nodes"
     side, texture = sources.irradiance
     found = layers(diffuser, x64, jnp.stack([side, texture, jnp.full(COUNT, 0.37)]))
     front = np.asarray(covered[0])
@@ -134,7 +134,7 @@ def test_fast_diffuser_is_the_plain_one_within_its_stated_error(float32, approxi
 
 
 def test_fast_gradient_is_the_plain_one(float64):
-    """Without clusters and coarse points, and with so wide a support that nothing is left out."""
+    """Without clusters and nodes, and with so wide a support that nothing is left out."""
     with jax.enable_x64(True):
         body, view, _, points, covered = scene.__wrapped__(True)
         step = 5
@@ -144,7 +144,7 @@ def test_fast_gradient_is_the_plain_one(float64):
         rng = np.random.default_rng(8)
         irradiance = jnp.asarray(rng.uniform(size=(2, body.count)))
         cotangent = jnp.asarray(rng.normal(size=(3, 2, 3, SIZE // 2, SIZE // 2)))
-        fast = planned(body, view, cluster_size=0.0, pixel_size=0.0, support=8.0)
+        fast = planned(body, view, error=0.0, support=8.0)
 
         def total(diffuser, sources, kernels, points):
             found = diffuser.diffuse(sources, kernels, points, covered, view)
@@ -185,7 +185,7 @@ def test_outside_its_plan_the_diffuser_says_so(x64):
 
 def test_a_nearer_camera_needs_more_than_planned(x64):
     body, view, sources, points, covered = scene(x64)
-    diffuser = planned(body, bodies.perspective(fov=120.0, width=SIZE, height=SIZE), cluster_size=0.0, pixel_size=0.0)
+    diffuser = planned(body, bodies.perspective(fov=120.0, width=SIZE, height=SIZE), error=0.0)
     assert float(jax.jit(lambda k: diffuser.diffuse(sources, k, points, covered, view).needed)(kernels())) > 1
 
 

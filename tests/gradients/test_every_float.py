@@ -82,7 +82,7 @@ def test_gradient_is_that_of_central_differences(world, path, name):
             pytest.fail(f"gradient along {name}: {expected:.12g}, by differences {difference:.12g}; see {where}")
 
 
-PATHS_AGREE = 0.02  # of the norm: the support of the Gaussians, clusters and coarse points
+PATHS_AGREE = 0.02  # of the norm: the support of the Gaussians, clusters and nodes
 CENTERS_AGREE = 0.1  # where every splat moves through the window of what is in front
 
 

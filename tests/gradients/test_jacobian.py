@@ -20,7 +20,7 @@ ROW_BY_ROW = 1e-5  # asked; 1e-12 measured
 
 
 def scene(single: bool) -> sj.Scene:
-    """A bumpy ball with albedo; a layer handed over, one of splats, one of clusters on coarse points."""
+    """A bumpy ball with albedo; a layer handed over, one of splats, one of clusters, through nodes."""
     body = bodies.bumpy(300)
     albedo = jnp.asarray(np.random.default_rng(12).uniform(0.2, 0.9, (body.count, 2)))
     splats = sj.Splats(body.centers, body.normals, body.radii, body.areas, albedo)

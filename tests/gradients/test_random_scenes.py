@@ -20,7 +20,9 @@ from worlds import World, named, with_leaf
 
 import splatjax as sj
 from splatjax.diffusion import ClusterDiffuser, DenseDiffuser
-from splatjax.diffusion._clustered import LayerPlan
+from splatjax.diffusion._clustered import LayerPlan, NodePlan
+from splatjax.diffusion._neighbors import Boxes, Neighbors
+from splatjax.diffusion._pixels import tile_grid
 from splatjax.splatting import BinCapacity, DenseRasterizer, ShadowSettings, TileCapacity, TileRasterizer
 
 pytestmark = [pytest.mark.slow, pytest.mark.once]
@@ -221,15 +223,25 @@ def roomy(plan: sj.Plan, shape: Shape) -> sj.Plan:
             return TileRasterizer(part.side, part.lanes, part.slots, TileCapacity(max(shape.splats, 1), room))
         if isinstance(part, ClusterDiffuser):
             assert part.layers is not None
-            tiles = -(-shape.width // 8) * -(-shape.height // 8) + part.lanes
-            room = BinCapacity(*_room(64 + shape.splats, tiles, part.lanes, part.slots))
+            grid = tile_grid(shape.width, shape.height, 1)
+            room = BinCapacity(*_room(2 * 64, grid.tiles, grid.lanes, grid.slots))
             layers = tuple(
-                LayerPlan(each.level, each.stride, 0.0, math.inf, None if each.capacity is None else room) for each in part.layers
+                LayerPlan(each.level, 0.0, math.inf, None if each.capacity is None else room, far_reaching(each.nodes))
+                for each in part.layers
             )
             return eqx.tree_at(lambda d: d.layers, part, layers, is_leaf=lambda leaf: isinstance(leaf, tuple))
         return part
 
     return jax.tree.map(widened, plan, is_leaf=lambda part: isinstance(part, TileRasterizer | ClusterDiffuser))
+
+
+def far_reaching(nodes: NodePlan | None) -> NodePlan | None:
+    if nodes is None:
+        return None
+    points, sources = nodes.neighbors.points, nodes.neighbors.sources
+    everywhere = Boxes(jnp.full_like(points.low, -jnp.inf), jnp.full_like(points.high, jnp.inf))
+    all_sources = Boxes(jnp.full_like(sources.low, -jnp.inf), jnp.full_like(sources.high, jnp.inf))
+    return NodePlan(Neighbors.find(everywhere, all_sources, math.inf, 1, 4), nodes.deviations)
 
 
 def _room(items: int, tiles: int, lanes: int, slots: int) -> tuple[int, int, int]:

@@ -11,11 +11,11 @@ from splatjax.diffusion import ClusterDiffuser
 from splatjax.gaussians import gaussian
 from splatjax.io import load_material
 
-EXACT = sj.RenderSettings(diffuser=ClusterDiffuser(cluster_size=0.0, pixel_size=0.0))
+EXACT = sj.RenderSettings(diffuser=ClusterDiffuser(error=0.0))
 MARBLE_VARIANCES = tuple(load_material("marble").gaussians.variances.tolist())
 PEAK_SHARE = 1e-3  # a layer is compared where it exceeds this share of its peak
 BEAM_TOLERANCE = 0.01
-WIDE_TOLERANCE = 0.03  # with clusters and a coarse grid
+WIDE_TOLERANCE = 0.03  # with clusters and nodes
 
 
 def beam(splats: sj.Splats) -> jnp.ndarray:

@@ -13,7 +13,7 @@ from splatjax.splatting import DenseRasterizer, ShadowSettings
 
 EXITANCE_TOLERANCE = 1e-3
 PLAIN = sj.RenderSettings(shadows=ShadowSettings(resolution=32), rasterizer=DenseRasterizer(), diffuser=DenseDiffuser())
-EXACT = sj.RenderSettings(diffuser=ClusterDiffuser(cluster_size=0.0, pixel_size=0.0))
+EXACT = sj.RenderSettings(diffuser=ClusterDiffuser(error=0.0))
 
 
 def lamp(irradiance=(1.0, 1.0, 1.0), direction=(0.0, 0.0, -1.0), cast_shadows=False) -> sj.DirectionalLight:

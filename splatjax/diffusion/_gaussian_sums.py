@@ -1,0 +1,248 @@
+"""Sums of Gaussians around blocks of sources at blocks of points, with a derivative that recomputes the weights.
+
+Every block of points has a list of the blocks of sources near it. Some blocks of points, one per *lane*, are swept together;
+in a *step* each lane meets the next few blocks of its list. Tables hold center, rate, and what is summed, one block of
+sources after the other.
+"""
+
+import math
+from collections.abc import Callable
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+
+class Steps(eqx.Module):
+    """Which blocks of sources the blocks of points meet. Not differentiated."""
+
+    ids: Int[Array, "steps lanes slots"]
+    """Blocks of sources; the number of blocks, which is no block, in an empty slot."""
+    begins: Int[Array, " sweeps"]
+    """Of each sweep, its first step."""
+    ends: Int[Array, " sweeps"]
+    order: Int[Array, " points_blocks"]
+    """The block of points of each lane, sweep after sweep."""
+
+    def lanes(self, sweep: Int[Array, ""]) -> Int[Array, " lanes"]:
+        lanes = self.ids.shape[1]
+        return lax.dynamic_slice_in_dim(self.order, sweep * lanes, lanes)
+
+
+class Kernel(eqx.Module):
+    """A Gaussian within a largest exponent. Static."""
+
+    largest: float = eqx.field(static=True)
+    rim: float = eqx.field(static=True)
+    """Height of the Gaussian at the rim if its tangent there is taken off, 0 if not."""
+
+    def __call__(self, exponent: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+        """Give the weight, and minus its derivative in the exponent."""
+        inside, gaussian = exponent < self.largest, jnp.exp(-exponent)
+        if self.rim == 0:
+            weight = jnp.where(inside, gaussian, 0.0)
+            return weight, weight
+        weight = gaussian - self.rim * (1 + self.largest - exponent)
+        return jnp.where(inside, weight, 0.0), jnp.where(inside, gaussian - self.rim, 0.0)
+
+
+def cut_off(support: float) -> Kernel:
+    """A Gaussian within so many standard deviations."""
+    return Kernel(0.5 * support * support, 0.0)
+
+
+def tapered(support: float) -> Kernel:
+    """A Gaussian that comes down to zero, with its derivative, at so many standard deviations."""
+    return Kernel(0.5 * support * support, math.exp(-0.5 * support * support))
+
+
+class _Rule(eqx.Module):
+    """What is common to all sweeps. Static."""
+
+    kernel: "Kernel"
+    finish: Callable = eqx.field(static=True)
+
+    def finished(self, sums: Float[Array, "lanes rows points"], points: Float[Array, "lanes 3 points"]):
+        return jax.vmap(self.finish)(sums, points)
+
+    def weights(self, points, sources):
+        """Give the weights, `[lanes, sources, points]`, how they fall with the exponent, offsets and squared distances."""
+        dx, dy, dz = (points[:, axis, None] - sources[:, axis, :, None] for axis in range(3))
+        squared = dx * dx + dy * dy + dz * dz
+        return *self.kernel(sources[:, 3, :, None] * squared), (dx, dy, dz), squared
+
+    def sums(self, steps: Steps, sweep, here, table):
+        """Sum over all that a sweep's points meet."""
+
+        def add(step, sums):
+            sources, _ = _met(table, steps, step)
+            weights, *_ = self.weights(here, sources)
+            return sums + jnp.einsum("lrs,lsp->lrp", sources[:, 4:], weights)
+
+        start = jnp.zeros((here.shape[0], table.shape[1] - 4, here.shape[2]), here.dtype)
+        return lax.fori_loop(steps.begins[sweep], steps.ends[sweep], add, start)
+
+
+def source_table(
+    centers: Float[Array, "3 sources"], rates: Float[Array, " sources"], rows: Float[Array, "rows sources"], block: int
+) -> Float[Array, "blocks_and_one columns block"]:
+    """Give the table of sources, `block` of them to a block; the last block is empty."""
+    columns = jnp.concatenate([centers, rates[None], rows])
+    return jnp.pad(columns.reshape(columns.shape[0], -1, block).transpose(1, 0, 2), ((0, 1), (0, 0), (0, 0)))
+
+
+def _met(table, steps: Steps, step):
+    """Give the sources that each lane meets in a step, `[lanes, columns, sources]`, and their blocks."""
+    ids = lax.dynamic_index_in_dim(steps.ids, step, 0, keepdims=False)
+    found = table.at[ids].get(mode="promise_in_bounds")
+    return jnp.moveaxis(found, 1, 2).reshape(ids.shape[0], table.shape[1], -1), ids
+
+
+def _swept(steps: Steps, sweep: Callable, out):
+    """Let all sweeps write what they found for their points."""
+
+    def write(i, out):
+        lanes = steps.lanes(i)
+        return out.at[lanes].set(sweep(i, lanes), mode="promise_in_bounds", unique_indices=True)
+
+    return lax.fori_loop(0, steps.begins.shape[0], write, out)
+
+
+def _forward(rule: _Rule, steps: Steps, points, table):
+    def sweep(i, lanes):
+        here = points.at[lanes].get(mode="promise_in_bounds")
+        return rule.finished(rule.sums(steps, i, here, table), here)
+
+    return _swept(steps, sweep, _empty(rule, points, table))
+
+
+def _empty(rule: _Rule, points, table):
+    sums = jax.ShapeDtypeStruct((points.shape[0], table.shape[1] - 4, points.shape[2]), points.dtype)
+    found = jax.eval_shape(rule.finished, sums, points)
+    return jnp.zeros(found.shape, found.dtype)
+
+
+def _derivative(rule: _Rule, steps: Steps, points, table, d_table):
+    """Give what was found, and how it changes with the table; one look at each weight serves both."""
+    count = table.shape[1] - 4
+
+    def sweep(i, lanes):
+        here = points.at[lanes].get(mode="promise_in_bounds")
+
+        def add(step, sums):
+            (sources, _), (moved, _) = _met(table, steps, step), _met(d_table, steps, step)
+            weights, falls, offsets, squared = rule.weights(here, sources)
+            nearer = sum(offset * moved[:, axis, :, None] for axis, offset in enumerate(offsets))
+            d_weights = falls * (2 * sources[:, 3, :, None] * nearer - moved[:, 3, :, None] * squared)
+            both = jnp.einsum("lrs,lsp->lrp", jnp.concatenate([sources[:, 4:], moved[:, 4:]], axis=1), weights)
+            return sums + both.at[:, count:].add(jnp.einsum("lrs,lsp->lrp", sources[:, 4:], d_weights))
+
+        start = jnp.zeros((here.shape[0], 2 * count, here.shape[2]), here.dtype)
+        sums = lax.fori_loop(steps.begins[i], steps.ends[i], add, start)
+        values, slopes = jax.jvp(lambda sums: rule.finished(sums, here), (sums[:, :count],), (sums[:, count:],))
+        return jnp.concatenate([values, slopes], axis=1)
+
+    empty = _empty(rule, points, table)
+    out = _swept(steps, sweep, jnp.concatenate([empty, empty], axis=1))
+    return out[:, : empty.shape[1]], out[:, empty.shape[1] :]
+
+
+def _backward(rule: _Rule, steps: Steps, points, table, cotangents):
+    def sweep(i, carry):
+        d_points, d_table = carry
+        lanes = steps.lanes(i)
+        here, cotangent = (each.at[lanes].get(mode="promise_in_bounds") for each in (points, cotangents))
+        _, pull = jax.vjp(rule.finished, rule.sums(steps, i, here, table), here)
+        cotangent, d_finish = pull(cotangent)
+
+        def add(step, carry):
+            d_here, d_table = carry
+            sources, ids = _met(table, steps, step)
+            weights, falls, _, _ = rule.weights(here, sources)
+            # What an exponent's cotangent is multiplied by is a polynomial in point and source, seen from one of the sources:
+            # its moments over the points, and over the sources, are all that is needed.
+            origin = sources[:, :3, :1]
+            x, y, rate = here - origin, sources[:, :3] - origin, sources[:, 3:4]
+            pulls = falls * jnp.einsum("lrs,lrp->lsp", sources[:, 4:], cotangent)
+            of_points = jnp.concatenate([jnp.ones_like(x[:, :1]), x, jnp.sum(x * x, axis=1, keepdims=True)], axis=1)
+            moments = jnp.einsum("lkp,lsp->lks", of_points, pulls)
+            d_rows = jnp.einsum("lrp,lsp->lrs", cotangent, weights)
+            d_centers = 2 * rate * (moments[:, 1:4] - y * moments[:, :1])
+            squared = moments[:, 4:] - 2 * jnp.sum(y * moments[:, 1:4], axis=1, keepdims=True)
+            d_rates = -squared - jnp.sum(y * y, axis=1, keepdims=True) * moments[:, :1]
+            toward = jnp.einsum("lks,lsp->lkp", jnp.concatenate([rate, rate * y], axis=1), pulls)
+            part = jnp.concatenate([d_centers, d_rates, d_rows], axis=1)
+            part = jnp.moveaxis(part.reshape(part.shape[0], part.shape[1], ids.shape[1], -1), 2, 1)
+            d_table = d_table.at[ids].add(part, mode="promise_in_bounds")
+            return d_here - 2 * (x * toward[:, :1] - toward[:, 1:]), d_table
+
+        d_here, d_table = lax.fori_loop(steps.begins[i], steps.ends[i], add, (d_finish, d_table))
+        return d_points.at[lanes].set(d_here, mode="promise_in_bounds", unique_indices=True), d_table
+
+    return lax.fori_loop(0, steps.begins.shape[0], sweep, (jnp.zeros_like(points), jnp.zeros_like(table)))
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(0,))
+def _sums(rule: _Rule, steps: Steps, points, table):
+    return _forward(rule, steps, points, table)
+
+
+def _sums_fwd(rule: _Rule, steps: Steps, points, table):
+    return _forward(rule, steps, points, table), (steps, points, table)
+
+
+def _sums_bwd(rule: _Rule, residuals, cotangents):
+    return (None, *_backward(rule, *residuals, cotangents))
+
+
+_sums.defvjp(_sums_fwd, _sums_bwd)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _sums_forward(rule: _Rule, steps: Steps, points, table):
+    return _forward(rule, steps, points, table)
+
+
+@_sums_forward.defjvp
+def _sums_jvp(rule: _Rule, primals, tangents):
+    return _derivative(rule, *primals, tangents[2])
+
+
+def gaussian_sums(
+    points: Float[Array, "points_blocks 3 points"],
+    table: Float[Array, "blocks_and_one columns block"],
+    steps: Steps,
+    kernel: Kernel,
+    finish: Callable[[Float[Array, "rows points"], Float[Array, "3 points"]], Float[Array, "values points"]],
+) -> Float[Array, "points_blocks values points"]:
+    r"""Give what follows at every point from `sum_j rows_j exp(-rate_j |x - p_j|^2)`, over the blocks of sources it meets.
+
+    **Arguments:**
+
+    - `points`: `x`, mm; points that do not count may lie far away. Differentiable.
+    - `table`: from `source_table`: `p_j` (mm), `rate_j` (1/mm^2) and `rows_j`. Differentiable.
+    - `kernel`: what stands for `exp`; terms beyond its rim are left out, whatever the lists hold. Static.
+    - `finish`: makes values of sums and points. Static.
+
+    **Returns:** 0 for blocks of points that no sweep visits.
+    """
+    return _sums(_Rule(kernel, finish), steps, points, table)
+
+
+def gaussian_sums_forward(
+    points: Float[Array, "points_blocks 3 points"],
+    table: Float[Array, "blocks_and_one columns block"],
+    steps: Steps,
+    kernel: Kernel,
+    finish: Callable[[Float[Array, "rows points"], Float[Array, "3 points"]], Float[Array, "values points"]],
+) -> Float[Array, "points_blocks values points"]:
+    """Give what `gaussian_sums` gives, with forward mode in the table and not reverse mode; the points are constants."""
+    return _sums_forward(_Rule(kernel, finish), steps, lax.stop_gradient(points), table)
+
+
+def as_they_are(sums: Float[Array, "rows points"], points: Float[Array, "3 points"]) -> Float[Array, "rows points"]:
+    """Finish with the sums themselves."""
+    return sums
