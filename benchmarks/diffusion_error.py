@@ -1,0 +1,126 @@
+"""How far pass 4 is from the untruncated sum over all splats: `python -m benchmarks.diffusion_error`.
+
+Writes out/diffusion_error.png: the layer that errs most, at the pixels that were looked at.
+"""
+
+import argparse
+import time
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from PIL import Image
+
+import splatjax as sj
+from splatjax import diffusion, splatting
+from splatjax.diffusion import _layers
+from splatjax.render import _passes as wiring
+
+from .__main__ import head
+from .yardstick import make_scene
+
+AT_ONCE = 8  # pixels
+
+
+def arguments():
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.diffusion_error", description=__doc__)
+    parser.add_argument("--splats", type=int, default=683_549, help="on the prototype's head (default %(default)s)")
+    parser.add_argument("--width", type=int, default=1024, help="of the square picture, pixels (default %(default)s)")
+    parser.add_argument("--pixels", type=int, default=2000, help="random covered ones (default %(default)s)")
+    parser.add_argument(
+        "--errors", type=float, nargs="+", default=[2e-3], help="settings of ClusterDiffuser (default %(default)s)"
+    )
+    parser.add_argument("--white", action="store_true", help="without the map of albedo")
+    return parser.parse_args()
+
+
+@jax.jit
+def untruncated(sources: diffusion.Sources, points, variance, depth):
+    """Means and last exits of a layer at points `[3, pixels]`, over every splat."""
+    centers = sources.centers - depth * sources.normals
+
+    def some(x):
+        offset = x[:, :, None] - centers[:, None]
+        weight = sources.areas * jnp.exp(-0.5 * jnp.sum(offset * offset, axis=0) / variance)
+        gathered = weight.sum(axis=1)
+        exits = gathered * jnp.exp(0.5 * depth * depth / variance) / (2 * jnp.pi * variance)
+        return jnp.concatenate([(sources.irradiance @ weight.T) / gathered, exits[None]])
+
+    found = jax.lax.map(some, points.reshape(3, -1, AT_ONCE).transpose(1, 0, 2))
+    return found.transpose(1, 0, 2).reshape(found.shape[1], -1)
+
+
+def main() -> None:
+    options = arguments()
+    options.pixels -= options.pixels % AT_ONCE
+    scene, camera = head(make_scene(options.splats), options.width)
+    if options.white:
+        scene = eqx.tree_at(lambda s: s.splats.albedo, scene, None)
+    settings = sj.RenderSettings()
+    plan = sj.plan(scene, camera, settings)
+    view, normalization = splatting.PerspectiveView.of(camera), settings.diffusion.normalization
+
+    @jax.jit
+    def seen_by(scene):
+        light = wiring.cast_shadows(scene, settings, plan)
+        entering = wiring.let_light_in(scene, light)
+        seen = wiring.see_surfaces(scene.splats, wiring.surface_attributes(scene, light, entering), view, settings, plan)
+        return wiring.sources_of(scene.splats, entering.source), seen.receivers()
+
+    sources, receivers = seen_by(scene)
+    points, covered = _layers._receivers(receivers, view)
+    variances = scene.material.gaussians.variances
+    kernels = diffusion.Kernels(variances, normalization.depths(variances))
+    rows, columns = np.nonzero(np.asarray(covered[0]))
+    picked = np.random.default_rng(0).choice(len(rows), options.pixels, replace=False)
+    rows, columns = rows[picked], columns[picked]
+
+    def at_pixels(array):
+        return array[..., rows, columns][..., None, :]
+
+    front = jax.tree.map(at_pixels, receivers[0])
+
+    def layers(means, exits, carried):
+        """`L_k` at the pixels, by the normalization and the handover."""
+        diffused = diffusion.Diffused(means[:, None], exits[:, None], carried, jnp.zeros(()))
+        point = _layers._Point.of(scene.material, front, diffused, jnp.ones((1, 1, options.pixels), bool), 0)
+        return np.asarray(point.layers(plan.interval, normalization, variances)[0])[:, :, 0]
+
+    exact = None
+    for error in options.errors:
+        diffuser = diffusion.ClusterDiffuser(error=error).planned(scene.splats, kernels, plan.interval, [view])
+        run = jax.jit(lambda diffuser: diffuser.diffuse(sources, kernels, points, covered, view))
+        jax.block_until_ready(run(diffuser))
+        start = time.perf_counter()
+        found = jax.block_until_ready(run(diffuser))
+        seconds = time.perf_counter() - start
+        if float(found.needed) > 1:
+            raise SystemExit("the plan does not hold its own scene")
+        if exact is None:
+            all_kernels = zip(kernels.variances, kernels.depths, strict=True)
+            exact = jnp.stack([untruncated(sources, points[0][:, rows, columns], *kernel) for kernel in all_kernels])[:, :, None]
+            exact_layers = layers(exact[:, :-1], exact[:, -1], found.carried)
+        ours = layers(at_pixels(found.means[:, 0]), at_pixels(found.exits[:, 0]), found.carried)
+        scale = np.sqrt(np.mean(exact_layers**2, axis=2, keepdims=True))
+        off = np.max(np.abs(ours - exact_layers) / scale, axis=1)
+        print(f"error={error:g}: pass 4 without the gain {1e3 * seconds:.0f} ms; of the RMS: median, 99th percentile, maximum")
+        for k, (each, layer) in enumerate(zip(off, diffuser.layers, strict=True)):
+            if not float(found.carried[k]):
+                continue
+            how = "every pixel gathers" if layer.nodes is None else "through nodes"
+            print(f"  {variances[k] ** 0.5:5.2f} mm: {np.median(each):.1e} {np.quantile(each, 0.99):.1e} {each.max():.1e}  {how}")
+    picture = np.zeros(covered.shape[1:], np.uint8) + np.uint8(40) * np.asarray(covered[0])
+    shade = np.clip(60 + 195 * np.max(off, axis=0) / 1e-2, 60, 255).astype(np.uint8)
+    for i in (-1, 0, 1):
+        for j in (-1, 0, 1):
+            picture[np.clip(rows + i, 0, options.width - 1), np.clip(columns + j, 0, options.width - 1)] = shade
+    out = Path("out/diffusion_error.png")
+    out.parent.mkdir(exist_ok=True)
+    Image.fromarray(picture).save(out)
+    print(f"written: {out}, white where a layer is off by 1e-2 or more")
+
+
+if __name__ == "__main__":
+    main()
