@@ -218,7 +218,7 @@ class ClusterDiffuser(AbstractDiffuser):
             blocks, gathering.table(_SOURCES, slopes=True), plan.asked(bins, count), cut_off(self.support), as_they_are
         )
         at = jnp.where(there, nodes.centers, 0.0)
-        values, slopes = gathering.slopes_and_values(plan.in_row(sums, count), at)
+        values, slopes = gathering.values_and_slopes(plan.in_row(sums, count), at)
         table = nodes_table(at, nodes.areas, values, slopes, 0.5 / plan.deviations**2, _NODES)
         found = self.sums(pixels.tiles, table, pixels.steps(bins, table.shape[0] - 1), tapered(_BLENDED), blended_nodes)
         moved = plan.neighbors.needed(

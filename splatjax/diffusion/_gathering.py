@@ -13,7 +13,6 @@ class Gathering(eqx.Module):
 
     clusters: Clusters
     """As wide as their splats are spread, and below them."""
-    variance: Float[Array, ""]
     wide: Float[Array, " clusters"]
     """Variances of layer and cluster together, mm^2."""
     flat: Float[Array, " clusters"]
@@ -23,7 +22,7 @@ class Gathering(eqx.Module):
     def of(cls, clusters: Clusters, variance: Float[Array, ""], depth: Float[Array, ""]) -> "Gathering":
         below = clusters.lowered(depth)
         wide = variance + below.spread
-        return cls(below, variance, wide, jnp.exp(0.5 * depth * depth / wide) / (2 * jnp.pi * wide))
+        return cls(below, wide, jnp.exp(0.5 * depth * depth / wide) / (2 * jnp.pi * wide))
 
     def table(self, block: int, slopes: bool) -> Float[Array, "blocks_and_one columns block"]:
         """Give what `gaussian_sums` needs for the values, and for the slopes."""
@@ -40,10 +39,10 @@ class Gathering(eqx.Module):
             rows += [pulls, *(pulls * axis[None] for axis in clusters.centers)]
         return source_table(clusters.centers, 0.5 / self.wide, jnp.concatenate(rows), block)
 
-    def slopes_and_values(
+    def values_and_slopes(
         self, sums: Float[Array, "rows points"], points: Float[Array, "3 points"]
     ) -> tuple[Float[Array, "values points"], Float[Array, "3 values points"]]:
-        """Give the values at points, and their slopes in space (1/mm)."""
+        """Give the values at points, and their slopes in space (1/mm), for a table that had slopes."""
         values, pulls = self.finish.split(sums, points)
         # grad N = sum w E (q - x) / v, and grad (N / D) = (grad N - (N / D) grad D) / D.
         gathered, count = values[-1], values.shape[0]

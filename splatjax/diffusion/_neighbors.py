@@ -47,14 +47,9 @@ class Neighbors(eqx.Module):
     def find(cls, points: Boxes, sources: Boxes, reach: float, lanes: int, slots: int) -> "Neighbors":
         """Search once; `reach` in mm. The number of steps is rounded up, so that nearby geometries need no other program."""
         low, high = (np.asarray(each.T, np.float64) for each in (sources.low, sources.high))
-        blocks = len(points.low.T)
-        pairs = [
-            (block, near)
-            for block, near in _near(
-                np.asarray(points.low.T, np.float64), np.asarray(points.high.T, np.float64), low, high, reach
-            )
-        ]
-        of, near = (np.concatenate(each) for each in zip(*pairs, strict=True))
+        blocks = points.low.shape[1]
+        of_points = (np.asarray(each.T, np.float64) for each in (points.low, points.high))
+        of, near = (np.concatenate(each) for each in zip(*_near(*of_points, low, high, reach), strict=True))
         counts = np.bincount(of, minlength=blocks)
         begins = np.concatenate([[0], np.cumsum(counts)[:-1]])
         lengths = -(-counts // slots)

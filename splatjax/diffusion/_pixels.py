@@ -24,7 +24,6 @@ class Pixels(eqx.Module):
     """The points of the surface in front and of the one behind it, in tiles."""
 
     tiles: Float[Array, "tiles 3 points"]
-    points: Float[Array, "surfaces 3 height width"]
     origin: Float[Array, "3"]
     """From which all points are seen here, mm."""
     farthest: Float[Array, "surfaces down across"]
@@ -46,7 +45,7 @@ class Pixels(eqx.Module):
         seen = points - origin[None, :, None, None]
         away = jnp.pad(jnp.where(covered[:, None], seen, FAR), ((0, 0), (0, 0), (0, off[0]), (0, 0)), constant_values=FAR)
         tiles = tile_grid(view.width, view.height, 1).cut(jnp.concatenate([away[0], away[1]], axis=1), FAR)
-        return cls(tiles, seen, origin, farthest, view)
+        return cls(tiles, origin, farthest, view)
 
     def bins(self, centers, there, reach: Float[Array, " sources"], block: int, slots: int, capacity: BinCapacity) -> Bins:
         """List for each tile the blocks of sources within reach (mm); for the surface behind their numbers go on."""
@@ -73,10 +72,8 @@ class Pixels(eqx.Module):
     @property
     def boxes(self) -> Boxes:
         """Boxes around the points of every tile."""
-        points = stop_gradient(self.tiles).transpose(1, 0, 2)
-        there = points[0] != FAR
-        low, high = jnp.where(there, points, jnp.inf), jnp.where(there, points, -jnp.inf)
-        return Boxes(jnp.min(low, axis=2), jnp.max(high, axis=2))
+        points = self.tiles.transpose(1, 0, 2).reshape(3, -1)
+        return Boxes.around(points, points[0] != FAR, _SIDE**2)
 
     def steps(self, bins: Bins, blocks: int) -> Steps:
         sweeps = bins.places // bins.ids.shape[1]

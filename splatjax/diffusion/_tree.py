@@ -145,4 +145,5 @@ def _blocks(count: int) -> int:
 
 def _round_up(count: int) -> int:
     """Round up to the next of sixteen steps per octave and to whole blocks, so that a moving surface needs no other program."""
-    return _blocks(-(-count // (grain := max(1 << max(count.bit_length() - 5, 0), 1))) * grain)
+    grain = 1 << max(count.bit_length() - 5, 0)
+    return _blocks(-(-count // grain) * grain)
