@@ -80,7 +80,7 @@ def passes(scene: sj.Scene, camera: sj.Camera, plan: sj.Plan, settings: sj.Rende
 
     def layers(scene, entering, seen):
         sources = wiring.sources_of(scene.splats, entering.source)
-        rest = plan.interval, view, plan.diffuser, settings.diffusion.normalization
+        rest = plan.interval, seen.atlas, plan.diffuser, settings.diffusion.normalization
         return diffusion.diffusion_layers(sources, scene.material, seen.receivers(), *rest)
 
     light = jax.jit(shadow)(scene)

@@ -67,31 +67,31 @@ def main() -> None:
         light = wiring.cast_shadows(scene, settings, plan)
         entering = wiring.let_light_in(scene, light)
         seen = wiring.see_surfaces(scene.splats, wiring.surface_attributes(scene, light, entering), view, settings, plan)
-        return wiring.sources_of(scene.splats, entering.source), seen.receivers()
+        return wiring.sources_of(scene.splats, entering.source), seen
 
-    sources, receivers = seen_by(scene)
-    points, covered = _layers._receivers(receivers, view)
+    sources, seen = seen_by(scene)
+    receivers, atlas = seen.receivers(), seen.atlas
     variances = scene.material.gaussians.variances
     kernels = diffusion.Kernels(variances, normalization.depths(variances))
-    rows, columns = np.nonzero(np.asarray(covered[0]))
-    picked = np.random.default_rng(0).choice(len(rows), options.pixels, replace=False)
-    rows, columns = rows[picked], columns[picked]
+    tiles, within = np.nonzero(np.asarray(seen.covered & atlas.in_front[:, None]))
+    picked = np.random.default_rng(0).choice(len(tiles), options.pixels, replace=False)
+    tiles, within = tiles[picked], within[picked]
 
     def at_pixels(array):
-        return array[..., rows, columns][..., None, :]
+        """Give the chosen pixels of an array `[tiles, ..., pixels]` as a single tile."""
+        return jnp.moveaxis(array[tiles, ..., within], 0, -1)[None]
 
-    front = jax.tree.map(at_pixels, receivers[0])
+    front = jax.tree.map(at_pixels, receivers)
 
     def layers(means, exits, carried):
         """`L_k` at the pixels, by the normalization and the handover."""
-        diffused = diffusion.Diffused(means[:, None], exits[:, None], carried, jnp.zeros(()))
-        point = _layers._Point.of(scene.material, front, diffused, jnp.ones((1, 1, options.pixels), bool), 0)
+        point = _layers._Point.of(scene.material, front, means, exits, carried)
         return np.asarray(point.layers(plan.interval, normalization, variances)[0])[:, :, 0]
 
     exact = None
     for error in options.errors:
-        diffuser = diffusion.ClusterDiffuser(error=error).planned(scene.splats, kernels, plan.interval, [view])
-        run = jax.jit(lambda diffuser: diffuser.diffuse(sources, kernels, points, covered, view))
+        diffuser = diffusion.ClusterDiffuser(error=error).planned(scene.splats, kernels, plan.interval, [atlas])
+        run = jax.jit(lambda diffuser: diffuser.diffuse(sources, kernels, seen.points, seen.covered, atlas))
         jax.block_until_ready(run(diffuser))
         start = time.perf_counter()
         found = jax.block_until_ready(run(diffuser))
@@ -100,9 +100,9 @@ def main() -> None:
             raise SystemExit("the plan does not hold its own scene")
         if exact is None:
             all_kernels = zip(kernels.variances, kernels.depths, strict=True)
-            exact = jnp.stack([untruncated(sources, points[0][:, rows, columns], *kernel) for kernel in all_kernels])[:, :, None]
-            exact_layers = layers(exact[:, :-1], exact[:, -1], found.carried)
-        ours = layers(at_pixels(found.means[:, 0]), at_pixels(found.exits[:, 0]), found.carried)
+            exact = jnp.stack([untruncated(sources, front.points[0], *kernel) for kernel in all_kernels])[None]
+            exact_layers = layers(exact[:, :, :-1], exact[:, :, -1], found.carried)
+        ours = layers(at_pixels(found.means), at_pixels(found.exits), found.carried)
         scale = np.sqrt(np.mean(exact_layers**2, axis=2, keepdims=True))
         off = np.max(np.abs(ours - exact_layers) / scale, axis=1)
         print(f"error={error:g}: pass 4 without the gain {1e3 * seconds:.0f} ms; of the RMS: median, 99th percentile, maximum")
@@ -111,7 +111,11 @@ def main() -> None:
                 continue
             how = "every pixel gathers" if layer.nodes is None else "through nodes"
             print(f"  {variances[k] ** 0.5:5.2f} mm: {np.median(each):.1e} {np.quantile(each, 0.99):.1e} {each.max():.1e}  {how}")
-    picture = np.zeros(covered.shape[1:], np.uint8) + np.uint8(40) * np.asarray(covered[0])
+    places, side = np.asarray(atlas.tiles), splatting.SIDE
+    rows = places[tiles] // atlas.grid.across * side + within // side
+    columns = places[tiles] % atlas.grid.across * side + within % side
+    covered = np.asarray(seen.covered, np.uint8)[..., None].astype(np.float32)
+    picture = (40 * np.asarray(atlas.front_picture(jnp.asarray(covered))[..., 0])).astype(np.uint8)
     shade = np.clip(60 + 195 * np.max(off, axis=0) / 1e-2, 60, 255).astype(np.uint8)
     for i in (-1, 0, 1):
         for j in (-1, 0, 1):

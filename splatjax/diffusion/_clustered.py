@@ -8,12 +8,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float
 
 from splatjax.scene import Splats
-from splatjax.splatting import AbstractView, BinCapacity, Bins
+from splatjax.splatting import Atlas, BinCapacity, Bins
 
 from ._diffuser import AbstractDiffuser, Diffused, Kernels, Sources
 from ._gathering import Gathering, blended_nodes, nodes_table
@@ -99,7 +98,7 @@ class ClusterDiffuser(AbstractDiffuser):
         splats: Splats,
         kernels: Kernels,
         interval: Float[Array, "2"],
-        views: Sequence[AbstractView],
+        atlases: Sequence[Atlas],
     ) -> "ClusterDiffuser":
         values = np.asarray(kernels.variances, np.float64)
         areas = np.asarray(splats.areas, np.float64)
@@ -122,15 +121,16 @@ class ClusterDiffuser(AbstractDiffuser):
             nodes = capacity = None
             if is_carried:
                 largest = v * self.margin
-                if edge > 0 and self._in_pixels(float(edge), views, splats) > 1:
+                if edge > 0 and self._in_pixels(float(edge), atlases, splats) > 1:
                     radii = jnp.where(splats.areas * begin < largest, splats.radii, 0.0)  # of splats that carry the layer
                     nodes = self._plan_nodes(levels[level], largest, depth, float(edge), tree.largest(radii, level))
-                capacity = self._capacity(splats, origin, levels[level], nodes, largest, depth, views)
+                capacity = self._capacity(origin, levels[level], nodes, largest, depth, atlases)
             layers.append(LayerPlan(level, float(v) / self.margin, float(v) * self.margin, capacity, nodes))
         return eqx.tree_at(_parts, self, (tree, tuple(layers)), is_leaf=_is_none)
 
-    def _in_pixels(self, edge: float, views: Sequence[AbstractView], splats: Splats) -> float:
+    def _in_pixels(self, edge: float, atlases: Sequence[Atlas], splats: Splats) -> float:
         """Give the length of an edge amid the splats, in pixels of the closest view."""
+        views = [atlas.view for atlas in atlases]
         depths = (view.project(jnp.mean(splats.centers, axis=0)[:, None])[2] for view in views)
         return max(edge * float(view.pixels_per_mm(depth)[0]) for view, depth in zip(views, depths, strict=True))
 
@@ -147,7 +147,7 @@ class ClusterDiffuser(AbstractDiffuser):
         return NodePlan(neighbors, jnp.maximum(_SMOOTHING * edge, (radii + 0.87 * edge) / _BLENDED))
 
     def _capacity(
-        self, splats: Splats, origin, clusters: Clusters, nodes: NodePlan | None, variance: float, depth, views
+        self, origin, clusters: Clusters, nodes: NodePlan | None, variance: float, depth, atlases: Sequence[Atlas]
     ) -> BinCapacity:
         """Find how much the lists of tiles must hold: sources, or nodes."""
         if nodes is None:
@@ -157,8 +157,8 @@ class ClusterDiffuser(AbstractDiffuser):
         else:
             reach = _BLENDED * nodes.deviations
             size = _NODES, _NODE_SLOTS
-        counts = [_demand(clusters, origin, reach, *size, splats, view) for view in views]
-        return BinCapacity.for_counts(counts, tile_grid(views[0].width, views[0].height, size[1]))
+        counts = [_demand(clusters, origin, reach, *size, atlas) for atlas in atlases]
+        return BinCapacity.for_counts(counts, tile_grid(atlases[0].view.width, atlases[0].view.height, size[1]))
 
     def in_forward_mode(self) -> "ClusterDiffuser":
         return dataclasses.replace(self, sums=gaussian_sums_forward)
@@ -167,9 +167,9 @@ class ClusterDiffuser(AbstractDiffuser):
         self,
         sources: Sources,
         kernels: Kernels,
-        points: Float[Array, "surfaces 3 height width"],
-        covered: Bool[Array, "surfaces height width"],
-        view: AbstractView,
+        points: Float[Array, "tiles 3 points"],
+        covered: Bool[Array, "tiles points"],
+        atlas: Atlas,
     ) -> Diffused:
         if self.tree is None or self.layers is None:
             raise ValueError("this ClusterDiffuser has no clusters yet; take one from a plan (splatjax.plan) or from `planned`")
@@ -177,11 +177,11 @@ class ClusterDiffuser(AbstractDiffuser):
             raise ValueError(f"this plan is for {len(self.layers)} Gaussians, not {kernels.variances.shape[0]}; make it anew")
         channels = sources.irradiance.shape[0]
         carried = jnp.asarray([layer.capacity is not None for layer in self.layers], points.dtype)
-        empty = jnp.zeros((2, channels + 1, *covered.shape[1:]), points.dtype)
+        empty = jnp.zeros((covered.shape[0], channels + 1, covered.shape[1]), points.dtype)
         layers, needed = [], []
         if any(layer.capacity is not None for layer in self.layers):
             origin = stop_gradient(jnp.mean(sources.centers, axis=1))
-            pixels = Pixels.of(points, covered, origin, view)
+            pixels = Pixels.of(points, covered, origin, atlas)
             levels = self.tree.levels(dataclasses.replace(sources, centers=sources.centers - origin[:, None]))
         plans = jax.tree.map(lambda leaf: leaf.astype(points.dtype) if eqx.is_inexact_array(leaf) else leaf, self.layers)
         for variance, depth, layer in zip(kernels.variances, kernels.depths, plans, strict=True):
@@ -193,11 +193,11 @@ class ClusterDiffuser(AbstractDiffuser):
                     values, need = self._at_pixels(gathering, layer.capacity, pixels)
                 else:
                     values, need = self._through_nodes(levels[layer.level], gathering, layer.nodes, layer.capacity, pixels)
-                layers.append(jnp.where(covered[:, None], values, 0.0))
+                layers.append(jnp.where(covered[:, None], values[:-1], 0.0))
                 needed.append(need.astype(points.dtype))
             needed.append(jnp.maximum(layer.smallest / variance, variance / layer.largest) * (1 - 1e-6))
         needed = stop_gradient(jnp.max(jnp.stack(needed))) if needed else jnp.zeros((), points.dtype)
-        found = jnp.stack(layers) if layers else jnp.zeros((0, *empty.shape), points.dtype)
+        found = jnp.stack(layers, axis=1) if layers else empty[:, None][:, :0]
         return Diffused(found[:, :, :channels], found[:, :, channels], carried, needed)
 
     def _at_pixels(self, gathering: Gathering, capacity: BinCapacity, pixels: Pixels):
@@ -207,7 +207,7 @@ class ClusterDiffuser(AbstractDiffuser):
         bins = pixels.bins(clusters.centers, clusters.areas > 0, reach, _SOURCES, _SOURCE_SLOTS, capacity)
         table = gathering.table(_SOURCES, slopes=False)
         values = self.sums(pixels.tiles, table, pixels.steps(bins, table.shape[0] - 1), cut_off(self.support), gathering.finish)
-        return pixels.surfaces(values), bins.needed
+        return values, bins.needed
 
     def _through_nodes(self, nodes: Clusters, gathering: Gathering, plan: NodePlan, capacity: BinCapacity, pixels: Pixels):
         """Let the nodes gather, and blend them into the pixels."""
@@ -226,7 +226,7 @@ class ClusterDiffuser(AbstractDiffuser):
             Boxes.around(gathering.clusters.centers, there, _SOURCES),
             self.support * jnp.sqrt(jnp.max(stop_gradient(gathering.wide))),
         )
-        return pixels.surfaces(found), jnp.maximum(bins.needed.astype(moved.dtype), moved)
+        return found, jnp.maximum(bins.needed.astype(moved.dtype), moved)
 
 
 def _parts(diffuser: ClusterDiffuser):
@@ -238,20 +238,8 @@ def _is_none(leaf) -> bool:
 
 
 @eqx.filter_jit
-def _demand(clusters: Clusters, origin, reach, block: int, slots: int, splats: Splats, view: AbstractView):
-    """Count what every tile lists, for a surface as far away as the splats that face the eye."""
-    x, y, depth = view.project(splats.centers.T)
-    _, _, facing = view.slant(x, y, depth, splats.normals.T)
-    depth = jnp.where(facing > 0, depth + 2 * splats.radii, -jnp.inf)
-    grid = tile_grid(view.width, view.height, slots)
-    i, j = (
-        jnp.clip(jnp.floor(each / grid.side), 0, last - 1).astype(jnp.int32)
-        for each, last in ((x, grid.across), (y, grid.down // 2))
-    )
-    farthest = jnp.full((grid.down // 2, grid.across), -jnp.inf, depth.dtype).at[j, i].max(depth)
-    nearest = jnp.full_like(farthest, jnp.inf).at[j, i].min(jnp.where(facing > 0, depth, jnp.inf))
-    # A surface shows behind another only where splats that face the eye lie at several depths.
-    several = farthest - nearest > jnp.mean(splats.radii)
-    several = lax.reduce_window(several, False, jnp.logical_or, (3, 3), (1, 1), "SAME")
-    both = jnp.stack([farthest, jnp.where(several, farthest, -jnp.inf)])
-    return block_ranges(clusters.centers + origin[:, None], clusters.areas > 0, reach, block, view, both).per_tile(grid)
+def _demand(clusters: Clusters, origin, reach, block: int, slots: int, atlas: Atlas):
+    """Count what every tile lists."""
+    grid = tile_grid(atlas.view.width, atlas.view.height, slots)
+    centers, there = clusters.centers + origin[:, None], clusters.areas > 0
+    return block_ranges(centers, there, reach, block, atlas.view, atlas.farthest).per_tile(grid)

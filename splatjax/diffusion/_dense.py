@@ -8,29 +8,27 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float
 
 from splatjax.scene import Splats
-from splatjax.splatting import AbstractView
+from splatjax.splatting import Atlas
 
 from ._diffuser import AbstractDiffuser, Diffused, Kernels, Sources
 
 
 class DenseDiffuser(AbstractDiffuser):
-    """Sums over every splat at every point, a row of points at a time. Slow and plain."""
+    """Sums over every splat at every point, a tile of points at a time. Slow and plain."""
 
-    def planned(
-        self, splats: Splats, kernels: Kernels, interval: Float[Array, "2"], views: Sequence[AbstractView]
-    ) -> "DenseDiffuser":
+    def planned(self, splats: Splats, kernels: Kernels, interval: Float[Array, "2"], atlases: Sequence[Atlas]) -> "DenseDiffuser":
         return self
 
     def diffuse(
         self,
         sources: Sources,
         kernels: Kernels,
-        points: Float[Array, "surfaces 3 height width"],
-        covered: Bool[Array, "surfaces height width"],
-        view: AbstractView,
+        points: Float[Array, "tiles 3 points"],
+        covered: Bool[Array, "tiles points"],
+        atlas: Atlas,
     ) -> Diffused:
-        def picture_row(row):
-            points, covered = row
+        def of_tile(tile):
+            points, covered = tile
 
             def layer(kernel):
                 variance, depth = kernel
@@ -48,17 +46,13 @@ class DenseDiffuser(AbstractDiffuser):
             found = jax.lax.map(layer, (kernels.variances, kernels.depths))
             return jnp.where(covered[None, None], found, 0.0)
 
-        surfaces, height, width = covered.shape
-        channels = sources.irradiance.shape[0]
-        none, carried = jnp.zeros((), points.dtype), jnp.ones(kernels.variances.shape, points.dtype)
+        channels, gaussians = sources.irradiance.shape[0], kernels.variances.shape[0]
+        none, carried = jnp.zeros((), points.dtype), jnp.ones(gaussians, points.dtype)
         if sources.areas.shape[0] == 0:
-            nothing = jnp.zeros((kernels.variances.shape[0], surfaces, channels + 1, height, width), points.dtype)
-            return Diffused(nothing[:, :, :channels], nothing[:, :, channels], carried, none)
-        rows = points.transpose(0, 2, 1, 3).reshape(surfaces * height, 3, width), covered.reshape(surfaces * height, width)
-        layers = jax.lax.map(picture_row, rows)
-        layers = layers.reshape(surfaces, height, *layers.shape[1:])
-        layers = layers.transpose(2, 0, 3, 1, 4)
-        return Diffused(layers[:, :, :channels], layers[:, :, channels], carried, none)
+            found = jnp.zeros((covered.shape[0], gaussians, channels + 1, covered.shape[1]), points.dtype)
+        else:
+            found = jax.lax.map(of_tile, (points, covered))
+        return Diffused(found[:, :, :channels], found[:, :, channels], carried, none)
 
     def in_forward_mode(self) -> "DenseDiffuser":
         return self

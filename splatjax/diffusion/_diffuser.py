@@ -7,7 +7,7 @@ import equinox as eqx
 from jaxtyping import Array, Bool, Float
 
 from splatjax.scene import Splats
-from splatjax.splatting import AbstractView
+from splatjax.splatting import Atlas
 
 
 class Sources(eqx.Module):
@@ -29,8 +29,8 @@ class Kernels(eqx.Module):
 class Diffused(eqx.Module):
     """The diffusion integrals, and what capacity they needed over what was planned."""
 
-    means: Float[Array, "gaussians surfaces channels height width"]
-    exits: Float[Array, "gaussians surfaces height width"]
+    means: Float[Array, "tiles gaussians channels points"]
+    exits: Float[Array, "tiles gaussians points"]
     carried: Float[Array, " gaussians"]
     """1, or 0 for a layer that was not evaluated, being too narrow for nearly all splats."""
     needed: Float[Array, ""]
@@ -47,20 +47,20 @@ class AbstractDiffuser(eqx.Module):
 
     @abc.abstractmethod
     def planned(
-        self, splats: Splats, kernels: Kernels, interval: Float[Array, "2"], views: Sequence[AbstractView]
+        self, splats: Splats, kernels: Kernels, interval: Float[Array, "2"], atlases: Sequence[Atlas]
     ) -> "AbstractDiffuser":
-        """Give a diffuser with room for these splats, kernels and views; `interval` tells which layers are handed over."""
+        """Give a diffuser with room for these splats, kernels and pictures; `interval` tells which layers are handed over."""
 
     @abc.abstractmethod
     def diffuse(
         self,
         sources: Sources,
         kernels: Kernels,
-        points: Float[Array, "surfaces 3 height width"],
-        covered: Bool[Array, "surfaces height width"],
-        view: AbstractView,
+        points: Float[Array, "tiles 3 points"],
+        covered: Bool[Array, "tiles points"],
+        atlas: Atlas,
     ) -> Diffused:
-        """Evaluate every layer at the covered points of the surface in front and of the one behind it; 0 elsewhere."""
+        """Evaluate every layer at the covered points that the tiles of an atlas show; 0 elsewhere."""
 
     @abc.abstractmethod
     def in_forward_mode(self) -> "AbstractDiffuser":

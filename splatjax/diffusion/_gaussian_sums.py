@@ -25,7 +25,7 @@ class Steps(eqx.Module):
     """Of each sweep, its first step."""
     ends: Int[Array, " sweeps"]
     order: Int[Array, " points_blocks"]
-    """The block of points of each lane, sweep after sweep."""
+    """The block of points of each lane, sweep after sweep; one that holds no point may stand for several."""
 
     def lanes(self, sweep: Int[Array, ""]) -> Int[Array, " lanes"]:
         lanes = self.ids.shape[1]
@@ -106,7 +106,7 @@ def _swept(steps: Steps, sweep: Callable, out):
 
     def write(i, out):
         lanes = steps.lanes(i)
-        return out.at[lanes].set(sweep(i, lanes), mode="promise_in_bounds", unique_indices=True)
+        return out.at[lanes].set(sweep(i, lanes), mode="promise_in_bounds")
 
     return lax.fori_loop(0, steps.begins.shape[0], write, out)
 
@@ -182,7 +182,7 @@ def _backward(rule: _Rule, steps: Steps, points, table, cotangents):
             return d_here - 2 * (x * toward[:, :1] - toward[:, 1:]), d_table
 
         d_here, d_table = lax.fori_loop(steps.begins[i], steps.ends[i], add, (d_finish, d_table))
-        return d_points.at[lanes].set(d_here, mode="promise_in_bounds", unique_indices=True), d_table
+        return d_points.at[lanes].set(d_here, mode="promise_in_bounds"), d_table
 
     return lax.fori_loop(0, steps.begins.shape[0], sweep, (jnp.zeros_like(points), jnp.zeros_like(table)))
 

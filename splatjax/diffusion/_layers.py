@@ -1,63 +1,56 @@
 """Pass 4: splat-based diffusion (section 4.2), one layer per Gaussian."""
 
-from collections.abc import Sequence
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.lax import stop_gradient
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
+from splatjax.pointwise import AT_ONCE, in_parts
 from splatjax.scene import Material
-from splatjax.splatting import AbstractView, Surface
+from splatjax.splatting import SIDE, Atlas
 
-from ._diffuser import AbstractDiffuser, Diffused, Kernels, Sources
+from ._diffuser import AbstractDiffuser, Kernels, Sources
 from ._handover import resolved_share
 from ._normalization import AbstractNormalization
 
 
 class DiffusionLayers(eqx.Module):
-    """The layers `L_k` of one surface, and how much of each is the diffusion integral, not the surface's own irradiance."""
+    """The layers `L_k`, and how much of each is the diffusion integral, not the surface's own irradiance."""
 
-    layers: Float[Array, "gaussians channels height width"]
-    resolved: Float[Array, "gaussians height width"]
+    layers: Float[Array, "tiles gaussians channels pixels"]
+    resolved: Float[Array, "tiles gaussians pixels"]
 
 
 class ExitanceJacobian(eqx.Module):
     """What radiant exitance does per change of the material; the channels of the weights do not mix."""
 
-    weights: Float[Array, "gaussians channels height width"]
-    variances: Float[Array, "gaussians channels height width"]
+    weights: Float[Array, "tiles gaussians channels pixels"]
+    variances: Float[Array, "tiles gaussians channels pixels"]
     """1/mm^2."""
 
 
 class SeenSurface(eqx.Module):
-    """A surface as the pixels see it, with what pass 3 blended for the layers that the splats are too far apart to carry."""
+    """What the pixels see, with what pass 3 blended for the layers that the splats are too far apart to carry."""
 
-    surface: Surface
-    irradiance: Float[Array, "channels height width"]
-    area: Float[Array, "height width"]
+    points: Float[Array, "tiles 3 pixels"]
+    """mm."""
+    covered: Bool[Array, "tiles pixels"]
+    irradiance: Float[Array, "tiles channels pixels"]
+    area: Float[Array, "tiles pixels"]
     """Of a splat, mm^2."""
-    albedo: Float[Array, "channels height width"]
+    albedo: Float[Array, "tiles channels pixels"]
     """What colors the surface, besides the Gaussians' weights."""
-
-
-def pixel_points(view: AbstractView, depth: Float[Array, "height width"]) -> Float[Array, "3 height width"]:
-    """Give the points (mm) that the pixels see at a depth (mm)."""
-    x = jnp.arange(view.width, dtype=depth.dtype)[None] + 0.5
-    y = jnp.arange(view.height, dtype=depth.dtype)[:, None] + 0.5
-    return view.unproject(jnp.broadcast_to(x, depth.shape), jnp.broadcast_to(y, depth.shape), depth)
 
 
 def diffusion_layers(
     sources: Sources,
     material: Material,
-    seen: Sequence[SeenSurface],
+    seen: SeenSurface,
     interval: Float[Array, "2"],
-    view: AbstractView,
+    atlas: Atlas,
     diffuser: AbstractDiffuser,
     normalization: AbstractNormalization,
-) -> tuple[list[DiffusionLayers], Float[Array, ""]]:
+) -> tuple[DiffusionLayers, Float[Array, ""]]:
     r"""Diffuse the irradiance of the splats to the points that the pixels see.
 
     **Arguments:**
@@ -65,36 +58,35 @@ def diffusion_layers(
     - `sources`: centers (mm), normals, areas (mm^2) and irradiance of the splats. Differentiable.
     - `material`: its Gaussians, one per layer. Their weights tell the normalization how much light is absorbed; the layers are
       not multiplied by them. Differentiable.
-    - `seen`: the surface in front, and the one that shows behind its silhouettes. Differentiable.
+    - `seen`: the surfaces, in the tiles of the atlas. Differentiable.
     - `interval`: from `handover_interval`.
 
-    **Returns:** the layers of both, without weights, and what capacity was needed over what was planned. They are linear in the
+    **Returns:** the layers, without weights, and what capacity was needed over what was planned. They are linear in the
     light. For weights that are not negative and sum to one or less, their weighted sum is at most the greatest irradiance; where
     they sum to one it keeps constants. Each layer keeps constants, and `min E <= L_k <= max E`, where the normalization's gain
     is 1: everywhere for `PlainMean`; for `ExitOdds` on flat pieces and at open edges.
 
     **Source:** Kim et al. 2010, section 4.2; the normalization's own.
     """
-    points, covered = _receivers(seen, view)
     variances = material.gaussians.variances
-    diffused = diffuser.diffuse(sources, _kernels(variances, normalization), points, covered, view)
-    found = []
-    for place, each in enumerate(seen):
-        at = _Point.of(material, each, diffused, covered, place)
-        layers, resolved = at.layers(interval, normalization, variances)
-        found.append(DiffusionLayers(layers, resolved[:, 0]))
-    return found, diffused.needed
+    diffused = diffuser.diffuse(sources, _kernels(variances, normalization), seen.points, seen.covered, atlas)
+
+    def layers(seen, means, exits):
+        at = _Point.of(material, seen, means, exits, diffused.carried)
+        return DiffusionLayers(*_tiles_first(at.layers(interval, normalization, variances)))
+
+    return _in_parts(layers, seen, diffused.means, diffused.exits), diffused.needed
 
 
 def exitance_jacobian(
     sources: Sources,
     material: Material,
-    seen: Sequence[SeenSurface],
+    seen: SeenSurface,
     interval: Float[Array, "2"],
-    view: AbstractView,
+    atlas: Atlas,
     diffuser: AbstractDiffuser,
     normalization: AbstractNormalization,
-) -> tuple[list[DiffusionLayers], list[ExitanceJacobian], Float[Array, ""]]:
+) -> tuple[DiffusionLayers, ExitanceJacobian, Float[Array, ""]]:
     r"""Diffuse, and differentiate the radiant exitance `M = sum_k w_k L_k` of every pixel in the weights and the variances.
 
     Layer k gathers light by its own variance alone, so one more accumulation per layer, of `A E dG/dv` and `A dG/dv`, serves the
@@ -103,67 +95,74 @@ def exitance_jacobian(
 
     **Arguments:** as in `diffusion_layers`; the irradiance counts as given.
 
-    **Returns:** the layers and the Jacobian, of both surfaces, and what capacity was needed over what was planned.
+    **Returns:** the layers and the Jacobian, and what capacity was needed over what was planned.
     """
-    points, covered = _receivers(seen, view)
     variances = material.gaussians.variances
     forward = diffuser.in_forward_mode()
 
     def diffuse(variances):
-        return forward.diffuse(sources, _kernels(variances, normalization), points, covered, view)
+        return forward.diffuse(sources, _kernels(variances, normalization), seen.points, seen.covered, atlas)
 
     diffused, slopes = jax.jvp(diffuse, (variances,), (jnp.ones_like(variances),))
-    layers, jacobians = [], []
-    for place, each in enumerate(seen):
-        at = _Point.of(material, each, diffused, covered, place).per_channel()
+
+    def layers(seen, means, exits, slopes_of_means, slopes_of_exits):
+        at = _Point.of(material, seen, means, exits, diffused.carried).per_channel()
 
         def exitance(at: _Point):
             layers, resolved = at.layers(interval, normalization, variances)
-            return jnp.sum(at.weights * layers, axis=0), DiffusionLayers(layers, resolved[:, 0])
+            return jnp.sum(at.weights * layers, axis=0), (layers, resolved)
 
         total, pull, found = jax.vjp(exitance, at, has_aux=True)
         (slope,) = pull(jnp.ones_like(total))
-        of_means = slope.means * slopes.means[:, place]
-        of_exits = slope.exits * slopes.exits[:, place][:, None]
-        layers.append(found)
-        jacobians.append(ExitanceJacobian(slope.weights, slope.variances + of_means + of_exits))
-    return layers, jacobians, diffused.needed
+        of_means = slope.means * slopes_of_means.transpose(1, 2, 0, 3)
+        of_exits = slope.exits * slopes_of_exits.transpose(1, 0, 2)[:, None]
+        jacobian = slope.weights, slope.variances + of_means + of_exits
+        return DiffusionLayers(*_tiles_first(found)), ExitanceJacobian(*(each.transpose(2, 0, 1, 3) for each in jacobian))
+
+    found, jacobian = _in_parts(layers, seen, diffused.means, diffused.exits, slopes.means, slopes.exits)
+    return found, jacobian, diffused.needed
+
+
+def _in_parts(function, *trees):
+    return in_parts(function, *trees, at_once=AT_ONCE // SIDE**2)
+
+
+def _tiles_first(found):
+    layers, resolved = found
+    return layers.transpose(2, 0, 1, 3), resolved[:, 0].transpose(1, 0, 2)
 
 
 def _kernels(variances: Float[Array, " gaussians"], normalization: AbstractNormalization) -> Kernels:
     return Kernels(variances, normalization.depths(variances))
 
 
-def _receivers(seen: Sequence[SeenSurface], view: AbstractView):
-    """Give the points of all surfaces, and where there is one."""
-    covered = jnp.stack([stop_gradient(each.surface.weight_sum) > 0 for each in seen])
-    return jnp.stack([pixel_points(view, each.surface.depth) for each in seen]), covered
-
-
 class _Point(eqx.Module):
     """All that makes the layers of a pixel; pixels, and channels, do not know of each other."""
 
-    weights: Float[Array, "gaussians channels #height #width"]
-    variances: Float[Array, "gaussians #channels #height #width"]
-    means: Float[Array, "gaussians channels height width"]
-    exits: Float[Array, "gaussians #channels height width"]
+    weights: Float[Array, "gaussians channels #tiles #pixels"]
+    variances: Float[Array, "gaussians #channels #tiles #pixels"]
+    means: Float[Array, "gaussians channels tiles pixels"]
+    exits: Float[Array, "gaussians #channels tiles pixels"]
     carried: Float[Array, " gaussians"]
     once: Float[Array, "channels 1 1"]
-    surface: SeenSurface
-    area: Float[Array, "height width"]
+    irradiance: Float[Array, "channels tiles pixels"]
+    """Of the surface itself."""
+    area: Float[Array, "tiles pixels"]
+    albedo: Float[Array, "channels tiles pixels"]
 
     @classmethod
-    def of(cls, material: Material, seen: SeenSurface, diffused: Diffused, covered, place: int) -> "_Point":
+    def of(cls, material: Material, seen: SeenSurface, means, exits, carried) -> "_Point":
         gaussians = material.gaussians
         return cls(
             weights=gaussians.weights[:, :, None, None],
             variances=gaussians.variances[:, None, None, None],
-            means=diffused.means[:, place],
-            exits=diffused.exits[:, place][:, None],
-            carried=diffused.carried,
+            means=means.transpose(1, 2, 0, 3),
+            exits=exits.transpose(1, 0, 2)[:, None],
+            carried=carried,
             once=(material.total_reflectance() - gaussians.total_reflectance())[:, None, None],
-            surface=seen,
-            area=jnp.where(covered[place], seen.area, 1.0),
+            irradiance=seen.irradiance.transpose(1, 0, 2),
+            area=jnp.where(seen.covered, seen.area, 1.0),
+            albedo=seen.albedo.transpose(1, 0, 2),
         )
 
     def per_channel(self) -> "_Point":
@@ -173,12 +172,11 @@ class _Point(eqx.Module):
 
     def layers(
         self, interval: Float[Array, "2"], normalization: AbstractNormalization, order: Float[Array, " gaussians"]
-    ) -> tuple[Float[Array, "gaussians channels height width"], Float[Array, "gaussians #channels height width"]]:
+    ) -> tuple[Float[Array, "gaussians channels tiles pixels"], Float[Array, "gaussians #channels tiles pixels"]]:
         resolved = resolved_share(self.variances, self.area[None, None], interval) * self.carried[:, None, None, None]
         resolved = jnp.where(self.exits > 0, resolved, 0.0)  # no splat within reach
-        own = self.surface.irradiance[None]
+        own = self.irradiance[None]
         # Splats too far apart to carry a layer do not count its exits either.
         exits = 1 + resolved * (self.exits - 1)
         means = own + resolved * (self.means - own)
-        albedo = self.surface.albedo
-        return normalization.gain(exits, order, self.weights * albedo[None], self.once * albedo) * means, resolved
+        return normalization.gain(exits, order, self.weights * self.albedo[None], self.once * self.albedo) * means, resolved

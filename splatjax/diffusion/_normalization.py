@@ -79,13 +79,13 @@ class ExitOdds(AbstractNormalization):
     depth: float = eqx.field(static=True, default=0.75)
 
     def gain(self, exits, variances, energies, once):
-        order = jnp.argsort(variances)
-        energies = energies[order]
         energies = jnp.where(energies >= 0, energies, 0.0)
         absorbed = 1 - jnp.sum(energies, axis=0) - once
         absorbed = jnp.where(absorbed >= -_SLACK, absorbed, 0.0)[None]  # white is white to rounding: not at a corner
-        inside = jnp.cumsum(energies[::-1], axis=0)[::-1] + absorbed
+        rank = jnp.argsort(jnp.argsort(variances))
+        upto = (rank[None] <= rank[:, None]).astype(exits.dtype)  # of row k: the layers that are not wider
+        inside = jnp.tensordot(upto.T, energies, 1) + absorbed
         leaving = energies / jnp.where(inside > _NOTHING, inside, 1.0)
-        more = jnp.maximum(exits[order] - 1, 0)
+        more = jnp.maximum(exits - 1, 0)
         more = more * more / (more + _ROUNDING)
-        return ((1 + more) / jnp.cumprod(1 + leaving * more, axis=0))[jnp.argsort(order)]
+        return (1 + more) * jnp.exp(-jnp.tensordot(upto, jnp.log(1 + leaving * more), 1))

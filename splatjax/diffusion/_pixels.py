@@ -3,65 +3,55 @@
 import equinox as eqx
 import jax.numpy as jnp
 from jax.lax import stop_gradient
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
-from splatjax.splatting import AbstractView, BinCapacity, Bins, TileGrid, TileRanges, bin_items
+from splatjax.splatting import SIDE, AbstractView, Atlas, BinCapacity, Bins, TileGrid, TileRanges, bin_items
 
 from ._gaussian_sums import Steps
 from ._neighbors import Boxes
 
 FAR = -1e6  # mm from anything, yet with a square that float32 holds
-_SIDE = 8
 _LANES = 32
 
 
 def tile_grid(width: int, height: int, slots: int) -> TileGrid:
     """The tiles of two surfaces of a picture, one below the other."""
-    return TileGrid(width, 2 * -(-height // _SIDE) * _SIDE, _SIDE, _LANES, slots)
+    return TileGrid(width, 2 * -(-height // SIDE) * SIDE, SIDE, _LANES, slots)
 
 
 class Pixels(eqx.Module):
-    """The points of the surface in front and of the one behind it, in tiles."""
+    """The points of the surface in front and of the one behind it, in the tiles of an atlas."""
 
-    tiles: Float[Array, "tiles 3 points"]
+    tiles: Float[Array, "tiles_and_one 3 points"]
+    """The last shows nothing: it stands for every tile that is not in the atlas."""
     origin: Float[Array, "3"]
     """From which all points are seen here, mm."""
-    farthest: Float[Array, "surfaces down across"]
-    """Depth (mm) of the farthest point of each tile: what lies well behind it is not needed there."""
-    view: AbstractView
+    atlas: Atlas
 
     @classmethod
     def of(
-        cls,
-        points: Float[Array, "surfaces 3 height width"],
-        covered: Bool[Array, "surfaces height width"],
-        origin: Float[Array, "3"],
-        view: AbstractView,
+        cls, points: Float[Array, "tiles 3 points"], covered: Bool[Array, "tiles points"], origin: Float[Array, "3"], atlas: Atlas
     ) -> "Pixels":
-        depth = jnp.where(covered, view.project(stop_gradient(points).transpose(1, 0, 2, 3))[2], -jnp.inf)
-        off = [(-view.height) % _SIDE, (-view.width) % _SIDE]
-        padded = jnp.pad(depth, ((0, 0), (0, off[0]), (0, off[1])), constant_values=-jnp.inf)
-        farthest = padded.reshape(2, padded.shape[1] // _SIDE, _SIDE, -1, _SIDE).max(axis=(2, 4))
-        seen = points - origin[None, :, None, None]
-        away = jnp.pad(jnp.where(covered[:, None], seen, FAR), ((0, 0), (0, 0), (0, off[0]), (0, 0)), constant_values=FAR)
-        tiles = tile_grid(view.width, view.height, 1).cut(jnp.concatenate([away[0], away[1]], axis=1), FAR)
-        return cls(tiles, origin, farthest, view)
+        seen = jnp.where(covered[:, None], points - origin[None, :, None], FAR)
+        return cls(jnp.pad(seen, ((0, 1), (0, 0), (0, 0)), constant_values=FAR), origin, atlas)
 
     def bins(self, centers, there, reach: Float[Array, " sources"], block: int, slots: int, capacity: BinCapacity) -> Bins:
         """List for each tile the blocks of sources within reach (mm); for the surface behind their numbers go on."""
-        grid = tile_grid(self.view.width, self.view.height, slots)
+        view = self.atlas.view
+        grid = tile_grid(view.width, view.height, slots)
         centers, reach = stop_gradient(centers), stop_gradient(reach)
-        ranges = block_ranges(centers + self.origin[:, None], there, reach, block, self.view, self.farthest)
+        ranges = block_ranges(centers + self.origin[:, None], there, reach, block, view, self.atlas.farthest)
         blocks, tiles = Boxes.around(centers, there, block), self.boxes
         farthest = jnp.max(jnp.where(there, reach, 0.0).reshape(-1, block), axis=1)
+        places = self._places(grid)
 
         def meet(item, tile):
-            item = item % farthest.shape[0]
+            item, place = item % farthest.shape[0], places[tile]
 
             def apart(axis):
                 """Give how far the boxes lie apart along an axis."""
                 gap = jnp.maximum(
-                    tiles.low[axis][tile] - blocks.high[axis][item], blocks.low[axis][item] - tiles.high[axis][tile]
+                    tiles.low[axis][place] - blocks.high[axis][item], blocks.low[axis][item] - tiles.high[axis][place]
                 )
                 return jnp.maximum(gap, 0.0)
 
@@ -69,23 +59,22 @@ class Pixels(eqx.Module):
 
         return bin_items(ranges, grid, capacity, meet)
 
+    def _places(self, grid: TileGrid) -> Int[Array, " tiles"]:
+        places = self.atlas.places
+        return jnp.pad(places, (0, grid.tiles - places.shape[0]), constant_values=self.tiles.shape[0] - 1)
+
     @property
     def boxes(self) -> Boxes:
         """Boxes around the points of every tile."""
         points = self.tiles.transpose(1, 0, 2).reshape(3, -1)
-        return Boxes.around(points, points[0] != FAR, _SIDE**2)
+        return Boxes.around(points, points[0] != FAR, SIDE**2)
 
     def steps(self, bins: Bins, blocks: int) -> Steps:
-        sweeps = bins.places // bins.ids.shape[1]
+        lanes = bins.ids.shape[1]
+        sweeps = bins.places // lanes
         ids = jnp.where(bins.ids < 2 * blocks, bins.ids % blocks, blocks)
-        return Steps(ids, bins.first_block[:sweeps], bins.first_block[1 : sweeps + 1], bins.order)
-
-    def surfaces(self, tiles: Float[Array, "tiles rows points"]) -> Float[Array, "surfaces rows height width"]:
-        """Put both pictures together from their tiles."""
-        grid = tile_grid(self.view.width, self.view.height, 1)
-        picture = grid.join(tiles)
-        both = picture.reshape(picture.shape[0], 2, -1, picture.shape[2])[:, :, : self.view.height]
-        return both.transpose(1, 0, 2, 3)
+        places = self._places(tile_grid(self.atlas.view.width, self.atlas.view.height, 1))
+        return Steps(ids, bins.first_block[:sweeps], bins.first_block[1 : sweeps + 1], places[bins.order[: sweeps * lanes]])
 
 
 def block_ranges(
@@ -105,7 +94,7 @@ def block_ranges(
 
     left, top, near = (of_block(jnp.min, each, jnp.inf) for each in (left, top, depth - reach))
     right, bottom = (of_block(jnp.max, each, -jnp.inf) for each in (right, bottom))
-    grid = TileGrid(view.width, view.height, _SIDE)
+    grid = TileGrid(view.width, view.height, SIDE)
     ranges = TileRanges.of(left, right, top, bottom, jnp.any(there.reshape(-1, block), axis=1), grid)
     found = []
     for surface, far in enumerate(farthest):

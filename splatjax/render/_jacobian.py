@@ -19,10 +19,9 @@ from ._passes import (
     cast_shadows,
     compose,
     let_light_in,
-    over,
     poisoned_unless,
     see_surfaces,
-    shade_surfaces,
+    shade,
     sources_of,
     surface_attributes,
 )
@@ -121,21 +120,20 @@ def _picture_jacobian(scene: Scene, camera: Camera, settings: RenderSettings, pl
     if more is not None:
         attributes["more"] = more
     seen = see_surfaces(splats, attributes, view, settings, plan)
-    rest = plan.interval, view, plan.diffuser, settings.diffusion.normalization
+    rest = plan.interval, seen.atlas, plan.diffuser, settings.diffusion.normalization
     layers, slopes, needed = _diffusion.exitance_jacobian(sources_of(splats, entering.source), material, seen.receivers(), *rest)
-    of_weights = [slope.weights for slope in slopes]
+    of_weights = slopes.weights
     if more is not None:
         gained, _ = _diffusion.diffusion_layers(sources_of(splats, more), material, seen.receivers("more"), *rest)
-        mix = material.gaussians.weights[:, :, None, None]
-        of_weights = [w + jnp.sum(mix * each.layers, axis=0)[None] for w, each in zip(of_weights, gained, strict=True)]
-    front, behind = shade_surfaces(scene, view, light.groups, seen, layers)
+        of_weights = of_weights + jnp.sum(material.gaussians.weights[None, :, :, None] * gained.layers, axis=1, keepdims=True)
+    shaded = shade(scene, view, light.groups, seen, layers)
 
-    def of_beauty(a: Float[Array, "gaussians channels height width"], b: Float[Array, "gaussians channels height width"]):
-        return over(front, behind, front.post[None] * a.transpose(0, 2, 3, 1), behind.post[None] * b.transpose(0, 2, 3, 1))
+    def of_beauty(slopes: Float[Array, "tiles gaussians channels pixels"]):
+        return seen.picture(shaded.post[:, None] * slopes.transpose(0, 1, 3, 2))
 
-    weights, variances = of_beauty(*of_weights), of_beauty(*(slope.variances for slope in slopes))
+    weights, variances = of_beauty(of_weights), of_beauty(slopes.variances)
     needed = jnp.max(jnp.stack([needed, seen.needed, light.needed]))
-    frame = compose(front, behind, material.gaussians.weights, needed)
+    frame = compose(shaded, seen, layers.resolved, material.gaussians.weights, needed)
     return PictureJacobian(frame, *poisoned_unless(needed <= 1, (weights, variances)))
 
 

@@ -3,9 +3,11 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jax.lax import stop_gradient
+from jaxtyping import Array, Bool, Float
 
 from splatjax import diffusion as _diffusion, shading as _shading, splatting as _splatting
+from splatjax.pointwise import AT_ONCE, in_parts
 from splatjax.scene import Frame, Scene, Splats, StackedLights, stack_lights
 
 from ._plan import Plan, shadow_views
@@ -70,29 +72,58 @@ def surface_attributes(scene: Scene, light: LightOnSplats, entering: EnteringLig
 
 
 class SeenSurfaces(eqx.Module):
-    """Passes 2 and 3: the surface in front, and the one that shows behind its silhouettes."""
+    """Passes 2 and 3: the surface in front and the one that shows behind its silhouettes, in the tiles of an atlas."""
 
-    surfaces: tuple[_splatting.Surface, _splatting.Surface]
-    named: tuple[dict[str, Array], dict[str, Array]]
-    """Their blended attributes."""
+    atlas: _splatting.Atlas
+    points: Float[Array, "tiles 3 pixels"]
+    """mm."""
+    depth: Float[Array, "tiles pixels"]
+    covered: Bool[Array, "tiles pixels"]
+    named: dict[str, Float[Array, "tiles _rows pixels"]]
+    """Blended attributes."""
+    coverage: Float[Array, "height width"]
+    """Of both surfaces together."""
+    share: Float[Array, "tiles pixels"]
+    """Of its pixel that each point covers: behind, of what the front leaves."""
     needed: Float[Array, ""]
 
-    def receivers(self, source: str = "source") -> list[_diffusion.SeenSurface]:
+    def receivers(self, source: str = "source") -> _diffusion.SeenSurface:
         """Give what pass 4 asks of them, of the light of that name."""
-        return [
-            _diffusion.SeenSurface(each, named[source], named["area"][0], named.get("albedo", jnp.ones_like(named[source])))
-            for each, named in zip(self.surfaces, self.named, strict=True)
-        ]
+        named = self.named
+        albedo = named.get("albedo", jnp.ones_like(named[source]))
+        return _diffusion.SeenSurface(self.points, self.covered, named[source], named["area"][:, 0], albedo)
+
+    def picture(self, values: Float[Array, "tiles *rows pixels channels"]) -> Float[Array, "*rows height width channels"]:
+        """Lay the front over what shows behind it, premultiplied by coverage."""
+        share = self.share.reshape(self.share.shape[0], *(1,) * (values.ndim - 3), self.share.shape[1], 1)
+        return self.atlas.picture(share * values)
 
 
 def see_surfaces(
     splats: Splats, attributes: dict[str, Array], view: _splatting.AbstractView, settings: RenderSettings, plan: Plan
 ) -> SeenSurfaces:
     """Passes 2 and 3."""
-    stacked = jnp.concatenate(list(attributes.values()))
-    found = _splatting.splat_surfaces(splats, stacked, view, settings.splatting, plan.camera)
-    named = _by_name(attributes, found.front.attributes), _by_name(attributes, found.behind.attributes)
-    return SeenSurfaces((found.front, found.behind), named, found.needed)
+    found = _splatting.splat_surfaces(splats, jnp.concatenate(list(attributes.values())), view, settings.splatting, plan.camera)
+    atlas = _splatting.Atlas.of(_splatting.farthest_depths(found), view, plan.tiles)
+    front = found.front.coverage
+    behind = (1 - front) * found.behind.coverage
+    rows = (
+        jnp.concatenate([each.attributes, jnp.stack([each.depth, each.weight_sum, share])])
+        for each, share in ((found.front, front), (found.behind, behind))
+    )
+    packed = atlas.pack(*rows)
+    covered = stop_gradient(packed[:, -2]) > 0
+    depth = jnp.where(covered, packed[:, -3], 1.0)
+    return SeenSurfaces(
+        atlas=atlas,
+        points=atlas.points(depth).transpose(1, 0, 2),
+        depth=depth,
+        covered=covered,
+        named=_by_name(attributes, packed),
+        coverage=front + behind,
+        share=packed[:, -1],
+        needed=jnp.maximum(found.needed, atlas.needed),
+    )
 
 
 def sources_of(splats: Splats, irradiance: Float[Array, "channels splats"]) -> _diffusion.Sources:
@@ -101,60 +132,56 @@ def sources_of(splats: Splats, irradiance: Float[Array, "channels splats"]) -> _
 
 
 class ShadedSurface(eqx.Module):
-    """One surface, shaded; nothing premultiplied."""
+    """The surface, shaded, in the tiles of an atlas; nothing premultiplied."""
 
-    coverage: Float[Array, "height width"]
-    depth: Float[Array, "height width"]
-    position: Float[Array, "height width 3"]
-    normal: Float[Array, "height width 3"]
-    albedo: Float[Array, "height width channels"]
-    shadow: Float[Array, "lights height width"]
-    irradiance: Float[Array, "height width channels"]
-    post: Float[Array, "height width #channels"]
+    depth: Float[Array, "tiles pixels"]
+    position: Float[Array, "tiles pixels 3"]
+    normal: Float[Array, "tiles pixels 3"]
+    albedo: Float[Array, "tiles pixels channels"]
+    shadow: Float[Array, "tiles lights pixels"]
+    irradiance: Float[Array, "tiles pixels channels"]
+    post: Float[Array, "tiles pixels #channels"]
     """From a layer to the radiance towards the eye."""
-    layers: Float[Array, "gaussians height width channels"]
-    specular: Float[Array, "height width channels"]
-    single_scattering: Float[Array, "height width channels"] | None
-    resolved: Float[Array, "gaussians height width"]
+    layers: Float[Array, "tiles gaussians pixels channels"]
+    specular: Float[Array, "tiles pixels channels"]
+    single_scattering: Float[Array, "tiles pixels channels"] | None
 
 
-def shade_surfaces(
+def shade(
     scene: Scene,
-    view: _splatting.AbstractView,
+    view: _splatting.PerspectiveView,
     groups: list[StackedLights],
     seen: SeenSurfaces,
-    layers: list[_diffusion.DiffusionLayers],
-) -> list[ShadedSurface]:
-    """Pass 5 on the surface in front and on the one behind it."""
-    return [
-        _shade(scene, view, groups, surface, named, layer)
-        for surface, named, layer in zip(seen.surfaces, seen.named, layers, strict=True)
-    ]
+    layers: _diffusion.DiffusionLayers,
+) -> ShadedSurface:
+    """Pass 5."""
+
+    def shaded(points, depth, covered, named, layers):
+        return _shade(scene, view, groups, points, depth, covered, named, layers)
+
+    at_once = AT_ONCE // _splatting.SIDE**2
+    return in_parts(shaded, seen.points, seen.depth, seen.covered, seen.named, layers.layers, at_once=at_once)
 
 
-def _shade(scene: Scene, view, groups, surface: _splatting.Surface, named, layers: _diffusion.DiffusionLayers) -> ShadedSurface:
+def _shade(scene: Scene, view, groups: list[StackedLights], position, depth, covered, named, layers) -> ShadedSurface:
     splats, material = scene.splats, scene.material
     f0 = _shading.fresnel_f0(material.eta)
-    covered = surface.weight_sum > 0
-    dtype = surface.depth.dtype
-    shape = surface.depth.shape
-    position = _diffusion.pixel_points(view, surface.depth)
-    to_eye = jnp.broadcast_to(view.position[:, None, None], position.shape) - position
-    outgoing = to_eye / jnp.sqrt(jnp.sum(to_eye * to_eye, axis=0))[None]
+    dtype, shape, channels = depth.dtype, depth.shape, layers.shape[2]
+    to_eye = jnp.broadcast_to(view.position[None, :, None], position.shape) - position
+    outgoing = to_eye / jnp.sqrt(jnp.sum(to_eye * to_eye, axis=1, keepdims=True))
     points = _shading.SurfacePoints(
-        positions=position.transpose(1, 2, 0),
-        normals=_shading.unit_normals(named["normal"].transpose(1, 2, 0)),
-        outgoing=outgoing.transpose(1, 2, 0),
-        specular=material.specular if splats.specular is None else named["specular"][0],
-        roughness=material.roughness if splats.roughness is None else named["roughness"][0],
-        lit=[named.get(f"lit {i}") for i in range(len(groups))],
+        positions=position.transpose(0, 2, 1),
+        normals=_shading.unit_normals(named["normal"].transpose(0, 2, 1)),
+        outgoing=outgoing.transpose(0, 2, 1),
+        specular=material.specular if splats.specular is None else named["specular"][:, 0],
+        roughness=material.roughness if splats.roughness is None else named["roughness"][:, 0],
+        lit=[shares.transpose(1, 0, 2) if (shares := named.get(f"lit {i}")) is not None else None for i in range(len(groups))],
     )
-    channels = layers.layers.shape[1]
     specular = _shading.reflected_radiance(points, groups, f0, channels)
     albedo = jnp.ones((*shape, channels), dtype)
     post = (_shading.leaving_share(points, f0) / jnp.pi)[..., None]
     if splats.albedo is not None:
-        albedo = named["albedo"].transpose(1, 2, 0)
+        albedo = named["albedo"].transpose(0, 2, 1)
         post = post * _shading.albedo_root(albedo)
     single = None
     if material.single_scattering is not None:
@@ -162,54 +189,43 @@ def _shade(scene: Scene, view, groups, surface: _splatting.Surface, named, layer
         if splats.albedo is not None:
             single = single * _shading.albedo_root(albedo) ** 2
     return ShadedSurface(
-        coverage=surface.coverage,
-        depth=jnp.where(covered, surface.depth, jnp.inf),
+        depth=jnp.where(covered, depth, jnp.inf),
         position=jnp.where(covered[..., None], points.positions, 0.0),
         normal=points.normals,
         albedo=albedo,
-        shadow=_shadows_in_order(points.lit, groups, shape, dtype),
-        irradiance=named.get("irradiance", named["source"]).transpose(1, 2, 0),
+        shadow=jnp.where(covered[:, None], _shadows_in_order(points.lit, groups, shape, dtype).transpose(1, 0, 2), 1.0),
+        irradiance=named.get("irradiance", named["source"]).transpose(0, 2, 1),
         post=post,
-        layers=post[None] * layers.layers.transpose(0, 2, 3, 1),
+        layers=post[:, None] * layers.transpose(0, 1, 3, 2),
         specular=jnp.where(covered[..., None], specular, 0.0),
         single_scattering=None if single is None else jnp.where(covered[..., None], single, 0.0),
-        resolved=layers.resolved,
     )
 
 
-def over(front: ShadedSurface, behind: ShadedSurface, a: Float[Array, "..."], b: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Lay what belongs to the front over what belongs to the surface behind, premultiplied by coverage; channels last."""
-    lift = (*(None,) * (a.ndim - 3), ..., None)
-    return front.coverage[lift] * a + _shown_behind(front, behind)[lift] * b
-
-
-def _shown_behind(front: ShadedSurface, behind: ShadedSurface) -> Float[Array, "height width"]:
-    return (1 - front.coverage) * behind.coverage
-
-
 def compose(
-    front: ShadedSurface, behind: ShadedSurface, weights: Float[Array, "gaussians channels"], needed: Float[Array, ""]
+    shaded: ShadedSurface,
+    seen: SeenSurfaces,
+    resolved: Float[Array, "tiles gaussians pixels"],
+    weights: Float[Array, "gaussians channels"],
+    needed: Float[Array, ""],
 ) -> Frame:
     """Lay the front over what shows behind it; sum the layers."""
-
-    def premultiplied(name: str):
-        return over(front, behind, getattr(front, name), getattr(behind, name))
-
-    layers = premultiplied("layers")
+    front = seen.atlas.front_picture
+    layers = seen.picture(shaded.layers)
     diffuse = jnp.sum(weights[:, None, None] * layers, axis=0)
-    specular = premultiplied("specular")
-    single = None if front.single_scattering is None else premultiplied("single_scattering")
-    drawn = (front.coverage > 0).astype(front.depth.dtype)
-    handed_over = jnp.sum((1 - front.resolved) * drawn[None], axis=(1, 2)) / jnp.maximum(jnp.sum(drawn), 1)
+    specular = seen.picture(shaded.specular)
+    single = None if shaded.single_scattering is None else seen.picture(shaded.single_scattering)
+    drawn = ((seen.share > 0) & seen.atlas.in_front[:, None]).astype(shaded.depth.dtype)
+    handed_over = jnp.sum((1 - resolved) * drawn[:, None], axis=(0, 2)) / jnp.maximum(jnp.sum(drawn), 1)
     frame = Frame(
         beauty=diffuse + specular if single is None else diffuse + single + specular,
-        coverage=front.coverage + _shown_behind(front, behind),
-        depth=front.depth,
-        position=front.position,
-        normal=front.normal,
-        albedo=premultiplied("albedo"),
-        shadow=front.shadow,
-        irradiance=premultiplied("irradiance"),
+        coverage=seen.coverage,
+        depth=front(shaded.depth[..., None], jnp.inf)[..., 0],
+        position=front(shaded.position),
+        normal=front(shaded.normal),
+        albedo=seen.picture(shaded.albedo),
+        shadow=front(shaded.shadow[..., None], 1.0)[..., 0],
+        irradiance=seen.picture(shaded.irradiance),
         layers=layers,
         weights=weights,
         diffuse=diffuse,
@@ -263,14 +279,14 @@ def _surface_parameters(scene: Scene):
     return specular, roughness
 
 
-def _by_name(attributes: dict[str, Array], stacked: Float[Array, "rows height width"]) -> dict[str, Array]:
+def _by_name(attributes: dict[str, Array], packed: Float[Array, "tiles rows pixels"]) -> dict[str, Array]:
     edges = [0]
     for rows in attributes.values():
         edges.append(edges[-1] + rows.shape[0])
-    return {name: stacked[i:j] for name, i, j in zip(attributes, edges, edges[1:], strict=False)}
+    return {name: packed[:, i:j] for name, i, j in zip(attributes, edges, edges[1:], strict=False)}
 
 
-def _shadows_in_order(lit, groups: list[StackedLights], shape, dtype) -> Float[Array, "lights height width"]:
+def _shadows_in_order(lit, groups: list[StackedLights], shape, dtype) -> Float[Array, "lights tiles pixels"]:
     """Per light, in the scene's order; 1 where a light casts none."""
     planes = [jnp.ones(shape, dtype)] * sum(len(group.places) for group in groups)
     for group, shares in zip(groups, lit, strict=True):

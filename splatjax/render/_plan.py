@@ -35,6 +35,8 @@ class Plan(eqx.Module):
     """
 
     camera: _splatting.AbstractRasterizer
+    tiles: int = eqx.field(static=True)
+    """Of the pictures, that show a surface or one behind it."""
     shadows: tuple[ShadowPlan | None, ...]
     diffuser: _diffusion.AbstractDiffuser
     interval: Float[Array, "2"]
@@ -62,12 +64,25 @@ def _plan(scene: Scene, cameras: Camera | Sequence[Camera], settings: RenderSett
     interval = _diffusion.handover_interval(_diffusion.irregularity(scene.splats), settings.diffusion)
     variances = scene.material.gaussians.variances
     kernels = _diffusion.Kernels(variances, settings.diffusion.normalization.depths(variances))
+    camera = settings.rasterizer.planned(scene.splats, views, settings.splatting)
+    looks = [_look(scene.splats, view, settings.splatting, camera) for view in views]
+    shown = max(int(jnp.sum(look > -jnp.inf)) for look in looks)
+    tiles = min(_splatting.round_up(shown, 1), looks[0].size)
+    atlases = [_splatting.Atlas.of(look, view, tiles) for look, view in zip(looks, views, strict=True)]
     return Plan(
-        camera=settings.rasterizer.planned(scene.splats, views, settings.splatting),
+        camera=camera,
+        tiles=tiles,
         shadows=tuple(_plan_shadows(group, scene.splats, bounds, settings) for group in stack_lights(scene.lights)),
-        diffuser=settings.diffuser.planned(scene.splats, kernels, interval, views),
+        diffuser=settings.diffuser.planned(scene.splats, kernels, interval, atlases),
         interval=interval,
     )
+
+
+@eqx.filter_jit
+def _look(splats: Splats, view, settings: _splatting.SplattingSettings, rasterizer) -> Float[Array, "surfaces down across"]:
+    """Find where there is anything to see, and how far away."""
+    nothing = jnp.zeros((0, splats.count), splats.centers.dtype)
+    return _splatting.farthest_depths(_splatting.splat_surfaces(splats, nothing, view, settings, rasterizer))
 
 
 def plan_unless_traced(scene: Scene, camera: Camera, settings: RenderSettings, plan: Plan | None) -> Plan:

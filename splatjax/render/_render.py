@@ -8,7 +8,7 @@ from splatjax import diffusion as _diffusion, splatting as _splatting
 from splatjax.scene import Camera, Frame, Scene
 
 from ._inputs import SAME, check_channels, in_one_dtype
-from ._passes import cast_shadows, compose, let_light_in, see_surfaces, shade_surfaces, sources_of, surface_attributes
+from ._passes import cast_shadows, compose, let_light_in, see_surfaces, shade, sources_of, surface_attributes
 from ._plan import Plan, plan_unless_traced
 from ._settings import RenderSettings
 
@@ -45,13 +45,13 @@ def _render(scene: Scene, camera: Camera, settings: RenderSettings, plan: Plan) 
         scene.material,
         seen.receivers(),
         plan.interval,
-        view,
+        seen.atlas,
         plan.diffuser,
         settings.diffusion.normalization,
     )
-    front, behind = shade_surfaces(scene, view, light.groups, seen, layers)
+    shaded = shade(scene, view, light.groups, seen, layers)
     needed = jnp.max(jnp.stack([needed, seen.needed, light.needed]))
-    return compose(front, behind, scene.material.gaussians.weights, needed)
+    return compose(shaded, seen, layers.resolved, scene.material.gaussians.weights, needed)
 
 
 def diffuse(
@@ -89,14 +89,14 @@ def _diffuse(scene: Scene, irradiance, camera: Camera, settings: RenderSettings,
     if splats.albedo is not None:
         attributes["albedo"] = splats.albedo.T
     seen = see_surfaces(splats, attributes, view, settings, plan)
-    (front, _), needed = _diffusion.diffusion_layers(
+    layers, needed = _diffusion.diffusion_layers(
         sources_of(splats, irradiance.T),
         scene.material,
         seen.receivers(),
         plan.interval,
-        view,
+        seen.atlas,
         plan.diffuser,
         settings.diffusion.normalization,
     )
     fits = jnp.maximum(needed, seen.needed) <= 1
-    return jnp.where(fits, front.layers.transpose(0, 2, 3, 1), jnp.nan)
+    return jnp.where(fits, seen.atlas.front_picture(layers.layers.transpose(0, 1, 3, 2)), jnp.nan)

@@ -8,6 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from splatjax.pointwise import in_parts
+
 from ._specular import ROUGHNESS_RANGE, clamped_roughness
 
 # Chebyshev nodes in sqrt(mu) and in log m. The square root resolves the steep part at grazing angles, where the albedo
@@ -90,8 +92,8 @@ def _table(key: tuple[int, int, int], x: Float[Array, "..."], t: Float[Array, ".
     """Evaluate a table. Its derivatives are tables too: one number is kept for the way back, not the whole recurrence."""
     coefficients = _derivative_table(key)
     if t.ndim == 0:
-        over_mu = _chebyshev(list(jnp.asarray(coefficients.T, t.dtype)), jnp.broadcast_to(t, (len(coefficients),)))
-        return _chebyshev(list(over_mu), x)
+        over_mu = list(_chebyshev(list(jnp.asarray(coefficients.T, t.dtype)), jnp.broadcast_to(t, (len(coefficients),))))
+        return in_parts(lambda x: _chebyshev(over_mu, x), x.reshape(-1)).reshape(x.shape)
     x, t = jnp.broadcast_arrays(x, t)
     rows = jnp.asarray(coefficients, t.dtype)
 

@@ -16,25 +16,25 @@ from ._specular import specular_lobe
 class SurfacePoints(eqx.Module):
     """What the pixels see of one surface: blended attributes, ready to be shaded."""
 
-    positions: Float[Array, "height width 3"]
-    normals: Float[Array, "height width 3"]
+    positions: Float[Array, "*pixels 3"]
+    normals: Float[Array, "*pixels 3"]
     """Unit, or zero where there is no surface."""
-    outgoing: Float[Array, "height width 3"]
+    outgoing: Float[Array, "*pixels 3"]
     """`wo`: unit, towards the eye."""
-    specular: Float[Array, "height width"] | Float[Array, ""]
-    roughness: Float[Array, "height width"] | Float[Array, ""]
-    lit: list[Float[Array, "_lights height width"] | None]
+    specular: Float[Array, "*pixels"] | Float[Array, ""]
+    roughness: Float[Array, "*pixels"] | Float[Array, ""]
+    lit: list[Float[Array, "_lights *pixels"] | None]
     """Per group of lights, as the splats received it."""
 
 
-def unit_normals(normals: Float[Array, "height width 3"]) -> Float[Array, "height width 3"]:
+def unit_normals(normals: Float[Array, "*pixels 3"]) -> Float[Array, "*pixels 3"]:
     """Give blended normals unit length; zero stays zero, with a zero gradient: no direction is better than another."""
     squared = jnp.sum(normals * normals, axis=-1, keepdims=True)
     there = squared > 0
     return jnp.where(there, normals / jnp.sqrt(jnp.where(there, squared, 1.0)), 0.0)
 
 
-def leaving_share(points: SurfacePoints, f0: Float[Array, ""]) -> Float[Array, "height width"]:
+def leaving_share(points: SurfacePoints, f0: Float[Array, ""]) -> Float[Array, "*pixels"]:
     """Give the share of diffused light that leaves towards the eye, `(1 - rho(wo)) / (1 - rho_avg)`: on average 1."""
     cosine = jnp.maximum(jnp.sum(points.normals * points.outgoing, axis=-1), 0)
     return diffuse_transmission(cosine, f0, points.specular, points.roughness)
@@ -42,7 +42,7 @@ def leaving_share(points: SurfacePoints, f0: Float[Array, ""]) -> Float[Array, "
 
 def reflected_radiance(
     points: SurfacePoints, groups: list[StackedLights], f0: Float[Array, ""], channels: int
-) -> Float[Array, "height width channels"]:
+) -> Float[Array, "*pixels channels"]:
     """Give the specular radiance towards the eye: Kelemen / Szirmay-Kalos, each light in its own shadow."""
     total = jnp.zeros((*points.positions.shape[:-1], channels), points.positions.dtype)
     for group, shares in zip(groups, points.lit, strict=True):
@@ -63,7 +63,7 @@ def reflected_radiance(
 
 def single_scattered_radiance(
     points: SurfacePoints, groups: list[StackedLights], f0: Float[Array, ""], single: SingleScattering
-) -> Float[Array, "height width channels"]:
+) -> Float[Array, "*pixels channels"]:
     """Give the radiance of light that entered where it leaves and scattered once, each light in its own shadow.
 
     What the specular lobe reflects does not enter. The surface counts as flat and evenly lit over a mean free path.

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Float
 
+from splatjax.pointwise import in_parts
 from splatjax.scene import Splats
 
 from ._rasterizer import AbstractRasterizer
@@ -127,15 +128,31 @@ def lit_share(splats: Splats, view: AbstractView, surfaces: Surfaces, settings: 
 
     **Returns:** in [0, 1]; 1 outside the map. Differentiable in the splats, the view and the map.
     """
-    x, y, depth = view.project(splats.centers.T)
-    across, down, facing = view.slant(x, y, depth, splats.normals.T)
-    facing = jnp.maximum(facing, 1 / settings.largest_slope)
-    slope_x, slope_y = across / facing, down / facing
-
-    column, row = jnp.floor(stop_gradient(x)), jnp.floor(stop_gradient(y))
-    tx, ty = x - column - 0.5, y - row - 0.5
     flat = jnp.stack([s.reshape(-1) for s in (surfaces.front.depth, surfaces.front.coverage)])
     flat_behind = jnp.stack([s.reshape(-1) for s in (surfaces.behind.depth, surfaces.behind.coverage)])
+
+    def land(centers, normals):
+        x, y, depth = view.project(centers.T)
+        across, down, facing = view.slant(x, y, depth, normals.T)
+        facing = jnp.maximum(facing, 1 / settings.largest_slope)
+        return jnp.stack([x, y, depth, across / facing, down / facing], axis=1)
+
+    # Where splats land is kept: each of nine comparisons, and each of their derivatives, reads it.
+    landed = in_parts(land, splats.centers, splats.normals)
+    return in_parts(lambda part: _compared(part.T, view, flat, flat_behind, settings), landed)
+
+
+def _compared(
+    landed: Float[Array, "5 splats"],
+    view: AbstractView,
+    flat: Float[Array, "2 pixels"],
+    flat_behind: Float[Array, "2 pixels"],
+    settings: ShadowSettings,
+) -> Float[Array, " splats"]:
+    """Compare with depth and coverage of both surfaces of a map."""
+    x, y, depth, slope_x, slope_y = landed
+    column, row = jnp.floor(stop_gradient(x)), jnp.floor(stop_gradient(y))
+    tx, ty = x - column - 0.5, y - row - 0.5
 
     def held_up(step_x: int, step_y: int):
         at_x, at_y = column.astype(jnp.int32) + step_x, row.astype(jnp.int32) + step_y

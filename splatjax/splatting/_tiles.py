@@ -16,6 +16,7 @@ from jax import lax
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
+from splatjax.pointwise import in_parts
 from splatjax.scene import Splats
 
 from ._bins import BinCapacity, Bins, TileGrid, TileRanges, bin_items, round_up, scatter_slots, slot_plane
@@ -74,7 +75,7 @@ class TileRasterizer(AbstractRasterizer):
         splats = jax.tree.map(
             lambda leaf: jnp.stack(_taken(leaf.T, ids), axis=-1) if leaf.ndim == 2 else _taken([leaf], ids)[0], splats
         )
-        footprints, grid = view.footprints(splats, settings), self._grid(view)
+        footprints, grid = in_parts(lambda part: view.footprints(part, settings), splats), self._grid(view)
         bins = bin_items(_ranges(footprints, grid), grid, self.capacity.bins)
         bins = eqx.tree_at(lambda b: b.needed, bins, jnp.maximum(bins.needed, seen / self.capacity.splats))
         planes = tuple(getattr(footprints, name) for name in _PLANES)

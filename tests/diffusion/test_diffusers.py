@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from splatjax.diffusion import ClusterDiffuser, DenseDiffuser, Kernels, Sources, pixel_points
-from splatjax.splatting import DenseRasterizer, SplattingSettings, splat_surfaces
+from splatjax.diffusion import ClusterDiffuser, DenseDiffuser, Kernels, Sources
+from splatjax.splatting import Atlas, DenseRasterizer, SplattingSettings, farthest_depths, splat_surfaces
 
 COUNT, SIZE = 3000, 64
 VARIANCES = (1.0, 9.0, 20.0)
@@ -25,19 +25,37 @@ EXITS = 1.5  # times as much for the exits, of which a layer passes on the small
 OVERSHOOT = 1e-2  # continued slopes and moments may pass the extremes by this much of the range
 
 
+def atlas_of(body, view):
+    """The tiles that a view shows of a body, and what they show."""
+
+    @jax.jit
+    def look(body):
+        surfaces = splat_surfaces(
+            body, jnp.zeros((0, body.count), body.centers.dtype), view, SplattingSettings(), DenseRasterizer()
+        )
+        farthest = farthest_depths(surfaces)
+        atlas = Atlas.of(farthest, view, farthest.size)
+        rows = atlas.pack(*(jnp.stack([each.depth, each.weight_sum]) for each in (surfaces.front, surfaces.behind)))
+        covered = rows[:, 1] > 0
+        return atlas, atlas.points(jnp.where(covered, rows[:, 0], 1.0)).transpose(1, 0, 2), covered
+
+    return look(body)
+
+
 @cache
 def scene(x64: bool):
     """A bumpy body lit from the side, and the points that a view sees of it; in the precision under test."""
     body = bodies.bumpy(COUNT)
-    view = bodies.perspective(fov=FOV, width=SIZE, height=SIZE)
-    surfaces = jax.jit(lambda s: splat_surfaces(s, jnp.zeros((0, COUNT)), view, SplattingSettings(), DenseRasterizer()))(body)
-    seen = (surfaces.front, surfaces.behind)
-    points = jnp.stack([pixel_points(view, each.depth) for each in seen])
-    covered = jnp.stack([each.weight_sum > 0 for each in seen])
+    atlas, points, covered = atlas_of(body, bodies.perspective(fov=FOV, width=SIZE, height=SIZE))
     side = jnp.maximum(body.normals @ jnp.asarray([0.8, 0.3, 0.52]), 0.0)
     texture = 0.5 + 0.4 * jnp.sin(0.9 * body.centers[:, 0]) * jnp.cos(0.7 * body.centers[:, 1])
     sources = Sources(body.centers.T, body.normals.T, body.areas, jnp.stack([side, texture]))
-    return body, view, sources, points, covered
+    return body, atlas, sources, points, covered
+
+
+def in_front(x64: bool) -> np.ndarray:
+    _, atlas, _, _, covered = scene(x64)
+    return np.asarray(covered) & np.asarray(atlas.in_front)[:, None]
 
 
 def kernels(factor=1.0):
@@ -45,22 +63,25 @@ def kernels(factor=1.0):
     return Kernels(variances, DEPTH * jnp.sqrt(variances))
 
 
-def planned(body, view, **settings):
-    return ClusterDiffuser(**settings).planned(body, kernels(), jnp.asarray(RESOLVED), [view])
+def planned(body, atlas, **settings):
+    return ClusterDiffuser(**settings).planned(body, kernels(), jnp.asarray(RESOLVED), [atlas])
 
 
 def layers(diffuser, x64, irradiance=None):
-    _, view, sources, points, covered = scene(x64)
+    """Means, and last the exits, at the points of the front surface: `[gaussians, channels and one, points]`."""
+    _, atlas, sources, points, covered = scene(x64)
     irradiance = sources.irradiance if irradiance is None else irradiance
 
     @jax.jit
     def run(irradiance):
         lit = Sources(sources.centers, sources.normals, sources.areas, irradiance)
-        return diffuser.diffuse(lit, kernels(), points, covered, view)
+        return diffuser.diffuse(lit, kernels(), points, covered, atlas)
 
     diffused = run(irradiance)
     assert float(diffused.needed) <= 1
-    return np.concatenate([np.asarray(diffused.means), np.asarray(diffused.exits)[:, :, None]], axis=2)
+    found = np.concatenate([np.asarray(diffused.means), np.asarray(diffused.exits)[:, :, None]], axis=2).transpose(1, 2, 0, 3)
+    assert not np.any(found[:, :, ~np.asarray(covered)])
+    return found[:, :, in_front(x64)]
 
 
 @cache
@@ -71,51 +92,45 @@ def plain(x64):
 
 
 def test_plain_integral_keeps_constants_lies_between_the_extremes_and_is_linear(x64):
-    _, _, sources, _, covered = scene(x64)
+    _, _, sources, _, _ = scene(x64)
     found = plain(x64)
-    assert np.sum(np.asarray(covered)) > 700
-    there = np.broadcast_to(np.asarray(covered), found[:, :, 0].shape)
-    np.testing.assert_allclose(found[:, :, 2][there], 0.37, rtol=1e-5)
-    np.testing.assert_allclose(found[:, :, 3], 2 * found[:, :, 0] - 3 * found[:, :, 1], atol=1e-5)
+    assert found.shape[2] > 700
+    np.testing.assert_allclose(found[:, 2], 0.37, rtol=1e-5)
+    np.testing.assert_allclose(found[:, 3], 2 * found[:, 0] - 3 * found[:, 1], atol=1e-5)
     for channel, values in enumerate(np.asarray(sources.irradiance)):
-        inside = found[:, :, channel][there]
-        assert inside.min() >= values.min() - 1e-6
-        assert inside.max() <= values.max() + 1e-6
-    assert not np.any(found.transpose(1, 3, 4, 0, 2)[~np.asarray(covered)])
+        assert found[:, channel].min() >= values.min() - 1e-6
+        assert found[:, channel].max() <= values.max() + 1e-6
 
 
 def test_plain_integral_is_the_formula(x64):
-    _, _, sources, points, covered = scene(x64)
-    rows, columns = np.nonzero(np.asarray(covered[0]))
-    chosen = rows[::97], columns[::97]
-    x = np.asarray(points[0], float)[:, *chosen]
+    _, _, sources, points, _ = scene(x64)
+    x = np.asarray(points, float).transpose(1, 0, 2)[:, in_front(x64)][:, ::97]
     centers, normals, areas, irradiance = (np.asarray(each, float) for each in jax.tree.leaves(sources))
     for k, variance in enumerate(VARIANCES):
         below = centers - DEPTH * np.sqrt(variance) * normals
         squared = np.sum((x[:, :, None] - below[:, None]) ** 2, axis=0)
         weight = areas * np.exp(-squared / (2 * variance))
         expected = (weight @ irradiance.T) / weight.sum(1, keepdims=True)
-        np.testing.assert_allclose(plain(x64)[k, 0, :2][:, *chosen], expected.T, rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(plain(x64)[k, :2, ::97], expected.T, rtol=1e-5, atol=1e-6)
         flat = 2 * np.pi * variance * np.exp(-(DEPTH**2) / 2)
-        np.testing.assert_allclose(plain(x64)[k, 0, -1][*chosen], weight.sum(1) / flat, rtol=1e-5)
+        np.testing.assert_allclose(plain(x64)[k, -1, ::97], weight.sum(1) / flat, rtol=1e-5)
 
 
 @pytest.mark.parametrize("approximation", ["support alone", "default"])
 def test_fast_diffuser_is_the_plain_one_within_its_stated_error(float32, approximation, x64):
-    body, view, sources, _, covered = scene(x64)
+    body, atlas, sources, _, _ = scene(x64)
     exact = approximation == "support alone"
-    diffuser = planned(body, view, **({"error": 0.0} if exact else {}))
+    diffuser = planned(body, atlas, **({"error": 0.0} if exact else {}))
     assert diffuser.layers is not None
     if not exact:
         assert max(layer.level for layer in diffuser.layers) >= 2, "nothing is merged"
         assert sum(layer.nodes is not None for layer in diffuser.layers) >= 2, "no nodes"
     side, texture = sources.irradiance
     found = layers(diffuser, x64, jnp.stack([side, texture, jnp.full(COUNT, 0.37)]))
-    front = np.asarray(covered[0])
-    np.testing.assert_allclose(found[:, 0, 2][:, front], 0.37, rtol=1e-5, err_msg="constants are kept")
+    np.testing.assert_allclose(found[:, 2], 0.37, rtol=1e-5, err_msg="constants are kept")
     for k in range(len(VARIANCES)):
         for channel in (0, 1, -1):
-            ours, expected = found[k, 0, channel][front], plain(x64)[k, 0, channel][front]
+            ours, expected = found[k, channel], plain(x64)[k, channel]
             error = np.abs(ours - expected) / np.sqrt(np.mean(expected**2))
             if exact:
                 assert error.max() < SUPPORT_ERROR, (k, channel)
@@ -136,18 +151,15 @@ def test_fast_diffuser_is_the_plain_one_within_its_stated_error(float32, approxi
 def test_fast_gradient_is_the_plain_one(float64):
     """Without clusters and nodes, and with so wide a support that nothing is left out."""
     with jax.enable_x64(True):
-        body, view, _, points, covered = scene.__wrapped__(True)
-        step = 5
-        body = jax.tree.map(lambda leaf: leaf[::step], body)
-        points, covered = points[:, :, ::2, ::2], covered[:, ::2, ::2]
-        view = bodies.perspective(fov=FOV, width=SIZE // 2, height=SIZE // 2)
+        body = bodies.bumpy(COUNT // 5)
+        atlas, points, covered = atlas_of(body, bodies.perspective(fov=FOV, width=SIZE // 2, height=SIZE // 2))
         rng = np.random.default_rng(8)
         irradiance = jnp.asarray(rng.uniform(size=(2, body.count)))
-        cotangent = jnp.asarray(rng.normal(size=(3, 2, 3, SIZE // 2, SIZE // 2)))
-        fast = planned(body, view, error=0.0, support=8.0)
+        cotangent = jnp.asarray(rng.normal(size=(covered.shape[0], 3, 3, covered.shape[1])))
+        fast = planned(body, atlas, error=0.0, support=8.0)
 
         def total(diffuser, sources, kernels, points):
-            found = diffuser.diffuse(sources, kernels, points, covered, view)
+            found = diffuser.diffuse(sources, kernels, points, covered, atlas)
             return jnp.vdot(found.means, cotangent[:, :, :2]) + jnp.vdot(found.exits, cotangent[:, :, 2])
 
         @jax.jit
@@ -163,11 +175,11 @@ def test_fast_gradient_is_the_plain_one(float64):
 
 def test_far_from_every_source_gradients_are_finite(x64):
     """As in a layer that is handed over: nothing reaches a point between splats."""
-    _, view, sources, points, covered = scene(x64)
+    _, atlas, sources, points, covered = scene(x64)
     narrow = jnp.asarray([1e-6, 1e-3])
 
     def total(kernels):
-        found = DenseDiffuser().diffuse(sources, kernels, points[:1], covered[:1], view)
+        found = DenseDiffuser().diffuse(sources, kernels, points[:9], covered[:9], atlas)
         return jnp.sum(found.exits) + jnp.sum(found.means)
 
     gradient = jax.jit(jax.grad(total))(Kernels(narrow, DEPTH * jnp.sqrt(narrow)))
@@ -175,23 +187,24 @@ def test_far_from_every_source_gradients_are_finite(x64):
 
 
 def test_outside_its_plan_the_diffuser_says_so(x64):
-    body, view, sources, points, covered = scene(x64)
-    diffuser = planned(body, view)
-    run = jax.jit(lambda d, k: d.diffuse(sources, k, points, covered, view).needed)
+    body, atlas, sources, points, covered = scene(x64)
+    diffuser = planned(body, atlas)
+    run = jax.jit(lambda d, k: d.diffuse(sources, k, points, covered, atlas).needed)
     assert float(run(diffuser, kernels(1.2))) <= 1
     assert float(run(diffuser, kernels(1.4))) > 1
     assert float(run(diffuser, kernels(0.7))) > 1
 
 
 def test_a_nearer_camera_needs_more_than_planned(x64):
-    body, view, sources, points, covered = scene(x64)
-    diffuser = planned(body, bodies.perspective(fov=120.0, width=SIZE, height=SIZE), error=0.0)
-    assert float(jax.jit(lambda k: diffuser.diffuse(sources, k, points, covered, view).needed)(kernels())) > 1
+    body, atlas, sources, points, covered = scene(x64)
+    from_afar, _, _ = atlas_of(body, bodies.perspective(fov=120.0, width=SIZE, height=SIZE))
+    diffuser = planned(body, from_afar, error=0.0)
+    assert float(jax.jit(lambda k: diffuser.diffuse(sources, k, points, covered, atlas).needed)(kernels())) > 1
 
 
 def test_a_diffuser_without_clusters_and_one_for_other_layers_say_what_to_do(x64):
-    body, view, sources, points, covered = scene(x64)
+    body, atlas, sources, points, covered = scene(x64)
     with pytest.raises(ValueError, match="plan"):
-        ClusterDiffuser().diffuse(sources, kernels(), points, covered, view)
+        ClusterDiffuser().diffuse(sources, kernels(), points, covered, atlas)
     with pytest.raises(ValueError, match="3 Gaussians, not 2"):
-        planned(body, view).diffuse(sources, jax.tree.map(lambda leaf: leaf[:2], kernels()), points, covered, view)
+        planned(body, atlas).diffuse(sources, jax.tree.map(lambda leaf: leaf[:2], kernels()), points, covered, atlas)

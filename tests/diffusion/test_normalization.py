@@ -10,7 +10,7 @@ from splatjax.diffusion import DenseDiffuser, ExitOdds, Kernels, PlainMean, Seen
 from splatjax.gaussians import SumOfGaussians
 from splatjax.scattering import Medium, SingleScattering
 from splatjax.scene import Material
-from splatjax.splatting import Surface
+from splatjax.splatting import Atlas
 
 # Six Gaussians on the reflectance of half spaces of sigma_t = 1/mm, isotropic scattering, no change of index; albedo 0.9, 0.98
 # and 0.998. `fit_gaussians` on four million walks, non-negative, totals held.
@@ -130,23 +130,19 @@ def test_a_thin_white_sheet_returns_what_it_receives_whatever_is_handed_over(end
     up = np.zeros_like(flat) + np.asarray([[0.0], [0.0], [1.0]])
     centers, normals = np.concatenate([flat, flat - 0.5 * up], axis=1), np.concatenate([up, -up], axis=1)
     sources = Sources(*map(jnp.asarray, (centers, normals, np.full(2 * x.size, spacing**2), np.ones((1, 2 * x.size)))))
-    view = bodies.perspective(width=1, height=1)
     one = jnp.ones((1, 1))
-    depth = view.project(jnp.zeros((3, 1, 1)))[2]
-    seen = SeenSurface(Surface(jnp.zeros((0, 1, 1)), depth, one, one), one[None], jnp.full((1, 1), spacing**2), one[None])
+    seen = SeenSurface(jnp.zeros((1, 3, 1)), one > 0, one[None], spacing**2 * one, one[None])
+    atlas = Atlas.of(jnp.zeros((2, 1, 1)), bodies.perspective(width=1, height=1), 1)  # unused by the plain diffuser
     gaussians = SumOfGaussians(jnp.asarray([0.3, 1.0, 4.0]), jnp.asarray([[0.3], [0.3], [0.4]]))
 
     def returned(gaussians):
-        (layers,), _ = diffusion_layers(
-            sources, Material(gaussians), [seen], jnp.asarray(ends), view, DenseDiffuser(), ExitOdds()
-        )
-        return layers
+        return diffusion_layers(sources, Material(gaussians), seen, jnp.asarray(ends), atlas, DenseDiffuser(), ExitOdds())[0]
 
     layers = returned(gaussians)
     assert np.any(np.asarray(layers.resolved) > 0)
-    np.testing.assert_allclose(float(jnp.sum(gaussians.weights * layers.layers[:, 0, 0])), 1, rtol=1e-4)
+    np.testing.assert_allclose(float(jnp.sum(gaussians.weights * layers.layers[0, :, :, 0])), 1, rtol=1e-4)
     darker = SumOfGaussians(gaussians.variances, 0.5 * gaussians.weights)
-    assert 0.5 < float(jnp.sum(darker.weights * returned(darker).layers[:, 0, 0])) < 1
+    assert 0.5 < float(jnp.sum(darker.weights * returned(darker).layers[0, :, :, 0])) < 1
 
 
 def test_the_corner_is_rounded():
@@ -173,13 +169,13 @@ def through_a_sheet(thickness: float, normalization) -> np.ndarray:
     sources = Sources(*map(jnp.asarray, (centers, np.concatenate([up, -up], axis=1), np.full(2 * x.size, spacing**2), entering)))
     gaussians = material().gaussians
     kernels = Kernels(gaussians.variances, normalization.depths(gaussians.variances))
-    points, covered = jnp.zeros((1, 3, 1, 1)), jnp.ones((1, 1, 1), bool)
-    view = bodies.perspective(width=1, height=1)  # unused by the plain diffuser
-    found = DenseDiffuser().diffuse(sources, kernels, points, covered, view)
-    carried = (gaussians.variances > spacing**2)[:, None, None]  # the others are too narrow for the splats, and do not reach
-    exits = jnp.where(carried, found.exits[:, 0], 1.0)
-    means = jnp.where(carried[:, None], found.means[:, 0], 0.0)
-    layers = np.asarray(gains(exits[:, 0, 0], material(), normalization=normalization)) * np.asarray(means[:, :, 0, 0])
+    points, covered = jnp.zeros((1, 3, 1)), jnp.ones((1, 1), bool)
+    atlas = Atlas.of(jnp.zeros((2, 1, 1)), bodies.perspective(width=1, height=1), 1)  # unused by the plain diffuser
+    found = DenseDiffuser().diffuse(sources, kernels, points, covered, atlas)
+    carried = gaussians.variances > spacing**2  # the others are too narrow for the splats, and do not reach
+    exits = jnp.where(carried, found.exits[0, :, 0], 1.0)
+    means = jnp.where(carried[:, None], found.means[0, :, :, 0], 0.0)
+    layers = np.asarray(gains(exits, material(), normalization=normalization)) * np.asarray(means)
     return np.sum(np.asarray(gaussians.weights) * layers, axis=0)
 
 

@@ -214,10 +214,11 @@ def typical(shape: Shape) -> tuple[sj.Scene, sj.Camera]:
 
 def roomy(plan: sj.Plan, shape: Shape) -> sj.Plan:
     """Give every list room for everything, and every layer any variance."""
+    camera = plan.camera
 
     def widened(part):
         if isinstance(part, TileRasterizer):
-            size = (shape.width, shape.height) if part is plan.camera else (SHADOWS.resolution,) * 2
+            size = (shape.width, shape.height) if part is camera else (SHADOWS.resolution,) * 2
             tiles = -(-size[0] // part.side) * -(-size[1] // part.side) + part.lanes
             room = BinCapacity(*_room(shape.splats, tiles, part.lanes, part.slots))
             return TileRasterizer(part.side, part.lanes, part.slots, TileCapacity(max(shape.splats, 1), room))
@@ -232,6 +233,8 @@ def roomy(plan: sj.Plan, shape: Shape) -> sj.Plan:
             return eqx.tree_at(lambda d: d.layers, part, layers, is_leaf=lambda leaf: isinstance(leaf, tuple))
         return part
 
+    tiles = tile_grid(shape.width, shape.height, 1)
+    plan = dataclasses.replace(plan, tiles=tiles.across * tiles.down)
     return jax.tree.map(widened, plan, is_leaf=lambda part: isinstance(part, TileRasterizer | ClusterDiffuser))
 
 

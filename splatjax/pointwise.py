@@ -1,0 +1,40 @@
+"""Functions of one point, applied to many points a part at a time."""
+
+from collections.abc import Callable
+from typing import TypeVar
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import PyTree
+
+Result = TypeVar("Result", bound=PyTree)
+
+AT_ONCE = 1 << 16
+
+
+def in_parts(function: Callable[..., Result], *arrays: PyTree, at_once: int = AT_ONCE) -> Result:
+    r"""Apply a function to parts of arrays, one after the other, and put the results together.
+
+    What is computed on the way is never larger than a part, and for the derivative it is computed anew. What is found is
+    kept: a compiler that fuses would otherwise compute it again wherever it is read, many times over.
+
+    **Arguments:**
+
+    - `function`: pointwise: element i of each result depends on element i of the arrays only, and on what it closes over.
+    - `arrays`: trees of arrays, all of one length. Differentiable as the function is.
+    - `at_once`: the length of a part.
+
+    **Returns:** `function(*arrays)`.
+    """
+    count = jax.tree.leaves(arrays)[0].shape[0]
+    parts = -(-count // at_once)
+    if parts <= 1:
+        return function(*arrays)
+    size = -(-count // parts)
+
+    def cut(leaf):
+        padding = [(0, parts * size - count)] + [(0, 0)] * (leaf.ndim - 1)
+        return jnp.pad(leaf, padding, mode="edge").reshape(parts, size, *leaf.shape[1:])
+
+    found = jax.lax.map(jax.checkpoint(lambda part: function(*part)), jax.tree.map(cut, arrays))
+    return jax.tree.map(lambda leaf: leaf.reshape(parts * size, *leaf.shape[2:])[:count], found)

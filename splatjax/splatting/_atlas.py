@@ -1,0 +1,95 @@
+"""The tiles of a picture that show anything, packed: what works on pixels one by one need not look at the others."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax.lax import stop_gradient
+from jaxtyping import Array, Float, Int
+
+from ._bins import TileGrid
+from ._surfaces import Surfaces
+from ._views import AbstractView
+
+SIDE = 8
+"""Pixels along a tile."""
+
+
+def farthest_depths(surfaces: Surfaces) -> Float[Array, "surfaces down across"]:
+    """Give the depth (mm) of the farthest point that each tile shows, of both surfaces; -inf where a tile shows none."""
+    both = [jnp.where(each.weight_sum > 0, stop_gradient(each.depth), -jnp.inf) for each in (surfaces.front, surfaces.behind)]
+    grid = TileGrid(both[0].shape[1], both[0].shape[0], SIDE)
+    return jnp.max(grid.tiled(jnp.stack(both), -jnp.inf), axis=(2, 4))
+
+
+class Atlas(eqx.Module):
+    """The tiles of the front surface and of the one behind it that show anything, packed into a list of places."""
+
+    view: AbstractView
+    farthest: Float[Array, "surfaces down across"]
+    tiles: Int[Array, " tiles"]
+    """The tile at each place: those of the front row by row, then those behind; in an empty place the number of all."""
+    places: Int[Array, " all"]
+    """The place of every tile; the number of places for a tile that shows nothing."""
+    needed: Float[Array, ""]
+    """Tiles over places; what lies beyond is missing where this is above 1."""
+
+    @classmethod
+    def of(cls, farthest: Float[Array, "surfaces down across"], view: AbstractView, room: int) -> "Atlas":
+        """Pack the tiles that show anything, as `farthest_depths` says, into `room` places."""
+        shows = farthest.reshape(-1) > -jnp.inf
+        tiles = jnp.nonzero(shows, size=room, fill_value=shows.shape[0])[0].astype(jnp.int32)
+        places = jnp.full(shows.shape[0], room, jnp.int32).at[tiles].set(jnp.arange(room, dtype=jnp.int32), mode="drop")
+        needed = jnp.sum(shows).astype(farthest.dtype) / room
+        return cls(view, farthest, tiles, places, needed)
+
+    @property
+    def grid(self) -> TileGrid:
+        """The tiles of one surface."""
+        return TileGrid(self.view.width, self.view.height, SIDE)
+
+    @property
+    def in_front(self):
+        """Say which places hold tiles of the front surface."""
+        return self.tiles < self._count
+
+    @property
+    def _count(self) -> int:
+        return self.grid.across * self.grid.down
+
+    def pack(
+        self, front: Float[Array, "rows height width"], behind: Float[Array, "rows height width"]
+    ) -> Float[Array, "tiles rows pixels"]:
+        """Cut pictures of the front surface and of the one behind it into their tiles; 0 in empty places. Differentiable."""
+        grid, count = self.grid, self._count
+
+        def cut(picture, tiles):
+            return grid.tiled(picture).at[*grid.place(tiles)].get(mode="fill", fill_value=0)
+
+        later = jnp.where(self.tiles >= count, self.tiles - count, count)
+        found = jnp.where(self.in_front[:, None, None, None], cut(front, self.tiles), cut(behind, later))
+        return found.reshape(self.tiles.shape[0], front.shape[0], SIDE**2)
+
+    def points(self, depth: Float[Array, "tiles pixels"]) -> Float[Array, "3 tiles pixels"]:
+        """Give the points (mm) that the pixels see at a depth (mm). Differentiable."""
+        within = jnp.arange(SIDE**2, dtype=jnp.int32)
+        tile = self.tiles % self._count
+        x = (tile % self.grid.across * SIDE)[:, None] + (within % SIDE)[None]
+        y = (tile // self.grid.across * SIDE)[:, None] + (within // SIDE)[None]
+        return self.view.unproject(x.astype(depth.dtype) + 0.5, y.astype(depth.dtype) + 0.5, depth)
+
+    def front_picture(
+        self, values: Float[Array, "tiles *rows pixels channels"], fill: float = 0.0
+    ) -> Float[Array, "*rows height width channels"]:
+        """Put the picture of the front surface together; `fill` where a tile shows nothing."""
+        grid, (_, *rows, _, channels) = self.grid, values.shape
+        tiles = values.at[self.places[: self._count]].get(mode="fill", fill_value=fill)
+        tiles = tiles.reshape(grid.down, grid.across, *rows, SIDE, SIDE, channels)
+        last = tiles.ndim - 3
+        whole = tiles.transpose(*range(2, last), 0, last, 1, last + 1, last + 2)
+        whole = whole.reshape(*rows, grid.down * SIDE, grid.across * SIDE, channels)
+        return whole[..., : grid.height, : grid.width, :]
+
+    def picture(self, values: Float[Array, "tiles *rows pixels channels"]) -> Float[Array, "*rows height width channels"]:
+        """Put the picture together to which both surfaces add."""
+        behind = jnp.where(self.in_front, self.tiles + self._count, self.places.shape[0])
+        partner = self.places.at[behind].get(mode="fill", fill_value=self.tiles.shape[0])
+        return self.front_picture(values + values.at[partner].get(mode="fill", fill_value=0))

@@ -1,0 +1,47 @@
+"""Parts give what the whole gives, in value and in every derivative."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from splatjax.pointwise import in_parts
+
+
+def squares_and_lengths(scale, record):
+    points, factors = record["points"], record["factors"]
+    return {"scaled": scale * points * factors[:, None], "length": jnp.sqrt(jnp.sum(points * points, axis=1)) + scale}
+
+
+@pytest.mark.parametrize("at_once", [1, 3, 4, 11, 12])
+def test_parts_give_what_the_whole_gives(at_once):
+    keys = jax.random.split(jax.random.key(0), 2)
+    record = {"points": jax.random.normal(keys[0], (11, 3)), "factors": jax.random.normal(keys[1], (11,))}
+    scale = jnp.asarray(1.5)
+
+    def loss(scale, record, run):
+        found = run(lambda part: squares_and_lengths(scale, part), record)
+        return jnp.sum(jnp.sin(found["scaled"])) + jnp.sum(found["length"] ** 2), found
+
+    def parts(function, tree):
+        return in_parts(function, tree, at_once=at_once)
+
+    def whole(function, tree):
+        return function(tree)
+
+    derivative = jax.grad(loss, argnums=(0, 1), has_aux=True)
+    close = {"rtol": 1e-5, "atol": 1e-6}
+    for got, expected in zip(
+        jax.tree.leaves(derivative(scale, record, parts)), jax.tree.leaves(derivative(scale, record, whole)), strict=True
+    ):
+        np.testing.assert_allclose(np.asarray(got), np.asarray(expected), **close)
+    moved = scale, record
+    (_, forward), (_, plain) = (jax.jvp(lambda s, r, run=run: loss(s, r, run)[0], moved, moved) for run in (parts, whole))
+    np.testing.assert_allclose(float(forward), float(plain), **close)
+
+
+def test_a_part_that_is_filled_up_adds_nothing():
+    """What fills the last part is a copy of the last point: no zero of which a norm has no derivative."""
+    points = jnp.ones((5, 3))
+    slope = jax.grad(lambda p: jnp.sum(in_parts(lambda part: jnp.linalg.norm(part, axis=1), p, at_once=3)))(points)
+    np.testing.assert_allclose(np.asarray(slope), 1 / np.sqrt(3), rtol=1e-6)
