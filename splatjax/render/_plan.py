@@ -42,23 +42,34 @@ class Plan(eqx.Module):
     interval: Float[Array, "2"]
 
 
-def plan(scene: Scene, cameras: Camera | Sequence[Camera], settings: RenderSettings | None = None) -> Plan:
+def plan(scenes: Scene | Sequence[Scene], cameras: Camera | Sequence[Camera], settings: RenderSettings | None = None) -> Plan:
     r"""Find the capacities and orders that rendering a scene with these cameras needs.
 
-    **Arguments:** `scene`, `cameras`: concrete (not traced); all cameras have pictures of one size.
+    **Arguments:** concrete, not traced.
 
-    **Returns:** a `Plan` that serves every one of the cameras, and scenes and materials near this one: variances within a factor
-    of 1.25, splats that have moved among each other by less than a tenth of a layer's width, any light and color.
+    - `scenes`: one, or several that differ in their lights alone: the same splats and material, lights of the same kinds in the
+      same order.
+    - `cameras`: all have pictures of one size.
+
+    **Returns:** a `Plan` that serves every scene with every camera, and scenes and materials near these: variances within a
+    factor of 1.25, splats that have moved among each other by less than a tenth of a layer's width, light of any strength and
+    color. A light that casts shadows from elsewhere may need more room.
+
+    **Raises:** `ValueError` when cameras or scenes do not fit together.
     """
-    return _plan(scene, cameras, RenderSettings() if settings is None else settings)
+    return _plan(scenes, cameras, RenderSettings() if settings is None else settings)
 
 
-def _plan(scene: Scene, cameras: Camera | Sequence[Camera], settings: RenderSettings) -> Plan:
+def _plan(scenes: Scene | Sequence[Scene], cameras: Camera | Sequence[Camera], settings: RenderSettings) -> Plan:
     cameras = [cameras] if isinstance(cameras, Camera) else list(cameras)
-    scene, *cameras = in_one_dtype(scene, *cameras)
+    scene, *others = [scenes] if isinstance(scenes, Scene) else scenes
+    scene, others, cameras = in_one_dtype(scene, others, cameras)
     if len({(camera.width, camera.height) for camera in cameras}) != 1:
         sizes = sorted({(camera.width, camera.height) for camera in cameras})
         raise ValueError(f"cameras of one plan must have pictures of one size, not {sizes}")
+    for i, other in enumerate(others, 1):
+        if not eqx.tree_equal((scene.splats, scene.material), (other.splats, other.material)):
+            raise ValueError(f"scenes of one plan may differ in their lights alone, but scenes[{i}] has other splats or material")
     views = [_splatting.PerspectiveView.of(camera) for camera in cameras]
     bounds = _splatting.Bounds.of(scene.splats)
     interval = _diffusion.handover_interval(_diffusion.irregularity(scene.splats), settings.diffusion)
@@ -72,7 +83,9 @@ def _plan(scene: Scene, cameras: Camera | Sequence[Camera], settings: RenderSett
     return Plan(
         camera=camera,
         tiles=tiles,
-        shadows=tuple(_plan_shadows(group, scene.splats, bounds, settings) for group in stack_lights(scene.lights)),
+        shadows=tuple(
+            _plan_shadows(group, scene.splats, bounds, settings) for group in _groups([each.lights for each in (scene, *others)])
+        ),
         diffuser=settings.diffuser.planned(scene.splats, kernels, interval, atlases),
         interval=interval,
     )
@@ -101,13 +114,24 @@ def shadow_views(light, bounds, settings: RenderSettings, cube: bool) -> Sequenc
     return [_splatting.near_view(light.position, bounds, settings.shadows)]
 
 
-def _plan_shadows(group: StackedLights, splats: Splats, bounds, settings: RenderSettings) -> ShadowPlan | None:
-    if not group.lights.cast_shadows:
+def _groups(lights: Sequence[tuple[AbstractLight, ...]]) -> list[list[StackedLights]]:
+    """Give, for each group of lights that are rendered together, what it is in every scene."""
+    stacked = [stack_lights(each) for each in lights]
+    kinds = [[(jax.tree.structure(group.lights), group.places) for group in groups] for groups in stacked]
+    for i, each in enumerate(kinds):
+        if each != kinds[0]:
+            raise ValueError(f"scenes of one plan must have lights of the same kinds in the same order, but not so scenes[{i}]")
+    return [list(group) for group in zip(*stacked, strict=True)]
+
+
+def _plan_shadows(groups: Sequence[StackedLights], splats: Splats, bounds, settings: RenderSettings) -> ShadowPlan | None:
+    kind = groups[0].lights
+    if not kind.cast_shadows:
         return None
+    lights = [jax.tree.map(lambda leaf, i=i: leaf[i], group.lights) for group in groups for i in range(len(group.places))]
     cube = False
-    if isinstance(group.lights, PointLight):
-        distance = jnp.linalg.norm(group.lights.position - bounds.center[None], axis=1)
-        cube = bool(jnp.any(distance < 1.05 * bounds.radius))
-    lights = [jax.tree.map(lambda leaf, i=i: leaf[i], group.lights) for i in range(len(group.places))]
+    if isinstance(kind, PointLight):
+        distances = jnp.stack([jnp.linalg.norm(light.position - bounds.center) for light in lights])
+        cube = bool(jnp.any(distances < 1.05 * bounds.radius))
     views = [view for light in lights for view in shadow_views(light, bounds, settings, cube)]
     return ShadowPlan(settings.rasterizer.planned(splats, views, settings.splatting), cube)

@@ -1,0 +1,48 @@
+"""One plan for an animation: it holds for every camera and every light."""
+
+import jax.numpy as jnp
+import pytest
+from scenes import sheet, two_gaussians
+
+import splatjax as sj
+from splatjax.diffusion import DenseDiffuser
+from splatjax.scene import AbstractLight
+
+SETTINGS = sj.RenderSettings(diffuser=DenseDiffuser())  # which needs no plan
+
+
+def scene_under(*lights: AbstractLight, splats: sj.Splats | None = None) -> sj.Scene:
+    return sj.Scene(sheet(1.0, 5.0) if splats is None else splats, lights, sj.Material(two_gaussians()))
+
+
+def lamp(*direction: float, cast_shadows: bool = True) -> sj.DirectionalLight:
+    return sj.DirectionalLight(jnp.asarray(direction, float), jnp.ones(3), cast_shadows)
+
+
+def camera_at(z: float) -> sj.Camera:
+    return sj.Camera.look_at(jnp.asarray([0.0, 0.0, z]), jnp.zeros(3), width=8, height=8)
+
+
+def test_a_plan_of_several_scenes_has_room_for_the_shadows_of_each():
+    camera = camera_at(20.0)
+    steep, grazing = scene_under(lamp(0.0, 0.0, -1.0)), scene_under(lamp(0.99, 0.0, -0.14))
+    alone = [sj.plan(scene, camera, SETTINGS).shadows[0].rasterizer.capacity.bins for scene in (steep, grazing)]
+    assert alone[0].pairs > alone[1].pairs
+    for scenes in ([steep, grazing], [grazing, steep]):
+        together = sj.plan(scenes, camera, SETTINGS).shadows[0].rasterizer.capacity.bins
+        assert together == alone[0]
+
+
+def test_a_lamp_among_the_splats_in_one_scene_has_six_faces_in_all():
+    far, near = (scene_under(sj.PointLight(jnp.asarray([0.0, 0.0, z]), jnp.ones(3))) for z in (30.0, 1.0))
+    assert sj.plan([far, near], camera_at(20.0), SETTINGS).shadows[0].cube
+    assert not sj.plan([far, far], camera_at(20.0), SETTINGS).shadows[0].cube
+
+
+def test_scenes_that_differ_in_more_than_their_lights_are_refused():
+    camera, scene = camera_at(20.0), scene_under(lamp(0.0, 0.0, -1.0))
+    with pytest.raises(ValueError, match=r"scenes\[1\] has other splats"):
+        sj.plan([scene, scene_under(lamp(0.0, 0.0, -1.0), splats=sheet(1.0, 4.0))], camera, SETTINGS)
+    for other in (scene_under(), scene_under(lamp(0.0, 0.0, -1.0, cast_shadows=False))):
+        with pytest.raises(ValueError, match=r"lights of the same kinds.*scenes\[2\]"):
+            sj.plan([scene, scene, other], camera, SETTINGS)
