@@ -1,11 +1,15 @@
 """The only room that touches files: splats, meshes, pictures, materials."""
 
+from ._animation import write_animation as write_animation
 from ._atomic import atomic_path as atomic_path
 from ._exr import read_exr as read_exr, read_picture as read_picture, write_exr as write_exr
+from ._materials import material_path as material_path
 from ._materials import load_material as load_material, load_medium as load_medium, load_profile as load_profile
 from ._materials import materials as materials, profiles_folder as profiles_folder, save_material as save_material
 from ._mesh import sample_mesh as sample_mesh
 from ._ply import read_splats as read_splats, write_splats as write_splats
 from ._png import write_png as write_png
 from ._profiles import read_profile as read_profile, save_exports as save_exports
+from ._record import fingerprint as fingerprint, read_record as read_record, write_record as write_record
 from ._starts import dipole_starts as dipole_starts
+from ._version import own_version as own_version

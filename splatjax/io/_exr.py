@@ -2,7 +2,6 @@
 
 import os
 from collections.abc import Callable, Iterator, Sequence
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -12,6 +11,7 @@ import OpenEXR  # ty: ignore[import-not-found]
 from splatjax.scene import Frame
 
 from ._atomic import atomic_path
+from ._version import own_version
 
 _REC709_D65 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 _WEIGHTS = "splatjax.weights.{}"
@@ -42,7 +42,7 @@ def write_exr(path: str | os.PathLike[str], frame: Frame, *, variances: Sequence
     header: dict = {
         "compression": OpenEXR.ZIP_COMPRESSION,
         "type": OpenEXR.scanlineimage,
-        "software": f"splatjax {_own_version()}",
+        "software": f"splatjax {own_version()}",
         "comments": "Linear light. Depth and position in mm; depth, position and normal are not premultiplied.",
         _HANDED_OVER: _floats(frame.handed_over),
         _OVERFLOW: float(frame.overflow),
@@ -92,13 +92,6 @@ def _read(path: Path) -> tuple[dict, dict[str, np.ndarray]]:
             return dict(file.header()), {name: np.array(channel.pixels) for name, channel in file.channels().items()}
     except Exception as error:  # the package raises whatever its C++ side throws
         raise ValueError(f"{path}: cannot be read as OpenEXR ({error}); it is cut short or of another format") from error
-
-
-def _own_version() -> str:
-    try:
-        return version("splatjax")
-    except PackageNotFoundError:
-        return "(not installed)"
 
 
 def _floats(values) -> list[float]:

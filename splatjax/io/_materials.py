@@ -46,6 +46,22 @@ def materials() -> tuple[str, ...]:
     return tuple(sorted(path.stem for path in profiles_folder().glob("*.toml")))
 
 
+def material_path(name_or_path: str | os.PathLike[str]) -> Path:
+    """Give the file behind what `load_material` takes: that of a name, or the path itself.
+
+    **Raises:** `ValueError` for an unknown name.
+    """
+    path = Path(name_or_path)
+    if not isinstance(name_or_path, str) or path.suffix or len(path.parts) != 1:
+        return path
+    known = materials()
+    if name_or_path in known:
+        return profiles_folder() / f"{name_or_path}.toml"
+    near = difflib.get_close_matches(name_or_path.lower(), known, n=1)
+    hint = f"did you mean {near[0]!r}?" if near else f"known are {', '.join(known)}"
+    raise ValueError(f"{name_or_path}: is no known material; {hint} (a file is named by its path: ./{name_or_path}.toml)")
+
+
 def load_material(name_or_path: str | os.PathLike[str]) -> Material:
     r"""Load a material: its fitted Gaussians and its surface.
 
@@ -232,7 +248,7 @@ def _medium(medium: "_Table") -> Medium:
 
 
 def _read(name_or_path: str | os.PathLike[str]) -> tuple[Path, dict[str, Any]]:
-    path = _resolve(name_or_path)
+    path = material_path(name_or_path)
     try:
         tables = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
@@ -254,18 +270,6 @@ def _read(name_or_path: str | os.PathLike[str]) -> tuple[Path, dict[str, Any]]:
     if "layers" in tables:
         _layered(path, tables["layers"])
     return path, tables
-
-
-def _resolve(name_or_path: str | os.PathLike[str]) -> Path:
-    path = Path(name_or_path)
-    if not isinstance(name_or_path, str) or path.suffix or len(path.parts) != 1:
-        return path
-    known = materials()
-    if name_or_path in known:
-        return profiles_folder() / f"{name_or_path}.toml"
-    near = difflib.get_close_matches(name_or_path.lower(), known, n=1)
-    hint = f"did you mean {near[0]!r}?" if near else f"known are {', '.join(known)}"
-    raise ValueError(f"{name_or_path}: is no known material; {hint} (a file is named by its path: ./{name_or_path}.toml)")
 
 
 class _Table:
