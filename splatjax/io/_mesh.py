@@ -5,9 +5,9 @@ import os
 import struct
 from io import BytesIO
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import trimesh
 from jaxtyping import Float
 from PIL import Image, UnidentifiedImageError
 
@@ -15,6 +15,9 @@ from splatjax.geometry import Mesh, Textures, cut_below, sample_mesh as sample_s
 from splatjax.scene import Splats
 
 from ._color import srgb_to_linear
+
+if TYPE_CHECKING:
+    import trimesh
 
 _KINDS = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off")
 Name = str | os.PathLike[str]
@@ -81,6 +84,8 @@ def read_mesh(path: Name, *, mm_per_unit: float, v_up: bool | None = None) -> tu
 
     **Raises:** `FileNotFoundError`, or `ValueError` when the file cannot be read, has no triangle, or values not finite.
     """
+    import trimesh  # takes a second, so only where a mesh is read
+
     path = Path(path)
     if not (np.isfinite(mm_per_unit) and mm_per_unit > 0):
         raise ValueError(f"{path}: mm_per_unit is {mm_per_unit}; it must be the positive length of the file's unit in mm")
@@ -124,7 +129,7 @@ def _with_materials(glb: bytes) -> bytes:
     return struct.pack("<4sII", b"glTF", 2, 20 + len(text) + len(rest)) + struct.pack("<I4s", len(text), b"JSON") + text + rest
 
 
-def _piece(path: Path, piece: trimesh.Trimesh, upside_down: bool) -> Mesh:
+def _piece(path: Path, piece: "trimesh.Trimesh", upside_down: bool) -> Mesh:
     """Turn a mesh of trimesh, whose texture coordinates have v up when the file keeps to its format, into a record."""
     vertices, faces = np.asarray(piece.vertices, np.float64), np.asarray(piece.faces, np.int64)
     if not np.isfinite(vertices).all():
@@ -151,7 +156,7 @@ def _join(meshes: list[Mesh]) -> Mesh:
     )
 
 
-def _base_color(piece: trimesh.Trimesh) -> Image.Image | None:
+def _base_color(piece: "trimesh.Trimesh") -> Image.Image | None:
     material = getattr(piece.visual, "material", None)
     for name in ("baseColorTexture", "image"):
         picture = getattr(material, name, None)

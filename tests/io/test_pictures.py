@@ -11,6 +11,7 @@ import pytest
 from PIL import Image
 
 from splatjax.io import read_exr, write_exr, write_png
+from splatjax.io._color import linear_to_srgb
 from splatjax.scene import Frame
 
 TOOLS = [(["exrheader"], "diffusion.4.G, 32-bit floating-point"), (["oiiotool", "--info", "-v"], "diffusion.4.G")]
@@ -131,3 +132,11 @@ def test_png_refuses_what_has_no_colors(tmp_path):
     with pytest.raises(ValueError, match="exposure is nan"):
         write_png(tmp_path / "a.png", np.zeros((2, 2, 3)), exposure=float("nan"))
     assert not list(tmp_path.iterdir())
+
+
+def test_encoding_for_the_screen_is_that_of_colour_science():
+    import colour
+
+    linear = np.concatenate([np.linspace(-0.5, 1.5, 1001), np.geomspace(1e-6, 1, 100), [0.0031308, np.nan, np.inf]])
+    clipped = np.clip(np.nan_to_num(linear, nan=0.0), 0, 1)
+    np.testing.assert_allclose(linear_to_srgb(linear), colour.cctf_encoding(clipped, function="sRGB"), atol=1e-15)
