@@ -1,3 +1,3 @@
-"""The command line: `splatjax materials | fit | sample | render`. It calls the public interface, and nothing else."""
+"""The command line: `splatjax materials | fit | export | sample | render | turntable`. It calls the public interface alone."""
 
 from ._main import main as main

@@ -13,6 +13,7 @@ from ._fit import Fit
 from ._materials import Materials
 from ._render import Render
 from ._sample import Sample
+from ._turntable import Turntable
 
 _Command = (
     Annotated[Materials, tyro.conf.subcommand("materials")]
@@ -20,6 +21,7 @@ _Command = (
     | Annotated[Export, tyro.conf.subcommand("export")]
     | Annotated[Sample, tyro.conf.subcommand("sample")]
     | Annotated[Render, tyro.conf.subcommand("render")]
+    | Annotated[Turntable, tyro.conf.subcommand("turntable")]
 )
 _DESCRIPTION = """Render translucent materials, and find the sums of Gaussians that stand for them. Lengths are in mm.
 

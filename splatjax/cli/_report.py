@@ -2,9 +2,10 @@
 
 import contextlib
 import time
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 
 from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 
 def _console() -> Console:
@@ -24,3 +25,31 @@ def stage(what: str) -> Generator[None, None, None]:
 def note(what: str) -> None:
     """Say something the user should know."""
     _console().print(what, markup=False)
+
+
+@contextlib.contextmanager
+def progress(what: str, total: int) -> Generator[Callable[[], None], None, None]:
+    """Show how many of equal steps are done, what one takes, and the time that is left. Gives what is to be called after each.
+
+    Where nobody looks at a terminal, a line is printed for each.
+    """
+    console, begin, done = _console(), time.perf_counter(), 0
+
+    def step() -> str:
+        nonlocal begin, done
+        begin, before, done = time.perf_counter(), begin, done + 1
+        return f"{begin - before:.1f} s"
+
+    if not console.is_terminal:
+        yield lambda: console.print(f"{what}: {done + 1} of {total}, {step()}", markup=False)
+        return
+    columns = (
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[took]}"),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=console) as bar:
+        task = bar.add_task(what, total=total, took="")
+        yield lambda: bar.update(task, advance=1, took=step())

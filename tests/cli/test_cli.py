@@ -1,5 +1,6 @@
 """The command line, run in process on tiny inputs."""
 
+import itertools
 import json
 
 import jax
@@ -7,59 +8,20 @@ import jax.numpy as jnp
 import numpy as np
 import OpenEXR
 import pytest
-from jax.experimental.compilation_cache import compilation_cache
+from commands import failure, plate, write_ply
 from PIL import Image
 
 import splatjax as sj
 from splatjax.cli import main
 from splatjax.cli._environment import cache_folder, prepare_jax
-from splatjax.cli._render import frame_all, towards
+from splatjax.cli._shot import frame_all, towards
 
-PLY_HEAD = "ply\nformat ascii 1.0\nelement vertex {count}\n{properties}end_header\n"
 SKIN = """[medium]
 unit = "1/mm"
 sigma_a = [{sigma_a}, 0.17, 0.48]
 sigma_s_prime = [0.74, 0.88, 1.01]
 eta = 1.3
 """
-
-
-@pytest.fixture(autouse=True)
-def own_cache(tmp_path, monkeypatch):
-    """Compiled code goes to a folder of the test, and the program's settings are taken back."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    before = {name: getattr(jax.config, name) for name in ("jax_compilation_cache_dir", "jax_platforms")}
-    yield
-    for name, value in before.items():
-        jax.config.update(name, value)
-    compilation_cache.reset_cache()
-
-
-def write_ply(path, rows, names):
-    properties = "".join(f"property float {name}\n" for name in names)
-    lines = [" ".join(f"{value}" for value in row) for row in rows]
-    path.write_text(PLY_HEAD.format(count=len(rows), properties=properties) + "\n".join(lines) + "\n")
-    return path
-
-
-def plate(path, radius=1.5):
-    """Write an even plate of 20 x 20 mm that faces +z, without albedo."""
-    places = np.linspace(-9.5, 9.5, 20)
-    rows = [(x, y, 0, 0, 0, 1, radius, 1) for x in places for y in places]
-    return write_ply(path, rows, ("x", "y", "z", "nx", "ny", "nz", "radius", "area"))
-
-
-def failure(args, capsys, outputs=()):
-    """Run a command that must fail; give its one line on stderr."""
-    status = main([str(word) for word in args])
-    captured = capsys.readouterr()
-    assert status == 2
-    assert captured.out == ""
-    assert captured.err.startswith("splatjax: ")
-    assert captured.err.count("\n") == 1
-    for output in outputs:
-        assert not output.exists()
-    return captured.err
 
 
 def test_materials_lists_the_library(capsys):
@@ -200,6 +162,17 @@ def test_render_shows_the_bust_and_says_what_it_does(tmp_path, capsys):
 
 @pytest.mark.slow
 @pytest.mark.once
+def test_turntable_of_the_bust_is_one_program(tmp_path, drawn):
+    size = ("--count", "5000", "--width", "64", "--height", "64")  # as above: it need not be compiled again
+    assert main(["turntable", *size, "--frames", "3", "--degrees", "0.3", "--output", str(tmp_path / "turn")]) == 0
+    assert len({(id(plan), compiled) for plan, compiled in drawn}) == 1
+    pictures = [np.asarray(sj.read_exr(tmp_path / "turn" / f"frame_{i:04}.exr").beauty) for i in range(3)]
+    for one, other in itertools.pairwise(pictures):
+        assert 0 < np.abs(one - other).mean() < 1e-2
+
+
+@pytest.mark.slow
+@pytest.mark.once
 def test_render_without_scattering_is_lambertian(tmp_path, capsys):
     splats, output = plate(tmp_path / "plate.ply"), tmp_path / "plate.exr"
     view = ["--width", "32", "--height", "32", "--azimuth", "0", "--light-azimuth", "0", "--light-elevation", "60", "--fill", "0"]
@@ -307,6 +280,8 @@ def test_azimuth_turns_from_the_front_to_the_side():
 
 
 def test_cache_folder_follows_the_environment(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    jax.config.update("jax_compilation_cache_dir", None)
     prepare_jax()
     assert jax.config.jax_compilation_cache_dir == str(tmp_path / "cache" / "splatjax" / "jax")
     monkeypatch.setenv("XDG_CACHE_HOME", "relative")

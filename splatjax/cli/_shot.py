@@ -1,0 +1,164 @@
+"""What `splatjax render` and `splatjax turntable` share: what is shown, from where, and under which light."""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+
+import splatjax as sj
+
+from ._outputs import OptionalPath
+from ._report import note, stage
+
+_FILL_SIDE, _FILL_ELEVATION = 25.0, 10.0  # degrees: beside the camera, away from the light
+_NARROW = 1e-6  # mm^2: far below any splat, so that the surface's own light stands for the layer
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shot:
+    """Splats of one material, a camera that sees all of them, a light and a weak fill."""
+
+    splats: tyro.conf.Positional[OptionalPath] = None
+    """PLY file of splats, in mm (`splatjax sample` makes one). Without it, the built-in bust."""
+    output: Path
+    """What is written."""
+    material: str = "skin"
+    """Name of a material (`splatjax materials`), or path of a TOML file."""
+    width: int = 512
+    """Width of the picture, pixels."""
+    height: int = 512
+    """Height of the picture, pixels."""
+    azimuth: float = 25.0
+    """Of the camera, seen from the middle of the splats."""
+    elevation: float = 0.0
+    """Of the camera; between -90 and 90, both excluded."""
+    fov: float = 25.0
+    """Vertical field of view."""
+    light_azimuth: float = -20.0
+    """Of the place the light comes from; beyond 90 it stands behind."""
+    light_elevation: float = 30.0
+    """Of the place the light comes from."""
+    fill: float = 0.1
+    """Of a second light, without shadows, from beside the camera: its share of the first one's strength. 0 for none."""
+    exposure: float = 0.0
+    """Of the PNG, in stops: each doubles its brightness. The EXR is never changed by it."""
+    scattering: bool = True
+    """Whether light spreads below the surface. Without, it leaves where it enters, in the same color."""
+    count: int = 200_000
+    """Number of splats of the built-in bust."""
+
+    def check(self) -> None:
+        """Raise `ValueError` for a fill, an exposure or an elevation that cannot be."""
+        if not 0 <= self.fill < math.inf:
+            raise ValueError(f"--fill is {self.fill:g}; it is a share of the light's strength: 0 or more")
+        if not math.isfinite(self.exposure):
+            raise ValueError(f"--exposure is {self.exposure:g}; it must be a finite number of stops")
+        if not -90 < self.elevation < 90:
+            raise ValueError(f"--elevation is {self.elevation:g}; it must lie between -90 and 90 degrees, both excluded")
+
+    def load(self) -> tuple[sj.Splats, sj.Material]:
+        """Give the splats, and the material as it is rendered with them."""
+        material = sj.load_material(self.material)
+        splats = self._splats()
+        if splats.albedo is not None:
+            material = material.white()
+            note(f"the splats carry albedo: the weights of {self.material} are divided by their sums")
+        material = in_color(material)
+        return splats, material if self.scattering else without_scattering(material)
+
+    def _splats(self) -> sj.Splats:
+        if self.splats is None:
+            with stage(f"making the bust with {self.count} splats"):
+                return sj.bust(self.count)
+        with stage(f"reading {self.splats}"):
+            return sj.read_splats(self.splats)
+
+    def lights(self, channels: int, azimuth: float, light_azimuth: float) -> tuple[sj.DirectionalLight, ...]:
+        """Give the light, and the fill beside a camera at an azimuth: on the same side of it wherever it goes."""
+        # On a white diffuser that faces it, the first light gives radiance 1.
+        irradiance = jnp.full(channels, jnp.pi)
+        key = sj.DirectionalLight(direction=-towards(light_azimuth, self.light_elevation), irradiance=irradiance)
+        if self.fill == 0:
+            return (key,)
+        side = math.copysign(_FILL_SIDE, self.azimuth - self.light_azimuth)
+        beside = towards(azimuth + side, _FILL_ELEVATION)
+        return key, sj.DirectionalLight(direction=-beside, irradiance=self.fill * irradiance, cast_shadows=False)
+
+    def camera(self, splats: sj.Splats, azimuth: float) -> sj.Camera:
+        """Give the camera at an azimuth."""
+        return frame_all(splats, towards(azimuth, self.elevation), self.fov, self.width, self.height)
+
+    def write(self, path: Path, frame: sj.Frame, material: sj.Material) -> tuple[Path, Path]:
+        """Write the picture with all its layers, and the PNG file beside it; give both paths."""
+        beside = path.with_suffix(".png")
+        sj.write_exr(path, frame, variances=material.gaussians.variances.tolist())
+        sj.write_png(beside, frame, exposure=self.exposure)
+        return path, beside
+
+    def say_what_was_handed_over(self, frame: sj.Frame, material: sj.Material) -> None:
+        """Say which layers are narrower than the splats."""
+        if not self.scattering:
+            return
+        handed_over = frame.handed_over > 0.5
+        widths = ", ".join(
+            f"{float(v) ** 0.5:.3g}" for v, there in zip(material.gaussians.variances, handed_over, strict=True) if there
+        )
+        if widths:
+            note(f"narrower than the splats, so that the surface's own light stands for them: the Gaussians of {widths} mm")
+
+
+def draw(scene: sj.Scene, camera: sj.Camera, plan: sj.Plan) -> sj.Frame:
+    """Render, and wait for the picture.
+
+    **Raises:** `ValueError` when the plan lacks room.
+    """
+    frame = jax.block_until_ready(sj.render(scene, camera, plan=plan))
+    if frame.overflow > 0:
+        raise ValueError(f"the plan lacks room: {float(frame.overflow):.2f} times what it holds is needed")
+    return frame
+
+
+def in_color(material: sj.Material) -> sj.Material:
+    """Give a material of one channel the same weights for red, green and blue."""
+    gaussians = material.gaussians
+    if gaussians.weights.shape[1] != 1:
+        return material
+    weights = jnp.broadcast_to(gaussians.weights, (len(gaussians.variances), 3))
+    single = material.single_scattering
+    if single is not None:
+        single = jax.tree.map(lambda values: jnp.broadcast_to(values, 3), single)
+    gaussians = sj.SumOfGaussians(gaussians.variances, weights)
+    return sj.Material(gaussians, material.eta, material.specular, material.roughness, single)
+
+
+def without_scattering(material: sj.Material) -> sj.Material:
+    """Give the same surface and color with light that leaves where it enters: one Gaussian, narrower than any splat."""
+    gaussians = material.gaussians
+    variances = jnp.full_like(gaussians.variances, _NARROW, shape=(1,))
+    return material.surface_of(sj.SumOfGaussians(variances, material.total_reflectance()[None]))
+
+
+def towards(azimuth: float, elevation: float) -> jax.Array:
+    """Give the unit vector from the middle towards a place on the sky, given in degrees."""
+    azimuth, elevation = math.radians(azimuth), math.radians(elevation)
+    across = math.cos(elevation)
+    return jnp.asarray([math.sin(azimuth) * across, math.sin(elevation), math.cos(azimuth) * across], float)
+
+
+def frame_all(splats: sj.Splats, direction: jax.Array, fov: float, width: int, height: int) -> sj.Camera:
+    """Place a camera in a direction so that the bounding sphere of the splats just fits the narrower side of the picture."""
+    centers = np.asarray(splats.centers)
+    middle = (centers.min(axis=0) + centers.max(axis=0)) / 2
+    radius = float(np.max(np.linalg.norm(centers - middle[None], axis=1) + np.asarray(splats.radii)))
+    if not 0 < fov < 180 or width < 1 or height < 1:
+        distance = 1.0  # `look_at` refuses, and says why
+    else:
+        half_angle = math.atan(math.tan(math.radians(fov) / 2) * min(1.0, width / height))
+        distance = radius / math.sin(half_angle)
+    target = jnp.asarray(middle)
+    eye = target + distance * direction.astype(target.dtype)
+    return sj.Camera.look_at(eye, target, fov=fov, width=width, height=height)

@@ -1,0 +1,42 @@
+"""The command line is run in process: its settings are those of the whole process."""
+
+import jax
+import pytest
+from jax.experimental.compilation_cache import compilation_cache
+
+from splatjax.cli import _turntable
+
+COMPILED = "/jax/core/compile/backend_compile_duration"
+
+
+@pytest.fixture(autouse=True, scope="module")
+def own_cache(tmp_path_factory):
+    """Compiled code goes to a folder of the tests, and the program's settings are taken back."""
+    before = {name: getattr(jax.config, name) for name in ("jax_compilation_cache_dir", "jax_platforms")}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        yield
+    for name, value in before.items():
+        jax.config.update(name, value)
+    compilation_cache.reset_cache()
+
+
+@pytest.fixture
+def drawn(monkeypatch):
+    """The plans by which a turntable's frames are drawn, and how many programs had been compiled after each."""
+    compiled, seen = [], []
+    draw = _turntable.draw
+
+    def watched(scene, camera, plan):
+        frame = draw(scene, camera, plan)
+        seen.append((plan, len(compiled)))
+        return frame
+
+    def listen(event, duration, **_):
+        if event == COMPILED:
+            compiled.append(duration)
+
+    monkeypatch.setattr(_turntable, "draw", watched)
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    yield seen
+    jax.monitoring.unregister_event_duration_listener(listen)
