@@ -6,13 +6,19 @@ from jax.experimental.compilation_cache import compilation_cache
 
 from splatjax.cli import _turntable
 
+SETTINGS = (
+    "jax_compilation_cache_dir",
+    "jax_logging_level",
+    "jax_persistent_cache_min_compile_time_secs",
+    "jax_platforms",
+)
 COMPILED = "/jax/core/compile/backend_compile_duration"
 
 
 @pytest.fixture(autouse=True, scope="module")
 def own_cache(tmp_path_factory):
     """Compiled code goes to a folder of the tests, and the program's settings are taken back."""
-    before = {name: getattr(jax.config, name) for name in ("jax_compilation_cache_dir", "jax_platforms")}
+    before = {name: getattr(jax.config, name) for name in SETTINGS}
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
         yield
