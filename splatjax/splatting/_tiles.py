@@ -112,6 +112,8 @@ class _Lanes(eqx.Module):
 
     row: Int[Array, " lanes"]
     """Of the first block, in slots cut into rows of one lane each; the next block is `stride` rows on."""
+    lengths: Int[Array, " lanes"]
+    """Of each lane's list, in blocks: what follows is another chunk's."""
     blocks: Int[Array, ""]
     x: Float[Array, "lanes 1"]
     y: Float[Array, "lanes 1"]
@@ -123,6 +125,10 @@ class _Lanes(eqx.Module):
     def add(self, plane: Float[Array, "rows slots"], block, part: Float[Array, "lanes slots"]) -> Float[Array, "rows slots"]:
         return plane.at[self.row + block * self.stride].add(part, mode="promise_in_bounds")
 
+    def until_end(self, beyond: Float[Array, "lanes pixels"], block) -> Float[Array, "lanes pixels"]:
+        """Give limits that nothing is nearer than, for lanes whose list has ended before a block."""
+        return jnp.where((block < self.lengths)[:, None], beyond, jnp.inf)
+
 
 class _ChunkLanes(_Lanes):
     """The tiles of one chunk: their rows follow one another."""
@@ -132,6 +138,9 @@ class _ChunkLanes(_Lanes):
 
     def add(self, plane: Float[Array, "rows slots"], block, part: Float[Array, "lanes slots"]) -> Float[Array, "rows slots"]:
         return lax.dynamic_update_slice_in_dim(plane, self.read(plane, block) + part, self.row[0] + block * self.stride, 0)
+
+    def until_end(self, beyond: Float[Array, "lanes pixels"], block) -> Float[Array, "lanes pixels"]:
+        return beyond
 
 
 class _Sweep(eqx.Module):
@@ -147,22 +156,22 @@ class _Sweep(eqx.Module):
         side = np.arange(self.grid.side, dtype=dtype) + np.asarray(0.5, dtype)
         return np.tile(side, self.grid.side), np.repeat(side, self.grid.side)
 
-    def _lanes(self, kind: type[_Lanes], bins: Bins, places, blocks, dtype) -> _Lanes:
+    def _lanes(self, kind: type[_Lanes], bins: Bins, places, dtype) -> _Lanes:
         lanes, grid = self.grid.lanes, self.grid
-        tiles = bins.order[places]
-        row = bins.first_block[places // lanes] * lanes + places % lanes
+        tiles, chunk = bins.order[places], places // lanes
+        row = bins.first_block[chunk] * lanes + places % lanes
+        lengths = bins.first_block[chunk + 1] - bins.first_block[chunk]
         x, y = ((each * grid.side).astype(dtype)[:, None] for each in (tiles % grid.across, tiles // grid.across))
-        return kind(row, blocks, x, y, lanes)
+        return kind(row, lengths, jnp.max(lengths), x, y, lanes)
 
     def chunk(self, bins: Bins, i, dtype) -> _Lanes:
         """Give the tiles of a chunk."""
         places = i * self.grid.lanes + jnp.arange(self.grid.lanes, dtype=jnp.int32)
-        return self._lanes(_ChunkLanes, bins, places, bins.first_block[i + 1] - bins.first_block[i], dtype)
+        return self._lanes(_ChunkLanes, bins, places, dtype)
 
     def picked(self, bins: Bins, places: Int[Array, " lanes"], dtype) -> _Lanes:
         """Give tiles by their places in the order; places beyond the last are the last one's, with nothing in them."""
-        chunk = places // self.grid.lanes
-        return self._lanes(_Lanes, bins, places, jnp.max(bins.first_block[chunk + 1] - bins.first_block[chunk]), dtype)
+        return self._lanes(_Lanes, bins, places, dtype)
 
     def splats(self, planes, block, lanes: _Lanes):
         """Read a block's splats, `[lanes, slots]` each, placed relative to their tile's corner."""
@@ -193,7 +202,8 @@ class _Sweep(eqx.Module):
             splats = self.splats(slots.planes, block, lanes)
             nearness, quadric = self.fragments(splats)
             shifted = self.view.shifted(nearness, lanes.read(slots.shift, block)[:, :, None])
-            squared_radius = self.squared_radii(nearness, quadric, jnp.full_like(front, -jnp.inf), front)
+            beyond = lanes.until_end(jnp.full_like(front, -jnp.inf), block)
+            squared_radius = self.squared_radii(nearness, quadric, beyond, front)
             weight = splats[-1][:, :, None] * fast_fragment_weight(squared_radius)
             each = weight > LEAST_WEIGHT, squared_radius < 1
             found = (jnp.max(jnp.where(candidate, shifted, -jnp.inf), axis=1) for candidate in each)
@@ -223,7 +233,7 @@ class _Sweep(eqx.Module):
 
         def add(block, sums):
             splats = self.splats(slots.planes, block, lanes)
-            squared_radius = self.squared_radii(*self.fragments(splats), beyond, upto)
+            squared_radius = self.squared_radii(*self.fragments(splats), lanes.until_end(beyond, block), upto)
             weight = splats[-1][:, :, None] * fast_fragment_weight(squared_radius)
             rows = jnp.stack(self.rows(splats, slots.attributes, block, lanes), axis=1)
             return sums + jnp.einsum("trs,tsp->trp", rows, weight)
@@ -246,7 +256,7 @@ class _Sweep(eqx.Module):
         def add(block, gradients):
             splats = self.splats(slots.planes, block, lanes)
             nearness, quadric = self.fragments(splats)
-            squared_radius = self.squared_radii(nearness, quadric, beyond, upto)
+            squared_radius = self.squared_radii(nearness, quadric, lanes.until_end(beyond, block), upto)
             weight = fast_fragment_weight(squared_radius)
             rows, opacity = self.rows(splats, slots.attributes, block, lanes), splats[-1]
             d_rows = jnp.moveaxis(jnp.einsum("trp,tsp->trs", cotangent, weight), 1, 0)
