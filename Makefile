@@ -43,10 +43,14 @@ test-x64: setup
 test-once: setup
 	XLA_FLAGS="$(LEAST_OPTIMIZATION) $$XLA_FLAGS" $(PYTEST) -m once
 
-# Ten thousand scenes and losses, in both precisions: no gradient of a finite loss may be infinite or no number.
+# Ten thousand scenes and losses, in both precisions: no gradient of a finite loss may be infinite or no number. Five hundred of
+# each kind by the fast paths and by plain ones.
 random-scenes: setup
 	SPLATJAX_RANDOM_SCENES=10000 XLA_FLAGS="$(LEAST_OPTIMIZATION) $$XLA_FLAGS" \
 	    $(BIN)/python -m pytest -n $(WORKERS) --dist load -q tests/gradients/test_random_scenes.py
+	SPLATJAX_RANDOM_SCENES=10000 JAX_ENABLE_X64=1 XLA_FLAGS="$(LEAST_OPTIMIZATION) $$XLA_FLAGS" \
+	    $(BIN)/python -m pytest -n $(WORKERS) --dist load -q tests/splatting/test_random_bodies.py \
+	    tests/diffusion/test_random_diffusers.py
 
 bench: setup
 	$(BIN)/python -m benchmarks

@@ -148,31 +148,6 @@ def test_fast_diffuser_is_the_plain_one_within_its_stated_error(float32, approxi
             assert ours.max() <= values.max() + slack
 
 
-def test_fast_gradient_is_the_plain_one(float64):
-    """Without clusters and nodes, and with so wide a support that nothing is left out."""
-    with jax.enable_x64(True):
-        body = bodies.bumpy(COUNT // 5)
-        atlas, points, covered = atlas_of(body, bodies.perspective(fov=FOV, width=SIZE // 2, height=SIZE // 2))
-        rng = np.random.default_rng(8)
-        irradiance = jnp.asarray(rng.uniform(size=(2, body.count)))
-        cotangent = jnp.asarray(rng.normal(size=(covered.shape[0], 3, 3, covered.shape[1])))
-        fast = planned(body, atlas, error=0.0, support=8.0)
-
-        def total(diffuser, sources, kernels, points):
-            found = diffuser.diffuse(sources, kernels, points, covered, atlas)
-            return jnp.vdot(found.means, cotangent[:, :, :2]) + jnp.vdot(found.exits, cotangent[:, :, 2])
-
-        @jax.jit
-        def gradients(*where):
-            return tuple(jax.grad(lambda *x, d=d: total(d, *x), argnums=(0, 1, 2))(*where) for d in (fast, DenseDiffuser()))
-
-        found, expected = gradients(Sources(body.centers.T, body.normals.T, body.areas, irradiance), kernels(), points)
-    for ours, theirs in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
-        scale = np.max(np.abs(np.asarray(theirs)))
-        assert scale > 0
-        np.testing.assert_allclose(np.asarray(ours), np.asarray(theirs), atol=1e-6 * scale)
-
-
 def test_far_from_every_source_gradients_are_finite(x64):
     """As in a layer that is handed over: nothing reaches a point between splats."""
     _, atlas, sources, points, covered = scene(x64)

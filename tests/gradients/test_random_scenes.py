@@ -238,13 +238,16 @@ def roomy(plan: sj.Plan, shape: Shape) -> sj.Plan:
     return jax.tree.map(widened, plan, is_leaf=lambda part: isinstance(part, TileRasterizer | ClusterDiffuser))
 
 
+FARTHEST = 1e15  # mm, to which all is near
+
+
 def far_reaching(nodes: NodePlan | None) -> NodePlan | None:
     if nodes is None:
         return None
     points, sources = nodes.neighbors.points, nodes.neighbors.sources
-    everywhere = Boxes(jnp.full_like(points.low, -jnp.inf), jnp.full_like(points.high, jnp.inf))
-    all_sources = Boxes(jnp.full_like(sources.low, -jnp.inf), jnp.full_like(sources.high, jnp.inf))
-    return NodePlan(Neighbors.find(everywhere, all_sources, math.inf, 1, 4), nodes.deviations)
+    everywhere = Boxes(jnp.full_like(points.low, -FARTHEST), jnp.full_like(points.high, FARTHEST))
+    all_sources = Boxes(jnp.full_like(sources.low, -FARTHEST), jnp.full_like(sources.high, FARTHEST))
+    return NodePlan(Neighbors.find(everywhere, all_sources, 10 * FARTHEST, 1, 4), nodes.deviations)
 
 
 def _room(items: int, tiles: int, lanes: int, slots: int) -> tuple[int, int, int]:

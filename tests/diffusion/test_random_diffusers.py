@@ -1,0 +1,142 @@
+"""The fast diffuser on random scenes: without clusters the plain sum over the sources within its support, in value and gradient.
+
+With `error=0` nothing is merged. What is left out is then known to the last source, so that its lists are held to rounding,
+not to the support's error; and that error is what the untruncated sum has beyond the support.
+"""
+
+import math
+from functools import cache
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from random_bodies import KINDS, disagreement, random_body, seeds
+
+from splatjax.diffusion import ClusterDiffuser, DenseDiffuser, Kernels, Sources, pixel_points
+from splatjax.diffusion._clustered import LayerPlan
+from splatjax.diffusion._pixels import tile_grid
+from splatjax.scene import Splats
+from splatjax.splatting import BinCapacity
+
+WIDTH, HEIGHT = 19, 14
+CHANNELS, GAUSSIANS = 2, 2
+IN_SUITE = 45
+RESOLVED = (0.0, 0.0)  # an interval that hands no layer over
+VALUE, GRADIENT = 1e-10, 1e-8  # float64: the same sums in another order
+
+
+def with_room(diffuser: ClusterDiffuser, count: int) -> ClusterDiffuser:
+    """Give room for every source in every tile, at any variance: one program for all scenes."""
+    grid = tile_grid(WIDTH, HEIGHT, 4)
+    blocks, chunks = -(-count // 64) * 4, grid.tiles // grid.lanes
+    pairs = -(-2 * blocks * grid.tiles // 1024) * 1024
+    room = BinCapacity(pairs, chunks * -(-2 * blocks // grid.slots), chunks)
+    layers = tuple(LayerPlan(each.level, 0.0, math.inf, room, each.nodes) for each in diffuser.layers or ())
+    return eqx.tree_at(lambda d: d.layers, diffuser, layers)
+
+
+def within_support(sources: Sources, kernels: Kernels, points, covered, support: float):
+    """Give means and exits, written down plainly; 0 where no source is within the support."""
+    found = []
+    for variance, depth in zip(kernels.variances, kernels.depths, strict=True):
+        offset = points[:, :, :, :, None] - (sources.centers - depth * sources.normals)[None, :, None, None]
+        exponent = 0.5 * jnp.sum(offset * offset, axis=1) / variance
+        weight = jnp.where(exponent < 0.5 * support**2, jnp.exp(-exponent), 0.0) * sources.areas[None, None, None]
+        gathered = jnp.sum(weight, axis=-1)
+        reached = covered & (gathered > 0)
+        means = jnp.einsum("cj,shwj->schw", sources.irradiance, weight) / jnp.where(reached, gathered, 1.0)[:, None]
+        exits = gathered * jnp.exp(0.5 * depth * depth / variance) / (2 * jnp.pi * variance)
+        found.append(jnp.where(reached[:, None], jnp.concatenate([means, exits[:, None]], axis=1), 0.0))
+    return jnp.stack(found)
+
+
+class Scene(eqx.Module):
+    """All that pass 4 is differentiated in."""
+
+    sources: Sources
+    kernels: Kernels
+    depths: jax.Array
+    view: eqx.Module
+
+
+def random_scene(seed: int, count: int) -> tuple[Splats, Scene, jax.Array]:
+    """Draw splats, layers from far narrower than the splats lie apart to wider than all, and two surfaces amid the splats."""
+    body, view = random_body(seed, count, True, WIDTH, HEIGHT)
+    rng = np.random.default_rng([seed, count])
+    body = eqx.tree_at(lambda s: s.areas, body, jnp.asarray(np.exp(rng.normal(size=count))))
+    depths = np.exp(rng.normal(size=(2, HEIGHT, WIDTH)) * rng.choice([0.02, 0.5]) + np.log(rng.uniform(4, 40)))
+    points = jnp.stack([pixel_points(view, jnp.asarray(each)) for each in depths])
+    away = np.linalg.norm(np.asarray(points)[..., None] - np.asarray(body.centers).T[None, :, None, None], axis=1)
+    variances = np.quantile(away, 10 ** rng.uniform(-2, 0, GAUSSIANS)) ** 2 / rng.uniform(1, 10, GAUSSIANS)
+    covered = rng.uniform(size=depths.shape) < rng.choice([0.0, 0.3, 1.0], (2, 1, 1), p=[0.1, 0.3, 0.6])
+    irradiance = rng.uniform(size=(CHANNELS, count)) * (rng.uniform(size=(CHANNELS, count)) < 0.7)
+    kernels = Kernels(jnp.asarray(variances), jnp.asarray(rng.choice([0.0, 0.75]) * np.sqrt(variances)))
+    sources = Sources(body.centers.T, body.normals.T, body.areas, jnp.asarray(irradiance))
+    return body, Scene(sources, kernels, jnp.asarray(depths), view), jnp.asarray(covered)
+
+
+@cache
+def by_both(count: int):
+    """Give a function of a scene: values and gradients of a random sum of them, of the fast diffuser and of the plain sum."""
+    factors = jnp.asarray(np.random.default_rng(count).normal(size=(GAUSSIANS, 2, CHANNELS + 1, HEIGHT, WIDTH)))
+
+    def stacked(found):
+        return jnp.concatenate([found.means, found.exits[:, :, None]], axis=2)
+
+    @jax.jit
+    def both(diffuser: ClusterDiffuser, scene: Scene, covered):
+        def points_of(scene):
+            return jnp.stack([pixel_points(scene.view, each) for each in scene.depths])
+
+        def fast(scene: Scene):
+            found = diffuser.diffuse(scene.sources, scene.kernels, points_of(scene), covered, scene.view)
+            return stacked(found), found.needed
+
+        def plain(scene: Scene):
+            return within_support(scene.sources, scene.kernels, points_of(scene), covered, diffuser.support), jnp.zeros(())
+
+        # Exits are areas over that of the kernel: times it all are as large, and no sum is drowned in another's rounding.
+        flat = 2 * jnp.pi * scene.kernels.variances
+        as_large = jnp.stack([*[jnp.ones_like(flat)] * CHANNELS, flat], axis=1)[:, None, :, None, None]
+
+        def found(diffuse):
+            def total(scene):
+                values, needed = diffuse(scene)
+                return jnp.vdot(factors * as_large, values), (values, needed)
+
+            return jax.value_and_grad(total, has_aux=True)(scene)
+
+        untruncated = DenseDiffuser().diffuse(scene.sources, scene.kernels, points_of(scene), covered, scene.view)
+        return found(fast), found(plain), stacked(untruncated)
+
+    return both
+
+
+@pytest.mark.parametrize("count", [80, 1])
+def test_without_clusters_all_within_the_support_is_summed(float64, count):
+    both, worst, reached = by_both(count), {}, 0
+    for seed in seeds(IN_SUITE if count > 1 else len(KINDS)):
+        body, scene, covered = random_scene(seed, count)
+        diffuser = ClusterDiffuser(error=0.0).planned(body, scene.kernels, jnp.asarray(RESOLVED), [scene.view])
+        found, expected, untruncated = both(with_room(diffuser, count), scene, covered)
+        (_, (values, needed)), gradients = found
+        (_, (plain, _)), plain_gradients = expected
+        assert float(needed) <= 1
+        reached += int(jnp.sum(plain[:, :, -1] > 0))
+        pairs = {"means": (values[:, :, :-1], plain[:, :, :-1]), "exits": (values[:, :, -1], plain[:, :, -1])}
+        names = jax.tree_util.tree_flatten_with_path(plain_gradients)[0]
+        leaves = zip(names, jax.tree.leaves(gradients), strict=True)
+        pairs |= {jax.tree_util.keystr(path): (ours, theirs) for (path, theirs), ours in leaves}
+        for name, (ours, theirs) in pairs.items():
+            assert np.all(np.isfinite(theirs)), (seed, name)
+            error = disagreement(ours, theirs)
+            assert error < (VALUE if name in ("means", "exits") else GRADIENT), f"scene {seed}: {name} differ by {error:.1e}"
+            worst[name] = max(worst.get(name, 0.0), error)
+        # What the support leaves out is missing from the exits; the mean of the rest is another by so much of the range.
+        left_out = 1 - plain[:, :, -1:] / jnp.maximum(untruncated[:, :, -1:], 1e-300)
+        off = jnp.abs(values - untruncated)[:, :, :-1] - left_out * jnp.ptp(scene.sources.irradiance)
+        assert float(jnp.max(jnp.where(plain[:, :, -1:] > 0, off, 0.0))) < VALUE
+    print({name: f"{error:.1e}" for name, error in worst.items()}, f"{reached} points of layers reached")
+    assert reached > 1000

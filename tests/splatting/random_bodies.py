@@ -1,0 +1,163 @@
+"""Small random scenes of one shape, the first of each sequence of one kind alone: what goes wrong goes wrong at some of these.
+
+A scene of a seed is always the same. Each is drawn in the coordinates of the view that sees it: `x` and `y` in pixels, depth in
+mm, so that every kind is met whatever the view.
+"""
+
+import dataclasses
+import os
+
+import jax.numpy as jnp
+import numpy as np
+
+from splatjax.scene import Splats
+from splatjax.splatting import AbstractView, OrthographicView, PerspectiveView, SplattingSettings
+
+KINDS = (
+    "plain",
+    "larger than the picture",
+    "tiny",
+    "behind",
+    "off screen",
+    "at the border",
+    "edge on",
+    "nearly edge on",
+    "facing away",
+    "through the near plane",
+    "in one tile",
+    "in one place",
+    "two sheets",
+    "alone",
+    "none is seen",
+)
+NEAR = 1e-2
+ALL = int(os.environ.get("SPLATJAX_RANDOM_SCENES", "0"))
+
+
+def seeds(in_suite: int) -> range:
+    """Seeds of the scenes to try: some dozens in the suite, a twentieth of SPLATJAX_RANDOM_SCENES where it asks for more."""
+    return range(max(in_suite, ALL // 20))
+
+
+@dataclasses.dataclass(frozen=True)
+class Sight:
+    """A view's numbers, in NumPy's float64."""
+
+    position: np.ndarray
+    rotation: np.ndarray
+    pixels: float
+    """Focal length in pixels, or pixels per mm."""
+    perspective: bool
+    width: int
+    height: int
+
+    def view(self) -> AbstractView:
+        position, rotation, pixels = (jnp.asarray(each, float) for each in (self.position, self.rotation, self.pixels))
+        if self.perspective:
+            return PerspectiveView(position, rotation, pixels, self.width, self.height, NEAR)
+        return OrthographicView(position, rotation, pixels, self.width, self.height)
+
+    def mm(self, depth: np.ndarray) -> np.ndarray:
+        """Size of a pixel at a depth."""
+        return depth / self.pixels if self.perspective else np.full_like(depth, 1 / self.pixels)
+
+    def places(self, x, y, depth) -> np.ndarray:
+        """Points under pixels, in the view's own axes."""
+        across = np.stack([x - self.width / 2, y - self.height / 2], 1) * self.mm(depth)[:, None]
+        return np.concatenate([across, depth[:, None]], 1)
+
+    def rays(self, places: np.ndarray) -> np.ndarray:
+        """Unit vectors from the eye to points in the view's own axes."""
+        if not self.perspective:
+            return np.tile([0.0, 0.0, 1.0], (len(places), 1))
+        return places / np.linalg.norm(places, axis=1, keepdims=True)
+
+
+def sight(rng: np.random.Generator, perspective: bool, width: int, height: int) -> Sight:
+    """A view from anywhere to anywhere."""
+    rotation, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    rotation[2] *= np.linalg.det(rotation)
+    pixels = height / (2 * np.tan(np.radians(rng.uniform(10, 50)))) if perspective else rng.uniform(0.4, 2.5)
+    return Sight(rng.normal(size=3) * 10, rotation, pixels, perspective, width, height)
+
+
+def random_body(seed: int, count: int, perspective: bool, width: int, height: int) -> tuple[Splats, AbstractView]:
+    """Draw `count` splats and what sees them."""
+    rng = np.random.default_rng([seed, count, perspective])
+    seen = sight(rng, perspective, width, height)
+    kinds = [KINDS[seed]] if seed < len(KINDS) else list(rng.choice(KINDS[:-2], rng.integers(1, 5), replace=False))
+    parts = [_drawn(str(kind), rng, count, seen) for kind in kinds]
+    which = rng.integers(0, len(parts), count)
+    places, normals, radii = (np.stack(each)[which, np.arange(count)] for each in zip(*parts, strict=True))
+    centers = places @ seen.rotation + seen.position
+    areas = (radii / 1.5) ** 2 * rng.uniform(0.5, 2, count)
+    arrays = centers, normals @ seen.rotation, radii, areas
+    return Splats(*(jnp.asarray(each, float) for each in arrays)), seen.view()
+
+
+def disagreement(found, expected) -> float:
+    """Give the largest error, each relative to what is expected there and to what is typical: the median of all that is not 0.
+
+    So a number that is far larger than the others hides nothing. NaN where anything is.
+    """
+    found, expected = np.asarray(found), np.asarray(expected)
+    size = np.abs(expected)
+    typical = np.median(size[size > 0]) if np.any(size > 0) else 1.0
+    return float(np.max(np.abs(found - expected) / (size + typical), initial=0.0))
+
+
+def _drawn(kind: str, rng: np.random.Generator, count: int, seen: Sight):
+    """Give places, normals (in the view's own axes) and radii of splats of one kind."""
+    width, height = seen.width, seen.height
+    x, y = rng.uniform(0, width, count), rng.uniform(0, height, count)
+    depth = np.exp(rng.uniform(np.log(4.0), np.log(rng.choice([5.0, 40.0])), count))
+    size = np.exp(rng.uniform(np.log(0.6), np.log(6.0), count))  # radius in pixels
+    steepest = rng.choice([0.3, 1.0, 5.0])
+    if kind == "larger than the picture":
+        size = np.exp(rng.uniform(0, 3, count)) * width
+    if kind == "tiny":
+        size = 10 ** rng.uniform(-3, -0.5, count)
+    if kind == "behind":
+        depth = -depth
+    if kind in ("off screen", "none is seen"):
+        x = np.where(rng.uniform(size=count) < 0.5, -1, 1) * rng.uniform(2, 40, count) * width
+    if kind == "at the border":
+        x = rng.choice([0.0, width], count) + rng.uniform(-1.5, 1.5, count) * size
+    if kind == "through the near plane":
+        depth = NEAR * np.exp(rng.uniform(-1, 5, count))
+        size = np.exp(rng.uniform(0, 6, count))
+    if kind == "in one tile":
+        x, y, size = (rng.uniform(8.2, 15.8, count) for _ in range(2)), None, rng.uniform(0.3, 2, count)
+        x, y = x
+    if kind == "in one place":
+        x, y, depth = (np.repeat(each[:1], count) for each in (x, y, depth))
+    if kind == "two sheets":
+        depth, size = np.full(count, depth[0]), rng.uniform(2, 6, count)
+    places = seen.places(x, y, depth)
+    rays = seen.rays(places)
+    random = rng.normal(size=(count, 3))
+    across = np.cross(rays, random)
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    slope = np.abs(rng.normal(size=count)) * steepest
+    if kind == "in one place" and rng.uniform() < 0.5:
+        across, slope, size = (np.repeat(each[:1], count, axis=0) for each in (across, slope, size))
+    normals = -rays + slope[:, None] * across
+    if kind == "facing away":
+        normals = -normals
+    if kind == "edge on":
+        normals = across
+    if kind == "nearly edge on":
+        normals = across - rays * (rng.choice([-1, 1], count) * 10 ** rng.uniform(-9, -1, count))[:, None]
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    radii = size * seen.mm(np.abs(depth))
+    if kind == "two sheets":
+        settings = SplattingSettings()
+        radii = np.full(count, radii[0])
+        normals = -rays
+        reach = np.hypot(radii, settings.filter_radius * seen.mm(depth))
+        apart = settings.epsilon_z * reach * rng.choice([0.5, 0.97, 1.03, 2.5])
+        places += np.where(np.arange(count) % 2, apart, 0)[:, None] * rays
+    if kind == "alone":
+        hidden = np.arange(count) != rng.integers(count)
+        normals = np.where(hidden[:, None], rays, normals)
+    return places, normals, radii
