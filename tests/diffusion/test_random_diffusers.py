@@ -7,6 +7,7 @@ not to the support's error; and that error is what the untruncated sum has beyon
 import math
 from functools import cache
 
+import bodies
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -18,10 +19,10 @@ from splatjax.diffusion import ClusterDiffuser, DenseDiffuser, Kernels, Sources,
 from splatjax.diffusion._clustered import LayerPlan
 from splatjax.diffusion._pixels import tile_grid
 from splatjax.scene import Splats
-from splatjax.splatting import BinCapacity
+from splatjax.splatting import BinCapacity, DenseRasterizer, SplattingSettings, splat_surfaces
 
 WIDTH, HEIGHT = 19, 14
-CHANNELS, GAUSSIANS = 2, 2
+CHANNELS = 2
 IN_SUITE = 45
 RESOLVED = (0.0, 0.0)  # an interval that hands no layer over
 VALUE, GRADIENT = 1e-10, 1e-8  # float64: the same sums in another order
@@ -61,6 +62,11 @@ class Scene(eqx.Module):
     view: eqx.Module
 
 
+def gaussians_of(count: int) -> int:
+    """Two layers of many splats; of one splat one, which is sooner compiled."""
+    return 2 if count > 1 else 1
+
+
 def random_scene(seed: int, count: int) -> tuple[Splats, Scene, jax.Array]:
     """Draw splats, layers from far narrower than the splats lie apart to wider than all, and two surfaces amid the splats."""
     body, view = random_body(seed, count, True, WIDTH, HEIGHT)
@@ -69,7 +75,8 @@ def random_scene(seed: int, count: int) -> tuple[Splats, Scene, jax.Array]:
     depths = np.exp(rng.normal(size=(2, HEIGHT, WIDTH)) * rng.choice([0.02, 0.5]) + np.log(rng.uniform(4, 40)))
     points = jnp.stack([pixel_points(view, jnp.asarray(each)) for each in depths])
     away = np.linalg.norm(np.asarray(points)[..., None] - np.asarray(body.centers).T[None, :, None, None], axis=1)
-    variances = np.quantile(away, 10 ** rng.uniform(-2, 0, GAUSSIANS)) ** 2 / rng.uniform(1, 10, GAUSSIANS)
+    gaussians = gaussians_of(count)
+    variances = np.quantile(away, 10 ** rng.uniform(-2, 0, gaussians)) ** 2 / rng.uniform(1, 10, gaussians)
     covered = rng.uniform(size=depths.shape) < rng.choice([0.0, 0.3, 1.0], (2, 1, 1), p=[0.1, 0.3, 0.6])
     irradiance = rng.uniform(size=(CHANNELS, count)) * (rng.uniform(size=(CHANNELS, count)) < 0.7)
     kernels = Kernels(jnp.asarray(variances), jnp.asarray(rng.choice([0.0, 0.75]) * np.sqrt(variances)))
@@ -80,7 +87,7 @@ def random_scene(seed: int, count: int) -> tuple[Splats, Scene, jax.Array]:
 @cache
 def by_both(count: int):
     """Give a function of a scene: values and gradients of a random sum of them, of the fast diffuser and of the plain sum."""
-    factors = jnp.asarray(np.random.default_rng(count).normal(size=(GAUSSIANS, 2, CHANNELS + 1, HEIGHT, WIDTH)))
+    factors = jnp.asarray(np.random.default_rng(count).normal(size=(gaussians_of(count), 2, CHANNELS + 1, HEIGHT, WIDTH)))
 
     def stacked(found):
         return jnp.concatenate([found.means, found.exits[:, :, None]], axis=2)
@@ -140,3 +147,117 @@ def test_without_clusters_all_within_the_support_is_summed(float64, count):
         assert float(jnp.max(jnp.where(plain[:, :, -1:] > 0, off, 0.0))) < VALUE
     print({name: f"{error:.1e}" for name, error in worst.items()}, f"{reached} points of layers reached")
     assert reached > 1000
+
+
+COUNT, SIZE = 1500, 24
+VARIANCES = (14.0, 40.0)
+LIT_IN_SUITE = 7  # one for each of what a layer is differentiated in
+SUPPORT = 7.0  # so wide that only clusters and nodes err, and no difference steps over its rim
+# Of a layer's root mean square, as `ClusterDiffuser.error` states them; of the exits a layer passes on a part.
+MEDIAN, EXITS_MEDIAN, HIGH = 2e-3, 3e-3, 1e-2
+STEP, AGREEMENT = 1e-6, 1e-5  # of differences along a random way; 4e-7 found
+
+
+class Lit(eqx.Module):
+    """A body that moves a little, lit anew, with layers of other widths, and the points that are seen of it."""
+
+    sources: Sources
+    kernels: Kernels
+    points: jax.Array
+
+
+@cache
+def body_and_plan() -> tuple[Splats, list, ClusterDiffuser]:
+    """One plan for all cameras."""
+    body, rng = bodies.bumpy(COUNT), np.random.default_rng(3)
+    eyes = rng.normal(size=(LIT_IN_SUITE, 3))
+    eyes *= rng.uniform(30, 50, (LIT_IN_SUITE, 1)) / np.linalg.norm(eyes, axis=1, keepdims=True)
+    views = [bodies.perspective(eye, fov=32.0, width=SIZE, height=SIZE) for eye in eyes]
+    kernels = Kernels(jnp.asarray(VARIANCES), 0.75 * jnp.sqrt(jnp.asarray(VARIANCES)))
+    diffuser = ClusterDiffuser(support=SUPPORT).planned(body, kernels, jnp.asarray(RESOLVED), views)
+    assert diffuser.layers is not None
+    assert [layer.level for layer in diffuser.layers] == [1, 2]
+    assert all(layer.nodes is not None for layer in diffuser.layers)
+    return body, views, diffuser
+
+
+@cache
+def seen_depths():
+    nothing = jnp.zeros((0, COUNT))
+    return jax.jit(lambda s, view: splat_surfaces(s, nothing, view, SplattingSettings(), DenseRasterizer()))
+
+
+def lit(seed: int):
+    """Light from a side, textured; behind the edge of a shadow there is none."""
+    body, views, _ = body_and_plan()
+    rng, view = np.random.default_rng(seed), views[seed % LIT_IN_SUITE]
+    body = eqx.tree_at(lambda s: s.centers, body, body.centers + jnp.asarray(rng.normal(size=(COUNT, 3)) * 0.02))
+    surfaces = seen_depths()(body, view)
+    seen = surfaces.front, surfaces.behind
+    centers, normals = np.asarray(body.centers), np.asarray(body.normals)
+    to_light, across = (each / np.linalg.norm(each) for each in rng.normal(size=(2, 3)))
+    waves = [np.sin(centers @ rng.normal(size=3) * rng.uniform(0.2, 1.0) + rng.uniform(0, 6)) for _ in range(2)]
+    irradiance = np.stack([np.maximum(normals @ to_light, 0) * (1 + 0.3 * waves[0]), (1 + 0.5 * waves[1])])
+    irradiance[1] *= 1 / (1 + np.exp(-4 * (centers @ across - rng.uniform(-5, 5))))
+    factors = np.exp(rng.uniform(np.log(0.85), np.log(1.2), len(VARIANCES)))
+    variances = jnp.asarray(VARIANCES) * jnp.asarray(factors)
+    sources = Sources(body.centers.T, body.normals.T, body.areas, jnp.asarray(irradiance))
+    points = jnp.stack([pixel_points(view, each.depth) for each in seen])
+    covered = jnp.stack([each.weight_sum > 0 for each in seen])
+    seen = surfaces.front.coverage > 0.5  # by coverage pictures multiply; where it is small, the point lies off the body
+    return Lit(sources, Kernels(variances, 0.75 * jnp.sqrt(variances)), points), covered, np.asarray(seen), view
+
+
+@cache
+def through_clusters():
+    factors = jnp.asarray(np.random.default_rng(1).normal(size=(len(VARIANCES), 2, CHANNELS + 1, SIZE, SIZE)))
+    _, _, diffuser = body_and_plan()
+
+    def run(each, scene, covered, view):
+        found = each.diffuse(scene.sources, scene.kernels, scene.points, covered, view)
+        return jnp.concatenate([found.means, found.exits[:, :, None]], axis=2), found.needed
+
+    @jax.jit
+    def fast(scene: Lit, covered, view):
+        def total(scene):
+            values, needed = run(diffuser, scene, covered, view)
+            return jnp.vdot(factors, values), (values, needed)
+
+        return jax.value_and_grad(total, has_aux=True)(scene)
+
+    return fast, jax.jit(lambda *scene: run(DenseDiffuser(), *scene)[0])
+
+
+def test_clusters_err_as_stated_and_their_gradient_is_that_of_differences(float64):
+    """Errors are those of all scenes together; each scene is moved along one of the things it is differentiated in."""
+    fast, plain = through_clusters()
+    errors, slopes = {}, {}
+    for seed in seeds(LIT_IN_SUITE):
+        scene, covered, seen, view = lit(seed)
+        (_, (values, needed)), gradient = fast(scene, covered, view)
+        assert float(needed) <= 1
+        expected = np.asarray(plain(scene, covered, view))
+        for k in range(len(VARIANCES)):
+            for row, name in enumerate(("mean", "mean", "exits")):
+                ours, theirs = np.asarray(values)[k, 0, row][seen], expected[k, 0, row][seen]
+                errors.setdefault((k, name), []).append(np.abs(ours - theirs) / np.sqrt(np.mean(theirs**2)))
+        leaves, structure = jax.tree.flatten(scene)
+        moved = seed % len(leaves)
+        way = jnp.asarray(np.random.default_rng(seed).normal(size=leaves[moved].shape)) * jnp.mean(jnp.abs(leaves[moved]))
+
+        def total(step, leaves=leaves, moved=moved, way=way, structure=structure, covered=covered, view=view):
+            there = structure.unflatten([leaf + step * way if i == moved else leaf for i, leaf in enumerate(leaves)])
+            return float(fast(there, covered, view)[0][0])
+
+        difference = (total(STEP) - total(-STEP)) / (2 * STEP)
+        along = jax.tree.leaves(gradient)[moved]
+        typical = float(jnp.linalg.norm(along) * jnp.linalg.norm(way)) / np.sqrt(way.size)  # a way may happen to lead nowhere
+        slopes[moved] = max(slopes.get(moved, 0.0), abs(float(jnp.vdot(along, way)) - difference) / typical)
+    pooled = {key: np.quantile(np.concatenate(each), [0.5, 0.99]) for key, each in errors.items()}
+    print({key: f"{median:.1e} {high:.1e}" for key, (median, high) in pooled.items()})
+    print({place: f"{error:.1e}" for place, error in slopes.items()})
+    assert len(slopes) == len(leaves)
+    assert max(slopes.values()) < AGREEMENT, slopes
+    for (k, name), (median, high) in pooled.items():
+        assert median < (MEDIAN if name == "mean" else EXITS_MEDIAN), (k, name, median)
+        assert high < HIGH, (k, name, high)
