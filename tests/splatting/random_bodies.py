@@ -120,7 +120,10 @@ def _drawn(kind: str, rng: np.random.Generator, count: int, seen: Sight):
     if kind == "behind":
         depth = -depth
     if kind in ("off screen", "none is seen"):
-        x = np.where(rng.uniform(size=count) < 0.5, -1, 1) * rng.uniform(2, 40, count) * width
+        away = rng.uniform(1, 40, count) * width
+        x = np.where(rng.uniform(size=count) < 0.5, -away, width + away)
+    if kind == "off screen":
+        size = np.where(rng.uniform(size=count) < 0.5, size, away * rng.uniform(0.8, 2.0, count))  # some reach into the picture
     if kind == "at the border":
         x = rng.choice([0.0, width], count) + rng.uniform(-1.5, 1.5, count) * size
     if kind == "through the near plane":
