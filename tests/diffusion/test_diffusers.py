@@ -161,7 +161,7 @@ def test_far_from_every_source_gradients_are_finite(x64):
     assert all(np.all(np.isfinite(np.asarray(leaf))) for leaf in jax.tree.leaves(gradient))
 
 
-def test_outside_its_plan_the_diffuser_says_so(x64):
+def test_outside_its_plan_the_diffuser_says_so(float64, x64):
     body, atlas, sources, points, covered = scene(x64)
     diffuser = planned(body, atlas)
     run = jax.jit(lambda d, k: d.diffuse(sources, k, points, covered, atlas).needed)
@@ -170,7 +170,7 @@ def test_outside_its_plan_the_diffuser_says_so(x64):
     assert float(run(diffuser, kernels(0.7))) > 1
 
 
-def test_a_nearer_camera_needs_more_than_planned(x64):
+def test_a_nearer_camera_needs_more_than_planned(float64, x64):
     body, atlas, sources, points, covered = scene(x64)
     from_afar, _, _ = atlas_of(body, bodies.perspective(fov=120.0, width=SIZE, height=SIZE))
     diffuser = planned(body, from_afar, error=0.0)

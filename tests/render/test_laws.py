@@ -52,6 +52,7 @@ def test_white_material_with_an_albedo_map_gives_the_albedo():
     np.testing.assert_allclose(exitance, np.broadcast_to(albedo, exitance.shape), rtol=EXITANCE_TOLERANCE)
 
 
+@pytest.mark.once
 def test_a_white_diffuser_facing_pi_has_radiance_one():
     gaussians = sj.SumOfGaussians(jnp.ones(1), jnp.ones((1, 3)))
     scene = sj.Scene(sheet(1.0, 20.0), (lamp((np.pi,) * 3),), sj.Material(gaussians, specular=0.0))
@@ -104,6 +105,7 @@ def test_energy_does_not_depend_on_how_finely_half_the_sheet_is_splatted():
     assert np.max(np.abs(pictures[1] / pictures[0] - 1)[seen]) < 0.01
 
 
+@pytest.mark.once
 def test_layers_add_up_to_the_diffuse_picture_and_that_to_beauty(bumpy_frame):
     frame = bumpy_frame
     total = np.einsum("kc,khwc->hwc", np.asarray(frame.weights, np.float64), np.asarray(frame.layers, np.float64))
@@ -111,6 +113,7 @@ def test_layers_add_up_to_the_diffuse_picture_and_that_to_beauty(bumpy_frame):
     np.testing.assert_allclose(np.asarray(frame.beauty), np.asarray(frame.diffuse + frame.specular), atol=1e-6)
 
 
+@pytest.mark.once
 def test_a_closed_surface_has_no_hole(bumpy_frame):
     coverage = np.asarray(bumpy_frame.coverage)
     y, x = np.mgrid[0 : coverage.shape[0], 0 : coverage.shape[1]] + 0.5

@@ -41,12 +41,10 @@ def test_absorption_by_differences_of_the_same_walks(float64):
 
 def test_scattering_by_differences_of_other_walks(float32):
     """Within their errors, for all that is reported."""
-    photons, step = 1_000_000, 0.1
+    # A long step: dividing by it magnifies the errors of the differences, and what they bend over it is a tenth of those.
+    photons, step = 1_000_000, 0.2
     _, _, by_scattering = sj.path_derivatives(slab(0.2, 2.0), photons, KEY)
-    # More photons for the differences: dividing by the step magnifies their errors.
-    below, above = (
-        sj.monte_carlo(slab(0.2, 2.0 + sign * step), 4 * photons, jax.random.fold_in(KEY, sign + 2)) for sign in (-1, 1)
-    )
+    below, above = (sj.monte_carlo(slab(0.2, 2.0 + sign * step), photons, jax.random.fold_in(KEY, sign + 2)) for sign in (-1, 1))
     for name in ("total_reflectance", "total_transmittance", "absorbed"):
         one, other, found = getattr(below, name), getattr(above, name), getattr(by_scattering, name)
         difference = (np.asarray(other.value) - np.asarray(one.value)) / (2 * step)
