@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from splatjax.diffusion import ClusterDiffuser, DenseDiffuser, Kernels, Sources
-from splatjax.splatting import Atlas, DenseRasterizer, SplattingSettings, farthest_depths, splat_surfaces
+from splatjax.splatting import DenseRasterizer, SplattingSettings, splat_surfaces
 
 COUNT, SIZE = 3000, 64
 VARIANCES = (1.0, 9.0, 20.0)
@@ -30,14 +30,10 @@ def atlas_of(body, view):
 
     @jax.jit
     def look(body):
-        surfaces = splat_surfaces(
-            body, jnp.zeros((0, body.count), body.centers.dtype), view, SplattingSettings(), DenseRasterizer()
-        )
-        farthest = farthest_depths(surfaces)
-        atlas = Atlas.of(farthest, view, farthest.size)
-        rows = atlas.pack(*(jnp.stack([each.depth, each.weight_sum]) for each in (surfaces.front, surfaces.behind)))
-        covered = rows[:, 1] > 0
-        return atlas, atlas.points(jnp.where(covered, rows[:, 0], 1.0)).transpose(1, 0, 2), covered
+        nothing = jnp.zeros((0, body.count), body.centers.dtype)
+        surfaces = splat_surfaces(body, nothing, view, SplattingSettings(), DenseRasterizer())
+        both = surfaces.front, surfaces.behind
+        return bodies.packed(jnp.stack([each.depth for each in both]), jnp.stack([each.weight_sum for each in both]), view)
 
     return look(body)
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from random_bodies import KINDS, disagreement, random_body, seeds
 
-from splatjax.diffusion import ClusterDiffuser, DenseDiffuser, Kernels, Sources, pixel_points
+from splatjax.diffusion import ClusterDiffuser, DenseDiffuser, Kernels, Sources
 from splatjax.diffusion._clustered import LayerPlan
 from splatjax.diffusion._pixels import tile_grid
 from splatjax.scene import Splats
@@ -42,15 +42,15 @@ def within_support(sources: Sources, kernels: Kernels, points, covered, support:
     """Give means and exits, written down plainly; 0 where no source is within the support."""
     found = []
     for variance, depth in zip(kernels.variances, kernels.depths, strict=True):
-        offset = points[:, :, :, :, None] - (sources.centers - depth * sources.normals)[None, :, None, None]
+        offset = points[:, :, :, None] - (sources.centers - depth * sources.normals)[None, :, None]
         exponent = 0.5 * jnp.sum(offset * offset, axis=1) / variance
-        weight = jnp.where(exponent < 0.5 * support**2, jnp.exp(-exponent), 0.0) * sources.areas[None, None, None]
+        weight = jnp.where(exponent < 0.5 * support**2, jnp.exp(-exponent), 0.0) * sources.areas[None, None]
         gathered = jnp.sum(weight, axis=-1)
         reached = covered & (gathered > 0)
-        means = jnp.einsum("cj,shwj->schw", sources.irradiance, weight) / jnp.where(reached, gathered, 1.0)[:, None]
+        means = jnp.einsum("cj,tpj->tcp", sources.irradiance, weight) / jnp.where(reached, gathered, 1.0)[:, None]
         exits = gathered * jnp.exp(0.5 * depth * depth / variance) / (2 * jnp.pi * variance)
         found.append(jnp.where(reached[:, None], jnp.concatenate([means, exits[:, None]], axis=1), 0.0))
-    return jnp.stack(found)
+    return jnp.stack(found, axis=1)
 
 
 class Scene(eqx.Module):
@@ -73,8 +73,8 @@ def random_scene(seed: int, count: int) -> tuple[Splats, Scene, jax.Array]:
     rng = np.random.default_rng([seed, count])
     body = eqx.tree_at(lambda s: s.areas, body, jnp.asarray(np.exp(rng.normal(size=count))))
     depths = np.exp(rng.normal(size=(2, HEIGHT, WIDTH)) * rng.choice([0.02, 0.5]) + np.log(rng.uniform(4, 40)))
-    points = jnp.stack([pixel_points(view, jnp.asarray(each)) for each in depths])
-    away = np.linalg.norm(np.asarray(points)[..., None] - np.asarray(body.centers).T[None, :, None, None], axis=1)
+    _, points, _ = bodies.packed(jnp.asarray(depths), jnp.ones(depths.shape), view)
+    away = np.linalg.norm(np.asarray(points)[..., None] - np.asarray(body.centers).T[None, :, None], axis=1)
     gaussians = gaussians_of(count)
     variances = np.quantile(away, 10 ** rng.uniform(-2, 0, gaussians)) ** 2 / rng.uniform(1, 10, gaussians)
     covered = rng.uniform(size=depths.shape) < rng.choice([0.0, 0.3, 1.0], (2, 1, 1), p=[0.1, 0.3, 0.6])
@@ -87,26 +87,30 @@ def random_scene(seed: int, count: int) -> tuple[Splats, Scene, jax.Array]:
 @cache
 def by_both(count: int):
     """Give a function of a scene: values and gradients of a random sum of them, of the fast diffuser and of the plain sum."""
-    factors = jnp.asarray(np.random.default_rng(count).normal(size=(gaussians_of(count), 2, CHANNELS + 1, HEIGHT, WIDTH)))
+    tiles = tile_grid(WIDTH, HEIGHT, 1)
+    shape = tiles.across * tiles.down, gaussians_of(count), CHANNELS + 1, tiles.side**2
+    factors = jnp.asarray(np.random.default_rng(count).normal(size=shape))
 
     def stacked(found):
         return jnp.concatenate([found.means, found.exits[:, :, None]], axis=2)
 
     @jax.jit
     def both(diffuser: ClusterDiffuser, scene: Scene, covered):
-        def points_of(scene):
-            return jnp.stack([pixel_points(scene.view, each) for each in scene.depths])
+        def seen(scene):
+            return bodies.packed(scene.depths, covered.astype(scene.depths.dtype), scene.view)
 
         def fast(scene: Scene):
-            found = diffuser.diffuse(scene.sources, scene.kernels, points_of(scene), covered, scene.view)
+            atlas, points, there = seen(scene)
+            found = diffuser.diffuse(scene.sources, scene.kernels, points, there, atlas)
             return stacked(found), found.needed
 
         def plain(scene: Scene):
-            return within_support(scene.sources, scene.kernels, points_of(scene), covered, diffuser.support), jnp.zeros(())
+            _, points, there = seen(scene)
+            return within_support(scene.sources, scene.kernels, points, there, diffuser.support), jnp.zeros(())
 
         # Exits are areas over that of the kernel: times it all are as large, and no sum is drowned in another's rounding.
         flat = 2 * jnp.pi * scene.kernels.variances
-        as_large = jnp.stack([*[jnp.ones_like(flat)] * CHANNELS, flat], axis=1)[:, None, :, None, None]
+        as_large = jnp.stack([*[jnp.ones_like(flat)] * CHANNELS, flat], axis=1)[None, :, :, None]
 
         def found(diffuse):
             def total(scene):
@@ -115,7 +119,8 @@ def by_both(count: int):
 
             return jax.value_and_grad(total, has_aux=True)(scene)
 
-        untruncated = DenseDiffuser().diffuse(scene.sources, scene.kernels, points_of(scene), covered, scene.view)
+        atlas, points, there = seen(scene)
+        untruncated = DenseDiffuser().diffuse(scene.sources, scene.kernels, points, there, atlas)
         return found(fast), found(plain), stacked(untruncated)
 
     return both
@@ -126,7 +131,8 @@ def test_without_clusters_all_within_the_support_is_summed(float64, count):
     both, worst, reached = by_both(count), {}, 0
     for seed in seeds(IN_SUITE if count > 1 else len(KINDS)):
         body, scene, covered = random_scene(seed, count)
-        diffuser = ClusterDiffuser(error=0.0).planned(body, scene.kernels, jnp.asarray(RESOLVED), [scene.view])
+        atlas, _, _ = bodies.packed(scene.depths, covered.astype(float), scene.view)
+        diffuser = ClusterDiffuser(error=0.0).planned(body, scene.kernels, jnp.asarray(RESOLVED), [atlas])
         found, expected, untruncated = both(with_room(diffuser, count), scene, covered)
         (_, (values, needed)), gradients = found
         (_, (plain, _)), plain_gradients = expected
@@ -167,6 +173,20 @@ class Lit(eqx.Module):
 
 
 @cache
+def seen_of():
+    """Give a function of body and view: depths, sums of weights and coverage of both surfaces."""
+    nothing = jnp.zeros((0, COUNT))
+
+    @jax.jit
+    def look(body, view):
+        surfaces = splat_surfaces(body, nothing, view, SplattingSettings(), DenseRasterizer())
+        both = surfaces.front, surfaces.behind
+        return tuple(jnp.stack([getattr(each, name) for each in both]) for name in ("depth", "weight_sum", "coverage"))
+
+    return look
+
+
+@cache
 def body_and_plan() -> tuple[Splats, list, ClusterDiffuser]:
     """One plan for all cameras."""
     body, rng = bodies.bumpy(COUNT), np.random.default_rng(3)
@@ -174,17 +194,12 @@ def body_and_plan() -> tuple[Splats, list, ClusterDiffuser]:
     eyes *= rng.uniform(30, 50, (LIT_IN_SUITE, 1)) / np.linalg.norm(eyes, axis=1, keepdims=True)
     views = [bodies.perspective(eye, fov=32.0, width=SIZE, height=SIZE) for eye in eyes]
     kernels = Kernels(jnp.asarray(VARIANCES), 0.75 * jnp.sqrt(jnp.asarray(VARIANCES)))
-    diffuser = ClusterDiffuser(support=SUPPORT).planned(body, kernels, jnp.asarray(RESOLVED), views)
+    atlases = [bodies.packed(*seen_of()(body, view)[:2], view)[0] for view in views]
+    diffuser = ClusterDiffuser(support=SUPPORT).planned(body, kernels, jnp.asarray(RESOLVED), atlases)
     assert diffuser.layers is not None
     assert [layer.level for layer in diffuser.layers] == [1, 2]
     assert all(layer.nodes is not None for layer in diffuser.layers)
     return body, views, diffuser
-
-
-@cache
-def seen_depths():
-    nothing = jnp.zeros((0, COUNT))
-    return jax.jit(lambda s, view: splat_surfaces(s, nothing, view, SplattingSettings(), DenseRasterizer()))
 
 
 def lit(seed: int):
@@ -192,8 +207,7 @@ def lit(seed: int):
     body, views, _ = body_and_plan()
     rng, view = np.random.default_rng(seed), views[seed % LIT_IN_SUITE]
     body = eqx.tree_at(lambda s: s.centers, body, body.centers + jnp.asarray(rng.normal(size=(COUNT, 3)) * 0.02))
-    surfaces = seen_depths()(body, view)
-    seen = surfaces.front, surfaces.behind
+    depths, weight_sums, coverage = seen_of()(body, view)
     centers, normals = np.asarray(body.centers), np.asarray(body.normals)
     to_light, across = (each / np.linalg.norm(each) for each in rng.normal(size=(2, 3)))
     waves = [np.sin(centers @ rng.normal(size=3) * rng.uniform(0.2, 1.0) + rng.uniform(0, 6)) for _ in range(2)]
@@ -202,25 +216,27 @@ def lit(seed: int):
     factors = np.exp(rng.uniform(np.log(0.85), np.log(1.2), len(VARIANCES)))
     variances = jnp.asarray(VARIANCES) * jnp.asarray(factors)
     sources = Sources(body.centers.T, body.normals.T, body.areas, jnp.asarray(irradiance))
-    points = jnp.stack([pixel_points(view, each.depth) for each in seen])
-    covered = jnp.stack([each.weight_sum > 0 for each in seen])
-    seen = surfaces.front.coverage > 0.5  # by coverage pictures multiply; where it is small, the point lies off the body
-    return Lit(sources, Kernels(variances, 0.75 * jnp.sqrt(variances)), points), covered, np.asarray(seen), view
+    atlas, points, covered = bodies.packed(depths, weight_sums, view)
+    # By coverage pictures multiply; where it is small, the point lies off the body.
+    seen = np.asarray((atlas.pack(coverage[:1], 0 * coverage[1:])[:, 0] > 0.5) & atlas.in_front[:, None])
+    return Lit(sources, Kernels(variances, 0.75 * jnp.sqrt(variances)), points), covered, seen, atlas
 
 
 @cache
 def through_clusters():
-    factors = jnp.asarray(np.random.default_rng(1).normal(size=(len(VARIANCES), 2, CHANNELS + 1, SIZE, SIZE)))
+    tiles = tile_grid(SIZE, SIZE, 1)
+    shape = tiles.across * tiles.down, len(VARIANCES), CHANNELS + 1, tiles.side**2
+    factors = jnp.asarray(np.random.default_rng(1).normal(size=shape))
     _, _, diffuser = body_and_plan()
 
-    def run(each, scene, covered, view):
-        found = each.diffuse(scene.sources, scene.kernels, scene.points, covered, view)
+    def run(each, scene, covered, atlas):
+        found = each.diffuse(scene.sources, scene.kernels, scene.points, covered, atlas)
         return jnp.concatenate([found.means, found.exits[:, :, None]], axis=2), found.needed
 
     @jax.jit
-    def fast(scene: Lit, covered, view):
+    def fast(scene: Lit, covered, atlas):
         def total(scene):
-            values, needed = run(diffuser, scene, covered, view)
+            values, needed = run(diffuser, scene, covered, atlas)
             return jnp.vdot(factors, values), (values, needed)
 
         return jax.value_and_grad(total, has_aux=True)(scene)
@@ -233,21 +249,21 @@ def test_clusters_err_as_stated_and_their_gradient_is_that_of_differences(float6
     fast, plain = through_clusters()
     errors, slopes = {}, {}
     for seed in seeds(LIT_IN_SUITE):
-        scene, covered, seen, view = lit(seed)
-        (_, (values, needed)), gradient = fast(scene, covered, view)
+        scene, covered, seen, atlas = lit(seed)
+        (_, (values, needed)), gradient = fast(scene, covered, atlas)
         assert float(needed) <= 1
-        expected = np.asarray(plain(scene, covered, view))
+        expected = np.asarray(plain(scene, covered, atlas))
         for k in range(len(VARIANCES)):
             for row, name in enumerate(("mean", "mean", "exits")):
-                ours, theirs = np.asarray(values)[k, 0, row][seen], expected[k, 0, row][seen]
+                ours, theirs = np.asarray(values)[:, k, row][seen], expected[:, k, row][seen]
                 errors.setdefault((k, name), []).append(np.abs(ours - theirs) / np.sqrt(np.mean(theirs**2)))
         leaves, structure = jax.tree.flatten(scene)
         moved = seed % len(leaves)
         way = jnp.asarray(np.random.default_rng(seed).normal(size=leaves[moved].shape)) * jnp.mean(jnp.abs(leaves[moved]))
 
-        def total(step, leaves=leaves, moved=moved, way=way, structure=structure, covered=covered, view=view):
+        def total(step, leaves=leaves, moved=moved, way=way, structure=structure, covered=covered, atlas=atlas):
             there = structure.unflatten([leaf + step * way if i == moved else leaf for i, leaf in enumerate(leaves)])
-            return float(fast(there, covered, view)[0][0])
+            return float(fast(there, covered, atlas)[0][0])
 
         difference = (total(STEP) - total(-STEP)) / (2 * STEP)
         along = jax.tree.leaves(gradient)[moved]

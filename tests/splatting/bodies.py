@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from splatjax.scene import Camera, Splats
-from splatjax.splatting import OrthographicView, PerspectiveView
+from splatjax.splatting import Atlas, OrthographicView, PerspectiveView, Surface, Surfaces, farthest_depths
 
 
 def splats(centers, normals, radii, areas=None) -> Splats:
@@ -84,3 +84,16 @@ def orthographic(scale=1.2, width=40, height=32) -> OrthographicView:
     right /= np.linalg.norm(right)
     rotation = jnp.asarray(np.stack([right, np.cross(forward, right), forward]), float)
     return OrthographicView(jnp.zeros(3), rotation, jnp.asarray(scale, float), width, height)
+
+
+def packed(depths, weight_sums, view):
+    """The atlas of a front surface and one behind it `[2, height, width]`, their points in it (mm), and which are covered."""
+    surfaces = [
+        Surface(jnp.zeros((0, *depth.shape), depth.dtype), depth, weight_sum, weight_sum)
+        for depth, weight_sum in zip(depths, weight_sums, strict=True)
+    ]
+    farthest = farthest_depths(Surfaces(*surfaces, jnp.zeros((), depths.dtype)))
+    atlas = Atlas.of(farthest, view, farthest.size)
+    rows = atlas.pack(*jnp.stack([depths, weight_sums], axis=1))
+    covered = rows[:, 1] > 0
+    return atlas, atlas.points(jnp.where(covered, rows[:, 0], 1.0)).transpose(1, 0, 2), covered
