@@ -114,7 +114,7 @@ class ClusterDiffuser(AbstractDiffuser):
         cells = sorted({float(edge) for edge in edges if edge > 0})
         tree = ClusterTree.build(splats.centers, cells)
         origin = jnp.mean(splats.centers, axis=0)
-        levels = tree.levels(Sources(splats.centers.T - origin[:, None], splats.normals.T, splats.areas, splats.areas[None]))
+        levels = _levels(tree, Sources(splats.centers.T - origin[:, None], splats.normals.T, splats.areas, splats.areas[None]))
         layers = []
         for v, depth, edge, is_carried in zip(values, kernels.depths, edges, carried, strict=True):
             level = cells.index(edge) + 1 if edge > 0 else 0
@@ -235,6 +235,11 @@ def _parts(diffuser: ClusterDiffuser):
 
 def _is_none(leaf) -> bool:
     return leaf is None
+
+
+@eqx.filter_jit
+def _levels(tree: ClusterTree, sources: Sources) -> list[Clusters]:
+    return tree.levels(sources)
 
 
 @eqx.filter_jit

@@ -1,5 +1,6 @@
 """Layers narrower than the splats are handed over to the surface itself."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.lax import stop_gradient
@@ -12,6 +13,7 @@ from ._settings import DiffusionSettings
 _SAMPLES = 64
 
 
+@eqx.filter_jit
 def irregularity(splats: Splats) -> Float[Array, ""]:
     r"""Give how unevenly the splats are spread: 0 on a regular grid, about 0.5 at random.
 
