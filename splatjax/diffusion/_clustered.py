@@ -136,13 +136,10 @@ class ClusterDiffuser(AbstractDiffuser):
 
     def _plan_nodes(self, clusters: Clusters, variance: float, depth: Float[Array, ""], edge: float, radii) -> NodePlan:
         """Find what nodes gather from. Pixels are within a radius of a splat's center, and that within 0.87 edges of a node."""
-        below = clusters.lowered(depth)
-        boxes = Boxes.around(clusters.centers, clusters.areas > 0, BLOCK)
-        sources = Boxes.around(below.centers, clusters.areas > 0, _SOURCES)
         # Sources of a wider layer lie deeper, where clusters may be wider too.
-        spread = max(float(jnp.max(clusters.lowered(d).spread)) for d in (depth, depth * math.sqrt(self.margin)))
+        boxes, sources, spread = _boxes(clusters, depth, depth * math.sqrt(self.margin))
         sinking = math.sqrt(3) * float(depth) * (math.sqrt(self.margin) - 1)
-        reach = self.support * math.sqrt(variance + spread) + sinking
+        reach = self.support * math.sqrt(variance + float(spread)) + sinking
         neighbors = Neighbors.find(boxes, sources, reach, min(_LANES, boxes.low.shape[1]), _SOURCE_SLOTS)
         return NodePlan(neighbors, jnp.maximum(_SMOOTHING * edge, (radii + 0.87 * edge) / _BLENDED))
 
@@ -151,8 +148,7 @@ class ClusterDiffuser(AbstractDiffuser):
     ) -> BinCapacity:
         """Find how much the lists of tiles must hold: sources, or nodes."""
         if nodes is None:
-            clusters = clusters.lowered(depth)
-            reach = self.support * jnp.sqrt(jnp.asarray(variance, clusters.spread.dtype) + clusters.spread)
+            clusters, reach = _reaching(clusters, depth, jnp.asarray(variance, depth.dtype), self.support)
             size = _SOURCES, _SOURCE_SLOTS
         else:
             reach = _BLENDED * nodes.deviations
@@ -240,6 +236,21 @@ def _is_none(leaf) -> bool:
 @eqx.filter_jit
 def _levels(tree: ClusterTree, sources: Sources) -> list[Clusters]:
     return tree.levels(sources)
+
+
+@eqx.filter_jit
+def _boxes(clusters: Clusters, depth: Float[Array, ""], deeper: Float[Array, ""]):
+    """Give boxes around nodes and around sources, and the greatest spread of these at both depths."""
+    below, there = clusters.lowered(depth), clusters.areas > 0
+    spread = jnp.maximum(jnp.max(below.spread), jnp.max(clusters.lowered(deeper).spread))
+    return Boxes.around(clusters.centers, there, BLOCK), Boxes.around(below.centers, there, _SOURCES), spread
+
+
+@eqx.filter_jit
+def _reaching(clusters: Clusters, depth: Float[Array, ""], variance: Float[Array, ""], support: float):
+    """Give the sources of a layer, and how far each of them reaches, mm."""
+    below = clusters.lowered(depth)
+    return below, support * jnp.sqrt(variance + below.spread)
 
 
 @eqx.filter_jit
