@@ -54,6 +54,7 @@ random-scenes: setup
 
 bench: setup
 	$(BIN)/python -m benchmarks
+	$(BIN)/python -m benchmarks.scale
 
 # Written anew when dependencies change; hashes, no addresses.
 lock: setup
