@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Float
 
-from splatjax.pointwise import in_parts
+from splatjax.pointwise import AT_ONCE, in_parts
 from splatjax.scene import Splats
 
 from ._rasterizer import AbstractRasterizer
@@ -115,9 +115,9 @@ def light_surfaces(splats: Splats, view: AbstractView, splatting: SplattingSetti
     return splat_surfaces(splats, jnp.zeros((0, splats.count), splats.centers.dtype), view, splatting, rasterizer)
 
 
-def _spline(t: Float[Array, " splats"]) -> tuple[Float[Array, " splats"], ...]:
+def _spline(t: Float[Array, " splats"]) -> Float[Array, "3 splats"]:
     """Give the quadratic B-spline's weights of the three pixels around a place; `t` in [-1/2, 1/2] from the middle one."""
-    return 0.5 * (0.5 - t) ** 2, 0.75 - t * t, 0.5 * (0.5 + t) ** 2
+    return jnp.stack([0.5 * (0.5 - t) ** 2, 0.75 - t * t, 0.5 * (0.5 + t) ** 2])
 
 
 def lit_share(splats: Splats, view: AbstractView, surfaces: Surfaces, settings: ShadowSettings) -> Float[Array, " splats"]:
@@ -139,7 +139,8 @@ def lit_share(splats: Splats, view: AbstractView, surfaces: Surfaces, settings: 
 
     # Where splats land is kept: each of nine comparisons, and each of their derivatives, reads it.
     landed = in_parts(land, splats.centers, splats.normals)
-    return in_parts(lambda part: _compared(part.T, view, flat, flat_behind, settings), landed)
+    # Large parts: for each, the way back adds to the whole map.
+    return in_parts(lambda part: _compared(part.T, view, flat, flat_behind, settings), landed, at_once=4 * AT_ONCE)
 
 
 def _compared(
@@ -154,24 +155,27 @@ def _compared(
     column, row = jnp.floor(stop_gradient(x)), jnp.floor(stop_gradient(y))
     tx, ty = x - column - 0.5, y - row - 0.5
 
-    def held_up(step_x: int, step_y: int):
-        at_x, at_y = column.astype(jnp.int32) + step_x, row.astype(jnp.int32) + step_y
-        index = jnp.clip(at_y, 0, view.height - 1) * view.width + jnp.clip(at_x, 0, view.width - 1)
-        outside = (at_x < 0) | (at_y < 0) | (at_x >= view.width) | (at_y >= view.height)
-        here = depth + slope_x * (step_x - tx) + slope_y * (step_y - ty)
+    # Nine pixels around each splat, side by side: [across, down, splats].
+    step = jnp.arange(-1, 2, dtype=jnp.int32)
+    step_x, step_y = step[:, None, None], step[None, :, None]
+    at_x, at_y = column.astype(jnp.int32)[None, None] + step_x, row.astype(jnp.int32)[None, None] + step_y
+    index = jnp.clip(at_y, 0, view.height - 1) * view.width + jnp.clip(at_x, 0, view.width - 1)
+    inside = (at_x >= 0) & (at_y >= 0) & (at_x < view.width) & (at_y < view.height)
+    across = slope_x[None, None] * (step_x.astype(x.dtype) - tx[None, None])
+    down = slope_y[None, None] * (step_y.astype(x.dtype) - ty[None, None])
+    here = depth[None, None] + across + down
 
-        def hidden(plane):
-            t = jnp.clip((here - plane[0][index] - settings.bias) / settings.softness, 0, 1)
-            return plane[1][index] * t * t * (3 - 2 * t)
+    def hidden(depth, coverage):
+        t = jnp.clip((here - depth - settings.bias) / settings.softness, 0, 1)
+        return coverage * t * t * (3 - 2 * t)
 
-        blocked = hidden(flat) + (1 - flat[1][index]) * hidden(flat_behind)
-        return jnp.where(outside, 0.0, blocked)
+    def of_map(plane):
+        return plane.at[index].get(mode="promise_in_bounds")
 
-    blocked = sum(
-        wx * wy * held_up(i, j)
-        for i, wx in zip((-1, 0, 1), _spline(tx), strict=True)
-        for j, wy in zip((-1, 0, 1), _spline(ty), strict=True)
-    )
+    coverage = of_map(flat[1])
+    blocked = hidden(of_map(flat[0]), coverage) + (1 - coverage) * hidden(*(of_map(plane) for plane in flat_behind))
+    weights = _spline(tx)[:, None] * _spline(ty)[None]
+    blocked = jnp.sum(weights * jnp.where(inside, blocked, 0.0), axis=(0, 1))
     return jnp.maximum(1 - blocked, 0)  # rounding must not make light negative
 
 
