@@ -15,8 +15,9 @@ AT_ONCE = 1 << 16
 def in_parts(function: Callable[..., Result], *arrays: PyTree, at_once: int = AT_ONCE) -> Result:
     r"""Apply a function to parts of arrays, one after the other, and put the results together.
 
-    What is computed on the way is never larger than a part, and for the derivative it is computed anew. What is found is
-    kept: a compiler that fuses would otherwise compute it again wherever it is read, many times over.
+    What is no more than one part is done at once. Of more, what is computed on the way is never larger than a part, and for the
+    derivative it is computed anew. What is found is kept: a compiler that fuses would otherwise compute it again wherever it is
+    read, many times over.
 
     **Arguments:**
 

@@ -52,11 +52,14 @@ class Shot:
     """Number of splats of the built-in bust."""
 
     def check(self) -> None:
-        """Raise `ValueError` for a fill, an exposure or an elevation that cannot be."""
+        """Raise `ValueError` for a fill, an exposure or an angle that cannot be."""
         if not 0 <= self.fill < math.inf:
             raise ValueError(f"--fill is {self.fill:g}; it is a share of the light's strength: 0 or more")
         if not math.isfinite(self.exposure):
             raise ValueError(f"--exposure is {self.exposure:g}; it must be a finite number of stops")
+        for name in ("azimuth", "light_azimuth", "light_elevation"):
+            if not math.isfinite(value := getattr(self, name)):
+                raise ValueError(f"--{name.replace('_', '-')} is {value:g}; it must be a finite number of degrees")
         if not -90 < self.elevation < 90:
             raise ValueError(f"--elevation is {self.elevation:g}; it must lie between -90 and 90 degrees, both excluded")
 
@@ -84,7 +87,7 @@ class Shot:
         key = sj.DirectionalLight(direction=-towards(light_azimuth, self.light_elevation), irradiance=irradiance)
         if self.fill == 0:
             return (key,)
-        side = math.copysign(_FILL_SIDE, self.azimuth - self.light_azimuth)
+        side = math.copysign(_FILL_SIDE, math.remainder(self.azimuth - self.light_azimuth, 360))
         beside = towards(azimuth + side, _FILL_ELEVATION)
         return key, sj.DirectionalLight(direction=-beside, irradiance=self.fill * irradiance, cast_shadows=False)
 
@@ -117,7 +120,7 @@ def draw(scene: sj.Scene, camera: sj.Camera, plan: sj.Plan) -> sj.Frame:
     **Raises:** `ValueError` when the plan lacks room.
     """
     frame = jax.block_until_ready(sj.render(scene, camera, plan=plan))
-    if frame.overflow > 0:
+    if not frame.overflow <= 0:
         raise ValueError(f"the plan lacks room: {float(frame.overflow):.2f} times what it holds is needed")
     return frame
 

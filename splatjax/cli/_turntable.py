@@ -16,6 +16,7 @@ from ._report import note, progress, stage
 from ._shot import Shot, draw
 
 _RECORD = "turntable.json"
+_LARGEST = 16_383  # pixels along a side of a WebP file
 _MOST_FRAMES = 10_000  # that four digits can name
 
 
@@ -48,7 +49,8 @@ class Turntable(Shot):
     """What turns: the camera around object and light, the light around object and camera, or the object before both, which
     is the same as camera and light together around it. The fill keeps beside the camera."""
     degrees: float = 360.0
-    """How far it turns in all: to greater azimuths, or to smaller ones if negative."""
+    """How far camera and light go around in all: to greater azimuths, or to smaller ones if negative. What stands before
+    both seems to turn the other way."""
     fps: float = 24.0
     """Frames per second of turntable.webp, from 0.1 to 60."""
 
@@ -70,6 +72,8 @@ class Turntable(Shot):
         self.check()
         if not 1 <= self.frames <= _MOST_FRAMES:
             raise ValueError(f"--frames is {self.frames}; it must lie between 1 and {_MOST_FRAMES}")
+        if max(self.width, self.height) > _LARGEST:
+            raise ValueError(f"--width and --height are {self.width} and {self.height}; turntable.webp holds at most {_LARGEST}")
         if self.degrees == 0 or not math.isfinite(self.degrees):
             raise ValueError(f"--degrees is {self.degrees:g}; nothing would turn")
         if not 0.1 <= self.fps <= 60:

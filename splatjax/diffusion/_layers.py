@@ -5,9 +5,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from splatjax.pointwise import AT_ONCE, in_parts
+from splatjax.pointwise import in_parts
 from splatjax.scene import Material
-from splatjax.splatting import SIDE, Atlas
+from splatjax.splatting import TILES_AT_ONCE, Atlas
 
 from ._diffuser import AbstractDiffuser, Kernels, Sources
 from ._handover import resolved_share
@@ -124,7 +124,7 @@ def exitance_jacobian(
 
 
 def _in_parts(function, *trees):
-    return in_parts(function, *trees, at_once=AT_ONCE // SIDE**2)
+    return in_parts(function, *trees, at_once=TILES_AT_ONCE)
 
 
 def _tiles_first(found):

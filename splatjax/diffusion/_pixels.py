@@ -105,7 +105,7 @@ def block_ranges(
 
 
 def _farthest_in(ranges: TileRanges, far: Float[Array, "down across"]):
-    """Give the maximum over each rectangle: the smallest power of two that spans it, four overlapping looks at that level."""
+    """Give at least the maximum over each rectangle: that over the smallest square of a power of two that spans it."""
     span = jnp.maximum(ranges.across, ranges.down)
     pyramid, size = [far], 1
     while size < max(far.shape):

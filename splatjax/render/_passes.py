@@ -7,7 +7,7 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float
 
 from splatjax import diffusion as _diffusion, shading as _shading, splatting as _splatting
-from splatjax.pointwise import AT_ONCE, in_parts
+from splatjax.pointwise import in_parts
 from splatjax.scene import Frame, Scene, Splats, StackedLights, stack_lights
 
 from ._plan import Plan, shadow_views
@@ -159,8 +159,7 @@ def shade(
     def shaded(points, depth, covered, named, layers):
         return _shade(scene, view, groups, points, depth, covered, named, layers)
 
-    at_once = AT_ONCE // _splatting.SIDE**2
-    return in_parts(shaded, seen.points, seen.depth, seen.covered, seen.named, layers.layers, at_once=at_once)
+    return in_parts(shaded, seen.points, seen.depth, seen.covered, seen.named, layers.layers, at_once=_splatting.TILES_AT_ONCE)
 
 
 def _shade(scene: Scene, view, groups: list[StackedLights], position, depth, covered, named, layers) -> ShadedSurface:
@@ -231,7 +230,7 @@ def compose(
         diffuse=diffuse,
         specular=specular,
         handed_over=handed_over,
-        overflow=jnp.where(needed > 1, needed, 0.0),
+        overflow=jnp.where(needed <= 1, 0.0, needed),
         single_scattering=single,
     )
     poisoned = poisoned_unless(needed <= 1, frame)
@@ -239,8 +238,8 @@ def compose(
 
 
 def poisoned_unless(fits, tree):
-    """Make every array NaN where the plan does not suffice."""
-    return jax.tree.map(lambda leaf: jnp.where(fits, leaf, jnp.nan), tree)
+    """Make every array NaN where the plan does not suffice, and its derivatives too."""
+    return jax.tree.map(lambda leaf: leaf * jnp.where(fits, 1.0, jnp.nan).astype(leaf.dtype), tree)
 
 
 def _lit_shares(splats: Splats, groups: list[StackedLights], settings: RenderSettings, plan: Plan):

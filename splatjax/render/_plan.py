@@ -62,7 +62,10 @@ def plan(scenes: Scene | Sequence[Scene], cameras: Camera | Sequence[Camera], se
 
 def _plan(scenes: Scene | Sequence[Scene], cameras: Camera | Sequence[Camera], settings: RenderSettings) -> Plan:
     cameras = [cameras] if isinstance(cameras, Camera) else list(cameras)
-    scene, *others = [scenes] if isinstance(scenes, Scene) else scenes
+    scenes = [scenes] if isinstance(scenes, Scene) else list(scenes)
+    if not cameras or not scenes:
+        raise ValueError(f"a plan needs a scene and a camera at least, not {len(scenes)} scenes and {len(cameras)} cameras")
+    scene, *others = scenes
     scene, others, cameras = in_one_dtype(scene, others, cameras)
     if len({(camera.width, camera.height) for camera in cameras}) != 1:
         sizes = sorted({(camera.width, camera.height) for camera in cameras})
@@ -93,9 +96,11 @@ def _plan(scenes: Scene | Sequence[Scene], cameras: Camera | Sequence[Camera], s
 
 @eqx.filter_jit
 def _look(splats: Splats, view, settings: _splatting.SplattingSettings, rasterizer) -> Float[Array, "surfaces down across"]:
-    """Find where there is anything to see, and how far away."""
+    """Find where there is anything to see, and how far away: a tile farther on every side, and two radii, for what moves."""
     nothing = jnp.zeros((0, splats.count), splats.centers.dtype)
-    return _splatting.farthest_depths(_splatting.splat_surfaces(splats, nothing, view, settings, rasterizer))
+    seen = _splatting.farthest_depths(_splatting.splat_surfaces(splats, nothing, view, settings, rasterizer))
+    grown = jax.lax.reduce_window(seen, -jnp.inf, jax.lax.max, (1, 3, 3), (1, 1, 1), "SAME")
+    return jnp.where(grown > -jnp.inf, grown + 2 * jnp.mean(splats.radii), -jnp.inf)
 
 
 def plan_unless_traced(scene: Scene, camera: Camera, settings: RenderSettings, plan: Plan | None) -> Plan:

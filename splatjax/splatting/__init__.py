@@ -1,6 +1,7 @@
 """Passes 1 to 3 of the paper: shadow maps, visibility and attributes (Eq. 1). Knows nothing of scattering."""
 
 from ._atlas import Atlas as Atlas, farthest_depths as farthest_depths, SIDE as SIDE
+from ._atlas import TILES_AT_ONCE as TILES_AT_ONCE
 from ._bins import BinCapacity as BinCapacity, bin_items as bin_items, Bins as Bins, round_up as round_up
 from ._bins import scatter_slots as scatter_slots, slot_plane as slot_plane, TileGrid as TileGrid, TileRanges as TileRanges
 from ._dense import DenseRasterizer as DenseRasterizer

@@ -5,19 +5,27 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Float, Int
 
+from splatjax.pointwise import AT_ONCE
+
 from ._bins import TileGrid
 from ._surfaces import Surfaces
 from ._views import AbstractView
 
 SIDE = 8
 """Pixels along a tile."""
+TILES_AT_ONCE = AT_ONCE // SIDE**2
+"""For what is computed in parts."""
 
 
 def farthest_depths(surfaces: Surfaces) -> Float[Array, "surfaces down across"]:
-    """Give the depth (mm) of the farthest point that each tile shows, of both surfaces; -inf where a tile shows none."""
+    """Give the depth (mm) of the farthest point that each tile shows, of both surfaces; -inf where a tile shows none.
+
+    Where one shows behind, there is a front.
+    """
     both = [jnp.where(each.weight_sum > 0, stop_gradient(each.depth), -jnp.inf) for each in (surfaces.front, surfaces.behind)]
     grid = TileGrid(both[0].shape[1], both[0].shape[0], SIDE)
-    return jnp.max(grid.tiled(jnp.stack(both), -jnp.inf), axis=(2, 4))
+    front, behind = jnp.max(grid.tiled(jnp.stack(both), -jnp.inf), axis=(2, 4))
+    return jnp.stack([jnp.maximum(front, behind), behind])
 
 
 class Atlas(eqx.Module):

@@ -300,7 +300,7 @@ def _picked(is_open: Bool[Array, " tiles"]):
     def pick(i):
         picked = lax.dynamic_slice_in_dim(places, i * _PICKED, _PICKED)
         real = picked < is_open.shape[0]
-        return jnp.where(real, picked, 0), real[:, None]
+        return jnp.where(real, picked, is_open.shape[0] - 1), real[:, None]
 
     return pick, -(-count // _PICKED)
 

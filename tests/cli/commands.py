@@ -34,10 +34,6 @@ def failure(args, capsys, outputs=()):
     return captured.err
 
 
-def test_materials_lists_the_library(capsys):
-    assert main(["materials"]) == 0
-
-
 def ball(path, radius=10.0, count=300):
     """Write an even ball, without albedo. From all around it looks alike, so that one program serves every view."""
     z = 1 - (2 * np.arange(count) + 1) / count

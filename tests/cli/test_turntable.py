@@ -198,9 +198,11 @@ def test_light_goes_around_a_camera_that_stands_still(splats, around, tmp_path):
     np.testing.assert_allclose(np.asarray(sj.read_exr(alone).beauty), np.asarray(frames[3].beauty), atol=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("option", "value"), [("frames", 0), ("frames", 10_001), ("degrees", 0), ("degrees", "nan"), ("fps", 0), ("exposure", "inf")]
-)
+IMPOSSIBLE = [("frames", 0), ("frames", 10_001), ("degrees", 0), ("degrees", "nan"), ("fps", 0), ("width", 20_000)]
+IMPOSSIBLE += [("exposure", "inf"), ("light-azimuth", "nan")]
+
+
+@pytest.mark.parametrize(("option", "value"), IMPOSSIBLE)
 def test_impossible_turns_are_one_line(option, value, splats, tmp_path, capsys):
     folder = tmp_path / "turn"
     assert f"--{option}" in failure(command(splats, folder, f"--{option}", value), capsys, [folder])

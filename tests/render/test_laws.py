@@ -1,6 +1,9 @@
 """Energy, white, interfaces, limits, and what silhouettes cover."""
 
+import dataclasses
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -166,6 +169,35 @@ def test_a_plan_that_does_not_suffice_poisons_the_picture_and_says_so():
     assert float(frame.overflow) > 1
     assert np.all(np.isnan(np.asarray(frame.beauty)))
     assert np.all(np.isnan(np.asarray(frame.coverage)))
+
+
+@pytest.mark.once
+def test_too_few_tiles_poison_all_that_is_made_of_them_and_its_derivative():
+    scene, camera = sj.Scene(sheet(1.0, 6.0), (lamp(),), sj.Material(two_gaussians())), camera_over(5.0, 16)
+    plan = sj.plan(scene, camera, PLAIN)
+    short = dataclasses.replace(plan, tiles=1)
+    frame, slope = jax.value_and_grad(
+        lambda radii: jnp.sum(sj.render(eqx.tree_at(lambda s: s.splats.radii, scene, radii), camera, PLAIN, short).beauty)
+    )(scene.splats.radii)
+    assert np.isnan(float(frame))
+    assert np.any(np.isnan(np.asarray(slope)))  # where a pixel sees the splat: no step can be taken
+    jacobian = sj.picture_jacobian(scene, camera, PLAIN, short)
+    assert float(jacobian.frame.overflow) > 1
+    assert np.all(np.isnan(np.asarray(jacobian.weights)))
+    assert np.all(np.isnan(np.asarray(sj.diffuse(scene, jnp.ones((scene.splats.count, 3)), camera, PLAIN, short))))
+    assert float(sj.render(scene, camera, PLAIN, plan).overflow) == 0
+
+
+@pytest.mark.once
+def test_a_plan_holds_for_splats_that_move_a_little():
+    """Over a tile's edge, and away from the eye: what is seen then was not seen when it was planned."""
+    camera = camera_over(5.0, 32)
+    small = sheet(0.25, 1.0)
+    material = sj.Material(two_gaussians())
+    plan = sj.plan(sj.Scene(small, (lamp(),), material), camera)
+    for offset in ([0.1, 0.1, 0.0], [-0.1, 0.1, 0.1], [0.0, -0.1, -0.1]):
+        moved = eqx.tree_at(lambda s: s.centers, small, small.centers + jnp.asarray([offset]))
+        assert float(sj.render(sj.Scene(moved, (lamp(),), material), camera, plan=plan).overflow) == 0
 
 
 def test_a_light_that_has_come_among_the_splats_needs_another_plan():

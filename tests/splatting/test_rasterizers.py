@@ -118,8 +118,9 @@ def every_scene(kind, view) -> dict[str, Splats]:
     }
 
 
+@pytest.mark.once
 @pytest.mark.parametrize("kind", VIEWS)
-def test_tiles_draw_what_the_plain_rasterizer_draws(kind, float32):
+def test_tiles_draw_what_the_plain_rasterizer_draws(kind):
     view = VIEWS[kind]()
     pictures = compare(view, every_scene(kind, view))
     weights = {name: planes[[4, 10]] for name, planes in pictures.items()}
