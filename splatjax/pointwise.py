@@ -28,14 +28,16 @@ def in_parts(function: Callable[..., Result], *arrays: PyTree, at_once: int = AT
     **Returns:** `function(*arrays)`.
     """
     count = jax.tree.leaves(arrays)[0].shape[0]
-    parts = -(-count // at_once)
-    if parts <= 1:
+    fewest = -(-count // at_once)
+    if fewest <= 1:
         return function(*arrays)
+    parts = next((parts for parts in range(fewest, 2 * fewest) if count % parts == 0), fewest)  # equal ones need no copy
     size = -(-count // parts)
 
     def cut(leaf):
-        padding = [(0, parts * size - count)] + [(0, 0)] * (leaf.ndim - 1)
-        return jnp.pad(leaf, padding, mode="edge").reshape(parts, size, *leaf.shape[1:])
+        if parts * size > count:
+            leaf = jnp.concatenate([leaf, jnp.broadcast_to(leaf[-1:], (parts * size - count, *leaf.shape[1:]))])
+        return leaf.reshape(parts, size, *leaf.shape[1:])
 
     found = jax.lax.map(jax.checkpoint(lambda part: function(*part)), jax.tree.map(cut, arrays))
     return jax.tree.map(lambda leaf: leaf.reshape(parts * size, *leaf.shape[2:])[:count], found)

@@ -1,10 +1,11 @@
 """The fast rasterizer: tile by tile, only the splats that touch the tile. It gives what `DenseRasterizer` gives."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
@@ -62,7 +63,7 @@ class TileRasterizer(AbstractRasterizer):
             return Blended(empty, empty, jnp.zeros((), dtype))
         ids, seen = _compacted(view.may_see(splats), self.capacity.splats)
         splats = jax.tree.map(
-            lambda leaf: jnp.stack(_taken(leaf.T, ids), axis=-1) if leaf.ndim == 2 else _taken([leaf], ids)[0], splats
+            lambda leaf: jnp.stack(_taken(leaf.T, ids), axis=-1) if leaf.ndim == 2 else _taken(leaf[None], ids)[0], splats
         )
         footprints, grid = in_parts(lambda part: view.footprints(part, settings), splats), self._grid(view)
         bins = bin_items(_ranges(footprints, grid), grid, self.capacity.bins)
@@ -87,9 +88,10 @@ def _compacted(chosen: Bool[Array, " splats"], room: int) -> tuple[Int[Array, " 
     return jnp.full(room, count, jnp.int32).at[target].set(jnp.arange(count, dtype=jnp.int32), mode="drop"), ends[-1]
 
 
-def _taken(rows: Iterable[Float[Array, " splats"]], ids: Int[Array, " room"]) -> list[Float[Array, " room"]]:
+def _taken(rows: Float[Array, "rows splats"], ids: Int[Array, " room"]) -> list[Float[Array, " room"]]:
     """Take columns, 0 for those that are none; row by row, so that derivatives are planes too."""
-    return [row.at[ids].get(mode="fill", fill_value=0, indices_are_sorted=True) for row in rows]
+    split = lax.split(rows, [1] * rows.shape[0])  # of a split the derivative is put together once; of slices, summed
+    return [row[0].at[ids].get(mode="fill", fill_value=0, indices_are_sorted=True) for row in split]
 
 
 def _ranges(f: Footprints, grid: TileGrid) -> TileRanges:
