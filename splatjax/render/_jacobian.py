@@ -19,7 +19,6 @@ from ._passes import (
     cast_shadows,
     compose,
     let_light_in,
-    poisoned_unless,
     see_surfaces,
     shade,
     sources_of,
@@ -128,13 +127,14 @@ def _picture_jacobian(scene: Scene, camera: Camera, settings: RenderSettings, pl
         of_weights = of_weights + jnp.sum(material.gaussians.weights[None, :, :, None] * gained.layers, axis=1, keepdims=True)
     shaded = shade(scene, view, light.groups, seen, layers)
 
+    needed = jnp.max(jnp.stack([needed, seen.needed, light.needed]))
+    seen = seen.poisoned_unless(needed <= 1)
+
     def of_beauty(slopes: Float[Array, "tiles gaussians channels pixels"]):
         return seen.picture(shaded.post[:, None] * slopes.transpose(0, 1, 3, 2))
 
-    weights, variances = of_beauty(of_weights), of_beauty(slopes.variances)
-    needed = jnp.max(jnp.stack([needed, seen.needed, light.needed]))
     frame = compose(shaded, seen, layers.resolved, material.gaussians.weights, needed)
-    return PictureJacobian(frame, *poisoned_unless(needed <= 1, (weights, variances)))
+    return PictureJacobian(frame, of_beauty(of_weights), of_beauty(slopes.variances))
 
 
 def _entering_and_its_slope(scene: Scene, light: LightOnSplats) -> tuple[EnteringLight, Float[Array, "channels splats"] | None]:

@@ -87,6 +87,10 @@ class SeenSurfaces(eqx.Module):
     """Of its pixel that each point covers: behind, of what the front leaves."""
     needed: Float[Array, ""]
 
+    def poisoned_unless(self, fits: Bool[Array, ""]) -> "SeenSurfaces":
+        """Make every picture NaN, and its derivatives too, where a plan does not suffice."""
+        return eqx.tree_at(lambda seen: seen.atlas, self, self.atlas.poisoned_unless(fits))
+
     def receivers(self, source: str = "source") -> _diffusion.SeenSurface:
         """Give what pass 4 asks of them, of the light of that name."""
         named = self.named
@@ -143,6 +147,8 @@ class ShadedSurface(eqx.Module):
     post: Float[Array, "tiles pixels #channels"]
     """From a layer to the radiance towards the eye."""
     layers: Float[Array, "tiles gaussians pixels channels"]
+    diffuse: Float[Array, "tiles pixels channels"]
+    """The layers, weighted and summed."""
     specular: Float[Array, "tiles pixels channels"]
     single_scattering: Float[Array, "tiles pixels channels"] | None
 
@@ -187,6 +193,7 @@ def _shade(scene: Scene, view, groups: list[StackedLights], position, depth, cov
         single = _shading.single_scattered_radiance(points, groups, f0, material.single_scattering)
         if splats.albedo is not None:
             single = single * _shading.albedo_root(albedo) ** 2
+    layers = post[:, None] * layers.transpose(0, 1, 3, 2)
     return ShadedSurface(
         depth=jnp.where(covered, depth, jnp.inf),
         position=jnp.where(covered[..., None], points.positions, 0.0),
@@ -195,7 +202,8 @@ def _shade(scene: Scene, view, groups: list[StackedLights], position, depth, cov
         shadow=jnp.where(covered[:, None], _shadows_in_order(points.lit, groups, shape, dtype).transpose(1, 0, 2), 1.0),
         irradiance=named.get("irradiance", named["source"]).transpose(0, 2, 1),
         post=post,
-        layers=post[:, None] * layers.transpose(0, 1, 3, 2),
+        layers=layers,
+        diffuse=jnp.sum(material.gaussians.weights[None, :, None] * layers, axis=1),
         specular=jnp.where(covered[..., None], specular, 0.0),
         single_scattering=None if single is None else jnp.where(covered[..., None], single, 0.0),
     )
@@ -208,38 +216,30 @@ def compose(
     weights: Float[Array, "gaussians channels"],
     needed: Float[Array, ""],
 ) -> Frame:
-    """Lay the front over what shows behind it; sum the layers."""
+    """Lay the front over what shows behind it; all of it NaN where the plan does not suffice."""
+    seen = seen.poisoned_unless(needed <= 1)
     front = seen.atlas.front_picture
-    layers = seen.picture(shaded.layers)
-    diffuse = jnp.sum(weights[:, None, None] * layers, axis=0)
-    specular = seen.picture(shaded.specular)
+    diffuse, specular = seen.picture(shaded.diffuse), seen.picture(shaded.specular)
     single = None if shaded.single_scattering is None else seen.picture(shaded.single_scattering)
     drawn = ((seen.share > 0) & seen.atlas.in_front[:, None]).astype(shaded.depth.dtype)
     handed_over = jnp.sum((1 - resolved) * drawn[:, None], axis=(0, 2)) / jnp.maximum(jnp.sum(drawn), 1)
-    frame = Frame(
+    return Frame(
         beauty=diffuse + specular if single is None else diffuse + single + specular,
-        coverage=seen.coverage,
+        coverage=seen.atlas.poison * seen.coverage,
         depth=front(shaded.depth[..., None], jnp.inf)[..., 0],
         position=front(shaded.position),
         normal=front(shaded.normal),
         albedo=seen.picture(shaded.albedo),
         shadow=front(shaded.shadow[..., None], 1.0)[..., 0],
         irradiance=seen.picture(shaded.irradiance),
-        layers=layers,
+        layers=seen.picture(shaded.layers),
         weights=weights,
         diffuse=diffuse,
         specular=specular,
-        handed_over=handed_over,
+        handed_over=seen.atlas.poison * handed_over,
         overflow=jnp.where(needed <= 1, 0.0, needed),
         single_scattering=single,
     )
-    poisoned = poisoned_unless(needed <= 1, frame)
-    return eqx.tree_at(lambda f: (f.weights, f.overflow), poisoned, (weights, frame.overflow))
-
-
-def poisoned_unless(fits, tree):
-    """Make every array NaN where the plan does not suffice, and its derivatives too."""
-    return jax.tree.map(lambda leaf: leaf * jnp.where(fits, 1.0, jnp.nan).astype(leaf.dtype), tree)
 
 
 def _lit_shares(splats: Splats, groups: list[StackedLights], settings: RenderSettings, plan: Plan):
@@ -279,10 +279,9 @@ def _surface_parameters(scene: Scene):
 
 
 def _by_name(attributes: dict[str, Array], packed: Float[Array, "tiles rows pixels"]) -> dict[str, Array]:
-    edges = [0]
-    for rows in attributes.values():
-        edges.append(edges[-1] + rows.shape[0])
-    return {name: packed[:, i:j] for name, i, j in zip(attributes, edges, edges[1:], strict=False)}
+    sizes = [rows.shape[0] for rows in attributes.values()]
+    parts = jax.lax.split(packed, [*sizes, packed.shape[1] - sum(sizes)], axis=1)
+    return dict(zip(attributes, parts, strict=False))
 
 
 def _shadows_in_order(lit, groups: list[StackedLights], shape, dtype) -> Float[Array, "lights tiles pixels"]:

@@ -8,7 +8,7 @@ from splatjax import diffusion as _diffusion, splatting as _splatting
 from splatjax.scene import Camera, Frame, Scene
 
 from ._inputs import SAME, check_channels, in_one_dtype
-from ._passes import cast_shadows, compose, let_light_in, poisoned_unless, see_surfaces, shade, sources_of, surface_attributes
+from ._passes import cast_shadows, compose, let_light_in, see_surfaces, shade, sources_of, surface_attributes
 from ._plan import Plan, plan_unless_traced
 from ._settings import RenderSettings
 
@@ -98,5 +98,5 @@ def _diffuse(scene: Scene, irradiance, camera: Camera, settings: RenderSettings,
         plan.diffuser,
         settings.diffusion.normalization,
     )
-    fits = jnp.maximum(needed, seen.needed) <= 1
-    return poisoned_unless(fits, seen.atlas.front_picture(layers.layers.transpose(0, 1, 3, 2)))
+    seen = seen.poisoned_unless(jnp.maximum(needed, seen.needed) <= 1)
+    return seen.atlas.front_picture(layers.layers.transpose(0, 1, 3, 2))

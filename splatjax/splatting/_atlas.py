@@ -3,7 +3,7 @@
 import equinox as eqx
 import jax.numpy as jnp
 from jax.lax import stop_gradient
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from splatjax.pointwise import AT_ONCE
 
@@ -39,6 +39,8 @@ class Atlas(eqx.Module):
     """The place of every tile; the number of places for a tile that shows nothing."""
     needed: Float[Array, ""]
     """Tiles over places; what lies beyond is missing where this is above 1."""
+    poison: Float[Array, ""]
+    """Factor of every picture: 1, or NaN."""
 
     @classmethod
     def of(cls, farthest: Float[Array, "surfaces down across"], view: AbstractView, room: int) -> "Atlas":
@@ -47,7 +49,12 @@ class Atlas(eqx.Module):
         tiles = jnp.nonzero(shows, size=room, fill_value=shows.shape[0])[0].astype(jnp.int32)
         places = jnp.full(shows.shape[0], room, jnp.int32).at[tiles].set(jnp.arange(room, dtype=jnp.int32), mode="drop")
         needed = jnp.sum(shows).astype(farthest.dtype) / room
-        return cls(view, farthest, tiles, places, needed)
+        return cls(view, farthest, tiles, places, needed, jnp.ones_like(needed))
+
+    def poisoned_unless(self, fits: Bool[Array, ""]) -> "Atlas":
+        """Make every picture NaN, and its derivatives too, where a plan does not suffice."""
+        poison = jnp.where(fits, self.poison, jnp.asarray(jnp.nan, self.poison.dtype))
+        return eqx.tree_at(lambda atlas: atlas.poison, self, poison)
 
     @property
     def grid(self) -> TileGrid:
@@ -89,7 +96,7 @@ class Atlas(eqx.Module):
     ) -> Float[Array, "*rows height width channels"]:
         """Put the picture of the front surface together; `fill` where a tile shows nothing."""
         grid, (_, *rows, _, channels) = self.grid, values.shape
-        tiles = values.at[self.places[: self._count]].get(mode="fill", fill_value=fill)
+        tiles = self.poison * values.at[self.places[: self._count]].get(mode="fill", fill_value=fill)
         tiles = tiles.reshape(grid.down, grid.across, *rows, SIDE, SIDE, channels)
         last = tiles.ndim - 3
         whole = tiles.transpose(*range(2, last), 0, last, 1, last + 1, last + 2)
