@@ -17,12 +17,14 @@ from splatjax.splatting import Atlas, BinCapacity, Bins
 from ._diffuser import AbstractDiffuser, Diffused, Kernels, Sources
 from ._gathering import Gathering, blended_nodes, nodes_table
 from ._gaussian_sums import Steps, as_they_are, cut_off, gaussian_sums, gaussian_sums_forward, tapered
+from ._handover import resolved_share
 from ._neighbors import Boxes, Neighbors
 from ._order import BLOCK
 from ._pixels import FAR, Pixels, block_ranges, tile_grid
 from ._tree import Clusters, ClusterTree
 
-_FINEST = 0.01  # share of the splats that may be fine enough for a layer that is handed over everywhere
+_FINEST = 0.01  # share of the splats that may be finer than those that tell how much of a layer is carried
+_LEAST_LEFT_OUT = 4e-5  # share of a layer's power beyond its support, at least: 4.5 standard deviations
 _LANES = 32
 _SOURCES = 16  # of a block that gathers into points, and how many blocks a step holds
 _SOURCE_SLOTS = 4
@@ -65,8 +67,10 @@ class LayerPlan(eqx.Module):
     """How one layer is evaluated. It holds while the variance stays within the range."""
 
     level: int = eqx.field(static=True)
-    smallest: float = eqx.field(static=True)
-    largest: float = eqx.field(static=True)
+    support: float = eqx.field(static=True)
+    """Sources farther away, in standard deviations of the layer, are left out."""
+    smallest: Float[Array, ""]
+    largest: Float[Array, ""]
     capacity: BinCapacity | None
     """Of the tiles' lists; None for a layer that is handed over to the surface at every variance of the range."""
     nodes: NodePlan | None
@@ -79,15 +83,13 @@ class ClusterDiffuser(AbstractDiffuser):
     **Attributes:** (static)
 
     - `error`: what half of the pixels of a layer may be off, of the layer's root mean square, where light changes much within its
-      width; one pixel in a hundred is off by five times as much. 0 merges no splats, and every pixel gathers for itself: what is
-      left then is the support's.
-    - `support`: sources farther away, in standard deviations of the layer, are left out. 4.5 leaves out 4e-5 of the power.
+      width; one pixel in a hundred is off by five times as much. Half of it is the power beyond the support of a layer, less its
+      share that is handed over. 0 merges no splats, and every pixel gathers for itself; beyond the support there is 4e-5 then.
     - `margin`: a plan holds while the variances stay within this factor of those that it was made for.
     - `sums`: `gaussian_sums`, which has reverse mode, or `gaussian_sums_forward`.
     """
 
     error: float = eqx.field(static=True, default=2e-3)
-    support: float = eqx.field(static=True, default=4.5)
     margin: float = eqx.field(static=True, default=1.25)
     sums: Callable[..., Array] = eqx.field(static=True, default=gaussian_sums)
     tree: ClusterTree | None = None
@@ -103,12 +105,13 @@ class ClusterDiffuser(AbstractDiffuser):
         values = np.asarray(kernels.variances, np.float64)
         areas = np.asarray(splats.areas, np.float64)
         if areas.size == 0:
-            layers = tuple(LayerPlan(0, 0.0, math.inf, None, None) for _ in values)
-            none = ClusterTree(jnp.zeros(0, jnp.int32), (), (), ())
+            layers = tuple(LayerPlan(0, 0.0, jnp.zeros(()), jnp.full((), jnp.inf), None, None) for _ in values)
+            none = ClusterTree(jnp.zeros(0, jnp.int32), (), ())
             return eqx.tree_at(_parts, self, (none, layers), is_leaf=_is_none)
         spacing = math.sqrt(areas.mean())
-        begin = float(interval[0]) ** 2
-        carried = values * self.margin > begin * np.quantile(areas, _FINEST)
+        begin, fine = float(interval[0]) ** 2, jnp.asarray(np.quantile(areas, _FINEST), kernels.variances.dtype)
+        shares = np.asarray(resolved_share(kernels.variances * self.margin, fine, interval))
+        carried = shares > 0
         edges = _CELL * (self.error / 2e-3) ** (1 / 3) * np.sqrt(values / self.margin)
         edges = np.where(carried & (edges > _WORTHWHILE * spacing), edges, 0.0)
         cells = sorted({float(edge) for edge in edges if edge > 0})
@@ -116,17 +119,24 @@ class ClusterDiffuser(AbstractDiffuser):
         origin = jnp.mean(splats.centers, axis=0)
         levels = _levels(tree, Sources(splats.centers.T - origin[:, None], splats.normals.T, splats.areas, splats.areas[None]))
         layers = []
-        for v, depth, edge, is_carried in zip(values, kernels.depths, edges, carried, strict=True):
+        for v, depth, edge, share in zip(values, kernels.depths, edges, shares, strict=True):
+            support = self.support(float(share))
             level = cells.index(edge) + 1 if edge > 0 else 0
             nodes = capacity = None
-            if is_carried:
+            if share > 0:
                 largest = v * self.margin
                 if edge > 0 and self._in_pixels(float(edge), atlases, splats) > 1:
                     radii = jnp.where(splats.areas * begin < largest, splats.radii, 0.0)  # of splats that carry the layer
-                    nodes = self._plan_nodes(levels[level], largest, depth, float(edge), tree.largest(radii, level))
-                capacity = self._capacity(origin, levels[level], nodes, largest, depth, atlases)
-            layers.append(LayerPlan(level, float(v) / self.margin, float(v) * self.margin, capacity, nodes))
+                    nodes = self._plan_nodes(levels[level], largest, depth, float(edge), support, tree.largest(radii, level))
+                capacity = self._capacity(origin, levels[level], nodes, largest, depth, support, atlases)
+            smallest, largest = (jnp.asarray(edge, depth.dtype) for edge in (v / self.margin, v * self.margin))
+            layers.append(LayerPlan(level, support, smallest, largest, capacity, nodes))
         return eqx.tree_at(_parts, self, (tree, tuple(layers)), is_leaf=_is_none)
+
+    def support(self, share: float) -> float:
+        """Give the support of a layer, standard deviations, of which the diffusion integral is a share."""
+        left_out = max(0.5 * self.error / max(share, 1e-3), _LEAST_LEFT_OUT)
+        return round(8 * math.sqrt(2 * math.log(1 / min(left_out, 0.1)))) / 8
 
     def _in_pixels(self, edge: float, atlases: Sequence[Atlas], splats: Splats) -> float:
         """Give the length of an edge amid the splats, in pixels of the closest view."""
@@ -134,21 +144,21 @@ class ClusterDiffuser(AbstractDiffuser):
         depths = (view.project(jnp.mean(splats.centers, axis=0)[:, None])[2] for view in views)
         return max(edge * float(view.pixels_per_mm(depth)[0]) for view, depth in zip(views, depths, strict=True))
 
-    def _plan_nodes(self, clusters: Clusters, variance: float, depth: Float[Array, ""], edge: float, radii) -> NodePlan:
+    def _plan_nodes(self, clusters: Clusters, variance: float, depth, edge: float, support: float, radii) -> NodePlan:
         """Find what nodes gather from. Pixels are within a radius of a splat's center, and that within 0.87 edges of a node."""
         # Sources of a wider layer lie deeper, where clusters may be wider too.
         boxes, sources, spread = _boxes(clusters, depth, depth * math.sqrt(self.margin))
         sinking = math.sqrt(3) * float(depth) * (math.sqrt(self.margin) - 1)
-        reach = self.support * math.sqrt(variance + float(spread)) + sinking
+        reach = support * math.sqrt(variance + float(spread)) + sinking
         neighbors = Neighbors.find(boxes, sources, reach, min(_LANES, boxes.low.shape[1]), _SOURCE_SLOTS)
         return NodePlan(neighbors, jnp.maximum(_SMOOTHING * edge, (radii + 0.87 * edge) / _BLENDED))
 
     def _capacity(
-        self, origin, clusters: Clusters, nodes: NodePlan | None, variance: float, depth, atlases: Sequence[Atlas]
+        self, origin, clusters: Clusters, nodes: NodePlan | None, variance: float, depth, support: float, atlases: Sequence[Atlas]
     ) -> BinCapacity:
         """Find how much the lists of tiles must hold: sources, or nodes."""
         if nodes is None:
-            clusters, reach = _reaching(clusters, depth, jnp.asarray(variance, depth.dtype), self.support)
+            clusters, reach = _reaching(clusters, depth, jnp.asarray(variance, depth.dtype), support)
             size = _SOURCES, _SOURCE_SLOTS
         else:
             reach = _BLENDED * nodes.deviations
@@ -186,9 +196,10 @@ class ClusterDiffuser(AbstractDiffuser):
             else:
                 gathering = Gathering.of(levels[layer.level], variance, depth)
                 if layer.nodes is None:
-                    values, need = self._at_pixels(gathering, layer.capacity, pixels)
+                    values, need = self._at_pixels(gathering, layer.support, layer.capacity, pixels)
                 else:
-                    values, need = self._through_nodes(levels[layer.level], gathering, layer.nodes, layer.capacity, pixels)
+                    rest = layer.nodes, layer.support, layer.capacity, pixels
+                    values, need = self._through_nodes(levels[layer.level], gathering, *rest)
                 layers.append(jnp.where(covered[:, None], values[:-1], 0.0))
                 needed.append(need.astype(points.dtype))
             needed.append(jnp.maximum(layer.smallest / variance, variance / layer.largest) * (1 - 1e-6))
@@ -196,23 +207,23 @@ class ClusterDiffuser(AbstractDiffuser):
         found = jnp.stack(layers, axis=1) if layers else empty[:, None][:, :0]
         return Diffused(found[:, :, :channels], found[:, :, channels], carried, needed)
 
-    def _at_pixels(self, gathering: Gathering, capacity: BinCapacity, pixels: Pixels):
+    def _at_pixels(self, gathering: Gathering, support: float, capacity: BinCapacity, pixels: Pixels):
         """Let every pixel gather for itself."""
         clusters = gathering.clusters
-        reach = self.support * jnp.sqrt(gathering.wide)
+        reach = support * jnp.sqrt(gathering.wide)
         bins = pixels.bins(clusters.centers, clusters.areas > 0, reach, _SOURCES, _SOURCE_SLOTS, capacity)
         table = gathering.table(_SOURCES, slopes=False)
-        values = self.sums(pixels.tiles, table, pixels.steps(bins, table.shape[0] - 1), cut_off(self.support), gathering.finish)
+        values = self.sums(pixels.tiles, table, pixels.steps(bins, table.shape[0] - 1), cut_off(support), gathering.finish)
         return values, bins.needed
 
-    def _through_nodes(self, nodes: Clusters, gathering: Gathering, plan: NodePlan, capacity: BinCapacity, pixels: Pixels):
+    def _through_nodes(
+        self, nodes: Clusters, gathering: Gathering, plan: NodePlan, support: float, capacity: BinCapacity, pixels: Pixels
+    ):
         """Let the nodes gather, and blend them into the pixels."""
         there, count = nodes.areas > 0, nodes.areas.shape[0]
         bins = pixels.bins(nodes.centers, there, _BLENDED * plan.deviations, _NODES, _NODE_SLOTS, capacity)
         blocks = plan.blocks(jnp.where(there, nodes.centers, FAR))
-        sums = self.sums(
-            blocks, gathering.table(_SOURCES, slopes=True), plan.asked(bins, count), cut_off(self.support), as_they_are
-        )
+        sums = self.sums(blocks, gathering.table(_SOURCES, slopes=True), plan.asked(bins, count), cut_off(support), as_they_are)
         at = jnp.where(there, nodes.centers, 0.0)
         values, slopes = gathering.values_and_slopes(plan.in_row(sums, count), at)
         table = nodes_table(at, nodes.areas, values, slopes, 0.5 / plan.deviations**2, _NODES)
@@ -220,7 +231,7 @@ class ClusterDiffuser(AbstractDiffuser):
         moved = plan.neighbors.needed(
             Boxes.around(nodes.centers, there, BLOCK),
             Boxes.around(gathering.clusters.centers, there, _SOURCES),
-            self.support * jnp.sqrt(jnp.max(stop_gradient(gathering.wide))),
+            support * jnp.sqrt(jnp.max(stop_gradient(gathering.wide))),
         )
         return found, jnp.maximum(bins.needed.astype(moved.dtype), moved)
 

@@ -45,17 +45,13 @@ class Pixels(eqx.Module):
         farthest = jnp.max(jnp.where(there, reach, 0.0).reshape(-1, block), axis=1)
         places = self._places(grid)
 
+        (tile_low, tile_high), (low, high) = ((each.low.T, each.high.T) for each in (tiles, blocks))
+
         def meet(item, tile):
             item, place = item % farthest.shape[0], places[tile]
-
-            def apart(axis):
-                """Give how far the boxes lie apart along an axis."""
-                gap = jnp.maximum(
-                    tiles.low[axis][place] - blocks.high[axis][item], blocks.low[axis][item] - tiles.high[axis][place]
-                )
-                return jnp.maximum(gap, 0.0)
-
-            return apart(0) ** 2 + apart(1) ** 2 + apart(2) ** 2 <= farthest[item] ** 2
+            # in one expression, so that it is one loop over the pairs
+            gaps = jnp.maximum(tile_low[place] - high[item], low[item] - tile_high[place])
+            return jnp.sum(jnp.maximum(gaps, 0.0) ** 2, axis=1) <= farthest[item] ** 2
 
         return bin_items(ranges, grid, capacity, meet)
 

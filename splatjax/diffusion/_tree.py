@@ -47,37 +47,32 @@ class Clusters(eqx.Module):
     def merged(self, parents: Int[Array, " clusters"], count: int) -> "Clusters":
         """Merge clusters into `count` parents. Area, energy and the first moments of both are kept. Differentiable."""
 
-        def total(values):
-            return jax.ops.segment_sum(values, parents, count)
+        def totals(rows: Float[Array, "rows clusters"]) -> Float[Array, "rows parents"]:
+            """Sum over the children: a few rows in one pass over them; of many the sums would not stay in the cache."""
+            return jax.vmap(lambda row: jax.ops.segment_sum(row, parents, count))(rows)
 
-        areas = total(self.areas)
+        channels = self.irradiance.shape[0]
+        energy = self.areas[None] * self.irradiance
+        own = jnp.concatenate([self.areas[None], self.areas[None] * self.centers, self.areas[None] * self.normals, energy])
+        areas, *sums = jnp.split(totals(own), [1, 4, 7])
         inverse = 1 / jnp.where(areas > 0, areas, 1.0)
-
-        def mean(values):
-            return total(self.areas * values) * inverse
-
-        centers = jnp.stack([mean(axis) for axis in self.centers])
-        normals = jnp.stack([mean(axis) for axis in self.normals])
-        irradiance = jnp.stack([mean(channel) for channel in self.irradiance])
+        centers, normals, irradiance = (each * inverse for each in sums)
         offset = self.centers - centers[:, parents]
         turn = self.normals - normals[:, parents]
-        spread = mean(self.spread + 0.5 * jnp.sum(offset * offset, axis=0))
-        opening = mean(self.opening + jnp.sum(offset * turn, axis=0))
-        bending = mean(self.bending + jnp.sum(turn * turn, axis=0))
+        spread = self.spread + 0.5 * jnp.sum(offset * offset, axis=0)
+        opening = self.opening + jnp.sum(offset * turn, axis=0)
+        bending = self.bending + jnp.sum(turn * turn, axis=0)
 
-        def energy_off(offset, own):
-            """Give the first moments of energy, those that the children bring included."""
-            energy = self.areas[None] * self.irradiance
-            brought = (lambda c, axis: 0.0) if own is None else (lambda c, axis: own[c, axis])
-            return jnp.stack(
-                [
-                    jnp.stack([total(energy[c] * offset[axis] + brought(c, axis)) for axis in range(3)])
-                    for c in range(energy.shape[0])
-                ]
-            )
+        def energy_off(offset, brought):
+            """Give the first moments of the children's energy, those that they bring included."""
+            moments = energy[:, None] * offset[None]
+            return (moments if brought is None else moments + brought).reshape(3 * channels, -1)
 
-        moments, turns = energy_off(offset, self.moments), energy_off(turn, self.turns)
-        return Clusters(centers, normals, areas, irradiance, spread, moments, turns, opening, bending)
+        spread, opening, bending = totals(self.areas[None] * jnp.stack([spread, opening, bending])) * inverse
+        moments, turns = (
+            totals(energy_off(*each)).reshape(channels, 3, count) for each in ((offset, self.moments), (turn, self.turns))
+        )
+        return Clusters(centers, normals, areas[0], irradiance, spread, moments, turns, opening, bending)
 
 
 class ClusterTree(eqx.Module):
@@ -88,8 +83,6 @@ class ClusterTree(eqx.Module):
     parents: tuple[Int[Array, " _"], ...]
     """For each level, the cell of every cluster of the level before (of the splat at every place, for the first)."""
     counts: tuple[int, ...] = eqx.field(static=True)
-    cells: tuple[float, ...] = eqx.field(static=True)
-    """Edge of the cells of each level, mm."""
 
     @classmethod
     def build(cls, centers: Float[Array, "splats 3"], cells: Sequence[float]) -> "ClusterTree":
@@ -115,17 +108,15 @@ class ClusterTree(eqx.Module):
             counts.append(_round_up(len(kept)))
             positions, members = middle[place], inside[place]
         order = np.pad(order, (0, _blocks(splats) - splats), constant_values=splats)
-        return cls(jnp.asarray(order, jnp.int32), tuple(parents), tuple(counts), tuple(cells))
+        return cls(jnp.asarray(order, jnp.int32), tuple(parents), tuple(counts))
 
     def levels(self, sources: Sources) -> list[Clusters]:
         """Give the clusters of every level, the splats themselves first."""
 
         def placed(values):
-            return values.at[self.order].get(mode="fill", fill_value=0)
+            return values.at[..., self.order].get(mode="fill", fill_value=0)
 
-        rows = [sources.centers, sources.normals, sources.irradiance]
-        centers, normals, irradiance = (jnp.stack([placed(row) for row in each]) for each in rows)
-        found = [Clusters.of(Sources(centers, normals, placed(sources.areas), irradiance))]
+        found = [Clusters.of(jax.tree.map(placed, sources))]
         for parents, count in zip(self.parents, self.counts, strict=True):
             found.append(found[-1].merged(parents, count))
         return found

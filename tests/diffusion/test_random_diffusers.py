@@ -4,7 +4,6 @@ With `error=0` nothing is merged. What is left out is then known to the last sou
 not to the support's error; and that error is what the untruncated sum has beyond the support.
 """
 
-import math
 from functools import cache
 
 import bodies
@@ -34,14 +33,17 @@ def with_room(diffuser: ClusterDiffuser, count: int) -> ClusterDiffuser:
     blocks, chunks = -(-count // 64) * 4, grid.tiles // grid.lanes
     pairs = -(-2 * blocks * grid.tiles // 1024) * 1024
     room = BinCapacity(pairs, chunks * -(-2 * blocks // grid.slots), chunks)
-    layers = tuple(LayerPlan(each.level, 0.0, math.inf, room, each.nodes) for each in diffuser.layers or ())
+    layers = tuple(
+        LayerPlan(each.level, each.support, jnp.zeros(()), jnp.full((), jnp.inf), room, each.nodes)
+        for each in diffuser.layers or ()
+    )
     return eqx.tree_at(lambda d: d.layers, diffuser, layers)
 
 
-def within_support(sources: Sources, kernels: Kernels, points, covered, support: float):
+def within_support(sources: Sources, kernels: Kernels, points, covered, supports: list[float]):
     """Give means and exits, written down plainly; 0 where no source is within the support."""
     found = []
-    for variance, depth in zip(kernels.variances, kernels.depths, strict=True):
+    for variance, depth, support in zip(kernels.variances, kernels.depths, supports, strict=True):
         offset = points[:, :, :, None] - (sources.centers - depth * sources.normals)[None, :, None]
         exponent = 0.5 * jnp.sum(offset * offset, axis=1) / variance
         weight = jnp.where(exponent < 0.5 * support**2, jnp.exp(-exponent), 0.0) * sources.areas[None, None]
@@ -106,7 +108,8 @@ def by_both(count: int):
 
         def plain(scene: Scene):
             _, points, there = seen(scene)
-            return within_support(scene.sources, scene.kernels, points, there, diffuser.support), jnp.zeros(())
+            supports = [layer.support for layer in diffuser.layers or ()]
+            return within_support(scene.sources, scene.kernels, points, there, supports), jnp.zeros(())
 
         # Exits are areas over that of the kernel: times it all are as large, and no sum is drowned in another's rounding.
         flat = 2 * jnp.pi * scene.kernels.variances
@@ -158,10 +161,16 @@ def test_without_clusters_all_within_the_support_is_summed(float64, count):
 COUNT, SIZE = 1500, 24
 VARIANCES = (14.0, 40.0)
 LIT_IN_SUITE = 7  # one for each of what a layer is differentiated in
-SUPPORT = 7.0  # so wide that only clusters and nodes err, and no difference steps over its rim
 # Of a layer's root mean square, as `ClusterDiffuser.error` states them; of the exits a layer passes on a part.
 MEDIAN, EXITS_MEDIAN, HIGH = 2e-3, 3e-3, 1e-2
 STEP, AGREEMENT = 1e-6, 1e-5  # of differences along a random way; 4e-7 found
+
+
+class WideDiffuser(ClusterDiffuser):
+    """Of so wide a support that only clusters and nodes err, and no difference steps over its rim."""
+
+    def support(self, share: float) -> float:
+        return 7.0
 
 
 class Lit(eqx.Module):
@@ -195,7 +204,7 @@ def body_and_plan() -> tuple[Splats, list, ClusterDiffuser]:
     views = [bodies.perspective(eye, fov=32.0, width=SIZE, height=SIZE) for eye in eyes]
     kernels = Kernels(jnp.asarray(VARIANCES), 0.75 * jnp.sqrt(jnp.asarray(VARIANCES)))
     atlases = [bodies.packed(*seen_of()(body, view)[:2], view)[0] for view in views]
-    diffuser = ClusterDiffuser(support=SUPPORT).planned(body, kernels, jnp.asarray(RESOLVED), atlases)
+    diffuser = WideDiffuser().planned(body, kernels, jnp.asarray(RESOLVED), atlases)
     assert diffuser.layers is not None
     assert [layer.level for layer in diffuser.layers] == [1, 2]
     assert all(layer.nodes is not None for layer in diffuser.layers)

@@ -227,7 +227,14 @@ def roomy(plan: sj.Plan, shape: Shape) -> sj.Plan:
             grid = tile_grid(shape.width, shape.height, 1)
             room = BinCapacity(*_room(2 * 64, grid.tiles, grid.lanes, grid.slots))
             layers = tuple(
-                LayerPlan(each.level, 0.0, math.inf, None if each.capacity is None else room, far_reaching(each.nodes))
+                LayerPlan(
+                    each.level,
+                    each.support,
+                    jnp.zeros(()),
+                    jnp.full((), jnp.inf),
+                    None if each.capacity is None else room,
+                    far_reaching(each.nodes),
+                )
                 for each in part.layers
             )
             return eqx.tree_at(lambda d: d.layers, part, layers, is_leaf=lambda leaf: isinstance(leaf, tuple))
