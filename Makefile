@@ -7,6 +7,8 @@ WORKERS ?= 2
 # users have it; the others with the least optimization, which takes a third of the time.
 PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
 LEAST_OPTIMIZATION := --xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false
+# Every worker of every run imports the same modules, with their shapes checked: whatever the shell says, bytecode is kept.
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: setup demo test test-float32 test-x64 test-once random-scenes lint bench lock
 
