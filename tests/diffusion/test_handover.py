@@ -22,18 +22,17 @@ def test_share_rises_smoothly_from_none_to_all():
     assert float(jnp.max(jnp.abs(jnp.diff(slopes)))) < largest_bend * 1.01 * 1.4 / 1400, "the slope jumps"
 
 
-def test_its_derivative_is_that_of_central_differences():
-    with jax.enable_x64(True):
-        interval = jnp.asarray([0.4, 0.8])
+def test_its_derivative_is_that_of_central_differences(float64):
+    interval = jnp.asarray([0.4, 0.8])
 
-        def share(v, area):
-            return resolved_share(v, area, interval)
+    def share(v, area):
+        return resolved_share(v, area, interval)
 
-        v, area, step = jnp.asarray(0.1), jnp.asarray([0.3, 0.4, 0.5]), 1e-6
-        found = jax.jacfwd(share)(v, area)
-        differences = (share(v + step, area) - share(v - step, area)) / (2 * step)
-        by_area = jax.grad(lambda a: jnp.sum(share(v, a)))(area)
-        area_differences = (share(v, area + step) - share(v, area - step)) / (2 * step)
+    v, area, step = jnp.asarray(0.1), jnp.asarray([0.3, 0.4, 0.5]), 1e-6
+    found = jax.jacfwd(share)(v, area)
+    differences = (share(v + step, area) - share(v - step, area)) / (2 * step)
+    by_area = jax.grad(lambda a: jnp.sum(share(v, a)))(area)
+    area_differences = (share(v, area + step) - share(v, area - step)) / (2 * step)
     np.testing.assert_allclose(np.asarray(found), np.asarray(differences), rtol=1e-7)
     np.testing.assert_allclose(np.asarray(by_area), np.asarray(area_differences), rtol=1e-7)
 

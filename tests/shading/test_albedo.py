@@ -1,5 +1,7 @@
 """The tabulated albedo of the specular lobe, against quadratures of the lobe itself."""
 
+from functools import cache
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,6 +15,7 @@ SLOPE_ERROR = 0.02
 NODES = 96  # of the hemisphere's quadrature, per axis
 
 
+@cache
 def hemisphere():
     """Give directions and weights of `int f dw` for a lobe symmetric about the x axis.
 
@@ -26,20 +29,17 @@ def hemisphere():
     return grid.reshape(-1, 3), np.outer(weights * 2 * t, weights * 6 * np.pi * t**2).ravel()
 
 
+@jax.jit
+def lobe(wi, wo, f0, roughness):
+    return specular_lobe(jnp.asarray([[0.0, 0.0, 1.0]]), wi, wo, f0=f0, specular=jnp.asarray(1.0), roughness=roughness)
+
+
 def integrated(mu, f0, roughness):
     """Integrate `specular_lobe` over incident directions, in float64."""
     with jax.enable_x64(True):
         wi, weights = hemisphere()
-        wo = jnp.asarray([[np.sqrt(1 - mu * mu), 0.0, mu]])
-        lobe = specular_lobe(
-            jnp.asarray([[0.0, 0.0, 1.0]]),
-            jnp.asarray(wi),
-            wo,
-            f0=jnp.asarray(f0),
-            specular=jnp.asarray(1.0),
-            roughness=jnp.asarray(roughness),
-        )
-        return float(np.sum(np.asarray(lobe) * wi[:, 2] * weights))
+        wo = np.asarray([[np.sqrt(1 - mu * mu), 0.0, mu]])
+        return float(np.sum(np.asarray(lobe(*arrays(None, wi, wo, f0, roughness))) * wi[:, 2] * weights))
 
 
 def arrays(dtype, *values):
@@ -113,12 +113,11 @@ def test_white_furnace_in_closed_form(mu, roughness, dtype):
     np.testing.assert_allclose(diffuse + float(directional_albedo(mu_o, *parameters)), 1.0, atol=1e-4)
 
 
-def test_slopes_agree_with_the_quadrature():
+def test_slopes_agree_with_the_quadrature(float64):
     mu, roughness = random_places(12, seed=2)
     mu, roughness, step = 0.1 + 0.85 * mu, np.clip(roughness, 0.12, 0.95), 1e-3
-    with jax.enable_x64(True):
-        rho = jax.grad(lambda m, r: jnp.sum(directional_albedo(m, *arrays(None, 0.028, 1.0), r)), argnums=(0, 1))
-        in_mu, in_roughness = rho(jnp.asarray(mu), jnp.asarray(roughness))
+    rho = jax.grad(lambda m, r: jnp.sum(directional_albedo(m, *arrays(None, 0.028, 1.0), r)), argnums=(0, 1))
+    in_mu, in_roughness = jax.jit(rho)(jnp.asarray(mu), jnp.asarray(roughness))
     for index, (m, r) in enumerate(zip(mu, roughness, strict=True)):
         truth = [
             (integrated(m + step, 0.028, r) - integrated(m - step, 0.028, r)) / (2 * step),
@@ -128,23 +127,26 @@ def test_slopes_agree_with_the_quadrature():
 
 
 @pytest.mark.parametrize("roughness", [0.3, [0.2, 0.5, 0.8]], ids=["one", "map"])
-def test_gradients_in_every_argument(roughness):
-    with jax.enable_x64(True):
-        arguments = arrays(None, [0.07, 0.4, 0.9], 0.05, 0.6, roughness)
-        check_grads(jax.jit(diffuse_transmission), arguments, order=1, rtol=1e-5)
+def test_gradients_in_every_argument(float64, roughness):
+    arguments = arrays(None, [0.07, 0.4, 0.9], 0.05, 0.6, roughness)
+    check_grads(jax.jit(diffuse_transmission), arguments, order=1, rtol=1e-5)
 
 
-def test_second_derivative_in_the_cosine():
-    with jax.enable_x64(True):
-        parameters = arrays(None, 0.05, 0.6, 0.3)
-        check_grads(jax.jit(lambda mu: directional_albedo(mu, *parameters)), arrays(None, 0.4), order=2, rtol=1e-5)
+def test_second_derivative_in_the_cosine(float64):
+    parameters = arrays(None, 0.05, 0.6, 0.3)
+    check_grads(jax.jit(lambda mu: directional_albedo(mu, *parameters)), arrays(None, 0.4), order=2, rtol=1e-5)
+
+
+VALUES_AND_SLOPES = [
+    jax.jit(jax.value_and_grad(each, argnums=(0, 1, 2, 3))) for each in (directional_albedo, diffuse_transmission)
+]
 
 
 @pytest.mark.parametrize("mu", [-0.1, 0.0, 1e-7, 1e-5, 1.0, 1.0000001])
 @pytest.mark.parametrize("roughness", [0.0, 0.05, 1.0, 1.5])
 def test_borders_of_the_table_are_finite(mu, roughness, dtype):
-    for function in (directional_albedo, diffuse_transmission):
+    for value_and_slopes in VALUES_AND_SLOPES:
         for f0, specular in ((0.0, 0.0), (0.028, 0.18), (1.0, 1.0), (1.0, 5.0)):
-            value, slopes = jax.value_and_grad(function, argnums=(0, 1, 2, 3))(*arrays(dtype, mu, f0, specular, roughness))
+            value, slopes = value_and_slopes(*arrays(dtype, mu, f0, specular, roughness))
             assert np.isfinite(float(value))
             assert all(np.isfinite(float(slope)) for slope in slopes)

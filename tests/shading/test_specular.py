@@ -1,5 +1,7 @@
 """The specular lobe: reciprocity, horizon, gradients."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -72,16 +74,17 @@ DEGENERATE = {
 }
 
 
+@jax.jit
+@partial(jax.value_and_grad, argnums=tuple(range(6)))
+def total_and_slopes(normal, wi, wo, f0, specular, roughness):
+    return jnp.sum(specular_lobe(normal, wi, wo, f0=f0, specular=specular, roughness=roughness))
+
+
 @pytest.mark.parametrize("place", DEGENERATE)
 @pytest.mark.parametrize("roughness", [0.0, 0.05, 1.0])
 def test_degenerate_places_are_finite(place, roughness, dtype):
     wi, wo = (unit([direction]) for direction in DEGENERATE[place])
-    arguments = tuple(jnp.asarray(x, dtype) for x in (UP, wi, wo, 0.028, 0.18, roughness))
-
-    def total(normal, wi, wo, f0, specular, roughness):
-        return jnp.sum(specular_lobe(normal, wi, wo, f0=f0, specular=specular, roughness=roughness))
-
-    value, slopes = jax.value_and_grad(total, argnums=tuple(range(6)))(*arguments)
+    value, slopes = total_and_slopes(*(jnp.asarray(x, dtype) for x in (UP, wi, wo, 0.028, 0.18, roughness)))
     assert np.isfinite(float(value))
     assert float(value) >= 0
     assert all(np.all(np.isfinite(np.asarray(slope))) for slope in slopes)
@@ -90,16 +93,15 @@ def test_degenerate_places_are_finite(place, roughness, dtype):
         assert all(np.all(np.asarray(slope) == 0) for slope in slopes)
 
 
-def test_gradients_of_the_lobe():
-    with jax.enable_x64(True):
-        wi, wo = jnp.asarray(random_directions(8, 6)), jnp.asarray(random_directions(8, 7))
-        normal = jnp.asarray(unit(random_directions(8, 8) + np.asarray([0, 0, 3.0])))
+def test_gradients_of_the_lobe(float64):
+    wi, wo = jnp.asarray(random_directions(8, 6)), jnp.asarray(random_directions(8, 7))
+    normal = jnp.asarray(unit(random_directions(8, 8) + np.asarray([0, 0, 3.0])))
 
-        def value(normal, wi, wo, f0, specular, roughness):
-            return specular_lobe(normal, wi, wo, f0=f0, specular=specular, roughness=roughness)
+    def value(normal, wi, wo, f0, specular, roughness):
+        return specular_lobe(normal, wi, wo, f0=f0, specular=specular, roughness=roughness)
 
-        scalars = (jnp.asarray(0.05), jnp.asarray(0.5), jnp.asarray(0.4))
-        check_grads(jax.jit(value), (normal, wi, wo, *scalars), order=2, rtol=1e-5)
+    scalars = (jnp.asarray(0.05), jnp.asarray(0.5), jnp.asarray(0.4))
+    check_grads(jax.jit(value), (normal, wi, wo, *scalars), order=2, rtol=1e-5)
 
 
 def test_root_of_albedo_and_its_floor(dtype):

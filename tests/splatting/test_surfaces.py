@@ -59,6 +59,7 @@ def test_coverage_is_one_inside_a_closed_surface(seed):
     assert np.max(front[outside]) == 0
 
 
+@pytest.mark.once
 @pytest.mark.parametrize("rasterizer", ["plain", "tiles"])
 def test_two_silhouettes_in_one_pixel_leave_no_gap(rasterizer):
     """Two small spheres whose outlines coincide, before a large one: neither rim may hide what lies behind both."""
@@ -79,6 +80,7 @@ def test_two_silhouettes_in_one_pixel_leave_no_gap(rasterizer):
     assert np.min((front + (1 - front) * behind)[inside]) > 1 - 1e-6
 
 
+@pytest.mark.once
 @pytest.mark.parametrize("rasterizer", ["plain", "tiles"])
 def test_an_inner_silhouette_leaves_no_gap(rasterizer):
     """A small sphere before a large one: where the small one ends, the large one shows."""
@@ -96,21 +98,20 @@ def test_an_inner_silhouette_leaves_no_gap(rasterizer):
     assert np.all(np.asarray(surfaces.behind.attributes[0])[edge] < 0.01)
 
 
-def test_coverage_of_a_silhouette_is_differentiable():
+def test_coverage_of_a_silhouette_is_differentiable(float64):
     """Moving a disc before nothing changes its coverage by central differences."""
-    with jax.enable_x64(True):
-        view = bodies.perspective(width=24, height=24)
-        body = bodies.sphere(200, 6.0)
+    view = bodies.perspective(width=24, height=24)
+    body = bodies.sphere(200, 6.0)
 
-        @jax.jit
-        def covered(shift):
-            moved = eqx.tree_at(lambda s: s.centers, body, body.centers + shift[None])
-            surfaces = splat_surfaces(moved, jnp.zeros((0, 200)), view, SETTINGS, DenseRasterizer())
-            ramp = jnp.arange(24, dtype=float)
-            return jnp.sum(surfaces.front.coverage * (ramp[None] + 2 * ramp[:, None]))
+    @jax.jit
+    def covered(shift):
+        moved = eqx.tree_at(lambda s: s.centers, body, body.centers + shift[None])
+        surfaces = splat_surfaces(moved, jnp.zeros((0, 200)), view, SETTINGS, DenseRasterizer())
+        ramp = jnp.arange(24, dtype=float)
+        return jnp.sum(surfaces.front.coverage * (ramp[None] + 2 * ramp[:, None]))
 
-        shift, step = jnp.asarray([0.1, -0.2, 0.3]), 1e-6
-        gradient = np.asarray(jax.jit(jax.grad(covered))(shift))
-        steps = step * jnp.eye(3)
-        differences = [float(covered(shift + d) - covered(shift - d)) / (2 * step) for d in steps]
+    shift, step = jnp.asarray([0.1, -0.2, 0.3]), 1e-6
+    gradient = np.asarray(jax.jit(jax.grad(covered))(shift))
+    steps = step * jnp.eye(3)
+    differences = [float(covered(shift + d) - covered(shift - d)) / (2 * step) for d in steps]
     np.testing.assert_allclose(gradient, differences, rtol=1e-5)
