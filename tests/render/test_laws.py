@@ -200,6 +200,7 @@ def test_a_plan_holds_for_splats_that_move_a_little():
         assert float(sj.render(sj.Scene(moved, (lamp(),), material), camera, plan=plan).overflow) == 0
 
 
+@pytest.mark.once
 def test_a_light_that_has_come_among_the_splats_needs_another_plan():
     """Its map was planned as one frustum around them all."""
     splats, camera = sheet(1.0, 3.0), camera_over(2.0, 8)

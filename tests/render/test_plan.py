@@ -23,6 +23,7 @@ def camera_at(z: float) -> sj.Camera:
     return sj.Camera.look_at(jnp.asarray([0.0, 0.0, z]), jnp.zeros(3), width=8, height=8)
 
 
+@pytest.mark.once
 def test_a_plan_of_several_scenes_has_room_for_the_shadows_of_each():
     camera = camera_at(20.0)
     steep, grazing = scene_under(lamp(0.0, 0.0, -1.0)), scene_under(lamp(0.99, 0.0, -0.14))

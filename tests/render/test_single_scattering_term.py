@@ -36,6 +36,7 @@ def picture(material, albedo=None):
     return sj.render(sj.Scene(sheet(albedo), (light,), material), camera, PLAIN)
 
 
+@pytest.mark.once
 def test_it_is_its_formula_and_part_of_the_beauty():
     lit = material()
     frame = picture(lit)
@@ -49,6 +50,7 @@ def test_it_is_its_formula_and_part_of_the_beauty():
     np.testing.assert_allclose(np.asarray(plain.diffuse), np.asarray(frame.diffuse), rtol=1e-5)
 
 
+@pytest.mark.once
 def test_albedo_colors_it_as_it_colors_the_rest():
     lit, colors = material(), [0.25, 0.5, 1.0]
     colored, plain = picture(lit, colors), picture(lit)
@@ -82,6 +84,7 @@ def test_no_more_leaves_than_came_however_the_light_grazes(eta):
         np.testing.assert_allclose(np.asarray(lit.left_to_diffuse(mu[:1])), 1, atol=2e-3)
 
 
+@pytest.mark.once
 def test_files_keep_it(tmp_path):
     lit = material().white()
     sj.save_material(lit, tmp_path / "jade.toml")

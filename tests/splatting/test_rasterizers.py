@@ -140,6 +140,7 @@ def test_no_splat_gives_an_empty_picture(rasterizer):
     assert float(surfaces.needed) == 0
 
 
+@pytest.mark.once
 @pytest.mark.parametrize("capacity", [TileCapacity(500, BinCapacity(1024, 4, 4)), TileCapacity(100, BinCapacity(8192, 400, 8))])
 def test_too_small_a_capacity_poisons_the_picture_and_says_so(capacity):
     view, body = bodies.perspective(), bodies.bumpy(500)

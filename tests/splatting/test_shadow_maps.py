@@ -49,6 +49,7 @@ LIGHTS = {
 }
 
 
+@pytest.mark.once
 @pytest.mark.parametrize("kind", LIGHTS)
 def test_umbra_is_dark_and_the_rest_is_lit(kind):
     body, floor = scene()

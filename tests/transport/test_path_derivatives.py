@@ -75,7 +75,8 @@ def test_errors_of_derivatives_are_their_spread(float32):
         assert 0.6 < np.std(values, ddof=1) / said < 1.5
 
 
-def test_reverse_mode_is_forward_mode(float32):
+@pytest.mark.once
+def test_reverse_mode_is_forward_mode():
     edges = jnp.linspace(0.0, 3.0, 11)
     rows = jnp.asarray(np.random.default_rng(3).normal(size=10))
 
