@@ -6,7 +6,8 @@ WORKERS ?= 2
 # A suite's time is XLA's. Files stay whole, so that a worker meets again what it has compiled. The float32 run is compiled as
 # users have it; the others with the least optimization, which takes a third of the time.
 PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
-LEAST_OPTIMIZATION := --xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false
+LEAST_OPTIMIZATION := --xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false \
+    --xla_cpu_parallel_codegen_split_count=1
 # Every worker of every run imports the same modules, with their shapes checked: whatever the shell says, bytecode is kept.
 unexport PYTHONDONTWRITEBYTECODE
 
