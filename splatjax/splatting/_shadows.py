@@ -128,8 +128,8 @@ def lit_share(splats: Splats, view: AbstractView, surfaces: Surfaces, settings: 
 
     **Returns:** in [0, 1]; 1 outside the map. Differentiable in the splats, the view and the map.
     """
-    flat = jnp.stack([s.reshape(-1) for s in (surfaces.front.depth, surfaces.front.coverage)])
-    flat_behind = jnp.stack([s.reshape(-1) for s in (surfaces.behind.depth, surfaces.behind.coverage)])
+    both = surfaces.front, surfaces.behind
+    flat = jnp.stack([plane.reshape(-1) for each in both for plane in (each.depth, each.coverage)], axis=1)
 
     def land(centers, normals):
         x, y, depth = view.project(centers.T)
@@ -140,14 +140,13 @@ def lit_share(splats: Splats, view: AbstractView, surfaces: Surfaces, settings: 
     # Where splats land is kept: each of nine comparisons, and each of their derivatives, reads it.
     landed = in_parts(land, splats.centers, splats.normals)
     # Large parts: for each, the way back adds to the whole map.
-    return in_parts(lambda part: _compared(part.T, view, flat, flat_behind, settings), landed, at_once=4 * AT_ONCE)
+    return in_parts(lambda part: _compared(part.T, view, flat, settings), landed, at_once=4 * AT_ONCE)
 
 
 def _compared(
     landed: Float[Array, "5 splats"],
     view: AbstractView,
-    flat: Float[Array, "2 pixels"],
-    flat_behind: Float[Array, "2 pixels"],
+    flat: Float[Array, "pixels 4"],
     settings: ShadowSettings,
 ) -> Float[Array, " splats"]:
     """Compare with depth and coverage of both surfaces of a map."""
@@ -169,11 +168,8 @@ def _compared(
         t = jnp.clip((here - depth - settings.bias) / settings.softness, 0, 1)
         return coverage * t * t * (3 - 2 * t)
 
-    def of_map(plane):
-        return plane.at[index].get(mode="promise_in_bounds")
-
-    coverage = of_map(flat[1])
-    blocked = hidden(of_map(flat[0]), coverage) + (1 - coverage) * hidden(*(of_map(plane) for plane in flat_behind))
+    front, coverage, behind, coverage_behind = jnp.unstack(flat.at[index].get(mode="promise_in_bounds"), axis=-1)
+    blocked = hidden(front, coverage) + (1 - coverage) * hidden(behind, coverage_behind)
     weights = _spline(tx)[:, None] * _spline(ty)[None]
     blocked = jnp.sum(weights * jnp.where(inside, blocked, 0.0), axis=(0, 1))
     return jnp.maximum(1 - blocked, 0)  # rounding must not make light negative
