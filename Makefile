@@ -57,7 +57,8 @@ random-scenes: setup
 
 bench: setup
 	$(BIN)/python -m benchmarks
-	$(BIN)/python -m benchmarks.scale
+	$(BIN)/python -m benchmarks.diffusion_error
+	$(BIN)/python -m benchmarks.shimmer
 
 # Written anew when dependencies change; hashes, no addresses.
 lock: setup

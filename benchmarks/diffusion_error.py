@@ -18,14 +18,15 @@ from splatjax import diffusion, splatting
 from splatjax.diffusion import _layers
 from splatjax.render import _passes as wiring
 
-from .__main__ import head
-from .yardstick import make_scene
+from .scenes import BODIES, MATERIALS, columns, lit
 
 AT_ONCE = 8  # pixels
 
 
 def arguments():
     parser = argparse.ArgumentParser(prog="python -m benchmarks.diffusion_error", description=__doc__)
+    parser.add_argument("--body", choices=BODIES, default="synthetic", help="(default %(default)s)")
+    parser.add_argument("--material", choices=MATERIALS, default="skin", help="(default %(default)s)")
     parser.add_argument("--splats", type=int, default=683_549, help="on the prototype's head (default %(default)s)")
     parser.add_argument("--width", type=int, default=1024, help="of the square picture, pixels (default %(default)s)")
     parser.add_argument("--pixels", type=int, default=2000, help="random covered ones (default %(default)s)")
@@ -55,7 +56,7 @@ def untruncated(sources: diffusion.Sources, points, variance, depth):
 def main() -> None:
     options = arguments()
     options.pixels -= options.pixels % AT_ONCE
-    scene, camera = head(make_scene(options.splats), options.width)
+    scene, camera = lit(columns(options.body, options.splats), options.width, options.material)
     if options.white:
         scene = eqx.tree_at(lambda s: s.splats.albedo, scene, None)
     settings = sj.RenderSettings()
@@ -112,14 +113,14 @@ def main() -> None:
             how = "every pixel gathers" if layer.nodes is None else "through nodes"
             print(f"  {variances[k] ** 0.5:5.2f} mm: {np.median(each):.1e} {np.quantile(each, 0.99):.1e} {each.max():.1e}  {how}")
     places, side = np.asarray(atlas.tiles), splatting.SIDE
-    rows = places[tiles] // atlas.grid.across * side + within // side
-    columns = places[tiles] % atlas.grid.across * side + within % side
+    down = places[tiles] // atlas.grid.across * side + within // side
+    across = places[tiles] % atlas.grid.across * side + within % side
     covered = np.asarray(seen.covered, np.uint8)[..., None].astype(np.float32)
     picture = (40 * np.asarray(atlas.front_picture(jnp.asarray(covered))[..., 0])).astype(np.uint8)
     shade = np.clip(60 + 195 * np.max(off, axis=0) / 1e-2, 60, 255).astype(np.uint8)
     for i in (-1, 0, 1):
         for j in (-1, 0, 1):
-            picture[np.clip(rows + i, 0, options.width - 1), np.clip(columns + j, 0, options.width - 1)] = shade
+            picture[np.clip(down + i, 0, options.width - 1), np.clip(across + j, 0, options.width - 1)] = shade
     out = Path("out/diffusion_error.png")
     out.parent.mkdir(exist_ok=True)
     Image.fromarray(picture).save(out)

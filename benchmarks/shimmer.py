@@ -17,14 +17,14 @@ import splatjax as sj
 from splatjax import diffusion
 from splatjax.render import _passes as wiring
 
-from .__main__ import head
-from .yardstick import make_scene
+from .scenes import BODIES, columns, lit
 
 VARIANCES = (4.0, 8.0, 16.0, 32.0)  # mm^2: what splats a millimetre apart carry
 
 
 def arguments():
     parser = argparse.ArgumentParser(prog="python -m benchmarks.shimmer", description=__doc__)
+    parser.add_argument("--body", choices=BODIES, default="synthetic", help="(default %(default)s)")
     parser.add_argument("--splats", type=int, default=100_000, help="on the prototype's head (default %(default)s)")
     parser.add_argument("--width", type=int, default=256, help="of the square picture, pixels (default %(default)s)")
     parser.add_argument("--steps", type=int, default=4, help="from frame to frame (default %(default)s)")
@@ -43,7 +43,7 @@ def turned(camera: sj.Camera, middle: np.ndarray, degrees: float) -> sj.Camera:
 
 def main() -> None:
     options = arguments()
-    scene, camera = head(make_scene(options.splats), options.width)
+    scene, camera = lit(columns(options.body, options.splats), options.width)
     weights = jnp.full((len(VARIANCES), 3), 1 / len(VARIANCES))
     scene = eqx.tree_at(lambda s: s.material, scene, sj.Material(sj.SumOfGaussians(jnp.asarray(VARIANCES), weights)))
     middle = np.mean(np.asarray(scene.splats.centers), axis=0)

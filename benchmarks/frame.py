@@ -1,0 +1,156 @@
+"""One body at one size, in a process of its own: `python -m benchmarks.frame`. The last line is all rows as JSON."""
+
+import argparse
+import json
+import resource
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import splatjax as sj
+from splatjax import diffusion, splatting
+from splatjax.render import _passes as wiring
+
+from .scenes import BODIES, columns, lit
+from .yardstick import Yardstick
+
+
+def arguments():
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.frame", description=__doc__)
+    parser.add_argument("--body", choices=BODIES, default="synthetic", help="(default %(default)s)")
+    parser.add_argument("--splats", type=int, default=683_549, help="(default %(default)s)")
+    parser.add_argument("--width", type=int, default=1024, help="of the square picture, pixels (default %(default)s)")
+    parser.add_argument("--repeats", type=int, default=7, help="rounds; medians are given (default %(default)s)")
+    parser.add_argument("--frame-only", action="store_true", help="the whole frame alone, without its passes and gradients")
+    return parser.parse_args()
+
+
+def rasterization(scene: sj.Scene, camera: sj.Camera, plan: sj.Plan, settings: sj.RenderSettings):
+    """Passes 2 and 3 with normals and albedo, and the gradient of the picture's mean square in all that they read.
+
+    The picture is what the yardstick makes, and coverage: the front laid over what shows behind it.
+    """
+    areas = scene.splats.areas
+
+    def picture(camera, centers, normals, radii, albedo):
+        view, splats = splatting.PerspectiveView.of(camera), sj.Splats(centers, normals, radii, areas)
+        rows = jnp.concatenate([normals.T, albedo.T])
+        seen = splatting.splat_surfaces(splats, rows, view, settings.splatting, plan.camera)
+        front = seen.front.coverage
+        behind = (1 - front) * seen.behind.coverage
+        return [
+            *(front * a + behind * b for a, b in zip(seen.front.attributes, seen.behind.attributes, strict=True)),
+            front + behind,
+        ]
+
+    def loss(*inputs):
+        return sum(jnp.mean(plane**2) for plane in picture(*inputs))
+
+    s = scene.splats
+    return picture, jax.grad(loss, argnums=(1, 2, 3, 4)), (camera, s.centers, s.normals, s.radii, s.albedo)
+
+
+def passes(scene: sj.Scene, camera: sj.Camera, plan: sj.Plan, settings: sj.RenderSettings) -> dict[str, tuple]:
+    """Each pass alone, fed with what the one before gave: name to function and arguments."""
+    view = splatting.PerspectiveView.of(camera)
+
+    def shadow(scene):
+        return wiring.cast_shadows(scene, settings, plan)
+
+    def visible(scene, light, entering):
+        attributes = wiring.surface_attributes(scene, light, entering)
+        return wiring.see_surfaces(scene.splats, attributes, view, settings, plan)
+
+    def layers(scene, entering, seen):
+        sources = wiring.sources_of(scene.splats, entering.source)
+        rest = plan.interval, seen.atlas, plan.diffuser, settings.diffusion.normalization
+        return diffusion.diffusion_layers(sources, scene.material, seen.receivers(), *rest)
+
+    light = jax.jit(shadow)(scene)
+    entering = jax.jit(wiring.let_light_in)(scene, light)
+    seen = jax.jit(visible)(scene, light, entering)
+    return {
+        "pass 1, shadow map": (shadow, (scene,)),
+        "irradiance": (wiring.let_light_in, (scene, light)),
+        "passes 2+3, all attributes": (visible, (scene, light, entering)),
+        "pass 4, six layers": (layers, (scene, entering, seen)),
+    }
+
+
+def timed(function: Callable, inputs: tuple) -> float:
+    start = time.perf_counter()
+    jax.block_until_ready(function(*inputs))
+    return 1e3 * (time.perf_counter() - start)
+
+
+def cases_of(scene: sj.Scene, camera: sj.Camera, plan: sj.Plan, frame_only: bool) -> dict[str, tuple]:
+    """Give what is timed, by name: functions and their arguments."""
+    settings = sj.RenderSettings()
+
+    def frame(scene):
+        return sj.render(scene, camera, settings, plan)
+
+    def mean(scene):
+        return jnp.mean(frame(scene).beauty)
+
+    def jacobian(scene):
+        return sj.picture_jacobian(scene, camera, settings, plan)
+
+    if frame_only:
+        return {"all five passes": (frame, (scene,))}
+    forward, backward, inputs = rasterization(scene, camera, plan, settings)
+    return {
+        "passes 2+3": (forward, inputs),
+        "passes 2+3 with gradients": (backward, inputs),
+        "all five passes": (frame, (scene,)),
+        "all five passes with gradients": (jax.grad(mean), (scene,)),
+        "all five passes with the Jacobian in the material": (jacobian, (scene,)),
+        **passes(scene, camera, plan, settings),
+    }
+
+
+def main() -> None:
+    options = arguments()
+    data = columns(options.body, options.splats)
+    scene, camera = lit(data, options.width)
+    sj.plan(scene, camera)
+    start = time.perf_counter()
+    plan = sj.plan(scene, camera)
+    planning = 1e3 * (time.perf_counter() - start)
+    if float(sj.render(scene, camera, plan=plan).overflow) > 0:
+        raise SystemExit(f"{options.splats} splats at {options.width}^2: the plan does not hold its own scene")
+    rows, compiled = {}, {}
+    for name, (function, inputs) in cases_of(scene, camera, plan, options.frame_only).items():
+        start = time.perf_counter()
+        compiled[name] = jax.jit(function).lower(*inputs).compile(), inputs
+        seconds = time.perf_counter() - start
+        held = compiled[name][0].memory_analysis()
+        bytes_held = held.temp_size_in_bytes + held.argument_size_in_bytes + held.output_size_in_bytes
+        rows[name] = {"compile_seconds": seconds, "gigabytes": 1e-9 * bytes_held}
+        timed(*compiled[name])
+    times = {name: [] for name in compiled}
+    with tempfile.TemporaryDirectory() as folder:
+        yardstick = Yardstick(Path(folder), data, options.width)
+        for _ in range(options.repeats):
+            yardstick.run()
+            for name, case in compiled.items():
+                times[name].append(timed(*case))
+    medians = yardstick.medians()
+    common = {"body": options.body, "splats": options.splats, "width": options.width}
+    common |= {f"{name.replace(' ', '_')}_milliseconds": value for name, value in medians.items()}
+    common |= {"planning_milliseconds": planning}
+    common |= {"process_gigabytes": 1e-6 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss}
+    unit = medians["yardstick"]
+    for name, row in rows.items():
+        value = float(np.median(times[name]))
+        row |= {"name": name, **common, "milliseconds": value, "ratio": value / unit if unit else None}
+    print(json.dumps(list(rows.values())))
+
+
+if __name__ == "__main__":
+    main()
