@@ -5,6 +5,7 @@ From a few optical coefficients to a translucent picture, and back; lengths in m
 
 from .fitting import FitResult as FitResult, fit_gaussians as fit_gaussians, relative_error as relative_error
 from .fitting import error_by_count as error_by_count, LeastCount as LeastCount
+from .fitting import fit_weights as fit_weights
 from .fitting import FreeWeights as FreeWeights, NonNegativeWeights as NonNegativeWeights
 from .fitting import TotalReflectanceHeld as TotalReflectanceHeld
 from .fitting import GivenVariances as GivenVariances, InsertedGaussians as InsertedGaussians
@@ -38,6 +39,8 @@ from .transport import DiffuseIncidence as DiffuseIncidence, NormalIncidence as 
 from .transport import HenyeyGreenstein as HenyeyGreenstein, Isotropic as Isotropic
 from .transport import monte_carlo as monte_carlo, MonteCarlo as MonteCarlo, path_derivatives as path_derivatives
 
+from .render import gather_picture as gather_picture, gather_picture_and_slopes as gather_picture_and_slopes
+from .render import GatheredPicture as GatheredPicture
 from .render import diffuse as diffuse, picture_jacobian as picture_jacobian, PictureJacobian as PictureJacobian
 from .render import Plan as Plan, plan as plan, render as render, RenderSettings as RenderSettings
 

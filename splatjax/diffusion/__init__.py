@@ -4,6 +4,8 @@ from ._clustered import ClusterDiffuser as ClusterDiffuser
 from ._dense import DenseDiffuser as DenseDiffuser
 from ._diffuser import AbstractDiffuser as AbstractDiffuser, Diffused as Diffused
 from ._diffuser import Kernels as Kernels, Sources as Sources
+from ._gathered import Gather as Gather, gather_light as gather_light, gather_light_and_slopes as gather_light_and_slopes
+from ._gathered import GatheredLight as GatheredLight, GatheredSlopes as GatheredSlopes
 from ._handover import handover_interval as handover_interval, irregularity as irregularity
 from ._handover import resolved_share as resolved_share
 from ._irradiance import entering_irradiance as entering_irradiance

@@ -88,6 +88,11 @@ class Problem(eqx.Module):
             basis = jnp.where(jnp.broadcast_to(active, basis.shape), basis, jnp.zeros_like(basis))
         return basis, *jax.vmap(solve)(basis, self.target, self.total / self.norm)
 
+    def weighed(self, log_variances: Float[Array, " gaussians"]) -> Float[Array, "gaussians channels"]:
+        """Give the best weights."""
+        _, coefficients, _ = self.solve(log_variances)
+        return (coefficients * self.norm[:, None] * self._energies(self.variances(log_variances))[None]).T
+
     def residuals(
         self, log_variances: Float[Array, " gaussians"], active: Bool[Array, " gaussians"] | None = None
     ) -> Float[Array, "channels nodes"]:
