@@ -44,4 +44,9 @@ from .render import GatheredPicture as GatheredPicture
 from .render import diffuse as diffuse, picture_jacobian as picture_jacobian, PictureJacobian as PictureJacobian
 from .render import Plan as Plan, plan as plan, render as render, RenderSettings as RenderSettings
 
+from .inverse import HuberLoss as HuberLoss, SquaredLoss as SquaredLoss
+from .inverse import KnownIntensity as KnownIntensity, UnknownColor as UnknownColor, UnknownIntensity as UnknownIntensity
+from .inverse import Candidate as Candidate, next_pictures as next_pictures, usual_candidates as usual_candidates
+from .inverse import Observation as Observation, recover as recover, Recovery as Recovery
+
 __version__ = "0.1.0"

@@ -1,0 +1,47 @@
+"""How much a residual counts."""
+
+import abc
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+
+class AbstractLoss(eqx.Module):
+    """What is summed over the pixels, as a function of residuals in units of their deviations."""
+
+    @abc.abstractmethod
+    def root(self, residuals: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Give what has the loss as its square, with the sign of the residual: near zero the residual itself."""
+
+
+class SquaredLoss(AbstractLoss):
+    """The square: right for noise that is normal, misled by every highlight that the model does not know."""
+
+    def root(self, residuals: Float[Array, "..."]) -> Float[Array, "..."]:
+        return residuals
+
+
+class HuberLoss(AbstractLoss):
+    r"""The square for small residuals and twice the absolute value times the bend for large ones, smoothly.
+
+        loss(r) = 2 b^2 (sqrt(1 + r^2 / b^2) - 1)
+
+    **Attributes:**
+
+    - `bend`: deviations at which one becomes the other, positive. Static.
+
+    **Raises:** `ValueError` for a bend that is not positive.
+
+    **Source:** Huber 1964; in this smooth form Charbonnier and others 1997.
+    """
+
+    bend: float = eqx.field(static=True, default=2.0)
+
+    def __check_init__(self):
+        if not self.bend > 0:
+            raise ValueError(f"bend must be positive (deviations); got {self.bend:g}")
+
+    def root(self, residuals: Float[Array, "..."]) -> Float[Array, "..."]:
+        squared = (residuals / self.bend) ** 2
+        return residuals * jnp.sqrt(2 / (1 + jnp.sqrt(1 + squared)))

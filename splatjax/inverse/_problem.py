@@ -1,0 +1,138 @@
+"""Coefficients in, residuals out: what the least squares solver sees."""
+
+import abc
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import Array, Bool, Float, Int
+
+from splatjax.fitting import AbstractWeights, GivenVariances, fit_gaussians, fit_weights
+from splatjax.gaussians import AbstractProfile, SumOfGaussians
+from splatjax.scattering import Medium
+
+from ._flat import FlatPictures
+from ._losses import AbstractLoss
+
+_STEPS = 64
+
+
+class Unknowns(eqx.Module):
+    """How the numbers to be found are laid out: log sigma_a, log sigma_s' per channel, then log factors of the lights."""
+
+    eta: Float[Array, " channels"]
+    factors: Int[Array, "pictures channels"]
+    """Which factor a picture's channel has; that many as there are where its intensity is known."""
+
+    def medium(self, point: Float[Array, " unknowns"]) -> Medium:
+        channels = self.eta.shape[0]
+        return Medium(jnp.exp(point[:channels]), jnp.exp(point[channels : 2 * channels]), self.eta)
+
+    def intensities(self, point: Float[Array, " unknowns"]) -> Float[Array, "pictures channels"]:
+        factors = jnp.append(point[2 * self.eta.shape[0] :], jnp.zeros((), point.dtype))
+        return jnp.exp(factors[self.factors])
+
+    def start(self, medium: Medium, count: int) -> Float[Array, " unknowns"]:
+        return jnp.concatenate([jnp.log(medium.sigma_a), jnp.log(medium.sigma_s_prime), jnp.zeros(count, self.eta.dtype)])
+
+
+class AbstractVariances(eqx.Module):
+    """Where the variances of a medium's Gaussians come from."""
+
+    @abc.abstractmethod
+    def gaussians(self, profile: AbstractProfile, weights: AbstractWeights) -> SumOfGaussians:
+        """Give the Gaussians of a profile. Differentiable."""
+
+
+class Held(AbstractVariances):
+    """The same for all media."""
+
+    variances: Float[Array, " gaussians"]
+
+    def gaussians(self, profile: AbstractProfile, weights: AbstractWeights) -> SumOfGaussians:
+        return fit_weights(profile, self.variances, weights=weights)
+
+
+class Fitted(AbstractVariances):
+    """Those of the best fit to each, near some: variances and weights move together."""
+
+    near: Float[Array, " gaussians"]
+
+    def gaussians(self, profile: AbstractProfile, weights: AbstractWeights) -> SumOfGaussians:
+        start = GivenVariances(self.near)
+        return fit_gaussians(profile, len(self.near), weights=weights, start=start, throw=False).gaussians
+
+
+class Problem(eqx.Module):
+    """The pictures, what was observed, and how the one is made from coefficients."""
+
+    pictures: FlatPictures
+    observed: Float[Array, "channels pixels"]
+    deviation: Float[Array, "channels pixels"]
+    unknowns: Unknowns
+    variances: AbstractVariances
+    loss: AbstractLoss
+    weights: AbstractWeights
+    model: Callable[[Medium], AbstractProfile] = eqx.field(static=True)
+
+    def gaussians(self, point: Float[Array, " unknowns"]) -> SumOfGaussians:
+        return self.variances.gaussians(self.model(self.unknowns.medium(point)), self.weights)
+
+    def radiance(self, point: Float[Array, " unknowns"]) -> Float[Array, "channels pixels"]:
+        return self.pictures.radiance(self.gaussians(point), self.unknowns.intensities(point))
+
+    def residuals(self, point: Float[Array, " unknowns"]) -> Float[Array, "channels pixels"]:
+        """Give what the loss has as its square."""
+        return self.loss.root((self.radiance(point) - self.observed) / self.deviation)
+
+
+class Found(eqx.Module):
+    """Where a search ended."""
+
+    point: Float[Array, " unknowns"]
+    cost: Float[Array, ""]
+    steps: Int[Array, ""]
+    converged: Bool[Array, ""]
+
+
+@eqx.filter_jit
+def search(problem: Problem, start: Float[Array, " unknowns"]) -> Found:
+    """Minimize the loss from a start: Levenberg and Marquardt's method."""
+    tolerance = 1e-4 if start.dtype == jnp.float32 else 1e-7
+    # In units of the start's own residual, so that damping and tolerances mean the same for any noise and number of pixels.
+    unit = jnp.sqrt(jnp.sum(problem.residuals(start) ** 2)) + jnp.finfo(start.dtype).tiny
+
+    def residuals(point, problem):
+        return problem.residuals(point) / unit
+
+    solver = optx.LevenbergMarquardt(rtol=tolerance, atol=tolerance)
+    found = optx.least_squares(residuals, solver, start, problem, max_steps=_STEPS, throw=False)
+    cost = jnp.sum(problem.residuals(found.value) ** 2)
+    steps = jnp.asarray(found.stats["num_steps"])
+    return Found(found.value, cost, steps, (found.result == optx.RESULTS.successful) & jnp.isfinite(cost))
+
+
+class Solution(eqx.Module):
+    """What is known at a point.
+
+    **Attributes:**
+
+    - `information`: the inverse of the covariance that noise of the given deviations leaves (Laplace, by Gauss and Newton).
+    - `gaussians`, `radiance`: of the point.
+    """
+
+    information: Float[Array, "unknowns unknowns"]
+    gaussians: SumOfGaussians
+    radiance: Float[Array, "channels pixels"]
+
+
+@eqx.filter_jit
+def solution(problem: Problem, point: Float[Array, " unknowns"]) -> Solution:
+    def residuals(point):
+        gaussians, radiance = problem.gaussians(point), problem.radiance(point)
+        return problem.residuals(point), (gaussians, radiance)
+
+    slopes, (gaussians, radiance) = jax.jacfwd(residuals, has_aux=True)(point)
+    return Solution(jnp.einsum("cpi,cpj->ij", slopes, slopes), gaussians, radiance)

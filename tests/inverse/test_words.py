@@ -1,0 +1,89 @@
+"""What a recovery says of itself: principal axes of a covariance, in words."""
+
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import pytest
+
+import splatjax as sj
+from splatjax.inverse import Recovery
+
+
+def recovery(information, chi_squared=1.0, noise_is_known=True, channels=1) -> Recovery:
+    """A recovery of which nothing is known but this."""
+    medium = sj.Medium(jnp.full(channels, 0.02), jnp.full(channels, 1.5), jnp.full(channels, 1.3))
+    gaussians = sj.SumOfGaussians(jnp.ones(1), jnp.full((1, channels), 0.5))
+    return Recovery(
+        medium=medium,
+        material=sj.Material(gaussians),
+        intensities=jnp.ones((1, channels)),
+        information=jnp.asarray(information, float),
+        chi_squared=jnp.asarray(chi_squared),
+        pictures=(),
+        residuals=(),
+        ends=(),
+        costs=jnp.zeros(1),
+        result=optx.RESULTS.successful,
+        noise_is_known=noise_is_known,
+        relative_noise=0.01,
+        steps=1,
+        rounds=1,
+    )
+
+
+def along(best: float, worst: float, angle: float) -> np.ndarray:
+    """Information of a medium whose best known combination lies at an angle to the axis of sigma_a."""
+    axes = np.asarray([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    return axes @ np.diag([best**-2, worst**-2]) @ axes.T
+
+
+def test_what_is_not_fixed_is_said():
+    """The reduced albedo is known to 1%, the mean free path to 50%."""
+    found = recovery(along(0.01, 0.5, -np.pi / 4))
+    ((best, worst),) = found.combinations()
+    np.testing.assert_allclose([best.deviation, worst.deviation], [0.01, 0.5], rtol=1e-4)
+    np.testing.assert_allclose(best.powers, (1, -1), rtol=1e-3)
+    np.testing.assert_allclose(worst.powers, (1, 1), rtol=1e-3)
+    assert not found.is_fixed()
+    said = found.words(["red"])
+    assert "not fixed by these pictures: sigma_a sigma_s', known to 50%; what they fix is sigma_a / sigma_s', to 1%" in said
+    np.testing.assert_allclose(found.relative_errors(), np.full((2, 1), np.sqrt((0.01**2 + 0.5**2) / 2)), rtol=1e-4)
+
+
+def test_what_is_fixed_is_not_said_to_be_open():
+    found = recovery(along(0.01, 0.02, 0.3))
+    assert found.is_fixed()
+    assert "not fixed" not in found.words()
+
+
+def test_without_noise_given_the_bars_are_those_of_what_is_left():
+    known = recovery(along(0.01, 0.02, 0.3), chi_squared=9.0)
+    unknown = recovery(along(0.01, 0.02, 0.3), chi_squared=9.0, noise_is_known=False)
+    np.testing.assert_allclose(unknown.covariance(), 9 * known.covariance(), rtol=1e-5)
+    assert "3 times the noise: it lacks something" in known.words()
+    assert "what the model leaves over" in unknown.words()
+
+
+def test_an_unknown_intensity_widens_the_bars():
+    """Where it does the same as the absorption does, they are infinite."""
+    parallel = np.asarray([[4.0, 1.0, 4.0], [1.0, 3.0, 1.0], [4.0, 1.0, 4.0]])
+    apart = parallel + np.diag([0, 0, 2.0])
+    (at_once,) = recovery(apart).covariance()
+    np.testing.assert_allclose(at_once, np.linalg.inv(apart)[:2, :2], rtol=1e-4)
+    found = recovery(parallel)
+    assert found.combinations()[0][1].deviation > 1e3
+    assert "anything" in found.words()
+
+
+def test_a_suggestion_needs_candidates():
+    splats = sj.Splats(jnp.zeros((1, 3)), jnp.zeros((1, 3)), jnp.ones(1), jnp.ones(1))
+    with pytest.raises(ValueError, match="candidates is empty"):
+        sj.next_pictures(recovery(np.eye(2)), splats, [])
+
+
+@pytest.mark.parametrize("information", [np.zeros((2, 2)), np.full((2, 2), np.nan), np.diag([4.0, 0.0])])
+def test_nothing_known_is_nothing_known(information):
+    found = recovery(information)
+    assert not found.is_fixed()
+    assert not np.any(np.isfinite(found.relative_errors()))
+    assert "anything" in found.words()
