@@ -11,6 +11,7 @@ from ._environment import prepare_jax
 from ._export import Export
 from ._fit import Fit
 from ._materials import Materials
+from ._recover import Recover
 from ._render import Render
 from ._sample import Sample
 from ._turntable import Turntable
@@ -21,6 +22,7 @@ _Command = (
     | Annotated[Export, tyro.conf.subcommand("export")]
     | Annotated[Sample, tyro.conf.subcommand("sample")]
     | Annotated[Render, tyro.conf.subcommand("render")]
+    | Annotated[Recover, tyro.conf.subcommand("recover")]
     | Annotated[Turntable, tyro.conf.subcommand("turntable")]
 )
 _DESCRIPTION = """Render translucent materials, and find the sums of Gaussians that stand for them. Lengths are in mm.

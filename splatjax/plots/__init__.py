@@ -2,3 +2,4 @@
 
 from ._counts import plot_error_by_count as plot_error_by_count
 from ._fit import plot_fit as plot_fit
+from ._recovery import plot_recovery as plot_recovery

@@ -1,0 +1,178 @@
+"""`splatjax recover`: from pictures of a known shape to a material."""
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+from rich.console import Console
+
+import splatjax as sj
+from splatjax.io import atomic_path, fingerprint, material_path, own_version, picture_paths, read_record, write_record
+
+from ._models import Model
+from ._outputs import OptionalPath, check_output
+from ._report import note, stage
+
+_MODELS = {Model.DIPOLE: sj.Dipole, Model.BETTER_DIPOLE: sj.BetterDipole}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recover:
+    """Find the absorption and scattering of a material from pictures of a known shape, with error bars, and say what the pictures
+    do not fix and which one to take next.
+
+    The pictures are listed in a TOML file, each with its camera, its lights, and what is known of noise and intensity:
+
+        [[pictures]]
+        file = "left.exr"
+        noise = 0.01             # over the picture's root mean square; leave it out if it is unknown
+        intensity = "unknown"    # or "known", the default, or "unknown color"
+        camera = { position = [0, 0, 500], target = [0, 0, 0], fov = 25 }
+        [[pictures.lights]]
+        kind = "directional"     # or "point" (position, intensity) or "beam" (origin, direction, power, variance)
+        direction = [1, -0.3, -0.5]
+        irradiance = [3.14, 3.14, 3.14]
+
+    Albedo of the splats is not used: the coefficients carry all color. Interrupt it, and the same command goes on from the best
+    medium it knew.
+
+    Example: splatjax recover head.ply pictures.toml --start skin1 marble --output mine.toml --report mine.png
+    """
+
+    splats: tyro.conf.Positional[Path]
+    """PLY file of splats, in mm (`splatjax sample` makes one)."""
+    pictures: tyro.conf.Positional[Path]
+    """TOML file that lists the pictures."""
+    start: tuple[str, ...] = ("skin1", "marble")
+    """Materials to start from, within a factor of three in both coefficients: names, or paths of TOML files. The best end counts;
+    the index of refraction is that of the first."""
+    output: Path = Path("recovered.toml")
+    """TOML file to write the material to."""
+    report: OptionalPath = None
+    """Picture to write of what was seen, what was recovered and what is left: .png, .pdf or .svg."""
+    model: tyro.conf.EnumChoicesFromValues[Model] = Model.DIPOLE
+    """dipole or better-dipole."""
+    count: int = 6
+    """Number of Gaussians."""
+    robust: bool = False
+    """Let pixels that are far off count less: highlights, dust, what the model does not know."""
+    specular: float = 0.0
+    """Strength of the specular lobe, if the pictures show one."""
+    roughness: float = 0.3
+    """Of the specular lobe."""
+    suggest: bool = True
+    """Say which picture would tell most, of some that could be taken from where the first was."""
+
+    def run(self) -> None:
+        """Load, recover, say, write."""
+        check_output(self.output, (".toml",))
+        if self.report is not None:
+            check_output(self.report, (".png", ".pdf", ".svg"))
+        if self.model not in _MODELS:
+            raise ValueError(f"--model {self.model.value} cannot be searched; take {' or '.join(m.value for m in _MODELS)}")
+        if not self.start:
+            raise ValueError("--start names no material; give one or more (`splatjax materials`)")
+        for name in self.start:
+            sj.load_medium(name)  # says at once what is wrong with it
+        with stage(f"reading {self.splats} and {self.pictures}"):
+            observations = sj.read_observations(self.pictures)
+            splats = sj.read_splats(self.splats)
+        splats = sj.Splats(splats.centers, splats.normals, splats.radii, splats.areas)
+        with jax.enable_x64(True):
+            self._run(observations, splats)
+
+    def _run(self, observations: list[sj.Observation], splats: sj.Splats) -> None:
+        starts = self._starts(observations[0].picture.shape[2])
+        surface = sj.Material(
+            sj.SumOfGaussians(jnp.ones(1), jnp.ones((1, starts[0].eta.shape[0]))),
+            eta=starts[0].eta[0],
+            specular=self.specular,
+            roughness=self.roughness,
+        )
+        begin, kept, made = time.perf_counter(), self._kept(), self._made()
+
+        def say(said: str, medium: sj.Medium) -> None:
+            note(f"{time.perf_counter() - begin:6.1f} s  {said}")
+            if medium is starts[0]:  # nothing is found yet
+                return
+            found = {"sigma_a": medium.sigma_a.tolist(), "sigma_s_prime": medium.sigma_s_prime.tolist()}
+            write_record(kept, {"made of": made, **found})
+
+        recovery = sj.recover(
+            observations,
+            splats,
+            starts,
+            surface=surface,
+            model=_MODELS[self.model],
+            count=self.count,
+            loss=sj.HuberLoss() if self.robust else sj.SquaredLoss(),
+            progress=say,
+        )
+        note(f"{time.perf_counter() - begin:6.1f} s  found, after {recovery.rounds} rounds and {recovery.steps} steps")
+        Console(highlight=False, soft_wrap=True).print(recovery.words(), markup=False)
+        if self.suggest:
+            self._suggest(recovery, observations, splats)
+        self._save(recovery)
+        kept.unlink(missing_ok=True)
+        print(self.output)
+        if self.report is not None:
+            from splatjax.plots import plot_recovery  # loads matplotlib
+
+            with atomic_path(self.report) as written:
+                plot_recovery(recovery, title=f"{self.output.stem}: {len(observations)} picture(s)").savefig(written)
+            print(self.report)
+
+    def _starts(self, channels: int) -> list[sj.Medium]:
+        """Give the media to start from: where an interrupted search had come to, if there was one."""
+        known = [sj.load_medium(name) for name in self.start]
+        for name, medium in zip(self.start, known, strict=True):
+            if medium.eta.shape[0] != channels:
+                raise ValueError(f"--start {name} has {medium.eta.shape[0]} channels, the pictures have {channels}; name another")
+        starts = [sj.Medium(medium.sigma_a, medium.sigma_s_prime, known[0].eta) for medium in known]
+        kept = self._kept()
+        if not kept.exists():
+            return starts
+        record = read_record(kept)
+        if record.get("made of") != self._made():
+            note(f"{kept}: is of another search, and is not used")
+            return starts
+        note(f"{kept}: an interrupted search goes on")
+        return [sj.Medium(jnp.asarray(record["sigma_a"]), jnp.asarray(record["sigma_s_prime"]), known[0].eta)]
+
+    def _kept(self) -> Path:
+        return self.output.with_suffix(".search.json")
+
+    def _made(self) -> dict[str, Any]:
+        """Give all that a search depends on."""
+        files = [self.splats, *picture_paths(self.pictures), *(material_path(name) for name in self.start)]
+        options = {"model": self.model.value, "count": self.count, "robust": self.robust, "specular": self.specular}
+        return {"files": [fingerprint(file) for file in files], **options, "roughness": self.roughness, "splatjax": own_version()}
+
+    def _suggest(self, recovery: sj.Recovery, observations: list[sj.Observation], splats: sj.Splats) -> None:
+        candidates = sj.usual_candidates(splats, observations[0].camera, observations[0].picture.shape[2])
+        with stage(f"looking at {len(candidates)} pictures that could be taken next"):
+            predictions = sj.next_pictures(recovery, splats, candidates, model=_MODELS[self.model])
+        print("what one more picture would do, the best first:")
+        for prediction in predictions:
+            print(f"  {prediction}")
+
+    def _save(self, recovery: sj.Recovery) -> None:
+        errors = recovery.relative_errors()
+        sj.save_material(
+            recovery.material,
+            self.output,
+            profile=_MODELS[self.model](recovery.medium),
+            source={
+                "provenance": f"recovered by splatjax {sj.__version__} from the pictures of {self.pictures.name}, "
+                f"on the shape {self.splats.name}",
+                "relative_error_of_sigma_a": np.asarray(errors[0]).tolist(),
+                "relative_error_of_sigma_s_prime": np.asarray(errors[1]).tolist(),
+                "chi_squared": float(recovery.chi_squared),
+            },
+            fit={"variances_of": "all channels", "weights_of": "non-negative, sum held to the total reflectance"},
+        )

@@ -1,0 +1,114 @@
+"""Which pictures were taken, and how: what a file says is what is read, and what it may not say."""
+
+import numpy as np
+import OpenEXR
+import pytest
+
+import splatjax as sj
+from splatjax.io import picture_paths
+
+GOOD = """[[pictures]]
+file = "one.exr"
+mask = "mask.exr"
+noise = 0.02
+intensity = "unknown"
+camera = { position = [0, 1, 50], target = [0, 0, 0], fov = 30 }
+[[pictures.lights]]
+kind = "directional"
+direction = [0, 0, -1]
+irradiance = [1, 2, 3]
+[[pictures.lights]]
+kind = "point"
+position = [0, 0, 20]
+intensity = 5
+cast_shadows = false
+
+[[pictures]]
+file = "one.exr"
+camera = { position = [0, 1, 50], target = [0, 0, 0] }
+[[pictures.lights]]
+kind = "beam"
+origin = [0, 0, 20]
+direction = [0, 0, -1]
+power = [1, 1, 1]
+variance = 0.5
+"""
+
+
+def write_picture(path, planes):
+    with OpenEXR.File({"type": OpenEXR.scanlineimage}, planes) as file:
+        file.write(str(path))
+
+
+@pytest.fixture
+def listed(tmp_path):
+    red = np.arange(12, dtype=np.float32).reshape(3, 4)
+    write_picture(tmp_path / "one.exr", {"R": red, "G": red + 1, "B": red + 2})
+    write_picture(tmp_path / "mask.exr", {"Y": (red > 5).astype(np.float32)})
+
+    def write(text: str):
+        path = tmp_path / "pictures.toml"
+        path.write_text(text)
+        return path
+
+    return write
+
+
+def test_what_is_written_is_read(listed):
+    first, second = sj.read_observations(listed(GOOD))
+    assert first.picture.shape == (3, 4, 3)
+    np.testing.assert_array_equal(first.picture[1, 2], [6, 7, 8])
+    np.testing.assert_array_equal(first.mask, np.arange(12).reshape(3, 4) > 5)
+    size = np.sqrt(np.mean(np.asarray(first.picture)[np.asarray(first.mask)] ** 2))
+    np.testing.assert_allclose(first.deviation, 0.02 * size, rtol=1e-6)
+    assert isinstance(first.intensity, sj.UnknownIntensity)
+    assert (first.camera.width, first.camera.height) == (4, 3)
+    np.testing.assert_allclose(first.camera.position, [0, 1, 50])
+    sun, lamp = first.lights
+    np.testing.assert_array_equal(sun.irradiance, [1, 2, 3])
+    assert sun.cast_shadows
+    assert isinstance(lamp, sj.PointLight)
+    np.testing.assert_array_equal(lamp.intensity, [5, 5, 5])
+    assert not lamp.cast_shadows
+    assert second.mask is None
+    assert second.deviation is None
+    assert isinstance(second.intensity, sj.KnownIntensity)
+    (beam,) = second.lights
+    assert isinstance(beam, sj.GaussianBeam)
+    assert float(beam.variance) == 0.5
+
+
+def test_all_files_are_named(listed, tmp_path):
+    names = [path.name for path in picture_paths(listed(GOOD))]
+    assert names == ["pictures.toml", "one.exr", "mask.exr", "one.exr"]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ('file = "one.exr"\nmask', "mask", r"\[pictures 1\] has no file; it must be the name of an EXR file"),
+        ("noise = 0.02", "noise = 0", r"\[pictures 1\] noise must be a number, positive; it is 0"),
+        ("noise = 0.02", "nois = 0.02", r"has an unknown entry 'nois'; known are camera, file"),
+        ('"unknown"', '"maybe"', r"intensity must be one of known, unknown, unknown color; it is 'maybe'"),
+        ("[0, 1, 50]", "[0, 1]", r"\[pictures 1 camera\] position must be three numbers; it is \[0.0, 1.0\]"),
+        ("[0, 0, -1]", "[0, 0, 0]", r"\[pictures 1 lights 1\] direction must be three numbers, not all 0"),
+        ("[1, 2, 3]", "[1, 2]", r"irradiance must be 3 numbers, as its picture has channels"),
+        ('"directional"', '"sun"', r"kind must be one of directional, point, beam; it is 'sun'"),
+        ("cast_shadows = false", "cast_shadows = 0", "cast_shadows must be true or false; it is 0"),
+        ("fov = 30", "fov = 200", "fov must be a number, between 0 and 180 degrees; it is 200"),
+    ],
+)
+def test_what_is_wrong_is_said(listed, old, new, said):
+    with pytest.raises(ValueError, match=said):
+        sj.read_observations(listed(GOOD.replace(old, new)))
+
+
+def test_files_that_list_nothing_are_refused(listed, tmp_path):
+    with pytest.raises(ValueError, match=r"must hold one \[\[pictures\]\] or more"):
+        sj.read_observations(listed("[medium]\n"))
+    with pytest.raises(ValueError, match="is no TOML file"):
+        sj.read_observations(listed("[[pictures"))
+    with pytest.raises(ValueError, match="cannot be read"):
+        sj.read_observations(tmp_path / "none.toml")
+    with pytest.raises(FileNotFoundError, match=r"gone\.exr"):
+        sj.read_observations(listed(GOOD.replace("one.exr", "gone.exr")))
