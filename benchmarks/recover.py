@@ -59,6 +59,18 @@ def rendered(splats, camera, lights, medium: sj.Medium, count: int, settings: sj
     return [np.asarray(sj.render(sj.Scene(splats, (light,), material), camera, settings).beauty) for light in lights]
 
 
+def frame_seconds(splats, camera, light, medium: sj.Medium) -> float:
+    """Time a forward frame of six layers, warm: the median of seven."""
+    material = sj.Material(sj.fit_gaussians(sj.Dipole(medium), 6, weights=WEIGHTS).gaussians, eta=medium.eta[0], specular=0.0)
+    scene, times = sj.Scene(splats, (light,), material), []
+    plan = sj.plan(scene, camera)
+    for _ in range(8):
+        begin = time.perf_counter()
+        jax.block_until_ready(sj.render(scene, camera, plan=plan))
+        times.append(time.perf_counter() - begin)
+    return float(np.median(times[1:]))
+
+
 def starts(medium: sj.Medium, off: float) -> list[sj.Medium]:
     return [sj.Medium(medium.sigma_a * a, medium.sigma_s_prime * s, medium.eta) for a, s in ((off, 1 / off), (1 / off, off))]
 
@@ -149,7 +161,12 @@ def main() -> None:
                     print(
                         f"{name}: of {options.draws} draws, within {reach} deviations: sigma_a {inside[0]}, sigma_s' {inside[1]}"
                     )
-                print(f"a draw takes {np.median(seconds):.1f} s; compiled {programs}", flush=True)
+                frame = frame_seconds(splats, camera, lights[0], medium)
+                print(f"a draw takes {np.median(seconds):.1f} s, the fastest {np.min(seconds):.1f} s; compiled {programs}")
+                print(
+                    f"a forward frame {frame:.2f} s; the last draw {seconds[-1] / frame / found.steps:.1f} frames a step",
+                    flush=True,
+                )
                 rows.append({"material": name, "case": "noise", "noise": options.noise, "pulls": pulls.tolist()})
     out = Path("out/recover.json")
     out.parent.mkdir(exist_ok=True)

@@ -7,6 +7,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
+from splatjax.diffusion import ClusterDiffuser
 from splatjax.fitting import AbstractWeights, NonNegativeWeights, TotalReflectanceHeld, fit_gaussians
 from splatjax.gaussians import AbstractProfile, SumOfGaussians
 from splatjax.render import RenderSettings
@@ -19,6 +20,9 @@ from ._losses import AbstractLoss, SquaredLoss
 from ._observation import Observation
 from ._problem import Fitted, Held, search, solution
 from ._recovery import Recovery, inverse
+
+_FINE = RenderSettings(diffuser=ClusterDiffuser(error=2.5e-4))
+"""Layers eight times finer than a picture needs: where much light comes back, 0.1% of it is 2% of the absorption."""
 
 _ROUNDS = 8
 _SETTLED = 1e-3
@@ -59,7 +63,8 @@ def recover(
     - `count`: number of Gaussians.
     - `weights`: how they are fitted; by default not negative and their sum held, as in the materials that come with the package.
     - `loss`: `SquaredLoss()`, or `HuberLoss()` where some pixels are not what the model knows.
-    - `settings`: of the renderer.
+    - `settings`: of the renderer. By default its layers are eight times finer than those of `render`: where much light comes
+      back, a picture that is off by 0.1% means an absorption that is off by 2%.
     - `progress`: told in words what is being done, and the best medium up to then.
     - `throw`: raise if a search has not converged; otherwise `result` says so.
 
@@ -78,7 +83,7 @@ def recover(
     unknowns, factors = evidence.unknowns(starts[0].eta)
     gatherer = Gatherer(
         splats,
-        RenderSettings() if settings is None else settings,
+        _FINE if settings is None else settings,
         [each.camera for each in observations],
         [each.lights for each in observations],
     )

@@ -113,7 +113,7 @@ class Recovery(eqx.Module):
         errors = self.relative_errors()
         lines = []
         for c, (name, (best, worst)) in enumerate(zip(names, self.combinations(), strict=True)):
-            found = self.medium.sigma_a[c], self.medium.sigma_s_prime[c]
+            found = np.asarray(self.medium.sigma_a)[c], np.asarray(self.medium.sigma_s_prime)[c]
             a, s = (f"{float(value):.4g} +- {percent(error[c])}" for value, error in zip(found, errors, strict=True))
             lines.append(f"{name}: sigma_a {a}, sigma_s' {s} (1/mm)")
             if worst.deviation > _FIXED:
@@ -123,7 +123,7 @@ class Recovery(eqx.Module):
                 )
         if not self.noise_is_known:
             lines.append("error bars are those of what the model leaves over, as if its pixels were independent")
-        elif self.chi_squared > _TOO_LARGE:
+        elif float(self.chi_squared) > _TOO_LARGE:
             lines.append(
                 f"the model leaves {float(self.chi_squared) ** 0.5:.2g} times the noise: it lacks something, and the error bars "
                 "are too small"
