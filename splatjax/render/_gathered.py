@@ -9,7 +9,7 @@ from splatjax.gaussians import SumOfGaussians
 from splatjax.scene import Camera, Scene
 
 from ._inputs import check_channels, in_one_dtype
-from ._passes import cast_shadows, let_light_in, poisoned_unless, see_surfaces, shade, sources_of, surface_attributes
+from ._passes import cast_shadows, let_light_in, see_surfaces, shade, sources_of, surface_attributes
 from ._plan import Plan, plan_unless_traced
 from ._settings import RenderSettings
 
@@ -27,7 +27,7 @@ class GatheredPicture(eqx.Module):
     - `in_front`: 1 for a point of the surface in front, else 0.
     - `specular`: radiance, premultiplied.
     - `coverage`: in [0, 1].
-    - `overflow`: as in a `Frame`; where it is above 0, all else is NaN.
+    - `overflow`: as in a `Frame`; where it is above 0, pictures are NaN.
     """
 
     light: _diffusion.GatheredLight
@@ -108,17 +108,15 @@ def _gather(scene: Scene, camera: Camera, settings: RenderSettings, plan: Plan, 
     unlit = jnp.zeros((tiles, 1, channels, pixels), gathered.means.dtype)  # layers are shaded later, when they are weighed
     shaded = shade(scene, view, light.groups, seen, _diffusion.DiffusionLayers(unlit, unlit[:, :, 0]))
     needed = jnp.max(jnp.stack([needed, seen.needed, light.needed]))
-    leaving = jnp.where(seen.covered[..., None], seen.share[..., None] * shaded.post, 0.0)
-    # Numbers of pixels are packed as floats, exact up to 4096^2 in single precision.
-    numbers = jnp.arange(view.height * view.width, dtype=leaving.dtype).reshape(1, view.height, view.width)
-    picture = GatheredPicture(
+    seen = seen.poisoned_unless(needed <= 1)
+    poison = seen.atlas.poison
+    leaving = poison * jnp.where(seen.covered[..., None], seen.share[..., None] * shaded.post, 0.0)
+    return GatheredPicture(
         light=gathered,
         leaving=leaving.reshape(tiles * pixels, -1).T,
-        pixels=jnp.round(seen.atlas.pack(numbers, numbers)).astype(jnp.int32).reshape(-1),
+        pixels=seen.atlas.pixels().reshape(-1),
         in_front=jnp.broadcast_to(seen.atlas.in_front[:, None], (tiles, pixels)).reshape(-1).astype(leaving.dtype),
         specular=seen.picture(shaded.specular),
-        coverage=seen.coverage,
+        coverage=poison * seen.coverage,
         overflow=jnp.where(needed <= 1, 0.0, needed),
     )
-    poisoned = poisoned_unless(needed <= 1, eqx.filter(picture, eqx.is_inexact_array))
-    return eqx.tree_at(lambda p: p.overflow, eqx.combine(poisoned, picture), picture.overflow)
