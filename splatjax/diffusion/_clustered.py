@@ -16,7 +16,7 @@ from splatjax.splatting import Atlas, BinCapacity, Bins
 
 from ._diffuser import AbstractDiffuser, Diffused, Kernels, Sources
 from ._gathering import Gathering, blended_nodes, nodes_table
-from ._gaussian_sums import Steps, as_they_are, cut_off, gaussian_sums, gaussian_sums_forward, tapered
+from ._gaussian_sums import Steps, as_they_are, faded, gaussian_sums, gaussian_sums_forward, tapered
 from ._handover import resolved_share
 from ._neighbors import Boxes, Neighbors
 from ._order import BLOCK
@@ -213,7 +213,7 @@ class ClusterDiffuser(AbstractDiffuser):
         reach = support * jnp.sqrt(gathering.wide)
         bins = pixels.bins(clusters.centers, clusters.areas > 0, reach, _SOURCES, _SOURCE_SLOTS, capacity)
         table = gathering.table(_SOURCES, slopes=False)
-        values = self.sums(pixels.tiles, table, pixels.steps(bins, table.shape[0] - 1), cut_off(support), gathering.finish)
+        values = self.sums(pixels.tiles, table, pixels.steps(bins, table.shape[0] - 1), faded(support), gathering.finish)
         return values, bins.needed
 
     def _through_nodes(
@@ -223,7 +223,7 @@ class ClusterDiffuser(AbstractDiffuser):
         there, count = nodes.areas > 0, nodes.areas.shape[0]
         bins = pixels.bins(nodes.centers, there, _BLENDED * plan.deviations, _NODES, _NODE_SLOTS, capacity)
         blocks = plan.blocks(jnp.where(there, nodes.centers, FAR))
-        sums = self.sums(blocks, gathering.table(_SOURCES, slopes=True), plan.asked(bins, count), cut_off(support), as_they_are)
+        sums = self.sums(blocks, gathering.table(_SOURCES, slopes=True), plan.asked(bins, count), faded(support), as_they_are)
         at = jnp.where(there, nodes.centers, 0.0)
         values, slopes = gathering.values_and_slopes(plan.in_row(sums, count), at)
         table = nodes_table(at, nodes.areas, values, slopes, 0.5 / plan.deviations**2, _NODES)

@@ -5,6 +5,7 @@ in a *step* each lane meets the next few blocks of its list. Tables hold center,
 sources after the other.
 """
 
+import abc
 import math
 from collections.abc import Callable
 from functools import partial
@@ -14,6 +15,8 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
+
+_FADING = 0.5  # of the exponent, before its largest
 
 
 class Steps(eqx.Module):
@@ -32,37 +35,52 @@ class Steps(eqx.Module):
         return lax.dynamic_slice_in_dim(self.order, sweep * lanes, lanes)
 
 
-class Kernel(eqx.Module):
-    """A Gaussian within a largest exponent. Static."""
+class AbstractKernel(eqx.Module):
+    """What stands for `exp(-exponent)`. It comes down to zero at a largest exponent: of a step there is no derivative."""
 
-    largest: float = eqx.field(static=True)
-    rim: float = eqx.field(static=True)
-    """Height of the Gaussian at the rim if its tangent there is taken off, 0 if not."""
-
+    @abc.abstractmethod
     def __call__(self, exponent: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         """Give the weight, and minus its derivative in the exponent."""
+
+
+class FadedGaussian(AbstractKernel):
+    """A Gaussian that fades linearly in the last of its exponents. Static."""
+
+    largest: float = eqx.field(static=True)
+
+    def __call__(self, exponent):
+        gaussian = jnp.exp(-exponent)
+        left = jnp.clip((self.largest - exponent) / _FADING, 0, 1)
+        weight = gaussian * left
+        return weight, weight + jnp.where((left > 0) & (left < 1), gaussian / _FADING, 0.0)
+
+
+class TaperedGaussian(AbstractKernel):
+    """A Gaussian less its tangent at the rim. Static."""
+
+    largest: float = eqx.field(static=True)
+
+    def __call__(self, exponent):
+        rim = math.exp(-self.largest)
         inside, gaussian = exponent < self.largest, jnp.exp(-exponent)
-        if self.rim == 0:
-            weight = jnp.where(inside, gaussian, 0.0)
-            return weight, weight
-        weight = gaussian - self.rim * (1 + self.largest - exponent)
-        return jnp.where(inside, weight, 0.0), jnp.where(inside, gaussian - self.rim, 0.0)
+        weight = gaussian - rim * (1 + self.largest - exponent)
+        return jnp.where(inside, weight, 0.0), jnp.where(inside, gaussian - rim, 0.0)
 
 
-def cut_off(support: float) -> Kernel:
-    """A Gaussian within so many standard deviations."""
-    return Kernel(0.5 * support * support, 0.0)
+def faded(support: float) -> FadedGaussian:
+    """A Gaussian that comes down to zero at so many standard deviations: itself but for the rim."""
+    return FadedGaussian(0.5 * support * support)
 
 
-def tapered(support: float) -> Kernel:
+def tapered(support: float) -> TaperedGaussian:
     """A Gaussian that comes down to zero, with its derivative, at so many standard deviations."""
-    return Kernel(0.5 * support * support, math.exp(-0.5 * support * support))
+    return TaperedGaussian(0.5 * support * support)
 
 
 class _Rule(eqx.Module):
     """What is common to all sweeps. Static."""
 
-    kernel: "Kernel"
+    kernel: AbstractKernel
     finish: Callable = eqx.field(static=True)
 
     def finished(self, sums: Float[Array, "lanes rows points"], points: Float[Array, "lanes 3 points"]):
@@ -218,7 +236,7 @@ def gaussian_sums(
     points: Float[Array, "points_blocks 3 points"],
     table: Float[Array, "blocks_and_one columns block"],
     steps: Steps,
-    kernel: Kernel,
+    kernel: AbstractKernel,
     finish: Callable[[Float[Array, "rows points"], Float[Array, "3 points"]], Float[Array, "values points"]],
 ) -> Float[Array, "points_blocks values points"]:
     r"""Give what follows at every point from `sum_j rows_j exp(-rate_j |x - p_j|^2)`, over the blocks of sources it meets.
@@ -239,7 +257,7 @@ def gaussian_sums_forward(
     points: Float[Array, "points_blocks 3 points"],
     table: Float[Array, "blocks_and_one columns block"],
     steps: Steps,
-    kernel: Kernel,
+    kernel: AbstractKernel,
     finish: Callable[[Float[Array, "rows points"], Float[Array, "3 points"]], Float[Array, "values points"]],
 ) -> Float[Array, "points_blocks values points"]:
     """Give what `gaussian_sums` gives, with forward mode in the table and not reverse mode; the points are constants."""

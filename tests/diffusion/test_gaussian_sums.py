@@ -8,7 +8,7 @@ import pytest
 from splatjax.diffusion._gaussian_sums import (
     Steps,
     as_they_are,
-    cut_off,
+    faded,
     gaussian_sums,
     gaussian_sums_forward,
     source_table,
@@ -57,7 +57,7 @@ def all_meet(blocks: int, points_blocks: int) -> Steps:
 
 
 @pytest.mark.parametrize("finish", [as_they_are, total_and_square])
-@pytest.mark.parametrize("kernel", [cut_off(4.0), tapered(2.0)], ids=["cut off", "tapered"])
+@pytest.mark.parametrize("kernel", [faded(4.0), tapered(2.0)], ids=["faded", "tapered"])
 def test_values_and_gradients_are_those_of_plain_sums(float64, kernel, finish):
     with jax.enable_x64(True):
         centers, rates, rows, points = problem(jnp.float64)
@@ -85,12 +85,20 @@ def test_values_and_gradients_are_those_of_plain_sums(float64, kernel, finish):
         np.testing.assert_allclose(slope, expected, atol=1e-11 * float(jnp.max(jnp.abs(expected))))
 
 
-def test_a_taper_comes_down_to_zero_with_its_derivative():
-    kernel = tapered(3.0)
-    weight, fall = kernel(jnp.asarray([0.0, 1.0, 4.5 * (1 - 1e-5), 4.6]))
+@pytest.mark.parametrize("kernel", [faded(3.0), tapered(3.0)], ids=["faded", "tapered"])
+def test_kernels_come_down_to_zero_without_a_step(kernel, float64):
+    exponents = jnp.linspace(0, 6, 60_001)
+    weight, fall = kernel(exponents)
     assert float(weight[0]) > 0.9
-    assert np.all(np.abs(np.asarray(weight[2:])) < 1e-6)
-    assert np.all(np.abs(np.asarray(fall[2:])) < 1e-5)
+    assert np.all(np.asarray(weight)[exponents >= 4.5] == 0)
+    assert np.all(np.diff(np.asarray(weight)) <= 0)
+    rise = np.cumsum((np.asarray(fall)[1:] + np.asarray(fall)[:-1]) / 2) * 1e-4  # what its derivative says it falls by
+    np.testing.assert_allclose(weight[0] - weight[1:], rise, atol=1e-5)
+
+
+def test_a_taper_comes_down_with_its_derivative():
+    _, fall = tapered(3.0)(jnp.asarray([4.5 * (1 - 1e-5), 4.6]))
+    assert np.all(np.abs(np.asarray(fall)) < 1e-5)
 
 
 def test_blocks_of_a_compact_order_are_small():

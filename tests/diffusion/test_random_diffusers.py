@@ -46,7 +46,8 @@ def within_support(sources: Sources, kernels: Kernels, points, covered, supports
     for variance, depth, support in zip(kernels.variances, kernels.depths, supports, strict=True):
         offset = points[:, :, :, None] - (sources.centers - depth * sources.normals)[None, :, None]
         exponent = 0.5 * jnp.sum(offset * offset, axis=1) / variance
-        weight = jnp.where(exponent < 0.5 * support**2, jnp.exp(-exponent), 0.0) * sources.areas[None, None]
+        left = jnp.clip(2 * (0.5 * support**2 - exponent), 0, 1)  # fading over the last half of an exponent
+        weight = jnp.exp(-exponent) * left * sources.areas[None, None]
         gathered = jnp.sum(weight, axis=-1)
         reached = covered & (gathered > 0)
         means = jnp.einsum("cj,tpj->tcp", sources.irradiance, weight) / jnp.where(reached, gathered, 1.0)[:, None]
