@@ -41,7 +41,15 @@ def test_the_function_of_an_equation_names_it(equation):
 
 @pytest.mark.parametrize(
     "page",
-    ["README.md", "CHANGELOG.md", "docs/conventions.md", "docs/equations.md", "docs/gradients.md", "docs/which_profile.md"],
+    [
+        "README.md",
+        "CHANGELOG.md",
+        "docs/conventions.md",
+        "docs/equations.md",
+        "docs/gradients.md",
+        "docs/recovery.md",
+        "docs/which_profile.md",
+    ],
 )
 def test_links_lead_to_files(page):
     place = ROOT / page

@@ -12,6 +12,7 @@ from splatjax.gaussians import SumOfGaussians
 from splatjax.splatting import Atlas
 
 from ._diffuser import AbstractDiffuser, Diffused, Sources
+from ._handover import resolved_share
 from ._layers import SeenSurface, _kernels, _Point
 from ._normalization import AbstractNormalization
 
@@ -48,6 +49,12 @@ class GatheredLight(eqx.Module):
     interval: Float[Array, "2"]
     normalization: AbstractNormalization
     slopes: GatheredSlopes | None = None
+
+    def resolved(self) -> Float[Array, " gaussians"]:
+        """Give the share of the points at which the splats carry each layer."""
+        shape = (len(self.variances), len(self.area))
+        variances, area = (jnp.broadcast_to(each, shape) for each in (self.variances[:, None], self.area[None]))
+        return self.carried * jnp.mean(resolved_share(variances, area, self.interval), axis=1)
 
     def exitance(self, gaussians: SumOfGaussians) -> Float[Array, "channels points"]:
         """Give the radiant exitance `sum_k w_k L_k` of a material without single scattering. Differentiable.

@@ -121,11 +121,13 @@ class Solution(eqx.Module):
 
     - `information`: the inverse of the covariance that noise of the given deviations leaves (Laplace, by Gauss and Newton).
     - `gaussians`, `radiance`: of the point.
+    - `unresolved`: the share of the light of each channel in layers that the splats do not carry.
     """
 
     information: Float[Array, "unknowns unknowns"]
     gaussians: SumOfGaussians
     radiance: Float[Array, "channels pixels"]
+    unresolved: Float[Array, " channels"]
 
 
 @eqx.filter_jit
@@ -135,4 +137,5 @@ def solution(problem: Problem, point: Float[Array, " unknowns"]) -> Solution:
         return problem.residuals(point), (gaussians, radiance)
 
     slopes, (gaussians, radiance) = jax.jacfwd(residuals, has_aux=True)(point)
-    return Solution(jnp.einsum("cpi,cpj->ij", slopes, slopes), gaussians, radiance)
+    unresolved = (1 - problem.pictures.light.resolved()) @ gaussians.weights / gaussians.total_reflectance()
+    return Solution(jnp.einsum("cpi,cpj->ij", slopes, slopes), gaussians, radiance, unresolved)

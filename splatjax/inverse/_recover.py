@@ -121,6 +121,7 @@ def recover(
         material=surface.surface_of(reached.gaussians),
         intensities=unknowns.intensities(best.point),
         information=reached.information,
+        unresolved=reached.unresolved,
         chi_squared=chi_squared,
         pictures=pictures,
         residuals=tuple(made - seen for made, seen in zip(pictures, evidence.pictures, strict=True)),

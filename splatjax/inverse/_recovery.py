@@ -42,6 +42,8 @@ class Recovery(eqx.Module):
     - `intensities`: factors on the light of each picture that were found; 1 where it was known.
     - `information`: inverse of the covariance that the given noise leaves: of the logarithms of `sigma_a`, channel by channel, of
       those of `sigma_s_prime`, and of the factors that were to be found.
+    - `unresolved`: the share of the light of each channel that spreads less than the splats are apart. A picture shows how much
+      of it there is, not how far it goes; error bars do not know that.
     - `chi_squared`: what the model leaves over, squared, over the noise, per degree of freedom. About 1 where model and noise are
       right; far above, the model lacks something, and error bars are too small.
     - `noise_is_known`: whether all pictures came with deviations; where not, error bars are those of what is left over. Static.
@@ -60,6 +62,7 @@ class Recovery(eqx.Module):
     material: Material
     intensities: Float[Array, "pictures channels"]
     information: Float[Array, "unknowns unknowns"]
+    unresolved: Float[Array, " channels"]
     chi_squared: Float[Array, ""]
     pictures: tuple[Float[np.ndarray, "_ _ channels"], ...]
     residuals: tuple[Float[np.ndarray, "_ _ channels"], ...]
@@ -121,6 +124,12 @@ class Recovery(eqx.Module):
                     f"  not fixed by these pictures: {worst}, known to {percent(worst.deviation)}; "
                     f"what they fix is {best}, to {percent(best.deviation)}"
                 )
+            unresolved = float(np.asarray(self.unresolved)[c])
+            if unresolved > _MOST:
+                lines.append(
+                    f"  {percent(unresolved)} of its light spreads less than the splats are apart: how far, they can hardly "
+                    "show, and the error bars are too small; take more splats, or a smaller piece"
+                )
         if not self.noise_is_known:
             lines.append("error bars are those of what the model leaves over, as if its pixels were independent")
         elif float(self.chi_squared) > _TOO_LARGE:
@@ -132,6 +141,8 @@ class Recovery(eqx.Module):
 
 
 _TOO_LARGE = 1.5
+_MOST = 0.8
+"""Of the light: marble on a head of 100,000 splats has 0.6 and comes back within 1.4%, the blue of skin 1.0 and does not."""
 
 
 def best_and_worst(covariance: Float[np.ndarray, "2 2"]) -> tuple[Combination, Combination]:

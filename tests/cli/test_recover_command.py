@@ -53,6 +53,7 @@ def search(monkeypatch):
             material=surface,
             intensities=jnp.ones((1, 3)),
             information=jnp.diag(jnp.asarray([1e4, 1e4, 1e4, 1e4, 1e4, 1.0])),
+            unresolved=jnp.zeros(3),
             chi_squared=jnp.asarray(1.0),
             pictures=(seen + 0.01,),
             residuals=(seen * 0 + 0.01,),

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import splatjax as sj
-from splatjax.diffusion import DenseDiffuser
+from splatjax.diffusion import DenseDiffuser, resolved_share
 from splatjax.inverse._evidence import Evidence
 from splatjax.splatting import DenseRasterizer
 
@@ -83,6 +83,16 @@ class TestRecover:
         np.testing.assert_allclose(found.medium.sigma_s_prime, medium().sigma_s_prime, rtol=ROUNDS)
         np.testing.assert_allclose(found.intensities, [[1, 1], [STRONGER, STRONGER]], rtol=1e-4)
         assert len(found.ends) == 2
+
+    def test_it_says_how_much_light_the_splats_do_not_carry(self):
+        found, areas = without_noise(), taken()[0].areas
+        gaussians = found.material.gaussians
+        shape = (COUNT, len(areas))
+        each = (jnp.broadcast_to(part, shape) for part in (gaussians.variances[:, None], areas[None]))
+        carried = jnp.mean(resolved_share(*each, jnp.asarray([1.0, 2.0])), axis=1)  # scattered splats: DiffusionSettings
+        expected = (1 - carried) @ gaussians.weights / gaussians.total_reflectance()
+        assert 0.1 < float(jnp.min(expected)) < float(jnp.max(expected)) < 0.98
+        np.testing.assert_allclose(found.unresolved, expected, atol=0.05)
         np.testing.assert_allclose(found.ends[0].sigma_a, found.ends[1].sigma_a, rtol=1e-2)
 
     def test_its_material_and_pictures_are_those_of_the_renderer(self):

@@ -9,7 +9,7 @@ import splatjax as sj
 from splatjax.inverse import Recovery
 
 
-def recovery(information, chi_squared=1.0, noise_is_known=True, channels=1) -> Recovery:
+def recovery(information, chi_squared=1.0, noise_is_known=True, channels=1, unresolved=0.0) -> Recovery:
     """A recovery of which nothing is known but this."""
     medium = sj.Medium(jnp.full(channels, 0.02), jnp.full(channels, 1.5), jnp.full(channels, 1.3))
     gaussians = sj.SumOfGaussians(jnp.ones(1), jnp.full((1, channels), 0.5))
@@ -18,6 +18,7 @@ def recovery(information, chi_squared=1.0, noise_is_known=True, channels=1) -> R
         material=sj.Material(gaussians),
         intensities=jnp.ones((1, channels)),
         information=jnp.asarray(information, float),
+        unresolved=jnp.full(channels, unresolved),
         chi_squared=jnp.asarray(chi_squared),
         pictures=(),
         residuals=(),
@@ -54,6 +55,12 @@ def test_what_is_fixed_is_not_said_to_be_open():
     found = recovery(along(0.01, 0.02, 0.3))
     assert found.is_fixed()
     assert "not fixed" not in found.words()
+
+
+def test_light_that_spreads_less_than_the_splats_are_apart_is_told():
+    said = recovery(along(0.01, 0.02, 0.3), unresolved=0.97).words()
+    assert "97% of its light spreads less than the splats are apart" in said
+    assert "splats" not in recovery(along(0.01, 0.02, 0.3), unresolved=0.5).words()
 
 
 def test_without_noise_given_the_bars_are_those_of_what_is_left():
