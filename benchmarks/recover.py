@@ -19,8 +19,7 @@ import splatjax as sj
 from splatjax.diffusion import ClusterDiffuser, DenseDiffuser
 from splatjax.splatting import DenseRasterizer
 
-from .__main__ import head
-from .yardstick import make_scene
+from .scenes import BODIES, columns, lit
 
 COMPILED = "/jax/core/compile/backend_compile_duration"
 WEIGHTS = sj.NonNegativeWeights(sj.TotalReflectanceHeld())
@@ -33,6 +32,7 @@ LIGHTS = {"front": (0.5, 0.6, 0.65), "side": (-1.0, 0.15, 0.25), "behind": (0.6,
 
 def arguments():
     parser = argparse.ArgumentParser(prog="python -m benchmarks.recover", description=__doc__)
+    parser.add_argument("--body", choices=BODIES, default="synthetic", help="(default %(default)s)")
     parser.add_argument("--splats", type=int, default=100_000, help="on the prototype's head (default %(default)s)")
     parser.add_argument("--width", type=int, default=256, help="of the square picture, pixels (default %(default)s)")
     parser.add_argument("--materials", nargs="+", default=["marble", "skin1", "wholemilk"])
@@ -48,8 +48,8 @@ def arguments():
     return parser.parse_args()
 
 
-def body(splats: int, width: int) -> tuple[sj.Splats, sj.Camera]:
-    scene, camera = head(make_scene(splats), width)
+def white(body: str, splats: int, width: int) -> tuple[sj.Splats, sj.Camera]:
+    scene, camera = lit(columns(body, splats), width)
     return eqx.tree_at(lambda s: s.albedo, scene.splats, None, is_leaf=lambda leaf: leaf is None), camera
 
 
@@ -95,7 +95,7 @@ def errors(recovery: sj.Recovery, medium: sj.Medium) -> np.ndarray:
 def main() -> None:
     options = arguments()
     compiled, rows = Compilations(), []
-    splats, camera = body(options.splats, options.width)
+    splats, camera = white(options.body, options.splats, options.width)
     lights = [sj.DirectionalLight(jnp.asarray(LIGHTS[name]), jnp.full(3, jnp.pi)) for name in options.lights]
 
     def recover(pictures, begin, deviations=None):
@@ -138,7 +138,7 @@ def main() -> None:
             found, *cost = recover(pictures, begin)
             tell(name, "same path", found, *cost, medium)
             for path in options.otherwise:
-                others, _ = body(2 * options.splats, options.width)
+                others, _ = white(options.body, 2 * options.splats, options.width)
                 seen = rendered(others, camera, lights, medium, 8, OTHERWISE[path])
                 found, *cost = recover(seen, begin)
                 tell(name, f"{path}, twice the splats, eight Gaussians", found, *cost, medium)

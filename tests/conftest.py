@@ -65,7 +65,8 @@ def _left_out(item) -> bool:
 def pytest_collection_modifyitems(config, items):
     """Leave out, and say so, what cannot run or need not run twice."""
     # The longest files first, so that no worker is left alone with one in the end.
-    items.sort(key=lambda item: not any(name in item.nodeid for name in ("test_notebooks", "tests/gradients", "tests/cli")))
+    longest = "test_notebooks", "gradients/test_every_float", "tests/gradients", "tests/transport", "tests/render", "tests/cli"
+    items.sort(key=lambda item: next((i for i, name in enumerate(longest) if name in item.nodeid), len(longest)))
     left_out = [item for item in items if _left_out(item)]
     if left_out:
         items[:] = [item for item in items if item not in left_out]
