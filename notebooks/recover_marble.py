@@ -61,7 +61,7 @@ with jax.enable_x64(True):
 #
 # The search starts at skin, which is some tens of times more absorbing. It finds the logarithms of both coefficients of red,
 # green and blue by least squares on all pixels at once. What of a picture does not depend on the weights of its layers is
-# rendered once, so that a step costs less than a frame.
+# rendered once, so that a step looks at no splat.
 
 # %%
 with jax.enable_x64(True):

@@ -47,7 +47,7 @@ def recover(
 
     The whole graph is in it: coefficients, profile, Gaussians, layers, picture. The layers, which are dear, depend on the
     variances of the Gaussians alone: rendered once, they serve many steps of Levenberg and Marquardt's method, each of which
-    costs less than a frame; nothing is compiled between steps, nor between starts. At first the variances are held: those of
+    looks at no splat; nothing is compiled between steps, nor between starts. At first the variances are held: those of
     `wide_variances`, which serve all coefficients within a factor of three of the starts. Then, in rounds, they are those of the
     fit to what was found, and layers move along their slopes as the fit does, until a round changes nothing: what is left is the
     picture that `render` makes of `Recovery.material`, with the derivatives of `picture_jacobian`.
