@@ -4,8 +4,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 WORKERS ?= 2
 # A suite's time is XLA's. Files stay whole, so that a worker meets again what it has compiled, and in the order of
-# tests/conftest.py: the longest first. The float32 run is compiled as
-# users have it; the others with the least optimization, which takes a third of the time.
+# tests/conftest.py: the longest first. The float32 run is compiled as users have it; the others with the least
+# optimization, which takes a third of the time.
 PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 LEAST_OPTIMIZATION := --xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false \
     --xla_cpu_parallel_codegen_split_count=1

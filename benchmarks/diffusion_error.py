@@ -15,7 +15,6 @@ from PIL import Image
 
 import splatjax as sj
 from splatjax import diffusion, splatting
-from splatjax.diffusion import _layers
 from splatjax.render import _passes as wiring
 
 from .scenes import BODIES, MATERIALS, columns, lit
@@ -73,7 +72,7 @@ def main() -> None:
     sources, seen = seen_by(scene)
     receivers, atlas = seen.receivers(), seen.atlas
     variances = scene.material.gaussians.variances
-    kernels = diffusion.Kernels(variances, normalization.depths(variances))
+    kernels = diffusion.Kernels.of(variances, normalization)
     tiles, within = np.nonzero(np.asarray(seen.covered & atlas.in_front[:, None]))
     picked = np.random.default_rng(0).choice(len(tiles), options.pixels, replace=False)
     tiles, within = tiles[picked], within[picked]
@@ -86,8 +85,8 @@ def main() -> None:
 
     def layers(means, exits, carried):
         """`L_k` at the pixels, by the normalization and the handover."""
-        point = _layers._Point.of(scene.material, front, means, exits, carried)
-        return np.asarray(point.layers(plan.interval, normalization, variances)[0])[:, :, 0]
+        points = diffusion.Points.of(scene.material, front, means, exits, carried)
+        return np.asarray(points.layers(plan.interval, normalization, variances)[0])[:, :, 0]
 
     exact = None
     for error in options.errors:

@@ -11,6 +11,6 @@ from ._handover import resolved_share as resolved_share
 from ._irradiance import entering_irradiance as entering_irradiance
 from ._layers import diffusion_layers as diffusion_layers, DiffusionLayers as DiffusionLayers
 from ._layers import exitance_jacobian as exitance_jacobian, ExitanceJacobian as ExitanceJacobian
-from ._layers import SeenSurface as SeenSurface
 from ._normalization import AbstractNormalization as AbstractNormalization, ExitOdds as ExitOdds, PlainMean as PlainMean
+from ._points import Points as Points, SeenSurface as SeenSurface
 from ._settings import DiffusionSettings as DiffusionSettings

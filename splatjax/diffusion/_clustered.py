@@ -24,7 +24,8 @@ from ._pixels import FAR, Pixels, block_ranges, tile_grid
 from ._tree import Clusters, ClusterTree
 
 _FINEST = 0.01  # share of the splats that may be finer than those that tell how much of a layer is carried
-_LEAST_LEFT_OUT = 4e-5  # share of a layer's power beyond its support, at least: 4.5 standard deviations
+_LEAST_LEFT_OUT, _MOST_LEFT_OUT = 4e-5, 0.1  # share of a layer's power beyond its support: 4.5 and 2.1 standard deviations
+_LEAST_SHARE = 1e-3  # of the diffusion integral in a layer that counts at all
 _LANES = 32
 _SOURCES = 16  # of a block that gathers into points, and how many blocks a step holds
 _SOURCE_SLOTS = 4
@@ -134,9 +135,12 @@ class ClusterDiffuser(AbstractDiffuser):
         return eqx.tree_at(_parts, self, (tree, tuple(layers)), is_leaf=_is_none)
 
     def support(self, share: float) -> float:
-        """Give the support of a layer, standard deviations, of which the diffusion integral is a share."""
-        left_out = max(0.5 * self.error / max(share, 1e-3), _LEAST_LEFT_OUT)
-        return round(8 * math.sqrt(2 * math.log(1 / min(left_out, 0.1)))) / 8
+        """Give the support of a layer, standard deviations, of which the diffusion integral is a share.
+
+        In eighths, so that plans that are nearly alike are the same to the compiler.
+        """
+        left_out = max(0.5 * self.error / max(share, _LEAST_SHARE), _LEAST_LEFT_OUT)
+        return round(8 * math.sqrt(2 * math.log(1 / min(left_out, _MOST_LEFT_OUT)))) / 8
 
     def _in_pixels(self, edge: float, atlases: Sequence[Atlas], splats: Splats) -> float:
         """Give the length of an edge amid the splats, in pixels of the closest view."""

@@ -4,10 +4,13 @@ import abc
 from collections.abc import Sequence
 
 import equinox as eqx
+import jax
 from jaxtyping import Array, Bool, Float
 
 from splatjax.scene import Splats
 from splatjax.splatting import Atlas
+
+from ._normalization import AbstractNormalization
 
 
 class Sources(eqx.Module):
@@ -24,6 +27,11 @@ class Kernels(eqx.Module):
 
     variances: Float[Array, " gaussians"]
     depths: Float[Array, " gaussians"]
+
+    @classmethod
+    def of(cls, variances: Float[Array, " gaussians"], normalization: AbstractNormalization) -> "Kernels":
+        """Give the kernels of layers as a normalization places their sources."""
+        return cls(variances, normalization.depths(variances))
 
 
 class Diffused(eqx.Module):
@@ -65,3 +73,29 @@ class AbstractDiffuser(eqx.Module):
     @abc.abstractmethod
     def in_forward_mode(self) -> "AbstractDiffuser":
         """Give a diffuser of the same values that has forward mode in the kernels; it may have no reverse mode."""
+
+
+def diffuse_with_slopes(
+    diffuser: AbstractDiffuser,
+    sources: Sources,
+    variances: Float[Array, " gaussians"],
+    normalization: AbstractNormalization,
+    points: Float[Array, "tiles 3 points"],
+    covered: Bool[Array, "tiles points"],
+    atlas: Atlas,
+    direction: Float[Array, " gaussians"],
+) -> tuple[Diffused, Diffused]:
+    """Diffuse, and differentiate in the variances: each layer gathers by its own alone, so one direction holds them all.
+
+    **Arguments:** as in `AbstractDiffuser.diffuse`.
+
+    - `direction`: by how much each variance moves, mm^2.
+
+    **Returns:** the integrals, and what each does per unit of `direction`.
+    """
+    forward = diffuser.in_forward_mode()
+
+    def diffuse(variances):
+        return forward.diffuse(sources, Kernels.of(variances, normalization), points, covered, atlas)
+
+    return jax.jvp(diffuse, (variances,), (direction,))

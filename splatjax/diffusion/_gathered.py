@@ -4,17 +4,16 @@ from collections.abc import Callable
 from typing import TypeAlias
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from splatjax.gaussians import SumOfGaussians
 from splatjax.splatting import Atlas
 
-from ._diffuser import AbstractDiffuser, Diffused, Sources
+from ._diffuser import AbstractDiffuser, Diffused, Kernels, Sources, diffuse_with_slopes
 from ._handover import resolved_share
-from ._layers import SeenSurface, _kernels, _Point
 from ._normalization import AbstractNormalization
+from ._points import Points, SeenSurface
 
 
 class GatheredSlopes(eqx.Module):
@@ -70,7 +69,7 @@ class GatheredLight(eqx.Module):
             means = means + moved[..., None] * self.slopes.means
             exits = jnp.maximum(exits + moved * self.slopes.exits, 0)
         weights = gaussians.weights
-        point = _Point(
+        points = Points(
             weights=weights[:, :, None, None],
             variances=variances[:, None, None, None],
             means=means[:, :, None],
@@ -81,7 +80,7 @@ class GatheredLight(eqx.Module):
             area=self.area[None],
             albedo=self.albedo[:, None],
         )
-        layers, _ = point.layers(self.interval, self.normalization, variances)
+        layers, _ = points.layers(self.interval, self.normalization, variances)
         return jnp.sum(weights[:, :, None] * layers[:, :, 0], axis=0)
 
 
@@ -100,7 +99,7 @@ def gather_light(
 
     **Returns:** the light at every point of every tile, tile by tile, and what capacity was needed over what was planned.
     """
-    found = diffuser.diffuse(sources, _kernels(variances, normalization), seen.points, seen.covered, atlas)
+    found = diffuser.diffuse(sources, Kernels.of(variances, normalization), seen.points, seen.covered, atlas)
     return _in_a_row(found, None, variances, seen, interval, normalization), found.needed
 
 
@@ -114,12 +113,8 @@ def gather_light_and_slopes(
     normalization: AbstractNormalization,
 ) -> tuple[GatheredLight, Float[Array, ""]]:
     """Diffuse as `gather_light`, and differentiate in the variances: one more accumulation per layer."""
-    forward = diffuser.in_forward_mode()
-
-    def diffuse(variances):
-        return forward.diffuse(sources, _kernels(variances, normalization), seen.points, seen.covered, atlas)
-
-    found, slopes = jax.jvp(diffuse, (variances,), (variances,))
+    given = sources, variances, normalization, seen.points, seen.covered, atlas
+    found, slopes = diffuse_with_slopes(diffuser, *given, variances)
     return _in_a_row(found, slopes, variances, seen, interval, normalization), found.needed
 
 

@@ -3,15 +3,15 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from splatjax.pointwise import in_parts
 from splatjax.scene import Material
 from splatjax.splatting import TILES_AT_ONCE, Atlas
 
-from ._diffuser import AbstractDiffuser, Kernels, Sources
-from ._handover import resolved_share
+from ._diffuser import AbstractDiffuser, Kernels, Sources, diffuse_with_slopes
 from ._normalization import AbstractNormalization
+from ._points import Points, SeenSurface
 
 
 class DiffusionLayers(eqx.Module):
@@ -27,19 +27,6 @@ class ExitanceJacobian(eqx.Module):
     weights: Float[Array, "tiles gaussians channels pixels"]
     variances: Float[Array, "tiles gaussians channels pixels"]
     """1/mm^2."""
-
-
-class SeenSurface(eqx.Module):
-    """What the pixels see, with what pass 3 blended for the layers that the splats are too far apart to carry."""
-
-    points: Float[Array, "tiles 3 pixels"]
-    """mm."""
-    covered: Bool[Array, "tiles pixels"]
-    irradiance: Float[Array, "tiles channels pixels"]
-    area: Float[Array, "tiles pixels"]
-    """Of a splat, mm^2."""
-    albedo: Float[Array, "tiles channels pixels"]
-    """What colors the surface, besides the Gaussians' weights."""
 
 
 def diffusion_layers(
@@ -69,10 +56,10 @@ def diffusion_layers(
     **Source:** Kim et al. 2010, section 4.2; the normalization's own.
     """
     variances = material.gaussians.variances
-    diffused = diffuser.diffuse(sources, _kernels(variances, normalization), seen.points, seen.covered, atlas)
+    diffused = diffuser.diffuse(sources, Kernels.of(variances, normalization), seen.points, seen.covered, atlas)
 
     def layers(seen, means, exits):
-        at = _Point.of(material, seen, means, exits, diffused.carried)
+        at = Points.of(material, seen, means, exits, diffused.carried)
         return DiffusionLayers(*_tiles_first(at.layers(interval, normalization, variances)))
 
     return _in_parts(layers, seen, diffused.means, diffused.exits), diffused.needed
@@ -98,17 +85,13 @@ def exitance_jacobian(
     **Returns:** the layers and the Jacobian, and what capacity was needed over what was planned.
     """
     variances = material.gaussians.variances
-    forward = diffuser.in_forward_mode()
-
-    def diffuse(variances):
-        return forward.diffuse(sources, _kernels(variances, normalization), seen.points, seen.covered, atlas)
-
-    diffused, slopes = jax.jvp(diffuse, (variances,), (jnp.ones_like(variances),))
+    given = sources, variances, normalization, seen.points, seen.covered, atlas
+    diffused, slopes = diffuse_with_slopes(diffuser, *given, jnp.ones_like(variances))
 
     def layers(seen, means, exits, slopes_of_means, slopes_of_exits):
-        at = _Point.of(material, seen, means, exits, diffused.carried).per_channel()
+        at = Points.of(material, seen, means, exits, diffused.carried).per_channel()
 
-        def exitance(at: _Point):
+        def exitance(at: Points):
             layers, resolved = at.layers(interval, normalization, variances)
             return jnp.sum(at.weights * layers, axis=0), (layers, resolved)
 
@@ -130,53 +113,3 @@ def _in_parts(function, *trees):
 def _tiles_first(found):
     layers, resolved = found
     return layers.transpose(2, 0, 1, 3), resolved[:, 0].transpose(1, 0, 2)
-
-
-def _kernels(variances: Float[Array, " gaussians"], normalization: AbstractNormalization) -> Kernels:
-    return Kernels(variances, normalization.depths(variances))
-
-
-class _Point(eqx.Module):
-    """All that makes the layers of a pixel; pixels, and channels, do not know of each other."""
-
-    weights: Float[Array, "gaussians channels #tiles #pixels"]
-    variances: Float[Array, "gaussians #channels #tiles #pixels"]
-    means: Float[Array, "gaussians channels tiles pixels"]
-    exits: Float[Array, "gaussians #channels tiles pixels"]
-    carried: Float[Array, " gaussians"]
-    once: Float[Array, "channels 1 1"]
-    irradiance: Float[Array, "channels tiles pixels"]
-    """Of the surface itself."""
-    area: Float[Array, "tiles pixels"]
-    albedo: Float[Array, "channels tiles pixels"]
-
-    @classmethod
-    def of(cls, material: Material, seen: SeenSurface, means, exits, carried) -> "_Point":
-        gaussians = material.gaussians
-        return cls(
-            weights=gaussians.weights[:, :, None, None],
-            variances=gaussians.variances[:, None, None, None],
-            means=means.transpose(1, 2, 0, 3),
-            exits=exits.transpose(1, 0, 2)[:, None],
-            carried=carried,
-            once=(material.total_reflectance() - gaussians.total_reflectance())[:, None, None],
-            irradiance=seen.irradiance.transpose(1, 0, 2),
-            area=jnp.where(seen.covered, seen.area, 1.0),
-            albedo=seen.albedo.transpose(1, 0, 2),
-        )
-
-    def per_channel(self) -> "_Point":
-        """Give every pixel and channel numbers of its own, so that one derivative is that of all."""
-        own = [jnp.broadcast_to(each, self.means.shape) for each in (self.weights, self.variances, self.exits)]
-        return eqx.tree_at(lambda at: (at.weights, at.variances, at.exits), self, own)
-
-    def layers(
-        self, interval: Float[Array, "2"], normalization: AbstractNormalization, order: Float[Array, " gaussians"]
-    ) -> tuple[Float[Array, "gaussians channels tiles pixels"], Float[Array, "gaussians #channels tiles pixels"]]:
-        resolved = resolved_share(self.variances, self.area[None, None], interval) * self.carried[:, None, None, None]
-        resolved = jnp.where(self.exits > 0, resolved, 0.0)  # no splat within reach
-        own = self.irradiance[None]
-        # Splats too far apart to carry a layer do not count its exits either.
-        exits = 1 + resolved * (self.exits - 1)
-        means = own + resolved * (self.means - own)
-        return normalization.gain(exits, order, self.weights * self.albedo[None], self.once * self.albedo) * means, resolved

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from splatjax.fitting import AbstractWeights, NonNegativeWeights, TotalReflectanceHeld
+from splatjax.fitting import AbstractWeights
 from splatjax.gaussians import AbstractProfile
 from splatjax.render import RenderSettings
 from splatjax.scattering import Dipole, Medium
@@ -18,7 +18,7 @@ from ._flat import Gatherer
 from ._intensity import AbstractIntensity, KnownIntensity
 from ._losses import SquaredLoss
 from ._observation import Observation
-from ._problem import Fitted, solution
+from ._problem import Fitted, solution, usual_weights
 from ._recovery import Combination, Recovery, best_and_worst, percent
 
 
@@ -66,11 +66,12 @@ def next_pictures(
     Each is rendered once, of the material that was found, and differentiated; noise is taken to be the same share of its
     brightness as in the pictures before. Information adds up, and its inverse is the covariance.
 
-    **Arguments:** `model`, `weights` and `settings` as in `recover`.
+    **Arguments:** `model` and `weights` as in `recover`.
 
     - `recovery`: what is known by now.
     - `splats`: of the body.
     - `candidates`: at least one; `usual_candidates` gives some.
+    - `settings`: of the renderer. By default those of `render`: a prediction needs no layers as fine as a search does.
 
     **Returns:** predictions; first the one whose worst known combination is known best.
 
@@ -79,7 +80,7 @@ def next_pictures(
     candidates = list(candidates)
     if not candidates:
         raise ValueError("candidates is empty: name a picture that could be taken, or take usual_candidates(splats, camera)")
-    weights = NonNegativeWeights(TotalReflectanceHeld()) if weights is None else weights
+    weights = usual_weights() if weights is None else weights
     settings = RenderSettings() if settings is None else settings
     medium, dtype = recovery.medium, recovery.medium.sigma_a.dtype
     cameras, lights = [each.camera for each in candidates], [each.lights for each in candidates]

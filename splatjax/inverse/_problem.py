@@ -9,7 +9,14 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
-from splatjax.fitting import AbstractWeights, GivenVariances, fit_gaussians, fit_weights
+from splatjax.fitting import (
+    AbstractWeights,
+    GivenVariances,
+    NonNegativeWeights,
+    TotalReflectanceHeld,
+    fit_gaussians,
+    fit_weights,
+)
 from splatjax.gaussians import AbstractProfile, SumOfGaussians
 from splatjax.scattering import Medium
 
@@ -17,6 +24,11 @@ from ._flat import FlatPictures
 from ._losses import AbstractLoss
 
 _STEPS = 64
+
+
+def usual_weights() -> AbstractWeights:
+    """Give how the materials that come with the package are fitted: weights are not negative, and their sum is held."""
+    return NonNegativeWeights(TotalReflectanceHeld())
 
 
 class Unknowns(eqx.Module):

@@ -8,7 +8,7 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from splatjax.diffusion import ClusterDiffuser
-from splatjax.fitting import AbstractWeights, NonNegativeWeights, TotalReflectanceHeld, fit_gaussians
+from splatjax.fitting import AbstractWeights, fit_gaussians
 from splatjax.gaussians import AbstractProfile, SumOfGaussians
 from splatjax.render import RenderSettings
 from splatjax.scattering import Dipole, Medium
@@ -18,7 +18,7 @@ from ._evidence import Evidence
 from ._flat import Gatherer, wide_variances
 from ._losses import AbstractLoss, SquaredLoss
 from ._observation import Observation
-from ._problem import Fitted, Held, search, solution
+from ._problem import Fitted, Held, search, solution, usual_weights
 from ._recovery import Recovery, inverse
 
 _FINE = RenderSettings(diffuser=ClusterDiffuser(error=2.5e-4))
@@ -77,7 +77,7 @@ def recover(
     observations = list(observations)
     _check(observations, splats, starts)
     say = progress or _nobody
-    weights = NonNegativeWeights(TotalReflectanceHeld()) if weights is None else weights
+    weights = usual_weights() if weights is None else weights
     loss = SquaredLoss() if loss is None else loss
     evidence = Evidence(observations, starts[0].sigma_a.dtype)
     unknowns, factors = evidence.unknowns(starts[0].eta)

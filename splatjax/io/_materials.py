@@ -8,7 +8,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 import tomli_w
 
@@ -27,6 +26,7 @@ from splatjax.scattering import (
 from splatjax.scene import Material
 
 from ._atomic import atomic_path
+from ._tables import Table, as_array
 
 COEFFICIENT_UNIT = "1/mm"
 VARIANCE_UNIT = "mm^2"
@@ -76,20 +76,20 @@ def load_material(name_or_path: str | os.PathLike[str]) -> Material:
     path, tables = _read(name_or_path)
     if "fit" not in tables:
         raise ValueError(f"{path}: has no [fit]; fit its coefficients first: `splatjax fit {path} --output {path}`")
-    fit = _Table(path, "fit", tables["fit"])
+    fit = Table(path, "fit", tables["fit"])
     fit.unit(VARIANCE_UNIT)
     variances = fit.numbers("variances", "positive (mm^2)", lambda x: x > 0)
     if np.any(np.diff(variances) <= 0):
         raise ValueError(f"{path}: [fit] variances must ascend, each once; got {variances.tolist()}")
     weights = fit.matrix("weights", len(variances))
-    surface = _Table(path, "surface", tables.get("surface", {}))
+    surface = Table(path, "surface", tables.get("surface", {}))
     eta = surface.number("eta", "positive", lambda x: x > 0, 1.4)
     specular = surface.number("specular", "at least 0", lambda x: x >= 0, 0.18)
     roughness = surface.number("roughness", "in (0, 1]", lambda x: 0 < x <= 1, 0.3)
     single = None
     if "single_scattering" in tables:
-        single = _single_scattering(_Table(path, "single_scattering", tables["single_scattering"]), weights.shape[1])
-    return Material(SumOfGaussians(_array(variances), _array(weights)), eta, specular, roughness, single)
+        single = _single_scattering(Table(path, "single_scattering", tables["single_scattering"]), weights.shape[1])
+    return Material(SumOfGaussians(as_array(variances), as_array(weights)), eta, specular, roughness, single)
 
 
 def load_medium(name_or_path: str | os.PathLike[str]) -> Medium:
@@ -107,7 +107,7 @@ def load_medium(name_or_path: str | os.PathLike[str]) -> Medium:
     if "medium" not in tables:
         have = "its layers, which `load_profile` gives" if "layers" in tables else "its Gaussians, which `load_material` gives"
         raise ValueError(f"{path}: has no [medium]; known are only {have}")
-    return _medium(_Table(path, "medium", tables["medium"]))
+    return _medium(Table(path, "medium", tables["medium"]))
 
 
 def load_profile(name_or_path: str | os.PathLike[str]) -> Dipole | LayeredMultipole:
@@ -198,7 +198,7 @@ def _plain_layer(layer: Layer | Film) -> dict[str, Any]:
 def _layered(path: Path, found: Any) -> LayeredMultipole:
     if not isinstance(found, list) or not found:
         raise ValueError(f"{path}: [[layers]] must be one table or more, from the top; it is {found!r}")
-    layers = [_layer(_Table(path, f"layers {number}", table)) for number, table in enumerate(found, start=1)]
+    layers = [_layer(Table(path, f"layers {number}", table)) for number, table in enumerate(found, start=1)]
     counts = {layer.optical_depth.shape[0] if isinstance(layer, Film) else layer.medium.eta.shape[0] for layer in layers}
     if len(counts) != 1:
         raise ValueError(f"{path}: [[layers]] must all have one number per channel; they have {sorted(counts)} channels")
@@ -208,13 +208,13 @@ def _layered(path: Path, found: Any) -> LayeredMultipole:
         raise ValueError(f"{path}: [[layers]]: {error}") from None
 
 
-def _layer(table: "_Table") -> Layer | Film:
+def _layer(table: Table) -> Layer | Film:
     if "optical_depth" in table.table:
-        return Film(_array(table.numbers("optical_depth", "at least 0", lambda x: x >= 0)))
+        return Film(as_array(table.numbers("optical_depth", "at least 0", lambda x: x >= 0)))
     table.unit(THICKNESS_UNIT, "thickness_unit")
     thickness = table.thickness("thickness")
     try:
-        layer = Layer(_medium(table), _array(thickness))
+        layer = Layer(_medium(table), as_array(thickness))
         layer.check_diffusion()
     except ValueError as error:
         if str(error).startswith(table.where):
@@ -223,7 +223,7 @@ def _layer(table: "_Table") -> Layer | Film:
     return layer
 
 
-def _single_scattering(table: "_Table", channels: int) -> SingleScattering:
+def _single_scattering(table: Table, channels: int) -> SingleScattering:
     medium = _medium(table)
     strength = np.ones(len(medium.eta))
     if "strength" in table.table:
@@ -233,10 +233,10 @@ def _single_scattering(table: "_Table", channels: int) -> SingleScattering:
         raise ValueError(
             f"{table.where} coefficients and strength must have {channels} channels, as [fit] has; they have {counts}"
         )
-    return SingleScattering(medium, _array(strength))
+    return SingleScattering(medium, as_array(strength))
 
 
-def _medium(medium: "_Table") -> Medium:
+def _medium(medium: Table) -> Medium:
     medium.unit(COEFFICIENT_UNIT)
     sigma_a = medium.numbers("sigma_a", "at least 0 (1/mm)", lambda x: x >= 0)
     sigma_s_prime = medium.numbers("sigma_s_prime", "positive (1/mm)", lambda x: x > 0)
@@ -244,7 +244,7 @@ def _medium(medium: "_Table") -> Medium:
     if not len(sigma_a) == len(sigma_s_prime) == len(eta):
         counts = f"{len(sigma_a)}, {len(sigma_s_prime)} and {len(eta)}"
         raise ValueError(f"{medium.where} sigma_a, sigma_s_prime and eta must have one number per channel; they have {counts}")
-    return Medium(_array(sigma_a), _array(sigma_s_prime), _array(eta))
+    return Medium(as_array(sigma_a), as_array(sigma_s_prime), as_array(eta))
 
 
 def _read(name_or_path: str | os.PathLike[str]) -> tuple[Path, dict[str, Any]]:
@@ -266,76 +266,10 @@ def _read(name_or_path: str | os.PathLike[str]) -> tuple[Path, dict[str, Any]]:
     if {"medium", "layers"} <= set(tables):
         raise ValueError(f"{path}: has both [medium] and [[layers]]; a material is one or the other")
     if "medium" in tables:
-        _medium(_Table(path, "medium", tables["medium"]))
+        _medium(Table(path, "medium", tables["medium"]))
     if "layers" in tables:
         _layered(path, tables["layers"])
     return path, tables
-
-
-class _Table:
-    """One table of a file, and what its entries must be."""
-
-    def __init__(self, path: Path, name: str, table: Any):
-        if not isinstance(table, dict):
-            raise ValueError(f"{path}: [{name}] must be a table; it is {table!r}")
-        self.where, self.table = f"{path}: [{name}]", table
-
-    def unit(self, expected: str, name: str = "unit") -> None:
-        found = self.table.get(name)
-        if found != expected:
-            remedy = "convert the numbers, then name the unit"
-            raise ValueError(f'{self.where} {name} must be "{expected}"; it is {found!r}: {remedy}')
-
-    def numbers(self, name: str, expected: str, holds, channels: int | None = None) -> np.ndarray:
-        """Give a list of numbers; a single one stands for all channels, if their number is given."""
-        found = self._entry(name, f"a list of numbers, {expected}")
-        if channels is not None and _is_number(found):
-            found = [found] * channels
-        if not isinstance(found, list) or not found or not all(_is_number(x) for x in found):
-            raise ValueError(f"{self.where} {name} must be a list of numbers, {expected}; it is {found!r}")
-        values = np.asarray(found, np.float64)
-        if not np.all(np.isfinite(values) & holds(values)):
-            raise ValueError(f"{self.where} {name} must be finite and {expected}; it is {found!r}")
-        return values
-
-    def thickness(self, name: str) -> np.ndarray:
-        found = self._entry(name, "a number of mm, or inf")
-        if not _is_number(found) or not found > 0:
-            raise ValueError(f"{self.where} {name} must be positive (mm), or inf; it is {found!r}")
-        return np.asarray(found, np.float64)
-
-    def number(self, name: str, expected: str, holds, default: float) -> float:
-        found = self.table.get(name, default)
-        if not _is_number(found) or not np.isfinite(found) or not holds(found):
-            raise ValueError(f"{self.where} {name} must be a number, {expected}; it is {found!r}")
-        return float(found)
-
-    def matrix(self, name: str, rows: int) -> np.ndarray:
-        found = self._entry(name, "a list of numbers per Gaussian, one per channel")
-        regular = isinstance(found, list) and all(isinstance(row, list) and row for row in found)
-        if not regular or not all(_is_number(x) and np.isfinite(x) for row in found for x in row):
-            raise ValueError(
-                f"{self.where} {name} must be a list of finite numbers per Gaussian, one per channel; it is {found!r}"
-            )
-        if len(found) != rows or len({len(row) for row in found}) != 1:
-            lengths = [len(row) for row in found]
-            raise ValueError(
-                f"{self.where} {name} must have {rows} rows, one per variance, of equal length; its rows have {lengths}"
-            )
-        return np.asarray(found, np.float64)
-
-    def _entry(self, name: str, expected: str) -> Any:
-        if name not in self.table:
-            raise ValueError(f"{self.where} has no {name}; it must be {expected}")
-        return self.table[name]
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
-
-
-def _array(values: np.ndarray):
-    return jnp.asarray(values, jnp.result_type(float))
 
 
 def _plain(values: Any) -> Any:

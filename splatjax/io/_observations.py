@@ -11,7 +11,7 @@ from splatjax.inverse import AbstractIntensity, KnownIntensity, Observation, Unk
 from splatjax.scene import AbstractLight, Camera, DirectionalLight, GaussianBeam, PointLight
 
 from ._exr import read_picture
-from ._materials import _array, _Table
+from ._tables import Table, as_array
 
 _INTENSITIES = {"known": KnownIntensity, "unknown": UnknownIntensity, "unknown color": UnknownColor}
 _ENTRIES = {"file", "mask", "noise", "intensity", "camera", "lights"}
@@ -56,7 +56,7 @@ def read_observations(path: str | os.PathLike[str]) -> list[Observation]:
         raise ValueError(
             f"{path}: must hold one [[pictures]] or more, and nothing else; it has {', '.join(sorted(tables)) or 'none'}"
         )
-    return [_observation(path, number, _Table(path, f"pictures {number}", each)) for number, each in enumerate(found, 1)]
+    return [_observation(path, number, Table(path, f"pictures {number}", each)) for number, each in enumerate(found, 1)]
 
 
 def picture_paths(path: str | os.PathLike[str]) -> list[Path]:
@@ -66,8 +66,8 @@ def picture_paths(path: str | os.PathLike[str]) -> list[Path]:
     return [path, *(path.parent / each[name] for each in pictures for name in ("file", "mask") if name in each)]
 
 
-def _observation(path: Path, number: int, table: _Table) -> Observation:
-    _only(table, _ENTRIES)
+def _observation(path: Path, number: int, table: Table) -> Observation:
+    table.only(_ENTRIES)
     picture = read_picture(path.parent / _text(table, "file"))
     height, width, channels = picture.shape
     mask = deviation = None
@@ -77,30 +77,30 @@ def _observation(path: Path, number: int, table: _Table) -> Observation:
         share = table.number("noise", "positive", lambda x: x > 0, 0.01)
         known = picture[np.all(np.isfinite(picture), axis=-1) & (True if mask is None or mask.shape != (height, width) else mask)]
         size = share * math.sqrt(np.mean(known**2)) if known.size else share
-        deviation = _array(np.full(picture.shape, size or share))
-    camera = _camera(_Table(path, f"pictures {number} camera", table._entry("camera", "a table")), width, height)
-    lights = table._entry("lights", "one [[pictures.lights]] or more")
+        deviation = as_array(np.full(picture.shape, size or share))
+    camera = _camera(Table(path, f"pictures {number} camera", table.entry("camera", "a table")), width, height)
+    lights = table.entry("lights", "one [[pictures.lights]] or more")
     if not isinstance(lights, list) or not lights:
         raise ValueError(f"{table.where} lights must be one [[pictures.lights]] or more; it is {lights!r}")
-    made = tuple(_light(_Table(path, f"pictures {number} lights {i}", each), channels) for i, each in enumerate(lights, 1))
+    made = tuple(_light(Table(path, f"pictures {number} lights {i}", each), channels) for i, each in enumerate(lights, 1))
     try:
-        return Observation(_array(picture), camera, made, mask, deviation, _intensity(table))
+        return Observation(as_array(picture), camera, made, mask, deviation, _intensity(table))
     except ValueError as error:
         raise ValueError(f"{table.where} {error}") from None
 
 
-def _camera(table: _Table, width: int, height: int) -> Camera:
-    _only(table, {"position", "target", "up", "fov"})
+def _camera(table: Table, width: int, height: int) -> Camera:
+    table.only({"position", "target", "up", "fov"})
     up = _vector(table, "up") if "up" in table.table else None
     fov = table.number("fov", "between 0 and 180 degrees", lambda x: 0 < x < 180, 25.0)
     return Camera.look_at(_vector(table, "position"), _vector(table, "target"), up=up, fov=fov, width=width, height=height)
 
 
-def _light(table: _Table, channels: int) -> AbstractLight:
+def _light(table: Table, channels: int) -> AbstractLight:
     kind = table.table.get("kind")
     if kind not in _LIGHTS:
         raise ValueError(f"{table.where} kind must be one of {', '.join(_LIGHTS)}; it is {kind!r}")
-    _only(table, _LIGHTS[kind] | {"kind"})
+    table.only(_LIGHTS[kind] | {"kind"})
     shadows = table.table.get("cast_shadows", True)
     if not isinstance(shadows, bool):
         raise ValueError(f"{table.where} cast_shadows must be true or false; it is {shadows!r}")
@@ -111,38 +111,32 @@ def _light(table: _Table, channels: int) -> AbstractLight:
             return PointLight(_vector(table, "position"), _color(table, "intensity", channels), shadows)
     variance = table.numbers("variance", "positive (mm^2)", lambda x: x > 0, channels=1)
     way = _vector(table, "direction", True)
-    return GaussianBeam(_vector(table, "origin"), way, _color(table, "power", channels), _array(variance)[0])
+    return GaussianBeam(_vector(table, "origin"), way, _color(table, "power", channels), as_array(variance)[0])
 
 
-def _intensity(table: _Table) -> AbstractIntensity:
+def _intensity(table: Table) -> AbstractIntensity:
     found = table.table.get("intensity", "known")
     if found not in _INTENSITIES:
         raise ValueError(f"{table.where} intensity must be one of {', '.join(_INTENSITIES)}; it is {found!r}")
     return _INTENSITIES[found]()
 
 
-def _vector(table: _Table, name: str, points: bool = False):
+def _vector(table: Table, name: str, points: bool = False):
     found = table.numbers(name, "three of them", lambda x: np.isfinite(x))
     if found.shape != (3,) or (points and not np.any(found)):
         raise ValueError(f"{table.where} {name} must be three numbers{', not all 0' if points else ''}; it is {found.tolist()}")
-    return _array(found)
+    return as_array(found)
 
 
-def _color(table: _Table, name: str, channels: int):
+def _color(table: Table, name: str, channels: int):
     found = table.numbers(name, "at least 0", lambda x: x >= 0, channels=channels)
     if found.shape != (channels,):
         raise ValueError(f"{table.where} {name} must be {channels} numbers, as its picture has channels; it is {found.tolist()}")
-    return _array(found)
+    return as_array(found)
 
 
-def _text(table: _Table, name: str) -> str:
-    found = table._entry(name, "the name of an EXR file")
+def _text(table: Table, name: str) -> str:
+    found = table.entry(name, "the name of an EXR file")
     if not isinstance(found, str):
         raise ValueError(f"{table.where} {name} must be the name of an EXR file; it is {found!r}")
     return found
-
-
-def _only(table: _Table, known: set[str]) -> None:
-    unknown = sorted(set(table.table) - known)
-    if unknown:
-        raise ValueError(f"{table.where} has an unknown entry {unknown[0]!r}; known are {', '.join(sorted(known))}")

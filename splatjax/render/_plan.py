@@ -76,8 +76,7 @@ def _plan(scenes: Scene | Sequence[Scene], cameras: Camera | Sequence[Camera], s
     views = [_splatting.PerspectiveView.of(camera) for camera in cameras]
     bounds = _splatting.Bounds.of(scene.splats)
     interval = _diffusion.handover_interval(_diffusion.irregularity(scene.splats), settings.diffusion)
-    variances = scene.material.gaussians.variances
-    kernels = _diffusion.Kernels(variances, settings.diffusion.normalization.depths(variances))
+    kernels = _diffusion.Kernels.of(scene.material.gaussians.variances, settings.diffusion.normalization)
     camera = settings.rasterizer.planned(scene.splats, views, settings.splatting)
     looks = [_look(scene.splats, view, settings.splatting, camera) for view in views]
     shown = max(int(jnp.sum(look > -jnp.inf)) for look in looks)

@@ -168,7 +168,7 @@ def through_a_sheet(thickness: float, normalization) -> np.ndarray:
     entering = np.repeat([0.0, 1.0], x.size)[None]
     sources = Sources(*map(jnp.asarray, (centers, np.concatenate([up, -up], axis=1), np.full(2 * x.size, spacing**2), entering)))
     gaussians = material().gaussians
-    kernels = Kernels(gaussians.variances, normalization.depths(gaussians.variances))
+    kernels = Kernels.of(gaussians.variances, normalization)
     points, covered = jnp.zeros((1, 3, 1)), jnp.ones((1, 1), bool)
     atlas = Atlas.of(jnp.zeros((2, 1, 1)), bodies.perspective(width=1, height=1), 1)  # unused by the plain diffuser
     found = DenseDiffuser().diffuse(sources, kernels, points, covered, atlas)
