@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from splatjax.pointwise import in_parts
+from splatjax.pointwise import in_parts, zeros_after
 
 
 def squares_and_lengths(scale, record):
@@ -45,3 +45,12 @@ def test_a_part_that_is_filled_up_adds_nothing():
     points = jnp.ones((5, 3))
     slope = jax.grad(lambda p: jnp.sum(in_parts(lambda part: jnp.linalg.norm(part, axis=1), p, at_once=3)))(points)
     np.testing.assert_allclose(np.asarray(slope), 1 / np.sqrt(3), rtol=1e-6)
+
+
+def test_zeros_wait_for_what_must_be_known_and_are_zeros_whatever_it_is():
+    make = jax.jit(lambda known: zeros_after(known, (2, 3), jnp.float32))
+    for known in (-1.0, 0.0, 5.0, np.nan, np.inf):
+        found = make(jnp.full((4, 1), known))
+        assert found.dtype == jnp.float32
+        np.testing.assert_array_equal(found, np.zeros((2, 3)))
+    assert "compare" in make.lower(jnp.zeros((4, 1))).compile().as_text()  # not made a constant of

@@ -16,6 +16,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from splatjax.pointwise import zeros_after
+
 _FADING = 0.5  # of the exponent, before its largest
 
 
@@ -140,7 +142,7 @@ def _forward(rule: _Rule, steps: Steps, points, table):
 def _empty(rule: _Rule, points, table):
     sums = jax.ShapeDtypeStruct((points.shape[0], table.shape[1] - 4, points.shape[2]), points.dtype)
     found = jax.eval_shape(rule.finished, sums, points)
-    return jnp.zeros(found.shape, found.dtype)
+    return zeros_after(table, found.shape, found.dtype)
 
 
 def _derivative(rule: _Rule, steps: Steps, points, table, d_table):
@@ -202,7 +204,8 @@ def _backward(rule: _Rule, steps: Steps, points, table, sums, cotangents):
         d_here, d_table = lax.fori_loop(steps.begins[i], steps.ends[i], add, (d_finish, d_table))
         return d_points.at[lanes].set(d_here, mode="promise_in_bounds"), d_table
 
-    return lax.fori_loop(0, steps.begins.shape[0], sweep, (jnp.zeros_like(points), jnp.zeros_like(table)))
+    start = tuple(zeros_after(cotangents, each.shape, each.dtype) for each in (points, table))
+    return lax.fori_loop(0, steps.begins.shape[0], sweep, start)
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0,))

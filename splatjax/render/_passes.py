@@ -111,11 +111,11 @@ def see_surfaces(
     atlas = _splatting.Atlas.of(_splatting.farthest_depths(found), view, plan.tiles)
     front = found.front.coverage
     behind = (1 - front) * found.behind.coverage
-    rows = (
+    rows = [
         jnp.concatenate([each.attributes, jnp.stack([each.depth, each.weight_sum, share])])
         for each, share in ((found.front, front), (found.behind, behind))
-    )
-    packed = atlas.pack(*rows)
+    ]
+    packed = atlas.pack(jnp.stack(rows))
     covered = stop_gradient(packed[:, -2]) > 0
     depth = jnp.where(covered, packed[:, -3], 1.0)
     return SeenSurfaces(

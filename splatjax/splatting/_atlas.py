@@ -70,18 +70,13 @@ class Atlas(eqx.Module):
     def _count(self) -> int:
         return self.grid.across * self.grid.down
 
-    def pack(
-        self, front: Float[Array, "rows height width"], behind: Float[Array, "rows height width"]
-    ) -> Float[Array, "tiles rows pixels"]:
+    def pack(self, pictures: Float[Array, "surfaces rows height width"]) -> Float[Array, "tiles rows pixels"]:
         """Cut pictures of the front surface and of the one behind it into their tiles; 0 in empty places. Differentiable."""
-        grid, count = self.grid, self._count
-
-        def cut(picture, tiles):
-            return grid.tiled(picture).at[*grid.place(tiles)].get(mode="fill", fill_value=0)
-
-        later = jnp.where(self.tiles >= count, self.tiles - count, count)
-        found = jnp.where(self.in_front[:, None, None, None], cut(front, self.tiles), cut(behind, later))
-        return found.reshape(self.tiles.shape[0], front.shape[0], SIDE**2)
+        grid, (surfaces, rows, height, width) = self.grid, pictures.shape
+        tiled = grid.tiled(pictures.reshape(-1, height, width)).reshape(surfaces, rows, grid.down, SIDE, grid.across, SIDE)
+        _, *place = grid.place(self.tiles % self._count)
+        found = tiled.at[self.tiles // self._count, :, *place].get(mode="fill", fill_value=0)
+        return found.reshape(-1, rows, SIDE**2)
 
     def points(self, depth: Float[Array, "tiles pixels"]) -> Float[Array, "3 tiles pixels"]:
         """Give the points (mm) that the pixels see at a depth (mm). Differentiable."""

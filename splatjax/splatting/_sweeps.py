@@ -14,6 +14,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from splatjax.pointwise import zeros_after
+
 from ._bins import Bins, TileGrid, scatter_slots, slot_plane
 from ._kernel import fast_fragment_weight, fragment_weight_derivative
 from ._rasterizer import LEAST_WEIGHT, blend_fragments
@@ -236,8 +238,8 @@ def _forward(sweep: Sweep, bins: Bins, shift, planes, attributes):
             lax.dynamic_update_slice_in_dim(whole, part, i * grid.lanes, 0) for whole, part in zip(out, parts, strict=True)
         )
 
-    never = jnp.full((bins.places, grid.side**2), jnp.inf, dtype)
-    empty = jnp.zeros((bins.places, count, grid.side**2), dtype)
+    empty = zeros_after(slots.shift, (bins.places, count, grid.side**2), dtype)
+    never = jnp.inf + empty[:, 0]
     front, limits = lax.fori_loop(jnp.int32(0), bins.chunks, chunk, (empty, never))
     gaps = (front[:, -1] < sweep.full_coverage) & (limits > -jnp.inf) & (limits < jnp.inf)
     pick, rounds = _picked(jnp.any(gaps, axis=1))
@@ -252,7 +254,7 @@ def _forward(sweep: Sweep, bins: Bins, shift, planes, attributes):
         return behind.at[*grid.place(bins.order[places])].add(rows), seconds.at[places].min(second)
 
     poison = jnp.where(bins.needed <= 1, 0.0, jnp.nan).astype(dtype)
-    behind = jnp.full((count, grid.down, grid.side, grid.across, grid.side), poison)
+    behind = poison + zeros_after(rounds, (count, grid.down, grid.side, grid.across, grid.side), dtype)
     behind, seconds = lax.fori_loop(jnp.int32(0), rounds, look_behind, (behind, never))
     return grid.join(bins.by_tile(front, 0.0)) + poison, grid.picture(behind), (front, limits, seconds)
 
@@ -271,7 +273,7 @@ def _backward(sweep: Sweep, bins: Bins, shift, planes, attributes, behind, swept
         cotangent = d_front.at[tiles].get(mode="promise_in_bounds")
         return sweep.add_cotangents(slots, sweep.chunk(bins, i, dtype), limit, None, blended, cotangent, gradients)
 
-    start = tuple(jnp.zeros_like(slots.shift) for _ in range(count))
+    start = tuple(zeros_after(d_front, slots.shift.shape, dtype) for _ in range(count))
     gradients = lax.fori_loop(jnp.int32(0), bins.chunks, chunk, start)
     pick, rounds = _picked(jnp.any(seconds < jnp.inf, axis=1))
 

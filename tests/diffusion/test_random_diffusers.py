@@ -228,7 +228,7 @@ def lit(seed: int):
     sources = Sources(body.centers.T, body.normals.T, body.areas, jnp.asarray(irradiance))
     atlas, points, covered = bodies.packed(depths, weight_sums, view)
     # By coverage pictures multiply; where it is small, the point lies off the body.
-    seen = np.asarray((atlas.pack(coverage[:1], 0 * coverage[1:])[:, 0] > 0.5) & atlas.in_front[:, None])
+    seen = np.asarray((atlas.pack(jnp.stack([coverage[:1], 0 * coverage[1:]]))[:, 0] > 0.5) & atlas.in_front[:, None])
     return Lit(sources, Kernels(variances, 0.75 * jnp.sqrt(variances)), points), covered, seen, atlas
 
 

@@ -94,6 +94,6 @@ def packed(depths, weight_sums, view):
     ]
     farthest = farthest_depths(Surfaces(*surfaces, jnp.zeros((), depths.dtype)))
     atlas = Atlas.of(farthest, view, farthest.size)
-    rows = atlas.pack(*jnp.stack([depths, weight_sums], axis=1))
+    rows = atlas.pack(jnp.stack([depths, weight_sums], axis=1))
     covered = rows[:, 1] > 0
     return atlas, atlas.points(jnp.where(covered, rows[:, 0], 1.0)).transpose(1, 0, 2), covered
