@@ -74,6 +74,7 @@ def passes(scene: sj.Scene, camera: sj.Camera, plan: sj.Plan, settings: sj.Rende
     light = jax.jit(shadow)(scene)
     entering = jax.jit(wiring.let_light_in)(scene, light)
     seen = jax.jit(visible)(scene, light, entering)
+    jax.clear_caches()  # so that each is compiled again, and timed
     return {
         "pass 1, shadow map": (shadow, (scene,)),
         "irradiance": (wiring.let_light_in, (scene, light)),

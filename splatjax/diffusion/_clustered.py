@@ -116,7 +116,7 @@ class ClusterDiffuser(AbstractDiffuser):
         edges = _CELL * (self.error / 2e-3) ** (1 / 3) * np.sqrt(values / self.margin)
         edges = np.where(carried & (edges > _WORTHWHILE * spacing), edges, 0.0)
         cells = sorted({float(edge) for edge in edges if edge > 0})
-        tree = ClusterTree.build(splats.centers, cells)
+        tree = ClusterTree.build(splats.centers, splats.normals, cells)
         origin = jnp.mean(splats.centers, axis=0)
         levels = _levels(tree, Sources(splats.centers.T - origin[:, None], splats.normals.T, splats.areas, splats.areas[None]))
         layers = []

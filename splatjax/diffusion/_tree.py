@@ -85,28 +85,30 @@ class ClusterTree(eqx.Module):
     counts: tuple[int, ...] = eqx.field(static=True)
 
     @classmethod
-    def build(cls, centers: Float[Array, "splats 3"], cells: Sequence[float]) -> "ClusterTree":
-        """Sort splats, and the clusters of each level, into cells of the edges `cells` (mm, ascending) by their centers."""
-        positions = np.asarray(centers, np.float64)
+    def build(cls, centers: Float[Array, "splats 3"], normals: Float[Array, "splats 3"], cells: Sequence[float]) -> "ClusterTree":
+        """Sort splats, and the clusters of each level, into cells of the edges `cells` (mm, ascending) by their centers.
+
+        A cell holds what faces one way: the two sides of a thin sheet are clusters of their own.
+        """
+        positions, facing = np.asarray(centers, np.float64), np.asarray(normals, np.float64)
         splats = len(positions)
         order = compact_order(positions)
-        positions, members = positions[order], np.ones(splats)
+        positions, facing, members = positions[order], facing[order], np.ones(splats)
         parents, counts = [], []
         for cell in cells:
             found = np.floor((positions - positions.min(axis=0)) / cell).astype(np.int64)
             extent = found.max(axis=0) + 1
             key = (found[:, 0] * extent[1] + found[:, 1]) * extent[2] + found[:, 2]
-            kept, parent = np.unique(key, return_inverse=True)
-            parent = parent.reshape(-1)
+            parent = _by_side(np.unique(key, return_inverse=True)[1].reshape(-1), facing)
             inside = np.bincount(parent, members)
-            middle = np.stack([np.bincount(parent, members * axis) for axis in positions.T], axis=1) / inside[:, None]
+            middle, toward = (_sums(parent, members[:, None] * rows) / inside[:, None] for rows in (positions, facing))
             place = compact_order(middle)
-            rank = np.empty(len(kept), np.int64)
-            rank[place] = np.arange(len(kept))
+            rank = np.empty(len(place), np.int64)
+            rank[place] = np.arange(len(place))
             before = counts[-1] if counts else _blocks(splats)
             parents.append(jnp.asarray(np.pad(rank[parent], (0, before - len(parent))), jnp.int32))
-            counts.append(_round_up(len(kept)))
-            positions, members = middle[place], inside[place]
+            counts.append(_round_up(len(place)))
+            positions, facing, members = middle[place], toward[place], inside[place]
         order = np.pad(order, (0, _blocks(splats) - splats), constant_values=splats)
         return cls(jnp.asarray(order, jnp.int32), tuple(parents), tuple(counts))
 
@@ -127,6 +129,21 @@ class ClusterTree(eqx.Module):
         for parents, count in zip(self.parents[:level], self.counts[:level], strict=True):
             found = jnp.zeros(count, found.dtype).at[parents].max(found)
         return found
+
+
+def _sums(groups: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Add up the rows of each group."""
+    return np.stack([np.bincount(groups, column) for column in rows.T], axis=1)
+
+
+def _by_side(groups: np.ndarray, facing: np.ndarray) -> np.ndarray:
+    """Split each group by which way along its main axis its members face; give new groups, numbered without gaps."""
+    rows, columns = np.triu_indices(3)
+    products = np.empty((groups.max() + 1, 3, 3))
+    products[:, rows, columns] = products[:, columns, rows] = _sums(groups, facing[:, rows] * facing[:, columns])
+    axes = np.linalg.eigh(products)[1][:, :, -1]
+    sides = 2 * groups + (np.sum(facing * axes[groups], axis=1) < 0)
+    return (np.cumsum(np.bincount(sides) > 0) - 1)[sides]
 
 
 def _blocks(count: int) -> int:

@@ -30,7 +30,7 @@ def of_splats(tree, level):
 
 def test_merging_keeps_area_energy_and_first_moments():
     given = sources()
-    tree = ClusterTree.build(given.centers.T, CELLS)
+    tree = ClusterTree.build(given.centers.T, given.normals.T, CELLS)
     levels = jax.jit(lambda s: tree.levels(s))(given)
     centers, areas, irradiance = (np.asarray(each, float) for each in (given.centers, given.areas, given.irradiance))
     for level, clusters in enumerate(levels[1:]):
@@ -65,7 +65,7 @@ def _whole(tree):
 
 def test_merging_twice_is_merging_once():
     given = sources()
-    tree = ClusterTree.build(given.centers.T, CELLS)
+    tree = ClusterTree.build(given.centers.T, given.normals.T, CELLS)
     step_by_step = tree.levels(given)[-1]
     at_once = tree.levels(given)[0].merged(_whole(tree), tree.counts[2])
     for ours, theirs in zip(jax.tree.leaves(step_by_step), jax.tree.leaves(at_once), strict=True):
@@ -74,7 +74,7 @@ def test_merging_twice_is_merging_once():
 
 def test_lowering_clusters_is_merging_lowered_splats():
     given, depth = sources(), 1.7
-    tree = ClusterTree.build(given.centers.T, CELLS)
+    tree = ClusterTree.build(given.centers.T, given.normals.T, CELLS)
     below = Sources(given.centers - depth * given.normals, given.normals, given.areas, given.irradiance)
     for ours, theirs in zip(tree.levels(given), tree.levels(below), strict=True):
         lowered = ours.lowered(jnp.asarray(depth))
@@ -85,7 +85,7 @@ def test_lowering_clusters_is_merging_lowered_splats():
 
 def test_a_cluster_fills_no_more_than_its_cell():
     given = sources()
-    tree = ClusterTree.build(given.centers.T, CELLS)
+    tree = ClusterTree.build(given.centers.T, given.normals.T, CELLS)
     centers = np.asarray(given.centers)
     numbers = []
     for level in range(len(CELLS)):
@@ -100,10 +100,26 @@ def test_a_cluster_fills_no_more_than_its_cell():
 
 def test_no_cells_merge_nothing():
     given = sources()
-    tree = ClusterTree.build(given.centers.T, [])
+    tree = ClusterTree.build(given.centers.T, given.normals.T, [])
     (only,) = tree.levels(given)
     order = np.asarray(tree.order)
     np.testing.assert_array_equal(np.sort(order[order < 800]), np.arange(800))
     np.testing.assert_array_equal(np.asarray(only.areas)[order < 800], np.asarray(given.areas)[order[order < 800]])
     assert not np.any(np.asarray(only.areas)[order == 800])
     assert not np.any(np.asarray(only.spread))
+
+
+def test_what_faces_the_other_way_is_in_a_cluster_of_its_own():
+    rng = np.random.default_rng(4)
+    across = np.concatenate([rng.uniform(0, 8, (200, 2))] * 2)
+    side = np.repeat([1.0, -1.0], 200)
+    centers = np.concatenate([across, 0.1 * side[:, None]], axis=1)
+    normals = side[:, None] * np.asarray([0.0, 0.0, 1.0]) + rng.normal(scale=0.3, size=(400, 3))
+    tree = ClusterTree.build(jnp.asarray(centers), jnp.asarray(normals), [3.0, 9.0])
+    place = np.arange(len(tree.order))
+    for parents, cells in zip(tree.parents, (9, 1), strict=True):
+        place = np.asarray(parents)[place]
+        mine = np.empty(400, int)
+        mine[np.asarray(tree.order)[:400]] = place[:400]
+        assert not set(mine[:200]) & set(mine[200:])
+        assert len(set(mine)) == 2 * cells

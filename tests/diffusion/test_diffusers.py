@@ -144,6 +144,34 @@ def test_fast_diffuser_is_the_plain_one_within_its_stated_error(float32, approxi
             assert ours.max() <= values.max() + slack
 
 
+def thin_sheet(thickness=0.6):
+    """Two faces, the front one lit: splats, and their sources."""
+    front, back = (bodies.sheet(16.0, 0.7, normal=(0, 0, side), center=(0, 0, side * thickness / 2)) for side in (1.0, -1.0))
+    splats = bodies.joined(front, back)
+    x, y, z = splats.centers.T
+    light = jnp.where(z > 0, 0.6 + 0.4 * jnp.sin(0.5 * x) * jnp.cos(0.4 * y), 0.0)
+    return splats, Sources(splats.centers.T, splats.normals.T, splats.areas, light[None])
+
+
+def test_the_two_faces_of_a_thin_sheet_are_not_merged(float32):
+    """Their sources lie below each, on either side of the other: one cluster for both is off by a twentieth."""
+    body, sources = thin_sheet()
+    atlas, points, covered = atlas_of(body, bodies.perspective(fov=FOV, width=SIZE, height=SIZE))
+    wide = Kernels(jnp.asarray([9.0]), jnp.asarray([DEPTH * 3.0]))
+    diffuser = ClusterDiffuser().planned(body, wide, jnp.asarray(RESOLVED), [atlas])
+    assert diffuser.layers[0].nodes is not None
+    ours, plain = (
+        jax.jit(lambda *given, each=each: each.diffuse(*given))(sources, wide, points, covered, atlas)
+        for each in (diffuser, DenseDiffuser())
+    )
+    shown = np.asarray(covered & atlas.in_front[:, None])
+    for found, expected in ((ours.means[:, 0, 0], plain.means[:, 0, 0]), (ours.exits[:, 0], plain.exits[:, 0])):
+        found, expected = np.asarray(found)[shown], np.asarray(expected)[shown]
+        error = np.abs(found - expected) / np.sqrt(np.mean(expected**2))
+        assert np.median(error) < 2 * MEDIAN
+        assert np.quantile(error, 0.99) < HIGH
+
+
 def test_far_from_every_source_gradients_are_finite(x64):
     """As in a layer that is handed over: nothing reaches a point between splats."""
     _, atlas, sources, points, covered = scene(x64)
