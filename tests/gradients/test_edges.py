@@ -37,23 +37,24 @@ def world() -> tuple[sj.Scene, sj.Camera, int]:
 
 @cache
 def rendered():
-    """Functions of how far the ball, the sheet and the light are moved: the frame; a weighed sum of beauty and its gradient."""
+    """A function of how far the ball, the sheet and the light are moved: a weighed sum of beauty, the frame, and the gradient.
+
+    All in one program: each takes its time to compile.
+    """
     scene, camera, sheet = world()
     settings = FAST  # what it is compared with elsewhere, the plain path, gives the same digits here
     plan = sj.plan(scene, camera, settings)
     of_sheet = np.arange(scene.splats.count) < sheet
     ways = [jnp.asarray(which[:, None] * np.asarray([1.0, 0.3, 0.0])) for which in (~of_sheet, of_sheet)]
 
-    def frame(moved):
+    def summed(moved, share):
         centers = scene.splats.centers + moved[0] * ways[0] + moved[1] * ways[1]
         direction = scene.lights[0].direction + moved[2] * jnp.asarray([0.0, 1.0, 0.0])
         there = eqx.tree_at(lambda s: (s.splats.centers, s.lights[0].direction), scene, (centers, direction))
-        return sj.render(there, camera, settings, plan)
+        frame = sj.render(there, camera, settings, plan)
+        return jnp.sum(share * frame.beauty), frame
 
-    def summed(moved, share):
-        return jnp.sum(share * frame(moved).beauty)
-
-    return jax.jit(frame), jax.jit(jax.value_and_grad(summed))
+    return jax.jit(jax.value_and_grad(summed, has_aux=True))
 
 
 def edges(frame: sj.Frame) -> dict[str, np.ndarray]:
@@ -88,14 +89,15 @@ CASES = {
 def test_edges_move_as_their_gradient_says(case):
     where, which, far = CASES[case]
     with jax.enable_x64(True):
-        frame, value_and_gradient = rendered()
-        mask = edges(frame(jnp.zeros(3)))[where]
+        found = rendered()
+        (_, frame), _ = found(jnp.zeros(3), jnp.zeros((SIZE, SIZE, 2)))
+        mask = edges(frame)[where]
         assert np.sum(mask) >= 15
         share = jnp.asarray(mask[..., None] * np.random.default_rng(1).uniform(-0.5, 1, (SIZE, SIZE, 2)))
         way = np.eye(3)[which]
 
         def at(t):
-            value, gradient = value_and_gradient(jnp.asarray(t * way), share)
+            (value, _), gradient = found(jnp.asarray(t * way), share)
             return float(value), float(gradient[which])
 
         start, slope = at(0.0)
