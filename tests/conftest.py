@@ -1,5 +1,6 @@
 """Strict modes for the whole suite. Precision comes from JAX_ENABLE_X64: the suite runs once in each."""
 
+import gc
 import json
 import os
 from pathlib import Path
@@ -10,6 +11,10 @@ import pytest
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+# Tracing makes objects by the million that live as long as what they were traced for: looking for garbage among them as often as
+# Python would takes 8% of the time.
+gc.set_threshold(100_000, 20, 20)
 
 
 @pytest.fixture
@@ -71,6 +76,11 @@ def pytest_collection_modifyitems(config, items):
     if left_out:
         items[:] = [item for item in items if item not in left_out]
         config.hook.pytest_deselected(items=left_out)
+
+
+def pytest_collection_finish():
+    """What has been imported stays."""
+    gc.freeze()
 
 
 def pytest_report_header():
