@@ -47,6 +47,10 @@ from .render import Plan as Plan, plan as plan, render as render, RenderSettings
 from .inverse import HuberLoss as HuberLoss, SquaredLoss as SquaredLoss
 from .inverse import KnownIntensity as KnownIntensity, UnknownColor as UnknownColor, UnknownIntensity as UnknownIntensity
 from .inverse import Candidate as Candidate, next_pictures as next_pictures, usual_candidates as usual_candidates
+from .inverse import AlbedoMap as AlbedoMap, CameraPoses as CameraPoses, LightPlaces as LightPlaces
+from .inverse import LightStrengths as LightStrengths, NormalOffsets as NormalOffsets
+from .inverse import BlackBackground as BlackBackground, UnknownBackground as UnknownBackground
+from .inverse import fit_scene as fit_scene, FittedScene as FittedScene
 from .inverse import Observation as Observation, recover as recover, Recovery as Recovery
 
 __version__ = "0.1.0"

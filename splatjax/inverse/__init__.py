@@ -1,5 +1,9 @@
-"""From pictures of a known shape back to optical coefficients, with error bars."""
+"""From pictures back to optical coefficients, with error bars, and to albedo, lights, cameras and shape."""
 
+from ._background import AbstractBackground as AbstractBackground, BlackBackground as BlackBackground
+from ._background import UnknownBackground as UnknownBackground
+from ._fit_scene import fit_scene as fit_scene, GradientTransformation as GradientTransformation
+from ._fitted_scene import FittedScene as FittedScene
 from ._flat import wide_variances as wide_variances
 from ._intensity import AbstractIntensity as AbstractIntensity, KnownIntensity as KnownIntensity
 from ._intensity import UnknownColor as UnknownColor, UnknownIntensity as UnknownIntensity
@@ -7,5 +11,8 @@ from ._losses import AbstractLoss as AbstractLoss, HuberLoss as HuberLoss, Squar
 from ._next import Candidate as Candidate, Prediction as Prediction, next_pictures as next_pictures
 from ._next import usual_candidates as usual_candidates
 from ._observation import Observation as Observation
+from ._offsets import NormalOffsets as NormalOffsets
+from ._parts import AbstractPart as AbstractPart, AlbedoMap as AlbedoMap, CameraPoses as CameraPoses
+from ._parts import LightPlaces as LightPlaces, LightStrengths as LightStrengths
 from ._recover import recover as recover
 from ._recovery import Recovery as Recovery

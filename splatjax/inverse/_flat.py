@@ -11,9 +11,11 @@ from jaxtyping import Array, Float, Int
 
 from splatjax.diffusion import GatheredLight
 from splatjax.gaussians import SumOfGaussians
-from splatjax.render import GatheredPicture, Plan, RenderSettings, gather_picture, gather_picture_and_slopes, plan
+from splatjax.render import GatheredPicture, Plan, RenderSettings, gather_picture, gather_picture_and_slopes
 from splatjax.scattering import Medium
 from splatjax.scene import AbstractLight, Camera, Material, Scene, Splats
+
+from ._plans import plans_of
 
 _FILLED = 0.999  # coverage
 _LARGER = 3.0
@@ -132,16 +134,7 @@ class Gatherer(eqx.Module):
         return [Scene(self.splats, lights, material) for lights in self.lights]
 
     def _plans(self, material: Material) -> list[Plan]:
-        scenes = self._scenes(_rounded(material))
-        alike: dict[object, list[int]] = {}
-        for i, (camera, lights) in enumerate(zip(self.cameras, self.lights, strict=True)):
-            alike.setdefault((camera.width, camera.height, *(jax.tree.structure(each) for each in lights)), []).append(i)
-        found: list[Plan | None] = [None] * len(scenes)
-        for places in alike.values():
-            made = plan([scenes[i] for i in places], [self.cameras[i] for i in places], self.settings)
-            for i in places:
-                found[i] = made
-        return [each for each in found if each is not None]
+        return plans_of(self._scenes(_rounded(material)), self.cameras, self.settings)
 
 
 def _rounded(material: Material) -> Material:

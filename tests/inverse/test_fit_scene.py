@@ -1,0 +1,328 @@
+"""What was moved comes back: albedo, lights, cameras, shape. What no picture tells of stays."""
+
+from functools import cache
+
+import bodies
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+import splatjax as sj
+from splatjax.diffusion import DenseDiffuser
+from splatjax.inverse import _fit_scene
+from splatjax.inverse._evidence import Evidence
+from splatjax.inverse._parts import Shot, rotation
+from splatjax.splatting import DenseRasterizer, ShadowSettings
+
+PLAIN = sj.RenderSettings(rasterizer=DenseRasterizer(), diffuser=DenseDiffuser())
+SIZE = 20
+PARTS = (
+    sj.AlbedoMap(step=0.2),
+    sj.NormalOffsets(step=0.02, smoothness=2.0, deviation=0.5),
+    sj.LightStrengths(),
+    sj.LightPlaces(),
+    sj.CameraPoses(turn=4e-3),
+)
+COMPILED = "/jax/core/compile/backend_compile_duration"
+
+
+def lights():
+    ways = [-1.0, -0.4, -0.3], [0.8, -0.2, -0.6]
+    return [sj.DirectionalLight(jnp.asarray(way), jnp.asarray([2.0, 3.0]), cast_shadows=False) for way in ways]
+
+
+def camera() -> sj.Camera:
+    return sj.Camera.look_at(jnp.asarray([6.0, 4.0, 40.0]), jnp.zeros(3), fov=32.0, width=SIZE, height=SIZE)
+
+
+def material() -> sj.Material:
+    gaussians = sj.SumOfGaussians(jnp.asarray([0.5, 3.0]), jnp.asarray([[0.5, 0.3], [0.5, 0.7]]))
+    return sj.Material(gaussians, eta=1.3, specular=0.0)
+
+
+@cache
+def body() -> sj.Splats:
+    """A bumpy ball with a map, and another behind the camera."""
+    splats = bodies.joined(bodies.bumpy(160), bodies.sphere(20, 4.0, center=(0.0, 0.0, 90.0)))
+    return with_albedo(splats, np.random.default_rng(2).uniform(0.3, 0.9, (splats.count, 2)))
+
+
+def with_albedo(splats: sj.Splats, albedo) -> sj.Splats:
+    return eqx.tree_at(lambda s: s.albedo, splats, jnp.asarray(albedo), is_leaf=lambda leaf: leaf is None)
+
+
+def tell(splats: sj.Splats, light: sj.DirectionalLight, picture=None, x=None) -> _fit_scene._Told:
+    """What a picture tells: the program that all fits of this file run."""
+    world = _fit_scene._World.of(splats, material(), PARTS)
+    shot = Shot(camera(), (light,))
+    picture = np.zeros((SIZE, SIZE, 2)) if picture is None else picture
+    (seen,) = _fit_scene._seen(Evidence([sj.Observation(picture, shot.camera, shot.lights)], jnp.zeros(()).dtype))
+    plan = sj.plan(sj.Scene(splats, shot.lights, material()), shot.camera, PLAIN)
+    x = (world.coordinates(), world.shot_coordinates(shot)) if x is None else x
+    return _fit_scene._tell(*x, world, shot, seen, plan, PLAIN, sj.SquaredLoss(), sj.BlackBackground())
+
+
+def observations(shots=None, x=None, **more) -> list[sj.Observation]:
+    """Pictures of the body, or of it at coordinates, under each light; said to be taken otherwise, if that is given."""
+    pictures = [np.asarray(tell(body(), light, x=x).beauty) for light in lights()]
+    shots = [(camera(), (light,)) for light in lights()] if shots is None else shots
+    return [sj.Observation(picture, *shot, **more) for picture, shot in zip(pictures, shots, strict=True)]
+
+
+def only(*kinds: type) -> optax.GradientTransformation:
+    """Let nothing else move: so all fits of this file run one compiled picture."""
+    chosen = [isinstance(part, kinds) for part in PARTS]
+
+    def kept(updates, params):
+        del params
+        body = tuple(_if(*each) for each in zip(chosen[:2], updates.body, strict=True))
+        shots = tuple(tuple(_if(*each) for each in zip(chosen[2:], shot, strict=True)) for shot in updates.shots)
+        return eqx.tree_at(lambda x: (x.body, x.shots), updates, (body, shots))
+
+    return optax.stateless(kept)
+
+
+def _zeros(tree):
+    return jax.tree.map(jnp.zeros_like, tree)
+
+
+def _if(moves: bool, update):
+    return update if moves else _zeros(update)
+
+
+def fitted(*kinds: type, steps: int, seen=None, splats=None, **more) -> sj.FittedScene:
+    optimizer = optax.chain(optax.adam(optax.cosine_decay_schedule(1.0, steps)), only(*kinds))
+    seen = observations() if seen is None else seen
+    splats = body() if splats is None else splats
+    found = sj.fit_scene(
+        seen, splats, material(), PARTS, optimizer, steps=steps, background=sj.BlackBackground(), settings=PLAIN, **more
+    )
+    print(f"losses {found.losses[0]:.3g} to {found.losses[found.best]:.3g} at step {found.best}")
+    return found
+
+
+def seen_well(splats: sj.Splats) -> np.ndarray:
+    way = np.asarray(camera().position) - np.asarray(splats.centers)
+    facing = np.sum(way * np.asarray(splats.normals), axis=1) / np.linalg.norm(way, axis=1)
+    return (facing > 0.5) & (np.asarray(splats.centers)[:, 2] < 20)
+
+
+def degrees(a, b) -> np.ndarray:
+    cosine = np.sum(np.asarray(a) * np.asarray(b), axis=-1)
+    return np.degrees(np.arccos(np.clip(cosine / np.linalg.norm(a, axis=-1) / np.linalg.norm(b, axis=-1), -1, 1)))
+
+
+@pytest.fixture
+def double():
+    with jax.enable_x64(True):
+        yield
+
+
+@pytest.mark.slow
+@pytest.mark.once
+@pytest.mark.usefixtures("double")
+class TestFitScene:
+    @pytest.mark.parametrize("kind", [type(part) for part in PARTS])
+    def test_gradients_are_those_of_finite_differences(self, kind):
+        step, rng = 1e-5, np.random.default_rng(5)
+        gray, light = with_albedo(body(), np.full(body().albedo.shape, 0.5)), lights()[0]
+        picture = observations()[0].picture
+        _, _, *zeros = tell(gray, light, picture).value
+        begin, way = (jax.tree.map(lambda leaf: jnp.asarray(rng.normal(size=leaf.shape)), zeros) for _ in range(2))
+        chosen = [isinstance(part, kind) for part in PARTS]
+        way = [
+            tuple(_if(*each) for each in zip(where, part, strict=True))
+            for where, part in zip((chosen[:2], chosen[2:]), way, strict=True)
+        ]
+
+        def told(by: float):
+            return tell(gray, light, picture, jax.tree.map(lambda leaf, along: leaf + by * along, begin, way)).value
+
+        _, _, *gradient = told(0.0)
+        along = sum(jax.tree.leaves(jax.tree.map(jnp.vdot, gradient, way)))
+        expected = (told(step)[0] - told(-step)[0]) / (2 * step)
+        assert abs(float(along / expected) - 1) < 1e-5
+
+    def test_what_is_right_stays_put(self):
+        found = fitted(*map(type, PARTS), steps=2)
+        assert found.losses[0] < 1e-20
+        assert found.best == 0
+        np.testing.assert_allclose(found.splats.centers, body().centers, atol=1e-12)
+        np.testing.assert_allclose(found.splats.normals, body().normals, atol=1e-12)
+        np.testing.assert_allclose(found.splats.albedo, body().albedo, atol=1e-12)
+
+    def test_an_albedo_map_comes_back_and_splats_unseen_do_not_move(self):
+        gray = with_albedo(body(), np.full(body().albedo.shape, 0.5))
+        found = fitted(sj.AlbedoMap, steps=60, splats=gray)
+        seen, unseen = seen_well(gray), np.asarray(gray.centers)[:, 2] > 20
+        errors = np.abs(np.asarray(found.splats.albedo - body().albedo))
+        print(np.median(errors[seen]), np.max(errors[seen]))
+        assert np.median(errors[seen]) < 0.03
+        np.testing.assert_allclose(found.splats.albedo[unseen], 0.5, atol=1e-12)
+
+    def test_lights_come_back(self):
+        off = [(0.7, [-1.0, -0.2, -0.5]), (1.3, [0.7, 0.0, -0.7])]
+        begin = [
+            (camera(), (sj.DirectionalLight(jnp.asarray(way), light.irradiance * factor, cast_shadows=False),))
+            for light, (factor, way) in zip(lights(), off, strict=True)
+        ]
+        found = fitted(sj.LightStrengths, sj.LightPlaces, steps=60, seen=observations(begin))
+        for (ours,), true in zip(found.lights, lights(), strict=True):
+            print(degrees(ours.direction, true.direction), ours.irradiance / true.irradiance)
+            assert degrees(ours.direction, true.direction) < 0.5
+            np.testing.assert_allclose(ours.irradiance, true.irradiance, rtol=5e-3)
+
+    def test_a_camera_comes_back(self):
+        right = camera()
+        turned = rotation(jnp.asarray([0.03, -0.04, 0.02]))
+        position = turned @ right.position + jnp.asarray([0.4, -0.3, 1.0])
+        off = eqx.tree_at(lambda c: (c.position, c.rotation), right, (position, right.rotation @ turned.T))
+        found = fitted(sj.CameraPoses, steps=80, seen=observations([(off, (light,)) for light in lights()]))
+        for ours in found.cameras:
+            print(np.linalg.norm(ours.position - right.position), degrees(ours.rotation, right.rotation))
+            assert np.linalg.norm(ours.position - right.position) < 0.1
+            assert np.max(degrees(ours.rotation, right.rotation)) < 0.1
+            np.testing.assert_allclose(ours.rotation @ ours.rotation.T, np.eye(3), atol=1e-12)
+
+    def test_a_shape_comes_back(self):
+        part = PARTS[1]
+        _, _, zeros, own = tell(body(), lights()[0]).value
+        x = jnp.asarray(40 * np.random.default_rng(4).normal(size=body().count))
+        dented = part.moved(body(), x, part.prepared(body()))
+        found = fitted(sj.NormalOffsets, steps=60, seen=observations(x=((jnp.zeros_like(zeros[0]), x), _zeros(own))))
+        before, after = (degrees(each.normals, dented.normals)[seen_well(dented)] for each in (body(), found.splats))
+        print(f"normals off by {np.median(before):.2f} degrees, then {np.median(after):.2f}")
+        assert np.median(before) > 3
+        assert np.median(after) < 1
+        np.testing.assert_allclose(jnp.linalg.norm(found.splats.normals, axis=1), 1, atol=1e-12)
+
+    def test_nothing_is_compiled_between_steps(self):
+        compiled, counts = [], []
+
+        def listen(event, duration, **_):
+            compiled.extend([duration] * (event == COMPILED))
+
+        jax.monitoring.register_event_duration_secs_listener(listen)
+        fitted(sj.AlbedoMap, steps=4, progress=lambda said, loss: counts.append(len(compiled)))
+        jax.monitoring.unregister_event_duration_listener(listen)
+        assert counts[0] < counts[2]  # the listener hears what the first step compiles
+        assert counts[2] == counts[-1]
+
+
+class Frame(eqx.Module):
+    """What a fit asks of a picture."""
+
+    beauty: jax.Array
+    coverage: jax.Array
+    overflow: jax.Array
+
+
+def stand_in(monkeypatch, reach: float, spoiled: float = np.inf) -> list[float]:
+    """Let a picture be the mean albedo; it outgrows plans by `reach`, and is no number where it is above `spoiled`.
+
+    Gives the albedos for which plans are made.
+    """
+    made = []
+
+    def plans_of(scenes, cameras, settings):
+        made.append(float(jnp.mean(scenes[0].splats.albedo)))
+        return [sj.Plan(DenseRasterizer(), 1, (), DenseDiffuser(), jnp.full(2, made[-1]))] * len(scenes)
+
+    def render(scene, camera, settings, plan):
+        mean = jnp.mean(scene.splats.albedo)
+        over = jnp.where(jnp.abs(mean - plan.interval[0]) > reach, 2.0, 0.0)
+        value = jnp.where((over > 0) | (mean > spoiled), jnp.nan, mean)
+        full = jnp.ones((camera.height, camera.width))
+        return Frame(value * jnp.ones((*full.shape, 2)), full, jax.lax.stop_gradient(over))
+
+    monkeypatch.setattr(_fit_scene, "plans_of", plans_of)
+    monkeypatch.setattr(_fit_scene, "render", render)
+    return made
+
+
+def lifted(target: float, settings, **more) -> tuple[sj.FittedScene, list[str]]:
+    """Fit a stand-in that starts at 0.5; settings tell stand-ins apart that are otherwise alike to the compiler.
+
+    A part of the picture is masked, and of another part nothing is known.
+    """
+    splats, said = with_albedo(bodies.sphere(20), np.full((20, 2), 0.5)), []
+    picture = np.full((SIZE, SIZE, 2), target)
+    picture[:5], picture[5, :, 1] = 90.0, np.nan
+    seen = sj.Observation(picture, camera(), (lights()[0],), mask=np.arange(SIZE)[:, None] > 4 * np.ones(SIZE))
+    optimizer = optax.adam(optax.cosine_decay_schedule(1.0, 40))
+    parts = [sj.AlbedoMap(deviation=1e3)]
+    found = sj.fit_scene(
+        [seen], splats, material(), parts, optimizer, steps=40, settings=settings, progress=lambda s, loss: said.append(s), **more
+    )
+    return found, said
+
+
+def test_a_scene_that_outgrows_its_plan_is_planned_anew(monkeypatch):
+    made = stand_in(monkeypatch, reach=0.07)
+    found, said = lifted(0.8, sj.RenderSettings(shadows=ShadowSettings(resolution=101)))
+    assert found.plans == len(made) > 2
+    assert sum("has outgrown its plan; planning anew" in each for each in said) == found.plans - 1
+    assert np.all(np.isfinite(found.losses))
+    np.testing.assert_allclose(found.splats.albedo, 0.8, atol=5e-3)
+    assert np.isnan(found.pictures[0][:6]).all()
+    np.testing.assert_allclose(found.residuals[0][6:], 0, atol=5e-3)
+
+
+def test_what_is_no_number_ends_the_fit_at_the_best_before_it(monkeypatch):
+    stand_in(monkeypatch, reach=np.inf, spoiled=0.6)
+    settings = sj.RenderSettings(shadows=ShadowSettings(resolution=102))
+    with pytest.raises(RuntimeError, match="Nonfinite"):
+        lifted(0.8, settings)
+    found, _ = lifted(0.8, settings, throw=False)
+    assert 2 < len(found.losses) == found.best + 2 < 40
+    assert 0.5 < float(jnp.mean(found.splats.albedo)) <= 0.6
+    assert np.all(np.isfinite(found.pictures[0]))
+    stand_in(monkeypatch, reach=np.inf, spoiled=0.1)
+    settings = sj.RenderSettings(shadows=ShadowSettings(resolution=103))
+    with pytest.raises(ValueError, match="loss or gradient of the start is not finite"):
+        lifted(0.8, settings)
+
+
+def test_pixels_that_a_body_does_not_fill_count_before_black_alone():
+    coverage = jnp.asarray([[0.0, 0.5, 0.9989, 0.9991, 1.0]])
+    np.testing.assert_array_equal(sj.UnknownBackground().counts(coverage), [[0, 0, 0, 1, 1]])
+    np.testing.assert_array_equal(sj.BlackBackground().counts(coverage), np.ones((1, 5)))
+
+
+def test_what_cannot_be_is_refused():
+    splats = with_albedo(bodies.sphere(20), np.full((20, 2), 0.5))
+    seen = sj.Observation(np.ones((SIZE, SIZE, 2)), camera(), (lights()[0],))
+    adam = optax.adam(1.0)
+
+    def fit(observations=(seen,), parts=None, splats=splats, steps=1):
+        parts = [sj.AlbedoMap()] if parts is None else parts
+        return sj.fit_scene(observations, splats, material(), parts, adam, steps=steps, settings=PLAIN)
+
+    with pytest.raises(ValueError, match="one part and one step are needed at least; got 1, 0 and 1"):
+        fit(parts=())
+    with pytest.raises(ValueError, match="one part and one step are needed at least; got 0, 1 and 0"):
+        fit(observations=(), steps=0)
+    with pytest.raises(ValueError, match="each kind of part may be given once; parts are AlbedoMap, AlbedoMap"):
+        fit(parts=(sj.AlbedoMap(), sj.AlbedoMap(step=1.0)))
+    with pytest.raises(ValueError, match=r"splats\.albedo is None, and AlbedoMap has nothing to move"):
+        fit(splats=bodies.sphere(20))
+    with pytest.raises(ValueError, match="16 splats are too few to measure slopes among; NormalOffsets needs 17"):
+        fit(splats=bodies.sphere(16), parts=(sj.NormalOffsets(0.1, 1.0, 1.0),))
+    with pytest.raises(ValueError, match=r"observations\[0\]\.picture has 3 channels, material has 2"):
+        fit(observations=(sj.Observation(np.ones((SIZE, SIZE, 3)), camera(), (lights()[0],)),))
+    with pytest.raises(ValueError, match=r"observations\[0\]\.intensity is UnknownColor\(\): that is for recover"):
+        fit(observations=(eqx.tree_at(lambda o: o.intensity, seen, sj.UnknownColor()),))
+    with pytest.raises(ValueError, match=r"LightStrengths\.step must be positive; got 0"):
+        sj.LightStrengths(step=0.0)
+
+
+def test_a_picture_none_of_whose_pixels_counts_is_refused(monkeypatch):
+    stand_in(monkeypatch, reach=np.inf)
+    splats = with_albedo(bodies.sphere(20), np.full((20, 2), 0.5))
+    seen = sj.Observation(np.full((SIZE, SIZE, 2), np.nan), camera(), (lights()[0],))
+    settings = sj.RenderSettings(shadows=ShadowSettings(resolution=104))
+    with pytest.raises(ValueError, match=r"no pixel of observations\[0\] counts"):
+        sj.fit_scene([seen], splats, material(), [sj.AlbedoMap()], optax.adam(1.0), steps=1, settings=settings)
