@@ -267,7 +267,7 @@ def _shown(beauty, counted, picture) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _cast(tree, dtype):
-    return jax.tree.map(lambda leaf: leaf.astype(dtype) if eqx.is_inexact_array(leaf) else leaf, tree)
+    return jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf), dtype) if eqx.is_inexact_array(leaf) else leaf, tree)
 
 
 def _check(observations: list[Observation], splats: Splats, material: Material, parts: list[AbstractPart], steps: int) -> None:
