@@ -1,6 +1,6 @@
 """From pictures to what a body looks like and how they were taken: first-order, along the gradient of the renderer."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from typing import Any, Protocol, runtime_checkable
 
@@ -242,7 +242,7 @@ def _advance(x: _Coordinates, state, told, world: _World, optimizer: GradientTra
 
 
 @contextmanager
-def _usual_promotion() -> Iterator[None]:
+def _usual_promotion() -> Generator[None]:
     """Optimizers are written for JAX's usual rules, whatever the user's are."""
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
         yield
