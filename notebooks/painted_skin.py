@@ -36,7 +36,7 @@ import splatjax as sj
 from splatjax.diffusion import DenseDiffuser
 from splatjax.splatting import DenseRasterizer
 
-SPLATS, SIZE, COUNT, STEPS, NOISE = 700, 30, 3, 40, 0.01
+SPLATS, SIZE, COUNT, STEPS, NOISE = 700, 30, 3, 30, 0.01
 HELD = sj.NonNegativeWeights(sj.TotalReflectanceHeld())
 # Every splat at every pixel: for small pictures. Leave `settings` out for large ones.
 settings = sj.RenderSettings(rasterizer=DenseRasterizer(), diffuser=DenseDiffuser())
