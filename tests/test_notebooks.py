@@ -9,11 +9,19 @@ import pytest
 from nbclient import NotebookClient
 
 NOTEBOOKS = Path(__file__).parents[1] / "notebooks"
+LONG = {"painted_skin", "shape_from_shading"}
+"""They take more than a minute: `make notebooks` runs them, `make test` does not."""
 
 
 @pytest.mark.slow
 @pytest.mark.once
-@pytest.mark.parametrize("path", sorted(NOTEBOOKS.glob("*.py")), ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path",
+    [
+        pytest.param(path, marks=pytest.mark.long if path.stem in LONG else (), id=path.stem)
+        for path in sorted(NOTEBOOKS.glob("*.py"))
+    ],
+)
 def test_notebook_runs_and_proves_its_claim(path, tmp_path, monkeypatch):
     notebook = jupytext.read(path)
     if any("monte_carlo" in cell.source for cell in notebook.cells):

@@ -146,7 +146,7 @@ def test_fast_diffuser_is_the_plain_one_within_its_stated_error(float32, approxi
 
 def thin_sheet(thickness=0.6):
     """Two faces, the front one lit: splats, and their sources."""
-    front, back = (bodies.sheet(16.0, 0.7, normal=(0, 0, side), center=(0, 0, side * thickness / 2)) for side in (1.0, -1.0))
+    front, back = (bodies.sheet(13.0, 0.75, normal=(0, 0, side), center=(0, 0, side * thickness / 2)) for side in (1.0, -1.0))
     splats = bodies.joined(front, back)
     x, y, z = splats.centers.T
     light = jnp.where(z > 0, 0.6 + 0.4 * jnp.sin(0.5 * x) * jnp.cos(0.4 * y), 0.0)
