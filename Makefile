@@ -12,7 +12,7 @@ LEAST_OPTIMIZATION := --xla_backend_optimization_level=0 --xla_cpu_use_fusion_em
 # Every worker of every run imports the same modules, with their shapes checked: whatever the shell says, bytecode is kept.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: setup demo test test-float32 test-x64 test-once notebooks random-scenes lint bench lock
+.PHONY: setup demo test test-float32 test-x64 test-once test-long random-scenes lint bench lock
 
 setup: $(VENV)/ready
 
@@ -47,9 +47,9 @@ test-x64: setup
 test-once: setup
 	XLA_FLAGS="$(LEAST_OPTIMIZATION) $$XLA_FLAGS" $(PYTEST) -m "once and not long"
 
-# All notebooks, those included that take more than a minute.
-notebooks: setup
-	XLA_FLAGS="$(LEAST_OPTIMIZATION) $$XLA_FLAGS" $(BIN)/python -m pytest -n $(WORKERS) --dist load tests/test_notebooks.py
+# What `make test` has no time for: notebooks that take more than half a minute.
+test-long: setup
+	XLA_FLAGS="$(LEAST_OPTIMIZATION) $$XLA_FLAGS" $(BIN)/python -m pytest -n $(WORKERS) --dist load -m long
 
 # Ten thousand scenes and losses, in both precisions: no gradient of a finite loss may be infinite or no number. Five hundred of
 # each kind by the fast paths and by plain ones.

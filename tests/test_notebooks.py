@@ -9,8 +9,8 @@ import pytest
 from nbclient import NotebookClient
 
 NOTEBOOKS = Path(__file__).parents[1] / "notebooks"
-LONG = {"painted_skin", "shape_from_shading"}
-"""They take more than a minute: `make notebooks` runs them, `make test` does not."""
+LONG = {"gradients", "painted_skin", "recover_marble", "shape_from_shading", "which_profile"}
+"""They take more than half a minute: `make test-long` runs them, `make test` does not."""
 
 
 @pytest.mark.slow
