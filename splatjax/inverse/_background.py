@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-_FILLED = 0.999  # coverage
+FILLED = 0.999
+"""Coverage of a pixel behind which nothing else is seen."""
 
 
 class AbstractBackground(eqx.Module):
@@ -22,7 +23,7 @@ class UnknownBackground(AbstractBackground):
     """Anything: pixels that the body does not fill do not count. A silhouette then tells nothing."""
 
     def counts(self, coverage: Float[Array, "height width"]) -> Float[Array, "height width"]:
-        return jax.lax.stop_gradient(jnp.where(coverage > _FILLED, 1.0, 0.0).astype(coverage.dtype))
+        return jax.lax.stop_gradient(jnp.where(coverage > FILLED, 1.0, 0.0).astype(coverage.dtype))
 
 
 class BlackBackground(AbstractBackground):

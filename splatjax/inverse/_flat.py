@@ -15,9 +15,9 @@ from splatjax.render import GatheredPicture, Plan, RenderSettings, gather_pictur
 from splatjax.scattering import Medium
 from splatjax.scene import AbstractLight, Camera, Material, Scene, Splats
 
+from ._background import FILLED
 from ._plans import plans_of
 
-_FILLED = 0.999  # coverage
 _LARGER = 3.0
 """Of a wide range: the ratio of neighboring variances. It leaves dipoles an error of 0.2%."""
 _NARROWEST, _WIDEST = 0.05, 200.0  # squared mean free paths: where the Gaussians of a dipole's fit lie, and beyond
@@ -53,7 +53,7 @@ class FlatPictures(eqx.Module):
 
 def which_count(picture: GatheredPicture, mask: np.ndarray) -> np.ndarray:
     """Give the numbers of the pixels that the body fills, among those of a mask."""
-    return np.flatnonzero((np.asarray(picture.coverage) > _FILLED).reshape(-1) & mask.reshape(-1))
+    return np.flatnonzero((np.asarray(picture.coverage) > FILLED).reshape(-1) & mask.reshape(-1))
 
 
 def flatten(pictures: Sequence[GatheredPicture], masks: Sequence[np.ndarray], dtype) -> tuple[FlatPictures, list[np.ndarray]]:

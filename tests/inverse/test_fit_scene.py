@@ -114,12 +114,6 @@ def degrees(a, b) -> np.ndarray:
     return np.degrees(np.arccos(np.clip(cosine / np.linalg.norm(a, axis=-1) / np.linalg.norm(b, axis=-1), -1, 1)))
 
 
-@pytest.fixture
-def double():
-    with jax.enable_x64(True):
-        yield
-
-
 @pytest.mark.slow
 @pytest.mark.once
 @pytest.mark.usefixtures("double")

@@ -67,12 +67,6 @@ def without_noise() -> sj.Recovery:
     return recovered(taken()[1], STARTS)
 
 
-@pytest.fixture
-def double():
-    with jax.enable_x64(True):
-        yield
-
-
 @pytest.mark.slow
 @pytest.mark.once
 @pytest.mark.usefixtures("double")
