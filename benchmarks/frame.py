@@ -35,7 +35,7 @@ def rasterization(scene: sj.Scene, camera: sj.Camera, plan: sj.Plan, settings: s
 
     The picture is what the yardstick makes, and coverage: the front laid over what shows behind it.
     """
-    areas = scene.splats.areas
+    areas, grid = scene.splats.areas, splatting.TileGrid(camera.width, camera.height)
 
     def picture(camera, centers, normals, radii, albedo):
         view, splats = splatting.PerspectiveView.of(camera), sj.Splats(centers, normals, radii, areas)
@@ -43,13 +43,12 @@ def rasterization(scene: sj.Scene, camera: sj.Camera, plan: sj.Plan, settings: s
         seen = splatting.splat_surfaces(splats, rows, view, settings.splatting, plan.camera)
         front = seen.front.coverage
         behind = (1 - front) * seen.behind.coverage
-        return [
-            *(front * a + behind * b for a, b in zip(seen.front.attributes, seen.behind.attributes, strict=True)),
-            front + behind,
-        ]
+        attributes = front[:, None] * seen.front.attributes + behind[:, None] * seen.behind.attributes
+        return grid.join(attributes), grid.join((front + behind)[:, None])[0]
 
     def loss(*inputs):
-        return sum(jnp.mean(plane**2) for plane in picture(*inputs))
+        attributes, coverage = picture(*inputs)
+        return jnp.sum(jnp.mean(attributes**2, axis=(1, 2))) + jnp.mean(coverage**2)
 
     s = scene.splats
     return picture, jax.grad(loss, argnums=(1, 2, 3, 4)), (camera, s.centers, s.normals, s.radii, s.albedo)

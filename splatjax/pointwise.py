@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import TypeVar
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, DTypeLike, PyTree
@@ -39,8 +40,35 @@ def in_parts(function: Callable[..., Result], *arrays: PyTree, at_once: int = AT
             leaf = jnp.concatenate([leaf, jnp.broadcast_to(leaf[-1:], (parts * size - count, *leaf.shape[1:]))])
         return leaf.reshape(parts, size, *leaf.shape[1:])
 
-    found = jax.lax.map(jax.checkpoint(lambda part: function(*part)), jax.tree.map(cut, arrays))
-    return jax.tree.map(lambda leaf: leaf.reshape(parts * size, *leaf.shape[2:])[:count], found)
+    def one(part):
+        return jax.tree.map(_planes, function(*jax.tree.map(_vectors, part, is_leaf=_is_planes)))
+
+    found = jax.lax.map(jax.checkpoint(one), jax.tree.map(cut, jax.tree.map(_planes, arrays)))
+    whole = jax.tree.map(lambda leaf: leaf.reshape(parts * size, *leaf.shape[2:])[:count], found)
+    return jax.tree.map(_vectors, whole, is_leaf=_is_planes)
+
+
+_LONGEST = 4  # of the vectors that are kept as planes
+
+
+class _Planes(eqx.Module):
+    """The numbers of vectors apart. A loop writes whole planes; numbers side by side the compiler would find one at a time."""
+
+    planes: tuple[Array, ...]
+
+
+def _is_planes(leaf) -> bool:
+    return isinstance(leaf, _Planes)
+
+
+def _planes(leaf: Array):
+    if leaf.ndim != 2 or leaf.shape[1] > _LONGEST:
+        return leaf
+    return _Planes(tuple(plane[:, 0] for plane in jax.lax.split(leaf, [1] * leaf.shape[1], axis=1)))
+
+
+def _vectors(leaf):
+    return jnp.stack(leaf.planes, axis=1) if isinstance(leaf, _Planes) else leaf
 
 
 def zeros_after(known: Array, shape: tuple[int, ...], dtype: DTypeLike) -> Array:

@@ -16,7 +16,7 @@ _LANES = 32
 
 def tile_grid(width: int, height: int, slots: int) -> TileGrid:
     """The tiles of two surfaces of a picture, one below the other."""
-    return TileGrid(width, 2 * -(-height // SIDE) * SIDE, SIDE, _LANES, slots)
+    return TileGrid(width, 2 * -(-height // SIDE) * SIDE, _LANES, slots)
 
 
 class Pixels(eqx.Module):
@@ -90,7 +90,7 @@ def block_ranges(
 
     left, top, near = (of_block(jnp.min, each, jnp.inf) for each in (left, top, depth - reach))
     right, bottom = (of_block(jnp.max, each, -jnp.inf) for each in (right, bottom))
-    grid = TileGrid(view.width, view.height, SIDE)
+    grid = TileGrid(view.width, view.height)
     ranges = TileRanges.of(left, right, top, bottom, jnp.any(there.reshape(-1, block), axis=1), grid)
     found = []
     for surface, far in enumerate(farthest):

@@ -117,6 +117,6 @@ def _gather(scene: Scene, camera: Camera, settings: RenderSettings, plan: Plan, 
         pixels=seen.atlas.pixels().reshape(-1),
         in_front=jnp.broadcast_to(seen.atlas.in_front[:, None], (tiles, pixels)).reshape(-1).astype(leaving.dtype),
         specular=seen.picture(shaded.specular),
-        coverage=poison * seen.coverage,
+        coverage=seen.coverage,
         overflow=jnp.where(needed <= 1, 0.0, needed),
     )

@@ -81,8 +81,6 @@ class SeenSurfaces(eqx.Module):
     covered: Bool[Array, "tiles pixels"]
     named: dict[str, Float[Array, "tiles _rows pixels"]]
     """Blended attributes."""
-    coverage: Float[Array, "height width"]
-    """Of both surfaces together."""
     share: Float[Array, "tiles pixels"]
     """Of its pixel that each point covers: behind, of what the front leaves."""
     needed: Float[Array, ""]
@@ -97,6 +95,11 @@ class SeenSurfaces(eqx.Module):
         albedo = named.get("albedo", jnp.ones_like(named[source]))
         return _diffusion.SeenSurface(self.points, self.covered, named[source], named["area"][:, 0], albedo)
 
+    @property
+    def coverage(self) -> Float[Array, "height width"]:
+        """Of both surfaces together."""
+        return self.atlas.picture(self.share[..., None])[..., 0]
+
     def picture(self, values: Float[Array, "tiles *rows pixels channels"]) -> Float[Array, "*rows height width channels"]:
         """Lay the front over what shows behind it, premultiplied by coverage."""
         share = self.share.reshape(self.share.shape[0], *(1,) * (values.ndim - 3), self.share.shape[1], 1)
@@ -107,26 +110,19 @@ def see_surfaces(
     splats: Splats, attributes: dict[str, Array], view: _splatting.AbstractView, settings: RenderSettings, plan: Plan
 ) -> SeenSurfaces:
     """Passes 2 and 3."""
-    found = _splatting.splat_surfaces(splats, jnp.concatenate(list(attributes.values())), view, settings.splatting, plan.camera)
-    atlas = _splatting.Atlas.of(_splatting.farthest_depths(found), view, plan.tiles)
-    front = found.front.coverage
-    behind = (1 - front) * found.behind.coverage
-    rows = [
-        jnp.concatenate([each.attributes, jnp.stack([each.depth, each.weight_sum, share])])
-        for each, share in ((found.front, front), (found.behind, behind))
-    ]
-    packed = atlas.pack(jnp.stack(rows))
-    covered = stop_gradient(packed[:, -2]) > 0
-    depth = jnp.where(covered, packed[:, -3], 1.0)
+    summed = plan.camera.summed(splats, jnp.concatenate(list(attributes.values())), view, settings.splatting)
+    atlas = _splatting.Atlas.of(_splatting.farthest_depths(summed, view), view, plan.tiles)
+    surface = _splatting.Surface.of(atlas.pack(summed.front, summed.behind), view, settings.splatting)
+    covered = stop_gradient(surface.weight_sum) > 0
+    depth = jnp.where(covered, surface.depth, 1.0)
     return SeenSurfaces(
         atlas=atlas,
         points=atlas.points(depth).transpose(1, 0, 2),
         depth=depth,
         covered=covered,
-        named=_by_name(attributes, packed),
-        coverage=front + behind,
-        share=packed[:, -1],
-        needed=jnp.maximum(found.needed, atlas.needed),
+        named=_by_name(attributes, surface.attributes),
+        share=atlas.shares(surface.coverage),
+        needed=jnp.maximum(summed.needed, atlas.needed),
     )
 
 
@@ -225,7 +221,7 @@ def compose(
     handed_over = jnp.sum((1 - resolved) * drawn[:, None], axis=(0, 2)) / jnp.maximum(jnp.sum(drawn), 1)
     return Frame(
         beauty=diffuse + specular if single is None else diffuse + single + specular,
-        coverage=seen.atlas.poison * seen.coverage,
+        coverage=seen.coverage,
         depth=front(shaded.depth[..., None], jnp.inf)[..., 0],
         position=front(shaded.position),
         normal=front(shaded.normal),
@@ -280,8 +276,7 @@ def _surface_parameters(scene: Scene):
 
 def _by_name(attributes: dict[str, Array], packed: Float[Array, "tiles rows pixels"]) -> dict[str, Array]:
     sizes = [rows.shape[0] for rows in attributes.values()]
-    parts = jax.lax.split(packed, [*sizes, packed.shape[1] - sum(sizes)], axis=1)
-    return dict(zip(attributes, parts, strict=False))
+    return dict(zip(attributes, jax.lax.split(packed, sizes, axis=1), strict=True))
 
 
 def _shadows_in_order(lit, groups: list[StackedLights], shape, dtype) -> Float[Array, "lights tiles pixels"]:

@@ -97,7 +97,7 @@ def _plan(scenes: Scene | Sequence[Scene], cameras: Camera | Sequence[Camera], s
 def _look(splats: Splats, view, settings: _splatting.SplattingSettings, rasterizer) -> Float[Array, "surfaces down across"]:
     """Find where there is anything to see, and how far away: a tile farther on every side, and two radii, for what moves."""
     nothing = jnp.zeros((0, splats.count), splats.centers.dtype)
-    seen = _splatting.farthest_depths(_splatting.splat_surfaces(splats, nothing, view, settings, rasterizer))
+    seen = _splatting.farthest_depths(rasterizer.summed(splats, nothing, view, settings), view)
     grown = jax.lax.reduce_window(seen, -jnp.inf, jax.lax.max, (1, 3, 3), (1, 1, 1), "SAME")
     return jnp.where(grown > -jnp.inf, grown + 2 * jnp.mean(splats.radii), -jnp.inf)
 

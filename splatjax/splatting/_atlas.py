@@ -1,31 +1,39 @@
 """The tiles of a picture that show anything, packed: what works on pixels one by one need not look at the others."""
 
+from typing import TypeVar
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jax.lax import stop_gradient
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from splatjax.pointwise import AT_ONCE
 
-from ._bins import TileGrid
-from ._surfaces import Surfaces
+from ._bins import SIDE, TileGrid
+from ._rasterizer import FragmentSums, SummedFragments
 from ._views import AbstractView
 
-SIDE = 8
-"""Pixels along a tile."""
+Packed = TypeVar("Packed", bound=PyTree)
+
 TILES_AT_ONCE = AT_ONCE // SIDE**2
 """For what is computed in parts."""
 
 
-def farthest_depths(surfaces: Surfaces) -> Float[Array, "surfaces down across"]:
+def farthest_depths(summed: SummedFragments, view: AbstractView) -> Float[Array, "surfaces down across"]:
     """Give the depth (mm) of the farthest point that each tile shows, of both surfaces; -inf where a tile shows none.
 
     Where one shows behind, there is a front.
     """
-    both = [jnp.where(each.weight_sum > 0, stop_gradient(each.depth), -jnp.inf) for each in (surfaces.front, surfaces.behind)]
-    grid = TileGrid(both[0].shape[1], both[0].shape[0], SIDE)
-    front, behind = jnp.max(grid.tiled(jnp.stack(both), -jnp.inf), axis=(2, 4))
-    return jnp.stack([jnp.maximum(front, behind), behind])
+
+    def farthest(sums: FragmentSums) -> Float[Array, " tiles"]:
+        there = sums.weights > 0
+        depth = view.depth(jnp.where(there, sums.nearness / jnp.where(there, sums.weights, 1.0), 1.0))
+        return stop_gradient(jnp.max(jnp.where(there, depth, -jnp.inf), axis=1))
+
+    front, behind = farthest(summed.front), farthest(summed.behind)
+    grid = TileGrid(view.width, view.height)
+    return jnp.stack([jnp.maximum(front, behind), behind]).reshape(2, grid.down, grid.across)
 
 
 class Atlas(eqx.Module):
@@ -59,24 +67,29 @@ class Atlas(eqx.Module):
     @property
     def grid(self) -> TileGrid:
         """The tiles of one surface."""
-        return TileGrid(self.view.width, self.view.height, SIDE)
+        return TileGrid(self.view.width, self.view.height)
 
     @property
     def in_front(self):
         """Say which places hold tiles of the front surface."""
-        return self.tiles < self._count
+        return self.tiles < self.grid.count
 
-    @property
-    def _count(self) -> int:
-        return self.grid.across * self.grid.down
+    def pack(self, front: Packed, behind: Packed) -> Packed:
+        """Put all tiles `[tiles, ...]` of both surfaces in their places, those that show nothing nowhere. Differentiable."""
+        count = self.grid.count
 
-    def pack(self, pictures: Float[Array, "surfaces rows height width"]) -> Float[Array, "tiles rows pixels"]:
-        """Cut pictures of the front surface and of the one behind it into their tiles; 0 in empty places. Differentiable."""
-        grid, (surfaces, rows, height, width) = self.grid, pictures.shape
-        tiled = grid.tiled(pictures.reshape(-1, height, width)).reshape(surfaces, rows, grid.down, SIDE, grid.across, SIDE)
-        _, *place = grid.place(self.tiles % self._count)
-        found = tiled.at[self.tiles // self._count, :, *place].get(mode="fill", fill_value=0)
-        return found.reshape(-1, rows, SIDE**2)
+        def packed(front: Array, behind: Array) -> Array:
+            among_front = front.at[jnp.where(self.in_front, self.tiles, count)].get(mode="fill", fill_value=0)
+            among_behind = behind.at[jnp.where(self.in_front, count, self.tiles - count)].get(mode="fill", fill_value=0)
+            return among_front + among_behind
+
+        return jax.tree.map(packed, front, behind)
+
+    def shares(self, coverage: Float[Array, "tiles pixels"]) -> Float[Array, "tiles pixels"]:
+        """Give the share of its pixel that each point covers, from its surface's coverage: behind, of what the front leaves."""
+        before = self.places.at[jnp.where(self.in_front, self.places.shape[0], self.tiles - self.grid.count)]
+        before = before.get(mode="fill", fill_value=self.tiles.shape[0])
+        return coverage * (1 - coverage.at[before].get(mode="fill", fill_value=0))
 
     def points(self, depth: Float[Array, "tiles pixels"]) -> Float[Array, "3 tiles pixels"]:
         """Give the points (mm) that the pixels see at a depth (mm). Differentiable."""
@@ -91,7 +104,7 @@ class Atlas(eqx.Module):
 
     def _columns_and_rows(self) -> tuple[Int[Array, "tiles pixels"], Int[Array, "tiles pixels"]]:
         within = jnp.arange(SIDE**2, dtype=jnp.int32)
-        tile = self.tiles % self._count
+        tile = self.tiles % self.grid.count
         x = (tile % self.grid.across * SIDE)[:, None] + (within % SIDE)[None]
         y = (tile // self.grid.across * SIDE)[:, None] + (within // SIDE)[None]
         return x, y
@@ -101,7 +114,7 @@ class Atlas(eqx.Module):
     ) -> Float[Array, "*rows height width channels"]:
         """Put the picture of the front surface together; `fill` where a tile shows nothing."""
         grid, (_, *rows, _, channels) = self.grid, values.shape
-        tiles = self.poison * values.at[self.places[: self._count]].get(mode="fill", fill_value=fill)
+        tiles = self.poison * values.at[self.places[: grid.count]].get(mode="fill", fill_value=fill)
         tiles = tiles.reshape(grid.down, grid.across, *rows, SIDE, SIDE, channels)
         last = tiles.ndim - 3
         whole = tiles.transpose(*range(2, last), 0, last, 1, last + 1, last + 2)
@@ -110,6 +123,6 @@ class Atlas(eqx.Module):
 
     def picture(self, values: Float[Array, "tiles *rows pixels channels"]) -> Float[Array, "*rows height width channels"]:
         """Put the picture together to which both surfaces add."""
-        behind = jnp.where(self.in_front, self.tiles + self._count, self.places.shape[0])
+        behind = jnp.where(self.in_front, self.tiles + self.grid.count, self.places.shape[0])
         partner = self.places.at[behind].get(mode="fill", fill_value=self.tiles.shape[0])
         return self.front_picture(values + values.at[partner].get(mode="fill", fill_value=0))

@@ -17,54 +17,59 @@ _ROW = 1024  # pairs sorted together; their place in the row takes the low 10 bi
 _ROW_BITS = 10
 
 
+SIDE = 8
+"""Pixels along a tile."""
+
+
 class TileGrid(eqx.Module):
-    """A picture cut into square tiles; the last ones may reach beyond it."""
+    """A picture cut into square tiles, row by row; the last ones may reach beyond it."""
 
     width: int = eqx.field(static=True)
     height: int = eqx.field(static=True)
-    side: int = eqx.field(static=True, default=8)
     lanes: int = eqx.field(static=True, default=64)
     slots: int = eqx.field(static=True, default=32)
 
     @property
     def across(self) -> int:
-        return -(-self.width // self.side)
+        return -(-self.width // SIDE)
 
     @property
     def down(self) -> int:
-        return -(-self.height // self.side)
+        return -(-self.height // SIDE)
+
+    @property
+    def count(self) -> int:
+        """Tiles of the picture."""
+        return self.across * self.down
 
     @property
     def tiles(self) -> int:
         """Tiles of the picture, and a few empty ones that fill the last chunk."""
-        return -(-self.across * self.down // self.lanes) * self.lanes
+        return -(-self.count // self.lanes) * self.lanes
 
-    def tiled(self, picture: Float[Array, "rows height width"], fill: float = 0.0) -> Float[Array, "rows down side across side"]:
-        """Show a picture as tiles, every pixel in its place; beyond the picture's edges tiles hold `fill`."""
-        side, (rows, height, width) = self.side, picture.shape
-        padding = ((0, 0), (0, self.down * side - height), (0, self.across * side - width))
-        return jnp.pad(picture, padding, constant_values=fill).reshape(rows, self.down, side, self.across, side)
-
-    def picture(self, tiled: Float[Array, "rows down side across side"]) -> Float[Array, "rows height width"]:
-        """Give the picture back that `tiled` shows."""
-        rows = tiled.shape[0]
-        return tiled.reshape(rows, self.down * self.side, self.across * self.side)[:, : self.height, : self.width]
-
-    def place(self, tiles: Int[Array, " some"]) -> tuple:
-        """Give the index of tiles in what `tiled` shows; it selects `[some, rows, side, side]`."""
-        return slice(None), tiles // self.across, slice(None), tiles % self.across, slice(None)
-
-    def cut(self, picture: Float[Array, "rows height width"], fill: float) -> Float[Array, "tiles rows pixels"]:
-        """Cut a picture into tiles."""
-        tiled = self.tiled(picture, fill).transpose(1, 3, 0, 2, 4)
-        tiles = tiled.reshape(self.down * self.across, picture.shape[0], self.side**2)
-        return jnp.pad(tiles, ((0, self.tiles - tiles.shape[0]), (0, 0), (0, 0)), constant_values=fill)
+    def cut(self, picture: Float[Array, "rows height width"]) -> Float[Array, "tiles rows pixels"]:
+        """Cut a picture into tiles; 0 beyond its edges."""
+        rows, height, width = picture.shape
+        whole = jnp.pad(picture, ((0, 0), (0, self.down * SIDE - height), (0, self.across * SIDE - width)))
+        return whole.reshape(rows, self.down, SIDE, self.across, SIDE).transpose(1, 3, 0, 2, 4).reshape(self.count, rows, SIDE**2)
 
     def join(self, tiles: Float[Array, "tiles rows pixels"]) -> Float[Array, "rows height width"]:
         """Put a picture together from its tiles."""
-        side, rows = self.side, tiles.shape[1]
-        tiles = tiles[: self.down * self.across].reshape(self.down, self.across, rows, side, side)
-        return self.picture(tiles.transpose(2, 0, 3, 1, 4))
+        rows = tiles.shape[1]
+        whole = tiles.reshape(self.down, self.across, rows, SIDE, SIDE).transpose(2, 0, 3, 1, 4)
+        return whole.reshape(rows, self.down * SIDE, self.across * SIDE)[:, : self.height, : self.width]
+
+    def pixel(self, x: Int[Array, "..."], y: Int[Array, "..."]) -> Int[Array, "..."]:
+        """Give the number of a pixel among those of all tiles, tile by tile."""
+        return (y // SIDE * self.across + x // SIDE) * SIDE**2 + y % SIDE * SIDE + x % SIDE
+
+    def within_picture(self) -> np.ndarray | None:
+        """Say which pixels `[tiles, pixels]` lie in the picture; None if all do."""
+        if self.width % SIDE == 0 and self.height % SIDE == 0:
+            return None
+        x, y = np.arange(self.across * SIDE) < self.width, np.arange(self.down * SIDE) < self.height
+        within = y.reshape(self.down, 1, SIDE, 1) & x.reshape(1, self.across, 1, SIDE)
+        return within.reshape(self.count, SIDE**2)
 
 
 class TileRanges(eqx.Module):
@@ -88,8 +93,8 @@ class TileRanges(eqx.Module):
     ) -> "TileRanges":
         """Find the tiles with a pixel center inside each box (pixels)."""
         across, down = (0, grid.width - 1), (0, grid.height - 1)
-        i0, i1 = _first(left, *across) / grid.side, _last(right, *across) / grid.side
-        j0, j1 = _first(top, *down) / grid.side, _last(bottom, *down) / grid.side
+        i0, i1 = _first(left, *across) / SIDE, _last(right, *across) / SIDE
+        j0, j1 = _first(top, *down) / SIDE, _last(bottom, *down) / SIDE
         touched = visible & (i0 <= i1) & (j0 <= j1)
         i0, i1, j0, j1 = (jnp.floor(edge).astype(jnp.int32) for edge in (i0, i1, j0, j1))
         return cls(i0, j0, jnp.where(touched, i1 - i0 + 1, 0), jnp.where(touched, j1 - j0 + 1, 0))
@@ -157,10 +162,10 @@ class Bins(eqx.Module):
         """How many chunks have anything in them: longer lists come first, so these lead."""
         return jnp.minimum(_occupied(self.first_block), self.places // self.ids.shape[1])
 
-    def by_tile(self, swept: Float[Array, "places ..."], fill: float) -> Float[Array, "tiles ..."]:
-        """Put what was found lane by lane in the order of the tiles; `fill` for empty ones."""
+    def by_tile(self, swept: Float[Array, "places ..."], count: int) -> Float[Array, "tiles ..."]:
+        """Put what was found lane by lane in the order of the tiles; 0 for empty ones."""
         lane = jnp.zeros_like(self.order).at[self.order].set(jnp.arange(self.order.shape[0], dtype=jnp.int32))
-        return swept.at[lane].get(mode="fill", fill_value=fill)
+        return swept.at[lane[:count]].get(mode="fill", fill_value=0)
 
 
 def _occupied(first_block: Int[Array, " chunks_and_one"]) -> Int[Array, ""]:

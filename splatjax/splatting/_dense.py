@@ -9,8 +9,9 @@ from jaxtyping import Array, Bool, Float
 
 from splatjax.scene import Splats
 
+from ._bins import SIDE, TileGrid
 from ._kernel import fragment_weight
-from ._rasterizer import LEAST_WEIGHT, AbstractRasterizer, Blended, blend_fragments
+from ._rasterizer import LEAST_WEIGHT, AbstractRasterizer, FragmentSums, SummedFragments
 from ._settings import SplattingSettings
 from ._views import AbstractView
 
@@ -21,9 +22,9 @@ class DenseRasterizer(AbstractRasterizer):
     def planned(self, splats: Splats, views: Sequence[AbstractView], settings: SplattingSettings) -> "DenseRasterizer":
         return self
 
-    def blended(
+    def summed(
         self, splats: Splats, attributes: Float[Array, "attributes splats"], view: AbstractView, settings: SplattingSettings
-    ) -> Blended:
+    ) -> SummedFragments:
         dtype, rows, footprints = attributes.dtype, attributes.shape[0] + 2, view.footprints(splats, settings)
         columns = jnp.arange(view.width, dtype=dtype) + 0.5
 
@@ -39,21 +40,23 @@ class DenseRasterizer(AbstractRasterizer):
             limit = jnp.max(jnp.where(inside, shifted, -jnp.inf), axis=1)
             front = inside & (nearness > limit[:, None])
 
-            def blend(chosen: Bool[Array, "columns splats"]) -> Float[Array, "rows columns"]:
+            def summed(chosen: Bool[Array, "columns splats"]) -> Float[Array, "rows columns"]:
                 weights, hits = jnp.where(chosen, weight, 0.0), jnp.where(chosen, nearness, 0.0)
                 last = jnp.stack([jnp.sum(weights * hits, axis=1), jnp.sum(weights, axis=1)])
-                return blend_fragments(jnp.concatenate([attributes @ weights.T, last]))
+                return jnp.concatenate([attributes @ weights.T, last])
 
-            blended = blend(front)
-            open_pixel = stop_gradient(blended[-1]) < settings.full_coverage
+            in_front = summed(front)
+            open_pixel = stop_gradient(in_front[-1]) < settings.full_coverage
             rest = inside & ~front & open_pixel[:, None]
             weighty = jnp.max(jnp.where(rest & (weight > LEAST_WEIGHT), shifted, -jnp.inf), axis=1)
             of_any = jnp.max(jnp.where(rest, shifted, -jnp.inf), axis=1)
             limit_behind = jnp.where(weighty > -jnp.inf, weighty, of_any)
-            return blended, blend(rest & (nearness > limit_behind[:, None]))
+            return in_front, summed(rest & (nearness > limit_behind[:, None]))
 
+        grid = TileGrid(view.width, view.height)
         if splats.count == 0:
-            empty = jnp.zeros((rows, view.height, view.width), dtype)
-            return Blended(empty, empty, jnp.zeros((), dtype))
-        front, behind = jax.lax.map(picture_row, jnp.arange(view.height, dtype=dtype) + 0.5)
-        return Blended(front.transpose(1, 0, 2), behind.transpose(1, 0, 2), jnp.zeros((), dtype))
+            empty = FragmentSums.of(jnp.zeros((grid.count, rows, SIDE**2), dtype))
+            return SummedFragments(empty, empty, jnp.zeros((), dtype))
+        both = jax.lax.map(picture_row, jnp.arange(view.height, dtype=dtype) + 0.5)
+        front, behind = (FragmentSums.of(grid.cut(each.transpose(1, 0, 2))) for each in both)
+        return SummedFragments(front, behind, jnp.zeros((), dtype))

@@ -1,10 +1,11 @@
-"""What a rasterizer does, whichever way: blends attributes over the front surface and over what lies right behind it."""
+"""What a rasterizer does, whichever way: sums attributes over the front surface and over what lies right behind it."""
 
 import abc
 from collections.abc import Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Float
 
 from splatjax.scene import Splats
@@ -15,27 +16,31 @@ from ._views import AbstractView
 LEAST_WEIGHT = 0.06  # of a fragment that says where the surface behind the front is
 
 
-def blend_fragments(sums: Float[Array, "*tiles rows pixels"]) -> Float[Array, "*tiles rows pixels"]:
-    r"""Blend the fragments of each pixel, `c(f) = sum_i w_i c_i / sum_i w_i` (Eq. 1); 0 where there is none.
+class FragmentSums(eqx.Module):
+    """Of the fragments of one surface, per pixel; 0 where there is none, and in what of a tile lies beyond the picture."""
 
-    **Arguments:** `sums`: of `w_i c_i`, one row each; the last row is of the weights `w_i` themselves, and is kept.
+    attributes: Float[Array, "tiles attributes pixels"]
+    """Of weights times attributes."""
+    nearness: Float[Array, "tiles pixels"]
+    """Of weights times the nearness of the ray's hits with the fragments' planes."""
+    weights: Float[Array, "tiles pixels"]
 
-    **Source:** Kim et al. 2010, Eq. 1.
-    """
-    weight_sum = sums[..., -1:, :]
-    covered = weight_sum != 0  # it is never negative, and NaN must stay
-    blended = jnp.where(covered, sums[..., :-1, :] / jnp.where(covered, weight_sum, 1.0), 0.0)
-    return jnp.concatenate([blended, weight_sum], axis=-2)
+    @classmethod
+    def of(cls, rows: Float[Array, "tiles rows pixels"]) -> "FragmentSums":
+        """Take one row after the other: attributes, nearness, weights."""
+        attributes, nearness, weights = lax.split(rows, [rows.shape[1] - 2, 1, 1], axis=1)
+        return cls(attributes, nearness[:, 0], weights[:, 0])
+
+    def rows(self) -> Float[Array, "tiles rows pixels"]:
+        """Give what `of` takes."""
+        return jnp.concatenate([self.attributes, self.nearness[:, None], self.weights[:, None]], axis=1)
 
 
-class Blended(eqx.Module):
-    """Fragments blended per pixel (Eq. 1): those of the front surface, and of the surface behind it where the front leaves a gap.
+class SummedFragments(eqx.Module):
+    """The front surface, and the surface behind it where the front leaves a gap, in the tiles of a `TileGrid`."""
 
-    One row per attribute, then the nearness of the ray's hits with the fragments' planes, then the sum of the weights.
-    """
-
-    front: Float[Array, "rows height width"]
-    behind: Float[Array, "rows height width"]
+    front: FragmentSums
+    behind: FragmentSums
     needed: Float[Array, ""]
     """The largest of needed over planned capacity; above 1 all is NaN."""
 
@@ -54,7 +59,7 @@ class AbstractRasterizer(eqx.Module):
         """Give a rasterizer with room for these splats in each of these views, all of one size. Not for traced arrays."""
 
     @abc.abstractmethod
-    def blended(
+    def summed(
         self, splats: Splats, attributes: Float[Array, "attributes splats"], view: AbstractView, settings: SplattingSettings
-    ) -> Blended:
-        """Blend attributes and nearness over the fragments of every pixel."""
+    ) -> SummedFragments:
+        """Sum attributes and nearness over the fragments of every pixel."""

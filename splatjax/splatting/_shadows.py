@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 from splatjax.pointwise import AT_ONCE, in_parts
 from splatjax.scene import Splats
 
+from ._bins import TileGrid
 from ._rasterizer import AbstractRasterizer
 from ._settings import SplattingSettings
 from ._surfaces import Surfaces, splat_surfaces
@@ -158,7 +159,7 @@ def _compared(
     step = jnp.arange(-1, 2, dtype=jnp.int32)
     step_x, step_y = step[:, None, None], step[None, :, None]
     at_x, at_y = column.astype(jnp.int32)[None, None] + step_x, row.astype(jnp.int32)[None, None] + step_y
-    index = jnp.clip(at_y, 0, view.height - 1) * view.width + jnp.clip(at_x, 0, view.width - 1)
+    index = TileGrid(view.width, view.height).pixel(jnp.clip(at_x, 0, view.width - 1), jnp.clip(at_y, 0, view.height - 1))
     inside = (at_x >= 0) & (at_y >= 0) & (at_x < view.width) & (at_y < view.height)
     across = slope_x[None, None] * (step_x.astype(x.dtype) - tx[None, None])
     down = slope_y[None, None] * (step_y.astype(x.dtype) - ty[None, None])

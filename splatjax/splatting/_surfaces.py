@@ -7,22 +7,44 @@ from jaxtyping import Array, Float
 from splatjax.scene import Splats
 
 from ._kernel import coverage
-from ._rasterizer import AbstractRasterizer
+from ._rasterizer import AbstractRasterizer, FragmentSums
 from ._settings import SplattingSettings
 from ._views import AbstractView
 
 
-class Surface(eqx.Module):
-    """One surface as pixels see it. Where `weight_sum` is 0 there is none: attributes 0, depth 1."""
+def blend_fragments(
+    sums: Float[Array, "tiles *rows pixels"], weights: Float[Array, "tiles *#rows pixels"]
+) -> Float[Array, "..."]:
+    r"""Blend the fragments of each pixel, `c(f) = sum_i w_i c_i / sum_i w_i` (Eq. 1); 0 where there is none.
 
-    attributes: Float[Array, "attributes height width"]
-    depth: Float[Array, "height width"]
-    weight_sum: Float[Array, "height width"]
-    coverage: Float[Array, "height width"]
+    **Arguments:** `sums`, `weights`: of `w_i c_i` and of `w_i`. Differentiable.
+
+    **Source:** Kim et al. 2010, Eq. 1.
+    """
+    there = weights != 0  # they are never negative, and NaN must stay
+    return sums * jnp.where(there, 1 / jnp.where(there, weights, 1.0), 0.0)
+
+
+class Surface(eqx.Module):
+    """One surface as pixels see it, in tiles. Where `weight_sum` is 0 there is none: attributes 0, depth that of nearness 1."""
+
+    attributes: Float[Array, "tiles attributes pixels"]
+    depth: Float[Array, "tiles pixels"]
+    """mm along the view's forward axis."""
+    weight_sum: Float[Array, "tiles pixels"]
+    coverage: Float[Array, "tiles pixels"]
+
+    @classmethod
+    def of(cls, sums: FragmentSums, view: AbstractView, settings: SplattingSettings) -> "Surface":
+        """Blend the sums of a rasterizer."""
+        nearness = blend_fragments(sums.nearness, sums.weights)
+        depth = view.depth(jnp.where(sums.weights != 0, nearness, 1.0))
+        attributes = blend_fragments(sums.attributes, sums.weights[:, None])
+        return cls(attributes, depth, sums.weights, coverage(sums.weights, settings.full_coverage))
 
 
 class Surfaces(eqx.Module):
-    """What the pixels see: a front surface, and what shows through where it ends."""
+    """What the pixels see, in the tiles of a `TileGrid`: a front surface, and what shows through where it ends."""
 
     front: Surface
     behind: Surface
@@ -48,11 +70,6 @@ def splat_surfaces(
 
     **Returns:** `Surfaces`; NaN where the rasterizer's capacity was exceeded.
     """
-    blended = rasterizer.blended(splats, attributes, view, settings)
-
-    def surface(rows: Float[Array, "rows height width"]) -> Surface:
-        weight_sum = rows[-1]
-        depth = view.depth(jnp.where(weight_sum != 0, rows[-2], 1.0))
-        return Surface(rows[:-2], depth, weight_sum, coverage(weight_sum, settings.full_coverage))
-
-    return Surfaces(surface(blended.front), surface(blended.behind), blended.needed)
+    summed = rasterizer.summed(splats, attributes, view, settings)
+    front, behind = (Surface.of(each, view, settings) for each in (summed.front, summed.behind))
+    return Surfaces(front, behind, summed.needed)

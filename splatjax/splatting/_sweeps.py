@@ -16,15 +16,14 @@ from jaxtyping import Array, Bool, Float, Int
 
 from splatjax.pointwise import zeros_after
 
-from ._bins import Bins, TileGrid, scatter_slots, slot_plane
+from ._bins import SIDE, Bins, TileGrid, scatter_slots, slot_plane
 from ._kernel import fast_fragment_weight, fragment_weight_derivative
-from ._rasterizer import LEAST_WEIGHT, blend_fragments
+from ._rasterizer import LEAST_WEIGHT, FragmentSums
 from ._views import AbstractView
 
 PLANES = ("x", "y", "slope_x", "slope_y", "a", "b", "c", "nearness", "opacity")
 """Of the footprints, that sums depend on."""
 _EMPTY = (0.0, 0.0, 0.0, 0.0, 1e12, 0.0, 1e12, 1.0, 0.0)  # covers no pixel center
-_PICKED = 64  # open tiles swept together
 
 
 class _Lanes(eqx.Module):
@@ -73,15 +72,15 @@ class Sweep(eqx.Module):
 
     def pixels(self, dtype) -> tuple[np.ndarray, np.ndarray]:
         """Pixel centers of a tile, from its corner. Constants: made by NumPy, or the compiler computes them per fragment."""
-        side = np.arange(self.grid.side, dtype=dtype) + np.asarray(0.5, dtype)
-        return np.tile(side, self.grid.side), np.repeat(side, self.grid.side)
+        side = np.arange(SIDE, dtype=dtype) + np.asarray(0.5, dtype)
+        return np.tile(side, SIDE), np.repeat(side, SIDE)
 
     def _lanes(self, kind: type[_Lanes], bins: Bins, places, dtype) -> _Lanes:
-        lanes, grid = self.grid.lanes, self.grid
+        lanes, across = self.grid.lanes, self.grid.across
         tiles, chunk = bins.order[places], places // lanes
         row = bins.first_block[chunk] * lanes + places % lanes
         lengths = bins.first_block[chunk + 1] - bins.first_block[chunk]
-        x, y = ((each * grid.side).astype(dtype)[:, None] for each in (tiles % grid.across, tiles // grid.across))
+        x, y = ((each * SIDE).astype(dtype)[:, None] for each in (tiles % across, tiles // across))
         return kind(row, lengths, jnp.max(lengths), x, y, lanes)
 
     def chunk(self, bins: Bins, i, dtype) -> _Lanes:
@@ -134,7 +133,7 @@ class Sweep(eqx.Module):
         return jnp.where(weighty > -jnp.inf, weighty, of_any)
 
     def _nothing(self, lanes: _Lanes):
-        return jnp.full((lanes.row.shape[0], self.grid.side**2), -jnp.inf, lanes.x.dtype)
+        return jnp.full((lanes.row.shape[0], SIDE**2), -jnp.inf, lanes.x.dtype)
 
     def squared_radii(self, nearness, quadric, beyond, upto):
         """Give `rho^2`, below 1 for the fragments between two limits; 1, where the weight is 0, for all others."""
@@ -148,8 +147,8 @@ class Sweep(eqx.Module):
         x, y, sx, sy, _, _, _, e, _ = splats
         return [*(lanes.read(row, block) for row in attributes), e - sx * x - sy * y, sx, sy, jnp.ones_like(e)]
 
-    def blend(self, slots: "_Slots", lanes: _Lanes, beyond, upto):
-        """Blend attributes and nearness over the fragments between two limits, `[lanes, rows, pixels]`; the weights' sum last."""
+    def sums(self, slots: "_Slots", lanes: _Lanes, beyond, upto):
+        """Sum attributes and nearness over the fragments between two limits, `[lanes, rows, pixels]`; the weights last."""
 
         def add(block, sums):
             splats = self.splats(slots.planes, block, lanes)
@@ -162,11 +161,10 @@ class Sweep(eqx.Module):
         sums = lax.fori_loop(jnp.int32(0), lanes.blocks, add, start)
         px, py = self.pixels(beyond.dtype)
         nearness = sums[:, -4] + sums[:, -3] * px[None] + sums[:, -2] * py[None]
-        return blend_fragments(jnp.concatenate([sums[:, :-4], nearness[:, None], sums[:, -1:]], axis=1))
+        return jnp.concatenate([sums[:, :-4], nearness[:, None], sums[:, -1:]], axis=1)
 
-    def add_cotangents(self, slots: "_Slots", lanes: _Lanes, beyond, upto, blended, cotangent, gradients):
-        """Add the cotangents of planes and attributes, per slot, for the fragments between two limits."""
-        cotangent = _blend_cotangent(blended, cotangent)
+    def add_cotangents(self, slots: "_Slots", lanes: _Lanes, beyond, upto, cotangent, gradients):
+        """Add the cotangents of planes and attributes, per slot, for the fragments between two limits, from those of the sums."""
         px, py = self.pixels(beyond.dtype)
         monomials = jnp.asarray(np.stack([np.ones_like(px), px, py, px * px, px * py, py * py], axis=1))
         nearness = cotangent[:, -2]
@@ -212,90 +210,83 @@ class _Slots(eqx.Module):
         return cls([slots(*each) for each in filled], slots(shift, 0.0), [slots(row, 0.0) for row in attributes])
 
 
-def _picked(is_open: Bool[Array, " tiles"]):
-    """Find the places of open tiles, `_PICKED` at a time, and in how many rounds; the rest of the last round is empty."""
-    places = jnp.nonzero(is_open, size=is_open.shape[0] + _PICKED, fill_value=is_open.shape[0])[0].astype(jnp.int32)
+def _picked(is_open: Bool[Array, " tiles"], lanes: int):
+    """Find the places of open tiles, a lane each, and in how many rounds; the rest of the last round is empty."""
+    places = jnp.nonzero(is_open, size=is_open.shape[0] + lanes, fill_value=is_open.shape[0])[0].astype(jnp.int32)
     count = jnp.sum(is_open, dtype=jnp.int32)
 
     def pick(i):
-        picked = lax.dynamic_slice_in_dim(places, i * _PICKED, _PICKED)
+        picked = lax.dynamic_slice_in_dim(places, i * lanes, lanes)
         real = picked < is_open.shape[0]
         return jnp.where(real, picked, is_open.shape[0] - 1), real[:, None]
 
-    return pick, -(-count // _PICKED)
+    return pick, -(-count // lanes)
 
 
 def _forward(sweep: Sweep, bins: Bins, shift, planes, attributes):
-    """Sweep all chunks: the pictures of both surfaces, and per pixel their limits, in lane order."""
+    """Sweep all chunks: both surfaces, tile by tile, and per pixel where they end, in lane order."""
     slots, grid = _Slots.gathered(shift, planes, attributes, bins), sweep.grid
-    dtype, count = planes[0].dtype, len(attributes) + 2
+    dtype, within = planes[0].dtype, grid.within_picture()
+    poison = jnp.where(bins.needed <= 1, 0.0, jnp.nan).astype(dtype)
+
+    def seen(sums, tiles):
+        """What of a tile lies beyond the picture shows nothing."""
+        if within is None:
+            return sums + poison
+        return jnp.where(jnp.asarray(within)[jnp.minimum(tiles, grid.count - 1)][:, None], sums + poison, 0.0)
 
     def chunk(i, out):
         tiles = sweep.chunk(bins, i, dtype)
         limit = sweep.limits(slots, tiles)
-        parts = sweep.blend(slots, tiles, limit, None), limit
-        return tuple(
-            lax.dynamic_update_slice_in_dim(whole, part, i * grid.lanes, 0) for whole, part in zip(out, parts, strict=True)
-        )
+        sums = seen(sweep.sums(slots, tiles, limit, None), lax.dynamic_slice_in_dim(bins.order, i * grid.lanes, grid.lanes))
+        parts = FragmentSums.of(sums), limit
+        return jax.tree.map(lambda whole, part: lax.dynamic_update_slice_in_dim(whole, part, i * grid.lanes, 0), out, parts)
 
-    empty = zeros_after(slots.shift, (bins.places, count, grid.side**2), dtype)
+    empty = zeros_after(slots.shift, (bins.places, len(attributes) + 2, SIDE**2), dtype)
     never = jnp.inf + empty[:, 0]
-    front, limits = lax.fori_loop(jnp.int32(0), bins.chunks, chunk, (empty, never))
-    gaps = (front[:, -1] < sweep.full_coverage) & (limits > -jnp.inf) & (limits < jnp.inf)
-    pick, rounds = _picked(jnp.any(gaps, axis=1))
+    front, limits = lax.fori_loop(jnp.int32(0), bins.chunks, chunk, (FragmentSums.of(empty), never))
+    gaps = (front.weights < sweep.full_coverage) & (limits > -jnp.inf) & (limits < jnp.inf)
+    pick, rounds = _picked(jnp.any(gaps, axis=1), grid.lanes)
 
     def look_behind(i, out):
         behind, seconds = out
         places, real = pick(i)
-        tiles, limit = sweep.picked(bins, places, dtype), limits[places]
-        second = sweep.limits_behind(slots, tiles, jnp.where(gaps[places] & real, limit, -jnp.inf))
+        lanes, limit, tiles = sweep.picked(bins, places, dtype), limits[places], bins.order[places]
+        second = sweep.limits_behind(slots, lanes, jnp.where(gaps[places] & real, limit, -jnp.inf))
         second = jnp.where(second > -jnp.inf, second, jnp.inf)
-        rows = sweep.blend(slots, tiles, second, limit).reshape(_PICKED, count, grid.side, grid.side)
-        return behind.at[*grid.place(bins.order[places])].add(rows), seconds.at[places].min(second)
+        found = FragmentSums.of(seen(sweep.sums(slots, lanes, second, limit), tiles))
+        return jax.tree.map(lambda whole, part: whole.at[tiles].add(part), behind, found), seconds.at[places].min(second)
 
-    poison = jnp.where(bins.needed <= 1, 0.0, jnp.nan).astype(dtype)
-    behind = poison + zeros_after(rounds, (count, grid.down, grid.side, grid.across, grid.side), dtype)
-    behind, seconds = lax.fori_loop(jnp.int32(0), rounds, look_behind, (behind, never))
-    return grid.join(bins.by_tile(front, 0.0)) + poison, grid.picture(behind), (front, limits, seconds)
+    nothing = FragmentSums.of(poison + zeros_after(rounds, (grid.count, len(attributes) + 2, SIDE**2), dtype))
+    behind, seconds = lax.fori_loop(jnp.int32(0), rounds, look_behind, (nothing, never))
+    return jax.tree.map(lambda each: bins.by_tile(each, grid.count) + poison, front), behind, (limits, seconds)
 
 
-def _backward(sweep: Sweep, bins: Bins, shift, planes, attributes, behind, swept, cotangents):
+def _backward(sweep: Sweep, bins: Bins, shift, planes, attributes, limits, cotangents):
     """Sweep all chunks again: the cotangents of planes and attributes, per slot, then summed per splat."""
     slots, grid = _Slots.gathered(shift, planes, attributes, bins), sweep.grid
     dtype, count = planes[0].dtype, len(planes) + len(attributes)
-    front, limits, seconds = swept
-    d_front, behind, d_behind = grid.cut(cotangents[0], 0.0), grid.tiled(behind), grid.tiled(cotangents[1])
+    (limits, seconds), (d_front, d_behind) = limits, cotangents
+
+    def of_tiles(cotangent: FragmentSums, tiles):
+        return jax.tree.map(lambda whole: whole.at[tiles].get(mode="fill", fill_value=0), cotangent).rows()
 
     def chunk(i, gradients):
-        limit, blended, tiles = (
-            lax.dynamic_slice_in_dim(each, i * grid.lanes, grid.lanes) for each in (limits, front, bins.order)
-        )
-        cotangent = d_front.at[tiles].get(mode="promise_in_bounds")
-        return sweep.add_cotangents(slots, sweep.chunk(bins, i, dtype), limit, None, blended, cotangent, gradients)
+        limit, tiles = (lax.dynamic_slice_in_dim(each, i * grid.lanes, grid.lanes) for each in (limits, bins.order))
+        return sweep.add_cotangents(slots, sweep.chunk(bins, i, dtype), limit, None, of_tiles(d_front, tiles), gradients)
 
-    start = tuple(zeros_after(d_front, slots.shift.shape, dtype) for _ in range(count))
+    start = tuple(zeros_after(d_front.weights, slots.shift.shape, dtype) for _ in range(count))
     gradients = lax.fori_loop(jnp.int32(0), bins.chunks, chunk, start)
-    pick, rounds = _picked(jnp.any(seconds < jnp.inf, axis=1))
+    pick, rounds = _picked(jnp.any(seconds < jnp.inf, axis=1), grid.lanes)
 
     def look_behind(i, gradients):
         places, real = pick(i)
-        beyond = jnp.where(real, seconds[places], jnp.inf)
-        at = grid.place(bins.order[places])
-        rows = (each.at[*at].get(mode="promise_in_bounds").reshape(_PICKED, -1, grid.side**2) for each in (behind, d_behind))
-        return sweep.add_cotangents(slots, sweep.picked(bins, places, dtype), beyond, limits[places], *rows, gradients)
+        cotangent, beyond = of_tiles(d_behind, bins.order[places]), jnp.where(real, seconds[places], jnp.inf)
+        return sweep.add_cotangents(slots, sweep.picked(bins, places, dtype), beyond, limits[places], cotangent, gradients)
 
     gradients = lax.fori_loop(jnp.int32(0), rounds, look_behind, gradients)
     per_splat = tuple(scatter_slots(plane, bins, planes[0].shape[0]) for plane in gradients)
     return per_splat[: len(planes)], per_splat[len(planes) :]
-
-
-def _blend_cotangent(blended, cotangent):
-    """Give the cotangent of the sums that `blend_fragments` had."""
-    weight_sum = blended[:, -1:]
-    inverse = jnp.where(weight_sum != 0, 1 / jnp.where(weight_sum != 0, weight_sum, 1.0), 0.0)
-    rows = cotangent[:, :-1] * inverse
-    weight = cotangent[:, -1:] - jnp.sum(rows * blended[:, :-1], axis=1, keepdims=True)
-    return jnp.concatenate([rows, weight], axis=1)
 
 
 def _plane_cotangents(splats, quad, near):
@@ -320,14 +311,14 @@ def sweep_tiles(
     planes: tuple[Float[Array, " splats"], ...],
     attributes: tuple[Float[Array, " splats"], ...],
 ):
-    """Blend attributes over the splats of every tile: pictures of the front surface and of the one behind it, as `Blended`."""
+    """Sum attributes over the splats of every tile: the front surface and the one behind it."""
     front, behind, _ = _forward(sweep, bins, shift, planes, attributes)
     return front, behind
 
 
 def sweep_tiles_fwd(sweep: Sweep, bins: Bins, shift, planes, attributes):
-    front, behind, swept = _forward(sweep, bins, shift, planes, attributes)
-    return (front, behind), (bins, shift, planes, attributes, behind, swept)
+    front, behind, limits = _forward(sweep, bins, shift, planes, attributes)
+    return (front, behind), (bins, shift, planes, attributes, limits)
 
 
 def sweep_tiles_bwd(sweep: Sweep, residuals, cotangents):

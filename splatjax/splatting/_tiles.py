@@ -12,8 +12,8 @@ from jaxtyping import Array, Bool, Float, Int
 from splatjax.pointwise import in_parts
 from splatjax.scene import Splats
 
-from ._bins import BinCapacity, TileGrid, TileRanges, bin_items, round_up
-from ._rasterizer import AbstractRasterizer, Blended
+from ._bins import SIDE, BinCapacity, TileGrid, TileRanges, bin_items, round_up
+from ._rasterizer import AbstractRasterizer, FragmentSums, SummedFragments
 from ._settings import SplattingSettings
 from ._sweeps import PLANES, Sweep, sweep_tiles
 from ._views import AbstractView, Footprints
@@ -33,45 +33,44 @@ class TileRasterizer(AbstractRasterizer):
 
     **Attributes:** (all static)
 
-    - `side`, `lanes`, `slots`: pixels along a tile, tiles swept together, and splats of each swept together.
+    - `lanes`, `slots`: tiles swept together, and splats of each swept together.
     - `capacity`: set by `planned`; a picture that needs more is NaN.
     """
 
-    side: int = eqx.field(static=True, default=8)
     lanes: int = eqx.field(static=True, default=64)
     slots: int = eqx.field(static=True, default=32)
     capacity: TileCapacity | None = eqx.field(default=None)
 
     def _grid(self, view: AbstractView) -> TileGrid:
-        return TileGrid(view.width, view.height, self.side, self.lanes, self.slots)
+        return TileGrid(view.width, view.height, self.lanes, self.slots)
 
     def planned(self, splats: Splats, views: Sequence[AbstractView], settings: SplattingSettings) -> "TileRasterizer":
         grid = self._grid(views[0])
         counts = [_demand(splats, view, settings, grid) for view in views]
         seen = round_up(max(int(seen) for seen, _ in counts), _STEP)
         bins = BinCapacity.for_counts([per_tile for _, per_tile in counts], grid)
-        return TileRasterizer(self.side, self.lanes, self.slots, TileCapacity(min(seen, splats.count), bins))
+        return TileRasterizer(self.lanes, self.slots, TileCapacity(min(seen, splats.count), bins))
 
-    def blended(
+    def summed(
         self, splats: Splats, attributes: Float[Array, "attributes splats"], view: AbstractView, settings: SplattingSettings
-    ) -> Blended:
+    ) -> SummedFragments:
         if self.capacity is None:
             raise ValueError("this TileRasterizer has no capacity yet; take one from a plan (splatjax.plan) or from `planned`")
-        dtype = attributes.dtype
+        dtype, grid = attributes.dtype, self._grid(view)
         if splats.count == 0:
-            empty = jnp.zeros((attributes.shape[0] + 2, view.height, view.width), dtype)
-            return Blended(empty, empty, jnp.zeros((), dtype))
+            empty = FragmentSums.of(jnp.zeros((grid.count, attributes.shape[0] + 2, SIDE**2), dtype))
+            return SummedFragments(empty, empty, jnp.zeros((), dtype))
         ids, seen = _compacted(view.may_see(splats), self.capacity.splats)
         splats = jax.tree.map(
             lambda leaf: jnp.stack(_taken(leaf.T, ids), axis=-1) if leaf.ndim == 2 else _taken(leaf[None], ids)[0], splats
         )
-        footprints, grid = in_parts(lambda part: view.footprints(part, settings), splats), self._grid(view)
+        footprints = in_parts(lambda part: view.footprints(part, settings), splats)
         bins = bin_items(_ranges(footprints, grid), grid, self.capacity.bins)
         bins = eqx.tree_at(lambda b: b.needed, bins, jnp.maximum(bins.needed, seen / self.capacity.splats))
         planes = tuple(getattr(footprints, name) for name in PLANES)
         sweep = Sweep(type(view), grid, settings.full_coverage)
         front, behind = sweep_tiles(sweep, bins, stop_gradient(footprints.shift), planes, tuple(_taken(attributes, ids)))
-        return Blended(front, behind, bins.needed.astype(dtype))
+        return SummedFragments(front, behind, bins.needed.astype(dtype))
 
 
 @eqx.filter_jit

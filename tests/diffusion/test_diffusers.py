@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from splatjax.diffusion import ClusterDiffuser, DenseDiffuser, Kernels, Sources
-from splatjax.splatting import DenseRasterizer, SplattingSettings, splat_surfaces
+from splatjax.splatting import DenseRasterizer, SplattingSettings
 
 COUNT, SIZE = 3000, 64
 VARIANCES = (1.0, 9.0, 20.0)
@@ -31,7 +31,7 @@ def atlas_of(body, view):
     @jax.jit
     def look(body):
         nothing = jnp.zeros((0, body.count), body.centers.dtype)
-        surfaces = splat_surfaces(body, nothing, view, SplattingSettings(), DenseRasterizer())
+        surfaces = bodies.drawn(body, nothing, view, SplattingSettings(), DenseRasterizer())
         both = surfaces.front, surfaces.behind
         return bodies.packed(jnp.stack([each.depth for each in both]), jnp.stack([each.weight_sum for each in both]), view)
 

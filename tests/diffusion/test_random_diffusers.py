@@ -18,7 +18,7 @@ from splatjax.diffusion import ClusterDiffuser, DenseDiffuser, Kernels, Sources
 from splatjax.diffusion._clustered import LayerPlan
 from splatjax.diffusion._pixels import tile_grid
 from splatjax.scene import Splats
-from splatjax.splatting import BinCapacity, DenseRasterizer, SplattingSettings, splat_surfaces
+from splatjax.splatting import SIDE, BinCapacity, DenseRasterizer, SplattingSettings, TileGrid
 
 WIDTH, HEIGHT = 19, 14
 CHANNELS = 2
@@ -91,7 +91,7 @@ def random_scene(seed: int, count: int) -> tuple[Splats, Scene, jax.Array]:
 def by_both(count: int):
     """Give a function of a scene: values and gradients of a random sum of them, of the fast diffuser and of the plain sum."""
     tiles = tile_grid(WIDTH, HEIGHT, 1)
-    shape = tiles.across * tiles.down, gaussians_of(count), CHANNELS + 1, tiles.side**2
+    shape = tiles.count, gaussians_of(count), CHANNELS + 1, SIDE**2
     factors = jnp.asarray(np.random.default_rng(count).normal(size=shape))
 
     def stacked(found):
@@ -189,7 +189,7 @@ def seen_of():
 
     @jax.jit
     def look(body, view):
-        surfaces = splat_surfaces(body, nothing, view, SplattingSettings(), DenseRasterizer())
+        surfaces = bodies.drawn(body, nothing, view, SplattingSettings(), DenseRasterizer())
         both = surfaces.front, surfaces.behind
         return tuple(jnp.stack([getattr(each, name) for each in both]) for name in ("depth", "weight_sum", "coverage"))
 
@@ -228,14 +228,15 @@ def lit(seed: int):
     sources = Sources(body.centers.T, body.normals.T, body.areas, jnp.asarray(irradiance))
     atlas, points, covered = bodies.packed(depths, weight_sums, view)
     # By coverage pictures multiply; where it is small, the point lies off the body.
-    seen = np.asarray((atlas.pack(jnp.stack([coverage[:1], 0 * coverage[1:]]))[:, 0] > 0.5) & atlas.in_front[:, None])
+    front = TileGrid(SIZE, SIZE).cut(coverage[:1])[:, 0]
+    seen = np.asarray((atlas.pack(front, jnp.zeros_like(front)) > 0.5) & atlas.in_front[:, None])
     return Lit(sources, Kernels(variances, 0.75 * jnp.sqrt(variances)), points), covered, seen, atlas
 
 
 @cache
 def through_clusters():
     tiles = tile_grid(SIZE, SIZE, 1)
-    shape = tiles.across * tiles.down, len(VARIANCES), CHANNELS + 1, tiles.side**2
+    shape = tiles.count, len(VARIANCES), CHANNELS + 1, SIDE**2
     factors = jnp.asarray(np.random.default_rng(1).normal(size=shape))
     _, _, diffuser = body_and_plan()
 

@@ -23,7 +23,7 @@ from splatjax.diffusion import ClusterDiffuser, DenseDiffuser
 from splatjax.diffusion._clustered import LayerPlan, NodePlan
 from splatjax.diffusion._neighbors import Boxes, Neighbors
 from splatjax.diffusion._pixels import tile_grid
-from splatjax.splatting import BinCapacity, DenseRasterizer, ShadowSettings, TileCapacity, TileRasterizer
+from splatjax.splatting import BinCapacity, DenseRasterizer, ShadowSettings, TileCapacity, TileGrid, TileRasterizer
 
 pytestmark = [pytest.mark.slow, pytest.mark.once]
 
@@ -219,9 +219,9 @@ def roomy(plan: sj.Plan, shape: Shape) -> sj.Plan:
     def widened(part):
         if isinstance(part, TileRasterizer):
             size = (shape.width, shape.height) if part is camera else (SHADOWS.resolution,) * 2
-            tiles = -(-size[0] // part.side) * -(-size[1] // part.side) + part.lanes
+            tiles = TileGrid(*size, part.lanes).tiles
             room = BinCapacity(*_room(shape.splats, tiles, part.lanes, part.slots))
-            return TileRasterizer(part.side, part.lanes, part.slots, TileCapacity(max(shape.splats, 1), room))
+            return TileRasterizer(part.lanes, part.slots, TileCapacity(max(shape.splats, 1), room))
         if isinstance(part, ClusterDiffuser):
             assert part.layers is not None
             grid = tile_grid(shape.width, shape.height, 1)

@@ -1,10 +1,22 @@
 """Bodies and views to splat: normals and areas are those of the surface."""
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from splatjax.scene import Camera, Splats
-from splatjax.splatting import Atlas, OrthographicView, PerspectiveView, Surface, Surfaces, farthest_depths
+from splatjax.splatting import (
+    Atlas,
+    FragmentSums,
+    OrthographicView,
+    PerspectiveView,
+    SummedFragments,
+    Surface,
+    TileGrid,
+    farthest_depths,
+    splat_surfaces,
+)
 
 
 def splats(centers, normals, radii, areas=None) -> Splats:
@@ -86,14 +98,40 @@ def orthographic(scale=1.2, width=40, height=32) -> OrthographicView:
     return OrthographicView(jnp.zeros(3), rotation, jnp.asarray(scale, float), width, height)
 
 
+class Pictures(eqx.Module):
+    """A `Surface`, put together from its tiles."""
+
+    attributes: jax.Array
+    depth: jax.Array
+    weight_sum: jax.Array
+    coverage: jax.Array
+
+
+class Drawn(eqx.Module):
+    """What `splat_surfaces` gives, as pictures."""
+
+    front: Pictures
+    behind: Pictures
+    needed: jax.Array
+
+
+def drawn(body: Splats, rows, view, settings, rasterizer) -> Drawn:
+    surfaces, grid = splat_surfaces(body, rows, view, settings, rasterizer), TileGrid(view.width, view.height)
+
+    def pictures(each: Surface) -> Pictures:
+        planes = grid.join(jnp.stack([each.depth, each.weight_sum, each.coverage], axis=1))
+        return Pictures(grid.join(each.attributes), *planes)
+
+    return Drawn(pictures(surfaces.front), pictures(surfaces.behind), surfaces.needed)
+
+
 def packed(depths, weight_sums, view):
     """The atlas of a front surface and one behind it `[2, height, width]`, their points in it (mm), and which are covered."""
-    surfaces = [
-        Surface(jnp.zeros((0, *depth.shape), depth.dtype), depth, weight_sum, weight_sum)
-        for depth, weight_sum in zip(depths, weight_sums, strict=True)
-    ]
-    farthest = farthest_depths(Surfaces(*surfaces, jnp.zeros((), depths.dtype)))
+    grid = TileGrid(view.width, view.height)
+    tiles = [grid.cut(jnp.stack(planes)) for planes in zip(depths, weight_sums, strict=True)]
+    sums = [FragmentSums(each[:, :0], each[:, 1] / jnp.where(each[:, 1] > 0, each[:, 0], 1.0), each[:, 1]) for each in tiles]
+    farthest = farthest_depths(SummedFragments(*sums, jnp.zeros((), depths.dtype)), view)
     atlas = Atlas.of(farthest, view, farthest.size)
-    rows = atlas.pack(jnp.stack([depths, weight_sums], axis=1))
+    rows = atlas.pack(*tiles)
     covered = rows[:, 1] > 0
     return atlas, atlas.points(jnp.where(covered, rows[:, 0], 1.0)).transpose(1, 0, 2), covered

@@ -7,7 +7,7 @@ import pytest
 
 from splatjax.splatting import BinCapacity, TileGrid, TileRanges, bin_items, scatter_slots, slot_plane
 
-GRID = TileGrid(61, 45, side=8, lanes=4, slots=4)
+GRID = TileGrid(61, 45, lanes=4, slots=4)
 COUNT = 900
 
 
@@ -103,7 +103,18 @@ def test_scatter_is_the_transpose_of_the_gather(dtype):
 
 def test_tiles_are_cut_and_joined():
     picture = jnp.asarray(np.random.default_rng(2).normal(size=(3, GRID.height, GRID.width)), float)
-    tiles = GRID.cut(picture, 7.0)
-    assert tiles.shape == (GRID.tiles, 3, 64)
+    tiles = GRID.cut(picture)
+    assert tiles.shape == (GRID.count, 3, 64)
     np.testing.assert_array_equal(np.asarray(GRID.join(tiles)), np.asarray(picture))
-    assert float(jnp.sum(tiles == 7.0)) == tiles.size - picture.size
+    within = GRID.within_picture()
+    assert within.sum() == GRID.width * GRID.height
+    assert not np.any(np.asarray(tiles)[np.broadcast_to(~within[:, None], tiles.shape)])
+    assert TileGrid(64, 48).within_picture() is None
+
+
+def test_pixels_are_numbered_tile_by_tile():
+    x, y = np.meshgrid(np.arange(GRID.width), np.arange(GRID.height))
+    numbers = np.asarray(GRID.cut(jnp.asarray(np.stack([x, y]), float)), int)
+    found = np.asarray(GRID.pixel(jnp.asarray(x), jnp.asarray(y))).reshape(-1)
+    for row, expected in enumerate((x, y)):
+        np.testing.assert_array_equal(numbers[:, row].reshape(-1)[found], expected.reshape(-1))

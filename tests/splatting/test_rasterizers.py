@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from splatjax.scene import Splats
-from splatjax.splatting import BinCapacity, DenseRasterizer, SplattingSettings, TileCapacity, TileRasterizer, splat_surfaces
+from splatjax.splatting import BinCapacity, DenseRasterizer, SplattingSettings, TileCapacity, TileGrid, TileRasterizer
 
 SETTINGS = SplattingSettings()
 TILES = TileRasterizer(lanes=8, slots=16)
@@ -37,7 +37,7 @@ def both(view, body, rows, rasterizer):
     """Give the picture, and the gradients of a fixed random functional of it."""
 
     def picture(body, rows):
-        surfaces = splat_surfaces(body, rows, view, SETTINGS, rasterizer)
+        surfaces = bodies.drawn(body, rows, view, SETTINGS, rasterizer)
         return flat(surfaces), surfaces.needed
 
     planes, pullback, needed = jax.vjp(picture, body, rows, has_aux=True)
@@ -60,7 +60,7 @@ def roomy(planned: list[TileRasterizer]) -> TileRasterizer:
     """Give a rasterizer with room for what each of these has room for."""
     each = [tiles.capacity for tiles in planned]
     bins = {name: max(getattr(capacity.bins, name) for capacity in each) for name in ("pairs", "blocks", "chunks")}
-    return TileRasterizer(TILES.side, TILES.lanes, TILES.slots, TileCapacity(max(c.splats for c in each), BinCapacity(**bins)))
+    return TileRasterizer(TILES.lanes, TILES.slots, TileCapacity(max(c.splats for c in each), BinCapacity(**bins)))
 
 
 def compare(view, scenes: dict[str, Splats]):
@@ -132,10 +132,24 @@ def test_tiles_draw_what_the_plain_rasterizer_draws(kind):
     assert np.sum(pictures["one sphere before another"][-1] > 0.5) > 2, "no inner silhouette was seen"
 
 
+@pytest.mark.parametrize("rasterizer", [DenseRasterizer(), TILES])
+def test_what_of_a_tile_lies_beyond_the_picture_shows_nothing(rasterizer):
+    """The pixels of a tile that are none must not be shaded, nor count as seen."""
+    view, size, rng = bodies.perspective(width=21, height=18), 30, np.random.default_rng(5)
+    body = bodies.splats(rng.uniform(-8, 8, (size, 3)), rng.normal(size=(size, 3)) * 0.3 + [0, 0, 1], 6.0)
+    rasterizer = rasterizer.planned(body, [view], SETTINGS)
+    summed = jax.jit(lambda body: rasterizer.summed(body, attributes(size), view, SETTINGS))(body)
+    within = TileGrid(view.width, view.height).within_picture()
+    assert not np.any(np.asarray(summed.front.weights)[~within])
+    assert not np.any(np.asarray(summed.behind.weights)[~within])
+    assert np.mean(np.asarray(summed.front.weights)[within] > 0) > 0.5
+    assert np.any(np.asarray(summed.behind.weights) > 0)
+
+
 @pytest.mark.parametrize("rasterizer", [DenseRasterizer(), TileRasterizer(capacity=TileCapacity(1, BinCapacity(1024, 4, 1)))])
 def test_no_splat_gives_an_empty_picture(rasterizer):
     view, nothing = bodies.perspective(), bodies.splats(np.zeros((0, 3)), np.zeros((0, 3)), 1.0)
-    surfaces = splat_surfaces(nothing, jnp.zeros((2, 0)), view, SETTINGS, rasterizer)
+    surfaces = bodies.drawn(nothing, jnp.zeros((2, 0)), view, SETTINGS, rasterizer)
     assert not np.any(flat(surfaces))
     assert float(surfaces.needed) == 0
 
@@ -148,7 +162,7 @@ def test_too_small_a_capacity_poisons_the_picture_and_says_so(capacity):
     @jax.jit
     def picture(body):
         tiles = TileRasterizer(lanes=8, slots=16, capacity=capacity)
-        return splat_surfaces(body, attributes(500), view, SETTINGS, tiles)
+        return bodies.drawn(body, attributes(500), view, SETTINGS, tiles)
 
     surfaces = picture(body)
     assert float(surfaces.needed) > 1
@@ -159,4 +173,4 @@ def test_too_small_a_capacity_poisons_the_picture_and_says_so(capacity):
 def test_a_rasterizer_without_capacity_says_what_to_do():
     view, body = bodies.perspective(), bodies.splats(np.zeros((1, 3)), [[0.0, 0, 1]], 1.0)
     with pytest.raises(ValueError, match="plan"):
-        splat_surfaces(body, attributes(1), view, SETTINGS, TileRasterizer())
+        bodies.drawn(body, attributes(1), view, SETTINGS, TileRasterizer())

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from splatjax.splatting import DenseRasterizer, SplattingSettings, TileRasterizer, splat_surfaces
+from splatjax.splatting import DenseRasterizer, SplattingSettings, TileRasterizer
 
 SETTINGS = SplattingSettings()
 VIEWS = {"perspective": bodies.perspective, "orthographic": bodies.orthographic}
@@ -18,7 +18,7 @@ DISTANCE = 40.0
 def drawn(view, body, rows, rasterizer=None):
     """Draw with the plain rasterizer, unless another is given."""
     rasterizer = DenseRasterizer() if rasterizer is None else rasterizer
-    return jax.jit(lambda s, r: splat_surfaces(s, r, view, SETTINGS, rasterizer))(body, rows)
+    return jax.jit(lambda s, r: bodies.drawn(s, r, view, SETTINGS, rasterizer))(body, rows)
 
 
 @pytest.mark.parametrize("kind", VIEWS)
@@ -106,7 +106,7 @@ def test_coverage_of_a_silhouette_is_differentiable(float64):
     @jax.jit
     def covered(shift):
         moved = eqx.tree_at(lambda s: s.centers, body, body.centers + shift[None])
-        surfaces = splat_surfaces(moved, jnp.zeros((0, 200)), view, SETTINGS, DenseRasterizer())
+        surfaces = bodies.drawn(moved, jnp.zeros((0, 200)), view, SETTINGS, DenseRasterizer())
         ramp = jnp.arange(24, dtype=float)
         return jnp.sum(surfaces.front.coverage * (ramp[None] + 2 * ramp[:, None]))
 
