@@ -1,6 +1,9 @@
 """Passes 2 and 3: the surface in front, and the one behind it at silhouettes, with blended attributes (Eq. 1)."""
 
+from functools import partial
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -71,5 +74,6 @@ def splat_surfaces(
     **Returns:** `Surfaces`; NaN where the rasterizer's capacity was exceeded.
     """
     summed = rasterizer.summed(splats, attributes, view, settings)
-    front, behind = (Surface.of(each, view, settings) for each in (summed.front, summed.behind))
+    surface = jax.checkpoint(partial(Surface.of, settings=settings))  # what is blended is cheap to find again, and large
+    front, behind = (surface(each, view) for each in (summed.front, summed.behind))
     return Surfaces(front, behind, summed.needed)
