@@ -1,6 +1,7 @@
 """Merged splats keep what the far field needs, and their tree is nested."""
 
 import bodies
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,6 +19,11 @@ def sources():
     return Sources(body.centers.T, body.normals.T, body.areas, jnp.asarray(irradiance, float))
 
 
+@eqx.filter_jit
+def levels_of(tree, sources):
+    return tree.levels(sources)
+
+
 def of_splats(tree, level):
     """The cluster of every splat at a level."""
     place = np.empty(800, int)
@@ -31,7 +37,7 @@ def of_splats(tree, level):
 def test_merging_keeps_area_energy_and_first_moments():
     given = sources()
     tree = ClusterTree.build(given.centers.T, given.normals.T, CELLS)
-    levels = jax.jit(lambda s: tree.levels(s))(given)
+    levels = levels_of(tree, given)
     centers, areas, irradiance = (np.asarray(each, float) for each in (given.centers, given.areas, given.irradiance))
     for level, clusters in enumerate(levels[1:]):
         place, count = of_splats(tree, level), tree.counts[level]
@@ -66,20 +72,20 @@ def _whole(tree):
 def test_merging_twice_is_merging_once():
     given = sources()
     tree = ClusterTree.build(given.centers.T, given.normals.T, CELLS)
-    step_by_step = tree.levels(given)[-1]
-    at_once = tree.levels(given)[0].merged(_whole(tree), tree.counts[2])
+    splats, *_, step_by_step = levels_of(tree, given)
+    at_once = eqx.filter_jit(lambda splats, parents: splats.merged(parents, tree.counts[2]))(splats, _whole(tree))
     for ours, theirs in zip(jax.tree.leaves(step_by_step), jax.tree.leaves(at_once), strict=True):
-        np.testing.assert_allclose(np.asarray(ours), np.asarray(theirs), atol=2e-4 * float(jnp.max(jnp.abs(theirs))))
+        np.testing.assert_allclose(np.asarray(ours), np.asarray(theirs), atol=2e-4 * np.max(np.abs(theirs)))
 
 
 def test_lowering_clusters_is_merging_lowered_splats():
     given, depth = sources(), 1.7
     tree = ClusterTree.build(given.centers.T, given.normals.T, CELLS)
     below = Sources(given.centers - depth * given.normals, given.normals, given.areas, given.irradiance)
-    for ours, theirs in zip(tree.levels(given), tree.levels(below), strict=True):
-        lowered = ours.lowered(jnp.asarray(depth))
-        for found, expected in zip(jax.tree.leaves(lowered), jax.tree.leaves(theirs), strict=True):
-            scale = max(float(jnp.max(jnp.abs(expected))), 1e-3)
+    lowered = eqx.filter_jit(lambda levels: [each.lowered(jnp.asarray(depth)) for each in levels])(levels_of(tree, given))
+    for ours, theirs in zip(lowered, levels_of(tree, below), strict=True):
+        for found, expected in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
+            scale = max(np.max(np.abs(expected)), 1e-3)
             np.testing.assert_allclose(np.asarray(found), np.asarray(expected), atol=3e-4 * scale)
 
 
@@ -101,7 +107,7 @@ def test_a_cluster_fills_no_more_than_its_cell():
 def test_no_cells_merge_nothing():
     given = sources()
     tree = ClusterTree.build(given.centers.T, given.normals.T, [])
-    (only,) = tree.levels(given)
+    (only,) = levels_of(tree, given)
     order = np.asarray(tree.order)
     np.testing.assert_array_equal(np.sort(order[order < 800]), np.arange(800))
     np.testing.assert_array_equal(np.asarray(only.areas)[order < 800], np.asarray(given.areas)[order[order < 800]])

@@ -1,6 +1,7 @@
 """How light is shared where a body is thin: the laws of the normalization, and sheets against Monte Carlo."""
 
 import bodies
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -33,9 +34,13 @@ def material(weights=WEIGHTS):
 
 def gains(exits, material, albedo=1.0, normalization=None):
     """Of a point with exits [gaussians]: [gaussians, channels]."""
-    normalization = ExitOdds() if normalization is None else normalization
+    return _gains(jnp.asarray(exits), material, jnp.asarray(albedo), ExitOdds() if normalization is None else normalization)
+
+
+@eqx.filter_jit
+def _gains(exits, material, albedo, normalization):
     gaussians = material.gaussians
-    exits = jnp.broadcast_to(jnp.asarray(exits), gaussians.variances.shape)[:, None]
+    exits = jnp.broadcast_to(exits, gaussians.variances.shape)[:, None]
     once = (material.total_reflectance() - gaussians.total_reflectance()) * albedo
     return normalization.gain(exits, gaussians.variances, gaussians.weights * albedo, once)
 
@@ -112,6 +117,7 @@ def test_negative_weights_count_as_none():
 
 
 def test_slope_in_a_weight_of_zero_is_the_limit_from_above():
+    @jax.jit
     def out(w):
         lit = Material(SumOfGaussians(jnp.asarray([1.0, 4.0]), jnp.stack([w, jnp.asarray(0.4)])[:, None]))
         return jnp.sum(lit.gaussians.weights * gains(2.0, lit))
@@ -132,30 +138,38 @@ def test_a_thin_white_sheet_returns_what_it_receives_whatever_is_handed_over(end
     sources = Sources(*map(jnp.asarray, (centers, normals, np.full(2 * x.size, spacing**2), np.ones((1, 2 * x.size)))))
     one = jnp.ones((1, 1))
     seen = SeenSurface(jnp.zeros((1, 3, 1)), one > 0, one[None], spacing**2 * one, one[None])
-    atlas = Atlas.of(jnp.zeros((2, 1, 1)), bodies.perspective(width=1, height=1), 1)  # unused by the plain diffuser
     gaussians = SumOfGaussians(jnp.asarray([0.3, 1.0, 4.0]), jnp.asarray([[0.3], [0.3], [0.4]]))
-
-    def returned(gaussians):
-        return diffusion_layers(sources, Material(gaussians), seen, jnp.asarray(ends), atlas, DenseDiffuser(), ExitOdds())[0]
-
-    layers = returned(gaussians)
+    layers, returned = diffused(sources, gaussians, seen, jnp.asarray(ends))
     assert np.any(np.asarray(layers.resolved) > 0)
-    np.testing.assert_allclose(float(jnp.sum(gaussians.weights * layers.layers[0, :, :, 0])), 1, rtol=1e-4)
+    np.testing.assert_allclose(float(returned), 1, rtol=1e-4)
     darker = SumOfGaussians(gaussians.variances, 0.5 * gaussians.weights)
-    assert 0.5 < float(jnp.sum(darker.weights * returned(darker).layers[0, :, :, 0])) < 1
+    assert 0.5 < float(diffused(sources, darker, seen, jnp.asarray(ends))[1]) < 1
+
+
+@eqx.filter_jit
+def diffused(sources, gaussians, seen, ends):
+    """The layers at one point, and their weighted sum there."""
+    atlas = unused_atlas()
+    layers, _ = diffusion_layers(sources, Material(gaussians), seen, ends, atlas, DenseDiffuser(), ExitOdds())
+    return layers, jnp.sum(gaussians.weights * layers.layers[0, :, :, 0])
+
+
+def unused_atlas() -> Atlas:
+    """Of one pixel; the plain diffuser does not look at it."""
+    return Atlas.of(jnp.zeros((2, 1, 1)), bodies.perspective(width=1, height=1), 1)
 
 
 def test_the_corner_is_rounded():
-    slope = jax.grad(lambda s: jnp.sum(gains(s, material()) * jnp.ones((6, 3))))
+    slope = jax.jit(jax.grad(lambda s: jnp.sum(gains(s, material()) * jnp.ones((6, 3)))))
     assert float(slope(jnp.asarray(1.0))) == 0
     assert 0 < float(slope(jnp.asarray(1.001))) < 0.05 * float(slope(jnp.asarray(1.2)))
 
 
 def test_no_weights_at_all_have_finite_gradients():
     almost = np.asarray([0.5, 0.5, 0.0, 0.0, 0.0, np.finfo(np.float32).tiny])[:, None]
+    slope = jax.jit(jax.grad(lambda w: jnp.sum(gains(2.0, material(w)))))
     for weights in (np.zeros((6, 1)), np.eye(6)[:, :1], almost):
-        found = jax.grad(lambda w: jnp.sum(gains(2.0, material(w))))(jnp.asarray(weights))
-        assert np.all(np.isfinite(np.asarray(found)))
+        assert np.all(np.isfinite(np.asarray(slope(jnp.asarray(weights)))))
 
 
 def through_a_sheet(thickness: float, normalization) -> np.ndarray:
@@ -167,16 +181,20 @@ def through_a_sheet(thickness: float, normalization) -> np.ndarray:
     centers = np.concatenate([flat, flat - thickness * up], axis=1)
     entering = np.repeat([0.0, 1.0], x.size)[None]
     sources = Sources(*map(jnp.asarray, (centers, np.concatenate([up, -up], axis=1), np.full(2 * x.size, spacing**2), entering)))
-    gaussians = material().gaussians
-    kernels = Kernels.of(gaussians.variances, normalization)
+    exits, means = exits_and_means(sources, normalization)
+    carried = np.asarray(VARIANCES) > spacing**2  # the others are too narrow for the splats, and do not reach
+    exits, means = np.where(carried, exits, 1.0), np.where(carried[:, None], means, 0.0)
+    layers = np.asarray(gains(exits, material(), normalization=normalization)) * means
+    return np.sum(np.asarray(WEIGHTS) * layers, axis=0)
+
+
+@eqx.filter_jit
+def exits_and_means(sources, normalization):
+    """Of every layer at the origin."""
+    kernels = Kernels.of(jnp.asarray(VARIANCES), normalization)
     points, covered = jnp.zeros((1, 3, 1)), jnp.ones((1, 1), bool)
-    atlas = Atlas.of(jnp.zeros((2, 1, 1)), bodies.perspective(width=1, height=1), 1)  # unused by the plain diffuser
-    found = DenseDiffuser().diffuse(sources, kernels, points, covered, atlas)
-    carried = gaussians.variances > spacing**2  # the others are too narrow for the splats, and do not reach
-    exits = jnp.where(carried, found.exits[0, :, 0], 1.0)
-    means = jnp.where(carried[:, None], found.means[0, :, :, 0], 0.0)
-    layers = np.asarray(gains(exits, material(), normalization=normalization)) * np.asarray(means)
-    return np.sum(np.asarray(gaussians.weights) * layers, axis=0)
+    found = DenseDiffuser().diffuse(sources, kernels, points, covered, unused_atlas())
+    return found.exits[0, :, 0], found.means[0, :, :, 0]
 
 
 @pytest.mark.parametrize("thickness", list(THROUGH))
