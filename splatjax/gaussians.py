@@ -7,6 +7,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from splatjax.pointwise import one_program
+
 
 def gaussian(variance: Float[Array, "..."], squared_radius: Float[Array, "..."]) -> Float[Array, "..."]:
     r"""Give the normalized two-dimensional Gaussian of Eq. 2, `exp(-r^2 / 2v) / (2 pi v)`.
@@ -68,6 +70,7 @@ class SumOfGaussians(AbstractProfile):
     variances: Float[Array, " gaussians"]
     weights: Float[Array, "gaussians channels"]
 
+    @one_program
     def __call__(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
         squared_radius = jnp.broadcast_to((r * r)[..., None], (*r.shape, *self.variances.shape))
         variances = jnp.broadcast_to(self.variances, squared_radius.shape)

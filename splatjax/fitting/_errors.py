@@ -4,6 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from splatjax.gaussians import AbstractProfile, SumOfGaussians
+from splatjax.pointwise import one_program
 from splatjax.scattering import NORM_RULE, AbstractRadialRule, at_own_radii
 
 
@@ -19,6 +20,7 @@ def norm_radii(
     return rule.radii(profile)
 
 
+@one_program
 def squared_error(
     profile: AbstractProfile, gaussians: SumOfGaussians, rule: AbstractRadialRule = NORM_RULE
 ) -> Float[Array, " channels"]:
@@ -41,6 +43,7 @@ def squared_error(
     return jnp.sum(dr * r * difference * difference, axis=0)
 
 
+@one_program
 def relative_error(
     profile: AbstractProfile, gaussians: SumOfGaussians, rule: AbstractRadialRule = NORM_RULE
 ) -> Float[Array, " channels"]:

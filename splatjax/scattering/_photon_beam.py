@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from splatjax.gaussians import AbstractProfile
+from splatjax.pointwise import one_program
 
 from ._better_dipole import exitance_of_source
 from ._fresnel import AbstractFresnel, ExactFresnel
@@ -47,9 +48,11 @@ class PhotonBeam(AbstractProfile):
         self.medium = medium
         self.fresnel = ExactFresnel() if fresnel is None else fresnel
 
+    @one_program
     def __call__(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
         return self.multiple(r) + self.single(r)
 
+    @one_program
     def multiple(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
         """Give what was scattered more than once; finite at `r = 0`. 1/mm^2."""
         medium = self.medium
@@ -68,6 +71,7 @@ class PhotonBeam(AbstractProfile):
         """Give what was scattered once, 1/mm^2."""
         return SingleScattering(self.medium)(r)
 
+    @one_program
     def total_reflectance(self) -> Float[Array, " channels"]:
         """Give `2 pi` times the integral of `r R(r)`: single scattering exactly, multiple scattering by quadrature."""
         return SingleScattering(self.medium).total_reflectance() + integrated_reflectance(_Multiple(self))

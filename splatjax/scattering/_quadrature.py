@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from splatjax.gaussians import AbstractProfile
+from splatjax.pointwise import one_program
 
 
 class AbstractRadialRule(eqx.Module):
@@ -61,6 +62,7 @@ class RadialRule(AbstractRadialRule):
         nodes, weights = _nodes(self.smallest, self.largest, self.count, self.near)
         return jnp.asarray(nodes, dtype), jnp.asarray(weights, dtype)
 
+    @one_program
     def radii(self, profile: AbstractProfile) -> tuple[Float[Array, "nodes channels"], Float[Array, "nodes channels"]]:
         """Give the radii and weights for each channel, mm. They are constants of every derivative: an integral has no nodes.
 
@@ -151,6 +153,7 @@ def at_own_radii(profile: AbstractProfile, r: Float[Array, "nodes channels"]) ->
     return jnp.diagonal(profile(r), axis1=1, axis2=2)
 
 
+@one_program
 def integrated_reflectance(profile: AbstractProfile, rule: RadialRule = TOTAL_RULE) -> Float[Array, " channels"]:
     r"""Integrate `2 pi r R(r)` numerically: what `profile.total_reflectance()` gives in closed form.
 

@@ -6,6 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from splatjax.pointwise import one_program
+
 from ._fresnel import AbstractFresnel, ExactFresnel
 from ._medium import check_range
 
@@ -41,9 +43,11 @@ class RoughFresnel(AbstractFresnel):
     def __check_init__(self):
         check_range("roughness", self.roughness, "in [0, 1]", lambda x: (x >= 0) & (x <= 1))
 
+    @one_program
     def first_moment(self, eta: Float[Array, " channels"]) -> Float[Array, " channels"]:
         return self.smooth.first_moment(eta) + self._excess(eta, power=1)
 
+    @one_program
     def second_moment(self, eta: Float[Array, " channels"]) -> Float[Array, " channels"]:
         return self.smooth.second_moment(eta) + self._excess(eta, power=2)
 

@@ -8,6 +8,7 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Float
 
 from splatjax.gaussians import AbstractProfile
+from splatjax.pointwise import one_program
 
 from ._fresnel import moment_outside
 from ._medium import Medium
@@ -44,6 +45,7 @@ class SingleScattering(AbstractProfile):
         self.medium = medium
         self.strength = jnp.ones_like(medium.sigma_a) if strength is None else strength
 
+    @one_program
     def __call__(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
         medium = self.medium
         scattering = medium.albedo_prime * medium.sigma_t_prime
@@ -59,6 +61,7 @@ class SingleScattering(AbstractProfile):
             / (4 * jnp.pi * jnp.broadcast_to(r[..., None], total.shape))
         )
 
+    @one_program
     def total_reflectance(self) -> Float[Array, " channels"]:
         half_angle, share = self._escaping()
         return self.strength * 0.5 * self.medium.albedo_prime * jnp.sum(share * half_angle, axis=0)
@@ -66,6 +69,7 @@ class SingleScattering(AbstractProfile):
     def length_scale(self) -> Float[Array, " channels"]:
         return 1 / self.medium.sigma_t_prime
 
+    @one_program
     def reflected(self, mu_i: Float[Array, "*points"], mu_o: Float[Array, "*points"]) -> Float[Array, "*points channels"]:
         r"""Give the radiance towards `wo` per irradiance that has entered from `wi`, of a flat and evenly lit piece:
 
@@ -86,6 +90,7 @@ class SingleScattering(AbstractProfile):
         transmitted = 1 - 0.5 * (across * across + along * along)
         return scattered * transmitted / (4 * jnp.pi * eta * eta * (inside_i + inside_o))
 
+    @one_program
     def leaving(self, mu_i: Float[Array, "*points"]) -> Float[Array, "*points channels"]:
         """Give the share of the light that has entered under a cosine `mu_i` and leaves after one scattering; right to 1e-3."""
         nodes, weights = np.polynomial.legendre.leggauss(_COSINES)

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from splatjax.gaussians import AbstractProfile
+from splatjax.pointwise import one_program
 
 from ._adding import Response
 from ._hankel import inverse_hankel_transform
@@ -23,16 +24,20 @@ class AbstractSlabProfile(AbstractProfile):
     def falls(self) -> tuple[Float[Array, " channels"], Float[Array, " channels"]]:
         """Give lengths `a` (mm) such that reflectance and transmittance fall like `exp(-a k)` or faster."""
 
+    @one_program
     def __call__(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
         return inverse_hankel_transform(lambda k: self.response(k).reflectance_above, r, self.falls()[0])
 
+    @one_program
     def transmittance(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
         """Give the radiant exitance below per unit power entering above, at distance `r` (mm) from the axis; 1/mm^2."""
         return inverse_hankel_transform(lambda k: self.response(k).transmittance_down, r, self.falls()[1])
 
+    @one_program
     def total_reflectance(self) -> Float[Array, " channels"]:
         return self.response(jnp.zeros_like(self.length_scale())).reflectance_above
 
+    @one_program
     def total_transmittance(self) -> Float[Array, " channels"]:
         """Give the share of the entering power that leaves below."""
         return self.response(jnp.zeros_like(self.length_scale())).transmittance_down

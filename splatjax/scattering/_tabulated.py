@@ -8,6 +8,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from splatjax.gaussians import AbstractProfile
+from splatjax.pointwise import one_program
 
 from ._medium import check_range
 
@@ -59,6 +60,7 @@ class Tabulated(AbstractProfile):
                 if radius <= before:
                     raise ValueError(f"radii must ascend, each once; got {radius} mm after {before} mm")
 
+    @one_program
     def __call__(self, r: Float[Array, "*radii_"]) -> Float[Array, "*radii_ channels"]:
         flat = r.reshape(-1)
         columns = [jnp.interp(flat, self.radii, column, right=0.0) for column in self.values.T]
@@ -74,6 +76,7 @@ class Tabulated(AbstractProfile):
         total = None if self.total is None else self.total - profile.total_reflectance()
         return Tabulated(self.radii, self.values - profile(self.radii), self.deviation, total)
 
+    @one_program
     def total_reflectance(self) -> Float[Array, " channels"]:
         """Give the total, or else `2 pi` times the integral of `r R(r)`, exactly that of the straight lines."""
         if self.total is not None:
@@ -82,6 +85,7 @@ class Tabulated(AbstractProfile):
         lines = ((b - a) * (2 * a + b) / 6) @ self.values[:-1] + ((b - a) * (a + 2 * b) / 6) @ self.values[1:]
         return 2 * jnp.pi * (0.5 * self.radii[0] ** 2 * self.values[0] + lines)
 
+    @one_program
     def length_scale(self) -> Float[Array, " channels"]:
         """Give the radius, mm, within which half of the integral of `r |R|` lies, by the table's own steps."""
         share = jnp.cumsum(jnp.abs(self.values) * (self.radii * jnp.diff(self.radii, append=self.radii[-1:]))[:, None], axis=0)
