@@ -7,14 +7,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Float, Int, Key
 
 from splatjax.scattering import Film, Layer, Tabulated
 
 from ._incidence import AbstractIncidence, NormalIncidence
 from ._phase import AbstractPhaseFunction, Isotropic
 from ._rounds import Walk, finish, lanes_for
-from ._stack import LayeredMedia
+from ._stack import LayeredMedia, check_layers
+from ._tally import Tally
 from ._walk import Optics
 
 _FLIGHTS = 20_000
@@ -55,8 +56,7 @@ class MonteCarlo(eqx.Module):
     @property
     def radii(self) -> Float[Array, " rings"]:
         """The mean radius of each ring, mm: where a straight profile has its mean over the ring."""
-        a, b = self.edges[:-1], self.edges[1:]
-        return 2 / 3 * (a * a + a * b + b * b) / (a + b)
+        return _mean_radii(self.edges)
 
     def profile(self) -> Tabulated:
         """Give the reflectance as a profile; its total is that of all that leaves, farther out than the last ring too."""
@@ -70,6 +70,12 @@ class MonteCarlo(eqx.Module):
         """Give all that is accounted for, less 1: rounding, and the chance by which faint photons are given up."""
         parts = (self.total_reflectance, self.total_transmittance, self.unfinished)
         return sum(part.value for part in parts) + jnp.sum(self.absorbed.value, axis=0) - 1
+
+
+@jax.jit
+def _mean_radii(edges: Float[Array, " edges"]) -> Float[Array, " rings"]:
+    a, b = edges[:-1], edges[1:]
+    return 2 / 3 * (a * a + a * b + b * b) / (a + b)
 
 
 def monte_carlo(
@@ -162,14 +168,15 @@ def path_derivatives(
 
 
 class _Setup(eqx.Module):
-    """What a walk needs beside media."""
+    """What a walk needs beside media. The number of photons asks for no program of its own."""
 
     edges: Float[Array, " edges"]
     incidence: AbstractIncidence
     phase: AbstractPhaseFunction
     key: Key[Array, ""]
-    photons: int = eqx.field(static=True)
-    flights: int = eqx.field(static=True)
+    photons: Int[Array, ""]
+    flights: Int[Array, ""]
+    lanes: int = eqx.field(static=True)
 
 
 def _set_up(layers, photons, key, edges, incidence, phase, eta_above, eta_below, flights) -> tuple[LayeredMedia, _Setup]:
@@ -177,16 +184,28 @@ def _set_up(layers, photons, key, edges, incidence, phase, eta_above, eta_below,
     for name, number, least in (("photons", photons, 2), ("flights", flights, 1)):
         if not least <= number < 2**30:
             raise ValueError(f"{name} must be at least {least}, and below 2^30; got {number}")
+    check_layers(layers)
     phase = Isotropic() if phase is None else phase
-    dtype = next((each.medium.sigma_a.dtype for each in layers if isinstance(each, Layer)), jnp.zeros(()).dtype)
-    anisotropy = phase.anisotropy(len(layers), dtype)
-    media = LayeredMedia.of(layers, anisotropy, eta_above, eta_below)
-    edges = _default_edges(media, anisotropy) if edges is None else edges.astype(dtype)
+    above, below = (
+        eta if isinstance(eta, jax.Array) else jnp.asarray(eta, jnp.result_type(float)) for eta in (eta_above, eta_below)
+    )
+    media, edges = _laid_out(tuple(layers), phase, above, below, edges)
     if not isinstance(edges, Tracer):
         known = np.asarray(edges)
         if len(known) < 2 or known[0] < 0 or np.any(np.diff(known) <= 0):
             raise ValueError(f"edges must ascend from at least 0 mm, two or more of them; got {known.tolist()}")
-    return media, _Setup(edges, NormalIncidence() if incidence is None else incidence, phase, key, photons, flights)
+    incidence = NormalIncidence() if incidence is None else incidence
+    numbers = (jnp.asarray(each, jnp.int32) for each in (photons, flights))
+    return media, _Setup(edges, incidence, phase, key, *numbers, lanes_for(photons))
+
+
+@eqx.filter_jit
+def _laid_out(layers: tuple[Layer | Film, ...], phase: AbstractPhaseFunction, eta_above, eta_below, edges):
+    """Give media, and rings in their precision."""
+    dtype = next(each.medium.sigma_a.dtype for each in layers if isinstance(each, Layer))
+    anisotropy = phase.anisotropy(len(layers), dtype)
+    media = LayeredMedia.of(layers, anisotropy, eta_above, eta_below)
+    return media, _default_edges(media, anisotropy) if edges is None else edges.astype(dtype)
 
 
 def _default_edges(media: LayeredMedia, anisotropy: Float[Array, " layers"]) -> Float[Array, " edges"]:
@@ -219,6 +238,13 @@ def _monte_carlo_jvp(primals, tangents, *, progress):
         (by, tangent) for by, tangent in ((by_absorption, moved.sigma_a), (by_scattering, moved.sigma_s)) if tangent is not None
     ]
 
+    return found, _along(found, pairs)
+
+
+@eqx.filter_jit
+def _along(found: MonteCarlo, pairs: list[tuple[PathDerivatives, Float[Array, "layers channels"]]]) -> MonteCarlo:
+    """Give the derivative of an estimate along tangents of coefficients."""
+
     def tangent_of(name: str) -> Estimate:
         value = getattr(found, name).value
         total = jnp.zeros_like(value)
@@ -227,70 +253,68 @@ def _monte_carlo_jvp(primals, tangents, *, progress):
         return Estimate(total, jnp.zeros_like(value))
 
     names = ("reflected", "transmitted", "total_reflectance", "total_transmittance", "absorbed", "unfinished")
-    moved_found = MonteCarlo(
+    return MonteCarlo(
         edges=jnp.zeros_like(found.edges), specular=jnp.zeros_like(found.specular), **{name: tangent_of(name) for name in names}
     )
-    return found, moved_found
 
 
 def _walk_all(media: LayeredMedia, setup: _Setup, with_derivatives: bool, progress):
     """Walk each group of channels that walk alike, and put the channels in their order."""
     groups, parts = media.alike(), []
-    layers = media.sigma_a.shape[0]
     for number, group in enumerate(groups):
-        unit = media.unit[group]
-        sigma = media.sigma_a[:, group], media.sigma_s[:, group]
-
-        def optics_of(sigma_a, sigma_s, unit=unit):
-            return Optics.of(sigma_a, sigma_s, unit)
-
-        optics = optics_of(*sigma)
-        if with_derivatives:
-            ones = jnp.broadcast_to(jnp.eye(layers, dtype=unit.dtype)[:, :, None], (layers, *sigma[0].shape))
-            by_absorption = jax.vmap(lambda t, s=sigma, f=optics_of: jax.jvp(lambda a: f(a, s[1]), s[:1], (t,))[1])(ones)
-            by_scattering = jax.vmap(lambda t, s=sigma, f=optics_of: jax.jvp(lambda b: f(s[0], b), s[1:], (t,))[1])(ones)
-            slopes = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), by_absorption, by_scattering)
-        else:
-            slopes = jax.tree.map(lambda each: jnp.zeros((0, *each.shape), each.dtype), optics)
-        walk = Walk(
-            stack=jax.lax.stop_gradient(media.stack(int(group[0]))),
-            phase=setup.phase,
-            incidence=setup.incidence,
-            optics=optics,
-            slopes=slopes,
-            edges=setup.edges[None] / jax.lax.stop_gradient(unit)[:, None],
-            photons=jnp.asarray(setup.photons, jnp.int32),
-            flights=jnp.asarray(setup.flights, jnp.int32),
-            key=jax.random.fold_in(setup.key, number),
-            lanes=lanes_for(setup.photons),
-        )
+        walk = _walk_of(media, setup, jnp.asarray(number), jnp.asarray(group.astype(np.int32)), with_derivatives)
         share = None if progress is None else _share_of(progress, number, len(groups))
         parts.append(finish(walk, share))
-    order = np.argsort(np.concatenate(groups))
-    left = jnp.concatenate([part.left.over(setup.photons) for part in parts])[order]
-    absorbed = jnp.concatenate([part.absorbed.over(setup.photons) for part in parts], axis=1)[:, order]
-    return _assemble(left, absorbed, media, setup, layers if with_derivatives else 0)
+    order = np.argsort(np.concatenate(groups)).astype(np.int32)
+    return _assemble(parts, jnp.asarray(order), media, setup, with_derivatives)
+
+
+@eqx.filter_jit
+def _walk_of(
+    media: LayeredMedia, setup: _Setup, number: Int[Array, ""], group: Int[Array, " group"], with_derivatives: bool
+) -> Walk:
+    """Give the walk of a group of channels, in the free paths of the first of them."""
+    layers, unit = media.sigma_a.shape[0], media.unit[group]
+    sigma_a, sigma_s = media.sigma_a[:, group], media.sigma_s[:, group]
+    optics = Optics.of(sigma_a, sigma_s, unit)
+    if with_derivatives:
+        ones = jnp.broadcast_to(jnp.eye(layers, dtype=unit.dtype)[:, :, None], (layers, *sigma_a.shape))
+        by_absorption = jax.vmap(lambda t: jax.jvp(lambda a: Optics.of(a, sigma_s, unit), (sigma_a,), (t,))[1])(ones)
+        by_scattering = jax.vmap(lambda t: jax.jvp(lambda s: Optics.of(sigma_a, s, unit), (sigma_s,), (t,))[1])(ones)
+        slopes = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), by_absorption, by_scattering)
+    else:
+        slopes = jax.tree.map(lambda each: jnp.zeros((0, *each.shape), each.dtype), optics)
+    return Walk(
+        stack=jax.lax.stop_gradient(media.stack(group[0])),
+        phase=setup.phase,
+        incidence=setup.incidence,
+        optics=optics,
+        slopes=slopes,
+        edges=setup.edges[None] / jax.lax.stop_gradient(unit)[:, None],
+        photons=setup.photons,
+        flights=setup.flights,
+        key=jax.random.fold_in(setup.key, number),
+        lanes=setup.lanes,
+    )
 
 
 def _share_of(progress: Callable[[int, int], None], number: int, groups: int) -> Callable[[int, int], None]:
     return lambda done, photons: progress(number * photons + done, groups * photons)
 
 
-def _assemble(
-    left: Float[Array, "channels places moments"],
-    absorbed: Float[Array, "layers channels moments"],
-    media: LayeredMedia,
-    setup: _Setup,
-    layers: int,
-):
+@eqx.filter_jit
+def _assemble(parts: list[Tally], order: Int[Array, " channels"], media: LayeredMedia, setup: _Setup, with_derivatives: bool):
     """Turn means of moments into estimates: the moments are value, square, derivatives, and their squares."""
-    photons, rings = setup.photons, setup.edges.shape[0] - 1
+    rings, layers = setup.edges.shape[0] - 1, media.sigma_a.shape[0] if with_derivatives else 0
+    photons, others = (count.astype(setup.edges.dtype) for count in (setup.photons, setup.photons - 1))
+    left = jnp.concatenate([part.left.over(photons) for part in parts])[order]
+    absorbed = jnp.concatenate([part.absorbed.over(photons) for part in parts], axis=1)[:, order]
     areas = jnp.pi * (setup.edges[1:] ** 2 - setup.edges[:-1] ** 2)
     above, below, unfinished = left[:, : rings + 1], left[:, rings + 1 : -1], left[:, -1]
 
     def estimate(moments: Float[Array, "*shape moments"], value: int, square: int) -> Estimate:
         mean = moments[..., value]
-        variance = (moments[..., square] - mean * mean) / (photons - 1)
+        variance = (moments[..., square] - mean * mean) / others
         return Estimate(mean, jnp.sqrt(jnp.maximum(variance, 0.0)))
 
     def all_of(value, square):

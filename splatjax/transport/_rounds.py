@@ -5,6 +5,7 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, Key
 
@@ -67,7 +68,12 @@ class _State(eqx.Module):
     round: Int[Array, ""]
 
     def unfinished(self, walk: Walk) -> Bool[Array, ""]:
-        return (self.started < walk.photons) | jnp.any(self.photons.place == INSIDE)
+        return _any_left(self.started, walk.photons, self.photons.place)
+
+
+@jax.jit
+def _any_left(started: Int[Array, ""], photons: Int[Array, ""], place: Int[Array, " photons"]) -> Bool[Array, ""]:
+    return (started < photons) | jnp.any(place == INSIDE)
 
 
 def finish(walk: Walk, progress: Callable[[int, int], None] | None) -> Tally:
@@ -78,7 +84,7 @@ def finish(walk: Walk, progress: Callable[[int, int], None] | None) -> Tally:
     while bool(state.unfinished(walk)):
         state = _advance(walk, state)
         if progress is not None:
-            under_way = int(jnp.sum(state.photons.place == INSIDE))
+            under_way = int(np.sum(np.asarray(state.photons.place) == INSIDE))
             progress(int(state.started) - under_way, int(walk.photons))
     return state.tally
 

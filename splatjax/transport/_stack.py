@@ -7,12 +7,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from splatjax.scattering import Film, Layer
 
 _FILM_THICKNESS = 1e-6
 """In free paths of the first layer that scatters: so thin that no light moves sideways in a film."""
+
+
+def check_layers(layers: Sequence[Layer | Film]) -> None:
+    """Raise if photons could not walk here, or not farther than a layer above the lowest. Traced thicknesses pass."""
+    if not any(isinstance(layer, Layer) for layer in layers):
+        raise ValueError(f"photons need a layer that scatters; got {len(layers)} layers, none of which is a Layer")
+    for number, layer in enumerate(layers[:-1], start=1):
+        if isinstance(layer, Layer) and not isinstance(layer.thickness, Tracer) and np.isinf(np.asarray(layer.thickness)):
+            raise ValueError(f"layer {number} of {len(layers)} is infinitely thick; only the lowest may be")
 
 
 class LayeredMedia(eqx.Module):
@@ -37,16 +46,11 @@ class LayeredMedia(eqx.Module):
         cls,
         layers: Sequence[Layer | Film],
         anisotropy: Float[Array, " layers"],
-        eta_above: Float[Array, " channels"] | float,
-        eta_below: Float[Array, " channels"] | float,
+        eta_above: Float[Array, "*channels"],
+        eta_below: Float[Array, "*channels"],
     ) -> "LayeredMedia":
         """Lay out layers from the top. A film has the index of what scatters below it, or above where nothing does."""
         scattering = [layer for layer in layers if isinstance(layer, Layer)]
-        if not scattering:
-            raise ValueError(f"photons need a layer that scatters; got {len(layers)} layers, none of which is a Layer")
-        for number, layer in enumerate(layers[:-1], start=1):
-            if isinstance(layer, Layer) and not isinstance(layer.thickness, Tracer) and bool(jnp.isinf(layer.thickness)):
-                raise ValueError(f"layer {number} of {len(layers)} is infinitely thick; only the lowest may be")
         like = scattering[0].medium.sigma_a
         thin = _FILM_THICKNESS / jax.lax.stop_gradient(scattering[0].medium.sigma_s_prime)
         rows = []
@@ -60,7 +64,7 @@ class LayeredMedia(eqx.Module):
                 eta = (below[0] if below else scattering[-1]).medium.eta
                 rows.append((layer.optical_depth / thin, jnp.zeros_like(like), thin, eta))
         sigma_a, sigma_s, thickness, eta = (jnp.stack(column) for column in zip(*rows, strict=True))
-        above, below = (jnp.broadcast_to(jnp.asarray(each, like.dtype), like.shape)[None] for each in (eta_above, eta_below))
+        above, below = (jnp.broadcast_to(each.astype(like.dtype), like.shape)[None] for each in (eta_above, eta_below))
         first = next(number for number, layer in enumerate(layers) if isinstance(layer, Layer))
         return cls(sigma_a, sigma_s, thickness, jnp.concatenate([above, eta, below]), first)
 
@@ -69,7 +73,7 @@ class LayeredMedia(eqx.Module):
         """The free path between scatterings in the first layer that scatters, mm: walks are made in it."""
         return 1 / self.sigma_s[self.first]
 
-    def stack(self, channel: int) -> "Stack":
+    def stack(self, channel: Int[Array, ""]) -> "Stack":
         """Give the walk of one channel."""
         unit = self.unit[channel]
         return Stack(self.sigma_s[:, channel] * unit, self.thickness[:, channel] / unit, self.eta[:, channel])
@@ -83,8 +87,9 @@ class LayeredMedia(eqx.Module):
         known = (self.sigma_s, self.thickness, self.eta)
         if any(isinstance(each, Tracer) for each in known):
             return [np.asarray([channel]) for channel in range(channels)]
-        unit = np.asarray(self.unit)
-        walks = np.concatenate([np.asarray(self.sigma_s) * unit, np.asarray(self.thickness) / unit, np.asarray(self.eta)])
+        sigma_s, thickness, eta = (np.asarray(each) for each in known)
+        unit = 1 / sigma_s[self.first]
+        walks = np.concatenate([sigma_s * unit, thickness / unit, eta])
         _, group = np.unique(walks, axis=1, return_inverse=True)
         return [np.flatnonzero(group == number) for number in range(group.max() + 1)]
 

@@ -17,6 +17,7 @@ from splatjax.transport._sums import Sum, total
 from splatjax.transport._walk import INSIDE, Photons, fly
 
 KEY = jax.random.key(5)
+HALF_SPACE = [layer([0.1, 0.1], 1.0, 1.0)]
 
 
 def test_threefry_is_that_of_jax():
@@ -125,9 +126,10 @@ def test_sums_keep_what_rounding_takes(dtype):
 
 
 def test_rings_are_where_they_say(dtype):
-    edges = jnp.asarray([0.1, 0.5, 2.0], dtype)
-    found = sj.monte_carlo([layer(0.1, 1.0, 1.0)], 50_000, KEY, edges=edges)
-    np.testing.assert_allclose(found.radii, [2 / 3 * 0.31 / 0.6, 2 / 3 * 5.25 / 2.5], rtol=1e-6)
+    edges = jnp.geomspace(0.1, 2.0, 129, dtype=dtype)
+    found = sj.monte_carlo(HALF_SPACE, 65_536, KEY, edges=edges)
+    a, b = (np.asarray(edges, np.float64)[part] for part in (slice(None, -1), slice(1, None)))
+    np.testing.assert_allclose(found.radii, 2 / 3 * (b**3 - a**3) / (b**2 - a**2), rtol=1e-6)
     area = np.pi * np.diff(np.asarray(edges) ** 2)
     inside = np.sum(np.asarray(found.reflected.value)[:, 0] * area)
     # What leaves within the first edge and beyond the last is in no ring, and in the total.
@@ -139,7 +141,7 @@ def test_rings_are_where_they_say(dtype):
 
 def test_progress_is_told(float32):
     told = []
-    sj.monte_carlo([layer([0.1, 0.1], 1.0, 1.0)], 2_000_000, KEY, progress=lambda done, photons: told.append((done, photons)))
+    sj.monte_carlo(HALF_SPACE, 2_000_000, KEY, progress=lambda done, photons: told.append((done, photons)))
     assert len(told) > 1
     assert told == sorted(told)
     assert told[-1] == (2_000_000, 2_000_000)

@@ -10,6 +10,7 @@ import splatjax as sj
 
 KEY = jax.random.key(11)
 ERRORS = 3.5
+EDGES = jnp.linspace(0.0, 3.0, 11)
 
 
 def medium(sigma_a, sigma_s_prime) -> sj.Medium:
@@ -23,10 +24,10 @@ def slab(sigma_a, sigma_s_prime) -> list[sj.Layer]:
 
 def test_absorption_by_differences_of_the_same_walks(float64):
     """Photons fly alike whatever is absorbed, so that the derivative is that of the estimate itself, ring by ring."""
-    edges, step = jnp.linspace(0.0, 3.0, 11), 1e-4
+    step = 1e-4
 
     def estimate(sigma_a):
-        return sj.monte_carlo(slab(sigma_a, 2.0), 3_000, KEY, edges=edges)
+        return sj.monte_carlo(slab(sigma_a, 2.0), 3_000, KEY, edges=EDGES)
 
     at = jnp.asarray(0.2)
     value, slope = jax.jvp(estimate, (at,), (jnp.asarray(1.0),))
@@ -77,12 +78,11 @@ def test_errors_of_derivatives_are_their_spread(float32):
 
 @pytest.mark.once
 def test_reverse_mode_is_forward_mode():
-    edges = jnp.linspace(0.0, 3.0, 11)
     rows = jnp.asarray(np.random.default_rng(3).normal(size=10))
 
     def loss(coefficients):
-        found = sj.monte_carlo(slab(coefficients[0], coefficients[1]), 2_000, KEY, edges=edges)
-        return rows @ found.reflected.value[:, 0] + found.absorbed.value[1, 0] + found.profile()(edges[3:4])[0, 0]
+        found = sj.monte_carlo(slab(coefficients[0], coefficients[1]), 2_000, KEY, edges=EDGES)
+        return rows @ found.reflected.value[:, 0] + found.absorbed.value[1, 0] + found.profile()(EDGES[3:4])[0, 0]
 
     at = jnp.asarray([0.2, 2.0])
     reverse, compiled = jax.grad(loss)(at), jax.jit(jax.grad(loss))(at)
@@ -108,7 +108,7 @@ def test_the_depth_of_a_film(float64):
 
     def reflectance(depth):
         stack = [sj.Film(depth), layer(0.1, 2.0, 1.4, 1.0)]
-        return sj.monte_carlo(stack, 2_000, KEY).total_reflectance.value[0]
+        return sj.monte_carlo(stack, 2_000, KEY, edges=EDGES).total_reflectance.value[0]
 
     at, step = jnp.asarray([0.2]), 1e-4
     slope = jax.grad(reflectance)(at)[0]
