@@ -4,8 +4,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from splatjax.gaussians import SumOfGaussians
+from splatjax.pointwise import one_program
 
 
+@one_program
 def separable_kernel(
     gaussians: SumOfGaussians, samples: int = 25, reach: float | None = None
 ) -> tuple[Float[Array, " samples"], Float[Array, "samples channels"]]:

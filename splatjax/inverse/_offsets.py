@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from scipy.spatial import KDTree
 
+from splatjax.pointwise import one_program
 from splatjax.scene import Splats
 
 from ._parts import AbstractBodyPart
@@ -70,6 +71,7 @@ class NormalOffsets(AbstractBodyPart):
     def coordinates(self, splats: Splats) -> Float[Array, " splats"]:
         return jnp.zeros_like(splats.areas)
 
+    @one_program
     def moved(self, splats: Splats, x: Float[Array, " splats"], prepared: OffsetTables) -> Splats:
         offsets = self.step * jnp.sum(prepared.weights * x[prepared.blurred], axis=1)
         ways = offsets[:, None] * splats.normals

@@ -60,9 +60,14 @@ def every_kind():
     return given, ranges
 
 
+@jax.jit
+def per_tile(ranges):
+    return ranges.per_tile(GRID)
+
+
 def test_lists_hold_exactly_the_pairs_of_brute_force_in_order():
     given, ranges = every_kind()
-    capacity = BinCapacity.for_counts([each.per_tile(GRID) for each in ranges], GRID)
+    capacity = BinCapacity.for_counts([per_tile(each) for each in ranges], GRID)
     binned = jax.jit(lambda r: bin_items(r, GRID, capacity))
     for kind, box, item_ranges in zip(KINDS, given, ranges, strict=True):
         bins = binned(item_ranges)
@@ -72,14 +77,14 @@ def test_lists_hold_exactly_the_pairs_of_brute_force_in_order():
         assert sum(map(len, lists.values())) == len(expected), f"{kind}: a pair is listed twice"
         assert all(items == sorted(items) for items in lists.values()), kind
         assert 0 <= float(bins.needed) <= 1
-        counts = np.asarray(item_ranges.per_tile(GRID))
+        counts = np.asarray(per_tile(item_ranges))
         assert [len(lists[tile]) for tile in range(GRID.tiles)] == counts.tolist(), kind
 
 
 @pytest.mark.parametrize("short", [{"pairs": 1024}, {"blocks": 1}, {"chunks": 1}], ids=lambda short: next(iter(short)))
 def test_too_small_a_capacity_is_reported(short):
     _, ranges = every_kind()
-    enough = BinCapacity.for_counts([each.per_tile(GRID) for each in ranges], GRID)
+    enough = BinCapacity.for_counts([per_tile(each) for each in ranges], GRID)
     capacity = BinCapacity(**({"pairs": enough.pairs, "blocks": enough.blocks, "chunks": enough.chunks} | short))
     needed = float(jax.jit(lambda r: bin_items(r, GRID, capacity))(ranges[3]).needed)
     assert needed > 1
@@ -87,7 +92,7 @@ def test_too_small_a_capacity_is_reported(short):
 
 def test_scatter_is_the_transpose_of_the_gather(dtype):
     _, ranges = every_kind()
-    capacity = BinCapacity.for_counts([ranges[0].per_tile(GRID)], GRID)
+    capacity = BinCapacity.for_counts([per_tile(ranges[0])], GRID)
 
     @jax.jit
     def both_ways(values, slots):

@@ -1,6 +1,7 @@
 """Footprints against rays cut with planes, their boxes, and the law of the screen filter."""
 
 import bodies
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -39,6 +40,7 @@ def _box(footprints):
     return footprints.left, footprints.right, footprints.top, footprints.bottom
 
 
+@eqx.filter_jit
 def fragments(footprints, view, x, y):
     """Give which are inside the rim, rho^2 and depth at pixels `[splats, samples]`."""
     f = jax.tree.map(lambda leaf: leaf[:, None], footprints)
