@@ -1,5 +1,6 @@
 """How functions are computed: of many points a part at a time, of many steps as one program."""
 
+import functools
 from collections.abc import Callable
 from typing import TypeVar, cast
 
@@ -98,4 +99,10 @@ def one_program(function: Function) -> Function:
 
     **Returns:** the same function, differentiable as it is.
     """
-    return cast("Function", eqx.filter_jit(function, inline=True))  # ty: ignore[no-matching-overload]
+    compiled = eqx.filter_jit(function, inline=True)  # ty: ignore[no-matching-overload]
+
+    @functools.wraps(function)
+    def called(*arguments, **named):  # a function still, that classes bind as any other
+        return compiled(*arguments, **named)
+
+    return cast("Function", called)
