@@ -1,11 +1,12 @@
 """Parts give what the whole gives, in value and in every derivative."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from splatjax.pointwise import in_parts, zeros_after
+from splatjax.pointwise import in_parts, one_program, zeros_after
 
 
 def squares_and_lengths(scale, record):
@@ -55,3 +56,28 @@ def test_zeros_wait_for_what_must_be_known_and_are_zeros_whatever_it_is():
         assert found.dtype == jnp.float32
         np.testing.assert_array_equal(found, np.zeros((2, 3)))
     assert "compare" in make.lower(jnp.zeros((4, 1))).compile().as_text()  # not made a constant of
+
+
+class Curve(eqx.Module):
+    @one_program
+    def __call__(self, x):
+        return jnp.sin(3 * x) * x + jnp.cos(x) / (1 + x * x)
+
+
+def test_what_is_one_program_compiles_once_and_is_a_method_as_any_other():
+    compiled, x = [], jnp.linspace(0.0, 1.0, 23)
+
+    def listen(event, duration, **_):
+        compiled.extend([duration] * (event == "/jax/core/compile/backend_compile_duration"))
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    values = Curve()(x)
+    jax.monitoring.unregister_event_duration_listener(listen)
+    assert len(compiled) == 1
+    at = np.asarray(x)
+    np.testing.assert_allclose(values, np.sin(3 * at) * at + np.cos(at) / (1 + at * at), rtol=1e-5)
+    np.testing.assert_allclose(jax.jit(Curve())(x), values, rtol=1e-6)
+    slope = jax.jit(jax.grad(lambda x: Curve()(x)))(x[7])
+    np.testing.assert_allclose(slope, jax.grad(lambda x: jnp.sin(3 * x) * x + jnp.cos(x) / (1 + x * x))(x[7]), rtol=1e-5)
+    within = {step.primitive.name for step in jax.make_jaxpr(lambda x: Curve()(x))(x).eqns}
+    assert "sin" in within
