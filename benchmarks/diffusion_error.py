@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 import splatjax as sj
 from splatjax import diffusion, splatting
-from splatjax.render import _passes as wiring
+from splatjax.render import _lighting as lighting, _passes as wiring
 
 from .scenes import BODIES, MATERIALS, columns, lit
 
@@ -72,8 +72,8 @@ def main() -> None:
     @jax.jit
     def seen_by(scene):
         light = wiring.cast_shadows(scene, settings, plan)
-        entering = wiring.let_light_in(scene, light)
-        seen = wiring.see_surfaces(scene.splats, wiring.surface_attributes(scene, light, entering), view, settings, plan)
+        entering = lighting.let_light_in(scene, light)
+        seen = wiring.see_surfaces(scene.splats, lighting.surface_attributes(scene, light, entering), view, settings, plan)
         return wiring.sources_of(scene.splats, entering.source), seen
 
     sources, seen = seen_by(scene)

@@ -14,7 +14,7 @@ import numpy as np
 
 import splatjax as sj
 from splatjax import diffusion, splatting
-from splatjax.render import _passes as wiring
+from splatjax.render import _lighting as lighting, _passes as wiring
 
 from .scenes import BODIES, columns, lit
 from .yardstick import Yardstick
@@ -62,7 +62,7 @@ def passes(scene: sj.Scene, camera: sj.Camera, plan: sj.Plan, settings: sj.Rende
         return wiring.cast_shadows(scene, settings, plan)
 
     def visible(scene, light, entering):
-        attributes = wiring.surface_attributes(scene, light, entering)
+        attributes = lighting.surface_attributes(scene, light, entering)
         return wiring.see_surfaces(scene.splats, attributes, view, settings, plan)
 
     def layers(scene, entering, seen):
@@ -71,12 +71,12 @@ def passes(scene: sj.Scene, camera: sj.Camera, plan: sj.Plan, settings: sj.Rende
         return diffusion.diffusion_layers(sources, scene.material, seen.receivers(), *rest)
 
     light = jax.jit(shadow)(scene)
-    entering = jax.jit(wiring.let_light_in)(scene, light)
+    entering = jax.jit(lighting.let_light_in)(scene, light)
     seen = jax.jit(visible)(scene, light, entering)
     jax.clear_caches()  # so that each is compiled again, and timed
     return {
         "pass 1, shadow map": (shadow, (scene,)),
-        "irradiance": (wiring.let_light_in, (scene, light)),
+        "irradiance": (lighting.let_light_in, (scene, light)),
         "passes 2+3, all attributes": (visible, (scene, light, entering)),
         "pass 4, six layers": (layers, (scene, entering, seen)),
     }

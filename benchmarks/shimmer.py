@@ -15,7 +15,7 @@ from PIL import Image
 
 import splatjax as sj
 from splatjax import diffusion
-from splatjax.render import _passes as wiring
+from splatjax.render import _lighting as lighting, _passes as wiring
 
 from .scenes import BODIES, columns, lit
 
@@ -55,7 +55,7 @@ def main() -> None:
     }.items():
         plan = sj.plan(scene, cameras, settings)
         light = wiring.cast_shadows(scene, settings, plan)
-        irradiance = wiring.let_light_in(scene, light).source.T
+        irradiance = lighting.let_light_in(scene, light).source.T
         frames = []
         for i, each in enumerate(cameras):
             frames.append(np.asarray(jax.block_until_ready(sj.diffuse(scene, irradiance, each, settings, plan))))

@@ -9,7 +9,8 @@ from splatjax.gaussians import SumOfGaussians
 from splatjax.scene import Camera, Scene
 
 from ._inputs import check_channels, in_one_dtype
-from ._passes import cast_shadows, let_light_in, see_surfaces, shade, sources_of, surface_attributes
+from ._lighting import let_light_in
+from ._passes import cast_shadows, see_surfaces, shade, sources_of
 from ._plan import Plan, plan_unless_traced
 from ._settings import RenderSettings
 
@@ -99,7 +100,8 @@ def _gather(scene: Scene, camera: Camera, settings: RenderSettings, plan: Plan, 
     splats, view = scene.splats, _splatting.PerspectiveView.of(camera)
     light = cast_shadows(scene, settings, plan)
     entering = let_light_in(scene, light)
-    seen = see_surfaces(splats, surface_attributes(scene, light, entering), view, settings, plan)
+    attributes = settings.lighting.attributes(scene, light, entering)
+    seen = see_surfaces(splats, attributes, view, settings, plan).lit(scene, light, settings)
     rest = plan.interval, seen.atlas, plan.diffuser, settings.diffusion.normalization
     variances = scene.material.gaussians.variances
     gathered, needed = gather(sources_of(splats, entering.source), variances, seen.receivers(), *rest)

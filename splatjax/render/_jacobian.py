@@ -13,17 +13,8 @@ from splatjax.gaussians import SumOfGaussians
 from splatjax.scene import Camera, Frame, Scene
 
 from ._inputs import check_channels, in_one_dtype
-from ._passes import (
-    EnteringLight,
-    LightOnSplats,
-    cast_shadows,
-    compose,
-    let_light_in,
-    see_surfaces,
-    shade,
-    sources_of,
-    surface_attributes,
-)
+from ._lighting import EnteringLight, LightAtSplats, LightOnSplats, let_light_in
+from ._passes import cast_shadows, compose, see_surfaces, shade, sources_of
 from ._plan import Plan, plan_unless_traced
 from ._settings import RenderSettings
 
@@ -100,10 +91,15 @@ def picture_jacobian(
 
     **Returns:** a `PictureJacobian`; NaN where the plan does not suffice.
 
-    **Raises:** `ValueError` as `render`.
+    **Raises:** `ValueError` as `render`, and for a material with single scattering under light that is not found at the splats.
     """
     settings = RenderSettings() if settings is None else settings
     check_channels(scene)
+    if scene.material.single_scattering is not None and not isinstance(settings.lighting, LightAtSplats):
+        raise ValueError(
+            f"settings.lighting is {type(settings.lighting).__name__}, and scene.material has single scattering, whose share of "
+            "the light is differentiated at the splats alone; give lighting=LightAtSplats(), or a material without it"
+        )
     plan = plan_unless_traced(scene, camera, settings, plan)
     return _picture_jacobian(scene, camera, settings, plan)
 
@@ -115,10 +111,10 @@ def _picture_jacobian(scene: Scene, camera: Camera, settings: RenderSettings, pl
     view = _splatting.PerspectiveView.of(camera)
     light = cast_shadows(scene, settings, plan)
     entering, more = _entering_and_its_slope(scene, light)
-    attributes = surface_attributes(scene, light, entering)
+    attributes = settings.lighting.attributes(scene, light, entering)
     if more is not None:
         attributes["more"] = more
-    seen = see_surfaces(splats, attributes, view, settings, plan)
+    seen = see_surfaces(splats, attributes, view, settings, plan).lit(scene, light, settings)
     rest = plan.interval, seen.atlas, plan.diffuser, settings.diffusion.normalization
     layers, slopes, needed = _diffusion.exitance_jacobian(sources_of(splats, entering.source), material, seen.receivers(), *rest)
     of_weights = slopes.weights

@@ -10,17 +10,9 @@ from splatjax import diffusion as _diffusion, shading as _shading, splatting as 
 from splatjax.pointwise import in_parts
 from splatjax.scene import Frame, Scene, Splats, StackedLights, stack_lights
 
+from ._lighting import LightOnSplats
 from ._plan import Plan, shadow_views
 from ._settings import RenderSettings
-
-
-class LightOnSplats(eqx.Module):
-    """Pass 1: what of each light reaches each splat."""
-
-    groups: list[StackedLights]
-    shares: list[Float[Array, "_lights splats"] | None]
-    """Per group of lights; `None` for lights that cast no shadows."""
-    needed: Float[Array, ""]
 
 
 def cast_shadows(scene: Scene, settings: RenderSettings, plan: Plan) -> LightOnSplats:
@@ -28,47 +20,6 @@ def cast_shadows(scene: Scene, settings: RenderSettings, plan: Plan) -> LightOnS
     groups = stack_lights(scene.lights)
     shares, needs = _lit_shares(scene.splats, groups, settings, plan)
     return LightOnSplats(groups, shares, jnp.max(jnp.stack(needs)) if needs else jnp.zeros((), scene.splats.centers.dtype))
-
-
-class EnteringLight(eqx.Module):
-    """What the light leaves below the surface of each splat."""
-
-    irradiance: Float[Array, "channels splats"]
-    """That enters the surface."""
-    source: Float[Array, "channels splats"]
-    """That spreads: times the root of the albedo."""
-
-
-def let_light_in(scene: Scene, light: LightOnSplats) -> EnteringLight:
-    """The irradiance that enters at every splat."""
-    splats, material = scene.splats, scene.material
-    f0 = _shading.fresnel_f0(material.eta)
-    specular, roughness = _surface_parameters(scene)
-
-    def entering(cosine):
-        share = 1 - _shading.directional_albedo(cosine, f0, specular, roughness)
-        return share[None] if material.single_scattering is None else share[None] * material.left_to_diffuse(cosine).T
-
-    channels = material.gaussians.weights.shape[1]
-    irradiance = _diffusion.entering_irradiance(splats.centers, splats.normals, light.groups, light.shares, entering, channels)
-    return EnteringLight(irradiance, irradiance if splats.albedo is None else irradiance * _shading.albedo_root(splats.albedo).T)
-
-
-def surface_attributes(scene: Scene, light: LightOnSplats, entering: EnteringLight) -> dict[str, Float[Array, "_rows splats"]]:
-    """What passes 2 and 3 blend for the passes that follow, by name."""
-    splats = scene.splats
-    specular, roughness = _surface_parameters(scene)
-    attributes = {
-        "normal": splats.normals.T,
-        "area": splats.areas[None],
-        "source": entering.source,
-        "albedo": None if splats.albedo is None else splats.albedo.T,
-        "irradiance": None if splats.albedo is None else entering.irradiance,
-        "specular": None if splats.specular is None else specular[None],
-        "roughness": None if splats.roughness is None else roughness[None],
-    }
-    attributes |= {f"lit {i}": shares for i, shares in enumerate(light.shares)}
-    return {name: rows for name, rows in attributes.items() if rows is not None}
 
 
 class SeenSurfaces(eqx.Module):
@@ -88,6 +39,11 @@ class SeenSurfaces(eqx.Module):
     def poisoned_unless(self, fits: Bool[Array, ""]) -> "SeenSurfaces":
         """Make every picture NaN, and its derivatives too, where a plan does not suffice."""
         return eqx.tree_at(lambda seen: seen.atlas, self, self.atlas.poisoned_unless(fits))
+
+    def lit(self, scene: Scene, light: LightOnSplats, settings: RenderSettings) -> "SeenSurfaces":
+        """Give them with what passes 4 and 5 read."""
+        named = settings.lighting.at_pixels(scene, light.groups, self.points, self.named)
+        return eqx.tree_at(lambda seen: seen.named, self, named)
 
     def receivers(self, source: str = "source") -> _diffusion.SeenSurface:
         """Give what pass 4 asks of them, of the light of that name."""
@@ -264,14 +220,6 @@ def _lit_shares(splats: Splats, groups: list[StackedLights], settings: RenderSet
         lit.append(shares)
         needs.append(jnp.max(needed))
     return lit, needs
-
-
-def _surface_parameters(scene: Scene):
-    """The material's specular strength and roughness, times the splats' own."""
-    splats, material = scene.splats, scene.material
-    specular = material.specular if splats.specular is None else material.specular * splats.specular
-    roughness = material.roughness if splats.roughness is None else material.roughness * splats.roughness
-    return specular, roughness
 
 
 def _by_name(attributes: dict[str, Array], packed: Float[Array, "tiles rows pixels"]) -> dict[str, Array]:

@@ -138,4 +138,4 @@ def _plan_shadows(groups: Sequence[StackedLights], splats: Splats, bounds, setti
         distances = jnp.stack([jnp.linalg.norm(light.position - bounds.center) for light in lights])
         cube = bool(jnp.any(distances < 1.05 * bounds.radius))
     views = [view for light in lights for view in shadow_views(light, bounds, settings, cube)]
-    return ShadowPlan(settings.rasterizer.planned(splats, views, settings.splatting), cube)
+    return ShadowPlan(settings.rasterizer.for_shadows().planned(splats, views, settings.splatting), cube)

@@ -8,7 +8,8 @@ from splatjax import diffusion as _diffusion, splatting as _splatting
 from splatjax.scene import Camera, Frame, Scene
 
 from ._inputs import SAME, check_channels, in_one_dtype
-from ._passes import cast_shadows, compose, let_light_in, see_surfaces, shade, sources_of, surface_attributes
+from ._lighting import let_light_in
+from ._passes import cast_shadows, compose, see_surfaces, shade, sources_of
 from ._plan import Plan, plan_unless_traced
 from ._settings import RenderSettings
 
@@ -39,7 +40,8 @@ def _render(scene: Scene, camera: Camera, settings: RenderSettings, plan: Plan) 
     view = _splatting.PerspectiveView.of(camera)
     light = cast_shadows(scene, settings, plan)
     entering = let_light_in(scene, light)
-    seen = see_surfaces(scene.splats, surface_attributes(scene, light, entering), view, settings, plan)
+    attributes = settings.lighting.attributes(scene, light, entering)
+    seen = see_surfaces(scene.splats, attributes, view, settings, plan).lit(scene, light, settings)
     layers, needed = _diffusion.diffusion_layers(
         sources_of(scene.splats, entering.source),
         scene.material,

@@ -4,6 +4,8 @@ import equinox as eqx
 
 from splatjax import diffusion as _diffusion, splatting as _splatting
 
+from ._lighting import AbstractLighting, LightAtSplats
+
 
 class RenderSettings(eqx.Module):
     """How each pass works: the records of its room, and the objects that carry it out."""
@@ -13,3 +15,4 @@ class RenderSettings(eqx.Module):
     diffusion: _diffusion.DiffusionSettings = _diffusion.DiffusionSettings()
     rasterizer: _splatting.AbstractRasterizer = _splatting.TileRasterizer()
     diffuser: _diffusion.AbstractDiffuser = _diffusion.ClusterDiffuser()
+    lighting: AbstractLighting = LightAtSplats()

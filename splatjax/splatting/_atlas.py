@@ -93,21 +93,14 @@ class Atlas(eqx.Module):
 
     def points(self, depth: Float[Array, "tiles pixels"]) -> Float[Array, "3 tiles pixels"]:
         """Give the points (mm) that the pixels see at a depth (mm). Differentiable."""
-        x, y = self._columns_and_rows()
+        x, y = self.grid.columns_and_rows(self.tiles % self.grid.count)
         return self.view.unproject(x.astype(depth.dtype) + 0.5, y.astype(depth.dtype) + 0.5, depth)
 
     def pixels(self) -> Int[Array, "tiles pixels"]:
         """Number the pixels, row by row; what lies beyond the picture has the number of the pixel next to it."""
-        x, y = self._columns_and_rows()
+        x, y = self.grid.columns_and_rows(self.tiles % self.grid.count)
         grid = self.grid
         return jnp.minimum(y, grid.height - 1) * grid.width + jnp.minimum(x, grid.width - 1)
-
-    def _columns_and_rows(self) -> tuple[Int[Array, "tiles pixels"], Int[Array, "tiles pixels"]]:
-        within = jnp.arange(SIDE**2, dtype=jnp.int32)
-        tile = self.tiles % self.grid.count
-        x = (tile % self.grid.across * SIDE)[:, None] + (within % SIDE)[None]
-        y = (tile // self.grid.across * SIDE)[:, None] + (within // SIDE)[None]
-        return x, y
 
     def front_picture(
         self, values: Float[Array, "tiles *rows pixels channels"], fill: float = 0.0

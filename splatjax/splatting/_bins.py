@@ -59,6 +59,13 @@ class TileGrid(eqx.Module):
         whole = tiles.reshape(self.down, self.across, rows, SIDE, SIDE).transpose(2, 0, 3, 1, 4)
         return whole.reshape(rows, self.down * SIDE, self.across * SIDE)[:, : self.height, : self.width]
 
+    def columns_and_rows(self, tiles: Int[Array, " some"]) -> tuple[Int[Array, "some pixels"], Int[Array, "some pixels"]]:
+        """Give the column and the row of every pixel of some tiles."""
+        within = jnp.arange(SIDE**2, dtype=jnp.int32)
+        x = (tiles % self.across * SIDE)[:, None] + (within % SIDE)[None]
+        y = (tiles // self.across * SIDE)[:, None] + (within // SIDE)[None]
+        return x, y
+
     def pixel(self, x: Int[Array, "..."], y: Int[Array, "..."]) -> Int[Array, "..."]:
         """Give the number of a pixel among those of all tiles, tile by tile."""
         return (y // SIDE * self.across + x // SIDE) * SIDE**2 + y % SIDE * SIDE + x % SIDE

@@ -63,3 +63,7 @@ class AbstractRasterizer(eqx.Module):
         self, splats: Splats, attributes: Float[Array, "attributes splats"], view: AbstractView, settings: SplattingSettings
     ) -> SummedFragments:
         """Sum attributes and nearness over the fragments of every pixel."""
+
+    def for_shadows(self) -> "AbstractRasterizer":
+        """Give what draws the shadow maps beside it: itself, unless it is made for pictures alone."""
+        return self

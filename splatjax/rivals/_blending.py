@@ -1,0 +1,58 @@
+"""Blended splats, by any kernel: what the fragments of the front carry, normalized (Eq. 1)."""
+
+import jax
+import jax.numpy as jnp
+from jax.lax import stop_gradient
+from jaxtyping import Array, Float
+
+from splatjax.scene import Splats
+from splatjax.splatting import AbstractView, BinCapacity, FragmentSums, SplattingSettings, SummedFragments, blend_fragments
+
+from ._kernels import AbstractKernel
+from ._tiles import AbstractListRasterizer, nothing
+
+
+class BlendingRasterizer(AbstractListRasterizer):
+    r"""Blends the fragments within epsilon of the nearest one.
+
+    A pixel with any fragment is covered whole, one with none not at all: silhouettes are hard, and holes are holes.
+    Which fragments count, and coverage, have no derivative.
+
+    **Attributes:**
+
+    - `kernel`: what a splat leaves in a pixel.
+    - `capacity`: set by `planned`; a picture that needs more is NaN.
+    """
+
+    kernel: AbstractKernel
+    capacity: BinCapacity | None = None
+
+    def summed(
+        self, splats: Splats, attributes: Float[Array, "attributes splats"], view: AbstractView, settings: SplattingSettings
+    ) -> SummedFragments:
+        empty = nothing(attributes, view)
+        if splats.count == 0:
+            return SummedFragments(empty, empty, jnp.zeros((), attributes.dtype))
+        lists = self.lists(splats, view, settings)
+
+        def front(ids, footprints, dx, dy):
+            found = self.kernel.fragments(footprints, view, dx, dy)
+            return jnp.max(jnp.where(found.there, view.shifted(found.nearness, footprints.shift), -jnp.inf), axis=1)
+
+        limits = stop_gradient(lists.over_blocks(jax.ops.segment_max, lists.each(front)))
+
+        def blend(ids, footprints, dx, dy, limit):
+            found = self.kernel.fragments(footprints, view, dx, dy)
+            weight = jnp.where(found.there & (found.nearness > limit[:, None]), found.weight, 0.0)
+            rows = attributes.at[:, ids].get(mode="fill", fill_value=0)
+            sums = jnp.einsum("rts,tsp->trp", rows, weight)
+            own = jnp.stack([jnp.sum(weight * found.nearness, axis=1), jnp.sum(weight, axis=1)], axis=1)
+            return jnp.concatenate([sums, own], axis=1)
+
+        sums = FragmentSums.of(lists.tiles(lists.over_blocks(jax.ops.segment_sum, lists.each(blend, limits))))
+        blended = FragmentSums(
+            blend_fragments(sums.attributes, sums.weights[:, None]),
+            blend_fragments(sums.nearness, sums.weights),
+            jnp.where(sums.weights > 0, 1.0, 0 * sums.weights),
+        )
+        return SummedFragments(blended, empty, lists.bins.needed.astype(attributes.dtype))
