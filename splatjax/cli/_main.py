@@ -9,6 +9,7 @@ import tyro
 
 from ._environment import prepare_jax
 from ._export import Export
+from ._figure import Figure
 from ._fit import Fit
 from ._materials import Materials
 from ._recover import Recover
@@ -24,6 +25,7 @@ _Command = (
     | Annotated[Render, tyro.conf.subcommand("render")]
     | Annotated[Recover, tyro.conf.subcommand("recover")]
     | Annotated[Turntable, tyro.conf.subcommand("turntable")]
+    | Annotated[Figure, tyro.conf.subcommand("figure")]
 )
 _DESCRIPTION = """Render translucent materials, and find the sums of Gaussians that stand for them. Lengths are in mm.
 

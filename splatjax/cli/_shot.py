@@ -15,7 +15,6 @@ from ._outputs import OptionalPath
 from ._report import note, stage
 
 _FILL_SIDE, _FILL_ELEVATION = 25.0, 10.0  # degrees: beside the camera, away from the light
-_NARROW = 1e-6  # mm^2: far below any splat, so that the surface's own light stands for the layer
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,14 +65,15 @@ class Shot:
     def load(self) -> tuple[sj.Splats, sj.Material]:
         """Give the splats, and the material as it is rendered with them."""
         material = sj.load_material(self.material)
-        splats = self._splats()
+        splats = self.splats_to_show()
         if splats.albedo is not None:
             material = material.white()
             note(f"the splats carry albedo: the weights of {self.material} are divided by their sums")
         material = in_color(material)
-        return splats, material if self.scattering else without_scattering(material)
+        return splats, material if self.scattering else material.opaque()
 
-    def _splats(self) -> sj.Splats:
+    def splats_to_show(self) -> sj.Splats:
+        """Read the splats, or make the bust."""
         if self.splats is None:
             with stage(f"making the bust with {self.count} splats"):
                 return sj.bust(self.count)
@@ -136,13 +136,6 @@ def in_color(material: sj.Material) -> sj.Material:
         single = jax.tree.map(lambda values: jnp.broadcast_to(values, 3), single)
     gaussians = sj.SumOfGaussians(gaussians.variances, weights)
     return sj.Material(gaussians, material.eta, material.specular, material.roughness, single)
-
-
-def without_scattering(material: sj.Material) -> sj.Material:
-    """Give the same surface and color with light that leaves where it enters: one Gaussian, narrower than any splat."""
-    gaussians = material.gaussians
-    variances = jnp.full_like(gaussians.variances, _NARROW, shape=(1,))
-    return material.surface_of(sj.SumOfGaussians(variances, material.total_reflectance()[None]))
 
 
 def towards(azimuth: float, elevation: float) -> jax.Array:

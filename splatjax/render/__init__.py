@@ -7,5 +7,5 @@ from ._lighting import AbstractLighting as AbstractLighting, entering_light as e
 from ._lighting import EnteringLight as EnteringLight, LightAtSplats as LightAtSplats, LightOnSplats as LightOnSplats
 from ._lighting import surface_attributes as surface_attributes, surface_parameters as surface_parameters
 from ._plan import Plan as Plan, plan as plan, ShadowPlan as ShadowPlan
-from ._render import diffuse as diffuse, render as render
+from ._render import diffuse as diffuse, light_on_splats as light_on_splats, render as render
 from ._settings import RenderSettings as RenderSettings

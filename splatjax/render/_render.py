@@ -8,7 +8,7 @@ from splatjax import diffusion as _diffusion, splatting as _splatting
 from splatjax.scene import Camera, Frame, Scene
 
 from ._inputs import SAME, check_channels, in_one_dtype
-from ._lighting import let_light_in
+from ._lighting import EnteringLight, let_light_in
 from ._passes import cast_shadows, compose, see_surfaces, shade, sources_of
 from ._plan import Plan, plan_unless_traced
 from ._settings import RenderSettings
@@ -54,6 +54,29 @@ def _render(scene: Scene, camera: Camera, settings: RenderSettings, plan: Plan) 
     shaded = shade(scene, view, light.groups, seen, layers)
     needed = jnp.max(jnp.stack([needed, seen.needed, light.needed]))
     return compose(shaded, seen, layers.resolved, scene.material.gaussians.weights, needed)
+
+
+def light_on_splats(scene: Scene, plan: Plan, settings: RenderSettings | None = None) -> EnteringLight:
+    r"""Give the light that enters at every splat: pass 1, and the irradiance.
+
+    **Arguments:**
+
+    - `scene`: Differentiable.
+    - `plan`: from `splatjax.plan`.
+    - `settings`: those of the plan.
+
+    **Returns:** the irradiance, and what of it spreads: `source.T` is what `diffuse` asks for.
+
+    **Raises:** `ValueError` when the channels disagree.
+    """
+    check_channels(scene)
+    return _light_on_splats(scene, plan, RenderSettings() if settings is None else settings)
+
+
+@eqx.filter_jit
+def _light_on_splats(scene: Scene, plan: Plan, settings: RenderSettings) -> EnteringLight:
+    (scene,) = in_one_dtype(scene)
+    return let_light_in(scene, cast_shadows(scene, settings, plan))
 
 
 def diffuse(

@@ -7,6 +7,8 @@ from jaxtyping import Array, Float
 from splatjax.gaussians import SumOfGaussians
 from splatjax.scattering import SingleScattering
 
+_NARROW = 1e-6  # mm^2: far below any splat, so that the surface's own light stands for the layer
+
 
 class Material(eqx.Module):
     r"""A translucent material: how light spreads below the surface, and how the surface itself reflects.
@@ -63,6 +65,11 @@ class Material(eqx.Module):
     def surface_of(self, gaussians: SumOfGaussians) -> "Material":
         """Give other Gaussians, and nothing besides, the surface of this material."""
         return Material(gaussians, self.eta, self.specular, self.roughness)
+
+    def opaque(self) -> "Material":
+        """Give the same surface and color with light that leaves where it enters: one Gaussian, narrower than any splat."""
+        variances = jnp.full_like(self.gaussians.variances, _NARROW, shape=(1,))
+        return self.surface_of(SumOfGaussians(variances, self.total_reflectance()[None]))
 
     def white(self) -> "Material":
         """Give the material with a total reflectance of one per channel, so that an albedo map alone carries color."""

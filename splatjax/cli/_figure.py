@@ -1,0 +1,134 @@
+"""`splatjax figure`: the figures of the paper, made anew."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+
+import splatjax as sj
+from splatjax.io import atomic_path
+
+from ._outputs import check_output
+from ._report import stage
+from ._shot import Shot, in_color, towards
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure as Drawing
+
+    from splatjax.plots import Subject
+
+_DISTANCE = 900.0  # mm: that of a portrait
+_ROOM = 1.04  # of the picture over the body's outline
+
+
+@dataclass(frozen=True, kw_only=True)
+class Figure:
+    """Make a figure of the paper anew, from the built-in bust or from scanned heads: 1, 3, 4, 5, 6 or 7.
+
+    1: splats, the surface without and with scattering. 3: the layers of a profile. 4: the layers of a picture. 5: fewer splats
+    for wider layers. 6: bodies in four materials. 7: earlier point-based methods and this one. docs/figures.md shows them.
+
+    Example: splatjax figure 7 --scene head.ply --output figure_7.png
+    """
+
+    number: tyro.conf.Positional[int]
+    """Of the figure."""
+    output: Path = Path("figure.png")
+    """The PNG, PDF or SVG file to write."""
+    scene: tuple[Path, ...] = ()
+    """PLY files of splats, in mm (`splatjax sample` makes them). Figure 6 shows the bust and all of them, the others the first;
+    without one, the bust."""
+    material: str = "skin"
+    """Name of a material (`splatjax materials`), or path of a TOML file."""
+    materials: tuple[str, ...] = ("skin", "marble", "ketchup", "wholemilk")
+    """Of figure 6; the first is drawn with the body's own color."""
+    width: int = 512
+    """Of a picture in the figure, pixels along each side."""
+    count: int = 200_000
+    """Number of splats of the built-in bust."""
+    scale: float = 1.0
+    """Size of the bodies: at 0.5 a head is half as large, and the light goes twice as far in it. So do fewer splats for narrow
+    layers."""
+    close_up: tuple[float, float] = (0.48, 0.34)
+    """Of figure 7: what is shown closer, as shares of the height and of the width of the body's outline."""
+    azimuth: float = 25.0
+    """Of the camera, degrees."""
+    light_azimuth: float = -35.0
+    """Of the place the light comes from, degrees."""
+
+    def run(self) -> None:
+        """Draw, write."""
+        check_output(self.output, (".png", ".pdf", ".svg"))
+        if not 0 < self.scale < math.inf:
+            raise ValueError(f"--scale is {self.scale:g}; it must be a positive factor: 1 shows a body as large as it is")
+        figures = self._figures()
+        if self.number not in figures:
+            known = ", ".join(str(number) for number in figures)
+            raise ValueError(f"there is no figure {self.number} to make; give one of {known}")
+        with stage(f"drawing figure {self.number}"):
+            drawing = figures[self.number]()
+        with atomic_path(self.output) as written:
+            drawing.savefig(written, format=self.output.suffix[1:].lower())
+        print(self.output)
+
+    def _figures(self) -> dict[int, Callable[[], "Drawing"]]:
+        from splatjax import plots  # loads matplotlib
+
+        material = in_color(sj.load_material(self.material))
+        return {
+            1: lambda: plots.figure_1(self._subject(), material),
+            3: lambda: plots.figure_3(material.gaussians, title=self.material),
+            4: lambda: plots.figure_4(self._subject(), material),
+            5: lambda: plots.figure_5(self._subject()),
+            6: lambda: plots.figure_6(self._subjects(), {name: in_color(sj.load_material(name)) for name in self.materials}),
+            7: lambda: plots.figure_7(self._subject(), material, place=self.close_up),
+        }
+
+    def _subject(self) -> "Subject":
+        return self._placed(self.scene[0] if self.scene else None)
+
+    def _subjects(self) -> list["Subject"]:
+        return [self._placed(path) for path in (None, *self.scene)]
+
+    def _placed(self, path: Path | None) -> "Subject":
+        """Give the splats of a file, or the bust, under the lights and before the camera of all figures."""
+        from splatjax.plots import Subject
+
+        shot = Shot(
+            splats=path,
+            output=self.output,
+            width=self.width,
+            height=self.width,
+            azimuth=self.azimuth,
+            light_azimuth=self.light_azimuth,
+            light_elevation=25.0,
+            count=self.count,
+        )
+        shot.check()
+        splats = shot.splats_to_show()
+        lights = shot.lights(3, self.azimuth, self.light_azimuth)
+        name = "bust" if path is None else path.stem
+        camera = portrait(splats, towards(self.azimuth, 0.0), self.width)
+        return Subject(name, splats, lights, camera).scaled(self.scale)
+
+
+def portrait(splats: sj.Splats, direction: jax.Array, width: int) -> sj.Camera:
+    """Place a camera in a direction so that the outline of the splats just fits a square picture."""
+    centers = splats.centers
+    middle = (centers.min(axis=0) + centers.max(axis=0)) / 2
+    eye, fov = middle + _DISTANCE * direction.astype(middle.dtype), 40.0
+    for _ in range(3):  # looking elsewhere moves the outline a little
+        camera = sj.Camera.look_at(eye, middle, fov=fov, width=width, height=width)
+        right, down, forward = camera.rotation @ (centers - eye[None]).T
+        across, along = np.asarray(right / forward), np.asarray(down / forward)
+        box = [(low + high) / 2 for low, high in ((across.min(), across.max()), (along.min(), along.max()))]
+        middle = eye + camera.rotation.T @ jnp.asarray([*box, 1.0], middle.dtype)
+        reach = _ROOM * max(np.ptp(across), np.ptp(along)) / 2
+        fov = float(2 * np.degrees(np.arctan(reach)))
+    return sj.Camera.look_at(eye, middle, fov=fov, width=width, height=width)
