@@ -65,4 +65,4 @@ def data_sheet(gaussians: SumOfGaussians) -> dict[str, Any]:
 
 def _plain(values: Any) -> Any:
     """Python numbers, as short as they can be and still be read back the same."""
-    return np.vectorize(lambda x: float(str(x)), otypes=[object])(np.asarray(values)).tolist()
+    return np.vectorize(lambda x: float(np.format_float_scientific(x)), otypes=[object])(np.asarray(values)).tolist()

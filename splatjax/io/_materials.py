@@ -276,7 +276,8 @@ def _plain(values: Any) -> Any:
     """Python numbers, as short as they can be and still be read back the same."""
     values = np.asarray(values)
     if values.dtype == np.float32:
-        return np.vectorize(lambda x: float(str(x)), otypes=[object])(values).tolist()
+        # Not `str`, which shows six digits once colour-science has been imported.
+        return np.vectorize(lambda x: float(np.format_float_scientific(x)), otypes=[object])(values).tolist()
     return values.tolist()
 
 

@@ -92,6 +92,8 @@ def test_shipped_fits_are_reproduced():
 
 
 def test_a_saved_material_comes_back_bit_for_bit(dtype, tmp_path):
+    import colour  # noqa: F401  It makes NumPy print six digits.
+
     weights = jnp.asarray([[1 / 3, 1e-9], [0.1, -0.2]], dtype)
     material = Material(SumOfGaussians(jnp.asarray([1e-5, 2 / 3], dtype), weights), eta=1.37, specular=0.1, roughness=1.0)
     medium = Medium(*(jnp.asarray(x, dtype) for x in ([0.0, 1 / 7], [1.0, 1e5], [1.3, 1.1])))
