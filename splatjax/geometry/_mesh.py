@@ -18,12 +18,16 @@ class Mesh(eqx.Module):
     - `normals`: unit, outward, one per vertex.
     - `uvs`: per face and corner; u to the right and v *up*, so that (0, 0) is the lower left corner of a texture and
       (0, 1) the upper left, where its row 0 begins. `None` where there are none.
+    - `colors`: of vertices, linear, in [0, 1]. `None` where there are none.
+    - `parts`: number of the part that each face belongs to, where parts have textures of their own.
     """
 
     vertices: Float[np.ndarray, "vertices 3"]
     faces: Int[np.ndarray, "faces 3"]
     normals: Float[np.ndarray, "vertices 3"]
     uvs: Float[np.ndarray, "faces 3 2"] | None = None
+    colors: Float[np.ndarray, "vertices 3"] | None = None
+    parts: Int[np.ndarray, " faces"] | None = None
 
     def corners(self) -> Float[np.ndarray, "faces 3 3"]:
         """Give the positions of each triangle's corners, mm."""
@@ -45,7 +49,8 @@ class Mesh(eqx.Module):
 
     def select(self, keep) -> "Mesh":
         """Give the mesh of the chosen faces (a mask or indices); vertices are kept as they are."""
-        return Mesh(self.vertices, self.faces[keep], self.normals, None if self.uvs is None else self.uvs[keep])
+        uvs, parts = (None if each is None else each[keep] for each in (self.uvs, self.parts))
+        return Mesh(self.vertices, self.faces[keep], self.normals, uvs, self.colors, parts)
 
 
 def vertex_normals(

@@ -9,7 +9,7 @@ from splatjax.scene import Splats
 from ._cells import Cells, surface_cells
 from ._mesh import Mesh
 from ._scatter import SurfacePoints, faces_beyond, mirrored, scatter
-from ._textures import Textures, lookup, perturbed_normals, texture_coordinates
+from ._textures import Textures, lookup, perturbed_normals, texture_coordinates, worn_albedo
 
 
 def sample_mesh(mesh: Mesh, count: int, *, textures: Textures | None = None, seed: int = 0) -> Splats:
@@ -39,12 +39,13 @@ def splats_at(mesh: Mesh, points: SurfacePoints, textures: Textures | None = Non
     cells = surface_cells(centers, normals, limit=spacing, ghosts=mirrored(mesh, faces_beyond(mesh), centers, normals, spacing))
     areas = cells.areas * (mesh.area() / cells.areas.sum())
     radii = _radii(areas, cells)
-    albedo = specular = roughness = None
+    albedo = worn_albedo(textures, mesh, points)
+    specular = roughness = None
     if textures is not None:
         uvs = texture_coordinates(mesh, points)
-        albedo, specular, roughness, tangent_space = (
+        specular, roughness, tangent_space = (
             None if picture is None else lookup(picture, uvs)
-            for picture in (textures.albedo, textures.specular, textures.roughness, textures.normal)
+            for picture in (textures.specular, textures.roughness, textures.normal)
         )
         if tangent_space is not None:
             normals = perturbed_normals(mesh, points, normals, tangent_space)

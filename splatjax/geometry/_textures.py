@@ -13,13 +13,13 @@ class Textures(eqx.Module):
 
     **Attributes:**
 
-    - `albedo`: diffuse color, linear, in [0, 1].
+    - `albedo`: diffuse color, linear, in [0, 1]; or one for each part of the mesh, of one pixel where a part is plain.
     - `specular`: factor on the material's specular strength.
     - `roughness`: factor on the material's roughness.
     - `normal`: tangent-space normals in [-1, 1]: x along u, y along v (*up*), z outward; of any positive length.
     """
 
-    albedo: Float[np.ndarray, "h w channels"] | None = None
+    albedo: Float[np.ndarray, "h w channels"] | tuple[Float[np.ndarray, "_ _ channels"], ...] | None = None
     specular: Float[np.ndarray, "h2 w2"] | None = None
     roughness: Float[np.ndarray, "h3 w3"] | None = None
     normal: Float[np.ndarray, "h4 w4 3"] | None = None
@@ -37,6 +37,27 @@ def lookup(picture: Float[np.ndarray, "h w *channels"], uvs: Float[np.ndarray, "
     upper = picture[rows[0], columns[0]] * (1 - right_share) + picture[rows[0], columns[1]] * right_share
     lower = picture[rows[1], columns[0]] * (1 - right_share) + picture[rows[1], columns[1]] * right_share
     return upper * (1 - bottom_share) + lower * bottom_share
+
+
+def worn_albedo(textures: Textures | None, mesh: Mesh, points: SurfacePoints) -> Float[np.ndarray, "n channels"] | None:
+    """Give the albedo of points on a mesh: of its textures, times the colors of its vertices; `None` where it has neither."""
+    colors = None
+    if mesh.colors is not None:
+        colors = np.clip(np.einsum("nc,nci->ni", points.barycentrics, mesh.colors[mesh.faces[points.faces]]), 0.0, 1.0)
+    pictures = None if textures is None else textures.albedo
+    if pictures is None:
+        return colors
+    uvs = texture_coordinates(mesh, points)
+    if isinstance(pictures, tuple):
+        assert mesh.parts is not None
+        parts = mesh.parts[points.faces]
+        worn = np.empty((len(parts), pictures[0].shape[-1]))
+        for number, picture in enumerate(pictures):
+            there = parts == number
+            worn[there] = picture[0, 0] if picture.shape[:2] == (1, 1) else lookup(picture, uvs[there])
+    else:
+        worn = lookup(pictures, uvs)
+    return worn if colors is None else worn * colors
 
 
 def texture_coordinates(mesh: Mesh, points: SurfacePoints) -> Float[np.ndarray, "n 2"]:

@@ -3,18 +3,22 @@
 import os
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 import plyfile
 
-from splatjax.geometry import complete_splats
+from splatjax.geometry import complete_splats, unit
 from splatjax.scene import Splats
 
 from ._atomic import atomic_path
-from ._color import srgb_to_linear
+from ._files import existing_file
+from ._ply_columns import Table, colors_of, columns_of, normals_of, places_of, vertex_table
+from ._ply_tables import read_ply
 
 _RADIUS = ("radius", "radii")
 _AREA = ("area", "areas")
-_COLOR = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
+_SHORTEST, _LONGEST = 1e-9, 1e9  # mm: beyond, single precision loses areas
+_LARGEST = 1e6
 _GAUSSIAN_SPLATTING = ("f_dc_0", "scale_0", "rot_0")
 
 
@@ -41,30 +45,26 @@ def read_splats(path: str | os.PathLike[str], *, mm_per_unit: float = 1.0) -> Sp
     **Raises:** `FileNotFoundError`, or `ValueError` when the file is no PLY, is cut short, has no points, values that are
     not finite, radii or areas that are not positive, or holds a Gaussian-splatting scene.
     """
-    path = Path(path)
+    path = existing_file(path)
     _check_unit(path, mm_per_unit)
-    vertices = _read_vertices(path)
-    names = set(vertices.dtype.names or ())
-    if all(name in names for name in _GAUSSIAN_SPLATTING):
+    vertices = vertex_table(path, read_ply(path))
+    if all(name in vertices for name in _GAUSSIAN_SPLATTING):
         raise ValueError(
             f"{path}: is a Gaussian-splatting scene (f_dc, scale, rot, opacity): its fuzzy ellipsoids carry baked radiance and no"
             " surface; give a PLY of surface points (x y z, and nx ny nz, radius, red green blue where known)"
         )
-    centers = _columns(path, vertices, ("x", "y", "z"))
-    if centers is None:
-        raise ValueError(f"{path}: its vertices have no x, y, z; they have {', '.join(vertices.dtype.names or ()) or 'nothing'}")
-    normals = _columns(path, vertices, ("nx", "ny", "nz"))
-    if normals is not None:
-        normals = _unit_normals(path, normals)
-    radii, areas = (_positive(path, vertices, names, aliases) for aliases in (_RADIUS, _AREA))
-    albedo = next((found for found in (_colors(path, vertices, triple) for triple in _COLOR) if found is not None), None)
+    centers = places_of(path, vertices)
+    normals = normals_of(path, vertices)
+    radii, areas = _positive(path, vertices, _RADIUS, mm_per_unit), _positive(path, vertices, _AREA, mm_per_unit**2)
+    _check_place(path, centers * mm_per_unit, estimated=radii is None or areas is None)
+    albedo = colors_of(path, vertices)
     specular, roughness = (_factor(path, vertices, name) for name in ("specular", "roughness"))
     try:
         return complete_splats(
             centers * mm_per_unit,
-            normals=normals,
-            radii=None if radii is None else radii * mm_per_unit,
-            areas=None if areas is None else areas * mm_per_unit**2,
+            normals=None if normals is None else unit(normals / np.abs(normals).max(axis=1, keepdims=True)),
+            radii=radii,
+            areas=areas,
             albedo=albedo,
             specular=specular,
             roughness=roughness,
@@ -108,47 +108,27 @@ def _check_unit(path: Path, mm_per_unit: float) -> None:
         raise ValueError(f"{path}: mm_per_unit is {mm_per_unit}; it must be the positive length of the file's unit in mm")
 
 
-def _read_vertices(path: Path) -> np.ndarray:
-    if not path.exists():
-        raise FileNotFoundError(f"{path}: there is no such file; check the path")
-    try:
-        data = plyfile.PlyData.read(str(path))
-    except (plyfile.PlyParseError, ValueError, UnicodeDecodeError, EOFError, OverflowError, MemoryError) as error:
-        raise ValueError(f"{path}: cannot be read as PLY ({error}); it is cut short or no PLY file, write it again") from error
-    element = next((element for element in data.elements if element.name == "vertex"), None)
-    if element is None:
-        raise ValueError(f"{path}: has no element `vertex`; a PLY file of points keeps them there")
-    if element.count == 0:
-        raise ValueError(f"{path}: is empty, it holds no vertex; give a file with at least one point")
-    return np.asarray(element.data)
-
-
-def _columns(path: Path, vertices: np.ndarray, names: tuple[str, ...]) -> np.ndarray | None:
-    have = vertices.dtype.names or ()
-    if not all(name in have for name in names):
-        return None
-    values = np.stack([vertices[name] for name in names], axis=-1).astype(np.float64)
-    bad = np.flatnonzero(~np.isfinite(values).all(axis=-1))
-    if len(bad):
+def _check_place(path: Path, centers: np.ndarray, *, estimated: bool) -> None:
+    """Refuse points that lie where numbers of JAX's default precision cannot tell them apart."""
+    low, high = centers.min(axis=0), centers.max(axis=0)
+    reach, extent = float(np.abs([low, high]).max()), float((high - low).max())
+    if not reach <= _LONGEST:
+        raise ValueError(f"{path}: its points reach {reach:.3g} mm; give its unit (mm_per_unit), or scale it")
+    if estimated and extent < 1e3 * _SHORTEST:
         raise ValueError(
-            f"{path}: {' '.join(names)} of vertex {bad[0]} is not finite ({len(bad)} such vertices); remove or mend them"
+            f"{path}: its {len(centers)} points lie within {extent:.3g} mm; give its unit (mm_per_unit), or scale it"
         )
-    return values
-
-
-def _unit_normals(path: Path, normals: np.ndarray) -> np.ndarray:
-    length = np.linalg.norm(normals, axis=-1, keepdims=True)
-    bad = np.flatnonzero(length[:, 0] == 0)
-    if len(bad):
+    resolved = float(jnp.finfo(jnp.result_type(float)).eps) * reach
+    if 0 < extent < 1e4 * resolved:
         raise ValueError(
-            f"{path}: the normal of vertex {bad[0]} has length zero ({len(bad)} such vertices); mend it, or leave out nx ny nz"
+            f"{path}: its points lie {reach:.3g} mm from the origin, where single precision tells {resolved:.2g} mm apart, and it"
+            f" is {extent:.3g} mm large; move it to the origin"
         )
-    return normals / length
 
 
-def _positive(path: Path, vertices: np.ndarray, names: set[str], aliases: tuple[str, ...]) -> np.ndarray | None:
-    name = next((alias for alias in aliases if alias in names), None)
-    values = None if name is None else _columns(path, vertices, (name,))
+def _positive(path: Path, vertices: Table, aliases: tuple[str, ...], scale: float) -> np.ndarray | None:
+    name = next((alias for alias in aliases if alias in vertices), None)
+    values = None if name is None else columns_of(path, vertices, (name,))
     if values is None:
         return None
     values = values[:, 0]
@@ -158,28 +138,17 @@ def _positive(path: Path, vertices: np.ndarray, names: set[str], aliases: tuple[
             f"{path}: the {name} of vertex {bad[0]} is {values[bad[0]]:g} ({len(bad)} such vertices); it must be positive,"
             f" or leave {name} out to have it estimated"
         )
-    return values
+    if values.max() * scale > _LONGEST**2 or values.min() * scale < _SHORTEST**2:
+        said = f"{name} ranges from {values.min():.3g} to {values.max():.3g}"
+        raise ValueError(f"{path}: {said}; give its unit (mm_per_unit), or mend it")
+    return values * scale
 
 
-def _colors(path: Path, vertices: np.ndarray, names: tuple[str, ...]) -> np.ndarray | None:
-    values = _columns(path, vertices, names)
+def _factor(path: Path, vertices: Table, name: str) -> np.ndarray | None:
+    values = columns_of(path, vertices, (name,))
     if values is None:
         return None
-    kinds = {vertices.dtype[name] for name in names}
-    if all(kind.kind in "iu" for kind in kinds):
-        values = srgb_to_linear(values / max(np.iinfo(kind).max for kind in kinds))
-    if values.min() < 0 or values.max() > 1:
-        raise ValueError(
-            f"{path}: {' '.join(names)} range from {values.min():g} to {values.max():g}; floats are linear albedo in [0, 1],"
-            " integers are sRGB"
-        )
-    return values
-
-
-def _factor(path: Path, vertices: np.ndarray, name: str) -> np.ndarray | None:
-    values = _columns(path, vertices, (name,))
-    if values is None:
-        return None
-    if values.min() < 0:
-        raise ValueError(f"{path}: {name} reaches {values.min():g}; it is a factor on the material's and cannot be negative")
+    reached = values.min() if values.min() < 0 else values.max()
+    if not 0 <= reached <= _LARGEST:
+        raise ValueError(f"{path}: {name} reaches {reached:g}; it is a factor on the material's, from 0 to {_LARGEST:g}")
     return values[:, 0]
