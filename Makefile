@@ -12,7 +12,7 @@ LEAST_OPTIMIZATION := --xla_backend_optimization_level=0 --xla_cpu_use_fusion_em
 # Every worker of every run imports the same modules, with their shapes checked: whatever the shell says, bytecode is kept.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: setup demo test test-float32 test-x64 test-once test-long random-scenes lint bench lock
+.PHONY: setup demo test test-float32 test-x64 test-once test-long random-scenes fuzz lint bench lock
 
 setup: $(VENV)/ready
 
@@ -59,6 +59,11 @@ random-scenes: setup
 	SPLATJAX_RANDOM_SCENES=10000 JAX_ENABLE_X64=1 XLA_FLAGS="$(LEAST_OPTIMIZATION) $$XLA_FLAGS" \
 	    $(BIN)/python -m pytest -n $(WORKERS) --dist load -q tests/splatting/test_random_bodies.py \
 	    tests/diffusion/test_random_diffusers.py
+
+# Spoilt files at every reader, at most ten minutes of each kind for each; `make fuzz FUZZ="--readers ply --inputs 10000"` for
+# less. Inputs that grow along new lines of code need atheris: `.venv/bin/uv pip install atheris`.
+fuzz: setup
+	$(BIN)/python tools/fuzz.py $(FUZZ)
 
 bench: setup
 	$(BIN)/python -m benchmarks

@@ -1,7 +1,11 @@
 """A frame with all its layers in one OpenEXR file."""
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+import sys
+import tempfile
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import contextmanager, redirect_stdout
+from io import StringIO
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -11,6 +15,8 @@ import OpenEXR  # ty: ignore[import-not-found]
 from splatjax.scene import Frame
 
 from ._atomic import atomic_path
+from ._files import existing_file
+from ._room import check_room
 from ._version import own_version
 
 _REC709_D65 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
@@ -67,6 +73,9 @@ def read_exr(path: str | os.PathLike[str]) -> Frame:
         return _frame(header, planes)
     except KeyError as error:
         raise ValueError(f"{path}: lacks {error.args[0]}, so it is no frame; give a file written by write_exr") from error
+    except (TypeError, ValueError) as error:
+        said = " ".join(str(error).split())
+        raise ValueError(f"{path}: has no weights as a frame has ({said}); give a file written by write_exr") from None
 
 
 def read_picture(path: str | os.PathLike[str]) -> np.ndarray:
@@ -85,13 +94,44 @@ def read_picture(path: str | os.PathLike[str]) -> np.ndarray:
 
 
 def _read(path: Path) -> tuple[dict, dict[str, np.ndarray]]:
-    if not path.exists():
-        raise FileNotFoundError(f"{path}: there is no such file; check the path")
+    existing_file(path)
+    said: list[str] = []
     try:
-        with OpenEXR.File(str(path), separate_channels=True) as file:
-            return dict(file.header()), {name: np.array(channel.pixels) for name, channel in file.channels().items()}
-    except Exception as error:  # the package raises whatever its C++ side throws
-        raise ValueError(f"{path}: cannot be read as OpenEXR ({error}); it is cut short or of another format") from error
+        with _overheard(said):
+            with OpenEXR.File(str(path), header_only=True) as file:
+                header = dict(file.header())
+            low, high = (np.asarray(corner, np.int64) for corner in header["dataWindow"])
+            pixels, channels = float(np.prod(high - low + 1)), len(header["channels"])
+            check_room(f"{path}: a picture of {pixels:.3g} pixels and {channels} channels", 12.0 * pixels * channels, "give less")
+            with OpenEXR.File(str(path), separate_channels=True) as file:
+                planes = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
+        if said:
+            raise ValueError
+    except Exception as error:  # the package raises whatever its C++ side throws, or says it and goes on without
+        if str(error).startswith(f"{path}: a picture"):
+            raise
+        reason = " ".join((said[0] if said else str(error)).replace(f"{path}: ", "").split())
+        raise ValueError(f"{path}: cannot be read as OpenEXR ({reason}); it is cut short or of another format") from None
+    if len({plane.shape for plane in planes.values()}) != 1:
+        raise ValueError(f"{path}: has channels of several sizes, which are not read here; write all in full")
+    return header, planes
+
+
+@contextmanager
+def _overheard(said: list[str]) -> Generator[None, None, None]:
+    """Take down what the package's C++ side prints, and writes to the standard error of the process."""
+    sys.stderr.flush()
+    with tempfile.TemporaryFile() as heard, redirect_stdout(StringIO()) as printed:
+        kept = os.dup(2)
+        try:
+            os.dup2(heard.fileno(), 2)
+            yield
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+            heard.seek(0)
+            lines = heard.read().decode("utf-8", "replace").splitlines() + printed.getvalue().splitlines()
+            said.extend(line for line in lines if line.strip())
 
 
 def _floats(values) -> list[float]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from ._gltf_data import GltfData
 from ._pictures import read_color
-from ._pieces import Piece
+from ._pieces import Piece, moderate
 from ._room import check_room
 
 _KNOWN = {"KHR_mesh_quantization", "KHR_texture_transform", "EXT_texture_webp", "KHR_lights_punctual"}
@@ -112,7 +112,7 @@ def _primitive(data: GltfData, primitive: dict[str, Any]) -> Piece | None:
     else:
         order = np.arange(len(vertices))
     faces = _faces(order, mode)
-    normals = _table(data, attributes["NORMAL"], 3) if "NORMAL" in attributes else None
+    normals = moderate(_table(data, attributes["NORMAL"], 3)) if "NORMAL" in attributes else None
     colors = _table(data, attributes["COLOR_0"], (3, 4))[:, :3] if "COLOR_0" in attributes else None
     for name, table in (("NORMAL", normals), ("COLOR_0", colors)):
         if table is not None and len(table) != len(vertices):
@@ -129,7 +129,8 @@ def _table(data: GltfData, index: Any, width: int | tuple[int, ...]) -> np.ndarr
     values = data.values(index)
     if values.shape[1] not in (width if isinstance(width, tuple) else (width,)):
         raise ValueError(f"its vertices have rows of {values.shape[1]} numbers instead of {width}")
-    return values.astype(np.float64)
+    with np.errstate(invalid="ignore"):  # of NaN that signals
+        return values.astype(np.float64)
 
 
 def _faces(order: np.ndarray, mode: int) -> np.ndarray:

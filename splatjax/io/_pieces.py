@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 from splatjax.geometry import Mesh, Textures, unit, vertex_normals
 
 _FARTHEST = 1e12  # beyond, areas overflow
+_MOST_TILES = 1e6  # that a texture is repeated
 Picture = Float[np.ndarray, "height width 3"]
 
 
@@ -75,6 +76,13 @@ def check_places(path: Path, places: Float[np.ndarray, "n 3"]) -> None:
         raise ValueError(f"{path}: has vertices that are not finite, or reach {_FARTHEST:g} units; mend or remove them")
 
 
+def moderate(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """Scale vectors of any length so that squares of their components neither overflow nor vanish; those of zero stay."""
+    greatest = np.abs(vectors).max(axis=1, keepdims=True)
+    with np.errstate(invalid="ignore"):  # infinite ones become no numbers, and are refused as such
+        return vectors / np.where(greatest > 0, greatest, 1.0)
+
+
 def _mesh(path: Path, piece: Piece, mm_per_unit: float, upside_down: bool) -> Mesh:
     count = len(piece.vertices)
     check_places(path, piece.vertices)
@@ -83,13 +91,15 @@ def _mesh(path: Path, piece: Piece, mm_per_unit: float, upside_down: bool) -> Me
     if piece.faces.min() < 0 or piece.faces.max() >= count:
         raise ValueError(f"{path}: a face names vertex {piece.faces.max()} of {count}; write the file again")
     vertices = np.asarray(piece.vertices, np.float64) * mm_per_unit
-    normals = piece.normals
+    normals = None if piece.normals is None else moderate(piece.normals)
     if normals is None or (normals == 0).all(axis=1).any():
         made = vertex_normals(vertices, piece.faces)
         normals = made if normals is None else np.where((normals == 0).all(axis=1, keepdims=True), made, normals)
     uvs = piece.uvs
     if uvs is not None:
-        if not np.isfinite(uvs).all():
-            raise ValueError(f"{path}: has texture coordinates that are not finite; mend or remove them")
+        if not (np.abs(uvs) < _MOST_TILES).all():
+            raise ValueError(f"{path}: has texture coordinates that are not finite, or reach {_MOST_TILES:g}; mend them")
         uvs = np.stack([uvs[..., 0], 1 - uvs[..., 1] if upside_down else uvs[..., 1]], axis=-1)
+    if piece.colors is not None and not ((piece.colors >= 0) & (piece.colors <= 1)).all():
+        raise ValueError(f"{path}: has colors of vertices outside [0, 1]; mend or remove them")
     return Mesh(vertices, np.asarray(piece.faces, np.int64), unit(np.asarray(normals, np.float64)), uvs, piece.colors)

@@ -12,6 +12,7 @@ from splatjax.scene import Splats
 
 from ._atomic import atomic_path
 from ._files import existing_file
+from ._pieces import moderate
 from ._ply_columns import Table, colors_of, columns_of, normals_of, places_of, vertex_table
 from ._ply_tables import read_ply
 
@@ -62,7 +63,7 @@ def read_splats(path: str | os.PathLike[str], *, mm_per_unit: float = 1.0) -> Sp
     try:
         return complete_splats(
             centers * mm_per_unit,
-            normals=None if normals is None else unit(normals / np.abs(normals).max(axis=1, keepdims=True)),
+            normals=None if normals is None else unit(moderate(normals)),
             radii=radii,
             areas=areas,
             albedo=albedo,

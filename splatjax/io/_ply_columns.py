@@ -51,7 +51,8 @@ def columns_of(path: Path, table: Table, names: tuple[str, ...]) -> Float[np.nda
     found = [table[name] for name in names]
     if any(isinstance(each, Ragged) for each in found):
         raise ValueError(f"{path}: {' '.join(names)} of its vertices are lists; write single numbers")
-    values = np.stack(found, axis=-1).astype(np.float64)
+    with np.errstate(invalid="ignore"):  # of NaN that signals
+        values = np.stack(found, axis=-1).astype(np.float64)
     bad = np.flatnonzero(~np.isfinite(values).all(axis=-1))
     if len(bad):
         raise ValueError(

@@ -64,7 +64,8 @@ def _corner_coordinates(path: Path, file: PlyFile, lists: Ragged, polygons: list
         raise ValueError(f"{path}: its faces do not list two texture coordinates for each corner; write the file again")
     if not (lists.counts == 3).all():
         raise ValueError(f"{path}: lists texture coordinates in faces of more than three corners; export triangles")
-    return found.values.astype(np.float64).reshape(-1, 3, 2)
+    with np.errstate(invalid="ignore"):  # of NaN that signals
+        return found.values.astype(np.float64).reshape(-1, 3, 2)
 
 
 def _texture(path: Path, name: str) -> np.ndarray:

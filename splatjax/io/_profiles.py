@@ -14,6 +14,7 @@ from splatjax.scattering import Tabulated
 from splatjax.scene import Material
 
 from ._atomic import atomic_path
+from ._tables import rounded
 
 
 def read_profile(path: str | os.PathLike[str], *, mm_per_unit: float = 1.0) -> Tabulated:
@@ -48,7 +49,7 @@ def read_profile(path: str | os.PathLike[str], *, mm_per_unit: float = 1.0) -> T
         if not rows and not named and not _is_number(cells[0]):
             named = True
             continue
-        bad = next((cell for cell in cells if not _is_number(cell) or not math.isfinite(float(cell))), None)
+        bad = next((cell for cell in cells if not _is_number(cell) or not math.isfinite(rounded(float(cell)))), None)
         if bad is not None:
             raise ValueError(f"{path}: line {number}: {bad!r} is no number; give a radius and a value for each channel")
         if len(cells) < 2 or (rows and len(cells) != len(rows[0])):

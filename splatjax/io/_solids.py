@@ -20,7 +20,8 @@ def read_stl(path: Path) -> list[Piece]:
     count = int.from_bytes(data[80:84], "little")
     if len(data) >= 84 and len(data) == 84 + _TRIANGLE.itemsize * count:
         triangles: np.ndarray = np.frombuffer(data, _TRIANGLE, count, 84)
-        corners = triangles["corners"].astype(np.float64)
+        with np.errstate(invalid="ignore"):  # of NaN that signals
+            corners = triangles["corners"].astype(np.float64)
     elif data.lstrip()[:5].lower() == b"solid" and b"\0" not in data:
         corners = _stl_text(path, data.decode("latin-1"))
     else:

@@ -42,26 +42,26 @@ class Table:
         if not isinstance(found, list) or not found or not all(_is_number(x) for x in found):
             raise ValueError(f"{self.where} {name} must be a list of numbers, {expected}; it is {found!r}")
         values = np.asarray(found, np.float64)
-        if not np.all(np.isfinite(values) & holds(values)):
+        if not np.all(np.isfinite(rounded(values)) & holds(rounded(values))):
             raise ValueError(f"{self.where} {name} must be finite and {expected}; it is {found!r}")
         return values
 
     def thickness(self, name: str) -> np.ndarray:
         found = self.entry(name, "a number of mm, or inf")
-        if not _is_number(found) or not found > 0:
+        if not _is_number(found) or not rounded(found) > 0:
             raise ValueError(f"{self.where} {name} must be positive (mm), or inf; it is {found!r}")
         return np.asarray(found, np.float64)
 
     def number(self, name: str, expected: str, holds, default: float) -> float:
         found = self.table.get(name, default)
-        if not _is_number(found) or not np.isfinite(found) or not holds(found):
+        if not _is_number(found) or not np.isfinite(rounded(found)) or not holds(rounded(found)):
             raise ValueError(f"{self.where} {name} must be a number, {expected}; it is {found!r}")
         return float(found)
 
     def matrix(self, name: str, rows: int) -> np.ndarray:
         found = self.entry(name, "a list of numbers per Gaussian, one per channel")
         regular = isinstance(found, list) and all(isinstance(row, list) and row for row in found)
-        if not regular or not all(_is_number(x) and np.isfinite(x) for row in found for x in row):
+        if not regular or not all(_is_number(x) and np.isfinite(rounded(x)) for row in found for x in row):
             raise ValueError(
                 f"{self.where} {name} must be a list of finite numbers per Gaussian, one per channel; it is {found!r}"
             )
@@ -75,6 +75,12 @@ class Table:
 
 def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def rounded(values: Any) -> np.ndarray:
+    """Give numbers as they are in JAX's default precision: what is too large is infinite there, what is too small is 0."""
+    with np.errstate(over="ignore", under="ignore"):
+        return np.asarray(values, np.float64).astype(jnp.result_type(float))
 
 
 def as_array(values: np.ndarray) -> Array:
