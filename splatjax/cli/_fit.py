@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import jax
 import tyro
@@ -10,7 +11,7 @@ from rich.table import Table
 
 import splatjax as sj
 from splatjax.fitting import AbstractWeights
-from splatjax.io import read_picture
+from splatjax.io import read_picture, surface_and_source
 from splatjax.scattering import measure_laser_dot
 
 from ._models import Model, Reference, reference
@@ -42,8 +43,8 @@ class Fit:
     """Take the least number of Gaussians, up to 12, that leaves no channel a larger error (Eq. 4), instead of --count."""
     model: tyro.conf.EnumChoicesFromValues[Model] = Model.DIPOLE
     """Of coefficients: what makes a profile of them. The layers of a material are multipoles, or are walked by Monte Carlo."""
-    cut: float = 0.2
-    """Of photon beams and Monte Carlo, which are infinite at the origin: where the fit begins, in mean free paths."""
+    cut: Annotated[float | None, tyro.conf.arg(metavar="PATHS")] = None
+    """Of photon beams and Monte Carlo, which are infinite at the origin: where the fit begins, in mean free paths. None: 0.2."""
     photons: int = 1_000_000
     """Of Monte Carlo: how many walk."""
     single_scattering: bool = False
@@ -126,7 +127,7 @@ class Fit:
         made: Reference,
         fitted: sj.FitResult,
     ) -> None:
-        # The surface keeps the library's defaults; its index is that of the medium it bounds, if one is known.
+        # The index of a surface is that of the medium it bounds, if one is known; the rest is what the file says, if it says it.
         measured = isinstance(coefficients, sj.Tabulated)
         fitted_to = f"{'profile' if measured else 'coefficients'} of {self.medium}"
         source = {"provenance": f"fitted by splatjax {sj.__version__} to the {fitted_to}"}
@@ -140,7 +141,9 @@ class Fit:
             sj.save_material(sj.Material(fitted.gaussians), output, source=source, fit={"profile": "measured"} | how)
         else:
             medium = coefficients.medium if isinstance(coefficients, sj.Dipole) else coefficients.top.medium
-            material = sj.Material(fitted.gaussians, eta=medium.eta[0], single_scattering=made.single)
+            surface, said = surface_and_source(self.medium)
+            source = said | {"provenance": "; ".join([*filter(None, [said.get("provenance")]), source["provenance"]])}
+            material = sj.Material(fitted.gaussians, **({"eta": medium.eta[0]} | surface), single_scattering=made.single)
             known = (sj.Dipole, sj.BetterDipole, sj.PhotonBeam, sj.LayeredMultipole)
             if not isinstance(made.profile, known):
                 model = "photon beam" if self.model is Model.PHOTON_BEAM else f"Monte Carlo, {self.photons} photons"

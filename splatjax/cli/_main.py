@@ -1,6 +1,9 @@
 """From words on a command line to a command, and from an error to one clear line."""
 
+import os
 import sys
+import traceback
+import warnings
 from collections.abc import Sequence
 from typing import Annotated
 
@@ -14,6 +17,7 @@ from ._fit import Fit
 from ._materials import Materials
 from ._recover import Recover
 from ._render import Render
+from ._report import note
 from ._sample import Sample
 from ._turntable import Turntable
 
@@ -29,7 +33,8 @@ _Command = (
 )
 _DESCRIPTION = """Render translucent materials, and find the sums of Gaussians that stand for them. Lengths are in mm.
 
-`splatjax COMMAND --help` explains a command."""
+`splatjax COMMAND --help` explains a command. With --debug, an error shows where it arose."""
+_DEBUG = "--debug"
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -39,22 +44,47 @@ def main(args: Sequence[str] | None = None) -> int:
 
     - `args`: the words after `splatjax`; those of the process when not given.
 
-    **Returns:** the exit status: 0, or 2 after one line on stderr that says what is wrong; 130 when interrupted.
+    **Returns:** the exit status: 0; 2 after one line on stderr that says what is wrong with what was given; 1 after one that says
+    what is wrong with splatjax; 130 when interrupted, 141 when nobody reads on.
     """
-    command = tyro.cli(_Command, prog="splatjax", description=_DESCRIPTION, args=args)
+    words = list(sys.argv[1:] if args is None else args)
+    debug = _DEBUG in words
+    command = tyro.cli(_Command, prog="splatjax", description=_DESCRIPTION, args=[word for word in words if word != _DEBUG])
     try:
-        prepare_jax()
-        command.run()
-    except (ValueError, OSError, eqx.EquinoxRuntimeError) as error:
-        print(f"splatjax: {_one_line(error)}", file=sys.stderr)
-        return 2
+        with warnings.catch_warnings():
+            warnings.showwarning = lambda message, category, *_, **__: _show_warning(message, category)  # ty: ignore[invalid-assignment]
+            prepare_jax()
+            command.run()
+            sys.stdout.flush()
+    except (BrokenPipeError, SystemExit):  # of a pipe that rich was writing to
+        # Python would try once more when it ends.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 141
     except KeyboardInterrupt:
         print("splatjax: interrupted", file=sys.stderr)
         return 130
+    except Exception as error:
+        if debug:
+            traceback.print_exc()
+        said, status = _said(error)
+        print(f"splatjax: {said}", file=sys.stderr)
+        return status
     return 0
 
 
-def _one_line(error: Exception) -> str:
+def _said(error: Exception) -> tuple[str, int]:
+    """Give one line about an error, and the exit status: 2 for what the user can mend, 1 for what we must."""
+    words = " ".join(str(error).split())
     if isinstance(error, OSError) and error.strerror and error.filename is not None:
-        return f"{error.filename}: {error.strerror}"
-    return " ".join(str(error).split()) or type(error).__name__
+        return f"{error.filename}: {error.strerror}", 2
+    if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in words:
+        return "this takes more memory than there is; take fewer splats, or a smaller picture", 2
+    if isinstance(error, ValueError | OSError | eqx.EquinoxRuntimeError):
+        return words or type(error).__name__, 2
+    return f"a fault of splatjax itself: {type(error).__name__}: {words}; please report it with what {_DEBUG} shows", 1
+
+
+def _show_warning(message: Warning | str, category: type[Warning]) -> None:
+    """Show what a user should know in one line; what is meant for developers not at all."""
+    if issubclass(category, UserWarning):
+        note(" ".join(str(message).split()))

@@ -11,6 +11,8 @@ from rich.progress import Progress
 import splatjax as sj
 from splatjax.scattering import AbstractRadialRule
 
+_CUT = 0.2  # mean free paths
+
 
 class Model(Enum):
     """Names of the models."""
@@ -30,15 +32,22 @@ class Reference:
     single: sj.SingleScattering | None = None
 
 
-def reference(coefficients: sj.Dipole | sj.LayeredMultipole, model: Model, cut: float, photons: int, apart: bool) -> Reference:
-    """Give what a model makes of a medium or of layers; `cut` is in mean free paths.
+def reference(
+    coefficients: sj.Dipole | sj.LayeredMultipole, model: Model, cut: float | None, photons: int, apart: bool
+) -> Reference:
+    """Give what a model makes of a medium or of layers; `cut` is in mean free paths, 0.2 if it is not given.
 
     With `apart` light that scatters once is taken out of the profile.
 
-    **Raises:** `ValueError` for layers and a model that knows a half space alone, and for single scattering taken out of layers
-    or of a dipole.
+    **Raises:** `ValueError` for layers and a model that knows a half space alone, for a cut of what is finite, and for single
+    scattering taken out of layers or of a dipole.
     """
     layered = isinstance(coefficients, sj.LayeredMultipole)
+    if cut is None:
+        cut = _CUT
+    elif not (model is Model.MONTE_CARLO or (model is Model.PHOTON_BEAM and not apart)):
+        what = f"--model {model.value}{' with --single-scattering' if apart else ''}"
+        raise ValueError(f"--cut has no effect on {what}, which is finite at the origin; leave it out")
     if apart:
         return _apart(coefficients, model, cut, photons)
     if model is Model.DIPOLE:

@@ -3,7 +3,7 @@
 import os
 import secrets
 from collections.abc import Generator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 
@@ -11,10 +11,11 @@ from pathlib import Path
 def atomic_path(path: str | os.PathLike[str]) -> Generator[Path, None, None]:
     """Give a temporary path beside `path`, with its suffix, to write to; it takes the name `path` when the block ends well.
 
-    When the block raises, the temporary file is removed and what stood at `path` before is untouched.
+    When the block raises, the temporary file is removed and what stood at `path` before is untouched. A process that is killed
+    can remove nothing: what it leaves is removed when the same file is written next.
 
     **Raises:** `FileNotFoundError` when the folder does not exist, `NotADirectoryError` when it is none, `IsADirectoryError`
-    when `path` is a folder.
+    when `path` is a folder, `OSError` that names `path` when it cannot be written.
     """
     path = Path(path)
     folder = path.parent
@@ -24,9 +25,50 @@ def atomic_path(path: str | os.PathLike[str]) -> Generator[Path, None, None]:
         raise NotADirectoryError(f"{path}: {folder} is a file; name a folder that exists")
     if path.is_dir():
         raise IsADirectoryError(f"{path}: is a folder; name a file")
+    _remove_left_behind(path)
     temporary = folder / f".{path.stem}-{secrets.token_hex(4)}{path.suffix}"
     try:
-        yield temporary
+        held = os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o666)
+        try:
+            with suppress(OSError):  # where files cannot be held, what a kill leaves behind stays
+                _lock(held)
+            yield temporary
+            os.fsync(held)
+        finally:
+            os.close(held)
         os.replace(temporary, path)
+    except OSError as error:
+        if error.filename not in (None, str(temporary), temporary):
+            raise
+        reason = error.strerror or " ".join(str(error).split())
+        raise type(error)(error.errno, f"cannot be written: {reason}; what stood there before is untouched", str(path)) from error
     finally:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
+
+
+def _remove_left_behind(path: Path) -> None:
+    """Remove temporary files of this one that nobody holds any more."""
+    head, tail = f".{path.stem}-", path.suffix
+    for name in os.listdir(path.parent):
+        token = name[len(head) : len(name) - len(tail)]
+        if name.startswith(head) and name.endswith(tail) and len(token) == 8 and set(token) <= set("0123456789abcdef"):
+            with suppress(OSError):
+                left = os.open(path.parent / name, os.O_RDWR)
+                try:
+                    _lock(left)
+                    os.unlink(path.parent / name)
+                finally:
+                    os.close(left)
+
+
+def _lock(file: int) -> None:
+    """Hold a file until it is closed or the process ends, however it ends.
+
+    **Raises:** `OSError` when another holds it, or where files cannot be held.
+    """
+    try:
+        import fcntl  # not on Windows
+    except ImportError as error:
+        raise OSError("files cannot be held here") from error
+    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

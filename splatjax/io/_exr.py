@@ -1,5 +1,6 @@
 """A frame with all its layers in one OpenEXR file."""
 
+import errno
 import os
 import sys
 import tempfile
@@ -59,7 +60,11 @@ def write_exr(path: str | os.PathLike[str], frame: Frame, *, variances: Sequence
     if variances is not None:
         header[_VARIANCES] = _floats(variances)
     with atomic_path(path) as temporary, OpenEXR.File(header, planes) as file:
-        file.write(str(temporary))
+        try:
+            file.write(str(temporary))
+        except Exception as error:  # the package raises whatever its C++ side throws
+            said = " ".join(str(error).replace(str(temporary), "").split())
+            raise OSError(errno.EIO, said, str(temporary)) from None
 
 
 def read_exr(path: str | os.PathLike[str]) -> Frame:
@@ -89,7 +94,8 @@ def read_picture(path: str | os.PathLike[str]) -> np.ndarray:
     _, planes = _read(path)
     for names in ("RGB", "Y"):
         if set(names) <= set(planes):
-            return np.stack([planes[name] for name in names], axis=-1).astype(np.float64)
+            with np.errstate(invalid="ignore"):  # of NaN that signals
+                return np.stack([planes[name] for name in names], axis=-1).astype(np.float64)
     raise ValueError(f"{path}: has neither R, G and B nor Y; it has {', '.join(sorted(planes))}")
 
 

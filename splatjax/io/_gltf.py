@@ -1,6 +1,8 @@
 """Meshes from glTF 2.0 and GLB files."""
 
 import math
+from collections.abc import Generator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -9,7 +11,7 @@ import numpy as np
 
 from ._gltf_data import GltfData
 from ._pictures import read_color
-from ._pieces import Piece, moderate
+from ._pieces import Piece, check_places, moderate
 from ._room import check_room
 
 _KNOWN = {"KHR_mesh_quantization", "KHR_texture_transform", "EXT_texture_webp", "KHR_lights_punctual"}
@@ -24,7 +26,7 @@ def read_gltf(path: Path) -> list[Piece]:
 
     **Raises:** `ValueError` for what is no such file, is cut short, or needs an extension that is not known here.
     """
-    try:
+    with _named(path):
         data = GltfData(path)
         needed = set(data.content.get("extensionsRequired", ()))
         unknown = sorted(name for name in needed - _KNOWN if not name.startswith("KHR_materials_"))
@@ -41,8 +43,15 @@ def read_gltf(path: Path) -> list[Piece]:
         corners = sum(len(piece.faces) * 3 + len(piece.vertices) for piece, _ in pieces)
         check_room(f"{path}: a scene of {corners} corners", _BYTES_PER_CORNER * corners, "export a part of it")
         return [_moved(piece, matrix) for piece, matrix in pieces]
+
+
+@contextmanager
+def _named(path: Path) -> Generator[None, None, None]:
+    """Let what is wrong with a file name it."""
+    try:
+        yield
     except (KeyError, IndexError, TypeError, AttributeError, OverflowError, RecursionError) as error:
-        said = f"{type(error).__name__} {error}"
+        said = f"{type(error).__name__} {' '.join(str(error).split())}"
         raise ValueError(f"{path}: cannot be read as glTF: an entry is missing or wrong ({said}); write it again") from None
     except (FileNotFoundError, ValueError) as error:
         if str(error).startswith(str(path)):
@@ -104,6 +113,7 @@ def _primitive(data: GltfData, primitive: dict[str, Any]) -> Piece | None:
         return None
     attributes = primitive["attributes"]
     vertices = _table(data, attributes["POSITION"], 3)
+    check_places(data.path, vertices)
     if "indices" in primitive:
         order = data.values(primitive["indices"])
         if order.dtype.kind != "u" or order.shape[1] != 1:
@@ -177,12 +187,13 @@ def _color(factor: Any) -> tuple[float, ...]:
 
 
 def _texture(data: GltfData, index: Any) -> np.ndarray:
-    texture = data.entry("textures", index)
-    source = texture.get("extensions", {}).get("EXT_texture_webp", {}).get("source", texture.get("source"))
-    if source is None:
-        raise ValueError(f"{data.path}: its texture is packed in a way that is not read here; export it as PNG or JPEG")
-    image = data.entry("images", source)
-    return read_color(data.path, bytes(data.view(image["bufferView"])) if "bufferView" in image else data.named(image["uri"]))
+    with _named(data.path):
+        texture = data.entry("textures", index)
+        source = texture.get("extensions", {}).get("EXT_texture_webp", {}).get("source", texture.get("source"))
+        if source is None:
+            raise ValueError("its texture is packed in a way that is not read here, export it as PNG or JPEG")
+        image = data.entry("images", source)
+        return read_color(data.path, bytes(data.view(image["bufferView"])) if "bufferView" in image else data.named(image["uri"]))
 
 
 def _moved(piece: Piece, matrix: np.ndarray) -> Piece:

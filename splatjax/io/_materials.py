@@ -1,6 +1,5 @@
 """Materials as TOML files: optical coefficients, where they come from, and the Gaussians fitted to them."""
 
-import difflib
 import os
 import re
 import tomllib
@@ -26,11 +25,12 @@ from splatjax.scattering import (
 from splatjax.scene import Material
 
 from ._atomic import atomic_path
-from ._tables import Table, as_array
+from ._tables import Table, as_array, nearest
 
 COEFFICIENT_UNIT = "1/mm"
 VARIANCE_UNIT = "mm^2"
 THICKNESS_UNIT = "mm"
+_COEFFICIENTS = {"unit", "sigma_a", "sigma_s_prime", "eta"}
 _TABLES = ("medium", "layers", "surface", "single_scattering", "source", "fit")
 
 
@@ -57,8 +57,7 @@ def material_path(name_or_path: str | os.PathLike[str]) -> Path:
     known = materials()
     if name_or_path in known:
         return profiles_folder() / f"{name_or_path}.toml"
-    near = difflib.get_close_matches(name_or_path.lower(), known, n=1)
-    hint = f"did you mean {near[0]!r}?" if near else f"known are {', '.join(known)}"
+    hint = nearest(name_or_path, known)
     raise ValueError(f"{name_or_path}: is no known material; {hint} (a file is named by its path: ./{name_or_path}.toml)")
 
 
@@ -82,14 +81,22 @@ def load_material(name_or_path: str | os.PathLike[str]) -> Material:
     if np.any(np.diff(variances) <= 0):
         raise ValueError(f"{path}: [fit] variances must ascend, each once; got {variances.tolist()}")
     weights = fit.matrix("weights", len(variances))
-    surface = Table(path, "surface", tables.get("surface", {}))
-    eta = surface.number("eta", "positive", lambda x: x > 0, 1.4)
-    specular = surface.number("specular", "at least 0", lambda x: x >= 0, 0.18)
-    roughness = surface.number("roughness", "in (0, 1]", lambda x: 0 < x <= 1, 0.3)
     single = None
     if "single_scattering" in tables:
         single = _single_scattering(Table(path, "single_scattering", tables["single_scattering"]), weights.shape[1])
-    return Material(SumOfGaussians(as_array(variances), as_array(weights)), eta, specular, roughness, single)
+    surface = {"eta": 1.4, "specular": 0.18, "roughness": 0.3} | _surface(path, tables)
+    return Material(SumOfGaussians(as_array(variances), as_array(weights)), **surface, single_scattering=single)
+
+
+def surface_and_source(name_or_path: str | os.PathLike[str]) -> tuple[dict[str, float], dict[str, Any]]:
+    r"""Give what a file says of a material besides its coefficients: its surface, as `Material` takes it, and its [source].
+
+    **Raises:** `ValueError` as `load_material` does.
+    """
+    path, tables = _read(name_or_path)
+    source = tables.get("source", {})
+    Table(path, "source", source)
+    return _surface(path, tables), source
 
 
 def load_medium(name_or_path: str | os.PathLike[str]) -> Medium:
@@ -170,6 +177,17 @@ def save_material(
         temporary.write_text(_one_line_arrays(tomli_w.dumps(tables)), encoding="utf-8")
 
 
+def _surface(path: Path, tables: dict[str, Any]) -> dict[str, float]:
+    surface = Table(path, "surface", tables.get("surface", {}))
+    surface.only({"eta", "specular", "roughness"})
+    physical = {
+        "eta": ("positive", lambda x: x > 0),
+        "specular": ("at least 0", lambda x: x >= 0),
+        "roughness": ("in (0, 1]", lambda x: 0 < x <= 1),
+    }
+    return {name: surface.number(name, *physical[name], 0.0) for name in surface.table}
+
+
 def _description(profile: Dipole | BetterDipole | PhotonBeam | LayeredMultipole) -> str:
     moments = "exact Fresnel moments" if isinstance(profile.fresnel, ExactFresnel) else "fitted Fresnel moments"
     match profile:
@@ -209,6 +227,7 @@ def _layered(path: Path, found: Any) -> LayeredMultipole:
 
 
 def _layer(table: Table) -> Layer | Film:
+    table.only(_COEFFICIENTS | {"optical_depth", "thickness", "thickness_unit"})
     if "optical_depth" in table.table:
         return Film(as_array(table.numbers("optical_depth", "at least 0", lambda x: x >= 0)))
     table.unit(THICKNESS_UNIT, "thickness_unit")
@@ -224,6 +243,7 @@ def _layer(table: Table) -> Layer | Film:
 
 
 def _single_scattering(table: Table, channels: int) -> SingleScattering:
+    table.only(_COEFFICIENTS | {"strength"})
     medium = _medium(table)
     strength = np.ones(len(medium.eta))
     if "strength" in table.table:
@@ -259,14 +279,17 @@ def _read(name_or_path: str | os.PathLike[str]) -> tuple[Path, dict[str, Any]]:
         raise ValueError(f"{path}: is no TOML file: {error}") from None
     unknown = sorted(set(tables) - set(_TABLES))
     if unknown:
-        known = "[medium] or [[layers]], [surface], [single_scattering], [source] and [fit]"
-        raise ValueError(f"{path}: has an unknown entry {unknown[0]!r}; a material has {known}")
+        known = "a material has [medium] or [[layers]], [surface], [single_scattering], [source] and [fit]"
+        raise ValueError(f"{path}: has an unknown entry {unknown[0]!r}; {nearest(unknown[0], _TABLES)} ({known})")
     if not {"medium", "layers", "fit"} & set(tables):
         raise ValueError(f"{path}: has neither [medium] nor [[layers]] nor [fit]; a material needs one of them")
     if {"medium", "layers"} <= set(tables):
         raise ValueError(f"{path}: has both [medium] and [[layers]]; a material is one or the other")
+    _surface(path, tables)
     if "medium" in tables:
-        _medium(Table(path, "medium", tables["medium"]))
+        medium = Table(path, "medium", tables["medium"])
+        medium.only(_COEFFICIENTS)
+        _medium(medium)
     if "layers" in tables:
         _layered(path, tables["layers"])
     return path, tables

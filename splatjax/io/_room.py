@@ -1,7 +1,7 @@
 """Whether something fits into memory, asked before it is begun."""
 
+import math
 import os
-import resource
 from pathlib import Path
 
 
@@ -23,6 +23,10 @@ def check_room(what: str, needed: float, remedy: str) -> None:
 
 def free_bytes() -> float:
     """Give how much memory this process may still take: what the machine has free, within the limit of its address space."""
+    try:
+        import resource  # not on Windows
+    except ImportError:
+        return math.inf
     free = float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
     try:
         lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()

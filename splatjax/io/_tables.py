@@ -1,5 +1,7 @@
 """Tables of TOML files, and the errors that say what an entry must be."""
 
+import difflib
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +28,7 @@ class Table:
         """Refuse what is not known."""
         unknown = sorted(set(self.table) - known)
         if unknown:
-            raise ValueError(f"{self.where} has an unknown entry {unknown[0]!r}; known are {', '.join(sorted(known))}")
+            raise ValueError(f"{self.where} has an unknown entry {unknown[0]!r}; {nearest(unknown[0], known)}")
 
     def unit(self, expected: str, name: str = "unit") -> None:
         found = self.table.get(name)
@@ -71,6 +73,13 @@ class Table:
                 f"{self.where} {name} must have {rows} rows, one per variance, of equal length; its rows have {lengths}"
             )
         return np.asarray(found, np.float64)
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """Say which of the known names is nearest to one that is not; all of them, if none is near."""
+    known = sorted(known)
+    near = difflib.get_close_matches(name.lower(), known, n=1)
+    return f"did you mean {near[0]!r}?" if near else f"known are {', '.join(known)}"
 
 
 def _is_number(value: Any) -> bool:

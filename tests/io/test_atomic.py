@@ -1,8 +1,16 @@
 """Files are written whole or not at all."""
 
-import pytest
+import resource
+import signal
+import subprocess
+import sys
 
-from splatjax.io import atomic_path
+import numpy as np
+import pytest
+from test_pictures import some_frame
+
+from splatjax.geometry import complete_splats
+from splatjax.io import atomic_path, load_material, save_material, write_exr, write_png, write_record, write_splats
 
 
 def test_file_takes_its_name_when_the_block_ends_well(tmp_path):
@@ -43,3 +51,68 @@ def test_a_folder_is_no_file(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(NotADirectoryError, match="is a file"), atomic_path(tmp_path / "file" / "a.txt"):
         pass
+
+
+def test_what_a_kill_left_behind_goes_when_the_file_is_written_next(tmp_path):
+    """A process that holds its temporary file keeps it; those of other files, and whatever else lies there, stay."""
+    target = tmp_path / "a.txt"
+    left, other, alike = (tmp_path / name for name in (".a-0123abcd.txt", ".b-0123abcd.txt", ".a-0123abcx.txt"))
+    for path in (left, other, alike):
+        path.write_text("half")
+    with atomic_path(target) as first:
+        assert not left.exists()
+        with atomic_path(target) as second:
+            assert first.exists()
+            second.write_text("second")
+        first.write_text("first")
+    assert target.read_text() == "first"
+    assert {path.name for path in tmp_path.iterdir()} == {"a.txt", other.name, alike.name}
+
+
+KILLED = """
+import os, signal, sys
+from splatjax.io import atomic_path
+with atomic_path(sys.argv[1]) as temporary:
+    temporary.write_text("ha")
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_a_kill_leaves_the_file_that_stood_there(tmp_path):
+    target = tmp_path / "a.txt"
+    target.write_text("before")
+    assert subprocess.run([sys.executable, "-c", KILLED, str(target)], check=False).returncode == -signal.SIGKILL
+    assert target.read_text() == "before"
+    assert len(list(tmp_path.iterdir())) == 2
+    with atomic_path(target) as temporary:
+        temporary.write_text("after")
+    assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
+
+
+WRITERS = {
+    "a.exr": lambda path: write_exr(path, some_frame(height=40, width=40)),
+    "a.png": lambda path: write_png(path, np.random.default_rng(0).uniform(size=(60, 60, 3))),
+    "a.ply": lambda path: write_splats(path, complete_splats(np.random.default_rng(0).normal(size=(400, 3)))),
+    "a.toml": lambda path: save_material(load_material("skin"), path, source={"citation": 9000 * "x"}),
+    "a.json": lambda path: write_record(path, {"x": 9000 * "x"}),
+}
+
+
+@pytest.fixture
+def small_files():
+    """No file may grow beyond 4 kB: what a full disk does, without one."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, before[1]))
+    yield
+    resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_full_disk_leaves_what_stood_there_and_no_litter(tmp_path, name, small_files):
+    target = tmp_path / name
+    target.write_text("before")
+    with pytest.raises(OSError, match=r"cannot be written: .*what stood there before is untouched") as caught:
+        WRITERS[name](target)
+    assert caught.value.filename == str(target)
+    assert target.read_text() == "before"
+    assert list(tmp_path.iterdir()) == [target]

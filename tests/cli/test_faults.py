@@ -1,0 +1,127 @@
+"""What the program says when something goes wrong, and with which status it ends."""
+
+import os
+import subprocess
+import sys
+import tomllib
+import warnings
+
+import jax
+import pytest
+from commands import failure, plate
+
+from splatjax.cli import _materials, main
+
+OWN = """[medium]
+unit = "1/mm"
+sigma_a = [0.0021, 0.0041, 0.0071]
+sigma_s_prime = [2.19, 2.62, 3.0]
+eta = 1.5
+[surface]
+roughness = 0.11
+specular = 0.07
+[source]
+citation = "measured by hand"
+provenance = "the third sample"
+"""
+
+
+@pytest.fixture
+def spoilt(monkeypatch):
+    """`splatjax materials` with an error of choice in it."""
+
+    def with_error(error):
+        def run(self):
+            raise error
+
+        monkeypatch.setattr(_materials.Materials, "run", run)
+
+    return with_error
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "said"),
+    [
+        (ValueError("a.ply: is\nempty"), 2, "splatjax: a.ply: is empty\n"),
+        (OSError(28, "No space left on device", "a.exr"), 2, "splatjax: a.exr: No space left on device\n"),
+        (MemoryError(), 2, "splatjax: this takes more memory than there is; take fewer splats, or a smaller picture\n"),
+        (RuntimeError("RESOURCE_EXHAUSTED: Out of\nmemory"), 2, "splatjax: this takes more memory than there is"),
+        (TypeError("no such\nthing"), 1, "splatjax: a fault of splatjax itself: TypeError: no such thing; please report it with"),
+        (KeyboardInterrupt(), 130, "splatjax: interrupted\n"),
+    ],
+)
+def test_status_says_whose_fault_it_is(error, status, said, spoilt, capsys):
+    spoilt(error)
+    assert main(["materials"]) == status
+    captured = capsys.readouterr()
+    assert captured.err.startswith(said)
+    assert captured.err.count("\n") == 1
+
+
+@pytest.mark.parametrize("words", [["--debug", "materials"], ["materials", "--debug"]])
+def test_debug_shows_where_it_arose(words, spoilt, capsys):
+    spoilt(ValueError("a.ply: is empty"))
+    assert main(words) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0].startswith("Traceback")
+    assert lines[-1] == "splatjax: a.ply: is empty"
+
+
+def test_what_a_user_should_know_is_a_line(monkeypatch, capsys):
+    def run(self):
+        warnings.warn("a.obj: wears\nno texture", stacklevel=1)
+        warnings.warn("of no concern", DeprecationWarning, stacklevel=1)
+
+    monkeypatch.setattr(_materials.Materials, "run", run)
+    with warnings.catch_warnings():
+        warnings.simplefilter("default")
+        assert main(["materials"]) == 0
+    assert capsys.readouterr().err == "a.obj: wears no texture\n"
+
+
+@pytest.mark.long
+def test_nobody_reads_on():
+    """The other end of the pipe is closed before the first word."""
+    reading, writing = os.pipe()
+    os.close(reading)
+    command = [sys.executable, "-c", "import sys; from splatjax.cli import main; sys.exit(main(['materials']))"]
+    ended = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE, text=True, check=False)
+    os.close(writing)
+    assert ended.returncode == 141
+    assert ended.stderr == ""
+
+
+def test_names_that_are_nearly_right_are_told(tmp_path, capsys):
+    path = tmp_path / "mine.toml"
+    for right, wrong in (("roughness", "roughnes"), ("sigma_a", "sigma_A"), ("[surface]", "[surfaces]")):
+        path.write_text(OWN.replace(right, wrong))
+        assert f"unknown entry {wrong.strip('[]')!r}; did you mean {right.strip('[]')!r}?" in failure(["fit", path], capsys)
+    path.write_text(OWN.replace('"1/mm"', '"1/cm"'))
+    assert "unit must be \"1/mm\"; it is '1/cm': convert the numbers" in failure(["fit", path], capsys)
+    for value in ("1e-60", "1e60", "true", '"0.1"'):  # nothing, infinite in single precision; no number at all
+        path.write_text(OWN.replace("2.19", value))
+        said = failure(["render", plate(tmp_path / "plate.ply"), "--material", path, "--output", tmp_path / "o.exr"], capsys)
+        assert "sigma_s_prime must be" in said
+
+
+def test_a_cut_without_effect_is_refused(capsys):
+    for more in (["--model", "photon-beam", "--single-scattering"], [], ["--model", "better-dipole"]):
+        said = failure(["fit", "skin1", *more, "--cut", "0.3"], capsys)
+        assert "--cut has no effect on --model" in said
+        assert "leave it out" in said
+
+
+@pytest.mark.once
+def test_a_fit_to_its_own_file_keeps_what_stood_there(tmp_path, capsys):
+    path = tmp_path / "mine.toml"
+    path.write_text(OWN)
+    assert main(["fit", str(path), "--count", "1", "--output", str(path)]) == 0
+    before, after = tomllib.loads(OWN), tomllib.loads(path.read_text())
+    assert after["medium"]["sigma_a"] == before["medium"]["sigma_a"]
+    assert after["surface"] == {"eta": 1.5, "specular": 0.07, "roughness": 0.11}
+    assert after["source"]["citation"] == "measured by hand"
+    assert after["source"]["provenance"].startswith("the third sample; fitted by splatjax")
+    assert len(after["fit"]["variances"]) == 1
+    with jax.enable_x64(True):
+        assert main(["fit", str(path), "--count", "1", "--output", str(path)]) == 0
+    assert tomllib.loads(path.read_text())["surface"] == after["surface"]
