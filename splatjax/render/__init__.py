@@ -4,7 +4,8 @@ from ._gathered import gather_picture as gather_picture, gather_picture_and_slop
 from ._gathered import GatheredPicture as GatheredPicture
 from ._jacobian import picture_jacobian as picture_jacobian, PictureJacobian as PictureJacobian
 from ._lighting import AbstractLighting as AbstractLighting, entering_light as entering_light
-from ._lighting import EnteringLight as EnteringLight, LightAtSplats as LightAtSplats, LightOnSplats as LightOnSplats
+from ._lighting import EnteringLight as EnteringLight, let_light_in as let_light_in
+from ._lighting import LightAtSplats as LightAtSplats, LightOnSplats as LightOnSplats
 from ._lighting import surface_attributes as surface_attributes, surface_parameters as surface_parameters
 from ._plan import Plan as Plan, plan as plan, ShadowPlan as ShadowPlan
 from ._render import diffuse as diffuse, light_on_splats as light_on_splats, render as render

@@ -1,0 +1,160 @@
+"""A triangle mesh with its textures, on the device: what mesh-based rivals draw."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from splatjax.geometry import Mesh, Textures
+from splatjax.scene import Splats
+from splatjax.shading import unit_normals
+from splatjax.splatting import Bounds
+
+from ._mesh_raster import Landing, SeenFaces, barycentrics, interpolate
+
+_OUTSIDE = 1e-6  # of the texture, that coordinates may reach beyond it
+
+
+class TexturedMesh(eqx.Module):
+    r"""Triangles whose charts lie in the unit square, and the maps they wear; mm.
+
+    **Attributes:** (all floats differentiable)
+
+    - `vertices`, `faces`, `normals`, `uvs`: as in `splatjax.geometry.Mesh`.
+    - `albedo`, `specular`, `roughness`, `normal`: as in `splatjax.geometry.Textures`.
+    """
+
+    vertices: Float[Array, "vertices 3"]
+    faces: Int[Array, "faces 3"]
+    normals: Float[Array, "vertices 3"]
+    uvs: Float[Array, "faces 3 2"]
+    albedo: Float[Array, "h w channels"] | None = None
+    specular: Float[Array, "h2 w2"] | None = None
+    roughness: Float[Array, "h3 w3"] | None = None
+    normal: Float[Array, "h4 w4 3"] | None = None
+
+    @classmethod
+    def of(cls, mesh: Mesh, textures: Textures | None = None) -> "TexturedMesh":
+        """Put a mesh and its textures on the device, in JAX's default precision.
+
+        **Raises:** `ValueError` for a mesh without texture coordinates, or with some outside the unit square.
+        """
+        if mesh.uvs is None:
+            raise ValueError("the mesh has no texture coordinates, so light has no texture to be diffused in; give one with UVs")
+        low, high = float(mesh.uvs.min()), float(mesh.uvs.max())
+        if low < -_OUTSIDE or high > 1 + _OUTSIDE:
+            raise ValueError(
+                f"the mesh's texture coordinates reach from {low:g} to {high:g}; light is diffused in the unit square alone: "
+                "scale or move the charts into it"
+            )
+
+        def there(values):
+            return None if values is None else jnp.asarray(np.asarray(values, np.float64), dtype=float)
+
+        maps = () if textures is None else (textures.albedo, textures.specular, textures.roughness, textures.normal)
+        vertices, normals, uvs = (there(each) for each in (mesh.vertices, mesh.normals, mesh.uvs))
+        return cls(vertices, jnp.asarray(mesh.faces, jnp.int32), normals, uvs, *(there(each) for each in maps))
+
+    def corners(self) -> Float[Array, "faces 3 3"]:
+        """Give the positions of each triangle's corners, mm."""
+        return self.vertices[self.faces]
+
+    def bounds(self) -> Bounds:
+        """Give the sphere around it that shadow maps are laid around."""
+        corners = self.corners().reshape(-1, 3)  # a mesh that was cut has vertices without faces
+        center = 0.5 * (jnp.min(corners, axis=0) + jnp.max(corners, axis=0))
+        offset = corners - center[None]
+        return Bounds(center, 1.001 * jnp.sqrt(jnp.max(jnp.sum(offset * offset, axis=1))))
+
+    def lengths(self) -> tuple[Float[Array, " faces"], Float[Array, " faces"]]:
+        """Give how many mm of the surface a step of one along u, and along v, is; 0 on a face without a chart."""
+        along_u, along_v, _ = self._along()
+        return jnp.linalg.norm(along_u, axis=1), jnp.linalg.norm(along_v, axis=1)
+
+    def _along(self) -> tuple[Float[Array, "faces 3"], Float[Array, "faces 3"], Float[Array, " faces"]]:
+        """Give the derivatives of the position in u and v, and twice the area of the chart, negative where it is mirrored."""
+        corners = self.corners()
+        edges, steps = corners[:, 1:] - corners[:, :1], self.uvs[:, 1:] - self.uvs[:, :1]
+        doubled = steps[:, 0, 0] * steps[:, 1, 1] - steps[:, 0, 1] * steps[:, 1, 0]
+        inverse = jnp.where(doubled != 0, 1 / jnp.where(doubled != 0, doubled, 1.0), 0.0)[:, None]
+        along_u = inverse * (steps[:, 1, 1, None] * edges[:, 0] - steps[:, 0, 1, None] * edges[:, 1])
+        along_v = inverse * (steps[:, 0, 0, None] * edges[:, 1] - steps[:, 1, 0, None] * edges[:, 0])
+        return along_u, along_v, doubled
+
+
+class SurfaceTexels(eqx.Module):
+    """What a picture sees of a textured mesh, point by point, row by row."""
+
+    points: Splats
+    """As splats without extent: positions, unit normals, albedo, specular and roughness."""
+    uvs: Float[Array, "points 2"]
+    seen: SeenFaces
+
+    def picture(self, values: Float[Array, "points *rows"]) -> Float[Array, "height width *rows"]:
+        """Lay values out as the picture."""
+        return values.reshape(*self.seen.faces.shape, *values.shape[1:])
+
+
+def surface_texels(mesh: TexturedMesh, landing: Landing, seen: SeenFaces) -> SurfaceTexels:
+    """Give position, normal and textures of what every pixel of a landing sees. Differentiable in the mesh and the landing.
+
+    Where a pixel sees nothing, position and normal are 0.
+    """
+    shares = barycentrics(landing, seen)
+    carried = jnp.concatenate([mesh.corners(), mesh.normals[mesh.faces], mesh.uvs], axis=2)
+    count = seen.faces.size
+    found = interpolate(carried, seen, shares).reshape(count, -1)
+    positions, normals, uvs = found[:, :3], unit_normals(found[:, 3:6]), found[:, 6:]
+    if mesh.normal is not None:
+        normals = _perturbed(mesh, seen.faces.reshape(-1), normals, look_up(mesh.normal, uvs))
+    albedo, specular, roughness = (
+        None if each is None else look_up(each, uvs) for each in (mesh.albedo, mesh.specular, mesh.roughness)
+    )
+    nothing = jnp.zeros(count, positions.dtype)
+    return SurfaceTexels(Splats(positions, normals, nothing, nothing, albedo, specular, roughness), uvs, seen)
+
+
+def look_up(picture: Float[Array, "h w *channels"], uvs: Float[Array, "points 2"]) -> Float[Array, "points *channels"]:
+    """Look a picture up at texture coordinates (v up), bilinearly between the centers of its pixels, repeating it."""
+    height, width = picture.shape[:2]
+    weights, rows, columns = _four(uvs, height, width)
+    trailing = (slice(None), *(None,) * (picture.ndim - 2))
+    return sum(
+        weight[trailing] * picture[row % height, column % width]
+        for weight, row, column in zip(weights, rows, columns, strict=True)
+    )
+
+
+def look_up_charts(
+    picture: Float[Array, "h w channels"], valid: Float[Array, "h w"], uvs: Float[Array, "points 2"]
+) -> Float[Array, "points channels"]:
+    """Look a picture up that is known on the charts alone (`valid` 1, not 0): by the texels that are; 0 where none is."""
+    height, width = picture.shape[:2]
+    weights, rows, columns = _four(uvs, height, width)
+    total, share = jnp.zeros((len(uvs), picture.shape[2]), picture.dtype), jnp.zeros(len(uvs), picture.dtype)
+    for weight, row, column in zip(weights, rows, columns, strict=True):
+        at = jnp.clip(row, 0, height - 1), jnp.clip(column, 0, width - 1)
+        known = weight * valid[at]
+        total, share = total + known[:, None] * picture[at], share + known
+    return jnp.where(share[:, None] > 0, total / jnp.where(share > 0, share, 1.0)[:, None], 0.0)
+
+
+def _four(uvs: Float[Array, "points 2"], height: int, width: int):
+    """Give weights, rows and columns of the four pixels around points."""
+    x, y = uvs[:, 0] * width - 0.5, (1 - uvs[:, 1]) * height - 0.5
+    left, top = jnp.floor(x), jnp.floor(y)
+    a, b = x - left, y - top
+    left, top = left.astype(jnp.int32), top.astype(jnp.int32)
+    weights = (1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b
+    return weights, (top, top, top + 1, top + 1), (left, left + 1, left, left + 1)
+
+
+def _perturbed(mesh: TexturedMesh, faces: Int[Array, " points"], normals: Float[Array, "points 3"], tangent_space):
+    """Turn tangent-space normals into world space, as `splatjax.geometry` does for splats."""
+    along_u, _, doubled = mesh._along()
+    along_u, handedness = along_u[faces], jnp.sign(doubled)[faces][:, None]
+    tangent = unit_normals(along_u - jnp.sum(along_u * normals, axis=1, keepdims=True) * normals)
+    bitangent = handedness * jnp.cross(normals, tangent)
+    x, y, z = (tangent_space[:, axis, None] for axis in range(3))
+    turned = unit_normals(x * tangent + y * bitangent + z * normals)
+    return jnp.where(handedness == 0, normals, turned)

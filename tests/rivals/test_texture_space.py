@@ -1,0 +1,139 @@
+"""Texture-space diffusion: on a flat plane it is splat diffusion, if it knows how the chart is stretched."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from planes import HALF, camera_over, coordinates, gathered, painted, plane, splatted
+
+import splatjax as sj
+from splatjax import rivals
+from splatjax.diffusion import ExitOdds, Kernels, PlainMean, Sources
+from splatjax.geometry import Mesh
+
+SIZE = 192
+TWO = sj.SumOfGaussians(jnp.asarray([3.0, 0.5], float), jnp.asarray([[0.5, 0.6, 0.7], [0.5, 0.4, 0.3]], float))
+"""The wider first: layers keep the order of the Gaussians."""
+DULL = sj.Material(TWO, specular=0.0)
+FRONTAL = sj.DirectionalLight(jnp.asarray([0.0, 0.0, -1.0]), jnp.ones(3), cast_shadows=False)
+STILL = rivals.TextureSpaceSettings(SIZE, rivals.StretchCorrected(), rivals.OpaqueParts(), PlainMean())
+
+
+@eqx.filter_jit
+def diffused(mesh, settings, plan, uvs):
+    light = rivals.mesh_light(mesh, (FRONTAL,), settings.shadows, plan.shadows)
+    texels = rivals.lay_out(mesh, settings.resolution, plan.texture)
+    texture = rivals.diffuse_in_texture(mesh, texels, light, DULL, settings, plan.reaches)
+    return rivals.look_up_layers(texture, uvs), texture.renormalized
+
+
+def off_by(stretch: float, correction: rivals.AbstractStretch) -> float:
+    """How far the layers of the painted plane are from those of splats, of the peak; away from its edges."""
+    settings = dataclasses.replace(STILL, stretch=correction)
+    mesh = rivals.TexturedMesh.of(plane(stretch), painted(stretch, SIZE))
+    plan = rivals.plan_texture_space(mesh, (FRONTAL,), DULL, camera_over(6.0, 8), settings)
+    line = np.linspace(-HALF / 2, HALF / 2, 16)
+    points = np.column_stack([*(each.reshape(-1) for each in np.meshgrid(line, line)), np.zeros(256)])
+    ours, lost = diffused(mesh, settings, plan, jnp.asarray(coordinates(points, stretch), float))
+    assert 0 < lost[1] < lost[0] < 0.2
+    truth = splatted(points, TWO)
+    return float(np.max(np.abs(np.asarray(ours) - truth)) / np.max(truth))
+
+
+def test_on_a_plane_it_is_splat_diffusion():
+    assert off_by(1.0, rivals.StretchCorrected()) < 2e-3  # 1.4e-3
+    assert off_by(1.0, rivals.Uncorrected()) < 2e-3  # a chart that is not stretched needs no correction
+
+
+def test_a_stretched_chart_needs_the_correction():
+    assert off_by(3.0, rivals.StretchCorrected()) < 1e-2  # 7.6e-3: texels are three times as long
+    assert off_by(3.0, rivals.Uncorrected()) > 5e-2  # 1.1e-1
+
+
+@pytest.fixture(scope="module")
+def sheet():
+    """A white plane with sharp edges, from in front, seen with a rim of nothing around."""
+    mesh = rivals.TexturedMesh.of(plane(2.0))
+    settings = dataclasses.replace(STILL, resolution=64, thin_parts=rivals.TranslucentShadowMap(), normalization=ExitOdds())
+    lights = (dataclasses.replace(FRONTAL, cast_shadows=True),)
+    camera = camera_over(15.0, 32)
+    plan = rivals.plan_texture_space(mesh, lights, DULL, camera, settings)
+    return mesh, lights, camera, settings, plan
+
+
+def test_constant_light_stays_constant_up_to_the_edges(sheet):
+    mesh, lights, camera, settings, plan = sheet
+    found = rivals.render_texture_space(mesh, lights, DULL, camera, settings, plan)
+    on_chart = np.asarray(found.texture.layers)[:, np.asarray(found.texture.valid) > 0]
+    np.testing.assert_allclose(on_chart, 1.0, atol=1e-5)
+    frame = found.frame
+    covered = np.asarray(frame.coverage) > 0
+    assert np.mean(covered) == pytest.approx(0.64, abs=0.04)
+    np.testing.assert_allclose(np.asarray(frame.beauty)[covered], 1 / np.pi, rtol=1e-5)
+    rebuilt = jnp.einsum("gyxc,gc->yxc", frame.layers, frame.weights)
+    np.testing.assert_allclose(np.asarray(frame.diffuse), np.asarray(rebuilt), atol=1e-6)
+    assert np.all(np.isinf(np.asarray(frame.depth)[~covered]))
+    assert frame.overflow == 0
+
+
+def test_without_room_the_picture_is_nan_and_says_so(sheet):
+    mesh, lights, camera, settings, plan = sheet
+    small = dataclasses.replace(plan, camera=100)
+    frame = rivals.render_texture_space(mesh, lights, DULL, camera, settings, small).frame
+    assert frame.overflow > 1
+    assert np.all(np.isnan(np.asarray(frame.beauty)[np.asarray(frame.depth) < np.inf]))
+
+
+def test_bad_input_is_refused_in_one_sentence(sheet):
+    mesh, lights, camera, settings, _ = sheet
+    bare = plane(1.0)
+    with pytest.raises(ValueError, match="no texture coordinates"):
+        rivals.TexturedMesh.of(Mesh(bare.vertices, bare.faces, bare.normals))
+    with pytest.raises(ValueError, match=r"reach from 0.05 to 1.95; .* scale or move the charts"):
+        rivals.TexturedMesh.of(Mesh(bare.vertices, bare.faces, bare.normals, bare.uvs * [1.0, 2.0] + [0.0, 0.05]))
+    lamp = sj.PointLight(jnp.asarray([0.0, 0.0, 2.0]), jnp.ones(3))
+    with pytest.raises(ValueError, match=r"lights\[0\] stands 2 mm .* move it out"):
+        rivals.plan_texture_space(mesh, (lamp,), DULL, camera, settings)
+    with pytest.raises(ValueError, match="a plan is needed"):
+        jax.grad(lambda light: jnp.sum(rivals.render_texture_space(mesh, (light,), DULL, camera, settings).frame.beauty))(
+            lights[0]
+        )
+
+
+def slab(thickness: float) -> Mesh:
+    """Two parallel planes that face away from each other; their charts lie side by side."""
+    front = plane(1.0)
+    turn = np.asarray([-1.0, 1.0, -1.0])
+    vertices = np.concatenate([front.vertices, front.vertices * turn - [0.0, 0.0, thickness]])
+    faces = np.concatenate([front.faces, front.faces + len(front.vertices)])
+    halved = front.uvs * np.asarray([0.5, 1.0])
+    uvs = np.concatenate([halved, halved + np.asarray([0.5, 0.0])])
+    return Mesh(vertices, faces, np.concatenate([front.normals, front.normals * turn]), uvs)
+
+
+@pytest.mark.slow
+def test_through_a_slab_comes_what_comes_through_splats():
+    """Lit from behind: the share and the odds of leaving are those of two sheets of splats."""
+    thickness, settings = 1.5, dataclasses.replace(STILL, resolution=96)
+    settings = dataclasses.replace(settings, thin_parts=rivals.TranslucentShadowMap(), normalization=ExitOdds())
+    mesh, camera = rivals.TexturedMesh.of(slab(thickness)), camera_over(3.0, 4)
+    lights = (sj.DirectionalLight(jnp.asarray([0.0, 0.0, 1.0]), jnp.ones(3)),)
+    found = rivals.render_texture_space(mesh, lights, DULL, camera, settings).frame
+    ours = np.pi * np.asarray(found.layers)[:, 2, 2]
+
+    line = np.arange(-11.7, 12, 0.6)
+    x, y = (each.reshape(-1) for each in np.meshgrid(line, line))
+    side = np.repeat([1.0, -1.0], x.size)
+    centers = np.stack([np.tile(x, 2), np.tile(y, 2), np.where(side > 0, 0.0, -thickness)])
+    light = np.tile(np.where(side > 0, 0.0, 1.0), (3, 1))
+    arrays = centers, np.stack([0 * side, 0 * side, side]), np.full(side.size, 0.36), light
+    sources, odds = Sources(*(jnp.asarray(each, float) for each in arrays)), ExitOdds()
+    kernels = Kernels.of(TWO.variances, odds)
+    sums = gathered(sources, kernels, np.zeros((1, 3)))
+    gain = odds.gain(sums.exits[0][:, None], TWO.variances, TWO.weights[..., None], jnp.zeros((3, 1)))
+    truth = np.asarray(gain * sums.means[0])[..., 0]
+    assert np.all(truth[0] > 0.05)
+    np.testing.assert_allclose(ours, truth, atol=5e-3)
