@@ -62,6 +62,28 @@ def sample_mesh(
     """
     path = existing_file(path)
     check_room(f"{path}: {count} splats", _BYTES_PER_SPLAT * count, "take fewer")
+    mesh, textures = read_textured_mesh(
+        path, mm_per_unit=mm_per_unit, albedo=albedo, specular=specular, normal=normal, v_up=v_up, crop_min_y=crop_min_y
+    )
+    dressed = any(picture is not None for picture in (textures.albedo, textures.specular, textures.normal))
+    try:
+        return sample_surface(mesh, count, textures=textures if dressed else None, seed=seed)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def read_textured_mesh(
+    path: Name,
+    *,
+    mm_per_unit: float,
+    albedo: Name | None = None,
+    specular: Name | None = None,
+    normal: Name | None = None,
+    v_up: bool | None = None,
+    crop_min_y: float | None = None,
+) -> tuple[Mesh, Textures]:
+    """Read the mesh in a file, and its maps, as `sample_mesh` does; arguments and errors are its own."""
+    path = existing_file(path)
     mesh, textures = read_mesh(path, mm_per_unit=mm_per_unit, v_up=v_up, dressed=albedo is None)
     textures = Textures(
         albedo=textures.albedo if albedo is None else read_color(albedo),
@@ -81,10 +103,7 @@ def sample_mesh(
                 f"{path}: crop_min_y = {crop_min_y:g} leaves nothing; the mesh ends at y = {top:g} in the file's unit"
             )
         mesh = cut_below(mesh, crop_min_y * mm_per_unit)
-    try:
-        return sample_surface(mesh, count, textures=textures if dressed else None, seed=seed)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
+    return mesh, textures
 
 
 def read_mesh(path: Name, *, mm_per_unit: float, v_up: bool | None = None, dressed: bool = True) -> tuple[Mesh, Textures]:

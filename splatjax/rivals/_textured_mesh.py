@@ -10,7 +10,7 @@ from splatjax.scene import Splats
 from splatjax.shading import unit_normals
 from splatjax.splatting import Bounds
 
-from ._mesh_raster import Landing, SeenFaces, barycentrics, interpolate
+from ._mesh_raster import Landing, SeenFaces, barycentrics
 
 _OUTSIDE = 1e-6  # of the texture, that coordinates may reach beyond it
 
@@ -59,6 +59,12 @@ class TexturedMesh(eqx.Module):
         """Give the positions of each triangle's corners, mm."""
         return self.vertices[self.faces]
 
+    def face_areas(self) -> Float[Array, " faces"]:
+        """Give the area of each triangle, mm^2."""
+        corners = self.corners()
+        edges = corners[:, 1:] - corners[:, :1]
+        return 0.5 * jnp.linalg.norm(jnp.cross(edges[:, 0], edges[:, 1]), axis=1)
+
     def bounds(self) -> Bounds:
         """Give the sphere around it that shadow maps are laid around."""
         corners = self.corners().reshape(-1, 3)  # a mesh that was cut has vertices without faces
@@ -100,18 +106,33 @@ def surface_texels(mesh: TexturedMesh, landing: Landing, seen: SeenFaces) -> Sur
 
     Where a pixel sees nothing, position and normal are 0.
     """
-    shares = barycentrics(landing, seen)
+    points, uvs = surface_points(mesh, seen.faces.reshape(-1), barycentrics(landing, seen).reshape(-1, 3))
+    there = seen.covered.reshape(-1, 1)
+    centers, normals = jnp.where(there, points.centers, 0.0), jnp.where(there, points.normals, 0.0)
+    points = eqx.tree_at(lambda each: (each.centers, each.normals), points, (centers, normals))
+    return SurfaceTexels(points, uvs, seen)
+
+
+def surface_points(
+    mesh: TexturedMesh, faces: Int[Array, " points"], shares: Float[Array, "points 3"]
+) -> tuple[Splats, Float[Array, "points 2"]]:
+    r"""Give points of a mesh with its textures, as splats without extent, and their texture coordinates. Differentiable.
+
+    **Arguments:**
+
+    - `faces`: of the points.
+    - `shares`: their barycentric coordinates there.
+    """
     carried = jnp.concatenate([mesh.corners(), mesh.normals[mesh.faces], mesh.uvs], axis=2)
-    count = seen.faces.size
-    found = interpolate(carried, seen, shares).reshape(count, -1)
+    found = jnp.sum(carried[faces] * shares[..., None], axis=1)
     positions, normals, uvs = found[:, :3], unit_normals(found[:, 3:6]), found[:, 6:]
     if mesh.normal is not None:
-        normals = _perturbed(mesh, seen.faces.reshape(-1), normals, look_up(mesh.normal, uvs))
+        normals = _perturbed(mesh, faces, normals, look_up(mesh.normal, uvs))
     albedo, specular, roughness = (
         None if each is None else look_up(each, uvs) for each in (mesh.albedo, mesh.specular, mesh.roughness)
     )
-    nothing = jnp.zeros(count, positions.dtype)
-    return SurfaceTexels(Splats(positions, normals, nothing, nothing, albedo, specular, roughness), uvs, seen)
+    nothing = jnp.zeros(len(faces), positions.dtype)
+    return Splats(positions, normals, nothing, nothing, albedo, specular, roughness), uvs
 
 
 def look_up(picture: Float[Array, "h w *channels"], uvs: Float[Array, "points 2"]) -> Float[Array, "points *channels"]:

@@ -7,6 +7,8 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Float
 
+from splatjax.splatting import SIDE, TileGrid
+
 from ._mesh_light import MeshLight, MeshShadow
 from ._textured_mesh import SurfaceTexels
 
@@ -56,33 +58,34 @@ class TranslucentShadowMap(AbstractThinParts):
 
     A Gaussian is separable in depth too: what comes through is the light of the far side, already blurred there, times
     `exp(-d^2 / 2v)`. The thickness `d` is measured along the light, shortened by the cosine where the two sides face apart,
-    and blurred with the light; texels that face the light have no far side. Where the far side is close in the texture the blur
-    has brought its light already.
+    and blurred with the light; texels that face the light, or that are lit as far as the shadow map can tell, have no far side.
+    Where the far side is close in the texture the blur has brought its light already.
 
     **Source:** d'Eon and Luebke 2007 (GPU Gems 3, chapter 14.5), after Dachsbacher and Stamminger 2003.
     """
 
     def far_side(self, texels, light, widest, millimetres):
-        found = [self._of(texels, shadow, widest) for shadow in light.shadows if shadow is not None]
+        found = [self._of(texels, each, light.settings.bias, widest) for each in light.shadows if each is not None]
         if not found:
             return None
         uvs, nearness = (jnp.stack(each) for each in zip(*found, strict=True))
         offset = uvs - texels.uvs[None]
         return FarSide(uvs, nearness, millimetres * jnp.sqrt(jnp.sum(offset * offset, axis=2)), widest)
 
-    def _of(self, texels: SurfaceTexels, shadow: MeshShadow, scale: Float[Array, ""]):
+    def _of(self, texels: SurfaceTexels, shadow: MeshShadow, bias: float, scale: Float[Array, ""]):
         view, front = shadow.view, shadow.surfaces.front
         points, normals = texels.points.centers, texels.points.normals
         x, y, depth = view.project(points.T)
         column = jnp.clip(stop_gradient(jnp.floor(x)).astype(jnp.int32), 0, view.width - 1)
         row = jnp.clip(stop_gradient(jnp.floor(y)).astype(jnp.int32), 0, view.height - 1)
-        entered, lit = front.attributes[:, row, column], front.coverage[row, column] > 0
-        entry = view.unproject(x, y, jnp.where(lit, jnp.minimum(front.depth[row, column], depth), depth)).T
+        tile, pixel = jnp.divmod(TileGrid(view.width, view.height).pixel(column, row), SIDE**2)
+        entered, lit = front.attributes[tile, :, pixel].T, front.coverage[tile, pixel] > 0
+        entry = view.unproject(x, y, jnp.where(lit, jnp.minimum(front.depth[tile, pixel], depth), depth)).T
         squared = jnp.sum((points - entry) ** 2, axis=1)
         way = jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1.0)), 0.0)
         wi, _ = shadow.light.incidence(points)
         cosine = jnp.sum(wi * normals, axis=1)
         opposite = jnp.clip(-jnp.sum(entered[2:].T * normals, axis=1), 0, 1)
         thickness = way + opposite * (jnp.clip(-cosine, 0, 1) * way - way)
-        there = lit & (cosine < 0)
+        there = lit & (cosine < 0) & (depth > front.depth[row, column] + bias)
         return entered[:2].T, jnp.where(there, jnp.exp(-thickness / scale), 0.0)

@@ -1,0 +1,246 @@
+"""Splat diffusion and its rivals against brute-force integration over the surface: `python -m benchmarks.rivals`.
+
+Writes out/rivals_BODY_NORMALIZATION.json, and a picture of where each method errs around the nose; SSIM and FLIP are taken there.
+With `--figure`, out/rivals_figure8_BODY.png alone: half and half, and the difference.
+"""
+
+import argparse
+import dataclasses
+import itertools
+import json
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import splatjax as sj
+from splatjax import rivals
+from splatjax.diffusion import DiffusionSettings, ExitOdds, PlainMean
+from splatjax.splatting import PerspectiveView
+
+from .heads import HEADS, MAP, Body, conditions
+from .rivals_pictures import errors, figure_8
+from .surface_truth import integrate
+
+NORMALIZATIONS = {"mean": PlainMean(), "odds": ExitOdds()}
+STRETCHES = (1.0, 1.25, 1.6, 2.5, np.inf)
+RIM = 2  # pixels
+NOSE = (0.41, 0.49)  # of the picture, from the top and from the left
+
+
+def arguments():
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.rivals", description=__doc__)
+    parser.add_argument("--body", choices=HEADS, default="scanned", help="(default %(default)s)")
+    parser.add_argument("--normalization", choices=NORMALIZATIONS, default="mean", help="(default %(default)s)")
+    parser.add_argument("--splats", type=int, default=683_549, help="(default %(default)s)")
+    parser.add_argument("--width", type=int, default=1024, help="of the square picture, pixels (default %(default)s)")
+    parser.add_argument("--pixels", type=int, default=1000, help="random covered ones (default %(default)s)")
+    parser.add_argument("--refine", action="store_true", help="also integrate with twice the samples, and tell the change")
+    parser.add_argument("--figure", action="store_true", help="draw Figure 8 and nothing else")
+    return parser.parse_args()
+
+
+class Found(NamedTuple):
+    """A picture by one method, and the seconds it took, compiled."""
+
+    exitance: np.ndarray
+    layers: np.ndarray | None
+    beauty: np.ndarray
+    seconds: float
+
+
+def timed(function):
+    """Give what a function gives, and the least seconds of three calls after the first."""
+    found, seconds = jax.block_until_ready(function()), []
+    for _ in range(3):
+        start = time.perf_counter()
+        found = jax.block_until_ready(function())
+        seconds.append(time.perf_counter() - start)
+    return found, min(seconds)
+
+
+def methods(body: Body, light, camera, material: sj.Material, normalization) -> dict[str, Found]:
+    """Render by every method."""
+    scene = sj.Scene(body.splats, (light,), material)
+    settings = sj.RenderSettings(diffusion=DiffusionSettings(normalization=normalization))
+    plan = sj.plan(scene, camera, settings)
+    found = {}
+
+    def keep(name: str, frame: sj.Frame, seconds: float) -> None:
+        weights, layers = np.asarray(frame.weights), np.pi * np.asarray(frame.layers)
+        whole = np.asarray(rivals.exitance(frame))
+        root = np.asarray(frame.diffuse) * np.pi / np.where(whole > 0, whole, 1)
+        layers = layers / np.where(root > 0, root, 1)[None] if len(weights) > 1 else None
+        found[name] = Found(whole, layers, np.asarray(frame.beauty), seconds)
+        print(f"{name}: {seconds:.1f} s", flush=True)
+
+    frame, seconds = timed(lambda: sj.render(scene, camera, settings, plan))
+    keep("splats", frame, seconds)
+    for name, kernel in (
+        ("screen space, Gaussian by Gaussian", rivals.GaussianPasses()),
+        ("screen space, the kernel that ships", rivals.ShippedKernel()),
+    ):
+        on_screen = jax.jit(lambda frame, kernel=kernel: rivals.diffuse_on_screen(frame, camera, material, kernel))
+        found_frame, more = timed(lambda on_screen=on_screen: on_screen(frame))
+        keep(name, found_frame, more)
+    corrected, opaque = rivals.StretchCorrected(), rivals.OpaqueParts()
+    for name, stretch, thin in (
+        ("texture space", corrected, rivals.TranslucentShadowMap()),
+        ("texture space, no far side", corrected, opaque),
+        ("texture space, no stretch correction", rivals.Uncorrected(), rivals.TranslucentShadowMap()),
+    ):
+        how = rivals.TextureSpaceSettings(MAP, stretch, thin, normalization)
+        room = rivals.plan_texture_space(body.mesh, (light,), material, camera, how)
+        picture, seconds = timed(
+            lambda how=how, room=room: rivals.render_texture_space(body.mesh, (light,), material, camera, how, room)
+        )
+        keep(name, picture.frame, seconds)
+        lost = np.asarray(picture.texture.renormalized)
+        print(f"  weights that fell between the charts: {', '.join(f'{each:.1e}' for each in lost)}")
+        if float(picture.frame.overflow) > 0:
+            raise SystemExit("the plan does not hold its own scene")
+    return found
+
+
+def same_light(body: Body, maps: rivals.MeshLight, camera, material, normalization) -> Found:
+    """Diffuse by splats the light that the shadow map of the triangles lets through, as the rivals have it."""
+    scene = sj.Scene(body.splats, maps.lights, material)
+    settings = sj.RenderSettings(diffusion=DiffusionSettings(normalization=normalization))
+    plan = sj.plan(scene, camera, settings)
+    source = jax.jit(lambda splats: maps.entering(splats, material).source.T)(body.splats)
+    layers, seconds = timed(lambda: sj.diffuse(scene, source, camera, settings, plan))
+    whole = np.einsum("gyxc,gc->yxc", np.asarray(layers), np.asarray(material.gaussians.weights))
+    return Found(whole, np.asarray(layers), whole, seconds)
+
+
+def main() -> None:
+    options = arguments()
+    normalization = NORMALIZATIONS[options.normalization]
+    start = time.perf_counter()
+    body = HEADS[options.body](options.splats)
+    print(f"{options.body}: {len(body.mesh.faces)} triangles, {body.splats.count} splats ({time.perf_counter() - start:.0f} s)")
+    light, camera = conditions(options.width)
+    material = sj.load_material("skin").white()
+    if options.figure:
+        figure_8(body, light, camera, material, Path(f"out/rivals_figure8_{options.body}.png"))
+        return
+    dull = dataclasses.replace(material.surface_of(material.gaussians), specular=jnp.zeros(()))
+    found = methods(body, light, camera, dull, normalization)
+
+    settings = rivals.TextureSpaceSettings().shadows
+    rooms = rivals.shadow_rooms(body.mesh, (light,), settings)
+    maps = rivals.mesh_light(body.mesh, (light,), settings, rooms)
+    found["splats, by the triangles' shadow map"] = same_light(body, maps, camera, dull, normalization)
+    seen = Seen.of(body, camera, found)
+    pixels = seen.choose(options.pixels)
+    faces, shares = seen.on_mesh(pixels)
+    start = time.perf_counter()
+    truth = integrate(body.mesh, maps, dull, faces, shares, normalization)
+    print(f"the truth at {len(faces)} pixels: {time.perf_counter() - start:.0f} s", flush=True)
+    layers = truth.layers(dull, normalization)
+    weights = np.asarray(dull.gaussians.weights)
+    whole = np.einsum("gpc,gc->pc", layers, weights)
+    if options.refine:
+        finer = integrate(body.mesh, maps, dull, faces, shares, normalization, 2**0.5).layers(dull, normalization)
+        print("twice the samples change it by", rivals.Off.of(np.einsum("gpc,gc->pc", finer, weights), whole))
+        layers, whole = finer, np.einsum("gpc,gc->pc", finer, weights)
+    around = in_crop(body, maps, dull, normalization, seen, found, options)
+    deviations = np.sqrt(np.asarray(dull.gaussians.variances))
+    report(found, pixels, layers, whole, deviations, stretched(body, faces), around, options)
+
+
+class Seen(NamedTuple):
+    """What the camera sees of the triangles."""
+
+    faces: np.ndarray
+    shares: np.ndarray
+    there: np.ndarray
+    """Where every method shows the surface."""
+
+    @classmethod
+    def of(cls, body: Body, camera, found: dict[str, Found]) -> "Seen":
+        """Look at the triangles."""
+        landing = rivals.Landing.in_view(body.mesh.corners(), PerspectiveView.of(camera))
+        seen = rivals.see_faces(landing, rivals.room_for(landing))
+        there = np.asarray(seen.covered)
+        for each in found.values():
+            there = there & np.any(each.beauty > 0, axis=2)
+        return cls(np.asarray(seen.faces), np.asarray(rivals.barycentrics(landing, seen)), there)
+
+    def choose(self, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Choose pixels at random, at least two from where anything ends."""
+        steps, (height, width) = range(2 * RIM + 1), self.there.shape
+        padded = np.pad(self.there, RIM)
+        inside = np.all([padded[i : i + height, j : j + width] for i in steps for j in steps], axis=0)
+        rows, columns = np.nonzero(inside)
+        picked = np.random.default_rng(0).choice(len(rows), min(count, len(rows)), replace=False)
+        return rows[picked], columns[picked]
+
+    def on_mesh(self, pixels) -> tuple[np.ndarray, np.ndarray]:
+        """Give faces and barycentric coordinates under pixels."""
+        return self.faces[pixels], self.shares[pixels]
+
+
+def stretched(body: Body, faces: np.ndarray) -> np.ndarray:
+    """Give how stretched, or squeezed, the chart is on faces: the greater of the factors along u and along v, from the mean."""
+    lengths = np.stack([np.asarray(each) for each in body.mesh.lengths()])[:, faces]
+    a, b, c = np.moveaxis(np.asarray(body.mesh.uvs, np.float64), 1, 0)
+    doubled = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
+    mean = np.sqrt(np.sum(np.asarray(body.mesh.face_areas())) / np.sum(0.5 * np.abs(doubled)))
+    ratio = np.maximum(lengths, 1e-9) / mean
+    return np.max(np.maximum(ratio, 1 / ratio), axis=0)
+
+
+def in_crop(body: Body, maps, material, normalization, seen: Seen, found: dict[str, Found], options):
+    """Integrate at every pixel of a part of the picture, around the nose; draw what each method makes of it."""
+    size = options.width // 4
+    top, left = (int(share * options.width) for share in NOSE)
+    crop = slice(top, top + size), slice(left, left + size)
+    covered = seen.there[crop]
+    rows, columns = np.nonzero(covered)
+    faces, shares = seen.on_mesh((rows + top, columns + left))
+    truth = integrate(body.mesh, maps, material, faces, shares, normalization)
+    whole, root = np.zeros((size, size, 3)), np.zeros((size, size, 3))
+    whole[covered] = np.einsum("gpc,gc->pc", truth.layers(material, normalization), np.asarray(material.gaussians.weights))
+    root[covered] = np.sqrt(np.maximum(truth.albedo, 1e-4))
+    pictures = {name: each.exitance[crop] for name, each in found.items()}
+    return errors(pictures, whole, covered, root, Path(f"out/rivals_errors_{options.body}_{options.normalization}.png"))
+
+
+def report(found, pixels, layers, whole, deviations, stretch, around, options) -> None:
+    """Print the tables and write them."""
+    rows = []
+    print(f"\n{'':42}{'median':>9}{'99th pct':>9}{'maximum':>9}{'RMS':>9}{'SSIM':>8}{'FLIP':>8}{'seconds':>9}", end="   ")
+    print("RMS of the layers of", ", ".join(f"{each:.2f}" for each in deviations), "mm")
+    for name, each in found.items():
+        off = rivals.Off.of(each.exitance[pixels], whole)
+        by_layer = []
+        if each.layers is not None:
+            by_layer = [rivals.Off.of(each.layers[k][pixels], layers[k]).rms for k in range(len(layers))]
+        print(f"{name:42}{off.median:9.1e}{off.most:9.1e}{off.largest:9.1e}{off.rms:9.1e}", end="")
+        alike, seen = around[name]["ssim"], around[name]["flip"]
+        print(f"{alike:8.4f}{'none' if seen is None else f'{seen:.4f}':>8}{each.seconds:9.2f}  ", end=" ")
+        print(" ".join(f"{value:.1e}" for value in by_layer))
+        rows.append({"name": name, **dataclasses.asdict(off), **around[name], "seconds": each.seconds, "layers": by_layer})
+    print("\nRMS of the widest layer where the chart is stretched by")
+    bins = list(itertools.pairwise(STRETCHES))
+    inside = [(stretch >= low) & (stretch < high) for low, high in bins]
+    print(f"{'':42}" + "".join(f"{f'{low:g} to {high:g}':>13}" for low, high in bins))
+    print(f"{'share of the pixels':42}" + "".join(f"{each.mean():13.2f}" for each in inside))
+    scale = np.sqrt(np.mean(layers[-1] ** 2))
+    for row, (name, each) in zip(rows, found.items(), strict=True):
+        if each.layers is not None:
+            off = np.mean((each.layers[-1][pixels] - layers[-1]) ** 2, axis=1)
+            row["by_stretch"] = [float(np.sqrt(off[part].mean()) / scale) if part.any() else None for part in inside]
+            print(f"{name:42}" + "".join(f"{value:13.1e}" if value is not None else f"{'':13}" for value in row["by_stretch"]))
+    out = Path(f"out/rivals_{options.body}_{options.normalization}.json")
+    out.parent.mkdir(exist_ok=True)
+    out.write_text(json.dumps(rows, indent=1) + "\n")
+    print(f"\nwritten: {out}")
+
+
+if __name__ == "__main__":
+    main()
