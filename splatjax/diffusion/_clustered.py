@@ -110,6 +110,7 @@ class ClusterDiffuser(AbstractDiffuser):
             none = ClusterTree(jnp.zeros(0, jnp.int32), (), ())
             return eqx.tree_at(_parts, self, (none, layers), is_leaf=_is_none)
         spacing = math.sqrt(areas.mean())
+        radii = np.asarray(splats.radii)
         begin, fine = float(interval[0]) ** 2, jnp.asarray(np.quantile(areas, _FINEST), kernels.variances.dtype)
         shares = np.asarray(resolved_share(kernels.variances * self.margin, fine, interval))
         carried = shares > 0
@@ -117,8 +118,7 @@ class ClusterDiffuser(AbstractDiffuser):
         edges = np.where(carried & (edges > _WORTHWHILE * spacing), edges, 0.0)
         cells = sorted({float(edge) for edge in edges if edge > 0})
         tree = ClusterTree.build(splats.centers, splats.normals, cells)
-        origin = jnp.mean(splats.centers, axis=0)
-        levels = _levels(tree, Sources(splats.centers.T - origin[:, None], splats.normals.T, splats.areas, splats.areas[None]))
+        origin, levels = _levels(tree, splats)
         layers = []
         for v, depth, edge, share in zip(values, kernels.depths, edges, shares, strict=True):
             support = self.support(float(share))
@@ -127,8 +127,9 @@ class ClusterDiffuser(AbstractDiffuser):
             if share > 0:
                 largest = v * self.margin
                 if edge > 0 and self._in_pixels(float(edge), atlases, splats) > 1:
-                    radii = jnp.where(splats.areas * begin < largest, splats.radii, 0.0)  # of splats that carry the layer
-                    nodes = self._plan_nodes(levels[level], largest, depth, float(edge), support, tree.largest(radii, level))
+                    carriers = np.where(areas * begin < largest, radii, np.zeros_like(radii))
+                    farthest = tree.largest(carriers, level)
+                    nodes = self._plan_nodes(levels[level], largest, depth, float(edge), support, farthest)
                 capacity = self._capacity(origin, levels[level], nodes, largest, depth, support, atlases)
             smallest, largest = (jnp.asarray(edge, depth.dtype) for edge in (v / self.margin, v * self.margin))
             layers.append(LayerPlan(level, support, smallest, largest, capacity, nodes))
@@ -155,7 +156,7 @@ class ClusterDiffuser(AbstractDiffuser):
         sinking = math.sqrt(3) * float(depth) * (math.sqrt(self.margin) - 1)
         reach = support * math.sqrt(variance + float(spread)) + sinking
         neighbors = Neighbors.find(boxes, sources, reach, min(_LANES, boxes.low.shape[1]), _SOURCE_SLOTS)
-        return NodePlan(neighbors, jnp.maximum(_SMOOTHING * edge, (radii + 0.87 * edge) / _BLENDED))
+        return NodePlan(neighbors, jnp.asarray(np.maximum(_SMOOTHING * edge, (radii + 0.87 * edge) / _BLENDED), depth.dtype))
 
     def _capacity(
         self, origin, clusters: Clusters, nodes: NodePlan | None, variance: float, depth, support: float, atlases: Sequence[Atlas]
@@ -249,8 +250,11 @@ def _is_none(leaf) -> bool:
 
 
 @eqx.filter_jit
-def _levels(tree: ClusterTree, sources: Sources) -> list[Clusters]:
-    return tree.levels(sources)
+def _levels(tree: ClusterTree, splats: Splats) -> tuple[Float[Array, "3"], list[Clusters]]:
+    """Give the middle of the splats, and the clusters of every level about it."""
+    origin = jnp.mean(splats.centers, axis=0)
+    sources = Sources(splats.centers.T - origin[:, None], splats.normals.T, splats.areas, splats.areas[None])
+    return origin, tree.levels(sources)
 
 
 @eqx.filter_jit

@@ -123,11 +123,12 @@ class ClusterTree(eqx.Module):
             found.append(found[-1].merged(parents, count))
         return found
 
-    def largest(self, values: Float[Array, " splats"], level: int) -> Float[Array, " clusters"]:
-        """Give the largest value, 0 or above, of the splats in each cluster of a level."""
-        found = values.at[self.order].get(mode="fill", fill_value=0)
+    def largest(self, values: Float[np.ndarray, " splats"], level: int) -> Float[np.ndarray, " clusters"]:
+        """Give the largest value, 0 or above, of the splats in each cluster of a level. Not for traced arrays."""
+        found = np.append(values, np.zeros(1, values.dtype))[np.asarray(self.order)]
         for parents, count in zip(self.parents[:level], self.counts[:level], strict=True):
-            found = jnp.zeros(count, found.dtype).at[parents].max(found)
+            before, found = found, np.zeros(count, found.dtype)
+            np.maximum.at(found, np.asarray(parents), before)
         return found
 
 

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
@@ -73,21 +74,20 @@ def _plan(scenes: Scene | Sequence[Scene], cameras: Camera | Sequence[Camera], s
     for i, other in enumerate(others, 1):
         if not eqx.tree_equal((scene.splats, scene.material), (other.splats, other.material)):
             raise ValueError(f"scenes of one plan may differ in their lights alone, but scenes[{i}] has other splats or material")
+    groups = _groups([each.lights for each in (scene, *others)])
     views = [_splatting.PerspectiveView.of(camera) for camera in cameras]
     bounds = _splatting.Bounds.of(scene.splats)
     interval = _diffusion.handover_interval(_diffusion.irregularity(scene.splats), settings.diffusion)
     kernels = _diffusion.Kernels.of(scene.material.gaussians.variances, settings.diffusion.normalization)
     camera = settings.rasterizer.planned(scene.splats, views, settings.splatting)
     looks = [_look(scene.splats, view, settings.splatting, camera) for view in views]
-    shown = max(int(jnp.sum(look > -jnp.inf)) for look in looks)
+    shown = max(int(np.sum(np.asarray(look) > -np.inf)) for look in looks)
     tiles = min(_splatting.round_up(shown, 1), looks[0].size)
     atlases = [_splatting.Atlas.of(look, view, tiles) for look, view in zip(looks, views, strict=True)]
     return Plan(
         camera=camera,
         tiles=tiles,
-        shadows=tuple(
-            _plan_shadows(group, scene.splats, bounds, settings) for group in _groups([each.lights for each in (scene, *others)])
-        ),
+        shadows=tuple(_plan_shadows(group, scene.splats, bounds, settings) for group in groups),
         diffuser=settings.diffuser.planned(scene.splats, kernels, interval, atlases),
         interval=interval,
     )

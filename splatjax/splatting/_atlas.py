@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from splatjax.pointwise import AT_ONCE
+from splatjax.pointwise import AT_ONCE, one_program
 
 from ._bins import SIDE, TileGrid
 from ._rasterizer import FragmentSums, SummedFragments
@@ -51,6 +51,7 @@ class Atlas(eqx.Module):
     """Factor of every picture: 1, or NaN."""
 
     @classmethod
+    @one_program
     def of(cls, farthest: Float[Array, "surfaces down across"], view: AbstractView, room: int) -> "Atlas":
         """Pack the tiles that show anything, as `farthest_depths` says, into `room` places."""
         shows = farthest.reshape(-1) > -jnp.inf

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Float
 
-from splatjax.pointwise import AT_ONCE, in_parts
+from splatjax.pointwise import AT_ONCE, in_parts, one_program
 from splatjax.scene import Splats
 
 from ._bins import TileGrid
@@ -45,6 +45,7 @@ class Bounds(eqx.Module):
     radius: Float[Array, ""]
 
     @classmethod
+    @one_program
     def of(cls, splats: Splats) -> "Bounds":
         if splats.count == 0:
             return cls(jnp.zeros(3, splats.centers.dtype), jnp.ones((), splats.centers.dtype))

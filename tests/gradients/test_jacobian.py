@@ -46,13 +46,13 @@ def rendered(case: str):
     def beauty(gaussians):
         return sj.render(eqx.tree_at(lambda s: s.material.gaussians, start, gaussians), camera, settings, plan).beauty
 
-    return start, beauty, sj.picture_jacobian(start, camera, settings, plan)
+    return start, beauty, plan, sj.picture_jacobian(start, camera, settings, plan)
 
 
 def test_it_is_reverse_mode_row_by_row():
     """With every part that a material can have."""
     with jax.enable_x64(True):
-        start, beauty, jacobian = rendered("fast")
+        start, beauty, _, jacobian = rendered("fast")
         assert float(jacobian.frame.overflow) == 0
         gaussians = start.material.gaussians
 
@@ -83,7 +83,7 @@ def test_it_is_reverse_mode_row_by_row():
 def test_single_scattering_leaves_less_to_the_gaussians_where_light_grazes():
     """Then a weight moves the light that enters, which the row-by-row test would miss if no light grazed."""
     with jax.enable_x64(True):
-        start, _, jacobian = rendered("fast")
+        start, _, _, jacobian = rendered("fast")
         left = start.material.left_to_diffuse(jnp.asarray([0.05]))
     assert np.min(np.asarray(left)) < 0.97
     assert np.min(np.asarray(jacobian.weights)) < 0
@@ -92,10 +92,9 @@ def test_single_scattering_leaves_less_to_the_gaussians_where_light_grazes():
 def test_along_a_change_it_is_the_forward_derivative_of_the_plain_path():
     rng = np.random.default_rng(5)
     with jax.enable_x64(True):
-        start, beauty, jacobian = rendered("plain")
+        start, beauty, plan, jacobian = rendered("plain")
         change = jax.tree.map(lambda leaf: jnp.asarray(rng.normal(size=leaf.shape)), start.material.gaussians)
         expected = jax.jit(lambda g, c: jax.jvp(beauty, (g,), (c,))[1])(start.material.gaussians, change)
-        plan = sj.plan(start, view(*CAMERA), PLAIN)
 
         @jax.jit
         def along(gaussians):
@@ -155,17 +154,16 @@ def test_with_the_plain_mean_the_layers_are_the_derivative_in_the_weights():
 
 def test_a_function_of_other_gaussians_is_refused():
     with jax.enable_x64(True):
-        _, _, jacobian = rendered("plain")
+        *_, jacobian = rendered("plain")
         with pytest.raises(ValueError, match=r"has \[2, 2\] Gaussians and channels, the picture was made with \[3, 2\]"):
             jacobian.through(lambda w: sj.SumOfGaussians(jnp.ones(2), w), jnp.ones((2, 2)))
 
 
 def test_a_plan_that_does_not_suffice_makes_it_nan_and_says_so():
     with jax.enable_x64(True):
-        start, camera = scene(False), view(*CAMERA)
-        plan = sj.plan(start, camera, FAST)
+        start, _, plan, _ = rendered("fast")
         wider = eqx.tree_at(lambda s: s.material.gaussians.variances, start, 4 * start.material.gaussians.variances)
-        jacobian = sj.picture_jacobian(wider, camera, FAST, plan)
+        jacobian = sj.picture_jacobian(wider, view(*CAMERA), FAST, plan)
     assert float(jacobian.frame.overflow) > 1
     assert np.all(np.isnan(jacobian.weights))
     assert np.all(np.isnan(jacobian.variances))

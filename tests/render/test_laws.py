@@ -162,7 +162,7 @@ def test_no_splats_and_no_lights_give_an_empty_and_a_black_picture():
 def test_a_plan_that_does_not_suffice_poisons_the_picture_and_says_so():
     material = sj.Material(two_gaussians())
     camera = camera_over(5.0, 32)
-    scene = sj.Scene(sheet(0.25, 6.0), (lamp(),), material)
+    scene = sj.Scene(sheet(0.25, 1.0), (lamp(),), material)  # that of the test of splats that move: one program
     plan = sj.plan(scene, camera)
     wider = eqx.tree_at(lambda s: s.material.gaussians.variances, scene, scene.material.gaussians.variances * 2)
     frame = sj.render(wider, camera, plan=plan)

@@ -34,6 +34,7 @@ def test_a_plan_of_several_scenes_has_room_for_the_shadows_of_each():
         assert together == alone[0]
 
 
+@pytest.mark.once
 def test_a_lamp_among_the_splats_in_one_scene_has_six_faces_in_all():
     far, near = (scene_under(sj.PointLight(jnp.asarray([0.0, 0.0, z]), jnp.ones(3))) for z in (30.0, 1.0))
     assert sj.plan([far, near], camera_at(20.0), SETTINGS).shadows[0].cube
