@@ -68,11 +68,11 @@ def picture_paths(path: str | os.PathLike[str]) -> list[Path]:
 
 def _observation(path: Path, number: int, table: Table) -> Observation:
     table.only(_ENTRIES)
-    picture = read_picture(path.parent / _text(table, "file"))
+    picture = _picture(path, table, "file")
     height, width, channels = picture.shape
     mask = deviation = None
     if "mask" in table.table:
-        mask = np.any(read_picture(path.parent / _text(table, "mask")) > 0, axis=-1)
+        mask = np.any(_picture(path, table, "mask") > 0, axis=-1)
     if "noise" in table.table:
         share = table.number("noise", "positive", lambda x: x > 0, 0.01)
         known = picture[np.all(np.isfinite(picture), axis=-1) & (True if mask is None or mask.shape != (height, width) else mask)]
@@ -89,6 +89,13 @@ def _observation(path: Path, number: int, table: Table) -> Observation:
         raise ValueError(f"{table.where} {error}") from None
 
 
+def _picture(path: Path, table: Table, name: str) -> np.ndarray:
+    try:
+        return read_picture(path.parent / _text(table, name))
+    except OSError as error:
+        raise FileNotFoundError(f"{table.where} {name}: {error}") from None
+
+
 def _camera(table: Table, width: int, height: int) -> Camera:
     table.only({"position", "target", "up", "fov"})
     up = _vector(table, "up") if "up" in table.table else None
@@ -98,7 +105,7 @@ def _camera(table: Table, width: int, height: int) -> Camera:
 
 def _light(table: Table, channels: int) -> AbstractLight:
     kind = table.table.get("kind")
-    if kind not in _LIGHTS:
+    if not isinstance(kind, str) or kind not in _LIGHTS:
         raise ValueError(f"{table.where} kind must be one of {', '.join(_LIGHTS)}; it is {kind!r}")
     table.only(_LIGHTS[kind] | {"kind"})
     shadows = table.table.get("cast_shadows", True)
@@ -116,7 +123,7 @@ def _light(table: Table, channels: int) -> AbstractLight:
 
 def _intensity(table: Table) -> AbstractIntensity:
     found = table.table.get("intensity", "known")
-    if found not in _INTENSITIES:
+    if not isinstance(found, str) or found not in _INTENSITIES:
         raise ValueError(f"{table.where} intensity must be one of {', '.join(_INTENSITIES)}; it is {found!r}")
     return _INTENSITIES[found]()
 
