@@ -1,8 +1,9 @@
 """What `splatjax render` and `splatjax turntable` share: what is shown, from where, and under which light."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +11,7 @@ import numpy as np
 import tyro
 
 import splatjax as sj
+from splatjax.io import fingerprint, material_path, own_version
 
 from ._outputs import OptionalPath
 from ._report import note, stage
@@ -98,9 +100,20 @@ class Shot:
     def write(self, path: Path, frame: sj.Frame, material: sj.Material) -> tuple[Path, Path]:
         """Write the picture with all its layers, and the PNG file beside it; give both paths."""
         beside = path.with_suffix(".png")
-        sj.write_exr(path, frame, variances=material.gaussians.variances.tolist())
+        sj.write_exr(path, frame, variances=material.gaussians.variances.tolist(), manifest=self.manifest())
         sj.write_png(beside, frame, exposure=self.exposure)
         return path, beside
+
+    def manifest(self) -> dict[str, Any]:
+        """Give all that the pictures depend on: options by their names, what is in the files they name, and versions."""
+        options = {name: value for name, value in asdict(self).items() if name not in ("splats", "output")}
+        return {f"--{name.replace('_', '-')}": value for name, value in options.items()} | {
+            "splats": "the built-in bust" if self.splats is None else f"{self.splats.name}, {fingerprint(self.splats)}",
+            "contents of --material": material_path(self.material).read_text(encoding="utf-8"),
+            "precision": str(jnp.result_type(float)),
+            "splatjax": own_version(),
+            "jax": jax.__version__,
+        }
 
     def say_what_was_handed_over(self, frame: sj.Frame, material: sj.Material) -> None:
         """Say which layers are narrower than the splats."""

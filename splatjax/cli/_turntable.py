@@ -1,16 +1,16 @@
 """`splatjax turntable`: the frames of an animation, taken up again where it was interrupted."""
 
+import hashlib
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
 import tyro
 
 import splatjax as sj
-from splatjax.io import fingerprint, material_path, own_version, read_record, write_animation, write_record
+from splatjax.io import read_record, write_animation, write_record
 
 from ._report import note, progress, stage
 from ._shot import Shot, draw
@@ -134,13 +134,13 @@ class Turntable(Shot):
                 f"{path}: the frames beside it are others: {'; '.join(differing)}; name another --output, or delete that folder"
             )
 
+    def manifest(self) -> dict[str, Any]:
+        """Give all that the frames depend on; their speed is no matter of theirs."""
+        found = super().manifest() | {"--turn": self.turn.value}
+        return {name: value for name, value in found.items() if name != "--fps"}
+
     def _record(self) -> dict[str, Any]:
-        """Give all that the frames depend on, by the names of the options."""
-        options = {name: value for name, value in asdict(self).items() if name not in ("splats", "output", "fps")}
-        record = {f"--{name.replace('_', '-')}": value for name, value in (options | {"turn": self.turn.value}).items()}
-        return record | {
-            "splats": "the built-in bust" if self.splats is None else f"{self.splats.name}, {fingerprint(self.splats)}",
-            "contents of --material": fingerprint(material_path(self.material)),
-            "precision": str(jnp.result_type(float)),
-            "splatjax": own_version(),
-        }
+        """Give the same in short."""
+        material = self.manifest()["contents of --material"].encode()
+        digest = f"{len(material)} bytes, SHA-256 {hashlib.sha256(material).hexdigest()}"
+        return self.manifest() | {"contents of --material": digest}

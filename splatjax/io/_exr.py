@@ -1,13 +1,15 @@
 """A frame with all its layers in one OpenEXR file."""
 
 import errno
+import json
 import os
 import sys
 import tempfile
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout
 from io import StringIO
 from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -23,10 +25,17 @@ from ._version import own_version
 _REC709_D65 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 _WEIGHTS = "splatjax.weights.{}"
 _SINGLE = "single_scattering"
+_MANIFEST = "splatjax.manifest"
 _VARIANCES, _HANDED_OVER, _OVERFLOW = "splatjax.variances", "splatjax.handed_over", "splatjax.overflow"
 
 
-def write_exr(path: str | os.PathLike[str], frame: Frame, *, variances: Sequence[float] | None = None) -> None:
+def write_exr(
+    path: str | os.PathLike[str],
+    frame: Frame,
+    *,
+    variances: Sequence[float] | None = None,
+    manifest: Mapping[str, Any] | None = None,
+) -> None:
     r"""Write a frame with all its layers to one OpenEXR file, single precision, whole or not at all.
 
     | channels | what they are |
@@ -41,7 +50,8 @@ def write_exr(path: str | os.PathLike[str], frame: Frame, *, variances: Sequence
 
     Pictures of another number of channels than 3 have `beauty.1`, `beauty.2`, ..., `albedo.1`, ... instead of R G B.
     The header holds the weights of the Gaussians (`splatjax.weights.1`, ...: a value per channel), their variances (mm^2)
-    when given, and the color space: linear, Rec. 709 primaries, D65.
+    when given, and the color space: linear, Rec. 709 primaries, D65; and, as JSON in `splatjax.manifest`, what the picture was
+    made of, when that is given (`read_manifest`).
 
     **Raises:** `FileNotFoundError` when the folder does not exist.
     """
@@ -59,6 +69,8 @@ def write_exr(path: str | os.PathLike[str], frame: Frame, *, variances: Sequence
     header |= {_WEIGHTS.format(k): _floats(weights) for k, weights in enumerate(np.asarray(frame.weights), 1)}
     if variances is not None:
         header[_VARIANCES] = _floats(variances)
+    if manifest is not None:
+        header[_MANIFEST] = json.dumps(manifest)
     with atomic_path(path) as temporary, OpenEXR.File(header, planes) as file:
         try:
             file.write(str(temporary))
@@ -81,6 +93,22 @@ def read_exr(path: str | os.PathLike[str]) -> Frame:
     except (TypeError, ValueError) as error:
         said = " ".join(str(error).split())
         raise ValueError(f"{path}: has no weights as a frame has ({said}); give a file written by write_exr") from None
+
+
+def read_manifest(path: str | os.PathLike[str]) -> dict[str, Any]:
+    r"""Read what a picture was made of: versions, settings, material, as the command line writes it.
+
+    **Raises:** `FileNotFoundError`, or `ValueError` when the file cannot be read or does not say it.
+    """
+    path = Path(path)
+    header, _ = _read(path)
+    try:
+        found = json.loads(header[_MANIFEST])
+    except (KeyError, TypeError, ValueError):
+        found = None
+    if not isinstance(found, dict):
+        raise ValueError(f"{path}: does not say what it was made of; give a picture that `splatjax render` wrote")
+    return found
 
 
 def read_picture(path: str | os.PathLike[str]) -> np.ndarray:

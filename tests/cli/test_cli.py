@@ -17,6 +17,7 @@ import splatjax as sj
 from splatjax.cli import main
 from splatjax.cli._environment import cache_folder, prepare_jax
 from splatjax.cli._shot import frame_all, towards
+from splatjax.io import read_manifest
 
 SKIN = """[medium]
 unit = "1/mm"
@@ -157,6 +158,16 @@ def test_render_shows_the_bust_and_says_what_it_does(tmp_path, capsys):
     frame = sj.read_exr(output)
     np.testing.assert_allclose(np.sum(np.asarray(frame.weights), axis=0), 1.0, rtol=1e-5)
     assert 0.1 < np.mean(np.asarray(frame.coverage)) < 0.9
+    # What stands in the picture makes the picture again, bit by bit.
+    manifest = read_manifest(output)
+    material, again = tmp_path / "again.toml", tmp_path / "again.exr"
+    material.write_text(manifest["contents of --material"], encoding="utf-8")
+    options = [
+        f"{name}={value}" for name, value in manifest.items() if name[:2] == "--" and name not in ("--material", "--scattering")
+    ]
+    assert main(["render", *options, "--material", str(material), "--output", str(again)]) == 0
+    for name, value in vars(sj.read_exr(again)).items():
+        np.testing.assert_array_equal(np.asarray(value), np.asarray(getattr(frame, name)), err_msg=name)
     with Image.open(picture) as shown:
         assert shown.size == (64, 64)
         assert np.asarray(shown).max() > 100
