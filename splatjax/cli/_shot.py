@@ -11,12 +11,13 @@ import numpy as np
 import tyro
 
 import splatjax as sj
-from splatjax.io import fingerprint, material_path, own_version
+from splatjax.io import check_room, fingerprint, free_bytes, material_path, own_version
 
 from ._outputs import OptionalPath
 from ._report import note, stage
 
 _FILL_SIDE, _FILL_ELEVATION = 25.0, 10.0  # degrees: beside the camera, away from the light
+_BYTES_PER_SPLAT, _BYTES_PER_PIXEL = 1000.0, 500.0  # at least: what does not fit by these does not fit
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,6 +62,13 @@ class Shot:
         for name in ("azimuth", "light_azimuth", "light_elevation"):
             if not math.isfinite(value := getattr(self, name)):
                 raise ValueError(f"--{name.replace('_', '-')} is {value:g}; it must be a finite number of degrees")
+        if self.splats is None and self.count > 0:
+            check_room(
+                f"--count {self.count}", _BYTES_PER_SPLAT * self.count, f"take {free_bytes() / _BYTES_PER_SPLAT:.0f} at most"
+            )
+        if self.width > 0 and self.height > 0:
+            fits = f"take {free_bytes() / _BYTES_PER_PIXEL:.0f} pixels at most"
+            check_room(f"--width {self.width} --height {self.height}", _BYTES_PER_PIXEL * self.width * self.height, fits)
         if not -90 < self.elevation < 90:
             raise ValueError(f"--elevation is {self.elevation:g}; it must lie between -90 and 90 degrees, both excluded")
 

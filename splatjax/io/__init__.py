@@ -14,5 +14,6 @@ from ._ply import read_splats as read_splats, write_splats as write_splats
 from ._png import write_png as write_png
 from ._profiles import read_profile as read_profile, save_exports as save_exports
 from ._record import fingerprint as fingerprint, read_record as read_record, write_record as write_record
+from ._room import check_room as check_room, free_bytes as free_bytes
 from ._starts import dipole_starts as dipole_starts
 from ._version import own_version as own_version

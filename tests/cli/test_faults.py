@@ -1,6 +1,7 @@
 """What the program says when something goes wrong, and with which status it ends."""
 
 import os
+import re
 import subprocess
 import sys
 import tomllib
@@ -102,6 +103,19 @@ def test_names_that_are_nearly_right_are_told(tmp_path, capsys):
         path.write_text(OWN.replace("2.19", value))
         said = failure(["render", plate(tmp_path / "plate.ply"), "--material", path, "--output", tmp_path / "o.exr"], capsys)
         assert "sigma_s_prime must be" in said
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--width", "1000000", "--height", "1000000"], "--width 1000000 --height 1000000 would take about 5e+05 GB of memory"),
+        (["--count", "1000000000000"], "--count 1000000000000 would take about 1e+06 GB of memory"),
+    ],
+)
+def test_what_cannot_fit_is_refused_with_what_would(words, said, tmp_path, capsys):
+    line = failure(["render", *words, "--output", tmp_path / "o.exr"], capsys)
+    assert said in line
+    assert re.search(r"take \d+ (pixels )?at most", line)
 
 
 def test_a_cut_without_effect_is_refused(capsys):
