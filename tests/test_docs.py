@@ -46,6 +46,7 @@ def test_the_function_of_an_equation_names_it(equation):
         "CHANGELOG.md",
         "docs/conventions.md",
         "docs/equations.md",
+        "docs/figures.md",
         "docs/gradients.md",
         "docs/recovery.md",
         "docs/which_profile.md",

@@ -6,7 +6,7 @@ from jaxtyping import Array, Float
 
 from splatjax.scene import Splats
 
-_EVEN = 0.197  # fitted on the bust: docs/figures.md
+_EVEN = 0.2  # fitted on the bust: docs/figures.md
 _POINTS = 512  # at which the contrast is measured
 _AT_ONCE = 8
 
@@ -16,7 +16,7 @@ def thinning_error(
 ) -> Float[Array, "..."]:
     r"""Give the error of a layer that is made of a part of the splats, spread evenly: root mean square, of the layer's own.
 
-        E = 0.197 s x^(3/2) (1 - q)^(1/2),    x = (h / sigma) q^(-1/2)
+        E = 0.2 s x^(3/2) (1 - q)^(1/2),    x = (h / sigma) q^(-1/2)
 
     What counts is `x`, the spacing of the splats that stay in widths of the layer: where a radius is amplified a-fold, `1 / a^2`
     of the splats serve as well, as Figure 5 shows. A layer averages over `4 pi / x^2` of them. Were splats left out at random,

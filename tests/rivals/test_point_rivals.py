@@ -130,6 +130,18 @@ def test_a_plane_of_one_color_has_exactly_that_color_and_lies_where_it_lies(name
 
 
 @pytest.mark.once
+@pytest.mark.parametrize("name", RASTERIZERS)
+def test_what_is_nearer_hides_what_is_behind(name):
+    near, far = plane(6.0, 1.0, jitter=0.2), plane(6.0, 1.0, jitter=0.2)
+    both = [jnp.concatenate([getattr(far, each), getattr(near, each)]) for each in ("centers", "normals", "radii", "areas")]
+    both[0] = both[0].at[: far.count, 2].add(-8.0)
+    colors = jnp.concatenate([jnp.zeros((1, far.count)), jnp.ones((1, near.count))], axis=1)
+    seen, covered = drawn(name, sj.Splats(*both), colors, camera((0.0, 0.0, 20.0), fov=20.0))
+    assert np.all(covered > 0)
+    np.testing.assert_allclose(seen, 1.0, rtol=1e-6)
+
+
+@pytest.mark.once
 def test_elliptical_points_have_one_color_each_and_blended_ones_more():
     """Every color is some splat's own where the nearest wins; a blend has colors between them."""
     sheet = plane(6.0, 1.5, jitter=0.2)
@@ -205,12 +217,14 @@ def test_slopes_of_a_sphere_are_its_curvature_and_those_of_a_plane_are_none():
     assert np.max(np.abs(normal_slopes(plane(3.0, 1.0)))) == 0
 
 
+@pytest.mark.long
 @pytest.mark.once
 def test_a_rival_renders_what_the_renderer_does_with_scattering_and_shadow():
     """Where splats are smaller than what bends it makes little matter whether irradiance is blended or found per pixel."""
     body = ball(1500)
+    body = dataclasses.replace(body, albedo=jnp.broadcast_to(jnp.asarray([0.9, 0.6, 0.3]), (body.count, 3)))
     lamp = sj.DirectionalLight(jnp.asarray([0.4, -0.3, -1.0]), jnp.full(3, np.pi))
-    scene, seen = sj.Scene(body, (lamp,), sj.load_material("skin")), camera((0.0, 0.0, 60.0), fov=22.0)
+    scene, seen = sj.Scene(body, (lamp,), sj.load_material("skin").white()), camera((0.0, 0.0, 60.0), fov=22.0)
     own = sj.render(scene, seen)
     inner = np.asarray(own.normal[..., 2]) > 0.3
     for settings in (sj.RenderSettings(lighting=LightAtPixels()), deferred_splatting()):

@@ -1,19 +1,22 @@
 """The law of Figure 5 against sums over splats that were left out, on bodies that it was not fitted on."""
 
+import dataclasses
 import os
 from pathlib import Path
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import splatjax as sj
-from splatjax.diffusion import DenseDiffuser
+from splatjax.diffusion import DenseDiffuser, DiffusionSettings, PlainMean
 from splatjax.render import light_on_splats
-from splatjax.rivals import layer_contrast, splats_that_suffice, thinning_error
+from splatjax.rivals import ThinnedDiffuser, layer_contrast, splats_that_suffice, thinning_error
 
 FACTOR = 1.5  # what the law is held to
 POINTS, LIGHTS = 384, ((-0.5, -0.4, -0.75), (0.8, -0.6, -0.2))
+PLAIN = DiffusionSettings(normalization=PlainMean())
 AMPLIFIED, KEEP = (2.0, 3.0, 5.0), (2, 4, 8, 16)
 
 
@@ -114,3 +117,26 @@ def test_even_light_has_no_contrast_and_a_checkered_one_has_all():
     np.testing.assert_allclose(layer_contrast(sheet, jnp.ones((sheet.count, 1)), variance), 0, atol=1e-3)
     checkers = jnp.asarray(((x + y) % 2)[:, None], float)
     np.testing.assert_allclose(layer_contrast(sheet, checkers, variance), 1, rtol=0.02)
+
+
+@pytest.mark.once
+def test_layers_of_fewer_splats_keep_constants_and_those_of_all_are_the_plain_ones():
+    body = sj.bust(1200)
+    material = sj.Material(sj.SumOfGaussians(jnp.asarray([400.0, 900.0]), jnp.full((2, 1), 0.5)))
+    body = dataclasses.replace(body, albedo=None)
+    away = jnp.asarray([0.0, 0.0, 900.0])
+    scene, camera = sj.Scene(body, (), material), sj.Camera.look_at(away, jnp.zeros(3), width=16, height=16)
+    diffusers = DenseDiffuser(), ThinnedDiffuser(1), ThinnedDiffuser(7)
+    settings = [sj.RenderSettings(diffuser=each, diffusion=PLAIN) for each in diffusers]
+    plan = sj.plan(scene, camera, settings[0])
+    light = 0.5 + 0.5 * body.normals[:, :1]
+
+    def layers(light, settings):
+        own = eqx.tree_at(lambda plan: plan.diffuser, plan, settings.diffuser)
+        return np.asarray(sj.diffuse(scene, light, camera, settings, own))
+
+    exact, same, thinned = (layers(light, each) for each in settings)
+    np.testing.assert_allclose(same, exact, atol=1e-6)
+    there = exact > 0
+    assert 0.001 < np.sqrt(np.mean((thinned - exact)[there] ** 2)) < 0.1
+    np.testing.assert_allclose(layers(jnp.ones_like(light), settings[2])[there], 1.0, rtol=1e-5)
