@@ -100,8 +100,10 @@ def integrate(
         samples = known[spacing]
         sunk = samples.positions - depth * samples.normals
         mean, exit_ = np.zeros_like(own), np.zeros(len(own))
-        for i, found in enumerate(cKDTree(sunk).query_ball_point(points, REACH * deviation)):
-            squared = np.sum((sunk[found] - points[i]) ** 2, axis=1)
+        tree = cKDTree(sunk)
+        for i, point in enumerate(points):  # one by one: all their neighbors together would fill the memory
+            found = tree.query_ball_point(point, REACH * deviation)
+            squared = np.sum((sunk[found] - point) ** 2, axis=1)
             weight = samples.areas[found] * np.exp(-0.5 * squared / variance)
             gathered = weight.sum()
             mean[i] = weight @ samples.source[found] / gathered

@@ -49,6 +49,7 @@ def test_the_function_of_an_equation_names_it(equation):
         "docs/figures.md",
         "docs/gradients.md",
         "docs/recovery.md",
+        "docs/rivals.md",
         "docs/which_profile.md",
     ],
 )

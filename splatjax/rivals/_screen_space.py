@@ -175,10 +175,12 @@ def _fetch(
     place = jnp.clip(index + offset, 0, size - 1)
     first = jnp.clip(jnp.floor(place).astype(jnp.int32), 0, size - 2)
     beside = place - first.astype(place.dtype)
-    stacked = jnp.concatenate([rows, depth[None]])
-    found, total = jnp.zeros_like(rows), jnp.zeros_like(depth)
+    across = jnp.arange(depth.shape[axis - 1], dtype=jnp.int32)  # the place along the other axis
+    stacked = jnp.concatenate([rows, depth[None]]).transpose(1, 2, 0)
+    found, total = jnp.zeros((*depth.shape, len(rows)), rows.dtype), jnp.zeros_like(depth)
     for pixel, weight in ((first, 1 - beside), (first + 1, beside)):
-        tap = jnp.take_along_axis(stacked, jnp.broadcast_to(pixel[None], stacked.shape), axis=axis + 1)
-        trusted = weight * near(tap[-1])
-        found, total = found + trusted[None] * tap[:-1], total + trusted
-    return found, total
+        at = (pixel, across[None]) if axis == 0 else (across[:, None], pixel)
+        tap = stacked.at[at].get(mode="promise_in_bounds")
+        trusted = weight * near(tap[..., -1])
+        found, total = found + trusted[..., None] * tap[..., :-1], total + trusted
+    return found.transpose(2, 0, 1), total

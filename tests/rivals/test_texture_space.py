@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.test_util import check_grads
 from planes import HALF, camera_over, coordinates, gathered, painted, plane, splatted
 
 import splatjax as sj
@@ -137,3 +138,23 @@ def test_through_a_slab_comes_what_comes_through_splats():
     truth = np.asarray(gain * sums.means[0])[..., 0]
     assert np.all(truth[0] > 0.05)
     np.testing.assert_allclose(ours, truth, atol=5e-3)
+
+
+@pytest.mark.slow
+def test_a_picture_has_the_derivatives_that_differences_say(float64):
+    settings = dataclasses.replace(STILL, resolution=40)
+    mesh = rivals.TexturedMesh.of(plane(1.5), painted(1.5, 24))
+    camera = camera_over(6.0, 8)
+    lights = (dataclasses.replace(FRONTAL, direction=jnp.asarray([0.3, 0.2, -1.0])),)
+    plan = rivals.plan_texture_space(mesh, lights, DULL, camera, settings)
+    pattern = jnp.sin(jnp.arange(8.0 * 8 * 3)).reshape(8, 8, 3)
+
+    @jax.jit
+    def seen(variances, albedo, direction, normals):
+        painted_mesh = eqx.tree_at(lambda each: (each.albedo, each.normals), mesh, (albedo, normals))
+        material = sj.Material(sj.SumOfGaussians(variances, TWO.weights), specular=0.2)
+        light = (dataclasses.replace(lights[0], direction=direction),)
+        return jnp.sum(pattern * rivals.render_texture_space(painted_mesh, light, material, camera, settings, plan).frame.beauty)
+
+    given = TWO.variances, mesh.albedo, lights[0].direction, mesh.normals
+    check_grads(seen, given, order=1, modes=["rev"], rtol=1e-5, atol=1e-5)
