@@ -12,7 +12,7 @@ from splatjax.scene import Material, Splats
 from ._subject import Subject, bright, picture_grid
 
 _DISCS = 6000
-_APART = 0.5  # radius of the discs that are shown, in roots of the area each stands for
+_RADIUS = 0.5  # of the discs that are shown, in roots of the area each stands for
 
 
 def figure_1(subject: Subject, material: Material, *, discs: int = _DISCS) -> Figure:
@@ -22,7 +22,7 @@ def figure_1(subject: Subject, material: Material, *, discs: int = _DISCS) -> Fi
 
     - `subject`: the body.
     - `material`: with its scattering.
-    - `discs`: about how many splats are shown on the left, as discs apart from each other.
+    - `discs`: about how many splats are shown on the left, with gaps between them.
 
     **Returns:** a matplotlib `Figure`.
 
@@ -41,7 +41,7 @@ def figure_1(subject: Subject, material: Material, *, discs: int = _DISCS) -> Fi
 
 
 def spaced(splats: Splats, count: int) -> Splats:
-    """Give about so many of the splats, as discs that do not touch."""
+    """Give about so many of the splats, as discs with gaps between them."""
     step = max(splats.count // count, 1)
     kept = jax.tree.map(lambda rows: rows[::step], splats)
-    return replace(kept, radii=_APART * (step * kept.areas) ** 0.5, areas=step * kept.areas)
+    return replace(kept, radii=_RADIUS * (step * kept.areas) ** 0.5, areas=step * kept.areas)
