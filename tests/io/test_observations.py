@@ -88,7 +88,7 @@ def test_all_files_are_named(listed, tmp_path):
     [
         ('file = "one.exr"\nmask', "mask", r"\[pictures 1\] has no file; it must be the name of an EXR file"),
         ("noise = 0.02", "noise = 0", r"\[pictures 1\] noise must be a number, positive; it is 0"),
-        ("noise = 0.02", "nois = 0.02", r"has an unknown entry 'nois'; known are camera, file"),
+        ("noise = 0.02", "nois = 0.02", r"has an unknown entry 'nois'; did you mean 'noise'"),
         ('"unknown"', '"maybe"', r"intensity must be one of known, unknown, unknown color; it is 'maybe'"),
         ("[0, 1, 50]", "[0, 1]", r"\[pictures 1 camera\] position must be three numbers; it is \[0.0, 1.0\]"),
         ("[0, 0, -1]", "[0, 0, 0]", r"\[pictures 1 lights 1\] direction must be three numbers, not all 0"),
