@@ -143,7 +143,7 @@ def test_through_a_slab_comes_what_comes_through_splats():
 @pytest.mark.slow
 def test_a_picture_has_the_derivatives_that_differences_say(float64):
     settings = dataclasses.replace(STILL, resolution=40)
-    mesh = rivals.TexturedMesh.of(plane(1.5), painted(1.5, 24))
+    mesh = rivals.TexturedMesh.of(plane(1.4), painted(1.4, 24))
     camera = camera_over(6.0, 8)
     lights = (dataclasses.replace(FRONTAL, direction=jnp.asarray([0.3, 0.2, -1.0])),)
     plan = rivals.plan_texture_space(mesh, lights, DULL, camera, settings)
