@@ -87,5 +87,5 @@ class TranslucentShadowMap(AbstractThinParts):
         cosine = jnp.sum(wi * normals, axis=1)
         opposite = jnp.clip(-jnp.sum(entered[2:].T * normals, axis=1), 0, 1)
         thickness = way + opposite * (jnp.clip(-cosine, 0, 1) * way - way)
-        there = lit & (cosine < 0) & (depth > front.depth[row, column] + bias)
+        there = lit & (cosine < 0) & (depth > front.depth[tile, pixel] + bias)
         return entered[:2].T, jnp.where(there, jnp.exp(-thickness / scale), 0.0)

@@ -16,6 +16,7 @@ def pictures():
     return first, np.clip(first + 0.1 * random.normal(size=first.shape), 0, 1)
 
 
+@pytest.mark.once
 def test_similarity_is_that_of_other_code(pictures):
     first, second = (jnp.asarray(each, float) for each in pictures)
     theirs = structural_similarity(
@@ -25,6 +26,7 @@ def test_similarity_is_that_of_other_code(pictures):
     assert float(rivals.similarity(first, first)) == pytest.approx(1.0, abs=1e-5)
 
 
+@pytest.mark.once
 def test_points_are_off_by_their_worst_channel_of_the_root_mean_square():
     truth = np.tile([[1.0, 2.0]], (100, 1))
     found = truth.copy()
@@ -36,6 +38,7 @@ def test_points_are_off_by_their_worst_channel_of_the_root_mean_square():
     assert off.rms == pytest.approx(np.sqrt((0.09 + 0.01) / 200))
 
 
+@pytest.mark.once
 def test_halves_are_the_left_of_one_and_the_right_of_the_other():
     left, right = jnp.zeros((2, 4, 3)), jnp.ones((2, 4, 3)).at[0, 0].set(0.01)
     found = rivals.half_and_half(left, right, gain=4.0)

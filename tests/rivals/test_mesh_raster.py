@@ -36,6 +36,7 @@ def corners():
     return jnp.asarray(mesh.corners(), float)
 
 
+@pytest.mark.once
 def test_a_slanted_plane_is_seen_where_its_rays_meet_it_and_has_no_cracks(corners):
     landing, seen = seen_from(CAMERA, corners)
     found = rivals.interpolate(corners, seen, rivals.barycentrics(landing, seen))
@@ -46,6 +47,7 @@ def test_a_slanted_plane_is_seen_where_its_rays_meet_it_and_has_no_cracks(corner
     assert float(seen.needed) <= 1
 
 
+@pytest.mark.once
 def test_the_nearest_face_hides_the_others_and_backs_are_not_drawn(corners):
     nearer, back = corners + jnp.asarray([0.0, 0.0, 2.0])[None, None], corners[:, ::-1] + jnp.asarray([0.0, 0.0, 4.0])[None, None]
     landing, seen = seen_from(CAMERA, jnp.concatenate([corners, nearer, back]))
@@ -58,17 +60,20 @@ def test_the_nearest_face_hides_the_others_and_backs_are_not_drawn(corners):
     assert found[SIZE // 2, SIZE // 2, 2] == pytest.approx(2.0, abs=1e-4)
 
 
+@pytest.mark.once
 def test_a_face_that_reaches_before_the_near_plane_is_not_drawn(corners):
     behind = corners.at[0, 0].set(jnp.asarray([6.0, -9.0, 30.0]))
     _, seen = seen_from(CAMERA, behind)
     assert not np.any(np.asarray(seen.faces)[np.asarray(seen.covered)] == 0)
 
 
+@pytest.mark.once
 def test_what_lacks_room_is_told(corners):
     landing = rivals.Landing.in_view(corners, PerspectiveView.of(CAMERA))
     assert float(rivals.see_faces(landing, 100).needed) == pytest.approx(int(landing.fragments()) / 100)
 
 
+@pytest.mark.once
 def test_faces_cover_a_texture_without_gaps_mirrored_or_not():
     mesh = plane(1.0)
     for uvs in (mesh.uvs, mesh.uvs * [-1.0, 1.0] + [1.0, 0.0]):

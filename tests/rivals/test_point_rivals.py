@@ -214,6 +214,7 @@ def test_normals_that_vary_within_splats_are_closer_to_the_sphere_than_blended_a
     assert shades["phong"] < 0.5 * shades["deferred"] < 0.5 * shades["elliptical"]
 
 
+@pytest.mark.once
 def test_slopes_of_a_sphere_are_its_curvature_and_those_of_a_plane_are_none():
     body = ball(600, radius=10.0)
     slopes, normals = np.asarray(normal_slopes(body), float), np.asarray(body.normals, float)
@@ -239,6 +240,7 @@ def test_a_rival_renders_what_the_renderer_does_with_scattering_and_shadow():
         assert np.sqrt(np.mean(off**2)) < 0.02, settings.rasterizer  # of radiance up to 1; most of it where the light grazes
 
 
+@pytest.mark.once
 def test_without_a_plan_a_rival_says_what_to_do():
     body, seen = ball(50), camera((0.0, 0.0, 60.0))
     with pytest.raises(ValueError, match="plan"):
@@ -266,6 +268,7 @@ def test_what_is_blended_has_derivatives(name, float64):
     np.testing.assert_allclose(jax.jit(jax.grad(total))(0.0), expected, rtol=1e-3)
 
 
+@pytest.mark.once
 def test_single_scattering_is_not_differentiated_under_light_at_pixels():
     body, seen = ball(50), camera((0.0, 0.0, 60.0))
     medium = sj.Medium(jnp.full(1, 0.1), jnp.full(1, 1.0), jnp.full(1, 1.3))

@@ -76,16 +76,19 @@ def edge():
 PASSES, SHIPPED = rivals.GaussianPasses(reach=32), rivals.ShippedKernel()
 
 
+@pytest.mark.once
 def test_gaussian_by_gaussian_it_is_the_convolution(spotted):
     assert off_by(spotted, TWO, PASSES) < 2e-4  # 1.9e-5
 
 
+@pytest.mark.once
 def test_one_kernel_is_the_convolution_for_one_gaussian_alone(spotted):
     """But for its taps, which end at twice the root of the mean squared distance."""
     assert off_by(spotted, ONE, SHIPPED) < 5e-2  # 3.8e-2
     assert off_by(spotted, TWO, SHIPPED) > 8e-2  # 9.0e-2
 
 
+@pytest.mark.once
 def test_a_preintegrated_kernel_is_right_along_straight_edges_and_the_shipped_one_is_not(edge, spotted):
     preintegrated = rivals.PreintegratedKernel()
     assert off_by(edge, TWO, preintegrated) < 4e-2  # 3.5e-2, the ends of its taps
@@ -93,6 +96,7 @@ def test_a_preintegrated_kernel_is_right_along_straight_edges_and_the_shipped_on
     assert off_by(spotted, TWO, preintegrated) > 6e-2  # 6.8e-2
 
 
+@pytest.mark.once
 @pytest.mark.parametrize("kernel", [PASSES, SHIPPED])
 def test_constant_light_stays_constant_and_does_not_jump_to_another_surface(kernel):
     """The right half of the picture lies 100 mm farther away, and is dark; a corner shows nothing."""

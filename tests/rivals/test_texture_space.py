@@ -44,11 +44,13 @@ def off_by(stretch: float, correction: rivals.AbstractStretch) -> float:
     return float(np.max(np.abs(np.asarray(ours) - truth)) / np.max(truth))
 
 
+@pytest.mark.once
 def test_on_a_plane_it_is_splat_diffusion():
     assert off_by(1.0, rivals.StretchCorrected()) < 2e-3  # 1.4e-3
     assert off_by(1.0, rivals.Uncorrected()) < 2e-3  # a chart that is not stretched needs no correction
 
 
+@pytest.mark.once
 def test_a_stretched_chart_needs_the_correction():
     assert off_by(3.0, rivals.StretchCorrected()) < 1e-2  # 7.6e-3: texels are three times as long
     assert off_by(3.0, rivals.Uncorrected()) > 5e-2  # 1.1e-1
@@ -65,6 +67,7 @@ def sheet():
     return mesh, lights, camera, settings, plan
 
 
+@pytest.mark.once
 def test_constant_light_stays_constant_up_to_the_edges(sheet):
     mesh, lights, camera, settings, plan = sheet
     found = rivals.render_texture_space(mesh, lights, DULL, camera, settings, plan)
@@ -80,6 +83,7 @@ def test_constant_light_stays_constant_up_to_the_edges(sheet):
     assert frame.overflow == 0
 
 
+@pytest.mark.once
 def test_without_room_the_picture_is_nan_and_says_so(sheet):
     mesh, lights, camera, settings, plan = sheet
     small = dataclasses.replace(plan, camera=100)
@@ -88,6 +92,7 @@ def test_without_room_the_picture_is_nan_and_says_so(sheet):
     assert np.all(np.isnan(np.asarray(frame.beauty)[np.asarray(frame.depth) < np.inf]))
 
 
+@pytest.mark.once
 def test_bad_input_is_refused_in_one_sentence(sheet):
     mesh, lights, camera, settings, _ = sheet
     bare = plane(1.0)
@@ -115,6 +120,7 @@ def slab(thickness: float) -> Mesh:
     return Mesh(vertices, faces, np.concatenate([front.normals, front.normals * turn]), uvs)
 
 
+@pytest.mark.once
 @pytest.mark.slow
 def test_through_a_slab_comes_what_comes_through_splats():
     """Lit from behind: the share and the odds of leaving are those of two sheets of splats."""

@@ -93,6 +93,7 @@ def test_the_law_holds_on_a_head_it_was_not_fitted_on():
     assert np.max(np.abs(np.log(found))) < np.log(FACTOR), found
 
 
+@pytest.mark.once
 def test_what_suffices_is_the_inverse_of_the_error():
     width, spacing, contrast = (jnp.asarray(value) for value in (8.0, 1.0, 0.6))
     for error in (0.006, 0.02, 0.05):
@@ -101,12 +102,14 @@ def test_what_suffices_is_the_inverse_of_the_error():
     assert float(splats_that_suffice(width, spacing, jnp.asarray(1e-6), contrast)) == 1
 
 
+@pytest.mark.once
 def test_a_radius_twice_as_large_allows_a_quarter_of_the_splats():
     one = jnp.asarray(1.0)
     wide, narrow = (thinning_error(jnp.asarray(a), one, jnp.asarray(q), one) for a, q in ((8.0, 0.01), (4.0, 0.04)))
     np.testing.assert_allclose(wide / np.sqrt(1 - 0.01), narrow / np.sqrt(1 - 0.04), rtol=1e-5)
 
 
+@pytest.mark.once
 def test_even_light_has_no_contrast_and_a_checkered_one_has_all():
     line = np.arange(-10.0, 10.5)
     x, y = (each.reshape(-1) for each in np.meshgrid(line, line))

@@ -132,6 +132,7 @@ def test_tiles_draw_what_the_plain_rasterizer_draws(kind):
     assert np.sum(pictures["one sphere before another"][-1] > 0.5) > 2, "no inner silhouette was seen"
 
 
+@pytest.mark.once
 @pytest.mark.parametrize("rasterizer", [DenseRasterizer(), TILES])
 def test_what_of_a_tile_lies_beyond_the_picture_shows_nothing(rasterizer):
     """The pixels of a tile that are none must not be shaded, nor count as seen."""
