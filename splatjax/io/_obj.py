@@ -2,123 +2,121 @@
 
 import warnings
 from functools import partial
+from io import BytesIO
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 
-from splatjax.geometry import triangulate
-
 from ._color import srgb_to_linear
 from ._files import file_beside
+from ._library import check_fans, fan, merged, readable
 from ._pictures import read_color
 from ._pieces import Piece, check_places
 
+_TABLES = {"v": 3, "vt": 2, "vn": 3}
 _CURVES = {"curv", "curv2", "surf", "bzp", "bsp", "cdc", "cdp", "res"}
 
 
-class _Corners(NamedTuple):
-    """What stands at each corner of a face, and the tables that corners point into; -1 where they point nowhere."""
+_Corner = tuple[str, tuple[bool, ...]]
+"""A corner as trimesh is to read it, and which tables it names."""
 
-    places: np.ndarray
-    colors: np.ndarray | None
-    coordinates: np.ndarray
-    normals: np.ndarray
-    indices: np.ndarray
+
+class _Part:
+    """Faces of one material whose corners name the same tables."""
+
+    def __init__(self):
+        self.lines: list[str] = []
+        self.counts: list[int] = []
 
 
 def read_obj(path: Path) -> list[Piece]:
-    """Read the polygons of an OBJ file, cut into triangles: a piece for each material.
+    """Read the polygons of an OBJ file, cut into triangles: a piece for each material and kind of corner.
 
-    **Raises:** `ValueError` for numbers that are none, faces that name what is not there, and surfaces that are no polygons.
+    trimesh reads the numbers; it is given faces as triangles that count from the beginning, sorted by the tables that their
+    corners name, for it takes the first face's for all and does not look whether what a face names is there.
+
+    **Raises:** `ValueError` for numbers that are none, faces that name what is not there, faces that are not convex, and surfaces
+    that are no polygons.
     """
     text = path.read_bytes().decode("utf-8", "replace").replace("\\\r\n", " ").replace("\\\n", " ")
-    tables: dict[str, list[str]] = {"v": [], "vt": [], "vn": []}
-    seen: dict[str, int] = {}
-    faces: dict[str, list[list[int]]] = {}
-    libraries: list[str] = []
-    current = faces.setdefault("", [])
+    rows: dict[str, list[str]] = {name: [] for name in _TABLES}
+    parts: dict[tuple[str, tuple[bool, ...]], _Part] = {}
+    known: dict[str, _Corner] = {}
+    most, material, libraries = [0, 0, 0], "", []
     for line in text.splitlines():
         kind, _, rest = line.split("#", 1)[0].strip().replace("\t", " ").partition(" ")
-        if kind in tables:
-            tables[kind].append(rest)
+        if kind in rows:
+            if len(rest.split()) < _TABLES[kind]:
+                raise ValueError(f"{path}: `{line[:60]}` is no row of {_TABLES[kind]} numbers; write the file again")
+            rows[kind].append(f"{kind} {rest.strip()}")
         elif kind == "f":
-            words = [_absolute(word, tables) for word in rest.split()] if "-" in rest else rest.split()
-            if len(words) < 3:
-                raise ValueError(f"{path}: the face `{line[:60]}` has less than three corners; write the file again")
-            current.append([seen.setdefault(word, len(seen)) for word in words])
+            corners = [known.get(word) or _corner(path, word, rows, most, known) for word in rest.split()]
+            shapes = {shape for _, shape in corners}
+            if len(corners) < 3 or len(shapes) > 1:
+                what = "less than three corners" if len(corners) < 3 else "corners of several kinds"
+                raise ValueError(f"{path}: the face `{line[:60]}` has {what}; write the file again")
+            part = parts.setdefault((material, shapes.pop()), _Part())
+            part.lines += [f"f {a} {b} {c}" for a, b, c in fan([corner for corner, _ in corners])]
+            part.counts.append(len(corners) - 2)
         elif kind == "usemtl":
-            current = faces.setdefault(rest.strip(), [])
+            material = rest.strip()
         elif kind == "mtllib":
             libraries.append(rest.strip())
         elif kind in _CURVES:
             raise ValueError(f"{path}: has curved surfaces ({kind}), which are not read here; export polygons")
-    corners = _corners(path, tables, list(seen))
-    materials = _materials(path, libraries) if any(faces) else {}
-    return [_piece(path, polygons, corners, materials.get(name, {})) for name, polygons in faces.items() if polygons]
+    for name, named in zip(_TABLES, most, strict=True):
+        if named > len(rows[name]):
+            raise ValueError(f"{path}: a face names {name} {named}, but there are {len(rows[name])} {name}; write the file again")
+    if not parts:
+        return []
+    plain = [line for table in rows.values() for line in table]
+    for number, part in enumerate(parts.values()):
+        plain += [f"g {number}", *part.lines]
+    with readable(path, "OBJ"):
+        from trimesh.exchange.obj import load_obj  # takes a second, so only where a mesh is read
+
+        data = BytesIO("\n".join(plain).encode())
+        found = load_obj(data, split_groups=True, group_material=False, skip_materials=True)["geometry"]
+        materials = _materials(path, libraries)
+        return [
+            _piece(path, found[str(number)], part.counts, materials.get(name, {}))
+            for number, ((name, _), part) in enumerate(parts.items())
+        ]
 
 
-def _absolute(word: str, tables: dict[str, list[str]]) -> str:
-    """Count what is counted from the end, -1 for the last that stands above, from the beginning."""
+def _corner(path: Path, word: str, rows: dict[str, list[str]], most: list[int], known: dict[str, _Corner]) -> _Corner:
+    """Count what a corner `v/vt/vn` names from the beginning, also where -1 is the last that stands above."""
     parts = word.split("/")
-    for i, (part, above) in enumerate(zip(parts, tables.values(), strict=False)):
-        if part[:1] == "-" and part[1:].isdecimal():
-            parts[i] = str(len(above) + 1 - int(part[1:]))
-    return "/".join(parts)
-
-
-def _table(path: Path, name: str, rows: list[str], least: int) -> np.ndarray:
-    """Give the numbers of rows; those that have fewer are filled up with NaN, as of `vt u` or the colors of some vertices."""
     try:
-        return np.loadtxt(rows, np.float64, comments=None, ndmin=2) if rows else np.zeros((0, least))
+        numbers = [int(part) if part else 0 for part in parts]
+        places = [n if n >= 0 else len(above) + 1 + n for n, above in zip(numbers, rows.values(), strict=False)]
+        if len(parts) > 3 or any(part and place < 1 for part, place in zip(parts, places, strict=True)) or not parts[0]:
+            raise ValueError
     except ValueError:
-        pass
-    cells = [row.split() for row in rows]
-    width = max(least, *map(len, cells))
-    table = np.full((len(rows), min(width, 7)), np.nan)
-    try:
-        for i, row in enumerate(cells):
-            table[i, : len(row)] = [float(cell) for cell in row]
-    except ValueError as error:
-        raise ValueError(f"{path}: `{name} {rows[i][:60]}` is no row of {least} numbers ({error})") from None
-    return table
+        raise ValueError(f"{path}: a corner of a face is `{word[:60]}`, which names nothing; write the file again") from None
+    for i, place in enumerate(places):
+        most[i] = max(most[i], place)
+    shape = tuple(place > 0 for place in (*places, 0, 0)[:3])
+    corner = "/".join(str(place) if place else "" for place in places).rstrip("/"), shape
+    if "-" not in word:
+        known[word] = corner
+    return corner
 
 
-def _corners(path: Path, tables: dict[str, list[str]], words: list[str]) -> _Corners:
-    places, coordinates, normals = (_table(path, name, tables[name], least) for name, least in (("v", 3), ("vt", 2), ("vn", 3)))
-    if places.shape[1] < 3 or coordinates.shape[1] < 2 or normals.shape[1] < 3:
-        raise ValueError(f"{path}: its v, vt and vn need three, two and three numbers; write the file again")
-    counts = (len(places), len(coordinates), len(normals))
-    indices = np.full((len(words), 3), -1)
-    for i, word in enumerate(words):
-        parts = word.split("/")
-        for j, part in enumerate(parts):
-            if part and part.isdecimal() and len(part) < 16 and j < 3 and 1 <= int(part) <= counts[j]:
-                indices[i, j] = int(part) - 1
-            elif part or j == 0:
-                name = "v", "vt", "vn", "that"
-                have = f"there are {counts[j]} {name[j]}" if j < 3 else "a corner is v/vt/vn"
-                raise ValueError(f"{path}: a corner of a face is `{word[:60]}`, but {have}; write the file again")
-    check_places(path, places[:, :3])
-    colors = None
-    if places.shape[1] >= 6 and np.isfinite(places[:, 3:6]).all():
-        if places[:, 3:6].min() < 0 or places[:, 3:6].max() > 1:
-            raise ValueError(f"{path}: colors of vertices range up to {places[:, 3:6].max():g}; they are sRGB in [0, 1]")
-        colors = srgb_to_linear(places[:, 3:6])
-    return _Corners(places[:, :3], colors, coordinates[:, :2], normals[:, :3], indices)
-
-
-def _piece(path: Path, polygons: list[list[int]], corners: _Corners, dress: dict) -> Piece:
-    triangles = corners.indices[triangulate(corners.places[corners.indices[:, 0]], polygons)]
-    # A vertex for each pair of place and normal, so that creases stay sharp; texture coordinates belong to corners.
-    pairs, faces = np.unique(triangles[..., [0, 2]].reshape(-1, 2), axis=0, return_inverse=True)
-    normals = uvs = None
-    if (pairs[:, 1] >= 0).any():
-        normals = np.where(pairs[:, 1:] >= 0, corners.normals[pairs[:, 1]], 0.0)
-    if (triangles[..., 1] >= 0).all():
-        uvs = corners.coordinates[triangles[..., 1]]
-    colors = None if corners.colors is None else corners.colors[pairs[:, 0]]
-    return Piece(corners.places[pairs[:, 0]], faces.reshape(-1, 3), normals, uvs, colors, **dress)
+def _piece(path: Path, found: dict[str, Any], counts: list[int], dress: dict[str, Any]) -> Piece:
+    vertices, faces, visual = found["vertices"], found["faces"], found["visual"]
+    check_places(path, vertices)
+    check_fans(path, vertices[faces], np.asarray(counts))
+    uvs = None if visual is None else visual.uv[faces]
+    normals, colors = found.get("vertex_normals"), found.get("vertex_colors")
+    if colors is not None:
+        if not (colors.min() >= 0 and colors.max() <= 1):
+            raise ValueError(f"{path}: colors of vertices range up to {colors.max():g}; they are sRGB in [0, 1]")
+        colors = srgb_to_linear(colors)
+    elif normals is None:
+        vertices, faces = merged(vertices, faces)  # texture coordinates make no creases
+    return Piece(vertices, faces, normals, uvs, colors, **dress)
 
 
 def _materials(path: Path, libraries: list[str]) -> dict[str, dict]:

@@ -44,23 +44,46 @@ def test_obj_faces_are_counted_from_either_end(tmp_path, text, faces):
     np.testing.assert_allclose(mesh.normals, np.tile([0, 0, 1], (4, 1)))
 
 
+def polygon_obj(folder, places):
+    rows = "".join("v {} {} {}\n".format(*place) for place in places)
+    (folder / "a.obj").write_text(f"{rows}f {' '.join(str(i + 1) for i in range(len(places)))}\n")
+    return folder / "a.obj"
+
+
+def polygon_off(folder, places):
+    rows = "".join("{} {} {}\n".format(*place) for place in places)
+    (folder / "a.off").write_text(f"OFF\n{len(places)} 1 0\n{rows}{len(places)} {' '.join(map(str, range(len(places))))}\n")
+    return folder / "a.off"
+
+
+def polygon_ply(folder, places):
+    header = [ASCII, f"element vertex {len(places)}", *(f"property double {axis}" for axis in "xyz"), "element face 1"]
+    rows = "".join("{} {} {}\n".format(*place) for place in places) + f"{len(places)} {' '.join(map(str, range(len(places))))}\n"
+    return ply(folder / "a.ply", [*header, "property list uchar int vertex_indices"], rows.encode())
+
+
+WRITERS = {"obj": polygon_obj}
 POLYGONS = {
-    "arrow": ([(0, 0), (4, 4), (0, 2), (-4, 4)], 8.0),
-    "comb": ([(0, 0), (6, 0), (6, 4), (5, 4), (5, 1), (4, 1), (4, 4), (2, 4), (2, 1), (1, 1), (1, 4), (0, 4)], 18.0 - 2),
-    "convex": ([(0, 0), (2, 0), (3, 1), (2, 2), (0, 2)], 5.0),
+    "arrow": [(0, 0), (4, 4), (0, 2), (-4, 4)],
+    "comb": [(0, 0), (6, 0), (6, 4), (5, 4), (5, 1), (4, 1), (4, 4), (2, 4), (2, 1), (1, 1), (1, 4), (0, 4)],
+    "convex": [(0, 0), (2, 0), (3, 1), (2, 2), (0, 2)],
 }
 
 
 @pytest.mark.parametrize("shape", POLYGONS)
 @pytest.mark.parametrize("start", [0, 1, 2])
-def test_polygons_are_covered_and_no_more(tmp_path, shape, start):
-    """Wherever the polygon begins and however it stands in space, its triangles have its area and face its way."""
-    corners, _ = POLYGONS[shape]
+@pytest.mark.parametrize("write", WRITERS.values(), ids=WRITERS)
+def test_polygons_are_covered_and_no_more_or_refused(tmp_path, shape, start, write):
+    """Wherever the polygon begins and however it stands in space, the fan of its triangles has its area and faces its way."""
+    corners = POLYGONS[shape]
     corners = corners[start:] + corners[:start]
     x, y = np.asarray(corners, float).T
     area = 0.5 * np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))
-    lines = [f"v {3 - v} {u} {0.5 * u}" for u, v in corners]
-    mesh = mesh_of(tmp_path / "a.obj", "\n".join(lines) + f"\nf {' '.join(str(i + 1) for i in range(len(corners)))}\n")
+    path = write(tmp_path, [[3 - v, u, 0.5 * u] for u, v in corners])
+    if shape == "comb" or (shape == "arrow" and start == 1):
+        refused(path, f"face 0, of {len(corners)} corners, is not convex; cut it into triangles")
+        return
+    mesh = read_mesh(path, mm_per_unit=1.0)[0]
     assert len(mesh.faces) == len(corners) - 2
     np.testing.assert_allclose(mesh.face_areas().sum(), area * np.sqrt(1.25), rtol=1e-12)
     a, b, c = np.moveaxis(mesh.corners(), 1, 0)
@@ -113,16 +136,17 @@ def test_textures_are_taken_from_the_files_own_folder_alone(tmp_path):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        (SQUARE + "f 1 2 5\n", "a corner of a face is `5`, but there are 4 v;"),
-        (SQUARE + "f 1 2 -5\n", "a corner of a face is `0`, but there are 4 v;"),
+        (SQUARE + "f 1 2 5\n", "a face names v 5, but there are 4 v;"),
+        (SQUARE + "f 1 2 -5\n", "a corner of a face is `-5`, which names nothing;"),
         (SQUARE + "f 1 2 0\n", "a corner of a face is `0`"),
-        (SQUARE + "f 1/1 2/1 3/1\n", "a corner of a face is `1/1`, but there are 0 vt"),
+        (SQUARE + "f 1/1 2/1 3/1\n", "a face names vt 1, but there are 0 vt"),
+        (SQUARE + "vn 0 0 1\nf 1//1 2//1 3\n", "has corners of several kinds"),
         (SQUARE + "f 1 2 three\n", "a corner of a face is `three`"),
         (SQUARE + "f 1 2\n", "the face `f 1 2` has less than three corners"),
-        (SQUARE + "v 1 nan 0\nf 1 2 3\n", "not finite"),
-        (SQUARE + "v 1 x 0\nf 1 2 3\n", "`v 1 x 0` is no row of 3 numbers"),
-        (SQUARE + "v 1 1\nf 1 2 3\n", "not finite"),
-        (SQUARE + "v 1e300 0 0\nf 1 2 3\n", "or reach 1e"),
+        (SQUARE + "v 1 nan 0\nf 1 2 5\n", "not finite"),
+        (SQUARE + "v 1 x 0\nf 1 2 3\n", "cannot be read as OBJ: .*; it is cut short or wrong, write it again"),
+        (SQUARE + "v 1 1\nf 1 2 3\n", "`v 1 1` is no row of 3 numbers"),
+        (SQUARE + "v 1e300 0 0\nf 1 2 5\n", "or reach 1e"),
         ("cstype bezier\nsurf 0 1 0 1 1 2 3\n" + SQUARE, "has curved surfaces"),
         (SQUARE, "holds no triangle"),
         ("", "holds no triangle"),

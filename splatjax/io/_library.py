@@ -1,0 +1,65 @@
+"""Errors of the libraries that read meshes, said in one sentence; and what they do not ask of faces."""
+
+import warnings
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+
+@contextmanager
+def readable(path: Path, kind: str) -> Generator[None, None, None]:
+    """Let whatever a library raises name the file, say why and what to do.
+
+    **Raises:** `ValueError`; errors that already name the file pass.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", DeprecationWarning)  # NumPy's, of numbers that are none
+            yield
+    except Exception as error:  # each reader fails in its own way
+        if isinstance(error, (ValueError, OSError)) and str(error).startswith(str(path.parent)):
+            raise
+        said = " ".join(str(error).split())[:200]
+        said = said if isinstance(error, ValueError) and said else f"{type(error).__name__} {said}"
+        raise ValueError(f"{path}: cannot be read as {kind}: {said}; it is cut short or wrong, write it again") from None
+
+
+def fan(corners: Sequence[Any]) -> list[tuple[Any, Any, Any]]:
+    """Give the triangles between the first corner of a polygon and each side that does not touch it."""
+    return [(corners[0], *side) for side in pairwise(corners[1:])]
+
+
+def check_fans(path: Path, corners: Float[np.ndarray, "triangles 3 3"], counts: Int[np.ndarray, " polygons"]) -> None:
+    """Refuse polygons that their fans do not cover: those whose triangles do not all face one way.
+
+    **Arguments:**
+
+    - `corners`: of the triangles.
+    - `counts`: of the triangles of each polygon, in the same order.
+    """
+    if len(corners) != counts.sum():
+        raise ValueError(f"{path}: {counts.sum()} triangles were expected, and {len(corners)} were read; write the file again")
+    if not (counts > 1).any():
+        return
+    a, b, c = np.moveaxis(corners, 1, 0)
+    normals = np.cross(b - a, c - a)
+    polygon = np.repeat(np.arange(len(counts)), counts)
+    whole = np.add.reduceat(normals, np.cumsum(counts) - counts)
+    turned = (normals * whole[polygon]).sum(axis=1) < -1e-9 * (whole**2).sum(axis=1)[polygon]
+    if turned.any():
+        first = int(polygon[turned.argmax()])
+        raise ValueError(f"{path}: face {first}, of {counts[first] + 2} corners, is not convex; cut it into triangles")
+
+
+def merged(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"]) -> tuple[np.ndarray, np.ndarray]:
+    """Make one vertex of those at one place, in the order in which they come."""
+    _, first, inverse = np.unique(vertices, axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(order))
+    return vertices[first[order]], rank[inverse.reshape(-1)][faces]
