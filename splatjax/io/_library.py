@@ -25,7 +25,8 @@ def readable(path: Path, kind: str) -> Generator[None, None, None]:
         if isinstance(error, (ValueError, OSError)) and str(error).startswith(str(path.parent)):
             raise
         said = " ".join(str(error).split())[:200]
-        said = said if isinstance(error, ValueError) and said else f"{type(error).__name__} {said}"
+        if not isinstance(error, ValueError):
+            said = f"an entry is missing or wrong ({type(error).__name__} {said})"
         raise ValueError(f"{path}: cannot be read as {kind}: {said}; it is cut short or wrong, write it again") from None
 
 
