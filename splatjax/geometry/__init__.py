@@ -5,6 +5,5 @@ from ._complete import complete_splats as complete_splats
 from ._cut import cut_below as cut_below
 from ._mesh import Mesh as Mesh, unit as unit, vertex_normals as vertex_normals
 from ._normals import estimate_normals as estimate_normals
-from ._polygons import triangulate as triangulate
 from ._sample import sample_mesh as sample_mesh
 from ._textures import Textures as Textures

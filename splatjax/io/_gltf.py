@@ -53,7 +53,10 @@ def read_gltf(path: Path) -> list[Piece]:
         plain = content | {"buffers": [{"uri": name} for name in buffers]}
         found = load_gltf(BytesIO(json.dumps(plain).encode()), resolver=buffers, skip_materials=True)
         geometry = found["geometry"]
-        pieces = {name: _piece(path, table, *rest) for (name, table), *rest in zip(geometry.items(), asked, dresses, strict=True)}
+        pieces = {
+            name: _piece(path, table, wanted, dress)
+            for (name, table), wanted, dress in zip(geometry.items(), asked, dresses, strict=True)
+        }
         places = [edge for edge in found["graph"] if "geometry" in edge]
         corners = sum(3 * len(pieces[edge["geometry"]].faces) + len(pieces[edge["geometry"]].vertices) for edge in places)
         check_room(f"{path}: a scene of {corners} corners", _BYTES_PER_CORNER * corners, "export a part of it")
@@ -155,7 +158,8 @@ def _stage(content: dict[str, Any]) -> None:
     meshes = content.setdefault("meshes", [])
     for mesh in meshes:
         mesh["primitives"] = [each for each in mesh["primitives"] if each.get("mode", _TRIANGLES) in _SURFACES]
-    nodes = content["nodes"] = content.get("nodes") or [{"mesh": i} for i in range(len(meshes))]
+    content["nodes"] = content.get("nodes") or [{"mesh": i} for i in range(len(meshes))]
+    nodes: Any = content["nodes"]
     children = [child for node in nodes for child in node.get("children", [])]
     if content.get("scenes"):
         roots = content["scenes"][content.get("scene", 0)].get("nodes", [])

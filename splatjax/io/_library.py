@@ -1,5 +1,6 @@
 """Errors of the libraries that read meshes, said in one sentence; and what they do not ask of faces."""
 
+import logging
 import warnings
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager
@@ -17,9 +18,12 @@ def readable(path: Path, kind: str) -> Generator[None, None, None]:
 
     **Raises:** `ValueError`; errors that already name the file pass.
     """
+    log = logging.getLogger("trimesh")
+    before, log.disabled = log.disabled, True
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", DeprecationWarning)  # NumPy's, of numbers that are none
+            warnings.filterwarnings("ignore", "loadtxt: input contained no data")  # an empty list
             yield
     except Exception as error:  # each reader fails in its own way
         if isinstance(error, (ValueError, OSError)) and str(error).startswith(str(path.parent)):
@@ -28,11 +32,26 @@ def readable(path: Path, kind: str) -> Generator[None, None, None]:
         if not isinstance(error, ValueError):
             said = f"an entry is missing or wrong ({type(error).__name__} {said})"
         raise ValueError(f"{path}: cannot be read as {kind}: {said}; it is cut short or wrong, write it again") from None
+    finally:
+        log.disabled = before
 
 
 def fan(corners: Sequence[Any]) -> list[tuple[Any, Any, Any]]:
     """Give the triangles between the first corner of a polygon and each side that does not touch it."""
     return [(corners[0], *side) for side in pairwise(corners[1:])]
+
+
+def fans(counts: Int[np.ndarray, " polygons"], values: Int[np.ndarray, " corners"]) -> Int[np.ndarray, "triangles 3"]:
+    """Give the fans of polygons that stand one after the other.
+
+    **Arguments:**
+
+    - `counts`: corners of each, three at least.
+    """
+    polygon = np.repeat(np.arange(len(counts)), counts - 2)
+    first = (np.cumsum(counts) - counts)[polygon]
+    side = np.arange(len(polygon)) - (np.cumsum(counts - 2) - (counts - 2))[polygon]
+    return values[np.stack([first, first + side + 1, first + side + 2], axis=1)]
 
 
 def check_fans(path: Path, corners: Float[np.ndarray, "triangles 3 3"], counts: Int[np.ndarray, " polygons"]) -> None:

@@ -5,9 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from splatjax.geometry import triangulate
-
 from ._files import file_beside
+from ._library import check_fans, fans
 from ._pictures import read_color
 from ._pieces import Piece, check_places
 from ._ply_columns import colors_of, columns_of, normals_of, places_of, vertex_table
@@ -32,9 +31,10 @@ def read_ply_mesh(path: Path) -> list[Piece]:
     lists = next((file.elements.get("face", {})[name] for name in _LISTS if name in file.elements.get("face", {})), None)
     if not isinstance(lists, Ragged) or not len(lists.counts):
         raise ValueError(f"{path}: holds no triangle; give a triangle mesh, or read points with read_splats")
-    polygons = _split(path, lists, len(places))
-    faces = triangulate(places, polygons)
-    uvs = _corner_coordinates(path, file, lists, polygons)
+    _check_lists(path, lists, len(places))
+    faces = fans(lists.counts, lists.values.astype(np.int64))
+    check_fans(path, places[faces], lists.counts - 2)
+    uvs = _corner_coordinates(path, file, lists)
     if uvs is None:
         pairs = (columns_of(path, vertices, names) for names in _COORDINATES)
         found = next((pair for pair in pairs if pair is not None), None)
@@ -44,18 +44,14 @@ def read_ply_mesh(path: Path) -> list[Piece]:
     return [Piece(places, faces, normals_of(path, vertices), uvs, colors_of(path, vertices), texture)]
 
 
-def _split(path: Path, lists: Ragged, count: int) -> list[np.ndarray]:
-    values = lists.values.astype(np.int64)
-    if len(values) and not (values.min() >= 0 and values.max() < count):
-        raise ValueError(f"{path}: a face names vertex {values.max()} of {count}; write the file again")
+def _check_lists(path: Path, lists: Ragged, count: int) -> None:
     if lists.counts.min() < 3:
         raise ValueError(f"{path}: face {lists.counts.argmin()} has less than three corners; remove it")
-    if (lists.counts == lists.counts[0]).all():
-        return list(values.reshape(-1, lists.counts[0]))
-    return np.split(values, np.cumsum(lists.counts)[:-1])
+    if lists.values.dtype.kind not in "iu" or not (lists.values.min() >= 0 and lists.values.max() < count):
+        raise ValueError(f"{path}: a face names vertex {lists.values.max()} of {count}; write the file again")
 
 
-def _corner_coordinates(path: Path, file: PlyFile, lists: Ragged, polygons: list[np.ndarray]) -> np.ndarray | None:
+def _corner_coordinates(path: Path, file: PlyFile, lists: Ragged) -> np.ndarray | None:
     """Give the texture coordinates that some programs list in each face, a pair for each corner."""
     found = file.elements["face"].get("texcoord")
     if not isinstance(found, Ragged):

@@ -1,15 +1,19 @@
 """Tables of PLY files: ASCII or binary of either byte order, scalars and lists, of any type and in any order."""
 
+import re
+from io import BytesIO
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import plyfile
 
-_TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4", "double": "f8"}
-_TYPES |= {"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"}
-_TYPES |= {"float32": "f4", "float64": "f8"}
-_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
+from ._library import readable
+
 _LONGEST_HEADER = 1 << 20
+_END = re.compile(rb"(\r\n|\r|\n)end_header\1")
+_ELEMENT = re.compile(r"element\s+(\S+)\s+(\d{1,18})")
+_USUAL = {"texcoord": 6}  # numbers in a list, for which a table is read at once; in others, those of triangles
 
 
 class Ragged(NamedTuple):
@@ -17,27 +21,6 @@ class Ragged(NamedTuple):
 
     counts: np.ndarray
     values: np.ndarray
-
-
-class Property(NamedTuple):
-    """A column: its name, the type of its values and, of lists, that of their lengths."""
-
-    name: str
-    kind: np.dtype
-    lengths: np.dtype | None
-
-
-class Element(NamedTuple):
-    """A table: its name, its rows and its columns."""
-
-    name: str
-    count: int
-    properties: list[Property]
-
-    def least_bytes(self, text: bool) -> int:
-        """Give how many bytes its rows take at least: in text a digit and what separates it from the next."""
-        each = [2 if text else (p.kind if p.lengths is None else p.lengths).itemsize for p in self.properties]
-        return self.count * sum(each)
 
 
 class PlyFile(NamedTuple):
@@ -48,198 +31,84 @@ class PlyFile(NamedTuple):
 
 
 def read_ply(path: Path) -> PlyFile:
-    """Read all tables of a PLY file. No more memory is taken than a few times the size of the file, whatever its header says.
+    """Read all tables of a PLY file with plyfile, after a look at whether it can hold what its header says.
 
     **Raises:** `ValueError` when the file is no PLY, is cut short, or holds more than its header says.
     """
     data = path.read_bytes()
-    try:
-        order, comments, elements, start = _header(data)
-        body = memoryview(data)[start:]
-        text = order == "="
-        least = sum(element.least_bytes(text) for element in elements) - text
-        if least > len(body):
-            raise ValueError(f"its header promises {least} bytes at least, and {len(body)} follow it: it is cut short")
-        tables = _text_tables(elements, bytes(body).decode("latin-1")) if text else _binary_tables(elements, body, order)
-    except ValueError as error:
-        raise ValueError(f"{path}: cannot be read as PLY: {error}; write it again") from None
-    return PlyFile(comments, tables)
+    with readable(path, "PLY"):
+        end = _END.search(data, 0, _LONGEST_HEADER)
+        if data[:3] != b"ply" or end is None:
+            raise ValueError("it does not begin with `ply`, or its header has no end")
+        text, body = data[: end.end()].decode("utf-8", "replace"), memoryview(data)[end.end() :]
+        lines = text.split(end[1].decode())
+        plain = text.encode("ascii", "replace")  # which plyfile asks of comments, too
+        counts = _check_counts(lines, plain, body)
+        source = str(path) if text.isascii() else BytesIO(plain + body)
+        found = _read(source, counts)
+        _check_end(found, body)
+        comments = [line.strip()[len("comment ") :] for line in lines if line.startswith("comment")]
+        return PlyFile(comments, {element.name: _columns(element) for element in found})
 
 
-def _header(data: bytes) -> tuple[str, list[str], list[Element], int]:
-    if data[:3] != b"ply" or data[3:4] not in (b"\n", b"\r"):
-        raise ValueError("it does not begin with `ply`")
-    newline = b"\r\n" if data[3:5] == b"\r\n" else data[3:4]
-    end = data.find(newline + b"end_header" + newline, 0, _LONGEST_HEADER)
-    if end < 0:
-        raise ValueError("its header has no end")
-    order, comments, elements = "", [], []
-    for line in data[3:end].split(newline):
-        match line.decode("latin-1").split():
-            case [] | ["obj_info", *_]:
-                pass
-            case ["comment", *_]:
-                comments.append(line.decode("utf-8", "replace").strip()[len("comment ") :])
-            case ["format", kind, "1.0"] if kind in _ORDERS and not order:
-                order = _ORDERS[kind]
-            case ["element", name, count] if count.isdecimal() and len(count) < 19 and order:
-                if any(element.name == name for element in elements):
-                    raise ValueError(f"it has two elements {name!r}")
-                elements.append(Element(name, int(count), []))
-            case ["property", *what] if elements:
-                elements[-1].properties.append(_property(what, order, elements[-1]))
-            case _:
-                raise ValueError(f"its header has a line {line.decode('latin-1')[:60]!r}, which is no line of PLY 1.0")
-    if not order:
-        raise ValueError("its header says no format")
-    for element in elements:
-        if element.count and not element.properties:
+def _check_counts(lines: list[str], header: bytes, body: memoryview) -> dict[str, dict[str, int]]:
+    """Refuse a header that promises more than follows it; give how long the lists of each element usually are."""
+    promised = [_ELEMENT.fullmatch(line.strip()) for line in lines if line.startswith("element")]
+    if None in promised:
+        raise ValueError("its header has an element without a count")
+    empty = plyfile.PlyData.read(BytesIO(re.sub(rb"(element\s+\S+\s+)\d+", rb"\g<1>0", header)))
+    least = -1 if empty.text else 0
+    for element, line in zip(empty, promised, strict=True):
+        sizes = [2 if empty.text else np.dtype(getattr(p, "len_dtype", p.val_dtype)).itemsize for p in element.properties]
+        if not sizes and line is not None and int(line[2]):
             raise ValueError(f"its element {element.name!r} has no property")
-    return order, comments, elements, end + len(newline + b"end_header" + newline)
+        if any(np.dtype(getattr(p, "len_dtype", "u1")).kind == "f" for p in element.properties):
+            raise ValueError(f"its element {element.name!r} has lists whose lengths are no whole numbers")
+        least += 0 if line is None else int(line[2]) * sum(sizes)
+    if least > len(body):
+        raise ValueError(f"its header promises {least} bytes at least, and {len(body)} follow it: it is cut short")
+    lists = plyfile.PlyListProperty
+    return {e.name: {p.name: _USUAL.get(p.name, 3) for p in e.properties if isinstance(p, lists)} for e in empty}
 
 
-def _property(what: list[str], order: str, element: Element) -> Property:
-    match what:
-        case ["list", lengths, kind, name] if kind in _TYPES and _TYPES.get(lengths, "f4")[0] in "iu":
-            found = Property(name, np.dtype(order + _TYPES[kind]), np.dtype(order + _TYPES[lengths]))
-        case [kind, name] if kind in _TYPES:
-            found = Property(name, np.dtype(order + _TYPES[kind]), None)
-        case _:
-            raise ValueError(f"its header has a property {' '.join(what)[:60]!r}, of no type that PLY has")
-    if any(other.name == found.name for other in element.properties):
-        raise ValueError(f"its element {element.name!r} has two properties {found.name!r}")
-    return found
+def _read(source: str | BytesIO, usual: dict[str, dict[str, int]]) -> plyfile.PlyData:
+    """Read at once what has lists of the usual lengths only, otherwise row by row."""
+    if isinstance(source, str) and any(usual.values()):
+        try:
+            return plyfile.PlyData.read(source, known_list_len=usual)
+        except plyfile.PlyElementParseError:
+            pass
+    return plyfile.PlyData.read(source)
 
 
-def _binary_tables(elements: list[Element], body: memoryview, order: str) -> dict[str, dict[str, np.ndarray | Ragged]]:
-    tables, start = {}, 0
-    for element in elements:
-        tables[element.name], start = _binary_table(element, body, start)
-    if bytes(body[start : start + 16]).strip():
-        raise ValueError(f"{len(body) - start} bytes follow what its header promises")
-    return tables
+def _check_end(found: plyfile.PlyData, body: memoryview) -> None:
+    """Refuse what holds more than its header says."""
+    if found.text:
+        rows = sum(1 for line in bytes(body).decode("ascii").splitlines() if line.strip())
+        if rows != sum(element.count for element in found):
+            raise ValueError(f"its header promises {sum(element.count for element in found)} rows, and {rows} follow it")
+        return
+    taken = 0
+    for element in found:
+        for p in element.properties:
+            size = np.dtype(p.val_dtype).itemsize
+            if isinstance(p, plyfile.PlyListProperty):
+                taken += element.count * np.dtype(p.len_dtype).itemsize + size * sum(map(len, element[p.name]))
+            else:
+                taken += size * element.count
+    if taken < len(body) and bytes(body[taken : taken + 16]).strip():
+        raise ValueError(f"{len(body) - taken} bytes follow what its header promises")
 
 
-def _binary_table(element: Element, body: memoryview, start: int) -> tuple[dict[str, np.ndarray | Ragged], int]:
-    lists = [p for p in element.properties if p.lengths is not None]
-    if element.count == 0:
-        return {p.name: _column(p, np.zeros(0, np.int64), np.zeros(0, p.kind)) for p in element.properties}, start
-    # Lists of one length, as those of triangles are, are columns like any other.
-    first, _ = _walk(element._replace(count=1), body, start)
-    fields, sizes = [], {}
-    for i, (p, (_, counts)) in enumerate(zip(element.properties, first, strict=True)):
-        if p.lengths is not None:
-            sizes[p.name] = int(counts[0])
-            fields.append((f"{i} length", p.lengths))
-        fields.append((f"{i}", p.kind, (sizes[p.name],)) if p.lengths is not None else (f"{i}", p.kind))
-    row = np.dtype(fields)
-    if row.itemsize * element.count <= len(body) - start:
-        rows: np.ndarray = np.frombuffer(body, row, element.count, start)
-        lengths = {i: rows[f"{i} length"] for i, p in enumerate(element.properties) if p.lengths is not None}
-        if all((lengths[i] == sizes[p.name]).all() for i, p in enumerate(element.properties) if p.lengths is not None):
-            columns = {p.name: _column(p, lengths.get(i), rows[f"{i}"]) for i, p in enumerate(element.properties)}
-            return columns, start + row.itemsize * element.count
-    if not lists:
-        raise ValueError(f"its element {element.name!r} is cut short")
-    places, end = _walk(element, body, start)
-    return {p.name: _gathered(p, body, *place) for p, place in zip(element.properties, places, strict=True)}, end
-
-
-def _column(p: Property, lengths: np.ndarray | None, values: np.ndarray) -> np.ndarray | Ragged:
-    return values if p.lengths is None else Ragged(np.asarray(lengths, np.int64), values.reshape(-1))
-
-
-def _walk(element: Element, body: memoryview, start: int) -> tuple[list[tuple[np.ndarray, np.ndarray]], int]:
-    """Give, for each column, where its values begin in every row and how many they are; and where the element ends."""
-    places: list[list[int]] = [[] for _ in element.properties]
-    counts: list[list[int]] = [[] for _ in element.properties]
-    signs = [p.lengths is not None and p.lengths.kind == "i" for p in element.properties]
-    order = "big" if any(p.kind.str[0] == ">" or (p.lengths or p.kind).str[0] == ">" for p in element.properties) else "little"
-    for number in range(element.count):
-        for i, p in enumerate(element.properties):
-            count = 1
-            if p.lengths is not None:
-                count = int.from_bytes(body[start : start + p.lengths.itemsize], order, signed=signs[i])
-                start += p.lengths.itemsize
-            places[i].append(start)
-            counts[i].append(count)
-            start += count * p.kind.itemsize
-            if count < 0 or start > len(body):
-                raise ValueError(f"its element {element.name!r} is cut short at row {number}")
-    return [
-        (np.asarray(place, np.int64), np.asarray(count, np.int64)) for place, count in zip(places, counts, strict=True)
-    ], start
-
-
-def _gathered(p: Property, body: memoryview, places: np.ndarray, counts: np.ndarray) -> np.ndarray | Ragged:
-    size = p.kind.itemsize
-    begins = np.repeat(places - size * (np.cumsum(counts) - counts), counts) + size * np.arange(counts.sum())
-    values = np.frombuffer(body, np.uint8)[begins[:, None] + np.arange(size)].view(p.kind)[:, 0]
-    return values if p.lengths is None else Ragged(counts, values)
-
-
-def _text_tables(elements: list[Element], body: str) -> dict[str, dict[str, np.ndarray | Ragged]]:
-    lines = [line for line in body.splitlines() if line and not line.isspace()]
-    promised = sum(element.count for element in elements)
-    if len(lines) != promised:
-        raise ValueError(f"its header promises {promised} rows, and {len(lines)} follow it: it is cut short, or not what it says")
-    tables, start = {}, 0
-    for element in elements:
-        rows = lines[start : start + element.count]
-        tables[element.name] = _text_table(element, rows)
-        start += element.count
-    return tables
-
-
-def _text_table(element: Element, lines: list[str]) -> dict[str, np.ndarray | Ragged]:
-    alone = len(element.properties) == 1 and element.properties[0].lengths is not None
-    if all(p.lengths is None for p in element.properties) or (alone and len({line.count(" ") for line in lines}) == 1):
-        numbers = _numbers(element, lines)
-        if not alone:
-            if numbers.shape[1] != len(element.properties):
-                raise ValueError(f"rows of its element {element.name!r} have {numbers.shape[1]} numbers")
-            return {p.name: _typed(p, numbers[:, i], p.kind) for i, p in enumerate(element.properties)}
-        if (numbers[:, 0] == numbers.shape[1] - 1).all():
-            p = element.properties[0]
-            counts = np.full(len(lines), numbers.shape[1] - 1)
-            return {p.name: Ragged(counts, _typed(p, numbers[:, 1:].reshape(-1), p.kind))}
-    counts: list[list[int]] = [[] for _ in element.properties]
-    values: list[list[str]] = [[] for _ in element.properties]
-    for number, line in enumerate(lines):
-        words, at = line.split(), 0
-        for i, p in enumerate(element.properties):
-            count = 1
-            if p.lengths is not None:
-                length = words[at] if at < len(words) else ""
-                if not length.isdecimal() or len(length) > 9:
-                    raise ValueError(f"row {number} of its element {element.name!r} has a list of length {length!r}")
-                count, at = int(length), at + 1
-            counts[i].append(count)
-            values[i].extend(words[at : at + count])
-            at += count
-        if at != len(words):
-            raise ValueError(f"row {number} of its element {element.name!r} has {len(words)} numbers instead of {at}")
-    columns = {}
-    for p, lengths, found in zip(element.properties, counts, values, strict=True):
-        numbers = _typed(p, _numbers(element, found)[:, 0] if found else np.zeros(0), p.kind)
-        columns[p.name] = numbers if p.lengths is None else Ragged(np.asarray(lengths, np.int64), numbers)
+def _columns(element: plyfile.PlyElement) -> dict[str, np.ndarray | Ragged]:
+    columns: dict[str, np.ndarray | Ragged] = {}
+    for p in element.properties:
+        column = np.asarray(element[p.name])
+        if not isinstance(p, plyfile.PlyListProperty):
+            columns[p.name] = column
+        elif column.ndim == 2:
+            columns[p.name] = Ragged(np.full(len(column), column.shape[1]), column.reshape(-1))
+        else:
+            values = np.concatenate([np.zeros(0, p.val_dtype), *column])
+            columns[p.name] = Ragged(np.fromiter(map(len, column), np.int64, len(column)), values)
     return columns
-
-
-def _numbers(element: Element, lines: list[str]) -> np.ndarray:
-    if not lines:
-        return np.zeros((0, len(element.properties)))
-    try:
-        return np.loadtxt(lines, np.float64, comments=None, ndmin=2)
-    except ValueError as error:
-        raise ValueError(f"its element {element.name!r}: {error}") from None
-
-
-def _typed(p: Property, numbers: np.ndarray, kind: np.dtype) -> np.ndarray:
-    if kind.kind == "f":
-        with np.errstate(over="ignore"):
-            return numbers.astype(kind)
-    low, high = np.iinfo(kind).min, np.iinfo(kind).max
-    if len(numbers) and not ((numbers >= low) & (numbers <= high) & (numbers == np.floor(numbers))).all():
-        raise ValueError(f"{p.name} has values that its type, from {low} to {high}, does not hold")
-    return numbers.astype(kind)

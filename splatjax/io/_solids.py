@@ -1,14 +1,12 @@
 """Meshes from STL and OFF files, which hold triangles and nothing else."""
 
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 
-from splatjax.geometry import triangulate
-
+from ._library import check_fans, fan, merged, readable
 from ._pieces import Piece, check_places
-
-_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("more", "<u2")])
 
 
 def read_stl(path: Path) -> list[Piece]:
@@ -18,29 +16,32 @@ def read_stl(path: Path) -> list[Piece]:
     """
     data = path.read_bytes()
     count = int.from_bytes(data[80:84], "little")
-    if len(data) >= 84 and len(data) == 84 + _TRIANGLE.itemsize * count:
-        triangles: np.ndarray = np.frombuffer(data, _TRIANGLE, count, 84)
-        with np.errstate(invalid="ignore"):  # of NaN that signals
-            corners = triangles["corners"].astype(np.float64)
-    elif data.lstrip()[:5].lower() == b"solid" and b"\0" not in data:
-        corners = _stl_text(path, data.decode("latin-1"))
-    else:
-        promised = 84 + _TRIANGLE.itemsize * count
-        raise ValueError(f"{path}: promises {count} triangles, {promised} bytes, and has {len(data)}: it is cut short, or no STL")
-    check_places(path, corners.reshape(-1, 3))
-    vertices, faces = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
-    return [Piece(vertices, faces.reshape(-1, 3))]
+    if len(data) < 84 or len(data) != 84 + 50 * count:
+        if data.lstrip()[:5].lower() != b"solid" or b"\0" in data:
+            promised = f"promises {count} triangles, {84 + 50 * count} bytes, and has {len(data)}"
+            raise ValueError(f"{path}: {promised}: it is cut short, or no STL")
+        lines = [line.strip() for line in data.decode("latin-1").lower().splitlines() if line.strip()]
+        count = sum(line.startswith("vertex") for line in lines) / 3
+        if not lines[-1].startswith("endsolid"):
+            raise ValueError(f"{path}: ends without `endsolid`: it is cut short")
+        data = "\n".join(lines).encode()
+    with readable(path, "STL"):
+        from trimesh.exchange.stl import load_stl  # takes a second, so only where a mesh is read
 
-
-def _stl_text(path: Path, text: str) -> np.ndarray:
-    rows = [words[1:] for line in text.splitlines() if (words := line.split()) and words[0].lower() == "vertex"]
-    if len(rows) % 3 or not text.rstrip().splitlines()[-1].split()[0].lower().startswith("endsolid"):
-        raise ValueError(f"{path}: ends within a triangle or without `endsolid`: it is cut short")
-    return _numbers(path, rows, 3).reshape(-1, 3, 3)
+        found = load_stl(BytesIO(data))
+        parts = list(found["geometry"].values()) if "geometry" in found else [found]
+        vertices = np.concatenate([np.zeros((0, 3)), *(np.asarray(part["vertices"], np.float64) for part in parts)])
+        if len(vertices) != 3 * count:
+            raise ValueError(f"{count:g} triangles were expected, and {len(vertices) / 3:g} were read")
+    check_places(path, vertices)
+    return [Piece(*merged(vertices, np.arange(len(vertices)).reshape(-1, 3)))]
 
 
 def read_off(path: Path) -> list[Piece]:
     """Read an OFF file of polygons; colors are left alone.
+
+    trimesh reads it, given faces as triangles, for it passes over faces of less than three corners and does not look whether a
+    line holds as many as it says.
 
     **Raises:** `ValueError` when it is cut short, no OFF, or names vertices that are not there.
     """
@@ -51,28 +52,24 @@ def read_off(path: Path) -> list[Piece]:
     rows = [rows[0][1:], *rows[1:]] if len(rows[0]) > 1 else rows[1:]
     if not rows or len(rows[0]) < 2 or not all(word.isdecimal() and len(word) < 16 for word in rows[0][:2]):
         raise ValueError(f"{path}: says no counts of vertices and faces; write it again")
-    vertices, faces = int(rows[0][0]), int(rows[0][1])
-    if vertices + faces > len(rows) - 1:
+    count, faces = int(rows[0][0]), int(rows[0][1])
+    if count + faces > len(rows) - 1:
         raise ValueError(
-            f"{path}: promises {vertices + faces} vertices and faces, and {len(rows) - 1} lines follow: it is cut short"
+            f"{path}: promises {count + faces} vertices and faces, and {len(rows) - 1} lines follow: it is cut short"
         )
-    places = _numbers(path, [row[:3] for row in rows[1 : 1 + vertices]], 3)
-    check_places(path, places)
-    polygons = []
-    for row in rows[1 + vertices : 1 + vertices + faces]:
+    triangles, counts = [], []
+    for row in rows[1 + count : 1 + count + faces]:
         size = int(row[0]) if row[0].isdecimal() and len(row[0]) < 9 else 0
-        corners = [int(word) if word.isdecimal() and len(word) < 16 else -1 for word in row[1 : 1 + size]]
-        if size < 3 or len(corners) < size or not all(0 <= corner < vertices for corner in corners):
-            raise ValueError(f"{path}: the face `{' '.join(row)[:60]}` has no three corners or more among {vertices} vertices")
-        polygons.append(corners)
-    return [Piece(places, triangulate(places, polygons))]
+        if size < 3 or len(row) <= size:
+            raise ValueError(f"{path}: the face `{' '.join(row)[:60]}` has no three corners or more among {count} vertices")
+        triangles += [f"3 {a} {b} {c}" for a, b, c in fan(row[1 : 1 + size])]
+        counts.append(size - 2)
+    plain = ["OFF", f"{count} {len(triangles)} 0", *(" ".join(row) for row in rows[1 : 1 + count]), *triangles]
+    with readable(path, "OFF"):
+        from trimesh.exchange.off import load_off  # takes a second, so only where a mesh is read
 
-
-def _numbers(path: Path, rows: list[list[str]], width: int) -> np.ndarray:
-    try:
-        found = np.asarray([[float(word) for word in row] for row in rows], np.float64).reshape(-1, width)
-    except ValueError as error:
-        raise ValueError(f"{path}: a vertex is not {width} numbers ({error}); write the file again") from None
-    if len(found) != len(rows):
-        raise ValueError(f"{path}: a vertex is not {width} numbers; write the file again")
-    return found
+        found = load_off(BytesIO("\n".join(plain).encode()))
+    vertices = np.asarray(found["vertices"], np.float64)
+    check_places(path, vertices)
+    check_fans(path, vertices[found["faces"]], np.asarray(counts, np.int64))
+    return [Piece(vertices, found["faces"])]

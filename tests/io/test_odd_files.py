@@ -62,7 +62,7 @@ def polygon_ply(folder, places):
     return ply(folder / "a.ply", [*header, "property list uchar int vertex_indices"], rows.encode())
 
 
-WRITERS = {"obj": polygon_obj}
+WRITERS = {"obj": polygon_obj, "off": polygon_off, "ply": polygon_ply}
 POLYGONS = {
     "arrow": [(0, 0), (4, 4), (0, 2), (-4, 4)],
     "comb": [(0, 0), (6, 0), (6, 4), (5, 4), (5, 1), (4, 1), (4, 4), (2, 4), (2, 1), (1, 1), (1, 4), (0, 4)],
@@ -191,9 +191,9 @@ def test_ply_of_every_newline_with_comments_of_any_language(tmp_path, newline):
             "promises 2000000240 bytes at least, and 240 follow",
         ),
         ([BINARY, "element vertex 20", *XYZ], POINTS.tobytes() + b"more", "4 bytes follow what its header promises"),
-        ([BINARY, "element vertex -1", *XYZ], b"", "a line 'element vertex -1', which is no line of PLY"),
-        ([ASCII, "element vertex 20", *XYZ, "property float x"], b"0 0 0 0\n" * 20, "two properties 'x'"),
-        ([ASCII, "element vertex 1", *XYZ, "element vertex 1", *XYZ], b"0 0 0\n" * 2, "two elements 'vertex'"),
+        ([BINARY, "element vertex -1", *XYZ], b"", "its header has an element without a count"),
+        ([ASCII, "element vertex 20", *XYZ, "property float x"], b"0 0 0 0\n" * 20, "two properties with same name"),
+        ([ASCII, "element vertex 1", *XYZ, "element vertex 1", *XYZ], b"0 0 0\n" * 2, "two elements with same name"),
         ([ASCII, "element vertex 1", "property list uchar float x", *XYZ[1:]], b"1 0 0 0\n", "are lists; write single numbers"),
         (
             [ASCII, "element vertex 20", *XYZ, "property float nx"],
@@ -201,12 +201,12 @@ def test_ply_of_every_newline_with_comments_of_any_language(tmp_path, newline):
             "have nx without ny; write all of them, or none",
         ),
         ([ASCII, "element vertex 20", *XYZ, "property uchar red"], b"0 0 0 1\n1 0 0 1\n" * 10, "have red without green"),
-        ([ASCII, "element vertex 1", "property uchar x", *XYZ[1:]], b"256 0 0\n", "x has values that its type, from 0 to 255"),
+        ([ASCII, "element vertex 1", "property uchar x", *XYZ[1:]], b"256 0 0\n", "256 out of bounds for uint8"),
         ([ASCII, "element vertex 20", *XYZ], b"1 1 1\n" * 20, "points lie within 0 mm"),
         ([ASCII, "element vertex 2", *XYZ], b"1e30 1 1\n0 0 0\n", "its points reach 1e"),
         ([ASCII, "element vertex 20"], b"", "its element 'vertex' has no property"),
-        (["format ascii 2.0", "element vertex 1", *XYZ], b"0 0 0\n", "'format ascii 2.0', which is no line of PLY 1.0"),
-        (["element vertex 1", *XYZ], b"0 0 0\n", "which is no line of PLY 1.0"),
+        (["format ascii 2.0", "element vertex 1", *XYZ], b"0 0 0\n", "line 2: expected version '1.0'"),
+        (["element vertex 1", *XYZ], b"0 0 0\n", "line 2: expected one of {format, comment, obj_info}"),
     ],
 )
 def test_ply_that_is_wrong_is_refused_before_memory_is_taken(tmp_path, header, body, said):
@@ -324,9 +324,9 @@ def test_a_scene_repeated_beyond_memory_is_refused(tmp_path):
             b"\0" * 80 + struct.pack("<I", 10**9) + b"\0" * 50,
             "promises 1000000000 triangles, 50000000084 bytes, and has 134",
         ),
-        ("a.stl", b"solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\n", "ends within a triangle or without"),
+        ("a.stl", b"solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\n", "ends without `endsolid`"),
         ("a.off", b"OFF\n1000000000000 3 0\n0 0 0\n", "promises 1000000000003 vertices and faces.* 1 lines.*: it is cut short"),
-        ("a.off", b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 3\n", "among 3 vertices"),
+        ("a.off", b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 3\n", "a face index outside the range of its vertices"),
         ("a.glb", b"glTF\2\0\0\0\xff\xff\xff\x7f\xff\xff\xff\x7fJSON", "promises .* bytes, and it has 20: it is cut short"),
         ("a.glb", b"PK\3\4", "does not begin with `glTF`"),
     ],
