@@ -19,7 +19,8 @@ def readable(path: Path, kind: str) -> Generator[None, None, None]:
     **Raises:** `ValueError`; errors that already name the file pass.
     """
     log = logging.getLogger("trimesh")
-    before, log.disabled = log.disabled, True
+    before = log.level
+    log.setLevel(logging.CRITICAL)  # what is wrong is said here
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", DeprecationWarning)  # NumPy's, of numbers that are none
@@ -33,7 +34,7 @@ def readable(path: Path, kind: str) -> Generator[None, None, None]:
             said = f"an entry is missing or wrong ({type(error).__name__} {said})"
         raise ValueError(f"{path}: cannot be read as {kind}: {said}; it is cut short or wrong, write it again") from None
     finally:
-        log.disabled = before
+        log.setLevel(before)
 
 
 def fan(corners: Sequence[Any]) -> list[tuple[Any, Any, Any]]:
@@ -77,9 +78,9 @@ def check_fans(path: Path, corners: Float[np.ndarray, "triangles 3 3"], counts: 
 
 
 def merged(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"]) -> tuple[np.ndarray, np.ndarray]:
-    """Make one vertex of those at one place, in the order in which they come."""
+    """Make one vertex of those at one place: give which ones stay, in the order in which they come, and faces that name them."""
     _, first, inverse = np.unique(vertices, axis=0, return_index=True, return_inverse=True)
     order = np.argsort(first)
     rank = np.empty_like(order)
     rank[order] = np.arange(len(order))
-    return vertices[first[order]], rank[inverse.reshape(-1)][faces]
+    return first[order], rank[inverse.reshape(-1)][faces]

@@ -14,7 +14,7 @@ from ._library import check_fans, fan, merged, readable
 from ._pictures import read_color
 from ._pieces import Piece, check_places
 
-_TABLES = {"v": 3, "vt": 2, "vn": 3}
+_TABLES = {"v": range(3, 9), "vt": range(2, 4), "vn": range(3, 4)}
 _CURVES = {"curv", "curv2", "surf", "bzp", "bsp", "cdc", "cdp", "res"}
 
 
@@ -47,8 +47,8 @@ def read_obj(path: Path) -> list[Piece]:
     for line in text.splitlines():
         kind, _, rest = line.split("#", 1)[0].strip().replace("\t", " ").partition(" ")
         if kind in rows:
-            if len(rest.split()) < _TABLES[kind]:
-                raise ValueError(f"{path}: `{line[:60]}` is no row of {_TABLES[kind]} numbers; write the file again")
+            if len(rest.split()) not in _TABLES[kind]:
+                raise ValueError(f"{path}: `{line[:60]}` is no row of {_TABLES[kind][0]} numbers; write the file again")
             rows[kind].append(f"{kind} {rest.strip()}")
         elif kind == "f":
             corners = [known.get(word) or _corner(path, word, rows, most, known) for word in rest.split()]
@@ -114,8 +114,9 @@ def _piece(path: Path, found: dict[str, Any], counts: list[int], dress: dict[str
         if not (colors.min() >= 0 and colors.max() <= 1):
             raise ValueError(f"{path}: colors of vertices range up to {colors.max():g}; they are sRGB in [0, 1]")
         colors = srgb_to_linear(colors)
-    elif normals is None:
-        vertices, faces = merged(vertices, faces)  # texture coordinates make no creases
+    if normals is None and uvs is not None:  # texture coordinates make no creases
+        kept, faces = merged(vertices, faces)
+        vertices, colors = vertices[kept], None if colors is None else colors[kept]
     return Piece(vertices, faces, normals, uvs, colors, **dress)
 
 

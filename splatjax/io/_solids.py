@@ -21,7 +21,7 @@ def read_stl(path: Path) -> list[Piece]:
             promised = f"promises {count} triangles, {84 + 50 * count} bytes, and has {len(data)}"
             raise ValueError(f"{path}: {promised}: it is cut short, or no STL")
         lines = [line.strip() for line in data.decode("latin-1").lower().splitlines() if line.strip()]
-        count = sum(line.startswith("vertex") for line in lines) / 3
+        count = sum(line.split()[0] == "vertex" for line in lines) / 3
         if not lines[-1].startswith("endsolid"):
             raise ValueError(f"{path}: ends without `endsolid`: it is cut short")
         data = "\n".join(lines).encode()
@@ -34,7 +34,8 @@ def read_stl(path: Path) -> list[Piece]:
         if len(vertices) != 3 * count:
             raise ValueError(f"{count:g} triangles were expected, and {len(vertices) / 3:g} were read")
     check_places(path, vertices)
-    return [Piece(*merged(vertices, np.arange(len(vertices)).reshape(-1, 3)))]
+    kept, faces = merged(vertices, np.arange(len(vertices)).reshape(-1, 3))
+    return [Piece(vertices[kept], faces)]
 
 
 def read_off(path: Path) -> list[Piece]:
