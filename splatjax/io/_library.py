@@ -72,6 +72,8 @@ def check_fans(path: Path, corners: Float[np.ndarray, "triangles 3 3"], counts: 
     polygon = np.repeat(np.arange(len(counts)), counts)
     whole = np.add.reduceat(normals, np.cumsum(counts) - counts)
     turned = (normals * whole[polygon]).sum(axis=1) < -1e-9 * (whole**2).sum(axis=1)[polygon]
+    sizes = np.add.reduceat(np.linalg.norm(normals, axis=1), np.cumsum(counts) - counts)
+    turned |= ((np.linalg.norm(whole, axis=1) <= 1e-9 * sizes) & (sizes > 0))[polygon]  # it crosses itself
     if turned.any():
         first = int(polygon[turned.argmax()])
         raise ValueError(f"{path}: face {first}, of {counts[first] + 2} corners, is not convex; cut it into triangles")

@@ -14,7 +14,7 @@ from ._library import check_fans, fan, merged, readable
 from ._pictures import read_color
 from ._pieces import Piece, check_places
 
-_TABLES = {"v": range(3, 9), "vt": range(2, 4), "vn": range(3, 4)}
+_TABLES = {"v": range(3, 8), "vt": range(2, 4), "vn": range(3, 4)}
 _CURVES = {"curv", "curv2", "surf", "bzp", "bsp", "cdc", "cdp", "res"}
 
 
@@ -47,7 +47,7 @@ def read_obj(path: Path) -> list[Piece]:
     for line in text.splitlines():
         kind, _, rest = line.split("#", 1)[0].strip().replace("\t", " ").partition(" ")
         if kind in rows:
-            if len(rest.split()) not in _TABLES[kind]:
+            if len(rest.split()) not in _TABLES[kind] or "_" in rest:  # Python's 1_0 is no number elsewhere
                 raise ValueError(f"{path}: `{line[:60]}` is no row of {_TABLES[kind][0]} numbers; write the file again")
             rows[kind].append(f"{kind} {rest.strip()}")
         elif kind == "f":
@@ -89,6 +89,8 @@ def _corner(path: Path, word: str, rows: dict[str, list[str]], most: list[int], 
     """Count what a corner `v/vt/vn` names from the beginning, also where -1 is the last that stands above."""
     parts = word.split("/")
     try:
+        if "_" in word:
+            raise ValueError
         numbers = [int(part) if part else 0 for part in parts]
         places = [n if n >= 0 else len(above) + 1 + n for n, above in zip(numbers, rows.values(), strict=False)]
         if len(parts) > 3 or any(part and place < 1 for part, place in zip(parts, places, strict=True)) or not parts[0]:

@@ -84,6 +84,8 @@ def _read(source: str | BytesIO, usual: dict[str, dict[str, int]]) -> plyfile.Pl
 def _check_end(found: plyfile.PlyData, body: memoryview) -> None:
     """Refuse what holds more than its header says."""
     if found.text:
+        if b"_" in bytes(body):  # which Python takes for a part of numbers
+            raise ValueError("it has `_` among its numbers")
         rows = sum(1 for line in bytes(body).decode("ascii").splitlines() if line.strip())
         if rows != sum(element.count for element in found):
             raise ValueError(f"its header promises {sum(element.count for element in found)} rows, and {rows} follow it")

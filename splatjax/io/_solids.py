@@ -21,7 +21,7 @@ def read_stl(path: Path) -> list[Piece]:
             promised = f"promises {count} triangles, {84 + 50 * count} bytes, and has {len(data)}"
             raise ValueError(f"{path}: {promised}: it is cut short, or no STL")
         lines = [line.strip() for line in data.decode("latin-1").lower().splitlines() if line.strip()]
-        count = sum(line.split()[0] == "vertex" for line in lines) / 3
+        count = sum(line.split()[0] == "vertex" and len(line.split()) == 4 for line in lines) / 3
         if not lines[-1].startswith("endsolid"):
             raise ValueError(f"{path}: ends without `endsolid`: it is cut short")
         data = "\n".join(lines).encode()
@@ -61,7 +61,7 @@ def read_off(path: Path) -> list[Piece]:
     triangles, counts = [], []
     for row in rows[1 + count : 1 + count + faces]:
         size = int(row[0]) if row[0].isdecimal() and len(row[0]) < 9 else 0
-        if size < 3 or len(row) <= size:
+        if size < 3 or len(row) <= size or not all(word.isdecimal() for word in row[1 : 1 + size]):
             raise ValueError(f"{path}: the face `{' '.join(row)[:60]}` has no three corners or more among {count} vertices")
         triangles += [f"3 {a} {b} {c}" for a, b, c in fan(row[1 : 1 + size])]
         counts.append(size - 2)

@@ -142,6 +142,8 @@ def test_textures_are_taken_from_the_files_own_folder_alone(tmp_path):
         (SQUARE + "f 1/1 2/1 3/1\n", "a face names vt 1, but there are 0 vt"),
         (SQUARE + "vn 0 0 1\nf 1//1 2//1 3\n", "has corners of several kinds"),
         (SQUARE + "f 1 2 three\n", "a corner of a face is `three`"),
+        (SQUARE + "v 1_0 0 0\nf 1 2 3\n", "`v 1_0 0 0` is no row of 3 numbers"),
+        ("v 5 0 0\nv 2 0 0\nv 2 2 0\nv 1 3 0\nv 0 2 0\nf 1 2 3 4 5\n", "is not convex"),
         (SQUARE + "f 1 2\n", "the face `f 1 2` has less than three corners"),
         (SQUARE + "v 1 nan 0\nf 1 2 5\n", "not finite"),
         (SQUARE + "v 1 x 0\nf 1 2 3\n", "cannot be read as OBJ: .*; it is cut short or wrong, write it again"),
