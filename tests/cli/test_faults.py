@@ -92,14 +92,15 @@ def test_nobody_reads_on():
     assert ended.stderr == ""
 
 
-def test_names_that_are_nearly_right_are_told(tmp_path, capsys):
+def test_names_that_are_nearly_right_are_told(tmp_path, capsys, x64):
     path = tmp_path / "mine.toml"
     for right, wrong in (("roughness", "roughnes"), ("sigma_a", "sigma_A"), ("[surface]", "[surfaces]")):
         path.write_text(OWN.replace(right, wrong))
         assert f"unknown entry {wrong.strip('[]')!r}; did you mean {right.strip('[]')!r}?" in failure(["fit", path], capsys)
     path.write_text(OWN.replace('"1/mm"', '"1/cm"'))
     assert "unit must be \"1/mm\"; it is '1/cm': convert the numbers" in failure(["fit", path], capsys)
-    for value in ("1e-60", "1e60", "true", '"0.1"'):  # nothing, infinite in single precision; no number at all
+    beyond_single = () if x64 else ("1e-60", "1e60")  # nothing, and infinite
+    for value in ("true", '"0.1"', *beyond_single):
         path.write_text(OWN.replace("2.19", value))
         said = failure(["render", plate(tmp_path / "plate.ply"), "--material", path, "--output", tmp_path / "o.exr"], capsys)
         assert "sigma_s_prime must be" in said
