@@ -83,7 +83,6 @@ def read_textured_mesh(
     crop_min_y: float | None = None,
 ) -> tuple[Mesh, Textures]:
     """Read the mesh in a file, and its maps, as `sample_mesh` does; arguments and errors are its own."""
-    path = existing_file(path)
     mesh, textures = read_mesh(path, mm_per_unit=mm_per_unit, v_up=v_up, dressed=albedo is None)
     textures = Textures(
         albedo=textures.albedo if albedo is None else read_color(albedo),

@@ -51,20 +51,20 @@ def read_ply(path: Path) -> PlyFile:
         return PlyFile(comments, {element.name: _columns(element) for element in found})
 
 
-def _check_counts(lines: list[str], header: bytes, body: memoryview) -> dict[str, dict[str, int]]:
+def _check_counts(rows: list[str], header: bytes, body: memoryview) -> dict[str, dict[str, int]]:
     """Refuse a header that promises more than follows it; give how long the lists of each element usually are."""
-    promised = [_ELEMENT.fullmatch(line.strip()) for line in lines if line.startswith("element")]
-    if None in promised:
+    counted = [_ELEMENT.fullmatch(row.strip()) for row in rows if row.startswith("element")]
+    if None in counted:
         raise ValueError("its header has an element without a count")
     empty = plyfile.PlyData.read(BytesIO(re.sub(rb"(element\s+\S+\s+)\d+", rb"\g<1>0", header)))
     least = -1 if empty.text else 0
-    for element, line in zip(empty, promised, strict=True):
+    for element, count in zip(empty, counted, strict=True):
         sizes = [2 if empty.text else np.dtype(getattr(p, "len_dtype", p.val_dtype)).itemsize for p in element.properties]
-        if not sizes and line is not None and int(line[2]):
+        if not sizes and count is not None and int(count[2]):
             raise ValueError(f"its element {element.name!r} has no property")
         if any(np.dtype(getattr(p, "len_dtype", "u1")).kind == "f" for p in element.properties):
             raise ValueError(f"its element {element.name!r} has lists whose lengths are no whole numbers")
-        least += 0 if line is None else int(line[2]) * sum(sizes)
+        least += 0 if count is None else int(count[2]) * sum(sizes)
     if least > len(body):
         raise ValueError(f"its header promises {least} bytes at least, and {len(body)} follow it: it is cut short")
     lists = plyfile.PlyListProperty

@@ -5,11 +5,10 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Float
 
-from splatjax.scene import Splats
-from splatjax.splatting import AbstractView, BinCapacity, FragmentSums, SplattingSettings, SummedFragments, blend_fragments
+from splatjax.splatting import AbstractView, BinCapacity, FragmentSums, blend_fragments
 
 from ._kernels import AbstractKernel
-from ._tiles import AbstractListRasterizer, nothing
+from ._tiles import AbstractListRasterizer, Lists
 
 
 class BlendingRasterizer(AbstractListRasterizer):
@@ -27,19 +26,12 @@ class BlendingRasterizer(AbstractListRasterizer):
     kernel: AbstractKernel
     capacity: BinCapacity | None = None
 
-    def summed(
-        self, splats: Splats, attributes: Float[Array, "attributes splats"], view: AbstractView, settings: SplattingSettings
-    ) -> SummedFragments:
-        empty = nothing(attributes, view)
-        if splats.count == 0:
-            return SummedFragments(empty, empty, jnp.zeros((), attributes.dtype))
-        lists = self.lists(splats, view, settings)
-
-        def front(ids, footprints, dx, dy):
+    def front(self, lists: Lists, attributes: Float[Array, "attributes splats"], view: AbstractView) -> FragmentSums:
+        def nearest(ids, footprints, dx, dy):
             found = self.kernel.fragments(footprints, view, dx, dy)
             return jnp.max(jnp.where(found.there, view.shifted(found.nearness, footprints.shift), -jnp.inf), axis=1)
 
-        limits = stop_gradient(lists.over_blocks(jax.ops.segment_max, lists.each(front)))
+        limits = stop_gradient(lists.over_blocks(jax.ops.segment_max, lists.each(nearest)))
 
         def blend(ids, footprints, dx, dy, limit):
             found = self.kernel.fragments(footprints, view, dx, dy)
@@ -50,9 +42,8 @@ class BlendingRasterizer(AbstractListRasterizer):
             return jnp.concatenate([sums, own], axis=1)
 
         sums = FragmentSums.of(lists.tiles(lists.over_blocks(jax.ops.segment_sum, lists.each(blend, limits))))
-        blended = FragmentSums(
+        return FragmentSums(
             blend_fragments(sums.attributes, sums.weights[:, None]),
             blend_fragments(sums.nearness, sums.weights),
             jnp.where(sums.weights > 0, 1.0, 0 * sums.weights),
         )
-        return SummedFragments(blended, empty, lists.bins.needed.astype(attributes.dtype))

@@ -5,11 +5,10 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Float
 
-from splatjax.scene import Splats
-from splatjax.splatting import AbstractView, BinCapacity, FragmentSums, SplattingSettings, SummedFragments
+from splatjax.splatting import AbstractView, BinCapacity, FragmentSums
 
 from ._kernels import AbstractKernel, DiscKernel
-from ._tiles import AbstractListRasterizer, nothing
+from ._tiles import AbstractListRasterizer, Lists
 
 
 class NearestRasterizer(AbstractListRasterizer):
@@ -18,14 +17,7 @@ class NearestRasterizer(AbstractListRasterizer):
     kernel: AbstractKernel = DiscKernel()
     capacity: BinCapacity | None = None
 
-    def summed(
-        self, splats: Splats, attributes: Float[Array, "attributes splats"], view: AbstractView, settings: SplattingSettings
-    ) -> SummedFragments:
-        empty = nothing(attributes, view)
-        if splats.count == 0:
-            return SummedFragments(empty, empty, jnp.zeros((), attributes.dtype))
-        lists = self.lists(splats, view, settings)
-
+    def front(self, lists: Lists, attributes: Float[Array, "attributes splats"], view: AbstractView) -> FragmentSums:
         def nearest(ids, footprints, dx, dy):
             found = self.kernel.fragments(footprints, view, dx, dy)
             near = jnp.where(found.there, found.nearness, -jnp.inf)
@@ -37,8 +29,7 @@ class NearestRasterizer(AbstractListRasterizer):
         wins = (near == nearest_of_all[lists.chunk]) & (near > -jnp.inf)
         winner = lists.over_blocks(jax.ops.segment_max, jnp.where(wins, ids, -1))
         winner = lists.tiles((jnp.maximum(winner, -1)[:, :, None] + 1).astype(attributes.dtype))[:, 0] - 1
-        front = _of_winners(self.kernel, lists, view, attributes, winner)
-        return SummedFragments(front, empty, lists.bins.needed.astype(attributes.dtype))
+        return _of_winners(self.kernel, lists, view, attributes, winner)
 
 
 def _of_winners(

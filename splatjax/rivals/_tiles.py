@@ -1,5 +1,6 @@
 """Lists of splats per tile, walked block by block in the plainest way: nothing is kept back, and every derivative is there."""
 
+import abc
 from collections.abc import Callable, Sequence
 from typing import TypeVar
 
@@ -18,6 +19,7 @@ from splatjax.splatting import (
     Footprints,
     FragmentSums,
     SplattingSettings,
+    SummedFragments,
     TileGrid,
     TileRanges,
     TileRasterizer,
@@ -42,6 +44,19 @@ class AbstractListRasterizer(AbstractRasterizer):
 
     def for_shadows(self) -> AbstractRasterizer:
         return TileRasterizer()
+
+    @abc.abstractmethod
+    def front(self, lists: "Lists", attributes: Float[Array, "attributes splats"], view: AbstractView) -> FragmentSums:
+        """Give the surface that the lists show."""
+
+    def summed(
+        self, splats: Splats, attributes: Float[Array, "attributes splats"], view: AbstractView, settings: SplattingSettings
+    ) -> SummedFragments:
+        nothing = FragmentSums.of(jnp.zeros((_grid(view).count, attributes.shape[0] + 2, SIDE**2), attributes.dtype))
+        if splats.count == 0:
+            return SummedFragments(nothing, nothing, jnp.zeros((), attributes.dtype))
+        lists = self.lists(splats, view, settings)
+        return SummedFragments(self.front(lists, attributes, view), nothing, lists.bins.needed.astype(attributes.dtype))
 
     def lists(self, splats: Splats, view: AbstractView, settings: SplattingSettings) -> "Lists":
         """Sort the splats into the tiles of a picture.
@@ -99,11 +114,6 @@ class Lists(eqx.Module):
         within, tiles = self.grid.within_picture(), self.bins.by_tile(found.reshape(-1, *found.shape[2:]), self.grid.count)
         poison = jnp.where(self.bins.needed <= 1, 0.0, jnp.nan).astype(found.dtype)
         return (tiles if within is None else jnp.where(within[:, None], tiles, 0.0)) + poison
-
-
-def nothing(attributes: Float[Array, "attributes splats"], view: AbstractView) -> FragmentSums:
-    """Give a surface of which no pixel shows anything."""
-    return FragmentSums.of(jnp.zeros((_grid(view).count, attributes.shape[0] + 2, SIDE**2), attributes.dtype))
 
 
 def _grid(view: AbstractView) -> TileGrid:

@@ -232,8 +232,8 @@ def _forward(sweep: Sweep, bins: Bins, shift, planes, attributes):
     def seen(sums, tiles):
         """What of a tile lies beyond the picture shows nothing."""
         if within is None:
-            return sums + poison
-        return jnp.where(jnp.asarray(within)[jnp.minimum(tiles, grid.count - 1)][:, None], sums + poison, 0.0)
+            return sums
+        return jnp.where(jnp.asarray(within)[jnp.minimum(tiles, grid.count - 1)][:, None], sums, 0.0)
 
     def chunk(i, out):
         tiles = sweep.chunk(bins, i, dtype)
