@@ -7,8 +7,7 @@ import numpy as np
 
 import splatjax as sj
 from splatjax import rivals
-from splatjax.geometry import Mesh, Textures, bust_mesh, cut_below, sample_mesh as sample_surface
-from splatjax.geometry._complexion import complexion
+from splatjax.geometry import Mesh, Textures, sample_mesh as sample_surface
 from splatjax.io import read_textured_mesh
 
 from .scenes import DISTANCE, FOCAL_LENGTH
@@ -48,16 +47,9 @@ def scanned(count: int) -> Body:
 
 
 def bust(count: int) -> Body:
-    """Give the bust's head, its colors laid out by its own coordinates: longitude and latitude, seen from inside."""
-    mesh = cut_below(bust_mesh(), -105.0)
-    assert mesh.uvs is not None
-    low, high = mesh.uvs.min(axis=(0, 1)), mesh.uvs.max(axis=(0, 1))
-    mesh = Mesh(mesh.vertices, mesh.faces, mesh.normals, 0.002 + 0.996 * (mesh.uvs - low) / (high - low))
-    bare = rivals.TexturedMesh.of(mesh)
-    texels = rivals.lay_out(bare, MAP, rivals.room_for(rivals.Landing.in_texture(bare.uvs, MAP)))
-    points = np.asarray(texels.points.centers, np.float64)
-    albedo, specular, roughness = (each.reshape(MAP, MAP, *each.shape[1:]) for each in complexion(points))
-    return _body(before_the_camera(mesh), Textures(albedo, specular, roughness), count)
+    """Give the bust's head, its colors laid out by its own coordinates."""
+    mesh, textures = rivals.bust_with_textures(MAP)
+    return _body(before_the_camera(mesh), textures, count)
 
 
 def _body(mesh: Mesh, textures: Textures, count: int) -> Body:

@@ -1,7 +1,6 @@
 """Splat diffusion and its rivals against brute-force integration over the surface: `python -m benchmarks.rivals`.
 
 Writes out/rivals_BODY_NORMALIZATION.json, and a picture of where each method errs around the nose; SSIM and FLIP are taken there.
-With `--figure`, out/rivals_figure8_BODY.png alone: half and half, and the difference.
 """
 
 import argparse
@@ -22,7 +21,7 @@ from splatjax.diffusion import DiffusionSettings, ExitOdds, PlainMean
 from splatjax.splatting import PerspectiveView
 
 from .heads import HEADS, MAP, Body, conditions
-from .rivals_pictures import errors, figure_8
+from .rivals_pictures import errors
 from .surface_truth import integrate
 
 NORMALIZATIONS = {"mean": PlainMean(), "odds": ExitOdds()}
@@ -39,7 +38,6 @@ def arguments():
     parser.add_argument("--width", type=int, default=1024, help="of the square picture, pixels (default %(default)s)")
     parser.add_argument("--pixels", type=int, default=1000, help="random covered ones (default %(default)s)")
     parser.add_argument("--refine", action="store_true", help="also integrate with twice the samples, and tell the change")
-    parser.add_argument("--figure", action="store_true", help="draw Figure 8 and nothing else")
     return parser.parse_args()
 
 
@@ -125,9 +123,6 @@ def main() -> None:
     print(f"{options.body}: {len(body.mesh.faces)} triangles, {body.splats.count} splats ({time.perf_counter() - start:.0f} s)")
     light, camera = conditions(options.width)
     material = sj.load_material("skin").white()
-    if options.figure:
-        figure_8(body, light, camera, material, Path(f"out/rivals_figure8_{options.body}.png"))
-        return
     dull = dataclasses.replace(material.surface_of(material.gaussians), specular=jnp.zeros(()))
     settings = rivals.TextureSpaceSettings().shadows
     rooms = rivals.shadow_rooms(body.mesh, (light,), settings)

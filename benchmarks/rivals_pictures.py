@@ -1,6 +1,5 @@
-"""Pictures of splat diffusion and its rivals: Figure 8, and where each of them errs."""
+"""Pictures of where splat diffusion and its rivals err."""
 
-import dataclasses
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -8,29 +7,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 from PIL import Image
 
-import splatjax as sj
 from splatjax import rivals
 from splatjax.io._color import linear_to_srgb
-
-FILL = 0.1  # of a second light, from the other side, without shadows
-SHOWN = 448  # pixels along a panel
-GAIN = 8.0  # by which differences are enlarged
-
-
-def figure_8(body, light: sj.DirectionalLight, camera: sj.Camera, material: sj.Material, path: Path) -> None:
-    """Draw a head half by texture-space and half by splat diffusion, and the difference of the whole pictures."""
-    beside = sj.DirectionalLight(light.direction * jnp.asarray([-1.0, 0.2, 1.0]), FILL * light.irradiance, cast_shadows=False)
-    lights = (light, beside)
-    camera = dataclasses.replace(camera, width=SHOWN, height=SHOWN)
-    finer = dataclasses.replace(camera, width=2 * SHOWN, height=2 * SHOWN)
-    left = rivals.render_texture_space(body.mesh, lights, material, finer).frame.beauty
-    left = left.reshape(SHOWN, 2, SHOWN, 2, 3).mean(axis=(1, 3))
-    right = sj.render(sj.Scene(body.splats, lights, material), camera).beauty
-    found = rivals.half_and_half(left, right, GAIN)
-    halves = linear_to_srgb(np.asarray(found.halves, np.float64))
-    dashes = np.arange(SHOWN) % 8 < 4
-    halves[dashes, SHOWN // 2 - 1 : SHOWN // 2 + 1] = 0.9
-    save(np.concatenate([halves, np.asarray(found.difference)], axis=1), path)
 
 
 def errors(

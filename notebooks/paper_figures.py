@@ -13,17 +13,20 @@
 # %% [markdown]
 # # The paper's figures, small
 #
-# Figures 1 and 3 to 7 of "Subsurface scattering using splat-based diffusion in point-based rendering", from the built-in bust.
+# Figures 1 and 3 to 8 of "Subsurface scattering using splat-based diffusion in point-based rendering", from the built-in bust.
 # `splatjax figure 7 --output figure_7.png` and so on make them larger, and from scanned heads; `docs/figures.md` says what to
 # see.
 
 # %%
 # %matplotlib inline
+from dataclasses import replace
+
 import jax.numpy as jnp
 import numpy as np
 
 import splatjax as sj
 from splatjax import plots, rivals
+from splatjax.geometry import sample_mesh
 
 # %% [markdown]
 # A bust of a third of life size, so that few splats resolve what light does in skin, under one light with shadows.
@@ -72,6 +75,17 @@ plots.figure_6([bust], {"skin": skin, "marble": marble})
 # %%
 plots.figure_7(bust, skin)
 
+
+# %% [markdown]
+# Figure 8: left of the line triangles with texture-space diffusion, right of it splats. The bust's chart is longitude and latitude.
+
+# %%
+mesh, textures = rivals.bust_with_textures(256)
+splats = sample_mesh(mesh, 20_000, textures=textures)
+head = plots.Subject("bust", splats, (light,), camera).scaled(0.3)
+triangles = rivals.TexturedMesh.of(mesh, textures)
+triangles = replace(triangles, vertices=0.3 * triangles.vertices)
+plots.figure_8(head, triangles, skin)
 
 # %% [markdown]
 # In numbers: how rough the light is, as the mean step from pixel to pixel inside the bust.

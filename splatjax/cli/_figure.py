@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,6 +14,7 @@ import tyro
 import splatjax as sj
 from splatjax.io import atomic_path
 
+from ._mesh_maps import MeshMaps
 from ._outputs import check_output
 from ._report import stage
 from ._shot import Shot, in_color, towards
@@ -22,19 +23,23 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure as Drawing
 
     from splatjax.plots import Subject
+    from splatjax.rivals import TexturedMesh
 
 _DISTANCE = 900.0  # mm: that of a portrait
+_TEXELS = 1024  # along an edge of the bust's textures
 _ROOM = 1.04  # of the picture over the body's outline
 
 
 @dataclass(frozen=True, kw_only=True)
-class Figure:
-    """Make a figure of the paper anew, from the built-in bust or from scanned heads: 1, 3, 4, 5, 6 or 7.
+class Figure(MeshMaps):
+    """Make a figure of the paper anew, from the built-in bust or from scanned heads: 1 or 3 to 8.
 
     1: splats, the surface without and with scattering. 3: the layers of a profile. 4: the layers of a picture. 5: fewer splats
-    for wider layers. 6: bodies in four materials. 7: earlier point-based methods and this one. docs/figures.md shows them.
+    for wider layers. 6: bodies in four materials. 7: earlier point-based methods and this one. 8: texture-space diffusion and
+    this one, half and half. docs/figures.md shows them.
 
-    Example: splatjax figure 7 --scene head.ply --output figure_7.png
+    Examples: splatjax figure 7 --scene head.ply --output figure_7.png
+    splatjax figure 8 --scene head.glb --mm-per-unit 53 --albedo color.jpg --output figure_8.png
     """
 
     number: tyro.conf.Positional[int]
@@ -43,7 +48,9 @@ class Figure:
     """The PNG, PDF or SVG file to write."""
     scene: tuple[Path, ...] = ()
     """PLY files of splats, in mm (`splatjax sample` makes them). Figure 6 shows the bust and all of them, the others the first;
-    without one, the bust."""
+    without one, the bust. Figure 8 takes a mesh with texture coordinates (GLB, glTF, OBJ, ...) and the maps below."""
+    mm_per_unit: float | None = None
+    """Of figure 8: length of the mesh file's unit, mm: 1000 for metres."""
     material: str = "skin"
     """Name of a material (`splatjax materials`), or path of a TOML file."""
     materials: tuple[str, ...] = ("skin", "marble", "ketchup", "wholemilk")
@@ -51,7 +58,7 @@ class Figure:
     width: int = 512
     """Of a picture in the figure, pixels along each side."""
     count: int = 200_000
-    """Number of splats of the built-in bust."""
+    """Number of splats of the built-in bust, and of a mesh."""
     scale: float = 1.0
     """Size of the bodies: at 0.5 a head is half as large, and the light goes twice as far in it. So do fewer splats for narrow
     layers."""
@@ -88,6 +95,7 @@ class Figure:
             5: lambda: plots.figure_5(self._subject()),
             6: lambda: plots.figure_6(self._subjects(), {name: in_color(sj.load_material(name)) for name in self.materials}),
             7: lambda: plots.figure_7(self._subject(), material, place=self.close_up),
+            8: lambda: plots.figure_8(*self._both_ways(), material),
         }
 
     def _subject(self) -> "Subject":
@@ -98,8 +106,30 @@ class Figure:
 
     def _placed(self, path: Path | None) -> "Subject":
         """Give the splats of a file, or the bust, under the lights and before the camera of all figures."""
-        from splatjax.plots import Subject
+        shot = self._shot(path)
+        splats = shot.splats_to_show()
+        return self._before_the_camera("bust" if path is None else path.stem, splats, shot)
 
+    def _both_ways(self) -> "tuple[Subject, TexturedMesh]":
+        """Give the mesh of a file, or the bust's, as splats and as triangles."""
+        from splatjax.geometry import sample_mesh
+        from splatjax.io import read_textured_mesh
+        from splatjax.rivals import TexturedMesh, bust_with_textures
+
+        path = self.scene[0] if self.scene else None
+        shot = self._shot(None)
+        if path is None:
+            mesh, textures = bust_with_textures(_TEXELS)
+        elif self.mm_per_unit is None:
+            raise ValueError(f"--mm-per-unit is missing: say how many mm a unit of {path} is (1000 for metres)")
+        else:
+            mesh, textures = read_textured_mesh(path, mm_per_unit=self.mm_per_unit, **self.worn())
+        triangles = TexturedMesh.of(mesh, textures)
+        splats = sample_mesh(mesh, self.count, textures=textures)
+        subject = self._before_the_camera("bust" if path is None else path.stem, splats, shot)
+        return subject, replace(triangles, vertices=self.scale * triangles.vertices)
+
+    def _shot(self, path: Path | None) -> Shot:
         shot = Shot(
             splats=path,
             output=self.output,
@@ -111,9 +141,12 @@ class Figure:
             count=self.count,
         )
         shot.check()
-        splats = shot.splats_to_show()
+        return shot
+
+    def _before_the_camera(self, name: str, splats: sj.Splats, shot: Shot) -> "Subject":
+        from splatjax.plots import Subject
+
         lights = shot.lights(3, self.azimuth, self.light_azimuth)
-        name = "bust" if path is None else path.stem
         camera = portrait(splats, towards(self.azimuth, 0.0), self.width)
         return Subject(name, splats, lights, camera).scaled(self.scale)
 

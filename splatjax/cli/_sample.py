@@ -2,18 +2,18 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
 import tyro
 
 import splatjax as sj
 
-from ._outputs import OptionalPath, check_output
+from ._mesh_maps import MeshMaps
+from ._outputs import check_output
 from ._report import note, stage
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sample:
+class Sample(MeshMaps):
     """Cover a mesh (GLB, glTF, OBJ, ...) evenly with splats, bake its maps into them, and write them as PLY, in mm.
 
     Example: splatjax sample head.glb --albedo color.jpg --mm-per-unit 53 --count 683549 --output head.ply
@@ -27,17 +27,6 @@ class Sample:
     """The PLY file to write."""
     count: int = 200_000
     """Number of splats."""
-    albedo: OptionalPath = None
-    """Map of the diffuse color, sRGB. Without it, the texture that the file itself carries, if any."""
-    specular: OptionalPath = None
-    """Gray map: factor on the material's specular strength."""
-    normal: OptionalPath = None
-    """Tangent-space normal map; green points up."""
-    v_up: bool | None = None
-    """Whether v = 0 is the lower edge of a map. None: as the format prescribes (OBJ yes, glTF and GLB no). If lips land on the
-    chin, say True."""
-    crop_min_y: Annotated[float | None, tyro.conf.arg(metavar="Y")] = None
-    """Cut off what lies below this height, in the file's unit."""
     seed: int = 0
     """Another spread of the same quality."""
 
@@ -45,17 +34,7 @@ class Sample:
         """Read, sample, write."""
         check_output(self.output, (".ply",))
         with stage(f"sampling {self.mesh} with {self.count} splats"):
-            splats = sj.sample_mesh(
-                self.mesh,
-                self.count,
-                mm_per_unit=self.mm_per_unit,
-                albedo=self.albedo,
-                specular=self.specular,
-                normal=self.normal,
-                v_up=self.v_up,
-                crop_min_y=self.crop_min_y,
-                seed=self.seed,
-            )
+            splats = sj.sample_mesh(self.mesh, self.count, mm_per_unit=self.mm_per_unit, seed=self.seed, **self.worn())
         with stage(f"writing {self.output}"):
             sj.write_splats(self.output, splats)
         carried = [name for name in ("albedo", "specular", "roughness") if getattr(splats, name) is not None]

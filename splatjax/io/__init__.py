@@ -2,7 +2,7 @@
 
 from ._animation import write_animation as write_animation
 from ._atomic import atomic_path as atomic_path
-from ._color import linear_to_srgb as linear_to_srgb
+from ._color import linear_to_srgb as linear_to_srgb, srgb_to_linear as srgb_to_linear
 from ._exr import read_exr as read_exr, read_manifest as read_manifest, read_picture as read_picture, write_exr as write_exr
 from ._materials import material_path as material_path
 from ._materials import load_material as load_material, load_medium as load_medium, load_profile as load_profile

@@ -9,4 +9,5 @@ from ._figure_4 import figure_4 as figure_4
 from ._figure_5 import figure_5 as figure_5
 from ._figure_6 import figure_6 as figure_6
 from ._figure_7 import figure_7 as figure_7
+from ._figure_8 import figure_8 as figure_8
 from ._subject import bright as bright, picture_grid as picture_grid, Subject as Subject

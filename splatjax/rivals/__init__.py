@@ -1,5 +1,6 @@
 """The methods that splat-based diffusion is measured against, and by what they are compared."""
 
+from ._bust import bust_with_textures as bust_with_textures
 from ._blending import BlendingRasterizer as BlendingRasterizer
 from ._halves import half_and_half as half_and_half, HalfAndHalf as HalfAndHalf
 from ._kernels import AbstractKernel as AbstractKernel, DiscKernel as DiscKernel, DiscOrPixelKernel as DiscOrPixelKernel

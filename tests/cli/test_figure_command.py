@@ -30,7 +30,9 @@ def test_every_figure_is_made_from_a_ball(tmp_path, number):
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        (["8"], "no figure 8"),
+        (["2"], "no figure 2"),
+        (["8", "--scene", "nowhere.glb"], "--mm-per-unit"),
+        (["8", "--scene", "nowhere.glb", "--mm-per-unit", "53"], "nowhere.glb"),
         (["1", "--scale", "0"], "--scale"),
         (["1", "--output", "figure.exr"], ".png"),
         (["1", "--scene", "nowhere.ply"], "nowhere.ply"),
