@@ -25,7 +25,7 @@ AMPLIFIED = 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0
 KEEP = 2, 4, 8, 16, 32, 64, 128
 CELLS = 0.3, 0.45, 0.6, 0.85, 1.2, 1.7, 2.4  # edges, in standard deviations of a layer
 WIDEST, COARSEST, DEPTH = 25.0, 2.2, 0.75  # mm; spacings of what stays and depth of sources, in standard deviations
-POINTS, AT_ONCE, REPEATS = 600, 8, 3
+POINTS, AT_ONCE, REPEATS = 600, 8, 12
 
 
 def arguments():

@@ -12,7 +12,7 @@ import pytest
 from nbclient import NotebookClient
 
 NOTEBOOKS = Path(__file__).parents[1] / "notebooks"
-LONG = {"painted_skin", "paper_figures", "recover_marble", "shape_from_shading"}
+LONG = {"painted_skin", "recover_marble", "shape_from_shading", *(f"figure_{number}" for number in (1, 4, 5, 6, 7, 8))}
 """They take more than half a minute: `make test-long` runs them, `make test` does not."""
 RUN_LONGER_THAN_THEY_COMPILE = {"shape_from_shading", "which_profile"}
 """They are compiled as users have it, whatever the shell says."""

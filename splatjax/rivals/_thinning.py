@@ -31,7 +31,7 @@ def thinning_error(
     - `ratio`: of the splats that stay, in (0, 1].
     - `contrast`: `s`, from `layer_contrast`.
 
-    **Returns:** within a factor of 1.5 of what is measured, in 98% of 234 layers with `x` up to 2.2 (docs/figures.md).
+    **Returns:** within a factor of 1.5 of what is measured, in 99% of 234 layers with `x` up to 2.2 (docs/figures.md).
 
     **Source:** fitted; Kim et al. 2010, Figure 5, which it explains.
     """
