@@ -27,6 +27,15 @@ def test_every_figure_is_made_from_a_ball(tmp_path, number):
         assert np.std(np.asarray(picture.convert("L"), float)) > 10
 
 
+@pytest.mark.long
+@pytest.mark.once
+def test_figure_8_is_made_from_the_bust(tmp_path):
+    output = tmp_path / "figure.png"
+    assert main(["figure", "8", "--output", str(output), "--width", "48", "--count", "3000"]) == 0
+    with Image.open(output) as picture:
+        assert np.std(np.asarray(picture.convert("L"), float)) > 10
+
+
 @pytest.mark.parametrize(
     ("words", "says"),
     [
