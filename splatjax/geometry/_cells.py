@@ -4,8 +4,8 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
+import scipy  # its parts are loaded where they are used, which takes a third of a second
 from jaxtyping import Float
-from scipy.spatial import KDTree
 
 _CHUNK = 1 << 11  # small enough to stay in cache
 _OPEN_END = 0.75
@@ -76,7 +76,7 @@ def surface_cells(
         everyone = np.concatenate([points, ghosts.points])
         single = np.concatenate([single, ghosts.normals.astype(np.float32)])
     neighbors = min(neighbors, len(everyone) - 1)
-    tree = KDTree(everyone, balanced_tree=False, compact_nodes=False)
+    tree = scipy.spatial.KDTree(everyone, balanced_tree=False, compact_nodes=False)
     distances, near = tree.query(points, k=neighbors + 1, workers=-1)
     angles = (np.arange(directions) + 0.5) * (2 * np.pi / directions)
     fan = np.stack([np.cos(angles), np.sin(angles)]).astype(np.float32)

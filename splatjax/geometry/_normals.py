@@ -1,10 +1,8 @@
 """Normals of raw points."""
 
 import numpy as np
+import scipy  # its parts are loaded where they are used, which takes a third of a second
 from jaxtyping import Float, Int
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
-from scipy.spatial import KDTree
 
 _CHUNK = 1 << 16
 
@@ -24,7 +22,7 @@ def estimate_normals(points: Float[np.ndarray, "n 3"], *, neighbors: int = 12) -
     **Source:** Hoppe et al. 1992, "Surface Reconstruction from Unorganized Points", sections 3.2 and 3.3.
     """
     neighbors = min(neighbors, len(points) - 1)
-    near = KDTree(points).query(points, k=neighbors + 1, workers=-1)[1]
+    near = scipy.spatial.KDTree(points).query(points, k=neighbors + 1, workers=-1)[1]
     normals = np.empty(points.shape)
     for start in range(0, len(points), _CHUNK):
         part = slice(start, start + _CHUNK)
@@ -42,9 +40,9 @@ def _signs(points: np.ndarray, normals: np.ndarray, near: Int[np.ndarray, "n k"]
     cost = 1.001 - np.minimum(agreement, 1.0)  # a zero would be no edge
     low, high = np.minimum(start, end), np.maximum(start, end)
     key, first = np.unique(low * np.int64(count) + high, return_index=True)
-    graph = coo_array((cost[first], (key // count, key % count)), shape=(count, count)).tocsr()
-    tree = minimum_spanning_tree(graph)
-    parts, part = connected_components(graph, directed=False)
+    graph = scipy.sparse.coo_array((cost[first], (key // count, key % count)), shape=(count, count)).tocsr()
+    tree = scipy.sparse.csgraph.minimum_spanning_tree(graph)
+    parts, part = scipy.sparse.csgraph.connected_components(graph, directed=False)
     sizes = np.bincount(part, minlength=parts)
     middles = np.stack([np.bincount(part, points[:, axis], parts) / sizes for axis in range(3)], axis=-1)
     outward = points - middles[part]
@@ -57,10 +55,10 @@ def _signs(points: np.ndarray, normals: np.ndarray, near: Int[np.ndarray, "n k"]
 def _carried(tree, roots: np.ndarray, normals: np.ndarray, root_signs: np.ndarray) -> Float[np.ndarray, " n"]:
     """Carry the signs of the roots along the trees, all of which hang from one more node."""
     count = len(normals)
-    tree = coo_array(tree)
+    tree = scipy.sparse.coo_array(tree)
     row, column = (np.append(index, more) for index, more in zip(tree.coords, (np.full(len(roots), count), roots), strict=True))
-    joined = coo_array((np.ones(len(row)), (row, column)), shape=(count + 1, count + 1)).tocsr()
-    ahead = breadth_first_order(joined, count, directed=False)[1]
+    joined = scipy.sparse.coo_array((np.ones(len(row)), (row, column)), shape=(count + 1, count + 1)).tocsr()
+    ahead = scipy.sparse.csgraph.breadth_first_order(joined, count, directed=False)[1]
     ahead[count] = count
     signs = np.ones(count + 1)
     inner = ahead[:count] < count

@@ -3,8 +3,8 @@
 from typing import NamedTuple
 
 import numpy as np
+import scipy  # its parts are loaded where they are used, which takes a third of a second
 from jaxtyping import Float, Int
-from scipy.spatial import KDTree
 
 from ._cells import Ghosts, surface_cells
 from ._mesh import Mesh, unit
@@ -115,7 +115,7 @@ def mirrored(
     edge = np.repeat(np.arange(len(faces)), pieces)
     share = (np.arange(len(edge)) - np.repeat(np.cumsum(pieces) - pieces, pieces) + 0.5) / pieces[edge]
     marks = starts[edge] + share[:, None] * (ends - starts)[edge]
-    distance, mark = KDTree(marks).query(points, distance_upper_bound=1.5 * spacing, workers=-1)
+    distance, mark = scipy.spatial.KDTree(marks).query(points, distance_upper_bound=1.5 * spacing, workers=-1)
     near = np.flatnonzero(np.isfinite(distance))
     edge = edge[mark[near]]
     along = (ends - starts)[edge] / lengths[edge, None]

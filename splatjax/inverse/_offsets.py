@@ -5,8 +5,8 @@ import math
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+import scipy  # its parts are loaded where they are used, which takes a third of a second
 from jaxtyping import Array, Float, Int
-from scipy.spatial import KDTree
 
 from splatjax.pointwise import one_program
 from splatjax.scene import Splats
@@ -59,7 +59,7 @@ class NormalOffsets(AbstractBodyPart):
 
     def prepared(self, splats: Splats) -> OffsetTables:
         centers, normals, areas = (np.asarray(each, np.float64) for each in (splats.centers, splats.normals, splats.areas))
-        tree, dtype = KDTree(centers), splats.centers.dtype
+        tree, dtype = scipy.spatial.KDTree(centers), splats.centers.dtype
         count = int(np.max(tree.query_ball_point(centers, _REACH * self.smoothness, return_length=True)))
         near, weights = _blur(tree, normals, areas, self.smoothness, -(-count // _ROUNDED) * _ROUNDED)
         around, tangents, slopes = _slopes(tree, normals)
@@ -95,7 +95,7 @@ class NormalOffsets(AbstractBodyPart):
         return jnp.sum((self.step * prepared.gain / self.deviation * x) ** 2)
 
 
-def _blur(tree: KDTree, normals: np.ndarray, areas: np.ndarray, width: float, count: int):
+def _blur(tree: "scipy.spatial.KDTree", normals: np.ndarray, areas: np.ndarray, width: float, count: int):
     """Give neighbors and the weights of a mean over them; those beyond reach and on other sides have none."""
     distances, near = tree.query(tree.data, k=np.arange(1, count + 1), distance_upper_bound=_REACH * width, workers=-1)
     there = near < len(areas)
@@ -105,7 +105,7 @@ def _blur(tree: KDTree, normals: np.ndarray, areas: np.ndarray, width: float, co
     return near, weights / np.sum(weights, axis=1, keepdims=True)
 
 
-def _slopes(tree: KDTree, normals: np.ndarray):
+def _slopes(tree: "scipy.spatial.KDTree", normals: np.ndarray):
     """Give neighbors, tangents, and the weights of derivatives along them: least squares with quadratic terms."""
     around = tree.query(tree.data, k=_SLOPES, workers=-1)[1][:, 1:]
     helper = np.where(np.abs(normals[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])

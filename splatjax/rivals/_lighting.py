@@ -2,8 +2,8 @@
 
 import jax.numpy as jnp
 import numpy as np
+import scipy  # its parts are loaded where they are used, which takes a third of a second
 from jaxtyping import Array, Float
-from scipy.spatial import KDTree
 
 from splatjax.pointwise import in_parts
 from splatjax.render import AbstractLighting, LightOnSplats, entering_light, surface_attributes
@@ -70,7 +70,7 @@ def normal_slopes(splats: Splats, neighbors: int = _NEIGHBORS) -> Float[Array, "
     **Returns:** zero along the splat's own normal, and where the neighbors lie in one line, across it.
     """
     centers, normals = (np.asarray(each, np.float64) for each in (splats.centers, splats.normals))
-    near = KDTree(centers).query(centers, k=min(neighbors + 1, len(centers)))[1][:, 1:]
+    near = scipy.spatial.KDTree(centers).query(centers, k=min(neighbors + 1, len(centers)))[1][:, 1:]
     helper = np.where(np.abs(normals[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
     first = np.cross(normals, helper)
     first /= np.linalg.norm(first, axis=1, keepdims=True)

@@ -11,8 +11,8 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy  # its parts are loaded where they are used, which takes a third of a second
 from jaxtyping import Array, Float
-from scipy.special import erfc, loggamma
 
 _STEP = 0.06  # of the logarithm: the Nyquist frequency is 52
 _PASSED = 22.0  # frequency up to which nothing is damped: exp(-pi/2 * 22) = 1e-15 bounds what lies above
@@ -102,9 +102,9 @@ def _filter() -> tuple[np.ndarray, np.ndarray]:
     nyquist = np.pi / _STEP
     frequency = np.linspace(-nyquist, nyquist, 8001)
     width = (nyquist - _PASSED) / 12
-    taper = 0.5 * erfc((np.abs(frequency) - 0.5 * (nyquist + _PASSED)) / width)
+    taper = 0.5 * scipy.special.erfc((np.abs(frequency) - 0.5 * (nyquist + _PASSED)) / width)
     half = 0.5 + 0.5j * frequency
-    response = np.exp(1j * frequency * np.log(2) + loggamma(half) - loggamma(half.conj()))
+    response = np.exp(1j * frequency * np.log(2) + scipy.special.loggamma(half) - scipy.special.loggamma(half.conj()))
     logarithms = np.arange(round(_FIRST / _STEP), round(_LAST / _STEP) + 1) * _STEP
     waves = np.exp(-1j * logarithms[:, None] * frequency)
     weights = np.trapezoid(taper * response * waves, frequency, axis=1).real * _STEP / (2 * np.pi)
