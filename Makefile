@@ -1,4 +1,4 @@
-# Two commands for a fresh machine: `make demo` and `make test`.
+# Two commands for a fresh machine: `make demo` and `make test`. Others: docs, notebooks, gallery, bench, release-check.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -12,7 +12,8 @@ LEAST_OPTIMIZATION := --xla_backend_optimization_level=0 --xla_cpu_use_fusion_em
 # Every worker of every run imports the same modules, with their shapes checked: whatever the shell says, bytecode is kept.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: setup demo test test-float32 test-x64 test-once test-long random-scenes fuzz lint bench lock
+.PHONY: setup demo test test-float32 test-x64 test-once test-long random-scenes fuzz lint bench lock docs notebooks gallery \
+    release-check
 
 setup: $(VENV)/ready
 
@@ -70,7 +71,54 @@ bench: setup
 	$(BIN)/python -m benchmarks.diffusion_error
 	$(BIN)/python -m benchmarks.shimmer
 
-# Written anew when dependencies change; hashes, no addresses.
+# The site, in out/site: pages, the API from its docstrings, and the notebooks with what they print and draw. Notebooks are run
+# anew when they or the code have changed, which takes some minutes; `make -j2 docs` runs two at once.
+NOTEBOOKS := $(wildcard notebooks/*.py)
+SOURCES := $(shell find splatjax profiles -name '*.py' -o -name '*.toml')
+
+docs: $(VENV)/docs $(NOTEBOOKS:notebooks/%.py=out/notebooks/%.ipynb)
+	$(BIN)/python -m mkdocs build --quiet
+	$(BIN)/python tools/check_site.py out/site
+	@echo "out/site/index.html; with search: python3 -m http.server --directory out/site"
+
+out/notebooks/%.ipynb: notebooks/%.py $(SOURCES) | $(VENV)/docs
+	mkdir -p out/notebooks/running
+	$(BIN)/jupytext --quiet --to ipynb --output out/notebooks/running/$*.ipynb $<
+	cd out/notebooks/running && $(abspath $(BIN))/jupyter-execute --inplace --timeout 1200 $*.ipynb
+	mv out/notebooks/running/$*.ipynb $@
+
+$(VENV)/docs: requirements-docs.lock $(VENV)/ready
+	VIRTUAL_ENV=$(abspath $(VENV)) $(BIN)/uv pip install --quiet --require-hashes --requirements requirements-docs.lock
+	touch $@
+
+# JupyterLab, with copies of the notebooks in out/lab: what is changed there is yours, until the notebook itself changes.
+notebooks: $(VENV)/notebooks $(NOTEBOOKS:notebooks/%.py=out/lab/%.ipynb)
+	$(BIN)/jupyter-lab out/lab
+
+out/lab/%.ipynb: notebooks/%.py | $(VENV)/notebooks
+	mkdir -p out/lab
+	$(BIN)/jupytext --quiet --to ipynb --output $@ $<
+
+$(VENV)/notebooks: requirements-notebooks.lock $(VENV)/ready
+	VIRTUAL_ENV=$(abspath $(VENV)) $(BIN)/uv pip install --quiet --require-hashes --requirements requirements-notebooks.lock
+	touch $@
+
+# The pictures of docs/gallery.md, into out/gallery; HEAD=head.ply names the scan that three of them show.
+gallery: setup
+	$(BIN)/python tools/make_gallery.py $(if $(HEAD),--head $(HEAD))
+
+# Wheel and sdist, into dist; and whether they work where there is no checkout.
+release-check: setup
+	rm -rf dist
+	$(BIN)/hatchling build --target sdist --target wheel
+	$(BIN)/python tools/release_check.py
+
+# Written anew when dependencies change; hashes, no addresses. What docs and notebooks need besides is in locks of its own, so that
+# setting up stays quick.
+COMPILE := $(BIN)/uv pip compile --python-version 3.11 --universal --generate-hashes --no-emit-index-url --no-emit-find-links \
+    --no-annotate --no-header
+
 lock: setup
-	$(BIN)/uv pip compile pyproject.toml --group dev --python-version 3.11 --universal --generate-hashes \
-	    --no-emit-index-url --no-emit-find-links --no-annotate --no-header --output-file requirements.lock
+	$(COMPILE) pyproject.toml --group dev --output-file requirements.lock
+	$(COMPILE) --group docs --constraints requirements.lock --output-file requirements-docs.lock
+	$(COMPILE) --group lab --constraints requirements.lock --output-file requirements-notebooks.lock

@@ -1,0 +1,49 @@
+"""What the README and the pages tell their readers to type: commands, programs, and files to write."""
+
+import re
+import shlex
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+_FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+_TYPED = re.compile(r"^ {4}((?:splatjax|make|python) .*)$", re.MULTILINE)
+_QUOTED = re.compile(r"`((?:splatjax|make|python) [^`]*)`")
+
+
+def name(page: Path) -> str:
+    """Give the name of a page in the repository."""
+    return page.relative_to(ROOT).as_posix()
+
+
+def fences(page: Path, language: str) -> list[str]:
+    """Give what stands in a page in fences of a language."""
+    return [body for found, body in _FENCE.findall(page.read_text(encoding="utf-8")) if found == language]
+
+
+def commands(page: Path, *, quoted: bool = False) -> list[str]:
+    """Give the command lines of a page without their comments; those in running text too, if they are to be `quoted`."""
+    prose = _FENCE.sub("", page.read_text(encoding="utf-8"))
+    lines = [*_TYPED.findall(prose), *(_QUOTED.findall(prose) if quoted else [])]
+    return [re.split(r"\s+#", " ".join(line.split()))[0] for line in lines]
+
+
+def words(command: str) -> list[str]:
+    """Give the words of a command after `splatjax`, without where its output is led to."""
+    typed = shlex.split(command)[1:]
+    return typed[: typed.index(">")] if ">" in typed else typed
+
+
+def named_files(page: Path) -> dict[str, str]:
+    """Give the files that a page says to write: fences that begin with their name, `# name.toml`."""
+    found = {}
+    for body in fences(page, "toml"):
+        first = re.match(r"# (\S+\.toml)\n", body)
+        if first:
+            found[first[1]] = body
+    return found
+
+
+def programs(page: Path) -> list[str]:
+    """Give the Python of a page, fence by fence."""
+    return fences(page, "python")

@@ -1,0 +1,91 @@
+"""Every command of README and docs is understood; what the command line can run on small stand-ins is run."""
+
+import contextlib
+import os
+import re
+import shlex
+
+import pytest
+import tyro
+from pages import PAGES, ROOT, commands, name, named_files, words
+from stand_ins import lay_out
+
+from splatjax.cli import main
+from splatjax.cli._main import _Command
+
+SMALL = {
+    "render": ["--width", "32", "--height", "32"],
+    "turntable": ["--width", "32", "--height", "32", "--frames", "2"],
+    "sample": ["--count", "1500"],
+    "figure": ["--width", "40"],
+    "recover": ["--count", "3", "--no-suggest"],
+}
+"""Options that make a command quick; the last one given counts."""
+
+NOT_RUN = {
+    "make": "sets up an environment, runs this suite or takes long; that there is such a target is tested",
+    "python": "benchmarks and tools take minutes or hours; that there is such a module with such options is tested",
+}
+
+typed = [
+    pytest.param(command, id=f"{name(page)}-{number}")
+    for page in PAGES
+    for number, command in enumerate(commands(page))
+    if command.startswith("splatjax")
+]
+others = sorted({command for page in PAGES for command in commands(page, quoted=True) if command.split()[0] in NOT_RUN})
+
+
+@pytest.mark.parametrize("command", typed)
+def test_the_command_line_understands(command):
+    given = words(command)
+    said = "--help" in given or "--tyro-print-completion" in given
+    with pytest.raises(SystemExit) if said else contextlib.nullcontext() as stopped:
+        tyro.cli(_Command, prog="splatjax", args=given)
+    assert stopped is None or not stopped.value.code
+
+
+@pytest.mark.parametrize("command", [command for command in others if command.startswith("make")])
+def test_make_has_such_a_target(command):
+    targets = set(re.findall(r"^([a-z][\w-]*):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
+    asked = [word for word in shlex.split(command)[1:] if not word.startswith("-") and "=" not in word]
+    assert set(asked) <= targets
+
+
+@pytest.mark.parametrize("command", [command for command in others if command.startswith("python")])
+def test_there_is_such_a_module_with_such_options(command):
+    first, *rest = shlex.split(command)[1:]
+    if first == "-c" or rest[:1] == ["pytest"]:
+        places = [ROOT / word for word in rest if "/" in word]
+        assert all(place.exists() for place in places)
+        return
+    path = ROOT / (rest.pop(0).replace(".", "/") if first == "-m" else first)
+    path = path / "__main__.py" if path.is_dir() else path.with_suffix(".py")
+    source = path.read_text(encoding="utf-8")
+    assert [word for word in rest if word.startswith("--") and f'"{word}"' not in source] == []
+
+
+@pytest.mark.long
+@pytest.mark.once
+@pytest.mark.parametrize(
+    "page", [pytest.param(page, id=name(page)) for page in PAGES if any(c.startswith("splatjax") for c in commands(page))]
+)
+def test_the_commands_of_a_page_run_one_after_the_other(page, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    lay_out(tmp_path, page.read_text(encoding="utf-8"))
+    for file, text in named_files(page).items():
+        (tmp_path / file).write_text(text, encoding="utf-8")
+    for command in commands(page):
+        given = words(command)
+        if not command.startswith("splatjax") or given[0].startswith("-") or "--help" in given:
+            continue
+        small = SMALL.get(given[0], [])
+        if given[0] in ("render", "turntable", "figure") and not any(word.endswith(".ply") for word in given):
+            small = [*small, "--count", "1500"]
+        if "--photons" in given or "monte-carlo" in given:
+            small = [*small, "--photons", "20000"]
+        before = set(os.listdir())
+        assert main([*given, *small]) == 0, command
+        output = given[given.index("--output") + 1] if "--output" in given else None
+        assert output is None or output in os.listdir(), command
+        assert output is not None or given[0] == "materials" or set(os.listdir()) > before
