@@ -1,13 +1,17 @@
 """Splats from points that lack normals, radii or areas."""
 
+import warnings
+
 import numpy as np
 from jaxtyping import Float
 
 from splatjax.scene import Splats
 
+from ._distinct import distinct
 from ._morton import morton_order
 from ._normals import estimate_normals
 from ._sample import covering, make_splats
+from ._strays import strays
 
 
 def complete_splats(
@@ -29,10 +33,13 @@ def complete_splats(
     - `areas`: mm^2; `None`: those of the Voronoi cells in the tangent planes.
     - `radii`: mm; `None`: as large as the cells ask for, so that no hole is left.
 
-    **Raises:** `ValueError` when something must be estimated and there are fewer than four points.
+    Points that lie alone are kept, estimated as large as their neighbours are, and a warning tells how many there are. Points at
+    one place share their area.
+
+    **Raises:** `ValueError` when something must be estimated and there are fewer than four points at different places.
     """
-    count = len(centers)
-    if count < 4 and (normals is None or areas is None or radii is None):
+    estimated = normals is None or areas is None or radii is None
+    if estimated and (count := len(distinct(centers)[0])) < 4:
         raise ValueError(f"{count} points are too few to estimate normals, radii and areas from; give at least 4, or all three")
     order = morton_order(centers.astype(np.float32))
     centers = centers[order]
@@ -42,7 +49,23 @@ def complete_splats(
     if normals is None:
         normals = estimate_normals(centers)
     if radii is None or areas is None:
-        cell_areas, cell_radii = covering(centers, normals)
+        cell_areas, cell_radii = _covered(centers, normals)
         areas = cell_areas if areas is None else areas
         radii = cell_radii if radii is None else radii
     return make_splats(centers, normals, radii, areas, albedo, specular, roughness)
+
+
+def _covered(centers: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Give areas and radii; those of points that lie alone are their neighbours', lest their discs hide everything."""
+    first, place = distinct(centers)
+    places = centers[first]
+    areas, radii = covering(places, normals[first])
+    alone, near, distances = strays(places)
+    if alone.any():
+        areas[alone], radii[alone] = (np.median(each[near[alone]], axis=1) for each in (areas, radii))
+        warnings.warn(
+            f"{alone.sum()} of {len(centers)} points lie alone, one of them {distances[alone].max():.3g} mm from its neighbours;"
+            " they are kept, as specks as large as those: remove them if they are noise of a scanner",
+            stacklevel=3,
+        )
+    return (areas / np.bincount(place))[place], radii[place]

@@ -49,3 +49,95 @@ def test_given_fields_are_kept():
 def test_too_few_points_are_refused():
     with pytest.raises(ValueError, match="3 points are too few"):
         complete_splats(np.eye(3))
+
+
+def plane(count=900, spacing=1.0, seed=0):
+    """Points of a jittered square grid at height zero."""
+    side = round(count**0.5)
+    grid = spacing * np.stack(np.meshgrid(np.arange(side), np.arange(side)), axis=-1).reshape(-1, 2)
+    grid = grid + np.random.default_rng(seed).uniform(-0.3, 0.3, grid.shape) * spacing
+    return np.concatenate([grid, np.zeros((len(grid), 1))], axis=1)
+
+
+@pytest.mark.parametrize("gap", [1.6, 2.5])
+def test_two_sheets_close_together_are_not_mixed(gap):
+    """A slab little thicker than its points are apart: each side has its own normals, and they face away from each other."""
+    sheet = plane()
+    points = np.concatenate([sheet, sheet + np.asarray([0.4, 0.3, gap])])
+    normals = estimate_normals(points)
+    inner = (np.abs(points[:, :2] - 14.5) < 11).all(axis=1)
+    np.testing.assert_allclose(np.abs(normals[inner, 2]), 1, atol=1 - np.cos(np.radians(15)))
+    above = points[:, 2] > 0
+    assert (np.sign(normals[inner & above, 2]) == 1).all()
+    assert (np.sign(normals[inner & ~above, 2]) == -1).all()
+
+
+def test_an_open_surface_faces_one_way():
+    """A dome, seen from both sides: away from its middle."""
+    points = plane(1600)
+    points[:, 2] = 40 - 0.02 * ((points[:, :2] - 19.5) ** 2).sum(axis=1)
+    normals = estimate_normals(points)
+    assert (normals[:, 2] > 0).all() or (normals[:, 2] < 0).all()
+
+
+def test_what_lies_deep_within_follows_what_is_seen():
+    """A cup with a rim: the bottom of its inside is seen through its mouth alone."""
+    random = np.random.default_rng(0)
+    turn = random.uniform(0, 2 * np.pi, 20_000)
+    around, flat = np.stack([np.cos(turn), np.sin(turn)], axis=1), np.zeros((20_000, 1))
+    share = random.uniform(size=(20_000, 1))
+    outward = np.concatenate([around, flat], axis=1)
+    up = np.asarray([0.0, 0.0, 1.0])
+    parts = [
+        (9_400, lambda u: (10 * around, 30 * u), outward),
+        (5_100, lambda u: (6 * around, 3 + 27 * u), -outward),
+        (1_600, lambda u: (10 * np.sqrt(u) * around, 0 * u), -up),
+        (600, lambda u: (6 * np.sqrt(u) * around, 3 + 0 * u), up),
+        (1_000, lambda u: (np.sqrt(36 + 64 * u) * around, 30 + 0 * u), up),
+    ]
+    points = np.concatenate([np.concatenate(place(share), axis=1)[:count] for count, place, _ in parts])
+    expected = np.concatenate([np.broadcast_to(normal, (20_000, 3))[:count] for count, _, normal in parts])
+    agreement = np.einsum("ni,ni->n", estimate_normals(points), expected)
+    assert (agreement > 0).mean() > 0.99
+
+
+def test_a_hollow_within_a_body_faces_its_middle():
+    """A shell around a shell: nothing sees the inner one, and a body within a body there is none."""
+    random = np.random.default_rng(1)
+    ways = random.normal(size=(8_000, 3))
+    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+    outer = np.arange(8_000) < 6_000
+    agreement = np.einsum("ni,ni->n", estimate_normals(np.where(outer, 20.0, 11.0)[:, None] * ways), ways)
+    assert (agreement[outer] > 0).all()
+    assert (agreement[~outer] < 0).all()
+
+
+def test_points_at_one_place_share_its_area_and_its_normal():
+    """Ten scans of one sheet, each point in its place: more than there are neighbours to look at."""
+    sheet = plane(400)
+    once, often = complete_splats(sheet), complete_splats(np.concatenate([sheet] * 20))
+    np.testing.assert_allclose(float(often.areas.sum()), float(once.areas.sum()), rtol=1e-5)
+    np.testing.assert_allclose(float(often.radii.max()), float(once.radii.max()), rtol=1e-5)
+    np.testing.assert_allclose(np.abs(np.asarray(often.normals)[:, 2]), 1, atol=1e-6)
+    with pytest.raises(ValueError, match="3 points are too few"):
+        complete_splats(np.concatenate([np.eye(3)] * 4))
+
+
+def test_points_alone_are_told_and_stay_small():
+    sheet = plane(900)
+    dense = np.concatenate([sheet, 0.1 * plane(900, seed=1) + [40, 0, 0]])
+    complete_splats(dense)  # where all are sparse none is alone
+    with pytest.warns(UserWarning, match=r"2 of 902 points lie alone, one of them .* mm from its neighbours"):
+        splats = complete_splats(np.concatenate([sheet, [[15, 15, 20.0], [90, 0, 0]]]))
+    assert splats.count == 902
+    assert float(splats.radii.max()) < 3
+
+
+def test_radii_follow_the_density():
+    """Ten times as dense on one side: discs close the surface there and here, and none reaches far."""
+    coarse, fine = plane(900), plane(9000, spacing=0.1)
+    points = np.concatenate([coarse, fine[:9000] - [9.7, 0, 0]])
+    splats = complete_splats(points)
+    left = np.asarray(splats.centers)[:, 0] < -1
+    radii = np.asarray(splats.radii)
+    np.testing.assert_allclose(np.median(radii[~left]) / np.median(radii[left]), 10, rtol=0.1)
