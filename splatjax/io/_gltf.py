@@ -14,15 +14,16 @@ import numpy as np
 from ._files import file_beside
 from ._library import readable
 from ._pictures import read_color
-from ._pieces import Piece, check_places, moderate
+from ._pieces import Piece, Wrap, check_places, moderate
 from ._room import check_room
 
 _KNOWN = {"KHR_mesh_quantization", "KHR_texture_transform", "EXT_texture_webp", "KHR_lights_punctual"}
 _COUNTS = {"count", "byteOffset", "byteLength", "byteStride", "bufferView", "buffer", "mesh", "scene", "indices", "material"}
-_COUNTS |= {"index", "source", "texCoord", "children", "nodes", "attributes", "mode"}
+_COUNTS |= {"index", "sampler", "source", "texCoord", "children", "nodes", "attributes", "mode"}
 _WIDTHS = {"_PLACE": (3,), "_NORMAL": (3,), "_COLOR": (3, 4), "_UV": (2,)}
 _WHOLE = {5121, 5123, 5125}
 _TRIANGLES, _STRIP, _FAN = _SURFACES = 4, 5, 6
+_WRAPS: dict[int, Wrap] = {10497: "wrap", 33071: "edge", 33648: "symmetric"}
 _BYTES_PER_CORNER = 300.0  # of a mesh, on its way from the file to splats
 _BYTES_PER_ZERO = 80.0  # of a sparse accessor
 
@@ -250,7 +251,18 @@ def _dress(
     laid = surface["baseColorTexture"]
     lay = laid.get("extensions", {}).get("KHR_texture_transform", {})
     texture = partial(_texture, path, content, buffers, laid["index"])
-    return f"TEXCOORD_{lay.get('texCoord', laid.get('texCoord', 0))}", lay, {"color": color[:3], "texture": texture}
+    dress = {"color": color[:3], "texture": texture, "wraps": _wraps(content, laid["index"])}
+    return f"TEXCOORD_{lay.get('texCoord', laid.get('texCoord', 0))}", lay, dress
+
+
+def _wraps(content: dict[str, Any], index: int) -> tuple[Wrap, Wrap]:
+    """Give how a texture goes on beyond its borders, along u and v."""
+    number = content["textures"][index].get("sampler")
+    sampler = {} if number is None else content["samplers"][number]
+    along_u, along_v = (_WRAPS.get(sampler.get(name, 10497)) for name in ("wrapS", "wrapT"))
+    if along_u is None or along_v is None:
+        raise ValueError(f"its textures are wrapped by {sampler.get('wrapS')!r} and {sampler.get('wrapT')!r}, which is unknown")
+    return along_u, along_v
 
 
 def _laid(uvs: np.ndarray, lay: dict[str, Any]) -> np.ndarray:

@@ -17,6 +17,7 @@ from ._pieces import Piece, join_pieces, own_albedo
 from ._ply_mesh import read_ply_mesh
 from ._room import check_room
 from ._solids import read_off, read_stl
+from ._tiles import tiled
 
 _READERS: dict[str, Callable[[Path], list[Piece]]] = {
     ".glb": read_gltf,
@@ -118,5 +119,8 @@ def read_mesh(path: Name, *, mm_per_unit: float, v_up: bool | None = None, dress
         raise ValueError(f"{path}: {kind or 'no suffix'} is no mesh format known here; give one of {', '.join(_READERS)}")
     pieces = _READERS[kind](path)
     prescribed = kind not in (".glb", ".gltf")
-    mesh = join_pieces(path, pieces, mm_per_unit, upside_down=v_up is not None and v_up != prescribed)
+    upside_down = v_up is not None and v_up != prescribed
+    if dressed:
+        pieces = [tiled(path, piece, upside_down=upside_down) for piece in pieces]
+    mesh = join_pieces(path, pieces, mm_per_unit, upside_down=upside_down)
     return mesh, own_albedo(pieces) if dressed else Textures()

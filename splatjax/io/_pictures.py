@@ -1,19 +1,21 @@
 """Maps: JPEG, PNG, TIFF and others, of 8 or 16 bits."""
 
 import os
+import sys
 import warnings
 from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
-from PIL import Image
+from PIL import Image, ImageFile
 
 from ._color import srgb_to_linear
 from ._files import existing_file
 from ._room import check_room
 
 _BYTES_PER_PIXEL = 80.0  # of three channels in double precision, while they are decoded
+_GRAY = (0.299, 0.587, 0.114)  # Pillow's
 
 
 def read_color(path: str | os.PathLike[str], encoded: bytes | None = None) -> Float[np.ndarray, "height width 3"]:
@@ -33,14 +35,22 @@ def read_factor(path: str | os.PathLike[str]) -> Float[np.ndarray, "height width
 
 def _read(path: str | os.PathLike[str], mode: str, encoded: bytes | None = None) -> Float[np.ndarray, "..."]:
     path = existing_file(path)
+
+    def opened() -> ImageFile.ImageFile:
+        return Image.open(path if encoded is None else BytesIO(encoded))
+
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of large pictures, for which there is room or not
-            with Image.open(path if encoded is None else BytesIO(encoded)) as picture:
+            with opened() as picture:
                 width, height = picture.size
                 size = f"a picture of {width} x {height} pixels"
                 check_room(f"{path}: {size}", _BYTES_PER_PIXEL * width * height, "give a smaller one")
-                return _values(picture, mode)
+                if not _of_16_bits(picture):
+                    return _values(picture, mode)
+                with opened() as again:
+                    values = _deep_values(picture, again)
+                    return values if mode == "RGB" else values @ np.asarray(_GRAY)
     except ValueError as error:
         raise error if str(error).startswith(f"{path}: ") else _unreadable(path, error) from None
     except Exception as error:  # each decoder of Pillow fails in its own way
@@ -59,3 +69,23 @@ def _values(picture: Image.Image, mode: str) -> Float[np.ndarray, "..."]:
         gray = np.asarray(picture, np.float64) / 65535
         return gray if mode == "L" else np.repeat(gray[..., None], 3, axis=-1)
     return np.asarray(picture.convert(mode), np.float64) / 255
+
+
+def _of_16_bits(picture: ImageFile.ImageFile) -> bool:
+    """Whether Pillow would pass over the lower half of a picture's 16 bits, as it does where there are several channels."""
+    return not picture.mode.startswith("I") and any(";16" in _raw_mode(tile.args) for tile in picture.tile)
+
+
+def _deep_values(picture: ImageFile.ImageFile, again: ImageFile.ImageFile) -> Float[np.ndarray, "height width 3"]:
+    """Read a picture of 16 bits twice: the upper bytes, and the lower ones as if they were upper ones in the other order."""
+    swapped = {"B": "L", "L": "B", "N": "B" if sys.byteorder == "little" else "L"}
+    for i, tile in enumerate(again.tile):
+        raw = _raw_mode(tile.args)
+        other = raw[:-1] + swapped[raw[-1]]
+        again.tile[i] = tile._replace(args=(other, *tile.args[1:]) if isinstance(tile.args, tuple) else other)
+    upper, lower = (np.asarray(each.convert("RGB"), np.float64) for each in (picture, again))
+    return (256 * upper + lower) / 65535
+
+
+def _raw_mode(arguments: object) -> str:
+    return str(arguments[0] if isinstance(arguments, tuple) and arguments else arguments)

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -12,6 +12,8 @@ from splatjax.geometry import Mesh, Textures, unit, vertex_normals
 _FARTHEST = 1e12  # beyond, areas overflow
 _MOST_TILES = 1e6  # that a texture is repeated
 Picture = Float[np.ndarray, "height width 3"]
+Wrap = Literal["wrap", "edge", "symmetric"]
+"""How a texture goes on beyond its border: as `numpy.pad` calls it."""
 
 
 class Piece(NamedTuple):
@@ -19,7 +21,7 @@ class Piece(NamedTuple):
 
     `normals` may be of any length; those of length zero, and all if there are none, are made of the triangles. `uvs` have v up.
     `colors` of vertices and the material's own `color` are linear and are multiplied with the texture, which is read when it is
-    called for.
+    called for; `wraps` says how it goes on along u and v.
     """
 
     vertices: Float[np.ndarray, "vertices 3"]
@@ -29,6 +31,7 @@ class Piece(NamedTuple):
     colors: Float[np.ndarray, "vertices 3"] | None = None
     texture: Callable[[], Picture] | None = None
     color: tuple[float, ...] = (1.0, 1.0, 1.0)
+    wraps: tuple[Wrap, Wrap] = ("wrap", "wrap")
 
 
 def join_pieces(path: Path, pieces: Sequence[Piece], mm_per_unit: float, *, upside_down: bool) -> Mesh:
