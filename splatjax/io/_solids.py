@@ -1,12 +1,15 @@
-"""Meshes from STL and OFF files, which hold triangles and nothing else."""
+"""Meshes from STL and OFF files, which hold little but triangles."""
 
 from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 
+from ._color import srgb_to_linear
 from ._library import check_fans, fan, merged, readable
 from ._pieces import Piece, check_places
+
+_OFF = ("OFF", "NOFF", "COFF", "CNOFF")
 
 
 def read_stl(path: Path) -> list[Piece]:
@@ -39,7 +42,9 @@ def read_stl(path: Path) -> list[Piece]:
 
 
 def read_off(path: Path) -> list[Piece]:
-    """Read an OFF file of polygons; colors are left alone.
+    """Read an OFF file of polygons, with normals and colors of its vertices where it begins with NOFF, COFF or CNOFF.
+
+    Whole numbers are sRGB up to 255, others linear; colors of faces are left alone.
 
     trimesh reads it, given faces as triangles, for it passes over faces of less than three corners and does not look whether a
     line holds as many as it says.
@@ -48,8 +53,9 @@ def read_off(path: Path) -> list[Piece]:
     """
     lines = [line.split("#", 1)[0].split() for line in path.read_bytes().decode("latin-1").splitlines()]
     rows = [words for words in lines if words]
-    if not rows or rows[0][0] != "OFF":
-        raise ValueError(f"{path}: does not begin with `OFF`; give a plain OFF file")
+    if not rows or rows[0][0] not in _OFF:
+        raise ValueError(f"{path}: does not begin with `OFF`; give a plain OFF file, or one with {', '.join(_OFF[1:])}")
+    kind = rows[0][0]
     rows = [rows[0][1:], *rows[1:]] if len(rows[0]) > 1 else rows[1:]
     if not rows or len(rows[0]) < 2 or not all(word.isdecimal() and len(word) < 16 for word in rows[0][:2]):
         raise ValueError(f"{path}: says no counts of vertices and faces; write it again")
@@ -65,7 +71,9 @@ def read_off(path: Path) -> list[Piece]:
             raise ValueError(f"{path}: the face `{' '.join(row)[:60]}` has no three corners or more among {count} vertices")
         triangles += [f"3 {a} {b} {c}" for a, b, c in fan(row[1 : 1 + size])]
         counts.append(size - 2)
-    plain = ["OFF", f"{count} {len(triangles)} 0", *(" ".join(row) for row in rows[1 : 1 + count]), *triangles]
+    normals, colors = _off_columns(path, kind, rows[1 : 1 + count])
+    places = [row if kind == "OFF" else row[:3] for row in rows[1 : 1 + count]]
+    plain = ["OFF", f"{count} {len(triangles)} 0", *(" ".join(row) for row in places), *triangles]
     with readable(path, "OFF"):
         from trimesh.exchange.off import load_off  # takes a second, so only where a mesh is read
 
@@ -73,4 +81,24 @@ def read_off(path: Path) -> list[Piece]:
     vertices = np.asarray(found["vertices"], np.float64)
     check_places(path, vertices)
     check_fans(path, vertices[found["faces"]], np.asarray(counts, np.int64))
-    return [Piece(vertices, found["faces"])]
+    return [Piece(vertices, found["faces"], normals, None, colors)]
+
+
+def _off_columns(path: Path, kind: str, rows: list[list[str]]) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """Give normals and linear colors of vertices, as far as the kind of file has them."""
+    first = 6 if "N" in kind else 3  # of the colors' columns
+    widths = {first + 3, first + 4} if "C" in kind else {first}
+    if kind == "OFF":
+        return None, None
+    if len({len(row) for row in rows}) != 1 or len(rows[0]) not in widths:
+        raise ValueError(f"{path}: its vertices have not all the {min(widths)} numbers of {kind}; write it again")
+    words = [row[3:] for row in rows]
+    with readable(path, "OFF"):
+        values = np.asarray(words, np.float64)
+    normals, colors = values[:, : first - 3], values[:, first - 3 : first]
+    whole = all(word.isdecimal() for row in words for word in row[first - 3 : first])
+    if not (colors >= 0).all() or not (colors <= (255 if whole else 1)).all():
+        raise ValueError(
+            f"{path}: has colors of vertices that reach {colors.max():g}; write whole numbers up to 255, or up to 1.0"
+        )
+    return normals if "N" in kind else None, None if "C" not in kind else srgb_to_linear(colors / 255) if whole else colors
