@@ -1,8 +1,8 @@
 """Normals of raw points."""
 
 import numpy as np
+import scipy  # its parts are loaded where they are used, which takes a third of a second
 from jaxtyping import Float
-from scipy.spatial import KDTree
 
 from ._distinct import distinct
 from ._morton import morton_order
@@ -31,7 +31,7 @@ def estimate_normals(points: Float[np.ndarray, "n 3"], *, neighbors: int = 12) -
     along = morton_order(points[first].astype(np.float32))
     places = points[first[along]]
     neighbors = min(neighbors, len(places) - 1)
-    distances, near = KDTree(places).query(places, k=neighbors + 1, workers=-1)
+    distances, near = scipy.spatial.KDTree(places).query(places, k=neighbors + 1, workers=-1)
     normals = np.empty(places.shape)
     for start in range(0, len(places), _CHUNK):
         part = slice(start, start + _CHUNK)

@@ -1,10 +1,8 @@
 """Which side of a surface is outside, where only points and their planes are known."""
 
 import numpy as np
+import scipy  # its parts are loaded where they are used, which takes a third of a second
 from jaxtyping import Float, Int
-from scipy.ndimage import maximum_filter
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 
 from ._hollows import turn_cavities
 
@@ -80,7 +78,7 @@ def _votes(points: np.ndarray, normals: np.ndarray, pixel: float) -> tuple[Signs
         place = rows * width + columns
         nearest = np.full((rows.max() + 1, width), -np.inf, np.float32)
         np.maximum.at(nearest.reshape(-1), place, towards)
-        nearest = maximum_filter(nearest, 3, mode="nearest").reshape(-1)
+        nearest = scipy.ndimage.maximum_filter(nearest, 3, mode="nearest").reshape(-1)
         cosine = np.where(towards >= nearest[place] - pixel, facing @ frame[2], 0)
         votes += cosine * np.abs(cosine)
         cast += cosine * cosine
@@ -106,13 +104,15 @@ def _carried(
     low, high = key // count, key % count
     agreement = _agreement(points, normals, low, high)
     cost = 1.001 - np.minimum(np.abs(agreement), 1.0)
-    graph = coo_array((cost, (low, high)), shape=(count + 1, count + 1))
-    farthest, outward = _farthest(points, connected_components(graph, directed=False)[1][:count], sure)
+    graph = scipy.sparse.coo_array((cost, (low, high)), shape=(count + 1, count + 1))
+    farthest, outward = _farthest(points, scipy.sparse.csgraph.connected_components(graph, directed=False)[1][:count], sure)
     signs[farthest] = np.where(np.einsum("ni,ni->n", normals[farthest], outward) < 0, -1.0, 1.0)
     roots = np.concatenate([sure, farthest])
     row, column = np.concatenate([low, roots]), np.concatenate([high, np.full(len(roots), count)])
-    joined = coo_array((np.concatenate([cost, np.full(len(roots), _ROOT)]), (row, column)), shape=graph.shape)
-    ahead = breadth_first_order(minimum_spanning_tree(joined.tocsr()), count, directed=False)[1]
+    joined = scipy.sparse.coo_array((np.concatenate([cost, np.full(len(roots), _ROOT)]), (row, column)), shape=graph.shape)
+    ahead = scipy.sparse.csgraph.breadth_first_order(
+        scipy.sparse.csgraph.minimum_spanning_tree(joined.tocsr()), count, directed=False
+    )[1]
     ahead[count] = count
     inner = np.flatnonzero(ahead[:count] < count)
     signs[inner] = np.where(_agreement(points, normals, inner, ahead[inner]) < 0, -1.0, 1.0)
@@ -124,7 +124,9 @@ def _carried(
     free = np.ones(count, bool)
     free[sure] = False
     smooth = (agreement * signs[low] * signs[high] > _SMOOTH) & free[low] & free[high]
-    parts = connected_components(coo_array((cost[smooth], (low[smooth], high[smooth])), shape=(count, count)), directed=False)[1]
+    parts = scipy.sparse.csgraph.connected_components(
+        scipy.sparse.coo_array((cost[smooth], (low[smooth], high[smooth])), shape=(count, count)), directed=False
+    )[1]
     order = np.argsort(parts, kind="stable")
     patches = np.split(order, np.flatnonzero(np.diff(parts[order])) + 1)
     return signs, [patch for patch in patches if len(patch) >= _LEAST_PATCH]

@@ -1,8 +1,8 @@
 """Points that belong to no surface."""
 
 import numpy as np
+import scipy  # its parts are loaded where they are used, which takes a third of a second
 from jaxtyping import Bool, Float, Int
-from scipy.spatial import KDTree
 
 _NEIGHBORS = 8
 _ALONE = 5.0  # times farther from its neighbours than they are from theirs
@@ -17,7 +17,7 @@ def strays(points: Float[np.ndarray, "n 3"]) -> tuple[Bool[np.ndarray, " n"], In
 
     **Source:** after Breunig et al. 2000, "LOF: Identifying Density-Based Local Outliers", medians in the place of means.
     """
-    distances, near = KDTree(points).query(points, k=min(_NEIGHBORS, len(points) - 1) + 1, workers=-1)
+    distances, near = scipy.spatial.KDTree(points).query(points, k=min(_NEIGHBORS, len(points) - 1) + 1, workers=-1)
     mean, near = distances[:, 1:].mean(axis=1), near[:, 1:]
     wanted = np.bincount(near.ravel(), minlength=len(points)) > 0
     return (mean > _ALONE * np.median(mean[near], axis=1)) & ~wanted, near, mean
