@@ -98,19 +98,22 @@ def next_pictures(
         bright = float(jnp.sqrt(jnp.mean(seen.radiance**2)))
         deviations = noise * (bright or 1.0) / float(problem.deviation[0, 0])
         told = np.asarray(seen.information, float) / max(deviations, np.finfo(float).tiny) ** 2
-        own = 2 * len(medium.eta)
-        found.append(Prediction(candidate, recovery.covariance(_marginal(told, own, before))))
+        channels = len(medium.eta)
+        found.append(Prediction(candidate, recovery.covariance(_marginal(told, 2 * channels, channels, before))))
     return sorted(found, key=lambda each: each.worst.deviation)
 
 
-def _marginal(information: np.ndarray, own: int, size: int) -> np.ndarray:
-    """Give what is told of the first unknowns, whatever the picture's own are; with room for those of other pictures."""
-    rest = information[own:, own:]
-    told = information[:own, :own]
-    if rest.size:
-        told = told - information[:own, own:] @ np.linalg.pinv(rest) @ information[own:, :own]
+def _marginal(information: np.ndarray, own: int, channels: int, size: int) -> np.ndarray:
+    """Give what is told of coefficients and handover, whatever the picture's own factors are; with room for those of others."""
+    kept = np.r_[:own, len(information) - channels : len(information)]
+    factors = np.arange(own, len(information) - channels)
+    told = information[np.ix_(kept, kept)]
+    if factors.size:
+        mixed = information[np.ix_(kept, factors)]
+        told = told - mixed @ np.linalg.pinv(information[np.ix_(factors, factors)]) @ mixed.T
+    there = np.r_[:own, size - channels : size]
     whole = np.zeros((size, size))
-    whole[:own, :own] = told
+    whole[np.ix_(there, there)] = told
     return whole
 
 

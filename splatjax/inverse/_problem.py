@@ -99,6 +99,17 @@ class Problem(eqx.Module):
         """Give what the loss has as its square."""
         return self.loss.root((self.radiance(point) - self.observed) / self.deviation)
 
+    def handover_slopes(self, point: Float[Array, " unknowns"]) -> Float[Array, "channels pixels"]:
+        """Differentiate the residuals in the logarithm of the widths below which the renderer hands layers to the surface."""
+
+        def moved(by: Float[Array, ""]) -> Float[Array, "channels pixels"]:
+            return eqx.tree_at(lambda its: its.pictures.light.interval, self, replace_fn=lambda at: at * jnp.exp(by)).residuals(
+                point
+            )
+
+        zero = jnp.zeros((), point.dtype)
+        return jax.jvp(moved, (zero,), (zero + 1,))[1]
+
 
 class Found(eqx.Module):
     """Where a search ended."""
@@ -131,12 +142,13 @@ class Solution(eqx.Module):
 
     **Attributes:**
 
-    - `information`: the inverse of the covariance that noise of the given deviations leaves (Laplace, by Gauss and Newton).
+    - `information`: the inverse of the covariance that noise of the given deviations leaves (Laplace, by Gauss and Newton); after
+      the unknowns come, channel by channel, the logarithms of the widths below which layers are handed to the surface.
     - `gaussians`, `radiance`: of the point.
     - `unresolved`: the share of the light of each channel in layers that the splats do not carry.
     """
 
-    information: Float[Array, "unknowns unknowns"]
+    information: Float[Array, "all all"]
     gaussians: SumOfGaussians
     radiance: Float[Array, "channels pixels"]
     unresolved: Float[Array, " channels"]
@@ -149,5 +161,7 @@ def solution(problem: Problem, point: Float[Array, " unknowns"]) -> Solution:
         return problem.residuals(point), (gaussians, radiance)
 
     slopes, (gaussians, radiance) = jax.jacfwd(residuals, has_aux=True)(point)
+    handover = problem.handover_slopes(point)[..., None] * jnp.eye(slopes.shape[0], dtype=slopes.dtype)[:, None]
+    slopes = jnp.concatenate([slopes, handover], axis=-1)
     unresolved = (1 - problem.pictures.light.resolved()) @ gaussians.weights / gaussians.total_reflectance()
     return Solution(jnp.einsum("cpi,cpj->ij", slopes, slopes), gaussians, radiance, unresolved)

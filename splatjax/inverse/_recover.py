@@ -113,7 +113,8 @@ def recover(
         reached = solution(problem, best.point)
         chi_squared = best.cost / max(problem.observed.size - best.point.size, 1)
         scale = 1.0 if evidence.noise_is_known else float(chi_squared)
-        deviations = np.sqrt(np.diagonal(inverse(np.asarray(reached.information, np.float64)) * scale))
+        told = np.asarray(reached.information, np.float64)[: best.point.size, : best.point.size]
+        deviations = np.sqrt(np.diagonal(inverse(told) * scale))
         settled = bool(best.converged) and bool(np.all(np.abs(best.point - before) <= np.maximum(_SETTLED, 0.1 * deviations)))
     pictures = evidence.shown(np.asarray(reached.radiance), numbers)
     recovery = Recovery(

@@ -1,5 +1,6 @@
 """What was recovered, and how well it is known."""
 
+import math
 from collections.abc import Sequence
 
 import equinox as eqx
@@ -12,6 +13,9 @@ from splatjax.scene import Material
 
 _FIXED = 0.1
 """A combination that is known no better than this, as a relative error, counts as not fixed."""
+_HANDOVER = math.log(2.0)
+"""How well the width is known, as a logarithm, below which layers are handed to the surface: those of regular and of scattered
+splats lie a factor of 2.5 apart, and a splat itself blurs what it carries."""
 
 
 class Combination(eqx.Module):
@@ -41,9 +45,10 @@ class Recovery(eqx.Module):
     - `material`: its Gaussians, and the surface that was taken as known.
     - `intensities`: factors on the light of each picture that were found; 1 where it was known.
     - `information`: inverse of the covariance that the given noise leaves: of the logarithms of `sigma_a`, channel by channel, of
-      those of `sigma_s_prime`, and of the factors that were to be found.
+      those of `sigma_s_prime`, of the factors that were to be found, and, channel by channel, of the width below which a layer is
+      handed to the surface, because the splats are too far apart to carry it.
     - `unresolved`: the share of the light of each channel that spreads less than the splats are apart. A picture shows how much
-      of it there is, not how far it goes; error bars do not know that.
+      of it there is, not how far it goes.
     - `chi_squared`: what the model leaves over, squared, over the noise, per degree of freedom. About 1 where model and noise are
       right; far above, the model lacks something, and error bars are too small.
     - `noise_is_known`: whether all pictures came with deviations; where not, error bars are those of what is left over. Static.
@@ -55,13 +60,14 @@ class Recovery(eqx.Module):
     - `result`: what became of it, as a message (`optimistix.RESULTS`).
 
     Error bars assume that model and shape are right and that the noise of pixels is independent: they are of precision, not of
-    truth.
+    truth. That a layer narrower than the splats looks as the renderer makes it look is not assumed: the width of that handover
+    counts as known to a factor of two, so that coefficients which nothing else tells are not known better.
     """
 
     medium: Medium
     material: Material
     intensities: Float[Array, "pictures channels"]
-    information: Float[Array, "unknowns unknowns"]
+    information: Float[Array, "all all"]
     unresolved: Float[Array, " channels"]
     chi_squared: Float[Array, ""]
     pictures: tuple[Float[np.ndarray, "_ _ channels"], ...]
@@ -79,22 +85,37 @@ class Recovery(eqx.Module):
         """What the covariance of the given noise is to be multiplied by."""
         return 1.0 if self.noise_is_known else float(self.chi_squared)
 
-    def covariance(self, more: Float[np.ndarray, "unknowns unknowns"] | None = None) -> Float[np.ndarray, "channels 2 2"]:
+    def covariance(self, more: Float[np.ndarray, "all all"] | None = None) -> Float[np.ndarray, "channels 2 2"]:
         """Give, for each channel, that of the logarithms of `sigma_a` and `sigma_s_prime`, whatever the other unknowns are.
 
         **Arguments:**
 
         - `more`: information that another picture would add.
         """
-        matrix = np.asarray(self.information, np.float64) / max(self.scale, np.finfo(np.float64).tiny)
-        whole = inverse(matrix if more is None else matrix + more)
+        matrix = self._told() if more is None else self._told() + more
+        channels = self.medium.eta.shape[0]
+        known = np.concatenate([np.zeros(len(matrix) - channels), np.full(channels, _HANDOVER**-2)])
+        return self._of_pairs(inverse(matrix + np.diag(known)))
+
+    def covariance_of_noise(self) -> Float[np.ndarray, "channels 2 2"]:
+        """Give the covariance as if the renderer were right about layers narrower than the splats: what noise alone leaves."""
+        unknowns = len(self.information) - self.medium.eta.shape[0]
+        return self._of_pairs(inverse(self._told()[:unknowns, :unknowns]))
+
+    def _told(self) -> Float[np.ndarray, "all all"]:
+        return np.asarray(self.information, np.float64) / max(self.scale, np.finfo(np.float64).tiny)
+
+    def _of_pairs(self, whole: Float[np.ndarray, "some some"]) -> Float[np.ndarray, "channels 2 2"]:
         channels = self.medium.eta.shape[0]
         return np.stack([whole[np.ix_([c, channels + c], [c, channels + c])] for c in range(channels)])
 
     def relative_errors(self) -> tuple[Float[np.ndarray, " channels"], Float[np.ndarray, " channels"]]:
         """Give the standard deviations of the logarithms of `sigma_a` and of `sigma_s_prime`."""
-        roots = np.sqrt(np.diagonal(self.covariance(), axis1=1, axis2=2))
-        return roots[:, 0], roots[:, 1]
+        return _roots(self.covariance())
+
+    def noise_errors(self) -> tuple[Float[np.ndarray, " channels"], Float[np.ndarray, " channels"]]:
+        """Give those of `covariance_of_noise`: how far a search would scatter if the picture were taken again."""
+        return _roots(self.covariance_of_noise())
 
     def combinations(self) -> list[tuple[Combination, Combination]]:
         """Give, for each channel, the combination of coefficients that is known best and the one that is known worst."""
@@ -128,7 +149,7 @@ class Recovery(eqx.Module):
             if unresolved > _MOST:
                 lines.append(
                     f"  {percent(unresolved)} of its light spreads less than the splats are apart: how far, they can hardly "
-                    "show, and the error bars are too small; take more splats, or a smaller piece"
+                    "show; take more splats, or a smaller piece from closer up"
                 )
         if not self.noise_is_known:
             lines.append("error bars are those of what the model leaves over, as if its pixels were independent")
@@ -156,6 +177,13 @@ def best_and_worst(covariance: Float[np.ndarray, "2 2"]) -> tuple[Combination, C
         axis = axis if axis[0] > 0.05 or axis[1] > 0.95 else -axis
         found.append(Combination((float(axis[0]), float(axis[1])), float(np.sqrt(max(value, 0.0)))))
     return found[0], found[1]
+
+
+def _roots(
+    covariances: Float[np.ndarray, "channels 2 2"],
+) -> tuple[Float[np.ndarray, " channels"], Float[np.ndarray, " channels"]]:
+    roots = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
+    return roots[:, 0], roots[:, 1]
 
 
 def inverse(information: Float[np.ndarray, "unknowns unknowns"]) -> Float[np.ndarray, "unknowns unknowns"]:

@@ -52,7 +52,7 @@ def search(monkeypatch):
             medium=medium,
             material=surface,
             intensities=jnp.ones((1, 3)),
-            information=jnp.diag(jnp.asarray([1e4, 1e4, 1e4, 1e4, 1e4, 1.0])),
+            information=jnp.diag(jnp.asarray([1e4, 1e4, 1e4, 1e4, 1e4, 1.0, 0.0, 0.0, 0.0])),
             unresolved=jnp.zeros(3),
             chi_squared=jnp.asarray(1.0),
             pictures=(seen + 0.01,),

@@ -232,15 +232,17 @@ def stand_in(monkeypatch, reach: float, spoiled: float = np.inf) -> list[float]:
     return made
 
 
-def lifted(target: float, settings, **more) -> tuple[sj.FittedScene, list[str]]:
+def lifted(target: float, settings, spoilt=(), **more) -> tuple[sj.FittedScene, list[str]]:
     """Fit a stand-in that starts at 0.5; settings tell stand-ins apart that are otherwise alike to the compiler.
 
-    A part of the picture is masked, and of another part nothing is known.
+    A part of the picture is masked, and of another part nothing is known; some rows may be spoilt.
     """
     splats, said = with_albedo(bodies.sphere(20), np.full((20, 2), 0.5)), []
     picture = np.full((SIZE, SIZE, 2), target)
+    picture[list(spoilt)] = 90.0
     picture[:5], picture[5, :, 1] = 90.0, np.nan
-    seen = sj.Observation(picture, camera(), (lights()[0],), mask=np.arange(SIZE)[:, None] > 4 * np.ones(SIZE))
+    mask, deviation = np.arange(SIZE)[:, None] > 4 * np.ones(SIZE), np.full(picture.shape, 0.01)
+    seen = sj.Observation(picture, camera(), (lights()[0],), mask=mask, deviation=deviation)
     optimizer = optax.adam(optax.cosine_decay_schedule(1.0, 40))
     parts = [sj.AlbedoMap(deviation=1e3)]
     found = sj.fit_scene(
@@ -258,6 +260,44 @@ def test_a_scene_that_outgrows_its_plan_is_planned_anew(monkeypatch):
     np.testing.assert_allclose(found.splats.albedo, 0.8, atol=5e-3)
     assert np.isnan(found.pictures[0][:6]).all()
     np.testing.assert_allclose(found.residuals[0][6:], 0, atol=5e-3)
+
+
+def test_a_robust_loss_is_not_misled_by_rows_that_shine(monkeypatch):
+    """Two rows of fourteen: where they pull with 2 b at most, each of the others gives way by less than a deviation."""
+    stand_in(monkeypatch, reach=np.inf)
+    settings = sj.RenderSettings(shadows=ShadowSettings(resolution=105))
+    found, _ = lifted(0.8, settings, spoilt=(8, 13), loss=sj.HuberLoss())
+    np.testing.assert_allclose(found.splats.albedo, 0.8, atol=0.01)
+    misled, _ = lifted(0.8, settings, spoilt=(8, 13))
+    assert float(jnp.min(misled.splats.albedo)) > 0.85
+
+
+@pytest.mark.slow
+@pytest.mark.long
+def test_a_camera_that_comes_closer_outgrows_its_plan_and_arrives():
+    """The renderer's own plan: the body fills four times the pixels that it filled at the start."""
+    far = sj.Camera.look_at(jnp.asarray([0.0, 0.0, 90.0]), jnp.zeros(3), fov=32.0, width=48, height=48)
+    near = eqx.tree_at(lambda c: c.position, far, jnp.asarray([0.0, 0.0, 45.0]))
+    splats, said = bodies.bumpy(600), []
+    scene = sj.Scene(splats, (lights()[0],), material())
+    seen = sj.Observation(np.asarray(sj.render(scene, near).beauty), far, (lights()[0],))
+    optimizer = optax.adam(optax.cosine_decay_schedule(2.0, 60), b2=0.9)
+    found = sj.fit_scene(
+        [seen],
+        splats,
+        material(),
+        [sj.CameraPoses(shift=1.0)],
+        optimizer,
+        steps=60,
+        background=sj.BlackBackground(),
+        progress=lambda what, loss: said.append(what),
+    )
+    assert found.plans > 1
+    assert sum("has outgrown its plan" in each for each in said) == found.plans - 1
+    assert np.all(np.isfinite(found.losses))
+    (camera,) = found.cameras
+    assert abs(float(camera.position[2]) - 45) < 2
+    assert np.all(np.isfinite(found.pictures[0]))
 
 
 def test_what_is_no_number_ends_the_fit_at_the_best_before_it(monkeypatch):

@@ -9,8 +9,12 @@ import splatjax as sj
 from splatjax.inverse import Recovery
 
 
-def recovery(information, chi_squared=1.0, noise_is_known=True, channels=1, unresolved=0.0) -> Recovery:
-    """A recovery of which nothing is known but this."""
+def recovery(information, chi_squared=1.0, noise_is_known=True, channels=1, unresolved=0.0, handover=None) -> Recovery:
+    """A recovery of which nothing is known but this; no layer is handed to the surface, unless told how that is mixed in."""
+    if handover is None:
+        information = np.pad(information, (0, channels))
+    else:
+        information = np.block([[information, np.asarray(handover)[:-1, None]], [np.asarray(handover)[None]]])
     medium = sj.Medium(jnp.full(channels, 0.02), jnp.full(channels, 1.5), jnp.full(channels, 1.3))
     gaussians = sj.SumOfGaussians(jnp.ones(1), jnp.full((1, channels), 0.5))
     return Recovery(
@@ -61,6 +65,29 @@ def test_light_that_spreads_less_than_the_splats_are_apart_is_told():
     said = recovery(along(0.01, 0.02, 0.3), unresolved=0.97).words()
     assert "97% of its light spreads less than the splats are apart" in said
     assert "splats" not in recovery(along(0.01, 0.02, 0.3), unresolved=0.5).words()
+
+
+def test_what_only_the_handover_tells_is_known_no_better_than_the_handover():
+    """The mean free path changes the picture as the width of the handover does, the other way round: they are told together."""
+    own, path = along(1e-3, 1e-2, -np.pi / 4), np.asarray([1, 1]) / np.sqrt(2)
+    along_path = path @ own @ path
+    mixed = np.append(-along_path * path, along_path)
+    found = recovery(own, handover=mixed, unresolved=1.0)
+    best, worst = found.combinations()[0]
+    np.testing.assert_allclose(best.deviation, 1e-3, rtol=1e-3)
+    np.testing.assert_allclose(worst.deviation, np.hypot(np.log(2), 1e-2), rtol=1e-3)
+    assert not found.is_fixed()
+    assert "not fixed by these pictures: sigma_a sigma_s', known to 69%" in found.words()
+    np.testing.assert_allclose(found.noise_errors(), recovery(own).relative_errors(), rtol=1e-6)
+    np.testing.assert_allclose(found.noise_errors(), np.full((2, 1), np.sqrt((1e-6 + 1e-4) / 2)), rtol=1e-3)
+
+
+def test_a_picture_that_tells_of_the_handover_unties_the_two():
+    """As does a close one: there the coefficients move what the handover does not."""
+    own, path = along(1e-3, 1e-2, -np.pi / 4), np.asarray([1, 1]) / np.sqrt(2)
+    found = recovery(own, handover=np.append(-(path @ own @ path) * path, path @ own @ path))
+    close = np.pad(along(1e-2, 1e-2, 0.0), (0, 1))
+    assert np.sqrt(np.linalg.eigvalsh(found.covariance(close)[0])[-1]) < 0.011
 
 
 def test_without_noise_given_the_bars_are_those_of_what_is_left():
