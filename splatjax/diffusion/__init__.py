@@ -14,3 +14,4 @@ from ._layers import exitance_jacobian as exitance_jacobian, ExitanceJacobian as
 from ._normalization import AbstractNormalization as AbstractNormalization, ExitOdds as ExitOdds, PlainMean as PlainMean
 from ._points import Points as Points, SeenSurface as SeenSurface
 from ._settings import DiffusionSettings as DiffusionSettings
+from ._sharded import ShardedDiffuser as ShardedDiffuser

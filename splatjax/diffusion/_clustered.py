@@ -130,7 +130,7 @@ class ClusterDiffuser(AbstractDiffuser):
                     carriers = np.where(areas * begin < largest, radii, np.zeros_like(radii))
                     farthest = tree.largest(carriers, level)
                     nodes = self._plan_nodes(levels[level], largest, depth, float(edge), support, farthest)
-                capacity = self._capacity(origin, levels[level], nodes, largest, depth, support, atlases)
+                capacity = self.capacity_at(origin, levels[level], nodes, largest, depth, support, atlases)
             smallest, largest = (jnp.asarray(edge, depth.dtype) for edge in (v / self.margin, v * self.margin))
             layers.append(LayerPlan(level, support, smallest, largest, capacity, nodes))
         return eqx.tree_at(_parts, self, (tree, tuple(layers)), is_leaf=_is_none)
@@ -158,7 +158,7 @@ class ClusterDiffuser(AbstractDiffuser):
         neighbors = Neighbors.find(boxes, sources, reach, min(_LANES, boxes.low.shape[1]), _SOURCE_SLOTS)
         return NodePlan(neighbors, jnp.asarray(np.maximum(_SMOOTHING * edge, (radii + 0.87 * edge) / _BLENDED), depth.dtype))
 
-    def _capacity(
+    def capacity_at(
         self, origin, clusters: Clusters, nodes: NodePlan | None, variance: float, depth, support: float, atlases: Sequence[Atlas]
     ) -> BinCapacity:
         """Find how much the lists of tiles must hold: sources, or nodes."""
@@ -182,43 +182,75 @@ class ClusterDiffuser(AbstractDiffuser):
         covered: Bool[Array, "tiles points"],
         atlas: Atlas,
     ) -> Diffused:
+        tree, _ = self.plans(kernels)
+
+        def within() -> tuple[list[Clusters], Pixels]:
+            origin = stop_gradient(jnp.mean(sources.centers, axis=1))
+            levels = tree.levels(dataclasses.replace(sources, centers=sources.centers - origin[:, None]))
+            return levels, Pixels.of(points, covered, origin, atlas)
+
+        return self.spread(within, kernels, sources.irradiance.shape[0], covered, self.at_pixels)
+
+    def plans(self, kernels: Kernels) -> tuple[ClusterTree, tuple[LayerPlan, ...]]:
+        """Give the tree, and the plans of the layers.
+
+        **Raises:** `ValueError` where there are none, or not as many as kernels.
+        """
         if self.tree is None or self.layers is None:
             raise ValueError("this ClusterDiffuser has no clusters yet; take one from a plan (splatjax.plan) or from `planned`")
         if kernels.variances.shape[0] != len(self.layers):
             raise ValueError(f"this plan is for {len(self.layers)} Gaussians, not {kernels.variances.shape[0]}; make it anew")
-        channels = sources.irradiance.shape[0]
-        carried = jnp.asarray([layer.capacity is not None for layer in self.layers], points.dtype)
-        empty = jnp.zeros((covered.shape[0], channels + 1, covered.shape[1]), points.dtype)
+        return self.tree, self.layers
+
+    def spread(
+        self,
+        within: Callable[[], tuple[Sequence[Clusters], Pixels]],
+        kernels: Kernels,
+        channels: int,
+        covered: Bool[Array, "tiles points"],
+        single: Callable,
+    ) -> Diffused:
+        """Evaluate every layer at the covered points, from the clusters of its level.
+
+        **Arguments:**
+
+        - `within`: gives the clusters of every level, and the points; not asked where no layer is carried.
+        - `single`: how a layer of single splats is gathered, like `at_pixels`.
+        """
+        dtype, (_, plans) = kernels.variances.dtype, self.plans(kernels)
+        carried = jnp.asarray([layer.capacity is not None for layer in plans], dtype)
+        levels, pixels = within() if any(layer.capacity is not None for layer in plans) else ([], None)
+        empty = jnp.zeros((covered.shape[0], channels + 1, covered.shape[1]), dtype)
         layers, needed = [], []
-        if any(layer.capacity is not None for layer in self.layers):
-            origin = stop_gradient(jnp.mean(sources.centers, axis=1))
-            pixels = Pixels.of(points, covered, origin, atlas)
-            levels = self.tree.levels(dataclasses.replace(sources, centers=sources.centers - origin[:, None]))
-        plans = jax.tree.map(lambda leaf: leaf.astype(points.dtype) if eqx.is_inexact_array(leaf) else leaf, self.layers)
+        plans = jax.tree.map(lambda leaf: leaf.astype(dtype) if eqx.is_inexact_array(leaf) else leaf, plans)
         for variance, depth, layer in zip(kernels.variances, kernels.depths, plans, strict=True):
             if layer.capacity is None:
                 layers.append(empty)
             else:
                 gathering = Gathering.of(levels[layer.level], variance, depth)
                 if layer.nodes is None:
-                    values, need = self._at_pixels(gathering, layer.support, layer.capacity, pixels)
+                    gather = single if layer.level == 0 else self.at_pixels
+                    values, need = gather(gathering, layer.support, layer.capacity, pixels)
                 else:
                     rest = layer.nodes, layer.support, layer.capacity, pixels
                     values, need = self._through_nodes(levels[layer.level], gathering, *rest)
                 layers.append(jnp.where(covered[:, None], values[:-1], 0.0))
-                needed.append(need.astype(points.dtype))
+                needed.append(need.astype(dtype))
             needed.append(jnp.maximum(layer.smallest / variance, variance / layer.largest) * (1 - 1e-6))
-        needed = stop_gradient(jnp.max(jnp.stack(needed))) if needed else jnp.zeros((), points.dtype)
+        needed = stop_gradient(jnp.max(jnp.stack(needed))) if needed else jnp.zeros((), dtype)
         found = jnp.stack(layers, axis=1) if layers else empty[:, None][:, :0]
         return Diffused(found[:, :, :channels], found[:, :, channels], carried, needed)
 
-    def _at_pixels(self, gathering: Gathering, support: float, capacity: BinCapacity, pixels: Pixels):
-        """Let every pixel gather for itself."""
+    def at_pixels(
+        self, gathering: Gathering, support: float, capacity: BinCapacity, pixels: Pixels, finish: Callable | None = None
+    ):
+        """Let every pixel gather for itself; what it gathers means what `finish` says, or the gathering."""
         clusters = gathering.clusters
         reach = support * jnp.sqrt(gathering.wide)
         bins = pixels.bins(clusters.centers, clusters.areas > 0, reach, _SOURCES, _SOURCE_SLOTS, capacity)
         table = gathering.table(_SOURCES, slopes=False)
-        values = self.sums(pixels.tiles, table, pixels.steps(bins, table.shape[0] - 1), faded(support), gathering.finish)
+        finish = gathering.finish if finish is None else finish
+        values = self.sums(pixels.tiles, table, pixels.steps(bins, table.shape[0] - 1), faded(support), finish)
         return values, bins.needed
 
     def _through_nodes(

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
+from splatjax.devices import Devices
 from splatjax.splatting import SIDE, AbstractView, Atlas, BinCapacity, Bins, TileGrid, TileRanges, bin_items
 
 from ._gaussian_sums import Steps
@@ -34,6 +35,11 @@ class Pixels(eqx.Module):
     ) -> "Pixels":
         seen = jnp.where(covered[:, None], points - origin[None, :, None], FAR)
         return cls(jnp.pad(seen, ((0, 1), (0, 0), (0, 0)), constant_values=FAR), origin, atlas)
+
+    def of_all(self, devices: Devices) -> "Pixels":
+        """Give the points of all devices: each has its own share."""
+        tiles = devices.everything(self.tiles[:-1])
+        return Pixels(jnp.pad(tiles, ((0, 1), (0, 0), (0, 0)), constant_values=FAR), self.origin, self.atlas.of_all(devices))
 
     def bins(self, centers, there, reach: Float[Array, " sources"], block: int, slots: int, capacity: BinCapacity) -> Bins:
         """List for each tile the blocks of sources within reach (mm); for the surface behind their numbers go on."""

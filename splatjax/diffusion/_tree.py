@@ -1,6 +1,6 @@
 """Splats merged into clusters: fewer sources for wider layers (section 4.2, Figure 5)."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import jax
@@ -44,12 +44,15 @@ class Clusters(eqx.Module):
         centers = self.centers - depth * self.normals
         return Clusters(centers, self.normals, self.areas, self.irradiance, spread, moments, self.turns, opening, self.bending)
 
-    def merged(self, parents: Int[Array, " clusters"], count: int) -> "Clusters":
-        """Merge clusters into `count` parents. Area, energy and the first moments of both are kept. Differentiable."""
+    def merged(self, parents: Int[Array, " clusters"], count: int, total: Callable[[Array], Array] = lambda sums: sums) -> "Clusters":
+        """Merge clusters into `count` parents. Area, energy and the first moments of both are kept. Differentiable.
+
+        `total` adds up what others have of the same parents.
+        """
 
         def totals(rows: Float[Array, "rows clusters"]) -> Float[Array, "rows parents"]:
             """Sum over the children: a few rows in one pass over them; of many the sums would not stay in the cache."""
-            return jax.vmap(lambda row: jax.ops.segment_sum(row, parents, count))(rows)
+            return total(jax.vmap(lambda row: jax.ops.segment_sum(row, parents, count))(rows))
 
         channels = self.irradiance.shape[0]
         energy = self.areas[None] * self.irradiance
@@ -105,11 +108,11 @@ class ClusterTree(eqx.Module):
             place = compact_order(middle)
             rank = np.empty(len(place), np.int64)
             rank[place] = np.arange(len(place))
-            before = counts[-1] if counts else _blocks(splats)
+            before = counts[-1] if counts else blocks_of(splats)
             parents.append(jnp.asarray(np.pad(rank[parent], (0, before - len(parent))), jnp.int32))
             counts.append(_round_up(len(place)))
             positions, facing, members = middle[place], toward[place], inside[place]
-        order = np.pad(order, (0, _blocks(splats) - splats), constant_values=splats)
+        order = np.pad(order, (0, blocks_of(splats) - splats), constant_values=splats)
         return cls(jnp.asarray(order, jnp.int32), tuple(parents), tuple(counts))
 
     def levels(self, sources: Sources) -> list[Clusters]:
@@ -118,7 +121,11 @@ class ClusterTree(eqx.Module):
         def placed(values):
             return values.at[..., self.order].get(mode="fill", fill_value=0)
 
-        found = [Clusters.of(jax.tree.map(placed, sources))]
+        return self.above(Clusters.of(jax.tree.map(placed, sources)))
+
+    def above(self, clusters: Clusters) -> list[Clusters]:
+        """Give clusters, and those of every level that merges them."""
+        found = [clusters]
         for parents, count in zip(self.parents, self.counts, strict=True):
             found.append(found[-1].merged(parents, count))
         return found
@@ -147,7 +154,7 @@ def _by_side(groups: np.ndarray, facing: np.ndarray) -> np.ndarray:
     return (np.cumsum(np.bincount(sides) > 0) - 1)[sides]
 
 
-def _blocks(count: int) -> int:
+def blocks_of(count: int) -> int:
     """Round up to whole blocks."""
     return max(-(-count // BLOCK), 1) * BLOCK
 
@@ -155,4 +162,4 @@ def _blocks(count: int) -> int:
 def _round_up(count: int) -> int:
     """Round up to the next of sixteen steps per octave and to whole blocks, so that a moving surface needs no other program."""
     grain = 1 << max(count.bit_length() - 5, 0)
-    return _blocks(-(-count // grain) * grain)
+    return blocks_of(-(-count // grain) * grain)

@@ -1,5 +1,7 @@
 """The five passes, wired. No mathematics lives here."""
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -11,14 +13,16 @@ from splatjax.pointwise import in_parts
 from splatjax.scene import Frame, Scene, Splats, StackedLights, stack_lights
 
 from ._lighting import LightOnSplats
-from ._plan import Plan, shadow_views
+from ._records import Plan, shadow_views
 from ._settings import RenderSettings
 
 
-def cast_shadows(scene: Scene, settings: RenderSettings, plan: Plan) -> LightOnSplats:
+def cast_shadows(
+    scene: Scene, settings: RenderSettings, plan: Plan, bounds_of: Callable[[Splats], _splatting.Bounds] = _splatting.Bounds.of
+) -> LightOnSplats:
     """Pass 1."""
     groups = stack_lights(scene.lights)
-    shares, needs = _lit_shares(scene.splats, groups, settings, plan)
+    shares, needs = _lit_shares(scene.splats, groups, settings, plan, bounds_of(scene.splats))
     return LightOnSplats(groups, shares, jnp.max(jnp.stack(needs)) if needs else jnp.zeros((), scene.splats.centers.dtype))
 
 
@@ -194,9 +198,8 @@ def compose(
     )
 
 
-def _lit_shares(splats: Splats, groups: list[StackedLights], settings: RenderSettings, plan: Plan):
+def _lit_shares(splats: Splats, groups: list[StackedLights], settings: RenderSettings, plan: Plan, bounds: _splatting.Bounds):
     """Pass 1 for every group of lights: per group the share of each light that reaches each splat, or None."""
-    bounds = _splatting.Bounds.of(splats)
     lit, needs = [], []
     for group, shadow in zip(groups, plan.shadows, strict=True):
         if shadow is None:

@@ -7,43 +7,24 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+from jax.sharding import Mesh
 from jaxtyping import Array, Float
 
 from splatjax import diffusion as _diffusion, splatting as _splatting
 from splatjax.scene import AbstractLight, Camera, PointLight, Scene, Splats, StackedLights, stack_lights
 
 from ._inputs import in_one_dtype
+from ._records import Plan, shadow_views, ShadowPlan, ShadowsWanted, Wanted
 from ._settings import RenderSettings
+from ._sharded_plan import on_one_device, plan_over
 
 
-class ShadowPlan(eqx.Module):
-    """Shadow maps for one group of lights. A point light among the splats needs the six faces of a cube."""
-
-    rasterizer: _splatting.AbstractRasterizer
-    cube: bool = eqx.field(static=True)
-
-    def closeness(self, light: AbstractLight, bounds: _splatting.Bounds) -> Float[Array, ""]:
-        """Give above 1 for a point light that was planned outside the splats' bounding sphere and has come into it."""
-        if self.cube or not isinstance(light, PointLight):
-            return jnp.zeros_like(bounds.radius)
-        return jax.lax.stop_gradient(bounds.radius / jnp.linalg.norm(light.position - bounds.center))
-
-
-class Plan(eqx.Module):
-    r"""What `jit`, `grad` and loops need to know of shapes; made by `plan` from concrete arrays.
-
-    Capacities are static, indices are arrays. A picture that needs more than its plan holds is NaN, and says so in `overflow`.
-    """
-
-    camera: _splatting.AbstractRasterizer
-    tiles: int = eqx.field(static=True)
-    """Of the pictures, that show a surface or one behind it."""
-    shadows: tuple[ShadowPlan | None, ...]
-    diffuser: _diffusion.AbstractDiffuser
-    interval: Float[Array, "2"]
-
-
-def plan(scenes: Scene | Sequence[Scene], cameras: Camera | Sequence[Camera], settings: RenderSettings | None = None) -> Plan:
+def plan(
+    scenes: Scene | Sequence[Scene],
+    cameras: Camera | Sequence[Camera],
+    settings: RenderSettings | None = None,
+    mesh: Mesh | None = None,
+) -> Plan:
     r"""Find the capacities and orders that rendering a scene with these cameras needs.
 
     **Arguments:** concrete, not traced.
@@ -51,6 +32,7 @@ def plan(scenes: Scene | Sequence[Scene], cameras: Camera | Sequence[Camera], se
     - `scenes`: one, or several that differ in their lights alone: the same splats and material, lights of the same kinds in the
       same order.
     - `cameras`: all have pictures of one size.
+    - `mesh`: devices over which the splats are cut when rendering; planned on one.
 
     **Returns:** a `Plan` that serves every scene with every camera, and scenes and materials near these: variances within a
     factor of 1.25, splats that have moved among each other by less than a tenth of a layer's width, light of any strength and
@@ -58,15 +40,18 @@ def plan(scenes: Scene | Sequence[Scene], cameras: Camera | Sequence[Camera], se
 
     **Raises:** `ValueError` when cameras or scenes do not fit together.
     """
-    return _plan(scenes, cameras, RenderSettings() if settings is None else settings)
+    return _plan(scenes, cameras, RenderSettings() if settings is None else settings, mesh)
 
 
-def _plan(scenes: Scene | Sequence[Scene], cameras: Camera | Sequence[Camera], settings: RenderSettings) -> Plan:
+def _plan(
+    scenes: Scene | Sequence[Scene], cameras: Camera | Sequence[Camera], settings: RenderSettings, mesh: Mesh | None
+) -> Plan:
     cameras = [cameras] if isinstance(cameras, Camera) else list(cameras)
     scenes = [scenes] if isinstance(scenes, Scene) else list(scenes)
     if not cameras or not scenes:
         raise ValueError(f"a plan needs a scene and a camera at least, not {len(scenes)} scenes and {len(cameras)} cameras")
-    scene, *others = scenes
+    scene, *others = scenes if mesh is None else on_one_device(scenes)
+    cameras = cameras if mesh is None else on_one_device(cameras)
     scene, others, cameras = in_one_dtype(scene, others, cameras)
     if len({(camera.width, camera.height) for camera in cameras}) != 1:
         sizes = sorted({(camera.width, camera.height) for camera in cameras})
@@ -81,15 +66,27 @@ def _plan(scenes: Scene | Sequence[Scene], cameras: Camera | Sequence[Camera], s
     kernels = _diffusion.Kernels.of(scene.material.gaussians.variances, settings.diffusion.normalization)
     camera = settings.rasterizer.planned(scene.splats, views, settings.splatting)
     looks = [_look(scene.splats, view, settings.splatting, camera) for view in views]
+    shadows = [_shadows_wanted(group, bounds, settings) for group in groups]
+    wanted = Wanted(scene.splats, settings, kernels, interval, views, looks, shadows, camera)
+    return _on_one_device(wanted) if mesh is None else plan_over(mesh, wanted)
+
+
+def _on_one_device(wanted: Wanted) -> Plan:
+    splats, settings, looks = wanted.splats, wanted.settings, wanted.looks
     shown = max(int(np.sum(np.asarray(look) > -np.inf)) for look in looks)
     tiles = min(_splatting.round_up(shown, 1), looks[0].size)
-    atlases = [_splatting.Atlas.of(look, view, tiles) for look, view in zip(looks, views, strict=True)]
+    atlases = [_splatting.Atlas.of(look, view, tiles) for look, view in zip(looks, wanted.views, strict=True)]
+    rasterizer = settings.rasterizer.for_shadows()
+    shadows = (
+        None if each is None else ShadowPlan(rasterizer.planned(splats, each.views, settings.splatting), each.cube)
+        for each in wanted.shadows
+    )
     return Plan(
-        camera=camera,
+        camera=wanted.camera,
         tiles=tiles,
-        shadows=tuple(_plan_shadows(group, scene.splats, bounds, settings) for group in groups),
-        diffuser=settings.diffuser.planned(scene.splats, kernels, interval, atlases),
-        interval=interval,
+        shadows=tuple(shadows),
+        diffuser=settings.diffuser.planned(splats, wanted.kernels, wanted.interval, atlases),
+        interval=wanted.interval,
     )
 
 
@@ -102,20 +99,17 @@ def _look(splats: Splats, view, settings: _splatting.SplattingSettings, rasteriz
     return jnp.where(grown > -jnp.inf, grown + 2 * jnp.mean(splats.radii), -jnp.inf)
 
 
-def plan_unless_traced(scene: Scene, camera: Camera, settings: RenderSettings, plan: Plan | None) -> Plan:
+def plan_unless_traced(
+    scene: Scene, camera: Camera, settings: RenderSettings, plan: Plan | None, mesh: Mesh | None = None
+) -> Plan:
     if plan is not None:
+        if mesh is not None and plan.mesh != mesh:
+            made_for = "one device" if plan.mesh is None else f"{plan.mesh}"
+            raise ValueError(f"the plan is for {made_for}, not for {mesh}; make it with splatjax.plan(..., mesh=mesh)")
         return plan
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((scene, camera))):
         raise ValueError("under jit, grad or vmap a plan is needed: plan=splatjax.plan(scene, camera, settings), made outside")
-    return _plan(scene, camera, settings)
-
-
-def shadow_views(light, bounds, settings: RenderSettings, cube: bool) -> Sequence[_splatting.AbstractView]:
-    if not isinstance(light, PointLight):
-        return [_splatting.distant_view(light.direction, bounds, settings.shadows)]
-    if cube:
-        return _splatting.cube_views(light.position, settings.shadows)
-    return [_splatting.near_view(light.position, bounds, settings.shadows)]
+    return _plan(scene, camera, settings, mesh)
 
 
 def _groups(lights: Sequence[tuple[AbstractLight, ...]]) -> list[list[StackedLights]]:
@@ -128,7 +122,7 @@ def _groups(lights: Sequence[tuple[AbstractLight, ...]]) -> list[list[StackedLig
     return [list(group) for group in zip(*stacked, strict=True)]
 
 
-def _plan_shadows(groups: Sequence[StackedLights], splats: Splats, bounds, settings: RenderSettings) -> ShadowPlan | None:
+def _shadows_wanted(groups: Sequence[StackedLights], bounds: _splatting.Bounds, settings: RenderSettings) -> ShadowsWanted | None:
     kind = groups[0].lights
     if not kind.cast_shadows:
         return None
@@ -137,5 +131,4 @@ def _plan_shadows(groups: Sequence[StackedLights], splats: Splats, bounds, setti
     if isinstance(kind, PointLight):
         distances = jnp.stack([jnp.linalg.norm(light.position - bounds.center) for light in lights])
         cube = bool(jnp.any(distances < 1.05 * bounds.radius))
-    views = [view for light in lights for view in shadow_views(light, bounds, settings, cube)]
-    return ShadowPlan(settings.rasterizer.for_shadows().planned(splats, views, settings.splatting), cube)
+    return ShadowsWanted([view for light in lights for view in shadow_views(light, bounds, settings, cube)], cube)

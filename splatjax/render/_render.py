@@ -2,6 +2,7 @@
 
 import equinox as eqx
 import jax.numpy as jnp
+from jax.sharding import Mesh
 from jaxtyping import Array, Float
 
 from splatjax import diffusion as _diffusion, splatting as _splatting
@@ -12,9 +13,16 @@ from ._lighting import EnteringLight, let_light_in
 from ._passes import cast_shadows, compose, see_surfaces, shade, sources_of
 from ._plan import Plan, plan_unless_traced
 from ._settings import RenderSettings
+from ._sharded import render_over
 
 
-def render(scene: Scene, camera: Camera, settings: RenderSettings | None = None, plan: Plan | None = None) -> Frame:
+def render(
+    scene: Scene,
+    camera: Camera,
+    settings: RenderSettings | None = None,
+    plan: Plan | None = None,
+    mesh: Mesh | None = None,
+) -> Frame:
     r"""Render a picture with all its layers: shadow maps, visibility, attributes, diffusion, shading.
 
     **Arguments:**
@@ -23,20 +31,24 @@ def render(scene: Scene, camera: Camera, settings: RenderSettings | None = None,
     - `camera`: Differentiable.
     - `settings`: how each pass works.
     - `plan`: from `splatjax.plan`; needed under `jit`, `grad` and `vmap`, made here otherwise.
+    - `mesh`: devices over which the splats are cut, whatever its axes: each holds a share, and their gradients (docs/devices.md).
+      It is the plan's where that is given.
 
-    **Returns:** a `Frame` in the dtype of `splats.centers`.
+    **Returns:** a `Frame` in the dtype of `splats.centers`; the same on every device, and to rounding whatever the mesh.
 
-    **Raises:** `ValueError` when a plan is needed and not given, or when the scene's channels disagree.
+    **Raises:** `ValueError` when a plan is needed and not given, or is not for this mesh, or when the scene's channels disagree.
     """
     settings = RenderSettings() if settings is None else settings
     check_channels(scene)
-    plan = plan_unless_traced(scene, camera, settings, plan)
+    plan = plan_unless_traced(scene, camera, settings, plan, mesh)
     return _render(scene, camera, settings, plan)
 
 
 @eqx.filter_jit
 def _render(scene: Scene, camera: Camera, settings: RenderSettings, plan: Plan) -> Frame:
     scene, camera = in_one_dtype(scene, camera)
+    if plan.mesh is not None:
+        return render_over(plan.mesh, scene, camera, settings, plan)
     view = _splatting.PerspectiveView.of(camera)
     light = cast_shadows(scene, settings, plan)
     entering = let_light_in(scene, light)

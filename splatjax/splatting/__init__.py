@@ -9,6 +9,7 @@ from ._kernel import coverage as coverage, fragment_weight as fragment_weight
 from ._rasterizer import AbstractRasterizer as AbstractRasterizer, FragmentSums as FragmentSums
 from ._rasterizer import SummedFragments as SummedFragments
 from ._settings import SplattingSettings as SplattingSettings
+from ._sharded import bounds_over as bounds_over, ShardedRasterizer as ShardedRasterizer
 from ._shadows import Bounds as Bounds, cube_views as cube_views, distant_view as distant_view
 from ._shadows import in_cube_face as in_cube_face, light_surfaces as light_surfaces, lit_share as lit_share
 from ._shadows import near_view as near_view, ShadowSettings as ShadowSettings, stack_views as stack_views

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from splatjax.devices import Devices
 from splatjax.pointwise import AT_ONCE, one_program
 
 from ._bins import SIDE, TileGrid
@@ -59,6 +60,14 @@ class Atlas(eqx.Module):
         places = jnp.full(shows.shape[0], room, jnp.int32).at[tiles].set(jnp.arange(room, dtype=jnp.int32), mode="drop")
         needed = jnp.sum(shows).astype(farthest.dtype) / room
         return cls(view, farthest, tiles, places, needed, jnp.ones_like(needed))
+
+    def of_all(self, devices: Devices) -> "Atlas":
+        """Give the atlas of the places of all devices, one after the other, each of which shows tiles of its own."""
+        tiles = devices.everything(self.tiles)
+        room = tiles.shape[0]
+        places = jnp.full(self.places.shape[0], room, jnp.int32).at[tiles].set(jnp.arange(room, dtype=jnp.int32), mode="drop")
+        farthest, needed = devices.largest((self.farthest, self.needed))
+        return Atlas(self.view, farthest, tiles, places, needed, self.poison)
 
     def poisoned_unless(self, fits: Bool[Array, ""]) -> "Atlas":
         """Make every picture NaN, and its derivatives too, where a plan does not suffice."""

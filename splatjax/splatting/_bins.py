@@ -169,10 +169,10 @@ class Bins(eqx.Module):
         """How many chunks have anything in them: longer lists come first, so these lead."""
         return jnp.minimum(_occupied(self.first_block), self.places // self.ids.shape[1])
 
-    def by_tile(self, swept: Float[Array, "places ..."], count: int) -> Float[Array, "tiles ..."]:
-        """Put what was found lane by lane in the order of the tiles; 0 for empty ones."""
+    def by_tile(self, swept: Float[Array, "places ..."], count: int, fill: float = 0) -> Float[Array, "tiles ..."]:
+        """Put what was found lane by lane in the order of the tiles; `fill` for empty ones."""
         lane = jnp.zeros_like(self.order).at[self.order].set(jnp.arange(self.order.shape[0], dtype=jnp.int32))
-        return swept.at[lane[:count]].get(mode="fill", fill_value=0)
+        return swept.at[lane[:count]].get(mode="fill", fill_value=fill)
 
 
 def _occupied(first_block: Int[Array, " chunks_and_one"]) -> Int[Array, ""]:

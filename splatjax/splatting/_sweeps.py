@@ -104,7 +104,7 @@ class Sweep(eqx.Module):
         dx, dy = px - x, py - y
         return e + sx * dx + sy * dy, dx * (a * dx + b * dy) + c * dy * dy
 
-    def limits(self, slots: "_Slots", lanes: _Lanes):
+    def limits(self, slots: "Slots", lanes: _Lanes):
         """Find per pixel the nearest shifted fragment: the back end of the front."""
 
         def nearest(block, limit):
@@ -114,8 +114,8 @@ class Sweep(eqx.Module):
 
         return lax.fori_loop(jnp.int32(0), lanes.blocks, nearest, self._nothing(lanes))
 
-    def limits_behind(self, slots: "_Slots", lanes: _Lanes, front):
-        """Find the same for what lies behind the front's limits: of the fragments that weigh something, or of any."""
+    def limits_behind(self, slots: "Slots", lanes: _Lanes, front):
+        """Find the same for what lies behind the front's limits: of the fragments that weigh something, and of any."""
 
         def nearest(block, limits):
             splats = self.splats(slots.planes, block, lanes)
@@ -128,9 +128,7 @@ class Sweep(eqx.Module):
             found = (jnp.max(jnp.where(candidate, shifted, -jnp.inf), axis=1) for candidate in each)
             return tuple(jnp.maximum(limit, new) for limit, new in zip(limits, found, strict=True))
 
-        start = self._nothing(lanes), self._nothing(lanes)
-        weighty, of_any = lax.fori_loop(jnp.int32(0), lanes.blocks, nearest, start)
-        return jnp.where(weighty > -jnp.inf, weighty, of_any)
+        return lax.fori_loop(jnp.int32(0), lanes.blocks, nearest, (self._nothing(lanes), self._nothing(lanes)))
 
     def _nothing(self, lanes: _Lanes):
         return jnp.full((lanes.row.shape[0], SIDE**2), -jnp.inf, lanes.x.dtype)
@@ -147,7 +145,7 @@ class Sweep(eqx.Module):
         x, y, sx, sy, _, _, _, e, _ = splats
         return [*(lanes.read(row, block) for row in attributes), e - sx * x - sy * y, sx, sy, jnp.ones_like(e)]
 
-    def sums(self, slots: "_Slots", lanes: _Lanes, beyond, upto):
+    def sums(self, slots: "Slots", lanes: _Lanes, beyond, upto):
         """Sum attributes and nearness over the fragments between two limits, `[lanes, rows, pixels]`; the weights last."""
 
         def add(block, sums):
@@ -163,7 +161,7 @@ class Sweep(eqx.Module):
         nearness = sums[:, -4] + sums[:, -3] * px[None] + sums[:, -2] * py[None]
         return jnp.concatenate([sums[:, :-4], nearness[:, None], sums[:, -1:]], axis=1)
 
-    def add_cotangents(self, slots: "_Slots", lanes: _Lanes, beyond, upto, cotangent, gradients):
+    def add_cotangents(self, slots: "Slots", lanes: _Lanes, beyond, upto, cotangent, gradients):
         """Add the cotangents of planes and attributes, per slot, for the fragments between two limits, from those of the sums."""
         px, py = self.pixels(beyond.dtype)
         monomials = jnp.asarray(np.stack([np.ones_like(px), px, py, px * px, px * py, py * py], axis=1))
@@ -194,7 +192,7 @@ class Sweep(eqx.Module):
         return lax.fori_loop(jnp.int32(0), lanes.blocks, add, gradients)
 
 
-class _Slots(eqx.Module):
+class Slots(eqx.Module):
     """What the sweeps read, gathered into slots; rows of one lane each."""
 
     planes: list[Float[Array, "rows slots"]]
@@ -202,7 +200,7 @@ class _Slots(eqx.Module):
     attributes: list[Float[Array, "rows slots"]]
 
     @classmethod
-    def gathered(cls, shift, planes, attributes, bins: Bins) -> "_Slots":
+    def gathered(cls, shift, planes, attributes, bins: Bins) -> "Slots":
         def slots(plane, fill):
             return slot_plane(plane, fill, bins).reshape(-1, bins.ids.shape[2])
 
@@ -210,7 +208,7 @@ class _Slots(eqx.Module):
         return cls([slots(*each) for each in filled], slots(shift, 0.0), [slots(row, 0.0) for row in attributes])
 
 
-def _picked(is_open: Bool[Array, " tiles"], lanes: int):
+def picked(is_open: Bool[Array, " tiles"], lanes: int):
     """Find the places of open tiles, a lane each, and in how many rounds; the rest of the last round is empty."""
     places = jnp.nonzero(is_open, size=is_open.shape[0] + lanes, fill_value=is_open.shape[0])[0].astype(jnp.int32)
     count = jnp.sum(is_open, dtype=jnp.int32)
@@ -225,7 +223,7 @@ def _picked(is_open: Bool[Array, " tiles"], lanes: int):
 
 def _forward(sweep: Sweep, bins: Bins, shift, planes, attributes):
     """Sweep all chunks: both surfaces, tile by tile, and per pixel where they end, in lane order."""
-    slots, grid = _Slots.gathered(shift, planes, attributes, bins), sweep.grid
+    slots, grid = Slots.gathered(shift, planes, attributes, bins), sweep.grid
     dtype, within = planes[0].dtype, grid.within_picture()
     poison = jnp.where(bins.needed <= 1, 0.0, jnp.nan).astype(dtype)
 
@@ -246,13 +244,14 @@ def _forward(sweep: Sweep, bins: Bins, shift, planes, attributes):
     never = jnp.inf + empty[:, 0]
     front, limits = lax.fori_loop(jnp.int32(0), bins.chunks, chunk, (FragmentSums.of(empty), never))
     gaps = (front.weights < sweep.full_coverage) & (limits > -jnp.inf) & (limits < jnp.inf)
-    pick, rounds = _picked(jnp.any(gaps, axis=1), grid.lanes)
+    pick, rounds = picked(jnp.any(gaps, axis=1), grid.lanes)
 
     def look_behind(i, out):
         behind, seconds = out
         places, real = pick(i)
         lanes, limit, tiles = sweep.picked(bins, places, dtype), limits[places], bins.order[places]
-        second = sweep.limits_behind(slots, lanes, jnp.where(gaps[places] & real, limit, -jnp.inf))
+        weighty, of_any = sweep.limits_behind(slots, lanes, jnp.where(gaps[places] & real, limit, -jnp.inf))
+        second = jnp.where(weighty > -jnp.inf, weighty, of_any)
         second = jnp.where(second > -jnp.inf, second, jnp.inf)
         found = FragmentSums.of(seen(sweep.sums(slots, lanes, second, limit), tiles))
         return jax.tree.map(lambda whole, part: whole.at[tiles].add(part), behind, found), seconds.at[places].min(second)
@@ -262,9 +261,9 @@ def _forward(sweep: Sweep, bins: Bins, shift, planes, attributes):
     return jax.tree.map(lambda each: bins.by_tile(each, grid.count) + poison, front), behind, (limits, seconds)
 
 
-def _backward(sweep: Sweep, bins: Bins, shift, planes, attributes, limits, cotangents):
+def backward(sweep: Sweep, bins: Bins, shift, planes, attributes, limits, cotangents):
     """Sweep all chunks again: the cotangents of planes and attributes, per slot, then summed per splat."""
-    slots, grid = _Slots.gathered(shift, planes, attributes, bins), sweep.grid
+    slots, grid = Slots.gathered(shift, planes, attributes, bins), sweep.grid
     dtype, count = planes[0].dtype, len(planes) + len(attributes)
     (limits, seconds), (d_front, d_behind) = limits, cotangents
 
@@ -277,7 +276,7 @@ def _backward(sweep: Sweep, bins: Bins, shift, planes, attributes, limits, cotan
 
     start = tuple(zeros_after(d_front.weights, slots.shift.shape, dtype) for _ in range(count))
     gradients = lax.fori_loop(jnp.int32(0), bins.chunks, chunk, start)
-    pick, rounds = _picked(jnp.any(seconds < jnp.inf, axis=1), grid.lanes)
+    pick, rounds = picked(jnp.any(seconds < jnp.inf, axis=1), grid.lanes)
 
     def look_behind(i, gradients):
         places, real = pick(i)
@@ -322,7 +321,7 @@ def sweep_tiles_fwd(sweep: Sweep, bins: Bins, shift, planes, attributes):
 
 
 def sweep_tiles_bwd(sweep: Sweep, residuals, cotangents):
-    return (None, None, *_backward(sweep, *residuals, cotangents))
+    return (None, None, *backward(sweep, *residuals, cotangents))
 
 
 sweep_tiles.defvjp(sweep_tiles_fwd, sweep_tiles_bwd)

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 from splatjax.pointwise import in_parts
 from splatjax.scene import Splats
 
-from ._bins import SIDE, BinCapacity, TileGrid, TileRanges, bin_items, round_up
+from ._bins import SIDE, BinCapacity, Bins, TileGrid, TileRanges, bin_items, round_up
 from ._rasterizer import AbstractRasterizer, FragmentSums, SummedFragments
 from ._settings import SplattingSettings
 from ._sweeps import PLANES, Sweep, sweep_tiles
@@ -26,6 +26,16 @@ class TileCapacity(eqx.Module):
 
     splats: int = eqx.field(static=True)
     bins: BinCapacity
+
+
+class Binned(eqx.Module):
+    """What a sweep over the tiles reads."""
+
+    sweep: Sweep
+    bins: Bins
+    shift: Float[Array, " seen"]
+    planes: tuple[Float[Array, " seen"], ...]
+    attributes: tuple[Float[Array, " seen"], ...]
 
 
 class TileRasterizer(AbstractRasterizer):
@@ -45,21 +55,36 @@ class TileRasterizer(AbstractRasterizer):
         return TileGrid(view.width, view.height, self.lanes, self.slots)
 
     def planned(self, splats: Splats, views: Sequence[AbstractView], settings: SplattingSettings) -> "TileRasterizer":
+        return self.planned_for_each([splats], views, settings)
+
+    def planned_for_each(
+        self, parts: Sequence[Splats], views: Sequence[AbstractView], settings: SplattingSettings
+    ) -> "TileRasterizer":
+        """Give a rasterizer with room for any of several parts of the splats, all of one size, in each of these views."""
         grid = self._grid(views[0])
-        counts = [_demand(splats, view, settings, grid) for view in views]
+        counts = [_demand(part, view, settings, grid) for part in parts for view in views]
         seen = round_up(max(int(seen) for seen, _ in counts), _STEP)
         bins = BinCapacity.for_counts([per_tile for _, per_tile in counts], grid)
-        return TileRasterizer(self.lanes, self.slots, TileCapacity(min(seen, splats.count), bins))
+        return TileRasterizer(self.lanes, self.slots, TileCapacity(min(seen, parts[0].count), bins))
 
     def summed(
         self, splats: Splats, attributes: Float[Array, "attributes splats"], view: AbstractView, settings: SplattingSettings
     ) -> SummedFragments:
-        if self.capacity is None:
-            raise ValueError("this TileRasterizer has no capacity yet; take one from a plan (splatjax.plan) or from `planned`")
         dtype, grid = attributes.dtype, self._grid(view)
         if splats.count == 0:
             empty = FragmentSums.of(jnp.zeros((grid.count, attributes.shape[0] + 2, SIDE**2), dtype))
             return SummedFragments(empty, empty, jnp.zeros((), dtype))
+        binned = self.binned(splats, attributes, view, settings)
+        front, behind = sweep_tiles(binned.sweep, binned.bins, binned.shift, binned.planes, binned.attributes)
+        return SummedFragments(front, behind, binned.bins.needed.astype(dtype))
+
+    def binned(
+        self, splats: Splats, attributes: Float[Array, "attributes splats"], view: AbstractView, settings: SplattingSettings
+    ) -> "Binned":
+        """Project the splats that may be seen, and list them by tile."""
+        if self.capacity is None:
+            raise ValueError("this TileRasterizer has no capacity yet; take one from a plan (splatjax.plan) or from `planned`")
+        grid = self._grid(view)
         ids, seen = _compacted(view.may_see(splats), self.capacity.splats)
         splats = jax.tree.map(
             lambda leaf: jnp.stack(_taken(leaf.T, ids), axis=-1) if leaf.ndim == 2 else _taken(leaf[None], ids)[0], splats
@@ -69,8 +94,7 @@ class TileRasterizer(AbstractRasterizer):
         bins = eqx.tree_at(lambda b: b.needed, bins, jnp.maximum(bins.needed, seen / self.capacity.splats))
         planes = tuple(getattr(footprints, name) for name in PLANES)
         sweep = Sweep(type(view), grid, settings.full_coverage)
-        front, behind = sweep_tiles(sweep, bins, stop_gradient(footprints.shift), planes, tuple(_taken(attributes, ids)))
-        return SummedFragments(front, behind, bins.needed.astype(dtype))
+        return Binned(sweep, bins, stop_gradient(footprints.shift), planes, tuple(_taken(attributes, ids)))
 
 
 @eqx.filter_jit

@@ -1,0 +1,75 @@
+"""What a plan is made of, and what it must make room for."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.sharding import Mesh
+from jaxtyping import Array, Float
+
+from splatjax import diffusion as _diffusion, splatting as _splatting
+from splatjax.scene import AbstractLight, PointLight, Splats
+
+from ._settings import RenderSettings
+
+
+class ShadowPlan(eqx.Module):
+    """Shadow maps for one group of lights. A point light among the splats needs the six faces of a cube."""
+
+    rasterizer: _splatting.AbstractRasterizer
+    cube: bool = eqx.field(static=True)
+
+    def closeness(self, light: AbstractLight, bounds: _splatting.Bounds) -> Float[Array, ""]:
+        """Give above 1 for a point light that was planned outside the splats' bounding sphere and has come into it."""
+        if self.cube or not isinstance(light, PointLight):
+            return jnp.zeros_like(bounds.radius)
+        return jax.lax.stop_gradient(bounds.radius / jnp.linalg.norm(light.position - bounds.center))
+
+
+class Plan(eqx.Module):
+    r"""What `jit`, `grad` and loops need to know of shapes; made by `plan` from concrete arrays.
+
+    Capacities are static, indices are arrays. A picture that needs more than its plan holds is NaN, and says so in `overflow`.
+    """
+
+    camera: _splatting.AbstractRasterizer
+    tiles: int = eqx.field(static=True)
+    """Of the pictures, that show a surface or one behind it."""
+    shadows: tuple[ShadowPlan | None, ...]
+    diffuser: _diffusion.AbstractDiffuser
+    interval: Float[Array, "2"]
+    mesh: Mesh | None = eqx.field(static=True, default=None)
+    """The devices that hold the splats; `None` for one."""
+
+
+class Wanted(eqx.Module):
+    """What a plan must make room for, in concrete arrays."""
+
+    splats: Splats
+    settings: RenderSettings
+    kernels: _diffusion.Kernels
+    interval: Float[Array, "2"]
+    views: list[_splatting.PerspectiveView]
+    """Of the cameras."""
+    looks: list[Float[Array, "surfaces down across"]]
+    """For each of them, where there is anything to see, and how far away."""
+    shadows: list["ShadowsWanted | None"]
+    """For each group of lights; `None` for lights that cast no shadows."""
+    camera: _splatting.AbstractRasterizer
+    """With room for the views of the cameras."""
+
+
+class ShadowsWanted(eqx.Module):
+    """The views of the shadow maps of one group of lights."""
+
+    views: list[_splatting.AbstractView]
+    cube: bool = eqx.field(static=True)
+
+
+def shadow_views(light, bounds, settings: RenderSettings, cube: bool) -> Sequence[_splatting.AbstractView]:
+    if not isinstance(light, PointLight):
+        return [_splatting.distant_view(light.direction, bounds, settings.shadows)]
+    if cube:
+        return _splatting.cube_views(light.position, settings.shadows)
+    return [_splatting.near_view(light.position, bounds, settings.shadows)]
