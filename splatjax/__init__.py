@@ -12,7 +12,7 @@ from .fitting import GivenVariances as GivenVariances, InsertedGaussians as Inse
 from .fitting import SharedVariances as SharedVariances, VariancesPerChannel as VariancesPerChannel
 from .gaussians import AbstractProfile as AbstractProfile, SumOfGaussians as SumOfGaussians
 from .geometry import bust as bust, bust_mesh as bust_mesh
-from .io import read_exr as read_exr, read_splats as read_splats, sample_mesh as sample_mesh
+from .io import read_exr as read_exr, read_splats as read_splats, sample_mesh as sample_mesh, SplatFile as SplatFile
 from .io import write_exr as write_exr, write_png as write_png, write_splats as write_splats
 from .scattering import BetterDipole as BetterDipole, Burley as Burley, Dipole as Dipole, PhotonBeam as PhotonBeam
 from .scattering import EganFresnel as EganFresnel, ExactFresnel as ExactFresnel, Medium as Medium
@@ -42,6 +42,7 @@ from .transport import monte_carlo as monte_carlo, MonteCarlo as MonteCarlo, pat
 from .render import gather_picture as gather_picture, gather_picture_and_slopes as gather_picture_and_slopes
 from .render import GatheredPicture as GatheredPicture
 from .render import diffuse as diffuse, picture_jacobian as picture_jacobian, PictureJacobian as PictureJacobian
+from .render import map_over as map_over, render_streamed as render_streamed
 from .render import Plan as Plan, plan as plan, render as render, RenderSettings as RenderSettings
 
 from .inverse import HuberLoss as HuberLoss, SquaredLoss as SquaredLoss

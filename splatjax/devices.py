@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.lax import stop_gradient
-from jax.sharding import Mesh, PartitionSpec
+from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float, PyTree
 
 Parts = TypeVar("Parts", bound=PyTree)
@@ -48,9 +48,16 @@ class Devices(eqx.Module):
         return jax.tree.map(lambda rows: jax.lax.all_gather(rows, self.axes, axis=0, tiled=True), share)
 
     def extreme(self, values: Float[Array, "rows *more"], largest: bool) -> Float[Array, "*more"]:
-        """Give the largest (or the least) of all rows. The derivative is shared evenly by the rows that are, as `jnp.max` does."""
+        """Give the largest (or the least) of all rows. Rows that are share the derivative, as for `jnp.max`."""
         sign = 1 if largest else -1
         found = sign * self.largest(jnp.max(sign * values, axis=0))
         there = values == found[None]
         mean = self.total(jnp.sum(jnp.where(there, values, 0), axis=0)) / self.total(jnp.sum(there, axis=0).astype(values.dtype))
         return found + mean - stop_gradient(mean)
+
+
+def laid_out(mesh: Mesh, trees: Parts, specs: Parts) -> Parts:
+    """Lay arrays out over a mesh whose axes are explicit; where they are not, `shard_map` does so itself."""
+    if AxisType.Explicit not in mesh.axis_types:
+        return trees
+    return jax.tree.map(lambda leaf, spec: jax.reshard(leaf, NamedSharding(mesh, spec)), trees, specs)

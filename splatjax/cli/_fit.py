@@ -14,6 +14,7 @@ from splatjax.fitting import AbstractWeights
 from splatjax.io import read_picture, surface_and_source
 from splatjax.scattering import measure_laser_dot
 
+from ._fit_all import fit_all
 from ._models import Model, Reference, reference
 from ._outputs import OptionalPath, check_output
 from ._report import stage
@@ -31,7 +32,8 @@ class Fit:
     A medium is taken for what --model says: the dipole, which publications use, or one that comes nearer to the truth, or the
     truth itself (docs/which_profile.md).
 
-    Example: splatjax fit marble --count 6 --output marble.toml --plot marble.png
+    Examples: splatjax fit marble --count 6 --output marble.toml --plot marble.png
+              splatjax fit media.csv --all --output fits.csv
     """
 
     medium: tyro.conf.Positional[str]
@@ -57,6 +59,10 @@ class Fit:
     """Of a photograph: the size of a pixel on the surface."""
     power: float = 1.0
     """Of a photograph: the light that enters the material, in W if the picture is in W/(mm^2 sr)."""
+    all: bool = False
+    """Fit all media of a CSV file, whose columns are sigma_a, sigma_s_prime (1/mm), eta, and a name if you like; --output is a
+    CSV file then. Batches that are finished stay: after an interruption, run the same command again. Where a launcher has started
+    several processes (docs/devices.md), they share the work."""
     output: OptionalPath = None
     """TOML file to write the material to."""
     plot: OptionalPath = None
@@ -64,12 +70,28 @@ class Fit:
 
     def run(self) -> None:
         """Fit, print, write."""
+        if self.all:
+            self._run_all()
+            return
         if self.output is not None:
             check_output(self.output, (".toml",))
         if self.plot is not None:
             check_output(self.plot, (".png", ".pdf", ".svg"))
         with jax.enable_x64(True):
             self._run()
+
+    def _run_all(self) -> None:
+        if self.output is None:
+            raise ValueError("--all needs --output, a CSV file for what is fitted")
+        check_output(self.output, (".csv",))
+        usual = Fit(medium=self.medium, all=True, count=self.count, free=self.free, output=self.output)
+        if usual != self:
+            raise ValueError("--all fits dipoles by --count and --free alone; leave the other options out")
+        if not 1 <= self.count <= 8:
+            raise ValueError(f"--count is {self.count}; with --all it lies between 1 and 8")
+        weights = sj.FreeWeights() if self.free else sj.NonNegativeWeights(sj.TotalReflectanceHeld())
+        with jax.enable_x64(True):
+            fit_all(Path(self.medium), self.output, self.count, weights)
 
     def _run(self) -> None:
         coefficients = self._coefficients()

@@ -6,8 +6,8 @@ from pathlib import Path
 import splatjax as sj
 
 from ._outputs import check_output
-from ._report import stage
-from ._shot import Shot, draw
+from ._report import stage, sweeps
+from ._shot import Shot, draw, frame_parts, towards
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,10 +24,16 @@ class Render(Shot):
     output: Path = Path("out.exr")
     """The EXR file to write; the PNG file has the same name but for its end."""
 
+    stream: int = 0
+    """Read so many splats of the file at a time, and forget them: for files that are larger than memory. 0: all at once."""
+
     def run(self) -> None:
         """Load, render, write."""
         check_output(self.output, (".exr",))
         self.check()
+        if self.stream:
+            self._run_streamed()
+            return
         splats, material = self.load()
         lights = self.lights(material.gaussians.weights.shape[1], self.azimuth, self.light_azimuth)
         scene, camera = sj.Scene(splats, lights, material), self.camera(splats, self.azimuth)
@@ -35,6 +41,21 @@ class Render(Shot):
             plan = sj.plan(scene, camera)
         with stage(f"rendering {splats.count} splats at {self.width} x {self.height}"):
             frame = draw(scene, camera, plan)
+        self._write(frame, material)
+
+    def _run_streamed(self) -> None:
+        if self.splats is None or self.stream < 0:
+            raise ValueError(f"--stream is {self.stream}; it is a number of splats of a PLY file, which must be named")
+        file = sj.SplatFile(self.splats, self.stream)
+        with stage(f"looking at {file.count} splats"):
+            camera = frame_parts(file, towards(self.azimuth, self.elevation), self.fov, self.width, self.height)
+        material = self.material_for(next(file()), sj.load_material(self.material))
+        lights = self.lights(material.gaussians.weights.shape[1], self.azimuth, self.light_azimuth)
+        with sweeps(file.count) as report:
+            frame = sj.render_streamed(file, lights, material, camera, report=report)
+        self._write(frame, material)
+
+    def _write(self, frame: sj.Frame, material: sj.Material) -> None:
         self.say_what_was_handed_over(frame, material)
         with stage(f"writing {self.output} and {self.output.with_suffix('.png')}"):
             written = self.write(self.output, frame, material)

@@ -1,9 +1,10 @@
 """What `splatjax render` and `splatjax turntable` share: what is shown, from where, and under which light."""
 
 import math
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -76,11 +77,15 @@ class Shot:
         """Give the splats, and the material as it is rendered with them."""
         material = sj.load_material(self.material)
         splats = self.splats_to_show()
+        return splats, self.material_for(splats, material)
+
+    def material_for(self, splats: sj.Splats, material: sj.Material) -> sj.Material:
+        """Give a material as it is rendered with splats."""
         if splats.albedo is not None:
             material = material.white()
             note(f"the splats carry albedo: the weights of {self.material} are divided by their sums")
         material = in_color(material)
-        return splats, material if self.scattering else material.opaque()
+        return material if self.scattering else material.opaque()
 
     def splats_to_show(self) -> sj.Splats:
         """Read the splats, or make the bust."""
@@ -146,6 +151,10 @@ def draw(scene: sj.Scene, camera: sj.Camera, plan: sj.Plan) -> sj.Frame:
     return frame
 
 
+Parts: TypeAlias = Callable[[], Iterator[sj.Splats]]
+"""What gives all splats, part by part, whenever it is called."""
+
+
 def in_color(material: sj.Material) -> sj.Material:
     """Give a material of one channel the same weights for red, green and blue."""
     gaussians = material.gaussians
@@ -168,9 +177,17 @@ def towards(azimuth: float, elevation: float) -> jax.Array:
 
 def frame_all(splats: sj.Splats, direction: jax.Array, fov: float, width: int, height: int) -> sj.Camera:
     """Place a camera in a direction so that the bounding sphere of the splats just fits the narrower side of the picture."""
-    centers = np.asarray(splats.centers)
-    middle = (centers.min(axis=0) + centers.max(axis=0)) / 2
-    radius = float(np.max(np.linalg.norm(centers - middle[None], axis=1) + np.asarray(splats.radii)))
+    return frame_parts(lambda: iter([splats]), direction, fov, width, height)
+
+
+def frame_parts(parts: Parts, direction: jax.Array, fov: float, width: int, height: int) -> sj.Camera:
+    """Do the same for splats that come in parts."""
+    boxes = [(np.min(part.centers, axis=0), np.max(part.centers, axis=0)) for part in parts()]
+    middle = (np.min([low for low, _ in boxes], axis=0) + np.max([high for _, high in boxes], axis=0)) / 2
+    radius = max(
+        float(np.max(np.linalg.norm(np.asarray(part.centers) - middle[None], axis=1) + np.asarray(part.radii)))
+        for part in parts()
+    )
     if not 0 < fov < 180 or width < 1 or height < 1:
         distance = 1.0  # `look_at` refuses, and says why
     else:

@@ -12,6 +12,7 @@ import tyro
 import splatjax as sj
 from splatjax.io import read_record, write_animation, write_record
 
+from ._processes import own_share
 from ._report import note, progress, stage
 from ._shot import Shot, draw
 
@@ -36,7 +37,8 @@ class Turntable(Shot):
     Frames begin at --azimuth and --light-azimuth and go on in equal steps; a full turn ends one step before its beginning, so
     that it plays round and round. The splats are planned and the program is compiled once for all frames. Frames that are there
     are kept: after an interruption, run the same command again. A record in the folder, turntable.json, sees to it that only
-    frames of one kind come together.
+    frames of one kind come together. Where a launcher has started several processes (SLURM, Open MPI, or JAX_COORDINATOR_ADDRESS,
+    JAX_NUM_PROCESSES and JAX_PROCESS_ID), they share the frames of one folder that all of them see.
 
     Example: splatjax turntable head.ply --material skin --frames 72 --output head
     """
@@ -61,8 +63,14 @@ class Turntable(Shot):
         missing = [i for i in range(self.frames) if not all(path.exists() for path in self._paths(i))]
         if len(missing) < self.frames:
             note(f"{self.frames - len(missing)} of {self.frames} frames are there already, and kept")
-        if missing:
-            self._render(missing)
+        share = own_share()  # which waits: all have seen the same frames missing
+        own = share.of(missing)
+        if own:
+            self._render(own)
+        if share.count > 1 and not all(path.exists() for i in range(self.frames) for path in self._paths(i)):
+            note("other processes are still at work; the one that finds every frame there joins them, or the same command again")
+            print(*(path for i in own for path in self._paths(i)), sep="\n")
+            return
         animation = self.output / "turntable.webp"
         with stage(f"writing {animation}"):
             write_animation(animation, [self._paths(i)[1] for i in range(self.frames)], frames_per_second=self.fps)

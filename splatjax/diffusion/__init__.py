@@ -9,9 +9,11 @@ from ._gathered import GatheredLight as GatheredLight, GatheredSlopes as Gathere
 from ._handover import handover_interval as handover_interval, irregularity as irregularity
 from ._handover import resolved_share as resolved_share
 from ._irradiance import entering_irradiance as entering_irradiance
-from ._layers import diffusion_layers as diffusion_layers, DiffusionLayers as DiffusionLayers
+from ._layers import diffusion_layers as diffusion_layers, DiffusionLayers as DiffusionLayers, layers_of as layers_of
 from ._layers import exitance_jacobian as exitance_jacobian, ExitanceJacobian as ExitanceJacobian
 from ._normalization import AbstractNormalization as AbstractNormalization, ExitOdds as ExitOdds, PlainMean as PlainMean
 from ._points import Points as Points, SeenSurface as SeenSurface
 from ._settings import DiffusionSettings as DiffusionSettings
+from ._pixels import Pixels as Pixels
+from ._streamed import StreamedRoom as StreamedRoom, StreamedSums as StreamedSums
 from ._sharded import ShardedDiffuser as ShardedDiffuser

@@ -114,8 +114,7 @@ class ClusterDiffuser(AbstractDiffuser):
         begin, fine = float(interval[0]) ** 2, jnp.asarray(np.quantile(areas, _FINEST), kernels.variances.dtype)
         shares = np.asarray(resolved_share(kernels.variances * self.margin, fine, interval))
         carried = shares > 0
-        edges = _CELL * (self.error / 2e-3) ** (1 / 3) * np.sqrt(values / self.margin)
-        edges = np.where(carried & (edges > _WORTHWHILE * spacing), edges, 0.0)
+        edges = self.edges(values / self.margin, spacing, carried)
         cells = sorted({float(edge) for edge in edges if edge > 0})
         tree = ClusterTree.build(splats.centers, splats.normals, cells)
         origin, levels = _levels(tree, splats)
@@ -134,6 +133,13 @@ class ClusterDiffuser(AbstractDiffuser):
             smallest, largest = (jnp.asarray(edge, depth.dtype) for edge in (v / self.margin, v * self.margin))
             layers.append(LayerPlan(level, support, smallest, largest, capacity, nodes))
         return eqx.tree_at(_parts, self, (tree, tuple(layers)), is_leaf=_is_none)
+
+    def edges(
+        self, variances: Float[np.ndarray, " gaussians"], spacing: float, carried: Bool[np.ndarray, " gaussians"]
+    ) -> Float[np.ndarray, " gaussians"]:
+        """Give the edge (mm) of the cells of each layer; 0 where single splats are as few."""
+        edges = _CELL * (self.error / 2e-3) ** (1 / 3) * np.sqrt(variances)
+        return np.where(carried & (edges > _WORTHWHILE * spacing), edges, 0.0)
 
     def support(self, share: float) -> float:
         """Give the support of a layer, standard deviations, of which the diffusion integral is a share.
@@ -219,14 +225,15 @@ class ClusterDiffuser(AbstractDiffuser):
         """
         dtype, (_, plans) = kernels.variances.dtype, self.plans(kernels)
         carried = jnp.asarray([layer.capacity is not None for layer in plans], dtype)
-        levels, pixels = within() if any(layer.capacity is not None for layer in plans) else ([], None)
         empty = jnp.zeros((covered.shape[0], channels + 1, covered.shape[1]), dtype)
-        layers, needed = [], []
+        layers, needed, known = [], [], None
         plans = jax.tree.map(lambda leaf: leaf.astype(dtype) if eqx.is_inexact_array(leaf) else leaf, plans)
         for variance, depth, layer in zip(kernels.variances, kernels.depths, plans, strict=True):
             if layer.capacity is None:
                 layers.append(empty)
             else:
+                levels, pixels = within() if known is None else known
+                known = levels, pixels
                 gathering = Gathering.of(levels[layer.level], variance, depth)
                 if layer.nodes is None:
                     gather = single if layer.level == 0 else self.at_pixels

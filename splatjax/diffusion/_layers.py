@@ -9,7 +9,7 @@ from splatjax.pointwise import in_parts
 from splatjax.scene import Material
 from splatjax.splatting import TILES_AT_ONCE, Atlas
 
-from ._diffuser import AbstractDiffuser, Kernels, Sources, diffuse_with_slopes
+from ._diffuser import AbstractDiffuser, Diffused, Kernels, Sources, diffuse_with_slopes
 from ._normalization import AbstractNormalization
 from ._points import Points, SeenSurface
 
@@ -55,14 +55,21 @@ def diffusion_layers(
 
     **Source:** Kim et al. 2010, section 4.2; the normalization's own.
     """
-    variances = material.gaussians.variances
-    diffused = diffuser.diffuse(sources, Kernels.of(variances, normalization), seen.points, seen.covered, atlas)
+    kernels = Kernels.of(material.gaussians.variances, normalization)
+    diffused = diffuser.diffuse(sources, kernels, seen.points, seen.covered, atlas)
+    return layers_of(diffused, material, seen, interval, normalization), diffused.needed
+
+
+def layers_of(
+    diffused: Diffused, material: Material, seen: SeenSurface, interval: Float[Array, "2"], normalization: AbstractNormalization
+) -> DiffusionLayers:
+    """Make the layers of the diffusion integrals, and of what the splats are too far apart to carry."""
 
     def layers(seen, means, exits):
         at = Points.of(material, seen, means, exits, diffused.carried)
-        return DiffusionLayers(*_tiles_first(at.layers(interval, normalization, variances)))
+        return DiffusionLayers(*_tiles_first(at.layers(interval, normalization, material.gaussians.variances)))
 
-    return _in_parts(layers, seen, diffused.means, diffused.exits), diffused.needed
+    return _in_parts(layers, seen, diffused.means, diffused.exits)
 
 
 def exitance_jacobian(

@@ -66,6 +66,12 @@ class Pixels(eqx.Module):
         return jnp.pad(places, (0, grid.tiles - places.shape[0]), constant_values=self.tiles.shape[0] - 1)
 
     @property
+    def chunks(self) -> int:
+        """How many chunks of tiles there may be with anything in them."""
+        grid = tile_grid(self.atlas.view.width, self.atlas.view.height, 1)
+        return grid.tiles // grid.lanes
+
+    @property
     def boxes(self) -> Boxes:
         """Boxes around the points of every tile."""
         points = self.tiles.transpose(1, 0, 2).reshape(3, -1)

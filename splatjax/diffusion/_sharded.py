@@ -80,7 +80,7 @@ class ShardedDiffuser(AbstractDiffuser):
 
         def roomy(layer: LayerPlan, variance, depth) -> LayerPlan:
             """Give a layer of single splats room for any device's at the pixels of all."""
-            if layer.level > 0 or layer.capacity is None:
+            if not _of_single_splats(layer):
                 return layer
             largest = float(variance) * whole.margin
             found = [whole.capacity_at(origin, each, None, largest, depth, layer.support, atlases) for each in singles]
@@ -106,29 +106,31 @@ class ShardedDiffuser(AbstractDiffuser):
         covered: Bool[Array, "tiles points"],
         atlas: Atlas,
     ) -> Diffused:
-        rows = sources.areas.shape[0]
-        tree, _ = self.whole.plans(kernels)
+        rows, devices = sources.areas.shape[0], self.devices
+        tree, plans = self.whole.plans(kernels)
+        real = devices.index() * rows + jnp.arange(rows, dtype=jnp.int32) < self.splats
+        origin = stop_gradient(devices.total(jnp.sum(jnp.where(real[None], sources.centers, 0.0), axis=1)) / self.splats)
+        pixels = Pixels.of(points, covered, origin, atlas)
+        everywhere = pixels.of_all(devices) if any(_of_single_splats(layer) for layer in plans) else pixels
 
         def within() -> tuple[list[Clusters], Pixels]:
-            real = self.devices.index() * rows + jnp.arange(rows, dtype=jnp.int32) < self.splats
-            middle = self.devices.total(jnp.sum(jnp.where(real[None], sources.centers, 0.0), axis=1)) / self.splats
-            origin = stop_gradient(middle)
             own = Clusters.of(_placed(dataclasses.replace(sources, centers=sources.centers - origin[:, None]), self.order))
             levels = [own]
             if self.cells is not None:
-                levels += tree.above(own.merged(self.parents, self.cells, self.devices.total))
-            return levels, Pixels.of(points, covered, origin, atlas)
+                levels += tree.above(own.merged(self.parents, self.cells, devices.total))
+            return levels, pixels
 
-        return self.whole.spread(within, kernels, sources.irradiance.shape[0], covered, self._together)
+        def together(gathering: Gathering, support: float, capacity: BinCapacity, pixels: Pixels):
+            """Let the pixels of all devices gather from this device's splats, and add up for its own."""
+            sums, needed = self.whole.at_pixels(gathering, support, capacity, everywhere, as_they_are)
+            sums = jnp.pad(devices.own_share(sums[:-1]), ((0, 1), (0, 0), (0, 0)))
+            return jax.vmap(gathering.finish)(sums, pixels.tiles), needed
 
-    def _together(self, gathering: Gathering, support: float, capacity: BinCapacity, pixels: Pixels):
-        """Let the pixels of all devices gather from each device's splats, and add up."""
-        devices = self.devices
-        everywhere = pixels.of_all(devices)
-        sums, needed = self.whole.at_pixels(gathering, support, capacity, everywhere, as_they_are)
-        sums = devices.own_share(sums[:-1])
-        values = jax.vmap(gathering.finish)(jnp.pad(sums, ((0, 1), (0, 0), (0, 0))), pixels.tiles)
-        return values, needed
+        return self.whole.spread(within, kernels, sources.irradiance.shape[0], covered, together)
+
+
+def _of_single_splats(layer: LayerPlan) -> bool:
+    return layer.level == 0 and layer.capacity is not None
 
 
 def _placed(sources: Sources, order: Int[Array, " places"]) -> Sources:

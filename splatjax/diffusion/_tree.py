@@ -44,7 +44,9 @@ class Clusters(eqx.Module):
         centers = self.centers - depth * self.normals
         return Clusters(centers, self.normals, self.areas, self.irradiance, spread, moments, self.turns, opening, self.bending)
 
-    def merged(self, parents: Int[Array, " clusters"], count: int, total: Callable[[Array], Array] = lambda sums: sums) -> "Clusters":
+    def merged(
+        self, parents: Int[Array, " clusters"], count: int, total: Callable[[Array], Array] = lambda sums: sums
+    ) -> "Clusters":
         """Merge clusters into `count` parents. Area, energy and the first moments of both are kept. Differentiable.
 
         `total` adds up what others have of the same parents.
@@ -114,6 +116,12 @@ class ClusterTree(eqx.Module):
             positions, facing, members = middle[place], toward[place], inside[place]
         order = np.pad(order, (0, blocks_of(splats) - splats), constant_values=splats)
         return cls(jnp.asarray(order, jnp.int32), tuple(parents), tuple(counts))
+
+    def with_room(self, counts: Sequence[int]) -> "ClusterTree":
+        """Give the same tree with room for so many clusters at each level, as many at least as there are; the rest are empty."""
+        before = (self.order.shape[0], *counts)
+        parents = tuple(jnp.pad(each, (0, room - each.shape[0])) for each, room in zip(self.parents, before, strict=False))
+        return ClusterTree(self.order, parents, tuple(counts))
 
     def levels(self, sources: Sources) -> list[Clusters]:
         """Give the clusters of every level, the splats themselves first."""

@@ -16,8 +16,8 @@ from ._pieces import moderate
 from ._ply_columns import Table, colors_of, columns_of, normals_of, places_of, vertex_table
 from ._ply_tables import read_ply
 
-_RADIUS = ("radius", "radii")
-_AREA = ("area", "areas")
+RADIUS = ("radius", "radii")
+AREA = ("area", "areas")
 _SHORTEST, _LONGEST = 1e-9, 1e9  # mm: beyond, single precision loses areas
 _LARGEST = 1e6
 _GAUSSIAN_SPLATTING = ("f_dc_0", "scale_0", "rot_0")
@@ -56,10 +56,10 @@ def read_splats(path: str | os.PathLike[str], *, mm_per_unit: float = 1.0) -> Sp
         )
     centers = places_of(path, vertices)
     normals = normals_of(path, vertices)
-    radii, areas = _positive(path, vertices, _RADIUS, mm_per_unit), _positive(path, vertices, _AREA, mm_per_unit**2)
+    radii, areas = positive_of(path, vertices, RADIUS, mm_per_unit), positive_of(path, vertices, AREA, mm_per_unit**2)
     _check_place(path, centers * mm_per_unit, estimated=radii is None or areas is None)
     albedo = colors_of(path, vertices)
-    specular, roughness = (_factor(path, vertices, name) for name in ("specular", "roughness"))
+    specular, roughness = (factor_of(path, vertices, name) for name in ("specular", "roughness"))
     try:
         return complete_splats(
             centers * mm_per_unit,
@@ -127,7 +127,7 @@ def _check_place(path: Path, centers: np.ndarray, *, estimated: bool) -> None:
         )
 
 
-def _positive(path: Path, vertices: Table, aliases: tuple[str, ...], scale: float) -> np.ndarray | None:
+def positive_of(path: Path, vertices: Table, aliases: tuple[str, ...], scale: float) -> np.ndarray | None:
     name = next((alias for alias in aliases if alias in vertices), None)
     values = None if name is None else columns_of(path, vertices, (name,))
     if values is None:
@@ -145,7 +145,7 @@ def _positive(path: Path, vertices: Table, aliases: tuple[str, ...], scale: floa
     return values * scale
 
 
-def _factor(path: Path, vertices: Table, name: str) -> np.ndarray | None:
+def factor_of(path: Path, vertices: Table, name: str) -> np.ndarray | None:
     values = columns_of(path, vertices, (name,))
     if values is None:
         return None

@@ -71,7 +71,14 @@ def see_surfaces(
 ) -> SeenSurfaces:
     """Passes 2 and 3."""
     summed = plan.camera.summed(splats, jnp.concatenate(list(attributes.values())), view, settings.splatting)
-    atlas = _splatting.Atlas.of(_splatting.farthest_depths(summed, view), view, plan.tiles)
+    return surfaces_of(summed, {name: rows.shape[0] for name, rows in attributes.items()}, view, settings, plan.tiles)
+
+
+def surfaces_of(
+    summed: _splatting.SummedFragments, sizes: dict[str, int], view: _splatting.AbstractView, settings: RenderSettings, tiles: int
+) -> SeenSurfaces:
+    """Blend what is summed of the attributes, so many rows of each, and put it into so many tiles."""
+    atlas = _splatting.Atlas.of(_splatting.farthest_depths(summed, view), view, tiles)
     surface = _splatting.Surface.of(atlas.pack(summed.front, summed.behind), view, settings.splatting)
     covered = stop_gradient(surface.weight_sum) > 0
     depth = jnp.where(covered, surface.depth, 1.0)
@@ -80,7 +87,7 @@ def see_surfaces(
         points=atlas.points(depth).transpose(1, 0, 2),
         depth=depth,
         covered=covered,
-        named=_by_name(attributes, surface.attributes),
+        named=_by_name(sizes, surface.attributes),
         share=atlas.shares(surface.coverage),
         needed=jnp.maximum(summed.needed, atlas.needed),
     )
@@ -225,9 +232,8 @@ def _lit_shares(splats: Splats, groups: list[StackedLights], settings: RenderSet
     return lit, needs
 
 
-def _by_name(attributes: dict[str, Array], packed: Float[Array, "tiles rows pixels"]) -> dict[str, Array]:
-    sizes = [rows.shape[0] for rows in attributes.values()]
-    return dict(zip(attributes, jax.lax.split(packed, sizes, axis=1), strict=True))
+def _by_name(sizes: dict[str, int], packed: Float[Array, "tiles rows pixels"]) -> dict[str, Array]:
+    return dict(zip(sizes, jax.lax.split(packed, list(sizes.values()), axis=1), strict=True))
 
 
 def _shadows_in_order(lit, groups: list[StackedLights], shape, dtype) -> Float[Array, "lights tiles pixels"]:

@@ -14,7 +14,7 @@ from splatjax import diffusion as _diffusion, splatting as _splatting
 from splatjax.scene import AbstractLight, Camera, PointLight, Scene, Splats, StackedLights, stack_lights
 
 from ._inputs import in_one_dtype
-from ._records import Plan, shadow_views, ShadowPlan, ShadowsWanted, Wanted
+from ._records import Plan, ShadowPlan, ShadowsWanted, Wanted, shadow_views
 from ._settings import RenderSettings
 from ._sharded_plan import on_one_device, plan_over
 

@@ -11,7 +11,8 @@ from splatjax.scene import Camera, Frame, Scene
 from ._inputs import SAME, check_channels, in_one_dtype
 from ._lighting import EnteringLight, let_light_in
 from ._passes import cast_shadows, compose, see_surfaces, shade, sources_of
-from ._plan import Plan, plan_unless_traced
+from ._plan import plan_unless_traced
+from ._records import Plan
 from ._settings import RenderSettings
 from ._sharded import render_over
 

@@ -5,10 +5,10 @@ from functools import partial
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
+from jax.sharding import Mesh, PartitionSpec
 
 from splatjax import diffusion as _diffusion, splatting as _splatting
-from splatjax.devices import Devices
+from splatjax.devices import Devices, laid_out
 from splatjax.scene import Camera, Frame, Scene
 
 from ._lighting import let_light_in
@@ -22,20 +22,13 @@ def render_over(mesh: Mesh, scene: Scene, camera: Camera, settings: RenderSettin
     """Render with a plan that is made for a mesh. The picture is on every device; gradients go back to where the splats are."""
     devices = Devices.of(mesh)
     scene = Scene(filled_up(scene.splats, devices), scene.lights, scene.material)
-    specs = jax.tree.map(lambda _: PartitionSpec(), (scene, camera))
+    specs = jax.tree.map(lambda _: PartitionSpec(), (scene, camera, plan))
     specs = eqx.tree_at(lambda each: each[0].splats, specs, jax.tree.map(lambda _: devices.shares, scene.splats))
+    specs = eqx.tree_at(lambda each: each[2], specs, plan_specs(plan, devices))
     # Without a check of what varies over devices: rules of our own derivatives, and loops, are not written for it.
-    share = jax.shard_map(
-        partial(_share, devices, settings), mesh=mesh, in_specs=(*specs, plan_specs(plan)), out_specs=PartitionSpec(), check_vma=False
-    )
-    return share(*_laid_out(mesh, (scene, camera, plan), (*specs, plan_specs(plan))))
-
-
-def _laid_out(mesh: Mesh, trees, specs):
-    """Lay arrays out over a mesh whose axes are explicit; where they are not, `shard_map` does so itself."""
-    if AxisType.Explicit not in mesh.axis_types:
-        return trees
-    return jax.tree.map(lambda leaf, spec: jax.reshard(leaf, NamedSharding(mesh, spec)), trees, specs)
+    share = partial(_share, devices, settings)
+    share = jax.shard_map(share, mesh=mesh, in_specs=specs, out_specs=PartitionSpec(), check_vma=False)
+    return share(*laid_out(mesh, (scene, camera, plan), specs))
 
 
 def _share(devices: Devices, settings: RenderSettings, scene: Scene, camera: Camera, plan: Plan) -> Frame:
@@ -56,8 +49,8 @@ def _share(devices: Devices, settings: RenderSettings, scene: Scene, camera: Cam
     )
     shaded = shade(scene, view, light.groups, seen, layers)
     needed = devices.largest(jnp.max(jnp.stack([needed, seen.needed, light.needed])))
-    shaded, resolved, seen = devices.everything((shaded, layers.resolved)) + (_of_all(seen, devices),)
-    return compose(shaded, seen, resolved, scene.material.gaussians.weights, needed)
+    shaded, resolved = devices.everything((shaded, layers.resolved))
+    return compose(shaded, _of_all(seen, devices), resolved, scene.material.gaussians.weights, needed)
 
 
 def _of_all(seen: SeenSurfaces, devices: Devices) -> SeenSurfaces:

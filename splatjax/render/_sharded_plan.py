@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.experimental.multihost_utils import process_allgather
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jaxtyping import Array, PyTree
+from jaxtyping import PyTree
 
 from splatjax import diffusion as _diffusion, splatting as _splatting
 from splatjax.devices import Devices
@@ -32,7 +32,12 @@ def on_one_device(tree: Whole) -> Whole:
 
 def filled_up(splats: Splats, devices: Devices) -> Splats:
     """Add splats that nobody sees and that bring no light, so that each device has as many."""
-    lacking = max(-(-splats.count // devices.count), 1) * devices.count - splats.count
+    return filled_up_to(splats, max(-(-splats.count // devices.count), 1) * devices.count)
+
+
+def filled_up_to(splats: Splats, count: int) -> Splats:
+    """Add splats that nobody sees and that bring no light."""
+    lacking = count - splats.count
     if lacking == 0:
         return splats
     if splats.count == 0:
@@ -52,8 +57,9 @@ def plan_over(mesh: Mesh, wanted: Wanted) -> Plan:
     **Raises:** `ValueError` when the settings' rasterizer or diffuser cannot be cut.
     """
     settings, devices = wanted.settings, Devices.of(mesh)
-    if not isinstance(settings.rasterizer, _splatting.TileRasterizer):
-        raise ValueError(f"over a mesh the rasterizer must be a TileRasterizer, not a {type(settings.rasterizer).__name__}")
+    of_each = settings.rasterizer
+    if not isinstance(of_each, _splatting.TileRasterizer):
+        raise ValueError(f"over a mesh the rasterizer must be a TileRasterizer, not a {type(of_each).__name__}")
     if not isinstance(settings.diffuser, _diffusion.ClusterDiffuser):
         raise ValueError(f"over a mesh the diffuser must be a ClusterDiffuser, not a {type(settings.diffuser).__name__}")
     whole = filled_up(wanted.splats, devices)
@@ -64,7 +70,7 @@ def plan_over(mesh: Mesh, wanted: Wanted) -> Plan:
     owned = [[np.where(owners == i, look, -np.inf) for i in range(devices.count)] for look in looks]
 
     def rasterizer(views, **tiles) -> _splatting.ShardedRasterizer:
-        part = settings.rasterizer.planned_for_each(parts, views, settings.splatting)
+        part = of_each.planned_for_each(parts, views, settings.splatting)
         return _splatting.ShardedRasterizer(part, devices, **tiles)
 
     share = _splatting.round_up(max(int(np.sum(own[0] > -np.inf)) for each in owned for own in each), 1)
@@ -82,14 +88,13 @@ def plan_over(mesh: Mesh, wanted: Wanted) -> Plan:
         interval=wanted.interval,
         mesh=mesh,
     )
-    return jax.tree.map(lambda leaf, spec: jax.device_put(leaf, NamedSharding(mesh, spec)), made, plan_specs(made))
+    return jax.tree.map(lambda leaf, spec: jax.device_put(leaf, NamedSharding(mesh, spec)), made, plan_specs(made, devices))
 
 
-def plan_specs(plan: Plan) -> Plan:
+def plan_specs(plan: Plan, devices: Devices) -> Plan:
     """Say what of a plan every device has whole, and what it has a share of."""
     specs = jax.tree.map(lambda _: PartitionSpec(), plan)
-    shares = Devices.of(plan.mesh).shares
-    return eqx.tree_at(lambda each: (each.diffuser.order, each.diffuser.parents), specs, (shares, shares))
+    return eqx.tree_at(lambda each: (each.diffuser.order, each.diffuser.parents), specs, (devices.shares, devices.shares))
 
 
 def _owners(looks, count: int) -> np.ndarray:

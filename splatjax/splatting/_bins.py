@@ -145,6 +145,11 @@ class BinCapacity(eqx.Module):
             chunks = max(chunks, int((longest > 0).sum()))
         return cls(round_up(pairs, _ROW), round_up(blocks, 4), min(round_up(chunks, 4), grid.tiles // grid.lanes))
 
+    def grown(self, other: "BinCapacity | None", chunks: int) -> "BinCapacity":
+        """Give a fifth more room than this, as much as another at least, and for so many chunks."""
+        more = BinCapacity(round_up(int(1.2 * self.pairs), _ROW), round_up(int(1.2 * self.blocks), 4), chunks)
+        return more if other is None else BinCapacity(max(more.pairs, other.pairs), max(more.blocks, other.blocks), chunks)
+
 
 def round_up(count: int, step: int) -> int:
     """Round up to the next of sixteen steps per octave, and to a multiple of `step`, with 3% to spare."""

@@ -11,13 +11,12 @@ from jaxtyping import Array, Float, Int
 from splatjax.devices import Devices
 from splatjax.scene import Splats
 
-
 from ._rasterizer import AbstractRasterizer, FragmentSums, SummedFragments
 from ._settings import SplattingSettings
 from ._shadows import Bounds
 from ._stages import Stages, of_tiles, second_limits
-from ._sweeps import Slots, Sweep, backward
-from ._tiles import TileRasterizer
+from ._sweeps import Sweep, backward
+from ._tiles import Binned, TileRasterizer
 from ._views import AbstractView
 
 
@@ -44,22 +43,22 @@ class ShardedRasterizer(AbstractRasterizer):
         self, splats: Splats, attributes: Float[Array, "attributes splats"], view: AbstractView, settings: SplattingSettings
     ) -> SummedFragments:
         binned = self.part.binned(splats, attributes, view, settings)
-        front, behind, shown = _swept(
-            binned.sweep, self.devices, binned.bins, binned.shift, binned.planes, binned.attributes
-        )
+        front, behind, shown = _swept(binned.sweep, self.devices, binned.bins, binned.shift, binned.planes, binned.attributes)
         needed = binned.bins.needed.astype(attributes.dtype)
         if self.owners is None:
             return SummedFragments(*self.devices.total((front, behind)), self.devices.largest(needed))
-        owned, more = self._owned(shown)
+        owned, more = self._owned(shown, self.owners)
         both = jnp.concatenate([front.rows(), behind.rows()], axis=1)
         own = self.devices.own_share(of_tiles(both, owned.reshape(-1), 0))
         whole = jnp.zeros_like(both).at[owned[self.devices.index()]].set(own, mode="drop")
         front, behind = (FragmentSums.of(each) for each in jnp.split(whole, 2, axis=1))
         return SummedFragments(front, behind, self.devices.largest(jnp.maximum(needed, more)))
 
-    def _owned(self, shown: Float[Array, " tiles"]) -> tuple[Int[Array, "devices share"], Float[Array, ""]]:
+    def _owned(
+        self, shown: Float[Array, " tiles"], owners: Int[Array, " tiles"]
+    ) -> tuple[Int[Array, "devices share"], Float[Array, ""]]:
         """List the tiles that show anything by their owner, then the number of all; and how many there are over the room."""
-        own = (shown > 0)[None] & (self.owners[None] == jnp.arange(self.devices.count, dtype=jnp.int32)[:, None])
+        own = (shown > 0)[None] & (owners[None] == jnp.arange(self.devices.count, dtype=jnp.int32)[:, None])
         listed = jax.vmap(lambda tiles: jnp.nonzero(tiles, size=self.share, fill_value=tiles.shape[0])[0])(own)
         return listed.astype(jnp.int32), jnp.max(jnp.sum(own, axis=1)).astype(shown.dtype) / self.share
 
@@ -67,9 +66,7 @@ class ShardedRasterizer(AbstractRasterizer):
 def bounds_over(splats: Splats, devices: Devices) -> Bounds:
     """Give what `Bounds.of` gives, of the splats of all devices. Those without a radius fill a share and do not count."""
     there = splats.radii > 0
-    low, high = (
-        devices.extreme(jnp.where(there[:, None], splats.centers, sign * jnp.inf), largest=sign < 0) for sign in (1, -1)
-    )
+    low, high = (devices.extreme(jnp.where(there[:, None], splats.centers, sign * jnp.inf), largest=sign < 0) for sign in (1, -1))
     center = 0.5 * (low + high)
     offset = splats.centers - center[None]
     squared = devices.extreme(jnp.where(there, jnp.sum(offset * offset, axis=1), -jnp.inf), largest=True)
@@ -79,7 +76,7 @@ def bounds_over(splats: Splats, devices: Devices) -> Bounds:
 
 
 def _forward(sweep: Sweep, devices: Devices, bins, shift, planes, attributes):
-    stages = Stages(sweep, bins, Slots.gathered(shift, planes, attributes, bins))
+    stages = Stages.of(Binned(sweep, bins, shift, planes, attributes))
     limits = devices.largest(stages.limits())
     front = stages.front(limits)
     gaps = stages.gaps(limits, devices.total(front.weights))

@@ -14,6 +14,7 @@ from splatjax.pointwise import zeros_after
 from ._bins import SIDE, Bins
 from ._rasterizer import FragmentSums
 from ._sweeps import Slots, Sweep, picked
+from ._tiles import Binned
 
 
 class Stages(eqx.Module):
@@ -22,6 +23,10 @@ class Stages(eqx.Module):
     sweep: Sweep
     bins: Bins
     slots: Slots
+
+    @classmethod
+    def of(cls, binned: Binned) -> "Stages":
+        return cls(binned.sweep, binned.bins, Slots.gathered(binned.shift, binned.planes, binned.attributes, binned.bins))
 
     @property
     def _count(self) -> int:

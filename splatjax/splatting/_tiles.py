@@ -61,11 +61,20 @@ class TileRasterizer(AbstractRasterizer):
         self, parts: Sequence[Splats], views: Sequence[AbstractView], settings: SplattingSettings
     ) -> "TileRasterizer":
         """Give a rasterizer with room for any of several parts of the splats, all of one size, in each of these views."""
-        grid = self._grid(views[0])
-        counts = [_demand(part, view, settings, grid) for part in parts for view in views]
-        seen = round_up(max(int(seen) for seen, _ in counts), _STEP)
-        bins = BinCapacity.for_counts([per_tile for _, per_tile in counts], grid)
-        return TileRasterizer(self.lanes, self.slots, TileCapacity(min(seen, parts[0].count), bins))
+        counts = [self.demand(part, view, settings) for part in parts for view in views]
+        return self.with_room(counts, parts[0].count, views[0])
+
+    def demand(self, splats: Splats, view: AbstractView, settings: SplattingSettings) -> tuple[Array, Int[Array, " tiles"]]:
+        """Count the splats that may be seen, and the splats of every tile."""
+        return _demand(splats, view, settings, self._grid(view))
+
+    def with_room(
+        self, demands: Sequence[tuple[Array, Int[Array, " tiles"]]], splats: int, view: AbstractView
+    ) -> "TileRasterizer":
+        """Give a rasterizer with room for each of several demands, of so many splats at most."""
+        seen = round_up(max(int(seen) for seen, _ in demands), _STEP)
+        bins = BinCapacity.for_counts([per_tile for _, per_tile in demands], self._grid(view))
+        return TileRasterizer(self.lanes, self.slots, TileCapacity(min(seen, splats), bins))
 
     def summed(
         self, splats: Splats, attributes: Float[Array, "attributes splats"], view: AbstractView, settings: SplattingSettings

@@ -1,5 +1,6 @@
 """One plan for an animation: it holds for every camera and every light."""
 
+import jax
 import jax.numpy as jnp
 import pytest
 from scenes import sheet, two_gaussians
@@ -48,3 +49,11 @@ def test_scenes_that_differ_in_more_than_their_lights_are_refused():
     for other in (scene_under(), scene_under(lamp(0.0, 0.0, -1.0, cast_shadows=False))):
         with pytest.raises(ValueError, match=r"lights of the same kinds.*scenes\[2\]"):
             sj.plan([scene, scene, other], camera, SETTINGS)
+
+
+def test_a_mesh_needs_renderers_that_can_be_cut_and_a_plan_of_its_own():
+    mesh, camera, scene = jax.make_mesh((1,), ("splats",)), camera_at(20.0), scene_under()
+    with pytest.raises(ValueError, match="must be a ClusterDiffuser, not a DenseDiffuser"):
+        sj.plan(scene, camera, SETTINGS, mesh=mesh)
+    with pytest.raises(ValueError, match="the plan is for one device"):
+        sj.render(scene, camera, SETTINGS, sj.plan(scene, camera, SETTINGS), mesh=mesh)

@@ -1,0 +1,82 @@
+"""Splats of a PLY file that is larger than memory, a part at a time."""
+
+import os
+from collections.abc import Iterator
+
+import jax.numpy as jnp
+import numpy as np
+import plyfile
+
+from splatjax.geometry import unit
+from splatjax.scene import Splats
+
+from ._files import existing_file
+from ._library import readable
+from ._pieces import moderate
+from ._ply import AREA, RADIUS, factor_of, positive_of
+from ._ply_columns import Table, colors_of, normals_of, places_of
+
+_PART = 1_000_000
+
+
+class SplatFile:
+    r"""Complete splats in a binary PLY file, read a part at a time: what `splatjax.render_streamed` asks for.
+
+    Their order is that of the file: splats that are near in space should be near in it (`read_splats` sorts, a stream cannot).
+
+    **Arguments:**
+
+    - `path`: a PLY file whose vertices have `x y z`, `nx ny nz`, `radius` and `area`, as `read_splats` reads them, and no lists.
+    - `part`: splats of a part; about 1 kB of memory each.
+    - `mm_per_unit`: length of the file's unit, mm.
+
+    **Raises:** `FileNotFoundError`, or `ValueError` when the file is no binary PLY, or lacks one of these.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], part: int = _PART, *, mm_per_unit: float = 1.0):
+        self.path, self.part, self.mm_per_unit = existing_file(path), part, mm_per_unit
+        if part < 1:
+            raise ValueError(f"part is {part}; it must be at least one splat")
+        if not (np.isfinite(mm_per_unit) and mm_per_unit > 0):
+            raise ValueError(f"{path}: mm_per_unit is {mm_per_unit}; it must be the positive length of the file's unit in mm")
+        with readable(self.path, "PLY"):
+            elements = {element.name: element for element in plyfile.PlyData.read(str(self.path), mmap="r")}
+        vertices = elements["vertex"].data if "vertex" in elements else None
+        if not isinstance(vertices, np.memmap):
+            raise ValueError(f"{path}: its vertices cannot be read in parts; write them as binary, without lists, at least one")
+        self.count, self._rows, self._offset = len(vertices), vertices.dtype, int(vertices.offset)
+        names = self._names = self._rows.names or ()
+        for needed in (("nx",), RADIUS, AREA):
+            if not any(name in names for name in needed):
+                raise ValueError(f"{path}: its vertices have no {needed[0]}, which a part cannot estimate; write complete splats")
+
+    def __call__(self) -> Iterator[Splats]:
+        """Give all splats from the beginning, in mm and in JAX's default precision, in parts of one size but the last.
+
+        **Raises:** `ValueError` when numbers are not finite, or not what `read_splats` asks for.
+        """
+        for begin in range(0, self.count, self.part):
+            size = min(self.part, self.count - begin)
+            # not mapped: pages that were read would count as memory until something else needs it
+            rows = np.fromfile(self.path, self._rows, size, offset=self._offset + begin * self._rows.itemsize)
+            if len(rows) < size:
+                raise ValueError(f"{self.path}: is cut short: vertex {begin + len(rows)} of {self.count} is not there")
+            yield self._splats(begin, rows)
+
+    def _splats(self, begin: int, rows: np.ndarray) -> Splats:
+        where = self.path.with_name(f"{self.path.name}, from vertex {begin}") if begin else self.path
+        scale = self.mm_per_unit
+        table: Table = {name: rows[name] for name in self._names}
+        normals, albedo = normals_of(where, table), colors_of(where, table)
+        assert normals is not None  # nx is there, and not without the others
+        given = (
+            places_of(where, table) * scale,
+            unit(moderate(normals)),
+            positive_of(where, table, RADIUS, scale),
+            positive_of(where, table, AREA, scale**2),
+        )
+        rest = albedo, *(factor_of(where, table, name) for name in ("specular", "roughness"))
+        dtype = jnp.result_type(float)
+        return Splats(
+            *(jnp.asarray(each, dtype) for each in given), *(None if each is None else jnp.asarray(each, dtype) for each in rest)
+        )

@@ -1,0 +1,97 @@
+"""What must be known of all splats before a picture of them can be begun, from a look at one part after the other."""
+
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from splatjax import diffusion as _diffusion, splatting as _splatting
+from splatjax.scene import Splats
+
+_SAMPLED = 4096  # areas of each part
+_PLACES = 64  # as many as `diffusion.irregularity` looks at
+
+
+@dataclass(frozen=True)
+class Survey:
+    """Numbers of all splats. Lengths in mm."""
+
+    count: int
+    rows: int
+    """Splats of a part, but the last."""
+    low: np.ndarray
+    high: np.ndarray
+    reach: float
+    """From the middle of the box to the farthest rim."""
+    spacing: float
+    """Root of the mean area."""
+    fine: float
+    """Area that one splat in a hundred is finer than, of some of each part."""
+    unevenness: float
+    """As `diffusion.irregularity`, but that neighbors are those in the same part."""
+
+    @classmethod
+    def of(cls, parts: Callable[[], Iterable[Splats]]) -> "Survey":
+        """Look at all parts twice.
+
+        **Raises:** `ValueError` when there are no splats, or a part is larger than the first, or smaller and not the last.
+        """
+        sizes, low, high, area, radius, areas = [], [], [], 0.0, 0.0, []
+        for part in parts():
+            if part.count == 0:
+                continue
+            centers, own = np.asarray(part.centers), np.asarray(part.areas)
+            sizes.append(part.count)
+            low.append(centers.min(axis=0))
+            high.append(centers.max(axis=0))
+            area, radius = area + float(own.sum(dtype=np.float64)), max(radius, float(part.radii.max()))
+            areas.append(own[:: max(len(own) // _SAMPLED, 1)])
+        if not sizes:
+            raise ValueError("there are no splats to stream")
+        if any(size != sizes[0] for size in sizes[:-1]) or sizes[-1] > sizes[0]:
+            raise ValueError(f"parts must be of one size, but the last, which may be smaller; these are of {sizes}")
+        lowest, highest = np.min(low, axis=0), np.max(high, axis=0)
+        middle, squared, begin, near, count = (lowest + highest) / 2, 0.0, 0, [], sum(sizes)
+        places = np.linspace(0, count - 1, min(_PLACES, count)).astype(int)
+        for part in parts():
+            offset = np.asarray(part.centers) - middle[None]
+            squared = max(squared, float(np.max(np.sum(offset * offset, axis=1), initial=0)))
+            near += _nearest(part, places[(places >= begin) & (places < begin + part.count)] - begin)
+            begin += part.count
+        distances = np.asarray(near)
+        return cls(
+            count=count,
+            rows=sizes[0],
+            low=lowest,
+            high=highest,
+            reach=math.sqrt(squared) + radius,
+            spacing=math.sqrt(area / count),
+            fine=float(np.quantile(np.concatenate(areas), 0.01)),
+            unevenness=float(np.std(distances) / max(np.mean(distances), 1e-300)),
+        )
+
+    @property
+    def middle(self) -> np.ndarray:
+        """Of the box around all centers."""
+        return (self.low + self.high) / 2
+
+    def bounds(self, dtype) -> _splatting.Bounds:
+        """Give the sphere around all discs."""
+        return _splatting.Bounds(jnp.asarray(self.middle, dtype), jnp.asarray(self.reach, dtype))
+
+    def interval(self, settings: _diffusion.DiffusionSettings, dtype) -> Float[Array, "2"]:
+        """Give the interval of the layers' handover."""
+        return _diffusion.handover_interval(jnp.asarray(self.unevenness, dtype), settings)
+
+
+def _nearest(part: Splats, places: np.ndarray) -> list[float]:
+    """Give the distance of splats to the nearest other one of their part, over the root of their area; of the only one 0."""
+    centers, areas, found = np.asarray(part.centers), np.asarray(part.areas), []
+    for place in places:
+        offset = centers - centers[place][None]
+        squared = np.delete(np.sum(offset * offset, axis=1), place)
+        found.append(math.sqrt(np.min(squared, initial=np.inf) / areas[place]) if len(squared) else 0.0)
+    return found

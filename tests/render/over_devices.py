@@ -1,0 +1,145 @@
+"""Run by test_devices.py in a process of its own, with eight devices: what they find, as JSON."""
+
+import json
+import sys
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import NamedSharding, PartitionSpec
+from scenes import sphere
+
+import splatjax as sj
+from benchmarks.communication import Picture, counted
+from splatjax.diffusion import DenseDiffuser
+from splatjax.splatting import DenseRasterizer, ShadowSettings
+
+SETTINGS = sj.RenderSettings(shadows=ShadowSettings(resolution=32))
+
+
+def scene(count: int = 1501) -> sj.Scene:
+    """A ball of a number of splats that eight does not divide; a layer that the surface stands for, a narrow and a wide one."""
+    splats = sphere(count, 20.0)
+    shade = 0.6 + 0.3 * jnp.sin(splats.centers / 5)
+    splats = eqx.tree_at(lambda each: each.albedo, splats, shade, is_leaf=lambda leaf: leaf is None)
+    weights = jnp.asarray([[0.2, 0.1, 0.1], [0.3, 0.3, 0.2], [0.3, 0.2, 0.1]], float)
+    material = sj.Material(sj.SumOfGaussians(jnp.asarray([0.1, 16.0, 100.0], float), weights))
+    sun = sj.DirectionalLight(jnp.asarray([0.4, -0.5, -1.0], float), jnp.ones(3))
+    lamp = sj.PointLight(jnp.asarray([-60.0, 10.0, 20.0], float), 2000 * jnp.ones(3), cast_shadows=False)
+    return sj.Scene(splats, (sun, lamp), material)
+
+
+def camera(angle: float = 0.0) -> sj.Camera:
+    eye = jnp.asarray([80 * np.sin(angle), 6.0, 80 * np.cos(angle)], float)
+    return sj.Camera.look_at(eye, jnp.zeros(3), fov=34.0, width=44, height=40)
+
+
+@eqx.filter_jit
+def pictured(scene: sj.Scene, camera: sj.Camera, plan: sj.Plan):
+    """Give a loss that looks at every pixel, with all its derivatives, and the picture."""
+
+    def loss(of):
+        frame = sj.render(*of, SETTINGS, plan)
+        wave = jnp.sin(jnp.arange(frame.beauty.size, dtype=frame.beauty.dtype)).reshape(frame.beauty.shape)
+        return jnp.sum(wave * frame.beauty) + jnp.sum(frame.coverage**2) + 1e-3 * jnp.sum(wave * frame.position), frame
+
+    return eqx.filter_value_and_grad(loss, has_aux=True)((scene, camera))
+
+
+def apart(one, other) -> dict[str, float]:
+    """Give by how much each of two trees' leaves differ, over the largest number in it; infinite numbers must be the same."""
+    found = {}
+    for (path, x), y in zip(jax.tree_util.tree_leaves_with_path(one), jax.tree.leaves(other), strict=True):
+        x, y = np.asarray(x), np.asarray(y)
+        finite = np.isfinite(x)
+        same = np.array_equal(finite, np.isfinite(y)) and x.shape == y.shape
+        error = np.max(np.abs(x - y), where=finite, initial=0) / max(np.max(np.abs(x), where=finite, initial=0), 1e-30)
+        found[jax.tree_util.keystr(path)] = float(error) if same else float("inf")
+    return found
+
+
+def splats_cut() -> dict:
+    """One device against eight that each hold a share of the splats."""
+    world, eye = scene(), camera()
+    mesh = jax.make_mesh((4, 2), ("hosts", "devices"))
+    plans = [sj.plan(world, eye, SETTINGS), sj.plan(world, eye, SETTINGS, mesh=mesh)]
+    ((_, one), d_one), ((_, many), d_many) = (pictured(world, eye, plan) for plan in plans)
+    kinds = [[layer.level > 0, layer.nodes is not None] for layer in plans[0].diffuser.layers]
+    return {"frame": apart(one, many), "gradients": apart(d_one, d_many), "overflow": float(many.overflow), "layers": kinds}
+
+
+def traffic() -> dict:
+    """The collectives of the compiled program against the model, with splats that lie where they are worked on."""
+    mesh = jax.make_mesh((8,), ("splats",))
+    world = scene(1504)
+    plan = sj.plan(world, camera(), SETTINGS, mesh=mesh)
+    world = eqx.tree_at(
+        lambda each: each.splats, world, jax.device_put(world.splats, NamedSharding(mesh, PartitionSpec("splats")))
+    )
+    program = jax.jit(lambda splats: sj.render(sj.Scene(splats, world.lights, world.material), camera(), SETTINGS, plan))
+    found = counted(program.lower(world.splats).compile().as_text())
+    layers = [layer for layer in plan.diffuser.whole.layers if layer.capacity is not None]
+    picture = Picture(
+        tiles=30,
+        shown=8 * plan.camera.share,
+        places=8 * plan.tiles,
+        maps=(16,),
+        attributes=14,
+        channels=3,
+        gaussians=3,
+        lights=2,
+        singles=sum(layer.level == 0 for layer in layers),
+        cells=plan.diffuser.cells,
+    )
+    model = picture.traffic()
+    model = {"summed": model.summed, "scattered": model.scattered / 8, "gathered": model.gathered, "sent": picture.sent(8)}
+    return {"model": model, "counted": vars(found) | {"sent": found.sent(8)}}
+
+
+def views_cut() -> dict:
+    """A batch of cameras over the devices against one camera after the other, by plain renderers: their program is small."""
+    settings = sj.RenderSettings(shadows=ShadowSettings(resolution=16), rasterizer=DenseRasterizer(), diffuser=DenseDiffuser())
+    world, cameras = scene(97), [camera(angle) for angle in (0.0, 1.0, 2.0)]
+    plan = sj.plan(world, cameras, settings)
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *cameras)
+    mesh = jax.make_mesh((8,), ("views",))
+
+    def losses(frames):
+        return jnp.sum(frames.beauty**2) + jnp.sum(frames.coverage)
+
+    def draw(scene, camera):
+        return sj.render(scene, camera, settings, plan)
+
+    def one_by_one(of):
+        frames = jax.lax.map(lambda camera: draw(of[0], camera), of[1])
+        return losses(frames), frames
+
+    def over_devices(of):
+        frames = sj.map_over(mesh, draw, *of)
+        return losses(frames), frames
+
+    ((_, one), d_one), ((_, many), d_many) = (
+        eqx.filter_jit(eqx.filter_value_and_grad(each, has_aux=True))((world, stacked)) for each in (one_by_one, over_devices)
+    )
+    return {"frame": apart(one, many), "gradients": apart(d_one, d_many)}
+
+
+def gradients_at_home() -> dict:
+    """Where the gradients of the splats lie, that lie on eight devices: of coverage alone, which is soon compiled."""
+    mesh = jax.make_mesh((8,), ("splats",))
+    world = scene(1504)
+    plan = sj.plan(world, camera(), SETTINGS, mesh=mesh)
+    splats = jax.device_put(world.splats, NamedSharding(mesh, PartitionSpec("splats")))
+
+    def covered(splats):
+        return jnp.sum(sj.render(sj.Scene(splats, world.lights, world.material), camera(), SETTINGS, plan).coverage)
+
+    found = jax.jit(jax.grad(covered))(splats)
+    return {"rows": [shard.data.shape[0] for shard in found.centers.addressable_shards], "spec": str(found.centers.sharding.spec)}
+
+
+if __name__ == "__main__":
+    jax.config.update("jax_numpy_rank_promotion", "raise")
+    jax.config.update("jax_numpy_dtype_promotion", "strict")
+    print(json.dumps({name: globals()[name]() for name in sys.argv[1:]}))

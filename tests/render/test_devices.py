@@ -1,0 +1,69 @@
+"""Eight devices give what one gives, and send each other what the model says. They need a process of their own."""
+
+import json
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytestmark = pytest.mark.once
+
+HERE = Path(__file__).parent
+ROUNDING = 2e-5  # of the largest number of its kind: sums of a thousand terms, in another order
+ANSWERS = "splats_cut", "gradients_at_home", "traffic", "views_cut"
+
+
+def answers(commands, devices):
+    """Run scripts beside each other, each with so many devices; give what they print."""
+    flags = f"--xla_force_host_platform_device_count={devices} {os.environ.get('XLA_FLAGS', '')}"
+    environment = os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(HERE.parents[1])}
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "env": environment}
+    running = [subprocess.Popen([sys.executable, *map(str, words)], **pipes) for words in commands]
+    said = [process.communicate(timeout=600) for process in running]
+    assert all(process.returncode == 0 for process in running), said
+    return [json.loads(out.splitlines()[-1]) for out, _ in said]
+
+
+@pytest.fixture(scope="module")
+def found():
+    """What eight devices find."""
+    return answers([[HERE / "over_devices.py", *ANSWERS]], 8)[0]
+
+
+def test_splats_on_eight_devices_make_the_picture_and_the_gradients_of_one(found):
+    answer = found["splats_cut"]
+    assert answer["overflow"] == 0
+    assert answer["layers"] == [[False, False], [False, False], [True, True]]  # one of single splats, one through nodes
+    assert max(answer["frame"].values()) < ROUNDING, answer["frame"]
+    assert max(answer["gradients"].values()) < ROUNDING, answer["gradients"]
+
+
+def test_gradients_go_back_to_where_the_splats_are(found):
+    assert found["gradients_at_home"]["rows"] == [188] * 8
+
+
+def test_devices_send_each_other_what_the_model_says(found):
+    answer = found["traffic"]
+    for kind, model in answer["model"].items():
+        assert answer["counted"][kind] == pytest.approx(model, rel=0.1), (kind, answer)
+
+
+def test_views_on_eight_devices_are_those_of_one(found):
+    answer = found["views_cut"]
+    assert max(answer["frame"].values()) < ROUNDING, answer["frame"]
+    assert max(answer["gradients"].values()) < ROUNDING, answer["gradients"]
+
+
+@pytest.mark.parametrize("count", [2, 4])
+def test_splats_of_several_processes_make_the_picture_of_one(count):
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    for answer in answers([[HERE / "over_processes.py", i, count, port] for i in range(count)], 4 // count):
+        assert answer["devices"] == 4
+        assert answer["rows"] == [376] * (4 // count)
+        assert max(answer["frame"].values()) < ROUNDING, answer
+        assert answer["gradients"] < ROUNDING

@@ -1,0 +1,83 @@
+"""Splats that come a part at a time make the picture of all at once."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scenes import sphere
+
+import splatjax as sj
+from splatjax.diffusion import ClusterDiffuser, DenseDiffuser
+from splatjax.splatting import ShadowSettings
+
+pytestmark = pytest.mark.once
+
+ROUNDING = 2e-5  # of the largest number of its kind: sums of a thousand terms, in another order
+SHADOWS = ShadowSettings(resolution=32)
+LIGHTS = (
+    sj.DirectionalLight(jnp.asarray([0.4, -0.5, -1.0], float), jnp.ones(3)),
+    sj.PointLight(jnp.asarray([-60.0, 10.0, 20.0], float), 2000 * jnp.ones(3), cast_shadows=False),
+)
+MATERIAL = sj.Material(
+    sj.SumOfGaussians(
+        jnp.asarray([0.1, 9.0, 60.0], float), jnp.asarray([[0.2, 0.1, 0.1], [0.3, 0.3, 0.2], [0.3, 0.2, 0.1]], float)
+    )
+)
+CAMERA = sj.Camera.look_at(jnp.asarray([20.0, 6.0, 78.0], float), jnp.zeros(3), fov=34.0, width=44, height=40)
+
+
+@pytest.fixture(scope="module")
+def splats():
+    """A ball, and a smaller one before it that casts its shadow on it: what is in front comes last."""
+    balls = sphere(1400, 20.0), sphere(300, 6.0)
+    before = jnp.asarray([-8.0, 6.0, 30.0], float)
+    balls = balls[0], eqx.tree_at(lambda ball: ball.centers, balls[1], balls[1].centers + before[None])
+    both = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *balls)
+    return eqx.tree_at(lambda each: each.albedo, both, 0.6 + 0.3 * jnp.sin(both.centers / 5), is_leaf=lambda leaf: leaf is None)
+
+
+def in_parts(splats, size):
+    def parts():
+        for begin in range(0, splats.count, size):
+            yield jax.tree.map(lambda leaf: leaf[begin : begin + size], splats)  # noqa: B023
+
+    return parts
+
+
+def apart(one, other):
+    """Give by how much each field of two frames differs, over the largest number in it; infinite numbers must be the same."""
+    found = {}
+    for name in ("beauty", "coverage", "depth", "position", "normal", "albedo", "shadow", "irradiance", "specular", "layers"):
+        x, y = np.asarray(getattr(one, name)), np.asarray(getattr(other, name))
+        finite = np.isfinite(x)
+        np.testing.assert_array_equal(finite, np.isfinite(y))
+        found[name] = np.abs(x[finite] - y[finite]).max() / np.abs(x[finite]).max()
+    return found
+
+
+@pytest.mark.parametrize("error", [0.0, 2e-3])
+def test_parts_make_the_picture_of_all_at_once(splats, error):
+    settings = sj.RenderSettings(shadows=SHADOWS, diffuser=ClusterDiffuser(error=error))
+    whole = sj.render(sj.Scene(splats, LIGHTS, MATERIAL), CAMERA, settings)
+    done = []
+    streamed = sj.render_streamed(
+        in_parts(splats, 500), LIGHTS, MATERIAL, CAMERA, settings, lambda what, count: done.append((what, count))
+    )
+    assert streamed.overflow == 0
+    assert [count for what, count in done if what == "diffusion"] == [500, 1000, 1500, 1700]
+    found = apart(whole, streamed)
+    if error > 0:
+        assert found.pop("layers") < 0.02  # clusters of parts are others: docs/diffusion_error.md
+        assert found.pop("beauty") < 0.02
+    assert max(found.values()) < ROUNDING, found
+
+
+def test_what_cannot_be_streamed_is_refused(splats):
+    with pytest.raises(ValueError, match="DenseDiffuser"):
+        sj.render_streamed(in_parts(splats, 500), LIGHTS, MATERIAL, CAMERA, sj.RenderSettings(diffuser=DenseDiffuser()))
+    with pytest.raises(ValueError, match="no splats"):
+        sj.render_streamed(lambda: iter(()), LIGHTS, MATERIAL, CAMERA)
+    parts = [jax.tree.map(lambda leaf, size=size: leaf[:size], splats) for size in (10, 20)]
+    with pytest.raises(ValueError, match="of one size"):
+        sj.render_streamed(lambda: iter(parts), LIGHTS, MATERIAL, CAMERA)
