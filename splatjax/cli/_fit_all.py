@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
+from jaxtyping import Array, Float
 
 import splatjax as sj
 from splatjax.fitting import AbstractWeights
@@ -65,20 +66,21 @@ def fit_all(media: Path, output: Path, count: int, weights: AbstractWeights) -> 
 
 
 @eqx.filter_jit
-def _fit_each(media: sj.Medium, starts, count: int, weights: AbstractWeights):
-    def fit(medium):
+def _fit_each(coefficients: Float[Array, "media 3"], starts, count: int, weights: AbstractWeights):
+    def fit(row):
+        medium = sj.Medium(row[0:1], row[1:2], row[2:3])
         start = sj.GivenVariances(starts(medium, count).variances[0])
         fitted = sj.fit_gaussians(sj.Dipole(medium), count, start=start, weights=weights, throw=False)
         return fitted, fitted.result == optx.RESULTS.successful
 
-    return eqx.filter_vmap(fit)(media)
+    return eqx.filter_vmap(fit)(coefficients)
 
 
 def _fitted(coefficients: np.ndarray, count: int, weights: AbstractWeights) -> dict[str, np.ndarray]:
     """Give the columns of a batch; a smaller one is filled up, so that one program serves all."""
     given = len(coefficients)
     whole = np.pad(coefficients, ((0, _TOGETHER - given), (0, 0)), mode="edge")
-    found, converged = _fit_each(sj.Medium(*(jnp.asarray(each)[:, None] for each in whole.T)), sj.dipole_starts(), count, weights)
+    found, converged = _fit_each(jnp.asarray(whole), sj.dipole_starts(), count, weights)
     columns = dict(zip(("sigma_a", "sigma_s_prime", "eta"), coefficients.T, strict=True))
     columns |= {f"variance_{i + 1}": found.gaussians.variances[:, i] for i in range(count)}
     columns |= {f"weight_{i + 1}": found.gaussians.weights[:, i, 0] for i in range(count)}
