@@ -44,7 +44,7 @@ def test_a_table_of_media_becomes_a_table_of_fits_and_is_taken_up_again(media, t
     assert said.out == f"{tmp_path / 'fits.csv'}\n"
     assert "2 of 3 batches are there already" in said.err
     assert not (tmp_path / "fits.csv.parts").exists()
-    rows = list(csv.DictReader((tmp_path / "fits.csv").open()))
+    rows = list(csv.DictReader((tmp_path / "fits.csv").read_text().splitlines()))
     assert [row["name"] for row in rows] == [name for name, *_ in MEDIA]
     assert all(float(row["converged"]) == 1 for row in rows)
     with jax.enable_x64(True):
