@@ -8,6 +8,7 @@ ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 _FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 _TYPED = re.compile(r"^ {4}((?:splatjax|make|python) .*)$", re.MULTILINE)
+_CONTINUED = re.compile(r" \\\n +")
 _QUOTED = re.compile(r"`((?:splatjax|make|python) [^`]*)`")
 
 
@@ -23,7 +24,7 @@ def fences(page: Path, language: str) -> list[str]:
 
 def commands(page: Path, *, quoted: bool = False) -> list[str]:
     """Give the command lines of a page without their comments; those in running text too, if they are to be `quoted`."""
-    prose = _FENCE.sub("", page.read_text(encoding="utf-8"))
+    prose = _CONTINUED.sub(" ", _FENCE.sub("", page.read_text(encoding="utf-8")))
     lines = [*_TYPED.findall(prose), *(_QUOTED.findall(prose) if quoted else [])]
     return [re.split(r"\s+#", " ".join(line.split()))[0] for line in lines]
 
