@@ -27,6 +27,7 @@ from .surface_truth import integrate
 NORMALIZATIONS = {"mean": PlainMean(), "odds": ExitOdds()}
 STRETCHES = (1.0, 1.25, 1.6, 2.5, np.inf)
 RIM = 2  # pixels
+JUMP = 3.0  # mm from pixel to pixel: there one surface ends before another
 NOSE = (0.5, 0.48)  # of the picture, from the top and from the left
 
 
@@ -154,6 +155,8 @@ class Seen(NamedTuple):
     shares: np.ndarray
     there: np.ndarray
     """Where every method shows the surface."""
+    ends: np.ndarray
+    """Where the surface ends before another one."""
 
     @classmethod
     def of(cls, body: Body, camera, found: dict[str, Found]) -> "Seen":
@@ -163,12 +166,19 @@ class Seen(NamedTuple):
         there = np.asarray(seen.covered)
         for each in found.values():
             there = there & each.covered
-        return cls(np.asarray(seen.faces), np.asarray(rivals.barycentrics(landing, seen)), there)
+        faces, shares = np.asarray(seen.faces), np.asarray(rivals.barycentrics(landing, seen))
+        places = np.einsum("yxk,yxkc->yxc", shares, np.asarray(body.mesh.corners())[faces])
+        ends = np.zeros(there.shape, bool)
+        for axis in (0, 1):
+            jumps = np.linalg.norm(np.diff(places, axis=axis), axis=2) > JUMP
+            for pad in ((0, 1), (1, 0)):
+                ends |= np.pad(jumps, [pad if each == axis else (0, 0) for each in (0, 1)])
+        return cls(faces, shares, there, ends)
 
     def choose(self, count: int) -> tuple[np.ndarray, np.ndarray]:
         """Choose pixels at random, at least two from where anything ends."""
         steps, (height, width) = range(2 * RIM + 1), self.there.shape
-        padded = np.pad(self.there, RIM)
+        padded = np.pad(self.there & ~self.ends, RIM)
         inside = np.all([padded[i : i + height, j : j + width] for i in steps for j in steps], axis=0)
         rows, columns = np.nonzero(inside)
         picked = np.random.default_rng(0).choice(len(rows), min(count, len(rows)), replace=False)
