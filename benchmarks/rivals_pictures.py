@@ -33,7 +33,7 @@ def errors(
         off = np.where(covered[..., None], 0.5 + 5 * (picture - truth) / scale, 0.5)
         axis.imshow(np.clip(off, 0, 1), interpolation="nearest")
         axis.set_title(name, fontsize=7)
-    figure.tight_layout(pad=0.3)
+    figure.tight_layout(pad=0.3, h_pad=1.2)
     figure.savefig(path.with_suffix(".raw.png"), dpi=100)
     plt.close(figure)
     with Image.open(path.with_suffix(".raw.png")) as picture:
