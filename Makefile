@@ -77,7 +77,7 @@ NOTEBOOKS := $(wildcard notebooks/*.py)
 SOURCES := $(shell find splatjax profiles -name '*.py' -o -name '*.toml')
 
 docs: $(VENV)/docs $(NOTEBOOKS:notebooks/%.py=out/notebooks/%.ipynb)
-	$(BIN)/python -m mkdocs build --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet
 	$(BIN)/python tools/check_site.py out/site
 	@echo "out/site/index.html; with search: python3 -m http.server --directory out/site"
 

@@ -12,6 +12,7 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
+from latex2mathml.converter import convert
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
@@ -45,6 +46,7 @@ ROOMS = (
     "pointwise",
 )
 _LINK = re.compile(r"(\]\()([^)#\s]+)(#[^)\s]*)?(\))")
+_MATHS = re.compile(r"\$([^$\n]+)\$")
 _NAME = re.compile(r"(?<!\[)`(splatjax(?:\.\w+)+)`(?!\])")
 
 
@@ -61,9 +63,13 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
     """Lead links to the places that pages have on the site, and names of the library to what is said of them."""
     here = page.file.src_uri
+    if here in ("index.md", "tour.md", "gallery.md"):
+        page.meta["hide"] = ["navigation"]  # a page alone in its tab
     written = next((source for source, place in MOVED.items() if place == here), f"docs/{here}")
-    if here.startswith(("api/", "notebooks/")):
+    if here.startswith("api/") or here == MOVED["notebooks"]:
         return markdown
+    if here.startswith("notebooks/"):
+        written = here
     names = _documented()
 
     def led(match: re.Match) -> str:
@@ -71,6 +77,8 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
         if "://" in target:
             return match.group()
         place = posixpath.normpath(posixpath.join(posixpath.dirname(written), target))
+        if here.startswith("notebooks/") and not place.startswith("docs/"):
+            return match.group()  # its own pictures
         return f"{opened}{posixpath.relpath(_place(place), posixpath.dirname(here) or '.')}{anchor or ''}{closed}"
 
     parts = re.split(r"(^```.*?^```$)", _LINK.sub(led, markdown), flags=re.MULTILINE | re.DOTALL)
@@ -104,7 +112,7 @@ def _notebook(path: Path) -> tuple[str, dict[str, bytes]]:
     for cell in json.loads(path.read_text(encoding="utf-8"))["cells"]:
         source = "".join(cell["source"])
         if cell["cell_type"] == "markdown":
-            parts.append(source)
+            parts.append(_MATHS.sub(lambda m: convert(m[1]), source))  # browsers show MathML without a script
             continue
         shown = "\n".join(line.removesuffix("  # noqa: B018") for line in source.splitlines() if not line.startswith("%"))
         parts.append(f"```python\n{shown}\n```")

@@ -13,13 +13,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from PIL import Image
+from scipy.interpolate import CubicSpline
 
 import splatjax as sj
 from splatjax.geometry import Mesh, sample_mesh, vertex_normals
 from splatjax.io import linear_to_srgb
 
 FOLDER = Path(__file__).resolve().parents[1] / "out" / "gallery"
-SIDE = 640  # pixels
 HELD = sj.NonNegativeWeights(sj.TotalReflectanceHeld())
 
 
@@ -33,7 +33,7 @@ def fill(x: float, y: float, z: float, strength: float) -> sj.DirectionalLight:
     return sj.DirectionalLight(-jnp.asarray([x, y, z]), jnp.full(3, strength * jnp.pi), cast_shadows=False)
 
 
-def looking(eye, target, fov: float, side: int = SIDE) -> sj.Camera:
+def looking(eye, target, fov: float, side: int) -> sj.Camera:
     """Give a camera for a square picture."""
     return sj.Camera.look_at(jnp.asarray(eye, float), jnp.asarray(target, float), fov=fov, width=side, height=side)
 
@@ -55,8 +55,10 @@ def show(picture, exposure: float = 0.0) -> np.ndarray:
 
 
 def render(splats: sj.Splats, lights: tuple, material: sj.Material, camera: sj.Camera, exposure: float = 0.0) -> np.ndarray:
-    """Render, and give the picture as a display shows it."""
-    return show(sj.render(sj.Scene(splats, lights, material), camera).beauty, exposure)
+    """Render before a dark wall, lighter below, and give the picture as a display shows it."""
+    frame = sj.render(sj.Scene(splats, lights, material), camera)
+    wall = np.linspace(0.012, 0.04, camera.height)[:, None, None] * np.asarray([0.9, 1.0, 1.1])
+    return show(frame.beauty, exposure) + linear_to_srgb(wall) * (1 - np.asarray(frame.coverage))[..., None]
 
 
 def surface(points: np.ndarray, around: bool = True) -> Mesh:
@@ -96,7 +98,7 @@ def smooth(outline: list[tuple[float, float]], step: float = 0.5, width: float =
     return np.maximum(rounded, [[0.0, -np.inf]])
 
 
-def skin(head: sj.Splats, which: int) -> np.ndarray:
+def skin(head: sj.Splats, side: int, which: int) -> np.ndarray:
     """A face, a cheek with its nose, and the corner of an eye: the same skin from three distances."""
     middle = np.asarray(head.centers).mean(axis=0)
     low, high = (np.asarray(getattr(head.centers, end)(axis=0)) for end in ("min", "max"))
@@ -106,36 +108,40 @@ def skin(head: sj.Splats, which: int) -> np.ndarray:
     fov, eye = (21.0, 8.0, 3.2)[which], place + tall * np.asarray([1.1, 0.1, 2.4])
     lights = sun(-0.9, 0.7, 0.9, 1.0, (1.0, 0.97, 0.92)), sun(1.0, 0.1, -0.3, 0.5, (0.8, 0.9, 1.0)), fill(0.8, 0, 1, 0.06)
     material = sj.load_material("skin").white()
-    return render(head, lights, material, looking(eye, place + tall * targets[which], fov), 0.4)
+    return render(head, lights, material, looking(eye, place + tall * targets[which], fov, side), 0.4)
 
 
-def marble_bust(_: sj.Splats) -> np.ndarray:
+def marble_bust(_: sj.Splats, side: int) -> np.ndarray:
     """The bust in marble's own color, without its map."""
     bust = sj.bust(250_000)
     plain = sj.Splats(bust.centers, bust.normals, bust.radii, bust.areas)
     lights = sun(-0.8, 0.7, 0.6, 1.1, (1.0, 0.96, 0.9)), sun(0.9, 0.2, -0.7, 0.7, (0.75, 0.86, 1.0)), fill(0.5, 0, 1, 0.08)
-    return render(plain, lights, sj.load_material("marble"), looking((230, 20, 640), (0, -52, 0), 27.0), 0.0)
+    return render(plain, lights, sj.load_material("marble"), looking((230, 20, 640), (0, -40, 0), 30.0, side), 0.2)
 
 
-def milk_glass(_: sj.Splats) -> np.ndarray:
+def milk_glass(_: sj.Splats, side: int) -> np.ndarray:
     """A fluted vase of milk glass, 3 mm thick, with a lamp inside its rim and daylight from the side."""
-    outer = [(0, 0), (26, 0), (27, 3), (24, 8), (33, 30), (39, 52), (36, 72), (24, 92), (21, 100), (27, 112)]
-    inner = [(25, 112), (18, 100), (21, 91), (33, 71), (36, 52), (30, 30), (20, 9), (0, 6)]
-    vase = turned(smooth([*outer, *inner], width=1.2), flutes=14, depth=0.035)
+    heights = np.linspace(2, 112, 111)
+    radii = CubicSpline([2, 12, 30, 52, 72, 92, 101, 112], [24, 24.5, 33, 39, 36, 25, 22.5, 28])(heights)
+    walls = [np.stack([radii - inset, heights], axis=-1) for inset in (0.0, 2.6)]
+    outline = [(0, 0), (22, 0), *walls[0], *walls[1][:3:-1], (16, 5), (0, 5)]
+    vase = turned(smooth(outline, width=0.8), flutes=14, depth=0.03)
     splats = sample_mesh(vase, 300_000)
     opal = fitted(sj.BetterDipole(medium([0.0015, 0.002, 0.0028], [1.6, 1.9, 2.3], 1.5)), 1.5, 1.0, 0.07)
-    lamp = sj.PointLight(jnp.asarray([0.0, 60.0, 0.0]), jnp.asarray([1500.0, 900.0, 420.0]))
-    lights = lamp, sun(-0.9, 0.6, 0.5, 0.7, (0.85, 0.93, 1.0)), fill(0.6, 0.1, 0.8, 0.06)
-    return render(splats, lights, opal, looking((70, 120, 330), (0, 56, 0), 23.0), 0.0)
+    lamp = sj.PointLight(jnp.asarray([0.0, 60.0, 0.0]), jnp.asarray([7000.0, 4000.0, 1800.0]))
+    lights = lamp, sun(-0.9, 0.6, 0.5, 0.45, (0.75, 0.88, 1.0)), fill(0.6, 0.1, 0.8, 0.04)
+    return render(splats, lights, opal, looking((70, 130, 330), (0, 56, 0), 24.0, side), 0.0)
 
 
-def jade(_: sj.Splats) -> np.ndarray:
+def jade(_: sj.Splats, side: int) -> np.ndarray:
     """A disc of jade under a brown skin of half a millimetre, carved with grains, lit from behind and from the side."""
     inner, outer, thick, grain = 13.0, 44.0, 5.0, 0.9
     middle, half = (inner + outer) / 2, (outer - inner) / 2
-    t, angle = 2 * np.pi * np.arange(900) / 900, 2 * np.pi * np.arange(1200) / 1200
-    power = 2 / 7  # a rectangle with round corners
-    across, up = (np.sign(f(t)) * np.abs(f(t)) ** power for f in (np.cos, np.sin))
+    t, angle = np.linspace(0, 2 * np.pi, 40_001), 2 * np.pi * np.arange(1200) / 1200
+    outline = np.stack([np.sign(f(t)) * np.abs(f(t)) ** (2 / 7) for f in (np.cos, np.sin)], axis=-1)  # round corners
+    way = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(outline * [half, thick / 2], axis=0), axis=1))])
+    even = np.linspace(0, way[-1], 600, endpoint=False)
+    across, up = (np.interp(even, way, outline[:, k]) for k in range(2))
     radius = (middle + half * across)[:, None] + 0 * angle
     height = (thick / 2 * up)[:, None] + 0 * angle
     x, y = radius * np.cos(angle), radius * np.sin(angle)
@@ -150,14 +156,14 @@ def jade(_: sj.Splats) -> np.ndarray:
     height = height + np.sign(height) * grain * np.maximum(raised, rim) * (np.abs(up)[:, None] > 0.9)
     disc = surface(np.stack([x, y, height], axis=-1))
     splats = sample_mesh(disc, 400_000)
-    crust = sj.Layer(medium([0.02, 0.05, 0.16], [3.0, 3.2, 3.4], 1.55), jnp.asarray(0.4))
-    stone = sj.Layer(medium([0.035, 0.006, 0.028], [1.0, 1.1, 1.2], 1.55), jnp.asarray(jnp.inf))
+    crust = sj.Layer(medium([0.04, 0.06, 0.2], [3.0, 3.2, 3.4], 1.55), jnp.asarray(0.4))
+    stone = sj.Layer(medium([0.16, 0.022, 0.1], [0.9, 1.0, 1.1], 1.55), jnp.asarray(jnp.inf))
     material = fitted(sj.LayeredMultipole([crust, stone]), 1.6, 0.9, 0.12)
-    lights = sun(0.5, 0.5, -1.0, 2.2, (1.0, 0.95, 0.85)), sun(-0.9, 0.8, 0.7, 0.9), fill(0.7, -0.4, 1, 0.1)
-    return render(splats, lights, material, looking((-60, 40, 230), (0, 0, 0), 25.0), 0.3)
+    lights = sun(0.5, 0.5, -1.0, 3.0, (1.0, 0.95, 0.85)), sun(-0.9, 0.8, 0.5, 0.8), fill(0.7, -0.4, 1, 0.06)
+    return render(splats, lights, material, looking((-60, 40, 230), (0, 0, 0), 25.0, side), 0.2)
 
 
-def wax(_: sj.Splats) -> np.ndarray:
+def wax(_: sj.Splats, side: int) -> np.ndarray:
     """A candle that has burnt down a little: its flame stands behind the rim, and the rim glows."""
     outline = [(0, 0), (29, 0), (30, 1.5), (30, 78), (28.5, 80.5), (27, 80), (25.5, 70), (21, 60), (10, 56), (0, 55.5)]
     grid = turned(smooth(outline, width=0.8), columns=480)
@@ -170,14 +176,14 @@ def wax(_: sj.Splats) -> np.ndarray:
     paraffin = fitted(sj.BetterDipole(medium([0.0006, 0.0022, 0.009], [0.9, 1.0, 1.15], 1.44)), 1.44, 0.6, 0.2)
     flame = sj.PointLight(jnp.asarray([0.0, 69.0, 0.0]), jnp.asarray([5200.0, 3400.0, 1700.0]))
     lights = flame, sun(-0.8, 0.5, -0.9, 0.25, (0.6, 0.75, 1.0)), sun(0.8, 0.5, 0.8, 0.05, (0.6, 0.75, 1.0))
-    return render(splats, lights, paraffin, looking((60, 105, 260), (0, 44, 0), 24.0), 0.0)
+    return render(splats, lights, paraffin, looking((60, 92, 260), (0, 42, 0), 23.0, side), 0.3)
 
 
-def inverse(_: sj.Splats) -> np.ndarray:
+def inverse(_: sj.Splats, side: int) -> np.ndarray:
     """What was photographed, the same under the coefficients that the search starts from, and under those that it finds."""
-    bust, size, scale = sj.bust(60_000), 320, 0.2
+    bust, scale = sj.bust(60_000), 0.2
     splats = sj.Splats(scale * bust.centers, bust.normals, scale * bust.radii, scale * scale * bust.areas)
-    camera = looking((20, 0, 125), (0, -10, 0), 27.0, size)
+    camera = looking((20, 0, 125), (0, -10, 0), 27.0, side // 2)
     lamp = sun(0.9, 0.35, 0.25, 1.0)
     with jax.enable_x64(True):
         true, begin = sj.load_medium("wholemilk"), sj.load_medium("skin1")
@@ -200,7 +206,7 @@ def single(material: sj.Material) -> sj.Material:
     return jax.tree.map(lambda leaf: leaf.astype(jnp.float32), material)
 
 
-PICTURES: dict[str, Callable[[sj.Splats], np.ndarray]] = {
+PICTURES: dict[str, Callable[[sj.Splats, int], np.ndarray]] = {
     "skin_far": functools.partial(skin, which=0),
     "skin_near": functools.partial(skin, which=1),
     "skin_close": functools.partial(skin, which=2),
@@ -217,6 +223,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python tools/make_gallery.py", description=__doc__)
     parser.add_argument("names", nargs="*", help=f"of {', '.join(PICTURES)}; all by default")
     parser.add_argument("--head", type=Path, help="PLY file of a head, for the pictures of skin; the built-in bust by default")
+    parser.add_argument("--side", type=int, default=640, help="of a picture, pixels (default %(default)s)")
     given = parser.parse_args()
     if unknown := sorted(set(given.names) - set(PICTURES)):
         parser.error(f"{unknown[0]} is no picture of the gallery; give some of {', '.join(PICTURES)}")
@@ -226,7 +233,7 @@ def main() -> None:
         head = sj.bust(400_000) if given.head is None else sj.read_splats(given.head)
     FOLDER.mkdir(parents=True, exist_ok=True)
     for name in names:
-        picture = np.uint8(np.round(255 * np.clip(PICTURES[name](head), 0, 1)))
+        picture = np.uint8(np.round(255 * np.clip(PICTURES[name](head, given.side), 0, 1)))
         Image.fromarray(picture).save(FOLDER / f"{name}.png", optimize=True)
         print(FOLDER / f"{name}.png", flush=True)
 
