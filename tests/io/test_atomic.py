@@ -1,9 +1,13 @@
 """Files are written whole or not at all."""
 
+import os
 import resource
+import shutil
 import signal
 import subprocess
 import sys
+import tempfile
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -116,3 +120,44 @@ def test_a_full_disk_leaves_what_stood_there_and_no_litter(tmp_path, name, small
     assert caught.value.filename == str(target)
     assert target.read_text() == "before"
     assert list(tmp_path.iterdir()) == [target]
+
+
+@pytest.fixture
+def read_only():
+    """A folder that may be read and not written to, by root neither: it becomes nobody for a while."""
+    folder = Path(tempfile.mkdtemp())
+    (folder / "before").write_text("before")
+    folder.chmod(0o555)
+    as_root = os.geteuid() == 0
+    if as_root:
+        os.seteuid(65534)
+    yield folder
+    if as_root:
+        os.seteuid(0)
+    folder.chmod(0o755)
+    shutil.rmtree(folder)
+
+
+@pytest.fixture
+def ready(tmp_path):
+    """Whatever writers import is there."""
+    for name, write in WRITERS.items():
+        write(tmp_path / name)
+
+
+@pytest.mark.usefixtures("ready")
+def test_a_read_only_folder_is_said(read_only):
+    for name, write in WRITERS.items():
+        with pytest.raises(PermissionError, match="cannot be written: Permission denied") as caught:
+            write(read_only / name)
+        assert caught.value.filename == str(read_only / name)
+    assert [path.name for path in read_only.iterdir()] == ["before"]
+
+
+@pytest.mark.once
+def test_killed_at_any_moment():
+    """Writers of every kind, and a turntable that goes on afterwards; `python tools/kill_writers.py` does it fifty times."""
+    tool = Path(__file__).parent.parent.parent / "tools" / "kill_writers.py"
+    done = subprocess.run([sys.executable, str(tool), "3"], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert done.stdout.count("3 kills") == 6
