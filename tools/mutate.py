@@ -264,6 +264,7 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, default=ROOT / "out" / "mutants")
     parser.add_argument("--budget", type=float, default=30.0, help="seconds of tests for a mutant, in each precision")
     parser.add_argument("--minutes", type=float, default=1e9, help="stop then")
+    parser.add_argument("--single-only", action="store_true", help="without the tests in double precision")
     given = parser.parse_args()
     os.environ["XLA_FLAGS"] = LEAST
     import beartype, equinox, jax, matplotlib, optimistix, pytest, scipy.optimize, scipy.spatial  # noqa: E401, F401, I001
@@ -273,10 +274,11 @@ def main() -> None:
     for name in ("splatjax", "tests", "profiles"):
         shutil.copytree(ROOT / name, copy / name)
     shutil.copy2(ROOT / "pyproject.toml", copy)
-    for double in (False, True):
+    precisions = (False,) if given.single_only else (False, True)
+    for double in precisions:
         measure(folder, copy, double)
     sys.dont_write_bytecode = True  # from here on what is cached is the project's own
-    tables = {double: lines_to_tests(folder, copy, double) for double in (False, True)}
+    tables = {double: lines_to_tests(folder, copy, double) for double in precisions}
     record = folder / "met.jsonl"
     met = {each["name"]: each for each in map(json.loads, record.read_text().splitlines())} if record.exists() else {}
     began = time.time()
@@ -286,7 +288,7 @@ def main() -> None:
         if time.time() - began > 60 * given.minutes:
             break
         fate, took, tests = "no test", 0.0, []
-        for double in (False, True):
+        for double in precisions:
             lines, seconds = tables[double]
             tests = chosen(mutant, lines, seconds, given.budget)
             if tests:
