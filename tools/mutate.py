@@ -253,6 +253,8 @@ def meet(mutant: Mutant, copy: Path, double: bool, tests: list[str], seconds: fl
         status, took = in_child(copy.parent / "log", lambda: pytest_in(copy, double, ["-x", *tests]), more + times * seconds)
     finally:
         shutil.copy2(ROOT / mutant.path, target)
+    if status not in (0, 1, 2, 5) and status >= 0:  # 2: it cannot be imported
+        raise RuntimeError(f"pytest ended with status {status}; {copy.parent / 'log'} says why")
     return ("lives" if status in (0, 5) else "too slow" if status in (-24, -9) else "killed"), took
 
 
