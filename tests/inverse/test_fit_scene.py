@@ -272,7 +272,7 @@ def test_a_robust_loss_is_not_misled_by_rows_that_shine(monkeypatch):
     assert float(jnp.min(misled.splats.albedo)) > 0.85
 
 
-@pytest.mark.slow
+@pytest.mark.once
 @pytest.mark.long
 def test_a_camera_that_comes_closer_outgrows_its_plan_and_arrives():
     """The renderer's own plan: the body fills four times the pixels that it filled at the start."""

@@ -3,14 +3,17 @@
 from functools import cache
 
 import bodies
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import splatjax as sj
-from splatjax.diffusion import DenseDiffuser, resolved_share
+from splatjax.diffusion import DenseDiffuser, GatheredLight, PlainMean, resolved_share
 from splatjax.inverse._evidence import Evidence
+from splatjax.inverse._flat import FlatPictures
+from splatjax.inverse._problem import Held, Problem, Unknowns, solution
 from splatjax.splatting import DenseRasterizer
 
 PLAIN = sj.RenderSettings(rasterizer=DenseRasterizer(), diffuser=DenseDiffuser())
@@ -171,6 +174,39 @@ class TestRecover:
         now = max(worst.deviation for _, worst in found.combinations())
         assert first.worst.deviation < second.worst.deviation <= now * (1 + 1e-9)
         assert "as before: the worst known, " in str(first)
+
+
+@pytest.mark.once
+@pytest.mark.usefixtures("double")
+def test_the_handover_of_each_channel_is_an_unknown_of_its_own():
+    """Information of its width: squares of how residuals change with it, and nothing from one channel to the other."""
+    rng, points = np.random.default_rng(6), 40
+    light = GatheredLight(
+        variances=jnp.asarray([1.5, 2.5, 9.0]),
+        means=jnp.asarray(rng.uniform(0.5, 1.0, (3, 2, points))),
+        exits=jnp.ones((3, points)),
+        carried=jnp.ones(3),
+        irradiance=jnp.asarray(rng.uniform(0.0, 2.0, (2, points))),
+        area=jnp.ones(points),
+        albedo=jnp.ones((2, points)),
+        interval=jnp.asarray([1.0, 2.0]),
+        normalization=PlainMean(),
+    )
+    there = jnp.zeros(points, jnp.int32)
+    flat = FlatPictures(light, jnp.ones((2, points)), jnp.zeros((2, points)), there[:0], there)
+    noise, unknowns = jnp.full((2, points), 0.01), Unknowns(medium().eta, jnp.zeros((1, 2), jnp.int32))
+    problem = Problem(flat, noise, noise, unknowns, Held(light.variances), sj.SquaredLoss(), HELD, sj.Dipole)
+    point, step = unknowns.start(medium(), 0), 1e-5
+
+    @jax.jit
+    def at(by):
+        return eqx.tree_at(lambda its: its.pictures.light.interval, problem, light.interval * jnp.exp(by)).residuals(point)
+
+    slopes = (at(step) - at(-step)) / (2 * step)
+    told = solution(problem, point).information
+    assert told.shape == (6, 6)
+    np.testing.assert_allclose(told[4:, 4:], np.diag(jnp.sum(slopes**2, axis=1)), rtol=1e-6, atol=1e-6)
+    assert float(jnp.min(jnp.diagonal(told)[4:])) > 1
 
 
 def test_pixels_that_are_masked_unknown_or_not_filled_do_not_count():
