@@ -1,8 +1,8 @@
 """How well materials come back from one picture of the head: `python -m benchmarks.recover`. Needs SPLATJAX_SHARED.
 
 For each material: its picture is rendered, and its coefficients are searched from starts that are a factor off. The picture is
-made by the same path, with six Gaussians; or by another, with twice the splats, eight Gaussians and no clusters. Then it gets
-noise.
+made by the same path, with six Gaussians and layers as fine; or by another, with twice the splats, eight Gaussians and no
+clusters, or by the plain one that bins nothing either. Then it gets noise, and the steps of the search are timed.
 """
 
 import argparse
@@ -23,6 +23,9 @@ from .scenes import BODIES, columns, lit
 
 COMPILED = "/jax/core/compile/backend_compile_duration"
 WEIGHTS = sj.NonNegativeWeights(sj.TotalReflectanceHeld())
+FINE = sj.RenderSettings(diffuser=ClusterDiffuser(error=2.5e-4))
+"""The default of `recover`."""
+GOAL = 6.0  # forward frames for a step, all that a search does counted
 OTHERWISE = {
     "unmerged": sj.RenderSettings(diffuser=ClusterDiffuser(error=0.0)),
     "plain": sj.RenderSettings(rasterizer=DenseRasterizer(), diffuser=DenseDiffuser()),
@@ -59,14 +62,14 @@ def rendered(splats, camera, lights, medium: sj.Medium, count: int, settings: sj
     return [np.asarray(sj.render(sj.Scene(splats, (light,), material), camera, settings).beauty) for light in lights]
 
 
-def frame_seconds(splats, camera, light, medium: sj.Medium) -> float:
+def frame_seconds(splats, camera, light, medium: sj.Medium, settings: sj.RenderSettings | None = None) -> float:
     """Time a forward frame of six layers, warm: the median of seven."""
     material = sj.Material(sj.fit_gaussians(sj.Dipole(medium), 6, weights=WEIGHTS).gaussians, eta=medium.eta[0], specular=0.0)
     scene, times = sj.Scene(splats, (light,), material), []
-    plan = sj.plan(scene, camera)
+    plan = sj.plan(scene, camera, settings)
     for _ in range(8):
         begin = time.perf_counter()
-        jax.block_until_ready(sj.render(scene, camera, plan=plan))
+        jax.block_until_ready(sj.render(scene, camera, settings, plan))
         times.append(time.perf_counter() - begin)
     return float(np.median(times[1:]))
 
@@ -92,6 +95,18 @@ def errors(recovery: sj.Recovery, medium: sj.Medium) -> np.ndarray:
     return np.stack([np.asarray(found) / np.asarray(true) - 1 for found, true in pairs])
 
 
+def tell_pulls(name: str, pulls: np.ndarray) -> None:
+    """Say how often the truth lay within error bars: [noise's or all, draws, coefficients, channels]."""
+    for title, each in zip(("of noise", "reported"), np.abs(pulls), strict=True):
+        for reach in (1, 2):
+            inside = np.sum(each <= reach, axis=0)
+            print(
+                f"{name}: of {len(each)} draws, within {reach} error bars {title}: sigma_a {inside[0]}, sigma_s' {inside[1]}; of "
+                f"all {100 * np.mean(each <= reach):.0f}% (normal errors: {(68, 95)[reach - 1]}%)"
+            )
+        print(f"{name}: root mean square of errors over bars {title} {np.sqrt(np.mean(each**2)):.2f}", flush=True)
+
+
 def main() -> None:
     options = arguments()
     compiled, rows = Compilations(), []
@@ -107,12 +122,16 @@ def main() -> None:
         return found, time.perf_counter() - start, compiled.count - before
 
     def tell(name, case, found, seconds, programs, medium):
-        off = errors(found, medium)
-        a, s = (", ".join(f"{100 * each:+.2f}" for each in row) for row in off)
+        off, bars = errors(found, medium), np.stack(found.relative_errors())
+        a, s = (
+            ", ".join(f"{100 * each:+.2f} +- {100 * bar:.2f}" for each, bar in zip(*rows, strict=True))
+            for rows in zip(off, bars, strict=True)
+        )
         ends = ", ".join(f"{cost:.3g}" for cost in found.costs)
         print(
             f"{name}, {case}: sigma_a off by {a}%, sigma_s' by {s}%; {found.rounds} rounds, {found.steps} steps, "
-            f"{seconds:.1f} s, {programs} programs compiled; the first round ends at losses of {ends}",
+            f"{seconds:.1f} s, {programs} programs compiled; the first round ends at losses of {ends}; light that the splats do "
+            f"not carry: {', '.join(f'{100 * float(each):.0f}%' for each in found.unresolved)}",
             flush=True,
         )
         rows.append(
@@ -123,6 +142,8 @@ def main() -> None:
                 "splats": options.splats,
                 "width": options.width,
                 "errors": off.tolist(),
+                "bars": bars.tolist(),
+                "unresolved": np.asarray(found.unresolved).tolist(),
                 "steps": found.steps,
                 "rounds": found.rounds,
                 "seconds": seconds,
@@ -133,7 +154,7 @@ def main() -> None:
     with jax.enable_x64(True):
         for name in options.materials:
             medium = sj.load_medium(name)
-            pictures = rendered(splats, camera, lights, medium, 6)
+            pictures = rendered(splats, camera, lights, medium, 6, FINE)
             begin = starts(medium, options.off)
             found, *cost = recover(pictures, begin)
             tell(name, "same path", found, *cost, medium)
@@ -142,32 +163,35 @@ def main() -> None:
                 seen = rendered(others, camera, lights, medium, 8, OTHERWISE[path])
                 found, *cost = recover(seen, begin)
                 tell(name, f"{path}, twice the splats, eight Gaussians", found, *cost, medium)
-            rng, pulls, seconds, programs = np.random.default_rng(0), [], [], []
+            rng, pulls, seconds, programs, steps = np.random.default_rng(0), [], [], [], []
             for draw in range(options.draws):
                 sizes = [options.noise * np.sqrt(np.mean(picture**2)) for picture in pictures]
                 noisy = [picture + sd * rng.normal(size=picture.shape) for picture, sd in zip(pictures, sizes, strict=True)]
                 found, *cost = recover(noisy, begin, [np.full(p.shape, sd) for p, sd in zip(pictures, sizes, strict=True)])
                 seconds.append(cost[0])
                 programs.append(cost[1])
-                pulls.append(np.log1p(errors(found, medium)) / np.stack(found.relative_errors()))
-                said = np.array2string(pulls[-1], precision=1, separator=" ").replace("\n", "")
+                steps.append(found.steps)
+                off = np.log1p(errors(found, medium))
+                pulls.append(np.stack([off / np.stack(found.noise_errors()), off / np.stack(found.relative_errors())]))
+                said = np.array2string(pulls[-1][0], precision=1, separator=" ").replace("\n", "")
                 print(f"{name}, draw {draw + 1}: {cost[0]:.1f} s, {cost[1]} programs; off by deviations {said}", flush=True)
             if pulls:
                 print(found.words())
                 print(f"chi-squared {float(found.chi_squared):.4f}")
-                pulls = np.abs(np.stack(pulls))
-                for reach in (1, 2):
-                    inside = np.sum(pulls <= reach, axis=0)
-                    print(
-                        f"{name}: of {options.draws} draws, within {reach} deviations: sigma_a {inside[0]}, sigma_s' {inside[1]}"
-                    )
-                frame = frame_seconds(splats, camera, lights[0], medium)
-                print(f"a draw takes {np.median(seconds):.1f} s, the fastest {np.min(seconds):.1f} s; compiled {programs}")
+                pulls = np.stack(pulls, axis=1)
+                rows.append({"material": name, "case": "noise", "noise": options.noise, "pulls": pulls.tolist()})
+                tell_pulls(name, pulls)
+                coarse, fine = (frame_seconds(splats, camera, lights[0], medium, each) for each in (None, FINE))
+                each = np.asarray(seconds[1:] or seconds) / np.asarray(steps[1:] or steps)
+                step = float(np.median(each))
                 print(
-                    f"a forward frame {frame:.2f} s; the last draw {seconds[-1] / frame / found.steps:.1f} frames a step",
+                    f"a draw takes {np.median(seconds):.1f} s, the fastest {np.min(seconds):.1f} s; compiled {programs}\n"
+                    f"a forward frame {coarse:.2f} s, with layers as fine as the search's {fine:.2f} s; a step, all of a "
+                    f"draw over its steps, {step:.2f} s: {step / coarse:.1f} frames, or {step / fine:.1f} fine ones "
+                    f"(goal {GOAL:.0f})",
                     flush=True,
                 )
-                rows.append({"material": name, "case": "noise", "noise": options.noise, "pulls": pulls.tolist()})
+                rows.append({"material": name, "case": "step", "frame": coarse, "fine_frame": fine, "step": step})
     out = Path("out/recover.json")
     out.parent.mkdir(exist_ok=True)
     out.write_text(json.dumps(rows, indent=1) + "\n")

@@ -161,7 +161,9 @@ class TestRecover:
         both = recovered(taken()[1], STARTS[:1], NOISE)
         assert both.is_fixed()
         assert "not fixed" not in both.words()
-        np.testing.assert_allclose(both.medium.sigma_a, medium().sigma_a, rtol=ROUNDS)
+        np.testing.assert_allclose(
+            both.medium.sigma_a, medium().sigma_a, rtol=5e-3
+        )  # rounds end when one moves less than a tenth of a bar
 
     def test_another_picture_can_only_tell_more(self):
         found, (splats, _) = without_noise(), taken()
