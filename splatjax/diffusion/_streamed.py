@@ -132,7 +132,7 @@ class StreamedSums(eqx.Module):
 
 
 def _roomier(count: int) -> int:
-    return math.ceil(1.1 * count / 64) * 64
+    return math.ceil(1.3 * count / 64) * 64
 
 
 @eqx.filter_jit

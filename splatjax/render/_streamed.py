@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from splatjax import diffusion as _diffusion, splatting as _splatting
-from splatjax.scene import AbstractLight, Camera, Frame, PointLight, Scene, Splats, StackedLights, stack_lights
+from splatjax.scene import AbstractLight, Camera, Frame, Material, PointLight, Scene, Splats, StackedLights, stack_lights
 
 from ._inputs import check_channels, in_one_dtype
 from ._lighting import EnteringLight, LightOnSplats, let_light_in
@@ -57,7 +57,7 @@ class _Map(eqx.Module):
 def render_streamed(
     parts: Parts,
     lights: Sequence[AbstractLight],
-    material,
+    material: Material,
     camera: Camera,
     settings: RenderSettings | None = None,
     report: Report | None = None,
@@ -101,20 +101,10 @@ def render_streamed(
     dtype = first.splats.centers.dtype
     view, maps = _splatting.PerspectiveView.of(camera), _maps(groups, survey, settings, dtype)
     at = _with_room(every, [view, *(each.view for each in maps)], rasterizer, settings.splatting)
-    none = [each.nothing(0, dtype) for each in at]
-    limits = [jnp.full_like(each.weights, -jnp.inf) for each in none]
-    for scene in every("where the front ends"):
-        limits = [_limits(scene.splats, *each) for each in zip(at, limits, strict=True)]
-    fronts = none
-    for scene in every("what it weighs"):
-        fronts = [_fronts(scene.splats, *each) for each in zip(at, limits, fronts, strict=True)]
-    ends = [(jnp.full_like(each, -jnp.inf),) * 2 for each in limits]
-    for scene in every("where what lies behind ends"):
-        ends = [_ends(scene.splats, *each) for each in zip(at, limits, fronts, ends, strict=True)]
-    seconds = [_splatting.second_limits(*each) for each in ends]
-    behind = none[1:]
+    limits, fronts, seconds = _ends_of_surfaces(every, at, dtype)
+    behind = [each.nothing(0, dtype) for each in at[1:]]
     for scene in every("shadow maps") if maps else ():
-        behind = [_behind(scene.splats, *each) for each in zip(at[1:], limits[1:], seconds[1:], behind, strict=True)]
+        behind = _done(_behind(scene.splats, *each) for each in zip(at[1:], limits[1:], seconds[1:], behind, strict=True))
     surfaces = [_blended(*each) for each in zip(at[1:], fronts[1:], behind, strict=True)]
 
     def lit(scene: Scene) -> tuple[LightOnSplats, EnteringLight]:
@@ -125,7 +115,8 @@ def render_streamed(
     both = (at[0].nothing(sum(sizes.values()), dtype),) * 2
     for scene in every("what the camera sees"):
         attributes = settings.lighting.attributes(scene, *lit(scene))
-        both = _pictured(scene.splats, jnp.concatenate(list(attributes.values())), at[0], limits[0], seconds[0], both)
+        rows = jnp.concatenate(list(attributes.values()))
+        both = jax.block_until_ready(_pictured(scene.splats, rows, at[0], limits[0], seconds[0], both))
     summed = _splatting.SummedFragments(*both, jnp.zeros((), dtype))
     tiles = max(int(jnp.sum(_splatting.farthest_depths(summed, view) > -jnp.inf)), 1)
     surface = surfaces_of(summed, sizes, view, settings, tiles).lit(first, light, settings)
@@ -160,6 +151,25 @@ def _with_room(every, views, rasterizer: _splatting.TileRasterizer, settings: _s
         for view, found in zip(views, demands, strict=True):
             found.append(rasterizer.demand(scene.splats, view, settings))
     return [_View(view, rasterizer.with_room(found, rows, view), settings) for view, found in zip(views, demands, strict=True)]
+
+
+def _ends_of_surfaces(every, at: Sequence[_View], dtype):
+    """Find where the front ends in every view, what it weighs, and where what lies behind ends."""
+    fronts = [each.nothing(0, dtype) for each in at]
+    limits = [jnp.full_like(each.weights, -jnp.inf) for each in fronts]
+    ends = [(each, each) for each in limits]
+    for scene in every("where the front ends"):
+        limits = _done(_limits(scene.splats, *each) for each in zip(at, limits, strict=True))
+    for scene in every("what it weighs"):
+        fronts = _done(_fronts(scene.splats, *each) for each in zip(at, limits, fronts, strict=True))
+    for scene in every("where what lies behind ends"):
+        ends = _done(_ends(scene.splats, *each) for each in zip(at, limits, fronts, ends, strict=True))
+    return limits, fronts, [_splatting.second_limits(*each) for each in ends]
+
+
+def _done(found: Iterable) -> list:
+    """Wait: parts that are read ahead would pile up."""
+    return jax.block_until_ready(list(found))
 
 
 @eqx.filter_jit

@@ -146,8 +146,10 @@ class BinCapacity(eqx.Module):
         return cls(round_up(pairs, _ROW), round_up(blocks, 4), min(round_up(chunks, 4), grid.tiles // grid.lanes))
 
     def grown(self, other: "BinCapacity | None", chunks: int) -> "BinCapacity":
-        """Give a fifth more room than this, as much as another at least, and for so many chunks."""
-        more = BinCapacity(round_up(int(1.2 * self.pairs), _ROW), round_up(int(1.2 * self.blocks), 4), chunks)
+        """Give room for this and another, in powers of two, so that room soon grows no more; and for so many chunks."""
+        more = BinCapacity(
+            _ROW << (-(-self.pairs // _ROW) - 1).bit_length(), 4 << (-(-self.blocks // 4) - 1).bit_length(), chunks
+        )
         return more if other is None else BinCapacity(max(more.pairs, other.pairs), max(more.blocks, other.blocks), chunks)
 
 

@@ -19,8 +19,10 @@ SETTINGS = sj.RenderSettings(shadows=ShadowSettings(resolution=32))
 
 
 def scene(count: int = 1501) -> sj.Scene:
-    """A ball of a number of splats that eight does not divide; a layer that the surface stands for, a narrow and a wide one."""
-    splats = sphere(count, 20.0)
+    """Two balls, the last splats before the first, of a number that eight does not divide; layers of three kinds."""
+    behind, before = sphere(count - count // 5, 20.0), sphere(count // 5, 6.0)
+    before = eqx.tree_at(lambda ball: ball.centers, before, before.centers + jnp.asarray([[-8.0, 6.0, 30.0]], float))
+    splats = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), behind, before)
     shade = 0.6 + 0.3 * jnp.sin(splats.centers / 5)
     splats = eqx.tree_at(lambda each: each.albedo, splats, shade, is_leaf=lambda leaf: leaf is None)
     weights = jnp.asarray([[0.2, 0.1, 0.1], [0.3, 0.3, 0.2], [0.3, 0.2, 0.1]], float)
@@ -101,6 +103,7 @@ def views_cut() -> dict:
     """A batch of cameras over the devices against one camera after the other, by plain renderers: their program is small."""
     settings = sj.RenderSettings(shadows=ShadowSettings(resolution=16), rasterizer=DenseRasterizer(), diffuser=DenseDiffuser())
     world, cameras = scene(97), [camera(angle) for angle in (0.0, 1.0, 2.0)]
+    world = sj.Scene(world.splats, world.lights[1:], world.material)
     plan = sj.plan(world, cameras, settings)
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *cameras)
     mesh = jax.make_mesh((8,), ("views",))
