@@ -6,6 +6,7 @@ The first process compares with one device of its own.
 import json
 import sys
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.experimental.multihost_utils import process_allgather
@@ -26,12 +27,12 @@ def main(what: str, index: int, count: int, port: int) -> dict:
     def found(splats, mesh):
         plan = sj.plan(sj.Scene(splats, world.lights, world.material), eye, SETTINGS, mesh=mesh)
 
-        def draw(splats):
+        def draw(splats, plan):
             return sj.render(sj.Scene(splats, world.lights, world.material), eye, SETTINGS, plan)
 
         if what == "picture":
-            return draw(splats)
-        return jax.jit(jax.grad(lambda splats: jnp.sum(draw(splats).coverage ** 2)))(splats)
+            return draw(splats, plan)
+        return eqx.filter_jit(eqx.filter_grad(lambda splats, plan: jnp.sum(draw(splats, plan).coverage ** 2)))(splats, plan)
 
     answer = found(splats, mesh)
     if what == "gradients":
