@@ -55,8 +55,9 @@ def apart(one, other) -> dict[str, float]:
     for (path, x), y in zip(jax.tree_util.tree_leaves_with_path(one), jax.tree.leaves(other), strict=True):
         x, y = np.asarray(x), np.asarray(y)
         finite = np.isfinite(x)
-        same = np.array_equal(finite, np.isfinite(y)) and x.shape == y.shape
-        error = np.max(np.abs(x - y), where=finite, initial=0) / max(np.max(np.abs(x), where=finite, initial=0), 1e-30)
+        same = x.shape == y.shape and np.array_equal(finite, np.isfinite(y))
+        x, y = np.where(finite, x, 0), np.where(finite, y, 0)
+        error = np.max(np.abs(x - y)) / max(np.max(np.abs(x)), 1e-30)
         found[jax.tree_util.keystr(path)] = float(error) if same else float("inf")
     return found
 
