@@ -140,3 +140,10 @@ def test_a_fit_to_its_own_file_keeps_what_stood_there(tmp_path, capsys):
     with jax.enable_x64(True):
         assert main(["fit", str(path), "--count", "1", "--output", str(path)]) == 0
     assert tomllib.loads(path.read_text())["surface"] == after["surface"]
+
+
+def test_only_a_binary_file_is_streamed(tmp_path, capsys):
+    output = tmp_path / "out.exr"
+    assert "--stream is 5" in failure(["render", "--stream", 5, "--output", output], capsys, [output])
+    text = plate(tmp_path / "plate.ply")
+    assert "write them as binary" in failure(["render", text, "--stream", 5, "--output", output], capsys, [output])
