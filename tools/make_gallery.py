@@ -99,13 +99,13 @@ def smooth(outline: list[tuple[float, float]], step: float = 0.5, width: float =
 
 
 def skin(head: sj.Splats, side: int, which: int) -> np.ndarray:
-    """A face, a cheek with its nose, and the corner of an eye: the same skin from three distances."""
+    """A head, its nose and eyes, and the nose's shadow: the same skin from three distances."""
     middle = np.asarray(head.centers).mean(axis=0)
     low, high = (np.asarray(getattr(head.centers, end)(axis=0)) for end in ("min", "max"))
     tall = float(high[1] - low[1])
     place = np.asarray([middle[0], low[1] + 0.52 * tall, high[2]])
-    targets = (np.asarray([0, 0.0, -0.3]), np.asarray([0.10, -0.02, -0.06]), np.asarray([0.155, 0.1, -0.1]))
-    fov, eye = (21.0, 8.0, 3.2)[which], place + tall * np.asarray([1.1, 0.1, 2.4])
+    targets = (np.asarray([0, 0.0, -0.3]), np.asarray([0.10, -0.02, -0.06]), np.asarray([0.084, -0.107, -0.053]))
+    fov, eye = (21.0, 8.0, 4.2)[which], place + tall * np.asarray([1.1, 0.1, 2.4])
     lights = sun(-0.9, 0.7, 0.9, 1.0, (1.0, 0.97, 0.92)), sun(1.0, 0.1, -0.3, 0.5, (0.8, 0.9, 1.0)), fill(0.8, 0, 1, 0.06)
     material = sj.load_material("skin").white()
     return render(head, lights, material, looking(eye, place + tall * targets[which], fov, side), 0.4)
@@ -181,7 +181,7 @@ def wax(_: sj.Splats, side: int) -> np.ndarray:
 
 def inverse(_: sj.Splats, side: int) -> np.ndarray:
     """What was photographed, the same under the coefficients that the search starts from, and under those that it finds."""
-    bust, scale = sj.bust(60_000), 0.2
+    bust, scale = sj.bust(30_000), 0.2
     splats = sj.Splats(scale * bust.centers, bust.normals, scale * bust.radii, scale * scale * bust.areas)
     camera = looking((20, 0, 125), (0, -10, 0), 27.0, side // 2)
     lamp = sun(0.9, 0.35, 0.25, 1.0)

@@ -83,7 +83,7 @@ def test_the_commands_of_a_page_run_one_after_the_other(page, tmp_path, monkeypa
         if given[0] in ("render", "turntable", "figure") and not any(word.endswith(".ply") for word in given):
             small = [*small, "--count", "1500"]
         if "--photons" in given or "monte-carlo" in given:
-            small = [*small, "--photons", "20000"]
+            small = [*small, "--photons", "20000", "--count", "3"]
         before = set(os.listdir())
         assert main([*given, *small]) == 0, command
         output = given[given.index("--output") + 1] if "--output" in given else None
