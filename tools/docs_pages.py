@@ -44,6 +44,7 @@ ROOMS = (
     "io",
     "plots",
     "pointwise",
+    "devices",
 )
 _LINK = re.compile(r"(\]\()([^)#\s]+)(#[^)\s]*)?(\))")
 _MATHS = re.compile(r"\$([^$\n]+)\$")
