@@ -13,7 +13,6 @@ pytestmark = pytest.mark.once
 
 HERE = Path(__file__).parent
 ROUNDING = 2e-5  # of the largest number of its kind: sums of a thousand terms, in another order
-ANSWERS = "splats_cut", "gradients_at_home", "traffic", "views_cut"
 
 
 def answers(commands, devices):
@@ -27,37 +26,36 @@ def answers(commands, devices):
     return [json.loads(out.splitlines()[-1]) for out, _ in said]
 
 
-@pytest.fixture(scope="module")
-def found():
+def on_eight(*questions):
     """What eight devices find."""
-    return answers([[HERE / "over_devices.py", *ANSWERS]], 8)[0]
+    return answers([[HERE / "over_devices.py", *questions]], 8)[0]
 
 
-def test_splats_on_eight_devices_make_the_picture_and_the_gradients_of_one(found):
+def test_splats_on_eight_devices_make_the_picture_of_one_and_the_gradients_where_the_splats_are():
+    found = on_eight("splats_cut", "gradients_at_home")
     answer = found["splats_cut"]
     assert answer["overflow"] == 0
     assert answer["layers"] == [[False, False], [False, False], [True, True]]  # one of single splats, one through nodes
     assert max(answer["frame"].values()) < ROUNDING, answer["frame"]
     assert max(answer["gradients"].values()) < ROUNDING, answer["gradients"]
-
-
-def test_gradients_go_back_to_where_the_splats_are(found):
     assert found["gradients_at_home"]["rows"] == [188] * 8
 
 
-def test_devices_send_each_other_what_the_model_says(found):
-    answer = found["traffic"]
+@pytest.mark.long
+def test_devices_send_each_other_what_the_model_says():
+    answer = on_eight("traffic")["traffic"]
     for kind, model in answer["model"].items():
         assert answer["counted"][kind] == pytest.approx(model, rel=0.1), (kind, answer)
 
 
-def test_views_on_eight_devices_are_those_of_one(found):
-    answer = found["views_cut"]
+@pytest.mark.long
+def test_views_on_eight_devices_are_those_of_one():
+    answer = on_eight("views_cut")["views_cut"]
     assert max(answer["frame"].values()) < ROUNDING, answer["frame"]
     assert max(answer["gradients"].values()) < ROUNDING, answer["gradients"]
 
 
-@pytest.mark.parametrize(("what", "count"), [("picture", 2), ("gradients", 4)])
+@pytest.mark.parametrize(("what", "count"), [("picture", 2), pytest.param("gradients", 4, marks=pytest.mark.long)])
 def test_splats_of_several_processes_make_what_those_of_one_do(what, count):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
