@@ -42,7 +42,7 @@ test-float32: setup
 	$(PYTEST) -m "not once and not long"
 
 test-x64: setup
-	JAX_ENABLE_X64=1 XLA_FLAGS="$(LEAST_OPTIMIZATION) $$XLA_FLAGS" $(PYTEST)
+	JAX_ENABLE_X64=1 XLA_FLAGS="$(LEAST_OPTIMIZATION) $$XLA_FLAGS" $(PYTEST) -m "not long"
 
 # Long tests that say the same in both precisions.
 test-once: setup

@@ -72,6 +72,10 @@ class Figure(MeshMaps):
     def run(self) -> None:
         """Draw, write."""
         check_output(self.output, (".png", ".pdf", ".svg"))
+        laid = {name: value for name, value in {**self.worn(), "mm_per_unit": self.mm_per_unit}.items() if value is not None}
+        if laid and not (self.number == 8 and self.scene):
+            option = next(iter(laid)).replace("_", "-")
+            raise ValueError(f"--{option} is of the mesh of figure 8 alone; give that by --scene, or leave it out")
         if not 0 < self.scale < math.inf:
             raise ValueError(f"--scale is {self.scale:g}; it must be a positive factor: 1 shows a body as large as it is")
         figures = self._figures()

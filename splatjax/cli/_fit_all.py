@@ -45,21 +45,23 @@ def fit_all(media: Path, output: Path, count: int, weights: AbstractWeights) -> 
     if len(missing) < len(parts):
         note(f"{len(parts) - len(missing)} of {len(parts)} batches are there already, and kept")
     own = own_share().of(missing)  # which waits: all have seen the same batches missing
-    folder.mkdir(exist_ok=True)
-    write_record(folder / _RECORD, record)
     if own:
+        folder.mkdir(exist_ok=True)
+        write_record(folder / _RECORD, record)
         with progress(f"fitting {count} Gaussians to {len(names)} media, {_TOGETHER} at a time", len(own)) as one_more:
             for i in own:
                 part = slice(begins[i], begins[i] + _TOGETHER)
                 write_columns(parts[i], {"name": names[part]} | _fitted(coefficients[part], count, weights))
                 one_more()
+    if output.exists() and not folder.exists():  # joined by another process
+        return
     if not all(part.exists() for part in parts):
         note("other processes are still at work; the one that finds every batch there joins them, or the same command again")
         return
     try:
         join_tables(output, parts)
-    except FileNotFoundError:  # another process found every batch at the same time, and has joined them
-        if not output.exists():
+    except FileNotFoundError as error:  # another process found every batch at the same time, and has joined them
+        if not output.exists() or str(error.filename) not in map(str, parts):
             raise
     shutil.rmtree(folder, ignore_errors=True)
     print(output)

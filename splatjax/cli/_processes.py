@@ -33,7 +33,14 @@ def own_share() -> Share:
 
     **Raises:** `ValueError` when the environment speaks of several processes, and does not say which.
     """
-    if not any(_number(name) not in (None, 1) for name in _STARTED):
+    said = {name: number for name in _STARTED if (number := _number(name)) is not None}
+    for name, number in said.items():  # the first counts
+        if number < 1:
+            raise ValueError(f"{name} is {number}; at least one process works")
+        if number == 1:
+            return Share()
+        break
+    else:
         return Share()
     try:
         jax.distributed.initialize(num_processes=_number("JAX_NUM_PROCESSES"), process_id=_number("JAX_PROCESS_ID"))

@@ -89,7 +89,8 @@ class StreamedSums(eqx.Module):
         """Add what a part of the splats brings; splats without area bring nothing."""
         cells = self.cells
         tree = ClusterTree.build(sources.centers.T, sources.normals.T, cells)
-        counts = tuple(map(max, (_roomier(count) for count in tree.counts), room.counts or tree.counts))
+        held = room.counts or (0,) * len(tree.counts)
+        counts = tuple(had if count <= had else _roomier(count) for count, had in zip(tree.counts, held, strict=True))
         levels = _levels(tree.with_room(counts), sources, self.pixels.origin)
         bare = dataclasses.replace(self, totals=())
         capacities, totals = [], []

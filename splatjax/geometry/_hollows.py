@@ -33,7 +33,7 @@ def turn_cavities(
     Normal Orientation for Point Clouds by Regularizing the Winding-Number Field".
     """
     for patch in sorted(patches, key=len, reverse=True):
-        probes = points[patch[:: max(len(patch) // _PROBES, 1)]]
+        probes = points[patch[np.linspace(0, len(patch) - 1, min(len(patch), _PROBES)).astype(np.int64)]]
         everything = np.median(_winding(probes, points, oriented))
         own = np.median(_winding(probes, points[patch], oriented[patch]))
         if (everything - own - 0.5) * own > _CLEAR:
@@ -48,6 +48,9 @@ def _winding(
     starts = np.arange(0, len(points), _BLOCK)
     sizes = np.diff(np.append(starts, len(points)))
     middles, normals = np.add.reduceat(points, starts) / sizes[:, None], np.add.reduceat(oriented, starts)
-    way = middles[None] - probes[:, None]
-    cubed = np.einsum("pbi,pbi->pb", way, way) ** 1.5
-    return (np.einsum("pbi,bi->pb", way, normals) / np.where(cubed > 0, cubed, np.inf)).sum(axis=1) / (4 * np.pi)
+    found = np.empty(len(probes))
+    for i, probe in enumerate(probes):  # one by one, in memory that does not grow with both
+        way = middles - probe[None]
+        cubed = np.einsum("bi,bi->b", way, way) ** 1.5
+        found[i] = (np.einsum("bi,bi->b", way, normals) / np.where(cubed > 0, cubed, np.inf)).sum()
+    return found / (4 * np.pi)

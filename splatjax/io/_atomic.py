@@ -28,15 +28,16 @@ def atomic_path(path: str | os.PathLike[str]) -> Generator[Path, None, None]:
     _remove_left_behind(path)
     temporary = folder / f".{path.stem}-{secrets.token_hex(4)}{path.suffix}"
     try:
-        held = os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o666)
+        held, locked = _created(temporary)
         try:
-            with suppress(OSError):  # where files cannot be held, what a kill leaves behind stays
-                _lock(held)
             yield temporary
             os.fsync(held)
+            if locked:  # up to the end, or another process takes it for what a kill has left behind
+                os.replace(temporary, path)
         finally:
             os.close(held)
-        os.replace(temporary, path)
+        if not locked:
+            os.replace(temporary, path)
     except OSError as error:
         if error.filename not in (None, str(temporary), temporary):
             raise
@@ -45,6 +46,19 @@ def atomic_path(path: str | os.PathLike[str]) -> Generator[Path, None, None]:
     finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
+
+
+def _created(temporary: Path) -> tuple[int, bool]:
+    """Create a file and hold it; say whether files can be held here. Where they cannot, what a kill leaves behind stays."""
+    while True:
+        file = os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o666)
+        try:
+            _lock(file, wait=True)
+        except OSError:
+            return file, False
+        if os.fstat(file).st_nlink > 0:
+            return file, True
+        os.close(file)  # another process found it before it was held, and has removed it
 
 
 def _remove_left_behind(path: Path) -> None:
@@ -62,13 +76,13 @@ def _remove_left_behind(path: Path) -> None:
                     os.close(left)
 
 
-def _lock(file: int) -> None:
+def _lock(file: int, *, wait: bool = False) -> None:
     """Hold a file until it is closed or the process ends, however it ends.
 
-    **Raises:** `OSError` when another holds it, or where files cannot be held.
+    **Raises:** `OSError` when another holds it and is not waited for, or where files cannot be held.
     """
     try:
         import fcntl  # not on Windows
     except ImportError as error:
         raise OSError("files cannot be held here") from error
-    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    fcntl.flock(file, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)

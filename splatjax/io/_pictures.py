@@ -72,8 +72,12 @@ def _values(picture: Image.Image, mode: str) -> Float[np.ndarray, "..."]:
 
 
 def _of_16_bits(picture: ImageFile.ImageFile) -> bool:
-    """Whether Pillow would pass over the lower half of a picture's 16 bits, as it does where there are several channels."""
-    return not picture.mode.startswith("I") and any(";16" in _raw_mode(tile.args) for tile in picture.tile)
+    """Whether Pillow would pass over the lower half of a picture's 16 bits, as it does where there are several channels.
+
+    Of gray with alpha it knows one order of bytes alone, so that its lower half is passed over.
+    """
+    raw = [_raw_mode(tile.args) for tile in picture.tile]
+    return not picture.mode.startswith("I") and any(";16" in each and each.startswith("RGB") for each in raw)
 
 
 def _deep_values(picture: ImageFile.ImageFile, again: ImageFile.ImageFile) -> Float[np.ndarray, "height width 3"]:

@@ -57,7 +57,7 @@ def read_splats(path: str | os.PathLike[str], *, mm_per_unit: float = 1.0) -> Sp
     centers = places_of(path, vertices)
     normals = normals_of(path, vertices)
     radii, areas = positive_of(path, vertices, RADIUS, mm_per_unit), positive_of(path, vertices, AREA, mm_per_unit**2)
-    _check_place(path, centers * mm_per_unit, estimated=radii is None or areas is None)
+    check_place(path, centers * mm_per_unit, estimated=radii is None or areas is None)
     albedo = colors_of(path, vertices)
     specular, roughness = (factor_of(path, vertices, name) for name in ("specular", "roughness"))
     try:
@@ -109,7 +109,7 @@ def _check_unit(path: Path, mm_per_unit: float) -> None:
         raise ValueError(f"{path}: mm_per_unit is {mm_per_unit}; it must be the positive length of the file's unit in mm")
 
 
-def _check_place(path: Path, centers: np.ndarray, *, estimated: bool) -> None:
+def check_place(path: Path, centers: np.ndarray, *, estimated: bool) -> None:
     """Refuse points that lie where numbers of JAX's default precision cannot tell them apart."""
     low, high = centers.min(axis=0), centers.max(axis=0)
     reach, extent = float(np.abs([low, high]).max()), float((high - low).max())

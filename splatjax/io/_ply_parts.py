@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Iterator
+from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -13,7 +14,7 @@ from splatjax.scene import Splats
 from ._files import existing_file
 from ._library import readable
 from ._pieces import moderate
-from ._ply import AREA, RADIUS, factor_of, positive_of
+from ._ply import AREA, RADIUS, check_place, factor_of, positive_of
 from ._ply_columns import Table, colors_of, normals_of, places_of
 
 _PART = 1_000_000
@@ -46,26 +47,33 @@ class SplatFile:
             raise ValueError(f"{path}: its vertices cannot be read in parts; write them as binary, without lists, at least one")
         self.count, self._rows, self._offset = len(vertices), vertices.dtype, int(vertices.offset)
         names = self._names = self._rows.names or ()
-        for needed in (("nx",), RADIUS, AREA):
+        for needed in (("nx",), ("ny",), ("nz",), RADIUS, AREA):
             if not any(name in names for name in needed):
                 raise ValueError(f"{path}: its vertices have no {needed[0]}, which a part cannot estimate; write complete splats")
 
     def __call__(self) -> Iterator[Splats]:
         """Give all splats from the beginning, in mm and in JAX's default precision, in parts of one size but the last.
 
-        **Raises:** `ValueError` when numbers are not finite, or not what `read_splats` asks for.
+        **Raises:** `ValueError` when numbers are not finite, or not what `read_splats` asks for; how large the whole is turns out
+        at the end.
         """
+        corners = []
         for begin in range(0, self.count, self.part):
             size = min(self.part, self.count - begin)
             # not mapped: pages that were read would count as memory until something else needs it
             rows = np.fromfile(self.path, self._rows, size, offset=self._offset + begin * self._rows.itemsize)
             if len(rows) < size:
                 raise ValueError(f"{self.path}: is cut short: vertex {begin + len(rows)} of {self.count} is not there")
+            places = places_of(self._where(begin), {name: rows[name] for name in "xyz"}) * self.mm_per_unit
+            corners += [places.min(axis=0), places.max(axis=0)]
             yield self._splats(begin, rows)
+        check_place(self.path, np.stack(corners), estimated=False)
+
+    def _where(self, begin: int) -> Path:
+        return self.path.with_name(f"{self.path.name}, from vertex {begin}") if begin else self.path
 
     def _splats(self, begin: int, rows: np.ndarray) -> Splats:
-        where = self.path.with_name(f"{self.path.name}, from vertex {begin}") if begin else self.path
-        scale = self.mm_per_unit
+        where, scale = self._where(begin), self.mm_per_unit
         table: Table = {name: rows[name] for name in self._names}
         normals, albedo = normals_of(where, table), colors_of(where, table)
         assert normals is not None  # nx is there, and not without the others

@@ -28,7 +28,11 @@ def map_over(mesh: Mesh, function: Callable[[Any, Any], PyTree], shared: PyTree,
 
     **Raises:** `ValueError` when the batch is empty, or its arrays are not of one length.
     """
-    counts = sorted({leaf.shape[0] for leaf in jax.tree.leaves(eqx.filter(batch, eqx.is_array)) if leaf.ndim > 0})
+    arrays = jax.tree_util.tree_leaves_with_path(eqx.filter(batch, eqx.is_array))
+    single = [jax.tree_util.keystr(path) for path, leaf in arrays if leaf.ndim == 0]
+    if single:
+        raise ValueError(f"a batch is stacked along a first axis, and {', '.join(single)} has none; stack it, or share it")
+    counts = sorted({leaf.shape[0] for _, leaf in arrays})
     if len(counts) != 1 or counts[0] == 0:
         raise ValueError(f"the arrays of a batch must have one length along their first axis, not zero; these have {counts}")
     return _map_over(mesh, function, shared, batch, counts[0])

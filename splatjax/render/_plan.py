@@ -87,6 +87,7 @@ def _on_one_device(wanted: Wanted) -> Plan:
         shadows=tuple(shadows),
         diffuser=settings.diffuser.planned(splats, wanted.kernels, wanted.interval, atlases),
         interval=wanted.interval,
+        splats=splats.count,
     )
 
 
@@ -99,10 +100,32 @@ def _look(splats: Splats, view, settings: _splatting.SplattingSettings, rasteriz
     return jnp.where(grown > -jnp.inf, grown + 2 * jnp.mean(splats.radii), -jnp.inf)
 
 
-def plan_unless_traced(
-    scene: Scene, camera: Camera, settings: RenderSettings, plan: Plan | None, mesh: Mesh | None = None
-) -> Plan:
+def plan_unless_traced(scene: Scene, camera: Camera, settings: RenderSettings, plan: Plan | None) -> Plan:
+    """Give the plan, or make one where that can be.
+
+    **Raises:** `ValueError` for a plan that is made for a mesh, or when none is given under `jit`, `grad` or `vmap`.
+    """
     if plan is not None:
+        refuse_mesh(plan)
+    return plan_over_unless_traced(None, scene, camera, settings, plan)
+
+
+def check_count(plan: Plan, scene: Scene) -> None:
+    """Raise `ValueError` for a plan that is made for another number of splats."""
+    if plan.splats not in (None, scene.splats.count):
+        raise ValueError(f"the plan is for {plan.splats} splats, and the scene has {scene.splats.count}; make it anew")
+
+
+def refuse_mesh(plan: Plan) -> None:
+    """Raise `ValueError` for a plan that is made for a mesh."""
+    if plan.mesh is not None:
+        raise ValueError("the plan is made for a mesh, over which only splatjax.render works; make one without a mesh")
+
+
+def plan_over_unless_traced(mesh: Mesh | None, scene: Scene, camera: Camera, settings: RenderSettings, plan: Plan | None) -> Plan:
+    """The same for a mesh, which may be the plan's own."""
+    if plan is not None:
+        check_count(plan, scene)
         if mesh is not None and plan.mesh != mesh:
             made_for = "one device" if plan.mesh is None else f"{plan.mesh}"
             raise ValueError(f"the plan is for {made_for}, not for {mesh}; make it with splatjax.plan(..., mesh=mesh)")

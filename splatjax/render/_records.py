@@ -41,6 +41,8 @@ class Plan(eqx.Module):
     interval: Float[Array, "2"]
     mesh: Mesh | None = eqx.field(static=True, default=None)
     """The devices that hold the splats; `None` for one."""
+    splats: int | None = eqx.field(static=True, default=None)
+    """How many it is for: their order and clusters are in it. `None` for any number."""
 
 
 class Wanted(eqx.Module):

@@ -11,7 +11,7 @@ from splatjax.scene import Camera, Frame, Scene
 from ._inputs import SAME, check_channels, in_one_dtype
 from ._lighting import EnteringLight, let_light_in
 from ._passes import cast_shadows, compose, see_surfaces, shade, sources_of
-from ._plan import plan_unless_traced
+from ._plan import check_count, plan_over_unless_traced, plan_unless_traced, refuse_mesh
 from ._records import Plan
 from ._settings import RenderSettings
 from ._sharded import render_over
@@ -41,7 +41,7 @@ def render(
     """
     settings = RenderSettings() if settings is None else settings
     check_channels(scene)
-    plan = plan_unless_traced(scene, camera, settings, plan, mesh)
+    plan = plan_over_unless_traced(mesh, scene, camera, settings, plan)
     return _render(scene, camera, settings, plan)
 
 
@@ -80,9 +80,11 @@ def light_on_splats(scene: Scene, plan: Plan, settings: RenderSettings | None = 
 
     **Returns:** the irradiance, and what of it spreads: `source.T` is what `diffuse` asks for.
 
-    **Raises:** `ValueError` when the channels disagree.
+    **Raises:** `ValueError` when the channels disagree, or the plan is made for a mesh.
     """
     check_channels(scene)
+    refuse_mesh(plan)
+    check_count(plan, scene)
     return _light_on_splats(scene, plan, RenderSettings() if settings is None else settings)
 
 

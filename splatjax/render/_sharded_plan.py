@@ -87,6 +87,7 @@ def plan_over(mesh: Mesh, wanted: Wanted) -> Plan:
         diffuser=_diffusion.ShardedDiffuser.of(diffuser, wanted.splats, parts, wanted.kernels, uncut, devices),
         interval=wanted.interval,
         mesh=mesh,
+        splats=wanted.splats.count,
     )
     return jax.tree.map(lambda leaf, spec: jax.device_put(leaf, NamedSharding(mesh, spec)), made, plan_specs(made, devices))
 

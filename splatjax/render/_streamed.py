@@ -74,7 +74,8 @@ def render_streamed(
     **Returns:** what `render` gives, to rounding but for pass 4: its clusters are those of each part, and every pixel gathers for
     itself, so that it differs by less than the diffuser's own error. Without gradients.
 
-    **Raises:** `ValueError` when there are no splats, parts differ in size, or the settings cannot be streamed.
+    **Raises:** `ValueError` when there are no splats, parts differ in size, are not the same each time, or the settings cannot
+    be streamed.
     """
     settings = RenderSettings() if settings is None else settings
     rasterizer, diffuser = settings.rasterizer, settings.diffuser
@@ -117,6 +118,8 @@ def render_streamed(
         attributes = settings.lighting.attributes(scene, *lit(scene))
         rows = jnp.concatenate(list(attributes.values()))
         both = jax.block_until_ready(_pictured(scene.splats, rows, at[0], limits[0], seconds[0], both))
+    if not all(bool(jnp.all(jnp.isfinite(sums.weights))) for sums in (*fronts, *behind, *both)):
+        raise ValueError("the parts were not the same each time that they were asked for; give the same splats in the same order")
     summed = _splatting.SummedFragments(*both, jnp.zeros((), dtype))
     tiles = max(int(jnp.sum(_splatting.farthest_depths(summed, view) > -jnp.inf)), 1)
     surface = surfaces_of(summed, sizes, view, settings, tiles).lit(first, light, settings)

@@ -51,9 +51,10 @@ class Stages(eqx.Module):
         return picked(of_tiles(tiles, self.bins.order[: self.bins.places], False), self.sweep.grid.lanes)
 
     def _within(self, sums: Float[Array, "tiles rows pixels"]) -> FragmentSums:
-        """What of a tile lies beyond the picture shows nothing."""
+        """What of a tile lies beyond the picture shows nothing; all is NaN where the lists lack room."""
         within = self.sweep.grid.within_picture()
-        return FragmentSums.of(sums if within is None else jnp.where(jnp.asarray(within)[:, None], sums, 0.0))
+        poison = jnp.where(self.bins.needed <= 1, 0.0, jnp.nan).astype(sums.dtype)
+        return FragmentSums.of(poison + (sums if within is None else jnp.where(jnp.asarray(within)[:, None], sums, 0.0)))
 
     def limits(self) -> Float[Array, "tiles pixels"]:
         """Stage 1: where the front ends, -inf where there is none; of several parts, the largest."""

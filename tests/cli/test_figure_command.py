@@ -40,6 +40,7 @@ def test_figure_8_is_made_from_the_bust(tmp_path):
     ("words", "says"),
     [
         (["2"], "no figure 2"),
+        (["3", "--albedo", "nowhere.jpg"], "--albedo is of the mesh of figure 8"),
         (["8", "--scene", "nowhere.glb"], "--mm-per-unit"),
         (["8", "--scene", "nowhere.glb", "--mm-per-unit", "53"], "nowhere.glb"),
         (["1", "--scale", "0"], "--scale"),

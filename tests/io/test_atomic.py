@@ -161,3 +161,12 @@ def test_killed_at_any_moment():
     done = subprocess.run([sys.executable, str(tool), "3"], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     assert done.stdout.count("3 kills") == 6
+
+
+def test_processes_that_write_the_same_file_do_not_remove_what_others_write(tmp_path):
+    write = "import sys\nfrom splatjax.io import write_record\nfor i in range(150): write_record(sys.argv[1], {'i': i})"
+    words = [sys.executable, "-c", write, str(tmp_path / "same.json")]
+    writers = [subprocess.Popen(words, stderr=subprocess.PIPE, text=True) for _ in range(3)]
+    said = [writer.communicate(timeout=300)[1] for writer in writers]
+    assert [writer.returncode for writer in writers] == [0, 0, 0], said
+    assert [path.name for path in tmp_path.iterdir()] == ["same.json"]

@@ -28,7 +28,7 @@ def png_of_16_bits(values, path, filtered):
     if filtered:
         rows = np.diff(rows, axis=0, prepend=np.zeros_like(rows[:1]))
     data = b"".join(bytes([2 * filtered]) + row.tobytes() for row in rows)
-    header = struct.pack(">IIBBBBB", width, height, 16, {3: 2, 4: 6}[channels], 0, 0, 0)
+    header = struct.pack(">IIBBBBB", width, height, 16, {2: 4, 3: 2, 4: 6}[channels], 0, 0, 0)
     chunks = chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(data)) + chunk(b"IEND", b"")
     path.write_bytes(b"\x89PNG\r\n\x1a\n" + chunks)
 
@@ -42,6 +42,13 @@ def test_16_bits_are_all_read(tmp_path, channels, filtered):
     np.testing.assert_allclose(read_vectors(tmp_path / "a.png"), 2 * shares - 1, atol=1e-12)
     np.testing.assert_allclose(read_color(tmp_path / "a.png"), srgb_to_linear(shares), atol=1e-12)
     np.testing.assert_allclose(read_factor(tmp_path / "a.png"), shares @ [0.299, 0.587, 0.114], atol=1e-12)
+
+
+def test_gray_with_alpha_of_16_bits_is_read_by_its_upper_half(tmp_path):
+    """Pillow gives no more of it."""
+    values = np.random.default_rng(2).integers(0, 65536, (5, 7, 2))
+    png_of_16_bits(values, tmp_path / "a.png", filtered=False)
+    np.testing.assert_allclose(read_factor(tmp_path / "a.png"), values[..., 0] / 65535, atol=1 / 255)
 
 
 def test_gray_of_16_bits_and_color_of_8(tmp_path):

@@ -54,3 +54,11 @@ def test_a_bad_number_is_named_with_its_part(path):
     path.write_bytes(bytes(data))
     with pytest.raises(ValueError, match=r"all\.ply, from vertex 20: x y z of vertex 0 is not finite"):
         list(sj.SplatFile(path, part=10)())
+
+
+def test_places_that_numbers_cannot_tell_apart_are_refused(path, tmp_path):
+    splats = sj.read_splats(path)
+    far = sj.Splats(splats.centers + 1e7, splats.normals, splats.radii, splats.areas)
+    sj.write_splats(tmp_path / "far.ply", far)
+    with pytest.raises(ValueError, match=r"far\.ply: its points lie 1e\+07 mm from the origin"):
+        list(sj.SplatFile(tmp_path / "far.ply", part=10)())

@@ -1,5 +1,7 @@
 """One plan for an animation: it holds for every camera and every light."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import pytest
@@ -7,6 +9,7 @@ from scenes import sheet, two_gaussians
 
 import splatjax as sj
 from splatjax.diffusion import DenseDiffuser
+from splatjax.render import light_on_splats
 from splatjax.scene import AbstractLight
 
 SETTINGS = sj.RenderSettings(diffuser=DenseDiffuser())  # which needs no plan
@@ -57,3 +60,27 @@ def test_a_mesh_needs_renderers_that_can_be_cut_and_a_plan_of_its_own():
         sj.plan(scene, camera, SETTINGS, mesh=mesh)
     with pytest.raises(ValueError, match="the plan is for one device"):
         sj.render(scene, camera, SETTINGS, sj.plan(scene, camera, SETTINGS), mesh=mesh)
+
+
+def test_a_plan_for_a_mesh_or_for_other_splats_is_refused():
+    mesh, camera, scene = jax.make_mesh((1,), ("splats",)), camera_at(20.0), scene_under()
+    plan = sj.plan(scene, camera, SETTINGS)
+    over = dataclasses.replace(plan, mesh=mesh)
+    calls = (
+        lambda scene, plan: sj.gather_picture(scene, camera, SETTINGS, plan),
+        lambda scene, plan: sj.picture_jacobian(scene, camera, SETTINGS, plan),
+        lambda scene, plan: light_on_splats(scene, plan, SETTINGS),
+    )
+    for call in calls:
+        with pytest.raises(ValueError, match="the plan is made for a mesh"):
+            call(scene, over)
+    other = scene_under(splats=sheet(1.0, 4.0))
+    for call in (*calls, lambda scene, plan: sj.render(scene, camera, SETTINGS, plan)):
+        with pytest.raises(ValueError, match=rf"for {scene.splats.count} splats, and the scene has {other.splats.count}"):
+            call(other, plan)
+
+
+def test_a_batch_whose_arrays_are_not_stacked_is_refused():
+    mesh = jax.make_mesh((1,), ("views",))
+    with pytest.raises(ValueError, match=r"\['b'\] has none"):
+        sj.map_over(mesh, lambda one, each: each["a"], jnp.zeros(()), {"a": jnp.zeros(4), "b": jnp.zeros(())})
