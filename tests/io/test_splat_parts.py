@@ -56,7 +56,7 @@ def test_a_bad_number_is_named_with_its_part(path):
         list(sj.SplatFile(path, part=10)())
 
 
-def test_places_that_numbers_cannot_tell_apart_are_refused(path, tmp_path):
+def test_places_that_numbers_cannot_tell_apart_are_refused(path, tmp_path, float32):
     splats = sj.read_splats(path)
     far = sj.Splats(splats.centers + 1e7, splats.normals, splats.radii, splats.areas)
     sj.write_splats(tmp_path / "far.ply", far)
