@@ -272,34 +272,6 @@ def test_a_robust_loss_is_not_misled_by_rows_that_shine(monkeypatch):
     assert float(jnp.min(misled.splats.albedo)) > 0.85
 
 
-@pytest.mark.once
-@pytest.mark.long
-def test_a_camera_that_comes_closer_outgrows_its_plan_and_arrives():
-    """The renderer's own plan: the body fills four times the pixels that it filled at the start."""
-    far = sj.Camera.look_at(jnp.asarray([0.0, 0.0, 90.0]), jnp.zeros(3), fov=32.0, width=48, height=48)
-    near = eqx.tree_at(lambda c: c.position, far, jnp.asarray([0.0, 0.0, 45.0]))
-    splats, said = bodies.bumpy(600), []
-    scene = sj.Scene(splats, (lights()[0],), material())
-    seen = sj.Observation(np.asarray(sj.render(scene, near).beauty), far, (lights()[0],))
-    optimizer = optax.adam(optax.cosine_decay_schedule(2.0, 60), b2=0.9)
-    found = sj.fit_scene(
-        [seen],
-        splats,
-        material(),
-        [sj.CameraPoses(shift=1.0)],
-        optimizer,
-        steps=60,
-        background=sj.BlackBackground(),
-        progress=lambda what, loss: said.append(what),
-    )
-    assert found.plans > 1
-    assert sum("has outgrown its plan" in each for each in said) == found.plans - 1
-    assert np.all(np.isfinite(found.losses))
-    (camera,) = found.cameras
-    assert abs(float(camera.position[2]) - 45) < 2
-    assert np.all(np.isfinite(found.pictures[0]))
-
-
 def test_what_is_no_number_ends_the_fit_at_the_best_before_it(monkeypatch):
     stand_in(monkeypatch, reach=np.inf, spoiled=0.6)
     settings = sj.RenderSettings(shadows=ShadowSettings(resolution=102))
