@@ -10,9 +10,9 @@ from jaxtyping import Array, Bool, Float
 
 from splatjax import diffusion as _diffusion, shading as _shading, splatting as _splatting
 from splatjax.pointwise import in_parts
-from splatjax.scene import Frame, Scene, Splats, StackedLights, stack_lights
+from splatjax.scene import Camera, Frame, Scene, Splats, StackedLights, stack_lights
 
-from ._lighting import LightOnSplats
+from ._lighting import LightOnSplats, let_light_in
 from ._records import Plan, shadow_views
 from ._settings import RenderSettings
 
@@ -170,6 +170,33 @@ def _shade(scene: Scene, view, groups: list[StackedLights], position, depth, cov
         specular=jnp.where(covered[..., None], specular, 0.0),
         single_scattering=None if single is None else jnp.where(covered[..., None], single, 0.0),
     )
+
+
+def five_passes(
+    scene: Scene,
+    camera: Camera,
+    settings: RenderSettings,
+    plan: Plan,
+    bounds_of: Callable[[Splats], _splatting.Bounds] = _splatting.Bounds.of,
+) -> tuple[ShadedSurface, SeenSurfaces, Float[Array, "tiles gaussians pixels"], Float[Array, ""]]:
+    """Give what is shaded and seen, how much of each layer is diffused, and what room was needed over what there is."""
+    view = _splatting.PerspectiveView.of(camera)
+    light = cast_shadows(scene, settings, plan, bounds_of)
+    entering = let_light_in(scene, light)
+    attributes = settings.lighting.attributes(scene, light, entering)
+    seen = see_surfaces(scene.splats, attributes, view, settings, plan).lit(scene, light, settings)
+    layers, needed = _diffusion.diffusion_layers(
+        sources_of(scene.splats, entering.source),
+        scene.material,
+        seen.receivers(),
+        plan.interval,
+        seen.atlas,
+        plan.diffuser,
+        settings.diffusion.normalization,
+    )
+    shaded = shade(scene, view, light.groups, seen, layers)
+    needed = jnp.max(jnp.stack([needed, seen.needed, light.needed]))
+    return shaded, seen, layers.resolved, needed
 
 
 def compose(

@@ -10,7 +10,7 @@ from splatjax.scene import Camera, Frame, Scene
 
 from ._inputs import SAME, check_channels, in_one_dtype
 from ._lighting import EnteringLight, let_light_in
-from ._passes import cast_shadows, compose, see_surfaces, shade, sources_of
+from ._passes import cast_shadows, compose, five_passes, see_surfaces, sources_of
 from ._plan import check_count, plan_over_unless_traced, plan_unless_traced, refuse_mesh
 from ._records import Plan
 from ._settings import RenderSettings
@@ -50,23 +50,8 @@ def _render(scene: Scene, camera: Camera, settings: RenderSettings, plan: Plan) 
     scene, camera = in_one_dtype(scene, camera)
     if plan.mesh is not None:
         return render_over(plan.mesh, scene, camera, settings, plan)
-    view = _splatting.PerspectiveView.of(camera)
-    light = cast_shadows(scene, settings, plan)
-    entering = let_light_in(scene, light)
-    attributes = settings.lighting.attributes(scene, light, entering)
-    seen = see_surfaces(scene.splats, attributes, view, settings, plan).lit(scene, light, settings)
-    layers, needed = _diffusion.diffusion_layers(
-        sources_of(scene.splats, entering.source),
-        scene.material,
-        seen.receivers(),
-        plan.interval,
-        seen.atlas,
-        plan.diffuser,
-        settings.diffusion.normalization,
-    )
-    shaded = shade(scene, view, light.groups, seen, layers)
-    needed = jnp.max(jnp.stack([needed, seen.needed, light.needed]))
-    return compose(shaded, seen, layers.resolved, scene.material.gaussians.weights, needed)
+    shaded, seen, resolved, needed = five_passes(scene, camera, settings, plan)
+    return compose(shaded, seen, resolved, scene.material.gaussians.weights, needed)
 
 
 def light_on_splats(scene: Scene, plan: Plan, settings: RenderSettings | None = None) -> EnteringLight:

@@ -4,15 +4,13 @@ from functools import partial
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 from jax.sharding import Mesh, PartitionSpec
 
-from splatjax import diffusion as _diffusion, splatting as _splatting
+from splatjax import splatting as _splatting
 from splatjax.devices import Devices, laid_out
 from splatjax.scene import Camera, Frame, Scene
 
-from ._lighting import let_light_in
-from ._passes import SeenSurfaces, cast_shadows, compose, see_surfaces, shade, sources_of
+from ._passes import SeenSurfaces, compose, five_passes
 from ._records import Plan
 from ._settings import RenderSettings
 from ._sharded_plan import filled_up, plan_specs
@@ -33,23 +31,10 @@ def render_over(mesh: Mesh, scene: Scene, camera: Camera, settings: RenderSettin
 
 def _share(devices: Devices, settings: RenderSettings, scene: Scene, camera: Camera, plan: Plan) -> Frame:
     """Do what one device does."""
-    view = _splatting.PerspectiveView.of(camera)
-    light = cast_shadows(scene, settings, plan, lambda splats: _splatting.bounds_over(splats, devices))
-    entering = let_light_in(scene, light)
-    attributes = settings.lighting.attributes(scene, light, entering)
-    seen = see_surfaces(scene.splats, attributes, view, settings, plan).lit(scene, light, settings)
-    layers, needed = _diffusion.diffusion_layers(
-        sources_of(scene.splats, entering.source),
-        scene.material,
-        seen.receivers(),
-        plan.interval,
-        seen.atlas,
-        plan.diffuser,
-        settings.diffusion.normalization,
-    )
-    shaded = shade(scene, view, light.groups, seen, layers)
-    needed = devices.largest(jnp.max(jnp.stack([needed, seen.needed, light.needed])))
-    shaded, resolved = devices.everything((shaded, layers.resolved))
+    bounds_of = partial(_splatting.bounds_over, devices=devices)
+    shaded, seen, resolved, needed = five_passes(scene, camera, settings, plan, bounds_of)
+    shaded, resolved = devices.everything((shaded, resolved))
+    needed = devices.largest(needed)
     return compose(shaded, _of_all(seen, devices), resolved, scene.material.gaussians.weights, needed)
 
 
