@@ -31,7 +31,7 @@ def before_the_camera(mesh: Mesh) -> Mesh:
     return Mesh(mesh.vertices * toward - middle, mesh.faces, mesh.normals * toward, mesh.uvs)
 
 
-def scanned(count: int) -> Body:
+def scanned() -> tuple[Mesh, Textures]:
     """Give the scanned head with its maps."""
     folder = shared() / "data" / "lee_perry_smith"
     mesh, textures = read_textured_mesh(
@@ -43,16 +43,21 @@ def scanned(count: int) -> Body:
         specular=folder / "Map-SPEC.jpg",
         normal=folder / "Infinite-Level_02_Tangent_SmoothUV.jpg",
     )
-    return _body(before_the_camera(mesh), textures, count)
+    return before_the_camera(mesh), textures
 
 
-def bust(count: int) -> Body:
+def bust() -> tuple[Mesh, Textures]:
     """Give the bust's head, its colors laid out by its own coordinates."""
     mesh, textures = rivals.bust_with_textures(MAP)
-    return _body(before_the_camera(mesh), textures, count)
+    return before_the_camera(mesh), textures
 
 
-def _body(mesh: Mesh, textures: Textures, count: int) -> Body:
+HEADS = {"scanned": scanned, "bust": bust}
+
+
+def body_of(head: str, count: int) -> Body:
+    """Give one of the heads with so many splats."""
+    mesh, textures = HEADS[head]()
     return Body(rivals.TexturedMesh.of(mesh, textures), sample_surface(mesh, count, textures=textures))
 
 
@@ -60,6 +65,3 @@ def conditions(width: int) -> tuple[sj.DirectionalLight, sj.Camera]:
     """Give light and camera of `benchmarks.scenes`."""
     light = sj.DirectionalLight(jnp.asarray([0.5, 0.6, 0.65]), jnp.full(3, jnp.pi))
     return light, sj.Camera(jnp.zeros(3), jnp.eye(3), jnp.asarray(FOCAL_LENGTH), width, width)
-
-
-HEADS = {"scanned": scanned, "bust": bust}

@@ -20,7 +20,7 @@ from splatjax import rivals
 from splatjax.diffusion import DiffusionSettings, ExitOdds, PlainMean
 from splatjax.splatting import PerspectiveView
 
-from .heads import HEADS, MAP, Body, conditions
+from .heads import HEADS, MAP, Body, body_of, conditions
 from .rivals_pictures import errors
 from .surface_truth import integrate
 
@@ -120,7 +120,7 @@ def main() -> None:
     options = arguments()
     normalization = NORMALIZATIONS[options.normalization]
     start = time.perf_counter()
-    body = HEADS[options.body](options.splats)
+    body = body_of(options.body, options.splats)
     print(f"{options.body}: {len(body.mesh.faces)} triangles, {body.splats.count} splats ({time.perf_counter() - start:.0f} s)")
     light, camera = conditions(options.width)
     material = sj.load_material("skin").white()
