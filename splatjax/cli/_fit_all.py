@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 import splatjax as sj
 from splatjax.fitting import AbstractWeights
-from splatjax.io import fingerprint, join_tables, own_version, read_media, read_record, write_columns, write_record
+from splatjax.io import fingerprint, join_tables, own_version, read_column, read_media, read_record, write_columns, write_record
 
 from ._processes import own_share
 from ._report import note, progress
@@ -64,7 +64,16 @@ def fit_all(media: Path, output: Path, count: int, weights: AbstractWeights) -> 
         if not output.exists() or str(error.filename) not in map(str, parts):
             raise
     shutil.rmtree(folder, ignore_errors=True)
+    note(_how_many_converged(output))
     print(output)
+
+
+def _how_many_converged(table: Path) -> str:
+    converged = read_column(table, "converged")
+    failed = int(np.sum(converged == 0))
+    if not failed:
+        return f"all {len(converged)} fits converged"
+    return f"{failed} of {len(converged)} fits did not converge; in their rows `converged` is 0"
 
 
 @eqx.filter_jit

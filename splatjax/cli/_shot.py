@@ -1,10 +1,9 @@
 """What `splatjax render` and `splatjax turntable` share: what is shown, from where, and under which light."""
 
 import math
-from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +12,7 @@ import tyro
 
 import splatjax as sj
 from splatjax.io import check_room, fingerprint, free_bytes, material_path, own_version
+from splatjax.scene import Parts
 
 from ._outputs import OptionalPath
 from ._report import note, stage
@@ -149,10 +149,6 @@ def draw(scene: sj.Scene, camera: sj.Camera, plan: sj.Plan) -> sj.Frame:
     if not frame.overflow <= 0:
         raise ValueError(f"the plan lacks room: {float(frame.overflow):.2f} times what it holds is needed")
     return frame
-
-
-Parts: TypeAlias = Callable[[], Iterator[sj.Splats]]
-"""What gives all splats, part by part, whenever it is called."""
 
 
 def in_color(material: sj.Material) -> sj.Material:

@@ -1,6 +1,6 @@
 """Pass 4 of the paper: splat-based diffusion in object space."""
 
-from ._clustered import ClusterDiffuser as ClusterDiffuser
+from ._clustered import ClusterDiffuser as ClusterDiffuser, FINEST as FINEST
 from ._dense import DenseDiffuser as DenseDiffuser
 from ._diffuser import AbstractDiffuser as AbstractDiffuser, Diffused as Diffused
 from ._diffuser import Kernels as Kernels, Sources as Sources

@@ -23,7 +23,8 @@ from ._order import BLOCK
 from ._pixels import FAR, Pixels, block_ranges, tile_grid
 from ._tree import Clusters, ClusterTree
 
-_FINEST = 0.01  # share of the splats that may be finer than those that tell how much of a layer is carried
+FINEST = 0.01
+"""Share of the splats that may be finer than those that tell how much of a layer is carried."""
 _LEAST_LEFT_OUT, _MOST_LEFT_OUT = 4e-5, 0.1  # share of a layer's power beyond its support: 4.5 and 2.1 standard deviations
 _LEAST_SHARE = 1e-3  # of the diffusion integral in a layer that counts at all
 _LANES = 32
@@ -111,7 +112,7 @@ class ClusterDiffuser(AbstractDiffuser):
             return eqx.tree_at(_parts, self, (none, layers), is_leaf=_is_none)
         spacing = math.sqrt(areas.mean())
         radii = np.asarray(splats.radii)
-        begin, fine = float(interval[0]) ** 2, jnp.asarray(np.quantile(areas, _FINEST), kernels.variances.dtype)
+        begin, fine = float(interval[0]) ** 2, jnp.asarray(np.quantile(areas, FINEST), kernels.variances.dtype)
         shares = np.asarray(resolved_share(kernels.variances * self.margin, fine, interval))
         carried = shares > 0
         edges = self.edges(values / self.margin, spacing, carried)

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from splatjax.splatting import BinCapacity
 
@@ -85,8 +85,22 @@ class StreamedSums(eqx.Module):
         """Give the edges of the cells of each level, mm."""
         return sorted({layer.edge for layer in self.layers if layer.edge > 0})
 
+    @property
+    def reach(self) -> float:
+        """Give how far from its splats' centers the light of any layer reaches at most, mm."""
+        found = [0.0]
+        for layer in self.layers:
+            depth = float(layer.depth)
+            across = math.sqrt(3) * sum(cell for cell in self.cells if cell <= layer.edge)  # a cell holds cells, by their centers
+            spread = 0.5 * (across + 2 * depth) ** 2 if layer.edge > 0 else 0.0  # of splats that sink, each along its normal
+            if layer.carried:
+                found.append(depth + layer.support * math.sqrt(float(layer.variance) + spread))
+        return max(found)
+
     def plus(self, sources: Sources, room: StreamedRoom) -> tuple["StreamedSums", StreamedRoom]:
-        """Add what a part of the splats brings; splats without area bring nothing."""
+        """Add what a part of the splats brings; splats without area, or too far from every pixel, bring nothing."""
+        if not _within_reach(self.pixels, sources, self.reach):
+            return self, room
         cells = self.cells
         tree = ClusterTree.build(sources.centers.T, sources.normals.T, cells)
         held = room.counts or (0,) * len(tree.counts)
@@ -130,6 +144,16 @@ class StreamedSums(eqx.Module):
         ]
         values = jnp.stack(values, axis=1)
         return Diffused(values[:, :, :channels], values[:, :, channels], carried, jnp.zeros((), carried.dtype))
+
+
+@eqx.filter_jit
+def _within_reach(pixels: Pixels, sources: Sources, reach: float) -> Bool[Array, ""]:
+    """Say whether the box around sources is within reach (mm) of the box around any tile's points."""
+    there, tiles = (sources.areas > 0)[None], pixels.boxes
+    centers = sources.centers - pixels.origin[:, None]
+    low, high = (jnp.min(jnp.where(there, sign * centers, jnp.inf), axis=1, keepdims=True) for sign in (1, -1))
+    gaps = jnp.maximum(jnp.maximum(tiles.low + high, low - tiles.high), 0)
+    return jnp.any(jnp.sum(gaps * gaps, axis=0) <= reach * reach)
 
 
 def _roomier(count: int) -> int:

@@ -8,7 +8,8 @@ from ._materials import material_path as material_path
 from ._materials import load_material as load_material, load_medium as load_medium, load_profile as load_profile
 from ._materials import materials as materials, profiles_folder as profiles_folder, save_material as save_material
 from ._materials import surface_and_source as surface_and_source
-from ._media import join_tables as join_tables, read_media as read_media, write_columns as write_columns
+from ._media import join_tables as join_tables, read_column as read_column
+from ._media import read_media as read_media, write_columns as write_columns
 from ._mesh import read_mesh as read_mesh, read_textured_mesh as read_textured_mesh, sample_mesh as sample_mesh
 from ._observations import picture_paths as picture_paths, read_observations as read_observations
 from ._ply import read_splats as read_splats, write_splats as write_splats

@@ -67,6 +67,12 @@ def write_columns(path: str | os.PathLike[str], columns: Mapping[str, Iterable])
         writer.writerows(zip(*([_plain(cell) for cell in column] for column in columns.values()), strict=True))
 
 
+def read_column(path: str | os.PathLike[str], name: str) -> Float[np.ndarray, " rows"]:
+    """Read a column of numbers that `write_columns` has written."""
+    with open(path, newline="", encoding="utf-8") as file:
+        return np.asarray([float(row[name]) for row in csv.DictReader(file)])
+
+
 def join_tables(path: str | os.PathLike[str], parts: Sequence[Path]) -> None:
     """Write tables with the same columns as one, in their order, whole or not at all."""
     with atomic_path(path) as temporary, open(temporary, "w", encoding="utf-8") as file:

@@ -81,7 +81,8 @@ def check_places(path: Path, places: Float[np.ndarray, "n 3"]) -> None:
 
 def moderate(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
     """Scale vectors of any length so that squares of their components neither overflow nor vanish; those of zero stay."""
-    greatest = np.abs(vectors).max(axis=1, keepdims=True)
+    x, y, z = np.abs(vectors).T
+    greatest = np.maximum(np.maximum(x, y), z)[:, None]
     with np.errstate(invalid="ignore"):  # infinite ones become no numbers, and are refused as such
         return vectors / np.where(greatest > 0, greatest, 1.0)
 

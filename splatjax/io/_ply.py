@@ -47,7 +47,7 @@ def read_splats(path: str | os.PathLike[str], *, mm_per_unit: float = 1.0) -> Sp
     not finite, radii or areas that are not positive, or holds a Gaussian-splatting scene.
     """
     path = existing_file(path)
-    _check_unit(path, mm_per_unit)
+    check_unit(path, mm_per_unit)
     vertices = vertex_table(path, read_ply(path))
     if all(name in vertices for name in _GAUSSIAN_SPLATTING):
         raise ValueError(
@@ -104,7 +104,8 @@ def write_splats(path: str | os.PathLike[str], splats: Splats) -> None:
         plyfile.PlyData([element], text=False, byte_order="<", comments=comments).write(str(temporary))
 
 
-def _check_unit(path: Path, mm_per_unit: float) -> None:
+def check_unit(path: Path, mm_per_unit: float) -> None:
+    """Refuse a length of the unit (mm) that is none."""
     if not (np.isfinite(mm_per_unit) and mm_per_unit > 0):
         raise ValueError(f"{path}: mm_per_unit is {mm_per_unit}; it must be the positive length of the file's unit in mm")
 
@@ -127,7 +128,10 @@ def check_place(path: Path, centers: np.ndarray, *, estimated: bool) -> None:
         )
 
 
-def positive_of(path: Path, vertices: Table, aliases: tuple[str, ...], scale: float) -> np.ndarray | None:
+def positive_of(
+    path: Path, vertices: Table, aliases: tuple[str, ...], scale: float, then: str = "to have it estimated"
+) -> np.ndarray | None:
+    """Give radii or areas, in mm; where they are left out, `then` says what is to be done."""
     name = next((alias for alias in aliases if alias in vertices), None)
     values = None if name is None else columns_of(path, vertices, (name,))
     if values is None:
@@ -137,7 +141,7 @@ def positive_of(path: Path, vertices: Table, aliases: tuple[str, ...], scale: fl
     if len(bad):
         raise ValueError(
             f"{path}: the {name} of vertex {bad[0]} is {values[bad[0]]:g} ({len(bad)} such vertices); it must be positive,"
-            f" or leave {name} out to have it estimated"
+            f" or leave {name} out {then}"
         )
     if values.max() * scale > _LONGEST**2 or values.min() * scale < _SHORTEST**2:
         said = f"{name} ranges from {values.min():.3g} to {values.max():.3g}"

@@ -53,23 +53,26 @@ def columns_of(path: Path, table: Table, names: tuple[str, ...]) -> Float[np.nda
         raise ValueError(f"{path}: {' '.join(names)} of its vertices are lists; write single numbers")
     with np.errstate(invalid="ignore"):  # of NaN that signals
         values = np.stack(found, axis=-1).astype(np.float64)
-    bad = np.flatnonzero(~np.isfinite(values).all(axis=-1))
-    if len(bad):
+    finite = np.isfinite(values)
+    if not finite.all():
+        bad = np.flatnonzero(~finite.all(axis=-1))
         raise ValueError(
             f"{path}: {' '.join(names)} of vertex {bad[0]} is not finite ({len(bad)} such vertices); remove or mend them"
         )
     return values
 
 
-def normals_of(path: Path, table: Table) -> Float[np.ndarray, "rows 3"] | None:
-    """Give normals, of any length but zero."""
+def normals_of(path: Path, table: Table, then: str = "to have them estimated") -> Float[np.ndarray, "rows 3"] | None:
+    """Give normals, of any length but zero; where they are left out, `then` says what is to be done."""
     normals = columns_of(path, table, ("nx", "ny", "nz"))
     if normals is None:
         return None
-    bad = np.flatnonzero((normals == 0).all(axis=-1))
+    x, y, z = normals.T == 0
+    bad = np.flatnonzero(x & y & z)
     if len(bad):
         raise ValueError(
-            f"{path}: the normal of vertex {bad[0]} has length zero ({len(bad)} such vertices); mend it, or leave out nx ny nz"
+            f"{path}: the normal of vertex {bad[0]} has length zero ({len(bad)} such vertices); mend it,"
+            f" or leave nx ny nz out {then}"
         )
     return normals
 

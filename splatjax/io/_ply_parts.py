@@ -14,10 +14,14 @@ from splatjax.scene import Splats
 from ._files import existing_file
 from ._library import readable
 from ._pieces import moderate
-from ._ply import AREA, RADIUS, check_place, factor_of, positive_of
+from ._ply import AREA, RADIUS, check_place, check_unit, factor_of, positive_of
 from ._ply_columns import Table, colors_of, normals_of, places_of
 
 _PART = 1_000_000
+_COMPLETED = (
+    "complete the file first: splatjax.write_splats(complete, splatjax.read_splats(path)) estimates nx ny nz, radius and area"
+    " where they are left out, and `splatjax sample` of a mesh writes them"
+)
 
 
 class SplatFile:
@@ -38,8 +42,7 @@ class SplatFile:
         self.path, self.part, self.mm_per_unit = existing_file(path), part, mm_per_unit
         if part < 1:
             raise ValueError(f"part is {part}; it must be at least one splat")
-        if not (np.isfinite(mm_per_unit) and mm_per_unit > 0):
-            raise ValueError(f"{path}: mm_per_unit is {mm_per_unit}; it must be the positive length of the file's unit in mm")
+        check_unit(self.path, mm_per_unit)
         with readable(self.path, "PLY"):
             elements = {element.name: element for element in plyfile.PlyData.read(str(self.path), mmap="r")}
         vertices = elements["vertex"].data if "vertex" in elements else None
@@ -49,7 +52,7 @@ class SplatFile:
         names = self._names = self._rows.names or ()
         for needed in (("nx",), ("ny",), ("nz",), RADIUS, AREA):
             if not any(name in names for name in needed):
-                raise ValueError(f"{path}: its vertices have no {needed[0]}, which a part cannot estimate; write complete splats")
+                raise ValueError(f"{path}: its vertices have no {needed[0]}, which a part of them cannot tell; {_COMPLETED}")
 
     def __call__(self) -> Iterator[Splats]:
         """Give all splats from the beginning, in mm and in JAX's default precision, in parts of one size but the last.
@@ -65,23 +68,23 @@ class SplatFile:
             if len(rows) < size:
                 raise ValueError(f"{self.path}: is cut short: vertex {begin + len(rows)} of {self.count} is not there")
             places = places_of(self._where(begin), {name: rows[name] for name in "xyz"}) * self.mm_per_unit
-            corners += [places.min(axis=0), places.max(axis=0)]
-            yield self._splats(begin, rows)
+            corners += [[axis.min() for axis in places.T], [axis.max() for axis in places.T]]
+            yield self._splats(begin, rows, places)
         check_place(self.path, np.stack(corners), estimated=False)
 
     def _where(self, begin: int) -> Path:
         return self.path.with_name(f"{self.path.name}, from vertex {begin}") if begin else self.path
 
-    def _splats(self, begin: int, rows: np.ndarray) -> Splats:
+    def _splats(self, begin: int, rows: np.ndarray, places: np.ndarray) -> Splats:
         where, scale = self._where(begin), self.mm_per_unit
         table: Table = {name: rows[name] for name in self._names}
-        normals, albedo = normals_of(where, table), colors_of(where, table)
+        normals, albedo = normals_of(where, table, f"and {_COMPLETED}"), colors_of(where, table)
         assert normals is not None  # nx is there, and not without the others
         given = (
-            places_of(where, table) * scale,
+            places,
             unit(moderate(normals)),
-            positive_of(where, table, RADIUS, scale),
-            positive_of(where, table, AREA, scale**2),
+            positive_of(where, table, RADIUS, scale, f"and {_COMPLETED}"),
+            positive_of(where, table, AREA, scale**2, f"and {_COMPLETED}"),
         )
         rest = albedo, *(factor_of(where, table, name) for name in ("specular", "roughness"))
         dtype = jnp.result_type(float)

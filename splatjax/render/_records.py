@@ -13,6 +13,8 @@ from splatjax.scene import AbstractLight, PointLight, Splats
 
 from ._settings import RenderSettings
 
+_NEARLY = 1.05  # times the radius of the splats' bounding sphere, around which one frustum fits from outside alone
+
 
 class ShadowPlan(eqx.Module):
     """Shadow maps for one group of lights. A point light among the splats needs the six faces of a cube."""
@@ -67,6 +69,12 @@ class ShadowsWanted(eqx.Module):
 
     views: list[_splatting.AbstractView]
     cube: bool = eqx.field(static=True)
+
+
+def stands_among(lights: Sequence[AbstractLight], bounds: _splatting.Bounds) -> bool:
+    """Say whether a point light stands among the splats, or nearly so: all of its group need a cube. Not for traced arrays."""
+    near = (float(jnp.linalg.norm(light.position - bounds.center)) for light in lights if isinstance(light, PointLight))
+    return any(distance < _NEARLY * float(bounds.radius) for distance in near)
 
 
 def shadow_views(light, bounds, settings: RenderSettings, cube: bool) -> Sequence[_splatting.AbstractView]:

@@ -5,7 +5,8 @@ weighs; where what lies behind ends; the shadow maps' surfaces; then light, and 
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import TypeAlias
+from functools import partial
+from typing import TypeAlias, TypeVar
 
 import equinox as eqx
 import jax
@@ -13,18 +14,21 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from splatjax import diffusion as _diffusion, splatting as _splatting
-from splatjax.scene import AbstractLight, Camera, Frame, Material, PointLight, Scene, Splats, StackedLights, stack_lights
+from splatjax.scene import AbstractLight, Camera, Frame, Material, Parts, Scene, Splats, StackedLights, stack_lights
 
 from ._inputs import check_channels, in_one_dtype
 from ._lighting import EnteringLight, LightOnSplats, let_light_in
-from ._passes import compose, shade, sources_of, surfaces_of
-from ._records import shadow_views
+from ._passes import SeenSurfaces, compose, shade, sources_of, surfaces_of
+from ._records import shadow_views, stands_among
 from ._settings import RenderSettings
 from ._sharded_plan import filled_up_to
 from ._survey import Survey
 
-Parts: TypeAlias = Callable[[], Iterable[Splats]]
 Report: TypeAlias = Callable[[str, int], None]
+Scenes: TypeAlias = Callable[[str], Iterator[Scene]]
+"""Gives a scene of each part, and tells what is being done with them."""
+OfTiles: TypeAlias = Float[Array, "tiles pixels"]
+Done = TypeVar("Done")
 
 
 class _View(eqx.Module):
@@ -39,7 +43,7 @@ class _View(eqx.Module):
             attributes = jnp.zeros((0, splats.count), splats.centers.dtype)
         return _splatting.Stages.of(self.rasterizer.binned(splats, attributes, self.view, self.settings))
 
-    def nothing(self, attributes: int, dtype) -> _splatting.FragmentSums:
+    def nothing(self, attributes: int, dtype: jnp.dtype) -> _splatting.FragmentSums:
         """Give the sums of no part."""
         tiles = _splatting.TileGrid(self.view.width, self.view.height).count
         return _splatting.FragmentSums.of(jnp.zeros((tiles, attributes + 2, _splatting.SIDE**2), dtype))
@@ -84,17 +88,21 @@ def render_streamed(
             f"only a TileRasterizer and a ClusterDiffuser can be streamed, not a {type(rasterizer).__name__} and a"
             f" {type(diffuser).__name__}"
         )
-    survey = Survey.of(parts)
 
-    def every(what: str) -> Iterator[Scene]:
+    def told(what: str) -> Iterator[Splats]:
         done = 0
         for part in parts():
-            count = part.count
-            whole = Scene(filled_up_to(part, survey.rows), tuple(lights), material)
-            yield in_one_dtype(whole)[0]
-            done += count
+            yield part
+            done += part.count
             if report is not None:
                 report(what, done)
+
+    survey = Survey.of(partial(told, "looking"))
+
+    def every(what: str) -> Iterator[Scene]:
+        for part in told(what):
+            whole = Scene(filled_up_to(part, survey.rows), tuple(lights), material)
+            yield in_one_dtype(whole)[0]
 
     first = next(iter(every("looking")))
     check_channels(first)
@@ -113,7 +121,7 @@ def render_streamed(
 
     light, entering = lit(first)
     sizes = {name: rows.shape[0] for name, rows in settings.lighting.attributes(first, light, entering).items()}
-    both = (at[0].nothing(sum(sizes.values()), dtype),) * 2
+    both = at[0].nothing(sum(sizes.values()), dtype), at[0].nothing(sum(sizes.values()), dtype)
     for scene in every("what the camera sees"):
         attributes = settings.lighting.attributes(scene, *lit(scene))
         rows = jnp.concatenate(list(attributes.values()))
@@ -135,19 +143,23 @@ def render_streamed(
     return _finished(first, view, groups, surface, sums.found(first.material.gaussians.weights.shape[1]), interval, settings)
 
 
-def _maps(groups: Sequence[StackedLights], survey: Survey, settings: RenderSettings, dtype) -> list[_Map]:
+def _maps(groups: Sequence[StackedLights], survey: Survey, settings: RenderSettings, dtype: jnp.dtype) -> list[_Map]:
     bounds, found = survey.bounds(dtype), []
     for i, group in enumerate(groups):
         if not group.lights.cast_shadows:
             continue
         each = [jax.tree.map(lambda leaf, j=j: leaf[j], group.lights) for j in range(len(group.places))]
-        near = (float(jnp.linalg.norm(light.position - bounds.center)) for light in each if isinstance(light, PointLight))
-        cube = any(distance < 1.05 * float(bounds.radius) for distance in near)
+        cube = stands_among(each, bounds)
         found += [_Map(view, i, j, cube) for j, light in enumerate(each) for view in shadow_views(light, bounds, settings, cube)]
     return found
 
 
-def _with_room(every, views, rasterizer: _splatting.TileRasterizer, settings: _splatting.SplattingSettings) -> list[_View]:
+def _with_room(
+    every: Scenes,
+    views: Sequence[_splatting.AbstractView],
+    rasterizer: _splatting.TileRasterizer,
+    settings: _splatting.SplattingSettings,
+) -> list[_View]:
     demands, rows = [[] for _ in views], 0
     for scene in every("planning"):
         rows = scene.splats.count
@@ -156,7 +168,9 @@ def _with_room(every, views, rasterizer: _splatting.TileRasterizer, settings: _s
     return [_View(view, rasterizer.with_room(found, rows, view), settings) for view, found in zip(views, demands, strict=True)]
 
 
-def _ends_of_surfaces(every, at: Sequence[_View], dtype):
+def _ends_of_surfaces(
+    every: Scenes, at: Sequence[_View], dtype: jnp.dtype
+) -> tuple[list[OfTiles], list[_splatting.FragmentSums], list[OfTiles]]:
     """Find where the front ends in every view, what it weighs, and where what lies behind ends."""
     fronts = [each.nothing(0, dtype) for each in at]
     limits = [jnp.full_like(each.weights, -jnp.inf) for each in fronts]
@@ -170,29 +184,33 @@ def _ends_of_surfaces(every, at: Sequence[_View], dtype):
     return limits, fronts, [_splatting.second_limits(*each) for each in ends]
 
 
-def _done(found: Iterable) -> list:
+def _done(found: Iterable[Done]) -> list[Done]:
     """Wait: parts that are read ahead would pile up."""
     return jax.block_until_ready(list(found))
 
 
 @eqx.filter_jit
-def _limits(splats: Splats, at: _View, so_far):
+def _limits(splats: Splats, at: _View, so_far: OfTiles) -> OfTiles:
     return jnp.maximum(so_far, at.stages(splats).limits())
 
 
 @eqx.filter_jit
-def _fronts(splats: Splats, at: _View, limits, so_far):
+def _fronts(splats: Splats, at: _View, limits: OfTiles, so_far: _splatting.FragmentSums) -> _splatting.FragmentSums:
     return jax.tree.map(jnp.add, so_far, at.stages(splats).front(limits))
 
 
 @eqx.filter_jit
-def _ends(splats: Splats, at: _View, limits, front: _splatting.FragmentSums, so_far):
+def _ends(
+    splats: Splats, at: _View, limits: OfTiles, front: _splatting.FragmentSums, so_far: tuple[OfTiles, OfTiles]
+) -> tuple[OfTiles, OfTiles]:
     stages = at.stages(splats)
     return jax.tree.map(jnp.maximum, so_far, stages.limits_behind(limits, stages.gaps(limits, front.weights)))
 
 
 @eqx.filter_jit
-def _behind(splats: Splats, at: _View, limits, seconds, so_far):
+def _behind(
+    splats: Splats, at: _View, limits: OfTiles, seconds: OfTiles, so_far: _splatting.FragmentSums
+) -> _splatting.FragmentSums:
     return jax.tree.map(jnp.add, so_far, at.stages(splats).behind(limits, seconds))
 
 
@@ -204,7 +222,11 @@ def _blended(at: _View, front: _splatting.FragmentSums, behind: _splatting.Fragm
 
 @eqx.filter_jit
 def _lit(
-    scene: Scene, groups, maps: Sequence[_Map], surfaces, settings: _splatting.ShadowSettings
+    scene: Scene,
+    groups: list[StackedLights],
+    maps: Sequence[_Map],
+    surfaces: Sequence[_splatting.Surfaces],
+    settings: _splatting.ShadowSettings,
 ) -> tuple[LightOnSplats, EnteringLight]:
     """Let light in through the shadow maps of all parts."""
     shares: list = [None] * len(groups)
@@ -222,13 +244,28 @@ def _lit(
 
 
 @eqx.filter_jit
-def _pictured(splats: Splats, attributes, at: _View, limits, seconds, so_far):
+def _pictured(
+    splats: Splats,
+    attributes: Float[Array, "attributes splats"],
+    at: _View,
+    limits: OfTiles,
+    seconds: OfTiles,
+    so_far: tuple[_splatting.FragmentSums, _splatting.FragmentSums],
+) -> tuple[_splatting.FragmentSums, _splatting.FragmentSums]:
     stages = at.stages(splats, attributes)
     return jax.tree.map(jnp.add, so_far, (stages.front(limits), stages.behind(limits, seconds)))
 
 
 @eqx.filter_jit
-def _finished(scene: Scene, view, groups, surface, diffused, interval, settings: RenderSettings) -> Frame:
+def _finished(
+    scene: Scene,
+    view: _splatting.PerspectiveView,
+    groups: list[StackedLights],
+    surface: SeenSurfaces,
+    diffused: _diffusion.Diffused,
+    interval: Float[Array, "2"],
+    settings: RenderSettings,
+) -> Frame:
     material = scene.material
     layers = _diffusion.layers_of(diffused, material, surface.receivers(), interval, settings.diffusion.normalization)
     shaded = shade(scene, view, groups, surface, layers)

@@ -1,7 +1,6 @@
 """What must be known of all splats before a picture of them can be begun, from a look at one part after the other."""
 
 import math
-from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import jax.numpy as jnp
@@ -9,9 +8,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from splatjax import diffusion as _diffusion, splatting as _splatting
-from splatjax.scene import Splats
+from splatjax.scene import Parts, Splats
 
-_SAMPLED = 4096  # areas of each part
 _PLACES = 64  # as many as `diffusion.irregularity` looks at
 
 
@@ -29,26 +27,25 @@ class Survey:
     spacing: float
     """Root of the mean area."""
     fine: float
-    """Area that one splat in a hundred is finer than, of some of each part."""
+    """Area that one splat in a hundred is finer than."""
     unevenness: float
     """As `diffusion.irregularity`, but that neighbors are those in the same part."""
 
     @classmethod
-    def of(cls, parts: Callable[[], Iterable[Splats]]) -> "Survey":
-        """Look at all parts twice.
+    def of(cls, parts: Parts) -> "Survey":
+        """Look at all parts twice, and keep the areas of the finest.
 
         **Raises:** `ValueError` when there are no splats, or a part is larger than the first, or smaller and not the last.
         """
-        sizes, low, high, area, radius, areas = [], [], [], 0.0, 0.0, []
+        sizes, low, high, area, radius = [], [], [], 0.0, 0.0
         for part in parts():
             if part.count == 0:
                 continue
             centers, own = np.asarray(part.centers), np.asarray(part.areas)
             sizes.append(part.count)
-            low.append(centers.min(axis=0))
-            high.append(centers.max(axis=0))
+            low.append([axis.min() for axis in centers.T])  # quicker than over an axis of three
+            high.append([axis.max() for axis in centers.T])
             area, radius = area + float(own.sum(dtype=np.float64)), max(radius, float(part.radii.max()))
-            areas.append(own[:: max(len(own) // _SAMPLED, 1)])
         if not sizes:
             raise ValueError("there are no splats to stream")
         if any(size != sizes[0] for size in sizes[:-1]) or sizes[-1] > sizes[0]:
@@ -56,10 +53,11 @@ class Survey:
         lowest, highest = np.min(low, axis=0), np.max(high, axis=0)
         middle, squared, begin, near, count = (lowest + highest) / 2, 0.0, 0, [], sum(sizes)
         places = np.linspace(0, count - 1, min(_PLACES, count)).astype(int)
+        rank, finest = _diffusion.FINEST * (count - 1), np.zeros(0)
         for part in parts():
-            offset = np.asarray(part.centers) - middle[None]
-            squared = max(squared, float(np.max(np.sum(offset * offset, axis=1), initial=0)))
+            squared = max(squared, float(np.max(_squares(np.asarray(part.centers), middle), initial=0)))
             near += _nearest(part, places[(places >= begin) & (places < begin + part.count)] - begin)
+            finest = _smallest(np.concatenate([finest, np.asarray(part.areas)]), int(rank) + 2)
             begin += part.count
         distances = np.asarray(near)
         return cls(
@@ -69,7 +67,7 @@ class Survey:
             high=highest,
             reach=math.sqrt(squared) + radius,
             spacing=math.sqrt(area / count),
-            fine=float(np.quantile(np.concatenate(areas), 0.01)),
+            fine=float(np.interp(rank, np.arange(len(finest)), np.sort(finest))),
             unevenness=float(np.std(distances) / max(np.mean(distances), 1e-300)),
         )
 
@@ -87,11 +85,19 @@ class Survey:
         return _diffusion.handover_interval(jnp.asarray(self.unevenness, dtype), settings)
 
 
+def _squares(centers: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """Give squared distances, axis by axis, which is quicker."""
+    return sum((axis - at) ** 2 for axis, at in zip(centers.T, place, strict=True))
+
+
+def _smallest(values: np.ndarray, count: int) -> np.ndarray:
+    return values if len(values) <= count else np.partition(values, count - 1)[:count]
+
+
 def _nearest(part: Splats, places: np.ndarray) -> list[float]:
     """Give the distance of splats to the nearest other one of their part, over the root of their area; of the only one 0."""
     centers, areas, found = np.asarray(part.centers), np.asarray(part.areas), []
     for place in places:
-        offset = centers - centers[place][None]
-        squared = np.delete(np.sum(offset * offset, axis=1), place)
+        squared = np.delete(_squares(centers, centers[place]), place)
         found.append(math.sqrt(np.min(squared, initial=np.inf) / areas[place]) if len(squared) else 0.0)
     return found

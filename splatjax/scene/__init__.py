@@ -7,4 +7,4 @@ from ._lights import GaussianBeam as GaussianBeam, PointLight as PointLight
 from ._lights import stack_lights as stack_lights, StackedLights as StackedLights
 from ._material import Material as Material
 from ._scene import Scene as Scene
-from ._splats import Splats as Splats
+from ._splats import Parts as Parts, Splats as Splats

@@ -1,5 +1,8 @@
 """Splats: discs that cover a surface."""
 
+from collections.abc import Callable, Iterable
+from typing import TypeAlias
+
 import equinox as eqx
 from jaxtyping import Array, Float
 
@@ -33,3 +36,7 @@ class Splats(eqx.Module):
     @property
     def count(self) -> int:
         return self.centers.shape[0]
+
+
+Parts: TypeAlias = Callable[[], Iterable[Splats]]
+"""What gives all splats, part by part, whenever it is called."""

@@ -14,8 +14,8 @@ from splatjax.scene import Splats
 from ._rasterizer import AbstractRasterizer, FragmentSums, SummedFragments
 from ._settings import SplattingSettings
 from ._shadows import Bounds
-from ._stages import Stages, of_tiles, second_limits
-from ._sweeps import Sweep, backward
+from ._stages import Stages, of_tiles
+from ._sweeps import Sweep, backward, second_limits
 from ._tiles import Binned, TileRasterizer
 from ._views import AbstractView
 

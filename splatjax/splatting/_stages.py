@@ -101,12 +101,6 @@ class Stages(eqx.Module):
         return self._within(lax.fori_loop(jnp.int32(0), rounds, look, nothing))
 
 
-def second_limits(weighty: Float[Array, "tiles pixels"], of_any: Float[Array, "tiles pixels"]) -> Float[Array, "tiles pixels"]:
-    """Give where what lies behind ends, from the largest of both in all parts; inf where that is nothing."""
-    found = jnp.where(weighty > -jnp.inf, weighty, of_any)
-    return jnp.where(found > -jnp.inf, found, jnp.inf)
-
-
 def of_tiles(whole: Array, tiles: Array, fill) -> Array:
     """Take what belongs to some tiles; `fill` for those beyond the picture."""
     return whole.at[tiles].get(mode="fill", fill_value=fill)

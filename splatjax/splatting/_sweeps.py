@@ -221,6 +221,12 @@ def picked(is_open: Bool[Array, " tiles"], lanes: int):
     return pick, -(-count // lanes)
 
 
+def second_limits(weighty: Float[Array, "tiles pixels"], of_any: Float[Array, "tiles pixels"]) -> Float[Array, "tiles pixels"]:
+    """Give where what lies behind ends, from the largest of both in all parts; inf where that is nothing."""
+    found = jnp.where(weighty > -jnp.inf, weighty, of_any)
+    return jnp.where(found > -jnp.inf, found, jnp.inf)
+
+
 def _forward(sweep: Sweep, bins: Bins, shift, planes, attributes):
     """Sweep all chunks: both surfaces, tile by tile, and per pixel where they end, in lane order."""
     slots, grid = Slots.gathered(shift, planes, attributes, bins), sweep.grid
@@ -250,9 +256,7 @@ def _forward(sweep: Sweep, bins: Bins, shift, planes, attributes):
         behind, seconds = out
         places, real = pick(i)
         lanes, limit, tiles = sweep.picked(bins, places, dtype), limits[places], bins.order[places]
-        weighty, of_any = sweep.limits_behind(slots, lanes, jnp.where(gaps[places] & real, limit, -jnp.inf))
-        second = jnp.where(weighty > -jnp.inf, weighty, of_any)
-        second = jnp.where(second > -jnp.inf, second, jnp.inf)
+        second = second_limits(*sweep.limits_behind(slots, lanes, jnp.where(gaps[places] & real, limit, -jnp.inf)))
         found = FragmentSums.of(seen(sweep.sums(slots, lanes, second, limit), tiles))
         return jax.tree.map(lambda whole, part: whole.at[tiles].add(part), behind, found), seconds.at[places].min(second)
 

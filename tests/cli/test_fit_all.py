@@ -43,6 +43,7 @@ def test_a_table_of_media_becomes_a_table_of_fits_and_is_taken_up_again(media, t
     said = capsys.readouterr()
     assert said.out == f"{tmp_path / 'fits.csv'}\n"
     assert "2 of 3 batches are there already" in said.err
+    assert "all 5 fits converged" in said.err
     assert not (tmp_path / "fits.csv.parts").exists()
     rows = list(csv.DictReader((tmp_path / "fits.csv").read_text().splitlines()))
     assert [row["name"] for row in rows] == [name for name, *_ in MEDIA]
@@ -56,6 +57,15 @@ def test_a_table_of_media_becomes_a_table_of_fits_and_is_taken_up_again(media, t
         np.testing.assert_allclose([float(rows[3][f"variance_{i}"]) for i in (1, 2)], alone.gaussians.variances, rtol=1e-6)
         np.testing.assert_allclose([float(rows[3][f"weight_{i}"]) for i in (1, 2)], alone.gaussians.weights[:, 0], rtol=1e-6)
         np.testing.assert_allclose(float(rows[3]["error"]), alone.error[0], rtol=1e-6)
+
+
+def test_it_says_how_many_did_not_converge(media, tmp_path, monkeypatch, capsys):
+    def fitted(coefficients, count, weights):
+        return {"error": np.zeros(len(coefficients)), "converged": np.asarray([1.0, 0.0, 1.0, 1.0, 0.0])}
+
+    monkeypatch.setattr(_fit_all, "_fitted", fitted)
+    assert main(["fit", str(media), "--all", "--output", str(tmp_path / "fits.csv")]) == 0
+    assert "2 of 5 fits did not converge; in their rows `converged` is 0" in capsys.readouterr().err
 
 
 BAD = {

@@ -38,7 +38,7 @@ def test_files_that_cannot_be_read_in_parts_are_refused(path, tmp_path):
         sj.SplatFile(tmp_path / "text.ply")
     data = path.read_bytes()
     (tmp_path / "bare.ply").write_bytes(data.replace(b"property float area\n", b"property float else\n"))
-    with pytest.raises(ValueError, match=r"bare\.ply: its vertices have no area"):
+    with pytest.raises(ValueError, match=r"bare\.ply: its vertices have no area.* complete the file first: splatjax\."):
         sj.SplatFile(tmp_path / "bare.ply")
     (tmp_path / "short.ply").write_bytes(data[:-40])
     with pytest.raises(ValueError, match=r"short\.ply: .*cut short"):
@@ -53,6 +53,17 @@ def test_a_bad_number_is_named_with_its_part(path):
     data[-5 * row : -5 * row + 4] = np.float32(np.nan).tobytes()
     path.write_bytes(bytes(data))
     with pytest.raises(ValueError, match=r"all\.ply, from vertex 20: x y z of vertex 0 is not finite"):
+        list(sj.SplatFile(path, part=10)())
+
+
+@pytest.mark.parametrize(("columns", "what"), [((3, 4, 5), "length zero"), ((6,), "it must be positive")])
+def test_what_a_part_cannot_estimate_is_to_be_completed_first(path, columns, what):
+    data, row = bytearray(path.read_bytes()), 4 * 11
+    for column in columns:
+        begin = len(data) - 5 * row + 4 * column
+        data[begin : begin + 4] = bytes(4)
+    path.write_bytes(bytes(data))
+    with pytest.raises(ValueError, match=rf"{what}.*out and complete the file first: splatjax.write_splats"):
         list(sj.SplatFile(path, part=10)())
 
 

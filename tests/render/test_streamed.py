@@ -8,7 +8,8 @@ import pytest
 from scenes import sphere
 
 import splatjax as sj
-from splatjax.diffusion import DenseDiffuser
+from splatjax.diffusion import FINEST, DenseDiffuser
+from splatjax.render._survey import Survey
 from splatjax.splatting import ShadowSettings
 
 pytestmark = pytest.mark.once
@@ -66,11 +67,20 @@ def test_parts_make_the_picture_of_all_at_once(splats):
     )
     assert streamed.overflow == 0
     assert [count for what, count in done if what == "diffusion"] == [500, 1000, 1500, 1700]
+    assert [count for what, count in done if what == "looking"][:8] == 2 * [500, 1000, 1500, 1700]
     found = apart(whole, streamed)
     *single, wide = (np.abs(x - y).max() / x.max() for x, y in zip(whole.layers, streamed.layers, strict=True))
     assert max(single) < ROUNDING
     assert wide < CLUSTERS
     assert max(found.values()) < ROUNDING, found
+
+
+@pytest.mark.parametrize("size", [7, 500, 1700])
+def test_how_fine_the_splats_are_is_found_of_all(splats, size):
+    """By it a layer is carried or handed over, here and in `render` alike."""
+    areas = jnp.asarray(np.random.default_rng(3).permutation(np.geomspace(0.1, 10.0, splats.count)), float)
+    found = Survey.of(in_parts(eqx.tree_at(lambda each: each.areas, splats, areas), size)).fine
+    assert found == pytest.approx(np.quantile(np.asarray(areas, np.float64), FINEST), rel=1e-6)
 
 
 def test_what_cannot_be_streamed_is_refused(splats):
