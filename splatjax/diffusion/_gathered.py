@@ -7,6 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from splatjax.devices import Devices
 from splatjax.gaussians import SumOfGaussians
 from splatjax.splatting import Atlas
 
@@ -48,6 +49,18 @@ class GatheredLight(eqx.Module):
     interval: Float[Array, "2"]
     normalization: AbstractNormalization
     slopes: GatheredSlopes | None = None
+
+    def of_all(self, devices: Devices) -> "GatheredLight":
+        """Give the light at the points of all devices, one after the other."""
+
+        def gathered(rows: Float[Array, "*rows points"]) -> Float[Array, "*rows all"]:
+            return jnp.moveaxis(devices.everything(jnp.moveaxis(rows, -1, 0)), 0, -1)
+
+        def parts(light: "GatheredLight"):
+            own = light.means, light.exits, light.irradiance, light.area, light.albedo
+            return own if light.slopes is None else (*own, light.slopes.means, light.slopes.exits)
+
+        return eqx.tree_at(parts, self, [gathered(rows) for rows in parts(self)])
 
     def resolved(self) -> Float[Array, " gaussians"]:
         """Give the share of the points at which the splats carry each layer."""

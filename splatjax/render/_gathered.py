@@ -5,15 +5,17 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from splatjax import diffusion as _diffusion, splatting as _splatting
+from splatjax.devices import Devices
 from splatjax.gaussians import SumOfGaussians
 from splatjax.scene import Camera, Scene
 
 from ._inputs import check_channels, in_one_dtype
 from ._lighting import let_light_in
-from ._passes import cast_shadows, see_surfaces, shade, sources_of
+from ._passes import BoundsOf, SeenSurfaces, bounds_over, cast_shadows, see_surfaces, shade, sources_of
 from ._plan import plan_unless_traced
 from ._records import Plan
 from ._settings import RenderSettings
+from ._sharded import of_all, over
 
 
 class GatheredPicture(eqx.Module):
@@ -98,8 +100,34 @@ def _gather_any(
 @eqx.filter_jit
 def _gather(scene: Scene, camera: Camera, settings: RenderSettings, plan: Plan, gather: _diffusion.Gather) -> GatheredPicture:
     scene, camera = in_one_dtype(scene, camera)
+    if plan.mesh is None:
+        return _pictured(*_in_tiles(scene, camera, settings, plan, gather))
+
+    def share(devices: Devices, scene: Scene, plan: Plan, camera: Camera) -> GatheredPicture:
+        light, tiles, seen, needed = _in_tiles(scene, camera, settings, plan, gather, bounds_over(devices))
+        return _pictured(light.of_all(devices), devices.everything(tiles), of_all(seen, devices), devices.largest(needed))
+
+    return over(plan.mesh, share, scene, plan, camera)
+
+
+class _Shaded(eqx.Module):
+    """What the tiles show, whatever the weights."""
+
+    post: Float[Array, "tiles pixels #channels"]
+    """From radiant exitance to radiance; 0 where no point is."""
+    specular: Float[Array, "tiles pixels channels"]
+
+
+def _in_tiles(
+    scene: Scene,
+    camera: Camera,
+    settings: RenderSettings,
+    plan: Plan,
+    gather: _diffusion.Gather,
+    bounds_of: BoundsOf = _splatting.Bounds.of,
+) -> tuple[_diffusion.GatheredLight, _Shaded, SeenSurfaces, Float[Array, ""]]:
     splats, view = scene.splats, _splatting.PerspectiveView.of(camera)
-    light = cast_shadows(scene, settings, plan)
+    light = cast_shadows(scene, settings, plan, bounds_of)
     entering = let_light_in(scene, light)
     attributes = settings.lighting.attributes(scene, light, entering)
     seen = see_surfaces(splats, attributes, view, settings, plan).lit(scene, light, settings)
@@ -111,11 +139,16 @@ def _gather(scene: Scene, camera: Camera, settings: RenderSettings, plan: Plan, 
     unlit = jnp.zeros((tiles, 1, channels, pixels), gathered.means.dtype)  # layers are shaded later, when they are weighed
     shaded = shade(scene, view, light.groups, seen, _diffusion.DiffusionLayers(unlit, unlit[:, :, 0]))
     needed = jnp.max(jnp.stack([needed, seen.needed, light.needed]))
+    post = jnp.where(seen.covered[..., None], shaded.post, 0.0)
+    return gathered, _Shaded(post, shaded.specular), seen, needed
+
+
+def _pictured(light: _diffusion.GatheredLight, shaded: _Shaded, seen: SeenSurfaces, needed: Float[Array, ""]) -> GatheredPicture:
     seen = seen.poisoned_unless(needed <= 1)
-    poison = seen.atlas.poison
-    leaving = poison * jnp.where(seen.covered[..., None], seen.share[..., None] * shaded.post, 0.0)
+    tiles, pixels = seen.share.shape
+    leaving = seen.atlas.poison * seen.share[..., None] * shaded.post
     return GatheredPicture(
-        light=gathered,
+        light=light,
         leaving=leaving.reshape(tiles * pixels, -1).T,
         pixels=seen.atlas.pixels().reshape(-1),
         in_front=jnp.broadcast_to(seen.atlas.in_front[:, None], (tiles, pixels)).reshape(-1).astype(leaving.dtype),

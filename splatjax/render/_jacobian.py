@@ -9,15 +9,17 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from splatjax import diffusion as _diffusion, splatting as _splatting
+from splatjax.devices import Devices
 from splatjax.gaussians import SumOfGaussians
 from splatjax.scene import Camera, Frame, Scene
 
 from ._inputs import check_channels, in_one_dtype
 from ._lighting import EnteringLight, LightAtSplats, LightOnSplats, let_light_in
-from ._passes import cast_shadows, compose, see_surfaces, shade, sources_of
+from ._passes import BoundsOf, SeenSurfaces, ShadedSurface, bounds_over, cast_shadows, compose, see_surfaces, shade, sources_of
 from ._plan import plan_unless_traced
 from ._records import Plan
 from ._settings import RenderSettings
+from ._sharded import of_all, over
 
 Parameters = TypeVar("Parameters", bound=PyTree)
 
@@ -108,9 +110,41 @@ def picture_jacobian(
 @eqx.filter_jit
 def _picture_jacobian(scene: Scene, camera: Camera, settings: RenderSettings, plan: Plan) -> PictureJacobian:
     scene, camera = in_one_dtype(scene, camera)
+    if plan.mesh is None:
+        return _pictured(scene, *_in_tiles(scene, camera, settings, plan))
+
+    def share(devices: Devices, scene: Scene, plan: Plan, camera: Camera) -> PictureJacobian:
+        tiles, seen, needed = _in_tiles(scene, camera, settings, plan, bounds_over(devices))
+        return _pictured(scene, devices.everything(tiles), of_all(seen, devices), devices.largest(needed))
+
+    return over(plan.mesh, share, scene, plan, camera)
+
+
+class _Differentiated(eqx.Module):
+    """What the tiles show, and how radiant exitance changes there."""
+
+    shaded: ShadedSurface
+    resolved: Float[Array, "tiles gaussians pixels"]
+    weights: Float[Array, "tiles gaussians channels pixels"]
+    variances: Float[Array, "tiles gaussians channels pixels"]
+
+
+def _pictured(scene: Scene, tiles: _Differentiated, seen: SeenSurfaces, needed: Float[Array, ""]) -> PictureJacobian:
+    seen = seen.poisoned_unless(needed <= 1)
+
+    def of_beauty(slopes: Float[Array, "tiles gaussians channels pixels"]):
+        return seen.picture(tiles.shaded.post[:, None] * slopes.transpose(0, 1, 3, 2))
+
+    frame = compose(tiles.shaded, seen, tiles.resolved, scene.material.gaussians.weights, needed)
+    return PictureJacobian(frame, of_beauty(tiles.weights), of_beauty(tiles.variances))
+
+
+def _in_tiles(
+    scene: Scene, camera: Camera, settings: RenderSettings, plan: Plan, bounds_of: BoundsOf = _splatting.Bounds.of
+) -> tuple[_Differentiated, SeenSurfaces, Float[Array, ""]]:
     splats, material = scene.splats, scene.material
     view = _splatting.PerspectiveView.of(camera)
-    light = cast_shadows(scene, settings, plan)
+    light = cast_shadows(scene, settings, plan, bounds_of)
     entering, more = _entering_and_its_slope(scene, light)
     attributes = settings.lighting.attributes(scene, light, entering)
     if more is not None:
@@ -123,15 +157,8 @@ def _picture_jacobian(scene: Scene, camera: Camera, settings: RenderSettings, pl
         gained, _ = _diffusion.diffusion_layers(sources_of(splats, more), material, seen.receivers("more"), *rest)
         of_weights = of_weights + jnp.sum(material.gaussians.weights[None, :, :, None] * gained.layers, axis=1, keepdims=True)
     shaded = shade(scene, view, light.groups, seen, layers)
-
     needed = jnp.max(jnp.stack([needed, seen.needed, light.needed]))
-    seen = seen.poisoned_unless(needed <= 1)
-
-    def of_beauty(slopes: Float[Array, "tiles gaussians channels pixels"]):
-        return seen.picture(shaded.post[:, None] * slopes.transpose(0, 1, 3, 2))
-
-    frame = compose(shaded, seen, layers.resolved, material.gaussians.weights, needed)
-    return PictureJacobian(frame, of_beauty(of_weights), of_beauty(slopes.variances))
+    return _Differentiated(shaded, layers.resolved, of_weights, slopes.variances), seen, needed
 
 
 def _entering_and_its_slope(scene: Scene, light: LightOnSplats) -> tuple[EnteringLight, Float[Array, "channels splats"] | None]:

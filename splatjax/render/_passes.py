@@ -1,6 +1,8 @@
 """The five passes, wired. No mathematics lives here."""
 
 from collections.abc import Callable
+from functools import partial
+from typing import TypeAlias
 
 import equinox as eqx
 import jax
@@ -9,6 +11,7 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float
 
 from splatjax import diffusion as _diffusion, shading as _shading, splatting as _splatting
+from splatjax.devices import Devices
 from splatjax.pointwise import in_parts
 from splatjax.scene import Camera, Frame, Scene, Splats, StackedLights, stack_lights
 
@@ -16,10 +19,16 @@ from ._lighting import LightOnSplats, let_light_in
 from ._records import Plan, shadow_views
 from ._settings import RenderSettings
 
+BoundsOf: TypeAlias = Callable[[Splats], _splatting.Bounds]
+"""Gives the sphere around all splats of some: `Bounds.of` of those that are all, `bounds_over` of a device's."""
 
-def cast_shadows(
-    scene: Scene, settings: RenderSettings, plan: Plan, bounds_of: Callable[[Splats], _splatting.Bounds] = _splatting.Bounds.of
-) -> LightOnSplats:
+
+def bounds_over(devices: Devices) -> BoundsOf:
+    """Give what finds the sphere around the splats of all devices."""
+    return partial(_splatting.bounds_over, devices=devices)
+
+
+def cast_shadows(scene: Scene, settings: RenderSettings, plan: Plan, bounds_of: BoundsOf = _splatting.Bounds.of) -> LightOnSplats:
     """Pass 1."""
     groups = stack_lights(scene.lights)
     shares, needs = _lit_shares(scene.splats, groups, settings, plan, bounds_of(scene.splats))
@@ -177,7 +186,7 @@ def five_passes(
     camera: Camera,
     settings: RenderSettings,
     plan: Plan,
-    bounds_of: Callable[[Splats], _splatting.Bounds] = _splatting.Bounds.of,
+    bounds_of: BoundsOf = _splatting.Bounds.of,
 ) -> tuple[ShadedSurface, SeenSurfaces, Float[Array, "tiles gaussians pixels"], Float[Array, ""]]:
     """Give what is shaded and seen, how much of each layer is diffused, and what room was needed over what there is."""
     view = _splatting.PerspectiveView.of(camera)

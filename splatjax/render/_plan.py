@@ -11,10 +11,10 @@ from jax.sharding import Mesh
 from jaxtyping import Array, Float
 
 from splatjax import diffusion as _diffusion, splatting as _splatting
-from splatjax.scene import AbstractLight, Camera, PointLight, Scene, Splats, StackedLights, stack_lights
+from splatjax.scene import AbstractLight, Camera, Scene, Splats, StackedLights, stack_lights
 
 from ._inputs import in_one_dtype
-from ._records import Plan, ShadowPlan, ShadowsWanted, Wanted, shadow_views
+from ._records import Plan, ShadowPlan, ShadowsWanted, Wanted, shadow_views, stands_among
 from ._settings import RenderSettings
 from ._sharded_plan import on_one_device, plan_over
 
@@ -100,30 +100,20 @@ def _look(splats: Splats, view, settings: _splatting.SplattingSettings, rasteriz
     return jnp.where(grown > -jnp.inf, grown + 2 * jnp.mean(splats.radii), -jnp.inf)
 
 
-def plan_unless_traced(scene: Scene, camera: Camera, settings: RenderSettings, plan: Plan | None) -> Plan:
-    """Give the plan, or make one where that can be.
-
-    **Raises:** `ValueError` for a plan that is made for a mesh, or when none is given under `jit`, `grad` or `vmap`.
-    """
-    if plan is not None:
-        refuse_mesh(plan)
-    return plan_over_unless_traced(None, scene, camera, settings, plan)
-
-
 def check_count(plan: Plan, scene: Scene) -> None:
     """Raise `ValueError` for a plan that is made for another number of splats."""
     if plan.splats not in (None, scene.splats.count):
         raise ValueError(f"the plan is for {plan.splats} splats, and the scene has {scene.splats.count}; make it anew")
 
 
-def refuse_mesh(plan: Plan) -> None:
-    """Raise `ValueError` for a plan that is made for a mesh."""
-    if plan.mesh is not None:
-        raise ValueError("the plan is made for a mesh, over which only splatjax.render works; make one without a mesh")
+def plan_unless_traced(
+    scene: Scene, camera: Camera, settings: RenderSettings, plan: Plan | None, mesh: Mesh | None = None
+) -> Plan:
+    """Give the plan, or make one where that can be. Its own mesh need not be named.
 
-
-def plan_over_unless_traced(mesh: Mesh | None, scene: Scene, camera: Camera, settings: RenderSettings, plan: Plan | None) -> Plan:
-    """The same for a mesh, which may be the plan's own."""
+    **Raises:** `ValueError` for a plan of another number of splats or another mesh, or when none is given under `jit`, `grad` or
+    `vmap`.
+    """
     if plan is not None:
         check_count(plan, scene)
         if mesh is not None and plan.mesh != mesh:
@@ -146,12 +136,8 @@ def _groups(lights: Sequence[tuple[AbstractLight, ...]]) -> list[list[StackedLig
 
 
 def _shadows_wanted(groups: Sequence[StackedLights], bounds: _splatting.Bounds, settings: RenderSettings) -> ShadowsWanted | None:
-    kind = groups[0].lights
-    if not kind.cast_shadows:
+    if not groups[0].lights.cast_shadows:
         return None
     lights = [jax.tree.map(lambda leaf, i=i: leaf[i], group.lights) for group in groups for i in range(len(group.places))]
-    cube = False
-    if isinstance(kind, PointLight):
-        distances = jnp.stack([jnp.linalg.norm(light.position - bounds.center) for light in lights])
-        cube = bool(jnp.any(distances < 1.05 * bounds.radius))
+    cube = stands_among(lights, bounds)
     return ShadowsWanted([view for light in lights for view in shadow_views(light, bounds, settings, cube)], cube)

@@ -1,20 +1,22 @@
 """A picture with all its layers, and pass 4 alone."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
-from jax.sharding import Mesh
+from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Float
 
 from splatjax import diffusion as _diffusion, splatting as _splatting
+from splatjax.devices import Devices, laid_out
 from splatjax.scene import Camera, Frame, Scene
 
 from ._inputs import SAME, check_channels, in_one_dtype
 from ._lighting import EnteringLight, let_light_in
-from ._passes import cast_shadows, compose, five_passes, see_surfaces, sources_of
-from ._plan import check_count, plan_over_unless_traced, plan_unless_traced, refuse_mesh
+from ._passes import SeenSurfaces, bounds_over, cast_shadows, compose, five_passes, see_surfaces, sources_of
+from ._plan import check_count, plan_unless_traced
 from ._records import Plan
 from ._settings import RenderSettings
-from ._sharded import render_over
+from ._sharded import of_all, over
 
 
 def render(
@@ -41,17 +43,23 @@ def render(
     """
     settings = RenderSettings() if settings is None else settings
     check_channels(scene)
-    plan = plan_over_unless_traced(mesh, scene, camera, settings, plan)
+    plan = plan_unless_traced(scene, camera, settings, plan, mesh)
     return _render(scene, camera, settings, plan)
 
 
 @eqx.filter_jit
 def _render(scene: Scene, camera: Camera, settings: RenderSettings, plan: Plan) -> Frame:
     scene, camera = in_one_dtype(scene, camera)
-    if plan.mesh is not None:
-        return render_over(plan.mesh, scene, camera, settings, plan)
-    shaded, seen, resolved, needed = five_passes(scene, camera, settings, plan)
-    return compose(shaded, seen, resolved, scene.material.gaussians.weights, needed)
+    if plan.mesh is None:
+        shaded, seen, resolved, needed = five_passes(scene, camera, settings, plan)
+        return compose(shaded, seen, resolved, scene.material.gaussians.weights, needed)
+
+    def share(devices: Devices, scene: Scene, plan: Plan, camera: Camera) -> Frame:
+        shaded, seen, resolved, needed = five_passes(scene, camera, settings, plan, bounds_over(devices))
+        shaded, resolved = devices.everything((shaded, resolved))
+        return compose(shaded, of_all(seen, devices), resolved, scene.material.gaussians.weights, devices.largest(needed))
+
+    return over(plan.mesh, share, scene, plan, camera)
 
 
 def light_on_splats(scene: Scene, plan: Plan, settings: RenderSettings | None = None) -> EnteringLight:
@@ -65,10 +73,9 @@ def light_on_splats(scene: Scene, plan: Plan, settings: RenderSettings | None = 
 
     **Returns:** the irradiance, and what of it spreads: `source.T` is what `diffuse` asks for.
 
-    **Raises:** `ValueError` when the channels disagree, or the plan is made for a mesh.
+    **Raises:** `ValueError` when the channels disagree, or the plan is for another number of splats.
     """
     check_channels(scene)
-    refuse_mesh(plan)
     check_count(plan, scene)
     return _light_on_splats(scene, plan, RenderSettings() if settings is None else settings)
 
@@ -76,7 +83,17 @@ def light_on_splats(scene: Scene, plan: Plan, settings: RenderSettings | None = 
 @eqx.filter_jit
 def _light_on_splats(scene: Scene, plan: Plan, settings: RenderSettings) -> EnteringLight:
     (scene,) = in_one_dtype(scene)
-    return let_light_in(scene, cast_shadows(scene, settings, plan))
+    if plan.mesh is None:
+        return let_light_in(scene, cast_shadows(scene, settings, plan))
+
+    def share(devices: Devices, scene: Scene, plan: Plan) -> EnteringLight:
+        return let_light_in(scene, cast_shadows(scene, settings, plan, bounds_over(devices)))
+
+    found, count = over(plan.mesh, share, scene, plan, found=PartitionSpec(None, Devices.of(plan.mesh).axes)), scene.splats.count
+    if found.source.shape[1] == count:
+        return found
+    whole = laid_out(plan.mesh, found, jax.tree.map(lambda _: PartitionSpec(), found))
+    return jax.tree.map(lambda rows: rows[:, :count], whole)
 
 
 def diffuse(
@@ -109,6 +126,19 @@ def diffuse(
 @eqx.filter_jit
 def _diffuse(scene: Scene, irradiance, camera: Camera, settings: RenderSettings, plan: Plan):
     scene, camera, irradiance = in_one_dtype(scene, camera, irradiance)
+    if plan.mesh is None:
+        layers, seen, needed = _layers(settings, scene, plan, camera, irradiance)
+        return _front_picture(layers, seen, needed)
+
+    def share(devices: Devices, scene: Scene, plan: Plan, camera: Camera, irradiance):
+        layers, seen, needed = _layers(settings, scene, plan, camera, irradiance)
+        return _front_picture(devices.everything(layers), of_all(seen, devices), devices.largest(needed))
+
+    return over(plan.mesh, share, scene, plan, camera, rows=(irradiance,))
+
+
+def _layers(settings: RenderSettings, scene: Scene, plan: Plan, camera: Camera, irradiance: Float[Array, "splats channels"]):
+    """Give the plain layers in tiles, what is seen, and what room was needed over what there is."""
     splats, view = scene.splats, _splatting.PerspectiveView.of(camera)
     attributes = {"area": splats.areas[None], "source": irradiance.T}
     if splats.albedo is not None:
@@ -123,5 +153,10 @@ def _diffuse(scene: Scene, irradiance, camera: Camera, settings: RenderSettings,
         plan.diffuser,
         settings.diffusion.normalization,
     )
-    seen = seen.poisoned_unless(jnp.maximum(needed, seen.needed) <= 1)
-    return seen.atlas.front_picture(layers.layers.transpose(0, 1, 3, 2))
+    return layers.layers, seen, jnp.maximum(needed, seen.needed)
+
+
+def _front_picture(
+    layers: Float[Array, "tiles gaussians channels pixels"], seen: SeenSurfaces, needed: Float[Array, ""]
+) -> Float[Array, "gaussians height width channels"]:
+    return seen.poisoned_unless(needed <= 1).atlas.front_picture(layers.transpose(0, 1, 3, 2))

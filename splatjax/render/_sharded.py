@@ -1,44 +1,59 @@
-"""The five passes with the splats cut over the devices of a mesh: each works on its splats, then on its strip of the picture."""
+"""The passes with the splats cut over the devices of a mesh: each works on its splats, then on its strip of the picture."""
 
-from functools import partial
+from collections.abc import Callable
+from typing import TypeVar
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 from jax.sharding import Mesh, PartitionSpec
+from jaxtyping import Array, Float, PyTree
 
-from splatjax import splatting as _splatting
 from splatjax.devices import Devices, laid_out
-from splatjax.scene import Camera, Frame, Scene
+from splatjax.scene import Scene
 
-from ._passes import SeenSurfaces, compose, five_passes
+from ._passes import SeenSurfaces
 from ._records import Plan
-from ._settings import RenderSettings
 from ._sharded_plan import filled_up, plan_specs
 
+Found = TypeVar("Found", bound=PyTree)
 
-def render_over(mesh: Mesh, scene: Scene, camera: Camera, settings: RenderSettings, plan: Plan) -> Frame:
-    """Render with a plan that is made for a mesh. The picture is on every device; gradients go back to where the splats are."""
-    devices = Devices.of(mesh)
+
+def over(
+    mesh: Mesh,
+    share: Callable[..., Found],
+    scene: Scene,
+    plan: Plan,
+    *rest: PyTree,
+    rows: tuple[Float[Array, "splats channels"], ...] = (),
+    found: PartitionSpec | None = None,
+) -> Found:
+    """Let every device do its share, with a plan that is made for a mesh. Gradients go back to where the splats are.
+
+    **Arguments:**
+
+    - `share`: what one device does: of the devices, then of scene, plan, `rest` and `rows` as it has them, its own splats alone.
+    - `rest`: what every device has whole.
+    - `rows`: one for each splat, and cut as the splats are.
+    - `found`: how what the shares give lies over the devices; `None` for what is the same on all.
+    """
+    devices, count = Devices.of(mesh), scene.splats.count
     scene = Scene(filled_up(scene.splats, devices), scene.lights, scene.material)
-    specs = jax.tree.map(lambda _: PartitionSpec(), (scene, camera, plan))
-    specs = eqx.tree_at(lambda each: each[0].splats, specs, jax.tree.map(lambda _: devices.shares, scene.splats))
-    specs = eqx.tree_at(lambda each: each[2], specs, plan_specs(plan, devices))
+    rows = tuple(jnp.pad(each, ((0, scene.splats.count - count), (0, 0))) for each in rows)
+    of_scene, of_rest = jax.tree.map(lambda _: PartitionSpec(), (scene, rest))
+    of_scene = eqx.tree_at(lambda each: each.splats, of_scene, jax.tree.map(lambda _: devices.shares, scene.splats))
+    given, specs = (scene, plan, rest, rows), (of_scene, plan_specs(plan, devices), of_rest, (devices.shares,) * len(rows))
+
+    def whole_share(scene, plan, rest, rows):
+        return share(devices, scene, plan, *rest, *rows)
+
     # Without a check of what varies over devices: rules of our own derivatives, and loops, are not written for it.
-    share = partial(_share, devices, settings)
-    share = jax.shard_map(share, mesh=mesh, in_specs=specs, out_specs=PartitionSpec(), check_vma=False)
-    return share(*laid_out(mesh, (scene, camera, plan), specs))
+    gives = PartitionSpec() if found is None else found
+    whole_share = jax.shard_map(whole_share, mesh=mesh, in_specs=specs, out_specs=gives, check_vma=False)
+    return whole_share(*laid_out(mesh, given, specs))
 
 
-def _share(devices: Devices, settings: RenderSettings, scene: Scene, camera: Camera, plan: Plan) -> Frame:
-    """Do what one device does."""
-    bounds_of = partial(_splatting.bounds_over, devices=devices)
-    shaded, seen, resolved, needed = five_passes(scene, camera, settings, plan, bounds_of)
-    shaded, resolved = devices.everything((shaded, resolved))
-    needed = devices.largest(needed)
-    return compose(shaded, _of_all(seen, devices), resolved, scene.material.gaussians.weights, needed)
-
-
-def _of_all(seen: SeenSurfaces, devices: Devices) -> SeenSurfaces:
-    """Give what a picture is laid together by."""
+def of_all(seen: SeenSurfaces, devices: Devices) -> SeenSurfaces:
+    """Give what a picture is laid together by: the places of all devices' strips, and the shares of their pixels."""
     parts = seen.atlas.of_all(devices), devices.everything(seen.share)
     return eqx.tree_at(lambda each: (each.atlas, each.share), seen, parts)

@@ -13,6 +13,7 @@ from scenes import sphere
 import splatjax as sj
 from benchmarks.communication import Picture, counted
 from splatjax.diffusion import DenseDiffuser
+from splatjax.render import light_on_splats
 from splatjax.splatting import DenseRasterizer, ShadowSettings
 
 SETTINGS = sj.RenderSettings(shadows=ShadowSettings(resolution=32))
@@ -70,6 +71,26 @@ def splats_cut() -> dict:
     ((_, one), d_one), ((_, many), d_many) = (pictured(world, eye, plan) for plan in plans)
     kinds = [[layer.level > 0, layer.nodes is not None] for layer in plans[0].diffuser.layers]
     return {"frame": apart(one, many), "gradients": apart(d_one, d_many), "overflow": float(many.overflow), "layers": kinds}
+
+
+def more_than_pictures_cut() -> dict:
+    """What else is made of splats that are cut: the Jacobian, the picture of any weights, light on splats, pass 4 alone."""
+    world, eye = scene(), camera()
+    mesh = jax.make_mesh((8,), ("splats",))
+    other = sj.SumOfGaussians(world.material.gaussians.variances, world.material.gaussians.weights[::-1])
+    found = []
+    for plan in (sj.plan(world, eye, SETTINGS), sj.plan(world, eye, SETTINGS, mesh=mesh)):
+        light = light_on_splats(world, plan, SETTINGS)
+        gathered = sj.gather_picture_and_slopes(world, eye, SETTINGS, plan)
+        found.append(
+            {
+                "light": light,
+                "diffused": sj.diffuse(world, light.source.T, eye, SETTINGS, plan),
+                "gathered": (gathered.beauty(other), gathered.coverage),
+                "jacobian": sj.picture_jacobian(world, eye, SETTINGS, plan),
+            }
+        )
+    return apart(*found)
 
 
 def traffic() -> dict:

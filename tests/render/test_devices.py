@@ -42,6 +42,13 @@ def test_splats_on_eight_devices_make_the_picture_of_one_and_the_gradients_where
 
 
 @pytest.mark.long
+def test_splats_on_eight_devices_make_the_derivatives_and_the_light_of_one():
+    answer = on_eight("more_than_pictures_cut")["more_than_pictures_cut"]
+    assert len(answer) > 20
+    assert max(answer.values()) < ROUNDING, answer
+
+
+@pytest.mark.long
 def test_devices_send_each_other_what_the_model_says():
     answer = on_eight("traffic")["traffic"]
     for kind, model in answer["model"].items():
