@@ -13,13 +13,15 @@ from splatjax.io import atomic_path
 
 COLUMNS = ("x", "y", "z", "nx", "ny", "nz", "radius", "area", "red", "green", "blue")
 _AT_ONCE = 500_000
+_BEND = 0.75
 
 
 def write_cloud(path: Path, mesh: Mesh, textures: Textures, count: int) -> None:
     """Write splats that cover a mesh, of one area and with its albedo, neighbors near each other, as `SplatFile` reads them.
 
     Triangles go along a Morton curve, and each gives as many splats as its area asks for. The order within it is that of the
-    cuts. Memory does not grow with their number.
+    cuts. Splats lie on the mesh bent along its normals: they are so small that they would show its flat triangles. Memory does
+    not grow with their number.
     """
     header = ["ply", "format binary_little_endian 1.0", "comment lengths in mm", f"element vertex {count}"]
     header += [*(f"property float {name}" for name in COLUMNS), "end_header", ""]
@@ -42,14 +44,22 @@ def _pieces(mesh: Mesh, textures: Textures, count: int) -> Iterator[np.ndarray]:
 def _rows(mesh: Mesh, textures: Textures, faces: np.ndarray, counts: np.ndarray, areas: np.ndarray) -> np.ndarray:
     of, corners = cut(mesh.corners()[faces], counts)
     points = SurfacePoints(faces[of], corners[:, :, :3].mean(axis=1))
-    centers, normals = points.positions(mesh), points.normals(mesh)
+    flat, normals = points.positions(mesh), points.normals(mesh)
     if textures.normal is not None:
         normals = perturbed_normals(mesh, points, normals, lookup(textures.normal, texture_coordinates(mesh, points)))
     area = (areas / np.maximum(counts, 1))[of]
-    reach = np.linalg.norm(corners[:, :, 3:] - centers[:, None], axis=2).max(axis=1)
+    reach = np.linalg.norm(corners[:, :, 3:] - flat[:, None], axis=2).max(axis=1)
     albedo = worn_albedo(textures, mesh, points)
     assert albedo is not None
-    return np.column_stack([centers, normals, np.maximum(1.5 * np.sqrt(area), 1.2 * reach), area, albedo])
+    return np.column_stack([bent(mesh, points, flat), normals, np.maximum(1.5 * np.sqrt(area), 1.2 * reach), area, albedo])
+
+
+def bent(mesh: Mesh, points: SurfacePoints, flat: np.ndarray) -> np.ndarray:
+    """Move points `[points, 3]` toward the tangent planes of their triangles' corners: Boubekeur and Alexa 2008, section 3."""
+    at = mesh.faces[points.faces]
+    corners, normals = mesh.vertices[at], mesh.normals[at]
+    above = np.einsum("pci,pci->pc", flat[:, None] - corners, normals)
+    return flat - _BEND * np.einsum("pc,pc,pci->pi", points.barycentrics, above, normals)
 
 
 def cut(corners: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
