@@ -79,7 +79,7 @@ SOURCES := $(shell find splatjax profiles -name '*.py' -o -name '*.toml')
 docs: $(VENV)/docs $(NOTEBOOKS:notebooks/%.py=out/notebooks/%.ipynb)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet
 	$(BIN)/python tools/check_site.py out/site
-	@echo "out/site/index.html; with search: python3 -m http.server --directory out/site"
+	@echo out/site/index.html
 
 out/notebooks/%.ipynb: notebooks/%.py $(SOURCES) | $(VENV)/docs
 	mkdir -p out/notebooks/running

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Annotated
 
 import jax
+import optimistix as optx
 import tyro
 from rich.console import Console
 from rich.table import Table
@@ -107,7 +108,10 @@ class Fit:
         count = self.count if self.error is None else sj.LeastCount(self.error)
         title = f"{self.count} Gaussians" if self.error is None else f"Gaussians to an error of {self.error:g}"
         with stage(f"fitting {title} to {self.medium}"):
-            fitted = jax.block_until_ready(sj.fit_gaussians(profile, count, weights=self._weights(coefficients), rule=made.rule))
+            weights = self._weights(coefficients)
+            fitted = jax.block_until_ready(sj.fit_gaussians(profile, count, weights=weights, rule=made.rule, throw=False))
+            if fitted.result != optx.RESULTS.successful:
+                raise ValueError(self._unsettled(len(fitted.gaussians.variances)))
         _print(fitted)
         if self.output is not None:
             self._save(self.output, coefficients, made, fitted)
@@ -121,6 +125,12 @@ class Fit:
             with atomic_path(self.plot) as written:
                 figure.savefig(written)
             print(self.plot)
+
+    def _unsettled(self, count: int) -> str:
+        told = f"{self.medium}: the search for {count} Gaussians did not settle"
+        if self.model is Model.MONTE_CARLO:
+            return f"{told}; {self.photons} photons tell too little apart: give more --photons, or a smaller --count"
+        return f"{told}; give a smaller --count"
 
     def _coefficients(self) -> sj.Dipole | sj.LayeredMultipole | sj.Tabulated:
         match Path(self.medium).suffix.lower():

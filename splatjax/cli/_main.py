@@ -79,9 +79,16 @@ def _said(error: Exception) -> tuple[str, int]:
         return f"{error.filename}: {error.strerror}", 2
     if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in words:
         return "this takes more memory than there is; take fewer splats, or a smaller picture", 2
-    if isinstance(error, ValueError | OSError | eqx.EquinoxRuntimeError):
+    if isinstance(error, eqx.EquinoxRuntimeError):
+        return _said_in_compiled_code(str(error)), 2
+    if isinstance(error, ValueError | OSError):
         return words or type(error).__name__, 2
     return f"a fault of splatjax itself: {type(error).__name__}: {words}; please report it with what {_DEBUG} shows", 1
+
+
+def _said_in_compiled_code(words: str) -> str:
+    """Give what a check in compiled code says, without the stack before it and the advice to developers behind it."""
+    return " ".join(words.rpartition("EquinoxRuntimeError: ")[2].partition("\n\n---")[0].split())
 
 
 def _show_warning(message: Warning | str, category: type[Warning]) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix as optx
 import tyro
 from rich.console import Console
 
@@ -112,7 +113,13 @@ class Recover:
             count=self.count,
             loss=sj.HuberLoss() if self.robust else sj.SquaredLoss(),
             progress=say,
+            throw=False,
         )
+        if recovery.result != optx.RESULTS.successful:
+            raise ValueError(
+                f"{self.pictures}: the search did not settle in {recovery.rounds} rounds and {recovery.steps} steps; the same "
+                "command goes on where it stopped, or --start names materials that are nearer"
+            )
         note(f"{time.perf_counter() - begin:6.1f} s  found, after {recovery.rounds} rounds and {recovery.steps} steps")
         Console(highlight=False, soft_wrap=True).print(recovery.words(), markup=False)
         if self.suggest:

@@ -7,11 +7,15 @@ import sys
 import tomllib
 import warnings
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
+import optimistix as optx
 import pytest
 from commands import failure, plate
 
-from splatjax.cli import _materials, main
+import splatjax as sj
+from splatjax.cli import _materials, _models, main
 
 OWN = """[medium]
 unit = "1/mm"
@@ -57,6 +61,36 @@ def test_status_says_whose_fault_it_is(error, status, said, spoilt, capsys):
     captured = capsys.readouterr()
     assert captured.err.startswith(said)
     assert captured.err.count("\n") == 1
+
+
+def test_a_check_in_compiled_code_is_one_sentence(monkeypatch, capsys):
+    @eqx.filter_jit
+    def checked(x):
+        return eqx.error_if(x, x > 0, "x is positive;\ngive a negative one")
+
+    monkeypatch.setattr(_materials.Materials, "run", lambda self: checked(jnp.ones(())))
+    assert main(["materials"]) == 2
+    assert capsys.readouterr().err == "splatjax: x is positive; give a negative one\n"
+
+
+@pytest.mark.parametrize(
+    ("words", "remedy"),
+    [([], "give a smaller --count"), (["--model", "monte-carlo", "--photons", "200"], "200 photons tell too little apart")],
+)
+def test_a_fit_that_does_not_settle_says_what_to_change(words, remedy, monkeypatch, tmp_path, capsys):
+    def unsettled(profile, count, *, throw, **_):
+        assert not throw
+        gaussians = sj.SumOfGaussians(jnp.ones(count), jnp.ones((count, 3)))
+        result = optx.RESULTS.nonlinear_max_steps_reached
+        return sj.FitResult(gaussians, jnp.ones(3), jnp.ones(3), result, jnp.eye(4 * count))
+
+    medium = jnp.ones(3)
+    walked = sj.Tabulated(jnp.arange(1.0, 5.0), jnp.ones((4, 3)), jnp.ones((4, 3)), medium)
+    monkeypatch.setattr(sj, "fit_gaussians", unsettled)
+    monkeypatch.setattr(_models, "_walked", lambda layers, photons: walked)
+    said = failure(["fit", "skin1", *words, "--output", tmp_path / "mine.toml"], capsys, [tmp_path / "mine.toml"])
+    assert said.startswith("splatjax: skin1: the search for 6 Gaussians did not settle")
+    assert remedy in said
 
 
 @pytest.mark.parametrize("words", [["--debug", "materials"], ["materials", "--debug"]])

@@ -58,7 +58,22 @@ def pictures() -> dict:
     return names | {"picture": picture, "noise": noise, "optax": optax, "painted": worn, "material": material}
 
 
+def devices() -> dict:
+    """A scene and how it is cut; there is no cluster to join."""
+    from types import SimpleNamespace
+
+    from jax.sharding import NamedSharding, PartitionSpec
+
+    names = _seen()
+    made = sj.Scene(names["splats"], names["lights"], names["material"])
+    cameras = jax.tree.map(lambda leaf: jnp.stack([leaf] * jax.device_count()), names["camera"])
+    alone = SimpleNamespace(**vars(jax) | {"distributed": SimpleNamespace(initialize=lambda: None)})
+    cut = {"NamedSharding": NamedSharding, "PartitionSpec": PartitionSpec}
+    return names | cut | {"jax": alone, "splatjax": sj, "scene": made, "plan": sj.plan(made, names["camera"]), "cameras": cameras}
+
+
 CONTEXTS = {
+    "docs/devices.md": devices,
     "docs/gradients.md": scene,
     "docs/figures.md": scene,
     "docs/rivals.md": scene,

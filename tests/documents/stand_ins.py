@@ -90,6 +90,8 @@ def _frame(path: Path) -> None:
 
 _MADE = {
     "head.ply": _splats,
+    "head_40000.ply": _splats,
+    "cloud.ply": _splats,
     "head.glb": _mesh,
     "points.ply": _points,
     "color.jpg": _map,

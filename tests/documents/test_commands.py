@@ -30,8 +30,8 @@ NOT_RUN = {
 typed = [
     pytest.param(command, id=f"{name(page)}-{number}")
     for page in PAGES
-    for number, command in enumerate(commands(page))
-    if command.startswith("splatjax")
+    for number, command in enumerate(commands(page, quoted=True))
+    if command.startswith("splatjax") and (" --" in command or command in commands(page)) and "COMMAND" not in command
 ]
 others = sorted({command for page in PAGES for command in commands(page, quoted=True) if command.split()[0] in NOT_RUN})
 
@@ -45,11 +45,22 @@ def test_the_command_line_understands(command):
     assert stopped is None or not stopped.value.code
 
 
+targets = set(re.findall(r"^([a-z][\w-]*):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
+
+
 @pytest.mark.parametrize("command", [command for command in others if command.startswith("make")])
 def test_make_has_such_a_target(command):
-    targets = set(re.findall(r"^([a-z][\w-]*):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
     asked = [word for word in shlex.split(command)[1:] if not word.startswith("-") and "=" not in word]
     assert set(asked) <= targets
+
+
+@pytest.mark.parametrize("workflow", sorted((ROOT / ".github" / "workflows").iterdir()), ids=lambda path: path.stem)
+def test_a_workflow_makes_what_there_is(workflow):
+    text = workflow.read_text(encoding="utf-8")
+    asked = set(re.findall(r"run: make ([a-z-]+)$", text, re.MULTILINE))
+    asked |= {target for several in re.findall(r"suite: \[(.*)\]", text) for target in several.split(", ")}
+    assert asked
+    assert asked <= targets
 
 
 @pytest.mark.parametrize("command", [command for command in others if command.startswith("python")])

@@ -40,7 +40,7 @@ def test_what_programs_name_is_there(page):
 
 @pytest.mark.long
 @pytest.mark.once
-@pytest.mark.parametrize("page", [param for param in WITH_PROGRAMS if param.id != "README.md"])  # tests/test_docs.py runs that
+@pytest.mark.parametrize("page", WITH_PROGRAMS)
 def test_the_programs_of_a_page_run_one_after_the_other(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     text = "\n".join(programs(page))
