@@ -72,7 +72,8 @@ bench: setup
 	$(BIN)/python -m benchmarks.shimmer
 
 # The site, in out/site: pages, the API from its docstrings, and the notebooks with what they print and draw. Notebooks are run
-# anew when they or the code have changed, which takes some minutes; `make -j2 docs` runs two at once.
+# anew when they or the code have changed, which takes some minutes; `make -j2 docs` runs two at once. Most of that is XLA's, so
+# they are compiled as in the tests: those that run longer than they compile as users have it.
 NOTEBOOKS := $(wildcard notebooks/*.py)
 SOURCES := $(shell find splatjax profiles -name '*.py' -o -name '*.toml')
 
@@ -81,10 +82,13 @@ docs: $(VENV)/docs $(NOTEBOOKS:notebooks/%.py=out/notebooks/%.ipynb)
 	$(BIN)/python tools/check_site.py out/site
 	@echo out/site/index.html
 
+out/notebooks/%.ipynb: COMPILED := $(LEAST_OPTIMIZATION)
+out/notebooks/shape_from_shading.ipynb out/notebooks/which_profile.ipynb: COMPILED :=
+
 out/notebooks/%.ipynb: notebooks/%.py $(SOURCES) | $(VENV)/docs
 	mkdir -p out/notebooks/running
 	$(BIN)/jupytext --quiet --to ipynb --output out/notebooks/running/$*.ipynb $<
-	cd out/notebooks/running && $(abspath $(BIN))/jupyter-execute --inplace --timeout 1200 $*.ipynb
+	cd out/notebooks/running && XLA_FLAGS="$(COMPILED) $$XLA_FLAGS" $(abspath $(BIN))/jupyter-execute --inplace --timeout 3600 $*.ipynb
 	mv out/notebooks/running/$*.ipynb $@
 
 $(VENV)/docs: requirements-docs.lock $(VENV)/ready

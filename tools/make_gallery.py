@@ -181,24 +181,28 @@ def wax(_: sj.Splats, side: int) -> np.ndarray:
 
 def inverse(_: sj.Splats, side: int) -> np.ndarray:
     """What was photographed, the same under the coefficients that the search starts from, and under those that it finds."""
-    bust, scale = sj.bust(30_000), 0.2
+    bust, scale = sj.bust(20_000), 0.2
     splats = sj.Splats(scale * bust.centers, bust.normals, scale * bust.radii, scale * scale * bust.areas)
-    camera = looking((20, 0, 125), (0, -10, 0), 27.0, side // 2)
-    lamp = sun(0.9, 0.35, 0.25, 1.0)
+    camera = looking((25, 0, 125), (0, -9, 0), 27.0, 3 * side // 8)
+    lamp = sun(-0.9, 0.35, 0.3, 1.0)
     with jax.enable_x64(True):
-        true, begin = sj.load_medium("wholemilk"), sj.load_medium("skin1")
-        start = sj.Medium(begin.sigma_a, begin.sigma_s_prime, true.eta)
-        known = sj.Material(sj.fit_gaussians(sj.Dipole(true), 6, weights=HELD).gaussians, eta=1.3, specular=0.0)
-    photograph = np.asarray(sj.render(sj.Scene(splats, (lamp,), single(known)), camera).beauty)
-    deviation = 0.01 * float(np.sqrt(np.mean(photograph**2)))
-    photograph = photograph + deviation * np.random.default_rng(0).normal(size=photograph.shape)
+        marble, skin = sj.load_medium("marble"), sj.load_medium("skin1")
+        start = sj.Medium(skin.sigma_a, skin.sigma_s_prime, marble.eta)
+        known, guess = (
+            single(sj.Material(sj.fit_gaussians(sj.Dipole(each), 6, weights=HELD).gaussians, eta=1.5, specular=0.0))
+            for each in (marble, start)
+        )
+    rendered, before = (np.asarray(sj.render(sj.Scene(splats, (lamp,), each), camera).beauty) for each in (known, guess))
+    deviation = 0.01 * float(np.sqrt(np.mean(rendered**2)))
+    photograph = rendered + deviation * np.random.default_rng(0).normal(size=rendered.shape)
     with jax.enable_x64(True):
         seen = sj.Observation(photograph, camera, (lamp,), deviation=np.full(photograph.shape, deviation))
-        found = sj.recover([seen], splats, start)
-        guess = sj.Material(sj.fit_gaussians(sj.Dipole(start), 6, weights=HELD).gaussians, eta=1.3, specular=0.0)
+        found = sj.recover([seen], splats, start, progress=lambda said, medium: print(said, flush=True))
     print(found.words())
-    before = sj.render(sj.Scene(splats, (lamp,), single(guess)), camera).beauty
-    return np.concatenate([show(each, 0.2) for each in (photograph, before, found.pictures[0])], axis=1)
+    for name in ("sigma_a", "sigma_s_prime"):
+        print(f"{name} off by", np.asarray(getattr(found.medium, name) / getattr(marble, name) - 1))
+    shown = photograph, before, np.nan_to_num(found.pictures[0])  # no number where nothing is
+    return np.concatenate([show(np.maximum(each, 0), 0.3) for each in shown], axis=1)
 
 
 def single(material: sj.Material) -> sj.Material:

@@ -16,9 +16,11 @@ class Render(Shot):
 
     The camera looks at the middle of the splats from far enough to see all of them. Angles are in degrees: azimuth turns
     about the vertical axis, 0 is the front (+z) and 90 the side of +x; elevation rises above the horizon. If the splats carry
-    albedo, the weights of the material are divided by their sums, so that color comes from the albedo alone.
+    albedo, the weights of the material are divided by their sums, so that color comes from the albedo alone; with --no-albedo it
+    comes from the material alone.
 
-    Example: splatjax render head.ply --material skin --azimuth 30 --width 1024 --height 1024 --output head.exr
+    Examples: splatjax render head.ply --material skin --azimuth 30 --width 1024 --height 1024 --output head.exr
+              splatjax render --material marble --no-albedo --output marble.exr
     """
 
     output: Path = Path("out.exr")
@@ -49,10 +51,10 @@ class Render(Shot):
         file = sj.SplatFile(self.splats, self.stream)
         with stage(f"looking at {file.count} splats"):
             camera = frame_parts(file, towards(self.azimuth, self.elevation), self.fov, self.width, self.height)
-        material = self.material_for(next(file()), sj.load_material(self.material))
+        material = self.material_for(self.worn(next(file())), sj.load_material(self.material))
         lights = self.lights(material.gaussians.weights.shape[1], self.azimuth, self.light_azimuth)
         with sweeps(file.count) as report:
-            frame = sj.render_streamed(file, lights, material, camera, report=report)
+            frame = sj.render_streamed(lambda: map(self.worn, file()), lights, material, camera, report=report)
         self._write(frame, material)
 
     def _write(self, frame: sj.Frame, material: sj.Material) -> None:

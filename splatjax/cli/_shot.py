@@ -5,6 +5,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -51,6 +52,8 @@ class Shot:
     """Of the PNG, in stops: each doubles its brightness. The EXR is never changed by it."""
     scattering: bool = True
     """Whether light spreads below the surface. Without, it leaves where it enters, in the same color."""
+    albedo: bool = True
+    """Whether the splats wear the albedo that they carry, as the built-in bust does. Without, color is the material's own."""
     count: int = 200_000
     """Number of splats of the built-in bust."""
 
@@ -83,7 +86,7 @@ class Shot:
         """Give a material as it is rendered with splats."""
         if splats.albedo is not None:
             material = material.white()
-            note(f"the splats carry albedo: the weights of {self.material} are divided by their sums")
+            note(f"the splats carry albedo: the weights of {self.material} are divided by their sums (not so with --no-albedo)")
         material = in_color(material)
         return material if self.scattering else material.opaque()
 
@@ -91,9 +94,13 @@ class Shot:
         """Read the splats, or make the bust."""
         if self.splats is None:
             with stage(f"making the bust with {self.count} splats"):
-                return sj.bust(self.count)
+                return self.worn(sj.bust(self.count))
         with stage(f"reading {self.splats}"):
-            return sj.read_splats(self.splats)
+            return self.worn(sj.read_splats(self.splats))
+
+    def worn(self, splats: sj.Splats) -> sj.Splats:
+        """Give splats with their albedo, or without."""
+        return splats if self.albedo else eqx.tree_at(lambda each: each.albedo, splats, None, is_leaf=lambda leaf: leaf is None)
 
     def lights(self, channels: int, azimuth: float, light_azimuth: float) -> tuple[sj.DirectionalLight, ...]:
         """Give the light, and the fill beside a camera at an azimuth: on the same side of it wherever it goes."""

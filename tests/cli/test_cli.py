@@ -16,6 +16,7 @@ from PIL import Image
 import splatjax as sj
 from splatjax.cli import main
 from splatjax.cli._environment import cache_folder, prepare_jax
+from splatjax.cli._render import Render
 from splatjax.cli._shot import frame_all, towards
 from splatjax.io import read_manifest
 
@@ -182,6 +183,17 @@ def test_turntable_of_the_bust_is_one_program(tmp_path, drawn):
     pictures = [np.asarray(sj.read_exr(tmp_path / "turn" / f"frame_{i:04}.exr").beauty) for i in range(3)]
     for one, other in itertools.pairwise(pictures):
         assert 0 < np.abs(one - other).mean() < 1e-2
+
+
+def test_color_is_of_the_albedo_or_of_the_material(tmp_path, capsys):
+    path = tmp_path / "painted.ply"
+    bare, total = sj.read_splats(plate(path)), np.asarray(sj.load_material("marble").gaussians.total_reflectance())
+    sj.write_splats(path, sj.Splats(bare.centers, bare.normals, bare.radii, bare.areas, jnp.full_like(bare.centers, 0.5)))
+    for worn, weight in ((True, np.ones(3)), (False, total)):
+        splats, material = Render(splats=path, material="marble", albedo=worn).load()
+        assert (splats.albedo is not None) == worn
+        np.testing.assert_allclose(np.asarray(material.gaussians.total_reflectance()), weight, rtol=1e-5)
+        assert ("divided by their sums" in capsys.readouterr().err) == worn
 
 
 @pytest.mark.slow
