@@ -29,7 +29,7 @@ def _mesh(path: Path) -> None:
 def _splats(path: Path) -> None:
     mesh = path.with_name("ball.glb")
     _mesh(mesh)
-    splats = sj.sample_mesh(mesh, 1500, mm_per_unit=53)
+    splats = sj.sample_mesh(mesh, 1500, mm_per_unit=53.0)
     mesh.unlink()
     sj.write_splats(path, sj.Splats(splats.centers, splats.normals, splats.radii, splats.areas, jnp.full((1500, 3), 0.8)))
 
