@@ -23,7 +23,7 @@ def on_one_device(tree: Whole) -> Whole:
     """Gather what may lie on several devices, and on those of several processes, for planning."""
 
     def gathered(leaf):
-        if not isinstance(leaf, jax.Array) or len(leaf.devices()) == 1:
+        if not isinstance(leaf, jax.Array) or isinstance(leaf.sharding, jax.sharding.SingleDeviceSharding):
             return leaf
         return jnp.asarray(np.asarray(leaf) if leaf.is_fully_addressable else process_allgather(leaf, tiled=True))
 

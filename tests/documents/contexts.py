@@ -52,10 +52,7 @@ def pictures() -> dict:
     material = sj.Material(names["material"].gaussians, eta=1.5, specular=0.0)
     picture = np.asarray(sj.render(sj.Scene(names["splats"], names["lights"], material), names["camera"], settings).beauty)
     noise = np.full(picture.shape, 0.01 * float(np.sqrt(np.mean(picture**2))))
-    albedo = jnp.full((900, 3), 0.5)
-    bare = names["splats"]
-    worn = sj.Splats(bare.centers, bare.normals, bare.radii, bare.areas, albedo)
-    return names | {"picture": picture, "noise": noise, "optax": optax, "painted": worn, "material": material}
+    return names | {"picture": picture, "noise": noise, "optax": optax, "material": material}
 
 
 def devices() -> dict:

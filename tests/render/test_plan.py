@@ -8,6 +8,7 @@ from scenes import sheet, two_gaussians
 import splatjax as sj
 from splatjax.diffusion import DenseDiffuser
 from splatjax.render import light_on_splats
+from splatjax.render._sharded_plan import on_one_device
 from splatjax.scene import AbstractLight
 
 SETTINGS = sj.RenderSettings(diffuser=DenseDiffuser())  # which needs no plan
@@ -58,6 +59,11 @@ def test_a_mesh_needs_renderers_that_can_be_cut_and_a_plan_of_its_own():
         sj.plan(scene, camera, SETTINGS, mesh=mesh)
     with pytest.raises(ValueError, match="the plan is for one device"):
         sj.render(scene, camera, SETTINGS, sj.plan(scene, camera, SETTINGS), mesh=mesh)
+
+
+def test_planning_gathers_from_a_mesh_of_one_device_too():
+    sharding = jax.sharding.NamedSharding(jax.make_mesh((1,), ("splats",)), jax.sharding.PartitionSpec("splats"))
+    assert isinstance(on_one_device(jax.device_put(jnp.ones(3), sharding)).sharding, jax.sharding.SingleDeviceSharding)
 
 
 def test_a_plan_for_other_splats_is_refused():
