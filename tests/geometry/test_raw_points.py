@@ -72,6 +72,28 @@ def test_two_sheets_close_together_are_not_mixed(gap):
     assert (np.sign(normals[inner & ~above, 2]) == -1).all()
 
 
+@pytest.mark.parametrize("angle", [35, 90, 120])
+def test_the_sides_of_an_edge_keep_their_own_normals(angle):
+    """Half a spacing away from it a point is one side's."""
+    sheet = plane(1600)
+    fold = np.radians(angle)
+    right, left = (sheet[keep] - [19.5, 0, 0] for keep in (sheet[:, 0] > 19.9, sheet[:, 0] < 19.1))
+    left = np.stack([left[:, 0] * np.cos(fold), left[:, 1], left[:, 0] * np.sin(fold)], axis=1)
+    normals = estimate_normals(np.concatenate([right, left]))
+    expected = np.concatenate([np.tile([0, 0, 1.0], (len(right), 1)), np.tile([-np.sin(fold), 0, np.cos(fold)], (len(left), 1))])
+    agreement = np.abs(np.einsum("ni,ni->n", normals, expected))
+    assert (agreement > np.cos(np.radians(10))).mean() > 0.99
+
+
+def test_noise_averages_out():
+    """A tenth of a spacing up or down: the plane through each point's own neighbours alone is off by 4 degrees."""
+    sheet = plane(1600)
+    sheet[:, 2] += 0.1 * np.random.default_rng(7).normal(size=1600)
+    inner = (np.abs(sheet[:, :2] - 19.5) < 17).all(axis=1)
+    off = np.degrees(np.arccos(np.minimum(np.abs(estimate_normals(sheet)[inner, 2]), 1)))
+    assert np.sqrt(np.mean(off**2)) < 3
+
+
 def test_an_open_surface_faces_one_way():
     """A dome, seen from both sides: away from its middle."""
     points = plane(1600)
