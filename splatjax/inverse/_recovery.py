@@ -13,9 +13,9 @@ from splatjax.scene import Material
 
 _FIXED = 0.1
 """A combination that is known no better than this, as a relative error, counts as not fixed."""
-_HANDOVER = math.log(2.0)
-"""How well the width is known, as a logarithm, below which layers are handed to the surface: those of regular and of scattered
-splats lie a factor of 2.5 apart, and a splat itself blurs what it carries."""
+_HANDOVER = 0.5 * math.log(2.0)
+"""How well the width is known, as a logarithm, below which layers are handed to the surface: twice as many splats move it by as
+much, and that of regular ones lies a factor of 2.5 below that of scattered ones."""
 
 
 class Combination(eqx.Module):
@@ -61,7 +61,7 @@ class Recovery(eqx.Module):
 
     Error bars assume that model and shape are right and that the noise of pixels is independent: they are of precision, not of
     truth. That a layer narrower than the splats looks as the renderer makes it look is not assumed: the width of that handover
-    counts as known to a factor of two, so that coefficients which nothing else tells are not known better.
+    counts as known to a factor of 1.4, and how far the search would go astray with it is part of the bars.
     """
 
     medium: Medium
@@ -88,14 +88,20 @@ class Recovery(eqx.Module):
     def covariance(self, more: Float[np.ndarray, "all all"] | None = None) -> Float[np.ndarray, "channels 2 2"]:
         """Give, for each channel, that of the logarithms of `sigma_a` and `sigma_s_prime`, whatever the other unknowns are.
 
+        What noise leaves, and the square of how far the handover's width, off by its deviation, would lead the search astray.
+
         **Arguments:**
 
         - `more`: information that another picture would add.
         """
-        matrix = self._told() if more is None else self._told() + more
-        channels = self.medium.eta.shape[0]
-        known = np.concatenate([np.zeros(len(matrix) - channels), np.full(channels, _HANDOVER**-2)])
-        return self._of_pairs(inverse(matrix + np.diag(known)))
+        told = self._told() if more is None else self._told() + more
+        unknowns = len(told) - self.medium.eta.shape[0]
+        noise = inverse(told[:unknowns, :unknowns])
+        if not np.all(np.isfinite(noise)):
+            return self._of_pairs(noise)
+        # The width is not searched: where pictures tell of it, they tell it to nobody.
+        astray = noise @ told[:unknowns, unknowns:] * _HANDOVER
+        return self._of_pairs(noise + astray @ astray.T)
 
     def covariance_of_noise(self) -> Float[np.ndarray, "channels 2 2"]:
         """Give the covariance as if the renderer were right about layers narrower than the splats: what noise alone leaves."""

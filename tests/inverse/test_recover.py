@@ -10,13 +10,16 @@ import numpy as np
 import pytest
 
 import splatjax as sj
-from splatjax.diffusion import DenseDiffuser, GatheredLight, PlainMean, resolved_share
+from splatjax.diffusion import DenseDiffuser, DiffusionSettings, GatheredLight, PlainMean, resolved_share
 from splatjax.inverse._evidence import Evidence
 from splatjax.inverse._flat import FlatPictures
-from splatjax.inverse._problem import Held, Problem, Unknowns, solution
+from splatjax.inverse._problem import Held, Problem, Unknowns, search, solution
 from splatjax.splatting import DenseRasterizer
 
-PLAIN = sj.RenderSettings(rasterizer=DenseRasterizer(), diffuser=DenseDiffuser())
+PLAIN = sj.RenderSettings(
+    rasterizer=DenseRasterizer(), diffuser=DenseDiffuser(), diffusion=DiffusionSettings(regular=(0.1, 0.2), scattered=(0.1, 0.2))
+)
+"""Next to nothing is handed to the surface: here pictures are made as they are searched, however coarse the splats."""
 SIZE = 24
 COUNT = 4
 HELD = sj.NonNegativeWeights(sj.TotalReflectanceHeld())
@@ -83,16 +86,6 @@ class TestRecover:
         first, second = found.ends
         np.testing.assert_allclose(first.sigma_a, second.sigma_a, rtol=1e-2)
 
-    def test_it_says_how_much_light_the_splats_do_not_carry(self):
-        found, areas = without_noise(), taken()[0].areas
-        gaussians = found.material.gaussians
-        shape = (COUNT, len(areas))
-        each = (jnp.broadcast_to(part, shape) for part in (gaussians.variances[:, None], areas[None]))
-        carried = jnp.mean(resolved_share(*each, jnp.asarray([1.0, 2.0])), axis=1)  # scattered splats: DiffusionSettings
-        expected = (1 - carried) @ gaussians.weights / gaussians.total_reflectance()
-        assert 0.1 < float(jnp.min(expected)) < float(jnp.max(expected)) < 0.98
-        np.testing.assert_allclose(found.unresolved, expected, atol=0.05)
-
     def test_its_material_and_pictures_are_those_of_the_renderer(self):
         found, (splats, pictures) = without_noise(), taken()
         scene = sj.Scene(splats, (lights()[0],), found.material)
@@ -119,7 +112,7 @@ class TestRecover:
             off = np.stack([np.log(np.asarray(a) / np.asarray(b)) for a, b in pairs])
             bars.append(np.stack(found.relative_errors()))
             noise = np.stack(found.noise_errors())
-            assert np.all(bars[-1] > noise)  # the handover is of no certain width
+            assert np.all(bars[-1] >= noise)
             pulls.append(off / noise)
             assert 0.8 < float(found.chi_squared) < 1.2
             if draw == 0:  # what is left to compile is done; from here on nothing is
@@ -149,16 +142,17 @@ class TestRecover:
 
     @pytest.mark.long
     def test_one_picture_of_unknown_strength_does_not_fix_both_coefficients_and_a_second_one_does(self):
-        (_, alone), splats = observations(taken()[1], NOISE), taken()[0]
+        noise = 2.5 * NOISE
+        (_, alone), splats = observations(taken()[1], noise), taken()[0]
         found = sj.recover([alone], splats, medium(1.5, 0.7), count=COUNT, settings=PLAIN)
         assert not found.is_fixed()
         assert "not fixed by these pictures" in found.words()
         dot = sj.GaussianBeam(camera().position, -camera().position, jnp.full(2, 20.0), jnp.asarray(2.0))
         candidates = [sj.Candidate("lamp", camera(), (lights()[0],)), sj.Candidate("dot", camera(), (dot,))]
         first, second = sj.next_pictures(found, splats, candidates, settings=PLAIN)
-        assert first.candidate.name == "dot"
+        assert {first.candidate.name, second.candidate.name} == {"lamp", "dot"}
         assert first.worst.deviation < second.worst.deviation < 0.1 < found.combinations()[0][1].deviation
-        both = recovered(taken()[1], STARTS[:1], NOISE)
+        both = recovered(taken()[1], STARTS[:1], noise)
         assert both.is_fixed()
         assert "not fixed" not in both.words()
         np.testing.assert_allclose(
@@ -178,10 +172,8 @@ class TestRecover:
         assert "as before: the worst known, " in str(first)
 
 
-@pytest.mark.once
-@pytest.mark.usefixtures("double")
-def test_the_handover_of_each_channel_is_an_unknown_of_its_own():
-    """Information of its width: squares of how residuals change with it, and nothing from one channel to the other."""
+def half_resolved() -> Problem:
+    """Made up layers at 40 points, of which the narrower ones are handed to the surface in part; nothing is observed yet."""
     rng, points = np.random.default_rng(6), 40
     light = GatheredLight(
         variances=jnp.asarray([1.5, 2.5, 9.0]),
@@ -197,18 +189,48 @@ def test_the_handover_of_each_channel_is_an_unknown_of_its_own():
     there = jnp.zeros(points, jnp.int32)
     flat = FlatPictures(light, jnp.ones((2, points)), jnp.zeros((2, points)), there[:0], there)
     noise, unknowns = jnp.full((2, points), 0.01), Unknowns(medium().eta, jnp.zeros((1, 2), jnp.int32))
-    problem = Problem(flat, noise, noise, unknowns, Held(light.variances), sj.SquaredLoss(), HELD, sj.Dipole)
-    point, step = unknowns.start(medium(), 0), 1e-5
+    return Problem(flat, noise, noise, unknowns, Held(light.variances), sj.SquaredLoss(), HELD, sj.Dipole)
 
-    @jax.jit
-    def at(by):
-        return eqx.tree_at(lambda its: its.pictures.light.interval, problem, light.interval * jnp.exp(by)).residuals(point)
 
-    slopes = (at(step) - at(-step)) / (2 * step)
-    told = solution(problem, point).information
-    assert told.shape == (6, 6)
-    np.testing.assert_allclose(told[4:, 4:], np.diag(jnp.sum(slopes**2, axis=1)), rtol=1e-6, atol=1e-6)
-    assert float(jnp.min(jnp.diagonal(told)[4:])) > 1
+@pytest.mark.once
+@pytest.mark.usefixtures("double")
+class TestHandover:
+    def test_each_channel_has_a_width_of_its_own(self):
+        """Information of it: squares of how residuals change with it, and nothing from one channel to the other."""
+        problem, step = half_resolved(), 1e-5
+        point = problem.unknowns.start(medium(), 0)
+
+        @jax.jit
+        def at(by):
+            wider = problem.pictures.light.interval * jnp.exp(by)
+            return eqx.tree_at(lambda its: its.pictures.light.interval, problem, wider).residuals(point)
+
+        slopes = (at(step) - at(-step)) / (2 * step)
+        told = solution(problem, point).information
+        assert told.shape == (6, 6)
+        np.testing.assert_allclose(told[4:, 4:], np.diag(jnp.sum(slopes**2, axis=1)), rtol=1e-6, atol=1e-6)
+        assert float(jnp.min(jnp.diagonal(told)[4:])) > 1
+
+    def test_a_search_goes_astray_with_the_width_as_its_bars_say(self):
+        """The picture of a width a little off, searched as if it were not."""
+        problem, by = half_resolved(), 0.01
+        point = problem.unknowns.start(medium(), 0)
+        wider = eqx.tree_at(lambda its: its.pictures.light.interval, problem, problem.pictures.light.interval * np.exp(by))
+        seen = eqx.tree_at(lambda its: its.observed, problem, wider.radiance(point))
+        told = np.asarray(solution(problem, point).information)
+        expected = -np.linalg.inv(told[:4, :4]) @ told[:4, 4:] @ np.full(2, -by)
+        assert np.max(np.abs(expected)) > 1e-3
+        np.testing.assert_allclose(search(seen, point).point - point, expected, atol=0.05 * np.max(np.abs(expected)))
+
+    def test_light_in_layers_that_the_splats_do_not_carry_is_counted(self):
+        problem = half_resolved()
+        found = solution(problem, problem.unknowns.start(medium(), 0))
+        light, gaussians = problem.pictures.light, found.gaussians
+        carried = resolved_share(light.variances, jnp.ones(3), light.interval)
+        assert 0.05 < float(carried[0]) < float(carried[1]) < 0.6
+        expected = (1 - carried) @ gaussians.weights / gaussians.total_reflectance()
+        np.testing.assert_allclose(found.unresolved, expected, rtol=1e-6)
+        assert 0.05 < float(jnp.min(expected)) < float(jnp.max(expected)) < 0.98
 
 
 def test_pixels_that_are_masked_unknown_or_not_filled_do_not_count():
