@@ -1,8 +1,8 @@
-"""What a single picture does not fix, and what a second one does: `python -m benchmarks.close_up`. Needs SPLATJAX_SHARED.
+"""What a picture of a whole head does not fix, and what a close one does: `python -m benchmarks.close_up`. Needs SPLATJAX_SHARED.
 
 The scanned head, pictures made otherwise than the recovery makes them: twice the splats, eight Gaussians, no clusters. First one
-of the whole head under a lamp from the side; then with it one of a spot on the cheek, from closer up, where the splats lie
-closer: under the lamp, or under a laser dot.
+of the whole head under a lamp from the side; then one of a spot on the cheek, from closer up, where the splats lie closer, under
+the lamp or under a laser dot: with the first, and alone.
 """
 
 import argparse
@@ -33,7 +33,7 @@ DOT = 0.25  # mm, standard deviation of the laser dot
 def arguments():
     parser = argparse.ArgumentParser(prog="python -m benchmarks.close_up", description=__doc__)
     parser.add_argument("--splats", type=int, default=100_000, help="on the head (default %(default)s)")
-    parser.add_argument("--close", type=int, default=30_000, help="around the spot (default %(default)s)")
+    parser.add_argument("--close", type=int, default=100_000, help="around the spot (default %(default)s)")
     parser.add_argument("--width", type=int, default=256, help="of the square picture of the head, pixels (default %(default)s)")
     parser.add_argument("--close-width", type=int, default=128, help="of those of the spot (default %(default)s)")
     parser.add_argument("--materials", nargs="+", default=["skin1"])
@@ -90,7 +90,7 @@ def main() -> None:
     dot = sj.GaussianBeam(jnp.asarray(spot + 50 * normal), jnp.asarray(-normal), jnp.full(3, jnp.pi), jnp.asarray(DOT**2))
     shots = {"the head": (whole, lamp), "the spot under the lamp": (close, lamp), "the spot under a laser dot": (close, dot)}
     cases = [["the head"], ["the head", "the spot under the lamp"], ["the head", "the spot under a laser dot"]]
-    cases += [["the spot under a laser dot"]]
+    cases += [["the spot under the lamp"], ["the spot under a laser dot"]]
     with jax.enable_x64(True):
         for name in options.materials:
             medium = sj.load_medium(name)
