@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from splatjax.scene import Splats
 from splatjax.splatting import BinCapacity
 
 from ._clustered import ClusterDiffuser
@@ -97,10 +98,12 @@ class StreamedSums(eqx.Module):
                 found.append(depth + layer.support * math.sqrt(float(layer.variance) + spread))
         return max(found)
 
+    def within_reach(self, splats: Splats) -> bool:
+        """Say whether a part may bring anything to any pixel."""
+        return bool(_within_reach(self.pixels, splats, self.reach))
+
     def plus(self, sources: Sources, room: StreamedRoom) -> tuple["StreamedSums", StreamedRoom]:
-        """Add what a part of the splats brings; splats without area, or too far from every pixel, bring nothing."""
-        if not _within_reach(self.pixels, sources, self.reach):
-            return self, room
+        """Add what a part of the splats brings; splats without area bring nothing."""
         cells = self.cells
         tree = ClusterTree.build(sources.centers.T, sources.normals.T, cells)
         held = room.counts or (0,) * len(tree.counts)
@@ -147,10 +150,10 @@ class StreamedSums(eqx.Module):
 
 
 @eqx.filter_jit
-def _within_reach(pixels: Pixels, sources: Sources, reach: float) -> Bool[Array, ""]:
-    """Say whether the box around sources is within reach (mm) of the box around any tile's points."""
-    there, tiles = (sources.areas > 0)[None], pixels.boxes
-    centers = sources.centers - pixels.origin[:, None]
+def _within_reach(pixels: Pixels, splats: Splats, reach: float) -> Bool[Array, ""]:
+    """Say whether the box around splats is within reach (mm) of the box around any tile's points."""
+    there, tiles = (splats.areas > 0)[None], pixels.boxes
+    centers = splats.centers.T - pixels.origin[:, None]
     low, high = (jnp.min(jnp.where(there, sign * centers, jnp.inf), axis=1, keepdims=True) for sign in (1, -1))
     gaps = jnp.maximum(jnp.maximum(tiles.low + high, low - tiles.high), 0)
     return jnp.any(jnp.sum(gaps * gaps, axis=0) <= reach * reach)

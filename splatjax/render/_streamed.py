@@ -4,9 +4,9 @@ What the passes know of each other decides how often: where the front of every s
 weighs; where what lies behind ends; the shadow maps' surfaces; then light, and the camera's sums; then what the pixels gather.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from typing import TypeAlias, TypeVar
+from typing import TypeAlias
 
 import equinox as eqx
 import jax
@@ -22,31 +22,10 @@ from ._passes import SeenSurfaces, compose, shade, sources_of, surfaces_of
 from ._records import shadow_views, stands_among
 from ._settings import RenderSettings
 from ._sharded_plan import filled_up_to
-from ._survey import Survey
+from ._survey import SameParts, Survey
+from ._swept_views import SweptViews, behind, blended, ends_of_surfaces, pictured
 
 Report: TypeAlias = Callable[[str, int], None]
-Scenes: TypeAlias = Callable[[str], Iterator[Scene]]
-"""Gives a scene of each part, and tells what is being done with them."""
-OfTiles: TypeAlias = Float[Array, "tiles pixels"]
-Done = TypeVar("Done")
-
-
-class _View(eqx.Module):
-    """A view, with room for any part."""
-
-    view: _splatting.AbstractView
-    rasterizer: _splatting.TileRasterizer
-    settings: _splatting.SplattingSettings
-
-    def stages(self, splats: Splats, attributes: Float[Array, "attributes splats"] | None = None) -> _splatting.Stages:
-        if attributes is None:
-            attributes = jnp.zeros((0, splats.count), splats.centers.dtype)
-        return _splatting.Stages.of(self.rasterizer.binned(splats, attributes, self.view, self.settings))
-
-    def nothing(self, attributes: int, dtype: jnp.dtype) -> _splatting.FragmentSums:
-        """Give the sums of no part."""
-        tiles = _splatting.TileGrid(self.view.width, self.view.height).count
-        return _splatting.FragmentSums.of(jnp.zeros((tiles, attributes + 2, _splatting.SIDE**2), dtype))
 
 
 class _Map(eqx.Module):
@@ -89,9 +68,11 @@ def render_streamed(
             f" {type(diffuser).__name__}"
         )
 
+    same = SameParts(parts)
+
     def told(what: str) -> Iterator[Splats]:
         done = 0
-        for part in parts():
+        for part in same():
             yield part
             done += part.count
             if report is not None:
@@ -109,25 +90,23 @@ def render_streamed(
     (first, camera), groups = in_one_dtype(first, camera), stack_lights(first.lights)
     dtype = first.splats.centers.dtype
     view, maps = _splatting.PerspectiveView.of(camera), _maps(groups, survey, settings, dtype)
-    at = _with_room(every, [view, *(each.view for each in maps)], rasterizer, settings.splatting)
-    limits, fronts, seconds = _ends_of_surfaces(every, at, dtype)
-    behind = [each.nothing(0, dtype) for each in at[1:]]
-    for scene in every("shadow maps") if maps else ():
-        behind = _done(_behind(scene.splats, *each) for each in zip(at[1:], limits[1:], seconds[1:], behind, strict=True))
-    surfaces = [_blended(*each) for each in zip(at[1:], fronts[1:], behind, strict=True)]
+    views = SweptViews.planned(every, [view, *(each.view for each in maps)], rasterizer, settings.splatting)
+    limits, fronts, seconds = ends_of_surfaces(every, views, dtype)
+    shadows = views.but_the_first
+    hidden = behind(every("shadow maps") if maps else iter(()), shadows, limits[1:], seconds[1:], dtype)
+    surfaces = [blended(*each) for each in zip(shadows.at, fronts[1:], hidden, strict=True)]
 
     def lit(scene: Scene) -> tuple[LightOnSplats, EnteringLight]:
         return _lit(scene, groups, maps, surfaces, settings.shadows)
 
     light, entering = lit(first)
     sizes = {name: rows.shape[0] for name, rows in settings.lighting.attributes(first, light, entering).items()}
-    both = at[0].nothing(sum(sizes.values()), dtype), at[0].nothing(sum(sizes.values()), dtype)
-    for scene in every("what the camera sees"):
-        attributes = settings.lighting.attributes(scene, *lit(scene))
-        rows = jnp.concatenate(list(attributes.values()))
-        both = jax.block_until_ready(_pictured(scene.splats, rows, at[0], limits[0], seconds[0], both))
-    if not all(bool(jnp.all(jnp.isfinite(sums.weights))) for sums in (*fronts, *behind, *both)):
-        raise ValueError("the parts were not the same each time that they were asked for; give the same splats in the same order")
+    camera_at, nothing = views.at[0], views.at[0].nothing(sum(sizes.values()), dtype)
+    both = nothing, nothing
+    for scene, shows in zip(every("what the camera sees"), views.in_the_first, strict=True):
+        if shows:
+            rows = jnp.concatenate(list(settings.lighting.attributes(scene, *lit(scene)).values()))
+            both = jax.block_until_ready(pictured(scene.splats, rows, camera_at, limits[0], seconds[0], both))
     summed = _splatting.SummedFragments(*both, jnp.zeros((), dtype))
     tiles = max(int(jnp.sum(_splatting.farthest_depths(summed, view) > -jnp.inf)), 1)
     surface = surfaces_of(summed, sizes, view, settings, tiles).lit(first, light, settings)
@@ -139,7 +118,8 @@ def render_streamed(
     sums = _diffusion.StreamedSums.begin(diffuser, kernels, survey.spacing, fine, interval, pixels)
     room = _diffusion.StreamedRoom()
     for scene in every("diffusion"):
-        sums, room = sums.plus(sources_of(scene.splats, lit(scene)[1].source), room)
+        if sums.within_reach(scene.splats):
+            sums, room = sums.plus(sources_of(scene.splats, lit(scene)[1].source), room)
     return _finished(first, view, groups, surface, sums.found(first.material.gaussians.weights.shape[1]), interval, settings)
 
 
@@ -152,72 +132,6 @@ def _maps(groups: Sequence[StackedLights], survey: Survey, settings: RenderSetti
         cube = stands_among(each, bounds)
         found += [_Map(view, i, j, cube) for j, light in enumerate(each) for view in shadow_views(light, bounds, settings, cube)]
     return found
-
-
-def _with_room(
-    every: Scenes,
-    views: Sequence[_splatting.AbstractView],
-    rasterizer: _splatting.TileRasterizer,
-    settings: _splatting.SplattingSettings,
-) -> list[_View]:
-    demands, rows = [[] for _ in views], 0
-    for scene in every("planning"):
-        rows = scene.splats.count
-        for view, found in zip(views, demands, strict=True):
-            found.append(rasterizer.demand(scene.splats, view, settings))
-    return [_View(view, rasterizer.with_room(found, rows, view), settings) for view, found in zip(views, demands, strict=True)]
-
-
-def _ends_of_surfaces(
-    every: Scenes, at: Sequence[_View], dtype: jnp.dtype
-) -> tuple[list[OfTiles], list[_splatting.FragmentSums], list[OfTiles]]:
-    """Find where the front ends in every view, what it weighs, and where what lies behind ends."""
-    fronts = [each.nothing(0, dtype) for each in at]
-    limits = [jnp.full_like(each.weights, -jnp.inf) for each in fronts]
-    ends = [(each, each) for each in limits]
-    for scene in every("where the front ends"):
-        limits = _done(_limits(scene.splats, *each) for each in zip(at, limits, strict=True))
-    for scene in every("what it weighs"):
-        fronts = _done(_fronts(scene.splats, *each) for each in zip(at, limits, fronts, strict=True))
-    for scene in every("where what lies behind ends"):
-        ends = _done(_ends(scene.splats, *each) for each in zip(at, limits, fronts, ends, strict=True))
-    return limits, fronts, [_splatting.second_limits(*each) for each in ends]
-
-
-def _done(found: Iterable[Done]) -> list[Done]:
-    """Wait: parts that are read ahead would pile up."""
-    return jax.block_until_ready(list(found))
-
-
-@eqx.filter_jit
-def _limits(splats: Splats, at: _View, so_far: OfTiles) -> OfTiles:
-    return jnp.maximum(so_far, at.stages(splats).limits())
-
-
-@eqx.filter_jit
-def _fronts(splats: Splats, at: _View, limits: OfTiles, so_far: _splatting.FragmentSums) -> _splatting.FragmentSums:
-    return jax.tree.map(jnp.add, so_far, at.stages(splats).front(limits))
-
-
-@eqx.filter_jit
-def _ends(
-    splats: Splats, at: _View, limits: OfTiles, front: _splatting.FragmentSums, so_far: tuple[OfTiles, OfTiles]
-) -> tuple[OfTiles, OfTiles]:
-    stages = at.stages(splats)
-    return jax.tree.map(jnp.maximum, so_far, stages.limits_behind(limits, stages.gaps(limits, front.weights)))
-
-
-@eqx.filter_jit
-def _behind(
-    splats: Splats, at: _View, limits: OfTiles, seconds: OfTiles, so_far: _splatting.FragmentSums
-) -> _splatting.FragmentSums:
-    return jax.tree.map(jnp.add, so_far, at.stages(splats).behind(limits, seconds))
-
-
-@eqx.filter_jit
-def _blended(at: _View, front: _splatting.FragmentSums, behind: _splatting.FragmentSums) -> _splatting.Surfaces:
-    both = (_splatting.Surface.of(sums, at.view, at.settings) for sums in (front, behind))
-    return _splatting.Surfaces(*both, jnp.zeros((), front.weights.dtype))
 
 
 @eqx.filter_jit
@@ -241,19 +155,6 @@ def _lit(
         groups, [None if each is None else jnp.stack(each) for each in shares], jnp.zeros((), scene.splats.centers.dtype)
     )
     return light, let_light_in(scene, light)
-
-
-@eqx.filter_jit
-def _pictured(
-    splats: Splats,
-    attributes: Float[Array, "attributes splats"],
-    at: _View,
-    limits: OfTiles,
-    seconds: OfTiles,
-    so_far: tuple[_splatting.FragmentSums, _splatting.FragmentSums],
-) -> tuple[_splatting.FragmentSums, _splatting.FragmentSums]:
-    stages = at.stages(splats, attributes)
-    return jax.tree.map(jnp.add, so_far, (stages.front(limits), stages.behind(limits, seconds)))
 
 
 @eqx.filter_jit

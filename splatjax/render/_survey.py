@@ -1,8 +1,10 @@
 """What must be known of all splats before a picture of them can be begun, from a look at one part after the other."""
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -10,7 +12,38 @@ from jaxtyping import Array, Float
 from splatjax import diffusion as _diffusion, splatting as _splatting
 from splatjax.scene import Parts, Splats
 
+_OTHERS = "the parts were not the same each time that they were asked for; give the same splats in the same order"
 _PLACES = 64  # as many as `diffusion.irregularity` looks at
+
+
+class SameParts:
+    """Parts that must be the same each time that they are asked for: what is known of one is used when it comes again."""
+
+    def __init__(self, parts: Parts):
+        self.parts, self.marks = parts, None
+
+    def __call__(self) -> Iterator[Splats]:
+        """Give all splats from the beginning.
+
+        **Raises:** `ValueError` when a part is another one than the first time, or there are fewer or more.
+        """
+        marks = []
+        for part in self.parts():
+            marks.append(np.asarray(_mark(part)))
+            self._check(marks)
+            yield part
+        self.marks = marks if self.marks is None else self.marks
+        if len(marks) != len(self.marks):
+            raise ValueError(_OTHERS)
+
+    def _check(self, marks: list[np.ndarray]) -> None:
+        if self.marks is not None and not np.array_equal(marks[-1:], self.marks[len(marks) - 1 : len(marks)], equal_nan=True):
+            raise ValueError(_OTHERS)
+
+
+@jax.jit
+def _mark(splats: Splats) -> Float[Array, " leaves"]:
+    return jnp.stack([jnp.sum(leaf) for leaf in jax.tree.leaves(splats)])
 
 
 @dataclass(frozen=True)

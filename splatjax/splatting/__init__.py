@@ -13,7 +13,7 @@ from ._sharded import bounds_over as bounds_over, ShardedRasterizer as ShardedRa
 from ._shadows import Bounds as Bounds, cube_views as cube_views, distant_view as distant_view
 from ._shadows import in_cube_face as in_cube_face, light_surfaces as light_surfaces, lit_share as lit_share
 from ._shadows import near_view as near_view, ShadowSettings as ShadowSettings, stack_views as stack_views
-from ._stages import Stages as Stages
+from ._stages import gaps as gaps, Stages as Stages
 from ._surfaces import blend_fragments as blend_fragments, splat_surfaces as splat_surfaces
 from ._surfaces import Surface as Surface, Surfaces as Surfaces
 from ._sweeps import second_limits as second_limits

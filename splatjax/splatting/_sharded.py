@@ -14,7 +14,7 @@ from splatjax.scene import Splats
 from ._rasterizer import AbstractRasterizer, FragmentSums, SummedFragments
 from ._settings import SplattingSettings
 from ._shadows import Bounds
-from ._stages import Stages, of_tiles
+from ._stages import Stages, gaps, of_tiles
 from ._sweeps import Sweep, backward, second_limits
 from ._tiles import Binned, TileRasterizer
 from ._views import AbstractView
@@ -79,8 +79,8 @@ def _forward(sweep: Sweep, devices: Devices, bins, shift, planes, attributes):
     stages = Stages.of(Binned(sweep, bins, shift, planes, attributes))
     limits = devices.largest(stages.limits())
     front = stages.front(limits)
-    gaps = stages.gaps(limits, devices.total(front.weights))
-    seconds = second_limits(*devices.largest(stages.limits_behind(limits, gaps)))
+    open_to = gaps(limits, devices.total(front.weights), sweep.full_coverage)
+    seconds = second_limits(*devices.largest(stages.limits_behind(limits, open_to)))
     behind = stages.behind(limits, seconds)
     shown = jnp.any(limits > -jnp.inf, axis=1).astype(shift.dtype)
     poison = jnp.where(bins.needed <= 1, 0.0, jnp.nan).astype(shift.dtype)

@@ -68,10 +68,6 @@ class Stages(eqx.Module):
 
         return self._within(self._by_chunk(sums, (len(self.slots.attributes) + 2,), 0.0))
 
-    def gaps(self, limits: Float[Array, "tiles pixels"], weights: Float[Array, "tiles pixels"]) -> Bool[Array, "tiles pixels"]:
-        """Say which pixels the front leaves open, by its weights in all parts."""
-        return (weights < self.sweep.full_coverage) & (limits > -jnp.inf)
-
     def limits_behind(self, limits: Float[Array, "tiles pixels"], gaps: Bool[Array, "tiles pixels"]):
         """Stage 3: where what lies behind ends, of the fragments that weigh something and of any; the largest of each."""
         pick, rounds = self._open(jnp.any(gaps, axis=1))
@@ -99,6 +95,13 @@ class Stages(eqx.Module):
 
         nothing = zeros_after(rounds, (self._count, len(self.slots.attributes) + 2, SIDE**2), limits.dtype)
         return self._within(lax.fori_loop(jnp.int32(0), rounds, look, nothing))
+
+
+def gaps(
+    limits: Float[Array, "tiles pixels"], weights: Float[Array, "tiles pixels"], full_coverage: float
+) -> Bool[Array, "tiles pixels"]:
+    """Say which pixels the front leaves open, by where it ends and what it weighs in all parts."""
+    return (weights < full_coverage) & (limits > -jnp.inf)
 
 
 def of_tiles(whole: Array, tiles: Array, fill) -> Array:

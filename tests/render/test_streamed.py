@@ -9,6 +9,7 @@ from scenes import sphere
 
 import splatjax as sj
 from splatjax.diffusion import FINEST, DenseDiffuser
+from splatjax.diffusion._tree import ClusterTree
 from splatjax.render._survey import Survey
 from splatjax.splatting import ShadowSettings
 
@@ -31,12 +32,11 @@ CAMERA = sj.Camera.look_at(jnp.asarray([20.0, 6.0, 78.0], float), jnp.zeros(3), 
 
 @pytest.fixture(scope="module")
 def splats():
-    """A ball, and a smaller one before it that casts its shadow on it: what is in front comes last."""
-    balls = sphere(1400, 20.0), sphere(300, 6.0)
-    before = jnp.asarray([-8.0, 6.0, 30.0], float)
-    balls = balls[0], eqx.tree_at(lambda ball: ball.centers, balls[1], balls[1].centers + before[None])
-    both = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *balls)
-    return eqx.tree_at(lambda each: each.albedo, both, 0.6 + 0.3 * jnp.sin(both.centers / 5), is_leaf=lambda leaf: leaf is None)
+    """A ball, a smaller one before it that casts its shadow on it, and one so far behind it that nothing is seen of it."""
+    balls = (sphere(1400, 20.0), (0.0, 0.0, 0.0)), (sphere(300, 6.0), (-8.0, 6.0, 30.0)), (sphere(500, 6.0), (-25.0, -7.0, -97.0))
+    balls = (eqx.tree_at(lambda of: of.centers, ball, ball.centers + jnp.asarray([at], float)) for ball, at in balls)
+    cloud = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *balls)
+    return eqx.tree_at(lambda each: each.albedo, cloud, 0.6 + 0.3 * jnp.sin(cloud.centers / 5), is_leaf=lambda leaf: leaf is None)
 
 
 def in_parts(splats, size):
@@ -58,16 +58,18 @@ def apart(one, other):
     return found
 
 
-def test_parts_make_the_picture_of_all_at_once(splats):
+def test_parts_make_the_picture_of_all_at_once(splats, monkeypatch):
     settings = sj.RenderSettings(shadows=SHADOWS)
     whole = sj.render(sj.Scene(splats, LIGHTS, MATERIAL), CAMERA, settings)
-    done = []
+    build, built, done, counts = ClusterTree.build, [], [], [300, 600, 900, 1200, 1500, 1800, 2100, 2200]
+    monkeypatch.setattr(ClusterTree, "build", lambda *given: built.append(len(given[0])) or build(*given))
     streamed = sj.render_streamed(
-        in_parts(splats, 500), LIGHTS, MATERIAL, CAMERA, settings, lambda what, count: done.append((what, count))
+        in_parts(splats, 300), LIGHTS, MATERIAL, CAMERA, settings, lambda what, count: done.append((what, count))
     )
     assert streamed.overflow == 0
-    assert [count for what, count in done if what == "diffusion"] == [500, 1000, 1500, 1700]
-    assert [count for what, count in done if what == "looking"][:8] == 2 * [500, 1000, 1500, 1700]
+    assert [count for what, count in done if what == "diffusion"] == counts
+    assert [count for what, count in done if what == "looking"][:16] == 2 * counts
+    assert built == [300] * 6  # no pixel gathers from the last two parts; the camera sees nothing of the fourth
     found = apart(whole, streamed)
     *single, wide = (np.abs(x - y).max() / x.max() for x, y in zip(whole.layers, streamed.layers, strict=True))
     assert max(single) < ROUNDING
@@ -75,7 +77,7 @@ def test_parts_make_the_picture_of_all_at_once(splats):
     assert max(found.values()) < ROUNDING, found
 
 
-@pytest.mark.parametrize("size", [7, 500, 1700])
+@pytest.mark.parametrize("size", [70, 2200])
 def test_how_fine_the_splats_are_is_found_of_all(splats, size):
     """By it a layer is carried or handed over, here and in `render` alike."""
     areas = jnp.asarray(np.random.default_rng(3).permutation(np.geomspace(0.1, 10.0, splats.count)), float)
@@ -89,5 +91,9 @@ def test_what_cannot_be_streamed_is_refused(splats):
     with pytest.raises(ValueError, match="no splats"):
         sj.render_streamed(lambda: iter(()), LIGHTS, MATERIAL, CAMERA)
     parts = [jax.tree.map(lambda leaf, size=size: leaf[:size], splats) for size in (10, 20)]
+    for others in ([parts[1], parts[0]], [parts[0]], [parts[0], parts[0], parts[0]]):
+        each = iter([[parts[0], parts[0]], others])
+        with pytest.raises(ValueError, match="not the same each time"):
+            sj.render_streamed(lambda each=each: iter(next(each)), LIGHTS, MATERIAL, CAMERA)
     with pytest.raises(ValueError, match="of one size"):
         sj.render_streamed(lambda: iter(parts), LIGHTS, MATERIAL, CAMERA)
