@@ -57,8 +57,13 @@ def show(picture, exposure: float = 0.0) -> np.ndarray:
 def render(splats: sj.Splats, lights: tuple, material: sj.Material, camera: sj.Camera, exposure: float = 0.0) -> np.ndarray:
     """Render before a dark wall, lighter below, and give the picture as a display shows it."""
     frame = sj.render(sj.Scene(splats, lights, material), camera)
-    wall = np.linspace(0.012, 0.04, camera.height)[:, None, None] * np.asarray([0.9, 1.0, 1.1])
-    return show(frame.beauty, exposure) + linear_to_srgb(wall) * (1 - np.asarray(frame.coverage))[..., None]
+    return before_a_wall(show(frame.beauty, exposure), frame.coverage)
+
+
+def before_a_wall(shown: np.ndarray, coverage) -> np.ndarray:
+    """Put what a display shows before a dark wall."""
+    wall = np.linspace(0.012, 0.04, len(shown))[:, None, None] * np.asarray([0.9, 1.0, 1.1])
+    return shown + linear_to_srgb(wall) * (1 - np.asarray(coverage))[..., None]
 
 
 def surface(points: np.ndarray, around: bool = True) -> Mesh:
@@ -183,8 +188,8 @@ def inverse(_: sj.Splats, side: int) -> np.ndarray:
     """What was photographed, the same under the coefficients that the search starts from, and under those that it finds."""
     bust, scale = sj.bust(20_000), 0.2
     splats = sj.Splats(scale * bust.centers, bust.normals, scale * bust.radii, scale * scale * bust.areas)
-    camera = looking((25, 0, 125), (0, -9, 0), 27.0, 3 * side // 8)
-    lamp = sun(-0.9, 0.35, 0.3, 1.0)
+    camera = looking((46, 4, 128), (0, -8, 0), 30.0, 3 * side // 8)
+    lights = sun(-0.9, 0.5, 0.45), sun(0.9, 0.2, -0.6, 0.6)
     with jax.enable_x64(True):
         marble, skin = sj.load_medium("marble"), sj.load_medium("skin1")
         start = sj.Medium(skin.sigma_a, skin.sigma_s_prime, marble.eta)
@@ -192,17 +197,22 @@ def inverse(_: sj.Splats, side: int) -> np.ndarray:
             single(sj.Material(sj.fit_gaussians(sj.Dipole(each), 6, weights=HELD).gaussians, eta=1.5, specular=0.0))
             for each in (marble, start)
         )
-    rendered, before = (np.asarray(sj.render(sj.Scene(splats, (lamp,), each), camera).beauty) for each in (known, guess))
-    deviation = 0.01 * float(np.sqrt(np.mean(rendered**2)))
-    photograph = rendered + deviation * np.random.default_rng(0).normal(size=rendered.shape)
+
+    def seen_in(material):
+        return sj.render(sj.Scene(splats, lights, material), camera)
+
+    rendered = seen_in(known)
+    deviation = 0.01 * float(np.sqrt(np.mean(np.asarray(rendered.beauty) ** 2)))
+    photograph = np.asarray(rendered.beauty) + deviation * np.random.default_rng(0).normal(size=rendered.beauty.shape)
     with jax.enable_x64(True):
-        seen = sj.Observation(photograph, camera, (lamp,), deviation=np.full(photograph.shape, deviation))
+        seen = sj.Observation(photograph, camera, lights, deviation=np.full(photograph.shape, deviation))
         found = sj.recover([seen], splats, start, progress=lambda said, medium: print(said, flush=True))
     print(found.words())
     for name in ("sigma_a", "sigma_s_prime"):
-        print(f"{name} off by", np.asarray(getattr(found.medium, name) / getattr(marble, name) - 1))
-    shown = photograph, before, np.nan_to_num(found.pictures[0])  # no number where nothing is
-    return np.concatenate([show(np.maximum(each, 0), 0.3) for each in shown], axis=1)
+        print(f"{name} off by", np.asarray(getattr(found.medium, name)) / np.asarray(getattr(marble, name)) - 1)
+    shown = np.maximum(photograph, 0), seen_in(guess).beauty, seen_in(single(found.material)).beauty
+    body = np.asarray(rendered.coverage)[..., None]
+    return np.concatenate([before_a_wall(show(each * (body > 0), 0.2), body[..., 0]) for each in shown], axis=1)
 
 
 def single(material: sj.Material) -> sj.Material:
