@@ -16,7 +16,7 @@ CELLS = [2.0, 4.0, 16.0]
 def sources():
     body = bodies.bumpy(800)
     irradiance = np.random.default_rng(2).uniform(size=(2, 800))
-    return Sources(body.centers.T, body.normals.T, body.areas, jnp.asarray(irradiance, float))
+    return Sources(body.centers.T, body.normals.T, 0.01 * body.areas, jnp.asarray(irradiance, float))
 
 
 @eqx.filter_jit

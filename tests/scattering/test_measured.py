@@ -113,6 +113,16 @@ def test_power_and_pixel_scale_what_a_photograph_gives(float64):
     np.testing.assert_allclose(other.profile.values, one.profile.values / 2, rtol=1e-12)
 
 
+@pytest.mark.parametrize("center", [(20.5, 61.0), (60.0, 14.5), (98.0, 60.5), (61.5, 103.0)])
+def test_rings_end_at_the_nearest_edge(center):
+    nearest = MM_PER_PIXEL * min(*center, 121 - center[0], 121 - center[1])
+    dot = measure_laser_dot(photograph(center=center), MM_PER_PIXEL, power=2.0, center=center)
+    assert nearest - 1.5 * MM_PER_PIXEL < float(dot.profile.radii[-1]) < nearest
+    shorter = measure_laser_dot(photograph(center=center), MM_PER_PIXEL, power=2.0, center=center, largest=1.0)
+    assert 1.0 - 1.5 * MM_PER_PIXEL < float(shorter.profile.radii[-1]) < 1.0
+    np.testing.assert_allclose(dot.profile.values, truth()(dot.profile.radii), rtol=0.02, atol=1e-4)
+
+
 def test_saturated_rings_are_left_out(float64):
     image = photograph()
     limit = 0.5 * image.max()
