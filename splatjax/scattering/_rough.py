@@ -22,7 +22,8 @@ class RoughFresnel(AbstractFresnel):
     by it or leaves; what it meets afterwards is neglected. With all facets reflecting everything the moments are 1, and without
     roughness they are those of `smooth`.
 
-    Differentiable in `eta` and `roughness`, and in the latter to first order at 0, where the derivative is 0.
+    Differentiable in `eta` and `roughness`, and in the latter to first order at 0, where the derivative is 0. At `eta = 1` itself
+    the derivative in `eta` is that of `smooth`: what roughness takes from it close by is not in it.
 
     **Attributes:**
 
