@@ -1,10 +1,12 @@
 """Do the tests notice? Small mistakes are planted in the mathematics, one at a time: `python tools/mutate.py --sample 400`.
 
 A seeded sample of all places where an operator, a comparison, a number or a function's name can be mistaken for its neighbour is
-taken from `gaussians`, `scattering`, `fitting`, `splatting` and `diffusion`. Each mutant meets the tests of its room that run
-through its line (by coverage.py's contexts, the shortest first), in single precision, and if it lives in double precision too.
-What lives on is written out with its line. Needs coverage.py (`.venv/bin/uv pip install coverage`); results are kept in a folder,
-and the same command goes on where it stopped.
+taken from `gaussians`, `scattering`, `fitting`, `splatting` and `diffusion`. Each mutant meets the tests of its room, as long as
+there is time: first those that run through its line (by coverage.py's contexts, the shortest first), then those beside them,
+which share what the first has compiled or drawn. In double precision, and if it lives those that run once in single precision
+too. What lives on is written out with its line. Needs coverage.py (`.venv/bin/uv pip install coverage`). Results are kept in a
+folder, and the same command goes on where it stopped; `--again` meets what has lived anew, with a larger `--budget` or other
+tests.
 """
 
 import argparse
@@ -12,19 +14,40 @@ import ast
 import json
 import os
 import random
-import resource
 import shutil
+import signal
 import sys
 import time
-import traceback
 from pathlib import Path
 from typing import NamedTuple
+
+from mutate_meet import Meeting, in_child, pytest_in
 
 ROOT = Path(__file__).resolve().parent.parent
 ROOMS = ("gaussians", "scattering", "fitting", "splatting", "diffusion")
 LEAST = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
 PATIENCE = 40.0, 3.0
 """Seconds of processor time that a mutant may take more than its tests, and how many times theirs."""
+LONGEST = 90.0
+"""Seconds of processor time of a test that there is no time for."""
+PRECISIONS = {True: "not once and not long", False: "once and not long"}
+"""Whether double, and which tests."""
+_SEVERAL = "tests/render/test_devices.py"
+BESIDE = {
+    "scattering": ("tests/transport/test_single_scattering.py", "tests/render/test_laser_dot.py"),
+    "fitting": ("tests/render/test_laser_dot.py",),
+    "splatting": (_SEVERAL, "tests/render/test_streamed.py"),
+    "diffusion": (
+        _SEVERAL,
+        "tests/render/test_streamed.py",
+        "tests/render/test_gathered.py",
+        "tests/gradients/test_jacobian.py",
+    ),
+}
+"""Tests of a room's parts that stand in other folders, since they need more than the room."""
+LIVING = ("lives", "no test")
+UNSEEN = {"_sharded.py": _SEVERAL}
+"""Files that run in other processes, where coverage does not look, and their tests."""
 _BINARY = {
     ast.Add: "-",
     ast.Sub: "+",
@@ -137,11 +160,12 @@ def sampled(count: int, seed: int) -> list[Mutant]:
 
 def room_tests(room: str) -> list[str]:
     """Give where the tests of a room stand."""
-    return [str(path.relative_to(ROOT)) for path in (ROOT / "tests" / room, ROOT / "tests" / f"test_{room}.py") if path.exists()]
+    own = (ROOT / "tests" / room, ROOT / "tests" / f"test_{room}.py")
+    return [*(str(path.relative_to(ROOT)) for path in own if path.exists()), *BESIDE.get(room, ())]
 
 
 class Recorder:
-    """A pytest plugin that tells coverage which test is running, and keeps how long each took."""
+    """A pytest plugin that tells coverage which test is running, keeps how long each took, and ends those that take too long."""
 
     def __init__(self, measured):
         self.measured, self.seconds, self.failed = measured, {}, set()
@@ -149,43 +173,20 @@ class Recorder:
     def pytest_runtest_logstart(self, nodeid, location):
         """Let what runs from here on count for this test."""
         self.measured.switch_context(nodeid)
+        signal.signal(signal.SIGPROF, _enough)
+        signal.setitimer(signal.ITIMER_PROF, LONGEST)
 
     def pytest_runtest_logreport(self, report):
         """Add what a part of a test took; a test that fails without mutants tells nothing."""
         if report.failed:
             self.failed.add(report.nodeid)
         self.seconds[report.nodeid] = self.seconds.get(report.nodeid, 0.0) + report.duration
+        if report.when == "teardown":
+            signal.setitimer(signal.ITIMER_PROF, 0)
 
 
-def in_child(log: Path, work, processor_seconds: float | None = None) -> tuple[int, float]:
-    """Do something in a process of its own; give its exit status, or minus the signal that ended it, and its seconds."""
-    child = os.fork()
-    if child == 0:
-        if processor_seconds is not None:
-            resource.setrlimit(resource.RLIMIT_CPU, (round(processor_seconds), round(processor_seconds) + 5))
-        said = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
-        os.dup2(said, 1)
-        os.dup2(said, 2)
-        status = 70
-        try:
-            status = int(work())
-        except BaseException:
-            traceback.print_exc()
-        sys.stdout.flush()
-        os._exit(status)
-    _, status, used = os.wait4(child, 0)
-    return (-os.WTERMSIG(status) if os.WIFSIGNALED(status) else os.WEXITSTATUS(status)), used.ru_utime + used.ru_stime
-
-
-def pytest_in(folder: Path, double: bool, arguments: list[str], plugins=()) -> int:
-    """Run tests in a copy of the project, in either precision; only in a process that has not imported it yet."""
-    import jax
-    import pytest
-
-    os.chdir(folder)
-    sys.path.insert(0, str(folder))
-    jax.config.update("jax_enable_x64", double)
-    return int(pytest.main(["-q", "-W", "ignore::pytest.PytestAssertRewriteWarning", *arguments], plugins=list(plugins)))
+def _enough(*_) -> None:
+    raise TimeoutError(f"more than {LONGEST} seconds")
 
 
 def measure(folder: Path, copy: Path, double: bool) -> None:
@@ -196,8 +197,8 @@ def measure(folder: Path, copy: Path, double: bool) -> None:
         measured = coverage.Coverage(data_file=str(folder / f"coverage-{double}"), source=[str(copy / "splatjax")], branch=False)
         recorder = Recorder(measured)
         measured.start()
-        tests = [test for room in ROOMS for test in room_tests(room)]
-        status = pytest_in(copy, double, [*tests, "-m", "not long"], [recorder])
+        tests = sorted({test for room in ROOMS for test in room_tests(room)})
+        status = pytest_in(copy, double, [*tests, "-m", PRECISIONS[double]], [recorder])
         measured.stop()
         measured.save()
         (folder / f"seconds-{double}.json").write_text(
@@ -224,16 +225,23 @@ def lines_to_tests(folder: Path, copy: Path, double: bool) -> tuple[dict[tuple[s
 
 
 def chosen(mutant: Mutant, lines, seconds: dict[str, float], budget: float) -> list[str]:
-    """Give the tests of its room that run through a mutant's line, the shortest first, as long as there is time for them.
+    """Give the tests of its room that may notice a mutant, as long as there is time for them.
 
-    Lines that run when a module is imported are those of all tests that run through the file.
+    Those that run through its line come first, the shortest of them before all. Only the first test that needs something compiled
+    or drawn runs through its lines: next are those of the same files, and then those that run through the mutant's file at all.
     """
     places = tuple(room_tests(Path(mutant.path).parts[1].removesuffix(".py")))
-    tests = lines.get((mutant.path, mutant.line), set())
-    if not tests:
-        tests = {test for (path, _), those in lines.items() if path == mutant.path for test in those}
+    unseen = UNSEEN.get(Path(mutant.path).name)
+    through = {test for test in seconds if unseen and test.startswith(unseen)} | lines.get((mutant.path, mutant.line), set())
+    files = {test.split("::")[0] for test in through}
+    of_file = {test for (path, _), those in lines.items() if path == mutant.path for test in those}
+
+    def order(test: str) -> tuple[bool, bool, float]:
+        return test not in through, test.split("::")[0] not in files, seconds[test]
+
+    candidates = {test for test in seconds if test.split("::")[0] in files} | of_file | through
     taken, sum_ = [], 0.0
-    for test in sorted((test for test in tests if test in seconds and test.startswith(places)), key=lambda test: seconds[test]):
+    for test in sorted((test for test in candidates if test in seconds and test.startswith(places)), key=order):
         sum_ += seconds[test]
         if taken and sum_ > budget:
             break
@@ -241,21 +249,33 @@ def chosen(mutant: Mutant, lines, seconds: dict[str, float], budget: float) -> l
     return taken
 
 
-def meet(mutant: Mutant, copy: Path, double: bool, tests: list[str], seconds: float) -> tuple[str, float]:
-    """Plant a mutant in the copy, run tests against it, and take it out again."""
-    target = copy / mutant.path
-    lines = (ROOT / mutant.path).read_bytes().splitlines(keepends=True)
+def planted(mutant: Mutant, text: bytes) -> bytes:
+    """Give the text of a file with a mutant in it."""
+    lines = text.splitlines(keepends=True)
     line = lines[mutant.line - 1]
     lines[mutant.line - 1] = line[: mutant.start] + mutant.text.encode() + line[mutant.end :]
-    target.write_bytes(b"".join(lines))
+    return b"".join(lines)
+
+
+def meet(mutant: Mutant, copy: Path, meeting: Meeting, tests: list[str], seconds: float) -> tuple[str, float]:
+    """Let tests meet a mutant."""
     more, times = PATIENCE
+    target = copy / mutant.path
+    before, limit = target.read_bytes(), more + times * seconds
+    text = planted(mutant, before)
+    fate, took = meeting.meet(mutant.path, text, tests, limit)
+    if fate != "imported":
+        return fate, took
+    target.write_bytes(text)
     try:
-        status, took = in_child(copy.parent / "log", lambda: pytest_in(copy, double, ["-x", *tests]), more + times * seconds)
+        status, more = in_child(copy.parent / "log", lambda: pytest_in(copy, meeting.double, ["-x", *tests]), limit)
     finally:
-        shutil.copy2(ROOT / mutant.path, target)
-    if status not in (0, 1, 2, 5) and status >= 0:  # 2: it cannot be imported
+        target.write_bytes(before)
+    if status in (-24, -9):
+        return "too slow", took + more
+    if status > 2 and status != 5:  # 2: it cannot be imported
         raise RuntimeError(f"pytest ended with status {status}; {copy.parent / 'log'} says why")
-    return ("lives" if status in (0, 5) else "too slow" if status in (-24, -9) else "killed"), took
+    return ("lives" if status in (0, 5) else "killed"), took + more
 
 
 def main() -> None:
@@ -266,42 +286,43 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, default=ROOT / "out" / "mutants")
     parser.add_argument("--budget", type=float, default=30.0, help="seconds of tests for a mutant, in each precision")
     parser.add_argument("--minutes", type=float, default=1e9, help="stop then")
-    parser.add_argument("--single-only", action="store_true", help="without the tests in double precision")
+    parser.add_argument("--again", action="store_true", help="meet again what has lived")
     given = parser.parse_args()
     os.environ["XLA_FLAGS"] = LEAST
     import beartype, equinox, jax, matplotlib, optimistix, pytest, scipy.optimize, scipy.spatial  # noqa: E401, F401, I001
 
     folder, copy = given.folder.resolve(), given.folder.resolve() / "copy"
     shutil.rmtree(copy, ignore_errors=True)
-    for name in ("splatjax", "tests", "profiles"):
-        shutil.copytree(ROOT / name, copy / name)
+    for name in ("splatjax", "tests", "profiles", "benchmarks"):
+        shutil.copytree(ROOT / name, copy / name, ignore=shutil.ignore_patterns("*.pyc"))
     shutil.copy2(ROOT / "pyproject.toml", copy)
-    precisions = (False,) if given.single_only else (False, True)
-    for double in precisions:
+    for double in PRECISIONS:
         measure(folder, copy, double)
     sys.dont_write_bytecode = True  # from here on what is cached is the project's own
-    tables = {double: lines_to_tests(folder, copy, double) for double in precisions}
+    meetings = {double: Meeting(copy, double) for double in PRECISIONS}
+    tables = {double: lines_to_tests(folder, copy, double) for double in PRECISIONS}
     record = folder / "met.jsonl"
     met = {each["name"]: each for each in map(json.loads, record.read_text().splitlines())} if record.exists() else {}
     began = time.time()
     for number, mutant in enumerate(sampled(given.sample, given.seed)):
-        if mutant.name() in met:
+        if mutant.name() in met and not (given.again and met[mutant.name()]["fate"] in LIVING):
             continue
         if time.time() - began > 60 * given.minutes:
             break
         fate, took, tests = "no test", 0.0, []
-        for double in precisions:
-            lines, seconds = tables[double]
+        for double, (lines, seconds) in tables.items():
             tests = chosen(mutant, lines, seconds, given.budget)
             if tests:
-                fate, spent = meet(mutant, copy, double, tests, sum(seconds[test] for test in tests))
+                fate, spent = meet(mutant, copy, meetings[double], tests, sum(seconds[test] for test in tests))
                 took += spent
-            if fate not in ("lives", "no test"):
+            if fate not in LIVING:
                 break
         met[mutant.name()] = {"name": mutant.name(), "fate": fate, "seconds": round(took, 1), "tests": len(tests)}
         with record.open("a") as file:
             print(json.dumps(met[mutant.name()]), file=file)
         print(f"{number + 1}: {fate} after {took:.0f} s, {mutant.name()}", flush=True)
+    for meeting in meetings.values():
+        meeting.end()
     _report(list(met.values()))
 
 
@@ -309,7 +330,7 @@ def _report(met: list[dict]) -> None:
     for fate in ("killed", "too slow", "lives", "no test"):
         print(f"{fate}: {sum(each['fate'] == fate for each in met)} of {len(met)}")
     for each in met:
-        if each["fate"] in ("lives", "no test"):
+        if each["fate"] in LIVING:
             path, line = each["name"].split(":")[:2]
             print(f"{each['fate']}: {each['name']}\n    {(ROOT / path).read_text().splitlines()[int(line) - 1].strip()}")
 

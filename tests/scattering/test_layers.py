@@ -109,7 +109,9 @@ def test_adding_sums_the_series(float64):
 def test_a_stack_of_one_is_its_layer(float64):
     slab = layer(*MARBLE_GREEN, 2.0)
     r = jnp.asarray([0.0, 1.0])
-    np.testing.assert_allclose(LayeredMultipole([slab], 1.2, 1.1)(r), Multipole(slab, 1.2, 1.1)(r), rtol=1e-14)
+    stack = LayeredMultipole([slab], 1.2, 1.1)
+    np.testing.assert_allclose(stack(r), Multipole(slab, 1.2, 1.1)(r), rtol=1e-14)
+    np.testing.assert_allclose(stack.length_scale(), 1 / slab.medium.sigma_t_prime, rtol=1e-14)
 
 
 def test_a_film_of_no_depth_changes_nothing(float64):
