@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
@@ -68,12 +69,12 @@ def recover(
     - `progress`: told in words what is being done, and the best medium up to then.
     - `throw`: raise if a search has not converged; otherwise `result` says so.
 
-    **Returns:** a `Recovery`. Its precision is that of the starts: float64 shows small errors, the pictures stay as they are.
+    **Returns:** a `Recovery` in JAX's default precision: under `jax.enable_x64` small errors show, the pictures stay as they are.
 
     **Raises:** `ValueError` for no observation or start, for channels that disagree, for starts without absorption, and for a
     picture none of whose pixels counts; an error with the message of `result` if `throw`.
     """
-    starts = [starts] if isinstance(starts, Medium) else list(starts)
+    starts = [_in_full(start) for start in ([starts] if isinstance(starts, Medium) else starts)]
     observations = list(observations)
     _check(observations, splats, starts)
     say = progress or _nobody
@@ -155,6 +156,11 @@ def _check(observations: list[Observation], splats: Splats, starts: list[Medium]
             raise ValueError(f"observations[{i}].picture has {each.picture.shape[2]} channels, starts have {channels}")
     if splats.albedo is not None and splats.albedo.shape[1] != channels:
         raise ValueError(f"splats.albedo has {splats.albedo.shape[1]} channels, starts have {channels}")
+
+
+def _in_full(medium: Medium) -> Medium:
+    """Give a medium in JAX's default precision, whichever it was loaded in."""
+    return jax.tree.map(lambda leaf: leaf.astype(jnp.result_type(float)), medium)
 
 
 def _unweighed(variances: Float[Array, " gaussians"], channels: int) -> SumOfGaussians:

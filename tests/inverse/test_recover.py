@@ -65,7 +65,7 @@ def observations(pictures, deviation=None):
 
 
 def recovered(pictures, starts, deviation=None, **more) -> sj.Recovery:
-    media = [medium(*off) for off in starts]
+    media = [jax.tree.map(lambda leaf: leaf.astype(jnp.float32), medium(*off)) for off in starts]  # as they are loaded elsewhere
     return sj.recover(observations(pictures, deviation), taken()[0], media, count=COUNT, settings=PLAIN, **more)
 
 
