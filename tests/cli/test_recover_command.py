@@ -37,16 +37,18 @@ FOUND = (0.011, 0.022, 0.033)
 
 @pytest.fixture
 def search(monkeypatch):
-    """A search that finds the same whatever it sees; the first one may be interrupted."""
+    """A search that finds the same whatever it sees; the first one may be interrupted, or end before it has settled."""
     asked, interrupted = [], []
 
-    def recover(observations, splats, starts, *, surface, model, count, loss, progress):
+    def recover(observations, splats, starts, *, surface, model, count, loss, progress, throw):
+        assert not throw  # what it has not reached the command line says
         asked.append((observations, splats, starts, model, count, loss))
         medium = sj.Medium(jnp.asarray(FOUND), starts[0].sigma_s_prime, starts[0].eta)
         progress("rendering", starts[0])
         progress("round 1", medium)
-        if interrupted:
-            raise interrupted.pop()
+        ended = interrupted.pop() if interrupted else optx.RESULTS.successful
+        if isinstance(ended, BaseException):
+            raise ended
         seen = np.where(np.arange(64).reshape(8, 8, 1) < 40, np.asarray(observations[0].picture, float), np.nan)
         return sj.Recovery(
             medium=medium,
@@ -59,7 +61,7 @@ def search(monkeypatch):
             residuals=(seen * 0 + 0.01,),
             ends=(medium,),
             costs=jnp.zeros(1),
-            result=optx.RESULTS.successful,
+            result=ended,
             noise_is_known=True,
             relative_noise=0.01,
             steps=5,
@@ -133,3 +135,15 @@ def test_what_cannot_be_is_said_in_one_line(files, search, tmp_path, capsys):
     assert "must end in .toml" in failure(["recover", *files, "--output", tmp_path / "mine.exr"], capsys)
     assert "has no [medium]" in failure([*command, "--start", "skin"], capsys, [output])
     assert not search[0]
+
+
+def test_a_search_that_does_not_settle_says_so_and_is_taken_up_again(files, search, tmp_path, capsys):
+    search[1].append(optx.RESULTS.nonlinear_max_steps_reached)
+    command = [str(word) for word in ("recover", *files, "--output", tmp_path / "mine.toml", "--no-suggest")]
+    assert main(command) == 2
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert f"{files[1]}: the search did not settle in 1 rounds and 5 steps; the same command goes on where it stopped" in said
+    assert (tmp_path / "mine.search.json").exists()
+    assert not (tmp_path / "mine.toml").exists()
+    assert main(command) == 0
+    np.testing.assert_allclose(search[0][1][2][0].sigma_a, FOUND)
