@@ -12,9 +12,9 @@ import pytest
 from nbclient import NotebookClient
 
 NOTEBOOKS = Path(__file__).parents[1] / "notebooks"
-LONG = {"gradients", "painted_skin", "recover_marble", "shape_from_shading", "which_profile"}
+LONG = {"gradients", "measured_material", "new_material", "painted_skin", "recover_marble", "shape_from_shading", "which_profile"}
 LONG |= {f"figure_{number}" for number in (1, 4, 5, 6, 7, 8)}  # Figure 3 has no picture to render
-"""They take more than half a minute: `make test-long` runs them, `make test` does not."""
+"""They take a quarter of a minute or more: `make test-long` runs them, `make test` does not."""
 RUN_LONGER_THAN_THEY_COMPILE = {"shape_from_shading", "which_profile"}
 """They are compiled as users have it, whatever the shell says."""
 

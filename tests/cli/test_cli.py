@@ -164,7 +164,9 @@ def test_render_shows_the_bust_and_says_what_it_does(tmp_path, capsys):
     material, again = tmp_path / "again.toml", tmp_path / "again.exr"
     material.write_text(manifest["contents of --material"], encoding="utf-8")
     options = [
-        f"{name}={value}" for name, value in manifest.items() if name[:2] == "--" and name not in ("--material", "--scattering")
+        f"{name}={value}"
+        for name, value in manifest.items()
+        if name[:2] == "--" and name not in ("--material", "--scattering", "--albedo")
     ]
     assert main(["render", *options, "--material", str(material), "--output", str(again)]) == 0
     for name, value in vars(sj.read_exr(again)).items():

@@ -32,6 +32,7 @@ def graph(path: str):
     return loss, parts(world.scene), [world.camera, other]
 
 
+@pytest.mark.long
 def test_many_cameras_by_map_and_many_materials_by_vmap_are_those_one_by_one():
     with jax.enable_x64(True):
         loss, point, cameras = graph("fast")

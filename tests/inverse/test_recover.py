@@ -159,6 +159,7 @@ class TestRecover:
             both.medium.sigma_a, medium().sigma_a, rtol=5e-3
         )  # rounds end when one moves less than a tenth of a bar
 
+    @pytest.mark.long
     def test_another_picture_can_only_tell_more(self):
         found, (splats, _) = without_noise(), taken()
         candidates = [

@@ -18,7 +18,7 @@ def same_bits():
     return module
 
 
-@pytest.mark.once
+@pytest.mark.long
 def test_a_picture_is_the_same_on_one_processor(same_bits):
     names = "points", "picture"
     assert same_bits.in_a_process({min(os.sched_getaffinity(0))}, *names) == same_bits.outputs(names)
