@@ -107,6 +107,14 @@ def sources_of(splats: Splats, irradiance: Float[Array, "channels splats"]) -> _
     return _diffusion.Sources(splats.centers.T, splats.normals.T, splats.areas, irradiance)
 
 
+def spread_light(
+    scene: Scene, source: Float[Array, "channels splats"], seen: SeenSurfaces, settings: RenderSettings, plan: Plan
+) -> tuple[_diffusion.DiffusionLayers, Float[Array, ""]]:
+    """Pass 4: also what room was needed over what there is."""
+    rest = plan.interval, seen.atlas, plan.diffuser, settings.diffusion.normalization
+    return _diffusion.diffusion_layers(sources_of(scene.splats, source), scene.material, seen.receivers(), *rest)
+
+
 class ShadedSurface(eqx.Module):
     """The surface, shaded, in the tiles of an atlas; nothing premultiplied."""
 
@@ -194,15 +202,7 @@ def five_passes(
     entering = let_light_in(scene, light)
     attributes = settings.lighting.attributes(scene, light, entering)
     seen = see_surfaces(scene.splats, attributes, view, settings, plan).lit(scene, light, settings)
-    layers, needed = _diffusion.diffusion_layers(
-        sources_of(scene.splats, entering.source),
-        scene.material,
-        seen.receivers(),
-        plan.interval,
-        seen.atlas,
-        plan.diffuser,
-        settings.diffusion.normalization,
-    )
+    layers, needed = spread_light(scene, entering.source, seen, settings, plan)
     shaded = shade(scene, view, light.groups, seen, layers)
     needed = jnp.max(jnp.stack([needed, seen.needed, light.needed]))
     return shaded, seen, layers.resolved, needed

@@ -6,13 +6,13 @@ import jax.numpy as jnp
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Float
 
-from splatjax import diffusion as _diffusion, splatting as _splatting
+from splatjax import splatting as _splatting
 from splatjax.devices import Devices, laid_out
 from splatjax.scene import Camera, Frame, Scene
 
 from ._inputs import SAME, check_channels, in_one_dtype
 from ._lighting import EnteringLight, let_light_in
-from ._passes import SeenSurfaces, bounds_over, cast_shadows, compose, five_passes, see_surfaces, sources_of
+from ._passes import SeenSurfaces, bounds_over, cast_shadows, compose, five_passes, see_surfaces, spread_light
 from ._plan import check_count, plan_unless_traced
 from ._records import Plan
 from ._settings import RenderSettings
@@ -144,15 +144,7 @@ def _layers(settings: RenderSettings, scene: Scene, plan: Plan, camera: Camera, 
     if splats.albedo is not None:
         attributes["albedo"] = splats.albedo.T
     seen = see_surfaces(splats, attributes, view, settings, plan)
-    layers, needed = _diffusion.diffusion_layers(
-        sources_of(splats, irradiance.T),
-        scene.material,
-        seen.receivers(),
-        plan.interval,
-        seen.atlas,
-        plan.diffuser,
-        settings.diffusion.normalization,
-    )
+    layers, needed = spread_light(scene, irradiance.T, seen, settings, plan)
     return layers.layers, seen, jnp.maximum(needed, seen.needed)
 
 
