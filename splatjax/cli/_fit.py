@@ -1,6 +1,6 @@
 """`splatjax fit`: from optical coefficients to a sum of Gaussians."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated
 
@@ -19,6 +19,15 @@ from ._fit_all import fit_all
 from ._models import Model, Reference, reference
 from ._outputs import OptionalPath, check_output
 from ._report import stage
+
+_KINDS = {".csv": "a measured profile", ".exr": "a photograph"}
+_COEFFICIENTS = "coefficients"
+_OPTIONS = {
+    _COEFFICIENTS: ("model", "cut", "photons", "single_scattering"),
+    "a measured profile": ("mm_per_unit",),
+    "a photograph": ("mm_per_pixel", "power"),
+}
+"""What each kind of input alone has use for."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,13 +103,20 @@ class Fit:
         with jax.enable_x64(True):
             fit_all(Path(self.medium), self.output, self.count, weights)
 
+    def _check_options(self) -> None:
+        """Refuse what has no effect on this kind of input."""
+        kind = _KINDS.get(Path(self.medium).suffix.lower(), _COEFFICIENTS)
+        given = {field.name for field in fields(self) if getattr(self, field.name) != field.default}
+        for other, names in _OPTIONS.items():
+            for name in names:
+                if other != kind and name in given:
+                    option = f"--{name.replace('_', '-')}"
+                    raise ValueError(f"{option} is for {other}, and {self.medium} is taken for {kind}; leave it out")
+
     def _run(self) -> None:
+        self._check_options()
         coefficients = self._coefficients()
         if isinstance(coefficients, sj.Tabulated):
-            if self.single_scattering:
-                raise ValueError(
-                    f"{self.medium}: --single-scattering needs coefficients, and this is a measured profile; leave it out"
-                )
             made = Reference(coefficients, sj.NORM_RULE)
         else:
             made = reference(coefficients, self.model, self.cut, self.photons, self.single_scattering)

@@ -127,6 +127,19 @@ def test_fit_takes_a_photograph_that_any_program_wrote(tmp_path, capsys):
     np.testing.assert_allclose(gaussians.weights, [[1.0]], rtol=0.01)
 
 
+@pytest.mark.parametrize(
+    ("command", "said"),
+    [
+        (["dot.csv", "--model", "monte-carlo"], "--model is for coefficients, and dot.csv is taken for a measured profile"),
+        (["dot.exr", "--mm-per-pixel", "1", "--single-scattering"], "--single-scattering is for coefficients, and dot.exr"),
+        (["dot.csv", "--power", "2"], "--power is for a photograph, and dot.csv is taken for a measured profile"),
+        (["marble", "--mm-per-unit", "10"], "--mm-per-unit is for a measured profile, and marble is taken for coefficients"),
+    ],
+)
+def test_fit_refuses_what_has_no_effect(command, said, capsys):
+    assert said in failure(["fit", *command], capsys)
+
+
 def test_export_writes_what_other_renderers_take(tmp_path, capsys):
     output = tmp_path / "skin.json"
     assert main(["export", "skin", "--output", str(output)]) == 0

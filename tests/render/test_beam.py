@@ -84,7 +84,7 @@ def test_the_sum_of_layers_is_the_profile():
 
 @pytest.mark.slow
 @pytest.mark.once
-@pytest.mark.parametrize("name", ["skin", "marble"])
+@pytest.mark.parametrize("name", ["skin", pytest.param("marble", marks=pytest.mark.long)])
 def test_a_wide_beam_with_default_settings_is_the_widened_profile(name):
     material = load_material(name)
     half_width = 30.0

@@ -38,6 +38,7 @@ def photograph(medium: sj.Medium) -> np.ndarray:
 
 @pytest.mark.slow
 @pytest.mark.once
+@pytest.mark.long
 def test_a_rendered_dot_gives_the_coefficients_back_within_their_error_bars():
     with jax.enable_x64(True):
         medium = sj.Medium(jnp.asarray([0.02]), jnp.asarray([1.2]), jnp.asarray([1.4]))

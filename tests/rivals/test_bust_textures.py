@@ -13,6 +13,7 @@ def dressed():
     return bust_with_textures(512)
 
 
+@pytest.mark.once
 def test_its_face_has_the_colors_of_the_bust(dressed):
     mesh, textures = dressed
     triangles = TexturedMesh.of(mesh, textures)

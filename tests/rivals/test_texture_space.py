@@ -147,6 +147,7 @@ def test_through_a_slab_comes_what_comes_through_splats():
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_a_picture_has_the_derivatives_that_differences_say(float64):
     settings = dataclasses.replace(STILL, resolution=40)
     mesh = rivals.TexturedMesh.of(plane(1.4), painted(1.4, 24))
