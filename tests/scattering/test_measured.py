@@ -35,6 +35,16 @@ def test_integrals_of_a_table_are_sums_over_its_radii(float64):
     np.testing.assert_array_equal(np.asarray(weights) > 0, np.asarray(radii) >= np.asarray(table.length_scale()))
 
 
+def test_half_of_a_table_lies_within_its_length_scale(float64):
+    """The first r^2 of 2 exp(-r^2) hold a share of 1 - exp(-r^2), however the radii are spaced."""
+    r = jnp.linspace(0.02, 2.2, 700) ** 2
+    table = Tabulated(r, jnp.stack([2 * jnp.exp(-(r**2)), -jnp.exp(-(r**2) / 9)], axis=1))
+    half = np.sqrt(np.log(2.0))
+    # Of the second, which falls three times as far out, 7% lie beyond the last radius.
+    cut = 1 - np.exp(-(float(r[-1]) ** 2) / 9)
+    np.testing.assert_allclose(table.length_scale(), [half, 3 * np.sqrt(-np.log1p(-0.5 * cut))], rtol=5e-3)
+
+
 def test_a_table_is_fitted_over_its_own_radii_alone(float64):
     """A table that ends early says nothing of the tail: the Gaussians behind it come back all the same."""
     r = jnp.linspace(0.05, 3.0, 60)
