@@ -205,7 +205,7 @@ def inverse(information: Float[np.ndarray, "unknowns unknowns"]) -> Float[np.nda
 
 def percent(share: float) -> str:
     """Write a relative error."""
-    return "anything" if not np.isfinite(share) or share > 10 else f"{100 * share:.2g}%"
+    return "anything" if not np.isfinite(share) or share > 10 else f"{float(f'{100 * share:.2g}'):g}%"
 
 
 def _power(name: str, power: float) -> str:

@@ -55,6 +55,14 @@ def test_what_is_not_fixed_is_said():
     np.testing.assert_allclose(found.relative_errors(), np.full((2, 1), np.sqrt((0.01**2 + 0.5**2) / 2)), rtol=1e-4)
 
 
+def test_shares_of_one_and_more_are_written_out():
+    """All of the light, and a path known to 150%."""
+    said = recovery(along(0.01, 1.5, -np.pi / 4), unresolved=0.998).words()
+    assert "known to 150%" in said
+    assert "+- 110%" in said
+    assert "100% of its light" in said
+
+
 def test_what_is_fixed_is_not_said_to_be_open():
     found = recovery(along(0.01, 0.02, 0.3))
     assert found.is_fixed()
