@@ -2,7 +2,7 @@
 
 The scanned head, pictures made otherwise than the recovery makes them: twice the splats, eight Gaussians, no clusters. First one
 of the whole head under a lamp from the side; then one of a spot on the cheek, from closer up, where the splats lie closer, under
-the lamp or under a laser dot: with the first, and alone.
+the lamp or under a laser dot: with the first (cases 2 and 3), and alone (4 and 5).
 """
 
 import argparse
@@ -28,6 +28,8 @@ SPOT = (28.0, 10.0)
 REACH = 14.0  # mm around the spot where splats lie closer
 FIELD = 16.0  # mm that the close picture shows
 DOT = 0.25  # mm, standard deviation of the laser dot
+HEAD, LAMP, LASER = "the head", "the spot under the lamp", "the spot under a laser dot"
+CASES = ((HEAD,), (HEAD, LAMP), (HEAD, LASER), (LAMP,), (LASER,))
 
 
 def arguments():
@@ -37,6 +39,9 @@ def arguments():
     parser.add_argument("--width", type=int, default=256, help="of the square picture of the head, pixels (default %(default)s)")
     parser.add_argument("--close-width", type=int, default=128, help="of those of the spot (default %(default)s)")
     parser.add_argument("--materials", nargs="+", default=["skin1"])
+    parser.add_argument(
+        "--cases", nargs="+", type=int, default=range(1, 6), choices=range(1, 6), help="in the order above (default: all)"
+    )
     parser.add_argument("--off", type=float, default=3.0, help="factor of the starts (default %(default)s)")
     parser.add_argument("--noise", type=float, default=0.01, help="over a picture's root mean square, told (default %(default)s)")
     parser.add_argument("--otherwise", default="unmerged", choices=OTHERWISE, help="the data's path (default %(default)s)")
@@ -88,9 +93,9 @@ def main() -> None:
     whole, close = cameras(spot, normal, options.width, options.close_width)
     lamp = sj.DirectionalLight(jnp.asarray(LIGHTS["side"]), jnp.full(3, jnp.pi))
     dot = sj.GaussianBeam(jnp.asarray(spot + 50 * normal), jnp.asarray(-normal), jnp.full(3, jnp.pi), jnp.asarray(DOT**2))
-    shots = {"the head": (whole, lamp), "the spot under the lamp": (close, lamp), "the spot under a laser dot": (close, dot)}
-    cases = [["the head"], ["the head", "the spot under the lamp"], ["the head", "the spot under a laser dot"]]
-    cases += [["the spot under the lamp"], ["the spot under a laser dot"]]
+    cases = [CASES[number - 1] for number in options.cases]
+    shots = {HEAD: (whole, lamp), LAMP: (close, lamp), LASER: (close, dot)}
+    shots = {title: shot for title, shot in shots.items() if any(title in case for case in cases)}
     with jax.enable_x64(True):
         for name in options.materials:
             medium = sj.load_medium(name)

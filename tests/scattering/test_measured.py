@@ -155,6 +155,7 @@ def test_a_measured_profile_is_fitted_without_negative_weights(float64):
     [
         ({"mm_per_pixel": 0.0}, "mm_per_pixel must be positive; got 0"),
         ({"power": -1.0}, "power must be positive; got -1"),
+        ({"power": np.asarray([2.0, -1.0])}, "power must be positive; got -1"),
         ({"step": 0.5}, "step must be at least 1 pixel; got 0.5"),
         ({"center": (-3.0, 4.0)}, "center -3, 4 is outside of the picture of 121 x 121 pixels"),
     ],
