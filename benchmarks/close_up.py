@@ -8,6 +8,7 @@ the lamp or under a laser dot: with the first (cases 2 and 3), and alone (4 and 
 import argparse
 import json
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import jax
@@ -85,6 +86,15 @@ def cameras(spot: np.ndarray, normal: np.ndarray, width: int, close_width: int) 
     return whole, close
 
 
+def told(found: sj.Recovery | sj.Estimate, medium: sj.Medium, name: str, pictures: Sequence[str]) -> dict:
+    """Print what was found, and give it as a row."""
+    off, bars = errors(found, medium), np.stack(found.relative_errors())
+    for what, wrong, bar in zip(("sigma_a", "sigma_s'"), off, bars, strict=True):
+        print(f"  {what} off by", ", ".join(f"{100 * w:+.1f} +- {100 * b:.1f}%" for w, b in zip(wrong, bar, strict=True)))
+    print(found.words(), flush=True)
+    return {"material": name, "pictures": list(pictures), "errors": off.tolist(), "bars": bars.tolist()}
+
+
 def main() -> None:
     options = arguments()
     mesh, rows = head(), []
@@ -106,18 +116,19 @@ def main() -> None:
                 seen[title] = sj.Observation(picture, camera, (light,), deviation=deviation)
                 Path("out").mkdir(exist_ok=True)
                 sj.write_png(f"out/close_up_{name}_{title.replace(' ', '_')}.png", picture / np.quantile(picture, 0.99))
+            apart = {}
             for case in cases:
                 begin = time.perf_counter()
                 found = sj.recover([seen[title] for title in case], ours, starts(medium, options.off), throw=False)
-                took, off, bars = time.perf_counter() - begin, errors(found, medium), np.stack(found.relative_errors())
-                print(f"\n{name} from {' and '.join(case)}, {took:.0f} s:")
-                for what, wrong, bar in zip(("sigma_a", "sigma_s'"), off, bars, strict=True):
-                    print(
-                        f"  {what} off by",
-                        ", ".join(f"{100 * w:+.1f} +- {100 * b:.1f}%" for w, b in zip(wrong, bar, strict=True)),
-                    )
-                print(found.words(), flush=True)
-                rows.append({"material": name, "pictures": case, "errors": off.tolist(), "bars": bars.tolist(), "seconds": took})
+                print(f"\n{name} from {' and '.join(case)}, {time.perf_counter() - begin:.0f} s:")
+                rows.append(told(found, medium, name, case))
+                if len(case) == 1:
+                    apart[case[0]] = found
+                Path("out/close_up.json").write_text(json.dumps(rows, indent=1) + "\n")
+            if HEAD in apart and len(apart) > 1:
+                closest = [title for title in (HEAD, LASER, LAMP) if title in apart][:2]
+                print(f"\n{name} from {' and '.join(closest)}, each searched apart, combined:")
+                rows.append(told(sj.combined([apart[title] for title in closest]), medium, name, closest))
                 Path("out/close_up.json").write_text(json.dumps(rows, indent=1) + "\n")
 
 

@@ -89,7 +89,7 @@ class Compilations:
         self.count += event == COMPILED
 
 
-def errors(recovery: sj.Recovery, medium: sj.Medium) -> np.ndarray:
+def errors(recovery: sj.Recovery | sj.Estimate, medium: sj.Medium) -> np.ndarray:
     """Give what each coefficient is off, as a share: two rows of channels."""
     pairs = (recovery.medium.sigma_a, medium.sigma_a), (recovery.medium.sigma_s_prime, medium.sigma_s_prime)
     return np.stack([np.asarray(found) / np.asarray(true) - 1 for found, true in pairs])

@@ -52,6 +52,7 @@ from .inverse import AlbedoMap as AlbedoMap, CameraPoses as CameraPoses, LightPl
 from .inverse import LightStrengths as LightStrengths, NormalOffsets as NormalOffsets
 from .inverse import BlackBackground as BlackBackground, UnknownBackground as UnknownBackground
 from .inverse import fit_scene as fit_scene, FittedScene as FittedScene
+from .inverse import combined as combined, Estimate as Estimate
 from .inverse import Observation as Observation, recover as recover, Recovery as Recovery
 
 __version__ = "0.1.0"

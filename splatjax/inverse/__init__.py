@@ -15,4 +15,5 @@ from ._offsets import NormalOffsets as NormalOffsets
 from ._parts import AbstractPart as AbstractPart, AlbedoMap as AlbedoMap, CameraPoses as CameraPoses
 from ._parts import LightPlaces as LightPlaces, LightStrengths as LightStrengths
 from ._recover import recover as recover
-from ._recovery import Recovery as Recovery
+from ._estimate import Estimate as Estimate
+from ._recovery import combined as combined, Recovery as Recovery

@@ -13,13 +13,14 @@ from splatjax.render import RenderSettings
 from splatjax.scattering import Dipole, Medium
 from splatjax.scene import AbstractLight, Camera, DirectionalLight, GaussianBeam, Splats
 
+from ._estimate import Combination, best_and_worst, percent
 from ._evidence import Evidence
 from ._flat import Gatherer
 from ._intensity import AbstractIntensity, KnownIntensity
 from ._losses import SquaredLoss
 from ._observation import Observation
 from ._problem import Fitted, solution, usual_weights
-from ._recovery import Combination, Recovery, best_and_worst, percent
+from ._recovery import Recovery
 
 
 class Candidate(eqx.Module):

@@ -15,12 +15,13 @@ from splatjax.render import RenderSettings
 from splatjax.scattering import Dipole, Medium
 from splatjax.scene import Material, Splats
 
+from ._estimate import inverse
 from ._evidence import Evidence
 from ._flat import Gatherer, wide_variances
 from ._losses import AbstractLoss, SquaredLoss
 from ._observation import Observation
 from ._problem import Fitted, Held, search, solution, usual_weights
-from ._recovery import Recovery, inverse
+from ._recovery import Recovery
 
 _FINE = RenderSettings(diffuser=ClusterDiffuser(error=2.5e-4))
 """Layers eight times finer than a picture needs: where much light comes back, 0.1% of it is 2% of the absorption."""

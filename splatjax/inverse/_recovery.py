@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
@@ -11,29 +12,11 @@ from jaxtyping import Array, Float
 from splatjax.scattering import Medium
 from splatjax.scene import Material
 
-_FIXED = 0.1
-"""A combination that is known no better than this, as a relative error, counts as not fixed."""
+from ._estimate import Combination, Estimate, inverse, percent, roots
+
 _HANDOVER = 0.5 * math.log(2.0)
 """How well the width is known, as a logarithm, below which layers are handed to the surface: twice as many splats move it by as
 much, and that of regular ones lies a factor of 2.5 below that of scattered ones."""
-
-
-class Combination(eqx.Module):
-    r"""A product of powers, `sigma_a^p sigma_s'^q`, and how well it is known.
-
-    **Attributes:**
-
-    - `powers`: p and q, the larger of which is 1. Static.
-    - `deviation`: standard deviation of its logarithm: its relative error, where it is small. Static.
-    """
-
-    powers: tuple[float, float] = eqx.field(static=True)
-    deviation: float = eqx.field(static=True)
-
-    def __str__(self) -> str:
-        above = [_power(name, p) for name, p in zip(("sigma_a", "sigma_s'"), self.powers, strict=True) if p > 0.05]
-        below = [_power(name, -p) for name, p in zip(("sigma_a", "sigma_s'"), self.powers, strict=True) if p < -0.05]
-        return " ".join(above) + (f" / {' '.join(below)}" if below else "")
 
 
 class Recovery(eqx.Module):
@@ -115,21 +98,25 @@ class Recovery(eqx.Module):
         channels = self.medium.eta.shape[0]
         return np.stack([whole[np.ix_([c, channels + c], [c, channels + c])] for c in range(channels)])
 
+    def estimate(self) -> Estimate:
+        """Give the coefficients with their covariance, without what they came from."""
+        return Estimate(self.medium, self.covariance())
+
     def relative_errors(self) -> tuple[Float[np.ndarray, " channels"], Float[np.ndarray, " channels"]]:
         """Give the standard deviations of the logarithms of `sigma_a` and of `sigma_s_prime`."""
-        return _roots(self.covariance())
+        return roots(self.covariance())
 
     def noise_errors(self) -> tuple[Float[np.ndarray, " channels"], Float[np.ndarray, " channels"]]:
         """Give those of `covariance_of_noise`: how far a search would scatter if the picture were taken again."""
-        return _roots(self.covariance_of_noise())
+        return roots(self.covariance_of_noise())
 
     def combinations(self) -> list[tuple[Combination, Combination]]:
         """Give, for each channel, the combination of coefficients that is known best and the one that is known worst."""
-        return [best_and_worst(each) for each in self.covariance()]
+        return self.estimate().combinations()
 
     def is_fixed(self) -> bool:
         """Say whether the pictures fix both coefficients of every channel, to a tenth or better."""
-        return all(worst.deviation <= _FIXED for _, worst in self.combinations())
+        return self.estimate().is_fixed()
 
     def words(self, channels: Sequence[str] | None = None) -> str:
         """Say what was found, how well, and what the pictures do not fix.
@@ -138,24 +125,13 @@ class Recovery(eqx.Module):
 
         - `channels`: their names; by default red, green and blue, or numbers.
         """
-        count = self.medium.eta.shape[0]
-        names = channels or (("red", "green", "blue") if count == 3 else [f"channel {c + 1}" for c in range(count)])
-        errors = self.relative_errors()
         lines = []
-        for c, (name, (best, worst)) in enumerate(zip(names, self.combinations(), strict=True)):
-            found = np.asarray(self.medium.sigma_a)[c], np.asarray(self.medium.sigma_s_prime)[c]
-            a, s = (f"{float(value):.4g} +- {percent(error[c])}" for value, error in zip(found, errors, strict=True))
-            lines.append(f"{name}: sigma_a {a}, sigma_s' {s} (1/mm)")
-            if worst.deviation > _FIXED:
-                lines.append(
-                    f"  not fixed by these pictures: {worst}, known to {percent(worst.deviation)}; "
-                    f"what they fix is {best}, to {percent(best.deviation)}"
-                )
-            unresolved = float(np.asarray(self.unresolved)[c])
+        for said, unresolved in zip(self.estimate().lines(channels), np.asarray(self.unresolved), strict=True):
+            lines += said
             if unresolved > _MOST:
                 lines.append(
-                    f"  {percent(unresolved)} of its light spreads less than the splats are apart: how far, they can hardly "
-                    "show; take more splats, or a smaller piece from closer up"
+                    f"  {percent(float(unresolved))} of its light spreads less than the splats are apart: how far, they can "
+                    "hardly show; take more splats, or a smaller piece from closer up"
                 )
         if not self.noise_is_known:
             lines.append("error bars are those of what the model leaves over, as if its pixels were independent")
@@ -172,41 +148,50 @@ _MOST = 0.8
 """Of the light: marble on a head of 100,000 splats has 0.6 and comes back within 1.4%, the blue of skin 1.0 and does not."""
 
 
-def best_and_worst(covariance: Float[np.ndarray, "2 2"]) -> tuple[Combination, Combination]:
-    """Give the principal axes of a covariance of logarithms."""
-    if not np.all(np.isfinite(covariance)):
-        return Combination((1.0, 0.0), np.inf), Combination((0.0, 1.0), np.inf)
-    values, axes = np.linalg.eigh(covariance)
-    found = []
-    for value, axis in zip(values, axes.T, strict=True):
-        axis = axis / axis[np.argmax(np.abs(axis))]
-        axis = axis if axis[0] > 0.05 or axis[1] > 0.95 else -axis
-        found.append(Combination((float(axis[0]), float(axis[1])), float(np.sqrt(max(value, 0.0)))))
-    return found[0], found[1]
+def combined(recoveries: Sequence[Recovery]) -> Estimate:
+    r"""Put together what pictures tell that were searched apart: the mean of the logarithms, weighed by what each knows.
+
+    A search of all pictures at once weighs their pixels by noise alone. Many pixels that do not show how far light goes, for its
+    layers are handed to the surface, then outvote a few that do. Apart, each picture's error bars say which combination of the
+    coefficients it knows, and here it is asked for that alone: a coarse picture of a body for the reflectance, a close one
+    under a laser dot for how far light goes.
+
+    **Arguments:**
+
+    - `recoveries`: of one material. What is left of the error in each counts as independent of the others'. Where a model leaves
+      more than the noise, its share of the error bars is stretched by the root of `chi_squared`.
+
+    **Returns:** an `Estimate`.
+
+    **Raises:** `ValueError` for none, and for channels or indices of refraction that are not the same in all.
+    """
+    if not recoveries:
+        raise ValueError("nothing to combine; give one recovery at least")
+    first = recoveries[0].medium
+    for i, each in enumerate(recoveries):
+        if each.medium.eta.shape != first.eta.shape or np.any(np.asarray(each.medium.eta) != np.asarray(first.eta)):
+            raise ValueError(
+                f"recoveries[{i}].medium.eta is {each.medium.eta.tolist()}, that of the first {first.eta.tolist()}: "
+                "they are of different materials"
+            )
+    points = np.log([np.stack([each.medium.sigma_a, each.medium.sigma_s_prime], axis=-1) for each in recoveries])
+    means, covariances = [], []
+    for c in range(first.eta.shape[0]):
+        known = [_information(_stretched(each).covariance()[c]) for each in recoveries]
+        covariance = inverse(np.sum(known, axis=0))
+        told = sum(its @ point[c] for its, point in zip(known, points, strict=True))
+        # Where nothing is known there is nothing to weigh by.
+        means.append(covariance @ told if np.all(np.isfinite(covariance)) else np.mean(points[:, c], axis=0))
+        covariances.append(covariance)
+    sigma_a, sigma_s_prime = jnp.exp(jnp.asarray(np.stack(means, axis=-1), first.eta.dtype))
+    return Estimate(Medium(sigma_a, sigma_s_prime, first.eta), np.stack(covariances))
 
 
-def _roots(
-    covariances: Float[np.ndarray, "channels 2 2"],
-) -> tuple[Float[np.ndarray, " channels"], Float[np.ndarray, " channels"]]:
-    roots = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
-    return roots[:, 0], roots[:, 1]
+def _stretched(recovery: Recovery) -> Recovery:
+    """Let noise count for what the model leaves over, where that is more."""
+    stretch = max(float(recovery.chi_squared), 1.0) if recovery.noise_is_known else 1.0
+    return eqx.tree_at(lambda its: its.information, recovery, recovery.information / stretch)
 
 
-def inverse(information: Float[np.ndarray, "unknowns unknowns"]) -> Float[np.ndarray, "unknowns unknowns"]:
-    """Give the covariance; infinite where nothing is known."""
-    lengths = np.sqrt(np.diagonal(information))
-    if not np.all(np.isfinite(information)) or np.any(lengths == 0):
-        return np.full_like(information, np.inf)
-    values, axes = np.linalg.eigh(information / np.outer(lengths, lengths))
-    # What rounding leaves of a direction in which nothing changes counts as nothing.
-    values = np.maximum(values, np.finfo(np.float64).eps * len(values))
-    return (axes / values) @ axes.T / np.outer(lengths, lengths)
-
-
-def percent(share: float) -> str:
-    """Write a relative error."""
-    return "anything" if not np.isfinite(share) or share > 10 else f"{float(f'{100 * share:.2g}'):g}%"
-
-
-def _power(name: str, power: float) -> str:
-    return name if round(power, 2) == 1 else f"{name}^{power:.2g}"
+def _information(covariance: Float[np.ndarray, "2 2"]) -> Float[np.ndarray, "2 2"]:
+    return inverse(covariance) if np.all(np.isfinite(covariance)) else np.zeros_like(covariance)

@@ -1,5 +1,6 @@
 """What a recovery says of itself: principal axes of a covariance, in words."""
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
@@ -133,3 +134,48 @@ def test_nothing_known_is_nothing_known(information):
     assert not found.is_fixed()
     assert not np.any(np.isfinite(found.relative_errors()))
     assert "anything" in found.words()
+
+
+def test_what_is_combined_is_the_mean_by_what_each_knows():
+    """One knows the reduced albedo, the other scattering: together both, whichever comes first."""
+    ratio = recovery(along(0.01, 0.5, -np.pi / 4))
+    medium = sj.Medium(*(jnp.asarray([value]) for value in (0.03, 1.5, 1.3)))
+    path = eqx.tree_at(lambda r: r.medium, recovery(np.diag([0.3**-2, 0.02**-2])), medium)
+    found = sj.combined([ratio, path])
+    assert found.is_fixed()
+    assert not ratio.is_fixed()
+    known = [np.linalg.inv(each.covariance()[0]) for each in (ratio, path)]
+    points = [np.log([float(each.medium.sigma_a[0]), float(each.medium.sigma_s_prime[0])]) for each in (ratio, path)]
+    expected = np.linalg.solve(known[0] + known[1], known[0] @ points[0] + known[1] @ points[1])
+    np.testing.assert_allclose(np.log([found.medium.sigma_a[0], found.medium.sigma_s_prime[0]]), expected, rtol=1e-5)
+    np.testing.assert_allclose(found.covariance[0], np.linalg.inv(known[0] + known[1]), rtol=1e-4)
+    np.testing.assert_allclose(sj.combined([path, ratio]).medium.sigma_a, found.medium.sigma_a, rtol=1e-6)
+    assert "not fixed" not in found.words()
+
+
+def test_one_alone_stays_what_it_is_and_one_that_knows_nothing_adds_nothing():
+    known, nothing = recovery(along(0.01, 0.5, -np.pi / 4)), recovery(np.zeros((2, 2)))
+    for given in ([known], [known, nothing]):
+        found = sj.combined(given)
+        np.testing.assert_allclose(found.medium.sigma_s_prime, known.medium.sigma_s_prime, rtol=1e-5)
+        np.testing.assert_allclose(found.relative_errors(), known.relative_errors(), rtol=1e-4)
+        assert found.words() == known.words()
+    found = sj.combined([nothing, nothing])
+    np.testing.assert_allclose(found.medium.sigma_a, nothing.medium.sigma_a, rtol=1e-6)
+    assert "anything" in found.words()
+
+
+def test_a_model_that_leaves_much_counts_for_less():
+    info = along(0.01, 0.02, 0.3)
+    good, bad, unknown = recovery(info), recovery(info, chi_squared=9.0), recovery(info, chi_squared=9.0, noise_is_known=False)
+    np.testing.assert_allclose(sj.combined([bad]).relative_errors(), 3 * np.asarray(good.relative_errors()), rtol=1e-6)
+    np.testing.assert_allclose(sj.combined([unknown]).relative_errors(), unknown.relative_errors(), rtol=1e-6)
+
+
+def test_what_does_not_belong_together_is_refused():
+    one = recovery(along(0.01, 0.02, 0.3))
+    other = eqx.tree_at(lambda r: r.medium.eta, one, one.medium.eta + 0.1)
+    with pytest.raises(ValueError, match="give one recovery at least"):
+        sj.combined([])
+    with pytest.raises(ValueError, match=r"recoveries\[1\].medium.eta is .* different materials"):
+        sj.combined([one, other])
