@@ -11,7 +11,7 @@ from splatjax.scene import Splats
 
 from ._bins import SIDE, TileGrid
 from ._kernel import fragment_weight
-from ._rasterizer import LEAST_WEIGHT, AbstractRasterizer, FragmentSums, SummedFragments
+from ._rasterizer import AbstractRasterizer, FragmentSums, SummedFragments, least_weight
 from ._settings import SplattingSettings
 from ._views import AbstractView
 
@@ -27,6 +27,8 @@ class DenseRasterizer(AbstractRasterizer):
     ) -> SummedFragments:
         dtype, rows, footprints = attributes.dtype, attributes.shape[0] + 2, view.footprints(splats, settings)
         columns = jnp.arange(view.width, dtype=dtype) + 0.5
+        conic = footprints.a, footprints.b, footprints.c, footprints.nearness
+        least = stop_gradient(least_weight(type(view), *conic, settings.filter_radius))
 
         def picture_row(y: Float[Array, ""]):
             dx, dy = columns[:, None] - footprints.x[None], (y - footprints.y)[None]
@@ -48,7 +50,7 @@ class DenseRasterizer(AbstractRasterizer):
             in_front = summed(front)
             open_pixel = stop_gradient(in_front[-1]) < settings.full_coverage
             rest = inside & ~front & open_pixel[:, None]
-            weighty = jnp.max(jnp.where(rest & (weight > LEAST_WEIGHT), shifted, -jnp.inf), axis=1)
+            weighty = jnp.max(jnp.where(rest & (weight > least[None]), shifted, -jnp.inf), axis=1)
             of_any = jnp.max(jnp.where(rest, shifted, -jnp.inf), axis=1)
             limit_behind = jnp.where(weighty > -jnp.inf, weighty, of_any)
             return in_front, summed(rest & (nearness > limit_behind[:, None]))

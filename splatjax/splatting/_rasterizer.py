@@ -16,6 +16,22 @@ from ._views import AbstractView
 LEAST_WEIGHT = 0.06  # of a fragment that says where the surface behind the front is
 
 
+def least_weight(
+    view: type[AbstractView],
+    a: Float[Array, "*splats"],
+    b: Float[Array, "*splats"],
+    c: Float[Array, "*splats"],
+    nearness: Float[Array, "*splats"],
+    filter_radius: float,
+) -> Float[Array, "*splats"]:
+    """Give `LEAST_WEIGHT`, and in proportion less for splats smaller than a pixel: the filter makes them that much fainter."""
+    # Disc and filter together have axes whose squares add up to r^2 (1 + cos^2) + 2 f^2.
+    determinant = (a * c - 0.25 * b * b) * view.squared_radius(nearness, jnp.ones_like(a))
+    axes = (a + c) / jnp.where(determinant > 0, determinant, 1.0)
+    # In float32 the determinant may vanish, for splats much larger than a pixel.
+    return LEAST_WEIGHT * jnp.where(determinant > 0, jnp.clip(axes - 2 * filter_radius**2, 0, 1), 1.0)
+
+
 class FragmentSums(eqx.Module):
     """Of the fragments of one surface, per pixel; 0 where there is none, and in what of a tile lies beyond the picture."""
 
@@ -49,8 +65,9 @@ class AbstractRasterizer(eqx.Module):
     r"""Passes 2 and 3. Fragments are weighted with `fragment_weight`, times the opacity of their footprint.
 
     The *front* of a pixel are the fragments within epsilon of the nearest one (3.1). *Behind* are, in pixels that the front
-    does not cover in full, the fragments within epsilon of the nearest one that is not in front and weighs at least 0.06: the
-    rims of splats that are seen nearly edge on do not hide the surface behind them. Where none does, the nearest one counts.
+    does not cover in full, the fragments within epsilon of the nearest one that is not in front and weighs at least 0.06
+    (less for splats smaller than a pixel, `least_weight`): the rims of splats that are seen nearly edge on do not hide the
+    surface behind them. Where none does, the nearest one counts.
     The choice of fragments is piecewise constant: it has no derivative.
     """
 

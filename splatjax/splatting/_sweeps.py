@@ -18,7 +18,7 @@ from splatjax.pointwise import zeros_after
 
 from ._bins import SIDE, Bins, TileGrid, scatter_slots, slot_plane
 from ._kernel import fast_fragment_weight, fragment_weight_derivative
-from ._rasterizer import LEAST_WEIGHT, FragmentSums
+from ._rasterizer import FragmentSums, least_weight
 from ._views import AbstractView
 
 PLANES = ("x", "y", "slope_x", "slope_y", "a", "b", "c", "nearness", "opacity")
@@ -69,6 +69,7 @@ class Sweep(eqx.Module):
     """The view's class: fragments need its formulas, not where it stands."""
     grid: TileGrid
     full_coverage: float = eqx.field(static=True)
+    filter_radius: float = eqx.field(static=True)
 
     def pixels(self, dtype) -> tuple[np.ndarray, np.ndarray]:
         """Pixel centers of a tile, from its corner. Constants: made by NumPy, or the compiler computes them per fragment."""
@@ -124,7 +125,8 @@ class Sweep(eqx.Module):
             beyond = lanes.until_end(jnp.full_like(front, -jnp.inf), block)
             squared_radius = self.squared_radii(nearness, quadric, beyond, front)
             weight = splats[-1][:, :, None] * fast_fragment_weight(squared_radius)
-            each = weight > LEAST_WEIGHT, squared_radius < 1
+            least = least_weight(self.view, *splats[4:8], self.filter_radius)
+            each = weight > least[:, :, None], squared_radius < 1
             found = (jnp.max(jnp.where(candidate, shifted, -jnp.inf), axis=1) for candidate in each)
             return tuple(jnp.maximum(limit, new) for limit, new in zip(limits, found, strict=True))
 

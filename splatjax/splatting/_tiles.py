@@ -102,7 +102,7 @@ class TileRasterizer(AbstractRasterizer):
         bins = bin_items(_ranges(footprints, grid), grid, self.capacity.bins)
         bins = eqx.tree_at(lambda b: b.needed, bins, jnp.maximum(bins.needed, seen / self.capacity.splats))
         planes = tuple(getattr(footprints, name) for name in PLANES)
-        sweep = Sweep(type(view), grid, settings.full_coverage)
+        sweep = Sweep(type(view), grid, settings.full_coverage, settings.filter_radius)
         return Binned(sweep, bins, stop_gradient(footprints.shift), planes, tuple(_taken(attributes, ids)))
 
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from splatjax.splatting import DenseRasterizer, SplattingSettings, TileRasterizer
+from splatjax.splatting import DenseRasterizer, OrthographicView, SplattingSettings, TileRasterizer
 
 SETTINGS = SplattingSettings()
 VIEWS = {"perspective": bodies.perspective, "orthographic": bodies.orthographic}
@@ -96,6 +96,43 @@ def test_an_inner_silhouette_leaves_no_gap(rasterizer):
     assert np.min((front + (1 - front) * behind)[inside]) > 1 - 1e-6
     assert np.all(np.asarray(surfaces.front.attributes[0])[edge] > 0.99)
     assert np.all(np.asarray(surfaces.behind.attributes[0])[edge] < 0.01)
+
+
+def limb(pixel: float, radius: float):
+    """Where a cylinder of 270 pixels in radius turns away before a sheet; splats with a radius in pixels."""
+    spacing = radius * pixel / 1.5
+    sideways = np.arange(-2.5 * pixel, 2.5 * pixel, spacing)
+
+    def strip(along):
+        return (each.ravel() for each in np.meshgrid(along, sideways))
+
+    z, y = strip(np.arange(-50 * pixel, 110 * pixel, spacing))
+    curved = np.stack([np.sqrt((270 * pixel) ** 2 - z * z), y, z], axis=1)
+    x, y = strip(np.arange(250 * pixel, 290 * pixel, spacing))
+    flat = np.stack([x, y, np.full_like(x, -160 * pixel)], axis=1)
+    normals = np.concatenate([curved * [1.0, 0.0, 1.0] / (270 * pixel), np.tile([0.0, 0.0, 1.0], (len(flat), 1))])
+    centers = np.concatenate([curved, flat]) - [268 * pixel, 0.0, 0.0]
+    return bodies.splats(centers, normals, np.full(len(centers), radius * pixel))
+
+
+@pytest.mark.once
+@pytest.mark.parametrize("radius", [1.0, 0.3])
+@pytest.mark.parametrize("rasterizer", ["plain", "tiles"])
+@pytest.mark.parametrize("kind", VIEWS)
+def test_an_edge_hides_nothing_behind_it_however_small_the_splats(kind, rasterizer, radius):
+    """Fragments of splats smaller than a pixel weigh less than those that the surface behind an edge is told by."""
+    width, height, pixel = 24, 4, 0.02
+    if kind == "perspective":
+        view = bodies.perspective(fov=2 * np.degrees(np.arctan(0.5 * height * pixel / DISTANCE)), width=width, height=height)
+    else:
+        facing = jnp.diag(jnp.asarray([1.0, -1.0, -1.0]))
+        view = OrthographicView(jnp.zeros(3), facing, jnp.asarray(1 / pixel), width, height)
+    body = limb(pixel, radius)
+    tiles = TileRasterizer(lanes=2, slots=16).planned(body, [view], SETTINGS)
+    surfaces = drawn(view, body, jnp.zeros((0, body.count)), DenseRasterizer() if rasterizer == "plain" else tiles)
+    front, behind = np.asarray(surfaces.front.coverage), np.asarray(surfaces.behind.coverage)
+    assert np.any(front < 1), "the edge lies between pixels"
+    assert np.min(front + (1 - front) * behind) > 1 - 1e-6
 
 
 def test_coverage_of_a_silhouette_is_differentiable(float64):
