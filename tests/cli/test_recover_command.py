@@ -90,7 +90,7 @@ def test_it_writes_a_material_and_a_report_and_says_what_is_not_fixed(files, sea
     assert main([str(word) for word in command]) == 0
     printed = capsys.readouterr().out
     assert "red: sigma_a 0.011 +- 1%, sigma_s' 0.74 +- 1% (1/mm)" in printed
-    assert "not fixed by these pictures: sigma_s', known to 1e+02%" in printed
+    assert "not fixed by these pictures: sigma_s', known to 100%" in printed
     assert printed.splitlines()[-2:] == [str(output), str(report)]
     with Image.open(report) as picture:
         assert min(picture.size) > 200
