@@ -4,8 +4,10 @@ import bodies
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from test_diffusers import atlas_of
 
+from splatjax.diffusion import _neighbors
 from splatjax.diffusion._neighbors import Boxes, Neighbors
 from splatjax.diffusion._order import BLOCK, compact_order
 from splatjax.diffusion._pixels import Pixels
@@ -27,8 +29,10 @@ def gaps(one, other):
     return np.sum(np.maximum(apart, 0) ** 2, axis=0)
 
 
-def test_neighbors_are_the_boxes_within_reach_each_once():
+@pytest.mark.parametrize("at_once", [1 << 20, 40])
+def test_neighbors_are_the_boxes_within_reach_each_once(at_once, monkeypatch):
     """More blocks of sources than are tested at one go, and more of points than lanes."""
+    monkeypatch.setattr(_neighbors, "_AT_ONCE", at_once)
     centers = np.random.default_rng(3).uniform(-6, 6, (BLOCK * 26, 3))
     centers = jnp.asarray(centers[compact_order(centers)].T, float)
     there = np.ones(centers.shape[1], bool)
