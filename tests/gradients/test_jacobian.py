@@ -49,6 +49,7 @@ def rendered(case: str):
     return start, beauty, plan, sj.picture_jacobian(start, camera, settings, plan)
 
 
+@pytest.mark.long
 def test_it_is_reverse_mode_row_by_row():
     """With every part that a material can have."""
     with jax.enable_x64(True):

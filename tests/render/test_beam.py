@@ -68,6 +68,7 @@ def test_every_layer_of_skin_and_marble_is_its_gaussian(variance):
 
 @pytest.mark.slow
 @pytest.mark.once
+@pytest.mark.long
 def test_the_sum_of_layers_is_the_profile():
     # wide enough that what the widest layer loses beyond the border does not come back in the normalization
     splats = sheet(0.05, 10.5)

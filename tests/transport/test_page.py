@@ -4,6 +4,7 @@ import importlib.util
 from pathlib import Path
 
 import jax
+import pytest
 
 ROOT = Path(__file__).parents[2]
 PHOTONS = 100_000
@@ -20,6 +21,7 @@ def cells(rows) -> list[list[str]]:
     return [[cell.strip() for cell in row.split("|")[1:-1]] for row in rows]
 
 
+@pytest.mark.long
 def test_the_table_is_what_the_tool_gives_today(float32):
     made = tool()
     page = made.PAGE.read_text(encoding="utf-8")
