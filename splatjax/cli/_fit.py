@@ -20,12 +20,12 @@ from ._models import Model, Reference, reference
 from ._outputs import OptionalPath, check_output
 from ._report import stage
 
-_KINDS = {".csv": "a measured profile", ".exr": "a photograph"}
-_COEFFICIENTS = "coefficients"
+_COEFFICIENTS, _PROFILE, _PHOTOGRAPH = "coefficients", "a measured profile", "a photograph"
+_KINDS = {".csv": _PROFILE, ".exr": _PHOTOGRAPH}
 _OPTIONS = {
     _COEFFICIENTS: ("model", "cut", "photons", "single_scattering"),
-    "a measured profile": ("mm_per_unit",),
-    "a photograph": ("mm_per_pixel", "power"),
+    _PROFILE: ("mm_per_unit",),
+    _PHOTOGRAPH: ("mm_per_pixel", "power"),
 }
 """What each kind of input alone has use for."""
 
