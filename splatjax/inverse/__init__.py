@@ -2,7 +2,8 @@
 
 from ._background import AbstractBackground as AbstractBackground, BlackBackground as BlackBackground
 from ._background import UnknownBackground as UnknownBackground
-from ._fit_scene import fit_scene as fit_scene, GradientTransformation as GradientTransformation
+from ._descent import GradientTransformation as GradientTransformation
+from ._fit_scene import fit_scene as fit_scene
 from ._fitted_scene import FittedScene as FittedScene
 from ._flat import wide_variances as wide_variances
 from ._intensity import AbstractIntensity as AbstractIntensity, KnownIntensity as KnownIntensity

@@ -1,35 +1,25 @@
 """From pictures to what a body looks like and how they were taken: first-order, along the gradient of the renderer."""
 
-from collections.abc import Callable, Generator, Sequence
-from contextlib import contextmanager
-from typing import Any, Protocol, runtime_checkable
+from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array, Bool, Float, PyTree
 
-from splatjax.render import Plan, RenderSettings, render
+from splatjax.render import Plan, RenderSettings
 from splatjax.scene import Material, Scene, Splats
 
 from ._background import AbstractBackground, UnknownBackground
+from ._descent import Coordinates, GradientTransformation, Told, World, advance, pictures_of, tell, usual_promotion
 from ._evidence import Evidence
 from ._fitted_scene import FittedScene
 from ._intensity import KnownIntensity
 from ._losses import AbstractLoss, SquaredLoss
 from ._observation import Observation
-from ._parts import AbstractBodyPart, AbstractPart, AbstractShotPart, Shot
+from ._parts import AbstractPart, Shot
 from ._plans import plans_of
-
-
-@runtime_checkable
-class GradientTransformation(Protocol):
-    """What optax calls so: a pair of functions."""
-
-    init: Callable[..., Any]
-    update: Callable[..., Any]
 
 
 def fit_scene(
@@ -88,22 +78,22 @@ def fit_scene(
     say = progress or _nobody
     dtype = splats.centers.dtype
     shots = [_cast(Shot(each.camera, each.lights), dtype) for each in observations]
-    world = _World.of(_cast(splats, dtype), _cast(material, dtype), parts)
-    seen = _seen(Evidence(observations, dtype))
-    x = _Coordinates(world.coordinates(), tuple(world.shot_coordinates(shot) for shot in shots))
+    world = World.of(_cast(splats, dtype), _cast(material, dtype), parts)
+    seen = pictures_of(Evidence(observations, dtype))
+    x = Coordinates(world.coordinates(), tuple(world.shot_coordinates(shot) for shot in shots))
 
-    def planned(x: _Coordinates) -> list[Plan]:
+    def planned(x: Coordinates) -> list[Plan]:
         moved = [world.shot_at(shot, its) for shot, its in zip(shots, x.shots, strict=True)]
         body = world.splats_at(x.body)
         return plans_of([Scene(body, each.lights, world.material) for each in moved], [each.camera for each in moved], settings)
 
-    def told(x: _Coordinates, plans: list[Plan]) -> list["_Told"]:
+    def told(x: Coordinates, plans: list[Plan]) -> list[Told]:
         together = zip(x.shots, shots, seen, plans, strict=True)
-        return [_tell(x.body, its, world, shot, one, plan, settings, loss, background) for its, shot, one, plan in together]
+        return [tell(x.body, its, world, shot, one, plan, settings, loss, background) for its, shot, one, plan in together]
 
     say("planning", float("nan"))
     plans, times = planned(x), 1
-    with _usual_promotion():
+    with usual_promotion():
         state = optimizer.init(x)
     best, at, losses, result = None, x, [], optx.RESULTS.successful
     for step in range(steps + 1):
@@ -114,7 +104,7 @@ def fit_scene(
             pictures = told(x, plans)
         if step == 0:
             _check_counted(pictures)
-        ahead, state, value, finite = _advance(x, state, [each.value for each in pictures], world, optimizer)
+        ahead, state, value, finite = advance(x, state, [each.value for each in pictures], world, optimizer)
         losses.append(float(value))
         if not bool(finite):
             result = optx.RESULTS.nonfinite
@@ -142,122 +132,6 @@ def fit_scene(
         plans=times,
     )
     return fitted.result.error_if(fitted, True) if throw and result != optx.RESULTS.successful else fitted
-
-
-class _Coordinates(eqx.Module):
-    """Of every part of the body, and of every part of each picture."""
-
-    body: tuple[PyTree[Array], ...]
-    shots: tuple[tuple[PyTree[Array], ...], ...]
-
-
-class _World(eqx.Module):
-    """The start, and what of it may move."""
-
-    splats: Splats
-    material: Material
-    middle: Float[Array, "3"]
-    body: tuple[AbstractBodyPart, ...]
-    prepared: tuple[PyTree[Array], ...]
-    shot: tuple[AbstractShotPart, ...]
-
-    @classmethod
-    def of(cls, splats: Splats, material: Material, parts: Sequence[AbstractPart]) -> "_World":
-        body = tuple(part for part in parts if isinstance(part, AbstractBodyPart))
-        shot = tuple(part for part in parts if isinstance(part, AbstractShotPart))
-        for part in body:
-            part.check(splats)
-        return cls(splats, material, jnp.mean(splats.centers, axis=0), body, tuple(each.prepared(splats) for each in body), shot)
-
-    def coordinates(self) -> tuple[PyTree[Array], ...]:
-        return tuple(part.coordinates(self.splats) for part in self.body)
-
-    def shot_coordinates(self, shot: Shot) -> tuple[PyTree[Array], ...]:
-        return tuple(part.coordinates(shot) for part in self.shot)
-
-    def splats_at(self, x: tuple[PyTree[Array], ...]) -> Splats:
-        splats = self.splats
-        for part, its, prepared in zip(self.body, x, self.prepared, strict=True):
-            splats = part.moved(splats, its, prepared)
-        return splats
-
-    def shot_at(self, shot: Shot, x: tuple[PyTree[Array], ...]) -> Shot:
-        for part, its in zip(self.shot, x, strict=True):
-            shot = part.moved(shot, its, self.middle)
-        return shot
-
-    def unlikely(self, x: _Coordinates) -> Float[Array, ""]:
-        priors = [part.unlikely(its, own) for part, its, own in zip(self.body, x.body, self.prepared, strict=True)]
-        return sum(priors, jnp.zeros((), self.splats.centers.dtype))
-
-
-class _Seen(eqx.Module):
-    """A picture as arrays: 0 where it is not known, and which pixels may count."""
-
-    picture: Float[Array, "height width channels"]
-    deviation: Float[Array, "height width channels"]
-    known: Bool[Array, "height width"]
-
-
-class _Told(eqx.Module):
-    """What a picture tells: its loss, and the gradient in the coordinates of the body and in its own."""
-
-    value: tuple
-    overflow: Float[Array, ""]
-    beauty: Float[Array, "height width channels"]
-    counted: Float[Array, "height width"]
-
-
-@eqx.filter_jit
-def _tell(body, own, world: _World, shot: Shot, seen: _Seen, plan: Plan, settings, loss, background) -> _Told:
-    """Render a picture, and differentiate its loss."""
-
-    def lost(x):
-        body, own = x
-        taken = world.shot_at(shot, own)
-        frame = render(Scene(world.splats_at(body), taken.lights, world.material), taken.camera, settings, plan)
-        counted = jnp.where(seen.known, background.counts(frame.coverage), 0.0)
-        counts = (counted > 0)[..., None]
-        residuals = jnp.where(counts, (frame.beauty - seen.picture) / seen.deviation, 0.0)
-        return jnp.sum(loss.root(residuals) ** 2), (counted, frame)
-
-    (value, (counted, frame)), gradient = jax.value_and_grad(lost, has_aux=True)((body, own))
-    values = jnp.sum(counted) * frame.beauty.shape[2]
-    return _Told((value, values, *gradient), frame.overflow, frame.beauty, counted)
-
-
-@eqx.filter_jit
-def _advance(x: _Coordinates, state, told, world: _World, optimizer: GradientTransformation):
-    """Take a step; also give the loss before it, and whether all of it is finite."""
-    values, counts, body, own = zip(*told, strict=True)
-    unlikely, prior = jax.value_and_grad(world.unlikely)(x)
-    count = jnp.maximum(jnp.sum(jnp.stack(counts)), 1.0)
-    summed = jax.tree.map(lambda *each: sum(each[1:], each[0]), prior.body, *body)
-    gradient = jax.tree.map(lambda leaf: leaf / count, _Coordinates(summed, own))
-    value = (jnp.sum(jnp.stack(values)) + unlikely) / count
-    finite = jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in (value, *jax.tree.leaves(gradient))])
-    with _usual_promotion():
-        updates, state = optimizer.update(gradient, state, x)
-    return jax.tree.map(lambda leaf, by: leaf + by, x, updates), state, value, jnp.all(finite)
-
-
-@contextmanager
-def _usual_promotion() -> Generator[None]:
-    """Optimizers are written for JAX's usual rules, whatever the user's are."""
-    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
-        yield
-
-
-def _seen(evidence: Evidence) -> list[_Seen]:
-    together = zip(evidence.pictures, evidence.deviations, evidence.masks, strict=True)
-    return [
-        _Seen(
-            jnp.asarray(np.where(known[..., None], picture, 0.0), evidence.dtype),
-            jnp.asarray(deviation, evidence.dtype),
-            jnp.asarray(known),
-        )
-        for picture, deviation, known in together
-    ]
 
 
 def _shown(beauty, counted, picture) -> tuple[np.ndarray, np.ndarray]:
@@ -289,7 +163,7 @@ def _check(observations: list[Observation], splats: Splats, material: Material, 
             )
 
 
-def _check_counted(pictures: list[_Told]) -> None:
+def _check_counted(pictures: list[Told]) -> None:
     for i, each in enumerate(pictures):
         if not np.any(np.asarray(each.counted) > 0):
             raise ValueError(

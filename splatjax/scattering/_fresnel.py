@@ -1,4 +1,4 @@
-"""Diffuse moments of the Fresnel reflectance met from inside, and what diffusion makes of them."""
+"""The Fresnel reflectance, its diffuse moments met from inside, and what diffusion makes of them."""
 
 import abc
 import functools
@@ -86,6 +86,15 @@ class EganFresnel(AbstractFresnel):
         above = above + eta * _polynomial(eta, (1213.67, -568.556, 164.798, -27.0181, 1.91826))
         below = _polynomial(eta, (0.828421, -2.62051, 3.36231, -1.95284, 0.236494, 0.145787))
         return jnp.where(eta == 1, jnp.zeros_like(eta), jnp.where(eta < 1, below, above))
+
+
+def reflectance(
+    inside: Float[Array, "*shape"], outside: Float[Array, "*shape"], eta: Float[Array, "*shape"]
+) -> Float[Array, "*shape"]:
+    """Give the reflectance for unpolarized light from its cosines on either side of a smooth interface, from either side."""
+    across = (eta * inside - outside) / (eta * inside + outside)
+    along = (inside - eta * outside) / (inside + eta * outside)
+    return 0.5 * (across * across + along * along)
 
 
 def _polynomial(x: Float[Array, " channels"], coefficients: tuple[float, ...]) -> Float[Array, " channels"]:

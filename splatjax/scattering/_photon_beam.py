@@ -13,7 +13,7 @@ from splatjax.pointwise import one_program
 from ._better_dipole import exitance_of_source
 from ._fresnel import AbstractFresnel, ExactFresnel
 from ._medium import Medium
-from ._quadrature import integrated_reflectance
+from ._quadrature import along_first_axis, integrated_reflectance
 from ._single_scattering import SingleScattering
 
 _NODES = 128
@@ -58,7 +58,7 @@ class PhotonBeam(AbstractProfile):
         medium = self.medium
         shape = (_NODES, *r.shape, *medium.sigma_a.shape)
         optical_depths, shares = _beam()
-        depth, share = (_over(each, shape, r.dtype) for each in (optical_depths, shares))
+        depth, share = (along_first_axis(each, shape, r.dtype) for each in (optical_depths, shares))
         sigma_t_prime = jnp.broadcast_to(medium.sigma_t_prime, shape)
         depth = depth / sigma_t_prime
         squared_radius = jnp.broadcast_to((r * r)[None, ..., None], shape)
@@ -97,11 +97,6 @@ class _Multiple(AbstractProfile):
 
     def length_scale(self):
         return self.beam.length_scale()
-
-
-def _over(values: np.ndarray, shape: tuple[int, ...], dtype) -> Float[Array, "..."]:
-    """Lay constants along the first axis."""
-    return jnp.broadcast_to(jnp.asarray(values, dtype).reshape(-1, *[1] * (len(shape) - 1)), shape)
 
 
 @functools.cache

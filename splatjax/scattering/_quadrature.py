@@ -166,3 +166,8 @@ def integrated_reflectance(profile: AbstractProfile, rule: RadialRule = TOTAL_RU
     """
     r, dr = rule.radii(profile)
     return 2 * jnp.pi * jnp.sum(dr * r * at_own_radii(profile, r), axis=0)
+
+
+def along_first_axis(values: np.ndarray, shape: tuple[int, ...], dtype) -> Float[Array, "..."]:
+    """Lay constants along the first axis of a shape."""
+    return jnp.broadcast_to(jnp.asarray(values, dtype).reshape(-1, *[1] * (len(shape) - 1)), shape)

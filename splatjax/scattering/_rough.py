@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 from splatjax.pointwise import one_program
 
-from ._fresnel import AbstractFresnel, ExactFresnel
+from ._fresnel import AbstractFresnel, ExactFresnel, reflectance
 from ._medium import check_range
 
 _COSINES, _SLOPES, _STEEPEST = 24, 64, 4.0
@@ -75,9 +75,7 @@ def _internal_reflectance(
     squared = 1 - eta * eta * (1 - cosine * cosine)
     leaves = squared > 0
     outside = jnp.sqrt(jnp.where(leaves, squared, jnp.ones_like(squared)))
-    across = (eta * cosine - outside) / (eta * cosine + outside)
-    along = (cosine - eta * outside) / (cosine + eta * outside)
-    return jnp.where(leaves, 0.5 * (across * across + along * along), jnp.ones_like(squared))
+    return jnp.where(leaves, reflectance(cosine, outside, eta), jnp.ones_like(squared))
 
 
 def _cosines(eta: Float[Array, " channels"]) -> tuple[Float[Array, "cosines channels"], Float[Array, "cosines channels"]]:
@@ -100,7 +98,7 @@ def _unit_nodes(count: int) -> tuple[np.ndarray, np.ndarray]:
 
 @functools.cache
 def _slopes(cosines: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Give slopes of unit roughness along and across, and their weights: [cosines, slopes].
+    """Give slopes of unit roughness along and across, and their weights up to a factor: [cosines, slopes].
 
     Equally spaced, which for a Gaussian is exact from whatever offset; each cosine has its own, so that what the critical angle
     does to single sums averages out.
@@ -110,5 +108,4 @@ def _slopes(cosines: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     lines = step * (np.arange(_SLOPES) + offsets[..., None]) - _STEEPEST
     p = np.repeat(lines[:, 0], _SLOPES, axis=1)
     q = np.tile(lines[:, 1], (1, _SLOPES))
-    weights = np.exp(-p * p - q * q)
-    return p, q, weights / weights.sum(axis=1, keepdims=True)
+    return p, q, np.exp(-p * p - q * q)

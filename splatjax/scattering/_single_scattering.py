@@ -10,9 +10,9 @@ from jaxtyping import Array, Float
 from splatjax.gaussians import AbstractProfile
 from splatjax.pointwise import one_program
 
-from ._fresnel import moment_outside
+from ._fresnel import moment_outside, reflectance
 from ._medium import Medium
-from ._quadrature import unit_interval
+from ._quadrature import along_first_axis, unit_interval
 
 _LEAST_COSINE = 1e-4
 _COSINES = 10
@@ -85,9 +85,7 @@ class SingleScattering(AbstractProfile):
         eta, scattered = (jnp.broadcast_to(each, shape) for each in (eta, self.strength * self.medium.albedo_prime))
         mu_i, mu_o = (jnp.broadcast_to(jnp.maximum(mu, _LEAST_COSINE)[..., None], shape) for mu in (mu_i, mu_o))
         inside_i, inside_o = (jnp.sqrt(jnp.maximum(mu * mu + (eta * eta - 1), _LEAST_COSINE**2)) / eta for mu in (mu_i, mu_o))
-        across = (mu_o - eta * inside_o) / (mu_o + eta * inside_o)
-        along = (inside_o - eta * mu_o) / (inside_o + eta * mu_o)
-        transmitted = 1 - 0.5 * (across * across + along * along)
+        transmitted = 1 - reflectance(inside_o, mu_o, eta)
         return scattered * transmitted / (4 * jnp.pi * eta * eta * (inside_i + inside_o))
 
     @one_program
@@ -107,22 +105,15 @@ class SingleScattering(AbstractProfile):
         The angle is measured on the rarer side, where it takes all values: `sin(theta) = min(1, 1 / eta) sin(psi)`.
         """
         eta = self.medium.eta
-        x, beyond, weights = (_over(each, (len(each), *eta.shape), eta.dtype) for each in unit_interval())
+        x, beyond, weights = (along_first_axis(each, (len(each), *eta.shape), eta.dtype) for each in unit_interval())
         sine, cosine = jnp.sin(0.5 * jnp.pi * x), jnp.sin(0.5 * jnp.pi * beyond)
         eta = jnp.broadcast_to(eta, x.shape)
         inside, outside = jnp.where(eta < 1, 1.0, 1 / eta), jnp.where(eta < 1, eta, 1.0)
         cos_in, cos_out = (jnp.sqrt(cosine**2 + (1 - scale**2) * sine**2) for scale in (inside, outside))
-        across = (eta * cos_in - cos_out) / (eta * cos_in + cos_out)
-        along = (cos_in - eta * cos_out) / (cos_in + eta * cos_out)
-        reflected, weights = 0.5 * (across**2 + along**2), 0.5 * jnp.pi * weights * cosine
+        reflected, weights = reflectance(cos_in, cos_out, eta), 0.5 * jnp.pi * weights * cosine
         # As eta goes to 1, all that is reflected is so at grazing angles, which get infinitely few nodes: the quadrature keeps
         # its value and loses its derivative. One more node, at the grazing angle, adds what the closed form has.
         missed = jnp.sum(weights * reflected * sine, axis=0) - 0.5 * moment_outside(self.medium.eta)
         grazing = stop_gradient(inside[0] / (1 + jnp.sqrt(1 - inside[0] ** 2)))
         half_angle = jnp.concatenate([inside * sine / (1 + cos_in), grazing[None]])
         return half_angle, jnp.concatenate([weights * (1 - reflected) * inside, (inside[0] * missed)[None]])
-
-
-def _over(values: np.ndarray, shape: tuple[int, ...], dtype) -> Float[Array, "..."]:
-    """Lay constants along the first axis."""
-    return jnp.broadcast_to(jnp.asarray(values, dtype).reshape(-1, *[1] * (len(shape) - 1)), shape)

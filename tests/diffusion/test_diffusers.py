@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from splatjax.diffusion import ClusterDiffuser, DenseDiffuser, Kernels, Sources
+from splatjax.diffusion._gathering import MeansAndExits
 from splatjax.splatting import DenseRasterizer, SplattingSettings
 
 COUNT, SIZE = 3000, 64
@@ -183,6 +184,13 @@ def test_far_from_every_source_gradients_are_finite(x64):
 
     gradient = jax.jit(jax.grad(total))(Kernels(narrow, DEPTH * jnp.sqrt(narrow)))
     assert all(np.all(np.isfinite(np.asarray(leaf))) for leaf in jax.tree.leaves(gradient))
+
+
+def test_where_nothing_gathers_there_is_neither_a_mean_nor_an_exit(dtype):
+    sums = jnp.asarray([[1.0, 0.0], [2.0, 0.0], [4.0, 0.0], [7.0, 9.0]], dtype)  # of two channels, and one row more
+    values, rest = MeansAndExits(channels=2, moments=False).split(sums, jnp.zeros((3, 2), dtype))
+    np.testing.assert_array_equal(values, [[0.25, 0.0], [0.5, 0.0], [4.0, 0.0]])
+    np.testing.assert_array_equal(rest, [[7.0, 9.0]])
 
 
 def test_outside_its_plan_the_diffuser_says_so(float64, x64):

@@ -12,7 +12,7 @@ import pytest
 
 import splatjax as sj
 from splatjax.diffusion import DenseDiffuser
-from splatjax.inverse import _fit_scene
+from splatjax.inverse import _descent, _fit_scene
 from splatjax.inverse._evidence import Evidence
 from splatjax.inverse._parts import Shot, rotation
 from splatjax.splatting import DenseRasterizer, ShadowSettings
@@ -55,15 +55,15 @@ def with_albedo(splats: sj.Splats, albedo) -> sj.Splats:
     return eqx.tree_at(lambda s: s.albedo, splats, jnp.asarray(albedo), is_leaf=lambda leaf: leaf is None)
 
 
-def tell(splats: sj.Splats, light: sj.DirectionalLight, picture=None, x=None) -> _fit_scene._Told:
+def tell(splats: sj.Splats, light: sj.DirectionalLight, picture=None, x=None) -> _descent.Told:
     """What a picture tells: the program that all fits of this file run."""
-    world = _fit_scene._World.of(splats, material(), PARTS)
+    world = _descent.World.of(splats, material(), PARTS)
     shot = Shot(camera(), (light,))
     picture = np.zeros((SIZE, SIZE, 2)) if picture is None else picture
-    (seen,) = _fit_scene._seen(Evidence([sj.Observation(picture, shot.camera, shot.lights)], jnp.zeros(()).dtype))
+    (seen,) = _descent.pictures_of(Evidence([sj.Observation(picture, shot.camera, shot.lights)], jnp.zeros(()).dtype))
     plan = sj.plan(sj.Scene(splats, shot.lights, material()), shot.camera, PLAIN)
     x = (world.coordinates(), world.shot_coordinates(shot)) if x is None else x
-    return _fit_scene._tell(*x, world, shot, seen, plan, PLAIN, sj.SquaredLoss(), sj.BlackBackground())
+    return _descent.tell(*x, world, shot, seen, plan, PLAIN, sj.SquaredLoss(), sj.BlackBackground())
 
 
 def observations(shots=None, x=None, **more) -> list[sj.Observation]:
@@ -228,7 +228,7 @@ def stand_in(monkeypatch, reach: float, spoiled: float = np.inf) -> list[float]:
         return Frame(value * jnp.ones((*full.shape, 2)), full, jax.lax.stop_gradient(over))
 
     monkeypatch.setattr(_fit_scene, "plans_of", plans_of)
-    monkeypatch.setattr(_fit_scene, "render", render)
+    monkeypatch.setattr(_descent, "render", render)
     return made
 
 

@@ -45,6 +45,11 @@ def test_it_is_the_picture_of_any_weights():
         found = gathered.beauty(gaussians_of(weights))
         np.testing.assert_allclose(found, frame.beauty, rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(gathered.coverage, frame.coverage, rtol=1e-4, atol=1e-5)
+    # The narrowest layer is handed to the surface everywhere, the widest nowhere.
+    narrow, middle, wide = np.asarray(gathered.light.resolved())
+    assert narrow < 1e-3 < middle
+    assert middle <= wide
+    np.testing.assert_allclose(wide, 1, rtol=1e-3)
 
 
 def test_its_derivative_is_that_of_the_picture():

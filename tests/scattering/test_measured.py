@@ -133,6 +133,16 @@ def test_rings_end_at_the_nearest_edge(center):
     np.testing.assert_allclose(dot.profile.values, truth()(dot.profile.radii), rtol=0.02, atol=1e-4)
 
 
+def test_a_ring_is_where_its_pixels_are_on_average(float64):
+    """What falls as the square of the distance from the center is found at every radius as it is, however wide the rings."""
+    x0, y0 = center = 17.3, 20.6
+    y, x = np.mgrid[:40, :40] + 0.5
+    squared = MM_PER_PIXEL**2 * ((x - x0) ** 2 + (y - y0) ** 2)
+    for step in (1.0, 2.5):
+        dot = measure_laser_dot(9 - squared[..., None], MM_PER_PIXEL, power=np.pi, center=center, step=step)
+        np.testing.assert_allclose(dot.profile.values[:, 0], 9 - dot.profile.radii**2, rtol=1e-12)
+
+
 def test_saturated_rings_are_left_out(float64):
     image = photograph()
     limit = 0.5 * image.max()

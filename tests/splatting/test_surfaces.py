@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from splatjax.splatting import DenseRasterizer, OrthographicView, SplattingSettings, TileRasterizer
+from splatjax.splatting._sweeps import second_limits
 
 SETTINGS = SplattingSettings()
 VIEWS = {"perspective": bodies.perspective, "orthographic": bodies.orthographic}
@@ -151,3 +152,9 @@ def test_coverage_of_a_silhouette_is_differentiable(float64):
     steps = step * jnp.eye(3)
     differences = [float(covered(shift + d) - covered(shift - d)) / (2 * step) for d in steps]
     np.testing.assert_allclose(gradient, differences, rtol=1e-5)
+
+
+def test_what_lies_behind_ends_where_something_weighs_or_else_where_anything_is(dtype):
+    nothing = -jnp.inf
+    weighty, of_any = jnp.asarray([[-5.0, nothing, nothing]], dtype), jnp.asarray([[-2.0, -3.0, nothing]], dtype)
+    np.testing.assert_array_equal(second_limits(weighty, of_any), [[-5.0, -3.0, jnp.inf]])
