@@ -79,7 +79,8 @@ def test_values_and_gradients_are_those_of_plain_sums(float64, kernel, finish):
         np.testing.assert_allclose(found, expected, atol=1e-12)
         for a, b in zip(push(cotangent), pull(cotangent), strict=True):
             np.testing.assert_allclose(a, b, atol=1e-11 * float(jnp.max(jnp.abs(b))))
-        moved = [jnp.asarray(np.random.default_rng(7).normal(size=each.shape)) for each in (centers, rates, rows)]
+        rng = np.random.default_rng(7)
+        moved = [jnp.asarray(rng.normal(size=each.shape)) for each in (centers, rates, rows)]
         _, slope = jax.jvp(lambda *rest: ours(padded, *rest, sums=gaussian_sums_forward), (centers, rates, rows), tuple(moved))
         _, expected = jax.jvp(lambda *rest: theirs(points, *rest), (centers, rates, rows), tuple(moved))
         np.testing.assert_allclose(slope, expected, atol=1e-11 * float(jnp.max(jnp.abs(expected))))

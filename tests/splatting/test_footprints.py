@@ -155,3 +155,17 @@ def test_splats_beside_the_eye_do_not_veil_the_picture(dtype):
     x, y = (jnp.asarray(np.tile(each.reshape(1, -1), (24, 1)), dtype) for each in np.mgrid[0.5:64:4, 0.5:64:4])
     inside, _, _ = fragments(footprints, view, x, y)
     assert not bool(jnp.any(inside & footprints.visible[:, None]))
+
+
+def test_the_filter_is_the_narrowest_that_keeps_power_to_four_percent():
+    """What a splat far below a pixel weighs depends on where between the pixels it lies, the more the narrower the filter."""
+    view = bodies.orthographic(width=24, height=24)
+    places = np.linspace(0, 1, 16, endpoint=False) / float(view.pixels_per_mm(jnp.asarray(40.0)))
+    across, toward = np.asarray(view.rotation, float)[:2], np.asarray(view.rotation, float)[2]
+    centers = np.stack([each.ravel() for each in np.meshgrid(places, places)], axis=1) @ across
+    body = bodies.splats(centers, np.tile(-toward, (256, 1)), np.full(256, 1e-3))
+    x, y = (jnp.asarray(np.tile(each.reshape(1, -1), (256, 1)), float) for each in np.mgrid[0.5:24, 0.5:24])
+    footprints = jax.jit(lambda s: view.footprints(s, SplattingSettings()))(body)
+    inside, squared_radius, _ = jax.jit(lambda f: fragments(f, view, x, y))(footprints)
+    weights = np.sum(np.where(inside, fragment_weight(jnp.where(inside, squared_radius, 1.0)), 0.0), axis=1)
+    assert 0.5 * POWER_ERROR < np.ptp(weights) / np.mean(weights) < POWER_ERROR
