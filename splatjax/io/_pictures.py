@@ -46,6 +46,7 @@ def _read(path: str | os.PathLike[str], mode: str, encoded: bytes | None = None)
                 width, height = picture.size
                 size = f"a picture of {width} x {height} pixels"
                 check_room(f"{path}: {size}", _BYTES_PER_PIXEL * width * height, "give a smaller one")
+                _check_whole(picture)
                 if not _of_16_bits(picture):
                     return _values(picture, mode)
                 with opened() as again:
@@ -55,6 +56,20 @@ def _read(path: str | os.PathLike[str], mode: str, encoded: bytes | None = None)
         raise error if str(error).startswith(f"{path}: ") else _unreadable(path, error) from None
     except Exception as error:  # each decoder of Pillow fails in its own way
         raise _unreadable(path, error) from None
+
+
+def _check_whole(picture: ImageFile.ImageFile) -> None:
+    """Refuse a TIFF whose strips end before it does: Pillow would leave the rest at 0."""
+    if picture.format != "TIFF":
+        return
+    width, height = picture.size
+    held: dict[str, int] = {}  # by raw mode: each channel may have strips of its own
+    for tile in picture.tile:
+        left, top, right, bottom = tile.extents or (0, 0, width, height)
+        held[_raw_mode(tile.args)] = held.get(_raw_mode(tile.args), 0) + (right - left) * (bottom - top)
+    least = min(held.values(), default=0)
+    if least < width * height:
+        raise ValueError(f"it holds {least} of {width} x {height} pixels")
 
 
 def _unreadable(path: Path, error: Exception) -> ValueError:

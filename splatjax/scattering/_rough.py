@@ -82,7 +82,7 @@ def _cosines(eta: Float[Array, " channels"]) -> tuple[Float[Array, "cosines chan
     """Give nodes and weights over the cosine inside, on either side of the critical angle, beyond which it is as a root."""
     t, dt = (jnp.asarray(each, eta.dtype)[:, None] for each in _unit_nodes(_COSINES))
     denser = eta > 1
-    critical = jnp.sqrt(jnp.where(denser, 1 - 1 / jnp.where(denser, eta * eta, 2), 0.0))
+    critical = jnp.where(denser, jnp.sqrt(1 - 1 / jnp.where(denser, eta * eta, 2)), 0.0)
     shape = (_COSINES, len(eta))
     t, dt, critical = (jnp.broadcast_to(each, shape) for each in (t, dt, critical))
     # Below as well: what a rough interface lets through begins as a root there.

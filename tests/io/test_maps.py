@@ -121,3 +121,20 @@ def test_an_unknown_sampler_is_refused(tmp_path):
     file.save_binary(str(tmp_path / "a.glb"))
     with pytest.raises(ValueError, match="wrapped by 5 and"):
         read_mesh(tmp_path / "a.glb", mm_per_unit=1.0)
+
+
+@pytest.mark.parametrize("compression", ["raw", "tiff_lzw", "packbits", "tiff_adobe_deflate"])
+@pytest.mark.parametrize("mode", ["RGB", "RGBA", "L", "I;16"])
+def test_a_tiff_that_ends_before_it_says_is_refused(tmp_path, mode, compression):
+    depth, channels = (np.uint16, 1) if mode == "I;16" else (np.uint8, len(mode))
+    values = np.random.default_rng(0).integers(1, np.iinfo(depth).max, (6, 4, channels)).astype(depth)
+    Image.fromarray(values.squeeze()).save(tmp_path / "whole.tiff", compression=compression)
+    found = read_factor(tmp_path / "whole.tiff")
+    assert np.all(found > 0)
+    assert found.shape == (6, 4)
+    height = struct.pack("<HHII", 257, 4 if compression == "raw" else 3, 1, 6)
+    data = (tmp_path / "whole.tiff").read_bytes()
+    assert data.count(height) == 1
+    (tmp_path / "more.tiff").write_bytes(data.replace(height, height[:-4] + struct.pack("<I", 6000)))
+    with pytest.raises(ValueError, match=r"more\.tiff: cannot be read as a picture \(.*\); give a whole"):
+        read_factor(tmp_path / "more.tiff")

@@ -67,6 +67,15 @@ def test_derivatives_in_roughness_and_index(float64):
     check_grads(jax.jit(moments), (jnp.asarray(0.37), jnp.asarray([1.33, 1.5])), order=1, rtol=2e-3, eps=1e-7)
 
 
+def test_into_rarer_media_and_matched_ones_derivatives_are_finite_in_either_mode(float64):
+    fresnel, etas = RoughFresnel(0.4), jnp.asarray([0.7, 1.0, 1.4])
+    for moment in ("first_moment", "second_moment"):
+        forward, reverse = (np.diag(jax.jit(way(getattr(fresnel, moment)))(etas)) for way in (jax.jacfwd, jax.jacrev))
+        np.testing.assert_allclose(forward, reverse, rtol=1e-9, atol=1e-9)
+        matched = jax.jacrev(getattr(ExactFresnel(), moment))(etas)[1, 1]
+        np.testing.assert_allclose(forward[1], matched, rtol=1e-5, atol=1e-9)
+
+
 def test_a_rough_surface_changes_the_top_of_layers_alone(float64):
     medium = Medium(jnp.asarray([0.02]), jnp.asarray([2.0]), jnp.asarray([1.4]))
     layer, rough = Layer(medium, jnp.asarray(2.0)), RoughFresnel(0.5)
