@@ -17,6 +17,7 @@ from splatjax.render import light_on_splats
 from splatjax.splatting import DenseRasterizer, ShadowSettings
 
 SETTINGS = sj.RenderSettings(shadows=ShadowSettings(resolution=32))
+PLACE = np.asarray([40.0, -25.0, 15.0])  # mm; where the balls stand, away from the origin of all coordinates
 
 
 def scene(count: int = 1501) -> sj.Scene:
@@ -25,17 +26,18 @@ def scene(count: int = 1501) -> sj.Scene:
     before = eqx.tree_at(lambda ball: ball.centers, before, before.centers + jnp.asarray([[-8.0, 6.0, 30.0]], float))
     splats = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), behind, before)
     shade = 0.6 + 0.3 * jnp.sin(splats.centers / 5)
+    splats = eqx.tree_at(lambda each: each.centers, splats, splats.centers + jnp.asarray(PLACE[None], float))
     splats = eqx.tree_at(lambda each: each.albedo, splats, shade, is_leaf=lambda leaf: leaf is None)
     weights = jnp.asarray([[0.2, 0.1, 0.1], [0.3, 0.3, 0.2], [0.3, 0.2, 0.1]], float)
     material = sj.Material(sj.SumOfGaussians(jnp.asarray([0.1, 16.0, 100.0], float), weights))
     sun = sj.DirectionalLight(jnp.asarray([0.4, -0.5, -1.0], float), jnp.ones(3))
-    lamp = sj.PointLight(jnp.asarray([-60.0, 10.0, 20.0], float), 2000 * jnp.ones(3), cast_shadows=False)
+    lamp = sj.PointLight(jnp.asarray(PLACE + np.asarray([-60.0, 10.0, 20.0]), float), 2000 * jnp.ones(3), cast_shadows=False)
     return sj.Scene(splats, (sun, lamp), material)
 
 
 def camera(angle: float = 0.0) -> sj.Camera:
-    eye = jnp.asarray([80 * np.sin(angle), 6.0, 80 * np.cos(angle)], float)
-    return sj.Camera.look_at(eye, jnp.zeros(3), fov=34.0, width=44, height=40)
+    eye = jnp.asarray(PLACE + np.asarray([80 * np.sin(angle), 6.0, 80 * np.cos(angle)]), float)
+    return sj.Camera.look_at(eye, jnp.asarray(PLACE, float), fov=34.0, width=44, height=40)
 
 
 @eqx.filter_jit
