@@ -113,7 +113,7 @@ def test_plain_integral_is_the_formula(x64):
         np.testing.assert_allclose(plain(x64)[k, -1, ::97], weight.sum(1) / flat, rtol=1e-5)
 
 
-@pytest.mark.parametrize("approximation", ["support alone", "default"])
+@pytest.mark.parametrize("approximation", [pytest.param("support alone", marks=pytest.mark.long), "default"])
 def test_fast_diffuser_is_the_plain_one_within_its_stated_error(float32, approximation, x64):
     body, atlas, sources, _, _ = scene(x64)
     exact = approximation == "support alone"

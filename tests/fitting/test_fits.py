@@ -149,15 +149,16 @@ def all_channels() -> Dipole:
     return Dipole(Medium(*(jnp.concatenate(each) for each in zip(*coefficients, strict=True))), EganFresnel())
 
 
-def test_one_to_eight_gaussians_reach_the_best_known_errors(float64):
-    """The whole table: 12 media, per channel, shared by the channels, and shared with non-negative weights of a held sum."""
-    own = error_by_count(all_channels(), 8, spread=VariancesPerChannel()).error
-    best = np.stack([np.asarray(error) for channels in PER_CHANNEL.values() for error in channels], axis=1)
+@pytest.mark.parametrize("every", [2, pytest.param(1, marks=pytest.mark.long)])
+def test_one_to_eight_gaussians_reach_the_best_known_errors(float64, every):
+    """Of 12 media or every other one: per channel, shared by the channels, and so with non-negative weights of a held sum."""
+    media = jax.tree.map(lambda leaf: leaf.reshape(-1, 3)[::every], all_channels())
+    own = error_by_count(jax.tree.map(jnp.ravel, media), 8, spread=VariancesPerChannel()).error
+    best = np.stack([np.asarray(error) for channels in list(PER_CHANNEL.values())[::every] for error in channels], axis=1)
     ratios = {"per channel": np.max(np.asarray(own) / best, axis=1)}
-    stacked = jax.tree.map(lambda leaf: leaf.reshape(-1, 3), all_channels())
     for name, weights, table in (("shared", FreeWeights(), SHARED_FREE), ("shared, held", HELD_ABOVE_ZERO, SHARED_HELD)):
-        found = eqx.filter_vmap(lambda profile, weights=weights: error_by_count(profile, 8, weights=weights).error)(stacked)
-        ratios[name] = np.max(np.sqrt(np.mean(np.square(found), axis=2)) / np.asarray(list(table.values())), axis=0)
+        found = eqx.filter_vmap(lambda profile, weights=weights: error_by_count(profile, 8, weights=weights).error)(media)
+        ratios[name] = np.max(np.sqrt(np.mean(np.square(found), axis=2)) / np.asarray(list(table.values())[::every]), axis=0)
     for name, worst in ratios.items():
         print(f"worst error over the best known, {name}, 1 to 8 Gaussians:", worst.round(4))
     assert np.max(ratios["per channel"]) < BAR

@@ -103,9 +103,10 @@ def test_fast_and_plain_gradients_agree():
 IN_FLOAT32 = 1e-4  # of the norm; 3e-5 measured, 5e-6 but for the specular strength
 
 
-def test_float32_gradients_are_those_of_float64():
+@pytest.mark.parametrize("path", ["plain", pytest.param("fast", marks=pytest.mark.long)])
+def test_float32_gradients_are_those_of_float64(path):
     with jax.enable_x64(True):
-        single, double = rendered("lamp and maps", "fast", jnp.float32)[1], rendered("lamp and maps", "fast")[1]
+        single, double = rendered("lamp and maps", path, jnp.float32)[1], rendered("lamp and maps", path)[1]
         assert {leaf.dtype for leaf in jax.tree.leaves(single)} == {jnp.dtype(jnp.float32)}
         errors = differences(single, double)
     print({name: f"{error:.1e}" for name, error in errors.items()})

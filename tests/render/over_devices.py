@@ -20,7 +20,7 @@ SETTINGS = sj.RenderSettings(shadows=ShadowSettings(resolution=32))
 PLACE = np.asarray([40.0, -25.0, 15.0])  # mm; where the balls stand, away from the origin of all coordinates
 
 
-def scene(count: int = 1501) -> sj.Scene:
+def scene(count: int = 1501, variances=(0.1, 16.0, 100.0)) -> sj.Scene:
     """Two balls, the last splats before the first, of a number that eight does not divide; layers of three kinds."""
     behind, before = sphere(count - count // 5, 20.0), sphere(count // 5, 6.0)
     before = eqx.tree_at(lambda ball: ball.centers, before, before.centers + jnp.asarray([[-8.0, 6.0, 30.0]], float))
@@ -28,8 +28,8 @@ def scene(count: int = 1501) -> sj.Scene:
     shade = 0.6 + 0.3 * jnp.sin(splats.centers / 5)
     splats = eqx.tree_at(lambda each: each.centers, splats, splats.centers + jnp.asarray(PLACE[None], float))
     splats = eqx.tree_at(lambda each: each.albedo, splats, shade, is_leaf=lambda leaf: leaf is None)
-    weights = jnp.asarray([[0.2, 0.1, 0.1], [0.3, 0.3, 0.2], [0.3, 0.2, 0.1]], float)
-    material = sj.Material(sj.SumOfGaussians(jnp.asarray([0.1, 16.0, 100.0], float), weights))
+    weights = jnp.asarray([[0.2, 0.1, 0.1], [0.3, 0.3, 0.2], [0.3, 0.2, 0.1]], float)[-len(variances) :]
+    material = sj.Material(sj.SumOfGaussians(jnp.asarray(variances, float), weights))
     sun = sj.DirectionalLight(jnp.asarray([0.4, -0.5, -1.0], float), jnp.ones(3))
     lamp = sj.PointLight(jnp.asarray(PLACE + np.asarray([-60.0, 10.0, 20.0]), float), 2000 * jnp.ones(3), cast_shadows=False)
     return sj.Scene(splats, (sun, lamp), material)

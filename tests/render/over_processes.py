@@ -20,7 +20,7 @@ def main(what: str, index: int, count: int, port: int) -> dict:
     """Give the picture, or the gradients of what soon compiles, and how the first process finds them."""
     jax.distributed.initialize(f"127.0.0.1:{port}", count, index)
     mesh = jax.make_mesh((jax.device_count(),), ("splats",))
-    world, eye = scene(1504), camera()
+    world, eye = scene(1504, variances=(16.0, 100.0)), camera()  # one layer of single splats, and one through nodes
     cut = NamedSharding(mesh, PartitionSpec("splats"))
     splats = jax.tree.map(lambda leaf: jax.device_put(leaf, cut), world.splats)
 

@@ -14,6 +14,7 @@ def dressed():
 
 
 @pytest.mark.once
+@pytest.mark.long
 def test_its_face_has_the_colors_of_the_bust(dressed):
     mesh, textures = dressed
     triangles = TexturedMesh.of(mesh, textures)

@@ -199,6 +199,7 @@ def lit_ball(settings_of, count: int):
 
 
 @pytest.mark.once
+@pytest.mark.long
 def test_normals_that_vary_within_splats_are_closer_to_the_sphere_than_blended_and_flat_ones():
     """A sphere of 150 splats, under the light of a white diffuser."""
     rivals = {

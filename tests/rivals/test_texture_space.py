@@ -121,7 +121,7 @@ def slab(thickness: float) -> Mesh:
 
 
 @pytest.mark.once
-@pytest.mark.slow
+@pytest.mark.long
 def test_through_a_slab_comes_what_comes_through_splats():
     """Lit from behind: the share and the odds of leaving are those of two sheets of splats."""
     thickness, settings = 1.5, dataclasses.replace(STILL, resolution=96)
