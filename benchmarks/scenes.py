@@ -54,7 +54,10 @@ def scanned(splats: int) -> dict[str, np.ndarray]:
         "specular": folder / "Map-SPEC.jpg",
         "normal": folder / "Infinite-Level_02_Tangent_SmoothUV.jpg",
     }
-    found = sj.sample_mesh(folder / "LeePerrySmith.glb", splats, mm_per_unit=53, v_up=True, crop_min_y=-0.9, **maps)
+    # on the triangles, as others draw them
+    found = sj.sample_mesh(
+        folder / "LeePerrySmith.glb", splats, mm_per_unit=53, v_up=True, crop_min_y=-0.9, rounded=False, **maps
+    )
     toward = np.asarray([1.0, -1.0, -1.0], np.float32)  # the file has y up and looks along +z
     centers = np.asarray(found.centers) * toward
     middle = 0.5 * (centers.min(axis=0) + centers.max(axis=0))

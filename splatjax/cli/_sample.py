@@ -29,12 +29,16 @@ class Sample(MeshMaps):
     """Number of splats."""
     seed: int = 0
     """Another spread of the same quality."""
+    rounded: bool = True
+    """Put splats where the surface is that bends as the mesh's normals do; otherwise on its flat triangles."""
 
     def run(self) -> None:
         """Read, sample, write."""
         check_output(self.output, (".ply",))
         with stage(f"sampling {self.mesh} with {self.count} splats"):
-            splats = sj.sample_mesh(self.mesh, self.count, mm_per_unit=self.mm_per_unit, seed=self.seed, **self.worn())
+            splats = sj.sample_mesh(
+                self.mesh, self.count, mm_per_unit=self.mm_per_unit, seed=self.seed, rounded=self.rounded, **self.worn()
+            )
         with stage(f"writing {self.output}"):
             sj.write_splats(self.output, splats)
         carried = [name for name in ("albedo", "specular", "roughness") if getattr(splats, name) is not None]

@@ -42,6 +42,7 @@ def sample_mesh(
     v_up: bool | None = None,
     crop_min_y: float | None = None,
     seed: int = 0,
+    rounded: bool = True,
 ) -> Splats:
     r"""Cover the mesh in a file (GLB, glTF, OBJ, PLY, STL, OFF) with splats, its maps and the colors of its vertices baked in.
 
@@ -56,6 +57,8 @@ def sample_mesh(
       GLB. Files converted without care need `True`: with the wrong choice the lips land on the chin.
     - `crop_min_y`: what lies below this height, in the file's unit, is cut off.
     - `seed`: another spread of the same quality.
+    - `rounded`: put splats where the surface is that bends as the mesh's normals do; otherwise on its flat triangles, whose edges
+      show where light ends. Edges stay where normals are more than 40 degrees off their triangles.
 
     **Returns:** splats in mm; `splatjax.geometry.sample_mesh` says how they are spread.
 
@@ -68,7 +71,7 @@ def sample_mesh(
     )
     dressed = any(picture is not None for picture in (textures.albedo, textures.specular, textures.normal))
     try:
-        return sample_surface(mesh, count, textures=textures if dressed else None, seed=seed)
+        return sample_surface(mesh, count, textures=textures if dressed else None, seed=seed, rounded=rounded)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
 

@@ -7,7 +7,10 @@ from scipy.spatial import cKDTree
 
 from splatjax.geometry import Mesh, Textures, cut_below, sample_mesh
 from splatjax.geometry._cells import surface_cells
+from splatjax.geometry._mesh import vertex_normals
 from splatjax.geometry._morton import morton_order
+from splatjax.geometry._rounding import rounded_area, rounded_positions
+from splatjax.geometry._scatter import SurfacePoints
 
 COUNT = 3000
 SINGLE = 2e-6  # relative: a sum of thousands of float32
@@ -163,3 +166,58 @@ def test_what_cannot_be_sampled_is_refused():
         sample_mesh(flat, 10)
     with pytest.raises(ValueError, match="no texture coordinates"):
         sample_mesh(sphere(), 10, textures=Textures(albedo=np.ones((2, 2, 3))))
+
+
+def anywhere(mesh: Mesh, each: int = 20) -> SurfacePoints:
+    """Points all over the triangles of a mesh."""
+    shares = np.random.default_rng(0).dirichlet(np.ones(3), each * len(mesh.faces))
+    return SurfacePoints(np.repeat(np.arange(len(mesh.faces)), each), shares)
+
+
+def test_a_rounded_sphere_is_round_to_fourth_order():
+    """In the length of its edges; what flat triangles are off by is of second."""
+    flat, off = [], []
+    for subdivisions in (2, 3):
+        mesh = sphere(subdivisions=subdivisions)
+        points = anywhere(mesh)
+        flat.append(np.max(np.abs(np.linalg.norm(points.positions(mesh), axis=1) - 50)))
+        off.append(np.max(np.abs(np.linalg.norm(rounded_positions(mesh, points), axis=1) - 50)))
+    assert off[0] < 0.03 * flat[0]
+    assert off[1] < off[0] / 14
+    whole = 4 * np.pi * 50**2
+    assert abs(rounded_area(sphere()) / whole - 1) < 1e-4
+    assert sphere().area() / whole - 1 < -4e-3
+
+
+def test_what_triangles_share_stays_or_moves_for_all_of_them():
+    vertices = sphere().vertices * [1.0, 0.6, 1.4]
+    mesh = Mesh(vertices, sphere().faces, vertex_normals(vertices, sphere().faces))
+    every = np.arange(len(mesh.faces))
+    found = {}
+    for one, other in ((0, 1), (1, 2), (2, 0)):
+        shares = np.where(np.arange(3) == one, 0.3, np.where(np.arange(3) == other, 0.7, 0.0))
+        for way in (shares, shares[[other if k == one else one if k == other else k for k in range(3)]]):
+            points = SurfacePoints(every, np.broadcast_to(way, (len(every), 3)))
+            for at, plain in zip(rounded_positions(mesh, points), points.positions(mesh), strict=True):
+                np.testing.assert_allclose(found.setdefault(tuple(plain.round(6)), at), at, atol=1e-9)
+    assert len(found) == len(every) * 3  # two points on each edge, and two triangles
+    corners = SurfacePoints(every, np.broadcast_to([1.0, 0, 0], (len(every), 3)))
+    np.testing.assert_allclose(rounded_positions(mesh, corners), corners.positions(mesh), atol=1e-12)
+
+
+def test_a_box_stays_a_box():
+    box = trimesh.creation.box(extents=(10.0, 20.0, 30.0))
+    vertices, faces = np.array(box.vertices), np.array(box.faces)
+    mesh = Mesh(vertices, faces, vertex_normals(vertices, faces))  # smooth at its edges, as where a file has no normals
+    points = anywhere(mesh)
+    np.testing.assert_array_equal(rounded_positions(mesh, points), points.positions(mesh))
+    assert rounded_area(mesh) == pytest.approx(2 * (200 + 300 + 600), rel=1e-12)
+
+
+def test_rounded_splats_cover_the_rounded_surface():
+    splats = sample_mesh(sphere(subdivisions=2), COUNT, rounded=True)
+    centers, normals = np.asarray(splats.centers, np.float64), np.asarray(splats.normals, np.float64)
+    from_middle = np.linalg.norm(centers, axis=1)
+    np.testing.assert_allclose(from_middle, 50, rtol=5e-4)
+    assert np.min(np.sum(centers * normals, axis=1) / from_middle) > np.cos(np.radians(0.5))
+    np.testing.assert_allclose(np.asarray(splats.areas, np.float64).sum(), 4 * np.pi * 50**2, rtol=1e-3)
