@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Annotated
 
 import jax
+import jax.numpy as jnp
 import optimistix as optx
 import tyro
 from rich.console import Console
@@ -18,9 +19,11 @@ from splatjax.scattering import measure_laser_dot
 from ._fit_all import fit_all
 from ._models import Model, Reference, reference
 from ._outputs import OptionalPath, check_output
-from ._report import stage
+from ._report import note, stage
 
 _COEFFICIENTS, _PROFILE, _PHOTOGRAPH = "coefficients", "a measured profile", "a photograph"
+_MOST = 12
+"""Gaussians, as many as a least error may take."""
 _KINDS = {".csv": _PROFILE, ".exr": _PHOTOGRAPH}
 _OPTIONS = {
     _COEFFICIENTS: ("model", "cut", "photons", "single_scattering"),
@@ -115,6 +118,8 @@ class Fit:
 
     def _run(self) -> None:
         self._check_options()
+        if self.count > _MOST:
+            raise ValueError(f"--count is {self.count}; it lies between 1 and {_MOST}, beyond which nothing is gained but time")
         coefficients = self._coefficients()
         if isinstance(coefficients, sj.Tabulated):
             made = Reference(coefficients, sj.NORM_RULE)
@@ -129,6 +134,9 @@ class Fit:
             if fitted.result != optx.RESULTS.successful:
                 raise ValueError(self._unsettled(len(fitted.gaussians.variances)))
         _print(fitted)
+        total = fitted.gaussians.total_reflectance()
+        if float(jnp.max(total)) > 1 + 1e-3:
+            note(f"{self.medium} sends back {_numbers(total, '.3g')} times the light it is given: are its unit and power right?")
         if self.output is not None:
             self._save(self.output, coefficients, made, fitted)
             print(self.output)

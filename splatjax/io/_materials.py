@@ -74,7 +74,8 @@ def load_material(name_or_path: str | os.PathLike[str]) -> Material:
     """
     path, tables = _read(name_or_path)
     if "fit" not in tables:
-        raise ValueError(f"{path}: has no [fit]; fit its coefficients first: `splatjax fit {path} --output {path}`")
+        fitted = path.with_name(f"{path.stem}_fitted.toml")
+        raise ValueError(f"{path}: has no [fit]; take what `splatjax fit {path} --output {fitted}` makes of its coefficients")
     fit = Table(path, "fit", tables["fit"])
     fit.unit(VARIANCE_UNIT)
     variances = fit.numbers("variances", "positive (mm^2)", lambda x: x > 0)

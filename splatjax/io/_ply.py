@@ -23,6 +23,9 @@ _LARGEST = 1e6
 _GAUSSIAN_SPLATTING = ("f_dc_0", "scale_0", "rot_0")
 
 
+_MESHES = (".glb", ".gltf", ".obj", ".off", ".stl")
+
+
 def read_splats(path: str | os.PathLike[str], *, mm_per_unit: float = 1.0) -> Splats:
     r"""Read splats from the vertices of a PLY file: ASCII or binary of either byte order, properties in any order.
 
@@ -48,6 +51,8 @@ def read_splats(path: str | os.PathLike[str], *, mm_per_unit: float = 1.0) -> Sp
     """
     path = existing_file(path)
     check_unit(path, mm_per_unit)
+    if path.suffix.lower() in _MESHES:
+        raise ValueError(f"{path}: is a mesh; cover it with splats first: `splatjax sample {path} --mm-per-unit`, or sample_mesh")
     vertices = vertex_table(path, read_ply(path))
     if all(name in vertices for name in _GAUSSIAN_SPLATTING):
         raise ValueError(

@@ -4,6 +4,7 @@ import csv
 import json
 import math
 import os
+import re
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -16,11 +17,15 @@ from splatjax.scene import Material
 from ._atomic import atomic_path
 from ._tables import rounded
 
+_UNITS = {"mm": 1.0, "cm": 10.0, "um": 1e-3, "µm": 1e-3}
+"""Units of length that the names of a table's columns may speak of, mm."""
+
 
 def read_profile(path: str | os.PathLike[str], *, mm_per_unit: float = 1.0) -> Tabulated:
     r"""Read a measured profile from a CSV file: a column of radii, and one of values for each channel.
 
-    Empty lines and those that begin with `#` are left out; a first line of names may stand above. Radii ascend.
+    Empty lines and those that begin with `#` are left out; a first line of names may stand above. If it speaks of a unit of
+    length, that must be the one given. Radii ascend.
 
     **Arguments:**
 
@@ -48,6 +53,7 @@ def read_profile(path: str | os.PathLike[str], *, mm_per_unit: float = 1.0) -> T
         cells = [cell.strip() for cell in next(csv.reader([line]))]
         if not rows and not named and not _is_number(cells[0]):
             named = True
+            _check_unit(path, number, line, mm_per_unit)
             continue
         bad = next((cell for cell in cells if not _is_number(cell) or not math.isfinite(rounded(float(cell)))), None)
         if bad is not None:
@@ -77,6 +83,16 @@ def save_exports(material: Material, path: str | os.PathLike[str]) -> None:
         raise ValueError(f"{path}: the material has single scattering besides its Gaussians; fit it without, then export")
     with atomic_path(path) as temporary:
         temporary.write_text(json.dumps(data_sheet(material.gaussians), indent=2) + "\n", encoding="utf-8")
+
+
+def _check_unit(path: Path, number: int, line: str, mm_per_unit: float) -> None:
+    """Refuse names that speak of another unit of length than is given, such as `r (cm)`; mm where none is given."""
+    for unit, size in _UNITS.items():
+        if re.search(rf"(?<![A-Za-z]){unit}(?![A-Za-z])", line) and not math.isclose(size, mm_per_unit, rel_tol=1e-6):
+            raise ValueError(
+                f"{path}: line {number} speaks of {unit}, and lengths are taken as {mm_per_unit:g} mm; "
+                f"give mm_per_unit = {size:g} (--mm-per-unit {size:g}), or name the right unit"
+            )
 
 
 def _is_number(cell: str) -> bool:

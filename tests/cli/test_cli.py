@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import re
 from pathlib import Path
 
 import jax
@@ -9,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import OpenEXR
 import pytest
+import trimesh
 from commands import failure, plate, write_ply
 from jax.experimental.compilation_cache import compilation_cache
 from PIL import Image
@@ -134,10 +136,26 @@ def test_fit_takes_a_photograph_that_any_program_wrote(tmp_path, capsys):
         (["dot.exr", "--mm-per-pixel", "1", "--single-scattering"], "--single-scattering is for coefficients, and dot.exr"),
         (["dot.csv", "--power", "2"], "--power is for a photograph, and dot.csv is taken for a measured profile"),
         (["marble", "--mm-per-unit", "10"], "--mm-per-unit is for a measured profile, and marble is taken for coefficients"),
+        (["marble", "--count", "13"], "--count is 13; it lies between 1 and 12"),
     ],
 )
 def test_fit_refuses_what_has_no_effect(command, said, capsys):
     assert said in failure(["fit", *command], capsys)
+
+
+@pytest.mark.once
+def test_fit_tells_of_more_light_than_is_given(tmp_path, capsys):
+    path = tmp_path / "bright.csv"
+    path.write_text("r (mm), R\n0.5, 0.42\n1, 0.19\n2, 0.048\n4, 0.0062\n")
+    assert main(["fit", str(path), "--count", "1"]) == 0
+    assert re.search(r"bright\.csv sends back [1-9][0-9.]* times the light it is given", capsys.readouterr().err)
+
+
+def test_a_mesh_is_no_cloud_of_splats(tmp_path, capsys):
+    mesh = tmp_path / "ball.obj"
+    trimesh.creation.icosphere().export(mesh)
+    said = failure(["render", str(mesh), "--output", str(tmp_path / "o.exr")], capsys)
+    assert f"ball.obj: is a mesh; cover it with splats first: `splatjax sample {mesh} --mm-per-unit`" in said
 
 
 def test_export_writes_what_other_renderers_take(tmp_path, capsys):

@@ -53,3 +53,12 @@ def test_exports_are_written_whole(tmp_path):
     np.testing.assert_allclose(json.loads(path.read_text())["gaussians"]["variances"], [0.0064, 0.0484, 0.187, 0.567, 1.99, 7.41])
     with pytest.raises(FileNotFoundError):
         save_exports(load_material("skin"), tmp_path / "nowhere" / "skin.json")
+
+
+@pytest.mark.parametrize(("unit", "given", "right"), [("cm", 1.0, 10.0), ("mm", 10.0, 1.0), ("um", 1.0, 0.001)])
+def test_a_profile_in_another_unit_than_given_is_refused(tmp_path, unit, given, right):
+    path = tmp_path / "a.csv"
+    path.write_text(f"radius ({unit}), R (1/{unit}^2)\n0.1, 1\n0.2, 0.5\n", encoding="utf-8")
+    with pytest.raises(ValueError, match=rf"a\.csv: line 1 speaks of {unit}, .* give mm_per_unit = {right:g} "):
+        read_profile(path, mm_per_unit=given)
+    assert read_profile(path, mm_per_unit=right).radii[0] == pytest.approx(0.1 * right)
