@@ -22,8 +22,6 @@ from ._outputs import OptionalPath, check_output
 from ._report import note, stage
 
 _COEFFICIENTS, _PROFILE, _PHOTOGRAPH = "coefficients", "a measured profile", "a photograph"
-_MOST = 12
-"""Gaussians, as many as a least error may take."""
 _KINDS = {".csv": _PROFILE, ".exr": _PHOTOGRAPH}
 _OPTIONS = {
     _COEFFICIENTS: ("model", "cut", "photons", "single_scattering"),
@@ -118,8 +116,8 @@ class Fit:
 
     def _run(self) -> None:
         self._check_options()
-        if self.count > _MOST:
-            raise ValueError(f"--count is {self.count}; it lies between 1 and {_MOST}, beyond which nothing is gained but time")
+        if self.count > (most := sj.LeastCount.largest):
+            raise ValueError(f"--count is {self.count}; it lies between 1 and {most}, as many as --error takes")
         coefficients = self._coefficients()
         if isinstance(coefficients, sj.Tabulated):
             made = Reference(coefficients, sj.NORM_RULE)

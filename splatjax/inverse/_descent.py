@@ -130,6 +130,7 @@ def usual_promotion() -> Generator[None]:
 
 
 def pictures_of(evidence: Evidence) -> list[Seen]:
+    """Put what was seen into arrays of the precision that is computed in."""
     together = zip(evidence.pictures, evidence.deviations, evidence.masks, strict=True)
     return [
         Seen(

@@ -27,6 +27,8 @@ _READERS: dict[str, Callable[[Path], list[Piece]]] = {
     ".stl": read_stl,
     ".off": read_off,
 }
+MESHES_ALONE = frozenset(_READERS) - {".ply"}
+"""Suffixes of files that hold meshes and no splats."""
 _BYTES_PER_SPLAT = 2500.0  # while they are spread, measured: 1.2 GB for 683,549
 Name = str | os.PathLike[str]
 

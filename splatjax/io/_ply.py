@@ -12,6 +12,7 @@ from splatjax.scene import Splats
 
 from ._atomic import atomic_path
 from ._files import existing_file
+from ._mesh import MESHES_ALONE
 from ._pieces import moderate
 from ._ply_columns import Table, colors_of, columns_of, normals_of, places_of, vertex_table
 from ._ply_tables import read_ply
@@ -21,9 +22,6 @@ AREA = ("area", "areas")
 _SHORTEST, _LONGEST = 1e-9, 1e9  # mm: beyond, single precision loses areas
 _LARGEST = 1e6
 _GAUSSIAN_SPLATTING = ("f_dc_0", "scale_0", "rot_0")
-
-
-_MESHES = (".glb", ".gltf", ".obj", ".off", ".stl")
 
 
 def read_splats(path: str | os.PathLike[str], *, mm_per_unit: float = 1.0) -> Splats:
@@ -51,7 +49,7 @@ def read_splats(path: str | os.PathLike[str], *, mm_per_unit: float = 1.0) -> Sp
     """
     path = existing_file(path)
     check_unit(path, mm_per_unit)
-    if path.suffix.lower() in _MESHES:
+    if path.suffix.lower() in MESHES_ALONE:
         raise ValueError(f"{path}: is a mesh; cover it with splats first: `splatjax sample {path} --mm-per-unit`, or sample_mesh")
     vertices = vertex_table(path, read_ply(path))
     if all(name in vertices for name in _GAUSSIAN_SPLATTING):
