@@ -1,3 +1,3 @@
-"""The command line: `splatjax materials | fit | export | sample | render | turntable`. It calls the public interface alone."""
+"""The command line, `splatjax COMMAND`: a file per command. It calls the public interface alone."""
 
 from ._main import main as main

@@ -14,8 +14,10 @@ from ._outputs import check_output
 
 @dataclass(frozen=True, kw_only=True)
 class Export:
-    """Write a material's Gaussians as JSON for other renderers, each with formula, unit and source: GPU Gems weights, a kernel
-    for separable subsurface scattering, Burley's d, the shape parameter of Unity's HDRP, Blender's radius.
+    """Write a material's Gaussians as JSON for other renderers.
+
+    Each entry with formula, unit and source: GPU Gems weights, a kernel for separable subsurface scattering, Burley's d, the
+    shape parameter of Unity's HDRP, Blender's radius.
 
     Example: splatjax export skin --output skin.json
     """

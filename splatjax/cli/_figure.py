@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +15,7 @@ import splatjax as sj
 from splatjax.io import atomic_path
 
 from ._mesh_maps import MeshMaps
+from ._options import MaterialName, MaterialNames, OptionalFloat
 from ._outputs import check_output
 from ._report import stage
 from ._shot import Shot, in_color, towards
@@ -28,6 +29,14 @@ if TYPE_CHECKING:
 _DISTANCE = 900.0  # mm: that of a portrait
 _TEXELS = 1024  # along an edge of the bust's textures
 _ROOM = 1.04  # of the picture over the body's outline
+_SCENE = (
+    "PLY files of splats, in mm (`splatjax sample` makes them). Figure 6 shows the bust and all of them, the others the first; "
+    "without one, the bust. Figure 8 takes a mesh with texture coordinates (GLB, glTF, OBJ) and the maps below."
+)
+_SCALE = (
+    "Size of the bodies: at 0.5 a head is half as large, and the light goes twice as far in it. So do fewer splats for narrow "
+    "layers."
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,29 +48,25 @@ class Figure(MeshMaps):
     this one, half and half. docs/figures.md shows them.
 
     Examples: splatjax figure 7 --scene head.ply --output figure_7.png
-    splatjax figure 8 --scene head.glb --mm-per-unit 53 --albedo color.jpg --output figure_8.png
+              splatjax figure 8 --scene head.glb --mm-per-unit 53 --albedo color.jpg --output figure_8.png
     """
 
     number: tyro.conf.Positional[int]
     """Of the figure."""
     output: Path = Path("figure.png")
     """The PNG, PDF or SVG file to write."""
-    scene: tuple[Path, ...] = ()
-    """PLY files of splats, in mm (`splatjax sample` makes them). Figure 6 shows the bust and all of them, the others the first;
-    without one, the bust. Figure 8 takes a mesh with texture coordinates (GLB, glTF, OBJ, ...) and the maps below."""
-    mm_per_unit: float | None = None
+    scene: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="PATH [PATH ...]", help=_SCENE, help_behavior_hint="")] = ()
+    mm_per_unit: OptionalFloat = None
     """Of figure 8: length of the mesh file's unit, mm: 1000 for metres."""
-    material: str = "skin"
+    material: MaterialName = "skin"
     """Name of a material (`splatjax materials`), or path of a TOML file."""
-    materials: tuple[str, ...] = ("skin", "marble", "ketchup", "wholemilk")
+    materials: MaterialNames = ("skin", "marble", "ketchup", "wholemilk")
     """Of figure 6; the first is drawn with the body's own color."""
     width: int = 512
     """Of a picture in the figure, pixels along each side."""
     count: int = 200_000
     """Number of splats of the built-in bust, and of a mesh."""
-    scale: float = 1.0
-    """Size of the bodies: at 0.5 a head is half as large, and the light goes twice as far in it. So do fewer splats for narrow
-    layers."""
+    scale: Annotated[float, tyro.conf.arg(help=_SCALE)] = 1.0
     close_up: tuple[float, float] = (0.48, 0.34)
     """Of figure 7: what is shown closer, as shares of the height and of the width of the body's outline."""
     azimuth: float = 25.0

@@ -13,12 +13,14 @@ from rich.table import Table
 
 import splatjax as sj
 from splatjax.fitting import AbstractWeights
+from splatjax.gaussians import channel_names
 from splatjax.io import read_picture, surface_and_source
 from splatjax.scattering import measure_laser_dot
 
 from ._fit_all import fit_all
 from ._models import Model, Reference, reference
-from ._outputs import OptionalPath, check_output
+from ._options import OptionalFloat, OptionalPath
+from ._outputs import check_output
 from ._report import note, stage
 
 _COEFFICIENTS, _PROFILE, _PHOTOGRAPH = "coefficients", "a measured profile", "a photograph"
@@ -29,16 +31,25 @@ _OPTIONS = {
     _PHOTOGRAPH: ("mm_per_pixel", "power"),
 }
 """What each kind of input alone has use for."""
+_MEDIUM = (
+    "Name of a material (`splatjax materials`), or path: of a TOML file with a [medium] or [[layers]], of a CSV file with radii "
+    "and a column per channel, or of an EXR file with a linear photograph of a laser dot."
+)
+_ALL = (
+    "Fit all media of a CSV file, whose columns are sigma_a, sigma_s_prime (1/mm), eta, and a name if you like; --output is a "
+    "CSV file then. Batches that are finished stay: after an interruption, run the same command again. Where a launcher has "
+    "started several processes (docs/devices.md), they share the work."
+)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Fit:
-    """Fit a sum of Gaussians to a diffusion profile, and print it with its errors: to that of a medium (the dipole) or of layers
-    (multipoles), to a measured one, or to that of a laser dot in a photograph.
+    """Fit a sum of Gaussians to a diffusion profile, and print it with its errors.
 
-    Double precision. Variances are shared by the channels. Weights are not negative, and their sum is held at the total
-    reflectance of the profile, so that the picture keeps its energy, unless --free is given. To measured profiles, whose totals
-    are not known, weights are fitted freely, but not below zero.
+    The profile is that of a medium, that of layers, a measured one, or that of a laser dot in a photograph. Double precision.
+    Variances are shared by the channels. Weights are not negative, and their sum is held at the total reflectance of the profile,
+    so that the picture keeps its energy, unless --free is given. To measured profiles, whose totals are not known, weights are
+    fitted freely, but not below zero.
 
     A medium is taken for what --model says: the dipole, which publications use, or one that comes nearer to the truth, or the
     truth itself (docs/which_profile.md).
@@ -47,17 +58,15 @@ class Fit:
               splatjax fit media.csv --all --output fits.csv
     """
 
-    medium: tyro.conf.Positional[str]
-    """Name of a material (`splatjax materials`), or path: of a TOML file with a [medium] or [[layers]], of a CSV file with radii
-    and a column per channel, or of an EXR file with a linear photograph of a laser dot."""
+    medium: Annotated[tyro.conf.Positional[str], tyro.conf.arg(help=_MEDIUM)]
     count: int = 6
     """Number of Gaussians."""
-    error: float | None = None
+    error: OptionalFloat = None
     """Take the least number of Gaussians, up to 12, that leaves no channel a larger error (Eq. 4), instead of --count."""
     model: tyro.conf.EnumChoicesFromValues[Model] = Model.DIPOLE
     """Of coefficients: what makes a profile of them. The layers of a material are multipoles, or are walked by Monte Carlo."""
-    cut: Annotated[float | None, tyro.conf.arg(metavar="PATHS")] = None
-    """Of photon beams and Monte Carlo, which are infinite at the origin: where the fit begins, in mean free paths. None: 0.2."""
+    cut: OptionalFloat = None
+    """Of photon beams and Monte Carlo, which are infinite at the origin: the fit begins at so many mean free paths, or at 0.2."""
     photons: int = 1_000_000
     """Of Monte Carlo: how many walk."""
     single_scattering: bool = False
@@ -65,15 +74,12 @@ class Fit:
     free: bool = False
     """Leave the weights free: the least error of Eq. 3, which may miss some of the energy."""
     mm_per_unit: float = 1.0
-    """Of a CSV file: its unit of length."""
-    mm_per_pixel: float | None = None
-    """Of a photograph: the size of a pixel on the surface."""
+    """Of a CSV file: its unit of length, mm."""
+    mm_per_pixel: OptionalFloat = None
+    """Of a photograph: the size of a pixel on the surface, mm."""
     power: float = 1.0
     """Of a photograph: the light that enters the material, in W if the picture is in W/(mm^2 sr)."""
-    all: bool = False
-    """Fit all media of a CSV file, whose columns are sigma_a, sigma_s_prime (1/mm), eta, and a name if you like; --output is a
-    CSV file then. Batches that are finished stay: after an interruption, run the same command again. Where a launcher has started
-    several processes (docs/devices.md), they share the work."""
+    all: Annotated[bool, tyro.conf.arg(help=_ALL)] = False
     output: OptionalPath = None
     """TOML file to write the material to."""
     plot: OptionalPath = None
@@ -125,8 +131,8 @@ class Fit:
             made = reference(coefficients, self.model, self.cut, self.photons, self.single_scattering)
         profile = made.profile
         count = self.count if self.error is None else sj.LeastCount(self.error)
-        title = f"{self.count} Gaussians" if self.error is None else f"Gaussians to an error of {self.error:g}"
-        with stage(f"fitting {title} to {self.medium}"):
+        wanted = _gaussians(self.count) if self.error is None else f"Gaussians that leave an error of {self.error:g} at most"
+        with stage(f"fitting to {self.medium}: {wanted}"):
             weights = self._weights(coefficients)
             fitted = jax.block_until_ready(sj.fit_gaussians(profile, count, weights=weights, rule=made.rule, throw=False))
             if fitted.result != optx.RESULTS.successful:
@@ -143,13 +149,13 @@ class Fit:
             from splatjax.plots import plot_fit  # loads matplotlib
 
             found = len(fitted.gaussians.variances)
-            figure = plot_fit(profile, fitted.gaussians, rule=made.rule, title=f"{self.medium}, {found} Gaussians")
+            figure = plot_fit(profile, fitted.gaussians, rule=made.rule, title=f"{self.medium}, {_gaussians(found)}")
             with atomic_path(self.plot) as written:
                 figure.savefig(written)
             print(self.plot)
 
     def _unsettled(self, count: int) -> str:
-        told = f"{self.medium}: the search for {count} Gaussians did not settle"
+        told = f"{self.medium}: the search for {_gaussians(count)} did not settle"
         if self.model is Model.MONTE_CARLO:
             return f"{told}; {self.photons} photons tell too little apart: give more --photons, or a smaller --count"
         return f"{told}; give a smaller --count"
@@ -213,7 +219,8 @@ class Fit:
 
 def _print(fitted: sj.FitResult) -> None:
     table = Table(box=None, pad_edge=False)
-    for title in ("variance, mm^2", "weights"):
+    names = ", ".join(channel_names(fitted.gaussians.weights.shape[1]))
+    for title in ("variance, mm^2", f"weights ({names})"):
         table.add_column(title, justify="right", no_wrap=True)
     for variance, weights in zip(fitted.gaussians.variances, fitted.gaussians.weights, strict=True):
         table.add_row(f"{float(variance):.6g}", _numbers(weights, ".5f"))
@@ -221,6 +228,10 @@ def _print(fitted: sj.FitResult) -> None:
     table.add_row("error (Eq. 4)", _numbers(fitted.error, ".2e"))
     table.add_row("energy error", _numbers(fitted.energy_error, ".2e"))
     Console(highlight=False).print(table)
+
+
+def _gaussians(count: int) -> str:
+    return "1 Gaussian" if count == 1 else f"{count} Gaussians"
 
 
 def _numbers(values: jax.Array, form: str) -> str:

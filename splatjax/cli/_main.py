@@ -1,14 +1,20 @@
 """From words on a command line to a command, and from an error to one clear line."""
 
+import functools
+import inspect
+import operator
 import os
 import sys
 import traceback
 import warnings
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, Any
 
 import equinox as eqx
+import jax
 import tyro
+
+from splatjax.io import own_version
 
 from ._environment import prepare_jax
 from ._export import Export
@@ -21,20 +27,22 @@ from ._report import note
 from ._sample import Sample
 from ._turntable import Turntable
 
-_Command = (
-    Annotated[Materials, tyro.conf.subcommand("materials")]
-    | Annotated[Fit, tyro.conf.subcommand("fit")]
-    | Annotated[Export, tyro.conf.subcommand("export")]
-    | Annotated[Sample, tyro.conf.subcommand("sample")]
-    | Annotated[Render, tyro.conf.subcommand("render")]
-    | Annotated[Recover, tyro.conf.subcommand("recover")]
-    | Annotated[Turntable, tyro.conf.subcommand("turntable")]
-    | Annotated[Figure, tyro.conf.subcommand("figure")]
-)
+_COMMANDS = {
+    "materials": Materials,
+    "fit": Fit,
+    "export": Export,
+    "sample": Sample,
+    "render": Render,
+    "turntable": Turntable,
+    "recover": Recover,
+    "figure": Figure,
+}
 _DESCRIPTION = """Render translucent materials, and find the sums of Gaussians that stand for them. Lengths are in mm.
 
-`splatjax COMMAND --help` explains a command. With --debug, an error shows where it arose."""
+`splatjax COMMAND --help` explains a command. With --debug, an error shows where it arose. `splatjax --version` says which
+version this is."""
 _DEBUG = "--debug"
+_STYLE = (tyro.conf.PositionalMetavarFromFieldName,)
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -49,7 +57,10 @@ def main(args: Sequence[str] | None = None) -> int:
     """
     words = list(sys.argv[1:] if args is None else args)
     debug = _DEBUG in words
-    command = tyro.cli(_Command, prog="splatjax", description=_DESCRIPTION, args=[word for word in words if word != _DEBUG])
+    try:
+        command = parsed([word for word in words if word != _DEBUG])
+    except BrokenPipeError:
+        return _nobody_reads_on()
     try:
         with warnings.catch_warnings():
             warnings.showwarning = lambda message, category, *_, **__: _show_warning(message, category)  # ty: ignore[invalid-assignment]
@@ -57,9 +68,7 @@ def main(args: Sequence[str] | None = None) -> int:
             command.run()
             sys.stdout.flush()
     except (BrokenPipeError, SystemExit):  # of a pipe that rich was writing to
-        # Python would try once more when it ends.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 141
+        return _nobody_reads_on()
     except KeyboardInterrupt:
         print("splatjax: interrupted", file=sys.stderr)
         return 130
@@ -70,6 +79,31 @@ def main(args: Sequence[str] | None = None) -> int:
         print(f"splatjax: {said}", file=sys.stderr)
         return status
     return 0
+
+
+def _nobody_reads_on() -> int:
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python would try once more when it ends
+    return 141
+
+
+def parsed(words: list[str]) -> Any:
+    """Give the command that words stand for; raise `SystemExit` where they ask for help or the version, or stand for none.
+
+    The command of the first word alone is looked at, so that what is said speaks of nothing else.
+    """
+    name, *rest = words or ["--help"]
+    if name == "--version":
+        print(f"splatjax {own_version()}, jax {jax.__version__}")
+        raise SystemExit
+    if name in _COMMANDS:
+        return tyro.cli(_COMMANDS[name], prog=f"splatjax {name}", args=rest, config=_STYLE)
+    each = [Annotated[command, tyro.conf.subcommand(name, description=_summary(command))] for name, command in _COMMANDS.items()]
+    union: Any = functools.reduce(operator.or_, each)
+    return tyro.cli(union, prog="splatjax", description=_DESCRIPTION, args=[name, *rest], config=_STYLE)
+
+
+def _summary(command: type) -> str:
+    return (inspect.getdoc(command) or "").partition("\n")[0]
 
 
 def _said(error: Exception) -> tuple[str, int]:

@@ -5,7 +5,12 @@ from typing import Annotated, Any
 
 import tyro
 
-from ._outputs import OptionalPath
+from ._options import OptionalFloat, OptionalPath
+
+_V_UP = (
+    "Whether v = 0 is the lower edge of a map. Without it, as the format prescribes: OBJ yes, glTF and GLB no. If lips land on "
+    "the chin, say True."
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -18,10 +23,8 @@ class MeshMaps:
     """Gray map: factor on the material's specular strength."""
     normal: OptionalPath = None
     """Tangent-space normal map; green points up."""
-    v_up: bool | None = None
-    """Whether v = 0 is the lower edge of a map. None: as the format prescribes (OBJ yes, glTF and GLB no). If lips land on the
-    chin, say True."""
-    crop_min_y: Annotated[float | None, tyro.conf.arg(metavar="Y")] = None
+    v_up: Annotated[bool | None, tyro.conf.arg(metavar="{True,False}", help=_V_UP, help_behavior_hint="")] = None
+    crop_min_y: OptionalFloat = None
     """Cut off what lies below this height, in the file's unit."""
 
     def worn(self) -> dict[str, Any]:

@@ -1,11 +1,6 @@
 """Outputs are checked before the work begins: nobody should wait for a picture that cannot be written."""
 
 from pathlib import Path
-from typing import Annotated
-
-import tyro
-
-OptionalPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH")]
 
 
 def check_output(path: Path, suffixes: tuple[str, ...]) -> None:

@@ -3,7 +3,7 @@
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
@@ -16,28 +16,35 @@ import splatjax as sj
 from splatjax.io import atomic_path, fingerprint, material_path, own_version, picture_paths, read_record, write_record
 
 from ._models import Model
-from ._outputs import OptionalPath, check_output
+from ._options import MaterialNames, OptionalPath
+from ._outputs import check_output
 from ._report import note, stage
 
+_START = (
+    "Materials to start from, within a factor of three in both coefficients: names, or paths of TOML files. The best end counts; "
+    "the index of refraction is that of the first."
+)
 _MODELS = {Model.DIPOLE: sj.Dipole, Model.BETTER_DIPOLE: sj.BetterDipole}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Recover:
-    """Find the absorption and scattering of a material from pictures of a known shape, with error bars, and say what the pictures
-    do not fix and which one to take next.
+    """Find the absorption and scattering of a material from pictures of a known shape.
 
-    The pictures are listed in a TOML file, each with its camera, its lights, and what is known of noise and intensity:
+    Both come with error bars; what the pictures do not fix is said, and which one to take next. They are listed in a TOML file,
+    each with its camera, its lights, and what is known of noise and intensity:
 
         [[pictures]]
         file = "left.exr"
-        noise = 0.01             # over the picture's root mean square; leave it out if it is unknown
+        noise = 0.01             # over the picture's root mean square, if it is known
         intensity = "unknown"    # or "known", the default, or "unknown color"
         camera = { position = [0, 0, 500], target = [0, 0, 0], fov = 25 }
         [[pictures.lights]]
-        kind = "directional"     # or "point" (position, intensity) or "beam" (origin, direction, power, variance)
+        kind = "directional"
         direction = [1, -0.3, -0.5]
         irradiance = [3.14, 3.14, 3.14]
+
+    A light is also of kind "point" (position, intensity) or "beam" (origin, direction, power, variance).
 
     Albedo of the splats is not used: the coefficients carry all color. Interrupt it, and the same command goes on from the best
     medium it knew.
@@ -49,9 +56,7 @@ class Recover:
     """PLY file of splats, in mm (`splatjax sample` makes one)."""
     pictures: tyro.conf.Positional[Path]
     """TOML file that lists the pictures."""
-    start: tuple[str, ...] = ("skin1", "marble")
-    """Materials to start from, within a factor of three in both coefficients: names, or paths of TOML files. The best end counts;
-    the index of refraction is that of the first."""
+    start: Annotated[MaterialNames, tyro.conf.arg(help=_START)] = ("skin1", "marble")
     output: Path = Path("recovered.toml")
     """TOML file to write the material to."""
     report: OptionalPath = None

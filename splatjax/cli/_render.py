@@ -12,12 +12,12 @@ from ._shot import Shot, draw, frame_parts, towards
 
 @dataclass(frozen=True, kw_only=True)
 class Render(Shot):
-    """Render splats, or the built-in bust, under a light and a weak fill: an EXR file with every layer, and a PNG file beside it.
+    """Render splats, or the built-in bust: an EXR file with every layer, and a PNG file beside it.
 
-    The camera looks at the middle of the splats from far enough to see all of them. Angles are in degrees: azimuth turns
-    about the vertical axis, 0 is the front (+z) and 90 the side of +x; elevation rises above the horizon. If the splats carry
-    albedo, the weights of the material are divided by their sums, so that color comes from the albedo alone; with --no-albedo it
-    comes from the material alone.
+    They stand under a light and a weak fill. The camera looks at the middle of the splats from far enough to see all of them.
+    Angles are in degrees: azimuth turns about the vertical axis, 0 is the front (+z) and 90 the side of +x; elevation rises above
+    the horizon. If the splats carry albedo, the weights of the material are divided by their sums, so that color comes from the
+    albedo alone; with --no-albedo it comes from the material alone.
 
     Examples: splatjax render head.ply --material skin --azimuth 30 --width 1024 --height 1024 --output head.exr
               splatjax render --material marble --no-albedo --output marble.exr

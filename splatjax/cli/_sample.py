@@ -14,7 +14,9 @@ from ._report import note, stage
 
 @dataclass(frozen=True, kw_only=True)
 class Sample(MeshMaps):
-    """Cover a mesh (GLB, glTF, OBJ, ...) evenly with splats, bake its maps into them, and write them as PLY, in mm.
+    """Cover a mesh with splats that wear its maps, and write them as PLY, in mm.
+
+    The mesh is a GLB, glTF, OBJ, PLY, STL or OFF file.
 
     Example: splatjax sample head.glb --albedo color.jpg --mm-per-unit 53 --count 683549 --output head.ply
     """

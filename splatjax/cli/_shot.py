@@ -3,7 +3,7 @@
 import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import equinox as eqx
 import jax
@@ -15,7 +15,7 @@ import splatjax as sj
 from splatjax.io import check_room, fingerprint, free_bytes, material_path, own_version
 from splatjax.scene import Parts
 
-from ._outputs import OptionalPath
+from ._options import MaterialName
 from ._report import note, stage
 
 _FILL_SIDE, _FILL_ELEVATION = 25.0, 10.0  # degrees: beside the camera, away from the light
@@ -26,11 +26,11 @@ _BYTES_PER_SPLAT, _BYTES_PER_PIXEL = 1000.0, 500.0  # at least: what does not fi
 class Shot:
     """Splats of one material, a camera that sees all of them, a light and a weak fill."""
 
-    splats: tyro.conf.Positional[OptionalPath] = None
+    splats: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="[SPLATS]", help_behavior_hint="")] = None
     """PLY file of splats, in mm (`splatjax sample` makes one). Without it, the built-in bust."""
     output: Path
     """What is written."""
-    material: str = "skin"
+    material: MaterialName = "skin"
     """Name of a material (`splatjax materials`), or path of a TOML file."""
     width: int = 512
     """Width of the picture, pixels."""
@@ -66,15 +66,18 @@ class Shot:
         for name in ("azimuth", "light_azimuth", "light_elevation"):
             if not math.isfinite(value := getattr(self, name)):
                 raise ValueError(f"--{name.replace('_', '-')} is {value:g}; it must be a finite number of degrees")
-        if self.splats is None and self.count > 0:
-            check_room(
-                f"--count {self.count}", _BYTES_PER_SPLAT * self.count, f"take {free_bytes() / _BYTES_PER_SPLAT:.0f} at most"
-            )
-        if self.width > 0 and self.height > 0:
-            fits = f"take {free_bytes() / _BYTES_PER_PIXEL:.0f} pixels at most"
-            check_room(f"--width {self.width} --height {self.height}", _BYTES_PER_PIXEL * self.width * self.height, fits)
+        for name in ("width", "height", "count"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"--{name} is {getattr(self, name)}; it must be 1 or more")
+        if not 0 < self.fov < 180:
+            raise ValueError(f"--fov is {self.fov:g}; it must lie between 0 and 180 degrees, both excluded")
         if not -90 < self.elevation < 90:
             raise ValueError(f"--elevation is {self.elevation:g}; it must lie between -90 and 90 degrees, both excluded")
+        if self.splats is None:
+            fits = f"take {free_bytes() / _BYTES_PER_SPLAT:.0f} at most"
+            check_room(f"--count {self.count}", _BYTES_PER_SPLAT * self.count, fits)
+        fits = f"take {free_bytes() / _BYTES_PER_PIXEL:.0f} pixels at most"
+        check_room(f"--width {self.width} --height {self.height}", _BYTES_PER_PIXEL * self.width * self.height, fits)
 
     def load(self) -> tuple[sj.Splats, sj.Material]:
         """Give the splats, and the material as it is rendered with them."""
@@ -86,7 +89,7 @@ class Shot:
         """Give a material as it is rendered with splats."""
         if splats.albedo is not None:
             material = material.white()
-            note(f"the splats carry albedo: the weights of {self.material} are divided by their sums (not so with --no-albedo)")
+            note(f"color is the splats' own albedo, and {self.material} only spreads the light; --no-albedo shows its own color")
         material = in_color(material)
         return material if self.scattering else material.opaque()
 
@@ -191,11 +194,8 @@ def frame_parts(parts: Parts, direction: jax.Array, fov: float, width: int, heig
         float(np.max(np.linalg.norm(np.asarray(part.centers) - middle[None], axis=1) + np.asarray(part.radii)))
         for part in parts()
     )
-    if not 0 < fov < 180 or width < 1 or height < 1:
-        distance = 1.0  # `look_at` refuses, and says why
-    else:
-        half_angle = math.atan(math.tan(math.radians(fov) / 2) * min(1.0, width / height))
-        distance = radius / math.sin(half_angle)
+    half_angle = math.atan(math.tan(math.radians(fov) / 2) * min(1.0, width / height))
+    distance = radius / math.sin(half_angle)
     target = jnp.asarray(middle)
     eye = target + distance * direction.astype(target.dtype)
     return sj.Camera.look_at(eye, target, fov=fov, width=width, height=height)

@@ -5,7 +5,7 @@ import math
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import tyro
 
@@ -19,6 +19,14 @@ from ._shot import Shot, draw
 _RECORD = "turntable.json"
 _LARGEST = 16_383  # pixels along a side of a WebP file
 _MOST_FRAMES = 10_000  # that four digits can name
+_TURN = (
+    "What turns: the camera around object and light, the light around object and camera, or the object before both, which is the "
+    "same as camera and light together around it. The fill keeps beside the camera."
+)
+_DEGREES = (
+    "How far camera and light go around in all: to greater azimuths, or to smaller ones if negative. What stands before both "
+    "seems to turn the other way."
+)
 
 
 class Turn(Enum):
@@ -31,14 +39,14 @@ class Turn(Enum):
 
 @dataclass(frozen=True, kw_only=True)
 class Turntable(Shot):
-    """Render the frames of an animation around splats, or the built-in bust: per frame an EXR file with every layer and a PNG
-    file, and in the end turntable.webp, which plays in a browser.
+    """Render the frames of an animation around splats, or the built-in bust.
 
-    Frames begin at --azimuth and --light-azimuth and go on in equal steps; a full turn ends one step before its beginning, so
-    that it plays round and round. The splats are planned and the program is compiled once for all frames. Frames that are there
-    are kept: after an interruption, run the same command again. A record in the folder, turntable.json, sees to it that only
-    frames of one kind come together. Where a launcher has started several processes (SLURM, Open MPI, or JAX_COORDINATOR_ADDRESS,
-    JAX_NUM_PROCESSES and JAX_PROCESS_ID), they share the frames of one folder that all of them see.
+    Per frame an EXR file with every layer and a PNG file; in the end turntable.webp, which plays in a browser. Frames begin
+    at --azimuth and --light-azimuth and go on in equal steps; a full turn ends one step before its beginning, so that it plays
+    round and round. The splats are planned and the program is compiled once for all frames. Frames that are there are kept: after
+    an interruption, run the same command again. A record in the folder, turntable.json, sees to it that only frames of one kind
+    come together. Where a launcher has started several processes (SLURM, Open MPI, or JAX_COORDINATOR_ADDRESS, JAX_NUM_PROCESSES
+    and JAX_PROCESS_ID), they share the frames of one folder that all of them see.
 
     Example: splatjax turntable head.ply --material skin --frames 72 --output head
     """
@@ -47,12 +55,8 @@ class Turntable(Shot):
     """The folder to write to; it is made where its parent exists."""
     frames: int = 36
     """Number of frames."""
-    turn: tyro.conf.EnumChoicesFromValues[Turn] = Turn.OBJECT
-    """What turns: the camera around object and light, the light around object and camera, or the object before both, which
-    is the same as camera and light together around it. The fill keeps beside the camera."""
-    degrees: float = 360.0
-    """How far camera and light go around in all: to greater azimuths, or to smaller ones if negative. What stands before
-    both seems to turn the other way."""
+    turn: Annotated[tyro.conf.EnumChoicesFromValues[Turn], tyro.conf.arg(help=_TURN)] = Turn.OBJECT
+    degrees: Annotated[float, tyro.conf.arg(help=_DEGREES)] = 360.0
     fps: float = 24.0
     """Frames per second of turntable.webp, from 0.1 to 60."""
 

@@ -6,6 +6,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
+from splatjax.gaussians import channel_names
 from splatjax.scattering import Medium
 
 _FIXED = 0.1
@@ -66,7 +67,7 @@ class Estimate(eqx.Module):
     def lines(self, channels: Sequence[str] | None = None) -> list[list[str]]:
         """Give what there is to say of each channel."""
         count = self.medium.eta.shape[0]
-        names = channels or (("red", "green", "blue") if count == 3 else [f"channel {c + 1}" for c in range(count)])
+        names = channels or channel_names(count)
         found, errors = (self.medium.sigma_a, self.medium.sigma_s_prime), self.relative_errors()
         said = []
         for c, (name, (best, worst)) in enumerate(zip(names, self.combinations(), strict=True)):

@@ -105,7 +105,7 @@ def recover(
     while not settled and rounds < _ROUNDS:
         rounds += 1
         medium = unknowns.medium(best.point)
-        say(f"round {rounds}: rendering the {count} layers of {_words(medium)}", medium)
+        say(f"round {rounds}, of {_ROUNDS} at most: rendering the {count} layers of {_words(medium)}", medium)
         fitted = fit_gaussians(model(medium), count, weights=weights, throw=False).gaussians
         surface = surface.surface_of(_unweighed(fitted.variances, len(medium.eta)))
         gathered, plans = gatherer.moving(surface, plans)

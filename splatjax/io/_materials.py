@@ -113,8 +113,8 @@ def load_medium(name_or_path: str | os.PathLike[str]) -> Medium:
     """
     path, tables = _read(name_or_path)
     if "medium" not in tables:
-        have = "its layers, which `load_profile` gives" if "layers" in tables else "its Gaussians, which `load_material` gives"
-        raise ValueError(f"{path}: has no [medium]; known are only {have}")
+        have = "layers (`load_profile`)" if "layers" in tables else "Gaussians, which are ready to render (`load_material`)"
+        raise ValueError(f"{path}: has no [medium]; known are only its {have}")
     return _medium(Table(path, "medium", tables["medium"]))
 
 

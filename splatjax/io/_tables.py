@@ -31,10 +31,13 @@ class Table:
             raise ValueError(f"{self.where} has an unknown entry {unknown[0]!r}; {nearest(unknown[0], known)}")
 
     def unit(self, expected: str, name: str = "unit") -> None:
-        found = self.table.get(name)
-        if found != expected:
-            remedy = "convert the numbers, then name the unit"
-            raise ValueError(f'{self.where} {name} must be "{expected}"; it is {found!r}: {remedy}')
+        """Refuse numbers in another unit, and such as do not say theirs."""
+        if name not in self.table:
+            raise ValueError(f'{self.where} has no {name}; convert the numbers, and say {name} = "{expected}"')
+        if (found := self.table[name]) != expected:
+            raise ValueError(
+                f'{self.where} {name} must be "{expected}"; it is {found!r}: convert the numbers, then name the unit'
+            )
 
     def numbers(self, name: str, expected: str, holds, channels: int | None = None) -> np.ndarray:
         """Give a list of numbers; a single one stands for all channels, if their number is given."""

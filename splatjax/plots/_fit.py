@@ -10,13 +10,15 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 from splatjax.fitting import relative_error
-from splatjax.gaussians import AbstractProfile, SumOfGaussians, gaussian
+from splatjax.gaussians import AbstractProfile, SumOfGaussians, channel_names, gaussian
 from splatjax.scattering import NORM_RULE, AbstractRadialRule
 
 _RGB = ("#c0392b", "#27853f", "#2c5aa0")
 _POINTS = 400
 _TAIL = 1e-7
 """Share of its peak down to which a profile is drawn."""
+_HELD = 1e-6
+"""Relative error of the energy that is rounding."""
 
 
 def plot_fit(
@@ -26,7 +28,7 @@ def plot_fit(
 
     Three channels are drawn in red, green and blue; the single
     Gaussians of the fit, with the mean weight of the channels, in gray.
-    The legend gives the error (Eq. 4) and the energy of the fit relative to the profile's, minus 1.
+    The legend gives the error (Eq. 4) and the energy of the fit relative to the profile's, minus 1: held, if that is rounding.
 
     **Arguments:**
 
@@ -42,7 +44,7 @@ def plot_fit(
     error = np.asarray(relative_error(profile, gaussians, rule))
     energy = np.asarray(gaussians.total_reflectance() / profile.total_reflectance() - 1)
     radii = np.asarray(r)
-    colors = colors_of(len(error))
+    colors, names = colors_of(len(error)), channel_names(len(error))
 
     figure = Figure(figsize=(10, 7.5), layout="constrained")
     grid = figure.add_gridspec(2, 2, height_ratios=(3, 2))
@@ -52,7 +54,8 @@ def plot_fit(
     for part in parts.T:
         log.loglog(radii, part, color="0.75", linewidth=0.8, zorder=1)
     for channel, color in enumerate(colors):
-        label = f"E = {error[channel]:.2e}, energy {energy[channel]:+.2e}"
+        held = "held" if abs(energy[channel]) < _HELD else f"{energy[channel]:+.2e}"
+        label = f"{names[channel]}: E = {error[channel]:.2e}, energy {held}"
         linear.plot(radii, radii * reference[:, channel], color=color, linewidth=3, alpha=0.35)
         linear.plot(radii, radii * fitted[:, channel], color=color, linewidth=1.2, label=label)
         log.loglog(radii, reference[:, channel], color=color, linewidth=3, alpha=0.35)

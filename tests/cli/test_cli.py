@@ -37,6 +37,22 @@ def test_materials_lists_the_library(capsys):
     assert "skin" in listed
 
 
+def test_materials_tells_what_is_known_and_who_published_it(capsys):
+    assert main(["materials"]) == 0
+    lines = {line.split()[0]: line for line in capsys.readouterr().out.splitlines()}
+    assert re.search(r"skin +Gaussians .* d'Eon et al. 2007", lines["skin"])
+    assert re.search(r"skin_layers +layers .* Donner et al. 2005", lines["skin_layers"])
+    assert re.search(r"marble +coefficients .* Jensen et al. 2001", lines["marble"])
+
+
+def test_materials_prints_the_file_of_one_to_begin_with(tmp_path, capsys):
+    assert main(["materials", "marble"]) == 0
+    mine = tmp_path / "mine.toml"
+    mine.write_text(capsys.readouterr().out, encoding="utf-8")
+    np.testing.assert_array_equal(sj.load_material(mine).gaussians.weights, sj.load_material("marble").gaussians.weights)
+    assert "is no known material; did you mean 'marble'?" in failure(["materials", "marbel"], capsys)
+
+
 @pytest.mark.once
 def test_fit_prints_and_writes_a_material_that_loads(tmp_path, capsys):
     output, plot = tmp_path / "mine.toml", tmp_path / "mine.png"
@@ -186,7 +202,7 @@ def test_render_shows_the_bust_and_says_what_it_does(tmp_path, capsys):
     captured = capsys.readouterr()
     picture = output.with_suffix(".png")
     assert captured.out.splitlines() == [str(output), str(picture)]
-    assert "divided by their sums" in captured.err
+    assert "only spreads the light" in captured.err
     frame = sj.read_exr(output)
     np.testing.assert_allclose(np.sum(np.asarray(frame.weights), axis=0), 1.0, rtol=1e-5)
     assert 0.1 < np.mean(np.asarray(frame.coverage)) < 0.9
@@ -226,7 +242,7 @@ def test_color_is_of_the_albedo_or_of_the_material(tmp_path, capsys):
         splats, material = Render(splats=path, material="marble", albedo=worn).load()
         assert (splats.albedo is not None) == worn
         np.testing.assert_allclose(np.asarray(material.gaussians.total_reflectance()), weight, rtol=1e-5)
-        assert ("divided by their sums" in capsys.readouterr().err) == worn
+        assert ("only spreads the light" in capsys.readouterr().err) == worn
 
 
 @pytest.mark.slow

@@ -133,6 +133,8 @@ def test_names_that_are_nearly_right_are_told(tmp_path, capsys, x64):
         assert f"unknown entry {wrong.strip('[]')!r}; did you mean {right.strip('[]')!r}?" in failure(["fit", path], capsys)
     path.write_text(OWN.replace('"1/mm"', '"1/cm"'))
     assert "unit must be \"1/mm\"; it is '1/cm': convert the numbers" in failure(["fit", path], capsys)
+    path.write_text(OWN.replace('unit = "1/mm"\n', "", 1))
+    assert 'has no unit; convert the numbers, and say unit = "1/mm"' in failure(["fit", path], capsys)
     beyond_single = () if x64 else ("1e-60", "1e60")  # nothing, and infinite
     for value in ("true", '"0.1"', *beyond_single):
         path.write_text(OWN.replace("2.19", value))
@@ -151,6 +153,21 @@ def test_what_cannot_fit_is_refused_with_what_would(words, said, tmp_path, capsy
     line = failure(["render", *words, "--output", tmp_path / "o.exr"], capsys)
     assert said in line
     assert re.search(r"take \d+ (pixels )?at most", line)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--width", "0"], "--width is 0; it must be 1 or more"),
+        (["--height", "-3"], "--height is -3; it must be 1 or more"),
+        (["--count", "0"], "--count is 0; it must be 1 or more"),
+        (["--fov", "180"], "--fov is 180; it must lie between 0 and 180 degrees"),
+        (["--fov", "nan"], "--fov is nan; it must lie between 0 and 180 degrees"),
+    ],
+)
+def test_a_size_that_cannot_be_is_refused_before_splats_are_read(words, said, tmp_path, capsys):
+    nowhere = tmp_path / "missing.ply"
+    assert said in failure(["render", nowhere, *words, "--output", tmp_path / "o.exr"], capsys)
 
 
 def test_a_cut_without_effect_is_refused(capsys):

@@ -181,7 +181,7 @@ def test_an_unknown_name_suggests_the_nearest(name, hint):
         (GOOD_MEDIUM.replace("[1.0]", "[true]"), r"\[medium\] sigma_s_prime must be a list of numbers"),
         (GOOD_MEDIUM.replace("[1.0]", "[1.0, 2.0]"), r"one number per channel; they have 1, 2 and 1"),
         (GOOD_MEDIUM.replace("1/mm", "1/cm"), r'\[medium\] unit must be "1/mm"; it is \'1/cm\''),
-        (GOOD_MEDIUM.replace('unit = "1/mm"\n', ""), r'\[medium\] unit must be "1/mm"; it is None'),
+        (GOOD_MEDIUM.replace('unit = "1/mm"\n', ""), r'\[medium\] has no unit; convert the numbers, and say unit = "1/mm"'),
         (GOOD_MEDIUM.replace("eta = 1.3\n", ""), r"\[medium\] has no eta"),
         (GOOD_MEDIUM, r"has no \[fit\]"),
         (GOOD_MEDIUM.replace("eta", "=eta"), r"is no TOML file"),

@@ -28,8 +28,16 @@ def test_axes_have_names_and_units(figure):
 def test_legend_gives_error_and_energy(figure):
     labels = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
     assert len(labels) == 3
-    assert labels[0].startswith("E = 4.2")
-    assert "energy" in labels[0]
+    assert labels[0].startswith("red: E = 4.2")
+    assert [label.partition(":")[0] for label in labels] == ["red", "green", "blue"]
+    assert all(label.endswith("energy held") for label in labels)
+
+
+def test_legend_gives_the_energy_that_is_missed():
+    gaussians = load_material("marble").gaussians
+    less = SumOfGaussians(gaussians.variances, 0.99 * gaussians.weights)
+    label = plot_fit(gaussians, less).axes[0].get_legend().get_texts()[0].get_text()
+    assert label.endswith("energy -1.00e-02")
 
 
 def test_it_is_drawn_outside_of_pyplot_and_written(figure, tmp_path):
