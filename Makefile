@@ -88,7 +88,7 @@ out/notebooks/shape_from_shading.ipynb out/notebooks/which_profile.ipynb: COMPIL
 out/notebooks/%.ipynb: notebooks/%.py $(SOURCES) | $(VENV)/docs
 	mkdir -p out/notebooks/running
 	$(BIN)/jupytext --quiet --to ipynb --output out/notebooks/running/$*.ipynb $<
-	cd out/notebooks/running && XLA_FLAGS="$(COMPILED) $$XLA_FLAGS" $(abspath $(BIN))/jupyter-execute --inplace --timeout 3600 $*.ipynb
+	cd out/notebooks/running && XLA_FLAGS="$(COMPILED)$${XLA_FLAGS:+ $$XLA_FLAGS}" $(abspath $(BIN))/jupyter-execute --inplace --timeout 3600 $*.ipynb
 	mv out/notebooks/running/$*.ipynb $@
 
 $(VENV)/docs: requirements-docs.lock $(VENV)/ready

@@ -103,17 +103,34 @@ def smooth(outline: list[tuple[float, float]], step: float = 0.5, width: float =
     return np.maximum(rounded, [[0.0, -np.inf]])
 
 
+def on(head: sj.Splats, place: tuple[float, float, float]) -> np.ndarray:
+    """Give a place in heights of a head, from halfway up its foremost."""
+    centers = np.asarray(head.centers)
+    low, high = centers.min(axis=0), centers.max(axis=0)
+    tall = high[1] - low[1]
+    return np.asarray([centers[:, 0].mean(), low[1] + 0.52 * tall, high[2]]) + tall * np.asarray(place)
+
+
 def skin(head: sj.Splats, side: int, which: int) -> np.ndarray:
     """A head, its nose and eyes, and the nose's shadow: the same skin from three distances."""
-    middle = np.asarray(head.centers).mean(axis=0)
-    low, high = (np.asarray(getattr(head.centers, end)(axis=0)) for end in ("min", "max"))
-    tall = float(high[1] - low[1])
-    place = np.asarray([middle[0], low[1] + 0.52 * tall, high[2]])
-    targets = (np.asarray([0, 0.0, -0.3]), np.asarray([0.10, -0.02, -0.06]), np.asarray([0.084, -0.107, -0.053]))
-    fov, eye = (21.0, 8.0, 4.2)[which], place + tall * np.asarray([1.1, 0.1, 2.4])
+    eye, target = on(head, (1.1, 0.1, 2.4)), on(head, ((0, 0, -0.3), (0.10, -0.02, -0.06), (0.084, -0.107, -0.053))[which])
     lights = sun(-0.9, 0.7, 0.9, 1.0, (1.0, 0.97, 0.92)), sun(1.0, 0.1, -0.3, 0.5, (0.8, 0.9, 1.0)), fill(0.8, 0, 1, 0.06)
+    return render(head, lights, sj.load_material("skin").white(), looking(eye, target, (21.0, 8.0, 4.2)[which], side), 0.4)
+
+
+def face(head: sj.Splats, side: int, scattering: bool) -> np.ndarray:
+    """A face, with light that spreads below its skin or without."""
+    eye, target = on(head, (0.62, 0.02, 2.1)), on(head, (0.085, -0.05, -0.08))
+    lights = sun(-0.95, 0.55, 0.75, 1.0, (1.0, 0.97, 0.92)), sun(1.0, 0.15, -0.45, 0.7, (0.8, 0.9, 1.0)), fill(0.8, 0, 1, 0.05)
     material = sj.load_material("skin").white()
-    return render(head, lights, material, looking(eye, place + tall * targets[which], fov, side), 0.4)
+    return render(head, lights, material if scattering else material.opaque(), looking(eye, target, 7.5, side), 0.5)
+
+
+def ear(head: sj.Splats, side: int) -> np.ndarray:
+    """An ear with the sun behind it."""
+    eye, target = on(head, (1.7, 0.0, 1.3)), on(head, (0.275, -0.01, -0.45))
+    lights = sun(0.22, 0.25, -1.0, 3.0, (1.0, 0.95, 0.88)), sun(-0.5, 0.4, 1.0, 0.3, (0.8, 0.9, 1.0)), fill(1, 0.1, 0.7, 0.11)
+    return render(head, lights, sj.load_material("skin").white(), looking(eye, target, 9.5, side), 0.2)
 
 
 def marble_bust(_: sj.Splats, side: int) -> np.ndarray:
@@ -224,6 +241,9 @@ PICTURES: dict[str, Callable[[sj.Splats, int], np.ndarray]] = {
     "skin_far": functools.partial(skin, which=0),
     "skin_near": functools.partial(skin, which=1),
     "skin_close": functools.partial(skin, which=2),
+    "head_skin": functools.partial(face, scattering=True),
+    "head_plain": functools.partial(face, scattering=False),
+    "head_ear": ear,
     "marble_bust": marble_bust,
     "milk_glass": milk_glass,
     "jade": jade,
@@ -243,7 +263,7 @@ def main() -> None:
         parser.error(f"{unknown[0]} is no picture of the gallery; give some of {', '.join(PICTURES)}")
     names = given.names or list(PICTURES)
     head = None
-    if any(name.startswith("skin") for name in names):
+    if any(name.startswith(("head", "skin")) for name in names):
         head = sj.bust(400_000) if given.head is None else sj.read_splats(given.head)
     FOLDER.mkdir(parents=True, exist_ok=True)
     for name in names:

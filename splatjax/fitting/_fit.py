@@ -65,19 +65,23 @@ def fit_gaussians(
     - `count`: number of Gaussians, at least 1; or `LeastCount(error)`, the least that leaves no more than that.
     - `spread`: `SharedVariances()` (default) or `VariancesPerChannel()`.
     - `weights`: `FreeWeights()` (default), `TotalReflectanceHeld()`, or `NonNegativeWeights()` among either.
-    - `start`: `InsertedGaussians()` (default), which finds the best fit; or `GivenVariances(...)` near it, which is fast.
+    - `start`: `InsertedGaussians()` (default), which finds the best fit; or `GivenVariances(...)` near it, which is fast. Of a
+      given count alone: the least one is found by inserting.
     - `rule`: radii of the integral, in length scales of the profile; or `InverseVariance()`, for one with standard errors.
     - `throw`: raise if the search has not converged; otherwise `result` says so.
 
     **Returns:** a `FitResult`; neither `error` nor `weights` depends on the unit of length.
 
-    **Raises:** `ValueError` for a count below 1, for an error that no count reaches, and for a profile that is infinite at the
-    origin unless the rule starts beyond it (`NORM_RULE.beyond`); an error with the message of `result` if `throw`.
+    **Raises:** `ValueError` for a count below 1, for an error that no count reaches, for a `start` without a count, and for a
+    profile that is infinite at the origin unless the rule starts beyond it (`NORM_RULE.beyond`); an error with the message of
+    `result` if `throw`.
 
     **Source:** Kim et al. 2010, Eq. 3; variable projection: Golub and Pereyra 1973.
     """
     if not isinstance(count, LeastCount):
         check_count("count", count)
+    elif start is not None:
+        raise ValueError(f"start is given, and {count}, which finds its own; leave start out, or give a count")
     spread = SharedVariances() if spread is None else spread
     weights = FreeWeights() if weights is None else weights
     start = InsertedGaussians() if start is None else start

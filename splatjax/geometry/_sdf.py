@@ -6,11 +6,6 @@ Point = tuple[np.ndarray, np.ndarray, np.ndarray]
 Size = float | int
 
 
-def ball(p: Point, center, radius: Size) -> np.ndarray:
-    """Give the distance to a sphere."""
-    return np.sqrt(sum((x - c) ** 2 for x, c in zip(p, center, strict=True))) - radius
-
-
 def ellipsoid(p: Point, center, radii) -> np.ndarray:
     """Give the distance to an ellipsoid, to first order (exact on it): `k (k - 1) / |grad k^2 / 2|`, `k = |p / r|`."""
     scaled = [(x - c) / r for x, c, r in zip(p, center, radii, strict=True)]

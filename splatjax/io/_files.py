@@ -1,5 +1,6 @@
 """What every reader asks of a file before it looks inside."""
 
+import math
 import os
 from pathlib import Path
 from urllib.parse import unquote
@@ -16,6 +17,12 @@ def existing_file(path: str | os.PathLike[str]) -> Path:
     if path.is_dir():
         raise IsADirectoryError(f"{path}: is a folder; name a file")
     return path
+
+
+def check_unit(path: Path, mm_per_unit: float) -> None:
+    """Refuse a length of the unit (mm) that is none."""
+    if not 0 < mm_per_unit < math.inf:
+        raise ValueError(f"{path}: mm_per_unit is {mm_per_unit}; it must be the positive length of the file's unit in mm")
 
 
 def file_beside(path: Path, name: str, *, encoded: bool = False) -> Path:

@@ -9,7 +9,7 @@ import numpy as np
 from splatjax.geometry import Mesh, Textures, cut_below, sample_mesh as sample_surface
 from splatjax.scene import Splats
 
-from ._files import existing_file
+from ._files import check_unit, existing_file
 from ._gltf import read_gltf
 from ._obj import read_obj
 from ._pictures import read_color, read_factor, read_vectors
@@ -117,8 +117,7 @@ def read_mesh(path: Name, *, mm_per_unit: float, v_up: bool | None = None, dress
     **Raises:** `FileNotFoundError`, or `ValueError` when the file cannot be read, has no triangle, or values not finite.
     """
     path = existing_file(path)
-    if not (np.isfinite(mm_per_unit) and mm_per_unit > 0):
-        raise ValueError(f"{path}: mm_per_unit is {mm_per_unit}; it must be the positive length of the file's unit in mm")
+    check_unit(path, mm_per_unit)
     kind = path.suffix.lower()
     if kind not in _READERS:
         raise ValueError(f"{path}: {kind or 'no suffix'} is no mesh format known here; give one of {', '.join(_READERS)}")

@@ -100,7 +100,11 @@ def _camera(table: Table, width: int, height: int) -> Camera:
     table.only({"position", "target", "up", "fov"})
     up = _vector(table, "up") if "up" in table.table else None
     fov = table.number("fov", "between 0 and 180 degrees", lambda x: 0 < x < 180, 25.0)
-    return Camera.look_at(_vector(table, "position"), _vector(table, "target"), up=up, fov=fov, width=width, height=height)
+    position, target = _vector(table, "position"), _vector(table, "target")
+    try:
+        return Camera.look_at(position, target, up=up, fov=fov, width=width, height=height)
+    except ValueError as error:
+        raise ValueError(f"{table.where} {error}") from None
 
 
 def _light(table: Table, channels: int) -> AbstractLight:

@@ -11,7 +11,7 @@ from splatjax.geometry import complete_splats, unit
 from splatjax.scene import Splats
 
 from ._atomic import atomic_path
-from ._files import existing_file
+from ._files import check_unit, existing_file
 from ._mesh import MESHES_ALONE
 from ._pieces import moderate
 from ._ply_columns import Table, colors_of, columns_of, normals_of, places_of, vertex_table
@@ -105,12 +105,6 @@ def write_splats(path: str | os.PathLike[str], splats: Splats) -> None:
     element = plyfile.PlyElement.describe(table, "vertex")
     with atomic_path(path) as temporary:
         plyfile.PlyData([element], text=False, byte_order="<", comments=comments).write(str(temporary))
-
-
-def check_unit(path: Path, mm_per_unit: float) -> None:
-    """Refuse a length of the unit (mm) that is none."""
-    if not (np.isfinite(mm_per_unit) and mm_per_unit > 0):
-        raise ValueError(f"{path}: mm_per_unit is {mm_per_unit}; it must be the positive length of the file's unit in mm")
 
 
 def check_place(path: Path, centers: np.ndarray, *, estimated: bool) -> None:

@@ -11,10 +11,10 @@ import plyfile
 from splatjax.geometry import unit
 from splatjax.scene import Splats
 
-from ._files import existing_file
+from ._files import check_unit, existing_file
 from ._library import readable
 from ._pieces import moderate
-from ._ply import AREA, RADIUS, check_place, check_unit, factor_of, positive_of
+from ._ply import AREA, RADIUS, check_place, factor_of, positive_of
 from ._ply_columns import Table, colors_of, normals_of, places_of
 
 _PART = 1_000_000

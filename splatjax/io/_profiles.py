@@ -15,6 +15,7 @@ from splatjax.scattering import Tabulated
 from splatjax.scene import Material
 
 from ._atomic import atomic_path
+from ._files import check_unit, existing_file
 from ._tables import rounded
 
 _UNITS = {"mm": 1.0, "cm": 10.0, "um": 1e-3, "µm": 1e-3}
@@ -36,11 +37,8 @@ def read_profile(path: str | os.PathLike[str], *, mm_per_unit: float = 1.0) -> T
 
     **Raises:** `FileNotFoundError`, and `ValueError` for what is no such table: file, line and what is wrong.
     """
-    path = Path(path)
-    if not mm_per_unit > 0:
-        raise ValueError(f"mm_per_unit must be positive; got {mm_per_unit:g}")
-    if not path.exists():
-        raise FileNotFoundError(f"{path}: there is no such file; check the path")
+    path = existing_file(path)
+    check_unit(path, mm_per_unit)
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except UnicodeDecodeError as error:
@@ -53,7 +51,7 @@ def read_profile(path: str | os.PathLike[str], *, mm_per_unit: float = 1.0) -> T
         cells = [cell.strip() for cell in next(csv.reader([line]))]
         if not rows and not named and not _is_number(cells[0]):
             named = True
-            _check_unit(path, number, line, mm_per_unit)
+            _check_named_unit(path, number, line, mm_per_unit)
             continue
         bad = next((cell for cell in cells if not _is_number(cell) or not math.isfinite(rounded(float(cell)))), None)
         if bad is not None:
@@ -85,7 +83,7 @@ def save_exports(material: Material, path: str | os.PathLike[str]) -> None:
         temporary.write_text(json.dumps(data_sheet(material.gaussians), indent=2) + "\n", encoding="utf-8")
 
 
-def _check_unit(path: Path, number: int, line: str, mm_per_unit: float) -> None:
+def _check_named_unit(path: Path, number: int, line: str, mm_per_unit: float) -> None:
     """Refuse names that speak of another unit of length than is given, such as `r (cm)`; mm where none is given."""
     for unit, size in _UNITS.items():
         if re.search(rf"(?<![A-Za-z]){unit}(?![A-Za-z])", line) and not math.isclose(size, mm_per_unit, rel_tol=1e-6):

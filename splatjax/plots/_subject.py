@@ -67,7 +67,7 @@ def picture_grid(
 
     **Arguments:**
 
-    - `rows`: of pictures `[height, width, 3]`, or `None` for an empty place.
+    - `rows`: of pictures `[height, width, 3]`.
     - `titles`: of the columns.
     - `names`: of the rows.
     - `inches`: height of a picture.

@@ -39,7 +39,8 @@ def render(
 
     **Returns:** a `Frame` in the dtype of `splats.centers`; the same on every device, and to rounding whatever the mesh.
 
-    **Raises:** `ValueError` when a plan is needed and not given, or is not for this mesh, or when the scene's channels disagree.
+    **Raises:** `ValueError` when a plan is needed and not given, or is for another mesh or another number of splats, or when the
+    scene's channels disagree.
     """
     settings = RenderSettings() if settings is None else settings
     check_channels(scene)

@@ -4,7 +4,12 @@ import math
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
+
+_ALONG = 1e-6
+"""Sine of an angle in which single precision knows no direction."""
 
 
 class Camera(eqx.Module):
@@ -43,13 +48,15 @@ class Camera(eqx.Module):
     ) -> "Camera":
         """Place a camera at `eye` (mm) that looks at `target` (mm), with vertical field of view `fov` in degrees.
 
-        **Raises:** `ValueError` when the field of view or the size of the picture is out of range.
+        **Raises:** `ValueError` when the field of view or the size of the picture is out of range, and, unless they are traced,
+        for an eye, a target and an `up` on one line.
         """
         if not 0 < fov < 180:
             raise ValueError(f"fov must lie between 0 and 180 degrees, not {fov}")
         if width < 1 or height < 1:
             raise ValueError(f"a picture of {width} x {height} pixels has no pixel; width and height must be at least 1")
         up = jnp.asarray([0.0, 1.0, 0.0], eye.dtype) if up is None else up
+        _check_directions(eye, target, up)
         forward = target - eye
         forward = forward / jnp.linalg.norm(forward)
         right = jnp.cross(forward, up)
@@ -57,3 +64,15 @@ class Camera(eqx.Module):
         down = jnp.cross(forward, right)
         focal_length = jnp.asarray(0.5 / math.tan(math.radians(fov) / 2), eye.dtype)
         return cls(eye, jnp.stack([right, down, forward]), focal_length, width, height, near)
+
+
+def _check_directions(eye: Float[Array, "3"], target: Float[Array, "3"], up: Float[Array, "3"]) -> None:
+    """Refuse what gives no axes; traced values are trusted."""
+    if any(isinstance(each, Tracer) for each in (eye, target, up)):
+        return
+    forward = np.asarray(target, np.float64) - np.asarray(eye, np.float64)
+    if not np.linalg.norm(forward) > 0:
+        raise ValueError(f"the camera stands at {np.asarray(eye).tolist()}, where it looks at; move one of them")
+    upright = np.linalg.norm(np.cross(forward, np.asarray(up, np.float64)))
+    if not upright > _ALONG * np.linalg.norm(forward) * np.linalg.norm(np.asarray(up)):
+        raise ValueError(f"up is {up.tolist()}, along the line of sight; give another, such as [0, 0, -1] to look down")

@@ -34,7 +34,7 @@ class Footprints(eqx.Module):
     c: Float[Array, " splats"]
     nearness: Float[Array, " splats"]
     shift: Float[Array, " splats"]
-    """How the surface is moved away by epsilon (4.1); not differentiated."""
+    """How the surface is moved away by epsilon (3.1); not differentiated."""
     opacity: Float[Array, " splats"]
     """What the screen filter leaves of the peak weight: 1 for large frontal splats, 0 edge on."""
     left: Float[Array, " splats"]

@@ -103,6 +103,8 @@ def test_the_least_count_that_reaches_an_error(float64):
     np.testing.assert_allclose(relative_error(marble(), fitted.gaussians), fitted.error, rtol=1e-9)
     with pytest.raises(ValueError, match=r"an error of 1e-06 is not reached: 4 Gaussians leave .* allow more"):
         by_count.least(1e-6)
+    with pytest.raises(ValueError, match=r"start is given, and LeastCount\(.*, which finds its own; leave start out"):
+        fit_gaussians(marble(), LeastCount(wanted, largest=4), start=by_count.start(3))
     with pytest.raises(ValueError, match="depends on values; find it outside of jit"):
         jax.jit(lambda error: eqx.tree_at(lambda b: b.error, by_count, error).least(0.1))(by_count.error)
     with pytest.raises(ValueError, match="largest must be a whole number of Gaussians, at least 1; got 0"):

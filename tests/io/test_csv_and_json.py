@@ -43,8 +43,13 @@ def test_a_bad_table_is_refused_with_its_line(tmp_path, text, complaint):
 def test_a_missing_table_and_a_bad_unit_are_refused(tmp_path):
     with pytest.raises(FileNotFoundError, match="there is no such file"):
         read_profile(tmp_path / "none.csv")
-    with pytest.raises(ValueError, match="mm_per_unit must be positive; got 0"):
-        read_profile(tmp_path / "none.csv", mm_per_unit=0.0)
+    path = tmp_path / "one.csv"
+    path.write_text("0.1, 1\n0.2, 0.5\n")
+    for unit in (0.0, -1.0, float("inf"), float("nan")):
+        with pytest.raises(ValueError, match=rf"one\.csv: mm_per_unit is {unit}; it must be the positive length"):
+            read_profile(path, mm_per_unit=unit)
+    with pytest.raises(IsADirectoryError, match="is a folder; name a file"):
+        read_profile(tmp_path)
 
 
 def test_exports_are_written_whole(tmp_path):

@@ -30,6 +30,9 @@ def test_a_split_slab_is_the_whole(float32):
     agree(whole.total_transmittance, split.total_transmittance)
     absorbed = type(split.absorbed)(split.absorbed.value.sum(0), jnp.linalg.norm(split.absorbed.deviation, axis=0))
     agree(whole.absorbed, absorbed)
+    through = whole.transmitted_profile()
+    np.testing.assert_array_equal(through.total_reflectance(), whole.total_transmittance.value)
+    np.testing.assert_array_equal(through.values, whole.transmitted.value)
     # Ring by ring, where many photons leave.
     many = np.asarray(whole.reflected.deviation[:, 0]) < 0.05 * np.asarray(whole.reflected.value[:, 0])
     pull = (whole.reflected.value - split.reflected.value) / np.hypot(whole.reflected.deviation, split.reflected.deviation)
