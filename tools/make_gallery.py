@@ -120,17 +120,17 @@ def skin(head: sj.Splats, side: int, which: int) -> np.ndarray:
 
 def face(head: sj.Splats, side: int, scattering: bool) -> np.ndarray:
     """A face, with light that spreads below its skin or without."""
-    eye, target = on(head, (0.62, 0.02, 2.1)), on(head, (0.085, -0.05, -0.08))
+    eye, target = on(head, (0.62, 0.02, 2.1)), on(head, (0.07, -0.07, -0.08))
     lights = sun(-0.95, 0.55, 0.75, 1.0, (1.0, 0.97, 0.92)), sun(1.0, 0.15, -0.45, 0.7, (0.8, 0.9, 1.0)), fill(0.8, 0, 1, 0.05)
     material = sj.load_material("skin").white()
-    return render(head, lights, material if scattering else material.opaque(), looking(eye, target, 7.5, side), 0.5)
+    return render(head, lights, material if scattering else material.opaque(), looking(eye, target, 10.0, side), 0.5)
 
 
 def ear(head: sj.Splats, side: int) -> np.ndarray:
     """An ear with the sun behind it."""
-    eye, target = on(head, (1.7, 0.0, 1.3)), on(head, (0.275, -0.01, -0.45))
+    eye, target = on(head, (1.7, 0.0, 1.3)), on(head, (0.305, -0.02, -0.46))
     lights = sun(0.22, 0.25, -1.0, 3.0, (1.0, 0.95, 0.88)), sun(-0.5, 0.4, 1.0, 0.3, (0.8, 0.9, 1.0)), fill(1, 0.1, 0.7, 0.11)
-    return render(head, lights, sj.load_material("skin").white(), looking(eye, target, 9.5, side), 0.2)
+    return render(head, lights, sj.load_material("skin").white(), looking(eye, target, 7.6, side), 0.3)
 
 
 def marble_bust(_: sj.Splats, side: int) -> np.ndarray:

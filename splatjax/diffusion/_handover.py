@@ -10,7 +10,8 @@ from splatjax.scene import Splats
 
 from ._settings import DiffusionSettings
 
-_SAMPLES = 64
+PLACES = 64
+"""Splats that are asked how evenly all are spread."""
 
 
 @eqx.filter_jit
@@ -22,7 +23,7 @@ def irregularity(splats: Splats) -> Float[Array, ""]:
     """
     if splats.count < 2:
         return jnp.zeros((), splats.centers.dtype)
-    places = jnp.linspace(0, splats.count - 1, min(_SAMPLES, splats.count)).astype(jnp.int32)
+    places = jnp.linspace(0, splats.count - 1, min(PLACES, splats.count)).astype(jnp.int32)
     centers = stop_gradient(splats.centers).T
 
     def nearest(place):

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import tomli_w
 
+from splatjax.exports import plain_numbers
 from splatjax.gaussians import SumOfGaussians
 from splatjax.scattering import (
     BetterDipole,
@@ -161,18 +162,18 @@ def save_material(
     elif profile is not None:
         tables["medium"] = _plain_medium(profile.medium)
     surface = {"eta": material.eta, "specular": material.specular, "roughness": material.roughness}
-    tables["surface"] = {name: _plain(value) for name, value in surface.items()}
+    tables["surface"] = {name: plain_numbers(value) for name, value in surface.items()}
     if material.single_scattering is not None:
-        strength = _plain(material.single_scattering.strength)
+        strength = plain_numbers(material.single_scattering.strength)
         tables["single_scattering"] = {**_plain_medium(material.single_scattering.medium), "strength": strength}
     tables["source"] = dict(source or {})
     gaussians = material.gaussians
     tables["fit"] = {
         "unit": VARIANCE_UNIT,
-        "variances": _plain(gaussians.variances),
-        "weights": _plain(gaussians.weights),
+        "variances": plain_numbers(gaussians.variances),
+        "weights": plain_numbers(gaussians.weights),
         **({} if profile is None else {"profile": _description(profile)}),
-        **{name: value if isinstance(value, str | int | float) else _plain(value) for name, value in (fit or {}).items()},
+        **{name: value if isinstance(value, str | int | float) else plain_numbers(value) for name, value in (fit or {}).items()},
     }
     with atomic_path(path) as temporary:
         temporary.write_text(_one_line_arrays(tomli_w.dumps(tables)), encoding="utf-8")
@@ -205,13 +206,13 @@ def _description(profile: Dipole | BetterDipole | PhotonBeam | LayeredMultipole)
 
 def _plain_medium(medium: Medium) -> dict[str, Any]:
     coefficients = {"sigma_a": medium.sigma_a, "sigma_s_prime": medium.sigma_s_prime, "eta": medium.eta}
-    return {"unit": COEFFICIENT_UNIT, **{name: _plain(values) for name, values in coefficients.items()}}
+    return {"unit": COEFFICIENT_UNIT, **{name: plain_numbers(values) for name, values in coefficients.items()}}
 
 
 def _plain_layer(layer: Layer | Film) -> dict[str, Any]:
     if isinstance(layer, Film):
-        return {"optical_depth": _plain(layer.optical_depth)}
-    return {"thickness": _plain(layer.thickness), "thickness_unit": THICKNESS_UNIT, **_plain_medium(layer.medium)}
+        return {"optical_depth": plain_numbers(layer.optical_depth)}
+    return {"thickness": plain_numbers(layer.thickness), "thickness_unit": THICKNESS_UNIT, **_plain_medium(layer.medium)}
 
 
 def _layered(path: Path, found: Any) -> LayeredMultipole:
@@ -294,15 +295,6 @@ def _read(name_or_path: str | os.PathLike[str]) -> tuple[Path, dict[str, Any]]:
     if "layers" in tables:
         _layered(path, tables["layers"])
     return path, tables
-
-
-def _plain(values: Any) -> Any:
-    """Python numbers, as short as they can be and still be read back the same."""
-    values = np.asarray(values)
-    if values.dtype == np.float32:
-        # Not `str`, which shows six digits once colour-science has been imported.
-        return np.vectorize(lambda x: float(np.format_float_scientific(x)), otypes=[object])(values).tolist()
-    return values.tolist()
 
 
 def _one_line_arrays(text: str) -> str:

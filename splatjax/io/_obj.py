@@ -10,9 +10,10 @@ import numpy as np
 
 from ._color import srgb_to_linear
 from ._files import file_beside
-from ._library import check_fans, fan, merged, readable
+from ._library import readable
 from ._pictures import read_color
 from ._pieces import Piece, check_places
+from ._polygons import check_fans, fan, merged
 
 _TABLES = {"v": range(3, 8), "vt": range(2, 4), "vn": range(3, 4)}
 _CURVES = {"curv", "curv2", "surf", "bzp", "bsp", "cdc", "cdp", "res"}

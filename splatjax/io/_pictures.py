@@ -14,7 +14,7 @@ from ._color import srgb_to_linear
 from ._files import existing_file
 from ._room import check_room
 
-_BYTES_PER_PIXEL = 80.0  # of three channels in double precision, while they are decoded
+BYTES_PER_PIXEL = 80.0  # of three channels in double precision, while they are decoded
 _GRAY = (0.299, 0.587, 0.114)  # Pillow's
 
 
@@ -45,7 +45,7 @@ def _read(path: str | os.PathLike[str], mode: str, encoded: bytes | None = None)
             with opened() as picture:
                 width, height = picture.size
                 size = f"a picture of {width} x {height} pixels"
-                check_room(f"{path}: {size}", _BYTES_PER_PIXEL * width * height, "give a smaller one")
+                check_room(f"{path}: {size}", BYTES_PER_PIXEL * width * height, "give a smaller one")
                 _check_whole(picture)
                 if not _of_16_bits(picture):
                     return _values(picture, mode)

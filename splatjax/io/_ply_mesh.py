@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 
 from ._files import file_beside
-from ._library import check_fans, fans
 from ._pictures import read_color
 from ._pieces import Piece, check_places
 from ._ply_columns import colors_of, columns_of, normals_of, places_of, vertex_table
 from ._ply_tables import PlyFile, Ragged, read_ply
+from ._polygons import check_fans, fans
 
 _LISTS = ("vertex_indices", "vertex_index")
 _COORDINATES = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"))

@@ -1,7 +1,6 @@
-"""Measured profiles, and fits for other programs."""
+"""Measured profiles."""
 
 import csv
-import json
 import math
 import os
 import re
@@ -10,11 +9,8 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
-from splatjax.exports import data_sheet
 from splatjax.scattering import Tabulated
-from splatjax.scene import Material
 
-from ._atomic import atomic_path
 from ._files import check_unit, existing_file
 from ._tables import rounded
 
@@ -68,19 +64,6 @@ def read_profile(path: str | os.PathLike[str], *, mm_per_unit: float = 1.0) -> T
         return Tabulated(jnp.asarray(table[:, 0] * mm_per_unit, dtype), jnp.asarray(table[:, 1:] / mm_per_unit**2, dtype))
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
-
-
-def save_exports(material: Material, path: str | os.PathLike[str]) -> None:
-    r"""Write a material's Gaussians in the terms of other renderers to a JSON file (`splatjax.exports.data_sheet`), whole or not
-    at all.
-
-    **Raises:** `ValueError` for a material with single scattering as a term of its own, which other renderers have no number for;
-    `OSError` if the file cannot be written.
-    """
-    if material.single_scattering is not None:
-        raise ValueError(f"{path}: the material has single scattering besides its Gaussians; fit it without, then export")
-    with atomic_path(path) as temporary:
-        temporary.write_text(json.dumps(data_sheet(material.gaussians), indent=2) + "\n", encoding="utf-8")
 
 
 def _check_named_unit(path: Path, number: int, line: str, mm_per_unit: float) -> None:

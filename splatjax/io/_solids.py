@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 
 from ._color import srgb_to_linear
-from ._library import check_fans, fan, merged, readable
+from ._library import readable
 from ._pieces import Piece, check_places
+from ._polygons import check_fans, fan, merged
 
 _OFF = ("OFF", "NOFF", "COFF", "CNOFF")
 

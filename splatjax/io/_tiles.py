@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from ._pictures import BYTES_PER_PIXEL
 from ._pieces import Piece, Wrap
 from ._room import check_room
 
 _FARTHEST = 2.0  # that coordinates may reach beyond a border, in tiles
-_BYTES_PER_PIXEL = 80.0
 
 
 def tiled(path: Path, piece: Piece, *, upside_down: bool) -> Piece:
@@ -52,7 +52,7 @@ def _widened(
             )
         before = after = start = int(np.ceil(beyond * size)) + 1
     pixels = picture.shape[1 - axis] * (size + before + after)
-    check_room(f"{path}: a texture of {pixels} pixels", _BYTES_PER_PIXEL * pixels, "bring its coordinates to [0, 1]")
+    check_room(f"{path}: a texture of {pixels} pixels", BYTES_PER_PIXEL * pixels, "bring its coordinates to [0, 1]")
     widths = [(0, 0)] * 3
     widths[axis] = (before, after)
     return np.pad(picture, widths, mode=wrap), (along * size + start) / (size + before + after)

@@ -8,7 +8,7 @@ from matplotlib.patches import Circle
 
 from splatjax.gaussians import SumOfGaussians, gaussian
 
-from ._fit import colors_of
+from ._fit import colors_of, single_gaussians
 
 _POINTS = 400
 _DECADES = 4.0
@@ -39,10 +39,10 @@ def figure_3(gaussians: SumOfGaussians, *, title: str | None = None) -> Figure:
     figure = Figure(figsize=(1.7 * len(widths) + 0.4, 6.2), dpi=150, layout="constrained")
     grid = figure.add_gridspec(2, len(widths), height_ratios=(1, 1.9))
     line = np.linspace(-reach, reach, 181)
-    squared = line[:, None] ** 2 + line[None] ** 2
+    squared = jnp.asarray(line[:, None] ** 2 + line[None] ** 2)
     for column, (width, weight) in enumerate(zip(widths, weights, strict=True)):
         axes = figure.add_subplot(grid[0, column])
-        spread = weight.mean() * np.exp(-0.5 * squared / width**2) / (2 * np.pi * width**2)
+        spread = weight.mean() * np.asarray(gaussian(jnp.full_like(squared, width**2), squared))
         shades = LogNorm(peak * 10**-_DECADES, peak)
         axes.imshow(np.maximum(spread, 1e-30), cmap="magma", norm=shades, extent=(-reach, reach, -reach, reach))
         axes.add_patch(Circle((0, 0), width, fill=False, color="white", linewidth=0.6, linestyle=":"))
@@ -54,9 +54,7 @@ def figure_3(gaussians: SumOfGaussians, *, title: str | None = None) -> Figure:
     r = np.linspace(0, reach, _POINTS)
     radii = jnp.asarray(r)
     total = np.asarray(gaussians(radii), np.float64)
-    shape = (len(r), len(widths))
-    single = gaussian(jnp.broadcast_to(jnp.asarray(widths**2), shape), jnp.broadcast_to((radii * radii)[:, None], shape))
-    single = np.asarray(single, np.float64) * weights.mean(axis=1)[None]
+    single = np.asarray(single_gaussians(gaussians, radii), np.float64)[:, order]
     below = np.zeros_like(r)
     for column in range(len(widths)):
         shade = str(0.45 + 0.5 * column / len(widths))

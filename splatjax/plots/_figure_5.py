@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 
-from splatjax.diffusion import DenseDiffuser, DiffusionSettings, PlainMean
+from splatjax.diffusion import DenseDiffuser, DiffusionSettings, ExitOdds, PlainMean
 from splatjax.gaussians import SumOfGaussians
 from splatjax.render import RenderSettings, diffuse, light_on_splats, plan
 from splatjax.rivals import ThinnedDiffuser, layer_contrast, thinning_error
@@ -19,7 +19,6 @@ from ._subject import Subject, bright, picture_grid
 _AMPLIFIED = (2.0, 4.0, 8.0, 16.0)
 _KEEP = (1, 4, 16, 64)
 _FACTOR = 1.5
-_DEPTH = 0.75  # of the sources, in widths of their layer, as everywhere in this renderer
 
 
 def figure_5(subject: Subject, *, amplified: tuple[float, ...] = _AMPLIFIED, keep: tuple[int, ...] = _KEEP) -> Figure:
@@ -42,7 +41,9 @@ def figure_5(subject: Subject, *, amplified: tuple[float, ...] = _AMPLIFIED, kee
     widths = spacing * np.asarray(amplified)
     weights = jnp.full((len(widths), 3), 1 / len(widths))
     scene = subject.scene(Material(SumOfGaussians(jnp.asarray(widths**2, weights.dtype), weights)))
-    settings = RenderSettings(diffuser=DenseDiffuser(), diffusion=DiffusionSettings(normalization=PlainMean(depth=_DEPTH)))
+    settings = RenderSettings(
+        diffuser=DenseDiffuser(), diffusion=DiffusionSettings(normalization=PlainMean(depth=ExitOdds().depth))
+    )
     found = plan(scene, subject.camera, settings)
     source = light_on_splats(scene, found, settings).source.T
     layers = []

@@ -50,7 +50,7 @@ def plot_fit(
     grid = figure.add_gridspec(2, 2, height_ratios=(3, 2))
     linear, log, residual = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[0, 1]), figure.add_subplot(grid[1, :])
 
-    parts = _parts(gaussians, r)
+    parts = single_gaussians(gaussians, r)
     for part in parts.T:
         log.loglog(radii, part, color="0.75", linewidth=0.8, zorder=1)
     for channel, color in enumerate(colors):
@@ -126,7 +126,8 @@ def _core(radii: np.ndarray, reference: np.ndarray) -> float:
     return float(radii[within.max()])
 
 
-def _parts(gaussians: SumOfGaussians, r: Float[Array, " radii"]) -> np.ndarray:
+def single_gaussians(gaussians: SumOfGaussians, r: Float[Array, " radii"]) -> np.ndarray:
+    """Give each Gaussian of a sum, with the mean weight of the channels: [radii, gaussians]."""
     shape = (*r.shape, *gaussians.variances.shape)
     values = gaussian(jnp.broadcast_to(gaussians.variances, shape), jnp.broadcast_to((r * r)[:, None], shape))
     return np.asarray(values * jnp.broadcast_to(jnp.mean(gaussians.weights, axis=1), shape))

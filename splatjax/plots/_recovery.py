@@ -4,8 +4,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from splatjax.inverse import Recovery
-
-_GAMMA = 1 / 2.2
+from splatjax.io import linear_to_srgb
 
 
 def plot_recovery(recovery: Recovery, *, title: str | None = None) -> Figure:
@@ -47,5 +46,5 @@ def _shown(picture: np.ndarray, bright: float) -> np.ndarray:
     unknown = ~np.all(np.isfinite(picture), axis=-1, keepdims=True)
     gray = np.broadcast_to(np.mean(picture, axis=-1, keepdims=True), (*picture.shape[:2], 3))
     colors = picture if picture.shape[-1] == 3 else gray
-    encoded = np.clip(np.where(unknown, 0.0, colors) / bright, 0, 1) ** _GAMMA
+    encoded = linear_to_srgb(np.where(unknown, 0.0, colors) / bright)
     return np.where(unknown, 0.8, encoded)

@@ -13,7 +13,6 @@ from splatjax import diffusion as _diffusion, splatting as _splatting
 from splatjax.scene import Parts, Splats
 
 _OTHERS = "the parts were not the same each time that they were asked for; give the same splats in the same order"
-_PLACES = 64  # as many as `diffusion.irregularity` looks at
 
 
 class SameParts:
@@ -85,7 +84,7 @@ class Survey:
             raise ValueError(f"parts must be of one size, but the last, which may be smaller; these are of {sizes}")
         lowest, highest = np.min(low, axis=0), np.max(high, axis=0)
         middle, squared, begin, near, count = (lowest + highest) / 2, 0.0, 0, [], sum(sizes)
-        places = np.linspace(0, count - 1, min(_PLACES, count)).astype(int)
+        places = np.linspace(0, count - 1, min(_diffusion.PLACES, count)).astype(int)
         rank, finest = _diffusion.FINEST * (count - 1), np.zeros(0)
         for part in parts():
             squared = max(squared, float(np.max(_squares(np.asarray(part.centers), middle), initial=0)))

@@ -1,14 +1,14 @@
 """The Fresnel reflectance, its diffuse moments met from inside, and what diffusion makes of them."""
 
 import abc
-import functools
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from splatjax.pointwise import one_program
+
+from ._quadrature import along_first_axis, unit_legendre
 
 _POINTS = 48
 """Gauss-Legendre points: the integrands are smooth on the whole interval, and 48 reach float64 rounding up to eta = 4."""
@@ -110,15 +110,9 @@ def _denser_over_rarer(eta: Float[Array, " channels"]) -> Float[Array, " channel
     return jnp.where(rarer_inside, 1 / jnp.where(rarer_inside, eta, jnp.ones_like(eta)), eta)
 
 
-@functools.cache
-def _unit_nodes() -> tuple[np.ndarray, np.ndarray]:
-    nodes, weights = np.polynomial.legendre.leggauss(_POINTS)
-    return 0.5 * (nodes + 1), 0.5 * weights
-
-
 def _integral(integrand, lower: Float[Array, " channels"]) -> Float[Array, " channels"]:
     """Integrate `integrand(t)` from `lower` to 1; it is given [points, channels]."""
-    nodes, weights = (jnp.broadcast_to(jnp.asarray(a, lower.dtype)[:, None], (_POINTS, *lower.shape)) for a in _unit_nodes())
+    nodes, weights = (along_first_axis(each, (_POINTS, *lower.shape), lower.dtype) for each in unit_legendre(_POINTS))
     length = jnp.broadcast_to((1 - lower)[None], nodes.shape)
     return jnp.sum(weights * length * integrand(1 - length * (1 - nodes)), axis=0)
 

@@ -14,6 +14,8 @@ import numpy as np
 import scipy  # its parts are loaded where they are used, which takes a third of a second
 from jaxtyping import Array, Float
 
+from ._quadrature import along_first_axis
+
 _STEP = 0.06  # of the logarithm: the Nyquist frequency is 52
 _PASSED = 22.0  # frequency up to which nothing is damped: exp(-pi/2 * 22) = 1e-15 bounds what lies above
 _FIRST, _LAST = -20.0, 8.0  # logarithms of the abscissas
@@ -72,25 +74,20 @@ def inverse_hankel_transform(
 
 def _filtered(function, at: Float[Array, "*some"]) -> Float[Array, "*some"]:
     """Give the integral of `x J0(x at) function(x)`."""
-    abscissas, weights = (_along(each, at) for each in _filter())
+    abscissas, weights = (along_first_axis(each, (len(each), *at.shape), at.dtype) for each in _filter())
     x = abscissas / at[None]
     return jnp.sum(weights * x * function(x), axis=0) / at
 
 
 def _series(transform, decay: Float[Array, " channels"]) -> list[Float[Array, " channels"]]:
     """Give the coefficients of the integral of `k J0(k r) F(k)` in powers of `(r / 2 decay)^2`."""
-    nodes, weights = (_along(each, decay) for each in _half_line())
+    nodes, weights = (along_first_axis(each, (len(each), *decay.shape), decay.dtype) for each in _half_line())
     terms = weights * transform(nodes / decay[None]) / (decay * decay)[None]
     coefficients = []
     for power in range(_TERMS):
         coefficients.append(jnp.sum(terms, axis=0))
         terms = terms * nodes * nodes * (-1 / (power + 1) ** 2)
     return coefficients
-
-
-def _along(values: np.ndarray, like: Float[Array, "*some"]) -> Float[Array, "nodes *some"]:
-    """Lay constants along a new first axis."""
-    return jnp.broadcast_to(jnp.asarray(values, like.dtype).reshape(-1, *[1] * like.ndim), (len(values), *like.shape))
 
 
 @functools.cache

@@ -168,6 +168,13 @@ def integrated_reflectance(profile: AbstractProfile, rule: RadialRule = TOTAL_RU
     return 2 * jnp.pi * jnp.sum(dr * r * at_own_radii(profile, r), axis=0)
 
 
+@functools.cache
+def unit_legendre(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Give nodes of the interval (0, 1), and weights that sum to 1: Gauss and Legendre's rule."""
+    nodes, weights = np.polynomial.legendre.leggauss(count)
+    return 0.5 * (nodes + 1), 0.5 * weights
+
+
 def along_first_axis(values: np.ndarray, shape: tuple[int, ...], dtype) -> Float[Array, "..."]:
     """Lay constants along the first axis of a shape."""
     return jnp.broadcast_to(jnp.asarray(values, dtype).reshape(-1, *[1] * (len(shape) - 1)), shape)

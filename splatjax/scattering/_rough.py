@@ -10,6 +10,7 @@ from splatjax.pointwise import one_program
 
 from ._fresnel import AbstractFresnel, ExactFresnel, reflectance
 from ._medium import check_range
+from ._quadrature import unit_legendre
 
 _COSINES, _SLOPES, _STEEPEST = 24, 64, 4.0
 """Nodes on each side of the critical angle; nodes of either slope, which end where they are 1e-7 as frequent as none."""
@@ -80,7 +81,7 @@ def _internal_reflectance(
 
 def _cosines(eta: Float[Array, " channels"]) -> tuple[Float[Array, "cosines channels"], Float[Array, "cosines channels"]]:
     """Give nodes and weights over the cosine inside, on either side of the critical angle, beyond which it is as a root."""
-    t, dt = (jnp.asarray(each, eta.dtype)[:, None] for each in _unit_nodes(_COSINES))
+    t, dt = (jnp.asarray(each, eta.dtype)[:, None] for each in unit_legendre(_COSINES))
     denser = eta > 1
     critical = jnp.where(denser, jnp.sqrt(1 - 1 / jnp.where(denser, eta * eta, 2)), 0.0)
     shape = (_COSINES, len(eta))
@@ -88,12 +89,6 @@ def _cosines(eta: Float[Array, " channels"]) -> tuple[Float[Array, "cosines chan
     # Below as well: what a rough interface lets through begins as a root there.
     below, above = jnp.where(critical > 0, critical * (1 - t * t), t), critical + (1 - critical) * t * t
     return jnp.concatenate([below, above]), jnp.concatenate([critical * 2 * t * dt, (1 - critical) * 2 * t * dt])
-
-
-@functools.cache
-def _unit_nodes(count: int) -> tuple[np.ndarray, np.ndarray]:
-    nodes, weights = np.polynomial.legendre.leggauss(count)
-    return 0.5 * (nodes + 1), 0.5 * weights
 
 
 @functools.cache

@@ -12,7 +12,7 @@ from splatjax.pointwise import one_program
 
 from ._fresnel import moment_outside, reflectance
 from ._medium import Medium
-from ._quadrature import along_first_axis, unit_interval
+from ._quadrature import along_first_axis, unit_interval, unit_legendre
 
 _LEAST_COSINE = 1e-4
 _COSINES = 10
@@ -91,9 +91,8 @@ class SingleScattering(AbstractProfile):
     @one_program
     def leaving(self, mu_i: Float[Array, "*points"]) -> Float[Array, "*points channels"]:
         """Give the share of the light that has entered under a cosine `mu_i` and leaves after one scattering; right to 1e-3."""
-        nodes, weights = np.polynomial.legendre.leggauss(_COSINES)
         share = jnp.zeros((*mu_i.shape, *self.strength.shape), mu_i.dtype)
-        for node, weight in zip(0.5 * (nodes + 1), 0.5 * weights, strict=True):
+        for node, weight in zip(*unit_legendre(_COSINES), strict=True):
             # mu = t^2: the radiance has a root at grazing angles.
             radiance = self.reflected(mu_i, jnp.full_like(mu_i, node * node))
             share = share + float(4 * np.pi * weight * node**3) * radiance
