@@ -19,7 +19,7 @@ from splatjax.render import _lighting as lighting, _passes as wiring
 
 from .scenes import BODIES, columns, lit
 
-VARIANCES = (4.0, 8.0, 16.0, 32.0)  # mm^2: what splats a millimetre apart carry
+VARIANCES = (4.0, 8.0, 16.0, 32.0)  # mm^2: what splats a millimeter apart carry
 
 
 def arguments():

@@ -13,7 +13,7 @@
 # %% [markdown]
 # # Marble as a sum of Gaussians
 #
-# Light that enters marble leaves it some millimetres away. How much leaves at distance $r$ is the profile $R(r)$, in 1/mm². The
+# Light that enters marble leaves it some millimeters away. How much leaves at distance $r$ is the profile $R(r)$, in 1/mm². The
 # renderer wants it as a sum of Gaussians, $R(r) \approx \sum_i w_i\, G(v_i, r)$: one blurred layer for each. Here we fit one.
 
 # %%

@@ -59,7 +59,7 @@ print("variances (mm²)", variances.round(4))
 print("  known to     ", (np.sqrt(np.diag(covariance))[:count] / variances).round(3))
 
 # %% [markdown]
-# A glaze, half a millimetre thick, changes the core of the profile and hardly the tail: light that travels far travels below it.
+# A glaze, half a millimeter thick, changes the core of the profile and hardly the tail: light that travels far travels below it.
 # A scattering layer must be thicker than a mean free path, here $1 / (4 + 0.3)$ mm; thinner ones are refused.
 
 # %%

@@ -13,7 +13,7 @@
 # %% [markdown]
 # # Marble from one photograph
 #
-# A figurine of marble, three centimetres tall, stands under a lamp from the side. We know its shape, where camera and lamp are,
+# A figurine of marble, three centimeters tall, stands under a lamp from the side. We know its shape, where camera and lamp are,
 # and how strong the lamp is. What are the absorption and the scattering of the stone, and how well does one photograph tell?
 #
 # The photograph is rendered here, from the coefficients that Jensen and others measured in 2001, so that we know what should

@@ -1,6 +1,6 @@
 """splatjax: a differentiable renderer for translucent materials.
 
-From a few optical coefficients to a translucent picture, and back; lengths in millimetres throughout.
+From a few optical coefficients to a translucent picture, and back; lengths in millimeters throughout.
 """
 
 from .fitting import FitResult as FitResult, fit_gaussians as fit_gaussians, relative_error as relative_error

@@ -156,7 +156,7 @@ def milk_glass(_: sj.Splats, side: int) -> np.ndarray:
 
 
 def jade(_: sj.Splats, side: int) -> np.ndarray:
-    """A disc of jade under a brown skin of half a millimetre, carved with grains, lit from behind and from the side."""
+    """A disc of jade under a brown skin of half a millimeter, carved with grains, lit from behind and from the side."""
     inner, outer, thick, grain = 13.0, 44.0, 5.0, 0.9
     middle, half = (inner + outer) / 2, (outer - inner) / 2
     t, angle = np.linspace(0, 2 * np.pi, 40_001), 2 * np.pi * np.arange(1200) / 1200

@@ -1,6 +1,6 @@
 """Do the tests notice? Small mistakes are planted in the mathematics, one at a time: `python tools/mutate.py --sample 400`.
 
-A seeded sample of all places where an operator, a comparison, a number or a function's name can be mistaken for its neighbour is
+A seeded sample of all places where an operator, a comparison, a number or a function's name can be mistaken for its neighbor is
 taken from `gaussians`, `scattering`, `fitting`, `splatting` and `diffusion`. Each mutant meets the tests of its room, as long as
 there is time: first those that run through its line (by coverage.py's contexts, the shortest first), then those beside them,
 which share what the first has compiled or drawn. In double precision, and if it lives those that run once in single precision

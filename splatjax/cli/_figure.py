@@ -57,7 +57,7 @@ class Figure(MeshMaps):
     """The PNG, PDF or SVG file to write."""
     scene: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="PATH [PATH ...]", help=_SCENE, help_behavior_hint="")] = ()
     mm_per_unit: OptionalFloat = None
-    """Of figure 8: length of the mesh file's unit, mm: 1000 for metres."""
+    """Of figure 8: length of the mesh file's unit, mm: 1000 for meters."""
     material: MaterialName = "skin"
     """Name of a material (`splatjax materials`), or path of a TOML file."""
     materials: MaterialNames = ("skin", "marble", "ketchup", "wholemilk")
@@ -130,7 +130,7 @@ class Figure(MeshMaps):
         if path is None:
             mesh, textures = bust_with_textures(_TEXELS)
         elif self.mm_per_unit is None:
-            raise ValueError(f"--mm-per-unit is missing: say how many mm a unit of {path} is (1000 for metres)")
+            raise ValueError(f"--mm-per-unit is missing: say how many mm a unit of {path} is (1000 for meters)")
         else:
             mesh, textures = read_textured_mesh(path, mm_per_unit=self.mm_per_unit, **self.worn())
         triangles = TexturedMesh.of(mesh, textures)

@@ -24,7 +24,7 @@ class Sample(MeshMaps):
     mesh: tyro.conf.Positional[Path]
     """The file of the mesh."""
     mm_per_unit: float
-    """Length of the file's unit, mm: 1000 for metres."""
+    """Length of the file's unit, mm: 1000 for meters."""
     output: Path
     """The PLY file to write."""
     count: int = 200_000

@@ -52,9 +52,9 @@ def surface_cells(
 ) -> Cells:
     r"""Measure the Voronoi cell of each point in its tangent plane.
 
-    The border of a cell in the direction `u` lies at `r(u) = min_j |d_j|^2 / (2 d_j . u)` over the neighbours at `d_j`; its
+    The border of a cell in the direction `u` lies at `r(u) = min_j |d_j|^2 / (2 d_j . u)` over the neighbors at `d_j`; its
     area is `1/2` the integral of `r^2` over all directions and its centroid `1/3` that of `r^3 u`, divided by the area.
-    Neighbours that face away (the other side of a thin sheet) do not count. Where the surface ends, a cell ends at
+    Neighbors that face away (the other side of a thin sheet) do not count. Where the surface ends, a cell ends at
     `limit`. Points that coincide share a cell.
 
     **Arguments:**
@@ -92,7 +92,7 @@ def surface_cells(
 
 
 def _measure(offsets, distances, own, theirs, fan, limit: float | None) -> Cells:
-    """Measure cells from the way to their neighbours, the normals of both, and a fan of directions."""
+    """Measure cells from the way to their neighbors, the normals of both, and a fan of directions."""
     tangent, bitangent = tangent_frames(own)
     across = np.stack([np.einsum("nki,ni->nk", offsets, axis) for axis in (tangent, bitangent)], axis=-1)
     squared = np.square(distances).astype(np.float32)

@@ -29,11 +29,11 @@ def complete_splats(
     **Arguments:**
 
     - `centers`: mm, at least one.
-    - `normals`: unit; `None`: from neighbours (`estimate_normals`).
+    - `normals`: unit; `None`: from neighbors (`estimate_normals`).
     - `areas`: mm^2; `None`: those of the Voronoi cells in the tangent planes.
     - `radii`: mm; `None`: as large as the cells ask for, so that no hole is left.
 
-    Points that lie alone are kept, estimated as large as their neighbours are, and a warning tells how many there are. Points at
+    Points that lie alone are kept, estimated as large as their neighbors are, and a warning tells how many there are. Points at
     one place share their area.
 
     **Raises:** `ValueError` when something must be estimated and there are fewer than four points at different places.
@@ -56,7 +56,7 @@ def complete_splats(
 
 
 def _covered(centers: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Give areas and radii; those of points that lie alone are their neighbours', lest their discs hide everything."""
+    """Give areas and radii; those of points that lie alone are their neighbors', lest their discs hide everything."""
     first, place = distinct(centers)
     places = centers[first]
     areas, radii = covering(places, normals[first])
@@ -64,7 +64,7 @@ def _covered(centers: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.n
     if alone.any():
         areas[alone], radii[alone] = (np.median(each[near[alone]], axis=1) for each in (areas, radii))
         warnings.warn(
-            f"{alone.sum()} of {len(centers)} points lie alone, one of them {distances[alone].max():.3g} mm from its neighbours;"
+            f"{alone.sum()} of {len(centers)} points lie alone, one of them {distances[alone].max():.3g} mm from its neighbors;"
             " they are kept, as specks as large as those: remove them if they are noise of a scanner",
             stacklevel=3,
         )

@@ -1,4 +1,4 @@
-"""A head, modelled in clay: serene, eyes closed. Its signed distance, mm; +y up, facing +z, eyes near y = 0."""
+"""A head, modeled in clay: serene, eyes closed. Its signed distance, mm; +y up, facing +z, eyes near y = 0."""
 
 import numpy as np
 from jaxtyping import Float

@@ -1,4 +1,4 @@
-"""The Morton curve, along which neighbours in space are near in memory."""
+"""The Morton curve, along which neighbors in space are near in memory."""
 
 import numpy as np
 from jaxtyping import Float, Int

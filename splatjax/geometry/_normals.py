@@ -9,7 +9,7 @@ from ._morton import morton_order
 from ._orientation import outward_signs
 
 _CHUNK = 1 << 16
-_BEYOND = 1.05  # of the distance of the farthest neighbour, so that it counts a little
+_BEYOND = 1.05  # of the distance of the farthest neighbor, so that it counts a little
 _WINDOW = 8  # nearest points that make a plane
 _FLAT = 1e-3  # of a window's squared size: planes that are off by less are as good as each other
 
@@ -18,9 +18,9 @@ def estimate_normals(points: Float[np.ndarray, "n 3"], *, neighbors: int = 12) -
     r"""Give unit normals of points on a surface, all on its outer side.
 
     Around each point there is a plane in which the nearest ones vary least (principal components, of which near ones count more).
-    A point's normal is the mean of those of its own plane and its neighbours', each by how little it is off its own points and
+    A point's normal is the mean of those of its own plane and its neighbors', each by how little it is off its own points and
     this one: at an edge the planes of one side remain, at a second sheet close by those of the point's own, and where there is
-    noise many count. What can be seen from outside faces whoever sees it; the rest follows its neighbours, and a surface open to
+    noise many count. What can be seen from outside faces whoever sees it; the rest follows its neighbors, and a surface open to
     both sides faces away from its middle at the farthest point.
 
     **Arguments:**
@@ -29,7 +29,7 @@ def estimate_normals(points: Float[np.ndarray, "n 3"], *, neighbors: int = 12) -
     - `neighbors`: whose planes count.
 
     **Source:** Hoppe et al. 1992, "Surface Reconstruction from Unorganized Points", sections 3.2 and 3.3; weights of
-    Pauly et al. 2003, "Shape Modeling with Point-Sampled Geometry"; planes of neighbours after the windows of Kuwahara et al.
+    Pauly et al. 2003, "Shape Modeling with Point-Sampled Geometry"; planes of neighbors after the windows of Kuwahara et al.
     1976.
     """
     first, inverse = distinct(points)

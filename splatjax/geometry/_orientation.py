@@ -9,7 +9,7 @@ from ._hollows import turn_cavities
 _VIEWS = 32
 _SURE = 0.7  # share of the votes by which one side wins
 _DOUBT = 0.5  # votes that nobody cast: a side seen once is not sure yet
-_SMOOTH = 0.99  # agreement of neighbours in one patch
+_SMOOTH = 0.99  # agreement of neighbors in one patch
 _LEAST_PATCH = 100
 _ROOT = 1e-9  # cost of being one; a zero would be no edge
 
@@ -24,8 +24,8 @@ def outward_signs(
 ) -> Signs:
     r"""Give the signs that turn normals outward.
 
-    The points are looked at from all around. Where a point and its neighbours are seen from one side alone, it is the outer one.
-    From there signs are carried along a minimum spanning tree of the neighbourhood graph. Neighbours at `p_i` and `p_j` agree as
+    The points are looked at from all around. Where a point and its neighbors are seen from one side alone, it is the outer one.
+    From there signs are carried along a minimum spanning tree of the neighborhood graph. Neighbors at `p_i` and `p_j` agree as
     far as one normal is the mirror image of the other in the plane between the points, as on a circle, around an edge and across
     a thin sheet, and the cost of an edge is `1.001 - |agreement|`. A part that is seen from both sides alike, or not at all, is
     turned away from its middle at its farthest point. What hides within a body is a hollow (`turn_cavities`).
@@ -33,7 +33,7 @@ def outward_signs(
     **Arguments:**
 
     - `normals`: unit, of either sign.
-    - `near`: neighbours of each point, without itself, each at another place.
+    - `near`: neighbors of each point, without itself, each at another place.
     - `reaches`: mm, how far away the last of them is.
 
     **Source:** Hoppe et al. 1992, section 3.3; König and Gumhold 2009, "Consistent Propagation of Normal Orientations in Point

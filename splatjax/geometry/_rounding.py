@@ -22,7 +22,7 @@ def rounded_positions(mesh: Mesh, points: SurfacePoints) -> Float[np.ndarray, "n
         x + 1/2 sum_i u_i ((v_i - x) . n_i) n_i
 
     from a point `x` of a triangle, with corners `v_i`, normals `n_i` and barycentric coordinates `u_i`. That is a sum over edges,
-    so that neighbours meet. Edges stay straight at vertices whose normal is more than 40 degrees off that of one of their
+    so that neighbors meet. Edges stay straight at vertices whose normal is more than 40 degrees off that of one of their
     triangles: a box stays a box.
 
     **Source:** Boubekeur and Alexa 2008, "Phong tessellation", with the weight (they prefer 3/4) that keeps spheres round.

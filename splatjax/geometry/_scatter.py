@@ -35,7 +35,7 @@ class SurfacePoints(NamedTuple):
 
 
 def scatter(mesh: Mesh, count: int, *, seed: int = 0, relaxations: int = 4) -> SurfacePoints:
-    r"""Spread points over a mesh, one density everywhere, each far from its neighbours (blue noise).
+    r"""Spread points over a mesh, one density everywhere, each far from its neighbors (blue noise).
 
     Points are dealt out evenly along a Morton curve of the triangles, by a low-discrepancy sequence inside each, then moved
     `relaxations` times to the centroids of their Voronoi cells (Lloyd), along the surface.

@@ -5,15 +5,15 @@ import scipy  # its parts are loaded where they are used, which takes a third of
 from jaxtyping import Bool, Float, Int
 
 _NEIGHBORS = 8
-_ALONE = 5.0  # times farther from its neighbours than they are from theirs
+_ALONE = 5.0  # times farther from its neighbors than they are from theirs
 
 
 def strays(points: Float[np.ndarray, "n 3"]) -> tuple[Bool[np.ndarray, " n"], Int[np.ndarray, "n k"], Float[np.ndarray, " n"]]:
-    r"""Tell which points lie alone: much farther from their neighbours than these are from their own, and no one's neighbours.
+    r"""Tell which points lie alone: much farther from their neighbors than these are from their own, and no one's neighbors.
 
     So that neither a place where all points are sparse holds one, nor the border between dense and sparse.
 
-    **Returns:** whether each is one, its nearest neighbours, and its mean distance to them, mm.
+    **Returns:** whether each is one, its nearest neighbors, and its mean distance to them, mm.
 
     **Source:** after Breunig et al. 2000, "LOF: Identifying Density-Based Local Outliers", medians in the place of means.
     """

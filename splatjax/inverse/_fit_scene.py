@@ -17,7 +17,7 @@ from ._evidence import Evidence
 from ._fitted_scene import FittedScene
 from ._intensity import KnownIntensity
 from ._losses import AbstractLoss, SquaredLoss
-from ._observation import Observation
+from ._observation import Observation, nothing_counts
 from ._parts import AbstractPart, Shot
 from ._plans import plans_of
 
@@ -166,10 +166,7 @@ def _check(observations: list[Observation], splats: Splats, material: Material, 
 def _check_counted(pictures: list[Told]) -> None:
     for i, each in enumerate(pictures):
         if not np.any(np.asarray(each.counted) > 0):
-            raise ValueError(
-                f"no pixel of observations[{i}] counts: the splats fill none that its mask leaves and whose color is known; "
-                "check camera, mask and NaN"
-            )
+            raise nothing_counts(i)
 
 
 def _nobody(said: str, loss: float) -> None:

@@ -16,6 +16,7 @@ from splatjax.scattering import Medium
 from splatjax.scene import AbstractLight, Camera, Material, Scene, Splats
 
 from ._background import FILLED
+from ._observation import nothing_counts
 from ._plans import plans_of
 
 _LARGER = 3.0
@@ -66,10 +67,7 @@ def flatten(pictures: Sequence[GatheredPicture], masks: Sequence[np.ndarray], dt
     for i, (picture, mask) in enumerate(zip(pictures, masks, strict=True)):
         chosen = which_count(picture, mask)
         if chosen.size == 0:
-            raise ValueError(
-                f"no pixel of observations[{i}] counts: the splats fill none that its mask leaves and whose color is known; "
-                "check camera, mask and NaN"
-            )
+            raise nothing_counts(i)
         place = np.full(mask.size, -1)
         place[chosen] = np.arange(chosen.size)
         there = np.any(np.asarray(picture.leaving) > 0, axis=0)

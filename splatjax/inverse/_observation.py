@@ -43,3 +43,11 @@ class Observation(eqx.Module):
                 )
         if self.deviation is not None and not np.all(np.asarray(self.deviation) > 0):
             raise ValueError(f"deviation must be positive; its least is {float(np.min(self.deviation)):g}")
+
+
+def nothing_counts(number: int) -> ValueError:
+    """Say that no pixel of an observation tells anything."""
+    return ValueError(
+        f"no pixel of observations[{number}] counts: the splats fill none that its mask leaves and whose color is known; "
+        "check camera, mask and NaN"
+    )

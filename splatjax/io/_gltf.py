@@ -31,7 +31,7 @@ _BYTES_PER_ZERO = 80.0  # of a sparse accessor
 def read_gltf(path: Path) -> list[Piece]:
     """Read the triangles of the scene that a file shows, moved by its nodes: a piece for each primitive of each node.
 
-    Primitives of points and lines are left alone, and so are skins and morph targets: meshes stand as they were modelled.
+    Primitives of points and lines are left alone, and so are skins and morph targets: meshes stand as they were modeled.
     trimesh reads buffers, accessors and nodes; it is asked for accessors as they stand in the file, for it leaves alone what is
     normalized and what is sparse.
 

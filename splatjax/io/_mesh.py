@@ -51,7 +51,7 @@ def sample_mesh(
     **Arguments:**
 
     - `count`: of splats.
-    - `mm_per_unit`: length of the file's unit, mm. glTF prescribes metres (1000), yet many scans ignore that.
+    - `mm_per_unit`: length of the file's unit, mm. glTF prescribes meters (1000), yet many scans ignore that.
     - `albedo`: picture, sRGB; `None`: the base color textures that the file itself carries, if any.
     - `specular`: gray picture, not decoded: factor on the material's specular strength.
     - `normal`: tangent-space normal map, not decoded; green points up.

@@ -30,7 +30,7 @@ def read_splats(path: str | os.PathLike[str], *, mm_per_unit: float = 1.0) -> Sp
     | property | what it is |
     | --- | --- |
     | `x y z` | center, in the file's unit |
-    | `nx ny nz` | normal, made unit; estimated from neighbours when absent |
+    | `nx ny nz` | normal, made unit; estimated from neighbors when absent |
     | `radius` (or `radii`) | in the file's unit; from the local density when absent |
     | `area` (or `areas`) | in the file's unit squared; from the local density when absent |
     | `red green blue` | albedo: integers are sRGB up to the type's maximum, floats are linear |

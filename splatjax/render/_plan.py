@@ -138,6 +138,6 @@ def _groups(lights: Sequence[tuple[AbstractLight, ...]]) -> list[list[StackedLig
 def _shadows_wanted(groups: Sequence[StackedLights], bounds: _splatting.Bounds, settings: RenderSettings) -> ShadowsWanted | None:
     if not groups[0].lights.cast_shadows:
         return None
-    lights = [jax.tree.map(lambda leaf, i=i: leaf[i], group.lights) for group in groups for i in range(len(group.places))]
+    lights = [light for group in groups for light in group.apart()]
     cube = stands_among(lights, bounds)
     return ShadowsWanted([view for light in lights for view in shadow_views(light, bounds, settings, cube)], cube)

@@ -128,7 +128,7 @@ def _maps(groups: Sequence[StackedLights], survey: Survey, settings: RenderSetti
     for i, group in enumerate(groups):
         if not group.lights.cast_shadows:
             continue
-        each = [jax.tree.map(lambda leaf, j=j: leaf[j], group.lights) for j in range(len(group.places))]
+        each = group.apart()
         cube = stands_among(each, bounds)
         found += [_Map(view, i, j, cube) for j, light in enumerate(each) for view in shadow_views(light, bounds, settings, cube)]
     return found

@@ -35,7 +35,7 @@ class SweptView(eqx.Module):
     def nothing(self, attributes: int, dtype: jnp.dtype) -> _splatting.FragmentSums:
         """Give the sums of no part."""
         tiles = _splatting.TileGrid(self.view.width, self.view.height).count
-        return _splatting.FragmentSums.of(jnp.zeros((tiles, attributes + 2, _splatting.SIDE**2), dtype))
+        return _splatting.FragmentSums.nothing(tiles, attributes, dtype)
 
 
 @dataclass(frozen=True)

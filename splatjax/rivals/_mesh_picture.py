@@ -51,7 +51,7 @@ def plan_texture_space(
     texels = lay_out(mesh, settings.resolution, rooms[0])
     valid = texels.seen.covered.astype(mesh.vertices.dtype)
     extents = stretch_map(mesh, texels)
-    taken = jnp.stack(settings.stretch.millimetres(*extents, valid))
+    taken = jnp.stack(settings.stretch.millimeters(*extents, valid))
     reaches = reaches_of(material.gaussians.variances, taken, valid)
     return TexturePlan(*rooms, shadow_rooms(mesh, lights, settings.shadows), reaches)
 

@@ -25,7 +25,7 @@ class AbstractStretch(eqx.Module):
     """How many mm of the surface a texel is."""
 
     @abc.abstractmethod
-    def millimetres(
+    def millimeters(
         self, along_u: Float[Array, "height width"], along_v: Float[Array, "height width"], valid: Float[Array, "height width"]
     ) -> tuple[Float[Array, "height width"], Float[Array, "height width"]]:
         """Give what the blur takes for a texel's extent along u and v, mm, of what it is."""
@@ -34,14 +34,14 @@ class AbstractStretch(eqx.Module):
 class StretchCorrected(AbstractStretch):
     """Every texel has its own extent, along u and along v: the stretch map of d'Eon and Luebke."""
 
-    def millimetres(self, along_u, along_v, valid):
+    def millimeters(self, along_u, along_v, valid):
         return along_u, along_v
 
 
 class Uncorrected(AbstractStretch):
     """One extent for the whole texture: the root of the mean area of a texel."""
 
-    def millimetres(self, along_u, along_v, valid):
+    def millimeters(self, along_u, along_v, valid):
         mean = jnp.sqrt(jnp.sum(valid * along_u * along_v) / jnp.sum(valid))
         return jnp.full_like(along_u, mean), jnp.full_like(along_v, mean)
 
@@ -139,7 +139,7 @@ def diffuse_in_texture(
     entering = light.entering(texels.points, material)
     valid = texels.seen.covered.astype(entering.source.dtype)
     extents = stretch_map(mesh, texels)
-    taken = jnp.stack(settings.stretch.millimetres(*extents, valid))
+    taken = jnp.stack(settings.stretch.millimeters(*extents, valid))
     variances = material.gaussians.variances
     average = jnp.sqrt(jnp.sum(valid * extents[0] * extents[1]) / jnp.sum(valid)) * settings.resolution
     far = settings.thin_parts.far_side(texels, light, jnp.sqrt(jnp.max(variances)), average)

@@ -11,7 +11,6 @@ from jaxtyping import Array, Float, Int, PyTree
 
 from splatjax.scene import Splats
 from splatjax.splatting import (
-    SIDE,
     AbstractRasterizer,
     AbstractView,
     BinCapacity,
@@ -21,7 +20,6 @@ from splatjax.splatting import (
     SplattingSettings,
     SummedFragments,
     TileGrid,
-    TileRanges,
     TileRasterizer,
     bin_items,
 )
@@ -52,7 +50,7 @@ class AbstractListRasterizer(AbstractRasterizer):
     def summed(
         self, splats: Splats, attributes: Float[Array, "attributes splats"], view: AbstractView, settings: SplattingSettings
     ) -> SummedFragments:
-        nothing = FragmentSums.of(jnp.zeros((_grid(view).count, attributes.shape[0] + 2, SIDE**2), attributes.dtype))
+        nothing = FragmentSums.nothing(_grid(view).count, attributes.shape[0], attributes.dtype)
         if splats.count == 0:
             return SummedFragments(nothing, nothing, jnp.zeros((), attributes.dtype))
         lists = self.lists(splats, view, settings)
@@ -68,7 +66,7 @@ class AbstractListRasterizer(AbstractRasterizer):
                 f"this {type(self).__name__} has no capacity yet; take one from a plan (splatjax.plan) or from `planned`"
             )
         footprints, grid = self.kernel.footprints(splats, view, settings), _grid(view)
-        bins = bin_items(_ranges(footprints, grid), grid, self.capacity)
+        bins = bin_items(footprints.ranges(grid), grid, self.capacity)
         chunk = jnp.searchsorted(bins.first_block, jnp.arange(bins.ids.shape[0], dtype=jnp.int32), side="right") - 1
         return Lists(footprints, bins, chunk.astype(jnp.int32), grid)
 
@@ -112,19 +110,14 @@ class Lists(eqx.Module):
     def tiles(self, found: Float[Array, "chunks lanes rows pixels"]) -> Float[Array, "tiles rows pixels"]:
         """Put what the chunks found in the order of the tiles; 0 beyond the picture, NaN where the lists had no room."""
         within, tiles = self.grid.within_picture(), self.bins.by_tile(found.reshape(-1, *found.shape[2:]), self.grid.count)
-        poison = jnp.where(self.bins.needed <= 1, 0.0, jnp.nan).astype(found.dtype)
-        return (tiles if within is None else jnp.where(within[:, None], tiles, 0.0)) + poison
+        return (tiles if within is None else jnp.where(within[:, None], tiles, 0.0)) + self.bins.poison(found.dtype)
 
 
 def _grid(view: AbstractView) -> TileGrid:
     return TileGrid(view.width, view.height)
 
 
-def _ranges(f: Footprints, grid: TileGrid) -> TileRanges:
-    return TileRanges.of(f.left, f.right, f.top, f.bottom, f.visible, grid)
-
-
 @eqx.filter_jit
 def _demand(kernel: AbstractKernel, splats: Splats, view: AbstractView, settings: SplattingSettings):
     grid = _grid(view)
-    return _ranges(kernel.footprints(splats, view, settings), grid).per_tile(grid)
+    return kernel.footprints(splats, view, settings).ranges(grid).per_tile(grid)

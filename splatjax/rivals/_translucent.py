@@ -41,15 +41,15 @@ class AbstractThinParts(eqx.Module):
 
     @abc.abstractmethod
     def far_side(
-        self, texels: SurfaceTexels, light: MeshLight, widest: Float[Array, ""], millimetres: Float[Array, ""]
+        self, texels: SurfaceTexels, light: MeshLight, widest: Float[Array, ""], millimeters: Float[Array, ""]
     ) -> FarSide | None:
-        """Find the far side of each texel; `widest` is the widest layer's standard deviation, `millimetres` a texture's edge."""
+        """Find the far side of each texel; `widest` is the widest layer's standard deviation, `millimeters` a texture's edge."""
 
 
 class OpaqueParts(AbstractThinParts):
     """Light does not come through: the texture alone is blurred."""
 
-    def far_side(self, texels, light, widest, millimetres):
+    def far_side(self, texels, light, widest, millimeters):
         return None
 
 
@@ -64,13 +64,13 @@ class TranslucentShadowMap(AbstractThinParts):
     **Source:** d'Eon and Luebke 2007 (GPU Gems 3, chapter 14.5), after Dachsbacher and Stamminger 2003.
     """
 
-    def far_side(self, texels, light, widest, millimetres):
+    def far_side(self, texels, light, widest, millimeters):
         found = [self._of(texels, each, light.settings.bias, widest) for each in light.shadows if each is not None]
         if not found:
             return None
         uvs, nearness = (jnp.stack(each) for each in zip(*found, strict=True))
         offset = uvs - texels.uvs[None]
-        return FarSide(uvs, nearness, millimetres * jnp.sqrt(jnp.sum(offset * offset, axis=2)), widest)
+        return FarSide(uvs, nearness, millimeters * jnp.sqrt(jnp.sum(offset * offset, axis=2)), widest)
 
     def _of(self, texels: SurfaceTexels, shadow: MeshShadow, bias: float, scale: Float[Array, ""]):
         view, front = shadow.view, shadow.surfaces.front

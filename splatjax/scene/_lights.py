@@ -101,6 +101,10 @@ class StackedLights(eqx.Module):
     lights: AbstractLight
     places: tuple[int, ...] = eqx.field(static=True)
 
+    def apart(self) -> list[AbstractLight]:
+        """Give them one by one."""
+        return [jax.tree.map(lambda leaf, i=i: leaf[i], self.lights) for i in range(len(self.places))]
+
 
 def stack_lights(lights: tuple[AbstractLight, ...]) -> list[StackedLights]:
     """Stack lights of equal kind, so that any number of them is computed by one loop."""

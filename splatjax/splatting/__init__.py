@@ -6,6 +6,9 @@ from ._bins import scatter_slots as scatter_slots, SIDE as SIDE, slot_plane as s
 from ._bins import TileGrid as TileGrid, TileRanges as TileRanges
 from ._dense import DenseRasterizer as DenseRasterizer
 from ._kernel import coverage as coverage, fragment_weight as fragment_weight
+from ._footprints import Footprints as Footprints
+from ._orthographic import OrthographicView as OrthographicView
+from ._perspective import PerspectiveView as PerspectiveView
 from ._rasterizer import AbstractRasterizer as AbstractRasterizer, FragmentSums as FragmentSums
 from ._rasterizer import SummedFragments as SummedFragments
 from ._settings import SplattingSettings as SplattingSettings
@@ -18,5 +21,4 @@ from ._surfaces import blend_fragments as blend_fragments, splat_surfaces as spl
 from ._surfaces import Surface as Surface, Surfaces as Surfaces
 from ._sweeps import second_limits as second_limits
 from ._tiles import TileCapacity as TileCapacity, TileRasterizer as TileRasterizer
-from ._views import AbstractView as AbstractView, Footprints as Footprints
-from ._views import OrthographicView as OrthographicView, PerspectiveView as PerspectiveView
+from ._views import AbstractView as AbstractView

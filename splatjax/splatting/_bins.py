@@ -11,7 +11,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, DTypeLike, Float, Int
 
 _ROW = 1024  # pairs sorted together; their place in the row takes the low 10 bits of a key
 _ROW_BITS = 10
@@ -175,6 +175,10 @@ class Bins(eqx.Module):
     def chunks(self) -> Int[Array, ""]:
         """How many chunks have anything in them: longer lists come first, so these lead."""
         return jnp.minimum(_occupied(self.first_block), self.places // self.ids.shape[1])
+
+    def poison(self, dtype: DTypeLike) -> Float[Array, ""]:
+        """Give what is added to whatever is found: 0, or NaN where the lists lack room."""
+        return jnp.where(self.needed <= 1, 0.0, jnp.nan).astype(dtype)
 
     def by_tile(self, swept: Float[Array, "places ..."], count: int, fill: float = 0) -> Float[Array, "tiles ..."]:
         """Put what was found lane by lane in the order of the tiles; `fill` for empty ones."""

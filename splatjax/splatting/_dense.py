@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float
 
 from splatjax.scene import Splats
 
-from ._bins import SIDE, TileGrid
+from ._bins import TileGrid
 from ._kernel import fragment_weight
 from ._rasterizer import AbstractRasterizer, FragmentSums, SummedFragments, least_weight
 from ._settings import SplattingSettings
@@ -25,7 +25,7 @@ class DenseRasterizer(AbstractRasterizer):
     def summed(
         self, splats: Splats, attributes: Float[Array, "attributes splats"], view: AbstractView, settings: SplattingSettings
     ) -> SummedFragments:
-        dtype, rows, footprints = attributes.dtype, attributes.shape[0] + 2, view.footprints(splats, settings)
+        dtype, footprints = attributes.dtype, view.footprints(splats, settings)
         columns = jnp.arange(view.width, dtype=dtype) + 0.5
         conic = footprints.a, footprints.b, footprints.c, footprints.nearness
         least = stop_gradient(least_weight(type(view), *conic, settings.filter_radius))
@@ -57,7 +57,7 @@ class DenseRasterizer(AbstractRasterizer):
 
         grid = TileGrid(view.width, view.height)
         if splats.count == 0:
-            empty = FragmentSums.of(jnp.zeros((grid.count, rows, SIDE**2), dtype))
+            empty = FragmentSums.nothing(grid.count, attributes.shape[0], dtype)
             return SummedFragments(empty, empty, jnp.zeros((), dtype))
         both = jax.lax.map(picture_row, jnp.arange(view.height, dtype=dtype) + 0.5)
         front, behind = (FragmentSums.of(grid.cut(each.transpose(1, 0, 2))) for each in both)

@@ -6,10 +6,11 @@ from collections.abc import Sequence
 import equinox as eqx
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, DTypeLike, Float
 
 from splatjax.scene import Splats
 
+from ._bins import SIDE
 from ._settings import SplattingSettings
 from ._views import AbstractView
 
@@ -46,6 +47,11 @@ class FragmentSums(eqx.Module):
         """Take one row after the other: attributes, nearness, weights."""
         attributes, nearness, weights = lax.split(rows, [rows.shape[1] - 2, 1, 1], axis=1)
         return cls(attributes, nearness[:, 0], weights[:, 0])
+
+    @classmethod
+    def nothing(cls, tiles: int, attributes: int, dtype: DTypeLike) -> "FragmentSums":
+        """Give those of no fragment at all."""
+        return cls.of(jnp.zeros((tiles, attributes + 2, SIDE**2), dtype))
 
     def rows(self) -> Float[Array, "tiles rows pixels"]:
         """Give what `of` takes."""

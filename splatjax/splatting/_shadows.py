@@ -12,10 +12,12 @@ from splatjax.pointwise import AT_ONCE, in_parts, one_program
 from splatjax.scene import Splats
 
 from ._bins import TileGrid
+from ._orthographic import OrthographicView
+from ._perspective import PerspectiveView
 from ._rasterizer import AbstractRasterizer
 from ._settings import SplattingSettings
 from ._surfaces import Surfaces, splat_surfaces
-from ._views import AbstractView, OrthographicView, PerspectiveView
+from ._views import AbstractView
 
 _NEAR = 1e-2  # mm: nearer, a splat is so large in pixels that float32 overflows
 

@@ -83,7 +83,7 @@ def _forward(sweep: Sweep, devices: Devices, bins, shift, planes, attributes):
     seconds = second_limits(*devices.largest(stages.limits_behind(limits, open_to)))
     behind = stages.behind(limits, seconds)
     shown = jnp.any(limits > -jnp.inf, axis=1).astype(shift.dtype)
-    poison = jnp.where(bins.needed <= 1, 0.0, jnp.nan).astype(shift.dtype)
+    poison = bins.poison(shift.dtype)
     return (*jax.tree.map(lambda sums: sums + poison, (front, behind)), shown), (limits, seconds)
 
 

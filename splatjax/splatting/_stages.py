@@ -53,7 +53,7 @@ class Stages(eqx.Module):
     def _within(self, sums: Float[Array, "tiles rows pixels"]) -> FragmentSums:
         """What of a tile lies beyond the picture shows nothing; all is NaN where the lists lack room."""
         within = self.sweep.grid.within_picture()
-        poison = jnp.where(self.bins.needed <= 1, 0.0, jnp.nan).astype(sums.dtype)
+        poison = self.bins.poison(sums.dtype)
         return FragmentSums.of(poison + (sums if within is None else jnp.where(jnp.asarray(within)[:, None], sums, 0.0)))
 
     def limits(self) -> Float[Array, "tiles pixels"]:

@@ -233,7 +233,7 @@ def _forward(sweep: Sweep, bins: Bins, shift, planes, attributes):
     """Sweep all chunks: both surfaces, tile by tile, and per pixel where they end, in lane order."""
     slots, grid = Slots.gathered(shift, planes, attributes, bins), sweep.grid
     dtype, within = planes[0].dtype, grid.within_picture()
-    poison = jnp.where(bins.needed <= 1, 0.0, jnp.nan).astype(dtype)
+    poison = bins.poison(dtype)
 
     def seen(sums, tiles):
         """What of a tile lies beyond the picture shows nothing."""

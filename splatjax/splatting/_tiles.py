@@ -12,11 +12,11 @@ from jaxtyping import Array, Bool, Float, Int
 from splatjax.pointwise import in_parts
 from splatjax.scene import Splats
 
-from ._bins import SIDE, BinCapacity, Bins, TileGrid, TileRanges, bin_items, round_up
+from ._bins import BinCapacity, Bins, TileGrid, bin_items, round_up
 from ._rasterizer import AbstractRasterizer, FragmentSums, SummedFragments
 from ._settings import SplattingSettings
 from ._sweeps import PLANES, Sweep, sweep_tiles
-from ._views import AbstractView, Footprints
+from ._views import AbstractView
 
 _STEP = 1024  # of the planned number of splats
 
@@ -81,7 +81,7 @@ class TileRasterizer(AbstractRasterizer):
     ) -> SummedFragments:
         dtype, grid = attributes.dtype, self._grid(view)
         if splats.count == 0:
-            empty = FragmentSums.of(jnp.zeros((grid.count, attributes.shape[0] + 2, SIDE**2), dtype))
+            empty = FragmentSums.nothing(grid.count, attributes.shape[0], dtype)
             return SummedFragments(empty, empty, jnp.zeros((), dtype))
         binned = self.binned(splats, attributes, view, settings)
         front, behind = sweep_tiles(binned.sweep, binned.bins, binned.shift, binned.planes, binned.attributes)
@@ -99,7 +99,7 @@ class TileRasterizer(AbstractRasterizer):
             lambda leaf: jnp.stack(_taken(leaf.T, ids), axis=-1) if leaf.ndim == 2 else _taken(leaf[None], ids)[0], splats
         )
         footprints = in_parts(lambda part: view.footprints(part, settings), splats)
-        bins = bin_items(_ranges(footprints, grid), grid, self.capacity.bins)
+        bins = bin_items(footprints.ranges(grid), grid, self.capacity.bins)
         bins = eqx.tree_at(lambda b: b.needed, bins, jnp.maximum(bins.needed, seen / self.capacity.splats))
         planes = tuple(getattr(footprints, name) for name in PLANES)
         sweep = Sweep(type(view), grid, settings.full_coverage, settings.filter_radius)
@@ -109,7 +109,7 @@ class TileRasterizer(AbstractRasterizer):
 @eqx.filter_jit
 def _demand(splats: Splats, view: AbstractView, settings: SplattingSettings, grid: TileGrid):
     """Count the splats that may be seen, and the splats of every tile."""
-    return jnp.sum(view.may_see(splats)), _ranges(view.footprints(splats, settings), grid).per_tile(grid)
+    return jnp.sum(view.may_see(splats)), view.footprints(splats, settings).ranges(grid).per_tile(grid)
 
 
 def _compacted(chosen: Bool[Array, " splats"], room: int) -> tuple[Int[Array, " room"], Int[Array, ""]]:
@@ -124,7 +124,3 @@ def _taken(rows: Float[Array, "rows splats"], ids: Int[Array, " room"]) -> list[
     """Take columns, 0 for those that are none; row by row, so that derivatives are planes too."""
     split = lax.split(rows, [1] * rows.shape[0])  # of a split the derivative is put together once; of slices, summed
     return [row[0].at[ids].get(mode="fill", fill_value=0, indices_are_sorted=True) for row in split]
-
-
-def _ranges(f: Footprints, grid: TileGrid) -> TileRanges:
-    return TileRanges.of(f.left, f.right, f.top, f.bottom, f.visible, grid)

@@ -86,7 +86,7 @@ def test_the_sides_of_an_edge_keep_their_own_normals(angle):
 
 
 def test_noise_averages_out():
-    """A tenth of a spacing up or down: the plane through each point's own neighbours alone is off by 4 degrees."""
+    """A tenth of a spacing up or down: the plane through each point's own neighbors alone is off by 4 degrees."""
     sheet = plane(1600)
     sheet[:, 2] += 0.1 * np.random.default_rng(7).normal(size=1600)
     inner = (np.abs(sheet[:, :2] - 19.5) < 17).all(axis=1)
@@ -135,7 +135,7 @@ def test_a_hollow_within_a_body_faces_its_middle():
 
 
 def test_points_at_one_place_share_its_area_and_its_normal():
-    """Ten scans of one sheet, each point in its place: more than there are neighbours to look at."""
+    """Ten scans of one sheet, each point in its place: more than there are neighbors to look at."""
     sheet = plane(400)
     once, often = complete_splats(sheet), complete_splats(np.concatenate([sheet] * 20))
     np.testing.assert_allclose(float(often.areas.sum()), float(once.areas.sum()), rtol=1e-5)
@@ -149,7 +149,7 @@ def test_points_alone_are_told_and_stay_small():
     sheet = plane(900)
     dense = np.concatenate([sheet, 0.1 * plane(900, seed=1) + [40, 0, 0]])
     complete_splats(dense)  # where all are sparse none is alone
-    with pytest.warns(UserWarning, match=r"2 of 902 points lie alone, one of them .* mm from its neighbours"):
+    with pytest.warns(UserWarning, match=r"2 of 902 points lie alone, one of them .* mm from its neighbors"):
         splats = complete_splats(np.concatenate([sheet, [[15, 15, 20.0], [90, 0, 0]]]))
     assert splats.count == 902
     assert float(splats.radii.max()) < 3

@@ -42,7 +42,7 @@ def test_areas_add_up_to_the_surface(splats, dtype):
 
 
 def test_areas_are_those_of_voronoi_cells(splats):
-    """On a sheet the cells are compared with exact counts of a fine grid of nearest neighbours."""
+    """On a sheet the cells are compared with exact counts of a fine grid of nearest neighbors."""
     sheet = sample_mesh(square(), 400)
     grid = (np.stack(np.meshgrid(np.arange(600), np.arange(600)), -1).reshape(-1, 2) + 0.5) / 60
     centers = np.asarray(sheet.centers)
@@ -67,7 +67,7 @@ def test_discs_leave_no_hole(splats):
 
 
 def test_points_are_spread_as_blue_noise(splats):
-    """Nearest neighbours: 0.5 of the spacing on average when random, 1.07 in a hexagonal grid."""
+    """Nearest neighbors: 0.5 of the spacing on average when random, 1.07 in a hexagonal grid."""
     spacing = np.sqrt(sphere().area() / COUNT)
     nearest = cKDTree(np.asarray(splats.centers)).query(np.asarray(splats.centers), k=2)[0][:, 1] / spacing
     assert nearest.mean() > 0.83

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from splatjax.splatting._views import _MARGIN
+from splatjax.splatting._views import MARGIN
 
 VIEWS = {
     "perspective": bodies.perspective(eye=(3.0, -2.0, 30.0), target=(1.0, 1.0, 0.0), width=48, height=30),
@@ -20,13 +20,13 @@ def beside_the_picture(view, off):
     rng = np.random.default_rng(8)
     radii, edge, depth = rng.uniform(0.05, 3.0, COUNT), rng.integers(0, 4, COUNT), rng.uniform(5, 25, COUNT)
     along = rng.uniform(0.1, 0.9, COUNT)
-    low, high = np.full(COUNT, -_MARGIN), np.where(edge < 2, view.width, view.height) + _MARGIN
+    low, high = np.full(COUNT, -MARGIN), np.where(edge < 2, view.width, view.height) + MARGIN
     column = np.where(edge < 2, np.where(edge == 0, low, high), along * view.width)
     row = np.where(edge < 2, along * view.height, np.where(edge == 2, low, high))
     touched = np.asarray(view.unproject(*(jnp.asarray(each, float) for each in (column, row, depth))), float)
     side = np.where(edge % 2 == 0, -1.0, 1.0)
     if hasattr(view, "focal_length"):  # a plane through the eye
-        half = 0.5 * np.where(edge < 2, view.width, view.height) + _MARGIN
+        half = 0.5 * np.where(edge < 2, view.width, view.height) + MARGIN
         slant = np.stack([side * float(view.focal_length), -half]) / np.hypot(float(view.focal_length), half)
     else:
         slant = np.stack([side, np.zeros(COUNT)])

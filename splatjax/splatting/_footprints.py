@@ -1,0 +1,69 @@
+"""A splat is a disc. In the picture its rim is an ellipse, and a fragment of it is described by numbers that are
+polynomials in the offset `d` (pixels) from the projected center:
+
+    nearness  e(d)  = nearness + slope . d          1 / z in perspective, -z without
+    quadric   n(d)  = a dx^2 + b dx dy + c dy^2
+    rho^2           = n / e^2 in perspective, n without: 1 on the rim
+
+so that the surface in front has the largest nearness and no fragment needs a square root.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from ._bins import TileGrid, TileRanges
+from ._settings import SplattingSettings
+
+EDGE_ON = 1e-5
+"""Cosine to the line of sight, below which float32 does not know which side of a splat is seen."""
+_SLOPE_FILTER = 0.25  # pixels; see `filtered`
+
+
+class Footprints(eqx.Module):
+    """Where every splat lands, planar: one array per number. Pixels, origin top left, unless said otherwise."""
+
+    x: Float[Array, " splats"]
+    y: Float[Array, " splats"]
+    slope_x: Float[Array, " splats"]
+    slope_y: Float[Array, " splats"]
+    a: Float[Array, " splats"]
+    b: Float[Array, " splats"]
+    c: Float[Array, " splats"]
+    nearness: Float[Array, " splats"]
+    shift: Float[Array, " splats"]
+    """How the surface is moved away by epsilon (3.1); not differentiated."""
+    opacity: Float[Array, " splats"]
+    """What the screen filter leaves of the peak weight: 1 for large frontal splats, 0 edge on."""
+    left: Float[Array, " splats"]
+    right: Float[Array, " splats"]
+    top: Float[Array, " splats"]
+    bottom: Float[Array, " splats"]
+    """The rim's bounding box. Not differentiated."""
+    visible: Bool[Array, " splats"]
+
+    def ranges(self, grid: TileGrid) -> TileRanges:
+        """Give the tiles that each splat may touch."""
+        return TileRanges.of(self.left, self.right, self.top, self.bottom, self.visible, grid)
+
+
+def filtered(xx, xy, yy, root, dx, dy, vx, vy, filter_radius):
+    """Widen the rim's ellipse by the screen filter: its inverse, the plane's slope, the ellipse, its determinant's root.
+
+    The ellipse `d^T S^-1 d = 1` grows to `S + f^2 I`; `root` is that of `det S`, `(dx, dy)` is `det S slope` and `(vx, vy)` is
+    `S slope`: the slope itself is infinite edge on, so a quarter of a pixel is added to `S` before it is divided by it. Hits
+    stay on the plane of every splat that a pixel can resolve. No term cancels another: float32 holds however slanted the splat.
+    """
+    determinant, trace, fine = root * root, xx + yy, _SLOPE_FILTER**2
+    slanted = determinant + fine * (trace + fine)
+    slope_x, slope_y = (dx + fine * vx) / slanted, (dy + fine * vy) / slanted
+    wide = filter_radius**2
+    determinant = determinant + wide * (trace + wide)
+    xx, yy = xx + wide, yy + wide
+    return yy / determinant, -2 * xy / determinant, xx / determinant, slope_x, slope_y, xx, yy, jnp.sqrt(determinant)
+
+
+def epsilon_of(radii, filter_radius, cosine, settings: SplattingSettings):
+    """Give the depth (mm) within which fragments belong to one surface: in radii, more on slanted splats."""
+    reach = jnp.sqrt(radii * radii + filter_radius * filter_radius)
+    return settings.epsilon_z * reach / jnp.maximum(cosine, 1 / settings.largest_slope)
