@@ -12,11 +12,10 @@ import numpy as np
 import tyro
 
 import splatjax as sj
-from splatjax.io import atomic_path
 
 from ._mesh_maps import MeshMaps
 from ._options import MaterialName, MaterialNames, OptionalFloat
-from ._outputs import check_output
+from ._outputs import FIGURES, check_output, save_figure
 from ._report import stage
 from ._shot import Shot, in_color, towards
 
@@ -76,7 +75,7 @@ class Figure(MeshMaps):
 
     def run(self) -> None:
         """Draw, write."""
-        check_output(self.output, (".png", ".pdf", ".svg"))
+        check_output(self.output, FIGURES)
         laid = {name: value for name, value in {**self.worn(), "mm_per_unit": self.mm_per_unit}.items() if value is not None}
         if laid and not (self.number == 8 and self.scene):
             option = next(iter(laid)).replace("_", "-")
@@ -89,8 +88,7 @@ class Figure(MeshMaps):
             raise ValueError(f"there is no figure {self.number} to make; give one of {known}")
         with stage(f"drawing figure {self.number}"):
             drawing = figures[self.number]()
-        with atomic_path(self.output) as written:
-            drawing.savefig(written, format=self.output.suffix[1:].lower())
+        save_figure(drawing, self.output)
         print(self.output)
 
     def _figures(self) -> dict[int, Callable[[], "Drawing"]]:

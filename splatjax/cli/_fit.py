@@ -14,13 +14,13 @@ from rich.table import Table
 import splatjax as sj
 from splatjax.fitting import AbstractWeights
 from splatjax.gaussians import channel_names
-from splatjax.io import read_picture, surface_and_source
+from splatjax.io import own_version, read_picture, surface_and_source
 from splatjax.scattering import measure_laser_dot
 
 from ._fit_all import fit_all
 from ._models import Model, Reference, reference
 from ._options import OptionalFloat, OptionalPath
-from ._outputs import check_output
+from ._outputs import FIGURES, check_output, save_figure
 from ._report import note, stage
 
 _COEFFICIENTS, _PROFILE, _PHOTOGRAPH = "coefficients", "a measured profile", "a photograph"
@@ -93,7 +93,7 @@ class Fit:
         if self.output is not None:
             check_output(self.output, (".toml",))
         if self.plot is not None:
-            check_output(self.plot, (".png", ".pdf", ".svg"))
+            check_output(self.plot, FIGURES)
         with jax.enable_x64(True):
             self._run()
 
@@ -145,13 +145,11 @@ class Fit:
             self._save(self.output, coefficients, made, fitted)
             print(self.output)
         if self.plot is not None:
-            from splatjax.io import atomic_path
             from splatjax.plots import plot_fit  # loads matplotlib
 
             found = len(fitted.gaussians.variances)
             figure = plot_fit(profile, fitted.gaussians, rule=made.rule, title=f"{self.medium}, {_gaussians(found)}")
-            with atomic_path(self.plot) as written:
-                figure.savefig(written)
+            save_figure(figure, self.plot)
             print(self.plot)
 
     def _unsettled(self, count: int) -> str:
@@ -190,7 +188,7 @@ class Fit:
         # The index of a surface is that of the medium it bounds, if one is known; the rest is what the file says, if it says it.
         measured = isinstance(coefficients, sj.Tabulated)
         fitted_to = f"{'profile' if measured else 'coefficients'} of {self.medium}"
-        source = {"provenance": f"fitted by splatjax {sj.__version__} to the {fitted_to}"}
+        source = {"provenance": f"fitted by splatjax {own_version()} to the {fitted_to}"}
         how = {
             "variances_of": "all channels",
             "weights_of": self._weights_of(measured),

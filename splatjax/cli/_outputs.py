@@ -1,6 +1,15 @@
 """Outputs are checked before the work begins: nobody should wait for a picture that cannot be written."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+from splatjax.io import atomic_path
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+FIGURES = (".png", ".pdf", ".svg")
+"""Suffixes of drawings."""
 
 
 def check_output(path: Path, suffixes: tuple[str, ...]) -> None:
@@ -11,3 +20,9 @@ def check_output(path: Path, suffixes: tuple[str, ...]) -> None:
         raise FileNotFoundError(f"{path}: there is no folder {path.parent}; make it first")
     if path.is_dir():
         raise ValueError(f"{path}: is a folder; give the name of a file")
+
+
+def save_figure(figure: "Figure", path: Path) -> None:
+    """Write a drawing, whole or not at all."""
+    with atomic_path(path) as written:
+        figure.savefig(written, format=path.suffix[1:].lower())

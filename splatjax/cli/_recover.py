@@ -13,11 +13,11 @@ import tyro
 from rich.console import Console
 
 import splatjax as sj
-from splatjax.io import atomic_path, fingerprint, material_path, own_version, picture_paths, read_record, write_record
+from splatjax.io import fingerprint, material_path, own_version, picture_paths, read_record, write_record
 
 from ._models import Model
 from ._options import MaterialNames, OptionalPath
-from ._outputs import check_output
+from ._outputs import FIGURES, check_output, save_figure
 from ._report import note, stage
 
 _START = (
@@ -78,7 +78,7 @@ class Recover:
         """Load, recover, say, write."""
         check_output(self.output, (".toml",))
         if self.report is not None:
-            check_output(self.report, (".png", ".pdf", ".svg"))
+            check_output(self.report, FIGURES)
         if self.model not in _MODELS:
             raise ValueError(f"--model {self.model.value} cannot be searched; take {' or '.join(m.value for m in _MODELS)}")
         if not self.start:
@@ -135,8 +135,7 @@ class Recover:
         if self.report is not None:
             from splatjax.plots import plot_recovery  # loads matplotlib
 
-            with atomic_path(self.report) as written:
-                plot_recovery(recovery, title=f"{self.output.stem}: {len(observations)} picture(s)").savefig(written)
+            save_figure(plot_recovery(recovery, title=f"{self.output.stem}: {len(observations)} picture(s)"), self.report)
             print(self.report)
 
     def _starts(self, channels: int) -> list[sj.Medium]:
@@ -180,7 +179,7 @@ class Recover:
             self.output,
             profile=_MODELS[self.model](recovery.medium),
             source={
-                "provenance": f"recovered by splatjax {sj.__version__} from the pictures of {self.pictures.name}, "
+                "provenance": f"recovered by splatjax {own_version()} from the pictures of {self.pictures.name}, "
                 f"on the shape {self.splats.name}",
                 "relative_error_of_sigma_a": np.asarray(errors[0]).tolist(),
                 "relative_error_of_sigma_s_prime": np.asarray(errors[1]).tolist(),

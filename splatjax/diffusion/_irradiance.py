@@ -2,11 +2,10 @@
 
 from collections.abc import Callable
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from splatjax.scene import StackedLights
+from splatjax.scene import StackedLights, sum_over_lights
 
 
 def entering_irradiance(
@@ -26,16 +25,11 @@ def entering_irradiance(
 
     **Returns:** linear in the lights. Differentiable in everything; the horizon is a kink.
     """
-    total = jnp.zeros((channels, points.shape[0]), points.dtype)
-    for group, shares in zip(groups, lit, strict=True):
 
-        @jax.checkpoint
-        def add(total, light_and_share):
-            light, share = light_and_share
-            wi, irradiance = light.incidence(points)
-            cosine = jnp.maximum(jnp.sum(wi * normals, axis=-1), 0)
-            received = cosine if share is None else cosine * share
-            return total + irradiance.T * (received[None] * entering(cosine)), None
+    def entering_of(light, share):
+        wi, irradiance = light.incidence(points)
+        cosine = jnp.maximum(jnp.sum(wi * normals, axis=-1), 0)
+        received = cosine if share is None else cosine * share
+        return irradiance.T * (received[None] * entering(cosine))
 
-        total, _ = jax.lax.scan(add, total, (group.lights, shares))
-    return total
+    return sum_over_lights(groups, lit, entering_of, jnp.zeros((channels, points.shape[0]), points.dtype))

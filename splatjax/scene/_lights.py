@@ -1,6 +1,7 @@
 """Lights. Directions point the way the light travels; `wi` points back, from the surface towards the light."""
 
 import abc
+from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import jax
@@ -115,3 +116,27 @@ def stack_lights(lights: tuple[AbstractLight, ...]) -> list[StackedLights]:
         StackedLights(jax.tree.map(lambda *leaves: jnp.stack(leaves), *[lights[i] for i in places]), tuple(places))
         for places in kinds.values()
     ]
+
+
+def sum_over_lights(
+    groups: list[StackedLights],
+    shares: Sequence[Array | None],
+    contribution: Callable[[AbstractLight, Array | None], Array],
+    start: Array,
+) -> Array:
+    """Add up what lights contribute, one after the other; backward, each is computed again.
+
+    **Arguments:**
+
+    - `shares`: for each group what of each light arrives, lights first; `None` for lights that cast no shadows.
+    - `contribution`: of a light, and its share.
+    - `start`: what they are added to.
+    """
+
+    @jax.checkpoint
+    def add(total, light_and_share):
+        return total + contribution(*light_and_share), None
+
+    for group, share in zip(groups, shares, strict=True):
+        start, _ = jax.lax.scan(add, start, (group.lights, share))
+    return start

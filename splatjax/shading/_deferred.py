@@ -1,12 +1,11 @@
 """Pass 5: deferred shading of one visible surface (section 4.1)."""
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from splatjax.scattering import SingleScattering
-from splatjax.scene import StackedLights
+from splatjax.scene import StackedLights, sum_over_lights
 
 from ._albedo import directional_albedo
 from ._composition import diffuse_transmission
@@ -44,21 +43,15 @@ def reflected_radiance(
     points: SurfacePoints, groups: list[StackedLights], f0: Float[Array, ""], channels: int
 ) -> Float[Array, "*pixels channels"]:
     """Give the specular radiance towards the eye: Kelemen / Szirmay-Kalos, each light in its own shadow."""
-    total = jnp.zeros((*points.positions.shape[:-1], channels), points.positions.dtype)
-    for group, shares in zip(groups, points.lit, strict=True):
 
-        @jax.checkpoint
-        def add(total, light_and_share):
-            light, share = light_and_share
-            wi, irradiance = light.incidence(points.positions)
-            lobe = specular_lobe(points.normals, wi, points.outgoing, f0=f0, specular=points.specular, roughness=points.roughness)
-            cosine = jnp.maximum(jnp.sum(wi * points.normals, axis=-1), 0)
-            received = lobe * cosine
-            received = received if share is None else received * share
-            return total + received[..., None] * irradiance, None
+    def reflected(light, share):
+        wi, irradiance = light.incidence(points.positions)
+        lobe = specular_lobe(points.normals, wi, points.outgoing, f0=f0, specular=points.specular, roughness=points.roughness)
+        received = lobe * jnp.maximum(jnp.sum(wi * points.normals, axis=-1), 0)
+        received = received if share is None else received * share
+        return received[..., None] * irradiance
 
-        total, _ = jax.lax.scan(add, total, (group.lights, shares))
-    return total
+    return sum_over_lights(groups, points.lit, reflected, _dark(points, channels))
 
 
 def single_scattered_radiance(
@@ -68,19 +61,17 @@ def single_scattered_radiance(
 
     What the specular lobe reflects does not enter. The surface counts as flat and evenly lit over a mean free path.
     """
-    channels = single.medium.sigma_a.shape[0]
-    total = jnp.zeros((*points.positions.shape[:-1], channels), points.positions.dtype)
     towards_eye = jnp.maximum(jnp.sum(points.normals * points.outgoing, axis=-1), 0)
-    for group, shares in zip(groups, points.lit, strict=True):
 
-        @jax.checkpoint
-        def add(total, light_and_share):
-            light, share = light_and_share
-            wi, irradiance = light.incidence(points.positions)
-            cosine = jnp.maximum(jnp.sum(wi * points.normals, axis=-1), 0)
-            entered = cosine * (1 - directional_albedo(cosine, f0, points.specular, points.roughness))
-            entered = entered if share is None else entered * share
-            return total + single.reflected(cosine, towards_eye) * entered[..., None] * irradiance, None
+    def scattered(light, share):
+        wi, irradiance = light.incidence(points.positions)
+        cosine = jnp.maximum(jnp.sum(wi * points.normals, axis=-1), 0)
+        entered = cosine * (1 - directional_albedo(cosine, f0, points.specular, points.roughness))
+        entered = entered if share is None else entered * share
+        return single.reflected(cosine, towards_eye) * entered[..., None] * irradiance
 
-        total, _ = jax.lax.scan(add, total, (group.lights, shares))
-    return total
+    return sum_over_lights(groups, points.lit, scattered, _dark(points, single.medium.sigma_a.shape[0]))
+
+
+def _dark(points: SurfacePoints, channels: int) -> Float[Array, "*pixels channels"]:
+    return jnp.zeros((*points.positions.shape[:-1], channels), points.positions.dtype)
