@@ -40,7 +40,7 @@ def rasterization(scene: sj.Scene, camera: sj.Camera, plan: sj.Plan, settings: s
     def picture(camera, centers, normals, radii, albedo):
         view, splats = splatting.PerspectiveView.of(camera), sj.Splats(centers, normals, radii, areas)
         rows = jnp.concatenate([normals.T, albedo.T])
-        seen = splatting.splat_surfaces(splats, rows, view, settings.splatting, plan.camera)
+        seen = splatting.splat_surfaces(splats, rows, view, settings.splatting, plan.rasterizer)
         front = seen.front.coverage
         behind = (1 - front) * seen.behind.coverage
         attributes = front[:, None] * seen.front.attributes + behind[:, None] * seen.behind.attributes

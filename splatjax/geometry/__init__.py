@@ -1,6 +1,7 @@
 """Makes and completes splats: bust, mesh sampling, normals, radii, areas."""
 
 from ._bust import bust as bust, bust_mesh as bust_mesh
+from ._cells import tangent_frames as tangent_frames
 from ._complete import complete_splats as complete_splats
 from ._complexion import complexion as complexion
 from ._cut import cut_below as cut_below

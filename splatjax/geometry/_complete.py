@@ -32,9 +32,12 @@ def complete_splats(
     - `normals`: unit; `None`: from neighbors (`estimate_normals`).
     - `areas`: mm^2; `None`: those of the Voronoi cells in the tangent planes.
     - `radii`: mm; `None`: as large as the cells ask for, so that no hole is left.
+    - `albedo`, `specular`, `roughness`: as `Splats` has them; never estimated.
 
     Points that lie alone are kept, estimated as large as their neighbors are, and a warning tells how many there are. Points at
     one place share their area.
+
+    **Returns:** as many splats as points, in JAX's default precision.
 
     **Raises:** `ValueError` when something must be estimated and there are fewer than four points at different places.
     """

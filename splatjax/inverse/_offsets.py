@@ -8,6 +8,7 @@ import numpy as np
 import scipy  # its parts are loaded where they are used, which takes a third of a second
 from jaxtyping import Array, Float, Int
 
+from splatjax.geometry import tangent_frames
 from splatjax.pointwise import one_program
 from splatjax.scene import Splats
 
@@ -108,10 +109,7 @@ def _blur(tree: "scipy.spatial.KDTree", normals: np.ndarray, areas: np.ndarray, 
 def _slopes(tree: "scipy.spatial.KDTree", normals: np.ndarray):
     """Give neighbors, tangents, and the weights of derivatives along them: least squares with quadratic terms."""
     around = tree.query(tree.data, k=_SLOPES, workers=-1)[1][:, 1:]
-    helper = np.where(np.abs(normals[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
-    first = np.cross(helper, normals)
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    tangents = np.stack([first, np.cross(normals, first)], axis=1)
+    tangents = np.stack(tangent_frames(normals), axis=1)
     offsets = tree.data[around] - tree.data[:, None]
     u, v = np.einsum("nki,nai->ank", offsets, tangents)
     size = np.sqrt(np.mean(u * u + v * v, axis=1, keepdims=True))

@@ -156,6 +156,8 @@ class Solution(eqx.Module):
 
 @eqx.filter_jit
 def solution(problem: Problem, point: Float[Array, " unknowns"]) -> Solution:
+    """Give what is known at a point: the picture, and how sharply residuals tell each unknown and the handover."""
+
     def residuals(point):
         gaussians, radiance = problem.gaussians(point), problem.radiance(point)
         return problem.residuals(point), (gaussians, radiance)

@@ -147,6 +147,7 @@ def positive_of(
 
 
 def factor_of(path: Path, vertices: Table, name: str) -> np.ndarray | None:
+    """Give a column of factors on what the material has; `None` if there is none."""
     values = columns_of(path, vertices, (name,))
     if values is None:
         return None

@@ -52,18 +52,21 @@ class Table:
         return values
 
     def thickness(self, name: str) -> np.ndarray:
+        """Give a positive number of mm, which may be infinite."""
         found = self.entry(name, "a number of mm, or inf")
         if not _is_number(found) or not rounded(found) > 0:
             raise ValueError(f"{self.where} {name} must be positive (mm), or inf; it is {found!r}")
         return np.asarray(found, np.float64)
 
     def number(self, name: str, expected: str, holds, default: float) -> float:
+        """Give one finite number, or what it is where the file says nothing."""
         found = self.table.get(name, default)
         if not _is_number(found) or not np.isfinite(rounded(found)) or not holds(rounded(found)):
             raise ValueError(f"{self.where} {name} must be a number, {expected}; it is {found!r}")
         return float(found)
 
     def matrix(self, name: str, rows: int) -> np.ndarray:
+        """Give a list of lists of finite numbers: so many, all equally long."""
         found = self.entry(name, "a list of numbers per Gaussian, one per channel")
         regular = isinstance(found, list) and all(isinstance(row, list) and row for row in found)
         if not regular or not all(_is_number(x) and np.isfinite(rounded(x)) for row in found for x in row):

@@ -79,7 +79,7 @@ def see_surfaces(
     splats: Splats, attributes: dict[str, Array], view: _splatting.AbstractView, settings: RenderSettings, plan: Plan
 ) -> SeenSurfaces:
     """Passes 2 and 3."""
-    summed = plan.camera.summed(splats, jnp.concatenate(list(attributes.values())), view, settings.splatting)
+    summed = plan.rasterizer.summed(splats, jnp.concatenate(list(attributes.values())), view, settings.splatting)
     return surfaces_of(summed, {name: rows.shape[0] for name, rows in attributes.items()}, view, settings, plan.tiles)
 
 

@@ -82,7 +82,7 @@ def _on_one_device(wanted: Wanted) -> Plan:
         for each in wanted.shadows
     )
     return Plan(
-        camera=wanted.camera,
+        rasterizer=wanted.rasterizer,
         tiles=tiles,
         shadows=tuple(shadows),
         diffuser=settings.diffuser.planned(splats, wanted.kernels, wanted.interval, atlases),

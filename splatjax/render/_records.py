@@ -9,7 +9,7 @@ from jax.sharding import Mesh
 from jaxtyping import Array, Float
 
 from splatjax import diffusion as _diffusion, splatting as _splatting
-from splatjax.scene import AbstractLight, PointLight, Splats
+from splatjax.scene import AbstractLight, DirectionalLight, GaussianBeam, PointLight, Splats
 
 from ._settings import RenderSettings
 
@@ -33,18 +33,25 @@ class Plan(eqx.Module):
     r"""What `jit`, `grad` and loops need to know of shapes; made by `plan` from concrete arrays.
 
     Capacities are static, indices are arrays. A picture that needs more than its plan holds is NaN, and says so in `overflow`.
+
+    **Attributes:**
+
+    - `rasterizer`: with room for what the camera sees.
+    - `tiles`: of the picture, that show a surface or one behind it. Static.
+    - `shadows`: for each group of lights of a kind the room of its shadow maps; `None` for lights that cast no shadows.
+    - `diffuser`: with the clusters of the splats.
+    - `interval`: widths between which a layer is handed over from the surface to diffusion, mm.
+    - `mesh`: the devices that hold the splats; `None` for one. Static.
+    - `splats`: how many it is for, whose order and clusters are in it; `None` for any number. Static.
     """
 
-    camera: _splatting.AbstractRasterizer
+    rasterizer: _splatting.AbstractRasterizer
     tiles: int = eqx.field(static=True)
-    """Of the pictures, that show a surface or one behind it."""
     shadows: tuple[ShadowPlan | None, ...]
     diffuser: _diffusion.AbstractDiffuser
     interval: Float[Array, "2"]
     mesh: Mesh | None = eqx.field(static=True, default=None)
-    """The devices that hold the splats; `None` for one."""
     splats: int | None = eqx.field(static=True, default=None)
-    """How many it is for: their order and clusters are in it. `None` for any number."""
 
 
 class Wanted(eqx.Module):
@@ -60,7 +67,7 @@ class Wanted(eqx.Module):
     """For each of them, where there is anything to see, and how far away."""
     shadows: list["ShadowsWanted | None"]
     """For each group of lights; `None` for lights that cast no shadows."""
-    camera: _splatting.AbstractRasterizer
+    rasterizer: _splatting.AbstractRasterizer
     """With room for the views of the cameras."""
 
 
@@ -77,9 +84,14 @@ def stands_among(lights: Sequence[AbstractLight], bounds: _splatting.Bounds) -> 
     return any(distance < _NEARLY * float(bounds.radius) for distance in near)
 
 
-def shadow_views(light, bounds, settings: RenderSettings, cube: bool) -> Sequence[_splatting.AbstractView]:
-    if not isinstance(light, PointLight):
+def shadow_views(
+    light: AbstractLight, bounds: _splatting.Bounds, settings: RenderSettings, cube: bool
+) -> Sequence[_splatting.AbstractView]:
+    """Give the views of a light's shadow maps: one of all splats, or the six faces of a cube around it."""
+    if isinstance(light, DirectionalLight | GaussianBeam):
         return [_splatting.distant_view(light.direction, bounds, settings.shadows)]
+    if not isinstance(light, PointLight):
+        raise ValueError(f"{type(light).__name__}: no shadow map is known for it; give one with cast_shadows=False")
     if cube:
         return _splatting.cube_views(light.position, settings.shadows)
     return [_splatting.near_view(light.position, bounds, settings.shadows)]

@@ -81,7 +81,7 @@ def plan_over(mesh: Mesh, wanted: Wanted) -> Plan:
     uncut = [_splatting.Atlas.of(look, view, look.size) for look, view in zip(wanted.looks, wanted.views, strict=True)]
     diffuser = settings.diffuser.planned(wanted.splats, wanted.kernels, wanted.interval, cut)
     made = Plan(
-        camera=rasterizer(wanted.views, owners=jnp.asarray(owners.reshape(-1)), share=share),
+        rasterizer=rasterizer(wanted.views, owners=jnp.asarray(owners.reshape(-1)), share=share),
         tiles=tiles,
         shadows=tuple(None if each is None else ShadowPlan(rasterizer(each.views), each.cube) for each in wanted.shadows),
         diffuser=_diffusion.ShardedDiffuser.of(diffuser, wanted.splats, parts, wanted.kernels, uncut, devices),

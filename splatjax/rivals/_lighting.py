@@ -5,6 +5,7 @@ import numpy as np
 import scipy  # its parts are loaded where they are used, which takes a third of a second
 from jaxtyping import Array, Float
 
+from splatjax.geometry import tangent_frames
 from splatjax.pointwise import in_parts
 from splatjax.render import AbstractLighting, LightOnSplats, entering_light, surface_attributes
 from splatjax.scene import Scene, Splats, StackedLights
@@ -71,10 +72,7 @@ def normal_slopes(splats: Splats, neighbors: int = _NEIGHBORS) -> Float[Array, "
     """
     centers, normals = (np.asarray(each, np.float64) for each in (splats.centers, splats.normals))
     near = scipy.spatial.KDTree(centers).query(centers, k=min(neighbors + 1, len(centers)))[1][:, 1:]
-    helper = np.where(np.abs(normals[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
-    first = np.cross(normals, helper)
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    plane = np.stack([first, np.cross(normals, first)], axis=1)
+    plane = np.stack(tangent_frames(normals), axis=1)
     counts = np.einsum("ski,si->sk", normals[near], normals) > 0
     offsets = np.einsum("ski,sai->ska", centers[near] - centers[:, None], plane) * counts[..., None]
     turns = normals[near] - normals[:, None]

@@ -214,11 +214,11 @@ def typical(shape: Shape) -> tuple[sj.Scene, sj.Camera]:
 
 def roomy(plan: sj.Plan, shape: Shape) -> sj.Plan:
     """Give every list room for everything, and every layer any variance."""
-    camera = plan.camera
+    rasterizer = plan.rasterizer
 
     def widened(part):
         if isinstance(part, TileRasterizer):
-            size = (shape.width, shape.height) if part is camera else (SHADOWS.resolution,) * 2
+            size = (shape.width, shape.height) if part is rasterizer else (SHADOWS.resolution,) * 2
             tiles = TileGrid(*size, part.lanes).tiles
             room = BinCapacity(*_room(shape.splats, tiles, part.lanes, part.slots))
             return TileRasterizer(part.lanes, part.slots, TileCapacity(max(shape.splats, 1), room))

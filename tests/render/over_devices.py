@@ -108,7 +108,7 @@ def traffic() -> dict:
     layers = [layer for layer in plan.diffuser.whole.layers if layer.capacity is not None]
     picture = Picture(
         tiles=30,
-        shown=8 * plan.camera.share,
+        shown=8 * plan.rasterizer.share,
         places=8 * plan.tiles,
         maps=(16,),
         attributes=14,

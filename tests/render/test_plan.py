@@ -1,5 +1,6 @@
 """One plan for an animation: it holds for every camera and every light."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import pytest
@@ -85,3 +86,23 @@ def test_a_batch_whose_arrays_are_not_stacked_is_refused():
     mesh = jax.make_mesh((1,), ("views",))
     with pytest.raises(ValueError, match=r"\['b'\] has none"):
         sj.map_over(mesh, lambda one, each: each["a"], jnp.zeros(()), {"a": jnp.zeros(4), "b": jnp.zeros(())})
+
+
+class Sky(AbstractLight):
+    """A light of someone's own: the same from every side."""
+
+    radiance: jax.Array
+    cast_shadows: bool = eqx.field(static=True, default=False)
+
+    def incidence(self, points):
+        up = jnp.zeros_like(points).at[..., 2].set(1.0)
+        return up, jnp.broadcast_to(self.radiance, points.shape)
+
+
+def test_a_light_of_ones_own_shines_without_shadows_and_is_told_so_with_them():
+    camera = camera_at(20.0)
+    shown = sj.render(scene_under(Sky(jnp.full(3, 2.0))), camera, settings=SETTINGS)
+    lit = sj.render(scene_under(lamp(0, 0, -2, cast_shadows=False)), camera, settings=SETTINGS)
+    assert jnp.allclose(shown.beauty, 2 * lit.beauty, rtol=1e-5)
+    with pytest.raises(ValueError, match="Sky: no shadow map is known for it; give one with cast_shadows=False"):
+        sj.plan(scene_under(Sky(jnp.ones(3), cast_shadows=True)), camera, SETTINGS)
