@@ -90,8 +90,3 @@ class SumOfGaussians(AbstractProfile):
     def white(self) -> "SumOfGaussians":
         """Give the same profile with the weights of each channel divided by their sum."""
         return SumOfGaussians(self.variances, self.weights / jnp.sum(self.weights, axis=0)[None])
-
-
-def channel_names(count: int) -> tuple[str, ...]:
-    """Give what channels are called where nobody has named them: red, green and blue if they are three."""
-    return ("red", "green", "blue") if count == 3 else tuple(f"channel {channel + 1}" for channel in range(count))

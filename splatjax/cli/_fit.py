@@ -13,9 +13,9 @@ from rich.table import Table
 
 import splatjax as sj
 from splatjax.fitting import AbstractWeights
-from splatjax.gaussians import channel_names
 from splatjax.io import own_version, read_picture, surface_and_source
 from splatjax.scattering import measure_laser_dot
+from splatjax.words import channel_names, counted
 
 from ._fit_all import fit_all
 from ._models import Model, Reference, reference
@@ -131,7 +131,7 @@ class Fit:
             made = reference(coefficients, self.model, self.cut, self.photons, self.single_scattering)
         profile = made.profile
         count = self.count if self.error is None else sj.LeastCount(self.error)
-        wanted = _gaussians(self.count) if self.error is None else f"Gaussians that leave an error of {self.error:g} at most"
+        wanted = counted(self.count, "Gaussian") if self.error is None else f"Gaussians to an error of {self.error:g}"
         with stage(f"fitting to {self.medium}: {wanted}"):
             weights = self._weights(coefficients)
             fitted = jax.block_until_ready(sj.fit_gaussians(profile, count, weights=weights, rule=made.rule, throw=False))
@@ -148,12 +148,12 @@ class Fit:
             from splatjax.plots import plot_fit  # loads matplotlib
 
             found = len(fitted.gaussians.variances)
-            figure = plot_fit(profile, fitted.gaussians, rule=made.rule, title=f"{self.medium}, {_gaussians(found)}")
+            figure = plot_fit(profile, fitted.gaussians, rule=made.rule, title=f"{self.medium}, {counted(found, 'Gaussian')}")
             save_figure(figure, self.plot)
             print(self.plot)
 
     def _unsettled(self, count: int) -> str:
-        told = f"{self.medium}: the search for {_gaussians(count)} did not settle"
+        told = f"{self.medium}: the search for {counted(count, 'Gaussian')} did not settle"
         if self.model is Model.MONTE_CARLO:
             return f"{told}; {self.photons} photons tell too little apart: give more --photons, or a smaller --count"
         return f"{told}; give a smaller --count"
@@ -226,10 +226,6 @@ def _print(fitted: sj.FitResult) -> None:
     table.add_row("error (Eq. 4)", _numbers(fitted.error, ".2e"))
     table.add_row("energy error", _numbers(fitted.energy_error, ".2e"))
     Console(highlight=False).print(table)
-
-
-def _gaussians(count: int) -> str:
-    return "1 Gaussian" if count == 1 else f"{count} Gaussians"
 
 
 def _numbers(values: jax.Array, form: str) -> str:

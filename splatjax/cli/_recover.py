@@ -14,16 +14,17 @@ from rich.console import Console
 
 import splatjax as sj
 from splatjax.io import fingerprint, material_path, own_version, picture_paths, read_record, write_record
+from splatjax.words import counted
 
 from ._models import Model
-from ._options import MaterialNames, OptionalPath
+from ._options import MaterialNames, OptionalFloat, OptionalPath
 from ._outputs import FIGURES, check_output, save_figure
 from ._report import note, stage
 
 _START = (
-    "Materials to start from, within a factor of three in both coefficients: names, or paths of TOML files. The best end counts; "
-    "the index of refraction is that of the first."
+    "Materials to start from, within a factor of three in both coefficients: names, or paths of TOML files. The best end counts."
 )
+_LARGEST_ETA = 3.0
 _MODELS = {Model.DIPOLE: sj.Dipole, Model.BETTER_DIPOLE: sj.BetterDipole}
 
 
@@ -57,6 +58,8 @@ class Recover:
     pictures: tyro.conf.Positional[Path]
     """TOML file that lists the pictures."""
     start: Annotated[MaterialNames, tyro.conf.arg(help=_START)] = ("skin1", "marble")
+    eta: OptionalFloat = None
+    """Index of refraction, which is not searched. Without it, that of the first start."""
     output: Path = Path("recovered.toml")
     """TOML file to write the material to."""
     report: OptionalPath = None
@@ -83,6 +86,8 @@ class Recover:
             raise ValueError(f"--model {self.model.value} cannot be searched; take {' or '.join(m.value for m in _MODELS)}")
         if not self.start:
             raise ValueError("--start names no material; give one or more (`splatjax materials`)")
+        if self.eta is not None and not 1 <= self.eta <= _LARGEST_ETA:
+            raise ValueError(f"--eta is {self.eta:g}; it must lie between 1 and {_LARGEST_ETA:g}: marble has 1.5, skin 1.4")
         for name in self.start:
             sj.load_medium(name)  # says at once what is wrong with it
         with stage(f"reading {self.splats} and {self.pictures}"):
@@ -122,10 +127,10 @@ class Recover:
         )
         if recovery.result != optx.RESULTS.successful:
             raise ValueError(
-                f"{self.pictures}: the search did not settle in {recovery.rounds} rounds and {recovery.steps} steps; the same "
+                f"{self.pictures}: the search did not settle in {self._effort(recovery)}; the same "
                 "command goes on where it stopped, or --start names materials that are nearer"
             )
-        note(f"{time.perf_counter() - begin:6.1f} s  found, after {recovery.rounds} rounds and {recovery.steps} steps")
+        note(f"{time.perf_counter() - begin:6.1f} s  found, after {self._effort(recovery)}")
         Console(highlight=False, soft_wrap=True).print(recovery.words(), markup=False)
         if self.suggest:
             self._suggest(recovery, observations, splats)
@@ -135,7 +140,9 @@ class Recover:
         if self.report is not None:
             from splatjax.plots import plot_recovery  # loads matplotlib
 
-            save_figure(plot_recovery(recovery, title=f"{self.output.stem}: {len(observations)} picture(s)"), self.report)
+            save_figure(
+                plot_recovery(recovery, title=f"{self.output.stem}: {counted(len(observations), 'picture')}"), self.report
+            )
             print(self.report)
 
     def _starts(self, channels: int) -> list[sj.Medium]:
@@ -144,7 +151,8 @@ class Recover:
         for name, medium in zip(self.start, known, strict=True):
             if medium.eta.shape[0] != channels:
                 raise ValueError(f"--start {name} has {medium.eta.shape[0]} channels, the pictures have {channels}; name another")
-        starts = [sj.Medium(medium.sigma_a, medium.sigma_s_prime, known[0].eta) for medium in known]
+        eta = known[0].eta if self.eta is None else jnp.full_like(known[0].eta, self.eta)
+        starts = [sj.Medium(medium.sigma_a, medium.sigma_s_prime, eta) for medium in known]
         kept = self._kept()
         if not kept.exists():
             return starts
@@ -153,7 +161,10 @@ class Recover:
             note(f"{kept}: is of another search, and is not used")
             return starts
         note(f"{kept}: an interrupted search goes on")
-        return [sj.Medium(jnp.asarray(record["sigma_a"]), jnp.asarray(record["sigma_s_prime"]), known[0].eta)]
+        return [sj.Medium(jnp.asarray(record["sigma_a"]), jnp.asarray(record["sigma_s_prime"]), eta)]
+
+    def _effort(self, recovery: sj.Recovery) -> str:
+        return f"{counted(recovery.rounds, 'round')} and {counted(recovery.steps, 'step')}"
 
     def _kept(self) -> Path:
         return self.output.with_suffix(".search.json")
@@ -161,7 +172,13 @@ class Recover:
     def _made(self) -> dict[str, Any]:
         """Give all that a search depends on."""
         files = [self.splats, *picture_paths(self.pictures), *(material_path(name) for name in self.start)]
-        options = {"model": self.model.value, "count": self.count, "robust": self.robust, "specular": self.specular}
+        options = {
+            "model": self.model.value,
+            "count": self.count,
+            "robust": self.robust,
+            "eta": self.eta,
+            "specular": self.specular,
+        }
         return {"files": [fingerprint(file) for file in files], **options, "roughness": self.roughness, "splatjax": own_version()}
 
     def _suggest(self, recovery: sj.Recovery, observations: list[sj.Observation], splats: sj.Splats) -> None:

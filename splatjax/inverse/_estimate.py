@@ -6,8 +6,8 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from splatjax.gaussians import channel_names
 from splatjax.scattering import Medium
+from splatjax.words import channel_names, percent
 
 _FIXED = 0.1
 """A combination that is known no better than this, as a relative error, counts as not fixed."""
@@ -111,11 +111,6 @@ def inverse(information: Float[np.ndarray, "unknowns unknowns"]) -> Float[np.nda
     # What rounding leaves of a direction in which nothing changes counts as nothing.
     values = np.maximum(values, np.finfo(np.float64).eps * len(values))
     return (axes / values) @ axes.T / np.outer(lengths, lengths)
-
-
-def percent(share: float) -> str:
-    """Write a relative error."""
-    return "anything" if not np.isfinite(share) or share > 10 else f"{float(f'{100 * share:.2g}'):g}%"
 
 
 def _power(name: str, power: float) -> str:

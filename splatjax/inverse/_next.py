@@ -12,8 +12,9 @@ from splatjax.gaussians import AbstractProfile
 from splatjax.render import RenderSettings
 from splatjax.scattering import Dipole, Medium
 from splatjax.scene import AbstractLight, Camera, DirectionalLight, GaussianBeam, Splats
+from splatjax.words import percent
 
-from ._estimate import Combination, best_and_worst, percent
+from ._estimate import Combination, best_and_worst
 from ._evidence import Evidence
 from ._flat import Gatherer
 from ._intensity import AbstractIntensity, KnownIntensity

@@ -14,6 +14,7 @@ from splatjax.gaussians import AbstractProfile, SumOfGaussians
 from splatjax.render import RenderSettings
 from splatjax.scattering import Dipole, Medium
 from splatjax.scene import Material, Splats
+from splatjax.words import counted
 
 from ._estimate import inverse
 from ._evidence import Evidence
@@ -95,9 +96,9 @@ def recover(
     def problem_of(gathered, variances):
         return evidence.problem(gathered, unknowns, variances, loss, weights, model)
 
-    say(f"rendering {len(wide.variances)} layers of {_number(len(observations), 'picture')}", starts[0])
+    say(f"rendering {len(wide.variances)} layers of {counted(len(observations), 'picture')}", starts[0])
     problem, _ = problem_of(gatherer.held(surface), Held(wide.variances))
-    say(f"searching from {_number(len(starts), 'start')} among {problem.observed.shape[1]} pixels", starts[0])
+    say(f"searching from {counted(len(starts), 'start')} among {problem.observed.shape[1]} pixels", starts[0])
     ends = [search(problem, unknowns.start(start, factors)) for start in starts]
     costs = np.nan_to_num([float(end.cost) for end in ends], nan=np.inf)
     best = ends[int(np.argmin(costs))]
@@ -171,10 +172,6 @@ def _unweighed(variances: Float[Array, " gaussians"], channels: int) -> SumOfGau
 
 def _nobody(said: str, medium: Medium) -> None:
     del said, medium
-
-
-def _number(count: int, what: str) -> str:
-    return f"{count} {what}{'s' if count > 1 else ''}"
 
 
 def _words(medium: Medium) -> str:

@@ -11,8 +11,9 @@ from jaxtyping import Array, Float
 
 from splatjax.scattering import Medium
 from splatjax.scene import Material
+from splatjax.words import percent
 
-from ._estimate import Combination, Estimate, inverse, percent, roots
+from ._estimate import Combination, Estimate, inverse, roots
 
 _HANDOVER = 0.5 * math.log(2.0)
 """How well the width is known, as a logarithm, below which layers are handed to the surface: twice as many splats move it by as

@@ -106,6 +106,15 @@ def test_it_writes_a_material_and_a_report_and_says_what_is_not_fixed(files, sea
     assert isinstance(loss, sj.HuberLoss)
 
 
+def test_the_index_of_refraction_is_that_of_the_first_start_or_the_one_given(files, search, tmp_path):
+    command = ["recover", *files, "--start", "marble", "skin1", "--output", tmp_path / "mine.toml", "--no-suggest"]
+    for more, eta in (([], 1.5), (["--eta", "1.42"], 1.42)):
+        assert main([str(word) for word in (*command, *more)]) == 0
+        for start in search[0][-1][2]:
+            np.testing.assert_allclose(start.eta, 3 * [eta], rtol=1e-6)
+        assert sj.load_material(tmp_path / "mine.toml").eta == pytest.approx(eta)
+
+
 def test_interrupted_it_goes_on_where_it_was(files, search, tmp_path, capsys):
     asked, interrupted = search
     interrupted.append(KeyboardInterrupt())
@@ -133,6 +142,7 @@ def test_what_cannot_be_is_said_in_one_line(files, search, tmp_path, capsys):
         [*command, "--model", "monte-carlo"], capsys, [output]
     )
     assert "must end in .toml" in failure(["recover", *files, "--output", tmp_path / "mine.exr"], capsys)
+    assert "--eta is 0.9; it must lie between 1 and 3" in failure([*command, "--eta", "0.9"], capsys, [output])
     assert "has no [medium]" in failure([*command, "--start", "skin"], capsys, [output])
     assert not search[0]
 
@@ -142,7 +152,7 @@ def test_a_search_that_does_not_settle_says_so_and_is_taken_up_again(files, sear
     command = [str(word) for word in ("recover", *files, "--output", tmp_path / "mine.toml", "--no-suggest")]
     assert main(command) == 2
     said = capsys.readouterr().err.splitlines()[-1]
-    assert f"{files[1]}: the search did not settle in 1 rounds and 5 steps; the same command goes on where it stopped" in said
+    assert f"{files[1]}: the search did not settle in 1 round and 5 steps; the same command goes on where it stopped" in said
     assert (tmp_path / "mine.search.json").exists()
     assert not (tmp_path / "mine.toml").exists()
     assert main(command) == 0

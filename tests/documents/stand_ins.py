@@ -77,6 +77,16 @@ def _photograph(path: Path) -> None:
     _exr(path, np.asarray(sj.render(sj.Scene(splats, (lamp,), material), camera).beauty))
 
 
+def _figurine(path: Path) -> None:
+    """As howto/recover.md makes it, of marble; and its picture."""
+    bust = sj.bust(1_500)
+    splats = sj.Splats(0.2 * bust.centers, bust.normals, 0.2 * bust.radii, 0.04 * bust.areas)
+    camera = sj.Camera.look_at(jnp.asarray([0.0, 0.0, 130.0]), jnp.asarray([0.0, -8.0, 0.0]), fov=30.0, width=_SIDE, height=_SIDE)
+    lamp = sj.DirectionalLight(jnp.asarray([1.0, -0.3, -0.5]), jnp.full(3, 3.14))
+    sj.write_splats(path, splats)
+    sj.write_exr(path.with_suffix(".exr"), sj.render(sj.Scene(splats, (lamp,), sj.load_material("marble")), camera))
+
+
 def _read_plain(path: Path) -> sj.Splats:
     splats = sj.read_splats(path)
     return sj.Splats(splats.centers, splats.normals, splats.radii, splats.areas)
@@ -102,6 +112,7 @@ _MADE = {
     "measured.csv": _measured,
     "dot.exr": _dot,
     "left.exr": _photograph,
+    "figurine.ply": _figurine,
 }
 
 
