@@ -31,13 +31,14 @@ class ShadowSettings(eqx.Module):
     - `bias`: a surface less than this far behind the map's, in mm, is still fully lit: keeps a surface from shadowing itself.
     - `softness`: over this many more mm the light fades; with it shadows have gradients in depth. Across the shadow's edge,
       light fades over about two pixels of the map.
-    - `largest_slope`: the slope up to which the receiver's own plane is followed from pixel to pixel of the map.
+    - `largest_slope`: the slope up to which the receiver's own plane is followed from pixel to pixel of the map. Measured on
+      heads: 4 leaves terraces where light grazes, beyond 8 nothing is gained.
     """
 
     resolution: int = eqx.field(static=True, default=1024)
     bias: float = eqx.field(static=True, default=0.4)
     softness: float = eqx.field(static=True, default=0.8)
-    largest_slope: float = eqx.field(static=True, default=4.0)
+    largest_slope: float = eqx.field(static=True, default=8.0)
 
 
 class Bounds(eqx.Module):

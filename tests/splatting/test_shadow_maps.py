@@ -171,6 +171,19 @@ def test_a_sphere_does_not_shadow_itself(kind):
 
 
 @pytest.mark.once
+@pytest.mark.once
+def test_light_that_grazes_a_smooth_body_leaves_no_terraces():
+    """A splat's depth is followed along its plane where the map's pixels are as wide as the light is deep: to a cosine of 1/8."""
+    body, toward = bodies.sphere(20_000, 40.0), np.asarray([0.6, 0.3, 0.742])
+    settings = ShadowSettings(resolution=128)
+    view = distant_view(-jnp.asarray(toward), Bounds.of(body), settings)
+    rasterizer = TileRasterizer().planned(body, [view], SPLATTING)
+    lit = np.asarray(lit_share(body, view, light_surfaces(body, view, SPLATTING, rasterizer), settings))
+    cosine = np.asarray(body.normals, float) @ toward
+    assert np.mean(lit[(cosine > 0.13) & (cosine < 0.2)]) > 0.99  # 0.97 if it is followed to 1/4
+    assert np.min(lit[cosine > 0.2]) > 0.999
+
+
 def test_edge_has_the_gradient_of_central_differences():
     """In the direction of the light, and in where the occluder stands."""
     with jax.enable_x64(True):
