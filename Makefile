@@ -24,10 +24,11 @@ $(VENV)/ready: requirements.lock pyproject.toml
 	VIRTUAL_ENV=$(abspath $(VENV)) $(BIN)/uv pip install --quiet --no-deps --no-build-isolation --editable .
 	touch $@
 
-# The built-in bust, in soft skin: out/bust.png and out/bust.exr.
+# The built-in bust, seven centimeters of skin: out/bust.png, and out/plain.png without light below the surface.
 demo: setup
 	mkdir -p out
-	$(BIN)/splatjax render --output out/bust.exr
+	$(BIN)/splatjax render --scale 0.2 --output out/bust.exr
+	$(BIN)/splatjax render --scale 0.2 --no-scattering --output out/plain.exr
 
 # Everything CI checks: style, types, the flow of imports, and the suite in both precisions.
 test: lint test-float32 test-x64 test-once

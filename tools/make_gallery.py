@@ -204,7 +204,7 @@ def wax(_: sj.Splats, side: int) -> np.ndarray:
 def inverse(_: sj.Splats, side: int) -> np.ndarray:
     """What was photographed, the same under the coefficients that the search starts from, and under those that it finds."""
     bust, scale = sj.bust(20_000), 0.2
-    splats = sj.Splats(scale * bust.centers, bust.normals, scale * bust.radii, scale * scale * bust.areas)
+    splats = sj.Splats(bust.centers, bust.normals, bust.radii, bust.areas).scaled(scale)
     camera = looking((46, 4, 128), (0, -8, 0), 30.0, 3 * side // 8)
     lights = sun(-0.9, 0.5, 0.45), sun(0.9, 0.2, -0.6, 0.6)
     with jax.enable_x64(True):

@@ -124,6 +124,8 @@ class Fit:
         self._check_options()
         if self.count > (most := sj.LeastCount.largest):
             raise ValueError(f"--count is {self.count}; it lies between 1 and {most}, as many as --error takes")
+        if self.error is not None and not self.error > 0:
+            raise ValueError(f"--error is {self.error:g}; it must be positive, such as 0.01")
         coefficients = self._coefficients()
         if isinstance(coefficients, sj.Tabulated):
             made = Reference(coefficients, sj.NORM_RULE)
@@ -132,6 +134,8 @@ class Fit:
         profile = made.profile
         count = self.count if self.error is None else sj.LeastCount(self.error)
         wanted = counted(self.count, "Gaussian") if self.error is None else f"Gaussians to an error of {self.error:g}"
+        if isinstance(coefficients, sj.Tabulated) and self.error is None and 2 * self.count > len(coefficients.radii):
+            note(f"{self.medium} has {len(coefficients.radii)} radii, too few to tell {wanted} apart: give a smaller --count")
         with stage(f"fitting to {self.medium}: {wanted}"):
             weights = self._weights(coefficients)
             fitted = jax.block_until_ready(sj.fit_gaussians(profile, count, weights=weights, rule=made.rule, throw=False))

@@ -50,7 +50,9 @@ class Render(Shot):
             raise ValueError(f"--stream is {self.stream}; it is a number of splats of a PLY file, which must be named")
         file = sj.SplatFile(self.splats, self.stream)
         with stage(f"looking at {file.count} splats"):
-            camera = frame_parts(file, towards(self.azimuth, self.elevation), self.fov, self.width, self.height)
+            camera = frame_parts(
+                lambda: map(self.worn, file()), towards(self.azimuth, self.elevation), self.fov, self.width, self.height
+            )
         material = self.material_for(self.worn(next(file())), sj.load_material(self.material))
         lights = self.lights(material.gaussians.weights.shape[1], self.azimuth, self.light_azimuth)
         with sweeps(file.count) as report:

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import tyro
 
 import splatjax as sj
@@ -44,5 +45,7 @@ class Sample(MeshMaps):
         with stage(f"writing {self.output}"):
             sj.write_splats(self.output, splats)
         carried = [name for name in ("albedo", "specular", "roughness") if getattr(splats, name) is not None]
-        note(f"{splats.count} splats that cover {float(splats.areas.sum()):.0f} mm^2, with {', '.join(carried) or 'no maps'}")
+        size = np.ptp(np.asarray(splats.centers), axis=0)
+        covered = f"{splats.count} splats on {float(splats.areas.sum()):.4g} mm^2, with {', '.join(carried) or 'no maps'}"
+        note(f"{covered}; the body is {size[0]:.3g} mm wide, {size[1]:.3g} high and {size[2]:.3g} deep")
         print(self.output)

@@ -56,6 +56,8 @@ class Shot:
     """Whether the splats wear the albedo that they carry, as the built-in bust does. Without, color is the material's own."""
     count: int = 200_000
     """Number of splats of the built-in bust."""
+    scale: float = 1.0
+    """Size of the body: at 0.2 the bust is 7 cm tall, and light goes five times as far in it."""
 
     def check(self) -> None:
         """Raise `ValueError` for a fill, an exposure or an angle that cannot be."""
@@ -69,6 +71,8 @@ class Shot:
         for name in ("width", "height", "count"):
             if getattr(self, name) < 1:
                 raise ValueError(f"--{name} is {getattr(self, name)}; it must be 1 or more")
+        if not 0 < self.scale < math.inf:
+            raise ValueError(f"--scale is {self.scale:g}; it must be a positive factor: 1 shows a body as large as it is")
         if not 0 < self.fov < 180:
             raise ValueError(f"--fov is {self.fov:g}; it must lie between 0 and 180 degrees, both excluded")
         if not -90 < self.elevation < 90:
@@ -102,7 +106,8 @@ class Shot:
             return self.worn(sj.read_splats(self.splats))
 
     def worn(self, splats: sj.Splats) -> sj.Splats:
-        """Give splats with their albedo, or without."""
+        """Give splats in the size that is asked for, with their albedo, or without."""
+        splats = splats if self.scale == 1 else splats.scaled(self.scale)
         return splats if self.albedo else eqx.tree_at(lambda each: each.albedo, splats, None, is_leaf=lambda leaf: leaf is None)
 
     def lights(self, channels: int, azimuth: float, light_azimuth: float) -> tuple[sj.DirectionalLight, ...]:
@@ -147,7 +152,10 @@ class Shot:
             f"{float(v) ** 0.5:.3g}" for v, there in zip(material.gaussians.variances, handed_over, strict=True) if there
         )
         if widths:
-            note(f"narrower than the splats, so that the surface's own light stands for them: the Gaussians of {widths} mm")
+            note(
+                f"narrower than the splats, so that the surface's own light stands for them: Gaussians of standard deviations "
+                f"{widths} mm; more splats show them, or a smaller body (--scale)"
+            )
 
 
 def draw(scene: sj.Scene, camera: sj.Camera, plan: sj.Plan) -> sj.Frame:

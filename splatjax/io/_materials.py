@@ -114,7 +114,7 @@ def load_medium(name_or_path: str | os.PathLike[str]) -> Medium:
     """
     path, tables = _read(name_or_path)
     if "medium" not in tables:
-        have = "layers (`load_profile`)" if "layers" in tables else "Gaussians, which are ready to render (`load_material`)"
+        have = "layers (`load_profile`)" if "layers" in tables else "Gaussians, ready for `splatjax render` or `load_material`"
         raise ValueError(f"{path}: has no [medium]; known are only its {have}")
     return _medium(Table(path, "medium", tables["medium"]))
 
@@ -275,9 +275,11 @@ def _read(name_or_path: str | os.PathLike[str]) -> tuple[Path, dict[str, Any]]:
         tables = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise ValueError(
-            f"{path}: cannot be read ({error.strerror}); name one of {', '.join(materials())}, or a TOML file"
+            f"{path}: cannot be read ({error.strerror}); check the path, or name a material (`materials()`)"
         ) from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except UnicodeDecodeError:
+        raise ValueError(f"{path}: is no TOML file, and no text at all; a material is one") from None
+    except tomllib.TOMLDecodeError as error:
         raise ValueError(f"{path}: is no TOML file: {error}") from None
     unknown = sorted(set(tables) - set(_TABLES))
     if unknown:
@@ -290,6 +292,8 @@ def _read(name_or_path: str | os.PathLike[str]) -> tuple[Path, dict[str, Any]]:
     _surface(path, tables)
     if "medium" in tables:
         medium = Table(path, "medium", tables["medium"])
+        if "sigma_s" in medium.table:
+            raise ValueError(f"{medium.where} has sigma_s; give sigma_s_prime = (1 - g) sigma_s, with the mean cosine g")
         medium.only(_COEFFICIENTS)
         _medium(medium)
     if "layers" in tables:

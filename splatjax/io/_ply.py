@@ -1,6 +1,7 @@
 """Splats in PLY files."""
 
 import os
+import warnings
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -15,12 +16,13 @@ from ._files import check_unit, existing_file
 from ._mesh import MESHES_ALONE
 from ._pieces import moderate
 from ._ply_columns import Table, colors_of, columns_of, normals_of, places_of, vertex_table
-from ._ply_tables import read_ply
+from ._ply_tables import Ragged, read_ply
 
 RADIUS = ("radius", "radii")
 AREA = ("area", "areas")
 _SHORTEST, _LONGEST = 1e-9, 1e9  # mm: beyond, single precision loses areas
 _LARGEST = 1e6
+_COVER = "cover it with splats first: `splatjax sample {} --mm-per-unit ... --output ...`, or sample_mesh"
 _GAUSSIAN_SPLATTING = ("f_dc_0", "scale_0", "rot_0")
 
 
@@ -36,7 +38,7 @@ def read_splats(path: str | os.PathLike[str], *, mm_per_unit: float = 1.0) -> Sp
     | `red green blue` | albedo: integers are sRGB up to the type's maximum, floats are linear |
     | `specular`, `roughness` | factors on the material's |
 
-    Other properties and elements are left alone.
+    Other properties and elements are left alone; where there are faces and no radii, a warning says so.
 
     **Arguments:**
 
@@ -50,8 +52,9 @@ def read_splats(path: str | os.PathLike[str], *, mm_per_unit: float = 1.0) -> Sp
     path = existing_file(path)
     check_unit(path, mm_per_unit)
     if path.suffix.lower() in MESHES_ALONE:
-        raise ValueError(f"{path}: is a mesh; cover it with splats first: `splatjax sample {path} --mm-per-unit`, or sample_mesh")
-    vertices = vertex_table(path, read_ply(path))
+        raise ValueError(f"{path}: is a mesh; {_COVER.format(path)}")
+    file = read_ply(path)
+    vertices = vertex_table(path, file)
     if all(name in vertices for name in _GAUSSIAN_SPLATTING):
         raise ValueError(
             f"{path}: is a Gaussian-splatting scene (f_dc, scale, rot, opacity): its fuzzy ellipsoids carry baked radiance and no"
@@ -61,6 +64,8 @@ def read_splats(path: str | os.PathLike[str], *, mm_per_unit: float = 1.0) -> Sp
     normals = normals_of(path, vertices)
     radii, areas = positive_of(path, vertices, RADIUS, mm_per_unit), positive_of(path, vertices, AREA, mm_per_unit**2)
     check_place(path, centers * mm_per_unit, estimated=radii is None or areas is None)
+    if radii is None and _rows(file.elements.get("face", {})):
+        warnings.warn(f"{path}: has faces, and only their corners are taken, as points; {_COVER.format(path)}", stacklevel=2)
     albedo = colors_of(path, vertices)
     specular, roughness = (factor_of(path, vertices, name) for name in ("specular", "roughness"))
     try:
@@ -155,3 +160,8 @@ def factor_of(path: Path, vertices: Table, name: str) -> np.ndarray | None:
     if not 0 <= reached <= _LARGEST:
         raise ValueError(f"{path}: {name} reaches {reached:g}; it is a factor on the material's, from 0 to {_LARGEST:g}")
     return values[:, 0]
+
+
+def _rows(element: dict[str, np.ndarray | Ragged]) -> int:
+    """Count the rows of an element, which its header may have announced without any."""
+    return max((len(column.counts if isinstance(column, Ragged) else column) for column in element.values()), default=0)

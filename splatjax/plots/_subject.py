@@ -27,11 +27,8 @@ class Subject:
 
     def scaled(self, factor: float) -> "Subject":
         """Give the same body, larger or smaller, before the same camera and lights at infinity."""
-        splats, camera = self.splats, self.camera
-        grown = replace(
-            splats, centers=factor * splats.centers, radii=factor * splats.radii, areas=factor * factor * splats.areas
-        )
-        return replace(self, splats=grown, camera=replace(camera, position=factor * camera.position))
+        camera = replace(self.camera, position=factor * self.camera.position)
+        return replace(self, splats=self.splats.scaled(factor), camera=camera)
 
     def without_albedo(self) -> "Subject":
         """Give the same body without its map: a material then shows in its own color."""

@@ -37,6 +37,11 @@ class Splats(eqx.Module):
     def count(self) -> int:
         return self.centers.shape[0]
 
+    def scaled(self, factor: Float[Array, ""] | float) -> "Splats":
+        """Give the same body in another size, about the origin. Light goes as far as before: a small one is more translucent."""
+        grown = self.centers * factor, self.radii * factor, self.areas * (factor * factor)
+        return eqx.tree_at(lambda splats: (splats.centers, splats.radii, splats.areas), self, grown)
+
 
 Parts: TypeAlias = Callable[[], Iterable[Splats]]
 """What gives all splats, part by part, whenever it is called."""

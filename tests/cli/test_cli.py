@@ -167,11 +167,31 @@ def test_fit_tells_of_more_light_than_is_given(tmp_path, capsys):
     assert re.search(r"bright\.csv sends back [1-9][0-9.]* times the light it is given", capsys.readouterr().err)
 
 
+@pytest.mark.once
+def test_fit_tells_of_radii_too_few_for_its_gaussians(tmp_path, capsys):
+    path = tmp_path / "few.csv"
+    path.write_text("r (mm), R\n0.5, 0.084\n1, 0.037\n2, 0.0096\n4, 0.00124\n8, 0.000084\n")
+    assert main(["fit", str(path), "--count", "2"]) == 0
+    assert "too few" not in capsys.readouterr().err
+    main(["fit", str(path), "--count", "3"])
+    assert "few.csv has 5 radii, too few to tell 3 Gaussians apart: give a smaller --count" in capsys.readouterr().err
+
+
+def test_a_small_body_is_framed_as_a_large_one(tmp_path):
+    body = plate(tmp_path / "plate.ply")
+    large, small = (Render(splats=body, output=tmp_path / "o.exr", scale=scale) for scale in (1.0, 0.2))
+    ours, theirs = large.splats_to_show(), small.splats_to_show()
+    np.testing.assert_allclose(theirs.centers, 0.2 * ours.centers, rtol=1e-6)
+    np.testing.assert_allclose(theirs.areas.sum(), 0.04 * ours.areas.sum(), rtol=1e-5)
+    np.testing.assert_allclose(small.camera(theirs, 25.0).position, 0.2 * large.camera(ours, 25.0).position, rtol=1e-5)
+    np.testing.assert_allclose(small.camera(theirs, 25.0).rotation, large.camera(ours, 25.0).rotation, atol=1e-6)
+
+
 def test_a_mesh_is_no_cloud_of_splats(tmp_path, capsys):
     mesh = tmp_path / "ball.obj"
     trimesh.creation.icosphere().export(mesh)
     said = failure(["render", str(mesh), "--output", str(tmp_path / "o.exr")], capsys)
-    assert f"ball.obj: is a mesh; cover it with splats first: `splatjax sample {mesh} --mm-per-unit`" in said
+    assert f"ball.obj: is a mesh; cover it with splats first: `splatjax sample {mesh} --mm-per-unit ... --output ...`" in said
 
 
 def test_export_writes_what_other_renderers_take(tmp_path, capsys):

@@ -135,6 +135,8 @@ def test_names_that_are_nearly_right_are_told(tmp_path, capsys, x64):
     assert "unit must be \"1/mm\"; it is '1/cm': convert the numbers" in failure(["fit", path], capsys)
     path.write_text(OWN.replace('unit = "1/mm"\n', "", 1))
     assert 'has no unit; convert the numbers, and say unit = "1/mm"' in failure(["fit", path], capsys)
+    path.write_text(OWN.replace("sigma_s_prime", "sigma_s"))
+    assert "has sigma_s; give sigma_s_prime = (1 - g) sigma_s, with the mean cosine g" in failure(["fit", path], capsys)
     beyond_single = () if x64 else ("1e-60", "1e60")  # nothing, and infinite
     for value in ("true", '"0.1"', *beyond_single):
         path.write_text(OWN.replace("2.19", value))
@@ -161,6 +163,7 @@ def test_what_cannot_fit_is_refused_with_what_would(words, said, tmp_path, capsy
         (["--width", "0"], "--width is 0; it must be 1 or more"),
         (["--height", "-3"], "--height is -3; it must be 1 or more"),
         (["--count", "0"], "--count is 0; it must be 1 or more"),
+        (["--scale", "0"], "--scale is 0; it must be a positive factor"),
         (["--fov", "180"], "--fov is 180; it must lie between 0 and 180 degrees"),
         (["--fov", "nan"], "--fov is nan; it must lie between 0 and 180 degrees"),
     ],
@@ -168,6 +171,16 @@ def test_what_cannot_fit_is_refused_with_what_would(words, said, tmp_path, capsy
 def test_a_size_that_cannot_be_is_refused_before_splats_are_read(words, said, tmp_path, capsys):
     nowhere = tmp_path / "missing.ply"
     assert said in failure(["render", nowhere, *words, "--output", tmp_path / "o.exr"], capsys)
+
+
+def test_what_no_error_can_be_is_refused_before_the_fit(capsys):
+    assert "--error is -1; it must be positive" in failure(["fit", "marble", "--error", "-1"], capsys)
+
+
+def test_a_picture_is_no_material(tmp_path, capsys):
+    path = tmp_path / "bust.png"
+    path.write_bytes(bytes(range(256)))
+    assert "bust.png: is no TOML file, and no text at all" in failure(["fit", path], capsys)
 
 
 def test_a_cut_without_effect_is_refused(capsys):

@@ -5,6 +5,9 @@ import importlib
 import inspect
 import re
 
+import equinox as eqx
+import jax
+import numpy as np
 import pytest
 from contexts import CONTEXTS
 from pages import PAGES, name, programs
@@ -49,6 +52,9 @@ def test_the_programs_of_a_page_run_one_after_the_other(page, tmp_path, monkeypa
     names = CONTEXTS.get(name(page), dict)()
     for program in programs(page):
         exec(compile(_small(program), name(page), "exec"), names)
+    for what, value in names.items():
+        for leaf in jax.tree.leaves(eqx.filter(value, eqx.is_inexact_array)):
+            assert not np.any(np.isnan(leaf)), what
 
 
 def test_every_context_is_of_a_page_with_programs():

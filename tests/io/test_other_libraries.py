@@ -88,7 +88,8 @@ def test_plyfile_writes_polygons_normals_and_colors(tmp_path, text, order):
     np.testing.assert_allclose(found.vertices, places)
     np.testing.assert_allclose(found.normals, np.tile([0, 0, 1], (6, 1)))
     np.testing.assert_allclose(found.colors, np.tile([1, 0.2140529, 0], (6, 1)), atol=1e-5)
-    assert read_splats(tmp_path / "a.ply").count == 6
+    with pytest.warns(UserWarning, match=r"a\.ply: has faces, and only their corners are taken, as points; cover it .* sample"):
+        assert read_splats(tmp_path / "a.ply").count == 6
 
 
 def test_splats_written_here_are_read_by_three_libraries(tmp_path):
