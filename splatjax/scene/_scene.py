@@ -13,3 +13,7 @@ class Scene(eqx.Module):
     splats: Splats
     lights: tuple[AbstractLight, ...]
     material: Material
+
+    def __check_init__(self):
+        if isinstance(self.lights, AbstractLight):
+            raise TypeError(f"lights is a {type(self.lights).__name__}; it must be a tuple of lights: (light,) for one")
