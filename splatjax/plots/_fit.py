@@ -18,6 +18,8 @@ _RGB = ("#c0392b", "#27853f", "#2c5aa0")
 _POINTS = 400
 _TAIL = 1e-7
 """Share of its peak down to which a profile is drawn."""
+_FEW = 60
+"""Radii of a measurement, up to which each is marked."""
 _HELD = 1e-6
 """Relative error of the energy that is rounding."""
 
@@ -28,7 +30,7 @@ def plot_fit(
     r"""Draw a profile and its fit, on linear and on logarithmic axes, and the difference between them.
 
     Three channels are drawn in red, green and blue; the single
-    Gaussians of the fit, with the mean weight of the channels, in gray.
+    Gaussians of the fit, with the mean weight of the channels, in gray. Of a measurement each radius is marked.
     The legend gives the error (Eq. 4) and the energy of the fit relative to the profile's, minus 1: held, if that is rounding.
 
     **Arguments:**
@@ -51,18 +53,21 @@ def plot_fit(
     grid = figure.add_gridspec(2, 2, height_ratios=(3, 2))
     linear, log, residual = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[0, 1]), figure.add_subplot(grid[1, :])
 
-    parts = single_gaussians(gaussians, r)
-    for part in parts.T:
-        log.loglog(radii, part, color="0.75", linewidth=0.8, zorder=1)
+    dense = r if len(r) > _FEW else jnp.geomspace(r[0], r[-1], _POINTS, dtype=r.dtype)  # what the fit is between few radii
+    between, of_fit = np.asarray(dense), np.asarray(gaussians(dense), np.float64)
+    marker, width = (None, 3.0) if len(r) > _FEW else ("o", 0.8)
+    for part in single_gaussians(gaussians, dense).T:
+        log.loglog(between, part, color="0.75", linewidth=0.8, zorder=1)
     for channel, color in enumerate(colors):
         held = "held" if abs(energy[channel]) < _HELD else f"{energy[channel]:+.2e}"
         label = f"{names[channel]}: E = {error[channel]:.2e}, energy {held}"
-        linear.plot(radii, radii * reference[:, channel], color=color, linewidth=3, alpha=0.35)
-        linear.plot(radii, radii * fitted[:, channel], color=color, linewidth=1.2, label=label)
-        log.loglog(radii, reference[:, channel], color=color, linewidth=3, alpha=0.35)
-        log.loglog(radii, fitted[:, channel], color=color, linewidth=1.2)
+        linear.plot(radii, radii * reference[:, channel], color=color, alpha=0.35, linewidth=width, marker=marker)
+        linear.plot(between, between * of_fit[:, channel], color=color, linewidth=1.2, label=label)
+        log.loglog(radii, reference[:, channel], color=color, alpha=0.35, linewidth=width, marker=marker)
+        log.loglog(between, of_fit[:, channel], color=color, linewidth=1.2)
         difference = radii * (fitted[:, channel] - reference[:, channel])
-        residual.semilogx(radii, difference / np.max(radii * reference[:, channel]), color=color, linewidth=1.2)
+        share = difference / np.max(radii * reference[:, channel])
+        residual.semilogx(radii, share, color=color, linewidth=1.2, marker=marker)
 
     linear.set(xlabel="r (mm)", ylabel="r R(r) (1/mm)", xlim=(0, _core(radii, reference)), ylim=(0, None))
     linear.set_title("profile (wide) and fit (narrow)", fontsize="medium")

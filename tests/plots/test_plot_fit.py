@@ -9,7 +9,7 @@ import splatjax as sj
 from splatjax.gaussians import SumOfGaussians
 from splatjax.io import load_material, load_medium
 from splatjax.plots import plot_fit
-from splatjax.scattering import Dipole
+from splatjax.scattering import Dipole, Tabulated
 
 
 @pytest.fixture
@@ -65,3 +65,13 @@ def test_what_was_not_fitted_is_shaded_and_not_counted(float64, dtype):
         np.testing.assert_allclose(shade.get_x() + shade.get_width(), 0.5 / 2.6241, rtol=0.05)
     with pytest.raises(ValueError, match="infinity like 1/r"):
         plot_fit(beam, fitted.gaussians)
+
+
+def test_few_radii_are_marked_and_the_fit_is_drawn_between_them():
+    radii = jnp.asarray([0.5, 1.0, 2.0, 4.0, 8.0])
+    figure = plot_fit(Tabulated(radii, jnp.exp(-radii)[:, None]), SumOfGaussians(jnp.asarray([1.0]), jnp.ones((1, 1))))
+    given, drawn = figure.axes[0].lines
+    assert given.get_marker() == "o"
+    np.testing.assert_allclose(given.get_xdata(), radii)
+    assert len(drawn.get_xdata()) > 100
+    np.testing.assert_allclose(drawn.get_xdata()[[0, -1]], [0.5, 8.0], rtol=1e-5)
