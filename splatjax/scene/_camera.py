@@ -10,6 +10,8 @@ from jaxtyping import Array, Float
 
 _ALONG = 1e-6
 """Sine of an angle in which single precision knows no direction."""
+_FARTHEST = 1e15
+"""Of what single precision can square, and multiply once more."""
 
 
 class Camera(eqx.Module):
@@ -70,9 +72,16 @@ def _check_directions(eye: Float[Array, "3"], target: Float[Array, "3"], up: Flo
     """Refuse what gives no axes; traced values are trusted."""
     if any(isinstance(each, Tracer) for each in (eye, target, up)):
         return
-    forward = np.asarray(target, np.float64) - np.asarray(eye, np.float64)
+    offset, upright = np.asarray(target, np.float64) - np.asarray(eye, np.float64), np.asarray(up, np.float64)
+    forward, above = _moderate(offset), _moderate(upright)
     if not np.linalg.norm(forward) > 0:
         raise ValueError(f"the camera stands at {np.asarray(eye).tolist()}, where it looks at; move one of them")
-    upright = np.linalg.norm(np.cross(forward, np.asarray(up, np.float64)))
-    if not upright > _ALONG * np.linalg.norm(forward) * np.linalg.norm(np.asarray(up)):
-        raise ValueError(f"up is {up.tolist()}, along the line of sight; give another, such as [0, 0, -1] to look down")
+    if not max(np.max(np.abs(offset)), np.max(np.abs(upright))) < _FARTHEST:
+        raise ValueError(f"from the camera to its target it is {offset.tolist()} mm, and up is {upright.tolist()}; give less")
+    if not np.linalg.norm(np.cross(forward, above)) > _ALONG * np.linalg.norm(forward) * np.linalg.norm(above):
+        raise ValueError(f"up is {upright.tolist()}, along the line of sight; give another, such as [0, 0, -1] to look down")
+
+
+def _moderate(vector: np.ndarray) -> np.ndarray:
+    """Give a vector of the same direction whose square can be taken."""
+    return vector / max(float(np.max(np.abs(vector))), np.finfo(float).tiny)

@@ -38,6 +38,13 @@ def test_nothing_is_seen_from_where_one_looks():
         sj.Camera.look_at(EYE, EYE)
 
 
+def test_what_single_precision_cannot_square_is_no_place():
+    with pytest.raises(ValueError, match=r"from the camera to its target it is .* give less"):
+        sj.Camera.look_at(jnp.asarray([0.0, 0.0, 1e25]), jnp.zeros(3))
+    for size in (1e-10, 1e12):
+        assert np.all(np.isfinite(sj.Camera.look_at(size * EYE, jnp.zeros(3)).rotation))
+
+
 @pytest.mark.parametrize(
     ("given", "said"), [({"fov": 180.0}, "fov must lie"), ({"width": 0}, "0 x 512"), ({"height": -1}, "x -1")]
 )
