@@ -1,6 +1,5 @@
 """`splatjax figure`: the figures of the paper, made anew."""
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,7 +16,7 @@ from ._mesh_maps import MeshMaps
 from ._options import MaterialName, MaterialNames, OptionalFloat
 from ._outputs import FIGURES, check_output, save_figure
 from ._report import stage
-from ._shot import Shot, in_color, towards
+from ._shot import Shot, check_scale, in_color, towards
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Drawing
@@ -80,8 +79,7 @@ class Figure(MeshMaps):
         if laid and not (self.number == 8 and self.scene):
             option = next(iter(laid)).replace("_", "-")
             raise ValueError(f"--{option} is of the mesh of figure 8 alone; give that by --scene, or leave it out")
-        if not 0 < self.scale < math.inf:
-            raise ValueError(f"--scale is {self.scale:g}; it must be a positive factor: 1 shows a body as large as it is")
+        check_scale(self.scale)
         figures = self._figures()
         if self.number not in figures:
             known = ", ".join(str(number) for number in figures)

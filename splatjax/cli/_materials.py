@@ -1,5 +1,6 @@
 """`splatjax materials`: what is in the library."""
 
+import re
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -55,6 +56,6 @@ def _known(name: str) -> str:
 
 def _publication(name: str) -> str:
     """Give the first author's name and the year of where a material comes from."""
-    authors, _, rest = surface_and_source(name)[1]["citation"].partition(" 2")
-    first = authors.replace(" and ", ",").partition(",")
-    return f"{first[0]}{' et al.' if first[2] else ''} 2{rest[:3]}"
+    authors, year = re.findall(r"^(.+?) (\d{4})", surface_and_source(name)[1]["citation"])[0]
+    first, *others = re.split(r", | and ", authors)
+    return f"{first}{' et al.' if others else ''} {year}"

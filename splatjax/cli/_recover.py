@@ -25,6 +25,7 @@ _START = (
     "Materials to start from, within a factor of three in both coefficients: names, or paths of TOML files. The best end counts."
 )
 _LARGEST_ETA = 3.0
+"""Of any translucent solid: diamond has 2.4."""
 _MODELS = {Model.DIPOLE: sj.Dipole, Model.BETTER_DIPOLE: sj.BetterDipole}
 
 

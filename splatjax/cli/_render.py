@@ -1,5 +1,6 @@
 """`splatjax render`: from splats and a material to a picture with all its layers."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -49,14 +50,16 @@ class Render(Shot):
         if self.splats is None or self.stream < 0:
             raise ValueError(f"--stream is {self.stream}; it is a number of splats of a PLY file, which must be named")
         file = sj.SplatFile(self.splats, self.stream)
+
+        def parts() -> Iterator[sj.Splats]:
+            return map(self.as_shown, file())
+
         with stage(f"looking at {file.count} splats"):
-            camera = frame_parts(
-                lambda: map(self.worn, file()), towards(self.azimuth, self.elevation), self.fov, self.width, self.height
-            )
-        material = self.material_for(self.worn(next(file())), sj.load_material(self.material))
+            camera = frame_parts(parts, towards(self.azimuth, self.elevation), self.fov, self.width, self.height)
+        material = self.material_for(next(parts()), sj.load_material(self.material))
         lights = self.lights(material.gaussians.weights.shape[1], self.azimuth, self.light_azimuth)
         with sweeps(file.count) as report:
-            frame = sj.render_streamed(lambda: map(self.worn, file()), lights, material, camera, report=report)
+            frame = sj.render_streamed(parts, lights, material, camera, report=report)
         self._write(frame, material)
 
     def _write(self, frame: sj.Frame, material: sj.Material) -> None:

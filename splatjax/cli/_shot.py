@@ -71,8 +71,7 @@ class Shot:
         for name in ("width", "height", "count"):
             if getattr(self, name) < 1:
                 raise ValueError(f"--{name} is {getattr(self, name)}; it must be 1 or more")
-        if not 0 < self.scale < math.inf:
-            raise ValueError(f"--scale is {self.scale:g}; it must be a positive factor: 1 shows a body as large as it is")
+        check_scale(self.scale)
         if not 0 < self.fov < 180:
             raise ValueError(f"--fov is {self.fov:g}; it must lie between 0 and 180 degrees, both excluded")
         if not -90 < self.elevation < 90:
@@ -101,11 +100,11 @@ class Shot:
         """Read the splats, or make the bust."""
         if self.splats is None:
             with stage(f"making the bust with {self.count} splats"):
-                return self.worn(sj.bust(self.count))
+                return self.as_shown(sj.bust(self.count))
         with stage(f"reading {self.splats}"):
-            return self.worn(sj.read_splats(self.splats))
+            return self.as_shown(sj.read_splats(self.splats))
 
-    def worn(self, splats: sj.Splats) -> sj.Splats:
+    def as_shown(self, splats: sj.Splats) -> sj.Splats:
         """Give splats in the size that is asked for, with their albedo, or without."""
         splats = splats if self.scale == 1 else splats.scaled(self.scale)
         return splats if self.albedo else eqx.tree_at(lambda each: each.albedo, splats, None, is_leaf=lambda leaf: leaf is None)
@@ -156,6 +155,12 @@ class Shot:
                 f"narrower than the splats, so that the surface's own light stands for them: Gaussians of standard deviations "
                 f"{widths} mm; more splats show them, or a smaller body (--scale)"
             )
+
+
+def check_scale(scale: float) -> None:
+    """Raise `ValueError` for a size that no body has."""
+    if not 0 < scale < math.inf:
+        raise ValueError(f"--scale is {scale:g}; it must be a positive factor: 1 shows a body as large as it is")
 
 
 def draw(scene: sj.Scene, camera: sj.Camera, plan: sj.Plan) -> sj.Frame:

@@ -16,7 +16,7 @@ from ._files import check_unit, existing_file
 from ._mesh import MESHES_ALONE
 from ._pieces import moderate
 from ._ply_columns import Table, colors_of, columns_of, normals_of, places_of, vertex_table
-from ._ply_tables import Ragged, read_ply
+from ._ply_tables import read_ply
 
 RADIUS = ("radius", "radii")
 AREA = ("area", "areas")
@@ -64,7 +64,7 @@ def read_splats(path: str | os.PathLike[str], *, mm_per_unit: float = 1.0) -> Sp
     normals = normals_of(path, vertices)
     radii, areas = positive_of(path, vertices, RADIUS, mm_per_unit), positive_of(path, vertices, AREA, mm_per_unit**2)
     check_place(path, centers * mm_per_unit, estimated=radii is None or areas is None)
-    if radii is None and _rows(file.elements.get("face", {})):
+    if radii is None and file.rows("face"):
         warnings.warn(f"{path}: has faces, and only their corners are taken, as points; {_COVER.format(path)}", stacklevel=2)
     albedo = colors_of(path, vertices)
     specular, roughness = (factor_of(path, vertices, name) for name in ("specular", "roughness"))
@@ -160,8 +160,3 @@ def factor_of(path: Path, vertices: Table, name: str) -> np.ndarray | None:
     if not 0 <= reached <= _LARGEST:
         raise ValueError(f"{path}: {name} reaches {reached:g}; it is a factor on the material's, from 0 to {_LARGEST:g}")
     return values[:, 0]
-
-
-def _rows(element: dict[str, np.ndarray | Ragged]) -> int:
-    """Count the rows of an element, which its header may have announced without any."""
-    return max((len(column.counts if isinstance(column, Ragged) else column) for column in element.values()), default=0)

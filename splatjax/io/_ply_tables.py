@@ -12,7 +12,7 @@ from ._library import readable
 
 _LONGEST_HEADER = 1 << 20
 _END = re.compile(rb"(\r\n|\r|\n)end_header\1")
-_ELEMENT = re.compile(r"element\s+(\S+)\s+(\d{1,18})")
+_ELEMENT = re.compile(r"element\s+(\S+)\s+(\d{1,18})\Z")
 _USUAL = {"texcoord": 6}  # numbers in a list, for which a table is read at once; in others, those of triangles
 
 
@@ -28,6 +28,11 @@ class PlyFile(NamedTuple):
 
     comments: list[str]
     elements: dict[str, dict[str, np.ndarray | Ragged]]
+
+    def rows(self, element: str) -> int:
+        """Count the rows of an element: none of one that is not there, and of one that is announced without any."""
+        columns = self.elements.get(element, {}).values()
+        return max((len(column.counts if isinstance(column, Ragged) else column) for column in columns), default=0)
 
 
 def read_ply(path: Path) -> PlyFile:
@@ -53,7 +58,7 @@ def read_ply(path: Path) -> PlyFile:
 
 def _check_counts(rows: list[str], header: bytes, body: memoryview) -> dict[str, dict[str, int]]:
     """Refuse a header that promises more than follows it; give how long the lists of each element usually are."""
-    counted = [_ELEMENT.fullmatch(row.strip()) for row in rows if row.startswith("element")]
+    counted = [_ELEMENT.match(row.strip()) for row in rows if row.startswith("element")]
     if None in counted:
         raise ValueError("its header has an element without a count")
     empty = plyfile.PlyData.read(BytesIO(re.sub(rb"(element\s+\S+\s+)\d+", rb"\g<1>0", header)))

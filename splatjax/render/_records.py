@@ -40,7 +40,7 @@ class Plan(eqx.Module):
     - `tiles`: of the picture, that show a surface or one behind it. Static.
     - `shadows`: for each group of lights of a kind the room of its shadow maps; `None` for lights that cast no shadows.
     - `diffuser`: with the clusters of the splats.
-    - `interval`: widths between which a layer is handed over from the surface to diffusion, mm.
+    - `interval`: standard deviations per spacing between which a layer passes from the surface to diffusion.
     - `mesh`: the devices that hold the splats; `None` for one. Static.
     - `splats`: how many it is for, whose order and clusters are in it; `None` for any number. Static.
     """

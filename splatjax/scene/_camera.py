@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 _ALONG = 1e-6
 """Sine of an angle in which single precision knows no direction."""
 _FARTHEST = 1e15
-"""Of what single precision can square, and multiply once more."""
+"""Numbers that single precision can square, and multiply once more."""
 
 
 class Camera(eqx.Module):
@@ -68,20 +68,17 @@ class Camera(eqx.Module):
         return cls(eye, jnp.stack([right, down, forward]), focal_length, width, height, near)
 
 
-def _check_directions(eye: Float[Array, "3"], target: Float[Array, "3"], up: Float[Array, "3"]) -> None:
+def _check_directions(eye: Array | np.ndarray, target: Array | np.ndarray, up: Array | np.ndarray) -> None:
     """Refuse what gives no axes; traced values are trusted."""
     if any(isinstance(each, Tracer) for each in (eye, target, up)):
         return
-    offset, upright = np.asarray(target, np.float64) - np.asarray(eye, np.float64), np.asarray(up, np.float64)
-    forward, above = _moderate(offset), _moderate(upright)
+    eye, target, upright = (np.asarray(each, np.float64) for each in (eye, target, up))
+    if not np.max(np.abs([eye, target, upright])) < _FARTHEST:
+        raise ValueError(
+            f"from the camera to its target it is {(target - eye).tolist()} mm, and up is {upright.tolist()}; give less"
+        )
+    forward = target - eye
     if not np.linalg.norm(forward) > 0:
-        raise ValueError(f"the camera stands at {np.asarray(eye).tolist()}, where it looks at; move one of them")
-    if not max(np.max(np.abs(offset)), np.max(np.abs(upright))) < _FARTHEST:
-        raise ValueError(f"from the camera to its target it is {offset.tolist()} mm, and up is {upright.tolist()}; give less")
-    if not np.linalg.norm(np.cross(forward, above)) > _ALONG * np.linalg.norm(forward) * np.linalg.norm(above):
+        raise ValueError(f"the camera stands at {eye.tolist()}, where it looks at; move one of them")
+    if not np.linalg.norm(np.cross(forward, upright)) > _ALONG * np.linalg.norm(forward) * np.linalg.norm(upright):
         raise ValueError(f"up is {upright.tolist()}, along the line of sight; give another, such as [0, 0, -1] to look down")
-
-
-def _moderate(vector: np.ndarray) -> np.ndarray:
-    """Give a vector of the same direction whose square can be taken."""
-    return vector / max(float(np.max(np.abs(vector))), np.finfo(float).tiny)
