@@ -1,4 +1,5 @@
-"""How fast a frame and its derivatives are, beside the yardstick: `python -m benchmarks`. Writes out/bench.json.
+"""How fast a frame and its derivatives are, beside the yardstick: `python -m benchmarks`. Writes
+out/bench.json.
 
 Every body and size runs in a process of its own (`python -m benchmarks.frame`).
 """
@@ -32,8 +33,12 @@ _HEADINGS = ("ms", "ratio", "goal", "compile, s", "memory, GB")
 
 def arguments():
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
-    parser.add_argument("--repeats", type=int, default=7, help="rounds; medians are given (default %(default)s)")
-    parser.add_argument("--largest", type=int, default=10_000_000, help="of splats; cases with more are left out")
+    parser.add_argument(
+        "--repeats", type=int, default=7, help="rounds; medians are given (default %(default)s)"
+    )
+    parser.add_argument(
+        "--largest", type=int, default=10_000_000, help="of splats; cases with more are left out"
+    )
     return parser.parse_args()
 
 
@@ -44,14 +49,20 @@ def _number(value: float | None, digits: int = 2) -> str:
 def report(rows: list[dict]) -> None:
     """Print the rows of one body and size."""
     first = rows[0]
-    yard, limit, both = (first[f"{name}_milliseconds"] for name in ("yardstick", "limit", "limit_with_gradients"))
+    yard, limit, both = (
+        first[f"{name}_milliseconds"] for name in ("yardstick", "limit", "limit_with_gradients")
+    )
     print(f"\n{first['splats']:,} splats of the {first['body']} head at {first['width']}^2")
     print(
-        f"passes 2+3 in C, one thread: {_number(yard, 1) or 'none'} ms, the unit; hand-tuned {_number(limit, 1) or 'none'}",
+        f"passes 2+3 in C, one thread: {_number(yard, 1) or 'none'} ms, the unit; hand-tuned "
+        f"{_number(limit, 1) or 'none'}",
         end="",
     )
     print(f", with gradients {_number(both, 1) or 'none'}")
-    print(f"planning {first['planning_milliseconds']:.0f} ms; greatest memory of the process {first['process_gigabytes']:.1f} GB")
+    print(
+        f"planning {first['planning_milliseconds']:.0f} ms; greatest memory of the process "
+        f"{first['process_gigabytes']:.1f} GB"
+    )
     print(f"{'':50}" + "".join(f"{heading:>12}" for heading in _HEADINGS))
     by_name = {row["name"]: row["milliseconds"] for row in rows}
     for row in rows:
@@ -70,11 +81,25 @@ def main() -> None:
     for body, splats, width, frame_only in CASES:
         if splats > options.largest:
             continue
-        command = [sys.executable, "-m", "benchmarks.frame", "--body", body, "--splats", str(splats), "--width", str(width)]
+        command = [
+            sys.executable,
+            "-m",
+            "benchmarks.frame",
+            "--body",
+            body,
+            "--splats",
+            str(splats),
+            "--width",
+            str(width),
+        ]
         command += ["--repeats", str(options.repeats), *(["--frame-only"] if frame_only else [])]
-        *said, last = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout.splitlines()
+        *said, last = subprocess.run(
+            command, stdout=subprocess.PIPE, text=True, check=True
+        ).stdout.splitlines()
         print("\n".join(said), end="\n" if said else "")
-        found = [row | {"goal": GOALS.get((row["name"], splats, width))} for row in json.loads(last)]
+        found = [
+            row | {"goal": GOALS.get((row["name"], splats, width))} for row in json.loads(last)
+        ]
         report(found)
         rows += found
     out = Path("out/bench.json")

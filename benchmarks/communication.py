@@ -1,4 +1,5 @@
-"""What devices that share a scene's splats send each other for a picture: the model of docs/devices.md, and what a program does.
+"""What devices that share a scene's splats send each other for a picture: the model of
+docs/devices.md, and what a program does.
 
 `python -m benchmarks.communication` prints the model for 1e9 splats on 64 devices.
 """
@@ -28,7 +29,9 @@ class Traffic:
     def sent(self, devices: int) -> float:
         """Give the bytes that each device sends when they stand in a ring, which is the least."""
         return (
-            2 * (devices - 1) / devices * self.summed + (devices - 1) * self.scattered + (devices - 1) / devices * self.gathered
+            2 * (devices - 1) / devices * self.summed
+            + (devices - 1) * self.scattered
+            + (devices - 1) / devices * self.gathered
         )
 
 
@@ -43,7 +46,9 @@ def counted(program: str) -> Traffic:
 
 @dataclasses.dataclass(frozen=True)
 class Picture:
-    """What the traffic of a picture depends on; not on the number of splats but through the cells."""
+    """What the traffic of a picture depends on; not on the number of splats but through the
+    cells.
+    """
 
     tiles: int
     """Of the picture."""
@@ -67,16 +72,19 @@ class Picture:
     def traffic(self) -> Traffic:
         """Give the traffic of a picture, without gradients."""
         at_pixels = PIXELS * self.size
-        # Limits of the front, its weights, and two limits of what lies behind; of a shadow map also both surfaces' two sums.
+        # Limits of the front, its weights, and two limits of what lies behind; of a shadow map also
+        # both surfaces' two sums.
         summed = at_pixels * (4 * self.tiles + 8 * sum(self.maps))
         scattered = at_pixels * self.shown * 2 * (self.attributes + 2)
-        # Depth, position, normal, coverage; shadows; layers and how they are resolved; albedo, irradiance, diffuse and specular.
+        # Depth, position, normal, coverage; shadows; layers and how they are resolved; albedo,
+        # irradiance, diffuse and specular.
         shaded = 8 + self.lights + self.gaussians * (self.channels + 1) + 4 * self.channels
         gathered = at_pixels * self.places * shaded
         if self.singles:
             gathered += at_pixels * self.places * 3
             scattered += at_pixels * self.places * self.singles * (self.channels + 1)
-        # Area, centers, normals, energy; spread, opening, bending; first moments about centers and about normals.
+        # Area, centers, normals, energy; spread, opening, bending; first moments about centers and
+        # about normals.
         summed += self.size * self.cells * (7 + self.channels + 3 + 6 * self.channels)
         return Traffic(summed, scattered, gathered)
 
@@ -87,7 +95,9 @@ class Picture:
 
 
 def main() -> None:
-    """Print the model of a head of 1e9 splats at 2048 x 2048 in skin, on 64 devices that send 50 GB/s."""
+    """Print the model of a head of 1e9 splats at 2048 x 2048 in skin, on 64 devices that send 50
+    GB/s.
+    """
     devices, rate = 64, 50e9
     tiles = (2048 // 8) ** 2
     picture = Picture(
@@ -102,7 +112,10 @@ def main() -> None:
         singles=0,
         cells=0,
     )
-    for cells in (0, 113_000_000):  # of skin's narrowest layer, 0.043 mm, on the bust's 209,443 mm^2
+    for cells in (
+        0,
+        113_000_000,
+    ):  # of skin's narrowest layer, 0.043 mm, on the bust's 209,443 mm^2
         found = dataclasses.replace(picture, cells=cells)
         sent = found.sent(devices)
         print(f"{cells:>11,} cells: {sent / 1e9:.2f} GB from each device, {sent / rate:.3f} s")

@@ -1,6 +1,8 @@
-"""How far pass 4 is from the untruncated sum over all splats: `python -m benchmarks.diffusion_error`.
+"""How far pass 4 is from the untruncated sum over all splats: `python -m
+benchmarks.diffusion_error`.
 
-Writes out/diffusion_error.png: the layer that errs most, every pixel as the nearest one that was looked at.
+Writes out/diffusion_error.png: the layer that errs most, every pixel as the nearest one that was
+looked at.
 """
 
 import argparse
@@ -25,14 +27,31 @@ AT_ONCE = 8  # pixels
 
 
 def arguments():
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.diffusion_error", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.diffusion_error", description=__doc__
+    )
     parser.add_argument("--body", choices=BODIES, default="synthetic", help="(default %(default)s)")
-    parser.add_argument("--material", choices=MATERIALS, default="skin", help="(default %(default)s)")
-    parser.add_argument("--splats", type=int, default=683_549, help="on the prototype's head (default %(default)s)")
-    parser.add_argument("--width", type=int, default=1024, help="of the square picture, pixels (default %(default)s)")
-    parser.add_argument("--pixels", type=int, default=2000, help="random covered ones (default %(default)s)")
     parser.add_argument(
-        "--errors", type=float, nargs="+", default=[2e-3], help="settings of ClusterDiffuser (default %(default)s)"
+        "--material", choices=MATERIALS, default="skin", help="(default %(default)s)"
+    )
+    parser.add_argument(
+        "--splats", type=int, default=683_549, help="on the prototype's head (default %(default)s)"
+    )
+    parser.add_argument(
+        "--width",
+        type=int,
+        default=1024,
+        help="of the square picture, pixels (default %(default)s)",
+    )
+    parser.add_argument(
+        "--pixels", type=int, default=2000, help="random covered ones (default %(default)s)"
+    )
+    parser.add_argument(
+        "--errors",
+        type=float,
+        nargs="+",
+        default=[2e-3],
+        help="settings of ClusterDiffuser (default %(default)s)",
     )
     parser.add_argument("--white", action="store_true", help="without the map of albedo")
     return parser.parse_args()
@@ -73,7 +92,9 @@ def main() -> None:
     def seen_by(scene):
         light = wiring.cast_shadows(scene, settings, plan)
         entering = lighting.let_light_in(scene, light)
-        seen = wiring.see_surfaces(scene.splats, lighting.surface_attributes(scene, light, entering), view, settings, plan)
+        seen = wiring.see_surfaces(
+            scene.splats, lighting.surface_attributes(scene, light, entering), view, settings, plan
+        )
         return wiring.sources_of(scene.splats, entering.source), seen
 
     sources, seen = seen_by(scene)
@@ -97,7 +118,9 @@ def main() -> None:
 
     exact = None
     for error in options.errors:
-        diffuser = diffusion.ClusterDiffuser(error=error).planned(scene.splats, kernels, plan.interval, [atlas])
+        diffuser = diffusion.ClusterDiffuser(error=error).planned(
+            scene.splats, kernels, plan.interval, [atlas]
+        )
         given = diffuser, sources, kernels, seen.points, seen.covered, atlas
         jax.block_until_ready(diffuse(*given))
         start = time.perf_counter()
@@ -107,17 +130,25 @@ def main() -> None:
             raise SystemExit("the plan does not hold its own scene")
         if exact is None:
             all_kernels = zip(kernels.variances, kernels.depths, strict=True)
-            exact = jnp.stack([untruncated(sources, front.points[0], *kernel) for kernel in all_kernels])[None]
+            exact = jnp.stack(
+                [untruncated(sources, front.points[0], *kernel) for kernel in all_kernels]
+            )[None]
             exact_layers = layers(exact[:, :, :-1], exact[:, :, -1], found.carried)
         ours = layers(at_pixels(found.means), at_pixels(found.exits), found.carried)
         scale = np.sqrt(np.mean(exact_layers**2, axis=2, keepdims=True))
         off = np.max(np.abs(ours - exact_layers) / scale, axis=1)
-        print(f"error={error:g}: pass 4 without the gain {1e3 * seconds:.0f} ms; of the RMS: median, 99th percentile, maximum")
+        print(
+            f"error={error:g}: pass 4 without the gain {1e3 * seconds:.0f} ms; of the RMS: median, "
+            "99th percentile, maximum"
+        )
         for k, (each, layer) in enumerate(zip(off, diffuser.layers, strict=True)):
             if not float(found.carried[k]):
                 continue
             how = "every pixel gathers" if layer.nodes is None else "through nodes"
-            print(f"  {variances[k] ** 0.5:5.2f} mm: {np.median(each):.1e} {np.quantile(each, 0.99):.1e} {each.max():.1e}  {how}")
+            print(
+                f"  {variances[k] ** 0.5:5.2f} mm: {np.median(each):.1e} "
+                f"{np.quantile(each, 0.99):.1e} {each.max():.1e}  {how}"
+            )
     places, side = np.asarray(atlas.tiles), splatting.SIDE
     down = places[tiles] // atlas.grid.across * side + within // side
     across = places[tiles] % atlas.grid.across * side + within % side
@@ -125,7 +156,9 @@ def main() -> None:
     rows, beside = np.nonzero(np.asarray(atlas.front_picture(jnp.asarray(covered))[..., 0]))
     nearest = cKDTree(np.stack([down, across], axis=1)).query(np.stack([rows, beside], axis=1))[1]
     picture = np.zeros((options.width, options.width, 3), np.uint8)
-    shades = matplotlib.colormaps["magma"](0.1 + 0.9 * np.clip(np.max(off, axis=0) / 1e-2, 0, 1), bytes=True)[:, :3]
+    shades = matplotlib.colormaps["magma"](
+        0.1 + 0.9 * np.clip(np.max(off, axis=0) / 1e-2, 0, 1), bytes=True
+    )[:, :3]
     picture[rows, beside] = shades[nearest]
     out = Path("out/diffusion_error.png")
     out.parent.mkdir(exist_ok=True)

@@ -1,6 +1,8 @@
-"""How well albedo, lights, cameras and shape come back first-order: `python -m benchmarks.fit_scene`.
+"""How well albedo, lights, cameras and shape come back first-order: `python -m
+benchmarks.fit_scene`.
 
-The bust in skin, pictures under three lights that cast shadows, with noise; each part starts off by something and moves alone.
+The bust in skin, pictures under three lights that cast shadows, with noise; each part starts off by
+something and moves alone.
 """
 
 import argparse
@@ -24,9 +26,19 @@ LIGHTS = (-1.0, -0.3, -0.6), (1.0, -0.3, -0.6), (0.2, -1.0, -0.8)
 def arguments():
     parser = argparse.ArgumentParser(prog="python -m benchmarks.fit_scene", description=__doc__)
     parser.add_argument("--splats", type=int, default=20_000, help="(default %(default)s)")
-    parser.add_argument("--width", type=int, default=128, help="of the square pictures, pixels (default %(default)s)")
+    parser.add_argument(
+        "--width",
+        type=int,
+        default=128,
+        help="of the square pictures, pixels (default %(default)s)",
+    )
     parser.add_argument("--steps", type=int, default=60, help="(default %(default)s)")
-    parser.add_argument("--noise", type=float, default=0.01, help="over a picture's root mean square (default %(default)s)")
+    parser.add_argument(
+        "--noise",
+        type=float,
+        default=0.01,
+        help="over a picture's root mean square (default %(default)s)",
+    )
     return parser.parse_args()
 
 
@@ -41,7 +53,11 @@ def main() -> None:
     compiled, rng = Compilations(), np.random.default_rng(0)
     splats, material = sj.bust(options.splats), sj.load_material("skin").white()
     camera = sj.Camera.look_at(
-        jnp.asarray([60.0, 0.0, 560.0]), jnp.asarray([0.0, -30.0, 0.0]), fov=30.0, width=options.width, height=options.width
+        jnp.asarray([60.0, 0.0, 560.0]),
+        jnp.asarray([0.0, -30.0, 0.0]),
+        fov=30.0,
+        width=options.width,
+        height=options.width,
     )
     lights = [sj.DirectionalLight(jnp.asarray(way), jnp.full(3, jnp.pi)) for way in LIGHTS]
     well = np.asarray(splats.normals) @ np.asarray(camera.rotation[2]) < -0.5
@@ -54,9 +70,14 @@ def main() -> None:
             found.append((picture + deviation * rng.normal(size=picture.shape), deviation))
         return found
 
-    def fit(name: str, true: sj.Splats, begin: sj.Splats, shots, parts, background, error: Callable) -> None:
+    def fit(
+        name: str, true: sj.Splats, begin: sj.Splats, shots, parts, background, error: Callable
+    ) -> None:
         together = zip(pictures(true), shots, strict=True)
-        seen = [sj.Observation(picture, cam, (light,), deviation=sd) for (picture, sd), (cam, light) in together]
+        seen = [
+            sj.Observation(picture, cam, (light,), deviation=sd)
+            for (picture, sd), (cam, light) in together
+        ]
         optimizer = optax.adam(optax.cosine_decay_schedule(2.0, options.steps), b2=0.9)
         times, programs = [], []
 
@@ -65,13 +86,24 @@ def main() -> None:
             programs.append(compiled.count)
 
         found = sj.fit_scene(
-            seen, begin, material, parts, optimizer, steps=options.steps, background=background, progress=progress
+            seen,
+            begin,
+            material,
+            parts,
+            optimizer,
+            steps=options.steps,
+            background=background,
+            progress=progress,
         )
         print(
-            f"{name}: {error(begin, [cam for cam, _ in shots], [light for _, light in shots])} before, "
-            f"{error(found.splats, found.cameras, [light for (light,) in found.lights])} after; loss {found.losses[0]:.4g} to "
-            f"{found.losses[found.best]:.4g} at step {found.best}; {np.median(np.diff(times[3:])):.2f} s a step; planned "
-            f"{found.plans} times, {programs[-1] - programs[2]} programs compiled after the first step",
+            f"{name}: {error(begin, [cam for cam, _ in shots], [light for _, light in shots])} "
+            "before, "
+            f"{error(found.splats, found.cameras, [light for (light,) in found.lights])} after; "
+            f"loss {found.losses[0]:.4g} to "
+            f"{found.losses[found.best]:.4g} at step {found.best}; "
+            f"{np.median(np.diff(times[3:])):.2f} s a step; planned "
+            f"{found.plans} times, {programs[-1] - programs[2]} programs compiled after the first "
+            "step",
             flush=True,
         )
 
@@ -80,18 +112,30 @@ def main() -> None:
     gray = eqx.tree_at(lambda s: s.albedo, splats, jnp.full_like(splats.albedo, 0.5))
 
     def of_albedo(body, cameras, lights):
-        return f"{np.median(np.abs(np.asarray(body.albedo - splats.albedo))[well]):.4f} of albedo (median)"
+        error = np.median(np.abs(np.asarray(body.albedo - splats.albedo))[well])
+        return f"{error:.4f} of albedo (median)"
 
     fit("albedo", splats, gray, right, [sj.AlbedoMap()], filled, of_albedo)
 
-    turns = [Rotation.from_rotvec(np.radians(12) * way / np.linalg.norm(way)) for way in rng.normal(size=(3, 3))]
+    turns = [
+        Rotation.from_rotvec(np.radians(12) * way / np.linalg.norm(way))
+        for way in rng.normal(size=(3, 3))
+    ]
     dim = [
-        (camera, sj.DirectionalLight(jnp.asarray(turn.apply(way), jnp.float32), light.irradiance * factor))
+        (
+            camera,
+            sj.DirectionalLight(
+                jnp.asarray(turn.apply(way), jnp.float32), light.irradiance * factor
+            ),
+        )
         for turn, way, light, factor in zip(turns, LIGHTS, lights, (0.7, 1.3, 0.8), strict=True)
     ]
 
     def of_lights(body, cameras, found):
-        way = max(float(degrees(ours.direction, light.direction)) for ours, light in zip(found, lights, strict=True))
+        way = max(
+            float(degrees(ours.direction, light.direction))
+            for ours, light in zip(found, lights, strict=True)
+        )
         off = max(float(jnp.max(jnp.abs(ours.irradiance / jnp.pi - 1))) for ours in found)
         return f"{way:.2f} degrees and {100 * off:.2f}% (worst)"
 
@@ -115,11 +159,15 @@ def main() -> None:
 
     part = sj.NormalOffsets(step=0.1, smoothness=6.0, deviation=1.5)
     tables = part.prepared(splats)
-    x = jnp.asarray(rng.normal(size=splats.count) * 1.5 / part.step / float(tables.gain), jnp.float32)
+    x = jnp.asarray(
+        rng.normal(size=splats.count) * 1.5 / part.step / float(tables.gain), jnp.float32
+    )
     bumpy = part.moved(splats, x, tables)
 
     def of_shape(body, cameras, lights):
-        return f"{np.mean(degrees(body.normals, bumpy.normals)[well]):.2f} degrees of normals (mean)"
+        return (
+            f"{np.mean(degrees(body.normals, bumpy.normals)[well]):.2f} degrees of normals (mean)"
+        )
 
     fit("shape", bumpy, splats, right, [part], filled, of_shape)
 

@@ -1,4 +1,5 @@
-"""How fast fits are, beside SciPy: `python -m benchmarks.fits`. Both are warm; compile times are given apart.
+"""How fast fits are, beside SciPy: `python -m benchmarks.fits`. Both are warm; compile times are
+given apart.
 
 SciPy's `least_squares` (MINPACK) gets the same residuals, their exact Jacobian, and the same start.
 """
@@ -22,8 +23,12 @@ PUSHED = np.array([0.5, -0.4, 0.3, -0.5, 0.4, -0.3])  # log variances of the sta
 
 def arguments():
     parser = argparse.ArgumentParser(prog="python -m benchmarks.fits", description=__doc__)
-    parser.add_argument("--media", type=int, default=1000, help="random ones, in one call (default %(default)s)")
-    parser.add_argument("--repeats", type=int, default=7, help="medians are given (default %(default)s)")
+    parser.add_argument(
+        "--media", type=int, default=1000, help="random ones, in one call (default %(default)s)"
+    )
+    parser.add_argument(
+        "--repeats", type=int, default=7, help="medians are given (default %(default)s)"
+    )
     return parser.parse_args()
 
 
@@ -69,22 +74,37 @@ def one_material(repeats: int) -> None:
     start = jnp.log(best.gaussians.variances) + PUSHED
     given = sj.GivenVariances(jnp.exp(start))
     ours, seconds, first = timed(lambda: sj.fit_gaussians(profile, COUNT, start=given), repeats)
-    theirs, scipy_seconds, _ = timed(lambda: scipy_fit(problem, np.asarray(start - 2 * jnp.log(problem.unit))), repeats)
+    theirs, scipy_seconds, _ = timed(
+        lambda: scipy_fit(problem, np.asarray(start - 2 * jnp.log(problem.unit))), repeats
+    )
     search, search_seconds, search_first = timed(lambda: sj.fit_gaussians(profile, COUNT), repeats)
-    print(f"green marble, {COUNT} Gaussians, one start: {1e3 * seconds:.2f} ms, SciPy {1e3 * scipy_seconds:.2f} ms;", end=" ")
+    print(
+        f"green marble, {COUNT} Gaussians, one start: {1e3 * seconds:.2f} ms, SciPy "
+        f"{1e3 * scipy_seconds:.2f} ms;",
+        end=" ",
+    )
     print(f"E {float(ours.error[0]):.6e} and {float(theirs):.6e}; first call {first:.1f} s")
-    print(f"  by the full search: {1e3 * search_seconds:.1f} ms, E {float(search.error[0]):.6e}; first call {search_first:.1f} s")
+    print(
+        f"  by the full search: {1e3 * search_seconds:.1f} ms, E {float(search.error[0]):.6e}; "
+        f"first call {search_first:.1f} s"
+    )
 
 
 def many_media(count: int, repeats: int) -> None:
     noise = np.random.default_rng(0)
     albedo, sigma_t = 1 - 10 ** noise.uniform(-4, -0.02, count), 10 ** noise.uniform(-1, 1.3, count)
     coefficients = ((1 - albedo) * sigma_t, albedo * sigma_t, noise.uniform(1.0, 1.8, count))
-    media, starts = sj.Medium(*(jnp.asarray(each)[:, None] for each in coefficients)), sj.dipole_starts()
+    media, starts = (
+        sj.Medium(*(jnp.asarray(each)[:, None] for each in coefficients)),
+        sj.dipole_starts(),
+    )
 
     def fit(medium):
         return sj.fit_gaussians(
-            sj.Dipole(medium), COUNT, start=sj.GivenVariances(starts(medium, COUNT).variances[0]), throw=False
+            sj.Dipole(medium),
+            COUNT,
+            start=sj.GivenVariances(starts(medium, COUNT).variances[0]),
+            throw=False,
         )
 
     batched = eqx.filter_jit(eqx.filter_vmap(fit))
@@ -96,9 +116,15 @@ def many_media(count: int, repeats: int) -> None:
         problem = make_problem(sj.Dipole(medium), sj.FreeWeights(), sj.NORM_RULE)
         start = np.asarray(jnp.log(starts(medium, COUNT).variances[0] / problem.unit**2))
         theirs.append(timed(lambda problem=problem, start=start: scipy_fit(problem, start), 1)[:2])
-    ratio = max(float(fitted.error[i, 0]) / float(error) for i, (error, _) in zip(few, theirs, strict=True))
+    ratio = max(
+        float(fitted.error[i, 0]) / float(error) for i, (error, _) in zip(few, theirs, strict=True)
+    )
     scipy_seconds = float(np.median([seconds for _, seconds in theirs]))
-    print(f"{count} media in one call: {1e3 * seconds / count:.2f} ms each, SciPy {1e3 * scipy_seconds:.2f} ms;", end=" ")
+    print(
+        f"{count} media in one call: {1e3 * seconds / count:.2f} ms each, SciPy "
+        f"{1e3 * scipy_seconds:.2f} ms;",
+        end=" ",
+    )
     print(f"worst E over SciPy's {ratio:.6f}; first call {first:.1f} s")
 
 

@@ -1,4 +1,6 @@
-"""One body at one size, in a process of its own: `python -m benchmarks.frame`. The last line is all rows as JSON."""
+"""One body at one size, in a process of its own: `python -m benchmarks.frame`. The last line is all
+rows as JSON.
+"""
 
 import argparse
 import json
@@ -24,26 +26,43 @@ def arguments():
     parser = argparse.ArgumentParser(prog="python -m benchmarks.frame", description=__doc__)
     parser.add_argument("--body", choices=BODIES, default="synthetic", help="(default %(default)s)")
     parser.add_argument("--splats", type=int, default=683_549, help="(default %(default)s)")
-    parser.add_argument("--width", type=int, default=1024, help="of the square picture, pixels (default %(default)s)")
-    parser.add_argument("--repeats", type=int, default=7, help="rounds; medians are given (default %(default)s)")
-    parser.add_argument("--frame-only", action="store_true", help="the whole frame alone, without its passes and gradients")
+    parser.add_argument(
+        "--width",
+        type=int,
+        default=1024,
+        help="of the square picture, pixels (default %(default)s)",
+    )
+    parser.add_argument(
+        "--repeats", type=int, default=7, help="rounds; medians are given (default %(default)s)"
+    )
+    parser.add_argument(
+        "--frame-only",
+        action="store_true",
+        help="the whole frame alone, without its passes and gradients",
+    )
     return parser.parse_args()
 
 
 def rasterization(scene: sj.Scene, camera: sj.Camera, plan: sj.Plan, settings: sj.RenderSettings):
-    """Passes 2 and 3 with normals and albedo, and the gradient of the picture's mean square in all that they read.
+    """Passes 2 and 3 with normals and albedo, and the gradient of the picture's mean square in all
+    that they read.
 
     The picture is what the yardstick makes, and coverage: the front laid over what shows behind it.
     """
     areas, grid = scene.splats.areas, splatting.TileGrid(camera.width, camera.height)
 
     def picture(camera, centers, normals, radii, albedo):
-        view, splats = splatting.PerspectiveView.of(camera), sj.Splats(centers, normals, radii, areas)
+        view, splats = (
+            splatting.PerspectiveView.of(camera),
+            sj.Splats(centers, normals, radii, areas),
+        )
         rows = jnp.concatenate([normals.T, albedo.T])
         seen = splatting.splat_surfaces(splats, rows, view, settings.splatting, plan.rasterizer)
         front = seen.front.coverage
         behind = (1 - front) * seen.behind.coverage
-        attributes = front[:, None] * seen.front.attributes + behind[:, None] * seen.behind.attributes
+        attributes = (
+            front[:, None] * seen.front.attributes + behind[:, None] * seen.behind.attributes
+        )
         return grid.join(attributes), grid.join((front + behind)[:, None])[0]
 
     def loss(*inputs):
@@ -51,10 +70,16 @@ def rasterization(scene: sj.Scene, camera: sj.Camera, plan: sj.Plan, settings: s
         return jnp.sum(jnp.mean(attributes**2, axis=(1, 2))) + jnp.mean(coverage**2)
 
     s = scene.splats
-    return picture, jax.grad(loss, argnums=(1, 2, 3, 4)), (camera, s.centers, s.normals, s.radii, s.albedo)
+    return (
+        picture,
+        jax.grad(loss, argnums=(1, 2, 3, 4)),
+        (camera, s.centers, s.normals, s.radii, s.albedo),
+    )
 
 
-def passes(scene: sj.Scene, camera: sj.Camera, plan: sj.Plan, settings: sj.RenderSettings) -> dict[str, tuple]:
+def passes(
+    scene: sj.Scene, camera: sj.Camera, plan: sj.Plan, settings: sj.RenderSettings
+) -> dict[str, tuple]:
     """Each pass alone, fed with what the one before gave: name to function and arguments."""
     view = splatting.PerspectiveView.of(camera)
 
@@ -88,7 +113,9 @@ def timed(function: Callable, inputs: tuple) -> float:
     return 1e3 * (time.perf_counter() - start)
 
 
-def cases_of(scene: sj.Scene, camera: sj.Camera, plan: sj.Plan, frame_only: bool) -> dict[str, tuple]:
+def cases_of(
+    scene: sj.Scene, camera: sj.Camera, plan: sj.Plan, frame_only: bool
+) -> dict[str, tuple]:
     """Give what is timed, by name: functions and their arguments."""
     settings = sj.RenderSettings()
 
@@ -123,14 +150,18 @@ def main() -> None:
     plan = sj.plan(scene, camera)
     planning = 1e3 * (time.perf_counter() - start)
     if float(sj.render(scene, camera, plan=plan).overflow) > 0:
-        raise SystemExit(f"{options.splats} splats at {options.width}^2: the plan does not hold its own scene")
+        raise SystemExit(
+            f"{options.splats} splats at {options.width}^2: the plan does not hold its own scene"
+        )
     rows, compiled = {}, {}
     for name, (function, inputs) in cases_of(scene, camera, plan, options.frame_only).items():
         start = time.perf_counter()
         compiled[name] = jax.jit(function).lower(*inputs).compile(), inputs
         seconds = time.perf_counter() - start
         held = compiled[name][0].memory_analysis()
-        bytes_held = held.temp_size_in_bytes + held.argument_size_in_bytes + held.output_size_in_bytes
+        bytes_held = (
+            held.temp_size_in_bytes + held.argument_size_in_bytes + held.output_size_in_bytes
+        )
         rows[name] = {"compile_seconds": seconds, "gigabytes": 1e-9 * bytes_held}
         timed(*compiled[name])
     times = {name: [] for name in compiled}
@@ -148,7 +179,12 @@ def main() -> None:
     unit = medians["yardstick"]
     for name, row in rows.items():
         value = float(np.median(times[name]))
-        row |= {"name": name, **common, "milliseconds": value, "ratio": value / unit if unit else None}
+        row |= {
+            "name": name,
+            **common,
+            "milliseconds": value,
+            "ratio": value / unit if unit else None,
+        }
     print(json.dumps(list(rows.values())))
 
 

@@ -58,7 +58,9 @@ HEADS = {"scanned": scanned, "bust": bust}
 def body_of(head: str, count: int) -> Body:
     """Give one of the heads with so many splats."""
     mesh, textures = HEADS[head]()
-    return Body(rivals.TexturedMesh.of(mesh, textures), sample_surface(mesh, count, textures=textures))
+    return Body(
+        rivals.TexturedMesh.of(mesh, textures), sample_surface(mesh, count, textures=textures)
+    )
 
 
 def conditions(width: int) -> tuple[sj.DirectionalLight, sj.Camera]:

@@ -1,10 +1,13 @@
-"""What comes back from path-traced pictures, and what a differentiable path tracer takes: `python -m benchmarks.mitsuba`.
+"""What comes back from path-traced pictures, and what a differentiable path tracer takes: `python
+-m benchmarks.mitsuba`.
 
-A sphere with no change of index at its surface, lit from the side, is path-traced (Mitsuba 3, `volpath`, each channel by itself).
-From its picture `recover` finds the coefficients by each model; so it does from the picture that splatjax makes of a profile by
-Monte Carlo, whose error is the model's alone. Then Mitsuba's `prbvolpath` walks down the same picture's squared error, by Adam,
-from the same starts. Seconds are the processor's, of all threads, compiling included. Needs `mitsuba` (the dependency group
-`truth`), and for it an LLVM newer than 15, which `DRJIT_LIBLLVM_PATH` names where several are installed.
+A sphere with no change of index at its surface, lit from the side, is path-traced (Mitsuba 3,
+`volpath`, each channel by itself). From its picture `recover` finds the coefficients by each model;
+so it does from the picture that splatjax makes of a profile by Monte Carlo, whose error is the
+model's alone. Then Mitsuba's `prbvolpath` walks down the same picture's squared error, by Adam,
+from the same starts. Seconds are the processor's, of all threads, compiling included. Needs
+`mitsuba` (the dependency group `truth`), and for it an LLVM newer than 15, which
+`DRJIT_LIBLLVM_PATH` names where several are installed.
 """
 
 import argparse
@@ -34,13 +37,37 @@ RATE = 0.1  # Adam's, in logarithms of coefficients: from afar to nearly nothing
 def arguments():
     parser = argparse.ArgumentParser(prog="python -m benchmarks.mitsuba", description=__doc__)
     parser.add_argument("--materials", nargs="+", default=["marble", "skin1"])
-    parser.add_argument("--models", nargs="*", default=list(MODELS), choices=MODELS, help="to recover by; none: the path tracer")
-    parser.add_argument("--width", type=int, default=64, help="of the square picture, pixels (default %(default)s)")
-    parser.add_argument("--samples", type=int, default=4096, help="paths per pixel of the truth (default %(default)s)")
-    parser.add_argument("--splats", type=int, default=40_000, help="on the sphere (default %(default)s)")
-    parser.add_argument("--off", type=float, default=3.0, help="factor of the starts (default %(default)s)")
-    parser.add_argument("--steps", type=int, default=200, help="of the path tracer; 0: none (default %(default)s)")
-    parser.add_argument("--step-samples", type=int, default=32, help="paths per pixel of its steps (default %(default)s)")
+    parser.add_argument(
+        "--models",
+        nargs="*",
+        default=list(MODELS),
+        choices=MODELS,
+        help="to recover by; none: the path tracer",
+    )
+    parser.add_argument(
+        "--width", type=int, default=64, help="of the square picture, pixels (default %(default)s)"
+    )
+    parser.add_argument(
+        "--samples",
+        type=int,
+        default=4096,
+        help="paths per pixel of the truth (default %(default)s)",
+    )
+    parser.add_argument(
+        "--splats", type=int, default=40_000, help="on the sphere (default %(default)s)"
+    )
+    parser.add_argument(
+        "--off", type=float, default=3.0, help="factor of the starts (default %(default)s)"
+    )
+    parser.add_argument(
+        "--steps", type=int, default=200, help="of the path tracer; 0: none (default %(default)s)"
+    )
+    parser.add_argument(
+        "--step-samples",
+        type=int,
+        default=32,
+        help="paths per pixel of its steps (default %(default)s)",
+    )
     return parser.parse_args()
 
 
@@ -49,7 +76,9 @@ def path_tracer():
     try:
         import mitsuba
     except ImportError:
-        raise SystemExit("mitsuba is not installed, and it makes the truth here: pip install mitsuba==3.9.1") from None
+        raise SystemExit(
+            "mitsuba is not installed, and it makes the truth here: pip install mitsuba==3.9.1"
+        ) from None
     mitsuba.set_variant("llvm_ad_mono")
     return mitsuba
 
@@ -65,12 +94,23 @@ class Traced:
             "albedo": sigma_s / (sigma_a + sigma_s),
             "phase": {"type": "isotropic"},
         }
-        film = {"type": "hdrfilm", "width": width, "height": width, "pixel_format": "luminance", "rfilter": {"type": "box"}}
+        film = {
+            "type": "hdrfilm",
+            "width": width,
+            "height": width,
+            "pixel_format": "luminance",
+            "rfilter": {"type": "box"},
+        }
         view = mi.ScalarTransform4f().look_at(origin=list(EYE), target=[0, 0, 0], up=[0, 1, 0])
         self.scene = mi.load_dict(
             {
                 "type": "scene",
-                "body": {"type": "sphere", "radius": RADIUS, "bsdf": {"type": "null"}, "interior": medium},
+                "body": {
+                    "type": "sphere",
+                    "radius": RADIUS,
+                    "bsdf": {"type": "null"},
+                    "interior": medium,
+                },
                 "light": {"type": "directional", "direction": list(WAY), "irradiance": IRRADIANCE},
                 "camera": {
                     "type": "perspective",
@@ -95,13 +135,20 @@ class Traced:
         """Give the picture, and the variance of its noise."""
         integrator, passes = self.integrator("volpath"), max(2, samples // at_once)
         found = [
-            np.asarray(self.mi.render(self.scene, integrator=integrator, spp=samples // passes, seed=i), float)[..., 0]
+            np.asarray(
+                self.mi.render(self.scene, integrator=integrator, spp=samples // passes, seed=i),
+                float,
+            )[..., 0]
             for i in range(passes)
         ]
         return np.mean(found, axis=0), np.var(found, axis=0, ddof=1) / passes
 
-    def descend(self, truth: np.ndarray, start: tuple[float, float], steps: int, samples: int) -> list[dict]:
-        """Walk from a start down the squared error, by Adam; give where it was after each step, and when."""
+    def descend(
+        self, truth: np.ndarray, start: tuple[float, float], steps: int, samples: int
+    ) -> list[dict]:
+        """Walk from a start down the squared error, by Adam; give where it was after each step, and
+        when.
+        """
         import drjit as dr
 
         mi, integrator = self.mi, self.integrator("prbvolpath")
@@ -111,7 +158,9 @@ class Traced:
         optimizer["a"], optimizer["s"] = mi.Float(np.log(start[0])), mi.Float(np.log(start[1]))
         path, begin = [], time.process_time()
         for step in range(steps):
-            optimizer.set_learning_rate(RATE * (0.02 + 0.98 * 0.5 * (1 + np.cos(np.pi * step / steps))))
+            optimizer.set_learning_rate(
+                RATE * (0.02 + 0.98 * 0.5 * (1 + np.cos(np.pi * step / steps)))
+            )
             sigma_a, sigma_s = dr.exp(optimizer["a"]), dr.exp(optimizer["s"])
             self.parameters[self.total] = sigma_a + sigma_s
             self.parameters[self.albedo] = sigma_s / (sigma_a + sigma_s)
@@ -129,7 +178,9 @@ class Traced:
             dr.backward(loss)
             optimizer.step()
             now = [float(np.exp(np.asarray(optimizer[name]).item())) for name in ("a", "s")]
-            path.append({"seconds": time.process_time() - begin, "sigma_a": now[0], "sigma_s_prime": now[1]})
+            path.append(
+                {"seconds": time.process_time() - begin, "sigma_a": now[0], "sigma_s_prime": now[1]}
+            )
         return path
 
 
@@ -142,7 +193,9 @@ def sphere(count: int) -> sj.Splats:
 
 
 def off(a: np.ndarray, b: np.ndarray) -> list[float]:
-    """Give, per channel, the root mean square of a difference over that of the second picture, where both are known."""
+    """Give, per channel, the root mean square of a difference over that of the second picture,
+    where both are known.
+    """
     there = np.all(np.isfinite(a), axis=-1)
     return (np.sqrt(np.mean((a - b)[there] ** 2, axis=0) / np.mean(b[there] ** 2, axis=0))).tolist()
 
@@ -155,8 +208,13 @@ class Splatted:
     """The sphere as splats, under the same light and camera."""
 
     def __init__(self, count: int, width: int):
-        self.splats, self.light = sphere(count), sj.DirectionalLight(jnp.asarray(WAY), jnp.full(3, IRRADIANCE))
-        self.camera = sj.Camera.look_at(jnp.asarray(EYE), jnp.zeros(3), fov=FOV, width=width, height=width)
+        self.splats, self.light = (
+            sphere(count),
+            sj.DirectionalLight(jnp.asarray(WAY), jnp.full(3, IRRADIANCE)),
+        )
+        self.camera = sj.Camera.look_at(
+            jnp.asarray(EYE), jnp.zeros(3), fov=FOV, width=width, height=width
+        )
 
     def picture(self, profile, rule=None) -> np.ndarray:
         more = {} if rule is None else {"rule": rule}
@@ -166,9 +224,13 @@ class Splatted:
         filled = np.asarray(frame.coverage)[..., None] > 0.999
         return np.where(filled, np.asarray(frame.beauty, float), np.nan)
 
-    def recover(self, picture: np.ndarray, medium: sj.Medium, model, away: float) -> tuple[sj.Recovery, float]:
+    def recover(
+        self, picture: np.ndarray, medium: sj.Medium, model, away: float
+    ) -> tuple[sj.Recovery, float]:
         seen, begin = sj.Observation(picture, self.camera, (self.light,)), time.process_time()
-        return sj.recover([seen], self.splats, starts(medium, away), model=model, throw=False), time.process_time() - begin
+        return sj.recover(
+            [seen], self.splats, starts(medium, away), model=model, throw=False
+        ), time.process_time() - begin
 
 
 def compared(mi, splatted: Splatted, name: str, options) -> dict:
@@ -182,14 +244,19 @@ def compared(mi, splatted: Splatted, name: str, options) -> dict:
     truth, noise = (np.stack(each, axis=-1) for each in zip(*found, strict=True))
     seconds = time.process_time() - begin
     grain = np.sqrt(np.mean(noise, axis=(0, 1)) / np.mean(truth**2, axis=(0, 1)))
-    print(f"\n{name}: path-traced in {seconds:.0f} s, noise {percents(grain)}% (red, green, blue)", flush=True)
+    print(
+        f"\n{name}: path-traced in {seconds:.0f} s, noise {percents(grain)}% (red, green, blue)",
+        flush=True,
+    )
     row = {"material": name, "trace_seconds": seconds, "noise": grain.tolist(), "models": []}
     if options.models:
         row["models"] = recovered(splatted, medium, truth, options)
     if options.steps:
         row["descent"] = [
             [
-                each.descend(truth[..., c], (a * times, s / times), options.steps, options.step_samples)
+                each.descend(
+                    truth[..., c], (a * times, s / times), options.steps, options.step_samples
+                )
                 for times in (options.off, 1 / options.off)
             ]
             for c, (each, (a, s)) in enumerate(zip(traced, pairs, strict=True))
@@ -199,17 +266,30 @@ def compared(mi, splatted: Splatted, name: str, options) -> dict:
 
 
 def recovered(splatted: Splatted, medium: sj.Medium, truth: np.ndarray, options) -> list[dict]:
-    """Recover from the path-traced picture, and from that of a profile by Monte Carlo: what then is off is the model's fault."""
+    """Recover from the path-traced picture, and from that of a profile by Monte Carlo: what then is
+    off is the model's fault.
+    """
     chosen = {title: MODELS[title] for title in options.models}
     with jax.enable_x64(False):
-        layer = sj.Layer(jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf), float), medium), jnp.asarray(jnp.inf))
+        layer = sj.Layer(
+            jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf), float), medium),
+            jnp.asarray(jnp.inf),
+        )
         walks = sj.monte_carlo([layer], PHOTONS, jax.random.key(4)).profile()
     rule = sj.NORM_RULE.beyond(0.2 / float(np.max(medium.sigma_t_prime)))
-    by_walks = splatted.picture(jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf), float), walks), rule)
-    made = {"Monte Carlo": by_walks} | {title: splatted.picture(model(medium)) for title, model in chosen.items()}
+    by_walks = splatted.picture(
+        jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf), float), walks), rule
+    )
+    made = {"Monte Carlo": by_walks} | {
+        title: splatted.picture(model(medium)) for title, model in chosen.items()
+    }
     rows = []
     for title, picture in made.items():
-        print(f"  the picture of the true coefficients, {title}: off by {percents(off(picture, truth))}% rms", flush=True)
+        print(
+            f"  the picture of the true coefficients, {title}: off by "
+            f"{percents(off(picture, truth))}% rms",
+            flush=True,
+        )
     for title, model in chosen.items():
         for data, picture in (("path-traced", truth), ("of Monte Carlo's profile", by_walks)):
             recovery, took = splatted.recover(picture, medium, model, options.off)
@@ -217,32 +297,52 @@ def recovered(splatted: Splatted, medium: sj.Medium, truth: np.ndarray, options)
             bars = np.stack(recovery.relative_errors())
             (left,) = recovery.residuals
             print(
-                f"  {data}, {title}: sigma_a off by {percents(wrong[0])}% (bars {percents(bars[0])}), sigma_s' by "
+                f"  {data}, {title}: sigma_a off by {percents(wrong[0])}% (bars "
+                f"{percents(bars[0])}), sigma_s' by "
                 f"{percents(wrong[1])}% (bars {percents(bars[1])}); leaves "
                 f"{percents(off(picture + left, picture))}% rms; {took:.0f} s",
                 flush=True,
             )
-            rows.append({"data": data, "model": title, "errors": wrong.tolist(), "bars": bars.tolist(), "seconds": took})
+            rows.append(
+                {
+                    "data": data,
+                    "model": title,
+                    "errors": wrong.tolist(),
+                    "bars": bars.tolist(),
+                    "seconds": took,
+                }
+            )
     return rows
 
 
 def tell_descent(descent: list[list[dict]], pairs: np.ndarray) -> None:
-    """Say how long each channel took from each start to be within shares of the truth, and to stay there."""
+    """Say how long each channel took from each start to be within shares of the truth, and to stay
+    there.
+    """
     for reach in (0.2, 0.1, 0.05, 0.03):
         said = []
         for paths, (a, s) in zip(descent, pairs, strict=True):
             for path in paths:
-                wrong = [max(abs(at["sigma_a"] / a - 1), abs(at["sigma_s_prime"] / s - 1)) for at in path]
+                wrong = [
+                    max(abs(at["sigma_a"] / a - 1), abs(at["sigma_s_prime"] / s - 1)) for at in path
+                ]
                 outside = [i for i, each in enumerate(wrong) if each > reach]
                 last = outside[-1] + 1 if outside else 0
                 said.append(f"{path[last]['seconds']:.0f} s" if last < len(path) else "never")
-        print(f"  prbvolpath within {100 * reach:.0f}% (red, red, green, green, blue, blue from both starts): {', '.join(said)}")
+        print(
+            f"  prbvolpath within {100 * reach:.0f}% (red, red, green, green, blue, blue from both "
+            f"starts): {', '.join(said)}"
+        )
     for c, paths in enumerate(descent):
         for path in paths:
             end = path[-1]
-            wrong = percents([end["sigma_a"] / pairs[c][0] - 1, end["sigma_s_prime"] / pairs[c][1] - 1])
+            wrong = percents(
+                [end["sigma_a"] / pairs[c][0] - 1, end["sigma_s_prime"] / pairs[c][1] - 1]
+            )
             print(
-                f"  prbvolpath, channel {c}: ends off by {wrong}% after {end['seconds']:.0f} s and {len(path)} steps", flush=True
+                f"  prbvolpath, channel {c}: ends off by {wrong}% after {end['seconds']:.0f} s and "
+                f"{len(path)} steps",
+                flush=True,
             )
 
 

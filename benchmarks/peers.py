@@ -1,9 +1,10 @@
 """The same splats by PyTorch3D, where a person has it: `python -m benchmarks.peers`.
 
-Pulsar blends spheres of the splats' radii and colors by depth, with no normals, no attributes and no light: less than passes 2
-and 3 do here. `PointsRasterizer` lists the nearest points of every pixel and blends nothing; on a CPU it tries every point in
-every pixel, so it gets fewer splats and pixels. Both are differentiable. Told beside each time is how much of the picture is
-covered: about the same, or it is not the same picture.
+Pulsar blends spheres of the splats' radii and colors by depth, with no normals, no attributes and
+no light: less than passes 2 and 3 do here. `PointsRasterizer` lists the nearest points of every
+pixel and blends nothing; on a CPU it tries every point in every pixel, so it gets fewer splats and
+pixels. Both are differentiable. Told beside each time is how much of the picture is covered: about
+the same, or it is not the same picture.
 """
 
 import argparse
@@ -23,7 +24,9 @@ try:
     from pytorch3d.renderer.points.rasterize_points import rasterize_points
     from pytorch3d.structures import Pointclouds
 except ImportError as missing:
-    raise SystemExit(f"PyTorch3D cannot be imported ({missing}); install it, with PyTorch, to compare with it") from None
+    raise SystemExit(
+        f"PyTorch3D cannot be imported ({missing}); install it, with PyTorch, to compare with it"
+    ) from None
 
 _GAMMA = 1e-3  # of Pulsar: how far depths blend; small means the nearest wins
 _NEAREST = 8  # points listed for a pixel
@@ -33,9 +36,18 @@ def arguments():
     parser = argparse.ArgumentParser(prog="python -m benchmarks.peers", description=__doc__)
     parser.add_argument("--body", choices=BODIES, default="synthetic", help="(default %(default)s)")
     parser.add_argument("--splats", type=int, default=683_549, help="(default %(default)s)")
-    parser.add_argument("--width", type=int, default=1024, help="of the square picture, pixels (default %(default)s)")
-    parser.add_argument("--few", type=int, default=10_000, help="splats for PointsRasterizer (default %(default)s)")
-    parser.add_argument("--narrow", type=int, default=128, help="its picture, pixels (default %(default)s)")
+    parser.add_argument(
+        "--width",
+        type=int,
+        default=1024,
+        help="of the square picture, pixels (default %(default)s)",
+    )
+    parser.add_argument(
+        "--few", type=int, default=10_000, help="splats for PointsRasterizer (default %(default)s)"
+    )
+    parser.add_argument(
+        "--narrow", type=int, default=128, help="its picture, pixels (default %(default)s)"
+    )
     return parser.parse_args()
 
 
@@ -44,7 +56,11 @@ def tell(name: str, run, coverage) -> None:
     run()
     start = time.perf_counter()
     found = run()
-    print(f"{name}: {1e3 * (time.perf_counter() - start):.0f} ms, {100 * coverage(found):.1f}% covered", flush=True)
+    print(
+        f"{name}: {1e3 * (time.perf_counter() - start):.0f} ms, {100 * coverage(found):.1f}% "
+        "covered",
+        flush=True,
+    )
 
 
 def splatjax(data: dict[str, np.ndarray], width: int) -> None:
@@ -61,7 +77,9 @@ def splatjax(data: dict[str, np.ndarray], width: int) -> None:
 def pulsar(data: dict[str, np.ndarray], width: int) -> None:
     count = len(data["p"])
     renderer = Renderer(width, width, count)
-    camera = torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, FOCAL_LENGTH, 1.0])  # position, rotation, focal length, sensor's width
+    camera = torch.tensor(
+        [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, FOCAL_LENGTH, 1.0]
+    )  # position, rotation, focal length, sensor's width
     spheres = [torch.from_numpy(data[name]) for name in ("p", "col", "r")]
     farthest = float(data["p"][:, 2].max()) + 10
     tell(
@@ -73,7 +91,9 @@ def pulsar(data: dict[str, np.ndarray], width: int) -> None:
 
 def points(data: dict[str, np.ndarray], width: int) -> None:
     scale = 2 * FOCAL_LENGTH / data["p"][:, 2:]
-    places = np.concatenate([data["p"][:, :2] * -scale, data["p"][:, 2:]], axis=1)  # x to the left, y up, edges at 1
+    places = np.concatenate(
+        [data["p"][:, :2] * -scale, data["p"][:, 2:]], axis=1
+    )  # x to the left, y up, edges at 1
     cloud = Pointclouds([torch.from_numpy(places)])
     radii = torch.from_numpy(data["r"] * scale[:, 0])
     tell(

@@ -1,6 +1,8 @@
-"""Splat diffusion and its rivals against brute-force integration over the surface: `python -m benchmarks.rivals`.
+"""Splat diffusion and its rivals against brute-force integration over the surface: `python -m
+benchmarks.rivals`.
 
-Writes out/rivals_BODY_NORMALIZATION.json, and a picture of where each method errs around the nose; SSIM and FLIP are taken there.
+Writes out/rivals_BODY_NORMALIZATION.json, and a picture of where each method errs around the nose;
+SSIM and FLIP are taken there.
 """
 
 import argparse
@@ -34,11 +36,24 @@ NOSE = (0.5, 0.48)  # of the picture, from the top and from the left
 def arguments():
     parser = argparse.ArgumentParser(prog="python -m benchmarks.rivals", description=__doc__)
     parser.add_argument("--body", choices=HEADS, default="scanned", help="(default %(default)s)")
-    parser.add_argument("--normalization", choices=NORMALIZATIONS, default="mean", help="(default %(default)s)")
+    parser.add_argument(
+        "--normalization", choices=NORMALIZATIONS, default="mean", help="(default %(default)s)"
+    )
     parser.add_argument("--splats", type=int, default=683_549, help="(default %(default)s)")
-    parser.add_argument("--width", type=int, default=1024, help="of the square picture, pixels (default %(default)s)")
-    parser.add_argument("--pixels", type=int, default=1000, help="random covered ones (default %(default)s)")
-    parser.add_argument("--refine", action="store_true", help="also integrate with twice the samples, and tell the change")
+    parser.add_argument(
+        "--width",
+        type=int,
+        default=1024,
+        help="of the square picture, pixels (default %(default)s)",
+    )
+    parser.add_argument(
+        "--pixels", type=int, default=1000, help="random covered ones (default %(default)s)"
+    )
+    parser.add_argument(
+        "--refine",
+        action="store_true",
+        help="also integrate with twice the samples, and tell the change",
+    )
     return parser.parse_args()
 
 
@@ -52,7 +67,9 @@ class Found(NamedTuple):
 
 
 def timed(function):
-    """Give what a function gives, and the least processor seconds of three calls after the first; others may use the machine."""
+    """Give what a function gives, and the least processor seconds of three calls after the first;
+    others may use the machine.
+    """
     found, seconds = jax.block_until_ready(function()), []
     for _ in range(3):
         start = time.process_time()
@@ -82,31 +99,45 @@ def methods(body: Body, light, camera, material: sj.Material, normalization) -> 
     for name, stretch, thin in (
         ("texture space", corrected, rivals.TranslucentShadowMap()),
         ("texture space, no far side", corrected, opaque),
-        ("texture space, no stretch correction", rivals.Uncorrected(), rivals.TranslucentShadowMap()),
+        (
+            "texture space, no stretch correction",
+            rivals.Uncorrected(),
+            rivals.TranslucentShadowMap(),
+        ),
     ):
         how = rivals.TextureSpaceSettings(MAP, stretch, thin, normalization)
         room = rivals.plan_texture_space(body.mesh, (light,), material, camera, how)
         picture, seconds = timed(
-            lambda how=how, room=room: rivals.render_texture_space(body.mesh, (light,), material, camera, how, room)
+            lambda how=how, room=room: rivals.render_texture_space(
+                body.mesh, (light,), material, camera, how, room
+            )
         )
         keep(name, picture.frame, seconds)
         lost = np.asarray(picture.texture.renormalized)
-        print(f"  weights that fell between the charts: {', '.join(f'{each:.1e}' for each in lost)}")
+        print(
+            f"  weights that fell between the charts: {', '.join(f'{each:.1e}' for each in lost)}"
+        )
         if float(picture.frame.overflow) > 0:
             raise SystemExit("the plan does not hold its own scene")
-        frame = picture.frame  # its buffers, but for the layers, are those of any way of spreading light
+        frame = (
+            picture.frame
+        )  # its buffers, but for the layers, are those of any way of spreading light
     for name, kernel in (
         ("screen space, Gaussian by Gaussian", rivals.GaussianPasses()),
         ("screen space, the kernel that ships", rivals.ShippedKernel()),
     ):
-        on_screen = jax.jit(lambda frame, kernel=kernel: rivals.diffuse_on_screen(frame, camera, material, kernel))
+        on_screen = jax.jit(
+            lambda frame, kernel=kernel: rivals.diffuse_on_screen(frame, camera, material, kernel)
+        )
         diffused, seconds = timed(lambda on_screen=on_screen, frame=frame: on_screen(frame))
         keep(name, diffused, seconds)
     return found
 
 
 def same_light(body: Body, maps: rivals.MeshLight, camera, material, normalization) -> Found:
-    """Diffuse by splats the light that the shadow map of the triangles lets through, as the rivals have it."""
+    """Diffuse by splats the light that the shadow map of the triangles lets through, as the rivals
+    have it.
+    """
     scene = sj.Scene(body.splats, maps.lights, material)
     settings = sj.RenderSettings(diffusion=DiffusionSettings(normalization=normalization))
     plan = sj.plan(scene, camera, settings)
@@ -121,7 +152,10 @@ def main() -> None:
     normalization = NORMALIZATIONS[options.normalization]
     start = time.perf_counter()
     body = body_of(options.body, options.splats)
-    print(f"{options.body}: {len(body.mesh.faces)} triangles, {body.splats.count} splats ({time.perf_counter() - start:.0f} s)")
+    print(
+        f"{options.body}: {len(body.mesh.faces)} triangles, {body.splats.count} splats "
+        f"({time.perf_counter() - start:.0f} s)"
+    )
     light, camera = conditions(options.width)
     material = sj.load_material("skin").white()
     dull = dataclasses.replace(material.surface_of(material.gaussians), specular=jnp.zeros(()))
@@ -140,8 +174,13 @@ def main() -> None:
     weights = np.asarray(dull.gaussians.weights)
     whole = np.einsum("gpc,gc->pc", layers, weights)
     if options.refine:
-        finer = integrate(body.mesh, maps, dull, faces, shares, normalization, 2**0.5).layers(dull, normalization)
-        print("twice the samples change it by", rivals.Off.of(np.einsum("gpc,gc->pc", finer, weights), whole))
+        finer = integrate(body.mesh, maps, dull, faces, shares, normalization, 2**0.5).layers(
+            dull, normalization
+        )
+        print(
+            "twice the samples change it by",
+            rivals.Off.of(np.einsum("gpc,gc->pc", finer, weights), whole),
+        )
         layers, whole = finer, np.einsum("gpc,gc->pc", finer, weights)
     around = in_crop(body, maps, dull, normalization, seen, found, options)
     deviations = np.sqrt(np.asarray(dull.gaussians.variances))
@@ -179,7 +218,9 @@ class Seen(NamedTuple):
         """Choose pixels at random, at least two from where anything ends."""
         steps, (height, width) = range(2 * RIM + 1), self.there.shape
         padded = np.pad(self.there & ~self.ends, RIM)
-        inside = np.all([padded[i : i + height, j : j + width] for i in steps for j in steps], axis=0)
+        inside = np.all(
+            [padded[i : i + height, j : j + width] for i in steps for j in steps], axis=0
+        )
         rows, columns = np.nonzero(inside)
         picked = np.random.default_rng(0).choice(len(rows), min(count, len(rows)), replace=False)
         return rows[picked], columns[picked]
@@ -190,7 +231,9 @@ class Seen(NamedTuple):
 
 
 def stretched(body: Body, faces: np.ndarray) -> np.ndarray:
-    """Give how stretched, or squeezed, the chart is on faces: the greater of the factors along u and along v, from the mean."""
+    """Give how stretched, or squeezed, the chart is on faces: the greater of the factors along u
+    and along v, from the mean.
+    """
     lengths = np.stack([np.asarray(each) for each in body.mesh.lengths()])[:, faces]
     a, b, c = np.moveaxis(np.asarray(body.mesh.uvs, np.float64), 1, 0)
     doubled = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
@@ -199,8 +242,12 @@ def stretched(body: Body, faces: np.ndarray) -> np.ndarray:
     return np.max(np.maximum(ratio, 1 / ratio), axis=0)
 
 
-def in_crop(body: Body, maps, material, normalization, seen: Seen, found: dict[str, Found], options):
-    """Integrate at every pixel of a part of the picture, around the nose; draw what each method makes of it."""
+def in_crop(
+    body: Body, maps, material, normalization, seen: Seen, found: dict[str, Found], options
+):
+    """Integrate at every pixel of a part of the picture, around the nose; draw what each method
+    makes of it.
+    """
     size = options.width // 6
     top, left = (int(share * options.width) for share in NOSE)
     crop = slice(top, top + size), slice(left, left + size)
@@ -209,27 +256,52 @@ def in_crop(body: Body, maps, material, normalization, seen: Seen, found: dict[s
     faces, shares = seen.on_mesh((rows + top, columns + left))
     truth = integrate(body.mesh, maps, material, faces, shares, normalization)
     whole, root = np.zeros((size, size, 3)), np.zeros((size, size, 3))
-    whole[covered] = np.einsum("gpc,gc->pc", truth.layers(material, normalization), np.asarray(material.gaussians.weights))
+    whole[covered] = np.einsum(
+        "gpc,gc->pc", truth.layers(material, normalization), np.asarray(material.gaussians.weights)
+    )
     root[covered] = np.sqrt(np.maximum(truth.albedo, 1e-4))
     pictures = {name: each.exitance[crop] for name, each in found.items()}
-    return errors(pictures, whole, covered, root, Path(f"out/rivals_errors_{options.body}_{options.normalization}.png"))
+    return errors(
+        pictures,
+        whole,
+        covered,
+        root,
+        Path(f"out/rivals_errors_{options.body}_{options.normalization}.png"),
+    )
 
 
 def report(found, pixels, layers, whole, deviations, stretch, around, options) -> None:
     """Print the tables and write them."""
     rows = []
-    print(f"\n{'':42}{'median':>9}{'99th pct':>9}{'maximum':>9}{'RMS':>9}{'SSIM':>8}{'FLIP':>8}{'CPU s':>9}", end="   ")
+    print(
+        f"\n{'':42}{'median':>9}{'99th pct':>9}{'maximum':>9}{'RMS':>9}"
+        f"{'SSIM':>8}{'FLIP':>8}{'CPU s':>9}",
+        end="   ",
+    )
     print("RMS of the layers of", ", ".join(f"{each:.2f}" for each in deviations), "mm")
     for name, each in found.items():
         off = rivals.Off.of(each.exitance[pixels], whole)
         by_layer = []
         if each.layers is not None:
-            by_layer = [rivals.Off.of(each.layers[k][pixels], layers[k]).rms for k in range(len(layers))]
+            by_layer = [
+                rivals.Off.of(each.layers[k][pixels], layers[k]).rms for k in range(len(layers))
+            ]
         print(f"{name:42}{off.median:9.1e}{off.most:9.1e}{off.largest:9.1e}{off.rms:9.1e}", end="")
         alike, seen = around[name]["ssim"], around[name]["flip"]
-        print(f"{alike:8.4f}{'none' if seen is None else f'{seen:.4f}':>8}{each.seconds:9.2f}  ", end=" ")
+        print(
+            f"{alike:8.4f}{'none' if seen is None else f'{seen:.4f}':>8}{each.seconds:9.2f}  ",
+            end=" ",
+        )
         print(" ".join(f"{value:.1e}" for value in by_layer))
-        rows.append({"name": name, **dataclasses.asdict(off), **around[name], "seconds": each.seconds, "layers": by_layer})
+        rows.append(
+            {
+                "name": name,
+                **dataclasses.asdict(off),
+                **around[name],
+                "seconds": each.seconds,
+                "layers": by_layer,
+            }
+        )
     print("\nRMS of the widest layer where the chart is stretched by")
     bins = list(itertools.pairwise(STRETCHES))
     inside = [(stretch >= low) & (stretch < high) for low, high in bins]
@@ -239,8 +311,16 @@ def report(found, pixels, layers, whole, deviations, stretch, around, options) -
     for row, (name, each) in zip(rows, found.items(), strict=True):
         if each.layers is not None:
             off = np.mean((each.layers[-1][pixels] - layers[-1]) ** 2, axis=1)
-            row["by_stretch"] = [float(np.sqrt(off[part].mean()) / scale) if part.any() else None for part in inside]
-            print(f"{name:42}" + "".join(f"{value:13.1e}" if value is not None else f"{'':13}" for value in row["by_stretch"]))
+            row["by_stretch"] = [
+                float(np.sqrt(off[part].mean()) / scale) if part.any() else None for part in inside
+            ]
+            print(
+                f"{name:42}"
+                + "".join(
+                    f"{value:13.1e}" if value is not None else f"{'':13}"
+                    for value in row["by_stretch"]
+                )
+            )
     out = Path(f"out/rivals_{options.body}_{options.normalization}.json")
     out.parent.mkdir(exist_ok=True)
     out.write_text(json.dumps(rows, indent=1) + "\n")

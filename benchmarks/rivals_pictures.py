@@ -12,16 +12,26 @@ from splatjax.io._color import linear_to_srgb
 
 
 def errors(
-    pictures: dict[str, np.ndarray], truth: np.ndarray, covered: np.ndarray, root: np.ndarray, path: Path
+    pictures: dict[str, np.ndarray],
+    truth: np.ndarray,
+    covered: np.ndarray,
+    root: np.ndarray,
+    path: Path,
 ) -> dict[str, dict[str, float | None]]:
-    """Draw the truth, and by how much each method's exitance is off; give SSIM and FLIP of what leaves, as a display shows it."""
+    """Draw the truth, and by how much each method's exitance is off; give SSIM and FLIP of what
+    leaves, as a display shows it.
+    """
     exposure = 0.8 / np.quantile((truth * root)[covered], 0.98)
 
     def shown(exitance):
-        return linear_to_srgb(np.where(covered[..., None], exposure * exitance * root, 0.0)).astype(np.float32)
+        return linear_to_srgb(np.where(covered[..., None], exposure * exitance * root, 0.0)).astype(
+            np.float32
+        )
 
     found, reference = {}, shown(truth)
-    figure, axes = plt.subplots(2, (len(pictures) + 2) // 2, figsize=(2.3 * ((len(pictures) + 2) // 2), 4.9), squeeze=False)
+    figure, axes = plt.subplots(
+        2, (len(pictures) + 2) // 2, figsize=(2.3 * ((len(pictures) + 2) // 2), 4.9), squeeze=False
+    )
     for axis in axes.flat:
         axis.set_axis_off()
     axes.flat[0].imshow(reference, interpolation="nearest")
@@ -29,7 +39,10 @@ def errors(
     scale = np.sqrt(np.mean(truth[covered] ** 2, axis=0))
     for axis, (name, picture) in zip(list(axes.flat)[1:], pictures.items(), strict=False):
         ours = shown(picture)
-        found[name] = {"ssim": float(rivals.similarity(jnp.asarray(ours), jnp.asarray(reference))), "flip": flip(reference, ours)}
+        found[name] = {
+            "ssim": float(rivals.similarity(jnp.asarray(ours), jnp.asarray(reference))),
+            "flip": flip(reference, ours),
+        }
         off = np.where(covered[..., None], 0.5 + 5 * (picture - truth) / scale, 0.5)
         axis.imshow(np.clip(off, 0, 1), interpolation="nearest")
         axis.set_title(name, fontsize=7)

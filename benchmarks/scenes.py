@@ -18,12 +18,16 @@ MATERIALS = ("skin", "marble")
 
 
 def columns(body: str, splats: int) -> dict[str, np.ndarray]:
-    """Give the prototype's head, the scanned head or a thin sheet: p, n, r, col, area, irr, as the yardstick reads them."""
+    """Give the prototype's head, the scanned head or a thin sheet: p, n, r, col, area, irr, as the
+    yardstick reads them.
+    """
     return {"synthetic": make_scene, "scanned": scanned, "sheet": sheet}[body](splats)
 
 
 def sheet(splats: int) -> dict[str, np.ndarray]:
-    """Give a wavy sheet 1 mm thick, 160 mm along an edge: two faces, as thin as an ear's rim, seen at a slant."""
+    """Give a wavy sheet 1 mm thick, 160 mm along an edge: two faces, as thin as an ear's rim, seen
+    at a slant.
+    """
     rng = np.random.default_rng(0)
     u, v = rng.uniform(-80, 80, (2, splats))
     side = np.where(np.arange(splats) % 2 == 0, 1.0, -1.0)
@@ -33,7 +37,9 @@ def sheet(splats: int) -> dict[str, np.ndarray]:
     stretch = np.linalg.norm(normals, axis=1)
     normals *= (side / stretch)[:, None]
     turn = np.asarray([[0.8, 0.0, 0.6], [0.0, 1.0, 0.0], [-0.6, 0.0, 0.8]])
-    centers = (np.stack([u, v, height], axis=1) + 0.5 * normals) @ turn.T + np.asarray([0.0, 0.0, DISTANCE])
+    centers = (np.stack([u, v, height], axis=1) + 0.5 * normals) @ turn.T + np.asarray(
+        [0.0, 0.0, DISTANCE]
+    )
     areas = stretch * 160**2 / (splats / 2)
     columns = {
         "p": centers,
@@ -56,7 +62,13 @@ def scanned(splats: int) -> dict[str, np.ndarray]:
     }
     # on the triangles, as others draw them
     found = sj.sample_mesh(
-        folder / "LeePerrySmith.glb", splats, mm_per_unit=53, v_up=True, crop_min_y=-0.9, rounded=False, **maps
+        folder / "LeePerrySmith.glb",
+        splats,
+        mm_per_unit=53,
+        v_up=True,
+        crop_min_y=-0.9,
+        rounded=False,
+        **maps,
     )
     toward = np.asarray([1.0, -1.0, -1.0], np.float32)  # the file has y up and looks along +z
     centers = np.asarray(found.centers) * toward
@@ -71,11 +83,17 @@ def scanned(splats: int) -> dict[str, np.ndarray]:
     }
 
 
-def lit(data: dict[str, np.ndarray], width: int, material: str = "skin") -> tuple[sj.Scene, sj.Camera]:
+def lit(
+    data: dict[str, np.ndarray], width: int, material: str = "skin"
+) -> tuple[sj.Scene, sj.Camera]:
     """Give scene and camera of a square picture."""
     array = {name: jnp.asarray(values) for name, values in data.items()}
     splats = sj.Splats(array["p"], array["n"], array["r"], array["area"], array["col"])
-    skin = sj.Material(sj.SumOfGaussians(jnp.asarray(SKIN), jnp.full((len(SKIN), 3), 1 / len(SKIN))))
+    skin = sj.Material(
+        sj.SumOfGaussians(jnp.asarray(SKIN), jnp.full((len(SKIN), 3), 1 / len(SKIN)))
+    )
     light = sj.DirectionalLight(jnp.asarray([0.5, 0.6, 0.65]), jnp.full(3, jnp.pi))
     camera = sj.Camera(jnp.zeros(3), jnp.eye(3), jnp.asarray(FOCAL_LENGTH), width, width)
-    return sj.Scene(splats, (light,), skin if material == "skin" else sj.load_material(material)), camera
+    return sj.Scene(
+        splats, (light,), skin if material == "skin" else sj.load_material(material)
+    ), camera

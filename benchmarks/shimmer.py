@@ -1,7 +1,8 @@
-"""Whether layers shimmer under a slow turntable: `python -m benchmarks.shimmer`. Writes out/shimmer.png.
+"""Whether layers shimmer under a slow turntable: `python -m benchmarks.shimmer`. Writes
+out/shimmer.png.
 
-From frame to frame of a tenth of a degree a layer changes by so much; told is by how much more or less it does on the fast path
-than by the untruncated sum, of the layer's root mean square.
+From frame to frame of a tenth of a degree a layer changes by so much; told is by how much more or
+less it does on the fast path than by the untruncated sum, of the layer's root mean square.
 """
 
 import argparse
@@ -25,10 +26,18 @@ VARIANCES = (4.0, 8.0, 16.0, 32.0)  # mm^2: what splats a millimeter apart carry
 def arguments():
     parser = argparse.ArgumentParser(prog="python -m benchmarks.shimmer", description=__doc__)
     parser.add_argument("--body", choices=BODIES, default="synthetic", help="(default %(default)s)")
-    parser.add_argument("--splats", type=int, default=100_000, help="on the prototype's head (default %(default)s)")
-    parser.add_argument("--width", type=int, default=256, help="of the square picture, pixels (default %(default)s)")
-    parser.add_argument("--steps", type=int, default=4, help="from frame to frame (default %(default)s)")
-    parser.add_argument("--degrees", type=float, default=0.1, help="of a step (default %(default)s)")
+    parser.add_argument(
+        "--splats", type=int, default=100_000, help="on the prototype's head (default %(default)s)"
+    )
+    parser.add_argument(
+        "--width", type=int, default=256, help="of the square picture, pixels (default %(default)s)"
+    )
+    parser.add_argument(
+        "--steps", type=int, default=4, help="from frame to frame (default %(default)s)"
+    )
+    parser.add_argument(
+        "--degrees", type=float, default=0.1, help="of a step (default %(default)s)"
+    )
     return parser.parse_args()
 
 
@@ -37,7 +46,10 @@ def turned(camera: sj.Camera, middle: np.ndarray, degrees: float) -> sj.Camera:
     cosine, sine = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     turn = np.asarray([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])
     position = turn @ (np.asarray(camera.position) - middle) + middle
-    moved = jnp.asarray(position, jnp.float32), jnp.asarray(np.asarray(camera.rotation) @ turn.T, jnp.float32)
+    moved = (
+        jnp.asarray(position, jnp.float32),
+        jnp.asarray(np.asarray(camera.rotation) @ turn.T, jnp.float32),
+    )
     return eqx.tree_at(lambda c: (c.position, c.rotation), camera, moved)
 
 
@@ -45,7 +57,9 @@ def main() -> None:
     options = arguments()
     scene, camera = lit(columns(options.body, options.splats), options.width)
     weights = jnp.full((len(VARIANCES), 3), 1 / len(VARIANCES))
-    scene = eqx.tree_at(lambda s: s.material, scene, sj.Material(sj.SumOfGaussians(jnp.asarray(VARIANCES), weights)))
+    scene = eqx.tree_at(
+        lambda s: s.material, scene, sj.Material(sj.SumOfGaussians(jnp.asarray(VARIANCES), weights))
+    )
     middle = np.mean(np.asarray(scene.splats.centers), axis=0)
     cameras = [turned(camera, middle, options.degrees * step) for step in range(options.steps + 1)]
     layers = {}
@@ -58,18 +72,30 @@ def main() -> None:
         irradiance = lighting.let_light_in(scene, light).source.T
         frames = []
         for i, each in enumerate(cameras):
-            frames.append(np.asarray(jax.block_until_ready(sj.diffuse(scene, irradiance, each, settings, plan))))
+            frames.append(
+                np.asarray(
+                    jax.block_until_ready(sj.diffuse(scene, irradiance, each, settings, plan))
+                )
+            )
             print(f"  {name}: frame {i + 1} of {len(cameras)}", flush=True)
         layers[name] = np.stack(frames)
-    scale = np.sqrt(np.mean(layers["exact"] ** 2, axis=(0, 2, 3), where=layers["exact"] > 0))[None, :, None, None]
+    scale = np.sqrt(np.mean(layers["exact"] ** 2, axis=(0, 2, 3), where=layers["exact"] > 0))[
+        None, :, None, None
+    ]
     changes = {name: np.diff(each, axis=0) / scale for name, each in layers.items()}
     more = np.abs(changes["fast"] - changes["exact"]).max(axis=-1)
     covered = layers["exact"][1:].max(axis=(1, 4)) > 0
-    print(f"{options.degrees:g} degrees, {options.steps} steps; fast frames change so much beyond the exact ones, of the RMS:")
+    print(
+        f"{options.degrees:g} degrees, {options.steps} steps; fast frames change so much beyond "
+        "the exact ones, of the RMS:"
+    )
     for k, variance in enumerate(VARIANCES):
         median, high, largest = (np.quantile(more[:, k][covered], q) for q in (0.5, 0.99, 1.0))
         exact = np.quantile(np.abs(changes["exact"])[:, k].max(axis=-1)[covered], 0.99)
-        print(f"  {variance**0.5:5.2f} mm: {median:.1e} {high:.1e} {largest:.1e}; the exact change's 99th percentile {exact:.1e}")
+        print(
+            f"  {variance**0.5:5.2f} mm: {median:.1e} {high:.1e} {largest:.1e}; the exact change's "
+            f"99th percentile {exact:.1e}"
+        )
     out = Path("out/shimmer.png")
     out.parent.mkdir(exist_ok=True)
     Image.fromarray(np.clip(255 * more.max(axis=(0, 1)) / 5e-3, 0, 255).astype(np.uint8)).save(out)

@@ -1,7 +1,9 @@
-"""A cloud larger than memory, streamed: `python -m benchmarks.streamed --splats 100000000`. Writes out/streamed_*.png.
+"""A cloud larger than memory, streamed: `python -m benchmarks.streamed --splats 100000000`. Writes
+out/streamed_*.png.
 
-The cloud is written part by part (44 bytes a splat), if it is not there, and then drawn in a process of its own. Where
-`--compare` is given, `render` draws it too, in another one, with all of it in memory.
+The cloud is written part by part (44 bytes a splat), if it is not there, and then drawn in a
+process of its own. Where `--compare` is given, `render` draws it too, in another one, with all of
+it in memory.
 """
 
 import argparse
@@ -27,10 +29,26 @@ def arguments():
     parser = argparse.ArgumentParser(prog="python -m benchmarks.streamed", description=__doc__)
     parser.add_argument("--body", choices=HEADS, default="scanned", help="(default %(default)s)")
     parser.add_argument("--splats", type=int, default=10_000_000, help="(default %(default)s)")
-    parser.add_argument("--part", type=int, default=1_000_000, help="splats read at a time (default %(default)s)")
-    parser.add_argument("--width", type=int, default=1024, help="of the square picture, pixels (default %(default)s)")
-    parser.add_argument("--compare", action="store_true", help="with `render`, which takes about 1 kB of memory a splat")
-    parser.add_argument("--folder", type=Path, default=Path("out"), help="of clouds and pictures (default %(default)s)")
+    parser.add_argument(
+        "--part", type=int, default=1_000_000, help="splats read at a time (default %(default)s)"
+    )
+    parser.add_argument(
+        "--width",
+        type=int,
+        default=1024,
+        help="of the square picture, pixels (default %(default)s)",
+    )
+    parser.add_argument(
+        "--compare",
+        action="store_true",
+        help="with `render`, which takes about 1 kB of memory a splat",
+    )
+    parser.add_argument(
+        "--folder",
+        type=Path,
+        default=Path("out"),
+        help="of clouds and pictures (default %(default)s)",
+    )
     return parser.parse_args()
 
 
@@ -62,11 +80,16 @@ def written(path: Path, body: str, splats: int) -> float:
 
 
 def streamed(cloud: Path, out: Path, part: int, width: int) -> float:
-    """Draw the cloud a part at a time, and write the frame; give the most memory that it took, GB."""
+    """Draw the cloud a part at a time, and write the frame; give the most memory that it
+    took, GB.
+    """
     light, camera = conditions(width)
     file = sj.SplatFile(cloud, part)
     stages = Stages(file.count)
-    save(out, sj.render_streamed(file, (light,), sj.load_material("skin").white(), camera, report=stages))
+    save(
+        out,
+        sj.render_streamed(file, (light,), sj.load_material("skin").white(), camera, report=stages),
+    )
     stages("what the pixels show", file.count)
     print(f"  {'in all':30}{time.process_time():9.0f} s of CPU time", flush=True)
     return peak()
@@ -89,7 +112,9 @@ def save(out: Path, frame: sj.Frame) -> None:
 
 
 def compare(one: Path, other: Path) -> None:
-    """Print by how much two frames differ: over the largest number of its kind, and of layers over their root mean square."""
+    """Print by how much two frames differ: over the largest number of its kind, and of layers over
+    their root mean square.
+    """
     with np.load(one) as whole, np.load(other) as parts:
         for name in whole:
             if name == "layers":
@@ -98,7 +123,10 @@ def compare(one: Path, other: Path) -> None:
             seen = np.isfinite(x) & np.isfinite(y)
             differ = int(np.sum(np.isfinite(x) != np.isfinite(y)))
             largest = np.max(np.abs(x[seen] - y[seen])) / np.max(np.abs(x[seen]))
-            print(f"  {name:12}{largest:9.1e}" + (f", and {differ} pixels are finite in one alone" if differ else ""))
+            print(
+                f"  {name:12}{largest:9.1e}"
+                + (f", and {differ} pixels are finite in one alone" if differ else "")
+            )
         for i, (x, y) in enumerate(zip(whole["layers"], parts["layers"], strict=True), 1):
             lit = np.any(x > 0, axis=2)
             off = np.abs(x - y).max(axis=2)[lit] / np.sqrt(np.mean(x[lit] ** 2))
@@ -123,8 +151,12 @@ def main() -> None:
     ways = {"streamed": streamed} | ({"in_memory": in_memory} if options.compare else {})
     made = [options.folder / f"{way}_{name}.npz" for way in ways]
     for (way, draw), out in zip(ways.items(), made, strict=True):
-        print(f"{way.replace('_', ' ')}: {options.splats:,} splats at {options.width}^2", flush=True)
-        print(f"  {alone(draw, cloud, out, options.part, options.width):.1f} GB at most", flush=True)
+        print(
+            f"{way.replace('_', ' ')}: {options.splats:,} splats at {options.width}^2", flush=True
+        )
+        print(
+            f"  {alone(draw, cloud, out, options.part, options.width):.1f} GB at most", flush=True
+        )
     if options.compare:
         compare(*reversed(made))
 

@@ -1,4 +1,6 @@
-"""Brute-force integration over the surface of a mesh: what every way of spreading light should give."""
+"""Brute-force integration over the surface of a mesh: what every way of spreading light should
+give.
+"""
 
 from typing import NamedTuple
 
@@ -39,12 +41,19 @@ class Truth(NamedTuple):
         """Give `L_k` at the points, `[gaussians, points, channels]`."""
         gaussians = material.gaussians
         weights = np.asarray(gaussians.weights)[:, :, None] * self.albedo.T[None]
-        given = jnp.asarray(self.exits[:, None]), gaussians.variances, jnp.asarray(weights), jnp.zeros_like(self.albedo.T)
+        given = (
+            jnp.asarray(self.exits[:, None]),
+            gaussians.variances,
+            jnp.asarray(weights),
+            jnp.zeros_like(self.albedo.T),
+        )
         return self.means * np.asarray(normalization.gain(*given)).transpose(0, 2, 1)
 
 
 def cut(pieces: int) -> np.ndarray:
-    """Give the barycentric coordinates of the middles of the `pieces^2` equal triangles that a face is cut into."""
+    """Give the barycentric coordinates of the middles of the `pieces^2` equal triangles that a face
+    is cut into.
+    """
     i, j = (each.reshape(-1) for each in np.indices((pieces, pieces)))
     lower, upper = i + j < pieces, i + j < pieces - 1
     u = np.concatenate([i[lower] + 1 / 3, i[upper] + 2 / 3]) / pieces
@@ -67,7 +76,9 @@ def looked_at(mesh, light, material, faces: np.ndarray, shares: np.ndarray) -> l
         few = AT_ONCE - len(faces[part])  # padded: one shape compiles once
         face, share = np.pad(faces[part], (0, few)), np.pad(shares[part], ((0, few), (0, 0)))
         given = jnp.asarray(face, jnp.int32), jnp.asarray(share, jnp.float32)
-        parts.append([np.asarray(each)[: AT_ONCE - few] for each in _entering(mesh, light, material, *given)])
+        parts.append(
+            [np.asarray(each)[: AT_ONCE - few] for each in _entering(mesh, light, material, *given)]
+        )
     return [np.concatenate(each) for each in zip(*parts, strict=True)]
 
 
@@ -80,7 +91,9 @@ def integrate(
     normalization: AbstractNormalization,
     refined: float = 1.0,
 ) -> Truth:
-    """Integrate every layer at points on faces; `refined` more samples along each axis show whether they are enough."""
+    """Integrate every layer at points on faces; `refined` more samples along each axis show whether
+    they are enough.
+    """
     points, _, own, albedo = looked_at(mesh, light, material, faces, shares)
     variances = np.asarray(material.gaussians.variances, np.float64)
     depths = np.asarray(normalization.depths(material.gaussians.variances), np.float64)
@@ -101,7 +114,9 @@ def integrate(
         sunk = samples.positions - depth * samples.normals
         mean, exit_ = np.zeros_like(own), np.zeros(len(own))
         tree = cKDTree(sunk)
-        for i, point in enumerate(points):  # one by one: all their neighbors together would fill the memory
+        for i, point in enumerate(
+            points
+        ):  # one by one: all their neighbors together would fill the memory
             found = tree.query_ball_point(point, REACH * deviation)
             squared = np.sum((sunk[found] - point) ** 2, axis=1)
             weight = samples.areas[found] * np.exp(-0.5 * squared / variance)
@@ -119,18 +134,24 @@ def sampled(mesh, light, material, points: np.ndarray, reach: float, spacing: fl
     around, middles = cKDTree(points), corners.mean(axis=1)
     extents = np.max(np.linalg.norm(corners - middles[:, None], axis=2), axis=1)
     near = np.flatnonzero(around.query(middles)[0] < reach + extents)
-    doubled = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    doubled = np.linalg.norm(
+        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
+    )
     longest = np.max(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2), axis=1)
     pieces = np.ceil(np.maximum(np.sqrt(0.5 * doubled), 0.6 * longest)[near] / spacing).astype(int)
     faces, shares, areas = [], [], []
     for each in np.unique(pieces):
         shape = cut(each)
-        for few in np.array_split(near[pieces == each], -(-np.sum(pieces == each) * each**2 // AT_ONCE)):
+        for few in np.array_split(
+            near[pieces == each], -(-np.sum(pieces == each) * each**2 // AT_ONCE)
+        ):
             places = np.einsum("sc,fci->fsi", shape, corners[few])
             inside = np.isfinite(around.query(places, distance_upper_bound=reach, workers=-1)[0])
             face, share = np.nonzero(inside)
             faces.append(few[face])
             shares.append(shape[share])
             areas.append(0.5 * doubled[few[face]] / each**2)
-    positions, normals, source, _ = looked_at(mesh, light, material, np.concatenate(faces), np.concatenate(shares))
+    positions, normals, source, _ = looked_at(
+        mesh, light, material, np.concatenate(faces), np.concatenate(shares)
+    )
     return Samples(positions, normals, np.concatenate(areas), source)

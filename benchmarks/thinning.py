@@ -1,7 +1,8 @@
 """How much a layer errs that is made of fewer splats: `python -m benchmarks.thinning`.
 
-Splats are left out evenly, at random, or merged into clusters; of the bust and of the scanned head, under three lights
-with shadows. The factor of each law is fitted on the bust alone. Told is how far it is off on both.
+Splats are left out evenly, at random, or merged into clusters; of the bust and of the scanned head,
+under three lights with shadows. The factor of each law is fitted on the bust alone. Told is how far
+it is off on both.
 """
 
 import argparse
@@ -24,14 +25,20 @@ LIGHTS = (-0.5, -0.4, -0.75), (0.8, -0.6, -0.4), (0.1, -0.9, -0.5)
 AMPLIFIED = 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0
 KEEP = 2, 4, 8, 16, 32, 64, 128
 CELLS = 0.3, 0.45, 0.6, 0.85, 1.2, 1.7, 2.4  # edges, in standard deviations of a layer
-WIDEST, COARSEST, DEPTH = 25.0, 2.2, 0.75  # mm; spacings of what stays and depth of sources, in standard deviations
+WIDEST, COARSEST, DEPTH = (
+    25.0,
+    2.2,
+    0.75,
+)  # mm; spacings of what stays and depth of sources, in standard deviations
 POINTS, AT_ONCE, REPEATS = 600, 8, 12
 
 
 def arguments():
     parser = argparse.ArgumentParser(prog="python -m benchmarks.thinning", description=__doc__)
     parser.add_argument("--splats", type=int, default=60_000, help="(default %(default)s)")
-    parser.add_argument("--bodies", nargs="+", default=["bust", "scanned"], help="(default %(default)s)")
+    parser.add_argument(
+        "--bodies", nargs="+", default=["bust", "scanned"], help="(default %(default)s)"
+    )
     return parser.parse_args()
 
 
@@ -41,7 +48,9 @@ def layer(points, centers, areas, source, variance):
 
     def some(x):
         squared = jnp.sum((x[:, None] - centers[None]) ** 2, axis=2)
-        weight = areas * jnp.exp(-0.5 * (squared - jnp.min(squared, axis=1, keepdims=True)) / variance)
+        weight = areas * jnp.exp(
+            -0.5 * (squared - jnp.min(squared, axis=1, keepdims=True)) / variance
+        )
         return (weight @ source) / jnp.sum(weight, axis=1, keepdims=True)
 
     return jax.lax.map(some, points.reshape(-1, AT_ONCE, 3)).reshape(len(points), -1)
@@ -68,11 +77,16 @@ def body(name: str, count: int) -> sj.Splats:
 
 
 def errors(splats: sj.Splats) -> list[tuple[str, float, float]]:
-    """Give, for everything that is left out: how, the error, and what the law makes of it but for its factor."""
+    """Give, for everything that is left out: how, the error, and what the law makes of it but for
+    its factor.
+    """
     rng = np.random.default_rng(0)
     material = sj.load_material("skin").white()
     scenes = [
-        sj.Scene(splats, (sj.DirectionalLight(jnp.asarray(direction), jnp.full(3, np.pi)),), material) for direction in LIGHTS
+        sj.Scene(
+            splats, (sj.DirectionalLight(jnp.asarray(direction), jnp.full(3, np.pi)),), material
+        )
+        for direction in LIGHTS
     ]
     middle = jnp.mean(splats.centers, axis=0)
     camera = sj.Camera.look_at(middle + jnp.asarray([0.0, 0.0, 900.0]), middle, width=16, height=16)
@@ -94,41 +108,66 @@ def errors(splats: sj.Splats) -> list[tuple[str, float, float]]:
             def record(how, kept, squares, power, width=width, contrast=contrast):
                 x = spacing / (width * np.sqrt(kept))
                 if x < COARSEST and np.mean(squares) > 2e-4**2:
-                    found.append((how, np.sqrt(np.mean(squares)), contrast * x**power * np.sqrt(1 - kept)))
+                    found.append(
+                        (how, np.sqrt(np.mean(squares)), contrast * x**power * np.sqrt(1 - kept))
+                    )
 
             for keep in KEEP:
                 if spacing * np.sqrt(keep) > COARSEST * width or splats.count // keep < 64:
                     continue
-                even = [np.arange(start, splats.count, keep) for start in rng.integers(keep, size=REPEATS)]
-                thrown = [np.sort(rng.choice(splats.count, len(kept), replace=False)) for kept in even]
+                even = [
+                    np.arange(start, splats.count, keep)
+                    for start in rng.integers(keep, size=REPEATS)
+                ]
+                thrown = [
+                    np.sort(rng.choice(splats.count, len(kept), replace=False)) for kept in even
+                ]
                 for how, choices, power in (("evenly", even, 1.5), ("at random", thrown, 1.0)):
-                    layers = (layer(points, below[kept], splats.areas[kept], source[kept], variance) for kept in choices)
+                    layers = (
+                        layer(points, below[kept], splats.areas[kept], source[kept], variance)
+                        for kept in choices
+                    )
                     record(how, 1 / keep, [error(each) for each in layers], power)
             for cell in CELLS:
                 if cell * width < spacing:
                     continue
                 tree = ClusterTree.build(splats.centers, splats.normals, [cell * width])
-                sources = diffusion.Sources((splats.centers - middle[None]).T, splats.normals.T, splats.areas, source.T)
+                sources = diffusion.Sources(
+                    (splats.centers - middle[None]).T, splats.normals.T, splats.areas, source.T
+                )
                 clusters = tree.levels(sources)[1]
                 gathering = Gathering.of(clusters, variance, jnp.asarray(DEPTH * width))
                 kept = float(jnp.sum(clusters.areas > 0)) / splats.count
-                record("merged", kept, [error(merged_layer(points - middle[None], gathering))], 1.75)
+                record(
+                    "merged", kept, [error(merged_layer(points - middle[None], gathering))], 1.75
+                )
     return found
 
 
 def main() -> None:
     options = arguments()
     measured = {name: errors(body(name, options.splats)) for name in options.bodies}
-    for how, law in (("evenly", "C s x^1.5"), ("at random", "C s x, C = 0.282 by theory"), ("merged", "C s x^1.75")):
+    for how, law in (
+        ("evenly", "C s x^1.5"),
+        ("at random", "C s x, C = 0.282 by theory"),
+        ("merged", "C s x^1.75"),
+    ):
         logs = {
-            name: np.asarray([np.log(error / law) for each, error, law in rows if each == how]) for name, rows in measured.items()
+            name: np.asarray([np.log(error / law) for each, error, law in rows if each == how])
+            for name, rows in measured.items()
         }
         factor = np.mean(logs[options.bodies[0]])
-        print(f"{how}: {law}, times (1 - q)^0.5; C = {np.exp(factor):.3f}, fitted on {options.bodies[0]}")
+        print(
+            f"{how}: {law}, times (1 - q)^0.5; C = {np.exp(factor):.3f}, fitted on "
+            f"{options.bodies[0]}"
+        )
         for name, values in logs.items():
             off = np.abs(values - factor)
             within = 100 * np.mean(off < np.log(1.5))
-            print(f"  {name}: {len(off)} layers, {within:.0f}% within a factor of 1.5, the worst {np.exp(off.max()):.2f}")
+            print(
+                f"  {name}: {len(off)} layers, {within:.0f}% within a factor of 1.5, the worst "
+                f"{np.exp(off.max()):.2f}"
+            )
 
 
 if __name__ == "__main__":

@@ -13,8 +13,9 @@
 # %% [markdown]
 # # Figure 1: splats, the surface they make, and light below it
 #
-# "Subsurface scattering using splat-based diffusion in point-based rendering", Figure 1, from the built-in bust.
-# `splatjax figure 1 --output figure_1.png` makes it larger, and from scanned heads; `docs/figures.md` says what to see.
+# "Subsurface scattering using splat-based diffusion in point-based rendering", Figure 1, from the
+# built-in bust. `splatjax figure 1 --output figure_1.png` makes it larger, and from scanned heads;
+# `docs/figures.md` says what to see.
 
 # %%
 # %matplotlib inline
@@ -25,7 +26,8 @@ import splatjax as sj
 from splatjax import plots, rivals
 
 # %% [markdown]
-# A bust of a third of life size, so that few splats resolve what light does in skin, under one light with shadows.
+# A bust of a third of life size, so that few splats resolve what light does in skin, under one
+# light with shadows.
 
 # %%
 eye, middle = jnp.asarray([400.0, -30.0, 820.0]), jnp.asarray([0.0, -60.0, 0.0])
@@ -36,8 +38,8 @@ skin = sj.load_material("skin")
 plots.figure_1(bust, skin, discs=3000)
 
 # %% [markdown]
-# In numbers: how much light there is where none falls, because the surface turns away or lies in shadow. What scatters gets
-# there.
+# In numbers: how much light there is where none falls, because the surface turns away or lies in
+# shadow. What scatters gets there.
 
 # %%
 (opaque,) = bust.drawn(skin.opaque(), rivals.deferred_splatting())
@@ -45,7 +47,10 @@ plots.figure_1(bust, skin, discs=3000)
 unlit = (np.asarray(soft.coverage) > 0.99) & (np.asarray(opaque.diffuse).max(axis=2) < 1e-4)
 reached = float(np.asarray(soft.diffuse)[unlit].mean() / np.asarray(soft.diffuse)[~unlit].mean())
 share = np.asarray(soft.diffuse)[unlit].sum(axis=0)
-print(f"{unlit.sum()} pixels have no light of their own; scattering brings {100 * reached:.1f}% of the rest's there, mostly red")
+print(
+    f"{unlit.sum()} pixels have no light of their own; scattering brings {100 * reached:.1f}% of "
+    "the rest's there, mostly red"
+)
 
 # %%
 assert unlit.sum() > 100

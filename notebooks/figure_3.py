@@ -29,10 +29,16 @@ skin = sj.load_material("skin").gaussians
 plots.figure_3(skin, title="skin")
 
 # %% [markdown]
-# In numbers: how far light goes, as the root mean square of the distance in each channel. Red goes farthest.
+# In numbers: how far light goes, as the root mean square of the distance in each channel. Red goes
+# farthest.
 
 # %%
-reach = np.sqrt(2 * np.asarray(jnp.sum(skin.weights * skin.variances[:, None], axis=0) / jnp.sum(skin.weights, axis=0)))
+reach = np.sqrt(
+    2
+    * np.asarray(
+        jnp.sum(skin.weights * skin.variances[:, None], axis=0) / jnp.sum(skin.weights, axis=0)
+    )
+)
 print("red, green and blue go", np.round(reach, 2), "mm")
 radii = jnp.linspace(0, 8 * jnp.sqrt(skin.variances.max()), 20_001)
 within = jnp.trapezoid(2 * jnp.pi * radii[:, None] * skin(radii), radii, axis=0)

@@ -13,8 +13,9 @@
 # %% [markdown]
 # # Figure 4: the layers of a picture
 #
-# "Subsurface scattering using splat-based diffusion in point-based rendering", Figure 4, from the built-in bust.
-# `splatjax figure 4 --output figure_4.png` makes it larger, and from scanned heads; `docs/figures.md` says what to see.
+# "Subsurface scattering using splat-based diffusion in point-based rendering", Figure 4, from the
+# built-in bust. `splatjax figure 4 --output figure_4.png` makes it larger, and from scanned heads;
+# `docs/figures.md` says what to see.
 
 # %%
 # %matplotlib inline
@@ -27,8 +28,8 @@ import splatjax as sj
 from splatjax import plots
 
 # %% [markdown]
-# A bust of a seventh of life size, so that few splats resolve what light does in skin, under one light with shadows. Blue and
-# green stay where they enter, red travels.
+# A bust of a seventh of life size, so that few splats resolve what light does in skin, under one
+# light with shadows. Blue and green stay where they enter, red travels.
 
 # %%
 eye, middle = jnp.asarray([400.0, -30.0, 820.0]), jnp.asarray([0.0, -60.0, 0.0])

@@ -13,8 +13,9 @@
 # %% [markdown]
 # # Figure 5: the wider the splats, the fewer of them do
 #
-# "Subsurface scattering using splat-based diffusion in point-based rendering", Figure 5, from the built-in bust.
-# `splatjax figure 5 --output figure_5.png` makes it larger, and from scanned heads; `docs/figures.md` has the law.
+# "Subsurface scattering using splat-based diffusion in point-based rendering", Figure 5, from the
+# built-in bust. `splatjax figure 5 --output figure_5.png` makes it larger, and from scanned heads;
+# `docs/figures.md` has the law.
 
 # %%
 # %matplotlib inline
@@ -39,8 +40,14 @@ plots.figure_5(few, amplified=(2.0, 4.0, 8.0), keep=(1, 4, 16))
 
 # %%
 narrow, wide, error, contrast = (jnp.asarray(value) for value in (4.0, 8.0, 0.02, 0.5))
-fewer = [float(rivals.splats_that_suffice(width, jnp.asarray(1.0), error, contrast)) for width in (narrow, wide)]
-print(f"of the splats {100 * fewer[0]:.1f}% do for a layer 4 spacings wide, {100 * fewer[1]:.1f}% for one of 8")
+fewer = [
+    float(rivals.splats_that_suffice(width, jnp.asarray(1.0), error, contrast))
+    for width in (narrow, wide)
+]
+print(
+    f"of the splats {100 * fewer[0]:.1f}% do for a layer 4 spacings wide, {100 * fewer[1]:.1f}% "
+    "for one of 8"
+)
 
 # %%
 np.testing.assert_allclose(fewer[0] / fewer[1], 4, rtol=1e-5)

@@ -13,8 +13,9 @@
 # %% [markdown]
 # # Figure 7: earlier point-based methods and this one
 #
-# "Subsurface scattering using splat-based diffusion in point-based rendering", Figure 7, from the built-in bust.
-# `splatjax figure 7 --output figure_7.png` makes it larger, and from scanned heads; `docs/figures.md` says what to see.
+# "Subsurface scattering using splat-based diffusion in point-based rendering", Figure 7, from the
+# built-in bust. `splatjax figure 7 --output figure_7.png` makes it larger, and from scanned heads;
+# `docs/figures.md` says what to see.
 
 # %%
 # %matplotlib inline
@@ -25,8 +26,9 @@ import splatjax as sj
 from splatjax import plots, rivals
 
 # %% [markdown]
-# A bust of a third of life size, so that few splats resolve what light does in skin, under one light with shadows.
-# Elliptical points are flat, splats that are blended are smooth, scattering is soft.
+# A bust of a third of life size, so that few splats resolve what light does in skin, under one
+# light with shadows. Elliptical points are flat, splats that are blended are smooth, scattering is
+# soft.
 
 # %%
 eye, middle = jnp.asarray([400.0, -30.0, 820.0]), jnp.asarray([0.0, -60.0, 0.0])

@@ -13,9 +13,9 @@
 # %% [markdown]
 # # Figure 8: half by texture-space diffusion, half by splats
 #
-# "Subsurface scattering using splat-based diffusion in point-based rendering", Figure 8, from the built-in bust.
-# `splatjax figure 8 --output figure_8.png` makes it larger, and from meshes with texture coordinates; `docs/figures.md` says
-# what to see.
+# "Subsurface scattering using splat-based diffusion in point-based rendering", Figure 8, from the
+# built-in bust. `splatjax figure 8 --output figure_8.png` makes it larger, and from meshes with
+# texture coordinates; `docs/figures.md` says what to see.
 
 # %%
 # %matplotlib inline
@@ -29,7 +29,8 @@ from splatjax import plots, rivals
 from splatjax.geometry import sample_mesh
 
 # %% [markdown]
-# The head of the bust at a third of life size. Its chart is longitude and latitude seen from inside, and its ears overlap there.
+# The head of the bust at a third of life size. Its chart is longitude and latitude seen from
+# inside, and its ears overlap there.
 
 # %%
 eye, middle = jnp.asarray([400.0, 30.0, 820.0]), jnp.asarray([0.0, 0.0, 0.0])
@@ -58,7 +59,10 @@ theirs = rivals.render_texture_space(triangles, scene.lights, scene.material, bu
 inside = (np.asarray(ours.coverage) > 0.99) & (np.asarray(theirs.coverage) > 0.99)
 a, b = (np.asarray(frame.beauty)[inside] for frame in (ours, theirs))
 apart = np.abs(a - b).max(axis=1) / np.sqrt(np.mean(a**2))
-print(f"apart by {np.median(apart):.4f} at the median, {np.quantile(apart, 0.9):.3f} in one pixel of ten")
+print(
+    f"apart by {np.median(apart):.4f} at the median, {np.quantile(apart, 0.9):.3f} in one pixel of "
+    "ten"
+)
 
 # %%
 assert np.median(apart) < 0.02

@@ -13,8 +13,9 @@
 # %% [markdown]
 # # Marble as a sum of Gaussians
 #
-# Light that enters marble leaves it some millimeters away. How much leaves at distance $r$ is the profile $R(r)$, in 1/mm². The
-# renderer wants it as a sum of Gaussians, $R(r) \approx \sum_i w_i\, G(v_i, r)$: one blurred layer for each. Here we fit one.
+# Light that enters marble leaves it some millimeters away. How much leaves at distance $r$ is the
+# profile $R(r)$, in 1/mm². The renderer wants it as a sum of Gaussians, $R(r) \approx \sum_i w_i\,
+# G(v_i, r)$: one blurred layer for each. Here we fit one.
 
 # %%
 # %matplotlib inline
@@ -25,36 +26,51 @@ import splatjax as sj
 from splatjax.plots import plot_fit
 
 # %% [markdown]
-# The coefficients were measured by Jensen and others in 2001; splatjax ships them, in 1/mm, with their source. A `Dipole` turns
-# them into a profile. Double precision lets the fit show its error rather than rounding.
+# The coefficients were measured by Jensen and others in 2001; splatjax ships them, in 1/mm, with
+# their source. A `Dipole` turns them into a profile. Double precision lets the fit show its error
+# rather than rounding.
 
 # %%
 with jax.enable_x64(True):
     medium = sj.load_medium("marble")
-    # The published fit used the polynomial Fresnel moments, which differ from the exact ones by less than 0.1%.
+    # The published fit used the polynomial Fresnel moments, which differ from the exact ones by
+    # less than 0.1%.
     profile = sj.Dipole(medium, sj.EganFresnel())
     six = sj.fit_gaussians(profile, 6)
     held = sj.fit_gaussians(profile, 6, weights=sj.TotalReflectanceHeld())
-    figure = plot_fit(profile, six.gaussians, title="marble, six Gaussians, variances shared by red, green and blue")
+    figure = plot_fit(
+        profile,
+        six.gaussians,
+        title="marble, six Gaussians, variances shared by red, green and blue",
+    )
 figure  # noqa: B018
 
 # %% [markdown]
-# The error $E$ (Eq. 4 of the paper) hardly sees the tail, and the free fit misses a few per cent of the red energy there. Holding
-# the sum of the weights to the total reflectance keeps the energy, for a little more error. Materials are shipped that way.
+# The error $E$ (Eq. 4 of the paper) hardly sees the tail, and the free fit misses a few per cent of
+# the red energy there. Holding the sum of the weights to the total reflectance keeps the energy,
+# for a little more error. Materials are shipped that way.
 
 # %%
 print("total reflectance ", np.asarray(profile.total_reflectance()).round(4))
 for name, fit in (("free", six), ("sum held", held)):
-    print(f"{name:9s} E", np.asarray(fit.error).round(5), " energy", np.asarray(fit.energy_error).round(5))
+    print(
+        f"{name:9s} E",
+        np.asarray(fit.error).round(5),
+        " energy",
+        np.asarray(fit.energy_error).round(5),
+    )
 
 # %% [markdown]
-# Green marble alone, with four Gaussians, was published in GPU Gems 3 (chapter 14): variances .036, .14, .91, 7.0 mm² and weights
-# .070, .18, .21, .29. The same numbers come out here.
+# Green marble alone, with four Gaussians, was published in GPU Gems 3 (chapter 14): variances .036,
+# .14, .91, 7.0 mm² and weights .070, .18, .21, .29. The same numbers come out here.
 
 # %%
 with jax.enable_x64(True):
     four = sj.fit_gaussians(profile, 4, spread=sj.VariancesPerChannel())
-variances, weights = np.asarray(four.gaussians.variances[1]), np.asarray(four.gaussians.weights[1, :, 0])
+variances, weights = (
+    np.asarray(four.gaussians.variances[1]),
+    np.asarray(four.gaussians.weights[1, :, 0]),
+)
 print("variances (mm²)", variances.round(4))
 print("weights        ", weights.round(4), " E =", round(float(four.error[1]), 5))
 

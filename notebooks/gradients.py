@@ -13,8 +13,9 @@
 # %% [markdown]
 # # Gradients one can check, and see
 #
-# A picture here is a differentiable function: of optical coefficients, of every splat, of lights and camera. First we check the
-# diffusion pass against finite differences. Then we look at a derivative: what a little more absorption does to each pixel.
+# A picture here is a differentiable function: of optical coefficients, of every splat, of lights
+# and camera. First we check the diffusion pass against finite differences. Then we look at a
+# derivative: what a little more absorption does to each pixel.
 
 # %%
 # %matplotlib inline
@@ -37,24 +38,41 @@ def gaussians_of(medium: sj.Medium) -> sj.SumOfGaussians:
 
 def scene_of(gaussians: sj.SumOfGaussians, count: int) -> sj.Scene:
     light = sj.DirectionalLight(jnp.asarray([-1.0, -0.25, -0.35]), jnp.full(3, np.pi))
-    bare = eqx.tree_at(lambda splats: splats.albedo, sj.bust(count), None)  # no map: the material alone has color
+    bare = eqx.tree_at(
+        lambda splats: splats.albedo, sj.bust(count), None
+    )  # no map: the material alone has color
     return sj.Scene(bare, (light,), sj.Material(gaussians, eta=1.5, specular=0.0))
 
 
-camera = sj.Camera.look_at(jnp.asarray([60.0, -10.0, 560.0]), jnp.asarray([0.0, -30.0, 0.0]), fov=30.0, width=SIZE, height=SIZE)
+camera = sj.Camera.look_at(
+    jnp.asarray([60.0, -10.0, 560.0]),
+    jnp.asarray([0.0, -30.0, 0.0]),
+    fov=30.0,
+    width=SIZE,
+    height=SIZE,
+)
 
 # %% [markdown]
 # ## The diffusion pass, checked
 #
-# `sj.diffuse` is pass 4 alone: from the light below the surface of every splat to one layer per Gaussian. In double precision,
-# along a random direction of each input, its reverse mode must agree with central differences. Where splats are moved, the step
-# must be so small that none comes to the front or vanishes behind another: which splats are seen has no derivative.
+# `sj.diffuse` is pass 4 alone: from the light below the surface of every splat to one layer per
+# Gaussian. In double precision, along a random direction of each input, its reverse mode must agree
+# with central differences. Where splats are moved, the step must be so small that none comes to the
+# front or vanishes behind another: which splats are seen has no derivative.
 
 # %%
 with jax.enable_x64(True):
-    gaussians = sj.SumOfGaussians(jnp.asarray([40.0, 150.0]), jnp.asarray([[0.4, 0.3, 0.2], [0.3, 0.2, 0.1]]))
+    gaussians = sj.SumOfGaussians(
+        jnp.asarray([40.0, 150.0]), jnp.asarray([[0.4, 0.3, 0.2], [0.3, 0.2, 0.1]])
+    )
     small = jax.tree.map(lambda leaf: leaf.astype(jnp.float64), scene_of(gaussians, 2000))
-    lens = sj.Camera.look_at(jnp.asarray([0.0, -30.0, 560.0]), jnp.asarray([0.0, -30.0, 0.0]), fov=30.0, width=32, height=32)
+    lens = sj.Camera.look_at(
+        jnp.asarray([0.0, -30.0, 560.0]),
+        jnp.asarray([0.0, -30.0, 0.0]),
+        fov=30.0,
+        width=32,
+        height=32,
+    )
     rng = np.random.default_rng(0)
     irradiance = jnp.asarray(rng.uniform(size=(small.splats.count, 3)))
     plan = sj.plan(small, lens)
@@ -64,7 +82,9 @@ with jax.enable_x64(True):
         def loss(inputs):
             scene, irradiance = inputs
             layers = sj.diffuse(scene, irradiance, lens, plan=plan)
-            return jnp.mean(layers * jnp.asarray(np.random.default_rng(1).uniform(-0.5, 1, layers.shape)))
+            return jnp.mean(
+                layers * jnp.asarray(np.random.default_rng(1).uniform(-0.5, 1, layers.shape))
+            )
 
         return jax.value_and_grad(loss)(inputs)
 
@@ -82,17 +102,23 @@ with jax.enable_x64(True):
         leaf = part(inputs)
         way = jnp.asarray(rng.normal(size=leaf.shape)) * jnp.mean(jnp.abs(leaf))
         step = 1e-4 if name in ("weights", "irradiance") else 1e-6
-        above, below = (float(loss_and_gradient(eqx.tree_at(part, inputs, leaf + s * way))[0]) for s in (step, -step))
+        above, below = (
+            float(loss_and_gradient(eqx.tree_at(part, inputs, leaf + s * way))[0])
+            for s in (step, -step)
+        )
         found, expected = float(jnp.vdot(part(gradient), way)), (above - below) / (2 * step)
         errors[name] = abs(found / expected - 1)
-        print(f"{name:10s} reverse mode {found:+.9e}   differences {expected:+.9e}   relative difference {errors[name]:.0e}")
+        print(
+            f"{name:10s} reverse mode {found:+.9e}   differences {expected:+.9e}   relative "
+            f"difference {errors[name]:.0e}"
+        )
 
 # %% [markdown]
 # ## A derivative picture
 #
-# `sj.picture_jacobian` renders and gives the derivative of every pixel in every weight and variance, at the price of about one
-# more frame, however many pixels there are. `through` takes it on to what the Gaussians were made of: here the coefficients of
-# marble.
+# `sj.picture_jacobian` renders and gives the derivative of every pixel in every weight and
+# variance, at the price of about one more frame, however many pixels there are. `through` takes it
+# on to what the Gaussians were made of: here the coefficients of marble.
 
 # %%
 with jax.enable_x64(True):
@@ -108,7 +134,9 @@ with jax.enable_x64(True):
 # %%
 def change(name: str) -> np.ndarray:
     """What 1% more of a coefficient, in all channels, does to the picture."""
-    return np.asarray(getattr(by_coefficient, name) @ (0.01 * getattr(medium, name).astype(jnp.float32)))
+    return np.asarray(
+        getattr(by_coefficient, name) @ (0.01 * getattr(medium, name).astype(jnp.float32))
+    )
 
 
 picture = np.asarray(jacobian.frame.beauty)
@@ -131,16 +159,27 @@ for ax in figure.axes[:6]:
 figure  # noqa: B018
 
 # %% [markdown]
-# More absorption darkens everything; the share of its light that a pixel loses is greatest where that light has come a long way,
-# beyond the edge of the shadow. More scattering lets light turn back sooner: what is lit gains, and what lies in shadow loses.
+# More absorption darkens everything; the share of its light that a pixel loses is greatest where
+# that light has come a long way, beyond the edge of the shadow. More scattering lets light turn
+# back sooner: what is lit gains, and what lies in shadow loses.
 #
-# The same picture by finite differences takes a fit and a frame for each side, for every coefficient:
+# The same picture by finite differences takes a fit and a frame for each side, for every
+# coefficient:
 
 # %%
 with jax.enable_x64(True):
-    moved = [eqx.tree_at(lambda m: m.sigma_a, medium, medium.sigma_a * factor) for factor in (1.01, 0.99)]
-    ends = [jax.tree.map(lambda leaf: leaf.astype(jnp.float32), gaussians_of(each)) for each in moved]
-frames = [sj.picture_jacobian(eqx.tree_at(lambda s: s.material.gaussians, scene, end), camera, plan=plan).frame for end in ends]
+    moved = [
+        eqx.tree_at(lambda m: m.sigma_a, medium, medium.sigma_a * factor) for factor in (1.01, 0.99)
+    ]
+    ends = [
+        jax.tree.map(lambda leaf: leaf.astype(jnp.float32), gaussians_of(each)) for each in moved
+    ]
+frames = [
+    sj.picture_jacobian(
+        eqx.tree_at(lambda s: s.material.gaussians, scene, end), camera, plan=plan
+    ).frame
+    for end in ends
+]
 pictures = [np.asarray(frame.beauty) for frame in frames]
 difference = (pictures[0] - pictures[1]) / 2
 error = np.linalg.norm(change("sigma_a") - difference) / np.linalg.norm(difference)

@@ -13,8 +13,9 @@
 # %% [markdown]
 # # A material from a measurement
 #
-# A profile $R(r)$ that was measured is a table of radii and values. A photograph of a laser dot, linear and from straight above,
-# is as good: means over rings around its center are the profile, and their scatter says how well it is known.
+# A profile $R(r)$ that was measured is a table of radii and values. A photograph of a laser dot,
+# linear and from straight above, is as good: means over rings around its center are the profile,
+# and their scatter says how well it is known.
 
 # %%
 # %matplotlib inline
@@ -33,8 +34,9 @@ from splatjax.plots import plot_fit
 from splatjax.scattering import measure_laser_dot
 
 # %% [markdown]
-# Here is such a photograph, of something like potato, with the noise of a camera. The beam has a variance of 0.25 mm² along each
-# axis, so that what is seen is the profile blurred by it: the variances add.
+# Here is such a photograph, of something like potato, with the noise of a camera. The beam has a
+# variance of 0.25 mm² along each axis, so that what is seen is the profile blurred by it: the
+# variances add.
 
 # %%
 with jax.enable_x64(True):
@@ -52,8 +54,9 @@ axes.imshow(np.log10(np.maximum(photograph[..., 0], 1e-4)), cmap="magma", extent
 figure  # noqa: B018
 
 # %% [markdown]
-# Which absorption and scattering explain it? `fit_medium` goes the way of the picture, from coefficients to Gaussians to the
-# blurred profile, and back along its derivatives. The error bars come from the scatter of the pixels.
+# Which absorption and scattering explain it? `fit_medium` goes the way of the picture, from
+# coefficients to Gaussians to the blurred profile, and back along its derivatives. The error bars
+# come from the scatter of the pixels.
 
 # %%
 with jax.enable_x64(True):
@@ -68,8 +71,9 @@ for name, value, bar in zip(("sigma_a ", "sigma_s'"), values, bars, strict=True)
 print(f"chi squared per degree of freedom {chi_squared:.2f}")
 
 # %% [markdown]
-# Where no model is wanted, the table itself is fitted, over its own radii and no further. In a file it is a CSV of radii and a
-# column for each channel; `splatjax fit potato.csv --output potato.toml` does the same.
+# Where no model is wanted, the table itself is fitted, over its own radii and no further. In a file
+# it is a CSV of radii and a column for each channel; `splatjax fit potato.csv --output potato.toml`
+# does the same.
 
 # %%
 with jax.enable_x64(True):
@@ -82,7 +86,8 @@ with jax.enable_x64(True):
 figure  # noqa: B018
 
 # %% [markdown]
-# Colleagues with other renderers get the same material as JSON, each number with its formula and source.
+# Colleagues with other renderers get the same material as JSON, each number with its formula and
+# source.
 
 # %%
 with jax.enable_x64(True):

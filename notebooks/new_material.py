@@ -13,8 +13,9 @@
 # %% [markdown]
 # # A new material from coefficients, or from layers
 #
-# All it takes is the absorption coefficient $\sigma_a$ and the reduced scattering coefficient $\sigma_s'$ of each channel, in
-# 1/mm, and the index of refraction. Here: a jade-like stone, and the same stone under a thin red glaze.
+# All it takes is the absorption coefficient $\sigma_a$ and the reduced scattering coefficient
+# $\sigma_s'$ of each channel, in 1/mm, and the index of refraction. Here: a jade-like stone, and
+# the same stone under a thin red glaze.
 
 # %%
 # %matplotlib inline
@@ -29,7 +30,9 @@ from splatjax.plots import plot_error_by_count, plot_fit
 weights = sj.TotalReflectanceHeld()
 with jax.enable_x64(True):
     stone = sj.Medium(
-        sigma_a=jnp.asarray([0.020, 0.006, 0.015]), sigma_s_prime=jnp.asarray([1.1, 1.3, 1.5]), eta=jnp.full(3, 1.6)
+        sigma_a=jnp.asarray([0.020, 0.006, 0.015]),
+        sigma_s_prime=jnp.asarray([1.1, 1.3, 1.5]),
+        eta=jnp.full(3, 1.6),
     )
     profile = sj.Dipole(stone)
     by_count = sj.error_by_count(profile, 6, weights=weights)
@@ -37,10 +40,12 @@ with jax.enable_x64(True):
 figure  # noqa: B018
 
 # %% [markdown]
-# Each further Gaussian divides the error by two to three. One layer is drawn for each, so take as many as the picture deserves:
-# the least, say, that leaves no channel more than two hundredths. (`fit_gaussians(profile, LeastCount(0.02))` does it at once.)
-# The sum of the weights is held at the total reflectance, which keeps the energy of the picture. (Where channels differ more,
-# some weights come out slightly negative; `NonNegativeWeights(TotalReflectanceHeld())` forbids it: the library is fitted so.)
+# Each further Gaussian divides the error by two to three. One layer is drawn for each, so take as
+# many as the picture deserves: the least, say, that leaves no channel more than two hundredths.
+# (`fit_gaussians(profile, LeastCount(0.02))` does it at once.) The sum of the weights is held at
+# the total reflectance, which keeps the energy of the picture. (Where channels differ more, some
+# weights come out slightly negative; `NonNegativeWeights(TotalReflectanceHeld())` forbids it: the
+# library is fitted so.)
 
 # %%
 with jax.enable_x64(True):
@@ -51,28 +56,33 @@ with jax.enable_x64(True):
 figure  # noqa: B018
 
 # %% [markdown]
-# How well determined is it? `covariance` holds variances first, then the weights of red, green and blue. Within its ellipsoid
-# the error of Eq. 3 at most doubles: a relative deviation above 1 would say that a Gaussian may as well be left out.
+# How well determined is it? `covariance` holds variances first, then the weights of red, green and
+# blue. Within its ellipsoid the error of Eq. 3 at most doubles: a relative deviation above 1 would
+# say that a Gaussian may as well be left out.
 
 # %%
 print("variances (mm²)", variances.round(4))
 print("  known to     ", (np.sqrt(np.diag(covariance))[:count] / variances).round(3))
 
 # %% [markdown]
-# A glaze, half a millimeter thick, changes the core of the profile and hardly the tail: light that travels far travels below it.
-# A scattering layer must be thicker than a mean free path, here $1 / (4 + 0.3)$ mm; thinner ones are refused.
+# A glaze, half a millimeter thick, changes the core of the profile and hardly the tail: light that
+# travels far travels below it. A scattering layer must be thicker than a mean free path, here $1 /
+# (4 + 0.3)$ mm; thinner ones are refused.
 
 # %%
 with jax.enable_x64(True):
     glaze = sj.Medium(jnp.asarray([0.02, 0.3, 0.3]), jnp.full(3, 4.0), jnp.full(3, 1.5))
-    glazed = sj.LayeredMultipole([sj.Layer(glaze, jnp.asarray(0.5)), sj.Layer(stone, jnp.asarray(jnp.inf))])
+    glazed = sj.LayeredMultipole(
+        [sj.Layer(glaze, jnp.asarray(0.5)), sj.Layer(stone, jnp.asarray(jnp.inf))]
+    )
     fitted_glaze = sj.fit_gaussians(glazed, 4)
     figure = plot_fit(glazed, fitted_glaze.gaussians, title="stone under a red glaze")
 figure  # noqa: B018
 
 # %% [markdown]
-# A material is these Gaussians and a surface. `save_material` writes it with its layers, unit and source as a TOML file, which
-# `splatjax render --material glazed.toml` takes, as `load_material` does.
+# A material is these Gaussians and a surface. `save_material` writes it with its layers, unit and
+# source as a TOML file, which `splatjax render --material glazed.toml` takes, as `load_material`
+# does.
 
 # %%
 with jax.enable_x64(True):

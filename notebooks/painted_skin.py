@@ -13,15 +13,18 @@
 # %% [markdown]
 # # Painted skin, from pictures under three lights
 #
-# A figurine the size of a fingertip, with the optical coefficients of skin, wears paint in bands. We know its shape, camera and
-# lights, and that there is no paint below its chin. What are the coefficients, and what is the paint?
+# A figurine the size of a fingertip, with the optical coefficients of skin, wears paint in bands.
+# We know its shape, camera and lights, and that there is no paint below its chin. What are the
+# coefficients, and what is the paint?
 #
-# A picture tells the product of the map and of what the coefficients send back. So something must be known: here the map where
-# the skin is bare, 1. There `recover` finds the coefficients, all pixels at once, with error bars. Then `fit_scene` moves the
-# albedo of every splat along the gradient of the renderer. We do not move both at once: six coefficients are found by least
-# squares, which knows how they depend on each other, in steps that look at no splat; first-order steps would have to follow them
-# with thousands of albedos in tow. Paint near the border takes light from bare skin, which moves the coefficients by a per cent;
-# to be rid of that too, let the two take turns, with the paint that was found.
+# A picture tells the product of the map and of what the coefficients send back. So something must
+# be known: here the map where the skin is bare, 1. There `recover` finds the coefficients, all
+# pixels at once, with error bars. Then `fit_scene` moves the albedo of every splat along the
+# gradient of the renderer. We do not move both at once: six coefficients are found by least
+# squares, which knows how they depend on each other, in steps that look at no splat; first-order
+# steps would have to follow them with thousands of albedos in tow. Paint near the border takes
+# light from bare skin, which moves the coefficients by a per cent; to be rid of that too, let the
+# two take turns, with the paint that was found.
 
 # %%
 # %matplotlib inline
@@ -43,18 +46,34 @@ settings = sj.RenderSettings(rasterizer=DenseRasterizer(), diffuser=DenseDiffuse
 
 
 def with_map(splats: sj.Splats, albedo) -> sj.Splats:
-    return eqx.tree_at(lambda s: s.albedo, splats, jnp.asarray(albedo, jnp.float32), is_leaf=lambda leaf: leaf is None)
+    return eqx.tree_at(
+        lambda s: s.albedo,
+        splats,
+        jnp.asarray(albedo, jnp.float32),
+        is_leaf=lambda leaf: leaf is None,
+    )
 
 
 bust = sj.bust(SPLATS)
 figurine = sj.Splats(bust.centers / 16, bust.normals, bust.radii / 16, bust.areas / 256)
 x, y, _ = np.asarray(figurine.centers).T
 painted = y > np.quantile(y, 0.45)
-bands = np.stack([0.25 + 0.6 * (np.sin(2.2 * y) > 0), 0.35 + 0.3 * (np.sin(1.6 * x) > 0), 0.75 - 0.45 * (np.sin(2.2 * y) > 0)], 1)
+bands = np.stack(
+    [
+        0.25 + 0.6 * (np.sin(2.2 * y) > 0),
+        0.35 + 0.3 * (np.sin(1.6 * x) > 0),
+        0.75 - 0.45 * (np.sin(2.2 * y) > 0),
+    ],
+    1,
+)
 paint = np.where(painted[:, None], bands, 1.0)
-camera = sj.Camera.look_at(jnp.asarray([4.0, 0.0, 35.0]), jnp.asarray([0.0, -1.75, 0.0]), fov=32.0, width=SIZE, height=SIZE)
+camera = sj.Camera.look_at(
+    jnp.asarray([4.0, 0.0, 35.0]), jnp.asarray([0.0, -1.75, 0.0]), fov=32.0, width=SIZE, height=SIZE
+)
 ways = [-1.0, -0.3, -0.5], [1.0, -0.2, -0.6], [0.1, -1.0, -0.5]
-lamps = [sj.DirectionalLight(jnp.asarray(way), jnp.full(3, np.pi), cast_shadows=False) for way in ways]
+lamps = [
+    sj.DirectionalLight(jnp.asarray(way), jnp.full(3, np.pi), cast_shadows=False) for way in ways
+]
 
 # %%
 with jax.enable_x64(True):
@@ -67,7 +86,10 @@ frames = [sj.render(scene, camera, settings) for scene in scenes]
 rendered = [np.asarray(frame.beauty, np.float64) for frame in frames]
 deviations = [np.full(picture.shape, NOISE * np.sqrt(np.mean(picture**2))) for picture in rendered]
 rng = np.random.default_rng(0)
-photographs = [picture + sd * rng.normal(size=sd.shape) for picture, sd in zip(rendered, deviations, strict=True)]
+photographs = [
+    picture + sd * rng.normal(size=sd.shape)
+    for picture, sd in zip(rendered, deviations, strict=True)
+]
 border = np.min(y[painted])
 bare = np.asarray(frames[0].position)[..., 1] < border - 0.3
 
@@ -80,23 +102,33 @@ bare = np.asarray(frames[0].position)[..., 1] < border - 0.3
 # %%
 def observed(mask) -> list[sj.Observation]:
     together = zip(photographs, lamps, deviations, strict=True)
-    return [sj.Observation(picture, camera, (lamp,), mask=mask, deviation=sd) for picture, lamp, sd in together]
+    return [
+        sj.Observation(picture, camera, (lamp,), mask=mask, deviation=sd)
+        for picture, lamp, sd in together
+    ]
 
 
 begin = with_map(figurine, np.where(painted[:, None], 0.5, 1.0) * np.ones(3))
 with jax.enable_x64(True):
     start = sj.Medium(skin.sigma_a * 2, skin.sigma_s_prime / 2, skin.eta)
     found = sj.recover(observed(bare), begin, start, count=COUNT, settings=settings)
-off = [np.asarray(getattr(found.medium, name)) / np.asarray(getattr(skin, name)) - 1 for name in ("sigma_a", "sigma_s_prime")]
+off = [
+    np.asarray(getattr(found.medium, name)) / np.asarray(getattr(skin, name)) - 1
+    for name in ("sigma_a", "sigma_s_prime")
+]
 print(found.words())
 print(f"sigma_a off by {(100 * off[0]).round(1)}%, sigma_s' by {(100 * off[1]).round(1)}%")
 
 # %%
 optimizer = optax.adam(optax.cosine_decay_schedule(2.0, STEPS), b2=0.9)
 parts = [sj.AlbedoMap(step=0.2)]
-fitted = sj.fit_scene(observed(None), begin, found.material, parts, optimizer, steps=STEPS, settings=settings)
+fitted = sj.fit_scene(
+    observed(None), begin, found.material, parts, optimizer, steps=STEPS, settings=settings
+)
 seen_well = np.sum(np.asarray(figurine.normals) * np.asarray(camera.rotation[2]), axis=1) < -0.4
-missed = [np.abs(np.asarray(body.albedo) - paint)[painted & seen_well] for body in (begin, fitted.splats)]
+missed = [
+    np.abs(np.asarray(body.albedo) - paint)[painted & seen_well] for body in (begin, fitted.splats)
+]
 print(f"albedo off by {np.median(missed[0]):.3f} before, {np.median(missed[1]):.3f} after (median)")
 print(f"loss {fitted.losses[0]:.4g} to {fitted.losses[fitted.best]:.3g}")
 
@@ -129,8 +161,8 @@ for ax in axes.reshape(-1):
 figure  # noqa: B018
 
 # %% [markdown]
-# The photographs are soft where light has spread; the map is not. Where no picture tells of a splat, at the back, it stays as it
-# was.
+# The photographs are soft where light has spread; the map is not. Where no picture tells of a
+# splat, at the back, it stays as it was.
 
 # %%
 assert np.max(np.abs(off)) < 0.05

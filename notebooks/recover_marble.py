@@ -13,11 +13,12 @@
 # %% [markdown]
 # # Marble from one photograph
 #
-# A figurine of marble, three centimeters tall, stands under a lamp from the side. We know its shape, where camera and lamp are,
-# and how strong the lamp is. What are the absorption and the scattering of the stone, and how well does one photograph tell?
+# A figurine of marble, three centimeters tall, stands under a lamp from the side. We know its
+# shape, where camera and lamp are, and how strong the lamp is. What are the absorption and the
+# scattering of the stone, and how well does one photograph tell?
 #
-# The photograph is rendered here, from the coefficients that Jensen and others measured in 2001, so that we know what should
-# come out; noise of 1% is added.
+# The photograph is rendered here, from the coefficients that Jensen and others measured in 2001, so
+# that we know what should come out; noise of 1% is added.
 
 # %%
 # %matplotlib inline
@@ -32,9 +33,12 @@ from splatjax.splatting import DenseRasterizer, ShadowSettings
 
 SIZE, COUNT, NOISE = 40, 4, 0.01
 HELD = sj.NonNegativeWeights(sj.TotalReflectanceHeld())
-# Every splat at every pixel, and coarse shadows: for small pictures. Leave `settings` out for large ones.
+# Every splat at every pixel, and coarse shadows: for small pictures. Leave `settings` out for large
+# ones.
 shadows = ShadowSettings(resolution=48, bias=1.0, softness=2.0)
-settings = sj.RenderSettings(shadows=shadows, rasterizer=DenseRasterizer(), diffuser=DenseDiffuser())
+settings = sj.RenderSettings(
+    shadows=shadows, rasterizer=DenseRasterizer(), diffuser=DenseDiffuser()
+)
 
 
 def figurine(count: int) -> sj.Splats:
@@ -44,7 +48,9 @@ def figurine(count: int) -> sj.Splats:
 
 
 splats = figurine(1200)
-camera = sj.Camera.look_at(jnp.asarray([8.0, 0.0, 70.0]), jnp.asarray([0.0, -3.5, 0.0]), fov=32.0, width=SIZE, height=SIZE)
+camera = sj.Camera.look_at(
+    jnp.asarray([8.0, 0.0, 70.0]), jnp.asarray([0.0, -3.5, 0.0]), fov=32.0, width=SIZE, height=SIZE
+)
 lamp = sj.DirectionalLight(jnp.asarray([-1.0, -0.3, -0.4]), jnp.full(3, np.pi))
 
 # %%
@@ -52,22 +58,26 @@ with jax.enable_x64(True):
     marble = sj.load_medium("marble")
     gaussians = sj.fit_gaussians(sj.Dipole(marble), COUNT, weights=HELD).gaussians
     material = sj.Material(gaussians, eta=1.5, specular=0.0)
-    rendered = np.asarray(sj.gather_picture(sj.Scene(splats, (lamp,), material), camera, settings).beauty(gaussians))
+    rendered = np.asarray(
+        sj.gather_picture(sj.Scene(splats, (lamp,), material), camera, settings).beauty(gaussians)
+    )
     deviation = NOISE * np.sqrt(np.mean(rendered**2))
     photograph = rendered + deviation * np.random.default_rng(0).normal(size=rendered.shape)
 
 # %% [markdown]
 # ## The coefficients behind it
 #
-# The search starts at skin, which is some tens of times more absorbing. It finds the logarithms of both coefficients of red,
-# green and blue by least squares on all pixels at once. What of a picture does not depend on the weights of its layers is
-# rendered once, so that a step looks at no splat.
+# The search starts at skin, which is some tens of times more absorbing. It finds the logarithms of
+# both coefficients of red, green and blue by least squares on all pixels at once. What of a picture
+# does not depend on the weights of its layers is rendered once, so that a step looks at no splat.
 
 # %%
 with jax.enable_x64(True):
     skin = sj.load_medium("skin1")
     start = sj.Medium(skin.sigma_a, skin.sigma_s_prime, marble.eta)
-    taken = sj.Observation(photograph, camera, (lamp,), deviation=np.full(photograph.shape, deviation))
+    taken = sj.Observation(
+        photograph, camera, (lamp,), deviation=np.full(photograph.shape, deviation)
+    )
     found = sj.recover([taken], splats, start, count=COUNT, settings=settings)
 print(found.words())
 print(f"{found.rounds} rounds, {found.steps} steps; chi-squared {float(found.chi_squared):.3f}")
@@ -84,20 +94,28 @@ pulls = []
 for name, bars in zip(("sigma_a", "sigma_s_prime"), found.relative_errors(), strict=True):
     true, ours = np.asarray(getattr(marble, name)), np.asarray(getattr(found.medium, name))
     pulls.append(np.log(ours / true) / bars)
-    print(f"{name:14s} measured {true.round(4)}  recovered {ours.round(4)}  error bars off {pulls[-1].round(1)}")
+    print(
+        f"{name:14s} measured {true.round(4)}  recovered {ours.round(4)}  error bars off "
+        f"{pulls[-1].round(1)}"
+    )
 
 # %% [markdown]
 # ## Which picture to take next
 #
-# A picture fixes best how much light comes back, and worse how far it goes: the coefficients are known along one direction much
-# better than across it. Each of these pictures, rendered of the material that was found, would add information; the inverse of
-# the sum is what would be known then.
+# A picture fixes best how much light comes back, and worse how far it goes: the coefficients are
+# known along one direction much better than across it. Each of these pictures, rendered of the
+# material that was found, would add information; the inverse of the sum is what would be known
+# then.
 
 # %%
 best, worst = found.combinations()[0]
-print(f"red: {best} is known to {100 * best.deviation:.2g}%, {worst} to {100 * worst.deviation:.2g}%")
+print(
+    f"red: {best} is known to {100 * best.deviation:.2g}%, {worst} to {100 * worst.deviation:.2g}%"
+)
 with jax.enable_x64(True):
-    predictions = sj.next_pictures(found, splats, sj.usual_candidates(splats, camera), settings=settings)
+    predictions = sj.next_pictures(
+        found, splats, sj.usual_candidates(splats, camera), settings=settings
+    )
 for prediction in predictions:
     print(prediction)
 

@@ -13,10 +13,12 @@
 # %% [markdown]
 # # Bumps found again from their shading
 #
-# A ball of two centimeters has bumps and dents of half a millimeter and more. We are given the ball without them, and pictures of
-# the true one under three lights, with noise of 1%. Each splat may move along its normal; its normal then follows from how its
-# neighbors have moved. Where light spreads below the surface it fills the dark side of each bump: shading tells less. We do it
-# for a material in which light hardly spreads, and for one in which it spreads as far as the bumps are wide.
+# A ball of two centimeters has bumps and dents of half a millimeter and more. We are given the ball
+# without them, and pictures of the true one under three lights, with noise of 1%. Each splat may
+# move along its normal; its normal then follows from how its neighbors have moved. Where light
+# spreads below the surface it fills the dark side of each bump: shading tells less. We do it for a
+# material in which light hardly spreads, and for one in which it spreads as far as the bumps are
+# wide.
 
 # %%
 # %matplotlib inline
@@ -38,7 +40,9 @@ def spread(count: int) -> np.ndarray:
     """Directions, evenly."""
     i = np.arange(count) + 0.5
     z, turn = 1 - 2 * i / count, np.pi * (1 + 5**0.5) * i
-    return np.stack([np.cos(turn) * np.sqrt(1 - z * z), np.sin(turn) * np.sqrt(1 - z * z), z], axis=1)
+    return np.stack(
+        [np.cos(turn) * np.sqrt(1 - z * z), np.sin(turn) * np.sqrt(1 - z * z), z], axis=1
+    )
 
 
 def ball() -> sj.Splats:
@@ -58,29 +62,43 @@ def degrees(a, b) -> np.ndarray:
 
 
 smooth = ball()
-as_given = sj.NormalOffsets(step=1.0, smoothness=1e-3, deviation=1.0)  # no blur: heights are what they are
-bumpy = as_given.moved(smooth, jnp.asarray(heights(np.asarray(smooth.normals)), jnp.float32), as_given.prepared(smooth))
-camera = sj.Camera.look_at(jnp.asarray([0.0, 0.0, 60.0]), jnp.zeros(3), fov=22.0, width=SIZE, height=SIZE)
+as_given = sj.NormalOffsets(
+    step=1.0, smoothness=1e-3, deviation=1.0
+)  # no blur: heights are what they are
+bumpy = as_given.moved(
+    smooth, jnp.asarray(heights(np.asarray(smooth.normals)), jnp.float32), as_given.prepared(smooth)
+)
+camera = sj.Camera.look_at(
+    jnp.asarray([0.0, 0.0, 60.0]), jnp.zeros(3), fov=22.0, width=SIZE, height=SIZE
+)
 directions = [-1.0, -0.5, -0.5], [1.0, -0.4, -0.5], [0.0, 1.0, -0.5]
-lamps = [sj.DirectionalLight(jnp.asarray(way), jnp.full(3, np.pi), cast_shadows=False) for way in directions]
+lamps = [
+    sj.DirectionalLight(jnp.asarray(way), jnp.full(3, np.pi), cast_shadows=False)
+    for way in directions
+]
 weights = jnp.asarray([[0.35, 0.35, 0.4], [0.3, 0.25, 0.2], [0.2, 0.15, 0.1]])
 
 
 def material(wider: float) -> sj.Material:
     """Light spreads by so many times 0.5, 1.2 and 2.8 mm."""
-    return sj.Material(sj.SumOfGaussians(wider**2 * jnp.asarray([0.3, 1.5, 8.0]), weights), eta=1.5, specular=0.0)
+    return sj.Material(
+        sj.SumOfGaussians(wider**2 * jnp.asarray([0.3, 1.5, 8.0]), weights), eta=1.5, specular=0.0
+    )
 
 
 # %% [markdown]
 # ## Found along the gradient
 #
-# Offsets are blurred over 1 mm, about as far as the splats are apart: what is finer is not looked for. Outlines are left out,
-# since only pixels that the body fills count.
+# Offsets are blurred over 1 mm, about as far as the splats are apart: what is finer is not looked
+# for. Outlines are left out, since only pixels that the body fills count.
 
 
 # %%
 def taken(splats: sj.Splats, wider: float) -> list[np.ndarray]:
-    return [np.asarray(sj.render(sj.Scene(splats, (lamp,), material(wider)), camera, settings).beauty) for lamp in lamps]
+    return [
+        np.asarray(sj.render(sj.Scene(splats, (lamp,), material(wider)), camera, settings).beauty)
+        for lamp in lamps
+    ]
 
 
 part = sj.NormalOffsets(step=0.04, smoothness=1.0, deviation=0.4)
@@ -92,13 +110,23 @@ for wider in (0.2, 1.0):
     pictures[wider] = taken(bumpy, wider)
     for picture, lamp in zip(pictures[wider], lamps, strict=True):
         deviation = np.full(picture.shape, NOISE * np.sqrt(np.mean(picture**2)))
-        seen.append(sj.Observation(picture + deviation * rng.normal(size=picture.shape), camera, (lamp,), deviation=deviation))
+        seen.append(
+            sj.Observation(
+                picture + deviation * rng.normal(size=picture.shape),
+                camera,
+                (lamp,),
+                deviation=deviation,
+            )
+        )
     optimizer = optax.adam(optax.cosine_decay_schedule(2.0, STEPS), b2=0.9)
-    found[wider] = sj.fit_scene(seen, smooth, material(wider), [part], optimizer, steps=STEPS, settings=settings)
+    found[wider] = sj.fit_scene(
+        seen, smooth, material(wider), [part], optimizer, steps=STEPS, settings=settings
+    )
     after[wider] = degrees(found[wider].splats.normals, bumpy.normals)[facing]
     losses = found[wider].losses
     print(
-        f"light spreads {wider:g} x: normals off by {np.mean(before):.1f} degrees before, {np.mean(after[wider]):.1f} after; "
+        f"light spreads {wider:g} x: normals off by {np.mean(before):.1f} degrees before, "
+        f"{np.mean(after[wider]):.1f} after; "
         f"loss {losses[0]:.0f} to {losses[found[wider].best]:.2f}"
     )
 
@@ -113,7 +141,10 @@ for line, wider in zip(axes, found, strict=True):
         ax.imshow(np.clip(shot / bright, 0, 1) ** (1 / 2.2))
         ax.set_title(f"{title}, light spreads {wider:g} x")
         ax.axis("off")
-    normals = [sj.render(sj.Scene(body, (lamps[0],), material(wider)), camera, settings).normal for body in (fitted, bumpy)]
+    normals = [
+        sj.render(sj.Scene(body, (lamps[0],), material(wider)), camera, settings).normal
+        for body in (fitted, bumpy)
+    ]
     off = np.where(np.linalg.norm(normals[1], axis=-1) > 0.5, degrees(*normals), np.nan)
     image = line[3].imshow(off, cmap="magma", vmin=0, vmax=15)
     line[3].set_title("normals, degrees off")

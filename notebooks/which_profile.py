@@ -13,9 +13,10 @@
 # %% [markdown]
 # # Which profile for which material
 #
-# Every model below turns the same coefficients into a profile. They differ near the source, where diffusion is a poor picture of
-# light, and they agree far away. The dots are the truth: photons, walked by `sj.monte_carlo`, with their standard errors. All is
-# drawn over radii counted in mean free paths, $r \sigma_t'$. [The page](../docs/which_profile.md) has the numbers for many media.
+# Every model below turns the same coefficients into a profile. They differ near the source, where
+# diffusion is a poor picture of light, and they agree far away. The dots are the truth: photons,
+# walked by `sj.monte_carlo`, with their standard errors. All is drawn over radii counted in mean
+# free paths, $r \sigma_t'$. [The page](../docs/which_profile.md) has the numbers for many media.
 
 # %%
 # %matplotlib inline
@@ -27,7 +28,11 @@ from matplotlib.figure import Figure
 import splatjax as sj
 
 # %%
-media = {"marble, green": (0.0041, 2.62, 1.5), "skin, red": (0.032, 0.74, 1.3), "skin, blue": (0.48, 1.01, 1.3)}
+media = {
+    "marble, green": (0.0041, 2.62, 1.5),
+    "skin, red": (0.032, 0.74, 1.3),
+    "skin, blue": (0.48, 1.01, 1.3),
+}
 models = {"Dipole": sj.Dipole, "BetterDipole": sj.BetterDipole, "PhotonBeam": sj.PhotonBeam}
 
 
@@ -42,7 +47,9 @@ truth = {}
 for name, numbers in media.items():
     medium = sj.Medium(*(jnp.asarray([x], jnp.float32) for x in numbers))
     edges = jnp.geomspace(0.08, 20.0, 41, dtype=jnp.float32) / medium.sigma_t_prime
-    truth[name] = sj.monte_carlo([sj.Layer(medium, jnp.asarray(jnp.inf))], 100_000, jax.random.key(1), edges=edges)
+    truth[name] = sj.monte_carlo(
+        [sj.Layer(medium, jnp.asarray(jnp.inf))], 100_000, jax.random.key(1), edges=edges
+    )
 
 # %%
 curves, totals = {}, {}
@@ -60,24 +67,32 @@ with jax.enable_x64(True):
         found = truth[name]
         dots = np.asarray(found.radii) / free_path
         scale = np.asarray(found.radii) * free_path
-        value, deviation = (np.asarray(each)[:, 0] * scale for each in (found.reflected.value, found.reflected.deviation))
+        value, deviation = (
+            np.asarray(each)[:, 0] * scale
+            for each in (found.reflected.value, found.reflected.deviation)
+        )
         known = deviation < 0.2 * value
-        axes.errorbar(dots[known], value[known], deviation[known], fmt="k.", ms=3, lw=0.8, label="Monte Carlo")
+        axes.errorbar(
+            dots[known], value[known], deviation[known], fmt="k.", ms=3, lw=0.8, label="Monte Carlo"
+        )
         axes.set(title=name, xlabel="r (mean free paths)", ylabel="r R(r) (per mean free path)")
     axes.legend(frameon=False)
 figure  # noqa: B018
 
 # %% [markdown]
-# - **Dipole** (Jensen 2001): what most published fits and coefficients were made with. It puts too much light between one and
-#   two mean free paths and, where absorption is strong, loses the tail. Take it to compare with the literature.
-# - **BetterDipole** (d'Eon 2012): the same cost, the best totals, and right to some ten per cent beyond one mean free path where
-#   little is absorbed.
-# - **PhotonBeam** (Habel 2013): adds single scattering, which is infinite at the origin like $1/r$. Beyond one mean free path it
-#   lies within a few per cent of the truth for marble. Take it, with a cut, when in doubt.
-# - **Burley** (Christensen 2015): a curve fitted to Monte Carlo, known by its color and one length. It is what film renderers
-#   exchange. The index of refraction is not in it: for marble, whose surface sends much of the light back, it falls too early.
-# - **Multipole** and **LayeredMultipole** (Donner 2005): slabs and layers, for skin, leaves and paper; four mean free paths thick
-#   and more.
+# - **Dipole** (Jensen 2001): what most published fits and coefficients were made with. It puts too
+#   much light between one and two mean free paths and, where absorption is strong, loses the tail.
+#   Take it to compare with the literature.
+# - **BetterDipole** (d'Eon 2012): the same cost, the best totals, and right to some ten per cent
+#   beyond one mean free path where little is absorbed.
+# - **PhotonBeam** (Habel 2013): adds single scattering, which is infinite at the origin like $1/r$.
+#   Beyond one mean free path it lies within a few per cent of the truth for marble. Take it, with a
+#   cut, when in doubt.
+# - **Burley** (Christensen 2015): a curve fitted to Monte Carlo, known by its color and one length.
+#   It is what film renderers exchange. The index of refraction is not in it: for marble, whose
+#   surface sends much of the light back, it falls too early.
+# - **Multipole** and **LayeredMultipole** (Donner 2005): slabs and layers, for skin, leaves and
+#   paper; four mean free paths thick and more.
 #
 # The totals differ as well: what leaves at all.
 
@@ -85,11 +100,16 @@ figure  # noqa: B018
 for name in media:
     found = truth[name].total_reflectance
     true = f"truth {float(found.value[0]):.3f} +- {float(found.deviation[0]):.3f}"
-    print(f"{name:14s}", true, " ".join(f"{label} {totals[name, label]:.3f}" for label in (*models, "Burley")))
+    print(
+        f"{name:14s}",
+        true,
+        " ".join(f"{label} {totals[name, label]:.3f}" for label in (*models, "Burley")),
+    )
 
 # %% [markdown]
-# Profiles with a $1/r$ core have no integral of $r R^2$ at the origin. Their Gaussians are fitted beyond a cut, stated in length
-# scales of the profile; the narrowest Gaussians of a material stand for what lies within.
+# Profiles with a $1/r$ core have no integral of $r R^2$ at the origin. Their Gaussians are fitted
+# beyond a cut, stated in length scales of the profile; the narrowest Gaussians of a material stand
+# for what lies within.
 
 # %%
 with jax.enable_x64(True):
@@ -99,14 +119,17 @@ with jax.enable_x64(True):
 print("E beyond one mean free path", round(error, 4))
 
 # %% [markdown]
-# The truth itself can be fitted, weighed by its errors; the sum of the weights is then held at the true total.
+# The truth itself can be fitted, weighed by its errors; the sum of the weights is then held at the
+# true total.
 
 # %%
 found = truth["marble, green"]
 with jax.enable_x64(True):
     profile = jax.tree.map(lambda each: each.astype(jnp.float64), found.profile())
     rule = sj.InverseVariance(sj.NORM_RULE.beyond(0.2))
-    true_fit = sj.fit_gaussians(profile, 5, weights=sj.TotalReflectanceHeld(), rule=rule, throw=False)
+    true_fit = sj.fit_gaussians(
+        profile, 5, weights=sj.TotalReflectanceHeld(), rule=rule, throw=False
+    )
     r, weights = rule.radii(profile)
     misses = (profile.values - true_fit.gaussians(r[:, 0])) ** 2 * weights * r
     chi_squared = float(jnp.sum(misses) / (jnp.sum(weights > 0) - 9))

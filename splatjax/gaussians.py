@@ -1,4 +1,6 @@
-"""The normalized Gaussian, profiles, and the one sum of Gaussians that fitter and renderer share."""
+"""The normalized Gaussian, profiles, and the one sum of Gaussians that fitter and renderer
+share.
+"""
 
 import abc
 from typing import ClassVar
@@ -10,10 +12,13 @@ from jaxtyping import Array, Float
 from splatjax.pointwise import one_program
 
 
-def gaussian(variance: Float[Array, "..."], squared_radius: Float[Array, "..."]) -> Float[Array, "..."]:
+def gaussian(
+    variance: Float[Array, "..."], squared_radius: Float[Array, "..."]
+) -> Float[Array, "..."]:
     r"""Give the normalized two-dimensional Gaussian of Eq. 2, `exp(-r^2 / 2v) / (2 pi v)`.
 
-    It is a function of the squared radius, so that no square root stands between a position and its gradient.
+    It is a function of the squared radius, so that no square root stands between a position and its
+    gradient.
 
     **Arguments:**
 
@@ -30,11 +35,14 @@ def gaussian(variance: Float[Array, "..."], squared_radius: Float[Array, "..."])
 class AbstractProfile(eqx.Module):
     """A radial profile: radiant exitance per unit power entering at the origin of a flat surface.
 
-    Lengths are in mm, `profile(r)` in 1/mm^2. Fresnel transmission at entry and exit is not part of it.
+    Lengths are in mm, `profile(r)` in 1/mm^2. Fresnel transmission at entry and exit is not part of
+    it.
     """
 
     singular: ClassVar[bool] = False
-    """Whether the profile goes to infinity at the origin like 1/r: the integrals of Eq. 3 and 4 then exist beyond a cut only."""
+    """Whether the profile goes to infinity at the origin like 1/r: the integrals of Eq. 3 and 4
+    then exist beyond a cut only.
+    """
 
     @abc.abstractmethod
     def __call__(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
@@ -42,14 +50,19 @@ class AbstractProfile(eqx.Module):
 
     @abc.abstractmethod
     def total_reflectance(self) -> Float[Array, " channels"]:
-        """Give `2 pi` times the integral of `r profile(r)`: the share of the entering power that leaves."""
+        """Give `2 pi` times the integral of `r profile(r)`: the share of the entering power that
+        leaves.
+        """
 
     @abc.abstractmethod
     def length_scale(self) -> Float[Array, " channels"]:
-        """Give the distance (mm) over which the core of the profile changes: quadrature counts radii in it."""
+        """Give the distance (mm) over which the core of the profile changes: quadrature counts
+        radii in it.
+        """
 
     def known_radii(self) -> tuple[Float[Array, " samples"], Float[Array, " samples"]] | None:
-        """Give the radii at which alone a measured profile is known, and their weights `dr` (mm); None for one known everywhere.
+        """Give the radii at which alone a measured profile is known, and their weights `dr` (mm);
+        None for one known everywhere.
 
         Integrals of the profile are then sums over these.
         """
@@ -64,7 +77,8 @@ class SumOfGaussians(AbstractProfile):
     **Attributes:**
 
     - `variances`: mm^2, per axis. Differentiable.
-    - `weights`: energies; their sum over the Gaussians is the total reflectance of a channel. Differentiable.
+    - `weights`: energies; their sum over the Gaussians is the total reflectance of a channel.
+      Differentiable.
     """
 
     variances: Float[Array, " gaussians"]
@@ -84,7 +98,9 @@ class SumOfGaussians(AbstractProfile):
         return jnp.full_like(self.weights[0], jnp.sqrt(jnp.min(self.variances)))
 
     def blurred(self, variance: Float[Array, ""] | float) -> "SumOfGaussians":
-        """Give what a Gaussian beam of a variance (mm^2 per axis) makes of the profile: the variances add (its convolution)."""
+        """Give what a Gaussian beam of a variance (mm^2 per axis) makes of the profile: the
+        variances add (its convolution).
+        """
         return SumOfGaussians(self.variances + variance, self.weights)
 
     def white(self) -> "SumOfGaussians":

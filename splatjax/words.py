@@ -4,8 +4,14 @@ import math
 
 
 def channel_names(count: int) -> tuple[str, ...]:
-    """Give what channels are called where nobody has named them: red, green and blue if they are three."""
-    return ("red", "green", "blue") if count == 3 else tuple(f"channel {channel + 1}" for channel in range(count))
+    """Give what channels are called where nobody has named them: red, green and blue if they are
+    three.
+    """
+    return (
+        ("red", "green", "blue")
+        if count == 3
+        else tuple(f"channel {channel + 1}" for channel in range(count))
+    )
 
 
 def counted(count: int, what: str) -> str:
@@ -15,4 +21,8 @@ def counted(count: int, what: str) -> str:
 
 def percent(share: float) -> str:
     """Write a relative error."""
-    return "anything" if not math.isfinite(share) or share > 10 else f"{float(f'{100 * share:.2g}'):g}%"
+    return (
+        "anything"
+        if not math.isfinite(share) or share > 10
+        else f"{float(f'{100 * share:.2g}'):g}%"
+    )

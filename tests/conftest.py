@@ -1,4 +1,6 @@
-"""Strict modes for the whole suite. Precision comes from JAX_ENABLE_X64: the suite runs once in each."""
+"""Strict modes for the whole suite. Precision comes from JAX_ENABLE_X64: the suite runs once in
+each.
+"""
 
 import gc
 import json
@@ -12,8 +14,8 @@ import pytest
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 
-# Tracing makes objects by the million that live as long as what they were traced for: looking for garbage among them as often as
-# Python would takes 8% of the time.
+# Tracing makes objects by the million that live as long as what they were traced for: looking for
+# garbage among them as often as Python would takes 8% of the time.
 gc.set_threshold(100_000, 20, 20)
 
 
@@ -25,13 +27,17 @@ def x64() -> bool:
 
 @pytest.fixture
 def float64(x64):
-    """Numbers that float32 cannot show: such tests belong to the float64 run, and are left out of the other."""
+    """Numbers that float32 cannot show: such tests belong to the float64 run, and are left out of
+    the other.
+    """
     assert x64
 
 
 @pytest.fixture
 def float32(x64):
-    """Long sums that need a compiler's whole effort, as users have it: such tests belong to the float32 run alone."""
+    """Long sums that need a compiler's whole effort, as users have it: such tests belong to the
+    float32 run alone.
+    """
     assert not x64
 
 
@@ -70,8 +76,19 @@ def _left_out(item) -> bool:
 def pytest_collection_modifyitems(config, items):
     """Leave out, and say so, what cannot run or need not run twice."""
     # The longest files first, so that no worker is left alone with one in the end.
-    longest = "test_notebooks", "gradients/test_every_float", "tests/gradients", "tests/transport", "tests/render", "tests/cli"
-    items.sort(key=lambda item: next((i for i, name in enumerate(longest) if name in item.nodeid), len(longest)))
+    longest = (
+        "test_notebooks",
+        "gradients/test_every_float",
+        "tests/gradients",
+        "tests/transport",
+        "tests/render",
+        "tests/cli",
+    )
+    items.sort(
+        key=lambda item: next(
+            (i for i, name in enumerate(longest) if name in item.nodeid), len(longest)
+        )
+    )
     left_out = [item for item in items if _left_out(item)]
     if left_out:
         items[:] = [item for item in items if item not in left_out]
@@ -86,5 +103,9 @@ def pytest_collection_finish():
 def pytest_report_header():
     precision = "float64" if jax.config.jax_enable_x64 else "float32"
     folder = shared_folder()
-    where = f"shared files from {folder}" if folder else "tests marked `shared` are left out: SPLATJAX_SHARED names no folder"
+    where = (
+        f"shared files from {folder}"
+        if folder
+        else "tests marked `shared` are left out: SPLATJAX_SHARED names no folder"
+    )
     return f"splatjax in {precision}; {where}"

@@ -24,7 +24,9 @@ def test_gaussian_is_smooth_at_the_origin(dtype):
 
 
 def test_sum_of_gaussians_is_a_profile_whose_weights_are_energies(dtype):
-    profile = SumOfGaussians(jnp.asarray([0.04, 1.0], dtype), jnp.asarray([[0.2, 0.1], [0.5, 0.3]], dtype))
+    profile = SumOfGaussians(
+        jnp.asarray([0.04, 1.0], dtype), jnp.asarray([[0.2, 0.1], [0.5, 0.3]], dtype)
+    )
     assert profile(jnp.zeros((4, 5), dtype)).shape == (4, 5, 2)
     np.testing.assert_allclose(np.asarray(profile.total_reflectance()), [0.7, 0.4], rtol=1e-6)
     np.testing.assert_allclose(np.asarray(profile.white().total_reflectance()), 1.0, rtol=1e-6)
@@ -34,5 +36,7 @@ def test_sum_of_gaussians_is_a_profile_whose_weights_are_energies(dtype):
             np.exp(-(r**2) / (2 * v))[..., None] / (2 * np.pi * v) * np.asarray(weights)
             for v, weights in ((0.04 + wider, [0.2, 0.1]), (1.0 + wider, [0.5, 0.3]))
         )
-        np.testing.assert_allclose(profile.blurred(wider)(jnp.asarray(r, dtype)), expected, rtol=1e-5)
+        np.testing.assert_allclose(
+            profile.blurred(wider)(jnp.asarray(r, dtype)), expected, rtol=1e-5
+        )
     np.testing.assert_allclose(np.asarray(profile.length_scale()), [0.2, 0.2], rtol=1e-6)

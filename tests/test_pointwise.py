@@ -11,13 +11,19 @@ from splatjax.pointwise import in_parts, one_program, zeros_after
 
 def squares_and_lengths(scale, record):
     points, factors = record["points"], record["factors"]
-    return {"scaled": scale * points * factors[:, None], "length": jnp.sqrt(jnp.sum(points * points, axis=1)) + scale}
+    return {
+        "scaled": scale * points * factors[:, None],
+        "length": jnp.sqrt(jnp.sum(points * points, axis=1)) + scale,
+    }
 
 
 @pytest.mark.parametrize("at_once", [1, 3, 4, 11, 12])
 def test_parts_give_what_the_whole_gives(at_once):
     keys = jax.random.split(jax.random.key(0), 2)
-    record = {"points": jax.random.normal(keys[0], (11, 3)), "factors": jax.random.normal(keys[1], (11,))}
+    record = {
+        "points": jax.random.normal(keys[0], (11, 3)),
+        "factors": jax.random.normal(keys[1], (11,)),
+    }
     scale = jnp.asarray(1.5)
 
     def loss(scale, record, run):
@@ -33,19 +39,29 @@ def test_parts_give_what_the_whole_gives(at_once):
     derivative = jax.jit(jax.grad(loss, argnums=(0, 1), has_aux=True), static_argnums=2)
     close = {"rtol": 1e-5, "atol": 1e-6}
     for got, expected in zip(
-        jax.tree.leaves(derivative(scale, record, parts)), jax.tree.leaves(derivative(scale, record, whole)), strict=True
+        jax.tree.leaves(derivative(scale, record, parts)),
+        jax.tree.leaves(derivative(scale, record, whole)),
+        strict=True,
     ):
         np.testing.assert_allclose(np.asarray(got), np.asarray(expected), **close)
     moved = scale, record
-    along = jax.jit(lambda run: jax.jvp(lambda s, r: loss(s, r, run)[0], moved, moved)[1], static_argnums=0)
+    along = jax.jit(
+        lambda run: jax.jvp(lambda s, r: loss(s, r, run)[0], moved, moved)[1], static_argnums=0
+    )
     forward, plain = along(parts), along(whole)
     np.testing.assert_allclose(float(forward), float(plain), **close)
 
 
 def test_a_part_that_is_filled_up_adds_nothing():
-    """What fills the last part is a copy of the last point: no zero of which a norm has no derivative."""
+    """What fills the last part is a copy of the last point: no zero of which a norm has no
+    derivative.
+    """
     points = jnp.ones((5, 3))
-    slope = jax.jit(jax.grad(lambda p: jnp.sum(in_parts(lambda part: jnp.linalg.norm(part, axis=1), p, at_once=3))))(points)
+    slope = jax.jit(
+        jax.grad(
+            lambda p: jnp.sum(in_parts(lambda part: jnp.linalg.norm(part, axis=1), p, at_once=3))
+        )
+    )(points)
     np.testing.assert_allclose(np.asarray(slope), 1 / np.sqrt(3), rtol=1e-6)
 
 
@@ -78,6 +94,8 @@ def test_what_is_one_program_compiles_once_and_is_a_method_as_any_other():
     np.testing.assert_allclose(values, np.sin(3 * at) * at + np.cos(at) / (1 + at * at), rtol=1e-5)
     np.testing.assert_allclose(jax.jit(Curve())(x), values, rtol=1e-6)
     slope = jax.jit(jax.grad(lambda x: Curve()(x)))(x[7])
-    np.testing.assert_allclose(slope, jax.grad(lambda x: jnp.sin(3 * x) * x + jnp.cos(x) / (1 + x * x))(x[7]), rtol=1e-5)
+    np.testing.assert_allclose(
+        slope, jax.grad(lambda x: jnp.sin(3 * x) * x + jnp.cos(x) / (1 + x * x))(x[7]), rtol=1e-5
+    )
     within = {step.primitive.name for step in jax.make_jaxpr(lambda x: Curve()(x))(x).eqns}
     assert "sin" in within

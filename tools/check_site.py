@@ -1,7 +1,7 @@
 """Hold a built site to what MkDocs does not check: `python tools/check_site.py out/site`.
 
-Every link and picture of every page leads to a file, and to a place in it that exists; and no page fetches anything from
-elsewhere.
+Every link and picture of every page leads to a file, and to a place in it that exists; and no page
+fetches anything from elsewhere.
 """
 
 import sys
@@ -9,7 +9,13 @@ from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import unquote, urldefrag
 
-_FETCHED = {("script", "src"), ("img", "src"), ("source", "src"), ("iframe", "src"), ("link", "href")}
+_FETCHED = {
+    ("script", "src"),
+    ("img", "src"),
+    ("source", "src"),
+    ("iframe", "src"),
+    ("link", "href"),
+}
 _FOLLOWED = {("a", "href"), *_FETCHED}
 _NEVER_FETCHED = {"canonical", "alternate", "prev", "next"}
 
@@ -28,7 +34,9 @@ class _Page(HTMLParser):
         self.places |= {value for value in (named.get("id"), named.get("name")) if value}
         for name, value in attrs:
             if value and (tag, name) in _FOLLOWED:
-                self.links.append((value, (tag, name) in _FETCHED and named.get("rel") not in _NEVER_FETCHED))
+                self.links.append(
+                    (value, (tag, name) in _FETCHED and named.get("rel") not in _NEVER_FETCHED)
+                )
 
 
 def faults(site: Path) -> list[str]:
@@ -51,7 +59,12 @@ def faults(site: Path) -> list[str]:
                 led = led / "index.html"
             if not led.exists():
                 found.append(f"{where} leads nowhere")
-            elif place and led in pages and unquote(place) not in pages[led].places and not place.startswith("__"):
+            elif (
+                place
+                and led in pages
+                and unquote(place) not in pages[led].places
+                and not place.startswith("__")
+            ):
                 found.append(f"{where}: there is no such place on that page")
     for style in sorted(site.rglob("*.css")):
         text = style.read_text(encoding="utf-8")

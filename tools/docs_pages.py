@@ -1,7 +1,9 @@
-"""Pages of the site that are written elsewhere: README, changelog, notebooks with their outputs, and the API from its docstrings.
+"""Pages of the site that are written elsewhere: README, changelog, notebooks with their outputs,
+and the API from its docstrings.
 
-A hook of MkDocs (mkdocs.yml): `make docs` builds the site. Pages link to each other as files of the repository, so that they can
-be read there too; here links are led to where the pages stand on the site.
+A hook of MkDocs (mkdocs.yml): `make docs` builds the site. Pages link to each other as files of the
+repository, so that they can be read there too; here links are led to where the pages stand on the
+site.
 """
 
 import ast
@@ -55,14 +57,18 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add what does not stand in docs/."""
     for source, place in MOVED.items():
         if (ROOT / source).is_file():
-            files.append(File.generated(config, place, content=(ROOT / source).read_text(encoding="utf-8")))
+            files.append(
+                File.generated(config, place, content=(ROOT / source).read_text(encoding="utf-8"))
+            )
     for place, content in (*_notebook_pages(), *_api_pages()):
         files.append(File.generated(config, place, content=content))
     return files
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Lead links to the places that pages have on the site, and names of the library to what is said of them."""
+    """Lead links to the places that pages have on the site, and names of the library to what is
+    said of them.
+    """
     here = page.file.src_uri
     if here in ("index.md", "tour.md", "gallery.md"):
         page.meta["hide"] = ["navigation"]  # a page alone in its tab
@@ -80,10 +86,14 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
         place = posixpath.normpath(posixpath.join(posixpath.dirname(written), target))
         if here.startswith("notebooks/") and not place.startswith("docs/"):
             return match.group()  # its own pictures
-        return f"{opened}{posixpath.relpath(_place(place), posixpath.dirname(here) or '.')}{anchor or ''}{closed}"
+        path = posixpath.relpath(_place(place), posixpath.dirname(here) or ".")
+        return f"{opened}{path}{anchor or ''}{closed}"
 
     parts = re.split(r"(^```.*?^```$)", _LINK.sub(led, markdown), flags=re.MULTILINE | re.DOTALL)
-    parts[::2] = [_NAME.sub(lambda m: f"[{m[0]}][{m[1]}]" if m[1] in names else m[0], part) for part in parts[::2]]
+    parts[::2] = [
+        _NAME.sub(lambda m: f"[{m[0]}][{m[1]}]" if m[1] in names else m[0], part)
+        for part in parts[::2]
+    ]
     return "".join(parts)
 
 
@@ -98,7 +108,12 @@ def _place(source: str) -> str:
 
 def _notebook_pages() -> Iterator[tuple[str, str | bytes]]:
     """Give a page for each executed notebook, its pictures, and a list of all."""
-    listed = ["# Notebooks", "", "Each ends with a claim that it asserts; the tests run them. `make notebooks` opens them.", ""]
+    listed = [
+        "# Notebooks",
+        "",
+        "Each ends with a claim that it asserts; the tests run them. `make notebooks` opens them.",
+        "",
+    ]
     for path in sorted(EXECUTED.glob("*.ipynb")):
         text, pictures = _notebook(path)
         yield f"notebooks/{path.stem}.md", text
@@ -113,9 +128,15 @@ def _notebook(path: Path) -> tuple[str, dict[str, bytes]]:
     for cell in json.loads(path.read_text(encoding="utf-8"))["cells"]:
         source = "".join(cell["source"])
         if cell["cell_type"] == "markdown":
-            parts.append(_MATHS.sub(lambda m: convert(m[1]), source))  # browsers show MathML without a script
+            parts.append(
+                _MATHS.sub(lambda m: convert(m[1]), source)
+            )  # browsers show MathML without a script
             continue
-        shown = "\n".join(line.removesuffix("  # noqa: B018") for line in source.splitlines() if not line.startswith("%"))
+        shown = "\n".join(
+            line.removesuffix("  # noqa: B018")
+            for line in source.splitlines()
+            if not line.startswith("%")
+        )
         parts.append(f"```python\n{shown}\n```")
         for output in cell["outputs"]:
             data = output.get("data", {})
@@ -146,7 +167,8 @@ def _surface() -> str:
             rows += [(name.name, f"splatjax.{node.module}.{name.name}") for name in node.names]
     known = _documented()
     lines = [
-        f"| {f'[`{name}`][{path}]' if path in known else f'`{name}`'} | [`{path.rpartition('.')[0]}`]({path.split('.')[1]}.md) |"
+        f"| {f'[`{name}`][{path}]' if path in known else f'`{name}`'} | "
+        f"[`{path.rpartition('.')[0]}`]({path.split('.')[1]}.md) |"
         for name, path in sorted(rows)
     ]
     intro = "What `import splatjax as sj` gives. These names are stable; everything else may move."

@@ -1,10 +1,13 @@
-"""Throw files that are almost right at every reader: each must be read, or refused by the errors that are documented.
+"""Throw files that are almost right at every reader: each must be read, or refused by the errors
+that are documented.
 
-    python tools/fuzz.py --inputs 200000 --seconds 600 --readers ply obj    # all readers if none is named
+    python tools/fuzz.py --inputs 200000 --seconds 600 --readers ply obj    # all readers if none is
+    named
 
-Two kinds of inputs take turns: mutations of real files, by a fixed seed, and inputs that grow from those which reached lines of
-`splatjax.io` that none had reached before (coverage-guided, by atheris where it is installed). Memory is limited, warnings of
-NumPy count as errors, and so does whatever computes longer than five seconds. What is found is written to tests/io/corpus, where
+Two kinds of inputs take turns: mutations of real files, by a fixed seed, and inputs that grow from
+those which reached lines of `splatjax.io` that none had reached before (coverage-guided, by atheris
+where it is installed). Memory is limited, warnings of NumPy count as errors, and so does whatever
+computes longer than five seconds. What is found is written to tests/io/corpus, where
 tests/io/test_corpus.py reads it ever after.
 """
 
@@ -41,7 +44,9 @@ def _ring(*_) -> None:
 
 
 def try_input(door: Door, path: Path, longest: float = LONGEST) -> str:
-    """Read a file; say what became of it: `read`, `refused`, or the traceback of what should not have happened."""
+    """Read a file; say what became of it: `read`, `refused`, or the traceback of what should not
+    have happened.
+    """
     before = signal.signal(signal.SIGPROF, _ring)
     signal.setitimer(signal.ITIMER_PROF, longest)
     try:
@@ -98,7 +103,9 @@ _INTEGERS = [0, 1, 0x7F, 0x80, 0xFF, 0xFFFF, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF]
 
 
 def mutate(data: bytes, others: list[bytes], chance: random.Random) -> bytes:
-    """Spoil a file in one place or in a few: bytes, numbers, words, pieces lost, doubled or taken from another file."""
+    """Spoil a file in one place or in a few: bytes, numbers, words, pieces lost, doubled or taken
+    from another file.
+    """
     for _ in range(chance.choice((1, 1, 1, 2, 3, 6))):
         if not data:
             return chance.choice(others)
@@ -113,17 +120,27 @@ def mutate(data: bytes, others: list[bytes], chance: random.Random) -> bytes:
             case 3:
                 data = data[:at] + data[at + chance.randrange(1, 20) :]
             case 4:
-                data = data[:at] + data[max(0, at - chance.randrange(1, 40)) : at] * chance.randrange(1, 4) + data[at:]
+                data = (
+                    data[:at]
+                    + data[max(0, at - chance.randrange(1, 40)) : at] * chance.randrange(1, 4)
+                    + data[at:]
+                )
             case 5:
                 kind = chance.choice(("<I", ">I", "<H", "<Q", "<f", "<d"))
                 value = (
-                    chance.choice((float("nan"), float("inf"), 1e38, -1.0)) if kind in ("<f", "<d") else chance.choice(_INTEGERS)
+                    chance.choice((float("nan"), float("inf"), 1e38, -1.0))
+                    if kind in ("<f", "<d")
+                    else chance.choice(_INTEGERS)
                 )
                 packed = struct.pack(kind, min(value, 0xFFFF) if kind == "<H" else value)
                 data = data[:at] + packed + data[at + len(packed) :]
             case 6:
                 other = chance.choice(others)
-                data = data[:at] + other[chance.randrange(len(other)) :][: chance.randrange(1, 200)] + data[at:]
+                data = (
+                    data[:at]
+                    + other[chance.randrange(len(other)) :][: chance.randrange(1, 200)]
+                    + data[at:]
+                )
             case _:
                 tokens = list(_TOKEN.finditer(data[: 1 << 14]))
                 if tokens:
@@ -162,7 +179,9 @@ def _work(name: str, folder: Path, inputs: int, seconds: float, counts, guided: 
         one(mutate(chance.choice(seeds), seeds, chance))
 
 
-def _guided(one: Callable[[bytes], None], seeds: list[bytes], inputs: int, seconds: float, folder: Path) -> None:
+def _guided(
+    one: Callable[[bytes], None], seeds: list[bytes], inputs: int, seconds: float, folder: Path
+) -> None:
     import atheris
 
     corpus = folder / "grown"
@@ -171,20 +190,47 @@ def _guided(one: Callable[[bytes], None], seeds: list[bytes], inputs: int, secon
         (corpus / str(i)).write_bytes(data)
     modules = [module for name, module in sys.modules.items() if name.startswith("splatjax.io.")]
     for module in modules:
-        own = [value for value in vars(module).values() if getattr(value, "__module__", "") == module.__name__]
-        for value in own + [method for each in own if isinstance(each, type) for method in vars(each).values()]:
+        own = [
+            value
+            for value in vars(module).values()
+            if getattr(value, "__module__", "") == module.__name__
+        ]
+        for value in own + [
+            method for each in own if isinstance(each, type) for method in vars(each).values()
+        ]:
             if hasattr(value, "__code__"):
                 value.__code__ = atheris.instrument_func(value).__code__
-    options = [f"-runs={inputs}", f"-max_total_time={int(seconds)}", "-max_len=8192", f"-seed={SEED}", "-print_final_stats=0"]
-    atheris.Setup([sys.argv[0], *options, "-verbosity=0", "-rss_limit_mb=0", "-timeout=100", "-handle_segv=0", str(corpus)], one)
+    options = [
+        f"-runs={inputs}",
+        f"-max_total_time={int(seconds)}",
+        "-max_len=8192",
+        f"-seed={SEED}",
+        "-print_final_stats=0",
+    ]
+    atheris.Setup(
+        [
+            sys.argv[0],
+            *options,
+            "-verbosity=0",
+            "-rss_limit_mb=0",
+            "-timeout=100",
+            "-handle_segv=0",
+            str(corpus),
+        ],
+        one,
+    )
     atheris.Fuzz()
 
 
 def keep(name: str, data: bytes, became: str) -> None:
-    """Write an input that was not taken as it should be, once for each place in the code where it failed."""
+    """Write an input that was not taken as it should be, once for each place in the code where it
+    failed.
+    """
     places = re.findall(r'File "[^"]*/([^"/]+)", line (\d+)', became)
     last = became.strip().splitlines()[-1][:100]
-    digest = hashlib.sha256(f"{places[-2:]} {re.sub(r'[0-9]+', '', last)[:40]}".encode()).hexdigest()[:10]
+    digest = hashlib.sha256(
+        f"{places[-2:]} {re.sub(r'[0-9]+', '', last)[:40]}".encode()
+    ).hexdigest()[:10]
     folder = CORPUS / name
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{digest}{DOORS[name].suffix}"
@@ -200,7 +246,9 @@ def fuzz(name: str, inputs: int, seconds: float, *, guided: bool) -> None:
     with tempfile.TemporaryDirectory(dir="/dev/shm" if Path("/dev/shm").is_dir() else None) as made:
         folder = Path(made)
         while counts[0] < inputs and (left := seconds - (time.monotonic() - begin)) > 1:
-            process = multiprocessing.get_context("fork").Process(target=_work, args=(name, folder, inputs, left, counts, guided))
+            process = multiprocessing.get_context("fork").Process(
+                target=_work, args=(name, folder, inputs, left, counts, guided)
+            )
             process.start()
             process.join(2 * left + 60)
             if process.is_alive():
@@ -211,12 +259,16 @@ def fuzz(name: str, inputs: int, seconds: float, *, guided: bool) -> None:
             deaths += 1
             path = folder / f"input{DOORS[name].suffix}"
             keep(
-                name, path.read_bytes(), f"the process died: {process.exitcode}, {hashlib.sha256(path.read_bytes()).hexdigest()}"
+                name,
+                path.read_bytes(),
+                f"the process died: {process.exitcode}, "
+                f"{hashlib.sha256(path.read_bytes()).hexdigest()}",
             )
     spent = time.monotonic() - begin
     kind = "grown" if guided else "mutations"
     print(
-        f"{name}: {counts[0]} {kind}, {counts[1]} read, {counts[0] - counts[1] - counts[2]} refused, {counts[2]} wrong,"
+        f"{name}: {counts[0]} {kind}, {counts[1]} read, {counts[0] - counts[1] - counts[2]} "
+        f"refused, {counts[2]} wrong,"
         f" {deaths} deaths, {spent:.0f} s, {counts[0] / spent:.0f} per s",
         flush=True,
     )
@@ -224,11 +276,17 @@ def fuzz(name: str, inputs: int, seconds: float, *, guided: bool) -> None:
 
 def main() -> None:
     """Fuzz the readers that are named."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--inputs", type=int, default=200_000, help="of each kind, for each reader")
-    parser.add_argument("--seconds", type=float, default=600.0, help="at most, for each kind and reader")
+    parser.add_argument(
+        "--seconds", type=float, default=600.0, help="at most, for each kind and reader"
+    )
     parser.add_argument("--readers", nargs="+", choices=DOORS, default=list(DOORS))
-    parser.add_argument("--kinds", nargs="+", choices=("mutations", "grown"), default=("mutations", "grown"))
+    parser.add_argument(
+        "--kinds", nargs="+", choices=("mutations", "grown"), default=("mutations", "grown")
+    )
     options = parser.parse_args()
     import splatjax.io  # noqa: F401  Before processes are forked.
 

@@ -1,6 +1,8 @@
-"""Compare splatted with path-traced bodies, and write the table and picture of docs/bodies.md: `python tools/make_bodies.py`.
+"""Compare splatted with path-traced bodies, and write the table and picture of docs/bodies.md:
+`python tools/make_bodies.py`.
 
-The path-traced pictures are made once, by `python tools/path_traced_bodies.py out/bodies`, which needs Mitsuba 3.
+The path-traced pictures are made once, by `python tools/path_traced_bodies.py out/bodies`, which
+needs Mitsuba 3.
 """
 
 import os
@@ -45,7 +47,15 @@ class Body(NamedTuple):
 
 
 BODIES = [
-    Body("sphere", "sphere of radius 10, lit from the side", (-1, -1, -1), (0, 0, 80), (0, 0, 0), 18, 150_000),
+    Body(
+        "sphere",
+        "sphere of radius 10, lit from the side",
+        (-1, -1, -1),
+        (0, 0, 80),
+        (0, 0, 0),
+        18,
+        150_000,
+    ),
     Body(
         "block",
         "block of 40 x 40 x 20 with a shadow's edge",
@@ -56,20 +66,49 @@ BODIES = [
         200_000,
         ((15, 0, 45), (30, 50)),
     ),
-    Body("sheet", "sheet of 40 x 40 x 2, lit from behind", (0, 0, 1), (30, 20, 80), (0, 0, 0), 30, 150_000),
-    Body("head", "scanned head, lit from the front", (-0.7, -0.5, -1), (250, 100, 800), (0, 70, 0), 19, 683_549),
-    Body("ear", "its ear, lit from behind", (-0.45, -0.25, 1), (450, 80, 300), (60, 60, 0), 9, 683_549),
+    Body(
+        "sheet",
+        "sheet of 40 x 40 x 2, lit from behind",
+        (0, 0, 1),
+        (30, 20, 80),
+        (0, 0, 0),
+        30,
+        150_000,
+    ),
+    Body(
+        "head",
+        "scanned head, lit from the front",
+        (-0.7, -0.5, -1),
+        (250, 100, 800),
+        (0, 70, 0),
+        19,
+        683_549,
+    ),
+    Body(
+        "ear",
+        "its ear, lit from behind",
+        (-0.45, -0.25, 1),
+        (450, 80, 300),
+        (60, 60, 0),
+        9,
+        683_549,
+    ),
 ]
 """The head is Lee Perry-Smith's (CC-BY 3.0), from the folder that SPLATJAX_SHARED names."""
 MM_PER_UNIT = 53.0
 PHOTONS = 4_000_000
 EVEN = 1.0
-"""Full coverage of splats as evenly spread as these; outlines then lie within 0.2 pixels of the truth, with the default 0.7."""
+"""Full coverage of splats as evenly spread as these; outlines then lie within 0.2 pixels of the
+truth, with the default 0.7.
+"""
 
 PAGE = Path(__file__).parents[1] / "docs" / "bodies.md"
 PICTURE = PAGE.parent / "images" / "bodies.png"
 BEGIN, END = "<!-- table: tools/make_bodies.py -->", "<!-- end of table -->"
-HEAD = "| body | model | red off by | green | blue | FLIP | seconds | path tracer's seconds to the same error |"
+HEAD = (
+    "| body | model | red off by | green | blue | FLIP | seconds | path tracer's "
+    "seconds to the same error |"
+)
 
 
 def mesh_of(body: Body) -> trimesh.Trimesh:
@@ -85,7 +124,9 @@ def mesh_of(body: Body) -> trimesh.Trimesh:
             return trimesh.creation.box([40, 40, 2])
     shared = os.environ.get("SPLATJAX_SHARED")
     if shared is None:
-        raise ValueError("SPLATJAX_SHARED: is not set; the head needs the folder with data/lee_perry_smith")
+        raise ValueError(
+            "SPLATJAX_SHARED: is not set; the head needs the folder with data/lee_perry_smith"
+        )
     path = Path(shared) / "data" / "lee_perry_smith" / "LeePerrySmith_closed.ply"
     mesh = trimesh.load(path, process=False)
     mesh.apply_scale(MM_PER_UNIT)
@@ -101,7 +142,9 @@ class Truth(NamedTuple):
     seconds: float
 
     def sound(self) -> np.ndarray:
-        """Tell which pixels count: not the few that one stray path in a hundred million makes brighter than all light."""
+        """Tell which pixels count: not the few that one stray path in a hundred million makes
+        brighter than all light.
+        """
         deviation, bright = np.sqrt(self.variance), np.quantile(self.picture, 0.98, axis=(0, 1))
         return np.all(deviation < 0.25 * bright, axis=-1)
 
@@ -114,7 +157,9 @@ def read_truth(body: Body, folder: Path) -> Truth:
     """Read what `tools/path_traced_bodies.py` wrote."""
     path = folder / f"{body.name}.npz"
     if not path.exists():
-        raise FileNotFoundError(f"{path}: there is no such file; run tools/path_traced_bodies.py {folder} first")
+        raise FileNotFoundError(
+            f"{path}: there is no such file; run tools/path_traced_bodies.py {folder} first"
+        )
     with np.load(path) as found:
         passes = int(found["passes"])
         mean = found["total"] / passes
@@ -129,19 +174,28 @@ def medium() -> sj.Medium:
 
 
 def material(profile: sj.Tabulated, single: sj.SingleScattering | None = None) -> sj.Material:
-    """Fit six Gaussians to a reflectance, its total held; nothing is reflected by the surface itself."""
+    """Fit six Gaussians to a reflectance, its total held; nothing is reflected by the surface
+    itself.
+    """
     profile = profile if single is None else profile.without(single)
     with jax.enable_x64(True):
         reference = jax.tree.map(lambda leaf: leaf.astype(jnp.float64), profile)
         fit = sj.fit_gaussians(
-            reference, 6, weights=sj.NonNegativeWeights(sj.TotalReflectanceHeld()), rule=sj.NORM_RULE.beyond(0.2 / SIGMA_T)
+            reference,
+            6,
+            weights=sj.NonNegativeWeights(sj.TotalReflectanceHeld()),
+            rule=sj.NORM_RULE.beyond(0.2 / SIGMA_T),
         )
         gaussians = jax.tree.map(np.asarray, fit.gaussians)
-    return sj.Material(jax.tree.map(jnp.asarray, gaussians), eta=1.0, specular=0.0, single_scattering=single)
+    return sj.Material(
+        jax.tree.map(jnp.asarray, gaussians), eta=1.0, specular=0.0, single_scattering=single
+    )
 
 
 def splats_of(body: Body) -> sj.Splats:
-    """Cover a body, its edges kept sharp, and its blocker: black splats so far away that no light spreads to the body."""
+    """Cover a body, its edges kept sharp, and its blocker: black splats so far away that no light
+    spreads to the body.
+    """
     mesh = mesh_of(body)
     vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces)
     if body.name in ("block", "sheet"):
@@ -157,7 +211,9 @@ def splats_of(body: Body) -> sj.Splats:
     return jax.tree.map(lambda *parts: jnp.concatenate(parts), splats, blocker)
 
 
-def splatted(body: Body, splats: sj.Splats, material: sj.Material, settings: sj.RenderSettings) -> tuple[np.ndarray, float]:
+def splatted(
+    body: Body, splats: sj.Splats, material: sj.Material, settings: sj.RenderSettings
+) -> tuple[np.ndarray, float]:
     """Give the picture, and the seconds that it takes once compiled."""
     light = sj.DirectionalLight(jnp.asarray(body.light, float), jnp.full(len(ALBEDO), IRRADIANCE))
     eye, target = (jnp.asarray(place, float) for place in (body.eye, body.target))
@@ -172,14 +228,18 @@ def splatted(body: Body, splats: sj.Splats, material: sj.Material, settings: sj.
 
 
 def errors(picture: np.ndarray, truth: Truth) -> tuple[list[float], float]:
-    """Give per channel the root mean square error over that of the truth, the truth's noise taken out; and the FLIP error."""
+    """Give per channel the root mean square error over that of the truth, the truth's noise taken
+    out; and the FLIP error.
+    """
     sound = truth.sound()
     noise = truth.variance[sound].mean(0)
     squared = ((picture - truth.picture)[sound] ** 2).mean(0) - noise
     rms = np.sqrt(np.maximum(squared, 0) / (truth.picture[sound] ** 2).mean(0))
     import flip_evaluator
 
-    pictures = (np.where(sound[..., None], truth.exposure() * each, 0) for each in (truth.picture, picture))
+    pictures = (
+        np.where(sound[..., None], truth.exposure() * each, 0) for each in (truth.picture, picture)
+    )
     shown = [encode(each).astype(np.float32) for each in pictures]
     return rms.tolist(), float(flip_evaluator.evaluate(*shown, "LDR")[1])
 
@@ -192,7 +252,9 @@ def encode(linear: np.ndarray) -> np.ndarray:
 
 def models() -> dict[str, tuple[sj.Material, sj.RenderSettings]]:
     """Give what is compared: material and settings, by name."""
-    found = sj.monte_carlo([sj.Layer(medium(), jnp.asarray(jnp.inf))], PHOTONS, jax.random.key(4)).profile()
+    found = sj.monte_carlo(
+        [sj.Layer(medium(), jnp.asarray(jnp.inf))], PHOTONS, jax.random.key(4)
+    ).profile()
     whole, parted = material(found), material(found, sj.SingleScattering(medium()))
     even = SplattingSettings(full_coverage=EVEN)
     plain = sj.RenderSettings(even, diffusion=DiffusionSettings(normalization=PlainMean()))
@@ -217,11 +279,18 @@ def draw(shown: list[tuple[Body, Truth, dict[str, np.ndarray]]], path: Path) -> 
     """Draw every body: the truth, the models, and by how much each is off."""
     names = list(shown[0][2])
     columns = ["path traced", *names, *(f"{name}, difference" for name in names)]
-    figure, axes = plt.subplots(len(shown), len(columns), figsize=(2.2 * len(columns), 2.25 * len(shown)), squeeze=False)
+    figure, axes = plt.subplots(
+        len(shown), len(columns), figsize=(2.2 * len(columns), 2.25 * len(shown)), squeeze=False
+    )
     for axes_row, (body, truth, pictures) in zip(axes, shown, strict=True):
         exposure = truth.exposure()
-        images = [encode(exposure * truth.picture), *(encode(exposure * each) for each in pictures.values())]
-        images += [np.clip(0.5 + exposure * (each - truth.picture), 0, 1) for each in pictures.values()]
+        images = [
+            encode(exposure * truth.picture),
+            *(encode(exposure * each) for each in pictures.values()),
+        ]
+        images += [
+            np.clip(0.5 + exposure * (each - truth.picture), 0, 1) for each in pictures.values()
+        ]
         for axis, image, title in zip(axes_row, images, columns, strict=True):
             axis.imshow(image, interpolation="nearest")
             axis.set_axis_off()
@@ -247,7 +316,9 @@ def main() -> None:
     draw(shown, folder / "bodies.png")
     if chosen == BODIES:
         before, rest = PAGE.read_text(encoding="utf-8").split(BEGIN)
-        table = "\n".join([BEGIN, "", HEAD, "|" + " --- |" * HEAD.count(" | ") + " --- |", *rows, "", END])
+        table = "\n".join(
+            [BEGIN, "", HEAD, "|" + " --- |" * HEAD.count(" | ") + " --- |", *rows, "", END]
+        )
         PAGE.write_text(before + table + rest.split(END)[1], encoding="utf-8")
         draw(shown, PICTURE)
 

@@ -1,9 +1,10 @@
-"""Fit the materials in profiles/ anew: `python tools/make_profiles.py [name ...]`, all of them by default.
+"""Fit the materials in profiles/ anew: `python tools/make_profiles.py [name ...]`, all of them by
+default.
 
-Each file keeps its coefficients, [surface] and [source]; [fit] is written anew: six Gaussians for the dipole, or the multipole
-of the layers, with exact Fresnel moments, their variances shared by the channels, the weights of each channel non-negative and
-summing to its total reflectance; fitted in float64.
-A material without coefficients was published as Gaussians, and is left as it is.
+Each file keeps its coefficients, [surface] and [source]; [fit] is written anew: six Gaussians for
+the dipole, or the multipole of the layers, with exact Fresnel moments, their variances shared by
+the channels, the weights of each channel non-negative and summing to its total reflectance; fitted
+in float64. A material without coefficients was published as Gaussians, and is left as it is.
 """
 
 import sys
@@ -28,7 +29,9 @@ SETTINGS = {
 def fit_material(name: str) -> FitResult:
     """Give the fit that a material is shipped with."""
     with jax.enable_x64(True):
-        return fit_gaussians(load_profile(name), COUNT, weights=NonNegativeWeights(TotalReflectanceHeld()))
+        return fit_gaussians(
+            load_profile(name), COUNT, weights=NonNegativeWeights(TotalReflectanceHeld())
+        )
 
 
 def write(name: str) -> FitResult:
@@ -37,7 +40,9 @@ def write(name: str) -> FitResult:
     tables = tomllib.loads(path.read_text(encoding="utf-8"))
     fitted = fit_material(name)
     with jax.enable_x64(True):
-        gaussians = SumOfGaussians(_rounded(fitted.gaussians.variances), _rounded(fitted.gaussians.weights))
+        gaussians = SumOfGaussians(
+            _rounded(fitted.gaussians.variances), _rounded(fitted.gaussians.weights)
+        )
         found = {"error": _rounded(fitted.error, 4)}
         material = Material(gaussians, **tables["surface"])
         profile = load_profile(name)
@@ -46,12 +51,16 @@ def write(name: str) -> FitResult:
 
 
 def _rounded(values: jax.Array, digits: int = DIGITS) -> jax.Array:
-    return jax.numpy.asarray(np.vectorize(lambda x: float(f"{x:.{digits - 1}e}"))(np.asarray(values)))
+    return jax.numpy.asarray(
+        np.vectorize(lambda x: float(f"{x:.{digits - 1}e}"))(np.asarray(values))
+    )
 
 
 def main(names: list[str]) -> None:
     for name in names or materials():
-        if not {"medium", "layers"} & set(tomllib.loads((profiles_folder() / f"{name}.toml").read_text(encoding="utf-8"))):
+        if not {"medium", "layers"} & set(
+            tomllib.loads((profiles_folder() / f"{name}.toml").read_text(encoding="utf-8"))
+        ):
             print(f"{name}: as published")
             continue
         print(f"{name}: E = {', '.join(f'{x:.2e}' for x in write(name).error)}")

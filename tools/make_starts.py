@@ -1,6 +1,8 @@
-"""Tabulate anew where fits of dipoles start: `python tools/make_starts.py`; writes profiles/dipole_starts.npz.
+"""Tabulate anew where fits of dipoles start: `python tools/make_starts.py`; writes
+profiles/dipole_starts.npz.
 
-The best fits of 1 to 8 Gaussians over reduced albedo and index of refraction, by the full search, in float64.
+The best fits of 1 to 8 Gaussians over reduced albedo and index of refraction, by the full search,
+in float64.
 """
 
 import jax
@@ -23,9 +25,14 @@ def main() -> None:
         medium = Medium(*(jnp.asarray(each) for each in (absorbed, 1 - absorbed, eta)))
         for count in COUNTS:
             fitted = fit_gaussians(Dipole(medium), count, spread=VariancesPerChannel())
-            log_variances = np.log(np.asarray(fitted.gaussians.variances)).reshape(len(ROOTS), len(ETAS), count)
+            log_variances = np.log(np.asarray(fitted.gaussians.variances)).reshape(
+                len(ROOTS), len(ETAS), count
+            )
             tables[f"log_variances_{count}"] = log_variances.astype(np.float32)
-            print(f"{count} Gaussians: E from {fitted.error.min():.1e} to {fitted.error.max():.1e}", flush=True)
+            print(
+                f"{count} Gaussians: E from {fitted.error.min():.1e} to {fitted.error.max():.1e}",
+                flush=True,
+            )
     path = profiles_folder() / "dipole_starts.npz"
     with atomic_path(path) as written, open(written, "wb") as file:
         np.savez_compressed(file, roots=ROOTS, etas=ETAS, **tables)

@@ -1,6 +1,8 @@
-"""Write the table of docs/which_profile.md anew, by Monte Carlo: `python tools/make_which_profile.py [photons]`.
+"""Write the table of docs/which_profile.md anew, by Monte Carlo: `python
+tools/make_which_profile.py [photons]`.
 
-Half spaces of three indices, one walk each for all albedos; slabs from half a mean free path to eight; three layers of skin.
+Half spaces of three indices, one walk each for all albedos; slabs from half a mean free path to
+eight; three layers of skin.
 """
 
 import sys
@@ -23,7 +25,11 @@ PLACES = (0.25, 1.0, 4.0, 16.0)
 """Mean free paths, at which model over truth is given."""
 
 RINGS = np.concatenate([[0.0], np.geomspace(0.1, 60.0, 65)])
-HEAD = "| medium | true total | model | total off by | E beyond 1 | " + " | ".join(f"at {place:g}" for place in PLACES) + " |"
+HEAD = (
+    "| medium | true total | model | total off by | E beyond 1 | "
+    + " | ".join(f"at {place:g}" for place in PLACES)
+    + " |"
+)
 KEY = jax.random.key(2010)
 
 
@@ -32,7 +38,12 @@ def burley(medium: sj.Medium) -> sj.Burley:
     return sj.Burley(sj.BetterDipole(medium).total_reflectance(), 1 / medium.sigma_t_prime)
 
 
-HALF_SPACES = {"Dipole": sj.Dipole, "BetterDipole": sj.BetterDipole, "PhotonBeam": sj.PhotonBeam, "Burley": burley}
+HALF_SPACES = {
+    "Dipole": sj.Dipole,
+    "BetterDipole": sj.BetterDipole,
+    "PhotonBeam": sj.PhotonBeam,
+    "Burley": burley,
+}
 
 
 def half_spaces(photons: int) -> Iterator[str]:
@@ -54,11 +65,15 @@ def slabs(photons: int) -> Iterator[str]:
         truth = walk([layer], photons, 10 + number)
         name = f"slab of {thickness:g}, albedo' 0.99, eta 1.4"
         if thickness < 1:
-            yield f"| {name} | {share(truth.total_reflectance)} | Multipole | refused |" + " |" * (1 + len(PLACES))
+            yield f"| {name} | {share(truth.total_reflectance)} | Multipole | refused |" + " |" * (
+                1 + len(PLACES)
+            )
             continue
         slab = sj.Multipole(layer)
         yield from rows(name + ", reflected", truth, {"Multipole": slab}, 0)
-        yield from rows(name + ", transmitted", truth, {"Multipole": slab.transmitted()}, 0, below=True)
+        yield from rows(
+            name + ", transmitted", truth, {"Multipole": slab.transmitted()}, 0, below=True
+        )
 
 
 def layers(photons: int) -> Iterator[str]:
@@ -73,16 +88,26 @@ def walk(stack, photons: int, number: int, unit: float = 1.0) -> sj.MonteCarlo:
     """Walk in float32, whatever the precision of the models."""
     stack = jax.tree.map(lambda each: each.astype(jnp.float32), list(stack))
     key = jax.random.fold_in(KEY, number)
-    return sj.monte_carlo(stack, photons, key, edges=jnp.asarray(RINGS * unit, jnp.float32), progress=tell)
+    return sj.monte_carlo(
+        stack, photons, key, edges=jnp.asarray(RINGS * unit, jnp.float32), progress=tell
+    )
 
 
 def tell(done: int, photons: int) -> None:
     print(f"\r{done / photons:6.1%}", end="", file=sys.stderr, flush=True)
 
 
-def rows(name: str, truth: sj.MonteCarlo, models: dict, channel: int, below: bool = False) -> Iterator[str]:
-    """A row for each model: how far off its total is, Eq. 4 beyond one mean free path, and ratios by ring."""
-    side, total = (truth.transmitted, truth.total_transmittance) if below else (truth.reflected, truth.total_reflectance)
+def rows(
+    name: str, truth: sj.MonteCarlo, models: dict, channel: int, below: bool = False
+) -> Iterator[str]:
+    """A row for each model: how far off its total is, Eq. 4 beyond one mean free path, and ratios
+    by ring.
+    """
+    side, total = (
+        (truth.transmitted, truth.total_transmittance)
+        if below
+        else (truth.reflected, truth.total_reflectance)
+    )
     values, errors = np.asarray(side.value)[:, channel], np.asarray(side.deviation)[:, channel]
     edges, radii = RINGS, np.asarray(truth.radii, np.float64)
     true = share(total, channel)
@@ -96,7 +121,9 @@ def rows(name: str, truth: sj.MonteCarlo, models: dict, channel: int, below: boo
         error = np.sqrt(max(square, 0.0) / np.sum(weights[far] * values[far] ** 2))
         off = float(model.total_reflectance()[channel]) / float(total.value[channel]) - 1
         ratios = [ratio(found, values, errors, edges, place * length) for place in PLACES]
-        yield f"| {name} | {true} | {label} | {off:+.1%} | {error:.3f} | " + " | ".join(ratios) + " |"
+        yield (
+            f"| {name} | {true} | {label} | {off:+.1%} | {error:.3f} | " + " | ".join(ratios) + " |"
+        )
         name = true = ""
 
 
@@ -106,11 +133,17 @@ def ring_means(model, edges: np.ndarray) -> jnp.ndarray:
     half, middle = np.diff(edges) / 2, (edges[1:] + edges[:-1]) / 2
     r = middle[:, None] + half[:, None] * nodes
     values = model(jnp.asarray(r.reshape(-1))).reshape(*r.shape, -1)
-    return jnp.einsum("rn,rnc->rc", jnp.asarray(2 * half[:, None] * weights * r / np.diff(edges**2)[:, None]), values)
+    return jnp.einsum(
+        "rn,rnc->rc",
+        jnp.asarray(2 * half[:, None] * weights * r / np.diff(edges**2)[:, None]),
+        values,
+    )
 
 
 def ratio(found, values, errors, edges, place: float) -> str:
-    """Model over truth in the ring that holds a radius; nothing where the truth is known to less than 10%."""
+    """Model over truth in the ring that holds a radius; nothing where the truth is known to less
+    than 10%.
+    """
     ring = np.searchsorted(edges, place) - 1
     if ring >= len(values) or errors[ring] > 0.1 * values[ring] or values[ring] == 0:
         return ""

@@ -1,12 +1,14 @@
-"""Do the tests notice? Small mistakes are planted in the mathematics, one at a time: `python tools/mutate.py --sample 400`.
+"""Do the tests notice? Small mistakes are planted in the mathematics, one at a time: `python
+tools/mutate.py --sample 400`.
 
-A seeded sample of all places where an operator, a comparison, a number or a function's name can be mistaken for its neighbor is
-taken from `gaussians`, `scattering`, `fitting`, `splatting` and `diffusion`. Each mutant meets the tests of its room, as long as
-there is time: first those that run through its line (by coverage.py's contexts, the shortest first), then those beside them,
-which share what the first has compiled or drawn. In double precision, and if it lives those that run once in single precision
-too. What lives on is written out with its line. Needs coverage.py (`.venv/bin/uv pip install coverage`). Results are kept in a
-folder, and the same command goes on where it stopped; `--again` meets what has lived anew, with a larger `--budget` or other
-tests.
+A seeded sample of all places where an operator, a comparison, a number or a function's name can be
+mistaken for its neighbor is taken from `gaussians`, `scattering`, `fitting`, `splatting` and
+`diffusion`. Each mutant meets the tests of its room, as long as there is time: first those that run
+through its line (by coverage.py's contexts, the shortest first), then those beside them, which
+share what the first has compiled or drawn. In double precision, and if it lives those that run once
+in single precision too. What lives on is written out with its line. Needs coverage.py
+(`.venv/bin/uv pip install coverage`). Results are kept in a folder, and the same command goes on
+where it stopped; `--again` meets what has lived anew, with a larger `--budget` or other tests.
 """
 
 import argparse
@@ -25,9 +27,13 @@ from mutate_meet import Meeting, in_child, pytest_in
 
 ROOT = Path(__file__).resolve().parent.parent
 ROOMS = ("gaussians", "scattering", "fitting", "splatting", "diffusion")
-LEAST = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
+LEAST = (
+    "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false "
+    "--xla_cpu_parallel_codegen_split_count=1"
+)
 PATIENCE = 40.0, 3.0
-"""Seconds of processor time that a mutant may take more than its tests, and how many times theirs."""
+"""Seconds of processor time that a mutant may take more than its tests, and how many times theirs.
+"""
 LONGEST = 90.0
 """Seconds of processor time of a test that there is no time for."""
 PRECISIONS = {True: "not once and not long", False: "once and not long"}
@@ -78,8 +84,19 @@ _NAMES = {
     "sum": "max",
     "exp": "expm1",
 }
-_NAMES |= {"log": "log1p", "sqrt": "square", "zeros": "ones", "zeros_like": "ones_like", "cumsum": "cumprod", "abs": "negative"}
-_NAMES |= {other: name for name, other in _NAMES.items() if name not in ("sum", "log", "exp", "abs", "sqrt", "cumsum")}
+_NAMES |= {
+    "log": "log1p",
+    "sqrt": "square",
+    "zeros": "ones",
+    "zeros_like": "ones_like",
+    "cumsum": "cumprod",
+    "abs": "negative",
+}
+_NAMES |= {
+    other: name
+    for name, other in _NAMES.items()
+    if name not in ("sum", "log", "exp", "abs", "sqrt", "cumsum")
+}
 
 
 class Mutant(NamedTuple):
@@ -103,15 +120,27 @@ def mutants_of(path: Path) -> list[Mutant]:
     found = []
 
     def between(left: ast.expr, right: ast.expr, text: str) -> None:
-        if left.end_lineno == right.lineno:  # the operator stands between, perhaps among parentheses
+        if (
+            left.end_lineno == right.lineno
+        ):  # the operator stands between, perhaps among parentheses
             gap = lines[right.lineno - 1].encode()[left.end_col_offset : right.col_offset].decode()
             operator = gap.strip().strip("()").strip()
             at = left.end_col_offset + gap.index(operator)
-            found.append(Mutant(str(path.relative_to(ROOT)), right.lineno, at, at + len(operator), text))
+            found.append(
+                Mutant(str(path.relative_to(ROOT)), right.lineno, at, at + len(operator), text)
+            )
 
     def instead(node: ast.expr, text: str) -> None:
         if node.lineno == node.end_lineno:
-            found.append(Mutant(str(path.relative_to(ROOT)), node.lineno, node.col_offset, node.end_col_offset or 0, text))
+            found.append(
+                Mutant(
+                    str(path.relative_to(ROOT)),
+                    node.lineno,
+                    node.col_offset,
+                    node.end_col_offset or 0,
+                    text,
+                )
+            )
 
     def visit(node: ast.AST) -> None:
         match node:
@@ -123,7 +152,9 @@ def mutants_of(path: Path) -> list[Mutant]:
                 between(node.left, node.comparators[0], _COMPARE[type(op)])
             case ast.BoolOp():
                 between(*node.values[:2], "or" if isinstance(node.op, ast.And) else "and")
-            case ast.UnaryOp(op=ast.USub() | ast.Not()) if not isinstance(node.operand, ast.Constant):
+            case ast.UnaryOp(op=ast.USub() | ast.Not()) if not isinstance(
+                node.operand, ast.Constant
+            ):
                 instead(node, f"({ast.unparse(node.operand)})")
             case ast.Constant(value=bool()):
                 instead(node, str(not node.value))
@@ -134,7 +165,13 @@ def mutants_of(path: Path) -> list[Mutant]:
             case ast.Attribute() if node.attr in _NAMES and node.end_lineno == node.lineno:
                 end = node.end_col_offset or 0
                 found.append(
-                    Mutant(str(path.relative_to(ROOT)), node.lineno, end - len(node.attr.encode()), end, _NAMES[node.attr])
+                    Mutant(
+                        str(path.relative_to(ROOT)),
+                        node.lineno,
+                        end - len(node.attr.encode()),
+                        end,
+                        _NAMES[node.attr],
+                    )
                 )
             case ast.IfExp():
                 instead(node.test, f"(not ({ast.unparse(node.test)}))")
@@ -151,7 +188,10 @@ def mutants_of(path: Path) -> list[Mutant]:
 def sampled(count: int, seed: int) -> list[Mutant]:
     """Take a sample of all mutants of the rooms."""
     paths = [
-        path for room in ROOMS for path in sorted(ROOT.glob(f"splatjax/{room}.py")) + sorted(ROOT.glob(f"splatjax/{room}/*.py"))
+        path
+        for room in ROOMS
+        for path in sorted(ROOT.glob(f"splatjax/{room}.py"))
+        + sorted(ROOT.glob(f"splatjax/{room}/*.py"))
     ]
     everyone = [mutant for path in paths for mutant in mutants_of(path)]
     print(f"{len(everyone)} mutants in {len(paths)} files")
@@ -165,7 +205,9 @@ def room_tests(room: str) -> list[str]:
 
 
 class Recorder:
-    """A pytest plugin that tells coverage which test is running, keeps how long each took, and ends those that take too long."""
+    """A pytest plugin that tells coverage which test is running, keeps how long each took, and ends
+    those that take too long.
+    """
 
     def __init__(self, measured):
         self.measured, self.seconds, self.failed = measured, {}, set()
@@ -190,11 +232,17 @@ def _enough(*_) -> None:
 
 
 def measure(folder: Path, copy: Path, double: bool) -> None:
-    """Run the tests of all rooms once, and keep which of them run through which line, and how long they take."""
+    """Run the tests of all rooms once, and keep which of them run through which line, and how long
+    they take.
+    """
     import coverage
 
     def work() -> int:
-        measured = coverage.Coverage(data_file=str(folder / f"coverage-{double}"), source=[str(copy / "splatjax")], branch=False)
+        measured = coverage.Coverage(
+            data_file=str(folder / f"coverage-{double}"),
+            source=[str(copy / "splatjax")],
+            branch=False,
+        )
         recorder = Recorder(measured)
         measured.start()
         tests = sorted({test for room in ROOMS for test in room_tests(room)})
@@ -202,16 +250,28 @@ def measure(folder: Path, copy: Path, double: bool) -> None:
         measured.stop()
         measured.save()
         (folder / f"seconds-{double}.json").write_text(
-            json.dumps({test: took for test, took in recorder.seconds.items() if test not in recorder.failed})
+            json.dumps(
+                {
+                    test: took
+                    for test, took in recorder.seconds.items()
+                    if test not in recorder.failed
+                }
+            )
         )
         return status
 
     if not (folder / f"seconds-{double}.json").exists():
         status, seconds = in_child(folder / f"log-{double}", work)
-        print(f"tests of all rooms, {'double' if double else 'single'} precision: status {status}, {seconds:.0f} s", flush=True)
+        print(
+            f"tests of all rooms, {'double' if double else 'single'} precision: status {status}, "
+            f"{seconds:.0f} s",
+            flush=True,
+        )
 
 
-def lines_to_tests(folder: Path, copy: Path, double: bool) -> tuple[dict[tuple[str, int], set[str]], dict[str, float]]:
+def lines_to_tests(
+    folder: Path, copy: Path, double: bool
+) -> tuple[dict[tuple[str, int], set[str]], dict[str, float]]:
     """Give the tests that run through each line, and their seconds."""
     import coverage
 
@@ -227,12 +287,15 @@ def lines_to_tests(folder: Path, copy: Path, double: bool) -> tuple[dict[tuple[s
 def chosen(mutant: Mutant, lines, seconds: dict[str, float], budget: float) -> list[str]:
     """Give the tests of its room that may notice a mutant, as long as there is time for them.
 
-    Those that run through its line come first, the shortest of them before all. Only the first test that needs something compiled
-    or drawn runs through its lines: next are those of the same files, and then those that run through the mutant's file at all.
+    Those that run through its line come first, the shortest of them before all. Only the first test
+    that needs something compiled or drawn runs through its lines: next are those of the same files,
+    and then those that run through the mutant's file at all.
     """
     places = tuple(room_tests(Path(mutant.path).parts[1].removesuffix(".py")))
     unseen = UNSEEN.get(Path(mutant.path).name)
-    through = {test for test in seconds if unseen and test.startswith(unseen)} | lines.get((mutant.path, mutant.line), set())
+    through = {test for test in seconds if unseen and test.startswith(unseen)} | lines.get(
+        (mutant.path, mutant.line), set()
+    )
     files = {test.split("::")[0] for test in through}
     of_file = {test for (path, _), those in lines.items() if path == mutant.path for test in those}
 
@@ -241,7 +304,9 @@ def chosen(mutant: Mutant, lines, seconds: dict[str, float], budget: float) -> l
 
     candidates = {test for test in seconds if test.split("::")[0] in files} | of_file | through
     taken, sum_ = [], 0.0
-    for test in sorted((test for test in candidates if test in seconds and test.startswith(places)), key=order):
+    for test in sorted(
+        (test for test in candidates if test in seconds and test.startswith(places)), key=order
+    ):
         sum_ += seconds[test]
         if taken and sum_ > budget:
             break
@@ -257,7 +322,9 @@ def planted(mutant: Mutant, text: bytes) -> bytes:
     return b"".join(lines)
 
 
-def meet(mutant: Mutant, copy: Path, meeting: Meeting, tests: list[str], seconds: float) -> tuple[str, float]:
+def meet(
+    mutant: Mutant, copy: Path, meeting: Meeting, tests: list[str], seconds: float
+) -> tuple[str, float]:
     """Let tests meet a mutant."""
     more, times = PATIENCE
     target = copy / mutant.path
@@ -268,7 +335,9 @@ def meet(mutant: Mutant, copy: Path, meeting: Meeting, tests: list[str], seconds
         return fate, took
     target.write_bytes(text)
     try:
-        status, more = in_child(copy.parent / "log", lambda: pytest_in(copy, meeting.double, ["-x", *tests]), limit)
+        status, more = in_child(
+            copy.parent / "log", lambda: pytest_in(copy, meeting.double, ["-x", *tests]), limit
+        )
     finally:
         target.write_bytes(before)
     if status in (-24, -9):
@@ -280,11 +349,18 @@ def meet(mutant: Mutant, copy: Path, meeting: Meeting, tests: list[str], seconds
 
 def main() -> None:
     """Measure, plant, meet, report."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--sample", type=int, default=400)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--folder", type=Path, default=ROOT / "out" / "mutants")
-    parser.add_argument("--budget", type=float, default=30.0, help="seconds of tests for a mutant, in each precision")
+    parser.add_argument(
+        "--budget",
+        type=float,
+        default=30.0,
+        help="seconds of tests for a mutant, in each precision",
+    )
     parser.add_argument("--minutes", type=float, default=1e9, help="stop then")
     parser.add_argument("--again", action="store_true", help="meet again what has lived")
     given = parser.parse_args()
@@ -302,7 +378,11 @@ def main() -> None:
     meetings = {double: Meeting(copy, double) for double in PRECISIONS}
     tables = {double: lines_to_tests(folder, copy, double) for double in PRECISIONS}
     record = folder / "met.jsonl"
-    met = {each["name"]: each for each in map(json.loads, record.read_text().splitlines())} if record.exists() else {}
+    met = (
+        {each["name"]: each for each in map(json.loads, record.read_text().splitlines())}
+        if record.exists()
+        else {}
+    )
     began = time.time()
     for number, mutant in enumerate(sampled(given.sample, given.seed)):
         if mutant.name() in met and not (given.again and met[mutant.name()]["fate"] in LIVING):
@@ -313,11 +393,18 @@ def main() -> None:
         for double, (lines, seconds) in tables.items():
             tests = chosen(mutant, lines, seconds, given.budget)
             if tests:
-                fate, spent = meet(mutant, copy, meetings[double], tests, sum(seconds[test] for test in tests))
+                fate, spent = meet(
+                    mutant, copy, meetings[double], tests, sum(seconds[test] for test in tests)
+                )
                 took += spent
             if fate not in LIVING:
                 break
-        met[mutant.name()] = {"name": mutant.name(), "fate": fate, "seconds": round(took, 1), "tests": len(tests)}
+        met[mutant.name()] = {
+            "name": mutant.name(),
+            "fate": fate,
+            "seconds": round(took, 1),
+            "tests": len(tests),
+        }
         with record.open("a") as file:
             print(json.dumps(met[mutant.name()]), file=file)
         print(f"{number + 1}: {fate} after {took:.0f} s, {mutant.name()}", flush=True)
@@ -332,7 +419,10 @@ def _report(met: list[dict]) -> None:
     for each in met:
         if each["fate"] in LIVING:
             path, line = each["name"].split(":")[:2]
-            print(f"{each['fate']}: {each['name']}\n    {(ROOT / path).read_text().splitlines()[int(line) - 1].strip()}")
+            print(
+                f"{each['fate']}: {each['name']}\n    "
+                f"{(ROOT / path).read_text().splitlines()[int(line) - 1].strip()}"
+            )
 
 
 if __name__ == "__main__":

@@ -1,8 +1,9 @@
 """Processes in which mutants meet tests; for `mutate.py`.
 
-A worker has the project imported. Into its functions it puts the code of a mutant, forgets what was compiled, and runs the tests;
-then it puts back what was there. That takes seconds less than a new process for each. What is not inside of a function
-(constants, fields, defaults) is imported, and meets its tests in a new process.
+A worker has the project imported. Into its functions it puts the code of a mutant, forgets what was
+compiled, and runs the tests; then it puts back what was there. That takes seconds less than a new
+process for each. What is not inside of a function (constants, fields, defaults) is imported, and
+meets its tests in a new process.
 """
 
 import functools
@@ -20,17 +21,25 @@ from pathlib import Path
 from types import CodeType, FunctionType
 
 _HOOK = ("splatjax",), "beartype.beartype"
-_PLAIN = "addopts=--strict-markers --strict-config -p no:cacheprovider"  # the project's, less the hook
+_PLAIN = (
+    "addopts=--strict-markers --strict-config -p no:cacheprovider"  # the project's, less the hook
+)
 _FEWER = 100  # mutants to a worker, which grows with each
 _PATIENCE = 3600.0  # seconds without an answer
 
 
-def in_child(log: Path, work: Callable[[], int], processor_seconds: float | None = None) -> tuple[int, float]:
-    """Do something in a process of its own; give its exit status, or minus the signal that ended it, and its seconds."""
+def in_child(
+    log: Path, work: Callable[[], int], processor_seconds: float | None = None
+) -> tuple[int, float]:
+    """Do something in a process of its own; give its exit status, or minus the signal that ended
+    it, and its seconds.
+    """
     child = os.fork()
     if child == 0:
         if processor_seconds is not None:
-            resource.setrlimit(resource.RLIMIT_CPU, (round(processor_seconds), round(processor_seconds) + 5))
+            resource.setrlimit(
+                resource.RLIMIT_CPU, (round(processor_seconds), round(processor_seconds) + 5)
+            )
         _speak_into(log)
         status = 70
         try:
@@ -40,7 +49,9 @@ def in_child(log: Path, work: Callable[[], int], processor_seconds: float | None
         sys.stdout.flush()
         os._exit(status)
     _, status, used = os.wait4(child, 0)
-    return (-os.WTERMSIG(status) if os.WIFSIGNALED(status) else os.WEXITSTATUS(status)), used.ru_utime + used.ru_stime
+    return (
+        -os.WTERMSIG(status) if os.WIFSIGNALED(status) else os.WEXITSTATUS(status)
+    ), used.ru_utime + used.ru_stime
 
 
 def _speak_into(log: Path) -> None:
@@ -60,14 +71,20 @@ def _configure(folder: Path, double: bool) -> None:
 
 
 def pytest_in(folder: Path, double: bool, arguments: list[str], plugins=()) -> int:
-    """Run tests in a copy of the project, in either precision; only in a process that has not imported it yet.
+    """Run tests in a copy of the project, in either precision; only in a process that has not
+    imported it yet.
 
     What has been compiled before is kept beside the copy: a mutant changes little of it.
     """
     import pytest
 
     _configure(folder, double)
-    return int(pytest.main(["-q", "-W", "ignore::pytest.PytestAssertRewriteWarning", *arguments], plugins=list(plugins)))
+    return int(
+        pytest.main(
+            ["-q", "-W", "ignore::pytest.PytestAssertRewriteWarning", *arguments],
+            plugins=list(plugins),
+        )
+    )
 
 
 def _codes(code: CodeType) -> Iterator[CodeType]:
@@ -80,7 +97,11 @@ def _codes(code: CodeType) -> Iterator[CodeType]:
 
 def _own(code: CodeType) -> tuple:
     """Give what of a code is its own, and not its functions'."""
-    return code.co_code, code.co_names, [repr(each) for each in code.co_consts if not isinstance(each, CodeType)]
+    return (
+        code.co_code,
+        code.co_names,
+        [repr(each) for each in code.co_consts if not isinstance(each, CodeType)],
+    )
 
 
 def _key(code: CodeType) -> tuple:
@@ -105,23 +126,36 @@ class _Worker:
         for each in gc.get_objects():
             if isinstance(each, FunctionType) and "splatjax" in each.__code__.co_filename:
                 self.functions.setdefault(each.__code__.co_filename, []).append(each)
-        for module in [module for name, module in sys.modules.items() if name.startswith("splatjax")]:
+        for module in [
+            module for name, module in sys.modules.items() if name.startswith("splatjax")
+        ]:
             self.of_module[module.__file__] = module
 
     def meet(self, path: str, source: bytes, tests: list[str]) -> str:
         """Run tests with another text in the place of a file."""
         file = str(self.folder / path)
         loader = self.of_module[file].__loader__
-        codes = [loader.source_to_code(text, file) for text in ((self.folder / path).read_bytes(), source)]
+        codes = [
+            loader.source_to_code(text, file)
+            for text in ((self.folder / path).read_bytes(), source)
+        ]
         before, after = ({_key(each): each for each in [code, *_codes(code)]} for code in codes)
-        changed = {key for key in after if key not in before or _own(before[key]) != _own(after[key])}
+        changed = {
+            key for key in after if key not in before or _own(before[key]) != _own(after[key])
+        }
         living = {_key(each.__code__): each for each in self.functions[file]}
-        outer = {key for key in changed if not any(key[0].startswith(f"{each[0]}.<locals>") or key == each for each in living)}
+        outer = {
+            key
+            for key in changed
+            if not any(key[0].startswith(f"{each[0]}.<locals>") or key == each for each in living)
+        }
         if outer:
             return "imported"
         if not changed:
             return "lives"
-        replaced = [(each, each.__code__) for each in self.functions[file] if _key(each.__code__) in after]
+        replaced = [
+            (each, each.__code__) for each in self.functions[file] if _key(each.__code__) in after
+        ]
         try:
             for function, code in replaced:
                 function.__code__ = after[_key(code)]
@@ -140,13 +174,26 @@ class _Worker:
             if str(getattr(module, "__file__", None)).startswith(str(self.folder / "tests")):
                 del sys.modules[name]
         for each in gc.get_objects():
-            if isinstance(each, functools._lru_cache_wrapper) and each.__module__.startswith("splatjax"):
+            if isinstance(each, functools._lru_cache_wrapper) and each.__module__.startswith(
+                "splatjax"
+            ):
                 each.cache_clear()
         eqx.clear_caches()
         jax.clear_caches()
         gc.collect()
         return int(
-            pytest.main(["-q", "-x", "--tb=line", "-W", "ignore::pytest.PytestAssertRewriteWarning", "-o", _PLAIN, *tests])
+            pytest.main(
+                [
+                    "-q",
+                    "-x",
+                    "--tb=line",
+                    "-W",
+                    "ignore::pytest.PytestAssertRewriteWarning",
+                    "-o",
+                    _PLAIN,
+                    *tests,
+                ]
+            )
         )
 
 
@@ -178,7 +225,9 @@ def _processor_seconds(process: int) -> float:
 
 
 class Meeting:
-    """Where mutants meet tests: a worker, and another when it does not answer in time or has had enough."""
+    """Where mutants meet tests: a worker, and another when it does not answer in time or has had
+    enough.
+    """
 
     def __init__(self, folder: Path, double: bool):
         self.folder, self.double, self.process, self.had = folder, double, None, 0
@@ -191,7 +240,9 @@ class Meeting:
         if self.process is None or self.had >= _FEWER:
             self.end()
             self.pipe, theirs = multiprocessing.Pipe()
-            self.process = multiprocessing.get_context("fork").Process(target=_work, args=(theirs, self.folder, self.double))
+            self.process = multiprocessing.get_context("fork").Process(
+                target=_work, args=(theirs, self.folder, self.double)
+            )
             self.process.start()
             theirs.close()
             assert self.pipe.recv() == "ready"

@@ -1,7 +1,9 @@
-"""Path-trace the bodies of `tools/make_bodies.py` with Mitsuba 3: `python tools/path_traced_bodies.py FOLDER`.
+"""Path-trace the bodies of `tools/make_bodies.py` with Mitsuba 3: `python
+tools/path_traced_bodies.py FOLDER`.
 
-Needs `mitsuba` (the dependency group `truth`). What is there already is kept, and continued where it broke off: each pass is
-added to FOLDER/NAME.npz, written beside and renamed. The time kept is that of the fastest pass.
+Needs `mitsuba` (the dependency group `truth`). What is there already is kept, and continued where
+it broke off: each pass is added to FOLDER/NAME.npz, written beside and renamed. The time kept is
+that of the fastest pass.
 """
 
 import os
@@ -17,15 +19,28 @@ from rich.progress import track
 
 
 def scene(mi, body: Body, mesh: Path):
-    """A medium inside a boundary that neither reflects nor bends; isotropic scattering; one directional light."""
+    """A medium inside a boundary that neither reflects nor bends; isotropic scattering; one
+    directional light.
+    """
     transform = mi.ScalarTransform4f
     albedo = {"type": "rgb", "value": list(ALBEDO)}
-    medium = {"type": "homogeneous", "sigma_t": SIGMA_T, "albedo": albedo, "phase": {"type": "isotropic"}}
+    medium = {
+        "type": "homogeneous",
+        "sigma_t": SIGMA_T,
+        "albedo": albedo,
+        "phase": {"type": "isotropic"},
+    }
     boundary = {"type": "null"}
     description = {
         "type": "scene",
         "integrator": {"type": "volpath", "max_depth": 4000, "rr_depth": 400},
-        "body": {"type": "ply", "filename": str(mesh), "face_normals": True, "bsdf": boundary, "interior": medium},
+        "body": {
+            "type": "ply",
+            "filename": str(mesh),
+            "face_normals": True,
+            "bsdf": boundary,
+            "interior": medium,
+        },
         "light": {
             "type": "directional",
             "direction": list(body.light),
@@ -35,7 +50,9 @@ def scene(mi, body: Body, mesh: Path):
             "type": "perspective",
             "fov": body.fov,
             "fov_axis": "y",
-            "to_world": transform().look_at(origin=list(body.eye), target=list(body.target), up=[0, 1, 0]),
+            "to_world": transform().look_at(
+                origin=list(body.eye), target=list(body.target), up=[0, 1, 0]
+            ),
             "film": {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}},
             "sampler": {"type": "independent"},
         },
@@ -58,8 +75,16 @@ def trace(mi, body: Body, folder: Path) -> None:
     if path.exists():
         with np.load(path) as found:
             if str(found["made_of"]) != made_of:
-                raise ValueError(f"{path}: is the picture of another body or setting; remove it, or take another folder")
-            total, squares, seconds, passes = found["total"], found["squares"], float(found["seconds"]), int(found["passes"])
+                raise ValueError(
+                    f"{path}: is the picture of another body or setting; remove it, or take "
+                    "another folder"
+                )
+            total, squares, seconds, passes = (
+                found["total"],
+                found["squares"],
+                float(found["seconds"]),
+                int(found["passes"]),
+            )
     mesh = folder / f"{body.name}.ply"
     mesh_of(body).export(mesh)
     made = scene(mi, body, mesh)
@@ -71,7 +96,14 @@ def trace(mi, body: Body, folder: Path) -> None:
             raise ValueError(f"{path}: pass {number} has values that are not finite")
         total, squares = total + picture, squares + picture**2
         beside = path.with_suffix(".part.npz")
-        np.savez(beside, total=total, squares=squares, seconds=seconds, passes=number + 1, made_of=made_of)
+        np.savez(
+            beside,
+            total=total,
+            squares=squares,
+            seconds=seconds,
+            passes=number + 1,
+            made_of=made_of,
+        )
         os.replace(beside, path)
 
 

@@ -16,16 +16,16 @@ from ._outputs import check_output
 class Export:
     """Write a material's Gaussians as JSON for other renderers.
 
-    Each entry with formula, unit and source: GPU Gems weights, a kernel for separable subsurface scattering, Burley's d, the
-    shape parameter of Unity's HDRP, Blender's radius.
+    Each entry with formula, unit and source: GPU Gems weights, a kernel for separable subsurface
+    scattering, Burley's d, the shape parameter of Unity's HDRP, Blender's radius.
 
     Example: splatjax export skin --output skin.json
     """
 
+    #: Name of a material (`splatjax materials`), or path of a TOML file with a [fit].
     material: tyro.conf.Positional[str]
-    """Name of a material (`splatjax materials`), or path of a TOML file with a [fit]."""
+    #: JSON file to write.
     output: Path
-    """JSON file to write."""
 
     def run(self) -> None:
         """Load, write."""

@@ -37,10 +37,11 @@ _COMMANDS = {
     "recover": Recover,
     "figure": Figure,
 }
-_DESCRIPTION = """Render translucent materials, and find the sums of Gaussians that stand for them. Lengths are in mm.
+_DESCRIPTION = """Render translucent materials, and find the sums of Gaussians that stand for them.
+Lengths are in mm.
 
-`splatjax COMMAND --help` explains a command. With --debug, an error shows where it arose. `splatjax --version` says which
-version this is."""
+`splatjax COMMAND --help` explains a command. With --debug, an error shows where it arose.
+`splatjax --version` says which version this is."""
 _DEBUG = "--debug"
 _STYLE = (tyro.conf.PositionalMetavarFromFieldName,)
 
@@ -52,8 +53,9 @@ def main(args: Sequence[str] | None = None) -> int:
 
     - `args`: the words after `splatjax`; those of the process when not given.
 
-    **Returns:** the exit status: 0; 2 after one line on stderr that says what is wrong with what was given; 1 after one that says
-    what is wrong with splatjax; 130 when interrupted, 141 when nobody reads on.
+    **Returns:** the exit status: 0; 2 after one line on stderr that says what is wrong with what
+    was given; 1 after one that says what is wrong with splatjax; 130 when interrupted, 141 when
+    nobody reads on.
     """
     words = list(sys.argv[1:] if args is None else args)
     debug = _DEBUG in words
@@ -63,7 +65,7 @@ def main(args: Sequence[str] | None = None) -> int:
         return _nobody_reads_on()
     try:
         with warnings.catch_warnings():
-            warnings.showwarning = lambda message, category, *_, **__: _show_warning(message, category)  # ty: ignore[invalid-assignment]
+            warnings.showwarning = _show_warning  # ty: ignore[invalid-assignment]
             prepare_jax()
             command.run()
             sys.stdout.flush()
@@ -82,12 +84,15 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 def _nobody_reads_on() -> int:
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python would try once more when it ends
+    os.dup2(
+        os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno()
+    )  # Python would try once more when it ends
     return 141
 
 
 def parsed(words: list[str]) -> Any:
-    """Give the command that words stand for; raise `SystemExit` where they ask for help or the version, or stand for none.
+    """Give the command that words stand for; raise `SystemExit` where they ask for help or the
+    version, or stand for none.
 
     The command of the first word alone is looked at, so that what is said speaks of nothing else.
     """
@@ -97,9 +102,14 @@ def parsed(words: list[str]) -> Any:
         raise SystemExit
     if name in _COMMANDS:
         return tyro.cli(_COMMANDS[name], prog=f"splatjax {name}", args=rest, config=_STYLE)
-    each = [Annotated[command, tyro.conf.subcommand(name, description=_summary(command))] for name, command in _COMMANDS.items()]
+    each = [
+        Annotated[command, tyro.conf.subcommand(name, description=_summary(command))]
+        for name, command in _COMMANDS.items()
+    ]
     union: Any = functools.reduce(operator.or_, each)
-    return tyro.cli(union, prog="splatjax", description=_DESCRIPTION, args=[name, *rest], config=_STYLE)
+    return tyro.cli(
+        union, prog="splatjax", description=_DESCRIPTION, args=[name, *rest], config=_STYLE
+    )
 
 
 def _summary(command: type) -> str:
@@ -107,7 +117,9 @@ def _summary(command: type) -> str:
 
 
 def _said(error: Exception) -> tuple[str, int]:
-    """Give one line about an error, and the exit status: 2 for what the user can mend, 1 for what we must."""
+    """Give one line about an error, and the exit status: 2 for what the user can mend, 1 for what
+    we must.
+    """
     words = " ".join(str(error).split())
     if isinstance(error, OSError) and error.strerror and error.filename is not None:
         return f"{error.filename}: {error.strerror}", 2
@@ -117,15 +129,21 @@ def _said(error: Exception) -> tuple[str, int]:
         return _said_in_compiled_code(str(error)), 2
     if isinstance(error, ValueError | OSError):
         return words or type(error).__name__, 2
-    return f"a fault of splatjax itself: {type(error).__name__}: {words}; please report it with what {_DEBUG} shows", 1
+    return (
+        f"a fault of splatjax itself: {type(error).__name__}: {words}; please report it with what "
+        f"{_DEBUG} shows",
+        1,
+    )
 
 
 def _said_in_compiled_code(words: str) -> str:
-    """Give what a check in compiled code says, without the stack before it and the advice to developers behind it."""
+    """Give what a check in compiled code says, without the stack before it and the advice to
+    developers behind it.
+    """
     return " ".join(words.rpartition("EquinoxRuntimeError: ")[2].partition("\n\n---")[0].split())
 
 
-def _show_warning(message: Warning | str, category: type[Warning]) -> None:
+def _show_warning(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
     """Show what a user should know in one line; what is meant for developers not at all."""
     if issubclass(category, UserWarning):
         note(" ".join(str(message).split()))

@@ -11,20 +11,25 @@ from rich.table import Table
 import splatjax as sj
 from splatjax.io import material_path, surface_and_source
 
-_MATERIAL = "Print the file of this one: coefficients, source, Gaussians. A beginning of one's own. Without it, list all."
+_MATERIAL = (
+    "Print the file of this one: coefficients, source, Gaussians. A beginning of "
+    "one's own. Without it, list all."
+)
 
 
 @dataclass(frozen=True)
 class Materials:
     """List the materials of the library, or print one.
 
-    Their names serve `splatjax render --material` and, where coefficients or layers are known, `splatjax fit`.
+    Their names serve `splatjax render --material` and, where coefficients or layers are known,
+    `splatjax fit`.
 
     Example: splatjax materials marble > mine.toml
     """
 
     material: Annotated[
-        tyro.conf.Positional[str | None], tyro.conf.arg(metavar="[MATERIAL]", help=_MATERIAL, help_behavior_hint="")
+        tyro.conf.Positional[str | None],
+        tyro.conf.arg(metavar="[MATERIAL]", help=_MATERIAL, help_behavior_hint=""),
     ] = None
 
     def run(self) -> None:
@@ -40,7 +45,14 @@ class Materials:
             material = sj.load_material(name)
             reflectance = "  ".join(f"{float(share):.3f}" for share in material.total_reflectance())
             widest = float(material.gaussians.variances.max()) ** 0.5
-            table.add_row(name, _known(name), reflectance, f"{widest:.3g}", f"{float(material.eta):.3g}", _publication(name))
+            table.add_row(
+                name,
+                _known(name),
+                reflectance,
+                f"{widest:.3g}",
+                f"{float(material.eta):.3g}",
+                _publication(name),
+            )
         console = Console(highlight=False)
         if not console.is_terminal:
             console.width = 200  # in a pipe, a line stays whole
@@ -49,7 +61,9 @@ class Materials:
 
 def _known(name: str) -> str:
     try:
-        return "layers" if isinstance(sj.load_profile(name), sj.LayeredMultipole) else "coefficients"
+        return (
+            "layers" if isinstance(sj.load_profile(name), sj.LayeredMultipole) else "coefficients"
+        )
     except ValueError:
         return "Gaussians"
 

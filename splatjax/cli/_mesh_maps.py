@@ -8,7 +8,8 @@ import tyro
 from ._options import OptionalFloat, OptionalPath
 
 _V_UP = (
-    "Whether v = 0 is the lower edge of a map. Without it, as the format prescribes: OBJ yes, glTF and GLB no. If lips land on "
+    "Whether v = 0 is the lower edge of a map. Without it, as the format prescribes: OBJ yes, glTF "
+    "and GLB no. If lips land on "
     "the chin, say True."
 )
 
@@ -17,15 +18,18 @@ _V_UP = (
 class MeshMaps:
     """Maps of a mesh, and where they lie."""
 
+    #: Map of the mesh's diffuse color, sRGB. Without it, the texture that the file itself carries,
+    #: if any.
     albedo: OptionalPath = None
-    """Map of the mesh's diffuse color, sRGB. Without it, the texture that the file itself carries, if any."""
+    #: Gray map: factor on the material's specular strength.
     specular: OptionalPath = None
-    """Gray map: factor on the material's specular strength."""
+    #: Tangent-space normal map; green points up.
     normal: OptionalPath = None
-    """Tangent-space normal map; green points up."""
-    v_up: Annotated[bool | None, tyro.conf.arg(metavar="{True,False}", help=_V_UP, help_behavior_hint="")] = None
+    v_up: Annotated[
+        bool | None, tyro.conf.arg(metavar="{True,False}", help=_V_UP, help_behavior_hint="")
+    ] = None
+    #: Cut off what lies below this height, in the file's unit.
     crop_min_y: OptionalFloat = None
-    """Cut off what lies below this height, in the file's unit."""
 
     def worn(self) -> dict[str, Any]:
         """Give them as `splatjax.sample_mesh` and `splatjax.io.read_textured_mesh` take them."""

@@ -1,4 +1,6 @@
-"""Types of options, as help shows them. What takes more than a line to explain is a `help`: breaks in docstrings are kept."""
+"""Types of options, as help shows them. What takes more than a line to explain is a `help`: breaks
+in docstrings are kept.
+"""
 
 from pathlib import Path
 from typing import Annotated

@@ -1,4 +1,6 @@
-"""Outputs are checked before the work begins: nobody should wait for a picture that cannot be written."""
+"""Outputs are checked before the work begins: nobody should wait for a picture that cannot be
+written.
+"""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,7 +15,9 @@ FIGURES = (".png", ".pdf", ".svg")
 
 
 def check_output(path: Path, suffixes: tuple[str, ...]) -> None:
-    """Raise `ValueError` for a name with another suffix or a folder in its place, `FileNotFoundError` for a missing folder."""
+    """Raise `ValueError` for a name with another suffix or a folder in its place,
+    `FileNotFoundError` for a missing folder.
+    """
     if path.suffix.lower() not in suffixes:
         raise ValueError(f"{path}: the name of this output must end in {' or '.join(suffixes)}")
     if not path.parent.is_dir():

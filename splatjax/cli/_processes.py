@@ -28,10 +28,12 @@ class Share:
 def own_share() -> Share:
     """Wait until all processes have come this far, and find which of them this is.
 
-    JAX finds out under SLURM and Open MPI; elsewhere `JAX_COORDINATOR_ADDRESS`, `JAX_NUM_PROCESSES` and `JAX_PROCESS_ID` say so.
-    From then on each goes on alone: one that fails stops no other. To be called before anything is computed.
+    JAX finds out under SLURM and Open MPI; elsewhere `JAX_COORDINATOR_ADDRESS`, `JAX_NUM_PROCESSES`
+    and `JAX_PROCESS_ID` say so. From then on each goes on alone: one that fails stops no other. To
+    be called before anything is computed.
 
-    **Raises:** `ValueError` when the environment speaks of several processes, and does not say which.
+    **Raises:** `ValueError` when the environment speaks of several processes, and does not say
+    which.
     """
     said = {name: number for name in _STARTED if (number := _number(name)) is not None}
     for name, number in said.items():  # the first counts
@@ -43,10 +45,13 @@ def own_share() -> Share:
     else:
         return Share()
     try:
-        jax.distributed.initialize(num_processes=_number("JAX_NUM_PROCESSES"), process_id=_number("JAX_PROCESS_ID"))
+        jax.distributed.initialize(
+            num_processes=_number("JAX_NUM_PROCESSES"), process_id=_number("JAX_PROCESS_ID")
+        )
     except (ValueError, TypeError) as error:
         raise ValueError(
-            f"several processes were started, but not all is said of them: {error} Set JAX_COORDINATOR_ADDRESS, JAX_NUM_PROCESSES"
+            f"several processes were started, but not all is said of them: {error} Set "
+            "JAX_COORDINATOR_ADDRESS, JAX_NUM_PROCESSES"
             " and JAX_PROCESS_ID, or JAX_NUM_PROCESSES=1 for a process of its own"
         ) from None
     share = Share(jax.process_index(), jax.process_count())

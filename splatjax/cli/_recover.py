@@ -13,7 +13,14 @@ import tyro
 from rich.console import Console
 
 import splatjax as sj
-from splatjax.io import fingerprint, material_path, own_version, picture_paths, read_record, write_record
+from splatjax.io import (
+    fingerprint,
+    material_path,
+    own_version,
+    picture_paths,
+    read_record,
+    write_record,
+)
 from splatjax.words import counted
 
 from ._models import Model
@@ -22,7 +29,8 @@ from ._outputs import FIGURES, check_output, save_figure
 from ._report import note, stage
 
 _START = (
-    "Materials to start from, within a factor of three in both coefficients: names, or paths of TOML files. The best end counts."
+    "Materials to start from, within a factor of three in both coefficients: names, "
+    "or paths of TOML files. The best end counts."
 )
 _LARGEST_ETA = 3.0
 """Of any translucent solid: diamond has 2.4."""
@@ -33,8 +41,9 @@ _MODELS = {Model.DIPOLE: sj.Dipole, Model.BETTER_DIPOLE: sj.BetterDipole}
 class Recover:
     """Find the absorption and scattering of a material from pictures of a known shape.
 
-    Both come with error bars; what the pictures do not fix is said, and which one to take next. They are listed in a TOML file,
-    each with its camera, its lights, and what is known of noise and intensity:
+    Both come with error bars; what the pictures do not fix is said, and which one to take next.
+    They are listed in a TOML file, each with its camera, its lights, and what is known of noise and
+    intensity:
 
         [[pictures]]
         file = "left.exr"
@@ -46,37 +55,39 @@ class Recover:
         direction = [1, -0.3, -0.5]
         irradiance = [3.14, 3.14, 3.14]
 
-    A light is also of kind "point" (position, intensity) or "beam" (origin, direction, power, variance).
+    A light is also of kind "point" (position, intensity) or "beam" (origin, direction, power,
+    variance).
 
-    Albedo of the splats is not used: the coefficients carry all color. Interrupt it, and the same command goes on from the best
-    medium it knew.
+    Albedo of the splats is not used: the coefficients carry all color. Interrupt it, and the same
+    command goes on from the best medium it knew.
 
-    Example: splatjax recover head.ply pictures.toml --start skin1 marble --output mine.toml --report mine.png
+    Example: splatjax recover head.ply pictures.toml --start skin1 marble --output mine.toml
+    --report mine.png
     """
 
+    #: PLY file of splats, in mm (`splatjax sample` makes one).
     splats: tyro.conf.Positional[Path]
-    """PLY file of splats, in mm (`splatjax sample` makes one)."""
+    #: TOML file that lists the pictures.
     pictures: tyro.conf.Positional[Path]
-    """TOML file that lists the pictures."""
     start: Annotated[MaterialNames, tyro.conf.arg(help=_START)] = ("skin1", "marble")
+    #: Index of refraction, which is not searched. Without it, that of the first start.
     eta: OptionalFloat = None
-    """Index of refraction, which is not searched. Without it, that of the first start."""
+    #: TOML file to write the material to.
     output: Path = Path("recovered.toml")
-    """TOML file to write the material to."""
+    #: Picture to write of what was seen, what was recovered and what is left: .png, .pdf or .svg.
     report: OptionalPath = None
-    """Picture to write of what was seen, what was recovered and what is left: .png, .pdf or .svg."""
+    #: dipole or better-dipole.
     model: tyro.conf.EnumChoicesFromValues[Model] = Model.DIPOLE
-    """dipole or better-dipole."""
+    #: Number of Gaussians.
     count: int = 6
-    """Number of Gaussians."""
+    #: Let pixels that are far off count less: highlights, dust, what the model does not know.
     robust: bool = False
-    """Let pixels that are far off count less: highlights, dust, what the model does not know."""
+    #: Strength of the specular lobe, if the pictures show one.
     specular: float = 0.0
-    """Strength of the specular lobe, if the pictures show one."""
+    #: Of the specular lobe.
     roughness: float = 0.3
-    """Of the specular lobe."""
+    #: Say which picture would tell most, of some that could be taken from where the first was.
     suggest: bool = True
-    """Say which picture would tell most, of some that could be taken from where the first was."""
 
     def run(self) -> None:
         """Load, recover, say, write."""
@@ -84,11 +95,17 @@ class Recover:
         if self.report is not None:
             check_output(self.report, FIGURES)
         if self.model not in _MODELS:
-            raise ValueError(f"--model {self.model.value} cannot be searched; take {' or '.join(m.value for m in _MODELS)}")
+            raise ValueError(
+                f"--model {self.model.value} cannot be searched; take "
+                f"{' or '.join(m.value for m in _MODELS)}"
+            )
         if not self.start:
             raise ValueError("--start names no material; give one or more (`splatjax materials`)")
         if self.eta is not None and not 1 <= self.eta <= _LARGEST_ETA:
-            raise ValueError(f"--eta is {self.eta:g}; it must lie between 1 and {_LARGEST_ETA:g}: marble has 1.5, skin 1.4")
+            raise ValueError(
+                f"--eta is {self.eta:g}; it must lie between 1 and {_LARGEST_ETA:g}: marble has "
+                "1.5, skin 1.4"
+            )
         for name in self.start:
             sj.load_medium(name)  # says at once what is wrong with it
         with stage(f"reading {self.splats} and {self.pictures}"):
@@ -112,7 +129,10 @@ class Recover:
             note(f"{time.perf_counter() - begin:6.1f} s  {said}")
             if medium is starts[0]:  # nothing is found yet
                 return
-            found = {"sigma_a": medium.sigma_a.tolist(), "sigma_s_prime": medium.sigma_s_prime.tolist()}
+            found = {
+                "sigma_a": medium.sigma_a.tolist(),
+                "sigma_s_prime": medium.sigma_s_prime.tolist(),
+            }
             write_record(kept, {"made of": made, **found})
 
         recovery = sj.recover(
@@ -142,16 +162,24 @@ class Recover:
             from splatjax.plots import plot_recovery  # loads matplotlib
 
             save_figure(
-                plot_recovery(recovery, title=f"{self.output.stem}: {counted(len(observations), 'picture')}"), self.report
+                plot_recovery(
+                    recovery, title=f"{self.output.stem}: {counted(len(observations), 'picture')}"
+                ),
+                self.report,
             )
             print(self.report)
 
     def _starts(self, channels: int) -> list[sj.Medium]:
-        """Give the media to start from: where an interrupted search had come to, if there was one."""
+        """Give the media to start from: where an interrupted search had come to, if there was
+        one.
+        """
         known = [sj.load_medium(name) for name in self.start]
         for name, medium in zip(self.start, known, strict=True):
             if medium.eta.shape[0] != channels:
-                raise ValueError(f"--start {name} has {medium.eta.shape[0]} channels, the pictures have {channels}; name another")
+                raise ValueError(
+                    f"--start {name} has {medium.eta.shape[0]} channels, the pictures have "
+                    f"{channels}; name another"
+                )
         eta = known[0].eta if self.eta is None else jnp.full_like(known[0].eta, self.eta)
         starts = [sj.Medium(medium.sigma_a, medium.sigma_s_prime, eta) for medium in known]
         kept = self._kept()
@@ -162,7 +190,9 @@ class Recover:
             note(f"{kept}: is of another search, and is not used")
             return starts
         note(f"{kept}: an interrupted search goes on")
-        return [sj.Medium(jnp.asarray(record["sigma_a"]), jnp.asarray(record["sigma_s_prime"]), eta)]
+        return [
+            sj.Medium(jnp.asarray(record["sigma_a"]), jnp.asarray(record["sigma_s_prime"]), eta)
+        ]
 
     def _effort(self, recovery: sj.Recovery) -> str:
         return f"{counted(recovery.rounds, 'round')} and {counted(recovery.steps, 'step')}"
@@ -172,7 +202,11 @@ class Recover:
 
     def _made(self) -> dict[str, Any]:
         """Give all that a search depends on."""
-        files = [self.splats, *picture_paths(self.pictures), *(material_path(name) for name in self.start)]
+        files = [
+            self.splats,
+            *picture_paths(self.pictures),
+            *(material_path(name) for name in self.start),
+        ]
         options = {
             "model": self.model.value,
             "count": self.count,
@@ -180,10 +214,19 @@ class Recover:
             "eta": self.eta,
             "specular": self.specular,
         }
-        return {"files": [fingerprint(file) for file in files], **options, "roughness": self.roughness, "splatjax": own_version()}
+        return {
+            "files": [fingerprint(file) for file in files],
+            **options,
+            "roughness": self.roughness,
+            "splatjax": own_version(),
+        }
 
-    def _suggest(self, recovery: sj.Recovery, observations: list[sj.Observation], splats: sj.Splats) -> None:
-        candidates = sj.usual_candidates(splats, observations[0].camera, observations[0].picture.shape[2])
+    def _suggest(
+        self, recovery: sj.Recovery, observations: list[sj.Observation], splats: sj.Splats
+    ) -> None:
+        candidates = sj.usual_candidates(
+            splats, observations[0].camera, observations[0].picture.shape[2]
+        )
         with stage(f"looking at {len(candidates)} pictures that could be taken next"):
             predictions = sj.next_pictures(recovery, splats, candidates, model=_MODELS[self.model])
         print("what one more picture would do, the best first:")
@@ -197,11 +240,16 @@ class Recover:
             self.output,
             profile=_MODELS[self.model](recovery.medium),
             source={
-                "provenance": f"recovered by splatjax {own_version()} from the pictures of {self.pictures.name}, "
-                f"on the shape {self.splats.name}",
+                "provenance": (
+                    f"recovered by splatjax {own_version()} from the pictures of "
+                    f"{self.pictures.name}, on the shape {self.splats.name}"
+                ),
                 "relative_error_of_sigma_a": np.asarray(errors[0]).tolist(),
                 "relative_error_of_sigma_s_prime": np.asarray(errors[1]).tolist(),
                 "chi_squared": float(recovery.chi_squared),
             },
-            fit={"variances_of": "all channels", "weights_of": "non-negative, sum held to the total reflectance"},
+            fit={
+                "variances_of": "all channels",
+                "weights_of": "non-negative, sum held to the total reflectance",
+            },
         )

@@ -29,21 +29,28 @@ def note(what: str) -> None:
 
 @contextlib.contextmanager
 def sweeps(total: int) -> Generator[Callable[[str, int], None], None, None]:
-    """Show what is being done, with how much of a total. Gives what is to be told so; where nobody looks, each is a line."""
+    """Show what is being done, with how much of a total. Gives what is to be told so; where nobody
+    looks, each is a line.
+    """
     console, begin = _console(), time.perf_counter()
     with console.status("looking") as status:
 
         def report(what: str, done: int) -> None:
             status.update(f"{what}: {done} of {total}")
             if done == total:
-                console.print(f"{what}: {total} splats, {time.perf_counter() - begin:.1f} s since the beginning", markup=False)
+                console.print(
+                    f"{what}: {total} splats, {time.perf_counter() - begin:.1f} s since the "
+                    "beginning",
+                    markup=False,
+                )
 
         yield report
 
 
 @contextlib.contextmanager
 def progress(what: str, total: int) -> Generator[Callable[[], None], None, None]:
-    """Show how many of equal steps are done, what one takes, and the time that is left. Gives what is to be called after each.
+    """Show how many of equal steps are done, what one takes, and the time that is left. Gives what
+    is to be called after each.
 
     Where nobody looks at a terminal, a line is printed for each.
     """

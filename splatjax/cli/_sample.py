@@ -19,33 +19,50 @@ class Sample(MeshMaps):
 
     The mesh is a GLB, glTF, OBJ, PLY, STL or OFF file.
 
-    Example: splatjax sample head.glb --albedo color.jpg --mm-per-unit 53 --count 683549 --output head.ply
+    Example: splatjax sample head.glb --albedo color.jpg --mm-per-unit 53 --count 683549 --output
+    head.ply
     """
 
+    #: The file of the mesh.
     mesh: tyro.conf.Positional[Path]
-    """The file of the mesh."""
+    #: Length of the file's unit, mm: 1000 for meters.
     mm_per_unit: float
-    """Length of the file's unit, mm: 1000 for meters."""
+    #: The PLY file to write.
     output: Path
-    """The PLY file to write."""
+    #: Number of splats.
     count: int = 200_000
-    """Number of splats."""
+    #: Another spread of the same quality.
     seed: int = 0
-    """Another spread of the same quality."""
+    #: Put splats where the surface is that bends as the mesh's normals do; otherwise on its flat
+    #: triangles.
     rounded: bool = True
-    """Put splats where the surface is that bends as the mesh's normals do; otherwise on its flat triangles."""
 
     def run(self) -> None:
         """Read, sample, write."""
         check_output(self.output, (".ply",))
         with stage(f"sampling {self.mesh} with {self.count} splats"):
             splats = sj.sample_mesh(
-                self.mesh, self.count, mm_per_unit=self.mm_per_unit, seed=self.seed, rounded=self.rounded, **self.worn()
+                self.mesh,
+                self.count,
+                mm_per_unit=self.mm_per_unit,
+                seed=self.seed,
+                rounded=self.rounded,
+                **self.worn(),
             )
         with stage(f"writing {self.output}"):
             sj.write_splats(self.output, splats)
-        carried = [name for name in ("albedo", "specular", "roughness") if getattr(splats, name) is not None]
+        carried = [
+            name
+            for name in ("albedo", "specular", "roughness")
+            if getattr(splats, name) is not None
+        ]
         size = np.ptp(np.asarray(splats.centers), axis=0)
-        covered = f"{splats.count} splats on {float(splats.areas.sum()):.4g} mm^2, with {', '.join(carried) or 'no maps'}"
-        note(f"{covered}; the body is {size[0]:.3g} mm wide, {size[1]:.3g} high and {size[2]:.3g} deep")
+        area = float(splats.areas.sum())
+        covered = (
+            f"{splats.count} splats on {area:.4g} mm^2, with {', '.join(carried) or 'no maps'}"
+        )
+        note(
+            f"{covered}; the body is {size[0]:.3g} mm wide, {size[1]:.3g} high and {size[2]:.3g} "
+            "deep"
+        )
         print(self.output)

@@ -18,16 +18,20 @@ from ._points import Points, SeenSurface
 
 
 class GatheredSlopes(eqx.Module):
-    """What the diffusion integrals and their denominators do per change of the logarithm of their layer's variance."""
+    """What the diffusion integrals and their denominators do per change of the logarithm of their
+    layer's variance.
+    """
 
     means: Float[Array, "gaussians channels points"]
     exits: Float[Array, "gaussians points"]
 
 
 class GatheredLight(eqx.Module):
-    r"""The light that each layer brings to points of the surface, before it is known how much of it each layer carries.
+    r"""The light that each layer brings to points of the surface, before it is known how much of it
+    each layer carries.
 
-    Weights enter after this, point by point: `exitance` costs no look at any splat, and has derivatives of every kind and order.
+    Weights enter after this, point by point: `exitance` costs no look at any splat, and has
+    derivatives of every kind and order.
 
     **Attributes:**
 
@@ -65,15 +69,19 @@ class GatheredLight(eqx.Module):
     def resolved(self) -> Float[Array, " gaussians"]:
         """Give the share of the points at which the splats carry each layer."""
         shape = (len(self.variances), len(self.area))
-        variances, area = (jnp.broadcast_to(each, shape) for each in (self.variances[:, None], self.area[None]))
+        variances, area = (
+            jnp.broadcast_to(each, shape) for each in (self.variances[:, None], self.area[None])
+        )
         return self.carried * jnp.mean(resolved_share(variances, area, self.interval), axis=1)
 
     def exitance(self, gaussians: SumOfGaussians) -> Float[Array, "channels points"]:
-        """Give the radiant exitance `sum_k w_k L_k` of a material without single scattering. Differentiable.
+        """Give the radiant exitance `sum_k w_k L_k` of a material without single scattering.
+        Differentiable.
 
         **Arguments:**
 
-        - `gaussians`: variances near those of the layers, which are moved along their slopes; without slopes they do not matter.
+        - `gaussians`: variances near those of the layers, which are moved along their slopes;
+          without slopes they do not matter.
         """
         variances, means, exits = self.variances, self.means, self.exits
         if self.slopes is not None:
@@ -110,9 +118,12 @@ def gather_light(
 
     **Arguments:** as in `diffusion_layers`.
 
-    **Returns:** the light at every point of every tile, tile by tile, and what capacity was needed over what was planned.
+    **Returns:** the light at every point of every tile, tile by tile, and what capacity was needed
+    over what was planned.
     """
-    found = diffuser.diffuse(sources, Kernels.of(variances, normalization), seen.points, seen.covered, atlas)
+    found = diffuser.diffuse(
+        sources, Kernels.of(variances, normalization), seen.points, seen.covered, atlas
+    )
     return _in_a_row(found, None, variances, seen, interval, normalization), found.needed
 
 
@@ -125,7 +136,9 @@ def gather_light_and_slopes(
     diffuser: AbstractDiffuser,
     normalization: AbstractNormalization,
 ) -> tuple[GatheredLight, Float[Array, ""]]:
-    """Diffuse as `gather_light`, and differentiate in the variances: one more accumulation per layer."""
+    """Diffuse as `gather_light`, and differentiate in the variances: one more accumulation per
+    layer.
+    """
     given = sources, variances, normalization, seen.points, seen.covered, atlas
     found, slopes = diffuse_with_slopes(diffuser, *given, variances)
     return _in_a_row(found, slopes, variances, seen, interval, normalization), found.needed
@@ -136,7 +149,12 @@ Gather: TypeAlias = Callable[..., tuple[GatheredLight, Array]]
 
 
 def _in_a_row(
-    found: Diffused, slopes: Diffused | None, variances: Array, seen: SeenSurface, interval: Array, normalization
+    found: Diffused,
+    slopes: Diffused | None,
+    variances: Array,
+    seen: SeenSurface,
+    interval: Array,
+    normalization,
 ) -> GatheredLight:
     def row(tiles: Float[Array, "tiles *rows pixels"]) -> Float[Array, "*rows points"]:
         return jnp.moveaxis(tiles, 0, -2).reshape(*tiles.shape[1:-1], -1)

@@ -9,7 +9,9 @@ from ._tree import Clusters
 
 
 class Gathering(eqx.Module):
-    r"""Sources of one layer. Energy off a cluster's center counts to first order: `G(x - o) = G(x) (1 + o x / v)`."""
+    r"""Sources of one layer. Energy off a cluster's center counts to first order: `G(x - o) = G(x)
+    (1 + o x / v)`.
+    """
 
     clusters: Clusters
     """As wide as their splats are spread, and below them."""
@@ -19,7 +21,9 @@ class Gathering(eqx.Module):
     """What makes a flat sheet one exit."""
 
     @classmethod
-    def of(cls, clusters: Clusters, variance: Float[Array, ""], depth: Float[Array, ""]) -> "Gathering":
+    def of(
+        cls, clusters: Clusters, variance: Float[Array, ""], depth: Float[Array, ""]
+    ) -> "Gathering":
         below = clusters.lowered(depth)
         wide = variance + below.spread
         return cls(below, wide, jnp.exp(0.5 * depth * depth / wide) / (2 * jnp.pi * wide))
@@ -42,7 +46,9 @@ class Gathering(eqx.Module):
     def values_and_slopes(
         self, sums: Float[Array, "rows points"], points: Float[Array, "3 points"]
     ) -> tuple[Float[Array, "values points"], Float[Array, "3 values points"]]:
-        """Give the values at points, and their slopes in space (1/mm), for a table that had slopes."""
+        """Give the values at points, and their slopes in space (1/mm), for a table that had
+        slopes.
+        """
         values, pulls = self.finish.split(sums, points)
         # grad N = sum w E (q - x) / v, and grad (N / D) = (grad N - (N / D) grad D) / D.
         gathered, count = values[-1], values.shape[0]
@@ -64,14 +70,23 @@ class MeansAndExits(eqx.Module):
     channels: int = eqx.field(static=True)
     moments: bool = eqx.field(static=True)
 
-    def __call__(self, sums: Float[Array, "rows points"], points: Float[Array, "3 points"]) -> Float[Array, "values points"]:
+    def __call__(
+        self, sums: Float[Array, "rows points"], points: Float[Array, "3 points"]
+    ) -> Float[Array, "values points"]:
         return self.split(sums, points)[0]
 
     def split(self, sums: Float[Array, "rows points"], points: Float[Array, "3 points"]):
         """Give the values, and the sums that follow theirs."""
-        energy, gathered, rest = sums[: self.channels], sums[self.channels], sums[self.channels + 1 :]
+        energy, gathered, rest = (
+            sums[: self.channels],
+            sums[self.channels],
+            sums[self.channels + 1 :],
+        )
         if self.moments:
-            moments, rest = rest[: 3 * self.channels].reshape(self.channels, 3, -1), rest[3 * self.channels :]
+            moments, rest = (
+                rest[: 3 * self.channels].reshape(self.channels, 3, -1),
+                rest[3 * self.channels :],
+            )
             energy = energy + jnp.sum(moments * points[None], axis=1)
         reached = gathered > 0
         means = energy / jnp.where(reached, gathered, 1.0)[None]
@@ -86,18 +101,22 @@ def nodes_table(
     rates: Float[Array, " nodes"],
     block: int,
 ) -> Float[Array, "blocks_and_one columns block"]:
-    """Give the table of nodes that `blended_nodes` blends, each by its area and a Gaussian of a rate (1/mm^2)."""
+    """Give the table of nodes that `blended_nodes` blends, each by its area and a Gaussian of a
+    rate (1/mm^2).
+    """
     continued = values - 0.5 * jnp.sum(slopes * centers[:, None], axis=0)
     rows = [jnp.ones_like(areas)[None], centers, continued, slopes.reshape(-1, areas.shape[0])]
     return source_table(centers, rates, jnp.concatenate(rows) * areas[None], block)
 
 
-def blended_nodes(sums: Float[Array, "rows points"], points: Float[Array, "3 points"]) -> Float[Array, "values points"]:
+def blended_nodes(
+    sums: Float[Array, "rows points"], points: Float[Array, "3 points"]
+) -> Float[Array, "values points"]:
     r"""Give the values at points from the sums over nodes near them; 0 where there is none.
 
-    A node is continued along half its slope: the whole slope errs by as much as none does, with the other sign, so that the
-    error is of third order in the distance of the nodes. Nodes lie around a point unevenly; the other half of their mean slope
-    makes up for that.
+    A node is continued along half its slope: the whole slope errs by as much as none does, with the
+    other sign, so that the error is of third order in the distance of the nodes. Nodes lie around a
+    point unevenly; the other half of their mean slope makes up for that.
     """
     count = (sums.shape[0] - 4) // 4
     weight, middle, continued = sums[0], sums[1:4], sums[4 : 4 + count]

@@ -1,8 +1,9 @@
-"""Sums of Gaussians around blocks of sources at blocks of points, with a derivative that recomputes the weights.
+"""Sums of Gaussians around blocks of sources at blocks of points, with a derivative that recomputes
+the weights.
 
-Every block of points has a list of the blocks of sources near it. Some blocks of points, one per *lane*, are swept together;
-in a *step* each lane meets the next few blocks of its list. Tables hold center, rate, and what is summed, one block of
-sources after the other.
+Every block of points has a list of the blocks of sources near it. Some blocks of points, one per
+*lane*, are swept together; in a *step* each lane meets the next few blocks of its list. Tables hold
+center, rate, and what is summed, one block of sources after the other.
 """
 
 import abc
@@ -30,7 +31,9 @@ class Steps(eqx.Module):
     """Of each sweep, its first step."""
     ends: Int[Array, " sweeps"]
     order: Int[Array, " points_blocks"]
-    """The block of points of each lane, sweep after sweep; one that holds no point may stand for several."""
+    """The block of points of each lane, sweep after sweep; one that holds no point may stand for
+    several.
+    """
 
     def lanes(self, sweep: Int[Array, ""]) -> Int[Array, " lanes"]:
         lanes = self.ids.shape[1]
@@ -38,10 +41,14 @@ class Steps(eqx.Module):
 
 
 class AbstractKernel(eqx.Module):
-    """What stands for `exp(-exponent)`. It comes down to zero at a largest exponent: of a step there is no derivative."""
+    """What stands for `exp(-exponent)`. It comes down to zero at a largest exponent: of a step
+    there is no derivative.
+    """
 
     @abc.abstractmethod
-    def __call__(self, exponent: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+    def __call__(
+        self, exponent: Float[Array, "..."]
+    ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         """Give the weight, and minus its derivative in the exponent."""
 
 
@@ -85,11 +92,15 @@ class _Rule(eqx.Module):
     kernel: AbstractKernel
     finish: Callable = eqx.field(static=True)
 
-    def finished(self, sums: Float[Array, "lanes rows points"], points: Float[Array, "lanes 3 points"]):
+    def finished(
+        self, sums: Float[Array, "lanes rows points"], points: Float[Array, "lanes 3 points"]
+    ):
         return jax.vmap(self.finish)(sums, points)
 
     def weights(self, points, sources):
-        """Give the weights, `[lanes, sources, points]`, how they fall with the exponent, offsets and squared distances."""
+        """Give the weights, `[lanes, sources, points]`, how they fall with the exponent, offsets
+        and squared distances.
+        """
         dx, dy, dz = (points[:, axis, None] - sources[:, axis, :, None] for axis in range(3))
         squared = dx * dx + dy * dy + dz * dz
         return *self.kernel(sources[:, 3, :, None] * squared), (dx, dy, dz), squared
@@ -107,15 +118,22 @@ class _Rule(eqx.Module):
 
 
 def source_table(
-    centers: Float[Array, "3 sources"], rates: Float[Array, " sources"], rows: Float[Array, "rows sources"], block: int
+    centers: Float[Array, "3 sources"],
+    rates: Float[Array, " sources"],
+    rows: Float[Array, "rows sources"],
+    block: int,
 ) -> Float[Array, "blocks_and_one columns block"]:
     """Give the table of sources, `block` of them to a block; the last block is empty."""
     columns = jnp.concatenate([centers, rates[None], rows])
-    return jnp.pad(columns.reshape(columns.shape[0], -1, block).transpose(1, 0, 2), ((0, 1), (0, 0), (0, 0)))
+    return jnp.pad(
+        columns.reshape(columns.shape[0], -1, block).transpose(1, 0, 2), ((0, 1), (0, 0), (0, 0))
+    )
 
 
 def _met(table, steps: Steps, step):
-    """Give the sources that each lane meets in a step, `[lanes, columns, sources]`, and their blocks."""
+    """Give the sources that each lane meets in a step, `[lanes, columns, sources]`, and their
+    blocks.
+    """
     ids = lax.dynamic_index_in_dim(steps.ids, step, 0, keepdims=False)
     found = table.at[ids].get(mode="promise_in_bounds")
     return jnp.moveaxis(found, 1, 2).reshape(ids.shape[0], table.shape[1], -1), ids
@@ -140,13 +158,17 @@ def _forward(rule: _Rule, steps: Steps, points, table):
 
 
 def _empty(rule: _Rule, points, table):
-    sums = jax.ShapeDtypeStruct((points.shape[0], table.shape[1] - 4, points.shape[2]), points.dtype)
+    sums = jax.ShapeDtypeStruct(
+        (points.shape[0], table.shape[1] - 4, points.shape[2]), points.dtype
+    )
     found = jax.eval_shape(rule.finished, sums, points)
     return zeros_after(table, found.shape, found.dtype)
 
 
 def _derivative(rule: _Rule, steps: Steps, points, table, d_table):
-    """Give what was found, and how it changes with the table; one look at each weight serves both."""
+    """Give what was found, and how it changes with the table; one look at each weight serves
+    both.
+    """
     count = table.shape[1] - 4
 
     def sweep(i, lanes):
@@ -156,13 +178,21 @@ def _derivative(rule: _Rule, steps: Steps, points, table, d_table):
             (sources, _), (moved, _) = _met(table, steps, step), _met(d_table, steps, step)
             weights, falls, offsets, squared = rule.weights(here, sources)
             nearer = sum(offset * moved[:, axis, :, None] for axis, offset in enumerate(offsets))
-            d_weights = falls * (2 * sources[:, 3, :, None] * nearer - moved[:, 3, :, None] * squared)
-            both = jnp.einsum("lrs,lsp->lrp", jnp.concatenate([sources[:, 4:], moved[:, 4:]], axis=1), weights)
-            return sums + both.at[:, count:].add(jnp.einsum("lrs,lsp->lrp", sources[:, 4:], d_weights))
+            d_weights = falls * (
+                2 * sources[:, 3, :, None] * nearer - moved[:, 3, :, None] * squared
+            )
+            both = jnp.einsum(
+                "lrs,lsp->lrp", jnp.concatenate([sources[:, 4:], moved[:, 4:]], axis=1), weights
+            )
+            return sums + both.at[:, count:].add(
+                jnp.einsum("lrs,lsp->lrp", sources[:, 4:], d_weights)
+            )
 
         start = jnp.zeros((here.shape[0], 2 * count, here.shape[2]), here.dtype)
         sums = lax.fori_loop(steps.begins[i], steps.ends[i], add, start)
-        values, slopes = jax.jvp(lambda sums: rule.finished(sums, here), (sums[:, :count],), (sums[:, count:],))
+        values, slopes = jax.jvp(
+            lambda sums: rule.finished(sums, here), (sums[:, :count],), (sums[:, count:],)
+        )
         return jnp.concatenate([values, slopes], axis=1)
 
     empty = _empty(rule, points, table)
@@ -174,7 +204,9 @@ def _backward(rule: _Rule, steps: Steps, points, table, sums, cotangents):
     def sweep(i, carry):
         d_points, d_table = carry
         lanes = steps.lanes(i)
-        here, found, cotangent = (each.at[lanes].get(mode="promise_in_bounds") for each in (points, sums, cotangents))
+        here, found, cotangent = (
+            each.at[lanes].get(mode="promise_in_bounds") for each in (points, sums, cotangents)
+        )
         _, pull = jax.vjp(rule.finished, found, here)
         cotangent, d_finish = pull(cotangent)
 
@@ -182,14 +214,20 @@ def _backward(rule: _Rule, steps: Steps, points, table, sums, cotangents):
             d_here, d_table = carry
             sources, ids = _met(table, steps, step)
             weights, falls, _, _ = rule.weights(here, sources)
-            # What an exponent's cotangent is multiplied by is a polynomial in point and source, seen from one of the sources:
-            # its moments over the points, and over the sources, are all that is needed.
+            # What an exponent's cotangent is multiplied by is a polynomial in point and source,
+            # seen from one of the sources: its moments over the points, and over the sources, are
+            # all that is needed.
             origin = sources[:, :3, :1]
             x, y, rate = here - origin, sources[:, :3] - origin, sources[:, 3:4]
-            # written out, so that it is done where the weights are: half the time of a product of matrices
-            pairs = zip(jnp.unstack(sources[:, 4:], axis=1), jnp.unstack(cotangent, axis=1), strict=True)
+            # written out, so that it is done where the weights are: half the time of a product of
+            # matrices
+            pairs = zip(
+                jnp.unstack(sources[:, 4:], axis=1), jnp.unstack(cotangent, axis=1), strict=True
+            )
             pulls = falls * sum(row[:, :, None] * each[:, None] for row, each in pairs)
-            of_points = jnp.concatenate([jnp.ones_like(x[:, :1]), x, jnp.sum(x * x, axis=1, keepdims=True)], axis=1)
+            of_points = jnp.concatenate(
+                [jnp.ones_like(x[:, :1]), x, jnp.sum(x * x, axis=1, keepdims=True)], axis=1
+            )
             moments = jnp.einsum("lkp,lsp->lks", of_points, pulls)
             d_rows = jnp.einsum("lrp,lsp->lrs", cotangent, weights)
             d_centers = 2 * rate * (moments[:, 1:4] - y * moments[:, :1])
@@ -240,15 +278,19 @@ def gaussian_sums(
     table: Float[Array, "blocks_and_one columns block"],
     steps: Steps,
     kernel: AbstractKernel,
-    finish: Callable[[Float[Array, "rows points"], Float[Array, "3 points"]], Float[Array, "values points"]],
+    finish: Callable[
+        [Float[Array, "rows points"], Float[Array, "3 points"]], Float[Array, "values points"]
+    ],
 ) -> Float[Array, "points_blocks values points"]:
-    r"""Give what follows at every point from `sum_j rows_j exp(-rate_j |x - p_j|^2)`, over the blocks of sources it meets.
+    r"""Give what follows at every point from `sum_j rows_j exp(-rate_j |x - p_j|^2)`, over the
+    blocks of sources it meets.
 
     **Arguments:**
 
     - `points`: `x`, mm; points that do not count may lie far away. Differentiable.
     - `table`: from `source_table`: `p_j` (mm), `rate_j` (1/mm^2) and `rows_j`. Differentiable.
-    - `kernel`: what stands for `exp`; terms beyond its rim are left out, whatever the lists hold. Static.
+    - `kernel`: what stands for `exp`; terms beyond its rim are left out, whatever the lists hold.
+      Static.
     - `finish`: makes values of sums and points. Static.
 
     **Returns:** 0 for blocks of points that no sweep visits.
@@ -261,12 +303,18 @@ def gaussian_sums_forward(
     table: Float[Array, "blocks_and_one columns block"],
     steps: Steps,
     kernel: AbstractKernel,
-    finish: Callable[[Float[Array, "rows points"], Float[Array, "3 points"]], Float[Array, "values points"]],
+    finish: Callable[
+        [Float[Array, "rows points"], Float[Array, "3 points"]], Float[Array, "values points"]
+    ],
 ) -> Float[Array, "points_blocks values points"]:
-    """Give what `gaussian_sums` gives, with forward mode in the table and not reverse mode; the points are constants."""
+    """Give what `gaussian_sums` gives, with forward mode in the table and not reverse mode; the
+    points are constants.
+    """
     return _sums_forward(_Rule(kernel, finish), steps, lax.stop_gradient(points), table)
 
 
-def as_they_are(sums: Float[Array, "rows points"], points: Float[Array, "3 points"]) -> Float[Array, "rows points"]:
+def as_they_are(
+    sums: Float[Array, "rows points"], points: Float[Array, "3 points"]
+) -> Float[Array, "rows points"]:
     """Finish with the sums themselves."""
     return sums

@@ -18,8 +18,8 @@ PLACES = 64
 def irregularity(splats: Splats) -> Float[Array, ""]:
     r"""Give how unevenly the splats are spread: 0 on a regular grid, about 0.5 at random.
 
-    It is the relative standard deviation of the distance to the nearest splat over the root of the area, on 64 splats.
-    A number of the geometry's; not differentiated.
+    It is the relative standard deviation of the distance to the nearest splat over the root of the
+    area, on 64 splats. A number of the geometry's; not differentiated.
     """
     if splats.count < 2:
         return jnp.zeros((), splats.centers.dtype)
@@ -35,15 +35,23 @@ def irregularity(splats: Splats) -> Float[Array, ""]:
     return jnp.std(distance) / jnp.maximum(jnp.mean(distance), jnp.finfo(distance.dtype).tiny)
 
 
-def handover_interval(unevenness: Float[Array, ""], settings: DiffusionSettings) -> Float[Array, "2"]:
-    """Give standard deviations per spacing between which a layer passes from the surface to the diffusion integral."""
+def handover_interval(
+    unevenness: Float[Array, ""], settings: DiffusionSettings
+) -> Float[Array, "2"]:
+    """Give standard deviations per spacing between which a layer passes from the surface to the
+    diffusion integral.
+    """
     scattered = jnp.clip(unevenness / 0.05, 0, 1)
     regular = jnp.asarray(settings.regular, unevenness.dtype)
     return regular + scattered * (jnp.asarray(settings.scattered, unevenness.dtype) - regular)
 
 
-def resolved_share(variance: Float[Array, "..."], area: Float[Array, "..."], interval: Float[Array, "2"]) -> Float[Array, "..."]:
-    """Give how much of a layer is the diffusion integral: a smooth step of variance over area per splat."""
+def resolved_share(
+    variance: Float[Array, "..."], area: Float[Array, "..."], interval: Float[Array, "2"]
+) -> Float[Array, "..."]:
+    """Give how much of a layer is the diffusion integral: a smooth step of variance over area per
+    splat.
+    """
     begin, end = interval[0] ** 2, interval[1] ** 2
     t = jnp.clip((variance / area - begin) / (end - begin), 0, 1)
     return t * t * (3 - 2 * t)

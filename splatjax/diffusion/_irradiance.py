@@ -16,12 +16,15 @@ def entering_irradiance(
     entering: Callable[[Float[Array, " splats"]], Float[Array, "#channels splats"]],
     channels: int,
 ) -> Float[Array, "channels splats"]:
-    r"""Give the irradiance that enters the surface, `sum_lights irradiance max(n . wi, 0) lit entering(n . wi)`.
+    r"""Give the irradiance that enters the surface, `sum_lights irradiance max(n . wi, 0) lit
+    entering(n . wi)`.
 
     **Arguments:**
 
-    - `lit`: for each group the share of each light that reaches each splat; `None` for lights that cast no shadows.
-    - `entering`: the share that is left to diffuse, as a function of the cosine; one row for all channels, or one for each.
+    - `lit`: for each group the share of each light that reaches each splat; `None` for lights that
+      cast no shadows.
+    - `entering`: the share that is left to diffuse, as a function of the cosine; one row for all
+      channels, or one for each.
 
     **Returns:** linear in the lights. Differentiable in everything; the horizon is a kink.
     """
@@ -32,4 +35,6 @@ def entering_irradiance(
         received = cosine if share is None else cosine * share
         return irradiance.T * (received[None] * entering(cosine))
 
-    return sum_over_lights(groups, lit, entering_of, jnp.zeros((channels, points.shape[0]), points.dtype))
+    return sum_over_lights(
+        groups, lit, entering_of, jnp.zeros((channels, points.shape[0]), points.dtype)
+    )

@@ -7,18 +7,23 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 _SLACK = 1e-5
-_NOTHING = 1e-12  # of the light: what is left for the widest layers, when their odds are not asked for
+_NOTHING = (
+    1e-12  # of the light: what is left for the widest layers, when their odds are not asked for
+)
 _ROUNDING = 0.05  # of a flat sheet's exits: below this excess the gain rises from 1 quadratically
 
 
 class AbstractNormalization(eqx.Module):
-    r"""How light is shared where a body is thin or curved. A layer is the mean over the splats around, times a gain:
+    r"""How light is shared where a body is thin or curved. A layer is the mean over the splats
+    around, times a gain:
 
-        L_k(x) = gain_k(x) sum_j A_j G(v_k, |x - q_j|) E_j / sum_j A_j G(v_k, |x - q_j|),   q_j = p_j - depth_k n_j
+        L_k(x) = gain_k(x) sum_j A_j G(v_k, |x - q_j|) E_j / sum_j A_j G(v_k, |x - q_j|),   q_j =
+        p_j - depth_k n_j
 
     **Attributes:**
 
-    - `depth`: how far below its splat the source of a layer lies, in standard deviations of the layer. Static.
+    - `depth`: how far below its splat the source of a layer lies, in standard deviations of the
+      layer. Static.
     """
 
     depth: eqx.AbstractVar[float]
@@ -39,16 +44,19 @@ class AbstractNormalization(eqx.Module):
 
         **Arguments:**
 
-        - `exits`: `sum_j A_j G(v_k, |x - q_j|)` over what it is on a flat sheet: 1 there, 2 in a sheet much thinner than the
-          layer is wide, less at open edges.
+        - `exits`: `sum_j A_j G(v_k, |x - q_j|)` over what it is on a flat sheet: 1 there, 2 in a
+          sheet much thinner than the layer is wide, less at open edges.
         - `variances`: mm^2; only their order counts.
-        - `energies`: weights times the albedo there: the share of the light that leaves a flat piece as each layer.
+        - `energies`: weights times the albedo there: the share of the light that leaves a flat
+          piece as each layer.
         - `once`: the share that leaves as single scattering.
         """
 
 
 class PlainMean(AbstractNormalization):
-    """The paper's: the mean over the splats around, as they lie. Constants are kept whatever the shape."""
+    """The paper's: the mean over the splats around, as they lie. Constants are kept whatever the
+    shape.
+    """
 
     depth: float = eqx.field(static=True, default=0.0)
 
@@ -57,21 +65,24 @@ class PlainMean(AbstractNormalization):
 
 
 class ExitOdds(AbstractNormalization):
-    r"""Light leaves a thin or convex part sooner, so less of it is absorbed: twice the ways out, twice the odds of leaving.
+    r"""Light leaves a thin or convex part sooner, so less of it is absorbed: twice the ways out,
+    twice the odds of leaving.
 
-    Light spreads from layer to layer, the narrow ones first. Of what is still inside, the share `p_k = w_k / (W_k + 1 - W)`
-    leaves a flat surface as layer k, where `W_k` is the energy of the layers as wide or wider and `W` that of all and of single
-    scattering, each times the albedo. With `S_k` exits for one the odds `p_k / (1 - p_k)` grow S_k-fold, and the wider layers
-    have what is left:
+    Light spreads from layer to layer, the narrow ones first. Of what is still inside, the share
+    `p_k = w_k / (W_k + 1 - W)` leaves a flat surface as layer k, where `W_k` is the energy of the
+    layers as wide or wider and `W` that of all and of single scattering, each times the albedo.
+    With `S_k` exits for one the odds `p_k / (1 - p_k)` grow S_k-fold, and the wider layers have
+    what is left:
 
         gain_k = S_k / prod_(j <= k) (1 + p_j (S_j - 1))    where S > 1; S counts as 1 elsewhere
 
-    On flat pieces and at open edges the gain is 1. Of weights that are not negative and sum to one or less never more leaves than
-    came, `sum_k w_k gain_k <= 1`, and from what absorbs nothing (`W = 1`) all of it. Negative weights, as a free fit may have,
-    count as none. The corner at `S = 1` is rounded over 0.05.
+    On flat pieces and at open edges the gain is 1. Of weights that are not negative and sum to one
+    or less never more leaves than came, `sum_k w_k gain_k <= 1`, and from what absorbs nothing (`W
+    = 1`) all of it. Negative weights, as a free fit may have, count as none. The corner at `S = 1`
+    is rounded over 0.05.
 
-    The source lies below its splat, since the light that leaves has been inside: what faces away is nearer through a thin
-    part, and what lies across a gap of air is farther.
+    The source lies below its splat, since the light that leaves has been inside: what faces away is
+    nearer through a thin part, and what lies across a gap of air is farther.
 
     **Source:** fitted to path tracing: docs/bodies.md.
     """
@@ -81,9 +92,13 @@ class ExitOdds(AbstractNormalization):
     def gain(self, exits, variances, energies, once):
         energies = jnp.where(energies >= 0, energies, 0.0)
         absorbed = 1 - jnp.sum(energies, axis=0) - once
-        absorbed = jnp.where(absorbed >= -_SLACK, absorbed, 0.0)[None]  # white is white to rounding: not at a corner
+        absorbed = jnp.where(absorbed >= -_SLACK, absorbed, 0.0)[
+            None
+        ]  # white is white to rounding: not at a corner
         rank = jnp.argsort(jnp.argsort(variances))
-        upto = (rank[None] <= rank[:, None]).astype(exits.dtype)  # of row k: the layers that are not wider
+        upto = (rank[None] <= rank[:, None]).astype(
+            exits.dtype
+        )  # of row k: the layers that are not wider
         inside = jnp.tensordot(upto.T, energies, 1) + absorbed
         leaving = energies / jnp.where(inside > _NOTHING, inside, 1.0)
         more = jnp.maximum(exits - 1, 0)

@@ -10,11 +10,15 @@ _TOGETHER = 64 * BLOCK  # split side by side from here on
 
 
 def compact_order(points: np.ndarray) -> np.ndarray:
-    """Give the order `[points]` of a k-d tree whose leaves hold `BLOCK` points, but the last, and are sorted down to eighths.
+    """Give the order `[points]` of a k-d tree whose leaves hold `BLOCK` points, but the last, and
+    are sorted down to eighths.
 
     **Arguments:** `points`: `[points, 3]`.
     """
-    order, place = np.arange(len(points)), np.array(points.T, np.float32, order="C")  # turned together: near in memory
+    order, place = (
+        np.arange(len(points)),
+        np.array(points.T, np.float32, order="C"),
+    )  # turned together: near in memory
     todo = [(0, len(points))]
     while todo:
         begin, end = todo.pop()
@@ -34,11 +38,15 @@ def compact_order(points: np.ndarray) -> np.ndarray:
 
 
 def _halve(order: np.ndarray, place: np.ndarray, size: int) -> None:
-    """Split parts of one size in halves, along their longest axes, down to eighths of a block. In place."""
+    """Split parts of one size in halves, along their longest axes, down to eighths of a block. In
+    place.
+    """
     while size > BLOCK // 8:
         parts = place.reshape(3, -1, size)
         longest = np.argmax(np.ptp(parts, axis=2), axis=0)
         rows = np.arange(parts.shape[1])
-        turn = (np.argpartition(parts[longest, rows], size // 2, axis=1) + rows[:, None] * size).reshape(-1)
+        turn = (
+            np.argpartition(parts[longest, rows], size // 2, axis=1) + rows[:, None] * size
+        ).reshape(-1)
         order[:], place[:] = order[turn], place[:, turn]
         size //= 2

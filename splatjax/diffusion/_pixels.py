@@ -6,7 +6,16 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
 from splatjax.devices import Devices
-from splatjax.splatting import SIDE, AbstractView, Atlas, BinCapacity, Bins, TileGrid, TileRanges, bin_items
+from splatjax.splatting import (
+    SIDE,
+    AbstractView,
+    Atlas,
+    BinCapacity,
+    Bins,
+    TileGrid,
+    TileRanges,
+    bin_items,
+)
 
 from ._gaussian_sums import Steps
 from ._neighbors import Boxes
@@ -31,7 +40,11 @@ class Pixels(eqx.Module):
 
     @classmethod
     def of(
-        cls, points: Float[Array, "tiles 3 points"], covered: Bool[Array, "tiles points"], origin: Float[Array, "3"], atlas: Atlas
+        cls,
+        points: Float[Array, "tiles 3 points"],
+        covered: Bool[Array, "tiles points"],
+        origin: Float[Array, "3"],
+        atlas: Atlas,
     ) -> "Pixels":
         seen = jnp.where(covered[:, None], points - origin[None, :, None], FAR)
         return cls(jnp.pad(seen, ((0, 1), (0, 0), (0, 0)), constant_values=FAR), origin, atlas)
@@ -39,14 +52,30 @@ class Pixels(eqx.Module):
     def of_all(self, devices: Devices) -> "Pixels":
         """Give the points of all devices: each has its own share."""
         tiles = devices.everything(self.tiles[:-1])
-        return Pixels(jnp.pad(tiles, ((0, 1), (0, 0), (0, 0)), constant_values=FAR), self.origin, self.atlas.of_all(devices))
+        return Pixels(
+            jnp.pad(tiles, ((0, 1), (0, 0), (0, 0)), constant_values=FAR),
+            self.origin,
+            self.atlas.of_all(devices),
+        )
 
-    def bins(self, centers, there, reach: Float[Array, " sources"], block: int, slots: int, capacity: BinCapacity) -> Bins:
-        """List for each tile the blocks of sources within reach (mm); for the surface behind their numbers go on."""
+    def bins(
+        self,
+        centers,
+        there,
+        reach: Float[Array, " sources"],
+        block: int,
+        slots: int,
+        capacity: BinCapacity,
+    ) -> Bins:
+        """List for each tile the blocks of sources within reach (mm); for the surface behind their
+        numbers go on.
+        """
         view = self.atlas.view
         grid = tile_grid(view.width, view.height, slots)
         centers, reach = stop_gradient(centers), stop_gradient(reach)
-        ranges = block_ranges(centers + self.origin[:, None], there, reach, block, view, self.atlas.farthest)
+        ranges = block_ranges(
+            centers + self.origin[:, None], there, reach, block, view, self.atlas.farthest
+        )
         blocks, tiles = Boxes.around(centers, there, block), self.boxes
         farthest = jnp.max(jnp.where(there, reach, 0.0).reshape(-1, block), axis=1)
         places = self._places(grid)
@@ -63,7 +92,9 @@ class Pixels(eqx.Module):
 
     def _places(self, grid: TileGrid) -> Int[Array, " tiles"]:
         places = self.atlas.places
-        return jnp.pad(places, (0, grid.tiles - places.shape[0]), constant_values=self.tiles.shape[0] - 1)
+        return jnp.pad(
+            places, (0, grid.tiles - places.shape[0]), constant_values=self.tiles.shape[0] - 1
+        )
 
     @property
     def chunks(self) -> int:
@@ -82,7 +113,12 @@ class Pixels(eqx.Module):
         sweeps = bins.places // lanes
         ids = jnp.where(bins.ids < 2 * blocks, bins.ids % blocks, blocks)
         places = self._places(tile_grid(self.atlas.view.width, self.atlas.view.height, 1))
-        return Steps(ids, bins.first_block[:sweeps], bins.first_block[1 : sweeps + 1], places[bins.order[: sweeps * lanes]])
+        return Steps(
+            ids,
+            bins.first_block[:sweeps],
+            bins.first_block[1 : sweeps + 1],
+            places[bins.order[: sweeps * lanes]],
+        )
 
 
 def block_ranges(
@@ -93,7 +129,9 @@ def block_ranges(
     view: AbstractView,
     farthest: Float[Array, "surfaces down across"],
 ) -> TileRanges:
-    """Find the tiles of both surfaces within reach of any source of each block. Not differentiated."""
+    """Find the tiles of both surfaces within reach of any source of each block. Not
+    differentiated.
+    """
     reach = stop_gradient(reach)
     left, right, top, bottom, depth = view.sphere_box(centers, reach)
 
@@ -103,7 +141,9 @@ def block_ranges(
     left, top, near = (of_block(jnp.min, each, jnp.inf) for each in (left, top, depth - reach))
     right, bottom = (of_block(jnp.max, each, -jnp.inf) for each in (right, bottom))
     grid = TileGrid(view.width, view.height)
-    ranges = TileRanges.of(left, right, top, bottom, jnp.any(there.reshape(-1, block), axis=1), grid)
+    ranges = TileRanges.of(
+        left, right, top, bottom, jnp.any(there.reshape(-1, block), axis=1), grid
+    )
     found = []
     for surface, far in enumerate(farthest):
         keep = near <= _farthest_in(ranges, far)
@@ -113,7 +153,9 @@ def block_ranges(
 
 
 def _farthest_in(ranges: TileRanges, far: Float[Array, "down across"]):
-    """Give at least the maximum over each rectangle: that over the smallest square of a power of two that spans it."""
+    """Give at least the maximum over each rectangle: that over the smallest square of a power of
+    two that spans it.
+    """
     span = jnp.maximum(ranges.across, ranges.down)
     pyramid, size = [far], 1
     while size < max(far.shape):
@@ -122,10 +164,17 @@ def _farthest_in(ranges: TileRanges, far: Float[Array, "down across"]):
         h, w = last.shape
         pyramid.append(
             jnp.maximum(
-                jnp.maximum(last, shifted[size : size + h, :w]), jnp.maximum(shifted[:h, size : size + w], shifted[size:, size:])
+                jnp.maximum(last, shifted[size : size + h, :w]),
+                jnp.maximum(shifted[:h, size : size + w], shifted[size:, size:]),
             )
         )
         size *= 2
     stack = jnp.stack(pyramid)  # level l: maximum over the 2^l tiles right of and below each
-    level = jnp.clip(jnp.ceil(jnp.log2(jnp.maximum(span, 1).astype(jnp.float32))).astype(jnp.int32), 0, stack.shape[0] - 1)
-    return stack[level, jnp.minimum(ranges.top, far.shape[0] - 1), jnp.minimum(ranges.left, far.shape[1] - 1)]
+    level = jnp.clip(
+        jnp.ceil(jnp.log2(jnp.maximum(span, 1).astype(jnp.float32))).astype(jnp.int32),
+        0,
+        stack.shape[0] - 1,
+    )
+    return stack[
+        level, jnp.minimum(ranges.top, far.shape[0] - 1), jnp.minimum(ranges.left, far.shape[1] - 1)
+    ]

@@ -1,4 +1,6 @@
-"""The layers of surface points, once the light around them is gathered: handover and gain, point by point."""
+"""The layers of surface points, once the light around them is gathered: handover and gain, point by
+point.
+"""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,7 +13,9 @@ from ._normalization import AbstractNormalization
 
 
 class SeenSurface(eqx.Module):
-    """What the pixels see, with what pass 3 blended for the layers that the splats are too far apart to carry."""
+    """What the pixels see, with what pass 3 blended for the layers that the splats are too far
+    apart to carry.
+    """
 
     points: Float[Array, "tiles 3 pixels"]
     """mm."""
@@ -24,7 +28,9 @@ class SeenSurface(eqx.Module):
 
 
 class Points(eqx.Module):
-    """All that makes the layers of surface points; points, and channels, do not know of each other."""
+    """All that makes the layers of surface points; points, and channels, do not know of each
+    other.
+    """
 
     weights: Float[Array, "gaussians channels #tiles #pixels"]
     variances: Float[Array, "gaussians #channels #tiles #pixels"]
@@ -54,17 +60,33 @@ class Points(eqx.Module):
         )
 
     def per_channel(self) -> "Points":
-        """Give every pixel and channel numbers of its own, so that one derivative is that of all."""
-        own = [jnp.broadcast_to(each, self.means.shape) for each in (self.weights, self.variances, self.exits)]
+        """Give every pixel and channel numbers of its own, so that one derivative is that of
+        all.
+        """
+        own = [
+            jnp.broadcast_to(each, self.means.shape)
+            for each in (self.weights, self.variances, self.exits)
+        ]
         return eqx.tree_at(lambda at: (at.weights, at.variances, at.exits), self, own)
 
     def layers(
-        self, interval: Float[Array, "2"], normalization: AbstractNormalization, order: Float[Array, " gaussians"]
-    ) -> tuple[Float[Array, "gaussians channels tiles pixels"], Float[Array, "gaussians #channels tiles pixels"]]:
-        resolved = resolved_share(self.variances, self.area[None, None], interval) * self.carried[:, None, None, None]
+        self,
+        interval: Float[Array, "2"],
+        normalization: AbstractNormalization,
+        order: Float[Array, " gaussians"],
+    ) -> tuple[
+        Float[Array, "gaussians channels tiles pixels"],
+        Float[Array, "gaussians #channels tiles pixels"],
+    ]:
+        resolved = (
+            resolved_share(self.variances, self.area[None, None], interval)
+            * self.carried[:, None, None, None]
+        )
         resolved = jnp.where(self.exits > 0, resolved, 0.0)  # no splat within reach
         own = self.irradiance[None]
         # Splats too far apart to carry a layer do not count its exits either.
         exits = 1 + resolved * (self.exits - 1)
         means = own + resolved * (self.means - own)
-        return normalization.gain(exits, order, self.weights * self.albedo[None], self.once * self.albedo) * means, resolved
+        return normalization.gain(
+            exits, order, self.weights * self.albedo[None], self.once * self.albedo
+        ) * means, resolved

@@ -6,10 +6,12 @@ from ._normalization import AbstractNormalization, ExitOdds
 
 
 class DiffusionSettings(eqx.Module):
-    r"""How layers are normalized, and where one is too narrow for the splats. Lengths in spacings (the root of a splat's area).
+    r"""How layers are normalized, and where one is too narrow for the splats. Lengths in spacings
+    (the root of a splat's area).
 
-    Below some width, in standard deviations per spacing, a layer is the surface's own irradiance; from another on it is the
-    diffusion integral, in between a smooth blend. Splats on a regular grid carry narrower layers than scattered ones.
+    Below some width, in standard deviations per spacing, a layer is the surface's own irradiance;
+    from another on it is the diffusion integral, in between a smooth blend. Splats on a regular
+    grid carry narrower layers than scattered ones.
 
     **Attributes:**
 

@@ -1,4 +1,6 @@
-"""Pass 4 with splats that come a part at a time: each part adds to what the pixels gather, and is forgotten."""
+"""Pass 4 with splats that come a part at a time: each part adds to what the pixels gather, and is
+forgotten.
+"""
 
 import dataclasses
 import math
@@ -45,8 +47,9 @@ class StreamedRoom:
 class StreamedSums(eqx.Module):
     r"""What the pixels gather of every layer, part by part.
 
-    The cells of a part are its own, so that one which two parts share counts as two: never coarser than the cells of all splats
-    together. Every pixel gathers for itself. Nothing is kept of a part but the sums, which do not grow with the number of splats.
+    The cells of a part are its own, so that one which two parts share counts as two: never coarser
+    than the cells of all splats together. Every pixel gathers for itself. Nothing is kept of a part
+    but the sums, which do not grow with the number of splats.
     """
 
     diffuser: ClusterDiffuser
@@ -74,10 +77,16 @@ class StreamedSums(eqx.Module):
         - `interval`: from `handover_interval`.
         """
         shares = np.asarray(resolved_share(kernels.variances * diffuser.margin, fine, interval))
-        edges = diffuser.edges(np.asarray(kernels.variances, np.float64) / diffuser.margin, spacing, shares > 0)
+        edges = diffuser.edges(
+            np.asarray(kernels.variances, np.float64) / diffuser.margin, spacing, shares > 0
+        )
         layers = tuple(
-            StreamedLayer(variance, depth, float(edge), diffuser.support(float(share)), bool(share > 0))
-            for variance, depth, edge, share in zip(kernels.variances, kernels.depths, edges, shares, strict=True)
+            StreamedLayer(
+                variance, depth, float(edge), diffuser.support(float(share)), bool(share > 0)
+            )
+            for variance, depth, edge, share in zip(
+                kernels.variances, kernels.depths, edges, shares, strict=True
+            )
         )
         return cls(diffuser, layers, pixels, (None,) * len(layers))
 
@@ -92,8 +101,12 @@ class StreamedSums(eqx.Module):
         found = [0.0]
         for layer in self.layers:
             depth = float(layer.depth)
-            across = math.sqrt(3) * sum(cell for cell in self.cells if cell <= layer.edge)  # a cell holds cells, by their centers
-            spread = 0.5 * (across + 2 * depth) ** 2 if layer.edge > 0 else 0.0  # of splats that sink, each along its normal
+            across = math.sqrt(3) * sum(
+                cell for cell in self.cells if cell <= layer.edge
+            )  # a cell holds cells, by their centers
+            spread = (
+                0.5 * (across + 2 * depth) ** 2 if layer.edge > 0 else 0.0
+            )  # of splats that sink, each along its normal
             if layer.carried:
                 found.append(depth + layer.support * math.sqrt(float(layer.variance) + spread))
         return max(found)
@@ -107,7 +120,10 @@ class StreamedSums(eqx.Module):
         cells = self.cells
         tree = ClusterTree.build(sources.centers.T, sources.normals.T, cells)
         held = room.counts or (0,) * len(tree.counts)
-        counts = tuple(had if count <= had else _roomier(count) for count, had in zip(tree.counts, held, strict=True))
+        counts = tuple(
+            had if count <= had else _roomier(count)
+            for count, had in zip(tree.counts, held, strict=True)
+        )
         levels = _levels(tree.with_room(counts), sources, self.pixels.origin)
         bare = dataclasses.replace(self, totals=())
         capacities, totals = [], []
@@ -118,7 +134,9 @@ class StreamedSums(eqx.Module):
                 continue
             level = cells.index(layer.edge) + 1 if layer.edge > 0 else 0
             held = room.capacities[i] if room.capacities else None
-            added, needed = (None, 2.0) if held is None else _added(bare, layer, levels[level], held, total)
+            added, needed = (
+                (None, 2.0) if held is None else _added(bare, layer, levels[level], held, total)
+            )
             if needed > 1:
                 found = self.diffuser.capacity_at(
                     self.pixels.origin,
@@ -133,7 +151,9 @@ class StreamedSums(eqx.Module):
                 added, _ = _added(bare, layer, levels[level], held, total)
             capacities.append(held)
             totals.append(added)
-        return dataclasses.replace(self, totals=tuple(totals)), StreamedRoom(counts, tuple(capacities))
+        return dataclasses.replace(self, totals=tuple(totals)), StreamedRoom(
+            counts, tuple(capacities)
+        )
 
     def found(self, channels: int) -> Diffused:
         """Give the diffusion integrals of all parts together."""
@@ -146,15 +166,22 @@ class StreamedSums(eqx.Module):
             for layer, total in zip(self.layers, self.totals, strict=True)
         ]
         values = jnp.stack(values, axis=1)
-        return Diffused(values[:, :, :channels], values[:, :, channels], carried, jnp.zeros((), carried.dtype))
+        return Diffused(
+            values[:, :, :channels], values[:, :, channels], carried, jnp.zeros((), carried.dtype)
+        )
 
 
 @eqx.filter_jit
 def _within_reach(pixels: Pixels, splats: Splats, reach: float) -> Bool[Array, ""]:
-    """Say whether the box around splats is within reach (mm) of the box around any tile's points."""
+    """Say whether the box around splats is within reach (mm) of the box around any tile's
+    points.
+    """
     there, tiles = (splats.areas > 0)[None], pixels.boxes
     centers = splats.centers.T - pixels.origin[:, None]
-    low, high = (jnp.min(jnp.where(there, sign * centers, jnp.inf), axis=1, keepdims=True) for sign in (1, -1))
+    low, high = (
+        jnp.min(jnp.where(there, sign * centers, jnp.inf), axis=1, keepdims=True)
+        for sign in (1, -1)
+    )
     gaps = jnp.maximum(jnp.maximum(tiles.low + high, low - tiles.high), 0)
     return jnp.any(jnp.sum(gaps * gaps, axis=0) <= reach * reach)
 
@@ -169,9 +196,13 @@ def _levels(tree: ClusterTree, sources: Sources, origin: Float[Array, "3"]) -> l
 
 
 @eqx.filter_jit
-def _added(sums: StreamedSums, layer: StreamedLayer, clusters: Clusters, capacity: BinCapacity, total):
+def _added(
+    sums: StreamedSums, layer: StreamedLayer, clusters: Clusters, capacity: BinCapacity, total
+):
     gathering = Gathering.of(clusters, layer.variance, layer.depth)
-    found, needed = sums.diffuser.at_pixels(gathering, layer.support, capacity, sums.pixels, as_they_are)
+    found, needed = sums.diffuser.at_pixels(
+        gathering, layer.support, capacity, sums.pixels, as_they_are
+    )
     return found if total is None else total + found, needed
 
 

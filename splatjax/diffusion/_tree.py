@@ -21,9 +21,13 @@ class Clusters(eqx.Module):
     areas: Float[Array, " clusters"]
     irradiance: Float[Array, "channels clusters"]
     spread: Float[Array, " clusters"]
-    """Half the mean squared distance of the splats from the center: the variance per axis of a flat cluster, mm^2."""
+    """Half the mean squared distance of the splats from the center: the variance per axis of a flat
+    cluster, mm^2.
+    """
     moments: Float[Array, "channels 3 clusters"] | None
-    """Where the energy lies: the sum of area, irradiance and offset from the center. `None` for single splats: nothing."""
+    """Where the energy lies: the sum of area, irradiance and offset from the center. `None` for
+    single splats: nothing.
+    """
     turns: Float[Array, "channels 3 clusters"] | None
     """The same of the offset from the mean normal."""
     opening: Float[Array, " clusters"]
@@ -34,31 +38,70 @@ class Clusters(eqx.Module):
     @classmethod
     def of(cls, sources: Sources) -> "Clusters":
         none = jnp.zeros_like(sources.areas)
-        return cls(sources.centers, sources.normals, sources.areas, sources.irradiance, none, None, None, none, none)
+        return cls(
+            sources.centers,
+            sources.normals,
+            sources.areas,
+            sources.irradiance,
+            none,
+            None,
+            None,
+            none,
+            none,
+        )
 
     def lowered(self, depth: Float[Array, ""]) -> "Clusters":
         """Give the clusters of the same splats, each moved so far (mm) against its normal."""
-        spread = jnp.maximum(self.spread - depth * self.opening + 0.5 * depth * depth * self.bending, 0)
-        moments = None if self.moments is None or self.turns is None else self.moments - depth * self.turns
+        spread = jnp.maximum(
+            self.spread - depth * self.opening + 0.5 * depth * depth * self.bending, 0
+        )
+        moments = (
+            None
+            if self.moments is None or self.turns is None
+            else self.moments - depth * self.turns
+        )
         opening = self.opening - depth * self.bending
         centers = self.centers - depth * self.normals
-        return Clusters(centers, self.normals, self.areas, self.irradiance, spread, moments, self.turns, opening, self.bending)
+        return Clusters(
+            centers,
+            self.normals,
+            self.areas,
+            self.irradiance,
+            spread,
+            moments,
+            self.turns,
+            opening,
+            self.bending,
+        )
 
     def merged(
-        self, parents: Int[Array, " clusters"], count: int, total: Callable[[Array], Array] = lambda sums: sums
+        self,
+        parents: Int[Array, " clusters"],
+        count: int,
+        total: Callable[[Array], Array] = lambda sums: sums,
     ) -> "Clusters":
-        """Merge clusters into `count` parents. Area, energy and the first moments of both are kept. Differentiable.
+        """Merge clusters into `count` parents. Area, energy and the first moments of both are kept.
+        Differentiable.
 
         `total` adds up what others have of the same parents.
         """
 
         def totals(rows: Float[Array, "rows clusters"]) -> Float[Array, "rows parents"]:
-            """Sum over the children: a few rows in one pass over them; of many the sums would not stay in the cache."""
+            """Sum over the children: a few rows in one pass over them; of many the sums would not
+            stay in the cache.
+            """
             return total(jax.vmap(lambda row: jax.ops.segment_sum(row, parents, count))(rows))
 
         channels = self.irradiance.shape[0]
         energy = self.areas[None] * self.irradiance
-        own = jnp.concatenate([self.areas[None], self.areas[None] * self.centers, self.areas[None] * self.normals, energy])
+        own = jnp.concatenate(
+            [
+                self.areas[None],
+                self.areas[None] * self.centers,
+                self.areas[None] * self.normals,
+                energy,
+            ]
+        )
         areas, *sums = jnp.split(totals(own), [1, 4, 7])
         inverse = 1 / jnp.where(areas > 0, areas, 1.0)
         centers, normals, irradiance = (each * inverse for each in sums)
@@ -73,25 +116,42 @@ class Clusters(eqx.Module):
             moments = energy[:, None] * offset[None]
             return (moments if brought is None else moments + brought).reshape(3 * channels, -1)
 
-        spread, opening, bending = totals(self.areas[None] * jnp.stack([spread, opening, bending])) * inverse
-        moments, turns = (
-            totals(energy_off(*each)).reshape(channels, 3, count) for each in ((offset, self.moments), (turn, self.turns))
+        spread, opening, bending = (
+            totals(self.areas[None] * jnp.stack([spread, opening, bending])) * inverse
         )
-        return Clusters(centers, normals, areas[0], irradiance, spread, moments, turns, opening, bending)
+        moments, turns = (
+            totals(energy_off(*each)).reshape(channels, 3, count)
+            for each in ((offset, self.moments), (turn, self.turns))
+        )
+        return Clusters(
+            centers, normals, areas[0], irradiance, spread, moments, turns, opening, bending
+        )
 
 
 class ClusterTree(eqx.Module):
-    """Splats in a compact order, and cells in cells around them. Which splats share a cell is not differentiated."""
+    """Splats in a compact order, and cells in cells around them. Which splats share a cell is not
+    differentiated.
+    """
 
     order: Int[Array, " places"]
-    """The splat at each place; the number of splats, which is none, at the places that fill the last block."""
+    """The splat at each place; the number of splats, which is none, at the places that fill the
+    last block.
+    """
     parents: tuple[Int[Array, " _"], ...]
-    """For each level, the cell of every cluster of the level before (of the splat at every place, for the first)."""
+    """For each level, the cell of every cluster of the level before (of the splat at every place,
+    for the first).
+    """
     counts: tuple[int, ...] = eqx.field(static=True)
 
     @classmethod
-    def build(cls, centers: Float[Array, "splats 3"], normals: Float[Array, "splats 3"], cells: Sequence[float]) -> "ClusterTree":
-        """Sort splats, and the clusters of each level, into cells of the edges `cells` (mm, ascending) by their centers.
+    def build(
+        cls,
+        centers: Float[Array, "splats 3"],
+        normals: Float[Array, "splats 3"],
+        cells: Sequence[float],
+    ) -> "ClusterTree":
+        """Sort splats, and the clusters of each level, into cells of the edges `cells` (mm,
+        ascending) by their centers.
 
         A cell holds what faces one way: the two sides of a thin sheet are clusters of their own.
         """
@@ -106,7 +166,10 @@ class ClusterTree(eqx.Module):
             key = (found[:, 0] * extent[1] + found[:, 1]) * extent[2] + found[:, 2]
             parent = _by_side(np.unique(key, return_inverse=True)[1].reshape(-1), facing)
             inside = np.bincount(parent, members)
-            middle, toward = (_sums(parent, members[:, None] * rows) / inside[:, None] for rows in (positions, facing))
+            middle, toward = (
+                _sums(parent, members[:, None] * rows) / inside[:, None]
+                for rows in (positions, facing)
+            )
             place = compact_order(middle)
             rank = np.empty(len(place), np.int64)
             rank[place] = np.arange(len(place))
@@ -118,9 +181,14 @@ class ClusterTree(eqx.Module):
         return cls(jnp.asarray(order, jnp.int32), tuple(parents), tuple(counts))
 
     def with_room(self, counts: Sequence[int]) -> "ClusterTree":
-        """Give the same tree with room for so many clusters at each level, as many at least as there are; the rest are empty."""
+        """Give the same tree with room for so many clusters at each level, as many at least as
+        there are; the rest are empty.
+        """
         before = (self.order.shape[0], *counts)
-        parents = tuple(jnp.pad(each, (0, room - each.shape[0])) for each, room in zip(self.parents, before, strict=False))
+        parents = tuple(
+            jnp.pad(each, (0, room - each.shape[0]))
+            for each, room in zip(self.parents, before, strict=False)
+        )
         return ClusterTree(self.order, parents, tuple(counts))
 
     def levels(self, sources: Sources) -> list[Clusters]:
@@ -138,8 +206,12 @@ class ClusterTree(eqx.Module):
             found.append(found[-1].merged(parents, count))
         return found
 
-    def largest(self, values: Float[np.ndarray, " splats"], level: int) -> Float[np.ndarray, " clusters"]:
-        """Give the largest value, 0 or above, of the splats in each cluster of a level. Not for traced arrays."""
+    def largest(
+        self, values: Float[np.ndarray, " splats"], level: int
+    ) -> Float[np.ndarray, " clusters"]:
+        """Give the largest value, 0 or above, of the splats in each cluster of a level. Not for
+        traced arrays.
+        """
         found = np.append(values, np.zeros(1, values.dtype))[np.asarray(self.order)]
         for parents, count in zip(self.parents[:level], self.counts[:level], strict=True):
             before, found = found, np.zeros(count, found.dtype)
@@ -153,10 +225,14 @@ def _sums(groups: np.ndarray, rows: np.ndarray) -> np.ndarray:
 
 
 def _by_side(groups: np.ndarray, facing: np.ndarray) -> np.ndarray:
-    """Split each group by which way along its main axis its members face; give new groups, numbered without gaps."""
+    """Split each group by which way along its main axis its members face; give new groups, numbered
+    without gaps.
+    """
     rows, columns = np.triu_indices(3)
     products = np.empty((groups.max() + 1, 3, 3))
-    products[:, rows, columns] = products[:, columns, rows] = _sums(groups, facing[:, rows] * facing[:, columns])
+    products[:, rows, columns] = products[:, columns, rows] = _sums(
+        groups, facing[:, rows] * facing[:, columns]
+    )
     axes = np.linalg.eigh(products)[1][:, :, -1]
     sides = 2 * groups + (np.sum(facing * axes[groups], axis=1) < 0)
     return (np.cumsum(np.bincount(sides) > 0) - 1)[sides]
@@ -168,6 +244,8 @@ def blocks_of(count: int) -> int:
 
 
 def _round_up(count: int) -> int:
-    """Round up to the next of sixteen steps per octave and to whole blocks, so that a moving surface needs no other program."""
+    """Round up to the next of sixteen steps per octave and to whole blocks, so that a moving
+    surface needs no other program.
+    """
     grain = 1 << max(count.bit_length() - 5, 0)
     return blocks_of(-(-count // grain) * grain)

@@ -1,6 +1,10 @@
 """From a profile to the sum of Gaussians that stands for it: Eq. 3 and Eq. 4."""
 
-from ._counts import ErrorByCount as ErrorByCount, LeastCount as LeastCount, error_by_count as error_by_count
+from ._counts import (
+    ErrorByCount as ErrorByCount,
+    LeastCount as LeastCount,
+    error_by_count as error_by_count,
+)
 from ._errors import relative_error as relative_error, squared_error as squared_error
 from ._fit import FitResult as FitResult, fit_gaussians as fit_gaussians
 from ._given import fit_weights as fit_weights

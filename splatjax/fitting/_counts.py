@@ -21,7 +21,8 @@ class ErrorByCount(eqx.Module):
     **Attributes:**
 
     - `error`: of the best sums of 1, 2, ... Gaussians.
-    - `variances`: theirs, mm^2, ascending; infinite where there are fewer. With `VariancesPerChannel`, for each channel.
+    - `variances`: theirs, mm^2, ascending; infinite where there are fewer. With
+      `VariancesPerChannel`, for each channel.
     """
 
     error: Float[Array, "counts channels"]
@@ -30,14 +31,20 @@ class ErrorByCount(eqx.Module):
     def least(self, error: float) -> int:
         r"""Give the least number of Gaussians with which no channel exceeds an error.
 
-        **Raises:** `ValueError` if none of them does, and inside `jit`, where the answer depends on values.
+        **Raises:** `ValueError` if none of them does, and inside `jit`, where the answer depends on
+        values.
         """
         if isinstance(self.error, Tracer):
-            raise ValueError("the least number of Gaussians depends on values; find it outside of jit and vmap")
+            raise ValueError(
+                "the least number of Gaussians depends on values; find it outside of jit and vmap"
+            )
         worst = np.max(np.asarray(self.error), axis=1)
         if not error > 0 or not np.any(worst <= error):
             left = f"{len(worst)} Gaussians leave {worst[-1]:.2e} (worst channel)"
-            raise ValueError(f"an error of {error:g} is not reached: {left}; ask for that, or allow more Gaussians")
+            raise ValueError(
+                f"an error of {error:g} is not reached: {left}; ask for that, or allow more "
+                "Gaussians"
+            )
         return int(np.argmax(worst <= error)) + 1
 
     def start(self, count: int) -> GivenVariances:
@@ -55,7 +62,8 @@ def error_by_count(
 ) -> ErrorByCount:
     r"""Find the best sums of 1, 2, ... Gaussians in one search, and what error each leaves.
 
-    One compilation serves all of them; their sums of squares are those of the best fits to about 1e-5.
+    One compilation serves all of them; their sums of squares are those of the best fits to about
+    1e-5.
 
     **Arguments:** as `fit_gaussians` has them.
 
@@ -67,7 +75,9 @@ def error_by_count(
     """
     check_count("largest", largest)
     spread = SharedVariances() if spread is None else spread
-    return _error_by_count(profile, largest, spread, FreeWeights() if weights is None else weights, rule)
+    return _error_by_count(
+        profile, largest, spread, FreeWeights() if weights is None else weights, rule
+    )
 
 
 class LeastCount(eqx.Module):
@@ -91,7 +101,11 @@ def check_count(name: str, count: int) -> None:
 
 @eqx.filter_jit
 def _error_by_count(
-    profile: AbstractProfile, largest: int, spread: AbstractSpread, weights: AbstractWeights, rule: AbstractRadialRule
+    profile: AbstractProfile,
+    largest: int,
+    spread: AbstractSpread,
+    weights: AbstractWeights,
+    rule: AbstractRadialRule,
 ) -> ErrorByCount:
     def climb(problem, start):
         del start

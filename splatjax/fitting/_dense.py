@@ -1,16 +1,21 @@
 """Least squares with a handful of unknowns, in plain array operations.
 
-The fit solves thousands of tiny systems at once inside a loop. Batched LAPACK calls there were seen to wait for each other for
-good on a machine of two cores; elimination in six columns needs none. Columns are scaled to unit length, so that the normal
-equations are benign (their condition number stays below 2000 for eight Gaussians), and one step of refinement makes up for
-having squared it.
+The fit solves thousands of tiny systems at once inside a loop. Batched LAPACK calls there were seen
+to wait for each other for good on a machine of two cores; elimination in six columns needs none.
+Columns are scaled to unit length, so that the normal equations are benign (their condition number
+stays below 2000 for eight Gaussians), and one step of refinement makes up for having squared it.
 """
 
 import jax
 import jax.numpy as jnp
 import lineax as lx
 from jaxtyping import Array, Float
-from lineax.internal import pack_structures, ravel_vector, transpose_packed_structures, unravel_solution
+from lineax.internal import (
+    pack_structures,
+    ravel_vector,
+    transpose_packed_structures,
+    unravel_solution,
+)
 
 
 @jax.custom_jvp
@@ -28,7 +33,9 @@ def invert(matrix: Float[Array, "columns columns"]) -> Float[Array, "columns col
         at_row = jnp.broadcast_to(here[:, None], matrix.shape)
         at_column = jnp.broadcast_to(here[None, :], matrix.shape)
         unit = jnp.where(here, 1 / pivot, zeros)
-        return jnp.where(at_column, (unit - left)[:, None], jnp.where(at_row, (row / pivot)[None, :], others))
+        return jnp.where(
+            at_column, (unit - left)[:, None], jnp.where(at_row, (row / pivot)[None, :], others)
+        )
 
     return jax.lax.fori_loop(0, matrix.shape[0], eliminate, matrix)
 
@@ -39,8 +46,12 @@ def _invert_jvp(primals, tangents):
     return inverse, -inverse @ tangents[0] @ inverse
 
 
-def invert_moving(hessian: Float[Array, "gaussians gaussians"]) -> Float[Array, "gaussians gaussians"]:
-    """Invert a Hessian; a Gaussian of weight zero in all channels changes nothing, and stays where it is."""
+def invert_moving(
+    hessian: Float[Array, "gaussians gaussians"],
+) -> Float[Array, "gaussians gaussians"]:
+    """Invert a Hessian; a Gaussian of weight zero in all channels changes nothing, and stays where
+    it is.
+    """
     still = jnp.diagonal(hessian) == 0
     return invert(hessian + jnp.diag(still.astype(hessian.dtype)))
 
@@ -51,7 +62,9 @@ def normal_inverse(matrix: Float[Array, "rows columns"]) -> Float[Array, "column
 
 
 def least_squares(
-    matrix: Float[Array, "rows columns"], right: Float[Array, " rows"], inverse: Float[Array, "columns columns"]
+    matrix: Float[Array, "rows columns"],
+    right: Float[Array, " rows"],
+    inverse: Float[Array, "columns columns"],
 ) -> Float[Array, " columns"]:
     """Give the `x` of the least `|matrix x - right|`; `inverse` is that of the normal equations."""
     solution = inverse @ (matrix.T @ right)
@@ -71,7 +84,9 @@ class NormalEquations(lx.AbstractLinearSolver):
         matrix, inverse, transposed, structures = state
         right = ravel_vector(vector, structures)
         # The transposed system is wide: its shortest solution.
-        solution = matrix @ (inverse @ right) if transposed else least_squares(matrix, right, inverse)
+        solution = (
+            matrix @ (inverse @ right) if transposed else least_squares(matrix, right, inverse)
+        )
         return unravel_solution(solution, structures), lx.RESULTS.successful, {}
 
     def transpose(self, state, options):

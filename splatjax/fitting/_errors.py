@@ -14,7 +14,8 @@ def norm_radii(
     """Give radii and weights of integrals of `r R^2`, or say that there is none."""
     if profile.singular and rule.reaches_origin:
         raise ValueError(
-            f"{type(profile).__name__} goes to infinity like 1/r, so that the integral of r R^2 from 0 (Eq. 3) does not exist; "
+            f"{type(profile).__name__} goes to infinity like 1/r, so that the integral of r R^2 "
+            "from 0 (Eq. 3) does not exist; "
             "state where it starts, in length scales of the profile: rule=NORM_RULE.beyond(1.0)"
         )
     return rule.radii(profile)
@@ -24,7 +25,8 @@ def norm_radii(
 def squared_error(
     profile: AbstractProfile, gaussians: SumOfGaussians, rule: AbstractRadialRule = NORM_RULE
 ) -> Float[Array, " channels"]:
-    r"""Give the error that a fit minimizes, the integral over r of `r (R(r) - sum_i w_i G(v_i, r))^2` (Eq. 3).
+    r"""Give the error that a fit minimizes, the integral over r of `r (R(r) - sum_i w_i G(v_i,
+    r))^2` (Eq. 3).
 
     **Arguments:**
 
@@ -34,7 +36,8 @@ def squared_error(
 
     **Returns:** [channels], 1/mm^2, at least 0.
 
-    **Raises:** `ValueError` for a profile that is infinite at the origin, unless the rule starts beyond it.
+    **Raises:** `ValueError` for a profile that is infinite at the origin, unless the rule starts
+    beyond it.
 
     **Source:** Kim et al. 2010, Eq. 3 (d'Eon, Luebke and Enderton 2007).
     """
@@ -47,16 +50,21 @@ def squared_error(
 def relative_error(
     profile: AbstractProfile, gaussians: SumOfGaussians, rule: AbstractRadialRule = NORM_RULE
 ) -> Float[Array, " channels"]:
-    r"""Give the relative error of a fit, the root of Eq. 3 over that of the integral of `r R(r)^2` (Eq. 4).
+    r"""Give the relative error of a fit, the root of Eq. 3 over that of the integral of `r R(r)^2`
+    (Eq. 4).
 
     It sees the core of a profile and hardly its tail: see `FitResult.energy_error` for the energy.
 
-    **Arguments:** as for `squared_error`, whose radii and norm it takes. Differentiable where the fit is not perfect.
+    **Arguments:** as for `squared_error`, whose radii and norm it takes. Differentiable where the
+    fit is not perfect.
 
-    **Returns:** [channels], at least 0; it depends on neither the unit of length nor the scale of the profile.
+    **Returns:** [channels], at least 0; it depends on neither the unit of length nor the scale of
+    the profile.
 
     **Source:** Kim et al. 2010, Eq. 4.
     """
     r, dr = norm_radii(profile, rule)
     values = at_own_radii(profile, r)
-    return jnp.sqrt(squared_error(profile, gaussians, rule) / jnp.sum(dr * r * values * values, axis=0))
+    return jnp.sqrt(
+        squared_error(profile, gaussians, rule) / jnp.sum(dr * r * values * values, axis=0)
+    )

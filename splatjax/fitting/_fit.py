@@ -23,13 +23,16 @@ class FitResult(eqx.Module):
 
     **Attributes:**
 
-    - `gaussians`: variances ascend. With `VariancesPerChannel`, one of a single channel for each channel, batched.
+    - `gaussians`: variances ascend. With `VariancesPerChannel`, one of a single channel for each
+      channel, batched.
     - `error`: Eq. 4 of each channel.
-    - `energy_error`: sum of the weights over the profile's total reflectance, minus 1; 0 if the sum was held.
+    - `energy_error`: sum of the weights over the profile's total reflectance, minus 1; 0 if the sum
+      was held.
     - `result`: what became of the search, as a message (`optimistix.RESULTS`).
-    - `covariance`: of the variances, and then of the weights of one channel after the other, by Gauss and Newton; with
-      `VariancesPerChannel`, for each channel. Within its ellipsoid Eq. 3 at most doubles. Where the residuals are noise of
-      equal size at N independent nodes of Eq. 3, divide by N less the number of parameters.
+    - `covariance`: of the variances, and then of the weights of one channel after the other, by
+      Gauss and Newton; with `VariancesPerChannel`, for each channel. Within its ellipsoid Eq. 3 at
+      most doubles. Where the residuals are noise of equal size at N independent nodes of Eq. 3,
+      divide by N less the number of parameters.
     """
 
     gaussians: SumOfGaussians
@@ -51,37 +54,44 @@ def fit_gaussians(
 ) -> FitResult:
     r"""Fit a sum of Gaussians to a profile: the least Eq. 3 over variances and weights.
 
-    Variable projection: for given variances the best weights are a linear problem, solved inside; Levenberg and Marquardt's
-    method moves the logarithms of the variances. Unless told otherwise, a fit with one Gaussian more starts from the best fit
-    before, with a Gaussian inserted in each gap and at both ends. Compiles once for each count and kind of profile.
+    Variable projection: for given variances the best weights are a linear problem, solved inside;
+    Levenberg and Marquardt's method moves the logarithms of the variances. Unless told otherwise, a
+    fit with one Gaussian more starts from the best fit before, with a Gaussian inserted in each gap
+    and at both ends. Compiles once for each count and kind of profile.
 
-    The result is differentiable in every float of the profile, by the implicit function theorem with the full Hessian of Eq. 3,
-    in forward and reverse mode; to first order. The precision follows the profile. In float32 errors below about 1e-5 are
-    rounding, and reaching that floor counts as success.
+    The result is differentiable in every float of the profile, by the implicit function theorem
+    with the full Hessian of Eq. 3, in forward and reverse mode; to first order. The precision
+    follows the profile. In float32 errors below about 1e-5 are rounding, and reaching that floor
+    counts as success.
 
     **Arguments:**
 
     - `profile`: 1/mm^2; the integral of `r R(r)^2` must exist. Differentiable.
-    - `count`: number of Gaussians, at least 1; or `LeastCount(error)`, the least that leaves no more than that.
+    - `count`: number of Gaussians, at least 1; or `LeastCount(error)`, the least that leaves no
+      more than that.
     - `spread`: `SharedVariances()` (default) or `VariancesPerChannel()`.
-    - `weights`: `FreeWeights()` (default), `TotalReflectanceHeld()`, or `NonNegativeWeights()` among either.
-    - `start`: `InsertedGaussians()` (default), which finds the best fit; or `GivenVariances(...)` near it, which is fast. Of a
-      given count alone: the least one is found by inserting.
-    - `rule`: radii of the integral, in length scales of the profile; or `InverseVariance()`, for one with standard errors.
+    - `weights`: `FreeWeights()` (default), `TotalReflectanceHeld()`, or `NonNegativeWeights()`
+      among either.
+    - `start`: `InsertedGaussians()` (default), which finds the best fit; or `GivenVariances(...)`
+      near it, which is fast. Of a given count alone: the least one is found by inserting.
+    - `rule`: radii of the integral, in length scales of the profile; or `InverseVariance()`, for
+      one with standard errors.
     - `throw`: raise if the search has not converged; otherwise `result` says so.
 
     **Returns:** a `FitResult`; neither `error` nor `weights` depends on the unit of length.
 
-    **Raises:** `ValueError` for a count below 1, for an error that no count reaches, for a `start` without a count, and for a
-    profile that is infinite at the origin unless the rule starts beyond it (`NORM_RULE.beyond`); an error with the message of
-    `result` if `throw`.
+    **Raises:** `ValueError` for a count below 1, for an error that no count reaches, for a `start`
+    without a count, and for a profile that is infinite at the origin unless the rule starts beyond
+    it (`NORM_RULE.beyond`); an error with the message of `result` if `throw`.
 
     **Source:** Kim et al. 2010, Eq. 3; variable projection: Golub and Pereyra 1973.
     """
     if not isinstance(count, LeastCount):
         check_count("count", count)
     elif start is not None:
-        raise ValueError(f"start is given, and {count}, which finds its own; leave start out, or give a count")
+        raise ValueError(
+            f"start is given, and {count}, which finds its own; leave start out, or give a count"
+        )
     spread = SharedVariances() if spread is None else spread
     weights = FreeWeights() if weights is None else weights
     start = InsertedGaussians() if start is None else start
@@ -112,10 +122,20 @@ def _fit_compiled(
     problem = spread.problem(profile, weights, rule)
     found, converged = spread.over(partial(_fit_problem, count=count), problem, start)
     energy = jnp.sum(found.gaussians.weights, axis=-2).reshape(-1)
-    result = optx.RESULTS.where(jnp.all(converged), optx.RESULTS.successful, optx.RESULTS.nonlinear_max_steps_reached)
-    return FitResult(found.gaussians, found.error.reshape(-1), energy / profile.total_reflectance() - 1, result, found.covariance)
+    result = optx.RESULTS.where(
+        jnp.all(converged), optx.RESULTS.successful, optx.RESULTS.nonlinear_max_steps_reached
+    )
+    return FitResult(
+        found.gaussians,
+        found.error.reshape(-1),
+        energy / profile.total_reflectance() - 1,
+        result,
+        found.covariance,
+    )
 
 
-def _fit_problem(problem: Problem, start: AbstractStart, count: int) -> tuple[Outcome, Bool[Array, ""]]:
+def _fit_problem(
+    problem: Problem, start: AbstractStart, count: int
+) -> tuple[Outcome, Bool[Array, ""]]:
     found, converged = refine(problem, search(problem, count, start))
     return problem.outcome(stationary(problem, found)), converged

@@ -18,21 +18,26 @@ def fit_weights(
     weights: AbstractWeights | None = None,
     rule: AbstractRadialRule = NORM_RULE,
 ) -> SumOfGaussians:
-    r"""Fit the weights of Gaussians of given variances to a profile: the least Eq. 3 over the weights alone.
+    r"""Fit the weights of Gaussians of given variances to a profile: the least Eq. 3 over the
+    weights alone.
 
-    No search, hence fast. Variances that ascend by a factor of 3 over all widths of the dipoles of many media leave each an error
-    (Eq. 4) of about 0.2%, by a factor of 2 of 0.002%: layers that are rendered once serve all of these media.
+    No search, hence fast. Variances that ascend by a factor of 3 over all widths of the dipoles of
+    many media leave each an error (Eq. 4) of about 0.2%, by a factor of 2 of 0.002%: layers that
+    are rendered once serve all of these media.
 
     **Arguments:**
 
     - `profile`: 1/mm^2. Differentiable, in forward and reverse mode.
     - `variances`: mm^2, positive, all different. Constants of every derivative.
-    - `weights`: `FreeWeights()` (default), `TotalReflectanceHeld()`, or `NonNegativeWeights()` among either.
+    - `weights`: `FreeWeights()` (default), `TotalReflectanceHeld()`, or `NonNegativeWeights()`
+      among either.
     - `rule`: radii of the integral, in length scales of the profile.
 
-    **Returns:** the Gaussians, in the profile's precision; with the variances of a fit they are those of the fit.
+    **Returns:** the Gaussians, in the profile's precision; with the variances of a fit they are
+    those of the fit.
 
-    **Raises:** `ValueError` for a profile that is infinite at the origin unless the rule starts beyond it.
+    **Raises:** `ValueError` for a profile that is infinite at the origin unless the rule starts
+    beyond it.
     """
     problem = make_problem(profile, FreeWeights() if weights is None else weights, rule)
     variances = jax.lax.stop_gradient(variances).astype(problem.target.dtype)

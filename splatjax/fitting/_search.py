@@ -15,7 +15,9 @@ _FIRST = (-3.0, 4.0)
 """Log variances, in squared length scales, between which a single Gaussian starts."""
 
 _OUTWARD = 1.5
-"""How far, in log variance, a Gaussian starts outside the previous ones: neighbors lie 1.4 to 2.2 apart."""
+"""How far, in log variance, a Gaussian starts outside the previous ones: neighbors lie 1.4 to 2.2
+apart.
+"""
 
 _TOLERANCE = 1e-3
 _STEPS = 64
@@ -27,16 +29,22 @@ class AbstractStart(eqx.Module):
 
     @abc.abstractmethod
     def search(self, problem: Problem, count: int) -> Float[Array, " gaussians"]:
-        """Give nearly the best log variances, ascending, of a problem in JAX's default precision."""
+        """Give nearly the best log variances, ascending, of a problem in JAX's default
+        precision.
+        """
 
     def of_channels(self, channels: int) -> "AbstractStart":
-        """Give the starts of so many channels that have variances of their own, along a leading axis."""
+        """Give the starts of so many channels that have variances of their own, along a leading
+        axis.
+        """
         del channels
         return self
 
 
 class InsertedGaussians(AbstractStart):
-    """From the best fit with one Gaussian fewer, and so on down to one: one is inserted at every place, and the best is kept."""
+    """From the best fit with one Gaussian fewer, and so on down to one: one is inserted at every
+    place, and the best is kept.
+    """
 
     def search(self, problem: Problem, count: int) -> Float[Array, " gaussians"]:
         return ladder(problem, count)[-1]
@@ -49,7 +57,8 @@ class GivenVariances(AbstractStart):
 
     **Attributes:**
 
-    - `variances`: mm^2, positive: one for each Gaussian, or, for channels with variances of their own, a row for each channel.
+    - `variances`: mm^2, positive: one for each Gaussian, or, for channels with variances of their
+      own, a row for each channel.
     """
 
     variances: Float[Array, "*channels gaussians"]
@@ -61,7 +70,10 @@ class GivenVariances(AbstractStart):
     def search(self, problem: Problem, count: int) -> Float[Array, " gaussians"]:
         if self.variances.shape != (count,):
             shape = list(self.variances.shape)
-            raise ValueError(f"a fit of {count} Gaussians starts from as many variances, shared by the channels; got {shape}")
+            raise ValueError(
+                f"a fit of {count} Gaussians starts from as many variances, shared by the "
+                f"channels; got {shape}"
+            )
         variances = jax.lax.stop_gradient(self.variances).astype(problem.target.dtype)
         start = jnp.log(variances / (problem.unit * problem.unit))
         return jnp.sort(_descend(problem, start, None)[0])
@@ -73,13 +85,17 @@ def search(problem: Problem, count: int, start: AbstractStart) -> Float[Array, "
 
 
 def constant(problem: Problem) -> Problem:
-    """Give a problem through which no derivative goes, in JAX's default precision: optimistix damps in it, whatever it is
-    given."""
-    return jax.tree.map(lambda leaf: jax.lax.stop_gradient(leaf).astype(jnp.result_type(float)), problem)
+    """Give a problem through which no derivative goes, in JAX's default precision: optimistix damps
+    in it, whatever it is given."""
+    return jax.tree.map(
+        lambda leaf: jax.lax.stop_gradient(leaf).astype(jnp.result_type(float)), problem
+    )
 
 
 def ladder(problem: Problem, largest: int) -> Float[Array, "counts gaussians"]:
-    """Give nearly the best log variances of 1 to so many Gaussians, each ascending, with zeros behind."""
+    """Give nearly the best log variances of 1 to so many Gaussians, each ascending, with zeros
+    behind.
+    """
     dtype = problem.target.dtype
 
     def rung(best, active_count):
@@ -92,7 +108,9 @@ def ladder(problem: Problem, largest: int) -> Float[Array, "counts gaussians"]:
     return jax.lax.scan(rung, jnp.zeros(largest, dtype), jnp.arange(1, largest + 1))[1]
 
 
-def _insert(best: Float[Array, " gaussians"], active_count: Int[Array, ""], place: Int[Array, ""]) -> Float[Array, " gaussians"]:
+def _insert(
+    best: Float[Array, " gaussians"], active_count: Int[Array, ""], place: Int[Array, ""]
+) -> Float[Array, " gaussians"]:
     """Insert one log variance at a place among the first `active_count - 1`, which ascend."""
     count = best.shape[0]
     last = active_count - 1
@@ -100,7 +118,9 @@ def _insert(best: Float[Array, " gaussians"], active_count: Int[Array, ""], plac
     below = best[jnp.maximum(place - 1, 0)]
     above = best[jnp.minimum(place, count - 1)]
     between = 0.5 * (below + above)
-    value = jnp.where(place == 0, above - _OUTWARD, jnp.where(place == last, below + _OUTWARD, between))
+    value = jnp.where(
+        place == 0, above - _OUTWARD, jnp.where(place == last, below + _OUTWARD, between)
+    )
     index = jnp.arange(count)
     shifted = jnp.roll(best, 1)
     inserted = jnp.where(index < place, best, jnp.where(index == place, value, shifted))
@@ -112,13 +132,16 @@ def _descend(
     problem: Problem, start: Float[Array, " gaussians"], active: Bool[Array, " gaussians"] | None
 ) -> tuple[Float[Array, " gaussians"], Float[Array, ""]]:
     """Give where a descent ends, and the sum of squares there."""
-    # In units of the start's own residual, so that damping and tolerances mean the same for a good fit as for a poor one.
+    # In units of the start's own residual, so that damping and tolerances mean the same for a good
+    # fit as for a poor one.
     unit = jnp.sqrt(_cost(problem.residuals(start, active)))
 
     def residuals(point, _):
         return _projected(problem, active, point) / unit
 
-    solver = optx.LevenbergMarquardt(rtol=_TOLERANCE, atol=_TOLERANCE, linear_solver=NormalEquations())
+    solver = optx.LevenbergMarquardt(
+        rtol=_TOLERANCE, atol=_TOLERANCE, linear_solver=NormalEquations()
+    )
     found = optx.least_squares(residuals, solver, start, max_steps=_STEPS, throw=False).value
     return found, _cost(problem.residuals(found, active))
 
@@ -143,6 +166,8 @@ def _cost(residuals: Float[Array, "channels nodes"]) -> Float[Array, ""]:
     return jnp.where(jnp.isfinite(cost), cost, jnp.full_like(cost, jnp.inf))
 
 
-def _sorted(point: Float[Array, " gaussians"], active: Bool[Array, " gaussians"]) -> Float[Array, " gaussians"]:
+def _sorted(
+    point: Float[Array, " gaussians"], active: Bool[Array, " gaussians"]
+) -> Float[Array, " gaussians"]:
     ordered = jnp.sort(jnp.where(active, point, jnp.full_like(point, jnp.inf)))
     return jnp.where(active, ordered, jnp.zeros_like(point))

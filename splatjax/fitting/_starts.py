@@ -11,10 +11,12 @@ from ._search import GivenVariances
 
 
 class DipoleStarts(eqx.Module):
-    r"""Variances of the best fits to dipoles, per channel, over reduced albedo and index of refraction.
+    r"""Variances of the best fits to dipoles, per channel, over reduced albedo and index of
+    refraction.
 
-    Counted in squared mean free paths they depend on nothing else. They are tabulated over `sqrt(1 - alpha')`, in which they are
-    smooth, and interpolated linearly in their logarithms; beyond the table's ends the last entry serves.
+    Counted in squared mean free paths they depend on nothing else. They are tabulated over `sqrt(1
+    - alpha')`, in which they are smooth, and interpolated linearly in their logarithms; beyond the
+    table's ends the last entry serves.
 
     **Attributes:**
 
@@ -28,22 +30,29 @@ class DipoleStarts(eqx.Module):
     log_variances: tuple[Float[Array, "roots etas _"], ...]
 
     def __call__(self, medium: Medium, count: int) -> GivenVariances:
-        r"""Give the start of a fit of `count` Gaussians to `Dipole(medium)` with `VariancesPerChannel()`.
+        r"""Give the start of a fit of `count` Gaussians to `Dipole(medium)` with
+        `VariancesPerChannel()`.
 
         **Raises:** `ValueError` for more Gaussians than the table has.
         """
         if not 1 <= count <= len(self.log_variances):
-            raise ValueError(f"starts are tabulated for 1 to {len(self.log_variances)} Gaussians; got {count}")
+            raise ValueError(
+                f"starts are tabulated for 1 to {len(self.log_variances)} Gaussians; got {count}"
+            )
         dtype = medium.eta.dtype
         root = jnp.sqrt(medium.sigma_a / medium.sigma_t_prime)
         place = [_place(self.roots, root), _place(self.etas, medium.eta)]
         table = self.log_variances[count - 1].astype(dtype)
-        columns = [map_coordinates(table[..., i], place, order=1, mode="nearest") for i in range(count)]
+        columns = [
+            map_coordinates(table[..., i], place, order=1, mode="nearest") for i in range(count)
+        ]
         length = 1 / medium.sigma_t_prime
         return GivenVariances(jnp.exp(jnp.stack(columns, axis=-1)) * (length * length)[:, None])
 
 
-def _place(nodes: Float[Array, " nodes"], values: Float[Array, " channels"]) -> Float[Array, " channels"]:
+def _place(
+    nodes: Float[Array, " nodes"], values: Float[Array, " channels"]
+) -> Float[Array, " channels"]:
     """Give where values lie among equally spaced nodes, in steps."""
     nodes = nodes.astype(values.dtype)
     return (values - nodes[0]) / (nodes[1] - nodes[0])

@@ -21,13 +21,15 @@ class AbstractWeights(eqx.Module):
         energies: Float[Array, " gaussians"],
         total: Float[Array, ""],
     ) -> tuple[Float[Array, " gaussians"], Float[Array, "gaussians gaussians"]]:
-        """Give the coefficients in the set with the least `|target - basis @ coefficients|`, and their response.
+        """Give the coefficients in the set with the least `|target - basis @ coefficients|`, and
+        their response.
 
         **Arguments:** (all differentiable)
 
         - `basis`: scaled Gaussians at the roots of the quadrature's weights, of full column rank.
         - `target`: the profile there.
-        - `energies`: weight of a unit coefficient; `energies @ coefficients` is the energy of the sum.
+        - `energies`: weight of a unit coefficient; `energies @ coefficients` is the energy of the
+          sum.
         - `total`: the energy of the profile.
 
         **Returns:** the coefficients, and their derivative in `basis^T target`, which is symmetric.
@@ -35,7 +37,9 @@ class AbstractWeights(eqx.Module):
 
 
 class FreeWeights(AbstractWeights):
-    """Any weights: the least error of Eq. 3. Their sum may miss the profile's total reflectance by some per cent."""
+    """Any weights: the least error of Eq. 3. Their sum may miss the profile's total reflectance by
+    some per cent.
+    """
 
     def solve(
         self,
@@ -50,7 +54,9 @@ class FreeWeights(AbstractWeights):
 
 
 class TotalReflectanceHeld(AbstractWeights):
-    """Weights whose sum is the profile's total reflectance: the picture keeps its energy, at a somewhat larger error."""
+    """Weights whose sum is the profile's total reflectance: the picture keeps its energy, at a
+    somewhat larger error.
+    """
 
     def solve(
         self,
@@ -71,14 +77,15 @@ class TotalReflectanceHeld(AbstractWeights):
 class NonNegativeWeights(AbstractWeights):
     """None of the weights is below zero, as that of a mixture; otherwise as `among` has it.
 
-    Fits of single channels of a dipole have no negative weights anyway. Where variances are shared, some may become 0.
+    Fits of single channels of a dipole have no negative weights anyway. Where variances are shared,
+    some may become 0.
 
     **Attributes:**
 
     - `among`: `FreeWeights()` (default) or `TotalReflectanceHeld()`.
 
-    **Source:** the conditions are those of Kuhn and Tucker; one index at a time is exchanged, the last first (Murty 1974), which
-    ends for every positive definite problem.
+    **Source:** the conditions are those of Kuhn and Tucker; one index at a time is exchanged, the
+    last first (Murty 1974), which ends for every positive definite problem.
     """
 
     among: AbstractWeights = FreeWeights()
@@ -112,10 +119,14 @@ class NonNegativeWeights(AbstractWeights):
 
         everything = jnp.ones(count, bool)
         start = everything, wrong(everything), jnp.asarray(0)
-        positive, *_ = jax.lax.while_loop(lambda state: jnp.any(state[1]) & (state[2] < _EXCHANGES), exchange, start)
+        positive, *_ = jax.lax.while_loop(
+            lambda state: jnp.any(state[1]) & (state[2] < _EXCHANGES), exchange, start
+        )
         positive = jax.lax.stop_gradient(positive)
         coefficients, response = solved(positive)
-        return coefficients, jnp.where(positive[:, None] & positive[None], response, jnp.zeros_like(response))
+        return coefficients, jnp.where(
+            positive[:, None] & positive[None], response, jnp.zeros_like(response)
+        )
 
 
 _ROUNDING = 100.0
@@ -127,7 +138,9 @@ def without_idle(
     target: Float[Array, " rows"],
     energies: Float[Array, " gaussians"],
     active: Bool[Array, " gaussians"],
-) -> tuple[Float[Array, "more_rows gaussians"], Float[Array, " more_rows"], Float[Array, " gaussians"]]:
+) -> tuple[
+    Float[Array, "more_rows gaussians"], Float[Array, " more_rows"], Float[Array, " gaussians"]
+]:
     """Give the problem in which only the active Gaussians count: the others' coefficients are zero.
 
     One more row for each idle column keeps the rank full.
@@ -135,4 +148,8 @@ def without_idle(
     idle = jnp.diag(jnp.where(active, jnp.zeros_like(energies), jnp.ones_like(energies)))
     columns = jnp.where(jnp.broadcast_to(active, basis.shape), basis, jnp.zeros_like(basis))
     rows = jnp.concatenate([columns, idle])
-    return rows, jnp.concatenate([target, jnp.zeros_like(energies)]), jnp.where(active, energies, jnp.zeros_like(energies))
+    return (
+        rows,
+        jnp.concatenate([target, jnp.zeros_like(energies)]),
+        jnp.where(active, energies, jnp.zeros_like(energies)),
+    )

@@ -1,4 +1,6 @@
-"""The share of the surface that belongs to each of a set of points: Voronoi cells in their tangent planes."""
+"""The share of the surface that belongs to each of a set of points: Voronoi cells in their tangent
+planes.
+"""
 
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
@@ -12,7 +14,9 @@ _OPEN_END = 0.75
 
 
 class Cells(NamedTuple):
-    """Per point: the area of its cell (mm^2), its farthest corner (mm), and the way to its centroid (mm)."""
+    """Per point: the area of its cell (mm^2), its farthest corner (mm), and the way to its centroid
+    (mm).
+    """
 
     areas: Float[np.ndarray, " n"]
     reaches: Float[np.ndarray, " n"]
@@ -20,13 +24,17 @@ class Cells(NamedTuple):
 
 
 class Ghosts(NamedTuple):
-    """Points beyond the open border of a surface that end the cells before it, as mirror images do; with unit normals."""
+    """Points beyond the open border of a surface that end the cells before it, as mirror images do;
+    with unit normals.
+    """
 
     points: Float[np.ndarray, "m 3"]
     normals: Float[np.ndarray, "m 3"]
 
 
-def tangent_frames(normals: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+def tangent_frames(
+    normals: Float[np.ndarray, "n 3"],
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
     """Give two unit vectors that make a right-handed frame with each normal.
 
     **Source:** Duff et al. 2017, "Building an Orthonormal Basis, Revisited".
@@ -52,10 +60,11 @@ def surface_cells(
 ) -> Cells:
     r"""Measure the Voronoi cell of each point in its tangent plane.
 
-    The border of a cell in the direction `u` lies at `r(u) = min_j |d_j|^2 / (2 d_j . u)` over the neighbors at `d_j`; its
-    area is `1/2` the integral of `r^2` over all directions and its centroid `1/3` that of `r^3 u`, divided by the area.
-    Neighbors that face away (the other side of a thin sheet) do not count. Where the surface ends, a cell ends at
-    `limit`. Points that coincide share a cell.
+    The border of a cell in the direction `u` lies at `r(u) = min_j |d_j|^2 / (2 d_j . u)` over the
+    neighbors at `d_j`; its area is `1/2` the integral of `r^2` over all directions and its centroid
+    `1/3` that of `r^3 u`, divided by the area. Neighbors that face away (the other side of a thin
+    sheet) do not count. Where the surface ends, a cell ends at `limit`. Points that coincide share
+    a cell.
 
     **Arguments:**
 
@@ -66,7 +75,8 @@ def surface_cells(
     - `limit`: mm; `None`: 0.75 of the mean distance to the six nearest points.
     - `directions`: of the quadrature. With 32 the area is good to about 1 %.
 
-    **Returns:** the cells. On a closed surface sampled evenly the areas add up to its own within about 1 %.
+    **Returns:** the cells. On a closed surface sampled evenly the areas add up to its own within
+    about 1 %.
     """
     count = len(points)
     if count == 1:
@@ -88,13 +98,19 @@ def surface_cells(
         return _measure(offsets, distances[part, 1:], single[part], single[others], fan, limit)
 
     with ThreadPoolExecutor() as pool:
-        return Cells(*map(np.concatenate, zip(*pool.map(measure, range(0, count, _CHUNK)), strict=True)))
+        return Cells(
+            *map(np.concatenate, zip(*pool.map(measure, range(0, count, _CHUNK)), strict=True))
+        )
 
 
 def _measure(offsets, distances, own, theirs, fan, limit: float | None) -> Cells:
-    """Measure cells from the way to their neighbors, the normals of both, and a fan of directions."""
+    """Measure cells from the way to their neighbors, the normals of both, and a fan of
+    directions.
+    """
     tangent, bitangent = tangent_frames(own)
-    across = np.stack([np.einsum("nki,ni->nk", offsets, axis) for axis in (tangent, bitangent)], axis=-1)
+    across = np.stack(
+        [np.einsum("nki,ni->nk", offsets, axis) for axis in (tangent, bitangent)], axis=-1
+    )
     squared = np.square(distances).astype(np.float32)
     coincident = squared == 0
     same_side = np.einsum("nki,ni->nk", theirs, own) > 0.1
@@ -102,7 +118,9 @@ def _measure(offsets, distances, own, theirs, fan, limit: float | None) -> Cells
     nearest = distances[:, :6]
     around = nearest.sum(axis=1) / np.maximum((nearest > 0).sum(axis=1), 1)
     end = np.full(len(own), limit) if limit is not None else _OPEN_END * around
-    inverse = (across @ fan) * (2 / squared)[..., None]  # of the distance to the border; negative behind the point
+    inverse = (across @ fan) * (2 / squared)[
+        ..., None
+    ]  # of the distance to the border; negative behind the point
     border = 1 / np.maximum(inverse.max(axis=1), 1 / np.maximum(end, 1e-12)[:, None])
     step = 2 * np.pi / fan.shape[1]
     area = 0.5 * step * np.einsum("nd,nd->n", border, border)

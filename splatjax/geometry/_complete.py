@@ -34,20 +34,25 @@ def complete_splats(
     - `radii`: mm; `None`: as large as the cells ask for, so that no hole is left.
     - `albedo`, `specular`, `roughness`: as `Splats` has them; never estimated.
 
-    Points that lie alone are kept, estimated as large as their neighbors are, and a warning tells how many there are. Points at
-    one place share their area.
+    Points that lie alone are kept, estimated as large as their neighbors are, and a warning tells
+    how many there are. Points at one place share their area.
 
     **Returns:** as many splats as points, in JAX's default precision.
 
-    **Raises:** `ValueError` when something must be estimated and there are fewer than four points at different places.
+    **Raises:** `ValueError` when something must be estimated and there are fewer than four points
+    at different places.
     """
     estimated = normals is None or areas is None or radii is None
     if estimated and (count := len(distinct(centers)[0])) < 4:
-        raise ValueError(f"{count} points are too few to estimate normals, radii and areas from; give at least 4, or all three")
+        raise ValueError(
+            f"{count} points are too few to estimate normals, radii and areas from; give at least "
+            "4, or all three"
+        )
     order = morton_order(centers.astype(np.float32))
     centers = centers[order]
     normals, radii, areas, albedo, specular, roughness = (
-        None if array is None else array[order] for array in (normals, radii, areas, albedo, specular, roughness)
+        None if array is None else array[order]
+        for array in (normals, radii, areas, albedo, specular, roughness)
     )
     if normals is None:
         normals = estimate_normals(centers)
@@ -59,16 +64,22 @@ def complete_splats(
 
 
 def _covered(centers: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Give areas and radii; those of points that lie alone are their neighbors', lest their discs hide everything."""
+    """Give areas and radii; those of points that lie alone are their neighbors', lest their discs
+    hide everything.
+    """
     first, place = distinct(centers)
     places = centers[first]
     areas, radii = covering(places, normals[first])
     alone, near, distances = strays(places)
     if alone.any():
-        areas[alone], radii[alone] = (np.median(each[near[alone]], axis=1) for each in (areas, radii))
+        areas[alone], radii[alone] = (
+            np.median(each[near[alone]], axis=1) for each in (areas, radii)
+        )
         warnings.warn(
-            f"{alone.sum()} of {len(centers)} points lie alone, one of them {distances[alone].max():.3g} mm from its neighbors;"
-            " they are kept, as specks as large as those: remove them if they are noise of a scanner",
+            f"{alone.sum()} of {len(centers)} points lie alone, one of them "
+            f"{distances[alone].max():.3g} mm from its neighbors;"
+            " they are kept, as specks as large as those: remove them if they are noise of a "
+            "scanner",
             stacklevel=3,
         )
     return (areas / np.bincount(place))[place], radii[place]

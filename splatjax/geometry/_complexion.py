@@ -15,7 +15,9 @@ _SCALP = np.asarray([0.47, 0.335, 0.285])
 def complexion(
     points: Float[np.ndarray, "n 3"],
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Give linear albedo in (0, 1), and the factors on specular strength and roughness, at points of the bust (mm)."""
+    """Give linear albedo in (0, 1), and the factors on specular strength and roughness, at points
+    of the bust (mm).
+    """
     x, y, z = points.T
     side = np.abs(x)
     front = smooth_step(z, 20, 60)
@@ -26,7 +28,10 @@ def complexion(
     blood = blood + 0.35 * bump(side, 31, 17) * bump(y, -3, 10) * smooth_step(z, 55, 66)  # lids
     blood = blood + 0.10 * _mottling(points, 17.0, 3) + 0.07 * _mottling(points, 5.0, 5)
     albedo = _SKIN * _BLOOD ** np.clip(blood, -0.5, 1.6)[:, None]
-    albedo = albedo * (1 + 0.02 * _mottling(points, 28.0, 7) + 0.025 * _mottling(points, 2.2, 11))[:, None]
+    albedo = (
+        albedo
+        * (1 + 0.02 * _mottling(points, 28.0, 7) + 0.025 * _mottling(points, 2.2, 11))[:, None]
+    )
     albedo = _mix(albedo, _SCALP, 0.55 * _scalp(x, y, z) * (1 + 0.12 * _mottling(points, 1.6, 13)))
     lips = _lips(side, y, z)
     albedo = _mix(albedo, _LIPS, 0.95 * lips)
@@ -60,9 +65,18 @@ def _lips(side, y, z):
 
 def _brows(points, side, y, z):
     """Brows: an arch, with single hairs along it."""
-    arch = 25.5 + 6.0 * np.sin(np.clip((side - 12) / 44, 0, 1) * np.pi * 0.62) - 0.16 * np.maximum(side - 42, 0)
+    arch = (
+        25.5
+        + 6.0 * np.sin(np.clip((side - 12) / 44, 0, 1) * np.pi * 0.62)
+        - 0.16 * np.maximum(side - 42, 0)
+    )
     width = 4.4 - 0.06 * np.clip(side - 14, 0, 42)
-    shape = bump(y, arch, width) * smooth_step(side, 9, 17) * smooth_step(side, 57, 46) * smooth_step(z, 30, 45)
+    shape = (
+        bump(y, arch, width)
+        * smooth_step(side, 9, 17)
+        * smooth_step(side, 57, 46)
+        * smooth_step(z, 30, 45)
+    )
     hairs = 0.5 + 0.5 * np.sin(3.1 * side + 2.2 * (y - arch) + 2.0 * _mottling(points, 2.5, 19))
     return shape * (0.65 + 0.35 * hairs)
 
@@ -70,13 +84,19 @@ def _brows(points, side, y, z):
 def _lashes(side, y, z):
     across = side - 31
     parting = -6.5 + 0.012 * across**2 - 0.02 * across
-    return bump(y, parting - 0.6, 0.9) * smooth_step(np.abs(across), 17, 13) * smooth_step(z, 55, 62)
+    return (
+        bump(y, parting - 0.6, 0.9) * smooth_step(np.abs(across), 17, 13) * smooth_step(z, 55, 62)
+    )
 
 
 def _mottling(points: Float[np.ndarray, "n 3"], size: float, seed: int) -> Float[np.ndarray, " n"]:
-    """Give smooth noise of about unit variance whose patches are of the given size, mm: 16 waves in random directions."""
+    """Give smooth noise of about unit variance whose patches are of the given size, mm: 16 waves in
+    random directions.
+    """
     random = np.random.default_rng(seed)
     directions = random.normal(size=(3, 16))
     directions *= (np.pi / size) * random.uniform(0.4, 1.6, 16) / np.linalg.norm(directions, axis=0)
-    waves = (points.astype(np.float32) @ directions.astype(np.float32)) + random.uniform(0, 2 * np.pi, 16).astype(np.float32)
+    waves = (points.astype(np.float32) @ directions.astype(np.float32)) + random.uniform(
+        0, 2 * np.pi, 16
+    ).astype(np.float32)
     return np.sin(waves).sum(axis=1) * np.float32(np.sqrt(2 / 16))

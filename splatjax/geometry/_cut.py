@@ -6,7 +6,9 @@ from ._mesh import Mesh, unit
 
 
 def cut_below(mesh: Mesh, height: float) -> Mesh:
-    """Give what lies above `y = height` (mm), triangles across the plane cut along it; the border stays open."""
+    """Give what lies above `y = height` (mm), triangles across the plane cut along it; the border
+    stays open.
+    """
     above = mesh.vertices[mesh.faces, 1] >= height
     corners_above = above.sum(axis=1)
     parts = [mesh.select(corners_above == 3)]
@@ -18,7 +20,11 @@ def cut_below(mesh: Mesh, height: float) -> Mesh:
     starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
 
     def joined(name: str) -> np.ndarray | None:
-        return None if getattr(mesh, name) is None else np.concatenate([getattr(part, name) for part in parts])
+        return (
+            None
+            if getattr(mesh, name) is None
+            else np.concatenate([getattr(part, name) for part in parts])
+        )
 
     return Mesh(
         np.concatenate([part.vertices for part in parts]),
@@ -30,8 +36,12 @@ def cut_below(mesh: Mesh, height: float) -> Mesh:
     )
 
 
-def _cut(mesh: Mesh, chosen: np.ndarray, lonely: np.ndarray, height: float, *, keep_lonely: bool) -> Mesh:
-    """Cut triangles with one corner alone on its side: the tip is kept, or the two triangles that remain below it."""
+def _cut(
+    mesh: Mesh, chosen: np.ndarray, lonely: np.ndarray, height: float, *, keep_lonely: bool
+) -> Mesh:
+    """Cut triangles with one corner alone on its side: the tip is kept, or the two triangles that
+    remain below it.
+    """
     turn = (lonely[:, None] + np.arange(3)) % 3
     rows = np.arange(len(chosen))[:, None]
     faces = mesh.faces[chosen][rows, turn]
@@ -44,7 +54,9 @@ def _cut(mesh: Mesh, chosen: np.ndarray, lonely: np.ndarray, height: float, *, k
     share = ((height - y[:, :1]) / (y[:, 1:] - y[:, :1]))[..., None]
 
     def pieces(whole: np.ndarray) -> np.ndarray:
-        cut = whole[:, :1] * (1 - share) + whole[:, 1:] * share  # on the edges lonely-second, lonely-third
+        cut = (
+            whole[:, :1] * (1 - share) + whole[:, 1:] * share
+        )  # on the edges lonely-second, lonely-third
         if keep_lonely:
             return np.concatenate([whole[:, :1], cut], axis=1)
         return np.concatenate(
@@ -59,4 +71,6 @@ def _cut(mesh: Mesh, chosen: np.ndarray, lonely: np.ndarray, height: float, *, k
     parts = None if mesh.parts is None else np.tile(mesh.parts[chosen], 1 if keep_lonely else 2)
     colors = found["colors"].reshape(-1, 3) if "colors" in found else None
     faces = np.arange(len(vertices)).reshape(-1, 3)
-    return Mesh(vertices, faces, unit(found["normals"].reshape(-1, 3)), found.get("uvs"), colors, parts)
+    return Mesh(
+        vertices, faces, unit(found["normals"].reshape(-1, 3)), found.get("uvs"), colors, parts
+    )

@@ -4,8 +4,12 @@ import numpy as np
 from jaxtyping import Float, Int
 
 
-def distinct(points: Float[np.ndarray, "n 3"]) -> tuple[Int[np.ndarray, " places"], Int[np.ndarray, " n"]]:
-    """Give the first point of each place, in the order of the points, and the place of every point."""
+def distinct(
+    points: Float[np.ndarray, "n 3"],
+) -> tuple[Int[np.ndarray, " places"], Int[np.ndarray, " n"]]:
+    """Give the first point of each place, in the order of the points, and the place of every
+    point.
+    """
     if len(points) == 0:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     order = np.lexsort(points.T)

@@ -1,4 +1,6 @@
-"""A head, modeled in clay: serene, eyes closed. Its signed distance, mm; +y up, facing +z, eyes near y = 0."""
+"""A head, modeled in clay: serene, eyes closed. Its signed distance, mm; +y up, facing +z, eyes
+near y = 0.
+"""
 
 import numpy as np
 from jaxtyping import Float
@@ -54,7 +56,9 @@ def _masses(x, y, z, side):
 def _face(body, x, y, z, side):
     p, q = (x, y, z), (side, y, z)
     # brow and sockets
-    brow = join(limb(q, (8, 21, 78.5), (36, 27, 71), 7, 7), limb(q, (36, 27, 71), (52, 13, 48), 7, 6), 10)
+    brow = join(
+        limb(q, (8, 21, 78.5), (36, 27, 71), 7, 7), limb(q, (36, 27, 71), (52, 13, 48), 7, 6), 10
+    )
     brow = join(brow, limb(p, (-10, 21, 78), (10, 21, 78), 7, 7), 8)
     rim = limb(q, (51, 12, 47), (48, -14, 54), 6, 8)
     body = join(join(body, brow, 16), rim, 20)

@@ -18,9 +18,10 @@ def turn_cavities(
 ) -> None:
     r"""Turn patches around, in place, that would make a body within a body.
 
-    The winding number of a surface is 0 outside, 1 inside and on the surface itself their mean, 1/2. A patch is turned when that
-    brings the number on it, of everything else and of itself, nearer to 1/2: a shell within a body makes it 3/2 where it faces
-    outward, and 1/2 where it faces its middle. The greatest patch comes first.
+    The winding number of a surface is 0 outside, 1 inside and on the surface itself their mean,
+    1/2. A patch is turned when that brings the number on it, of everything else and of itself,
+    nearer to 1/2: a shell within a body makes it 3/2 where it faces outward, and 1/2 where it faces
+    its middle. The greatest patch comes first.
 
     **Arguments:**
 
@@ -29,11 +30,14 @@ def turn_cavities(
     - `patches`: points of each.
     - `signs`: those of turned patches are turned.
 
-    **Source:** Barill et al. 2018, "Fast Winding Numbers for Soups and Clouds", equation 4; Xu et al. 2023, "Globally Consistent
-    Normal Orientation for Point Clouds by Regularizing the Winding-Number Field".
+    **Source:** Barill et al. 2018, "Fast Winding Numbers for Soups and Clouds", equation 4; Xu et
+    al. 2023, "Globally Consistent Normal Orientation for Point Clouds by Regularizing the
+    Winding-Number Field".
     """
     for patch in sorted(patches, key=len, reverse=True):
-        probes = points[patch[np.linspace(0, len(patch) - 1, min(len(patch), _PROBES)).astype(np.int64)]]
+        probes = points[
+            patch[np.linspace(0, len(patch) - 1, min(len(patch), _PROBES)).astype(np.int64)]
+        ]
         everything = np.median(_winding(probes, points, oriented))
         own = np.median(_winding(probes, points[patch], oriented[patch]))
         if (everything - own - 0.5) * own > _CLEAR:
@@ -42,12 +46,19 @@ def turn_cavities(
 
 
 def _winding(
-    probes: Float[np.ndarray, "probes 3"], points: Float[np.ndarray, "n 3"], oriented: Float[np.ndarray, "n 3"]
+    probes: Float[np.ndarray, "probes 3"],
+    points: Float[np.ndarray, "n 3"],
+    oriented: Float[np.ndarray, "n 3"],
 ) -> Float[np.ndarray, " probes"]:
-    """Give winding numbers on a surface, of points in blocks; those of a block that a probe belongs to nearly cancel."""
+    """Give winding numbers on a surface, of points in blocks; those of a block that a probe belongs
+    to nearly cancel.
+    """
     starts = np.arange(0, len(points), _BLOCK)
     sizes = np.diff(np.append(starts, len(points)))
-    middles, normals = np.add.reduceat(points, starts) / sizes[:, None], np.add.reduceat(oriented, starts)
+    middles, normals = (
+        np.add.reduceat(points, starts) / sizes[:, None],
+        np.add.reduceat(oriented, starts),
+    )
     found = np.empty(len(probes))
     for i, probe in enumerate(probes):  # one by one, in memory that does not grow with both
         way = middles - probe[None]

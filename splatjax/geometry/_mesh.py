@@ -8,16 +8,16 @@ from jaxtyping import Float, Int
 class Mesh(eqx.Module):
     r"""Triangles with normals and texture coordinates; NumPy arrays on the host, mm, right-handed.
 
-    Texture coordinates belong to the corners of triangles, not to vertices, so that a mesh stays closed across the seams of
-    its texture.
+    Texture coordinates belong to the corners of triangles, not to vertices, so that a mesh stays
+    closed across the seams of its texture.
 
     **Attributes:**
 
     - `vertices`: mm.
     - `faces`: vertices of each triangle, counterclockwise seen from outside.
     - `normals`: unit, outward, one per vertex.
-    - `uvs`: per face and corner; u to the right and v *up*, so that (0, 0) is the lower left corner of a texture and
-      (0, 1) the upper left, where its row 0 begins. `None` where there are none.
+    - `uvs`: per face and corner; u to the right and v *up*, so that (0, 0) is the lower left corner
+      of a texture and (0, 1) the upper left, where its row 0 begins. `None` where there are none.
     - `colors`: of vertices, linear, in [0, 1]. `None` where there are none.
     - `parts`: number of the part that each face belongs to, where parts have textures of their own.
     """
@@ -43,7 +43,9 @@ class Mesh(eqx.Module):
         return float(self.face_areas().sum())
 
     def volume(self) -> float:
-        """Give the enclosed volume, mm^3: positive for a closed mesh whose triangles face outward (divergence theorem)."""
+        """Give the enclosed volume, mm^3: positive for a closed mesh whose triangles face outward
+        (divergence theorem).
+        """
         a, b, c = np.moveaxis(self.corners(), 1, 0)
         return float(np.einsum("fi,fi->", a, np.cross(b, c)) / 6)
 
@@ -56,11 +58,17 @@ class Mesh(eqx.Module):
 def vertex_normals(
     vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
 ) -> Float[np.ndarray, "vertices 3"]:
-    """Give unit vertex normals as the area-weighted mean of those of the faces around; +y for a vertex without faces."""
+    """Give unit vertex normals as the area-weighted mean of those of the faces around; +y for a
+    vertex without faces.
+    """
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
     face_normals = np.cross(b - a, c - a)
     normals = np.stack(
-        [np.bincount(faces.ravel(), np.repeat(face_normals[:, axis], 3), len(vertices)) for axis in range(3)], axis=-1
+        [
+            np.bincount(faces.ravel(), np.repeat(face_normals[:, axis], 3), len(vertices))
+            for axis in range(3)
+        ],
+        axis=-1,
     )
     return unit(normals)
 

@@ -20,12 +20,18 @@ def _spread(x: np.ndarray) -> np.ndarray:
 
 
 def morton_order(points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
-    """Give the order of points along the Morton curve of their bounding cube, 2^21 cells a side; ties keep their order."""
+    """Give the order of points along the Morton curve of their bounding cube, 2^21 cells a side;
+    ties keep their order.
+    """
     if len(points) == 0:
         return np.zeros(0, np.int64)
     points = points.astype(np.float64)
     low = points.min(axis=0)
     extent = float((points.max(axis=0) - low).max()) or 1.0
     cells = np.minimum((points - low) * (2**_BITS / extent), 2**_BITS - 1).astype(np.uint64)
-    code = _spread(cells[:, 0]) | (_spread(cells[:, 1]) << np.uint64(1)) | (_spread(cells[:, 2]) << np.uint64(2))
+    code = (
+        _spread(cells[:, 0])
+        | (_spread(cells[:, 1]) << np.uint64(1))
+        | (_spread(cells[:, 2]) << np.uint64(2))
+    )
     return np.argsort(code, kind="stable")

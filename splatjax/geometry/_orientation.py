@@ -24,11 +24,13 @@ def outward_signs(
 ) -> Signs:
     r"""Give the signs that turn normals outward.
 
-    The points are looked at from all around. Where a point and its neighbors are seen from one side alone, it is the outer one.
-    From there signs are carried along a minimum spanning tree of the neighborhood graph. Neighbors at `p_i` and `p_j` agree as
-    far as one normal is the mirror image of the other in the plane between the points, as on a circle, around an edge and across
-    a thin sheet, and the cost of an edge is `1.001 - |agreement|`. A part that is seen from both sides alike, or not at all, is
-    turned away from its middle at its farthest point. What hides within a body is a hollow (`turn_cavities`).
+    The points are looked at from all around. Where a point and its neighbors are seen from one side
+    alone, it is the outer one. From there signs are carried along a minimum spanning tree of the
+    neighborhood graph. Neighbors at `p_i` and `p_j` agree as far as one normal is the mirror image
+    of the other in the plane between the points, as on a circle, around an edge and across a thin
+    sheet, and the cost of an edge is `1.001 - |agreement|`. A part that is seen from both sides
+    alike, or not at all, is turned away from its middle at its farthest point. What hides within a
+    body is a hollow (`turn_cavities`).
 
     **Arguments:**
 
@@ -36,8 +38,8 @@ def outward_signs(
     - `near`: neighbors of each point, without itself, each at another place.
     - `reaches`: mm, how far away the last of them is.
 
-    **Source:** Hoppe et al. 1992, section 3.3; König and Gumhold 2009, "Consistent Propagation of Normal Orientations in Point
-    Clouds", for agreement around edges.
+    **Source:** Hoppe et al. 1992, section 3.3; König and Gumhold 2009, "Consistent Propagation of
+    Normal Orientations in Point Clouds", for agreement around edges.
     """
     votes, cast = _votes(points, normals, 0.6 * float(np.quantile(reaches, 0.99)))
     around, cast_around = votes.copy(), cast.copy()
@@ -45,7 +47,9 @@ def outward_signs(
         around += votes[each] * np.sign(np.einsum("ni,ni->n", normals, normals[each]))
         cast_around += cast[each]
     sure = np.abs(around) > _SURE * (cast_around + _DOUBT * (1 + near.shape[1]))
-    signs, patches = _carried(points, normals, near, np.flatnonzero(sure), np.where(around < 0, -1.0, 1.0))
+    signs, patches = _carried(
+        points, normals, near, np.flatnonzero(sure), np.where(around < 0, -1.0, 1.0)
+    )
     if not sure.any() or not patches:
         return signs
     areas = np.pi / near.shape[1] * reaches**2
@@ -55,9 +59,11 @@ def outward_signs(
 
 
 def _votes(points: np.ndarray, normals: np.ndarray, pixel: float) -> tuple[Signs, Signs]:
-    """Give for how many views each normal points to the viewer less those where it points away, and how many see it at all.
+    """Give for how many views each normal points to the viewer less those where it points away, and
+    how many see it at all.
 
-    A point is seen where nothing lies more than a pixel before it and the pixels around. A view counts by its squared cosine.
+    A point is seen where nothing lies more than a pixel before it and the pixels around. A view
+    counts by its squared cosine.
     """
     index = np.arange(_VIEWS) + 0.5  # on a spiral around the sphere
     height, angle = 1 - 2 * index / _VIEWS, index * np.pi * (3 - np.sqrt(5))
@@ -73,7 +79,9 @@ def _votes(points: np.ndarray, normals: np.ndarray, pixel: float) -> tuple[Signs
             [r * np.cos(turn), r * np.sin(turn), z],
         ]
         across, up, towards = np.asarray(frame, np.float32) @ single.T
-        columns, rows = (np.floor((each - each.min()) / pixel).astype(np.int64) for each in (across, up))
+        columns, rows = (
+            np.floor((each - each.min()) / pixel).astype(np.int64) for each in (across, up)
+        )
         width = columns.max() + 1
         place = rows * width + columns
         nearest = np.full((rows.max() + 1, width), -np.inf, np.float32)
@@ -85,7 +93,9 @@ def _votes(points: np.ndarray, normals: np.ndarray, pixel: float) -> tuple[Signs
     return votes, cast
 
 
-def _agreement(points: np.ndarray, normals: np.ndarray, one: np.ndarray, other: np.ndarray) -> Signs:
+def _agreement(
+    points: np.ndarray, normals: np.ndarray, one: np.ndarray, other: np.ndarray
+) -> Signs:
     """Give the cosine between normals and the mirror images of others in the plane between them."""
     between = points[other] - points[one]
     along = [np.einsum("ni,ni->n", normals[each], between) for each in (one, other)]
@@ -96,7 +106,9 @@ def _agreement(points: np.ndarray, normals: np.ndarray, one: np.ndarray, other: 
 def _carried(
     points: np.ndarray, normals: np.ndarray, near: np.ndarray, sure: np.ndarray, signs: Signs
 ) -> tuple[Signs, list[np.ndarray]]:
-    """Carry signs from points that are sure of theirs to all others; give also which of these hang together smoothly."""
+    """Carry signs from points that are sure of theirs to all others; give also which of these hang
+    together smoothly.
+    """
     count, neighbors = near.shape
     waiting = np.setdiff1d(np.arange(count), sure, assume_unique=True)
     start, end = np.repeat(waiting, neighbors), near[waiting].ravel()
@@ -105,11 +117,15 @@ def _carried(
     agreement = _agreement(points, normals, low, high)
     cost = 1.001 - np.minimum(np.abs(agreement), 1.0)
     graph = scipy.sparse.coo_array((cost, (low, high)), shape=(count + 1, count + 1))
-    farthest, outward = _farthest(points, scipy.sparse.csgraph.connected_components(graph, directed=False)[1][:count], sure)
+    farthest, outward = _farthest(
+        points, scipy.sparse.csgraph.connected_components(graph, directed=False)[1][:count], sure
+    )
     signs[farthest] = np.where(np.einsum("ni,ni->n", normals[farthest], outward) < 0, -1.0, 1.0)
     roots = np.concatenate([sure, farthest])
     row, column = np.concatenate([low, roots]), np.concatenate([high, np.full(len(roots), count)])
-    joined = scipy.sparse.coo_array((np.concatenate([cost, np.full(len(roots), _ROOT)]), (row, column)), shape=graph.shape)
+    joined = scipy.sparse.coo_array(
+        (np.concatenate([cost, np.full(len(roots), _ROOT)]), (row, column)), shape=graph.shape
+    )
     ahead = scipy.sparse.csgraph.breadth_first_order(
         scipy.sparse.csgraph.minimum_spanning_tree(joined.tocsr()), count, directed=False
     )[1]
@@ -117,7 +133,9 @@ def _carried(
     inner = np.flatnonzero(ahead[:count] < count)
     signs[inner] = np.where(_agreement(points, normals, inner, ahead[inner]) < 0, -1.0, 1.0)
     signs = np.append(signs, 1.0)
-    while not (ahead == count).all():  # pointer doubling: as many rounds as the depth of the tree has bits
+    while not (
+        ahead == count
+    ).all():  # pointer doubling: as many rounds as the depth of the tree has bits
         signs *= signs[ahead]
         ahead = ahead[ahead]
     signs = signs[:count]
@@ -125,18 +143,25 @@ def _carried(
     free[sure] = False
     smooth = (agreement * signs[low] * signs[high] > _SMOOTH) & free[low] & free[high]
     parts = scipy.sparse.csgraph.connected_components(
-        scipy.sparse.coo_array((cost[smooth], (low[smooth], high[smooth])), shape=(count, count)), directed=False
+        scipy.sparse.coo_array((cost[smooth], (low[smooth], high[smooth])), shape=(count, count)),
+        directed=False,
     )[1]
     order = np.argsort(parts, kind="stable")
     patches = np.split(order, np.flatnonzero(np.diff(parts[order])) + 1)
     return signs, [patch for patch in patches if len(patch) >= _LEAST_PATCH]
 
 
-def _farthest(points: np.ndarray, part: np.ndarray, sure: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Give, of each part without a sure point, the point farthest from its middle, and the way there."""
+def _farthest(
+    points: np.ndarray, part: np.ndarray, sure: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Give, of each part without a sure point, the point farthest from its middle, and the way
+    there.
+    """
     parts = part.max() + 1
     sizes = np.maximum(np.bincount(part, minlength=parts), 1)
-    middles = np.stack([np.bincount(part, points[:, axis], parts) / sizes for axis in range(3)], axis=-1)
+    middles = np.stack(
+        [np.bincount(part, points[:, axis], parts) / sizes for axis in range(3)], axis=-1
+    )
     outward = points - middles[part]
     by_distance = np.argsort(np.einsum("ni,ni->n", outward, outward), kind="stable")
     farthest = np.full(parts, -1)

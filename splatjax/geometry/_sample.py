@@ -13,7 +13,14 @@ from ._scatter import SurfacePoints, faces_beyond, mirrored, scatter
 from ._textures import Textures, lookup, perturbed_normals, texture_coordinates, worn_albedo
 
 
-def sample_mesh(mesh: Mesh, count: int, *, textures: Textures | None = None, seed: int = 0, rounded: bool = False) -> Splats:
+def sample_mesh(
+    mesh: Mesh,
+    count: int,
+    *,
+    textures: Textures | None = None,
+    seed: int = 0,
+    rounded: bool = False,
+) -> Splats:
     r"""Cover a mesh with splats, spread evenly, its textures baked in.
 
     **Arguments:**
@@ -22,24 +29,38 @@ def sample_mesh(mesh: Mesh, count: int, *, textures: Textures | None = None, see
     - `count`: of splats, at least 1.
     - `textures`: looked up bilinearly at every splat; `None` for a plain surface.
     - `seed`: another spread of the same quality; the same seed gives the same splats.
-    - `rounded`: put them where the surface is that bends as the mesh's normals do, instead of on flat triangles.
+    - `rounded`: put them where the surface is that bends as the mesh's normals do, instead of on
+      flat triangles.
 
-    **Returns:** splats in Morton order, in JAX's default precision. Their areas are those of their Voronoi cells on the
-    surface, all scaled by one factor so that they add up to the surface's area; their radii are `1.5 sqrt(area)`, and at
-    least 1.2 times the way to the farthest corner of the cell, so that the discs leave no hole.
+    **Returns:** splats in Morton order, in JAX's default precision. Their areas are those of their
+    Voronoi cells on the surface, all scaled by one factor so that they add up to the surface's
+    area; their radii are `1.5 sqrt(area)`, and at least 1.2 times the way to the farthest corner of
+    the cell, so that the discs leave no hole.
 
-    **Raises:** `ValueError` for a count below 1, a mesh without area, or textures on a mesh without UVs.
+    **Raises:** `ValueError` for a count below 1, a mesh without area, or textures on a mesh without
+    UVs.
     """
     points = scatter(mesh, count, seed=seed)
     return splats_at(mesh, points, textures, rounded=rounded)
 
 
-def splats_at(mesh: Mesh, points: SurfacePoints, textures: Textures | None = None, *, rounded: bool = False) -> Splats:
+def splats_at(
+    mesh: Mesh, points: SurfacePoints, textures: Textures | None = None, *, rounded: bool = False
+) -> Splats:
     """Make splats of points on a mesh, its textures baked in; the rest as `sample_mesh` has it."""
-    centers, area = (rounded_positions(mesh, points), rounded_area(mesh)) if rounded else (points.positions(mesh), mesh.area())
+    centers, area = (
+        (rounded_positions(mesh, points), rounded_area(mesh))
+        if rounded
+        else (points.positions(mesh), mesh.area())
+    )
     normals = points.normals(mesh)
     spacing = float(np.sqrt(area / len(centers)))
-    cells = surface_cells(centers, normals, limit=spacing, ghosts=mirrored(mesh, faces_beyond(mesh), centers, normals, spacing))
+    cells = surface_cells(
+        centers,
+        normals,
+        limit=spacing,
+        ghosts=mirrored(mesh, faces_beyond(mesh), centers, normals, spacing),
+    )
     areas = cells.areas * (area / cells.areas.sum())
     radii = _radii(areas, cells)
     albedo = worn_albedo(textures, mesh, points)
@@ -58,7 +79,9 @@ def splats_at(mesh: Mesh, points: SurfacePoints, textures: Textures | None = Non
 def covering(
     centers: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Give areas (mm^2) and radii (mm) of splats that cover a surface of which no more is known than these points."""
+    """Give areas (mm^2) and radii (mm) of splats that cover a surface of which no more is known
+    than these points.
+    """
     cells = surface_cells(centers, normals)
     return cells.areas, _radii(cells.areas, cells)
 
@@ -67,7 +90,9 @@ def _radii(areas: Float[np.ndarray, " n"], cells: Cells) -> Float[np.ndarray, " 
     return np.maximum(1.5 * np.sqrt(areas), 1.2 * cells.reaches)
 
 
-def make_splats(centers, normals, radii, areas, albedo=None, specular=None, roughness=None) -> Splats:
+def make_splats(
+    centers, normals, radii, areas, albedo=None, specular=None, roughness=None
+) -> Splats:
     """Put host arrays into a record, in JAX's default precision."""
 
     def there(array):

@@ -16,7 +16,9 @@ _WALK = 64
 
 
 class SurfacePoints(NamedTuple):
-    """Points on a mesh: the face of each, and its barycentric coordinates there (non-negative, adding up to 1)."""
+    """Points on a mesh: the face of each, and its barycentric coordinates there (non-negative,
+    adding up to 1).
+    """
 
     faces: Int[np.ndarray, " n"]
     barycentrics: Float[np.ndarray, "n 3"]
@@ -27,7 +29,9 @@ class SurfacePoints(NamedTuple):
 
     def normals(self, mesh: Mesh) -> Float[np.ndarray, "n 3"]:
         """Give unit normals, interpolated between those of the vertices."""
-        return unit(np.einsum("nc,nci->ni", self.barycentrics, mesh.normals[mesh.faces[self.faces]]))
+        return unit(
+            np.einsum("nc,nci->ni", self.barycentrics, mesh.normals[mesh.faces[self.faces]])
+        )
 
     def take(self, order: Int[np.ndarray, " m"]) -> "SurfacePoints":
         """Give some of the points, or all in another order."""
@@ -37,8 +41,9 @@ class SurfacePoints(NamedTuple):
 def scatter(mesh: Mesh, count: int, *, seed: int = 0, relaxations: int = 4) -> SurfacePoints:
     r"""Spread points over a mesh, one density everywhere, each far from its neighbors (blue noise).
 
-    Points are dealt out evenly along a Morton curve of the triangles, by a low-discrepancy sequence inside each, then moved
-    `relaxations` times to the centroids of their Voronoi cells (Lloyd), along the surface.
+    Points are dealt out evenly along a Morton curve of the triangles, by a low-discrepancy sequence
+    inside each, then moved `relaxations` times to the centroids of their Voronoi cells (Lloyd),
+    along the surface.
 
     **Arguments:**
 
@@ -54,7 +59,9 @@ def scatter(mesh: Mesh, count: int, *, seed: int = 0, relaxations: int = 4) -> S
         raise ValueError(f"count is {count}; at least one splat is needed")
     areas = mesh.face_areas() if len(mesh.faces) else np.zeros(0)
     if not areas.sum() > 0:
-        raise ValueError("the mesh has no area; it needs at least one triangle that is not degenerate")
+        raise ValueError(
+            "the mesh has no area; it needs at least one triangle that is not degenerate"
+        )
     points = _deal(mesh, areas, count, np.random.default_rng(seed))
     points = points.take(morton_order(points.positions(mesh)))
     if relaxations and count > 1:
@@ -63,9 +70,13 @@ def scatter(mesh: Mesh, count: int, *, seed: int = 0, relaxations: int = 4) -> S
         for _ in range(relaxations):
             positions, normals = points.positions(mesh), points.normals(mesh)
             ghosts = mirrored(mesh, beyond, positions, normals, spacing)
-            cells = surface_cells(positions, normals, neighbors=10, directions=12, limit=spacing, ghosts=ghosts)
+            cells = surface_cells(
+                positions, normals, neighbors=10, directions=12, limit=spacing, ghosts=ghosts
+            )
             points = _settle(mesh, beyond, points.faces, positions + 1.3 * cells.to_centroids)
-    return points.take(morton_order(points.positions(mesh).astype(np.float32)))  # as it will be seen in single precision
+    return points.take(
+        morton_order(points.positions(mesh).astype(np.float32))
+    )  # as it will be seen in single precision
 
 
 def _deal(mesh: Mesh, areas: np.ndarray, count: int, random: np.random.Generator) -> SurfacePoints:
@@ -80,10 +91,16 @@ def _deal(mesh: Mesh, areas: np.ndarray, count: int, random: np.random.Generator
 
 
 def faces_beyond(mesh: Mesh) -> Int[np.ndarray, "faces 3"]:
-    """Give, per face and corner, the face beyond the edge opposite to the corner; -1 at an open edge."""
+    """Give, per face and corner, the face beyond the edge opposite to the corner; -1 at an open
+    edge.
+    """
     beyond = _beyond(mesh.faces)
-    if (beyond < 0).any():  # textures cut meshes open along their seams: vertices at one place are one
-        beyond = _beyond(np.unique(mesh.vertices, axis=0, return_inverse=True)[1].reshape(-1)[mesh.faces])
+    if (
+        beyond < 0
+    ).any():  # textures cut meshes open along their seams: vertices at one place are one
+        beyond = _beyond(
+            np.unique(mesh.vertices, axis=0, return_inverse=True)[1].reshape(-1)[mesh.faces]
+        )
     return beyond
 
 
@@ -105,7 +122,9 @@ def mirrored(
     normals: Float[np.ndarray, "n 3"],
     spacing: float,
 ) -> Ghosts | None:
-    """Mirror points at the open border of a mesh, those within 1.5 spacings of it; `None` where the mesh is closed."""
+    """Mirror points at the open border of a mesh, those within 1.5 spacings of it; `None` where the
+    mesh is closed.
+    """
     faces, corners = np.nonzero(beyond < 0)
     if not len(faces):
         return None
@@ -113,9 +132,13 @@ def mirrored(
     lengths = np.linalg.norm(ends - starts, axis=1)
     pieces = np.maximum(np.ceil(lengths / (0.1 * spacing)).astype(np.int64), 1)
     edge = np.repeat(np.arange(len(faces)), pieces)
-    share = (np.arange(len(edge)) - np.repeat(np.cumsum(pieces) - pieces, pieces) + 0.5) / pieces[edge]
+    share = (np.arange(len(edge)) - np.repeat(np.cumsum(pieces) - pieces, pieces) + 0.5) / pieces[
+        edge
+    ]
     marks = starts[edge] + share[:, None] * (ends - starts)[edge]
-    distance, mark = scipy.spatial.KDTree(marks).query(points, distance_upper_bound=1.5 * spacing, workers=-1)
+    distance, mark = scipy.spatial.KDTree(marks).query(
+        points, distance_upper_bound=1.5 * spacing, workers=-1
+    )
     near = np.flatnonzero(np.isfinite(distance))
     edge = edge[mark[near]]
     along = (ends - starts)[edge] / lengths[edge, None]
@@ -123,7 +146,10 @@ def mirrored(
     share = np.clip(np.einsum("ni,ni->n", offset, along), 0.0, lengths[edge])
     foot = starts[edge] + share[:, None] * along
     gap = np.linalg.norm(foot - points[near], axis=1)
-    near, foot = near[gap > 1e-3 * spacing], foot[gap > 1e-3 * spacing]  # on the border itself a point is its own image
+    near, foot = (
+        near[gap > 1e-3 * spacing],
+        foot[gap > 1e-3 * spacing],
+    )  # on the border itself a point is its own image
     return Ghosts(2 * foot - points[near], normals[near])
 
 

@@ -1,4 +1,6 @@
-"""Signed distances of soft clay: primitives, and the ways to join them. Negative inside; mm; arrays of one shape."""
+"""Signed distances of soft clay: primitives, and the ways to join them. Negative inside; mm; arrays
+of one shape.
+"""
 
 import numpy as np
 
@@ -7,7 +9,9 @@ Size = float | int
 
 
 def ellipsoid(p: Point, center, radii) -> np.ndarray:
-    """Give the distance to an ellipsoid, to first order (exact on it): `k (k - 1) / |grad k^2 / 2|`, `k = |p / r|`."""
+    """Give the distance to an ellipsoid, to first order (exact on it): `k (k - 1) / |grad k^2 /
+    2|`, `k = |p / r|`.
+    """
     scaled = [(x - c) / r for x, c, r in zip(p, center, radii, strict=True)]
     k = np.sqrt(sum(s * s for s in scaled))
     slope = np.sqrt(sum((s / r) ** 2 for s, r in zip(scaled, radii, strict=True)))
@@ -15,7 +19,9 @@ def ellipsoid(p: Point, center, radii) -> np.ndarray:
 
 
 def limb(p: Point, start, end, start_radius: Size, end_radius: Size) -> np.ndarray:
-    """Give the distance to a capsule whose radius changes linearly from `start` to `end` (to first order)."""
+    """Give the distance to a capsule whose radius changes linearly from `start` to `end` (to first
+    order).
+    """
     axis = [e - s for s, e in zip(start, end, strict=True)]
     length = sum(a * a for a in axis)
     share = sum((x - s) * a for x, s, a in zip(p, start, axis, strict=True)) / length
@@ -25,7 +31,9 @@ def limb(p: Point, start, end, start_radius: Size, end_radius: Size) -> np.ndarr
 
 
 def join(a: np.ndarray, b: np.ndarray, softness: Size) -> np.ndarray:
-    """Unite two bodies; where both are within `softness`, a fillet fills the corner (quadratic smooth minimum)."""
+    """Unite two bodies; where both are within `softness`, a fillet fills the corner (quadratic
+    smooth minimum).
+    """
     blend = np.maximum(softness - np.abs(a - b), 0.0)
     return np.minimum(a, b) - blend * blend * (0.25 / softness)
 

@@ -11,21 +11,37 @@ from ._mesh import Mesh, unit
 Distance = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, " n"]]
 _CHUNK = 1 << 14
 _CORNERS = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(-1, 3)
-_EDGES = [(a, a | bit) for bit in (4, 2, 1) for a in range(8) if not a & bit]  # corners are numbered 4 x + 2 y + z
-_SIDES = [(0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 2, 6, 4), (1, 3, 7, 5)]  # around each
+_EDGES = [
+    (a, a | bit) for bit in (4, 2, 1) for a in range(8) if not a & bit
+]  # corners are numbered 4 x + 2 y + z
+_SIDES = [
+    (0, 1, 3, 2),
+    (4, 5, 7, 6),
+    (0, 1, 5, 4),
+    (2, 3, 7, 6),
+    (0, 2, 6, 4),
+    (1, 3, 7, 5),
+]  # around each
 
 
 def _sheets() -> Int[np.ndarray, "256 12"]:
-    """Give, for each set of corners inside, which sheet of the surface crosses each edge of a cell; -1 for none.
+    """Give, for each set of corners inside, which sheet of the surface crosses each edge of a cell;
+    -1 for none.
 
-    Sheets are told apart so that no two of them share a vertex: on a side whose inner corners lie across from each other, the
-    surface goes around each of them.
+    Sheets are told apart so that no two of them share a vertex: on a side whose inner corners lie
+    across from each other, the surface goes around each of them.
     """
     table = np.full((256, 12), -1, np.int64)
     for corners in range(256):
-        sheet = [edge if (corners >> a & 1) != (corners >> b & 1) else -1 for edge, (a, b) in enumerate(_EDGES)]
+        sheet = [
+            edge if (corners >> a & 1) != (corners >> b & 1) else -1
+            for edge, (a, b) in enumerate(_EDGES)
+        ]
         for side in _SIDES:
-            around = [_EDGES.index((min(pair), max(pair))) for pair in zip(side, (*side[1:], side[0]), strict=True)]
+            around = [
+                _EDGES.index((min(pair), max(pair)))
+                for pair in zip(side, (*side[1:], side[0]), strict=True)
+            ]
             crossed = [edge for edge in around if sheet[edge] >= 0]
             pairs = [tuple(crossed)] if len(crossed) == 2 else []
             if len(crossed) == 4:
@@ -39,7 +55,9 @@ def _sheets() -> Int[np.ndarray, "256 12"]:
 
 
 def in_chunks(distance: Distance, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-    """Evaluate a distance in pieces that stay in cache, on as many threads as there are cores; single precision."""
+    """Evaluate a distance in pieces that stay in cache, on as many threads as there are cores;
+    single precision.
+    """
     points = points.astype(np.float32)
     pieces = [points[start : start + _CHUNK] for start in range(0, len(points), _CHUNK)]
     with ThreadPoolExecutor() as pool:
@@ -50,8 +68,8 @@ def surface_nets(distance: Distance, low, high, spacing: float, *, slack: float 
     r"""Mesh the zero level of a distance: one vertex per grid cell and sheet of it
     that crosses the cell, one quadrilateral per grid edge.
 
-    Cells are sought from coarse to fine, so that only those near the surface are looked at; the vertices are then drawn onto
-    the surface by Newton's method, and their normals are its gradient.
+    Cells are sought from coarse to fine, so that only those near the surface are looked at; the
+    vertices are then drawn onto the surface by Newton's method, and their normals are its gradient.
 
     **Arguments:**
 
@@ -59,7 +77,8 @@ def surface_nets(distance: Distance, low, high, spacing: float, *, slack: float 
     - `low`, `high`: corners of a box that holds the surface, mm.
     - `spacing`: of the finest grid, mm.
 
-    **Returns:** a closed mesh without texture coordinates, its triangles counterclockwise seen from outside.
+    **Returns:** a closed mesh without texture coordinates, its triangles counterclockwise seen from
+    outside.
 
     **Source:** Gibson 1998, "Constrained Elastic Surface Nets".
     """
@@ -88,7 +107,9 @@ def surface_nets(distance: Distance, low, high, spacing: float, *, slack: float 
     return Mesh(vertices, faces, unit(normals))  # those of the second step, which is tiny
 
 
-def _cells_near(distance: Distance, low, shape, spacing: float, slack: float) -> Int[np.ndarray, "n 3"]:
+def _cells_near(
+    distance: Distance, low, shape, spacing: float, slack: float
+) -> Int[np.ndarray, "n 3"]:
     """Give the cells of the finest grid whose corners may lie on both sides."""
     factor = 8
     blocks = -(-shape // factor)
@@ -104,10 +125,14 @@ def _cells_near(distance: Distance, low, shape, spacing: float, slack: float) ->
 
 
 def _crossings(values: Float[np.ndarray, "n 8"], sheets: Int[np.ndarray, "n 12"]):
-    """Give the cell of each vertex, and the mean of the points where its sheet crosses the edges of that cell, in cells."""
+    """Give the cell of each vertex, and the mean of the points where its sheet crosses the edges of
+    that cell, in cells.
+    """
     a, b = np.asarray(_EDGES).T
     crossing = sheets >= 0
-    share = np.where(crossing, values[:, a] / np.where(crossing, values[:, a] - values[:, b], 1.0), 0.0)
+    share = np.where(
+        crossing, values[:, a] / np.where(crossing, values[:, a] - values[:, b], 1.0), 0.0
+    )
     points = _CORNERS[a] + share[..., None] * (_CORNERS[b] - _CORNERS[a])
     owners, sheet = np.nonzero(np.arange(4) <= sheets.max(axis=1, keepdims=True))
     mine = (sheets[owners] == sheet[:, None]).astype(np.float64)
@@ -115,7 +140,9 @@ def _crossings(values: Float[np.ndarray, "n 8"], sheets: Int[np.ndarray, "n 12"]
 
 
 def _faces(cells, keys, stride, inside, vertex, vertices) -> Int[np.ndarray, "f 3"]:
-    """Make two triangles of the four cells around each grid edge that the surface crosses, split along the shorter diagonal."""
+    """Make two triangles of the four cells around each grid edge that the surface crosses, split
+    along the shorter diagonal.
+    """
     order = np.argsort(keys)
     ordered = keys[order]
     triangles = []
@@ -128,7 +155,10 @@ def _faces(cells, keys, stride, inside, vertex, vertices) -> Int[np.ndarray, "f 
             key = keys[chosen] - _CORNERS[corner] @ stride
             place = np.minimum(np.searchsorted(ordered, key), len(ordered) - 1)
             if not (ordered[place] == key).all():
-                raise ValueError("the surface leaves the box, or its distance is too far from true; widen the box or the slack")
+                raise ValueError(
+                    "the surface leaves the box, or its distance is too far from true; widen the "
+                    "box or the slack"
+                )
             around.append(vertex[order[place], _EDGES.index((corner, corner | bit))])
         quad = np.stack(around, axis=-1)
         quad = np.where(start_inside[chosen, None], quad, quad[:, ::-1])
@@ -140,7 +170,9 @@ def _faces(cells, keys, stride, inside, vertex, vertices) -> Int[np.ndarray, "f 
 
 
 def _gradient(distance: Distance, points: Float[np.ndarray, "n 3"], step: float = 0.2):
-    """Give the unit gradient and the distance over its length, by central differences over the corners of a tetrahedron."""
+    """Give the unit gradient and the distance over its length, by central differences over the
+    corners of a tetrahedron.
+    """
     corners = np.asarray([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) * step
     levels = in_chunks(distance, (points[:, None] + corners).reshape(-1, 3)).reshape(-1, 4)
     slope = levels @ corners / (4 * step * step)

@@ -1,6 +1,11 @@
-"""From pictures back to optical coefficients, with error bars, and to albedo, lights, cameras and shape."""
+"""From pictures back to optical coefficients, with error bars, and to albedo, lights, cameras and
+shape.
+"""
 
-from ._background import AbstractBackground as AbstractBackground, BlackBackground as BlackBackground
+from ._background import (
+    AbstractBackground as AbstractBackground,
+    BlackBackground as BlackBackground,
+)
 from ._background import UnknownBackground as UnknownBackground
 from ._descent import GradientTransformation as GradientTransformation
 from ._fit_scene import fit_scene as fit_scene
@@ -8,7 +13,11 @@ from ._fitted_scene import FittedScene as FittedScene
 from ._flat import wide_variances as wide_variances
 from ._intensity import AbstractIntensity as AbstractIntensity, KnownIntensity as KnownIntensity
 from ._intensity import UnknownColor as UnknownColor, UnknownIntensity as UnknownIntensity
-from ._losses import AbstractLoss as AbstractLoss, HuberLoss as HuberLoss, SquaredLoss as SquaredLoss
+from ._losses import (
+    AbstractLoss as AbstractLoss,
+    HuberLoss as HuberLoss,
+    SquaredLoss as SquaredLoss,
+)
 from ._next import Candidate as Candidate, Prediction as Prediction, next_pictures as next_pictures
 from ._next import usual_candidates as usual_candidates
 from ._observation import Observation as Observation

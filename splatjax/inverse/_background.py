@@ -20,14 +20,18 @@ class AbstractBackground(eqx.Module):
 
 
 class UnknownBackground(AbstractBackground):
-    """Anything: pixels that the body does not fill do not count. A silhouette then tells nothing."""
+    """Anything: pixels that the body does not fill do not count. A silhouette then tells
+    nothing.
+    """
 
     def counts(self, coverage: Float[Array, "height width"]) -> Float[Array, "height width"]:
         return jax.lax.stop_gradient(jnp.where(coverage > FILLED, 1.0, 0.0).astype(coverage.dtype))
 
 
 class BlackBackground(AbstractBackground):
-    """Nothing that sends light: all pixels count, and where the body ends is what tells most of a camera's pose."""
+    """Nothing that sends light: all pixels count, and where the body ends is what tells most of a
+    camera's pose.
+    """
 
     def counts(self, coverage: Float[Array, "height width"]) -> Float[Array, "height width"]:
         return jnp.ones_like(coverage)

@@ -1,4 +1,6 @@
-"""A step along the gradient of pictures: what moves, what each picture tells, and where the optimizer goes."""
+"""A step along the gradient of pictures: what moves, what each picture tells, and where the
+optimizer goes.
+"""
 
 from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
@@ -48,7 +50,14 @@ class World(eqx.Module):
         shot = tuple(part for part in parts if isinstance(part, AbstractShotPart))
         for part in body:
             part.check(splats)
-        return cls(splats, material, jnp.mean(splats.centers, axis=0), body, tuple(each.prepared(splats) for each in body), shot)
+        return cls(
+            splats,
+            material,
+            jnp.mean(splats.centers, axis=0),
+            body,
+            tuple(each.prepared(splats) for each in body),
+            shot,
+        )
 
     def coordinates(self) -> tuple[PyTree[Array], ...]:
         return tuple(part.coordinates(self.splats) for part in self.body)
@@ -68,7 +77,10 @@ class World(eqx.Module):
         return shot
 
     def unlikely(self, x: Coordinates) -> Float[Array, ""]:
-        priors = [part.unlikely(its, own) for part, its, own in zip(self.body, x.body, self.prepared, strict=True)]
+        priors = [
+            part.unlikely(its, own)
+            for part, its, own in zip(self.body, x.body, self.prepared, strict=True)
+        ]
         return sum(priors, jnp.zeros((), self.splats.centers.dtype))
 
 
@@ -81,7 +93,9 @@ class Seen(eqx.Module):
 
 
 class Told(eqx.Module):
-    """What a picture tells: its loss, and the gradient in the coordinates of the body and in its own."""
+    """What a picture tells: its loss, and the gradient in the coordinates of the body and in its
+    own.
+    """
 
     value: tuple
     overflow: Float[Array, ""]
@@ -90,13 +104,17 @@ class Told(eqx.Module):
 
 
 @eqx.filter_jit
-def tell(body, own, world: World, shot: Shot, seen: Seen, plan: Plan, settings, loss, background) -> Told:
+def tell(
+    body, own, world: World, shot: Shot, seen: Seen, plan: Plan, settings, loss, background
+) -> Told:
     """Render a picture, and differentiate its loss."""
 
     def lost(x):
         body, own = x
         taken = world.shot_at(shot, own)
-        frame = render(Scene(world.splats_at(body), taken.lights, world.material), taken.camera, settings, plan)
+        frame = render(
+            Scene(world.splats_at(body), taken.lights, world.material), taken.camera, settings, plan
+        )
         counted = jnp.where(seen.known, background.counts(frame.coverage), 0.0)
         counts = (counted > 0)[..., None]
         residuals = jnp.where(counts, (frame.beauty - seen.picture) / seen.deviation, 0.0)
@@ -116,7 +134,9 @@ def advance(x: Coordinates, state, told, world: World, optimizer: GradientTransf
     summed = jax.tree.map(lambda *each: sum(each[1:], each[0]), prior.body, *body)
     gradient = jax.tree.map(lambda leaf: leaf / count, Coordinates(summed, own))
     value = (jnp.sum(jnp.stack(values)) + unlikely) / count
-    finite = jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in (value, *jax.tree.leaves(gradient))])
+    finite = jnp.stack(
+        [jnp.all(jnp.isfinite(leaf)) for leaf in (value, *jax.tree.leaves(gradient))]
+    )
     with usual_promotion():
         updates, state = optimizer.update(gradient, state, x)
     return jax.tree.map(lambda leaf, by: leaf + by, x, updates), state, value, jnp.all(finite)

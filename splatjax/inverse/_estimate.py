@@ -19,15 +19,24 @@ class Combination(eqx.Module):
     **Attributes:**
 
     - `powers`: p and q, the larger of which is 1. Static.
-    - `deviation`: standard deviation of its logarithm: its relative error, where it is small. Static.
+    - `deviation`: standard deviation of its logarithm: its relative error, where it is small.
+      Static.
     """
 
     powers: tuple[float, float] = eqx.field(static=True)
     deviation: float = eqx.field(static=True)
 
     def __str__(self) -> str:
-        above = [_power(name, p) for name, p in zip(("sigma_a", "sigma_s'"), self.powers, strict=True) if p > 0.05]
-        below = [_power(name, -p) for name, p in zip(("sigma_a", "sigma_s'"), self.powers, strict=True) if p < -0.05]
+        above = [
+            _power(name, p)
+            for name, p in zip(("sigma_a", "sigma_s'"), self.powers, strict=True)
+            if p > 0.05
+        ]
+        below = [
+            _power(name, -p)
+            for name, p in zip(("sigma_a", "sigma_s'"), self.powers, strict=True)
+            if p < -0.05
+        ]
         return " ".join(above) + (f" / {' '.join(below)}" if below else "")
 
 
@@ -37,18 +46,23 @@ class Estimate(eqx.Module):
     **Attributes:**
 
     - `medium`: 1/mm.
-    - `covariance`: of the logarithms of `sigma_a` and `sigma_s_prime`, channel by channel; infinite where nothing is known.
+    - `covariance`: of the logarithms of `sigma_a` and `sigma_s_prime`, channel by channel; infinite
+      where nothing is known.
     """
 
     medium: Medium
     covariance: Float[np.ndarray, "channels 2 2"]
 
-    def relative_errors(self) -> tuple[Float[np.ndarray, " channels"], Float[np.ndarray, " channels"]]:
+    def relative_errors(
+        self,
+    ) -> tuple[Float[np.ndarray, " channels"], Float[np.ndarray, " channels"]]:
         """Give the standard deviations of the logarithms of `sigma_a` and of `sigma_s_prime`."""
         return roots(self.covariance)
 
     def combinations(self) -> list[tuple[Combination, Combination]]:
-        """Give, for each channel, the combination of coefficients that is known best and the one that is known worst."""
+        """Give, for each channel, the combination of coefficients that is known best and the one
+        that is known worst.
+        """
         return [best_and_worst(each) for each in self.covariance]
 
     def is_fixed(self) -> bool:
@@ -71,7 +85,10 @@ class Estimate(eqx.Module):
         found, errors = (self.medium.sigma_a, self.medium.sigma_s_prime), self.relative_errors()
         said = []
         for c, (name, (best, worst)) in enumerate(zip(names, self.combinations(), strict=True)):
-            a, s = (f"{float(value[c]):.4g} +- {percent(error[c])}" for value, error in zip(found, errors, strict=True))
+            a, s = (
+                f"{float(value[c]):.4g} +- {percent(error[c])}"
+                for value, error in zip(found, errors, strict=True)
+            )
             said.append([f"{name}: sigma_a {a}, sigma_s' {s} (1/mm)"])
             if worst.deviation > _FIXED:
                 said[-1].append(
@@ -102,7 +119,9 @@ def roots(
     return found[:, 0], found[:, 1]
 
 
-def inverse(information: Float[np.ndarray, "unknowns unknowns"]) -> Float[np.ndarray, "unknowns unknowns"]:
+def inverse(
+    information: Float[np.ndarray, "unknowns unknowns"],
+) -> Float[np.ndarray, "unknowns unknowns"]:
     """Give the covariance; infinite where nothing is known."""
     lengths = np.sqrt(np.diagonal(information))
     if not np.all(np.isfinite(information)) or np.any(lengths == 0):

@@ -16,7 +16,9 @@ from ._observation import Observation
 from ._problem import AbstractVariances, Problem, Unknowns
 
 _UNKNOWN_NOISE = 0.01
-"""Deviation of pictures that come without one, as a share of their brightness: error bars do not depend on it."""
+"""Deviation of pictures that come without one, as a share of their brightness: error bars do not
+depend on it.
+"""
 
 
 class Evidence:
@@ -26,7 +28,8 @@ class Evidence:
         self.observations, self.dtype = list(observations), dtype
         self.pictures = [np.asarray(each.picture, np.float64) for each in self.observations]
         self.masks = [
-            np.all(np.isfinite(picture), axis=-1) & (True if each.mask is None else np.asarray(each.mask))
+            np.all(np.isfinite(picture), axis=-1)
+            & (True if each.mask is None else np.asarray(each.mask))
             for picture, each in zip(self.pictures, self.observations, strict=True)
         ]
         self.brightness = [
@@ -37,7 +40,9 @@ class Evidence:
             np.full(picture.shape, _UNKNOWN_NOISE * (bright or 1.0))
             if each.deviation is None
             else np.broadcast_to(np.asarray(each.deviation, np.float64), picture.shape)
-            for picture, bright, each in zip(self.pictures, self.brightness, self.observations, strict=True)
+            for picture, bright, each in zip(
+                self.pictures, self.brightness, self.observations, strict=True
+            )
         ]
 
     @property
@@ -47,7 +52,10 @@ class Evidence:
     @property
     def relative_noise(self) -> float:
         """Of a typical pixel: its deviation over the brightness of its picture."""
-        shares = [np.median(each) / (bright or 1.0) for each, bright in zip(self.deviations, self.brightness, strict=True)]
+        shares = [
+            np.median(each) / (bright or 1.0)
+            for each, bright in zip(self.deviations, self.brightness, strict=True)
+        ]
         return float(np.mean(shares))
 
     def unknowns(self, eta) -> tuple[Unknowns, int]:
@@ -58,7 +66,9 @@ class Evidence:
             rows.append(np.where(groups < 0, -1, groups + count))
             count += int(np.max(groups)) + 1
         factors = np.stack(rows)
-        return Unknowns(eta, jnp.asarray(np.where(factors < 0, count, factors).astype(np.int32))), count
+        return Unknowns(
+            eta, jnp.asarray(np.where(factors < 0, count, factors).astype(np.int32))
+        ), count
 
     def problem(
         self,
@@ -69,14 +79,28 @@ class Evidence:
         weights: AbstractWeights,
         model: Callable[[Medium], AbstractProfile],
     ) -> tuple[Problem, list[np.ndarray]]:
-        """State the least squares problem of layers; also give the numbers of the pixels that count, in each picture."""
+        """State the least squares problem of layers; also give the numbers of the pixels that
+        count, in each picture.
+        """
         flat, numbers = flatten(gathered, self.masks, self.dtype)
 
         def in_row(pictures):
-            rows = [each.reshape(-1, each.shape[-1])[chosen] for each, chosen in zip(pictures, numbers, strict=True)]
+            rows = [
+                each.reshape(-1, each.shape[-1])[chosen]
+                for each, chosen in zip(pictures, numbers, strict=True)
+            ]
             return jnp.asarray(np.concatenate(rows).T, self.dtype)
 
-        return Problem(flat, in_row(self.pictures), in_row(self.deviations), unknowns, variances, loss, weights, model), numbers
+        return Problem(
+            flat,
+            in_row(self.pictures),
+            in_row(self.deviations),
+            unknowns,
+            variances,
+            loss,
+            weights,
+            model,
+        ), numbers
 
     def shown(self, radiance: np.ndarray, numbers: Sequence[np.ndarray]) -> tuple[np.ndarray, ...]:
         """Put pixels back into their pictures; NaN where they do not count."""

@@ -16,8 +16,8 @@ class FittedScene(eqx.Module):
     - `splats`: the body.
     - `cameras`, `lights`: of each picture.
     - `material`: as it was given.
-    - `losses`: at the start and after each step: sum of the losses of all pixels and of what the priors add, over the number of
-      values that count. About 1 where what is left is noise.
+    - `losses`: at the start and after each step: sum of the losses of all pixels and of what the
+      priors add, over the number of values that count. About 1 where what is left is noise.
     - `best`: the step with the least of them, which all else here is of. Static.
     - `plans`: how many times was planned, once for the start. Static.
     - `pictures`: what the renderer makes of it; NaN where a pixel does not count.

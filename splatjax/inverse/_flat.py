@@ -1,4 +1,6 @@
-"""All pixels of all pictures that count, in one row, with the layers that were gathered for them."""
+"""All pixels of all pictures that count, in one row, with the layers that were gathered for
+them.
+"""
 
 import math
 from collections.abc import Sequence
@@ -11,7 +13,13 @@ from jaxtyping import Array, Float, Int
 
 from splatjax.diffusion import GatheredLight
 from splatjax.gaussians import SumOfGaussians
-from splatjax.render import GatheredPicture, Plan, RenderSettings, gather_picture, gather_picture_and_slopes
+from splatjax.render import (
+    GatheredPicture,
+    Plan,
+    RenderSettings,
+    gather_picture,
+    gather_picture_and_slopes,
+)
 from splatjax.scattering import Medium
 from splatjax.scene import AbstractLight, Camera, Material, Scene, Splats
 
@@ -21,7 +29,10 @@ from ._plans import plans_of
 
 _LARGER = 3.0
 """Of a wide range: the ratio of neighboring variances. It leaves dipoles an error of 0.2%."""
-_NARROWEST, _WIDEST = 0.05, 200.0  # squared mean free paths: where the Gaussians of a dipole's fit lie, and beyond
+_NARROWEST, _WIDEST = (
+    0.05,
+    200.0,
+)  # squared mean free paths: where the Gaussians of a dipole's fit lie, and beyond
 _GRID = math.log(1.15)
 """Between the log variances that plans are made for; a plan holds for more than that."""
 _REACH = 10.0
@@ -31,7 +42,8 @@ _REACH = 10.0
 class FlatPictures(eqx.Module):
     """The pixels that count, and all that makes them but weights and intensities.
 
-    Points come in this order: that of the surface in front for every pixel, then those behind silhouettes.
+    Points come in this order: that of the surface in front for every pixel, then those behind
+    silhouettes.
     """
 
     light: GatheredLight
@@ -57,7 +69,9 @@ def which_count(picture: GatheredPicture, mask: np.ndarray) -> np.ndarray:
     return np.flatnonzero((np.asarray(picture.coverage) > FILLED).reshape(-1) & mask.reshape(-1))
 
 
-def flatten(pictures: Sequence[GatheredPicture], masks: Sequence[np.ndarray], dtype) -> tuple[FlatPictures, list[np.ndarray]]:
+def flatten(
+    pictures: Sequence[GatheredPicture], masks: Sequence[np.ndarray], dtype
+) -> tuple[FlatPictures, list[np.ndarray]]:
     """Put the pixels of pictures in one row; also give their numbers in each picture.
 
     **Raises:** `ValueError` when no pixel of a picture counts.
@@ -71,7 +85,10 @@ def flatten(pictures: Sequence[GatheredPicture], masks: Sequence[np.ndarray], dt
         place = np.full(mask.size, -1)
         place[chosen] = np.arange(chosen.size)
         there = np.any(np.asarray(picture.leaving) > 0, axis=0)
-        at, in_front = np.where(there, place[np.asarray(picture.pixels)], -1), np.asarray(picture.in_front) > 0
+        at, in_front = (
+            np.where(there, place[np.asarray(picture.pixels)], -1),
+            np.asarray(picture.in_front) > 0,
+        )
         front, back = np.flatnonzero((at >= 0) & in_front), np.flatnonzero((at >= 0) & ~in_front)
         front = front[np.argsort(at[front])]
         fronts.append(_points(picture, front))
@@ -80,14 +97,18 @@ def flatten(pictures: Sequence[GatheredPicture], masks: Sequence[np.ndarray], dt
         specular.append(np.asarray(picture.specular).reshape(mask.size, -1)[chosen].T)
         numbers.append(chosen)
         before += chosen.size
-    rows, leaving = jax.tree.map(lambda *parts: jnp.asarray(np.concatenate(parts, axis=-1), dtype), *fronts, *backs)
+    rows, leaving = jax.tree.map(
+        lambda *parts: jnp.asarray(np.concatenate(parts, axis=-1), dtype), *fronts, *backs
+    )
     light = jax.tree.map(lambda leaf: leaf.astype(dtype), pictures[0].light)
     flat = FlatPictures(
         light=eqx.tree_at(_point_by_point, light, rows),
         leaving=leaving,
         specular=jnp.asarray(np.concatenate(specular, axis=1), dtype),
         behind=jnp.asarray(np.concatenate(behind).astype(np.int32)),
-        picture=jnp.asarray(np.repeat(np.arange(len(numbers), dtype=np.int32), [each.size for each in numbers])),
+        picture=jnp.asarray(
+            np.repeat(np.arange(len(numbers), dtype=np.int32), [each.size for each in numbers])
+        ),
     )
     return flat, numbers
 
@@ -100,11 +121,15 @@ def _point_by_point(light: GatheredLight):
 
 def _points(picture: GatheredPicture, places: np.ndarray):
     leaving = np.broadcast_to(np.asarray(picture.leaving), picture.light.irradiance.shape)
-    return tuple(np.asarray(each)[..., places] for each in _point_by_point(picture.light)), leaving[..., places]
+    return tuple(np.asarray(each)[..., places] for each in _point_by_point(picture.light)), leaving[
+        ..., places
+    ]
 
 
 class Gatherer(eqx.Module):
-    """Renders all that weights do not change; pictures that may share a plan do, so that nothing is compiled twice."""
+    """Renders all that weights do not change; pictures that may share a plan do, so that nothing is
+    compiled twice.
+    """
 
     splats: Splats
     settings: RenderSettings
@@ -115,8 +140,12 @@ class Gatherer(eqx.Module):
         """Gather for the variances of a material, and no others."""
         return self._gather(gather_picture, material, self._plans(material))
 
-    def moving(self, material: Material, plans: list[Plan] | None = None) -> tuple[list[GatheredPicture], list[Plan]]:
-        """Gather for variances near those of a material; the plans are those that are given, if they hold."""
+    def moving(
+        self, material: Material, plans: list[Plan] | None = None
+    ) -> tuple[list[GatheredPicture], list[Plan]]:
+        """Gather for variances near those of a material; the plans are those that are given, if
+        they hold.
+        """
         if plans is not None:
             found = self._gather(gather_picture_and_slopes, material, plans)
             if all(float(each.overflow) == 0 for each in found):
@@ -126,7 +155,10 @@ class Gatherer(eqx.Module):
 
     def _gather(self, gather, material: Material, plans: list[Plan]) -> list[GatheredPicture]:
         together = zip(self._scenes(material), self.cameras, plans, strict=True)
-        return [jax.block_until_ready(gather(scene, camera, self.settings, its)) for scene, camera, its in together]
+        return [
+            jax.block_until_ready(gather(scene, camera, self.settings, its))
+            for scene, camera, its in together
+        ]
 
     def _scenes(self, material: Material) -> list[Scene]:
         return [Scene(self.splats, lights, material) for lights in self.lights]
@@ -136,7 +168,9 @@ class Gatherer(eqx.Module):
 
 
 def _rounded(material: Material) -> Material:
-    """Give variances on a coarse grid: materials that are nearly alike have plans of the same shapes, and one program."""
+    """Give variances on a coarse grid: materials that are nearly alike have plans of the same
+    shapes, and one program.
+    """
     gaussians = material.gaussians
     variances = jnp.exp(jnp.round(jnp.log(gaussians.variances) / _GRID) * _GRID)
     return material.surface_of(SumOfGaussians(variances, gaussians.weights))
@@ -145,12 +179,16 @@ def _rounded(material: Material) -> Material:
 def wide_variances(media: Sequence[Medium], splats: Splats) -> Float[Array, " gaussians"]:
     r"""Give variances (mm^2) that serve all media near some: each three times the one before.
 
-    They hold what coefficients up to three times as large, or as small, make of a dipole. None is much wider than the body.
+    They hold what coefficients up to three times as large, or as small, make of a dipole. None is
+    much wider than the body.
     """
     paths = np.concatenate([1 / np.asarray(medium.sigma_t_prime, np.float64) for medium in media])
     root = np.concatenate([np.asarray(medium.squared_sigma_tr, np.float64) for medium in media])
     diffuse = 1 / np.sqrt(np.maximum(root, 1e-12))
-    low, high = _NARROWEST * np.min(paths**2) / _REACH, np.max(np.maximum(_WIDEST * paths**2, 3 * diffuse**2)) * _REACH
+    low, high = (
+        _NARROWEST * np.min(paths**2) / _REACH,
+        np.max(np.maximum(_WIDEST * paths**2, 3 * diffuse**2)) * _REACH,
+    )
     size = float(np.sum(np.var(np.asarray(splats.centers, np.float64), axis=0)))
     high = max(min(high, size), _LARGER * low)
     count = max(2, math.ceil(math.log(high / low) / math.log(_LARGER)) + 1)

@@ -11,7 +11,9 @@ class AbstractIntensity(eqx.Module):
 
     @abc.abstractmethod
     def groups(self, channels: int) -> np.ndarray:
-        """Give, for each channel, the number of its factor among those of the picture; -1 where it is known to be 1."""
+        """Give, for each channel, the number of its factor among those of the picture; -1 where it
+        is known to be 1.
+        """
 
 
 class KnownIntensity(AbstractIntensity):
@@ -22,14 +24,18 @@ class KnownIntensity(AbstractIntensity):
 
 
 class UnknownIntensity(AbstractIntensity):
-    """One factor for all channels: an exposure that was not measured, under light of a known color."""
+    """One factor for all channels: an exposure that was not measured, under light of a known
+    color.
+    """
 
     def groups(self, channels: int) -> np.ndarray:
         return np.zeros(channels, int)
 
 
 class UnknownColor(AbstractIntensity):
-    """A factor for each channel. What then tells of the material is how the light is spread over the picture alone."""
+    """A factor for each channel. What then tells of the material is how the light is spread over
+    the picture alone.
+    """
 
     def groups(self, channels: int) -> np.ndarray:
         return np.arange(channels)

@@ -12,18 +12,23 @@ class AbstractLoss(eqx.Module):
 
     @abc.abstractmethod
     def root(self, residuals: Float[Array, "..."]) -> Float[Array, "..."]:
-        """Give what has the loss as its square, with the sign of the residual: near zero the residual itself."""
+        """Give what has the loss as its square, with the sign of the residual: near zero the
+        residual itself.
+        """
 
 
 class SquaredLoss(AbstractLoss):
-    """The square: right for noise that is normal, misled by every highlight that the model does not know."""
+    """The square: right for noise that is normal, misled by every highlight that the model does not
+    know.
+    """
 
     def root(self, residuals: Float[Array, "..."]) -> Float[Array, "..."]:
         return residuals
 
 
 class HuberLoss(AbstractLoss):
-    r"""The square for small residuals and twice the absolute value times the bend for large ones, smoothly.
+    r"""The square for small residuals and twice the absolute value times the bend for large ones,
+    smoothly.
 
         loss(r) = 2 b^2 (sqrt(1 + r^2 / b^2) - 1)
 

@@ -25,7 +25,9 @@ from ._recovery import Recovery
 
 
 class Candidate(eqx.Module):
-    """A picture that could be taken: what it is called, from where, and under which lights. Its strength may be unknown."""
+    """A picture that could be taken: what it is called, from where, and under which lights. Its
+    strength may be unknown.
+    """
 
     name: str = eqx.field(static=True)
     camera: Camera
@@ -48,10 +50,15 @@ class Prediction(eqx.Module):
     @property
     def worst(self) -> Combination:
         """The combination, of all channels, that is known worst then."""
-        return max((best_and_worst(each)[1] for each in self.covariance), key=lambda each: each.deviation)
+        return max(
+            (best_and_worst(each)[1] for each in self.covariance), key=lambda each: each.deviation
+        )
 
     def __str__(self) -> str:
-        return f"{self.candidate.name}: the worst known, {self.worst}, then to {percent(self.worst.deviation)}"
+        return (
+            f"{self.candidate.name}: the worst known, {self.worst},"
+            f" then to {percent(self.worst.deviation)}"
+        )
 
 
 def next_pictures(
@@ -63,17 +70,20 @@ def next_pictures(
     weights: AbstractWeights | None = None,
     settings: RenderSettings | None = None,
 ) -> list[Prediction]:
-    r"""Rank pictures that could be taken by how well the coefficients would be known with each of them.
+    r"""Rank pictures that could be taken by how well the coefficients would be known with each of
+    them.
 
-    Each is rendered once, of the material that was found, and differentiated; noise is taken to be the same share of its
-    brightness as in the pictures before. Information adds up, and its inverse is the covariance.
+    Each is rendered once, of the material that was found, and differentiated; noise is taken to be
+    the same share of its brightness as in the pictures before. Information adds up, and its inverse
+    is the covariance.
 
     **Arguments:** `model` and `weights` as in `recover`.
 
     - `recovery`: what is known by now.
     - `splats`: of the body.
     - `candidates`: at least one; `usual_candidates` gives some.
-    - `settings`: of the renderer. By default those of `render`: a prediction needs no layers as fine as a search does.
+    - `settings`: of the renderer. By default those of `render`: a prediction needs no layers as
+      fine as a search does.
 
     **Returns:** predictions; first the one whose worst known combination is known best.
 
@@ -81,7 +91,10 @@ def next_pictures(
     """
     candidates = list(candidates)
     if not candidates:
-        raise ValueError("candidates is empty: name a picture that could be taken, or take usual_candidates(splats, camera)")
+        raise ValueError(
+            "candidates is empty: name a picture that could be taken, or take "
+            "usual_candidates(splats, camera)"
+        )
     weights = usual_weights() if weights is None else weights
     settings = RenderSettings() if settings is None else settings
     medium, dtype = recovery.medium, recovery.medium.sigma_a.dtype
@@ -92,7 +105,10 @@ def next_pictures(
     before, found = len(recovery.information), []
     for candidate, picture in zip(candidates, gathered, strict=True):
         dark = np.zeros((candidate.camera.height, candidate.camera.width, len(medium.eta)))
-        evidence = Evidence([Observation(dark, candidate.camera, candidate.lights, intensity=candidate.intensity)], dtype)
+        evidence = Evidence(
+            [Observation(dark, candidate.camera, candidate.lights, intensity=candidate.intensity)],
+            dtype,
+        )
         unknowns, factors = evidence.unknowns(medium.eta)
         problem, _ = evidence.problem([picture], unknowns, variances, SquaredLoss(), weights, model)
         point = unknowns.start(medium, factors)
@@ -101,12 +117,18 @@ def next_pictures(
         deviations = noise * (bright or 1.0) / float(problem.deviation[0, 0])
         told = np.asarray(seen.information, float) / max(deviations, np.finfo(float).tiny) ** 2
         channels = len(medium.eta)
-        found.append(Prediction(candidate, recovery.covariance(_marginal(told, 2 * channels, channels, before))))
+        found.append(
+            Prediction(
+                candidate, recovery.covariance(_marginal(told, 2 * channels, channels, before))
+            )
+        )
     return sorted(found, key=lambda each: each.worst.deviation)
 
 
 def _marginal(information: np.ndarray, own: int, channels: int, size: int) -> np.ndarray:
-    """Give what is told of coefficients and handover, whatever the picture's own factors are; with room for those of others."""
+    """Give what is told of coefficients and handover, whatever the picture's own factors are; with
+    room for those of others.
+    """
     kept = np.r_[:own, len(information) - channels : len(information)]
     factors = np.arange(own, len(information) - channels)
     told = information[np.ix_(kept, kept)]
@@ -120,8 +142,8 @@ def _marginal(information: np.ndarray, own: int, channels: int, size: int) -> np
 
 
 def usual_candidates(splats: Splats, camera: Camera, channels: int = 3) -> list[Candidate]:
-    r"""Give pictures that one could take with a camera: parallel light from the front, left, right, above and behind, and a laser
-    dot in the middle of the picture, as wide as a few splats.
+    r"""Give pictures that one could take with a camera: parallel light from the front, left, right,
+    above and behind, and a laser dot in the middle of the picture, as wide as a few splats.
 
     **Arguments:**
 
@@ -139,18 +161,26 @@ def usual_candidates(splats: Splats, camera: Camera, channels: int = 3) -> list[
     }
     dtype = splats.centers.dtype
     strength = jnp.full(channels, jnp.pi, dtype)
-    lights = {name: DirectionalLight(direction=jnp.asarray(way, dtype), irradiance=strength) for name, way in ways.items()}
+    lights = {
+        name: DirectionalLight(direction=jnp.asarray(way, dtype), irradiance=strength)
+        for name, way in ways.items()
+    }
     found = [Candidate(name, camera, (light,)) for name, light in lights.items()]
     spot, spacing = _middle(splats, camera), float(np.sqrt(np.mean(splats.areas)))
     eye = np.asarray(camera.position, float)
     beam = GaussianBeam(
-        jnp.asarray(eye, dtype), jnp.asarray(spot - eye, dtype), strength * spacing**2, jnp.asarray((2 * spacing) ** 2, dtype)
+        jnp.asarray(eye, dtype),
+        jnp.asarray(spot - eye, dtype),
+        strength * spacing**2,
+        jnp.asarray((2 * spacing) ** 2, dtype),
     )
     return [*found, Candidate("a laser dot in the middle", camera, (beam,))]
 
 
 def _middle(splats: Splats, camera: Camera) -> np.ndarray:
-    """Give the center of the nearest splat at the middle of the picture, or of the one that is next to it."""
+    """Give the center of the nearest splat at the middle of the picture, or of the one that is next
+    to it.
+    """
     offset = np.asarray(splats.centers, float) - np.asarray(camera.position, float)
     across, down, depth = np.asarray(camera.rotation, float) @ offset.T
     aside = np.hypot(across, down) / np.maximum(depth, 1e-9) + np.where(depth > 0, 0.0, np.inf)

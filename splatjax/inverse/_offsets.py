@@ -22,32 +22,40 @@ _SAME_SIDE = 0.3  # least cosine between normals of splats that belong together
 
 
 class OffsetTables(eqx.Module):
-    """Of each splat its neighbors: those that its offset is blurred over, and those that its slope is measured among."""
+    """Of each splat its neighbors: those that its offset is blurred over, and those that its slope
+    is measured among.
+    """
 
     blurred: Int[Array, "splats _near"]
     weights: Float[Array, "splats _near"]
     around: Int[Array, "splats _around"]
     slopes: Float[Array, "splats _around 2"]
-    """Sums of values times these are derivatives along the tangents; exact for what is quadratic in them."""
+    """Sums of values times these are derivatives along the tangents; exact for what is quadratic in
+    them.
+    """
     tangents: Float[Array, "splats 2 3"]
     gain: Float[Array, ""]
     """Root mean square of blurred noise whose own is 1."""
 
 
 class NormalOffsets(AbstractBodyPart):
-    r"""How far each splat has moved along the normal it starts with: a displacement map, no finer than `smoothness`.
+    r"""How far each splat has moved along the normal it starts with: a displacement map, no finer
+    than `smoothness`.
 
         offset = step blur(x),   center = start + offset normal
 
-    The blur is a Gaussian over the surface that takes means, so that an offset moves by no more than its coordinates do. Normals,
-    areas and radii follow from the slopes of the offsets among the neighbors of each splat: light feels a bump by its normals.
-    A splat farther than 2.5 `smoothness` from all that the pictures tell of stays exactly where it is.
+    The blur is a Gaussian over the surface that takes means, so that an offset moves by no more
+    than its coordinates do. Normals, areas and radii follow from the slopes of the offsets among
+    the neighbors of each splat: light feels a bump by its normals. A splat farther than 2.5
+    `smoothness` from all that the pictures tell of stays exactly where it is.
 
     **Attributes:** (static)
 
     - `step`: mm.
-    - `smoothness`: standard deviation of the blur, mm; some spacings of the splats. What is finer is not looked for.
-    - `deviation`: how large an offset is expected to be, one standard deviation of a normal prior, mm.
+    - `smoothness`: standard deviation of the blur, mm; some spacings of the splats. What is finer
+      is not looked for.
+    - `deviation`: how large an offset is expected to be, one standard deviation of a normal prior,
+      mm.
     """
 
     step: float = eqx.field(static=True)
@@ -56,18 +64,34 @@ class NormalOffsets(AbstractBodyPart):
 
     def check(self, splats: Splats) -> None:
         if splats.count < _SLOPES:
-            raise ValueError(f"{splats.count} splats are too few to measure slopes among; NormalOffsets needs {_SLOPES} at least")
+            raise ValueError(
+                f"{splats.count} splats are too few to measure slopes among; NormalOffsets needs "
+                f"{_SLOPES} at least"
+            )
 
     def prepared(self, splats: Splats) -> OffsetTables:
-        centers, normals, areas = (np.asarray(each, np.float64) for each in (splats.centers, splats.normals, splats.areas))
+        centers, normals, areas = (
+            np.asarray(each, np.float64) for each in (splats.centers, splats.normals, splats.areas)
+        )
         tree, dtype = scipy.spatial.KDTree(centers), splats.centers.dtype
-        count = int(np.max(tree.query_ball_point(centers, _REACH * self.smoothness, return_length=True)))
-        near, weights = _blur(tree, normals, areas, self.smoothness, -(-count // _ROUNDED) * _ROUNDED)
+        count = int(
+            np.max(tree.query_ball_point(centers, _REACH * self.smoothness, return_length=True))
+        )
+        near, weights = _blur(
+            tree, normals, areas, self.smoothness, -(-count // _ROUNDED) * _ROUNDED
+        )
         around, tangents, slopes = _slopes(tree, normals)
         gain = math.sqrt(np.mean(np.sum(weights**2, axis=1)))
         arrays = weights, slopes, tangents, np.asarray(gain)
         weights, slopes, tangents, gain = (jnp.asarray(each, dtype) for each in arrays)
-        return OffsetTables(jnp.asarray(near, jnp.int32), weights, jnp.asarray(around, jnp.int32), slopes, tangents, gain)
+        return OffsetTables(
+            jnp.asarray(near, jnp.int32),
+            weights,
+            jnp.asarray(around, jnp.int32),
+            slopes,
+            tangents,
+            gain,
+        )
 
     def coordinates(self, splats: Splats) -> Float[Array, " splats"]:
         return jnp.zeros_like(splats.areas)
@@ -96,25 +120,37 @@ class NormalOffsets(AbstractBodyPart):
         return jnp.sum((self.step * prepared.gain / self.deviation * x) ** 2)
 
 
-def _blur(tree: "scipy.spatial.KDTree", normals: np.ndarray, areas: np.ndarray, width: float, count: int):
-    """Give neighbors and the weights of a mean over them; those beyond reach and on other sides have none."""
-    distances, near = tree.query(tree.data, k=np.arange(1, count + 1), distance_upper_bound=_REACH * width, workers=-1)
+def _blur(
+    tree: "scipy.spatial.KDTree", normals: np.ndarray, areas: np.ndarray, width: float, count: int
+):
+    """Give neighbors and the weights of a mean over them; those beyond reach and on other sides
+    have none.
+    """
+    distances, near = tree.query(
+        tree.data, k=np.arange(1, count + 1), distance_upper_bound=_REACH * width, workers=-1
+    )
     there = near < len(areas)
     near = np.where(there, near, np.arange(len(areas))[:, None])
     there &= np.einsum("nki,ni->nk", normals[near], normals) > _SAME_SIDE
-    weights = np.where(there, np.exp(-0.5 * (np.where(there, distances, 0.0) / width) ** 2) * areas[near], 0.0)
+    weights = np.where(
+        there, np.exp(-0.5 * (np.where(there, distances, 0.0) / width) ** 2) * areas[near], 0.0
+    )
     return near, weights / np.sum(weights, axis=1, keepdims=True)
 
 
 def _slopes(tree: "scipy.spatial.KDTree", normals: np.ndarray):
-    """Give neighbors, tangents, and the weights of derivatives along them: least squares with quadratic terms."""
+    """Give neighbors, tangents, and the weights of derivatives along them: least squares with
+    quadratic terms.
+    """
     around = tree.query(tree.data, k=_SLOPES, workers=-1)[1][:, 1:]
     tangents = np.stack(tangent_frames(normals), axis=1)
     offsets = tree.data[around] - tree.data[:, None]
     u, v = np.einsum("nki,nai->ank", offsets, tangents)
     size = np.sqrt(np.mean(u * u + v * v, axis=1, keepdims=True))
     u, v = u / size, v / size
-    trust = np.exp(-0.5 * (u * u + v * v)) * (np.einsum("nki,ni->nk", normals[around], normals) > _SAME_SIDE)
+    trust = np.exp(-0.5 * (u * u + v * v)) * (
+        np.einsum("nki,ni->nk", normals[around], normals) > _SAME_SIDE
+    )
     rows = trust[..., None] * np.stack([u, v, u * u, u * v, v * v], axis=-1)
     solved = np.linalg.pinv(rows, rcond=1e-3)[:, :2] * trust[:, None] / size[:, None]
     return around, tangents, solved.transpose(0, 2, 1)

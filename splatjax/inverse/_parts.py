@@ -24,15 +24,17 @@ class Shot(eqx.Module):
 class AbstractPart(eqx.Module):
     r"""What may move. Its coordinates count steps from where it starts: there they are all zero.
 
-    An optimizer sees coordinates in steps, so that one learning rate serves all parts: Adam at a rate of 1 moves each by up to
-    one step at a time.
+    An optimizer sees coordinates in steps, so that one learning rate serves all parts: Adam at a
+    rate of 1 moves each by up to one step at a time.
     """
 
     def __check_init__(self):
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
             if not value > 0:
-                raise ValueError(f"{type(self).__name__}.{field.name} must be positive; got {value:g}")
+                raise ValueError(
+                    f"{type(self).__name__}.{field.name} must be positive; got {value:g}"
+                )
 
 
 class AbstractBodyPart(AbstractPart):
@@ -56,7 +58,9 @@ class AbstractBodyPart(AbstractPart):
 
     @abc.abstractmethod
     def unlikely(self, x: PyTree[Array], prepared: PyTree[Array]) -> Float[Array, ""]:
-        """Give what the prior adds to the loss: squares of the coordinates over what they are expected to be."""
+        """Give what the prior adds to the loss: squares of the coordinates over what they are
+        expected to be.
+        """
 
 
 class AbstractShotPart(AbstractPart):
@@ -68,7 +72,9 @@ class AbstractShotPart(AbstractPart):
 
     @abc.abstractmethod
     def moved(self, shot: Shot, x: PyTree[Array], middle: Float[Array, "3"]) -> Shot:
-        """Give camera and lights at coordinates; `middle` is that of the body, mm. Differentiable."""
+        """Give camera and lights at coordinates; `middle` is that of the body, mm.
+        Differentiable.
+        """
 
 
 class AlbedoMap(AbstractBodyPart):
@@ -79,8 +85,9 @@ class AlbedoMap(AbstractBodyPart):
     **Attributes:** (static)
 
     - `step`: of the logit: 0.1 moves an albedo of 0.5 by 0.025.
-    - `deviation`: how far from the start a logit is expected, one standard deviation of a normal prior. A splat that no picture
-      tells of stays where it started; one of which they tell next to nothing stays near.
+    - `deviation`: how far from the start a logit is expected, one standard deviation of a normal
+      prior. A splat that no picture tells of stays where it started; one of which they tell next to
+      nothing stays near.
 
     Albedos that start below 0.001 or above 0.999 start there.
     """
@@ -90,7 +97,10 @@ class AlbedoMap(AbstractBodyPart):
 
     def check(self, splats: Splats) -> None:
         if splats.albedo is None:
-            raise ValueError("splats.albedo is None, and AlbedoMap has nothing to move: start from a map, 0.5 everywhere for one")
+            raise ValueError(
+                "splats.albedo is None, and AlbedoMap has nothing to move: start from a map, 0.5 "
+                "everywhere for one"
+            )
 
     def coordinates(self, splats: Splats) -> Float[Array, "splats channels"]:
         assert splats.albedo is not None
@@ -108,7 +118,8 @@ class AlbedoMap(AbstractBodyPart):
 
 
 class LightStrengths(AbstractShotPart):
-    """How strong each light of each picture is, channel by channel, as a logarithm: of irradiance, intensity or power.
+    """How strong each light of each picture is, channel by channel, as a logarithm: of irradiance,
+    intensity or power.
 
     **Attributes:** (static)
 
@@ -118,9 +129,13 @@ class LightStrengths(AbstractShotPart):
     step: float = eqx.field(static=True, default=0.05)
 
     def coordinates(self, shot: Shot) -> tuple[Float[Array, " channels"], ...]:
-        return tuple(jnp.zeros_like(getattr(light, _of(light, _STRENGTHS))) for light in shot.lights)
+        return tuple(
+            jnp.zeros_like(getattr(light, _of(light, _STRENGTHS))) for light in shot.lights
+        )
 
-    def moved(self, shot: Shot, x: tuple[Float[Array, " channels"], ...], middle: Float[Array, "3"]) -> Shot:
+    def moved(
+        self, shot: Shot, x: tuple[Float[Array, " channels"], ...], middle: Float[Array, "3"]
+    ) -> Shot:
         del middle
         lights = []
         for light, its in zip(shot.lights, x, strict=True):
@@ -130,7 +145,8 @@ class LightStrengths(AbstractShotPart):
 
 
 class LightPlaces(AbstractShotPart):
-    """Where each light of each picture is: directions turn, and point lights and the origins of beams shift.
+    """Where each light of each picture is: directions turn, and point lights and the origins of
+    beams shift.
 
     **Attributes:** (static)
 
@@ -142,25 +158,35 @@ class LightPlaces(AbstractShotPart):
     shift: float = eqx.field(static=True, default=1.0)
 
     def coordinates(self, shot: Shot) -> tuple[dict[str, Float[Array, "3"]], ...]:
-        return tuple({name: jnp.zeros_like(getattr(light, name)) for name in _of(light, _PLACES)} for light in shot.lights)
+        return tuple(
+            {name: jnp.zeros_like(getattr(light, name)) for name in _of(light, _PLACES)}
+            for light in shot.lights
+        )
 
-    def moved(self, shot: Shot, x: tuple[dict[str, Float[Array, "3"]], ...], middle: Float[Array, "3"]) -> Shot:
+    def moved(
+        self, shot: Shot, x: tuple[dict[str, Float[Array, "3"]], ...], middle: Float[Array, "3"]
+    ) -> Shot:
         del middle
         lights = []
         for light, its in zip(shot.lights, x, strict=True):
             for name in _of(light, _PLACES):
                 place = getattr(light, name)
-                to = rotation(self.turn * its[name]) @ place if name == "direction" else place + self.shift * its[name]
+                to = (
+                    rotation(self.turn * its[name]) @ place
+                    if name == "direction"
+                    else place + self.shift * its[name]
+                )
                 light = _with(light, name, to)
             lights.append(light)
         return Shot(shot.camera, tuple(lights))
 
 
 class CameraPoses(AbstractShotPart):
-    r"""Where each camera is and which way it looks: it turns around the middle of the splats, and shifts.
+    r"""Where each camera is and which way it looks: it turns around the middle of the splats, and
+    shifts.
 
-    Turning around the body and not around the pinhole, a turn changes what is seen of it, and a shift where it is in the picture:
-    the two are not mistaken for each other.
+    Turning around the body and not around the pinhole, a turn changes what is seen of it, and a
+    shift where it is in the picture: the two are not mistaken for each other.
 
     **Attributes:** (static)
 
@@ -182,7 +208,8 @@ class CameraPoses(AbstractShotPart):
 
 
 def rotation(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    r"""Give the rotation around a vector by its length, radians. Differentiable, also where there is none.
+    r"""Give the rotation around a vector by its length, radians. Differentiable, also where there
+    is none.
 
         R = 1 + sin(t) / t [v] + (1 - cos t) / t^2 [v]^2,   t = |v|
 
@@ -191,8 +218,12 @@ def rotation(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
     squared = jnp.sum(vector * vector)
     near = squared < 1e-2
     t = jnp.sqrt(jnp.where(near, 1.0, squared))
-    first = jnp.where(near, 1 - squared / 6 * (1 - squared / 20 * (1 - squared / 42)), jnp.sin(t) / t)
-    second = jnp.where(near, 0.5 - squared / 24 * (1 - squared / 30 * (1 - squared / 56)), (1 - jnp.cos(t)) / t**2)
+    first = jnp.where(
+        near, 1 - squared / 6 * (1 - squared / 20 * (1 - squared / 42)), jnp.sin(t) / t
+    )
+    second = jnp.where(
+        near, 0.5 - squared / 24 * (1 - squared / 30 * (1 - squared / 56)), (1 - jnp.cos(t)) / t**2
+    )
     x, y, z = vector
     zero = jnp.zeros_like(x)
     cross = jnp.stack([jnp.stack(row) for row in ((zero, -z, y), (z, zero, -x), (-y, x, zero))])
@@ -206,9 +237,15 @@ def _with(light: AbstractLight, name: str, value: Array) -> AbstractLight:
 def _of(light: AbstractLight, names: dict):
     if type(light) not in names:
         known = ", ".join(kind.__name__ for kind in names)
-        raise ValueError(f"what may move of a {type(light).__name__} is not known; of these it is: {known}")
+        raise ValueError(
+            f"what may move of a {type(light).__name__} is not known; of these it is: {known}"
+        )
     return names[type(light)]
 
 
 _STRENGTHS = {DirectionalLight: "irradiance", PointLight: "intensity", GaussianBeam: "power"}
-_PLACES = {DirectionalLight: ("direction",), PointLight: ("position",), GaussianBeam: ("direction", "origin")}
+_PLACES = {
+    DirectionalLight: ("direction",),
+    PointLight: ("position",),
+    GaussianBeam: ("direction", "origin"),
+}

@@ -27,12 +27,16 @@ _STEPS = 64
 
 
 def usual_weights() -> AbstractWeights:
-    """Give how the materials that come with the package are fitted: weights are not negative, and their sum is held."""
+    """Give how the materials that come with the package are fitted: weights are not negative, and
+    their sum is held.
+    """
     return NonNegativeWeights(TotalReflectanceHeld())
 
 
 class Unknowns(eqx.Module):
-    """How the numbers to be found are laid out: log sigma_a, log sigma_s' per channel, then log factors of the lights."""
+    """How the numbers to be found are laid out: log sigma_a, log sigma_s' per channel, then log
+    factors of the lights.
+    """
 
     eta: Float[Array, " channels"]
     factors: Int[Array, "pictures channels"]
@@ -47,7 +51,13 @@ class Unknowns(eqx.Module):
         return jnp.exp(factors[self.factors])
 
     def start(self, medium: Medium, count: int) -> Float[Array, " unknowns"]:
-        return jnp.concatenate([jnp.log(medium.sigma_a), jnp.log(medium.sigma_s_prime), jnp.zeros(count, self.eta.dtype)])
+        return jnp.concatenate(
+            [
+                jnp.log(medium.sigma_a),
+                jnp.log(medium.sigma_s_prime),
+                jnp.zeros(count, self.eta.dtype),
+            ]
+        )
 
 
 class AbstractVariances(eqx.Module):
@@ -74,7 +84,9 @@ class Fitted(AbstractVariances):
 
     def gaussians(self, profile: AbstractProfile, weights: AbstractWeights) -> SumOfGaussians:
         start = GivenVariances(self.near)
-        return fit_gaussians(profile, len(self.near), weights=weights, start=start, throw=False).gaussians
+        return fit_gaussians(
+            profile, len(self.near), weights=weights, start=start, throw=False
+        ).gaussians
 
 
 class Problem(eqx.Module):
@@ -100,12 +112,16 @@ class Problem(eqx.Module):
         return self.loss.root((self.radiance(point) - self.observed) / self.deviation)
 
     def handover_slopes(self, point: Float[Array, " unknowns"]) -> Float[Array, "channels pixels"]:
-        """Differentiate the residuals in the logarithm of the widths below which the renderer hands layers to the surface."""
+        """Differentiate the residuals in the logarithm of the widths below which the renderer hands
+        layers to the surface.
+        """
 
         def moved(by: Float[Array, ""]) -> Float[Array, "channels pixels"]:
-            return eqx.tree_at(lambda its: its.pictures.light.interval, self, replace_fn=lambda at: at * jnp.exp(by)).residuals(
-                point
-            )
+            return eqx.tree_at(
+                lambda its: its.pictures.light.interval,
+                self,
+                replace_fn=lambda at: at * jnp.exp(by),
+            ).residuals(point)
 
         zero = jnp.zeros((), point.dtype)
         return jax.jvp(moved, (zero,), (zero + 1,))[1]
@@ -124,7 +140,8 @@ class Found(eqx.Module):
 def search(problem: Problem, start: Float[Array, " unknowns"]) -> Found:
     """Minimize the loss from a start: Levenberg and Marquardt's method."""
     tolerance = 1e-4 if start.dtype == jnp.float32 else 1e-7
-    # In units of the start's own residual, so that damping and tolerances mean the same for any noise and number of pixels.
+    # In units of the start's own residual, so that damping and tolerances mean the same for any
+    # noise and number of pixels.
     unit = jnp.sqrt(jnp.sum(problem.residuals(start) ** 2)) + jnp.finfo(start.dtype).tiny
 
     def residuals(point, problem):
@@ -134,7 +151,9 @@ def search(problem: Problem, start: Float[Array, " unknowns"]) -> Found:
     found = optx.least_squares(residuals, solver, start, problem, max_steps=_STEPS, throw=False)
     cost = jnp.sum(problem.residuals(found.value) ** 2)
     steps = jnp.asarray(found.stats["num_steps"])
-    return Found(found.value, cost, steps, (found.result == optx.RESULTS.successful) & jnp.isfinite(cost))
+    return Found(
+        found.value, cost, steps, (found.result == optx.RESULTS.successful) & jnp.isfinite(cost)
+    )
 
 
 class Solution(eqx.Module):
@@ -142,8 +161,9 @@ class Solution(eqx.Module):
 
     **Attributes:**
 
-    - `information`: the inverse of the covariance that noise of the given deviations leaves (Laplace, by Gauss and Newton); after
-      the unknowns come, channel by channel, the logarithms of the widths below which layers are handed to the surface.
+    - `information`: the inverse of the covariance that noise of the given deviations leaves
+      (Laplace, by Gauss and Newton); after the unknowns come, channel by channel, the logarithms of
+      the widths below which layers are handed to the surface.
     - `gaussians`, `radiance`: of the point.
     - `unresolved`: the share of the light of each channel in layers that the splats do not carry.
     """
@@ -156,14 +176,21 @@ class Solution(eqx.Module):
 
 @eqx.filter_jit
 def solution(problem: Problem, point: Float[Array, " unknowns"]) -> Solution:
-    """Give what is known at a point: the picture, and how sharply residuals tell each unknown and the handover."""
+    """Give what is known at a point: the picture, and how sharply residuals tell each unknown and
+    the handover.
+    """
 
     def residuals(point):
         gaussians, radiance = problem.gaussians(point), problem.radiance(point)
         return problem.residuals(point), (gaussians, radiance)
 
     slopes, (gaussians, radiance) = jax.jacfwd(residuals, has_aux=True)(point)
-    handover = problem.handover_slopes(point)[..., None] * jnp.eye(slopes.shape[0], dtype=slopes.dtype)[:, None]
+    handover = (
+        problem.handover_slopes(point)[..., None]
+        * jnp.eye(slopes.shape[0], dtype=slopes.dtype)[:, None]
+    )
     slopes = jnp.concatenate([slopes, handover], axis=-1)
-    unresolved = (1 - problem.pictures.light.resolved()) @ gaussians.weights / gaussians.total_reflectance()
+    unresolved = (
+        (1 - problem.pictures.light.resolved()) @ gaussians.weights / gaussians.total_reflectance()
+    )
     return Solution(jnp.einsum("cpi,cpj->ij", slopes, slopes), gaussians, radiance, unresolved)

@@ -25,7 +25,9 @@ from ._problem import Fitted, Held, search, solution, usual_weights
 from ._recovery import Recovery
 
 _FINE = RenderSettings(diffuser=ClusterDiffuser(error=2.5e-4))
-"""Layers eight times finer than a picture needs: where much light comes back, 0.1% of it is 2% of the absorption."""
+"""Layers eight times finer than a picture needs: where much light comes back, 0.1% of it is 2% of
+the absorption.
+"""
 
 _ROUNDS = 8
 _SETTLED = 1e-3
@@ -46,35 +48,44 @@ def recover(
     progress: Callable[[str, Medium], None] | None = None,
     throw: bool = True,
 ) -> Recovery:
-    r"""Find the absorption and scattering that explain pictures of a known shape: weighed least squares on all pixels at once.
+    r"""Find the absorption and scattering that explain pictures of a known shape: weighed least
+    squares on all pixels at once.
 
-    The whole graph is in it: coefficients, profile, Gaussians, layers, picture. The layers, which are dear, depend on the
-    variances of the Gaussians alone: rendered once, they serve many steps of Levenberg and Marquardt's method, each of which
-    looks at no splat; nothing is compiled between steps, nor between starts. At first the variances are held: those of
-    `wide_variances`, which serve all coefficients within a factor of three of the starts. Then, in rounds, they are those of the
-    fit to what was found, and layers move along their slopes as the fit does, until a round changes nothing: what is left is the
-    picture that `render` makes of `Recovery.material`, with the derivatives of `picture_jacobian`.
+    The whole graph is in it: coefficients, profile, Gaussians, layers, picture. The layers, which
+    are dear, depend on the variances of the Gaussians alone: rendered once, they serve many steps
+    of Levenberg and Marquardt's method, each of which looks at no splat; nothing is compiled
+    between steps, nor between starts. At first the variances are held: those of `wide_variances`,
+    which serve all coefficients within a factor of three of the starts. Then, in rounds, they are
+    those of the fit to what was found, and layers move along their slopes as the fit does, until a
+    round changes nothing: what is left is the picture that `render` makes of `Recovery.material`,
+    with the derivatives of `picture_jacobian`.
 
     **Arguments:**
 
     - `observations`: one or more.
-    - `splats`: of the body, mm. Its albedo is taken as known; without one the coefficients alone carry color.
-    - `starts`: where to search from; their `eta` is taken as known and must be the same. Of several, the best end is kept.
-    - `surface`: whose index, specular strength and roughness are known; its Gaussians do not matter. By default the index is that
-      of the start, without a specular lobe.
+    - `splats`: of the body, mm. Its albedo is taken as known; without one the coefficients alone
+      carry color.
+    - `starts`: where to search from; their `eta` is taken as known and must be the same. Of
+      several, the best end is kept.
+    - `surface`: whose index, specular strength and roughness are known; its Gaussians do not
+      matter. By default the index is that of the start, without a specular lobe.
     - `model`: from a medium to a profile that is finite at the origin.
     - `count`: number of Gaussians.
-    - `weights`: how they are fitted; by default not negative and their sum held, as in the materials that come with the package.
+    - `weights`: how they are fitted; by default not negative and their sum held, as in the
+      materials that come with the package.
     - `loss`: `SquaredLoss()`, or `HuberLoss()` where some pixels are not what the model knows.
-    - `settings`: of the renderer. By default its layers are eight times finer than those of `render`: where much light comes
-      back, a picture that is off by 0.1% means an absorption that is off by 2%.
+    - `settings`: of the renderer. By default its layers are eight times finer than those of
+      `render`: where much light comes back, a picture that is off by 0.1% means an absorption that
+      is off by 2%.
     - `progress`: told in words what is being done, and the best medium up to then.
     - `throw`: raise if a search has not converged; otherwise `result` says so.
 
-    **Returns:** a `Recovery` in JAX's default precision: under `jax.enable_x64` small errors show, the pictures stay as they are.
+    **Returns:** a `Recovery` in JAX's default precision: under `jax.enable_x64` small errors show,
+    the pictures stay as they are.
 
-    **Raises:** `ValueError` for no observation or start, for channels that disagree, for starts without absorption, and for a
-    picture none of whose pixels counts; an error with the message of `result` if `throw`.
+    **Raises:** `ValueError` for no observation or start, for channels that disagree, for starts
+    without absorption, and for a picture none of whose pixels counts; an error with the message of
+    `result` if `throw`.
     """
     starts = [_in_full(start) for start in ([starts] if isinstance(starts, Medium) else starts)]
     observations = list(observations)
@@ -91,14 +102,24 @@ def recover(
         [each.lights for each in observations],
     )
     wide = _unweighed(wide_variances(starts, splats), len(starts[0].eta))
-    surface = Material(wide, eta=starts[0].eta[0], specular=0.0) if surface is None else surface.surface_of(wide)
+    surface = (
+        Material(wide, eta=starts[0].eta[0], specular=0.0)
+        if surface is None
+        else surface.surface_of(wide)
+    )
 
     def problem_of(gathered, variances):
         return evidence.problem(gathered, unknowns, variances, loss, weights, model)
 
-    say(f"rendering {len(wide.variances)} layers of {counted(len(observations), 'picture')}", starts[0])
+    say(
+        f"rendering {len(wide.variances)} layers of {counted(len(observations), 'picture')}",
+        starts[0],
+    )
     problem, _ = problem_of(gatherer.held(surface), Held(wide.variances))
-    say(f"searching from {counted(len(starts), 'start')} among {problem.observed.shape[1]} pixels", starts[0])
+    say(
+        f"searching from {counted(len(starts), 'start')} among {problem.observed.shape[1]} pixels",
+        starts[0],
+    )
     ends = [search(problem, unknowns.start(start, factors)) for start in starts]
     costs = np.nan_to_num([float(end.cost) for end in ends], nan=np.inf)
     best = ends[int(np.argmin(costs))]
@@ -106,7 +127,11 @@ def recover(
     while not settled and rounds < _ROUNDS:
         rounds += 1
         medium = unknowns.medium(best.point)
-        say(f"round {rounds}, of {_ROUNDS} at most: rendering the {count} layers of {_words(medium)}", medium)
+        say(
+            f"round {rounds}, of {_ROUNDS} at most: rendering the {count} layers of "
+            f"{_words(medium)}",
+            medium,
+        )
         fitted = fit_gaussians(model(medium), count, weights=weights, throw=False).gaussians
         surface = surface.surface_of(_unweighed(fitted.variances, len(medium.eta)))
         gathered, plans = gatherer.moving(surface, plans)
@@ -118,7 +143,9 @@ def recover(
         scale = 1.0 if evidence.noise_is_known else float(chi_squared)
         told = np.asarray(reached.information, np.float64)[: best.point.size, : best.point.size]
         deviations = np.sqrt(np.diagonal(inverse(told) * scale))
-        settled = bool(best.converged) and bool(np.all(np.abs(best.point - before) <= np.maximum(_SETTLED, 0.1 * deviations)))
+        settled = bool(best.converged) and bool(
+            np.all(np.abs(best.point - before) <= np.maximum(_SETTLED, 0.1 * deviations))
+        )
     pictures = evidence.shown(np.asarray(reached.radiance), numbers)
     recovery = Recovery(
         medium=unknowns.medium(best.point),
@@ -128,10 +155,14 @@ def recover(
         unresolved=reached.unresolved,
         chi_squared=chi_squared,
         pictures=pictures,
-        residuals=tuple(made - seen for made, seen in zip(pictures, evidence.pictures, strict=True)),
+        residuals=tuple(
+            made - seen for made, seen in zip(pictures, evidence.pictures, strict=True)
+        ),
         ends=tuple(unknowns.medium(end.point) for end in ends),
         costs=jnp.asarray(costs, evidence.dtype),
-        result=optx.RESULTS.where(jnp.asarray(settled), optx.RESULTS.successful, optx.RESULTS.nonlinear_max_steps_reached),
+        result=optx.RESULTS.where(
+            jnp.asarray(settled), optx.RESULTS.successful, optx.RESULTS.nonlinear_max_steps_reached
+        ),
         noise_is_known=evidence.noise_is_known,
         relative_noise=evidence.relative_noise,
         steps=steps,
@@ -142,22 +173,34 @@ def recover(
 
 def _check(observations: list[Observation], splats: Splats, starts: list[Medium]) -> None:
     if not observations or not starts:
-        raise ValueError(f"one observation and one start are needed at least; got {len(observations)} and {len(starts)}")
+        raise ValueError(
+            f"one observation and one start are needed at least; got {len(observations)} and "
+            f"{len(starts)}"
+        )
     channels = starts[0].eta.shape[0]
     for i, start in enumerate(starts):
-        if start.eta.shape[0] != channels or np.any(np.asarray(start.eta) != np.asarray(starts[0].eta)):
+        if start.eta.shape[0] != channels or np.any(
+            np.asarray(start.eta) != np.asarray(starts[0].eta)
+        ):
             raise ValueError(
-                f"starts[{i}].eta is {start.eta.tolist()}, that of the first {starts[0].eta.tolist()}: it is known, hence one"
+                f"starts[{i}].eta is {start.eta.tolist()}, that of the first "
+                f"{starts[0].eta.tolist()}: it is known, hence one"
             )
         if not np.all(np.asarray(start.sigma_a) > 0):
             raise ValueError(
-                f"starts[{i}].sigma_a is {start.sigma_a.tolist()}: logarithms are searched, start above 0 (1e-4 is little)"
+                f"starts[{i}].sigma_a is {start.sigma_a.tolist()}: logarithms are searched, start "
+                "above 0 (1e-4 is little)"
             )
     for i, each in enumerate(observations):
         if each.picture.shape[2] != channels:
-            raise ValueError(f"observations[{i}].picture has {each.picture.shape[2]} channels, starts have {channels}")
+            raise ValueError(
+                f"observations[{i}].picture has {each.picture.shape[2]} channels, starts have "
+                f"{channels}"
+            )
     if splats.albedo is not None and splats.albedo.shape[1] != channels:
-        raise ValueError(f"splats.albedo has {splats.albedo.shape[1]} channels, starts have {channels}")
+        raise ValueError(
+            f"splats.albedo has {splats.albedo.shape[1]} channels, starts have {channels}"
+        )
 
 
 def _in_full(medium: Medium) -> Medium:
@@ -175,5 +218,8 @@ def _nobody(said: str, medium: Medium) -> None:
 
 
 def _words(medium: Medium) -> str:
-    values = ("  ".join(f"{float(value):.3g}" for value in each) for each in (medium.sigma_a, medium.sigma_s_prime))
+    values = (
+        "  ".join(f"{float(value):.3g}" for value in each)
+        for each in (medium.sigma_a, medium.sigma_s_prime)
+    )
     return "sigma_a {}, sigma_s' {}".format(*values)

@@ -7,8 +7,8 @@ from jaxtyping import Float
 def srgb_to_linear(encoded: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
     """Decode sRGB values in [0, 1] to linear light, as float64.
 
-    The pictures that come here are millions of values of 8 or 16 bits, so a table of 65,536 decoded levels serves them all;
-    between its levels it is interpolated.
+    The pictures that come here are millions of values of 8 or 16 bits, so a table of 65,536 decoded
+    levels serves them all; between its levels it is interpolated.
     """
     import colour  # takes 2 s, so only where a color is read
 

@@ -26,7 +26,11 @@ _REC709_D65 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 _WEIGHTS = "splatjax.weights.{}"
 _SINGLE = "single_scattering"
 _MANIFEST = "splatjax.manifest"
-_VARIANCES, _HANDED_OVER, _OVERFLOW = "splatjax.variances", "splatjax.handed_over", "splatjax.overflow"
+_VARIANCES, _HANDED_OVER, _OVERFLOW = (
+    "splatjax.variances",
+    "splatjax.handed_over",
+    "splatjax.overflow",
+)
 
 
 def write_exr(
@@ -36,7 +40,8 @@ def write_exr(
     variances: Sequence[float] | None = None,
     manifest: Mapping[str, Any] | None = None,
 ) -> None:
-    r"""Write a frame with all its layers to one OpenEXR file, single precision, whole or not at all.
+    r"""Write a frame with all its layers to one OpenEXR file, single precision, whole or not at
+    all.
 
     | channels | what they are |
     | --- | --- |
@@ -46,27 +51,36 @@ def write_exr(
     | `albedo.R G B`, `irradiance.R G B`, `diffuse.R G B`, `specular.R G B` | premultiplied |
     | `single_scattering.R G B` | premultiplied; only when the material has such a term |
     | `shadow.1`, `shadow.2`, ... | per light |
-    | `diffusion.1.R G B`, `diffusion.2.R G B`, ... | per Gaussian, so that `diffuse = sum_k weights_k diffusion.k` |
+    | `diffusion.1.R G B`, ... | per Gaussian: `diffuse = sum_k weights_k diffusion.k` |
 
-    Pictures of another number of channels than 3 have `beauty.1`, `beauty.2`, ..., `albedo.1`, ... instead of R G B.
-    The header holds the weights of the Gaussians (`splatjax.weights.1`, ...: a value per channel), their variances (mm^2)
-    when given, and the color space: linear, Rec. 709 primaries, D65; and, as JSON in `splatjax.manifest`, what the picture was
-    made of, when that is given (`read_manifest`).
+    Pictures of another number of channels than 3 have `beauty.1`, `beauty.2`, ..., `albedo.1`, ...
+    instead of R G B. The header holds the weights of the Gaussians (`splatjax.weights.1`, ...: a
+    value per channel), their variances (mm^2) when given, and the color space: linear, Rec. 709
+    primaries, D65; and, as JSON in `splatjax.manifest`, what the picture was made of, when that is
+    given (`read_manifest`).
 
     **Raises:** `FileNotFoundError` when the folder does not exist.
     """
-    planes = {name: np.ascontiguousarray(np.asarray(plane, np.float32)) for name, plane in _planes(frame)}
+    planes = {
+        name: np.ascontiguousarray(np.asarray(plane, np.float32)) for name, plane in _planes(frame)
+    }
     header: dict = {
         "compression": OpenEXR.ZIP_COMPRESSION,
         "type": OpenEXR.scanlineimage,
         "software": f"splatjax {own_version()}",
-        "comments": "Linear light. Depth and position in mm; depth, position and normal are not premultiplied.",
+        "comments": (
+            "Linear light. Depth and position in mm; depth, position and normal are "
+            "not premultiplied."
+        ),
         _HANDED_OVER: _floats(frame.handed_over),
         _OVERFLOW: float(frame.overflow),
     }
     if frame.beauty.shape[-1] == 3:
         header |= {"chromaticities": _REC709_D65, "colorInteropID": "lin_rec709_scene"}
-    header |= {_WEIGHTS.format(k): _floats(weights) for k, weights in enumerate(np.asarray(frame.weights), 1)}
+    header |= {
+        _WEIGHTS.format(k): _floats(weights)
+        for k, weights in enumerate(np.asarray(frame.weights), 1)
+    }
     if variances is not None:
         header[_VARIANCES] = _floats(variances)
     if manifest is not None:
@@ -82,23 +96,30 @@ def write_exr(
 def read_exr(path: str | os.PathLike[str]) -> Frame:
     r"""Read a frame that `write_exr` wrote: what was single precision comes back bit by bit.
 
-    **Raises:** `FileNotFoundError`, or `ValueError` when the file cannot be read or lacks the layers of a frame.
+    **Raises:** `FileNotFoundError`, or `ValueError` when the file cannot be read or lacks the
+    layers of a frame.
     """
     path = Path(path)
     header, planes = _read(path)
     try:
         return _frame(header, planes)
     except KeyError as error:
-        raise ValueError(f"{path}: lacks {error.args[0]}, so it is no frame; give a file written by write_exr") from error
+        raise ValueError(
+            f"{path}: lacks {error.args[0]}, so it is no frame; give a file written by write_exr"
+        ) from error
     except (TypeError, ValueError) as error:
         said = " ".join(str(error).split())
-        raise ValueError(f"{path}: has no weights as a frame has ({said}); give a file written by write_exr") from None
+        raise ValueError(
+            f"{path}: has no weights as a frame has ({said}); give a file written by write_exr"
+        ) from None
 
 
 def read_manifest(path: str | os.PathLike[str]) -> dict[str, Any]:
-    r"""Read what a picture was made of: versions, settings, material, as the command line writes it.
+    r"""Read what a picture was made of: versions, settings, material, as the command line writes
+    it.
 
-    **Raises:** `FileNotFoundError`, or `ValueError` when the file cannot be read or does not say it.
+    **Raises:** `FileNotFoundError`, or `ValueError` when the file cannot be read or does not say
+    it.
     """
     path = Path(path)
     header, _ = _read(path)
@@ -107,7 +128,9 @@ def read_manifest(path: str | os.PathLike[str]) -> dict[str, Any]:
     except (KeyError, TypeError, ValueError):
         found = None
     if not isinstance(found, dict):
-        raise ValueError(f"{path}: does not say what it was made of; give a picture that `splatjax render` wrote")
+        raise ValueError(
+            f"{path}: does not say what it was made of; give a picture that `splatjax render` wrote"
+        )
     return found
 
 
@@ -136,24 +159,38 @@ def _read(path: Path) -> tuple[dict, dict[str, np.ndarray]]:
                 header = dict(file.header())
             low, high = (np.asarray(corner, np.int64) for corner in header["dataWindow"])
             pixels, channels = float(np.prod(high - low + 1)), len(header["channels"])
-            check_room(f"{path}: a picture of {pixels:.3g} pixels and {channels} channels", 12.0 * pixels * channels, "give less")
+            check_room(
+                f"{path}: a picture of {pixels:.3g} pixels and {channels} channels",
+                12.0 * pixels * channels,
+                "give less",
+            )
             with OpenEXR.File(str(path), separate_channels=True) as file:
-                planes = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
+                planes = {
+                    name: np.array(channel.pixels) for name, channel in file.channels().items()
+                }
         if said:
             raise ValueError
-    except Exception as error:  # the package raises whatever its C++ side throws, or says it and goes on without
+    except (
+        Exception
+    ) as error:  # the package raises whatever its C++ side throws, or says it and goes on without
         if str(error).startswith(f"{path}: a picture"):
             raise
         reason = " ".join((said[0] if said else str(error)).replace(f"{path}: ", "").split())
-        raise ValueError(f"{path}: cannot be read as OpenEXR ({reason}); it is cut short or of another format") from None
+        raise ValueError(
+            f"{path}: cannot be read as OpenEXR ({reason}); it is cut short or of another format"
+        ) from None
     if len({plane.shape for plane in planes.values()}) != 1:
-        raise ValueError(f"{path}: has channels of several sizes, which are not read here; write all in full")
+        raise ValueError(
+            f"{path}: has channels of several sizes, which are not read here; write all in full"
+        )
     return header, planes
 
 
 @contextmanager
 def _overheard(said: list[str]) -> Generator[None, None, None]:
-    """Take down what the package's C++ side prints, and writes to the standard error of the process."""
+    """Take down what the package's C++ side prints, and writes to the standard error of the
+    process.
+    """
     sys.stderr.flush()
     with tempfile.TemporaryFile() as heard, redirect_stdout(StringIO()) as printed:
         kept = os.dup(2)
@@ -164,7 +201,10 @@ def _overheard(said: list[str]) -> Generator[None, None, None]:
             os.dup2(kept, 2)
             os.close(kept)
             heard.seek(0)
-            lines = heard.read().decode("utf-8", "replace").splitlines() + printed.getvalue().splitlines()
+            lines = (
+                heard.read().decode("utf-8", "replace").splitlines()
+                + printed.getvalue().splitlines()
+            )
             said.extend(line for line in lines if line.strip())
 
 
@@ -173,7 +213,11 @@ def _floats(values) -> list[float]:
 
 
 def _names(layer: str, channels: int) -> list[str]:
-    return [f"{layer}.{letter}" for letter in "RGB"] if channels == 3 else [f"{layer}.{k}" for k in range(1, channels + 1)]
+    return (
+        [f"{layer}.{letter}" for letter in "RGB"]
+        if channels == 3
+        else [f"{layer}.{k}" for k in range(1, channels + 1)]
+    )
 
 
 def _beauty_names(channels: int) -> list[str]:
@@ -222,8 +266,14 @@ def _frame(header: dict, planes: dict[str, np.ndarray]) -> Frame:
         "beauty": picture(_beauty_names(channels)),
         "coverage": planes["A"],
         "depth": planes["Z"],
-        **{layer: picture([f"{layer}.{axis}" for axis in "XYZ"]) for layer in ("position", "normal")},
-        **{layer: picture(_names(layer, channels)) for layer in ("albedo", "irradiance", "diffuse", "specular")},
+        **{
+            layer: picture([f"{layer}.{axis}" for axis in "XYZ"])
+            for layer in ("position", "normal")
+        },
+        **{
+            layer: picture(_names(layer, channels))
+            for layer in ("albedo", "irradiance", "diffuse", "specular")
+        },
         "shadow": stacked([planes[f"shadow.{k}"] for k in range(1, lights + 1)], *shape),
         "layers": stacked(layers, *shape, channels),
         "weights": stacked(weights, channels),

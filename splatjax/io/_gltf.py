@@ -17,8 +17,24 @@ from ._pictures import read_color
 from ._pieces import Piece, Wrap, check_places, moderate
 from ._room import check_room
 
-_KNOWN = {"KHR_mesh_quantization", "KHR_texture_transform", "EXT_texture_webp", "KHR_lights_punctual"}
-_COUNTS = {"count", "byteOffset", "byteLength", "byteStride", "bufferView", "buffer", "mesh", "scene", "indices", "material"}
+_KNOWN = {
+    "KHR_mesh_quantization",
+    "KHR_texture_transform",
+    "EXT_texture_webp",
+    "KHR_lights_punctual",
+}
+_COUNTS = {
+    "count",
+    "byteOffset",
+    "byteLength",
+    "byteStride",
+    "bufferView",
+    "buffer",
+    "mesh",
+    "scene",
+    "indices",
+    "material",
+}
 _COUNTS |= {"index", "sampler", "source", "texCoord", "children", "nodes", "attributes", "mode"}
 _WIDTHS = {"_PLACE": (3,), "_NORMAL": (3,), "_COLOR": (3, 4), "_UV": (2,)}
 _WHOLE = {5121, 5123, 5125}
@@ -29,38 +45,58 @@ _BYTES_PER_ZERO = 80.0  # of a sparse accessor
 
 
 def read_gltf(path: Path) -> list[Piece]:
-    """Read the triangles of the scene that a file shows, moved by its nodes: a piece for each primitive of each node.
+    """Read the triangles of the scene that a file shows, moved by its nodes: a piece for each
+    primitive of each node.
 
-    Primitives of points and lines are left alone, and so are skins and morph targets: meshes stand as they were modeled.
-    trimesh reads buffers, accessors and nodes; it is asked for accessors as they stand in the file, for it leaves alone what is
-    normalized and what is sparse.
+    Primitives of points and lines are left alone, and so are skins and morph targets: meshes stand
+    as they were modeled. trimesh reads buffers, accessors and nodes; it is asked for accessors as
+    they stand in the file, for it leaves alone what is normalized and what is sparse.
 
-    **Raises:** `ValueError` for what is no such file, is cut short, or needs an extension that is not known here.
+    **Raises:** `ValueError` for what is no such file, is cut short, or needs an extension that is
+    not known here.
     """
     with readable(path, "glTF"):
         from trimesh.exchange.gltf import load_gltf  # takes a second, so only where a mesh is read
 
         content, chunk = _opened(path)
         _check(path, content)
-        buffers = {str(i): _buffer(path, entry, chunk, i) for i, entry in enumerate(content.get("buffers", []))}
+        buffers = {
+            str(i): _buffer(path, entry, chunk, i)
+            for i, entry in enumerate(content.get("buffers", []))
+        }
         for view in content.get("bufferViews", []):
-            end, size = view.get("byteOffset", 0) + view["byteLength"], len(buffers[str(view["buffer"])])
+            end, size = (
+                view.get("byteOffset", 0) + view["byteLength"],
+                len(buffers[str(view["buffer"])]),
+            )
             if end > size:
                 raise ValueError(f"its bufferViews promise {end} bytes of a buffer of {size}")
         _stage(content)
         primitives = [primitive for mesh in content["meshes"] for primitive in mesh["primitives"]]
         dresses = [_dress(path, content, buffers, primitive) for primitive in primitives]
-        asked = [_ask(content, primitive, which) for primitive, (which, *_) in zip(primitives, dresses, strict=True)]
+        asked = [
+            _ask(content, primitive, which)
+            for primitive, (which, *_) in zip(primitives, dresses, strict=True)
+        ]
         plain = content | {"buffers": [{"uri": name} for name in buffers]}
-        found = load_gltf(BytesIO(json.dumps(plain).encode()), resolver=buffers, skip_materials=True)
+        found = load_gltf(
+            BytesIO(json.dumps(plain).encode()), resolver=buffers, skip_materials=True
+        )
         geometry = found["geometry"]
         pieces = {
             name: _piece(path, table, wanted, dress)
             for (name, table), wanted, dress in zip(geometry.items(), asked, dresses, strict=True)
         }
         places = [edge for edge in found["graph"] if "geometry" in edge]
-        corners = sum(3 * len(pieces[edge["geometry"]].faces) + len(pieces[edge["geometry"]].vertices) for edge in places)
-        check_room(f"{path}: a scene of {corners} corners", _BYTES_PER_CORNER * corners, "export a part of it")
+        corners = sum(
+            3 * len(pieces[edge["geometry"]].faces) + len(pieces[edge["geometry"]].vertices)
+            for edge in places
+        )
+        check_room(
+            f"{path}: a scene of {corners} corners",
+            _BYTES_PER_CORNER * corners,
+            "export a part of it",
+        )
         world, moved = {found["base_frame"]: np.eye(4)}, []
         for edge in found["graph"]:
             world[edge["frame_to"]] = matrix = world[edge["frame_from"]] @ edge["matrix"]
@@ -91,7 +127,10 @@ def _chunks(data: bytes) -> tuple[bytes, bytes | None]:
     if version != 2:
         raise ValueError(f"it is GLB of version {version}, and version 2 is read")
     if length > len(data) or 20 + text_length > length:
-        raise ValueError(f"its header promises {max(length, 20 + text_length)} bytes, and it has {len(data)}: it is cut short")
+        raise ValueError(
+            f"its header promises {max(length, 20 + text_length)} bytes, and it has {len(data)}: "
+            "it is cut short"
+        )
     if kind != b"JSON":
         raise ValueError("its first chunk is not JSON")
     start = 20 + text_length
@@ -107,20 +146,28 @@ def _chunks(data: bytes) -> tuple[bytes, bytes | None]:
 
 
 def _check(path: Path, content: dict[str, Any]) -> None:
-    """Refuse what trimesh would pass over in silence: other versions and extensions, counts below zero, accessors of nothing."""
+    """Refuse what trimesh would pass over in silence: other versions and extensions, counts below
+    zero, accessors of nothing.
+    """
     version = str(content["asset"]["version"])
     if not version.startswith("2."):
         raise ValueError(f"it is of version {version[:20]}, and version 2 is read")
     unknown = sorted(set(content.get("extensionsRequired", ())) - _KNOWN)
     unknown = [name for name in unknown if not name.startswith("KHR_materials_")]
     if unknown:
-        raise ValueError(f"it needs the extension {unknown[0]}, which is not read here; export without it")
+        raise ValueError(
+            f"it needs the extension {unknown[0]}, which is not read here; export without it"
+        )
     _check_counts(content)
     for accessor in content.get("accessors", []):
         if "bufferView" not in accessor:
             if "sparse" not in accessor:
                 raise ValueError("it has an accessor without data: export it without compression")
-            check_room(f"{path}: an accessor of {accessor['count']} zeros", _BYTES_PER_ZERO * accessor["count"], "write it again")
+            check_room(
+                f"{path}: an accessor of {accessor['count']} zeros",
+                _BYTES_PER_ZERO * accessor["count"],
+                "write it again",
+            )
 
 
 def _check_counts(value: Any) -> None:
@@ -130,9 +177,23 @@ def _check_counts(value: Any) -> None:
         if isinstance(value, list):
             waiting.extend(value)
         for key, each in value.items() if isinstance(value, dict) else ():
-            if (key in _COUNTS and not isinstance(each, dict | list)) or key in ("children", "nodes", "attributes"):
-                several = each.values() if isinstance(each, dict) else each if isinstance(each, list) else [each]
-                wrong = [one for one in several if not isinstance(one, dict) and (type(one) is not int or one < 0)]
+            if (key in _COUNTS and not isinstance(each, dict | list)) or key in (
+                "children",
+                "nodes",
+                "attributes",
+            ):
+                several = (
+                    each.values()
+                    if isinstance(each, dict)
+                    else each
+                    if isinstance(each, list)
+                    else [each]
+                )
+                wrong = [
+                    one
+                    for one in several
+                    if not isinstance(one, dict) and (type(one) is not int or one < 0)
+                ]
                 if wrong:
                     raise ValueError(f"it has {wrong[0]!r} in the place of a count, its {key}")
             if key != "extras":
@@ -155,10 +216,14 @@ def _named(path: Path, uri: str) -> bytes:
 
 
 def _stage(content: dict[str, Any]) -> None:
-    """Make the scene plain: one that is shown, nodes that trimesh does not pass over, each in one place."""
+    """Make the scene plain: one that is shown, nodes that trimesh does not pass over, each in one
+    place.
+    """
     meshes = content.setdefault("meshes", [])
     for mesh in meshes:
-        mesh["primitives"] = [each for each in mesh["primitives"] if each.get("mode", _TRIANGLES) in _SURFACES]
+        mesh["primitives"] = [
+            each for each in mesh["primitives"] if each.get("mode", _TRIANGLES) in _SURFACES
+        ]
     content["nodes"] = content.get("nodes") or [{"mesh": i} for i in range(len(meshes))]
     nodes: Any = content["nodes"]
     children = [child for node in nodes for child in node.get("children", [])]
@@ -179,15 +244,21 @@ def _stage(content: dict[str, Any]) -> None:
             raise ValueError(f"its nodes have a rotation {node['rotation']!r}")
 
 
-def _ask(content: dict[str, Any], primitive: dict[str, Any], which: str) -> dict[str, dict[str, Any]]:
-    """Let a primitive name, beside its places, all that is needed as attributes of its own; give their accessors."""
+def _ask(
+    content: dict[str, Any], primitive: dict[str, Any], which: str
+) -> dict[str, dict[str, Any]]:
+    """Let a primitive name, beside its places, all that is needed as attributes of its own; give
+    their accessors.
+    """
     if primitive.get("mode", _TRIANGLES) == _FAN:
         raise ValueError("it has triangle fans, which are not read here; export triangles")
     accessors, attributes = content["accessors"], primitive["attributes"]
     if "indices" in primitive:
         order = accessors[primitive["indices"]]
         if order["componentType"] not in _WHOLE or order["type"] != "SCALAR" or "sparse" in order:
-            raise ValueError("its indices are no plain whole numbers; export it without compression")
+            raise ValueError(
+                "its indices are no plain whole numbers; export it without compression"
+            )
     wanted = {"_PLACE": "POSITION", "_NORMAL": "NORMAL", "_COLOR": "COLOR_0", "_UV": which}
     asked = {name: accessors[attributes[old]] for name, old in wanted.items() if old in attributes}
     primitive["attributes"] = {"POSITION": attributes["POSITION"]}
@@ -196,23 +267,37 @@ def _ask(content: dict[str, Any], primitive: dict[str, Any], which: str) -> dict
     for name, accessor in asked.items():
         if "sparse" in accessor:
             sparse = accessor["sparse"]
-            for end, entry, kind in (("_AT", sparse["indices"], {"type": "SCALAR"}), ("_OF", sparse["values"], accessor)):
+            for end, entry, kind in (
+                ("_AT", sparse["indices"], {"type": "SCALAR"}),
+                ("_OF", sparse["values"], accessor),
+            ):
                 part = {"componentType": kind.get("componentType", 0), "type": kind["type"]} | entry
                 primitive["attributes"][name + end] = len(accessors)
                 accessors.append(part | {"count": sparse["count"]})
     return asked
 
 
-def _tables(found: dict[str, np.ndarray], asked: dict[str, dict[str, Any]]) -> dict[str, np.ndarray]:
-    """Give the values of attributes, with what is sparse in its place and what is normalized as floats."""
+def _tables(
+    found: dict[str, np.ndarray], asked: dict[str, dict[str, Any]]
+) -> dict[str, np.ndarray]:
+    """Give the values of attributes, with what is sparse in its place and what is normalized as
+    floats.
+    """
     tables = {}
     for name, accessor in asked.items():
         table = found[name]
         if f"{name}_AT" in found:
             table = table.copy()
             table[found[f"{name}_AT"][:, 0].astype(np.uint32)] = found[f"{name}_OF"]
-        if table.ndim != 2 or table.shape[1] not in _WIDTHS[name] or len(table) != len(found["_PLACE"]):
-            raise ValueError(f"its {len(found['_PLACE'])} vertices have {table.shape} numbers for {name[1:].lower()}")
+        if (
+            table.ndim != 2
+            or table.shape[1] not in _WIDTHS[name]
+            or len(table) != len(found["_PLACE"])
+        ):
+            raise ValueError(
+                f"its {len(found['_PLACE'])} vertices have {table.shape} numbers for "
+                f"{name[1:].lower()}"
+            )
         with np.errstate(invalid="ignore"):  # of NaN that signals
             tables[name] = table.astype(np.float64)
         if accessor.get("normalized") and table.dtype.kind in "iu":
@@ -220,7 +305,9 @@ def _tables(found: dict[str, np.ndarray], asked: dict[str, dict[str, Any]]) -> d
     return tables
 
 
-def _piece(path: Path, found: dict[str, Any], asked: dict[str, dict[str, Any]], dress: tuple) -> Piece:
+def _piece(
+    path: Path, found: dict[str, Any], asked: dict[str, dict[str, Any]], dress: tuple
+) -> Piece:
     tables, faces = _tables(found["vertex_attributes"], asked), np.asarray(found["faces"], np.int64)
     normals, colors, uvs = (tables.get(name) for name in ("_NORMAL", "_COLOR", "_UV"))
     check_places(path, tables["_PLACE"])
@@ -239,7 +326,9 @@ def _piece(path: Path, found: dict[str, Any], asked: dict[str, dict[str, Any]], 
 def _dress(
     path: Path, content: dict[str, Any], buffers: dict[str, bytes], primitive: dict[str, Any]
 ) -> tuple[str, dict[str, Any], dict[str, Any]]:
-    """Give which texture coordinates a primitive wears, how they are laid, and the base color of its material."""
+    """Give which texture coordinates a primitive wears, how they are laid, and the base color of
+    its material.
+    """
     if "material" not in primitive:
         return "TEXCOORD_0", {}, {}
     surface = content["materials"][primitive["material"]].get("pbrMetallicRoughness", {})
@@ -261,7 +350,10 @@ def _wraps(content: dict[str, Any], index: int) -> tuple[Wrap, Wrap]:
     sampler = {} if number is None else content["samplers"][number]
     along_u, along_v = (_WRAPS.get(sampler.get(name, 10497)) for name in ("wrapS", "wrapT"))
     if along_u is None or along_v is None:
-        raise ValueError(f"its textures are wrapped by {sampler.get('wrapS')!r} and {sampler.get('wrapT')!r}, which is unknown")
+        raise ValueError(
+            f"its textures are wrapped by {sampler.get('wrapS')!r} and {sampler.get('wrapT')!r}, "
+            "which is unknown"
+        )
     return along_u, along_v
 
 
@@ -272,12 +364,20 @@ def _laid(uvs: np.ndarray, lay: dict[str, Any]) -> np.ndarray:
     return uvs + np.asarray(lay.get("offset", (0, 0)), np.float64).reshape(1, 2)
 
 
-def _texture(path: Path, content: dict[str, Any], buffers: dict[str, bytes], index: int) -> np.ndarray:
+def _texture(
+    path: Path, content: dict[str, Any], buffers: dict[str, bytes], index: int
+) -> np.ndarray:
     with readable(path, "glTF"):
         texture = content["textures"][index]
-        source = texture.get("extensions", {}).get("EXT_texture_webp", {}).get("source", texture.get("source"))
+        source = (
+            texture.get("extensions", {})
+            .get("EXT_texture_webp", {})
+            .get("source", texture.get("source"))
+        )
         if source is None:
-            raise ValueError("its texture is packed in a way that is not read here, export it as PNG or JPEG")
+            raise ValueError(
+                "its texture is packed in a way that is not read here, export it as PNG or JPEG"
+            )
         image = content["images"][source]
         if "bufferView" not in image:
             return read_color(path, _named(path, image["uri"]))
@@ -287,13 +387,24 @@ def _texture(path: Path, content: dict[str, Any], buffers: dict[str, bytes], ind
 
 
 def _moved(piece: Piece, matrix: np.ndarray) -> Piece:
-    """Give a piece in the world. A mirror turns its triangles around, so that they face outward again."""
+    """Give a piece in the world. A mirror turns its triangles around, so that they face outward
+    again.
+    """
     linear = matrix[:3, :3]
     vertices = piece.vertices @ linear.T + matrix[:3, 3]
-    # The cofactors are the inverse's transpose times the determinant, and exist where there is no inverse.
-    cofactors = np.stack([np.cross(linear[1], linear[2]), np.cross(linear[2], linear[0]), np.cross(linear[0], linear[1])])
+    # The cofactors are the inverse's transpose times the determinant, and exist where there is no
+    # inverse.
+    cofactors = np.stack(
+        [
+            np.cross(linear[1], linear[2]),
+            np.cross(linear[2], linear[0]),
+            np.cross(linear[0], linear[1]),
+        ]
+    )
     mirrored = np.linalg.det(linear) < 0
-    normals = None if piece.normals is None else piece.normals @ (-cofactors if mirrored else cofactors).T
+    normals = (
+        None if piece.normals is None else piece.normals @ (-cofactors if mirrored else cofactors).T
+    )
     if mirrored:
         turned = None if piece.uvs is None else piece.uvs[:, ::-1]
         piece = piece._replace(faces=piece.faces[:, ::-1], uvs=turned)

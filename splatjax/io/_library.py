@@ -27,6 +27,8 @@ def readable(path: Path, kind: str) -> Generator[None, None, None]:
         said = " ".join(str(error).split())[:200]
         if not isinstance(error, ValueError):
             said = f"an entry is missing or wrong ({type(error).__name__} {said})"
-        raise ValueError(f"{path}: cannot be read as {kind}: {said}; it is cut short or wrong, write it again") from None
+        raise ValueError(
+            f"{path}: cannot be read as {kind}: {said}; it is cut short or wrong, write it again"
+        ) from None
     finally:
         log.setLevel(before)

@@ -18,8 +18,12 @@ BYTES_PER_PIXEL = 80.0  # of three channels in double precision, while they are 
 _GRAY = (0.299, 0.587, 0.114)  # Pillow's
 
 
-def read_color(path: str | os.PathLike[str], encoded: bytes | None = None) -> Float[np.ndarray, "height width 3"]:
-    """Read an sRGB picture as linear light, row 0 at the top: from a file, or from what stands encoded within it."""
+def read_color(
+    path: str | os.PathLike[str], encoded: bytes | None = None
+) -> Float[np.ndarray, "height width 3"]:
+    """Read an sRGB picture as linear light, row 0 at the top: from a file, or from what stands
+    encoded within it.
+    """
     return srgb_to_linear(_read(path, "RGB", encoded))
 
 
@@ -33,7 +37,9 @@ def read_factor(path: str | os.PathLike[str]) -> Float[np.ndarray, "height width
     return _read(path, "L")
 
 
-def _read(path: str | os.PathLike[str], mode: str, encoded: bytes | None = None) -> Float[np.ndarray, "..."]:
+def _read(
+    path: str | os.PathLike[str], mode: str, encoded: bytes | None = None
+) -> Float[np.ndarray, "..."]:
     path = existing_file(path)
 
     def opened() -> ImageFile.ImageFile:
@@ -45,7 +51,9 @@ def _read(path: str | os.PathLike[str], mode: str, encoded: bytes | None = None)
             with opened() as picture:
                 width, height = picture.size
                 size = f"a picture of {width} x {height} pixels"
-                check_room(f"{path}: {size}", BYTES_PER_PIXEL * width * height, "give a smaller one")
+                check_room(
+                    f"{path}: {size}", BYTES_PER_PIXEL * width * height, "give a smaller one"
+                )
                 _check_whole(picture)
                 if not _of_16_bits(picture):
                     return _values(picture, mode)
@@ -66,7 +74,9 @@ def _check_whole(picture: ImageFile.ImageFile) -> None:
     held: dict[str, int] = {}  # by raw mode: each channel may have strips of its own
     for tile in picture.tile:
         left, top, right, bottom = tile.extents or (0, 0, width, height)
-        held[_raw_mode(tile.args)] = held.get(_raw_mode(tile.args), 0) + (right - left) * (bottom - top)
+        held[_raw_mode(tile.args)] = held.get(_raw_mode(tile.args), 0) + (right - left) * (
+            bottom - top
+        )
     least = min(held.values(), default=0)
     if least < width * height:
         raise ValueError(f"it holds {least} of {width} x {height} pixels")
@@ -74,12 +84,16 @@ def _check_whole(picture: ImageFile.ImageFile) -> None:
 
 def _unreadable(path: Path, error: Exception) -> ValueError:
     said = " ".join(str(error).split()) or type(error).__name__
-    return ValueError(f"{path}: cannot be read as a picture ({said}); give a whole JPEG, PNG or TIFF")
+    return ValueError(
+        f"{path}: cannot be read as a picture ({said}); give a whole JPEG, PNG or TIFF"
+    )
 
 
 def _values(picture: Image.Image, mode: str) -> Float[np.ndarray, "..."]:
     if picture.mode == "F":
-        raise ValueError("its values are floating point, of which nothing says how they are encoded")
+        raise ValueError(
+            "its values are floating point, of which nothing says how they are encoded"
+        )
     if picture.mode.startswith("I"):  # 16 bits, which `convert` would clip
         gray = np.asarray(picture, np.float64) / 65535
         return gray if mode == "L" else np.repeat(gray[..., None], 3, axis=-1)
@@ -87,21 +101,30 @@ def _values(picture: Image.Image, mode: str) -> Float[np.ndarray, "..."]:
 
 
 def _of_16_bits(picture: ImageFile.ImageFile) -> bool:
-    """Whether Pillow would pass over the lower half of a picture's 16 bits, as it does where there are several channels.
+    """Whether Pillow would pass over the lower half of a picture's 16 bits, as it does where there
+    are several channels.
 
     Of gray with alpha it knows one order of bytes alone, so that its lower half is passed over.
     """
     raw = [_raw_mode(tile.args) for tile in picture.tile]
-    return not picture.mode.startswith("I") and any(";16" in each and each.startswith("RGB") for each in raw)
+    return not picture.mode.startswith("I") and any(
+        ";16" in each and each.startswith("RGB") for each in raw
+    )
 
 
-def _deep_values(picture: ImageFile.ImageFile, again: ImageFile.ImageFile) -> Float[np.ndarray, "height width 3"]:
-    """Read a picture of 16 bits twice: the upper bytes, and the lower ones as if they were upper ones in the other order."""
+def _deep_values(
+    picture: ImageFile.ImageFile, again: ImageFile.ImageFile
+) -> Float[np.ndarray, "height width 3"]:
+    """Read a picture of 16 bits twice: the upper bytes, and the lower ones as if they were upper
+    ones in the other order.
+    """
     swapped = {"B": "L", "L": "B", "N": "B" if sys.byteorder == "little" else "L"}
     for i, tile in enumerate(again.tile):
         raw = _raw_mode(tile.args)
         other = raw[:-1] + swapped[raw[-1]]
-        again.tile[i] = tile._replace(args=(other, *tile.args[1:]) if isinstance(tile.args, tuple) else other)
+        again.tile[i] = tile._replace(
+            args=(other, *tile.args[1:]) if isinstance(tile.args, tuple) else other
+        )
     upper, lower = (np.asarray(each.convert("RGB"), np.float64) for each in (picture, again))
     return (256 * upper + lower) / 65535
 

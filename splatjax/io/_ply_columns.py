@@ -8,7 +8,11 @@ from jaxtyping import Float
 from ._color import srgb_to_linear
 from ._ply_tables import PlyFile, Ragged
 
-_COLORS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
+_COLORS = (
+    ("red", "green", "blue"),
+    ("r", "g", "b"),
+    ("diffuse_red", "diffuse_green", "diffuse_blue"),
+)
 Table = dict[str, np.ndarray | Ragged]
 
 
@@ -21,7 +25,9 @@ def vertex_table(path: Path, file: PlyFile) -> Table:
     if table is None:
         raise ValueError(f"{path}: has no element `vertex`; a PLY file of points keeps them there")
     if not table or not len(next(iter(table.values()))):
-        raise ValueError(f"{path}: is empty, it holds no vertex; give a file with at least one point")
+        raise ValueError(
+            f"{path}: is empty, it holds no vertex; give a file with at least one point"
+        )
     return table
 
 
@@ -37,7 +43,9 @@ def places_of(path: Path, table: Table) -> Float[np.ndarray, "rows 3"]:
     return places
 
 
-def columns_of(path: Path, table: Table, names: tuple[str, ...]) -> Float[np.ndarray, "rows columns"] | None:
+def columns_of(
+    path: Path, table: Table, names: tuple[str, ...]
+) -> Float[np.ndarray, "rows columns"] | None:
     """Give columns that belong together as numbers; `None` when there is none of them.
 
     **Raises:** `ValueError` when only some are there, are lists, or hold what is not finite.
@@ -47,23 +55,33 @@ def columns_of(path: Path, table: Table, names: tuple[str, ...]) -> Float[np.nda
         return None
     if len(have) < len(names):
         lacking = next(name for name in names if name not in table)
-        raise ValueError(f"{path}: its vertices have {' '.join(have)} without {lacking}; write all of them, or none")
+        raise ValueError(
+            f"{path}: its vertices have {' '.join(have)} without {lacking}; write all of them, or "
+            "none"
+        )
     found = [table[name] for name in names]
     if any(isinstance(each, Ragged) for each in found):
-        raise ValueError(f"{path}: {' '.join(names)} of its vertices are lists; write single numbers")
+        raise ValueError(
+            f"{path}: {' '.join(names)} of its vertices are lists; write single numbers"
+        )
     with np.errstate(invalid="ignore"):  # of NaN that signals
         values = np.stack(found, axis=-1).astype(np.float64)
     finite = np.isfinite(values)
     if not finite.all():
         bad = np.flatnonzero(~finite.all(axis=-1))
         raise ValueError(
-            f"{path}: {' '.join(names)} of vertex {bad[0]} is not finite ({len(bad)} such vertices); remove or mend them"
+            f"{path}: {' '.join(names)} of vertex {bad[0]} is not finite ({len(bad)} such "
+            "vertices); remove or mend them"
         )
     return values
 
 
-def normals_of(path: Path, table: Table, then: str = "to have them estimated") -> Float[np.ndarray, "rows 3"] | None:
-    """Give normals, of any length but zero; where they are left out, `then` says what is to be done."""
+def normals_of(
+    path: Path, table: Table, then: str = "to have them estimated"
+) -> Float[np.ndarray, "rows 3"] | None:
+    """Give normals, of any length but zero; where they are left out, `then` says what is to be
+    done.
+    """
     normals = columns_of(path, table, ("nx", "ny", "nz"))
     if normals is None:
         return None
@@ -71,14 +89,17 @@ def normals_of(path: Path, table: Table, then: str = "to have them estimated") -
     bad = np.flatnonzero(x & y & z)
     if len(bad):
         raise ValueError(
-            f"{path}: the normal of vertex {bad[0]} has length zero ({len(bad)} such vertices); mend it,"
+            f"{path}: the normal of vertex {bad[0]} has length zero ({len(bad)} such vertices); "
+            "mend it,"
             f" or leave nx ny nz out {then}"
         )
     return normals
 
 
 def colors_of(path: Path, table: Table) -> Float[np.ndarray, "rows 3"] | None:
-    """Give linear colors: whole numbers are sRGB up to the greatest that their type holds, others are linear."""
+    """Give linear colors: whole numbers are sRGB up to the greatest that their type holds, others
+    are linear.
+    """
     names = next((names for names in _COLORS if any(name in table for name in names)), None)
     values = None if names is None else columns_of(path, table, names)
     if names is None or values is None:
@@ -91,7 +112,8 @@ def colors_of(path: Path, table: Table) -> Float[np.ndarray, "rows 3"] | None:
         values = values / np.iinfo(kinds[0]).max
     if values.min() < 0 or values.max() > 1:
         raise ValueError(
-            f"{path}: {' '.join(names)} range from {values.min():g} to {values.max():g}; floats are linear albedo in [0, 1],"
+            f"{path}: {' '.join(names)} range from {values.min():g} to {values.max():g}; floats "
+            "are linear albedo in [0, 1],"
             " integers are sRGB"
         )
     return srgb_to_linear(values) if encoded else values

@@ -37,7 +37,9 @@ def read_record(path: str | os.PathLike[str]) -> dict[str, Any]:
     try:
         record = json.loads(Path(path).read_text(encoding="utf-8"))
     except ValueError as error:
-        raise ValueError(f"{path}: is no JSON file ({error}); delete it, or name another folder") from None
+        raise ValueError(
+            f"{path}: is no JSON file ({error}); delete it, or name another folder"
+        ) from None
     if not isinstance(record, dict):
         raise ValueError(f"{path}: is no record; delete it, or name another folder")
     return record

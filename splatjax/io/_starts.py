@@ -11,16 +11,22 @@ from ._materials import profiles_folder
 
 
 def dipole_starts() -> DipoleStarts:
-    r"""Give where fits of 1 to 8 Gaussians to dipoles start: one descent then finds what a search would.
+    r"""Give where fits of 1 to 8 Gaussians to dipoles start: one descent then finds what a search
+    would.
 
-        fit_gaussians(Dipole(medium), 6, spread=VariancesPerChannel(), start=dipole_starts()(medium, 6))
+        fit_gaussians(Dipole(medium), 6, spread=VariancesPerChannel(), start=dipole_starts()(medium,
+        6))
 
     **Returns:** a `DipoleStarts` in JAX's default precision. `tools/make_starts.py` made the table.
     """
     tables, dtype = _tables(), jnp.result_type(float)
     counts = sum(name.startswith("log_variances_") for name in tables)
-    log_variances = tuple(jnp.asarray(tables[f"log_variances_{count}"], dtype) for count in range(1, counts + 1))
-    return DipoleStarts(jnp.asarray(tables["roots"], dtype), jnp.asarray(tables["etas"], dtype), log_variances)
+    log_variances = tuple(
+        jnp.asarray(tables[f"log_variances_{count}"], dtype) for count in range(1, counts + 1)
+    )
+    return DipoleStarts(
+        jnp.asarray(tables["roots"], dtype), jnp.asarray(tables["etas"], dtype), log_variances
+    )
 
 
 @functools.cache

@@ -28,24 +28,33 @@ class Table:
         """Refuse what is not known."""
         unknown = sorted(set(self.table) - known)
         if unknown:
-            raise ValueError(f"{self.where} has an unknown entry {unknown[0]!r}; {nearest(unknown[0], known)}")
+            raise ValueError(
+                f"{self.where} has an unknown entry {unknown[0]!r}; {nearest(unknown[0], known)}"
+            )
 
     def unit(self, expected: str, name: str = "unit") -> None:
         """Refuse numbers in another unit, and such as do not say theirs."""
         if name not in self.table:
-            raise ValueError(f'{self.where} has no {name}; convert the numbers, and say {name} = "{expected}"')
+            raise ValueError(
+                f'{self.where} has no {name}; convert the numbers, and say {name} = "{expected}"'
+            )
         if (found := self.table[name]) != expected:
             raise ValueError(
-                f'{self.where} {name} must be "{expected}"; it is {found!r}: convert the numbers, then name the unit'
+                f'{self.where} {name} must be "{expected}"; it is {found!r}: '
+                "convert the numbers, then name the unit"
             )
 
     def numbers(self, name: str, expected: str, holds, channels: int | None = None) -> np.ndarray:
-        """Give a list of numbers; a single one stands for all channels, if their number is given."""
+        """Give a list of numbers; a single one stands for all channels, if their number is
+        given.
+        """
         found = self.entry(name, f"a list of numbers, {expected}")
         if channels is not None and _is_number(found):
             found = [found] * channels
         if not isinstance(found, list) or not found or not all(_is_number(x) for x in found):
-            raise ValueError(f"{self.where} {name} must be a list of numbers, {expected}; it is {found!r}")
+            raise ValueError(
+                f"{self.where} {name} must be a list of numbers, {expected}; it is {found!r}"
+            )
         values = np.asarray(found, np.float64)
         if not np.all(np.isfinite(rounded(values)) & holds(rounded(values))):
             raise ValueError(f"{self.where} {name} must be finite and {expected}; it is {found!r}")
@@ -69,14 +78,18 @@ class Table:
         """Give a list of lists of finite numbers: so many, all equally long."""
         found = self.entry(name, "a list of numbers per Gaussian, one per channel")
         regular = isinstance(found, list) and all(isinstance(row, list) and row for row in found)
-        if not regular or not all(_is_number(x) and np.isfinite(rounded(x)) for row in found for x in row):
+        if not regular or not all(
+            _is_number(x) and np.isfinite(rounded(x)) for row in found for x in row
+        ):
             raise ValueError(
-                f"{self.where} {name} must be a list of finite numbers per Gaussian, one per channel; it is {found!r}"
+                f"{self.where} {name} must be a list of finite numbers per Gaussian, one per "
+                f"channel; it is {found!r}"
             )
         if len(found) != rows or len({len(row) for row in found}) != 1:
             lengths = [len(row) for row in found]
             raise ValueError(
-                f"{self.where} {name} must have {rows} rows, one per variance, of equal length; its rows have {lengths}"
+                f"{self.where} {name} must have {rows} rows, one per variance, of equal length; "
+                f"its rows have {lengths}"
             )
         return np.asarray(found, np.float64)
 
@@ -93,7 +106,9 @@ def _is_number(value: Any) -> bool:
 
 
 def rounded(values: Any) -> np.ndarray:
-    """Give numbers as they are in JAX's default precision: what is too large is infinite there, what is too small is 0."""
+    """Give numbers as they are in JAX's default precision: what is too large is infinite there,
+    what is too small is 0.
+    """
     with np.errstate(over="ignore", under="ignore"):
         return np.asarray(values, np.float64).astype(jnp.result_type(float))
 

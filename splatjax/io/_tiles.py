@@ -13,7 +13,8 @@ _FARTHEST = 2.0  # that coordinates may reach beyond a border, in tiles
 
 
 def tiled(path: Path, piece: Piece, *, upside_down: bool) -> Piece:
-    """Give a piece whose texture repeats and shows the same: it is widened by what lies beyond its borders.
+    """Give a piece whose texture repeats and shows the same: it is widened by what lies beyond its
+    borders.
 
     **Arguments:**
 
@@ -21,7 +22,12 @@ def tiled(path: Path, piece: Piece, *, upside_down: bool) -> Piece:
 
     **Raises:** `ValueError` for coordinates that reach far beyond a texture that ends.
     """
-    if piece.texture is None or piece.uvs is None or piece.wraps == ("wrap", "wrap") or not np.isfinite(piece.uvs).all():
+    if (
+        piece.texture is None
+        or piece.uvs is None
+        or piece.wraps == ("wrap", "wrap")
+        or not np.isfinite(piece.uvs).all()
+    ):
         return piece
     picture, uvs = piece.texture(), piece.uvs.copy()
     if upside_down:
@@ -34,7 +40,11 @@ def tiled(path: Path, piece: Piece, *, upside_down: bool) -> Piece:
 
 
 def _widened(
-    path: Path, picture: Float[np.ndarray, "height width 3"], along: Float[np.ndarray, "faces 3"], axis: int, wrap: Wrap
+    path: Path,
+    picture: Float[np.ndarray, "height width 3"],
+    along: Float[np.ndarray, "faces 3"],
+    axis: int,
+    wrap: Wrap,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Widen a picture along an axis, and give the coordinates that it then has."""
     size = picture.shape[axis]
@@ -47,12 +57,17 @@ def _widened(
     else:
         if beyond > _FARTHEST:
             raise ValueError(
-                f"{path}: has texture coordinates {beyond:.3g} tiles beyond a texture that ends at its border;"
+                f"{path}: has texture coordinates {beyond:.3g} tiles beyond a texture that ends at "
+                "its border;"
                 " bring them to [0, 1]"
             )
         before = after = start = int(np.ceil(beyond * size)) + 1
     pixels = picture.shape[1 - axis] * (size + before + after)
-    check_room(f"{path}: a texture of {pixels} pixels", BYTES_PER_PIXEL * pixels, "bring its coordinates to [0, 1]")
+    check_room(
+        f"{path}: a texture of {pixels} pixels",
+        BYTES_PER_PIXEL * pixels,
+        "bring its coordinates to [0, 1]",
+    )
     widths = [(0, 0)] * 3
     widths[axis] = (before, after)
     return np.pad(picture, widths, mode=wrap), (along * size + start) / (size + before + after)

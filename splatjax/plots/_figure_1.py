@@ -16,7 +16,8 @@ _RADIUS = 0.5  # of the discs that are shown, in roots of the area each stands f
 
 
 def figure_1(subject: Subject, material: Material, *, discs: int = _DISCS) -> Figure:
-    r"""Draw a set of surface splats; the surface they make, with light that leaves where it enters; and with scattering.
+    r"""Draw a set of surface splats; the surface they make, with light that leaves where it enters;
+    and with scattering.
 
     **Arguments:**
 

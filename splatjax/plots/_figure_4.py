@@ -9,14 +9,16 @@ from ._subject import Subject, bright, picture_grid
 
 
 def figure_4(subject: Subject, material: Material) -> Figure:
-    r"""Draw the layers of a picture, the narrowest first: as they are, and as their weights color what they add.
+    r"""Draw the layers of a picture, the narrowest first: as they are, and as their weights color
+    what they add.
 
     **Arguments:**
 
     - `subject`: the body.
     - `material`: of as many layers as it has Gaussians.
 
-    **Returns:** a matplotlib `Figure`; the lower pictures add up to the diffuse part of the frame, at one exposure.
+    **Returns:** a matplotlib `Figure`; the lower pictures add up to the diffuse part of the frame,
+    at one exposure.
 
     **Source:** Kim et al. 2010, Figure 4.
     """
@@ -30,5 +32,9 @@ def figure_4(subject: Subject, material: Material) -> Figure:
         f"{width:.2g} mm" + (" (the surface's light)" if gone else "")
         for width, gone in zip(np.sqrt(variances[order]), handed_over, strict=True)
     ]
-    added = [color * weight[None, None] * layer for weight, layer in zip(weights, layers, strict=True)]
-    return picture_grid([[gray * layer for layer in layers], added], titles, ["layer", "what it adds"], inches=2.3)
+    added = [
+        color * weight[None, None] * layer for weight, layer in zip(weights, layers, strict=True)
+    ]
+    return picture_grid(
+        [[gray * layer for layer in layers], added], titles, ["layer", "what it adds"], inches=2.3
+    )

@@ -3,7 +3,13 @@
 import numpy as np
 from matplotlib.figure import Figure
 
-from splatjax.rivals import deferred_splatting, elliptical_points, ewa_splatting, normal_slopes, phong_splatting
+from splatjax.rivals import (
+    deferred_splatting,
+    elliptical_points,
+    ewa_splatting,
+    normal_slopes,
+    phong_splatting,
+)
 from splatjax.scene import Material
 
 from ._subject import Subject, bright, picture_grid
@@ -12,10 +18,17 @@ _ZOOM = 5.0
 _PLACE = 0.48, 0.34  # of the outline: beside the nose
 
 
-def figure_7(subject: Subject, material: Material, *, zoom: float = _ZOOM, place: tuple[float, float] = _PLACE) -> Figure:
+def figure_7(
+    subject: Subject,
+    material: Material,
+    *,
+    zoom: float = _ZOOM,
+    place: tuple[float, float] = _PLACE,
+) -> Figure:
     r"""Draw a body by each point-based method, all under one light; below, a close-up of each.
 
-    From left to right light appears smoother: elliptical points are flat, splats that are blended are smooth, scattering is soft.
+    From left to right light appears smoother: elliptical points are flat, splats that are blended
+    are smooth, scattering is soft.
 
     **Arguments:**
 
@@ -38,5 +51,7 @@ def figure_7(subject: Subject, material: Material, *, zoom: float = _ZOOM, place
     }
     frames = [subject.drawn(*each, near) for each in columns.values()]
     factor = bright([np.asarray(whole.beauty) for whole, _ in frames])
-    rows = [[factor * np.asarray(frame.beauty) for frame in line] for line in zip(*frames, strict=True)]
+    rows = [
+        [factor * np.asarray(frame.beauty) for frame in line] for line in zip(*frames, strict=True)
+    ]
     return picture_grid(rows, list(columns), inches=2.8)

@@ -15,8 +15,11 @@ _GAIN = 8.0
 _FINER = 2  # samples of triangles along an edge of a pixel
 
 
-def figure_8(subject: Subject, mesh: TexturedMesh, material: Material, *, gain: float = _GAIN) -> Figure:
-    r"""Draw a body half as triangles with texture-space diffusion and half as splats; beside it the difference of the wholes.
+def figure_8(
+    subject: Subject, mesh: TexturedMesh, material: Material, *, gain: float = _GAIN
+) -> Figure:
+    r"""Draw a body half as triangles with texture-space diffusion and half as splats; beside it the
+    difference of the wholes.
 
     One should not see the line between the halves.
 
@@ -27,15 +30,20 @@ def figure_8(subject: Subject, mesh: TexturedMesh, material: Material, *, gain: 
     - `material`: with its scattering.
     - `gain`: by how much differences are enlarged.
 
-    **Returns:** a matplotlib `Figure`. The difference, splats less triangles, lies around middle gray.
+    **Returns:** a matplotlib `Figure`. The difference, splats less triangles, lies around middle
+    gray.
 
-    **Raises:** `ValueError` for a mesh and a subject of which one has a map of albedo and the other none.
+    **Raises:** `ValueError` for a mesh and a subject of which one has a map of albedo and the other
+    none.
 
     **Source:** Kim et al. 2010, Figure 8.
     """
     if (mesh.albedo is None) != (subject.splats.albedo is None):
         has, lacks = ("splats", "mesh") if mesh.albedo is None else ("mesh", "splats")
-        raise ValueError(f"the {has} have a map of albedo, and the {lacks} none: make the splats from the mesh and its maps")
+        raise ValueError(
+            f"the {has} have a map of albedo, and the {lacks} none: make the splats from the mesh "
+            "and its maps"
+        )
     scene, camera = subject.scene(material), subject.camera
     fine = render_texture_space(mesh, scene.lights, scene.material, _finer(camera)).frame.beauty
     triangles = fine.reshape(camera.height, _FINER, camera.width, _FINER, -1).mean(axis=(1, 3))

@@ -8,9 +8,11 @@ from splatjax.io import linear_to_srgb
 
 
 def plot_recovery(recovery: Recovery, *, title: str | None = None) -> Figure:
-    r"""Draw for each picture what was observed, the recovered material in its place, and the difference.
+    r"""Draw for each picture what was observed, the recovered material in its place, and the
+    difference.
 
-    Pixels that do not count are gray. The difference is the mean of the channels, over the picture's root mean square.
+    Pixels that do not count are gray. The difference is the mean of the channels, over the
+    picture's root mean square.
 
     **Arguments:**
 
@@ -22,10 +24,14 @@ def plot_recovery(recovery: Recovery, *, title: str | None = None) -> Figure:
     rows = len(recovery.pictures)
     figure = Figure(figsize=(9.5, 3.1 * rows), layout="constrained")
     axes = figure.subplots(rows, 3, squeeze=False)
-    for number, (line, made, left) in enumerate(zip(axes, recovery.pictures, recovery.residuals, strict=True), 1):
+    for number, (line, made, left) in enumerate(
+        zip(axes, recovery.pictures, recovery.residuals, strict=True), 1
+    ):
         seen = made - left
         bright = float(np.nanquantile(seen, 0.99)) or 1.0
-        for ax, picture, name in zip(line, (seen, made), (f"picture {number}", "recovered"), strict=False):
+        for ax, picture, name in zip(
+            line, (seen, made), (f"picture {number}", "recovered"), strict=False
+        ):
             ax.imshow(_shown(picture, bright))
             ax.set_title(name)
         share = 100 * np.mean(left, axis=-1) / np.sqrt(np.nanmean(seen**2))

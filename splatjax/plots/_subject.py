@@ -23,7 +23,9 @@ class Subject:
 
     def scene(self, material: Material) -> Scene:
         """Give the scene; where the splats carry albedo, that alone gives the color."""
-        return Scene(self.splats, self.lights, material if self.splats.albedo is None else material.white())
+        return Scene(
+            self.splats, self.lights, material if self.splats.albedo is None else material.white()
+        )
 
     def scaled(self, factor: float) -> "Subject":
         """Give the same body, larger or smaller, before the same camera and lights at infinity."""
@@ -34,7 +36,9 @@ class Subject:
         """Give the same body without its map: a material then shows in its own color."""
         return replace(self, splats=replace(self.splats, albedo=None))
 
-    def drawn(self, material: Material, settings: RenderSettings | None = None, *more: Camera) -> list[Frame]:
+    def drawn(
+        self, material: Material, settings: RenderSettings | None = None, *more: Camera
+    ) -> list[Frame]:
         """Render before the camera, and before others of the same size; all with one plan.
 
         **Raises:** `ValueError` as `splatjax.render`.
@@ -45,7 +49,9 @@ class Subject:
         return [jax.block_until_ready(render(scene, camera, settings, found)) for camera in cameras]
 
     def close_up(self, row: float, column: float, zoom: float) -> Camera:
-        """Give a camera at the same place that looks at what lies at a part of the height and width of the body's outline."""
+        """Give a camera at the same place that looks at what lies at a part of the height and width
+        of the body's outline.
+        """
         view, splats = PerspectiveView.of(self.camera), self.splats
         x, y, depth = (np.asarray(each) for each in view.project(splats.centers.T))
         middle = x.min() + column * np.ptp(x), y.min() + row * np.ptp(y)
@@ -58,7 +64,12 @@ class Subject:
 
 
 def picture_grid(
-    rows: list[list[np.ndarray]], titles: list[str], names: list[str] | None = None, *, inches: float = 2.6, below: float = 0.0
+    rows: list[list[np.ndarray]],
+    titles: list[str],
+    names: list[str] | None = None,
+    *,
+    inches: float = 2.6,
+    below: float = 0.0,
 ) -> Figure:
     r"""Lay out pictures of linear light, premultiplied, over black.
 
@@ -71,10 +82,22 @@ def picture_grid(
     - `below`: inches of room that is left below, for what else the figure shows.
     """
     height, width = rows[0][0].shape[:2]
-    figure = Figure(figsize=(inches * width / height * len(titles) + 0.3, inches * len(rows) + 0.35 + below), dpi=150)
+    figure = Figure(
+        figsize=(inches * width / height * len(titles) + 0.3, inches * len(rows) + 0.35 + below),
+        dpi=150,
+    )
     top, bottom = 1 - 0.3 / figure.get_figheight(), (0.05 + below) / figure.get_figheight()
     left = 0.28 / figure.get_figwidth() if names else 0.01
-    grid = figure.add_gridspec(len(rows), len(titles), left=left, right=0.995, top=top, bottom=bottom, wspace=0.02, hspace=0.02)
+    grid = figure.add_gridspec(
+        len(rows),
+        len(titles),
+        left=left,
+        right=0.995,
+        top=top,
+        bottom=bottom,
+        wspace=0.02,
+        hspace=0.02,
+    )
     for i, line in enumerate(rows):
         for j, picture in enumerate(line):
             axes = figure.add_subplot(grid[i, j])
@@ -90,6 +113,8 @@ def picture_grid(
 
 
 def bright(pictures: list[np.ndarray], share: float = 0.995) -> float:
-    """Give the factor that brings the brightest pixels of some pictures, but for a share of them, just to white."""
+    """Give the factor that brings the brightest pixels of some pictures, but for a share of them,
+    just to white.
+    """
     values = np.concatenate([np.max(np.asarray(each), axis=-1).ravel() for each in pictures])
     return float(0.95 / np.quantile(values[values > 0], share))

@@ -25,10 +25,16 @@ def check_channels(scene: Scene) -> None:
     if scene.splats.albedo is not None:
         found["splats.albedo"] = scene.splats.albedo.shape[1]
     if scene.material.single_scattering is not None:
-        found["material.single_scattering.medium"] = scene.material.single_scattering.medium.sigma_a.shape[0]
+        found["material.single_scattering.medium"] = (
+            scene.material.single_scattering.medium.sigma_a.shape[0]
+        )
     point = jax.ShapeDtypeStruct((1, 3), scene.splats.centers.dtype)
     for i, light in enumerate(scene.lights):
-        found[f"lights[{i}]"] = eqx.filter_eval_shape(lambda light, x: light.incidence(x)[1], light, point).shape[1]
+        found[f"lights[{i}]"] = eqx.filter_eval_shape(
+            lambda light, x: light.incidence(x)[1], light, point
+        ).shape[1]
     for name, count in found.items():
         if count != channels:
-            raise ValueError(f"{name} has {count} channels, material.gaussians.weights has {channels}: {SAME}")
+            raise ValueError(
+                f"{name} has {count} channels, material.gaussians.weights has {channels}: {SAME}"
+            )

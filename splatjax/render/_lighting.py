@@ -1,4 +1,6 @@
-"""Where the light that enters the surface is found: at the splats, or at what the pixels see of them."""
+"""Where the light that enters the surface is found: at the splats, or at what the pixels see of
+them.
+"""
 
 import abc
 
@@ -47,29 +49,43 @@ def entering_light(
 
     def entering(cosine):
         share = 1 - _shading.directional_albedo(cosine, f0, specular, roughness)
-        return share[None] if material.single_scattering is None else share[None] * material.left_to_diffuse(cosine).T
+        return (
+            share[None]
+            if material.single_scattering is None
+            else share[None] * material.left_to_diffuse(cosine).T
+        )
 
     channels = material.gaussians.weights.shape[1]
-    irradiance = _diffusion.entering_irradiance(points, normals, light.groups, light.shares, entering, channels)
-    return EnteringLight(irradiance, irradiance if albedo is None else irradiance * _shading.albedo_root(albedo).T)
+    irradiance = _diffusion.entering_irradiance(
+        points, normals, light.groups, light.shares, entering, channels
+    )
+    return EnteringLight(
+        irradiance, irradiance if albedo is None else irradiance * _shading.albedo_root(albedo).T
+    )
 
 
 def let_light_in(scene: Scene, light: LightOnSplats) -> EnteringLight:
     """The irradiance that enters at every splat."""
     splats = scene.splats
     specular, roughness = surface_parameters(scene)
-    return entering_light(scene.material, light, splats.centers, splats.normals, splats.albedo, specular, roughness)
+    return entering_light(
+        scene.material, light, splats.centers, splats.normals, splats.albedo, specular, roughness
+    )
 
 
 def surface_parameters(scene: Scene):
     """The material's specular strength and roughness, times the splats' own."""
     splats, material = scene.splats, scene.material
     specular = material.specular if splats.specular is None else material.specular * splats.specular
-    roughness = material.roughness if splats.roughness is None else material.roughness * splats.roughness
+    roughness = (
+        material.roughness if splats.roughness is None else material.roughness * splats.roughness
+    )
     return specular, roughness
 
 
-def surface_attributes(scene: Scene, light: LightOnSplats, entering: EnteringLight) -> dict[str, Float[Array, "_rows splats"]]:
+def surface_attributes(
+    scene: Scene, light: LightOnSplats, entering: EnteringLight
+) -> dict[str, Float[Array, "_rows splats"]]:
     """What passes 2 and 3 blend for the passes that follow, by name."""
     splats = scene.splats
     specular, roughness = surface_parameters(scene)
@@ -87,9 +103,13 @@ def surface_attributes(scene: Scene, light: LightOnSplats, entering: EnteringLig
 
 
 class AbstractLighting(eqx.Module):
-    """What splats carry into the picture, and what pixels make of it before light spreads and is shaded."""
+    """What splats carry into the picture, and what pixels make of it before light spreads and is
+    shaded.
+    """
 
-    def attributes(self, scene: Scene, light: LightOnSplats, entering: EnteringLight) -> dict[str, Float[Array, "_rows splats"]]:
+    def attributes(
+        self, scene: Scene, light: LightOnSplats, entering: EnteringLight
+    ) -> dict[str, Float[Array, "_rows splats"]]:
         """Give what passes 2 and 3 blend, by name: `surface_attributes`, or more."""
         return surface_attributes(scene, light, entering)
 
@@ -101,14 +121,17 @@ class AbstractLighting(eqx.Module):
         points: Float[Array, "tiles 3 pixels"],
         named: dict[str, Float[Array, "tiles _rows pixels"]],
     ) -> dict[str, Float[Array, "tiles _rows pixels"]]:
-        """Give what passes 4 and 5 read, from what was blended at the points (mm) that the pixels see.
+        """Give what passes 4 and 5 read, from what was blended at the points (mm) that the pixels
+        see.
 
         They read the names of `surface_attributes`; normals need not be unit.
         """
 
 
 class LightAtSplats(AbstractLighting):
-    """The irradiance of the splats, blended like all they carry: what spreads below a pixel is what enters the splats there."""
+    """The irradiance of the splats, blended like all they carry: what spreads below a pixel is what
+    enters the splats there.
+    """
 
     def at_pixels(self, scene, groups, points, named):
         return named

@@ -20,7 +20,9 @@ from ._records import Plan, shadow_views
 from ._settings import RenderSettings
 
 BoundsOf: TypeAlias = Callable[[Splats], _splatting.Bounds]
-"""Gives the sphere around all splats of some: `Bounds.of` of those that are all, `bounds_over` of a device's."""
+"""Gives the sphere around all splats of some: `Bounds.of` of those that are all, `bounds_over` of a
+device's.
+"""
 
 
 def bounds_over(devices: Devices) -> BoundsOf:
@@ -28,15 +30,23 @@ def bounds_over(devices: Devices) -> BoundsOf:
     return partial(_splatting.bounds_over, devices=devices)
 
 
-def cast_shadows(scene: Scene, settings: RenderSettings, plan: Plan, bounds_of: BoundsOf = _splatting.Bounds.of) -> LightOnSplats:
+def cast_shadows(
+    scene: Scene, settings: RenderSettings, plan: Plan, bounds_of: BoundsOf = _splatting.Bounds.of
+) -> LightOnSplats:
     """Pass 1."""
     groups = stack_lights(scene.lights)
     shares, needs = _lit_shares(scene.splats, groups, settings, plan, bounds_of(scene.splats))
-    return LightOnSplats(groups, shares, jnp.max(jnp.stack(needs)) if needs else jnp.zeros((), scene.splats.centers.dtype))
+    return LightOnSplats(
+        groups,
+        shares,
+        jnp.max(jnp.stack(needs)) if needs else jnp.zeros((), scene.splats.centers.dtype),
+    )
 
 
 class SeenSurfaces(eqx.Module):
-    """Passes 2 and 3: the surface in front and the one that shows behind its silhouettes, in the tiles of an atlas."""
+    """Passes 2 and 3: the surface in front and the one that shows behind its silhouettes, in the
+    tiles of an atlas.
+    """
 
     atlas: _splatting.Atlas
     points: Float[Array, "tiles 3 pixels"]
@@ -62,33 +72,59 @@ class SeenSurfaces(eqx.Module):
         """Give what pass 4 asks of them, of the light of that name."""
         named = self.named
         albedo = named.get("albedo", jnp.ones_like(named[source]))
-        return _diffusion.SeenSurface(self.points, self.covered, named[source], named["area"][:, 0], albedo)
+        return _diffusion.SeenSurface(
+            self.points, self.covered, named[source], named["area"][:, 0], albedo
+        )
 
     @property
     def coverage(self) -> Float[Array, "height width"]:
         """Of both surfaces together."""
         return self.atlas.picture(self.share[..., None])[..., 0]
 
-    def picture(self, values: Float[Array, "tiles *rows pixels channels"]) -> Float[Array, "*rows height width channels"]:
+    def picture(
+        self, values: Float[Array, "tiles *rows pixels channels"]
+    ) -> Float[Array, "*rows height width channels"]:
         """Lay the front over what shows behind it, premultiplied by coverage."""
-        share = self.share.reshape(self.share.shape[0], *(1,) * (values.ndim - 3), self.share.shape[1], 1)
+        share = self.share.reshape(
+            self.share.shape[0], *(1,) * (values.ndim - 3), self.share.shape[1], 1
+        )
         return self.atlas.picture(share * values)
 
 
 def see_surfaces(
-    splats: Splats, attributes: dict[str, Array], view: _splatting.AbstractView, settings: RenderSettings, plan: Plan
+    splats: Splats,
+    attributes: dict[str, Array],
+    view: _splatting.AbstractView,
+    settings: RenderSettings,
+    plan: Plan,
 ) -> SeenSurfaces:
     """Passes 2 and 3."""
-    summed = plan.rasterizer.summed(splats, jnp.concatenate(list(attributes.values())), view, settings.splatting)
-    return surfaces_of(summed, {name: rows.shape[0] for name, rows in attributes.items()}, view, settings, plan.tiles)
+    summed = plan.rasterizer.summed(
+        splats, jnp.concatenate(list(attributes.values())), view, settings.splatting
+    )
+    return surfaces_of(
+        summed,
+        {name: rows.shape[0] for name, rows in attributes.items()},
+        view,
+        settings,
+        plan.tiles,
+    )
 
 
 def surfaces_of(
-    summed: _splatting.SummedFragments, sizes: dict[str, int], view: _splatting.AbstractView, settings: RenderSettings, tiles: int
+    summed: _splatting.SummedFragments,
+    sizes: dict[str, int],
+    view: _splatting.AbstractView,
+    settings: RenderSettings,
+    tiles: int,
 ) -> SeenSurfaces:
-    """Blend what is summed of the attributes, so many rows of each, and put it into so many tiles."""
+    """Blend what is summed of the attributes, so many rows of each, and put it into so many
+    tiles.
+    """
     atlas = _splatting.Atlas.of(_splatting.farthest_depths(summed, view), view, tiles)
-    surface = _splatting.Surface.of(atlas.pack(summed.front, summed.behind), view, settings.splatting)
+    surface = _splatting.Surface.of(
+        atlas.pack(summed.front, summed.behind), view, settings.splatting
+    )
     covered = stop_gradient(surface.weight_sum) > 0
     depth = jnp.where(covered, surface.depth, 1.0)
     return SeenSurfaces(
@@ -108,11 +144,17 @@ def sources_of(splats: Splats, irradiance: Float[Array, "channels splats"]) -> _
 
 
 def spread_light(
-    scene: Scene, source: Float[Array, "channels splats"], seen: SeenSurfaces, settings: RenderSettings, plan: Plan
+    scene: Scene,
+    source: Float[Array, "channels splats"],
+    seen: SeenSurfaces,
+    settings: RenderSettings,
+    plan: Plan,
 ) -> tuple[_diffusion.DiffusionLayers, Float[Array, ""]]:
     """Pass 4: also what room was needed over what there is."""
     rest = plan.interval, seen.atlas, plan.diffuser, settings.diffusion.normalization
-    return _diffusion.diffusion_layers(sources_of(scene.splats, source), scene.material, seen.receivers(), *rest)
+    return _diffusion.diffusion_layers(
+        sources_of(scene.splats, source), scene.material, seen.receivers(), *rest
+    )
 
 
 class ShadedSurface(eqx.Module):
@@ -145,10 +187,20 @@ def shade(
     def shaded(points, depth, covered, named, layers):
         return _shade(scene, view, groups, points, depth, covered, named, layers)
 
-    return in_parts(shaded, seen.points, seen.depth, seen.covered, seen.named, layers.layers, at_once=_splatting.TILES_AT_ONCE)
+    return in_parts(
+        shaded,
+        seen.points,
+        seen.depth,
+        seen.covered,
+        seen.named,
+        layers.layers,
+        at_once=_splatting.TILES_AT_ONCE,
+    )
 
 
-def _shade(scene: Scene, view, groups: list[StackedLights], position, depth, covered, named, layers) -> ShadedSurface:
+def _shade(
+    scene: Scene, view, groups: list[StackedLights], position, depth, covered, named, layers
+) -> ShadedSurface:
     splats, material = scene.splats, scene.material
     f0 = _shading.fresnel_f0(material.eta)
     dtype, shape, channels = depth.dtype, depth.shape, layers.shape[2]
@@ -160,7 +212,10 @@ def _shade(scene: Scene, view, groups: list[StackedLights], position, depth, cov
         outgoing=outgoing.transpose(0, 2, 1),
         specular=material.specular if splats.specular is None else named["specular"][:, 0],
         roughness=material.roughness if splats.roughness is None else named["roughness"][:, 0],
-        lit=[shares.transpose(1, 0, 2) if (shares := named.get(f"lit {i}")) is not None else None for i in range(len(groups))],
+        lit=[
+            shares.transpose(1, 0, 2) if (shares := named.get(f"lit {i}")) is not None else None
+            for i in range(len(groups))
+        ],
     )
     specular = _shading.reflected_radiance(points, groups, f0, channels)
     albedo = jnp.ones((*shape, channels), dtype)
@@ -179,7 +234,11 @@ def _shade(scene: Scene, view, groups: list[StackedLights], position, depth, cov
         position=jnp.where(covered[..., None], points.positions, 0.0),
         normal=points.normals,
         albedo=albedo,
-        shadow=jnp.where(covered[:, None], _shadows_in_order(points.lit, groups, shape, dtype).transpose(1, 0, 2), 1.0),
+        shadow=jnp.where(
+            covered[:, None],
+            _shadows_in_order(points.lit, groups, shape, dtype).transpose(1, 0, 2),
+            1.0,
+        ),
         irradiance=named.get("irradiance", named["source"]).transpose(0, 2, 1),
         post=post,
         layers=layers,
@@ -196,7 +255,9 @@ def five_passes(
     plan: Plan,
     bounds_of: BoundsOf = _splatting.Bounds.of,
 ) -> tuple[ShadedSurface, SeenSurfaces, Float[Array, "tiles gaussians pixels"], Float[Array, ""]]:
-    """Give what is shaded and seen, how much of each layer is diffused, and what room was needed over what there is."""
+    """Give what is shaded and seen, how much of each layer is diffused, and what room was needed
+    over what there is.
+    """
     view = _splatting.PerspectiveView.of(camera)
     light = cast_shadows(scene, settings, plan, bounds_of)
     entering = let_light_in(scene, light)
@@ -221,7 +282,9 @@ def compose(
     diffuse, specular = seen.picture(shaded.diffuse), seen.picture(shaded.specular)
     single = None if shaded.single_scattering is None else seen.picture(shaded.single_scattering)
     drawn = ((seen.share > 0) & seen.atlas.in_front[:, None]).astype(shaded.depth.dtype)
-    handed_over = jnp.sum((1 - resolved) * drawn[:, None], axis=(0, 2)) / jnp.maximum(jnp.sum(drawn), 1)
+    handed_over = jnp.sum((1 - resolved) * drawn[:, None], axis=(0, 2)) / jnp.maximum(
+        jnp.sum(drawn), 1
+    )
     return Frame(
         beauty=diffuse + specular if single is None else diffuse + single + specular,
         coverage=seen.coverage,
@@ -241,8 +304,16 @@ def compose(
     )
 
 
-def _lit_shares(splats: Splats, groups: list[StackedLights], settings: RenderSettings, plan: Plan, bounds: _splatting.Bounds):
-    """Pass 1 for every group of lights: per group the share of each light that reaches each splat, or None."""
+def _lit_shares(
+    splats: Splats,
+    groups: list[StackedLights],
+    settings: RenderSettings,
+    plan: Plan,
+    bounds: _splatting.Bounds,
+):
+    """Pass 1 for every group of lights: per group the share of each light that reaches each splat,
+    or None.
+    """
     lit, needs = [], []
     for group, shadow in zip(groups, plan.shadows, strict=True):
         if shadow is None:
@@ -253,14 +324,18 @@ def _lit_shares(splats: Splats, groups: list[StackedLights], settings: RenderSet
             views = shadow_views(light, bounds, settings, shadow.cube)
 
             def one_view(view):
-                surfaces = _splatting.light_surfaces(splats, view, settings.splatting, shadow.rasterizer)
+                surfaces = _splatting.light_surfaces(
+                    splats, view, settings.splatting, shadow.rasterizer
+                )
                 shares = _splatting.lit_share(splats, view, surfaces, settings.shadows)
                 if shadow.cube:
                     shares = shares * _splatting.in_cube_face(view, splats.centers.T)
                 return shares, surfaces.needed
 
             shares, needed = jax.lax.map(one_view, _splatting.stack_views(views))
-            return jnp.sum(shares, axis=0), jnp.maximum(jnp.max(needed), shadow.closeness(light, bounds))
+            return jnp.sum(shares, axis=0), jnp.maximum(
+                jnp.max(needed), shadow.closeness(light, bounds)
+            )
 
         shares, needed = jax.lax.map(share, group.lights)
         lit.append(shares)
@@ -272,7 +347,9 @@ def _by_name(sizes: dict[str, int], packed: Float[Array, "tiles rows pixels"]) -
     return dict(zip(sizes, jax.lax.split(packed, list(sizes.values()), axis=1), strict=True))
 
 
-def _shadows_in_order(lit, groups: list[StackedLights], shape, dtype) -> Float[Array, "lights tiles pixels"]:
+def _shadows_in_order(
+    lit, groups: list[StackedLights], shape, dtype
+) -> Float[Array, "lights tiles pixels"]:
     """Per light, in the scene's order; 1 where a light casts none."""
     planes = [jnp.ones(shape, dtype)] * sum(len(group.places) for group in groups)
     for group, shares in zip(groups, lit, strict=True):

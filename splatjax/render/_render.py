@@ -12,7 +12,15 @@ from splatjax.scene import Camera, Frame, Scene
 
 from ._inputs import SAME, check_channels, in_one_dtype
 from ._lighting import EnteringLight, let_light_in
-from ._passes import SeenSurfaces, bounds_over, cast_shadows, compose, five_passes, see_surfaces, spread_light
+from ._passes import (
+    SeenSurfaces,
+    bounds_over,
+    cast_shadows,
+    compose,
+    five_passes,
+    see_surfaces,
+    spread_light,
+)
 from ._plan import check_count, plan_unless_traced
 from ._records import Plan
 from ._settings import RenderSettings
@@ -26,7 +34,8 @@ def render(
     plan: Plan | None = None,
     mesh: Mesh | None = None,
 ) -> Frame:
-    r"""Render a picture with all its layers: shadow maps, visibility, attributes, diffusion, shading.
+    r"""Render a picture with all its layers: shadow maps, visibility, attributes, diffusion,
+    shading.
 
     **Arguments:**
 
@@ -34,13 +43,14 @@ def render(
     - `camera`: Differentiable.
     - `settings`: how each pass works.
     - `plan`: from `splatjax.plan`; needed under `jit`, `grad` and `vmap`, made here otherwise.
-    - `mesh`: devices over which the splats are cut, whatever its axes: each holds a share, and their gradients (docs/devices.md).
-      It is the plan's where that is given.
+    - `mesh`: devices over which the splats are cut, whatever its axes: each holds a share, and
+      their gradients (docs/devices.md). It is the plan's where that is given.
 
-    **Returns:** a `Frame` in the dtype of `splats.centers`; the same on every device, and to rounding whatever the mesh.
+    **Returns:** a `Frame` in the dtype of `splats.centers`; the same on every device, and to
+    rounding whatever the mesh.
 
-    **Raises:** `ValueError` when a plan is needed and not given, or is for another mesh or another number of splats, or when the
-    scene's channels disagree.
+    **Raises:** `ValueError` when a plan is needed and not given, or is for another mesh or another
+    number of splats, or when the scene's channels disagree.
     """
     settings = RenderSettings() if settings is None else settings
     check_channels(scene)
@@ -56,14 +66,24 @@ def _render(scene: Scene, camera: Camera, settings: RenderSettings, plan: Plan) 
         return compose(shaded, seen, resolved, scene.material.gaussians.weights, needed)
 
     def share(devices: Devices, scene: Scene, plan: Plan, camera: Camera) -> Frame:
-        shaded, seen, resolved, needed = five_passes(scene, camera, settings, plan, bounds_over(devices))
+        shaded, seen, resolved, needed = five_passes(
+            scene, camera, settings, plan, bounds_over(devices)
+        )
         shaded, resolved = devices.everything((shaded, resolved))
-        return compose(shaded, of_all(seen, devices), resolved, scene.material.gaussians.weights, devices.largest(needed))
+        return compose(
+            shaded,
+            of_all(seen, devices),
+            resolved,
+            scene.material.gaussians.weights,
+            devices.largest(needed),
+        )
 
     return over(plan.mesh, share, scene, plan, camera)
 
 
-def light_on_splats(scene: Scene, plan: Plan, settings: RenderSettings | None = None) -> EnteringLight:
+def light_on_splats(
+    scene: Scene, plan: Plan, settings: RenderSettings | None = None
+) -> EnteringLight:
     r"""Give the light that enters at every splat: pass 1, and the irradiance.
 
     **Arguments:**
@@ -74,7 +94,8 @@ def light_on_splats(scene: Scene, plan: Plan, settings: RenderSettings | None = 
 
     **Returns:** the irradiance, and what of it spreads: `source.T` is what `diffuse` asks for.
 
-    **Raises:** `ValueError` when the channels disagree, or the plan is for another number of splats.
+    **Raises:** `ValueError` when the channels disagree, or the plan is for another number of
+    splats.
     """
     check_channels(scene)
     check_count(plan, scene)
@@ -90,7 +111,10 @@ def _light_on_splats(scene: Scene, plan: Plan, settings: RenderSettings) -> Ente
     def share(devices: Devices, scene: Scene, plan: Plan) -> EnteringLight:
         return let_light_in(scene, cast_shadows(scene, settings, plan, bounds_over(devices)))
 
-    found, count = over(plan.mesh, share, scene, plan, found=PartitionSpec(None, Devices.of(plan.mesh).axes)), scene.splats.count
+    found, count = (
+        over(plan.mesh, share, scene, plan, found=PartitionSpec(None, Devices.of(plan.mesh).axes)),
+        scene.splats.count,
+    )
     if found.source.shape[1] == count:
         return found
     whole = laid_out(plan.mesh, found, jax.tree.map(lambda _: PartitionSpec(), found))
@@ -104,14 +128,18 @@ def diffuse(
     settings: RenderSettings | None = None,
     plan: Plan | None = None,
 ) -> Float[Array, "gaussians height width channels"]:
-    r"""Diffuse any irradiance of the splats below the surface: pass 4 alone, the plain layers `L_k` (section 4.2).
+    r"""Diffuse any irradiance of the splats below the surface: pass 4 alone, the plain layers `L_k`
+    (section 4.2).
 
-    **Arguments:** as for `render`; of the scene only the splats' geometry and albedo and the material's Gaussians matter.
+    **Arguments:** as for `render`; of the scene only the splats' geometry and albedo and the
+    material's Gaussians matter.
 
-    - `irradiance`: that enters at each splat, in the channels of the material's weights. Differentiable.
+    - `irradiance`: that enters at each splat, in the channels of the material's weights.
+      Differentiable.
 
-    **Returns:** one layer per Gaussian on the front surface, 0 where there is none; NaN where the plan does not suffice.
-    Weighted by `material.gaussians.weights` and summed they are the radiant exitance.
+    **Returns:** one layer per Gaussian on the front surface, 0 where there is none; NaN where the
+    plan does not suffice. Weighted by `material.gaussians.weights` and summed they are the radiant
+    exitance.
 
     **Raises:** `ValueError` when a plan is needed and not given, or when the channels disagree.
     """
@@ -119,7 +147,10 @@ def diffuse(
     check_channels(scene)
     channels = scene.material.gaussians.weights.shape[1]
     if irradiance.shape[1] != channels:
-        raise ValueError(f"irradiance has {irradiance.shape[1]} channels, material.gaussians.weights has {channels}: {SAME}")
+        raise ValueError(
+            f"irradiance has {irradiance.shape[1]} channels, material.gaussians.weights has "
+            f"{channels}: {SAME}"
+        )
     plan = plan_unless_traced(scene, camera, settings, plan)
     return _diffuse(scene, irradiance, camera, settings, plan)
 
@@ -133,12 +164,20 @@ def _diffuse(scene: Scene, irradiance, camera: Camera, settings: RenderSettings,
 
     def share(devices: Devices, scene: Scene, plan: Plan, camera: Camera, irradiance):
         layers, seen, needed = _layers(settings, scene, plan, camera, irradiance)
-        return _front_picture(devices.everything(layers), of_all(seen, devices), devices.largest(needed))
+        return _front_picture(
+            devices.everything(layers), of_all(seen, devices), devices.largest(needed)
+        )
 
     return over(plan.mesh, share, scene, plan, camera, rows=(irradiance,))
 
 
-def _layers(settings: RenderSettings, scene: Scene, plan: Plan, camera: Camera, irradiance: Float[Array, "splats channels"]):
+def _layers(
+    settings: RenderSettings,
+    scene: Scene,
+    plan: Plan,
+    camera: Camera,
+    irradiance: Float[Array, "splats channels"],
+):
     """Give the plain layers in tiles, what is seen, and what room was needed over what there is."""
     splats, view = scene.splats, _splatting.PerspectiveView.of(camera)
     attributes = {"area": splats.areas[None], "source": irradiance.T}
@@ -150,6 +189,8 @@ def _layers(settings: RenderSettings, scene: Scene, plan: Plan, camera: Camera, 
 
 
 def _front_picture(
-    layers: Float[Array, "tiles gaussians channels pixels"], seen: SeenSurfaces, needed: Float[Array, ""]
+    layers: Float[Array, "tiles gaussians channels pixels"],
+    seen: SeenSurfaces,
+    needed: Float[Array, ""],
 ) -> Float[Array, "gaussians height width channels"]:
     return seen.poisoned_unless(needed <= 1).atlas.front_picture(layers.transpose(0, 1, 3, 2))

@@ -17,7 +17,8 @@ class RenderSettings(eqx.Module):
     - `diffusion`: pass 4: normalization, and which layers are too narrow for the splats.
     - `rasterizer`: `TileRasterizer()`, or `DenseRasterizer()`, the plain reference.
     - `diffuser`: `ClusterDiffuser()`, or `DenseDiffuser()`, the plain reference.
-    - `lighting`: what splats carry into the picture: `LightAtSplats()` has the irradiance in them; `splatjax.rivals` has others.
+    - `lighting`: what splats carry into the picture: `LightAtSplats()` has the irradiance in them;
+      `splatjax.rivals` has others.
     """
 
     splatting: _splatting.SplattingSettings = _splatting.SplattingSettings()

@@ -23,9 +23,13 @@ def on_one_device(tree: Whole) -> Whole:
     """Gather what may lie on several devices, and on those of several processes, for planning."""
 
     def gathered(leaf):
-        if not isinstance(leaf, jax.Array) or isinstance(leaf.sharding, jax.sharding.SingleDeviceSharding):
+        if not isinstance(leaf, jax.Array) or isinstance(
+            leaf.sharding, jax.sharding.SingleDeviceSharding
+        ):
             return leaf
-        return jnp.asarray(np.asarray(leaf) if leaf.is_fully_addressable else process_allgather(leaf, tiled=True))
+        return jnp.asarray(
+            np.asarray(leaf) if leaf.is_fully_addressable else process_allgather(leaf, tiled=True)
+        )
 
     return jax.tree.map(gathered, tree)
 
@@ -42,8 +46,14 @@ def filled_up_to(splats: Splats, count: int) -> Splats:
         return splats
     if splats.count == 0:
         return jax.tree.map(lambda leaf: jnp.zeros((lacking, *leaf.shape[1:]), leaf.dtype), splats)
-    last = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf[-1:], (lacking, *leaf.shape[1:])), splats)
-    last = Splats(last.centers, *(jnp.zeros_like(each) for each in (last.normals, last.radii, last.areas)), *_carried(last))
+    last = jax.tree.map(
+        lambda leaf: jnp.broadcast_to(leaf[-1:], (lacking, *leaf.shape[1:])), splats
+    )
+    last = Splats(
+        last.centers,
+        *(jnp.zeros_like(each) for each in (last.normals, last.radii, last.areas)),
+        *_carried(last),
+    )
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), splats, last)
 
 
@@ -52,19 +62,28 @@ def _carried(splats: Splats):
 
 
 def plan_over(mesh: Mesh, wanted: Wanted) -> Plan:
-    """Cut the splats into a share for each device of a mesh, and the tiles of the pictures into strips.
+    """Cut the splats into a share for each device of a mesh, and the tiles of the pictures into
+    strips.
 
     **Raises:** `ValueError` when the settings' rasterizer or diffuser cannot be cut.
     """
     settings, devices = wanted.settings, Devices.of(mesh)
     of_each = settings.rasterizer
     if not isinstance(of_each, _splatting.TileRasterizer):
-        raise ValueError(f"over a mesh the rasterizer must be a TileRasterizer, not a {type(of_each).__name__}")
+        raise ValueError(
+            f"over a mesh the rasterizer must be a TileRasterizer, not a {type(of_each).__name__}"
+        )
     if not isinstance(settings.diffuser, _diffusion.ClusterDiffuser):
-        raise ValueError(f"over a mesh the diffuser must be a ClusterDiffuser, not a {type(settings.diffuser).__name__}")
+        raise ValueError(
+            "over a mesh the diffuser must be a ClusterDiffuser, not a "
+            f"{type(settings.diffuser).__name__}"
+        )
     whole = filled_up(wanted.splats, devices)
     rows = whole.count // devices.count
-    parts = [jax.tree.map(lambda leaf, i=i: leaf[i * rows : (i + 1) * rows], whole) for i in range(devices.count)]
+    parts = [
+        jax.tree.map(lambda leaf, i=i: leaf[i * rows : (i + 1) * rows], whole)
+        for i in range(devices.count)
+    ]
     looks = [np.asarray(look) for look in wanted.looks]
     owners = _owners(looks, devices.count)
     owned = [[np.where(owners == i, look, -np.inf) for i in range(devices.count)] for look in looks]
@@ -73,33 +92,59 @@ def plan_over(mesh: Mesh, wanted: Wanted) -> Plan:
         part = of_each.planned_for_each(parts, views, settings.splatting)
         return _splatting.ShardedRasterizer(part, devices, **tiles)
 
-    share = _splatting.round_up(max(int(np.sum(own[0] > -np.inf)) for each in owned for own in each), 1)
-    tiles = _splatting.round_up(max(int(np.sum(own > -np.inf)) for each in owned for own in each), 1)
+    share = _splatting.round_up(
+        max(int(np.sum(own[0] > -np.inf)) for each in owned for own in each), 1
+    )
+    tiles = _splatting.round_up(
+        max(int(np.sum(own > -np.inf)) for each in owned for own in each), 1
+    )
     cut = [
-        _splatting.Atlas.of(jnp.asarray(own), view, tiles) for each, view in zip(owned, wanted.views, strict=True) for own in each
+        _splatting.Atlas.of(jnp.asarray(own), view, tiles)
+        for each, view in zip(owned, wanted.views, strict=True)
+        for own in each
     ]
-    uncut = [_splatting.Atlas.of(look, view, look.size) for look, view in zip(wanted.looks, wanted.views, strict=True)]
+    uncut = [
+        _splatting.Atlas.of(look, view, look.size)
+        for look, view in zip(wanted.looks, wanted.views, strict=True)
+    ]
     diffuser = settings.diffuser.planned(wanted.splats, wanted.kernels, wanted.interval, cut)
     made = Plan(
         rasterizer=rasterizer(wanted.views, owners=jnp.asarray(owners.reshape(-1)), share=share),
         tiles=tiles,
-        shadows=tuple(None if each is None else ShadowPlan(rasterizer(each.views), each.cube) for each in wanted.shadows),
-        diffuser=_diffusion.ShardedDiffuser.of(diffuser, wanted.splats, parts, wanted.kernels, uncut, devices),
+        shadows=tuple(
+            None if each is None else ShadowPlan(rasterizer(each.views), each.cube)
+            for each in wanted.shadows
+        ),
+        diffuser=_diffusion.ShardedDiffuser.of(
+            diffuser, wanted.splats, parts, wanted.kernels, uncut, devices
+        ),
         interval=wanted.interval,
         mesh=mesh,
         splats=wanted.splats.count,
     )
-    return jax.tree.map(lambda leaf, spec: jax.device_put(leaf, NamedSharding(mesh, spec)), made, plan_specs(made, devices))
+    return jax.tree.map(
+        lambda leaf, spec: jax.device_put(leaf, NamedSharding(mesh, spec)),
+        made,
+        plan_specs(made, devices),
+    )
 
 
 def plan_specs(plan: Plan, devices: Devices) -> Plan:
     """Say what of a plan every device has whole, and what it has a share of."""
     specs = jax.tree.map(lambda _: PartitionSpec(), plan)
-    return eqx.tree_at(lambda each: (each.diffuser.order, each.diffuser.parents), specs, (devices.shares, devices.shares))
+    return eqx.tree_at(
+        lambda each: (each.diffuser.order, each.diffuser.parents),
+        specs,
+        (devices.shares, devices.shares),
+    )
 
 
 def _owners(looks, count: int) -> np.ndarray:
-    """Give each tile `[down, across]` to a device: strips along rows, each with as much to see of all pictures."""
+    """Give each tile `[down, across]` to a device: strips along rows, each with as much to see of
+    all pictures.
+    """
     seen = np.cumsum(sum((look > -np.inf).sum(axis=0) for look in looks).reshape(-1))
-    strips = np.minimum((seen - 1) * count // max(int(seen[-1]), 1), count - 1) if seen.size else seen
+    strips = (
+        np.minimum((seen - 1) * count // max(int(seen[-1]), 1), count - 1) if seen.size else seen
+    )
     return np.maximum(strips, 0).astype(np.int32).reshape(looks[0].shape[1:])

@@ -1,7 +1,9 @@
-"""A picture of more splats than memory holds: they come a part at a time, several times over, and leave only sums behind.
+"""A picture of more splats than memory holds: they come a part at a time, several times over, and
+leave only sums behind.
 
-What the passes know of each other decides how often: where the front of every shadow map and of the camera ends; what it
-weighs; where what lies behind ends; the shadow maps' surfaces; then light, and the camera's sums; then what the pixels gather.
+What the passes know of each other decides how often: where the front of every shadow map and of the
+camera ends; what it weighs; where what lies behind ends; the shadow maps' surfaces; then light, and
+the camera's sums; then what the pixels gather.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -14,7 +16,17 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from splatjax import diffusion as _diffusion, splatting as _splatting
-from splatjax.scene import AbstractLight, Camera, Frame, Material, Parts, Scene, Splats, StackedLights, stack_lights
+from splatjax.scene import (
+    AbstractLight,
+    Camera,
+    Frame,
+    Material,
+    Parts,
+    Scene,
+    Splats,
+    StackedLights,
+    stack_lights,
+)
 
 from ._inputs import check_channels, in_one_dtype
 from ._lighting import EnteringLight, LightOnSplats, let_light_in
@@ -49,22 +61,28 @@ def render_streamed(
 
     **Arguments:**
 
-    - `parts`: gives all splats from the beginning whenever it is called, in parts of one size but the last, that are complete and
-      near in memory where they are near in space: `splatjax.SplatFile`, for one.
-    - `lights`, `material`, `camera`, `settings`: as for `render`; the rasterizer and the diffuser are the usual ones.
+    - `parts`: gives all splats from the beginning whenever it is called, in parts of one size but
+      the last, that are complete and near in memory where they are near in space:
+      `splatjax.SplatFile`, for one.
+    - `lights`, `material`, `camera`, `settings`: as for `render`; the rasterizer and the diffuser
+      are the usual ones.
     - `report`: is told after each part what is being done, and how many splats are done.
 
-    **Returns:** what `render` gives, to rounding but for pass 4: its clusters are those of each part, and every pixel gathers for
-    itself, so that it differs by less than the diffuser's own error. Without gradients.
+    **Returns:** what `render` gives, to rounding but for pass 4: its clusters are those of each
+    part, and every pixel gathers for itself, so that it differs by less than the diffuser's own
+    error. Without gradients.
 
-    **Raises:** `ValueError` when there are no splats, parts differ in size, are not the same each time, or the settings cannot
-    be streamed.
+    **Raises:** `ValueError` when there are no splats, parts differ in size, are not the same each
+    time, or the settings cannot be streamed.
     """
     settings = RenderSettings() if settings is None else settings
     rasterizer, diffuser = settings.rasterizer, settings.diffuser
-    if not isinstance(rasterizer, _splatting.TileRasterizer) or not isinstance(diffuser, _diffusion.ClusterDiffuser):
+    if not isinstance(rasterizer, _splatting.TileRasterizer) or not isinstance(
+        diffuser, _diffusion.ClusterDiffuser
+    ):
         raise ValueError(
-            f"only a TileRasterizer and a ClusterDiffuser can be streamed, not a {type(rasterizer).__name__} and a"
+            "only a TileRasterizer and a ClusterDiffuser can be streamed, not a "
+            f"{type(rasterizer).__name__} and a"
             f" {type(diffuser).__name__}"
         )
 
@@ -90,28 +108,39 @@ def render_streamed(
     (first, camera), groups = in_one_dtype(first, camera), stack_lights(first.lights)
     dtype = first.splats.centers.dtype
     view, maps = _splatting.PerspectiveView.of(camera), _maps(groups, survey, settings, dtype)
-    views = SweptViews.planned(every, [view, *(each.view for each in maps)], rasterizer, settings.splatting)
+    views = SweptViews.planned(
+        every, [view, *(each.view for each in maps)], rasterizer, settings.splatting
+    )
     limits, fronts, seconds = ends_of_surfaces(every, views, dtype)
     shadows = views.but_the_first
-    hidden = behind(every("shadow maps") if maps else iter(()), shadows, limits[1:], seconds[1:], dtype)
+    hidden = behind(
+        every("shadow maps") if maps else iter(()), shadows, limits[1:], seconds[1:], dtype
+    )
     surfaces = [blended(*each) for each in zip(shadows.at, fronts[1:], hidden, strict=True)]
 
     def lit(scene: Scene) -> tuple[LightOnSplats, EnteringLight]:
         return _lit(scene, groups, maps, surfaces, settings.shadows)
 
     light, entering = lit(first)
-    sizes = {name: rows.shape[0] for name, rows in settings.lighting.attributes(first, light, entering).items()}
+    sizes = {
+        name: rows.shape[0]
+        for name, rows in settings.lighting.attributes(first, light, entering).items()
+    }
     camera_at, nothing = views.at[0], views.at[0].nothing(sum(sizes.values()), dtype)
     both = nothing, nothing
     for scene, shows in zip(every("what the camera sees"), views.in_the_first, strict=True):
         if shows:
             rows = jnp.concatenate(list(settings.lighting.attributes(scene, *lit(scene)).values()))
-            both = jax.block_until_ready(pictured(scene.splats, rows, camera_at, limits[0], seconds[0], both))
+            both = jax.block_until_ready(
+                pictured(scene.splats, rows, camera_at, limits[0], seconds[0], both)
+            )
     summed = _splatting.SummedFragments(*both, jnp.zeros((), dtype))
     tiles = max(int(jnp.sum(_splatting.farthest_depths(summed, view) > -jnp.inf)), 1)
     surface = surfaces_of(summed, sizes, view, settings, tiles).lit(first, light, settings)
 
-    kernels = _diffusion.Kernels.of(first.material.gaussians.variances, settings.diffusion.normalization)
+    kernels = _diffusion.Kernels.of(
+        first.material.gaussians.variances, settings.diffusion.normalization
+    )
     origin, interval = jnp.asarray(survey.middle, dtype), survey.interval(settings.diffusion, dtype)
     pixels = _diffusion.Pixels.of(surface.points, surface.covered, origin, surface.atlas)
     fine = jnp.asarray(survey.fine, dtype)
@@ -120,17 +149,31 @@ def render_streamed(
     for scene in every("diffusion"):
         if sums.within_reach(scene.splats):
             sums, room = sums.plus(sources_of(scene.splats, lit(scene)[1].source), room)
-    return _finished(first, view, groups, surface, sums.found(first.material.gaussians.weights.shape[1]), interval, settings)
+    return _finished(
+        first,
+        view,
+        groups,
+        surface,
+        sums.found(first.material.gaussians.weights.shape[1]),
+        interval,
+        settings,
+    )
 
 
-def _maps(groups: Sequence[StackedLights], survey: Survey, settings: RenderSettings, dtype: jnp.dtype) -> list[_Map]:
+def _maps(
+    groups: Sequence[StackedLights], survey: Survey, settings: RenderSettings, dtype: jnp.dtype
+) -> list[_Map]:
     bounds, found = survey.bounds(dtype), []
     for i, group in enumerate(groups):
         if not group.lights.cast_shadows:
             continue
         each = group.apart()
         cube = stands_among(each, bounds)
-        found += [_Map(view, i, j, cube) for j, light in enumerate(each) for view in shadow_views(light, bounds, settings, cube)]
+        found += [
+            _Map(view, i, j, cube)
+            for j, light in enumerate(each)
+            for view in shadow_views(light, bounds, settings, cube)
+        ]
     return found
 
 
@@ -152,7 +195,9 @@ def _lit(
             shares[each.group] = [0.0] * len(groups[each.group].places)
         shares[each.group][each.light] = shares[each.group][each.light] + share
     light = LightOnSplats(
-        groups, [None if each is None else jnp.stack(each) for each in shares], jnp.zeros((), scene.splats.centers.dtype)
+        groups,
+        [None if each is None else jnp.stack(each) for each in shares],
+        jnp.zeros((), scene.splats.centers.dtype),
     )
     return light, let_light_in(scene, light)
 
@@ -168,6 +213,10 @@ def _finished(
     settings: RenderSettings,
 ) -> Frame:
     material = scene.material
-    layers = _diffusion.layers_of(diffused, material, surface.receivers(), interval, settings.diffusion.normalization)
+    layers = _diffusion.layers_of(
+        diffused, material, surface.receivers(), interval, settings.diffusion.normalization
+    )
     shaded = shade(scene, view, groups, surface, layers)
-    return compose(shaded, surface, layers.resolved, material.gaussians.weights, jnp.zeros((), interval.dtype))
+    return compose(
+        shaded, surface, layers.resolved, material.gaussians.weights, jnp.zeros((), interval.dtype)
+    )

@@ -1,4 +1,6 @@
-"""What must be known of all splats before a picture of them can be begun, from a look at one part after the other."""
+"""What must be known of all splats before a picture of them can be begun, from a look at one part
+after the other.
+"""
 
 import math
 from collections.abc import Iterator
@@ -12,11 +14,16 @@ from jaxtyping import Array, Float
 from splatjax import diffusion as _diffusion, splatting as _splatting
 from splatjax.scene import Parts, Splats
 
-_OTHERS = "the parts were not the same each time that they were asked for; give the same splats in the same order"
+_OTHERS = (
+    "the parts were not the same each time that they were asked for; give the same "
+    "splats in the same order"
+)
 
 
 class SameParts:
-    """Parts that must be the same each time that they are asked for: what is known of one is used when it comes again."""
+    """Parts that must be the same each time that they are asked for: what is known of one is used
+    when it comes again.
+    """
 
     def __init__(self, parts: Parts):
         self.parts, self.marks = parts, None
@@ -24,7 +31,8 @@ class SameParts:
     def __call__(self) -> Iterator[Splats]:
         """Give all splats from the beginning.
 
-        **Raises:** `ValueError` when a part is another one than the first time, or there are fewer or more.
+        **Raises:** `ValueError` when a part is another one than the first time, or there are fewer
+        or more.
         """
         marks = []
         for part in self.parts():
@@ -36,7 +44,9 @@ class SameParts:
             raise ValueError(_OTHERS)
 
     def _check(self, marks: list[np.ndarray]) -> None:
-        if self.marks is not None and not np.array_equal(marks[-1:], self.marks[len(marks) - 1 : len(marks)], equal_nan=True):
+        if self.marks is not None and not np.array_equal(
+            marks[-1:], self.marks[len(marks) - 1 : len(marks)], equal_nan=True
+        ):
             raise ValueError(_OTHERS)
 
 
@@ -67,7 +77,8 @@ class Survey:
     def of(cls, parts: Parts) -> "Survey":
         """Look at all parts twice, and keep the areas of the finest.
 
-        **Raises:** `ValueError` when there are no splats, or a part is larger than the first, or smaller and not the last.
+        **Raises:** `ValueError` when there are no splats, or a part is larger than the first, or
+        smaller and not the last.
         """
         sizes, low, high, area, radius = [], [], [], 0.0, 0.0
         for part in parts():
@@ -77,18 +88,28 @@ class Survey:
             sizes.append(part.count)
             low.append([axis.min() for axis in centers.T])  # quicker than over an axis of three
             high.append([axis.max() for axis in centers.T])
-            area, radius = area + float(own.sum(dtype=np.float64)), max(radius, float(part.radii.max()))
+            area, radius = (
+                area + float(own.sum(dtype=np.float64)),
+                max(radius, float(part.radii.max())),
+            )
         if not sizes:
             raise ValueError("there are no splats to stream")
         if any(size != sizes[0] for size in sizes[:-1]) or sizes[-1] > sizes[0]:
-            raise ValueError(f"parts must be of one size, but the last, which may be smaller; these are of {sizes}")
+            raise ValueError(
+                "parts must be of one size, but the last, which may be smaller; these are of "
+                f"{sizes}"
+            )
         lowest, highest = np.min(low, axis=0), np.max(high, axis=0)
         middle, squared, begin, near, count = (lowest + highest) / 2, 0.0, 0, [], sum(sizes)
         places = np.linspace(0, count - 1, min(_diffusion.PLACES, count)).astype(int)
         rank, finest = _diffusion.FINEST * (count - 1), np.zeros(0)
         for part in parts():
-            squared = max(squared, float(np.max(_squares(np.asarray(part.centers), middle), initial=0)))
-            near += _nearest(part, places[(places >= begin) & (places < begin + part.count)] - begin)
+            squared = max(
+                squared, float(np.max(_squares(np.asarray(part.centers), middle), initial=0))
+            )
+            near += _nearest(
+                part, places[(places >= begin) & (places < begin + part.count)] - begin
+            )
             finest = _smallest(np.concatenate([finest, np.asarray(part.areas)]), int(rank) + 2)
             begin += part.count
         distances = np.asarray(near)
@@ -127,9 +148,13 @@ def _smallest(values: np.ndarray, count: int) -> np.ndarray:
 
 
 def _nearest(part: Splats, places: np.ndarray) -> list[float]:
-    """Give the distance of splats to the nearest other one of their part, over the root of their area; of the only one 0."""
+    """Give the distance of splats to the nearest other one of their part, over the root of their
+    area; of the only one 0.
+    """
     centers, areas, found = np.asarray(part.centers), np.asarray(part.areas), []
     for place in places:
         squared = np.delete(_squares(centers, centers[place]), place)
-        found.append(math.sqrt(np.min(squared, initial=np.inf) / areas[place]) if len(squared) else 0.0)
+        found.append(
+            math.sqrt(np.min(squared, initial=np.inf) / areas[place]) if len(squared) else 0.0
+        )
     return found

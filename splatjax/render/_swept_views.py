@@ -1,4 +1,6 @@
-"""Passes 2 and 3 of splats that come a part at a time: what each sweep finds of a part is added to what is known of all."""
+"""Passes 2 and 3 of splats that come a part at a time: what each sweep finds of a part is added to
+what is known of all.
+"""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -26,11 +28,15 @@ class SweptView(eqx.Module):
     rasterizer: _splatting.TileRasterizer
     settings: _splatting.SplattingSettings
 
-    def stages(self, splats: Splats, attributes: Float[Array, "attributes splats"] | None = None) -> _splatting.Stages:
+    def stages(
+        self, splats: Splats, attributes: Float[Array, "attributes splats"] | None = None
+    ) -> _splatting.Stages:
         """Bin a part."""
         if attributes is None:
             attributes = jnp.zeros((0, splats.count), splats.centers.dtype)
-        return _splatting.Stages.of(self.rasterizer.binned(splats, attributes, self.view, self.settings))
+        return _splatting.Stages.of(
+            self.rasterizer.binned(splats, attributes, self.view, self.settings)
+        )
 
     def nothing(self, attributes: int, dtype: jnp.dtype) -> _splatting.FragmentSums:
         """Give the sums of no part."""
@@ -79,14 +85,21 @@ class SweptViews:
     def among(self, open_to: Iterable[Bool[Array, "_ pixels"]]) -> "SweptViews":
         """Let only tiles with some such pixels count."""
         tiles = [np.asarray(jnp.any(pixels, axis=1)) for pixels in open_to]
-        return replace(self, touched=[own & some[None] for own, some in zip(self.touched, tiles, strict=True)])
+        return replace(
+            self, touched=[own & some[None] for own, some in zip(self.touched, tiles, strict=True)]
+        )
 
     def sweep(self, scenes: Iterator[Scene], add: Callable, *known: Sequence) -> list:
-        """Let every part add to what is known, which is given last; before it what `add` needs of each view."""
+        """Let every part add to what is known, which is given last; before it what `add` needs of
+        each view.
+        """
         *given, found = known
         for part, scene in enumerate(scenes):
             each = zip(self.at, self.touched, zip(*given, found, strict=True), strict=True)
-            found = [add(scene.splats, at, *own) if tiles[part].any() else own[-1] for at, tiles, own in each]
+            found = [
+                add(scene.splats, at, *own) if tiles[part].any() else own[-1]
+                for at, tiles, own in each
+            ]
             jax.block_until_ready(found)  # parts that are read ahead would pile up
         return list(found)
 
@@ -109,11 +122,17 @@ def ends_of_surfaces(
 
 
 def behind(
-    scenes: Iterator[Scene], views: SweptViews, limits: Sequence[OfTiles], seconds: Sequence[OfTiles], dtype: jnp.dtype
+    scenes: Iterator[Scene],
+    views: SweptViews,
+    limits: Sequence[OfTiles],
+    seconds: Sequence[OfTiles],
+    dtype: jnp.dtype,
 ) -> list[_splatting.FragmentSums]:
     """Sum what lies behind the front in every view."""
     nothing = [each.nothing(0, dtype) for each in views.at]
-    return views.among(each < jnp.inf for each in seconds).sweep(scenes, _behind, limits, seconds, nothing)
+    return views.among(each < jnp.inf for each in seconds).sweep(
+        scenes, _behind, limits, seconds, nothing
+    )
 
 
 @eqx.filter_jit
@@ -131,7 +150,9 @@ def pictured(
 
 
 @eqx.filter_jit
-def blended(at: SweptView, front: _splatting.FragmentSums, behind: _splatting.FragmentSums) -> _splatting.Surfaces:
+def blended(
+    at: SweptView, front: _splatting.FragmentSums, behind: _splatting.FragmentSums
+) -> _splatting.Surfaces:
     """Blend both surfaces."""
     both = (_splatting.Surface.of(sums, at.view, at.settings) for sums in (front, behind))
     return _splatting.Surfaces(*both, jnp.zeros((), front.weights.dtype))
@@ -143,17 +164,25 @@ def _limits(splats: Splats, at: SweptView, so_far: OfTiles) -> OfTiles:
 
 
 @eqx.filter_jit
-def _fronts(splats: Splats, at: SweptView, limits: OfTiles, so_far: _splatting.FragmentSums) -> _splatting.FragmentSums:
+def _fronts(
+    splats: Splats, at: SweptView, limits: OfTiles, so_far: _splatting.FragmentSums
+) -> _splatting.FragmentSums:
     return jax.tree.map(jnp.add, so_far, at.stages(splats).front(limits))
 
 
 @eqx.filter_jit
-def _ends(splats: Splats, at: SweptView, limits: OfTiles, gaps: Gaps, so_far: tuple[OfTiles, OfTiles]) -> tuple[OfTiles, OfTiles]:
+def _ends(
+    splats: Splats, at: SweptView, limits: OfTiles, gaps: Gaps, so_far: tuple[OfTiles, OfTiles]
+) -> tuple[OfTiles, OfTiles]:
     return jax.tree.map(jnp.maximum, so_far, at.stages(splats).limits_behind(limits, gaps))
 
 
 @eqx.filter_jit
 def _behind(
-    splats: Splats, at: SweptView, limits: OfTiles, seconds: OfTiles, so_far: _splatting.FragmentSums
+    splats: Splats,
+    at: SweptView,
+    limits: OfTiles,
+    seconds: OfTiles,
+    so_far: _splatting.FragmentSums,
 ) -> _splatting.FragmentSums:
     return jax.tree.map(jnp.add, so_far, at.stages(splats).behind(limits, seconds))

@@ -14,8 +14,8 @@ from ._tiles import AbstractListRasterizer, Lists
 class BlendingRasterizer(AbstractListRasterizer):
     r"""Blends the fragments within epsilon of the nearest one.
 
-    A pixel with any fragment is covered whole, one with none not at all: silhouettes are hard, and holes are holes.
-    Which fragments count, and coverage, have no derivative.
+    A pixel with any fragment is covered whole, one with none not at all: silhouettes are hard, and
+    holes are holes. Which fragments count, and coverage, have no derivative.
 
     **Attributes:**
 
@@ -26,10 +26,15 @@ class BlendingRasterizer(AbstractListRasterizer):
     kernel: AbstractKernel
     capacity: BinCapacity | None = None
 
-    def front(self, lists: Lists, attributes: Float[Array, "attributes splats"], view: AbstractView) -> FragmentSums:
+    def front(
+        self, lists: Lists, attributes: Float[Array, "attributes splats"], view: AbstractView
+    ) -> FragmentSums:
         def nearest(ids, footprints, dx, dy):
             found = self.kernel.fragments(footprints, view, dx, dy)
-            return jnp.max(jnp.where(found.there, view.shifted(found.nearness, footprints.shift), -jnp.inf), axis=1)
+            return jnp.max(
+                jnp.where(found.there, view.shifted(found.nearness, footprints.shift), -jnp.inf),
+                axis=1,
+            )
 
         limits = stop_gradient(lists.over_blocks(jax.ops.segment_max, lists.each(nearest)))
 
@@ -38,10 +43,14 @@ class BlendingRasterizer(AbstractListRasterizer):
             weight = jnp.where(found.there & (found.nearness > limit[:, None]), found.weight, 0.0)
             rows = attributes.at[:, ids].get(mode="fill", fill_value=0)
             sums = jnp.einsum("rts,tsp->trp", rows, weight)
-            own = jnp.stack([jnp.sum(weight * found.nearness, axis=1), jnp.sum(weight, axis=1)], axis=1)
+            own = jnp.stack(
+                [jnp.sum(weight * found.nearness, axis=1), jnp.sum(weight, axis=1)], axis=1
+            )
             return jnp.concatenate([sums, own], axis=1)
 
-        sums = FragmentSums.of(lists.tiles(lists.over_blocks(jax.ops.segment_sum, lists.each(blend, limits))))
+        sums = FragmentSums.of(
+            lists.tiles(lists.over_blocks(jax.ops.segment_sum, lists.each(blend, limits)))
+        )
         return FragmentSums(
             blend_fragments(sums.attributes, sums.weights[:, None]),
             blend_fragments(sums.nearness, sums.weights),

@@ -38,10 +38,12 @@ def blur_along(
     variance: Float[Array, "height width"],
     reach: int,
 ) -> Gathered:
-    r"""Gather along one axis by Gaussian weights, `sum_s exp(-s^2 / 2 variance) trust(guide(x + s)) values(x + s)`.
+    r"""Gather along one axis by Gaussian weights, `sum_s exp(-s^2 / 2 variance) trust(guide(x + s))
+    values(x + s)`.
 
-    Taps lie on whole pixels, so that no detail of the picture falls between them. Of a Gaussian narrower than a pixel the sampled
-    weights would have too small a variance; theirs is as asked for.
+    Taps lie on whole pixels, so that no detail of the picture falls between them. Of a Gaussian
+    narrower than a pixel the sampled weights would have too small a variance; theirs is as asked
+    for.
 
     **Arguments:**
 
@@ -49,7 +51,8 @@ def blur_along(
     - `values`: Differentiable.
     - `guide`: a picture that tells how much a tap counts; beyond the picture it is 0.
     - `trust`: of the guide at the tap, in [0, 1]; it must give 0 for a guide of 0.
-    - `variance`: at each pixel, pixels^2, not negative. Differentiable but at 1/2, where it jumps by 0.4%.
+    - `variance`: at each pixel, pixels^2, not negative. Differentiable but at 1/2, where it jumps
+      by 0.4%.
     - `reach`: the farthest tap, pixels. Static.
 
     **Returns:** `Gathered`.
@@ -69,7 +72,9 @@ def blur_along(
         weight = jnp.exp(-rate * step.astype(rate.dtype) ** 2)
         for tap, trusted in (shifted(step), shifted(-step)):
             counted = weight * trusted
-            found = Gathered(found.sums + counted[None] * tap, found.trusted + counted, found.total + weight)
+            found = Gathered(
+                found.sums + counted[None] * tap, found.trusted + counted, found.total + weight
+            )
         return found, None
 
     trusted = trust(guide)
@@ -79,10 +84,14 @@ def blur_along(
 
 
 def _rate(variance: Float[Array, "height width"]) -> Float[Array, "height width"]:
-    """Give the `rate` of weights `exp(-rate s^2)` on whole pixels whose variance is as asked for."""
+    """Give the `rate` of weights `exp(-rate s^2)` on whole pixels whose variance is as asked
+    for.
+    """
     narrow = variance < 0.5
     v = jnp.where(narrow, variance, 0.25)
     q = v / (2 * (1 - v))  # exp(-rate): of three taps the variance is 2 q / (1 + 2 q)
     for _ in range(4):  # and of five
         q = 0.5 * v * (1 + 2 * q + 2 * q**4) - 4 * q**4
-    return jnp.where(narrow, -jnp.log(jnp.maximum(q, 1e-12)), 0.5 / jnp.where(narrow, 1.0, variance))
+    return jnp.where(
+        narrow, -jnp.log(jnp.maximum(q, 1e-12)), 0.5 / jnp.where(narrow, 1.0, variance)
+    )

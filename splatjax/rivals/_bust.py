@@ -13,17 +13,18 @@ _RIM = 0.002  # of the texture, that stays free along its edges
 
 
 def bust_with_textures(texels: int) -> tuple[Mesh, Textures]:
-    r"""Give the head of the bust as a mesh whose colors lie in textures, laid out by its own coordinates.
+    r"""Give the head of the bust as a mesh whose colors lie in textures, laid out by its own
+    coordinates.
 
-    These are longitude and latitude seen from inside the head: the ears, the nostrils and the neck overlap in them, and the
-    nearest texel's color there is that of one of the parts.
+    These are longitude and latitude seen from inside the head: the ears, the nostrils and the neck
+    overlap in them, and the nearest texel's color there is that of one of the parts.
 
     **Arguments:**
 
     - `texels`: along each edge of the textures.
 
-    **Returns:** the mesh as `splatjax.geometry.bust_mesh` makes it, cut off at the neck (mm), and its albedo (linear), specular
-    and roughness (factors), `[texels, texels, ...]`.
+    **Returns:** the mesh as `splatjax.geometry.bust_mesh` makes it, cut off at the neck (mm), and
+    its albedo (linear), specular and roughness (factors), `[texels, texels, ...]`.
 
     **Raises:** `ValueError` for no texels.
     """
@@ -32,7 +33,12 @@ def bust_with_textures(texels: int) -> tuple[Mesh, Textures]:
     mesh = cut_below(bust_mesh(), _NECK)
     assert mesh.uvs is not None
     low, high = mesh.uvs.min(axis=(0, 1)), mesh.uvs.max(axis=(0, 1))
-    mesh = Mesh(mesh.vertices, mesh.faces, mesh.normals, _RIM + (1 - 2 * _RIM) * (mesh.uvs - low) / (high - low))
+    mesh = Mesh(
+        mesh.vertices,
+        mesh.faces,
+        mesh.normals,
+        _RIM + (1 - 2 * _RIM) * (mesh.uvs - low) / (high - low),
+    )
     bare = TexturedMesh.of(mesh)
     laid_out = lay_out(bare, texels, room_for(Landing.in_texture(bare.uvs, texels)))
     colors = complexion(np.asarray(laid_out.points.centers, np.float64))

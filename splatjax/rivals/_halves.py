@@ -15,7 +15,9 @@ class HalfAndHalf(eqx.Module):
 
 
 def half_and_half(
-    left: Float[Array, "height width channels"], right: Float[Array, "height width channels"], gain: float = 4.0
+    left: Float[Array, "height width channels"],
+    right: Float[Array, "height width channels"],
+    gain: float = 4.0,
 ) -> HalfAndHalf:
     r"""Put two pictures of the same view together, as Figure 8 does.
 
@@ -24,7 +26,8 @@ def half_and_half(
     - `left`, `right`: radiance.
     - `gain`: by how much differences are enlarged.
 
-    **Returns:** the halves, in radiance, and the difference of the whole pictures, to be shown as it is.
+    **Returns:** the halves, in radiance, and the difference of the whole pictures, to be shown as
+    it is.
 
     **Source:** Kim et al. 2010, Figure 8.
     """

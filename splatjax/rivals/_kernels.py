@@ -24,25 +24,40 @@ class Fragments(eqx.Module):
 
 
 class AbstractKernel(eqx.Module):
-    """The footprint of a splat. All weigh their fragments by `splatjax.splatting.fragment_weight`, of a squared radius each."""
+    """The footprint of a splat. All weigh their fragments by `splatjax.splatting.fragment_weight`,
+    of a squared radius each.
+    """
 
     @abc.abstractmethod
-    def footprints(self, splats: Splats, view: AbstractView, settings: SplattingSettings) -> Footprints:
+    def footprints(
+        self, splats: Splats, view: AbstractView, settings: SplattingSettings
+    ) -> Footprints:
         """Project splats; the boxes hold all fragments."""
 
     @abc.abstractmethod
     def squared_radius(
-        self, f: Footprints, view: AbstractView, dx: Float[Array, "..."], dy: Float[Array, "..."], nearness: Float[Array, "..."]
+        self,
+        f: Footprints,
+        view: AbstractView,
+        dx: Float[Array, "..."],
+        dy: Float[Array, "..."],
+        nearness: Float[Array, "..."],
     ) -> Float[Array, "..."]:
-        """Give `rho^2` at offsets from the center (pixels); 1 or more where a splat leaves nothing."""
+        """Give `rho^2` at offsets from the center (pixels); 1 or more where a splat leaves
+        nothing.
+        """
 
     def nearness(
         self, f: Footprints, view: AbstractView, dx: Float[Array, "..."], dy: Float[Array, "..."]
     ) -> Float[Array, "..."]:
-        """Give how near the plane of the splat is: hit by the ray, as everywhere in this renderer."""
+        """Give how near the plane of the splat is: hit by the ray, as everywhere in this
+        renderer.
+        """
         return f.nearness + f.slope_x * dx + f.slope_y * dy
 
-    def fragments(self, f: Footprints, view: AbstractView, dx: Float[Array, "..."], dy: Float[Array, "..."]) -> Fragments:
+    def fragments(
+        self, f: Footprints, view: AbstractView, dx: Float[Array, "..."], dy: Float[Array, "..."]
+    ) -> Fragments:
         """Give fragments at offsets from the center. Differentiable in the footprints."""
         nearness = self.nearness(f, view, dx, dy)
         squared = self.squared_radius(f, view, dx, dy, nearness)
@@ -52,9 +67,11 @@ class AbstractKernel(eqx.Module):
 
 
 class DiscKernel(AbstractKernel):
-    """The disc itself, seen in exact perspective: no filter. What is smaller than a pixel is missed, or stands for all of it.
+    """The disc itself, seen in exact perspective: no filter. What is smaller than a pixel is
+    missed, or stands for all of it.
 
-    **Source:** Zwicker et al. 2004, "Perspective Accurate Splatting"; Botsch et al. 2004, "Phong Splatting".
+    **Source:** Zwicker et al. 2004, "Perspective Accurate Splatting"; Botsch et al. 2004, "Phong
+    Splatting".
     """
 
     def footprints(self, splats, view, settings):
@@ -65,30 +82,35 @@ class DiscKernel(AbstractKernel):
 
 
 class EwaKernel(AbstractKernel):
-    r"""The elliptical weighted average: the disc's Gaussian, projected by the affine map at its center, blurred by the pixel's.
+    r"""The elliptical weighted average: the disc's Gaussian, projected by the affine map at its
+    center, blurred by the pixel's.
 
-    In the picture the kernel is `exp(-d^T (J V J^T + I)^-1 d / 2)` and its like, with the pixel's filter of variance `I`, cut
-    where the house's kernel ends. The projection is exact at the center alone: large splats near the eye may part, and leave
-    holes.
+    In the picture the kernel is `exp(-d^T (J V J^T + I)^-1 d / 2)` and its like, with the pixel's
+    filter of variance `I`, cut where the house's kernel ends. The projection is exact at the center
+    alone: large splats near the eye may part, and leave holes.
 
     **Attributes:**
 
     - `filter_variance`: of the pixel's filter, pixels squared. Static.
 
-    **Source:** Zwicker et al. 2001, "Surface Splatting", section 4.2; Heckbert 1989, "Fundamentals of Texture Mapping and Image
-    Warping".
+    **Source:** Zwicker et al. 2001, "Surface Splatting", section 4.2; Heckbert 1989, "Fundamentals
+    of Texture Mapping and Image Warping".
     """
 
     filter_variance: float = eqx.field(static=True, default=1.0)
 
     def footprints(self, splats, view, settings):
         # exp(-4 rho^2) has an eighth of the squared radius as its variance
-        f = view.footprints(splats, dataclasses.replace(settings, filter_radius=(8 * self.filter_variance) ** 0.5))
+        f = view.footprints(
+            splats, dataclasses.replace(settings, filter_radius=(8 * self.filter_variance) ** 0.5)
+        )
         a, b, c = (stop_gradient(each) for each in self._quadric(f, view))
         determinant = a * c - 0.25 * b * b
         x, y = stop_gradient(f.x), stop_gradient(f.y)
         across, down = jnp.sqrt(c / determinant), jnp.sqrt(a / determinant)
-        return dataclasses.replace(f, left=x - across, right=x + across, top=y - down, bottom=y + down)
+        return dataclasses.replace(
+            f, left=x - across, right=x + across, top=y - down, bottom=y + down
+        )
 
     def squared_radius(self, f, view, dx, dy, nearness):
         a, b, c = self._quadric(f, view)
@@ -96,16 +118,20 @@ class EwaKernel(AbstractKernel):
 
     @staticmethod
     def _quadric(f: Footprints, view: AbstractView):
-        """Give the ellipse of the affine map: the one in perspective, with the nearness of the center everywhere."""
+        """Give the ellipse of the affine map: the one in perspective, with the nearness of the
+        center everywhere.
+        """
         there = jnp.where(f.visible, f.nearness, 1.0)
         return tuple(view.squared_radius(there, each) for each in (f.a, f.b, f.c))
 
 
 class DiscOrPixelKernel(AbstractKernel):
-    r"""The disc in exact perspective, or a circle of a pixel's size around its center, whichever weighs more.
+    r"""The disc in exact perspective, or a circle of a pixel's size around its center, whichever
+    weighs more.
 
-    `rho^2 = min(rho_disc^2, d^2 / 2)`: an approximation of the elliptical weighted average that leaves no splat smaller than a
-    pixel, at the price of weights that are not those of a convolution.
+    `rho^2 = min(rho_disc^2, d^2 / 2)`: an approximation of the elliptical weighted average that
+    leaves no splat smaller than a pixel, at the price of weights that are not those of a
+    convolution.
 
     **Attributes:**
 
@@ -131,11 +157,15 @@ class DiscOrPixelKernel(AbstractKernel):
         )
 
     def nearness(self, f, view, dx, dy):
-        """What lies beyond the disc is as near as the disc's rim: planes seen edge on would come too close."""
+        """What lies beyond the disc is as near as the disc's rim: planes seen edge on would come
+        too close.
+        """
         plane = super().nearness(f, view, dx, dy)
         squared = _in_perspective(f, view, dx, dy, plane)
         beyond = stop_gradient(squared) > 1
-        shrink = jnp.where(beyond, 1 / jnp.sqrt(jnp.where(beyond, jnp.minimum(squared, 1e12), 1.0)), 1.0)
+        shrink = jnp.where(
+            beyond, 1 / jnp.sqrt(jnp.where(beyond, jnp.minimum(squared, 1e12), 1.0)), 1.0
+        )
         return super().nearness(f, view, shrink * dx, shrink * dy)
 
     def squared_radius(self, f, view, dx, dy, nearness):
@@ -144,7 +174,9 @@ class DiscOrPixelKernel(AbstractKernel):
 
 
 def _in_perspective(f: Footprints, view: AbstractView, dx, dy, nearness) -> Float[Array, "..."]:
-    """Give `rho^2` of the ray's hit with the disc's plane; infinite where the ray misses the rim."""
+    """Give `rho^2` of the ray's hit with the disc's plane; infinite where the ray misses the
+    rim.
+    """
     quadric = dx * (f.a * dx + f.b * dy) + f.c * dy * dy
     inside = f.visible & view.inside(nearness, quadric)
     found = view.squared_radius(jnp.where(inside, nearness, 1.0), jnp.where(inside, quadric, 0.0))

@@ -19,7 +19,8 @@ _LEAST_SPREAD = 1e-3  # of the neighbors' mean squared distance: below it a dire
 class LightAtPixels(AbstractLighting):
     """Blends normals and all else that splats carry, and lights each pixel by what was blended.
 
-    **Source:** Botsch et al. 2005, "High-Quality Surface Splatting on Today's GPUs", section 4; so did Zwicker et al. 2001.
+    **Source:** Botsch et al. 2005, "High-Quality Surface Splatting on Today's GPUs", section 4; so
+    did Zwicker et al. 2001.
     """
 
     def at_pixels(self, scene, groups, points, named):
@@ -32,12 +33,13 @@ class LightAtPixels(AbstractLighting):
 class NormalFields(LightAtPixels):
     r"""Lights each pixel by normals that vary within a splat: `n_i + slopes_i (x - p_i)`, not unit.
 
-    The fields of a pixel's splats are blended, then shaded; the originals were shaded, then blended, which is the same to second
-    order in how much they disagree there.
+    The fields of a pixel's splats are blended, then shaded; the originals were shaded, then
+    blended, which is the same to second order in how much they disagree there.
 
     **Attributes:**
 
-    - `slopes`: how the normal of each splat turns, 1/mm; from `normal_slopes`, or of the surface's curvature. Differentiable.
+    - `slopes`: how the normal of each splat turns, 1/mm; from `normal_slopes`, or of the surface's
+      curvature. Differentiable.
 
     **Source:** Botsch et al. 2004, "Phong Splatting".
     """
@@ -61,23 +63,29 @@ class NormalFields(LightAtPixels):
 
 
 def normal_slopes(splats: Splats, neighbors: int = _NEIGHBORS) -> Float[Array, "splats 3 3"]:
-    r"""Give how normals turn around each splat, by least squares over its neighbors in the plane of the splat, 1/mm.
+    r"""Give how normals turn around each splat, by least squares over its neighbors in the plane of
+    the splat, 1/mm.
 
     **Arguments:**
 
     - `splats`: concrete, not traced; at least 4.
     - `neighbors`: how many; those that face the other way, beyond a thin part, do not count.
 
-    **Returns:** zero along the splat's own normal, and where the neighbors lie in one line, across it.
+    **Returns:** zero along the splat's own normal, and where the neighbors lie in one line, across
+    it.
     """
     centers, normals = (np.asarray(each, np.float64) for each in (splats.centers, splats.normals))
-    near = scipy.spatial.KDTree(centers).query(centers, k=min(neighbors + 1, len(centers)))[1][:, 1:]
+    near = scipy.spatial.KDTree(centers).query(centers, k=min(neighbors + 1, len(centers)))[1][
+        :, 1:
+    ]
     plane = np.stack(tangent_frames(normals), axis=1)
     counts = np.einsum("ski,si->sk", normals[near], normals) > 0
     offsets = np.einsum("ski,sai->ska", centers[near] - centers[:, None], plane) * counts[..., None]
     turns = normals[near] - normals[:, None]
     spread = np.einsum("ska,skb->sab", offsets, offsets)
-    spread += _LEAST_SPREAD * np.trace(spread, axis1=1, axis2=2)[:, None, None] * np.eye(2) + np.finfo(float).tiny * np.eye(2)
+    spread += _LEAST_SPREAD * np.trace(spread, axis1=1, axis2=2)[:, None, None] * np.eye(
+        2
+    ) + np.finfo(float).tiny * np.eye(2)
     slopes = np.einsum("ska,ski->sai", offsets, turns)
     found = np.einsum("sai,saj->sij", np.linalg.solve(spread, slopes), plane)
     return jnp.asarray(found, splats.centers.dtype)
@@ -97,7 +105,10 @@ def _lit(
     def tiled(rows: Float[Array, "rows points"]) -> Float[Array, "tiles rows pixels"]:
         return rows.reshape(rows.shape[0], tiles, -1).transpose(1, 0, 2)
 
-    shares = [flat(lit).T if (lit := named.get(f"lit {i}")) is not None else None for i in range(len(groups))]
+    shares = [
+        flat(lit).T if (lit := named.get(f"lit {i}")) is not None else None
+        for i in range(len(groups))
+    ]
     light = LightOnSplats(groups, shares, jnp.zeros((), points.dtype))
     specular = flat(named["specular"])[:, 0] if "specular" in named else material.specular
     roughness = flat(named["roughness"])[:, 0] if "roughness" in named else material.roughness

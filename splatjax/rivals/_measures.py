@@ -13,9 +13,11 @@ _STABLE = (0.01, 0.03)
 
 
 class Off(eqx.Module):
-    r"""By how much points are off, each by its worst channel, of the truth's root mean square per channel.
+    r"""By how much points are off, each by its worst channel, of the truth's root mean square per
+    channel.
 
-    **Attributes:** `median`, `most` (the 99th percentile), `largest`, and `rms`, the root mean square of all channels.
+    **Attributes:** `median`, `most` (the 99th percentile), `largest`, and `rms`, the root mean
+    square of all channels.
     """
 
     median: float
@@ -24,15 +26,25 @@ class Off(eqx.Module):
     rms: float
 
     @classmethod
-    def of(cls, found: Float[np.ndarray, "points channels"], truth: Float[np.ndarray, "points channels"]) -> "Off":
+    def of(
+        cls,
+        found: Float[np.ndarray, "points channels"],
+        truth: Float[np.ndarray, "points channels"],
+    ) -> "Off":
         """Compare points."""
         off = (found - truth) / np.sqrt(np.mean(truth**2, axis=0))[None]
         worst = np.max(np.abs(off), axis=1)
-        return cls(float(np.median(worst)), float(np.quantile(worst, 0.99)), float(worst.max()), float(np.sqrt(np.mean(off**2))))
+        return cls(
+            float(np.median(worst)),
+            float(np.quantile(worst, 0.99)),
+            float(worst.max()),
+            float(np.sqrt(np.mean(off**2))),
+        )
 
 
 def exitance(frame: Frame) -> Float[Array, "height width channels"]:
-    """Give the radiant exitance of a picture before the albedo colors what leaves; of a surface that reflects nothing itself.
+    """Give the radiant exitance of a picture before the albedo colors what leaves; of a surface
+    that reflects nothing itself.
 
     What is left is how light has spread: the weighted layers `L_k`; 0 where there is nothing.
     """
@@ -42,11 +54,13 @@ def exitance(frame: Frame) -> Float[Array, "height width channels"]:
     return jnp.where(there[..., None], spread, 0.0)
 
 
-def similarity(first: Float[Array, "height width channels"], second: Float[Array, "height width channels"]) -> Float[Array, ""]:
+def similarity(
+    first: Float[Array, "height width channels"], second: Float[Array, "height width channels"]
+) -> Float[Array, ""]:
     r"""Give the mean structural similarity (SSIM) of two pictures whose values lie between 0 and 1.
 
-    Means, variances and covariance are taken in a Gaussian window of standard deviation 1.5 pixels, whole windows alone, and the
-    channels are averaged. Differentiable.
+    Means, variances and covariance are taken in a Gaussian window of standard deviation 1.5 pixels,
+    whole windows alone, and the channels are averaged. Differentiable.
 
     **Returns:** at most 1, which it is for equal pictures.
 
@@ -68,7 +82,9 @@ def similarity(first: Float[Array, "height width channels"], second: Float[Array
     covariance = mean(first * second) - mean_a * mean_b
     bright, contrast = (share**2 for share in _STABLE)
     alike = (2 * mean_a * mean_b + bright) * (2 * covariance + contrast)
-    return jnp.mean(alike / ((mean_a**2 + mean_b**2 + bright) * (variance_a + variance_b + contrast)))
+    return jnp.mean(
+        alike / ((mean_a**2 + mean_b**2 + bright) * (variance_a + variance_b + contrast))
+    )
 
 
 def _cut(picture, begin: int, size: int, axis: int):

@@ -1,4 +1,6 @@
-"""Light on a mesh: shadow maps of its faces, compared as those of splats are, and what enters the surface."""
+"""Light on a mesh: shadow maps of its faces, compared as those of splats are, and what enters the
+surface.
+"""
 
 import equinox as eqx
 import jax
@@ -7,7 +9,15 @@ from jaxtyping import Array, Float
 
 from splatjax import splatting as _splatting
 from splatjax.render import EnteringLight, LightOnSplats, let_light_in
-from splatjax.scene import AbstractLight, DirectionalLight, Material, PointLight, Scene, Splats, stack_lights
+from splatjax.scene import (
+    AbstractLight,
+    DirectionalLight,
+    Material,
+    PointLight,
+    Scene,
+    Splats,
+    stack_lights,
+)
 
 from ._mesh_raster import Landing, barycentrics, interpolate, room_for, see_faces
 from ._textured_mesh import TexturedMesh
@@ -23,7 +33,9 @@ class MeshShadow(eqx.Module):
 
 
 class MeshLight(eqx.Module):
-    """Lights, and their shadow maps: `None` for one that casts no shadows. In the order of the scene."""
+    """Lights, and their shadow maps: `None` for one that casts no shadows. In the order of the
+    scene.
+    """
 
     lights: tuple[AbstractLight, ...]
     shadows: tuple[MeshShadow | None, ...]
@@ -36,7 +48,11 @@ class MeshLight(eqx.Module):
         shares = []
         for group in groups:
             maps = [self.shadows[place] for place in group.places]
-            found = [_splatting.lit_share(points, each.view, each.surfaces, self.settings) for each in maps if each is not None]
+            found = [
+                _splatting.lit_share(points, each.view, each.surfaces, self.settings)
+                for each in maps
+                if each is not None
+            ]
             shares.append(jnp.stack(found) if found else None)
         return LightOnSplats(groups, shares, self.needed)
 
@@ -59,7 +75,10 @@ def light_views(
         elif isinstance(light, PointLight):
             views.append(_splatting.near_view(light.position, bounds, settings))
         else:
-            raise ValueError(f"{type(light).__name__}: no shadow map of a mesh is known for it; give one with cast_shadows=False")
+            raise ValueError(
+                f"{type(light).__name__}: no shadow map of a mesh is known for it; give one with "
+                "cast_shadows=False"
+            )
     return views
 
 
@@ -68,7 +87,8 @@ def shadow_rooms(
 ) -> tuple[int | None, ...]:
     """Give the room that each light's shadow map needs; of concrete lights.
 
-    **Raises:** `ValueError` for a point light that casts shadows from within the mesh's bounding sphere.
+    **Raises:** `ValueError` for a point light that casts shadows from within the mesh's bounding
+    sphere.
     """
     bounds = mesh.bounds()
     for i, light in enumerate(lights):
@@ -76,17 +96,24 @@ def shadow_rooms(
             distance = float(jnp.linalg.norm(light.position - bounds.center))
             if distance < 1.05 * float(bounds.radius):
                 raise ValueError(
-                    f"lights[{i}] stands {distance:g} mm from the middle of the mesh, within its bounding sphere of radius "
+                    f"lights[{i}] stands {distance:g} mm from the middle of the mesh, within its "
+                    "bounding sphere of radius "
                     f"{float(bounds.radius):g} mm; move it out, or let it cast no shadows"
                 )
     views = light_views(mesh, lights, settings)
-    return tuple(None if view is None else room_for(Landing.in_view(mesh.corners(), view)) for view in views)
+    return tuple(
+        None if view is None else room_for(Landing.in_view(mesh.corners(), view)) for view in views
+    )
 
 
 def mesh_light(
-    mesh: TexturedMesh, lights: tuple[AbstractLight, ...], settings: _splatting.ShadowSettings, rooms: tuple[int | None, ...]
+    mesh: TexturedMesh,
+    lights: tuple[AbstractLight, ...],
+    settings: _splatting.ShadowSettings,
+    rooms: tuple[int | None, ...],
 ) -> MeshLight:
-    r"""Make the shadow maps of a mesh (4.1, of triangles). Differentiable in depth, not in what hides what.
+    r"""Make the shadow maps of a mesh (4.1, of triangles). Differentiable in depth, not in what
+    hides what.
 
     **Arguments:**
 
@@ -101,10 +128,15 @@ def mesh_light(
             continue
         landing = Landing.in_view(corners, view)
         seen = see_faces(landing, room)
-        carried = jnp.concatenate([mesh.uvs, mesh.normals[mesh.faces], landing.depth[..., None]], axis=2)
+        carried = jnp.concatenate(
+            [mesh.uvs, mesh.normals[mesh.faces], landing.depth[..., None]], axis=2
+        )
         found = interpolate(carried, seen, barycentrics(landing, seen)).transpose(2, 0, 1)
         there = seen.covered.astype(found.dtype)
-        depth, grid = jnp.where(seen.covered, found[5], 1.0), _splatting.TileGrid(view.width, view.height)
+        depth, grid = (
+            jnp.where(seen.covered, found[5], 1.0),
+            _splatting.TileGrid(view.width, view.height),
+        )
         depth, there = (grid.cut(plane[None])[:, 0] for plane in (depth, there))
         front = _splatting.Surface(grid.cut(found[:5]), depth, there, there)
         behind = jax.tree.map(jnp.zeros_like, front)

@@ -1,4 +1,6 @@
-"""Pictures of a mesh by texture-space diffusion, with the layers and the shading of the splats' pictures."""
+"""Pictures of a mesh by texture-space diffusion, with the layers and the shading of the splats'
+pictures.
+"""
 
 import equinox as eqx
 import jax
@@ -25,7 +27,9 @@ from ._textured_mesh import SurfaceTexels, TexturedMesh, surface_texels
 
 
 class TexturePlan(eqx.Module):
-    """What `jit`, `grad` and loops need to know of shapes; made by `plan_texture_space` from concrete arrays. Static."""
+    """What `jit`, `grad` and loops need to know of shapes; made by `plan_texture_space` from
+    concrete arrays. Static.
+    """
 
     texture: int = eqx.field(static=True)
     camera: int = eqx.field(static=True)
@@ -40,7 +44,8 @@ def plan_texture_space(
     camera: Camera,
     settings: TextureSpaceSettings | None = None,
 ) -> TexturePlan:
-    """Find the room that rendering a mesh needs, and how far its blurs reach; all concrete, not traced.
+    """Find the room that rendering a mesh needs, and how far its blurs reach; all concrete, not
+    traced.
 
     **Raises:** `ValueError` for a point light within the mesh's bounding sphere.
     """
@@ -71,10 +76,12 @@ def render_texture_space(
     settings: TextureSpaceSettings | None = None,
     plan: TexturePlan | None = None,
 ) -> TextureSpacePicture:
-    r"""Render a mesh with texture-space diffusion: shadow maps, irradiance map, blurs, far side, and the picture.
+    r"""Render a mesh with texture-space diffusion: shadow maps, irradiance map, blurs, far side,
+    and the picture.
 
-    Light, interface, material, normalization and shading are those of `splatjax.render`; what differs is how light spreads, and
-    that triangles are drawn: one sample per pixel, so that edges are not smoothed.
+    Light, interface, material, normalization and shading are those of `splatjax.render`; what
+    differs is how light spreads, and that triangles are drawn: one sample per pixel, so that edges
+    are not smoothed.
 
     **Arguments:**
 
@@ -82,8 +89,8 @@ def render_texture_space(
     - `lights`, `material`, `camera`: as for `splatjax.render`. Differentiable.
     - `plan`: from `plan_texture_space`; needed under `jit`, `grad` and `vmap`, made here otherwise.
 
-    **Returns:** a `TextureSpacePicture` in the dtype of `mesh.vertices`; NaN where the plan does not suffice, and its frame's
-    `overflow` says so.
+    **Returns:** a `TextureSpacePicture` in the dtype of `mesh.vertices`; NaN where the plan does
+    not suffice, and its frame's `overflow` says so.
 
     **Raises:** `ValueError` when a plan is needed and not given, or as `plan_texture_space` does.
 
@@ -91,16 +98,29 @@ def render_texture_space(
     """
     settings = TextureSpaceSettings() if settings is None else settings
     if plan is None:
-        if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((mesh, lights, material, camera))):
-            raise ValueError("under jit, grad or vmap a plan is needed: plan=plan_texture_space(...), made outside")
+        if any(
+            isinstance(leaf, Tracer) for leaf in jax.tree.leaves((mesh, lights, material, camera))
+        ):
+            raise ValueError(
+                "under jit, grad or vmap a plan is needed: plan=plan_texture_space(...), made "
+                "outside"
+            )
         plan = plan_texture_space(mesh, lights, material, camera, settings)
     return _render(mesh, lights, material, camera, settings, plan)
 
 
 @eqx.filter_jit
-def _render(mesh: TexturedMesh, lights, material: Material, camera: Camera, settings: TextureSpaceSettings, plan: TexturePlan):
+def _render(
+    mesh: TexturedMesh,
+    lights,
+    material: Material,
+    camera: Camera,
+    settings: TextureSpaceSettings,
+    plan: TexturePlan,
+):
     lights, material, camera = jax.tree.map(
-        lambda leaf: leaf.astype(mesh.vertices.dtype) if eqx.is_inexact_array(leaf) else leaf, (lights, material, camera)
+        lambda leaf: leaf.astype(mesh.vertices.dtype) if eqx.is_inexact_array(leaf) else leaf,
+        (lights, material, camera),
     )
     light = mesh_light(mesh, lights, settings.shadows, plan.shadows)
     texels = lay_out(mesh, settings.resolution, plan.texture)
@@ -108,7 +128,9 @@ def _render(mesh: TexturedMesh, lights, material: Material, camera: Camera, sett
     view = _splatting.PerspectiveView.of(camera)
     landing = Landing.in_view(mesh.corners(), view)
     seen = surface_texels(mesh, landing, see_faces(landing, plan.camera))
-    depth = interpolate(landing.depth[..., None], seen.seen, barycentrics(landing, seen.seen))[..., 0]
+    depth = interpolate(landing.depth[..., None], seen.seen, barycentrics(landing, seen.seen))[
+        ..., 0
+    ]
     needed = jnp.maximum(texture.needed, seen.seen.needed)
     frame = _shaded(seen, depth, look_up_layers(texture, seen.uvs), light, material, view, needed)
     return TextureSpacePicture(frame, texture)
@@ -132,22 +154,34 @@ def _shaded(
         positions=points.centers,
         normals=points.normals,
         outgoing=_shading.unit_normals(to_eye),
-        specular=material.specular if points.specular is None else material.specular * points.specular,
-        roughness=material.roughness if points.roughness is None else material.roughness * points.roughness,
+        specular=material.specular
+        if points.specular is None
+        else material.specular * points.specular,
+        roughness=material.roughness
+        if points.roughness is None
+        else material.roughness * points.roughness,
         lit=received.shares,
     )
     covered = seen.seen.covered
     drawn = jnp.where(needed <= 1, 1.0, jnp.nan) * covered.reshape(-1, 1).astype(depth.dtype)
     post = drawn * _shading.leaving_share(surface, f0)[:, None] / jnp.pi
-    albedo = jnp.ones((len(points.centers), channels), depth.dtype) if points.albedo is None else points.albedo
+    albedo = (
+        jnp.ones((len(points.centers), channels), depth.dtype)
+        if points.albedo is None
+        else points.albedo
+    )
     root = jnp.ones_like(albedo) if points.albedo is None else _shading.albedo_root(albedo)
     single = None
     if material.single_scattering is not None:
-        single = _shading.single_scattered_radiance(surface, received.groups, f0, material.single_scattering)
+        single = _shading.single_scattered_radiance(
+            surface, received.groups, f0, material.single_scattering
+        )
         single = seen.picture(drawn * single * root**2)
     layers = (post * root)[None] * layers
     diffuse = seen.picture(jnp.sum(material.gaussians.weights[:, None] * layers, axis=0))
-    specular = seen.picture(drawn * _shading.reflected_radiance(surface, received.groups, f0, channels))
+    specular = seen.picture(
+        drawn * _shading.reflected_radiance(surface, received.groups, f0, channels)
+    )
     shadow = jnp.ones((len(light.lights), *covered.shape), depth.dtype)
     for group, shares in zip(received.groups, received.shares, strict=True):
         if shares is not None:

@@ -1,4 +1,6 @@
-"""The point-based methods that the paper measures itself against, each as settings of this renderer."""
+"""The point-based methods that the paper measures itself against, each as settings of this
+renderer.
+"""
 
 import dataclasses
 
@@ -13,7 +15,8 @@ from ._nearest import NearestRasterizer
 
 
 def elliptical_points(settings: RenderSettings | None = None) -> RenderSettings:
-    """Give settings that draw elliptical points: the nearest splat wins, and has one color, as in flat shading.
+    """Give settings that draw elliptical points: the nearest splat wins, and has one color, as in
+    flat shading.
 
     Neither color nor normals are interpolated, and nothing is filtered. Figure 7, left.
     """
@@ -21,18 +24,22 @@ def elliptical_points(settings: RenderSettings | None = None) -> RenderSettings:
 
 
 def ewa_splatting(settings: RenderSettings | None = None) -> RenderSettings:
-    """Give settings that splat surfaces with the elliptical weighted average: the splat's kernel blurred by the pixel's.
+    """Give settings that splat surfaces with the elliptical weighted average: the splat's kernel
+    blurred by the pixel's.
 
-    The projection is affine; where splats are large in the picture and the perspective strong, small holes open. Shading is
-    per pixel.
+    The projection is affine; where splats are large in the picture and the perspective strong,
+    small holes open. Shading is per pixel.
 
     **Source:** Zwicker et al. 2001, "Surface Splatting".
     """
     return _with(settings, BlendingRasterizer(EwaKernel()), LightAtPixels())
 
 
-def phong_splatting(slopes: Float[Array, "splats 3 3"], settings: RenderSettings | None = None) -> RenderSettings:
-    """Give settings for Phong splatting: normals vary linearly within each splat, and nothing is filtered in the picture.
+def phong_splatting(
+    slopes: Float[Array, "splats 3 3"], settings: RenderSettings | None = None
+) -> RenderSettings:
+    """Give settings for Phong splatting: normals vary linearly within each splat, and nothing is
+    filtered in the picture.
 
     Few splats suffice for a smooth surface; splats smaller than a pixel alias.
 
@@ -46,7 +53,8 @@ def phong_splatting(slopes: Float[Array, "splats 3 3"], settings: RenderSettings
 
 
 def deferred_splatting(settings: RenderSettings | None = None) -> RenderSettings:
-    """Give settings for high-quality deferred splatting: attributes are blended, with a filter for small splats, then shaded.
+    """Give settings for high-quality deferred splatting: attributes are blended, with a filter for
+    small splats, then shaded.
 
     Figure 7, middle.
 

@@ -1,4 +1,6 @@
-"""Screen-space diffusion (Jimenez): light is blurred in the finished picture's own buffers, along rows and along columns."""
+"""Screen-space diffusion (Jimenez): light is blurred in the finished picture's own buffers, along
+rows and along columns.
+"""
 
 import abc
 
@@ -15,7 +17,9 @@ from splatjax.scene import Camera, Frame, Material
 from ._blur import Trust, blur_along
 
 _SUPPORT = 3.75  # standard deviations of a Gaussian
-_FOLLOWED = 3.0  # standard deviations of a Gaussian in depth, beyond which a pixel is of another surface
+_FOLLOWED = (
+    3.0  # standard deviations of a Gaussian in depth, beyond which a pixel is of another surface
+)
 
 
 class ScreenLight(eqx.Module):
@@ -29,23 +33,29 @@ class ScreenLight(eqx.Module):
 
 
 class AbstractScreenKernel(eqx.Module):
-    """How light is blurred on the screen. What differs in depth is not trusted: the pixel's own light stands for it."""
+    """How light is blurred on the screen. What differs in depth is not trusted: the pixel's own
+    light stands for it.
+    """
 
     @abc.abstractmethod
     def diffuse(
         self, light: ScreenLight, gaussians: SumOfGaussians
     ) -> tuple[Float[Array, "layers channels height width"], Float[Array, "layers channels"]]:
-        """Give layers, and the weights with which they add up to the radiant exitance. Differentiable in the light's colors."""
+        """Give layers, and the weights with which they add up to the radiant exitance.
+        Differentiable in the light's colors.
+        """
 
 
 class GaussianPasses(AbstractScreenKernel):
-    """Every Gaussian by itself: a blur along rows, then one along columns; on a frontal plane exactly the sum of Gaussians.
+    """Every Gaussian by itself: a blur along rows, then one along columns; on a frontal plane
+    exactly the sum of Gaussians.
 
     **Attributes:**
 
     - `reach`: the farthest tap, pixels; what is wider is narrowed to it. Static.
 
-    **Source:** Jimenez, Sundstedt and Gutierrez 2009, the follow-surface test of Jimenez et al. 2015.
+    **Source:** Jimenez, Sundstedt and Gutierrez 2009, the follow-surface test of Jimenez et al.
+    2015.
     """
 
     reach: int = eqx.field(static=True, default=64)
@@ -68,7 +78,9 @@ class AbstractOneKernel(AbstractScreenKernel):
     samples: eqx.AbstractVar[int]
 
     @abc.abstractmethod
-    def taps(self, gaussians: SumOfGaussians) -> tuple[Float[Array, " samples"], Float[Array, "samples channels"]]:
+    def taps(
+        self, gaussians: SumOfGaussians
+    ) -> tuple[Float[Array, " samples"], Float[Array, "samples channels"]]:
         """Give offsets (mm), and weights that add up to 1 in each channel."""
 
     def diffuse(self, light, gaussians):
@@ -85,7 +97,8 @@ class AbstractOneKernel(AbstractScreenKernel):
 
 
 class ShippedKernel(AbstractOneKernel):
-    """The kernel that ships with "Separable subsurface scattering": the radial profile at the taps (`splatjax.exports`).
+    """The kernel that ships with "Separable subsurface scattering": the radial profile at the taps
+    (`splatjax.exports`).
 
     Two blurs by it are the profile for one Gaussian alone.
 
@@ -99,7 +112,8 @@ class ShippedKernel(AbstractOneKernel):
 
 
 class PreintegratedKernel(AbstractOneKernel):
-    """The profile summed along one axis, at the same taps: light that changes along one axis only is diffused as it should be.
+    """The profile summed along one axis, at the same taps: light that changes along one axis only
+    is diffused as it should be.
 
     **Source:** Jimenez et al. 2015, section 3.2.
     """
@@ -111,22 +125,29 @@ class PreintegratedKernel(AbstractOneKernel):
         steps = jnp.diff(offsets)
         widths = 0.5 * (jnp.append(steps, 0.0) + jnp.insert(steps, 0, 0.0))
         variances = gaussians.variances
-        lines = jnp.exp(-0.5 * (offsets * offsets)[:, None] / variances[None]) / jnp.sqrt(2 * jnp.pi * variances)[None]
+        lines = (
+            jnp.exp(-0.5 * (offsets * offsets)[:, None] / variances[None])
+            / jnp.sqrt(2 * jnp.pi * variances)[None]
+        )
         weights = widths[:, None] * (lines @ gaussians.weights)
         return offsets, weights / jnp.sum(weights, axis=0)[None]
 
 
-def diffuse_on_screen(frame: Frame, camera: Camera, material: Material, kernel: AbstractScreenKernel | None = None) -> Frame:
-    r"""Replace the diffused light of a picture by what a blur on the screen makes of its irradiance.
+def diffuse_on_screen(
+    frame: Frame, camera: Camera, material: Material, kernel: AbstractScreenKernel | None = None
+) -> Frame:
+    r"""Replace the diffused light of a picture by what a blur on the screen makes of its
+    irradiance.
 
-    Light that the camera does not see is not there: it does not come from behind silhouettes, nor through thin parts.
+    Light that the camera does not see is not there: it does not come from behind silhouettes, nor
+    through thin parts.
 
     **Arguments:**
 
-    - `frame`: from `splatjax.render` or `render_texture_space`; its irradiance, albedo, depth, normal and position are read.
-      Differentiable.
-    - `camera`, `material`: those of the frame. The surface is taken to shine as the material does: maps of `specular` and
-      `roughness` are not among the buffers.
+    - `frame`: from `splatjax.render` or `render_texture_space`; its irradiance, albedo, depth,
+      normal and position are read. Differentiable.
+    - `camera`, `material`: those of the frame. The surface is taken to shine as the material does:
+      maps of `specular` and `roughness` are not among the buffers.
     - `kernel`: `GaussianPasses()` when not given.
 
     **Returns:** the frame with other `layers`, `weights`, `diffuse` and `beauty`.
@@ -144,9 +165,16 @@ def diffuse_on_screen(frame: Frame, camera: Camera, material: Material, kernel: 
     layers, weights = kernel.diffuse(light, material.gaussians)
     to_eye = view.position[None, None] - frame.position
     surface = _shading.SurfacePoints(
-        frame.position, frame.normal, _shading.unit_normals(to_eye), material.specular, material.roughness, []
+        frame.position,
+        frame.normal,
+        _shading.unit_normals(to_eye),
+        material.specular,
+        material.roughness,
+        [],
     )
-    post = frame.coverage * _shading.leaving_share(surface, _shading.fresnel_f0(material.eta)) / jnp.pi
+    post = (
+        frame.coverage * _shading.leaving_share(surface, _shading.fresnel_f0(material.eta)) / jnp.pi
+    )
     layers = (post[..., None] * root)[None] * layers.transpose(0, 2, 3, 1)
     diffuse = jnp.sum(weights[:, None, None] * layers, axis=0)
     beauty = frame.beauty - frame.diffuse + diffuse
@@ -158,7 +186,9 @@ def diffuse_on_screen(frame: Frame, camera: Camera, material: Material, kernel: 
 
 
 def _follows(depth: Float[Array, "height width"], reach: Float[Array, ""]):
-    """Give how much a tap counts whose depth differs: less and less up to `reach` mm, nothing where there is no surface."""
+    """Give how much a tap counts whose depth differs: less and less up to `reach` mm, nothing where
+    there is no surface.
+    """
     return lambda tap: jnp.where(tap > 0, jnp.clip(1 - jnp.abs(tap - depth) / reach, 0, 1), 0.0)
 
 
@@ -169,9 +199,13 @@ def _fetch(
     offset: Float[Array, "height width"],
     axis: int,
 ) -> tuple[Float[Array, "rows height width"], Float[Array, "height width"]]:
-    """Fetch what is trusted so many pixels beside each pixel, and how much is, linearly between two; at the border, the last."""
+    """Fetch what is trusted so many pixels beside each pixel, and how much is, linearly between
+    two; at the border, the last.
+    """
     size = depth.shape[axis]
-    index = jnp.broadcast_to(jnp.expand_dims(jnp.arange(size, dtype=offset.dtype), 1 - axis), depth.shape)
+    index = jnp.broadcast_to(
+        jnp.expand_dims(jnp.arange(size, dtype=offset.dtype), 1 - axis), depth.shape
+    )
     place = jnp.clip(index + offset, 0, size - 1)
     first = jnp.clip(jnp.floor(place).astype(jnp.int32), 0, size - 2)
     beside = place - first.astype(place.dtype)

@@ -1,4 +1,6 @@
-"""Texture-space diffusion (d'Eon and Luebke 2007): light is blurred in the texture of a mesh, Gaussian by Gaussian."""
+"""Texture-space diffusion (d'Eon and Luebke 2007): light is blurred in the texture of a mesh,
+Gaussian by Gaussian.
+"""
 
 import abc
 
@@ -17,7 +19,8 @@ from ._mesh_raster import Landing, see_faces
 from ._textured_mesh import SurfaceTexels, TexturedMesh, look_up_charts, surface_texels
 from ._translucent import AbstractThinParts, FarSide, TranslucentShadowMap
 
-_WIDEST = 0.995  # share of the texels whose blur is as wide as asked for; what is wider than theirs is cut
+# share of the texels whose blur is as wide as asked for; what is wider than theirs is cut
+_WIDEST = 0.995
 _SUPPORT = 3.75  # standard deviations
 
 
@@ -26,7 +29,10 @@ class AbstractStretch(eqx.Module):
 
     @abc.abstractmethod
     def millimeters(
-        self, along_u: Float[Array, "height width"], along_v: Float[Array, "height width"], valid: Float[Array, "height width"]
+        self,
+        along_u: Float[Array, "height width"],
+        along_v: Float[Array, "height width"],
+        valid: Float[Array, "height width"],
     ) -> tuple[Float[Array, "height width"], Float[Array, "height width"]]:
         """Give what the blur takes for a texel's extent along u and v, mm, of what it is."""
 
@@ -73,8 +79,9 @@ class TextureLayers(eqx.Module):
     - `layers`: one per Gaussian, as `L_k` of pass 4; 0 between the charts.
     - `valid`: 1 on the charts.
     - `entering`: the light before it spreads.
-    - `renormalized`: per Gaussian, the share of its weight that fell between the charts and beyond the texture, on average over
-      the texels: light is not lost there, but neither does it cross a seam.
+    - `renormalized`: per Gaussian, the share of its weight that fell between the charts and beyond
+      the texture, on average over the texels: light is not lost there, but neither does it cross a
+      seam.
     - `needed`: what the plan lacks, above 1.
     """
 
@@ -92,7 +99,9 @@ def lay_out(mesh: TexturedMesh, resolution: int, room: int) -> SurfaceTexels:
 
 
 def stretch_map(mesh: TexturedMesh, texels: SurfaceTexels) -> Float[Array, "2 height width"]:
-    """Give the extent of every texel along u and along v, mm; that of an average one between the charts."""
+    """Give the extent of every texel along u and along v, mm; that of an average one between the
+    charts.
+    """
     seen = texels.seen
     along = jnp.stack(mesh.lengths())[:, seen.faces] / seen.faces.shape[0]
     valid = seen.covered.astype(along.dtype)
@@ -101,14 +110,24 @@ def stretch_map(mesh: TexturedMesh, texels: SurfaceTexels) -> Float[Array, "2 he
 
 
 def reaches_of(
-    variances: Float[Array, " gaussians"], extents: Float[Array, "2 height width"], valid: Float[Array, "height width"]
+    variances: Float[Array, " gaussians"],
+    extents: Float[Array, "2 height width"],
+    valid: Float[Array, "height width"],
 ) -> tuple[int, ...]:
-    """Give how far each step of the blurs must reach, texels, for concrete variances and extents; per step first u, then v."""
+    """Give how far each step of the blurs must reach, texels, for concrete variances and extents;
+    per step first u, then v.
+    """
     widths = np.sqrt(np.diff(np.sort(np.asarray(variances, np.float64)), prepend=0.0))
     there = np.asarray(valid) > 0
-    smallest = [max(float(np.quantile(np.asarray(each)[there], 1 - _WIDEST)), 1e-6) for each in extents]
+    smallest = [
+        max(float(np.quantile(np.asarray(each)[there], 1 - _WIDEST)), 1e-6) for each in extents
+    ]
     limit = there.shape[0] // 4
-    return tuple(min(int(np.ceil(_SUPPORT * width / each)) + 1, limit) for width in widths for each in smallest)
+    return tuple(
+        min(int(np.ceil(_SUPPORT * width / each)) + 1, limit)
+        for width in widths
+        for each in smallest
+    )
 
 
 def diffuse_in_texture(
@@ -121,8 +140,9 @@ def diffuse_in_texture(
 ) -> TextureLayers:
     r"""Diffuse light in the texture of a mesh.
 
-    The irradiance map is blurred along u and along v by what one variance has more than the one before, so that layer k is
-    blurred by all of `v_k`; the stretch map is blurred with it. Weights are divided by what of them lies on the charts.
+    The irradiance map is blurred along u and along v by what one variance has more than the one
+    before, so that layer k is blurred by all of `v_k`; the stretch map is blurred with it. Weights
+    are divided by what of them lies on the charts.
 
     **Arguments:**
 
@@ -131,8 +151,8 @@ def diffuse_in_texture(
     - `material`: its Gaussians, in any order. Differentiable.
     - `reaches`: from `reaches_of`. Static.
 
-    **Returns:** `TextureLayers`. Constant light stays constant, and layers lie between the least and the greatest irradiance,
-    where the normalization's gain is 1.
+    **Returns:** `TextureLayers`. Constant light stays constant, and layers lie between the least
+    and the greatest irradiance, where the normalization's gain is 1.
 
     **Source:** d'Eon, Luebke and Enderton 2007; d'Eon and Luebke 2007 (GPU Gems 3, chapter 14).
     """
@@ -141,7 +161,9 @@ def diffuse_in_texture(
     extents = stretch_map(mesh, texels)
     taken = jnp.stack(settings.stretch.millimeters(*extents, valid))
     variances = material.gaussians.variances
-    average = jnp.sqrt(jnp.sum(valid * extents[0] * extents[1]) / jnp.sum(valid)) * settings.resolution
+    average = (
+        jnp.sqrt(jnp.sum(valid * extents[0] * extents[1]) / jnp.sum(valid)) * settings.resolution
+    )
     far = settings.thin_parts.far_side(texels, light, jnp.sqrt(jnp.max(variances)), average)
     rows = [texels.picture(entering.source.T).transpose(2, 0, 1), taken]
     if far is not None:
@@ -151,7 +173,9 @@ def diffuse_in_texture(
     means, exits, lost = [], [], []
     for step in range(len(variances)):
         variance = variances[order[step]]
-        blurred, kept = _spread(blurred, valid, variance - spent, channels, reaches[2 * step : 2 * step + 2])
+        blurred, kept = _spread(
+            blurred, valid, variance - spent, channels, reaches[2 * step : 2 * step + 2]
+        )
         spent = variance
         own = blurred[:channels].reshape(channels, -1)
         mean, exit_ = _with_far_side(own, blurred[channels + 2 :], far, valid, variance, settings)
@@ -161,7 +185,8 @@ def diffuse_in_texture(
     back = jnp.argsort(order)
     layers = _normalized(jnp.stack(means)[back], jnp.stack(exits)[back], texels, material, settings)
     return TextureLayers(
-        layers=texels.picture(layers.transpose(2, 0, 1)).transpose(2, 0, 1, 3) * valid[None, :, :, None],
+        layers=texels.picture(layers.transpose(2, 0, 1)).transpose(2, 0, 1, 3)
+        * valid[None, :, :, None],
         valid=valid,
         entering=entering,
         renormalized=jnp.cumsum(jnp.stack(lost))[back],
@@ -169,20 +194,30 @@ def diffuse_in_texture(
     )
 
 
-def look_up_layers(texture: TextureLayers, uvs: Float[Array, "points 2"]) -> Float[Array, "gaussians points channels"]:
+def look_up_layers(
+    texture: TextureLayers, uvs: Float[Array, "points 2"]
+) -> Float[Array, "gaussians points channels"]:
     """Give the layers at texture coordinates, bilinearly by the texels on the charts."""
     gaussians, height, width, channels = texture.layers.shape
     picture = texture.layers.transpose(1, 2, 0, 3).reshape(height, width, -1)
-    return look_up_charts(picture, texture.valid, uvs).reshape(-1, gaussians, channels).transpose(1, 0, 2)
+    return (
+        look_up_charts(picture, texture.valid, uvs)
+        .reshape(-1, gaussians, channels)
+        .transpose(1, 0, 2)
+    )
 
 
 def _spread(rows, valid, variance, channels: int, reaches: tuple[int, ...]):
-    """Blur along u and along v, each by the stretch there; give also how much of the weights was on the charts."""
+    """Blur along u and along v, each by the stretch there; give also how much of the weights was on
+    the charts.
+    """
     kept = valid
     for axis, extent, reach in ((1, channels, reaches[0]), (0, channels + 1, reaches[1])):
         size = jnp.where(valid > 0, rows[extent], 1.0)
         widest = (reach / _SUPPORT) ** 2
-        found = blur_along(axis, rows, valid, _as_it_is, jnp.minimum(variance / (size * size), widest), reach)
+        found = blur_along(
+            axis, rows, valid, _as_it_is, jnp.minimum(variance / (size * size), widest), reach
+        )
         rows = found.renormalized() * valid[None]
         kept = kept * found.trusted / found.total
     return rows, kept
@@ -192,8 +227,12 @@ def _as_it_is(guide):
     return guide
 
 
-def _with_far_side(own, nearness, far: FarSide | None, valid, variance, settings: TextureSpaceSettings):
-    """Give mean and exits: the texel's own surroundings, and what comes through from the far side."""
+def _with_far_side(
+    own, nearness, far: FarSide | None, valid, variance, settings: TextureSpaceSettings
+):
+    """Give mean and exits: the texel's own surroundings, and what comes through from the far
+    side.
+    """
     if far is None:
         return own, jnp.ones_like(own[:1])
     depth = settings.normalization.depths(variance[None])[0]
@@ -206,10 +245,16 @@ def _with_far_side(own, nearness, far: FarSide | None, valid, variance, settings
     return total / weight, weight
 
 
-def _normalized(means, exits, texels: SurfaceTexels, material: Material, settings: TextureSpaceSettings):
+def _normalized(
+    means, exits, texels: SurfaceTexels, material: Material, settings: TextureSpaceSettings
+):
     weights = material.gaussians.weights
     albedo = texels.points.albedo
     albedo = jnp.ones((1, *means.shape[1:]), means.dtype) if albedo is None else albedo.T[None]
-    once = (material.total_reflectance() - material.gaussians.total_reflectance())[:, None] * albedo[0]
-    gain = settings.normalization.gain(exits, material.gaussians.variances, weights[:, :, None] * albedo, once)
+    once = (material.total_reflectance() - material.gaussians.total_reflectance())[
+        :, None
+    ] * albedo[0]
+    gain = settings.normalization.gain(
+        exits, material.gaussians.variances, weights[:, :, None] * albedo, once
+    )
     return gain * means

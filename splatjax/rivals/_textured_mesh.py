@@ -37,23 +37,40 @@ class TexturedMesh(eqx.Module):
     def of(cls, mesh: Mesh, textures: Textures | None = None) -> "TexturedMesh":
         """Put a mesh and its textures on the device, in JAX's default precision.
 
-        **Raises:** `ValueError` for a mesh without texture coordinates, or with some outside the unit square.
+        **Raises:** `ValueError` for a mesh without texture coordinates, or with some outside the
+        unit square.
         """
         if mesh.uvs is None:
-            raise ValueError("the mesh has no texture coordinates, so light has no texture to be diffused in; give one with UVs")
+            raise ValueError(
+                "the mesh has no texture coordinates, so light has no texture to be diffused in; "
+                "give one with UVs"
+            )
         low, high = float(mesh.uvs.min()), float(mesh.uvs.max())
         if low < -_OUTSIDE or high > 1 + _OUTSIDE:
             raise ValueError(
-                f"the mesh's texture coordinates reach from {low:g} to {high:g}; light is diffused in the unit square alone: "
+                f"the mesh's texture coordinates reach from {low:g} to {high:g}; light is diffused "
+                "in the unit square alone: "
                 "scale or move the charts into it"
             )
 
         def there(values):
-            return None if values is None else jnp.asarray(np.asarray(values, np.float64), dtype=float)
+            return (
+                None if values is None else jnp.asarray(np.asarray(values, np.float64), dtype=float)
+            )
 
-        maps = () if textures is None else (textures.albedo, textures.specular, textures.roughness, textures.normal)
+        maps = (
+            ()
+            if textures is None
+            else (textures.albedo, textures.specular, textures.roughness, textures.normal)
+        )
         vertices, normals, uvs = (there(each) for each in (mesh.vertices, mesh.normals, mesh.uvs))
-        return cls(vertices, jnp.asarray(mesh.faces, jnp.int32), normals, uvs, *(there(each) for each in maps))
+        return cls(
+            vertices,
+            jnp.asarray(mesh.faces, jnp.int32),
+            normals,
+            uvs,
+            *(there(each) for each in maps),
+        )
 
     def corners(self) -> Float[Array, "faces 3 3"]:
         """Give the positions of each triangle's corners, mm."""
@@ -73,18 +90,28 @@ class TexturedMesh(eqx.Module):
         return Bounds(center, 1.001 * jnp.sqrt(jnp.max(jnp.sum(offset * offset, axis=1))))
 
     def lengths(self) -> tuple[Float[Array, " faces"], Float[Array, " faces"]]:
-        """Give how many mm of the surface a step of one along u, and along v, is; 0 on a face without a chart."""
+        """Give how many mm of the surface a step of one along u, and along v, is; 0 on a face
+        without a chart.
+        """
         along_u, along_v, _ = self._along()
         return jnp.linalg.norm(along_u, axis=1), jnp.linalg.norm(along_v, axis=1)
 
-    def _along(self) -> tuple[Float[Array, "faces 3"], Float[Array, "faces 3"], Float[Array, " faces"]]:
-        """Give the derivatives of the position in u and v, and twice the area of the chart, negative where it is mirrored."""
+    def _along(
+        self,
+    ) -> tuple[Float[Array, "faces 3"], Float[Array, "faces 3"], Float[Array, " faces"]]:
+        """Give the derivatives of the position in u and v, and twice the area of the chart,
+        negative where it is mirrored.
+        """
         corners = self.corners()
         edges, steps = corners[:, 1:] - corners[:, :1], self.uvs[:, 1:] - self.uvs[:, :1]
         doubled = steps[:, 0, 0] * steps[:, 1, 1] - steps[:, 0, 1] * steps[:, 1, 0]
         inverse = jnp.where(doubled != 0, 1 / jnp.where(doubled != 0, doubled, 1.0), 0.0)[:, None]
-        along_u = inverse * (steps[:, 1, 1, None] * edges[:, 0] - steps[:, 0, 1, None] * edges[:, 1])
-        along_v = inverse * (steps[:, 0, 0, None] * edges[:, 1] - steps[:, 1, 0, None] * edges[:, 0])
+        along_u = inverse * (
+            steps[:, 1, 1, None] * edges[:, 0] - steps[:, 0, 1, None] * edges[:, 1]
+        )
+        along_v = inverse * (
+            steps[:, 0, 0, None] * edges[:, 1] - steps[:, 1, 0, None] * edges[:, 0]
+        )
         return along_u, along_v, doubled
 
 
@@ -102,11 +129,14 @@ class SurfaceTexels(eqx.Module):
 
 
 def surface_texels(mesh: TexturedMesh, landing: Landing, seen: SeenFaces) -> SurfaceTexels:
-    """Give position, normal and textures of what every pixel of a landing sees. Differentiable in the mesh and the landing.
+    """Give position, normal and textures of what every pixel of a landing sees. Differentiable in
+    the mesh and the landing.
 
     Where a pixel sees nothing, position and normal are 0.
     """
-    points, uvs = surface_points(mesh, seen.faces.reshape(-1), barycentrics(landing, seen).reshape(-1, 3))
+    points, uvs = surface_points(
+        mesh, seen.faces.reshape(-1), barycentrics(landing, seen).reshape(-1, 3)
+    )
     there = seen.covered.reshape(-1, 1)
     centers, normals = jnp.where(there, points.centers, 0.0), jnp.where(there, points.normals, 0.0)
     points = eqx.tree_at(lambda each: (each.centers, each.normals), points, (centers, normals))
@@ -116,7 +146,8 @@ def surface_texels(mesh: TexturedMesh, landing: Landing, seen: SeenFaces) -> Sur
 def surface_points(
     mesh: TexturedMesh, faces: Int[Array, " points"], shares: Float[Array, "points 3"]
 ) -> tuple[Splats, Float[Array, "points 2"]]:
-    r"""Give points of a mesh with its textures, as splats without extent, and their texture coordinates. Differentiable.
+    r"""Give points of a mesh with its textures, as splats without extent, and their texture
+    coordinates. Differentiable.
 
     **Arguments:**
 
@@ -129,14 +160,19 @@ def surface_points(
     if mesh.normal is not None:
         normals = _perturbed(mesh, faces, normals, look_up(mesh.normal, uvs))
     albedo, specular, roughness = (
-        None if each is None else look_up(each, uvs) for each in (mesh.albedo, mesh.specular, mesh.roughness)
+        None if each is None else look_up(each, uvs)
+        for each in (mesh.albedo, mesh.specular, mesh.roughness)
     )
     nothing = jnp.zeros(len(faces), positions.dtype)
     return Splats(positions, normals, nothing, nothing, albedo, specular, roughness), uvs
 
 
-def look_up(picture: Float[Array, "h w *channels"], uvs: Float[Array, "points 2"]) -> Float[Array, "points *channels"]:
-    """Look a picture up at texture coordinates (v up), bilinearly between the centers of its pixels, repeating it."""
+def look_up(
+    picture: Float[Array, "h w *channels"], uvs: Float[Array, "points 2"]
+) -> Float[Array, "points *channels"]:
+    """Look a picture up at texture coordinates (v up), bilinearly between the centers of its
+    pixels, repeating it.
+    """
     height, width = picture.shape[:2]
     weights, rows, columns = _four(uvs, height, width)
     trailing = (slice(None), *(None,) * (picture.ndim - 2))
@@ -149,10 +185,15 @@ def look_up(picture: Float[Array, "h w *channels"], uvs: Float[Array, "points 2"
 def look_up_charts(
     picture: Float[Array, "h w channels"], valid: Float[Array, "h w"], uvs: Float[Array, "points 2"]
 ) -> Float[Array, "points channels"]:
-    """Look a picture up that is known on the charts alone (`valid` 1, not 0): by the texels that are; 0 where none is."""
+    """Look a picture up that is known on the charts alone (`valid` 1, not 0): by the texels that
+    are; 0 where none is.
+    """
     height, width = picture.shape[:2]
     weights, rows, columns = _four(uvs, height, width)
-    total, share = jnp.zeros((len(uvs), picture.shape[2]), picture.dtype), jnp.zeros(len(uvs), picture.dtype)
+    total, share = (
+        jnp.zeros((len(uvs), picture.shape[2]), picture.dtype),
+        jnp.zeros(len(uvs), picture.dtype),
+    )
     for weight, row, column in zip(weights, rows, columns, strict=True):
         at = jnp.clip(row, 0, height - 1), jnp.clip(column, 0, width - 1)
         known = weight * valid[at]
@@ -170,7 +211,12 @@ def _four(uvs: Float[Array, "points 2"], height: int, width: int):
     return weights, (top, top, top + 1, top + 1), (left, left + 1, left, left + 1)
 
 
-def _perturbed(mesh: TexturedMesh, faces: Int[Array, " points"], normals: Float[Array, "points 3"], tangent_space):
+def _perturbed(
+    mesh: TexturedMesh,
+    faces: Int[Array, " points"],
+    normals: Float[Array, "points 3"],
+    tangent_space,
+):
     """Turn tangent-space normals into world space, as `splatjax.geometry` does for splats."""
     along_u, _, doubled = mesh._along()
     along_u, handedness = along_u[faces], jnp.sign(doubled)[faces][:, None]

@@ -1,4 +1,6 @@
-"""Layers from fewer splats, as the paper has it: the others are left out, and those that stay stand for them."""
+"""Layers from fewer splats, as the paper has it: the others are left out, and those that stay stand
+for them.
+"""
 
 from collections.abc import Sequence
 
@@ -13,7 +15,8 @@ from splatjax.splatting import Atlas
 
 
 class ThinnedDiffuser(AbstractDiffuser):
-    r"""Sums over every `keep`-th splat alone. What is kept lies evenly where nearby splats are near in memory.
+    r"""Sums over every `keep`-th splat alone. What is kept lies evenly where nearby splats are near
+    in memory.
 
     The renderer's own `ClusterDiffuser` merges splats instead, which errs far less for as many.
 
@@ -29,7 +32,11 @@ class ThinnedDiffuser(AbstractDiffuser):
     whole: AbstractDiffuser = DenseDiffuser()
 
     def planned(
-        self, splats: Splats, kernels: Kernels, interval: Float[Array, "2"], atlases: Sequence[Atlas]
+        self,
+        splats: Splats,
+        kernels: Kernels,
+        interval: Float[Array, "2"],
+        atlases: Sequence[Atlas],
     ) -> "ThinnedDiffuser":
         kept = jax.tree.map(lambda rows: rows[:: self.keep], splats)
         return ThinnedDiffuser(self.keep, self.whole.planned(kept, kernels, interval, atlases))
@@ -43,7 +50,11 @@ class ThinnedDiffuser(AbstractDiffuser):
         atlas: Atlas,
     ) -> Diffused:
         kept = jax.tree.map(lambda rows: rows[..., :: self.keep], sources)
-        larger = eqx.tree_at(lambda kept: kept.areas, kept, kept.areas * (jnp.sum(sources.areas) / jnp.sum(kept.areas)))
+        larger = eqx.tree_at(
+            lambda kept: kept.areas,
+            kept,
+            kept.areas * (jnp.sum(sources.areas) / jnp.sum(kept.areas)),
+        )
         return self.whole.diffuse(larger, kernels, points, covered, atlas)
 
     def in_forward_mode(self) -> "ThinnedDiffuser":

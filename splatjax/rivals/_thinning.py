@@ -1,4 +1,6 @@
-"""The law of Figure 5: how much a layer errs when it is made of fewer splats, and how many are enough."""
+"""The law of Figure 5: how much a layer errs when it is made of fewer splats, and how many are
+enough.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -12,17 +14,22 @@ _AT_ONCE = 8
 
 
 def thinning_error(
-    width: Float[Array, "..."], spacing: Float[Array, "..."], ratio: Float[Array, "..."], contrast: Float[Array, "..."]
+    width: Float[Array, "..."],
+    spacing: Float[Array, "..."],
+    ratio: Float[Array, "..."],
+    contrast: Float[Array, "..."],
 ) -> Float[Array, "..."]:
-    r"""Give the error of a layer that is made of a part of the splats, spread evenly: root mean square, of the layer's own.
+    r"""Give the error of a layer that is made of a part of the splats, spread evenly: root mean
+    square, of the layer's own.
 
         E = 0.2 s x^(3/2) (1 - q)^(1/2),    x = (h / sigma) q^(-1/2)
 
-    What counts is `x`, the spacing of the splats that stay in widths of the layer: where a radius is amplified a-fold, `1 / a^2`
-    of the splats serve as well, as Figure 5 shows. A layer averages over `4 pi / x^2` of them. Were splats left out at random,
-    each would err by `s`, and the mean by `s x (1 - q)^(1/2) / (2 sqrt(pi))`, with nothing to fit. Evenly spread, each
-    stands for a cell around it and errs chiefly where an edge of light crosses the cell. That is a share of `x` of the cells,
-    so that the error falls by another `x^(1/2)`; the factor is fitted.
+    What counts is `x`, the spacing of the splats that stay in widths of the layer: where a radius
+    is amplified a-fold, `1 / a^2` of the splats serve as well, as Figure 5 shows. A layer averages
+    over `4 pi / x^2` of them. Were splats left out at random, each would err by `s`, and the mean
+    by `s x (1 - q)^(1/2) / (2 sqrt(pi))`, with nothing to fit. Evenly spread, each stands for a
+    cell around it and errs chiefly where an edge of light crosses the cell. That is a share of `x`
+    of the cells, so that the error falls by another `x^(1/2)`; the factor is fitted.
 
     **Arguments:**
 
@@ -31,7 +38,8 @@ def thinning_error(
     - `ratio`: of the splats that stay, in (0, 1].
     - `contrast`: `s`, from `layer_contrast`.
 
-    **Returns:** within a factor of 1.5 of what is measured, in 99% of 234 layers with `x` up to 2.2 (docs/figures.md).
+    **Returns:** within a factor of 1.5 of what is measured, in 99% of 234 layers with `x` up to 2.2
+    (docs/figures.md).
 
     **Source:** fitted; Kim et al. 2010, Figure 5, which it explains.
     """
@@ -40,9 +48,13 @@ def thinning_error(
 
 
 def splats_that_suffice(
-    width: Float[Array, "..."], spacing: Float[Array, "..."], error: Float[Array, "..."], contrast: Float[Array, "..."]
+    width: Float[Array, "..."],
+    spacing: Float[Array, "..."],
+    error: Float[Array, "..."],
+    contrast: Float[Array, "..."],
 ) -> Float[Array, "..."]:
-    r"""Give the ratio of the splats of which a layer errs by no more than `error`: the inverse of `thinning_error`.
+    r"""Give the ratio of the splats of which a layer errs by no more than `error`: the inverse of
+    `thinning_error`.
 
     To the root `(1 - q)^(1/2)`, which counts as 1: a little too many, where most of them stay.
 
@@ -55,11 +67,13 @@ def splats_that_suffice(
 
 
 @jax.jit
-def layer_contrast(splats: Splats, source: Float[Array, "splats channels"], variance: Float[Array, ""]) -> Float[Array, ""]:
+def layer_contrast(
+    splats: Splats, source: Float[Array, "splats channels"], variance: Float[Array, ""]
+) -> Float[Array, ""]:
     r"""Give how uneven light is within the width of a layer: `s`, of the layer's root mean square.
 
-    The standard deviation of the light under `G(v / 2, r)`, which is the square of the layer's Gaussian; root mean square over
-    512 splats, evenly chosen, and over the channels.
+    The standard deviation of the light under `G(v / 2, r)`, which is the square of the layer's
+    Gaussian; root mean square over 512 splats, evenly chosen, and over the channels.
 
     **Arguments:**
 

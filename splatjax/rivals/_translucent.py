@@ -1,4 +1,6 @@
-"""What a texture-space method knows of the far side of thin parts: nothing, or what a translucent shadow map tells."""
+"""What a texture-space method knows of the far side of thin parts: nothing, or what a translucent
+shadow map tells.
+"""
 
 import abc
 
@@ -12,7 +14,9 @@ from splatjax.splatting import SIDE, TileGrid
 from ._mesh_light import MeshLight, MeshShadow
 from ._textured_mesh import SurfaceTexels
 
-_APART = 6.0  # standard deviations of a layer, in the texture, between two texels that the blur does not bring together
+# standard deviations of a layer, in the texture, between two texels that the blur does not bring
+# together
+_APART = 6.0
 
 
 class FarSide(eqx.Module):
@@ -26,8 +30,15 @@ class FarSide(eqx.Module):
     scale: Float[Array, ""]
     """mm."""
 
-    def share(self, nearness: Float[Array, "lights points"], variance: Float[Array, ""], depth: Float[Array, ""]):
-        """Give what the far side weighs against the texel's own surroundings, `[lights, points]`, in a layer."""
+    def share(
+        self,
+        nearness: Float[Array, "lights points"],
+        variance: Float[Array, ""],
+        depth: Float[Array, ""],
+    ):
+        """Give what the far side weighs against the texel's own surroundings, `[lights, points]`,
+        in a layer.
+        """
         there = nearness > 0
         thickness = -self.scale * jnp.log(jnp.where(there, nearness, 1.0))
         beyond = thickness - depth  # the source lies below its own surface, so nearer to this one
@@ -41,9 +52,15 @@ class AbstractThinParts(eqx.Module):
 
     @abc.abstractmethod
     def far_side(
-        self, texels: SurfaceTexels, light: MeshLight, widest: Float[Array, ""], millimeters: Float[Array, ""]
+        self,
+        texels: SurfaceTexels,
+        light: MeshLight,
+        widest: Float[Array, ""],
+        millimeters: Float[Array, ""],
     ) -> FarSide | None:
-        """Find the far side of each texel; `widest` is the widest layer's standard deviation, `millimeters` a texture's edge."""
+        """Find the far side of each texel; `widest` is the widest layer's standard deviation,
+        `millimeters` a texture's edge.
+        """
 
 
 class OpaqueParts(AbstractThinParts):
@@ -54,23 +71,32 @@ class OpaqueParts(AbstractThinParts):
 
 
 class TranslucentShadowMap(AbstractThinParts):
-    r"""A shadow map that tells where in the texture the light went in, and how far away that is (modified, of d'Eon and Luebke).
+    r"""A shadow map that tells where in the texture the light went in, and how far away that is
+    (modified, of d'Eon and Luebke).
 
-    A Gaussian is separable in depth too: what comes through is the light of the far side, already blurred there, times
-    `exp(-d^2 / 2v)`. The thickness `d` is measured along the light, shortened by the cosine where the two sides face apart,
-    and blurred with the light; texels that face the light, or that are lit as far as the shadow map can tell, have no far side.
-    Where the far side is close in the texture the blur has brought its light already.
+    A Gaussian is separable in depth too: what comes through is the light of the far side, already
+    blurred there, times `exp(-d^2 / 2v)`. The thickness `d` is measured along the light, shortened
+    by the cosine where the two sides face apart, and blurred with the light; texels that face the
+    light, or that are lit as far as the shadow map can tell, have no far side. Where the far side
+    is close in the texture the blur has brought its light already.
 
-    **Source:** d'Eon and Luebke 2007 (GPU Gems 3, chapter 14.5), after Dachsbacher and Stamminger 2003.
+    **Source:** d'Eon and Luebke 2007 (GPU Gems 3, chapter 14.5), after Dachsbacher and Stamminger
+    2003.
     """
 
     def far_side(self, texels, light, widest, millimeters):
-        found = [self._of(texels, each, light.settings.bias, widest) for each in light.shadows if each is not None]
+        found = [
+            self._of(texels, each, light.settings.bias, widest)
+            for each in light.shadows
+            if each is not None
+        ]
         if not found:
             return None
         uvs, nearness = (jnp.stack(each) for each in zip(*found, strict=True))
         offset = uvs - texels.uvs[None]
-        return FarSide(uvs, nearness, millimeters * jnp.sqrt(jnp.sum(offset * offset, axis=2)), widest)
+        return FarSide(
+            uvs, nearness, millimeters * jnp.sqrt(jnp.sum(offset * offset, axis=2)), widest
+        )
 
     def _of(self, texels: SurfaceTexels, shadow: MeshShadow, bias: float, scale: Float[Array, ""]):
         view, front = shadow.view, shadow.surfaces.front
@@ -80,7 +106,9 @@ class TranslucentShadowMap(AbstractThinParts):
         row = jnp.clip(stop_gradient(jnp.floor(y)).astype(jnp.int32), 0, view.height - 1)
         tile, pixel = jnp.divmod(TileGrid(view.width, view.height).pixel(column, row), SIDE**2)
         entered, lit = front.attributes[tile, :, pixel].T, front.coverage[tile, pixel] > 0
-        entry = view.unproject(x, y, jnp.where(lit, jnp.minimum(front.depth[tile, pixel], depth), depth)).T
+        entry = view.unproject(
+            x, y, jnp.where(lit, jnp.minimum(front.depth[tile, pixel], depth), depth)
+        ).T
         squared = jnp.sum((points - entry) ** 2, axis=1)
         way = jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1.0)), 0.0)
         wi, _ = shadow.light.incidence(points)

@@ -10,7 +10,9 @@ from ._quadrature import unit_interval
 
 
 class Response(eqx.Module):
-    """Reflectance and transmittance of a stack of layers in the Hankel domain, for light from above and from below."""
+    """Reflectance and transmittance of a stack of layers in the Hankel domain, for light from above
+    and from below.
+    """
 
     reflectance_above: Float[Array, "*shape"]
     transmittance_down: Float[Array, "*shape"]
@@ -18,7 +20,8 @@ class Response(eqx.Module):
     transmittance_up: Float[Array, "*shape"]
 
     def over(self, lower: "Response") -> "Response":
-        """Lay this on another: light goes to and fro between them, and the geometric series is summed.
+        """Lay this on another: light goes to and fro between them, and the geometric series is
+        summed.
 
         **Source:** Donner and Jensen 2005 (adding, after Kubelka).
         """
@@ -34,7 +37,9 @@ class Response(eqx.Module):
 
 
 def film_response(film: Film, lit_by_beam: bool, shape: tuple[int, ...]) -> Response:
-    """Give the response of a film; `lit_by_beam` where no layer above it has scattered the light that comes down."""
+    """Give the response of a film; `lit_by_beam` where no layer above it has scattered the light
+    that comes down.
+    """
     depth = jnp.broadcast_to(film.optical_depth, shape)
     diffuse = diffuse_transmittance(depth)
     none = jnp.zeros(shape, depth.dtype)
@@ -42,8 +47,13 @@ def film_response(film: Film, lit_by_beam: bool, shape: tuple[int, ...]) -> Resp
 
 
 def diffuse_transmittance(optical_depth: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """Give `2 E3(t)`, the integral of `2 mu exp(-t / mu)` over the cosine: 1 at t = 0, with the derivative -2."""
-    mu, _, weights = (jnp.asarray(each, optical_depth.dtype).reshape(-1, *[1] * optical_depth.ndim) for each in unit_interval())
+    """Give `2 E3(t)`, the integral of `2 mu exp(-t / mu)` over the cosine: 1 at t = 0, with the
+    derivative -2.
+    """
+    mu, _, weights = (
+        jnp.asarray(each, optical_depth.dtype).reshape(-1, *[1] * optical_depth.ndim)
+        for each in unit_interval()
+    )
     return jnp.sum(2 * weights * mu * jnp.exp(-optical_depth[None] / mu), axis=0)
 
 
@@ -57,8 +67,8 @@ def slab_response(
 ) -> Response:
     r"""Give the response of a slab: the infinite series of Donner and Jensen's multipole, summed.
 
-    With `s^2 = sigma_tr^2 + k^2`, `l = 1 / sigma_t'`, extrapolated boundaries `z_a` above and `z_b` below, and
-    `H = d + z_a + z_b`,
+    With `s^2 = sigma_tr^2 + k^2`, `l = 1 / sigma_t'`, extrapolated boundaries `z_a` above and `z_b`
+    below, and `H = d + z_a + z_b`,
 
         R(k) = alpha' sinh(s (d - l + z_b)) cosh(s z_a) / sinh(s H),
         T(k) = alpha' sinh(s (l + z_a)) cosh(s z_b) / sinh(s H),
@@ -82,7 +92,15 @@ def slab_response(
     beneath, height = thickness - depth, thickness + above + below
     albedo, depth, above, below, beneath, height, squared_sigma_tr = (
         jnp.broadcast_to(each, k.shape)
-        for each in (medium.albedo_prime, depth, above, below, beneath, height, medium.squared_sigma_tr)
+        for each in (
+            medium.albedo_prime,
+            depth,
+            above,
+            below,
+            beneath,
+            height,
+            medium.squared_sigma_tr,
+        )
     )
     u = squared_sigma_tr + k * k
 
@@ -101,12 +119,18 @@ _SMALL = 0.05**2  # of (s H)^2: below, a series in it leaves 1e-16
 
 
 def hyperbolic_ratio(
-    u: Float[Array, "..."], a: Float[Array, "..."], b: Float[Array, "..."], fall: Float[Array, "..."], height: Float[Array, "..."]
+    u: Float[Array, "..."],
+    a: Float[Array, "..."],
+    b: Float[Array, "..."],
+    fall: Float[Array, "..."],
+    height: Float[Array, "..."],
 ) -> Float[Array, "..."]:
-    r"""Give `sinh(s a) cosh(s b) / sinh(s height)` with `s = sqrt(u)`, where `height = a + b + fall` and nothing is negative.
+    r"""Give `sinh(s a) cosh(s b) / sinh(s height)` with `s = sqrt(u)`, where `height = a + b +
+    fall` and nothing is negative.
 
-    An even function of s, hence smooth in u for a finite height: a series about `u = 0` keeps its derivatives. `a` and `height`
-    may be infinite together; then it is `exp(-s fall) (1 + exp(-2 s b)) / 2`. So may `fall` and `height`; then it is 0.
+    An even function of s, hence smooth in u for a finite height: a series about `u = 0` keeps its
+    derivatives. `a` and `height` may be infinite together; then it is `exp(-s fall) (1 + exp(-2 s
+    b)) / 2`. So may `fall` and `height`; then it is 0.
     """
     finite = ~jnp.isinf(height)  # NaN is to stay
     reach = jnp.where(finite, height, 1.0)

@@ -13,16 +13,19 @@ from ._medium import Medium
 
 
 class BetterDipole(AbstractProfile):
-    r"""The dipole of d'Eon: closer to light transport than the classical one where absorption is strong.
+    r"""The dipole of d'Eon: closer to light transport than the classical one where absorption is
+    strong.
 
-    With `D = (2 sigma_a + sigma_s') / (3 sigma_t'^2)`, `sigma_tr^2 = sigma_a / D`, `A = (1 + 3 C2) / (1 - 2 C1)`,
-    `z_r = 1 / sigma_t'`, `z_v = z_r + 4 A D`, `C_phi = (1 - 2 C1) / 4` and `C_E = (1 - 3 C2) / 2`,
+    With `D = (2 sigma_a + sigma_s') / (3 sigma_t'^2)`, `sigma_tr^2 = sigma_a / D`, `A = (1 + 3 C2)
+    / (1 - 2 C1)`, `z_r = 1 / sigma_t'`, `z_v = z_r + 4 A D`, `C_phi = (1 - 2 C1) / 4` and `C_E = (1
+    - 3 C2) / 2`,
 
         R(r) = alpha' / (4 pi) * { C_phi / D [exp(-sigma_tr d_r) / d_r - exp(-sigma_tr d_v) / d_v]
-                                   + C_E * sum over z in (z_r, z_v) of z (1 + sigma_tr d) exp(-sigma_tr d) / d^3 }.
+                                   + C_E * sum over z in (z_r, z_v) of z (1 + sigma_tr d)
+                                   exp(-sigma_tr d) / d^3 }.
 
-    Differentiable in every coefficient and in `r`; the derivatives at `r = 0` and, for the profile, at `sigma_a = 0` equal the
-    one-sided limits.
+    Differentiable in every coefficient and in `r`; the derivatives at `r = 0` and, for the profile,
+    at `sigma_a = 0` equal the one-sided limits.
 
     **Attributes:**
 
@@ -52,10 +55,11 @@ class BetterDipole(AbstractProfile):
     def total_reflectance(self) -> Float[Array, " channels"]:
         r"""Give `2 pi` times the integral of `r R(r)` in closed form.
 
-            alpha' { C_phi (exp(-s z_r) - exp(-s z_v)) / (2 D s) + C_E / 2 (exp(-s z_r) + exp(-s z_v)) },  s = sigma_tr
+            alpha' { C_phi (exp(-s z_r) - exp(-s z_v)) / (2 D s) + C_E / 2 (exp(-s z_r) + exp(-s
+            z_v)) },  s = sigma_tr
 
-        **Returns:** in [0, 1]; 1 where `sigma_a = 0`, with a derivative in `sigma_a` that diverges there: autodiff's is not
-        finite.
+        **Returns:** in [0, 1]; 1 where `sigma_a = 0`, with a derivative in `sigma_a` that diverges
+        there: autodiff's is not finite.
         """
         medium = self.medium
         diffusion, squared_sigma_tr = grosjean(medium)
@@ -70,8 +74,12 @@ class BetterDipole(AbstractProfile):
 
 
 def grosjean(medium: Medium) -> tuple[Float[Array, " channels"], Float[Array, " channels"]]:
-    """Give Grosjean's diffusion coefficient (mm) and the square of the effective transport coefficient (1/mm^2)."""
-    diffusion = (2 * medium.sigma_a + medium.sigma_s_prime) / (3 * medium.sigma_t_prime * medium.sigma_t_prime)
+    """Give Grosjean's diffusion coefficient (mm) and the square of the effective transport
+    coefficient (1/mm^2).
+    """
+    diffusion = (2 * medium.sigma_a + medium.sigma_s_prime) / (
+        3 * medium.sigma_t_prime * medium.sigma_t_prime
+    )
     return diffusion, medium.sigma_a / diffusion
 
 
@@ -82,20 +90,31 @@ def _boundary(medium: Medium, fresnel: AbstractFresnel, diffusion: Float[Array, 
 
 
 def exitance_of_source(
-    medium: Medium, fresnel: AbstractFresnel, depth: Float[Array, "*shape"], squared_radius: Float[Array, "*shape"]
+    medium: Medium,
+    fresnel: AbstractFresnel,
+    depth: Float[Array, "*shape"],
+    squared_radius: Float[Array, "*shape"],
 ) -> Float[Array, "*shape"]:
-    """Give the exitance, 1/mm^2, above a point source of unit power and its image; the last axis is the channels."""
+    """Give the exitance, 1/mm^2, above a point source of unit power and its image; the last axis is
+    the channels.
+    """
     shape = depth.shape
     diffusion, squared_sigma_tr = grosjean(medium)
     factors = _boundary(medium, fresnel, diffusion)
     fluence_share, flux_share, height = (jnp.broadcast_to(each, shape) for each in factors)
-    diffusion, squared_sigma_tr = (jnp.broadcast_to(each, shape) for each in (diffusion, squared_sigma_tr))
+    diffusion, squared_sigma_tr = (
+        jnp.broadcast_to(each, shape) for each in (diffusion, squared_sigma_tr)
+    )
     image = depth + height
     near, far = squared_radius + depth * depth, squared_radius + image * image
     fluence = fluence_share / diffusion * fluence_difference(squared_sigma_tr, near, far)
 
     def flux(z, squared_distance):
-        return z * screening(squared_sigma_tr * squared_distance) / (squared_distance * jnp.sqrt(squared_distance))
+        return (
+            z
+            * screening(squared_sigma_tr * squared_distance)
+            / (squared_distance * jnp.sqrt(squared_distance))
+        )
 
     return (fluence + flux_share * (flux(depth, near) + flux(image, far))) / (4 * jnp.pi)
 
@@ -108,8 +127,11 @@ def falling_share(x: Float[Array, "..."]) -> Float[Array, "..."]:
 
 
 @jax.custom_jvp
-def fluence_difference(u: Float[Array, "..."], near: Float[Array, "..."], far: Float[Array, "..."]) -> Float[Array, "..."]:
-    r"""Give `exp(-sqrt(u near)) / sqrt(near) - exp(-sqrt(u far)) / sqrt(far)`, where near and far are squared distances.
+def fluence_difference(
+    u: Float[Array, "..."], near: Float[Array, "..."], far: Float[Array, "..."]
+) -> Float[Array, "..."]:
+    r"""Give `exp(-sqrt(u near)) / sqrt(near) - exp(-sqrt(u far)) / sqrt(far)`, where near and far
+    are squared distances.
 
     The rule is there for `u = 0`: the infinite derivatives of the two cancel.
     """
@@ -123,5 +145,10 @@ def _fluence_difference_jvp(primals, tangents):
     u_dot, near_dot, far_dot = tangents
     s, a, b = jnp.sqrt(u), jnp.sqrt(near), jnp.sqrt(far)
     along_u = -0.5 * (b - a) * jnp.exp(-s * a) * falling_share(s * (b - a))
-    along_near, along_far = -0.5 * screening(u * near) / (near * a), 0.5 * screening(u * far) / (far * b)
-    return fluence_difference(u, near, far), along_u * u_dot + along_near * near_dot + along_far * far_dot
+    along_near, along_far = (
+        -0.5 * screening(u * near) / (near * a),
+        0.5 * screening(u * far) / (far * b),
+    )
+    return fluence_difference(
+        u, near, far
+    ), along_u * u_dot + along_near * near_dot + along_far * far_dot

@@ -22,21 +22,27 @@ class AbstractBurleyScaling(eqx.Module):
 
 
 class Searchlight(AbstractBurleyScaling):
-    """For light that enters as a beam; lengths are counted in mean free paths. **Source:** Christensen and Burley 2015."""
+    """For light that enters as a beam; lengths are counted in mean free paths. **Source:**
+    Christensen and Burley 2015.
+    """
 
     def __call__(self, albedo):
         return 1.85 - albedo + 7 * jnp.abs(albedo - 0.8) ** 3
 
 
 class DiffuseTransmission(AbstractBurleyScaling):
-    """For light that enters diffusely; lengths are counted in mean free paths. **Source:** Christensen and Burley 2015, Eq. 6."""
+    """For light that enters diffusely; lengths are counted in mean free paths. **Source:**
+    Christensen and Burley 2015, Eq. 6.
+    """
 
     def __call__(self, albedo):
         return 1.9 - albedo + 3.5 * (albedo - 0.8) ** 2
 
 
 class DiffuseMeanFreePath(AbstractBurleyScaling):
-    """For light that enters as a beam; lengths are diffuse mean free paths. **Source:** Christensen and Burley 2015."""
+    """For light that enters as a beam; lengths are diffuse mean free paths. **Source:** Christensen
+    and Burley 2015.
+    """
 
     def __call__(self, albedo):
         return 3.5 + 100 * (albedo - 0.33) ** 4
@@ -55,7 +61,8 @@ class Burley(AbstractProfile):
     - `free_path`: mm, positive.
     - `scaling`: what kind of free path it is, and how light enters.
 
-    **Source:** Christensen and Burley 2015, "Approximate reflectance profiles for efficient subsurface scattering".
+    **Source:** Christensen and Burley 2015, "Approximate reflectance profiles for efficient
+    subsurface scattering".
     """
 
     albedo: Float[Array, " channels"]
@@ -83,7 +90,9 @@ class Burley(AbstractProfile):
         shape = (*r.shape, *self.albedo.shape)
         radius = jnp.broadcast_to(r[..., None], shape)
         albedo, d = (jnp.broadcast_to(each, shape) for each in (self.albedo, self.length_scale()))
-        return albedo * (jnp.exp(-radius / d) + jnp.exp(-radius / (3 * d))) / (8 * jnp.pi * d * radius)
+        return (
+            albedo * (jnp.exp(-radius / d) + jnp.exp(-radius / (3 * d))) / (8 * jnp.pi * d * radius)
+        )
 
     def total_reflectance(self) -> Float[Array, " channels"]:
         return self.albedo
@@ -94,7 +103,9 @@ class Burley(AbstractProfile):
 
     @one_program
     def reflectance_within(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
-        """Give the share that leaves within a radius (mm): `A (1 - exp(-r/d)/4 - 3 exp(-r/3d)/4)`."""
+        """Give the share that leaves within a radius (mm): `A (1 - exp(-r/d)/4 - 3
+        exp(-r/3d)/4)`.
+        """
         shape = (*r.shape, *self.albedo.shape)
         radius = jnp.broadcast_to(r[..., None], shape)
         albedo, d = (jnp.broadcast_to(each, shape) for each in (self.albedo, self.length_scale()))

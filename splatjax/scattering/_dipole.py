@@ -12,14 +12,17 @@ from ._medium import Medium
 
 
 class Dipole(AbstractProfile):
-    r"""The dipole of a semi-infinite medium: a source one mean free path below the surface, its mirror image above.
+    r"""The dipole of a semi-infinite medium: a source one mean free path below the surface, its
+    mirror image above.
 
     With `z_r = 1 / sigma_t'`, `z_v = z_r (1 + 4A/3)` and `d^2 = r^2 + z^2`,
 
-        R(r) = alpha' / (4 pi) * sum over z in (z_r, z_v) of z (1 + sigma_tr d) exp(-sigma_tr d) / d^3.
+        R(r) = alpha' / (4 pi) * sum over z in (z_r, z_v) of z (1 + sigma_tr d) exp(-sigma_tr d) /
+        d^3.
 
-    Fresnel transmission at entry and exit is not part of it. Differentiable in every coefficient and in `r`; the derivatives
-    at `r = 0` and, for the profile, at `sigma_a = 0` equal the one-sided limits.
+    Fresnel transmission at entry and exit is not part of it. Differentiable in every coefficient
+    and in `r`; the derivatives at `r = 0` and, for the profile, at `sigma_a = 0` equal the
+    one-sided limits.
 
     **Attributes:**
 
@@ -56,8 +59,9 @@ class Dipole(AbstractProfile):
 
             alpha'/2 (1 + exp(-(4/3) A s)) exp(-s),  s = sqrt(3 (1 - alpha'))
 
-        **Returns:** in [0, 1]; 1 where `sigma_a = 0`. There its derivative in `sigma_a` diverges like `-sigma_a^(-1/2)`, so that
-        what autodiff gives at `sigma_a = 0` is not finite, on purpose.
+        **Returns:** in [0, 1]; 1 where `sigma_a = 0`. There its derivative in `sigma_a` diverges
+        like `-sigma_a^(-1/2)`, so that what autodiff gives at `sigma_a = 0` is not finite, on
+        purpose.
 
         **Source:** Jensen et al. 2001, section 2.4.
         """
@@ -77,7 +81,8 @@ class Dipole(AbstractProfile):
 
 @jax.custom_jvp
 def screening(y: Float[Array, "..."]) -> Float[Array, "..."]:
-    r"""Give `(1 + sqrt y) exp(-sqrt y)`, where `y = (sigma_tr d)^2` is at least 0; its derivative is `-exp(-sqrt y) / 2`.
+    r"""Give `(1 + sqrt y) exp(-sqrt y)`, where `y = (sigma_tr d)^2` is at least 0; its derivative
+    is `-exp(-sqrt y) / 2`.
 
     The rule is there for `y = 0`: the square roots' infinite derivatives cancel.
     """

@@ -1,8 +1,10 @@
-r"""The Hankel transform of order 0 and its inverse, by a digital filter: no oscillating integral, no Bessel function.
+r"""The Hankel transform of order 0 and its inverse, by a digital filter: no oscillating integral,
+no Bessel function.
 
-In the logarithm of the radius the transform is a convolution. The kernel's Mellin transform has modulus 1, and what is
-transformed is analytic in a strip, so that sampling both at equal steps of the logarithm leaves errors of rounding only: about
-1e-15 of the largest value, whatever the shape. All is a plain sum over samples of the function, which differentiates.
+In the logarithm of the radius the transform is a convolution. The kernel's Mellin transform has
+modulus 1, and what is transformed is analytic in a strip, so that sampling both at equal steps of
+the logarithm leaves errors of rounding only: about 1e-15 of the largest value, whatever the shape.
+All is a plain sum over samples of the function, which differentiates.
 """
 
 import functools
@@ -17,7 +19,9 @@ from jaxtyping import Array, Float
 from ._quadrature import along_first_axis
 
 _STEP = 0.06  # of the logarithm: the Nyquist frequency is 52
-_PASSED = 22.0  # frequency up to which nothing is damped: exp(-pi/2 * 22) = 1e-15 bounds what lies above
+_PASSED = (
+    22.0  # frequency up to which nothing is damped: exp(-pi/2 * 22) = 1e-15 bounds what lies above
+)
 _FIRST, _LAST = -20.0, 8.0  # logarithms of the abscissas
 _NEAR = 0.05  # in units of the decay: below this radius a series about the origin takes over
 _TERMS = 8  # of that series; the ratio of two is below 0.0025
@@ -25,13 +29,16 @@ _NEAR_NODES = 120
 
 
 def hankel_transform(
-    function: Callable[[Float[Array, "..."]], Float[Array, "..."]], k: Float[Array, "*frequencies channels"]
+    function: Callable[[Float[Array, "..."]], Float[Array, "..."]],
+    k: Float[Array, "*frequencies channels"],
 ) -> Float[Array, "*frequencies channels"]:
-    r"""Give `2 pi` times the integral of `r J0(k r) f(r)`: the two-dimensional Fourier transform of a round function.
+    r"""Give `2 pi` times the integral of `r J0(k r) f(r)`: the two-dimensional Fourier transform of
+    a round function.
 
     **Arguments:**
 
-    - `function`: takes radii (mm) whose last axis is the channels, gives `f` of the same shape; smooth in the logarithm of
+    - `function`: takes radii (mm) whose last axis is the channels, gives `f` of the same shape;
+      smooth in the logarithm of
         `r`, with `r f(r)` bounded and vanishing at infinity.
     - `k`: 1/mm, positive. Differentiable.
 
@@ -51,13 +58,14 @@ def inverse_hankel_transform(
 
     **Arguments:**
 
-    - `transform`: takes `k` (1/mm) whose last axis is the channels, gives `F` of the same shape; falls at
+    - `transform`: takes `k` (1/mm) whose last axis is the channels, gives `F` of the same shape;
+      falls at
         least like `exp(-decay k)`.
     - `r`: mm, at least 0. Differentiable, at 0 too.
     - `decay`: mm, positive: places the nodes near the origin. Not differentiated.
 
-    **Returns:** 1/mm^2. Its error is about 1e-15 of the value at `r = 0` or, farther out, of `1 / (decay r)`: a tail that
-    has fallen below that is rounding.
+    **Returns:** 1/mm^2. Its error is about 1e-15 of the value at `r = 0` or, farther out, of `1 /
+    (decay r)`: a tail that has fallen below that is rounding.
     """
     decay = jax.lax.stop_gradient(decay)
     shape = (*r.shape, *decay.shape)
@@ -74,14 +82,18 @@ def inverse_hankel_transform(
 
 def _filtered(function, at: Float[Array, "*some"]) -> Float[Array, "*some"]:
     """Give the integral of `x J0(x at) function(x)`."""
-    abscissas, weights = (along_first_axis(each, (len(each), *at.shape), at.dtype) for each in _filter())
+    abscissas, weights = (
+        along_first_axis(each, (len(each), *at.shape), at.dtype) for each in _filter()
+    )
     x = abscissas / at[None]
     return jnp.sum(weights * x * function(x), axis=0) / at
 
 
 def _series(transform, decay: Float[Array, " channels"]) -> list[Float[Array, " channels"]]:
     """Give the coefficients of the integral of `k J0(k r) F(k)` in powers of `(r / 2 decay)^2`."""
-    nodes, weights = (along_first_axis(each, (len(each), *decay.shape), decay.dtype) for each in _half_line())
+    nodes, weights = (
+        along_first_axis(each, (len(each), *decay.shape), decay.dtype) for each in _half_line()
+    )
     terms = weights * transform(nodes / decay[None]) / (decay * decay)[None]
     coefficients = []
     for power in range(_TERMS):
@@ -94,14 +106,19 @@ def _series(transform, decay: Float[Array, " channels"]) -> list[Float[Array, " 
 def _filter() -> tuple[np.ndarray, np.ndarray]:
     """Abscissas `x` and weights, such that the sum of `w x f(x)` is the integral of `x J0(x) f(x)`.
 
-    With `u = log x` the kernel `exp(u) J0(exp(u))` has the Fourier transform `2^(i w) Gamma((1 + i w)/2) / Gamma((1 - i w)/2)`.
+    With `u = log x` the kernel `exp(u) J0(exp(u))` has the Fourier transform `2^(i w) Gamma((1 + i
+    w)/2) / Gamma((1 - i w)/2)`.
     """
     nyquist = np.pi / _STEP
     frequency = np.linspace(-nyquist, nyquist, 8001)
     width = (nyquist - _PASSED) / 12
     taper = 0.5 * scipy.special.erfc((np.abs(frequency) - 0.5 * (nyquist + _PASSED)) / width)
     half = 0.5 + 0.5j * frequency
-    response = np.exp(1j * frequency * np.log(2) + scipy.special.loggamma(half) - scipy.special.loggamma(half.conj()))
+    response = np.exp(
+        1j * frequency * np.log(2)
+        + scipy.special.loggamma(half)
+        - scipy.special.loggamma(half.conj())
+    )
     logarithms = np.arange(round(_FIRST / _STEP), round(_LAST / _STEP) + 1) * _STEP
     waves = np.exp(-1j * logarithms[:, None] * frequency)
     weights = np.trapezoid(taper * response * waves, frequency, axis=1).real * _STEP / (2 * np.pi)
@@ -110,7 +127,9 @@ def _filter() -> tuple[np.ndarray, np.ndarray]:
 
 @functools.cache
 def _half_line() -> tuple[np.ndarray, np.ndarray]:
-    """Nodes and weights for the integral of `k f(k)` over k > 0, f like `exp(-k)`: `log k = t - exp(-t)`, equal steps of t."""
+    """Nodes and weights for the integral of `k f(k)` over k > 0, f like `exp(-k)`: `log k = t -
+    exp(-t)`, equal steps of t.
+    """
     t, step = np.linspace(-2.6, 3.65, _NEAR_NODES, retstep=True)
     nodes = np.exp(t - np.exp(-t))
     return nodes, step * nodes * nodes * (1 + np.exp(-t))

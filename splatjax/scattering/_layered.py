@@ -16,21 +16,24 @@ from ._slab import AbstractSlabProfile, slab_falls
 class LayeredMultipole(AbstractSlabProfile):
     r"""Any number of layers, each a multipole, added in the Hankel domain.
 
-    Between two scattering layers the interface has the ratio of their indices; a film has none of its own. Light comes from
-    above as a narrow beam. Each slab keeps its own extrapolated boundaries, so that cutting one in two, indices matched, is not
-    neutral: a few per cent at four mean free paths.
+    Between two scattering layers the interface has the ratio of their indices; a film has none of
+    its own. Light comes from above as a narrow beam. Each slab keeps its own extrapolated
+    boundaries, so that cutting one in two, indices matched, is not neutral: a few per cent at four
+    mean free paths.
 
     Differentiable in every coefficient and thickness, and in `r`.
 
     **Attributes:**
 
-    - `layers`: `Layer` and `Film`, from the top; at least one scatters. Only the lowest may be infinite.
+    - `layers`: `Layer` and `Film`, from the top; at least one scatters. Only the lowest may be
+      infinite.
     - `eta_above`, `eta_below`: indices of the neighbors relative to air, [channels].
     - `fresnel`: the diffuse Fresnel moments.
     - `surface`: those of the topmost interface, if it is another: `RoughFresnel(...)`.
 
-    **Raises:** `ValueError` for no scattering layer, for an infinite layer with something below, and for a layer thinner than one
-    mean free path `1 / sigma_t'` in any channel. Under `jit` that is unknown, and the profile NaN.
+    **Raises:** `ValueError` for no scattering layer, for an infinite layer with something below,
+    and for a layer thinner than one mean free path `1 / sigma_t'` in any channel. Under `jit` that
+    is unknown, and the profile NaN.
 
     **Source:** Donner and Jensen 2005, "Light diffusion in multi-layered translucent materials".
     """
@@ -51,11 +54,15 @@ class LayeredMultipole(AbstractSlabProfile):
     ):
         scattering = [layer for layer in layers if isinstance(layer, Layer)]
         if not scattering:
-            raise ValueError(f"a profile needs a layer that scatters; got {len(layers)} layers, none of which is a Layer")
+            raise ValueError(
+                f"a profile needs a layer that scatters; got {len(layers)} layers, none of which "
+                "is a Layer"
+            )
         self.layers = _merged(layers)
         like = scattering[0].medium.eta
         self.eta_above, self.eta_below = (
-            jnp.broadcast_to(jnp.asarray(eta, like.dtype), like.shape) for eta in (eta_above, eta_below)
+            jnp.broadcast_to(jnp.asarray(eta, like.dtype), like.shape)
+            for eta in (eta_above, eta_below)
         )
         self.fresnel = ExactFresnel() if fresnel is None else fresnel
         self.surface = self.fresnel if surface is None else surface
@@ -63,7 +70,10 @@ class LayeredMultipole(AbstractSlabProfile):
     def __check_init__(self):
         for number, layer in enumerate(self.layers[:-1], start=1):
             if isinstance(layer, Layer) and _is_infinite(layer):
-                raise ValueError(f"layer {number} of {len(self.layers)} is infinitely thick; only the lowest may be")
+                raise ValueError(
+                    f"layer {number} of {len(self.layers)} is infinitely thick; only the lowest "
+                    "may be"
+                )
         for layer in self._scattering():
             layer.check_diffusion()
 
@@ -84,7 +94,9 @@ class LayeredMultipole(AbstractSlabProfile):
                 responses.append(film_response(layer, passed == 0, k.shape))
             else:
                 above = self.surface if passed == 0 else self.fresnel
-                responses.append(slab_response(layer, etas[passed], etas[passed + 2], above, self.fresnel, k))
+                responses.append(
+                    slab_response(layer, etas[passed], etas[passed + 2], above, self.fresnel, k)
+                )
                 passed += 1
         return reduce(Response.over, responses)
 

@@ -25,11 +25,14 @@ class Layer(eqx.Module):
         check_range("thickness", self.thickness, "at least 0 (mm)", lambda x: x >= 0, finite=False)
 
     def check_diffusion(self) -> None:
-        """Raise if diffusion does not know such a slab: the light would come from outside of it. A traced one passes."""
+        """Raise if diffusion does not know such a slab: the light would come from outside of it. A
+        traced one passes.
+        """
         check_range(
             "thickness in mean free paths, thickness * sigma_t',",
             self.thickness.astype(self.medium.sigma_a.dtype) * self.medium.sigma_t_prime,
-            "at least 1 in every channel: diffusion does not hold in a thinner layer; monte_carlo does, and a Film absorbs "
+            "at least 1 in every channel: diffusion does not hold in a thinner layer; monte_carlo "
+            "does, and a Film absorbs "
             "and scatters nothing",
             lambda x: x >= 1 - 1e-6,
             finite=False,
@@ -39,7 +42,8 @@ class Layer(eqx.Module):
 class Film(eqx.Module):
     r"""A layer that absorbs and does not scatter, thinner than anything the light spreads over.
 
-    Light that comes from outside as a beam keeps `exp(-t)` of its power, diffuse light `2 E3(t)`, with t the optical depth.
+    Light that comes from outside as a beam keeps `exp(-t)` of its power, diffuse light `2 E3(t)`,
+    with t the optical depth.
 
     **Attributes:**
 

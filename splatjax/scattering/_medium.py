@@ -16,7 +16,8 @@ class Medium(eqx.Module):
     - `sigma_s_prime`: reduced scattering coefficient, 1/mm, positive.
     - `eta`: index of refraction relative to air.
 
-    **Raises:** `ValueError` for a value out of these ranges. Under `jit` values are unknown, and not checked.
+    **Raises:** `ValueError` for a value out of these ranges. Under `jit` values are unknown, and
+    not checked.
     """
 
     sigma_a: Float[Array, " channels"]
@@ -40,7 +41,9 @@ class Medium(eqx.Module):
 
     @property
     def squared_sigma_tr(self) -> Float[Array, " channels"]:
-        """Square of the effective transport coefficient, `3 sigma_a sigma_t'`, 1/mm^2: smooth where `sigma_a = 0`."""
+        """Square of the effective transport coefficient, `3 sigma_a sigma_t'`, 1/mm^2: smooth where
+        `sigma_a = 0`.
+        """
         return 3 * self.sigma_a * self.sigma_t_prime
 
 
@@ -51,4 +54,6 @@ def check_range(name: str, value, expected: str, holds, finite: bool = True) -> 
     known = np.asarray(value)
     possible = np.isfinite(known) if finite else ~np.isnan(known)
     if known.dtype.kind == "f" and not np.all(possible & holds(known)):
-        raise ValueError(f"{name} must be {'finite and ' if finite else ''}{expected}; got {known.tolist()}")
+        raise ValueError(
+            f"{name} must be {'finite and ' if finite else ''}{expected}; got {known.tolist()}"
+        )

@@ -10,9 +10,11 @@ from ._slab import AbstractSlabProfile, slab_falls
 
 
 class Multipole(AbstractSlabProfile):
-    r"""The dipole of a slab: the infinite series of images between both of its sides, summed in closed form in the Hankel domain.
+    r"""The dipole of a slab: the infinite series of images between both of its sides, summed in
+    closed form in the Hankel domain.
 
-    A slab many mean free paths thick becomes `Dipole`. Differentiable in every coefficient, in the thickness, and in `r`.
+    A slab many mean free paths thick becomes `Dipole`. Differentiable in every coefficient, in the
+    thickness, and in `r`.
 
     **Attributes:**
 
@@ -21,8 +23,9 @@ class Multipole(AbstractSlabProfile):
     - `fresnel`: the diffuse Fresnel moments.
     - `surface`: those of the upper side, if it is another: `RoughFresnel(...)`.
 
-    **Raises:** `ValueError` for a layer thinner than one mean free path `1 / sigma_t'` in any channel: its light would come from
-    outside of it. Under `jit` that is unknown, and the profile NaN.
+    **Raises:** `ValueError` for a layer thinner than one mean free path `1 / sigma_t'` in any
+    channel: its light would come from outside of it. Under `jit` that is unknown, and the profile
+    NaN.
 
     **Source:** Donner and Jensen 2005, "Light diffusion in multi-layered translucent materials".
     """
@@ -44,7 +47,8 @@ class Multipole(AbstractSlabProfile):
         like = layer.medium.eta
         self.layer = layer
         self.eta_above, self.eta_below = (
-            jnp.broadcast_to(jnp.asarray(eta, like.dtype), like.shape) for eta in (eta_above, eta_below)
+            jnp.broadcast_to(jnp.asarray(eta, like.dtype), like.shape)
+            for eta in (eta_above, eta_below)
         )
         self.fresnel = ExactFresnel() if fresnel is None else fresnel
         self.surface = self.fresnel if surface is None else surface
@@ -53,7 +57,9 @@ class Multipole(AbstractSlabProfile):
         self.layer.check_diffusion()
 
     def response(self, k: Float[Array, "*frequencies channels"]) -> Response:
-        return slab_response(self.layer, self.eta_above, self.eta_below, self.surface, self.fresnel, k)
+        return slab_response(
+            self.layer, self.eta_above, self.eta_below, self.surface, self.fresnel, k
+        )
 
     def falls(self) -> tuple[Float[Array, " channels"], Float[Array, " channels"]]:
         return slab_falls(self.layer)

@@ -20,16 +20,20 @@ _NODES = 128
 
 
 class PhotonBeam(AbstractProfile):
-    r"""Photon beam diffusion: the better dipole's exitance averaged over a beam's depth, plus single scattering.
+    r"""Photon beam diffusion: the better dipole's exitance averaged over a beam's depth, plus
+    single scattering.
 
-    Light enters as a beam along the normal and is scattered at depth z with density `sigma_t' exp(-sigma_t' z)`. What scatters
-    more than once is `alpha'^2 kappa E(z, r)`, with E the exitance above a point source and the correction
-    `kappa = 1 - exp(-2 sigma_t' (d_r + z))`. What scatters once, isotropically, is followed to the surface, attenuated, and
-    through it with the Fresnel transmittance; with theta the angle inside,
+    Light enters as a beam along the normal and is scattered at depth z with density `sigma_t'
+    exp(-sigma_t' z)`. What scatters more than once is `alpha'^2 kappa E(z, r)`, with E the exitance
+    above a point source and the correction `kappa = 1 - exp(-2 sigma_t' (d_r + z))`. What scatters
+    once, isotropically, is followed to the surface, attenuated, and through it with the Fresnel
+    transmittance; with theta the angle inside,
 
-        R1(r) = alpha' sigma_t' / (4 pi r) * integral of exp(-sigma_t' r cot(theta / 2)) (1 - F) cos(theta) d theta.
+        R1(r) = alpha' sigma_t' / (4 pi r) * integral of exp(-sigma_t' r cot(theta / 2)) (1 - F)
+        cos(theta) d theta.
 
-    Infinite at the origin like 1/r: Eq. 3 is taken beyond a cut. Differentiable in every coefficient, and for `r > 0`.
+    Infinite at the origin like 1/r: Eq. 3 is taken beyond a cut. Differentiable in every
+    coefficient, and for `r > 0`.
 
     **Attributes:**
 
@@ -64,7 +68,9 @@ class PhotonBeam(AbstractProfile):
         squared_radius = jnp.broadcast_to((r * r)[None, ..., None], shape)
         distance = jnp.sqrt(squared_radius + depth * depth)
         kappa = -jnp.expm1(-2 * sigma_t_prime * (distance + depth))
-        total = jnp.sum(share * kappa * exitance_of_source(medium, self.fresnel, depth, squared_radius), axis=0)
+        total = jnp.sum(
+            share * kappa * exitance_of_source(medium, self.fresnel, depth, squared_radius), axis=0
+        )
         return jnp.broadcast_to(medium.albedo_prime**2, total.shape) * total
 
     def single(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
@@ -73,11 +79,17 @@ class PhotonBeam(AbstractProfile):
 
     @one_program
     def total_reflectance(self) -> Float[Array, " channels"]:
-        """Give `2 pi` times the integral of `r R(r)`: single scattering exactly, multiple scattering by quadrature."""
-        return SingleScattering(self.medium).total_reflectance() + integrated_reflectance(_Multiple(self))
+        """Give `2 pi` times the integral of `r R(r)`: single scattering exactly, multiple
+        scattering by quadrature.
+        """
+        return SingleScattering(self.medium).total_reflectance() + integrated_reflectance(
+            _Multiple(self)
+        )
 
     def multiply_scattered(self) -> AbstractProfile:
-        """Give what was scattered more than once as a profile: for a material with a `SingleScattering` of its own."""
+        """Give what was scattered more than once as a profile: for a material with a
+        `SingleScattering` of its own.
+        """
         return _Multiple(self)
 
     def length_scale(self) -> Float[Array, " channels"]:
@@ -101,7 +113,9 @@ class _Multiple(AbstractProfile):
 
 @functools.cache
 def _beam() -> tuple[np.ndarray, np.ndarray]:
-    """Optical depths of sources and their shares `exp(-x) dx`, at equal steps of the logarithm: all scales are resolved."""
+    """Optical depths of sources and their shares `exp(-x) dx`, at equal steps of the logarithm: all
+    scales are resolved.
+    """
     logarithm, step = np.linspace(-30.0, 3.9, _NODES, retstep=True)
     x = np.exp(logarithm)
     shares = step * x * np.exp(-x)

@@ -1,4 +1,6 @@
-"""Radial integrals of profiles: one rule in units of a profile's own length, the same for every medium."""
+"""Radial integrals of profiles: one rule in units of a profile's own length, the same for every
+medium.
+"""
 
 import abc
 import functools
@@ -17,7 +19,9 @@ class AbstractRadialRule(eqx.Module):
     """How integrals over r weigh a profile's radii."""
 
     @abc.abstractmethod
-    def radii(self, profile: AbstractProfile) -> tuple[Float[Array, "nodes channels"], Float[Array, "nodes channels"]]:
+    def radii(
+        self, profile: AbstractProfile
+    ) -> tuple[Float[Array, "nodes channels"], Float[Array, "nodes channels"]]:
         """Give the radii and weights `dr` for each channel, mm."""
 
     @property
@@ -27,10 +31,11 @@ class AbstractRadialRule(eqx.Module):
 
 
 class RadialRule(AbstractRadialRule):
-    r"""Nodes and weights for integrals over r in [0, inf), in units of a profile's `length_scale()`.
+    r"""Nodes and weights for integrals over r in [0, inf), in units of a profile's
+    `length_scale()`.
 
-    One Gauss-Legendre panel in log r from `smallest` to `largest`, and a linear one from 0 to `smallest`. Equally spaced radii
-    are useless here: a profile changes over five decades.
+    One Gauss-Legendre panel in log r from `smallest` to `largest`, and a linear one from 0 to
+    `smallest`. Equally spaced radii are useless here: a profile changes over five decades.
 
     **Attributes:**
 
@@ -45,7 +50,8 @@ class RadialRule(AbstractRadialRule):
     near: int = eqx.field(static=True, default=8)
 
     def beyond(self, cut: float) -> "RadialRule":
-        """Give the rule that starts at `cut` length scales: for profiles that are infinite at the origin, or not known there.
+        """Give the rule that starts at `cut` length scales: for profiles that are infinite at the
+        origin, or not known there.
 
         **Raises:** `ValueError` unless `cut` lies between 0 and the largest radius.
         """
@@ -63,8 +69,11 @@ class RadialRule(AbstractRadialRule):
         return jnp.asarray(nodes, dtype), jnp.asarray(weights, dtype)
 
     @one_program
-    def radii(self, profile: AbstractProfile) -> tuple[Float[Array, "nodes channels"], Float[Array, "nodes channels"]]:
-        """Give the radii and weights for each channel, mm. They are constants of every derivative: an integral has no nodes.
+    def radii(
+        self, profile: AbstractProfile
+    ) -> tuple[Float[Array, "nodes channels"], Float[Array, "nodes channels"]]:
+        """Give the radii and weights for each channel, mm. They are constants of every derivative:
+        an integral has no nodes.
 
         A measured profile has its own; those outside of the rule weigh nothing.
         """
@@ -76,19 +85,27 @@ class RadialRule(AbstractRadialRule):
         if known is not None:
             radii, weights = (jnp.broadcast_to(each[:, None], shape) for each in known)
             first = 0.0 if self.near else self.smallest
-            return radii, jnp.where((radii >= first * scale) & (radii <= self.largest * scale), weights, jnp.zeros_like(weights))
-        return jnp.broadcast_to(nodes[:, None], shape) * scale, jnp.broadcast_to(weights[:, None], shape) * scale
+            return radii, jnp.where(
+                (radii >= first * scale) & (radii <= self.largest * scale),
+                weights,
+                jnp.zeros_like(weights),
+            )
+        return jnp.broadcast_to(nodes[:, None], shape) * scale, jnp.broadcast_to(
+            weights[:, None], shape
+        ) * scale
 
 
 class InverseVariance(AbstractRadialRule):
-    r"""The radii of a table, each weighed by its standard error: integrals of `r f(r)^2` become sums of `f^2 / deviation^2`.
+    r"""The radii of a table, each weighed by its standard error: integrals of `r f(r)^2` become
+    sums of `f^2 / deviation^2`.
 
-    A fit by it has the least chi-squared, and its `error` is the root of that over the sum of `(R / deviation)^2`. Radii without
-    an error, which no photon reached, are left out.
+    A fit by it has the least chi-squared, and its `error` is the root of that over the sum of `(R /
+    deviation)^2`. Radii without an error, which no photon reached, are left out.
 
     **Attributes:**
 
-    - `among`: which radii count, in length scales of the profile: by default all, `NORM_RULE.beyond(1.0)` for a cut.
+    - `among`: which radii count, in length scales of the profile: by default all,
+      `NORM_RULE.beyond(1.0)` for a cut.
 
     **Raises:** `ValueError`, when used, for a profile that has no `deviation`.
     """
@@ -106,7 +123,8 @@ class InverseVariance(AbstractRadialRule):
         deviation = getattr(profile, "deviation", None)
         if deviation is None:
             raise ValueError(
-                f"{type(profile).__name__} has no standard errors to weigh by; Tabulated(radii, values, deviation) and "
+                f"{type(profile).__name__} has no standard errors to weigh by; Tabulated(radii, "
+                "values, deviation) and "
                 "monte_carlo(...).profile() have"
             )
         r, dr = self.among.radii(profile)
@@ -115,14 +133,17 @@ class InverseVariance(AbstractRadialRule):
 
 
 NORM_RULE = RadialRule(smallest=1e-3, largest=1e4, count=192)
-"""For integrals of `r R^2` (Eq. 3 and Eq. 4): the neglected tail of a medium without absorption is 1e-16 of the whole.
+"""For integrals of `r R^2` (Eq. 3 and Eq. 4): the neglected tail of a medium without absorption is
+1e-16 of the whole.
 
-A fit is trusted to the square of its error, so that the nodes are many: with 128 an error of 1e-5 is wrong by a tenth,
-with 192 by 1e-7.
+A fit is trusted to the square of its error, so that the nodes are many: with 128 an error of 1e-5
+is wrong by a tenth, with 192 by 1e-7.
 """
 
 TOTAL_RULE = RadialRule(smallest=1e-3, largest=1e7, count=256)
-"""For integrals of `r R`, whose tails are long: without absorption they fall like 1/r, and 1e-7 is left out."""
+"""For integrals of `r R`, whose tails are long: without absorption they fall like 1/r, and 1e-7 is
+left out.
+"""
 
 
 @functools.cache
@@ -137,8 +158,8 @@ def _nodes(smallest: float, largest: float, count: int, near: int) -> tuple[np.n
 
 @functools.cache
 def unit_interval() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Give nodes x of the interval (0, 1), the same as 1 - x without loss, and weights: for integrands rough at
-    either end.
+    """Give nodes x of the interval (0, 1), the same as 1 - x without loss, and weights: for
+    integrands rough at either end.
 
     Takahasi and Mori's double exponential formula; analytic integrands leave about 1e-15.
     """
@@ -148,14 +169,19 @@ def unit_interval() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return x, beyond, step * np.pi * np.cosh(t) * x * beyond
 
 
-def at_own_radii(profile: AbstractProfile, r: Float[Array, "nodes channels"]) -> Float[Array, "nodes channels"]:
+def at_own_radii(
+    profile: AbstractProfile, r: Float[Array, "nodes channels"]
+) -> Float[Array, "nodes channels"]:
     """Give each channel of a profile at its own radii (mm), in 1/mm^2."""
     return jnp.diagonal(profile(r), axis1=1, axis2=2)
 
 
 @one_program
-def integrated_reflectance(profile: AbstractProfile, rule: RadialRule = TOTAL_RULE) -> Float[Array, " channels"]:
-    r"""Integrate `2 pi r R(r)` numerically: what `profile.total_reflectance()` gives in closed form.
+def integrated_reflectance(
+    profile: AbstractProfile, rule: RadialRule = TOTAL_RULE
+) -> Float[Array, " channels"]:
+    r"""Integrate `2 pi r R(r)` numerically: what `profile.total_reflectance()` gives in closed
+    form.
 
     **Arguments:**
 

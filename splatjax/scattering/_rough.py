@@ -13,26 +13,30 @@ from ._medium import check_range
 from ._quadrature import unit_legendre
 
 _COSINES, _SLOPES, _STEEPEST = 24, 64, 4.0
-"""Nodes on each side of the critical angle; nodes of either slope, which end where they are 1e-7 as frequent as none."""
+"""Nodes on each side of the critical angle; nodes of either slope, which end where they are 1e-7 as
+frequent as none.
+"""
 
 
 class RoughFresnel(AbstractFresnel):
     r"""The moments of an interface of microfacets: a rough surface over a material.
 
-    Light from inside meets a facet with the probability that it sees it (Smith's masking, Beckmann's slopes), and is reflected
-    by it or leaves; what it meets afterwards is neglected. With all facets reflecting everything the moments are 1, and without
-    roughness they are those of `smooth`.
+    Light from inside meets a facet with the probability that it sees it (Smith's masking,
+    Beckmann's slopes), and is reflected by it or leaves; what it meets afterwards is neglected.
+    With all facets reflecting everything the moments are 1, and without roughness they are those of
+    `smooth`.
 
-    Differentiable in `eta` and `roughness`, and in the latter to first order at 0, where the derivative is 0. At `eta = 1` itself
-    the derivative in `eta` is that of `smooth`: what roughness takes from it close by is not in it.
+    Differentiable in `eta` and `roughness`, and in the latter to first order at 0, where the
+    derivative is 0. At `eta = 1` itself the derivative in `eta` is that of `smooth`: what roughness
+    takes from it close by is not in it.
 
     **Attributes:**
 
     - `roughness`: root mean square slope m, in [0, 1], as `Material` has it.
     - `smooth`: moments of the smooth interface; by default the exact ones.
 
-    **Source:** that a rough surface changes the diffuse reflectance of the boundary condition: Donner and Jensen 2005; visible
-    facets: Heitz 2014.
+    **Source:** that a rough surface changes the diffuse reflectance of the boundary condition:
+    Donner and Jensen 2005; visible facets: Heitz 2014.
     """
 
     roughness: Float[Array, ""]
@@ -54,16 +58,29 @@ class RoughFresnel(AbstractFresnel):
         return self.smooth.second_moment(eta) + self._excess(eta, power=2)
 
     def _excess(self, eta: Float[Array, " channels"], power: int) -> Float[Array, " channels"]:
-        """Give what roughness adds to a moment: the difference of two sums over the same cosines."""
+        """Give what roughness adds to a moment: the difference of two sums over the same
+        cosines.
+        """
         cosine, share = _cosines(eta)
-        along, across, weights = (jnp.asarray(each, eta.dtype)[..., None] for each in _slopes(len(cosine)))
+        along, across, weights = (
+            jnp.asarray(each, eta.dtype)[..., None] for each in _slopes(len(cosine))
+        )
         slope, shape = self.roughness.astype(eta.dtype), (*along.shape[:2], len(eta))
-        # How much of a facet of slope (p, q) a direction in the plane of p sees, and at what cosine it meets it.
+        # How much of a facet of slope (p, q) a direction in the plane of p sees, and at what cosine
+        # it meets it.
         across_it = jnp.broadcast_to(jnp.sqrt(1 - cosine * cosine)[:, None], shape)
-        seen = jnp.maximum(jnp.broadcast_to(cosine[:, None], shape) + jnp.broadcast_to(slope * along, shape) * across_it, 0)
-        met = seen / jnp.broadcast_to(jnp.sqrt(1 + slope * slope * (along * along + across * across)), shape)
+        seen = jnp.maximum(
+            jnp.broadcast_to(cosine[:, None], shape)
+            + jnp.broadcast_to(slope * along, shape) * across_it,
+            0,
+        )
+        met = seen / jnp.broadcast_to(
+            jnp.sqrt(1 + slope * slope * (along * along + across * across)), shape
+        )
         counted = jnp.broadcast_to(weights, shape) * seen
-        rough = jnp.sum(counted * _internal_reflectance(met, eta), axis=1) / jnp.sum(counted, axis=1)
+        rough = jnp.sum(counted * _internal_reflectance(met, eta), axis=1) / jnp.sum(
+            counted, axis=1
+        )
         excess = rough - _internal_reflectance(cosine, eta)
         return jnp.sum((power + 1) * share * cosine**power * excess, axis=0)
 
@@ -71,7 +88,9 @@ class RoughFresnel(AbstractFresnel):
 def _internal_reflectance(
     cosine: Float[Array, "*shape channels"], eta: Float[Array, " channels"]
 ) -> Float[Array, "*shape channels"]:
-    """Give the unpolarized Fresnel reflectance at a cosine inside, where the index is `eta` times that outside."""
+    """Give the unpolarized Fresnel reflectance at a cosine inside, where the index is `eta` times
+    that outside.
+    """
     eta = jnp.broadcast_to(eta, cosine.shape)
     squared = 1 - eta * eta * (1 - cosine * cosine)
     leaves = squared > 0
@@ -79,27 +98,39 @@ def _internal_reflectance(
     return jnp.where(leaves, reflectance(cosine, outside, eta), jnp.ones_like(squared))
 
 
-def _cosines(eta: Float[Array, " channels"]) -> tuple[Float[Array, "cosines channels"], Float[Array, "cosines channels"]]:
-    """Give nodes and weights over the cosine inside, on either side of the critical angle, beyond which it is as a root."""
+def _cosines(
+    eta: Float[Array, " channels"],
+) -> tuple[Float[Array, "cosines channels"], Float[Array, "cosines channels"]]:
+    """Give nodes and weights over the cosine inside, on either side of the critical angle, beyond
+    which it is as a root.
+    """
     t, dt = (jnp.asarray(each, eta.dtype)[:, None] for each in unit_legendre(_COSINES))
     denser = eta > 1
     critical = jnp.where(denser, jnp.sqrt(1 - 1 / jnp.where(denser, eta * eta, 2)), 0.0)
     shape = (_COSINES, len(eta))
     t, dt, critical = (jnp.broadcast_to(each, shape) for each in (t, dt, critical))
     # Below as well: what a rough interface lets through begins as a root there.
-    below, above = jnp.where(critical > 0, critical * (1 - t * t), t), critical + (1 - critical) * t * t
-    return jnp.concatenate([below, above]), jnp.concatenate([critical * 2 * t * dt, (1 - critical) * 2 * t * dt])
+    below, above = (
+        jnp.where(critical > 0, critical * (1 - t * t), t),
+        critical + (1 - critical) * t * t,
+    )
+    return jnp.concatenate([below, above]), jnp.concatenate(
+        [critical * 2 * t * dt, (1 - critical) * 2 * t * dt]
+    )
 
 
 @functools.cache
 def _slopes(cosines: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Give slopes of unit roughness along and across, and their weights up to a factor: [cosines, slopes].
+    """Give slopes of unit roughness along and across, and their weights up to a factor: [cosines,
+    slopes].
 
-    Equally spaced, which for a Gaussian is exact from whatever offset; each cosine has its own, so that what the critical angle
-    does to single sums averages out.
+    Equally spaced, which for a Gaussian is exact from whatever offset; each cosine has its own, so
+    that what the critical angle does to single sums averages out.
     """
     step = 2 * _STEEPEST / _SLOPES
-    offsets = np.modf(np.outer(np.arange(1, cosines + 1), (0.7548776662, 0.5698402910)))[0]  # of an even sequence in the plane
+    offsets = np.modf(np.outer(np.arange(1, cosines + 1), (0.7548776662, 0.5698402910)))[
+        0
+    ]  # of an even sequence in the plane
     lines = step * (np.arange(_SLOPES) + offsets[..., None]) - _STEEPEST
     p = np.repeat(lines[:, 0], _SLOPES, axis=1)
     q = np.tile(lines[:, 1], (1, _SLOPES))

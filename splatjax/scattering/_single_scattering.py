@@ -19,12 +19,14 @@ _COSINES = 10
 
 
 class SingleScattering(AbstractProfile):
-    r"""What a half space scatters once, isotropically with the reduced coefficient: as a profile, and as a picture sees it.
+    r"""What a half space scatters once, isotropically with the reduced coefficient: as a profile,
+    and as a picture sees it.
 
-    As a profile it is that of light along the normal, followed to the surface, attenuated, and through it with the Fresnel
-    transmittance; with theta the angle inside,
+    As a profile it is that of light along the normal, followed to the surface, attenuated, and
+    through it with the Fresnel transmittance; with theta the angle inside,
 
-        R1(r) = alpha' sigma_t' / (4 pi r) * integral of exp(-sigma_t' r cot(theta / 2)) (1 - F) cos(theta) d theta.
+        R1(r) = alpha' sigma_t' / (4 pi r) * integral of exp(-sigma_t' r cot(theta / 2)) (1 - F)
+        cos(theta) d theta.
 
     Infinite at the origin like 1/r. Differentiable in every coefficient, and for `r > 0`.
 
@@ -52,8 +54,12 @@ class SingleScattering(AbstractProfile):
         half_angle, share = self._escaping()
         shape = (half_angle.shape[0], *r.shape, *scattering.shape)
         middle = tuple(range(1, 1 + r.ndim))
-        half_angle, share = (jnp.broadcast_to(jnp.expand_dims(each, middle), shape) for each in (half_angle, share))
-        path = jnp.broadcast_to(r[None, ..., None], shape) * jnp.broadcast_to(medium.sigma_t_prime, shape)
+        half_angle, share = (
+            jnp.broadcast_to(jnp.expand_dims(each, middle), shape) for each in (half_angle, share)
+        )
+        path = jnp.broadcast_to(r[None, ..., None], shape) * jnp.broadcast_to(
+            medium.sigma_t_prime, shape
+        )
         total = jnp.sum(share * jnp.exp(-path / half_angle), axis=0)
         return (
             jnp.broadcast_to(self.strength * scattering, total.shape)
@@ -70,27 +76,42 @@ class SingleScattering(AbstractProfile):
         return 1 / self.medium.sigma_t_prime
 
     @one_program
-    def reflected(self, mu_i: Float[Array, "*points"], mu_o: Float[Array, "*points"]) -> Float[Array, "*points channels"]:
-        r"""Give the radiance towards `wo` per irradiance that has entered from `wi`, of a flat and evenly lit piece:
+    def reflected(
+        self, mu_i: Float[Array, "*points"], mu_o: Float[Array, "*points"]
+    ) -> Float[Array, "*points channels"]:
+        r"""Give the radiance towards `wo` per irradiance that has entered from `wi`, of a flat and
+        evenly lit piece:
 
             alpha' / 4 pi * (1 - F(mu_o)) / (eta^2 (mu_i' + mu_o')),
 
-        with the cosines `mu'` refracted. Times `mu_o` and integrated over all directions, with light along the normal, it is the
-        total reflectance.
+        with the cosines `mu'` refracted. Times `mu_o` and integrated over all directions, with
+        light along the normal, it is the total reflectance.
 
-        **Arguments:** `mu_i`, `mu_o`: cosines of `wi` and `wo` outside, in [0, 1]; kept above 1e-4. Differentiable.
+        **Arguments:** `mu_i`, `mu_o`: cosines of `wi` and `wo` outside, in [0, 1]; kept above 1e-4.
+        Differentiable.
         """
         eta = self.medium.eta
         shape = (*mu_i.shape, *eta.shape)
-        eta, scattered = (jnp.broadcast_to(each, shape) for each in (eta, self.strength * self.medium.albedo_prime))
-        mu_i, mu_o = (jnp.broadcast_to(jnp.maximum(mu, _LEAST_COSINE)[..., None], shape) for mu in (mu_i, mu_o))
-        inside_i, inside_o = (jnp.sqrt(jnp.maximum(mu * mu + (eta * eta - 1), _LEAST_COSINE**2)) / eta for mu in (mu_i, mu_o))
+        eta, scattered = (
+            jnp.broadcast_to(each, shape)
+            for each in (eta, self.strength * self.medium.albedo_prime)
+        )
+        mu_i, mu_o = (
+            jnp.broadcast_to(jnp.maximum(mu, _LEAST_COSINE)[..., None], shape)
+            for mu in (mu_i, mu_o)
+        )
+        inside_i, inside_o = (
+            jnp.sqrt(jnp.maximum(mu * mu + (eta * eta - 1), _LEAST_COSINE**2)) / eta
+            for mu in (mu_i, mu_o)
+        )
         transmitted = 1 - reflectance(inside_o, mu_o, eta)
         return scattered * transmitted / (4 * jnp.pi * eta * eta * (inside_i + inside_o))
 
     @one_program
     def leaving(self, mu_i: Float[Array, "*points"]) -> Float[Array, "*points channels"]:
-        """Give the share of the light that has entered under a cosine `mu_i` and leaves after one scattering; right to 1e-3."""
+        """Give the share of the light that has entered under a cosine `mu_i` and leaves after one
+        scattering; right to 1e-3.
+        """
         share = jnp.zeros((*mu_i.shape, *self.strength.shape), mu_i.dtype)
         for node, weight in zip(*unit_legendre(_COSINES), strict=True):
             # mu = t^2: the radiance has a root at grazing angles.
@@ -99,20 +120,29 @@ class SingleScattering(AbstractProfile):
         return share
 
     def _escaping(self) -> tuple[Float[Array, "angles channels"], Float[Array, "angles channels"]]:
-        """Give `tan(theta / 2)` of the angles at which light leaves, and their weights `(1 - F) cos(theta) d theta`.
+        """Give `tan(theta / 2)` of the angles at which light leaves, and their weights `(1 - F)
+        cos(theta) d theta`.
 
-        The angle is measured on the rarer side, where it takes all values: `sin(theta) = min(1, 1 / eta) sin(psi)`.
+        The angle is measured on the rarer side, where it takes all values: `sin(theta) = min(1, 1 /
+        eta) sin(psi)`.
         """
         eta = self.medium.eta
-        x, beyond, weights = (along_first_axis(each, (len(each), *eta.shape), eta.dtype) for each in unit_interval())
+        x, beyond, weights = (
+            along_first_axis(each, (len(each), *eta.shape), eta.dtype) for each in unit_interval()
+        )
         sine, cosine = jnp.sin(0.5 * jnp.pi * x), jnp.sin(0.5 * jnp.pi * beyond)
         eta = jnp.broadcast_to(eta, x.shape)
         inside, outside = jnp.where(eta < 1, 1.0, 1 / eta), jnp.where(eta < 1, eta, 1.0)
-        cos_in, cos_out = (jnp.sqrt(cosine**2 + (1 - scale**2) * sine**2) for scale in (inside, outside))
+        cos_in, cos_out = (
+            jnp.sqrt(cosine**2 + (1 - scale**2) * sine**2) for scale in (inside, outside)
+        )
         reflected, weights = reflectance(cos_in, cos_out, eta), 0.5 * jnp.pi * weights * cosine
-        # As eta goes to 1, all that is reflected is so at grazing angles, which get infinitely few nodes: the quadrature keeps
-        # its value and loses its derivative. One more node, at the grazing angle, adds what the closed form has.
+        # As eta goes to 1, all that is reflected is so at grazing angles, which get infinitely few
+        # nodes: the quadrature keeps its value and loses its derivative. One more node, at the
+        # grazing angle, adds what the closed form has.
         missed = jnp.sum(weights * reflected * sine, axis=0) - 0.5 * moment_outside(self.medium.eta)
         grazing = stop_gradient(inside[0] / (1 + jnp.sqrt(1 - inside[0] ** 2)))
         half_angle = jnp.concatenate([inside * sine / (1 + cos_in), grazing[None]])
-        return half_angle, jnp.concatenate([weights * (1 - reflected) * inside, (inside[0] * missed)[None]])
+        return half_angle, jnp.concatenate(
+            [weights * (1 - reflected) * inside, (inside[0] * missed)[None]]
+        )

@@ -22,16 +22,24 @@ class AbstractSlabProfile(AbstractProfile):
 
     @abc.abstractmethod
     def falls(self) -> tuple[Float[Array, " channels"], Float[Array, " channels"]]:
-        """Give lengths `a` (mm) such that reflectance and transmittance fall like `exp(-a k)` or faster."""
+        """Give lengths `a` (mm) such that reflectance and transmittance fall like `exp(-a k)` or
+        faster.
+        """
 
     @one_program
     def __call__(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
-        return inverse_hankel_transform(lambda k: self.response(k).reflectance_above, r, self.falls()[0])
+        return inverse_hankel_transform(
+            lambda k: self.response(k).reflectance_above, r, self.falls()[0]
+        )
 
     @one_program
     def transmittance(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
-        """Give the radiant exitance below per unit power entering above, at distance `r` (mm) from the axis; 1/mm^2."""
-        return inverse_hankel_transform(lambda k: self.response(k).transmittance_down, r, self.falls()[1])
+        """Give the radiant exitance below per unit power entering above, at distance `r` (mm) from
+        the axis; 1/mm^2.
+        """
+        return inverse_hankel_transform(
+            lambda k: self.response(k).transmittance_down, r, self.falls()[1]
+        )
 
     @one_program
     def total_reflectance(self) -> Float[Array, " channels"]:
@@ -68,7 +76,9 @@ _SHALLOWEST = 1e-3  # mean free paths: so near the far side a source is a point 
 
 
 def slab_falls(layer: Layer) -> tuple[Float[Array, " channels"], Float[Array, " channels"]]:
-    """Give the source's distances (mm) from both sides; an infinite layer lets nothing through, and any length does."""
+    """Give the source's distances (mm) from both sides; an infinite layer lets nothing through, and
+    any length does.
+    """
     depth = 1 / layer.medium.sigma_t_prime
     beneath = jnp.maximum(layer.thickness.astype(depth.dtype) - depth, _SHALLOWEST * depth)
     return depth, jnp.where(jnp.isfinite(beneath), beneath, depth)

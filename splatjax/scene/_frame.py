@@ -7,8 +7,9 @@ from jaxtyping import Array, Float
 class Frame(eqx.Module):
     r"""A picture, linear light, row 0 at the top.
 
-    `beauty`, `diffuse`, `specular`, `layers`, `albedo` and `irradiance` are premultiplied by coverage; `depth`, `position`
-    and `normal` are those of the front surface and are not. `diffuse = sum_k weights_k layers_k` everywhere.
+    `beauty`, `diffuse`, `specular`, `layers`, `albedo` and `irradiance` are premultiplied by
+    coverage; `depth`, `position` and `normal` are those of the front surface and are not. `diffuse
+    = sum_k weights_k layers_k` everywhere.
 
     **Attributes:**
 
@@ -19,14 +20,16 @@ class Frame(eqx.Module):
     - `normal`: world space, unit; 0 where there is nothing.
     - `albedo`: of the splats; 1 where they carry none.
     - `shadow`: per light, 1 lit and 0 in shadow, not premultiplied; 1 where there is nothing.
-    - `irradiance`: that enters the surface: cosine, shadow and the loss to the specular lobe included.
+    - `irradiance`: that enters the surface: cosine, shadow and the loss to the specular lobe
+      included.
     - `layers`: one per Gaussian, `post * transmission / pi * L_k`.
     - `weights`: those the picture was made with.
     - `diffuse`, `specular`: radiance.
-    - `handed_over`: per Gaussian, the share of the covered pixels for which the splats are too far apart to carry the
-      layer, so that it is the surface's own irradiance.
+    - `handed_over`: per Gaussian, the share of the covered pixels for which the splats are too far
+      apart to carry the layer, so that it is the surface's own irradiance.
     - `single_scattering`: radiance, premultiplied; `None` when the material has none.
-    - `overflow`: what the plan lacks: 0 when the picture fits, else the largest of needed over planned, and the picture is NaN.
+    - `overflow`: what the plan lacks: 0 when the picture fits, else the largest of needed over
+      planned, and the picture is NaN.
     """
 
     beauty: Float[Array, "height width channels"]

@@ -1,4 +1,6 @@
-"""Lights. Directions point the way the light travels; `wi` points back, from the surface towards the light."""
+"""Lights. Directions point the way the light travels; `wi` points back, from the surface towards
+the light.
+"""
 
 import abc
 from collections.abc import Callable, Sequence
@@ -19,11 +21,17 @@ class AbstractLight(eqx.Module):
     cast_shadows: eqx.AbstractVar[bool]
 
     @abc.abstractmethod
-    def incidence(self, points: Float[Array, "*points 3"]) -> tuple[Float[Array, "*points 3"], Float[Array, "*points channels"]]:
-        """Give, at points in mm, the unit direction `wi` towards the light and the irradiance on a surface facing it."""
+    def incidence(
+        self, points: Float[Array, "*points 3"]
+    ) -> tuple[Float[Array, "*points 3"], Float[Array, "*points channels"]]:
+        """Give, at points in mm, the unit direction `wi` towards the light and the irradiance on a
+        surface facing it.
+        """
 
 
-def _per_channel(value: Float[Array, " channels"], points: Float[Array, "*points 3"]) -> Float[Array, "*points channels"]:
+def _per_channel(
+    value: Float[Array, " channels"], points: Float[Array, "*points 3"]
+) -> Float[Array, "*points channels"]:
     return jnp.broadcast_to(value, (*points.shape[:-1], *value.shape))
 
 
@@ -33,7 +41,8 @@ class DirectionalLight(AbstractLight):
     **Attributes:**
 
     - `direction`: the way the light travels, any length but zero. Differentiable.
-    - `irradiance`: on a surface that faces the light; pi on a white diffuser gives radiance 1. Differentiable.
+    - `irradiance`: on a surface that faces the light; pi on a white diffuser gives radiance 1.
+      Differentiable.
     - `cast_shadows`: static.
     """
 
@@ -41,7 +50,9 @@ class DirectionalLight(AbstractLight):
     irradiance: Float[Array, " channels"]
     cast_shadows: bool = eqx.field(static=True, default=True)
 
-    def incidence(self, points: Float[Array, "*points 3"]) -> tuple[Float[Array, "*points 3"], Float[Array, "*points channels"]]:
+    def incidence(
+        self, points: Float[Array, "*points 3"]
+    ) -> tuple[Float[Array, "*points 3"], Float[Array, "*points channels"]]:
         wi = -self.direction / jnp.linalg.norm(self.direction)
         return jnp.broadcast_to(wi, points.shape), _per_channel(self.irradiance, points)
 
@@ -49,12 +60,14 @@ class DirectionalLight(AbstractLight):
 class PointLight(AbstractLight):
     r"""Light from a point, falling off with the square of the distance.
 
-    A point within 1e-6 mm of the light receives none: the limit diverges, so value and gradient are cut to zero there.
+    A point within 1e-6 mm of the light receives none: the limit diverges, so value and gradient are
+    cut to zero there.
 
     **Attributes:**
 
     - `position`: mm. Differentiable.
-    - `intensity`: power per solid angle; the irradiance is `intensity cos / d^2`, d in mm. Differentiable.
+    - `intensity`: power per solid angle; the irradiance is `intensity cos / d^2`, d in mm.
+      Differentiable.
     - `cast_shadows`: static.
     """
 
@@ -62,7 +75,9 @@ class PointLight(AbstractLight):
     intensity: Float[Array, " channels"]
     cast_shadows: bool = eqx.field(static=True, default=True)
 
-    def incidence(self, points: Float[Array, "*points 3"]) -> tuple[Float[Array, "*points 3"], Float[Array, "*points channels"]]:
+    def incidence(
+        self, points: Float[Array, "*points 3"]
+    ) -> tuple[Float[Array, "*points 3"], Float[Array, "*points channels"]]:
         to_light = jnp.broadcast_to(self.position, points.shape) - points
         squared = jnp.sum(to_light * to_light, axis=-1, keepdims=True)
         apart = squared > _TOUCHING**2
@@ -72,7 +87,8 @@ class PointLight(AbstractLight):
 
 
 class GaussianBeam(AbstractLight):
-    r"""A laser: parallel light whose power falls off as a Gaussian with the distance from its axis. It casts no shadows.
+    r"""A laser: parallel light whose power falls off as a Gaussian with the distance from its axis.
+    It casts no shadows.
 
     **Attributes:**
 
@@ -88,7 +104,9 @@ class GaussianBeam(AbstractLight):
     variance: Float[Array, ""]
     cast_shadows: bool = eqx.field(static=True, default=False, init=False)
 
-    def incidence(self, points: Float[Array, "*points 3"]) -> tuple[Float[Array, "*points 3"], Float[Array, "*points channels"]]:
+    def incidence(
+        self, points: Float[Array, "*points 3"]
+    ) -> tuple[Float[Array, "*points 3"], Float[Array, "*points channels"]]:
         axis = jnp.broadcast_to(self.direction / jnp.linalg.norm(self.direction), points.shape)
         offset = points - jnp.broadcast_to(self.origin, points.shape)
         across = offset - jnp.sum(offset * axis, axis=-1, keepdims=True) * axis
@@ -104,7 +122,9 @@ class StackedLights(eqx.Module):
 
     def apart(self) -> list[AbstractLight]:
         """Give them one by one."""
-        return [jax.tree.map(lambda leaf, i=i: leaf[i], self.lights) for i in range(len(self.places))]
+        return [
+            jax.tree.map(lambda leaf, i=i: leaf[i], self.lights) for i in range(len(self.places))
+        ]
 
 
 def stack_lights(lights: tuple[AbstractLight, ...]) -> list[StackedLights]:
@@ -113,7 +133,10 @@ def stack_lights(lights: tuple[AbstractLight, ...]) -> list[StackedLights]:
     for place, light in enumerate(lights):
         kinds.setdefault(jax.tree.structure(light), []).append(place)
     return [
-        StackedLights(jax.tree.map(lambda *leaves: jnp.stack(leaves), *[lights[i] for i in places]), tuple(places))
+        StackedLights(
+            jax.tree.map(lambda *leaves: jnp.stack(leaves), *[lights[i] for i in places]),
+            tuple(places),
+        )
         for places in kinds.values()
     ]
 
@@ -128,7 +151,8 @@ def sum_over_lights(
 
     **Arguments:**
 
-    - `shares`: for each group what of each light arrives, lights first; `None` for lights that cast no shadows.
+    - `shares`: for each group what of each light arrives, lights first; `None` for lights that cast
+      no shadows.
     - `contribution`: of a light, and its share.
     - `start`: what they are added to.
     """

@@ -11,16 +11,18 @@ _NARROW = 1e-6  # mm^2: far below any splat, so that the surface's own light sta
 
 
 class Material(eqx.Module):
-    r"""A translucent material: how light spreads below the surface, and how the surface itself reflects.
+    r"""A translucent material: how light spreads below the surface, and how the surface itself
+    reflects.
 
     **Attributes:** (all differentiable)
 
-    - `gaussians`: the diffusion profile; the picture's diffuse reflectance is the sum of its weights.
+    - `gaussians`: the diffusion profile; the picture's diffuse reflectance is the sum of its
+      weights.
     - `eta`: index of refraction relative to air, for the Fresnel term of the specular lobe.
     - `specular`: strength of the specular lobe (rho_s).
     - `roughness`: of the specular lobe (m, root mean square slope), in (0, 1].
-    - `single_scattering`: light that scatters once, as a term of its own; the Gaussians then stand for the rest. `None`: they
-      stand for all.
+    - `single_scattering`: light that scatters once, as a term of its own; the Gaussians then stand
+      for the rest. `None`: they stand for all.
     """
 
     gaussians: SumOfGaussians
@@ -45,15 +47,22 @@ class Material(eqx.Module):
         self.single_scattering = single_scattering
 
     def total_reflectance(self) -> Float[Array, " channels"]:
-        """Give the share of the light that enters along the normal of a flat piece and leaves it again."""
+        """Give the share of the light that enters along the normal of a flat piece and leaves it
+        again.
+        """
         total = self.gaussians.total_reflectance()
-        return total if self.single_scattering is None else total + self.single_scattering.total_reflectance()
+        return (
+            total
+            if self.single_scattering is None
+            else total + self.single_scattering.total_reflectance()
+        )
 
     def left_to_diffuse(self, mu_i: Float[Array, "*points"]) -> Float[Array, "*points channels"]:
-        """Give what the Gaussians have of the light that enters under a cosine `mu_i`, over what they have along the normal.
+        """Give what the Gaussians have of the light that enters under a cosine `mu_i`, over what
+        they have along the normal.
 
-        Light that grazes scatters out again at once, more of it than along the normal. Where that and the Gaussians' total would
-        be more than all, the Gaussians have what is left.
+        Light that grazes scatters out again at once, more of it than along the normal. Where that
+        and the Gaussians' total would be more than all, the Gaussians have what is left.
         """
         if self.single_scattering is None:
             return jnp.ones((*mu_i.shape, self.gaussians.weights.shape[1]), mu_i.dtype)
@@ -67,12 +76,16 @@ class Material(eqx.Module):
         return Material(gaussians, self.eta, self.specular, self.roughness)
 
     def opaque(self) -> "Material":
-        """Give the same surface and color with light that leaves where it enters: one Gaussian, narrower than any splat."""
+        """Give the same surface and color with light that leaves where it enters: one Gaussian,
+        narrower than any splat.
+        """
         variances = jnp.full_like(self.gaussians.variances, _NARROW, shape=(1,))
         return self.surface_of(SumOfGaussians(variances, self.total_reflectance()[None]))
 
     def white(self) -> "Material":
-        """Give the material with a total reflectance of one per channel, so that an albedo map alone carries color."""
+        """Give the material with a total reflectance of one per channel, so that an albedo map
+        alone carries color.
+        """
         single = self.single_scattering
         if single is None:
             return self.surface_of(self.gaussians.white())

@@ -16,4 +16,7 @@ class Scene(eqx.Module):
 
     def __check_init__(self):
         if isinstance(self.lights, AbstractLight):
-            raise TypeError(f"lights is a {type(self.lights).__name__}; it must be a tuple of lights: (light,) for one")
+            raise TypeError(
+                f"lights is a {type(self.lights).__name__}; it must be a tuple of lights: (light,) "
+                "for one"
+            )

@@ -1,4 +1,6 @@
-"""How much of the light the specular lobe takes: its directional and its average albedo, tabulated."""
+"""How much of the light the specular lobe takes: its directional and its average albedo,
+tabulated.
+"""
 
 import functools
 from collections.abc import Sequence
@@ -12,8 +14,9 @@ from splatjax.pointwise import in_parts
 
 from ._specular import ROUGHNESS_RANGE, clamped_roughness
 
-# Chebyshev nodes in sqrt(mu) and in log m. The square root resolves the steep part at grazing angles, where the albedo
-# goes like mu log mu; with these degrees the error is at most 1.3e-4 (a) and 1.2e-4 (b) for every mu and m in range.
+# Chebyshev nodes in sqrt(mu) and in log m. The square root resolves the steep part at grazing
+# angles, where the albedo goes like mu log mu; with these degrees the error is at most 1.3e-4 (a)
+# and 1.2e-4 (b) for every mu and m in range.
 _MU_NODES = 18
 _ROUGHNESS_NODES = 12
 _LEAST_MU = 1e-5
@@ -23,12 +26,16 @@ def _nodes(count: int) -> np.ndarray:
     return np.cos(np.pi * (np.arange(count) + 0.5) / count)
 
 
-def _lobe_quadrature(mu: np.ndarray, roughness: np.ndarray, nodes: tuple[int, int] = (64, 32)) -> np.ndarray:
-    """Integrate the lobe over incident directions, with F = 1 and with F = (1 - H.V)^5; stacked, in float64.
+def _lobe_quadrature(
+    mu: np.ndarray, roughness: np.ndarray, nodes: tuple[int, int] = (64, 32)
+) -> np.ndarray:
+    """Integrate the lobe over incident directions, with F = 1 and with F = (1 - H.V)^5; stacked, in
+    float64.
 
-    In the slopes p of the half vector the integral is that of a Gaussian, `exp(-p^2 / m^2) / (pi m^2)`, times
-    `2 - mu (1 + p^2) / (mu - p_x sin)`, over the disc of radius `1 / mu` around `(-tan, 0)`, whose rim are the directions that
-    graze the surface. Nodes crowd at the rim near the origin; beyond five m the Gaussian is nothing.
+    In the slopes p of the half vector the integral is that of a Gaussian, `exp(-p^2 / m^2) / (pi
+    m^2)`, times `2 - mu (1 + p^2) / (mu - p_x sin)`, over the disc of radius `1 / mu` around
+    `(-tan, 0)`, whose rim are the directions that graze the surface. Nodes crowd at the rim near
+    the origin; beyond five m the Gaussian is nothing.
     """
     mu, roughness = (x[..., None, None] for x in np.broadcast_arrays(mu, roughness))
     sine = np.sqrt(1 - mu * mu)
@@ -45,13 +52,17 @@ def _lobe_quadrature(mu: np.ndarray, roughness: np.ndarray, nodes: tuple[int, in
     towards = mu - px * sine
     half_cosine = np.clip(towards / np.sqrt(1 + squared), 0, 1)
     density = np.exp(-squared / roughness**2) / (np.pi * roughness**2)
-    integrand = density * np.maximum(2 - mu * (1 + squared) / towards, 0) * px_weights * reach * y_weights
+    integrand = (
+        density * np.maximum(2 - mu * (1 + squared) / towards, 0) * px_weights * reach * y_weights
+    )
     return np.stack([integrand.sum((-1, -2)), (integrand * (1 - half_cosine) ** 5).sum((-1, -2))])
 
 
 @functools.cache
 def _tables() -> tuple[np.ndarray, np.ndarray]:
-    """Give the Chebyshev coefficients of (a, b) over sqrt(mu) and log m, and those of their averages over log m."""
+    """Give the Chebyshev coefficients of (a, b) over sqrt(mu) and log m, and those of their
+    averages over log m.
+    """
     mu = ((1 + _nodes(_MU_NODES)) / 2) ** 2
     low, high = np.log(ROUGHNESS_RANGE)
     roughness = np.exp(low + (high - low) * (1 + _nodes(_ROUGHNESS_NODES)) / 2)
@@ -67,7 +78,9 @@ def _tables() -> tuple[np.ndarray, np.ndarray]:
 
 
 def _chebyshev(coefficients: Sequence, x: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Evaluate a Chebyshev series, whose coefficients broadcast against `x`, by Clenshaw's recurrence."""
+    """Evaluate a Chebyshev series, whose coefficients broadcast against `x`, by Clenshaw's
+    recurrence.
+    """
     last, before = jnp.zeros_like(x), jnp.zeros_like(x)
     for index in range(len(coefficients) - 1, 0, -1):
         last, before = 2 * x * last - before + coefficients[index], last
@@ -81,18 +94,29 @@ def _roughness_coordinate(roughness: Float[Array, "..."]) -> Float[Array, "..."]
 
 @functools.cache
 def _derivative_table(key: tuple[int, int, int]) -> np.ndarray:
-    """Give the coefficients of table a (0) or b (1), differentiated so many times in either coordinate."""
+    """Give the coefficients of table a (0) or b (1), differentiated so many times in either
+    coordinate.
+    """
     table, in_mu, in_roughness = key
     chebder = np.polynomial.chebyshev.chebder
     return chebder(chebder(_tables()[0][table], in_mu, axis=0), in_roughness, axis=1)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _table(key: tuple[int, int, int], x: Float[Array, "..."], t: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Evaluate a table. Its derivatives are tables too: one number is kept for the way back, not the whole recurrence."""
+def _table(
+    key: tuple[int, int, int], x: Float[Array, "..."], t: Float[Array, "..."]
+) -> Float[Array, "..."]:
+    """Evaluate a table. Its derivatives are tables too: one number is kept for the way back, not
+    the whole recurrence.
+    """
     coefficients = _derivative_table(key)
     if t.ndim == 0:
-        over_mu = list(_chebyshev(list(jnp.asarray(coefficients.T, t.dtype)), jnp.broadcast_to(t, (len(coefficients),))))
+        over_mu = list(
+            _chebyshev(
+                list(jnp.asarray(coefficients.T, t.dtype)),
+                jnp.broadcast_to(t, (len(coefficients),)),
+            )
+        )
         return in_parts(lambda x: _chebyshev(over_mu, x), x.reshape(-1)).reshape(x.shape)
     x, t = jnp.broadcast_arrays(x, t)
     rows = jnp.asarray(coefficients, t.dtype)
@@ -102,7 +126,9 @@ def _table(key: tuple[int, int, int], x: Float[Array, "..."], t: Float[Array, ".
         return (2 * x * last - before + _chebyshev(list(row), t), last), None
 
     # A loop over the rows: written out, they would be a thousand operations for every use.
-    (last, before), _ = jax.lax.scan(clenshaw, (jnp.zeros_like(x), jnp.zeros_like(x)), rows[1:], reverse=True)
+    (last, before), _ = jax.lax.scan(
+        clenshaw, (jnp.zeros_like(x), jnp.zeros_like(x)), rows[1:], reverse=True
+    )
     return x * last - before + _chebyshev(list(rows[0]), t)
 
 
@@ -114,28 +140,36 @@ def _table_jvp(key, primals, tangents):
     return _table(key, x, t), in_x + _table((table, in_mu, in_roughness + 1), x, t) * t_dot
 
 
-def _schlick(f0: Float[Array, "..."], constant: Float[Array, "..."], grazing: Float[Array, "..."]) -> Float[Array, "..."]:
+def _schlick(
+    f0: Float[Array, "..."], constant: Float[Array, "..."], grazing: Float[Array, "..."]
+) -> Float[Array, "..."]:
     return f0 * constant + (1 - f0) * grazing
 
 
 def directional_albedo(
-    mu: Float[Array, "..."], f0: Float[Array, "..."], specular: Float[Array, "..."], roughness: Float[Array, "..."]
+    mu: Float[Array, "..."],
+    f0: Float[Array, "..."],
+    specular: Float[Array, "..."],
+    roughness: Float[Array, "..."],
 ) -> Float[Array, "..."]:
     r"""Give the share of the light from one direction that the specular lobe reflects, `rho(mu)`.
 
-    `rho = specular (f0 a(mu, m) + (1 - f0) b(mu, m))`: Schlick's term splits the integral of `specular_lobe` over the
-    hemisphere into two tables, computed once by quadrature and kept as Chebyshev series in `sqrt(mu)` and `log m`.
+    `rho = specular (f0 a(mu, m) + (1 - f0) b(mu, m))`: Schlick's term splits the integral of
+    `specular_lobe` over the hemisphere into two tables, computed once by quadrature and kept as
+    Chebyshev series in `sqrt(mu)` and `log m`.
 
-    **Arguments:** scalars, or arrays that broadcast; a scalar `f0` and a scalar `roughness` make it cheapest.
+    **Arguments:** scalars, or arrays that broadcast; a scalar `f0` and a scalar `roughness` make it
+    cheapest.
 
-    - `mu`: cosine of the direction with the normal, clamped to [1e-5, 1]. Differentiable; the slope at `mu = 0` diverges
-      like `log mu` and is cut to 0 below 1e-5.
+    - `mu`: cosine of the direction with the normal, clamped to [1e-5, 1]. Differentiable; the slope
+      at `mu = 0` diverges like `log mu` and is cut to 0 below 1e-5.
     - `f0`: reflectance at normal incidence. Differentiable.
     - `specular`: strength rho_s. Differentiable.
     - `roughness`: m, clamped to [0.05, 1] as in the lobe. Differentiable.
 
-    **Returns:** in [0, 1], within 2e-4 of the integral (times `specular`). With `specular <= 1` the integral never exceeds one;
-    where a larger `specular` would make it, rho is cut to 1 with gradient 0: then nothing enters, and the lobe makes energy.
+    **Returns:** in [0, 1], within 2e-4 of the integral (times `specular`). With `specular <= 1` the
+    integral never exceeds one; where a larger `specular` would make it, rho is cut to 1 with
+    gradient 0: then nothing enters, and the lobe makes energy.
 
     **Source:** the lobe of Kelemen and Szirmay-Kalos 2001, as normalized in `specular_lobe`.
     """
@@ -145,10 +179,13 @@ def directional_albedo(
     return jnp.clip(specular * share, 0.0, 1.0)
 
 
-def average_albedo(f0: Float[Array, "..."], specular: Float[Array, "..."], roughness: Float[Array, "..."]) -> Float[Array, "..."]:
+def average_albedo(
+    f0: Float[Array, "..."], specular: Float[Array, "..."], roughness: Float[Array, "..."]
+) -> Float[Array, "..."]:
     r"""Give the share of uniform light that the specular lobe reflects, `2 int_0^1 rho(mu) mu dmu`.
 
-    It is the exact integral of the series that `directional_albedo` evaluates, so that nothing is lost between the two.
+    It is the exact integral of the series that `directional_albedo` evaluates, so that nothing is
+    lost between the two.
 
     **Arguments:** as in `directional_albedo`.
 

@@ -27,14 +27,18 @@ class SurfacePoints(eqx.Module):
 
 
 def unit_normals(normals: Float[Array, "*pixels 3"]) -> Float[Array, "*pixels 3"]:
-    """Give blended normals unit length; zero stays zero, with a zero gradient: no direction is better than another."""
+    """Give blended normals unit length; zero stays zero, with a zero gradient: no direction is
+    better than another.
+    """
     squared = jnp.sum(normals * normals, axis=-1, keepdims=True)
     there = squared > 0
     return jnp.where(there, normals / jnp.sqrt(jnp.where(there, squared, 1.0)), 0.0)
 
 
 def leaving_share(points: SurfacePoints, f0: Float[Array, ""]) -> Float[Array, "*pixels"]:
-    """Give the share of diffused light that leaves towards the eye, `(1 - rho(wo)) / (1 - rho_avg)`: on average 1."""
+    """Give the share of diffused light that leaves towards the eye, `(1 - rho(wo)) / (1 -
+    rho_avg)`: on average 1.
+    """
     cosine = jnp.maximum(jnp.sum(points.normals * points.outgoing, axis=-1), 0)
     return diffuse_transmission(cosine, f0, points.specular, points.roughness)
 
@@ -42,11 +46,20 @@ def leaving_share(points: SurfacePoints, f0: Float[Array, ""]) -> Float[Array, "
 def reflected_radiance(
     points: SurfacePoints, groups: list[StackedLights], f0: Float[Array, ""], channels: int
 ) -> Float[Array, "*pixels channels"]:
-    """Give the specular radiance towards the eye: Kelemen / Szirmay-Kalos, each light in its own shadow."""
+    """Give the specular radiance towards the eye: Kelemen / Szirmay-Kalos, each light in its own
+    shadow.
+    """
 
     def reflected(light, share):
         wi, irradiance = light.incidence(points.positions)
-        lobe = specular_lobe(points.normals, wi, points.outgoing, f0=f0, specular=points.specular, roughness=points.roughness)
+        lobe = specular_lobe(
+            points.normals,
+            wi,
+            points.outgoing,
+            f0=f0,
+            specular=points.specular,
+            roughness=points.roughness,
+        )
         received = lobe * jnp.maximum(jnp.sum(wi * points.normals, axis=-1), 0)
         received = received if share is None else received * share
         return received[..., None] * irradiance
@@ -55,11 +68,16 @@ def reflected_radiance(
 
 
 def single_scattered_radiance(
-    points: SurfacePoints, groups: list[StackedLights], f0: Float[Array, ""], single: SingleScattering
+    points: SurfacePoints,
+    groups: list[StackedLights],
+    f0: Float[Array, ""],
+    single: SingleScattering,
 ) -> Float[Array, "*pixels channels"]:
-    """Give the radiance of light that entered where it leaves and scattered once, each light in its own shadow.
+    """Give the radiance of light that entered where it leaves and scattered once, each light in its
+    own shadow.
 
-    What the specular lobe reflects does not enter. The surface counts as flat and evenly lit over a mean free path.
+    What the specular lobe reflects does not enter. The surface counts as flat and evenly lit over a
+    mean free path.
     """
     towards_eye = jnp.maximum(jnp.sum(points.normals * points.outgoing, axis=-1), 0)
 
@@ -70,7 +88,9 @@ def single_scattered_radiance(
         entered = entered if share is None else entered * share
         return single.reflected(cosine, towards_eye) * entered[..., None] * irradiance
 
-    return sum_over_lights(groups, points.lit, scattered, _dark(points, single.medium.sigma_a.shape[0]))
+    return sum_over_lights(
+        groups, points.lit, scattered, _dark(points, single.medium.sigma_a.shape[0])
+    )
 
 
 def _dark(points: SurfacePoints, channels: int) -> Float[Array, "*pixels channels"]:

@@ -1,4 +1,6 @@
-"""The tiles of a picture that show anything, packed: what works on pixels one by one need not look at the others."""
+"""The tiles of a picture that show anything, packed: what works on pixels one by one need not look
+at the others.
+"""
 
 from typing import TypeVar
 
@@ -21,15 +23,20 @@ TILES_AT_ONCE = AT_ONCE // SIDE**2
 """For what is computed in parts."""
 
 
-def farthest_depths(summed: SummedFragments, view: AbstractView) -> Float[Array, "surfaces down across"]:
-    """Give the depth (mm) of the farthest point that each tile shows, of both surfaces; -inf where a tile shows none.
+def farthest_depths(
+    summed: SummedFragments, view: AbstractView
+) -> Float[Array, "surfaces down across"]:
+    """Give the depth (mm) of the farthest point that each tile shows, of both surfaces; -inf where
+    a tile shows none.
 
     Where one shows behind, there is a front.
     """
 
     def farthest(sums: FragmentSums) -> Float[Array, " tiles"]:
         there = sums.weights > 0
-        depth = view.depth(jnp.where(there, sums.nearness / jnp.where(there, sums.weights, 1.0), 1.0))
+        depth = view.depth(
+            jnp.where(there, sums.nearness / jnp.where(there, sums.weights, 1.0), 1.0)
+        )
         return stop_gradient(jnp.max(jnp.where(there, depth, -jnp.inf), axis=1))
 
     front, behind = farthest(summed.front), farthest(summed.behind)
@@ -38,12 +45,16 @@ def farthest_depths(summed: SummedFragments, view: AbstractView) -> Float[Array,
 
 
 class Atlas(eqx.Module):
-    """The tiles of the front surface and of the one behind it that show anything, packed into a list of places."""
+    """The tiles of the front surface and of the one behind it that show anything, packed into a
+    list of places.
+    """
 
     view: AbstractView
     farthest: Float[Array, "surfaces down across"]
     tiles: Int[Array, " tiles"]
-    """The tile at each place: those of the front row by row, then those behind; in an empty place the number of all."""
+    """The tile at each place: those of the front row by row, then those behind; in an empty place
+    the number of all.
+    """
     places: Int[Array, " all"]
     """The place of every tile; the number of places for a tile that shows nothing."""
     needed: Float[Array, ""]
@@ -53,19 +64,31 @@ class Atlas(eqx.Module):
 
     @classmethod
     @one_program
-    def of(cls, farthest: Float[Array, "surfaces down across"], view: AbstractView, room: int) -> "Atlas":
+    def of(
+        cls, farthest: Float[Array, "surfaces down across"], view: AbstractView, room: int
+    ) -> "Atlas":
         """Pack the tiles that show anything, as `farthest_depths` says, into `room` places."""
         shows = farthest.reshape(-1) > -jnp.inf
         tiles = jnp.nonzero(shows, size=room, fill_value=shows.shape[0])[0].astype(jnp.int32)
-        places = jnp.full(shows.shape[0], room, jnp.int32).at[tiles].set(jnp.arange(room, dtype=jnp.int32), mode="drop")
+        places = (
+            jnp.full(shows.shape[0], room, jnp.int32)
+            .at[tiles]
+            .set(jnp.arange(room, dtype=jnp.int32), mode="drop")
+        )
         needed = jnp.sum(shows).astype(farthest.dtype) / room
         return cls(view, farthest, tiles, places, needed, jnp.ones_like(needed))
 
     def of_all(self, devices: Devices) -> "Atlas":
-        """Give the atlas of the places of all devices, one after the other, each of which shows tiles of its own."""
+        """Give the atlas of the places of all devices, one after the other, each of which shows
+        tiles of its own.
+        """
         tiles = devices.everything(self.tiles)
         room = tiles.shape[0]
-        places = jnp.full(self.places.shape[0], room, jnp.int32).at[tiles].set(jnp.arange(room, dtype=jnp.int32), mode="drop")
+        places = (
+            jnp.full(self.places.shape[0], room, jnp.int32)
+            .at[tiles]
+            .set(jnp.arange(room, dtype=jnp.int32), mode="drop")
+        )
         farthest, needed = devices.largest((self.farthest, self.needed))
         return Atlas(self.view, farthest, tiles, places, needed, self.poison)
 
@@ -85,19 +108,29 @@ class Atlas(eqx.Module):
         return self.tiles < self.grid.count
 
     def pack(self, front: Packed, behind: Packed) -> Packed:
-        """Put all tiles `[tiles, ...]` of both surfaces in their places, those that show nothing nowhere. Differentiable."""
+        """Put all tiles `[tiles, ...]` of both surfaces in their places, those that show nothing
+        nowhere. Differentiable.
+        """
         count = self.grid.count
 
         def packed(front: Array, behind: Array) -> Array:
-            among_front = front.at[jnp.where(self.in_front, self.tiles, count)].get(mode="fill", fill_value=0)
-            among_behind = behind.at[jnp.where(self.in_front, count, self.tiles - count)].get(mode="fill", fill_value=0)
+            among_front = front.at[jnp.where(self.in_front, self.tiles, count)].get(
+                mode="fill", fill_value=0
+            )
+            among_behind = behind.at[jnp.where(self.in_front, count, self.tiles - count)].get(
+                mode="fill", fill_value=0
+            )
             return among_front + among_behind
 
         return jax.tree.map(packed, front, behind)
 
     def shares(self, coverage: Float[Array, "tiles pixels"]) -> Float[Array, "tiles pixels"]:
-        """Give the share of its pixel that each point covers, from its surface's coverage: behind, of what the front leaves."""
-        before = self.places.at[jnp.where(self.in_front, self.places.shape[0], self.tiles - self.grid.count)]
+        """Give the share of its pixel that each point covers, from its surface's coverage: behind,
+        of what the front leaves.
+        """
+        before = self.places.at[
+            jnp.where(self.in_front, self.places.shape[0], self.tiles - self.grid.count)
+        ]
         before = before.get(mode="fill", fill_value=self.tiles.shape[0])
         return coverage * (1 - coverage.at[before].get(mode="fill", fill_value=0))
 
@@ -107,7 +140,9 @@ class Atlas(eqx.Module):
         return self.view.unproject(x.astype(depth.dtype) + 0.5, y.astype(depth.dtype) + 0.5, depth)
 
     def pixels(self) -> Int[Array, "tiles pixels"]:
-        """Number the pixels, row by row; what lies beyond the picture has the number of the pixel next to it."""
+        """Number the pixels, row by row; what lies beyond the picture has the number of the pixel
+        next to it.
+        """
         x, y = self.grid.columns_and_rows(self.tiles % self.grid.count)
         grid = self.grid
         return jnp.minimum(y, grid.height - 1) * grid.width + jnp.minimum(x, grid.width - 1)
@@ -124,7 +159,9 @@ class Atlas(eqx.Module):
         whole = whole.reshape(*rows, grid.down * SIDE, grid.across * SIDE, channels)
         return whole[..., : grid.height, : grid.width, :]
 
-    def picture(self, values: Float[Array, "tiles *rows pixels channels"]) -> Float[Array, "*rows height width channels"]:
+    def picture(
+        self, values: Float[Array, "tiles *rows pixels channels"]
+    ) -> Float[Array, "*rows height width channels"]:
         """Put the picture together to which both surfaces add."""
         behind = jnp.where(self.in_front, self.tiles + self.grid.count, self.places.shape[0])
         partner = self.places.at[behind].get(mode="fill", fill_value=self.tiles.shape[0])

@@ -1,8 +1,8 @@
 """Lists of items per tile of the picture, laid out so that sweeps over them read contiguous memory.
 
-Tiles are ordered by the length of their list and swept `lanes` at a time, a *chunk*; the lists of a chunk are stored as
-*blocks* of `[lanes, slots]`. Nothing is dropped: the only limits are the planned numbers of pairs and of blocks, and needing
-more than either is reported.
+Tiles are ordered by the length of their list and swept `lanes` at a time, a *chunk*; the lists of a
+chunk are stored as *blocks* of `[lanes, slots]`. Nothing is dropped: the only limits are the
+planned numbers of pairs and of blocks, and needing more than either is reported.
 """
 
 from collections.abc import Callable, Sequence
@@ -50,16 +50,26 @@ class TileGrid(eqx.Module):
     def cut(self, picture: Float[Array, "rows height width"]) -> Float[Array, "tiles rows pixels"]:
         """Cut a picture into tiles; 0 beyond its edges."""
         rows, height, width = picture.shape
-        whole = jnp.pad(picture, ((0, 0), (0, self.down * SIDE - height), (0, self.across * SIDE - width)))
-        return whole.reshape(rows, self.down, SIDE, self.across, SIDE).transpose(1, 3, 0, 2, 4).reshape(self.count, rows, SIDE**2)
+        whole = jnp.pad(
+            picture, ((0, 0), (0, self.down * SIDE - height), (0, self.across * SIDE - width))
+        )
+        return (
+            whole.reshape(rows, self.down, SIDE, self.across, SIDE)
+            .transpose(1, 3, 0, 2, 4)
+            .reshape(self.count, rows, SIDE**2)
+        )
 
     def join(self, tiles: Float[Array, "tiles rows pixels"]) -> Float[Array, "rows height width"]:
         """Put a picture together from its tiles."""
         rows = tiles.shape[1]
         whole = tiles.reshape(self.down, self.across, rows, SIDE, SIDE).transpose(2, 0, 3, 1, 4)
-        return whole.reshape(rows, self.down * SIDE, self.across * SIDE)[:, : self.height, : self.width]
+        return whole.reshape(rows, self.down * SIDE, self.across * SIDE)[
+            :, : self.height, : self.width
+        ]
 
-    def columns_and_rows(self, tiles: Int[Array, " some"]) -> tuple[Int[Array, "some pixels"], Int[Array, "some pixels"]]:
+    def columns_and_rows(
+        self, tiles: Int[Array, " some"]
+    ) -> tuple[Int[Array, "some pixels"], Int[Array, "some pixels"]]:
         """Give the column and the row of every pixel of some tiles."""
         within = jnp.arange(SIDE**2, dtype=jnp.int32)
         x = (tiles % self.across * SIDE)[:, None] + (within % SIDE)[None]
@@ -111,8 +121,20 @@ class TileRanges(eqx.Module):
         one = jnp.where(self.across * self.down > 0, 1, 0)
         corners = jnp.zeros((grid.down + 1, grid.across + 1), jnp.int32)
         i0, j0 = jnp.minimum(self.left, grid.across), jnp.minimum(self.top, grid.down)
-        i1, j1 = jnp.minimum(self.left + self.across, grid.across), jnp.minimum(self.top + self.down, grid.down)
-        corners = corners.at[j0, i0].add(one).at[j1, i1].add(one).at[j0, i1].add(-one).at[j1, i0].add(-one)
+        i1, j1 = (
+            jnp.minimum(self.left + self.across, grid.across),
+            jnp.minimum(self.top + self.down, grid.down),
+        )
+        corners = (
+            corners.at[j0, i0]
+            .add(one)
+            .at[j1, i1]
+            .add(one)
+            .at[j0, i1]
+            .add(-one)
+            .at[j1, i0]
+            .add(-one)
+        )
         counts = jnp.cumsum(jnp.cumsum(corners, axis=0), axis=1)[:-1, :-1].reshape(-1)
         return jnp.pad(counts, (0, grid.tiles - counts.shape[0]))
 
@@ -128,7 +150,9 @@ def _last(edge: Float[Array, " items"], first: int, last: int) -> Float[Array, "
 
 
 class BinCapacity(eqx.Module):
-    """How many pairs of item and tile, blocks, and chunks with anything in them there is room for. Static."""
+    """How many pairs of item and tile, blocks, and chunks with anything in them there is room for.
+    Static.
+    """
 
     pairs: int = eqx.field(static=True)
     blocks: int = eqx.field(static=True)
@@ -136,25 +160,41 @@ class BinCapacity(eqx.Module):
 
     @classmethod
     def for_counts(cls, per_tile: Sequence[Int[Array, " tiles"]], grid: TileGrid) -> "BinCapacity":
-        """Give room for each of these numbers of items per tile, rounded up so that nearby ones need no other program."""
+        """Give room for each of these numbers of items per tile, rounded up so that nearby ones
+        need no other program.
+        """
         pairs = blocks = chunks = 1
         for tiles in per_tile:
             counts = np.asarray(tiles, np.int64)
             longest = np.sort(-(-counts // grid.slots))[::-1][:: grid.lanes]
             pairs, blocks = max(pairs, int(counts.sum())), max(blocks, int(longest.sum()))
             chunks = max(chunks, int((longest > 0).sum()))
-        return cls(round_up(pairs, _ROW), round_up(blocks, 4), min(round_up(chunks, 4), grid.tiles // grid.lanes))
+        return cls(
+            round_up(pairs, _ROW),
+            round_up(blocks, 4),
+            min(round_up(chunks, 4), grid.tiles // grid.lanes),
+        )
 
     def grown(self, other: "BinCapacity | None", chunks: int) -> "BinCapacity":
-        """Give room for this and another, in powers of two, so that room soon grows no more; and for so many chunks."""
+        """Give room for this and another, in powers of two, so that room soon grows no more; and
+        for so many chunks.
+        """
         more = BinCapacity(
-            _ROW << (-(-self.pairs // _ROW) - 1).bit_length(), 4 << (-(-self.blocks // 4) - 1).bit_length(), chunks
+            _ROW << (-(-self.pairs // _ROW) - 1).bit_length(),
+            4 << (-(-self.blocks // 4) - 1).bit_length(),
+            chunks,
         )
-        return more if other is None else BinCapacity(max(more.pairs, other.pairs), max(more.blocks, other.blocks), chunks)
+        return (
+            more
+            if other is None
+            else BinCapacity(max(more.pairs, other.pairs), max(more.blocks, other.blocks), chunks)
+        )
 
 
 def round_up(count: int, step: int) -> int:
-    """Round up to the next of sixteen steps per octave, and to a multiple of `step`, with 3% to spare."""
+    """Round up to the next of sixteen steps per octave, and to a multiple of `step`, with 3% to
+    spare.
+    """
     count = int(count * 1.03) + 1
     grain = max(1 << max(count.bit_length() - 5, 0), step)
     return -(-count // grain) * grain
@@ -169,7 +209,8 @@ class Bins(eqx.Module):
     first_block: Int[Array, " chunks_and_one"]
     needed: Float[Array, ""]
     places: int = eqx.field(static=True)
-    """How many lanes, of the leading chunks, there is room for; what lies beyond has an empty list."""
+    """How many lanes, of the leading chunks, there is room for; what lies beyond has an empty list.
+    """
 
     @property
     def chunks(self) -> Int[Array, ""]:
@@ -180,9 +221,15 @@ class Bins(eqx.Module):
         """Give what is added to whatever is found: 0, or NaN where the lists lack room."""
         return jnp.where(self.needed <= 1, 0.0, jnp.nan).astype(dtype)
 
-    def by_tile(self, swept: Float[Array, "places ..."], count: int, fill: float = 0) -> Float[Array, "tiles ..."]:
+    def by_tile(
+        self, swept: Float[Array, "places ..."], count: int, fill: float = 0
+    ) -> Float[Array, "tiles ..."]:
         """Put what was found lane by lane in the order of the tiles; `fill` for empty ones."""
-        lane = jnp.zeros_like(self.order).at[self.order].set(jnp.arange(self.order.shape[0], dtype=jnp.int32))
+        lane = (
+            jnp.zeros_like(self.order)
+            .at[self.order]
+            .set(jnp.arange(self.order.shape[0], dtype=jnp.int32))
+        )
         return swept.at[lane[:count]].get(mode="fill", fill_value=fill)
 
 
@@ -209,7 +256,11 @@ def _pairs(ranges: TileRanges, grid: TileGrid, capacity: int):
     ends = jnp.cumsum(counts)
     begins, total = ends - counts, ends[-1]
     items = jnp.arange(counts.shape[0], dtype=jnp.int32)
-    marks = jnp.zeros(capacity, jnp.int32).at[jnp.where(counts > 0, begins, capacity)].max(items, mode="drop")
+    marks = (
+        jnp.zeros(capacity, jnp.int32)
+        .at[jnp.where(counts > 0, begins, capacity)]
+        .max(items, mode="drop")
+    )
     item = _running_max(marks)
     pair = jnp.arange(capacity, dtype=jnp.int32)
 
@@ -218,20 +269,29 @@ def _pairs(ranges: TileRanges, grid: TileGrid, capacity: int):
 
     corner = ranges.top * grid.across + ranges.left
     local, across = pair - of_item(begins), jnp.maximum(of_item(ranges.across), 1)
-    down = ((local.astype(jnp.float32) + 0.5) / across.astype(jnp.float32)).astype(jnp.int32)  # exact below 4 million
+    down = ((local.astype(jnp.float32) + 0.5) / across.astype(jnp.float32)).astype(
+        jnp.int32
+    )  # exact below 4 million
     tile = of_item(corner) + local + down * (grid.across - across)
     return item, jnp.where(pair < total, tile, grid.tiles), jnp.sum(counts.astype(jnp.float32))
 
 
 def _ranks(tile: Int[Array, " pairs"], tiles: int):
-    """Number the pairs of each tile in order: rows are sorted apart, and counts carried from row to row."""
+    """Number the pairs of each tile in order: rows are sorted apart, and counts carried from row to
+    row.
+    """
     place = jnp.arange(_ROW, dtype=jnp.uint32)[None]
     keys = (tile.astype(jnp.uint32).reshape(-1, _ROW) << _ROW_BITS) | place
     parts = jnp.array_split(keys, 2)  # a sort runs on one core; several run side by side
     keys = jnp.concatenate([lax.sort(part, dimension=1, is_stable=False) for part in parts])
-    sorted_tile, source = (keys >> _ROW_BITS).astype(jnp.int32), (keys & (_ROW - 1)).astype(jnp.int32)
+    sorted_tile, source = (
+        (keys >> _ROW_BITS).astype(jnp.int32),
+        (keys & (_ROW - 1)).astype(jnp.int32),
+    )
     rows = keys.shape[0]
-    ends = jnp.concatenate([sorted_tile[:, 1:] != sorted_tile[:, :-1], jnp.ones((rows, 1), bool)], axis=1)
+    ends = jnp.concatenate(
+        [sorted_tile[:, 1:] != sorted_tile[:, :-1], jnp.ones((rows, 1), bool)], axis=1
+    )
     position = jnp.arange(_ROW, dtype=jnp.int32)[None]
 
     def earliest(carry, value):
@@ -246,7 +306,9 @@ def _ranks(tile: Int[Array, " pairs"], tiles: int):
         counts = counts.at[tiles_of_row].add(1, mode="promise_in_bounds")
         return counts, counts.at[tiles_of_row].get(mode="promise_in_bounds") - from_end
 
-    counts, rank = lax.scan(count_on, jnp.zeros(tiles + 1, jnp.int32), (sorted_tile, run_end - position + 1))
+    counts, rank = lax.scan(
+        count_on, jnp.zeros(tiles + 1, jnp.int32), (sorted_tile, run_end - position + 1)
+    )
     return sorted_tile, source, rank, counts[:tiles]
 
 
@@ -254,9 +316,12 @@ def bin_items(
     ranges: TileRanges,
     grid: TileGrid,
     capacity: BinCapacity,
-    meet: Callable[[Int[Array, " pairs"], Int[Array, " pairs"]], Bool[Array, " pairs"]] | None = None,
+    meet: Callable[[Int[Array, " pairs"], Int[Array, " pairs"]], Bool[Array, " pairs"]]
+    | None = None,
 ) -> Bins:
-    """List the items of every tile, in their order; if asked, only those that `meet` says the tile meets. Not differentiated."""
+    """List the items of every tile, in their order; if asked, only those that `meet` says the tile
+    meets. Not differentiated.
+    """
     items, lanes, slots, tiles = ranges.left.shape[0], grid.lanes, grid.slots, grid.tiles
     room = capacity.blocks * lanes * slots
     item, tile, total = _pairs(ranges, grid, capacity.pairs)
@@ -275,18 +340,36 @@ def bin_items(
     lane = jnp.arange(tiles, dtype=jnp.int32)
     begins = first_block[lane // lanes] * (lanes * slots) + (lane % lanes) * slots
     begin_of_tile = jnp.full(tiles + 1, room, jnp.int32).at[order].set(begins)
-    target = begin_of_tile.at[tile].get(mode="promise_in_bounds") + (rank // slots) * (lanes * slots) + rank % slots
+    target = (
+        begin_of_tile.at[tile].get(mode="promise_in_bounds")
+        + (rank // slots) * (lanes * slots)
+        + rank % slots
+    )
     ids = jnp.full(room, items, jnp.int32).at[target.reshape(-1)].set(item.reshape(-1), mode="drop")
     blocks, chunks = first_block[-1].astype(jnp.float32), _occupied(first_block).astype(jnp.float32)
-    needed = jnp.maximum(total / capacity.pairs, jnp.maximum(blocks / capacity.blocks, chunks / capacity.chunks))
-    return Bins(ids.reshape(capacity.blocks, lanes, slots), order, first_block, needed, capacity.chunks * lanes)
+    needed = jnp.maximum(
+        total / capacity.pairs, jnp.maximum(blocks / capacity.blocks, chunks / capacity.chunks)
+    )
+    return Bins(
+        ids.reshape(capacity.blocks, lanes, slots),
+        order,
+        first_block,
+        needed,
+        capacity.chunks * lanes,
+    )
 
 
-def slot_plane(plane: Float[Array, " items"], fill: float, bins: Bins) -> Float[Array, "blocks lanes slots"]:
+def slot_plane(
+    plane: Float[Array, " items"], fill: float, bins: Bins
+) -> Float[Array, "blocks lanes slots"]:
     """Gather a number of the items into their slots; `fill` in empty slots."""
     return plane.at[bins.ids].get(mode="fill", fill_value=fill)
 
 
-def scatter_slots(slots: Float[Array, "*blocks slots"], bins: Bins, items: int) -> Float[Array, " items"]:
+def scatter_slots(
+    slots: Float[Array, "*blocks slots"], bins: Bins, items: int
+) -> Float[Array, " items"]:
     """Add the slots of every item: the transpose of the gather."""
-    return jnp.zeros(items, slots.dtype).at[bins.ids.reshape(-1)].add(slots.reshape(-1), mode="drop")
+    return (
+        jnp.zeros(items, slots.dtype).at[bins.ids.reshape(-1)].add(slots.reshape(-1), mode="drop")
+    )

@@ -1,4 +1,6 @@
-"""The plain rasterizer: every splat against every pixel, a row at a time. The reference; it has every derivative."""
+"""The plain rasterizer: every splat against every pixel, a row at a time. The reference; it has
+every derivative.
+"""
 
 from collections.abc import Sequence
 
@@ -19,11 +21,17 @@ from ._views import AbstractView
 class DenseRasterizer(AbstractRasterizer):
     """Tries every splat at every pixel. Slow and plain; forward mode and second order work."""
 
-    def planned(self, splats: Splats, views: Sequence[AbstractView], settings: SplattingSettings) -> "DenseRasterizer":
+    def planned(
+        self, splats: Splats, views: Sequence[AbstractView], settings: SplattingSettings
+    ) -> "DenseRasterizer":
         return self
 
     def summed(
-        self, splats: Splats, attributes: Float[Array, "attributes splats"], view: AbstractView, settings: SplattingSettings
+        self,
+        splats: Splats,
+        attributes: Float[Array, "attributes splats"],
+        view: AbstractView,
+        settings: SplattingSettings,
     ) -> SummedFragments:
         dtype, footprints = attributes.dtype, view.footprints(splats, settings)
         columns = jnp.arange(view.width, dtype=dtype) + 0.5
@@ -32,11 +40,22 @@ class DenseRasterizer(AbstractRasterizer):
 
         def picture_row(y: Float[Array, ""]):
             dx, dy = columns[:, None] - footprints.x[None], (y - footprints.y)[None]
-            nearness = footprints.nearness[None] + footprints.slope_x[None] * dx + footprints.slope_y[None] * dy
-            quadric = dx * (footprints.a[None] * dx + footprints.b[None] * dy) + footprints.c[None] * dy * dy
+            nearness = (
+                footprints.nearness[None]
+                + footprints.slope_x[None] * dx
+                + footprints.slope_y[None] * dy
+            )
+            quadric = (
+                dx * (footprints.a[None] * dx + footprints.b[None] * dy)
+                + footprints.c[None] * dy * dy
+            )
             inside = footprints.visible[None] & view.inside(nearness, quadric)
-            squared_radius = jnp.where(inside, view.squared_radius(jnp.where(inside, nearness, 1.0), quadric), 1.0)
-            weight = jnp.where(inside, footprints.opacity[None] * fragment_weight(squared_radius), 0.0)
+            squared_radius = jnp.where(
+                inside, view.squared_radius(jnp.where(inside, nearness, 1.0), quadric), 1.0
+            )
+            weight = jnp.where(
+                inside, footprints.opacity[None] * fragment_weight(squared_radius), 0.0
+            )
             shifted = view.shifted(nearness, footprints.shift[None])
 
             limit = jnp.max(jnp.where(inside, shifted, -jnp.inf), axis=1)

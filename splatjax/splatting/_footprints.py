@@ -1,5 +1,5 @@
-"""A splat is a disc. In the picture its rim is an ellipse, and a fragment of it is described by numbers that are
-polynomials in the offset `d` (pixels) from the projected center:
+"""A splat is a disc. In the picture its rim is an ellipse, and a fragment of it is described by
+numbers that are polynomials in the offset `d` (pixels) from the projected center:
 
     nearness  e(d)  = nearness + slope . d          1 / z in perspective, -z without
     quadric   n(d)  = a dx^2 + b dx dy + c dy^2
@@ -21,7 +21,9 @@ _SLOPE_FILTER = 0.25  # pixels; see `filtered`
 
 
 class Footprints(eqx.Module):
-    """Where every splat lands, planar: one array per number. Pixels, origin top left, unless said otherwise."""
+    """Where every splat lands, planar: one array per number. Pixels, origin top left, unless said
+    otherwise.
+    """
 
     x: Float[Array, " splats"]
     y: Float[Array, " splats"]
@@ -48,11 +50,13 @@ class Footprints(eqx.Module):
 
 
 def filtered(xx, xy, yy, root, dx, dy, vx, vy, filter_radius):
-    """Widen the rim's ellipse by the screen filter: its inverse, the plane's slope, the ellipse, its determinant's root.
+    """Widen the rim's ellipse by the screen filter: its inverse, the plane's slope, the ellipse,
+    its determinant's root.
 
-    The ellipse `d^T S^-1 d = 1` grows to `S + f^2 I`; `root` is that of `det S`, `(dx, dy)` is `det S slope` and `(vx, vy)` is
-    `S slope`: the slope itself is infinite edge on, so a quarter of a pixel is added to `S` before it is divided by it. Hits
-    stay on the plane of every splat that a pixel can resolve. No term cancels another: float32 holds however slanted the splat.
+    The ellipse `d^T S^-1 d = 1` grows to `S + f^2 I`; `root` is that of `det S`, `(dx, dy)` is `det
+    S slope` and `(vx, vy)` is `S slope`: the slope itself is infinite edge on, so a quarter of a
+    pixel is added to `S` before it is divided by it. Hits stay on the plane of every splat that a
+    pixel can resolve. No term cancels another: float32 holds however slanted the splat.
     """
     determinant, trace, fine = root * root, xx + yy, _SLOPE_FILTER**2
     slanted = determinant + fine * (trace + fine)
@@ -60,10 +64,21 @@ def filtered(xx, xy, yy, root, dx, dy, vx, vy, filter_radius):
     wide = filter_radius**2
     determinant = determinant + wide * (trace + wide)
     xx, yy = xx + wide, yy + wide
-    return yy / determinant, -2 * xy / determinant, xx / determinant, slope_x, slope_y, xx, yy, jnp.sqrt(determinant)
+    return (
+        yy / determinant,
+        -2 * xy / determinant,
+        xx / determinant,
+        slope_x,
+        slope_y,
+        xx,
+        yy,
+        jnp.sqrt(determinant),
+    )
 
 
 def epsilon_of(radii, filter_radius, cosine, settings: SplattingSettings):
-    """Give the depth (mm) within which fragments belong to one surface: in radii, more on slanted splats."""
+    """Give the depth (mm) within which fragments belong to one surface: in radii, more on slanted
+    splats.
+    """
     reach = jnp.sqrt(radii * radii + filter_radius * filter_radius)
     return settings.epsilon_z * reach / jnp.maximum(cosine, 1 / settings.largest_slope)

@@ -13,7 +13,9 @@ from ._views import MARGIN, AbstractView, rows
 
 
 class OrthographicView(AbstractView):
-    """What a light at infinity sees. `position` is seen at the center of the picture, at depth 0."""
+    """What a light at infinity sees. `position` is seen at the center of the picture, at
+    depth 0.
+    """
 
     position: Float[Array, "3"]
     rotation: Float[Array, "3 3"]
@@ -27,11 +29,17 @@ class OrthographicView(AbstractView):
         nx, ny, nz = rows(self.rotation, splats.normals.T)
         visible = nz < -EDGE_ON
         squared = (splats.radii * self.scale) ** 2
-        xx, xy, yy = squared * (ny * ny + nz * nz), squared * (-nx * ny), squared * (nx * nx + nz * nz)
+        xx, xy, yy = (
+            squared * (ny * ny + nz * nz),
+            squared * (-nx * ny),
+            squared * (nx * nx + nz * nz),
+        )
         across, along = -squared * nz, squared / self.scale
         dx, dy = across * along * nx, across * along * ny
         vx, vy = -along * nz * nx, -along * nz * ny
-        a, b, c, gx, gy, xx, yy, root = filtered(xx, xy, yy, across, dx, dy, vx, vy, settings.filter_radius)
+        a, b, c, gx, gy, xx, yy, root = filtered(
+            xx, xy, yy, across, dx, dy, vx, vy, settings.filter_radius
+        )
         x, y = self.width / 2 + self.scale * px, self.height / 2 + self.scale * py
         half_x, half_y = jnp.sqrt(xx), jnp.sqrt(yy)
         filter_radius = jnp.broadcast_to(settings.filter_radius / self.scale, splats.radii.shape)
@@ -57,7 +65,11 @@ class OrthographicView(AbstractView):
         x, y, _ = rows(self.rotation, (splats.centers - self.position[None]).T)
         _, _, facing = rows(self.rotation, splats.normals.T)
         inside_x = jnp.abs(x) < 0.5 * (self.width + 2 * MARGIN) / self.scale + splats.radii
-        return inside_x & (jnp.abs(y) < 0.5 * (self.height + 2 * MARGIN) / self.scale + splats.radii) & (facing < 0)
+        return (
+            inside_x
+            & (jnp.abs(y) < 0.5 * (self.height + 2 * MARGIN) / self.scale + splats.radii)
+            & (facing < 0)
+        )
 
     @staticmethod
     def inside(nearness, quadric):
@@ -97,5 +109,9 @@ class OrthographicView(AbstractView):
         return x - half, x + half, y - half, y + half, depth
 
     def unproject(self, x, y, depth):
-        along = jnp.stack([(x - self.width / 2) / self.scale, (y - self.height / 2) / self.scale, depth])
-        return jnp.tensordot(self.rotation.T, along, 1) + self.position.reshape(3, *[1] * depth.ndim)
+        along = jnp.stack(
+            [(x - self.width / 2) / self.scale, (y - self.height / 2) / self.scale, depth]
+        )
+        return jnp.tensordot(self.rotation.T, along, 1) + self.position.reshape(
+            3, *[1] * depth.ndim
+        )

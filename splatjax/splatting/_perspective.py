@@ -40,9 +40,12 @@ class PerspectiveView(AbstractView):
         in_sight = self._in_sight(px, py, pz, splats.radii)
         pz = jnp.where(in_sight, pz, 1.0)
         u, v, scale = px / pz, py / pz, self.focal_length / pz
-        # All below is homogeneous in the normal and the radius (pixels): the normal is taken that long.
+        # All below is homogeneous in the normal and the radius (pixels): the normal is taken that
+        # long.
         radius = splats.radii * self.focal_length / pz
-        nx, ny, nz = (n * splats.radii * self.focal_length / pz for n in rows(self.rotation, splats.normals.T))
+        nx, ny, nz = (
+            n * splats.radii * self.focal_length / pz for n in rows(self.rotation, splats.normals.T)
+        )
         facing = -(nx * u + ny * v + nz)
         visible = in_sight & (facing > EDGE_ON * radius)
         # The disc's ellipse: S = r^2 P (I - n n^T) P^T, with P = [[1, 0, -u], [0, 1, -v]].
@@ -54,11 +57,14 @@ class PerspectiveView(AbstractView):
         dx, dy = -facing * along * nx / self.focal_length, -facing * along * ny / self.focal_length
         vx = (along * u + (nx - u * nz) * nz) / self.focal_length
         vy = (along * v + (ny - v * nz) * nz) / self.focal_length
-        a, b, c, gx, gy, xx, yy, root = filtered(xx, xy, yy, across, dx, dy, vx, vy, settings.filter_radius)
+        a, b, c, gx, gy, xx, yy, root = filtered(
+            xx, xy, yy, across, dx, dy, vx, vy, settings.filter_radius
+        )
         opacity = jnp.where(visible, across / root, 0.0)
         inverse = 1 / pz
         square = inverse * inverse
-        # The rim is a conic; its box is exact while the splat does not reach the plane of the pinhole.
+        # The rim is a conic; its box is exact while the splat does not reach the plane of the
+        # pinhole.
         ux, uy = xx * gx + xy * gy, xy * gx + yy * gy
         kappa = stop_gradient(1 - (gx * ux + gy * uy))
         bounded = kappa > 1e-3
@@ -93,11 +99,15 @@ class PerspectiveView(AbstractView):
         return self._in_sight(px, py, pz, splats.radii) & (nx * px + ny * py + nz * pz < 0)
 
     def _in_sight(self, x, y, z, radii):
-        """Say which spheres touch the pyramid of the picture. Others, far to the side, are beyond what float32 projects."""
+        """Say which spheres touch the pyramid of the picture. Others, far to the side, are beyond
+        what float32 projects.
+        """
 
         def beside(offset, size):
             half = 0.5 * size + MARGIN
-            return jnp.abs(offset) * self.focal_length - z * half < radii * jnp.sqrt(self.focal_length**2 + half**2)
+            return jnp.abs(offset) * self.focal_length - z * half < radii * jnp.sqrt(
+                self.focal_length**2 + half**2
+            )
 
         return (z > self.near) & beside(x, self.width) & beside(y, self.height)
 
@@ -126,7 +136,10 @@ class PerspectiveView(AbstractView):
         offset = points - self.position.reshape(3, *[1] * (points.ndim - 1))
         x, y, z = jnp.tensordot(self.rotation, offset, 1)
         safe = jnp.where(z > self.near, z, 1.0)
-        column, row = self.width / 2 + self.focal_length * x / safe, self.height / 2 + self.focal_length * y / safe
+        column, row = (
+            self.width / 2 + self.focal_length * x / safe,
+            self.height / 2 + self.focal_length * y / safe,
+        )
         return column, row, z
 
     def slant(self, x, y, depth, normals):
@@ -142,8 +155,12 @@ class PerspectiveView(AbstractView):
         x, y, depth = self.project(centers)
         bounded = depth > 1.01 * radii + self.near
         stretch = radii / jnp.where(bounded, depth - radii, 1.0)
-        half_x = jnp.where(bounded, stretch * (self.focal_length + jnp.abs(x - self.width / 2)), jnp.inf)
-        half_y = jnp.where(bounded, stretch * (self.focal_length + jnp.abs(y - self.height / 2)), jnp.inf)
+        half_x = jnp.where(
+            bounded, stretch * (self.focal_length + jnp.abs(x - self.width / 2)), jnp.inf
+        )
+        half_y = jnp.where(
+            bounded, stretch * (self.focal_length + jnp.abs(y - self.height / 2)), jnp.inf
+        )
         behind = depth + radii < self.near
         half_x = jnp.where(behind, -1.0, half_x)
         return x - half_x, x + half_x, y - half_y, y + half_y, depth
@@ -151,4 +168,6 @@ class PerspectiveView(AbstractView):
     def unproject(self, x, y, depth):
         u, v = (x - self.width / 2) / self.focal_length, (y - self.height / 2) / self.focal_length
         along = jnp.stack([u * depth, v * depth, depth])
-        return jnp.tensordot(self.rotation.T, along, 1) + self.position.reshape(3, *[1] * depth.ndim)
+        return jnp.tensordot(self.rotation.T, along, 1) + self.position.reshape(
+            3, *[1] * depth.ndim
+        )

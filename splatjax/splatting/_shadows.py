@@ -1,4 +1,6 @@
-"""Pass 1: shadow maps. The scene's surfaces as a light sees them, and how much of the light reaches each splat."""
+"""Pass 1: shadow maps. The scene's surfaces as a light sees them, and how much of the light reaches
+each splat.
+"""
 
 from collections.abc import Sequence
 
@@ -28,11 +30,13 @@ class ShadowSettings(eqx.Module):
     **Attributes:**
 
     - `resolution`: pixels along a side of each map.
-    - `bias`: a surface less than this far behind the map's, in mm, is still fully lit: keeps a surface from shadowing itself.
-    - `softness`: over this many more mm the light fades; with it shadows have gradients in depth. Across the shadow's edge,
-      light fades over about two pixels of the map.
-    - `largest_slope`: the slope up to which the receiver's own plane is followed from pixel to pixel of the map. Measured on
-      heads: 4 leaves terraces where light grazes, beyond 8 nothing is gained.
+    - `bias`: a surface less than this far behind the map's, in mm, is still fully lit: keeps a
+      surface from shadowing itself.
+    - `softness`: over this many more mm the light fades; with it shadows have gradients in depth.
+      Across the shadow's edge, light fades over about two pixels of the map.
+    - `largest_slope`: the slope up to which the receiver's own plane is followed from pixel to
+      pixel of the map. Measured on heads: 4 leaves terraces where light grazes, beyond 8 nothing is
+      gained.
     """
 
     resolution: int = eqx.field(static=True, default=1024)
@@ -42,7 +46,9 @@ class ShadowSettings(eqx.Module):
 
 
 class Bounds(eqx.Module):
-    """A sphere around all discs. Shadow maps are laid around it, so it is differentiated as they are."""
+    """A sphere around all discs. Shadow maps are laid around it, so it is differentiated as they
+    are.
+    """
 
     center: Float[Array, "3"]
     radius: Float[Array, ""]
@@ -61,7 +67,9 @@ class Bounds(eqx.Module):
 
 
 def _facing(forward: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    """Give a rotation whose third row is `forward`; the other two are smooth in it wherever it is not along an axis' flip."""
+    """Give a rotation whose third row is `forward`; the other two are smooth in it wherever it is
+    not along an axis' flip.
+    """
     helper = jnp.where(
         jnp.abs(stop_gradient(forward[1])) < 0.9,
         jnp.asarray([0.0, 1.0, 0.0], forward.dtype),
@@ -72,15 +80,21 @@ def _facing(forward: Float[Array, "3"]) -> Float[Array, "3 3"]:
     return jnp.stack([right, jnp.cross(forward, right), forward])
 
 
-def distant_view(direction: Float[Array, "3"], bounds: Bounds, settings: ShadowSettings) -> OrthographicView:
+def distant_view(
+    direction: Float[Array, "3"], bounds: Bounds, settings: ShadowSettings
+) -> OrthographicView:
     """Give what a directional light sees: the bounding sphere, in parallel."""
     size = settings.resolution
     scale = 0.5 * (size - 4) / bounds.radius
     rotation = _facing(direction / jnp.linalg.norm(direction))
-    return OrthographicView(position=bounds.center, rotation=rotation, scale=scale, width=size, height=size)
+    return OrthographicView(
+        position=bounds.center, rotation=rotation, scale=scale, width=size, height=size
+    )
 
 
-def near_view(position: Float[Array, "3"], bounds: Bounds, settings: ShadowSettings) -> PerspectiveView:
+def near_view(
+    position: Float[Array, "3"], bounds: Bounds, settings: ShadowSettings
+) -> PerspectiveView:
     """Give what a point light outside the bounding sphere sees: a frustum around the sphere."""
     to_center = bounds.center - position
     distance = jnp.linalg.norm(to_center)
@@ -101,40 +115,66 @@ def cube_views(position: Float[Array, "3"], settings: ShadowSettings) -> list[Pe
     """Give what a point light inside the bounding sphere sees: six faces of a cube."""
     size, dtype = settings.resolution, position.dtype
     axes = jnp.concatenate([jnp.eye(3, dtype=dtype), -jnp.eye(3, dtype=dtype)])
-    focal_length = jnp.asarray(0.5 * (size - 4), dtype)  # two pixels beyond each edge, for the filter
+    focal_length = jnp.asarray(
+        0.5 * (size - 4), dtype
+    )  # two pixels beyond each edge, for the filter
     return [
-        PerspectiveView(position=position, rotation=_facing(axis), focal_length=focal_length, width=size, height=size, near=_NEAR)
+        PerspectiveView(
+            position=position,
+            rotation=_facing(axis),
+            focal_length=focal_length,
+            width=size,
+            height=size,
+            near=_NEAR,
+        )
         for axis in axes
     ]
 
 
-def in_cube_face(view: PerspectiveView, points: Float[Array, "3 splats"]) -> Float[Array, " splats"]:
-    """Say (1 or 0) which points belong to a face of the cube: those whose largest coordinate is along its axis."""
+def in_cube_face(
+    view: PerspectiveView, points: Float[Array, "3 splats"]
+) -> Float[Array, " splats"]:
+    """Say (1 or 0) which points belong to a face of the cube: those whose largest coordinate is
+    along its axis.
+    """
     offset = points - view.position[:, None]
     along = jnp.tensordot(view.rotation[2], offset, 1)
     return (along >= jnp.max(jnp.abs(offset), axis=0) * (1 - 1e-6)).astype(points.dtype)
 
 
-def light_surfaces(splats: Splats, view: AbstractView, splatting: SplattingSettings, rasterizer: AbstractRasterizer) -> Surfaces:
-    """Make a shadow map (4.1): the surfaces that a light sees, by the camera's own passes 2 and 3."""
-    return splat_surfaces(splats, jnp.zeros((0, splats.count), splats.centers.dtype), view, splatting, rasterizer)
+def light_surfaces(
+    splats: Splats, view: AbstractView, splatting: SplattingSettings, rasterizer: AbstractRasterizer
+) -> Surfaces:
+    """Make a shadow map (4.1): the surfaces that a light sees, by the camera's own passes 2
+    and 3.
+    """
+    return splat_surfaces(
+        splats, jnp.zeros((0, splats.count), splats.centers.dtype), view, splatting, rasterizer
+    )
 
 
 def _spline(t: Float[Array, " splats"]) -> Float[Array, "3 splats"]:
-    """Give the quadratic B-spline's weights of the three pixels around a place; `t` in [-1/2, 1/2] from the middle one."""
+    """Give the quadratic B-spline's weights of the three pixels around a place; `t` in [-1/2, 1/2]
+    from the middle one.
+    """
     return jnp.stack([0.5 * (0.5 - t) ** 2, 0.75 - t * t, 0.5 * (0.5 + t) ** 2])
 
 
-def lit_share(splats: Splats, view: AbstractView, surfaces: Surfaces, settings: ShadowSettings) -> Float[Array, " splats"]:
+def lit_share(
+    splats: Splats, view: AbstractView, surfaces: Surfaces, settings: ShadowSettings
+) -> Float[Array, " splats"]:
     r"""Give the share of a light that reaches each splat, by soft comparison with its shadow map.
 
-    Nine pixels are compared and averaged with a smooth spline; at each, the splat's depth is continued along its own plane.
-    Light is held up by the front surface with its coverage, and by the one behind it with what is left.
+    Nine pixels are compared and averaged with a smooth spline; at each, the splat's depth is
+    continued along its own plane. Light is held up by the front surface with its coverage, and by
+    the one behind it with what is left.
 
     **Returns:** in [0, 1]; 1 outside the map. Differentiable in the splats, the view and the map.
     """
     both = surfaces.front, surfaces.behind
-    flat = jnp.stack([plane.reshape(-1) for each in both for plane in (each.depth, each.coverage)], axis=1)
+    flat = jnp.stack(
+        [plane.reshape(-1) for each in both for plane in (each.depth, each.coverage)], axis=1
+    )
 
     def land(centers, normals):
         x, y, depth = view.project(centers.T)
@@ -145,7 +185,9 @@ def lit_share(splats: Splats, view: AbstractView, surfaces: Surfaces, settings: 
     # Where splats land is kept: each of nine comparisons, and each of their derivatives, reads it.
     landed = in_parts(land, splats.centers, splats.normals)
     # Large parts: for each, the way back adds to the whole map.
-    return in_parts(lambda part: _compared(part.T, view, flat, settings), landed, at_once=4 * AT_ONCE)
+    return in_parts(
+        lambda part: _compared(part.T, view, flat, settings), landed, at_once=4 * AT_ONCE
+    )
 
 
 def _compared(
@@ -162,8 +204,13 @@ def _compared(
     # Nine pixels around each splat, side by side: [across, down, splats].
     step = jnp.arange(-1, 2, dtype=jnp.int32)
     step_x, step_y = step[:, None, None], step[None, :, None]
-    at_x, at_y = column.astype(jnp.int32)[None, None] + step_x, row.astype(jnp.int32)[None, None] + step_y
-    index = TileGrid(view.width, view.height).pixel(jnp.clip(at_x, 0, view.width - 1), jnp.clip(at_y, 0, view.height - 1))
+    at_x, at_y = (
+        column.astype(jnp.int32)[None, None] + step_x,
+        row.astype(jnp.int32)[None, None] + step_y,
+    )
+    index = TileGrid(view.width, view.height).pixel(
+        jnp.clip(at_x, 0, view.width - 1), jnp.clip(at_y, 0, view.height - 1)
+    )
     inside = (at_x >= 0) & (at_y >= 0) & (at_x < view.width) & (at_y < view.height)
     across = slope_x[None, None] * (step_x.astype(x.dtype) - tx[None, None])
     down = slope_y[None, None] * (step_y.astype(x.dtype) - ty[None, None])
@@ -173,7 +220,9 @@ def _compared(
         t = jnp.clip((here - depth - settings.bias) / settings.softness, 0, 1)
         return coverage * t * t * (3 - 2 * t)
 
-    front, coverage, behind, coverage_behind = jnp.unstack(flat.at[index].get(mode="promise_in_bounds"), axis=-1)
+    front, coverage, behind, coverage_behind = jnp.unstack(
+        flat.at[index].get(mode="promise_in_bounds"), axis=-1
+    )
     blocked = hidden(front, coverage) + (1 - coverage) * hidden(behind, coverage_behind)
     weights = _spline(tx)[:, None] * _spline(ty)[None]
     blocked = jnp.sum(weights * jnp.where(inside, blocked, 0.0), axis=(0, 1))

@@ -1,4 +1,6 @@
-"""Passes 2 and 3: the surface in front, and the one behind it at silhouettes, with blended attributes (Eq. 1)."""
+"""Passes 2 and 3: the surface in front, and the one behind it at silhouettes, with blended
+attributes (Eq. 1).
+"""
 
 from functools import partial
 
@@ -18,7 +20,8 @@ from ._views import AbstractView
 def blend_fragments(
     sums: Float[Array, "tiles *rows pixels"], weights: Float[Array, "tiles *#rows pixels"]
 ) -> Float[Array, "..."]:
-    r"""Blend the fragments of each pixel, `c(f) = sum_i w_i c_i / sum_i w_i` (Eq. 1); 0 where there is none.
+    r"""Blend the fragments of each pixel, `c(f) = sum_i w_i c_i / sum_i w_i` (Eq. 1); 0 where there
+    is none.
 
     **Arguments:** `sums`, `weights`: of `w_i c_i` and of `w_i`. Differentiable.
 
@@ -29,7 +32,9 @@ def blend_fragments(
 
 
 class Surface(eqx.Module):
-    """One surface as pixels see it, in tiles. Where `weight_sum` is 0 there is none: attributes 0, depth that of nearness 1."""
+    """One surface as pixels see it, in tiles. Where `weight_sum` is 0 there is none: attributes 0,
+    depth that of nearness 1.
+    """
 
     attributes: Float[Array, "tiles attributes pixels"]
     depth: Float[Array, "tiles pixels"]
@@ -47,7 +52,9 @@ class Surface(eqx.Module):
 
 
 class Surfaces(eqx.Module):
-    """What the pixels see, in the tiles of a `TileGrid`: a front surface, and what shows through where it ends."""
+    """What the pixels see, in the tiles of a `TileGrid`: a front surface, and what shows through
+    where it ends.
+    """
 
     front: Surface
     behind: Surface
@@ -63,7 +70,8 @@ def splat_surfaces(
 ) -> Surfaces:
     r"""Find the visible surfaces and blend the attributes of their splats (passes 2 and 3).
 
-    The nearness of each ray's hit with each splat's plane is blended like an attribute, so that a plane stays a plane.
+    The nearness of each ray's hit with each splat's plane is blended like an attribute, so that a
+    plane stays a plane.
 
     **Arguments:**
 
@@ -74,6 +82,8 @@ def splat_surfaces(
     **Returns:** `Surfaces`; NaN where the rasterizer's capacity was exceeded.
     """
     summed = rasterizer.summed(splats, attributes, view, settings)
-    surface = jax.checkpoint(partial(Surface.of, settings=settings))  # what is blended is cheap to find again, and large
+    surface = jax.checkpoint(
+        partial(Surface.of, settings=settings)
+    )  # what is blended is cheap to find again, and large
     front, behind = (surface(each, view) for each in (summed.front, summed.behind))
     return Surfaces(front, behind, summed.needed)

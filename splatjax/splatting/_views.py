@@ -22,11 +22,15 @@ class AbstractView(eqx.Module):
 
     @abc.abstractmethod
     def footprints(self, splats: Splats, settings: SplattingSettings) -> Footprints:
-        """Project splats. Splats that face away or are seen edge on, or lie before the near plane, are not visible."""
+        """Project splats. Splats that face away or are seen edge on, or lie before the near plane,
+        are not visible.
+        """
 
     @abc.abstractmethod
     def may_see(self, splats: Splats) -> Bool[Array, " splats"]:
-        """Say which splats face the eye, with spheres that touch the picture: cheap, and never too few."""
+        """Say which splats face the eye, with spheres that touch the picture: cheap, and never too
+        few.
+        """
 
     @staticmethod
     @abc.abstractmethod
@@ -35,13 +39,17 @@ class AbstractView(eqx.Module):
 
     @staticmethod
     @abc.abstractmethod
-    def squared_radius(nearness: Float[Array, "..."], quadric: Float[Array, "..."]) -> Float[Array, "..."]:
+    def squared_radius(
+        nearness: Float[Array, "..."], quadric: Float[Array, "..."]
+    ) -> Float[Array, "..."]:
         """Give `rho^2`, in units of the splat's radius, for a fragment inside."""
 
     @staticmethod
     @abc.abstractmethod
     def squared_radius_vjp(
-        nearness: Float[Array, "..."], squared_radius: Float[Array, "..."], cotangent: Float[Array, "..."]
+        nearness: Float[Array, "..."],
+        squared_radius: Float[Array, "..."],
+        cotangent: Float[Array, "..."],
     ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         """Give the cotangents of nearness and quadric for one of `rho^2`."""
 
@@ -67,7 +75,8 @@ class AbstractView(eqx.Module):
         depth: Float[Array, "*points"],
         normals: Float[Array, "3 *points"],
     ) -> tuple[Float[Array, "*points"], Float[Array, "*points"], Float[Array, "*points"]]:
-        """Give, for planes at projected points, two numbers and a third whose quotients are the depth's slope, mm per pixel.
+        """Give, for planes at projected points, two numbers and a third whose quotients are the
+        depth's slope, mm per pixel.
 
         The third is the cosine-like factor that vanishes where a plane is seen edge on."""
 
@@ -79,7 +88,9 @@ class AbstractView(eqx.Module):
     def sphere_box(
         self, centers: Float[Array, "3 spheres"], radii: Float[Array, " spheres"]
     ) -> tuple[Float[Array, " spheres"], ...]:
-        """Give left, right, top and bottom (pixels) of boxes around spheres, and their centers' depth (mm)."""
+        """Give left, right, top and bottom (pixels) of boxes around spheres, and their centers'
+        depth (mm).
+        """
 
     @abc.abstractmethod
     def unproject(
@@ -88,7 +99,9 @@ class AbstractView(eqx.Module):
         """Give the point in the world at a depth under a pixel."""
 
 
-def rows(matrix: Float[Array, "3 3"], vectors: Float[Array, "3 splats"]) -> tuple[Float[Array, " splats"], ...]:
+def rows(
+    matrix: Float[Array, "3 3"], vectors: Float[Array, "3 splats"]
+) -> tuple[Float[Array, " splats"], ...]:
     """Multiply by a matrix, as three planes."""
     x, y, z = vectors
     return tuple(matrix[i, 0] * x + matrix[i, 1] * y + matrix[i, 2] * z for i in range(3))

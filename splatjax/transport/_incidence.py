@@ -17,13 +17,20 @@ class AbstractIncidence(eqx.Module):
 
     @abc.abstractmethod
     def enter(
-        self, xi_cosine: Float[Array, " photons"], xi_angle: Float[Array, " photons"], eta: Float[Array, " two"]
+        self,
+        xi_cosine: Float[Array, " photons"],
+        xi_angle: Float[Array, " photons"],
+        eta: Float[Array, " two"],
     ) -> tuple[Direction, Float[Array, " photons"]]:
-        """Give directions inside and weights, of mean 1, by uniform numbers and the indices outside and inside."""
+        """Give directions inside and weights, of mean 1, by uniform numbers and the indices outside
+        and inside.
+        """
 
     @abc.abstractmethod
     def reflected(self, eta: Float[Array, " channels"]) -> Float[Array, " channels"]:
-        """Give the share of the arriving power that does not enter, by the index inside over outside."""
+        """Give the share of the arriving power that does not enter, by the index inside over
+        outside.
+        """
 
 
 class NormalIncidence(AbstractIncidence):
@@ -44,7 +51,9 @@ class DiffuseIncidence(AbstractIncidence):
         outside, inside = (jnp.broadcast_to(each, xi_cosine.shape) for each in eta)
         reflectance, cosine = fresnel(jnp.sqrt(xi_cosine), outside, inside)
         sine = jnp.sqrt(jnp.maximum(1 - cosine * cosine, 0.0))
-        weight = (1 - reflectance) / jnp.broadcast_to(1 - self.reflected(eta[1:] / eta[:1])[0], xi_cosine.shape)
+        weight = (1 - reflectance) / jnp.broadcast_to(
+            1 - self.reflected(eta[1:] / eta[:1])[0], xi_cosine.shape
+        )
         x, y = on_circle(xi_angle)
         return (sine * x, sine * y, cosine), weight
 

@@ -31,13 +31,14 @@ class Estimate(eqx.Module):
 class MonteCarlo(eqx.Module):
     r"""What became of the light that entered, by counting photons.
 
-    Powers are shares of what enters, as for every profile: what the surface reflects outright, `specular`, is a share of what
-    arrives.
+    Powers are shares of what enters, as for every profile: what the surface reflects outright,
+    `specular`, is a share of what arrives.
 
     **Attributes:**
 
     - `edges`: of the rings, mm.
-    - `reflected`, `transmitted`: what leaves above and below through each ring, by its area; 1/mm^2, [rings, channels].
+    - `reflected`, `transmitted`: what leaves above and below through each ring, by its area;
+      1/mm^2, [rings, channels].
     - `total_reflectance`, `total_transmittance`: all that leaves, wherever it does; [channels].
     - `absorbed`: in each layer; [layers, channels].
     - `unfinished`: what photons still carried after the last flight they were allowed; [channels].
@@ -59,15 +60,26 @@ class MonteCarlo(eqx.Module):
         return _mean_radii(self.edges)
 
     def profile(self) -> Tabulated:
-        """Give the reflectance as a profile; its total is that of all that leaves, farther out than the last ring too."""
-        return Tabulated(self.radii, self.reflected.value, self.reflected.deviation, self.total_reflectance.value)
+        """Give the reflectance as a profile; its total is that of all that leaves, farther out than
+        the last ring too.
+        """
+        return Tabulated(
+            self.radii, self.reflected.value, self.reflected.deviation, self.total_reflectance.value
+        )
 
     def transmitted_profile(self) -> Tabulated:
         """Give the transmittance as a profile."""
-        return Tabulated(self.radii, self.transmitted.value, self.transmitted.deviation, self.total_transmittance.value)
+        return Tabulated(
+            self.radii,
+            self.transmitted.value,
+            self.transmitted.deviation,
+            self.total_transmittance.value,
+        )
 
     def balance(self) -> Float[Array, " channels"]:
-        """Give all that is accounted for, less 1: rounding, and the chance by which faint photons are given up."""
+        """Give all that is accounted for, less 1: rounding, and the chance by which faint photons
+        are given up.
+        """
         parts = (self.total_reflectance, self.total_transmittance, self.unfinished)
         return sum(part.value for part in parts) + jnp.sum(self.absorbed.value, axis=0) - 1
 
@@ -91,44 +103,52 @@ def monte_carlo(
     flights: int = _FLIGHTS,
     progress: Callable[[int, int], None] | None = None,
 ) -> MonteCarlo:
-    r"""Walk photons through layers and count where they leave: no diffusion, no limit on thinness or absorption.
+    r"""Walk photons through layers and count where they leave: no diffusion, no limit on thinness
+    or absorption.
 
-    Photons fly from scattering to scattering; absorption lessens what they carry; interfaces reflect or refract them by
-    Fresnel's formulas. Channels that differ in absorption alone, or in scale alone (a half space of one index), share their
-    walks: the flights are made once, and their errors go together.
+    Photons fly from scattering to scattering; absorption lessens what they carry; interfaces
+    reflect or refract them by Fresnel's formulas. Channels that differ in absorption alone, or in
+    scale alone (a half space of one index), share their walks: the flights are made once, and their
+    errors go together.
 
-    Differentiable in `sigma_a`, `sigma_s_prime` and the optical depth of films, in forward and reverse mode, by the likelihood
-    of each path. The standard errors are constants; those of derivatives: `path_derivatives`.
+    Differentiable in `sigma_a`, `sigma_s_prime` and the optical depth of films, in forward and
+    reverse mode, by the likelihood of each path. The standard errors are constants; those of
+    derivatives: `path_derivatives`.
 
     **Arguments:**
 
     - `layers`: from the top; only the lowest may be infinite.
     - `photons`: how many for each walk; errors fall with its root.
     - `key`: of `jax.random`; the same key gives the same numbers.
-    - `edges`: of the rings, mm; ascending. By default 128 rings whose widths grow in proportion, from a fiftieth of a mean
-      free path.
+    - `edges`: of the rings, mm; ascending. By default 128 rings whose widths grow in proportion,
+      from a fiftieth of a mean free path.
     - `incidence`: `NormalIncidence()` (default) or `DiffuseIncidence()`.
     - `phase`: `Isotropic()` (default) or `HenyeyGreenstein(g)`; `sigma_s = sigma_s' / (1 - g)`.
     - `eta_above`, `eta_below`: indices of the neighbors relative to air.
-    - `flights`: from event to event, at most so many for each photon; what it then carries is `unfinished`.
+    - `flights`: from event to event, at most so many for each photon; what it then carries is
+      `unfinished`.
     - `progress`: called from time to time with the photons done and all of them.
 
     **Returns:** a `MonteCarlo`.
 
-    **Raises:** `ValueError` for no scattering layer, for an infinite layer above another, for a number of photons below 2 or not
-    below 2^30, for edges that do not ascend, and for derivatives in other arguments.
+    **Raises:** `ValueError` for no scattering layer, for an infinite layer above another, for a
+    number of photons below 2 or not below 2^30, for edges that do not ascend, and for derivatives
+    in other arguments.
 
-    **Source:** Wang, Jacques and Zheng 1995 (MCML); one walk for many absorptions: Kienle and Patterson 1996; path weights:
-    Hayakawa et al. 2001.
+    **Source:** Wang, Jacques and Zheng 1995 (MCML); one walk for many absorptions: Kienle and
+    Patterson 1996; path weights: Hayakawa et al. 2001.
     """
-    media, setup = _set_up(layers, photons, key, edges, incidence, phase, eta_above, eta_below, flights)
+    media, setup = _set_up(
+        layers, photons, key, edges, incidence, phase, eta_above, eta_below, flights
+    )
     return _monte_carlo(media, setup, progress=progress)
 
 
 class PathDerivatives(eqx.Module):
     r"""Derivatives of what `monte_carlo` gives, with their standard errors.
 
-    **Attributes:** (a leading axis runs over the layers with whose coefficient each channel is differentiated)
+    **Attributes:** (a leading axis runs over the layers with whose coefficient each channel is
+    differentiated)
 
     - `reflected`, `transmitted`: 1/mm^2 by 1/mm, [layers, rings, channels].
     - `total_reflectance`, `total_transmittance`: [layers, channels].
@@ -156,14 +176,17 @@ def path_derivatives(
     flights: int = _FLIGHTS,
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[MonteCarlo, PathDerivatives, PathDerivatives]:
-    r"""Give what `monte_carlo` gives, and its derivatives in each layer's `sigma_a` and `sigma_s` (mm), with standard errors.
+    r"""Give what `monte_carlo` gives, and its derivatives in each layer's `sigma_a` and `sigma_s`
+    (mm), with standard errors.
 
     **Arguments:** as for `monte_carlo`.
 
-    **Returns:** the estimate, and its derivatives by absorption and by scattering. A film's absorption is its optical depth
-    over its thickness, a millionth of a free path.
+    **Returns:** the estimate, and its derivatives by absorption and by scattering. A film's
+    absorption is its optical depth over its thickness, a millionth of a free path.
     """
-    media, setup = _set_up(layers, photons, key, edges, incidence, phase, eta_above, eta_below, flights)
+    media, setup = _set_up(
+        layers, photons, key, edges, incidence, phase, eta_above, eta_below, flights
+    )
     return _walk_all(media, setup, with_derivatives=True, progress=progress)
 
 
@@ -179,7 +202,9 @@ class _Setup(eqx.Module):
     lanes: int = eqx.field(static=True)
 
 
-def _set_up(layers, photons, key, edges, incidence, phase, eta_above, eta_below, flights) -> tuple[LayeredMedia, _Setup]:
+def _set_up(
+    layers, photons, key, edges, incidence, phase, eta_above, eta_below, flights
+) -> tuple[LayeredMedia, _Setup]:
     """Check and complete the arguments of `monte_carlo`."""
     for name, number, least in (("photons", photons, 2), ("flights", flights, 1)):
         if not least <= number < 2**30:
@@ -187,20 +212,25 @@ def _set_up(layers, photons, key, edges, incidence, phase, eta_above, eta_below,
     check_layers(layers)
     phase = Isotropic() if phase is None else phase
     above, below = (
-        eta if isinstance(eta, jax.Array) else jnp.asarray(eta, jnp.result_type(float)) for eta in (eta_above, eta_below)
+        eta if isinstance(eta, jax.Array) else jnp.asarray(eta, jnp.result_type(float))
+        for eta in (eta_above, eta_below)
     )
     media, edges = _laid_out(tuple(layers), phase, above, below, edges)
     if not isinstance(edges, Tracer):
         known = np.asarray(edges)
         if len(known) < 2 or known[0] < 0 or np.any(np.diff(known) <= 0):
-            raise ValueError(f"edges must ascend from at least 0 mm, two or more of them; got {known.tolist()}")
+            raise ValueError(
+                f"edges must ascend from at least 0 mm, two or more of them; got {known.tolist()}"
+            )
     incidence = NormalIncidence() if incidence is None else incidence
     numbers = (jnp.asarray(each, jnp.int32) for each in (photons, flights))
     return media, _Setup(edges, incidence, phase, key, *numbers, lanes_for(photons))
 
 
 @eqx.filter_jit
-def _laid_out(layers: tuple[Layer | Film, ...], phase: AbstractPhaseFunction, eta_above, eta_below, edges):
+def _laid_out(
+    layers: tuple[Layer | Film, ...], phase: AbstractPhaseFunction, eta_above, eta_below, edges
+):
     """Give media, and rings in their precision."""
     dtype = next(each.medium.sigma_a.dtype for each in layers if isinstance(each, Layer))
     anisotropy = phase.anisotropy(len(layers), dtype)
@@ -208,15 +238,24 @@ def _laid_out(layers: tuple[Layer | Film, ...], phase: AbstractPhaseFunction, et
     return media, _default_edges(media, anisotropy) if edges is None else edges.astype(dtype)
 
 
-def _default_edges(media: LayeredMedia, anisotropy: Float[Array, " layers"]) -> Float[Array, " edges"]:
+def _default_edges(
+    media: LayeredMedia, anisotropy: Float[Array, " layers"]
+) -> Float[Array, " edges"]:
     """Rings from a fiftieth of the least mean free path to where hardly anything leaves."""
     media = jax.lax.stop_gradient(media)
     sigma_s_prime = media.sigma_s[media.first] * (1 - anisotropy[media.first])
     free_path = 1 / (media.sigma_a[media.first] + sigma_s_prime)
     sigma_tr = jnp.sqrt(3 * media.sigma_a[media.first] / free_path)
-    last = jnp.max(jnp.minimum(200 * free_path, 20 / jnp.maximum(sigma_tr, 1e-6 / free_path) + 10 * free_path))
+    last = jnp.max(
+        jnp.minimum(200 * free_path, 20 / jnp.maximum(sigma_tr, 1e-6 / free_path) + 10 * free_path)
+    )
     first = 0.02 * jnp.min(free_path)
-    return jnp.concatenate([jnp.zeros_like(first)[None], first * (last / first) ** jnp.linspace(0, 1, 128, dtype=first.dtype)])
+    return jnp.concatenate(
+        [
+            jnp.zeros_like(first)[None],
+            first * (last / first) ** jnp.linspace(0, 1, 128, dtype=first.dtype),
+        ]
+    )
 
 
 @eqx.filter_custom_jvp
@@ -227,22 +266,34 @@ def _monte_carlo(media: LayeredMedia, setup: _Setup, *, progress) -> MonteCarlo:
 @_monte_carlo.def_jvp
 def _monte_carlo_jvp(primals, tangents, *, progress):
     (media, setup), (moved, moved_setup) = primals, tangents
-    for name, tangent in (("thickness", moved.thickness), ("eta", moved.eta), ("edges and phase", moved_setup)):
+    for name, tangent in (
+        ("thickness", moved.thickness),
+        ("eta", moved.eta),
+        ("edges and phase", moved_setup),
+    ):
         if jax.tree.leaves(tangent):
             raise ValueError(
-                f"monte_carlo has no derivative in {name}: photons would fly in other directions or leave elsewhere; "
-                "differentiate sigma_a and sigma_s_prime, or take differences of estimates with the same key"
+                f"monte_carlo has no derivative in {name}: photons would fly in other directions "
+                "or leave elsewhere; "
+                "differentiate sigma_a and sigma_s_prime, or take differences of estimates with "
+                "the same key"
             )
-    found, by_absorption, by_scattering = _walk_all(media, setup, with_derivatives=True, progress=progress)
+    found, by_absorption, by_scattering = _walk_all(
+        media, setup, with_derivatives=True, progress=progress
+    )
     pairs = [
-        (by, tangent) for by, tangent in ((by_absorption, moved.sigma_a), (by_scattering, moved.sigma_s)) if tangent is not None
+        (by, tangent)
+        for by, tangent in ((by_absorption, moved.sigma_a), (by_scattering, moved.sigma_s))
+        if tangent is not None
     ]
 
     return found, _along(found, pairs)
 
 
 @eqx.filter_jit
-def _along(found: MonteCarlo, pairs: list[tuple[PathDerivatives, Float[Array, "layers channels"]]]) -> MonteCarlo:
+def _along(
+    found: MonteCarlo, pairs: list[tuple[PathDerivatives, Float[Array, "layers channels"]]]
+) -> MonteCarlo:
     """Give the derivative of an estimate along tangents of coefficients."""
 
     def tangent_of(name: str) -> Estimate:
@@ -252,9 +303,18 @@ def _along(found: MonteCarlo, pairs: list[tuple[PathDerivatives, Float[Array, "l
             total = total + jnp.einsum("l...c,lc->...c", getattr(by, name).value, tangent)
         return Estimate(total, jnp.zeros_like(value))
 
-    names = ("reflected", "transmitted", "total_reflectance", "total_transmittance", "absorbed", "unfinished")
+    names = (
+        "reflected",
+        "transmitted",
+        "total_reflectance",
+        "total_transmittance",
+        "absorbed",
+        "unfinished",
+    )
     return MonteCarlo(
-        edges=jnp.zeros_like(found.edges), specular=jnp.zeros_like(found.specular), **{name: tangent_of(name) for name in names}
+        edges=jnp.zeros_like(found.edges),
+        specular=jnp.zeros_like(found.specular),
+        **{name: tangent_of(name) for name in names},
     )
 
 
@@ -262,7 +322,9 @@ def _walk_all(media: LayeredMedia, setup: _Setup, with_derivatives: bool, progre
     """Walk each group of channels that walk alike, and put the channels in their order."""
     groups, parts = media.alike(), []
     for number, group in enumerate(groups):
-        walk = _walk_of(media, setup, jnp.asarray(number), jnp.asarray(group.astype(np.int32)), with_derivatives)
+        walk = _walk_of(
+            media, setup, jnp.asarray(number), jnp.asarray(group.astype(np.int32)), with_derivatives
+        )
         share = None if progress is None else _share_of(progress, number, len(groups))
         parts.append(finish(walk, share))
     order = np.argsort(np.concatenate(groups)).astype(np.int32)
@@ -271,16 +333,26 @@ def _walk_all(media: LayeredMedia, setup: _Setup, with_derivatives: bool, progre
 
 @eqx.filter_jit
 def _walk_of(
-    media: LayeredMedia, setup: _Setup, number: Int[Array, ""], group: Int[Array, " group"], with_derivatives: bool
+    media: LayeredMedia,
+    setup: _Setup,
+    number: Int[Array, ""],
+    group: Int[Array, " group"],
+    with_derivatives: bool,
 ) -> Walk:
     """Give the walk of a group of channels, in the free paths of the first of them."""
     layers, unit = media.sigma_a.shape[0], media.unit[group]
     sigma_a, sigma_s = media.sigma_a[:, group], media.sigma_s[:, group]
     optics = Optics.of(sigma_a, sigma_s, unit)
     if with_derivatives:
-        ones = jnp.broadcast_to(jnp.eye(layers, dtype=unit.dtype)[:, :, None], (layers, *sigma_a.shape))
-        by_absorption = jax.vmap(lambda t: jax.jvp(lambda a: Optics.of(a, sigma_s, unit), (sigma_a,), (t,))[1])(ones)
-        by_scattering = jax.vmap(lambda t: jax.jvp(lambda s: Optics.of(sigma_a, s, unit), (sigma_s,), (t,))[1])(ones)
+        ones = jnp.broadcast_to(
+            jnp.eye(layers, dtype=unit.dtype)[:, :, None], (layers, *sigma_a.shape)
+        )
+        by_absorption = jax.vmap(
+            lambda t: jax.jvp(lambda a: Optics.of(a, sigma_s, unit), (sigma_a,), (t,))[1]
+        )(ones)
+        by_scattering = jax.vmap(
+            lambda t: jax.jvp(lambda s: Optics.of(sigma_a, s, unit), (sigma_s,), (t,))[1]
+        )(ones)
         slopes = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), by_absorption, by_scattering)
     else:
         slopes = jax.tree.map(lambda each: jnp.zeros((0, *each.shape), each.dtype), optics)
@@ -298,15 +370,27 @@ def _walk_of(
     )
 
 
-def _share_of(progress: Callable[[int, int], None], number: int, groups: int) -> Callable[[int, int], None]:
+def _share_of(
+    progress: Callable[[int, int], None], number: int, groups: int
+) -> Callable[[int, int], None]:
     return lambda done, photons: progress(number * photons + done, groups * photons)
 
 
 @eqx.filter_jit
-def _assemble(parts: list[Tally], order: Int[Array, " channels"], media: LayeredMedia, setup: _Setup, with_derivatives: bool):
-    """Turn means of moments into estimates: the moments are value, square, derivatives, and their squares."""
+def _assemble(
+    parts: list[Tally],
+    order: Int[Array, " channels"],
+    media: LayeredMedia,
+    setup: _Setup,
+    with_derivatives: bool,
+):
+    """Turn means of moments into estimates: the moments are value, square, derivatives, and their
+    squares.
+    """
     rings, layers = setup.edges.shape[0] - 1, media.sigma_a.shape[0] if with_derivatives else 0
-    photons, others = (count.astype(setup.edges.dtype) for count in (setup.photons, setup.photons - 1))
+    photons, others = (
+        count.astype(setup.edges.dtype) for count in (setup.photons, setup.photons - 1)
+    )
     left = jnp.concatenate([part.left.over(photons) for part in parts])[order]
     absorbed = jnp.concatenate([part.absorbed.over(photons) for part in parts], axis=1)[:, order]
     areas = jnp.pi * (setup.edges[1:] ** 2 - setup.edges[:-1] ** 2)
@@ -331,7 +415,18 @@ def _assemble(parts: list[Tally], order: Int[Array, " channels"], media: Layered
             "unfinished": estimate(unfinished, value, square),
         }
 
-    found = MonteCarlo(edges=setup.edges, specular=setup.incidence.reflected(media.eta[1] / media.eta[0]), **all_of(0, 1))
-    slopes = [PathDerivatives(**all_of(2 + number, 2 + 2 * layers + number)) for number in range(2 * layers)]
-    stacked = [jax.tree.map(lambda *each: jnp.stack(each), *slopes[i : i + layers]) for i in (0, layers) if layers]
+    found = MonteCarlo(
+        edges=setup.edges,
+        specular=setup.incidence.reflected(media.eta[1] / media.eta[0]),
+        **all_of(0, 1),
+    )
+    slopes = [
+        PathDerivatives(**all_of(2 + number, 2 + 2 * layers + number))
+        for number in range(2 * layers)
+    ]
+    stacked = [
+        jax.tree.map(lambda *each: jnp.stack(each), *slopes[i : i + layers])
+        for i in (0, layers)
+        if layers
+    ]
     return (found, *stacked)

@@ -36,7 +36,9 @@ class AbstractPhaseFunction(eqx.Module):
 
 
 class Isotropic(AbstractPhaseFunction):
-    """All directions are equally likely. By similarity it stands for any phase function, with `sigma_s'` for `sigma_s`."""
+    """All directions are equally likely. By similarity it stands for any phase function, with
+    `sigma_s'` for `sigma_s`.
+    """
 
     def anisotropy(self, layers, dtype):
         return jnp.zeros(layers, dtype)
@@ -53,11 +55,13 @@ class HenyeyGreenstein(AbstractPhaseFunction):
 
     **Attributes:**
 
-    - `g`: mean cosine, between -1 and 1; one for all layers, or one for each. A constant of every derivative.
+    - `g`: mean cosine, between -1 and 1; one for all layers, or one for each. A constant of every
+      derivative.
 
     **Raises:** `ValueError` for a `g` out of this range.
 
-    **Source:** Henyey and Greenstein 1941; the inverse of its distribution is written so that nothing is singular at `g = 0`.
+    **Source:** Henyey and Greenstein 1941; the inverse of its distribution is written so that
+    nothing is singular at `g = 0`.
     """
 
     g: Float[Array, "*layers"] = eqx.field(converter=jnp.asarray)
@@ -67,14 +71,23 @@ class HenyeyGreenstein(AbstractPhaseFunction):
 
     def anisotropy(self, layers, dtype):
         if self.g.ndim and self.g.shape[0] != layers:
-            raise ValueError(f"g must be one number, or one for each of the {layers} layers; got {self.g.shape[0]}")
+            raise ValueError(
+                f"g must be one number, or one for each of the {layers} layers; got "
+                f"{self.g.shape[0]}"
+            )
         return jnp.broadcast_to(self.g.astype(dtype), (layers,))
 
     def scatter(self, direction, layer, xi_cosine, xi_angle):
         x, y, z = direction
-        g = jnp.broadcast_to(self.g.astype(x.dtype), x.shape) if self.g.ndim == 0 else of_layer(self.g.astype(x.dtype), layer)
+        g = (
+            jnp.broadcast_to(self.g.astype(x.dtype), x.shape)
+            if self.g.ndim == 0
+            else of_layer(self.g.astype(x.dtype), layer)
+        )
         s = 2 * xi_cosine - 1
-        cosine = (s + 0.5 * g * (3 + s * s) + g * g * (s + 0.5 * g * (s * s - 1))) / ((1 + g * s) * (1 + g * s))
+        cosine = (s + 0.5 * g * (3 + s * s) + g * g * (s + 0.5 * g * (s * s - 1))) / (
+            (1 + g * s) * (1 + g * s)
+        )
         sine = jnp.sqrt(jnp.maximum(1 - cosine * cosine, 0.0))
         along, across = (sine * each for each in on_circle(xi_angle))
         # An orthonormal basis about the direction (Duff et al. 2017).
@@ -90,10 +103,13 @@ class HenyeyGreenstein(AbstractPhaseFunction):
         return turned[0] * scale, turned[1] * scale, turned[2] * scale
 
 
-def on_circle(xi: Float[Array, " photons"]) -> tuple[Float[Array, " photons"], Float[Array, " photons"]]:
+def on_circle(
+    xi: Float[Array, " photons"],
+) -> tuple[Float[Array, " photons"], Float[Array, " photons"]]:
     """Give a point of the unit circle for each number in (0, 1]; right to 1e-10.
 
-    Series for a quarter of a turn, and the double angle: a library's sine is made for arguments of any size, and slow.
+    Series for a quarter of a turn, and the double angle: a library's sine is made for arguments of
+    any size, and slow.
     """
     half_turns = xi - 0.5
     squared = half_turns * half_turns

@@ -1,7 +1,7 @@
 """Uniform random numbers by counting, in one pass.
 
-`jax.random` gives the same numbers, but on a CPU it lowers each round of the cipher to a loop over memory, which takes longer
-than all the physics of a flight.
+`jax.random` gives the same numbers, but on a CPU it lowers each round of the cipher to a loop over
+memory, which takes longer than all the physics of a flight.
 """
 
 import jax
@@ -15,17 +15,24 @@ _GOLDEN = 0x9E3779B9
 """2^32 over the golden ratio."""
 
 
-def uniforms(key: Key[Array, ""], number: Int[Array, ""], lanes: int, dtype) -> Float[Array, "four lanes"]:
-    """Give four independent numbers in (0, 1] for each lane, steps of 2^-24: the `number`-th of a key."""
+def uniforms(
+    key: Key[Array, ""], number: Int[Array, ""], lanes: int, dtype
+) -> Float[Array, "four lanes"]:
+    """Give four independent numbers in (0, 1] for each lane, steps of 2^-24: the `number`-th of a
+    key.
+    """
     words = jax.random.key_data(key).reshape(-1).astype(jnp.uint32)
     lane = jnp.arange(lanes, dtype=jnp.uint32)
     count = jnp.broadcast_to(2 * number.astype(jnp.uint32), (lanes,))
     pairs = [threefry(words[0], words[-1], lane, count + jnp.uint32(half)) for half in (0, 1)]
-    return jnp.stack([((word >> 8) + jnp.uint32(1)).astype(dtype) * 2.0**-24 for pair in pairs for word in pair])
+    return jnp.stack(
+        [((word >> 8) + jnp.uint32(1)).astype(dtype) * 2.0**-24 for pair in pairs for word in pair]
+    )
 
 
 def evenly(key: Key[Array, ""], number: Int[Array, " lanes"], dtype) -> Float[Array, " lanes"]:
-    """Give numbers in (0, 1] that fill it evenly as `number` counts: Weyl's sequence of the golden ratio, from a random start.
+    """Give numbers in (0, 1] that fill it evenly as `number` counts: Weyl's sequence of the golden
+    ratio, from a random start.
 
     Means over a smooth function of one of them are nearly exact.
     """
@@ -35,7 +42,10 @@ def evenly(key: Key[Array, ""], number: Int[Array, " lanes"], dtype) -> Float[Ar
 
 
 def threefry(
-    first: UInt32[Array, ""], second: UInt32[Array, ""], x: UInt32[Array, " lanes"], y: UInt32[Array, " lanes"]
+    first: UInt32[Array, ""],
+    second: UInt32[Array, ""],
+    x: UInt32[Array, " lanes"],
+    y: UInt32[Array, " lanes"],
 ) -> tuple[UInt32[Array, " lanes"], UInt32[Array, " lanes"]]:
     """Encipher pairs of words: Threefry 2x32 with 20 rounds.
 

@@ -17,7 +17,9 @@ from ._tally import Tally
 from ._walk import IDLE, INSIDE, Optics, PathWeights, Photons, fly, weigh
 
 _MOST_LANES, _LEAST_LANES, _PHOTONS_A_LANE = 16384, 1024, 8
-"""Photons on their way at once: their state stays in the cache of a core or two, and few lanes wait for the last photon."""
+"""Photons on their way at once: their state stays in the cache of a core or two, and few lanes wait
+for the last photon.
+"""
 
 _FLIGHTS = 4
 """Flights between two looks at who is done."""
@@ -29,7 +31,9 @@ _UNWATCHED = 8
 """Rounds between two looks at whether all are done."""
 
 _LEAST, _SURVIVING = 1e-4, 0.1
-"""A photon that carries less than this is given up, except for this share, which carries more instead (Russian roulette)."""
+"""A photon that carries less than this is given up, except for this share, which carries more
+instead (Russian roulette).
+"""
 
 
 class Walk(eqx.Module):
@@ -72,15 +76,21 @@ class _State(eqx.Module):
 
 
 @jax.jit
-def _any_left(started: Int[Array, ""], photons: Int[Array, ""], place: Int[Array, " photons"]) -> Bool[Array, ""]:
+def _any_left(
+    started: Int[Array, ""], photons: Int[Array, ""], place: Int[Array, " photons"]
+) -> Bool[Array, ""]:
     return (started < photons) | jnp.any(place == INSIDE)
 
 
 def finish(walk: Walk, progress: Callable[[int, int], None] | None) -> Tally:
-    """Walk all photons to their end. Under `jit` in one loop, else call by call, telling progress in between."""
+    """Walk all photons to their end. Under `jit` in one loop, else call by call, telling progress
+    in between.
+    """
     state = _start(walk)
     if isinstance(state.started, Tracer):
-        return jax.lax.while_loop(lambda state: state.unfinished(walk), lambda state: _round(walk, state), state).tally
+        return jax.lax.while_loop(
+            lambda state: state.unfinished(walk), lambda state: _round(walk, state), state
+        ).tally
     while bool(state.unfinished(walk)):
         state = _advance(walk, state)
         if progress is not None:
@@ -96,10 +106,14 @@ def _start(walk: Walk) -> _State:
     nothing, nowhere = jnp.zeros(walk.lanes, dtype), jnp.zeros(walk.lanes, jnp.int32)
     down = (nothing, nothing, nothing + 1)
     photons = Photons(nothing, nothing, nothing, down, nothing, nowhere, nowhere + IDLE, nowhere)
-    weights = PathWeights(jnp.zeros((channels, walk.lanes), dtype), jnp.zeros((layers, channels, walk.lanes), dtype))
+    weights = PathWeights(
+        jnp.zeros((channels, walk.lanes), dtype), jnp.zeros((layers, channels, walk.lanes), dtype)
+    )
     slopes = jax.tree.map(lambda each: jnp.zeros((parameters, *each.shape), dtype), weights)
     tally = Tally.empty(rings, layers, channels, parameters, dtype)
-    state = _State(photons, weights, slopes, tally, jnp.zeros((), jnp.int32), jnp.zeros((), jnp.int32))
+    state = _State(
+        photons, weights, slopes, tally, jnp.zeros((), jnp.int32), jnp.zeros((), jnp.int32)
+    )
     return _launch(walk, state, photons.place == IDLE)
 
 
@@ -135,7 +149,9 @@ def _round(walk: Walk, state: _State) -> _State:
         def push(optics, weights):
             return jax.jvp(path, (walk.optics, state.weights), (optics, weights), has_aux=True)
 
-        weights, slopes, photons = jax.vmap(push, out_axes=(None, 0, None))(walk.slopes, state.slopes)
+        weights, slopes, photons = jax.vmap(push, out_axes=(None, 0, None))(
+            walk.slopes, state.slopes
+        )
     else:
         (weights, photons), slopes = path(walk.optics, state.weights), state.slopes
 
@@ -145,9 +161,14 @@ def _round(walk: Walk, state: _State) -> _State:
     dropped = faint & (chance > _SURVIVING)
     boost = jnp.where(faint & ~dropped, 1 / _SURVIVING, jnp.ones_like(chance))
     weights, slopes = (
-        PathWeights(each.carried * jnp.broadcast_to(boost, each.carried.shape), each.absorbed) for each in (weights, slopes)
+        PathWeights(each.carried * jnp.broadcast_to(boost, each.carried.shape), each.absorbed)
+        for each in (weights, slopes)
     )
-    done = ((photons.place != INSIDE) & (photons.place != IDLE)) | dropped | (inside & (photons.flights >= walk.flights))
+    done = (
+        ((photons.place != INSIDE) & (photons.place != IDLE))
+        | dropped
+        | (inside & (photons.flights >= walk.flights))
+    )
     tally = state.tally.plus(photons, weights, slopes, done, dropped, walk.edges)
     after = _State(photons, weights, slopes, tally, state.started, state.round + 1)
     return _launch(walk, after, done | (photons.place == IDLE))
@@ -170,10 +191,14 @@ def _launch(walk: Walk, state: _State, free: Bool[Array, " photons"]) -> _State:
         x=fresh(zero, old.x),
         y=fresh(zero, old.y),
         depth=fresh(zero, old.depth),
-        direction=tuple(fresh(new, each) for new, each in zip(direction, old.direction, strict=True)),
+        direction=tuple(
+            fresh(new, each) for new, each in zip(direction, old.direction, strict=True)
+        ),
         to_scatter=fresh(-jnp.log(xi[2]), old.to_scatter),
         layer=fresh(jnp.zeros_like(old.layer), old.layer),
-        place=fresh(jnp.full_like(old.place, INSIDE), jnp.where(free, IDLE, old.place).astype(jnp.int32)),
+        place=fresh(
+            jnp.full_like(old.place, INSIDE), jnp.where(free, IDLE, old.place).astype(jnp.int32)
+        ),
         flights=fresh(jnp.zeros_like(old.flights), old.flights),
     )
 
@@ -181,7 +206,9 @@ def _launch(walk: Walk, state: _State, free: Bool[Array, " photons"]) -> _State:
         return jnp.where(jnp.broadcast_to(free, each.shape), jnp.zeros_like(each), each)
 
     weights, slopes = (jax.tree.map(cleared, each) for each in (state.weights, state.slopes))
-    carried = weights.carried + jnp.broadcast_to(jnp.where(begins, weight, zero), weights.carried.shape)
+    carried = weights.carried + jnp.broadcast_to(
+        jnp.where(begins, weight, zero), weights.carried.shape
+    )
     weights = PathWeights(carried, weights.absorbed)
     started = state.started + jnp.sum(begins, dtype=jnp.int32)
     return _State(photons, weights, slopes, state.tally, started, state.round)

@@ -6,7 +6,8 @@ from jaxtyping import Array, Float
 
 
 class Sum(eqx.Module):
-    """A running sum and what rounding left out of it: exact to the precision of its terms after any number of them.
+    """A running sum and what rounding left out of it: exact to the precision of its terms after any
+    number of them.
 
     **Source:** Neumaier 1974.
     """
@@ -20,7 +21,11 @@ class Sum(eqx.Module):
 
     def plus(self, term: Float[Array, "..."]) -> "Sum":
         high = self.high + term
-        lost = jnp.where(jnp.abs(self.high) >= jnp.abs(term), (self.high - high) + term, (term - high) + self.high)
+        lost = jnp.where(
+            jnp.abs(self.high) >= jnp.abs(term),
+            (self.high - high) + term,
+            (term - high) + self.high,
+        )
         low = self.low + lost
         both = high + low
         return Sum(both, low - (both - high))
@@ -33,9 +38,17 @@ class Sum(eqx.Module):
 _AT_ONCE = 32
 
 
-def total(counts: Float[Array, " terms"], values: Float[Array, "terms moments"]) -> Float[Array, " moments"]:
-    """Give `counts @ values`, a few terms at a time: thousands of them, one after the other, are off by 5e-5 in float32."""
+def total(
+    counts: Float[Array, " terms"], values: Float[Array, "terms moments"]
+) -> Float[Array, " moments"]:
+    """Give `counts @ values`, a few terms at a time: thousands of them, one after the other, are
+    off by 5e-5 in float32.
+    """
     while counts.shape[0] % _AT_ONCE == 0:
-        values = jnp.einsum("ga,gam->gm", counts.reshape(-1, _AT_ONCE), values.reshape(-1, _AT_ONCE, values.shape[1]))
+        values = jnp.einsum(
+            "ga,gam->gm",
+            counts.reshape(-1, _AT_ONCE),
+            values.reshape(-1, _AT_ONCE, values.shape[1]),
+        )
         counts = jnp.ones(values.shape[0], values.dtype)
     return counts @ values

@@ -9,16 +9,19 @@ from ._sums import Sum, total
 from ._walk import ABOVE, BELOW, PathWeights, Photons
 
 _TABLES = 16
-"""Many equal numbers, added one by one to one ring, are off in float32: they are added to as many sums of it first."""
+"""Many equal numbers, added one by one to one ring, are off in float32: they are added to as many
+sums of it first.
+"""
 
 
 class Tally(eqx.Module):
-    r"""Sums over finished photons of weights, of their squares, and of derivatives and their squares.
+    r"""Sums over finished photons of weights, of their squares, and of derivatives and their
+    squares.
 
     **Attributes:** (the last axis: weight, its square; then the derivatives, then their squares)
 
-    - `left`: by channel, and by ring: those above, what left farther out, those below, what left farther out there, and what
-      was still on its way when it was given up.
+    - `left`: by channel, and by ring: those above, what left farther out, those below, what left
+      farther out there, and what was still on its way when it was given up.
     - `absorbed`: by layer and channel.
     """
 
@@ -28,7 +31,10 @@ class Tally(eqx.Module):
     @classmethod
     def empty(cls, rings: int, layers: int, channels: int, slopes: int, dtype) -> "Tally":
         moments = 2 + 2 * slopes
-        return cls(Sum.zeros((channels, 2 * (rings + 1) + 1, moments), dtype), Sum.zeros((layers, channels, moments), dtype))
+        return cls(
+            Sum.zeros((channels, 2 * (rings + 1) + 1, moments), dtype),
+            Sum.zeros((layers, channels, moments), dtype),
+        )
 
     def plus(
         self,
@@ -39,7 +45,9 @@ class Tally(eqx.Module):
         dropped: Bool[Array, " photons"],
         edges: Float[Array, "channels edges"],
     ) -> "Tally":
-        """Add the photons that are done. Those `dropped` were given up for having too little to carry, and leave nothing."""
+        """Add the photons that are done. Those `dropped` were given up for having too little to
+        carry, and leave nothing.
+        """
         rings = edges.shape[1] - 1
         radius = jnp.sqrt(photons.x * photons.x + photons.y * photons.y)
 
@@ -47,20 +55,35 @@ class Tally(eqx.Module):
             # Within the first edge and beyond the last is farther out too: no ring knows it.
             ring = jnp.searchsorted(edges, radius, side="right", method="scan_unrolled") - 1
             ring = jnp.where((ring < 0) | (ring >= rings), rings, ring)
-            ring = jnp.where(photons.place == ABOVE, ring, jnp.where(photons.place == BELOW, ring + rings + 1, 2 * rings + 2))
+            ring = jnp.where(
+                photons.place == ABOVE,
+                ring,
+                jnp.where(photons.place == BELOW, ring + rings + 1, 2 * rings + 2),
+            )
             counts = (done & ~dropped).astype(carried.dtype)
-            moments = _moments(carried, slope) * jnp.broadcast_to(counts[:, None], (counts.shape[0], self.left.high.shape[-1]))
+            moments = _moments(carried, slope) * jnp.broadcast_to(
+                counts[:, None], (counts.shape[0], self.left.high.shape[-1])
+            )
             table = jnp.arange(counts.shape[0], dtype=jnp.int32) % _TABLES
-            return jnp.sum(jnp.zeros((_TABLES, *self.left.high.shape[1:]), carried.dtype).at[table, ring].add(moments), axis=0)
+            return jnp.sum(
+                jnp.zeros((_TABLES, *self.left.high.shape[1:]), carried.dtype)
+                .at[table, ring]
+                .add(moments),
+                axis=0,
+            )
 
         left = jax.vmap(leave, in_axes=(0, 1, 0))(weights.carried, slopes.carried, edges)
 
         def absorb(absorbed, slope):
             return total(done.astype(absorbed.dtype), _moments(absorbed, slope))
 
-        absorbed = jax.vmap(jax.vmap(absorb, in_axes=(0, 1)), in_axes=(0, 1))(weights.absorbed, slopes.absorbed)
+        absorbed = jax.vmap(jax.vmap(absorb, in_axes=(0, 1)), in_axes=(0, 1))(
+            weights.absorbed, slopes.absorbed
+        )
         return Tally(self.left.plus(left), self.absorbed.plus(absorbed))
 
 
-def _moments(values: Float[Array, " photons"], slopes: Float[Array, "slopes photons"]) -> Float[Array, "photons moments"]:
+def _moments(
+    values: Float[Array, " photons"], slopes: Float[Array, "slopes photons"]
+) -> Float[Array, "photons moments"]:
     return jnp.concatenate([values[None], (values * values)[None], slopes, slopes * slopes]).T

@@ -1,4 +1,6 @@
-"""One flight of many photons: to the next scattering or to the next interface, whichever comes first."""
+"""One flight of many photons: to the next scattering or to the next interface, whichever comes
+first.
+"""
 
 import equinox as eqx
 import jax
@@ -15,7 +17,9 @@ INSIDE, ABOVE, BELOW, IDLE = 0, 1, 2, 3
 
 
 class Photons(eqx.Module):
-    """Where photons are, in free paths of the stack; depth counts from the top of their layer. No derivative passes here."""
+    """Where photons are, in free paths of the stack; depth counts from the top of their layer. No
+    derivative passes here.
+    """
 
     x: Float[Array, " photons"]
     y: Float[Array, " photons"]
@@ -28,7 +32,9 @@ class Photons(eqx.Module):
 
 
 class Flight(eqx.Module):
-    """What a flight means for weights: its length in a layer, 0 for a photon that does not fly, and how it ended."""
+    """What a flight means for weights: its length in a layer, 0 for a photon that does not fly, and
+    how it ended.
+    """
 
     length: Float[Array, " photons"]
     layer: Int[Array, " photons"]
@@ -51,7 +57,8 @@ class PathWeights(eqx.Module):
 
 
 class Optics(eqx.Module):
-    r"""What turns flights into weights, per free path of the stack. Differentiable: the only place where coefficients are.
+    r"""What turns flights into weights, per free path of the stack. Differentiable: the only place
+    where coefficients are.
 
     **Attributes:**
 
@@ -59,8 +66,8 @@ class Optics(eqx.Module):
     - `removal`: absorption, and scattering in excess of that by which flights are drawn.
     - `ratio`: scattering over that by which flights are drawn. 1 in value.
 
-    The likelihood of a path under other coefficients than those it was drawn by is a product over its flights and scatterings:
-    its derivative is the path's share in that of every mean.
+    The likelihood of a path under other coefficients than those it was drawn by is a product over
+    its flights and scatterings: its derivative is the path's share in that of every mean.
     """
 
     absorption: Float[Array, "*slopes layers channels"]
@@ -68,7 +75,12 @@ class Optics(eqx.Module):
     ratio: Float[Array, "*slopes layers channels"]
 
     @classmethod
-    def of(cls, sigma_a: Float[Array, "layers channels"], sigma_s: Float[Array, "layers channels"], unit) -> "Optics":
+    def of(
+        cls,
+        sigma_a: Float[Array, "layers channels"],
+        sigma_s: Float[Array, "layers channels"],
+        unit,
+    ) -> "Optics":
         """State coefficients (1/mm) in free paths of `unit` mm, [channels]."""
         drawn, unit = jax.lax.stop_gradient(sigma_s), jax.lax.stop_gradient(unit)[None]
         return cls(
@@ -78,15 +90,21 @@ class Optics(eqx.Module):
         )
 
 
-def fly(stack: Stack, phase: AbstractPhaseFunction, photons: Photons, xi: Float[Array, "four photons"]) -> tuple[Photons, Flight]:
-    """Move photons by one flight. Uniform random numbers: cosine or reflection, angle, and the next free path."""
+def fly(
+    stack: Stack, phase: AbstractPhaseFunction, photons: Photons, xi: Float[Array, "four photons"]
+) -> tuple[Photons, Flight]:
+    """Move photons by one flight. Uniform random numbers: cosine or reflection, angle, and the next
+    free path.
+    """
     ux, uy, uz = photons.direction
     layer, inside = photons.layer, photons.place == INSIDE
     sigma_s, thickness = of_layer(stack.sigma_s, layer), of_layer(stack.thickness, layer)
     down = uz > 0
     ahead = jnp.where(down, thickness - photons.depth, photons.depth)
     to_interface = jnp.maximum(ahead, 0.0) / jnp.maximum(jnp.abs(uz), jnp.finfo(uz.dtype).tiny)
-    to_scatter = jnp.where(sigma_s > 0, photons.to_scatter / jnp.where(sigma_s > 0, sigma_s, 1.0), jnp.inf)
+    to_scatter = jnp.where(
+        sigma_s > 0, photons.to_scatter / jnp.where(sigma_s > 0, sigma_s, 1.0), jnp.inf
+    )
     scattered = to_scatter < to_interface
     length = jnp.where(inside, jnp.minimum(to_scatter, to_interface), 0.0)
 
@@ -104,7 +122,9 @@ def fly(stack: Stack, phase: AbstractPhaseFunction, photons: Photons, xi: Float[
     up_again = jnp.where(crosses, jnp.where(down, onward, -onward), -uz)
     # At an interface the depth is 0 or that of the layer now entered, or met from inside, exactly.
     arrives_on_top = jnp.where(crosses, down, ~down)
-    at_interface = jnp.where(arrives_on_top, 0.0, of_layer(stack.thickness, jnp.where(stays, after, layer)))
+    at_interface = jnp.where(
+        arrives_on_top, 0.0, of_layer(stack.thickness, jnp.where(stays, after, layer))
+    )
 
     def now(new, old):
         return jnp.where(inside, new, old)
@@ -118,7 +138,10 @@ def fly(stack: Stack, phase: AbstractPhaseFunction, photons: Photons, xi: Float[
             now(jnp.where(scattered, turned[1], uy * bent), uy),
             now(jnp.where(scattered, turned[2], up_again), uz),
         ),
-        to_scatter=now(jnp.where(scattered, -jnp.log(xi[2]), photons.to_scatter - to_interface * sigma_s), photons.to_scatter),
+        to_scatter=now(
+            jnp.where(scattered, -jnp.log(xi[2]), photons.to_scatter - to_interface * sigma_s),
+            photons.to_scatter,
+        ),
         layer=now(jnp.where(scattered | ~stays, layer, after), layer),
         place=now(jnp.where(scattered, INSIDE, left), photons.place),
         flights=photons.flights + inside.astype(jnp.int32),
@@ -133,7 +156,10 @@ def weigh(optics: Optics, weights: PathWeights, flight: Flight) -> PathWeights:
     taken = weights.carried * _taken(of_layer(optics.absorption, flight.layer) * length, removal)
     scattered = jnp.broadcast_to(flight.scattered, weights.carried.shape)
     ratio = jnp.where(scattered, of_layer(optics.ratio, flight.layer), 1.0)
-    layers = jnp.broadcast_to(jnp.arange(weights.absorbed.shape[0], dtype=jnp.int32)[:, None, None], weights.absorbed.shape)
+    layers = jnp.broadcast_to(
+        jnp.arange(weights.absorbed.shape[0], dtype=jnp.int32)[:, None, None],
+        weights.absorbed.shape,
+    )
     here = jnp.broadcast_to(flight.layer, layers.shape) == layers
     return PathWeights(
         weights.carried * jnp.exp(-removal) * ratio,
@@ -145,7 +171,9 @@ def weigh(optics: Optics, weights: PathWeights, flight: Flight) -> PathWeights:
 def _taken(
     absorption: Float[Array, "channels photons"], removal: Float[Array, "channels photons"]
 ) -> Float[Array, "channels photons"]:
-    """Give `(1 - exp(-removal)) absorption / removal`, where both are equal in value, as they are on the path drawn."""
+    """Give `(1 - exp(-removal)) absorption / removal`, where both are equal in value, as they are
+    on the path drawn.
+    """
     return -jnp.expm1(-absorption)
 
 

@@ -10,7 +10,9 @@ PLY_HEAD = "ply\nformat ascii 1.0\nelement vertex {count}\n{properties}end_heade
 def write_ply(path, rows, names):
     properties = "".join(f"property float {name}\n" for name in names)
     lines = [" ".join(f"{value}" for value in row) for row in rows]
-    path.write_text(PLY_HEAD.format(count=len(rows), properties=properties) + "\n".join(lines) + "\n")
+    path.write_text(
+        PLY_HEAD.format(count=len(rows), properties=properties) + "\n".join(lines) + "\n"
+    )
     return path
 
 
@@ -35,7 +37,9 @@ def failure(args, capsys, outputs=()):
 
 
 def ball(path, radius=10.0, count=300):
-    """Write an even ball, without albedo. From all around it looks alike, so that one program serves every view."""
+    """Write an even ball, without albedo. From all around it looks alike, so that one program
+    serves every view.
+    """
     z = 1 - (2 * np.arange(count) + 1) / count
     longitude = np.pi * (3 - np.sqrt(5)) * np.arange(count)
     across = np.sqrt(1 - z * z)

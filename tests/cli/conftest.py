@@ -29,7 +29,9 @@ def own_cache(tmp_path_factory):
 
 @pytest.fixture
 def drawn(monkeypatch):
-    """The plans by which a turntable's frames are drawn, and how many programs had been compiled after each."""
+    """The plans by which a turntable's frames are drawn, and how many programs had been compiled
+    after each.
+    """
     compiled, seen = [], []
     draw = _turntable.draw
 

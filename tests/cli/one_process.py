@@ -1,4 +1,6 @@
-"""`splatjax` with plain renderers, as test_processes.py starts it several times over; killed where it is told to be."""
+"""`splatjax` with plain renderers, as test_processes.py starts it several times over; killed where
+it is told to be.
+"""
 
 import os
 import signal
@@ -10,7 +12,9 @@ from splatjax.cli import main
 from splatjax.diffusion import DenseDiffuser
 from splatjax.splatting import DenseRasterizer, ShadowSettings
 
-settings = sj.RenderSettings(shadows=ShadowSettings(resolution=32), rasterizer=DenseRasterizer(), diffuser=DenseDiffuser())
+settings = sj.RenderSettings(
+    shadows=ShadowSettings(resolution=32), rasterizer=DenseRasterizer(), diffuser=DenseDiffuser()
+)
 sj.plan, sj.render = partial(sj.plan, settings=settings), partial(sj.render, settings=settings)
 write_png = sj.write_png
 

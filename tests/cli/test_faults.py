@@ -48,10 +48,27 @@ def spoilt(monkeypatch):
     ("error", "status", "said"),
     [
         (ValueError("a.ply: is\nempty"), 2, "splatjax: a.ply: is empty\n"),
-        (OSError(28, "No space left on device", "a.exr"), 2, "splatjax: a.exr: No space left on device\n"),
-        (MemoryError(), 2, "splatjax: this takes more memory than there is; take fewer splats, or a smaller picture\n"),
-        (RuntimeError("RESOURCE_EXHAUSTED: Out of\nmemory"), 2, "splatjax: this takes more memory than there is"),
-        (TypeError("no such\nthing"), 1, "splatjax: a fault of splatjax itself: TypeError: no such thing; please report it with"),
+        (
+            OSError(28, "No space left on device", "a.exr"),
+            2,
+            "splatjax: a.exr: No space left on device\n",
+        ),
+        (
+            MemoryError(),
+            2,
+            "splatjax: this takes more memory than there is; take fewer splats, or a smaller "
+            "picture\n",
+        ),
+        (
+            RuntimeError("RESOURCE_EXHAUSTED: Out of\nmemory"),
+            2,
+            "splatjax: this takes more memory than there is",
+        ),
+        (
+            TypeError("no such\nthing"),
+            1,
+            "splatjax: a fault of splatjax itself: TypeError: no such thing; please report it with",
+        ),
         (KeyboardInterrupt(), 130, "splatjax: interrupted\n"),
     ],
 )
@@ -75,9 +92,14 @@ def test_a_check_in_compiled_code_is_one_sentence(monkeypatch, capsys):
 
 @pytest.mark.parametrize(
     ("words", "remedy"),
-    [([], "give a smaller --count"), (["--model", "monte-carlo", "--photons", "200"], "200 photons tell too little apart")],
+    [
+        ([], "give a smaller --count"),
+        (["--model", "monte-carlo", "--photons", "200"], "200 photons tell too little apart"),
+    ],
 )
-def test_a_fit_that_does_not_settle_says_what_to_change(words, remedy, monkeypatch, tmp_path, capsys):
+def test_a_fit_that_does_not_settle_says_what_to_change(
+    words, remedy, monkeypatch, tmp_path, capsys
+):
     def unsettled(profile, count, *, throw, **_):
         assert not throw
         gaussians = sj.SumOfGaussians(jnp.ones(count), jnp.ones((count, 3)))
@@ -88,7 +110,11 @@ def test_a_fit_that_does_not_settle_says_what_to_change(words, remedy, monkeypat
     walked = sj.Tabulated(jnp.arange(1.0, 5.0), jnp.ones((4, 3)), jnp.ones((4, 3)), medium)
     monkeypatch.setattr(sj, "fit_gaussians", unsettled)
     monkeypatch.setattr(_models, "_walked", lambda layers, photons: walked)
-    said = failure(["fit", "skin1", *words, "--output", tmp_path / "mine.toml"], capsys, [tmp_path / "mine.toml"])
+    said = failure(
+        ["fit", "skin1", *words, "--output", tmp_path / "mine.toml"],
+        capsys,
+        [tmp_path / "mine.toml"],
+    )
     assert said.startswith("splatjax: skin1: the search for 6 Gaussians did not settle")
     assert remedy in said
 
@@ -119,7 +145,11 @@ def test_nobody_reads_on():
     """The other end of the pipe is closed before the first word."""
     reading, writing = os.pipe()
     os.close(reading)
-    command = [sys.executable, "-c", "import sys; from splatjax.cli import main; sys.exit(main(['materials']))"]
+    command = [
+        sys.executable,
+        "-c",
+        "import sys; from splatjax.cli import main; sys.exit(main(['materials']))",
+    ]
     ended = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE, text=True, check=False)
     os.close(writing)
     assert ended.returncode == 141
@@ -128,26 +158,52 @@ def test_nobody_reads_on():
 
 def test_names_that_are_nearly_right_are_told(tmp_path, capsys, x64):
     path = tmp_path / "mine.toml"
-    for right, wrong in (("roughness", "roughnes"), ("sigma_a", "sigma_A"), ("[surface]", "[surfaces]")):
+    for right, wrong in (
+        ("roughness", "roughnes"),
+        ("sigma_a", "sigma_A"),
+        ("[surface]", "[surfaces]"),
+    ):
         path.write_text(OWN.replace(right, wrong))
-        assert f"unknown entry {wrong.strip('[]')!r}; did you mean {right.strip('[]')!r}?" in failure(["fit", path], capsys)
+        assert (
+            f"unknown entry {wrong.strip('[]')!r}; did you mean {right.strip('[]')!r}?"
+            in failure(["fit", path], capsys)
+        )
     path.write_text(OWN.replace('"1/mm"', '"1/cm"'))
-    assert "unit must be \"1/mm\"; it is '1/cm': convert the numbers" in failure(["fit", path], capsys)
+    assert "unit must be \"1/mm\"; it is '1/cm': convert the numbers" in failure(
+        ["fit", path], capsys
+    )
     path.write_text(OWN.replace('unit = "1/mm"\n', "", 1))
-    assert 'has no unit; convert the numbers, and say unit = "1/mm"' in failure(["fit", path], capsys)
+    assert 'has no unit; convert the numbers, and say unit = "1/mm"' in failure(
+        ["fit", path], capsys
+    )
     path.write_text(OWN.replace("sigma_s_prime", "sigma_s"))
-    assert "has sigma_s; give sigma_s_prime = (1 - g) sigma_s, with the mean cosine g" in failure(["fit", path], capsys)
+    assert "has sigma_s; give sigma_s_prime = (1 - g) sigma_s, with the mean cosine g" in failure(
+        ["fit", path], capsys
+    )
     beyond_single = () if x64 else ("1e-60", "1e60")  # nothing, and infinite
     for value in ("true", '"0.1"', *beyond_single):
         path.write_text(OWN.replace("2.19", value))
-        said = failure(["render", plate(tmp_path / "plate.ply"), "--material", path, "--output", tmp_path / "o.exr"], capsys)
+        said = failure(
+            [
+                "render",
+                plate(tmp_path / "plate.ply"),
+                "--material",
+                path,
+                "--output",
+                tmp_path / "o.exr",
+            ],
+            capsys,
+        )
         assert "sigma_s_prime must be" in said
 
 
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["--width", "1000000", "--height", "1000000"], "--width 1000000 --height 1000000 would take about 5e+05 GB of memory"),
+        (
+            ["--width", "1000000", "--height", "1000000"],
+            "--width 1000000 --height 1000000 would take about 5e+05 GB of memory",
+        ),
         (["--count", "1000000000000"], "--count 1000000000000 would take about 1e+06 GB of memory"),
     ],
 )
@@ -174,7 +230,9 @@ def test_a_size_that_cannot_be_is_refused_before_splats_are_read(words, said, tm
 
 
 def test_what_no_error_can_be_is_refused_before_the_fit(capsys):
-    assert "--error is -1; it must be positive" in failure(["fit", "marble", "--error", "-1"], capsys)
+    assert "--error is -1; it must be positive" in failure(
+        ["fit", "marble", "--error", "-1"], capsys
+    )
 
 
 def test_a_picture_is_no_material(tmp_path, capsys):
@@ -184,7 +242,11 @@ def test_a_picture_is_no_material(tmp_path, capsys):
 
 
 def test_a_cut_without_effect_is_refused(capsys):
-    for more in (["--model", "photon-beam", "--single-scattering"], [], ["--model", "better-dipole"]):
+    for more in (
+        ["--model", "photon-beam", "--single-scattering"],
+        [],
+        ["--model", "better-dipole"],
+    ):
         said = failure(["fit", "skin1", *more, "--cut", "0.3"], capsys)
         assert "--cut has no effect on --model" in said
         assert "leave it out" in said
@@ -208,6 +270,10 @@ def test_a_fit_to_its_own_file_keeps_what_stood_there(tmp_path, capsys):
 
 def test_only_a_binary_file_is_streamed(tmp_path, capsys):
     output = tmp_path / "out.exr"
-    assert "--stream is 5" in failure(["render", "--stream", 5, "--output", output], capsys, [output])
+    assert "--stream is 5" in failure(
+        ["render", "--stream", 5, "--output", output], capsys, [output]
+    )
     text = plate(tmp_path / "plate.ply")
-    assert "write them as binary" in failure(["render", text, "--stream", 5, "--output", output], capsys, [output])
+    assert "write them as binary" in failure(
+        ["render", text, "--stream", 5, "--output", output], capsys, [output]
+    )

@@ -1,4 +1,6 @@
-"""`splatjax figure`: each figure is made from a body of one's own, and what cannot be made is said."""
+"""`splatjax figure`: each figure is made from a body of one's own, and what cannot be made is
+said.
+"""
 
 import numpy as np
 import pytest
@@ -21,7 +23,18 @@ def test_figure_3_needs_no_body(tmp_path):
 @pytest.mark.parametrize("number", [1, 4, 5, 6, 7])
 def test_every_figure_is_made_from_a_ball(tmp_path, number):
     body, output = ball(tmp_path / "ball.ply", radius=60.0, count=2500), tmp_path / "figure.png"
-    words = ["figure", str(number), "--scene", str(body), "--output", str(output), "--width", "48", "--count", "3000"]
+    words = [
+        "figure",
+        str(number),
+        "--scene",
+        str(body),
+        "--output",
+        str(output),
+        "--width",
+        "48",
+        "--count",
+        "3000",
+    ]
     assert main([*words, *(["--materials", "skin", "marble"] if number == 6 else [])]) == 0
     with Image.open(output) as picture:
         assert np.std(np.asarray(picture.convert("L"), float)) > 10

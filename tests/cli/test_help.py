@@ -41,7 +41,9 @@ def test_help_of_a_command_breaks_no_sentence(command, capsys):
     printed = said([command, "--help"], capsys)
     options = printed.partition("-h, --help")[2].splitlines()[1:]
     told = [line.strip("│ ") for line in options if line[:2] in ("│ ", "  ") and line.strip("│ ")]
-    assert all(line[-1] in ".)" or (line.startswith("--") and "  " not in line) for line in told), told
+    assert all(line[-1] in ".)" or (line.startswith("--") and "  " not in line) for line in told), (
+        told
+    )
     assert len(told) >= len(fields(_COMMANDS[command])) - printed.count("positional arguments")
 
 

@@ -1,4 +1,6 @@
-"""Several processes share the work of one command; one that is killed costs nothing that is finished."""
+"""Several processes share the work of one command; one that is killed costs nothing that is
+finished.
+"""
 
 import os
 import signal
@@ -19,11 +21,17 @@ FRAMES = 6
 
 
 def started(command, count, **environment):
-    """Start a command in some processes, which find each other at this machine's own address; give those that still run."""
+    """Start a command in some processes, which find each other at this machine's own address; give
+    those that still run.
+    """
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{free.getsockname()[1]}"
-    common = os.environ | {"PYTHONPATH": str(SCRIPT.parents[2]), "JAX_COORDINATOR_ADDRESS": address} | environment
+    common = (
+        os.environ
+        | {"PYTHONPATH": str(SCRIPT.parents[2]), "JAX_COORDINATOR_ADDRESS": address}
+        | environment
+    )
     words = [sys.executable, str(SCRIPT), *map(str, command)]
     return [
         subprocess.Popen(
@@ -51,7 +59,17 @@ def test_processes_share_a_turntable_and_one_that_is_killed_costs_no_finished_fr
     splats = ball(tmp_path / "ball.ply")
 
     def command(folder):
-        size = ("--width", 16, "--height", 16, "--no-scattering", "--material", "marble", "--turn", "camera")
+        size = (
+            "--width",
+            16,
+            "--height",
+            16,
+            "--no-scattering",
+            "--material",
+            "marble",
+            "--turn",
+            "camera",
+        )
         return ["turntable", splats, *size, "--frames", FRAMES, "--output", tmp_path / folder]
 
     statuses, said = ended(started(command("two"), 2))
@@ -66,8 +84,14 @@ def test_processes_share_a_turntable_and_one_that_is_killed_costs_no_finished_fr
     assert statuses == [0, -signal.SIGKILL, 0, 0], said
     left = contents(tmp_path / "four")
     finished = {name for name in names if name[6:10] not in ("0001", "0005")}
-    assert finished | {"frame_0001.exr", "turntable.json"} == {name for name in left if not name.startswith(".")}
-    assert all("still at work" in error for status, (_, error) in zip(statuses, said, strict=True) if status == 0)
+    assert finished | {"frame_0001.exr", "turntable.json"} == {
+        name for name in left if not name.startswith(".")
+    }
+    assert all(
+        "still at work" in error
+        for status, (_, error) in zip(statuses, said, strict=True)
+        if status == 0
+    )
     statuses, said = ended(started(command("four"), 2))
     assert statuses == [0, 0], said
     assert f"4 of {FRAMES} frames are there already" in said[0][1]

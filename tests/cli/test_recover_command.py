@@ -1,4 +1,6 @@
-"""`splatjax recover`: what it reads, hands over, says and writes. The search itself is tested where it is."""
+"""`splatjax recover`: what it reads, hands over, says and writes. The search itself is tested where
+it is.
+"""
 
 import jax.numpy as jnp
 import numpy as np
@@ -25,7 +27,9 @@ irradiance = 3
 @pytest.fixture
 def files(tmp_path):
     pixels = np.full((8, 8), 0.5, np.float32)
-    with OpenEXR.File({"type": OpenEXR.scanlineimage}, {"R": pixels, "G": pixels, "B": pixels}) as file:
+    with OpenEXR.File(
+        {"type": OpenEXR.scanlineimage}, {"R": pixels, "G": pixels, "B": pixels}
+    ) as file:
         file.write(str(tmp_path / "one.exr"))
     pictures = tmp_path / "pictures.toml"
     pictures.write_text(PICTURES.format(more=""))
@@ -37,7 +41,9 @@ FOUND = (0.011, 0.022, 0.033)
 
 @pytest.fixture
 def search(monkeypatch):
-    """A search that finds the same whatever it sees; the first one may be interrupted, or end before it has settled."""
+    """A search that finds the same whatever it sees; the first one may be interrupted, or end
+    before it has settled.
+    """
     asked, interrupted = [], []
 
     def recover(observations, splats, starts, *, surface, model, count, loss, progress, throw):
@@ -49,7 +55,9 @@ def search(monkeypatch):
         ended = interrupted.pop() if interrupted else optx.RESULTS.successful
         if isinstance(ended, BaseException):
             raise ended
-        seen = np.where(np.arange(64).reshape(8, 8, 1) < 40, np.asarray(observations[0].picture, float), np.nan)
+        seen = np.where(
+            np.arange(64).reshape(8, 8, 1) < 40, np.asarray(observations[0].picture, float), np.nan
+        )
         return sj.Recovery(
             medium=medium,
             material=surface,
@@ -72,7 +80,9 @@ def search(monkeypatch):
     return asked, interrupted
 
 
-def test_it_writes_a_material_and_a_report_and_says_what_is_not_fixed(files, search, tmp_path, capsys):
+def test_it_writes_a_material_and_a_report_and_says_what_is_not_fixed(
+    files, search, tmp_path, capsys
+):
     output, report = tmp_path / "mine.toml", tmp_path / "mine.png"
     command = [
         "recover",
@@ -106,8 +116,19 @@ def test_it_writes_a_material_and_a_report_and_says_what_is_not_fixed(files, sea
     assert isinstance(loss, sj.HuberLoss)
 
 
-def test_the_index_of_refraction_is_that_of_the_first_start_or_the_one_given(files, search, tmp_path):
-    command = ["recover", *files, "--start", "marble", "skin1", "--output", tmp_path / "mine.toml", "--no-suggest"]
+def test_the_index_of_refraction_is_that_of_the_first_start_or_the_one_given(
+    files, search, tmp_path
+):
+    command = [
+        "recover",
+        *files,
+        "--start",
+        "marble",
+        "skin1",
+        "--output",
+        tmp_path / "mine.toml",
+        "--no-suggest",
+    ]
     for more, eta in (([], 1.5), (["--eta", "1.42"], 1.42)):
         assert main([str(word) for word in (*command, *more)]) == 0
         for start in search[0][-1][2]:
@@ -118,7 +139,10 @@ def test_the_index_of_refraction_is_that_of_the_first_start_or_the_one_given(fil
 def test_interrupted_it_goes_on_where_it_was(files, search, tmp_path, capsys):
     asked, interrupted = search
     interrupted.append(KeyboardInterrupt())
-    command = [str(word) for word in ("recover", *files, "--output", tmp_path / "mine.toml", "--no-suggest")]
+    command = [
+        str(word)
+        for word in ("recover", *files, "--output", tmp_path / "mine.toml", "--no-suggest")
+    ]
     assert main(command) == 130
     assert (tmp_path / "mine.search.json").exists()
     assert not (tmp_path / "mine.toml").exists()
@@ -141,18 +165,30 @@ def test_what_cannot_be_is_said_in_one_line(files, search, tmp_path, capsys):
     assert "--model monte-carlo cannot be searched; take dipole" in failure(
         [*command, "--model", "monte-carlo"], capsys, [output]
     )
-    assert "must end in .toml" in failure(["recover", *files, "--output", tmp_path / "mine.exr"], capsys)
-    assert "--eta is 0.9; it must lie between 1 and 3" in failure([*command, "--eta", "0.9"], capsys, [output])
+    assert "must end in .toml" in failure(
+        ["recover", *files, "--output", tmp_path / "mine.exr"], capsys
+    )
+    assert "--eta is 0.9; it must lie between 1 and 3" in failure(
+        [*command, "--eta", "0.9"], capsys, [output]
+    )
     assert "has no [medium]" in failure([*command, "--start", "skin"], capsys, [output])
     assert not search[0]
 
 
-def test_a_search_that_does_not_settle_says_so_and_is_taken_up_again(files, search, tmp_path, capsys):
+def test_a_search_that_does_not_settle_says_so_and_is_taken_up_again(
+    files, search, tmp_path, capsys
+):
     search[1].append(optx.RESULTS.nonlinear_max_steps_reached)
-    command = [str(word) for word in ("recover", *files, "--output", tmp_path / "mine.toml", "--no-suggest")]
+    command = [
+        str(word)
+        for word in ("recover", *files, "--output", tmp_path / "mine.toml", "--no-suggest")
+    ]
     assert main(command) == 2
     said = capsys.readouterr().err.splitlines()[-1]
-    assert f"{files[1]}: the search did not settle in 1 round and 5 steps; the same command goes on where it stopped" in said
+    assert (
+        f"{files[1]}: the search did not settle in 1 round and 5 steps; the same command goes on "
+        "where it stopped" in said
+    )
     assert (tmp_path / "mine.search.json").exists()
     assert not (tmp_path / "mine.toml").exists()
     assert main(command) == 0

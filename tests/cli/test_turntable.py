@@ -23,8 +23,14 @@ FRAMES = 4
 
 @pytest.fixture(autouse=True, scope="module")
 def plain():
-    """Plain renderers: their program is small, and which frames are made of what is no matter of the renderer."""
-    settings = sj.RenderSettings(shadows=ShadowSettings(resolution=32), rasterizer=DenseRasterizer(), diffuser=DenseDiffuser())
+    """Plain renderers: their program is small, and which frames are made of what is no matter of
+    the renderer.
+    """
+    settings = sj.RenderSettings(
+        shadows=ShadowSettings(resolution=32),
+        rasterizer=DenseRasterizer(),
+        diffuser=DenseDiffuser(),
+    )
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sj, "plan", partial(sj.plan, settings=settings))
         patch.setattr(sj, "render", partial(sj.render, settings=settings))
@@ -38,7 +44,16 @@ def splats(tmp_path_factory):
 
 def command(splats, folder, *more):
     size = ("--width", "16", "--height", "16", "--no-scattering", "--material", "marble")
-    return ["turntable", str(splats), *size, "--frames", str(FRAMES), "--output", str(folder), *map(str, more)]
+    return [
+        "turntable",
+        str(splats),
+        *size,
+        "--frames",
+        str(FRAMES),
+        "--output",
+        str(folder),
+        *map(str, more),
+    ]
 
 
 def names(*frames):
@@ -75,7 +90,9 @@ def test_frames_and_animation_are_made_by_one_program(splats, tmp_path, drawn, c
     assert main(command(splats, folder, "--turn", "camera")) == 0
     captured = capsys.readouterr()
     assert contents(folder).keys() == everything()
-    frames = [str(folder / f"frame_{i:04}.{suffix}") for i in range(FRAMES) for suffix in ("exr", "png")]
+    frames = [
+        str(folder / f"frame_{i:04}.{suffix}") for i in range(FRAMES) for suffix in ("exr", "png")
+    ]
     assert captured.out.splitlines() == [*frames, str(folder / "turntable.webp")]
     assert f"{FRAMES} of {FRAMES}, " in captured.err
     assert "\x1b" not in captured.err
@@ -90,14 +107,18 @@ def test_frames_and_animation_are_made_by_one_program(splats, tmp_path, drawn, c
 
 def test_a_full_turn_does_not_repeat():
     def azimuths(turn, degrees=360.0):
-        turntable = _turntable.Turntable(frames=5, azimuth=10.0, light_azimuth=-30.0, turn=turn, degrees=degrees)
+        turntable = _turntable.Turntable(
+            frames=5, azimuth=10.0, light_azimuth=-30.0, turn=turn, degrees=degrees
+        )
         return [turntable.azimuths(i) for i in range(5)]
 
     steps = [0.0, 72.0, 144.0, 216.0, 288.0]
     assert azimuths(_turntable.Turn.CAMERA) == [(10 + step, -30.0) for step in steps]
     assert azimuths(_turntable.Turn.LIGHT) == [(10.0, -30 + step) for step in steps]
     assert azimuths(_turntable.Turn.OBJECT) == [(10 + step, -30 + step) for step in steps]
-    assert azimuths(_turntable.Turn.CAMERA, -10.0) == [(10 - step, -30.0) for step in (0.0, 2.0, 4.0, 6.0, 8.0)]
+    assert azimuths(_turntable.Turn.CAMERA, -10.0) == [
+        (10 - step, -30.0) for step in (0.0, 2.0, 4.0, 6.0, 8.0)
+    ]
 
 
 def test_camera_keeps_its_distance_and_the_fill_its_place_beside_it():
@@ -110,7 +131,10 @@ def test_camera_keeps_its_distance_and_the_fill_its_place_beside_it():
     for azimuth in np.arange(0.0, 360.0, 40.0).tolist():
         camera = turntable.camera(splats, azimuth)
         distances.append(np.linalg.norm(np.asarray(camera.position) - middle))
-        fills.append(np.asarray(camera.rotation) @ np.asarray(turntable.lights(3, azimuth, -20.0)[1].direction))
+        fills.append(
+            np.asarray(camera.rotation)
+            @ np.asarray(turntable.lights(3, azimuth, -20.0)[1].direction)
+        )
     np.testing.assert_allclose(distances, distances[0], rtol=1e-5)
     np.testing.assert_allclose(fills, np.broadcast_to(fills[0], (9, 3)), atol=1e-5)
 
@@ -135,13 +159,19 @@ def test_another_speed_needs_no_rendering(splats, copied, drawn):
 
 
 @pytest.mark.parametrize("by", ["keyboard", "disk"])
-def test_interrupted_frames_are_whole_and_the_rest_follows(by, splats, around, tmp_path, drawn, monkeypatch, capsys):
+def test_interrupted_frames_are_whole_and_the_rest_follows(
+    by, splats, around, tmp_path, drawn, monkeypatch, capsys
+):
     folder = tmp_path / "turn"
     write_png = sj.write_png
 
     def interrupted(path, frame, **how):
         if path.stem == "frame_0001":
-            raise KeyboardInterrupt if by == "keyboard" else OSError(28, "No space left on device", str(path))
+            raise (
+                KeyboardInterrupt
+                if by == "keyboard"
+                else OSError(28, "No space left on device", str(path))
+            )
         write_png(path, frame, **how)
 
     monkeypatch.setattr(sj, "write_png", interrupted)
@@ -176,7 +206,9 @@ def test_frames_of_something_else_are_refused(splats, copied, tmp_path, drawn, c
     assert record["splatjax"] in str(before["turntable.json"])
     (copied / "turntable.json").unlink()
     before.pop("turntable.json")
-    assert "nothing says what it is made of" in refused(*command(splats, copied, "--turn", "camera"))
+    assert "nothing says what it is made of" in refused(
+        *command(splats, copied, "--turn", "camera")
+    )
     assert drawn == []
 
 
@@ -195,10 +227,19 @@ def test_light_goes_around_a_camera_that_stands_still(splats, around, tmp_path):
     words = command(splats, alone, "--light-azimuth", -90, *still)
     at = words.index("--frames")
     assert main(["render", *words[1:at], *words[at + 2 :]]) == 0
-    np.testing.assert_allclose(np.asarray(sj.read_exr(alone).beauty), np.asarray(frames[3].beauty), atol=1e-5)
+    np.testing.assert_allclose(
+        np.asarray(sj.read_exr(alone).beauty), np.asarray(frames[3].beauty), atol=1e-5
+    )
 
 
-IMPOSSIBLE = [("frames", 0), ("frames", 10_001), ("degrees", 0), ("degrees", "nan"), ("fps", 0), ("width", 20_000)]
+IMPOSSIBLE = [
+    ("frames", 0),
+    ("frames", 10_001),
+    ("degrees", 0),
+    ("degrees", "nan"),
+    ("fps", 0),
+    ("width", 20_000),
+]
 IMPOSSIBLE += [("exposure", "inf"), ("light-azimuth", "nan")]
 
 

@@ -16,7 +16,9 @@ CELLS = [2.0, 4.0, 16.0]
 def sources():
     body = bodies.bumpy(800)
     irradiance = np.random.default_rng(2).uniform(size=(2, 800))
-    return Sources(body.centers.T, body.normals.T, 0.01 * body.areas, jnp.asarray(irradiance, float))
+    return Sources(
+        body.centers.T, body.normals.T, 0.01 * body.areas, jnp.asarray(irradiance, float)
+    )
 
 
 @eqx.filter_jit
@@ -38,7 +40,9 @@ def test_merging_keeps_area_energy_and_first_moments():
     given = sources()
     tree = ClusterTree.build(given.centers.T, given.normals.T, CELLS)
     levels = levels_of(tree, given)
-    centers, areas, irradiance = (np.asarray(each, float) for each in (given.centers, given.areas, given.irradiance))
+    centers, areas, irradiance = (
+        np.asarray(each, float) for each in (given.centers, given.areas, given.irradiance)
+    )
     for level, clusters in enumerate(levels[1:]):
         place, count = of_splats(tree, level), tree.counts[level]
 
@@ -55,7 +59,9 @@ def test_merging_keeps_area_energy_and_first_moments():
             np.testing.assert_allclose(energy, total(areas * values), rtol=1e-5)
             for axis in range(3):
                 expected = total(areas * values * centers[axis])
-                found = energy * np.asarray(clusters.centers[axis]) + np.asarray(clusters.moments[channel, axis])
+                found = energy * np.asarray(clusters.centers[axis]) + np.asarray(
+                    clusters.moments[channel, axis]
+                )
                 np.testing.assert_allclose(found, expected, atol=1e-5 * np.max(areas) * 800 * 10)
         offset = centers - np.asarray(clusters.centers, float)[:, place]
         spread = total(areas * 0.5 * np.sum(offset**2, axis=0))[full] / area[full]
@@ -73,16 +79,24 @@ def test_merging_twice_is_merging_once():
     given = sources()
     tree = ClusterTree.build(given.centers.T, given.normals.T, CELLS)
     splats, *_, step_by_step = levels_of(tree, given)
-    at_once = eqx.filter_jit(lambda splats, parents: splats.merged(parents, tree.counts[2]))(splats, _whole(tree))
+    at_once = eqx.filter_jit(lambda splats, parents: splats.merged(parents, tree.counts[2]))(
+        splats, _whole(tree)
+    )
     for ours, theirs in zip(jax.tree.leaves(step_by_step), jax.tree.leaves(at_once), strict=True):
-        np.testing.assert_allclose(np.asarray(ours), np.asarray(theirs), atol=2e-4 * np.max(np.abs(theirs)))
+        np.testing.assert_allclose(
+            np.asarray(ours), np.asarray(theirs), atol=2e-4 * np.max(np.abs(theirs))
+        )
 
 
 def test_lowering_clusters_is_merging_lowered_splats():
     given, depth = sources(), 1.7
     tree = ClusterTree.build(given.centers.T, given.normals.T, CELLS)
-    below = Sources(given.centers - depth * given.normals, given.normals, given.areas, given.irradiance)
-    lowered = eqx.filter_jit(lambda levels: [each.lowered(jnp.asarray(depth)) for each in levels])(levels_of(tree, given))
+    below = Sources(
+        given.centers - depth * given.normals, given.normals, given.areas, given.irradiance
+    )
+    lowered = eqx.filter_jit(lambda levels: [each.lowered(jnp.asarray(depth)) for each in levels])(
+        levels_of(tree, given)
+    )
     for ours, theirs in zip(lowered, levels_of(tree, below), strict=True):
         for found, expected in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
             scale = max(np.max(np.abs(expected)), 1e-3)
@@ -110,7 +124,9 @@ def test_no_cells_merge_nothing():
     (only,) = levels_of(tree, given)
     order = np.asarray(tree.order)
     np.testing.assert_array_equal(np.sort(order[order < 800]), np.arange(800))
-    np.testing.assert_array_equal(np.asarray(only.areas)[order < 800], np.asarray(given.areas)[order[order < 800]])
+    np.testing.assert_array_equal(
+        np.asarray(only.areas)[order < 800], np.asarray(given.areas)[order[order < 800]]
+    )
     assert not np.any(np.asarray(only.areas)[order == 800])
     assert not np.any(np.asarray(only.spread))
 

@@ -20,8 +20,14 @@ def test_irradiance_is_the_sum_of_the_formulas(count, dtype):
     body = bodies.bumpy(count)
     centers, normals = np.asarray(body.centers, float), np.asarray(body.normals, float)
     directions = np.asarray([[0.3, -2.0, -1.0], [1.0, 0.2, -0.4]])
-    place, origin, axis = np.asarray([8.0, 20.0, 15.0]), np.asarray([1.0, 2.0, 30.0]), np.asarray([0.1, 0.0, -1.0])
-    one, two, three, four = np.asarray([[1.0, 2, 3], [0.5, 0.1, 0.2], [900.0, 500, 100], [4.0, 5, 6]])
+    place, origin, axis = (
+        np.asarray([8.0, 20.0, 15.0]),
+        np.asarray([1.0, 2.0, 30.0]),
+        np.asarray([0.1, 0.0, -1.0]),
+    )
+    one, two, three, four = np.asarray(
+        [[1.0, 2, 3], [0.5, 0.1, 0.2], [900.0, 500, 100], [4.0, 5, 6]]
+    )
 
     def array(values):
         return jnp.asarray(values, dtype)
@@ -34,11 +40,21 @@ def test_irradiance_is_the_sum_of_the_formulas(count, dtype):
     )
     groups = stack_lights(lights)
     rng = np.random.default_rng(0)
-    lit = [rng.uniform(size=(len(group.places), count)) if group.lights.cast_shadows else None for group in groups]
-    share = {place: lit[i][row] for i, g in enumerate(groups) if lit[i] is not None for row, place in enumerate(g.places)}
+    lit = [
+        rng.uniform(size=(len(group.places), count)) if group.lights.cast_shadows else None
+        for group in groups
+    ]
+    share = {
+        place: lit[i][row]
+        for i, g in enumerate(groups)
+        if lit[i] is not None
+        for row, place in enumerate(g.places)
+    }
 
     found = jax.jit(
-        lambda points, normals, lit: entering_irradiance(points, normals, groups, lit, lambda c: (0.9 - 0.2 * c)[None], 3),
+        lambda points, normals, lit: entering_irradiance(
+            points, normals, groups, lit, lambda c: (0.9 - 0.2 * c)[None], 3
+        ),
     )(body.centers, body.normals, [None if each is None else array(each) for each in lit])
 
     def received(wi):

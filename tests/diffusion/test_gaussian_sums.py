@@ -46,13 +46,16 @@ def all_meet(blocks: int, points_blocks: int) -> Steps:
     """Lists of everything, in two sweeps of three lanes; the last lane has no points of its own."""
     lanes, steps = 3, -(-blocks // SLOTS)
     ids = np.full((2 * steps, lanes, SLOTS), blocks, np.int32)
-    ids.reshape(2, steps, lanes, SLOTS)[:] = np.pad(np.arange(blocks), (0, -blocks % SLOTS), constant_values=blocks).reshape(
-        1, steps, 1, SLOTS
-    )
+    ids.reshape(2, steps, lanes, SLOTS)[:] = np.pad(
+        np.arange(blocks), (0, -blocks % SLOTS), constant_values=blocks
+    ).reshape(1, steps, 1, SLOTS)
     order = np.asarray([4, 0, 2, 1, 3, 5], np.int32)
     assert points_blocks == 5
     return Steps(
-        jnp.asarray(ids), jnp.asarray([0, steps], jnp.int32), jnp.asarray([steps, 2 * steps], jnp.int32), jnp.asarray(order)
+        jnp.asarray(ids),
+        jnp.asarray([0, steps], jnp.int32),
+        jnp.asarray([steps, 2 * steps], jnp.int32),
+        jnp.asarray(order),
     )
 
 
@@ -72,7 +75,11 @@ def test_values_and_gradients_are_those_of_plain_sums(float64, kernel, finish):
 
         expected, pull = jax.vjp(theirs, points, centers, rates, rows)
         found, push = jax.vjp(
-            lambda points, *rest: ours(jnp.concatenate([points, padded[5:]]), *rest), points, centers, rates, rows
+            lambda points, *rest: ours(jnp.concatenate([points, padded[5:]]), *rest),
+            points,
+            centers,
+            rates,
+            rows,
         )
         cotangent = jnp.asarray(np.random.default_rng(6).normal(size=expected.shape))
         assert float(jnp.max(jnp.abs(expected))) > 0.5
@@ -81,8 +88,14 @@ def test_values_and_gradients_are_those_of_plain_sums(float64, kernel, finish):
             np.testing.assert_allclose(a, b, atol=1e-11 * float(jnp.max(jnp.abs(b))))
         rng = np.random.default_rng(7)
         moved = [jnp.asarray(rng.normal(size=each.shape)) for each in (centers, rates, rows)]
-        _, slope = jax.jvp(lambda *rest: ours(padded, *rest, sums=gaussian_sums_forward), (centers, rates, rows), tuple(moved))
-        _, expected = jax.jvp(lambda *rest: theirs(points, *rest), (centers, rates, rows), tuple(moved))
+        _, slope = jax.jvp(
+            lambda *rest: ours(padded, *rest, sums=gaussian_sums_forward),
+            (centers, rates, rows),
+            tuple(moved),
+        )
+        _, expected = jax.jvp(
+            lambda *rest: theirs(points, *rest), (centers, rates, rows), tuple(moved)
+        )
         np.testing.assert_allclose(slope, expected, atol=1e-11 * float(jnp.max(jnp.abs(expected))))
 
 
@@ -93,7 +106,9 @@ def test_kernels_come_down_to_zero_without_a_step(kernel, float64):
     assert float(weight[0]) > 0.9
     assert np.all(np.asarray(weight)[exponents >= 4.5] == 0)
     assert np.all(np.diff(np.asarray(weight)) <= 0)
-    rise = np.cumsum((np.asarray(fall)[1:] + np.asarray(fall)[:-1]) / 2) * 1e-4  # what its derivative says it falls by
+    rise = (
+        np.cumsum((np.asarray(fall)[1:] + np.asarray(fall)[:-1]) / 2) * 1e-4
+    )  # what its derivative says it falls by
     np.testing.assert_allclose(weight[0] - weight[1:], rise, atol=1e-5)
 
 
@@ -125,9 +140,13 @@ def test_neighbors_are_all_blocks_within_reach_and_moving_too_far_is_told(float3
     reach = 2.0
     found = Neighbors.find(points, sources, reach, 4, SLOTS)
     listed = [set() for _ in range(12)]
-    for sweep, (begin, end) in enumerate(zip(found.steps.begins.tolist(), found.steps.ends.tolist(), strict=True)):
+    for sweep, (begin, end) in enumerate(
+        zip(found.steps.begins.tolist(), found.steps.ends.tolist(), strict=True)
+    ):
         for lane in range(4):
-            listed[sweep * 4 + lane] = set(np.asarray(found.steps.ids)[begin:end, lane].ravel().tolist()) - {40}
+            listed[sweep * 4 + lane] = set(
+                np.asarray(found.steps.ids)[begin:end, lane].ravel().tolist()
+            ) - {40}
     apart = np.linalg.norm(np.asarray(centers)[:, :, None] - np.asarray(centers)[:, None], axis=0)
     for block in range(10):
         rows = np.arange(block * BLOCK, min((block + 1) * BLOCK, 600))

@@ -1,4 +1,6 @@
-"""Which blocks of sources meet which blocks of points: every pair within reach, and no pair that the boxes keep apart."""
+"""Which blocks of sources meet which blocks of points: every pair within reach, and no pair that
+the boxes keep apart.
+"""
 
 import bodies
 import jax
@@ -47,7 +49,9 @@ def test_neighbors_are_the_boxes_within_reach_each_once(at_once, monkeypatch):
         row = steps.ids[steps.begins[sweep] : steps.ends[sweep], lane].reshape(-1)
         np.testing.assert_array_equal(np.sort(row[row < none]), np.flatnonzero(expected[place]))
     # As many steps as the longest list of each sweep has, and little room beyond.
-    longest = [-(-expected[i : i + LANES].sum(axis=1).max() // SLOTS) for i in range(0, blocks, LANES)]
+    longest = [
+        -(-expected[i : i + LANES].sum(axis=1).max() // SLOTS) for i in range(0, blocks, LANES)
+    ]
     np.testing.assert_array_equal(steps.ends - steps.begins, longest)
     assert sum(longest) <= len(steps.ids) <= 1.1 * sum(longest) + 1
 
@@ -65,10 +69,16 @@ def test_what_has_moved_needs_as_much_more_reach():
 
     shift = jnp.asarray([[0.1], [-0.03], [0.07]])
     np.testing.assert_allclose(needed(centers, centers), 1.2 / REACH, rtol=1e-5)
-    np.testing.assert_allclose(needed(centers + shift, centers), (1.2 + 3**0.5 * 0.1) / REACH, rtol=1e-5)
-    np.testing.assert_allclose(needed(centers + shift, centers - 2 * shift), (1.2 + 3**0.5 * 0.3) / REACH, rtol=1e-5)
+    np.testing.assert_allclose(
+        needed(centers + shift, centers), (1.2 + 3**0.5 * 0.1) / REACH, rtol=1e-5
+    )
+    np.testing.assert_allclose(
+        needed(centers + shift, centers - 2 * shift), (1.2 + 3**0.5 * 0.3) / REACH, rtol=1e-5
+    )
     middle = jnp.mean(jnp.where(there, centers, 0.0), axis=1, keepdims=True)
-    assert needed(0.9 * (centers - middle) + middle, centers) <= 1.2 / REACH + 0.2  # what draws together moves as well
+    assert (
+        needed(0.9 * (centers - middle) + middle, centers) <= 1.2 / REACH + 0.2
+    )  # what draws together moves as well
 
 
 def test_tiles_list_the_blocks_within_reach_of_what_they_show():
@@ -80,7 +90,11 @@ def test_tiles_list_the_blocks_within_reach_of_what_they_show():
     origin = jnp.asarray([0.4, -0.3, 0.2])
     pixels = Pixels.of(points, covered, origin, atlas)
     there, reach = jnp.arange(512) % 37 > 0, jnp.linspace(0.4, 1.6, 512)
-    bins = jax.jit(lambda reach: pixels.bins(centers - origin[:, None], there, reach, 16, 4, BinCapacity(8192, 400, 2)))(reach)
+    bins = jax.jit(
+        lambda reach: pixels.bins(
+            centers - origin[:, None], there, reach, 16, 4, BinCapacity(8192, 400, 2)
+        )
+    )(reach)
     assert float(bins.needed) <= 1
     steps = jax.tree.map(np.asarray, pixels.steps(bins, 32))
     listed = np.zeros((points.shape[0] + 1, 32), bool)
@@ -93,13 +107,22 @@ def test_tiles_list_the_blocks_within_reach_of_what_they_show():
     inside = [np.asarray(each) for each in (points, covered, there, reach, centers)]
     for tile, (shown, seen) in enumerate(zip(inside[0], inside[1], strict=True)):
         assert shown.shape == (3, SIDE**2)
-        apart = np.linalg.norm(inside[4][:, :, None] - shown[:, None, seen], axis=0) if seen.any() else np.full((512, 1), np.inf)
+        apart = (
+            np.linalg.norm(inside[4][:, :, None] - shown[:, None, seen], axis=0)
+            if seen.any()
+            else np.full((512, 1), np.inf)
+        )
         near = (inside[2] & np.any(apart <= inside[3][:, None], axis=1)).reshape(32, 16).any(axis=1)
         assert not np.any(near & ~listed[tile]), "a block within reach is missing"
         if seen.any():
             own = shown[:, seen].min(axis=1)[:, None], shown[:, seen].max(axis=1)[:, None]
-            cut = [np.where(inside[2], inside[4], far).reshape(3, 32, 16) for far in (np.inf, -np.inf)]
-            far = gaps(own, (cut[0].min(axis=2), cut[1].max(axis=2)))[0] > 1.0001 * inside[3].reshape(32, 16).max(axis=1) ** 2
+            cut = [
+                np.where(inside[2], inside[4], far).reshape(3, 32, 16) for far in (np.inf, -np.inf)
+            ]
+            far = (
+                gaps(own, (cut[0].min(axis=2), cut[1].max(axis=2)))[0]
+                > 1.0001 * inside[3].reshape(32, 16).max(axis=1) ** 2
+            )
             assert not np.any(far & listed[tile]), "a block out of reach is listed"
         else:
             assert not listed[tile].any()

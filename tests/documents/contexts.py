@@ -19,7 +19,13 @@ def _figurine() -> sj.Splats:
 
 def _seen(side: int = _SIDE) -> dict:
     splats = _figurine()
-    camera = sj.Camera.look_at(jnp.asarray([8.0, 0.0, 70.0]), jnp.asarray([0.0, -3.5, 0.0]), fov=32.0, width=side, height=side)
+    camera = sj.Camera.look_at(
+        jnp.asarray([8.0, 0.0, 70.0]),
+        jnp.asarray([0.0, -3.5, 0.0]),
+        fov=32.0,
+        width=side,
+        height=side,
+    )
     lights = (sj.DirectionalLight(jnp.asarray([-1.0, -0.3, -0.4]), jnp.full(3, jnp.pi)),)
     material = sj.load_material("marble")
     return {
@@ -48,9 +54,15 @@ def pictures() -> dict:
     import optax
 
     names = _seen()
-    settings = sj.RenderSettings(shadows=_COARSE, rasterizer=DenseRasterizer(), diffuser=DenseDiffuser())
+    settings = sj.RenderSettings(
+        shadows=_COARSE, rasterizer=DenseRasterizer(), diffuser=DenseDiffuser()
+    )
     material = sj.Material(names["material"].gaussians, eta=1.5, specular=0.0)
-    picture = np.asarray(sj.render(sj.Scene(names["splats"], names["lights"], material), names["camera"], settings).beauty)
+    picture = np.asarray(
+        sj.render(
+            sj.Scene(names["splats"], names["lights"], material), names["camera"], settings
+        ).beauty
+    )
     noise = np.full(picture.shape, 0.01 * float(np.sqrt(np.mean(picture**2))))
     return names | {"picture": picture, "noise": noise, "optax": optax, "material": material}
 
@@ -66,7 +78,17 @@ def devices() -> dict:
     cameras = jax.tree.map(lambda leaf: jnp.stack([leaf] * jax.device_count()), names["camera"])
     alone = SimpleNamespace(**vars(jax) | {"distributed": SimpleNamespace(initialize=lambda: None)})
     cut = {"NamedSharding": NamedSharding, "PartitionSpec": PartitionSpec}
-    return names | cut | {"jax": alone, "splatjax": sj, "scene": made, "plan": sj.plan(made, names["camera"]), "cameras": cameras}
+    return (
+        names
+        | cut
+        | {
+            "jax": alone,
+            "splatjax": sj,
+            "scene": made,
+            "plan": sj.plan(made, names["camera"]),
+            "cameras": cameras,
+        }
+    )
 
 
 CONTEXTS = {

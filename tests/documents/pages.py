@@ -1,4 +1,6 @@
-"""What the README and the pages tell their readers to type: commands, programs, and files to write."""
+"""What the README and the pages tell their readers to type: commands, programs, and files to
+write.
+"""
 
 import re
 import shlex
@@ -19,11 +21,17 @@ def name(page: Path) -> str:
 
 def fences(page: Path, language: str) -> list[str]:
     """Give what stands in a page in fences of a language."""
-    return [body for found, body in _FENCE.findall(page.read_text(encoding="utf-8")) if found == language]
+    return [
+        body
+        for found, body in _FENCE.findall(page.read_text(encoding="utf-8"))
+        if found == language
+    ]
 
 
 def commands(page: Path, *, quoted: bool = False) -> list[str]:
-    """Give the command lines of a page without their comments; those in running text too, if they are to be `quoted`."""
+    """Give the command lines of a page without their comments; those in running text too, if they
+    are to be `quoted`.
+    """
     prose = _CONTINUED.sub(" ", _FENCE.sub("", page.read_text(encoding="utf-8")))
     lines = [*_TYPED.findall(prose), *(_QUOTED.findall(prose) if quoted else [])]
     return [re.split(r"\s+#", " ".join(line.split()))[0] for line in lines]
@@ -36,7 +44,9 @@ def words(command: str) -> list[str]:
 
 
 def named_files(page: Path) -> dict[str, str]:
-    """Give the files that a page says to write: fences that begin with their name, `# name.toml`."""
+    """Give the files that a page says to write: fences that begin with their name, `#
+    name.toml`.
+    """
     found = {}
     for body in fences(page, "toml"):
         first = re.match(r"# (\S+\.toml)\n", body)

@@ -1,4 +1,6 @@
-"""Every command of README and docs is understood; what the command line can run on small stand-ins is run."""
+"""Every command of README and docs is understood; what the command line can run on small stand-ins
+is run.
+"""
 
 import contextlib
 import os
@@ -22,17 +24,32 @@ SMALL = {
 """Options that make a command quick; the last one given counts."""
 
 NOT_RUN = {
-    "make": "sets up an environment, runs this suite or takes long; that there is such a target is tested",
-    "python": "benchmarks and tools take minutes or hours; that there is such a module with such options is tested",
+    "make": (
+        "sets up an environment, runs this suite or takes long; that there is such a "
+        "target is tested"
+    ),
+    "python": (
+        "benchmarks and tools take minutes or hours; that there is such a module "
+        "with such options is tested"
+    ),
 }
 
 typed = [
     pytest.param(command, id=f"{name(page)}-{number}")
     for page in PAGES
     for number, command in enumerate(commands(page, quoted=True))
-    if command.startswith("splatjax") and (" --" in command or command in commands(page)) and "COMMAND" not in command
+    if command.startswith("splatjax")
+    and (" --" in command or command in commands(page))
+    and "COMMAND" not in command
 ]
-others = sorted({command for page in PAGES for command in commands(page, quoted=True) if command.split()[0] in NOT_RUN})
+others = sorted(
+    {
+        command
+        for page in PAGES
+        for command in commands(page, quoted=True)
+        if command.split()[0] in NOT_RUN
+    }
+)
 
 
 @pytest.mark.parametrize("command", typed)
@@ -44,20 +61,28 @@ def test_the_command_line_understands(command):
     assert stopped is None or not stopped.value.code
 
 
-targets = set(re.findall(r"^([a-z][\w-]*):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
+targets = set(
+    re.findall(r"^([a-z][\w-]*):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
+)
 
 
 @pytest.mark.parametrize("command", [command for command in others if command.startswith("make")])
 def test_make_has_such_a_target(command):
-    asked = [word for word in shlex.split(command)[1:] if not word.startswith("-") and "=" not in word]
+    asked = [
+        word for word in shlex.split(command)[1:] if not word.startswith("-") and "=" not in word
+    ]
     assert set(asked) <= targets
 
 
-@pytest.mark.parametrize("workflow", sorted((ROOT / ".github" / "workflows").iterdir()), ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "workflow", sorted((ROOT / ".github" / "workflows").iterdir()), ids=lambda path: path.stem
+)
 def test_a_workflow_makes_what_there_is(workflow):
     text = workflow.read_text(encoding="utf-8")
     asked = set(re.findall(r"run: make ([a-z-]+)$", text, re.MULTILINE))
-    asked |= {target for several in re.findall(r"suite: \[(.*)\]", text) for target in several.split(", ")}
+    asked |= {
+        target for several in re.findall(r"suite: \[(.*)\]", text) for target in several.split(", ")
+    }
     assert asked
     assert asked <= targets
 
@@ -78,7 +103,12 @@ def test_there_is_such_a_module_with_such_options(command):
 @pytest.mark.long
 @pytest.mark.once
 @pytest.mark.parametrize(
-    "page", [pytest.param(page, id=name(page)) for page in PAGES if any(c.startswith("splatjax") for c in commands(page))]
+    "page",
+    [
+        pytest.param(page, id=name(page))
+        for page in PAGES
+        if any(c.startswith("splatjax") for c in commands(page))
+    ],
 )
 def test_the_commands_of_a_page_run_one_after_the_other(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
@@ -90,7 +120,9 @@ def test_the_commands_of_a_page_run_one_after_the_other(page, tmp_path, monkeypa
         if not command.startswith("splatjax") or given[0].startswith("-") or "--help" in given:
             continue
         small = SMALL.get(given[0], [])
-        if given[0] in ("render", "turntable", "figure") and not any(word.endswith(".ply") for word in given):
+        if given[0] in ("render", "turntable", "figure") and not any(
+            word.endswith(".ply") for word in given
+        ):
             small = [*small, "--count", "1500"]
         if "--photons" in given or "monte-carlo" in given:
             small = [*small, "--photons", "20000", "--count", "3"]

@@ -33,10 +33,20 @@ def test_what_programs_name_is_there(page):
             if isinstance(node, ast.ImportFrom) and node.module.startswith("splatjax"):
                 module = importlib.import_module(node.module)
                 for alias in node.names:
-                    assert hasattr(module, alias.name) or importlib.util.find_spec(f"{node.module}.{alias.name}")
-            if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "sj":
+                    assert hasattr(module, alias.name) or importlib.util.find_spec(
+                        f"{node.module}.{alias.name}"
+                    )
+            if (
+                isinstance(node, ast.Attribute)
+                and isinstance(node.value, ast.Name)
+                and node.value.id == "sj"
+            ):
                 assert hasattr(sj, node.attr), node.attr
-            if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and ast.unparse(node.func.value) == "sj":
+            if (
+                isinstance(node, ast.Call)
+                and isinstance(node.func, ast.Attribute)
+                and ast.unparse(node.func.value) == "sj"
+            ):
                 known = inspect.signature(getattr(sj, node.func.attr)).parameters
                 assert {word.arg for word in node.keywords} <= set(known), node.func.attr
 

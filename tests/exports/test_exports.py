@@ -7,7 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from splatjax.exports import blender_radius, burley_distance, data_sheet, separable_kernel, unity_shape_parameter
+from splatjax.exports import (
+    blender_radius,
+    burley_distance,
+    data_sheet,
+    separable_kernel,
+    unity_shape_parameter,
+)
 from splatjax.gaussians import SumOfGaussians
 from splatjax.io import load_material
 from splatjax.scattering import Burley, DiffuseTransmission
@@ -36,7 +42,9 @@ def test_lengths_scale_and_stay_related(dtype):
     larger = SumOfGaussians(gaussians.variances * 4, gaussians.weights)
     np.testing.assert_allclose(burley_distance(larger), 2 * burley_distance(gaussians), rtol=1e-6)
     np.testing.assert_allclose(blender_radius(larger), 2 * blender_radius(gaussians), rtol=1e-6)
-    np.testing.assert_allclose(unity_shape_parameter(gaussians) * burley_distance(gaussians), 1, rtol=1e-6)
+    np.testing.assert_allclose(
+        unity_shape_parameter(gaussians) * burley_distance(gaussians), 1, rtol=1e-6
+    )
     # As Cycles reads it: a quarter of the radius over pi is the mean free path.
     path = 0.25 * blender_radius(gaussians) / np.pi
     burley = Burley(gaussians.total_reflectance(), path, DiffuseTransmission())
@@ -44,7 +52,9 @@ def test_lengths_scale_and_stay_related(dtype):
 
 
 def test_separable_kernel_is_the_published_one(float64):
-    """Red weights of the kernel of 25 samples in SeparableSSS.h: made with strength 0.48, and with distances over 1.001."""
+    """Red weights of the kernel of 25 samples in SeparableSSS.h: made with strength 0.48, and with
+    distances over 1.001.
+    """
     published = {
         0.0: 0.530605,
         3.0: 0.000973794,
@@ -59,11 +69,15 @@ def test_separable_kernel_is_the_published_one(float64):
     for offset, weight in published.items():
         at = int(np.argmin(np.abs(offsets - offset)))
         np.testing.assert_allclose(offsets[at], offset, atol=1e-5)
-        np.testing.assert_allclose(0.48 * weights[at, 0] + (0.52 if offset == 0 else 0), weight, rtol=1e-4)
+        np.testing.assert_allclose(
+            0.48 * weights[at, 0] + (0.52 if offset == 0 else 0), weight, rtol=1e-4
+        )
 
 
 def test_separable_kernel_of_one_gaussian_is_its_blur(float64):
-    offsets, weights = separable_kernel(SumOfGaussians(jnp.asarray([2.0]), jnp.asarray([[0.3]])), 201, 9.0)
+    offsets, weights = separable_kernel(
+        SumOfGaussians(jnp.asarray([2.0]), jnp.asarray([[0.3]])), 201, 9.0
+    )
     np.testing.assert_allclose(jnp.sum(weights), 1, rtol=1e-12)
     np.testing.assert_allclose(jnp.sum(weights[:, 0] * offsets**2), 2.0, rtol=1e-3)
     np.testing.assert_allclose(offsets, -offsets[::-1], atol=1e-12)
@@ -76,14 +90,19 @@ def test_a_kernel_without_a_middle_is_refused(dtype, samples):
 
 
 def test_exports_have_gradients(float64):
-    variances, weights = load_material("skin1").gaussians.variances, load_material("skin1").gaussians.weights
+    variances, weights = (
+        load_material("skin1").gaussians.variances,
+        load_material("skin1").gaussians.weights,
+    )
 
     def value(variances):
         return jnp.sum(jnp.log(blender_radius(SumOfGaussians(variances, weights))))
 
     slope = jax.grad(value)(variances)
     step = 1e-6 * variances[3] * jnp.eye(6)[3]
-    np.testing.assert_allclose(slope[3], (value(variances + step) - value(variances - step)) / (2 * step[3]), rtol=1e-6)
+    np.testing.assert_allclose(
+        slope[3], (value(variances + step) - value(variances - step)) / (2 * step[3]), rtol=1e-6
+    )
 
 
 def test_the_sheet_is_json_with_formulas_and_sources(dtype):
@@ -92,5 +111,7 @@ def test_the_sheet_is_json_with_formulas_and_sources(dtype):
     assert set(sheet) == {"gaussians", "gpu_gems", "separable_kernel", "burley", "unity", "blender"}
     for entry in sheet.values():
         assert {"formula", "unit", "source"} < set(entry)
-    np.testing.assert_array_equal(np.asarray(sheet["gaussians"]["weights"], dtype), np.asarray(gaussians.weights))
+    np.testing.assert_array_equal(
+        np.asarray(sheet["gaussians"]["weights"], dtype), np.asarray(gaussians.weights)
+    )
     np.testing.assert_allclose(np.sum(sheet["gpu_gems"]["weights"], axis=0), 1, rtol=1e-6)

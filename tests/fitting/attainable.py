@@ -1,6 +1,8 @@
-"""The errors (Eq. 4) that sums of k = 1 to 8 Gaussians can reach, for dipoles of Jensen's media with the Egan boundary.
+"""The errors (Eq. 4) that sums of k = 1 to 8 Gaussians can reach, for dipoles of Jensen's media
+with the Egan boundary.
 
-Best of many starts by an independent variable projection in float64; every optimum was reached from at least three starts.
+Best of many starts by an independent variable projection in float64; every optimum was reached from
+at least three starts.
 """
 
 # fmt: off

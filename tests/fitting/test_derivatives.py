@@ -6,7 +6,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from splatjax.fitting import FreeWeights, SharedVariances, TotalReflectanceHeld, VariancesPerChannel, fit_gaussians
+from splatjax.fitting import (
+    FreeWeights,
+    SharedVariances,
+    TotalReflectanceHeld,
+    VariancesPerChannel,
+    fit_gaussians,
+)
 from splatjax.gaussians import SumOfGaussians
 from splatjax.scattering import Dipole, Layer, Medium, Multipole
 
@@ -23,21 +29,31 @@ POINT = np.log([0.0021, 0.0071, 2.19, 3.0, 1.5, 1.5])
 
 
 def fit(point, spread, weights):
-    """Logarithms of variances and weights of a fit to a dipole, from the logarithms of its coefficients."""
+    """Logarithms of variances and weights of a fit to a dipole, from the logarithms of its
+    coefficients.
+    """
     sigma_a, sigma_s_prime, eta = jnp.exp(point).reshape(3, 2)
-    fitted = fit_gaussians(Dipole(Medium(sigma_a, sigma_s_prime, eta)), 3, spread=spread, weights=weights)
+    fitted = fit_gaussians(
+        Dipole(Medium(sigma_a, sigma_s_prime, eta)), 3, spread=spread, weights=weights
+    )
     gaussians = fitted.gaussians
-    return jnp.concatenate([jnp.log(gaussians.variances).ravel(), jnp.log(gaussians.weights).ravel(), fitted.error])
+    return jnp.concatenate(
+        [jnp.log(gaussians.variances).ravel(), jnp.log(gaussians.weights).ravel(), fitted.error]
+    )
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("spread", "weights"), [(SharedVariances(), TotalReflectanceHeld()), (VariancesPerChannel(), FreeWeights())]
+    ("spread", "weights"),
+    [(SharedVariances(), TotalReflectanceHeld()), (VariancesPerChannel(), FreeWeights())],
 )
 def test_derivative_of_a_fit_is_that_of_refits(float64, spread, weights):
     run = eqx.filter_jit(fit)
     forward = eqx.filter_jit(jax.jacfwd(fit))(POINT, spread, weights)
-    differences = [(run(POINT + h, spread, weights) - run(POINT - h, spread, weights)) / (2 * STEP) for h in STEP * np.eye(6)]
+    differences = [
+        (run(POINT + h, spread, weights) - run(POINT - h, spread, weights)) / (2 * STEP)
+        for h in STEP * np.eye(6)
+    ]
     assert np.max(np.abs(forward)) > 0.5
     np.testing.assert_allclose(forward, np.stack(differences, axis=1), rtol=REFITS, atol=REFITS)
 
@@ -50,7 +66,9 @@ def test_reverse_mode_through_a_slab_gives_the_derivative_of_refits(float64):
         *coefficients, thickness = jnp.exp(point)
         slab = Multipole(Layer(Medium(*(each[None] for each in coefficients)), thickness))
         gaussians = fit_gaussians(slab, 3, weights=TotalReflectanceHeld(), throw=False).gaussians
-        return jnp.sum(jnp.sin(jnp.log(gaussians.variances))) + jnp.sum(gaussians.weights[:, 0] * jnp.arange(1.0, 4.0))
+        return jnp.sum(jnp.sin(jnp.log(gaussians.variances))) + jnp.sum(
+            gaussians.weights[:, 0] * jnp.arange(1.0, 4.0)
+        )
 
     point = jnp.log(jnp.asarray([0.01, 2.5, 1.4, 2.0]))
     reverse = jax.jit(jax.grad(run))(point)
@@ -78,7 +96,9 @@ def test_where_the_fit_is_perfect_the_derivative_is_the_identity(float64):
     weights = jnp.asarray([[0.3], [0.2]])
 
     def again(log_variances):
-        return jnp.log(fit_gaussians(SumOfGaussians(jnp.exp(log_variances), weights), 2).gaussians.variances)
+        return jnp.log(
+            fit_gaussians(SumOfGaussians(jnp.exp(log_variances), weights), 2).gaussians.variances
+        )
 
     point = jnp.log(jnp.asarray([0.1, 2.0]))
     np.testing.assert_allclose(jax.jit(jax.jacfwd(again))(point), np.eye(2), atol=1e-6)
@@ -90,6 +110,8 @@ def test_float32_gives_the_same_derivatives(float64):
         medium = Medium(sigma_a[None], jnp.ones(1, dtype), jnp.full(1, 1.3, dtype))
         return fit_gaussians(Dipole(medium), 3).gaussians.variances[0]
 
-    slopes = [jax.grad(narrowest)(jnp.asarray(0.05, dtype), dtype) for dtype in (jnp.float32, jnp.float64)]
+    slopes = [
+        jax.grad(narrowest)(jnp.asarray(0.05, dtype), dtype) for dtype in (jnp.float32, jnp.float64)
+    ]
     assert slopes[0].dtype == jnp.float32
     np.testing.assert_allclose(*slopes, rtol=IN_FLOAT32)

@@ -29,7 +29,9 @@ from splatjax.io import dipole_starts, load_medium, load_profile
 from splatjax.scattering import NORM_RULE, Dipole, EganFresnel, LayeredMultipole, Medium, PhotonBeam
 
 BAR = 1.01
-"""Errors may exceed the best known ones by a hundredth, variances shared by a fiftieth (their tables have three digits)."""
+"""Errors may exceed the best known ones by a hundredth, variances shared by a fiftieth (their
+tables have three digits).
+"""
 SHARED_BAR = 1.02
 
 PUBLISHED = 0.02
@@ -64,8 +66,12 @@ def together(error) -> float:
 
 
 def test_a_sum_of_gaussians_is_found_again(float64):
-    """The error of what can be represented is rounding, and the Gaussians are the ones that were put in."""
-    truth = SumOfGaussians(jnp.asarray([0.05, 0.4, 3.0]), jnp.asarray([[0.3, 0.1], [0.2, 0.5], [0.1, 0.2]]))
+    """The error of what can be represented is rounding, and the Gaussians are the ones that were
+    put in.
+    """
+    truth = SumOfGaussians(
+        jnp.asarray([0.05, 0.4, 3.0]), jnp.asarray([[0.3, 0.1], [0.2, 0.5], [0.1, 0.2]])
+    )
     fitted = fit_gaussians(truth, 3)
     np.testing.assert_allclose(fitted.gaussians.variances, truth.variances, rtol=1e-6)
     np.testing.assert_allclose(fitted.gaussians.weights, truth.weights, rtol=1e-6)
@@ -80,7 +86,9 @@ def test_errors_of_eq_3_and_eq_4_in_closed_form(float64):
     squared = norm - 2 * 0.9 * cross + 0.81 * rest
     np.testing.assert_allclose(squared_error(one, other), [squared], rtol=1e-11)
     np.testing.assert_allclose(relative_error(one, other), [np.sqrt(squared / norm)], rtol=1e-11)
-    np.testing.assert_allclose(relative_error(one, SumOfGaussians(one.variances, 0 * one.weights)), [1.0], rtol=1e-12)
+    np.testing.assert_allclose(
+        relative_error(one, SumOfGaussians(one.variances, 0 * one.weights)), [1.0], rtol=1e-12
+    )
 
 
 def test_what_is_reported_is_what_eq_4_gives(float64):
@@ -120,8 +128,12 @@ def test_channels_of_their_own_fit_better_and_stand_alone(float64):
     thrice = load_medium("marble")
     thrice = jax.tree.map(lambda leaf: jnp.full_like(leaf, leaf[1]), thrice)
     green = fit_gaussians(Dipole(thrice, EganFresnel()), 4)
-    np.testing.assert_allclose(own.gaussians.variances[1], green.gaussians.variances, rtol=SAME_OPTIMUM)
-    np.testing.assert_allclose(own.gaussians.weights[1, :, 0], green.gaussians.weights[:, 1], rtol=SAME_OPTIMUM)
+    np.testing.assert_allclose(
+        own.gaussians.variances[1], green.gaussians.variances, rtol=SAME_OPTIMUM
+    )
+    np.testing.assert_allclose(
+        own.gaussians.weights[1, :, 0], green.gaussians.weights[:, 1], rtol=SAME_OPTIMUM
+    )
 
 
 def test_a_fit_does_not_depend_on_the_unit_of_length(float64):
@@ -130,14 +142,20 @@ def test_a_fit_does_not_depend_on_the_unit_of_length(float64):
     one, other = (fit_gaussians(Dipole(m, EganFresnel()), 4) for m in (medium, in_cm))
     np.testing.assert_allclose(other.error, one.error, rtol=1e-9)
     np.testing.assert_allclose(other.gaussians.weights, one.gaussians.weights, rtol=SAME_OPTIMUM)
-    np.testing.assert_allclose(other.gaussians.variances * 100, one.gaussians.variances, rtol=SAME_OPTIMUM)
+    np.testing.assert_allclose(
+        other.gaussians.variances * 100, one.gaussians.variances, rtol=SAME_OPTIMUM
+    )
 
 
 def test_green_marble_is_the_published_fit(float64):
     fitted = fit_gaussians(green_marble(), 4)
     assert float(fitted.error[0]) <= 0.0126
-    np.testing.assert_allclose(fitted.gaussians.variances, [0.0363, 0.1461, 0.9114, 7.010], rtol=PUBLISHED)
-    np.testing.assert_allclose(fitted.gaussians.weights[:, 0], [0.0704, 0.1839, 0.2060, 0.2882], rtol=PUBLISHED)
+    np.testing.assert_allclose(
+        fitted.gaussians.variances, [0.0363, 0.1461, 0.9114, 7.010], rtol=PUBLISHED
+    )
+    np.testing.assert_allclose(
+        fitted.gaussians.weights[:, 0], [0.0704, 0.1839, 0.2060, 0.2882], rtol=PUBLISHED
+    )
 
 
 HELD_ABOVE_ZERO = NonNegativeWeights(TotalReflectanceHeld())
@@ -146,19 +164,38 @@ HELD_ABOVE_ZERO = NonNegativeWeights(TotalReflectanceHeld())
 def all_channels() -> Dipole:
     """Of all media, as the channels of one."""
     coefficients = [jax.tree.leaves(load_medium(name)) for name in PER_CHANNEL]
-    return Dipole(Medium(*(jnp.concatenate(each) for each in zip(*coefficients, strict=True))), EganFresnel())
+    return Dipole(
+        Medium(*(jnp.concatenate(each) for each in zip(*coefficients, strict=True))), EganFresnel()
+    )
 
 
 @pytest.mark.parametrize("every", [2, pytest.param(1, marks=pytest.mark.long)])
 def test_one_to_eight_gaussians_reach_the_best_known_errors(float64, every):
-    """Of 12 media or every other one: per channel, shared by the channels, and so with non-negative weights of a held sum."""
+    """Of 12 media or every other one: per channel, shared by the channels, and so with non-negative
+    weights of a held sum.
+    """
     media = jax.tree.map(lambda leaf: leaf.reshape(-1, 3)[::every], all_channels())
     own = error_by_count(jax.tree.map(jnp.ravel, media), 8, spread=VariancesPerChannel()).error
-    best = np.stack([np.asarray(error) for channels in list(PER_CHANNEL.values())[::every] for error in channels], axis=1)
+    best = np.stack(
+        [
+            np.asarray(error)
+            for channels in list(PER_CHANNEL.values())[::every]
+            for error in channels
+        ],
+        axis=1,
+    )
     ratios = {"per channel": np.max(np.asarray(own) / best, axis=1)}
-    for name, weights, table in (("shared", FreeWeights(), SHARED_FREE), ("shared, held", HELD_ABOVE_ZERO, SHARED_HELD)):
-        found = eqx.filter_vmap(lambda profile, weights=weights: error_by_count(profile, 8, weights=weights).error)(media)
-        ratios[name] = np.max(np.sqrt(np.mean(np.square(found), axis=2)) / np.asarray(list(table.values())[::every]), axis=0)
+    for name, weights, table in (
+        ("shared", FreeWeights(), SHARED_FREE),
+        ("shared, held", HELD_ABOVE_ZERO, SHARED_HELD),
+    ):
+        found = eqx.filter_vmap(
+            lambda profile, weights=weights: error_by_count(profile, 8, weights=weights).error
+        )(media)
+        ratios[name] = np.max(
+            np.sqrt(np.mean(np.square(found), axis=2)) / np.asarray(list(table.values())[::every]),
+            axis=0,
+        )
     for name, worst in ratios.items():
         print(f"worst error over the best known, {name}, 1 to 8 Gaussians:", worst.round(4))
     assert np.max(ratios["per channel"]) < BAR
@@ -174,8 +211,13 @@ def test_layers_reach_the_best_known_errors(float64):
 def test_a_profile_without_a_norm_is_refused(dtype):
     """Single scattering is infinite at the origin: Eq. 3 needs to be told where to start."""
     medium = Medium(*(jnp.asarray([x], dtype) for x in (0.0041, 2.62, 1.5)))
-    for function in (fit_gaussians, lambda profile: relative_error(profile, SumOfGaussians(jnp.ones(1), jnp.ones((1, 1))))):
-        with pytest.raises(ValueError, match=r"PhotonBeam goes to infinity like 1/r.*NORM_RULE.beyond"):
+    for function in (
+        fit_gaussians,
+        lambda profile: relative_error(profile, SumOfGaussians(jnp.ones(1), jnp.ones((1, 1)))),
+    ):
+        with pytest.raises(
+            ValueError, match=r"PhotonBeam goes to infinity like 1/r.*NORM_RULE.beyond"
+        ):
             function(PhotonBeam(medium))
     with pytest.raises(ValueError, match=r"cut must be between 0 and .* length scales; got 0"):
         NORM_RULE.beyond(0.0)
@@ -240,18 +282,24 @@ def test_many_media_are_fitted_in_one_call(float64):
 
     batch = eqx.filter_vmap(fit)(sigma_a)
     alone = fit(sigma_a[2])
-    np.testing.assert_allclose(batch.gaussians.variances[2], alone.gaussians.variances, rtol=SAME_OPTIMUM)
+    np.testing.assert_allclose(
+        batch.gaussians.variances[2], alone.gaussians.variances, rtol=SAME_OPTIMUM
+    )
     np.testing.assert_allclose(batch.error[2], alone.error, rtol=SAME_OPTIMUM)
     assert np.all(np.diff(batch.error[:, 0]) < 0)
 
 
 def test_from_nearby_variances_the_optimum_is_found(float64):
-    truth = SumOfGaussians(jnp.asarray([0.05, 0.4, 3.0]), jnp.asarray([[0.3, 0.1], [0.2, 0.5], [0.1, 0.2]]))
+    truth = SumOfGaussians(
+        jnp.asarray([0.05, 0.4, 3.0]), jnp.asarray([[0.3, 0.1], [0.2, 0.5], [0.1, 0.2]])
+    )
     near = GivenVariances(truth.variances * jnp.asarray([1.3, 0.7, 1.4]))
     fitted = fit_gaussians(truth, 3, start=near)
     np.testing.assert_allclose(fitted.gaussians.variances, truth.variances, rtol=1e-6)
     np.testing.assert_allclose(fitted.gaussians.weights, truth.weights, rtol=1e-6)
-    with pytest.raises(ValueError, match=r"a fit of 2 Gaussians starts from as many variances.*got \[3\]"):
+    with pytest.raises(
+        ValueError, match=r"a fit of 2 Gaussians starts from as many variances.*got \[3\]"
+    ):
         fit_gaussians(truth, 2, start=near)
 
 

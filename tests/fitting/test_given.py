@@ -11,7 +11,9 @@ HELD = sj.NonNegativeWeights(sj.TotalReflectanceHeld())
 
 
 def medium(sigma_a=(0.02, 0.2), sigma_s_prime=(1.0, 0.7)):
-    return sj.Medium(jnp.asarray(sigma_a, float), jnp.asarray(sigma_s_prime, float), jnp.full(2, 1.3))
+    return sj.Medium(
+        jnp.asarray(sigma_a, float), jnp.asarray(sigma_s_prime, float), jnp.full(2, 1.3)
+    )
 
 
 def test_with_the_variances_of_a_fit_they_are_its_weights(float64):
@@ -25,14 +27,18 @@ def test_with_the_variances_of_a_fit_they_are_its_weights(float64):
 def test_wide_variances_serve_all_media_near(float64):
     """Within a factor of three of the start in both coefficients."""
     near = medium()
-    variances = wide_variances([near], sj.Splats(jnp.asarray(np.eye(3) * 1e4), jnp.eye(3), jnp.ones(3), jnp.ones(3)))
+    variances = wide_variances(
+        [near], sj.Splats(jnp.asarray(np.eye(3) * 1e4), jnp.eye(3), jnp.ones(3), jnp.ones(3))
+    )
     assert len(variances) < 20
 
     @jax.jit
     def error(sigma_a, sigma_s_prime):
         profile = sj.Dipole(sj.Medium(sigma_a, sigma_s_prime, near.eta))
         found = sj.fit_weights(profile, variances, weights=HELD)
-        return sj.relative_error(profile, found), found.total_reflectance() / profile.total_reflectance() - 1
+        return sj.relative_error(
+            profile, found
+        ), found.total_reflectance() / profile.total_reflectance() - 1
 
     for a in (1 / 3, 1, 3):
         for s in (1 / 3, 1, 3):
@@ -49,9 +55,14 @@ def test_they_have_derivatives_in_the_coefficients(float64):
         profile = sj.Dipole(sj.Medium(jnp.exp(point[:2]), jnp.exp(point[2:]), jnp.full(2, 1.3)))
         return sj.fit_weights(profile, variances, weights=HELD).weights
 
-    point, way, step = jnp.log(jnp.asarray([0.02, 0.2, 1.0, 0.7])), jnp.asarray([0.7, -0.4, 0.5, 1.0]), 1e-5
+    point, way, step = (
+        jnp.log(jnp.asarray([0.02, 0.2, 1.0, 0.7])),
+        jnp.asarray([0.7, -0.4, 0.5, 1.0]),
+        1e-5,
+    )
     _, slope = jax.jvp(weights, (point,), (way,))
     difference = (weights(point + step * way) - weights(point - step * way)) / (2 * step)
-    # Nodes of the integrals are constants of the derivative, and they move with the medium: an integral has none.
+    # Nodes of the integrals are constants of the derivative, and they move with the medium: an
+    # integral has none.
     np.testing.assert_allclose(slope, difference, atol=1e-6 * float(jnp.max(jnp.abs(slope))))
     assert float(jnp.max(jnp.abs(slope))) > 0.01

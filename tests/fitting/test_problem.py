@@ -31,7 +31,9 @@ def marble() -> Dipole:
     return Dipole(load_medium("marble"))
 
 
-@pytest.mark.parametrize("weights", [FreeWeights(), TotalReflectanceHeld(), NonNegativeWeights(TotalReflectanceHeld())])
+@pytest.mark.parametrize(
+    "weights", [FreeWeights(), TotalReflectanceHeld(), NonNegativeWeights(TotalReflectanceHeld())]
+)
 @pytest.mark.parametrize("active", [None, (True, True, True, False)])
 def test_the_expansion_is_that_of_automatic_differentiation(float64, weights, active):
     problem = make_problem(marble(), weights, NORM_RULE)
@@ -44,10 +46,19 @@ def test_the_expansion_is_that_of_automatic_differentiation(float64, weights, ac
             return jnp.sum(problem.residuals(point, active) ** 2)
 
         slopes = jax.jacfwd(lambda point: problem.residuals(point, active))(point)
-        return problem.expand(point, active), slopes, jax.jacfwd(cost)(point), jax.jacfwd(jax.jacfwd(cost))(point)
+        return (
+            problem.expand(point, active),
+            slopes,
+            jax.jacfwd(cost)(point),
+            jax.jacfwd(jax.jacfwd(cost))(point),
+        )
 
     found, jacobian, gradient, hessian = both(point)
-    for closed, automatic in ((found.jacobian, jacobian), (found.gradient, gradient), (found.hessian, hessian)):
+    for closed, automatic in (
+        (found.jacobian, jacobian),
+        (found.gradient, gradient),
+        (found.hessian, hessian),
+    ):
         assert np.max(np.abs(automatic)) > 0
         np.testing.assert_allclose(closed, automatic, atol=EXACT * float(np.max(np.abs(automatic))))
     if active is None:
@@ -55,7 +66,9 @@ def test_the_expansion_is_that_of_automatic_differentiation(float64, weights, ac
 
 
 def test_covariance_is_that_of_a_fit_of_all_parameters(float64):
-    """By Gauss and Newton: the inverse normal matrix of the Jacobian in variances and weights, times the sum of squares."""
+    """By Gauss and Newton: the inverse normal matrix of the Jacobian in variances and weights,
+    times the sum of squares.
+    """
     profile = marble()
     fitted = fit_gaussians(profile, 3)
     problem = make_problem(profile, FreeWeights(), NORM_RULE)
@@ -70,7 +83,9 @@ def test_covariance_is_that_of_a_fit_of_all_parameters(float64):
     jacobian = np.asarray(jax.jit(jax.jacfwd(residuals))(best))
     expected = np.linalg.inv(jacobian.T @ jacobian) * float(jnp.sum(residuals(best) ** 2))
     scale = np.sqrt(np.diag(expected))
-    np.testing.assert_allclose(fitted.covariance / np.outer(scale, scale), expected / np.outer(scale, scale), atol=1e-8)
+    np.testing.assert_allclose(
+        fitted.covariance / np.outer(scale, scale), expected / np.outer(scale, scale), atol=1e-8
+    )
 
 
 def test_held_weights_do_not_vary_together(float64):
@@ -99,15 +114,26 @@ def test_the_least_count_that_reaches_an_error(float64):
     fitted = fit_gaussians(marble(), LeastCount(wanted, largest=4))
     assert np.max(np.asarray(fitted.error)) <= wanted
     assert fitted.gaussians.variances.shape == (3,)
-    np.testing.assert_allclose(np.linalg.norm(fitted.error), np.linalg.norm(by_count.error[2]), rtol=1e-4)
+    np.testing.assert_allclose(
+        np.linalg.norm(fitted.error), np.linalg.norm(by_count.error[2]), rtol=1e-4
+    )
     np.testing.assert_allclose(relative_error(marble(), fitted.gaussians), fitted.error, rtol=1e-9)
-    with pytest.raises(ValueError, match=r"an error of 1e-06 is not reached: 4 Gaussians leave .* allow more"):
+    with pytest.raises(
+        ValueError, match=r"an error of 1e-06 is not reached: 4 Gaussians leave .* allow more"
+    ):
         by_count.least(1e-6)
-    with pytest.raises(ValueError, match=r"start is given, and LeastCount\(.*, which finds its own; leave start out"):
+    with pytest.raises(
+        ValueError,
+        match=r"start is given, and LeastCount\(.*, which finds its own; leave start out",
+    ):
         fit_gaussians(marble(), LeastCount(wanted, largest=4), start=by_count.start(3))
     with pytest.raises(ValueError, match="depends on values; find it outside of jit"):
-        jax.jit(lambda error: eqx.tree_at(lambda b: b.error, by_count, error).least(0.1))(by_count.error)
-    with pytest.raises(ValueError, match="largest must be a whole number of Gaussians, at least 1; got 0"):
+        jax.jit(lambda error: eqx.tree_at(lambda b: b.error, by_count, error).least(0.1))(
+            by_count.error
+        )
+    with pytest.raises(
+        ValueError, match="largest must be a whole number of Gaussians, at least 1; got 0"
+    ):
         error_by_count(marble(), 0)
 
 
@@ -115,7 +141,9 @@ def test_media_in_no_table_are_fitted_as_well_as_from_many_starts(float64):
     """Random reduced albedo and index; MINPACK from twelve random starts each."""
     noise = np.random.default_rng(1)
     absorbed = 10 ** noise.uniform(-4, -0.1, 6)
-    profile = Dipole(Medium(*(jnp.asarray(each) for each in (absorbed, 1 - absorbed, noise.uniform(1, 1.8, 6)))))
+    profile = Dipole(
+        Medium(*(jnp.asarray(each) for each in (absorbed, 1 - absorbed, noise.uniform(1, 1.8, 6))))
+    )
     problems = VariancesPerChannel().problem(profile, FreeWeights(), NORM_RULE)
     expand = eqx.filter_jit(lambda problem, point: problem.expand(point))
     best = []

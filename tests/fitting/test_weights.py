@@ -31,7 +31,9 @@ def problem(seed: int):
 
 
 def solve(weights, basis, target, energies, total):
-    coefficients, _ = weights.solve(*(jnp.asarray(each) for each in (basis, target, energies)), jnp.asarray(total))
+    coefficients, _ = weights.solve(
+        *(jnp.asarray(each) for each in (basis, target, energies)), jnp.asarray(total)
+    )
     return np.asarray(coefficients)
 
 
@@ -67,12 +69,16 @@ def test_derivatives_of_non_negative_weights(float64):
     basis, target, energies, total = problem(2)
 
     def value(target):
-        return NonNegativeWeights().solve(jnp.asarray(basis), target, jnp.asarray(energies), jnp.asarray(total))[0]
+        return NonNegativeWeights().solve(
+            jnp.asarray(basis), target, jnp.asarray(energies), jnp.asarray(total)
+        )[0]
 
     target = jnp.asarray(target)
     slopes = jax.jacrev(value)(target)
     step = 1e-6 * np.eye(40)[7]
-    np.testing.assert_allclose(slopes[:, 7], (value(target + step) - value(target - step)) / 2e-6, atol=1e-8)
+    np.testing.assert_allclose(
+        slopes[:, 7], (value(target + step) - value(target - step)) / 2e-6, atol=1e-8
+    )
     np.testing.assert_array_equal(slopes[np.asarray(value(target)) == 0], 0)
 
 
@@ -82,7 +88,9 @@ def test_a_fit_with_weights_at_zero_converges_and_has_the_derivative_of_refits(f
 
     def fit(scale):
         moved = Medium(medium.sigma_a * scale, medium.sigma_s_prime, medium.eta)
-        return fit_gaussians(Dipole(moved, EganFresnel()), 3, weights=NonNegativeWeights(), throw=False)
+        return fit_gaussians(
+            Dipole(moved, EganFresnel()), 3, weights=NonNegativeWeights(), throw=False
+        )
 
     @jax.jit
     def fit_and_slope(scale):

@@ -23,7 +23,9 @@ def test_bust_is_closed_and_faces_outward(mesh):
     assert len(np.unique(key)) == len(key)
     np.testing.assert_array_equal(np.sort(key), np.sort(reverse))
     assert mesh.volume() > 0
-    assert len(mesh.vertices) - len(key) // 2 + len(mesh.faces) == 2  # Euler: one body without a hole
+    assert (
+        len(mesh.vertices) - len(key) // 2 + len(mesh.faces) == 2
+    )  # Euler: one body without a hole
 
 
 @numpy_alone

@@ -15,7 +15,9 @@ def on_the_bust():
 
 
 def test_normals_point_outward_on_a_head(on_the_bust):
-    """Ears and nostrils included: at a spacing of 4 mm less than a hundredth lies on the wrong side."""
+    """Ears and nostrils included: at a spacing of 4 mm less than a hundredth lies on the wrong
+    side.
+    """
     _, centers, normals = on_the_bust
     agreement = np.einsum("ni,ni->n", estimate_normals(centers), normals)
     assert (agreement > 0).mean() > 0.99
@@ -61,7 +63,9 @@ def plane(count=900, spacing=1.0, seed=0):
 
 @pytest.mark.parametrize("gap", [1.6, 2.5])
 def test_two_sheets_close_together_are_not_mixed(gap):
-    """A slab little thicker than its points are apart: each side has its own normals, and they face away from each other."""
+    """A slab little thicker than its points are apart: each side has its own normals, and they face
+    away from each other.
+    """
     sheet = plane()
     points = np.concatenate([sheet, sheet + np.asarray([0.4, 0.3, gap])])
     normals = estimate_normals(points)
@@ -80,13 +84,20 @@ def test_the_sides_of_an_edge_keep_their_own_normals(angle):
     right, left = (sheet[keep] - [19.5, 0, 0] for keep in (sheet[:, 0] > 19.9, sheet[:, 0] < 19.1))
     left = np.stack([left[:, 0] * np.cos(fold), left[:, 1], left[:, 0] * np.sin(fold)], axis=1)
     normals = estimate_normals(np.concatenate([right, left]))
-    expected = np.concatenate([np.tile([0, 0, 1.0], (len(right), 1)), np.tile([-np.sin(fold), 0, np.cos(fold)], (len(left), 1))])
+    expected = np.concatenate(
+        [
+            np.tile([0, 0, 1.0], (len(right), 1)),
+            np.tile([-np.sin(fold), 0, np.cos(fold)], (len(left), 1)),
+        ]
+    )
     agreement = np.abs(np.einsum("ni,ni->n", normals, expected))
     assert (agreement > np.cos(np.radians(10))).mean() > 0.99
 
 
 def test_noise_averages_out():
-    """A tenth of a spacing up or down: the plane through each point's own neighbors alone is off by 4 degrees."""
+    """A tenth of a spacing up or down: the plane through each point's own neighbors alone is off by
+    4 degrees.
+    """
     sheet = plane(1600)
     sheet[:, 2] += 0.1 * np.random.default_rng(7).normal(size=1600)
     inner = (np.abs(sheet[:, :2] - 19.5) < 17).all(axis=1)
@@ -117,19 +128,27 @@ def test_what_lies_deep_within_follows_what_is_seen():
         (600, lambda u: (6 * np.sqrt(u) * around, 3 + 0 * u), up),
         (1_000, lambda u: (np.sqrt(36 + 64 * u) * around, 30 + 0 * u), up),
     ]
-    points = np.concatenate([np.concatenate(place(share), axis=1)[:count] for count, place, _ in parts])
-    expected = np.concatenate([np.broadcast_to(normal, (20_000, 3))[:count] for count, _, normal in parts])
+    points = np.concatenate(
+        [np.concatenate(place(share), axis=1)[:count] for count, place, _ in parts]
+    )
+    expected = np.concatenate(
+        [np.broadcast_to(normal, (20_000, 3))[:count] for count, _, normal in parts]
+    )
     agreement = np.einsum("ni,ni->n", estimate_normals(points), expected)
     assert (agreement > 0).mean() > 0.99
 
 
 def test_a_hollow_within_a_body_faces_its_middle():
-    """A shell around a shell: nothing sees the inner one, and a body within a body there is none."""
+    """A shell around a shell: nothing sees the inner one, and a body within a body there is
+    none.
+    """
     random = np.random.default_rng(1)
     ways = random.normal(size=(8_000, 3))
     ways /= np.linalg.norm(ways, axis=1, keepdims=True)
     outer = np.arange(8_000) < 6_000
-    agreement = np.einsum("ni,ni->n", estimate_normals(np.where(outer, 20.0, 11.0)[:, None] * ways), ways)
+    agreement = np.einsum(
+        "ni,ni->n", estimate_normals(np.where(outer, 20.0, 11.0)[:, None] * ways), ways
+    )
     assert (agreement[outer] > 0).all()
     assert (agreement[~outer] < 0).all()
 
@@ -149,14 +168,18 @@ def test_points_alone_are_told_and_stay_small():
     sheet = plane(900)
     dense = np.concatenate([sheet, 0.1 * plane(900, seed=1) + [40, 0, 0]])
     complete_splats(dense)  # where all are sparse none is alone
-    with pytest.warns(UserWarning, match=r"2 of 902 points lie alone, one of them .* mm from its neighbors"):
+    with pytest.warns(
+        UserWarning, match=r"2 of 902 points lie alone, one of them .* mm from its neighbors"
+    ):
         splats = complete_splats(np.concatenate([sheet, [[15, 15, 20.0], [90, 0, 0]]]))
     assert splats.count == 902
     assert float(splats.radii.max()) < 3
 
 
 def test_radii_follow_the_density():
-    """Ten times as dense on one side: discs close the surface there and here, and none reaches far."""
+    """Ten times as dense on one side: discs close the surface there and here, and none
+    reaches far.
+    """
     coarse, fine = plane(900), plane(9000, spacing=0.1)
     points = np.concatenate([coarse, fine[:9000] - [9.7, 0, 0]])
     splats = complete_splats(points)

@@ -37,7 +37,9 @@ def splats():
 def test_areas_add_up_to_the_surface(splats, dtype):
     assert splats.count == COUNT
     assert splats.areas.dtype == dtype
-    np.testing.assert_allclose(float(np.asarray(splats.areas, np.float64).sum()), sphere().area(), rtol=SINGLE)
+    np.testing.assert_allclose(
+        float(np.asarray(splats.areas, np.float64).sum()), sphere().area(), rtol=SINGLE
+    )
     assert float(splats.areas.min()) > 0
 
 
@@ -69,7 +71,10 @@ def test_discs_leave_no_hole(splats):
 def test_points_are_spread_as_blue_noise(splats):
     """Nearest neighbors: 0.5 of the spacing on average when random, 1.07 in a hexagonal grid."""
     spacing = np.sqrt(sphere().area() / COUNT)
-    nearest = cKDTree(np.asarray(splats.centers)).query(np.asarray(splats.centers), k=2)[0][:, 1] / spacing
+    nearest = (
+        cKDTree(np.asarray(splats.centers)).query(np.asarray(splats.centers), k=2)[0][:, 1]
+        / spacing
+    )
     assert nearest.mean() > 0.83
     assert nearest.min() > 0.45
     assert nearest.std() < 0.12
@@ -113,7 +118,9 @@ def test_a_handful_of_splats(count):
 def test_cut_keeps_what_is_above_the_plane():
     upper = cut_below(sphere(subdivisions=4), 20.0)
     assert upper.vertices[upper.faces, 1].min() >= 20 - 1e-9
-    np.testing.assert_allclose(upper.area(), 2 * np.pi * 50 * 30, rtol=3e-3)  # Archimedes; the mesh has 5120 faces
+    np.testing.assert_allclose(
+        upper.area(), 2 * np.pi * 50 * 30, rtol=3e-3
+    )  # Archimedes; the mesh has 5120 faces
 
 
 def test_open_border_has_no_clumps():
@@ -131,11 +138,17 @@ def test_cells_that_coincide_share_their_area():
 
 
 def test_textures_land_where_their_coordinates_say():
-    """Row 0 of the picture is at the top, v = 1; bilinear lookup gives back a picture that is linear in x and y."""
+    """Row 0 of the picture is at the top, v = 1; bilinear lookup gives back a picture that is
+    linear in x and y.
+    """
     size = 32
-    rows, columns = np.meshgrid((np.arange(size) + 0.5) / size, (np.arange(size) + 0.5) / size, indexing="ij")
+    rows, columns = np.meshgrid(
+        (np.arange(size) + 0.5) / size, (np.arange(size) + 0.5) / size, indexing="ij"
+    )
     picture = np.stack([columns, 1 - rows, np.full_like(rows, 0.25)], axis=-1)
-    splats = sample_mesh(square(), 500, textures=Textures(albedo=picture, specular=columns, roughness=rows))
+    splats = sample_mesh(
+        square(), 500, textures=Textures(albedo=picture, specular=columns, roughness=rows)
+    )
     xy = np.asarray(splats.centers)[:, :2] / 10
     inner = (np.abs(xy - 0.5) < 0.48).all(axis=1)
     assert splats.albedo is not None
@@ -151,10 +164,17 @@ def test_normal_map_tilts_along_u_and_v(mirrored):
     mesh = square()
     assert mesh.uvs is not None
     uvs = mesh.uvs * [-1, 1] if mirrored else mesh.uvs
-    tilt = np.asarray([0.6, 0.0, 0.8]) * np.ones((2, 2, 1)), np.asarray([0.0, 0.6, 0.8]) * np.ones((2, 2, 1))
+    tilt = (
+        np.asarray([0.6, 0.0, 0.8]) * np.ones((2, 2, 1)),
+        np.asarray([0.0, 0.6, 0.8]) * np.ones((2, 2, 1)),
+    )
     worn = Mesh(mesh.vertices, mesh.faces, mesh.normals, uvs)
-    along_u, along_v = (np.asarray(sample_mesh(worn, 20, textures=Textures(normal=n)).normals) for n in tilt)
-    np.testing.assert_allclose(along_u, np.tile([-0.6 if mirrored else 0.6, 0, 0.8], (20, 1)), atol=1e-6)
+    along_u, along_v = (
+        np.asarray(sample_mesh(worn, 20, textures=Textures(normal=n)).normals) for n in tilt
+    )
+    np.testing.assert_allclose(
+        along_u, np.tile([-0.6 if mirrored else 0.6, 0, 0.8], (20, 1)), atol=1e-6
+    )
     np.testing.assert_allclose(along_v, np.tile([0, 0.6, 0.8], (20, 1)), atol=1e-6)
 
 
@@ -196,19 +216,30 @@ def test_what_triangles_share_stays_or_moves_for_all_of_them():
     found = {}
     for one, other in ((0, 1), (1, 2), (2, 0)):
         shares = np.where(np.arange(3) == one, 0.3, np.where(np.arange(3) == other, 0.7, 0.0))
-        for way in (shares, shares[[other if k == one else one if k == other else k for k in range(3)]]):
+        for way in (
+            shares,
+            shares[[other if k == one else one if k == other else k for k in range(3)]],
+        ):
             points = SurfacePoints(every, np.broadcast_to(way, (len(every), 3)))
-            for at, plain in zip(rounded_positions(mesh, points), points.positions(mesh), strict=True):
-                np.testing.assert_allclose(found.setdefault(tuple(plain.round(6)), at), at, atol=1e-9)
+            for at, plain in zip(
+                rounded_positions(mesh, points), points.positions(mesh), strict=True
+            ):
+                np.testing.assert_allclose(
+                    found.setdefault(tuple(plain.round(6)), at), at, atol=1e-9
+                )
     assert len(found) == len(every) * 3  # two points on each edge, and two triangles
     corners = SurfacePoints(every, np.broadcast_to([1.0, 0, 0], (len(every), 3)))
-    np.testing.assert_allclose(rounded_positions(mesh, corners), corners.positions(mesh), atol=1e-12)
+    np.testing.assert_allclose(
+        rounded_positions(mesh, corners), corners.positions(mesh), atol=1e-12
+    )
 
 
 def test_a_box_stays_a_box():
     box = trimesh.creation.box(extents=(10.0, 20.0, 30.0))
     vertices, faces = np.array(box.vertices), np.array(box.faces)
-    mesh = Mesh(vertices, faces, vertex_normals(vertices, faces))  # smooth at its edges, as where a file has no normals
+    mesh = Mesh(
+        vertices, faces, vertex_normals(vertices, faces)
+    )  # smooth at its edges, as where a file has no normals
     points = anywhere(mesh)
     np.testing.assert_array_equal(rounded_positions(mesh, points), points.positions(mesh))
     assert rounded_area(mesh) == pytest.approx(2 * (200 + 300 + 600), rel=1e-12)
@@ -216,8 +247,13 @@ def test_a_box_stays_a_box():
 
 def test_rounded_splats_cover_the_rounded_surface():
     splats = sample_mesh(sphere(subdivisions=2), COUNT, rounded=True)
-    centers, normals = np.asarray(splats.centers, np.float64), np.asarray(splats.normals, np.float64)
+    centers, normals = (
+        np.asarray(splats.centers, np.float64),
+        np.asarray(splats.normals, np.float64),
+    )
     from_middle = np.linalg.norm(centers, axis=1)
     np.testing.assert_allclose(from_middle, 50, rtol=5e-4)
     assert np.min(np.sum(centers * normals, axis=1) / from_middle) > np.cos(np.radians(0.5))
-    np.testing.assert_allclose(np.asarray(splats.areas, np.float64).sum(), 4 * np.pi * 50**2, rtol=1e-3)
+    np.testing.assert_allclose(
+        np.asarray(splats.areas, np.float64).sum(), 4 * np.pi * 50**2, rtol=1e-3
+    )

@@ -16,9 +16,11 @@ FOLDER = Path("out/gradients")
 
 
 def write_evidence(title: str, world: World, name: str, way: jax.Array, step: float) -> Path:
-    """Write the picture, its derivative along `way` by differences, that of the plain path in forward mode, and their difference.
+    """Write the picture, its derivative along `way` by differences, that of the plain path in
+    forward mode, and their difference.
 
-    **Returns:** the path of a PNG; derivatives are red where positive, blue where negative, all in one scale.
+    **Returns:** the path of a PNG; derivatives are red where positive, blue where negative, all in
+    one scale.
     """
     plan = sj.plan(world.scene, world.camera, PLAIN)
 
@@ -32,12 +34,20 @@ def write_evidence(title: str, world: World, name: str, way: jax.Array, step: fl
     difference = np.asarray(beauty(leaf + step * way) - beauty(leaf - step * way)) / (2 * step)
     derivative = np.asarray(jax.jit(partial(jax.jvp, beauty))((leaf,), (way,))[1])
     scale = max(np.abs(difference).max(), np.abs(derivative).max(), np.finfo(float).tiny)
-    gray = np.repeat((picture / max(picture.max(), np.finfo(float).tiny))[..., None], 3, axis=-1) ** 0.45
-    rows = [gray, *(signed(each / scale) for each in (difference, derivative, derivative - difference))]
+    gray = (
+        np.repeat((picture / max(picture.max(), np.finfo(float).tiny))[..., None], 3, axis=-1)
+        ** 0.45
+    )
+    rows = [
+        gray,
+        *(signed(each / scale) for each in (difference, derivative, derivative - difference)),
+    ]
     pixels = (255 * np.clip(np.concatenate(rows), 0, 1)).astype(np.uint8)
     FOLDER.mkdir(parents=True, exist_ok=True)
     path = FOLDER / f"{title.replace(' ', '_')}.png"
-    Image.fromarray(pixels).resize((ENLARGED * pixels.shape[1], ENLARGED * pixels.shape[0]), Image.Resampling.NEAREST).save(path)
+    Image.fromarray(pixels).resize(
+        (ENLARGED * pixels.shape[1], ENLARGED * pixels.shape[0]), Image.Resampling.NEAREST
+    ).save(path)
     return path
 
 

@@ -1,7 +1,9 @@
-"""Gradients where things end: silhouettes against nothing and over a surface, edges of shadows. The picture is smooth there.
+"""Gradients where things end: silhouettes against nothing and over a surface, edges of shadows. The
+picture is smooth there.
 
-Against central differences, and over a way as long as a pixel: what the gradients along it add up to is what the picture does.
-That leaves little to the jumps that have no gradient, of fragments that enter or leave the front surface.
+Against central differences, and over a way as long as a pixel: what the gradients along it add up
+to is what the picture does. That leaves little to the jumps that have no gradient, of fragments
+that enter or leave the front surface.
 """
 
 from functools import cache
@@ -28,29 +30,45 @@ BALL = 4.5
 
 @cache
 def world() -> tuple[sj.Scene, sj.Camera, int]:
-    """A ball over a sheet that ends within the picture; the count of the splats that are the sheet's."""
-    sheet, ball = bodies.sheet(8.0, 1.2, center=(-2.7, 0.2, -6.0)), bodies.sphere(500, BALL, (1.0, 0.5, 4.0))
+    """A ball over a sheet that ends within the picture; the count of the splats that are the
+    sheet's.
+    """
+    sheet, ball = (
+        bodies.sheet(8.0, 1.2, center=(-2.7, 0.2, -6.0)),
+        bodies.sphere(500, BALL, (1.0, 0.5, 4.0)),
+    )
     light = sj.DirectionalLight(jnp.asarray([-0.5, -0.3, -1.0]), jnp.asarray([2.0, 3.0]))
     material = sj.Material(sj.SumOfGaussians(jnp.asarray([0.5]), jnp.asarray([[0.5, 0.3]])))
-    return sj.Scene(uneven(bodies.joined(sheet, ball)), (light,), material), view((3.0, 2.0, 40.0), 30.0, SIZE), sheet.count
+    return (
+        sj.Scene(uneven(bodies.joined(sheet, ball)), (light,), material),
+        view((3.0, 2.0, 40.0), 30.0, SIZE),
+        sheet.count,
+    )
 
 
 @cache
 def rendered():
-    """A function of how far the ball, the sheet and the light are moved: a weighed sum of beauty, the frame, and the gradient.
+    """A function of how far the ball, the sheet and the light are moved: a weighed sum of beauty,
+    the frame, and the gradient.
 
     All in one program: each takes its time to compile.
     """
     scene, camera, sheet = world()
-    settings = FAST  # what it is compared with elsewhere, the plain path, gives the same digits here
+    settings = (
+        FAST  # what it is compared with elsewhere, the plain path, gives the same digits here
+    )
     plan = sj.plan(scene, camera, settings)
     of_sheet = np.arange(scene.splats.count) < sheet
-    ways = [jnp.asarray(which[:, None] * np.asarray([1.0, 0.3, 0.0])) for which in (~of_sheet, of_sheet)]
+    ways = [
+        jnp.asarray(which[:, None] * np.asarray([1.0, 0.3, 0.0])) for which in (~of_sheet, of_sheet)
+    ]
 
     def summed(moved, share):
         centers = scene.splats.centers + moved[0] * ways[0] + moved[1] * ways[1]
         direction = scene.lights[0].direction + moved[2] * jnp.asarray([0.0, 1.0, 0.0])
-        there = eqx.tree_at(lambda s: (s.splats.centers, s.lights[0].direction), scene, (centers, direction))
+        there = eqx.tree_at(
+            lambda s: (s.splats.centers, s.lights[0].direction), scene, (centers, direction)
+        )
         frame = sj.render(there, camera, settings, plan)
         return jnp.sum(share * frame.beauty), frame
 
@@ -59,24 +77,37 @@ def rendered():
 
 def edges(frame: sj.Frame) -> dict[str, np.ndarray]:
     """Where the picture shows what: by depth, coverage and shadow."""
-    depth, coverage, shadow = (np.asarray(each) for each in (frame.depth, frame.coverage, frame.shadow[0]))
+    depth, coverage, shadow = (
+        np.asarray(each) for each in (frame.depth, frame.coverage, frame.shadow[0])
+    )
     front = np.where(np.isfinite(depth), depth, 0)
     steep = np.hypot(*np.gradient(front)) > 2
     inside = np.asarray(coverage) == 1
     outer = (coverage > 0) & (coverage < 1)
     far = front > 44  # the sheet
     inner = steep & inside & ~_grown(coverage == 0, 2)
-    return {"outer": outer, "inner": inner, "shadow": (shadow > 0.05) & (shadow < 0.95) & far & ~steep & inside}
+    return {
+        "outer": outer,
+        "inner": inner,
+        "shadow": (shadow > 0.05) & (shadow < 0.95) & far & ~steep & inside,
+    }
 
 
 def _grown(mask: np.ndarray, steps: int) -> np.ndarray:
     for _ in range(steps):
         padded = np.pad(mask, 1)
-        mask = padded[1:-1, 1:-1] | padded[:-2, 1:-1] | padded[2:, 1:-1] | padded[1:-1, :-2] | padded[1:-1, 2:]
+        mask = (
+            padded[1:-1, 1:-1]
+            | padded[:-2, 1:-1]
+            | padded[2:, 1:-1]
+            | padded[1:-1, :-2]
+            | padded[1:-1, 2:]
+        )
     return mask
 
 
-# What is looked at, what moves (ball, sheet, light), and how far: a pixel is 0.67 mm at the ball; the shadow falls 10 mm deep.
+# What is looked at, what moves (ball, sheet, light), and how far: a pixel is 0.67 mm at the ball;
+# the shadow falls 10 mm deep.
 CASES = {
     "outer-sheet": ("outer", 1, 0.67),
     "inner-ball": ("inner", 0, 0.67),
@@ -93,7 +124,9 @@ def test_edges_move_as_their_gradient_says(case):
         (_, frame), _ = found(jnp.zeros(3), jnp.zeros((SIZE, SIZE, 2)))
         mask = edges(frame)[where]
         assert np.sum(mask) >= 15
-        share = jnp.asarray(mask[..., None] * np.random.default_rng(1).uniform(-0.5, 1, (SIZE, SIZE, 2)))
+        share = jnp.asarray(
+            mask[..., None] * np.random.default_rng(1).uniform(-0.5, 1, (SIZE, SIZE, 2))
+        )
         way = np.eye(3)[which]
 
         def at(t):
@@ -105,6 +138,9 @@ def test_edges_move_as_their_gradient_says(case):
         np.testing.assert_allclose(slope, difference, rtol=AGREEMENT)
         slopes = [at((i + 0.5) / POINTS * far)[1] for i in range(POINTS)]
         moved, followed = at(far)[0] - start, far * np.mean(slopes)
-    print(f"{case}: gradient {slope:.6f}, differences {difference:.6f}; over a pixel {followed:.5f}, picture {moved:.5f}")
+    print(
+        f"{case}: gradient {slope:.6f}, differences {difference:.6f}; over a pixel {followed:.5f}, "
+        f"picture {moved:.5f}"
+    )
     assert abs(moved) > 0.01 * abs(start)
     assert abs(followed - moved) < OVER_A_PIXEL * far * np.mean(np.abs(slopes))

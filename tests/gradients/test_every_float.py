@@ -1,7 +1,9 @@
-"""The gradient of a whole picture in every float of scene and camera, against central differences, in float64.
+"""The gradient of a whole picture in every float of scene and camera, against central differences,
+in float64.
 
-A step must change neither which splats are visible nor which surface a shadow map sees; at 1e-6 of a parameter's scale the
-chosen directions do not. What the picture does over longer ways is in `test_edges.py`.
+A step must change neither which splats are visible nor which surface a shadow map sees; at 1e-6 of
+a parameter's scale the chosen directions do not. What the picture does over longer ways is in
+`test_edges.py`.
 """
 
 from functools import cache
@@ -21,7 +23,10 @@ pytestmark = [pytest.mark.slow, pytest.mark.once]  # in float64 whatever the pre
 STEP = 1e-6  # of a parameter's own scale
 AGREEMENT = 1e-5  # relative; rounding over the step leaves about 1e-9
 RECORDS = [
-    (world, path, name) for world, small in WORLDS.items() for path in small.paths for name in named(jax.eval_shape(small.make))
+    (world, path, name)
+    for world, small in WORLDS.items()
+    for path in small.paths
+    for name in named(jax.eval_shape(small.make))
 ]
 
 
@@ -39,7 +44,9 @@ def loss(frame: sj.Frame) -> jax.Array:
 
 @cache
 def rendered(world: str, path: str, precision=jnp.float64):
-    """A world, the gradient of its loss, and a function that gives the loss; kept by its arguments as they are spelled."""
+    """A world, the gradient of its loss, and a function that gives the loss; kept by its arguments
+    as they are spelled.
+    """
     start, settings = WORLDS[world].make(), WORLDS[world].paths[path]
     start = jax.tree.map(lambda leaf: leaf.astype(precision), start)
     plan = sj.plan(start.scene, start.camera, settings)
@@ -79,7 +86,10 @@ def test_gradient_is_that_of_central_differences(world, path, name):
         assert abs(difference) > 1e-7
         if not np.isclose(expected, difference, rtol=AGREEMENT, atol=0):
             where = write_evidence(f"{world} {path} {name}", start, name, way, STEP)
-            pytest.fail(f"gradient along {name}: {expected:.12g}, by differences {difference:.12g}; see {where}")
+            pytest.fail(
+                f"gradient along {name}: {expected:.12g}, by differences {difference:.12g}; see "
+                f"{where}"
+            )
 
 
 PATHS_AGREE = 0.02  # of the norm: the support of the Gaussians, clusters and nodes
@@ -88,8 +98,13 @@ CENTERS_AGREE = 0.1  # where every splat moves through the window of what is in 
 
 def differences(found: World, expected: World) -> dict[str, float]:
     """Of gradients, in shares of the norm."""
-    pairs = {name: (np.asarray(named(found)[name], float), np.asarray(each)) for name, each in named(expected).items()}
-    return {name: float(np.linalg.norm(a - b) / np.linalg.norm(b)) for name, (a, b) in pairs.items()}
+    pairs = {
+        name: (np.asarray(named(found)[name], float), np.asarray(each))
+        for name, each in named(expected).items()
+    }
+    return {
+        name: float(np.linalg.norm(a - b) / np.linalg.norm(b)) for name, (a, b) in pairs.items()
+    }
 
 
 def test_fast_and_plain_gradients_agree():
@@ -97,7 +112,9 @@ def test_fast_and_plain_gradients_agree():
         errors = differences(*(rendered("lamp and maps", path)[1] for path in ("fast", "plain")))
     print({name: f"{error:.1e}" for name, error in errors.items()})
     for name, error in errors.items():
-        assert error < (CENTERS_AGREE if "centers" in name or "camera" in name else PATHS_AGREE), errors
+        assert error < (CENTERS_AGREE if "centers" in name or "camera" in name else PATHS_AGREE), (
+            errors
+        )
 
 
 IN_FLOAT32 = 1e-4  # of the norm; 3e-5 measured, 5e-6 but for the specular strength
@@ -106,7 +123,10 @@ IN_FLOAT32 = 1e-4  # of the norm; 3e-5 measured, 5e-6 but for the specular stren
 @pytest.mark.parametrize("path", ["plain", pytest.param("fast", marks=pytest.mark.long)])
 def test_float32_gradients_are_those_of_float64(path):
     with jax.enable_x64(True):
-        single, double = rendered("lamp and maps", path, jnp.float32)[1], rendered("lamp and maps", path)[1]
+        single, double = (
+            rendered("lamp and maps", path, jnp.float32)[1],
+            rendered("lamp and maps", path)[1],
+        )
         assert {leaf.dtype for leaf in jax.tree.leaves(single)} == {jnp.dtype(jnp.float32)}
         errors = differences(single, double)
     print({name: f"{error:.1e}" for name, error in errors.items()})
@@ -122,7 +142,9 @@ def test_forward_mode_of_the_plain_path_is_its_reverse_mode():
 
         @jax.jit
         def forward(world: World, tangent: World):
-            return jax.jvp(lambda w: loss(sj.render(w.scene, w.camera, PLAIN, plan)), (world,), (tangent,))[1]
+            return jax.jvp(
+                lambda w: loss(sj.render(w.scene, w.camera, PLAIN, plan)), (world,), (tangent,)
+            )[1]
 
         products = jax.tree.map(lambda g, t: float(jnp.vdot(g, t)), gradient, tangent)
         found, expected = float(forward(start, tangent)), sum(jax.tree.leaves(products))

@@ -1,4 +1,6 @@
-"""The Jacobian of a picture in its material: equal to reverse mode row by row, and to the fit's own derivative behind it."""
+"""The Jacobian of a picture in its material: equal to reverse mode row by row, and to the fit's own
+derivative behind it.
+"""
 
 from functools import cache
 
@@ -20,16 +22,24 @@ ROW_BY_ROW = 1e-5  # asked; 1e-12 measured
 
 
 def scene(single: bool) -> sj.Scene:
-    """A bumpy ball with albedo; a layer handed over, one of splats, one of clusters, through nodes."""
+    """A bumpy ball with albedo; a layer handed over, one of splats, one of clusters, through
+    nodes.
+    """
     body = bodies.bumpy(300)
     albedo = jnp.asarray(np.random.default_rng(12).uniform(0.2, 0.9, (body.count, 2)))
     splats = sj.Splats(body.centers, body.normals, body.radii, body.areas, albedo)
-    gaussians = sj.SumOfGaussians(jnp.asarray([1.3, 12.0, 150.0]), jnp.asarray([[0.3, 0.2], [0.2, 0.3], [0.2, 0.2]]))
+    gaussians = sj.SumOfGaussians(
+        jnp.asarray([1.3, 12.0, 150.0]), jnp.asarray([[0.3, 0.2], [0.2, 0.3], [0.2, 0.2]])
+    )
     once = None
     if single:
-        medium = sj.Medium(jnp.asarray([0.1, 0.05]), jnp.asarray([0.9, 1.2]), jnp.asarray([1.3, 1.0]))
+        medium = sj.Medium(
+            jnp.asarray([0.1, 0.05]), jnp.asarray([0.9, 1.2]), jnp.asarray([1.3, 1.0])
+        )
         once = sj.SingleScattering(medium)
-    light = sj.DirectionalLight(jnp.asarray([-1.0, -0.4, -0.1]), jnp.asarray([2.0, 3.0]), cast_shadows=False)
+    light = sj.DirectionalLight(
+        jnp.asarray([-1.0, -0.4, -0.1]), jnp.asarray([2.0, 3.0]), cast_shadows=False
+    )
     return sj.Scene(splats, (light,), sj.Material(gaussians, single_scattering=once))
 
 
@@ -44,7 +54,9 @@ def rendered(case: str):
     plan = sj.plan(start, camera, settings)
 
     def beauty(gaussians):
-        return sj.render(eqx.tree_at(lambda s: s.material.gaussians, start, gaussians), camera, settings, plan).beauty
+        return sj.render(
+            eqx.tree_at(lambda s: s.material.gaussians, start, gaussians), camera, settings, plan
+        ).beauty
 
     return start, beauty, plan, sj.picture_jacobian(start, camera, settings, plan)
 
@@ -82,7 +94,9 @@ def test_it_is_reverse_mode_row_by_row():
 
 
 def test_single_scattering_leaves_less_to_the_gaussians_where_light_grazes():
-    """Then a weight moves the light that enters, which the row-by-row test would miss if no light grazed."""
+    """Then a weight moves the light that enters, which the row-by-row test would miss if no light
+    grazed.
+    """
     with jax.enable_x64(True):
         start, _, _, jacobian = rendered("fast")
         left = start.material.left_to_diffuse(jnp.asarray([0.05]))
@@ -94,15 +108,21 @@ def test_along_a_change_it_is_the_forward_derivative_of_the_plain_path():
     rng = np.random.default_rng(5)
     with jax.enable_x64(True):
         start, beauty, plan, jacobian = rendered("plain")
-        change = jax.tree.map(lambda leaf: jnp.asarray(rng.normal(size=leaf.shape)), start.material.gaussians)
-        expected = jax.jit(lambda g, c: jax.jvp(beauty, (g,), (c,))[1])(start.material.gaussians, change)
+        change = jax.tree.map(
+            lambda leaf: jnp.asarray(rng.normal(size=leaf.shape)), start.material.gaussians
+        )
+        expected = jax.jit(lambda g, c: jax.jvp(beauty, (g,), (c,))[1])(
+            start.material.gaussians, change
+        )
 
         @jax.jit
         def along(gaussians):
             moved = eqx.tree_at(lambda s: s.material.gaussians, start, gaussians)
             return sj.picture_jacobian(moved, view(*CAMERA), PLAIN, plan).along(change)
 
-        np.testing.assert_allclose(along(start.material.gaussians), jacobian.along(change), rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(
+            along(start.material.gaussians), jacobian.along(change), rtol=1e-9, atol=1e-12
+        )
         found = jacobian.along(change)
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12 * np.max(np.abs(expected)))
 
@@ -119,7 +139,10 @@ def gaussians_of(coefficients):
 def test_through_the_fit_it_is_the_derivative_in_the_coefficients():
     """Against reverse mode through profile, fit and picture at once, pixel by pixel."""
     with jax.enable_x64(True):
-        coefficients = {"sigma_a": jnp.asarray([0.02, 0.05]), "sigma_s_prime": jnp.asarray([0.4, 0.6])}
+        coefficients = {
+            "sigma_a": jnp.asarray([0.02, 0.05]),
+            "sigma_s_prime": jnp.asarray([0.4, 0.6]),
+        }
         start, camera = scene(False), view(*CAMERA)
         start = eqx.tree_at(lambda s: s.material.gaussians, start, gaussians_of(coefficients))
         plan = sj.plan(start, camera, PLAIN)
@@ -128,7 +151,9 @@ def test_through_the_fit_it_is_the_derivative_in_the_coefficients():
             moved = eqx.tree_at(lambda s: s.material.gaussians, start, gaussians_of(coefficients))
             return sj.render(moved, camera, PLAIN, plan).beauty
 
-        jacobian = sj.picture_jacobian(start, camera, PLAIN, plan).through(gaussians_of, coefficients)
+        jacobian = sj.picture_jacobian(start, camera, PLAIN, plan).through(
+            gaussians_of, coefficients
+        )
         places = [(16, 16, 0), (12, 20, 1), (20, 12, 1)]
 
         @jax.jit
@@ -141,12 +166,16 @@ def test_through_the_fit_it_is_the_derivative_in_the_coefficients():
     for place, row in zip(places, expected, strict=True):
         for name, each in row.items():
             assert np.max(np.abs(each)) > 0
-            np.testing.assert_allclose(jacobian[name][place], each, rtol=ROW_BY_ROW, atol=1e-9 * np.max(np.abs(each)))
+            np.testing.assert_allclose(
+                jacobian[name][place], each, rtol=ROW_BY_ROW, atol=1e-9 * np.max(np.abs(each))
+            )
 
 
 def test_with_the_plain_mean_the_layers_are_the_derivative_in_the_weights():
     settings = sj.RenderSettings(
-        rasterizer=PLAIN.rasterizer, diffuser=PLAIN.diffuser, diffusion=DiffusionSettings(normalization=PlainMean())
+        rasterizer=PLAIN.rasterizer,
+        diffuser=PLAIN.diffuser,
+        diffusion=DiffusionSettings(normalization=PlainMean()),
     )
     with jax.enable_x64(True):
         jacobian = sj.picture_jacobian(scene(False), view(*CAMERA), settings)
@@ -156,14 +185,19 @@ def test_with_the_plain_mean_the_layers_are_the_derivative_in_the_weights():
 def test_a_function_of_other_gaussians_is_refused():
     with jax.enable_x64(True):
         *_, jacobian = rendered("plain")
-        with pytest.raises(ValueError, match=r"has \[2, 2\] Gaussians and channels, the picture was made with \[3, 2\]"):
+        with pytest.raises(
+            ValueError,
+            match=r"has \[2, 2\] Gaussians and channels, the picture was made with \[3, 2\]",
+        ):
             jacobian.through(lambda w: sj.SumOfGaussians(jnp.ones(2), w), jnp.ones((2, 2)))
 
 
 def test_a_plan_that_does_not_suffice_makes_it_nan_and_says_so():
     with jax.enable_x64(True):
         start, _, plan, _ = rendered("fast")
-        wider = eqx.tree_at(lambda s: s.material.gaussians.variances, start, 4 * start.material.gaussians.variances)
+        wider = eqx.tree_at(
+            lambda s: s.material.gaussians.variances, start, 4 * start.material.gaussians.variances
+        )
         jacobian = sj.picture_jacobian(wider, view(*CAMERA), FAST, plan)
     assert float(jacobian.frame.overflow) > 1
     assert np.all(np.isnan(jacobian.weights))

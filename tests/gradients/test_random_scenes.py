@@ -1,6 +1,8 @@
-"""Any scene, any loss: if the loss is finite, so is every derivative of it. Contents are drawn, shapes and plans are fixed.
+"""Any scene, any loss: if the loss is finite, so is every derivative of it. Contents are drawn,
+shapes and plans are fixed.
 
-`make random-scenes` draws 10,000 of them over all shapes, in both precisions; the suite draws 200 over a few.
+`make random-scenes` draws 10,000 of them over all shapes, in both precisions; the suite draws 200
+over a few.
 """
 
 import dataclasses
@@ -23,7 +25,14 @@ from splatjax.diffusion import ClusterDiffuser, DenseDiffuser
 from splatjax.diffusion._clustered import LayerPlan, NodePlan
 from splatjax.diffusion._neighbors import Boxes, Neighbors
 from splatjax.diffusion._pixels import tile_grid
-from splatjax.splatting import BinCapacity, DenseRasterizer, ShadowSettings, TileCapacity, TileGrid, TileRasterizer
+from splatjax.splatting import (
+    BinCapacity,
+    DenseRasterizer,
+    ShadowSettings,
+    TileCapacity,
+    TileGrid,
+    TileRasterizer,
+)
 
 pytestmark = [pytest.mark.slow, pytest.mark.once]
 
@@ -39,7 +48,9 @@ class Shape:
     splats: int
     gaussians: int
     lights: str
-    """One letter each: d directional, s with shadow; p point, q with shadow, c with shadow among the splats; b beam."""
+    """One letter each: d directional, s with shadow; p point, q with shadow, c with shadow among
+    the splats; b beam.
+    """
     maps: str = ""
     """a albedo, s specular, r roughness."""
     channels: int = 1
@@ -55,7 +66,18 @@ SHAPES = [
     Shape(9, 1, "c", fast=False, width=5, height=5),
     # Beyond the suite.
     Shape(10, 2, "s", "r", precision="float64"),
-    Shape(8, 2, "pb", "as", channels=2, fast=False, precision="float64", single=True, width=6, height=5),
+    Shape(
+        8,
+        2,
+        "pb",
+        "as",
+        channels=2,
+        fast=False,
+        precision="float64",
+        single=True,
+        width=6,
+        height=5,
+    ),
     Shape(1, 1, "d"),
     Shape(1, 1, "d", precision="float64"),
     Shape(0, 1, "q"),
@@ -90,7 +112,9 @@ def rows(shape: tuple[int, ...], low: float, high: float):
 
 @st.composite
 def worlds(draw, shape: Shape) -> Callable[[], World]:
-    """What makes a scene of a shape; splats on each other, lights on splats, black texels and huge discs are likely."""
+    """What makes a scene of a shape; splats on each other, lights on splats, black texels and huge
+    discs are likely.
+    """
     count, channels = shape.splats, shape.channels
 
     def directions(*leading: int) -> np.ndarray:
@@ -143,20 +167,40 @@ def worlds(draw, shape: Shape) -> Callable[[], World]:
         def lamp(letter, *drawn):
             if letter == "b":
                 return sj.GaussianBeam(*numbers(*drawn))
-            return (sj.DirectionalLight if letter in "ds" else sj.PointLight)(*numbers(*drawn), cast_shadows=letter in "sqc")
+            return (sj.DirectionalLight if letter in "ds" else sj.PointLight)(
+                *numbers(*drawn), cast_shadows=letter in "sqc"
+            )
 
         single = None
         if medium is not None:
             sigma_a, sigma_s_prime, more, strength = numbers(*medium)
-            single = sj.SingleScattering(sj.Medium(sigma_a, sigma_s_prime + 1e-3, 1 + more), strength)
-        material = sj.Material(sj.SumOfGaussians(*numbers(variances, weights)), *numbers(*surface), single)
+            single = sj.SingleScattering(
+                sj.Medium(sigma_a, sigma_s_prime + 1e-3, 1 + more), strength
+            )
+        material = sj.Material(
+            sj.SumOfGaussians(*numbers(variances, weights)), *numbers(*surface), single
+        )
         camera = sj.Camera(*numbers(eye, rotation, focal_length), shape.width, shape.height)
-        return World(sj.Scene(sj.Splats(*numbers(*discs)), tuple(lamp(*each) for each in lamps), material), camera)
+        return World(
+            sj.Scene(sj.Splats(*numbers(*discs)), tuple(lamp(*each) for each in lamps), material),
+            camera,
+        )
 
     return made
 
 
-LAYERS = ("beauty", "coverage", "depth", "position", "normal", "albedo", "shadow", "irradiance", "layers", "specular")
+LAYERS = (
+    "beauty",
+    "coverage",
+    "depth",
+    "position",
+    "normal",
+    "albedo",
+    "shadow",
+    "irradiance",
+    "layers",
+    "specular",
+)
 
 
 @cache
@@ -164,7 +208,9 @@ def loss_and_gradient(shape: Shape):
     """Compiled once per shape, with room for every splat everywhere."""
     settings = sj.RenderSettings(shadows=SHADOWS)
     if not shape.fast:
-        settings = sj.RenderSettings(shadows=SHADOWS, rasterizer=DenseRasterizer(), diffuser=DenseDiffuser())
+        settings = sj.RenderSettings(
+            shadows=SHADOWS, rasterizer=DenseRasterizer(), diffuser=DenseDiffuser()
+        )
     plan = roomy(sj.plan(*typical(shape), settings), shape)
 
     @jax.jit
@@ -174,7 +220,9 @@ def loss_and_gradient(shape: Shape):
             total = jnp.zeros((), world.camera.focal_length.dtype)
             for factor, name in zip(factors, LAYERS, strict=True):
                 layer = getattr(frame, name)
-                share = jnp.asarray(np.random.default_rng(len(name)).normal(size=layer.shape), layer.dtype)
+                share = jnp.asarray(
+                    np.random.default_rng(len(name)).normal(size=layer.shape), layer.dtype
+                )
                 total = total + factor * jnp.sum(share * jnp.where(jnp.isfinite(layer), layer, 0.0))
             return jnp.where(jnp.isfinite(frame.overflow) & (frame.overflow == 0), total, jnp.nan)
 
@@ -184,7 +232,9 @@ def loss_and_gradient(shape: Shape):
 
 
 def typical(shape: Shape) -> tuple[sj.Scene, sj.Camera]:
-    """Some scene of the shape, to plan with: light c stands among the splats, the others far away."""
+    """Some scene of the shape, to plan with: light c stands among the splats, the others far
+    away.
+    """
     count, channels = shape.splats, shape.channels
     rng = np.random.default_rng(count)
 
@@ -195,20 +245,30 @@ def typical(shape: Shape) -> tuple[sj.Scene, sj.Camera]:
         if letter in "ds":
             return sj.DirectionalLight(-ones(3), ones(channels), cast_shadows=letter == "s")
         if letter in "pqc":
-            return sj.PointLight((0 if letter == "c" else 100) * ones(3), ones(channels), cast_shadows=letter != "p")
+            return sj.PointLight(
+                (0 if letter == "c" else 100) * ones(3), ones(channels), cast_shadows=letter != "p"
+            )
         return sj.GaussianBeam(ones(3), -ones(3), ones(channels), ones())
 
     centers = jnp.asarray(rng.uniform(-5, 5, (count, 3)), shape.precision)
     normals = centers / jnp.linalg.norm(centers, axis=1, keepdims=True)
     maps = (ones(count, channels), ones(count), ones(count))
-    maps = [each if letter in shape.maps else None for letter, each in zip("asr", maps, strict=True)]
+    maps = [
+        each if letter in shape.maps else None for letter, each in zip("asr", maps, strict=True)
+    ]
     splats = sj.Splats(centers, normals, 2 * ones(count), ones(count), *maps)
-    gaussians = sj.SumOfGaussians(4.0 ** jnp.arange(shape.gaussians, dtype=shape.precision), ones(shape.gaussians, channels))
+    gaussians = sj.SumOfGaussians(
+        4.0 ** jnp.arange(shape.gaussians, dtype=shape.precision), ones(shape.gaussians, channels)
+    )
     single = None
     if shape.single:
-        single = sj.SingleScattering(sj.Medium(ones(channels), ones(channels), ones(channels)), ones(channels))
+        single = sj.SingleScattering(
+            sj.Medium(ones(channels), ones(channels), ones(channels)), ones(channels)
+        )
     camera = sj.Camera.look_at(20 * ones(3), 0 * ones(3), width=shape.width, height=shape.height)
-    scene = sj.Scene(splats, tuple(map(light, shape.lights)), sj.Material(gaussians, single_scattering=single))
+    scene = sj.Scene(
+        splats, tuple(map(light, shape.lights)), sj.Material(gaussians, single_scattering=single)
+    )
     return scene, camera
 
 
@@ -237,12 +297,16 @@ def roomy(plan: sj.Plan, shape: Shape) -> sj.Plan:
                 )
                 for each in part.layers
             )
-            return eqx.tree_at(lambda d: d.layers, part, layers, is_leaf=lambda leaf: isinstance(leaf, tuple))
+            return eqx.tree_at(
+                lambda d: d.layers, part, layers, is_leaf=lambda leaf: isinstance(leaf, tuple)
+            )
         return part
 
     tiles = tile_grid(shape.width, shape.height, 1)
     plan = dataclasses.replace(plan, tiles=tiles.across * tiles.down)
-    return jax.tree.map(widened, plan, is_leaf=lambda part: isinstance(part, TileRasterizer | ClusterDiffuser))
+    return jax.tree.map(
+        widened, plan, is_leaf=lambda part: isinstance(part, TileRasterizer | ClusterDiffuser)
+    )
 
 
 FARTHEST = 1e15  # mm, to which all is near
@@ -253,7 +317,9 @@ def far_reaching(nodes: NodePlan | None) -> NodePlan | None:
         return None
     points, sources = nodes.neighbors.points, nodes.neighbors.sources
     everywhere = Boxes(jnp.full_like(points.low, -FARTHEST), jnp.full_like(points.high, FARTHEST))
-    all_sources = Boxes(jnp.full_like(sources.low, -FARTHEST), jnp.full_like(sources.high, FARTHEST))
+    all_sources = Boxes(
+        jnp.full_like(sources.low, -FARTHEST), jnp.full_like(sources.high, FARTHEST)
+    )
     return NodePlan(Neighbors.find(everywhere, all_sources, 10 * FARTHEST, 1, 4), nodes.deviations)
 
 
@@ -276,15 +342,24 @@ def test_gradients_of_a_finite_loss_are_finite(shape):
         phases=[Phase.generate, Phase.shrink],
         suppress_health_check=list(HealthCheck),
     )
-    @given(make=worlds(shape), factors=arrays(np.float64, len(LAYERS), elements=st.sampled_from([0.0, 1.0, -2.0])))
+    @given(
+        make=worlds(shape),
+        factors=arrays(np.float64, len(LAYERS), elements=st.sampled_from([0.0, 1.0, -2.0])),
+    )
     def check(make, factors):
         world = make()
         loss, gradient = loss_and_gradient(shape)(world, jnp.asarray(factors, shape.precision))
         finite.append(bool(jnp.isfinite(loss)))
         if finite[-1]:
-            wrong = [name for name, leaf in named(gradient).items() if not np.all(np.isfinite(np.asarray(leaf)))]
+            wrong = [
+                name
+                for name, leaf in named(gradient).items()
+                if not np.all(np.isfinite(np.asarray(leaf)))
+            ]
             shown = eqx.tree_pformat(world, short_arrays=False) if wrong else ""
-            assert not wrong, f"the gradient of a loss of {float(loss):g} is not finite in {wrong}, of {shown}"
+            assert not wrong, (
+                f"the gradient of a loss of {float(loss):g} is not finite in {wrong}, of {shown}"
+            )
 
     with jax.enable_x64(shape.precision == "float64"):
         check()
@@ -295,7 +370,10 @@ def test_gradients_of_a_finite_loss_are_finite(shape):
 SHAPE = SHAPES[0]  # in float32, on the fast path, a point light with a shadow map
 DEGENERATE = {
     "empty picture": {"camera.rotation": [[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]},
-    "grazing splats": {"scene.splats.normals": np.cross([1.0, 1.0, 1.0], [0.3, -1.0, 0.2]) / np.sqrt(3 * 1.13 - 0.25)},
+    "grazing splats": {
+        "scene.splats.normals": np.cross([1.0, 1.0, 1.0], [0.3, -1.0, 0.2])
+        / np.sqrt(3 * 1.13 - 0.25)
+    },
     "splats seen from behind": {"scene.splats.normals": -np.ones(3) / np.sqrt(3)},
     "all splats in one place": {"scene.splats.centers": [0.0, 0.0, 0.0]},
     "black texels": {"scene.splats.albedo": [0.0]},
@@ -308,7 +386,10 @@ DEGENERATE = {
     "mirror": {"scene.material.roughness": 0.0},
     "a very narrow layer": {"scene.material.gaussians.variances": 1e-8},
     "a very wide layer": {"scene.material.gaussians.variances": 1e8},
-    "the camera in a splat": {"camera.position": [0.0, 0.0, 0.0], "scene.splats.centers": [0.0, 0.0, 0.02]},
+    "the camera in a splat": {
+        "camera.position": [0.0, 0.0, 0.0],
+        "scene.splats.centers": [0.0, 0.0, 0.02],
+    },
 }
 
 

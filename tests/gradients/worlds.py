@@ -1,4 +1,6 @@
-"""Small scenes that together hold every float that a picture depends on: one record each, with what to check of it."""
+"""Small scenes that together hold every float that a picture depends on: one record each, with what
+to check of it.
+"""
 
 import dataclasses
 from collections.abc import Callable, Iterator
@@ -31,7 +33,9 @@ class Small:
     """A small world, and how it is rendered."""
 
     make: Callable[[], World]
-    paths: dict[str, sj.RenderSettings] = dataclasses.field(default_factory=lambda: {"plain": PLAIN})
+    paths: dict[str, sj.RenderSettings] = dataclasses.field(
+        default_factory=lambda: {"plain": PLAIN}
+    )
 
 
 def _gaussians() -> sj.SumOfGaussians:
@@ -44,11 +48,15 @@ def view(eye=(6.0, 4.0, 40.0), fov=32.0, size=SIZE) -> sj.Camera:
 
 def _colored(body: sj.Splats, seed: int = 12) -> sj.Splats:
     albedo = np.random.default_rng(seed).uniform(0.2, 0.9, (body.count, 2))
-    return eqx.tree_at(lambda s: s.albedo, body, jnp.asarray(albedo), is_leaf=lambda leaf: leaf is None)
+    return eqx.tree_at(
+        lambda s: s.albedo, body, jnp.asarray(albedo), is_leaf=lambda leaf: leaf is None
+    )
 
 
 def uneven(body: sj.Splats) -> sj.Splats:
-    """No two extents alike: where two splats share the largest, the bounds of the shadow maps have a kink."""
+    """No two extents alike: where two splats share the largest, the bounds of the shadow maps have
+    a kink.
+    """
     rng = np.random.default_rng(8)
     radii = body.radii * jnp.asarray(rng.uniform(0.95, 1.05, body.count))
     centers = body.centers + jnp.asarray(rng.uniform(-0.05, 0.05, (body.count, 3)))
@@ -56,11 +64,15 @@ def uneven(body: sj.Splats) -> sj.Splats:
 
 
 def lamp_and_maps() -> World:
-    """A body in its own shadow, with every map a splat can carry, under a point light around whose frustum a map is made."""
+    """A body in its own shadow, with every map a splat can carry, under a point light around whose
+    frustum a map is made.
+    """
     rng = np.random.default_rng(3)
     body = _colored(bodies.bumpy(240))
     specular, roughness = (jnp.asarray(rng.uniform(0.5, 1.5, body.count)) for _ in range(2))
-    splats = sj.Splats(body.centers, body.normals, body.radii, body.areas, body.albedo, specular, roughness)
+    splats = sj.Splats(
+        body.centers, body.normals, body.radii, body.areas, body.albedo, specular, roughness
+    )
     lights = (sj.PointLight(jnp.asarray([-14.0, 18.0, 25.0]), jnp.asarray([9e3, 5e3])),)
     return World(sj.Scene(splats, lights, sj.Material(_gaussians())), view())
 
@@ -68,9 +80,14 @@ def lamp_and_maps() -> World:
 def sun_and_beam() -> World:
     """Light from far away, and a laser; neither casts a shadow."""
     lights = (
-        sj.DirectionalLight(jnp.asarray([-0.6, -0.4, -0.7]), jnp.asarray([2.0, 3.0]), cast_shadows=False),
+        sj.DirectionalLight(
+            jnp.asarray([-0.6, -0.4, -0.7]), jnp.asarray([2.0, 3.0]), cast_shadows=False
+        ),
         sj.GaussianBeam(
-            jnp.asarray([2.0, 3.0, 30.0]), jnp.asarray([-0.1, 0.1, -1.0]), jnp.asarray([400.0, 600.0]), jnp.asarray(20.0)
+            jnp.asarray([2.0, 3.0, 30.0]),
+            jnp.asarray([-0.1, 0.1, -1.0]),
+            jnp.asarray([400.0, 600.0]),
+            jnp.asarray(20.0),
         ),
     )
     return World(sj.Scene(_colored(bodies.bumpy(240)), lights, sj.Material(_gaussians())), view())
@@ -78,14 +95,24 @@ def sun_and_beam() -> World:
 
 def lamp_inside() -> World:
     """A point light between two bodies: the six faces of a cube."""
-    body = uneven(bodies.joined(bodies.sphere(120, 6.0, (-7.0, 0.0, 0.0)), bodies.sphere(120, 5.0, (7.0, 1.0, 0.0), seed=1)))
+    body = uneven(
+        bodies.joined(
+            bodies.sphere(120, 6.0, (-7.0, 0.0, 0.0)),
+            bodies.sphere(120, 5.0, (7.0, 1.0, 0.0), seed=1),
+        )
+    )
     lights = (sj.PointLight(jnp.asarray([0.3, 0.4, 5.0]), jnp.asarray([90.0, 50.0])),)
     return World(sj.Scene(body, lights, sj.Material(_gaussians())), view())
 
 
 def ball_over_sheet() -> World:
     """A silhouette inside the picture, and the edge of a shadow."""
-    body = uneven(bodies.joined(bodies.sheet(14.0, 2.2, center=(0.3, 0.2, -6.0)), bodies.sphere(160, 4.5, (1.0, 0.5, 2.0))))
+    body = uneven(
+        bodies.joined(
+            bodies.sheet(14.0, 2.2, center=(0.3, 0.2, -6.0)),
+            bodies.sphere(160, 4.5, (1.0, 0.5, 2.0)),
+        )
+    )
     lights = (sj.DirectionalLight(jnp.asarray([-0.5, -0.3, -1.0]), jnp.asarray([2.0, 3.0])),)
     return World(sj.Scene(body, lights, sj.Material(_gaussians())), view((3.0, 2.0, 40.0), 30.0))
 
@@ -95,11 +122,21 @@ def scattered_once() -> World:
     medium = sj.Medium(jnp.asarray([0.1, 0.05]), jnp.asarray([0.9, 1.2]), jnp.asarray([1.3, 1.5]))
     single = sj.SingleScattering(medium, jnp.asarray([0.9, 1.0]))
     gaussians = sj.SumOfGaussians(jnp.asarray([4.0, 30.0]), jnp.asarray([[0.4, 0.5], [0.3, 0.3]]))
-    lights = (sj.DirectionalLight(jnp.asarray([-1.0, -0.2, 0.1]), jnp.asarray([2.0, 3.0]), cast_shadows=False),)
-    return World(sj.Scene(_colored(bodies.bumpy(160)), lights, sj.Material(gaussians, single_scattering=single)), view())
+    lights = (
+        sj.DirectionalLight(
+            jnp.asarray([-1.0, -0.2, 0.1]), jnp.asarray([2.0, 3.0]), cast_shadows=False
+        ),
+    )
+    return World(
+        sj.Scene(
+            _colored(bodies.bumpy(160)), lights, sj.Material(gaussians, single_scattering=single)
+        ),
+        view(),
+    )
 
 
-# The plain path is checked everywhere; the fast one where all its parts take part, and against the plain one.
+# The plain path is checked everywhere; the fast one where all its parts take part, and against the
+# plain one.
 WORLDS = {
     "lamp and maps": Small(lamp_and_maps, {"fast": FAST, "plain": PLAIN}),
     "sun and beam": Small(sun_and_beam),
@@ -137,8 +174,16 @@ def declared(kind: type) -> Iterator[str]:
     for field in dataclasses.fields(kind):
         if field.metadata.get("static"):
             continue
-        inner = [each for each in _mentioned(field.type) if isinstance(each, type) and issubclass(each, eqx.Module)]
-        inner = [sub for each in inner for sub in (_ours(each) if each.__name__.startswith("Abstract") else [each])]
+        inner = [
+            each
+            for each in _mentioned(field.type)
+            if isinstance(each, type) and issubclass(each, eqx.Module)
+        ]
+        inner = [
+            sub
+            for each in inner
+            for sub in (_ours(each) if each.__name__.startswith("Abstract") else [each])
+        ]
         if inner:
             for each in inner:
                 yield from declared(each)

@@ -31,11 +31,16 @@ COMPILED = "/jax/core/compile/backend_compile_duration"
 
 def lights():
     ways = [-1.0, -0.4, -0.3], [0.8, -0.2, -0.6]
-    return [sj.DirectionalLight(jnp.asarray(way), jnp.asarray([2.0, 3.0]), cast_shadows=False) for way in ways]
+    return [
+        sj.DirectionalLight(jnp.asarray(way), jnp.asarray([2.0, 3.0]), cast_shadows=False)
+        for way in ways
+    ]
 
 
 def camera() -> sj.Camera:
-    return sj.Camera.look_at(jnp.asarray([6.0, 4.0, 40.0]), jnp.zeros(3), fov=32.0, width=SIZE, height=SIZE)
+    return sj.Camera.look_at(
+        jnp.asarray([6.0, 4.0, 40.0]), jnp.zeros(3), fov=32.0, width=SIZE, height=SIZE
+    )
 
 
 def material() -> sj.Material:
@@ -52,7 +57,9 @@ def body() -> sj.Splats:
 
 
 def with_albedo(splats: sj.Splats, albedo) -> sj.Splats:
-    return eqx.tree_at(lambda s: s.albedo, splats, jnp.asarray(albedo), is_leaf=lambda leaf: leaf is None)
+    return eqx.tree_at(
+        lambda s: s.albedo, splats, jnp.asarray(albedo), is_leaf=lambda leaf: leaf is None
+    )
 
 
 def tell(splats: sj.Splats, light: sj.DirectionalLight, picture=None, x=None) -> _descent.Told:
@@ -60,17 +67,24 @@ def tell(splats: sj.Splats, light: sj.DirectionalLight, picture=None, x=None) ->
     world = _descent.World.of(splats, material(), PARTS)
     shot = Shot(camera(), (light,))
     picture = np.zeros((SIZE, SIZE, 2)) if picture is None else picture
-    (seen,) = _descent.pictures_of(Evidence([sj.Observation(picture, shot.camera, shot.lights)], jnp.zeros(()).dtype))
+    (seen,) = _descent.pictures_of(
+        Evidence([sj.Observation(picture, shot.camera, shot.lights)], jnp.zeros(()).dtype)
+    )
     plan = sj.plan(sj.Scene(splats, shot.lights, material()), shot.camera, PLAIN)
     x = (world.coordinates(), world.shot_coordinates(shot)) if x is None else x
     return _descent.tell(*x, world, shot, seen, plan, PLAIN, sj.SquaredLoss(), sj.BlackBackground())
 
 
 def observations(shots=None, x=None, **more) -> list[sj.Observation]:
-    """Pictures of the body, or of it at coordinates, under each light; said to be taken otherwise, if that is given."""
+    """Pictures of the body, or of it at coordinates, under each light; said to be taken otherwise,
+    if that is given.
+    """
     pictures = [np.asarray(tell(body(), light, x=x).beauty) for light in lights()]
     shots = [(camera(), (light,)) for light in lights()] if shots is None else shots
-    return [sj.Observation(picture, *shot, **more) for picture, shot in zip(pictures, shots, strict=True)]
+    return [
+        sj.Observation(picture, *shot, **more)
+        for picture, shot in zip(pictures, shots, strict=True)
+    ]
 
 
 def only(*kinds: type) -> optax.GradientTransformation:
@@ -80,7 +94,10 @@ def only(*kinds: type) -> optax.GradientTransformation:
     def kept(updates, params):
         del params
         body = tuple(_if(*each) for each in zip(chosen[:2], updates.body, strict=True))
-        shots = tuple(tuple(_if(*each) for each in zip(chosen[2:], shot, strict=True)) for shot in updates.shots)
+        shots = tuple(
+            tuple(_if(*each) for each in zip(chosen[2:], shot, strict=True))
+            for shot in updates.shots
+        )
         return eqx.tree_at(lambda x: (x.body, x.shots), updates, (body, shots))
 
     return optax.stateless(kept)
@@ -95,11 +112,21 @@ def _if(moves: bool, update):
 
 
 def fitted(*kinds: type, steps: int, seen=None, splats=None, **more) -> sj.FittedScene:
-    optimizer = optax.chain(optax.adam(optax.cosine_decay_schedule(2.0, steps), b2=0.9), only(*kinds))
+    optimizer = optax.chain(
+        optax.adam(optax.cosine_decay_schedule(2.0, steps), b2=0.9), only(*kinds)
+    )
     seen = observations() if seen is None else seen
     splats = body() if splats is None else splats
     return sj.fit_scene(
-        seen, splats, material(), PARTS, optimizer, steps=steps, background=sj.BlackBackground(), settings=PLAIN, **more
+        seen,
+        splats,
+        material(),
+        PARTS,
+        optimizer,
+        steps=steps,
+        background=sj.BlackBackground(),
+        settings=PLAIN,
+        **more,
     )
 
 
@@ -111,7 +138,9 @@ def seen_well(splats: sj.Splats) -> np.ndarray:
 
 def degrees(a, b) -> np.ndarray:
     cosine = np.sum(np.asarray(a) * np.asarray(b), axis=-1)
-    return np.degrees(np.arccos(np.clip(cosine / np.linalg.norm(a, axis=-1) / np.linalg.norm(b, axis=-1), -1, 1)))
+    return np.degrees(
+        np.arccos(np.clip(cosine / np.linalg.norm(a, axis=-1) / np.linalg.norm(b, axis=-1), -1, 1))
+    )
 
 
 @pytest.mark.slow
@@ -124,7 +153,10 @@ class TestFitScene:
         gray, light = with_albedo(body(), np.full(body().albedo.shape, 0.5)), lights()[0]
         picture = observations()[0].picture
         _, _, *zeros = tell(gray, light, picture).value
-        begin, way = (jax.tree.map(lambda leaf: jnp.asarray(rng.normal(size=leaf.shape)), zeros) for _ in range(2))
+        begin, way = (
+            jax.tree.map(lambda leaf: jnp.asarray(rng.normal(size=leaf.shape)), zeros)
+            for _ in range(2)
+        )
         chosen = [isinstance(part, kind) for part in PARTS]
         way = [
             tuple(_if(*each) for each in zip(where, part, strict=True))
@@ -132,7 +164,12 @@ class TestFitScene:
         ]
 
         def told(by: float):
-            return tell(gray, light, picture, jax.tree.map(lambda leaf, along: leaf + by * along, begin, way)).value
+            return tell(
+                gray,
+                light,
+                picture,
+                jax.tree.map(lambda leaf, along: leaf + by * along, begin, way),
+            ).value
 
         _, _, *gradient = told(0.0)
         along = sum(jax.tree.leaves(jax.tree.map(jnp.vdot, gradient, way)))
@@ -158,7 +195,14 @@ class TestFitScene:
     def test_lights_come_back(self):
         off = [(0.7, [-1.0, -0.2, -0.5]), (1.3, [0.7, 0.0, -0.7])]
         begin = [
-            (camera(), (sj.DirectionalLight(jnp.asarray(way), light.irradiance * factor, cast_shadows=False),))
+            (
+                camera(),
+                (
+                    sj.DirectionalLight(
+                        jnp.asarray(way), light.irradiance * factor, cast_shadows=False
+                    ),
+                ),
+            )
             for light, (factor, way) in zip(lights(), off, strict=True)
         ]
         found = fitted(sj.LightStrengths, sj.LightPlaces, steps=60, seen=observations(begin))
@@ -170,8 +214,12 @@ class TestFitScene:
         right = camera()
         turned = rotation(jnp.asarray([0.03, -0.04, 0.02]))
         position = turned @ right.position + jnp.asarray([0.4, -0.3, 1.0])
-        off = eqx.tree_at(lambda c: (c.position, c.rotation), right, (position, right.rotation @ turned.T))
-        found = fitted(sj.CameraPoses, steps=120, seen=observations([(off, (light,)) for light in lights()]))
+        off = eqx.tree_at(
+            lambda c: (c.position, c.rotation), right, (position, right.rotation @ turned.T)
+        )
+        found = fitted(
+            sj.CameraPoses, steps=120, seen=observations([(off, (light,)) for light in lights()])
+        )
         for ours in found.cameras:
             assert np.linalg.norm(ours.position - right.position) < 0.2  # mm; 2.4 at the start
             assert np.max(degrees(ours.rotation, right.rotation)) < 0.3  # 3 at the start
@@ -182,8 +230,15 @@ class TestFitScene:
         _, _, zeros, own = tell(body(), lights()[0]).value
         x = jnp.asarray(40 * np.random.default_rng(4).normal(size=body().count))
         dented = part.moved(body(), x, part.prepared(body()))
-        found = fitted(sj.NormalOffsets, steps=60, seen=observations(x=((jnp.zeros_like(zeros[0]), x), _zeros(own))))
-        before, after = (degrees(each.normals, dented.normals)[seen_well(dented)] for each in (body(), found.splats))
+        found = fitted(
+            sj.NormalOffsets,
+            steps=60,
+            seen=observations(x=((jnp.zeros_like(zeros[0]), x), _zeros(own))),
+        )
+        before, after = (
+            degrees(each.normals, dented.normals)[seen_well(dented)]
+            for each in (body(), found.splats)
+        )
         assert np.median(before) > 3
         assert np.median(after) < 0.4 * np.median(before)
         np.testing.assert_allclose(jnp.linalg.norm(found.splats.normals, axis=1), 1, atol=1e-12)
@@ -210,7 +265,8 @@ class Frame(eqx.Module):
 
 
 def stand_in(monkeypatch, reach: float, spoiled: float = np.inf) -> list[float]:
-    """Let a picture be the mean albedo; it outgrows plans by `reach`, and is no number where it is above `spoiled`.
+    """Let a picture be the mean albedo; it outgrows plans by `reach`, and is no number where it is
+    above `spoiled`.
 
     Gives the albedos for which plans are made.
     """
@@ -218,7 +274,9 @@ def stand_in(monkeypatch, reach: float, spoiled: float = np.inf) -> list[float]:
 
     def plans_of(scenes, cameras, settings):
         made.append(float(jnp.mean(scenes[0].splats.albedo)))
-        return [sj.Plan(DenseRasterizer(), 1, (), DenseDiffuser(), jnp.full(2, made[-1]))] * len(scenes)
+        return [sj.Plan(DenseRasterizer(), 1, (), DenseDiffuser(), jnp.full(2, made[-1]))] * len(
+            scenes
+        )
 
     def render(scene, camera, settings, plan):
         mean = jnp.mean(scene.splats.albedo)
@@ -233,7 +291,8 @@ def stand_in(monkeypatch, reach: float, spoiled: float = np.inf) -> list[float]:
 
 
 def lifted(target: float, settings, spoilt=(), **more) -> tuple[sj.FittedScene, list[str]]:
-    """Fit a stand-in that starts at 0.5; settings tell stand-ins apart that are otherwise alike to the compiler.
+    """Fit a stand-in that starts at 0.5; settings tell stand-ins apart that are otherwise alike to
+    the compiler.
 
     A part of the picture is masked, and of another part nothing is known; some rows may be spoilt.
     """
@@ -246,7 +305,15 @@ def lifted(target: float, settings, spoilt=(), **more) -> tuple[sj.FittedScene, 
     optimizer = optax.adam(optax.cosine_decay_schedule(1.0, 40))
     parts = [sj.AlbedoMap(deviation=1e3)]
     found = sj.fit_scene(
-        [seen], splats, material(), parts, optimizer, steps=40, settings=settings, progress=lambda s, loss: said.append(s), **more
+        [seen],
+        splats,
+        material(),
+        parts,
+        optimizer,
+        steps=40,
+        settings=settings,
+        progress=lambda s, loss: said.append(s),
+        **more,
     )
     return found, said
 
@@ -263,7 +330,9 @@ def test_a_scene_that_outgrows_its_plan_is_planned_anew(monkeypatch):
 
 
 def test_a_robust_loss_is_not_misled_by_rows_that_shine(monkeypatch):
-    """Two rows of fourteen: where they pull with 2 b at most, each of the others gives way by less than a deviation."""
+    """Two rows of fourteen: where they pull with 2 b at most, each of the others gives way by less
+    than a deviation.
+    """
     stand_in(monkeypatch, reach=np.inf)
     settings = sj.RenderSettings(shadows=ShadowSettings(resolution=105))
     found, _ = lifted(0.8, settings, spoilt=(8, 13), loss=sj.HuberLoss())
@@ -300,21 +369,37 @@ def test_what_cannot_be_is_refused():
 
     def fit(observations=(seen,), parts=None, splats=splats, steps=1):
         parts = [sj.AlbedoMap()] if parts is None else parts
-        return sj.fit_scene(observations, splats, material(), parts, adam, steps=steps, settings=PLAIN)
+        return sj.fit_scene(
+            observations, splats, material(), parts, adam, steps=steps, settings=PLAIN
+        )
 
-    with pytest.raises(ValueError, match="one part and one step are needed at least; got 1, 0 and 1"):
+    with pytest.raises(
+        ValueError, match="one part and one step are needed at least; got 1, 0 and 1"
+    ):
         fit(parts=())
-    with pytest.raises(ValueError, match="one part and one step are needed at least; got 0, 1 and 0"):
+    with pytest.raises(
+        ValueError, match="one part and one step are needed at least; got 0, 1 and 0"
+    ):
         fit(observations=(), steps=0)
-    with pytest.raises(ValueError, match="each kind of part may be given once; parts are AlbedoMap, AlbedoMap"):
+    with pytest.raises(
+        ValueError, match="each kind of part may be given once; parts are AlbedoMap, AlbedoMap"
+    ):
         fit(parts=(sj.AlbedoMap(), sj.AlbedoMap(step=1.0)))
-    with pytest.raises(ValueError, match=r"splats\.albedo is None, and AlbedoMap has nothing to move"):
+    with pytest.raises(
+        ValueError, match=r"splats\.albedo is None, and AlbedoMap has nothing to move"
+    ):
         fit(splats=bodies.sphere(20))
-    with pytest.raises(ValueError, match="16 splats are too few to measure slopes among; NormalOffsets needs 17"):
+    with pytest.raises(
+        ValueError, match="16 splats are too few to measure slopes among; NormalOffsets needs 17"
+    ):
         fit(splats=bodies.sphere(16), parts=(sj.NormalOffsets(0.1, 1.0, 1.0),))
-    with pytest.raises(ValueError, match=r"observations\[0\]\.picture has 3 channels, material has 2"):
+    with pytest.raises(
+        ValueError, match=r"observations\[0\]\.picture has 3 channels, material has 2"
+    ):
         fit(observations=(sj.Observation(np.ones((SIZE, SIZE, 3)), camera(), (lights()[0],)),))
-    with pytest.raises(ValueError, match=r"observations\[0\]\.intensity is UnknownColor\(\): that is for recover"):
+    with pytest.raises(
+        ValueError, match=r"observations\[0\]\.intensity is UnknownColor\(\): that is for recover"
+    ):
         fit(observations=(eqx.tree_at(lambda o: o.intensity, seen, sj.UnknownColor()),))
     with pytest.raises(ValueError, match=r"LightStrengths\.step must be positive; got 0"):
         sj.LightStrengths(step=0.0)
@@ -326,4 +411,12 @@ def test_a_picture_none_of_whose_pixels_counts_is_refused(monkeypatch):
     seen = sj.Observation(np.full((SIZE, SIZE, 2), np.nan), camera(), (lights()[0],))
     settings = sj.RenderSettings(shadows=ShadowSettings(resolution=104))
     with pytest.raises(ValueError, match=r"no pixel of observations\[0\] counts"):
-        sj.fit_scene([seen], splats, material(), [sj.AlbedoMap()], optax.adam(1.0), steps=1, settings=settings)
+        sj.fit_scene(
+            [seen],
+            splats,
+            material(),
+            [sj.AlbedoMap()],
+            optax.adam(1.0),
+            steps=1,
+            settings=settings,
+        )

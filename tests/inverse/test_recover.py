@@ -1,4 +1,6 @@
-"""Coefficients put in come back: from afar, with noise, and with lights whose strength is not known."""
+"""Coefficients put in come back: from afar, with noise, and with lights whose strength is not
+known.
+"""
 
 from functools import cache
 
@@ -10,16 +12,26 @@ import numpy as np
 import pytest
 
 import splatjax as sj
-from splatjax.diffusion import DenseDiffuser, DiffusionSettings, GatheredLight, PlainMean, resolved_share
+from splatjax.diffusion import (
+    DenseDiffuser,
+    DiffusionSettings,
+    GatheredLight,
+    PlainMean,
+    resolved_share,
+)
 from splatjax.inverse._evidence import Evidence
 from splatjax.inverse._flat import FlatPictures
 from splatjax.inverse._problem import Held, Problem, Unknowns, search, solution
 from splatjax.splatting import DenseRasterizer
 
 PLAIN = sj.RenderSettings(
-    rasterizer=DenseRasterizer(), diffuser=DenseDiffuser(), diffusion=DiffusionSettings(regular=(0.1, 0.2), scattered=(0.1, 0.2))
+    rasterizer=DenseRasterizer(),
+    diffuser=DenseDiffuser(),
+    diffusion=DiffusionSettings(regular=(0.1, 0.2), scattered=(0.1, 0.2)),
 )
-"""Next to nothing is handed to the surface: here pictures are made as they are searched, however coarse the splats."""
+"""Next to nothing is handed to the surface: here pictures are made as they are searched, however
+coarse the splats.
+"""
 SIZE = 24
 COUNT = 4
 HELD = sj.NonNegativeWeights(sj.TotalReflectanceHeld())
@@ -32,19 +44,26 @@ COMPILED = "/jax/core/compile/backend_compile_duration"
 
 
 def medium(times_a=1.0, times_s=1.0) -> sj.Medium:
-    return sj.Medium(jnp.asarray([0.01, 0.05]) * times_a, jnp.asarray([0.4, 0.7]) * times_s, jnp.full(2, 1.3))
+    return sj.Medium(
+        jnp.asarray([0.01, 0.05]) * times_a, jnp.asarray([0.4, 0.7]) * times_s, jnp.full(2, 1.3)
+    )
 
 
 STARTS = [(3, 1 / 3), (1 / 3, 3)]
 
 
 def camera() -> sj.Camera:
-    return sj.Camera.look_at(jnp.asarray([6.0, 4.0, 40.0]), jnp.zeros(3), fov=32.0, width=SIZE, height=SIZE)
+    return sj.Camera.look_at(
+        jnp.asarray([6.0, 4.0, 40.0]), jnp.zeros(3), fov=32.0, width=SIZE, height=SIZE
+    )
 
 
 def lights():
     ways = [-1.0, -0.4, -0.3], [0.8, -0.2, -0.6]
-    return [sj.DirectionalLight(jnp.asarray(way), jnp.asarray([2.0, 3.0]), cast_shadows=False) for way in ways]
+    return [
+        sj.DirectionalLight(jnp.asarray(way), jnp.asarray([2.0, 3.0]), cast_shadows=False)
+        for way in ways
+    ]
 
 
 @cache
@@ -52,21 +71,34 @@ def taken():
     """A bumpy ball, and its pictures under two lights."""
     splats = bodies.bumpy(200)
     gaussians = sj.fit_gaussians(sj.Dipole(medium()), COUNT, weights=HELD).gaussians
-    scenes = [sj.Scene(splats, (light,), sj.Material(gaussians, eta=1.3, specular=0.0)) for light in lights()]
+    scenes = [
+        sj.Scene(splats, (light,), sj.Material(gaussians, eta=1.3, specular=0.0))
+        for light in lights()
+    ]
     pictures = [sj.gather_picture(scene, camera(), PLAIN).beauty(gaussians) for scene in scenes]
-    return splats, [np.asarray(picture) * factor for picture, factor in zip(pictures, (1.0, STRONGER), strict=True)]
+    return splats, [
+        np.asarray(picture) * factor
+        for picture, factor in zip(pictures, (1.0, STRONGER), strict=True)
+    ]
 
 
 def observations(pictures, deviation=None):
     intensities = sj.KnownIntensity(), sj.UnknownIntensity()
     together = zip(pictures, lights(), intensities, strict=True)
     noise = None if deviation is None else np.full(pictures[0].shape, deviation)
-    return [sj.Observation(p, camera(), (light,), deviation=noise, intensity=how) for p, light, how in together]
+    return [
+        sj.Observation(p, camera(), (light,), deviation=noise, intensity=how)
+        for p, light, how in together
+    ]
 
 
 def recovered(pictures, starts, deviation=None, **more) -> sj.Recovery:
-    media = [jax.tree.map(lambda leaf: leaf.astype(jnp.float32), medium(*off)) for off in starts]  # as they are loaded elsewhere
-    return sj.recover(observations(pictures, deviation), taken()[0], media, count=COUNT, settings=PLAIN, **more)
+    media = [
+        jax.tree.map(lambda leaf: leaf.astype(jnp.float32), medium(*off)) for off in starts
+    ]  # as they are loaded elsewhere
+    return sj.recover(
+        observations(pictures, deviation), taken()[0], media, count=COUNT, settings=PLAIN, **more
+    )
 
 
 @cache
@@ -89,7 +121,9 @@ class TestRecover:
     def test_its_material_and_pictures_are_those_of_the_renderer(self):
         found, (splats, pictures) = without_noise(), taken()
         scene = sj.Scene(splats, (lights()[0],), found.material)
-        again = np.asarray(sj.gather_picture(scene, camera(), PLAIN).beauty(found.material.gaussians))
+        again = np.asarray(
+            sj.gather_picture(scene, camera(), PLAIN).beauty(found.material.gaussians)
+        )
         counted = np.isfinite(found.pictures[0])
         assert 0.3 < np.mean(counted) < 0.9
         np.testing.assert_allclose(found.pictures[0][counted], again[counted], rtol=1e-6)
@@ -108,7 +142,10 @@ class TestRecover:
         for draw in range(8):
             noisy = [picture + deviation * rng.normal(size=picture.shape) for picture in truth]
             found = recovered(noisy, STARTS, deviation)
-            pairs = (found.medium.sigma_a, medium().sigma_a), (found.medium.sigma_s_prime, medium().sigma_s_prime)
+            pairs = (
+                (found.medium.sigma_a, medium().sigma_a),
+                (found.medium.sigma_s_prime, medium().sigma_s_prime),
+            )
             off = np.stack([np.log(np.asarray(a) / np.asarray(b)) for a, b in pairs])
             bars.append(np.stack(found.relative_errors()))
             noise = np.stack(found.noise_errors())
@@ -134,24 +171,39 @@ class TestRecover:
 
         def off(loss):
             found = recovered(spoiled, STARTS[:1], deviation, loss=loss, throw=False)
-            pairs = (found.medium.sigma_a, medium().sigma_a), (found.medium.sigma_s_prime, medium().sigma_s_prime)
+            pairs = (
+                (found.medium.sigma_a, medium().sigma_a),
+                (found.medium.sigma_s_prime, medium().sigma_s_prime),
+            )
             return np.max([np.abs(np.log(np.asarray(a) / np.asarray(b))) for a, b in pairs])
 
         assert off(sj.SquaredLoss()) > 0.5
         assert off(sj.HuberLoss()) < 0.05
 
     @pytest.mark.long
-    def test_one_picture_of_unknown_strength_does_not_fix_both_coefficients_and_a_second_one_does(self):
+    def test_one_picture_of_unknown_strength_does_not_fix_both_coefficients_and_a_second_one_does(
+        self,
+    ):
         noise = 2.5 * NOISE
         (_, alone), splats = observations(taken()[1], noise), taken()[0]
         found = sj.recover([alone], splats, medium(1.5, 0.7), count=COUNT, settings=PLAIN)
         assert not found.is_fixed()
         assert "not fixed by these pictures" in found.words()
-        dot = sj.GaussianBeam(camera().position, -camera().position, jnp.full(2, 20.0), jnp.asarray(2.0))
-        candidates = [sj.Candidate("lamp", camera(), (lights()[0],)), sj.Candidate("dot", camera(), (dot,))]
+        dot = sj.GaussianBeam(
+            camera().position, -camera().position, jnp.full(2, 20.0), jnp.asarray(2.0)
+        )
+        candidates = [
+            sj.Candidate("lamp", camera(), (lights()[0],)),
+            sj.Candidate("dot", camera(), (dot,)),
+        ]
         first, second = sj.next_pictures(found, splats, candidates, settings=PLAIN)
         assert {first.candidate.name, second.candidate.name} == {"lamp", "dot"}
-        assert first.worst.deviation < second.worst.deviation < 0.1 < found.combinations()[0][1].deviation
+        assert (
+            first.worst.deviation
+            < second.worst.deviation
+            < 0.1
+            < found.combinations()[0][1].deviation
+        )
         both = recovered(taken()[1], STARTS[:1], noise)
         assert both.is_fixed()
         assert "not fixed" not in both.words()
@@ -164,7 +216,9 @@ class TestRecover:
         found, (splats, _) = without_noise(), taken()
         candidates = [
             sj.Candidate("as before", camera(), (lights()[0],)),
-            sj.Candidate("as before, of unknown color", camera(), (lights()[0],), sj.UnknownColor()),
+            sj.Candidate(
+                "as before, of unknown color", camera(), (lights()[0],), sj.UnknownColor()
+            ),
         ]
         first, second = sj.next_pictures(found, splats, candidates, settings=PLAIN)
         assert first.candidate.name == "as before"  # its light's strength is known
@@ -174,7 +228,9 @@ class TestRecover:
 
 
 def half_resolved() -> Problem:
-    """Made up layers at 40 points, of which the narrower ones are handed to the surface in part; nothing is observed yet."""
+    """Made up layers at 40 points, of which the narrower ones are handed to the surface in part;
+    nothing is observed yet.
+    """
     rng, points = np.random.default_rng(6), 40
     light = GatheredLight(
         variances=jnp.asarray([1.5, 2.5, 9.0]),
@@ -189,39 +245,56 @@ def half_resolved() -> Problem:
     )
     there = jnp.zeros(points, jnp.int32)
     flat = FlatPictures(light, jnp.ones((2, points)), jnp.zeros((2, points)), there[:0], there)
-    noise, unknowns = jnp.full((2, points), 0.01), Unknowns(medium().eta, jnp.zeros((1, 2), jnp.int32))
-    return Problem(flat, noise, noise, unknowns, Held(light.variances), sj.SquaredLoss(), HELD, sj.Dipole)
+    noise, unknowns = (
+        jnp.full((2, points), 0.01),
+        Unknowns(medium().eta, jnp.zeros((1, 2), jnp.int32)),
+    )
+    return Problem(
+        flat, noise, noise, unknowns, Held(light.variances), sj.SquaredLoss(), HELD, sj.Dipole
+    )
 
 
 @pytest.mark.once
 @pytest.mark.usefixtures("double")
 class TestHandover:
     def test_each_channel_has_a_width_of_its_own(self):
-        """Information of it: squares of how residuals change with it, and nothing from one channel to the other."""
+        """Information of it: squares of how residuals change with it, and nothing from one channel
+        to the other.
+        """
         problem, step = half_resolved(), 1e-5
         point = problem.unknowns.start(medium(), 0)
 
         @jax.jit
         def at(by):
             wider = problem.pictures.light.interval * jnp.exp(by)
-            return eqx.tree_at(lambda its: its.pictures.light.interval, problem, wider).residuals(point)
+            return eqx.tree_at(lambda its: its.pictures.light.interval, problem, wider).residuals(
+                point
+            )
 
         slopes = (at(step) - at(-step)) / (2 * step)
         told = solution(problem, point).information
         assert told.shape == (6, 6)
-        np.testing.assert_allclose(told[4:, 4:], np.diag(jnp.sum(slopes**2, axis=1)), rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(
+            told[4:, 4:], np.diag(jnp.sum(slopes**2, axis=1)), rtol=1e-6, atol=1e-6
+        )
         assert float(jnp.min(jnp.diagonal(told)[4:])) > 1
 
     def test_a_search_goes_astray_with_the_width_as_its_bars_say(self):
         """The picture of a width a little off, searched as if it were not."""
         problem, by = half_resolved(), 0.01
         point = problem.unknowns.start(medium(), 0)
-        wider = eqx.tree_at(lambda its: its.pictures.light.interval, problem, problem.pictures.light.interval * np.exp(by))
+        wider = eqx.tree_at(
+            lambda its: its.pictures.light.interval,
+            problem,
+            problem.pictures.light.interval * np.exp(by),
+        )
         seen = eqx.tree_at(lambda its: its.observed, problem, wider.radiance(point))
         told = np.asarray(solution(problem, point).information)
         expected = -np.linalg.inv(told[:4, :4]) @ told[:4, 4:] @ np.full(2, -by)
         assert np.max(np.abs(expected)) > 1e-3
-        np.testing.assert_allclose(search(seen, point).point - point, expected, atol=0.05 * np.max(np.abs(expected)))
+        np.testing.assert_allclose(
+            search(seen, point).point - point, expected, atol=0.05 * np.max(np.abs(expected))
+        )
 
     def test_light_in_layers_that_the_splats_do_not_carry_is_counted(self):
         problem = half_resolved()
@@ -249,7 +322,12 @@ def test_pixels_that_are_masked_unknown_or_not_filled_do_not_count():
 def test_the_smooth_loss_bends():
     loss = sj.HuberLoss(2.0)
     r = jnp.asarray([-1e3, -3.0, 0.0, 1e-3, 3.0])
-    np.testing.assert_allclose(loss.root(r) ** 2, 2 * 4 * (np.sqrt(1 + np.asarray(r, float) ** 2 / 4) - 1), rtol=1e-3, atol=1e-9)
+    np.testing.assert_allclose(
+        loss.root(r) ** 2,
+        2 * 4 * (np.sqrt(1 + np.asarray(r, float) ** 2 / 4) - 1),
+        rtol=1e-3,
+        atol=1e-9,
+    )
     np.testing.assert_allclose(loss.root(r[3]) / r[3], 1.0, rtol=1e-6)
     assert float(loss.root(r)[0]) < 0
     with pytest.raises(ValueError, match="bend must be positive"):
@@ -265,11 +343,19 @@ def test_what_cannot_be_is_refused():
         sj.Observation(picture[:12], camera(), light)
     with pytest.raises(ValueError, match="deviation must be positive; its least is 0"):
         sj.Observation(picture, camera(), light, deviation=0 * picture)
-    with pytest.raises(ValueError, match="one observation and one start are needed at least; got 0 and 1"):
+    with pytest.raises(
+        ValueError, match="one observation and one start are needed at least; got 0 and 1"
+    ):
         sj.recover([], splats, medium())
     with pytest.raises(ValueError, match=r"starts\[1\]\.eta is .*: it is known, hence one"):
-        sj.recover([seen], splats, [medium(), sj.Medium(medium().sigma_a, medium().sigma_a, jnp.full(2, 1.5))])
+        sj.recover(
+            [seen],
+            splats,
+            [medium(), sj.Medium(medium().sigma_a, medium().sigma_a, jnp.full(2, 1.5))],
+        )
     with pytest.raises(ValueError, match=r"starts\[0\]\.sigma_a is .*: logarithms are searched"):
         sj.recover([seen], splats, medium(times_a=0.0))
-    with pytest.raises(ValueError, match=r"observations\[0\]\.picture has 3 channels, starts have 2"):
+    with pytest.raises(
+        ValueError, match=r"observations\[0\]\.picture has 3 channels, starts have 2"
+    ):
         sj.recover([sj.Observation(np.ones((SIZE, SIZE, 3)), camera(), light)], splats, medium())

@@ -15,7 +15,9 @@ from splatjax.inverse._parts import Shot, rotation
 def test_a_rotation_is_that_of_its_vector(length, x64):
     vector = length * np.asarray([2.0, -1.0, 2.0]) / 3
     found = jax.jit(rotation)(jnp.asarray(vector))
-    np.testing.assert_allclose(found, Rotation.from_rotvec(vector).as_matrix(), atol=1e-14 if x64 else 1e-6)
+    np.testing.assert_allclose(
+        found, Rotation.from_rotvec(vector).as_matrix(), atol=1e-14 if x64 else 1e-6
+    )
 
 
 def test_a_rotation_has_a_derivative_where_there_is_none():
@@ -29,7 +31,12 @@ def test_lights_move_each_in_its_own_way():
     camera = sj.Camera.look_at(jnp.asarray([0.0, 0.0, 9.0]), jnp.zeros(3), width=4, height=4)
     lights = (
         sj.PointLight(jnp.asarray([1.0, 2.0, 3.0]), jnp.asarray([4.0, 5.0])),
-        sj.GaussianBeam(jnp.asarray([1.0, 2.0, 3.0]), jnp.asarray([0.0, 0.0, -2.0]), jnp.asarray([4.0, 5.0]), jnp.asarray(1.0)),
+        sj.GaussianBeam(
+            jnp.asarray([1.0, 2.0, 3.0]),
+            jnp.asarray([0.0, 0.0, -2.0]),
+            jnp.asarray([4.0, 5.0]),
+            jnp.asarray(1.0),
+        ),
     )
     shot, middle = Shot(camera, lights), jnp.zeros(3)
     places, strengths = sj.LightPlaces(turn=0.1, shift=2.0), sj.LightStrengths(step=0.5)
@@ -37,7 +44,9 @@ def test_lights_move_each_in_its_own_way():
     lamp, beam = places.moved(shot, x, middle).lights
     np.testing.assert_allclose(lamp.position, [3, 4, 5])
     np.testing.assert_allclose(beam.origin, [3, 4, 5])
-    np.testing.assert_allclose(beam.direction, Rotation.from_rotvec([0.1, 0.1, 0.1]).apply([0, 0, -2]), rtol=1e-5)
+    np.testing.assert_allclose(
+        beam.direction, Rotation.from_rotvec([0.1, 0.1, 0.1]).apply([0, 0, -2]), rtol=1e-5
+    )
     x = (jnp.asarray([0.0, 1.0]), jnp.asarray([2.0, 0.0]))
     lamp, beam = strengths.moved(shot, x, middle).lights
     np.testing.assert_allclose(lamp.intensity, [4, 5 * np.exp(0.5)], rtol=1e-6)
@@ -46,7 +55,9 @@ def test_lights_move_each_in_its_own_way():
 
 def test_a_camera_turns_around_the_body():
     """The middle stays where it was in the picture, and as far away."""
-    camera = sj.Camera.look_at(jnp.asarray([3.0, 0.0, 9.0]), jnp.asarray([1.0, 1.0, 0.0]), width=4, height=4)
+    camera = sj.Camera.look_at(
+        jnp.asarray([3.0, 0.0, 9.0]), jnp.asarray([1.0, 1.0, 0.0]), width=4, height=4
+    )
     middle, part = jnp.asarray([0.5, -1.0, 0.3]), sj.CameraPoses(turn=0.2, shift=0.5)
 
     def place(shot):
@@ -73,7 +84,9 @@ def test_an_albedo_stays_between_0_and_1():
         if by == 0:
             np.testing.assert_allclose(moved[1:-1], albedo[1:-1], rtol=1e-4)
     np.testing.assert_allclose(
-        part.moved(splats, jnp.ones((20, 2)), None).albedo[10, 0], 1 / (1 + (19 / 20) * np.exp(-0.5)), rtol=1e-5
+        part.moved(splats, jnp.ones((20, 2)), None).albedo[10, 0],
+        1 / (1 + (19 / 20) * np.exp(-0.5)),
+        rtol=1e-5,
     )
 
 
@@ -111,7 +124,9 @@ def test_a_ball_that_grows_stays_a_ball():
 
 def test_offsets_are_means_of_coordinates_over_the_same_side_of_a_sheet():
     near, far = flat(), flat()
-    behind = sj.Splats(far.centers - jnp.asarray([[0.0, 0.0, 0.2]]), -far.normals, far.radii, far.areas)
+    behind = sj.Splats(
+        far.centers - jnp.asarray([[0.0, 0.0, 0.2]]), -far.normals, far.radii, far.areas
+    )
     both = bodies.joined(near, behind)
     part = sj.NormalOffsets(step=0.1, smoothness=1.0, deviation=0.3)
     tables = part.prepared(both)
@@ -124,6 +139,10 @@ def test_offsets_are_means_of_coordinates_over_the_same_side_of_a_sheet():
     np.testing.assert_allclose(moved.normals[near.count :], behind.normals, atol=1e-6)
     # The prior: coordinates that make offsets of its deviation cost one each.
     noise = np.random.default_rng(4).normal(size=both.count)
-    offsets = np.asarray(part.moved(both, jnp.asarray(noise, float), tables).centers[:, 2] - both.centers[:, 2])
+    offsets = np.asarray(
+        part.moved(both, jnp.asarray(noise, float), tables).centers[:, 2] - both.centers[:, 2]
+    )
     expected = both.count * (np.sqrt(np.mean(offsets**2)) / 0.3) ** 2
-    np.testing.assert_allclose(part.unlikely(jnp.asarray(noise, float), tables), expected, rtol=0.15)
+    np.testing.assert_allclose(
+        part.unlikely(jnp.asarray(noise, float), tables), expected, rtol=0.15
+    )

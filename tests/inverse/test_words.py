@@ -10,12 +10,18 @@ import splatjax as sj
 from splatjax.inverse import Recovery
 
 
-def recovery(information, chi_squared=1.0, noise_is_known=True, channels=1, unresolved=0.0, handover=None) -> Recovery:
-    """A recovery of which nothing is known but this; no layer is handed to the surface, unless told how that is mixed in."""
+def recovery(
+    information, chi_squared=1.0, noise_is_known=True, channels=1, unresolved=0.0, handover=None
+) -> Recovery:
+    """A recovery of which nothing is known but this; no layer is handed to the surface, unless told
+    how that is mixed in.
+    """
     if handover is None:
         information = np.pad(information, (0, channels))
     else:
-        information = np.block([[information, np.asarray(handover)[:-1, None]], [np.asarray(handover)[None]]])
+        information = np.block(
+            [[information, np.asarray(handover)[:-1, None]], [np.asarray(handover)[None]]]
+        )
     medium = sj.Medium(jnp.full(channels, 0.02), jnp.full(channels, 1.5), jnp.full(channels, 1.3))
     gaussians = sj.SumOfGaussians(jnp.ones(1), jnp.full((1, channels), 0.5))
     return Recovery(
@@ -38,7 +44,9 @@ def recovery(information, chi_squared=1.0, noise_is_known=True, channels=1, unre
 
 
 def along(best: float, worst: float, angle: float) -> np.ndarray:
-    """Information of a medium whose best known combination lies at an angle to the axis of sigma_a."""
+    """Information of a medium whose best known combination lies at an angle to the axis of
+    sigma_a.
+    """
     axes = np.asarray([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     return axes @ np.diag([best**-2, worst**-2]) @ axes.T
 
@@ -52,8 +60,13 @@ def test_what_is_not_fixed_is_said():
     np.testing.assert_allclose(worst.powers, (1, 1), rtol=1e-3)
     assert not found.is_fixed()
     said = found.words(["red"])
-    assert "not fixed by these pictures: sigma_a sigma_s', known to 50%; what they fix is sigma_a / sigma_s', to 1%" in said
-    np.testing.assert_allclose(found.relative_errors(), np.full((2, 1), np.sqrt((0.01**2 + 0.5**2) / 2)), rtol=1e-4)
+    assert (
+        "not fixed by these pictures: sigma_a sigma_s', known to 50%; what they fix is sigma_a / "
+        "sigma_s', to 1%" in said
+    )
+    np.testing.assert_allclose(
+        found.relative_errors(), np.full((2, 1), np.sqrt((0.01**2 + 0.5**2) / 2)), rtol=1e-4
+    )
 
 
 def test_shares_of_one_and_more_are_written_out():
@@ -77,7 +90,9 @@ def test_light_that_spreads_less_than_the_splats_are_apart_is_told():
 
 
 def test_what_only_the_handover_tells_is_known_no_better_than_the_handover():
-    """The mean free path changes the picture as the width of the handover does, the other way round: they are told together."""
+    """The mean free path changes the picture as the width of the handover does, the other way
+    round: they are told together.
+    """
     own, path = along(1e-3, 1e-2, -np.pi / 4), np.asarray([1, 1]) / np.sqrt(2)
     along_path = path @ own @ path
     mixed = np.append(-along_path * path, along_path)
@@ -88,11 +103,15 @@ def test_what_only_the_handover_tells_is_known_no_better_than_the_handover():
     assert not found.is_fixed()
     assert "not fixed by these pictures: sigma_a sigma_s', known to 35%" in found.words()
     np.testing.assert_allclose(found.noise_errors(), recovery(own).relative_errors(), rtol=1e-6)
-    np.testing.assert_allclose(found.noise_errors(), np.full((2, 1), np.sqrt((1e-6 + 1e-4) / 2)), rtol=1e-3)
+    np.testing.assert_allclose(
+        found.noise_errors(), np.full((2, 1), np.sqrt((1e-6 + 1e-4) / 2)), rtol=1e-3
+    )
 
 
 def test_a_picture_without_a_handover_makes_up_for_one_with_as_far_as_it_weighs():
-    """A search weighs pixels by their noise, whatever the handover does to them: a weak close picture changes little."""
+    """A search weighs pixels by their noise, whatever the handover does to them: a weak close
+    picture changes little.
+    """
     own, path = along(1e-3, 1e-2, -np.pi / 4), np.asarray([1, 1]) / np.sqrt(2)
     weighs = path @ own @ path
     found = recovery(own, handover=np.append(-weighs * path, weighs))
@@ -100,7 +119,9 @@ def test_a_picture_without_a_handover_makes_up_for_one_with_as_far_as_it_weighs(
         close = np.pad(along(deviation, deviation, 0.0), (0, 1))
         share = weighs / (weighs + deviation**-2)
         expected = np.hypot(0.5 * np.log(2) * share, 1 / np.sqrt(weighs + deviation**-2))
-        np.testing.assert_allclose(np.sqrt(np.linalg.eigvalsh(found.covariance(close)[0])[-1]), expected, rtol=1e-4)
+        np.testing.assert_allclose(
+            np.sqrt(np.linalg.eigvalsh(found.covariance(close)[0])[-1]), expected, rtol=1e-4
+        )
 
 
 def test_without_noise_given_the_bars_are_those_of_what_is_left():
@@ -128,7 +149,9 @@ def test_a_suggestion_needs_candidates():
         sj.next_pictures(recovery(np.eye(2)), splats, [])
 
 
-@pytest.mark.parametrize("information", [np.zeros((2, 2)), np.full((2, 2), np.nan), np.diag([4.0, 0.0])])
+@pytest.mark.parametrize(
+    "information", [np.zeros((2, 2)), np.full((2, 2), np.nan), np.diag([4.0, 0.0])]
+)
 def test_nothing_known_is_nothing_known(information):
     found = recovery(information)
     assert not found.is_fixed()
@@ -145,11 +168,18 @@ def test_what_is_combined_is_the_mean_by_what_each_knows():
     assert found.is_fixed()
     assert not ratio.is_fixed()
     known = [np.linalg.inv(each.covariance()[0]) for each in (ratio, path)]
-    points = [np.log([float(each.medium.sigma_a[0]), float(each.medium.sigma_s_prime[0])]) for each in (ratio, path)]
+    points = [
+        np.log([float(each.medium.sigma_a[0]), float(each.medium.sigma_s_prime[0])])
+        for each in (ratio, path)
+    ]
     expected = np.linalg.solve(known[0] + known[1], known[0] @ points[0] + known[1] @ points[1])
-    np.testing.assert_allclose(np.log([found.medium.sigma_a[0], found.medium.sigma_s_prime[0]]), expected, rtol=1e-5)
+    np.testing.assert_allclose(
+        np.log([found.medium.sigma_a[0], found.medium.sigma_s_prime[0]]), expected, rtol=1e-5
+    )
     np.testing.assert_allclose(found.covariance[0], np.linalg.inv(known[0] + known[1]), rtol=1e-4)
-    np.testing.assert_allclose(sj.combined([path, ratio]).medium.sigma_a, found.medium.sigma_a, rtol=1e-6)
+    np.testing.assert_allclose(
+        sj.combined([path, ratio]).medium.sigma_a, found.medium.sigma_a, rtol=1e-6
+    )
     assert "not fixed" not in found.words()
 
 
@@ -157,7 +187,9 @@ def test_one_alone_stays_what_it_is_and_one_that_knows_nothing_adds_nothing():
     known, nothing = recovery(along(0.01, 0.5, -np.pi / 4)), recovery(np.zeros((2, 2)))
     for given in ([known], [known, nothing]):
         found = sj.combined(given)
-        np.testing.assert_allclose(found.medium.sigma_s_prime, known.medium.sigma_s_prime, rtol=1e-5)
+        np.testing.assert_allclose(
+            found.medium.sigma_s_prime, known.medium.sigma_s_prime, rtol=1e-5
+        )
         np.testing.assert_allclose(found.relative_errors(), known.relative_errors(), rtol=1e-4)
         assert found.words() == known.words()
     found = sj.combined([nothing, nothing])
@@ -167,9 +199,17 @@ def test_one_alone_stays_what_it_is_and_one_that_knows_nothing_adds_nothing():
 
 def test_a_model_that_leaves_much_counts_for_less():
     info = along(0.01, 0.02, 0.3)
-    good, bad, unknown = recovery(info), recovery(info, chi_squared=9.0), recovery(info, chi_squared=9.0, noise_is_known=False)
-    np.testing.assert_allclose(sj.combined([bad]).relative_errors(), 3 * np.asarray(good.relative_errors()), rtol=1e-6)
-    np.testing.assert_allclose(sj.combined([unknown]).relative_errors(), unknown.relative_errors(), rtol=1e-6)
+    good, bad, unknown = (
+        recovery(info),
+        recovery(info, chi_squared=9.0),
+        recovery(info, chi_squared=9.0, noise_is_known=False),
+    )
+    np.testing.assert_allclose(
+        sj.combined([bad]).relative_errors(), 3 * np.asarray(good.relative_errors()), rtol=1e-6
+    )
+    np.testing.assert_allclose(
+        sj.combined([unknown]).relative_errors(), unknown.relative_errors(), rtol=1e-6
+    )
 
 
 def test_what_does_not_belong_together_is_refused():

@@ -14,7 +14,15 @@ import pytest
 from test_pictures import some_frame
 
 from splatjax.geometry import complete_splats
-from splatjax.io import atomic_path, load_material, save_material, write_exr, write_png, write_record, write_splats
+from splatjax.io import (
+    atomic_path,
+    load_material,
+    save_material,
+    write_exr,
+    write_png,
+    write_record,
+    write_splats,
+)
 
 
 def test_file_takes_its_name_when_the_block_ends_well(tmp_path):
@@ -45,7 +53,10 @@ def test_failure_leaves_what_stood_there_before(tmp_path):
 
 def test_missing_folder_is_named_with_the_remedy(tmp_path):
     target = tmp_path / "nowhere" / "a.txt"
-    with pytest.raises(FileNotFoundError, match="nowhere does not exist; make it first"), atomic_path(target):
+    with (
+        pytest.raises(FileNotFoundError, match="nowhere does not exist; make it first"),
+        atomic_path(target),
+    ):
         pass
 
 
@@ -53,14 +64,21 @@ def test_a_folder_is_no_file(tmp_path):
     with pytest.raises(IsADirectoryError, match="name a file"), atomic_path(tmp_path):
         pass
     (tmp_path / "file").write_text("")
-    with pytest.raises(NotADirectoryError, match="is a file"), atomic_path(tmp_path / "file" / "a.txt"):
+    with (
+        pytest.raises(NotADirectoryError, match="is a file"),
+        atomic_path(tmp_path / "file" / "a.txt"),
+    ):
         pass
 
 
 def test_what_a_kill_left_behind_goes_when_the_file_is_written_next(tmp_path):
-    """A process that holds its temporary file keeps it; those of other files, and whatever else lies there, stay."""
+    """A process that holds its temporary file keeps it; those of other files, and whatever else
+    lies there, stay.
+    """
     target = tmp_path / "a.txt"
-    left, other, alike = (tmp_path / name for name in (".a-0123abcd.txt", ".b-0123abcd.txt", ".a-0123abcx.txt"))
+    left, other, alike = (
+        tmp_path / name for name in (".a-0123abcd.txt", ".b-0123abcd.txt", ".a-0123abcx.txt")
+    )
     for path in (left, other, alike):
         path.write_text("half")
     with atomic_path(target) as first:
@@ -85,7 +103,10 @@ with atomic_path(sys.argv[1]) as temporary:
 def test_a_kill_leaves_the_file_that_stood_there(tmp_path):
     target = tmp_path / "a.txt"
     target.write_text("before")
-    assert subprocess.run([sys.executable, "-c", KILLED, str(target)], check=False).returncode == -signal.SIGKILL
+    assert (
+        subprocess.run([sys.executable, "-c", KILLED, str(target)], check=False).returncode
+        == -signal.SIGKILL
+    )
     assert target.read_text() == "before"
     assert len(list(tmp_path.iterdir())) == 2
     with atomic_path(target) as temporary:
@@ -96,8 +117,12 @@ def test_a_kill_leaves_the_file_that_stood_there(tmp_path):
 WRITERS = {
     "a.exr": lambda path: write_exr(path, some_frame(height=40, width=40)),
     "a.png": lambda path: write_png(path, np.random.default_rng(0).uniform(size=(60, 60, 3))),
-    "a.ply": lambda path: write_splats(path, complete_splats(np.random.default_rng(0).normal(size=(400, 3)))),
-    "a.toml": lambda path: save_material(load_material("skin"), path, source={"citation": 9000 * "x"}),
+    "a.ply": lambda path: write_splats(
+        path, complete_splats(np.random.default_rng(0).normal(size=(400, 3)))
+    ),
+    "a.toml": lambda path: save_material(
+        load_material("skin"), path, source={"citation": 9000 * "x"}
+    ),
     "a.json": lambda path: write_record(path, {"x": 9000 * "x"}),
 }
 
@@ -115,7 +140,9 @@ def small_files():
 def test_a_full_disk_leaves_what_stood_there_and_no_litter(tmp_path, name, small_files):
     target = tmp_path / name
     target.write_text("before")
-    with pytest.raises(OSError, match=r"cannot be written: .*what stood there before is untouched") as caught:
+    with pytest.raises(
+        OSError, match=r"cannot be written: .*what stood there before is untouched"
+    ) as caught:
         WRITERS[name](target)
     assert caught.value.filename == str(target)
     assert target.read_text() == "before"
@@ -124,7 +151,9 @@ def test_a_full_disk_leaves_what_stood_there_and_no_litter(tmp_path, name, small
 
 @pytest.fixture
 def read_only():
-    """A folder that may be read and not written to, by root neither: it becomes nobody for a while."""
+    """A folder that may be read and not written to, by root neither: it becomes nobody for a
+    while.
+    """
     folder = Path(tempfile.mkdtemp())
     (folder / "before").write_text("before")
     folder.chmod(0o555)
@@ -156,15 +185,22 @@ def test_a_read_only_folder_is_said(read_only):
 
 @pytest.mark.once
 def test_killed_at_any_moment():
-    """Writers of every kind, and a turntable that goes on afterwards; `python tools/kill_writers.py` does it fifty times."""
+    """Writers of every kind, and a turntable that goes on afterwards; `python
+    tools/kill_writers.py` does it fifty times.
+    """
     tool = Path(__file__).parent.parent.parent / "tools" / "kill_writers.py"
-    done = subprocess.run([sys.executable, str(tool), "3"], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, str(tool), "3"], capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stdout + done.stderr
     assert done.stdout.count("3 kills") == 6
 
 
 def test_processes_that_write_the_same_file_do_not_remove_what_others_write(tmp_path):
-    write = "import sys\nfrom splatjax.io import write_record\nfor i in range(150): write_record(sys.argv[1], {'i': i})"
+    write = (
+        "import sys\nfrom splatjax.io import write_record\nfor i in range(150): "
+        "write_record(sys.argv[1], {'i': i})"
+    )
     words = [sys.executable, "-c", write, str(tmp_path / "same.json")]
     writers = [subprocess.Popen(words, stderr=subprocess.PIPE, text=True) for _ in range(3)]
     said = [writer.communicate(timeout=300)[1] for writer in writers]

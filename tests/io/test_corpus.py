@@ -1,4 +1,6 @@
-"""Files that fuzzing found (tools/fuzz.py): once they stopped a reader, now they are read or refused in one sentence."""
+"""Files that fuzzing found (tools/fuzz.py): once they stopped a reader, now they are read or
+refused in one sentence.
+"""
 
 import importlib.util
 import random
@@ -29,7 +31,10 @@ def tool():
 @pytest.mark.parametrize("path", FILES, ids=lambda path: f"{path.parent.name}-{path.stem}")
 def test_what_was_found_is_read_or_refused(path, tmp_path):
     copied = shutil.copy(path, tmp_path)
-    assert tool().try_input(tool().DOORS[path.parent.name], Path(copied), SLOW) in ("read", "refused")
+    assert tool().try_input(tool().DOORS[path.parent.name], Path(copied), SLOW) in (
+        "read",
+        "refused",
+    )
 
 
 def test_every_reader_takes_its_seeds_and_refuses_some_spoilt_ones(tmp_path):

@@ -9,7 +9,14 @@ import numpy as np
 import pytest
 
 from splatjax.gaussians import SumOfGaussians
-from splatjax.io import load_material, load_medium, load_profile, materials, profiles_folder, save_material
+from splatjax.io import (
+    load_material,
+    load_medium,
+    load_profile,
+    materials,
+    profiles_folder,
+    save_material,
+)
 from splatjax.scattering import Dipole, Film, Layer, LayeredMultipole, Medium
 from splatjax.scene import Material
 
@@ -35,10 +42,16 @@ def tool():
 
 
 def test_jensens_and_narasimhans_media_and_skin_are_shipped():
-    jensen = "apple chicken1 chicken2 cream ketchup marble potato skimmilk skin1 skin2 spectralon wholemilk"
-    narasimhan = """cappuccino_powder espresso lemon_tea_powder lowfat_chocolate_milk lowfat_milk lowfat_soy_milk reduced_milk
+    jensen = (
+        "apple chicken1 chicken2 cream ketchup marble potato skimmilk skin1 skin2 "
+        "spectralon wholemilk"
+    )
+    narasimhan = """cappuccino_powder espresso lemon_tea_powder lowfat_chocolate_milk lowfat_milk
+        lowfat_soy_milk reduced_milk
         regular_chocolate_milk regular_milk regular_soy_milk shampoo white_grapefruit_juice"""
-    assert materials() == tuple(sorted([*jensen.split(), *narasimhan.split(), "marble_gems", "skin", "skin_layers"]))
+    assert materials() == tuple(
+        sorted([*jensen.split(), *narasimhan.split(), "marble_gems", "skin", "skin_layers"])
+    )
 
 
 def test_coefficients_are_those_published():
@@ -67,7 +80,9 @@ def test_skin_is_as_published():
     np.testing.assert_allclose(skin.gaussians.total_reflectance(), 1.0, rtol=1e-6)
     mean_squared_radius = 2 * skin.gaussians.variances @ skin.gaussians.weights
     np.testing.assert_allclose(mean_squared_radius, [2.7657, 0.13626, 0.049544], rtol=1e-4)
-    np.testing.assert_allclose([skin.eta, skin.roughness, skin.specular], [1.4, 0.3, 0.18], rtol=1e-6)
+    np.testing.assert_allclose(
+        [skin.eta, skin.roughness, skin.specular], [1.4, 0.3, 0.18], rtol=1e-6
+    )
     with pytest.raises(ValueError, match=r"skin.toml: has no \[medium\]"):
         load_medium("skin")
 
@@ -76,7 +91,9 @@ def test_skin_is_as_published():
 def test_shipped_weights_are_not_negative_and_sum_to_the_total_reflectance(name):
     gaussians = load_material(name).gaussians
     assert np.all(gaussians.weights >= 0)
-    np.testing.assert_allclose(gaussians.total_reflectance(), load_profile(name).total_reflectance(), atol=HELD)
+    np.testing.assert_allclose(
+        gaussians.total_reflectance(), load_profile(name).total_reflectance(), atol=HELD
+    )
 
 
 @pytest.mark.once
@@ -87,22 +104,41 @@ def test_shipped_fits_are_reproduced():
         fitted = tool().fit_material(name)
         with jax.enable_x64(True):
             shipped = load_material(name).gaussians
-        np.testing.assert_allclose(fitted.gaussians.variances, shipped.variances, rtol=REPRODUCED, err_msg=name)
-        np.testing.assert_allclose(fitted.gaussians.weights, shipped.weights, rtol=REPRODUCED, atol=REPRODUCED, err_msg=name)
+        np.testing.assert_allclose(
+            fitted.gaussians.variances, shipped.variances, rtol=REPRODUCED, err_msg=name
+        )
+        np.testing.assert_allclose(
+            fitted.gaussians.weights,
+            shipped.weights,
+            rtol=REPRODUCED,
+            atol=REPRODUCED,
+            err_msg=name,
+        )
 
 
 def test_a_saved_material_comes_back_bit_for_bit(dtype, tmp_path):
     import colour  # noqa: F401  It makes NumPy print six digits.
 
     weights = jnp.asarray([[1 / 3, 1e-9], [0.1, -0.2]], dtype)
-    material = Material(SumOfGaussians(jnp.asarray([1e-5, 2 / 3], dtype), weights), eta=1.37, specular=0.1, roughness=1.0)
+    material = Material(
+        SumOfGaussians(jnp.asarray([1e-5, 2 / 3], dtype), weights),
+        eta=1.37,
+        specular=0.1,
+        roughness=1.0,
+    )
     medium = Medium(*(jnp.asarray(x, dtype) for x in ([0.0, 1 / 7], [1.0, 1e5], [1.3, 1.1])))
     path = tmp_path / "mine.toml"
     save_material(
-        material, path, profile=Dipole(medium), source={"citation": 'Me, "2024"'}, fit={"error": [0.1, 0.2], "count": 2}
+        material,
+        path,
+        profile=Dipole(medium),
+        source={"citation": 'Me, "2024"'},
+        fit={"error": [0.1, 0.2], "count": 2},
     )
     for ours, theirs in zip(
-        jax.tree.leaves((material, medium)), jax.tree.leaves((load_material(path), load_medium(path))), strict=True
+        jax.tree.leaves((material, medium)),
+        jax.tree.leaves((load_material(path), load_medium(path))),
+        strict=True,
     ):
         np.testing.assert_array_equal(ours, theirs)
     assert [file.name for file in tmp_path.iterdir()] == ["mine.toml"]
@@ -121,7 +157,9 @@ def test_saved_layers_come_back_bit_for_bit(dtype, tmp_path):
     material = Material(SumOfGaussians(jnp.ones(1, dtype), jnp.ones((1, 1), dtype)))
     path = tmp_path / "stack.toml"
     save_material(material, path, profile=stack)
-    for ours, theirs in zip(jax.tree.leaves(stack), jax.tree.leaves(load_profile(path)), strict=True):
+    for ours, theirs in zip(
+        jax.tree.leaves(stack), jax.tree.leaves(load_profile(path)), strict=True
+    ):
         np.testing.assert_array_equal(ours, theirs)
     assert 'profile = "multipole of 3 layers, exact Fresnel moments"' in path.read_text()
     with pytest.raises(ValueError, match=r"has no \[medium\]; known are only its layers"):
@@ -132,18 +170,38 @@ def layered(*tables: str) -> str:
     return "".join(f"[[layers]]\n{table}" for table in tables)
 
 
-SLAB = 'thickness = 2.0\nthickness_unit = "mm"\n' + GOOD_MEDIUM.removeprefix("[medium]\n").replace("eta = 1.3", "eta = [1.3]")
+SLAB = 'thickness = 2.0\nthickness_unit = "mm"\n' + GOOD_MEDIUM.removeprefix("[medium]\n").replace(
+    "eta = 1.3", "eta = [1.3]"
+)
 
 
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [
-        (layered(SLAB.replace("2.0", "0.1")), r"\[layers 1\] thickness in mean free paths.*at least 1 in every channel"),
-        (layered(SLAB.replace("2.0", "-1")), r"\[layers 1\] thickness must be positive \(mm\), or inf; it is -1"),
-        (layered(SLAB, SLAB.replace('"mm"', '"cm"')), r'\[layers 2\] thickness_unit must be "mm"; it is \'cm\''),
-        (layered(SLAB.replace("2.0", "inf"), SLAB), r"\[\[layers\]\]: layer 1 of 2 is infinitely thick"),
-        (layered(SLAB, "optical_depth = [0.1, 0.2]\n"), r"must all have one number per channel; they have \[1, 2\] channels"),
-        (layered("optical_depth = [-0.1]\n", SLAB), r"\[layers 1\] optical_depth must be finite and at least 0"),
+        (
+            layered(SLAB.replace("2.0", "0.1")),
+            r"\[layers 1\] thickness in mean free paths.*at least 1 in every channel",
+        ),
+        (
+            layered(SLAB.replace("2.0", "-1")),
+            r"\[layers 1\] thickness must be positive \(mm\), or inf; it is -1",
+        ),
+        (
+            layered(SLAB, SLAB.replace('"mm"', '"cm"')),
+            r'\[layers 2\] thickness_unit must be "mm"; it is \'cm\'',
+        ),
+        (
+            layered(SLAB.replace("2.0", "inf"), SLAB),
+            r"\[\[layers\]\]: layer 1 of 2 is infinitely thick",
+        ),
+        (
+            layered(SLAB, "optical_depth = [0.1, 0.2]\n"),
+            r"must all have one number per channel; they have \[1, 2\] channels",
+        ),
+        (
+            layered("optical_depth = [-0.1]\n", SLAB),
+            r"\[layers 1\] optical_depth must be finite and at least 0",
+        ),
         (layered("optical_depth = [0.1]\n"), r"none of which is a Layer"),
         (GOOD_MEDIUM + layered(SLAB), r"has both \[medium\] and \[\[layers\]\]"),
         ("layers = 3\n", r"\[\[layers\]\] must be one table or more"),
@@ -164,7 +222,11 @@ def test_one_index_stands_for_all_channels(tmp_path):
 
 @pytest.mark.parametrize(
     ("name", "hint"),
-    [("marbel", "did you mean 'marble'"), ("Skin", "did you mean 'skin'"), ("xyzzy", "known are apple, cappuccino_powder")],
+    [
+        ("marbel", "did you mean 'marble'"),
+        ("Skin", "did you mean 'skin'"),
+        ("xyzzy", "known are apple, cappuccino_powder"),
+    ],
 )
 def test_an_unknown_name_suggests_the_nearest(name, hint):
     with pytest.raises(ValueError, match=rf"{name}: is no known material; {hint}"):
@@ -174,14 +236,35 @@ def test_an_unknown_name_suggests_the_nearest(name, hint):
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [
-        (GOOD_MEDIUM.replace("[0.1]", "[-0.1]"), r"\[medium\] sigma_a must be finite and at least 0 \(1/mm\); it is \[-0.1\]"),
-        (GOOD_MEDIUM.replace("[1.0]", "[0.0]"), r"\[medium\] sigma_s_prime must be finite and positive"),
-        (GOOD_MEDIUM.replace("[1.0]", "[nan]"), r"\[medium\] sigma_s_prime must be finite and positive"),
-        (GOOD_MEDIUM.replace("[1.0]", '["1"]'), r"\[medium\] sigma_s_prime must be a list of numbers"),
-        (GOOD_MEDIUM.replace("[1.0]", "[true]"), r"\[medium\] sigma_s_prime must be a list of numbers"),
-        (GOOD_MEDIUM.replace("[1.0]", "[1.0, 2.0]"), r"one number per channel; they have 1, 2 and 1"),
+        (
+            GOOD_MEDIUM.replace("[0.1]", "[-0.1]"),
+            r"\[medium\] sigma_a must be finite and at least 0 \(1/mm\); it is \[-0.1\]",
+        ),
+        (
+            GOOD_MEDIUM.replace("[1.0]", "[0.0]"),
+            r"\[medium\] sigma_s_prime must be finite and positive",
+        ),
+        (
+            GOOD_MEDIUM.replace("[1.0]", "[nan]"),
+            r"\[medium\] sigma_s_prime must be finite and positive",
+        ),
+        (
+            GOOD_MEDIUM.replace("[1.0]", '["1"]'),
+            r"\[medium\] sigma_s_prime must be a list of numbers",
+        ),
+        (
+            GOOD_MEDIUM.replace("[1.0]", "[true]"),
+            r"\[medium\] sigma_s_prime must be a list of numbers",
+        ),
+        (
+            GOOD_MEDIUM.replace("[1.0]", "[1.0, 2.0]"),
+            r"one number per channel; they have 1, 2 and 1",
+        ),
         (GOOD_MEDIUM.replace("1/mm", "1/cm"), r'\[medium\] unit must be "1/mm"; it is \'1/cm\''),
-        (GOOD_MEDIUM.replace('unit = "1/mm"\n', ""), r'\[medium\] has no unit; convert the numbers, and say unit = "1/mm"'),
+        (
+            GOOD_MEDIUM.replace('unit = "1/mm"\n', ""),
+            r'\[medium\] has no unit; convert the numbers, and say unit = "1/mm"',
+        ),
         (GOOD_MEDIUM.replace("eta = 1.3\n", ""), r"\[medium\] has no eta"),
         (GOOD_MEDIUM, r"has no \[fit\]"),
         (GOOD_MEDIUM.replace("eta", "=eta"), r"is no TOML file"),
@@ -189,12 +272,21 @@ def test_an_unknown_name_suggests_the_nearest(name, hint):
         ("medium = 3\n", r"\[medium\] must be a table"),
         (GOOD_FIT + "[colour]\n", r"unknown entry 'colour'"),
         (GOOD_FIT.replace("0.1, 2.0", "2.0, 0.1"), r"\[fit\] variances must ascend"),
-        (GOOD_FIT.replace("0.1, 2.0", "0.0, 2.0"), r"\[fit\] variances must be finite and positive"),
+        (
+            GOOD_FIT.replace("0.1, 2.0", "0.0, 2.0"),
+            r"\[fit\] variances must be finite and positive",
+        ),
         (GOOD_FIT.replace("mm^2", "mm"), r'\[fit\] unit must be "mm\^2"'),
         (GOOD_FIT.replace("[[0.2], [0.3]]", "[[0.2]]"), r"\[fit\] weights must have 2 rows"),
-        (GOOD_FIT.replace("[[0.2], [0.3]]", "[0.2, 0.3]"), r"\[fit\] weights must be a list of finite numbers per Gaussian"),
+        (
+            GOOD_FIT.replace("[[0.2], [0.3]]", "[0.2, 0.3]"),
+            r"\[fit\] weights must be a list of finite numbers per Gaussian",
+        ),
         (GOOD_FIT.replace("[0.2]", "[inf]"), r"\[fit\] weights must be a list of finite numbers"),
-        (GOOD_FIT + "[surface]\nroughness = 1.5\n", r"\[surface\] roughness must be a number, in \(0, 1\]; it is 1.5"),
+        (
+            GOOD_FIT + "[surface]\nroughness = 1.5\n",
+            r"\[surface\] roughness must be a number, in \(0, 1\]; it is 1.5",
+        ),
     ],
 )
 def test_a_bad_file_is_refused_with_the_remedy(tmp_path, text, complaint):
@@ -206,5 +298,7 @@ def test_a_bad_file_is_refused_with_the_remedy(tmp_path, text, complaint):
 
 
 def test_a_missing_file_is_refused_by_name(tmp_path):
-    with pytest.raises(ValueError, match=r"none.toml: cannot be read \(No such file or directory\)"):
+    with pytest.raises(
+        ValueError, match=r"none.toml: cannot be read \(No such file or directory\)"
+    ):
         load_material(tmp_path / "none.toml")

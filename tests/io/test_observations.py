@@ -86,14 +86,38 @@ def test_all_files_are_named(listed, tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
-        ('file = "one.exr"\nmask', "mask", r"\[pictures 1\] has no file; it must be the name of an EXR file"),
+        (
+            'file = "one.exr"\nmask',
+            "mask",
+            r"\[pictures 1\] has no file; it must be the name of an EXR file",
+        ),
         ("noise = 0.02", "noise = 0", r"\[pictures 1\] noise must be a number, positive; it is 0"),
         ("noise = 0.02", "nois = 0.02", r"has an unknown entry 'nois'; did you mean 'noise'"),
-        ('"unknown"', '"maybe"', r"intensity must be one of known, unknown, unknown color; it is 'maybe'"),
-        ("[0, 1, 50]", "[0, 1]", r"\[pictures 1 camera\] position must be three numbers; it is \[0.0, 1.0\]"),
-        ("[0, 1, 50]", "[0, 50, 0]", r"\[pictures 1 camera\] up is \[0.0, 1.0, 0.0\], along the line of sight"),
-        ("[0, 1, 50]", "[0, 0, 0]", r"\[pictures 1 camera\] the camera stands at \[0.0, 0.0, 0.0\], where it looks at"),
-        ("[0, 0, -1]", "[0, 0, 0]", r"\[pictures 1 lights 1\] direction must be three numbers, not all 0"),
+        (
+            '"unknown"',
+            '"maybe"',
+            r"intensity must be one of known, unknown, unknown color; it is 'maybe'",
+        ),
+        (
+            "[0, 1, 50]",
+            "[0, 1]",
+            r"\[pictures 1 camera\] position must be three numbers; it is \[0.0, 1.0\]",
+        ),
+        (
+            "[0, 1, 50]",
+            "[0, 50, 0]",
+            r"\[pictures 1 camera\] up is \[0.0, 1.0, 0.0\], along the line of sight",
+        ),
+        (
+            "[0, 1, 50]",
+            "[0, 0, 0]",
+            r"\[pictures 1 camera\] the camera stands at \[0.0, 0.0, 0.0\], where it looks at",
+        ),
+        (
+            "[0, 0, -1]",
+            "[0, 0, 0]",
+            r"\[pictures 1 lights 1\] direction must be three numbers, not all 0",
+        ),
         ("[1, 2, 3]", "[1, 2]", r"irradiance must be 3 numbers, as its picture has channels"),
         ('"directional"', '"sun"', r"kind must be one of directional, point, beam; it is 'sun'"),
         ("cast_shadows = false", "cast_shadows = 0", "cast_shadows must be true or false; it is 0"),

@@ -14,7 +14,10 @@ from splatjax.io import read_exr, write_exr, write_png
 from splatjax.io._color import linear_to_srgb
 from splatjax.scene import Frame
 
-TOOLS = [(["exrheader"], "diffusion.4.G, 32-bit floating-point"), (["oiiotool", "--info", "-v"], "diffusion.4.G")]
+TOOLS = [
+    (["exrheader"], "diffusion.4.G, 32-bit floating-point"),
+    (["oiiotool", "--info", "-v"], "diffusion.4.G"),
+]
 
 
 def some_frame(channels=3, gaussians=4, lights=2, height=6, width=5) -> Frame:
@@ -25,7 +28,10 @@ def some_frame(channels=3, gaussians=4, lights=2, height=6, width=5) -> Frame:
         return random.uniform(0, 1, shape).astype(np.float32)
 
     layers, weights = noise(gaussians, height, width, channels), noise(gaussians, channels)
-    diffuse, specular = (layers * weights[:, None, None]).sum(axis=0), noise(height, width, channels)
+    diffuse, specular = (
+        (layers * weights[:, None, None]).sum(axis=0),
+        noise(height, width, channels),
+    )
     depth = noise(height, width)
     depth[0, 0] = np.inf
     parts = {
@@ -61,9 +67,15 @@ def test_frame_comes_back_bit_by_bit(tmp_path, channels, lights, gaussians):
 def test_diffuse_is_rebuilt_from_layers_and_header_alone(tmp_path):
     write_exr(tmp_path / "frame.exr", some_frame(), variances=[0.1, 0.2, 0.4, 7.5])
     with OpenEXR.File(str(tmp_path / "frame.exr"), separate_channels=True) as file:
-        header, planes = dict(file.header()), {name: np.array(channel.pixels) for name, channel in file.channels().items()}
+        header, planes = (
+            dict(file.header()),
+            {name: np.array(channel.pixels) for name, channel in file.channels().items()},
+        )
     for channel, letter in enumerate("RGB"):
-        rebuilt = sum(header[f"splatjax.weights.{k}"][channel] * planes[f"diffusion.{k}.{letter}"] for k in (1, 2, 3, 4))
+        rebuilt = sum(
+            header[f"splatjax.weights.{k}"][channel] * planes[f"diffusion.{k}.{letter}"]
+            for k in (1, 2, 3, 4)
+        )
         np.testing.assert_allclose(rebuilt, planes[f"diffuse.{letter}"], rtol=1e-6)
     np.testing.assert_allclose(header["splatjax.variances"], [0.1, 0.2, 0.4, 7.5], rtol=1e-7)
     np.testing.assert_allclose(np.ravel(header["chromaticities"])[:2], [0.64, 0.33], rtol=1e-6)
@@ -71,20 +83,38 @@ def test_diffuse_is_rebuilt_from_layers_and_header_alone(tmp_path):
 
 
 def test_frames_of_double_precision_are_written_in_single(tmp_path):
-    frame = jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf, np.float64), dtype=float), some_frame())
+    frame = jax.tree.map(
+        lambda leaf: jnp.asarray(np.asarray(leaf, np.float64), dtype=float), some_frame()
+    )
     write_exr(tmp_path / "frame.exr", frame)
-    np.testing.assert_array_equal(np.asarray(read_exr(tmp_path / "frame.exr").beauty), np.asarray(frame.beauty, np.float32))
+    np.testing.assert_array_equal(
+        np.asarray(read_exr(tmp_path / "frame.exr").beauty), np.asarray(frame.beauty, np.float32)
+    )
 
 
 @pytest.mark.parametrize(
     ("command", "said"),
-    [(command, said) for command, said in TOOLS if shutil.which(command[0])],  # Debian: openexr, openimageio-tools
+    [
+        (command, said) for command, said in TOOLS if shutil.which(command[0])
+    ],  # Debian: openexr, openimageio-tools
 )
 def test_common_tools_list_the_layers(tmp_path, command, said):
     write_exr(tmp_path / "frame.exr", some_frame())
-    told = subprocess.run([*command, str(tmp_path / "frame.exr")], capture_output=True, text=True, check=True).stdout
+    told = subprocess.run(
+        [*command, str(tmp_path / "frame.exr")], capture_output=True, text=True, check=True
+    ).stdout
     assert said in told
-    for name in ("R", "A", "Z", "position.X", "normal.Z", "albedo.R", "shadow.2", "irradiance.B", "specular.G"):
+    for name in (
+        "R",
+        "A",
+        "Z",
+        "position.X",
+        "normal.Z",
+        "albedo.R",
+        "shadow.2",
+        "irradiance.B",
+        "specular.G",
+    ):
         assert name in told
 
 
@@ -103,7 +133,9 @@ def test_exr_that_cannot_be_read_is_refused(tmp_path):
 
 
 def test_png_encodes_for_the_display(tmp_path):
-    """sRGB: linear 0.2159 is 128 of 255, 0.0021 is a 36th (the straight part), and exposure counts in stops."""
+    """sRGB: linear 0.2159 is 128 of 255, 0.0021 is a 36th (the straight part), and exposure counts
+    in stops.
+    """
     picture = np.asarray([[[0.0, 0.2158605, 1.0], [0.00215, 2.0, -1.0]]])
     write_png(tmp_path / "a.png", picture)
     with Image.open(tmp_path / "a.png") as image:
@@ -137,6 +169,10 @@ def test_png_refuses_what_has_no_colors(tmp_path):
 def test_encoding_for_the_screen_is_that_of_colour_science():
     import colour
 
-    linear = np.concatenate([np.linspace(-0.5, 1.5, 1001), np.geomspace(1e-6, 1, 100), [0.0031308, np.nan, np.inf]])
+    linear = np.concatenate(
+        [np.linspace(-0.5, 1.5, 1001), np.geomspace(1e-6, 1, 100), [0.0031308, np.nan, np.inf]]
+    )
     clipped = np.clip(np.nan_to_num(linear, nan=0.0), 0, 1)
-    np.testing.assert_allclose(linear_to_srgb(linear), colour.cctf_encoding(clipped, function="sRGB"), atol=1e-15)
+    np.testing.assert_allclose(
+        linear_to_srgb(linear), colour.cctf_encoding(clipped, function="sRGB"), atol=1e-15
+    )

@@ -14,7 +14,9 @@ from splatjax.scattering import Dipole, Tabulated
 
 @pytest.fixture
 def figure():
-    return plot_fit(Dipole(load_medium("marble")), load_material("marble").gaussians, title="marble")
+    return plot_fit(
+        Dipole(load_medium("marble")), load_material("marble").gaussians, title="marble"
+    )
 
 
 def test_axes_have_names_and_units(figure):
@@ -61,7 +63,9 @@ def test_what_was_not_fitted_is_shaded_and_not_counted(float64, dtype):
     legend = figure.axes[0].get_legend().get_texts()[0].get_text()
     assert f"E = {float(fitted.error[0]):.2e}" in legend
     for axes in figure.axes[1:]:
-        (shade,) = [patch for patch in axes.patches if patch.get_facecolor()[:3] == (0.93, 0.93, 0.93)]
+        (shade,) = [
+            patch for patch in axes.patches if patch.get_facecolor()[:3] == (0.93, 0.93, 0.93)
+        ]
         np.testing.assert_allclose(shade.get_x() + shade.get_width(), 0.5 / 2.6241, rtol=0.05)
     with pytest.raises(ValueError, match="infinity like 1/r"):
         plot_fit(beam, fitted.gaussians)
@@ -69,7 +73,10 @@ def test_what_was_not_fitted_is_shaded_and_not_counted(float64, dtype):
 
 def test_few_radii_are_marked_and_the_fit_is_drawn_between_them():
     radii = jnp.asarray([0.5, 1.0, 2.0, 4.0, 8.0])
-    figure = plot_fit(Tabulated(radii, jnp.exp(-radii)[:, None]), SumOfGaussians(jnp.asarray([1.0]), jnp.ones((1, 1))))
+    figure = plot_fit(
+        Tabulated(radii, jnp.exp(-radii)[:, None]),
+        SumOfGaussians(jnp.asarray([1.0]), jnp.ones((1, 1))),
+    )
     given, drawn = figure.axes[0].lines
     assert given.get_marker() == "o"
     np.testing.assert_allclose(given.get_xdata(), radii)

@@ -17,21 +17,35 @@ from splatjax.render import light_on_splats
 from splatjax.splatting import DenseRasterizer, ShadowSettings
 
 SETTINGS = sj.RenderSettings(shadows=ShadowSettings(resolution=32))
-PLACE = np.asarray([40.0, -25.0, 15.0])  # mm; where the balls stand, away from the origin of all coordinates
+PLACE = np.asarray(
+    [40.0, -25.0, 15.0]
+)  # mm; where the balls stand, away from the origin of all coordinates
 
 
 def scene(count: int = 1501, variances=(0.1, 16.0, 100.0)) -> sj.Scene:
-    """Two balls, the last splats before the first, of a number that eight does not divide; layers of three kinds."""
+    """Two balls, the last splats before the first, of a number that eight does not divide; layers
+    of three kinds.
+    """
     behind, before = sphere(count - count // 5, 20.0), sphere(count // 5, 6.0)
-    before = eqx.tree_at(lambda ball: ball.centers, before, before.centers + jnp.asarray([[-8.0, 6.0, 30.0]], float))
+    before = eqx.tree_at(
+        lambda ball: ball.centers, before, before.centers + jnp.asarray([[-8.0, 6.0, 30.0]], float)
+    )
     splats = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), behind, before)
     shade = 0.6 + 0.3 * jnp.sin(splats.centers / 5)
-    splats = eqx.tree_at(lambda each: each.centers, splats, splats.centers + jnp.asarray(PLACE[None], float))
+    splats = eqx.tree_at(
+        lambda each: each.centers, splats, splats.centers + jnp.asarray(PLACE[None], float)
+    )
     splats = eqx.tree_at(lambda each: each.albedo, splats, shade, is_leaf=lambda leaf: leaf is None)
-    weights = jnp.asarray([[0.2, 0.1, 0.1], [0.3, 0.3, 0.2], [0.3, 0.2, 0.1]], float)[-len(variances) :]
+    weights = jnp.asarray([[0.2, 0.1, 0.1], [0.3, 0.3, 0.2], [0.3, 0.2, 0.1]], float)[
+        -len(variances) :
+    ]
     material = sj.Material(sj.SumOfGaussians(jnp.asarray(variances, float), weights))
     sun = sj.DirectionalLight(jnp.asarray([0.4, -0.5, -1.0], float), jnp.ones(3))
-    lamp = sj.PointLight(jnp.asarray(PLACE + np.asarray([-60.0, 10.0, 20.0]), float), 2000 * jnp.ones(3), cast_shadows=False)
+    lamp = sj.PointLight(
+        jnp.asarray(PLACE + np.asarray([-60.0, 10.0, 20.0]), float),
+        2000 * jnp.ones(3),
+        cast_shadows=False,
+    )
     return sj.Scene(splats, (sun, lamp), material)
 
 
@@ -46,16 +60,24 @@ def pictured(scene: sj.Scene, camera: sj.Camera, plan: sj.Plan):
 
     def loss(of):
         frame = sj.render(*of, SETTINGS, plan)
-        wave = jnp.sin(jnp.arange(frame.beauty.size, dtype=frame.beauty.dtype)).reshape(frame.beauty.shape)
-        return jnp.sum(wave * frame.beauty) + jnp.sum(frame.coverage**2) + 1e-3 * jnp.sum(wave * frame.position), frame
+        wave = jnp.sin(jnp.arange(frame.beauty.size, dtype=frame.beauty.dtype)).reshape(
+            frame.beauty.shape
+        )
+        return jnp.sum(wave * frame.beauty) + jnp.sum(frame.coverage**2) + 1e-3 * jnp.sum(
+            wave * frame.position
+        ), frame
 
     return eqx.filter_value_and_grad(loss, has_aux=True)((scene, camera))
 
 
 def apart(one, other) -> dict[str, float]:
-    """Give by how much each of two trees' leaves differ, over the largest number in it; infinite numbers must be the same."""
+    """Give by how much each of two trees' leaves differ, over the largest number in it; infinite
+    numbers must be the same.
+    """
     found = {}
-    for (path, x), y in zip(jax.tree_util.tree_leaves_with_path(one), jax.tree.leaves(other), strict=True):
+    for (path, x), y in zip(
+        jax.tree_util.tree_leaves_with_path(one), jax.tree.leaves(other), strict=True
+    ):
         x, y = np.asarray(x), np.asarray(y)
         finite = np.isfinite(x)
         same = x.shape == y.shape and np.array_equal(finite, np.isfinite(y))
@@ -72,14 +94,23 @@ def splats_cut() -> dict:
     plans = [sj.plan(world, eye, SETTINGS), sj.plan(world, eye, SETTINGS, mesh=mesh)]
     ((_, one), d_one), ((_, many), d_many) = (pictured(world, eye, plan) for plan in plans)
     kinds = [[layer.level > 0, layer.nodes is not None] for layer in plans[0].diffuser.layers]
-    return {"frame": apart(one, many), "gradients": apart(d_one, d_many), "overflow": float(many.overflow), "layers": kinds}
+    return {
+        "frame": apart(one, many),
+        "gradients": apart(d_one, d_many),
+        "overflow": float(many.overflow),
+        "layers": kinds,
+    }
 
 
 def more_than_pictures_cut() -> dict:
-    """What else is made of splats that are cut: the Jacobian, the picture of any weights, light on splats, pass 4 alone."""
+    """What else is made of splats that are cut: the Jacobian, the picture of any weights, light on
+    splats, pass 4 alone.
+    """
     world, eye = scene(), camera()
     mesh = jax.make_mesh((8,), ("splats",))
-    other = sj.SumOfGaussians(world.material.gaussians.variances, world.material.gaussians.weights[::-1])
+    other = sj.SumOfGaussians(
+        world.material.gaussians.variances, world.material.gaussians.weights[::-1]
+    )
     found = []
     for plan in (sj.plan(world, eye, SETTINGS), sj.plan(world, eye, SETTINGS, mesh=mesh)):
         light = light_on_splats(world, plan, SETTINGS)
@@ -96,14 +127,22 @@ def more_than_pictures_cut() -> dict:
 
 
 def traffic() -> dict:
-    """The collectives of the compiled program against the model, with splats that lie where they are worked on."""
+    """The collectives of the compiled program against the model, with splats that lie where they
+    are worked on.
+    """
     mesh = jax.make_mesh((8,), ("splats",))
     world = scene(1504)
     plan = sj.plan(world, camera(), SETTINGS, mesh=mesh)
     world = eqx.tree_at(
-        lambda each: each.splats, world, jax.device_put(world.splats, NamedSharding(mesh, PartitionSpec("splats")))
+        lambda each: each.splats,
+        world,
+        jax.device_put(world.splats, NamedSharding(mesh, PartitionSpec("splats"))),
     )
-    program = jax.jit(lambda splats: sj.render(sj.Scene(splats, world.lights, world.material), camera(), SETTINGS, plan))
+    program = jax.jit(
+        lambda splats: sj.render(
+            sj.Scene(splats, world.lights, world.material), camera(), SETTINGS, plan
+        )
+    )
     found = counted(program.lower(world.splats).compile().as_text())
     layers = [layer for layer in plan.diffuser.whole.layers if layer.capacity is not None]
     picture = Picture(
@@ -119,13 +158,24 @@ def traffic() -> dict:
         cells=plan.diffuser.cells,
     )
     model = picture.traffic()
-    model = {"summed": model.summed, "scattered": model.scattered / 8, "gathered": model.gathered, "sent": picture.sent(8)}
+    model = {
+        "summed": model.summed,
+        "scattered": model.scattered / 8,
+        "gathered": model.gathered,
+        "sent": picture.sent(8),
+    }
     return {"model": model, "counted": vars(found) | {"sent": found.sent(8)}}
 
 
 def views_cut() -> dict:
-    """A batch of cameras over the devices against one camera after the other, by plain renderers: their program is small."""
-    settings = sj.RenderSettings(shadows=ShadowSettings(resolution=16), rasterizer=DenseRasterizer(), diffuser=DenseDiffuser())
+    """A batch of cameras over the devices against one camera after the other, by plain renderers:
+    their program is small.
+    """
+    settings = sj.RenderSettings(
+        shadows=ShadowSettings(resolution=16),
+        rasterizer=DenseRasterizer(),
+        diffuser=DenseDiffuser(),
+    )
     world, cameras = scene(97), [camera(angle) for angle in (0.0, 1.0, 2.0)]
     world = sj.Scene(world.splats, world.lights[1:], world.material)
     plan = sj.plan(world, cameras, settings)
@@ -147,23 +197,33 @@ def views_cut() -> dict:
         return losses(frames), frames
 
     ((_, one), d_one), ((_, many), d_many) = (
-        eqx.filter_jit(eqx.filter_value_and_grad(each, has_aux=True))((world, stacked)) for each in (one_by_one, over_devices)
+        eqx.filter_jit(eqx.filter_value_and_grad(each, has_aux=True))((world, stacked))
+        for each in (one_by_one, over_devices)
     )
     return {"frame": apart(one, many), "gradients": apart(d_one, d_many)}
 
 
 def gradients_at_home() -> dict:
-    """Where the gradients of the splats lie, that lie on eight devices: of coverage alone, which is soon compiled."""
+    """Where the gradients of the splats lie, that lie on eight devices: of coverage alone, which is
+    soon compiled.
+    """
     mesh = jax.make_mesh((8,), ("splats",))
     world = scene(1504)
     plan = sj.plan(world, camera(), SETTINGS, mesh=mesh)
     splats = jax.device_put(world.splats, NamedSharding(mesh, PartitionSpec("splats")))
 
     def covered(splats):
-        return jnp.sum(sj.render(sj.Scene(splats, world.lights, world.material), camera(), SETTINGS, plan).coverage)
+        return jnp.sum(
+            sj.render(
+                sj.Scene(splats, world.lights, world.material), camera(), SETTINGS, plan
+            ).coverage
+        )
 
     found = jax.jit(jax.grad(covered))(splats)
-    return {"rows": [shard.data.shape[0] for shard in found.centers.addressable_shards], "spec": str(found.centers.sharding.spec)}
+    return {
+        "rows": [shard.data.shape[0] for shard in found.centers.addressable_shards],
+        "spec": str(found.centers.sharding.spec),
+    }
 
 
 if __name__ == "__main__":

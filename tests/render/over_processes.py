@@ -1,4 +1,5 @@
-"""Run by test_devices.py, once for each of several processes: the splats of one scene lie on the devices of all of them.
+"""Run by test_devices.py, once for each of several processes: the splats of one scene lie on the
+devices of all of them.
 
 The first process compares with one device of its own.
 """
@@ -17,10 +18,15 @@ import splatjax as sj
 
 
 def main(what: str, index: int, count: int, port: int) -> dict:
-    """Give the picture, or the gradients of what soon compiles, and how the first process finds them."""
+    """Give the picture, or the gradients of what soon compiles, and how the first process finds
+    them.
+    """
     jax.distributed.initialize(f"127.0.0.1:{port}", count, index)
     mesh = jax.make_mesh((jax.device_count(),), ("splats",))
-    world, eye = scene(1504, variances=(16.0, 100.0)), camera()  # one layer of single splats, and one through nodes
+    world, eye = (
+        scene(1504, variances=(16.0, 100.0)),
+        camera(),
+    )  # one layer of single splats, and one through nodes
     cut = NamedSharding(mesh, PartitionSpec("splats"))
     splats = jax.tree.map(lambda leaf: jax.device_put(leaf, cut), world.splats)
 
@@ -32,7 +38,9 @@ def main(what: str, index: int, count: int, port: int) -> dict:
 
         if what == "picture":
             return draw(splats, plan)
-        return eqx.filter_jit(eqx.filter_grad(lambda splats, plan: jnp.sum(draw(splats, plan).coverage ** 2)))(splats, plan)
+        return eqx.filter_jit(
+            eqx.filter_grad(lambda splats, plan: jnp.sum(draw(splats, plan).coverage ** 2))
+        )(splats, plan)
 
     answer = found(splats, mesh)
     if what == "gradients":
@@ -40,7 +48,11 @@ def main(what: str, index: int, count: int, port: int) -> dict:
         answer = process_allgather(answer, tiled=True)
     else:
         rows = []
-    return {"devices": jax.device_count(), "rows": rows, "apart": apart(found(world.splats, None), answer) if index == 0 else {}}
+    return {
+        "devices": jax.device_count(),
+        "rows": rows,
+        "apart": apart(found(world.splats, None), answer) if index == 0 else {},
+    }
 
 
 if __name__ == "__main__":

@@ -22,12 +22,18 @@ def skin() -> sj.SumOfGaussians:
 
 
 def two_gaussians() -> sj.SumOfGaussians:
-    """A material of two layers, for laws that hold for any number: each more takes its time to compile."""
-    return sj.SumOfGaussians(jnp.asarray([0.5, 3.0], float), jnp.asarray([[0.3, 0.2, 0.1], [0.4, 0.3, 0.2]], float))
+    """A material of two layers, for laws that hold for any number: each more takes its time to
+    compile.
+    """
+    return sj.SumOfGaussians(
+        jnp.asarray([0.5, 3.0], float), jnp.asarray([[0.3, 0.2, 0.1], [0.4, 0.3, 0.2]], float)
+    )
 
 
 def sheet(spacing: float, half_width: float, kind: str = "grid") -> sj.Splats:
-    """A flat sheet at z = 0 that faces +z; a splat at the origin. Areas are exact but for `jittered`, where they are the mean."""
+    """A flat sheet at z = 0 that faces +z; a splat at the origin. Areas are exact but for
+    `jittered`, where they are the mean.
+    """
     count = round(half_width / spacing)
     line = np.arange(-count, count + 1) * spacing
     x, y = (each.reshape(-1) for each in np.meshgrid(line, line))
@@ -38,8 +44,12 @@ def sheet(spacing: float, half_width: float, kind: str = "grid") -> sj.Splats:
         x, y = x + jitter[0], y + jitter[1]
         areas = voronoi_areas(np.stack([x, y], 1), spacing, half_width)
     if kind == "graded":
-        # u -> x(u) with dx/du rising smoothly from 0.4 to 1.6: areas 4:1 from left to right, exact by the map's Jacobian
-        u, y = (each.reshape(-1) for each in np.meshgrid(np.arange(-3 * count, 3 * count + 1) * spacing, line))
+        # u -> x(u) with dx/du rising smoothly from 0.4 to 1.6: areas 4:1 from left to right, exact
+        # by the map's Jacobian
+        u, y = (
+            each.reshape(-1)
+            for each in np.meshgrid(np.arange(-3 * count, 3 * count + 1) * spacing, line)
+        )
         stretch = 0.3 * half_width
         x = u + 0.6 * stretch * np.log(np.cosh(u / stretch))
         areas = spacing * spacing * (1 + 0.6 * np.tanh(u / stretch))
@@ -52,7 +62,9 @@ def sheet(spacing: float, half_width: float, kind: str = "grid") -> sj.Splats:
 
 
 def voronoi_areas(points: np.ndarray, spacing: float, half_width: float) -> np.ndarray:
-    """Exact areas of the Voronoi cells inside the sheet; cells at the border are given the grid's."""
+    """Exact areas of the Voronoi cells inside the sheet; cells at the border are given the
+    grid's.
+    """
     from scipy.spatial import Voronoi
 
     diagram = Voronoi(points)

@@ -1,4 +1,6 @@
-"""The law that ties the halves together: a narrow beam on a flat sheet renders to the sum of Gaussians."""
+"""The law that ties the halves together: a narrow beam on a flat sheet renders to the sum of
+Gaussians.
+"""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -29,7 +31,9 @@ def positions(camera: sj.Camera) -> np.ndarray:
     """Where the camera's rays meet the plane z = 0."""
     x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     focal = float(camera.focal_length) * camera.height
-    rays = np.stack([(x - camera.width / 2) / focal, (y - camera.height / 2) / focal, np.ones_like(x)], -1)
+    rays = np.stack(
+        [(x - camera.width / 2) / focal, (y - camera.height / 2) / focal, np.ones_like(x)], -1
+    )
     rays = rays @ np.asarray(camera.rotation, np.float64)
     eye = np.asarray(camera.position, np.float64)
     return eye + rays * (-eye[2] / rays[..., 2:])
@@ -41,7 +45,10 @@ def layer_error(variance: float, kind: str, slant: float) -> float:
     material = sj.Material(sj.SumOfGaussians(jnp.asarray([variance], float), jnp.ones((1, 1))))
     scene = sj.Scene(splats, (), material)
     cameras = {each: camera_over(4 * deviation, 48, each) for each in SLANTS}
-    camera, plan = cameras[slant], sj.plan(scene, list(cameras.values()), EXACT)  # one plan is one program
+    camera, plan = (
+        cameras[slant],
+        sj.plan(scene, list(cameras.values()), EXACT),
+    )  # one plan is one program
     layer = np.asarray(sj.diffuse(scene, beam(splats), camera, EXACT, plan))[0, ..., 0]
     squared = np.sum(positions(camera)[..., :2] ** 2, axis=-1)
     truth = np.exp(-squared / (2 * variance)) / (2 * np.pi * variance)
@@ -70,7 +77,8 @@ def test_every_layer_of_skin_and_marble_is_its_gaussian(variance):
 @pytest.mark.once
 @pytest.mark.long
 def test_the_sum_of_layers_is_the_profile():
-    # wide enough that what the widest layer loses beyond the border does not come back in the normalization
+    # wide enough that what the widest layer loses beyond the border does not come back in the
+    # normalization
     splats = sheet(0.05, 10.5)
     material = sj.Material(skin())
     scene = sj.Scene(splats, (), material)
@@ -90,21 +98,33 @@ def test_a_wide_beam_with_default_settings_is_the_widened_profile(name):
     material = load_material(name)
     half_width = 30.0
     splats = sheet(0.18, half_width)  # wide enough for marble's widest layer
-    light = sj.GaussianBeam(jnp.asarray([0.0, 0.0, 10.0]), jnp.asarray([0.0, 0.0, -1.0]), jnp.ones(3), jnp.asarray(1.0))
-    scene = sj.Scene(splats, (light,), eqx.tree_at(lambda m: m.specular, material, jnp.asarray(0.0)))
+    light = sj.GaussianBeam(
+        jnp.asarray([0.0, 0.0, 10.0]), jnp.asarray([0.0, 0.0, -1.0]), jnp.ones(3), jnp.asarray(1.0)
+    )
+    scene = sj.Scene(
+        splats, (light,), eqx.tree_at(lambda m: m.specular, material, jnp.asarray(0.0))
+    )
     camera = camera_over(9.0, 144)
     frame = sj.render(scene, camera)
     exitance = np.pi * np.asarray(frame.diffuse)
     squared = np.sum(positions(camera)[..., :2] ** 2, axis=-1)
     variances = np.asarray(material.gaussians.variances, np.float64)
     weights = np.asarray(material.gaussians.weights, np.float64)
-    kernels = np.stack([np.asarray(gaussian(jnp.asarray(v + 1.0, float), jnp.asarray(squared, float))) for v in variances], -1)
+    kernels = np.stack(
+        [
+            np.asarray(gaussian(jnp.asarray(v + 1.0, float), jnp.asarray(squared, float)))
+            for v in variances
+        ],
+        -1,
+    )
     truth = kernels @ weights
     seen = truth > 1e-2 * truth.max(axis=(0, 1))
     assert np.max(np.abs(exitance / truth - 1)[seen]) < WIDE_TOLERANCE
 
 
-@pytest.mark.parametrize(("kind", "tolerance"), [("grid", 1e-3), ("graded", 1e-3), ("jittered", 5e-3)])
+@pytest.mark.parametrize(
+    ("kind", "tolerance"), [("grid", 1e-3), ("graded", 1e-3), ("jittered", 5e-3)]
+)
 def test_the_splats_inside_a_sheet_are_a_partition_of_unity(kind, tolerance):
     variance = 1.0
     splats = sheet(0.25, 8.0, kind)

@@ -1,4 +1,6 @@
-"""Eight devices give what one gives, and send each other what the model says. They need a process of their own."""
+"""Eight devices give what one gives, and send each other what the model says. They need a process
+of their own.
+"""
 
 import json
 import os
@@ -18,7 +20,11 @@ ROUNDING = 2e-5  # of the largest number of its kind: sums of a thousand terms, 
 def answers(commands, devices):
     """Run scripts beside each other, each with so many devices; give what they print."""
     flags = f"--xla_force_host_platform_device_count={devices} {os.environ.get('XLA_FLAGS', '')}"
-    environment = os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(HERE.parents[1])}
+    environment = os.environ | {
+        "XLA_FLAGS": flags,
+        "JAX_PLATFORMS": "cpu",
+        "PYTHONPATH": str(HERE.parents[1]),
+    }
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "env": environment}
     running = [subprocess.Popen([sys.executable, *map(str, words)], **pipes) for words in commands]
     said = [process.communicate(timeout=600) for process in running]
@@ -34,7 +40,11 @@ def on_eight(*questions):
 def test_splats_on_eight_devices_make_the_picture_and_the_gradients_of_one():
     answer = on_eight("splats_cut")["splats_cut"]
     assert answer["overflow"] == 0
-    assert answer["layers"] == [[False, False], [False, False], [True, True]]  # one of single splats, one through nodes
+    assert answer["layers"] == [
+        [False, False],
+        [False, False],
+        [True, True],
+    ]  # one of single splats, one through nodes
     assert max(answer["frame"].values()) < ROUNDING, answer["frame"]
     assert max(answer["gradients"].values()) < ROUNDING, answer["gradients"]
 
@@ -65,12 +75,16 @@ def test_views_on_eight_devices_are_those_of_one():
     assert max(answer["gradients"].values()) < ROUNDING, answer["gradients"]
 
 
-@pytest.mark.parametrize(("what", "count"), [("picture", 2), pytest.param("gradients", 4, marks=pytest.mark.long)])
+@pytest.mark.parametrize(
+    ("what", "count"), [("picture", 2), pytest.param("gradients", 4, marks=pytest.mark.long)]
+)
 def test_splats_of_several_processes_make_what_those_of_one_do(what, count):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    found = answers([[HERE / "over_processes.py", what, i, count, port] for i in range(count)], 4 // count)
+    found = answers(
+        [[HERE / "over_processes.py", what, i, count, port] for i in range(count)], 4 // count
+    )
     for answer in found:
         assert answer["devices"] == 4
         assert answer["rows"] == ([376] * (4 // count) if what == "gradients" else [])

@@ -18,13 +18,24 @@ VARIANCES = (0.01, 4.0, 60.0)
 
 
 def ball_over_sheet(gaussians, single=None) -> sj.Scene:
-    """Before a sheet, so that one surface shows behind the other; one layer is narrower than the splats."""
+    """Before a sheet, so that one surface shows behind the other; one layer is narrower than the
+    splats.
+    """
     ball, plate = sphere(200, 6.0), sheet(2.0, 12.0)
-    both = [jnp.concatenate([getattr(ball, name), getattr(plate, name)]) for name in ("centers", "normals", "radii", "areas")]
-    both[0] = both[0] - jnp.concatenate([jnp.zeros((200, 3)), jnp.tile(jnp.asarray([[0.0, 0, 8]]), (plate.count, 1))])
+    both = [
+        jnp.concatenate([getattr(ball, name), getattr(plate, name)])
+        for name in ("centers", "normals", "radii", "areas")
+    ]
+    both[0] = both[0] - jnp.concatenate(
+        [jnp.zeros((200, 3)), jnp.tile(jnp.asarray([[0.0, 0, 8]]), (plate.count, 1))]
+    )
     albedo = jnp.asarray(np.random.default_rng(1).uniform(0.3, 0.9, (len(both[2]), 2)), float)
-    light = sj.DirectionalLight(jnp.asarray([-0.5, -0.3, -1.0]), jnp.asarray([2.0, 3.0]), cast_shadows=False)
-    return sj.Scene(sj.Splats(*both, albedo), (light,), sj.Material(gaussians, single_scattering=single))
+    light = sj.DirectionalLight(
+        jnp.asarray([-0.5, -0.3, -1.0]), jnp.asarray([2.0, 3.0]), cast_shadows=False
+    )
+    return sj.Scene(
+        sj.Splats(*both, albedo), (light,), sj.Material(gaussians, single_scattering=single)
+    )
 
 
 def gaussians_of(weights) -> sj.SumOfGaussians:
@@ -60,7 +71,9 @@ def test_its_derivative_is_that_of_the_picture():
     gathered = sj.gather_picture_and_slopes(start, camera, PLAIN, plan)
     jacobian = sj.picture_jacobian(start, camera, PLAIN, plan)
     rng = np.random.default_rng(4)
-    way = jax.tree.map(lambda leaf: leaf * jnp.asarray(rng.normal(size=leaf.shape), leaf.dtype), gaussians_of(ONE))
+    way = jax.tree.map(
+        lambda leaf: leaf * jnp.asarray(rng.normal(size=leaf.shape), leaf.dtype), gaussians_of(ONE)
+    )
 
     def beauty(gaussians):
         return gathered.beauty(gaussians)
@@ -75,11 +88,17 @@ def test_its_derivative_is_that_of_the_picture():
         assert float(jnp.max(jnp.abs(expected))) > 1e-2
         np.testing.assert_allclose(found, expected, atol=1e-4 * float(jnp.max(jnp.abs(expected))))
     back = jax.vjp(beauty, gaussians_of(ONE))[1](picture)[0]
-    along = sum(jnp.vdot(*pair) for pair in zip(jax.tree.leaves(back), jax.tree.leaves(way), strict=True))
+    along = sum(
+        jnp.vdot(*pair) for pair in zip(jax.tree.leaves(back), jax.tree.leaves(way), strict=True)
+    )
     np.testing.assert_allclose(along, jnp.vdot(picture, slope), rtol=1e-3)
 
 
 def test_single_scattering_is_refused():
     medium = sj.Medium(jnp.asarray([0.1, 0.1]), jnp.asarray([1.0, 1.0]), jnp.asarray([1.3, 1.3]))
     with pytest.raises(ValueError, match=r"scene\.material has single scattering"):
-        sj.gather_picture(ball_over_sheet(gaussians_of(ONE), sj.SingleScattering(medium)), camera_over(14.0, 24), PLAIN)
+        sj.gather_picture(
+            ball_over_sheet(gaussians_of(ONE), sj.SingleScattering(medium)),
+            camera_over(14.0, 24),
+            PLAIN,
+        )

@@ -27,7 +27,10 @@ def photograph(medium: sj.Medium) -> np.ndarray:
     gaussians = sj.fit_gaussians(sj.Dipole(medium), COUNT).gaussians
     channels = len(medium.eta)
     beam = sj.GaussianBeam(
-        jnp.asarray([0.0, 0.0, 10.0]), jnp.asarray([0.0, 0.0, -1.0]), jnp.full(channels, POWER), jnp.asarray(BEAM)
+        jnp.asarray([0.0, 0.0, 10.0]),
+        jnp.asarray([0.0, 0.0, -1.0]),
+        jnp.full(channels, POWER),
+        jnp.asarray(BEAM),
     )
     scene = sj.Scene(sheet(0.25, 24.0), (beam,), sj.Material(gaussians, specular=0.0))
     image = np.asarray(sj.render(scene, camera_over(HALF_WIDTH, PIXELS), FINE).diffuse, np.float64)

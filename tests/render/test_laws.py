@@ -15,12 +15,18 @@ from splatjax.io import load_material
 from splatjax.splatting import DenseRasterizer, ShadowSettings
 
 EXITANCE_TOLERANCE = 1e-3
-PLAIN = sj.RenderSettings(shadows=ShadowSettings(resolution=32), rasterizer=DenseRasterizer(), diffuser=DenseDiffuser())
+PLAIN = sj.RenderSettings(
+    shadows=ShadowSettings(resolution=32), rasterizer=DenseRasterizer(), diffuser=DenseDiffuser()
+)
 EXACT = sj.RenderSettings(diffuser=ClusterDiffuser(error=0.0))
 
 
-def lamp(irradiance=(1.0, 1.0, 1.0), direction=(0.0, 0.0, -1.0), cast_shadows=False) -> sj.DirectionalLight:
-    return sj.DirectionalLight(jnp.asarray(direction, float), jnp.asarray(irradiance, float), cast_shadows)
+def lamp(
+    irradiance=(1.0, 1.0, 1.0), direction=(0.0, 0.0, -1.0), cast_shadows=False
+) -> sj.DirectionalLight:
+    return sj.DirectionalLight(
+        jnp.asarray(direction, float), jnp.asarray(irradiance, float), cast_shadows
+    )
 
 
 def matte(material: sj.Material) -> sj.Material:
@@ -39,27 +45,34 @@ def test_exitance_over_irradiance_is_the_total_reflectance_of_marble():
     frame = sj.render(scene, camera_over(8.0, 32))
     exitance = np.pi * middle(frame.diffuse)
     reflectance = np.asarray(material.gaussians.total_reflectance())
-    np.testing.assert_allclose(exitance, np.broadcast_to(reflectance, exitance.shape), rtol=EXITANCE_TOLERANCE)
+    np.testing.assert_allclose(
+        exitance, np.broadcast_to(reflectance, exitance.shape), rtol=EXITANCE_TOLERANCE
+    )
     held = np.asarray(sj.Dipole(sj.load_medium("marble")).total_reflectance())
     np.testing.assert_allclose(reflectance, held, rtol=EXITANCE_TOLERANCE)
 
 
 @pytest.mark.once
 def test_white_material_with_an_albedo_map_gives_the_albedo():
-    for albedo in ([0.8, 0.4, 0.1], [1.0, 1.0, 1.0]):  # and so a white diffuser that faces pi has radiance one
+    for albedo in (
+        [0.8, 0.4, 0.1],
+        [1.0, 1.0, 1.0],
+    ):  # and so a white diffuser that faces pi has radiance one
         splats = sheet(1.0, 20.0)
         colors = jnp.tile(jnp.asarray(albedo, float), (splats.count, 1))
         splats = eqx.tree_at(lambda s: s.albedo, splats, colors, is_leaf=lambda leaf: leaf is None)
         scene = sj.Scene(splats, (lamp((np.pi,) * 3),), matte(sj.Material(two_gaussians())).white())
         radiance = middle(sj.render(scene, camera_over(5.0, 32)).beauty)
-        np.testing.assert_allclose(radiance, np.broadcast_to(albedo, radiance.shape), rtol=EXITANCE_TOLERANCE)
+        np.testing.assert_allclose(
+            radiance, np.broadcast_to(albedo, radiance.shape), rtol=EXITANCE_TOLERANCE
+        )
 
 
 @pytest.mark.slow
 @pytest.mark.once
 def test_white_furnace():
-    # A sum over lights is coarse where the lobe is narrow, at the rim: more pixels see steeper ones there (1.009 at 64^2 with
-    # 512 lights; 1.0006 at 48^2 with 2048).
+    # A sum over lights is coarse where the lobe is narrow, at the rim: more pixels see steeper ones
+    # there (1.009 at 64^2 with 512 lights; 1.0006 at 48^2 with 2048).
     count = 512
     i = np.arange(count) + 0.5
     z = 1 - 2 * i / count
@@ -68,7 +81,9 @@ def test_white_furnace():
     # radiance 1 from everywhere: each light stands for its share of the sphere
     lights = tuple(lamp((4 * np.pi / count,) * 3, tuple(direction)) for direction in directions)
     scene = sj.Scene(sphere(4000), lights, sj.Material(skin().white()))
-    camera = sj.Camera.look_at(jnp.asarray([0.0, 0.0, 400.0], float), jnp.zeros(3), fov=16.0, width=32, height=32)
+    camera = sj.Camera.look_at(
+        jnp.asarray([0.0, 0.0, 400.0], float), jnp.zeros(3), fov=16.0, width=32, height=32
+    )
     frame = sj.render(scene, camera)
     covered = np.asarray(frame.coverage) > 0.999
     radiance = np.asarray(frame.beauty)[covered]
@@ -82,7 +97,9 @@ def test_white_furnace():
 def test_energy_does_not_depend_on_how_finely_half_the_sheet_is_splatted():
     coarse, fine = sheet(0.4, 16.0), sheet(0.2, 16.0)
     # cells of the coarse sheet end at x = 0.2, and there those of the shifted fine one begin
-    fine = eqx.tree_at(lambda s: s.centers, fine, fine.centers + jnp.asarray([[0.1, 0.1, 0.0]], float))
+    fine = eqx.tree_at(
+        lambda s: s.centers, fine, fine.centers + jnp.asarray([[0.1, 0.1, 0.0]], float)
+    )
     left, right = np.asarray(coarse.centers)[:, 0] < 0.1, np.asarray(fine.centers)[:, 0] > 0.25
     mixed = sj.Splats(
         *(
@@ -91,7 +108,12 @@ def test_energy_does_not_depend_on_how_finely_half_the_sheet_is_splatted():
         )
     )
     gaussians = sj.SumOfGaussians(jnp.asarray([2.0, 5.0], float), jnp.full((2, 1), 0.5, float))
-    beam = sj.GaussianBeam(jnp.asarray([0.0, 0.0, 10.0], float), jnp.asarray([0.0, 0.0, -1.0], float), jnp.ones(1), jnp.ones(()))
+    beam = sj.GaussianBeam(
+        jnp.asarray([0.0, 0.0, 10.0], float),
+        jnp.asarray([0.0, 0.0, -1.0], float),
+        jnp.ones(1),
+        jnp.ones(()),
+    )
     camera = camera_over(5.0, 32)
     pictures = []
     for splats in (coarse, mixed):
@@ -104,9 +126,13 @@ def test_energy_does_not_depend_on_how_finely_half_the_sheet_is_splatted():
 @pytest.mark.once
 def test_layers_add_up_to_the_diffuse_picture_and_that_to_beauty(bumpy_frame):
     frame = bumpy_frame
-    total = np.einsum("kc,khwc->hwc", np.asarray(frame.weights, np.float64), np.asarray(frame.layers, np.float64))
+    total = np.einsum(
+        "kc,khwc->hwc", np.asarray(frame.weights, np.float64), np.asarray(frame.layers, np.float64)
+    )
     np.testing.assert_allclose(np.asarray(frame.diffuse), total, atol=1e-6)
-    np.testing.assert_allclose(np.asarray(frame.beauty), np.asarray(frame.diffuse + frame.specular), atol=1e-6)
+    np.testing.assert_allclose(
+        np.asarray(frame.beauty), np.asarray(frame.diffuse + frame.specular), atol=1e-6
+    )
 
 
 @pytest.mark.once
@@ -122,8 +148,14 @@ def test_a_closed_surface_has_no_hole(bumpy_frame):
 @pytest.fixture(scope="module")
 def bumpy_frame() -> sj.Frame:
     """A sphere of skin lit from the side."""
-    scene = sj.Scene(sphere(3000), (lamp((3.0, 3.0, 3.0), (-1.0, -0.3, -0.5), cast_shadows=True),), sj.Material(skin()))
-    camera = sj.Camera.look_at(jnp.asarray([0.0, 0.0, 400.0], float), jnp.zeros(3), fov=18.0, width=64, height=64)
+    scene = sj.Scene(
+        sphere(3000),
+        (lamp((3.0, 3.0, 3.0), (-1.0, -0.3, -0.5), cast_shadows=True),),
+        sj.Material(skin()),
+    )
+    camera = sj.Camera.look_at(
+        jnp.asarray([0.0, 0.0, 400.0], float), jnp.zeros(3), fov=18.0, width=64, height=64
+    )
     settings = sj.RenderSettings(shadows=ShadowSettings(resolution=256))
     return sj.render(scene, camera, settings)
 
@@ -131,8 +163,14 @@ def bumpy_frame() -> sj.Frame:
 @pytest.mark.once
 def test_light_is_added_linearly():
     splats, material = sphere(1500), sj.Material(two_gaussians())
-    camera = sj.Camera.look_at(jnp.asarray([0.0, 0.0, 400.0], float), jnp.zeros(3), fov=18.0, width=32, height=32)
-    lit = ((1.0, 2.0, 3.0), (3.0, 1.0, 0.5)), ((1.0, 2.0, 3.0), (0.0,) * 3), ((0.0,) * 3, (3.0, 1.0, 0.5))
+    camera = sj.Camera.look_at(
+        jnp.asarray([0.0, 0.0, 400.0], float), jnp.zeros(3), fov=18.0, width=32, height=32
+    )
+    lit = (
+        ((1.0, 2.0, 3.0), (3.0, 1.0, 0.5)),
+        ((1.0, 2.0, 3.0), (0.0,) * 3),
+        ((0.0,) * 3, (3.0, 1.0, 0.5)),
+    )
     lights = [(lamp(one, (-1.0, 0.0, -0.2)), lamp(other, (0.5, -1.0, -0.7))) for one, other in lit]
     both, *single = (sj.render(sj.Scene(splats, each, material), camera).beauty for each in lights)
     np.testing.assert_allclose(np.asarray(both), np.asarray(single[0] + single[1]), atol=2e-6)
@@ -156,9 +194,13 @@ def test_no_splats_and_no_lights_give_an_empty_and_a_black_picture():
 def test_a_plan_that_does_not_suffice_poisons_the_picture_and_says_so():
     material = sj.Material(two_gaussians())
     camera = camera_over(5.0, 32)
-    scene = sj.Scene(sheet(0.25, 1.0), (lamp(),), material)  # that of the test of splats that move: one program
+    scene = sj.Scene(
+        sheet(0.25, 1.0), (lamp(),), material
+    )  # that of the test of splats that move: one program
     plan = sj.plan(scene, camera)
-    wider = eqx.tree_at(lambda s: s.material.gaussians.variances, scene, scene.material.gaussians.variances * 2)
+    wider = eqx.tree_at(
+        lambda s: s.material.gaussians.variances, scene, scene.material.gaussians.variances * 2
+    )
     frame = sj.render(wider, camera, plan=plan)
     assert float(frame.overflow) > 1
     assert np.all(np.isnan(np.asarray(frame.beauty)))
@@ -167,31 +209,46 @@ def test_a_plan_that_does_not_suffice_poisons_the_picture_and_says_so():
 
 @pytest.mark.once
 def test_too_few_tiles_poison_all_that_is_made_of_them_and_its_derivative():
-    scene, camera = sj.Scene(sheet(1.0, 6.0), (lamp(),), sj.Material(two_gaussians())), camera_over(5.0, 16)
+    scene, camera = (
+        sj.Scene(sheet(1.0, 6.0), (lamp(),), sj.Material(two_gaussians())),
+        camera_over(5.0, 16),
+    )
     plan = sj.plan(scene, camera, PLAIN)
     short = dataclasses.replace(plan, tiles=1)
     frame, slope = jax.value_and_grad(
-        lambda radii: jnp.sum(sj.render(eqx.tree_at(lambda s: s.splats.radii, scene, radii), camera, PLAIN, short).beauty)
+        lambda radii: jnp.sum(
+            sj.render(
+                eqx.tree_at(lambda s: s.splats.radii, scene, radii), camera, PLAIN, short
+            ).beauty
+        )
     )(scene.splats.radii)
     assert np.isnan(float(frame))
     assert np.any(np.isnan(np.asarray(slope)))  # where a pixel sees the splat: no step can be taken
     jacobian = sj.picture_jacobian(scene, camera, PLAIN, short)
     assert float(jacobian.frame.overflow) > 1
     assert np.all(np.isnan(np.asarray(jacobian.weights)))
-    assert np.all(np.isnan(np.asarray(sj.diffuse(scene, jnp.ones((scene.splats.count, 3)), camera, PLAIN, short))))
+    assert np.all(
+        np.isnan(
+            np.asarray(sj.diffuse(scene, jnp.ones((scene.splats.count, 3)), camera, PLAIN, short))
+        )
+    )
     assert float(sj.render(scene, camera, PLAIN, plan).overflow) == 0
 
 
 @pytest.mark.once
 def test_a_plan_holds_for_splats_that_move_a_little():
-    """Over a tile's edge, and away from the eye: what is seen then was not seen when it was planned."""
+    """Over a tile's edge, and away from the eye: what is seen then was not seen when it was
+    planned.
+    """
     camera = camera_over(5.0, 32)
     small = sheet(0.25, 1.0)
     material = sj.Material(two_gaussians())
     plan = sj.plan(sj.Scene(small, (lamp(),), material), camera)
     for offset in ([0.1, 0.1, 0.0], [-0.1, 0.1, 0.1], [0.0, -0.1, -0.1]):
         moved = eqx.tree_at(lambda s: s.centers, small, small.centers + jnp.asarray([offset]))
-        assert float(sj.render(sj.Scene(moved, (lamp(),), material), camera, plan=plan).overflow) == 0
+        assert (
+            float(sj.render(sj.Scene(moved, (lamp(),), material), camera, plan=plan).overflow) == 0
+        )
 
 
 @pytest.mark.once

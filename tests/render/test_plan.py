@@ -16,7 +16,9 @@ SETTINGS = sj.RenderSettings(diffuser=DenseDiffuser())  # which needs no plan
 
 
 def scene_under(*lights: AbstractLight, splats: sj.Splats | None = None) -> sj.Scene:
-    return sj.Scene(sheet(1.0, 5.0) if splats is None else splats, lights, sj.Material(two_gaussians()))
+    return sj.Scene(
+        sheet(1.0, 5.0) if splats is None else splats, lights, sj.Material(two_gaussians())
+    )
 
 
 def lamp(*direction: float, cast_shadows: bool = True) -> sj.DirectionalLight:
@@ -31,7 +33,10 @@ def camera_at(z: float) -> sj.Camera:
 def test_a_plan_of_several_scenes_has_room_for_the_shadows_of_each():
     camera = camera_at(20.0)
     steep, grazing = scene_under(lamp(0.0, 0.0, -1.0)), scene_under(lamp(0.99, 0.0, -0.14))
-    alone = [sj.plan(scene, camera, SETTINGS).shadows[0].rasterizer.capacity.bins for scene in (steep, grazing)]
+    alone = [
+        sj.plan(scene, camera, SETTINGS).shadows[0].rasterizer.capacity.bins
+        for scene in (steep, grazing)
+    ]
     assert alone[0].pairs > alone[1].pairs
     for scenes in ([steep, grazing], [grazing, steep]):
         together = sj.plan(scenes, camera, SETTINGS).shadows[0].rasterizer.capacity.bins
@@ -40,7 +45,9 @@ def test_a_plan_of_several_scenes_has_room_for_the_shadows_of_each():
 
 @pytest.mark.once
 def test_a_lamp_among_the_splats_in_one_scene_has_six_faces_in_all():
-    far, near = (scene_under(sj.PointLight(jnp.asarray([0.0, 0.0, z]), jnp.ones(3))) for z in (30.0, 1.0))
+    far, near = (
+        scene_under(sj.PointLight(jnp.asarray([0.0, 0.0, z]), jnp.ones(3))) for z in (30.0, 1.0)
+    )
     assert sj.plan([far, near], camera_at(20.0), SETTINGS).shadows[0].cube
     assert not sj.plan([far, far], camera_at(20.0), SETTINGS).shadows[0].cube
 
@@ -48,7 +55,9 @@ def test_a_lamp_among_the_splats_in_one_scene_has_six_faces_in_all():
 def test_scenes_that_differ_in_more_than_their_lights_are_refused():
     camera, scene = camera_at(20.0), scene_under(lamp(0.0, 0.0, -1.0))
     with pytest.raises(ValueError, match=r"scenes\[1\] has other splats"):
-        sj.plan([scene, scene_under(lamp(0.0, 0.0, -1.0), splats=sheet(1.0, 4.0))], camera, SETTINGS)
+        sj.plan(
+            [scene, scene_under(lamp(0.0, 0.0, -1.0), splats=sheet(1.0, 4.0))], camera, SETTINGS
+        )
     for other in (scene_under(), scene_under(lamp(0.0, 0.0, -1.0, cast_shadows=False))):
         with pytest.raises(ValueError, match=r"lights of the same kinds.*scenes\[2\]"):
             sj.plan([scene, scene, other], camera, SETTINGS)
@@ -63,8 +72,13 @@ def test_a_mesh_needs_renderers_that_can_be_cut_and_a_plan_of_its_own():
 
 
 def test_planning_gathers_from_a_mesh_of_one_device_too():
-    sharding = jax.sharding.NamedSharding(jax.make_mesh((1,), ("splats",)), jax.sharding.PartitionSpec("splats"))
-    assert isinstance(on_one_device(jax.device_put(jnp.ones(3), sharding)).sharding, jax.sharding.SingleDeviceSharding)
+    sharding = jax.sharding.NamedSharding(
+        jax.make_mesh((1,), ("splats",)), jax.sharding.PartitionSpec("splats")
+    )
+    assert isinstance(
+        on_one_device(jax.device_put(jnp.ones(3), sharding)).sharding,
+        jax.sharding.SingleDeviceSharding,
+    )
 
 
 def test_a_plan_for_other_splats_is_refused():
@@ -78,14 +92,22 @@ def test_a_plan_for_other_splats_is_refused():
     )
     other = scene_under(splats=sheet(1.0, 4.0))
     for call in calls:
-        with pytest.raises(ValueError, match=rf"for {scene.splats.count} splats, and the scene has {other.splats.count}"):
+        with pytest.raises(
+            ValueError,
+            match=rf"for {scene.splats.count} splats, and the scene has {other.splats.count}",
+        ):
             call(other, plan)
 
 
 def test_a_batch_whose_arrays_are_not_stacked_is_refused():
     mesh = jax.make_mesh((1,), ("views",))
     with pytest.raises(ValueError, match=r"\['b'\] has none"):
-        sj.map_over(mesh, lambda one, each: each["a"], jnp.zeros(()), {"a": jnp.zeros(4), "b": jnp.zeros(())})
+        sj.map_over(
+            mesh,
+            lambda one, each: each["a"],
+            jnp.zeros(()),
+            {"a": jnp.zeros(4), "b": jnp.zeros(())},
+        )
 
 
 class Sky(AbstractLight):
@@ -104,5 +126,7 @@ def test_a_light_of_ones_own_shines_without_shadows_and_is_told_so_with_them():
     shown = sj.render(scene_under(Sky(jnp.full(3, 2.0))), camera, settings=SETTINGS)
     lit = sj.render(scene_under(lamp(0, 0, -2, cast_shadows=False)), camera, settings=SETTINGS)
     assert jnp.allclose(shown.beauty, 2 * lit.beauty, rtol=1e-5)
-    with pytest.raises(ValueError, match="Sky: no shadow map is known for it; give one with cast_shadows=False"):
+    with pytest.raises(
+        ValueError, match="Sky: no shadow map is known for it; give one with cast_shadows=False"
+    ):
         sj.plan(scene_under(Sky(jnp.ones(3), cast_shadows=True)), camera, SETTINGS)

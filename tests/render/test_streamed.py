@@ -24,19 +24,36 @@ LIGHTS = (
 )
 MATERIAL = sj.Material(
     sj.SumOfGaussians(
-        jnp.asarray([0.1, 9.0, 60.0], float), jnp.asarray([[0.2, 0.1, 0.1], [0.3, 0.3, 0.2], [0.3, 0.2, 0.1]], float)
+        jnp.asarray([0.1, 9.0, 60.0], float),
+        jnp.asarray([[0.2, 0.1, 0.1], [0.3, 0.3, 0.2], [0.3, 0.2, 0.1]], float),
     )
 )
-CAMERA = sj.Camera.look_at(jnp.asarray([20.0, 6.0, 78.0], float), jnp.zeros(3), fov=34.0, width=44, height=40)
+CAMERA = sj.Camera.look_at(
+    jnp.asarray([20.0, 6.0, 78.0], float), jnp.zeros(3), fov=34.0, width=44, height=40
+)
 
 
 @pytest.fixture(scope="module")
 def splats():
-    """A ball, a smaller one before it that casts its shadow on it, and one so far behind it that nothing is seen of it."""
-    balls = (sphere(1400, 20.0), (0.0, 0.0, 0.0)), (sphere(300, 6.0), (-8.0, 6.0, 30.0)), (sphere(500, 6.0), (-25.0, -7.0, -97.0))
-    balls = (eqx.tree_at(lambda of: of.centers, ball, ball.centers + jnp.asarray([at], float)) for ball, at in balls)
+    """A ball, a smaller one before it that casts its shadow on it, and one so far behind it that
+    nothing is seen of it.
+    """
+    balls = (
+        (sphere(1400, 20.0), (0.0, 0.0, 0.0)),
+        (sphere(300, 6.0), (-8.0, 6.0, 30.0)),
+        (sphere(500, 6.0), (-25.0, -7.0, -97.0)),
+    )
+    balls = (
+        eqx.tree_at(lambda of: of.centers, ball, ball.centers + jnp.asarray([at], float))
+        for ball, at in balls
+    )
     cloud = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *balls)
-    return eqx.tree_at(lambda each: each.albedo, cloud, 0.6 + 0.3 * jnp.sin(cloud.centers / 5), is_leaf=lambda leaf: leaf is None)
+    return eqx.tree_at(
+        lambda each: each.albedo,
+        cloud,
+        0.6 + 0.3 * jnp.sin(cloud.centers / 5),
+        is_leaf=lambda leaf: leaf is None,
+    )
 
 
 def in_parts(splats, size):
@@ -48,9 +65,21 @@ def in_parts(splats, size):
 
 
 def apart(one, other):
-    """Give by how much each field of two frames differs, over the largest number in it; infinite numbers must be the same."""
+    """Give by how much each field of two frames differs, over the largest number in it; infinite
+    numbers must be the same.
+    """
     found = {}
-    for name in ("coverage", "depth", "position", "normal", "albedo", "shadow", "irradiance", "specular", "handed_over"):
+    for name in (
+        "coverage",
+        "depth",
+        "position",
+        "normal",
+        "albedo",
+        "shadow",
+        "irradiance",
+        "specular",
+        "handed_over",
+    ):
         x, y = np.asarray(getattr(one, name)), np.asarray(getattr(other, name))
         finite = np.isfinite(x)
         np.testing.assert_array_equal(finite, np.isfinite(y))
@@ -61,17 +90,33 @@ def apart(one, other):
 def test_parts_make_the_picture_of_all_at_once(splats, monkeypatch):
     settings = sj.RenderSettings(shadows=SHADOWS)
     whole = sj.render(sj.Scene(splats, LIGHTS, MATERIAL), CAMERA, settings)
-    build, built, done, counts = ClusterTree.build, [], [], [300, 600, 900, 1200, 1500, 1800, 2100, 2200]
-    monkeypatch.setattr(ClusterTree, "build", lambda *given: built.append(len(given[0])) or build(*given))
+    build, built, done, counts = (
+        ClusterTree.build,
+        [],
+        [],
+        [300, 600, 900, 1200, 1500, 1800, 2100, 2200],
+    )
+    monkeypatch.setattr(
+        ClusterTree, "build", lambda *given: built.append(len(given[0])) or build(*given)
+    )
     streamed = sj.render_streamed(
-        in_parts(splats, 300), LIGHTS, MATERIAL, CAMERA, settings, lambda what, count: done.append((what, count))
+        in_parts(splats, 300),
+        LIGHTS,
+        MATERIAL,
+        CAMERA,
+        settings,
+        lambda what, count: done.append((what, count)),
     )
     assert streamed.overflow == 0
     assert [count for what, count in done if what == "diffusion"] == counts
     assert [count for what, count in done if what == "looking"][:16] == 2 * counts
-    assert built == [300] * 6  # no pixel gathers from the last two parts; the camera sees nothing of the fourth
+    assert (
+        built == [300] * 6
+    )  # no pixel gathers from the last two parts; the camera sees nothing of the fourth
     found = apart(whole, streamed)
-    *single, wide = (np.abs(x - y).max() / x.max() for x, y in zip(whole.layers, streamed.layers, strict=True))
+    *single, wide = (
+        np.abs(x - y).max() / x.max() for x, y in zip(whole.layers, streamed.layers, strict=True)
+    )
     assert max(single) < ROUNDING
     assert wide < CLUSTERS
     assert max(found.values()) < ROUNDING, found
@@ -80,14 +125,22 @@ def test_parts_make_the_picture_of_all_at_once(splats, monkeypatch):
 @pytest.mark.parametrize("size", [70, 2200])
 def test_how_fine_the_splats_are_is_found_of_all(splats, size):
     """By it a layer is carried or handed over, here and in `render` alike."""
-    areas = jnp.asarray(np.random.default_rng(3).permutation(np.geomspace(0.1, 10.0, splats.count)), float)
+    areas = jnp.asarray(
+        np.random.default_rng(3).permutation(np.geomspace(0.1, 10.0, splats.count)), float
+    )
     found = Survey.of(in_parts(eqx.tree_at(lambda each: each.areas, splats, areas), size)).fine
     assert found == pytest.approx(np.quantile(np.asarray(areas, np.float64), FINEST), rel=1e-6)
 
 
 def test_what_cannot_be_streamed_is_refused(splats):
     with pytest.raises(ValueError, match="DenseDiffuser"):
-        sj.render_streamed(in_parts(splats, 500), LIGHTS, MATERIAL, CAMERA, sj.RenderSettings(diffuser=DenseDiffuser()))
+        sj.render_streamed(
+            in_parts(splats, 500),
+            LIGHTS,
+            MATERIAL,
+            CAMERA,
+            sj.RenderSettings(diffuser=DenseDiffuser()),
+        )
     with pytest.raises(ValueError, match="no splats"):
         sj.render_streamed(lambda: iter(()), LIGHTS, MATERIAL, CAMERA)
     parts = [jax.tree.map(lambda leaf, size=size: leaf[:size], splats) for size in (10, 20)]

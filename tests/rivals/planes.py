@@ -13,14 +13,19 @@ HALF = 12.0
 
 
 def plane(stretch: float, quads: int = 6, half: float = HALF) -> Mesh:
-    """A square at z = 0 that faces +z; `stretch` times as many mm along u as along v, its chart in the middle of the texture."""
+    """A square at z = 0 that faces +z; `stretch` times as many mm along u as along v, its chart in
+    the middle of the texture.
+    """
     line = np.linspace(-1.0, 1.0, quads + 1)
     x, y = np.meshgrid(line, line)
     flat = np.stack([x.reshape(-1), y.reshape(-1)], axis=1)
     first = (np.arange(quads)[:, None] * (quads + 1) + np.arange(quads)).reshape(-1)
     step = quads + 1
     faces = np.concatenate(
-        [np.stack([first, first + 1, first + step + 1], 1), np.stack([first, first + step + 1, first + step], 1)]
+        [
+            np.stack([first, first + 1, first + step + 1], 1),
+            np.stack([first, first + step + 1, first + step], 1),
+        ]
     )
     vertices = np.column_stack([half * flat, np.zeros(len(flat))])
     normals = np.tile([0.0, 0.0, 1.0], (len(flat), 1))
@@ -33,7 +38,9 @@ def coordinates(points: np.ndarray, stretch: float, half: float = HALF) -> np.nd
 
 
 def spots(points: np.ndarray) -> np.ndarray:
-    """Albedo of a plane with soft-edged spots and bars of several colors, some as small as the layers are wide."""
+    """Albedo of a plane with soft-edged spots and bars of several colors, some as small as the
+    layers are wide.
+    """
     x, y = points[:, 0], points[:, 1]
     fine = 0.5 + 0.5 * np.tanh(3 * np.sin(1.6 * x) * np.sin(1.3 * y + 0.4))
     bars = 0.5 + 0.5 * np.tanh(4 * np.sin(0.9 * x + 0.3 * y))
@@ -50,7 +57,9 @@ def painted(stretch: float, size: int) -> Textures:
 
 
 def splatted(points: np.ndarray, gaussians: sj.SumOfGaussians, spacing: float = 0.3) -> np.ndarray:
-    """The layers of the plane by splat diffusion, unlit but for its paint: `[gaussians, points, channels]`."""
+    """The layers of the plane by splat diffusion, unlit but for its paint: `[gaussians, points,
+    channels]`.
+    """
     line = np.arange(-HALF + spacing / 2, HALF, spacing)
     x, y = (each.reshape(-1) for each in np.meshgrid(line, line))
     centers = np.stack([x, y, np.zeros_like(x)])
@@ -65,10 +74,14 @@ def gathered(sources: Sources, kernels: Kernels, points: np.ndarray) -> Diffused
     """What every splat gives to points, as one tile."""
     anywhere = Atlas.of(jnp.zeros((2, 1, 1)), PerspectiveView.of(camera_over(1.0, 8)), 1)
     covered = jnp.ones((1, len(points)), bool)
-    return DenseDiffuser().diffuse(sources, kernels, jnp.asarray(points.T, float)[None], covered, anywhere)
+    return DenseDiffuser().diffuse(
+        sources, kernels, jnp.asarray(points.T, float)[None], covered, anywhere
+    )
 
 
 def camera_over(half: float, pixels: int) -> sj.Camera:
     """A camera far above the middle of the plane that sees `half` mm to each side."""
     fov = float(2 * np.degrees(np.arctan(1 / 40)))
-    return sj.Camera.look_at(jnp.asarray([0.0, 0.0, 40 * half]), jnp.zeros(3), fov=fov, width=pixels, height=pixels)
+    return sj.Camera.look_at(
+        jnp.asarray([0.0, 0.0, 40 * half]), jnp.zeros(3), fov=fov, width=pixels, height=pixels
+    )

@@ -12,7 +12,11 @@ from splatjax import rivals
 def pictures():
     random = np.random.default_rng(3)
     row, column = np.indices((40, 33)) / 10
-    first = np.stack([np.sin(row) * np.cos(column), np.cos(row + column), np.sin(row * column)], axis=2) * 0.4 + 0.5
+    first = (
+        np.stack([np.sin(row) * np.cos(column), np.cos(row + column), np.sin(row * column)], axis=2)
+        * 0.4
+        + 0.5
+    )
     return first, np.clip(first + 0.1 * random.normal(size=first.shape), 0, 1)
 
 
@@ -20,7 +24,12 @@ def pictures():
 def test_similarity_is_that_of_other_code(pictures):
     first, second = (jnp.asarray(each, float) for each in pictures)
     theirs = structural_similarity(
-        *pictures, channel_axis=2, data_range=1.0, gaussian_weights=True, sigma=1.5, use_sample_covariance=False
+        *pictures,
+        channel_axis=2,
+        data_range=1.0,
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
     )
     assert float(rivals.similarity(first, second)) == pytest.approx(theirs, abs=1e-4)
     assert float(rivals.similarity(first, first)) == pytest.approx(1.0, abs=1e-5)

@@ -12,7 +12,9 @@ from splatjax import rivals
 from splatjax.splatting import PerspectiveView
 
 SIZE = 24
-CAMERA = sj.Camera.look_at(jnp.asarray([6.0, -9.0, 18.0]), jnp.zeros(3), fov=40.0, width=SIZE, height=SIZE)
+CAMERA = sj.Camera.look_at(
+    jnp.asarray([6.0, -9.0, 18.0]), jnp.zeros(3), fov=40.0, width=SIZE, height=SIZE
+)
 
 
 def seen_from(camera, corners):
@@ -24,7 +26,9 @@ def hits(camera):
     """Where the rays through the pixel centers meet z = 0."""
     x, y = (each.reshape(-1) + 0.5 for each in np.indices((camera.height, camera.width))[::-1])
     view = PerspectiveView.of(camera)
-    far = np.asarray(view.unproject(jnp.asarray(x, float), jnp.asarray(y, float), jnp.ones(x.size))).T
+    far = np.asarray(
+        view.unproject(jnp.asarray(x, float), jnp.asarray(y, float), jnp.ones(x.size))
+    ).T
     eye = np.asarray(camera.position)
     way = far - eye
     return (eye - way * (eye[2] / way[:, 2])[:, None]).reshape(camera.height, camera.width, 3)
@@ -49,14 +53,21 @@ def test_a_slanted_plane_is_seen_where_its_rays_meet_it_and_has_no_cracks(corner
 
 @pytest.mark.once
 def test_the_nearest_face_hides_the_others_and_backs_are_not_drawn(corners):
-    nearer, back = corners + jnp.asarray([0.0, 0.0, 2.0])[None, None], corners[:, ::-1] + jnp.asarray([0.0, 0.0, 4.0])[None, None]
+    nearer, back = (
+        corners + jnp.asarray([0.0, 0.0, 2.0])[None, None],
+        corners[:, ::-1] + jnp.asarray([0.0, 0.0, 4.0])[None, None],
+    )
     landing, seen = seen_from(CAMERA, jnp.concatenate([corners, nearer, back]))
     faces = np.asarray(seen.faces)[np.asarray(seen.covered)]
     count = len(corners)
     assert np.all(faces < 2 * count)
     middle = faces[len(faces) // 2]
     assert count <= middle < 2 * count
-    found = np.asarray(rivals.interpolate(jnp.concatenate([corners, nearer, back]), seen, rivals.barycentrics(landing, seen)))
+    found = np.asarray(
+        rivals.interpolate(
+            jnp.concatenate([corners, nearer, back]), seen, rivals.barycentrics(landing, seen)
+        )
+    )
     assert found[SIZE // 2, SIZE // 2, 2] == pytest.approx(2.0, abs=1e-4)
 
 
@@ -70,7 +81,9 @@ def test_a_face_that_reaches_before_the_near_plane_is_not_drawn(corners):
 @pytest.mark.once
 def test_what_lacks_room_is_told(corners):
     landing = rivals.Landing.in_view(corners, PerspectiveView.of(CAMERA))
-    assert float(rivals.see_faces(landing, 100).needed) == pytest.approx(int(landing.fragments()) / 100)
+    assert float(rivals.see_faces(landing, 100).needed) == pytest.approx(
+        int(landing.fragments()) / 100
+    )
 
 
 @pytest.mark.once
@@ -91,8 +104,15 @@ def test_attributes_have_the_derivatives_that_differences_say(float64, corners):
     def picture(corners, values, focal_length):
         camera = sj.Camera(CAMERA.position, CAMERA.rotation, focal_length, SIZE, SIZE)
         landing = rivals.Landing.in_view(corners, PerspectiveView.of(camera))
-        return jnp.sum(jnp.sin(rivals.interpolate(values, seen, rivals.barycentrics(landing, seen))))
+        return jnp.sum(
+            jnp.sin(rivals.interpolate(values, seen, rivals.barycentrics(landing, seen)))
+        )
 
     check_grads(
-        picture, (corners, values, CAMERA.focal_length.astype(float)), order=1, modes=["fwd", "rev"], rtol=1e-6, atol=1e-6
+        picture,
+        (corners, values, CAMERA.focal_length.astype(float)),
+        order=1,
+        modes=["fwd", "rev"],
+        rtol=1e-6,
+        atol=1e-6,
     )

@@ -1,4 +1,6 @@
-"""What each point-based method is known for: flat points, aliasing, holes, curved normals; and that none invents a color."""
+"""What each point-based method is known for: flat points, aliasing, holes, curved normals; and that
+none invents a color.
+"""
 
 import dataclasses
 
@@ -38,11 +40,15 @@ def plane(half_width: float, spacing: float, jitter: float = 0.0) -> sj.Splats:
     """A sheet at z = 0 that faces +z."""
     line = np.arange(-half_width, half_width + 1e-9, spacing)
     x, y = (each.reshape(-1) for each in np.meshgrid(line, line))
-    x, y = np.stack([x, y]) + np.random.default_rng(3).uniform(-jitter, jitter, (2, x.size)) * spacing
+    x, y = (
+        np.stack([x, y]) + np.random.default_rng(3).uniform(-jitter, jitter, (2, x.size)) * spacing
+    )
     flat = np.zeros_like(x)
     centers, normals = np.stack([x, y, flat], 1), np.stack([flat, flat, flat + 1], 1)
     areas = np.full(x.size, spacing**2)
-    return sj.Splats(*(jnp.asarray(each, float) for each in (centers, normals, 1.5 * np.sqrt(areas), areas)))
+    return sj.Splats(
+        *(jnp.asarray(each, float) for each in (centers, normals, 1.5 * np.sqrt(areas), areas))
+    )
 
 
 def ball(count: int, radius: float = 10.0) -> sj.Splats:
@@ -51,11 +57,18 @@ def ball(count: int, radius: float = 10.0) -> sj.Splats:
     across = np.sqrt(1 - z * z)
     normals = np.stack([np.cos(turn) * across, np.sin(turn) * across, z], 1)
     areas = np.full(count, 4 * np.pi * radius**2 / count)
-    return sj.Splats(*(jnp.asarray(each, float) for each in (radius * normals, normals, 1.5 * np.sqrt(areas), areas)))
+    return sj.Splats(
+        *(
+            jnp.asarray(each, float)
+            for each in (radius * normals, normals, 1.5 * np.sqrt(areas), areas)
+        )
+    )
 
 
 def camera(eye, fov: float = 30.0, target=(0.0, 0.0, 0.0)) -> sj.Camera:
-    return sj.Camera.look_at(jnp.asarray(eye, float), jnp.asarray(target, float), fov=fov, width=SIZE, height=SIZE)
+    return sj.Camera.look_at(
+        jnp.asarray(eye, float), jnp.asarray(target, float), fov=fov, width=SIZE, height=SIZE
+    )
 
 
 def drawn(name: str, splats: sj.Splats, rows, *cameras: sj.Camera):
@@ -64,22 +77,32 @@ def drawn(name: str, splats: sj.Splats, rows, *cameras: sj.Camera):
     rasterizer = RASTERIZERS[name].planned(splats, views, SETTINGS)
     draw = jax.jit(lambda view: bodies.drawn(splats, rows, view, SETTINGS, rasterizer).front)
     found = [draw(view) for view in views]
-    return np.stack([each.attributes for each in found]), np.stack([each.coverage for each in found])
+    return np.stack([each.attributes for each in found]), np.stack(
+        [each.coverage for each in found]
+    )
 
 
 @pytest.fixture(scope="module")
 def far_checkers():
-    """Pictures of black and white squares smaller than a pixel, from cameras that shift by fractions of a pixel."""
+    """Pictures of black and white squares smaller than a pixel, from cameras that shift by
+    fractions of a pixel.
+    """
     sheet = plane(11.0, 0.125)
-    checkers = jnp.asarray((np.floor(np.asarray(sheet.centers[:, :2]) / 0.25 + 0.25).sum(1) % 2)[None], float)
+    checkers = jnp.asarray(
+        (np.floor(np.asarray(sheet.centers[:, :2]) / 0.25 + 0.25).sum(1) % 2)[None], float
+    )
     # 48 pixels of 0.42 mm: 1.7 squares, 3.3 splats along each
     shifts = np.linspace(0, 0.4, 5)
     cameras = [camera((s, 0.6 * s, 75.0), fov=15.2, target=(s, 0.6 * s, 0.0)) for s in shifts]
-    return {name: drawn(name, sheet, checkers, *cameras)[0][:, 0, 6:-6, 6:-6] for name in RASTERIZERS}
+    return {
+        name: drawn(name, sheet, checkers, *cameras)[0][:, 0, 6:-6, 6:-6] for name in RASTERIZERS
+    }
 
 
 @pytest.mark.once
-def test_squares_smaller_than_a_pixel_are_gray_where_there_is_a_filter_and_alias_where_there_is_none(far_checkers):
+def test_squares_smaller_than_a_pixel_are_gray_with_a_filter_and_alias_without(
+    far_checkers,
+):
     """The mean of the squares is gray, 1/2: all contrast that is left is an alias."""
     contrast = {name: np.std(pictures) for name, pictures in far_checkers.items()}
     np.testing.assert_allclose(np.mean(far_checkers["ewa"]), 0.5, atol=0.02)
@@ -100,7 +123,9 @@ def test_a_moving_camera_does_not_make_filtered_squares_flicker(far_checkers):
 
 @pytest.mark.once
 def test_what_aliases_has_power_at_low_frequencies_where_the_squares_have_none(far_checkers):
-    """The squares' own frequency is above the pixels': below half of Nyquist everything is an alias."""
+    """The squares' own frequency is above the pixels': below half of Nyquist everything is an
+    alias.
+    """
 
     def low(pictures):
         picture = pictures[0] - pictures[0].mean()
@@ -133,7 +158,10 @@ def test_a_plane_of_one_color_has_exactly_that_color_and_lies_where_it_lies(name
 @pytest.mark.parametrize("name", RASTERIZERS)
 def test_what_is_nearer_hides_what_is_behind(name):
     near, far = plane(6.0, 1.0, jitter=0.2), plane(6.0, 1.0, jitter=0.2)
-    both = [jnp.concatenate([getattr(far, each), getattr(near, each)]) for each in ("centers", "normals", "radii", "areas")]
+    both = [
+        jnp.concatenate([getattr(far, each), getattr(near, each)])
+        for each in ("centers", "normals", "radii", "areas")
+    ]
     both[0] = both[0].at[: far.count, 2].add(-8.0)
     colors = jnp.concatenate([jnp.zeros((1, far.count)), jnp.ones((1, near.count))], axis=1)
     seen, covered = drawn(name, sj.Splats(*both), colors, camera((0.0, 0.0, 20.0), fov=20.0))
@@ -175,11 +203,15 @@ def test_an_affine_projection_leaves_holes_near_the_eye_and_an_exact_one_leaves_
 
 
 def lit_ball(settings_of, count: int):
-    """Render a ball that lies off the origin: root mean square errors of its normals (degrees) and of its light."""
+    """Render a ball that lies off the origin: root mean square errors of its normals (degrees) and
+    of its light.
+    """
     middle = np.asarray([7.0, -4.0, 3.0])
     body = ball(count)
     body = dataclasses.replace(body, centers=body.centers + jnp.asarray(middle, float)[None])
-    lamp = sj.DirectionalLight(jnp.asarray([0.4, -0.3, -1.0]), jnp.full(1, np.pi), cast_shadows=False)
+    lamp = sj.DirectionalLight(
+        jnp.asarray([0.4, -0.3, -1.0]), jnp.full(1, np.pi), cast_shadows=False
+    )
     material = sj.Material(sj.SumOfGaussians(jnp.asarray([1e-6]), jnp.ones((1, 1))), specular=0.0)
     settings, scene, seen = (
         settings_of(body),
@@ -229,28 +261,45 @@ def test_slopes_of_a_sphere_are_its_curvature_and_those_of_a_plane_are_none():
 @pytest.mark.long
 @pytest.mark.once
 def test_a_rival_renders_what_the_renderer_does_with_scattering_and_shadow():
-    """Where splats are smaller than what bends it makes little matter whether irradiance is blended or found per pixel."""
+    """Where splats are smaller than what bends it makes little matter whether irradiance is blended
+    or found per pixel.
+    """
     body = ball(1500)
-    body = dataclasses.replace(body, albedo=jnp.broadcast_to(jnp.asarray([0.9, 0.6, 0.3]), (body.count, 3)))
+    body = dataclasses.replace(
+        body, albedo=jnp.broadcast_to(jnp.asarray([0.9, 0.6, 0.3]), (body.count, 3))
+    )
     lamp = sj.DirectionalLight(jnp.asarray([0.4, -0.3, -1.0]), jnp.full(3, np.pi))
-    scene, seen = sj.Scene(body, (lamp,), sj.load_material("skin").white()), camera((0.0, 0.0, 60.0), fov=22.0)
+    scene, seen = (
+        sj.Scene(body, (lamp,), sj.load_material("skin").white()),
+        camera((0.0, 0.0, 60.0), fov=22.0),
+    )
     own = sj.render(scene, seen)
     inner = np.asarray(own.normal[..., 2]) > 0.3
     for settings in (sj.RenderSettings(lighting=LightAtPixels()), deferred_splatting()):
         off = (np.asarray(sj.render(scene, seen, settings).beauty) - np.asarray(own.beauty))[inner]
-        assert np.sqrt(np.mean(off**2)) < 0.02, settings.rasterizer  # of radiance up to 1; most of it where the light grazes
+        assert np.sqrt(np.mean(off**2)) < 0.02, (
+            settings.rasterizer
+        )  # of radiance up to 1; most of it where the light grazes
 
 
 @pytest.mark.once
 def test_without_a_plan_a_rival_says_what_to_do():
     body, seen = ball(50), camera((0.0, 0.0, 60.0))
     with pytest.raises(ValueError, match="plan"):
-        bodies.drawn(body, jnp.ones((1, 50)), PerspectiveView.of(seen), SETTINGS, BlendingRasterizer(EwaKernel()))
+        bodies.drawn(
+            body,
+            jnp.ones((1, 50)),
+            PerspectiveView.of(seen),
+            SETTINGS,
+            BlendingRasterizer(EwaKernel()),
+        )
 
 
 @pytest.mark.parametrize("name", RASTERIZERS)
 def test_what_is_blended_has_derivatives(name, float64):
-    """Of what the splats carry and of where they are, as far as no fragment comes or goes: against differences."""
+    """Of what the splats carry and of where they are, as far as no fragment comes or goes: against
+    differences.
+    """
     sheet = plane(2.0, 0.7, jitter=0.2)
     view = PerspectiveView.of(camera((1.0, 2.0, 12.0), fov=15.0))
     rasterizer = RASTERIZERS[name].planned(sheet, [view], SETTINGS)
@@ -262,7 +311,9 @@ def test_what_is_blended_has_derivatives(name, float64):
     def total(step):
         moved = dataclasses.replace(sheet, centers=sheet.centers + step * direction)
         front = bodies.drawn(moved, rows * (1 + step), view, SETTINGS, rasterizer).front
-        return jnp.sum(turn * front.attributes[0]) + jnp.sum(turn * jnp.where(front.weight_sum > 0, front.depth, 0.0))
+        return jnp.sum(turn * front.attributes[0]) + jnp.sum(
+            turn * jnp.where(front.weight_sum > 0, front.depth, 0.0)
+        )
 
     step = 1e-8  # a longer one changes which splat some pixel shows
     expected = (total(step) - total(-step)) / (2 * step)
@@ -273,6 +324,9 @@ def test_what_is_blended_has_derivatives(name, float64):
 def test_single_scattering_is_not_differentiated_under_light_at_pixels():
     body, seen = ball(50), camera((0.0, 0.0, 60.0))
     medium = sj.Medium(jnp.full(1, 0.1), jnp.full(1, 1.0), jnp.full(1, 1.3))
-    material = sj.Material(sj.SumOfGaussians(jnp.ones(1), jnp.ones((1, 1))), single_scattering=sj.SingleScattering(medium))
+    material = sj.Material(
+        sj.SumOfGaussians(jnp.ones(1), jnp.ones((1, 1))),
+        single_scattering=sj.SingleScattering(medium),
+    )
     with pytest.raises(ValueError, match="lighting"):
         sj.picture_jacobian(sj.Scene(body, (), material), seen, deferred_splatting())

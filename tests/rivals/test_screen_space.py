@@ -1,4 +1,6 @@
-"""Screen-space diffusion: on a frontal plane it is a convolution, and one kernel is not the sum of its Gaussians."""
+"""Screen-space diffusion: on a frontal plane it is a convolution, and one kernel is not the sum of
+its Gaussians.
+"""
 
 import dataclasses
 
@@ -13,7 +15,9 @@ import splatjax as sj
 from splatjax import rivals
 
 SIZE, HALF = 128, 12.0
-TWO = sj.SumOfGaussians(jnp.asarray([0.3, 2.0], float), jnp.asarray([[0.5, 0.4, 0.3], [0.5, 0.6, 0.7]], float))
+TWO = sj.SumOfGaussians(
+    jnp.asarray([0.3, 2.0], float), jnp.asarray([[0.5, 0.4, 0.3], [0.5, 0.6, 0.7]], float)
+)
 ONE = sj.SumOfGaussians(jnp.asarray([1.0], float), jnp.ones((1, 3)))
 CAMERA = camera_over(HALF, SIZE)
 INSIDE = slice(SIZE // 4, -SIZE // 4)
@@ -29,25 +33,45 @@ def flat(light: np.ndarray) -> sj.Frame:
     depth, irradiance = 40 * HALF * ones, jnp.asarray(light, float)
     layers, weights = none[None], jnp.ones((1, 3))
     black = none, none, jnp.zeros(1), jnp.zeros(())
-    return sj.Frame(none, ones, depth, position, normal, none + 1, ones[None], irradiance, layers, weights, *black)
+    return sj.Frame(
+        none,
+        ones,
+        depth,
+        position,
+        normal,
+        none + 1,
+        ones[None],
+        irradiance,
+        layers,
+        weights,
+        *black,
+    )
 
 
 def picture_of(function) -> np.ndarray:
     row, column = np.indices((SIZE, SIZE)).reshape(2, -1)
-    points = np.stack([(column + 0.5) / SIZE * 2 * HALF - HALF, HALF - (row + 0.5) / SIZE * 2 * HALF], axis=1)
+    points = np.stack(
+        [(column + 0.5) / SIZE * 2 * HALF - HALF, HALF - (row + 0.5) / SIZE * 2 * HALF], axis=1
+    )
     return function(points).reshape(SIZE, SIZE, 3)
 
 
 def convolved(light: np.ndarray, gaussians: sj.SumOfGaussians) -> np.ndarray:
-    """The two-dimensional convolution with the profile, over whole pixels; right but for what comes from beyond the picture."""
+    """The two-dimensional convolution with the profile, over whole pixels; right but for what comes
+    from beyond the picture.
+    """
     step = 2 * HALF / SIZE
     line = np.arange(-SIZE // 2, SIZE // 2 + 1) * step
     x, y = np.meshgrid(line, line)
     total = np.zeros_like(light)
-    for variance, weights in zip(np.asarray(gaussians.variances), np.asarray(gaussians.weights), strict=True):
+    for variance, weights in zip(
+        np.asarray(gaussians.variances), np.asarray(gaussians.weights), strict=True
+    ):
         kernel = np.exp(-(x**2 + y**2) / (2 * variance))
         for channel, weight in enumerate(weights):
-            total[..., channel] += weight * fftconvolve(light[..., channel], kernel / kernel.sum(), mode="same")
+            total[..., channel] += weight * fftconvolve(
+                light[..., channel], kernel / kernel.sum(), mode="same"
+            )
     return total
 
 
@@ -57,7 +81,9 @@ def exitance(frame, gaussians, kernel):
     return jnp.pi * rivals.diffuse_on_screen(frame, CAMERA, material, kernel).diffuse
 
 
-def off_by(light: np.ndarray, gaussians: sj.SumOfGaussians, kernel: rivals.AbstractScreenKernel) -> float:
+def off_by(
+    light: np.ndarray, gaussians: sj.SumOfGaussians, kernel: rivals.AbstractScreenKernel
+) -> float:
     """The largest difference from the convolution, of its peak, away from the edges."""
     found, truth = np.asarray(exitance(flat(light), gaussians, kernel)), convolved(light, gaussians)
     return float(np.max(np.abs(found - truth)[INSIDE, INSIDE]) / np.max(truth))
@@ -89,7 +115,9 @@ def test_one_kernel_is_the_convolution_for_one_gaussian_alone(spotted):
 
 
 @pytest.mark.once
-def test_a_preintegrated_kernel_is_right_along_straight_edges_and_the_shipped_one_is_not(edge, spotted):
+def test_a_preintegrated_kernel_is_right_along_straight_edges_and_the_shipped_one_is_not(
+    edge, spotted
+):
     preintegrated = rivals.PreintegratedKernel()
     assert off_by(edge, TWO, preintegrated) < 4e-2  # 3.5e-2, the ends of its taps
     assert off_by(edge, TWO, SHIPPED) > 6e-2  # 6.3e-2
@@ -99,11 +127,15 @@ def test_a_preintegrated_kernel_is_right_along_straight_edges_and_the_shipped_on
 @pytest.mark.once
 @pytest.mark.parametrize("kernel", [PASSES, SHIPPED])
 def test_constant_light_stays_constant_and_does_not_jump_to_another_surface(kernel):
-    """The right half of the picture lies 100 mm farther away, and is dark; a corner shows nothing."""
+    """The right half of the picture lies 100 mm farther away, and is dark; a corner shows
+    nothing.
+    """
     right = np.indices((SIZE, SIZE))[1] >= SIZE // 2
     corner = np.indices((SIZE, SIZE)).sum(axis=0) < 20
     frame = flat(np.repeat(np.where(right, 0.0, 1.0)[..., None], 3, axis=2))
-    depth = jnp.where(jnp.asarray(corner), jnp.inf, frame.depth + jnp.asarray(np.where(right, 100.0, 0.0), float))
+    depth = jnp.where(
+        jnp.asarray(corner), jnp.inf, frame.depth + jnp.asarray(np.where(right, 100.0, 0.0), float)
+    )
     coverage = jnp.where(jnp.asarray(corner), 0.0, frame.coverage)
     irradiance = frame.irradiance * coverage[..., None]
     frame = dataclasses.replace(frame, depth=depth, coverage=coverage, irradiance=irradiance)

@@ -1,4 +1,6 @@
-"""Texture-space diffusion: on a flat plane it is splat diffusion, if it knows how the chart is stretched."""
+"""Texture-space diffusion: on a flat plane it is splat diffusion, if it knows how the chart is
+stretched.
+"""
 
 import dataclasses
 
@@ -16,11 +18,15 @@ from splatjax.diffusion import ExitOdds, Kernels, PlainMean, Sources
 from splatjax.geometry import Mesh
 
 SIZE = 192
-TWO = sj.SumOfGaussians(jnp.asarray([3.0, 0.5], float), jnp.asarray([[0.5, 0.6, 0.7], [0.5, 0.4, 0.3]], float))
+TWO = sj.SumOfGaussians(
+    jnp.asarray([3.0, 0.5], float), jnp.asarray([[0.5, 0.6, 0.7], [0.5, 0.4, 0.3]], float)
+)
 """The wider first: layers keep the order of the Gaussians."""
 DULL = sj.Material(TWO, specular=0.0)
 FRONTAL = sj.DirectionalLight(jnp.asarray([0.0, 0.0, -1.0]), jnp.ones(3), cast_shadows=False)
-STILL = rivals.TextureSpaceSettings(SIZE, rivals.StretchCorrected(), rivals.OpaqueParts(), PlainMean())
+STILL = rivals.TextureSpaceSettings(
+    SIZE, rivals.StretchCorrected(), rivals.OpaqueParts(), PlainMean()
+)
 
 
 @eqx.filter_jit
@@ -32,12 +38,16 @@ def diffused(mesh, settings, plan, uvs):
 
 
 def off_by(stretch: float, correction: rivals.AbstractStretch) -> float:
-    """How far the layers of the painted plane are from those of splats, of the peak; away from its edges."""
+    """How far the layers of the painted plane are from those of splats, of the peak; away from its
+    edges.
+    """
     settings = dataclasses.replace(STILL, stretch=correction)
     mesh = rivals.TexturedMesh.of(plane(stretch), painted(stretch, SIZE))
     plan = rivals.plan_texture_space(mesh, (FRONTAL,), DULL, camera_over(6.0, 8), settings)
     line = np.linspace(-HALF / 2, HALF / 2, 16)
-    points = np.column_stack([*(each.reshape(-1) for each in np.meshgrid(line, line)), np.zeros(256)])
+    points = np.column_stack(
+        [*(each.reshape(-1) for each in np.meshgrid(line, line)), np.zeros(256)]
+    )
     ours, lost = diffused(mesh, settings, plan, jnp.asarray(coordinates(points, stretch), float))
     assert 0 < lost[1] < lost[0] < 0.2
     truth = splatted(points, TWO)
@@ -47,7 +57,9 @@ def off_by(stretch: float, correction: rivals.AbstractStretch) -> float:
 @pytest.mark.once
 def test_on_a_plane_it_is_splat_diffusion():
     assert off_by(1.0, rivals.StretchCorrected()) < 2e-3  # 1.4e-3
-    assert off_by(1.0, rivals.Uncorrected()) < 2e-3  # a chart that is not stretched needs no correction
+    assert (
+        off_by(1.0, rivals.Uncorrected()) < 2e-3
+    )  # a chart that is not stretched needs no correction
 
 
 @pytest.mark.once
@@ -60,7 +72,9 @@ def test_a_stretched_chart_needs_the_correction():
 def sheet():
     """A white plane with sharp edges, from in front, seen with a rim of nothing around."""
     mesh = rivals.TexturedMesh.of(plane(2.0))
-    settings = dataclasses.replace(STILL, resolution=64, thin_parts=rivals.TranslucentShadowMap(), normalization=ExitOdds())
+    settings = dataclasses.replace(
+        STILL, resolution=64, thin_parts=rivals.TranslucentShadowMap(), normalization=ExitOdds()
+    )
     lights = (dataclasses.replace(FRONTAL, cast_shadows=True),)
     camera = camera_over(15.0, 32)
     plan = rivals.plan_texture_space(mesh, lights, DULL, camera, settings)
@@ -99,14 +113,18 @@ def test_bad_input_is_refused_in_one_sentence(sheet):
     with pytest.raises(ValueError, match="no texture coordinates"):
         rivals.TexturedMesh.of(Mesh(bare.vertices, bare.faces, bare.normals))
     with pytest.raises(ValueError, match=r"reach from 0.05 to 1.95; .* scale or move the charts"):
-        rivals.TexturedMesh.of(Mesh(bare.vertices, bare.faces, bare.normals, bare.uvs * [1.0, 2.0] + [0.0, 0.05]))
+        rivals.TexturedMesh.of(
+            Mesh(bare.vertices, bare.faces, bare.normals, bare.uvs * [1.0, 2.0] + [0.0, 0.05])
+        )
     lamp = sj.PointLight(jnp.asarray([0.0, 0.0, 2.0]), jnp.ones(3))
     with pytest.raises(ValueError, match=r"lights\[0\] stands 2 mm .* move it out"):
         rivals.plan_texture_space(mesh, (lamp,), DULL, camera, settings)
     with pytest.raises(ValueError, match="a plan is needed"):
-        jax.grad(lambda light: jnp.sum(rivals.render_texture_space(mesh, (light,), DULL, camera, settings).frame.beauty))(
-            lights[0]
-        )
+        jax.grad(
+            lambda light: jnp.sum(
+                rivals.render_texture_space(mesh, (light,), DULL, camera, settings).frame.beauty
+            )
+        )(lights[0])
 
 
 def slab(thickness: float) -> Mesh:
@@ -125,7 +143,9 @@ def slab(thickness: float) -> Mesh:
 def test_through_a_slab_comes_what_comes_through_splats():
     """Lit from behind: the share and the odds of leaving are those of two sheets of splats."""
     thickness, settings = 1.5, dataclasses.replace(STILL, resolution=96)
-    settings = dataclasses.replace(settings, thin_parts=rivals.TranslucentShadowMap(), normalization=ExitOdds())
+    settings = dataclasses.replace(
+        settings, thin_parts=rivals.TranslucentShadowMap(), normalization=ExitOdds()
+    )
     mesh, camera = rivals.TexturedMesh.of(slab(thickness)), camera_over(3.0, 4)
     lights = (sj.DirectionalLight(jnp.asarray([0.0, 0.0, 1.0]), jnp.ones(3)),)
     found = rivals.render_texture_space(mesh, lights, DULL, camera, settings).frame
@@ -140,7 +160,9 @@ def test_through_a_slab_comes_what_comes_through_splats():
     sources, odds = Sources(*(jnp.asarray(each, float) for each in arrays)), ExitOdds()
     kernels = Kernels.of(TWO.variances, odds)
     sums = gathered(sources, kernels, np.zeros((1, 3)))
-    gain = odds.gain(sums.exits[0][:, None], TWO.variances, TWO.weights[..., None], jnp.zeros((3, 1)))
+    gain = odds.gain(
+        sums.exits[0][:, None], TWO.variances, TWO.weights[..., None], jnp.zeros((3, 1))
+    )
     truth = np.asarray(gain * sums.means[0])[..., 0]
     assert np.all(truth[0] > 0.05)
     np.testing.assert_allclose(ours, truth, atol=5e-3)
@@ -158,10 +180,17 @@ def test_a_picture_has_the_derivatives_that_differences_say(float64):
 
     @jax.jit
     def seen(variances, albedo, direction, normals):
-        painted_mesh = eqx.tree_at(lambda each: (each.albedo, each.normals), mesh, (albedo, normals))
+        painted_mesh = eqx.tree_at(
+            lambda each: (each.albedo, each.normals), mesh, (albedo, normals)
+        )
         material = sj.Material(sj.SumOfGaussians(variances, TWO.weights), specular=0.2)
         light = (dataclasses.replace(lights[0], direction=direction),)
-        return jnp.sum(pattern * rivals.render_texture_space(painted_mesh, light, material, camera, settings, plan).frame.beauty)
+        return jnp.sum(
+            pattern
+            * rivals.render_texture_space(
+                painted_mesh, light, material, camera, settings, plan
+            ).frame.beauty
+        )
 
     given = TWO.variances, mesh.albedo, lights[0].direction, mesh.normals
     check_grads(seen, given, order=1, modes=["rev"], rtol=1e-5, atol=1e-5)

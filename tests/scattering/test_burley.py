@@ -16,7 +16,9 @@ PUBLISHED = {
 
 @pytest.mark.parametrize("scaling", PUBLISHED, ids=lambda scaling: type(scaling).__name__)
 def test_scaling_is_as_published(scaling):
-    albedo, expected = (jnp.asarray(list(each), float) for each in (PUBLISHED[scaling], PUBLISHED[scaling].values()))
+    albedo, expected = (
+        jnp.asarray(list(each), float) for each in (PUBLISHED[scaling], PUBLISHED[scaling].values())
+    )
     np.testing.assert_allclose(scaling(albedo), expected, rtol=1e-5)
     burley = Burley(albedo, jnp.full_like(albedo, 2.0), scaling)
     np.testing.assert_allclose(burley.length_scale(), 2 / np.asarray(expected), rtol=1e-5)
@@ -28,7 +30,13 @@ def test_what_leaves_within_a_radius_is_the_integral_of_the_profile():
     assert isinstance(burley.scaling, Searchlight)
     edges = np.geomspace(1e-4, 90.0, 4001)
     middle = jnp.asarray(np.sqrt(edges[1:] * edges[:-1]), float)
-    ring = 2 * np.pi * np.asarray(middle * middle)[:, None] * np.asarray(burley(middle), float) * np.log(edges[1] / edges[0])
+    ring = (
+        2
+        * np.pi
+        * np.asarray(middle * middle)[:, None]
+        * np.asarray(burley(middle), float)
+        * np.log(edges[1] / edges[0])
+    )
     within = np.asarray(burley.reflectance_within(jnp.asarray(edges, float)), float)
     np.testing.assert_allclose(within[0] + np.cumsum(ring, axis=0), within[1:], atol=2e-5)
     np.testing.assert_allclose(within[-1], burley.total_reflectance(), rtol=1e-5)
@@ -38,6 +46,10 @@ def test_what_leaves_within_a_radius_is_the_integral_of_the_profile():
 def test_albedos_beyond_the_physics_are_refused():
     one = jnp.ones(1)
     Burley(jnp.asarray([0.0, 1.0]), jnp.ones(2))
-    for albedo, path, name in ((-0.01, 1.0, "albedo"), (1.01, 1.0, "albedo"), (0.5, 0.0, "free_path")):
+    for albedo, path, name in (
+        (-0.01, 1.0, "albedo"),
+        (1.01, 1.0, "albedo"),
+        (0.5, 0.0, "free_path"),
+    ):
         with pytest.raises(ValueError, match=name):
             Burley(albedo * one, path * one)

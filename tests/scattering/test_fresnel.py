@@ -1,4 +1,6 @@
-"""Fresnel moments: integrals by an independent rule, published fits, and the limits at equal indices."""
+"""Fresnel moments: integrals by an independent rule, published fits, and the limits at equal
+indices.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -48,7 +50,14 @@ def reflectance(mu: float, eta: float) -> float:
 def moment(eta: float, power: int) -> float:
     """(power + 1) times the integral of mu^power F(mu), split at the critical angle."""
     critical = np.sqrt(max(0.0, 1 - 1 / eta**2))
-    rest, _ = quad(lambda mu: mu**power * reflectance(mu, eta), critical, 1, epsabs=1e-13, epsrel=1e-12, limit=400)
+    rest, _ = quad(
+        lambda mu: mu**power * reflectance(mu, eta),
+        critical,
+        1,
+        epsabs=1e-13,
+        epsrel=1e-12,
+        limit=400,
+    )
     return critical ** (power + 1) + (power + 1) * rest
 
 

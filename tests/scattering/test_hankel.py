@@ -13,7 +13,9 @@ ROUNDING = 1e-13
 
 
 def source(r, depth, sigma):
-    """What `exp(-depth sqrt(k^2 + sigma^2))` transforms to: a point source seen from a plane (Sommerfeld)."""
+    """What `exp(-depth sqrt(k^2 + sigma^2))` transforms to: a point source seen from a plane
+    (Sommerfeld).
+    """
     d = np.hypot(r, depth)
     return depth * (1 + sigma * d) * np.exp(-sigma * d) / (2 * np.pi * d**3)
 
@@ -48,21 +50,29 @@ def test_a_gaussian_stays_one(float64):
     np.testing.assert_allclose(hankel_transform(gaussian, k), transform(k), atol=1e-11)
     r = jnp.linspace(0, 3, 20)
     expected = gaussian(jnp.broadcast_to(r[:, None], (20, 2)))
-    np.testing.assert_allclose(inverse_hankel_transform(transform, r, jnp.sqrt(variance)), expected, atol=1e-12)
+    np.testing.assert_allclose(
+        inverse_hankel_transform(transform, r, jnp.sqrt(variance)), expected, atol=1e-12
+    )
 
 
 def test_in_the_precision_of_the_run(dtype):
     r = jnp.asarray([0.0, 0.01, 0.3, 3.0, 20.0], dtype)
     found = inverse_hankel_transform(lambda k: jnp.exp(-k), r, jnp.ones(1, dtype))[:, 0]
     assert found.dtype == dtype
-    np.testing.assert_allclose(found, source(np.asarray(r), 1.0, 0.0), atol=200 * jnp.finfo(dtype).eps)
+    np.testing.assert_allclose(
+        found, source(np.asarray(r), 1.0, 0.0), atol=200 * jnp.finfo(dtype).eps
+    )
 
 
 def test_derivatives(float64):
     def value(r, sigma):
-        return inverse_hankel_transform(lambda k: jnp.exp(-jnp.sqrt(k * k + sigma**2)), r, jnp.ones(1))
+        return inverse_hankel_transform(
+            lambda k: jnp.exp(-jnp.sqrt(k * k + sigma**2)), r, jnp.ones(1)
+        )
 
-    check_grads(jax.jit(value), (jnp.asarray([0.02, 0.3, 4.0]), jnp.asarray(0.4)), order=1, rtol=1e-6)
+    check_grads(
+        jax.jit(value), (jnp.asarray([0.02, 0.3, 4.0]), jnp.asarray(0.4)), order=1, rtol=1e-6
+    )
     # At the axis a round function is flat; beside it the series has the slope of the source.
     slope = jax.jacfwd(lambda r: value(r, 0.0))
     assert slope(jnp.asarray(0.0))[0] == 0

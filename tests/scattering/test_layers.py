@@ -8,7 +8,16 @@ import numpy as np
 import pytest
 from scipy.special import expn
 
-from splatjax.scattering import Dipole, EganFresnel, ExactFresnel, Film, Layer, LayeredMultipole, Medium, Multipole
+from splatjax.scattering import (
+    Dipole,
+    EganFresnel,
+    ExactFresnel,
+    Film,
+    Layer,
+    LayeredMultipole,
+    Medium,
+    Multipole,
+)
 from splatjax.scattering._adding import Response, diffuse_transmittance, hyperbolic_ratio
 
 INFINITE = float("inf")
@@ -16,15 +25,26 @@ MARBLE_GREEN = (0.0041, 2.62, 1.5)
 
 
 def layer(sigma_a, sigma_s_prime, eta, thickness, dtype=None) -> Layer:
-    one = (jnp.asarray([each], dtype or jnp.result_type(float)) for each in (sigma_a, sigma_s_prime, eta))
+    one = (
+        jnp.asarray([each], dtype or jnp.result_type(float))
+        for each in (sigma_a, sigma_s_prime, eta)
+    )
     return Layer(Medium(*one), jnp.asarray(thickness))
 
 
 def image_sum(slab: Layer, eta_above: float, eta_below: float, r: np.ndarray, images: int):
-    """Donner and Jensen's multipole, source by source: reflectance and transmittance of one channel."""
+    """Donner and Jensen's multipole, source by source: reflectance and transmittance of one
+    channel.
+    """
     medium, d = slab.medium, float(slab.thickness)
-    length, sigma_tr = float(1 / medium.sigma_t_prime[0]), float(jnp.sqrt(medium.squared_sigma_tr[0]))
-    above, below = (2 / 3 * length * float(ExactFresnel().boundary(medium.eta / eta)[0]) for eta in (eta_above, eta_below))
+    length, sigma_tr = (
+        float(1 / medium.sigma_t_prime[0]),
+        float(jnp.sqrt(medium.squared_sigma_tr[0])),
+    )
+    above, below = (
+        2 / 3 * length * float(ExactFresnel().boundary(medium.eta / eta)[0])
+        for eta in (eta_above, eta_below)
+    )
     period = 2 * (d + above + below)
 
     def field(z):
@@ -52,7 +72,9 @@ def test_closed_form_is_the_image_sum(float64, thickness):
 
 def test_a_slab_without_absorption_keeps_all_light(float64):
     profile = Multipole(layer(0.0, 2.0, 1.4, 3.0), 1.1, 1.5)
-    np.testing.assert_allclose(profile.total_reflectance() + profile.total_transmittance(), 1, rtol=1e-14)
+    np.testing.assert_allclose(
+        profile.total_reflectance() + profile.total_transmittance(), 1, rtol=1e-14
+    )
     lossy = Multipole(layer(1e-9, 2.0, 1.4, 3.0), 1.1, 1.5)
     np.testing.assert_allclose(lossy.total_reflectance(), profile.total_reflectance(), rtol=1e-7)
 
@@ -69,14 +91,18 @@ def test_a_thick_slab_is_the_half_space(float64):
 
 
 def test_the_sum_of_images_has_its_derivatives_where_it_is_expanded(float64):
-    """The even function of s, expanded about 0 and computed: values and derivatives meet at the border, `s H = 0.05`."""
+    """The even function of s, expanded about 0 and computed: values and derivatives meet at the
+    border, `s H = 0.05`.
+    """
     a, b, fall = jnp.asarray(1.3), jnp.asarray(0.4), jnp.asarray(0.6)
 
     def ratio(u):
         return hyperbolic_ratio(u, a, b, fall, a + b + fall)
 
     border = 0.05**2 / 2.3**2
-    below, above = (jax.value_and_grad(ratio)(jnp.asarray(border * side)) for side in (1 - 1e-9, 1 + 1e-9))
+    below, above = (
+        jax.value_and_grad(ratio)(jnp.asarray(border * side)) for side in (1 - 1e-9, 1 + 1e-9)
+    )
     np.testing.assert_allclose(below[0], above[0], rtol=1e-12)
     np.testing.assert_allclose(below[1], above[1], rtol=1e-7)
     s = 0.7
@@ -101,7 +127,9 @@ def test_adding_sums_the_series(float64):
     bounces = [(b.reflectance_above * a.reflectance_below) ** n for n in range(60)]
     series = reduce(jnp.add, bounces)
     both = a.over(b)
-    np.testing.assert_allclose(both.transmittance_down, a.transmittance_down * b.transmittance_down * series, rtol=1e-12)
+    np.testing.assert_allclose(
+        both.transmittance_down, a.transmittance_down * b.transmittance_down * series, rtol=1e-12
+    )
     inner = a.transmittance_down * b.reflectance_above * a.transmittance_up * series
     np.testing.assert_allclose(both.reflectance_above, a.reflectance_above + inner, rtol=1e-12)
 
@@ -119,7 +147,9 @@ def test_a_film_of_no_depth_changes_nothing(float64):
     film = Film(jnp.zeros(1))
     r = jnp.asarray([0.0, 0.5, 3.0])
     for places in ([film, *stack], [stack[0], film, stack[1]]):
-        np.testing.assert_allclose(LayeredMultipole(places)(r), LayeredMultipole(stack)(r), rtol=1e-12)
+        np.testing.assert_allclose(
+            LayeredMultipole(places)(r), LayeredMultipole(stack)(r), rtol=1e-12
+        )
 
 
 def test_films_on_each_other_are_one(float64):
@@ -129,7 +159,9 @@ def test_films_on_each_other_are_one(float64):
     np.testing.assert_allclose(two.total_reflectance(), one.total_reflectance(), rtol=1e-14)
     bare = LayeredMultipole([slab]).total_reflectance()
     # In as a beam, out as diffuse light: 0.779 and 0.649 of it at an optical depth of a quarter.
-    np.testing.assert_allclose(one.total_reflectance() / bare, np.exp(-0.25) * 2 * expn(3, 0.25), rtol=1e-12)
+    np.testing.assert_allclose(
+        one.total_reflectance() / bare, np.exp(-0.25) * 2 * expn(3, 0.25), rtol=1e-12
+    )
     np.testing.assert_allclose([np.exp(-0.25), 2 * expn(3, 0.25)], [0.779, 0.649], atol=5e-4)
 
 
@@ -157,25 +189,36 @@ def test_the_seam_without_absorption(float64):
     """Matched everywhere, `T = (l + z_b) / (d + 3 z_b - l)`."""
     d, length, boundary = 6.0, 0.5, 2 / 3 * 0.5
     halves = LayeredMultipole([layer(0.0, 2.0, 1.0, d / 2)] * 2)
-    np.testing.assert_allclose(halves.total_transmittance(), (length + boundary) / (d + 3 * boundary - length), rtol=1e-13)
+    np.testing.assert_allclose(
+        halves.total_transmittance(), (length + boundary) / (d + 3 * boundary - length), rtol=1e-13
+    )
 
 
 def test_three_layers_of_skin(float64):
-    """Donner and Jensen's skin with the thicknesses and the index that we chose; reference: the same sums in another program."""
+    """Donner and Jensen's skin with the thicknesses and the index that we chose; reference: the
+    same sums in another program.
+    """
     per_cm = (
         ((2.1, 2.1, 5.0), (48.0, 60.0, 65.0), 0.25),
         ((0.16, 0.19, 0.30), (32.0, 40.0, 46.0), 2.0),
         ((0.085, 1.0, 25.0), (4.5, 4.7, 4.8), INFINITE),
     )
-    stack = [Layer(Medium(jnp.asarray(a) / 10, jnp.asarray(s) / 10, jnp.full(3, 1.4)), jnp.asarray(d)) for a, s, d in per_cm]
+    stack = [
+        Layer(Medium(jnp.asarray(a) / 10, jnp.asarray(s) / 10, jnp.full(3, 1.4)), jnp.asarray(d))
+        for a, s, d in per_cm
+    ]
     profile = LayeredMultipole(stack, fresnel=EganFresnel())
     np.testing.assert_allclose(profile.total_reflectance(), [0.5377, 0.5348, 0.4093], atol=6e-5)
 
 
 def test_too_thin_is_refused(dtype):
-    with pytest.raises(ValueError, match=r"at least 1 in every channel: diffusion does not hold.*got \[0\.78"):
+    with pytest.raises(
+        ValueError, match=r"at least 1 in every channel: diffusion does not hold.*got \[0\.78"
+    ):
         Multipole(layer(0.0041, 2.62, 1.5, 0.3))
-    with pytest.raises(ValueError, match=r"at least 1 in every channel: diffusion does not hold.*got \[0\.78"):
+    with pytest.raises(
+        ValueError, match=r"at least 1 in every channel: diffusion does not hold.*got \[0\.78"
+    ):
         LayeredMultipole([layer(0.0041, 2.62, 1.5, 0.3), layer(0.0041, 2.62, 1.5, INFINITE)])
 
     @jax.jit

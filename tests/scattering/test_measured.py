@@ -7,7 +7,13 @@ import pytest
 
 from splatjax.fitting import NonNegativeWeights, TotalReflectanceHeld, fit_gaussians, relative_error
 from splatjax.gaussians import SumOfGaussians
-from splatjax.scattering import NORM_RULE, InverseVariance, Tabulated, integrated_reflectance, measure_laser_dot
+from splatjax.scattering import (
+    NORM_RULE,
+    InverseVariance,
+    Tabulated,
+    integrated_reflectance,
+    measure_laser_dot,
+)
 
 TRUTH = ([0.3, 2.0], [[0.3, 0.2], [0.4, 0.1]])
 MM_PER_PIXEL = 0.1
@@ -17,7 +23,9 @@ def truth() -> SumOfGaussians:
     return SumOfGaussians(*(jnp.asarray(each, float) for each in TRUTH))
 
 
-def photograph(pixels: int = 121, noise: float = 0.0, power: float = 2.0, center=(60.2, 61.3)) -> np.ndarray:
+def photograph(
+    pixels: int = 121, noise: float = 0.0, power: float = 2.0, center=(60.2, 61.3)
+) -> np.ndarray:
     y, x = (np.mgrid[:pixels, :pixels] + 0.5) * MM_PER_PIXEL
     squared = (x - center[0] * MM_PER_PIXEL) ** 2 + (y - center[1] * MM_PER_PIXEL) ** 2
     variances, weights = (np.asarray(each) for each in TRUTH)
@@ -32,7 +40,9 @@ def test_integrals_of_a_table_are_sums_over_its_radii(float64):
     np.testing.assert_allclose(integrated_reflectance(table), table.total_reflectance(), rtol=1e-3)
     beyond = NORM_RULE.beyond(1.0)
     radii, weights = beyond.radii(table)
-    np.testing.assert_array_equal(np.asarray(weights) > 0, np.asarray(radii) >= np.asarray(table.length_scale()))
+    np.testing.assert_array_equal(
+        np.asarray(weights) > 0, np.asarray(radii) >= np.asarray(table.length_scale())
+    )
 
 
 def test_half_of_a_table_lies_within_its_length_scale(float64):
@@ -42,11 +52,15 @@ def test_half_of_a_table_lies_within_its_length_scale(float64):
     half = np.sqrt(np.log(2.0))
     # Of the second, which falls three times as far out, 7% lie beyond the last radius.
     cut = 1 - np.exp(-(float(r[-1]) ** 2) / 9)
-    np.testing.assert_allclose(table.length_scale(), [half, 3 * np.sqrt(-np.log1p(-0.5 * cut))], rtol=5e-3)
+    np.testing.assert_allclose(
+        table.length_scale(), [half, 3 * np.sqrt(-np.log1p(-0.5 * cut))], rtol=5e-3
+    )
 
 
 def test_a_table_is_fitted_over_its_own_radii_alone(float64):
-    """A table that ends early says nothing of the tail: the Gaussians behind it come back all the same."""
+    """A table that ends early says nothing of the tail: the Gaussians behind it come back all the
+    same.
+    """
     r = jnp.linspace(0.05, 3.0, 60)
     fitted = fit_gaussians(Tabulated(r, truth()(r)), 2)
     np.testing.assert_allclose(fitted.gaussians.variances, truth().variances, rtol=1e-6)
@@ -54,19 +68,25 @@ def test_a_table_is_fitted_over_its_own_radii_alone(float64):
 
 
 def test_covariance_of_a_measured_fit_is_the_scatter_of_its_repetitions(float64):
-    """Noise of equal weight in Eq. 3: the residuals' sum over the degrees of freedom scales the covariance."""
+    """Noise of equal weight in Eq. 3: the residuals' sum over the degrees of freedom scales the
+    covariance.
+    """
     r = jnp.linspace(0.05, 5.0, 80)
     deviation = 0.002 / jnp.sqrt(r)
     noise = np.random.default_rng(0).normal(size=(200, 80, 1))
     values = jnp.asarray(np.asarray(truth()(r))[:, :1] + np.asarray(deviation)[:, None] * noise)
-    fitted = eqx.filter_jit(eqx.filter_vmap(lambda values: fit_gaussians(Tabulated(r, values), 2, throw=False)))(values)
+    fitted = eqx.filter_jit(
+        eqx.filter_vmap(lambda values: fit_gaussians(Tabulated(r, values), 2, throw=False))
+    )(values)
     found = np.concatenate([fitted.gaussians.variances, fitted.gaussians.weights[..., 0]], axis=1)
     stated = np.asarray(fitted.covariance) / (80 - 4)
     np.testing.assert_allclose(np.cov(found.T), np.median(stated, axis=0), rtol=0.3, atol=2e-7)
 
 
 def test_a_fit_weighed_by_its_errors_is_the_likeliest(float64):
-    """Noise of very different sizes: the scatter of repetitions is as stated, and less than by the integral's weights."""
+    """Noise of very different sizes: the scatter of repetitions is as stated, and less than by the
+    integral's weights.
+    """
     r = jnp.linspace(0.05, 5.0, 80)
     clean = np.asarray(truth()(r))[:, :1]
     deviation = jnp.asarray(0.03 * clean + 1e-5)
@@ -78,10 +98,14 @@ def test_a_fit_weighed_by_its_errors_is_the_likeliest(float64):
 
     fits = eqx.filter_jit(eqx.filter_vmap(fit, in_axes=(0, None)))
     found, plain = fits(values, InverseVariance()), fits(values, NORM_RULE)
-    parameters = np.concatenate([found.gaussians.variances, found.gaussians.weights[..., 0]], axis=1)
+    parameters = np.concatenate(
+        [found.gaussians.variances, found.gaussians.weights[..., 0]], axis=1
+    )
     stated = np.asarray(found.covariance) / (80 - 4)
     np.testing.assert_allclose(np.cov(parameters.T), np.median(stated, axis=0), rtol=0.3, atol=1e-6)
-    chi_squared = np.asarray(found.error)[:, 0] ** 2 * np.sum((np.asarray(values) / np.asarray(deviation)) ** 2, axis=(1, 2))
+    chi_squared = np.asarray(found.error)[:, 0] ** 2 * np.sum(
+        (np.asarray(values) / np.asarray(deviation)) ** 2, axis=(1, 2)
+    )
     assert abs(np.mean(chi_squared) - (80 - 4)) < 3
     assert np.std(found.gaussians.weights[:, 1, 0]) < 0.7 * np.std(plain.gaussians.weights[:, 1, 0])
 
@@ -128,18 +152,24 @@ def test_rings_end_at_the_nearest_edge(center):
     nearest = MM_PER_PIXEL * min(*center, 121 - center[0], 121 - center[1])
     dot = measure_laser_dot(photograph(center=center), MM_PER_PIXEL, power=2.0, center=center)
     assert nearest - 1.5 * MM_PER_PIXEL < float(dot.profile.radii[-1]) < nearest
-    shorter = measure_laser_dot(photograph(center=center), MM_PER_PIXEL, power=2.0, center=center, largest=1.0)
+    shorter = measure_laser_dot(
+        photograph(center=center), MM_PER_PIXEL, power=2.0, center=center, largest=1.0
+    )
     assert 1.0 - 1.5 * MM_PER_PIXEL < float(shorter.profile.radii[-1]) < 1.0
     np.testing.assert_allclose(dot.profile.values, truth()(dot.profile.radii), rtol=0.02, atol=1e-4)
 
 
 def test_a_ring_is_where_its_pixels_are_on_average(float64):
-    """What falls as the square of the distance from the center is found at every radius as it is, however wide the rings."""
+    """What falls as the square of the distance from the center is found at every radius as it is,
+    however wide the rings.
+    """
     x0, y0 = center = 17.3, 20.6
     y, x = np.mgrid[:40, :40] + 0.5
     squared = MM_PER_PIXEL**2 * ((x - x0) ** 2 + (y - y0) ** 2)
     for step in (1.0, 2.5):
-        dot = measure_laser_dot(9 - squared[..., None], MM_PER_PIXEL, power=np.pi, center=center, step=step)
+        dot = measure_laser_dot(
+            9 - squared[..., None], MM_PER_PIXEL, power=np.pi, center=center, step=step
+        )
         np.testing.assert_allclose(dot.profile.values[:, 0], 9 - dot.profile.radii**2, rtol=1e-12)
 
 
@@ -149,7 +179,9 @@ def test_saturated_rings_are_left_out(float64):
     dot = measure_laser_dot(np.minimum(image, limit), MM_PER_PIXEL, power=2.0, saturation=limit)
     np.testing.assert_allclose(dot.profile.values, truth()(dot.profile.radii), rtol=0.03)
     assert float(jnp.max(dot.profile.values)) < np.pi * limit / 2
-    with pytest.raises(ValueError, match=r"at least two rings; 0 of \d+ are inside and not saturated"):
+    with pytest.raises(
+        ValueError, match=r"at least two rings; 0 of \d+ are inside and not saturated"
+    ):
         measure_laser_dot(image, MM_PER_PIXEL, power=2.0, saturation=0.0)
 
 

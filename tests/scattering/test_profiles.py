@@ -37,7 +37,9 @@ def medium(sigma_a=(0.0041, 0.17), sigma_s_prime=(2.62, 0.88), eta=(1.5, 1.3), s
 def layers(m: Medium, scale=1.0):
     lower = Medium(0.5 * m.sigma_a, 1.5 * m.sigma_s_prime, jnp.full_like(m.eta, 1.4))
     film = Film(jnp.full_like(m.eta, 0.1))
-    return LayeredMultipole([film, Layer(m, jnp.asarray(2.0 / scale)), Layer(lower, jnp.asarray(jnp.inf))])
+    return LayeredMultipole(
+        [film, Layer(m, jnp.asarray(2.0 / scale)), Layer(lower, jnp.asarray(jnp.inf))]
+    )
 
 
 MODELS = {
@@ -55,8 +57,11 @@ models = pytest.mark.parametrize("model", MODELS.values(), ids=MODELS.keys())
 @models
 def test_total_is_the_integral(float64, model):
     profile = model(medium(), 1.0)
-    # Hankel transforms leave 1e-16 / r: an end at 3000 free paths keeps that out, and what absorption leaves there is nothing.
-    total = jax.jit(integrated_reflectance, static_argnums=1)(profile, RadialRule(smallest=1e-3, largest=3e3, count=256))
+    # Hankel transforms leave 1e-16 / r: an end at 3000 free paths keeps that out, and what
+    # absorption leaves there is nothing.
+    total = jax.jit(integrated_reflectance, static_argnums=1)(
+        profile, RadialRule(smallest=1e-3, largest=3e3, count=256)
+    )
     np.testing.assert_allclose(total, profile.total_reflectance(), rtol=1e-9)
     assert np.all(np.asarray(total) < 1)
 
@@ -85,7 +90,13 @@ def test_derivatives(float64, name):
         return profile(r), profile.total_reflectance()
 
     m = medium()
-    check_grads(jax.jit(values), (m.sigma_a, m.sigma_s_prime, m.eta, jnp.asarray([0.1, 1.0, 4.0])), order=1, rtol=1e-5, eps=1e-6)
+    check_grads(
+        jax.jit(values),
+        (m.sigma_a, m.sigma_s_prime, m.eta, jnp.asarray([0.1, 1.0, 4.0])),
+        order=1,
+        rtol=1e-5,
+        eps=1e-6,
+    )
 
 
 @models
@@ -95,7 +106,8 @@ def test_derivative_without_absorption_is_the_one_sided_limit(float64, model):
         return model(medium(sigma_a[None], (1.4,), (1.3,)), 1.0)(jnp.asarray([0.3, 1.5]))[:, 0]
 
     zero, h = jnp.asarray(0.0), 1e-7
-    # A profile goes as sigma_a and sigma_a^(3/2): two quotients, extrapolated in the root of the step.
+    # A profile goes as sigma_a and sigma_a^(3/2): two quotients, extrapolated in the root of the
+    # step.
     quotients = [(values(jnp.asarray(step)) - values(zero)) / step for step in (h, 4 * h)]
     exact = jax.jacfwd(values)(zero)
     assert np.all(exact != 0)
@@ -108,7 +120,8 @@ def test_derivative_at_equal_indices_is_the_limit_from_above(float64, model):
     def values(eta):
         return model(medium((0.1,), (1.4,), eta[None]), 1.0)(jnp.asarray([0.3, 1.5]))[:, 0]
 
-    # The neighbor above the multipole has 1.2. Moments of the Fresnel reflectance go as (eta - 1)^(3/2).
+    # The neighbor above the multipole has 1.2. Moments of the Fresnel reflectance go as (eta -
+    # 1)^(3/2).
     one, h = jnp.asarray(1.2 if model is MODELS["multipole"] else 1.0), 1e-7
     quotients = [(values(one + step) - values(one)) / step for step in (h, 4 * h)]
     np.testing.assert_allclose(jax.jacfwd(values)(one), 2 * quotients[0] - quotients[1], rtol=LIMIT)
@@ -125,18 +138,25 @@ def test_burley_keeps_its_albedo_and_its_units(float64, scaling):
     profile = Burley(jnp.asarray([0.8, 0.3]), jnp.asarray([1.0, 2.0]), scaling)
     np.testing.assert_allclose(integrated_reflectance(profile), [0.8, 0.3], rtol=1e-9)
     r = jnp.asarray([0.2, 3.0])
-    within = [integrated_reflectance(profile) - integrated_reflectance_beyond(profile, float(end)) for end in r]
+    within = [
+        integrated_reflectance(profile) - integrated_reflectance_beyond(profile, float(end))
+        for end in r
+    ]
     np.testing.assert_allclose(profile.reflectance_within(r), within, rtol=1e-9)
     in_cm = Burley(profile.albedo, profile.free_path / 10, scaling)
     np.testing.assert_allclose(in_cm(r / 10) / 100, profile(r), rtol=UNITS)
 
 
 def integrated_reflectance_beyond(profile, end: float):
-    """Integrate from one radius (mm) on, a substitution of its own: Gauss-Legendre in the square root of the distance."""
+    """Integrate from one radius (mm) on, a substitution of its own: Gauss-Legendre in the square
+    root of the distance.
+    """
     nodes, weights = np.polynomial.legendre.leggauss(200)
     t = 4.5 * (nodes + 1)
     r = jnp.asarray(end + t**2)
-    return 2 * jnp.pi * jnp.sum((jnp.asarray(4.5 * weights * 2 * t) * r)[:, None] * profile(r), axis=0)
+    return (
+        2 * jnp.pi * jnp.sum((jnp.asarray(4.5 * weights * 2 * t) * r)[:, None] * profile(r), axis=0)
+    )
 
 
 def test_burley_values():
@@ -151,7 +171,8 @@ def test_burley_values():
 
 
 @pytest.mark.parametrize(
-    ("albedo", "path", "message"), [(1.2, 1.0, r"albedo must .*in \[0, 1\]; got \[1.2"), (0.5, 0.0, "free_path")]
+    ("albedo", "path", "message"),
+    [(1.2, 1.0, r"albedo must .*in \[0, 1\]; got \[1.2"), (0.5, 0.0, "free_path")],
 )
 def test_burley_refuses(dtype, albedo, path, message):
     with pytest.raises(ValueError, match=message):
@@ -161,14 +182,25 @@ def test_burley_refuses(dtype, albedo, path, message):
 def test_a_table_gives_what_it_holds(float64):
     r = jnp.asarray([0.5, 1.0, 2.0, 4.0])
     table = Tabulated(r, jnp.asarray([4.0, 3.0, 1.0, 0.0]))
-    np.testing.assert_allclose(table(jnp.asarray([0.0, 0.5, 0.75, 3.0, 5.0]))[:, 0], [4, 4, 3.5, 0.5, 0])
+    np.testing.assert_allclose(
+        table(jnp.asarray([0.0, 0.5, 0.75, 3.0, 5.0]))[:, 0], [4, 4, 3.5, 0.5, 0]
+    )
     cells = np.linspace(0, 4, 400_001)
     middle = 0.5 * (cells[1:] + cells[:-1])
-    sums = 2 * np.pi * np.sum(middle * np.asarray(table(jnp.asarray(middle)))[:, 0]) * (cells[1] - cells[0])
+    sums = (
+        2
+        * np.pi
+        * np.sum(middle * np.asarray(table(jnp.asarray(middle)))[:, 0])
+        * (cells[1] - cells[0])
+    )
     np.testing.assert_allclose(table.total_reflectance(), sums, rtol=1e-9)
     fine = jnp.linspace(0.0, 60.0, 4000)
     dipole = Dipole(medium())
-    np.testing.assert_allclose(Tabulated(fine, dipole(fine)).total_reflectance()[1], dipole.total_reflectance()[1], rtol=1e-3)
+    np.testing.assert_allclose(
+        Tabulated(fine, dipole(fine)).total_reflectance()[1],
+        dipole.total_reflectance()[1],
+        rtol=1e-3,
+    )
 
 
 @pytest.mark.parametrize(
@@ -196,7 +228,9 @@ def test_a_table_refuses(dtype, radii, values, message):
     ],
 )
 def test_distances_from_monte_carlo(float64, monte_carlo, run, coefficients, distances):
-    """Eq. 4 beyond one mean free path against MCML, as measured for the dipole, the better dipole and the photon beam."""
+    """Eq. 4 beyond one mean free path against MCML, as measured for the dipole, the better dipole
+    and the photon beam.
+    """
     data = monte_carlo(run)
     m = Medium(*(jnp.asarray([each]) for each in coefficients))
     r = np.asarray(data["r_opt"])[:-1]

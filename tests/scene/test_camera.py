@@ -22,19 +22,25 @@ def test_it_looks_at_the_target_and_up_is_up():
 
 def test_the_field_of_view_is_that_of_the_height():
     camera = sj.Camera.look_at(EYE, TARGET, fov=40.0, width=300, height=100)
-    np.testing.assert_allclose(float(camera.focal_length) * 2 * np.tan(np.radians(20)), 1, rtol=1e-6)
+    np.testing.assert_allclose(
+        float(camera.focal_length) * 2 * np.tan(np.radians(20)), 1, rtol=1e-6
+    )
 
 
 @pytest.mark.parametrize("straight", [[0.0, -1.0, 0.0], [0.0, 7.0, 0.0]])
 def test_no_picture_is_upright_when_it_looks_along_up(straight):
-    with pytest.raises(ValueError, match=r"up is \[0.0, 1.0, 0.0\], along the line of sight; give another"):
+    with pytest.raises(
+        ValueError, match=r"up is \[0.0, 1.0, 0.0\], along the line of sight; give another"
+    ):
         sj.Camera.look_at(EYE, EYE + jnp.asarray(straight))
     camera = sj.Camera.look_at(EYE, EYE + jnp.asarray(straight), up=jnp.asarray([0.0, 0.0, -1.0]))
     assert np.all(np.isfinite(camera.rotation))
 
 
 def test_nothing_is_seen_from_where_one_looks():
-    with pytest.raises(ValueError, match=r"stands at \[30.0, 20.0, 50.0\], where it looks at; move one of them"):
+    with pytest.raises(
+        ValueError, match=r"stands at \[30.0, 20.0, 50.0\], where it looks at; move one of them"
+    ):
         sj.Camera.look_at(EYE, EYE)
 
 
@@ -46,7 +52,8 @@ def test_what_single_precision_cannot_square_is_no_place():
 
 
 @pytest.mark.parametrize(
-    ("given", "said"), [({"fov": 180.0}, "fov must lie"), ({"width": 0}, "0 x 512"), ({"height": -1}, "x -1")]
+    ("given", "said"),
+    [({"fov": 180.0}, "fov must lie"), ({"width": 0}, "0 x 512"), ({"height": -1}, "x -1")],
 )
 def test_what_is_no_picture_is_refused(given, said):
     with pytest.raises(ValueError, match=said):

@@ -19,19 +19,34 @@ NODES = 96  # of the hemisphere's quadrature, per axis
 def hemisphere():
     """Give directions and weights of `int f dw` for a lobe symmetric about the x axis.
 
-    Nodes crowd at the horizon and about the mirror direction, where the lobe of a grazing view is narrow.
+    Nodes crowd at the horizon and about the mirror direction, where the lobe of a grazing view is
+    narrow.
     """
     x, weights = np.polynomial.legendre.leggauss(NODES)
     t, weights = (1 + x) / 2, weights / 2
     cosine, azimuth = t**2, np.pi * (1 - t**3)
     sine = np.sqrt(1 - cosine**2)
-    grid = np.stack([np.outer(sine, np.cos(azimuth)), np.outer(sine, np.sin(azimuth)), np.outer(cosine, np.ones(NODES))], -1)
+    grid = np.stack(
+        [
+            np.outer(sine, np.cos(azimuth)),
+            np.outer(sine, np.sin(azimuth)),
+            np.outer(cosine, np.ones(NODES)),
+        ],
+        -1,
+    )
     return grid.reshape(-1, 3), np.outer(weights * 2 * t, weights * 6 * np.pi * t**2).ravel()
 
 
 @jax.jit
 def lobe(wi, wo, f0, roughness):
-    return specular_lobe(jnp.asarray([[0.0, 0.0, 1.0]]), wi, wo, f0=f0, specular=jnp.asarray(1.0), roughness=roughness)
+    return specular_lobe(
+        jnp.asarray([[0.0, 0.0, 1.0]]),
+        wi,
+        wo,
+        f0=f0,
+        specular=jnp.asarray(1.0),
+        roughness=roughness,
+    )
 
 
 def integrated(mu, f0, roughness):
@@ -39,7 +54,9 @@ def integrated(mu, f0, roughness):
     with jax.enable_x64(True):
         wi, weights = hemisphere()
         wo = np.asarray([[np.sqrt(1 - mu * mu), 0.0, mu]])
-        return float(np.sum(np.asarray(lobe(*arrays(None, wi, wo, f0, roughness))) * wi[:, 2] * weights))
+        return float(
+            np.sum(np.asarray(lobe(*arrays(None, wi, wo, f0, roughness))) * wi[:, 2] * weights)
+        )
 
 
 def arrays(dtype, *values):
@@ -61,7 +78,8 @@ def test_table_is_the_integral_of_the_lobe(f0, dtype):
 
 
 def test_published_albedos_of_skin(dtype):
-    # d'Eon and Luebke's shader leaves out the 1/pi of the lobe; its albedos, measured independently, are pi times ours.
+    # d'Eon and Luebke's shader leaves out the 1/pi of the lobe; its albedos, measured
+    # independently, are pi times ours.
     mu = jnp.asarray([1.0, 0.7, 0.4, 0.1], dtype)
     table = directional_albedo(mu, *arrays(dtype, 0.028, 1.0, 0.3))
     np.testing.assert_allclose(np.asarray(table) * np.pi, [0.0801, 0.0908, 0.211, 0.763], atol=1e-3)
@@ -86,12 +104,16 @@ def test_average_is_the_integral_of_the_table(dtype):
     mu = (1 + x) / 2
     for roughness in (0.05, 0.1, 0.3, 1.0):
         parameters = arrays(dtype, 0.04, 0.9, roughness)
-        integral = np.sum(weights * mu * np.asarray(directional_albedo(jnp.asarray(mu, dtype), *parameters)))
+        integral = np.sum(
+            weights * mu * np.asarray(directional_albedo(jnp.asarray(mu, dtype), *parameters))
+        )
         np.testing.assert_allclose(float(average_albedo(*parameters)), integral, rtol=1e-4)
 
 
 def test_never_more_than_all_light(dtype):
-    mu, roughness = jnp.meshgrid(jnp.linspace(0, 1, 101, dtype=dtype), jnp.linspace(0.01, 1.2, 40, dtype=dtype))
+    mu, roughness = jnp.meshgrid(
+        jnp.linspace(0, 1, 101, dtype=dtype), jnp.linspace(0.01, 1.2, 40, dtype=dtype)
+    )
     for f0 in (0.0, 0.028, 1.0):
         for specular in (1.0, 3.0):
             table = np.asarray(directional_albedo(mu, *arrays(dtype, f0, specular), roughness))
@@ -101,29 +123,40 @@ def test_never_more_than_all_light(dtype):
 @pytest.mark.parametrize("roughness", [0.1, 0.3, 0.6, 1.0])
 @pytest.mark.parametrize("mu", [0.05, 0.3, 0.7, 1.0])
 def test_white_furnace_in_closed_form(mu, roughness, dtype):
-    # Under uniform unit radiance a white diffuser below the interface returns, with the lobe, exactly what comes in.
+    # Under uniform unit radiance a white diffuser below the interface returns, with the lobe,
+    # exactly what comes in.
     parameters = arrays(dtype, 0.028, 1.0, roughness)
     x, weights = np.polynomial.legendre.leggauss(64)
     cosine = (1 + x) / 2
-    entering = np.pi * np.sum(weights * cosine * (1 - np.asarray(directional_albedo(jnp.asarray(cosine, dtype), *parameters))))
+    entering = np.pi * np.sum(
+        weights
+        * cosine
+        * (1 - np.asarray(directional_albedo(jnp.asarray(cosine, dtype), *parameters)))
+    )
     mu_o = jnp.asarray(mu, dtype)
     diffuse = entering * float(diffuse_transmission(mu_o, *parameters)) / np.pi
     lobe = integrated(mu, 0.028, roughness)
     np.testing.assert_allclose(diffuse + lobe, 1.0, atol=2e-3)
-    np.testing.assert_allclose(diffuse + float(directional_albedo(mu_o, *parameters)), 1.0, atol=1e-4)
+    np.testing.assert_allclose(
+        diffuse + float(directional_albedo(mu_o, *parameters)), 1.0, atol=1e-4
+    )
 
 
 def test_slopes_agree_with_the_quadrature(float64):
     mu, roughness = random_places(12, seed=2)
     mu, roughness, step = 0.1 + 0.85 * mu, np.clip(roughness, 0.12, 0.95), 1e-3
-    rho = jax.grad(lambda m, r: jnp.sum(directional_albedo(m, *arrays(None, 0.028, 1.0), r)), argnums=(0, 1))
+    rho = jax.grad(
+        lambda m, r: jnp.sum(directional_albedo(m, *arrays(None, 0.028, 1.0), r)), argnums=(0, 1)
+    )
     in_mu, in_roughness = jax.jit(rho)(jnp.asarray(mu), jnp.asarray(roughness))
     for index, (m, r) in enumerate(zip(mu, roughness, strict=True)):
         truth = [
             (integrated(m + step, 0.028, r) - integrated(m - step, 0.028, r)) / (2 * step),
             (integrated(m, 0.028, r + step) - integrated(m, 0.028, r - step)) / (2 * step),
         ]
-        np.testing.assert_allclose([in_mu[index], in_roughness[index]], truth, rtol=SLOPE_ERROR, atol=2e-3)
+        np.testing.assert_allclose(
+            [in_mu[index], in_roughness[index]], truth, rtol=SLOPE_ERROR, atol=2e-3
+        )
 
 
 @pytest.mark.parametrize("roughness", [0.3, [0.2, 0.5, 0.8]], ids=["one", "map"])
@@ -134,11 +167,17 @@ def test_gradients_in_every_argument(float64, roughness):
 
 def test_second_derivative_in_the_cosine(float64):
     parameters = arrays(None, 0.05, 0.6, 0.3)
-    check_grads(jax.jit(lambda mu: directional_albedo(mu, *parameters)), arrays(None, 0.4), order=2, rtol=1e-5)
+    check_grads(
+        jax.jit(lambda mu: directional_albedo(mu, *parameters)),
+        arrays(None, 0.4),
+        order=2,
+        rtol=1e-5,
+    )
 
 
 VALUES_AND_SLOPES = [
-    jax.jit(jax.value_and_grad(each, argnums=(0, 1, 2, 3))) for each in (directional_albedo, diffuse_transmission)
+    jax.jit(jax.value_and_grad(each, argnums=(0, 1, 2, 3)))
+    for each in (directional_albedo, diffuse_transmission)
 ]
 
 

@@ -23,7 +23,9 @@ def random_directions(count, seed):
 
 
 def lobe(normal, wi, wo, f0=0.028, specular=0.18, roughness=0.3, dtype=None):
-    normal, wi, wo, f0, specular, roughness = (jnp.asarray(x, dtype) for x in (normal, wi, wo, f0, specular, roughness))
+    normal, wi, wo, f0, specular, roughness = (
+        jnp.asarray(x, dtype) for x in (normal, wi, wo, f0, specular, roughness)
+    )
     return specular_lobe(normal, wi, wo, f0=f0, specular=specular, roughness=roughness)
 
 
@@ -57,7 +59,13 @@ def test_fresnel_is_evaluated_at_the_half_vector(dtype):
 
 def test_one_light_serves_many_points(dtype):
     normals = random_directions(6, 5).reshape(2, 3, 3)
-    value = lobe(normals, np.reshape(UP, (1, 1, 3)), np.reshape(UP, (1, 1, 3)), roughness=np.full((2, 3), 0.4), dtype=dtype)
+    value = lobe(
+        normals,
+        np.reshape(UP, (1, 1, 3)),
+        np.reshape(UP, (1, 1, 3)),
+        roughness=np.full((2, 3), 0.4),
+        dtype=dtype,
+    )
     assert value.shape == (2, 3)
 
 
@@ -84,7 +92,9 @@ def total_and_slopes(normal, wi, wo, f0, specular, roughness):
 @pytest.mark.parametrize("roughness", [0.0, 0.05, 1.0])
 def test_degenerate_places_are_finite(place, roughness, dtype):
     wi, wo = (unit([direction]) for direction in DEGENERATE[place])
-    value, slopes = total_and_slopes(*(jnp.asarray(x, dtype) for x in (UP, wi, wo, 0.028, 0.18, roughness)))
+    value, slopes = total_and_slopes(
+        *(jnp.asarray(x, dtype) for x in (UP, wi, wo, 0.028, 0.18, roughness))
+    )
     assert np.isfinite(float(value))
     assert float(value) >= 0
     assert all(np.all(np.isfinite(np.asarray(slope))) for slope in slopes)
@@ -106,6 +116,8 @@ def test_gradients_of_the_lobe(float64):
 
 def test_root_of_albedo_and_its_floor(dtype):
     albedo = jnp.asarray([0.0, 1e-5, 1e-4, 0.25, 1.0], dtype)
-    np.testing.assert_allclose(np.asarray(albedo_root(albedo)), [0.01, 0.01, 0.01, 0.5, 1.0], rtol=1e-6)
+    np.testing.assert_allclose(
+        np.asarray(albedo_root(albedo)), [0.01, 0.01, 0.01, 0.5, 1.0], rtol=1e-6
+    )
     slopes = jax.grad(lambda a: jnp.sum(albedo_root(a)))(albedo)
     np.testing.assert_allclose(np.asarray(slopes), [0, 0, 0, 1.0, 0.5], rtol=1e-6)

@@ -38,7 +38,9 @@ def directions(count: int, jitter: float = 0.35, seed: int = 0) -> np.ndarray:
     return u / np.linalg.norm(u, axis=1, keepdims=True)
 
 
-def sphere(count: int, radius: float = 10.0, center=(0.0, 0.0, 0.0), jitter: float = 0.35, seed: int = 0) -> Splats:
+def sphere(
+    count: int, radius: float = 10.0, center=(0.0, 0.0, 0.0), jitter: float = 0.35, seed: int = 0
+) -> Splats:
     u = directions(count, jitter, seed)
     area = 4 * np.pi * radius**2 / count
     return splats(np.asarray(center) + radius * u, u, 1.5 * np.sqrt(area), np.full(count, area))
@@ -48,7 +50,9 @@ def bumpy(count: int, radius: float = 10.0, seed: int = 0) -> Splats:
     """A closed body with bumps, its normals from the tangents of the surface."""
 
     def surface(u):
-        bump = 0.08 * np.sin(4 * u[:, 0] + 1) * np.cos(3 * u[:, 1]) + 0.04 * np.sin(7 * u[:, 1] + 2 * u[:, 2])
+        bump = 0.08 * np.sin(4 * u[:, 0] + 1) * np.cos(3 * u[:, 1]) + 0.04 * np.sin(
+            7 * u[:, 1] + 2 * u[:, 2]
+        )
         return radius * u * (1 + bump)[:, None]
 
     u = directions(count, seed=seed)
@@ -58,7 +62,10 @@ def bumpy(count: int, radius: float = 10.0, seed: int = 0) -> Splats:
     step = 1e-5
 
     def tangent(t):
-        ends = [surface(each / np.linalg.norm(each, axis=1, keepdims=True)) for each in (u + step * t, u - step * t)]
+        ends = [
+            surface(each / np.linalg.norm(each, axis=1, keepdims=True))
+            for each in (u + step * t, u - step * t)
+        ]
         return (ends[0] - ends[1]) / (2 * step)
 
     normal = np.cross(tangent(a), tangent(np.cross(u, a)))
@@ -69,10 +76,17 @@ def bumpy(count: int, radius: float = 10.0, seed: int = 0) -> Splats:
 
 
 def joined(*bodies: Splats) -> Splats:
-    return Splats(*(jnp.concatenate([getattr(b, name) for b in bodies]) for name in ("centers", "normals", "radii", "areas")))
+    return Splats(
+        *(
+            jnp.concatenate([getattr(b, name) for b in bodies])
+            for name in ("centers", "normals", "radii", "areas")
+        )
+    )
 
 
-def sheet(half_width: float, spacing: float, normal=(0.0, 0.0, 1.0), center=(0.0, 0.0, 0.0)) -> Splats:
+def sheet(
+    half_width: float, spacing: float, normal=(0.0, 0.0, 1.0), center=(0.0, 0.0, 0.0)
+) -> Splats:
     """A flat sheet of splats on a grid."""
     normal = np.asarray(normal, float) / np.linalg.norm(normal)
     a = np.cross(normal, [1.0, 0, 0] if abs(normal[0]) < 0.9 else [0, 1.0, 0])
@@ -83,7 +97,9 @@ def sheet(half_width: float, spacing: float, normal=(0.0, 0.0, 1.0), center=(0.0
     return splats(centers, np.tile(normal, (len(x), 1)), 1.5 * spacing)
 
 
-def perspective(eye=(0.0, 0.0, 40.0), target=(0.0, 0.0, 0.0), fov=35.0, width=40, height=32) -> PerspectiveView:
+def perspective(
+    eye=(0.0, 0.0, 40.0), target=(0.0, 0.0, 0.0), fov=35.0, width=40, height=32
+) -> PerspectiveView:
     eye, target = (jnp.asarray(each, float) for each in (eye, target))
     return PerspectiveView.of(Camera.look_at(eye, target, fov=fov, width=width, height=height))
 
@@ -116,7 +132,10 @@ class Drawn(eqx.Module):
 
 
 def drawn(body: Splats, rows, view, settings, rasterizer) -> Drawn:
-    surfaces, grid = splat_surfaces(body, rows, view, settings, rasterizer), TileGrid(view.width, view.height)
+    surfaces, grid = (
+        splat_surfaces(body, rows, view, settings, rasterizer),
+        TileGrid(view.width, view.height),
+    )
 
     def pictures(each: Surface) -> Pictures:
         planes = grid.join(jnp.stack([each.depth, each.weight_sum, each.coverage], axis=1))
@@ -126,10 +145,17 @@ def drawn(body: Splats, rows, view, settings, rasterizer) -> Drawn:
 
 
 def packed(depths, weight_sums, view):
-    """The atlas of a front surface and one behind it `[2, height, width]`, their points in it (mm), and which are covered."""
+    """The atlas of a front surface and one behind it `[2, height, width]`, their points in it (mm),
+    and which are covered.
+    """
     grid = TileGrid(view.width, view.height)
     tiles = [grid.cut(jnp.stack(planes)) for planes in zip(depths, weight_sums, strict=True)]
-    sums = [FragmentSums(each[:, :0], each[:, 1] / jnp.where(each[:, 1] > 0, each[:, 0], 1.0), each[:, 1]) for each in tiles]
+    sums = [
+        FragmentSums(
+            each[:, :0], each[:, 1] / jnp.where(each[:, 1] > 0, each[:, 0], 1.0), each[:, 1]
+        )
+        for each in tiles
+    ]
     farthest = farthest_depths(SummedFragments(*sums, jnp.zeros((), depths.dtype)), view)
     atlas = Atlas.of(farthest, view, farthest.size)
     rows = atlas.pack(*tiles)

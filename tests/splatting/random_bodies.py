@@ -1,7 +1,8 @@
-"""Small random scenes of one shape, the first of each sequence of one kind alone: what goes wrong goes wrong at some of these.
+"""Small random scenes of one shape, the first of each sequence of one kind alone: what goes wrong
+goes wrong at some of these.
 
-A scene of a seed is always the same. Each is drawn in the coordinates of the view that sees it: `x` and `y` in pixels, depth in
-mm, so that every kind is met whatever the view.
+A scene of a seed is always the same. Each is drawn in the coordinates of the view that sees it: `x`
+and `y` in pixels, depth in mm, so that every kind is met whatever the view.
 """
 
 import dataclasses
@@ -35,7 +36,9 @@ ALL = int(os.environ.get("SPLATJAX_RANDOM_SCENES", "0"))
 
 
 def seeds(in_suite: int) -> range:
-    """Seeds of the scenes to try: some dozens in the suite, a twentieth of SPLATJAX_RANDOM_SCENES where it asks for more."""
+    """Seeds of the scenes to try: some dozens in the suite, a twentieth of SPLATJAX_RANDOM_SCENES
+    where it asks for more.
+    """
     return range(max(in_suite, ALL // 20))
 
 
@@ -52,7 +55,9 @@ class Sight:
     height: int
 
     def view(self) -> AbstractView:
-        position, rotation, pixels = (jnp.asarray(each, float) for each in (self.position, self.rotation, self.pixels))
+        position, rotation, pixels = (
+            jnp.asarray(each, float) for each in (self.position, self.rotation, self.pixels)
+        )
         if self.perspective:
             return PerspectiveView(position, rotation, pixels, self.width, self.height, NEAR)
         return OrthographicView(position, rotation, pixels, self.width, self.height)
@@ -77,18 +82,30 @@ def sight(rng: np.random.Generator, perspective: bool, width: int, height: int) 
     """A view from anywhere to anywhere."""
     rotation, _ = np.linalg.qr(rng.normal(size=(3, 3)))
     rotation[2] *= np.linalg.det(rotation)
-    pixels = height / (2 * np.tan(np.radians(rng.uniform(10, 50)))) if perspective else rng.uniform(0.4, 2.5)
+    pixels = (
+        height / (2 * np.tan(np.radians(rng.uniform(10, 50))))
+        if perspective
+        else rng.uniform(0.4, 2.5)
+    )
     return Sight(rng.normal(size=3) * 10, rotation, pixels, perspective, width, height)
 
 
-def random_body(seed: int, count: int, perspective: bool, width: int, height: int) -> tuple[Splats, AbstractView]:
+def random_body(
+    seed: int, count: int, perspective: bool, width: int, height: int
+) -> tuple[Splats, AbstractView]:
     """Draw `count` splats and what sees them."""
     rng = np.random.default_rng([seed, count, perspective])
     seen = sight(rng, perspective, width, height)
-    kinds = [KINDS[seed]] if seed < len(KINDS) else list(rng.choice(KINDS[:-2], rng.integers(1, 5), replace=False))
+    kinds = (
+        [KINDS[seed]]
+        if seed < len(KINDS)
+        else list(rng.choice(KINDS[:-2], rng.integers(1, 5), replace=False))
+    )
     parts = [_drawn(str(kind), rng, count, seen) for kind in kinds]
     which = rng.integers(0, len(parts), count)
-    places, normals, radii = (np.stack(each)[which, np.arange(count)] for each in zip(*parts, strict=True))
+    places, normals, radii = (
+        np.stack(each)[which, np.arange(count)] for each in zip(*parts, strict=True)
+    )
     centers = places @ seen.rotation + seen.position
     areas = (radii / 1.5) ** 2 * rng.uniform(0.5, 2, count)
     arrays = centers, normals @ seen.rotation, radii, areas
@@ -96,7 +113,8 @@ def random_body(seed: int, count: int, perspective: bool, width: int, height: in
 
 
 def disagreement(found, expected) -> float:
-    """Give the largest error, each relative to what is expected there and to what is typical: the median of all that is not 0.
+    """Give the largest error, each relative to what is expected there and to what is typical: the
+    median of all that is not 0.
 
     So a number that is far larger than the others hides nothing. NaN where anything is.
     """
@@ -123,14 +141,20 @@ def _drawn(kind: str, rng: np.random.Generator, count: int, seen: Sight):
         away = rng.uniform(1, 40, count) * width
         x = np.where(rng.uniform(size=count) < 0.5, -away, width + away)
     if kind == "off screen":
-        size = np.where(rng.uniform(size=count) < 0.5, size, away * rng.uniform(0.8, 2.0, count))  # some reach into the picture
+        size = np.where(
+            rng.uniform(size=count) < 0.5, size, away * rng.uniform(0.8, 2.0, count)
+        )  # some reach into the picture
     if kind == "at the border":
         x = rng.choice([0.0, width], count) + rng.uniform(-1.5, 1.5, count) * size
     if kind == "through the near plane":
         depth = NEAR * np.exp(rng.uniform(-1, 5, count))
         size = np.exp(rng.uniform(0, 6, count))
     if kind == "in one tile":
-        x, y, size = (rng.uniform(8.2, 15.8, count) for _ in range(2)), None, rng.uniform(0.3, 2, count)
+        x, y, size = (
+            (rng.uniform(8.2, 15.8, count) for _ in range(2)),
+            None,
+            rng.uniform(0.3, 2, count),
+        )
         x, y = x
     if kind == "in one place":
         x, y, depth = (np.repeat(each[:1], count) for each in (x, y, depth))
@@ -150,7 +174,9 @@ def _drawn(kind: str, rng: np.random.Generator, count: int, seen: Sight):
     if kind == "edge on":
         normals = across
     if kind == "nearly edge on":
-        normals = across - rays * (rng.choice([-1, 1], count) * 10 ** rng.uniform(-9, -1, count))[:, None]
+        normals = (
+            across - rays * (rng.choice([-1, 1], count) * 10 ** rng.uniform(-9, -1, count))[:, None]
+        )
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     radii = size * seen.mm(np.abs(depth))
     if kind == "two sheets":

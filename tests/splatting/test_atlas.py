@@ -15,7 +15,8 @@ def packed():
     farthest[0, list(FRONT)], farthest[1, list(BEHIND)] = 40.0, 41.0
     rng = np.random.default_rng(3)
     front, behind = (
-        np.where(np.isin(np.arange(6), each)[:, None], rng.uniform(size=(6, SIDE**2)), 0) for each in (FRONT, BEHIND)
+        np.where(np.isin(np.arange(6), each)[:, None], rng.uniform(size=(6, SIDE**2)), 0)
+        for each in (FRONT, BEHIND)
     )
     atlas = Atlas.of(jnp.asarray(farthest.reshape(2, 2, 3), float), VIEW, 8)
     return atlas, front, behind
@@ -25,10 +26,14 @@ def test_what_shows_has_a_place_and_what_does_not_has_none():
     atlas, front, behind = packed()
     assert float(atlas.needed) == 6 / 8
     np.testing.assert_array_equal(atlas.tiles, [*FRONT, *(6 + each for each in BEHIND), 12, 12])
-    np.testing.assert_array_equal(np.asarray(atlas.places)[np.asarray(atlas.tiles)[:6]], np.arange(6))
+    np.testing.assert_array_equal(
+        np.asarray(atlas.places)[np.asarray(atlas.tiles)[:6]], np.arange(6)
+    )
     assert np.all(np.delete(np.asarray(atlas.places), np.asarray(atlas.tiles)[:6]) == 8)
     rows = atlas.pack(jnp.asarray(front, float), jnp.asarray(behind, float))
-    np.testing.assert_allclose(rows[:6], np.concatenate([front[list(FRONT)], behind[list(BEHIND)]]), rtol=1e-6)
+    np.testing.assert_allclose(
+        rows[:6], np.concatenate([front[list(FRONT)], behind[list(BEHIND)]]), rtol=1e-6
+    )
     np.testing.assert_array_equal(rows[6:], 0)
 
 
@@ -47,6 +52,8 @@ def test_both_surfaces_add_to_the_picture():
         expected = grid.join(jnp.asarray(tiles, float)[:, None])
         np.testing.assert_allclose(found(values[..., None])[..., 0], expected[0], rtol=1e-6)
         layers = found(jnp.stack([values, 2 * values], axis=1)[..., None])  # rows before the pixels
-        np.testing.assert_allclose(layers[..., 0], np.stack([expected[0], 2 * expected[0]]), rtol=1e-6)
+        np.testing.assert_allclose(
+            layers[..., 0], np.stack([expected[0], 2 * expected[0]]), rtol=1e-6
+        )
     poisoned = atlas.poisoned_unless(jnp.asarray(False)).picture(values[..., None])
     assert np.all(np.isnan(poisoned))

@@ -5,7 +5,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from splatjax.splatting import BinCapacity, TileGrid, TileRanges, bin_items, scatter_slots, slot_plane
+from splatjax.splatting import (
+    BinCapacity,
+    TileGrid,
+    TileRanges,
+    bin_items,
+    scatter_slots,
+    slot_plane,
+)
 
 GRID = TileGrid(61, 45, lanes=4, slots=4)
 COUNT = 900
@@ -13,22 +20,35 @@ COUNT = 900
 
 def boxes(kind):
     rng = np.random.default_rng(11)
-    middle, half = rng.uniform(-10, 70, (2, COUNT)), np.exp(rng.uniform(np.log(0.1), np.log(30.0), (2, COUNT)))
+    middle, half = (
+        rng.uniform(-10, 70, (2, COUNT)),
+        np.exp(rng.uniform(np.log(0.1), np.log(30.0), (2, COUNT))),
+    )
     if kind == "all in one tile":
         middle, half = rng.uniform(17, 23, (2, COUNT)), np.full((2, COUNT), 0.9)
     if kind == "off screen":
         middle, half = rng.uniform(-90, -40, (2, COUNT)), np.full((2, COUNT), 20.0)
     if kind == "infinite":
         half = np.where(rng.uniform(size=half.shape) < 0.05, np.inf, half)
-    return middle[0] - half[0], middle[0] + half[0], middle[1] - half[1], middle[1] + half[1], rng.uniform(size=COUNT) < 0.9
+    return (
+        middle[0] - half[0],
+        middle[0] + half[0],
+        middle[1] - half[1],
+        middle[1] + half[1],
+        rng.uniform(size=COUNT) < 0.9,
+    )
 
 
 def brute_force(left, right, top, bottom, visible):
     """Every item with a pixel center of the tile inside its box."""
     pairs = set()
     for tile in range(GRID.across * GRID.down):
-        columns = np.arange(tile % GRID.across * 8, min(tile % GRID.across * 8 + 8, GRID.width)) + 0.5
-        rows = np.arange(tile // GRID.across * 8, min(tile // GRID.across * 8 + 8, GRID.height)) + 0.5
+        columns = (
+            np.arange(tile % GRID.across * 8, min(tile % GRID.across * 8 + 8, GRID.width)) + 0.5
+        )
+        rows = (
+            np.arange(tile // GRID.across * 8, min(tile // GRID.across * 8 + 8, GRID.height)) + 0.5
+        )
         in_x = ((columns >= left[:, None]) & (columns <= right[:, None])).any(1)
         in_y = ((rows >= top[:, None]) & (rows <= bottom[:, None])).any(1)
         pairs |= {(tile, int(item)) for item in np.nonzero(in_x & in_y & visible)[0]}
@@ -56,7 +76,10 @@ KINDS = ("scattered", "all in one tile", "off screen", "infinite")
 
 def every_kind():
     given = [boxes(kind) for kind in KINDS]
-    ranges = [ranges_of(*(jnp.asarray(each, float) for each in box[:4]), jnp.asarray(box[4])) for box in given]
+    ranges = [
+        ranges_of(*(jnp.asarray(each, float) for each in box[:4]), jnp.asarray(box[4]))
+        for box in given
+    ]
     return given, ranges
 
 
@@ -81,11 +104,15 @@ def test_lists_hold_exactly_the_pairs_of_brute_force_in_order():
         assert [len(lists[tile]) for tile in range(GRID.tiles)] == counts.tolist(), kind
 
 
-@pytest.mark.parametrize("short", [{"pairs": 1024}, {"blocks": 1}, {"chunks": 1}], ids=lambda short: next(iter(short)))
+@pytest.mark.parametrize(
+    "short", [{"pairs": 1024}, {"blocks": 1}, {"chunks": 1}], ids=lambda short: next(iter(short))
+)
 def test_too_small_a_capacity_is_reported(short):
     _, ranges = every_kind()
     enough = BinCapacity.for_counts([per_tile(each) for each in ranges], GRID)
-    capacity = BinCapacity(**({"pairs": enough.pairs, "blocks": enough.blocks, "chunks": enough.chunks} | short))
+    capacity = BinCapacity(
+        **({"pairs": enough.pairs, "blocks": enough.blocks, "chunks": enough.chunks} | short)
+    )
     needed = float(jax.jit(lambda r: bin_items(r, GRID, capacity))(ranges[3]).needed)
     assert needed > 1
 

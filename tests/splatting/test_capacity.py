@@ -24,10 +24,18 @@ def test_room_is_for_the_longest_list_of_every_chunk():
     counts = np.zeros(64, int)
     counts[[3, 9, 17, 40, 41]] = 100, 20, 9, 9, 1  # chunks of 13 and 1 blocks
     room = BinCapacity.for_counts([jnp.asarray(counts), jnp.asarray(counts[::-1] // 2)], grid)
-    assert (room.pairs, room.blocks, room.chunks) == (round_up(139, 1024), round_up(14, 4), round_up(2, 4))
+    assert (room.pairs, room.blocks, room.chunks) == (
+        round_up(139, 1024),
+        round_up(14, 4),
+        round_up(2, 4),
+    )
     assert BinCapacity.for_counts([jnp.ones(64, int)], grid).chunks == 16  # no more than there are
     nothing = BinCapacity.for_counts([jnp.zeros(64, int)], grid)
-    assert (nothing.pairs, nothing.blocks, nothing.chunks) == (round_up(1, 1024), round_up(1, 4), round_up(1, 4))
+    assert (nothing.pairs, nothing.blocks, nothing.chunks) == (
+        round_up(1, 1024),
+        round_up(1, 4),
+        round_up(1, 4),
+    )
 
 
 def test_room_grows_by_doubling():

@@ -7,7 +7,10 @@ import numpy as np
 from splatjax import splatting
 from splatjax.splatting import _kernel
 
-coverage, fragment_weight = jax.jit(splatting.coverage, static_argnums=1), jax.jit(splatting.fragment_weight)
+coverage, fragment_weight = (
+    jax.jit(splatting.coverage, static_argnums=1),
+    jax.jit(splatting.fragment_weight),
+)
 fast_fragment_weight, fragment_weight_derivative = map(
     jax.jit, (_kernel.fast_fragment_weight, _kernel.fragment_weight_derivative)
 )
@@ -45,7 +48,9 @@ def test_fast_weight_is_the_weight():
 
 def test_derivative_from_the_weight_is_the_derivative():
     q = squared_radii()
-    np.testing.assert_allclose(fragment_weight_derivative(q, fragment_weight(q)), weight_slope(q), atol=2e-6)
+    np.testing.assert_allclose(
+        fragment_weight_derivative(q, fragment_weight(q)), weight_slope(q), atol=2e-6
+    )
 
 
 def test_coverage_is_a_smooth_step():
@@ -60,4 +65,6 @@ def test_coverage_is_a_smooth_step():
     assert slopes[0] == 0
     assert np.all(slopes[sums > full] == 0)
     np.testing.assert_allclose(float(coverage(jnp.asarray(full / 2), full)), 0.5, rtol=1e-6)
-    assert np.max(np.abs(np.diff(slopes))) < 6 / full**2 * (0.4 / 320) * 1.01  # no jump: bounded by its own slope
+    assert (
+        np.max(np.abs(np.diff(slopes))) < 6 / full**2 * (0.4 / 320) * 1.01
+    )  # no jump: bounded by its own slope

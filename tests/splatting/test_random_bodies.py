@@ -1,7 +1,9 @@
-"""The tile rasterizer gives what the plain one gives, in value and gradient: passes 2 and 3, and shadow maps, on random scenes.
+"""The tile rasterizer gives what the plain one gives, in value and gradient: passes 2 and 3, and
+shadow maps, on random scenes.
 
-Nothing is left out for being near a tie: no two numbers that are compared are equal but for rounding, since what is drawn is
-drawn from a continuum, and splats in one place differ from the limit of the front by epsilon.
+Nothing is left out for being near a tie: no two numbers that are compared are equal but for
+rounding, since what is drawn is drawn from a continuum, and splats in one place differ from the
+limit of the front by epsilon.
 """
 
 import dataclasses
@@ -27,7 +29,9 @@ WIDTH, HEIGHT = 21, 18
 IN_SUITE = 45
 # float64: both do the same sums in another order; 6e-13 and 6e-11 found in 3,000 scenes.
 VALUE, GRADIENT = 1e-10, 1e-8
-TOLD = 1e-6  # of less weight a mean is rounding over rounding: a weight at the rim is a difference of nearly equal numbers
+# of less weight a mean is rounding over rounding: a weight at the rim is a difference of nearly
+# equal numbers
+TOLD = 1e-6
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,7 +43,8 @@ class Use:
     settings: SplattingSettings
 
 
-# Lights blend no attributes; here in small tiles, and the front leaves so much open that not all open tiles are swept at once.
+# Lights blend no attributes; here in small tiles, and the front leaves so much open that not all
+# open tiles are swept at once.
 USES = {
     True: Use(2, TileRasterizer(lanes=4, slots=4), SplattingSettings()),
     False: Use(0, TileRasterizer(lanes=4, slots=4), SplattingSettings(full_coverage=0.6)),
@@ -56,7 +61,9 @@ def with_room(tiles: TileRasterizer, count: int) -> TileRasterizer:
 
 @cache
 def by_both(count: int, perspective: bool):
-    """Give a function of a scene: all that is seen, and the gradients of a random sum of it, by both rasterizers."""
+    """Give a function of a scene: all that is seen, and the gradients of a random sum of it, by
+    both rasterizers.
+    """
     use = USES[perspective]
     rng = np.random.default_rng(count)
     rows = jnp.asarray(rng.normal(size=(use.attributes, count)))
@@ -72,20 +79,30 @@ def by_both(count: int, perspective: bool):
                 planes |= {f"{name} depth": jnp.where(told, depth, 0.0)}
                 planes |= {f"{name} attributes": jnp.where(told[None], each.attributes, 0.0)}
                 planes |= {f"{name} weight sum": each.weight_sum, f"{name} coverage": each.coverage}
-                # As in a picture, a mean counts by its coverage: alone, its derivative is rounding over its weights.
+                # As in a picture, a mean counts by its coverage: alone, its derivative is rounding
+                # over its weights.
                 means = jnp.concatenate([each.attributes, depth[None]]) * each.coverage[None]
                 summed += [means, each.weight_sum[None], each.coverage[None]]
             return jnp.vdot(factors, jnp.concatenate(summed)), (planes, surfaces.needed)
 
         d_total = jax.value_and_grad(total, argnums=(0, 1, 2), has_aux=True)
         (_, (planes, needed)), (d_body, d_view, d_rows) = d_total(body, view, rows)
-        gradients = {"centers": d_body.centers, "normals": d_body.normals, "radii": d_body.radii, "attributes": d_rows}
-        of_view = jax.tree.map(lambda leaf, d: (d if leaf.ndim else leaf * d).reshape(-1), view, d_view)  # scale per share
+        gradients = {
+            "centers": d_body.centers,
+            "normals": d_body.normals,
+            "radii": d_body.radii,
+            "attributes": d_rows,
+        }
+        of_view = jax.tree.map(
+            lambda leaf, d: (d if leaf.ndim else leaf * d).reshape(-1), view, d_view
+        )  # scale per share
         return planes, gradients | {"view": jnp.concatenate(jax.tree.leaves(of_view))}, needed
 
     @jax.jit
     def both(body, view):
-        return tuple(found(each, body, view) for each in (with_room(use.tiles, count), DenseRasterizer()))
+        return tuple(
+            found(each, body, view) for each in (with_room(use.tiles, count), DenseRasterizer())
+        )
 
     return both
 
@@ -98,12 +115,19 @@ def test_tiles_give_what_the_plain_rasterizer_gives(float64, count, perspective)
         (values, gradients, needed), (plain, plain_gradients, _) = both(body, view)
         assert float(needed) <= 1
         behind += int(jnp.sum(plain["behind weight sum"] > 0))
-        most_open = max(most_open, open_tiles(np.asarray(plain["front weight sum"]), USES[perspective]))
-        for bound, found, expected in ((VALUE, values, plain), (GRADIENT, gradients, plain_gradients)):
+        most_open = max(
+            most_open, open_tiles(np.asarray(plain["front weight sum"]), USES[perspective])
+        )
+        for bound, found, expected in (
+            (VALUE, values, plain),
+            (GRADIENT, gradients, plain_gradients),
+        ):
             for name, each in expected.items():
                 assert np.all(np.isfinite(each)), (seed, name)
                 error = disagreement(found[name], each)
-                assert error < bound, f"scene {seed} of {count} splats: {name} differ by {error:.1e}"
+                assert error < bound, (
+                    f"scene {seed} of {count} splats: {name} differ by {error:.1e}"
+                )
                 worst[name] = max(worst.get(name, 0.0), error)
     print({name: f"{error:.1e}" for name, error in worst.items()})
     print(f"{behind} pixels show something behind the front; at most {most_open} tiles are open")
@@ -115,7 +139,13 @@ def test_tiles_give_what_the_plain_rasterizer_gives(float64, count, perspective)
 def open_tiles(weight_sum: np.ndarray, use: Use) -> int:
     """Count the tiles with a pixel that the front covers in part."""
     gaps = (weight_sum > 0) & (weight_sum < use.settings.full_coverage)
-    return int(jnp.sum(jnp.any(TileGrid(WIDTH, HEIGHT).cut(jnp.asarray(gaps)[None].astype(float)) > 0, axis=(1, 2))))
+    return int(
+        jnp.sum(
+            jnp.any(
+                TileGrid(WIDTH, HEIGHT).cut(jnp.asarray(gaps)[None].astype(float)) > 0, axis=(1, 2)
+            )
+        )
+    )
 
 
 BORDER = 20  # pixels
@@ -128,7 +158,10 @@ def test_a_picture_is_the_middle_of_a_larger_one(float64):
     def seen(body, view):
         larger = dataclasses.replace(view, width=WIDTH + 2 * BORDER, height=HEIGHT + 2 * BORDER)
         rows = jnp.ones((0, body.count))
-        return [bodies.drawn(body, rows, each, SplattingSettings(), DenseRasterizer()) for each in (view, larger)]
+        return [
+            bodies.drawn(body, rows, each, SplattingSettings(), DenseRasterizer())
+            for each in (view, larger)
+        ]
 
     middle = slice(BORDER, -BORDER), slice(BORDER, -BORDER)
     for seed in seeds(IN_SUITE):

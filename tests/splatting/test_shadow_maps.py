@@ -1,4 +1,6 @@
-"""Shadow maps: a disc above a plane, a sphere that must not shadow itself, and the gradient of a soft edge."""
+"""Shadow maps: a disc above a plane, a sphere that must not shadow itself, and the gradient of a
+soft edge.
+"""
 
 import bodies
 import equinox as eqx
@@ -58,26 +60,41 @@ def test_the_sphere_around_all_discs_reaches_two_pixels_from_the_edge(kind):
     body, _ = scene()
     bounds = Bounds.of(body)
     centers, radii = np.asarray(body.centers, float), np.asarray(body.radii, float)
-    np.testing.assert_allclose(bounds.center, 0.5 * (centers.min(axis=0) + centers.max(axis=0)), atol=1e-5)
+    np.testing.assert_allclose(
+        bounds.center, 0.5 * (centers.min(axis=0) + centers.max(axis=0)), atol=1e-5
+    )
     reach = np.linalg.norm(centers - np.asarray(bounds.center), axis=1)
     np.testing.assert_allclose(bounds.radius, reach.max() + radii.max(), rtol=1e-5)
-    on_sphere = np.asarray(bounds.center)[:, None] + float(bounds.radius) * bodies.directions(20_000).T
+    on_sphere = (
+        np.asarray(bounds.center)[:, None] + float(bounds.radius) * bodies.directions(20_000).T
+    )
     x, y, _ = LIGHTS[kind](bounds).project(jnp.asarray(on_sphere, float))
     for each in (x, y):
-        np.testing.assert_allclose([float(each.min()), float(each.max())], [2, SETTINGS.resolution - 2], atol=0.05)
+        np.testing.assert_allclose(
+            [float(each.min()), float(each.max())], [2, SETTINGS.resolution - 2], atol=0.05
+        )
     nothing = Bounds.of(jax.tree.map(lambda leaf: leaf[:0], body))
     np.testing.assert_array_equal(np.append(nothing.center, nothing.radius), [0, 0, 0, 1])
-    np.testing.assert_allclose(Bounds.of(jax.tree.map(lambda leaf: leaf[:1], body)).radius, radii[0], rtol=1e-6)
+    np.testing.assert_allclose(
+        Bounds.of(jax.tree.map(lambda leaf: leaf[:1], body)).radius, radii[0], rtol=1e-6
+    )
 
 
 def test_every_point_belongs_to_one_face_of_the_cube():
     eye, points = jnp.asarray([0.3, -0.2, 0.1]), jnp.asarray(bodies.directions(500).T, float)
-    assert np.all(sum(np.asarray(in_cube_face(view, points)) for view in cube_views(eye, SETTINGS)) == 1)
+    assert np.all(
+        sum(np.asarray(in_cube_face(view, points)) for view in cube_views(eye, SETTINGS)) == 1
+    )
     for view in cube_views(eye, SETTINGS):
         x, y, depth = (np.asarray(each) for each in view.project(points))
         off = np.maximum(np.abs(x - SETTINGS.resolution / 2), np.abs(y - SETTINGS.resolution / 2))
-        inside, known = (off < 30) & (depth > 2 * view.near), np.abs(off - 30) > 1e-3  # two pixels from the edge
-        np.testing.assert_array_equal(np.asarray(in_cube_face(view, points))[known] == 1, inside[known])
+        inside, known = (
+            (off < 30) & (depth > 2 * view.near),
+            np.abs(off - 30) > 1e-3,
+        )  # two pixels from the edge
+        np.testing.assert_array_equal(
+            np.asarray(in_cube_face(view, points))[known] == 1, inside[known]
+        )
 
 
 def smooth_step(t):
@@ -86,18 +103,27 @@ def smooth_step(t):
 
 
 def test_each_surface_holds_up_what_reaches_it():
-    """Level splats behind two level surfaces, of which each covers a part: the closed form, and less of it beyond the edge."""
+    """Level splats behind two level surfaces, of which each covers a part: the closed form, and
+    less of it beyond the edge.
+    """
     size, front, behind, covers, covers_behind = 32, 3.0, 4.5, 0.6, 0.25
     settings = ShadowSettings(resolution=size, bias=0.4, softness=0.8)
-    view = OrthographicView(jnp.zeros(3), jnp.diag(jnp.asarray([1.0, 1.0, 1.0])), jnp.asarray(2.0), size, size)
+    view = OrthographicView(
+        jnp.zeros(3), jnp.diag(jnp.asarray([1.0, 1.0, 1.0])), jnp.asarray(2.0), size, size
+    )
     tiles = (size // SIDE) ** 2, SIDE**2
 
     def surface(depth, coverage):
         none = jnp.zeros((tiles[0], 0, tiles[1]))
-        return Surface(none, jnp.full(tiles, depth), jnp.full(tiles, coverage), jnp.full(tiles, coverage))
+        return Surface(
+            none, jnp.full(tiles, depth), jnp.full(tiles, coverage), jnp.full(tiles, coverage)
+        )
 
     surfaces = Surfaces(surface(front, covers), surface(behind, covers_behind), jnp.zeros(()))
-    column, depth = (each.reshape(-1) for each in np.meshgrid(np.linspace(-1.7, 34.2, 38), np.linspace(2.9, 6.1, 33)))
+    column, depth = (
+        each.reshape(-1)
+        for each in np.meshgrid(np.linspace(-1.7, 34.2, 38), np.linspace(2.9, 6.1, 33))
+    )
     row = np.linspace(-0.4, 31.9, column.size)[::-1]
     centers = np.stack([(column - size / 2) / 2, (row - size / 2) / 2, depth], axis=1)
     body = bodies.splats(centers, np.tile([0.0, 0.0, -1.0], (len(depth), 1)), 0.1)
@@ -105,7 +131,9 @@ def test_each_surface_holds_up_what_reaches_it():
     held += (1 - covers) * covers_behind * smooth_step((depth - behind - 0.4) / 0.8)
 
     def share_inside(place):
-        """Of a quadratic spline around a place, what lies on the map: the integral of a hat of one pixel."""
+        """Of a quadratic spline around a place, what lies on the map: the integral of a hat of one
+        pixel.
+        """
         middle = np.floor(place) + np.arange(-1, 2)[:, None]
         away = np.abs(middle + 0.5 - place)
         weights = np.where(away < 0.5, 0.75 - away**2, 0.5 * np.clip(1.5 - away, 0, None) ** 2)
@@ -114,7 +142,9 @@ def test_each_surface_holds_up_what_reaches_it():
 
     expected = 1 - held * share_inside(column) * share_inside(row)
     assert expected.min() < 0.4
-    np.testing.assert_allclose(jax.jit(lit_share)(body, view, surfaces, settings), expected, atol=1e-5)
+    np.testing.assert_allclose(
+        jax.jit(lit_share)(body, view, surfaces, settings), expected, atol=1e-5
+    )
 
 
 @pytest.mark.once
@@ -142,7 +172,9 @@ def test_umbra_is_dark_and_the_rest_is_lit(kind):
 
 @pytest.mark.parametrize("kind", ["distant", "near", "cube"])
 def test_a_sphere_does_not_shadow_itself(kind):
-    """Every splat whose cosine to the light is above 0.2 is lit; the discs' own curvature is a quarter of the bias."""
+    """Every splat whose cosine to the light is above 0.2 is lit; the discs' own curvature is a
+    quarter of the bias.
+    """
     body = bodies.sphere(1500, 10.0)
     bounds = Bounds.of(body)
     toward = jnp.asarray([0.6, 0.3, 0.742])
@@ -173,12 +205,16 @@ def test_a_sphere_does_not_shadow_itself(kind):
 @pytest.mark.once
 @pytest.mark.once
 def test_light_that_grazes_a_smooth_body_leaves_no_terraces():
-    """A splat's depth is followed along its plane where the map's pixels are as wide as the light is deep: to a cosine of 1/8."""
+    """A splat's depth is followed along its plane where the map's pixels are as wide as the light
+    is deep: to a cosine of 1/8.
+    """
     body, toward = bodies.sphere(20_000, 40.0), np.asarray([0.6, 0.3, 0.742])
     settings = ShadowSettings(resolution=128)
     view = distant_view(-jnp.asarray(toward), Bounds.of(body), settings)
     rasterizer = TileRasterizer().planned(body, [view], SPLATTING)
-    lit = np.asarray(lit_share(body, view, light_surfaces(body, view, SPLATTING, rasterizer), settings))
+    lit = np.asarray(
+        lit_share(body, view, light_surfaces(body, view, SPLATTING, rasterizer), settings)
+    )
     cosine = np.asarray(body.normals, float) @ toward
     assert np.mean(lit[(cosine > 0.13) & (cosine < 0.2)]) > 0.99  # 0.97 if it is followed to 1/4
     assert np.min(lit[cosine > 0.2]) > 0.999
@@ -199,11 +235,15 @@ def test_edge_has_the_gradient_of_central_differences():
             direction, shift = parameters
             centers = jnp.concatenate([body.centers[:floor], body.centers[floor:] + shift[None]])
             moved = eqx.tree_at(lambda s: s.centers, body, centers)
-            return jnp.dot(shares(distant_view(direction, bounds, SETTINGS), moved, tiles)[:floor], weights)
+            return jnp.dot(
+                shares(distant_view(direction, bounds, SETTINGS), moved, tiles)[:floor], weights
+            )
 
         gradient, step = np.asarray(total(start)[1]).reshape(-1), 1e-6
         steps = step * jnp.eye(6).reshape(6, 2, 3)
-        differences = np.asarray([float(total(start + d)[0] - total(start - d)[0]) / (2 * step) for d in steps])
+        differences = np.asarray(
+            [float(total(start + d)[0] - total(start - d)[0]) / (2 * step) for d in steps]
+        )
     scale = np.max(np.abs(differences))
     assert scale > 0.1
     np.testing.assert_allclose(gradient, differences, atol=1e-5 * scale)

@@ -24,7 +24,9 @@ def drawn(view, body, rows, rasterizer=None):
 
 @pytest.mark.parametrize("kind", VIEWS)
 def test_a_constant_is_kept_and_a_plane_stays_a_plane(kind, dtype):
-    """Large enough splats: a quarter of a pixel is added to the ellipse that a slope is divided by."""
+    """Large enough splats: a quarter of a pixel is added to the ellipse that a slope is
+    divided by.
+    """
     normal = np.asarray([0.4, 0.3, 1.0]) / np.linalg.norm([0.4, 0.3, 1.0])
     view = VIEWS[kind]()
     if kind == "orthographic":
@@ -44,7 +46,9 @@ def test_a_constant_is_kept_and_a_plane_stays_a_plane(kind, dtype):
 
 def seen_sphere(view, radius, share):
     """Say which pixels see a sphere around the origin within `share` of its silhouette's radius."""
-    column, row = np.meshgrid(np.arange(view.width) + 0.5 - view.width / 2, np.arange(view.height) + 0.5 - view.height / 2)
+    column, row = np.meshgrid(
+        np.arange(view.width) + 0.5 - view.width / 2, np.arange(view.height) + 0.5 - view.height / 2
+    )
     tangent = np.hypot(column, row) / float(view.focal_length)
     return tangent < share * radius / np.sqrt(DISTANCE**2 - radius**2)
 
@@ -63,7 +67,9 @@ def test_coverage_is_one_inside_a_closed_surface(seed):
 @pytest.mark.once
 @pytest.mark.parametrize("rasterizer", ["plain", "tiles"])
 def test_two_silhouettes_in_one_pixel_leave_no_gap(rasterizer):
-    """Two small spheres whose outlines coincide, before a large one: neither rim may hide what lies behind both."""
+    """Two small spheres whose outlines coincide, before a large one: neither rim may hide what lies
+    behind both.
+    """
     view, radius = bodies.perspective(width=64, height=64), 12.0
     near, far, small = 20.0, 15.0, 3.0
     along = np.asarray([0.02, -0.03, 1.0])
@@ -74,7 +80,12 @@ def test_two_silhouettes_in_one_pixel_leave_no_gap(rasterizer):
         bodies.sphere(400, twin, places[1], seed=2),
     )
     tiles = TileRasterizer(lanes=8, slots=16).planned(body, [view], SETTINGS)
-    surfaces = drawn(view, body, jnp.zeros((0, body.count)), DenseRasterizer() if rasterizer == "plain" else tiles)
+    surfaces = drawn(
+        view,
+        body,
+        jnp.zeros((0, body.count)),
+        DenseRasterizer() if rasterizer == "plain" else tiles,
+    )
     front, behind = np.asarray(surfaces.front.coverage), np.asarray(surfaces.behind.coverage)
     inside = seen_sphere(view, radius, 0.9)
     assert (inside & (front < 1)).sum() >= 8, "the silhouettes lie between pixels"
@@ -86,7 +97,9 @@ def test_two_silhouettes_in_one_pixel_leave_no_gap(rasterizer):
 def test_an_inner_silhouette_leaves_no_gap(rasterizer):
     """A small sphere before a large one: where the small one ends, the large one shows."""
     view, radius = bodies.perspective(width=48, height=48), 12.0
-    body = bodies.joined(bodies.sphere(1400, radius), bodies.sphere(300, 3.0, (1.5, -1.0, 17.0), seed=1))
+    body = bodies.joined(
+        bodies.sphere(1400, radius), bodies.sphere(300, 3.0, (1.5, -1.0, 17.0), seed=1)
+    )
     near = jnp.concatenate([jnp.zeros((1, 1400)), jnp.ones((1, 300))], axis=1)
     tiles = TileRasterizer(lanes=8, slots=16).planned(body, [view], SETTINGS)
     surfaces = drawn(view, body, near, DenseRasterizer() if rasterizer == "plain" else tiles)
@@ -100,7 +113,9 @@ def test_an_inner_silhouette_leaves_no_gap(rasterizer):
 
 
 def limb(pixel: float, radius: float):
-    """Where a cylinder of 270 pixels in radius turns away before a sheet; splats with a radius in pixels."""
+    """Where a cylinder of 270 pixels in radius turns away before a sheet; splats with a radius in
+    pixels.
+    """
     spacing = radius * pixel / 1.5
     sideways = np.arange(-2.5 * pixel, 2.5 * pixel, spacing)
 
@@ -111,7 +126,9 @@ def limb(pixel: float, radius: float):
     curved = np.stack([np.sqrt((270 * pixel) ** 2 - z * z), y, z], axis=1)
     x, y = strip(np.arange(250 * pixel, 290 * pixel, spacing))
     flat = np.stack([x, y, np.full_like(x, -160 * pixel)], axis=1)
-    normals = np.concatenate([curved * [1.0, 0.0, 1.0] / (270 * pixel), np.tile([0.0, 0.0, 1.0], (len(flat), 1))])
+    normals = np.concatenate(
+        [curved * [1.0, 0.0, 1.0] / (270 * pixel), np.tile([0.0, 0.0, 1.0], (len(flat), 1))]
+    )
     centers = np.concatenate([curved, flat]) - [268 * pixel, 0.0, 0.0]
     return bodies.splats(centers, normals, np.full(len(centers), radius * pixel))
 
@@ -120,16 +137,27 @@ def limb(pixel: float, radius: float):
 @pytest.mark.parametrize("rasterizer", ["plain", "tiles"])
 @pytest.mark.parametrize("kind", VIEWS)
 def test_an_edge_hides_nothing_behind_it_however_small_the_splats(kind, rasterizer):
-    """Fragments of splats smaller than a pixel weigh less than those that the surface behind an edge is told by."""
+    """Fragments of splats smaller than a pixel weigh less than those that the surface behind an
+    edge is told by.
+    """
     width, height, pixel = 24, 4, 0.02
     if kind == "perspective":
-        view = bodies.perspective(fov=2 * np.degrees(np.arctan(0.5 * height * pixel / DISTANCE)), width=width, height=height)
+        view = bodies.perspective(
+            fov=2 * np.degrees(np.arctan(0.5 * height * pixel / DISTANCE)),
+            width=width,
+            height=height,
+        )
     else:
         facing = jnp.diag(jnp.asarray([1.0, -1.0, -1.0]))
         view = OrthographicView(jnp.zeros(3), facing, jnp.asarray(1 / pixel), width, height)
     body = limb(pixel, 0.3)
     tiles = TileRasterizer(lanes=2, slots=16).planned(body, [view], SETTINGS)
-    surfaces = drawn(view, body, jnp.zeros((0, body.count)), DenseRasterizer() if rasterizer == "plain" else tiles)
+    surfaces = drawn(
+        view,
+        body,
+        jnp.zeros((0, body.count)),
+        DenseRasterizer() if rasterizer == "plain" else tiles,
+    )
     front, behind = np.asarray(surfaces.front.coverage), np.asarray(surfaces.behind.coverage)
     assert np.any(front < 1), "the edge lies between pixels"
     assert np.min(front + (1 - front) * behind) > 1 - 1e-6
@@ -156,5 +184,8 @@ def test_coverage_of_a_silhouette_is_differentiable(float64):
 
 def test_what_lies_behind_ends_where_something_weighs_or_else_where_anything_is(dtype):
     nothing = -jnp.inf
-    weighty, of_any = jnp.asarray([[-5.0, nothing, nothing]], dtype), jnp.asarray([[-2.0, -3.0, nothing]], dtype)
+    weighty, of_any = (
+        jnp.asarray([[-5.0, nothing, nothing]], dtype),
+        jnp.asarray([[-2.0, -3.0, nothing]], dtype),
+    )
     np.testing.assert_array_equal(second_limits(weighty, of_any), [[-5.0, -3.0, jnp.inf]])

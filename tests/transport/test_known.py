@@ -33,7 +33,9 @@ def within(estimate, reference, deviation) -> None:
 def test_van_de_hulsts_slab(float32, score):
     """Albedo 0.9, g 0.75, optical thickness 2, indices matched: van de Hulst 1980, table 35."""
     slab = layer(1.0, 9 * 0.25, 1.0, 0.2)
-    found = sj.monte_carlo([slab], score * 625_000, KEY, edges=ONE_RING, phase=sj.HenyeyGreenstein(0.75))
+    found = sj.monte_carlo(
+        [slab], score * 625_000, KEY, edges=ONE_RING, phase=sj.HenyeyGreenstein(0.75)
+    )
     within(found.total_reflectance, 0.09739, 4e-4 / score**0.5)
     within(found.total_transmittance, 0.66096, 4e-4 / score**0.5)
 
@@ -41,29 +43,41 @@ def test_van_de_hulsts_slab(float32, score):
 @SCORES
 def test_giovanellis_half_space(float32, score):
     """Albedo 0.9, isotropic, index 1.5: Giovanelli 1955. What the surface reflects is counted."""
-    found = sj.monte_carlo([layer(1.0, 9.0, 1.5)], score * 750_000, KEY, edges=jnp.linspace(0.0, 4.0, EDGES))
+    found = sj.monte_carlo(
+        [layer(1.0, 9.0, 1.5)], score * 750_000, KEY, edges=jnp.linspace(0.0, 4.0, EDGES)
+    )
     np.testing.assert_allclose(found.specular, 0.04, rtol=1e-6)
     entering = 1 - found.specular
     total = type(found.total_reflectance)(
-        found.specular + entering * found.total_reflectance.value, entering * found.total_reflectance.deviation
+        found.specular + entering * found.total_reflectance.value,
+        entering * found.total_reflectance.deviation,
     )
     within(total, 0.2600, 4e-4 / score**0.5)
-    # Photons too faint to follow are given up: others carry for them, and nothing of theirs is counted.
+    # Photons too faint to follow are given up: others carry for them, and nothing of theirs is
+    # counted.
     np.testing.assert_array_equal(found.unfinished.value, 0)
     assert abs(found.balance()[0]) < 1e-5
 
 
 @SCORES
 def test_chandrasekhars_half_space(float32, score):
-    """Isotropic, indices matched, normal incidence: 1 - H(1) sqrt(1 - albedo). One walk serves all four."""
+    """Isotropic, indices matched, normal incidence: 1 - H(1) sqrt(1 - albedo). One walk serves all
+    four.
+    """
     albedo = np.asarray([0.2, 0.5, 0.9, 0.95])
     found = sj.monte_carlo([layer(1 / albedo - 1, 1.0, 1.0)], score * 900_000, KEY, edges=ONE_RING)
-    within(found.total_reflectance, [0.03523052, 0.11522588, 0.41494748, 0.53554099], 4e-4 / score**0.5)
+    within(
+        found.total_reflectance, [0.03523052, 0.11522588, 0.41494748, 0.53554099], 4e-4 / score**0.5
+    )
 
 
 def chi_squared(ours, photons, theirs, their_photons, places) -> None:
-    """Hold rings to those of another program. It gives no errors: they are ours, by the number of photons."""
-    value, error = (np.asarray(each)[: len(places), 0][places] for each in (ours.value, ours.deviation))
+    """Hold rings to those of another program. It gives no errors: they are ours, by the number of
+    photons.
+    """
+    value, error = (
+        np.asarray(each)[: len(places), 0][places] for each in (ours.value, ours.deviation)
+    )
     chi = np.sum((value - theirs[places]) ** 2 / (error**2 * (1 + photons / their_photons)))
     freedom = np.sum(places)
     assert freedom > 30
@@ -73,7 +87,13 @@ def chi_squared(ours, photons, theirs, their_photons, places) -> None:
 @pytest.mark.shared
 @pytest.mark.parametrize(
     "name",
-    ["skin1_R_near", "skin1_R_far", "skin1_G_near", pytest.param("marble_G_far", marks=pytest.mark.long), "slab_marbleG_d2.0"],
+    [
+        "skin1_R_near",
+        "skin1_R_far",
+        "skin1_G_near",
+        pytest.param("marble_G_far", marks=pytest.mark.long),
+        "slab_marbleG_d2.0",
+    ],
 )
 def test_ring_by_ring(float32, monte_carlo, name):
     """MCML: Wang, Jacques and Zheng 1995, run for this project."""
@@ -82,7 +102,9 @@ def test_ring_by_ring(float32, monte_carlo, name):
     (one,) = inputs["layers"]
     thickness = one["d"] if one["d"] < 1e7 else float("inf")
     edges = inputs["dr"] * jnp.arange(EDGES, dtype=jnp.float32)
-    found = sj.monte_carlo([layer(one["mua"], one["mus"], one["n"], thickness)], photons, KEY, edges=edges)
+    found = sj.monte_carlo(
+        [layer(one["mua"], one["mus"], one["n"], thickness)], photons, KEY, edges=edges
+    )
     entering = 1 - data["Rsp"]
     np.testing.assert_allclose(found.specular, data["Rsp"], rtol=1e-4)
     # Rings that a few hundred photons reached: their sums are nearly normal.
@@ -105,6 +127,8 @@ def test_what_is_reported_adds_up(float32):
     assert isinstance(found, MonteCarlo)
     assert np.all(np.abs(found.balance()) < 1e-5)
     assert np.all(np.asarray(found.absorbed.value) > 0.01)
-    few = sj.monte_carlo([layer(0.0, 2.0, 1.4)], 100_000, KEY, edges=jnp.linspace(0.0, 4.0, EDGES), flights=200)
+    few = sj.monte_carlo(
+        [layer(0.0, 2.0, 1.4)], 100_000, KEY, edges=jnp.linspace(0.0, 4.0, EDGES), flights=200
+    )
     assert few.unfinished.value[0] > 0.05
     assert abs(few.balance()[0]) < 1e-6

@@ -11,7 +11,9 @@ PHOTONS = 100_000
 
 
 def tool():
-    spec = importlib.util.spec_from_file_location("make_which_profile", ROOT / "tools" / "make_which_profile.py")
+    spec = importlib.util.spec_from_file_location(
+        "make_which_profile", ROOT / "tools" / "make_which_profile.py"
+    )
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
@@ -31,7 +33,14 @@ def test_the_table_is_what_the_tool_gives_today(float32):
     places = [place for place, row in enumerate(written) if row[0] == found[0][0]]
     assert len(places) == 1
     models = {row[2] for row in written}
-    assert models == {"Dipole", "BetterDipole", "PhotonBeam", "Burley", "Multipole", "LayeredMultipole"}
+    assert models == {
+        "Dipole",
+        "BetterDipole",
+        "PhotonBeam",
+        "Burley",
+        "Multipole",
+        "LayeredMultipole",
+    }
     for row, old in zip(found, written[places[0] :], strict=False):
         assert row[0] == old[0]
         # Half a per cent: three standard errors of a tenth of the photons.

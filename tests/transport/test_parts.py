@@ -29,7 +29,9 @@ def test_threefry_is_that_of_jax():
 
 
 def test_uniforms_are_uniform_and_independent(dtype):
-    numbers = np.concatenate([uniforms(KEY, jnp.asarray(n), 4096, dtype) for n in range(50)], axis=1)
+    numbers = np.concatenate(
+        [uniforms(KEY, jnp.asarray(n), 4096, dtype) for n in range(50)], axis=1
+    )
     assert numbers.dtype == dtype
     assert numbers.min() > 0
     assert numbers.max() <= 1
@@ -56,12 +58,16 @@ def test_points_lie_on_the_circle(float64):
 
 @pytest.mark.parametrize("g", [-0.6, 0.0, 1e-6, 0.5, 0.95])
 def test_henyey_and_greensteins_angles(float64, g):
-    """Its moments are the powers of g: the mean Legendre polynomials of the cosine. The direction itself is a unit vector."""
+    """Its moments are the powers of g: the mean Legendre polynomials of the cosine. The direction
+    itself is a unit vector.
+    """
     xi = (jnp.arange(200_000.0) + 0.5) / 200_000
     for start in ((0.0, 0.0, 1.0), (0.6, 0.0, -0.8), (0.0, 0.0, -1.0)):
         before = tuple(jnp.full_like(xi, each) for each in start)
         angle = (xi * 7919) % 1.0
-        after = sj.HenyeyGreenstein(jnp.asarray(g)).scatter(before, jnp.zeros(xi.shape, jnp.int32), xi, angle)
+        after = sj.HenyeyGreenstein(jnp.asarray(g)).scatter(
+            before, jnp.zeros(xi.shape, jnp.int32), xi, angle
+        )
         np.testing.assert_allclose(sum(each * each for each in after), 1, rtol=1e-12)
         cosine = np.asarray(sum(a * b for a, b in zip(before, after, strict=True)))
         np.testing.assert_allclose(cosine.mean(), g, atol=1e-6)
@@ -76,31 +82,48 @@ def test_reflectance_has_the_moments_of_diffusion(float64, eta):
     mu = (jnp.arange(400_000.0) + 0.5) / 400_000
     reflectance, onward = fresnel(mu, jnp.full_like(mu, eta), jnp.ones_like(mu))
     moment = 2 * jnp.mean(mu * reflectance)
-    np.testing.assert_allclose(moment, ExactFresnel().first_moment(jnp.asarray([eta]))[0], atol=2e-6)
+    np.testing.assert_allclose(
+        moment, ExactFresnel().first_moment(jnp.asarray([eta]))[0], atol=2e-6
+    )
     # Snell's law, where light goes on.
     goes = np.asarray(reflectance) < 1
     np.testing.assert_allclose((1 - onward**2)[goes], (eta**2 * (1 - mu**2))[goes], atol=1e-12)
 
 
 def test_light_is_bent_as_snell_has_it(float64):
-    """Photons that meet an inner interface go on with unit directions, in their plane, or turn back."""
+    """Photons that meet an inner interface go on with unit directions, in their plane, or turn
+    back.
+    """
     count = 4000
-    stack = Stack(jnp.asarray([1.0, 2.0]), jnp.asarray([0.5, 3.0]), jnp.asarray([1.0, 1.5, 1.2, 1.0]))
+    stack = Stack(
+        jnp.asarray([1.0, 2.0]), jnp.asarray([0.5, 3.0]), jnp.asarray([1.0, 1.5, 1.2, 1.0])
+    )
     azimuth, cosine = jnp.linspace(0.0, 6.0, count), jnp.linspace(0.05, 1.0, count)
     sine = jnp.sqrt(1 - cosine**2)
     before = (sine * jnp.cos(azimuth), sine * jnp.sin(azimuth), cosine)
     zero, whole = jnp.zeros(count), jnp.zeros(count, jnp.int32)
     photons = Photons(zero, zero, zero, before, zero + 100.0, whole, whole + INSIDE, whole)
-    after, flight = fly(stack, sj.Isotropic(), photons, uniforms(KEY, jnp.asarray(0), count, jnp.zeros(()).dtype))
+    after, flight = fly(
+        stack, sj.Isotropic(), photons, uniforms(KEY, jnp.asarray(0), count, jnp.zeros(()).dtype)
+    )
     ux, uy, uz = (np.asarray(each) for each in after.direction)
     np.testing.assert_allclose(ux**2 + uy**2 + uz**2, 1, rtol=1e-12)
     np.testing.assert_allclose(np.asarray(flight.length), 0.5 / np.asarray(cosine), rtol=1e-12)
-    np.testing.assert_allclose(np.hypot(after.x, after.y), 0.5 * np.asarray(sine / cosine), rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(
+        np.hypot(after.x, after.y), 0.5 * np.asarray(sine / cosine), rtol=1e-12, atol=1e-12
+    )
     crossed = np.asarray(after.layer) == 1
     assert np.array_equal(crossed, uz > 0)
     assert np.array_equal(np.asarray(after.depth), np.where(crossed, 0.0, 0.5))
-    np.testing.assert_allclose(np.hypot(ux, uy), np.where(crossed, 1.5 / 1.2, 1.0) * np.asarray(sine), rtol=1e-12, atol=1e-12)
-    np.testing.assert_allclose(np.asarray(after.to_scatter), 100 - np.asarray(flight.length), rtol=1e-12)
+    np.testing.assert_allclose(
+        np.hypot(ux, uy),
+        np.where(crossed, 1.5 / 1.2, 1.0) * np.asarray(sine),
+        rtol=1e-12,
+        atol=1e-12,
+    )
+    np.testing.assert_allclose(
+        np.asarray(after.to_scatter), 100 - np.asarray(flight.length), rtol=1e-12
+    )
     # Beyond the critical angle none goes on; well within it nearly all do.
     assert not np.any(crossed[np.asarray(sine) > 1.2 / 1.5])
     assert np.mean(crossed[np.asarray(sine) < 0.5]) > 0.95
@@ -117,12 +140,16 @@ def test_diffuse_light_enters_with_unit_power(float64, eta):
 
 def test_sums_keep_what_rounding_takes(dtype):
     term = jnp.asarray(0.1, jnp.float32)
-    added = jax.lax.fori_loop(0, 300_000, lambda _, each: each.plus(term), Sum.zeros((), jnp.float32))
+    added = jax.lax.fori_loop(
+        0, 300_000, lambda _, each: each.plus(term), Sum.zeros((), jnp.float32)
+    )
     np.testing.assert_allclose(added.over(300_000), np.float32(0.1), rtol=1e-7)
     naive = jax.lax.fori_loop(0, 300_000, lambda _, each: each + term, jnp.zeros((), jnp.float32))
     assert abs(float(naive) / 30_000 - 1) > 1e-4
     values = jnp.full((8192, 2), 0.1, jnp.float32)
-    np.testing.assert_allclose(total(jnp.ones(8192, jnp.float32), values), 8192 * np.float32(0.1), rtol=2e-6)
+    np.testing.assert_allclose(
+        total(jnp.ones(8192, jnp.float32), values), 8192 * np.float32(0.1), rtol=2e-6
+    )
 
 
 def test_rings_are_where_they_say(dtype):
@@ -141,7 +168,9 @@ def test_rings_are_where_they_say(dtype):
 
 def test_progress_is_told(float32):
     told = []
-    sj.monte_carlo(HALF_SPACE, 2_000_000, KEY, progress=lambda done, photons: told.append((done, photons)))
+    sj.monte_carlo(
+        HALF_SPACE, 2_000_000, KEY, progress=lambda done, photons: told.append((done, photons))
+    )
     assert len(told) > 1
     assert told == sorted(told)
     assert told[-1] == (2_000_000, 2_000_000)

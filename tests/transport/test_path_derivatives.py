@@ -23,7 +23,9 @@ def slab(sigma_a, sigma_s_prime) -> list[sj.Layer]:
 
 
 def test_absorption_by_differences_of_the_same_walks(float64):
-    """Photons fly alike whatever is absorbed, so that the derivative is that of the estimate itself, ring by ring."""
+    """Photons fly alike whatever is absorbed, so that the derivative is that of the estimate
+    itself, ring by ring.
+    """
     step = 1e-4
 
     def estimate(sigma_a):
@@ -32,10 +34,21 @@ def test_absorption_by_differences_of_the_same_walks(float64):
     at = jnp.asarray(0.2)
     value, slope = jax.jvp(estimate, (at,), (jnp.asarray(1.0),))
     below, above = estimate(at - step), estimate(at + step)
-    for name in ("reflected", "transmitted", "total_reflectance", "total_transmittance", "absorbed"):
-        found, one, other = (np.asarray(getattr(each, name).value) for each in (slope, below, above))
-        # A photon given up on one side of the difference and kept on the other is 1e-4 of one in 3,000.
-        np.testing.assert_allclose(found, (other - one) / (2 * step), rtol=1e-4, atol=1e-4 * np.abs(found).max())
+    for name in (
+        "reflected",
+        "transmitted",
+        "total_reflectance",
+        "total_transmittance",
+        "absorbed",
+    ):
+        found, one, other = (
+            np.asarray(getattr(each, name).value) for each in (slope, below, above)
+        )
+        # A photon given up on one side of the difference and kept on the other is 1e-4 of one in
+        # 3,000.
+        np.testing.assert_allclose(
+            found, (other - one) / (2 * step), rtol=1e-4, atol=1e-4 * np.abs(found).max()
+        )
     np.testing.assert_array_equal(value.reflected.value, estimate(at).reflected.value)
     np.testing.assert_array_equal(slope.reflected.deviation, 0)
 
@@ -43,34 +56,55 @@ def test_absorption_by_differences_of_the_same_walks(float64):
 @pytest.mark.parametrize("score", [1, pytest.param(4, marks=pytest.mark.long)])
 def test_scattering_by_differences_of_other_walks(float32, score):
     """Within their errors, for all that is reported."""
-    # A long step: dividing by it magnifies the errors of the differences, and what they bend over it is a tenth of those.
+    # A long step: dividing by it magnifies the errors of the differences, and what they bend over
+    # it is a tenth of those.
     photons, step = score * 250_000, 0.2
     _, _, by_scattering = sj.path_derivatives(slab(0.2, 2.0), photons, KEY)
-    below, above = (sj.monte_carlo(slab(0.2, 2.0 + sign * step), photons, jax.random.fold_in(KEY, sign + 2)) for sign in (-1, 1))
+    below, above = (
+        sj.monte_carlo(slab(0.2, 2.0 + sign * step), photons, jax.random.fold_in(KEY, sign + 2))
+        for sign in (-1, 1)
+    )
     for name in ("total_reflectance", "total_transmittance", "absorbed"):
         one, other, found = getattr(below, name), getattr(above, name), getattr(by_scattering, name)
         difference = (np.asarray(other.value) - np.asarray(one.value)) / (2 * step)
         error = np.hypot(other.deviation, one.deviation) / (2 * step)
         allowed = ERRORS * np.hypot(error, found.deviation[0])
-        assert np.all(np.abs(found.value[0] - difference) < allowed), (name, found.value[0], difference, allowed)
+        assert np.all(np.abs(found.value[0] - difference) < allowed), (
+            name,
+            found.value[0],
+            difference,
+            allowed,
+        )
         assert np.all(allowed < 0.4 / score**0.5 * np.max(np.abs(difference))), name
 
 
 def test_a_half_space_knows_albedo_alone(float32):
-    """`sigma_a dR/dsigma_a + sigma_s dR/dsigma_s = 0` for the total, and what is not reflected is absorbed."""
+    """`sigma_a dR/dsigma_a + sigma_s dR/dsigma_s = 0` for the total, and what is not reflected is
+    absorbed.
+    """
     found, by_absorption, by_scattering = sj.path_derivatives([layer(0.2, 1.0, 1.3)], 400_000, KEY)
-    along = 0.2 * by_absorption.total_reflectance.value + 1.0 * by_scattering.total_reflectance.value
-    error = np.hypot(0.2 * by_absorption.total_reflectance.deviation, by_scattering.total_reflectance.deviation)
+    along = (
+        0.2 * by_absorption.total_reflectance.value + 1.0 * by_scattering.total_reflectance.value
+    )
+    error = np.hypot(
+        0.2 * by_absorption.total_reflectance.deviation, by_scattering.total_reflectance.deviation
+    )
     assert np.all(np.abs(along) < ERRORS * error)
     assert np.all(error < 0.1 * np.abs(0.2 * by_absorption.total_reflectance.value))
     for by in (by_absorption, by_scattering):
         balance = by.total_reflectance.value[0] + by.absorbed.value[0, 0]
-        assert np.all(np.abs(balance) < ERRORS * np.hypot(by.total_reflectance.deviation[0], by.absorbed.deviation[0, 0]))
+        assert np.all(
+            np.abs(balance)
+            < ERRORS * np.hypot(by.total_reflectance.deviation[0], by.absorbed.deviation[0, 0])
+        )
     assert np.all(found.total_reflectance.deviation > 0)
 
 
 def test_errors_of_derivatives_are_their_spread(float32):
-    runs = [sj.path_derivatives([layer(0.2, 1.0, 1.3)], 4_000, jax.random.key(seed))[1:] for seed in range(25)]
+    runs = [
+        sj.path_derivatives([layer(0.2, 1.0, 1.3)], 4_000, jax.random.key(seed))[1:]
+        for seed in range(25)
+    ]
     for each in zip(*runs, strict=True):
         values = np.asarray([by.total_reflectance.value[0, 0] for by in each])
         said = np.mean([by.total_reflectance.deviation[0, 0] for by in each])
@@ -83,7 +117,11 @@ def test_reverse_mode_is_forward_mode():
 
     def loss(coefficients):
         found = sj.monte_carlo(slab(coefficients[0], coefficients[1]), 2_000, KEY, edges=EDGES)
-        return rows @ found.reflected.value[:, 0] + found.absorbed.value[1, 0] + found.profile()(EDGES[3:4])[0, 0]
+        return (
+            rows @ found.reflected.value[:, 0]
+            + found.absorbed.value[1, 0]
+            + found.profile()(EDGES[3:4])[0, 0]
+        )
 
     at = jnp.asarray([0.2, 2.0])
     reverse, compiled = jax.grad(loss)(at), jax.jit(jax.grad(loss))(at)
@@ -97,10 +135,14 @@ def test_without_absorption_it_is_the_limit(float64):
     """The path lengths of all that leaves: one-sided differences of the same walks tend to it."""
 
     def reflectance(sigma_a):
-        return sj.monte_carlo([layer(sigma_a, 2.0, 1.4, 1.0)], 2_000, KEY).total_reflectance.value[0]
+        return sj.monte_carlo([layer(sigma_a, 2.0, 1.4, 1.0)], 2_000, KEY).total_reflectance.value[
+            0
+        ]
 
     slope = jax.grad(reflectance)(jnp.asarray([0.0]))[0]
-    quotients = [(reflectance(jnp.asarray([h])) - reflectance(jnp.asarray([0.0]))) / h for h in (2e-4, 1e-4)]
+    quotients = [
+        (reflectance(jnp.asarray([h])) - reflectance(jnp.asarray([0.0]))) / h for h in (2e-4, 1e-4)
+    ]
     np.testing.assert_allclose(2 * quotients[1] - quotients[0], slope, rtol=1e-5)
 
 
@@ -113,7 +155,9 @@ def test_the_depth_of_a_film(float64):
 
     at, step = jnp.asarray([0.2]), 1e-4
     slope = jax.grad(reflectance)(at)[0]
-    np.testing.assert_allclose(slope, (reflectance(at + step) - reflectance(at - step)) / (2 * step), rtol=1e-3)
+    np.testing.assert_allclose(
+        slope, (reflectance(at + step) - reflectance(at - step)) / (2 * step), rtol=1e-3
+    )
     assert slope < -0.3
 
 
@@ -126,7 +170,10 @@ def test_what_paths_do_not_know_is_refused(dtype):
         jax.grad(thicker)(jnp.asarray(1.0, dtype))
 
     def denser(eta):
-        one = sj.Layer(sj.Medium(jnp.asarray([0.2], dtype), jnp.asarray([2.0], dtype), eta), jnp.asarray(1.0, dtype))
+        one = sj.Layer(
+            sj.Medium(jnp.asarray([0.2], dtype), jnp.asarray([2.0], dtype), eta),
+            jnp.asarray(1.0, dtype),
+        )
         return sj.monte_carlo([one], 100, KEY).total_reflectance.value[0]
 
     with pytest.raises(ValueError, match="no derivative in eta"):

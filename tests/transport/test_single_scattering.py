@@ -1,4 +1,6 @@
-"""Light that scatters once: against walks in media that hardly scatter twice, against closed forms, and in a picture."""
+"""Light that scatters once: against walks in media that hardly scatter twice, against closed forms,
+and in a picture.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +22,12 @@ def single(albedo=0.9, eta=1.0, channels=1):
 @pytest.mark.parametrize("eta", ETAS)
 def test_it_is_what_walks_scatter_where_hardly_any_light_scatters_twice(eta, float32):
     albedo = 2e-3
-    found = sj.monte_carlo([layer(1 - albedo, albedo, eta)], 1_000_000, jax.random.key(7), edges=jnp.geomspace(0.05, 6.0, 12))
+    found = sj.monte_carlo(
+        [layer(1 - albedo, albedo, eta)],
+        1_000_000,
+        jax.random.key(7),
+        edges=jnp.geomspace(0.05, 6.0, 12),
+    )
     ours = single(albedo, eta)
     total = found.total_reflectance
     # What scatters twice adds less than the albedo to one.
@@ -32,8 +39,13 @@ def test_it_is_what_walks_scatter_where_hardly_any_light_scatters_twice(eta, flo
     for i in range(1, len(edges) - 2):
         r = np.linspace(edges[i], edges[i + 1], 101)
         middle = 0.5 * (r[1:] + r[:-1])
-        ring = float(np.mean(np.asarray(ours(jnp.asarray(middle)))[:, 0] * middle) / np.mean(middle))
-        assert abs(ring - float(profile.values[i, 0])) < 4 * float(profile.deviation[i, 0]) + 3 * albedo * ring, i
+        ring = float(
+            np.mean(np.asarray(ours(jnp.asarray(middle)))[:, 0] * middle) / np.mean(middle)
+        )
+        assert (
+            abs(ring - float(profile.values[i, 0]))
+            < 4 * float(profile.deviation[i, 0]) + 3 * albedo * ring
+        ), i
 
 
 @pytest.mark.parametrize("eta", ETAS)
@@ -42,26 +54,40 @@ def test_radiance_integrates_to_the_total(eta):
     nodes, weights = np.polynomial.legendre.leggauss(200)
     mu, weights = 0.25 * (nodes + 1) ** 2, 0.5 * (nodes + 1) * weights
     radiance = np.asarray(ours.reflected(jnp.ones(len(mu)), jnp.asarray(mu)))[:, 0]
-    np.testing.assert_allclose(2 * np.pi * np.sum(weights * mu * radiance), float(ours.total_reflectance()[0]), rtol=1e-4)
+    np.testing.assert_allclose(
+        2 * np.pi * np.sum(weights * mu * radiance), float(ours.total_reflectance()[0]), rtol=1e-4
+    )
 
 
 def test_matched_indices_have_the_closed_forms():
-    """Chandrasekhar 1960: `alpha / 4 pi (mu + mu_0)`, and `alpha (1 - log 2) / 2` in all along the normal."""
+    """Chandrasekhar 1960: `alpha / 4 pi (mu + mu_0)`, and `alpha (1 - log 2) / 2` in all along the
+    normal.
+    """
     ours = single(0.7)
-    np.testing.assert_allclose(float(ours.total_reflectance()[0]), 0.35 * (1 - np.log(2)), rtol=1e-5)
+    np.testing.assert_allclose(
+        float(ours.total_reflectance()[0]), 0.35 * (1 - np.log(2)), rtol=1e-5
+    )
     mu_i, mu_o = jnp.asarray([1.0, 0.3, 0.05]), jnp.asarray([0.2, 0.9, 0.05])
     expected = 0.7 / (4 * np.pi * np.asarray(mu_i + mu_o))
     np.testing.assert_allclose(np.asarray(ours.reflected(mu_i, mu_o))[:, 0], expected, rtol=1e-5)
 
 
 def test_it_is_reciprocal():
-    """The radiance per irradiance outside is the same both ways, once what enters is counted as what leaves."""
+    """The radiance per irradiance outside is the same both ways, once what enters is counted as
+    what leaves.
+    """
     ours = single(eta=1.5)
-    there, back = (ours.reflected(*pair)[0] for pair in (map(jnp.asarray, (0.9, 0.2)), map(jnp.asarray, (0.2, 0.9))))
+    there, back = (
+        ours.reflected(*pair)[0]
+        for pair in (map(jnp.asarray, (0.9, 0.2)), map(jnp.asarray, (0.2, 0.9)))
+    )
 
     def enters(mu):
         inside = np.sqrt(1 - (1 - mu * mu) / 2.25)
-        across, along = (mu - 1.5 * inside) / (mu + 1.5 * inside), (inside - 1.5 * mu) / (inside + 1.5 * mu)
+        across, along = (
+            (mu - 1.5 * inside) / (mu + 1.5 * inside),
+            (inside - 1.5 * mu) / (inside + 1.5 * mu),
+        )
         return 1 - 0.5 * (across**2 + along**2)
 
     np.testing.assert_allclose(float(there) * enters(0.9), float(back) * enters(0.2), rtol=1e-5)
@@ -74,7 +100,9 @@ def test_the_share_that_leaves_is_the_integral_of_the_radiance():
         mu, weights = 0.25 * (nodes + 1) ** 2, 0.5 * (nodes + 1) * weights
         for each, found in zip(mu_i, ours.leaving(mu_i), strict=True):
             radiance = np.asarray(ours.reflected(jnp.full(len(mu), each), jnp.asarray(mu)))[:, 0]
-            np.testing.assert_allclose(float(found[0]), 2 * np.pi * np.sum(weights * mu * radiance), rtol=2e-3)
+            np.testing.assert_allclose(
+                float(found[0]), 2 * np.pi * np.sum(weights * mu * radiance), rtol=2e-3
+            )
 
 
 def test_gradients_at_matched_indices_are_the_limits_and_finite_at_grazing_angles(float64):
@@ -97,7 +125,9 @@ def test_a_table_without_it_is_the_rest():
     radii = jnp.asarray([0.1, 0.5, 2.0])
     table = sj.Tabulated(radii, 2 * ours(radii), total=2 * ours.total_reflectance()).without(ours)
     np.testing.assert_allclose(np.asarray(table.values), np.asarray(ours(radii)), rtol=1e-5)
-    np.testing.assert_allclose(np.asarray(table.total), np.asarray(ours.total_reflectance()), rtol=1e-5)
+    np.testing.assert_allclose(
+        np.asarray(table.total), np.asarray(ours.total_reflectance()), rtol=1e-5
+    )
 
 
 def test_a_table_from_zero_is_refused():

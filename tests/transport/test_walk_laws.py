@@ -10,7 +10,9 @@ import splatjax as sj
 KEY = jax.random.key(7)
 PHOTONS, FEW = 400_000, 10_000
 EDGES = 129
-"""Of rings given here: as many as there are by default, so that walks alike in their layers are one program."""
+"""Of rings given here: as many as there are by default, so that walks alike in their layers are one
+program.
+"""
 ERRORS = 3.5
 """Standard errors between two estimates: of some dozens here, none should be farther off."""
 
@@ -19,7 +21,11 @@ def agree(one, other, rtol=0.0) -> None:
     difference = np.abs(np.asarray(one.value) - np.asarray(other.value))
     error = np.hypot(np.asarray(one.deviation), np.asarray(other.deviation))
     assert np.all(error > 0)
-    assert np.all(difference < ERRORS * error + rtol * np.abs(np.asarray(one.value))), (one.value, other.value, error)
+    assert np.all(difference < ERRORS * error + rtol * np.abs(np.asarray(one.value))), (
+        one.value,
+        other.value,
+        error,
+    )
 
 
 def test_a_split_slab_is_the_whole(float32):
@@ -28,14 +34,20 @@ def test_a_split_slab_is_the_whole(float32):
     split = sj.monte_carlo(parts, PHOTONS, jax.random.fold_in(KEY, 1), eta_below=1.2)
     agree(whole.total_reflectance, split.total_reflectance)
     agree(whole.total_transmittance, split.total_transmittance)
-    absorbed = type(split.absorbed)(split.absorbed.value.sum(0), jnp.linalg.norm(split.absorbed.deviation, axis=0))
+    absorbed = type(split.absorbed)(
+        split.absorbed.value.sum(0), jnp.linalg.norm(split.absorbed.deviation, axis=0)
+    )
     agree(whole.absorbed, absorbed)
     through = whole.transmitted_profile()
     np.testing.assert_array_equal(through.total_reflectance(), whole.total_transmittance.value)
     np.testing.assert_array_equal(through.values, whole.transmitted.value)
     # Ring by ring, where many photons leave.
-    many = np.asarray(whole.reflected.deviation[:, 0]) < 0.05 * np.asarray(whole.reflected.value[:, 0])
-    pull = (whole.reflected.value - split.reflected.value) / np.hypot(whole.reflected.deviation, split.reflected.deviation)
+    many = np.asarray(whole.reflected.deviation[:, 0]) < 0.05 * np.asarray(
+        whole.reflected.value[:, 0]
+    )
+    pull = (whole.reflected.value - split.reflected.value) / np.hypot(
+        whole.reflected.deviation, split.reflected.deviation
+    )
     chi = np.sum(np.asarray(pull)[many] ** 2)
     assert np.sum(many) > 40
     assert abs(chi - np.sum(many)) < 4 * np.sqrt(2 * np.sum(many))
@@ -45,7 +57,9 @@ def test_light_goes_back_the_way_it_came(float32):
     """Reciprocity: a stack lets as much diffuse light through from above as from below."""
     stack = [layer(0.3, 1.0, 1.5, 0.4), layer(0.02, 3.0, 1.3, 1.0)]
     down, up = (
-        sj.monte_carlo(each, PHOTONS, jax.random.fold_in(KEY, number), incidence=sj.DiffuseIncidence())
+        sj.monte_carlo(
+            each, PHOTONS, jax.random.fold_in(KEY, number), incidence=sj.DiffuseIncidence()
+        )
         for number, each in enumerate((stack, stack[::-1]))
     )
 
@@ -60,7 +74,9 @@ def test_light_goes_back_the_way_it_came(float32):
 
 
 def test_similarity(float32):
-    """Scattering far and forward looks like a little in all directions, for a medium that absorbs little."""
+    """Scattering far and forward looks like a little in all directions, for a medium that absorbs
+    little.
+    """
     isotropic = sj.monte_carlo([layer(0.0041, 2.62, 1.5)], FEW, KEY)
     forward = sj.monte_carlo([layer(0.0041, 2.62, 1.5)], FEW, KEY, phase=sj.HenyeyGreenstein(0.9))
     agree(isotropic.total_reflectance, forward.total_reflectance, rtol=2e-3)
@@ -76,20 +92,28 @@ def test_units(dtype):
 
 
 def test_channels_that_walk_alike_are_walks_of_their_own(float32):
-    """White Monte Carlo: absorption by weight gives what each channel gives alone, and slabs that differ do not share."""
+    """White Monte Carlo: absorption by weight gives what each channel gives alone, and slabs that
+    differ do not share.
+    """
     edges = jnp.linspace(0.0, 4.0, EDGES)
     absorptions = [0.4, 0.01, 0.1]
     together = sj.monte_carlo([layer(absorptions, 2.0, 1.4, 1.0)], PHOTONS, KEY, edges=edges)
     for channel, sigma_a in enumerate(absorptions):
-        alone = sj.monte_carlo([layer(sigma_a, 2.0, 1.4, 1.0)], PHOTONS, jax.random.fold_in(KEY, channel), edges=edges)
+        alone = sj.monte_carlo(
+            [layer(sigma_a, 2.0, 1.4, 1.0)], PHOTONS, jax.random.fold_in(KEY, channel), edges=edges
+        )
         picked = jax.tree.map(lambda each, c=channel: each[c : c + 1], together.total_reflectance)
         agree(picked, alone.total_reflectance)
     ordered = np.asarray(together.total_reflectance.value)
     assert ordered[1] > ordered[2] > ordered[0]
     # A half space of one index is its own image in any scale; a slab is not.
     medium = sj.Medium(jnp.asarray([0.1, 0.2, 0.4]), jnp.asarray([1.0, 2.0, 4.0]), jnp.full(3, 1.4))
-    half_space = sj.monte_carlo([sj.Layer(medium, jnp.asarray(INFINITE))], PHOTONS, KEY, edges=edges)
-    np.testing.assert_allclose(half_space.total_reflectance.value, half_space.total_reflectance.value[0], rtol=1e-6)
+    half_space = sj.monte_carlo(
+        [sj.Layer(medium, jnp.asarray(INFINITE))], PHOTONS, KEY, edges=edges
+    )
+    np.testing.assert_allclose(
+        half_space.total_reflectance.value, half_space.total_reflectance.value[0], rtol=1e-6
+    )
     slab = sj.monte_carlo([sj.Layer(medium, jnp.asarray(1.0))], FEW, KEY, edges=edges)
     assert np.all(np.diff(slab.total_transmittance.value) < -0.05)
 
@@ -98,7 +122,9 @@ def test_a_film_is_a_thin_layer_that_absorbs(float32):
     thin = 1e-3
     below = layer(0.05, 2.0, 1.4, 2.0)
     film = sj.monte_carlo([sj.Film(jnp.asarray([0.3])), below], PHOTONS, KEY)
-    slab = sj.monte_carlo([layer(0.3 / thin, 1e-3, 1.4, thin), below], PHOTONS, jax.random.fold_in(KEY, 1))
+    slab = sj.monte_carlo(
+        [layer(0.3 / thin, 1e-3, 1.4, thin), below], PHOTONS, jax.random.fold_in(KEY, 1)
+    )
     agree(film.total_reflectance, slab.total_reflectance, rtol=1e-3)
     agree(film.absorbed, slab.absorbed, rtol=1e-3)
     bare = sj.monte_carlo([below], PHOTONS, KEY)
