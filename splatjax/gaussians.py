@@ -9,7 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from splatjax.pointwise import one_program
+from splatjax._chunking import jit_unless_traced
 
 
 def gaussian(
@@ -84,7 +84,7 @@ class SumOfGaussians(AbstractProfile):
     variances: Float[Array, " gaussians"]
     weights: Float[Array, "gaussians channels"]
 
-    @one_program
+    @jit_unless_traced
     def __call__(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
         squared_radius = jnp.broadcast_to((r * r)[..., None], (*r.shape, *self.variances.shape))
         variances = jnp.broadcast_to(self.variances, squared_radius.shape)

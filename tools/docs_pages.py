@@ -45,7 +45,6 @@ ROOMS = (
     "exports",
     "io",
     "plots",
-    "pointwise",
     "devices",
 )
 _LINK = re.compile(r"(\]\()([^)#\s]+)(#[^)\s]*)?(\))")

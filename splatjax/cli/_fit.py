@@ -12,10 +12,10 @@ from rich.console import Console
 from rich.table import Table
 
 import splatjax as sj
+from splatjax._format import channel_names, counted
 from splatjax.fitting import AbstractWeights
 from splatjax.io import own_version, read_picture, surface_and_source
 from splatjax.scattering import measure_laser_dot
-from splatjax.words import channel_names, counted
 
 from ._fit_all import fit_all
 from ._models import Model, Reference, reference

@@ -13,6 +13,7 @@ import tyro
 from rich.console import Console
 
 import splatjax as sj
+from splatjax._format import counted
 from splatjax.io import (
     fingerprint,
     material_path,
@@ -21,7 +22,6 @@ from splatjax.io import (
     read_record,
     write_record,
 )
-from splatjax.words import counted
 
 from ._models import Model
 from ._options import MaterialNames, OptionalFloat, OptionalPath

@@ -3,11 +3,11 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from splatjax._chunking import jit_unless_traced
 from splatjax.gaussians import SumOfGaussians
-from splatjax.pointwise import one_program
 
 
-@one_program
+@jit_unless_traced
 def separable_kernel(
     gaussians: SumOfGaussians, samples: int = 25, reach: float | None = None
 ) -> tuple[Float[Array, " samples"], Float[Array, "samples channels"]]:

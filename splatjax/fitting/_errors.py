@@ -3,8 +3,8 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from splatjax._chunking import jit_unless_traced
 from splatjax.gaussians import AbstractProfile, SumOfGaussians
-from splatjax.pointwise import one_program
 from splatjax.scattering import NORM_RULE, AbstractRadialRule, at_own_radii
 
 
@@ -21,7 +21,7 @@ def norm_radii(
     return rule.radii(profile)
 
 
-@one_program
+@jit_unless_traced
 def squared_error(
     profile: AbstractProfile, gaussians: SumOfGaussians, rule: AbstractRadialRule = NORM_RULE
 ) -> Float[Array, " channels"]:
@@ -46,7 +46,7 @@ def squared_error(
     return jnp.sum(dr * r * difference * difference, axis=0)
 
 
-@one_program
+@jit_unless_traced
 def relative_error(
     profile: AbstractProfile, gaussians: SumOfGaussians, rule: AbstractRadialRule = NORM_RULE
 ) -> Float[Array, " channels"]:

@@ -6,8 +6,8 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
+from splatjax._format import channel_names, percent
 from splatjax.scattering import Medium
-from splatjax.words import channel_names, percent
 
 _FIXED = 0.1
 """A combination that is known no better than this, as a relative error, counts as not fixed."""

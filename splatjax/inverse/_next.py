@@ -7,12 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from splatjax._format import percent
 from splatjax.fitting import AbstractWeights
 from splatjax.gaussians import AbstractProfile
 from splatjax.render import RenderSettings
 from splatjax.scattering import Dipole, Medium
 from splatjax.scene import AbstractLight, Camera, DirectionalLight, GaussianBeam, Splats
-from splatjax.words import percent
 
 from ._estimate import Combination, best_and_worst
 from ._evidence import Evidence

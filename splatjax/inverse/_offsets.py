@@ -8,8 +8,8 @@ import numpy as np
 import scipy  # its parts are loaded where they are used, which takes a third of a second
 from jaxtyping import Array, Float, Int
 
+from splatjax._chunking import jit_unless_traced
 from splatjax.geometry import tangent_frames
-from splatjax.pointwise import one_program
 from splatjax.scene import Splats
 
 from ._parts import AbstractBodyPart
@@ -96,7 +96,7 @@ class NormalOffsets(AbstractBodyPart):
     def coordinates(self, splats: Splats) -> Float[Array, " splats"]:
         return jnp.zeros_like(splats.areas)
 
-    @one_program
+    @jit_unless_traced
     def moved(self, splats: Splats, x: Float[Array, " splats"], prepared: OffsetTables) -> Splats:
         offsets = self.step * jnp.sum(prepared.weights * x[prepared.blurred], axis=1)
         ways = offsets[:, None] * splats.normals

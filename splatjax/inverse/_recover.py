@@ -8,13 +8,13 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
+from splatjax._format import counted
 from splatjax.diffusion import ClusterDiffuser
 from splatjax.fitting import AbstractWeights, fit_gaussians
 from splatjax.gaussians import AbstractProfile, SumOfGaussians
 from splatjax.render import RenderSettings
 from splatjax.scattering import Dipole, Medium
 from splatjax.scene import Material, Splats
-from splatjax.words import counted
 
 from ._estimate import inverse
 from ._evidence import Evidence

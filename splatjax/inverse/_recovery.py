@@ -9,9 +9,9 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
+from splatjax._format import percent
 from splatjax.scattering import Medium
 from splatjax.scene import Material
-from splatjax.words import percent
 
 from ._estimate import Combination, Estimate, inverse, roots
 

@@ -9,10 +9,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
+from splatjax._format import channel_names
 from splatjax.fitting import relative_error
 from splatjax.gaussians import AbstractProfile, SumOfGaussians, gaussian
 from splatjax.scattering import NORM_RULE, AbstractRadialRule
-from splatjax.words import channel_names
 
 _RGB = ("#c0392b", "#27853f", "#2c5aa0")
 _POINTS = 400

@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from splatjax._chunking import jit_unless_traced
 from splatjax.gaussians import AbstractProfile
-from splatjax.pointwise import one_program
 
 from ._dipole import screening
 from ._fresnel import AbstractFresnel, ExactFresnel
@@ -42,7 +42,7 @@ class BetterDipole(AbstractProfile):
         self.medium = medium
         self.fresnel = ExactFresnel() if fresnel is None else fresnel
 
-    @one_program
+    @jit_unless_traced
     def __call__(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
         medium = self.medium
         shape = (*r.shape, *medium.sigma_a.shape)
@@ -51,7 +51,7 @@ class BetterDipole(AbstractProfile):
         albedo_prime = jnp.broadcast_to(medium.albedo_prime, shape)
         return albedo_prime * exitance_of_source(medium, self.fresnel, depth, squared_radius)
 
-    @one_program
+    @jit_unless_traced
     def total_reflectance(self) -> Float[Array, " channels"]:
         r"""Give `2 pi` times the integral of `r R(r)` in closed form.
 

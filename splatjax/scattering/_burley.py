@@ -7,8 +7,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from splatjax._chunking import jit_unless_traced
 from splatjax.gaussians import AbstractProfile
-from splatjax.pointwise import one_program
 
 from ._medium import check_range
 
@@ -85,7 +85,7 @@ class Burley(AbstractProfile):
         check_range("albedo", self.albedo, "in [0, 1]", lambda x: (x >= 0) & (x <= 1))
         check_range("free_path", self.free_path, "positive (mm)", lambda x: x > 0)
 
-    @one_program
+    @jit_unless_traced
     def __call__(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
         shape = (*r.shape, *self.albedo.shape)
         radius = jnp.broadcast_to(r[..., None], shape)
@@ -101,7 +101,7 @@ class Burley(AbstractProfile):
         """Give `d`, mm."""
         return self.free_path / self.scaling(self.albedo)
 
-    @one_program
+    @jit_unless_traced
     def reflectance_within(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
         """Give the share that leaves within a radius (mm): `A (1 - exp(-r/d)/4 - 3
         exp(-r/3d)/4)`.

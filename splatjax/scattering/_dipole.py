@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from splatjax._chunking import jit_unless_traced
 from splatjax.gaussians import AbstractProfile
-from splatjax.pointwise import one_program
 
 from ._fresnel import AbstractFresnel, ExactFresnel
 from ._medium import Medium
@@ -39,7 +39,7 @@ class Dipole(AbstractProfile):
         self.medium = medium
         self.fresnel = ExactFresnel() if fresnel is None else fresnel
 
-    @one_program
+    @jit_unless_traced
     def __call__(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
         medium = self.medium
         shape = (*r.shape, *medium.sigma_a.shape)
@@ -53,7 +53,7 @@ class Dipole(AbstractProfile):
             total = total + z * screened / (squared_distance * jnp.sqrt(squared_distance))
         return jnp.broadcast_to(medium.albedo_prime, shape) / (4 * jnp.pi) * total
 
-    @one_program
+    @jit_unless_traced
     def total_reflectance(self) -> Float[Array, " channels"]:
         r"""Give `2 pi` times the integral of `r R(r)` in closed form.
 

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from splatjax.pointwise import one_program
+from splatjax._chunking import jit_unless_traced
 
 from ._quadrature import along_first_axis, unit_legendre
 
@@ -57,13 +57,13 @@ class ExactFresnel(AbstractFresnel):
     grows infinitely thin as `eta` goes to 1 is integrated in closed form.
     """
 
-    @one_program
+    @jit_unless_traced
     def first_moment(self, eta: Float[Array, " channels"]) -> Float[Array, " channels"]:
         ratio = _denser_over_rarer(eta)
         outside = _first_outside(ratio)
         return jnp.where(eta < 1, outside, 1 + (outside - 1) / (ratio * ratio))
 
-    @one_program
+    @jit_unless_traced
     def second_moment(self, eta: Float[Array, " channels"]) -> Float[Array, " channels"]:
         ratio = _denser_over_rarer(eta)
         cube = ratio * ratio * ratio
@@ -82,14 +82,14 @@ class EganFresnel(AbstractFresnel):
     **Source:** Egan and Hilgeman 1979; Donner and Jensen 2005; d'Eon and Irving 2011.
     """
 
-    @one_program
+    @jit_unless_traced
     def first_moment(self, eta: Float[Array, " channels"]) -> Float[Array, " channels"]:
         inverse = 1 / eta
         above = _polynomial(inverse, (0.6681, 0.7099, -1.4399)) + 0.0636 * eta
         below = _polynomial(inverse, (-0.4399, 0.7099, -0.3319, 0.0636))
         return jnp.where(eta == 1, jnp.zeros_like(eta), jnp.where(eta < 1, below, above))
 
-    @one_program
+    @jit_unless_traced
     def second_moment(self, eta: Float[Array, " channels"]) -> Float[Array, " channels"]:
         above = _polynomial(1 / eta, (-1641.1, 1376.53, -656.175, 135.926))
         above = above + eta * _polynomial(eta, (1213.67, -568.556, 164.798, -27.0181, 1.91826))

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from splatjax._chunking import jit_unless_traced
 from splatjax.gaussians import AbstractProfile
-from splatjax.pointwise import one_program
 
 from ._better_dipole import exitance_of_source
 from ._fresnel import AbstractFresnel, ExactFresnel
@@ -52,11 +52,11 @@ class PhotonBeam(AbstractProfile):
         self.medium = medium
         self.fresnel = ExactFresnel() if fresnel is None else fresnel
 
-    @one_program
+    @jit_unless_traced
     def __call__(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
         return self.multiple(r) + self.single(r)
 
-    @one_program
+    @jit_unless_traced
     def multiple(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
         """Give what was scattered more than once; finite at `r = 0`. 1/mm^2."""
         medium = self.medium
@@ -77,7 +77,7 @@ class PhotonBeam(AbstractProfile):
         """Give what was scattered once, 1/mm^2."""
         return SingleScattering(self.medium)(r)
 
-    @one_program
+    @jit_unless_traced
     def total_reflectance(self) -> Float[Array, " channels"]:
         """Give `2 pi` times the integral of `r R(r)`: single scattering exactly, multiple
         scattering by quadrature.

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from splatjax._chunking import jit_unless_traced
 from splatjax.gaussians import AbstractProfile
-from splatjax.pointwise import one_program
 
 
 class AbstractRadialRule(eqx.Module):
@@ -68,7 +68,7 @@ class RadialRule(AbstractRadialRule):
         nodes, weights = _nodes(self.smallest, self.largest, self.count, self.near)
         return jnp.asarray(nodes, dtype), jnp.asarray(weights, dtype)
 
-    @one_program
+    @jit_unless_traced
     def radii(
         self, profile: AbstractProfile
     ) -> tuple[Float[Array, "nodes channels"], Float[Array, "nodes channels"]]:
@@ -176,7 +176,7 @@ def at_own_radii(
     return jnp.diagonal(profile(r), axis1=1, axis2=2)
 
 
-@one_program
+@jit_unless_traced
 def integrated_reflectance(
     profile: AbstractProfile, rule: RadialRule = TOTAL_RULE
 ) -> Float[Array, " channels"]:

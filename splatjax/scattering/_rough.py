@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from splatjax.pointwise import one_program
+from splatjax._chunking import jit_unless_traced
 
 from ._fresnel import AbstractFresnel, ExactFresnel, reflectance
 from ._medium import check_range
@@ -49,11 +49,11 @@ class RoughFresnel(AbstractFresnel):
     def __check_init__(self):
         check_range("roughness", self.roughness, "in [0, 1]", lambda x: (x >= 0) & (x <= 1))
 
-    @one_program
+    @jit_unless_traced
     def first_moment(self, eta: Float[Array, " channels"]) -> Float[Array, " channels"]:
         return self.smooth.first_moment(eta) + self._excess(eta, power=1)
 
-    @one_program
+    @jit_unless_traced
     def second_moment(self, eta: Float[Array, " channels"]) -> Float[Array, " channels"]:
         return self.smooth.second_moment(eta) + self._excess(eta, power=2)
 

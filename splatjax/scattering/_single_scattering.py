@@ -7,8 +7,8 @@ import numpy as np
 from jax.lax import stop_gradient
 from jaxtyping import Array, Float
 
+from splatjax._chunking import jit_unless_traced
 from splatjax.gaussians import AbstractProfile
-from splatjax.pointwise import one_program
 
 from ._fresnel import moment_outside, reflectance
 from ._medium import Medium
@@ -47,7 +47,7 @@ class SingleScattering(AbstractProfile):
         self.medium = medium
         self.strength = jnp.ones_like(medium.sigma_a) if strength is None else strength
 
-    @one_program
+    @jit_unless_traced
     def __call__(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
         medium = self.medium
         scattering = medium.albedo_prime * medium.sigma_t_prime
@@ -67,7 +67,7 @@ class SingleScattering(AbstractProfile):
             / (4 * jnp.pi * jnp.broadcast_to(r[..., None], total.shape))
         )
 
-    @one_program
+    @jit_unless_traced
     def total_reflectance(self) -> Float[Array, " channels"]:
         half_angle, share = self._escaping()
         return self.strength * 0.5 * self.medium.albedo_prime * jnp.sum(share * half_angle, axis=0)
@@ -75,7 +75,7 @@ class SingleScattering(AbstractProfile):
     def length_scale(self) -> Float[Array, " channels"]:
         return 1 / self.medium.sigma_t_prime
 
-    @one_program
+    @jit_unless_traced
     def reflected(
         self, mu_i: Float[Array, "*points"], mu_o: Float[Array, "*points"]
     ) -> Float[Array, "*points channels"]:
@@ -107,7 +107,7 @@ class SingleScattering(AbstractProfile):
         transmitted = 1 - reflectance(inside_o, mu_o, eta)
         return scattered * transmitted / (4 * jnp.pi * eta * eta * (inside_i + inside_o))
 
-    @one_program
+    @jit_unless_traced
     def leaving(self, mu_i: Float[Array, "*points"]) -> Float[Array, "*points channels"]:
         """Give the share of the light that has entered under a cosine `mu_i` and leaves after one
         scattering; right to 1e-3.

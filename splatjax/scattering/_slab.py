@@ -5,8 +5,8 @@ import abc
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from splatjax._chunking import jit_unless_traced
 from splatjax.gaussians import AbstractProfile
-from splatjax.pointwise import one_program
 
 from ._adding import Response
 from ._hankel import inverse_hankel_transform
@@ -26,13 +26,13 @@ class AbstractSlabProfile(AbstractProfile):
         faster.
         """
 
-    @one_program
+    @jit_unless_traced
     def __call__(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
         return inverse_hankel_transform(
             lambda k: self.response(k).reflectance_above, r, self.falls()[0]
         )
 
-    @one_program
+    @jit_unless_traced
     def transmittance(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
         """Give the radiant exitance below per unit power entering above, at distance `r` (mm) from
         the axis; 1/mm^2.
@@ -41,11 +41,11 @@ class AbstractSlabProfile(AbstractProfile):
             lambda k: self.response(k).transmittance_down, r, self.falls()[1]
         )
 
-    @one_program
+    @jit_unless_traced
     def total_reflectance(self) -> Float[Array, " channels"]:
         return self.response(jnp.zeros_like(self.length_scale())).reflectance_above
 
-    @one_program
+    @jit_unless_traced
     def total_transmittance(self) -> Float[Array, " channels"]:
         """Give the share of the entering power that leaves below."""
         return self.response(jnp.zeros_like(self.length_scale())).transmittance_down

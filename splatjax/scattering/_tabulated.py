@@ -7,8 +7,8 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
+from splatjax._chunking import jit_unless_traced
 from splatjax.gaussians import AbstractProfile
-from splatjax.pointwise import one_program
 
 from ._medium import check_range
 
@@ -71,7 +71,7 @@ class Tabulated(AbstractProfile):
                         f"radii must ascend, each once; got {radius} mm after {before} mm"
                     )
 
-    @one_program
+    @jit_unless_traced
     def __call__(self, r: Float[Array, "*radii_"]) -> Float[Array, "*radii_ channels"]:
         flat = r.reshape(-1)
         columns = [jnp.interp(flat, self.radii, column, right=0.0) for column in self.values.T]
@@ -90,7 +90,7 @@ class Tabulated(AbstractProfile):
         total = None if self.total is None else self.total - profile.total_reflectance()
         return Tabulated(self.radii, self.values - profile(self.radii), self.deviation, total)
 
-    @one_program
+    @jit_unless_traced
     def total_reflectance(self) -> Float[Array, " channels"]:
         """Give the total, or else `2 pi` times the integral of `r R(r)`, exactly that of the
         straight lines.
@@ -103,7 +103,7 @@ class Tabulated(AbstractProfile):
         ) @ self.values[1:]
         return 2 * jnp.pi * (0.5 * self.radii[0] ** 2 * self.values[0] + lines)
 
-    @one_program
+    @jit_unless_traced
     def length_scale(self) -> Float[Array, " channels"]:
         """Give the radius, mm, within which half of the integral of `r |R|` lies, by the table's
         own steps.
