@@ -124,7 +124,8 @@ class Traced:
         )
         self.parameters = mi.traverse(self.scene)
         self.total, self.albedo = (
-            next(key for key in self.parameters.keys() if key.endswith(f"{name}.value.value"))  # noqa: SIM118
+            # noqa: SIM118
+            next(key for key in self.parameters.keys() if key.endswith(f"{name}.value.value"))
             for name in ("sigma_t", "albedo")
         )
 

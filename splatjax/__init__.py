@@ -64,17 +64,20 @@ from .transport import (
 )
 
 from .render import (
-    gather_picture as gather_picture,
-    gather_picture_and_slopes as gather_picture_and_slopes,
-)
-from .render import GatheredPicture as GatheredPicture
-from .render import (
-    diffuse as diffuse,
+    compute_irradiance as compute_irradiance,
+    diffuse_irradiance as diffuse_irradiance,
+    diffusion_basis as diffusion_basis,
+    DiffusionBasis as DiffusionBasis,
+    illuminate as illuminate,
+    make_plan as make_plan,
+    map_over as map_over,
     picture_jacobian as picture_jacobian,
     PictureJacobian as PictureJacobian,
+    Plan as Plan,
+    render as render,
+    RenderSettings as RenderSettings,
+    SplatLight as SplatLight,
 )
-from .render import map_over as map_over, render_streamed as render_streamed
-from .render import Plan as Plan, plan as plan, render as render, RenderSettings as RenderSettings
 
 from .inverse import HuberLoss as HuberLoss, SquaredLoss as SquaredLoss
 from .inverse import (

@@ -124,7 +124,8 @@ def kill_writer(suffix: str, kills: int, chance: random.Random) -> int:
 
 
 def _make_turntable_write_noise() -> None:
-    splats = Splats(*(np.ones(shape) for shape in ((300, 3), (300, 3), (300,), (300,))))  # ty: ignore
+    # ty: ignore
+    splats = Splats(*(np.ones(shape) for shape in ((300, 3), (300, 3), (300,), (300,))))
     _turntable.Turntable.load = lambda self: (splats, sj.load_material("skin"))  # ty: ignore
     sj.plan = lambda scenes, cameras: None  # ty: ignore
     _turntable.draw = lambda scene, camera, plan: frame(

@@ -365,7 +365,8 @@ def main() -> None:
     parser.add_argument("--again", action="store_true", help="meet again what has lived")
     given = parser.parse_args()
     os.environ["XLA_FLAGS"] = LEAST
-    import beartype, equinox, jax, matplotlib, optimistix, pytest, scipy.optimize, scipy.spatial  # noqa: E401, F401, I001
+    # noqa: E401, F401, I001
+    import beartype, equinox, jax, matplotlib, optimistix, pytest, scipy.optimize, scipy.spatial
 
     folder, copy = given.folder.resolve(), given.folder.resolve() / "copy"
     shutil.rmtree(copy, ignore_errors=True)

@@ -7,7 +7,7 @@ import numpy as np
 
 from splatjax.fitting import AbstractWeights
 from splatjax.gaussians import AbstractProfile
-from splatjax.render import GatheredPicture
+from splatjax.render import DiffusionBasis
 from splatjax.scattering import Medium
 
 from ._flat import flatten
@@ -72,7 +72,7 @@ class Evidence:
 
     def problem(
         self,
-        gathered: Sequence[GatheredPicture],
+        gathered: Sequence[DiffusionBasis],
         unknowns: Unknowns,
         variances: AbstractVariances,
         loss: AbstractLoss,

@@ -11,14 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from splatjax.diffusion import GatheredLight
+from splatjax.diffusion import LayersAtPoints
 from splatjax.gaussians import SumOfGaussians
 from splatjax.render import (
-    GatheredPicture,
+    DiffusionBasis,
     Plan,
     RenderSettings,
-    gather_picture,
-    gather_picture_and_slopes,
+    diffusion_basis,
 )
 from splatjax.scattering import Medium
 from splatjax.scene import AbstractLight, Camera, Material, Scene, Splats
@@ -46,7 +45,7 @@ class FlatPictures(eqx.Module):
     silhouettes.
     """
 
-    light: GatheredLight
+    light: LayersAtPoints
     leaving: Float[Array, "channels points"]
     specular: Float[Array, "channels pixels"]
     behind: Int[Array, " behind"]
@@ -64,13 +63,13 @@ class FlatPictures(eqx.Module):
         return intensities.T[:, self.picture] * (diffuse + self.specular)
 
 
-def which_count(picture: GatheredPicture, mask: np.ndarray) -> np.ndarray:
+def which_count(picture: DiffusionBasis, mask: np.ndarray) -> np.ndarray:
     """Give the numbers of the pixels that the body fills, among those of a mask."""
     return np.flatnonzero((np.asarray(picture.coverage) > FILLED).reshape(-1) & mask.reshape(-1))
 
 
 def flatten(
-    pictures: Sequence[GatheredPicture], masks: Sequence[np.ndarray], dtype
+    pictures: Sequence[DiffusionBasis], masks: Sequence[np.ndarray], dtype
 ) -> tuple[FlatPictures, list[np.ndarray]]:
     """Put the pixels of pictures in one row; also give their numbers in each picture.
 
@@ -113,13 +112,13 @@ def flatten(
     return flat, numbers
 
 
-def _point_by_point(light: GatheredLight):
+def _point_by_point(light: LayersAtPoints):
     """What of the light each point has its own of."""
-    slopes = () if light.slopes is None else (light.slopes.means, light.slopes.exits)
-    return light.means, light.exits, light.irradiance, light.area, light.albedo, *slopes
+    slopes = () if light.derivative is None else light.derivative
+    return light.means, light.mass, light.irradiance, light.area, light.albedo, *slopes
 
 
-def _points(picture: GatheredPicture, places: np.ndarray):
+def _points(picture: DiffusionBasis, places: np.ndarray):
     leaving = np.broadcast_to(np.asarray(picture.leaving), picture.light.irradiance.shape)
     return tuple(np.asarray(each)[..., places] for each in _point_by_point(picture.light)), leaving[
         ..., places
@@ -136,27 +135,29 @@ class Gatherer(eqx.Module):
     cameras: list[Camera]
     lights: list[tuple[AbstractLight, ...]]
 
-    def held(self, material: Material) -> list[GatheredPicture]:
+    def held(self, material: Material) -> list[DiffusionBasis]:
         """Gather for the variances of a material, and no others."""
-        return self._gather(gather_picture, material, self._plans(material))
+        return self._gather(False, material, self._plans(material))
 
     def moving(
         self, material: Material, plans: list[Plan] | None = None
-    ) -> tuple[list[GatheredPicture], list[Plan]]:
+    ) -> tuple[list[DiffusionBasis], list[Plan]]:
         """Gather for variances near those of a material; the plans are those that are given, if
         they hold.
         """
         if plans is not None:
-            found = self._gather(gather_picture_and_slopes, material, plans)
+            found = self._gather(True, material, plans)
             if all(float(each.overflow) == 0 for each in found):
                 return found, plans
         plans = self._plans(material)
-        return self._gather(gather_picture_and_slopes, material, plans), plans
+        return self._gather(True, material, plans), plans
 
-    def _gather(self, gather, material: Material, plans: list[Plan]) -> list[GatheredPicture]:
+    def _gather(
+        self, derivative: bool, material: Material, plans: list[Plan]
+    ) -> list[DiffusionBasis]:
         together = zip(self._scenes(material), self.cameras, plans, strict=True)
         return [
-            jax.block_until_ready(gather(scene, camera, self.settings, its))
+            jax.block_until_ready(diffusion_basis(scene, camera, self.settings, its, derivative))
             for scene, camera, its in together
         ]
 

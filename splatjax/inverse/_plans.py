@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import jax
 
-from splatjax.render import Plan, RenderSettings, plan
+from splatjax.render import Plan, RenderSettings, make_plan
 from splatjax.scene import Camera, Scene
 
 
@@ -21,7 +21,7 @@ def plans_of(
         ).append(i)
     found: list[Plan | None] = [None] * len(scenes)
     for places in alike.values():
-        made = plan([scenes[i] for i in places], [cameras[i] for i in places], settings)
+        made = make_plan([scenes[i] for i in places], [cameras[i] for i in places], settings)
         for i in places:
             found[i] = made
     return [each for each in found if each is not None]
