@@ -13,8 +13,8 @@ from splatjax.splatting import round_up
 
 from ._gaussian_sums import Steps
 
-LANES = 32
-SLOTS = 4
+LANES = 64
+SLOTS = 8
 """Blocks of sources that each lane meets in a step."""
 SOURCES = 16
 """Sources of a block."""

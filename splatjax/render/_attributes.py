@@ -1,5 +1,6 @@
 """What the splats carry into the picture, and what passes 4 and 5 read of it at the pixels."""
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -41,6 +42,32 @@ class SurfaceAttributes(eqx.Module):
     derivative: tuple[_diffusion.LayerValues | None, ...] | None = None
     added_source: Float[Array, "channels points"] | None = None
     extra: Any = None
+
+    def with_layers(
+        self,
+        layers: tuple[_diffusion.LayerValues | None, ...],
+        derivative: tuple[_diffusion.LayerValues | None, ...] | None,
+        added_source: Float[Array, "channels splats"] | None,
+        centers: Float[Array, "3 splats"],
+    ) -> "SurfaceAttributes":
+        """Add the layers of the splats to what is blended."""
+
+        def prepared(layers):
+            return tuple(
+                layer and _diffusion.continue_from_splats(layer, centers) for layer in layers
+            )
+
+        return dataclasses.replace(
+            self,
+            centers=centers,
+            layers=prepared(layers),
+            derivative=None if derivative is None else prepared(derivative),
+            added_source=added_source,
+        )
+
+    def without_layers(self) -> "SurfaceAttributes":
+        """Leave out the layers, once they are continued to the points seen."""
+        return dataclasses.replace(self, centers=None, layers=(), derivative=None)
 
 
 class SurfaceSamples(eqx.Module):

@@ -13,7 +13,7 @@ from ._attributes import SurfaceSamples
 from ._devices import on_devices
 from ._inputs import check_channels, in_one_dtype
 from ._lighting import LightVisibility
-from ._passes import light_splats, see_and_read
+from ._passes import in_a_row, light_splats, see_and_read
 from ._plan import Plan, plan_unless_traced
 from ._settings import RenderSettings
 from ._shade import layers_at_points, shade
@@ -141,34 +141,23 @@ def _diffusion_basis(
         tiles, visible, needed = see_and_read(scene, view, light, attributes, read, *given)
         tiles, visible = combination.gather(tiles), visible.gathered(combination)
         visible = visible.invalidate_unless(needed <= 1)
-        shape = gaussians.weights.shape
-
-        def in_a_row(values: Float[Array, "places rows pixels"]) -> Float[Array, "rows points"]:
-            return jnp.moveaxis(values, 1, 0).reshape(values.shape[1], -1)
-
         rows = jax.tree.map(in_a_row, tiles)
         leaving = visible.invalid_factor * visible.share.reshape(1, -1) * rows.post
         x, y = visible.pixels(visible.tiles)
         x, y = jnp.minimum(x, view.width - 1), jnp.minimum(y, view.height - 1)
         in_front = jnp.broadcast_to(visible.in_front[:, None], x.shape)
         resolvable = [layer is not None for layer in light.layers]
-
-        def layers(values):
-            means, mass = values
-            return means.reshape(*shape, -1), mass
-
-        means, mass = layers((rows.means, rows.mass))
         at = _diffusion.LayersAtPoints(
             variances=gaussians.variances,
-            means=means,
-            mass=mass,
+            means=rows.means,
+            mass=rows.mass,
             resolvable=jnp.asarray(resolvable, leaving.dtype),
             irradiance=rows.irradiance,
-            area=rows.area[0],
+            area=rows.area,
             albedo=rows.albedo,
             interval=plan.interval,
             kernel=settings.kernel,
-            derivative=None if rows.derivative is None else layers(rows.derivative),
+            derivative=rows.derivative,
         )
         return DiffusionBasis(
             light=at,
@@ -176,7 +165,7 @@ def _diffusion_basis(
             pixels=(y * view.width + x).reshape(-1),
             in_front=in_front.reshape(-1).astype(leaving.dtype),
             specular=visible.picture(tiles.specular),
-            coverage=visible.picture(jnp.ones_like(tiles.area))[..., 0],
+            coverage=visible.picture(jnp.ones_like(tiles.area)),
             overflow=jnp.where(needed <= 1, 0.0, needed),
         )
 

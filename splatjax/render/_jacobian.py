@@ -173,12 +173,7 @@ def _picture_jacobian(
         visible = visible.gathered(combination)
         frame = compose(scene, shaded, visible, needed)
         visible = visible.invalidate_unless(needed <= 1)
-        shape = gaussians.weights.shape
-
-        def picture(slope):
-            whole = visible.picture(slope)
-            return jnp.moveaxis(whole.reshape(*whole.shape[:2], *shape), 2, 0)
-
-        return PictureJacobian(frame, *map(picture, slopes))
+        pictures = [jnp.moveaxis(visible.picture(slope), 2, 0) for slope in slopes]
+        return PictureJacobian(frame, *pictures)
 
     return on_devices(passes, scene, plan, camera)

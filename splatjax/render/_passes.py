@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.lax import stop_gradient
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Bool, Float, PyTree, Shaped
 
 from splatjax import diffusion as _diffusion, splatting as _splatting
 from splatjax._chunking import map_chunks
@@ -130,88 +130,77 @@ def see_and_read(
     **Returns:** what was read, for each place of this device; the places; and the capacity needed
     over planned.
     """
-    origin = stop_gradient(_splatting.Bounds.of(scene.splats, combination).center)
-    attributes = with_layers(attributes, light, scene.splats.centers.T - origin[:, None])
+    origin = stop_gradient(_splatting.Bounds.of(scene.splats, combination).center)[:, None]
+    attributes = attributes.with_layers(
+        light.layers, light.derivative, light.added_source, scene.splats.centers.T - origin
+    )
     visible = _splatting.visible_surfaces(
         scene.splats, stack_rows(attributes), view, settings.splatting, plan.raster, combination
     )
-
-    def sampled(samples: SurfaceSamples) -> SurfaceSamples:
-        centers, own = samples.attributes.centers, samples.positions - origin[:, None]
-        layers, slopes = samples.attributes.layers, samples.attributes.derivative
-
-        def continued(layer):
-            return layer and _diffusion.continue_to_points(layer, centers, own)
-
-        parts = tuple(map(continued, layers)), slopes and tuple(map(continued, slopes))
-        return eqx.tree_at(
-            lambda each: (each.layers, each.derivative), samples, parts, is_leaf=lambda x: x is None
-        )
-
-    values = read_places(visible, attributes, lambda samples: read(sampled(samples)))
-    return values, visible, jnp.maximum(light.needed, visible.needed)
+    samples = sample_surfaces(visible, attributes, origin)
+    return map_samples(read, samples), visible, jnp.maximum(light.needed, visible.needed)
 
 
-def with_layers(
-    attributes: SurfaceAttributes, light: SplatLight, centers: Float[Array, "3 splats"]
-) -> SurfaceAttributes:
-    """Add the layers of the splats to what passes 2 and 3 blend."""
-
-    def prepared(layers):
-        return tuple(layer and _diffusion.continue_from_splats(layer, centers) for layer in layers)
-
-    return SurfaceAttributes(
-        normals=attributes.normals,
-        area=attributes.area,
-        source=attributes.source,
-        albedo=attributes.albedo,
-        irradiance=attributes.irradiance,
-        specular=attributes.specular,
-        roughness=attributes.roughness,
-        visibility=attributes.visibility,
-        centers=centers,
-        layers=prepared(light.layers),
-        derivative=None if light.derivative is None else prepared(light.derivative),
-        added_source=light.added_source,
-        extra=attributes.extra,
-    )
-
-
-def read_places(
-    visible: _splatting.VisibleSurfaces, like: SurfaceAttributes, read: Read[Values], *more: PyTree
-) -> Values:
-    """Blend the sums of every place, a chunk of places at a time, and read the samples.
+def sample_surfaces(
+    visible: _splatting.VisibleSurfaces, like: SurfaceAttributes, origin: Float[Array, "3 1"]
+) -> SurfaceSamples:
+    """Blend the sums of every place, and continue the layers of the splats to the points seen.
 
     **Arguments:**
 
     - `like`: the attributes whose rows were summed.
-    - `read`: of the samples, and of `more`.
-    - `more`: arrays `[places, rows, pixels]`, given to `read` as `[rows, points]`.
+    - `origin`: from which the splats' centers among them are counted.
 
-    **Returns:** for each array `[*rows, points]` that `read` returns, `[places, rows, pixels]`.
+    **Returns:** the samples, with arrays `[places, rows, pixels]`.
     """
     like = jax.eval_shape(lambda: like)
 
-    def chunk(rows, tiles, *more):
+    def blend(rows, tiles):
         surface = _splatting.Surface.of(rows, visible.view)
-        places, pixels = surface.depth.shape
-
-        def in_a_row(values: Float[Array, "places rows pixels"]) -> Float[Array, "rows points"]:
-            return jnp.moveaxis(values, 1, 0).reshape(values.shape[1], -1)
-
         attributes = split_rows(in_a_row(surface.attributes), like)
+        positions = in_a_row(visible.points(tiles, surface.depth))
+
+        def continued(layers):
+            own = attributes.centers, positions - origin
+            return tuple(each and _diffusion.continue_to_points(each, *own) for each in layers)
+
+        slopes = attributes.derivative
         samples = SurfaceSamples(
-            attributes=attributes,
-            positions=in_a_row(visible.points(tiles, surface.depth)),
-            depth=surface.depth.reshape(-1),
-            covered=surface.covered.reshape(-1),
-            layers=(),
-            derivative=None,
+            attributes=attributes.without_layers(),
+            positions=positions,
+            depth=in_a_row(surface.depth),
+            covered=in_a_row(surface.covered),
+            layers=continued(attributes.layers),
+            derivative=None if slopes is None else continued(slopes),
         )
+        return jax.tree.map(_by_place, samples)
 
-        def by_place(values: Float[Array, "*rows points"]) -> Float[Array, "places _ pixels"]:
-            return jnp.moveaxis(values.reshape(-1, places, pixels), 1, 0)
+    return map_chunks(
+        blend, visible.rows, visible.tiles, at_once=_splatting.TILES_AT_ONCE
+    )
 
-        return jax.tree.map(by_place, read(samples, *map(in_a_row, more)))
 
-    return map_chunks(chunk, visible.rows, visible.tiles, *more, at_once=_splatting.TILES_AT_ONCE)
+def map_samples(read: Read[Values], samples: SurfaceSamples) -> Values:
+    """Read samples, a chunk of places at a time.
+
+    **Arguments:**
+
+    - `samples`: with arrays `[places, *rows, pixels]`.
+
+    **Returns:** for each array `[*rows, points]` that `read` returns, `[places, *rows, pixels]`.
+    """
+
+    def chunk(samples):
+        return jax.tree.map(_by_place, read(jax.tree.map(in_a_row, samples)))
+
+    return map_chunks(chunk, samples, at_once=_splatting.TILES_AT_ONCE)
+
+
+def in_a_row(values: Shaped[Array, "places *rows pixels"]) -> Shaped[Array, "*rows points"]:
+    rows = jnp.moveaxis(values, 0, -2)
+    return rows.reshape(*rows.shape[:-2], -1)
+
+
+def _by_place(values: Shaped[Array, "*rows points"]) -> Shaped[Array, "places *rows pixels"]:
+    rows = values.reshape(*values.shape[:-1], -1, _splatting.SIDE**2)
+    return jnp.moveaxis(rows, -2, 0)

@@ -206,5 +206,4 @@ def _diffuse_irradiance(
         return visible.front_picture(combination.gather(layers))
 
     picture = on_devices(passes, scene, plan, camera, rows=(irradiance,))
-    gaussians, channels = scene.material.gaussians.weights.shape
-    return jnp.moveaxis(picture.reshape(*picture.shape[:2], gaussians, channels), 2, 0)
+    return jnp.moveaxis(picture, 2, 0)

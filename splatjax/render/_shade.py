@@ -135,27 +135,25 @@ def compose(
 
     **Arguments:**
 
-    - `shaded`: with arrays `[places, rows, pixels]`.
+    - `shaded`: with arrays `[places, *rows, pixels]`.
     """
     visible = visible.invalidate_unless(needed <= 1)
     front, picture = visible.front_picture, visible.picture
-    gaussians, channels = scene.material.gaussians.weights.shape
     diffuse, specular = picture(shaded.diffuse), picture(shaded.specular)
     single = None if shaded.single_scattering is None else picture(shaded.single_scattering)
-    layers = picture(shaded.layers)
     drawn = (visible.share > 0) & visible.in_front[:, None]
     drawn = drawn.astype(shaded.depth.dtype)
     unresolved = jnp.sum((1 - shaded.resolved) * drawn[:, None], axis=(0, 2))
     return Frame(
         beauty=diffuse + specular if single is None else diffuse + single + specular,
-        coverage=picture(jnp.ones_like(shaded.depth))[..., 0],
-        depth=front(shaded.depth, jnp.inf)[..., 0],
+        coverage=picture(jnp.ones_like(shaded.depth)),
+        depth=front(shaded.depth, jnp.inf),
         position=front(shaded.positions),
         normal=front(shaded.normals),
         albedo=picture(shaded.albedo),
         shadow=jnp.moveaxis(front(shaded.shadow, 1.0), -1, 0),
         irradiance=picture(shaded.irradiance),
-        layers=jnp.moveaxis(layers.reshape(*layers.shape[:2], gaussians, channels), 2, 0),
+        layers=jnp.moveaxis(picture(shaded.layers), 2, 0),
         weights=scene.material.gaussians.weights,
         diffuse=diffuse,
         specular=specular,

@@ -174,18 +174,10 @@ class Sweep(eqx.Module):
             chosen &= nearness <= upto[:, None]
         return jnp.where(chosen, self.view.squared_radius(nearness, quadric), 1.0)
 
-    def rows(self, splats, attributes, block, lanes: Lanes):
-        """Give what is summed, `[lanes, slots]` each: attributes, the plane of nearness (three
-        numbers), and 1.
-        """
+    def nearness_rows(self, splats):
+        """Return `[lanes, 4, slots]`: the plane of nearness over the tile (three numbers), and 1."""
         x, y, sx, sy, _, _, _, e, _ = splats
-        return [
-            *(lanes.read(row, block) for row in attributes),
-            e - sx * x - sy * y,
-            sx,
-            sy,
-            jnp.ones_like(e),
-        ]
+        return jnp.stack([e - sx * x - sy * y, sx, sy, jnp.ones_like(e)], axis=1)
 
     def sums(self, slots: "Slots", lanes: Lanes, beyond, upto):
         """Sum attributes and nearness over the fragments between two limits, `[lanes, rows,
@@ -198,28 +190,35 @@ class Sweep(eqx.Module):
                 *self.fragments(splats), lanes.until_end(beyond, block), upto
             )
             weight = splats[-1][:, :, None] * fast_fragment_weight(squared_radius)
-            rows = jnp.stack(self.rows(splats, slots.attributes, block, lanes), axis=1)
-            return sums + jnp.einsum("trs,tsp->trp", rows, weight)
+            rows = slots.rows(lanes.read(slots.ids, block))
+            attributes, nearness = sums
+            return (
+                attributes + jnp.einsum("tsr,tsp->trp", rows, weight),
+                nearness + jnp.einsum("trs,tsp->trp", self.nearness_rows(splats), weight),
+            )
 
-        start = jnp.zeros(
-            (beyond.shape[0], len(slots.attributes) + 4, beyond.shape[1]), beyond.dtype
+        places, pixels = beyond.shape
+        start = tuple(
+            jnp.zeros((places, rows, pixels), beyond.dtype)
+            for rows in (slots.attributes.shape[1], 4)
         )
-        sums = lax.fori_loop(jnp.int32(0), lanes.blocks, add, start)
+        attributes, nearness = lax.fori_loop(jnp.int32(0), lanes.blocks, add, start)
         px, py = self.pixels(beyond.dtype)
-        nearness = sums[:, -4] + sums[:, -3] * px[None] + sums[:, -2] * py[None]
-        return jnp.concatenate([sums[:, :-4], nearness[:, None], sums[:, -1:]], axis=1)
+        plane = nearness[:, 0] + nearness[:, 1] * px[None] + nearness[:, 2] * py[None]
+        return jnp.concatenate([attributes, plane[:, None], nearness[:, 3:]], axis=1)
 
     def add_cotangents(self, slots: "Slots", lanes: Lanes, beyond, upto, cotangent, gradients):
-        """Add the cotangents of planes and attributes, per slot, for the fragments between two
-        limits, from those of the sums.
+        """Add the cotangents of planes, per slot, and of attributes, per splat, for the fragments
+        between two limits, from those of the sums.
         """
         px, py = self.pixels(beyond.dtype)
         monomials = jnp.asarray(
             np.stack([np.ones_like(px), px, py, px * px, px * py, py * py], axis=1)
         )
-        nearness = cotangent[:, -2]
-        plane = jnp.stack([nearness, nearness * px[None], nearness * py[None]], axis=1)
-        cotangent = jnp.concatenate([cotangent[:, :-2], plane, cotangent[:, -1:]], axis=1)
+        of_attributes, of_nearness = cotangent[:, :-2], cotangent[:, -2]
+        of_plane = jnp.stack(
+            [of_nearness, of_nearness * px[None], of_nearness * py[None], cotangent[:, -1]], axis=1
+        )
 
         def add(block, gradients):
             splats = self.splats(slots.planes, block, lanes)
@@ -228,48 +227,69 @@ class Sweep(eqx.Module):
                 nearness, quadric, lanes.until_end(beyond, block), upto
             )
             weight = fast_fragment_weight(squared_radius)
-            rows, opacity = self.rows(splats, slots.attributes, block, lanes), splats[-1]
-            d_rows = jnp.moveaxis(jnp.einsum("trp,tsp->trs", cotangent, weight), 1, 0)
-            d_weight = opacity[:, :, None] * jnp.einsum(
-                "tsr,trp->tsp", jnp.stack(rows, axis=2), cotangent
-            )
+            ids, opacity = lanes.read(slots.ids, block), splats[-1]
+            attributes, plane = slots.rows(ids), self.nearness_rows(splats)
+            # Cotangents of the summed rows, per slot, for a weight without opacity.
+            d_attributes = jnp.einsum("trp,tsp->tsr", of_attributes, weight)
+            d_plane = jnp.einsum("trp,tsp->trs", of_plane, weight)
+            d_opacity = jnp.sum(attributes * d_attributes, axis=2) + jnp.sum(plane * d_plane, axis=1)
+            # Cotangents of the weights, and through them of nearness and quadric.
+            d_weight = jnp.einsum("tsr,trp->tsp", attributes, of_attributes)
+            d_weight = d_weight + jnp.einsum("trs,trp->tsp", plane, of_plane)
+            d_weight = opacity[:, :, None] * d_weight
             d_squared = fragment_weight_derivative(squared_radius, weight) * d_weight
             nearness = jnp.where(squared_radius < 1, nearness, 1.0)
             d_nearness, d_quadric = self.view.squared_radius_vjp(
                 nearness, squared_radius, d_squared
             )
-            # Both are polynomials in the pixel: their moments over the tile are all that is needed.
+            # Both are polynomials in the pixel: their moments over the tile suffice.
             quad = jnp.moveaxis(d_quadric @ monomials, 2, 0)
             near = jnp.moveaxis(d_nearness @ monomials[:, :3], 2, 0)
-            d_opacity = sum(row * d_row for row, d_row in zip(rows, d_rows, strict=True))
-            d_rows = d_rows * opacity[None]
-            d_planes = _plane_cotangents(splats, quad, near + d_rows[-4:-1])
-            parts = [*d_planes, d_opacity, *d_rows[:-4]]
-            return tuple(
-                lanes.add(whole, block, part) for whole, part in zip(gradients, parts, strict=True)
+            near = near + jnp.moveaxis(d_plane[:, :3], 1, 0) * opacity[None]
+            of_planes, of_rows = gradients
+            parts = *_plane_cotangents(splats, quad, near), d_opacity
+            return (
+                tuple(lanes.add(*each) for each in zip(of_planes, (block,) * 9, parts, strict=True)),
+                of_rows.at[ids].add(d_attributes * opacity[:, :, None], mode="drop"),
             )
 
         return lax.fori_loop(jnp.int32(0), lanes.blocks, add, gradients)
 
 
 class Slots(eqx.Module):
-    """What the sweeps read, gathered into slots; rows of one lane each."""
+    """What the sweeps read: planes gathered into slots, in rows of one lane each, and attributes
+    splat by splat, which are too many to be kept in slots.
+    """
 
+    ids: Int[Array, "rows slots"]
     planes: list[Float[Array, "rows slots"]]
     shift: Float[Array, "rows slots"]
-    attributes: list[Float[Array, "rows slots"]]
+    attributes: Float[Array, "splats attributes"]
 
     @classmethod
-    def gathered(cls, shift, planes, attributes, bins: Bins) -> "Slots":
-        def slots(plane, fill):
-            return slot_plane(plane, fill, bins).reshape(-1, bins.ids.shape[2])
+    def gathered(
+        cls,
+        shift: Float[Array, " splats"],
+        planes: tuple[Float[Array, " splats"], ...],
+        attributes: Float[Array, "splats attributes"],
+        bins: Bins,
+    ) -> "Slots":
+        """Gather splats into the slots of the bins."""
+        width = bins.ids.shape[2]
 
-        filled = zip(planes, _EMPTY, strict=True)
+        def slots(plane, fill):
+            return slot_plane(plane, fill, bins).reshape(-1, width)
+
         return cls(
-            [slots(*each) for each in filled],
-            slots(shift, 0.0),
-            [slots(row, 0.0) for row in attributes],
+            ids=bins.ids.reshape(-1, width),
+            planes=[slots(*each) for each in zip(planes, _EMPTY, strict=True)],
+            shift=slots(shift, 0.0),
+            attributes=attributes,
         )
+
+    def rows(self, ids: Int[Array, "lanes slots"]) -> Float[Array, "lanes slots attributes"]:
+        """Read the attributes of some slots; 0 in empty ones."""
+        return self.attributes.at[ids].get(mode="fill", fill_value=0)
 
 
 def _plane_cotangents(splats, quad, near):

@@ -148,26 +148,29 @@ class VisibleSurfaces(eqx.Module):
         return jnp.moveaxis(self.view.unproject(x, y, depth), 0, 1)
 
     def front_picture(
-        self, values: Float[Array, "places rows pixels"], fill: float = 0.0
-    ) -> Float[Array, "height width rows"]:
+        self, values: Float[Array, "places *rows pixels"], fill: float = 0.0
+    ) -> Float[Array, "height width *rows"]:
         """Join the picture of the front surface; `fill` where there is none."""
         tiles = jnp.full((self.grid.count, *values.shape[1:]), fill, values.dtype)
         return self._joined(tiles.at[self.tiles].set(values, mode="drop"))
 
     def picture(
-        self, values: Float[Array, "places rows pixels"]
-    ) -> Float[Array, "height width rows"]:
+        self, values: Float[Array, "places *rows pixels"]
+    ) -> Float[Array, "height width *rows"]:
         """Lay the front over what shows behind it, premultiplied by coverage."""
         tiles = jnp.zeros((self.grid.count, *values.shape[1:]), values.dtype)
         place = jnp.where(
             self.tiles < 2 * self.grid.count, self.tiles % self.grid.count, self.grid.count
         )
-        return self._joined(tiles.at[place].add(self.share[:, None] * values, mode="drop"))
+        share = self.share.reshape(len(self.tiles), *[1] * (values.ndim - 2), -1)
+        return self._joined(tiles.at[place].add(share * values, mode="drop"))
 
     def _joined(
-        self, tiles: Float[Array, "tiles rows pixels"]
-    ) -> Float[Array, "height width rows"]:
-        return self.invalid_factor * jnp.moveaxis(self.grid.join(tiles), 0, 2)
+        self, tiles: Float[Array, "tiles *rows pixels"]
+    ) -> Float[Array, "height width *rows"]:
+        flat = tiles.reshape(tiles.shape[0], -1, tiles.shape[-1])
+        picture = jnp.moveaxis(self.grid.join(flat), 0, 2)
+        return self.invalid_factor * picture.reshape(*picture.shape[:2], *tiles.shape[1:-1])
 
 
 def visible_surfaces(

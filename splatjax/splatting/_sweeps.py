@@ -51,7 +51,7 @@ def sum_fragments(
     bins: Bins,
     shift: Float[Array, " splats"],
     planes: tuple[Float[Array, " splats"], ...],
-    attributes: tuple[Float[Array, " splats"], ...],
+    attributes: Float[Array, "splats attributes"],
 ) -> FragmentSums:
     """Sum attributes over the splats of every tile: this device's part of the sums."""
     return _forward(sweep, capacity, combination, bins, shift, planes, attributes)[0]
@@ -76,7 +76,7 @@ def _sum_fwd(sweep, capacity, combination, bins, shift, planes, attributes):
 def _sum_bwd(sweep: Sweep, capacity: Places, combination, residuals, cotangent):
     bins, shift, planes, attributes, ends = residuals
     slots, lanes = Slots.gathered(shift, planes, attributes, bins), sweep.grid.lanes
-    dtype, count = shift.dtype, len(planes) + len(attributes)
+    dtype, splats = shift.dtype, shift.shape[0]
     cotangent = cotangent.rows
 
     def front(i, gradients):
@@ -97,12 +97,12 @@ def _sum_bwd(sweep: Sweep, capacity: Places, combination, residuals, cotangent):
         picked = sweep.picked(bins, picked, dtype)
         return sweep.add_cotangents(slots, picked, beyond, upto, own, gradients)
 
-    gradients = tuple(zeros_after(cotangent, slots.shift.shape, dtype) for _ in range(count))
+    of_planes = tuple(zeros_after(cotangent, slots.shift.shape, dtype) for _ in planes)
+    gradients = of_planes, zeros_after(cotangent, attributes.shape, dtype)
     gradients = lax.fori_loop(jnp.int32(0), bins.chunks, front, gradients)
     rounds = _rounds(jnp.any(ends.beyond[capacity.front :] < jnp.inf, axis=1), lanes)
-    gradients = lax.fori_loop(jnp.int32(0), rounds, behind, gradients)
-    per_splat = tuple(scatter_slots(plane, bins, shift.shape[0]) for plane in gradients)
-    return None, None, per_splat[: len(planes)], per_splat[len(planes) :]
+    of_planes, of_rows = lax.fori_loop(jnp.int32(0), rounds, behind, gradients)
+    return None, None, tuple(scatter_slots(each, bins, splats) for each in of_planes), of_rows
 
 
 sum_fragments.defvjp(_sum_fwd, _sum_bwd)
@@ -127,7 +127,7 @@ def _sum_chunks(
         sums = sweep.within_picture(sweep.sums(slots, tiles, limits, None), own)
         return write(rows, sums, i * lanes), write(beyond, limits, i * lanes)
 
-    rows = zeros_after(slots.shift, (count, len(slots.attributes) + 2, SIDE**2), dtype)
+    rows = zeros_after(slots.shift, (count, slots.attributes.shape[1] + 2, SIDE**2), dtype)
     beyond = jnp.inf + zeros_after(slots.shift, (count, SIDE**2), dtype)
     rows, beyond = lax.fori_loop(jnp.int32(0), bins.chunks, chunk, (rows, beyond))
 
@@ -196,7 +196,7 @@ class PartSweep(eqx.Module):
             sums = self.sweep.sums(self.slots, chunk, _round_of(beyond, i, self.sweep), farther)
             return self.sweep.within_picture(sums, self.bins.order[lanes])
 
-        rows = len(self.slots.attributes) + 2
+        rows = self.slots.attributes.shape[1] + 2
         return self._each_round(
             tiles, add, zeros_after(beyond, (len(tiles), rows, SIDE**2), beyond.dtype)
         )

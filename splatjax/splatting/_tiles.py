@@ -155,7 +155,7 @@ class TilePlan(AbstractRasterPlan):
             bins=eqx.tree_at(lambda each: each.needed, bins, needed),
             shift=stop_gradient(footprints.shift),
             planes=tuple(getattr(footprints, name) for name in PLANES),
-            attributes=tuple(_taken(attributes, chosen)),
+            attributes=attributes.T.at[chosen].get(mode="fill", fill_value=0),
         )
 
 
@@ -166,7 +166,7 @@ class _Binned(eqx.Module):
     bins: Bins
     shift: Float[Array, " seen"]
     planes: tuple[Float[Array, " seen"], ...]
-    attributes: tuple[Float[Array, " seen"], ...]
+    attributes: Float[Array, "seen attributes"]
 
 
 @eqx.filter_jit
