@@ -75,6 +75,7 @@ from .render import (
     PictureJacobian as PictureJacobian,
     Plan as Plan,
     render as render,
+    render_streamed as render_streamed,
     RenderSettings as RenderSettings,
     SplatLight as SplatLight,
 )

@@ -6,6 +6,7 @@ from ._points import (
     LayersAtPoints as LayersAtPoints,
 )
 from ._clustered import ClusterDiffuser as ClusterDiffuser, ClusterPlan as ClusterPlan
+from ._clustered import FINEST as FINEST
 from ._dense import dense_layer as dense_layer, DenseDiffuser as DenseDiffuser
 from ._diffuser import (
     AbstractDiffuser as AbstractDiffuser,
@@ -21,6 +22,8 @@ from ._kernel import (
     EscapeNormalization as EscapeNormalization,
     PlainMean as PlainMean,
     resolved_fraction as resolved_fraction,
+    SAMPLED_SPLATS as SAMPLED_SPLATS,
     unevenness as unevenness,
 )
+from ._streamed import StreamedDiffusion as StreamedDiffusion
 from ._order import BLOCK as BLOCK, compact_order as compact_order

@@ -89,7 +89,7 @@ class ClusterDiffuser(AbstractDiffuser):
         sizes, (edges, supports) = np.asarray(variances, np.float64), ([], [])
         if exists.any():
             spacing, fine = math.sqrt(areas[exists].mean()), np.quantile(areas[exists], FINEST)
-            edges, supports = self.layers(sizes, spacing, fine, kernel, interval)
+            edges, supports = self.choose_sources(sizes, spacing, fine, kernel, interval)
         cells = sorted({edge for edge in edges if edge > 0})
         tree = ClusterTree.build(centers, normals, exists, cells)
         sources = Sources(*(jnp.asarray(each.T) for each in (centers, normals)), areas, areas[None])
@@ -111,7 +111,7 @@ class ClusterDiffuser(AbstractDiffuser):
             layers.append(LayerPlan(level, support, smallest, largest, neighbors))
         return ClusterPlan(tree, tuple(layers))
 
-    def layers(
+    def choose_sources(
         self,
         variances: Float[np.ndarray, " gaussians"],
         spacing: float,
@@ -141,7 +141,7 @@ class ClusterDiffuser(AbstractDiffuser):
     ) -> Neighbors:
         """Find the sources of one layer within reach of the splats of every part."""
         depths = kernel.depths(jnp.stack([variance, largest]))
-        boxes, spread = _source_boxes(clusters, depths)
+        boxes, spread = source_boxes(clusters, depths)
         # Sources of a wider layer lie deeper than those of the boxes.
         sinking = math.sqrt(3) * float(depths[1] - depths[0])
         reach = support * math.sqrt(float(largest) + float(spread)) + sinking
@@ -248,17 +248,20 @@ def layer_table(
     variance: Float[Array, ""],
     depth: Float[Array, ""],
     truncated: TruncatedGaussian,
+    slopes: bool = True,
 ) -> tuple[Float[Array, "blocks_and_one columns block"], Float[Array, ""]]:
-    """Lay out the sources of one layer: light, mass, and the first moments of both, from which
-    slopes are computed. Also return the largest variance of a source.
+    """Lay out the sources of one layer: light, mass and, for slopes, the first moments of both. Also
+    return the largest variance of a source.
     """
     widths = variance + below.spread
     # A flat sheet has mass 1.
     flat = 1 / (2 * jnp.pi * widths * truncated.integral(0.5 * depth * depth / widths))
     mass = (below.areas * flat)[None]
     light = jnp.concatenate([mass * below.irradiance, mass])
-    firsts = (light[:, None] * below.centers[None]).reshape(-1, light.shape[1])
-    rows = jnp.concatenate([light, firsts])
+    rows = light
+    if slopes:
+        firsts = light[:, None] * below.centers[None]
+        rows = jnp.concatenate([light, firsts.reshape(-1, light.shape[1])])
     table = source_table(below.centers, 0.5 / widths, rows, SOURCES)
     return table, jnp.max(widths, where=below.areas > 0, initial=0)
 
@@ -276,7 +279,7 @@ def _levels(tree: ClusterTree, sources: Sources) -> tuple[Float[Array, "3"], lis
 
 
 @eqx.filter_jit
-def _source_boxes(clusters: Clusters, depths: Float[Array, "2"]) -> tuple[Boxes, Float[Array, ""]]:
+def source_boxes(clusters: Clusters, depths: Float[Array, "2"]) -> tuple[Boxes, Float[Array, ""]]:
     """Enclose the sources at the first depth, and find their greatest spread at either."""
     below, exists = clusters.lowered(depths[0]), clusters.areas > 0
     spread = jnp.maximum(jnp.max(below.spread), jnp.max(clusters.lowered(depths[1]).spread))

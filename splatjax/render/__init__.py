@@ -13,3 +13,4 @@ from ._render import compute_irradiance as compute_irradiance
 from ._render import diffuse_irradiance as diffuse_irradiance, illuminate as illuminate
 from ._render import render as render
 from ._settings import RenderSettings as RenderSettings
+from ._streamed import render_streamed as render_streamed

@@ -67,9 +67,9 @@ def on_devices(
     )
     out_specs = PartitionSpec()
     if by_splat:
-        out_specs = along_splats(
-            jax.eval_shape(lambda *given: run(OneDevice(), *given), *given), devices
-        )
+        shapes = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), given)
+        results = jax.eval_shape(lambda given: run(OneDevice(), *given), shapes)
+        out_specs = along_splats(results, devices)
     # Without a check of what varies over devices: custom derivatives and loops have no rules for
     # it.
     mapped = jax.shard_map(

@@ -1,5 +1,6 @@
 """The Jacobian of a picture in its material, pixel by pixel, at the price of about one more pass 4."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import TypeVar
 
@@ -153,12 +154,7 @@ def _picture_jacobian(
                 layers = tuple(
                     layer if layer is None else layer[channels:] for layer in samples.layers
                 )
-                samples = eqx.tree_at(
-                    lambda each: (each.layers, each.derivative),
-                    samples,
-                    (layers, None),
-                    is_leaf=lambda leaf: leaf is None,
-                )
+                samples = dataclasses.replace(samples, layers=layers, derivative=None)
                 at = layers_at_points(
                     samples, own, added, gaussians.variances, plan.interval, settings.kernel
                 )

@@ -1,0 +1,158 @@
+"""Pass 4 with splats that come a part at a time, at the points that the pixels see: each part adds
+to their sums, and is forgotten.
+"""
+
+import dataclasses
+import math
+from collections.abc import Iterable, Iterator
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from splatjax._combination import PartByPart
+
+from ._clustered import ClusterDiffuser, layer_table, source_boxes
+from ._clusters import Clusters, ClusterTree
+from ._diffuser import Sources
+from ._gaussian_sums import FAR, Steps, gaussian_sums, identity
+from ._kernel import AbstractDiffusionKernel, TruncatedGaussian
+from ._neighbors import Boxes, find_neighbors
+from ._order import BLOCK, compact_order
+
+_SPARE = 1.3  # times the clusters of a part, so that one program serves nearly all parts
+
+
+class _Layer(eqx.Module):
+    """How one layer is summed."""
+
+    variance: Float[Array, ""]
+    depth: Float[Array, ""]
+    edge: float = eqx.field(static=True)
+    truncated: TruncatedGaussian
+    support: float = eqx.field(static=True)
+
+
+class StreamedDiffusion:
+    """Evaluates the layers at points, from sources that come in parts.
+
+    The cells of a part are its own, so that one which two parts share counts as two: never coarser
+    than the cells of all splats together. Only the sums are kept, which do not grow with the number
+    of splats.
+    """
+
+    def __init__(
+        self,
+        diffuser: ClusterDiffuser,
+        kernel: AbstractDiffusionKernel,
+        variances: Float[Array, " gaussians"],
+        spacing: float,
+        fine: float,
+        interval: Float[Array, "2"],
+        points: Float[Array, "blocks 3 block"],
+        exists: Bool[Array, "blocks block"],
+    ):
+        """Prepare for points in blocks of `BLOCK`; `spacing`, `fine` and `interval` as for
+        `ClusterDiffuser.choose_sources`.
+        """
+        sizes = np.asarray(variances, np.float64)
+        edges, supports = diffuser.choose_sources(sizes, spacing, fine, kernel, interval)
+        each = zip(variances, kernel.depths(variances), edges, supports, strict=True)
+        self.layers = [
+            _Layer(variance, depth, edge, kernel.truncated(support), support) if support else None
+            for variance, depth, edge, support in each
+        ]
+        self.cells = sorted({edge for edge in edges if edge > 0})
+        self.points = jnp.where(exists[:, None], points, FAR)
+        self.boxes = Boxes.around(
+            jnp.moveaxis(self.points, 1, 0).reshape(3, -1), exists.reshape(-1), BLOCK
+        )
+        self.counts, self.steps = (0,) * len(self.cells), [0] * len(self.layers)
+
+    def evaluate(
+        self, parts: Iterable[Sources]
+    ) -> tuple[Float[Array, "blocks values block"] | None, ...]:
+        """Sum over all parts: means and mass of each layer; `None` for one that is not resolved.
+
+        **Arguments:**
+
+        - `parts`: of one size, with centers from the origin of the points; sources without area
+          bring nothing.
+        """
+        sums = PartByPart().own_total(self._sums(parts))
+        return tuple(None if each is None else _divide(each) for each in sums)
+
+    def _sums(self, parts: Iterable[Sources]) -> Iterator[list[Array | None]]:
+        """Iterate over the sums of each part."""
+        values = None
+        for sources in parts:
+            if values is None or self._in_reach(sources):
+                values = self._sum_part(sources)
+                yield values
+
+    def _in_reach(self, sources: Sources) -> bool:
+        """Test whether a part may bring anything to any point, by boxes."""
+        centers, exists = np.asarray(sources.centers), np.asarray(sources.areas) > 0
+        if not exists.any():
+            return False
+        low, high = centers[:, exists].min(axis=1), centers[:, exists].max(axis=1)
+        gaps = np.maximum(np.maximum(self.boxes.low - high, low - self.boxes.high), 0)
+        # Cells hold cells by their centers, and splats sink along their normals.
+        reaches = [
+            each.support
+            * math.sqrt(
+                float(each.variance) + 0.5 * (2 * math.sqrt(3) * each.edge + 2 * each.depth) ** 2
+            )
+            + float(each.depth)
+            for each in self.layers
+            if each is not None
+        ]
+        return bool(np.any(np.sum(gaps * gaps, axis=1) <= max(reaches, default=0.0) ** 2))
+
+    def _sum_part(self, sources: Sources) -> list[Array | None]:
+        order = compact_order(np.asarray(sources.centers.T))
+        sources = jax.tree.map(lambda rows: rows[..., order], sources)
+        arrays = (np.asarray(each.T) for each in (sources.centers, sources.normals))
+        tree = ClusterTree.build(*arrays, np.asarray(sources.areas) > 0, self.cells)
+        self.counts = tuple(
+            had if count <= had else math.ceil(_SPARE * count / BLOCK) * BLOCK
+            for count, had in zip(tree.counts, self.counts, strict=True)
+        )
+        levels = _levels(tree.with_capacity(self.counts), sources)
+        return [None if each is None else self._sum_layer(i, each, levels)
+                for i, each in enumerate(self.layers)]
+
+    def _sum_layer(self, i: int, layer: _Layer, levels: list[Clusters]) -> Array:
+        clusters = levels[self.cells.index(layer.edge) + 1 if layer.edge else 0]
+        boxes, spread = source_boxes(clusters, jnp.stack([layer.depth, layer.depth]))
+        reach = layer.support * math.sqrt(float(layer.variance) + float(spread))
+        steps = find_neighbors(self.boxes, boxes, reach)
+        if steps.ids.shape[0] > self.steps[i]:
+            self.steps[i] = 1 << (steps.ids.shape[0] - 1).bit_length()
+        more = self.steps[i] - steps.ids.shape[0]
+        ids = jnp.pad(steps.ids, ((0, more), (0, 0), (0, 0)))
+        return _sum(self.points, clusters, layer, dataclasses.replace(steps, ids=ids))
+
+
+@eqx.filter_jit
+def _levels(tree: ClusterTree, sources: Sources) -> list[Clusters]:
+    return tree.levels(sources)
+
+
+@eqx.filter_jit
+def _sum(points, clusters: Clusters, layer: _Layer, steps: Steps) -> Array:
+    below = clusters.lowered(layer.depth)
+    table, _ = layer_table(below, layer.variance, layer.depth, layer.truncated, slopes=False)
+    spare = steps.order.shape[0] - points.shape[0]
+    blocks = jnp.pad(points, ((0, spare), (0, 0), (0, 0)), constant_values=FAR)
+    return gaussian_sums(blocks, table, steps, layer.truncated, identity)[: points.shape[0]]
+
+
+@eqx.filter_jit
+def _divide(sums: Float[Array, "blocks values block"]) -> Float[Array, "blocks values block"]:
+    """Divide the light by the mass; 0 where nothing is in reach."""
+    mass = sums[:, -1:]
+    means = sums[:, :-1] / jnp.where(mass > 0, mass, 1.0)
+    return jnp.where(mass > 0, jnp.concatenate([means, mass], axis=1), 0.0)

@@ -1,0 +1,261 @@
+"""A picture of more splats than memory holds: they come a part at a time, several times over, and
+leave only sums behind.
+"""
+
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
+from typing import TypeAlias
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from splatjax import diffusion as _diffusion, splatting as _splatting
+from splatjax._combination import PartByPart
+from splatjax.scene import (
+    AbstractLight,
+    Camera,
+    Frame,
+    Material,
+    Parts,
+    Scene,
+    Splats,
+    StackedLights,
+    stack_lights,
+)
+
+from ._attributes import SurfaceAttributes, SurfaceSamples, stack_rows
+from ._inputs import check_channels, in_one_dtype
+from ._lighting import Irradiance, LightVisibility, irradiate, map_visibility
+from ._passes import in_a_row, map_samples, sample_surfaces
+from ._plan import fill_up
+from ._settings import RenderSettings
+from ._shade import compose, shade
+from ._shadow_plan import is_among, shadow_views
+from ._statistics import ReplayableStream, StreamStatistics
+
+Report: TypeAlias = Callable[[str, int], None]
+
+
+class _Map(eqx.Module):
+    """The view of one shadow map, and the light it belongs to."""
+
+    view: _splatting.AbstractView
+    group: int = eqx.field(static=True)
+    light: int = eqx.field(static=True)
+    cube: bool = eqx.field(static=True)
+
+
+def render_streamed(
+    parts: Parts,
+    lights: Sequence[AbstractLight],
+    material: Material,
+    camera: Camera,
+    settings: RenderSettings = RenderSettings(),
+    report: Report | None = None,
+) -> Frame:
+    r"""Render splats that come a part at a time, in memory that does not grow with their number.
+
+    **Arguments:**
+
+    - `parts`: iterates over all splats from the beginning whenever it is called, in complete parts
+      of one size but the last, that are near in memory where they are near in space:
+      `splatjax.SplatFile`, for one.
+    - `lights`, `material`, `camera`, `settings`: as for `render`, with the default rasterizer and
+      diffuser.
+    - `report`: called after each part with what is being done, and how many splats are done.
+
+    **Returns:** the frame of `render`, to rounding but for pass 4: its clusters are those of each
+    part, and layers are evaluated at the points that the pixels see, so that it differs by less
+    than the error of the diffuser. Without gradients.
+
+    **Raises:** `ValueError` when there are no splats, parts differ in size, are not the same each
+    time, or the settings cannot be streamed.
+    """
+    rasterizer, diffuser = settings.rasterizer, settings.diffuser
+    if not isinstance(rasterizer, _splatting.TileRasterizer) or not isinstance(
+        diffuser, _diffusion.ClusterDiffuser
+    ):
+        raise ValueError(
+            f"settings has a {type(rasterizer).__name__} and a {type(diffuser).__name__}; only a "
+            "TileRasterizer and a ClusterDiffuser can be streamed"
+        )
+    stream = ReplayableStream(parts)
+
+    def reported(task: str) -> Iterator[Splats]:
+        done = 0
+        for part in stream():
+            yield part
+            done += part.count
+            if report is not None:
+                report(task, done)
+
+    statistics = StreamStatistics.of(lambda: reported("looking"))
+
+    rows = -(-statistics.rows // _diffusion.BLOCK) * _diffusion.BLOCK
+
+    def scenes(task: str) -> Iterator[Scene]:
+        for part in reported(task):
+            whole = Scene(fill_up(part, rows), tuple(lights), material)
+            yield in_one_dtype(whole)[0]
+
+    first = next(iter(scenes("looking")))
+    check_channels(first)
+    (first, camera), groups = in_one_dtype(first, camera), stack_lights(first.lights)
+    dtype = first.splats.centers.dtype
+    bounds, view = statistics.bounds(dtype), _splatting.PerspectiveView.of(camera)
+
+    # Pass 1: the shadow maps.
+    maps = _maps(groups, bounds, settings)
+    sums = _sum_views(scenes, "shadow maps", [each.view for each in maps], settings, _no_rows)
+    shadow_maps = [
+        _splatting.ShadowMap.of(each, shadow.view, settings.splatting)
+        for each, shadow in zip(sums, maps, strict=True)
+    ]
+
+    def lit(scene: Scene) -> tuple[LightVisibility, Irradiance]:
+        return _light(scene, groups, maps, shadow_maps, settings)
+
+    # Passes 2 and 3: what the camera sees.
+    like = settings.lighting.attributes(first, *lit(first))
+
+    def attributes(scene: Scene) -> Array:
+        return stack_rows(settings.lighting.attributes(scene, *lit(scene)))
+
+    (seen,) = _sum_views(scenes, "what the camera sees", [view], settings, attributes)
+    visible, samples = _sample(seen, view, settings, like, bounds.center)
+
+    # Pass 4, at the points that the pixels see.
+    unevenness = jnp.asarray(statistics.unevenness, dtype)
+    interval = settings.kernel.interval(unevenness)
+    diffusion = _diffusion.StreamedDiffusion(
+        diffuser,
+        settings.kernel,
+        first.material.gaussians.variances,
+        statistics.spacing,
+        statistics.fine,
+        interval,
+        samples.positions - bounds.center[None, :, None],
+        samples.covered,
+    )
+
+    def sources() -> Iterator[_diffusion.Sources]:
+        for scene in scenes("diffusion"):
+            splats, (_, irradiance) = scene.splats, lit(scene)
+            centers = splats.centers.T - bounds.center[:, None]
+            yield _diffusion.Sources(centers, splats.normals.T, splats.areas, irradiance.source)
+
+    layers = diffusion.evaluate(sources())
+
+    # Pass 5.
+    return _shade(first, view, groups, visible, samples, layers, interval, settings)
+
+
+def _no_rows(scene: Scene) -> Float[Array, "0 splats"]:
+    return jnp.zeros((0, scene.splats.count), scene.splats.centers.dtype)
+
+
+def _maps(
+    groups: Sequence[StackedLights], bounds: _splatting.Bounds, settings: RenderSettings
+) -> list[_Map]:
+    maps = []
+    for i, group in enumerate(groups):
+        if group.lights.cast_shadows:
+            lights = group.apart()
+            cube = is_among(lights, bounds)
+            maps += [
+                _Map(view, i, j, cube)
+                for j, light in enumerate(lights)
+                for view in shadow_views(light, bounds, settings.shadows, cube)
+            ]
+    return maps
+
+
+def _sum_views(
+    scenes: Callable[[str], Iterator[Scene]],
+    task: str,
+    views: Sequence[_splatting.AbstractView],
+    settings: RenderSettings,
+    rows: Callable[[Scene], Array],
+) -> list[_splatting.FragmentSums]:
+    """Sum the fragments of all parts in some views."""
+    if not views:
+        return []
+    rasterizer, splatting = settings.rasterizer, settings.splatting
+    demands, count = [], 0
+    for scene in scenes("planning"):
+        count = scene.splats.count
+        demands.append([rasterizer.demand(scene.splats, view, splatting) for view in views])
+    plans = [
+        rasterizer.plan_for([[part[k]] for part in demands], count, view)
+        for k, view in enumerate(views)
+    ]
+
+    def parts() -> Iterator[list[_splatting.PartSweep]]:
+        for scene in scenes(task):
+            attributes = rows(scene)
+            yield [
+                _part_sweep(plan, scene.splats, attributes, view, splatting)
+                for plan, view in zip(plans, views, strict=True)
+            ]
+
+    found = _splatting.sum_parts(parts, [plan.places for plan in plans], PartByPart())
+    return [sums for sums, _ in found]
+
+
+@eqx.filter_jit
+def _part_sweep(plan: _splatting.TilePlan, splats: Splats, attributes, view, splatting):
+    return plan.part_sweep(splats, attributes, view, splatting)
+
+
+@eqx.filter_jit
+def _light(
+    scene: Scene,
+    groups: list[StackedLights],
+    maps: Sequence[_Map],
+    shadow_maps: Sequence[_splatting.ShadowMap],
+    settings: RenderSettings,
+) -> tuple[LightVisibility, Irradiance]:
+    """Look a part up in the shadow maps of all parts."""
+    visibility: list = [
+        [0.0] * len(group.places) if group.lights.cast_shadows else None for group in groups
+    ]
+    for own, shadow_map in zip(maps, shadow_maps, strict=True):
+        found = map_visibility(scene, shadow_map, settings.shadows, own.cube)
+        visibility[own.group][own.light] = visibility[own.group][own.light] + found
+    stacked = [None if each is None else jnp.stack(each) for each in visibility]
+    light = LightVisibility(groups, stacked, jnp.zeros((), scene.splats.centers.dtype))
+    return light, irradiate(scene, light)
+
+
+@eqx.filter_jit
+def _sample(
+    sums: _splatting.FragmentSums,
+    view: _splatting.AbstractView,
+    settings: RenderSettings,
+    like: SurfaceAttributes,
+    origin: Float[Array, "3"],
+) -> tuple[_splatting.VisibleSurfaces, SurfaceSamples]:
+    visible = _splatting.VisibleSurfaces.of(sums, view, settings.splatting, PartByPart())
+    return visible, sample_surfaces(visible, like, origin[:, None])
+
+
+@eqx.filter_jit
+def _shade(
+    scene: Scene,
+    view: _splatting.PerspectiveView,
+    groups: list[StackedLights],
+    visible: _splatting.VisibleSurfaces,
+    samples: SurfaceSamples,
+    layers: tuple[Float[Array, "places values pixels"] | None, ...],
+    interval: Float[Array, "2"],
+    settings: RenderSettings,
+) -> Frame:
+    samples = dataclasses.replace(samples, layers=layers)
+
+    def read(samples: SurfaceSamples):
+        own = settings.lighting.at_pixels(scene, groups, samples)
+        return shade(scene, view.position, groups, samples, own, interval, settings)
+
+    return compose(scene, map_samples(read, samples), visible, visible.needed)
