@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import splatjax as sj
-from splatjax import plots, rivals
+from splatjax import baselines, plots
 
 # %% [markdown]
 # A bust of a third of life size, so that few splats resolve what light does in skin, under one
@@ -42,7 +42,7 @@ plots.figure_1(bust, skin, discs=3000)
 # shadow. What scatters gets there.
 
 # %%
-(opaque,) = bust.drawn(skin.opaque(), rivals.deferred_splatting())
+(opaque,) = bust.drawn(skin.opaque(), baselines.deferred_splatting())
 (soft,) = bust.drawn(skin)
 unlit = (np.asarray(soft.coverage) > 0.99) & (np.asarray(opaque.diffuse).max(axis=2) < 1e-4)
 reached = float(np.asarray(soft.diffuse)[unlit].mean() / np.asarray(soft.diffuse)[~unlit].mean())

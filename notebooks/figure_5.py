@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import splatjax as sj
-from splatjax import plots, rivals
+from splatjax import baselines, plots
 
 # %% [markdown]
 # Errors follow a law with one fitted factor.
@@ -41,7 +41,7 @@ plots.figure_5(few, amplified=(2.0, 4.0, 8.0), keep=(1, 4, 16))
 # %%
 narrow, wide, error, contrast = (jnp.asarray(value) for value in (4.0, 8.0, 0.02, 0.5))
 fewer = [
-    float(rivals.splats_that_suffice(width, jnp.asarray(1.0), error, contrast))
+    float(baselines.splats_that_suffice(width, jnp.asarray(1.0), error, contrast))
     for width in (narrow, wide)
 ]
 print(

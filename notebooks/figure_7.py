@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import splatjax as sj
-from splatjax import plots, rivals
+from splatjax import baselines, plots
 
 # %% [markdown]
 # A bust of a third of life size, so that few splats resolve what light does in skin, under one
@@ -51,8 +51,8 @@ def roughness(material, settings=None):
     return float(steps[both].mean())
 
 
-flat = roughness(skin.opaque(), rivals.elliptical_points())
-blended = roughness(skin.opaque(), rivals.deferred_splatting())
+flat = roughness(skin.opaque(), baselines.elliptical_points())
+blended = roughness(skin.opaque(), baselines.deferred_splatting())
 soft = roughness(skin, None)
 print(f"elliptical points {flat:.4f}, deferred splatting {blended:.4f}, with scattering {soft:.4f}")
 

@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import splatjax as sj
-from splatjax import plots, rivals
+from splatjax import baselines, plots
 from splatjax.geometry import sample_mesh
 
 # %% [markdown]
@@ -36,10 +36,10 @@ from splatjax.geometry import sample_mesh
 eye, middle = jnp.asarray([400.0, 30.0, 820.0]), jnp.asarray([0.0, 0.0, 0.0])
 light = sj.DirectionalLight(jnp.asarray([0.5, -0.4, -0.75]), jnp.full(3, jnp.pi))
 camera = sj.Camera.look_at(eye, middle, fov=17.0, width=192, height=192)
-mesh, textures = rivals.bust_with_textures(512)
+mesh, textures = baselines.bust_with_textures(512)
 splats = sample_mesh(mesh, 40_000, textures=textures)
 bust = plots.Subject("bust", splats, (light,), camera).scaled(0.3)
-triangles = rivals.TexturedMesh.of(mesh, textures)
+triangles = baselines.TexturedMesh.of(mesh, textures)
 triangles = replace(triangles, vertices=0.3 * triangles.vertices)
 skin = sj.load_material("skin")
 
@@ -55,7 +55,7 @@ plots.figure_8(bust, triangles, skin)
 # %%
 scene = bust.scene(skin)
 ours = sj.render(scene, bust.camera)
-theirs = rivals.render_texture_space(triangles, scene.lights, scene.material, bust.camera).frame
+theirs = baselines.render_texture_space(triangles, scene.lights, scene.material, bust.camera).frame
 inside = (np.asarray(ours.coverage) > 0.99) & (np.asarray(theirs.coverage) > 0.99)
 a, b = (np.asarray(frame.beauty)[inside] for frame in (ours, theirs))
 apart = np.abs(a - b).max(axis=1) / np.sqrt(np.mean(a**2))

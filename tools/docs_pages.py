@@ -41,7 +41,7 @@ ROOMS = (
     "shading",
     "render",
     "inverse",
-    "rivals",
+    "baselines",
     "exports",
     "io",
     "plots",

@@ -21,8 +21,8 @@ from ._shot import Shot, check_scale, in_color, towards
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Drawing
 
+    from splatjax.baselines import TexturedMesh
     from splatjax.plots import Subject
-    from splatjax.rivals import TexturedMesh
 
 _DISTANCE = 900.0  # mm: that of a portrait
 _TEXELS = 1024  # along an edge of the bust's textures
@@ -138,9 +138,9 @@ class Figure(MeshMaps):
 
     def _both_ways(self) -> "tuple[Subject, TexturedMesh]":
         """Give the mesh of a file, or the bust's, as splats and as triangles."""
+        from splatjax.baselines import TexturedMesh, bust_with_textures
         from splatjax.geometry import sample_mesh
         from splatjax.io import read_textured_mesh
-        from splatjax.rivals import TexturedMesh, bust_with_textures
 
         path = self.scene[0] if self.scene else None
         shot = self._shot(None)

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 from matplotlib.figure import Figure
 
-from splatjax.rivals import deferred_splatting, elliptical_points
+from splatjax.baselines import deferred_splatting, elliptical_points
 from splatjax.scene import Material, Splats
 
 from ._subject import Subject, bright, picture_grid

@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 
+from splatjax.baselines import ThinnedDiffuser, layer_contrast, thinning_error
 from splatjax.diffusion import DenseDiffuser, DiffusionSettings, ExitOdds, PlainMean
 from splatjax.gaussians import SumOfGaussians
 from splatjax.render import RenderSettings, diffuse, light_on_splats, plan
-from splatjax.rivals import ThinnedDiffuser, layer_contrast, thinning_error
 from splatjax.scene import Material
 
 from ._subject import Subject, bright, picture_grid

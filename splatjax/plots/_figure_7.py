@@ -3,7 +3,7 @@
 import numpy as np
 from matplotlib.figure import Figure
 
-from splatjax.rivals import (
+from splatjax.baselines import (
     deferred_splatting,
     elliptical_points,
     ewa_splatting,

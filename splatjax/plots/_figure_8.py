@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 from matplotlib.figure import Figure
 
+from splatjax.baselines import TexturedMesh, half_and_half, render_texture_space
 from splatjax.io import srgb_to_linear
-from splatjax.rivals import TexturedMesh, half_and_half, render_texture_space
 from splatjax.scene import Camera, Material
 
 from ._subject import Subject, bright, picture_grid

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from skimage.metrics import structural_similarity
 
-from splatjax import rivals
+from splatjax import baselines
 
 
 @pytest.fixture
@@ -31,8 +31,8 @@ def test_similarity_is_that_of_other_code(pictures):
         sigma=1.5,
         use_sample_covariance=False,
     )
-    assert float(rivals.similarity(first, second)) == pytest.approx(theirs, abs=1e-4)
-    assert float(rivals.similarity(first, first)) == pytest.approx(1.0, abs=1e-5)
+    assert float(baselines.similarity(first, second)) == pytest.approx(theirs, abs=1e-4)
+    assert float(baselines.similarity(first, first)) == pytest.approx(1.0, abs=1e-5)
 
 
 @pytest.mark.once
@@ -40,7 +40,7 @@ def test_points_are_off_by_their_worst_channel_of_the_root_mean_square():
     truth = np.tile([[1.0, 2.0]], (100, 1))
     found = truth.copy()
     found[0], found[1, 1] = [1.3, 2.0], 1.8
-    off = rivals.Off.of(found, truth)
+    off = baselines.Off.of(found, truth)
     assert off.median == 0
     assert off.largest == pytest.approx(0.3)
     assert 0.1 <= off.most < 0.3
@@ -50,7 +50,7 @@ def test_points_are_off_by_their_worst_channel_of_the_root_mean_square():
 @pytest.mark.once
 def test_halves_are_the_left_of_one_and_the_right_of_the_other():
     left, right = jnp.zeros((2, 4, 3)), jnp.ones((2, 4, 3)).at[0, 0].set(0.01)
-    found = rivals.half_and_half(left, right, gain=4.0)
+    found = baselines.half_and_half(left, right, gain=4.0)
     assert np.array_equal(np.asarray(found.halves)[..., 0], [[0, 0, 1, 1]] * 2)
     assert float(found.difference[0, 0, 0]) == pytest.approx(0.54)
     assert float(found.difference[1, 1, 0]) == 1.0

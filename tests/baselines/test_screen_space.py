@@ -12,7 +12,7 @@ from planes import camera_over, spots
 from scipy.signal import fftconvolve
 
 import splatjax as sj
-from splatjax import rivals
+from splatjax import baselines
 
 SIZE, HALF = 128, 12.0
 TWO = sj.SumOfGaussians(
@@ -78,11 +78,11 @@ def convolved(light: np.ndarray, gaussians: sj.SumOfGaussians) -> np.ndarray:
 @eqx.filter_jit
 def exitance(frame, gaussians, kernel):
     material = sj.Material(gaussians, specular=0.0)
-    return jnp.pi * rivals.diffuse_on_screen(frame, CAMERA, material, kernel).diffuse
+    return jnp.pi * baselines.diffuse_on_screen(frame, CAMERA, material, kernel).diffuse
 
 
 def off_by(
-    light: np.ndarray, gaussians: sj.SumOfGaussians, kernel: rivals.AbstractScreenKernel
+    light: np.ndarray, gaussians: sj.SumOfGaussians, kernel: baselines.AbstractScreenKernel
 ) -> float:
     """The largest difference from the convolution, of its peak, away from the edges."""
     found, truth = np.asarray(exitance(flat(light), gaussians, kernel)), convolved(light, gaussians)
@@ -99,7 +99,7 @@ def edge():
     return picture_of(lambda points: np.repeat((points[:, :1] > 0.7) * 1.0, 3, axis=1))
 
 
-PASSES, SHIPPED = rivals.GaussianPasses(reach=32), rivals.ShippedKernel()
+PASSES, SHIPPED = baselines.GaussianPasses(reach=32), baselines.ShippedKernel()
 
 
 @pytest.mark.once
@@ -118,7 +118,7 @@ def test_one_kernel_is_the_convolution_for_one_gaussian_alone(spotted):
 def test_a_preintegrated_kernel_is_right_along_straight_edges_and_the_shipped_one_is_not(
     edge, spotted
 ):
-    preintegrated = rivals.PreintegratedKernel()
+    preintegrated = baselines.PreintegratedKernel()
     assert off_by(edge, TWO, preintegrated) < 4e-2  # 3.5e-2, the ends of its taps
     assert off_by(edge, TWO, SHIPPED) > 6e-2  # 6.3e-2
     assert off_by(spotted, TWO, preintegrated) > 6e-2  # 6.8e-2

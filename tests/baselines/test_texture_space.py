@@ -13,7 +13,7 @@ from jax.test_util import check_grads
 from planes import HALF, camera_over, coordinates, gathered, painted, plane, splatted
 
 import splatjax as sj
-from splatjax import rivals
+from splatjax import baselines
 from splatjax.diffusion import ExitOdds, Kernels, PlainMean, Sources
 from splatjax.geometry import Mesh
 
@@ -24,26 +24,26 @@ TWO = sj.SumOfGaussians(
 """The wider first: layers keep the order of the Gaussians."""
 DULL = sj.Material(TWO, specular=0.0)
 FRONTAL = sj.DirectionalLight(jnp.asarray([0.0, 0.0, -1.0]), jnp.ones(3), cast_shadows=False)
-STILL = rivals.TextureSpaceSettings(
-    SIZE, rivals.StretchCorrected(), rivals.OpaqueParts(), PlainMean()
+STILL = baselines.TextureSpaceSettings(
+    SIZE, baselines.StretchCorrected(), baselines.OpaqueParts(), PlainMean()
 )
 
 
 @eqx.filter_jit
 def diffused(mesh, settings, plan, uvs):
-    light = rivals.mesh_light(mesh, (FRONTAL,), settings.shadows, plan.shadows)
-    texels = rivals.lay_out(mesh, settings.resolution, plan.texture)
-    texture = rivals.diffuse_in_texture(mesh, texels, light, DULL, settings, plan.reaches)
-    return rivals.look_up_layers(texture, uvs), texture.renormalized
+    light = baselines.mesh_light(mesh, (FRONTAL,), settings.shadows, plan.shadows)
+    texels = baselines.lay_out(mesh, settings.resolution, plan.texture)
+    texture = baselines.diffuse_in_texture(mesh, texels, light, DULL, settings, plan.reaches)
+    return baselines.look_up_layers(texture, uvs), texture.renormalized
 
 
-def off_by(stretch: float, correction: rivals.AbstractStretch) -> float:
+def off_by(stretch: float, correction: baselines.AbstractStretch) -> float:
     """How far the layers of the painted plane are from those of splats, of the peak; away from its
     edges.
     """
     settings = dataclasses.replace(STILL, stretch=correction)
-    mesh = rivals.TexturedMesh.of(plane(stretch), painted(stretch, SIZE))
-    plan = rivals.plan_texture_space(mesh, (FRONTAL,), DULL, camera_over(6.0, 8), settings)
+    mesh = baselines.TexturedMesh.of(plane(stretch), painted(stretch, SIZE))
+    plan = baselines.plan_texture_space(mesh, (FRONTAL,), DULL, camera_over(6.0, 8), settings)
     line = np.linspace(-HALF / 2, HALF / 2, 16)
     points = np.column_stack(
         [*(each.reshape(-1) for each in np.meshgrid(line, line)), np.zeros(256)]
@@ -56,35 +56,35 @@ def off_by(stretch: float, correction: rivals.AbstractStretch) -> float:
 
 @pytest.mark.once
 def test_on_a_plane_it_is_splat_diffusion():
-    assert off_by(1.0, rivals.StretchCorrected()) < 2e-3  # 1.4e-3
+    assert off_by(1.0, baselines.StretchCorrected()) < 2e-3  # 1.4e-3
     assert (
-        off_by(1.0, rivals.Uncorrected()) < 2e-3
+        off_by(1.0, baselines.Uncorrected()) < 2e-3
     )  # a chart that is not stretched needs no correction
 
 
 @pytest.mark.once
 def test_a_stretched_chart_needs_the_correction():
-    assert off_by(3.0, rivals.StretchCorrected()) < 1e-2  # 7.6e-3: texels are three times as long
-    assert off_by(3.0, rivals.Uncorrected()) > 5e-2  # 1.1e-1
+    assert off_by(3.0, baselines.StretchCorrected()) < 1e-2  # 7.6e-3: texels are 3 times as long
+    assert off_by(3.0, baselines.Uncorrected()) > 5e-2  # 1.1e-1
 
 
 @pytest.fixture(scope="module")
 def sheet():
     """A white plane with sharp edges, from in front, seen with a rim of nothing around."""
-    mesh = rivals.TexturedMesh.of(plane(2.0))
+    mesh = baselines.TexturedMesh.of(plane(2.0))
     settings = dataclasses.replace(
-        STILL, resolution=64, thin_parts=rivals.TranslucentShadowMap(), normalization=ExitOdds()
+        STILL, resolution=64, thin_parts=baselines.TranslucentShadowMap(), normalization=ExitOdds()
     )
     lights = (dataclasses.replace(FRONTAL, cast_shadows=True),)
     camera = camera_over(15.0, 32)
-    plan = rivals.plan_texture_space(mesh, lights, DULL, camera, settings)
+    plan = baselines.plan_texture_space(mesh, lights, DULL, camera, settings)
     return mesh, lights, camera, settings, plan
 
 
 @pytest.mark.once
 def test_constant_light_stays_constant_up_to_the_edges(sheet):
     mesh, lights, camera, settings, plan = sheet
-    found = rivals.render_texture_space(mesh, lights, DULL, camera, settings, plan)
+    found = baselines.render_texture_space(mesh, lights, DULL, camera, settings, plan)
     on_chart = np.asarray(found.texture.layers)[:, np.asarray(found.texture.valid) > 0]
     np.testing.assert_allclose(on_chart, 1.0, atol=1e-5)
     frame = found.frame
@@ -101,7 +101,7 @@ def test_constant_light_stays_constant_up_to_the_edges(sheet):
 def test_without_room_the_picture_is_nan_and_says_so(sheet):
     mesh, lights, camera, settings, plan = sheet
     small = dataclasses.replace(plan, camera=100)
-    frame = rivals.render_texture_space(mesh, lights, DULL, camera, settings, small).frame
+    frame = baselines.render_texture_space(mesh, lights, DULL, camera, settings, small).frame
     assert frame.overflow > 1
     assert np.all(np.isnan(np.asarray(frame.beauty)[np.asarray(frame.depth) < np.inf]))
 
@@ -111,18 +111,18 @@ def test_bad_input_is_refused_in_one_sentence(sheet):
     mesh, lights, camera, settings, _ = sheet
     bare = plane(1.0)
     with pytest.raises(ValueError, match="no texture coordinates"):
-        rivals.TexturedMesh.of(Mesh(bare.vertices, bare.faces, bare.normals))
+        baselines.TexturedMesh.of(Mesh(bare.vertices, bare.faces, bare.normals))
     with pytest.raises(ValueError, match=r"reach from 0.05 to 1.95; .* scale or move the charts"):
-        rivals.TexturedMesh.of(
+        baselines.TexturedMesh.of(
             Mesh(bare.vertices, bare.faces, bare.normals, bare.uvs * [1.0, 2.0] + [0.0, 0.05])
         )
     lamp = sj.PointLight(jnp.asarray([0.0, 0.0, 2.0]), jnp.ones(3))
     with pytest.raises(ValueError, match=r"lights\[0\] stands 2 mm .* move it out"):
-        rivals.plan_texture_space(mesh, (lamp,), DULL, camera, settings)
+        baselines.plan_texture_space(mesh, (lamp,), DULL, camera, settings)
     with pytest.raises(ValueError, match="a plan is needed"):
         jax.grad(
             lambda light: jnp.sum(
-                rivals.render_texture_space(mesh, (light,), DULL, camera, settings).frame.beauty
+                baselines.render_texture_space(mesh, (light,), DULL, camera, settings).frame.beauty
             )
         )(lights[0])
 
@@ -144,11 +144,11 @@ def test_through_a_slab_comes_what_comes_through_splats():
     """Lit from behind: the share and the odds of leaving are those of two sheets of splats."""
     thickness, settings = 1.5, dataclasses.replace(STILL, resolution=96)
     settings = dataclasses.replace(
-        settings, thin_parts=rivals.TranslucentShadowMap(), normalization=ExitOdds()
+        settings, thin_parts=baselines.TranslucentShadowMap(), normalization=ExitOdds()
     )
-    mesh, camera = rivals.TexturedMesh.of(slab(thickness)), camera_over(3.0, 4)
+    mesh, camera = baselines.TexturedMesh.of(slab(thickness)), camera_over(3.0, 4)
     lights = (sj.DirectionalLight(jnp.asarray([0.0, 0.0, 1.0]), jnp.ones(3)),)
-    found = rivals.render_texture_space(mesh, lights, DULL, camera, settings).frame
+    found = baselines.render_texture_space(mesh, lights, DULL, camera, settings).frame
     ours = np.pi * np.asarray(found.layers)[:, 2, 2]
 
     line = np.arange(-11.7, 12, 0.6)
@@ -172,10 +172,10 @@ def test_through_a_slab_comes_what_comes_through_splats():
 @pytest.mark.long
 def test_a_picture_has_the_derivatives_that_differences_say(float64):
     settings = dataclasses.replace(STILL, resolution=40)
-    mesh = rivals.TexturedMesh.of(plane(1.4), painted(1.4, 24))
+    mesh = baselines.TexturedMesh.of(plane(1.4), painted(1.4, 24))
     camera = camera_over(6.0, 8)
     lights = (dataclasses.replace(FRONTAL, direction=jnp.asarray([0.3, 0.2, -1.0])),)
-    plan = rivals.plan_texture_space(mesh, lights, DULL, camera, settings)
+    plan = baselines.plan_texture_space(mesh, lights, DULL, camera, settings)
     pattern = jnp.sin(jnp.arange(8.0 * 8 * 3)).reshape(8, 8, 3)
 
     @jax.jit
@@ -187,7 +187,7 @@ def test_a_picture_has_the_derivatives_that_differences_say(float64):
         light = (dataclasses.replace(lights[0], direction=direction),)
         return jnp.sum(
             pattern
-            * rivals.render_texture_space(
+            * baselines.render_texture_space(
                 painted_mesh, light, material, camera, settings, plan
             ).frame.beauty
         )

@@ -1,4 +1,4 @@
-"""A triangle mesh with its textures, on the device: what mesh-based rivals draw."""
+"""A triangle mesh with its textures, on the device: what mesh-based baselines draw."""
 
 import equinox as eqx
 import jax.numpy as jnp

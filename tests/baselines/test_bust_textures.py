@@ -4,8 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from splatjax.baselines import TexturedMesh, bust_with_textures, look_up
 from splatjax.geometry import complexion
-from splatjax.rivals import TexturedMesh, bust_with_textures, look_up
 
 
 @pytest.fixture(scope="module")

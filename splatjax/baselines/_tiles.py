@@ -32,7 +32,7 @@ Result = TypeVar("Result", bound=PyTree)
 
 
 class AbstractListRasterizer(AbstractRasterizer):
-    """Passes 2 and 3 by a kernel, over lists of splats. Shadow maps are the renderer's: rivals
+    """Passes 2 and 3 by a kernel, over lists of splats. Shadow maps are the renderer's: baselines
     differ in the picture alone.
     """
 

@@ -1,4 +1,4 @@
-"""Pictures of where splat diffusion and its rivals err."""
+"""Pictures of where splat diffusion and its baselines err."""
 
 from pathlib import Path
 
@@ -7,7 +7,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from PIL import Image
 
-from splatjax import rivals
+from splatjax import baselines
 from splatjax.io._color import linear_to_srgb
 
 
@@ -40,7 +40,7 @@ def errors(
     for axis, (name, picture) in zip(list(axes.flat)[1:], pictures.items(), strict=False):
         ours = shown(picture)
         found[name] = {
-            "ssim": float(rivals.similarity(jnp.asarray(ours), jnp.asarray(reference))),
+            "ssim": float(baselines.similarity(jnp.asarray(ours), jnp.asarray(reference))),
             "flip": flip(reference, ours),
         }
         off = np.where(covered[..., None], 0.5 + 5 * (picture - truth) / scale, 0.5)

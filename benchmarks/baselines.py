@@ -1,8 +1,8 @@
-"""Splat diffusion and its rivals against brute-force integration over the surface: `python -m
-benchmarks.rivals`.
+"""Splat diffusion and its baselines against brute-force integration over the surface: `python -m
+benchmarks.baselines`.
 
-Writes out/rivals_BODY_NORMALIZATION.json, and a picture of where each method errs around the nose;
-SSIM and FLIP are taken there.
+Writes out/baselines_BODY_NORMALIZATION.json, and a picture of where each method errs around the
+nose; SSIM and FLIP are taken there.
 """
 
 import argparse
@@ -18,12 +18,12 @@ import jax.numpy as jnp
 import numpy as np
 
 import splatjax as sj
-from splatjax import rivals
+from splatjax import baselines
 from splatjax.diffusion import DiffusionSettings, ExitOdds, PlainMean
 from splatjax.splatting import PerspectiveView
 
+from .baselines_pictures import errors
 from .heads import HEADS, MAP, Body, body_of, conditions
-from .rivals_pictures import errors
 from .surface_truth import integrate
 
 NORMALIZATIONS = {"mean": PlainMean(), "odds": ExitOdds()}
@@ -34,7 +34,7 @@ NOSE = (0.5, 0.48)  # of the picture, from the top and from the left
 
 
 def arguments():
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.rivals", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.baselines", description=__doc__)
     parser.add_argument("--body", choices=HEADS, default="scanned", help="(default %(default)s)")
     parser.add_argument(
         "--normalization", choices=NORMALIZATIONS, default="mean", help="(default %(default)s)"
@@ -87,7 +87,7 @@ def methods(body: Body, light, camera, material: sj.Material, normalization) -> 
 
     def keep(name: str, frame: sj.Frame, seconds: float) -> None:
         weights, layers = np.asarray(frame.weights), np.pi * np.asarray(frame.layers)
-        whole = np.asarray(rivals.exitance(frame))
+        whole = np.asarray(baselines.exitance(frame))
         root = np.asarray(frame.diffuse) * np.pi / np.where(whole > 0, whole, 1)
         layers = layers / np.where(root > 0, root, 1)[None] if len(weights) > 1 else None
         found[name] = Found(whole, layers, np.asarray(frame.coverage) > 0, seconds)
@@ -95,20 +95,20 @@ def methods(body: Body, light, camera, material: sj.Material, normalization) -> 
 
     frame, seconds = timed(lambda: sj.render(scene, camera, settings, plan))
     keep("splats, by their own shadow map", frame, seconds)
-    corrected, opaque = rivals.StretchCorrected(), rivals.OpaqueParts()
+    corrected, opaque = baselines.StretchCorrected(), baselines.OpaqueParts()
     for name, stretch, thin in (
-        ("texture space", corrected, rivals.TranslucentShadowMap()),
+        ("texture space", corrected, baselines.TranslucentShadowMap()),
         ("texture space, no far side", corrected, opaque),
         (
             "texture space, no stretch correction",
-            rivals.Uncorrected(),
-            rivals.TranslucentShadowMap(),
+            baselines.Uncorrected(),
+            baselines.TranslucentShadowMap(),
         ),
     ):
-        how = rivals.TextureSpaceSettings(MAP, stretch, thin, normalization)
-        room = rivals.plan_texture_space(body.mesh, (light,), material, camera, how)
+        how = baselines.TextureSpaceSettings(MAP, stretch, thin, normalization)
+        room = baselines.plan_texture_space(body.mesh, (light,), material, camera, how)
         picture, seconds = timed(
-            lambda how=how, room=room: rivals.render_texture_space(
+            lambda how=how, room=room: baselines.render_texture_space(
                 body.mesh, (light,), material, camera, how, room
             )
         )
@@ -123,20 +123,22 @@ def methods(body: Body, light, camera, material: sj.Material, normalization) -> 
             picture.frame
         )  # its buffers, but for the layers, are those of any way of spreading light
     for name, kernel in (
-        ("screen space, Gaussian by Gaussian", rivals.GaussianPasses()),
-        ("screen space, the kernel that ships", rivals.ShippedKernel()),
+        ("screen space, Gaussian by Gaussian", baselines.GaussianPasses()),
+        ("screen space, the kernel that ships", baselines.ShippedKernel()),
     ):
         on_screen = jax.jit(
-            lambda frame, kernel=kernel: rivals.diffuse_on_screen(frame, camera, material, kernel)
+            lambda frame, kernel=kernel: baselines.diffuse_on_screen(
+                frame, camera, material, kernel
+            )
         )
         diffused, seconds = timed(lambda on_screen=on_screen, frame=frame: on_screen(frame))
         keep(name, diffused, seconds)
     return found
 
 
-def same_light(body: Body, maps: rivals.MeshLight, camera, material, normalization) -> Found:
-    """Diffuse by splats the light that the shadow map of the triangles lets through, as the rivals
-    have it.
+def same_light(body: Body, maps: baselines.MeshLight, camera, material, normalization) -> Found:
+    """Diffuse by splats the light that the shadow map of the triangles lets through, which the
+    baselines use.
     """
     scene = sj.Scene(body.splats, maps.lights, material)
     settings = sj.RenderSettings(diffusion=DiffusionSettings(normalization=normalization))
@@ -159,9 +161,9 @@ def main() -> None:
     light, camera = conditions(options.width)
     material = sj.load_material("skin").white()
     dull = dataclasses.replace(material.surface_of(material.gaussians), specular=jnp.zeros(()))
-    settings = rivals.TextureSpaceSettings().shadows
-    rooms = rivals.shadow_rooms(body.mesh, (light,), settings)
-    maps = rivals.mesh_light(body.mesh, (light,), settings, rooms)
+    settings = baselines.TextureSpaceSettings().shadows
+    rooms = baselines.shadow_rooms(body.mesh, (light,), settings)
+    maps = baselines.mesh_light(body.mesh, (light,), settings, rooms)
     found = {"splats": same_light(body, maps, camera, dull, normalization)}
     found |= methods(body, light, camera, dull, normalization)
     seen = Seen.of(body, camera, found)
@@ -179,7 +181,7 @@ def main() -> None:
         )
         print(
             "twice the samples change it by",
-            rivals.Off.of(np.einsum("gpc,gc->pc", finer, weights), whole),
+            baselines.Off.of(np.einsum("gpc,gc->pc", finer, weights), whole),
         )
         layers, whole = finer, np.einsum("gpc,gc->pc", finer, weights)
     around = in_crop(body, maps, dull, normalization, seen, found, options)
@@ -200,12 +202,12 @@ class Seen(NamedTuple):
     @classmethod
     def of(cls, body: Body, camera, found: dict[str, Found]) -> "Seen":
         """Look at the triangles."""
-        landing = rivals.Landing.in_view(body.mesh.corners(), PerspectiveView.of(camera))
-        seen = rivals.see_faces(landing, rivals.room_for(landing))
+        landing = baselines.Landing.in_view(body.mesh.corners(), PerspectiveView.of(camera))
+        seen = baselines.see_faces(landing, baselines.room_for(landing))
         there = np.asarray(seen.covered)
         for each in found.values():
             there = there & each.covered
-        faces, shares = np.asarray(seen.faces), np.asarray(rivals.barycentrics(landing, seen))
+        faces, shares = np.asarray(seen.faces), np.asarray(baselines.barycentrics(landing, seen))
         places = np.einsum("yxk,yxkc->yxc", shares, np.asarray(body.mesh.corners())[faces])
         ends = np.zeros(there.shape, bool)
         for axis in (0, 1):
@@ -266,7 +268,7 @@ def in_crop(
         whole,
         covered,
         root,
-        Path(f"out/rivals_errors_{options.body}_{options.normalization}.png"),
+        Path(f"out/baselines_errors_{options.body}_{options.normalization}.png"),
     )
 
 
@@ -280,11 +282,11 @@ def report(found, pixels, layers, whole, deviations, stretch, around, options) -
     )
     print("RMS of the layers of", ", ".join(f"{each:.2f}" for each in deviations), "mm")
     for name, each in found.items():
-        off = rivals.Off.of(each.exitance[pixels], whole)
+        off = baselines.Off.of(each.exitance[pixels], whole)
         by_layer = []
         if each.layers is not None:
             by_layer = [
-                rivals.Off.of(each.layers[k][pixels], layers[k]).rms for k in range(len(layers))
+                baselines.Off.of(each.layers[k][pixels], layers[k]).rms for k in range(len(layers))
             ]
         print(f"{name:42}{off.median:9.1e}{off.most:9.1e}{off.largest:9.1e}{off.rms:9.1e}", end="")
         alike, seen = around[name]["ssim"], around[name]["flip"]
@@ -321,7 +323,7 @@ def report(found, pixels, layers, whole, deviations, stretch, around, options) -
                     for value in row["by_stretch"]
                 )
             )
-    out = Path(f"out/rivals_{options.body}_{options.normalization}.json")
+    out = Path(f"out/baselines_{options.body}_{options.normalization}.json")
     out.parent.mkdir(exist_ok=True)
     out.write_text(json.dumps(rows, indent=1) + "\n")
     print(f"\nwritten: {out}")

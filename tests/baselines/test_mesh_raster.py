@@ -8,7 +8,7 @@ from jax.test_util import check_grads
 from planes import plane
 
 import splatjax as sj
-from splatjax import rivals
+from splatjax import baselines
 from splatjax.splatting import PerspectiveView
 
 SIZE = 24
@@ -18,8 +18,8 @@ CAMERA = sj.Camera.look_at(
 
 
 def seen_from(camera, corners):
-    landing = rivals.Landing.in_view(corners, PerspectiveView.of(camera))
-    return landing, rivals.see_faces(landing, rivals.room_for(landing))
+    landing = baselines.Landing.in_view(corners, PerspectiveView.of(camera))
+    return landing, baselines.see_faces(landing, baselines.room_for(landing))
 
 
 def hits(camera):
@@ -43,7 +43,7 @@ def corners():
 @pytest.mark.once
 def test_a_slanted_plane_is_seen_where_its_rays_meet_it_and_has_no_cracks(corners):
     landing, seen = seen_from(CAMERA, corners)
-    found = rivals.interpolate(corners, seen, rivals.barycentrics(landing, seen))
+    found = baselines.interpolate(corners, seen, baselines.barycentrics(landing, seen))
     there = hits(CAMERA)
     assert np.array_equal(np.asarray(seen.covered), np.abs(there).max(axis=2) < 12)
     assert 0.5 < np.mean(np.asarray(seen.covered)) < 1
@@ -64,8 +64,8 @@ def test_the_nearest_face_hides_the_others_and_backs_are_not_drawn(corners):
     middle = faces[len(faces) // 2]
     assert count <= middle < 2 * count
     found = np.asarray(
-        rivals.interpolate(
-            jnp.concatenate([corners, nearer, back]), seen, rivals.barycentrics(landing, seen)
+        baselines.interpolate(
+            jnp.concatenate([corners, nearer, back]), seen, baselines.barycentrics(landing, seen)
         )
     )
     assert found[SIZE // 2, SIZE // 2, 2] == pytest.approx(2.0, abs=1e-4)
@@ -80,8 +80,8 @@ def test_a_face_that_reaches_before_the_near_plane_is_not_drawn(corners):
 
 @pytest.mark.once
 def test_what_lacks_room_is_told(corners):
-    landing = rivals.Landing.in_view(corners, PerspectiveView.of(CAMERA))
-    assert float(rivals.see_faces(landing, 100).needed) == pytest.approx(
+    landing = baselines.Landing.in_view(corners, PerspectiveView.of(CAMERA))
+    assert float(baselines.see_faces(landing, 100).needed) == pytest.approx(
         int(landing.fragments()) / 100
     )
 
@@ -90,8 +90,8 @@ def test_what_lacks_room_is_told(corners):
 def test_faces_cover_a_texture_without_gaps_mirrored_or_not():
     mesh = plane(1.0)
     for uvs in (mesh.uvs, mesh.uvs * [-1.0, 1.0] + [1.0, 0.0]):
-        landing = rivals.Landing.in_texture(jnp.asarray(uvs, float), 40)
-        covered = np.asarray(rivals.see_faces(landing, rivals.room_for(landing)).covered)
+        landing = baselines.Landing.in_texture(jnp.asarray(uvs, float), 40)
+        covered = np.asarray(baselines.see_faces(landing, baselines.room_for(landing)).covered)
         assert np.array_equal(covered, np.pad(np.ones((36, 36), bool), 2))
 
 
@@ -103,9 +103,9 @@ def test_attributes_have_the_derivatives_that_differences_say(float64, corners):
     @jax.jit
     def picture(corners, values, focal_length):
         camera = sj.Camera(CAMERA.position, CAMERA.rotation, focal_length, SIZE, SIZE)
-        landing = rivals.Landing.in_view(corners, PerspectiveView.of(camera))
+        landing = baselines.Landing.in_view(corners, PerspectiveView.of(camera))
         return jnp.sum(
-            jnp.sin(rivals.interpolate(values, seen, rivals.barycentrics(landing, seen)))
+            jnp.sin(baselines.interpolate(values, seen, baselines.barycentrics(landing, seen)))
         )
 
     check_grads(

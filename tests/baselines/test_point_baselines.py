@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import splatjax as sj
-from splatjax.rivals import (
+from splatjax.baselines import (
     BlendingRasterizer,
     DiscKernel,
     DiscOrPixelKernel,
@@ -234,13 +234,13 @@ def lit_ball(settings_of, count: int):
 @pytest.mark.long
 def test_normals_that_vary_within_splats_are_closer_to_the_sphere_than_blended_and_flat_ones():
     """A sphere of 150 splats, under the light of a white diffuser."""
-    rivals = {
+    baselines = {
         "elliptical": lambda body: elliptical_points(),
         "deferred": lambda body: deferred_splatting(),
         "phong": lambda body: phong_splatting(normal_slopes(body)),
     }
     angles, shades = {}, {}
-    for name, settings in rivals.items():
+    for name, settings in baselines.items():
         angles[name], shades[name] = lit_ball(settings, 150)
     assert angles["phong"] < 0.5 * angles["deferred"]
     assert angles["deferred"] < 0.5 * angles["elliptical"]
@@ -260,7 +260,7 @@ def test_slopes_of_a_sphere_are_its_curvature_and_those_of_a_plane_are_none():
 
 @pytest.mark.long
 @pytest.mark.once
-def test_a_rival_renders_what_the_renderer_does_with_scattering_and_shadow():
+def test_a_baseline_renders_what_the_renderer_does_with_scattering_and_shadow():
     """Where splats are smaller than what bends it makes little matter whether irradiance is blended
     or found per pixel.
     """
@@ -283,7 +283,7 @@ def test_a_rival_renders_what_the_renderer_does_with_scattering_and_shadow():
 
 
 @pytest.mark.once
-def test_without_a_plan_a_rival_says_what_to_do():
+def test_without_a_plan_a_baseline_says_what_to_do():
     body, seen = ball(50), camera((0.0, 0.0, 60.0))
     with pytest.raises(ValueError, match="plan"):
         bodies.drawn(

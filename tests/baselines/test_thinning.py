@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 import splatjax as sj
+from splatjax.baselines import ThinnedDiffuser, layer_contrast, splats_that_suffice, thinning_error
 from splatjax.diffusion import DenseDiffuser, DiffusionSettings, PlainMean
 from splatjax.render import light_on_splats
-from splatjax.rivals import ThinnedDiffuser, layer_contrast, splats_that_suffice, thinning_error
 
 FACTOR = 1.5  # what the law is held to
 POINTS, LIGHTS = 384, ((-0.5, -0.4, -0.75), (0.8, -0.6, -0.2))
