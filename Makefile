@@ -12,8 +12,8 @@ LEAST_OPTIMIZATION := --xla_backend_optimization_level=0 --xla_cpu_use_fusion_em
 # Every worker of every run imports the same modules, with their shapes checked: whatever the shell says, bytecode is kept.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: setup demo test test-float32 test-x64 test-once test-long random-scenes fuzz lint bench lock docs notebooks gallery \
-    release-check
+.PHONY: setup demo test test-float32 test-x64 test-once test-long random-scenes fuzz lint bench lock docs figures notebooks \
+    gallery release-check
 
 setup: $(VENV)/ready
 
@@ -91,6 +91,10 @@ out/notebooks/%.ipynb: notebooks/%.py $(SOURCES) | $(VENV)/docs
 	$(BIN)/jupytext --quiet --to ipynb --output out/notebooks/running/$*.ipynb $<
 	cd out/notebooks/running && XLA_FLAGS="$(COMPILED)$${XLA_FLAGS:+ $$XLA_FLAGS}" $(abspath $(BIN))/jupyter-execute --inplace --timeout 3600 $*.ipynb
 	mv out/notebooks/running/$*.ipynb $@
+
+# The paper's figures, into out/figures.
+figures: $(patsubst notebooks/%.py,out/notebooks/%.ipynb,$(wildcard notebooks/figure_*.py))
+	$(BIN)/python tools/docs_pages.py out/figures $^
 
 $(VENV)/docs: requirements-docs.lock $(VENV)/ready
 	VIRTUAL_ENV=$(abspath $(VENV)) $(BIN)/uv pip install --quiet --require-hashes --requirements requirements-docs.lock

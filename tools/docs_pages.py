@@ -11,6 +11,7 @@ import base64
 import json
 import posixpath
 import re
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -195,3 +196,12 @@ def _exports(room: str) -> list[str]:
         elif isinstance(node, ast.FunctionDef | ast.ClassDef):
             names.append(node.name)
     return [name for name in names if not name.startswith("_") and not name.isupper()]
+
+
+if __name__ == "__main__":  # out/figures NOTEBOOK...: write the pictures of executed notebooks
+    folder = Path(sys.argv[1])
+    folder.mkdir(parents=True, exist_ok=True)
+    for executed in map(Path, sys.argv[2:]):
+        for name, data in _notebook(executed)[1].items():
+            (folder / name.replace("_1.png", ".png")).write_bytes(data)
+            print(folder / name.replace("_1.png", ".png"))

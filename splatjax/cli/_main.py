@@ -18,7 +18,6 @@ from splatjax.io import own_version
 
 from ._environment import prepare_jax
 from ._export import Export
-from ._figure import Figure
 from ._fit import Fit
 from ._materials import Materials
 from ._recover import Recover
@@ -35,7 +34,6 @@ _COMMANDS = {
     "render": Render,
     "turntable": Turntable,
     "recover": Recover,
-    "figure": Figure,
 }
 _DESCRIPTION = """Render translucent materials, and find the sums of Gaussians that stand for them.
 Lengths are in mm.
