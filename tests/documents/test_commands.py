@@ -119,9 +119,7 @@ def test_the_commands_of_a_page_run_one_after_the_other(page, tmp_path, monkeypa
         if not command.startswith("splatjax") or given[0].startswith("-") or "--help" in given:
             continue
         small = SMALL.get(given[0], [])
-        if given[0] in ("render", "turntable") and not any(
-            word.endswith(".ply") for word in given
-        ):
+        if given[0] in ("render", "turntable") and not any(word.endswith(".ply") for word in given):
             small = [*small, "--count", "1500"]
         if "--photons" in given or "monte-carlo" in given:
             small = [*small, "--photons", "20000", "--count", "3"]
