@@ -258,12 +258,10 @@ def _print(fitted: sj.FitResult) -> None:
     names = ", ".join(channel_names(gaussians.weights.shape[1]))
     pairs = zip(gaussians.variances, gaussians.weights, strict=True)
     rows = [(f"{float(variance):.6g}", _numbers(weights, ".5f")) for variance, weights in pairs]
-    rows += [
-        ("sum", _numbers(gaussians.total_reflectance(), ".5f")),
-        ("error (Eq. 4)", _numbers(fitted.error, ".2e")),
-        ("energy error", _numbers(fitted.energy_error, ".2e")),
-    ]
-    print_table({"variance, mm^2": "right", f"weights ({names})": "right"}, rows)
+    sums = ("sum", _numbers(gaussians.total_reflectance(), ".5f"))
+    error = ("error (Eq. 4)", _numbers(fitted.error, ".2e"))
+    energy = ("energy error", _numbers(fitted.energy_error, ".2e"))
+    print_table([("variance, mm^2", f"weights ({names})"), *rows, sums, error, energy])
 
 
 def _numbers(values: jax.Array, form: str) -> str:

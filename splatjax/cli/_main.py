@@ -58,7 +58,11 @@ def main(args: Sequence[str] | None = None) -> int:
         with warnings.catch_warnings():
             warnings.showwarning = _show_warning  # ty: ignore[invalid-assignment]
             prepare_jax()
-            _run(command)
+            try:
+                command.run()
+                sys.stdout.flush()
+            except SystemExit:  # of rich, when it writes to a closed pipe
+                raise BrokenPipeError from None
         return 0
     except BrokenPipeError:
         # Python would write once more when it ends.
@@ -98,14 +102,6 @@ def parsed(words: list[str]) -> Any:
         args=[name, *rest],
         config=style,
     )
-
-
-def _run(command: Any) -> None:
-    try:
-        command.run()
-        sys.stdout.flush()
-    except SystemExit:  # of rich, when it writes to a closed pipe
-        raise BrokenPipeError from None
 
 
 def _message(error: Exception) -> tuple[str, int]:

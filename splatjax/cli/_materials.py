@@ -37,36 +37,20 @@ class Materials:
         if self.material is not None:
             print(material_path(self.material).read_text(encoding="utf-8"), end="")
             return
-        columns = {
-            "material": "left",
-            "known": "left",
-            "total reflectance": "right",
-            "widest, mm": "right",
-            "eta": "right",
-            "source": "left",
-        }
-        print_table(columns, map(_row, sj.materials()))
+        titles = ("material", "known", "total reflectance", "widest, mm", "eta", "source")
+        print_table([titles, *map(_row, sj.materials())])
 
 
 def _row(name: str) -> tuple[str, ...]:
-    material = sj.load_material(name)
+    material, (_, source) = sj.load_material(name), surface_and_source(name)
+    try:
+        layered = isinstance(sj.load_profile(name), sj.LayeredMultipole)
+        known = "layers" if layered else "coefficients"
+    except ValueError:
+        known = "Gaussians"
     reflectance = "  ".join(f"{float(total):.3f}" for total in material.total_reflectance())
     widest = float(material.gaussians.variances.max()) ** 0.5
-    numbers = reflectance, f"{widest:.3g}", f"{float(material.eta):.3g}"
-    return name, _known(name), *numbers, _publication(name)
-
-
-def _known(name: str) -> str:
-    try:
-        profile = sj.load_profile(name)
-    except ValueError:
-        return "Gaussians"
-    return "layers" if isinstance(profile, sj.LayeredMultipole) else "coefficients"
-
-
-def _publication(name: str) -> str:
-    """Return the first author and the year of a material's publication."""
-    citation = surface_and_source(name)[1]["citation"]
-    authors, year = re.findall(r"^(.+?) (\d{4})", citation)[0]
+    authors, year = re.findall(r"^(.+?) (\d{4})", source["citation"])[0]
     first, *others = re.split(r", | and ", authors)
-    return f"{first}{' et al.' if others else ''} {year}"
+    publication = f"{first}{' et al.' if others else ''} {year}"
+    return name, known, reflectance, f"{widest:.3g}", f"{float(material.eta):.3g}", publication

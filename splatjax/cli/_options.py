@@ -17,6 +17,8 @@ OptionalPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavio
 OptionalFloat = Annotated[float | None, tyro.conf.arg(metavar="FLOAT", help_behavior_hint="")]
 MaterialName = Annotated[str, tyro.conf.arg(metavar="MATERIAL")]
 MaterialNames = Annotated[tuple[str, ...], tyro.conf.arg(metavar="MATERIAL [MATERIAL ...]")]
+Rules = dict[str, tuple[bool, str]]
+"""By field of a command, whether its value is valid, and what it must do."""
 FIGURES = (".png", ".pdf", ".svg")
 """Suffixes of drawings."""
 
@@ -26,13 +28,8 @@ def option_name(field: str) -> str:
     return f"--{field.replace('_', '-')}"
 
 
-def check_options(command: Any, rules: dict[str, tuple[bool, str]]) -> None:
-    """Raise `ValueError` for the first option that breaks its rule.
-
-    **Arguments:**
-
-    - `rules`: by field, whether its value is valid, and what it must do.
-    """
+def check_options(command: Any, rules: Rules) -> None:
+    """Raise `ValueError` for the first option that breaks its rule."""
     for field, (is_valid, expected) in rules.items():
         if not is_valid:
             value = getattr(command, field)

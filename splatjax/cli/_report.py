@@ -2,19 +2,16 @@
 
 import contextlib
 import time
-from collections.abc import Callable, Generator, Iterable, Sequence
+from collections.abc import Callable, Generator, Sequence
 
 from rich.console import Console
-from rich.table import Table
 
-
-def _console() -> Console:
-    return Console(stderr=True, highlight=False, soft_wrap=True)
+_CONSOLE = Console(stderr=True, highlight=False, soft_wrap=True)
 
 
 def note(what: str) -> None:
     """Print something the user should know."""
-    _console().print(what, markup=False)
+    _CONSOLE.print(what, markup=False)
 
 
 @contextlib.contextmanager
@@ -24,9 +21,8 @@ def stage(what: str, total: int = 0) -> Generator[Callable[..., None]]:
     Yields the function to call with the steps done of a total, and with what is being done where
     that changes. Where stderr is no terminal, it prints a line at most once a second.
     """
-    console, begin = _console(), time.perf_counter()
-    last = begin
-    with console.status(what) as status:
+    begin = last = time.perf_counter()
+    with _CONSOLE.status(what) as status:
 
         def report(done: int, what: str = what) -> None:
             nonlocal last
@@ -34,7 +30,7 @@ def stage(what: str, total: int = 0) -> Generator[Callable[..., None]]:
             left = (now - begin) / done * (total - done)
             line = f"{what}: {done} of {total}, {left:.0f} s left"
             status.update(line)
-            if not console.is_terminal and (done == total or now > last + 1):
+            if not _CONSOLE.is_terminal and (done == total or now > last + 1):
                 last = now
                 note(line)
 
@@ -42,14 +38,9 @@ def stage(what: str, total: int = 0) -> Generator[Callable[..., None]]:
     note(f"{what}: {time.perf_counter() - begin:.1f} s")
 
 
-def print_table(columns: dict[str, str], rows: Iterable[Sequence[str]]) -> None:
-    """Print a table on stdout, each column by its title and justification."""
-    table = Table(box=None, pad_edge=False)
-    for title, justify in columns.items():
-        table.add_column(title, justify=justify, no_wrap=True)  # ty: ignore[invalid-argument-type]
+def print_table(rows: Sequence[Sequence[str]]) -> None:
+    """Print rows on stdout, their columns aligned."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:
-        table.add_row(*row)
-    console = Console(highlight=False)
-    if not console.is_terminal:
-        console.width = 200  # in a pipe, a line stays whole
-    console.print(table)
+        cells = [cell.ljust(width) for cell, width in zip(row, widths, strict=True)]
+        print("  ".join(cells).rstrip())

@@ -1,17 +1,16 @@
 """`splatjax turntable`: the frames of an animation, continued where it was interrupted."""
 
-import hashlib
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import tyro
 
 import splatjax as sj
-from splatjax.io import write_animation
+from splatjax.io import fingerprint, material_path, write_animation
 
-from ._options import check_folder, check_options
+from ._options import check_folder
 from ._report import note, stage
 from ._resumable import ResumableFolder
 from ._view import ViewOptions, draw
@@ -57,10 +56,26 @@ class Turntable(ViewOptions):
 
     def run(self) -> None:
         """Check, render what is missing, join."""
-        self._check_turn()
+        in_webp = f"be {_LARGEST} at most in turntable.webp"
+        turns = self.degrees != 0 and math.isfinite(self.degrees)
+        most = f"lie between 1 and {_MOST_FRAMES}"
+        self.check(
+            {
+                "frames": (1 <= self.frames <= _MOST_FRAMES, most),
+                "width": (1 <= self.width <= _LARGEST, in_webp),
+                "height": (1 <= self.height <= _LARGEST, in_webp),
+                "degrees": (turns, "be a finite number other than 0"),
+                "fps": (0.1 <= self.fps <= 60, "lie between 0.1 and 60"),
+            }
+        )
+        if self.output.exists() and not self.output.is_dir():
+            raise ValueError(f"{self.output}: is a file; give the name of a folder")
+        check_folder(self.output)
+        material = fingerprint(material_path(self.material))
+        record = self.manifest() | {"contents of --material": material}
         names = [self.output / f"frame_{i:04}" for i in range(self.frames)]
         paths = [(name.with_suffix(".exr"), name.with_suffix(".png")) for name in names]
-        folder = ResumableFolder(self.output / "turntable.json", self._record(), paths, "frames")
+        folder = ResumableFolder(self.output / "turntable.json", record, paths, "frames")
         folder.check()
         own = folder.own_missing()
         if own:
@@ -73,25 +88,6 @@ class Turntable(ViewOptions):
             pictures = [picture for _, picture in paths]
             write_animation(animation, pictures, frames_per_second=self.fps)
         print(*(path for both in paths for path in both), animation, sep="\n")
-
-    def _check_turn(self) -> None:
-        self.check()
-        in_webp = f"be {_LARGEST} at most in turntable.webp"
-        turns = self.degrees != 0 and math.isfinite(self.degrees)
-        most = f"lie between 1 and {_MOST_FRAMES}"
-        check_options(
-            self,
-            {
-                "frames": (1 <= self.frames <= _MOST_FRAMES, most),
-                "width": (self.width <= _LARGEST, in_webp),
-                "height": (self.height <= _LARGEST, in_webp),
-                "degrees": (turns, "be a finite number other than 0"),
-                "fps": (0.1 <= self.fps <= 60, "lie between 0.1 and 60"),
-            },
-        )
-        if self.output.exists() and not self.output.is_dir():
-            raise ValueError(f"{self.output}: is a file; give the name of a folder")
-        check_folder(self.output)
 
     def azimuths(self, frame: int) -> tuple[float, float]:
         """Return the azimuths of camera and light."""
@@ -121,16 +117,3 @@ class Turntable(ViewOptions):
             note(f"the frames in {self.output} are whole; run the same command again to continue")
             raise
         self.note_unresolved_layers(frame, material)
-
-    def manifest(self) -> dict[str, Any]:
-        """Return all that the frames depend on, which their speed is not."""
-        manifest = super().manifest()
-        del manifest["--fps"]
-        return manifest
-
-    def _record(self) -> dict[str, Any]:
-        """Return the manifest with a digest of the material's file in place of its text."""
-        manifest = self.manifest()
-        material = manifest["contents of --material"].encode()
-        digest = f"{len(material)} bytes, SHA-256 {hashlib.sha256(material).hexdigest()}"
-        return manifest | {"contents of --material": digest}

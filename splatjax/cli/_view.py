@@ -14,11 +14,12 @@ import splatjax as sj
 from splatjax.io import check_room, fingerprint, free_bytes, material_path, own_version
 from splatjax.scene import Parts
 
-from ._options import MaterialName, check_options, option_name
+from ._options import MaterialName, Rules, check_options, option_name
 from ._report import note, stage
 
 # Degrees: the fill stands beside the camera, on the side away from the light.
 _FILL_SIDE, _FILL_ELEVATION = 25.0, 10.0
+_NOT_IN_PICTURES = ("splats", "output", "fps")
 # Lower bounds of the memory needed: what does not fit by these does not fit.
 _BYTES_PER_SPLAT, _BYTES_PER_PIXEL = 1000.0, 500.0
 
@@ -65,30 +66,28 @@ class ViewOptions:
     #: Size of the body: at 0.2 the bust is 7 cm tall, and light goes five times as far in it.
     scale: float = 1.0
 
-    def check(self) -> None:
-        """Raise `ValueError` for options that no picture can have, or that need more memory than
-        there is.
+    def check(self, more_rules: Rules | None = None) -> None:
+        """Raise `ValueError` for options that break a rule, or that need more memory than there
+        is.
         """
         finite, positive = "be a finite number", "be 1 or more"
-        check_options(
-            self,
-            {
-                "fill": (0 <= self.fill < math.inf, "be 0 or more"),
-                "scale": (0 < self.scale < math.inf, "be a positive factor"),
-                "azimuth": (math.isfinite(self.azimuth), finite),
-                "light_azimuth": (math.isfinite(self.light_azimuth), finite),
-                "light_elevation": (math.isfinite(self.light_elevation), finite),
-                "exposure": (math.isfinite(self.exposure), finite),
-                "width": (self.width >= 1, positive),
-                "height": (self.height >= 1, positive),
-                "count": (self.count >= 1, positive),
-                "fov": (0 < self.fov < 180, "lie between 0 and 180 degrees, both excluded"),
-                "elevation": (
-                    -90 < self.elevation < 90,
-                    "lie between -90 and 90 degrees, both excluded",
-                ),
-            },
-        )
+        rules: Rules = {
+            "fill": (0 <= self.fill < math.inf, "be 0 or more"),
+            "scale": (0 < self.scale < math.inf, "be a positive factor"),
+            "azimuth": (math.isfinite(self.azimuth), finite),
+            "light_azimuth": (math.isfinite(self.light_azimuth), finite),
+            "light_elevation": (math.isfinite(self.light_elevation), finite),
+            "exposure": (math.isfinite(self.exposure), finite),
+            "width": (self.width >= 1, positive),
+            "height": (self.height >= 1, positive),
+            "count": (self.count >= 1, positive),
+            "fov": (0 < self.fov < 180, "lie between 0 and 180 degrees, both excluded"),
+            "elevation": (
+                -90 < self.elevation < 90,
+                "lie between -90 and 90 degrees, both excluded",
+            ),
+        }
+        check_options(self, rules | (more_rules or {}))
         if self.splats is None:
             most = f"take {free_bytes() / _BYTES_PER_SPLAT:.0f} at most"
             check_room(f"--count {self.count}", _BYTES_PER_SPLAT * self.count, most)
@@ -172,7 +171,7 @@ class ViewOptions:
         they name, and versions.
         """
         fields = asdict(self).items()
-        options = {option_name(f): value for f, value in fields if f not in ("splats", "output")}
+        options = {option_name(f): value for f, value in fields if f not in _NOT_IN_PICTURES}
         splats = f"{self.splats.name}, {fingerprint(self.splats)}" if self.splats else None
         material = material_path(self.material).read_text(encoding="utf-8")
         return options | {
