@@ -162,8 +162,8 @@ def main() -> None:
     material = sj.load_material("skin").white()
     dull = dataclasses.replace(material.surface_of(material.gaussians), specular=jnp.zeros(()))
     settings = baselines.TextureSpaceSettings().shadows
-    rooms = baselines.shadow_rooms(body.mesh, (light,), settings)
-    maps = baselines.mesh_light(body.mesh, (light,), settings, rooms)
+    capacities = baselines.shadow_capacities(body.mesh, (light,), settings)
+    maps = baselines.mesh_light(body.mesh, (light,), settings, capacities)
     found = {"splats": same_light(body, maps, camera, dull, normalization)}
     found |= methods(body, light, camera, dull, normalization)
     seen = Seen.of(body, camera, found)
@@ -181,7 +181,7 @@ def main() -> None:
         )
         print(
             "twice the samples change it by",
-            baselines.Off.of(np.einsum("gpc,gc->pc", finer, weights), whole),
+            point_errors(np.einsum("gpc,gc->pc", finer, weights), whole),
         )
         layers, whole = finer, np.einsum("gpc,gc->pc", finer, weights)
     around = in_crop(body, maps, dull, normalization, seen, found, options)
@@ -203,7 +203,7 @@ class Seen(NamedTuple):
     def of(cls, body: Body, camera, found: dict[str, Found]) -> "Seen":
         """Look at the triangles."""
         landing = baselines.Landing.in_view(body.mesh.corners(), PerspectiveView.of(camera))
-        seen = baselines.see_faces(landing, baselines.room_for(landing))
+        seen = baselines.see_faces(landing, baselines.capacity_for(landing))
         there = np.asarray(seen.covered)
         for each in found.values():
             there = there & each.covered
@@ -239,7 +239,7 @@ def stretched(body: Body, faces: np.ndarray) -> np.ndarray:
     lengths = np.stack([np.asarray(each) for each in body.mesh.lengths()])[:, faces]
     a, b, c = np.moveaxis(np.asarray(body.mesh.uvs, np.float64), 1, 0)
     doubled = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
-    mean = np.sqrt(np.sum(np.asarray(body.mesh.face_areas())) / np.sum(0.5 * np.abs(doubled)))
+    mean = np.sqrt(np.sum(np.asarray(body.splats.areas)) / np.sum(0.5 * np.abs(doubled)))
     ratio = np.maximum(lengths, 1e-9) / mean
     return np.max(np.maximum(ratio, 1 / ratio), axis=0)
 
@@ -272,6 +272,18 @@ def in_crop(
     )
 
 
+def point_errors(values: np.ndarray, truth: np.ndarray) -> dict[str, float]:
+    """Return errors relative to the truth's root mean square per channel: median, 99th percentile
+    and largest of the worst channel of each point, and the root mean square of all.
+    """
+    error = (values - truth) / np.sqrt(np.mean(truth**2, axis=0))[None]
+    worst = np.max(np.abs(error), axis=1)
+    names, rms = ("median", "most", "largest"), float(np.sqrt(np.mean(error**2)))
+    return dict(zip(names, np.quantile(worst, (0.5, 0.99, 1.0)).tolist(), strict=True)) | {
+        "rms": rms
+    }
+
+
 def report(found, pixels, layers, whole, deviations, stretch, around, options) -> None:
     """Print the tables and write them."""
     rows = []
@@ -282,13 +294,13 @@ def report(found, pixels, layers, whole, deviations, stretch, around, options) -
     )
     print("RMS of the layers of", ", ".join(f"{each:.2f}" for each in deviations), "mm")
     for name, each in found.items():
-        off = baselines.Off.of(each.exitance[pixels], whole)
+        errors = point_errors(each.exitance[pixels], whole)
         by_layer = []
         if each.layers is not None:
             by_layer = [
-                baselines.Off.of(each.layers[k][pixels], layers[k]).rms for k in range(len(layers))
+                point_errors(each.layers[k][pixels], layers[k])["rms"] for k in range(len(layers))
             ]
-        print(f"{name:42}{off.median:9.1e}{off.most:9.1e}{off.largest:9.1e}{off.rms:9.1e}", end="")
+        print(f"{name:42}" + "".join(f"{value:9.1e}" for value in errors.values()), end="")
         alike, seen = around[name]["ssim"], around[name]["flip"]
         print(
             f"{alike:8.4f}{'none' if seen is None else f'{seen:.4f}':>8}{each.seconds:9.2f}  ",
@@ -298,7 +310,7 @@ def report(found, pixels, layers, whole, deviations, stretch, around, options) -
         rows.append(
             {
                 "name": name,
-                **dataclasses.asdict(off),
+                **errors,
                 **around[name],
                 "seconds": each.seconds,
                 "layers": by_layer,

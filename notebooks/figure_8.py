@@ -59,9 +59,10 @@ beauty, coverage = (
     for layer in (theirs.beauty, theirs.coverage)
 )
 white = float(np.quantile(ours.beauty, 0.995))
-both = baselines.half_and_half(jnp.asarray(beauty) / white, ours.beauty / white, 8.0)
+halves = np.concatenate([beauty[:, : SIZE // 2], ours.beauty[:, SIZE // 2 :]], axis=1) / white
+difference = 0.5 + 8 * (np.asarray(ours.beauty, np.float64) - beauty) / white
 plot_pictures(
-    [[both.halves, srgb_to_linear(np.asarray(both.difference, np.float64))]],
+    [[halves, srgb_to_linear(np.clip(difference, 0, 1))]],
     ["texture-space diffusion, splats", "difference, enlarged 8 times"],
     white=1.0,
     inches=4.2,

@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 
 from splatjax.splatting import AbstractView, BinCapacity, FragmentSums, blend_fragments
 
-from ._kernels import AbstractKernel
+from ._kernels import AbstractSplatKernel
 from ._tiles import AbstractListRasterizer, Lists
 
 
@@ -23,33 +23,32 @@ class BlendingRasterizer(AbstractListRasterizer):
     - `capacity`: set by `planned`; a picture that needs more is NaN.
     """
 
-    kernel: AbstractKernel
+    kernel: AbstractSplatKernel
     capacity: BinCapacity | None = None
 
     def front(
         self, lists: Lists, attributes: Float[Array, "attributes splats"], view: AbstractView
     ) -> FragmentSums:
         def nearest(ids, footprints, dx, dy):
-            found = self.kernel.fragments(footprints, view, dx, dy)
-            return jnp.max(
-                jnp.where(found.there, view.shifted(found.nearness, footprints.shift), -jnp.inf),
-                axis=1,
-            )
+            fragments = self.kernel.fragments(footprints, view, dx, dy)
+            shifted = view.shifted(fragments.nearness, footprints.shift)
+            return jnp.max(jnp.where(fragments.is_inside, shifted, -jnp.inf), axis=1)
 
-        limits = stop_gradient(lists.over_blocks(jax.ops.segment_max, lists.each(nearest)))
+        limits = stop_gradient(lists.reduce_blocks(jax.ops.segment_max, lists.map_blocks(nearest)))
 
         def blend(ids, footprints, dx, dy, limit):
-            found = self.kernel.fragments(footprints, view, dx, dy)
-            weight = jnp.where(found.there & (found.nearness > limit[:, None]), found.weight, 0.0)
+            fragments = self.kernel.fragments(footprints, view, dx, dy)
+            in_front = fragments.is_inside & (fragments.nearness > limit[:, None])
+            weight = jnp.where(in_front, fragments.weight, 0.0)
             rows = attributes.at[:, ids].get(mode="fill", fill_value=0)
             sums = jnp.einsum("rts,tsp->trp", rows, weight)
             own = jnp.stack(
-                [jnp.sum(weight * found.nearness, axis=1), jnp.sum(weight, axis=1)], axis=1
+                [jnp.sum(weight * fragments.nearness, axis=1), jnp.sum(weight, axis=1)], axis=1
             )
             return jnp.concatenate([sums, own], axis=1)
 
         sums = FragmentSums.of(
-            lists.tiles(lists.over_blocks(jax.ops.segment_sum, lists.each(blend, limits)))
+            lists.tiles(lists.reduce_blocks(jax.ops.segment_sum, lists.map_blocks(blend, limits)))
         )
         return FragmentSums(
             blend_fragments(sums.attributes, sums.weights[:, None]),

@@ -10,8 +10,8 @@ from jaxtyping import Array, Float
 Trust = Callable[[Float[Array, "height width"]], Float[Array, "height width"]]
 
 
-class Gathered(eqx.Module):
-    """What a blur finds at each pixel."""
+class BlurSums(eqx.Module):
+    """The weighted sums of a blur at each pixel."""
 
     sums: Float[Array, "rows height width"]
     """Of what was trusted, weighted."""
@@ -22,8 +22,10 @@ class Gathered(eqx.Module):
 
     def renormalized(self) -> Float[Array, "rows height width"]:
         """Give the mean over what was trusted; 0 where nothing was."""
-        there = self.trusted > 0
-        return jnp.where(there[None], self.sums / jnp.where(there, self.trusted, 1.0)[None], 0.0)
+        is_trusted = self.trusted > 0
+        return jnp.where(
+            is_trusted[None], self.sums / jnp.where(is_trusted, self.trusted, 1.0)[None], 0.0
+        )
 
     def filled(self, own: Float[Array, "rows height width"]) -> Float[Array, "rows height width"]:
         """Give the mean over all taps, the pixel's own value standing for what was not trusted."""
@@ -37,7 +39,7 @@ def blur_along(
     trust: Trust,
     variance: Float[Array, "height width"],
     reach: int,
-) -> Gathered:
+) -> BlurSums:
     r"""Gather along one axis by Gaussian weights, `sum_s exp(-s^2 / 2 variance) trust(guide(x + s))
     values(x + s)`.
 
@@ -55,7 +57,7 @@ def blur_along(
       by 0.4%.
     - `reach`: the farthest tap, pixels. Static.
 
-    **Returns:** `Gathered`.
+    **Returns:** `BlurSums`.
     """
     pad = [(0, 0), (0, 0)]
     pad[axis] = (reach, reach)
@@ -68,19 +70,19 @@ def blur_along(
         return tap, trust(jax.lax.dynamic_slice_in_dim(guides, reach + step, size, axis))
 
     @jax.checkpoint
-    def add(found, step):
+    def add(sums, step):
         weight = jnp.exp(-rate * step.astype(rate.dtype) ** 2)
         for tap, trusted in (shifted(step), shifted(-step)):
             counted = weight * trusted
-            found = Gathered(
-                found.sums + counted[None] * tap, found.trusted + counted, found.total + weight
+            sums = BlurSums(
+                sums.sums + counted[None] * tap, sums.trusted + counted, sums.total + weight
             )
-        return found, None
+        return sums, None
 
     trusted = trust(guide)
-    start = Gathered(trusted[None] * values, trusted, jnp.ones_like(rate))
-    found, _ = jax.lax.scan(add, start, jnp.arange(1, reach + 1, dtype=jnp.int32))
-    return found
+    start = BlurSums(trusted[None] * values, trusted, jnp.ones_like(rate))
+    sums, _ = jax.lax.scan(add, start, jnp.arange(1, reach + 1, dtype=jnp.int32))
+    return sums
 
 
 def _rate(variance: Float[Array, "height width"]) -> Float[Array, "height width"]:

@@ -4,8 +4,8 @@ import numpy as np
 
 from splatjax.geometry import Mesh, Textures, bust_mesh, complexion, cut_below
 
-from ._mesh_raster import Landing, room_for
-from ._texture_space import lay_out
+from ._mesh_raster import Landing, capacity_for
+from ._texture_space import rasterize_in_texture
 from ._textured_mesh import TexturedMesh
 
 _NECK = -105.0  # mm: below it the chart would show the shoulders over the chest
@@ -40,7 +40,7 @@ def bust_with_textures(texels: int) -> tuple[Mesh, Textures]:
         _RIM + (1 - 2 * _RIM) * (mesh.uvs - low) / (high - low),
     )
     bare = TexturedMesh.of(mesh)
-    laid_out = lay_out(bare, texels, room_for(Landing.in_texture(bare.uvs, texels)))
-    colors = complexion(np.asarray(laid_out.points.centers, np.float64))
-    albedo, specular, roughness = (each.reshape(texels, texels, *each.shape[1:]) for each in colors)
-    return mesh, Textures(albedo, specular, roughness)
+    capacity = capacity_for(Landing.in_texture(bare.uvs, texels))
+    points = rasterize_in_texture(bare, texels, capacity).points
+    colors = complexion(np.asarray(points.centers, np.float64))
+    return mesh, Textures(*(rows.reshape(texels, texels, *rows.shape[1:]) for rows in colors))

@@ -20,10 +20,10 @@ class Fragments(eqx.Module):
     weight: Float[Array, "..."]
     """0 where a splat leaves nothing."""
     nearness: Float[Array, "..."]
-    there: Bool[Array, "..."]
+    is_inside: Bool[Array, "..."]
 
 
-class AbstractKernel(eqx.Module):
+class AbstractSplatKernel(eqx.Module):
     """The footprint of a splat. All weigh their fragments by `splatjax.splatting.fragment_weight`,
     of a squared radius each.
     """
@@ -61,12 +61,12 @@ class AbstractKernel(eqx.Module):
         """Give fragments at offsets from the center. Differentiable in the footprints."""
         nearness = self.nearness(f, view, dx, dy)
         squared = self.squared_radius(f, view, dx, dy, nearness)
-        there = f.visible & (squared < 1)
-        weight = jnp.where(there, fragment_weight(jnp.where(there, squared, 1.0)), 0.0)
-        return Fragments(f.opacity * weight, jnp.where(there, nearness, 1.0), there)
+        is_inside = f.visible & (squared < 1)
+        weight = jnp.where(is_inside, fragment_weight(jnp.where(is_inside, squared, 1.0)), 0.0)
+        return Fragments(f.opacity * weight, jnp.where(is_inside, nearness, 1.0), is_inside)
 
 
-class DiscKernel(AbstractKernel):
+class DiscKernel(AbstractSplatKernel):
     """The disc itself, seen in exact perspective: no filter. What is smaller than a pixel is
     missed, or stands for all of it.
 
@@ -81,13 +81,13 @@ class DiscKernel(AbstractKernel):
         return _in_perspective(f, view, dx, dy, nearness)
 
 
-class EwaKernel(AbstractKernel):
+class EwaKernel(AbstractSplatKernel):
     r"""The elliptical weighted average: the disc's Gaussian, projected by the affine map at its
     center, blurred by the pixel's.
 
     In the picture the kernel is `exp(-d^T (J V J^T + I)^-1 d / 2)` and its like, with the pixel's
-    filter of variance `I`, cut where the house's kernel ends. The projection is exact at the center
-    alone: large splats near the eye may part, and leave holes.
+    filter of variance `I`, cut where the renderer's kernel ends. The projection is exact at the
+    center alone: large splats near the eye may part, and leave holes.
 
     **Attributes:**
 
@@ -104,7 +104,7 @@ class EwaKernel(AbstractKernel):
         f = view.footprints(
             splats, dataclasses.replace(settings, filter_radius=(8 * self.filter_variance) ** 0.5)
         )
-        a, b, c = (stop_gradient(each) for each in self._quadric(f, view))
+        a, b, c = stop_gradient(self._quadric(f, view))
         determinant = a * c - 0.25 * b * b
         x, y = stop_gradient(f.x), stop_gradient(f.y)
         across, down = jnp.sqrt(c / determinant), jnp.sqrt(a / determinant)
@@ -121,11 +121,11 @@ class EwaKernel(AbstractKernel):
         """Give the ellipse of the affine map: the one in perspective, with the nearness of the
         center everywhere.
         """
-        there = jnp.where(f.visible, f.nearness, 1.0)
-        return tuple(view.squared_radius(there, each) for each in (f.a, f.b, f.c))
+        nearness = jnp.where(f.visible, f.nearness, 1.0)
+        return tuple(view.squared_radius(nearness, coefficient) for coefficient in (f.a, f.b, f.c))
 
 
-class DiscOrPixelKernel(AbstractKernel):
+class DiscOrPixelKernel(AbstractSplatKernel):
     r"""The disc in exact perspective, or a circle of a pixel's size around its center, whichever
     weighs more.
 
@@ -179,5 +179,5 @@ def _in_perspective(f: Footprints, view: AbstractView, dx, dy, nearness) -> Floa
     """
     quadric = dx * (f.a * dx + f.b * dy) + f.c * dy * dy
     inside = f.visible & view.inside(nearness, quadric)
-    found = view.squared_radius(jnp.where(inside, nearness, 1.0), jnp.where(inside, quadric, 0.0))
-    return jnp.where(inside, found, jnp.inf)
+    nearness, quadric = jnp.where(inside, nearness, 1.0), jnp.where(inside, quadric, 0.0)
+    return jnp.where(inside, view.squared_radius(nearness, quadric), jnp.inf)

@@ -74,7 +74,7 @@ def normal_slopes(splats: Splats, neighbors: int = _NEIGHBORS) -> Float[Array, "
     **Returns:** zero along the splat's own normal, and where the neighbors lie in one line, across
     it.
     """
-    centers, normals = (np.asarray(each, np.float64) for each in (splats.centers, splats.normals))
+    centers, normals = (np.asarray(rows, float) for rows in (splats.centers, splats.normals))
     near = scipy.spatial.KDTree(centers).query(centers, k=min(neighbors + 1, len(centers)))[1][
         :, 1:
     ]
@@ -87,8 +87,8 @@ def normal_slopes(splats: Splats, neighbors: int = _NEIGHBORS) -> Float[Array, "
         2
     ) + np.finfo(float).tiny * np.eye(2)
     slopes = np.einsum("ska,ski->sai", offsets, turns)
-    found = np.einsum("sai,saj->sij", np.linalg.solve(spread, slopes), plane)
-    return jnp.asarray(found, splats.centers.dtype)
+    in_space = np.einsum("sai,saj->sij", np.linalg.solve(spread, slopes), plane)
+    return jnp.asarray(in_space, splats.centers.dtype)
 
 
 def _lit(
@@ -115,5 +115,5 @@ def _lit(
     albedo = flat(named["albedo"]) if "albedo" in named else None
     normals = unit_normals(flat(named["normal"]))
     entering = entering_light(material, light, flat(points), normals, albedo, specular, roughness)
-    found = named | {"source": tiled(entering.source)}
-    return found | {"irradiance": tiled(entering.irradiance)} if "irradiance" in named else found
+    lit = named | {"source": tiled(entering.source)}
+    return lit | {"irradiance": tiled(entering.irradiance)} if "irradiance" in named else lit

@@ -19,7 +19,7 @@ from splatjax.scene import (
     stack_lights,
 )
 
-from ._mesh_raster import Landing, barycentrics, interpolate, room_for, see_faces
+from ._mesh_raster import Landing, barycentrics, capacity_for, interpolate, see_faces
 from ._textured_mesh import TexturedMesh
 
 
@@ -48,12 +48,12 @@ class MeshLight(eqx.Module):
         shares = []
         for group in groups:
             maps = [self.shadows[place] for place in group.places]
-            found = [
-                _splatting.lit_share(points, each.view, each.surfaces, self.settings)
-                for each in maps
-                if each is not None
+            visible = [
+                _splatting.lit_share(points, shadow.view, shadow.surfaces, self.settings)
+                for shadow in maps
+                if shadow is not None
             ]
-            shares.append(jnp.stack(found) if found else None)
+            shares.append(jnp.stack(visible) if visible else None)
         return LightOnSplats(groups, shares, self.needed)
 
     def entering(self, points: Splats, material: Material) -> EnteringLight:
@@ -82,10 +82,10 @@ def light_views(
     return views
 
 
-def shadow_rooms(
+def shadow_capacities(
     mesh: TexturedMesh, lights: tuple[AbstractLight, ...], settings: _splatting.ShadowSettings
 ) -> tuple[int | None, ...]:
-    """Give the room that each light's shadow map needs; of concrete lights.
+    """Return the capacity that each light's shadow map needs; of concrete lights.
 
     **Raises:** `ValueError` for a point light that casts shadows from within the mesh's bounding
     sphere.
@@ -100,9 +100,9 @@ def shadow_rooms(
                     "bounding sphere of radius "
                     f"{float(bounds.radius):g} mm; move it out, or let it cast no shadows"
                 )
-    views = light_views(mesh, lights, settings)
+    corners, views = mesh.corners(), light_views(mesh, lights, settings)
     return tuple(
-        None if view is None else room_for(Landing.in_view(mesh.corners(), view)) for view in views
+        None if view is None else capacity_for(Landing.in_view(corners, view)) for view in views
     )
 
 
@@ -110,36 +110,34 @@ def mesh_light(
     mesh: TexturedMesh,
     lights: tuple[AbstractLight, ...],
     settings: _splatting.ShadowSettings,
-    rooms: tuple[int | None, ...],
+    capacities: tuple[int | None, ...],
 ) -> MeshLight:
     r"""Make the shadow maps of a mesh (4.1, of triangles). Differentiable in depth, not in what
     hides what.
 
     **Arguments:**
 
-    - `rooms`: from `shadow_rooms`.
+    - `capacities`: from `shadow_capacities`.
 
     **Returns:** a `MeshLight`.
     """
-    corners, shadows, needs = mesh.corners(), [], [jnp.zeros((), mesh.vertices.dtype)]
-    for light, view, room in zip(lights, light_views(mesh, lights, settings), rooms, strict=True):
-        if view is None or room is None:
+    corners, shadows, needed = mesh.corners(), [], jnp.zeros((), mesh.vertices.dtype)
+    views = light_views(mesh, lights, settings)
+    for light, view, capacity in zip(lights, views, capacities, strict=True):
+        if view is None or capacity is None:
             shadows.append(None)
             continue
         landing = Landing.in_view(corners, view)
-        seen = see_faces(landing, room)
+        seen = see_faces(landing, capacity)
         carried = jnp.concatenate(
             [mesh.uvs, mesh.normals[mesh.faces], landing.depth[..., None]], axis=2
         )
-        found = interpolate(carried, seen, barycentrics(landing, seen)).transpose(2, 0, 1)
-        there = seen.covered.astype(found.dtype)
-        depth, grid = (
-            jnp.where(seen.covered, found[5], 1.0),
-            _splatting.TileGrid(view.width, view.height),
-        )
-        depth, there = (grid.cut(plane[None])[:, 0] for plane in (depth, there))
-        front = _splatting.Surface(grid.cut(found[:5]), depth, there, there)
+        surface = interpolate(carried, seen, barycentrics(landing, seen)).transpose(2, 0, 1)
+        grid = _splatting.TileGrid(view.width, view.height)
+        depth = grid.cut(jnp.where(seen.covered, surface[5], 1.0)[None])[:, 0]
+        coverage = grid.cut(seen.covered.astype(surface.dtype)[None])[:, 0]
+        front = _splatting.Surface(grid.cut(surface[:5]), depth, coverage, coverage)
         behind = jax.tree.map(jnp.zeros_like, front)
         shadows.append(MeshShadow(light, view, _splatting.Surfaces(front, behind, seen.needed)))
-        needs.append(seen.needed)
-    return MeshLight(lights, tuple(shadows), settings, jnp.max(jnp.stack(needs)))
+        needed = jnp.maximum(needed, seen.needed)
+    return MeshLight(lights, tuple(shadows), settings, needed)

@@ -12,18 +12,20 @@ from splatjax import shading as _shading, splatting as _splatting
 from splatjax.render import LightOnSplats
 from splatjax.scene import AbstractLight, Camera, Frame, Material
 
-from ._mesh_light import MeshLight, mesh_light, shadow_rooms
-from ._mesh_raster import Landing, barycentrics, interpolate, room_for, see_faces
+from ._mesh_light import MeshLight, mesh_light, shadow_capacities
+from ._mesh_raster import Landing, barycentrics, capacity_for, interpolate, see_faces
 from ._texture_space import (
     TextureLayers,
     TextureSpaceSettings,
     diffuse_in_texture,
-    lay_out,
     look_up_layers,
+    rasterize_in_texture,
     reaches_of,
     stretch_map,
 )
 from ._textured_mesh import SurfaceTexels, TexturedMesh, surface_texels
+
+_SETTINGS = TextureSpaceSettings()
 
 
 class TexturePlan(eqx.Module):
@@ -42,23 +44,22 @@ def plan_texture_space(
     lights: tuple[AbstractLight, ...],
     material: Material,
     camera: Camera,
-    settings: TextureSpaceSettings | None = None,
+    settings: TextureSpaceSettings = _SETTINGS,
 ) -> TexturePlan:
-    """Find the room that rendering a mesh needs, and how far its blurs reach; all concrete, not
-    traced.
+    """Find the capacities that rendering a mesh needs, and how far its blurs reach; all concrete,
+    not traced.
 
     **Raises:** `ValueError` for a point light within the mesh's bounding sphere.
     """
-    settings = TextureSpaceSettings() if settings is None else settings
     in_texture = Landing.in_texture(mesh.uvs, settings.resolution)
     in_view = Landing.in_view(mesh.corners(), _splatting.PerspectiveView.of(camera))
-    rooms = room_for(in_texture), room_for(in_view)
-    texels = lay_out(mesh, settings.resolution, rooms[0])
+    capacities = capacity_for(in_texture), capacity_for(in_view)
+    texels = rasterize_in_texture(mesh, settings.resolution, capacities[0])
     valid = texels.seen.covered.astype(mesh.vertices.dtype)
     extents = stretch_map(mesh, texels)
     taken = jnp.stack(settings.stretch.millimeters(*extents, valid))
     reaches = reaches_of(material.gaussians.variances, taken, valid)
-    return TexturePlan(*rooms, shadow_rooms(mesh, lights, settings.shadows), reaches)
+    return TexturePlan(*capacities, shadow_capacities(mesh, lights, settings.shadows), reaches)
 
 
 class TextureSpacePicture(eqx.Module):
@@ -73,7 +74,7 @@ def render_texture_space(
     lights: tuple[AbstractLight, ...],
     material: Material,
     camera: Camera,
-    settings: TextureSpaceSettings | None = None,
+    settings: TextureSpaceSettings = _SETTINGS,
     plan: TexturePlan | None = None,
 ) -> TextureSpacePicture:
     r"""Render a mesh with texture-space diffusion: shadow maps, irradiance map, blurs, far side,
@@ -96,7 +97,6 @@ def render_texture_space(
 
     **Source:** d'Eon, Luebke and Enderton 2007; d'Eon and Luebke 2007 (GPU Gems 3, chapter 14).
     """
-    settings = TextureSpaceSettings() if settings is None else settings
     if plan is None:
         if any(
             isinstance(leaf, Tracer) for leaf in jax.tree.leaves((mesh, lights, material, camera))
@@ -123,7 +123,7 @@ def _render(
         (lights, material, camera),
     )
     light = mesh_light(mesh, lights, settings.shadows, plan.shadows)
-    texels = lay_out(mesh, settings.resolution, plan.texture)
+    texels = rasterize_in_texture(mesh, settings.resolution, plan.texture)
     texture = diffuse_in_texture(mesh, texels, light, material, settings, plan.reaches)
     view = _splatting.PerspectiveView.of(camera)
     landing = Landing.in_view(mesh.corners(), view)
@@ -170,7 +170,7 @@ def _shaded(
         if points.albedo is None
         else points.albedo
     )
-    root = jnp.ones_like(albedo) if points.albedo is None else _shading.albedo_root(albedo)
+    root = _shading.albedo_root(albedo)
     single = None
     if material.single_scattering is not None:
         single = _shading.single_scattered_radiance(

@@ -82,11 +82,6 @@ class Landing(eqx.Module):
             size.append(jnp.where(self.shown, jnp.maximum(last - first + 1, 0), 0))
         return *begin, *size
 
-    def fragments(self) -> Int[Array, ""]:
-        """Count the pixels in all boxes."""
-        _, _, across, down = self.boxes()
-        return jnp.sum(across * down)
-
 
 class SeenFaces(eqx.Module):
     """The face that every pixel sees; 0 where it sees none."""
@@ -94,17 +89,18 @@ class SeenFaces(eqx.Module):
     faces: Int[Array, "height width"]
     covered: Bool[Array, "height width"]
     needed: Float[Array, ""]
-    """Fragments over the room for them: above 1 some are missing."""
+    """Fragments over the capacity for them: above 1 some are missing."""
 
 
-def room_for(landing: Landing) -> int:
-    """Give the room that `see_faces` needs for a concrete landing, and an eighth more for what
-    moves.
+def capacity_for(landing: Landing) -> int:
+    """Return the capacity that `see_faces` needs for a concrete landing, and an eighth more for
+    motion.
     """
-    return round_up(9 * int(landing.fragments()) // 8, 1024)
+    _, _, across, down = landing.boxes()
+    return round_up(9 * int(jnp.sum(across * down)) // 8, 1024)
 
 
-def see_faces(landing: Landing, room: int) -> SeenFaces:
+def see_faces(landing: Landing, capacity: int) -> SeenFaces:
     r"""Find the nearest face under every pixel center. Not differentiated.
 
     Every face offers the pixels of its box; the least depth of those it covers wins.
@@ -112,7 +108,7 @@ def see_faces(landing: Landing, room: int) -> SeenFaces:
     **Arguments:**
 
     - `landing`: from `Landing.in_view` or `Landing.in_texture`.
-    - `room`: how many pixels all boxes may have together (`room_for`). Static.
+    - `capacity`: how many pixels all boxes may have together (`capacity_for`). Static.
 
     **Returns:** `SeenFaces`.
     """
@@ -120,13 +116,15 @@ def see_faces(landing: Landing, room: int) -> SeenFaces:
     left, top, across, down = landing.boxes()
     counts = across * down
     ends = jnp.cumsum(counts)
-    face = jnp.repeat(jnp.arange(len(counts), dtype=jnp.int32), counts, total_repeat_length=room)
-    within = jnp.arange(room, dtype=jnp.int32) - (ends - counts)[face]
-    there = jnp.arange(room, dtype=jnp.int32) < ends[-1]
+    face = jnp.repeat(
+        jnp.arange(len(counts), dtype=jnp.int32), counts, total_repeat_length=capacity
+    )
+    within = jnp.arange(capacity, dtype=jnp.int32) - (ends - counts)[face]
+    is_fragment = jnp.arange(capacity, dtype=jnp.int32) < ends[-1]
     wide = jnp.maximum(across[face], 1)
     column, row = left[face] + within % wide, top[face] + within // wide
     shares = _barycentrics(landing, face, column, row)
-    inside = there & jnp.all(shares >= -_ON_THE_EDGE, axis=1)
+    inside = is_fragment & jnp.all(shares >= -_ON_THE_EDGE, axis=1)
     depth = jnp.sum(shares * landing.depth[face], axis=1)
     pixels = landing.width * landing.height
     pixel = jnp.where(inside, row * landing.width + column, pixels)
@@ -139,7 +137,7 @@ def see_faces(landing: Landing, room: int) -> SeenFaces:
         .max(face, mode="drop")
     )
     seen = seen.reshape(landing.height, landing.width)
-    return SeenFaces(jnp.maximum(seen, 0), seen >= 0, ends[-1].astype(depth.dtype) / room)
+    return SeenFaces(jnp.maximum(seen, 0), seen >= 0, ends[-1].astype(depth.dtype) / capacity)
 
 
 def barycentrics(landing: Landing, seen: SeenFaces) -> Float[Array, "height width 3"]:
@@ -149,14 +147,14 @@ def barycentrics(landing: Landing, seen: SeenFaces) -> Float[Array, "height widt
     Where a pixel sees nothing they are those of a face's middle.
     """
     row, column = jnp.indices((landing.height, landing.width), dtype=jnp.int32)
-    found = _barycentrics(
+    interpolated = _barycentrics(
         landing,
         seen.faces.reshape(-1),
         column.reshape(-1),
         row.reshape(-1),
         seen.covered.reshape(-1),
     )
-    return found.reshape(landing.height, landing.width, 3)
+    return interpolated.reshape(landing.height, landing.width, 3)
 
 
 def interpolate(
@@ -165,8 +163,8 @@ def interpolate(
     """Interpolate what the corners of faces carry; 0 where a pixel sees nothing. Differentiable in
     the values and the shares.
     """
-    found = jnp.sum(values[seen.faces] * shares[..., None], axis=2)
-    return jnp.where(seen.covered[..., None], found, 0.0)
+    interpolated = jnp.sum(values[seen.faces] * shares[..., None], axis=2)
+    return jnp.where(seen.covered[..., None], interpolated, 0.0)
 
 
 def _barycentrics(landing: Landing, face, column, row, valid=None) -> Float[Array, "pixels 3"]:

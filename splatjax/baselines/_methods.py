@@ -2,7 +2,7 @@
 renderer.
 """
 
-import dataclasses
+from dataclasses import replace
 
 from jaxtyping import Array, Float
 
@@ -13,18 +13,20 @@ from ._kernels import DiscKernel, DiscOrPixelKernel, EwaKernel
 from ._lighting import LightAtPixels, NormalFields
 from ._nearest import NearestRasterizer
 
+_DEFAULTS = RenderSettings()
 
-def elliptical_points(settings: RenderSettings | None = None) -> RenderSettings:
-    """Give settings that draw elliptical points: the nearest splat wins, and has one color, as in
+
+def elliptical_points(settings: RenderSettings = _DEFAULTS) -> RenderSettings:
+    """Return settings that draw elliptical points: the nearest splat wins, and has one color, as in
     flat shading.
 
     Neither color nor normals are interpolated, and nothing is filtered. Figure 7, left.
     """
-    return _with(settings, NearestRasterizer(), LightAtSplats())
+    return replace(settings, rasterizer=NearestRasterizer(), lighting=LightAtSplats())
 
 
-def ewa_splatting(settings: RenderSettings | None = None) -> RenderSettings:
-    """Give settings that splat surfaces with the elliptical weighted average: the splat's kernel
+def ewa_splatting(settings: RenderSettings = _DEFAULTS) -> RenderSettings:
+    """Return settings that splat surfaces with the elliptical weighted average: the splat's kernel
     blurred by the pixel's.
 
     The projection is affine; where splats are large in the picture and the perspective strong,
@@ -32,13 +34,13 @@ def ewa_splatting(settings: RenderSettings | None = None) -> RenderSettings:
 
     **Source:** Zwicker et al. 2001, "Surface Splatting".
     """
-    return _with(settings, BlendingRasterizer(EwaKernel()), LightAtPixels())
+    return replace(settings, rasterizer=BlendingRasterizer(EwaKernel()), lighting=LightAtPixels())
 
 
 def phong_splatting(
-    slopes: Float[Array, "splats 3 3"], settings: RenderSettings | None = None
+    slopes: Float[Array, "splats 3 3"], settings: RenderSettings = _DEFAULTS
 ) -> RenderSettings:
-    """Give settings for Phong splatting: normals vary linearly within each splat, and nothing is
+    """Return settings for Phong splatting: normals vary linearly within each splat, and nothing is
     filtered in the picture.
 
     Few splats suffice for a smooth surface; splats smaller than a pixel alias.
@@ -49,21 +51,17 @@ def phong_splatting(
 
     **Source:** Botsch et al. 2004, "Phong Splatting".
     """
-    return _with(settings, BlendingRasterizer(DiscKernel()), NormalFields(slopes))
+    lighting = NormalFields(slopes)
+    return replace(settings, rasterizer=BlendingRasterizer(DiscKernel()), lighting=lighting)
 
 
-def deferred_splatting(settings: RenderSettings | None = None) -> RenderSettings:
-    """Give settings for high-quality deferred splatting: attributes are blended, with a filter for
-    small splats, then shaded.
+def deferred_splatting(settings: RenderSettings = _DEFAULTS) -> RenderSettings:
+    """Return settings for high-quality deferred splatting: attributes are blended, with a filter
+    for small splats, then shaded.
 
     Figure 7, middle.
 
     **Source:** Botsch et al. 2005, "High-Quality Surface Splatting on Today's GPUs".
     """
-    return _with(settings, BlendingRasterizer(DiscOrPixelKernel()), LightAtPixels())
-
-
-def _with(settings: RenderSettings | None, rasterizer, lighting) -> RenderSettings:
-    """Give the same settings, but for what sees the splats and where they are lit."""
-    settings = RenderSettings() if settings is None else settings
-    return dataclasses.replace(settings, rasterizer=rasterizer, lighting=lighting)
+    rasterizer = BlendingRasterizer(DiscOrPixelKernel())
+    return replace(settings, rasterizer=rasterizer, lighting=LightAtPixels())

@@ -22,16 +22,6 @@ _FOLLOWED = (
 )
 
 
-class ScreenLight(eqx.Module):
-    """The buffers that are blurred."""
-
-    source: Float[Array, "channels height width"]
-    """Light that has entered the surface, not premultiplied."""
-    depth: Float[Array, "height width"]
-    """mm; 0 where there is nothing."""
-    pixels_per_mm: Float[Array, "height width"]
-
-
 class AbstractScreenKernel(eqx.Module):
     """How light is blurred on the screen. What differs in depth is not trusted: the pixel's own
     light stands for it.
@@ -39,7 +29,11 @@ class AbstractScreenKernel(eqx.Module):
 
     @abc.abstractmethod
     def diffuse(
-        self, light: ScreenLight, gaussians: SumOfGaussians
+        self,
+        source: Float[Array, "channels height width"],
+        depth: Float[Array, "height width"],
+        pixels_per_mm: Float[Array, "height width"],
+        gaussians: SumOfGaussians,
     ) -> tuple[Float[Array, "layers channels height width"], Float[Array, "layers channels"]]:
         """Give layers, and the weights with which they add up to the radiant exitance.
         Differentiable in the light's colors.
@@ -60,14 +54,14 @@ class GaussianPasses(AbstractScreenKernel):
 
     reach: int = eqx.field(static=True, default=64)
 
-    def diffuse(self, light, gaussians):
+    def diffuse(self, source, depth, pixels_per_mm, gaussians):
         layers = []
         for variance in gaussians.variances:
-            width = jnp.minimum(variance * light.pixels_per_mm**2, (self.reach / _SUPPORT) ** 2)
-            near = _follows(light.depth, _FOLLOWED * jnp.sqrt(variance))
-            rows = light.source
+            width = jnp.minimum(variance * pixels_per_mm**2, (self.reach / _SUPPORT) ** 2)
+            near = _follows(depth, _FOLLOWED * jnp.sqrt(variance))
+            rows = source
             for axis in (1, 0):
-                rows = blur_along(axis, rows, light.depth, near, width, self.reach).filled(rows)
+                rows = blur_along(axis, rows, depth, near, width, self.reach).filled(rows)
             layers.append(rows)
         return jnp.stack(layers), gaussians.weights
 
@@ -83,14 +77,14 @@ class AbstractOneKernel(AbstractScreenKernel):
     ) -> tuple[Float[Array, " samples"], Float[Array, "samples channels"]]:
         """Give offsets (mm), and weights that add up to 1 in each channel."""
 
-    def diffuse(self, light, gaussians):
+    def diffuse(self, source, depth, pixels_per_mm, gaussians):
         offsets, weights = self.taps(gaussians)
-        near = _follows(light.depth, jnp.max(offsets))
-        rows = light.source
+        near = _follows(depth, jnp.max(offsets))
+        rows = source
         for axis in (1, 0):
             blurred = jnp.zeros_like(rows)
             for offset, weight in zip(offsets, weights, strict=True):
-                tap, trusted = _fetch(rows, light.depth, near, offset * light.pixels_per_mm, axis)
+                tap, trusted = _fetch(rows, depth, near, offset * pixels_per_mm, axis)
                 blurred = blurred + weight[:, None, None] * (tap + (1 - trusted)[None] * rows)
             rows = blurred
         return rows[None], gaussians.total_reflectance()[None]
@@ -133,8 +127,14 @@ class PreintegratedKernel(AbstractOneKernel):
         return offsets, weights / jnp.sum(weights, axis=0)[None]
 
 
+_GAUSSIAN_PASSES = GaussianPasses()
+
+
 def diffuse_on_screen(
-    frame: Frame, camera: Camera, material: Material, kernel: AbstractScreenKernel | None = None
+    frame: Frame,
+    camera: Camera,
+    material: Material,
+    kernel: AbstractScreenKernel = _GAUSSIAN_PASSES,
 ) -> Frame:
     r"""Replace the diffused light of a picture by what a blur on the screen makes of its
     irradiance.
@@ -148,21 +148,22 @@ def diffuse_on_screen(
       normal and position are read. Differentiable.
     - `camera`, `material`: those of the frame. The surface is taken to shine as the material does:
       maps of `specular` and `roughness` are not among the buffers.
-    - `kernel`: `GaussianPasses()` when not given.
+    - `kernel`: how light is blurred.
 
     **Returns:** the frame with other `layers`, `weights`, `diffuse` and `beauty`.
 
     **Source:** Jimenez, Sundstedt and Gutierrez 2009; Jimenez et al. 2015.
     """
-    kernel = GaussianPasses() if kernel is None else kernel
     view = _splatting.PerspectiveView.of(camera)
-    there = jnp.isfinite(frame.depth) & (frame.coverage > 0)
-    share = jnp.where(there, frame.coverage, 1.0)[..., None]
+    is_covered = jnp.isfinite(frame.depth) & (frame.coverage > 0)
+    share = jnp.where(is_covered, frame.coverage, 1.0)[..., None]
     root = _shading.albedo_root(frame.albedo / share)
-    depth = stop_gradient(jnp.where(there, frame.depth, 0.0))
-    source = jnp.where(there[..., None], frame.irradiance / share * root, 0.0).transpose(2, 0, 1)
-    light = ScreenLight(source, depth, view.pixels_per_mm(jnp.where(there, depth, 1e6)))
-    layers, weights = kernel.diffuse(light, material.gaussians)
+    depth = stop_gradient(jnp.where(is_covered, frame.depth, 0.0))
+    source = jnp.where(is_covered[..., None], frame.irradiance / share * root, 0.0).transpose(
+        2, 0, 1
+    )
+    pixels_per_mm = view.pixels_per_mm(jnp.where(is_covered, depth, 1e6))
+    layers, weights = kernel.diffuse(source, depth, pixels_per_mm, material.gaussians)
     to_eye = view.position[None, None] - frame.position
     surface = _shading.SurfacePoints(
         frame.position,
@@ -179,7 +180,13 @@ def diffuse_on_screen(
     diffuse = jnp.sum(weights[:, None, None] * layers, axis=0)
     beauty = frame.beauty - frame.diffuse + diffuse
     return eqx.tree_at(
-        lambda each: (each.layers, each.weights, each.diffuse, each.beauty, each.handed_over),
+        lambda frame: (
+            frame.layers,
+            frame.weights,
+            frame.diffuse,
+            frame.beauty,
+            frame.handed_over,
+        ),
         frame,
         (layers, weights, diffuse, beauty, jnp.zeros_like(weights[:, 0])),
     )
@@ -211,10 +218,10 @@ def _fetch(
     beside = place - first.astype(place.dtype)
     across = jnp.arange(depth.shape[axis - 1], dtype=jnp.int32)  # the place along the other axis
     stacked = jnp.concatenate([rows, depth[None]]).transpose(1, 2, 0)
-    found, total = jnp.zeros((*depth.shape, len(rows)), rows.dtype), jnp.zeros_like(depth)
+    sums, total = jnp.zeros((*depth.shape, len(rows)), rows.dtype), jnp.zeros_like(depth)
     for pixel, weight in ((first, 1 - beside), (first + 1, beside)):
         at = (pixel, across[None]) if axis == 0 else (across[:, None], pixel)
         tap = stacked.at[at].get(mode="promise_in_bounds")
         trusted = weight * near(tap[..., -1])
-        found, total = found + trusted[..., None] * tap[..., :-1], total + trusted
-    return found.transpose(2, 0, 1), total
+        sums, total = sums + trusted[..., None] * tap[..., :-1], total + trusted
+    return sums.transpose(2, 0, 1), total

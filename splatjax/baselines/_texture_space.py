@@ -92,10 +92,10 @@ class TextureLayers(eqx.Module):
     needed: Float[Array, ""]
 
 
-def lay_out(mesh: TexturedMesh, resolution: int, room: int) -> SurfaceTexels:
+def rasterize_in_texture(mesh: TexturedMesh, resolution: int, capacity: int) -> SurfaceTexels:
     """Rasterize a mesh in its texture. Differentiable in positions, normals and maps."""
     landing = Landing.in_texture(mesh.uvs, resolution)
-    return surface_texels(mesh, landing, see_faces(landing, room))
+    return surface_texels(mesh, landing, see_faces(landing, capacity))
 
 
 def stretch_map(mesh: TexturedMesh, texels: SurfaceTexels) -> Float[Array, "2 height width"]:
@@ -118,16 +118,10 @@ def reaches_of(
     per step first u, then v.
     """
     widths = np.sqrt(np.diff(np.sort(np.asarray(variances, np.float64)), prepend=0.0))
-    there = np.asarray(valid) > 0
-    smallest = [
-        max(float(np.quantile(np.asarray(each)[there], 1 - _WIDEST)), 1e-6) for each in extents
-    ]
-    limit = there.shape[0] // 4
-    return tuple(
-        min(int(np.ceil(_SUPPORT * width / each)) + 1, limit)
-        for width in widths
-        for each in smallest
-    )
+    on_chart = np.asarray(extents)[:, np.asarray(valid) > 0]
+    smallest = np.maximum(np.quantile(on_chart, 1 - _WIDEST, axis=1), 1e-6)
+    reaches = np.ceil(_SUPPORT * widths[:, None] / smallest).astype(int) + 1
+    return tuple(np.minimum(reaches, valid.shape[0] // 4).ravel().tolist())
 
 
 def diffuse_in_texture(
@@ -146,7 +140,7 @@ def diffuse_in_texture(
 
     **Arguments:**
 
-    - `texels`: from `lay_out`. Differentiable.
+    - `texels`: from `rasterize_in_texture`. Differentiable.
     - `light`: from `mesh_light`. Differentiable.
     - `material`: its Gaussians, in any order. Differentiable.
     - `reaches`: from `reaches_of`. Static.
@@ -215,16 +209,11 @@ def _spread(rows, valid, variance, channels: int, reaches: tuple[int, ...]):
     for axis, extent, reach in ((1, channels, reaches[0]), (0, channels + 1, reaches[1])):
         size = jnp.where(valid > 0, rows[extent], 1.0)
         widest = (reach / _SUPPORT) ** 2
-        found = blur_along(
-            axis, rows, valid, _as_it_is, jnp.minimum(variance / (size * size), widest), reach
-        )
-        rows = found.renormalized() * valid[None]
-        kept = kept * found.trusted / found.total
+        variance_in_texels = jnp.minimum(variance / (size * size), widest)
+        sums = blur_along(axis, rows, valid, lambda chart: chart, variance_in_texels, reach)
+        rows = sums.renormalized() * valid[None]
+        kept = kept * sums.trusted / sums.total
     return rows, kept
-
-
-def _as_it_is(guide):
-    return guide
 
 
 def _with_far_side(
@@ -239,9 +228,9 @@ def _with_far_side(
     share = far.share(nearness.reshape(nearness.shape[0], -1), variance, depth)
     picture = own.T.reshape(*valid.shape, -1)
     total, weight = own, jnp.ones_like(own[:1])
-    for uvs, each in zip(far.uvs, share, strict=True):
-        total = total + each[None] * look_up_charts(picture, valid, uvs).T
-        weight = weight + each[None]
+    for uvs, own_share in zip(far.uvs, share, strict=True):
+        total = total + own_share[None] * look_up_charts(picture, valid, uvs).T
+        weight = weight + own_share[None]
     return total / weight, weight
 
 
@@ -251,10 +240,7 @@ def _normalized(
     weights = material.gaussians.weights
     albedo = texels.points.albedo
     albedo = jnp.ones((1, *means.shape[1:]), means.dtype) if albedo is None else albedo.T[None]
-    once = (material.total_reflectance() - material.gaussians.total_reflectance())[
-        :, None
-    ] * albedo[0]
-    gain = settings.normalization.gain(
-        exits, material.gaussians.variances, weights[:, :, None] * albedo, once
-    )
+    single = material.total_reflectance() - material.gaussians.total_reflectance()
+    variances, colored = material.gaussians.variances, weights[:, :, None] * albedo
+    gain = settings.normalization.gain(exits, variances, colored, single[:, None] * albedo[0])
     return gain * means

@@ -1,5 +1,7 @@
 """A triangle mesh with its textures, on the device: what mesh-based baselines draw."""
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -16,7 +18,7 @@ _OUTSIDE = 1e-6  # of the texture, that coordinates may reach beyond it
 
 
 class TexturedMesh(eqx.Module):
-    r"""Triangles whose charts lie in the unit square, and the maps they wear; mm.
+    r"""Triangles whose charts lie in the unit square, and their textures; mm.
 
     **Attributes:** (all floats differentiable)
 
@@ -53,34 +55,18 @@ class TexturedMesh(eqx.Module):
                 "scale or move the charts into it"
             )
 
-        def there(values):
-            return (
-                None if values is None else jnp.asarray(np.asarray(values, np.float64), dtype=float)
-            )
+        def on_device(values):
+            as_float = None if values is None else np.asarray(values, np.float64)
+            return None if as_float is None else jnp.asarray(as_float, float)
 
-        maps = (
-            ()
-            if textures is None
-            else (textures.albedo, textures.specular, textures.roughness, textures.normal)
-        )
-        vertices, normals, uvs = (there(each) for each in (mesh.vertices, mesh.normals, mesh.uvs))
-        return cls(
-            vertices,
-            jnp.asarray(mesh.faces, jnp.int32),
-            normals,
-            uvs,
-            *(there(each) for each in maps),
-        )
+        names = ("albedo", "specular", "roughness", "normal")
+        maps = [on_device(getattr(textures, name, None)) for name in names]
+        vertices, normals, uvs = map(on_device, (mesh.vertices, mesh.normals, mesh.uvs))
+        return cls(vertices, jnp.asarray(mesh.faces, jnp.int32), normals, uvs, *maps)
 
     def corners(self) -> Float[Array, "faces 3 3"]:
         """Give the positions of each triangle's corners, mm."""
         return self.vertices[self.faces]
-
-    def face_areas(self) -> Float[Array, " faces"]:
-        """Give the area of each triangle, mm^2."""
-        corners = self.corners()
-        edges = corners[:, 1:] - corners[:, :1]
-        return 0.5 * jnp.linalg.norm(jnp.cross(edges[:, 0], edges[:, 1]), axis=1)
 
     def bounds(self) -> Bounds:
         """Give the sphere around it that shadow maps are laid around."""
@@ -137,10 +123,10 @@ def surface_texels(mesh: TexturedMesh, landing: Landing, seen: SeenFaces) -> Sur
     points, uvs = surface_points(
         mesh, seen.faces.reshape(-1), barycentrics(landing, seen).reshape(-1, 3)
     )
-    there = seen.covered.reshape(-1, 1)
-    centers, normals = jnp.where(there, points.centers, 0.0), jnp.where(there, points.normals, 0.0)
-    points = eqx.tree_at(lambda each: (each.centers, each.normals), points, (centers, normals))
-    return SurfaceTexels(points, uvs, seen)
+    is_covered = seen.covered.reshape(-1, 1)
+    centers = jnp.where(is_covered, points.centers, 0.0)
+    normals = jnp.where(is_covered, points.normals, 0.0)
+    return SurfaceTexels(replace(points, centers=centers, normals=normals), uvs, seen)
 
 
 def surface_points(
@@ -155,16 +141,16 @@ def surface_points(
     - `shares`: their barycentric coordinates there.
     """
     carried = jnp.concatenate([mesh.corners(), mesh.normals[mesh.faces], mesh.uvs], axis=2)
-    found = jnp.sum(carried[faces] * shares[..., None], axis=1)
-    positions, normals, uvs = found[:, :3], unit_normals(found[:, 3:6]), found[:, 6:]
+    blended = jnp.sum(carried[faces] * shares[..., None], axis=1)
+    positions, normals, uvs = blended[:, :3], unit_normals(blended[:, 3:6]), blended[:, 6:]
     if mesh.normal is not None:
         normals = _perturbed(mesh, faces, normals, look_up(mesh.normal, uvs))
     albedo, specular, roughness = (
-        None if each is None else look_up(each, uvs)
-        for each in (mesh.albedo, mesh.specular, mesh.roughness)
+        None if texture is None else look_up(texture, uvs)
+        for texture in (mesh.albedo, mesh.specular, mesh.roughness)
     )
-    nothing = jnp.zeros(len(faces), positions.dtype)
-    return Splats(positions, normals, nothing, nothing, albedo, specular, roughness), uvs
+    no_extent = jnp.zeros(len(faces), positions.dtype)
+    return Splats(positions, normals, no_extent, no_extent, albedo, specular, roughness), uvs
 
 
 def look_up(
@@ -190,10 +176,8 @@ def look_up_charts(
     """
     height, width = picture.shape[:2]
     weights, rows, columns = _four(uvs, height, width)
-    total, share = (
-        jnp.zeros((len(uvs), picture.shape[2]), picture.dtype),
-        jnp.zeros(len(uvs), picture.dtype),
-    )
+    total = jnp.zeros((len(uvs), picture.shape[2]), picture.dtype)
+    share = total[:, 0]
     for weight, row, column in zip(weights, rows, columns, strict=True):
         at = jnp.clip(row, 0, height - 1), jnp.clip(column, 0, width - 1)
         known = weight * valid[at]

@@ -26,7 +26,7 @@ from splatjax.splatting import (
     bin_items,
 )
 
-from ._kernels import AbstractKernel
+from ._kernels import AbstractSplatKernel
 
 Result = TypeVar("Result", bound=PyTree)
 
@@ -36,12 +36,12 @@ class AbstractListRasterizer(AbstractRasterizer):
     differ in the picture alone.
     """
 
-    kernel: eqx.AbstractVar[AbstractKernel]
+    kernel: eqx.AbstractVar[AbstractSplatKernel]
     capacity: eqx.AbstractVar[BinCapacity | None]
 
     def planned(self, splats: Splats, views: Sequence[AbstractView], settings: SplattingSettings):
         counts = [_demand(self.kernel, splats, view, settings) for view in views]
-        capacity = BinCapacity.for_counts(counts, _grid(views[0]))
+        capacity = BinCapacity.for_counts(counts, TileGrid(views[0].width, views[0].height))
         return eqx.tree_at(
             lambda rasterizer: rasterizer.capacity,
             self,
@@ -65,13 +65,13 @@ class AbstractListRasterizer(AbstractRasterizer):
         view: AbstractView,
         settings: SplattingSettings,
     ) -> SummedFragments:
-        nothing = FragmentSums.nothing(_grid(view).count, attributes.shape[0], attributes.dtype)
+        rows, dtype = attributes.shape[0], attributes.dtype
+        empty_sums = FragmentSums.nothing(TileGrid(view.width, view.height).count, rows, dtype)
         if splats.count == 0:
-            return SummedFragments(nothing, nothing, jnp.zeros((), attributes.dtype))
+            return SummedFragments(empty_sums, empty_sums, jnp.zeros((), dtype))
         lists = self.lists(splats, view, settings)
-        return SummedFragments(
-            self.front(lists, attributes, view), nothing, lists.bins.needed.astype(attributes.dtype)
-        )
+        front = self.front(lists, attributes, view)
+        return SummedFragments(front, empty_sums, lists.bins.needed.astype(dtype))
 
     def lists(self, splats: Splats, view: AbstractView, settings: SplattingSettings) -> "Lists":
         """Sort the splats into the tiles of a picture.
@@ -83,7 +83,10 @@ class AbstractListRasterizer(AbstractRasterizer):
                 f"this {type(self).__name__} has no capacity yet; take one from a plan "
                 "(splatjax.plan) or from `planned`"
             )
-        footprints, grid = self.kernel.footprints(splats, view, settings), _grid(view)
+        footprints, grid = (
+            self.kernel.footprints(splats, view, settings),
+            TileGrid(view.width, view.height),
+        )
         bins = bin_items(footprints.ranges(grid), grid, self.capacity)
         chunk = (
             jnp.searchsorted(
@@ -105,7 +108,7 @@ class Lists(eqx.Module):
     """The number of chunks for a block that holds nothing."""
     grid: TileGrid
 
-    def each(self, look: Callable[..., Result], *more) -> Result:
+    def map_blocks(self, look: Callable[..., Result], *more) -> Result:
         """Look at every block, one after the other: its splats `[lanes, slots]`, what more there is
         of its chunk, and offsets.
 
@@ -113,7 +116,7 @@ class Lists(eqx.Module):
 
         - `look`: of ids `[lanes, slots]`, footprints `[lanes, slots, 1]`, offsets in x and y
           `[lanes, slots, pixels]` and of each of `more` `[lanes, ...]`.
-        - `more`: of every tile, as `over_blocks` gives it.
+        - `more`: of every tile, as `reduce_blocks` returns it.
         """
         grid, dtype = self.grid, self.footprints.x.dtype
         last = self.bins.order.shape[0] // grid.lanes - 1
@@ -122,44 +125,37 @@ class Lists(eqx.Module):
         def one(ids, chunk):
             chunk = jnp.minimum(chunk, last)
             tile = jax.lax.dynamic_slice_in_dim(self.bins.order, chunk * grid.lanes, grid.lanes)
-            x, y = (each.astype(dtype)[:, None] + 0.5 for each in grid.columns_and_rows(tile))
-            found = jax.tree.map(
+            x, y = (pixel.astype(dtype)[:, None] + 0.5 for pixel in grid.columns_and_rows(tile))
+            own = jax.tree.map(
                 lambda plane: plane.at[ids].get(mode="fill", fill_value=0)[:, :, None],
                 self.footprints,
             )
-            return look(ids, found, x - found.x, y - found.y, *(each[chunk] for each in more))
+            return look(ids, own, x - own.x, y - own.y, *(values[chunk] for values in more))
 
         return jax.lax.map(lambda block: one(*block), (self.bins.ids, self.chunk))
 
-    def over_blocks(self, combine: Callable, found: jax.Array) -> jax.Array:
+    def reduce_blocks(self, combine: Callable, results: jax.Array) -> jax.Array:
         """Combine what the blocks of each chunk found, by a segment reduction: `[chunks, lanes,
         ...]`.
         """
         chunks = self.bins.order.shape[0] // self.grid.lanes
-        return combine(found, self.chunk, num_segments=chunks, indices_are_sorted=True)
+        return combine(results, self.chunk, num_segments=chunks, indices_are_sorted=True)
 
     def tiles(
-        self, found: Float[Array, "chunks lanes rows pixels"]
+        self, results: Float[Array, "chunks lanes rows pixels"]
     ) -> Float[Array, "tiles rows pixels"]:
         """Put what the chunks found in the order of the tiles; 0 beyond the picture, NaN where the
         lists had no room.
         """
-        within, tiles = (
-            self.grid.within_picture(),
-            self.bins.by_tile(found.reshape(-1, *found.shape[2:]), self.grid.count),
-        )
-        return (
-            tiles if within is None else jnp.where(within[:, None], tiles, 0.0)
-        ) + self.bins.poison(found.dtype)
-
-
-def _grid(view: AbstractView) -> TileGrid:
-    return TileGrid(view.width, view.height)
+        within = self.grid.within_picture()
+        tiles = self.bins.by_tile(results.reshape(-1, *results.shape[2:]), self.grid.count)
+        tiles = tiles if within is None else jnp.where(within[:, None], tiles, 0.0)
+        return tiles + self.bins.poison(results.dtype)
 
 
 @eqx.filter_jit
 def _demand(
-    kernel: AbstractKernel, splats: Splats, view: AbstractView, settings: SplattingSettings
+    kernel: AbstractSplatKernel, splats: Splats, view: AbstractView, settings: SplattingSettings
 ):
-    grid = _grid(view)
+    grid = TileGrid(view.width, view.height)
     return kernel.footprints(splats, view, settings).ranges(grid).per_tile(grid)

@@ -39,12 +39,12 @@ class FarSide(eqx.Module):
         """Give what the far side weighs against the texel's own surroundings, `[lights, points]`,
         in a layer.
         """
-        there = nearness > 0
-        thickness = -self.scale * jnp.log(jnp.where(there, nearness, 1.0))
+        is_far = nearness > 0
+        thickness = -self.scale * jnp.log(jnp.where(is_far, nearness, 1.0))
         beyond = thickness - depth  # the source lies below its own surface, so nearer to this one
         fade = jnp.exp(-0.5 * (beyond * beyond - depth * depth) / variance)
         apart = jnp.clip(self.apart / (_APART * jnp.sqrt(variance)), 0, 1)
-        return jnp.where(there, fade * apart, 0.0)
+        return jnp.where(is_far, fade * apart, 0.0)
 
 
 class AbstractThinParts(eqx.Module):
@@ -85,14 +85,14 @@ class TranslucentShadowMap(AbstractThinParts):
     """
 
     def far_side(self, texels, light, widest, millimeters):
-        found = [
-            self._of(texels, each, light.settings.bias, widest)
-            for each in light.shadows
-            if each is not None
+        sides = [
+            self._of(texels, shadow, light.settings.bias, widest)
+            for shadow in light.shadows
+            if shadow is not None
         ]
-        if not found:
+        if not sides:
             return None
-        uvs, nearness = (jnp.stack(each) for each in zip(*found, strict=True))
+        uvs, nearness = (jnp.stack(rows) for rows in zip(*sides, strict=True))
         offset = uvs - texels.uvs[None]
         return FarSide(
             uvs, nearness, millimeters * jnp.sqrt(jnp.sum(offset * offset, axis=2)), widest
@@ -115,5 +115,5 @@ class TranslucentShadowMap(AbstractThinParts):
         cosine = jnp.sum(wi * normals, axis=1)
         opposite = jnp.clip(-jnp.sum(entered[2:].T * normals, axis=1), 0, 1)
         thickness = way + opposite * (jnp.clip(-cosine, 0, 1) * way - way)
-        there = lit & (cosine < 0) & (depth > front.depth[tile, pixel] + bias)
-        return entered[:2].T, jnp.where(there, jnp.exp(-thickness / scale), 0.0)
+        is_far = lit & (cosine < 0) & (depth > front.depth[tile, pixel] + bias)
+        return entered[:2].T, jnp.where(is_far, jnp.exp(-thickness / scale), 0.0)

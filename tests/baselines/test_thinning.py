@@ -3,6 +3,7 @@ on.
 """
 
 import dataclasses
+import itertools
 import os
 from pathlib import Path
 
@@ -22,131 +23,92 @@ PLAIN = DiffusionSettings(normalization=PlainMean())
 AMPLIFIED, KEEP = (2.0, 3.0, 5.0), (2, 4, 8, 16)
 
 
-def layer(splats, source, points, variance, kept=slice(None)):
-    """Sum as the renderer does: sources lie below their splats."""
-    below = splats["centers"][kept] - 0.75 * np.float32(np.sqrt(variance)) * splats["normals"][kept]
-    offset = points[:, None] - below[None]
-    squared = np.einsum("pji,pji->pj", offset, offset)
-    weight = splats["areas"][None, kept] * np.exp(
-        -0.5 * (squared - squared.min(axis=1, keepdims=True)) / variance
-    )
-    return weight @ source[kept] / weight.sum(axis=1, keepdims=True)
+def factors(body: sj.Splats, sources, law, keep=KEEP, at_random=False):
+    """Return measured errors over those of a law, for lights, widths and ratios."""
+    rng, ratios = np.random.default_rng(2), []
+    columns = (body.centers, body.normals, body.areas)
+    centers, normals, areas = (np.asarray(column, np.float32) for column in columns)
+    spacing = float(np.sqrt(areas.mean()))
+    points = centers[rng.choice(body.count, POINTS, replace=False)]
+
+    def layer(source, variance, kept):
+        """Sum as the renderer does: sources lie below their splats."""
+        below = centers[kept] - 0.75 * np.float32(np.sqrt(variance)) * normals[kept]
+        squared = np.sum((points[:, None] - below[None]) ** 2, axis=2)
+        least = squared.min(axis=1, keepdims=True)
+        weight = areas[None, kept] * np.exp(-0.5 * (squared - least) / variance)
+        return weight @ source[kept] / weight.sum(axis=1, keepdims=True)
+
+    for source, width, number in itertools.product(sources, AMPLIFIED, keep):
+        variance, x = (width * spacing) ** 2, np.sqrt(number) / width
+        if x > 2:
+            continue
+        exact, squares = layer(source, variance, slice(None)), []
+        for start in range(3):
+            kept = np.arange(start * number // 3, body.count, number)
+            if at_random:
+                kept = np.sort(rng.choice(body.count, len(kept), replace=False))
+            squares.append(np.mean((layer(source, variance, kept) - exact) ** 2))
+        error = np.sqrt(np.mean(squares) / np.mean(exact**2))
+        light, square = (jnp.asarray(value, body.centers.dtype) for value in (source, variance))
+        ratios.append(error / law(x, 1 / number, layer_contrast(body, light, square)))
+    return np.asarray(ratios)
 
 
-def without_shadow(body: sj.Splats):
-    towards = [-np.asarray(direction) / np.linalg.norm(direction) for direction in LIGHTS]
-    return [
-        np.maximum(np.asarray(body.normals) @ each, 0)[:, None].astype(np.float32)
-        for each in towards
-    ]
+def evenly(x, ratio, contrast):
+    """Return the law of splats left out evenly: `x` is the spacing of those kept over the width."""
+    width = jnp.asarray(1 / (x * np.sqrt(ratio)))
+    return float(thinning_error(width, jnp.asarray(1.0), jnp.asarray(ratio), contrast))
 
 
-def in_shadow(body: sj.Splats):
-    """Give the light that enters under each of the lights, shadows and the color of the skin
-    included.
-    """
-    lamps = [
-        sj.DirectionalLight(jnp.asarray(direction), jnp.full(3, np.pi)) for direction in LIGHTS
-    ]
-    scenes = [sj.Scene(body, (lamp,), sj.load_material("skin").white()) for lamp in lamps]
-    away = jnp.asarray([0.0, 0.0, 900.0])
-    camera = sj.Camera.look_at(away, jnp.zeros(3), width=16, height=16)
-    plan = sj.plan(scenes, camera, sj.RenderSettings(diffuser=DenseDiffuser()))
-    return [np.asarray(light_on_splats(scene, plan).source.T) for scene in scenes]
-
-
-def factors(body: sj.Splats, sources, keep=KEEP, at_random=False):
-    """Give what is measured over what a law says, for lights, widths and ratios; at random the law
-    has nothing to fit.
-    """
-    rng = np.random.default_rng(2)
-    splats = {
-        name: np.asarray(getattr(body, name), np.float32)
-        for name in ("centers", "normals", "areas")
-    }
-    spacing = float(np.sqrt(splats["areas"].mean()))
-    points = splats["centers"][rng.choice(body.count, POINTS, replace=False)]
-    found = []
-    for source in sources:
-        for each in AMPLIFIED:
-            variance = (each * spacing) ** 2
-            exact = layer(splats, source, points, variance)
-            contrast = layer_contrast(
-                body,
-                jnp.asarray(source, body.centers.dtype),
-                jnp.asarray(variance, body.centers.dtype),
-            )
-            for number in keep:
-                x = np.sqrt(number) / each
-                if x > 2:
-                    continue
-                squares = []
-                for start in range(3):
-                    kept = np.arange(start * number // 3, body.count, number)
-                    kept = (
-                        np.sort(rng.choice(body.count, len(kept), replace=False))
-                        if at_random
-                        else kept
-                    )
-                    squares.append(
-                        np.mean((layer(splats, source, points, variance, kept) - exact) ** 2)
-                    )
-                error = np.sqrt(np.mean(squares) / np.mean(exact**2))
-                law = float(
-                    thinning_error(
-                        *(
-                            jnp.asarray(v)
-                            for v in (each * spacing, spacing, 1 / number, float(contrast))
-                        )
-                    )
-                )
-                if at_random:
-                    law = float(contrast) * x * np.sqrt(1 - 1 / number) / (2 * np.sqrt(np.pi))
-                found.append(error / law)
-    return np.asarray(found)
+def randomly(x, ratio, contrast):
+    """Return the standard error of a mean over the splats kept, with nothing fitted."""
+    return float(contrast) * x * np.sqrt(1 - ratio) / (2 * np.sqrt(np.pi))
 
 
 @pytest.mark.slow
 @pytest.mark.once
 def test_left_out_at_random_splats_err_as_independent_ones_do():
-    """With nothing fitted: the standard error of a mean over the splats that stay."""
     body = sj.bust(4000)
-    found = factors(body, without_shadow(body), keep=(2, 8), at_random=True)
-    assert np.max(np.abs(np.log(found))) < np.log(FACTOR), found
+    directions = -np.asarray(LIGHTS) / np.linalg.norm(LIGHTS, axis=1, keepdims=True)
+    cosines = np.maximum(np.asarray(body.normals) @ directions.T, 0).astype(np.float32)
+    sources = [cosines[:, :1], cosines[:, 1:]]
+    ratios = factors(body, sources, randomly, keep=(2, 8), at_random=True)
+    assert np.max(np.abs(np.log(ratios))) < np.log(FACTOR), ratios
 
 
 @pytest.mark.long
 @pytest.mark.once
 @pytest.mark.shared
 def test_the_law_holds_on_a_head_it_was_not_fitted_on():
+    """Light that enters under each of the lights, with shadows and the color of the skin."""
     folder = Path(os.environ["SPLATJAX_SHARED"]) / "data" / "lee_perry_smith"
-    maps = {"albedo": folder / "Map-COL.jpg"}
-    head = sj.sample_mesh(
-        folder / "LeePerrySmith.glb", 30_000, mm_per_unit=53.0, v_up=True, crop_min_y=-0.9, **maps
-    )
-    found = factors(head, in_shadow(head))
-    assert np.max(np.abs(np.log(found))) < np.log(FACTOR), found
+    options = {"mm_per_unit": 53.0, "v_up": True, "crop_min_y": -0.9}
+    mesh, albedo = folder / "LeePerrySmith.glb", folder / "Map-COL.jpg"
+    head, skin = sj.sample_mesh(mesh, 30_000, albedo=albedo, **options), sj.load_material("skin")
+    lamps = [
+        sj.DirectionalLight(jnp.asarray(direction), jnp.full(3, np.pi)) for direction in LIGHTS
+    ]
+    scenes = [sj.Scene(head, (lamp,), skin.white()) for lamp in lamps]
+    camera = sj.Camera.look_at(jnp.asarray([0.0, 0.0, 900.0]), jnp.zeros(3), width=16, height=16)
+    plan = sj.plan(scenes, camera, sj.RenderSettings(diffuser=DenseDiffuser()))
+    sources = [np.asarray(light_on_splats(scene, plan).source.T) for scene in scenes]
+    ratios = factors(head, sources, evenly)
+    assert np.max(np.abs(np.log(ratios))) < np.log(FACTOR), ratios
 
 
 @pytest.mark.once
-def test_what_suffices_is_the_inverse_of_the_error():
-    width, spacing, contrast = (jnp.asarray(value) for value in (8.0, 1.0, 0.6))
+def test_a_radius_twice_as_large_allows_a_quarter_and_what_suffices_is_the_inverse():
+    one, contrast = jnp.asarray(1.0), jnp.asarray(0.6)
     for error in (0.006, 0.02, 0.05):
-        ratio = splats_that_suffice(width, spacing, jnp.asarray(error), contrast)
-        np.testing.assert_allclose(
-            thinning_error(width, spacing, ratio, contrast), error * np.sqrt(1 - ratio), rtol=1e-5
-        )
-    assert float(splats_that_suffice(width, spacing, jnp.asarray(1e-6), contrast)) == 1
-
-
-@pytest.mark.once
-def test_a_radius_twice_as_large_allows_a_quarter_of_the_splats():
-    one = jnp.asarray(1.0)
-    wide, narrow = (
-        thinning_error(jnp.asarray(a), one, jnp.asarray(q), one)
-        for a, q in ((8.0, 0.01), (4.0, 0.04))
-    )
-    np.testing.assert_allclose(wide / np.sqrt(1 - 0.01), narrow / np.sqrt(1 - 0.04), rtol=1e-5)
+        ratios = [
+            splats_that_suffice(jnp.asarray(width), one, jnp.asarray(error), contrast)
+            for width in (16.0, 8.0)
+        ]
+        np.testing.assert_allclose(ratios[1] / ratios[0], 4, rtol=1e-5)
+        law = thinning_error(jnp.asarray(8.0), one, ratios[1], contrast)
+        np.testing.assert_allclose(law, error * np.sqrt(1 - ratios[1]), rtol=1e-5)
+    assert float(splats_that_suffice(jnp.asarray(8.0), one, jnp.asarray(1e-6), contrast)) == 1
 
 
 @pytest.mark.once
