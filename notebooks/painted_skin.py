@@ -136,11 +136,12 @@ maps = [
     np.asarray(sj.render(sj.Scene(body, (lamps[0],), truth), camera, settings).albedo)
     for body in (scenes[0].splats, fitted.splats)
 ]
-found_pictures = [np.nan_to_num(np.asarray(picture)) for picture in fitted.pictures]
+shown = zip((photographs, fitted.pictures), maps, strict=True)
 plot_pictures(
-    [[*photographs, maps[0]], [*found_pictures, maps[1]]],
+    [[*(3 * np.nan_to_num(np.asarray(x)) for x in images), paint] for images, paint in shown],
     ["light 1", "light 2", "light 3", "paint"],
     ["photographed", "found"],
+    white=1.0,
 )
 
 # %% [markdown]
