@@ -41,8 +41,8 @@ settings = sj.RenderSettings(
 )
 
 
+# The bust, eight times smaller, without its map: color comes from the coefficients alone.
 def figurine(count: int) -> sj.Splats:
-    """The bust, eight times smaller, without its map: color comes from the coefficients alone."""
     bust = sj.bust(count)
     return sj.Splats(bust.centers / 8, bust.normals, bust.radii / 8, bust.areas / 64)
 

@@ -18,7 +18,7 @@ class RenderSettings(eqx.Module):
     - `rasterizer`: `TileRasterizer()`, or `DenseRasterizer()`, the plain reference.
     - `diffuser`: `ClusterDiffuser()`, or `DenseDiffuser()`, the plain reference.
     - `lighting`: what splats carry into the picture: `LightAtSplats()` has the irradiance in them;
-      `splatjax.rivals` has others.
+      `splatjax.baselines` has others.
     """
 
     splatting: _splatting.SplattingSettings = _splatting.SplattingSettings()
