@@ -70,7 +70,7 @@ def one_material(repeats: int) -> None:
     marble = sj.load_medium("marble")
     profile = sj.Dipole(jax.tree.map(lambda leaf: leaf[1:2], marble))
     best = sj.fit_gaussians(profile, COUNT)
-    problem = make_problem(profile, sj.FreeWeights(), sj.NORM_RULE)
+    problem = make_problem(profile, sj.FreeWeights(), sj.L2_QUADRATURE)
     start = jnp.log(best.gaussians.variances) + PUSHED
     given = sj.GivenVariances(jnp.exp(start))
     ours, seconds, first = timed(lambda: sj.fit_gaussians(profile, COUNT, start=given), repeats)
@@ -113,7 +113,7 @@ def many_media(count: int, repeats: int) -> None:
     theirs = []
     for i in few:
         medium = jax.tree.map(lambda leaf, i=i: leaf[i], media)
-        problem = make_problem(sj.Dipole(medium), sj.FreeWeights(), sj.NORM_RULE)
+        problem = make_problem(sj.Dipole(medium), sj.FreeWeights(), sj.L2_QUADRATURE)
         start = np.asarray(jnp.log(starts(medium, COUNT).variances[0] / problem.unit**2))
         theirs.append(timed(lambda problem=problem, start=start: scipy_fit(problem, start), 1)[:2])
     ratio = max(

@@ -114,7 +114,7 @@ for name in media:
 # %%
 with jax.enable_x64(True):
     beam = sj.PhotonBeam(sj.Medium(*(jnp.asarray([x]) for x in media["marble, green"])))
-    fitted = sj.fit_gaussians(beam, 4, rule=sj.NORM_RULE.beyond(1.0))
+    fitted = sj.fit_gaussians(beam, 4, rule=sj.L2_QUADRATURE.beyond(1.0))
     error = float(fitted.error[0])
 print("E beyond one mean free path", round(error, 4))
 
@@ -126,7 +126,7 @@ print("E beyond one mean free path", round(error, 4))
 found = truth["marble, green"]
 with jax.enable_x64(True):
     profile = jax.tree.map(lambda each: each.astype(jnp.float64), found.profile())
-    rule = sj.InverseVariance(sj.NORM_RULE.beyond(0.2))
+    rule = sj.InverseVariance(sj.L2_QUADRATURE.beyond(0.2))
     true_fit = sj.fit_gaussians(
         profile, 5, weights=sj.TotalReflectanceHeld(), rule=rule, throw=False
     )

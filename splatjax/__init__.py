@@ -39,7 +39,7 @@ from .scattering import (
 )
 from .scattering import (
     InverseVariance as InverseVariance,
-    NORM_RULE as NORM_RULE,
+    L2_QUADRATURE as L2_QUADRATURE,
     RadialRule as RadialRule,
     SingleScattering as SingleScattering,
     Tabulated as Tabulated,

@@ -184,7 +184,7 @@ def material(profile: sj.Tabulated, single: sj.SingleScattering | None = None) -
             reference,
             6,
             weights=sj.NonNegativeWeights(sj.TotalReflectanceHeld()),
-            rule=sj.NORM_RULE.beyond(0.2 / SIGMA_T),
+            rule=sj.L2_QUADRATURE.beyond(0.2 / SIGMA_T),
         )
         gaussians = jax.tree.map(np.asarray, fit.gaussians)
     return sj.Material(

@@ -147,7 +147,7 @@ class Fit:
             raise ValueError(f"--error is {self.error:g}; it must be positive, such as 0.01")
         coefficients = self._coefficients()
         if isinstance(coefficients, sj.Tabulated):
-            made = Reference(coefficients, sj.NORM_RULE)
+            made = Reference(coefficients, sj.L2_QUADRATURE)
         else:
             made = reference(
                 coefficients, self.model, self.cut, self.photons, self.single_scattering

@@ -60,22 +60,22 @@ def reference(
     if apart:
         return _apart(coefficients, model, cut, photons)
     if model is Model.DIPOLE:
-        return Reference(coefficients, sj.NORM_RULE)
+        return Reference(coefficients, sj.L2_QUADRATURE)
     if model is Model.MONTE_CARLO:
         layers = (
             coefficients.layers
             if layered
             else (sj.Layer(coefficients.medium, jnp.asarray(jnp.inf)),)
         )
-        return Reference(_walked(layers, photons), sj.NORM_RULE.beyond(cut))
+        return Reference(_walked(layers, photons), sj.L2_QUADRATURE.beyond(cut))
     if layered:
         raise ValueError(
             f"--model {model.value} knows a half space, and this material has layers; take dipole "
             "or monte-carlo"
         )
     if model is Model.BETTER_DIPOLE:
-        return Reference(sj.BetterDipole(coefficients.medium), sj.NORM_RULE)
-    return Reference(sj.PhotonBeam(coefficients.medium), sj.NORM_RULE.beyond(cut))
+        return Reference(sj.BetterDipole(coefficients.medium), sj.L2_QUADRATURE)
+    return Reference(sj.PhotonBeam(coefficients.medium), sj.L2_QUADRATURE.beyond(cut))
 
 
 def _apart(
@@ -89,7 +89,7 @@ def _apart(
     match model:
         case Model.PHOTON_BEAM:
             return Reference(
-                sj.PhotonBeam(coefficients.medium).multiply_scattered(), sj.NORM_RULE, single
+                sj.PhotonBeam(coefficients.medium).multiply_scattered(), sj.L2_QUADRATURE, single
             )
         case Model.MONTE_CARLO:
             found = reference(coefficients, model, cut, photons, apart=False)

@@ -8,7 +8,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from splatjax.gaussians import AbstractProfile
-from splatjax.scattering import NORM_RULE, AbstractRadialRule
+from splatjax.scattering import L2_QUADRATURE, AbstractRadialRule
 
 from ._search import GivenVariances, InsertedGaussians, constant, ladder
 from ._spread import AbstractSpread, SharedVariances
@@ -58,7 +58,7 @@ def error_by_count(
     *,
     spread: AbstractSpread | None = None,
     weights: AbstractWeights | None = None,
-    rule: AbstractRadialRule = NORM_RULE,
+    rule: AbstractRadialRule = L2_QUADRATURE,
 ) -> ErrorByCount:
     r"""Find the best sums of 1, 2, ... Gaussians in one search, and what error each leaves.
 

@@ -8,7 +8,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
 from splatjax.gaussians import AbstractProfile, SumOfGaussians
-from splatjax.scattering import NORM_RULE, AbstractRadialRule
+from splatjax.scattering import L2_QUADRATURE, AbstractRadialRule
 
 from ._counts import LeastCount, check_count, error_by_count
 from ._problem import Outcome, Problem
@@ -49,7 +49,7 @@ def fit_gaussians(
     spread: AbstractSpread | None = None,
     weights: AbstractWeights | None = None,
     start: AbstractStart | None = None,
-    rule: AbstractRadialRule = NORM_RULE,
+    rule: AbstractRadialRule = L2_QUADRATURE,
     throw: bool = True,
 ) -> FitResult:
     r"""Fit a sum of Gaussians to a profile: the least Eq. 3 over variances and weights.
@@ -82,7 +82,7 @@ def fit_gaussians(
 
     **Raises:** `ValueError` for a count below 1, for an error that no count reaches, for a `start`
     without a count, and for a profile that is infinite at the origin unless the rule starts beyond
-    it (`NORM_RULE.beyond`); an error with the message of `result` if `throw`.
+    it (`L2_QUADRATURE.beyond`); an error with the message of `result` if `throw`.
 
     **Source:** Kim et al. 2010, Eq. 3; variable projection: Golub and Pereyra 1973.
     """

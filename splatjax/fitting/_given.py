@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from splatjax.gaussians import AbstractProfile, SumOfGaussians
-from splatjax.scattering import NORM_RULE, AbstractRadialRule
+from splatjax.scattering import L2_QUADRATURE, AbstractRadialRule
 
 from ._problem import make_problem
 from ._weights import AbstractWeights, FreeWeights
@@ -16,7 +16,7 @@ def fit_weights(
     variances: Float[Array, " gaussians"],
     *,
     weights: AbstractWeights | None = None,
-    rule: AbstractRadialRule = NORM_RULE,
+    rule: AbstractRadialRule = L2_QUADRATURE,
 ) -> SumOfGaussians:
     r"""Fit the weights of Gaussians of given variances to a profile: the least Eq. 3 over the
     weights alone.

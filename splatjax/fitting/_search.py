@@ -8,6 +8,8 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
+from splatjax._records import numbers, record
+
 from ._dense import NormalEquations
 from ._problem import Problem
 
@@ -50,6 +52,7 @@ class InsertedGaussians(AbstractStart):
         return ladder(problem, count)[-1]
 
 
+@record
 class GivenVariances(AbstractStart):
     r"""From variances that are known to lie near, of a fit of nearly the same profile.
 
@@ -61,7 +64,7 @@ class GivenVariances(AbstractStart):
       own, a row for each channel.
     """
 
-    variances: Float[Array, "*channels gaussians"]
+    variances: Float[Array, "*channels gaussians"] = eqx.field(converter=numbers)
 
     def of_channels(self, channels: int) -> "GivenVariances":
         count = self.variances.shape[-1]

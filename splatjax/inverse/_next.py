@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from splatjax._format import percent
+from splatjax._records import record, several
 from splatjax.fitting import AbstractWeights
 from splatjax.gaussians import AbstractProfile
 from splatjax.render import RenderSettings
@@ -24,6 +25,7 @@ from ._problem import Fitted, solution, usual_weights
 from ._recovery import Recovery
 
 
+@record
 class Candidate(eqx.Module):
     """A picture that could be taken: what it is called, from where, and under which lights. Its
     strength may be unknown.
@@ -31,7 +33,7 @@ class Candidate(eqx.Module):
 
     name: str = eqx.field(static=True)
     camera: Camera
-    lights: tuple[AbstractLight, ...]
+    lights: tuple[AbstractLight, ...] = eqx.field(converter=several)
     intensity: AbstractIntensity = KnownIntensity()
 
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ._fresnel import AbstractFresnel
-from ._layers import Film, Layer
+from ._medium import Film, Layer
 from ._quadrature import unit_interval
 
 
@@ -85,8 +85,7 @@ def slab_response(
     """
     medium = layer.medium
     depth = 1 / medium.sigma_t_prime
-    thickness = jnp.broadcast_to(layer.thickness.astype(depth.dtype), depth.shape)
-    thickness = jnp.where(thickness >= (1 - 1e-6) * depth, thickness, jnp.nan)
+    thickness = jnp.where(layer.thickness >= (1 - 1e-6) * depth, layer.thickness, jnp.nan)
     above = 2 / 3 * fresnel_above.boundary(medium.eta / eta_above) * depth
     below = 2 / 3 * fresnel_below.boundary(medium.eta / eta_below) * depth
     beneath, height = thickness - depth, thickness + above + below

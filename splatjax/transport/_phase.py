@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from splatjax.scattering import check_range
+from splatjax._records import check_values, numbers, record
 
 from ._lookup import of_layer
 
@@ -50,6 +50,7 @@ class Isotropic(AbstractPhaseFunction):
         return sine * x, sine * y, cosine
 
 
+@record
 class HenyeyGreenstein(AbstractPhaseFunction):
     r"""Henyey and Greenstein's phase function.
 
@@ -64,10 +65,12 @@ class HenyeyGreenstein(AbstractPhaseFunction):
     nothing is singular at `g = 0`.
     """
 
-    g: Float[Array, "*layers"] = eqx.field(converter=jnp.asarray)
+    g: Float[Array, "*layers"] = eqx.field(converter=numbers)
 
     def __check_init__(self):
-        check_range("g", self.g, "between -1 and 1, neither included", lambda x: abs(x) < 1)
+        check_values(
+            "HenyeyGreenstein.g", self.g, "between -1 and 1, neither included", lambda x: abs(x) < 1
+        )
 
     def anisotropy(self, layers, dtype):
         if self.g.ndim and self.g.shape[0] != layers:

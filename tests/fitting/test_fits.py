@@ -26,7 +26,14 @@ from splatjax.fitting._search import search
 from splatjax.fitting._stationary import refine
 from splatjax.gaussians import SumOfGaussians
 from splatjax.io import dipole_starts, load_medium, load_profile
-from splatjax.scattering import NORM_RULE, Dipole, EganFresnel, LayeredMultipole, Medium, PhotonBeam
+from splatjax.scattering import (
+    L2_QUADRATURE,
+    Dipole,
+    EganFresnel,
+    LayeredMultipole,
+    Medium,
+    PhotonBeam,
+)
 
 BAR = 1.01
 """Errors may exceed the best known ones by a hundredth, variances shared by a fiftieth (their
@@ -216,17 +223,17 @@ def test_a_profile_without_a_norm_is_refused(dtype):
         lambda profile: relative_error(profile, SumOfGaussians(jnp.ones(1), jnp.ones((1, 1)))),
     ):
         with pytest.raises(
-            ValueError, match=r"PhotonBeam goes to infinity like 1/r.*NORM_RULE.beyond"
+            ValueError, match=r"PhotonBeam goes to infinity like 1/r.*L2_QUADRATURE.beyond"
         ):
             function(PhotonBeam(medium))
     with pytest.raises(ValueError, match=r"cut must be between 0 and .* length scales; got 0"):
-        NORM_RULE.beyond(0.0)
+        L2_QUADRATURE.beyond(0.0)
 
 
 def test_beyond_a_cut_a_photon_beam_is_fitted(float64):
     beam = PhotonBeam(Medium(*(jnp.asarray([x]) for x in (0.0041, 2.62, 1.5))))
     near = GivenVariances(jnp.asarray([0.1, 0.5, 2.5, 12.0]))
-    fitted = fit_gaussians(beam, 4, start=near, rule=NORM_RULE.beyond(1.0))
+    fitted = fit_gaussians(beam, 4, start=near, rule=L2_QUADRATURE.beyond(1.0))
     assert fitted.error[0] < 0.02
     r = jnp.linspace(0.5, 4, 20)
     np.testing.assert_allclose(fitted.gaussians(r), beam(r), atol=0.02 * float(beam(r)[0, 0]))
@@ -254,7 +261,7 @@ def test_float32_holds_the_energy():
 def test_the_search_says_when_it_gave_up(float64, monkeypatch):
     """Far from the optimum nothing is called a success."""
     profile = media("skin2")
-    problem = make_problem(profile, FreeWeights(), NORM_RULE)
+    problem = make_problem(profile, FreeWeights(), L2_QUADRATURE)
     found, converged = refine(problem, search(problem, 2, InsertedGaussians()))
     assert bool(converged)
     monkeypatch.setattr(_stationary, "_STEPS", 0)

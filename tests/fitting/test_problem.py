@@ -20,7 +20,7 @@ from splatjax.fitting import (
 from splatjax.fitting._problem import make_problem
 from splatjax.gaussians import SumOfGaussians
 from splatjax.io import load_medium
-from splatjax.scattering import NORM_RULE, Dipole, Medium
+from splatjax.scattering import L2_QUADRATURE, Dipole, Medium
 
 EXACT = 1e-12
 POINT = jnp.asarray([-3.2, -1.9, 0.1, 2.2])
@@ -36,7 +36,7 @@ def marble() -> Dipole:
 )
 @pytest.mark.parametrize("active", [None, (True, True, True, False)])
 def test_the_expansion_is_that_of_automatic_differentiation(float64, weights, active):
-    problem = make_problem(marble(), weights, NORM_RULE)
+    problem = make_problem(marble(), weights, L2_QUADRATURE)
     active = None if active is None else jnp.asarray(active)
     point = POINT.astype(float)
 
@@ -71,7 +71,7 @@ def test_covariance_is_that_of_a_fit_of_all_parameters(float64):
     """
     profile = marble()
     fitted = fit_gaussians(profile, 3)
-    problem = make_problem(profile, FreeWeights(), NORM_RULE)
+    problem = make_problem(profile, FreeWeights(), L2_QUADRATURE)
     r = jnp.sqrt(problem.squared_radii)
 
     def residuals(parameters):
@@ -98,7 +98,7 @@ def test_held_weights_do_not_vary_together(float64):
 
 def test_the_variance_of_a_gaussian_without_weight_is_anything(float64):
     one = SumOfGaussians(jnp.asarray([1.0]), jnp.asarray([[0.5]]))
-    problem = make_problem(one, NonNegativeWeights(), NORM_RULE)
+    problem = make_problem(one, NonNegativeWeights(), L2_QUADRATURE)
     # Next to the truth: what the second Gaussian would add is negative.
     covariance = problem.outcome(jnp.log(jnp.asarray([0.9, 0.4]))).covariance
     assert np.isinf(covariance[1, 1])
@@ -144,7 +144,7 @@ def test_media_in_no_table_are_fitted_as_well_as_from_many_starts(float64):
     profile = Dipole(
         Medium(*(jnp.asarray(each) for each in (absorbed, 1 - absorbed, noise.uniform(1, 1.8, 6))))
     )
-    problems = VariancesPerChannel().problem(profile, FreeWeights(), NORM_RULE)
+    problems = VariancesPerChannel().problem(profile, FreeWeights(), L2_QUADRATURE)
     expand = eqx.filter_jit(lambda problem, point: problem.expand(point))
     best = []
     for channel in range(6):

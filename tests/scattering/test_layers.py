@@ -24,12 +24,8 @@ INFINITE = float("inf")
 MARBLE_GREEN = (0.0041, 2.62, 1.5)
 
 
-def layer(sigma_a, sigma_s_prime, eta, thickness, dtype=None) -> Layer:
-    one = (
-        jnp.asarray([each], dtype or jnp.result_type(float))
-        for each in (sigma_a, sigma_s_prime, eta)
-    )
-    return Layer(Medium(*one), jnp.asarray(thickness))
+def layer(sigma_a, sigma_s_prime, eta, thickness) -> Layer:
+    return Layer(Medium(sigma_a, sigma_s_prime, eta), thickness)
 
 
 def image_sum(slab: Layer, eta_above: float, eta_below: float, r: np.ndarray, images: int):
@@ -37,10 +33,8 @@ def image_sum(slab: Layer, eta_above: float, eta_below: float, r: np.ndarray, im
     channel.
     """
     medium, d = slab.medium, float(slab.thickness)
-    length, sigma_tr = (
-        float(1 / medium.sigma_t_prime[0]),
-        float(jnp.sqrt(medium.squared_sigma_tr[0])),
-    )
+    length = float(1 / medium.sigma_t_prime[0])
+    sigma_tr = float(jnp.sqrt(medium.squared_sigma_tr[0]))
     above, below = (
         2 / 3 * length * float(ExactFresnel().boundary(medium.eta / eta)[0])
         for eta in (eta_above, eta_below)
@@ -65,17 +59,17 @@ def test_closed_form_is_the_image_sum(float64, thickness):
     slab = layer(0.032, 0.74, 1.3, thickness)
     r = np.array([0.0, 0.03, 0.3, 1.0, 4.0, 10.0])
     reflected, transmitted = image_sum(slab, 1.1, 1.0, r, 200)
-    profile = Multipole(slab, 1.1, 1.0)
+    profile = Multipole(slab, eta_above=1.1, eta_below=1.0)
     np.testing.assert_allclose(profile(jnp.asarray(r))[:, 0], reflected, rtol=1e-10)
     np.testing.assert_allclose(profile.transmittance(jnp.asarray(r))[:, 0], transmitted, rtol=1e-10)
 
 
 def test_a_slab_without_absorption_keeps_all_light(float64):
-    profile = Multipole(layer(0.0, 2.0, 1.4, 3.0), 1.1, 1.5)
+    profile = Multipole(layer(0.0, 2.0, 1.4, 3.0), eta_above=1.1, eta_below=1.5)
     np.testing.assert_allclose(
         profile.total_reflectance() + profile.total_transmittance(), 1, rtol=1e-14
     )
-    lossy = Multipole(layer(1e-9, 2.0, 1.4, 3.0), 1.1, 1.5)
+    lossy = Multipole(layer(1e-9, 2.0, 1.4, 3.0), eta_above=1.1, eta_below=1.5)
     np.testing.assert_allclose(lossy.total_reflectance(), profile.total_reflectance(), rtol=1e-7)
 
 
@@ -137,14 +131,16 @@ def test_adding_sums_the_series(float64):
 def test_a_stack_of_one_is_its_layer(float64):
     slab = layer(*MARBLE_GREEN, 2.0)
     r = jnp.asarray([0.0, 1.0])
-    stack = LayeredMultipole([slab], 1.2, 1.1)
-    np.testing.assert_allclose(stack(r), Multipole(slab, 1.2, 1.1)(r), rtol=1e-14)
+    stack = LayeredMultipole([slab], eta_above=1.2, eta_below=1.1)
+    np.testing.assert_allclose(
+        stack(r), Multipole(slab, eta_above=1.2, eta_below=1.1)(r), rtol=1e-14
+    )
     np.testing.assert_allclose(stack.length_scale(), 1 / slab.medium.sigma_t_prime, rtol=1e-14)
 
 
 def test_a_film_of_no_depth_changes_nothing(float64):
     stack = [layer(0.1, 3.0, 1.4, 0.8), layer(0.02, 2.0, 1.3, INFINITE)]
-    film = Film(jnp.zeros(1))
+    film = Film(0.0)
     r = jnp.asarray([0.0, 0.5, 3.0])
     for places in ([film, *stack], [stack[0], film, stack[1]]):
         np.testing.assert_allclose(
@@ -154,7 +150,7 @@ def test_a_film_of_no_depth_changes_nothing(float64):
 
 def test_films_on_each_other_are_one(float64):
     slab = layer(0.1, 3.0, 1.4, INFINITE)
-    thin, thick = Film(jnp.asarray([0.125])), Film(jnp.asarray([0.25]))
+    thin, thick = Film(0.125), Film(0.25)
     two, one = LayeredMultipole([thin, thin, slab]), LayeredMultipole([thick, slab])
     np.testing.assert_allclose(two.total_reflectance(), one.total_reflectance(), rtol=1e-14)
     bare = LayeredMultipole([slab]).total_reflectance()
@@ -177,8 +173,10 @@ def test_the_seam_between_matched_halves(float64, free_paths, growth):
     """Each half keeps its own extrapolated boundary: transmittance grows by a known amount."""
     sigma_a, sigma_s_prime, eta = MARBLE_GREEN
     thickness = free_paths / (sigma_a + sigma_s_prime)
-    whole = LayeredMultipole([layer(*MARBLE_GREEN, thickness)], eta, eta)
-    halves = LayeredMultipole([layer(*MARBLE_GREEN, thickness / 2)] * 2, eta, eta)
+    whole = LayeredMultipole([layer(*MARBLE_GREEN, thickness)], eta_above=eta, eta_below=eta)
+    halves = LayeredMultipole(
+        [layer(*MARBLE_GREEN, thickness / 2)] * 2, eta_above=eta, eta_below=eta
+    )
     found = halves.total_transmittance()[0] / whole.total_transmittance()[0] - 1
     assert abs(found - growth) < 5.1e-4
     if free_paths == 4:
@@ -204,39 +202,23 @@ def test_three_layers_of_skin(float64):
         ((0.085, 1.0, 25.0), (4.5, 4.7, 4.8), INFINITE),
     )
     stack = [
-        Layer(Medium(jnp.asarray(a) / 10, jnp.asarray(s) / 10, jnp.full(3, 1.4)), jnp.asarray(d))
-        for a, s, d in per_cm
+        Layer(Medium(np.asarray(a) / 10, np.asarray(s) / 10, eta=1.4), d) for a, s, d in per_cm
     ]
     profile = LayeredMultipole(stack, fresnel=EganFresnel())
     np.testing.assert_allclose(profile.total_reflectance(), [0.5377, 0.5348, 0.4093], atol=6e-5)
 
 
 def test_too_thin_is_refused(dtype):
-    with pytest.raises(
-        ValueError, match=r"at least 1 in every channel: diffusion does not hold.*got \[0\.78"
-    ):
-        Multipole(layer(0.0041, 2.62, 1.5, 0.3))
-    with pytest.raises(
-        ValueError, match=r"at least 1 in every channel: diffusion does not hold.*got \[0\.78"
-    ):
-        LayeredMultipole([layer(0.0041, 2.62, 1.5, 0.3), layer(0.0041, 2.62, 1.5, INFINITE)])
+    for stack in ([layer(*MARBLE_GREEN, 0.3)], [layer(*MARBLE_GREEN, d) for d in (0.3, INFINITE)]):
+        with pytest.raises(ValueError, match=r"thickness \* sigma_t' of a Layer .* 0\.78"):
+            LayeredMultipole(stack)
 
     @jax.jit
     def traced(thickness):
-        return Multipole(layer(0.0041, 2.62, 1.5, thickness)).total_reflectance()
+        return Multipole(layer(*MARBLE_GREEN, thickness)).total_reflectance()
 
     assert np.isnan(traced(jnp.asarray(0.3))[0])
     assert np.isfinite(traced(jnp.asarray(0.5))[0])
-
-
-def test_stacks_that_cannot_be_are_refused(dtype):
-    half_space = layer(0.1, 1.0, 1.3, INFINITE)
-    with pytest.raises(ValueError, match="layer 1 of 2 is infinitely thick"):
-        LayeredMultipole([half_space, half_space])
-    with pytest.raises(ValueError, match="none of which is a Layer"):
-        LayeredMultipole([Film(jnp.zeros(1))])
-    with pytest.raises(ValueError, match="optical_depth must be finite and at least 0"):
-        Film(jnp.asarray([-0.1]))
 
 
 @pytest.mark.shared

@@ -8,7 +8,7 @@ import pytest
 from splatjax.fitting import NonNegativeWeights, TotalReflectanceHeld, fit_gaussians, relative_error
 from splatjax.gaussians import SumOfGaussians
 from splatjax.scattering import (
-    NORM_RULE,
+    L2_QUADRATURE,
     InverseVariance,
     Tabulated,
     integrated_reflectance,
@@ -38,7 +38,7 @@ def test_integrals_of_a_table_are_sums_over_its_radii(float64):
     r = jnp.linspace(0.1, 6.0, 300)
     table = Tabulated(r, truth()(r))
     np.testing.assert_allclose(integrated_reflectance(table), table.total_reflectance(), rtol=1e-3)
-    beyond = NORM_RULE.beyond(1.0)
+    beyond = L2_QUADRATURE.beyond(1.0)
     radii, weights = beyond.radii(table)
     np.testing.assert_array_equal(
         np.asarray(weights) > 0, np.asarray(radii) >= np.asarray(table.length_scale())
@@ -97,7 +97,7 @@ def test_a_fit_weighed_by_its_errors_is_the_likeliest(float64):
         return fit_gaussians(Tabulated(r, values, deviation), 2, rule=rule, throw=False)
 
     fits = eqx.filter_jit(eqx.filter_vmap(fit, in_axes=(0, None)))
-    found, plain = fits(values, InverseVariance()), fits(values, NORM_RULE)
+    found, plain = fits(values, InverseVariance()), fits(values, L2_QUADRATURE)
     parameters = np.concatenate(
         [found.gaussians.variances, found.gaussians.weights[..., 0]], axis=1
     )
@@ -112,7 +112,7 @@ def test_a_fit_weighed_by_its_errors_is_the_likeliest(float64):
 
 def test_weighing_needs_errors(float64):
     r = jnp.linspace(0.05, 5.0, 30)
-    with pytest.raises(ValueError, match="Tabulated has no standard errors to weigh by"):
+    with pytest.raises(ValueError, match="Tabulated has no standard errors"):
         fit_gaussians(Tabulated(r, truth()(r)), 2, rule=InverseVariance())
     with pytest.raises(ValueError, match="SumOfGaussians has no standard errors"):
         fit_gaussians(truth(), 2, rule=InverseVariance())

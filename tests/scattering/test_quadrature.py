@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from splatjax.gaussians import SumOfGaussians
-from splatjax.scattering import NORM_RULE, at_own_radii, integrated_reflectance
+from splatjax.scattering import L2_QUADRATURE, at_own_radii, integrated_reflectance
 
 FLOAT64 = 1e-12
 ROUNDING = {"float32": 3e-6, "float64": FLOAT64}
@@ -28,7 +28,7 @@ def test_norm_of_a_gaussian(float64):
     """
     for narrow in (1e-6, 1e-2, 1.0):
         profile = SumOfGaussians(jnp.asarray([narrow, 1.0]), jnp.asarray([[0.0], [1.0]]))
-        r, dr = NORM_RULE.radii(profile)
+        r, dr = L2_QUADRATURE.radii(profile)
         norm = jnp.sum(dr * r * at_own_radii(profile, r) ** 2)
         np.testing.assert_allclose(norm, 1 / (8 * np.pi**2), rtol=FLOAT64)
 

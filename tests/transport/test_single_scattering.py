@@ -98,7 +98,7 @@ def test_the_share_that_leaves_is_the_integral_of_the_radiance():
         ours, mu_i = single(eta=eta), jnp.asarray([1.0, 0.3, 0.0])
         nodes, weights = np.polynomial.legendre.leggauss(400)
         mu, weights = 0.25 * (nodes + 1) ** 2, 0.5 * (nodes + 1) * weights
-        for each, found in zip(mu_i, ours.leaving(mu_i), strict=True):
+        for each, found in zip(mu_i, ours.directional_albedo(mu_i), strict=True):
             radiance = np.asarray(ours.reflected(jnp.full(len(mu), each), jnp.asarray(mu)))[:, 0]
             np.testing.assert_allclose(
                 float(found[0]), 2 * np.pi * np.sum(weights * mu * radiance), rtol=2e-3

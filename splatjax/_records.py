@@ -1,0 +1,216 @@
+"""Records that take what people type: numbers, lists, tuples and NumPy arrays.
+
+    @record
+    class Medium(eqx.Module):
+        sigma_a: Float[Array, " channels"] = eqx.field(converter=numbers)
+        sigma_s_prime: Float[Array, " channels"] = eqx.field(converter=numbers)
+        eta: Float[Array, " channels"] = eqx.field(converter=numbers)
+
+`Medium([0.02, 0.01], [1.1, 1.3], eta=1.4)` has three arrays of two channels. An annotation states
+the axes of a field, and its converter states, to type checkers as well, what may be given. `record`
+converts all fields together: the length and the precision of one depend on the others. Ranges of
+values are checked by `check_values` in `__check_init__`.
+"""
+
+import dataclasses
+import inspect
+from collections.abc import Callable, Sequence
+from types import NoneType, UnionType
+from typing import Any, TypeAlias, TypeVar, get_args, get_origin
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jax.typing import ArrayLike
+from jaxtyping import Array, DTypeLike
+
+Class = TypeVar("Class", bound=type)
+Item = TypeVar("Item")
+Numbers: TypeAlias = ArrayLike | Sequence[Any] | jax.ShapeDtypeStruct
+"""Numbers, lists, tuples and arrays: everything that can be read as an array."""
+
+
+def numbers(values: Numbers) -> Any:
+    """Mark, as the converter of a field, that it takes numbers of any kind."""
+    return values
+
+
+def optional_numbers(values: Numbers | None) -> Any:
+    """Mark that a field takes numbers of any kind, or `None`."""
+    return values
+
+
+def several(values: Item | Sequence[Item]) -> Any:
+    """Mark that a field takes a list or tuple of records, or a single one."""
+    return values
+
+
+def record(cls: Class) -> Class:
+    r"""Convert the arguments of a class of records before its `__init__` sees them.
+
+    - Fields of `numbers` become strongly typed arrays of floats, in the precision of the first
+      record among the fields, else of the widest array, else JAX's default. A number is repeated
+      along axes whose lengths other fields give; the `channels` of a record among the fields count.
+      An array that lacks its last axis `channels` has one channel.
+    - Fields of `several` records become tuples.
+    - Fields of records are refused when they are records of other classes, or numbers.
+
+    Traced values are converted like others. `None` and objects that are no numbers, such as the
+    placeholders of JAX, pass unchanged. Records that JAX unflattens are not converted again.
+
+    **Raises:** `ValueError`, when a record is made, naming the field, its shape or class, and what
+    would be right.
+    """
+    initialize, signature = cls.__init__, inspect.signature(cls)
+    axes, classes = {}, {}
+    for field in dataclasses.fields(cls):  # ty: ignore[invalid-argument-type]
+        is_tuple = get_origin(field.type) is tuple
+        annotation = get_args(field.type)[0] if is_tuple else field.type
+        kinds = get_args(annotation) if isinstance(annotation, UnionType) else (annotation,)
+        if field.metadata.get("converter") in (numbers, optional_numbers):
+            axes[field.name] = kinds[0].dim_str.split()  # ty: ignore[missing-union-attribute]
+        elif all(inspect.isclass(kind) and issubclass(kind, _RECORDS) for kind in kinds):
+            classes[field.name] = kinds, is_tuple
+
+    def __init__(self, *args, **kwargs):
+        given = signature.bind(*args, **kwargs)
+        given.apply_defaults()
+        values = given.arguments
+        for name, (kinds, is_tuple) in classes.items():
+            if is_tuple:
+                value = values[name]
+                values[name] = tuple(value) if isinstance(value, list | tuple) else (value,)
+            for value in values[name] if is_tuple else (values[name],):
+                _check_class(f"{cls.__name__}.{name}", value, kinds)
+        _convert(cls.__name__, axes, values)
+        initialize(self, **values)
+
+    # No annotations here: runtime type checkers would refuse arguments before their conversion.
+    own = inspect.Parameter("self", inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    others = [part.replace(annotation=part.empty) for part in signature.parameters.values()]
+    __init__.__signature__ = inspect.Signature([own, *others])  # ty: ignore[unresolved-attribute]
+    cls.__init__ = __init__  # ty: ignore[invalid-assignment]
+    return cls
+
+
+def as_floats(values: Numbers, dtype: DTypeLike | None = None, name: str = "values") -> Array:
+    """Convert numbers to a strongly typed array of floats, by default in their own precision."""
+    return _as_floats(name, values, dtype or _precision([], [values]))
+
+
+def check_values(
+    name: str,
+    values: Any,
+    requirement: str,
+    holds: Callable[[np.ndarray], Any],
+    finite: bool = True,
+) -> None:
+    r"""Check every entry of an array. Unknown entries, as under `jit`, pass.
+
+    **Arguments:**
+
+    - `name`: of the values, for the error.
+    - `values`: an array; other objects pass.
+    - `requirement`: completes "must be", with the remedy.
+    - `holds`: returns for each entry whether it meets the requirement.
+    - `finite`: whether infinite entries are refused. NaN always is.
+
+    **Raises:** `ValueError` with the number of entries that fail, and the first of them.
+    """
+    if not isinstance(values, jax.Array | np.ndarray) or isinstance(values, Tracer):
+        return
+    if not getattr(values, "is_fully_addressable", True):
+        return
+    known = np.asarray(values)
+    good = holds(known) & (np.isfinite(known) if finite else ~np.isnan(known))
+    if not good.all():
+        place = tuple(np.argwhere(~good)[0].tolist())
+        raise ValueError(
+            f"{name} must be {requirement}; {np.sum(~good)} of {known.size} entries are not, the "
+            f"first is {known[place]:g}{f' at {list(place)}' if place else ''}"
+        )
+
+
+_RECORDS = (eqx.Module, NoneType)
+
+
+def _is_placeholder(value: Any) -> bool:
+    """Return whether a value is `None` or an object of JAX that stands for an array or a record."""
+    known = bool | int | float | complex | str | list | tuple | eqx.Module
+    return not isinstance(value, known) and not hasattr(value, "__array__")
+
+
+def _is_record(value: Any) -> bool:
+    return isinstance(value, eqx.Module)
+
+
+def _check_class(where: str, value: Any, kinds: tuple[type, ...]) -> None:
+    if not isinstance(value, kinds) and not _is_placeholder(value):
+        wanted = " or ".join(f"{kind.__name__}{inspect.signature(kind)}" for kind in kinds)
+        raise ValueError(f"{where} must be {wanted}; got {type(value).__name__}")
+
+
+def _convert(record: str, annotations: dict[str, list[str]], values: dict[str, Any]) -> None:
+    """Convert the values of all fields of numbers, in place."""
+    given = {name: values[name] for name in annotations if not _is_placeholder(values[name])}
+    parts = jax.tree.leaves(list(values.values()), is_leaf=_is_record)
+    nested = [part for part in parts if _is_record(part)]
+    channels = [part.channels for part in nested if hasattr(part, "channels")]
+    lengths = {"channels": channels[0]} if channels else {}
+    precision = _precision(nested, list(given.values()))
+    arrays = {
+        name: _as_floats(f"{record}.{name}", value, precision) for name, value in given.items()
+    }
+    # Numbers come last, when the lengths of axes are known.
+    for name, array in sorted(arrays.items(), key=lambda item: item[1].ndim == 0):
+        values[name] = _shaped(f"{record}.{name}", array, annotations[name], lengths)
+
+
+def _shaped(where: str, array: Array, axes: list[str], lengths: dict[str, int]) -> Array:
+    """Add the axes that a number or a single channel lacks, and add the lengths of all axes to the
+    known ones.
+    """
+    if any(axis.startswith("*") for axis in axes):
+        return array
+    if array.ndim == 0 and axes and all(axis in lengths for axis in axes):
+        return jnp.broadcast_to(array, [lengths[axis] for axis in axes])
+    if array.ndim == len(axes) - 1 and axes[-1] == "channels":
+        array = array[..., None]
+    wanted = [int(axis) if axis.isdigit() else lengths.get(axis, axis) for axis in axes]
+    # A string is an axis whose length no other field gives.
+    matches = [
+        own == length or isinstance(length, str)
+        for own, length in zip(array.shape, wanted, strict=False)
+    ]
+    if array.ndim != len(axes) or not all(matches):
+        raise ValueError(
+            f"{where} has shape {list(array.shape)}; give it [{', '.join(axes)}] = "
+            f"[{', '.join(map(str, wanted))}], like the other fields"
+        )
+    lengths |= dict(zip(axes, array.shape, strict=True))
+    return array
+
+
+def _as_floats(where: str, value: Any, dtype: Any) -> Array:
+    if isinstance(value, jax.Array) and value.dtype == dtype and not value.weak_type:
+        return value
+    try:
+        return jnp.asarray(value, dtype)
+    except (TypeError, ValueError):
+        raise ValueError(
+            f"{where} must be numbers, in rows of equal length; got {value!r}"
+        ) from None
+
+
+def _precision(records: list, values: list) -> Any:
+    """Choose the precision of floats; single numbers have no say."""
+
+    def of(tree):
+        leaves = [leaf for leaf in jax.tree.leaves(tree) if eqx.is_inexact_array(leaf)]
+        return [leaf.dtype for leaf in leaves if not getattr(leaf, "weak_type", False)]
+
+    dtypes = of(records)[:1] or of(values) or [jnp.result_type(float)]
+    widest = max([np.dtype(np.float32), *dtypes], key=lambda dtype: dtype.itemsize)
+    return jax.dtypes.canonicalize_dtype(widest)
