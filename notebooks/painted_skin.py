@@ -40,7 +40,7 @@ from splatjax.diffusion import DenseDiffuser
 from splatjax.splatting import DenseRasterizer
 
 SPLATS, SIZE, COUNT, STEPS, NOISE = 700, 30, 3, 30, 0.01
-HELD = sj.NonNegativeWeights(sj.TotalReflectanceHeld())
+HELD = sj.NonNegativeWeights(sj.FixedTotalReflectance())
 # Every splat at every pixel: for small pictures. Leave `settings` out for large ones.
 settings = sj.RenderSettings(rasterizer=DenseRasterizer(), diffuser=DenseDiffuser())
 

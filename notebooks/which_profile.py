@@ -128,7 +128,7 @@ with jax.enable_x64(True):
     profile = jax.tree.map(lambda each: each.astype(jnp.float64), found.profile())
     rule = sj.InverseVariance(sj.L2_QUADRATURE.beyond(0.2))
     true_fit = sj.fit_gaussians(
-        profile, 5, weights=sj.TotalReflectanceHeld(), rule=rule, throw=False
+        profile, 5, weights=sj.FixedTotalReflectance(), rule=rule, throw=False
     )
     r, weights = rule.radii(profile)
     misses = (profile.values - true_fit.gaussians(r[:, 0])) ** 2 * weights * r

@@ -90,7 +90,7 @@ def record(cls: Class) -> Class:
     # No annotations here: runtime type checkers would refuse arguments before their conversion.
     own = inspect.Parameter("self", inspect.Parameter.POSITIONAL_OR_KEYWORD)
     others = [part.replace(annotation=part.empty) for part in signature.parameters.values()]
-    __init__.__signature__ = inspect.Signature([own, *others])  # ty: ignore[unresolved-attribute]
+    __init__.__signature__ = inspect.Signature([own, *others])  # ty: ignore[missing-attribute]
     cls.__init__ = __init__  # ty: ignore[invalid-assignment]
     return cls
 

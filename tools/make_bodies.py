@@ -183,7 +183,7 @@ def material(profile: sj.Tabulated, single: sj.SingleScattering | None = None) -
         fit = sj.fit_gaussians(
             reference,
             6,
-            weights=sj.NonNegativeWeights(sj.TotalReflectanceHeld()),
+            weights=sj.NonNegativeWeights(sj.FixedTotalReflectance()),
             rule=sj.L2_QUADRATURE.beyond(0.2 / SIGMA_T),
         )
         gaussians = jax.tree.map(np.asarray, fit.gaussians)

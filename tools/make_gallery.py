@@ -21,7 +21,7 @@ from splatjax.geometry import Mesh, sample_mesh, vertex_normals
 from splatjax.io import linear_to_srgb
 
 FOLDER = Path(__file__).resolve().parents[1] / "out" / "gallery"
-HELD = sj.NonNegativeWeights(sj.TotalReflectanceHeld())
+HELD = sj.NonNegativeWeights(sj.FixedTotalReflectance())
 
 
 def sun(

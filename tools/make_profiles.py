@@ -13,7 +13,7 @@ import tomllib
 import jax
 import numpy as np
 
-from splatjax.fitting import FitResult, NonNegativeWeights, TotalReflectanceHeld, fit_gaussians
+from splatjax.fitting import FitResult, FixedTotalReflectance, NonNegativeWeights, fit_gaussians
 from splatjax.gaussians import SumOfGaussians
 from splatjax.io import load_profile, materials, profiles_folder, save_material
 from splatjax.scene import Material
@@ -30,7 +30,7 @@ def fit_material(name: str) -> FitResult:
     """Give the fit that a material is shipped with."""
     with jax.enable_x64(True):
         return fit_gaussians(
-            load_profile(name), COUNT, weights=NonNegativeWeights(TotalReflectanceHeld())
+            load_profile(name), COUNT, weights=NonNegativeWeights(FixedTotalReflectance())
         )
 
 

@@ -119,7 +119,7 @@ class Fit:
         if not 1 <= self.count <= 8:
             raise ValueError(f"--count is {self.count}; with --all it lies between 1 and 8")
         weights = (
-            sj.FreeWeights() if self.free else sj.NonNegativeWeights(sj.TotalReflectanceHeld())
+            sj.FreeWeights() if self.free else sj.NonNegativeWeights(sj.FixedTotalReflectance())
         )
         with jax.enable_x64(True):
             fit_all(Path(self.medium), self.output, self.count, weights)
@@ -228,7 +228,7 @@ class Fit:
         if self.free:
             return sj.FreeWeights()
         return sj.NonNegativeWeights(
-            sj.FreeWeights() if isinstance(profile, sj.Tabulated) else sj.TotalReflectanceHeld()
+            sj.FreeWeights() if isinstance(profile, sj.Tabulated) else sj.FixedTotalReflectance()
         )
 
     def _save(

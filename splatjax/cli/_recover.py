@@ -224,7 +224,7 @@ class Recover:
     def _suggest(
         self, recovery: sj.Recovery, observations: list[sj.Observation], splats: sj.Splats
     ) -> None:
-        candidates = sj.usual_candidates(
+        candidates = sj.default_candidates(
             splats, observations[0].camera, observations[0].picture.shape[2]
         )
         with stage(f"looking at {len(candidates)} pictures that could be taken next"):

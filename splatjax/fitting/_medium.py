@@ -13,7 +13,7 @@ from splatjax.scattering import Dipole, Medium, Tabulated
 
 from ._dense import NormalEquations, invert
 from ._fit import fit_gaussians
-from ._search import AbstractStart, InsertedGaussians
+from ._search import AbstractStart, GreedyInsertion
 from ._spread import VariancesPerChannel
 
 _TOLERANCE = 1e-7
@@ -66,7 +66,7 @@ def fit_medium(
     - `beam_variance`: of the beam that made the dot, per axis, mm^2.
     - `model`: from a medium to its profile.
     - `count`: number of Gaussians.
-    - `gaussians_start`: where their fits start; `InsertedGaussians()` by default.
+    - `gaussians_start`: where their fits start; `GreedyInsertion()` by default.
     - `throw`: raise if the search has not converged; otherwise `result` says so.
 
     **Returns:** a `MediumFit`.
@@ -81,7 +81,7 @@ def fit_medium(
         )
     if not bool(jnp.all(deviation > 0)):
         raise ValueError(f"deviations must be positive (1/mm^2); got {float(jnp.min(deviation)):g}")
-    gaussians_start = InsertedGaussians() if gaussians_start is None else gaussians_start
+    gaussians_start = GreedyInsertion() if gaussians_start is None else gaussians_start
     fitted = _fit_compiled(
         measured, deviation, start, jnp.asarray(beam_variance), model, count, gaussians_start
     )

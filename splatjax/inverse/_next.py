@@ -21,7 +21,7 @@ from ._flat import Gatherer
 from ._intensity import AbstractIntensity, KnownIntensity
 from ._losses import SquaredLoss
 from ._observation import Observation
-from ._problem import Fitted, solution, usual_weights
+from ._problem import Fitted, default_weights, solution
 from ._recovery import Recovery
 
 
@@ -83,7 +83,7 @@ def next_pictures(
 
     - `recovery`: what is known by now.
     - `splats`: of the body.
-    - `candidates`: at least one; `usual_candidates` gives some.
+    - `candidates`: at least one; `default_candidates` gives some.
     - `settings`: of the renderer. By default those of `render`: a prediction needs no layers as
       fine as a search does.
 
@@ -95,9 +95,9 @@ def next_pictures(
     if not candidates:
         raise ValueError(
             "candidates is empty: name a picture that could be taken, or take "
-            "usual_candidates(splats, camera)"
+            "default_candidates(splats, camera)"
         )
-    weights = usual_weights() if weights is None else weights
+    weights = default_weights() if weights is None else weights
     settings = RenderSettings() if settings is None else settings
     medium, dtype = recovery.medium, recovery.medium.sigma_a.dtype
     cameras, lights = [each.camera for each in candidates], [each.lights for each in candidates]
@@ -143,7 +143,7 @@ def _marginal(information: np.ndarray, own: int, channels: int, size: int) -> np
     return whole
 
 
-def usual_candidates(splats: Splats, camera: Camera, channels: int = 3) -> list[Candidate]:
+def default_candidates(splats: Splats, camera: Camera, channels: int = 3) -> list[Candidate]:
     r"""Give pictures that one could take with a camera: parallel light from the front, left, right,
     above and behind, and a laser dot in the middle of the picture, as wide as a few splats.
 

@@ -11,9 +11,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from splatjax.fitting import (
     AbstractWeights,
+    FixedTotalReflectance,
     GivenVariances,
     NonNegativeWeights,
-    TotalReflectanceHeld,
     fit_gaussians,
     fit_weights,
 )
@@ -26,11 +26,11 @@ from ._losses import AbstractLoss
 _STEPS = 64
 
 
-def usual_weights() -> AbstractWeights:
+def default_weights() -> AbstractWeights:
     """Give how the materials that come with the package are fitted: weights are not negative, and
     their sum is held.
     """
-    return NonNegativeWeights(TotalReflectanceHeld())
+    return NonNegativeWeights(FixedTotalReflectance())
 
 
 class Unknowns(eqx.Module):

@@ -21,7 +21,7 @@ from ._evidence import Evidence
 from ._flat import Gatherer, wide_variances
 from ._losses import AbstractLoss, SquaredLoss
 from ._observation import Observation
-from ._problem import Fitted, Held, search, solution, usual_weights
+from ._problem import Fitted, Held, default_weights, search, solution
 from ._recovery import Recovery
 
 _FINE = RenderSettings(diffuser=ClusterDiffuser(error=2.5e-4))
@@ -91,7 +91,7 @@ def recover(
     observations = list(observations)
     _check(observations, splats, starts)
     say = progress or _nobody
-    weights = usual_weights() if weights is None else weights
+    weights = default_weights() if weights is None else weights
     loss = SquaredLoss() if loss is None else loss
     evidence = Evidence(observations, starts[0].sigma_a.dtype)
     unknowns, factors = evidence.unknowns(starts[0].eta)

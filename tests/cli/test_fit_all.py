@@ -60,7 +60,7 @@ def test_a_table_of_media_becomes_a_table_of_fits_and_is_taken_up_again(
         alone = sj.fit_gaussians(
             sj.Dipole(sj.Medium(*(jnp.asarray([value]) for value in MEDIA[3][1:]))),
             2,
-            weights=sj.NonNegativeWeights(sj.TotalReflectanceHeld()),
+            weights=sj.NonNegativeWeights(sj.FixedTotalReflectance()),
         )
         np.testing.assert_allclose(
             [float(rows[3][f"variance_{i}"]) for i in (1, 2)], alone.gaussians.variances, rtol=1e-6

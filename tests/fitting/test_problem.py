@@ -8,10 +8,10 @@ import pytest
 from scipy.optimize import least_squares
 
 from splatjax.fitting import (
+    FixedTotalReflectance,
     FreeWeights,
     LeastCount,
     NonNegativeWeights,
-    TotalReflectanceHeld,
     VariancesPerChannel,
     error_by_count,
     fit_gaussians,
@@ -32,7 +32,7 @@ def marble() -> Dipole:
 
 
 @pytest.mark.parametrize(
-    "weights", [FreeWeights(), TotalReflectanceHeld(), NonNegativeWeights(TotalReflectanceHeld())]
+    "weights", [FreeWeights(), FixedTotalReflectance(), NonNegativeWeights(FixedTotalReflectance())]
 )
 @pytest.mark.parametrize("active", [None, (True, True, True, False)])
 def test_the_expansion_is_that_of_automatic_differentiation(float64, weights, active):
@@ -61,8 +61,6 @@ def test_the_expansion_is_that_of_automatic_differentiation(float64, weights, ac
     ):
         assert np.max(np.abs(automatic)) > 0
         np.testing.assert_allclose(closed, automatic, atol=EXACT * float(np.max(np.abs(automatic))))
-    if active is None:
-        np.testing.assert_allclose(problem.gradient(point), gradient, atol=EXACT)
 
 
 def test_covariance_is_that_of_a_fit_of_all_parameters(float64):
@@ -89,7 +87,7 @@ def test_covariance_is_that_of_a_fit_of_all_parameters(float64):
 
 
 def test_held_weights_do_not_vary_together(float64):
-    fitted = fit_gaussians(marble(), 2, weights=TotalReflectanceHeld())
+    fitted = fit_gaussians(marble(), 2, weights=FixedTotalReflectance())
     weights = np.asarray(fitted.covariance)[2:, 2:]
     of_sum = weights[:2, :2].sum()
     assert abs(of_sum) < 1e-12 * np.trace(weights)
@@ -100,7 +98,7 @@ def test_the_variance_of_a_gaussian_without_weight_is_anything(float64):
     one = SumOfGaussians(jnp.asarray([1.0]), jnp.asarray([[0.5]]))
     problem = make_problem(one, NonNegativeWeights(), L2_QUADRATURE)
     # Next to the truth: what the second Gaussian would add is negative.
-    covariance = problem.outcome(jnp.log(jnp.asarray([0.9, 0.4]))).covariance
+    _, _, covariance = problem.outcome(jnp.log(jnp.asarray([0.9, 0.4])))
     assert np.isinf(covariance[1, 1])
     assert np.all(np.isfinite(np.delete(np.diag(covariance), 1)))
 
@@ -144,7 +142,8 @@ def test_media_in_no_table_are_fitted_as_well_as_from_many_starts(float64):
     profile = Dipole(
         Medium(*(jnp.asarray(each) for each in (absorbed, 1 - absorbed, noise.uniform(1, 1.8, 6))))
     )
-    problems = VariancesPerChannel().problem(profile, FreeWeights(), L2_QUADRATURE)
+    shared = make_problem(profile, FreeWeights(), L2_QUADRATURE)
+    problems = jax.tree.map(lambda leaf: leaf[:, None], shared)
     expand = eqx.filter_jit(lambda problem, point: problem.expand(point))
     best = []
     for channel in range(6):

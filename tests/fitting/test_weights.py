@@ -9,7 +9,7 @@ import optimistix as optx
 import pytest
 from scipy.optimize import nnls
 
-from splatjax.fitting import FreeWeights, NonNegativeWeights, TotalReflectanceHeld, fit_gaussians
+from splatjax.fitting import FixedTotalReflectance, FreeWeights, NonNegativeWeights, fit_gaussians
 from splatjax.io import load_medium
 from splatjax.scattering import (
     Dipole,
@@ -59,7 +59,7 @@ def test_non_negative_weights_of_a_held_sum_are_the_best_of_all_subsets(float64,
             weights = np.linalg.solve(system, np.append(basis[:, subset].T @ target, total))[:-1]
             if np.all(weights >= 0):
                 best = min(best, np.linalg.norm(target - basis[:, subset] @ weights))
-    found = solve(NonNegativeWeights(TotalReflectanceHeld()), basis, target, energies, total)
+    found = solve(NonNegativeWeights(FixedTotalReflectance()), basis, target, energies, total)
     assert np.all(found >= 0)
     np.testing.assert_allclose(energies @ found, total, rtol=SOLVED)
     np.testing.assert_allclose(np.linalg.norm(target - basis @ found), best, rtol=SOLVED)

@@ -34,7 +34,7 @@ coarse the splats.
 """
 SIZE = 24
 COUNT = 4
-HELD = sj.NonNegativeWeights(sj.TotalReflectanceHeld())
+HELD = sj.NonNegativeWeights(sj.FixedTotalReflectance())
 STRONGER = 1.7
 """Than is told: the second light."""
 NOISE = 0.01

@@ -5,7 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from splatjax.fitting import NonNegativeWeights, TotalReflectanceHeld, fit_gaussians, relative_error
+from splatjax.fitting import (
+    FixedTotalReflectance,
+    NonNegativeWeights,
+    fit_gaussians,
+    relative_error,
+)
 from splatjax.gaussians import SumOfGaussians
 from splatjax.scattering import (
     L2_QUADRATURE,
@@ -127,7 +132,7 @@ def test_a_total_that_is_known_is_held(float64):
     r = jnp.linspace(0.05, 2.0, 60)
     table = Tabulated(r, truth()(r), total=truth().total_reflectance())
     assert Tabulated(r, truth()(r)).total_reflectance()[0] < 0.85 * table.total_reflectance()[0]
-    fitted = fit_gaussians(table, 2, weights=TotalReflectanceHeld())
+    fitted = fit_gaussians(table, 2, weights=FixedTotalReflectance())
     np.testing.assert_allclose(fitted.gaussians.weights, truth().weights, rtol=1e-6)
 
 
