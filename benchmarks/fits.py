@@ -14,7 +14,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 import splatjax as sj
-from splatjax.fitting._problem import Problem, make_problem
+from splatjax.fitting._problem import FitProblem, make_problem
 
 COUNT = 6
 TOLERANCE = 1e-12
@@ -33,16 +33,16 @@ def arguments():
 
 
 @eqx.filter_jit
-def residuals(problem: Problem, point):
+def residuals(problem: FitProblem, point):
     return problem.residuals(point)[0]
 
 
 @eqx.filter_jit
-def jacobian(problem: Problem, point):
+def jacobian(problem: FitProblem, point):
     return problem.expand(point).jacobian[0]
 
 
-def scipy_fit(problem: Problem, start: np.ndarray):
+def scipy_fit(problem: FitProblem, start: np.ndarray):
     """The error (Eq. 4) that SciPy reaches."""
     found = least_squares(
         lambda point: np.asarray(residuals(problem, point)),
@@ -75,7 +75,7 @@ def one_material(repeats: int) -> None:
     given = sj.GivenVariances(jnp.exp(start))
     ours, seconds, first = timed(lambda: sj.fit_gaussians(profile, COUNT, start=given), repeats)
     theirs, scipy_seconds, _ = timed(
-        lambda: scipy_fit(problem, np.asarray(start - 2 * jnp.log(problem.unit))), repeats
+        lambda: scipy_fit(problem, np.asarray(start - jnp.log(problem.squared_unit))), repeats
     )
     search, search_seconds, search_first = timed(lambda: sj.fit_gaussians(profile, COUNT), repeats)
     print(
@@ -94,10 +94,8 @@ def many_media(count: int, repeats: int) -> None:
     noise = np.random.default_rng(0)
     albedo, sigma_t = 1 - 10 ** noise.uniform(-4, -0.02, count), 10 ** noise.uniform(-1, 1.3, count)
     coefficients = ((1 - albedo) * sigma_t, albedo * sigma_t, noise.uniform(1.0, 1.8, count))
-    media, starts = (
-        sj.Medium(*(jnp.asarray(each)[:, None] for each in coefficients)),
-        sj.dipole_starts(),
-    )
+    media = jax.vmap(sj.Medium)(*(jnp.asarray(each)[:, None] for each in coefficients))
+    starts = sj.dipole_starts()
 
     def fit(medium):
         return sj.fit_gaussians(
@@ -114,7 +112,7 @@ def many_media(count: int, repeats: int) -> None:
     for i in few:
         medium = jax.tree.map(lambda leaf, i=i: leaf[i], media)
         problem = make_problem(sj.Dipole(medium), sj.FreeWeights(), sj.L2_QUADRATURE)
-        start = np.asarray(jnp.log(starts(medium, COUNT).variances[0] / problem.unit**2))
+        start = np.asarray(problem.log_variances(starts(medium, COUNT).variances[0]))
         theirs.append(timed(lambda problem=problem, start=start: scipy_fit(problem, start), 1)[:2])
     ratio = max(
         float(fitted.error[i, 0]) / float(error) for i, (error, _) in zip(few, theirs, strict=True)

@@ -188,6 +188,7 @@ def _shaped(where: str, array: Array, axes: list[str], lengths: dict[str, int]) 
         raise ValueError(
             f"{where} has shape {list(array.shape)}; give it [{', '.join(axes)}] = "
             f"[{', '.join(map(str, wanted))}], like the other fields"
+            f"{' (make batches by jax.vmap)' if array.ndim > len(axes) else ''}"
         )
     lengths |= dict(zip(axes, array.shape, strict=True))
     return array

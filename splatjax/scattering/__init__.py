@@ -14,6 +14,7 @@ from ._fresnel import (
     EganFresnel as EganFresnel,
     ExactFresnel as ExactFresnel,
     moment_outside as moment_outside,
+    reflectance as reflectance,
 )
 from ._hankel import inverse_hankel_transform as inverse_hankel_transform
 from ._laser_dot import LaserDot as LaserDot, measure_laser_dot as measure_laser_dot
