@@ -250,7 +250,7 @@ def main() -> None:
                     flush=True,
                 )
             if pulls:
-                print(found.words())
+                print(found.summary())
                 print(f"chi-squared {float(found.chi_squared):.4f}")
                 pulls = np.stack(pulls, axis=1)
                 rows.append(

@@ -116,7 +116,7 @@ off = [
     np.asarray(getattr(found.medium, name)) / np.asarray(getattr(skin, name)) - 1
     for name in ("sigma_a", "sigma_s_prime")
 ]
-print(found.words())
+print(found.summary())
 print(f"sigma_a off by {(100 * off[0]).round(1)}%, sigma_s' by {(100 * off[1]).round(1)}%")
 
 # %%

@@ -79,7 +79,7 @@ with jax.enable_x64(True):
         photograph, camera, (lamp,), deviation=np.full(photograph.shape, deviation)
     )
     found = sj.recover([taken], splats, start, count=COUNT, settings=settings)
-print(found.words())
+print(found.summary())
 print(f"{found.rounds} rounds, {found.steps} steps; chi-squared {float(found.chi_squared):.3f}")
 
 # %%

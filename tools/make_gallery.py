@@ -347,7 +347,7 @@ def inverse(_: sj.Splats, side: int) -> np.ndarray:
         found = sj.recover(
             [seen], splats, start, progress=lambda said, medium: print(said, flush=True)
         )
-    print(found.words())
+    print(found.summary())
     for name in ("sigma_a", "sigma_s_prime"):
         print(
             f"{name} off by",

@@ -152,7 +152,7 @@ class Recover:
                 "command goes on where it stopped, or --start names materials that are nearer"
             )
         note(f"{time.perf_counter() - begin:6.1f} s  found, after {self._effort(recovery)}")
-        Console(highlight=False, soft_wrap=True).print(recovery.words(), markup=False)
+        Console(highlight=False, soft_wrap=True).print(recovery.summary(), markup=False)
         if self.suggest:
             self._suggest(recovery, observations, splats)
         self._save(recovery)

@@ -13,7 +13,7 @@ from splatjax.scattering import Medium
 from ._flat import flatten
 from ._losses import AbstractLoss
 from ._observation import Observation
-from ._problem import AbstractVariances, Problem, Unknowns
+from ._problem import AbstractVariances, RecoveryProblem, Unknowns
 
 _UNKNOWN_NOISE = 0.01
 """Deviation of pictures that come without one, as a share of their brightness: error bars do not
@@ -78,7 +78,7 @@ class Evidence:
         loss: AbstractLoss,
         weights: AbstractWeights,
         model: Callable[[Medium], AbstractProfile],
-    ) -> tuple[Problem, list[np.ndarray]]:
+    ) -> tuple[RecoveryProblem, list[np.ndarray]]:
         """State the least squares problem of layers; also give the numbers of the pixels that
         count, in each picture.
         """
@@ -91,7 +91,7 @@ class Evidence:
             ]
             return jnp.asarray(np.concatenate(rows).T, self.dtype)
 
-        return Problem(
+        return RecoveryProblem(
             flat,
             in_row(self.pictures),
             in_row(self.deviations),

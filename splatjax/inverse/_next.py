@@ -69,8 +69,8 @@ def next_pictures(
     candidates: Sequence[Candidate],
     *,
     model: Callable[[Medium], AbstractProfile] = Dipole,
-    weights: AbstractWeights | None = None,
-    settings: RenderSettings | None = None,
+    weights: AbstractWeights = default_weights(),
+    settings: RenderSettings = RenderSettings(),
 ) -> list[Prediction]:
     r"""Rank pictures that could be taken by how well the coefficients would be known with each of
     them.
@@ -97,8 +97,6 @@ def next_pictures(
             "candidates is empty: name a picture that could be taken, or take "
             "default_candidates(splats, camera)"
         )
-    weights = default_weights() if weights is None else weights
-    settings = RenderSettings() if settings is None else settings
     medium, dtype = recovery.medium, recovery.medium.sigma_a.dtype
     cameras, lights = [each.camera for each in candidates], [each.lights for each in candidates]
     gathered, _ = Gatherer(splats, settings, cameras, lights).moving(recovery.material)

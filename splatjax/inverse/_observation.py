@@ -61,3 +61,12 @@ def nothing_counts(number: int) -> ValueError:
         f"no pixel of observations[{number}] counts: none is filled by the splats, left by the "
         "mask and of known color; check camera, mask and NaN"
     )
+
+
+def check_channels(number: int, observation: Observation, channels: int, source: str) -> None:
+    """Raise `ValueError` for a picture of another number of channels than its source has."""
+    found = observation.picture.shape[2]
+    if found != channels:
+        raise ValueError(
+            f"observations[{number}].picture has {found} channels, {source} has {channels}"
+        )

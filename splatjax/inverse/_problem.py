@@ -27,20 +27,20 @@ _STEPS = 64
 
 
 def default_weights() -> AbstractWeights:
-    """Give how the materials that come with the package are fitted: weights are not negative, and
-    their sum is held.
+    """Return the weights with which the materials of the package are fitted: not negative, with a
+    fixed sum.
     """
     return NonNegativeWeights(FixedTotalReflectance())
 
 
 class Unknowns(eqx.Module):
-    """How the numbers to be found are laid out: log sigma_a, log sigma_s' per channel, then log
-    factors of the lights.
+    """The layout of the unknowns: log sigma_a, log sigma_s' per channel, then log factors of the
+    lights.
     """
 
     eta: Float[Array, " channels"]
     factors: Int[Array, "pictures channels"]
-    """Which factor a picture's channel has; that many as there are where its intensity is known."""
+    """The factor of each channel of each picture; the number of factors where it is known."""
 
     def medium(self, point: Float[Array, " unknowns"]) -> Medium:
         channels = self.eta.shape[0]
@@ -61,11 +61,11 @@ class Unknowns(eqx.Module):
 
 
 class AbstractVariances(eqx.Module):
-    """Where the variances of a medium's Gaussians come from."""
+    """How the variances of Gaussians follow from a medium."""
 
     @abc.abstractmethod
     def gaussians(self, profile: AbstractProfile, weights: AbstractWeights) -> SumOfGaussians:
-        """Give the Gaussians of a profile. Differentiable."""
+        """Fit the Gaussians of a profile. Differentiable."""
 
 
 class Held(AbstractVariances):
@@ -78,7 +78,7 @@ class Held(AbstractVariances):
 
 
 class Fitted(AbstractVariances):
-    """Those of the best fit to each, near some: variances and weights move together."""
+    """Those of the best fit to each medium: variances and weights move together."""
 
     near: Float[Array, " gaussians"]
 
@@ -89,8 +89,8 @@ class Fitted(AbstractVariances):
         ).gaussians
 
 
-class Problem(eqx.Module):
-    """The pictures, what was observed, and how the one is made from coefficients."""
+class RecoveryProblem(eqx.Module):
+    """Observed pictures, and how pictures are made from coefficients."""
 
     pictures: FlatPictures
     observed: Float[Array, "channels pixels"]
@@ -108,7 +108,7 @@ class Problem(eqx.Module):
         return self.pictures.radiance(self.gaussians(point), self.unknowns.intensities(point))
 
     def residuals(self, point: Float[Array, " unknowns"]) -> Float[Array, "channels pixels"]:
-        """Give what the loss has as its square."""
+        """Compute residuals whose squares are the losses."""
         return self.loss.root((self.radiance(point) - self.observed) / self.deviation)
 
     def handover_slopes(self, point: Float[Array, " unknowns"]) -> Float[Array, "channels pixels"]:
@@ -137,7 +137,7 @@ class Found(eqx.Module):
 
 
 @eqx.filter_jit
-def search(problem: Problem, start: Float[Array, " unknowns"]) -> Found:
+def search(problem: RecoveryProblem, start: Float[Array, " unknowns"]) -> Found:
     """Minimize the loss from a start: Levenberg and Marquardt's method."""
     tolerance = 1e-4 if start.dtype == jnp.float32 else 1e-7
     # In units of the start's own residual, so that damping and tolerances mean the same for any
@@ -175,7 +175,7 @@ class Solution(eqx.Module):
 
 
 @eqx.filter_jit
-def solution(problem: Problem, point: Float[Array, " unknowns"]) -> Solution:
+def solution(problem: RecoveryProblem, point: Float[Array, " unknowns"]) -> Solution:
     """Give what is known at a point: the picture, and how sharply residuals tell each unknown and
     the handover.
     """

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, Int
 
 from splatjax._records import check_values, numbers, record
 
-from ._lookup import of_layer
+from ._stack import of_layer
 
 _SINE = [(-1) ** n * math.pi ** (2 * n + 1) / math.factorial(2 * n + 1) for n in range(8)]
 _COSINE = [(-1) ** n * math.pi ** (2 * n) / math.factorial(2 * n) for n in range(9)]

@@ -107,3 +107,17 @@ class Stack(eqx.Module):
     sigma_s: Float[Array, " layers"]
     thickness: Float[Array, " layers"]
     eta: Float[Array, " layers_and_neighbors"]
+
+
+def of_layer(
+    table: Float[Array, "layers *channels"], layer: Int[Array, " photons"]
+) -> Float[Array, "*channels photons"]:
+    """Look up the entry of each photon's layer: by selections, which vectorize as a gather does
+    not.
+    """
+    shape = (*table.shape[1:], *layer.shape)
+    entry = jnp.broadcast_to(table[0][..., None], shape)
+    for number in range(1, table.shape[0]):
+        here = jnp.broadcast_to(layer == number, shape)
+        entry = jnp.where(here, jnp.broadcast_to(table[number][..., None], shape), entry)
+    return entry

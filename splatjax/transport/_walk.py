@@ -8,9 +8,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ._interface import fresnel
-from ._lookup import of_layer
 from ._phase import AbstractPhaseFunction
-from ._stack import Stack
+from ._stack import Stack, of_layer
 
 INSIDE, ABOVE, BELOW, IDLE = 0, 1, 2, 3
 """Where a photon is; one that is idle is not on its way at all."""

@@ -188,7 +188,7 @@ def test_bad_arguments_are_refused():
             sj.monte_carlo(*arguments)
     with pytest.raises(ValueError, match="steps of edges"):
         sj.monte_carlo([half_space], 10, KEY, edges=jnp.asarray([0.0, 1.0, 1.0]))
-    with pytest.raises(ValueError, match="HenyeyGreenstein.g must be between -1 and 1"):
+    with pytest.raises(ValueError, match=r"HenyeyGreenstein\.g must be between -1 and 1"):
         sj.HenyeyGreenstein(jnp.asarray(1.0))
     with pytest.raises(ValueError, match="one for each of the 1 layers; got 2"):
         sj.monte_carlo([half_space], 10, KEY, phase=sj.HenyeyGreenstein(jnp.zeros(2)))
