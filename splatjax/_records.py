@@ -114,7 +114,8 @@ def check_values(
     - `name`: of the values, for the error.
     - `values`: an array; other objects pass.
     - `requirement`: completes "must be", with the remedy.
-    - `holds`: returns for each entry whether it meets the requirement.
+    - `holds`: returns for each entry whether it meets the requirement, which two numbers meet only
+      if all between them do.
     - `finite`: whether infinite entries are refused. NaN always is.
 
     **Raises:** `ValueError` with the number of entries that fail, and the first of them.
@@ -123,9 +124,13 @@ def check_values(
         return
     if not getattr(values, "is_fully_addressable", True):
         return
+
+    def is_good(entries):
+        return holds(entries) & (np.isfinite(entries) if finite else ~np.isnan(entries))
+
     known = np.asarray(values)
-    good = holds(known) & (np.isfinite(known) if finite else ~np.isnan(known))
-    if not good.all():
+    if known.size and not np.all(is_good(np.stack([known.min(), known.max()]))):
+        good = is_good(known)
         place = tuple(np.argwhere(~good)[0].tolist())
         raise ValueError(
             f"{name} must be {requirement}; {np.sum(~good)} of {known.size} entries are not, the "
@@ -209,8 +214,11 @@ def _precision(records: list, values: list) -> Any:
     """Choose the precision of floats; single numbers have no say."""
 
     def of(tree):
-        leaves = [leaf for leaf in jax.tree.leaves(tree) if eqx.is_inexact_array(leaf)]
-        return [leaf.dtype for leaf in leaves if not getattr(leaf, "weak_type", False)]
+        arrays = [
+            leaf for leaf in jax.tree.leaves(tree) if isinstance(leaf, jax.Array | np.ndarray)
+        ]
+        floats = [array for array in arrays if jnp.issubdtype(array.dtype, jnp.floating)]
+        return [array.dtype for array in floats if not getattr(array, "weak_type", False)]
 
     dtypes = of(records)[:1] or of(values) or [jnp.result_type(float)]
     widest = max([np.dtype(np.float32), *dtypes], key=lambda dtype: dtype.itemsize)

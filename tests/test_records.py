@@ -10,9 +10,11 @@ import pytest
 
 import splatjax as sj
 from splatjax._records import check_values
+from splatjax.diffusion import DenseDiffuser
 from splatjax.fitting import GivenVariances
 from splatjax.inverse import Candidate, Observation
 from splatjax.scattering import RoughFresnel
+from splatjax.splatting import DenseRasterizer
 from splatjax.transport import HenyeyGreenstein
 
 CENTERS = [[0, 0, 0], [1, 0, 0]]
@@ -139,6 +141,12 @@ def test_traced_values_and_placeholders_pass_through_transformations():
             r"Medium.sigma_s_prime has shape \[3\].* = \[2\]",
         ),
         (lambda: sj.SumOfGaussians([1, 2], [[1, 2, 3]]), r"weights has shape \[1, 3\]"),
+        (
+            lambda: sj.save_material(
+                material(), "x.toml", profile=sj.Multipole(sj.Layer(medium(), 3))
+            ),
+            "profile must be a Dipole, .* or LayeredMultipole.* got Multipole",
+        ),
         (lambda: splats(normals=[[0, 0, 1]]), r"Splats.normals has shape \[1, 3\].* = \[2, 3\]"),
         (lambda: splats(radii=[1, 2, 3]), r"Splats.radii has shape \[3\]"),
         (lambda: splats(areas=[1]), r"Splats.areas has shape \[1\]"),
@@ -164,6 +172,34 @@ def test_traced_values_and_placeholders_pass_through_transformations():
 def test_nonsense_is_refused_by_field_and_count(make, said):
     with pytest.raises(ValueError, match=said):
         make()
+
+
+def test_numbers_of_any_type_compile_a_picture_once():
+    """Weakly typed numbers would compile it again."""
+    plain = sj.RenderSettings(rasterizer=DenseRasterizer(), diffuser=DenseDiffuser())
+    weak = jnp.asarray(1.3)  # as JAX makes it of a Python number
+    view = camera()
+    shadowless = sj.DirectionalLight([0.5, -0.5, -1], 1, cast_shadows=False)
+    plan = sj.plan(sj.Scene(splats(), shadowless, material()), view, plain)
+    scenes = [
+        sj.Scene(
+            splats(radii=number),
+            sj.DirectionalLight([0.5, -0.5, -1], [number, 1, 1], cast_shadows=False),
+            sj.Material(material().gaussians, eta=number),
+        )
+        for number in (1.3, np.float64(1.3), weak, jnp.full((), 1.3), np.float32(1.3))
+    ]
+    sj.render(scenes[0], view, plain, plan)
+    events = []
+
+    def listen(event, duration, **_):
+        events.append(event)
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    for scene in scenes:
+        sj.render(scene, view, plain, plan)
+    jax.monitoring.unregister_event_duration_listener(listen)
+    assert "/jax/core/compile/backend_compile_duration" not in events
 
 
 def test_unknown_values_are_not_checked():

@@ -15,6 +15,7 @@ import tyro
 
 import splatjax as sj
 from splatjax.io import check_room, fingerprint, free_bytes, material_path, own_version
+from splatjax.render import check_displayable
 from splatjax.scene import Parts
 
 from ._options import MaterialName
@@ -123,6 +124,7 @@ class Shot:
                 "--no-albedo shows its own color"
             )
         material = in_color(material)
+        check_displayable(material.channels)
         return material if self.scattering else material.opaque()
 
     def splats_to_show(self) -> sj.Splats:
