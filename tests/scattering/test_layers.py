@@ -1,7 +1,5 @@
 """Slabs and stacks: the image sum, energy, limits, adding, the seam, what is refused."""
 
-from functools import reduce
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -109,43 +107,26 @@ def random_response(key) -> Response:
     return Response(*jax.random.uniform(key, (4, 7), minval=0.0, maxval=0.45))
 
 
-def test_adding_is_associative(float64):
+def test_adding_sums_the_series_and_is_associative(float64):
     a, b, c = (random_response(key) for key in jax.random.split(jax.random.key(3), 3))
     left, right = a.over(b).over(c), a.over(b.over(c))
-    for one, other in zip(jax.tree.leaves(left), jax.tree.leaves(right), strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-12)
-
-
-def test_adding_sums_the_series(float64):
-    a, b = (random_response(key) for key in jax.random.split(jax.random.key(5), 2))
-    bounces = [(b.reflectance_above * a.reflectance_below) ** n for n in range(60)]
-    series = reduce(jnp.add, bounces)
-    both = a.over(b)
-    np.testing.assert_allclose(
-        both.transmittance_down, a.transmittance_down * b.transmittance_down * series, rtol=1e-12
-    )
-    inner = a.transmittance_down * b.reflectance_above * a.transmittance_up * series
+    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-12), left, right)
+    series = sum((b.reflectance_above * a.reflectance_below) ** n for n in range(60))
+    both, through = a.over(b), a.transmittance_down * series
+    np.testing.assert_allclose(both.transmittance_down, through * b.transmittance_down, rtol=1e-12)
+    inner = through * b.reflectance_above * a.transmittance_up
     np.testing.assert_allclose(both.reflectance_above, a.reflectance_above + inner, rtol=1e-12)
 
 
-def test_a_stack_of_one_is_its_layer(float64):
-    slab = layer(*MARBLE_GREEN, 2.0)
-    r = jnp.asarray([0.0, 1.0])
-    stack = LayeredMultipole([slab], eta_above=1.2, eta_below=1.1)
-    np.testing.assert_allclose(
-        stack(r), Multipole(slab, eta_above=1.2, eta_below=1.1)(r), rtol=1e-14
-    )
-    np.testing.assert_allclose(stack.length_scale(), 1 / slab.medium.sigma_t_prime, rtol=1e-14)
-
-
-def test_a_film_of_no_depth_changes_nothing(float64):
-    stack = [layer(0.1, 3.0, 1.4, 0.8), layer(0.02, 2.0, 1.3, INFINITE)]
-    film = Film(0.0)
-    r = jnp.asarray([0.0, 0.5, 3.0])
-    for places in ([film, *stack], [stack[0], film, stack[1]]):
-        np.testing.assert_allclose(
-            LayeredMultipole(places)(r), LayeredMultipole(stack)(r), rtol=1e-12
-        )
+def test_a_stack_of_one_is_its_layer_and_a_film_of_no_depth_changes_nothing(float64):
+    slab, lower = layer(*MARBLE_GREEN, 2.0), layer(0.02, 2.0, 1.3, INFINITE)
+    r, etas = jnp.asarray([0.0, 1.0]), {"eta_above": 1.2, "eta_below": 1.1}
+    one, film = Multipole(slab, **etas), Film(0.0)
+    np.testing.assert_allclose(LayeredMultipole([slab], **etas)(r), one(r), rtol=1e-14)
+    np.testing.assert_allclose(one.length_scale(), 1 / slab.medium.sigma_t_prime, rtol=1e-14)
+    bare = LayeredMultipole([slab, lower])(r)
+    for places in ([film, slab, lower], [slab, film, lower]):
+        np.testing.assert_allclose(LayeredMultipole(places)(r), bare, rtol=1e-12)
 
 
 def test_films_on_each_other_are_one(float64):
