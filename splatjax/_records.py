@@ -32,13 +32,8 @@ Numbers: TypeAlias = ArrayLike | Sequence[Any] | jax.ShapeDtypeStruct
 """Numbers, lists, tuples and arrays: everything that can be read as an array."""
 
 
-def numbers(values: Numbers) -> Any:
+def numbers(values: Numbers | None) -> Any:
     """Mark, as the converter of a field, that it takes numbers of any kind."""
-    return values
-
-
-def optional_numbers(values: Numbers | None) -> Any:
-    """Mark that a field takes numbers of any kind, or `None`."""
     return values
 
 
@@ -51,9 +46,9 @@ def record(cls: Class) -> Class:
     r"""Convert the arguments of a class of records before its `__init__` sees them.
 
     - Fields of `numbers` become strongly typed arrays of floats, in the precision of the first
-      record among the fields, else of the widest array, else JAX's default. A number is repeated
-      along axes whose lengths other fields give; the `channels` of a record among the fields count.
-      An array that lacks its last axis `channels` has one channel.
+      array given, arrays in other records first, else in JAX's default. A number is repeated along
+      axes whose lengths other fields give; the `channels` of a record among the fields count. An
+      array that lacks its last axis `channels` has one channel.
     - Fields of `several` records become tuples.
     - Fields of records are refused when they are records of other classes, or numbers.
 
@@ -69,7 +64,7 @@ def record(cls: Class) -> Class:
         is_tuple = get_origin(field.type) is tuple
         annotation = get_args(field.type)[0] if is_tuple else field.type
         kinds = get_args(annotation) if isinstance(annotation, UnionType) else (annotation,)
-        if field.metadata.get("converter") in (numbers, optional_numbers):
+        if field.metadata.get("converter") is numbers:
             axes[field.name] = kinds[0].dim_str.split()  # ty: ignore[missing-union-attribute]
         elif all(inspect.isclass(kind) and issubclass(kind, _RECORDS) for kind in kinds):
             classes[field.name] = kinds, is_tuple
@@ -77,15 +72,21 @@ def record(cls: Class) -> Class:
     def __init__(self, *args, **kwargs):
         given = signature.bind(*args, **kwargs)
         given.apply_defaults()
-        values = given.arguments
+        values, records = given.arguments, []
         for name, (kinds, is_tuple) in classes.items():
-            if is_tuple:
-                value = values[name]
-                values[name] = tuple(value) if isinstance(value, list | tuple) else (value,)
-            for value in values[name] if is_tuple else (values[name],):
-                _check_class(f"{cls.__name__}.{name}", value, kinds)
-        _convert(cls.__name__, axes, values)
-        initialize(self, **values)
+            is_many = isinstance(values[name], list | tuple)
+            parts = tuple(values[name]) if is_tuple and is_many else (values[name],)
+            for part in parts:
+                if not isinstance(part, kinds) and not _is_placeholder(part):
+                    wanted = " or ".join(
+                        f"{kind.__name__}{inspect.signature(kind)}" for kind in kinds
+                    )
+                    raise ValueError(
+                        f"{cls.__name__}.{name} must be {wanted}; got {type(part).__name__}"
+                    )
+            values[name] = parts if is_tuple else parts[0]
+            records += parts
+        initialize(self, **(values | _converted(cls.__name__, axes, values, records)))
 
     # No annotations here: runtime type checkers would refuse arguments before their conversion.
     own = inspect.Parameter("self", inspect.Parameter.POSITIONAL_OR_KEYWORD)
@@ -97,7 +98,15 @@ def record(cls: Class) -> Class:
 
 def as_floats(values: Numbers, dtype: DTypeLike | None = None, name: str = "values") -> Array:
     """Convert numbers to a strongly typed array of floats, by default in their own precision."""
-    return _as_floats(name, values, dtype or _precision([], [values]))
+    dtype = dtype or _precision(values)
+    if isinstance(values, jax.Array) and values.dtype == dtype and not values.weak_type:
+        return values
+    try:
+        return jnp.asarray(values, dtype)
+    except (TypeError, ValueError):
+        raise ValueError(
+            f"{name} must be numbers, in rows of equal length; got {values!r}"
+        ) from None
 
 
 def check_values(
@@ -120,16 +129,15 @@ def check_values(
 
     **Raises:** `ValueError` with the number of entries that fail, and the first of them.
     """
-    if not isinstance(values, jax.Array | np.ndarray) or isinstance(values, Tracer):
-        return
-    if not getattr(values, "is_fully_addressable", True):
+    is_array = isinstance(values, jax.Array | np.ndarray) and not isinstance(values, Tracer)
+    if not is_array or not values.size or not getattr(values, "is_fully_addressable", True):
         return
 
     def is_good(entries):
         return holds(entries) & (np.isfinite(entries) if finite else ~np.isnan(entries))
 
     known = np.asarray(values)
-    if known.size and not np.all(is_good(np.stack([known.min(), known.max()]))):
+    if not np.all(is_good(np.stack([known.min(), known.max()]))):
         good = is_good(known)
         place = tuple(np.argwhere(~good)[0].tolist())
         raise ValueError(
@@ -147,30 +155,22 @@ def _is_placeholder(value: Any) -> bool:
     return not isinstance(value, known) and not hasattr(value, "__array__")
 
 
-def _is_record(value: Any) -> bool:
-    return isinstance(value, eqx.Module)
-
-
-def _check_class(where: str, value: Any, kinds: tuple[type, ...]) -> None:
-    if not isinstance(value, kinds) and not _is_placeholder(value):
-        wanted = " or ".join(f"{kind.__name__}{inspect.signature(kind)}" for kind in kinds)
-        raise ValueError(f"{where} must be {wanted}; got {type(value).__name__}")
-
-
-def _convert(record: str, annotations: dict[str, list[str]], values: dict[str, Any]) -> None:
-    """Convert the values of all fields of numbers, in place."""
-    given = {name: values[name] for name in annotations if not _is_placeholder(values[name])}
-    parts = jax.tree.leaves(list(values.values()), is_leaf=_is_record)
-    nested = [part for part in parts if _is_record(part)]
-    channels = [part.channels for part in nested if hasattr(part, "channels")]
-    lengths = {"channels": channels[0]} if channels else {}
-    precision = _precision(nested, list(given.values()))
+def _converted(
+    record: str, axes: dict[str, list[str]], values: dict[str, Any], records: list
+) -> dict[str, Array]:
+    """Convert the values of all fields of numbers."""
+    given = {name: values[name] for name in axes if not _is_placeholder(values[name])}
+    precision = _precision([records, list(given.values())])
     arrays = {
-        name: _as_floats(f"{record}.{name}", value, precision) for name, value in given.items()
+        name: as_floats(value, precision, f"{record}.{name}") for name, value in given.items()
     }
+    channels = [part.channels for part in records if hasattr(part, "channels")]
+    lengths = {"channels": channels[0]} if channels else {}
     # Numbers come last, when the lengths of axes are known.
-    for name, array in sorted(arrays.items(), key=lambda item: item[1].ndim == 0):
-        values[name] = _shaped(f"{record}.{name}", array, annotations[name], lengths)
+    return {
+        name: _shaped(f"{record}.{name}", array, axes[name], lengths)
+        for name, array in sorted(arrays.items(), key=lambda item: item[1].ndim == 0)
+    }
 
 
 def _shaped(where: str, array: Array, axes: list[str], lengths: dict[str, int]) -> Array:
@@ -199,27 +199,12 @@ def _shaped(where: str, array: Array, axes: list[str], lengths: dict[str, int]) 
     return array
 
 
-def _as_floats(where: str, value: Any, dtype: Any) -> Array:
-    if isinstance(value, jax.Array) and value.dtype == dtype and not value.weak_type:
-        return value
-    try:
-        return jnp.asarray(value, dtype)
-    except (TypeError, ValueError):
-        raise ValueError(
-            f"{where} must be numbers, in rows of equal length; got {value!r}"
-        ) from None
-
-
-def _precision(records: list, values: list) -> Any:
-    """Choose the precision of floats; single numbers have no say."""
-
-    def of(tree):
-        arrays = [
-            leaf for leaf in jax.tree.leaves(tree) if isinstance(leaf, jax.Array | np.ndarray)
-        ]
-        floats = [array for array in arrays if jnp.issubdtype(array.dtype, jnp.floating)]
-        return [array.dtype for array in floats if not getattr(array, "weak_type", False)]
-
-    dtypes = of(records)[:1] or of(values) or [jnp.result_type(float)]
-    widest = max([np.dtype(np.float32), *dtypes], key=lambda dtype: dtype.itemsize)
-    return jax.dtypes.canonicalize_dtype(widest)
+def _precision(tree: Any) -> Any:
+    """Return the precision of the first array of floats; numbers of other kinds have none."""
+    for leaf in jax.tree.leaves(tree):
+        is_strong = isinstance(leaf, jax.Array | np.ndarray) and not getattr(
+            leaf, "weak_type", False
+        )
+        if is_strong and jnp.issubdtype(leaf.dtype, jnp.floating):
+            return jax.dtypes.canonicalize_dtype(max(leaf.dtype, np.dtype(np.float32)))
+    return jnp.result_type(float)

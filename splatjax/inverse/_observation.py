@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from splatjax._records import Numbers, check_values, numbers, optional_numbers, record, several
+from splatjax._records import Numbers, check_values, numbers, record, several
 from splatjax.scene import AbstractLight, Camera
 
 from ._intensity import AbstractIntensity, KnownIntensity
@@ -39,7 +39,7 @@ class Observation(eqx.Module):
     lights: tuple[AbstractLight, ...] = eqx.field(converter=several)
     mask: Bool[Array, "height width"] | None = eqx.field(converter=_to_mask, default=None)
     deviation: Float[Array, "height width channels"] | None = eqx.field(
-        converter=optional_numbers, default=None
+        converter=numbers, default=None
     )
     intensity: AbstractIntensity = KnownIntensity()
 

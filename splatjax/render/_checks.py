@@ -21,6 +21,8 @@ _CLOSED = 0.15
 """
 _SOLID = 0.05
 """Volume of a body that is no sheet, as a fraction of that of a sphere of its area."""
+_OPAQUE = 2e-3
+"""Millimeters below which a material is meant to be opaque, as `Material.opaque` makes it."""
 _RATIO = 1000.0
 """Size of a body over the distance that light travels below its surface, or the inverse."""
 
@@ -98,10 +100,10 @@ def _doubts(scene: Scene, camera: Camera) -> Iterator[str]:
     variances, weights = (
         np.asarray(x, np.float64) for x in (gaussians.variances, gaussians.weights)
     )
-    if not scene.material.is_opaque and np.all(weights.sum(axis=0) > 0):
+    if np.all(weights.sum(axis=0) > 0):
         reach = np.sqrt(np.max(variances @ weights / weights.sum(axis=0)))
         size = np.linalg.norm(np.ptp(centers, axis=0))
-        if not 1 / _RATIO < size / reach < _RATIO:
+        if reach > _OPAQUE and not 1 / _RATIO < size / reach < _RATIO:
             yield (
                 f"the body is {size:.3g} mm large, and light travels {reach:.3g} mm below its "
                 "surface; check the units (mm), or scale the body by Splats.scaled"

@@ -6,7 +6,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from splatjax._chunking import jit_unless_traced
-from splatjax._records import check_values, numbers, optional_numbers, record
+from splatjax._records import check_values, numbers, record
 from splatjax.gaussians import AbstractProfile
 
 
@@ -33,10 +33,8 @@ class Tabulated(AbstractProfile):
 
     radii: Float[Array, " samples"] = eqx.field(converter=numbers)
     values: Float[Array, "samples channels"] = eqx.field(converter=numbers)
-    deviation: Float[Array, "samples channels"] | None = eqx.field(
-        converter=optional_numbers, default=None
-    )
-    total: Float[Array, " channels"] | None = eqx.field(converter=optional_numbers, default=None)
+    deviation: Float[Array, "samples channels"] | None = eqx.field(converter=numbers, default=None)
+    total: Float[Array, " channels"] | None = eqx.field(converter=numbers, default=None)
 
     def __check_init__(self):
         check_values("Tabulated.radii", self.radii, "at least 0 (mm)", lambda x: x >= 0)

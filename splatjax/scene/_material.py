@@ -2,7 +2,6 @@
 
 import equinox as eqx
 import jax.numpy as jnp
-from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from splatjax._records import check_values, numbers, record
@@ -44,12 +43,6 @@ class Material(eqx.Module):
     @property
     def channels(self) -> int:
         return self.gaussians.channels
-
-    @property
-    def is_opaque(self) -> bool:
-        """Whether this is the result of `opaque()`; False for traced variances."""
-        variances = self.gaussians.variances
-        return not isinstance(variances, Tracer) and bool(jnp.all(variances <= _NARROW))
 
     def total_reflectance(self) -> Float[Array, " channels"]:
         """Compute the fraction of the light entering a flat piece along its normal that leaves it

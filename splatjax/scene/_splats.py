@@ -6,7 +6,7 @@ from typing import TypeAlias
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from splatjax._records import check_values, numbers, optional_numbers, record
+from splatjax._records import check_values, numbers, record
 
 _ROUNDING = 1e-5
 """By which an albedo may leave [0, 1]."""
@@ -42,11 +42,9 @@ class Splats(eqx.Module):
     normals: Float[Array, "splats 3"] = eqx.field(converter=numbers)
     radii: Float[Array, " splats"] = eqx.field(converter=numbers)
     areas: Float[Array, " splats"] = eqx.field(converter=numbers)
-    albedo: Float[Array, "splats channels"] | None = eqx.field(
-        converter=optional_numbers, default=None
-    )
-    specular: Float[Array, " splats"] | None = eqx.field(converter=optional_numbers, default=None)
-    roughness: Float[Array, " splats"] | None = eqx.field(converter=optional_numbers, default=None)
+    albedo: Float[Array, "splats channels"] | None = eqx.field(converter=numbers, default=None)
+    specular: Float[Array, " splats"] | None = eqx.field(converter=numbers, default=None)
+    roughness: Float[Array, " splats"] | None = eqx.field(converter=numbers, default=None)
 
     def __check_init__(self):
         for name in ("centers", "normals"):
