@@ -68,7 +68,7 @@ class AbstractVariances(eqx.Module):
         """Fit the Gaussians of a profile. Differentiable."""
 
 
-class Held(AbstractVariances):
+class FixedVariances(AbstractVariances):
     """The same for all media."""
 
     variances: Float[Array, " gaussians"]
@@ -77,7 +77,7 @@ class Held(AbstractVariances):
         return fit_weights(profile, self.variances, weights=weights)
 
 
-class Fitted(AbstractVariances):
+class FittedVariances(AbstractVariances):
     """Those of the best fit to each medium: variances and weights move together."""
 
     near: Float[Array, " gaussians"]
@@ -111,14 +111,16 @@ class RecoveryProblem(eqx.Module):
         """Compute residuals whose squares are the losses."""
         return self.loss.root((self.radiance(point) - self.observed) / self.deviation)
 
-    def handover_slopes(self, point: Float[Array, " unknowns"]) -> Float[Array, "channels pixels"]:
-        """Differentiate the residuals in the logarithm of the widths below which the renderer hands
-        layers to the surface.
+    def resolution_slopes(
+        self, point: Float[Array, " unknowns"]
+    ) -> Float[Array, "channels pixels"]:
+        """Differentiate the residuals in the logarithm of the widths below which layers are
+        unresolved.
         """
 
         def moved(by: Float[Array, ""]) -> Float[Array, "channels pixels"]:
             return eqx.tree_at(
-                lambda its: its.pictures.light.interval,
+                lambda problem: problem.pictures.light.interval,
                 self,
                 replace_fn=lambda at: at * jnp.exp(by),
             ).residuals(point)
@@ -127,8 +129,8 @@ class RecoveryProblem(eqx.Module):
         return jax.jvp(moved, (zero,), (zero + 1,))[1]
 
 
-class Found(eqx.Module):
-    """Where a search ended."""
+class SearchEnd(eqx.Module):
+    """The end of a search."""
 
     point: Float[Array, " unknowns"]
     cost: Float[Array, ""]
@@ -137,8 +139,8 @@ class Found(eqx.Module):
 
 
 @eqx.filter_jit
-def search(problem: RecoveryProblem, start: Float[Array, " unknowns"]) -> Found:
-    """Minimize the loss from a start: Levenberg and Marquardt's method."""
+def search(problem: RecoveryProblem, start: Float[Array, " unknowns"]) -> SearchEnd:
+    """Minimize the loss from a start by the Levenberg-Marquardt method."""
     tolerance = 1e-4 if start.dtype == jnp.float32 else 1e-7
     # In units of the start's own residual, so that damping and tolerances mean the same for any
     # noise and number of pixels.
@@ -148,24 +150,22 @@ def search(problem: RecoveryProblem, start: Float[Array, " unknowns"]) -> Found:
         return problem.residuals(point) / unit
 
     solver = optx.LevenbergMarquardt(rtol=tolerance, atol=tolerance)
-    found = optx.least_squares(residuals, solver, start, problem, max_steps=_STEPS, throw=False)
-    cost = jnp.sum(problem.residuals(found.value) ** 2)
-    steps = jnp.asarray(found.stats["num_steps"])
-    return Found(
-        found.value, cost, steps, (found.result == optx.RESULTS.successful) & jnp.isfinite(cost)
-    )
+    end = optx.least_squares(residuals, solver, start, problem, max_steps=_STEPS, throw=False)
+    cost = jnp.sum(problem.residuals(end.value) ** 2)
+    converged = (end.result == optx.RESULTS.successful) & jnp.isfinite(cost)
+    return SearchEnd(end.value, cost, jnp.asarray(end.stats["num_steps"]), converged)
 
 
 class Solution(eqx.Module):
-    """What is known at a point.
+    """The solution at a point, and how well it is known.
 
     **Attributes:**
 
     - `information`: the inverse of the covariance that noise of the given deviations leaves
       (Laplace, by Gauss and Newton); after the unknowns come, channel by channel, the logarithms of
-      the widths below which layers are handed to the surface.
+      the widths below which layers are unresolved.
     - `gaussians`, `radiance`: of the point.
-    - `unresolved`: the share of the light of each channel in layers that the splats do not carry.
+    - `unresolved`: the fraction of the light of each channel in unresolved layers.
     """
 
     information: Float[Array, "all all"]
@@ -176,8 +176,8 @@ class Solution(eqx.Module):
 
 @eqx.filter_jit
 def solution(problem: RecoveryProblem, point: Float[Array, " unknowns"]) -> Solution:
-    """Give what is known at a point: the picture, and how sharply residuals tell each unknown and
-    the handover.
+    """Compute the picture at a point, and the information about each unknown and the transition to
+    unresolved layers.
     """
 
     def residuals(point):
@@ -185,11 +185,9 @@ def solution(problem: RecoveryProblem, point: Float[Array, " unknowns"]) -> Solu
         return problem.residuals(point), (gaussians, radiance)
 
     slopes, (gaussians, radiance) = jax.jacfwd(residuals, has_aux=True)(point)
-    handover = (
-        problem.handover_slopes(point)[..., None]
-        * jnp.eye(slopes.shape[0], dtype=slopes.dtype)[:, None]
-    )
-    slopes = jnp.concatenate([slopes, handover], axis=-1)
+    channels = jnp.eye(slopes.shape[0], dtype=slopes.dtype)[:, None]
+    resolution = problem.resolution_slopes(point)[..., None] * channels
+    slopes = jnp.concatenate([slopes, resolution], axis=-1)
     unresolved = (
         (1 - problem.pictures.light.resolved()) @ gaussians.weights / gaussians.total_reflectance()
     )

@@ -22,7 +22,7 @@ from ._evidence import Evidence
 from ._flat import Gatherer, wide_variances
 from ._losses import AbstractLoss, SquaredLoss
 from ._observation import Observation, check_channels
-from ._problem import Fitted, Held, default_weights, search, solution
+from ._problem import FittedVariances, FixedVariances, default_weights, search, solution
 from ._recovery import Recovery
 
 _FINE = RenderSettings(diffuser=ClusterDiffuser(error=2.5e-4))
@@ -98,8 +98,8 @@ def recover(
     gatherer = Gatherer(
         splats,
         settings,
-        [each.camera for each in observations],
-        [each.lights for each in observations],
+        [one.camera for one in observations],
+        [one.lights for one in observations],
     )
     wide = _unweighed(wide_variances(starts, splats), len(starts[0].eta))
     surface = (
@@ -115,7 +115,7 @@ def recover(
         f"rendering {len(wide.variances)} layers of {counted(len(observations), 'picture')}",
         starts[0],
     )
-    problem, _ = problem_of(gatherer.held(surface), Held(wide.variances))
+    problem, _ = problem_of(gatherer.held(surface), FixedVariances(wide.variances))
     report(
         f"searching from {counted(len(starts), 'start')} among {problem.observed.shape[1]} pixels",
         starts[0],
@@ -135,14 +135,15 @@ def recover(
         fitted = fit_gaussians(model(medium), count, weights=weights, throw=False).gaussians
         surface = surface.surface_of(_unweighed(fitted.variances, len(medium.eta)))
         gathered, plans = gatherer.moving(surface, plans)
-        problem, numbers = problem_of(gathered, Fitted(fitted.variances))
+        problem, numbers = problem_of(gathered, FittedVariances(fitted.variances))
         before, best = best.point, search(problem, best.point)
         steps += int(best.steps)
         reached = solution(problem, best.point)
         chi_squared = best.cost / max(problem.observed.size - best.point.size, 1)
         scale = 1.0 if evidence.noise_is_known else float(chi_squared)
-        told = np.asarray(reached.information, np.float64)[: best.point.size, : best.point.size]
-        deviations = np.sqrt(np.diagonal(inverse(told) * scale))
+        size = best.point.size
+        information = np.asarray(reached.information, np.float64)[:size, :size]
+        deviations = np.sqrt(np.diagonal(inverse(information) * scale))
         settled = bool(best.converged) and bool(
             np.all(np.abs(best.point - before) <= np.maximum(_SETTLED, 0.1 * deviations))
         )

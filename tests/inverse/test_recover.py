@@ -21,7 +21,7 @@ from splatjax.diffusion import (
 )
 from splatjax.inverse._evidence import Evidence
 from splatjax.inverse._flat import FlatPictures
-from splatjax.inverse._problem import Held, RecoveryProblem, Unknowns, search, solution
+from splatjax.inverse._problem import FixedVariances, RecoveryProblem, Unknowns, search, solution
 from splatjax.splatting import DenseRasterizer
 
 PLAIN = sj.RenderSettings(
@@ -244,7 +244,14 @@ def half_resolved() -> RecoveryProblem:
         Unknowns(medium().eta, jnp.zeros((1, 2), jnp.int32)),
     )
     return RecoveryProblem(
-        flat, noise, noise, unknowns, Held(light.variances), sj.SquaredLoss(), HELD, sj.Dipole
+        flat,
+        noise,
+        noise,
+        unknowns,
+        FixedVariances(light.variances),
+        sj.SquaredLoss(),
+        HELD,
+        sj.Dipole,
     )
 
 
