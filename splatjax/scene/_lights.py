@@ -152,7 +152,7 @@ class StackedLights(eqx.Module):
     places: tuple[int, ...] = eqx.field(static=True)
 
     def apart(self) -> list[AbstractLight]:
-        """Give them one by one."""
+        """Return the lights one by one."""
         return [
             jax.tree.map(lambda leaf, i=i: leaf[i], self.lights) for i in range(len(self.places))
         ]
@@ -178,7 +178,7 @@ def sum_over_lights(
     contribution: Callable[[AbstractLight, Array | None], Array],
     start: Array,
 ) -> Array:
-    """Add up what lights contribute, one after the other; backward, each is computed again.
+    """Add up the contributions of lights, one after the other; backward, each is recomputed.
 
     **Arguments:**
 

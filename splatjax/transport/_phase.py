@@ -22,7 +22,7 @@ class AbstractPhaseFunction(eqx.Module):
 
     @abc.abstractmethod
     def anisotropy(self, layers: int, dtype) -> Float[Array, " layers"]:
-        """Give the mean cosine `g` of each layer."""
+        """Return the mean cosine `g` of each layer."""
 
     @abc.abstractmethod
     def scatter(
@@ -32,7 +32,7 @@ class AbstractPhaseFunction(eqx.Module):
         xi_cosine: Float[Array, " photons"],
         xi_angle: Float[Array, " photons"],
     ) -> Direction:
-        """Give new unit directions from old ones, by two uniform random numbers in (0, 1) each."""
+        """Draw new unit directions by two uniform random numbers in (0, 1) each."""
 
 
 class Isotropic(AbstractPhaseFunction):
@@ -109,7 +109,7 @@ class HenyeyGreenstein(AbstractPhaseFunction):
 def on_circle(
     xi: Float[Array, " photons"],
 ) -> tuple[Float[Array, " photons"], Float[Array, " photons"]]:
-    """Give a point of the unit circle for each number in (0, 1]; right to 1e-10.
+    """Compute a point of the unit circle for each number in (0, 1]; right to 1e-10.
 
     Series for a quarter of a turn, and the double angle: a library's sine is made for arguments of
     any size, and slow.
