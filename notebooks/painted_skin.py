@@ -40,7 +40,7 @@ from splatjax.plots import plot_pictures
 from splatjax.splatting import DenseRasterizer
 
 SPLATS, SIZE, COUNT, STEPS, NOISE = 700, 30, 3, 30, 0.01
-HELD = sj.NonNegativeWeights(sj.TotalReflectanceHeld())
+HELD = sj.NonNegativeWeights(sj.FixedTotalReflectance())
 # Every splat at every pixel: for small pictures. Leave `settings` out for large ones.
 settings = sj.RenderSettings(rasterizer=DenseRasterizer(), diffuser=DenseDiffuser())
 
@@ -116,7 +116,7 @@ off = [
     np.asarray(getattr(found.medium, name)) / np.asarray(getattr(skin, name)) - 1
     for name in ("sigma_a", "sigma_s_prime")
 ]
-print(found.words())
+print(found.summary())
 print(f"sigma_a off by {(100 * off[0]).round(1)}%, sigma_s' by {(100 * off[1]).round(1)}%")
 
 # %%

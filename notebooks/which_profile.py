@@ -110,7 +110,7 @@ for name in media:
 # %%
 with jax.enable_x64(True):
     beam = sj.PhotonBeam(sj.Medium(*(jnp.asarray([x]) for x in media["marble, green"])))
-    fitted = sj.fit_gaussians(beam, 4, rule=sj.NORM_RULE.beyond(1.0))
+    fitted = sj.fit_gaussians(beam, 4, rule=sj.L2_QUADRATURE.beyond(1.0))
     error = float(fitted.error[0])
 print("E beyond one mean free path", round(error, 4))
 
@@ -122,7 +122,7 @@ print("E beyond one mean free path", round(error, 4))
 photons = truth["marble, green"]
 with jax.enable_x64(True):
     profile = jax.tree.map(lambda leaf: leaf.astype(jnp.float64), photons.profile())
-    rule, held = sj.InverseVariance(sj.NORM_RULE.beyond(0.2)), sj.TotalReflectanceHeld()
+    rule, held = sj.InverseVariance(sj.L2_QUADRATURE.beyond(0.2)), sj.FixedTotalReflectance()
     true_fit = sj.fit_gaussians(profile, 5, weights=held, rule=rule, throw=False)
     energy = float(true_fit.energy_error[0])
 print("weights", np.asarray(true_fit.gaussians.weights)[:, 0].round(4), "energy error", energy)

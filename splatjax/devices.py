@@ -34,8 +34,8 @@ class Devices(eqx.Module):
         return jax.lax.axis_index(self.axes)
 
     def largest(self, parts: Parts) -> Parts:
-        """Give the largest of what the devices found. A constant of the derivative: `lax.pmax` has
-        none.
+        """Return the largest of the values of all devices. A constant of the derivative: `lax.pmax`
+        has none.
         """
         return jax.tree.map(lambda part: jax.lax.pmax(stop_gradient(part), self.axes), parts)
 
@@ -56,7 +56,7 @@ class Devices(eqx.Module):
         )
 
     def extreme(self, values: Float[Array, "rows *more"], largest: bool) -> Float[Array, "*more"]:
-        """Give the largest (or the least) of all rows. Rows that are share the derivative, as for
+        """Return the largest (or the least) of all rows. Equal rows share the derivative, as for
         `jnp.max`.
         """
         sign = 1 if largest else -1

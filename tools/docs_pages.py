@@ -45,7 +45,6 @@ PACKAGES = (
     "exports",
     "io",
     "plots",
-    "pointwise",
     "devices",
 )
 _LINK = re.compile(r"(\]\()([^)#\s]+)(#[^)\s]*)?(\))")

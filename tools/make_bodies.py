@@ -139,10 +139,10 @@ def models() -> dict[str, tuple[sj.Material, sj.RenderSettings]]:
 
 def material(profile: sj.Tabulated, single: sj.SingleScattering | None = None) -> sj.Material:
     """Fit six Gaussians to a reflectance, its total held; the surface itself reflects nothing."""
-    weights = sj.NonNegativeWeights(sj.TotalReflectanceHeld())
+    weights = sj.NonNegativeWeights(sj.FixedTotalReflectance())
     with jax.enable_x64(True):
         profile = jax.tree.map(lambda leaf: leaf.astype(jnp.float64), profile)
-        rule = sj.NORM_RULE.beyond(0.2 / SIGMA_T)
+        rule = sj.L2_QUADRATURE.beyond(0.2 / SIGMA_T)
         gaussians = sj.fit_gaussians(profile, 6, weights=weights, rule=rule).gaussians
     gaussians = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), gaussians)
     return sj.Material(gaussians, eta=1.0, specular=0.0, single_scattering=single)

@@ -23,7 +23,7 @@ from splatjax.geometry import Mesh, sample_mesh, vertex_normals
 from splatjax.io import linear_to_srgb
 
 FOLDER = Path(__file__).resolve().parents[1] / "out" / "gallery"
-HELD = sj.NonNegativeWeights(sj.TotalReflectanceHeld())
+HELD = sj.NonNegativeWeights(sj.FixedTotalReflectance())
 WARM, BLUE = (1.0, 0.97, 0.92), (0.8, 0.9, 1.0)
 
 
@@ -216,7 +216,7 @@ def inverse(_: sj.Splats, side: int) -> np.ndarray:
     with jax.enable_x64(True):
         observation = sj.Observation(photograph, camera, lights, deviation=deviation)
         recovery = sj.recover([observation], splats, start, progress=lambda what, _: print(what))
-    print(recovery.words())
+    print(recovery.summary())
     for name in ("sigma_a", "sigma_s_prime"):
         ratio = np.asarray(getattr(recovery.medium, name)) / np.asarray(getattr(marble, name))
         print(f"{name} off by", ratio - 1)

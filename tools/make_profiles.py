@@ -33,7 +33,7 @@ SETTINGS = {
 def fit_material(name: str) -> sj.FitResult:
     """Return the fit that a material is shipped with."""
     with jax.enable_x64(True):
-        weights = sj.NonNegativeWeights(sj.TotalReflectanceHeld())
+        weights = sj.NonNegativeWeights(sj.FixedTotalReflectance())
         return sj.fit_gaussians(sj.load_profile(name), COUNT, weights=weights)
 
 

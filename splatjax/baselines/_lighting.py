@@ -5,8 +5,8 @@ import numpy as np
 import scipy  # its parts are loaded where they are used, which takes a third of a second
 from jaxtyping import Array, Float
 
+from splatjax._chunking import map_chunks
 from splatjax.geometry import tangent_frames
-from splatjax.pointwise import in_parts
 from splatjax.render import AbstractLighting, LightOnSplats, entering_light, surface_attributes
 from splatjax.scene import Scene, Splats, StackedLights
 from splatjax.shading import unit_normals
@@ -27,7 +27,7 @@ class LightAtPixels(AbstractLighting):
         def lit(points, named):
             return _lit(scene, groups, points, named)
 
-        return in_parts(lit, points, named, at_once=TILES_AT_ONCE)
+        return map_chunks(lit, points, named, at_once=TILES_AT_ONCE)
 
 
 class NormalFields(LightAtPixels):

@@ -10,10 +10,10 @@ import optimistix as optx
 import tyro
 
 import splatjax as sj
+from splatjax._format import channel_names, counted
 from splatjax.fitting import AbstractWeights
 from splatjax.io import own_version, read_picture, surface_and_source
 from splatjax.scattering import measure_laser_dot
-from splatjax.words import channel_names, counted
 
 from ._fit_all import fit_all
 from ._models import Model, Reference, reference
@@ -188,7 +188,7 @@ class Fit:
             return sj.FreeWeights(), "free"
         if measured:
             return sj.NonNegativeWeights(sj.FreeWeights()), "non-negative"
-        held = sj.NonNegativeWeights(sj.TotalReflectanceHeld())
+        held = sj.NonNegativeWeights(sj.FixedTotalReflectance())
         return held, "non-negative, sum held to the total reflectance"
 
     def _fitted(self, target: Reference, weights: AbstractWeights) -> sj.FitResult:
@@ -247,7 +247,7 @@ class Fit:
         sj.save_material(
             material,
             output,
-            profile=profile,  # ty: ignore[invalid-argument-type]
+            profile=profile,
             source=source,
             fit=settings,
         )

@@ -26,7 +26,7 @@ class Reference:
     """
 
     profile: sj.AbstractProfile
-    rule: AbstractRadialRule = sj.NORM_RULE
+    rule: AbstractRadialRule = sj.L2_QUADRATURE
     single: sj.SingleScattering | None = None
     description: str | None = None
 
@@ -52,7 +52,7 @@ def reference(
         raise ValueError(f"--cut has no effect on {option}, which is finite at the origin")
     if single_scattering and model not in ("photon-beam", "monte-carlo"):
         raise ValueError(f"{option} is not possible; take photon-beam or monte-carlo")
-    beyond = sj.NORM_RULE.beyond(_CUT if cut is None else cut)
+    beyond = sj.L2_QUADRATURE.beyond(_CUT if cut is None else cut)
     if isinstance(coefficients, sj.LayeredMultipole):
         if model == "dipole":
             return Reference(coefficients)

@@ -12,6 +12,7 @@ import optimistix as optx
 import tyro
 
 import splatjax as sj
+from splatjax._format import counted
 from splatjax.io import (
     fingerprint,
     material_path,
@@ -20,7 +21,6 @@ from splatjax.io import (
     read_record,
     write_record,
 )
-from splatjax.words import counted
 
 from ._options import (
     FIGURES,
@@ -144,7 +144,7 @@ class Recover:
                 "where it stopped, or --start names materials that are nearer"
             )
         note(f"{time.perf_counter() - begin:6.1f} s  found, after {effort}")
-        print(recovery.words())
+        print(recovery.summary())
         if self.suggest:
             self._suggest(recovery, observations, splats)
         self._save(recovery)
@@ -193,7 +193,7 @@ class Recover:
         self, recovery: sj.Recovery, observations: list[sj.Observation], splats: sj.Splats
     ) -> None:
         first = observations[0]
-        candidates = sj.usual_candidates(splats, first.camera, first.picture.shape[2])
+        candidates = sj.default_candidates(splats, first.camera, first.picture.shape[2])
         with stage(f"looking at {len(candidates)} pictures that could be taken next"):
             predictions = sj.next_pictures(recovery, splats, candidates, model=_MODELS[self.model])
         print("what one more picture would do, the best first:")

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from splatjax.pointwise import zeros_after
+from splatjax._chunking import zeros_after
 
 _FADING = 0.5  # of the exponent, before its largest
 

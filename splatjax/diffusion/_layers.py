@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from splatjax.pointwise import in_parts
+from splatjax._chunking import map_chunks
 from splatjax.scene import Material
 from splatjax.splatting import TILES_AT_ONCE, Atlas
 
@@ -132,7 +132,7 @@ def exitance_jacobian(
 
 
 def _in_parts(function, *trees):
-    return in_parts(function, *trees, at_once=TILES_AT_ONCE)
+    return map_chunks(function, *trees, at_once=TILES_AT_ONCE)
 
 
 def _tiles_first(found):

@@ -3,6 +3,7 @@ here.
 """
 
 from ._batches import map_over as map_over
+from ._checks import check_displayable as check_displayable, check_scene as check_scene
 from ._gathered import (
     gather_picture as gather_picture,
     gather_picture_and_slopes as gather_picture_and_slopes,

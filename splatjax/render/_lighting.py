@@ -52,7 +52,7 @@ def entering_light(
         return (
             share[None]
             if material.single_scattering is None
-            else share[None] * material.left_to_diffuse(cosine).T
+            else share[None] * material.diffuse_fraction(cosine).T
         )
 
     channels = material.gaussians.weights.shape[1]

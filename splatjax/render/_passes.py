@@ -11,8 +11,8 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float
 
 from splatjax import diffusion as _diffusion, shading as _shading, splatting as _splatting
+from splatjax._chunking import map_chunks
 from splatjax.devices import Devices
-from splatjax.pointwise import in_parts
 from splatjax.scene import Camera, Frame, Scene, Splats, StackedLights, stack_lights
 
 from ._lighting import LightOnSplats, let_light_in
@@ -187,7 +187,7 @@ def shade(
     def shaded(points, depth, covered, named, layers):
         return _shade(scene, view, groups, points, depth, covered, named, layers)
 
-    return in_parts(
+    return map_chunks(
         shaded,
         seen.points,
         seen.depth,

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from splatjax._chunking import AT_ONCE, jit_unless_traced
 from splatjax.devices import Devices
-from splatjax.pointwise import AT_ONCE, one_program
 
 from ._bins import SIDE, TileGrid
 from ._rasterizer import FragmentSums, SummedFragments
@@ -63,7 +63,7 @@ class Atlas(eqx.Module):
     """Factor of every picture: 1, or NaN."""
 
     @classmethod
-    @one_program
+    @jit_unless_traced
     def of(
         cls, farthest: Float[Array, "surfaces down across"], view: AbstractView, room: int
     ) -> "Atlas":

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Float
 
-from splatjax.pointwise import AT_ONCE, in_parts, one_program
+from splatjax._chunking import AT_ONCE, jit_unless_traced, map_chunks
 from splatjax.scene import Splats
 
 from ._bins import TileGrid
@@ -54,7 +54,7 @@ class Bounds(eqx.Module):
     radius: Float[Array, ""]
 
     @classmethod
-    @one_program
+    @jit_unless_traced
     def of(cls, splats: Splats) -> "Bounds":
         if splats.count == 0:
             return cls(jnp.zeros(3, splats.centers.dtype), jnp.ones((), splats.centers.dtype))
@@ -183,9 +183,9 @@ def lit_share(
         return jnp.stack([x, y, depth, across / facing, down / facing], axis=1)
 
     # Where splats land is kept: each of nine comparisons, and each of their derivatives, reads it.
-    landed = in_parts(land, splats.centers, splats.normals)
+    landed = map_chunks(land, splats.centers, splats.normals)
     # Large parts: for each, the way back adds to the whole map.
-    return in_parts(
+    return map_chunks(
         lambda part: _compared(part.T, view, flat, settings), landed, at_once=4 * AT_ONCE
     )
 

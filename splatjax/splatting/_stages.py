@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from splatjax.pointwise import zeros_after
+from splatjax._chunking import zeros_after
 
 from ._bins import SIDE, Bins
 from ._rasterizer import FragmentSums

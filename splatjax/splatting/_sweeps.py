@@ -15,7 +15,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from splatjax.pointwise import zeros_after
+from splatjax._chunking import zeros_after
 
 from ._bins import SIDE, Bins, TileGrid, scatter_slots, slot_plane
 from ._kernel import fast_fragment_weight, fragment_weight_derivative

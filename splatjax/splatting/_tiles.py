@@ -11,7 +11,7 @@ from jax import lax
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
-from splatjax.pointwise import in_parts
+from splatjax._chunking import map_chunks
 from splatjax.scene import Splats
 
 from ._bins import BinCapacity, Bins, TileGrid, bin_items, round_up
@@ -124,7 +124,7 @@ class TileRasterizer(AbstractRasterizer):
             ),
             splats,
         )
-        footprints = in_parts(lambda part: view.footprints(part, settings), splats)
+        footprints = map_chunks(lambda part: view.footprints(part, settings), splats)
         bins = bin_items(footprints.ranges(grid), grid, self.capacity.bins)
         bins = eqx.tree_at(
             lambda b: b.needed, bins, jnp.maximum(bins.needed, seen / self.capacity.splats)

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from splatjax.pointwise import in_parts, one_program, zeros_after
+from splatjax._chunking import jit_unless_traced, map_chunks, zeros_after
 
 
 def squares_and_lengths(scale, record):
@@ -31,7 +31,7 @@ def test_parts_give_what_the_whole_gives(at_once):
         return jnp.sum(jnp.sin(found["scaled"])) + jnp.sum(found["length"] ** 2), found
 
     def parts(function, tree):
-        return in_parts(function, tree, at_once=at_once)
+        return map_chunks(function, tree, at_once=at_once)
 
     def whole(function, tree):
         return function(tree)
@@ -59,7 +59,7 @@ def test_a_part_that_is_filled_up_adds_nothing():
     points = jnp.ones((5, 3))
     slope = jax.jit(
         jax.grad(
-            lambda p: jnp.sum(in_parts(lambda part: jnp.linalg.norm(part, axis=1), p, at_once=3))
+            lambda p: jnp.sum(map_chunks(lambda part: jnp.linalg.norm(part, axis=1), p, at_once=3))
         )
     )(points)
     np.testing.assert_allclose(np.asarray(slope), 1 / np.sqrt(3), rtol=1e-6)
@@ -75,12 +75,12 @@ def test_zeros_wait_for_what_must_be_known_and_are_zeros_whatever_it_is():
 
 
 class Curve(eqx.Module):
-    @one_program
+    @jit_unless_traced
     def __call__(self, x):
         return jnp.sin(3 * x) * x + jnp.cos(x) / (1 + x * x)
 
 
-def test_what_is_one_program_compiles_once_and_is_a_method_as_any_other():
+def test_a_compiled_function_compiles_once_and_binds_as_a_method():
     compiled, x = [], jnp.linspace(0.0, 1.0, 23)
 
     def listen(event, duration, **_):
