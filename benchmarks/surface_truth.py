@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 import splatjax as sj
-from splatjax import rivals
+from splatjax import baselines
 from splatjax.diffusion import AbstractNormalization
 
 REACH = 5.5  # standard deviations; what lies beyond is 3e-7 of the power
@@ -63,7 +63,7 @@ def cut(pieces: int) -> np.ndarray:
 
 @jax.jit
 def _entering(mesh, light, material, faces, shares):
-    points, _ = rivals.surface_points(mesh, faces, shares)
+    points, _ = baselines.surface_points(mesh, faces, shares)
     albedo = jnp.ones_like(points.centers) if points.albedo is None else points.albedo
     return points.centers, points.normals, light.entering(points, material).source.T, albedo
 
@@ -83,8 +83,8 @@ def looked_at(mesh, light, material, faces: np.ndarray, shares: np.ndarray) -> l
 
 
 def integrate(
-    mesh: rivals.TexturedMesh,
-    light: rivals.MeshLight,
+    mesh: baselines.TexturedMesh,
+    light: baselines.MeshLight,
     material: sj.Material,
     faces: np.ndarray,
     shares: np.ndarray,

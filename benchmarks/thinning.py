@@ -14,10 +14,10 @@ import numpy as np
 
 import splatjax as sj
 from splatjax import diffusion
+from splatjax.baselines import layer_contrast
 from splatjax.diffusion._gathering import Gathering
 from splatjax.diffusion._tree import ClusterTree
 from splatjax.render import light_on_splats
-from splatjax.rivals import layer_contrast
 
 from .scenes import columns
 

@@ -32,7 +32,7 @@ from splatjax.plots import plot_recovery
 from splatjax.splatting import DenseRasterizer, ShadowSettings
 
 SIZE, COUNT, NOISE = 40, 4, 0.01
-HELD = sj.NonNegativeWeights(sj.TotalReflectanceHeld())
+HELD = sj.NonNegativeWeights(sj.FixedTotalReflectance())
 # Every splat at every pixel, and coarse shadows: for small pictures. Leave `settings` out for large
 # ones.
 shadows = ShadowSettings(resolution=48, bias=1.0, softness=2.0)
@@ -41,8 +41,8 @@ settings = sj.RenderSettings(
 )
 
 
+# The bust, eight times smaller, without its map: color comes from the coefficients alone.
 def figurine(count: int) -> sj.Splats:
-    """The bust, eight times smaller, without its map: color comes from the coefficients alone."""
     bust = sj.bust(count)
     return sj.Splats(bust.centers / 8, bust.normals, bust.radii / 8, bust.areas / 64)
 
@@ -79,7 +79,7 @@ with jax.enable_x64(True):
         photograph, camera, (lamp,), deviation=np.full(photograph.shape, deviation)
     )
     found = sj.recover([taken], splats, start, count=COUNT, settings=settings)
-print(found.words())
+print(found.summary())
 print(f"{found.rounds} rounds, {found.steps} steps; chi-squared {float(found.chi_squared):.3f}")
 
 # %%
@@ -114,7 +114,7 @@ print(
 )
 with jax.enable_x64(True):
     predictions = sj.next_pictures(
-        found, splats, sj.usual_candidates(splats, camera), settings=settings
+        found, splats, sj.default_candidates(splats, camera), settings=settings
     )
 for prediction in predictions:
     print(prediction)

@@ -12,8 +12,8 @@ from .fitting import (
 from .fitting import error_by_count as error_by_count, LeastCount as LeastCount
 from .fitting import fit_weights as fit_weights
 from .fitting import FreeWeights as FreeWeights, NonNegativeWeights as NonNegativeWeights
-from .fitting import TotalReflectanceHeld as TotalReflectanceHeld
-from .fitting import GivenVariances as GivenVariances, InsertedGaussians as InsertedGaussians
+from .fitting import FixedTotalReflectance as FixedTotalReflectance
+from .fitting import GivenVariances as GivenVariances, GreedyInsertion as GreedyInsertion
 from .fitting import SharedVariances as SharedVariances, VariancesPerChannel as VariancesPerChannel
 from .gaussians import AbstractProfile as AbstractProfile, SumOfGaussians as SumOfGaussians
 from .geometry import bust as bust, bust_mesh as bust_mesh
@@ -39,7 +39,7 @@ from .scattering import (
 )
 from .scattering import (
     InverseVariance as InverseVariance,
-    NORM_RULE as NORM_RULE,
+    L2_QUADRATURE as L2_QUADRATURE,
     RadialRule as RadialRule,
     SingleScattering as SingleScattering,
     Tabulated as Tabulated,
@@ -89,7 +89,7 @@ from .inverse import (
 from .inverse import (
     Candidate as Candidate,
     next_pictures as next_pictures,
-    usual_candidates as usual_candidates,
+    default_candidates as default_candidates,
 )
 from .inverse import AlbedoMap as AlbedoMap, CameraPoses as CameraPoses, LightPlaces as LightPlaces
 from .inverse import LightStrengths as LightStrengths, NormalOffsets as NormalOffsets

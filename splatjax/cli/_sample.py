@@ -9,7 +9,7 @@ import tyro
 import splatjax as sj
 
 from ._mesh_maps import MeshMaps
-from ._outputs import check_output
+from ._options import check_output
 from ._report import note, stage
 
 

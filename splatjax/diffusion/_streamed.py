@@ -121,8 +121,10 @@ class StreamedDiffusion:
             for count, had in zip(tree.counts, self.counts, strict=True)
         )
         levels = _levels(tree.with_capacity(self.counts), sources)
-        return [None if each is None else self._sum_layer(i, each, levels)
-                for i, each in enumerate(self.layers)]
+        return [
+            None if each is None else self._sum_layer(i, each, levels)
+            for i, each in enumerate(self.layers)
+        ]
 
     def _sum_layer(self, i: int, layer: _Layer, levels: list[Clusters]) -> Array:
         clusters = levels[self.cells.index(layer.edge) + 1 if layer.edge else 0]

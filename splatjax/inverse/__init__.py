@@ -19,7 +19,7 @@ from ._losses import (
     SquaredLoss as SquaredLoss,
 )
 from ._next import Candidate as Candidate, Prediction as Prediction, next_pictures as next_pictures
-from ._next import usual_candidates as usual_candidates
+from ._next import default_candidates as default_candidates
 from ._observation import Observation as Observation
 from ._offsets import NormalOffsets as NormalOffsets
 from ._parts import AbstractPart as AbstractPart, AlbedoMap as AlbedoMap, CameraPoses as CameraPoses

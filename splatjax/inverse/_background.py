@@ -16,7 +16,7 @@ class AbstractBackground(eqx.Module):
 
     @abc.abstractmethod
     def counts(self, coverage: Float[Array, "height width"]) -> Float[Array, "height width"]:
-        """Give 1 for pixels that count, 0 for others; constant to the derivative."""
+        """Return 1 for pixels that count, 0 for others; constant to the derivative."""
 
 
 class UnknownBackground(AbstractBackground):

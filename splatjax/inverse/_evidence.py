@@ -1,4 +1,4 @@
-"""What was observed, made ready for a search: which pixels count, and how much."""
+"""Observations prepared for a search: which pixels count, and with which weight."""
 
 from collections.abc import Callable, Sequence
 
@@ -13,24 +13,24 @@ from splatjax.scattering import Medium
 from ._flat import flatten
 from ._losses import AbstractLoss
 from ._observation import Observation
-from ._problem import AbstractVariances, Problem, Unknowns
+from ._problem import AbstractVariances, RecoveryProblem, Unknowns
 
 _UNKNOWN_NOISE = 0.01
-"""Deviation of pictures that come without one, as a share of their brightness: error bars do not
+"""Deviation of pictures that come without one, as a fraction of their brightness: error bars do not
 depend on it.
 """
 
 
 class Evidence:
-    """Observations as arrays, in a search's precision."""
+    """Observations as arrays of NumPy; problems have the precision of the search."""
 
     def __init__(self, observations: Sequence[Observation], dtype):
         self.observations, self.dtype = list(observations), dtype
-        self.pictures = [np.asarray(each.picture, np.float64) for each in self.observations]
+        self.pictures = [np.asarray(one.picture, np.float64) for one in self.observations]
         self.masks = [
             np.all(np.isfinite(picture), axis=-1)
-            & (True if each.mask is None else np.asarray(each.mask))
-            for picture, each in zip(self.pictures, self.observations, strict=True)
+            & (True if one.mask is None else np.asarray(one.mask))
+            for picture, one in zip(self.pictures, self.observations, strict=True)
         ]
         self.brightness = [
             float(np.sqrt(np.mean(picture[mask] ** 2))) if mask.any() else 1.0
@@ -38,31 +38,31 @@ class Evidence:
         ]
         self.deviations = [
             np.full(picture.shape, _UNKNOWN_NOISE * (bright or 1.0))
-            if each.deviation is None
-            else np.broadcast_to(np.asarray(each.deviation, np.float64), picture.shape)
-            for picture, bright, each in zip(
+            if one.deviation is None
+            else np.broadcast_to(np.asarray(one.deviation, np.float64), picture.shape)
+            for picture, bright, one in zip(
                 self.pictures, self.brightness, self.observations, strict=True
             )
         ]
 
     @property
     def noise_is_known(self) -> bool:
-        return all(each.deviation is not None for each in self.observations)
+        return all(one.deviation is not None for one in self.observations)
 
     @property
     def relative_noise(self) -> float:
-        """Of a typical pixel: its deviation over the brightness of its picture."""
-        shares = [
-            np.median(each) / (bright or 1.0)
-            for each, bright in zip(self.deviations, self.brightness, strict=True)
+        """The deviation of a typical pixel over the brightness of its picture."""
+        fractions = [
+            np.median(deviation) / (bright or 1.0)
+            for deviation, bright in zip(self.deviations, self.brightness, strict=True)
         ]
-        return float(np.mean(shares))
+        return float(np.mean(fractions))
 
     def unknowns(self, eta) -> tuple[Unknowns, int]:
-        """Give how the unknowns are laid out, and how many factors of lights are among them."""
+        """Lay out the unknowns; also return how many factors of lights are among them."""
         rows, count, channels = [], 0, eta.shape[0]
-        for each in self.observations:
-            groups = each.intensity.groups(channels)
+        for one in self.observations:
+            groups = one.intensity.groups(channels)
             rows.append(np.where(groups < 0, -1, groups + count))
             count += int(np.max(groups)) + 1
         factors = np.stack(rows)
@@ -78,20 +78,20 @@ class Evidence:
         loss: AbstractLoss,
         weights: AbstractWeights,
         model: Callable[[Medium], AbstractProfile],
-    ) -> tuple[Problem, list[np.ndarray]]:
-        """State the least squares problem of layers; also give the numbers of the pixels that
+    ) -> tuple[RecoveryProblem, list[np.ndarray]]:
+        """Set up the least squares problem of layers; also return the numbers of the pixels that
         count, in each picture.
         """
         flat, numbers = flatten(gathered, self.masks, self.dtype)
 
         def in_row(pictures):
             rows = [
-                each.reshape(-1, each.shape[-1])[chosen]
-                for each, chosen in zip(pictures, numbers, strict=True)
+                one.reshape(-1, one.shape[-1])[chosen]
+                for one, chosen in zip(pictures, numbers, strict=True)
             ]
             return jnp.asarray(np.concatenate(rows).T, self.dtype)
 
-        return Problem(
+        return RecoveryProblem(
             flat,
             in_row(self.pictures),
             in_row(self.deviations),
@@ -103,11 +103,11 @@ class Evidence:
         ), numbers
 
     def shown(self, radiance: np.ndarray, numbers: Sequence[np.ndarray]) -> tuple[np.ndarray, ...]:
-        """Put pixels back into their pictures; NaN where they do not count."""
-        found, begin = [], 0
+        """Return pixels to their pictures; NaN where they do not count."""
+        pictures, begin = [], 0
         for picture, chosen in zip(self.pictures, numbers, strict=True):
             whole = np.full((picture.shape[0] * picture.shape[1], picture.shape[2]), np.nan)
             whole[chosen] = radiance[:, begin : begin + chosen.size].T
             begin += chosen.size
-            found.append(whole.reshape(picture.shape))
-        return tuple(found)
+            pictures.append(whole.reshape(picture.shape))
+        return tuple(pictures)

@@ -37,5 +37,5 @@ class FittedScene(eqx.Module):
     plans: int = eqx.field(static=True)
 
     def scene(self, picture: int = 0) -> Scene:
-        """Give the scene of a picture."""
+        """Return the scene of a picture."""
         return Scene(self.splats, self.lights[picture], self.material)

@@ -8,11 +8,11 @@ from jaxtyping import Array, Float
 
 
 class AbstractLoss(eqx.Module):
-    """What is summed over the pixels, as a function of residuals in units of their deviations."""
+    """The loss of a pixel, as a function of its residual in units of its deviation."""
 
     @abc.abstractmethod
     def root(self, residuals: Float[Array, "..."]) -> Float[Array, "..."]:
-        """Give what has the loss as its square, with the sign of the residual: near zero the
+        """Compute the root of the loss, with the sign of the residual: near zero the
         residual itself.
         """
 

@@ -11,9 +11,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from splatjax.fitting import (
     AbstractWeights,
+    FixedTotalReflectance,
     GivenVariances,
     NonNegativeWeights,
-    TotalReflectanceHeld,
     fit_gaussians,
     fit_weights,
 )
@@ -26,21 +26,21 @@ from ._losses import AbstractLoss
 _STEPS = 64
 
 
-def usual_weights() -> AbstractWeights:
-    """Give how the materials that come with the package are fitted: weights are not negative, and
-    their sum is held.
+def default_weights() -> AbstractWeights:
+    """Return the weights with which the materials of the package are fitted: not negative, with a
+    fixed sum.
     """
-    return NonNegativeWeights(TotalReflectanceHeld())
+    return NonNegativeWeights(FixedTotalReflectance())
 
 
 class Unknowns(eqx.Module):
-    """How the numbers to be found are laid out: log sigma_a, log sigma_s' per channel, then log
-    factors of the lights.
+    """The layout of the unknowns: log sigma_a, log sigma_s' per channel, then log factors of the
+    lights.
     """
 
     eta: Float[Array, " channels"]
     factors: Int[Array, "pictures channels"]
-    """Which factor a picture's channel has; that many as there are where its intensity is known."""
+    """The factor of each channel of each picture; the number of factors where it is known."""
 
     def medium(self, point: Float[Array, " unknowns"]) -> Medium:
         channels = self.eta.shape[0]
@@ -61,14 +61,14 @@ class Unknowns(eqx.Module):
 
 
 class AbstractVariances(eqx.Module):
-    """Where the variances of a medium's Gaussians come from."""
+    """How the variances of Gaussians follow from a medium."""
 
     @abc.abstractmethod
     def gaussians(self, profile: AbstractProfile, weights: AbstractWeights) -> SumOfGaussians:
-        """Give the Gaussians of a profile. Differentiable."""
+        """Fit the Gaussians of a profile. Differentiable."""
 
 
-class Held(AbstractVariances):
+class FixedVariances(AbstractVariances):
     """The same for all media."""
 
     variances: Float[Array, " gaussians"]
@@ -77,8 +77,8 @@ class Held(AbstractVariances):
         return fit_weights(profile, self.variances, weights=weights)
 
 
-class Fitted(AbstractVariances):
-    """Those of the best fit to each, near some: variances and weights move together."""
+class FittedVariances(AbstractVariances):
+    """Those of the best fit to each medium: variances and weights move together."""
 
     near: Float[Array, " gaussians"]
 
@@ -89,8 +89,8 @@ class Fitted(AbstractVariances):
         ).gaussians
 
 
-class Problem(eqx.Module):
-    """The pictures, what was observed, and how the one is made from coefficients."""
+class RecoveryProblem(eqx.Module):
+    """Observed pictures, and how pictures are made from coefficients."""
 
     pictures: FlatPictures
     observed: Float[Array, "channels pixels"]
@@ -108,17 +108,19 @@ class Problem(eqx.Module):
         return self.pictures.radiance(self.gaussians(point), self.unknowns.intensities(point))
 
     def residuals(self, point: Float[Array, " unknowns"]) -> Float[Array, "channels pixels"]:
-        """Give what the loss has as its square."""
+        """Compute residuals whose squares are the losses."""
         return self.loss.root((self.radiance(point) - self.observed) / self.deviation)
 
-    def handover_slopes(self, point: Float[Array, " unknowns"]) -> Float[Array, "channels pixels"]:
-        """Differentiate the residuals in the logarithm of the widths below which the renderer hands
-        layers to the surface.
+    def resolution_slopes(
+        self, point: Float[Array, " unknowns"]
+    ) -> Float[Array, "channels pixels"]:
+        """Differentiate the residuals in the logarithm of the widths below which layers are
+        unresolved.
         """
 
         def moved(by: Float[Array, ""]) -> Float[Array, "channels pixels"]:
             return eqx.tree_at(
-                lambda its: its.pictures.light.interval,
+                lambda problem: problem.pictures.light.interval,
                 self,
                 replace_fn=lambda at: at * jnp.exp(by),
             ).residuals(point)
@@ -127,8 +129,8 @@ class Problem(eqx.Module):
         return jax.jvp(moved, (zero,), (zero + 1,))[1]
 
 
-class Found(eqx.Module):
-    """Where a search ended."""
+class SearchEnd(eqx.Module):
+    """The end of a search."""
 
     point: Float[Array, " unknowns"]
     cost: Float[Array, ""]
@@ -137,8 +139,8 @@ class Found(eqx.Module):
 
 
 @eqx.filter_jit
-def search(problem: Problem, start: Float[Array, " unknowns"]) -> Found:
-    """Minimize the loss from a start: Levenberg and Marquardt's method."""
+def search(problem: RecoveryProblem, start: Float[Array, " unknowns"]) -> SearchEnd:
+    """Minimize the loss from a start by the Levenberg-Marquardt method."""
     tolerance = 1e-4 if start.dtype == jnp.float32 else 1e-7
     # In units of the start's own residual, so that damping and tolerances mean the same for any
     # noise and number of pixels.
@@ -148,24 +150,22 @@ def search(problem: Problem, start: Float[Array, " unknowns"]) -> Found:
         return problem.residuals(point) / unit
 
     solver = optx.LevenbergMarquardt(rtol=tolerance, atol=tolerance)
-    found = optx.least_squares(residuals, solver, start, problem, max_steps=_STEPS, throw=False)
-    cost = jnp.sum(problem.residuals(found.value) ** 2)
-    steps = jnp.asarray(found.stats["num_steps"])
-    return Found(
-        found.value, cost, steps, (found.result == optx.RESULTS.successful) & jnp.isfinite(cost)
-    )
+    end = optx.least_squares(residuals, solver, start, problem, max_steps=_STEPS, throw=False)
+    cost = jnp.sum(problem.residuals(end.value) ** 2)
+    converged = (end.result == optx.RESULTS.successful) & jnp.isfinite(cost)
+    return SearchEnd(end.value, cost, jnp.asarray(end.stats["num_steps"]), converged)
 
 
 class Solution(eqx.Module):
-    """What is known at a point.
+    """The solution at a point, and how well it is known.
 
     **Attributes:**
 
     - `information`: the inverse of the covariance that noise of the given deviations leaves
       (Laplace, by Gauss and Newton); after the unknowns come, channel by channel, the logarithms of
-      the widths below which layers are handed to the surface.
+      the widths below which layers are unresolved.
     - `gaussians`, `radiance`: of the point.
-    - `unresolved`: the share of the light of each channel in layers that the splats do not carry.
+    - `unresolved`: the fraction of the light of each channel in unresolved layers.
     """
 
     information: Float[Array, "all all"]
@@ -175,9 +175,9 @@ class Solution(eqx.Module):
 
 
 @eqx.filter_jit
-def solution(problem: Problem, point: Float[Array, " unknowns"]) -> Solution:
-    """Give what is known at a point: the picture, and how sharply residuals tell each unknown and
-    the handover.
+def solution(problem: RecoveryProblem, point: Float[Array, " unknowns"]) -> Solution:
+    """Compute the picture at a point, and the information about each unknown and the transition to
+    unresolved layers.
     """
 
     def residuals(point):
@@ -185,11 +185,9 @@ def solution(problem: Problem, point: Float[Array, " unknowns"]) -> Solution:
         return problem.residuals(point), (gaussians, radiance)
 
     slopes, (gaussians, radiance) = jax.jacfwd(residuals, has_aux=True)(point)
-    handover = (
-        problem.handover_slopes(point)[..., None]
-        * jnp.eye(slopes.shape[0], dtype=slopes.dtype)[:, None]
-    )
-    slopes = jnp.concatenate([slopes, handover], axis=-1)
+    channels = jnp.eye(slopes.shape[0], dtype=slopes.dtype)[:, None]
+    resolution = problem.resolution_slopes(point)[..., None] * channels
+    slopes = jnp.concatenate([slopes, resolution], axis=-1)
     unresolved = (
         (1 - problem.pictures.light.resolved()) @ gaussians.weights / gaussians.total_reflectance()
     )

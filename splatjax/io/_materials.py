@@ -13,7 +13,7 @@ import numpy as np
 import tomli_w
 
 from splatjax.exports import plain_numbers
-from splatjax.gaussians import SumOfGaussians
+from splatjax.gaussians import AbstractProfile, SumOfGaussians
 from splatjax.scattering import (
     BetterDipole,
     Dipole,
@@ -167,7 +167,7 @@ def save_material(
     material: Material,
     path: str | os.PathLike[str],
     *,
-    profile: Dipole | BetterDipole | PhotonBeam | LayeredMultipole | None = None,
+    profile: AbstractProfile | None = None,
     source: Mapping[str, Any] | None = None,
     fit: Mapping[str, Any] | None = None,
 ) -> None:
@@ -183,8 +183,13 @@ def save_material(
     - `source`: where the numbers come from: `citation`, `provenance`, ...
     - `fit`: more to be kept in [fit]: `error`, `energy_error`, ...
 
-    **Raises:** `OSError` if the file cannot be written.
+    **Raises:** `OSError` if the file cannot be written, `ValueError` for another kind of profile.
     """
+    if not isinstance(profile, Dipole | BetterDipole | PhotonBeam | LayeredMultipole | None):
+        raise ValueError(
+            f"profile must be a Dipole, BetterDipole, PhotonBeam or LayeredMultipole, which a file "
+            f"can hold; got {type(profile).__name__}"
+        )
     tables: dict[str, Any] = {}
     if isinstance(profile, LayeredMultipole):
         tables["layers"] = [_plain_layer(layer) for layer in profile.layers]

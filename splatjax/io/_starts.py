@@ -17,7 +17,7 @@ def dipole_starts() -> DipoleStarts:
         fit_gaussians(Dipole(medium), 6, spread=VariancesPerChannel(), start=dipole_starts()(medium,
         6))
 
-    **Returns:** a `DipoleStarts` in JAX's default precision. `tools/make_starts.py` made the table.
+    **Returns:** a `DipoleStarts` in JAX's default precision. `tools/make_profiles.py` made it.
     """
     tables, dtype = _tables(), jnp.result_type(float)
     counts = sum(name.startswith("log_variances_") for name in tables)

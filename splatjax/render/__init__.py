@@ -3,6 +3,7 @@
 from ._attributes import SurfaceAttributes as SurfaceAttributes, SurfaceSamples as SurfaceSamples
 from ._basis import diffusion_basis as diffusion_basis, DiffusionBasis as DiffusionBasis
 from ._batches import map_over as map_over
+from ._checks import check_displayable as check_displayable, check_scene as check_scene
 from ._jacobian import picture_jacobian as picture_jacobian, PictureJacobian as PictureJacobian
 from ._lighting import AbstractLighting as AbstractLighting, entering_light as entering_light
 from ._lighting import Irradiance as Irradiance, LightAtSplats as LightAtSplats

@@ -112,7 +112,7 @@ def entering_light(
         share = 1 - _shading.directional_albedo(cosine, f0, specular, roughness)
         if material.single_scattering is None:
             return share[None]
-        return share[None] * material.left_to_diffuse(cosine).T
+        return share[None] * material.diffuse_fraction(cosine).T
 
     channels = material.gaussians.weights.shape[1]
     irradiance = _diffusion.entering_irradiance(

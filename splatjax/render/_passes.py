@@ -175,9 +175,7 @@ def sample_surfaces(
         )
         return jax.tree.map(_by_place, samples)
 
-    return map_chunks(
-        blend, visible.rows, visible.tiles, at_once=_splatting.TILES_AT_ONCE
-    )
+    return map_chunks(blend, visible.rows, visible.tiles, at_once=_splatting.TILES_AT_ONCE)
 
 
 def map_samples(read: Read[Values], samples: SurfaceSamples) -> Values:

@@ -16,6 +16,7 @@ from splatjax import diffusion as _diffusion, splatting as _splatting
 from splatjax._combination import DeviceMesh, OneDevice
 from splatjax.scene import AbstractLight, Camera, Scene, Splats, StackedLights, stack_lights
 
+from ._checks import check_scene
 from ._inputs import in_one_dtype
 from ._settings import RenderSettings
 from ._shadow_plan import ShadowPlan, is_among, shadow_views
@@ -169,11 +170,12 @@ def plan_unless_traced(
     plan: Plan | None,
     mesh: Mesh | None = None,
 ) -> Plan:
-    """Check the plan, or make one where none is given.
+    """Check the scene and the plan, or make one where none is given.
 
     **Raises:** `ValueError` for a plan of other splats or another mesh, or when none is given under
     `jit`, `grad` or `vmap`.
     """
+    check_scene(scene, camera)
     if plan is not None:
         check_plan(plan, scene, mesh)
         return plan

@@ -19,7 +19,7 @@ rounding up to eta = 4.
 
 
 class AbstractFresnel(eqx.Module):
-    r"""How a smooth interface reflects diffuse light that meets it from inside.
+    r"""The reflectance of a smooth interface for diffuse light from inside.
 
     With `F(mu)` the internal reflectance, total internal reflection included, and `eta` the index
     inside over outside.
@@ -27,17 +27,17 @@ class AbstractFresnel(eqx.Module):
 
     @abc.abstractmethod
     def first_moment(self, eta: Float[Array, " channels"]) -> Float[Array, " channels"]:
-        """Give `2 C1`, twice the integral of `mu F(mu)` over [0, 1]: the diffuse reflectance Fdr,
-        in [0, 1).
+        """Compute `2 C1`, twice the integral of `mu F(mu)` over [0, 1]: the diffuse reflectance
+        Fdr, in [0, 1).
         """
 
     @abc.abstractmethod
     def second_moment(self, eta: Float[Array, " channels"]) -> Float[Array, " channels"]:
-        """Give `3 C2`, three times the integral of `mu^2 F(mu)` over [0, 1], in [0, 1)."""
+        """Compute `3 C2`, three times the integral of `mu^2 F(mu)` over [0, 1], in [0, 1)."""
 
     def boundary(self, eta: Float[Array, " channels"]) -> Float[Array, " channels"]:
-        r"""Give the boundary parameter `A = (1 + Fdr) / (1 - Fdr)` of the diffusion approximation;
-        1 at `eta = 1`.
+        r"""Compute the boundary parameter `A = (1 + Fdr) / (1 - Fdr)` of the diffusion
+        approximation; 1 at `eta = 1`.
 
         **Source:** Jensen et al. 2001, section 2.1.
         """
@@ -100,7 +100,7 @@ class EganFresnel(AbstractFresnel):
 def reflectance(
     inside: Float[Array, "*shape"], outside: Float[Array, "*shape"], eta: Float[Array, "*shape"]
 ) -> Float[Array, "*shape"]:
-    """Give the reflectance for unpolarized light from its cosines on either side of a smooth
+    """Compute the reflectance for unpolarized light from its cosines on either side of a smooth
     interface, from either side.
     """
     across = (eta * inside - outside) / (eta * inside + outside)
@@ -136,7 +136,7 @@ def _integral(integrand, lower: Float[Array, " channels"]) -> Float[Array, " cha
 
 
 def moment_outside(eta: Float[Array, " channels"]) -> Float[Array, " channels"]:
-    """Give twice the integral of `mu F(mu)` over the cosine on the rarer side of the interface;
+    """Compute twice the integral of `mu F(mu)` over the cosine on the rarer side of the interface;
     nothing is reflected totally.
     """
     return _first_outside(_denser_over_rarer(eta))

@@ -232,7 +232,9 @@ class Sweep(eqx.Module):
             # Cotangents of the summed rows, per slot, for a weight without opacity.
             d_attributes = jnp.einsum("trp,tsp->tsr", of_attributes, weight)
             d_plane = jnp.einsum("trp,tsp->trs", of_plane, weight)
-            d_opacity = jnp.sum(attributes * d_attributes, axis=2) + jnp.sum(plane * d_plane, axis=1)
+            d_opacity = jnp.sum(attributes * d_attributes, axis=2) + jnp.sum(
+                plane * d_plane, axis=1
+            )
             # Cotangents of the weights, and through them of nearness and quadric.
             d_weight = jnp.einsum("tsr,trp->tsp", attributes, of_attributes)
             d_weight = d_weight + jnp.einsum("trs,trp->tsp", plane, of_plane)
@@ -249,7 +251,9 @@ class Sweep(eqx.Module):
             of_planes, of_rows = gradients
             parts = *_plane_cotangents(splats, quad, near), d_opacity
             return (
-                tuple(lanes.add(*each) for each in zip(of_planes, (block,) * 9, parts, strict=True)),
+                tuple(
+                    lanes.add(*each) for each in zip(of_planes, (block,) * 9, parts, strict=True)
+                ),
                 of_rows.at[ids].add(d_attributes * opacity[:, :, None], mode="drop"),
             )
 

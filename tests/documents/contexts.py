@@ -95,6 +95,6 @@ CONTEXTS = {
     "docs/devices.md": devices,
     "docs/gradients.md": scene,
     "docs/figures.md": scene,
-    "docs/rivals.md": scene,
+    "docs/baselines.md": scene,
     "docs/recovery.md": pictures,
 }

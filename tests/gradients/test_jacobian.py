@@ -99,7 +99,7 @@ def test_single_scattering_leaves_less_to_the_gaussians_where_light_grazes():
     """
     with jax.enable_x64(True):
         start, _, _, jacobian = rendered("fast")
-        left = start.material.left_to_diffuse(jnp.asarray([0.05]))
+        left = start.material.diffuse_fraction(jnp.asarray([0.05]))
     assert np.min(np.asarray(left)) < 0.97
     assert np.min(np.asarray(jacobian.weights)) < 0
 

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import splatjax as sj
-from splatjax.inverse._parts import Shot, rotation
+from splatjax.inverse._parts import PictureSetup, rotation
 
 
 @pytest.mark.parametrize("length", [0.0, 1e-9, 0.05, 0.0999, 0.1001, 1.0, 3.0])
@@ -28,46 +28,37 @@ def test_a_rotation_has_a_derivative_where_there_is_none():
 
 
 def test_lights_move_each_in_its_own_way():
-    camera = sj.Camera.look_at(jnp.asarray([0.0, 0.0, 9.0]), jnp.zeros(3), width=4, height=4)
-    lights = (
-        sj.PointLight(jnp.asarray([1.0, 2.0, 3.0]), jnp.asarray([4.0, 5.0])),
-        sj.GaussianBeam(
-            jnp.asarray([1.0, 2.0, 3.0]),
-            jnp.asarray([0.0, 0.0, -2.0]),
-            jnp.asarray([4.0, 5.0]),
-            jnp.asarray(1.0),
-        ),
-    )
-    shot, middle = Shot(camera, lights), jnp.zeros(3)
+    camera = sj.Camera.look_at([0, 0, 9], [0, 0, 0], width=4, height=4)
+    beam = sj.GaussianBeam([1, 2, 3], [0, 0, -2], power=[4, 5], variance=1)
+    lights = sj.PointLight([1, 2, 3], intensity=[4, 5]), beam
+    setup, middle = PictureSetup(camera, lights), jnp.zeros(3)
     places, strengths = sj.LightPlaces(turn=0.1, shift=2.0), sj.LightStrengths(step=0.5)
-    x = jax.tree.map(jnp.ones_like, places.coordinates(shot))
-    lamp, beam = places.moved(shot, x, middle).lights
+    x = jax.tree.map(jnp.ones_like, places.coordinates(setup))
+    lamp, beam = places.moved(setup, x, middle).lights
     np.testing.assert_allclose(lamp.position, [3, 4, 5])
     np.testing.assert_allclose(beam.origin, [3, 4, 5])
     np.testing.assert_allclose(
         beam.direction, Rotation.from_rotvec([0.1, 0.1, 0.1]).apply([0, 0, -2]), rtol=1e-5
     )
     x = (jnp.asarray([0.0, 1.0]), jnp.asarray([2.0, 0.0]))
-    lamp, beam = strengths.moved(shot, x, middle).lights
+    lamp, beam = strengths.moved(setup, x, middle).lights
     np.testing.assert_allclose(lamp.intensity, [4, 5 * np.exp(0.5)], rtol=1e-6)
     np.testing.assert_allclose(beam.power, [4 * np.exp(1), 5], rtol=1e-6)
 
 
 def test_a_camera_turns_around_the_body():
     """The middle stays where it was in the picture, and as far away."""
-    camera = sj.Camera.look_at(
-        jnp.asarray([3.0, 0.0, 9.0]), jnp.asarray([1.0, 1.0, 0.0]), width=4, height=4
-    )
+    camera = sj.Camera.look_at([3, 0, 9], [1, 1, 0], width=4, height=4)
     middle, part = jnp.asarray([0.5, -1.0, 0.3]), sj.CameraPoses(turn=0.2, shift=0.5)
 
-    def place(shot):
-        return shot.camera.rotation @ (middle - shot.camera.position)
+    def place(setup):
+        return setup.camera.rotation @ (middle - setup.camera.position)
 
-    shot = Shot(camera, ())
-    turned = part.moved(shot, jnp.asarray([[1.0, -2.0, 0.5], [0.0, 0.0, 0.0]]), middle)
+    setup = PictureSetup(camera, ())
+    turned = part.moved(setup, jnp.asarray([[1.0, -2.0, 0.5], [0.0, 0.0, 0.0]]), middle)
     assert float(jnp.linalg.norm(turned.camera.position - camera.position)) > 1
-    np.testing.assert_allclose(place(turned), place(shot), atol=1e-5)
-    shifted = part.moved(shot, jnp.asarray([[0.0, 0.0, 0.0], [1.0, 2.0, 3.0]]), middle)
+    np.testing.assert_allclose(place(turned), place(setup), atol=1e-5)
+    shifted = part.moved(setup, jnp.asarray([[0.0, 0.0, 0.0], [1.0, 2.0, 3.0]]), middle)
     np.testing.assert_allclose(shifted.camera.position - camera.position, [0.5, 1, 1.5], atol=1e-6)
     np.testing.assert_allclose(shifted.camera.rotation, camera.rotation, atol=1e-6)
 
@@ -143,6 +134,4 @@ def test_offsets_are_means_of_coordinates_over_the_same_side_of_a_sheet():
         part.moved(both, jnp.asarray(noise, float), tables).centers[:, 2] - both.centers[:, 2]
     )
     expected = both.count * (np.sqrt(np.mean(offsets**2)) / 0.3) ** 2
-    np.testing.assert_allclose(
-        part.unlikely(jnp.asarray(noise, float), tables), expected, rtol=0.15
-    )
+    np.testing.assert_allclose(part.prior(jnp.asarray(noise, float), tables), expected, rtol=0.15)

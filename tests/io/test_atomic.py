@@ -183,19 +183,6 @@ def test_a_read_only_folder_is_said(read_only):
     assert [path.name for path in read_only.iterdir()] == ["before"]
 
 
-@pytest.mark.once
-def test_killed_at_any_moment():
-    """Writers of every kind, and a turntable that goes on afterwards; `python
-    tools/kill_writers.py` does it fifty times.
-    """
-    tool = Path(__file__).parent.parent.parent / "tools" / "kill_writers.py"
-    done = subprocess.run(
-        [sys.executable, str(tool), "3"], capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert done.stdout.count("3 kills") == 6
-
-
 def test_processes_that_write_the_same_file_do_not_remove_what_others_write(tmp_path):
     write = (
         "import sys\nfrom splatjax.io import write_record\nfor i in range(150): "

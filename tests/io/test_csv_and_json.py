@@ -31,7 +31,7 @@ def test_a_table_is_read_in_its_own_unit(tmp_path, dtype):
         (GOOD.replace("2.0", "nan"), r"line 5: 'nan' is no number"),
         (GOOD.replace("2.0, 1.0", "2.0"), r"line 5: has 2 numbers; expected 3 as above"),
         ("0\n1\n", r"line 1: has 1 numbers; expected a radius and at least one value"),
-        (GOOD.replace("0.3,", "0.1,"), r"radii must ascend, each once"),
+        (GOOD.replace("0.3,", "0.1,"), r"radii ascend, each once"),
         (GOOD.replace("0.0,", "-1,"), r"radii must be .*at least 0"),
     ],
 )

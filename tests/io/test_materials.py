@@ -180,7 +180,7 @@ SLAB = 'thickness = 2.0\nthickness_unit = "mm"\n' + GOOD_MEDIUM.removeprefix("[m
     [
         (
             layered(SLAB.replace("2.0", "0.1")),
-            r"\[layers 1\] thickness in mean free paths.*at least 1 in every channel",
+            r"\[layers 1\] thickness .* at least 1 in every channel",
         ),
         (
             layered(SLAB.replace("2.0", "-1")),
@@ -202,7 +202,7 @@ SLAB = 'thickness = 2.0\nthickness_unit = "mm"\n' + GOOD_MEDIUM.removeprefix("[m
             layered("optical_depth = [-0.1]\n", SLAB),
             r"\[layers 1\] optical_depth must be finite and at least 0",
         ),
-        (layered("optical_depth = [0.1]\n"), r"none of which is a Layer"),
+        (layered("optical_depth = [0.1]\n"), r"none of these 1 is a Layer"),
         (GOOD_MEDIUM + layered(SLAB), r"has both \[medium\] and \[\[layers\]\]"),
         ("layers = 3\n", r"\[\[layers\]\] must be one table or more"),
     ],

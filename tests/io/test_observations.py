@@ -111,7 +111,7 @@ def test_all_files_are_named(listed, tmp_path):
         (
             "[0, 1, 50]",
             "[0, 0, 0]",
-            r"\[pictures 1 camera\] the camera stands at \[0.0, 0.0, 0.0\], where it looks at",
+            r"\[pictures 1 camera\] eye and target are both \[0.0, 0.0, 0.0\]",
         ),
         (
             "[0, 0, -1]",

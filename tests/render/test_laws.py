@@ -269,6 +269,6 @@ def test_a_light_that_has_come_among_the_splats_needs_another_plan():
 
 
 def test_channels_that_disagree_are_refused():
-    scene = sj.Scene(sheet(1.0, 3.0), (lamp((1.0,)),), sj.Material(skin()))
-    with pytest.raises(ValueError, match=r"lights\[0\] has 1 channels"):
+    scene = sj.Scene(sheet(1.0, 3.0), (lamp((1.0, 1.0)),), sj.Material(skin()))
+    with pytest.raises(ValueError, match=r"lights\[0\] has 2 channels"):
         sj.render(scene, camera_over(2.0, 8))

@@ -1,0 +1,57 @@
+"""Blended splats, by any kernel: what the fragments of the front carry, normalized (Eq. 1)."""
+
+import jax
+import jax.numpy as jnp
+from jax.lax import stop_gradient
+from jaxtyping import Array, Float
+
+from splatjax.splatting import AbstractView, BinCapacity, FragmentSums, blend_fragments
+
+from ._kernels import AbstractSplatKernel
+from ._tiles import AbstractListRasterizer, Lists
+
+
+class BlendingRasterizer(AbstractListRasterizer):
+    r"""Blends the fragments within epsilon of the nearest one.
+
+    A pixel with any fragment is covered whole, one with none not at all: silhouettes are hard, and
+    holes are holes. Which fragments count, and coverage, have no derivative.
+
+    **Attributes:**
+
+    - `kernel`: what a splat leaves in a pixel.
+    - `capacity`: set by `planned`; a picture that needs more is NaN.
+    """
+
+    kernel: AbstractSplatKernel
+    capacity: BinCapacity | None = None
+
+    def front(
+        self, lists: Lists, attributes: Float[Array, "attributes splats"], view: AbstractView
+    ) -> FragmentSums:
+        def nearest(ids, footprints, dx, dy):
+            fragments = self.kernel.fragments(footprints, view, dx, dy)
+            shifted = view.shifted(fragments.nearness, footprints.shift)
+            return jnp.max(jnp.where(fragments.is_inside, shifted, -jnp.inf), axis=1)
+
+        limits = stop_gradient(lists.reduce_blocks(jax.ops.segment_max, lists.map_blocks(nearest)))
+
+        def blend(ids, footprints, dx, dy, limit):
+            fragments = self.kernel.fragments(footprints, view, dx, dy)
+            in_front = fragments.is_inside & (fragments.nearness > limit[:, None])
+            weight = jnp.where(in_front, fragments.weight, 0.0)
+            rows = attributes.at[:, ids].get(mode="fill", fill_value=0)
+            sums = jnp.einsum("rts,tsp->trp", rows, weight)
+            own = jnp.stack(
+                [jnp.sum(weight * fragments.nearness, axis=1), jnp.sum(weight, axis=1)], axis=1
+            )
+            return jnp.concatenate([sums, own], axis=1)
+
+        sums = FragmentSums.of(
+            lists.tiles(lists.reduce_blocks(jax.ops.segment_sum, lists.map_blocks(blend, limits)))
+        )
+        return FragmentSums(
+            blend_fragments(sums.attributes, sums.weights[:, None]),
+            blend_fragments(sums.nearness, sums.weights),
+            jnp.where(sums.weights > 0, 1.0, 0 * sums.weights),
+        )
