@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import TypeAlias
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -28,7 +27,7 @@ from splatjax.scene import (
 from ._attributes import SurfaceAttributes, SurfaceSamples, stack_rows
 from ._inputs import check_channels, in_one_dtype
 from ._lighting import Irradiance, LightVisibility, irradiate, map_visibility
-from ._passes import in_a_row, map_samples, sample_surfaces
+from ._passes import map_samples, sample_surfaces
 from ._plan import fill_up
 from ._settings import RenderSettings
 from ._shade import compose, shade
