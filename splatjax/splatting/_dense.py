@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 from splatjax._combination import AbstractCombination
 from splatjax.scene import Splats
 
-from ._grid import SIDE, TileGrid
+from ._grid import TileGrid
 from ._kernel import fragment_weight
 from ._rasterizer import AbstractRasterizer, AbstractRasterPlan, FragmentSums, least_weight
 from ._settings import SplattingSettings
@@ -39,9 +39,6 @@ class DenseRasterPlan(AbstractRasterPlan):
     ) -> FragmentSums:
         dtype, footprints = attributes.dtype, view.footprints(splats, settings)
         grid = TileGrid(view.width, view.height)
-        if splats.count == 0:
-            empty = jnp.zeros((grid.count, attributes.shape[0] + 2, SIDE**2), dtype)
-            return _all_tiles(empty, empty)
         columns = jnp.arange(view.width, dtype=dtype) + 0.5
         conic = footprints.a, footprints.b, footprints.c, footprints.nearness
         least = stop_gradient(least_weight(type(view), *conic, settings.filter_radius))

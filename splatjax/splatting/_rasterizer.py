@@ -88,7 +88,7 @@ class AbstractRasterPlan(eqx.Module):
 
         **Arguments:**
 
-        - `splats`, `attributes`: those of this device. Differentiable.
+        - `splats`, `attributes`: those of this device, at least one. Differentiable.
         - `combination`: of the parts of the splats that several devices hold.
 
         **Returns:** the sums over the splats of this device.

@@ -149,7 +149,7 @@ def _sum_chunks(
         here = capacity.front + i * lanes
         return write(rows, sums, here), write(beyond, seconds, here), write(upto, limits, i * lanes)
 
-    upto = zeros_after(is_open, (capacity.behind, SIDE**2), dtype)
+    upto = zeros_after(picks, (capacity.behind, SIDE**2), dtype)
     rounds = _rounds(picks < capacity.front, lanes)
     rows, beyond, upto = lax.fori_loop(jnp.int32(0), rounds, look_behind, (rows, beyond, upto))
     order = jnp.minimum(jnp.append(bins.order, grid.count), grid.count)
@@ -299,7 +299,7 @@ def sum_parts(
         )
         tiles = jnp.concatenate([fronts[k], behind[k]])
         sums = FragmentSums(tiles, jnp.concatenate([front[k], rest[k]]), needed, capacity.front)
-        places = jnp.full(grids[k].tiles, capacity.front, jnp.int32)
+        places = jnp.full(grids[k].tiles, len(tiles), jnp.int32)
         places = places.at[fronts[k]].set(jnp.arange(capacity.front, dtype=jnp.int32), mode="drop")
         beyond = jnp.concatenate([nearer[k], seconds[k]])
         own = Ends(beyond, upto[k], places[first[k].bins.order], first[k].lanes(behind[k]))

@@ -149,7 +149,7 @@ class TilePlan(AbstractRasterPlan):
         )
         footprints = map_chunks(lambda part: view.footprints(part, settings), splats)
         bins = bin_items(footprints.ranges(grid), grid, self.bins)
-        needed = jnp.maximum(bins.needed, seen / max(self.splats, 1))
+        needed = jnp.maximum(bins.needed, seen / self.splats)
         return _Binned(
             sweep=Sweep(type(view), grid, settings.full_coverage, settings.filter_radius),
             bins=eqx.tree_at(lambda each: each.needed, bins, needed),
@@ -188,8 +188,6 @@ def _compacted(
     chosen: Bool[Array, " splats"], capacity: int
 ) -> tuple[Int[Array, " capacity"], Int[Array, ""]]:
     """List the chosen splats in order, then the number of all, which is none; and count them."""
-    if chosen.shape[0] == 0:
-        return jnp.zeros(capacity, jnp.int32), jnp.zeros((), jnp.int32)
     ends = jnp.cumsum(chosen.astype(jnp.int32))
     count = chosen.shape[0]
     target = jnp.where(chosen, ends - 1, capacity)
