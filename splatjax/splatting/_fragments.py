@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, Shaped
 
 from ._bins import Bins, slot_plane
 from ._grid import SIDE, TileGrid
@@ -35,7 +35,7 @@ class Lanes(eqx.Module):
     y: Float[Array, "lanes 1"]
     stride: int = eqx.field(static=True)
 
-    def read(self, plane: Float[Array, "rows slots"], block) -> Float[Array, "lanes slots"]:
+    def read(self, plane: Shaped[Array, "rows slots"], block) -> Shaped[Array, "lanes slots"]:
         return plane.at[self.row + block * self.stride].get(mode="promise_in_bounds")
 
     def add(
@@ -55,7 +55,7 @@ class Lanes(eqx.Module):
 class ChunkLanes(Lanes):
     """The tiles of one chunk: their rows follow one another."""
 
-    def read(self, plane: Float[Array, "rows slots"], block) -> Float[Array, "lanes slots"]:
+    def read(self, plane: Shaped[Array, "rows slots"], block) -> Shaped[Array, "lanes slots"]:
         return lax.dynamic_slice_in_dim(plane, self.row[0] + block * self.stride, self.stride)
 
     def add(
