@@ -45,7 +45,6 @@ PACKAGES = (
     "exports",
     "io",
     "plots",
-    "devices",
 )
 _LINK = re.compile(r"(\]\()([^)#\s]+)(#[^)\s]*)?(\))")
 _MATHS = re.compile(r"\$([^$\n]+)\$")

@@ -18,7 +18,7 @@ import numpy as np
 import trimesh
 
 import splatjax as sj
-from splatjax.diffusion import DiffusionSettings, PlainMean
+from splatjax.diffusion import PlainMean
 from splatjax.geometry import Mesh, sample_mesh, vertex_normals
 from splatjax.io import linear_to_srgb
 from splatjax.splatting import SplattingSettings
@@ -129,10 +129,10 @@ def models() -> dict[str, tuple[sj.Material, sj.RenderSettings]]:
     single = sj.SingleScattering(medium)
     whole, parted = material(profile), material(profile.without(single), single)
     even = SplattingSettings(full_coverage=EVEN)
-    plain = sj.RenderSettings(even, diffusion=DiffusionSettings(normalization=PlainMean()))
+    plain = sj.RenderSettings(even, kernel=PlainMean())
     return {
         "the paper's mean": (whole, plain),
-        "exit odds": (whole, sj.RenderSettings(even)),
+        "escape normalization": (whole, sj.RenderSettings(even)),
         "and single scattering": (parted, sj.RenderSettings(even)),
     }
 
@@ -177,7 +177,7 @@ def splatted(
     eye, target = (jnp.asarray(place, float) for place in (body.eye, body.target))
     camera = sj.Camera.look_at(eye, target, fov=body.fov, width=SIZE, height=SIZE)
     scene = sj.Scene(splats, (light,), material)
-    plan = sj.plan(scene, camera, settings)
+    plan = sj.make_plan(scene, camera, settings)
     for _ in range(2):
         start = time.perf_counter()
         frame = jax.block_until_ready(sj.render(scene, camera, settings, plan))

@@ -33,7 +33,7 @@ def outputs(names: Sequence[str] = OUTPUTS) -> dict[str, str]:
     light = sj.DirectionalLight(jnp.asarray([0.3, -0.5, -0.8]), jnp.full(3, 3.0))
     camera = sj.Camera.look_at(jnp.asarray([0.0, 0.0, 700.0]), jnp.zeros(3), width=64, height=64)
     scene = sj.Scene(splats, (light,), material)
-    plan = sj.plan(scene, camera)
+    plan = sj.make_plan(scene, camera)
 
     def picture(scene=scene):
         return eqx.filter_jit(sj.render)(scene, camera, plan=plan)

@@ -12,6 +12,7 @@ from ._lighting import (
     LightAtPixels as LightAtPixels,
     normal_slopes as normal_slopes,
     NormalFields as NormalFields,
+    PhongSplats as PhongSplats,
 )
 from ._measures import exitance as exitance
 from ._mesh_light import (

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Float
 
-from splatjax.splatting import AbstractView, BinCapacity, FragmentSums, blend_fragments
+from splatjax.splatting import AbstractView, blend_fragments
 
 from ._kernels import AbstractSplatKernel
 from ._tiles import AbstractListRasterizer, Lists
@@ -20,15 +20,13 @@ class BlendingRasterizer(AbstractListRasterizer):
     **Attributes:**
 
     - `kernel`: what a splat leaves in a pixel.
-    - `capacity`: set by `planned`; a picture that needs more is NaN.
     """
 
     kernel: AbstractSplatKernel
-    capacity: BinCapacity | None = None
 
     def front(
         self, lists: Lists, attributes: Float[Array, "attributes splats"], view: AbstractView
-    ) -> FragmentSums:
+    ) -> Float[Array, "places rows pixels"]:
         def nearest(ids, footprints, dx, dy):
             fragments = self.kernel.fragments(footprints, view, dx, dy)
             shifted = view.shifted(fragments.nearness, footprints.shift)
@@ -47,11 +45,8 @@ class BlendingRasterizer(AbstractListRasterizer):
             )
             return jnp.concatenate([sums, own], axis=1)
 
-        sums = FragmentSums.of(
-            lists.tiles(lists.reduce_blocks(jax.ops.segment_sum, lists.map_blocks(blend, limits)))
-        )
-        return FragmentSums(
-            blend_fragments(sums.attributes, sums.weights[:, None]),
-            blend_fragments(sums.nearness, sums.weights),
-            jnp.where(sums.weights > 0, 1.0, 0 * sums.weights),
-        )
+        sums = lists.reduce_blocks(jax.ops.segment_sum, lists.map_blocks(blend, limits))
+        sums = sums.reshape(-1, *sums.shape[2:])
+        weights = sums[:, -1:]
+        is_covered = (weights > 0).astype(sums.dtype)
+        return jnp.concatenate([blend_fragments(sums[:, :-1], weights), is_covered], axis=1)

@@ -1,16 +1,24 @@
 """Deferred shading: the light is found at what the pixels see, by the normal there."""
 
+import dataclasses
+
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import scipy  # its parts are loaded where they are used, which takes a third of a second
 from jaxtyping import Array, Float
 
-from splatjax._chunking import map_chunks
 from splatjax.geometry import tangent_frames
-from splatjax.render import AbstractLighting, LightOnSplats, entering_light, surface_attributes
+from splatjax.render import (
+    AbstractLighting,
+    LightVisibility,
+    SurfaceAttributes,
+    SurfaceSamples,
+    entering_light,
+    surface_attributes,
+)
 from splatjax.scene import Scene, Splats, StackedLights
 from splatjax.shading import unit_normals
-from splatjax.splatting import TILES_AT_ONCE
 
 _NEIGHBORS = 12
 _LEAST_SPREAD = 1e-3  # of the neighbors' mean squared distance: below it a direction has no slope
@@ -23,43 +31,53 @@ class LightAtPixels(AbstractLighting):
     did Zwicker et al. 2001.
     """
 
-    def at_pixels(self, scene, groups, points, named):
-        def lit(points, named):
-            return _lit(scene, groups, points, named)
-
-        return map_chunks(lit, points, named, at_once=TILES_AT_ONCE)
+    def at_pixels(self, scene, groups, samples):
+        return _lit(scene, groups, samples, samples.attributes.normals)
 
 
-class NormalFields(LightAtPixels):
-    r"""Lights each pixel by normals that vary within a splat: `n_i + slopes_i (x - p_i)`, not unit.
+class PhongSplats(Splats):
+    """Splats whose normals vary: `n_i + slopes_i (x - p_i)` at a place `x`, not unit.
+
+    **Attributes:**
+
+    - `slopes`: how the normal of each splat turns, 1/mm: row by row a matrix of 3 x 3. From
+      `normal_slopes`, or of the surface's curvature. Differentiable.
+    """
+
+    slopes: Float[Array, "splats 9"] = eqx.field(kw_only=True)
+
+    @classmethod
+    def of(cls, splats: Splats) -> "PhongSplats":
+        """Add the slopes of `normal_slopes` to concrete splats."""
+        return cls(**vars(splats), slopes=normal_slopes(splats).reshape(-1, 9))
+
+
+class NormalFields(AbstractLighting):
+    r"""Lights each pixel by the normals of `PhongSplats` there.
 
     The fields of a pixel's splats are blended, then shaded; the originals were shaded, then
     blended, which is the same to second order in how much they disagree there.
 
-    **Attributes:**
-
-    - `slopes`: how the normal of each splat turns, 1/mm; from `normal_slopes`, or of the surface's
-      curvature. Differentiable.
-
     **Source:** Botsch et al. 2004, "Phong Splatting".
     """
 
-    slopes: Float[Array, "splats 3 3"]
-
-    def attributes(self, scene, light, entering):
-        splats, slopes = scene.splats, self.slopes.astype(scene.splats.centers.dtype)
+    def attributes(self, scene, light, irradiance):
+        splats = scene.splats
+        if not isinstance(splats, PhongSplats):
+            raise ValueError(
+                f"scene.splats are {type(splats).__name__}, whose normals do not vary; give "
+                "PhongSplats.of(splats)"
+            )
+        slopes = splats.slopes.reshape(-1, 3, 3)
         at_origin = splats.normals - jnp.einsum("sij,sj->si", slopes, splats.centers)
-        return surface_attributes(scene, light, entering) | {
-            "normal": at_origin.T,
-            "normal slopes": slopes.reshape(splats.count, 9).T,
-        }
+        attributes = surface_attributes(scene, light, irradiance)
+        return dataclasses.replace(attributes, normals=at_origin.T, extra=splats.slopes.T)
 
-    def at_pixels(self, scene, groups, points, named):
-        rows = dict(named)
-        slopes = rows.pop("normal slopes")
-        slopes = slopes.reshape(slopes.shape[0], 3, 3, slopes.shape[2])
-        normal = rows["normal"] + jnp.einsum("tijp,tjp->tip", slopes, points)
-        return super().at_pixels(scene, groups, points, rows | {"normal": normal})
+    def at_pixels(self, scene, groups, samples):
+        blended = samples.attributes
+        slopes = blended.extra.reshape(3, 3, -1)
+        normals = blended.normals + jnp.einsum("ijp,jp->ip", slopes, samples.positions)
+        return _lit(scene, groups, samples, normals)
 
 
 def normal_slopes(splats: Splats, neighbors: int = _NEIGHBORS) -> Float[Array, "splats 3 3"]:
@@ -94,26 +112,22 @@ def normal_slopes(splats: Splats, neighbors: int = _NEIGHBORS) -> Float[Array, "
 def _lit(
     scene: Scene,
     groups: list[StackedLights],
-    points: Float[Array, "tiles 3 pixels"],
-    named: dict[str, Float[Array, "tiles _rows pixels"]],
-) -> dict[str, Float[Array, "tiles _rows pixels"]]:
-    material, tiles = scene.material, points.shape[0]
-
-    def flat(rows: Float[Array, "tiles rows pixels"]) -> Float[Array, "points rows"]:
-        return rows.transpose(0, 2, 1).reshape(-1, rows.shape[1])
-
-    def tiled(rows: Float[Array, "rows points"]) -> Float[Array, "tiles rows pixels"]:
-        return rows.reshape(rows.shape[0], tiles, -1).transpose(1, 0, 2)
-
-    shares = [
-        flat(lit).T if (lit := named.get(f"lit {i}")) is not None else None
-        for i in range(len(groups))
-    ]
-    light = LightOnSplats(groups, shares, jnp.zeros((), points.dtype))
-    specular = flat(named["specular"])[:, 0] if "specular" in named else material.specular
-    roughness = flat(named["roughness"])[:, 0] if "roughness" in named else material.roughness
-    albedo = flat(named["albedo"]) if "albedo" in named else None
-    normals = unit_normals(flat(named["normal"]))
-    entering = entering_light(material, light, flat(points), normals, albedo, specular, roughness)
-    lit = named | {"source": tiled(entering.source)}
-    return lit | {"irradiance": tiled(entering.irradiance)} if "irradiance" in named else lit
+    samples: SurfaceSamples,
+    normals: Float[Array, "3 points"],
+) -> SurfaceAttributes:
+    """Compute the light that enters where the pixels look, by the normals there."""
+    material, blended = scene.material, samples.attributes
+    light = LightVisibility(groups, list(blended.visibility), jnp.zeros((), normals.dtype))
+    entering = entering_light(
+        material,
+        light,
+        samples.positions.T,
+        unit_normals(normals.T),
+        None if blended.albedo is None else blended.albedo.T,
+        material.specular if blended.specular is None else blended.specular[0],
+        material.roughness if blended.roughness is None else blended.roughness[0],
+    )
+    irradiance = None if blended.irradiance is None else entering.entering
+    return dataclasses.replace(
+        blended, normals=normals, source=entering.source, irradiance=irradiance, extra=None
+    )

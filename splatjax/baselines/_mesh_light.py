@@ -3,18 +3,16 @@ surface.
 """
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from splatjax import splatting as _splatting
-from splatjax.render import EnteringLight, LightOnSplats, let_light_in
+from splatjax.render import Irradiance, LightVisibility, entering_light
 from splatjax.scene import (
     AbstractLight,
     DirectionalLight,
     Material,
     PointLight,
-    Scene,
     Splats,
     stack_lights,
 )
@@ -27,9 +25,9 @@ class MeshShadow(eqx.Module):
     """What one light sees of a mesh."""
 
     light: AbstractLight
-    view: _splatting.AbstractView
-    surfaces: _splatting.Surfaces
-    """The front's attributes are texture coordinates and normal."""
+    depths: _splatting.ShadowMap
+    attributes: Float[Array, "tiles 5 pixels"]
+    """Texture coordinates and normal."""
 
 
 class MeshLight(eqx.Module):
@@ -42,23 +40,38 @@ class MeshLight(eqx.Module):
     settings: _splatting.ShadowSettings
     needed: Float[Array, ""]
 
-    def on(self, points: Splats) -> LightOnSplats:
-        """Give what of each light reaches points of the surface. Differentiable."""
+    def on(self, points: Splats) -> LightVisibility:
+        """Compute the fraction of each light that reaches points of the surface. Differentiable."""
         groups = stack_lights(self.lights)
         shares = []
         for group in groups:
             maps = [self.shadows[place] for place in group.places]
             visible = [
-                _splatting.lit_share(points, shadow.view, shadow.surfaces, self.settings)
+                _splatting.compute_visibility(points, shadow.depths, self.settings)
                 for shadow in maps
                 if shadow is not None
             ]
             shares.append(jnp.stack(visible) if visible else None)
-        return LightOnSplats(groups, shares, self.needed)
+        return LightVisibility(groups, shares, self.needed)
 
-    def entering(self, points: Splats, material: Material) -> EnteringLight:
-        """Give what enters the surface at points, by the renderer's own interface."""
-        return let_light_in(Scene(points, self.lights, material), self.on(points))
+    def entering(self, points: Splats, material: Material) -> Irradiance:
+        """Compute the light that enters the surface at points, by the renderer's own interface."""
+        specular, roughness = (
+            own if factor is None else own * factor
+            for own, factor in (
+                (material.specular, points.specular),
+                (material.roughness, points.roughness),
+            )
+        )
+        return entering_light(
+            material,
+            self.on(points),
+            points.centers,
+            points.normals,
+            points.albedo,
+            specular,
+            roughness,
+        )
 
 
 def light_views(
@@ -136,8 +149,9 @@ def mesh_light(
         grid = _splatting.TileGrid(view.width, view.height)
         depth = grid.cut(jnp.where(seen.covered, surface[5], 1.0)[None])[:, 0]
         coverage = grid.cut(seen.covered.astype(surface.dtype)[None])[:, 0]
-        front = _splatting.Surface(grid.cut(surface[:5]), depth, coverage, coverage)
-        behind = jax.tree.map(jnp.zeros_like, front)
-        shadows.append(MeshShadow(light, view, _splatting.Surfaces(front, behind, seen.needed)))
+        nothing = jnp.zeros_like(depth)
+        planes = jnp.stack([depth, coverage, nothing, nothing])
+        depths = _splatting.ShadowMap(view, planes, seen.needed)
+        shadows.append(MeshShadow(light, depths, grid.cut(surface[:5])))
         needed = jnp.maximum(needed, seen.needed)
     return MeshLight(lights, tuple(shadows), settings, needed)

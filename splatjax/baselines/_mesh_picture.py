@@ -9,7 +9,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from splatjax import shading as _shading, splatting as _splatting
-from splatjax.render import LightOnSplats
+from splatjax.render import LightVisibility
 from splatjax.scene import AbstractLight, Camera, Frame, Material
 
 from ._mesh_light import MeshLight, mesh_light, shadow_capacities
@@ -147,7 +147,7 @@ def _shaded(
 ) -> Frame:
     """Shade what a camera sees, as pass 5 does."""
     points, channels = seen.points, layers.shape[2]
-    received: LightOnSplats = light.on(points)
+    received: LightVisibility = light.on(points)
     f0 = _shading.fresnel_f0(material.eta)
     to_eye = view.position[None] - points.centers
     surface = _shading.SurfacePoints(
@@ -160,7 +160,7 @@ def _shaded(
         roughness=material.roughness
         if points.roughness is None
         else material.roughness * points.roughness,
-        lit=received.shares,
+        lit=received.visibility,
     )
     covered = seen.seen.covered
     drawn = jnp.where(needed <= 1, 1.0, jnp.nan) * covered.reshape(-1, 1).astype(depth.dtype)
@@ -183,7 +183,7 @@ def _shaded(
         drawn * _shading.reflected_radiance(surface, received.groups, f0, channels)
     )
     shadow = jnp.ones((len(light.lights), *covered.shape), depth.dtype)
-    for group, shares in zip(received.groups, received.shares, strict=True):
+    for group, shares in zip(received.groups, received.visibility, strict=True):
         if shares is not None:
             shares = jnp.where(covered[None], shares.reshape(-1, *covered.shape), 1.0)
             shadow = shadow.at[jnp.asarray(group.places)].set(shares)
@@ -195,7 +195,7 @@ def _shaded(
         normal=seen.picture(points.normals),
         albedo=seen.picture(drawn * albedo),
         shadow=shadow,
-        irradiance=seen.picture(drawn * light.entering(points, material).irradiance.T),
+        irradiance=seen.picture(drawn * light.entering(points, material).entering.T),
         layers=layers.reshape(layers.shape[0], *covered.shape, channels),
         weights=material.gaussians.weights,
         diffuse=diffuse,

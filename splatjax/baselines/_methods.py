@@ -4,8 +4,6 @@ renderer.
 
 from dataclasses import replace
 
-from jaxtyping import Array, Float
-
 from splatjax.render import LightAtSplats, RenderSettings
 
 from ._blending import BlendingRasterizer
@@ -37,22 +35,17 @@ def ewa_splatting(settings: RenderSettings = _DEFAULTS) -> RenderSettings:
     return replace(settings, rasterizer=BlendingRasterizer(EwaKernel()), lighting=LightAtPixels())
 
 
-def phong_splatting(
-    slopes: Float[Array, "splats 3 3"], settings: RenderSettings = _DEFAULTS
-) -> RenderSettings:
+def phong_splatting(settings: RenderSettings = _DEFAULTS) -> RenderSettings:
     """Return settings for Phong splatting: normals vary linearly within each splat, and nothing is
     filtered in the picture.
 
-    Few splats suffice for a smooth surface; splats smaller than a pixel alias.
-
-    **Arguments:**
-
-    - `slopes`: of `normal_slopes(splats)`.
+    Few splats suffice for a smooth surface; splats smaller than a pixel alias. The scene holds
+    `PhongSplats`.
 
     **Source:** Botsch et al. 2004, "Phong Splatting".
     """
-    lighting = NormalFields(slopes)
-    return replace(settings, rasterizer=BlendingRasterizer(DiscKernel()), lighting=lighting)
+    rasterizer = BlendingRasterizer(DiscKernel())
+    return replace(settings, rasterizer=rasterizer, lighting=NormalFields())
 
 
 def deferred_splatting(settings: RenderSettings = _DEFAULTS) -> RenderSettings:

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Float
 
-from splatjax.splatting import AbstractView, BinCapacity, FragmentSums
+from splatjax.splatting import AbstractView
 
 from ._kernels import AbstractSplatKernel, DiscKernel
 from ._tiles import AbstractListRasterizer, Lists
@@ -17,11 +17,10 @@ class NearestRasterizer(AbstractListRasterizer):
     """
 
     kernel: AbstractSplatKernel = DiscKernel()
-    capacity: BinCapacity | None = None
 
     def front(
         self, lists: Lists, attributes: Float[Array, "attributes splats"], view: AbstractView
-    ) -> FragmentSums:
+    ) -> Float[Array, "places rows pixels"]:
         def nearest(ids, footprints, dx, dy):
             fragments = self.kernel.fragments(footprints, view, dx, dy)
             nearness = jnp.where(fragments.is_inside, fragments.nearness, -jnp.inf)
@@ -32,18 +31,15 @@ class NearestRasterizer(AbstractListRasterizer):
         nearest_of_all = lists.reduce_blocks(jax.ops.segment_max, nearness)
         wins = (nearness == nearest_of_all[lists.chunk]) & (nearness > -jnp.inf)
         winner = lists.reduce_blocks(jax.ops.segment_max, jnp.where(wins, ids, -1))
-        # Beyond the picture tiles are 0, so the numbers of splats begin at 1.
-        numbers = (jnp.maximum(winner, -1)[:, :, None] + 1).astype(attributes.dtype)
-        winner = lists.tiles(numbers)[:, 0] - 1
+        winner = winner.reshape(-1, winner.shape[2])
         is_covered = winner >= 0
-        ids = jnp.where(is_covered, winner, 0).astype(jnp.int32)
+        ids = jnp.maximum(winner, 0)
         footprint = jax.tree.map(lambda plane: plane[ids], lists.footprints)
-        tiles = jnp.arange(lists.grid.count, dtype=jnp.int32)
         x, y = (
-            pixel.astype(attributes.dtype) + 0.5 for pixel in lists.grid.columns_and_rows(tiles)
+            pixel.astype(attributes.dtype) + 0.5
+            for pixel in lists.grid.columns_and_rows(lists.bins.order)
         )
         fragments = self.kernel.fragments(footprint, view, x - footprint.x, y - footprint.y)
-        own = jnp.stack([fragments.nearness, jnp.ones_like(winner)])
+        own = jnp.stack([fragments.nearness, jnp.ones_like(x)])
         rows = jnp.concatenate([attributes[:, ids], own])
-        rows = jnp.where(is_covered[None], rows, 0.0) + 0 * winner[None]  # NaN where none fits
-        return FragmentSums.of(rows.transpose(1, 0, 2))
+        return jnp.where(is_covered[None], rows, 0.0).transpose(1, 0, 2)

@@ -162,7 +162,7 @@ def diffuse_on_screen(
     source = jnp.where(is_covered[..., None], frame.irradiance / share * root, 0.0).transpose(
         2, 0, 1
     )
-    pixels_per_mm = view.pixels_per_mm(jnp.where(is_covered, depth, 1e6))
+    pixels_per_mm = view.focal_length / jnp.where(is_covered, depth, 1e6)
     layers, weights = kernel.diffuse(source, depth, pixels_per_mm, material.gaussians)
     to_eye = view.position[None, None] - frame.position
     surface = _shading.SurfacePoints(

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from splatjax import diffusion as _diffusion, splatting as _splatting
-from splatjax.render import EnteringLight
+from splatjax.render import Irradiance
 from splatjax.scene import Material
 
 from ._blur import blur_along
@@ -60,14 +60,14 @@ class TextureSpaceSettings(eqx.Module):
     - `resolution`: texels along an edge of the irradiance map. Static.
     - `stretch`: `StretchCorrected()` or `Uncorrected()`.
     - `thin_parts`: `TranslucentShadowMap()` or `OpaqueParts()`.
-    - `normalization`: as in pass 4; how deep the sources lie counts for the far side alone.
+    - `kernel`: as in pass 4; how deep the sources lie counts for the far side alone.
     - `shadows`: of the lights' shadow maps.
     """
 
     resolution: int = eqx.field(static=True, default=1024)
     stretch: AbstractStretch = StretchCorrected()
     thin_parts: AbstractThinParts = TranslucentShadowMap()
-    normalization: _diffusion.AbstractNormalization = _diffusion.ExitOdds()
+    kernel: _diffusion.AbstractDiffusionKernel = _diffusion.EscapeNormalization()
     shadows: _splatting.ShadowSettings = _splatting.ShadowSettings()
 
 
@@ -87,7 +87,7 @@ class TextureLayers(eqx.Module):
 
     layers: Float[Array, "gaussians height width channels"]
     valid: Float[Array, "height width"]
-    entering: EnteringLight
+    entering: Irradiance
     renormalized: Float[Array, " gaussians"]
     needed: Float[Array, ""]
 
@@ -146,7 +146,7 @@ def diffuse_in_texture(
     - `reaches`: from `reaches_of`. Static.
 
     **Returns:** `TextureLayers`. Constant light stays constant, and layers lie between the least
-    and the greatest irradiance, where the normalization's gain is 1.
+    and the greatest irradiance, where the gain of the kernel is 1.
 
     **Source:** d'Eon, Luebke and Enderton 2007; d'Eon and Luebke 2007 (GPU Gems 3, chapter 14).
     """
@@ -164,7 +164,7 @@ def diffuse_in_texture(
         rows.append(far.nearness.reshape(-1, *valid.shape))
     channels, blurred = entering.source.shape[0], jnp.concatenate(rows) * valid[None]
     order, spent = jnp.argsort(variances), jnp.zeros((), variances.dtype)
-    means, exits, lost = [], [], []
+    means, masses, lost = [], [], []
     for step in range(len(variances)):
         variance = variances[order[step]]
         blurred, kept = _spread(
@@ -172,12 +172,14 @@ def diffuse_in_texture(
         )
         spent = variance
         own = blurred[:channels].reshape(channels, -1)
-        mean, exit_ = _with_far_side(own, blurred[channels + 2 :], far, valid, variance, settings)
+        mean, mass = _with_far_side(own, blurred[channels + 2 :], far, valid, variance, settings)
         means.append(mean)
-        exits.append(exit_)
+        masses.append(mass)
         lost.append(1 - jnp.sum(kept) / jnp.sum(valid))
     back = jnp.argsort(order)
-    layers = _normalized(jnp.stack(means)[back], jnp.stack(exits)[back], texels, material, settings)
+    layers = _normalized(
+        jnp.stack(means)[back], jnp.stack(masses)[back], texels, material, settings
+    )
     return TextureLayers(
         layers=texels.picture(layers.transpose(2, 0, 1)).transpose(2, 0, 1, 3)
         * valid[None, :, :, None],
@@ -219,12 +221,10 @@ def _spread(rows, valid, variance, channels: int, reaches: tuple[int, ...]):
 def _with_far_side(
     own, nearness, far: FarSide | None, valid, variance, settings: TextureSpaceSettings
 ):
-    """Give mean and exits: the texel's own surroundings, and what comes through from the far
-    side.
-    """
+    """Compute mean and kernel mass of the texel's own surroundings and of the far side."""
     if far is None:
         return own, jnp.ones_like(own[:1])
-    depth = settings.normalization.depths(variance[None])[0]
+    depth = settings.kernel.depths(variance[None])[0]
     share = far.share(nearness.reshape(nearness.shape[0], -1), variance, depth)
     picture = own.T.reshape(*valid.shape, -1)
     total, weight = own, jnp.ones_like(own[:1])
@@ -235,12 +235,12 @@ def _with_far_side(
 
 
 def _normalized(
-    means, exits, texels: SurfaceTexels, material: Material, settings: TextureSpaceSettings
+    means, mass, texels: SurfaceTexels, material: Material, settings: TextureSpaceSettings
 ):
     weights = material.gaussians.weights
     albedo = texels.points.albedo
     albedo = jnp.ones((1, *means.shape[1:]), means.dtype) if albedo is None else albedo.T[None]
     single = material.total_reflectance() - material.gaussians.total_reflectance()
     variances, colored = material.gaussians.variances, weights[:, :, None] * albedo
-    gain = settings.normalization.gain(exits, variances, colored, single[:, None] * albedo[0])
+    gain = settings.kernel.gain(mass, variances, colored, single[:, None] * albedo[0])
     return gain * means

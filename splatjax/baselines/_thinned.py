@@ -2,60 +2,53 @@
 for them.
 """
 
-from collections.abc import Sequence
+import dataclasses
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
 
-from splatjax.diffusion import AbstractDiffuser, DenseDiffuser, Diffused, Kernels, Sources
-from splatjax.scene import Splats
-from splatjax.splatting import Atlas
+from splatjax.diffusion import (
+    AbstractDiffuser,
+    AbstractDiffusionPlan,
+    Diffused,
+    dense_layer,
+)
 
 
 class ThinnedDiffuser(AbstractDiffuser):
-    r"""Sums over every `keep`-th splat alone. What is kept lies evenly where nearby splats are near
-    in memory.
+    r"""Sums over every `keep`-th splat alone, for all splats. What is kept lies evenly: a plan
+    puts splats that are near in space near in memory.
 
     The renderer's own `ClusterDiffuser` merges splats instead, which errs far less for as many.
 
     **Attributes:**
 
     - `keep`: one splat of how many. Static.
-    - `whole`: sums over those that are kept.
 
     **Source:** Kim et al. 2010, section 4.2 and Figure 5.
     """
 
     keep: int = eqx.field(static=True)
-    whole: AbstractDiffuser = DenseDiffuser()
 
-    def planned(
-        self,
-        splats: Splats,
-        kernels: Kernels,
-        interval: Float[Array, "2"],
-        atlases: Sequence[Atlas],
-    ) -> "ThinnedDiffuser":
-        kept = jax.tree.map(lambda rows: rows[:: self.keep], splats)
-        return ThinnedDiffuser(self.keep, self.whole.planned(kept, kernels, interval, atlases))
+    def make_plan(self, parts, variances, kernel, interval):
+        return ThinnedPlan(self.keep)
 
-    def diffuse(
-        self,
-        sources: Sources,
-        kernels: Kernels,
-        points: Float[Array, "tiles 3 points"],
-        covered: Bool[Array, "tiles points"],
-        atlas: Atlas,
-    ) -> Diffused:
-        kept = jax.tree.map(lambda rows: rows[..., :: self.keep], sources)
-        larger = eqx.tree_at(
-            lambda kept: kept.areas,
-            kept,
-            kept.areas * (jnp.sum(sources.areas) / jnp.sum(kept.areas)),
+
+class ThinnedPlan(AbstractDiffusionPlan):
+    """What sums over fewer splats need to know: how many are left out."""
+
+    keep: int = eqx.field(static=True)
+
+    def diffuse(self, sources, variances, kernel, combination, wanted=None):
+        kept = jax.tree.map(lambda rows: rows[..., :: self.keep], combination.gather_last(sources))
+        whole = combination.total([jnp.sum(sources.areas)])
+        kept = dataclasses.replace(kept, areas=kept.areas * (whole / jnp.sum(kept.areas)))
+        layers = tuple(
+            dense_layer(kept, sources.centers, variance, depth)
+            for variance, depth in zip(variances, kernel.depths(variances), strict=True)
         )
-        return self.whole.diffuse(larger, kernels, points, covered, atlas)
+        return Diffused(layers, jnp.zeros((), sources.centers.dtype))
 
-    def in_forward_mode(self) -> "ThinnedDiffuser":
-        return ThinnedDiffuser(self.keep, self.whole.in_forward_mode())
+    def in_forward_mode(self) -> "ThinnedPlan":
+        return self

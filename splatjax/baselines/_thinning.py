@@ -77,7 +77,7 @@ def layer_contrast(
 
     **Arguments:**
 
-    - `source`: the light that spreads, as `splatjax.render.light_on_splats` gives it.
+    - `source`: the light that spreads, as `splatjax.render.compute_irradiance` gives it.
     - `variance`: of the layer, mm^2.
 
     **Returns:** 0 under even light.

@@ -3,7 +3,7 @@ every derivative is there.
 """
 
 import abc
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import TypeVar
 
 import equinox as eqx
@@ -14,13 +14,13 @@ from jaxtyping import Array, Float, Int, PyTree
 from splatjax.scene import Splats
 from splatjax.splatting import (
     AbstractRasterizer,
+    AbstractRasterPlan,
     AbstractView,
     BinCapacity,
     Bins,
     Footprints,
     FragmentSums,
     SplattingSettings,
-    SummedFragments,
     TileGrid,
     TileRasterizer,
     bin_items,
@@ -37,17 +37,15 @@ class AbstractListRasterizer(AbstractRasterizer):
     """
 
     kernel: eqx.AbstractVar[AbstractSplatKernel]
-    capacity: eqx.AbstractVar[BinCapacity | None]
 
-    def planned(self, splats: Splats, views: Sequence[AbstractView], settings: SplattingSettings):
-        counts = [_demand(self.kernel, splats, view, settings) for view in views]
-        capacity = BinCapacity.for_counts(counts, TileGrid(views[0].width, views[0].height))
-        return eqx.tree_at(
-            lambda rasterizer: rasterizer.capacity,
-            self,
-            capacity,
-            is_leaf=lambda leaf: leaf is None,
-        )
+    def make_plan(self, parts, views, settings):
+        if len(parts) > 1:
+            raise ValueError(
+                f"a {type(self).__name__} works on one device; give a TileRasterizer for a mesh"
+            )
+        counts = [_demand(self.kernel, parts[0], view, settings) for view in views]
+        grid = TileGrid(views[0].width, views[0].height)
+        return ListPlan(self, BinCapacity.for_counts(counts, grid))
 
     def for_shadows(self) -> AbstractRasterizer:
         return TileRasterizer()
@@ -55,46 +53,41 @@ class AbstractListRasterizer(AbstractRasterizer):
     @abc.abstractmethod
     def front(
         self, lists: "Lists", attributes: Float[Array, "attributes splats"], view: AbstractView
-    ) -> FragmentSums:
-        """Give the surface that the lists show."""
+    ) -> Float[Array, "places rows pixels"]:
+        """Compute the rows of the front surface, as in `FragmentSums`, lane by lane of the
+        lists.
+        """
 
-    def summed(
+
+class ListPlan(AbstractRasterPlan):
+    """The capacity of the lists of an `AbstractListRasterizer`. Nothing is shown behind the
+    front.
+    """
+
+    rasterizer: AbstractListRasterizer
+    capacity: BinCapacity
+
+    def sum_fragments(
         self,
         splats: Splats,
         attributes: Float[Array, "attributes splats"],
         view: AbstractView,
         settings: SplattingSettings,
-    ) -> SummedFragments:
-        rows, dtype = attributes.shape[0], attributes.dtype
-        empty_sums = FragmentSums.nothing(TileGrid(view.width, view.height).count, rows, dtype)
-        if splats.count == 0:
-            return SummedFragments(empty_sums, empty_sums, jnp.zeros((), dtype))
-        lists = self.lists(splats, view, settings)
-        front = self.front(lists, attributes, view)
-        return SummedFragments(front, empty_sums, lists.bins.needed.astype(dtype))
-
-    def lists(self, splats: Splats, view: AbstractView, settings: SplattingSettings) -> "Lists":
-        """Sort the splats into the tiles of a picture.
-
-        **Raises:** `ValueError` where the rasterizer comes from no plan.
-        """
-        if self.capacity is None:
-            raise ValueError(
-                f"this {type(self).__name__} has no capacity yet; take one from a plan "
-                "(splatjax.plan) or from `planned`"
-            )
-        footprints, grid = (
-            self.kernel.footprints(splats, view, settings),
-            TileGrid(view.width, view.height),
-        )
+        combination,
+    ) -> FragmentSums:
+        grid = TileGrid(view.width, view.height)
+        footprints = self.rasterizer.kernel.footprints(splats, view, settings)
         bins = bin_items(footprints.ranges(grid), grid, self.capacity)
-        chunk = (
-            jnp.searchsorted(
-                bins.first_block, jnp.arange(bins.ids.shape[0], dtype=jnp.int32), side="right"
-            )
-            - 1
-        )
-        return Lists(footprints, bins, chunk.astype(jnp.int32), grid)
+        block = jnp.arange(bins.ids.shape[0], dtype=jnp.int32)
+        chunk = jnp.searchsorted(bins.first_block, block, side="right") - 1
+        lists = Lists(footprints, bins, chunk.astype(jnp.int32), grid)
+        rows, within = self.rasterizer.front(lists, attributes, view), grid.within_picture()
+        if within is not None:
+            shown = jnp.asarray(within)[jnp.minimum(bins.order, grid.count - 1)]
+            rows = jnp.where(shown[:, None], rows, 0.0)
+        needed = bins.needed.astype(rows.dtype)
+        rows = rows + jnp.where(needed <= 1, 0.0, jnp.nan).astype(rows.dtype)
+        return FragmentSums(jnp.minimum(bins.order, grid.count), rows, needed, len(rows))
 
 
 class Lists(eqx.Module):
@@ -140,17 +133,6 @@ class Lists(eqx.Module):
         """
         chunks = self.bins.order.shape[0] // self.grid.lanes
         return combine(results, self.chunk, num_segments=chunks, indices_are_sorted=True)
-
-    def tiles(
-        self, results: Float[Array, "chunks lanes rows pixels"]
-    ) -> Float[Array, "tiles rows pixels"]:
-        """Put what the chunks found in the order of the tiles; 0 beyond the picture, NaN where the
-        lists had no room.
-        """
-        within = self.grid.within_picture()
-        tiles = self.bins.by_tile(results.reshape(-1, *results.shape[2:]), self.grid.count)
-        tiles = tiles if within is None else jnp.where(within[:, None], tiles, 0.0)
-        return tiles + self.bins.poison(results.dtype)
 
 
 @eqx.filter_jit

@@ -99,15 +99,15 @@ class TranslucentShadowMap(AbstractThinParts):
         )
 
     def _of(self, texels: SurfaceTexels, shadow: MeshShadow, bias: float, scale: Float[Array, ""]):
-        view, front = shadow.view, shadow.surfaces.front
+        view, (front, coverage, *_) = shadow.depths.view, shadow.depths.planes
         points, normals = texels.points.centers, texels.points.normals
         x, y, depth = view.project(points.T)
         column = jnp.clip(stop_gradient(jnp.floor(x)).astype(jnp.int32), 0, view.width - 1)
         row = jnp.clip(stop_gradient(jnp.floor(y)).astype(jnp.int32), 0, view.height - 1)
         tile, pixel = jnp.divmod(TileGrid(view.width, view.height).pixel(column, row), SIDE**2)
-        entered, lit = front.attributes[tile, :, pixel].T, front.coverage[tile, pixel] > 0
+        entered, lit = shadow.attributes[tile, :, pixel].T, coverage[tile, pixel] > 0
         entry = view.unproject(
-            x, y, jnp.where(lit, jnp.minimum(front.depth[tile, pixel], depth), depth)
+            x, y, jnp.where(lit, jnp.minimum(front[tile, pixel], depth), depth)
         ).T
         squared = jnp.sum((points - entry) ** 2, axis=1)
         way = jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1.0)), 0.0)
@@ -115,5 +115,5 @@ class TranslucentShadowMap(AbstractThinParts):
         cosine = jnp.sum(wi * normals, axis=1)
         opposite = jnp.clip(-jnp.sum(entered[2:].T * normals, axis=1), 0, 1)
         thickness = way + opposite * (jnp.clip(-cosine, 0, 1) * way - way)
-        is_far = lit & (cosine < 0) & (depth > front.depth[tile, pixel] + bias)
+        is_far = lit & (cosine < 0) & (depth > front[tile, pixel] + bias)
         return entered[:2].T, jnp.where(is_far, jnp.exp(-thickness / scale), 0.0)

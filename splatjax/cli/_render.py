@@ -53,18 +53,20 @@ class Render(ViewOptions):
         lights = self.lights(material, self.azimuth, self.light_azimuth)
         scene = sj.Scene(splats, lights, material)
         with stage("planning"):
-            plan = sj.plan(scene, camera)
+            plan = sj.make_plan(scene, camera)
         with stage(f"rendering {splats.count} splats at {self.width} x {self.height}"):
             return draw(scene, camera, plan), material
 
     def _streamed(self, file: sj.SplatFile) -> tuple[sj.Frame, sj.Material]:
+        material = self.displayable_material()
+
         def parts() -> Iterable[sj.Splats]:
             return map(self.adjusted, file())
 
         with stage(f"looking at {file.count} splats"):
             camera = self.camera(parts, self.azimuth)
         first = next(iter(parts()))
-        material = self.material_for(first, sj.load_material(self.material))
+        material = self.material_for(first, material)
         lights = self.lights(material, self.azimuth, self.light_azimuth)
         with stage("rendering the stream", file.count) as report:
             frame = sj.render_streamed(

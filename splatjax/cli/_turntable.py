@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
+import jax
 import tyro
 
 import splatjax as sj
@@ -36,7 +37,8 @@ class Turntable(ViewOptions):
     Per frame an EXR file with every layer and a PNG file; in the end turntable.webp, which plays in
     a browser. Frames begin at --azimuth and --light-azimuth and go on in equal steps; a full turn
     ends one step before its beginning, so that it plays round and round. The splats are planned and
-    the program is compiled once for all frames. Frames that are there are kept: after an
+    the program is compiled once for all frames; with --turn camera --fill 0 the light below the
+    surface is computed once too. Frames that are there are kept: after an
     interruption, run the same command again. A record in the folder, turntable.json, makes sure
     that frames with different options are not mixed. Where a launcher has started several processes
     (SLURM, Open MPI, or JAX_COORDINATOR_ADDRESS, JAX_NUM_PROCESSES and JAX_PROCESS_ID), they share
@@ -104,13 +106,18 @@ class Turntable(ViewOptions):
         cameras = [self.camera(lambda: [splats], azimuth) for azimuth, _ in places]
         # The plan is for all frames, so that an interruption changes none.
         with stage(f"planning {self.frames} frames"):
-            plan = sj.plan(scenes, cameras)
+            plan = sj.make_plan(scenes, cameras)
         folder.begin()
+        light = None
+        if self.turn == "camera" and self.fill == 0:
+            # No light moves: passes 1 and 4 are the same in every frame.
+            with stage("lighting the splats"):
+                light = jax.block_until_ready(sj.illuminate(scenes[0], plan))
         what = f"rendering {splats.count} splats at {self.width} x {self.height}"
         try:
             with stage(what, len(missing)) as report:
                 for number, i in enumerate(missing, 1):
-                    frame = draw(scenes[i], cameras[i], plan)
+                    frame = draw(scenes[i], cameras[i], plan, light)
                     self.write(folder.items[i][0], frame, material)
                     report(number)
         except (KeyboardInterrupt, OSError):

@@ -11,7 +11,9 @@ import numpy as np
 import tyro
 
 import splatjax as sj
-from splatjax.io import check_room, fingerprint, free_bytes, material_path, own_version
+from splatjax._memory import check_memory, free_bytes
+from splatjax.io import fingerprint, material_path, own_version
+from splatjax.render import check_displayable
 from splatjax.scene import Parts
 
 from ._options import MaterialName, Rules, check_options, option_name
@@ -90,19 +92,25 @@ class ViewOptions:
         check_options(self, rules | (more_rules or {}))
         if self.splats is None:
             most = f"take {free_bytes() / _BYTES_PER_SPLAT:.0f} at most"
-            check_room(f"--count {self.count}", _BYTES_PER_SPLAT * self.count, most)
+            check_memory(f"--count {self.count}", _BYTES_PER_SPLAT * self.count, most)
         size = f"--width {self.width} --height {self.height}"
         most = f"take {free_bytes() / _BYTES_PER_PIXEL:.0f} pixels at most"
-        check_room(size, _BYTES_PER_PIXEL * self.width * self.height, most)
+        check_memory(size, _BYTES_PER_PIXEL * self.width * self.height, most)
 
     def load(self) -> tuple[sj.Splats, sj.Material]:
         """Return the splats, and the material with which they are rendered."""
-        material = sj.load_material(self.material)
+        material = self.displayable_material()
         what = f"making the bust with {self.count} splats" if self.splats is None else ""
         with stage(what or f"reading {self.splats}"):
             splats = sj.bust(self.count) if self.splats is None else sj.read_splats(self.splats)
         splats = self.adjusted(splats)
         return splats, self.material_for(splats, material)
+
+    def displayable_material(self) -> sj.Material:
+        """Load the material; raise `ValueError` for one whose channels no PNG file shows."""
+        material = sj.load_material(self.material)
+        check_displayable(material.gaussians.weights.shape[1])
+        return material
 
     def material_for(self, splats: sj.Splats, material: sj.Material) -> sj.Material:
         """Return a material with which splats are rendered."""
@@ -194,12 +202,14 @@ class ViewOptions:
             )
 
 
-def draw(scene: sj.Scene, camera: sj.Camera, plan: sj.Plan) -> sj.Frame:
-    """Render, and wait for the picture.
+def draw(
+    scene: sj.Scene, camera: sj.Camera, plan: sj.Plan, light: sj.SplatLight | None = None
+) -> sj.Frame:
+    """Render, and wait for the picture; by the light of `sj.illuminate`, if it is given.
 
     **Raises:** `ValueError` when the plan's capacity is exceeded.
     """
-    frame = jax.block_until_ready(sj.render(scene, camera, plan=plan))
+    frame = jax.block_until_ready(sj.render(scene, camera, plan=plan, light=light))
     if not frame.overflow <= 0:
         needed = float(frame.overflow)
         raise ValueError(f"the plan's capacity is exceeded: {needed:.2f} times of it is needed")

@@ -92,7 +92,7 @@ class SurfaceSamples(eqx.Module):
     derivative: tuple[Float[Array, "values points"] | None, ...] | None
 
 
-def stack_rows(rows: PyTree[Float[Array, "*rows points"]]) -> Float[Array, "all points"]:
+def stack_rows(rows: PyTree[Float[Array, "... points"]]) -> Float[Array, "all points"]:
     """Stack the rows of a tree of arrays."""
     leaves = jax.tree.leaves(rows)
     return jnp.concatenate([leaf.reshape(-1, leaf.shape[-1]) for leaf in leaves])

@@ -23,7 +23,7 @@ def on_devices(
     plan: Plan,
     *whole: PyTree,
     rows: tuple[PyTree[Float[Array, "splats ..."]], ...] = (),
-    placed: PyTree[Float[Array, "*rows splats"]] = None,
+    placed: PyTree = None,
     by_splat: bool = False,
 ) -> Result:
     """Run a function on the devices of a plan, each with its own splats in the order of the plan.

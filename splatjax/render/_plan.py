@@ -233,7 +233,7 @@ def _arrange(splats: Splats, devices: int) -> tuple[list[Splats], Array, Array]:
         order = np.pad(order, (0, places - rows), mode="edge")
         orders.append(order.astype(np.int32))
         exist.append(exists)
-        parts.append(arrange(part, orders[-1], exists))
+        parts.append(arrange(part, jnp.asarray(orders[-1]), jnp.asarray(exists)))
     return parts, jnp.asarray(np.concatenate(orders)), jnp.asarray(np.concatenate(exist))
 
 

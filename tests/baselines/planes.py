@@ -4,9 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import splatjax as sj
-from splatjax.diffusion import DenseDiffuser, Diffused, Kernels, PlainMean, Sources
+from splatjax.diffusion import AbstractDiffusionKernel, PlainMean, Sources, dense_layer
 from splatjax.geometry import Mesh, Textures
-from splatjax.splatting import Atlas, PerspectiveView
 
 HALF = 12.0
 """mm, from the middle to the edges."""
@@ -66,17 +65,20 @@ def splatted(points: np.ndarray, gaussians: sj.SumOfGaussians, spacing: float = 
     light = np.sqrt(spots(centers.T))
     arrays = centers, np.tile([[0.0], [0.0], [1.0]], x.size), np.full(x.size, spacing**2), light.T
     sources = Sources(*(jnp.asarray(each, float) for each in arrays))
-    kernels = Kernels.of(gaussians.variances, PlainMean())
-    return np.asarray(gathered(sources, kernels, points).means[0].transpose(0, 2, 1))
+    means, _ = gathered(sources, gaussians.variances, PlainMean(), points)
+    return means.transpose(0, 2, 1)
 
 
-def gathered(sources: Sources, kernels: Kernels, points: np.ndarray) -> Diffused:
-    """What every splat gives to points, as one tile."""
-    anywhere = Atlas.of(jnp.zeros((2, 1, 1)), PerspectiveView.of(camera_over(1.0, 8)), 1)
-    covered = jnp.ones((1, len(points)), bool)
-    return DenseDiffuser().diffuse(
-        sources, kernels, jnp.asarray(points.T, float)[None], covered, anywhere
-    )
+def gathered(
+    sources: Sources, variances, kernel: AbstractDiffusionKernel, points: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The mean of every layer at points and its kernel mass, from all splats."""
+    places = jnp.asarray(points.T, float)
+    layers = [
+        dense_layer(sources, places, variance, depth)
+        for variance, depth in zip(variances, kernel.depths(variances), strict=True)
+    ]
+    return np.stack([each.means for each in layers]), np.stack([each.mass for each in layers])
 
 
 def camera_over(half: float, pixels: int) -> sj.Camera:

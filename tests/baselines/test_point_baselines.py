@@ -4,13 +4,13 @@ none invents a color.
 
 import dataclasses
 
-import bodies
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import splatjax as sj
+from splatjax._combination import OneDevice
 from splatjax.baselines import (
     BlendingRasterizer,
     DiscKernel,
@@ -18,12 +18,13 @@ from splatjax.baselines import (
     EwaKernel,
     LightAtPixels,
     NearestRasterizer,
+    PhongSplats,
     deferred_splatting,
     elliptical_points,
     normal_slopes,
     phong_splatting,
 )
-from splatjax.splatting import PerspectiveView, SplattingSettings
+from splatjax.splatting import PerspectiveView, SplattingSettings, Surface, visible_surfaces
 
 SETTINGS = SplattingSettings()
 RASTERIZERS = {
@@ -69,15 +70,28 @@ def camera(eye, fov: float = 30.0, target=(0.0, 0.0, 0.0)) -> sj.Camera:
     )
 
 
+def seen_by(name: str, splats: sj.Splats, view: PerspectiveView):
+    """Return how a view draws the splats, moved by less than a plan can hold, with rows of
+    attributes: pictures of the rows, of coverage and of depth.
+    """
+    plan = RASTERIZERS[name].make_plan([splats], [view], SETTINGS)
+
+    def draw(splats, rows, view):
+        visible = visible_surfaces(splats, rows, view, SETTINGS, plan, OneDevice())
+        surface = Surface.of(visible.rows, view)
+        depth = jnp.where(surface.covered, surface.depth, 0.0)
+        pictures = surface.attributes, visible.share, depth
+        return tuple(visible.front_picture(each) for each in pictures)
+
+    return jax.jit(draw)
+
+
 def drawn(name: str, splats: sj.Splats, rows, *cameras: sj.Camera):
-    """Give what each camera sees of rows of attributes, and where it sees anything."""
+    """Return what each camera sees of rows of attributes, and where it sees anything."""
     views = [PerspectiveView.of(each) for each in cameras]
-    rasterizer = RASTERIZERS[name].planned(splats, views, SETTINGS)
-    draw = jax.jit(lambda view: bodies.drawn(splats, rows, view, SETTINGS, rasterizer).front)
-    found = [draw(view) for view in views]
-    return np.stack([each.attributes for each in found]), np.stack(
-        [each.coverage for each in found]
-    )
+    found = [seen_by(name, splats, view)(splats, rows, view)[:2] for view in views]
+    attributes, coverage = (np.stack(pictures) for pictures in zip(*found, strict=True))
+    return np.moveaxis(attributes, 3, 1), coverage
 
 
 @pytest.fixture(scope="module")
@@ -130,14 +144,13 @@ def test_a_plane_of_one_color_has_exactly_that_color_and_lies_where_it_lies(name
     sheet, color = plane(9.0, 0.8, jitter=0.3), 0.7
     seen = camera((4.0, -9.0, 14.0), fov=20.0)
     view = PerspectiveView.of(seen)
-    rasterizer = RASTERIZERS[name].planned(sheet, [view], SETTINGS)
     rows = jnp.full((1, sheet.count), color)
-    front = jax.jit(lambda: bodies.drawn(sheet, rows, view, SETTINGS, rasterizer).front)()
-    inside = np.asarray(front.coverage) > 0
+    attributes, coverage, depth = seen_by(name, sheet, view)(sheet, rows, view)
+    inside = np.asarray(coverage) > 0
     assert inside.mean() > 0.95
-    np.testing.assert_allclose(np.asarray(front.attributes[0])[inside], color, rtol=1e-5)
+    np.testing.assert_allclose(np.asarray(attributes[..., 0])[inside], color, rtol=1e-5)
     y, x = np.mgrid[:SIZE, :SIZE] + 0.5
-    points = view.unproject(jnp.asarray(x, float), jnp.asarray(y, float), front.depth)
+    points = view.unproject(jnp.asarray(x, float), jnp.asarray(y, float), depth)
     np.testing.assert_allclose(np.asarray(points[2])[inside], 0.0, atol=2e-3)
 
 
@@ -189,7 +202,7 @@ def test_an_affine_projection_leaves_holes_near_the_eye_and_an_exact_one_leaves_
     assert holes["ewa"] > 0.1
 
 
-def lit_ball(settings_of, count: int):
+def lit_ball(settings: sj.RenderSettings, count: int):
     """Render a ball that lies off the origin: root mean square errors of its normals (degrees) and
     of its light.
     """
@@ -200,8 +213,8 @@ def lit_ball(settings_of, count: int):
         jnp.asarray([0.4, -0.3, -1.0]), jnp.full(1, np.pi), cast_shadows=False
     )
     material = sj.Material(sj.SumOfGaussians(jnp.asarray([1e-6]), jnp.ones((1, 1))), specular=0.0)
-    settings, scene, seen = (
-        settings_of(body),
+    body = PhongSplats.of(body)
+    scene, seen = (
         sj.Scene(body, (lamp,), material),
         camera(middle + np.asarray([0.0, 0.0, 60.0]), 18.0, middle),
     )
@@ -222,9 +235,9 @@ def lit_ball(settings_of, count: int):
 def test_normals_that_vary_within_splats_are_closer_to_the_sphere_than_blended_and_flat_ones():
     """A sphere of 150 splats, under the light of a white diffuser."""
     baselines = {
-        "elliptical": lambda body: elliptical_points(),
-        "deferred": lambda body: deferred_splatting(),
-        "phong": lambda body: phong_splatting(normal_slopes(body)),
+        "elliptical": elliptical_points(),
+        "deferred": deferred_splatting(),
+        "phong": phong_splatting(),
     }
     angles, shades = {}, {}
     for name, settings in baselines.items():
@@ -276,7 +289,7 @@ def test_what_is_blended_has_derivatives(name, float64):
     """
     sheet = plane(2.0, 0.7, jitter=0.2)
     view = PerspectiveView.of(camera((1.0, 2.0, 12.0), fov=15.0))
-    rasterizer = RASTERIZERS[name].planned(sheet, [view], SETTINGS)
+    draw = seen_by(name, sheet, view)
     rows = jnp.asarray(np.random.default_rng(1).uniform(size=(1, sheet.count)))
     turn = jnp.asarray(np.random.default_rng(2).normal(size=(SIZE, SIZE)))
     direction = jnp.asarray(np.random.default_rng(5).normal(size=sheet.centers.shape))
@@ -284,10 +297,8 @@ def test_what_is_blended_has_derivatives(name, float64):
     @jax.jit
     def total(step):
         moved = dataclasses.replace(sheet, centers=sheet.centers + step * direction)
-        front = bodies.drawn(moved, rows * (1 + step), view, SETTINGS, rasterizer).front
-        return jnp.sum(turn * front.attributes[0]) + jnp.sum(
-            turn * jnp.where(front.weight_sum > 0, front.depth, 0.0)
-        )
+        attributes, _, depth = draw(moved, rows * (1 + step), view)
+        return jnp.sum(turn * attributes[..., 0]) + jnp.sum(turn * depth)
 
     step = 1e-8  # a longer one changes which splat some pixel shows
     expected = (total(step) - total(-step)) / (2 * step)

@@ -14,7 +14,7 @@ from planes import HALF, camera_over, coordinates, gathered, painted, plane, spl
 
 import splatjax as sj
 from splatjax import baselines
-from splatjax.diffusion import ExitOdds, Kernels, PlainMean, Sources
+from splatjax.diffusion import EscapeNormalization, PlainMean, Sources
 from splatjax.geometry import Mesh
 
 SIZE = 192
@@ -73,7 +73,10 @@ def sheet():
     """A white plane with sharp edges, from in front, seen with a rim of nothing around."""
     mesh = baselines.TexturedMesh.of(plane(2.0))
     settings = dataclasses.replace(
-        STILL, resolution=64, thin_parts=baselines.TranslucentShadowMap(), normalization=ExitOdds()
+        STILL,
+        resolution=64,
+        thin_parts=baselines.TranslucentShadowMap(),
+        kernel=EscapeNormalization(),
     )
     lights = (dataclasses.replace(FRONTAL, cast_shadows=True),)
     camera = camera_over(15.0, 32)
@@ -136,10 +139,10 @@ def slab(thickness: float) -> Mesh:
 @pytest.mark.once
 @pytest.mark.long
 def test_through_a_slab_comes_what_comes_through_splats():
-    """Lit from behind: the share and the odds of leaving are those of two sheets of splats."""
+    """Lit from behind: the share and the gain are those of two sheets of splats."""
     thickness, settings = 1.5, dataclasses.replace(STILL, resolution=96)
     settings = dataclasses.replace(
-        settings, thin_parts=baselines.TranslucentShadowMap(), normalization=ExitOdds()
+        settings, thin_parts=baselines.TranslucentShadowMap(), kernel=EscapeNormalization()
     )
     mesh, camera = baselines.TexturedMesh.of(slab(thickness)), camera_over(3.0, 4)
     lights = (sj.DirectionalLight(jnp.asarray([0.0, 0.0, 1.0]), jnp.ones(3)),)
@@ -152,13 +155,11 @@ def test_through_a_slab_comes_what_comes_through_splats():
     centers = np.stack([np.tile(x, 2), np.tile(y, 2), np.where(side > 0, 0.0, -thickness)])
     light = np.tile(np.where(side > 0, 0.0, 1.0), (3, 1))
     arrays = centers, np.stack([0 * side, 0 * side, side]), np.full(side.size, 0.36), light
-    sources, odds = Sources(*(jnp.asarray(each, float) for each in arrays)), ExitOdds()
-    kernels = Kernels.of(TWO.variances, odds)
-    sums = gathered(sources, kernels, np.zeros((1, 3)))
-    gain = odds.gain(
-        sums.exits[0][:, None], TWO.variances, TWO.weights[..., None], jnp.zeros((3, 1))
-    )
-    truth = np.asarray(gain * sums.means[0])[..., 0]
+    sources, kernel = Sources(*(jnp.asarray(each, float) for each in arrays)), EscapeNormalization()
+    means, mass = gathered(sources, TWO.variances, kernel, np.zeros((1, 3)))
+    mass, weights = jnp.asarray(mass[:, None]), TWO.weights[..., None]
+    gain = kernel.gain(mass, TWO.variances, weights, jnp.zeros((3, 1)))
+    truth = np.asarray(gain * means)[..., 0]
     assert np.all(truth[0] > 0.05)
     np.testing.assert_allclose(ours, truth, atol=5e-3)
 

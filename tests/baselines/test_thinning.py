@@ -7,19 +7,16 @@ import itertools
 import os
 from pathlib import Path
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import splatjax as sj
 from splatjax.baselines import ThinnedDiffuser, layer_contrast, splats_that_suffice, thinning_error
-from splatjax.diffusion import DenseDiffuser, DiffusionSettings, PlainMean
-from splatjax.render import light_on_splats
+from splatjax.diffusion import DenseDiffuser, PlainMean
 
 FACTOR = 1.5  # what the law is held to
 POINTS, LIGHTS = 384, ((-0.5, -0.4, -0.75), (0.8, -0.6, -0.2))
-PLAIN = DiffusionSettings(normalization=PlainMean())
 AMPLIFIED, KEEP = (2.0, 3.0, 5.0), (2, 4, 8, 16)
 
 
@@ -91,8 +88,8 @@ def test_the_law_holds_on_a_head_it_was_not_fitted_on():
     ]
     scenes = [sj.Scene(head, (lamp,), skin.white()) for lamp in lamps]
     camera = sj.Camera.look_at(jnp.asarray([0.0, 0.0, 900.0]), jnp.zeros(3), width=16, height=16)
-    plan = sj.plan(scenes, camera, sj.RenderSettings(diffuser=DenseDiffuser()))
-    sources = [np.asarray(light_on_splats(scene, plan).source.T) for scene in scenes]
+    plan = sj.make_plan(scenes, camera, sj.RenderSettings(diffuser=DenseDiffuser()))
+    sources = [np.asarray(sj.compute_irradiance(scene, plan).source.T) for scene in scenes]
     ratios = factors(head, sources, evenly)
     assert np.max(np.abs(np.log(ratios))) < np.log(FACTOR), ratios
 
@@ -137,13 +134,11 @@ def test_layers_of_fewer_splats_keep_constants_and_those_of_all_are_the_plain_on
         sj.Camera.look_at(away, jnp.zeros(3), width=16, height=16),
     )
     diffusers = DenseDiffuser(), ThinnedDiffuser(1), ThinnedDiffuser(7)
-    settings = [sj.RenderSettings(diffuser=each, diffusion=PLAIN) for each in diffusers]
-    plan = sj.plan(scene, camera, settings[0])
+    settings = [sj.RenderSettings(diffuser=each, kernel=PlainMean()) for each in diffusers]
     light = 0.5 + 0.5 * body.normals[:, :1]
 
     def layers(light, settings):
-        own = eqx.tree_at(lambda plan: plan.diffuser, plan, settings.diffuser)
-        return np.asarray(sj.diffuse(scene, light, camera, settings, own))
+        return np.asarray(sj.diffuse_irradiance(scene, light, camera, settings))
 
     exact, same, thinned = (layers(light, each) for each in settings)
     np.testing.assert_allclose(same, exact, atol=1e-6)

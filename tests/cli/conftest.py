@@ -34,8 +34,8 @@ def drawn(monkeypatch):
     """
     compiled, seen, draw = [], [], _turntable.draw
 
-    def watched(scene, camera, plan):
-        frame = draw(scene, camera, plan)
+    def watched(scene, camera, plan, light):
+        frame = draw(scene, camera, plan, light)
         seen.append((plan, len(compiled)))
         return frame
 

@@ -29,8 +29,8 @@ def plain():
         diffuser=DenseDiffuser(),
     )
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sj, "plan", partial(sj.plan, settings=settings))
-        patch.setattr(sj, "render", partial(sj.render, settings=settings))
+        for name in ("make_plan", "illuminate", "render"):
+            patch.setattr(sj, name, partial(getattr(sj, name), settings=settings))
         yield
 
 
