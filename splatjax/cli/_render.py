@@ -64,7 +64,7 @@ class Render(ViewOptions):
         with stage(f"looking at {file.count} splats"):
             camera = self.camera(parts, self.azimuth)
         first = next(iter(parts()))
-        material = self.material_for(first, sj.load_material(self.material))
+        material = self.material_for(first, self.displayable_material())
         lights = self.lights(material, self.azimuth, self.light_azimuth)
         with stage("rendering the stream", file.count) as report:
             frame = sj.render_streamed(

@@ -12,6 +12,7 @@ import tyro
 
 import splatjax as sj
 from splatjax.io import check_room, fingerprint, free_bytes, material_path, own_version
+from splatjax.render import check_displayable
 from splatjax.scene import Parts
 
 from ._options import MaterialName, Rules, check_options, option_name
@@ -97,12 +98,18 @@ class ViewOptions:
 
     def load(self) -> tuple[sj.Splats, sj.Material]:
         """Return the splats, and the material with which they are rendered."""
-        material = sj.load_material(self.material)
+        material = self.displayable_material()
         what = f"making the bust with {self.count} splats" if self.splats is None else ""
         with stage(what or f"reading {self.splats}"):
             splats = sj.bust(self.count) if self.splats is None else sj.read_splats(self.splats)
         splats = self.adjusted(splats)
         return splats, self.material_for(splats, material)
+
+    def displayable_material(self) -> sj.Material:
+        """Load the material, and refuse it before rendering if no PNG file shows its channels."""
+        material = sj.load_material(self.material)
+        check_displayable(material.channels)
+        return material
 
     def material_for(self, splats: sj.Splats, material: sj.Material) -> sj.Material:
         """Return a material with which splats are rendered."""
