@@ -70,7 +70,11 @@ def record(cls: Class) -> Class:
             classes[field.name] = kinds, is_tuple
 
     def __init__(self, *args, **kwargs):
-        given = signature.bind(*args, **kwargs)
+        try:
+            given = signature.bind(*args, **kwargs)
+        except TypeError as error:
+            wanted = f"{cls.__name__}{inspect.signature(cls)}"
+            raise TypeError(f"{error}; give {wanted}") from None
         given.apply_defaults()
         values, records = given.arguments, []
         for name, (kinds, is_tuple) in classes.items():

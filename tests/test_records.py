@@ -174,13 +174,27 @@ def test_nonsense_is_refused_by_field_and_count(make, said):
         make()
 
 
-def test_numbers_of_any_type_compile_a_picture_once():
+def test_what_lacks_arguments_says_which_it_has():
+    with pytest.raises(TypeError, match=r"give Multipole\(layer, \*, eta_above=1"):
+        sj.Multipole(medium(), -1.0)
+
+
+def test_profiles_of_python_numbers_have_a_reflectance():
+    slab = sj.Layer(medium(), 3)
+    for profile in (
+        sj.Dipole(medium()),
+        sj.Multipole(slab, eta_above=1.2),
+        sj.LayeredMultipole([sj.Film(0.1), slab, sj.Layer(medium(), np.inf)]),
+        sj.Burley([0.8, 0.5], 1),
+    ):
+        total = np.asarray(profile.total_reflectance())
+        assert np.all((total > 0) & (total < 1))
+
+
+def test_numbers_of_any_type_compile_a_picture_once(compiled):
     """Weakly typed numbers would compile it again."""
     plain = sj.RenderSettings(rasterizer=DenseRasterizer(), diffuser=DenseDiffuser())
     weak = jnp.asarray(1.3)  # as JAX makes it of a Python number
-    view = camera()
-    shadowless = sj.DirectionalLight([0.5, -0.5, -1], 1, cast_shadows=False)
-    plan = sj.plan(sj.Scene(splats(), shadowless, material()), view, plain)
     scenes = [
         sj.Scene(
             splats(radii=number),
@@ -189,17 +203,24 @@ def test_numbers_of_any_type_compile_a_picture_once():
         )
         for number in (1.3, np.float64(1.3), weak, jnp.full((), 1.3), np.float32(1.3))
     ]
-    sj.render(scenes[0], view, plain, plan)
-    events = []
-
-    def listen(event, duration, **_):
-        events.append(event)
-
-    jax.monitoring.register_event_duration_secs_listener(listen)
+    plan = sj.make_plan(scenes[0], camera(), plain)
+    sj.render(scenes[0], camera(), plain, plan)
+    assert "jit(_render)" in compiled
+    compiled.clear()
     for scene in scenes:
-        sj.render(scene, view, plain, plan)
-    jax.monitoring.unregister_event_duration_listener(listen)
-    assert "/jax/core/compile/backend_compile_duration" not in events
+        sj.render(scene, camera(), plain, plan)
+    assert compiled == []
+
+
+@pytest.mark.slow
+@pytest.mark.once
+def test_sixteen_media_and_eight_counts_compile_eight_fits(compiled):
+    """An index of refraction that is a Python number would compile each medium's."""
+    for i in range(16):
+        profile = sj.Dipole(sj.Medium([0.01 * (i + 1)], [1.1], eta=1.2 + 0.02 * i))
+        for count in range(1, 9):
+            sj.fit_gaussians(profile, count, throw=False)
+    assert compiled.count("jit(_fit_compiled)") == 8
 
 
 def test_unknown_values_are_not_checked():

@@ -109,7 +109,7 @@ class ViewOptions:
     def displayable_material(self) -> sj.Material:
         """Load the material; raise `ValueError` for one whose channels no PNG file shows."""
         material = sj.load_material(self.material)
-        check_displayable(material.gaussians.weights.shape[1])
+        check_displayable(material.channels)
         return material
 
     def material_for(self, splats: sj.Splats, material: sj.Material) -> sj.Material:

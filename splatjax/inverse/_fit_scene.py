@@ -1,17 +1,19 @@
 """Fit a scene to pictures along the gradient of the renderer: albedo, shape, lights and cameras."""
 
+import math
 from collections.abc import Callable, Sequence
+from typing import TypeVar
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
+from jaxtyping import DTypeLike, Float, PyTree
 
+from splatjax._records import as_floats
 from splatjax.render import Plan, RenderSettings
-from splatjax.scene import Material, Scene, Splats
+from splatjax.scene import AbstractLight, Camera, Material, Scene, Splats
 
-from ._background import AbstractBackground, UnknownBackground
 from ._descent import (
     Coordinates,
     Evaluation,
@@ -19,16 +21,58 @@ from ._descent import (
     MovableScene,
     advance,
     evaluate,
-    observed_pictures,
     standard_promotion,
 )
-from ._evidence import Evidence
-from ._fitted_scene import FittedScene
-from ._intensity import KnownIntensity
-from ._losses import AbstractLoss, SquaredLoss
-from ._observation import Observation, check_channels, nothing_counts
-from ._parts import AbstractPart, PictureSetup
-from ._plans import plans_of
+from ._layers import make_plans
+from ._losses import (
+    AbstractBackground,
+    AbstractLoss,
+    SquaredLoss,
+    UnknownBackground,
+)
+from ._observation import (
+    Evidence,
+    KnownIntensity,
+    Observation,
+    check_channels,
+    nothing_counts,
+)
+from ._parts import AbstractPart, Setup
+
+Tree = TypeVar("Tree", bound=PyTree)
+
+
+class FittedScene(eqx.Module):
+    r"""The best that a fit came by.
+
+    **Attributes:**
+
+    - `splats`: the body.
+    - `cameras`, `lights`: of each picture.
+    - `material`: as it was given.
+    - `losses`: at the start and after each step: sum of the losses of all pixels and of what the
+      priors add, over the number of values that count. About 1 where what is left is noise.
+    - `best`: the step with the least of them, which all else here is of. Static.
+    - `plans`: how many times was planned, once for the start. Static.
+    - `pictures`: what the renderer makes of it; NaN where a pixel does not count.
+    - `residuals`: pictures less what was observed.
+    - `result`: what became of it, as a message (`optimistix.RESULTS`).
+    """
+
+    splats: Splats
+    cameras: tuple[Camera, ...]
+    lights: tuple[tuple[AbstractLight, ...], ...]
+    material: Material
+    losses: Float[np.ndarray, " steps"]
+    pictures: tuple[Float[np.ndarray, "_ _ channels"], ...]
+    residuals: tuple[Float[np.ndarray, "_ _ channels"], ...]
+    result: optx.RESULTS
+    best: int = eqx.field(static=True)
+    plans: int = eqx.field(static=True)
+
+    def scene(self, picture: int = 0) -> Scene:
+        """Return the scene of a picture."""
+        return Scene(self.splats, self.lights[picture], self.material)
 
 
 def fit_scene(
@@ -85,42 +129,43 @@ def fit_scene(
     if `throw`.
     """
     observations, parts = list(observations), list(parts)
-    _check(observations, splats, material, parts, steps)
+    _check(observations, material, parts, steps)
     report = progress or (lambda stage, loss: None)
     dtype = splats.centers.dtype
-    setups = [_cast(PictureSetup(one.camera, one.lights), dtype) for one in observations]
-    scene = MovableScene.of(_cast(splats, dtype), _cast(material, dtype), parts)
-    observed = observed_pictures(Evidence(observations, dtype))
-    x = scene.coordinates(setups)
+    setups = [_cast(Setup(splats, one.camera, one.lights), dtype) for one in observations]
+    scene = MovableScene.of(setups[0].splats, _cast(material, dtype), parts)
+    evidence = [Evidence.of(one, dtype) for one in observations]
+    x = scene.start(setups)
 
-    def moved(x: Coordinates) -> list[PictureSetup]:
-        return [scene.setup_at(setup, own) for setup, own in zip(setups, x.setups, strict=True)]
+    def moved(x: Coordinates) -> list[Setup]:
+        return [scene.moved(setup, scene.of_picture(x, i)) for i, setup in enumerate(setups)]
 
-    def make_plans(x: Coordinates) -> list[Plan]:
-        scenes = [Scene(scene.splats_at(x.body), one.lights, scene.material) for one in moved(x)]
-        return plans_of(scenes, [one.camera for one in moved(x)], settings)
+    def plan_all(x: Coordinates) -> list[Plan]:
+        scenes = [Scene(one.splats, one.lights, scene.material) for one in moved(x)]
+        return make_plans(scenes, [one.camera for one in moved(x)], settings)
 
     def evaluate_all(x: Coordinates, plans: list[Plan]) -> list[Evaluation]:
         return [
-            evaluate(x.body, own, scene, setup, picture, plan, settings, loss, background)
-            for own, setup, picture, plan in zip(x.setups, setups, observed, plans, strict=True)
+            evaluate(scene.of_picture(x, i), scene, *one, settings, loss, background)
+            for i, one in enumerate(zip(setups, evidence, plans, strict=True))
         ]
 
-    report("planning", float("nan"))
-    plans, times = make_plans(x), 1
+    report("planning", math.nan)
+    plans, times = plan_all(x), 1
     with standard_promotion():
         state = optimizer.init(x)
     best, at, losses, result = None, x, [], optx.RESULTS.successful
     for step in range(steps + 1):
         evaluations = evaluate_all(x, plans)
         if max(float(one.overflow) for one in evaluations) > 0:
-            last = losses[-1] if losses else float("nan")
+            last = losses[-1] if losses else math.nan
             report(f"step {step}: the scene exceeds the capacity of its plan; planning again", last)
-            plans, times = make_plans(x), times + 1
+            plans, times = plan_all(x), times + 1
             evaluations = evaluate_all(x, plans)
-        if step == 0:
-            _check_counted(evaluations)
-        values = [one.value for one in evaluations]
+        for i, evaluation in enumerate(evaluations if step == 0 else ()):
+            if not np.any(np.asarray(evaluation.counted) > 0):
+                raise nothing_counts(i)
+        values = [(one.loss, one.count, one.gradient) for one in evaluations]
         ahead, state, value, finite = advance(x, state, values, scene, optimizer)
         losses.append(float(value))
         if not bool(finite):
@@ -140,14 +185,14 @@ def fit_scene(
         for one in kept
     )
     fitted = FittedScene(
-        splats=scene.splats_at(at.body),
+        splats=moved(at)[0].splats,
         cameras=tuple(one.camera for one in moved(at)),
         lights=tuple(one.lights for one in moved(at)),
         material=scene.material,
         losses=np.asarray(losses),
         pictures=pictures,
         residuals=tuple(
-            made - np.asarray(one.picture) for made, one in zip(pictures, observed, strict=True)
+            made - np.asarray(one.picture) for made, one in zip(pictures, evidence, strict=True)
         ),
         result=result,
         best=best,
@@ -158,16 +203,12 @@ def fit_scene(
     return fitted
 
 
-def _cast(tree, dtype):
-    return jax.tree.map(
-        lambda leaf: jnp.asarray(np.asarray(leaf), dtype) if eqx.is_inexact_array(leaf) else leaf,
-        tree,
-    )
+def _cast(tree: Tree, dtype: DTypeLike) -> Tree:
+    return jax.tree.map(lambda leaf: as_floats(np.asarray(leaf), dtype), tree)
 
 
 def _check(
     observations: list[Observation],
-    splats: Splats,
     material: Material,
     parts: list[AbstractPart],
     steps: int,
@@ -188,9 +229,3 @@ def _check(
                 f"observations[{i}].intensity is {type(observation.intensity).__name__}(): that is "
                 "for recover; here LightStrengths among the parts lets lights be of any strength"
             )
-
-
-def _check_counted(evaluations: list[Evaluation]) -> None:
-    for i, evaluation in enumerate(evaluations):
-        if not np.any(np.asarray(evaluation.counted) > 0):
-            raise nothing_counts(i)

@@ -9,19 +9,23 @@ from jaxtyping import Float
 
 from splatjax._format import percent
 from splatjax._records import record, several
-from splatjax.fitting import AbstractWeights
+from splatjax.fitting import AbstractWeights, FixedTotalReflectance, NonNegativeWeights
 from splatjax.gaussians import AbstractProfile
 from splatjax.render import RenderSettings
 from splatjax.scattering import Dipole, Medium
 from splatjax.scene import AbstractLight, Camera, DirectionalLight, GaussianBeam, Splats
 
 from ._estimate import Combination, best_and_worst
-from ._evidence import Evidence
-from ._flat import Gatherer
-from ._intensity import AbstractIntensity, KnownIntensity
+from ._flat import which_count
+from ._layers import render_layers
 from ._losses import SquaredLoss
-from ._observation import Observation
-from ._problem import FittedVariances, default_weights, solution
+from ._observation import (
+    AbstractIntensity,
+    Evidence,
+    KnownIntensity,
+    Observation,
+)
+from ._problem import FittedVariances, RecoveryProblem, Unknowns, solution
 from ._recovery import Recovery
 
 
@@ -66,7 +70,7 @@ def next_pictures(
     candidates: Sequence[Candidate],
     *,
     model: Callable[[Medium], AbstractProfile] = Dipole,
-    weights: AbstractWeights = default_weights(),
+    weights: AbstractWeights = NonNegativeWeights(FixedTotalReflectance()),
     settings: RenderSettings = RenderSettings(),
 ) -> list[Prediction]:
     r"""Rank pictures that could be taken by the error bars of the coefficients with each of them.
@@ -93,46 +97,44 @@ def next_pictures(
             "candidates is empty: name a picture that could be taken, or take "
             "default_candidates(splats, camera)"
         )
-    medium, dtype = recovery.medium, recovery.medium.sigma_a.dtype
-    cameras, lights = [each.camera for each in candidates], [each.lights for each in candidates]
-    gathered, _ = Gatherer(splats, settings, cameras, lights).moving(recovery.material)
-    variances = FittedVariances(recovery.material.gaussians.variances.astype(dtype))
+    medium, loss = recovery.medium, SquaredLoss()
+    channels, dtype = medium.channels, medium.eta.dtype
+    observations = []
+    for one in candidates:
+        dark = np.zeros((one.camera.height, one.camera.width, channels))
+        observations.append(Observation(dark, one.camera, one.lights, intensity=one.intensity))
+    rendered, _ = render_layers(splats, recovery.material, observations, settings)
+    fit = FittedVariances(recovery.material.gaussians.variances.astype(dtype), weights)
     noise = recovery.relative_noise * recovery.scale**0.5
-    before, predictions = len(recovery.information), []
-    for candidate, picture in zip(candidates, gathered, strict=True):
-        dark = np.zeros((candidate.camera.height, candidate.camera.width, len(medium.eta)))
-        evidence = Evidence(
-            [Observation(dark, candidate.camera, candidate.lights, intensity=candidate.intensity)],
-            dtype,
-        )
-        unknowns, factors = evidence.unknowns(medium.eta)
-        problem, _ = evidence.problem([picture], unknowns, variances, SquaredLoss(), weights, model)
-        point = unknowns.start(medium, factors)
-        at_point = solution(problem, point)
+    predictions = []
+    for candidate, observation, picture in zip(candidates, observations, rendered, strict=True):
+        evidence = [Evidence.of(observation, dtype)]
+        unknowns = Unknowns.of(medium.eta, [candidate.intensity])
+        counted = which_count([picture], evidence)
+        problem = RecoveryProblem.of([picture], evidence, counted, unknowns, fit, loss, model)
+        at_point = solution(problem, unknowns.start(medium))
         bright = float(jnp.sqrt(jnp.mean(at_point.radiance**2)))
         deviation = noise * (bright or 1.0) / float(problem.deviation[0, 0])
         scale = max(deviation, np.finfo(float).tiny) ** -2
         information = np.asarray(at_point.information, float) * scale
-        channels = len(medium.eta)
-        more = _marginal(information, 2 * channels, channels, before)
+        more = _marginal(information, channels, len(recovery.information))
         predictions.append(Prediction(candidate, recovery.covariance(more)))
     return sorted(predictions, key=lambda prediction: prediction.worst.deviation)
 
 
-def _marginal(information: np.ndarray, own: int, channels: int, size: int) -> np.ndarray:
+def _marginal(information: np.ndarray, channels: int, size: int) -> np.ndarray:
     """Eliminate the factors of a picture from its information about coefficients and the transition
     to unresolved layers, and leave room for the factors of other pictures.
     """
-    last = len(information)
-    kept = np.r_[:own, last - channels : last]
-    marginal = information[np.ix_(kept, kept)]
-    factors = np.arange(own, last - channels)
-    if factors.size:
-        mixed = information[np.ix_(kept, factors)]
-        inverse = np.linalg.pinv(information[np.ix_(factors, factors)])
-        marginal = marginal - mixed @ inverse @ mixed.T
-    places, whole = np.r_[:own, size - channels : size], np.zeros((size, size))
-    whole[np.ix_(places, places)] = marginal
+
+    def apart(size):
+        return np.r_[: 2 * channels, size - channels : size], np.r_[2 * channels : size - channels]
+
+    kept, factors = apart(len(information))
+    mixed = information[np.ix_(kept, factors)]
+    inverse = np.linalg.pinv(information[np.ix_(factors, factors)])
+    whole, (places, _) = np.zeros((size, size)), apart(size)
+    whole[np.ix_(places, places)] = information[np.ix_(kept, kept)] - mixed @ inverse @ mixed.T
     return whole
 
 

@@ -12,7 +12,7 @@ from splatjax._chunking import jit_unless_traced
 from splatjax.geometry import tangent_frames
 from splatjax.scene import Splats
 
-from ._parts import AbstractBodyPart
+from ._parts import AbstractPart, Setup
 
 _REACH = 2.5  # of the blur, standard deviations
 _SLOPES = 17  # splats among which slopes are measured, itself included
@@ -38,7 +38,7 @@ class OffsetTables(eqx.Module):
     """Root mean square of blurred noise of root mean square 1."""
 
 
-class NormalOffsets(AbstractBodyPart):
+class NormalOffsets(AbstractPart):
     r"""The distance that each splat has moved along its normal at the start: a displacement map, no
     finer than `smoothness`.
 
@@ -58,18 +58,17 @@ class NormalOffsets(AbstractBodyPart):
       mm.
     """
 
+    shared = True
     step: float = eqx.field(static=True)
     smoothness: float = eqx.field(static=True)
     deviation: float = eqx.field(static=True)
 
-    def check(self, splats: Splats) -> None:
+    def prepared(self, splats: Splats) -> OffsetTables:
         if splats.count < _SLOPES:
             raise ValueError(
                 f"{splats.count} splats are too few to measure slopes among; NormalOffsets needs "
                 f"{_SLOPES} at least"
             )
-
-    def prepared(self, splats: Splats) -> OffsetTables:
         centers, normals, areas = (
             np.asarray(field, np.float64)
             for field in (splats.centers, splats.normals, splats.areas)
@@ -92,11 +91,12 @@ class NormalOffsets(AbstractBodyPart):
             jnp.asarray(gain, dtype),
         )
 
-    def coordinates(self, splats: Splats) -> Float[Array, " splats"]:
-        return jnp.zeros_like(splats.areas)
+    def coordinates(self, setup: Setup) -> Float[Array, " splats"]:
+        return jnp.zeros_like(setup.splats.areas)
 
     @jit_unless_traced
-    def moved(self, splats: Splats, x: Float[Array, " splats"], prepared: OffsetTables) -> Splats:
+    def moved(self, setup: Setup, x: Float[Array, " splats"], prepared: OffsetTables) -> Setup:
+        splats = setup.splats
         offsets = self.step * jnp.sum(prepared.weights * x[prepared.blurred], axis=1)
         shifts = offsets[:, None] * splats.normals
         apart = shifts[prepared.around] - shifts[:, None]
@@ -104,15 +104,16 @@ class NormalOffsets(AbstractBodyPart):
         along = prepared.tangents + jnp.sum(prepared.slopes[..., None] * apart[:, :, None], axis=1)
         across = jnp.cross(along[:, 0], along[:, 1])
         stretch = jnp.sqrt(jnp.sum(across * across, axis=1))
+        moved = (
+            splats.centers + shifts,
+            across / stretch[:, None],
+            splats.areas * stretch,
+            splats.radii * jnp.sqrt(stretch),
+        )
         return eqx.tree_at(
-            lambda s: (s.centers, s.normals, s.areas, s.radii),
-            splats,
-            (
-                splats.centers + shifts,
-                across / stretch[:, None],
-                splats.areas * stretch,
-                splats.radii * jnp.sqrt(stretch),
-            ),
+            lambda s: (s.splats.centers, s.splats.normals, s.splats.areas, s.splats.radii),
+            setup,
+            moved,
         )
 
     def prior(self, x: Float[Array, " splats"], prepared: OffsetTables) -> Float[Array, ""]:

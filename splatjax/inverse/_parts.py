@@ -2,6 +2,7 @@
 
 import abc
 import dataclasses
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -14,9 +15,10 @@ _BOUNDED = 1e-3
 """An albedo moves between this and one less this: at 0 and 1 themselves the logit is infinite."""
 
 
-class PictureSetup(eqx.Module):
-    """A camera and the lights of its picture."""
+class Setup(eqx.Module):
+    """The splats of a picture, its camera and its lights."""
 
+    splats: Splats
     camera: Camera
     lights: tuple[AbstractLight, ...]
 
@@ -28,6 +30,9 @@ class AbstractPart(eqx.Module):
     rate of 1 moves each by up to one step at a time.
     """
 
+    shared: ClassVar[bool] = False
+    """Whether all pictures share the part; else each has its own."""
+
     def __check_init__(self):
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
@@ -36,50 +41,26 @@ class AbstractPart(eqx.Module):
                     f"{type(self).__name__}.{field.name} must be positive; got {value:g}"
                 )
 
-
-class AbstractBodyPart(AbstractPart):
-    """A part of the body, which all pictures share."""
-
-    @abc.abstractmethod
-    def check(self, splats: Splats) -> None:
-        """Raise `ValueError` for splats that do not have the part."""
-
     def prepared(self, splats: Splats) -> PyTree[Array]:
         """Compute what depends on the splats at the start alone."""
         return None
 
     @abc.abstractmethod
-    def coordinates(self, splats: Splats) -> PyTree[Array]:
-        """Return the coordinates of the start: zeros."""
+    def coordinates(self, setup: Setup) -> PyTree[Array]:
+        """Return the coordinates of the start: zeros. Raise `ValueError` without such a part."""
 
     @abc.abstractmethod
-    def moved(self, splats: Splats, x: PyTree[Array], prepared: PyTree[Array]) -> Splats:
-        """Move the splats to coordinates. Differentiable."""
+    def moved(self, setup: Setup, x: PyTree[Array], prepared: PyTree[Array]) -> Setup:
+        """Move the part to coordinates. Differentiable."""
 
-    @abc.abstractmethod
-    def prior(self, x: PyTree[Array], prepared: PyTree[Array]) -> Float[Array, ""]:
+    def prior(self, x: PyTree[Array], prepared: PyTree[Array]) -> Float[Array, ""] | float:
         """Compute what the prior adds to the loss: squares of the coordinates over their expected
         deviations.
         """
+        return 0.0
 
 
-class AbstractSetupPart(AbstractPart):
-    """A part of how pictures were taken: each picture has its own."""
-
-    @abc.abstractmethod
-    def coordinates(self, setup: PictureSetup) -> PyTree[Array]:
-        """Return the coordinates of the start: zeros."""
-
-    @abc.abstractmethod
-    def moved(
-        self, setup: PictureSetup, x: PyTree[Array], middle: Float[Array, "3"]
-    ) -> PictureSetup:
-        """Move camera and lights to coordinates; `middle` is that of the body, mm.
-        Differentiable.
-        """
-
-
-class AlbedoMap(AbstractBodyPart):
+class AlbedoMap(AbstractPart):
     r"""The albedo of every splat and channel, as a logit: it stays between 0 and 1.
 
         albedo = 1 / (1 + exp(-(logit(start) + step x)))
@@ -94,30 +75,28 @@ class AlbedoMap(AbstractBodyPart):
     Albedos that start below 0.001 or above 0.999 start there.
     """
 
+    shared = True
     step: float = eqx.field(static=True, default=0.1)
     deviation: float = eqx.field(static=True, default=3.0)
 
-    def check(self, splats: Splats) -> None:
-        if splats.albedo is None:
+    def coordinates(self, setup: Setup) -> Float[Array, "splats channels"]:
+        if setup.splats.albedo is None:
             raise ValueError(
                 "splats.albedo is None, and AlbedoMap has nothing to move: start from a map, such "
                 "as 0.5 everywhere"
             )
+        return jnp.zeros_like(setup.splats.albedo)
 
-    def coordinates(self, splats: Splats) -> Float[Array, "splats channels"]:
-        assert splats.albedo is not None
-        return jnp.zeros_like(splats.albedo)
-
-    def moved(self, splats: Splats, x: Float[Array, "splats channels"], prepared: None) -> Splats:
-        assert splats.albedo is not None
-        start = jax.scipy.special.logit(jnp.clip(splats.albedo, _BOUNDED, 1 - _BOUNDED))
-        return eqx.tree_at(lambda s: s.albedo, splats, jax.nn.sigmoid(start + self.step * x))
+    def moved(self, setup: Setup, x: Float[Array, "splats channels"], prepared: None) -> Setup:
+        start = jnp.clip(setup.splats.albedo, _BOUNDED, 1 - _BOUNDED)
+        albedo = jax.nn.sigmoid(jax.scipy.special.logit(start) + self.step * x)
+        return eqx.tree_at(lambda s: s.splats.albedo, setup, albedo)
 
     def prior(self, x: Float[Array, "splats channels"], prepared: None) -> Float[Array, ""]:
         return jnp.sum((self.step / self.deviation * x) ** 2)
 
 
-class LightStrengths(AbstractSetupPart):
+class LightStrengths(AbstractPart):
     """The strength of each light of each picture, channel by channel, as a logarithm: of
     irradiance, intensity or power.
 
@@ -128,7 +107,7 @@ class LightStrengths(AbstractSetupPart):
 
     step: float = eqx.field(static=True, default=0.05)
 
-    def coordinates(self, setup: PictureSetup) -> tuple[Float[Array, " channels"], ...]:
+    def coordinates(self, setup: Setup) -> tuple[Float[Array, " channels"], ...]:
         for light in setup.lights:
             if not light.strength:
                 raise ValueError(
@@ -136,7 +115,7 @@ class LightStrengths(AbstractSetupPart):
                 )
         return tuple(jnp.zeros_like(getattr(light, light.strength)) for light in setup.lights)
 
-    def moved(self, setup: PictureSetup, x, middle) -> PictureSetup:
+    def moved(self, setup: Setup, x, prepared) -> Setup:
         return _with_lights(
             setup,
             [
@@ -146,7 +125,7 @@ class LightStrengths(AbstractSetupPart):
         )
 
 
-class LightPlaces(AbstractSetupPart):
+class LightPlaces(AbstractPart):
     """The place of each light of each picture: directions turn, and point lights and the origins of
     beams shift.
 
@@ -159,13 +138,13 @@ class LightPlaces(AbstractSetupPart):
     turn: float = eqx.field(static=True, default=0.02)
     shift: float = eqx.field(static=True, default=1.0)
 
-    def coordinates(self, setup: PictureSetup) -> tuple[dict[str, Float[Array, "3"]], ...]:
+    def coordinates(self, setup: Setup) -> tuple[dict[str, Float[Array, "3"]], ...]:
         return tuple(
             {name: jnp.zeros_like(getattr(light, name)) for name in _places(light)}
             for light in setup.lights
         )
 
-    def moved(self, setup: PictureSetup, x, middle) -> PictureSetup:
+    def moved(self, setup: Setup, x, prepared) -> Setup:
         def move(name: str, place: Array, steps: Array) -> Array:
             is_turned = name == "direction"
             return rotation(self.turn * steps) @ place if is_turned else place + self.shift * steps
@@ -177,7 +156,7 @@ class LightPlaces(AbstractSetupPart):
         return _with_lights(setup, places)
 
 
-class CameraPoses(AbstractSetupPart):
+class CameraPoses(AbstractPart):
     r"""Position and rotation of each camera: it turns around the middle of the splats, and shifts.
 
     A turn around the body changes which side is seen, a shift where the body is in the picture: the
@@ -192,15 +171,17 @@ class CameraPoses(AbstractSetupPart):
     turn: float = eqx.field(static=True, default=2e-3)
     shift: float = eqx.field(static=True, default=0.2)
 
-    def coordinates(self, setup: PictureSetup) -> Float[Array, "2 3"]:
+    def prepared(self, splats: Splats) -> Float[Array, "3"]:
+        return jnp.mean(splats.centers, axis=0)
+
+    def coordinates(self, setup: Setup) -> Float[Array, "2 3"]:
         return jnp.zeros((2, 3), setup.camera.position.dtype)
 
-    def moved(self, setup: PictureSetup, x, middle) -> PictureSetup:
-        camera, turned = setup.camera, rotation(self.turn * x[0])
+    def moved(self, setup: Setup, x, prepared: Float[Array, "3"]) -> Setup:
+        middle, camera, turned = prepared, setup.camera, rotation(self.turn * x[0])
         position = middle + turned @ (camera.position - middle) + self.shift * x[1]
         pose = position, camera.rotation @ turned.T
-        moved = eqx.tree_at(lambda camera: (camera.position, camera.rotation), camera, pose)
-        return PictureSetup(moved, setup.lights)
+        return eqx.tree_at(lambda s: (s.camera.position, s.camera.rotation), setup, pose)
 
 
 def rotation(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
@@ -225,14 +206,15 @@ def rotation(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
     return jnp.eye(3, dtype=vector.dtype) + first * cross + second * (cross @ cross)
 
 
-def _with_lights(setup: PictureSetup, changes: list[dict[str, Array]]) -> PictureSetup:
+def _with_lights(setup: Setup, changes: list[dict[str, Array]]) -> Setup:
     """Replace fields of the lights."""
-    lights = []
-    for light, values in zip(setup.lights, changes, strict=True):
-        for name, value in values.items():
-            light = eqx.tree_at(lambda one, name=name: getattr(one, name), light, value)
-        lights.append(light)
-    return PictureSetup(setup.camera, tuple(lights))
+
+    def fields(setup):
+        lights = zip(setup.lights, changes, strict=True)
+        return [getattr(light, name) for light, values in lights for name in values]
+
+    values = [value for light in changes for value in light.values()]
+    return eqx.tree_at(fields, setup, values) if values else setup
 
 
 def _places(light: AbstractLight) -> list[str]:

@@ -1,36 +1,34 @@
 """Coefficients in, residuals out: what the least squares solver sees."""
 
 import abc
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
+from splatjax.diffusion import resolved_fraction
 from splatjax.fitting import (
     AbstractWeights,
-    FixedTotalReflectance,
     GivenVariances,
-    NonNegativeWeights,
     fit_gaussians,
     fit_weights,
 )
 from splatjax.gaussians import AbstractProfile, SumOfGaussians
+from splatjax.render import DiffusionBasis
 from splatjax.scattering import Medium
 
-from ._flat import FlatPictures
+from ._flat import FlatPictures, flatten, in_a_row
 from ._losses import AbstractLoss
+from ._observation import (
+    AbstractIntensity,
+    Evidence,
+)
 
 _STEPS = 64
-
-
-def default_weights() -> AbstractWeights:
-    """Return the weights with which the materials of the package are fitted: not negative, with a
-    fixed sum.
-    """
-    return NonNegativeWeights(FixedTotalReflectance())
 
 
 class Unknowns(eqx.Module):
@@ -41,52 +39,62 @@ class Unknowns(eqx.Module):
     eta: Float[Array, " channels"]
     factors: Int[Array, "pictures channels"]
     """The factor of each channel of each picture; the number of factors where it is known."""
+    count: int = eqx.field(static=True)
+    """Number of factors."""
+
+    @classmethod
+    def of(
+        cls, eta: Float[Array, " channels"], intensities: Sequence[AbstractIntensity]
+    ) -> "Unknowns":
+        factors, count = [], 0
+        for intensity in intensities:
+            groups = intensity.groups(len(eta))
+            factors.append(np.where(groups < 0, -1, groups + count))
+            count += int(np.max(groups)) + 1
+        factors = np.stack(factors)
+        return cls(eta, jnp.asarray(np.where(factors < 0, count, factors), jnp.int32), count)
 
     def medium(self, point: Float[Array, " unknowns"]) -> Medium:
-        channels = self.eta.shape[0]
+        channels = len(self.eta)
         return Medium(jnp.exp(point[:channels]), jnp.exp(point[channels : 2 * channels]), self.eta)
 
     def intensities(self, point: Float[Array, " unknowns"]) -> Float[Array, "pictures channels"]:
-        factors = jnp.append(point[2 * self.eta.shape[0] :], jnp.zeros((), point.dtype))
+        factors = jnp.append(point[2 * len(self.eta) :], jnp.zeros((), point.dtype))
         return jnp.exp(factors[self.factors])
 
-    def start(self, medium: Medium, count: int) -> Float[Array, " unknowns"]:
-        return jnp.concatenate(
-            [
-                jnp.log(medium.sigma_a),
-                jnp.log(medium.sigma_s_prime),
-                jnp.zeros(count, self.eta.dtype),
-            ]
-        )
+    def start(self, medium: Medium) -> Float[Array, " unknowns"]:
+        coefficients = jnp.log(jnp.concatenate([medium.sigma_a, medium.sigma_s_prime]))
+        return jnp.pad(coefficients, (0, self.count))
 
 
-class AbstractVariances(eqx.Module):
-    """How the variances of Gaussians follow from a medium."""
+class AbstractGaussianFit(eqx.Module):
+    """How the Gaussians follow from a profile."""
 
     @abc.abstractmethod
-    def gaussians(self, profile: AbstractProfile, weights: AbstractWeights) -> SumOfGaussians:
+    def gaussians(self, profile: AbstractProfile) -> SumOfGaussians:
         """Fit the Gaussians of a profile. Differentiable."""
 
 
-class FixedVariances(AbstractVariances):
-    """The same for all media."""
+class FixedVariances(AbstractGaussianFit):
+    """The variances are the same for all media."""
 
     variances: Float[Array, " gaussians"]
+    weights: AbstractWeights
 
-    def gaussians(self, profile: AbstractProfile, weights: AbstractWeights) -> SumOfGaussians:
-        return fit_weights(profile, self.variances, weights=weights)
+    def gaussians(self, profile: AbstractProfile) -> SumOfGaussians:
+        return fit_weights(profile, self.variances, weights=self.weights)
 
 
-class FittedVariances(AbstractVariances):
-    """Those of the best fit to each medium: variances and weights move together."""
+class FittedVariances(AbstractGaussianFit):
+    """The variances are those of the best fit to each medium, and move with the weights."""
 
     near: Float[Array, " gaussians"]
+    weights: AbstractWeights
 
-    def gaussians(self, profile: AbstractProfile, weights: AbstractWeights) -> SumOfGaussians:
-        start = GivenVariances(self.near)
-        return fit_gaussians(
-            profile, len(self.near), weights=weights, start=start, throw=False
-        ).gaussians
+    def gaussians(self, profile: AbstractProfile) -> SumOfGaussians:
+        start, count = GivenVariances(self.near), len(self.near)
+        fit = fit_gaussians(profile, count, weights=self.weights, start=start, throw=False)
+        return fit.gaussians
 
 
 class RecoveryProblem(eqx.Module):
@@ -96,13 +104,32 @@ class RecoveryProblem(eqx.Module):
     observed: Float[Array, "channels pixels"]
     deviation: Float[Array, "channels pixels"]
     unknowns: Unknowns
-    variances: AbstractVariances
+    fit: AbstractGaussianFit
     loss: AbstractLoss
-    weights: AbstractWeights
     model: Callable[[Medium], AbstractProfile] = eqx.field(static=True)
 
+    @classmethod
+    def of(
+        cls,
+        pictures: Sequence[DiffusionBasis],
+        evidence: Sequence[Evidence],
+        counted: Sequence[np.ndarray],
+        unknowns: Unknowns,
+        fit: AbstractGaussianFit,
+        loss: AbstractLoss,
+        model: Callable[[Medium], AbstractProfile],
+    ) -> "RecoveryProblem":
+        """Compare rendered pictures with the observed ones, at the pixels that count."""
+        dtype = unknowns.eta.dtype
+        observed, deviation = (
+            jnp.asarray(in_a_row(images, counted), dtype)
+            for images in ([one.picture for one in evidence], [one.deviation for one in evidence])
+        )
+        flat = flatten(pictures, counted, dtype)
+        return cls(flat, observed, deviation, unknowns, fit, loss, model)
+
     def gaussians(self, point: Float[Array, " unknowns"]) -> SumOfGaussians:
-        return self.variances.gaussians(self.model(self.unknowns.medium(point)), self.weights)
+        return self.fit.gaussians(self.model(self.unknowns.medium(point)))
 
     def radiance(self, point: Float[Array, " unknowns"]) -> Float[Array, "channels pixels"]:
         return self.pictures.radiance(self.gaussians(point), self.unknowns.intensities(point))
@@ -110,23 +137,6 @@ class RecoveryProblem(eqx.Module):
     def residuals(self, point: Float[Array, " unknowns"]) -> Float[Array, "channels pixels"]:
         """Compute residuals whose squares are the losses."""
         return self.loss.root((self.radiance(point) - self.observed) / self.deviation)
-
-    def resolution_slopes(
-        self, point: Float[Array, " unknowns"]
-    ) -> Float[Array, "channels pixels"]:
-        """Differentiate the residuals in the logarithm of the widths below which layers are
-        unresolved.
-        """
-
-        def moved(by: Float[Array, ""]) -> Float[Array, "channels pixels"]:
-            return eqx.tree_at(
-                lambda problem: problem.pictures.light.interval,
-                self,
-                replace_fn=lambda at: at * jnp.exp(by),
-            ).residuals(point)
-
-        zero = jnp.zeros((), point.dtype)
-        return jax.jvp(moved, (zero,), (zero + 1,))[1]
 
 
 class SearchEnd(eqx.Module):
@@ -180,15 +190,22 @@ def solution(problem: RecoveryProblem, point: Float[Array, " unknowns"]) -> Solu
     unresolved layers.
     """
 
-    def residuals(point):
-        gaussians, radiance = problem.gaussians(point), problem.radiance(point)
-        return problem.residuals(point), (gaussians, radiance)
+    def residuals(point, log_width):
+        moved = eqx.tree_at(
+            lambda one: one.pictures.light.interval,
+            problem,
+            replace_fn=lambda interval: interval * jnp.exp(log_width),
+        )
+        return moved.residuals(point), (problem.gaussians(point), problem.radiance(point))
 
-    slopes, (gaussians, radiance) = jax.jacfwd(residuals, has_aux=True)(point)
-    channels = jnp.eye(slopes.shape[0], dtype=slopes.dtype)[:, None]
-    resolution = problem.resolution_slopes(point)[..., None] * channels
-    slopes = jnp.concatenate([slopes, resolution], axis=-1)
-    unresolved = (
-        (1 - problem.pictures.light.resolved()) @ gaussians.weights / gaussians.total_reflectance()
+    (slopes, of_width), (gaussians, radiance) = jax.jacfwd(residuals, (0, 1), has_aux=True)(
+        point, jnp.zeros((), point.dtype)
     )
+    # Every channel has a width of its own.
+    of_widths = of_width[..., None] * jnp.eye(len(of_width), dtype=of_width.dtype)[:, None]
+    slopes = jnp.concatenate([slopes, of_widths], axis=-1)
+    light = problem.pictures.light
+    resolved = resolved_fraction(light.variances[:, None], light.area[None], light.interval)
+    unresolved = 1 - light.resolvable * jnp.mean(resolved, axis=1)
+    unresolved = unresolved @ gaussians.weights / gaussians.total_reflectance()
     return Solution(jnp.einsum("cpi,cpj->ij", slopes, slopes), gaussians, radiance, unresolved)

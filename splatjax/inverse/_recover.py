@@ -11,18 +11,34 @@ from jaxtyping import Array, Float
 from splatjax._format import counted
 from splatjax._records import check_values
 from splatjax.diffusion import ClusterDiffuser
-from splatjax.fitting import AbstractWeights, fit_gaussians
+from splatjax.fitting import (
+    AbstractWeights,
+    FixedTotalReflectance,
+    NonNegativeWeights,
+    fit_gaussians,
+)
 from splatjax.gaussians import AbstractProfile, SumOfGaussians
 from splatjax.render import RenderSettings
 from splatjax.scattering import Dipole, Medium
 from splatjax.scene import Material, Splats
 
 from ._estimate import inverse
-from ._evidence import Evidence
-from ._flat import Gatherer, wide_variances
+from ._flat import in_pictures, which_count
+from ._layers import render_layers, wide_variances
 from ._losses import AbstractLoss, SquaredLoss
-from ._observation import Observation, check_channels
-from ._problem import FittedVariances, FixedVariances, default_weights, search, solution
+from ._observation import (
+    Evidence,
+    Observation,
+    check_channels,
+)
+from ._problem import (
+    FittedVariances,
+    FixedVariances,
+    RecoveryProblem,
+    Unknowns,
+    search,
+    solution,
+)
 from ._recovery import Recovery
 
 _FINE = RenderSettings(diffuser=ClusterDiffuser(error=2.5e-4))
@@ -44,7 +60,7 @@ def recover(
     surface: Material | None = None,
     model: Callable[[Medium], AbstractProfile] = Dipole,
     count: int = 6,
-    weights: AbstractWeights = default_weights(),
+    weights: AbstractWeights = NonNegativeWeights(FixedTotalReflectance()),
     loss: AbstractLoss = SquaredLoss(),
     settings: RenderSettings = _FINE,
     progress: Callable[[str, Medium], None] | None = None,
@@ -93,34 +109,27 @@ def recover(
     observations = list(observations)
     _check(observations, splats, starts, surface)
     report = progress or (lambda stage, medium: None)
-    evidence = Evidence(observations, starts[0].sigma_a.dtype)
-    unknowns, factors = evidence.unknowns(starts[0].eta)
-    gatherer = Gatherer(
-        splats,
-        settings,
-        [one.camera for one in observations],
-        [one.lights for one in observations],
-    )
-    wide = _unweighed(wide_variances(starts, splats), len(starts[0].eta))
-    surface = (
-        Material(wide, eta=starts[0].eta[0], specular=0)
-        if surface is None
-        else surface.surface_of(wide)
-    )
+    eta, channels = starts[0].eta, starts[0].channels
+    evidence = [Evidence.of(one, eta.dtype) for one in observations]
+    unknowns = Unknowns.of(eta, [one.intensity for one in observations])
+    noise_is_known = all(one.deviation is not None for one in observations)
+    wide = wide_variances(starts, splats)
+    gaussians = _unweighed(wide, channels)
+    surface = surface or Material(gaussians, eta=eta[0], specular=0)
+    surface = surface.surface_of(gaussians)
 
-    def problem_of(gathered, variances):
-        return evidence.problem(gathered, unknowns, variances, loss, weights, model)
+    def problem_of(rendered, fit):
+        mask = which_count(rendered, evidence)
+        return RecoveryProblem.of(rendered, evidence, mask, unknowns, fit, loss, model)
 
-    report(
-        f"rendering {len(wide.variances)} layers of {counted(len(observations), 'picture')}",
-        starts[0],
-    )
-    problem, _ = problem_of(gatherer.held(surface), FixedVariances(wide.variances))
+    report(f"rendering {len(wide)} layers of {counted(len(observations), 'picture')}", starts[0])
+    rendered, _ = render_layers(splats, surface, observations, settings, derivative=False)
+    problem = problem_of(rendered, FixedVariances(wide, weights))
     report(
         f"searching from {counted(len(starts), 'start')} among {problem.observed.shape[1]} pixels",
         starts[0],
     )
-    ends = [search(problem, unknowns.start(start, factors)) for start in starts]
+    ends = [search(problem, unknowns.start(start)) for start in starts]
     costs = np.nan_to_num([float(end.cost) for end in ends], nan=np.inf)
     best = ends[int(np.argmin(costs))]
     steps, settled, plans, rounds = sum(int(end.steps) for end in ends), False, None, 0
@@ -133,21 +142,20 @@ def recover(
             medium,
         )
         fitted = fit_gaussians(model(medium), count, weights=weights, throw=False).gaussians
-        surface = surface.surface_of(_unweighed(fitted.variances, len(medium.eta)))
-        gathered, plans = gatherer.moving(surface, plans)
-        problem, numbers = problem_of(gathered, FittedVariances(fitted.variances))
+        surface = surface.surface_of(_unweighed(fitted.variances, channels))
+        rendered, plans = render_layers(splats, surface, observations, settings, plans)
+        problem = problem_of(rendered, FittedVariances(fitted.variances, weights))
         before, best = best.point, search(problem, best.point)
         steps += int(best.steps)
         reached = solution(problem, best.point)
-        chi_squared = best.cost / max(problem.observed.size - best.point.size, 1)
-        scale = 1.0 if evidence.noise_is_known else float(chi_squared)
         size = best.point.size
-        information = np.asarray(reached.information, np.float64)[:size, :size]
-        deviations = np.sqrt(np.diagonal(inverse(information) * scale))
-        settled = bool(best.converged) and bool(
-            np.all(np.abs(best.point - before) <= np.maximum(_SETTLED, 0.1 * deviations))
-        )
-    pictures = evidence.shown(np.asarray(reached.radiance), numbers)
+        chi_squared = best.cost / max(problem.observed.size - size, 1)
+        covariance = inverse(np.asarray(reached.information, np.float64)[:size, :size])
+        deviations = np.sqrt(np.diagonal(covariance))
+        deviations *= 1.0 if noise_is_known else float(chi_squared) ** 0.5
+        moved = np.abs(best.point - before)
+        settled = bool(best.converged) and np.all(moved <= np.maximum(_SETTLED, 0.1 * deviations))
+    pictures = in_pictures(reached.radiance, which_count(rendered, evidence))
     recovery = Recovery(
         medium=unknowns.medium(best.point),
         material=surface.surface_of(reached.gaussians),
@@ -157,15 +165,15 @@ def recover(
         chi_squared=chi_squared,
         pictures=pictures,
         residuals=tuple(
-            made - seen for made, seen in zip(pictures, evidence.pictures, strict=True)
+            made - np.asarray(one.picture) for made, one in zip(pictures, evidence, strict=True)
         ),
         ends=tuple(unknowns.medium(end.point) for end in ends),
-        costs=jnp.asarray(costs, evidence.dtype),
+        costs=jnp.asarray(costs, eta.dtype),
         result=optx.RESULTS.where(
             jnp.asarray(settled), optx.RESULTS.successful, optx.RESULTS.nonlinear_max_steps_reached
         ),
-        noise_is_known=evidence.noise_is_known,
-        relative_noise=evidence.relative_noise,
+        noise_is_known=noise_is_known,
+        relative_noise=float(np.mean([one.relative_noise for one in evidence])),
         steps=steps,
         rounds=rounds,
     )

@@ -82,7 +82,7 @@ class Recovery(AbstractEstimate):
         return 1.0 if self.noise_is_known else float(self.chi_squared)
 
     def covariance(
-        self, more: Float[np.ndarray, "all all"] | float = 0.0
+        self, more: Float[np.ndarray, "all all"] | float = 0.0, resolution: float = _RESOLUTION
     ) -> Float[np.ndarray, "channels 2 2"]:
         """Compute the covariance of the logarithms of `sigma_a` and `sigma_s_prime` of each
         channel, whatever the other unknowns are.
@@ -93,36 +93,25 @@ class Recovery(AbstractEstimate):
         **Arguments:**
 
         - `more`: information that another picture would add.
+        - `resolution`: the deviation of the logarithm of the width below which a layer is
+          unresolved; 0 for a renderer that is right about it.
         """
-        information, unknowns = self._scaled_information() + more, self._unknowns()
-        noise = inverse(information[:unknowns, :unknowns])
-        if not np.all(np.isfinite(noise)):
-            return self._pairs(noise)
-        # The width is not searched: information about it helps no unknown.
-        astray = noise @ information[:unknowns, unknowns:] * _RESOLUTION
-        return self._pairs(noise + astray @ astray.T)
-
-    def covariance_of_noise(self) -> Float[np.ndarray, "channels 2 2"]:
-        """Compute the covariance as if the renderer were right about unresolved layers."""
-        unknowns = self._unknowns()
-        return self._pairs(inverse(self._scaled_information()[:unknowns, :unknowns]))
+        channels, scale = self.medium.channels, max(self.scale, np.finfo(np.float64).tiny)
+        information = np.asarray(self.information, np.float64) / scale + more
+        unknowns = len(information) - channels
+        covariance = inverse(information[:unknowns, :unknowns])
+        if np.all(np.isfinite(covariance)):
+            # The width is not searched: information about it helps no unknown.
+            astray = covariance @ information[:unknowns, unknowns:] * resolution
+            covariance = covariance + astray @ astray.T
+        pairs = np.arange(channels)[:, None] + [0, channels]
+        return covariance[pairs[:, :, None], pairs[:, None]]
 
     def noise_errors(self) -> tuple[Float[np.ndarray, " channels"], Float[np.ndarray, " channels"]]:
-        """Compute the deviations of `covariance_of_noise`: how far searches of pictures that are
-        taken again would scatter.
+        """Compute the errors that noise alone leaves: how far searches of pictures that are taken
+        again would scatter.
         """
-        return roots(self.covariance_of_noise())
-
-    def _unknowns(self) -> int:
-        return len(self.information) - self.medium.channels
-
-    def _scaled_information(self) -> Float[np.ndarray, "all all"]:
-        return np.asarray(self.information, np.float64) / max(self.scale, np.finfo(np.float64).tiny)
-
-    def _pairs(self, whole: Float[np.ndarray, "some some"]) -> Float[np.ndarray, "channels 2 2"]:
-        channels = self.medium.channels
-        pairs = [[c, channels + c] for c in range(channels)]
-        return np.stack([whole[np.ix_(pair, pair)] for pair in pairs])
+        return roots(self.covariance(resolution=0.0))
 
     def summary(self, channels: Sequence[str] | None = None) -> str:
         """Format the coefficients, their errors, and what the pictures do not determine.

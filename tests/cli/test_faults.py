@@ -24,7 +24,15 @@ eta = 1.5
 roughness = 0.11
 specular = 0.07
 """
+FOUR_CHANNELS = """[fit]
+unit = "mm^2"
+variances = [1.0]
+weights = [[0.1, 0.2, 0.3, 0.4]]
+[surface]
+eta = 1.5
+"""
 MEDIA = {
+    "four.toml": FOUR_CHANNELS,
     "negative.toml": MEDIUM.replace("0.0021", "-0.03"),
     "misspelt.toml": MEDIUM.replace("roughness", "roughnes"),
     "capital.toml": MEDIUM.replace("sigma_a", "sigma_A"),
@@ -67,6 +75,7 @@ REFUSED = {
     "fit unreduced.toml": ["sigma_s", "sigma_s_prime = (1 - g) sigma_s"],
     "render plate.ply --material true.toml": ["sigma_s_prime"],
     "render plate.ply --material text.toml": ["sigma_s_prime"],
+    "render plate.ply --material four.toml": ["4 channels", "PNG"],
     # Outputs.
     "render --output none/o.exr": ["none/o.exr", "no folder"],
     "render --output o.png": ["o.png", ".exr"],
