@@ -124,8 +124,7 @@ class Traced:
         )
         self.parameters = mi.traverse(self.scene)
         self.total, self.albedo = (
-            # noqa: SIM118
-            next(key for key in self.parameters.keys() if key.endswith(f"{name}.value.value"))
+            next(key for key in self.parameters if key.endswith(f"{name}.value.value"))
             for name in ("sigma_t", "albedo")
         )
 

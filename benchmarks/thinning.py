@@ -11,12 +11,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from splatjax.diffusion._gathering import Gathering
+from splatjax.diffusion._tree import ClusterTree
 
 import splatjax as sj
 from splatjax import diffusion
 from splatjax.baselines import layer_contrast
-from splatjax.diffusion._gathering import Gathering
-from splatjax.diffusion._tree import ClusterTree
 from splatjax.render import light_on_splats
 
 from .scenes import columns

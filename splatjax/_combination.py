@@ -142,7 +142,7 @@ def extreme(
 
 
 def lay_out(mesh: Mesh, trees: Partial, specs: Partial) -> Partial:
-    """Lay arrays out over a mesh with explicit axes; for other meshes `shard_map` does so itself."""
+    """Lay arrays out over a mesh with explicit axes; `shard_map` itself does so for others."""
     if AxisType.Explicit not in mesh.axis_types:
         return trees
     return jax.tree.map(

@@ -208,17 +208,17 @@ class ClusterPlan(AbstractDiffusionPlan):
             if layer.neighbors is None:
                 values.append(None)
                 continue
-            found, missed = self._layer(
-                levels[layer.level], points, variance, depth, kernel, layer, wanted
-            )
+            given = levels[layer.level], points, variance, depth
+            found, missed = self._layer(*given, kernel, layer.support, layer.neighbors, wanted)
             values.append(split_layer(found, variance))
             needed.append(missed)
         largest_need = jnp.max(jnp.stack(needed)) if needed else jnp.zeros((), variances.dtype)
         return Diffused(tuple(values), combination.largest([largest_need]))
 
-    def _layer(self, clusters, points, variance, depth, kernel, layer: LayerPlan, wanted):
+    def _layer(
+        self, clusters, points, variance, depth, kernel, support, neighbors: Neighbors, wanted
+    ):
         """Evaluate one layer at points; also return its need of reach over the planned one."""
-        support, neighbors = layer.support, layer.neighbors
         steps = neighbors.steps if wanted is None else neighbors.steps.only(wanted, BLOCK)
         below = clusters.lowered(depth)
         truncated = kernel.truncated(support)
@@ -254,7 +254,7 @@ def layer_table(
     truncated: TruncatedGaussian,
     slopes: bool = True,
 ) -> tuple[Float[Array, "blocks_and_one columns block"], Float[Array, ""]]:
-    """Lay out the sources of one layer: light, mass and, for slopes, the first moments of both. Also
+    """Lay out the sources of one layer: light, mass and, for slopes, first moments of both. Also
     return the largest variance of a source.
     """
     widths = variance + below.spread

@@ -86,6 +86,7 @@ def map_visibility(
     """Look the splats up in one map: 0 for those that belong to another face of a cube."""
     visibility = _splatting.compute_visibility(scene.splats, shadow_map, settings)
     if cube:
+        assert isinstance(shadow_map.view, _splatting.PerspectiveView)
         visibility *= _splatting.in_cube_face(shadow_map.view, scene.splats.centers.T)
     return visibility
 

@@ -182,6 +182,7 @@ def _sum_views(
     if not views:
         return []
     rasterizer, splatting = settings.rasterizer, settings.splatting
+    assert isinstance(rasterizer, _splatting.TileRasterizer)
     demands, count = [], 0
     for scene in scenes("planning"):
         count = scene.splats.count

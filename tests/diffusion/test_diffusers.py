@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from splatjax.diffusion._gathering import MeansAndExits
 
 from splatjax.diffusion import ClusterDiffuser, DenseDiffuser, Kernels, Sources
-from splatjax.diffusion._gathering import MeansAndExits
 from splatjax.splatting import DenseRasterizer, SplattingSettings
 
 COUNT, SIZE = 3000, 64

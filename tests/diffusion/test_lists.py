@@ -7,13 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from splatjax.diffusion._pixels import Pixels
+from splatjax.diffusion._tree import blocks_of
 from test_diffusers import atlas_of
 
 from splatjax.diffusion import _neighbors
 from splatjax.diffusion._neighbors import Boxes, Neighbors
 from splatjax.diffusion._order import BLOCK, compact_order
-from splatjax.diffusion._pixels import Pixels
-from splatjax.diffusion._tree import blocks_of
 from splatjax.splatting import SIDE, BinCapacity
 
 LANES, SLOTS, REACH = 5, 3, 1.5

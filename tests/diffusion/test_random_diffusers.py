@@ -15,10 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from random_bodies import KINDS, disagreement, random_body, seeds
+from splatjax.diffusion._pixels import tile_grid
 
 from splatjax.diffusion import ClusterDiffuser, DenseDiffuser, Kernels, Sources
 from splatjax.diffusion._clustered import LayerPlan
-from splatjax.diffusion._pixels import tile_grid
 from splatjax.scene import Splats
 from splatjax.splatting import SIDE, BinCapacity, DenseRasterizer, SplattingSettings, TileGrid
 

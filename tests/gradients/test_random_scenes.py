@@ -18,13 +18,13 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, Phase, given, settings, strategies as st
 from hypothesis.extra.numpy import arrays
+from splatjax.diffusion._pixels import tile_grid
 from worlds import World, named, with_leaf
 
 import splatjax as sj
 from splatjax.diffusion import ClusterDiffuser, DenseDiffuser
 from splatjax.diffusion._clustered import LayerPlan, NodePlan
 from splatjax.diffusion._neighbors import Boxes, Neighbors
-from splatjax.diffusion._pixels import tile_grid
 from splatjax.splatting import (
     BinCapacity,
     DenseRasterizer,

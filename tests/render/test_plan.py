@@ -5,11 +5,11 @@ import jax
 import jax.numpy as jnp
 import pytest
 from scenes import sheet, two_gaussians
+from splatjax.render._sharded_plan import on_one_device
 
 import splatjax as sj
 from splatjax.diffusion import DenseDiffuser
 from splatjax.render import light_on_splats
-from splatjax.render._sharded_plan import on_one_device
 from splatjax.scene import AbstractLight
 
 SETTINGS = sj.RenderSettings(diffuser=DenseDiffuser())  # which needs no plan

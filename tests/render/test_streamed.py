@@ -6,11 +6,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scenes import sphere
+from splatjax.diffusion._tree import ClusterTree
+from splatjax.render._survey import Survey
 
 import splatjax as sj
 from splatjax.diffusion import FINEST, DenseDiffuser
-from splatjax.diffusion._tree import ClusterTree
-from splatjax.render._survey import Survey
 from splatjax.splatting import ShadowSettings
 
 pytestmark = pytest.mark.once
