@@ -48,8 +48,8 @@ OTHER = [[0.4, 0.0], [0.0, 0.5], [0.5, 0.3]]
 
 def test_it_is_the_picture_of_any_weights():
     camera = camera_over(14.0, 24, slant=20.0)
-    plan = sj.plan(ball_over_sheet(gaussians_of(ONE)), camera, PLAIN)
-    gathered = sj.gather_picture(ball_over_sheet(gaussians_of(ONE)), camera, PLAIN, plan)
+    plan = sj.make_plan(ball_over_sheet(gaussians_of(ONE)), camera, PLAIN)
+    gathered = sj.diffusion_basis(ball_over_sheet(gaussians_of(ONE)), camera, PLAIN, plan)
     assert np.sum(np.asarray(gathered.in_front) == 0) > 0  # something shows behind
     for weights in (ONE, OTHER):
         frame = sj.render(ball_over_sheet(gaussians_of(weights)), camera, PLAIN, plan)
@@ -67,8 +67,8 @@ def test_its_derivative_is_that_of_the_picture():
     """In weights and variances, forward and reverse."""
     camera = camera_over(14.0, 24, slant=20.0)
     start = ball_over_sheet(gaussians_of(ONE))
-    plan = sj.plan(start, camera, PLAIN)
-    gathered = sj.gather_picture_and_slopes(start, camera, PLAIN, plan)
+    plan = sj.make_plan(start, camera, PLAIN)
+    gathered = sj.diffusion_basis(start, camera, PLAIN, plan, derivative=True)
     jacobian = sj.picture_jacobian(start, camera, PLAIN, plan)
     rng = np.random.default_rng(4)
     way = jax.tree.map(
@@ -97,7 +97,7 @@ def test_its_derivative_is_that_of_the_picture():
 def test_single_scattering_is_refused():
     medium = sj.Medium(jnp.asarray([0.1, 0.1]), jnp.asarray([1.0, 1.0]), jnp.asarray([1.3, 1.3]))
     with pytest.raises(ValueError, match=r"scene\.material has single scattering"):
-        sj.gather_picture(
+        sj.diffusion_basis(
             ball_over_sheet(gaussians_of(ONE), sj.SingleScattering(medium)),
             camera_over(14.0, 24),
             PLAIN,
