@@ -88,11 +88,13 @@ class ClusterDiffuser(AbstractDiffuser):
         exists = areas > 0
         sizes, (edges, supports) = np.asarray(variances, np.float64), ([], [])
         if exists.any():
-            spacing, fine = math.sqrt(areas[exists].mean()), np.quantile(areas[exists], FINEST)
+            spacing = math.sqrt(areas[exists].mean())
+            fine = float(np.quantile(areas[exists], FINEST))
             edges, supports = self.choose_sources(sizes, spacing, fine, kernel, interval)
         cells = sorted({edge for edge in edges if edge > 0})
         tree = ClusterTree.build(centers, normals, exists, cells)
-        sources = Sources(*(jnp.asarray(each.T) for each in (centers, normals)), areas, areas[None])
+        arrays = centers.T, normals.T, areas, areas[None]
+        sources = Sources(*(jnp.asarray(each) for each in arrays))
         origin, levels = _levels(tree, sources)
         dtype, layers = variances.dtype, []
         for i, variance in enumerate(sizes):
@@ -127,10 +129,10 @@ class ClusterDiffuser(AbstractDiffuser):
         - `spacing`: root of the mean area of the splats, mm.
         - `fine`: area that only `FINEST` of the splats are finer than, mm^2.
         """
-        shares = [
-            float(resolved_fraction(variance * self.margin, fine, np.asarray(interval)))
-            for variance in variances
-        ]
+        widest, area = (
+            jnp.asarray(each, interval.dtype) for each in (variances * self.margin, fine)
+        )
+        shares = resolved_fraction(widest, area, interval).tolist()
         edges = _CELL * (self.error / 2e-3) ** (1 / 3) * np.sqrt(variances / self.margin)
         edges = np.where((np.asarray(shares) > 0) & (edges > _WORTHWHILE * spacing), edges, 0.0)
         supports = [kernel.support(self.error, share) if share > 0 else 0.0 for share in shares]
