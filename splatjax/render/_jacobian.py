@@ -1,4 +1,4 @@
-"""The Jacobian of a picture in its material, pixel by pixel, at the price of about one more pass 4."""
+"""The Jacobian of a picture in its material, pixel by pixel, for about one more pass 4."""
 
 import dataclasses
 from collections.abc import Callable
