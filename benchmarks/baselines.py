@@ -1,7 +1,7 @@
 """Splat diffusion and its baselines against brute-force integration over the surface: `python -m
 benchmarks.baselines`.
 
-Writes out/baselines_BODY_NORMALIZATION.json, and a picture of where each method errs around the
+Writes out/baselines_BODY_KERNEL.json, and a picture of where each method errs around the
 nose; SSIM and FLIP are taken there.
 """
 
@@ -19,14 +19,14 @@ import numpy as np
 
 import splatjax as sj
 from splatjax import baselines
-from splatjax.diffusion import DiffusionSettings, ExitOdds, PlainMean
+from splatjax.diffusion import AbstractDiffusionKernel, EscapeNormalization, PlainMean
 from splatjax.splatting import PerspectiveView
 
 from .baselines_pictures import errors
 from .heads import HEADS, MAP, Body, body_of, conditions
 from .surface_truth import integrate
 
-NORMALIZATIONS = {"mean": PlainMean(), "odds": ExitOdds()}
+KERNELS: dict[str, AbstractDiffusionKernel] = {"mean": PlainMean(), "escape": EscapeNormalization()}
 STRETCHES = (1.0, 1.25, 1.6, 2.5, np.inf)
 RIM = 2  # pixels
 JUMP = 3.0  # mm from pixel to pixel: there one surface ends before another
@@ -36,9 +36,7 @@ NOSE = (0.5, 0.48)  # of the picture, from the top and from the left
 def arguments():
     parser = argparse.ArgumentParser(prog="python -m benchmarks.baselines", description=__doc__)
     parser.add_argument("--body", choices=HEADS, default="scanned", help="(default %(default)s)")
-    parser.add_argument(
-        "--normalization", choices=NORMALIZATIONS, default="mean", help="(default %(default)s)"
-    )
+    parser.add_argument("--kernel", choices=KERNELS, default="mean", help="(default %(default)s)")
     parser.add_argument("--splats", type=int, default=683_549, help="(default %(default)s)")
     parser.add_argument(
         "--width",
@@ -78,11 +76,11 @@ def timed(function):
     return found, min(seconds)
 
 
-def methods(body: Body, light, camera, material: sj.Material, normalization) -> dict[str, Found]:
+def methods(body: Body, light, camera, material: sj.Material, kernel) -> dict[str, Found]:
     """Render by every method."""
     scene = sj.Scene(body.splats, (light,), material)
-    settings = sj.RenderSettings(diffusion=DiffusionSettings(normalization=normalization))
-    plan = sj.plan(scene, camera, settings)
+    settings = sj.RenderSettings(kernel=kernel)
+    plan = sj.make_plan(scene, camera, settings)
     found = {}
 
     def keep(name: str, frame: sj.Frame, seconds: float) -> None:
@@ -105,7 +103,7 @@ def methods(body: Body, light, camera, material: sj.Material, normalization) -> 
             baselines.TranslucentShadowMap(),
         ),
     ):
-        how = baselines.TextureSpaceSettings(MAP, stretch, thin, normalization)
+        how = baselines.TextureSpaceSettings(MAP, stretch, thin, kernel)
         room = baselines.plan_texture_space(body.mesh, (light,), material, camera, how)
         picture, seconds = timed(
             lambda how=how, room=room: baselines.render_texture_space(
@@ -122,36 +120,34 @@ def methods(body: Body, light, camera, material: sj.Material, normalization) -> 
         frame = (
             picture.frame
         )  # its buffers, but for the layers, are those of any way of spreading light
-    for name, kernel in (
+    for name, blur in (
         ("screen space, Gaussian by Gaussian", baselines.GaussianPasses()),
         ("screen space, the kernel that ships", baselines.ShippedKernel()),
     ):
         on_screen = jax.jit(
-            lambda frame, kernel=kernel: baselines.diffuse_on_screen(
-                frame, camera, material, kernel
-            )
+            lambda frame, blur=blur: baselines.diffuse_on_screen(frame, camera, material, blur)
         )
         diffused, seconds = timed(lambda on_screen=on_screen, frame=frame: on_screen(frame))
         keep(name, diffused, seconds)
     return found
 
 
-def same_light(body: Body, maps: baselines.MeshLight, camera, material, normalization) -> Found:
+def same_light(body: Body, maps: baselines.MeshLight, camera, material, kernel) -> Found:
     """Diffuse by splats the light that the shadow map of the triangles lets through, which the
     baselines use.
     """
     scene = sj.Scene(body.splats, maps.lights, material)
-    settings = sj.RenderSettings(diffusion=DiffusionSettings(normalization=normalization))
-    plan = sj.plan(scene, camera, settings)
+    settings = sj.RenderSettings(kernel=kernel)
+    plan = sj.make_plan(scene, camera, settings)
     source = jax.jit(lambda splats: maps.entering(splats, material).source.T)(body.splats)
-    layers, seconds = timed(lambda: sj.diffuse(scene, source, camera, settings, plan))
+    layers, seconds = timed(lambda: sj.diffuse_irradiance(scene, source, camera, settings, plan))
     whole = np.einsum("gyxc,gc->yxc", np.asarray(layers), np.asarray(material.gaussians.weights))
     return Found(whole, np.asarray(layers), np.ones(whole.shape[:2], bool), seconds)
 
 
 def main() -> None:
     options = arguments()
-    normalization = NORMALIZATIONS[options.normalization]
+    kernel = KERNELS[options.kernel]
     start = time.perf_counter()
     body = body_of(options.body, options.splats)
     print(
@@ -164,27 +160,25 @@ def main() -> None:
     settings = baselines.TextureSpaceSettings().shadows
     capacities = baselines.shadow_capacities(body.mesh, (light,), settings)
     maps = baselines.mesh_light(body.mesh, (light,), settings, capacities)
-    found = {"splats": same_light(body, maps, camera, dull, normalization)}
-    found |= methods(body, light, camera, dull, normalization)
+    found = {"splats": same_light(body, maps, camera, dull, kernel)}
+    found |= methods(body, light, camera, dull, kernel)
     seen = Seen.of(body, camera, found)
     pixels = seen.choose(options.pixels)
     faces, shares = seen.on_mesh(pixels)
     start = time.perf_counter()
-    truth = integrate(body.mesh, maps, dull, faces, shares, normalization)
+    truth = integrate(body.mesh, maps, dull, faces, shares, kernel)
     print(f"the truth at {len(faces)} pixels: {time.perf_counter() - start:.0f} s", flush=True)
-    layers = truth.layers(dull, normalization)
+    layers = truth.layers(dull, kernel)
     weights = np.asarray(dull.gaussians.weights)
     whole = np.einsum("gpc,gc->pc", layers, weights)
     if options.refine:
-        finer = integrate(body.mesh, maps, dull, faces, shares, normalization, 2**0.5).layers(
-            dull, normalization
-        )
+        finer = integrate(body.mesh, maps, dull, faces, shares, kernel, 2**0.5).layers(dull, kernel)
         print(
             "twice the samples change it by",
             point_errors(np.einsum("gpc,gc->pc", finer, weights), whole),
         )
         layers, whole = finer, np.einsum("gpc,gc->pc", finer, weights)
-    around = in_crop(body, maps, dull, normalization, seen, found, options)
+    around = in_crop(body, maps, dull, kernel, seen, found, options)
     deviations = np.sqrt(np.asarray(dull.gaussians.variances))
     report(found, pixels, layers, whole, deviations, stretched(body, faces), around, options)
 
@@ -244,9 +238,7 @@ def stretched(body: Body, faces: np.ndarray) -> np.ndarray:
     return np.max(np.maximum(ratio, 1 / ratio), axis=0)
 
 
-def in_crop(
-    body: Body, maps, material, normalization, seen: Seen, found: dict[str, Found], options
-):
+def in_crop(body: Body, maps, material, kernel, seen: Seen, found: dict[str, Found], options):
     """Integrate at every pixel of a part of the picture, around the nose; draw what each method
     makes of it.
     """
@@ -256,10 +248,10 @@ def in_crop(
     covered = seen.there[crop]
     rows, columns = np.nonzero(covered)
     faces, shares = seen.on_mesh((rows + top, columns + left))
-    truth = integrate(body.mesh, maps, material, faces, shares, normalization)
+    truth = integrate(body.mesh, maps, material, faces, shares, kernel)
     whole, root = np.zeros((size, size, 3)), np.zeros((size, size, 3))
     whole[covered] = np.einsum(
-        "gpc,gc->pc", truth.layers(material, normalization), np.asarray(material.gaussians.weights)
+        "gpc,gc->pc", truth.layers(material, kernel), np.asarray(material.gaussians.weights)
     )
     root[covered] = np.sqrt(np.maximum(truth.albedo, 1e-4))
     pictures = {name: each.exitance[crop] for name, each in found.items()}
@@ -268,7 +260,7 @@ def in_crop(
         whole,
         covered,
         root,
-        Path(f"out/baselines_errors_{options.body}_{options.normalization}.png"),
+        Path(f"out/baselines_errors_{options.body}_{options.kernel}.png"),
     )
 
 
@@ -335,7 +327,7 @@ def report(found, pixels, layers, whole, deviations, stretch, around, options) -
                     for value in row["by_stretch"]
                 )
             )
-    out = Path(f"out/baselines_{options.body}_{options.normalization}.json")
+    out = Path(f"out/baselines_{options.body}_{options.kernel}.json")
     out.parent.mkdir(exist_ok=True)
     out.write_text(json.dumps(rows, indent=1) + "\n")
     print(f"\nwritten: {out}")

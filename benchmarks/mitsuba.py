@@ -123,8 +123,9 @@ class Traced:
             }
         )
         self.parameters = mi.traverse(self.scene)
+        keys = self.parameters.keys()
         self.total, self.albedo = (
-            next(key for key in self.parameters if key.endswith(f"{name}.value.value"))
+            next(key for key in keys if key.endswith(f"{name}.value.value"))
             for name in ("sigma_t", "albedo")
         )
 

@@ -100,7 +100,7 @@ def frame_seconds(
         specular=0.0,
     )
     scene, times = sj.Scene(splats, (light,), material), []
-    plan = sj.plan(scene, camera, settings)
+    plan = sj.make_plan(scene, camera, settings)
     for _ in range(8):
         begin = time.perf_counter()
         jax.block_until_ready(sj.render(scene, camera, settings, plan))

@@ -23,9 +23,8 @@ import numpy as np
 
 import splatjax as sj
 from splatjax import baselines
-from splatjax.diffusion import DiffusionSettings, PlainMean
+from splatjax.diffusion import PlainMean
 from splatjax.plots import plot_pictures
-from splatjax.render import light_on_splats
 
 # %% [markdown]
 # A bust under a light with shadows and a weak one without. Its layers are two, four and eight times
@@ -51,9 +50,8 @@ scene = sj.Scene(body, lights, sj.Material(gaussians, specular=0.0))
 # over that of the layer, and what the law expects with one fitted factor.
 
 # %%
-diffusion = DiffusionSettings(normalization=PlainMean())
 settings = [
-    sj.RenderSettings(diffuser=baselines.ThinnedDiffuser(number), diffusion=diffusion)
+    sj.RenderSettings(diffuser=baselines.ThinnedDiffuser(number), kernel=PlainMean())
     for number in keep
 ]
 rows = [np.asarray(sj.render(scene, camera, each).layers) for each in settings]
@@ -64,8 +62,8 @@ plot_pictures(
 # %%
 norms = np.linalg.norm(rows[0].reshape(3, -1), axis=1)
 measured = [np.linalg.norm((row - rows[0]).reshape(3, -1), axis=1) / norms for row in rows[1:]]
-plan = sj.plan(scene, camera, settings[0])
-source = light_on_splats(scene, plan, settings[0]).source.T
+plan = sj.make_plan(scene, camera, settings[0])
+source = sj.compute_irradiance(scene, plan, settings[0]).source.T
 contrast = jnp.stack([baselines.layer_contrast(body, source, v) for v in gaussians.variances])
 ratios = 1 / jnp.asarray(keep[1:])
 law = np.asarray(

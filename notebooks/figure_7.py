@@ -48,11 +48,11 @@ skin = sj.load_material("skin").white()
 # same from near.
 
 # %%
-opaque = sj.Scene(body, lights, skin.opaque())
+opaque = sj.Scene(baselines.PhongSplats.of(body), lights, skin.opaque())
 methods = {
     "elliptical points": (opaque, baselines.elliptical_points()),
     "EWA splatting": (opaque, baselines.ewa_splatting()),
-    "Phong splatting": (opaque, baselines.phong_splatting(baselines.normal_slopes(body))),
+    "Phong splatting": (opaque, baselines.phong_splatting()),
     "deferred splatting": (opaque, baselines.deferred_splatting()),
     "with scattering": (sj.Scene(body, lights, skin), sj.RenderSettings()),
 }

@@ -55,10 +55,10 @@ camera = sj.Camera.look_at(
 # %% [markdown]
 # ## The diffusion pass, checked
 #
-# `sj.diffuse` is pass 4 alone: from the light below the surface of every splat to one layer per
-# Gaussian. In double precision, along a random direction of each input, its reverse mode must agree
-# with central differences. Where splats are moved, the step must be so small that none comes to the
-# front or vanishes behind another: which splats are seen has no derivative.
+# `sj.diffuse_irradiance` is pass 4 alone: from the light below the surface of every splat to one
+# layer per Gaussian. In double precision, along a random direction of each input, its reverse mode
+# must agree with central differences. Where splats are moved, the step must be so small that none
+# comes to the front or vanishes behind another: which splats are seen has no derivative.
 
 # %%
 with jax.enable_x64(True):
@@ -70,12 +70,12 @@ with jax.enable_x64(True):
     rng = np.random.default_rng(0)
     inputs = small, jnp.asarray(rng.uniform(size=(small.splats.count, 3)))
     pattern = jnp.asarray(rng.uniform(-0.5, 1, (2, 32, 32, 3)))
-    plan = sj.plan(small, lens)
+    plan = sj.make_plan(small, lens)
 
     @jax.jit
     @jax.value_and_grad
     def loss_and_gradient(inputs):
-        return jnp.mean(sj.diffuse(*inputs, lens, plan=plan) * pattern)
+        return jnp.mean(sj.diffuse_irradiance(*inputs, lens, plan=plan) * pattern)
 
     _, gradient = loss_and_gradient(inputs)
     parts = {
@@ -107,7 +107,7 @@ with jax.enable_x64(True):
     medium = sj.load_medium("marble")
     gaussians = gaussians_of(medium)
 scene = scene_of(jax.tree.map(lambda leaf: leaf.astype(jnp.float32), gaussians), 20_000)
-plan = sj.plan(scene, camera)
+plan = sj.make_plan(scene, camera)
 jacobian = sj.picture_jacobian(scene, camera, plan=plan)
 with jax.enable_x64(True):
     by_coefficient = jacobian.through(gaussians_of, medium)

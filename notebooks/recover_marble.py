@@ -58,9 +58,7 @@ with jax.enable_x64(True):
     marble = sj.load_medium("marble")
     gaussians = sj.fit_gaussians(sj.Dipole(marble), COUNT, weights=HELD).gaussians
     material = sj.Material(gaussians, eta=1.5, specular=0.0)
-    rendered = np.asarray(
-        sj.gather_picture(sj.Scene(splats, (lamp,), material), camera, settings).beauty(gaussians)
-    )
+    rendered = np.asarray(sj.render(sj.Scene(splats, (lamp,), material), camera, settings).beauty)
     deviation = NOISE * np.sqrt(np.mean(rendered**2))
     photograph = rendered + deviation * np.random.default_rng(0).normal(size=rendered.shape)
 

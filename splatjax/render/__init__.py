@@ -1,4 +1,4 @@
-"""The five passes, wired: plan once what shapes they need, then render."""
+"""The five passes, wired: plan what shapes they need, then render. No mathematics lives here."""
 
 from ._attributes import SurfaceAttributes as SurfaceAttributes, SurfaceSamples as SurfaceSamples
 from ._basis import diffusion_basis as diffusion_basis, DiffusionBasis as DiffusionBasis

@@ -27,12 +27,16 @@ _RATIO = 1000.0
 """Size of a body over the distance that light travels below its surface, or the inverse."""
 
 
-def check_scene(scene: Scene, camera: Camera) -> None:
+def check_scene(scene: Scene, camera: Camera, is_lit: bool = True) -> None:
     r"""Refuse a picture that does not fit into memory, and warn of what makes it black or
     meaningless: no light, inverted normals, a camera inside the body, a body a thousand times
     larger or smaller than the length scale of its material.
 
     Traced scenes pass, and those spread over several processes. Each warning is shown once.
+
+    **Arguments:**
+
+    - `is_lit`: false where the irradiance is given and the lights do not matter.
 
     **Raises:** `ValueError` when the memory of the device does not suffice.
     """
@@ -46,7 +50,7 @@ def check_scene(scene: Scene, camera: Camera) -> None:
         "take fewer pixels, thin the splats, or render them by render_streamed",
         _device_memory(scene.splats),
     )
-    for message in _doubts(scene, camera):
+    for message in _doubts(scene, camera, is_lit):
         _warn_once(message)
 
 
@@ -72,9 +76,9 @@ def _device_memory(splats: Splats) -> float | None:
     return None if not stats else float(stats["bytes_limit"] - stats["bytes_in_use"])
 
 
-def _doubts(scene: Scene, camera: Camera) -> Iterator[str]:
+def _doubts(scene: Scene, camera: Camera, is_lit: bool) -> Iterator[str]:
     """Say what is hardly meant."""
-    if not any(np.any(np.asarray(_strength(light)) != 0) for light in scene.lights):
+    if is_lit and not any(np.any(np.asarray(_strength(light)) != 0) for light in scene.lights):
         yield "the scene has no light, and the picture will be black; add one to Scene.lights"
     if scene.splats.count == 0:
         return

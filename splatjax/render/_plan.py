@@ -169,13 +169,14 @@ def plan_unless_traced(
     settings: RenderSettings,
     plan: Plan | None,
     mesh: Mesh | None = None,
+    is_lit: bool = True,
 ) -> Plan:
     """Check the scene and the plan, or make one where none is given.
 
     **Raises:** `ValueError` for a plan of other splats or another mesh, or when none is given under
     `jit`, `grad` or `vmap`.
     """
-    check_scene(scene, camera)
+    check_scene(scene, camera, is_lit)
     if plan is not None:
         check_plan(plan, scene, mesh)
         return plan

@@ -175,7 +175,7 @@ def diffuse_irradiance(
             f"irradiance has {irradiance.shape[1]} channels, material.gaussians.weights has "
             f"{channels}: {SAME}"
         )
-    plan = plan_unless_traced(scene, camera, settings, plan)
+    plan = plan_unless_traced(scene, camera, settings, plan, is_lit=False)
     return _diffuse_irradiance(scene, irradiance, camera, settings, plan)
 
 

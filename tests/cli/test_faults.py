@@ -24,15 +24,7 @@ eta = 1.5
 roughness = 0.11
 specular = 0.07
 """
-FOUR_CHANNELS = """[fit]
-unit = "mm^2"
-variances = [1.0]
-weights = [[0.1, 0.2, 0.3, 0.4]]
-[surface]
-eta = 1.5
-"""
 MEDIA = {
-    "four.toml": FOUR_CHANNELS,
     "negative.toml": MEDIUM.replace("0.0021", "-0.03"),
     "misspelt.toml": MEDIUM.replace("roughness", "roughnes"),
     "capital.toml": MEDIUM.replace("sigma_a", "sigma_A"),
@@ -42,6 +34,13 @@ MEDIA = {
     "unreduced.toml": MEDIUM.replace("sigma_s_prime", "sigma_s"),
     "true.toml": MEDIUM.replace("2.19", "true"),
     "text.toml": MEDIUM.replace("2.19", '"0.1"'),
+    "two.toml": """[fit]
+unit = "mm^2"
+variances = [0.5, 2.0]
+weights = [[0.3, 0.4], [0.2, 0.5]]
+[surface]
+eta = 1.5
+""",
 }
 ROWS = {
     "empty.ply": [],
@@ -75,7 +74,7 @@ REFUSED = {
     "fit unreduced.toml": ["sigma_s", "sigma_s_prime = (1 - g) sigma_s"],
     "render plate.ply --material true.toml": ["sigma_s_prime"],
     "render plate.ply --material text.toml": ["sigma_s_prime"],
-    "render plate.ply --material four.toml": ["4 channels", "PNG"],
+    "render plate.ply --material two.toml": ["2 channels", "PNG", "1 or 3"],
     # Outputs.
     "render --output none/o.exr": ["none/o.exr", "no folder"],
     "render --output o.png": ["o.png", ".exr"],

@@ -179,6 +179,23 @@ def test_frames_of_something_else_are_refused(splats, copied, tmp_path, drawn, c
     assert drawn == []
 
 
+def test_an_orbit_under_lights_that_stand_still_is_lit_once(splats, tmp_path, monkeypatch):
+    folder, alone, lit, illuminate = tmp_path / "orbit", tmp_path / "alone.exr", [], sj.illuminate
+
+    def counted(scene, plan):
+        lit.append(plan)
+        return illuminate(scene, plan)
+
+    monkeypatch.setattr(sj, "illuminate", counted)
+    words = command(splats, folder, "--fill", 0)
+    assert run(*words) == 0
+    assert len(lit) == 1
+    still = [*words[1 : words.index("--frames")], "--fill", 0, "--azimuth", 115]
+    assert run("render", *still, "--output", alone) == 0
+    frames = [sj.read_exr(path) for path in (folder / "frame_0001.exr", alone)]
+    np.testing.assert_allclose(*(np.asarray(frame.beauty) for frame in frames), atol=1e-5)
+
+
 def test_light_goes_around_a_camera_that_stands_still(splats, tmp_path):
     folder, alone = tmp_path / "light", tmp_path / "alone.exr"
     still = ("--azimuth", 0, "--light-elevation", 0)

@@ -200,8 +200,8 @@ def test_gradients_at_the_corners_are_the_limits():
 
 @eqx.filter_jit
 def sheet_at_origin(thickness, half, spacing, light, variances, kernel) -> jax.Array:
-    """Means and mass `[gaussians, 2]` in the middle of a wide sheet's upper face; `light` enters the
-    upper and the lower face.
+    """Means and mass `[gaussians, 2]` in the middle of a wide sheet's upper face; `light` enters
+    the upper and the lower face.
     """
     line = jnp.arange(-half, half + 0.1, spacing)
     x, y = (each.reshape(-1) for each in jnp.meshgrid(line, line))

@@ -85,7 +85,7 @@ def devices() -> dict:
             "jax": alone,
             "splatjax": sj,
             "scene": made,
-            "plan": sj.plan(made, names["camera"]),
+            "plan": sj.make_plan(made, names["camera"]),
             "cameras": cameras,
         }
     )
