@@ -9,6 +9,7 @@ from scenes import sheet, two_gaussians
 import splatjax as sj
 from splatjax.diffusion import DenseDiffuser
 from splatjax.scene import AbstractLight
+from splatjax.splatting import DenseRasterizer
 
 SETTINGS = sj.RenderSettings(diffuser=DenseDiffuser())  # which needs no plan
 
@@ -61,15 +62,16 @@ def test_scenes_that_differ_in_more_than_their_lights_are_refused():
 
 
 def test_a_mesh_needs_renderers_that_can_be_cut_and_a_plan_of_its_own():
-    mesh, camera, scene = jax.make_mesh((1,), ("splats",)), camera_at(20.0), scene_under()
-    with pytest.raises(ValueError, match="DenseDiffuser"):
-        sj.make_plan(scene, camera, SETTINGS, mesh=mesh)
+    mesh, camera = jax.make_mesh((1,), ("splats",)), camera_at(20.0)
+    scene = scene_under(lamp(0.0, 0.0, -1.0))
+    with pytest.raises(ValueError, match="a DenseRasterizer works on one device"):
+        DenseRasterizer().make_plan([scene.splats, scene.splats], [], SETTINGS.splatting)
     with pytest.raises(ValueError, match="the plan is for one device"):
         sj.render(scene, camera, SETTINGS, sj.make_plan(scene, camera, SETTINGS), mesh=mesh)
 
 
 def test_a_plan_for_other_splats_is_refused():
-    camera, scene = camera_at(20.0), scene_under()
+    camera, scene = camera_at(20.0), scene_under(lamp(0.0, 0.0, -1.0))
     plan = sj.make_plan(scene, camera, SETTINGS)
     calls = (
         lambda scene, plan: sj.render(scene, camera, SETTINGS, plan),
@@ -77,7 +79,7 @@ def test_a_plan_for_other_splats_is_refused():
         lambda scene, plan: sj.picture_jacobian(scene, camera, SETTINGS, plan),
         lambda scene, plan: sj.compute_irradiance(scene, plan, SETTINGS),
     )
-    other = scene_under(splats=sheet(1.0, 4.0))
+    other = scene_under(lamp(0.0, 0.0, -1.0), splats=sheet(1.0, 4.0))
     for call in calls:
         with pytest.raises(
             ValueError,
@@ -114,6 +116,6 @@ def test_a_light_of_ones_own_shines_without_shadows_and_is_told_so_with_them():
     lit = sj.render(scene_under(lamp(0, 0, -2, cast_shadows=False)), camera, settings=SETTINGS)
     assert jnp.allclose(shown.beauty, 2 * lit.beauty, rtol=1e-5)
     with pytest.raises(
-        ValueError, match="Sky: no shadow map is known for it; give one with cast_shadows=False"
+        ValueError, match="Sky has no shadow map; give a light with cast_shadows=False"
     ):
         sj.make_plan(scene_under(Sky(jnp.ones(3), cast_shadows=True)), camera, SETTINGS)
