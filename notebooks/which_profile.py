@@ -15,8 +15,9 @@
 #
 # Every model below turns the same coefficients into a profile. They differ near the source, where
 # diffusion is a poor picture of light, and they agree far away. The dots are the truth: photons,
-# walked by `sj.monte_carlo`, with their standard errors. All is drawn over radii counted in mean
-# free paths, $r \sigma_t'$. [The page](../docs/which_profile.md) has the numbers for many media.
+# walked by `sj.monte_carlo`, with their standard errors. All is drawn over radii counted
+# in mean free paths, $r \sigma_t'$. [The page](../docs/which_profile.md) has the numbers for many
+# media.
 
 # %%
 # %matplotlib inline

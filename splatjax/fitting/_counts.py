@@ -11,8 +11,14 @@ from splatjax.gaussians import AbstractProfile
 from splatjax.scattering import L2_QUADRATURE, AbstractRadialRule
 
 from ._problem import FitProblem, make_problem
-from ._search import GivenVariances, GreedyInsertion, constant, greedy_path
-from ._spread import AbstractSpread, SharedVariances
+from ._search import (
+    AbstractSpread,
+    GivenVariances,
+    GreedyInsertion,
+    SharedVariances,
+    constant,
+    greedy_path,
+)
 from ._weights import AbstractWeights, FreeWeights
 
 

@@ -3,17 +3,18 @@
 from functools import partial
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
+from splatjax._records import Numbers, as_floats
 from splatjax.gaussians import AbstractProfile, SumOfGaussians
 from splatjax.scattering import L2_QUADRATURE, AbstractRadialRule
 
 from ._counts import LeastCount, check_count, error_by_count
 from ._problem import FitProblem, make_problem
-from ._search import AbstractStart, GreedyInsertion, search
-from ._spread import AbstractSpread, SharedVariances
+from ._search import AbstractSpread, AbstractStart, GreedyInsertion, SharedVariances, search
 from ._stationary import refine, stationary
 from ._weights import AbstractWeights, FreeWeights
 
@@ -130,3 +131,36 @@ def _fit_problem(
 ) -> tuple[tuple, Bool[Array, ""]]:
     optimum, converged = refine(problem, search(problem, count, start))
     return problem.outcome(stationary(problem, optimum)), converged
+
+
+def fit_weights(
+    profile: AbstractProfile,
+    variances: Numbers,
+    *,
+    weights: AbstractWeights = FreeWeights(),
+    rule: AbstractRadialRule = L2_QUADRATURE,
+) -> SumOfGaussians:
+    r"""Fit the weights of Gaussians of given variances to a profile: the least Eq. 3 over the
+    weights alone.
+
+    No search, hence fast. Variances that ascend by a factor of 3 over all widths of the dipoles of
+    many media leave each an error (Eq. 4) of about 0.2%, by a factor of 2 of 0.002%: layers that
+    are rendered once serve all of these media.
+
+    **Arguments:**
+
+    - `profile`: 1/mm^2. Differentiable, in forward and reverse mode.
+    - `variances`: mm^2, positive, all different. Constants of every derivative.
+    - `weights`: `FreeWeights()` (default), `FixedTotalReflectance()`, or `NonNegativeWeights()`
+      among either.
+    - `rule`: radii of the integral, in length scales of the profile.
+
+    **Returns:** the Gaussians, in the profile's precision; with the variances of a fit they are
+    those of the fit.
+
+    **Raises:** `ValueError` for a profile that is infinite at the origin unless the rule starts
+    beyond it.
+    """
+    problem = make_problem(profile, weights, rule)
+    variances = jax.lax.stop_gradient(as_floats(variances, problem.target.dtype))
+    return SumOfGaussians(variances, problem.best_weights(problem.log_variances(variances)))

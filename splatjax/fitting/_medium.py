@@ -14,8 +14,7 @@ from splatjax.scattering import Dipole, Medium, Tabulated
 
 from ._dense import NormalEquations, invert
 from ._fit import fit_gaussians
-from ._search import AbstractStart, GreedyInsertion
-from ._spread import VariancesPerChannel
+from ._search import AbstractStart, GreedyInsertion, VariancesPerChannel
 
 _TOLERANCE = 1e-7
 _STEPS = 64

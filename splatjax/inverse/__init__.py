@@ -11,10 +11,7 @@ from ._losses import (
     SquaredLoss as SquaredLoss,
 )
 from ._descent import GradientTransformation as GradientTransformation
-from ._fit_scene import (
-    fit_scene as fit_scene,
-    FittedScene as FittedScene,
-)
+from ._fit_scene import fit_scene as fit_scene, FittedScene as FittedScene
 from ._layers import wide_variances as wide_variances
 from ._observation import (
     AbstractIntensity as AbstractIntensity,

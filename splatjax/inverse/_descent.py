@@ -14,10 +14,7 @@ from jaxtyping import Array, Float, PyTree
 from splatjax.render import Plan, RenderSettings, render
 from splatjax.scene import Material, Scene, Splats
 
-from ._losses import (
-    AbstractBackground,
-    AbstractLoss,
-)
+from ._losses import AbstractBackground, AbstractLoss
 from ._observation import Evidence
 from ._parts import AbstractPart, Setup
 

@@ -24,19 +24,8 @@ from ._descent import (
     standard_promotion,
 )
 from ._layers import make_plans
-from ._losses import (
-    AbstractBackground,
-    AbstractLoss,
-    SquaredLoss,
-    UnknownBackground,
-)
-from ._observation import (
-    Evidence,
-    KnownIntensity,
-    Observation,
-    check_channels,
-    nothing_counts,
-)
+from ._losses import AbstractBackground, AbstractLoss, SquaredLoss, UnknownBackground
+from ._observation import Evidence, KnownIntensity, Observation, check_channels, nothing_counts
 from ._parts import AbstractPart, Setup
 
 Tree = TypeVar("Tree", bound=PyTree)

@@ -13,10 +13,7 @@ from splatjax.gaussians import SumOfGaussians
 from splatjax.render import DiffusionBasis
 
 from ._losses import FILLED
-from ._observation import (
-    Evidence,
-    nothing_counts,
-)
+from ._observation import Evidence, nothing_counts
 
 
 class FlatPictures(eqx.Module):

@@ -19,12 +19,7 @@ from ._estimate import Combination, best_and_worst
 from ._flat import which_count
 from ._layers import render_layers
 from ._losses import SquaredLoss
-from ._observation import (
-    AbstractIntensity,
-    Evidence,
-    KnownIntensity,
-    Observation,
-)
+from ._observation import AbstractIntensity, Evidence, KnownIntensity, Observation
 from ._problem import FittedVariances, RecoveryProblem, Unknowns, solution
 from ._recovery import Recovery
 

@@ -11,22 +11,14 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from splatjax.diffusion import resolved_fraction
-from splatjax.fitting import (
-    AbstractWeights,
-    GivenVariances,
-    fit_gaussians,
-    fit_weights,
-)
+from splatjax.fitting import AbstractWeights, GivenVariances, fit_gaussians, fit_weights
 from splatjax.gaussians import AbstractProfile, SumOfGaussians
 from splatjax.render import DiffusionBasis
 from splatjax.scattering import Medium
 
 from ._flat import FlatPictures, flatten, in_a_row
 from ._losses import AbstractLoss
-from ._observation import (
-    AbstractIntensity,
-    Evidence,
-)
+from ._observation import AbstractIntensity, Evidence
 
 _STEPS = 64
 

@@ -26,19 +26,8 @@ from ._estimate import inverse
 from ._flat import in_pictures, which_count
 from ._layers import render_layers, wide_variances
 from ._losses import AbstractLoss, SquaredLoss
-from ._observation import (
-    Evidence,
-    Observation,
-    check_channels,
-)
-from ._problem import (
-    FittedVariances,
-    FixedVariances,
-    RecoveryProblem,
-    Unknowns,
-    search,
-    solution,
-)
+from ._observation import Evidence, Observation, check_channels
+from ._problem import FittedVariances, FixedVariances, RecoveryProblem, Unknowns, search, solution
 from ._recovery import Recovery
 
 _FINE = RenderSettings(diffuser=ClusterDiffuser(error=2.5e-4))

@@ -196,9 +196,10 @@ def map_samples(read: Read[Values], samples: SurfaceSamples) -> Values:
 
 def in_a_row(values: Shaped[Array, "places *rows pixels"]) -> Shaped[Array, "*rows points"]:
     rows = jnp.moveaxis(values, 0, -2)
-    return rows.reshape(*rows.shape[:-2], -1)
+    return rows.reshape(*rows.shape[:-2], rows.shape[-2] * rows.shape[-1])
 
 
 def _by_place(values: Shaped[Array, "*rows points"]) -> Shaped[Array, "places *rows pixels"]:
-    rows = values.reshape(*values.shape[:-1], -1, _splatting.SIDE**2)
+    pixels = _splatting.SIDE**2
+    rows = values.reshape(*values.shape[:-1], values.shape[-1] // pixels, pixels)
     return jnp.moveaxis(rows, -2, 0)

@@ -18,12 +18,7 @@ from ._fresnel import (
 )
 from ._hankel import inverse_hankel_transform as inverse_hankel_transform
 from ._laser_dot import LaserDot as LaserDot, measure_laser_dot as measure_laser_dot
-from ._medium import (
-    check_stack as check_stack,
-    Film as Film,
-    Layer as Layer,
-    Medium as Medium,
-)
+from ._medium import check_stack as check_stack, Film as Film, Layer as Layer, Medium as Medium
 from ._photon_beam import PhotonBeam as PhotonBeam
 from ._quadrature import (
     AbstractRadialRule as AbstractRadialRule,

@@ -8,8 +8,8 @@ from jaxtyping import Array, Float
 
 from splatjax.scattering import moment_outside
 
-from ._interface import fresnel
 from ._phase import Direction, on_circle
+from ._walk import fresnel
 
 
 class AbstractIncidence(eqx.Module):

@@ -14,7 +14,7 @@ from splatjax.scattering import Film, Layer, check_stack
 from ._incidence import AbstractIncidence, NormalIncidence
 from ._phase import AbstractPhaseFunction, Isotropic
 from ._results import AbstractTallies, MonteCarlo, PathDerivatives, SampleMean, assemble
-from ._rounds import Walk, finish, lanes_for
+from ._rounds import Setup, Walk, finish, lanes_for
 from ._stack import LayeredMedia
 from ._walk import Optics
 
@@ -101,18 +101,6 @@ def path_derivatives(
     return _walk_all(*_set_up(layers, photons, key, **settings), True, progress)
 
 
-class _Setup(eqx.Module):
-    """The settings of a walk. The number of photons is traced: it needs no program of its own."""
-
-    edges: Float[Array, " edges"]
-    incidence: AbstractIncidence
-    phase: AbstractPhaseFunction
-    key: Key[Array, ""]
-    photons: Int[Array, ""]
-    flights: Int[Array, ""]
-    lanes: int = eqx.field(static=True)
-
-
 def _set_up(
     layers: Sequence[Layer | Film],
     photons: int,
@@ -124,7 +112,7 @@ def _set_up(
     eta_above: Numbers = 1.0,
     eta_below: Numbers = 1.0,
     flights: int = _FLIGHTS,
-) -> tuple[LayeredMedia, _Setup]:
+) -> tuple[LayeredMedia, Setup]:
     """Check and complete the arguments of `monte_carlo`."""
     for name, number, least in (("photons", photons, 2), ("flights", flights, 1)):
         if not least <= number < 2**30:
@@ -139,7 +127,7 @@ def _set_up(
     steps = jnp.diff(edges)
     check_values("the steps of edges", steps, "positive (mm): edges must ascend", lambda x: x > 0)
     numbers = jnp.asarray(photons, jnp.int32), jnp.asarray(flights, jnp.int32)
-    return media, _Setup(edges, incidence, phase, key, *numbers, lanes_for(photons))
+    return media, Setup(edges, incidence, phase, key, *numbers, lanes_for(photons))
 
 
 @eqx.filter_jit
@@ -165,7 +153,7 @@ def _default_edges(
 
 
 @eqx.filter_custom_jvp
-def _monte_carlo(media: LayeredMedia, setup: _Setup, *, progress) -> MonteCarlo:
+def _monte_carlo(media: LayeredMedia, setup: Setup, *, progress) -> MonteCarlo:
     return _walk_all(media, setup, False, progress)[0]
 
 
@@ -208,7 +196,7 @@ def _along(
     )
 
 
-def _walk_all(media: LayeredMedia, setup: _Setup, with_derivatives: bool, progress):
+def _walk_all(media: LayeredMedia, setup: Setup, with_derivatives: bool, progress):
     """Walk each group of channels that share a walk, and put the channels in their order."""
     groups, tallies = media.shared_walks(), []
     for number, group in enumerate(groups):
@@ -225,7 +213,7 @@ def _walk_all(media: LayeredMedia, setup: _Setup, with_derivatives: bool, progre
 @eqx.filter_jit
 def _walk_of(
     media: LayeredMedia,
-    setup: _Setup,
+    setup: Setup,
     number: Int[Array, ""],
     group: Int[Array, " group"],
     with_derivatives: bool,
@@ -244,16 +232,12 @@ def _walk_of(
     directions = directions if with_derivatives else directions[:0]
     slopes = jax.vmap(lambda along: jax.jvp(optics, coefficients, tuple(along))[1])(directions)
     return Walk(
+        setup=setup,
+        key=jax.random.fold_in(setup.key, number),
         stack=jax.lax.stop_gradient(media.stack(group[0])),
-        phase=setup.phase,
-        incidence=setup.incidence,
         optics=optics(*coefficients),
         slopes=slopes,
         edges=setup.edges[None] / jax.lax.stop_gradient(unit)[:, None],
-        photons=setup.photons,
-        flights=setup.flights,
-        key=jax.random.fold_in(setup.key, number),
-        lanes=setup.lanes,
     )
 
 

@@ -38,26 +38,35 @@ instead (Russian roulette).
 """
 
 
+class Setup(eqx.Module):
+    """The settings of walks. The number of photons is traced: it needs no program of its own."""
+
+    edges: Float[Array, " edges"]
+    incidence: AbstractIncidence
+    phase: AbstractPhaseFunction
+    key: Key[Array, ""]
+    photons: Int[Array, ""]
+    flights: Int[Array, ""]
+    lanes: int = eqx.field(static=True)
+
+
 class Walk(eqx.Module):
     r"""The constants of a walk.
 
     **Attributes:**
 
+    - `setup`: of all walks.
+    - `key`: of this one.
     - `optics`: of the channels that walk along; `slopes` are its derivatives in each parameter.
     - `edges`: of the rings, in free paths of the stack, for each channel.
-    - `photons`: how many, `flights`: at most so many each.
     """
 
+    setup: Setup
+    key: Key[Array, ""]
     stack: Stack
-    phase: AbstractPhaseFunction
-    incidence: AbstractIncidence
     optics: Optics
     slopes: Optics
     edges: Float[Array, "channels edges"]
-    photons: Int[Array, ""]
-    flights: Int[Array, ""]
-    key: Key[Array, ""]
-    lanes: int = eqx.field(static=True)
 
 
 def lanes_for(photons: int) -> int:
@@ -75,7 +84,7 @@ class _State(eqx.Module):
 
     @jit_unless_traced
     def unfinished(self, walk: Walk) -> Bool[Array, ""]:
-        return (self.started < walk.photons) | jnp.any(self.photons.place == INSIDE)
+        return (self.started < walk.setup.photons) | jnp.any(self.photons.place == INSIDE)
 
 
 def finish(walk: Walk, progress: Callable[[int, int], None]) -> Tally:
@@ -90,7 +99,7 @@ def finish(walk: Walk, progress: Callable[[int, int], None]) -> Tally:
     while bool(state.unfinished(walk)):
         state = _advance(walk, state)
         under_way = int(np.sum(np.asarray(state.photons.place) == INSIDE))
-        progress(int(state.started) - under_way, int(walk.photons))
+        progress(int(state.started) - under_way, int(walk.setup.photons))
     return state.tally
 
 
@@ -98,10 +107,11 @@ def finish(walk: Walk, progress: Callable[[int, int], None]) -> Tally:
 def _start(walk: Walk) -> _State:
     dtype, (layers, channels) = walk.edges.dtype, walk.optics.absorption.shape
     parameters, rings = walk.slopes.absorption.shape[0], walk.edges.shape[1] - 1
-    zero, number = jnp.zeros(walk.lanes, dtype), jnp.zeros(walk.lanes, jnp.int32)
+    zero, number = jnp.zeros(walk.setup.lanes, dtype), jnp.zeros(walk.setup.lanes, jnp.int32)
     photons = Photons(zero, zero, zero, (zero, zero, zero + 1), zero, number, number + IDLE, number)
     weights = PathWeights(
-        jnp.zeros((channels, walk.lanes), dtype), jnp.zeros((layers, channels, walk.lanes), dtype)
+        jnp.zeros((channels, walk.setup.lanes), dtype),
+        jnp.zeros((layers, channels, walk.setup.lanes), dtype),
     )
     slopes = jax.tree.map(lambda leaf: jnp.zeros((parameters, *leaf.shape), dtype), weights)
     tally = Tally.empty(rings, layers, channels, parameters, dtype)
@@ -129,8 +139,8 @@ def _round(walk: Walk, state: _State) -> _State:
     def path(optics, weights):
         def flight(number, carry):
             photons, weights = carry
-            xi = uniforms(walk.key, draws + number, walk.lanes, weights.carried.dtype)
-            photons, flown = fly(walk.stack, walk.phase, photons, xi)
+            xi = uniforms(walk.key, draws + number, walk.setup.lanes, weights.carried.dtype)
+            photons, flown = fly(walk.stack, walk.setup.phase, photons, xi)
             return photons, weigh(optics, weights, flown)
 
         photons, weights = jax.lax.fori_loop(0, _FLIGHTS, flight, (state.photons, weights))
@@ -149,7 +159,7 @@ def _round(walk: Walk, state: _State) -> _State:
 
     inside = photons.place == INSIDE
     faint = inside & (jnp.max(weights.carried, axis=0) < _LEAST)
-    chance = uniforms(walk.key, draws + _FLIGHTS, walk.lanes, walk.edges.dtype)[0]
+    chance = uniforms(walk.key, draws + _FLIGHTS, walk.setup.lanes, walk.edges.dtype)[0]
     dropped = faint & (chance > _SURVIVING)
     boost = jnp.where(faint & ~dropped, 1 / _SURVIVING, jnp.ones_like(chance))
     weights, slopes = (
@@ -159,7 +169,7 @@ def _round(walk: Walk, state: _State) -> _State:
     done = (
         ((photons.place != INSIDE) & (photons.place != IDLE))
         | dropped
-        | (inside & (photons.flights >= walk.flights))
+        | (inside & (photons.flights >= walk.setup.flights))
     )
     tally = state.tally.plus(photons, weights, slopes, done, dropped, walk.edges)
     after = _State(photons, weights, slopes, tally, state.started, state.round + 1)
@@ -170,12 +180,12 @@ def _launch(walk: Walk, state: _State, free: Bool[Array, " photons"]) -> _State:
     """Start photons in lanes that are free, as long as there are any left to start."""
     dtype = walk.edges.dtype
     turn = jnp.cumsum(free.astype(jnp.int32))
-    begins = free & (state.started + turn <= walk.photons)
-    xi = uniforms(walk.key, state.round * (_FLIGHTS + 2) + _FLIGHTS + 1, walk.lanes, dtype)
+    begins = free & (state.started + turn <= walk.setup.photons)
+    xi = uniforms(walk.key, state.round * (_FLIGHTS + 2) + _FLIGHTS + 1, walk.setup.lanes, dtype)
     spread = evenly(walk.key, state.started + turn, dtype)
-    direction, weight = walk.incidence.enter(spread, xi[1], walk.stack.eta[:2])
+    direction, weight = walk.setup.incidence.enter(spread, xi[1], walk.stack.eta[:2])
 
-    zero, number = jnp.zeros(walk.lanes, dtype), jnp.zeros(walk.lanes, jnp.int32)
+    zero, number = jnp.zeros(walk.setup.lanes, dtype), jnp.zeros(walk.setup.lanes, jnp.int32)
     fresh = Photons(zero, zero, zero, direction, -jnp.log(xi[2]), number, number + INSIDE, number)
     photons = jax.tree.map(lambda new, old: jnp.where(begins, new, old), fresh, state.photons)
     idle = jnp.where(free & ~begins, IDLE, photons.place)

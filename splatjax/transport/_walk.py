@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ._interface import fresnel
+from splatjax.scattering import reflectance
+
 from ._phase import AbstractPhaseFunction
 from ._stack import Stack, of_layer
 
@@ -183,3 +184,22 @@ def _taken_jvp(primals, tangents):
     taken = -jnp.expm1(-absorption)
     mean = jnp.where(absorption > 0, taken / jnp.where(absorption > 0, absorption, 1.0), 1.0)
     return taken, jnp.exp(-absorption) * removing + mean * (absorbing - removing)
+
+
+def fresnel(
+    cosine: Float[Array, " photons"],
+    eta_from: Float[Array, " photons"],
+    eta_to: Float[Array, " photons"],
+) -> tuple[Float[Array, " photons"], Float[Array, " photons"]]:
+    """Compute the reflectance for unpolarized light that arrives under `cosine` (0 to 1), and the
+    cosine of the transmitted light.
+
+    Total internal reflection is 1, with a cosine of 0. Between equal indices nothing is reflected
+    or bent, exactly.
+    """
+    ratio = eta_from / eta_to
+    squared = 1 - ratio * ratio * (1 - cosine * cosine)
+    matched = eta_from == eta_to
+    onward = jnp.where(matched, cosine, jnp.sqrt(jnp.maximum(squared, 0.0)))
+    reflected = jnp.where(squared > 0, reflectance(cosine, onward, ratio), 1.0)
+    return jnp.where(matched, 0.0, reflected), onward

@@ -1,100 +1,48 @@
 """What reference pages take for granted, small: pages that teach stand for themselves."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
+from jax.sharding import NamedSharding, PartitionSpec
 
 import splatjax as sj
-from splatjax.diffusion import DenseDiffuser
-from splatjax.splatting import DenseRasterizer, ShadowSettings
 
 _SIDE = 24
-_COARSE = ShadowSettings(resolution=48, bias=1.0, softness=2.0)
+PAGES = {f"docs/{name}.md" for name in ("devices", "gradients", "figures", "baselines", "recovery")}
 
 
-def _figurine() -> sj.Splats:
+def context() -> dict[str, Any]:
+    """Make a scene of marble, its picture, and what cuts it over devices."""
     bust = sj.bust(900)
-    return sj.Splats(bust.centers / 8, bust.normals, bust.radii / 8, bust.areas / 64)
-
-
-def _seen(side: int = _SIDE) -> dict:
-    splats = _figurine()
-    camera = sj.Camera.look_at(
-        jnp.asarray([8.0, 0.0, 70.0]),
-        jnp.asarray([0.0, -3.5, 0.0]),
-        fov=32.0,
-        width=side,
-        height=side,
-    )
-    lights = (sj.DirectionalLight(jnp.asarray([-1.0, -0.3, -0.4]), jnp.full(3, jnp.pi)),)
-    material = sj.load_material("marble")
+    splats = sj.Splats(bust.centers / 8, bust.normals, bust.radii / 8, bust.areas / 64)
+    camera = sj.Camera.look_at([8, 0, 70], [0, -3.5, 0], fov=32.0, width=_SIDE, height=_SIDE)
+    lights = (sj.DirectionalLight([-1, -0.3, -0.4], jnp.full(3, jnp.pi)),)
+    marble = sj.load_material("marble")
+    material = sj.Material(marble.gaussians, eta=1.5, specular=0.0)
+    scene = sj.Scene(splats, lights, material)
+    plan = sj.make_plan(scene, camera)
+    picture = np.asarray(sj.render(scene, camera, plan=plan).beauty)
     return {
         "jax": jax,
         "jnp": jnp,
         "np": np,
+        "optax": optax,
         "sj": sj,
+        "splatjax": sj,
+        "NamedSharding": NamedSharding,
+        "PartitionSpec": PartitionSpec,
         "splats": splats,
         "camera": camera,
+        "cameras": jax.tree.map(lambda leaf: jnp.stack([leaf] * jax.device_count()), camera),
         "lights": lights,
+        "medium": sj.load_medium("marble"),
         "material": material,
+        "scene": scene,
+        "plan": plan,
+        "picture": picture,
+        "noise": np.full(picture.shape, 0.01 * float(np.sqrt(np.mean(picture**2)))),
+        "target": jnp.zeros((_SIDE, _SIDE, 3)),
     }
-
-
-def scene() -> dict:
-    """A scene, a camera, and something to compare with."""
-    names = _seen()
-    medium = sj.load_medium("marble")
-    material = sj.Material(sj.fit_gaussians(sj.Dipole(medium)).gaussians)
-    made = sj.Scene(names["splats"], names["lights"], material)
-    return names | {"scene": made, "target": jnp.zeros((_SIDE, _SIDE, 3)), "medium": medium}
-
-
-def pictures() -> dict:
-    """A picture of marble, taken by the renderer itself, and an optimizer."""
-    import optax
-
-    names = _seen()
-    settings = sj.RenderSettings(
-        shadows=_COARSE, rasterizer=DenseRasterizer(), diffuser=DenseDiffuser()
-    )
-    material = sj.Material(names["material"].gaussians, eta=1.5, specular=0.0)
-    picture = np.asarray(
-        sj.render(
-            sj.Scene(names["splats"], names["lights"], material), names["camera"], settings
-        ).beauty
-    )
-    noise = np.full(picture.shape, 0.01 * float(np.sqrt(np.mean(picture**2))))
-    return names | {"picture": picture, "noise": noise, "optax": optax, "material": material}
-
-
-def devices() -> dict:
-    """A scene and how it is cut; there is no cluster to join."""
-    from types import SimpleNamespace
-
-    from jax.sharding import NamedSharding, PartitionSpec
-
-    names = _seen()
-    made = sj.Scene(names["splats"], names["lights"], names["material"])
-    cameras = jax.tree.map(lambda leaf: jnp.stack([leaf] * jax.device_count()), names["camera"])
-    alone = SimpleNamespace(**vars(jax) | {"distributed": SimpleNamespace(initialize=lambda: None)})
-    cut = {"NamedSharding": NamedSharding, "PartitionSpec": PartitionSpec}
-    return (
-        names
-        | cut
-        | {
-            "jax": alone,
-            "splatjax": sj,
-            "scene": made,
-            "plan": sj.make_plan(made, names["camera"]),
-            "cameras": cameras,
-        }
-    )
-
-
-CONTEXTS = {
-    "docs/devices.md": devices,
-    "docs/gradients.md": scene,
-    "docs/figures.md": scene,
-    "docs/baselines.md": scene,
-    "docs/recovery.md": pictures,
-}

@@ -1,5 +1,6 @@
 """Small files under the names that pages use for a reader's own."""
 
+import dataclasses
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -9,6 +10,7 @@ import trimesh
 from PIL import Image
 
 import splatjax as sj
+from splatjax.cli import main
 
 _RADIUS = 1.1  # of the ball, in units of 53 mm
 _SIDE = 24  # pixels
@@ -33,12 +35,7 @@ def _splats(path: Path) -> None:
     _mesh(mesh)
     splats = sj.sample_mesh(mesh, 1500, mm_per_unit=53.0)
     mesh.unlink()
-    sj.write_splats(
-        path,
-        sj.Splats(
-            splats.centers, splats.normals, splats.radii, splats.areas, jnp.full((1500, 3), 0.8)
-        ),
-    )
+    sj.write_splats(path, dataclasses.replace(splats, albedo=jnp.full((1500, 3), 0.8)))
 
 
 def _points(path: Path) -> None:
@@ -77,70 +74,29 @@ def _exr(path: Path, picture: np.ndarray) -> None:
 
 def _dot(path: Path) -> None:
     y, x = (np.mgrid[:120, :120] - 59.5) * 0.1
-    _exr(
-        path,
-        np.asarray(sj.load_material("marble").gaussians(jnp.hypot(x, y)), np.float64) * 5 / np.pi,
-    )
+    gaussians = sj.load_material("marble").gaussians
+    _exr(path, np.asarray(gaussians(jnp.hypot(x, y)), np.float64) * 5 / np.pi)
+
+
+def _marble(splats: sj.Splats, specular: float, **view) -> np.ndarray:
+    """Render marble as howto/recover.md lists its pictures."""
+    splats = dataclasses.replace(splats, albedo=None)
+    camera = sj.Camera.look_at(**view, width=_SIDE, height=_SIDE)
+    lamp = sj.DirectionalLight([1, -0.3, -0.5], 3.14)
+    material = dataclasses.replace(sj.load_material("marble"), specular=specular)
+    return np.asarray(sj.render(sj.Scene(splats, lamp, material), camera).beauty)
 
 
 def _photograph(path: Path) -> None:
-    """As pictures.toml of howto/recover.md has it, of marble."""
-    splats = _read_plain(path.with_name("head.ply"))
-    camera = sj.Camera.look_at(
-        jnp.asarray([0.0, 0.0, 500.0]),
-        jnp.asarray([0.0, -20.0, 0.0]),
-        fov=25.0,
-        width=_SIDE,
-        height=_SIDE,
-    )
-    lamp = sj.DirectionalLight(jnp.asarray([1.0, -0.3, -0.5]), jnp.full(3, 3.14))
-    marble = sj.load_material("marble")
-    material = sj.Material(marble.gaussians, eta=marble.eta, specular=0.0)
-    _exr(path, np.asarray(sj.render(sj.Scene(splats, (lamp,), material), camera).beauty))
+    splats = sj.read_splats(path.with_name("head.ply"))
+    _exr(path, _marble(splats, specular=0.0, eye=[0, 0, 500], target=[0, -20, 0], fov=25))
 
 
 def _figurine(path: Path) -> None:
-    """As howto/recover.md makes it, of marble; and its picture."""
-    bust = sj.bust(1_500)
-    splats = sj.Splats(0.2 * bust.centers, bust.normals, 0.2 * bust.radii, 0.04 * bust.areas)
-    camera = sj.Camera.look_at(
-        jnp.asarray([0.0, 0.0, 130.0]),
-        jnp.asarray([0.0, -8.0, 0.0]),
-        fov=30.0,
-        width=_SIDE,
-        height=_SIDE,
-    )
-    lamp = sj.DirectionalLight(jnp.asarray([1.0, -0.3, -0.5]), jnp.full(3, 3.14))
-    sj.write_splats(path, splats)
-    sj.write_exr(
-        path.with_suffix(".exr"),
-        sj.render(sj.Scene(splats, (lamp,), sj.load_material("marble")), camera),
-    )
-
-
-def _read_plain(path: Path) -> sj.Splats:
-    splats = sj.read_splats(path)
-    return sj.Splats(splats.centers, splats.normals, splats.radii, splats.areas)
-
-
-def _frame(path: Path) -> None:
-    from splatjax.cli import main
-
-    assert (
-        main(
-            [
-                "render",
-                str(path.with_name("head.ply")),
-                "--width",
-                "32",
-                "--height",
-                "32",
-                "--output",
-                str(path),
-            ]
-        )
-        == 0
-    )
+    splats = sj.bust(1_500).scaled(0.2)
+    sj.write_splats(path, dataclasses.replace(splats, albedo=None))
+    picture = _marble(splats, specular=0.18, eye=[0, 0, 130], target=[0, -8, 0], fov=30)
+    _exr(path.with_suffix(".exr"), picture)
 
 
 _MADE = {
@@ -172,4 +128,5 @@ def lay_out_frame(folder: Path, text: str) -> None:
     """Write the picture that a page's programs read and its commands would have made."""
     if "head.exr" in text:
         _splats(folder / "head.ply")
-        _frame(folder / "head.exr")
+        options = ["--width", "32", "--height", "32", "--output", str(folder / "head.exr")]
+        assert main(["render", str(folder / "head.ply"), *options]) == 0

@@ -272,13 +272,11 @@ def test_a_count_that_cannot_be_is_refused(dtype, count):
 
 
 @pytest.mark.once
-def test_sixteen_media_of_eight_counts_compile_eight_programs(caplog):
+def test_sixteen_media_of_eight_counts_compile_eight_programs(compiled):
     """Python numbers in a medium are arrays: each medium has the programs of the first."""
-    with jax.log_compiles():
-        for absorption in np.geomspace(1e-3, 1, 16).tolist():
-            for count in range(1, 9):
-                start = GivenVariances(np.geomspace(0.1, 9, count))
-                medium = sj.Medium([absorption] * 3, [1, 1.3, 1.5], eta=1.3)
-                fit_gaussians(sj.Dipole(medium), count, start=start, throw=False)
-    compiled = [record for record in caplog.records if "Finished XLA comp" in record.getMessage()]
-    assert sum("_fit_compiled" in record.getMessage() for record in compiled) == 8
+    for i in range(16):
+        medium = sj.Medium([0.01 * (i + 1)] * 3, [1, 1.3, 1.5], eta=1.2 + 0.02 * i)
+        for count in range(1, 9):
+            start = GivenVariances(np.geomspace(0.1, 9, count))
+            fit_gaussians(sj.Dipole(medium), count, start=start, throw=False)
+    assert compiled.count("jit(_fit_compiled)") == 8

@@ -11,11 +11,7 @@ from scipy.optimize import nnls
 
 from splatjax.fitting import FixedTotalReflectance, FreeWeights, NonNegativeWeights, fit_gaussians
 from splatjax.io import load_medium
-from splatjax.scattering import (
-    Dipole,
-    EganFresnel,
-    Medium,
-)
+from splatjax.scattering import Dipole, EganFresnel, Medium
 
 SOLVED = 1e-9
 

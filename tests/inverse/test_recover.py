@@ -29,14 +29,14 @@ PLAIN = sj.RenderSettings(
     diffuser=DenseDiffuser(),
     kernel=EscapeNormalization(regular=(0.1, 0.2), scattered=(0.1, 0.2)),
 )
-"""Next to nothing is handed to the surface: here pictures are made as they are searched, however
-coarse the splats.
+"""Nearly all layers are resolved: pictures are made as they are searched, however coarse the
+splats.
 """
 SIZE = 24
 COUNT = 4
 HELD = sj.NonNegativeWeights(sj.FixedTotalReflectance())
 STRONGER = 1.7
-"""Than is told: the second light."""
+"""The second light, than is given."""
 NOISE = 0.01
 ROUNDS = 5e-4
 """Rounds end when one moves nothing by more than 1e-3; 2e-4 measured."""
@@ -215,9 +215,9 @@ class TestRecover:
         assert "as before: the worst known, " in str(first)
 
 
-def half_resolved() -> RecoveryProblem:
-    """Made up layers at 40 points, of which the narrower ones are handed to the surface in part;
-    nothing is observed yet.
+def half_resolved():
+    """A problem without observations, and a point: layers at 40 points, of which the narrower ones
+    are unresolved in part.
     """
     rng, points = np.random.default_rng(6), 40
     light = LayersAtPoints(
@@ -232,74 +232,54 @@ def half_resolved() -> RecoveryProblem:
         kernel=PlainMean(),
         derivative=None,
     )
-    there = jnp.zeros(points, jnp.int32)
-    flat = FlatPictures(light, jnp.ones((2, points)), jnp.zeros((2, points)), there[:0], there)
-    noise, unknowns = (
-        jnp.full((2, points), 0.01),
-        Unknowns.of(medium().eta, [sj.KnownIntensity()]),
-    )
-    return RecoveryProblem(
-        flat,
-        noise,
-        noise,
-        unknowns,
-        FixedVariances(light.variances, HELD),
-        sj.SquaredLoss(),
-        sj.Dipole,
+    first, noise = jnp.zeros(points, jnp.int32), jnp.full((2, points), 0.01)
+    flat = FlatPictures(light, jnp.ones((2, points)), jnp.zeros((2, points)), first[:0], first)
+    unknowns = Unknowns.of(medium().eta, [sj.KnownIntensity()])
+    fit = FixedVariances(light.variances, HELD)
+    problem = RecoveryProblem(flat, noise, noise, unknowns, fit, sj.SquaredLoss(), sj.Dipole)
+    return problem, unknowns.start(medium())
+
+
+def wider(problem, by):
+    """Scale the widths below which layers are unresolved."""
+    return eqx.tree_at(
+        lambda one: one.pictures.light.interval,
+        problem,
+        replace_fn=lambda interval: interval * jnp.exp(by),
     )
 
 
 @pytest.mark.once
 @pytest.mark.usefixtures("double")
-class TestHandover:
-    def test_each_channel_has_a_width_of_its_own(self):
+class TestUnresolvedLayers:
+    def test_each_channel_has_a_width_of_its_own_and_its_light_is_counted(self):
         """Information of it: squares of how residuals change with it, and nothing from one channel
         to the other.
         """
-        problem, step = half_resolved(), 1e-5
-        point = problem.unknowns.start(medium())
-
-        @jax.jit
-        def at(by):
-            wider = problem.pictures.light.interval * jnp.exp(by)
-            return eqx.tree_at(lambda its: its.pictures.light.interval, problem, wider).residuals(
-                point
-            )
-
+        (problem, point), step = half_resolved(), 1e-5
+        at = jax.jit(lambda by: wider(problem, by).residuals(point))
         slopes = (at(step) - at(-step)) / (2 * step)
-        told = solution(problem, point).information
-        assert told.shape == (6, 6)
-        np.testing.assert_allclose(
-            told[4:, 4:], np.diag(jnp.sum(slopes**2, axis=1)), rtol=1e-6, atol=1e-6
-        )
-        assert float(jnp.min(jnp.diagonal(told)[4:])) > 1
+        found = solution(problem, point)
+        own = np.asarray(found.information)[4:, 4:]
+        np.testing.assert_allclose(own, np.diag(jnp.sum(slopes**2, axis=1)), rtol=1e-6, atol=1e-6)
+        assert np.min(np.diagonal(own)) > 1
+        light, gaussians = problem.pictures.light, found.gaussians
+        resolved = resolved_fraction(light.variances, jnp.ones(3), light.interval)
+        assert 0.05 < float(resolved[0]) < float(resolved[1]) < 0.6
+        expected = (1 - resolved) @ gaussians.weights / gaussians.total_reflectance()
+        np.testing.assert_allclose(found.unresolved, expected, rtol=1e-6)
+        assert 0.05 < float(jnp.min(expected)) < float(jnp.max(expected)) < 0.98
 
     def test_a_search_goes_astray_with_the_width_as_its_bars_say(self):
         """The picture of a width a little off, searched as if it were not."""
-        problem, by = half_resolved(), 0.01
-        point = problem.unknowns.start(medium())
-        wider = eqx.tree_at(
-            lambda its: its.pictures.light.interval,
-            problem,
-            problem.pictures.light.interval * np.exp(by),
-        )
-        seen = eqx.tree_at(lambda its: its.observed, problem, wider.radiance(point))
-        told = np.asarray(solution(problem, point).information)
-        expected = -np.linalg.inv(told[:4, :4]) @ told[:4, 4:] @ np.full(2, -by)
+        (problem, point), by = half_resolved(), 0.01
+        picture = wider(problem, by).radiance(point)
+        observed = eqx.tree_at(lambda one: one.observed, problem, picture)
+        information = np.asarray(solution(problem, point).information)
+        expected = np.linalg.inv(information[:4, :4]) @ information[:4, 4:] @ np.full(2, by)
         assert np.max(np.abs(expected)) > 1e-3
-        np.testing.assert_allclose(
-            search(seen, point).point - point, expected, atol=0.05 * np.max(np.abs(expected))
-        )
-
-    def test_light_in_layers_that_the_splats_do_not_carry_is_counted(self):
-        problem = half_resolved()
-        found = solution(problem, problem.unknowns.start(medium()))
-        light, gaussians = problem.pictures.light, found.gaussians
-        carried = resolved_fraction(light.variances, jnp.ones(3), light.interval)
-        assert 0.05 < float(carried[0]) < float(carried[1]) < 0.6
-        expected = (1 - carried) @ gaussians.weights / gaussians.total_reflectance()
-        np.testing.assert_allclose(found.unresolved, expected, rtol=1e-6)
-        assert 0.05 < float(jnp.min(expected)) < float(jnp.max(expected)) < 0.98
+        moved = search(observed, point).point - point
+        np.testing.assert_allclose(moved, expected, atol=0.05 * np.max(np.abs(expected)))
 
 
 def test_pixels_that_are_masked_unknown_or_not_filled_do_not_count():

@@ -11,16 +11,16 @@ from splatjax.inverse import Recovery
 
 
 def recovery(
-    information, chi_squared=1.0, noise_is_known=True, channels=1, unresolved=0.0, handover=None
+    information, chi_squared=1.0, noise_is_known=True, channels=1, unresolved=0.0, width=None
 ) -> Recovery:
-    """A recovery of which nothing is known but this; no layer is handed to the surface, unless told
-    how that is mixed in.
+    """Make a recovery of which nothing else is known; `width` is the information about the width
+    below which layers are unresolved.
     """
-    if handover is None:
+    if width is None:
         information = np.pad(information, (0, channels))
     else:
         information = np.block(
-            [[information, np.asarray(handover)[:-1, None]], [np.asarray(handover)[None]]]
+            [[information, np.asarray(width)[:-1, None]], [np.asarray(width)[None]]]
         )
     medium = sj.Medium(jnp.full(channels, 0.02), 1.5, 1.3)
     gaussians = sj.SumOfGaussians([1], jnp.full((1, channels), 0.5))
@@ -88,14 +88,14 @@ def test_a_summary_reports_what_matters(information, more, said, unsaid):
     assert np.all(np.isfinite(found.relative_errors())) == ("anything" not in found.summary())
 
 
-def test_what_only_the_handover_tells_is_known_no_better_than_the_handover():
-    """The mean free path changes the picture as the width of the handover does, the other way
-    round: they are told together.
+def test_what_only_the_width_shows_is_known_no_better_than_the_width():
+    """The mean free path changes the picture as the width does, the other way round: they
+    are known together.
     """
     own, path = along(1e-3, 1e-2, -np.pi / 4), np.asarray([1, 1]) / np.sqrt(2)
     along_path = path @ own @ path
     mixed = np.append(-along_path * path, along_path)
-    found = recovery(own, handover=mixed, unresolved=1.0)
+    found = recovery(own, width=mixed, unresolved=1.0)
     best, worst = found.combinations()[0]
     np.testing.assert_allclose(best.deviation, 1e-3, rtol=1e-3)
     np.testing.assert_allclose(worst.deviation, np.hypot(0.5 * np.log(2), 1e-2), rtol=1e-3)
@@ -107,13 +107,13 @@ def test_what_only_the_handover_tells_is_known_no_better_than_the_handover():
     )
 
 
-def test_a_picture_without_a_handover_makes_up_for_one_with_as_far_as_it_weighs():
-    """A search weighs pixels by their noise, whatever the handover does to them: a weak close
+def test_a_picture_without_unresolved_layers_makes_up_for_one_with_as_far_as_it_weighs():
+    """A search weighs pixels by their noise, whatever the width does to them: a weak close
     picture changes little.
     """
     own, path = along(1e-3, 1e-2, -np.pi / 4), np.asarray([1, 1]) / np.sqrt(2)
     weighs = path @ own @ path
-    found = recovery(own, handover=np.append(-weighs * path, weighs))
+    found = recovery(own, width=np.append(-weighs * path, weighs))
     for deviation in (1e-1, 1e-2, 1e-3):
         close = np.pad(along(deviation, deviation, 0.0), (0, 1))
         share = weighs / (weighs + deviation**-2)

@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 import splatjax as sj
+from splatjax.diffusion import DenseDiffuser
 from splatjax.render import _checks
 from splatjax.render._checks import check_displayable, check_scene
+from splatjax.splatting import DenseRasterizer
 
 
 def sphere(radius: float = 10.0, count: int = 2000) -> sj.Splats:
@@ -56,6 +58,14 @@ def test_a_scene_that_nobody_means_is_warned_of_once(wrong, distance, said):
     assert [said in str(warning.message) for warning in caught] == [True]
 
 
+def test_a_picture_is_checked_before_it_is_rendered():
+    _checks._warn_once.cache_clear()
+    settings = sj.RenderSettings(rasterizer=DenseRasterizer(), diffuser=DenseDiffuser())
+    with pytest.warns(UserWarning, match="no light"):
+        frame = sj.render(scene(sphere(count=20), lights=[]), camera(), settings)
+    assert float(np.max(frame.beauty)) == 0
+
+
 @pytest.mark.parametrize(
     "right",
     [
@@ -75,7 +85,7 @@ def test_other_scenes_pass(right):
 def test_a_picture_that_does_not_fit_is_refused_before_it_is_rendered(monkeypatch):
     large = sj.Camera.look_at([0, 0, 50], [0, 0, 0], width=10**6, height=10**6)
     with pytest.raises(ValueError, match=r"1000000 x 1000000 pixels .* 5e\+05 GB"):
-        check_scene(scene(), large)
+        sj.render(scene(), large)
     monkeypatch.setattr(_checks, "_device_memory", lambda splats: 1e6)
     with pytest.raises(ValueError, match=r"2000 splats would take .* 0.001 GB are free"):
         check_scene(scene(), camera())

@@ -5,10 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from splatjax.fitting import (
-    FixedTotalReflectance,
-    fit_gaussians,
-)
+from splatjax.fitting import FixedTotalReflectance, fit_gaussians
 from splatjax.gaussians import SumOfGaussians
 from splatjax.scattering import (
     L2_QUADRATURE,

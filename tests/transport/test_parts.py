@@ -9,9 +9,9 @@ from media import INFINITE, layer
 
 import splatjax as sj
 from splatjax.scattering import ExactFresnel
-from splatjax.transport._interface import fresnel
 from splatjax.transport._random import threefry, uniforms
-from splatjax.transport._sums import Sum, total
+from splatjax.transport._tally import Sum, total
+from splatjax.transport._walk import fresnel
 
 KEY = jax.random.key(5)
 HALF_SPACE = [layer([0.1, 0.1], 1.0, 1.0)]
