@@ -117,7 +117,11 @@ def _lit(
 ) -> SurfaceAttributes:
     """Compute the light that enters where the pixels look, by the normals there."""
     material, blended = scene.material, samples.attributes
-    light = LightVisibility(groups, list(blended.visibility), jnp.zeros((), normals.dtype))
+    lit = [
+        None if rows is None else group.per_sample(rows)
+        for group, rows in zip(groups, blended.visibility, strict=True)
+    ]
+    light = LightVisibility(groups, lit, jnp.zeros((), normals.dtype))
     entering = entering_light(
         material,
         light,

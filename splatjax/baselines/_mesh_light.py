@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from splatjax import splatting as _splatting
 from splatjax.render import Irradiance, LightVisibility, entering_light
 from splatjax.scene import (
-    AbstractLight,
+    AbstractLightSample,
     DirectionalLight,
     Material,
     PointLight,
@@ -24,7 +24,7 @@ from ._textured_mesh import TexturedMesh
 class MeshShadow(eqx.Module):
     """What one light sees of a mesh."""
 
-    light: AbstractLight
+    light: AbstractLightSample
     depths: _splatting.ShadowMap
     attributes: Float[Array, "tiles 5 pixels"]
     """Texture coordinates and normal."""
@@ -35,7 +35,7 @@ class MeshLight(eqx.Module):
     scene.
     """
 
-    lights: tuple[AbstractLight, ...]
+    lights: tuple[AbstractLightSample, ...]
     shadows: tuple[MeshShadow | None, ...]
     settings: _splatting.ShadowSettings
     needed: Float[Array, ""]
@@ -75,7 +75,7 @@ class MeshLight(eqx.Module):
 
 
 def light_views(
-    mesh: TexturedMesh, lights: tuple[AbstractLight, ...], settings: _splatting.ShadowSettings
+    mesh: TexturedMesh, lights: tuple[AbstractLightSample, ...], settings: _splatting.ShadowSettings
 ) -> list[_splatting.AbstractView | None]:
     """Give the view of each light; `None` for one that casts no shadows."""
     bounds = mesh.bounds()
@@ -96,7 +96,7 @@ def light_views(
 
 
 def shadow_capacities(
-    mesh: TexturedMesh, lights: tuple[AbstractLight, ...], settings: _splatting.ShadowSettings
+    mesh: TexturedMesh, lights: tuple[AbstractLightSample, ...], settings: _splatting.ShadowSettings
 ) -> tuple[int | None, ...]:
     """Return the capacity that each light's shadow map needs; of concrete lights.
 
@@ -121,7 +121,7 @@ def shadow_capacities(
 
 def mesh_light(
     mesh: TexturedMesh,
-    lights: tuple[AbstractLight, ...],
+    lights: tuple[AbstractLightSample, ...],
     settings: _splatting.ShadowSettings,
     capacities: tuple[int | None, ...],
 ) -> MeshLight:

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from splatjax import shading as _shading, splatting as _splatting
 from splatjax.render import LightVisibility
-from splatjax.scene import AbstractLight, Camera, Frame, Material
+from splatjax.scene import AbstractLightSample, Camera, Frame, Material
 
 from ._mesh_light import MeshLight, mesh_light, shadow_capacities
 from ._mesh_raster import Landing, barycentrics, capacity_for, interpolate, see_faces
@@ -41,7 +41,7 @@ class TexturePlan(eqx.Module):
 
 def plan_texture_space(
     mesh: TexturedMesh,
-    lights: tuple[AbstractLight, ...],
+    lights: tuple[AbstractLightSample, ...],
     material: Material,
     camera: Camera,
     settings: TextureSpaceSettings = _SETTINGS,
@@ -71,7 +71,7 @@ class TextureSpacePicture(eqx.Module):
 
 def render_texture_space(
     mesh: TexturedMesh,
-    lights: tuple[AbstractLight, ...],
+    lights: tuple[AbstractLightSample, ...],
     material: Material,
     camera: Camera,
     settings: TextureSpaceSettings = _SETTINGS,

@@ -22,7 +22,7 @@ class SurfaceAttributes(eqx.Module):
     - `source`: irradiance that spreads below the surface.
     - `albedo`, `irradiance`, `specular`, `roughness`: `None` where the splats carry none;
       `irradiance` is then `source`.
-    - `visibility`: per group of lights, of each light; `None` for lights that cast no shadows.
+    - `visibility`: per group of samples, of each light; `None` for lights that cast no shadows.
     - `layers`, `derivative`: the layers of pass 4 as `continue_from_splats` prepares them, and
       their derivatives; `centers` are the splats', mm from an origin.
     - `added_source`: the derivative of `source` in a weight of the Gaussians, where it has one.

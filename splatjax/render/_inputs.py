@@ -30,9 +30,10 @@ def check_channels(scene: Scene) -> None:
         )
     point = jax.ShapeDtypeStruct((1, 3), scene.splats.centers.dtype)
     for i, light in enumerate(scene.lights):
-        found[f"lights[{i}]"] = eqx.filter_eval_shape(
-            lambda light, x: light.incidence(x)[1], light, point
-        ).shape[1]
+        for sample in light.samples():
+            found[f"lights[{i}]"] = eqx.filter_eval_shape(
+                lambda sample, x: sample.incidence(x)[1], sample, point
+            ).shape[1]
     for name, count in found.items():
         if count != channels:
             raise ValueError(

@@ -20,14 +20,31 @@ class LightVisibility(eqx.Module):
 
     **Attributes:**
 
-    - `groups`: lights of one kind, stacked.
-    - `visibility`: per group; `None` for lights that cast no shadows.
+    - `groups`: samples of lights of one kind, stacked.
+    - `visibility`: per group, of each sample; `None` for lights that cast no shadows.
     - `needed`: capacity needed over planned.
     """
 
     groups: list[StackedLights]
-    visibility: list[Float[Array, "_lights points"] | None]
+    visibility: list[Float[Array, "_samples points"] | None]
     needed: Float[Array, ""]
+
+    def per_light(
+        self, positions: Float[Array, "points 3"], normals: Float[Array, "points 3"]
+    ) -> tuple[Float[Array, "_lights points"] | None, ...]:
+        """Average the visibility of each light's samples by the light that each would bring."""
+
+        def received(light):
+            wi, irradiance = light.incidence(positions)
+            cosine = jnp.maximum(jnp.sum(wi * normals, axis=-1), 0)
+            return cosine * jnp.sum(irradiance, axis=-1)
+
+        def mean(group: StackedLights, rows):
+            if rows is None or len(group.distinct) == len(group.places):
+                return rows
+            return group.mean_per_light(rows, jax.lax.map(received, group.lights))
+
+        return tuple(map(mean, self.groups, self.visibility))
 
 
 class Irradiance(eqx.Module):
@@ -158,7 +175,7 @@ def surface_attributes(
         irradiance=None if splats.albedo is None else irradiance.entering,
         specular=None if splats.specular is None else specular[None],
         roughness=None if splats.roughness is None else roughness[None],
-        visibility=tuple(light.visibility),
+        visibility=light.per_light(splats.centers, splats.normals),
     )
 
 

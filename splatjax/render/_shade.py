@@ -83,7 +83,10 @@ def shade(
         outgoing=(to_eye / jnp.sqrt(jnp.sum(to_eye * to_eye, axis=0, keepdims=True))).T,
         specular=material.specular if attributes.specular is None else attributes.specular[0],
         roughness=material.roughness if attributes.roughness is None else attributes.roughness[0],
-        lit=list(attributes.visibility),
+        lit=[
+            None if rows is None else group.per_sample(rows)
+            for group, rows in zip(groups, attributes.visibility, strict=True)
+        ],
     )
     gaussians = material.gaussians
     channels, post = gaussians.weights.shape[1], _shading.leaving_share(points, f0)[None] / jnp.pi
@@ -102,7 +105,7 @@ def shade(
     layers, resolved = at.weigh(gaussians, single_scattering_albedo(scene))
     layers = jnp.where(covered[None, None], post[None] * layers, 0.0)
     specular = _shading.reflected_radiance(points, groups, f0, channels).T
-    shadow = _shadows_in_order(attributes.visibility, groups, samples.depth)
+    shadow = _shadows_in_order(attributes.visibility, groups, len(scene.lights), samples.depth)
     return ShadedSurface(
         depth=jnp.where(covered, samples.depth, jnp.inf),
         positions=jnp.where(covered[None], samples.positions, 0.0),
@@ -164,12 +167,12 @@ def compose(
 
 
 def _shadows_in_order(
-    visibility, groups: list[StackedLights], depth: Float[Array, " points"]
+    visibility, groups: list[StackedLights], lights: int, depth: Float[Array, " points"]
 ) -> Float[Array, "lights points"]:
     """Sort the visibility of the lights into the scene's order; 1 where a light casts none."""
-    planes = [jnp.ones_like(depth)] * sum(len(group.places) for group in groups)
+    planes = [jnp.ones_like(depth)] * lights
     for group, own in zip(groups, visibility, strict=True):
         if own is not None:
-            for row, place in enumerate(group.places):
+            for row, place in enumerate(group.distinct):
                 planes[place] = own[row]
     return jnp.stack(planes) if planes else jnp.zeros((0, *depth.shape), depth.dtype)

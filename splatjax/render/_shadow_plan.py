@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from splatjax import splatting as _splatting
-from splatjax.scene import AbstractLight, DirectionalLight, GaussianBeam, PointLight
+from splatjax.scene import AbstractLightSample, DirectionalLight, GaussianBeam, PointLight
 
 _NEARLY = 1.05  # bounding radii, from which on one frustum around all splats fits
 
@@ -21,7 +21,7 @@ class ShadowPlan(eqx.Module):
     raster: _splatting.AbstractRasterPlan
     cube: bool = eqx.field(static=True)
 
-    def closeness(self, light: AbstractLight, bounds: _splatting.Bounds) -> Float[Array, ""]:
+    def closeness(self, light: AbstractLightSample, bounds: _splatting.Bounds) -> Float[Array, ""]:
         """Compute a number above 1 for a point light that was planned outside the splats' bounding
         sphere and has come into it.
         """
@@ -31,7 +31,7 @@ class ShadowPlan(eqx.Module):
         return jax.lax.stop_gradient(bounds.radius / distance)
 
 
-def is_among(lights: Sequence[AbstractLight], bounds: _splatting.Bounds) -> bool:
+def is_among(lights: Sequence[AbstractLightSample], bounds: _splatting.Bounds) -> bool:
     """Test whether a point light is among the splats, or nearly so: then all of its group need a
     cube. Not for traced arrays.
     """
@@ -44,7 +44,7 @@ def is_among(lights: Sequence[AbstractLight], bounds: _splatting.Bounds) -> bool
 
 
 def shadow_views(
-    light: AbstractLight,
+    light: AbstractLightSample,
     bounds: _splatting.Bounds,
     settings: _splatting.ShadowSettings,
     cube: bool,

@@ -4,6 +4,7 @@ from ._camera import Camera as Camera
 from ._frame import Frame as Frame
 from ._lights import (
     AbstractLight as AbstractLight,
+    AbstractLightSample as AbstractLightSample,
     DirectionalLight as DirectionalLight,
     GaussianBeam as GaussianBeam,
     PointLight as PointLight,

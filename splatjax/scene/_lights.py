@@ -20,9 +20,7 @@ _TOUCHING = 1e-6  # mm
 
 
 class AbstractLight(eqx.Module):
-    """A light. Whether it casts shadows is static: a light that casts none costs no shadow map."""
-
-    cast_shadows: eqx.AbstractVar[bool]
+    """A light: a distribution of samples, which are points or directions."""
 
     strength: ClassVar[str] = ""
     """The field with the power of each channel."""
@@ -46,6 +44,26 @@ class AbstractLight(eqx.Module):
         return eqx.tree_at(lambda light: getattr(light, light.strength), self, repeated)
 
     @abc.abstractmethod
+    def samples(self) -> tuple["AbstractLightSample", ...]:
+        """Return the points and directions from which the light comes.
+
+        Their light enters the surface, each with its own shadow. The specular lobe of each is
+        shadowed by the mean visibility of all, so that passes 2 and 3 blend one row per light.
+        """
+
+
+class AbstractLightSample(AbstractLight):
+    """A light from one point or direction. Whether it casts shadows is static: a light that casts
+    none costs no shadow map.
+    """
+
+    cast_shadows: eqx.AbstractVar[bool]
+
+    def samples(self) -> tuple["AbstractLightSample", ...]:
+        """Return the light itself."""
+        return (self,)
+
+    @abc.abstractmethod
     def incidence(
         self, points: Float[Array, "*points 3"]
     ) -> tuple[Float[Array, "*points 3"], Float[Array, "*points channels"]]:
@@ -61,7 +79,7 @@ def _per_channel(
 
 
 @record
-class DirectionalLight(AbstractLight):
+class DirectionalLight(AbstractLightSample):
     r"""Parallel light from infinitely far away.
 
     **Attributes:**
@@ -85,7 +103,7 @@ class DirectionalLight(AbstractLight):
 
 
 @record
-class PointLight(AbstractLight):
+class PointLight(AbstractLightSample):
     r"""Light from a point, falling off with the square of the distance.
 
     A point within 1e-6 mm of the light receives none: the limit diverges, so value and gradient are
@@ -116,7 +134,7 @@ class PointLight(AbstractLight):
 
 
 @record
-class GaussianBeam(AbstractLight):
+class GaussianBeam(AbstractLightSample):
     r"""A laser: parallel light whose power falls off as a Gaussian with the distance from its axis.
     It casts no shadows.
 
@@ -146,36 +164,61 @@ class GaussianBeam(AbstractLight):
 
 
 class StackedLights(eqx.Module):
-    """Lights of one kind, their leaves stacked, and their places in the scene's tuple."""
+    """Samples of lights of one kind, their leaves stacked, and for each the place of its light in
+    the scene's tuple.
+    """
 
-    lights: AbstractLight
+    lights: AbstractLightSample
     places: tuple[int, ...] = eqx.field(static=True)
 
-    def apart(self) -> list[AbstractLight]:
-        """Return the lights one by one."""
+    @property
+    def distinct(self) -> tuple[int, ...]:
+        """List the places of the lights, each once."""
+        return tuple(dict.fromkeys(self.places))
+
+    def mean_per_light(
+        self, rows: Float[Array, "samples points"], weights: Float[Array, "samples points"]
+    ) -> Float[Array, "lights points"]:
+        """Average the rows of the samples of each light."""
+        if len(self.distinct) == len(self.places):
+            return rows
+        member = jnp.asarray([[of == place for of in self.places] for place in self.distinct])
+        member = member.astype(rows.dtype)
+        total = member @ weights
+        mean = member @ (weights * rows) / jnp.where(total > 0, total, 1.0)
+        return jnp.where(total > 0, mean, 1.0)
+
+    def per_sample(self, rows: Float[Array, "lights points"]) -> Float[Array, "samples points"]:
+        """Repeat the row of each light for its samples."""
+        if len(self.distinct) == len(self.places):
+            return rows
+        return rows[jnp.asarray([self.distinct.index(place) for place in self.places])]
+
+    def apart(self) -> list[AbstractLightSample]:
+        """Return the samples one by one."""
         return [
             jax.tree.map(lambda leaf, i=i: leaf[i], self.lights) for i in range(len(self.places))
         ]
 
 
 def stack_lights(lights: tuple[AbstractLight, ...]) -> list[StackedLights]:
-    """Stack lights of equal kind, so that any number of them is computed by one loop."""
-    kinds: dict[object, list[int]] = {}
+    """Stack samples of equal kind, so that any number of them is computed by one loop."""
+    kinds: dict[object, list[tuple[int, AbstractLightSample]]] = {}
     for place, light in enumerate(lights):
-        kinds.setdefault(jax.tree.structure(light), []).append(place)
-    return [
-        StackedLights(
-            jax.tree.map(lambda *leaves: jnp.stack(leaves), *[lights[i] for i in places]),
-            tuple(places),
-        )
-        for places in kinds.values()
-    ]
+        for sample in light.samples():
+            kinds.setdefault(jax.tree.structure(sample), []).append((place, sample))
+    groups = []
+    for members in kinds.values():
+        places, samples = zip(*members, strict=True)
+        stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *samples)
+        groups.append(StackedLights(stacked, places))
+    return groups
 
 
 def sum_over_lights(
     groups: list[StackedLights],
     shares: Sequence[Array | None],
-    contribution: Callable[[AbstractLight, Array | None], Array],
+    contribution: Callable[[AbstractLightSample, Array | None], Array],
     start: Array,
 ) -> Array:
     """Add up the contributions of lights, one after the other; backward, each is recomputed.

@@ -8,7 +8,7 @@ from scenes import sheet, two_gaussians
 
 import splatjax as sj
 from splatjax.diffusion import DenseDiffuser
-from splatjax.scene import AbstractLight
+from splatjax.scene import AbstractLight, AbstractLightSample
 from splatjax.splatting import DenseRasterizer
 
 SETTINGS = sj.RenderSettings(diffuser=DenseDiffuser())  # which needs no plan
@@ -99,7 +99,7 @@ def test_a_batch_whose_arrays_are_not_stacked_is_refused():
         )
 
 
-class Sky(AbstractLight):
+class Sky(AbstractLightSample):
     """A light of someone's own: the same from every side."""
 
     radiance: jax.Array
@@ -119,3 +119,30 @@ def test_a_light_of_ones_own_shines_without_shadows_and_is_told_so_with_them():
         ValueError, match="Sky has no shadow map; give a light with cast_shadows=False"
     ):
         sj.make_plan(scene_under(Sky(jnp.ones(3), cast_shadows=True)), camera, SETTINGS)
+
+
+class Sun(AbstractLight):
+    """A light sampled from a list of directions."""
+
+    directions: jax.Array
+    irradiance: jax.Array
+
+    def samples(self):
+        return tuple(sj.DirectionalLight(each, self.irradiance) for each in self.directions)
+
+
+@pytest.mark.once
+def test_a_light_of_many_samples_is_the_sum_of_them_and_has_one_row():
+    camera, ball = camera_at(20.0), sheet(1.0, 5.0)
+    blocker = eqx.tree_at(lambda s: s.centers, sheet(0.5, 1.0), replace_fn=lambda c: c + 2.0)
+    splats = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), ball, blocker)
+    directions = jnp.asarray([[0.0, 0.0, -1.0], [0.6, 0.0, -0.8], [-0.6, 0.1, -0.8]])
+    irradiance = jnp.asarray([1.0, 2.0, 3.0])
+    sun = sj.render(scene_under(Sun(directions, irradiance), splats=splats), camera, SETTINGS)
+    lamps = [sj.DirectionalLight(each, irradiance) for each in directions]
+    apart = sj.render(scene_under(*lamps, splats=splats), camera, SETTINGS)
+    assert jnp.allclose(sun.diffuse, apart.diffuse, rtol=1e-5)
+    assert sun.shadow.shape == (1, 8, 8)
+    assert float(jnp.max(jnp.abs(sun.shadow[0] - jnp.mean(apart.shadow, axis=0)))) < 0.2
+    assert float(jnp.min(sun.shadow)) < 0.9
+    assert float(jnp.sum(sun.specular) / jnp.sum(apart.specular)) == pytest.approx(1, abs=0.1)
