@@ -86,7 +86,9 @@ def test_neighbors_are_the_boxes_within_reach_each_once(at_once, monkeypatch):
     monkeypatch.setattr(_neighbors, "_AT_ONCE", at_once)
     centers, exists = blocks_in_space(), jnp.arange(COUNT) < COUNT - BLOCK // 2
     points, sources = (Boxes.around(centers, exists, size) for size in (BLOCK, SOURCES))
-    gaps = jnp.maximum(points.low[:, None] - sources.high, sources.low - points.high[:, None])
+    gaps = jnp.maximum(
+        points.low[:, None] - sources.high[None], sources.low[None] - points.high[:, None]
+    )
     expected = np.sum(np.maximum(gaps, 0) ** 2, axis=2) <= REACH**2
     steps = jax.tree.map(np.asarray, find_neighbors(points, sources, REACH))
     blocks, none = expected.shape
