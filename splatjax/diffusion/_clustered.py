@@ -35,7 +35,8 @@ from ._neighbors import SOURCES, Boxes, Neighbors, find_neighbors
 from ._order import BLOCK
 
 FINEST = 0.01
-"""Fraction of the splats that may be finer than those that decide how far a layer is resolved."""
+"""Quantile of the areas of the splats: a layer counts as resolved as far as splats of that area
+resolve it."""
 _CELL = 0.6  # edge of the cells, in standard deviations, for an error of 2e-3; error ~ edge^3
 _WORTHWHILE = 2.0  # edge of the cells, in spacings, from which on merging splats pays
 
@@ -252,8 +253,8 @@ def layer_table(
     truncated: TruncatedGaussian,
     slopes: bool = True,
 ) -> tuple[Float[Array, "blocks_and_one columns block"], Float[Array, ""]]:
-    """Lay out the sources of one layer: light, mass and, for slopes, the first moments of both. Also
-    return the largest variance of a source.
+    """Lay out the sources of one layer: light, mass and, for slopes, the first moments of both.
+    Also return the largest variance of a source.
     """
     widths = variance + below.spread
     # A flat sheet has mass 1.

@@ -32,8 +32,8 @@ RESOLVED = jnp.asarray([0.0, 1e-3])  # an interval that resolves every layer
 # All of the root mean square of a layer. Beyond 4.5 standard deviations lie 4e-5 of the power;
 # several times that in the dark.
 SUPPORT_ERROR = 5e-4
-# Median, 99th percentile and maximum at the splats. The light of a cluster is its mean: on a body as
-# small as three standard deviations of the widest layer, half of its points err by 4e-3.
+# Median, 99th percentile and maximum at the splats. The light of a cluster is its mean: on a body
+# as small as three standard deviations of the widest layer, half of its points err by 4e-3.
 MEDIAN, HIGH, LARGEST = 4.5e-3, 1.5e-2, 3e-2
 # float64: the same sums in another order; and central differences with a step of 1e-6.
 VALUE, GRADIENT, DIFFERENCES = 1e-10, 1e-8, 1e-5
