@@ -35,7 +35,9 @@ from ._neighbors import SOURCES, Boxes, Neighbors, find_neighbors
 from ._order import BLOCK
 
 FINEST = 0.01
-"""Fraction of the splats that may be finer than those that decide how far a layer is resolved."""
+"""Quantile of the areas of the splats: a layer counts as resolved as far as splats of that area
+resolve it.
+"""
 _CELL = 0.6  # edge of the cells, in standard deviations, for an error of 2e-3; error ~ edge^3
 _WORTHWHILE = 2.0  # edge of the cells, in spacings, from which on merging splats pays
 

@@ -59,19 +59,23 @@ def dense_layer(
     depth: Float[Array, ""],
 ) -> LayerValues:
     """Evaluate one layer at any points, untruncated."""
+    # Sink the sources below their splats.
     below = sources.centers - depth * sources.normals
 
     def evaluate(points: Float[Array, "points 3"]) -> Float[Array, "points rows"]:
-        offset = points.T[:, :, None] - below[:, None]
+        # Squared distances of all points from all sources.
+        offset = below[:, None] - points.T[:, :, None]
         squared = jnp.sum(offset * offset, axis=0)
-        # The mean does not change when all sums are scaled: the nearest source's exponent is zero.
+        # Weigh the sources, A_j G(v, |x - q_j|), but for a factor per point, which the means do not
+        # notice: the exponent of the nearest source is zero.
         nearest = stop_gradient(jnp.min(squared, axis=1, keepdims=True))
         weight = sources.areas[None] * jnp.exp(-0.5 * (squared - nearest) / variance)
+        # Sum light and mass, and their first moments about the point; divide them.
         light = jnp.concatenate([sources.irradiance, jnp.ones_like(sources.areas)[None]])
-        sums = light @ weight.T
-        firsts = jnp.einsum("cs,as,ps->cap", light, below, weight)
-        rows = layer_values(sums, firsts, points.T)
-        # A flat sheet has mass 1; far from everything this underflows, cleanly.
+        firsts = jnp.einsum("cs,aps,ps->cap", light, offset, weight)
+        rows = layer_values(light @ weight.T, firsts, jnp.zeros_like(points.T))
+        # Scale the mass and its slopes, so that a flat sheet has mass 1; far from all sources the
+        # factor underflows to 0.
         flat = jnp.exp(-0.5 * (nearest[:, 0] - depth * depth) / variance) / (2 * jnp.pi * variance)
         of_mass = jnp.zeros((len(light), 4), bool).at[-1].set(True)
         of_mass = jnp.concatenate([of_mass[:, 0], of_mass[:, 1:].reshape(-1)])

@@ -50,7 +50,7 @@ class Diffused(eqx.Module):
 
     **Attributes:**
 
-    - `layers`: `None` for a layer that is too narrow for nearly all splats.
+    - `layers`: one for each Gaussian; `None` for a layer that is too narrow for nearly all splats.
     - `needed`: capacity needed over planned; above 1 the values are incomplete.
     """
 
@@ -80,7 +80,8 @@ class AbstractDiffusionPlan(eqx.Module):
         - `sources`: in the order of the plan. Differentiable.
         - `variances`: mm^2. Differentiable.
         - `combination`: of the parts of the splats that several devices hold.
-        - `wanted`: the splats whose layers will be looked at; all for `None`.
+        - `wanted`: the splats whose layers will be read; the values of others may be 0. All for
+          `None`.
         """
 
     def shares(self) -> tuple[Array, ...]:
@@ -109,8 +110,9 @@ class AbstractDiffuser(eqx.Module):
 
         **Arguments:**
 
-        - `parts`: the splats, each part in the compact order in which they will be diffused;
-          several parts where several devices hold them.
+        - `parts`: the splats, each part in the compact order in which they will be diffused
+          (`compact_order`) and filled up to whole blocks of `BLOCK` by splats without area; several
+          parts where several devices hold them.
         - `interval`: from `AbstractDiffusionKernel.interval`.
         """
 

@@ -144,7 +144,7 @@ def _empty(rule: _Rule, points, table):
 
 
 def _derivative(rule: _Rule, steps: Steps, points, table, d_table):
-    """Compute values and their derivative along `d_table` from one evaluation of the weights."""
+    """Compute the values and their derivative along `d_table`; weights are evaluated once."""
     rows = table.shape[1] - 4
 
     def sweep(i, lanes):

@@ -16,7 +16,7 @@ def entering_irradiance(
     entering: Callable[[Float[Array, " splats"]], Float[Array, "#channels splats"]],
     channels: int,
 ) -> Float[Array, "channels splats"]:
-    r"""Give the irradiance that enters the surface, `sum_lights irradiance max(n . wi, 0) lit
+    r"""Compute the irradiance that enters the surface, `sum_lights irradiance max(n . wi, 0) lit
     entering(n . wi)`.
 
     **Arguments:**

@@ -55,7 +55,7 @@ class Neighbors(eqx.Module):
     reach: Float[Array, ""]
 
     def needed(self, points: Boxes, sources: Boxes, reach: Float[Array, ""]) -> Float[Array, ""]:
-        """Compute a number above 1 if sources within `reach` (mm) of a point may be missing."""
+        """Compute a number above 1 if sources within `reach` (mm) of points may be missing."""
         moved = points.beyond(self.points) + sources.beyond(self.sources)
         return (reach + math.sqrt(3) * moved) / self.reach
 

@@ -10,7 +10,7 @@ _TOGETHER = 64 * BLOCK  # split side by side from here on
 
 
 def compact_order(points: np.ndarray) -> np.ndarray:
-    """Give the order `[points]` of a k-d tree whose leaves hold `BLOCK` points, but the last, and
+    """Find the order `[points]` of a k-d tree whose leaves hold `BLOCK` points, but the last, and
     are sorted down to eighths.
 
     **Arguments:** `points`: `[points, 3]`.

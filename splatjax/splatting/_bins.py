@@ -20,9 +20,7 @@ _ROW_BITS = 10
 
 
 class BinCapacity(eqx.Module):
-    """How many pairs of item and tile, blocks, and chunks with anything in them there is room for.
-    Static.
-    """
+    """Capacity of the lists: pairs of item and tile, blocks, and chunks with any item. Static."""
 
     pairs: int = eqx.field(static=True)
     blocks: int = eqx.field(static=True)
@@ -30,8 +28,8 @@ class BinCapacity(eqx.Module):
 
     @classmethod
     def for_counts(cls, per_tile: Sequence[Int[Array, " tiles"]], grid: TileGrid) -> "BinCapacity":
-        """Give room for each of these numbers of items per tile, rounded up so that nearby ones
-        need no other program.
+        """Choose the capacity for each of these numbers of items per tile, rounded up so that
+        nearby ones need no other program.
         """
         pairs = blocks = chunks = 1
         for tiles in per_tile:
@@ -77,7 +75,7 @@ def _occupied(first_block: Int[Array, " chunks_and_one"]) -> Int[Array, ""]:
 
 
 def _running_max(values: Int[Array, " pairs"]) -> Int[Array, " pairs"]:
-    """Give the running maximum: columns in sequence, side by side."""
+    """Compute the running maximum: columns in sequence, side by side."""
     columns = values.reshape(_ROW, -1).T
 
     def step(carry, value):
@@ -154,7 +152,8 @@ def _ranks(tile: Int[Array, " pairs"], tiles: int):
 def bin_items(ranges: TileRanges, grid: TileGrid, capacity: BinCapacity) -> Bins:
     """List the items of every tile, in their order. Not differentiated."""
     items, lanes, slots, tiles = ranges.left.shape[0], grid.lanes, grid.slots, grid.tiles
-    room = capacity.blocks * lanes * slots
+    size = capacity.blocks * lanes * slots
+    # List the pairs item after item, and number the pairs of each tile.
     item, tile, total = _pairs(ranges, grid, capacity.pairs)
     tile, source, rank, counts = _ranks(tile, tiles)
     item = jnp.take_along_axis(item.reshape(-1, _ROW), source, axis=1, mode="promise_in_bounds")
@@ -166,15 +165,19 @@ def bin_items(ranges: TileRanges, grid: TileGrid, capacity: BinCapacity) -> Bins
     keys = ((longest - jnp.minimum(lengths, longest)) << bits) | jnp.arange(tiles, dtype=jnp.int32)
     order = lax.sort(keys, is_stable=False) & ((1 << bits) - 1)
     first_block = jnp.concatenate([jnp.zeros(1, jnp.int32), jnp.cumsum(lengths[order[::lanes]])])
+
+    # Where each tile begins among the slots, and from there the slot of every pair.
     lane = jnp.arange(tiles, dtype=jnp.int32)
     begins = first_block[lane // lanes] * (lanes * slots) + (lane % lanes) * slots
-    begin_of_tile = jnp.full(tiles + 1, room, jnp.int32).at[order].set(begins)
+    begin_of_tile = jnp.full(tiles + 1, size, jnp.int32).at[order].set(begins)
     target = (
         begin_of_tile.at[tile].get(mode="promise_in_bounds")
         + (rank // slots) * (lanes * slots)
         + rank % slots
     )
-    ids = jnp.full(room, items, jnp.int32).at[target.reshape(-1)].set(item.reshape(-1), mode="drop")
+    ids = jnp.full(size, items, jnp.int32).at[target.reshape(-1)].set(item.reshape(-1), mode="drop")
+
+    # What was needed, of what was planned.
     blocks, chunks = first_block[-1].astype(jnp.float32), _occupied(first_block).astype(jnp.float32)
     needed = jnp.maximum(
         total / capacity.pairs, jnp.maximum(blocks / capacity.blocks, chunks / capacity.chunks)

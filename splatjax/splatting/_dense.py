@@ -40,22 +40,26 @@ class DenseRasterPlan(AbstractRasterPlan):
         dtype, footprints = attributes.dtype, view.footprints(splats, settings)
         grid = TileGrid(view.width, view.height)
         columns = jnp.arange(view.width, dtype=dtype) + 0.5
+        # The weight that a fragment behind the front needs to decide where that surface is.
         conic = footprints.a, footprints.b, footprints.c, footprints.nearness
         least = stop_gradient(least_weight(type(view), *conic, settings.filter_radius))
 
         def picture_row(y: Float[Array, ""]):
-            # Where the ray of every pixel hits the plane of every splat, and with what weight.
+            # Intersect the ray of every pixel with the plane of every splat: nearness and rho^2 are
+            # polynomials in the offset from the projected center.
             dx, dy = columns[:, None] - footprints.x[None], (y - footprints.y)[None]
             slope = footprints.slope_x[None] * dx + footprints.slope_y[None] * dy
             nearness = footprints.nearness[None] + slope
             quadric = dx * (footprints.a[None] * dx + footprints.b[None] * dy)
             quadric = quadric + footprints.c[None] * dy * dy
+            # Weigh the fragments: hits within the rim (Eq. 1's w_i).
             inside = footprints.visible[None] & view.inside(nearness, quadric)
             squared_radius = jnp.where(
                 inside, view.squared_radius(jnp.where(inside, nearness, 1.0), quadric), 1.0
             )
             weight = footprints.opacity[None] * fragment_weight(squared_radius)
             weight = jnp.where(inside, weight, 0.0)
+            # Move every fragment away from the eye by epsilon (3.1).
             shifted = view.shifted(nearness, footprints.shift[None])
 
             def nearest(chosen: Bool[Array, "columns splats"]) -> Float[Array, " columns"]:
@@ -66,9 +70,11 @@ class DenseRasterPlan(AbstractRasterPlan):
                 last = jnp.stack([jnp.sum(weights * hits, axis=1), jnp.sum(weights, axis=1)])
                 return jnp.concatenate([attributes @ weights.T, last])
 
-            # The front, and the surface behind it in pixels that it leaves open.
+            # The front: fragments nearer than the nearest shifted one.
             front = inside & (nearness > nearest(inside)[:, None])
             in_front = summed(front)
+            # Behind it, in pixels that it leaves open: the same among all others, from the nearest
+            # that weighs something.
             is_open = stop_gradient(in_front[-1]) < settings.full_coverage
             rest = inside & ~front & is_open[:, None]
             weighty = nearest(rest & (weight > least[None]))

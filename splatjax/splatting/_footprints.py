@@ -21,7 +21,7 @@ _SLOPE_FILTER = 0.25  # pixels; see `filtered`
 
 
 class Footprints(eqx.Module):
-    """Where every splat lands, planar: one array per number. Pixels, origin top left, unless said
+    """The projected splats, one array per number. Pixels, origin top left, unless said
     otherwise.
     """
 
@@ -45,7 +45,7 @@ class Footprints(eqx.Module):
     visible: Bool[Array, " splats"]
 
     def ranges(self, grid: TileGrid) -> TileRanges:
-        """Give the tiles that each splat may touch."""
+        """Find the tiles that each splat may touch."""
         return TileRanges.of(self.left, self.right, self.top, self.bottom, self.visible, grid)
 
 
@@ -77,8 +77,8 @@ def filtered(xx, xy, yy, root, dx, dy, vx, vy, filter_radius):
 
 
 def epsilon_of(radii, filter_radius, cosine, settings: SplattingSettings):
-    """Give the depth (mm) within which fragments belong to one surface: in radii, more on slanted
-    splats.
+    """Compute the depth (mm) within which fragments belong to one surface: in radii, more on
+    slanted splats.
     """
     reach = jnp.sqrt(radii * radii + filter_radius * filter_radius)
     return settings.epsilon_z * reach / jnp.maximum(cosine, 1 / settings.largest_slope)

@@ -46,7 +46,7 @@ class Lanes(eqx.Module):
     def until_end(
         self, beyond: Float[Array, "lanes pixels"], block
     ) -> Float[Array, "lanes pixels"]:
-        """Give limits that nothing is nearer than, for lanes whose list has ended before a
+        """Return limits that nothing is nearer than, for lanes whose list has ended before a
         block.
         """
         return jnp.where((block < self.lengths)[:, None], beyond, jnp.inf)
@@ -106,13 +106,13 @@ class Sweep(eqx.Module):
         return kind(row, lengths, jnp.max(lengths), x, y, lanes)
 
     def chunk(self, bins: Bins, i, dtype) -> Lanes:
-        """Give the tiles of a chunk."""
+        """Return the tiles of a chunk."""
         places = i * self.grid.lanes + jnp.arange(self.grid.lanes, dtype=jnp.int32)
         return self._lanes(ChunkLanes, bins, places, dtype)
 
     def picked(self, bins: Bins, places: Int[Array, " lanes"], dtype) -> Lanes:
-        """Give tiles by their places in the order; places beyond the last are the last one's, with
-        nothing in them.
+        """Return tiles by their places in the order; places beyond the last are the last one's,
+        with nothing in them.
         """
         return self._lanes(Lanes, bins, places, dtype)
 
@@ -122,7 +122,7 @@ class Sweep(eqx.Module):
         return x - lanes.x, y - lanes.y, *rest
 
     def fragments(self, splats):
-        """Give nearness and quadric of a block's fragments, `[lanes, slots, pixels]`."""
+        """Compute nearness and quadric of a block's fragments, `[lanes, slots, pixels]`."""
         x, y, sx, sy, a, b, c, e = (p[:, :, None] for p in splats[:8])
         px, py = (jnp.asarray(p)[None, None] for p in self.pixels(x.dtype))
         dx, dy = px - x, py - y
@@ -166,8 +166,8 @@ class Sweep(eqx.Module):
         return jnp.full((lanes.row.shape[0], SIDE**2), -jnp.inf, lanes.x.dtype)
 
     def squared_radii(self, nearness, quadric, beyond, upto):
-        """Give `rho^2`, below 1 for the fragments between two limits; 1, where the weight is 0, for
-        all others.
+        """Compute `rho^2`, below 1 for the fragments between two limits; 1, where the weight is 0,
+        for all others.
         """
         chosen = self.view.inside(nearness, quadric) & (nearness > beyond[:, None])
         if upto is not None:

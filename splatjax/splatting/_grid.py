@@ -58,18 +58,18 @@ class TileGrid(eqx.Module):
     def columns_and_rows(
         self, tiles: Int[Array, " some"]
     ) -> tuple[Int[Array, "some pixels"], Int[Array, "some pixels"]]:
-        """Give the column and the row of every pixel of some tiles."""
+        """Return the column and the row of every pixel of some tiles."""
         within = jnp.arange(SIDE**2, dtype=jnp.int32)
         x = (tiles % self.across * SIDE)[:, None] + (within % SIDE)[None]
         y = (tiles // self.across * SIDE)[:, None] + (within // SIDE)[None]
         return x, y
 
     def pixel(self, x: Int[Array, "..."], y: Int[Array, "..."]) -> Int[Array, "..."]:
-        """Give the number of a pixel among those of all tiles, tile by tile."""
+        """Return the number of a pixel among those of all tiles, tile by tile."""
         return (y // SIDE * self.across + x // SIDE) * SIDE**2 + y % SIDE * SIDE + x % SIDE
 
     def within_picture(self) -> np.ndarray | None:
-        """Say which pixels `[tiles, pixels]` lie in the picture; None if all do."""
+        """Mark the pixels `[tiles, pixels]` that lie in the picture; None if all do."""
         if self.width % SIDE == 0 and self.height % SIDE == 0:
             return None
         x, y = np.arange(self.across * SIDE) < self.width, np.arange(self.down * SIDE) < self.height
@@ -128,10 +128,10 @@ class TileRanges(eqx.Module):
 
 
 def _first(edge: Float[Array, " items"], first: int, last: int) -> Float[Array, " items"]:
-    """Give the first pixel whose center is not before an edge; `last + 1` if none is."""
+    """Return the first pixel whose center is not before an edge; `last + 1` if none is."""
     return jnp.clip(jnp.ceil(edge - 0.5), first, last + 1)
 
 
 def _last(edge: Float[Array, " items"], first: int, last: int) -> Float[Array, " items"]:
-    """Give the last pixel whose center is not behind an edge; `first - 1` if none is."""
+    """Return the last pixel whose center is not behind an edge; `first - 1` if none is."""
     return jnp.clip(jnp.floor(edge - 0.5), first - 1, last)

@@ -9,7 +9,8 @@ _AT_RIM = math.exp(-4.0)
 
 
 def fragment_weight(squared_radius: Float[Array, "..."]) -> Float[Array, "..."]:
-    r"""Give the Gaussian weight of a fragment in object space, `exp(-4 rho^2)`, tapered at the rim.
+    r"""Compute the Gaussian weight of a fragment in object space, `exp(-4 rho^2)`, tapered at the
+    rim.
 
     Its tangent at the rim is taken off, `exp(-4 q) - exp(-4) (5 - 4 q)` with `q = rho^2`, so that
     value and derivative reach zero there, and the weight is positive inside.
@@ -25,7 +26,7 @@ def fragment_weight(squared_radius: Float[Array, "..."]) -> Float[Array, "..."]:
 def fragment_weight_derivative(
     squared_radius: Float[Array, "..."], weight: Float[Array, "..."]
 ) -> Float[Array, "..."]:
-    """Give the derivative of `fragment_weight` in `rho^2`, from the weight itself."""
+    """Compute the derivative of `fragment_weight` in `rho^2`, from the weight itself."""
     return -4 * weight - 16 * _AT_RIM * (1 - squared_radius)
 
 
@@ -43,8 +44,8 @@ _ROOT = (
 
 
 def fast_fragment_weight(squared_radius: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Give `fragment_weight`, exactly 0 at the rim; in float32 by a polynomial, which costs a third
-    of the exponential.
+    """Compute `fragment_weight`, exactly 0 at the rim; in float32 by a polynomial, which costs a
+    third of the exponential.
     """
     if squared_radius.dtype != jnp.float32:
         return jnp.where(squared_radius < 1, fragment_weight(squared_radius), 0.0)
@@ -56,8 +57,8 @@ def fast_fragment_weight(squared_radius: Float[Array, "..."]) -> Float[Array, ".
 
 
 def coverage(weight_sum: Float[Array, "..."], full: float) -> Float[Array, "..."]:
-    """Give the share of a pixel that a surface covers: a smooth step of the sum of its weights, 1
-    from `full` on.
+    """Compute the fraction of a pixel that a surface covers: a smooth step of the sum of its
+    weights, 1 from `full` on.
     """
     t = jnp.clip(weight_sum / full, 0, 1)
     return t * t * (3 - 2 * t)

@@ -99,8 +99,8 @@ class PerspectiveView(AbstractView):
         return self._in_sight(px, py, pz, splats.radii) & (nx * px + ny * py + nz * pz < 0)
 
     def _in_sight(self, x, y, z, radii):
-        """Say which spheres touch the pyramid of the picture. Others, far to the side, are beyond
-        what float32 projects.
+        """Mark the spheres that touch the pyramid of the picture. Others, far to the side, are
+        beyond what float32 projects.
         """
 
         def beside(offset, size):

@@ -13,7 +13,7 @@ from splatjax.scene import Splats
 from ._settings import SplattingSettings
 from ._views import AbstractView
 
-LEAST_WEIGHT = 0.06  # of a fragment that says where the surface behind the front is
+LEAST_WEIGHT = 0.06  # of a fragment that decides where the surface behind the front is
 
 
 def least_weight(
@@ -24,8 +24,8 @@ def least_weight(
     nearness: Float[Array, "*splats"],
     filter_radius: float,
 ) -> Float[Array, "*splats"]:
-    """Give `LEAST_WEIGHT`, and in proportion less for splats smaller than a pixel: the filter makes
-    them that much fainter.
+    """Compute `LEAST_WEIGHT`, and in proportion less for splats smaller than a pixel: the filter
+    makes them that much fainter.
     """
     # Disc and filter together have axes whose squares add up to r^2 (1 + cos^2) + 2 f^2.
     determinant = (a * c - 0.25 * b * b) * view.squared_radius(nearness, jnp.ones_like(a))
@@ -37,7 +37,7 @@ def least_weight(
 
 
 class Places(eqx.Module):
-    """How many tiles there is capacity for: of the front, and of the surface behind it. Static."""
+    """Capacity for tiles of the front, and of the surface behind it. Static."""
 
     front: int = eqx.field(static=True)
     behind: int = eqx.field(static=True)

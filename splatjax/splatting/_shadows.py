@@ -76,7 +76,7 @@ class Bounds(eqx.Module):
 
 
 def _facing(forward: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    """Give a rotation whose third row is `forward`; the other two are smooth in it wherever it is
+    """Build a rotation whose third row is `forward`; the other two are smooth in it wherever it is
     not along an axis' flip.
     """
     helper = jnp.where(
@@ -92,7 +92,7 @@ def _facing(forward: Float[Array, "3"]) -> Float[Array, "3 3"]:
 def distant_view(
     direction: Float[Array, "3"], bounds: Bounds, settings: ShadowSettings
 ) -> OrthographicView:
-    """Give what a directional light sees: the bounding sphere, in parallel."""
+    """Make the view of what a directional light sees: the bounding sphere, in parallel."""
     size = settings.resolution
     scale = 0.5 * (size - 4) / bounds.radius
     rotation = _facing(direction / jnp.linalg.norm(direction))
@@ -104,7 +104,9 @@ def distant_view(
 def near_view(
     position: Float[Array, "3"], bounds: Bounds, settings: ShadowSettings
 ) -> PerspectiveView:
-    """Give what a point light outside the bounding sphere sees: a frustum around the sphere."""
+    """Make the view of what a point light outside the bounding sphere sees: a frustum around the
+    sphere.
+    """
     to_center = bounds.center - position
     distance = jnp.linalg.norm(to_center)
     closest = distance * distance - bounds.radius * bounds.radius
@@ -121,7 +123,7 @@ def near_view(
 
 
 def cube_views(position: Float[Array, "3"], settings: ShadowSettings) -> list[PerspectiveView]:
-    """Give what a point light inside the bounding sphere sees: six faces of a cube."""
+    """Make the view of what a point light inside the bounding sphere sees: six faces of a cube."""
     size, dtype = settings.resolution, position.dtype
     axes = jnp.concatenate([jnp.eye(3, dtype=dtype), -jnp.eye(3, dtype=dtype)])
     focal_length = jnp.asarray(
@@ -143,7 +145,7 @@ def cube_views(position: Float[Array, "3"], settings: ShadowSettings) -> list[Pe
 def in_cube_face(
     view: PerspectiveView, points: Float[Array, "3 splats"]
 ) -> Float[Array, " splats"]:
-    """Say (1 or 0) which points belong to a face of the cube: those whose largest coordinate is
+    """Mark (1 or 0) the points that belong to a face of the cube: those whose largest coordinate is
     along its axis.
     """
     offset = points - view.position[:, None]
@@ -189,8 +191,8 @@ def make_shadow_map(
 
 
 def _spline(t: Float[Array, " splats"]) -> Float[Array, "3 splats"]:
-    """Give the quadratic B-spline's weights of the three pixels around a place; `t` in [-1/2, 1/2]
-    from the middle one.
+    """Compute the quadratic B-spline's weights of the three pixels around a place; `t` in [-1/2,
+    1/2] from the middle one.
     """
     return jnp.stack([0.5 * (0.5 - t) ** 2, 0.75 - t * t, 0.5 * (0.5 + t) ** 2])
 

@@ -193,7 +193,8 @@ def visible_surfaces(
     - `view`: differentiable.
     - `plan`: from an `AbstractRasterizer`.
 
-    **Returns:** `VisibleSurfaces`; NaN where the capacity of the plan is exceeded.
+    **Returns:** the surfaces; where the capacity of the plan is exceeded, `needed` is above 1 and
+    the rows are NaN.
     """
     sums = plan.sum_fragments(splats, attributes, view, settings, combination)
     return VisibleSurfaces.of(sums, view, settings, combination)

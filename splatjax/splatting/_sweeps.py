@@ -197,9 +197,8 @@ class PartSweep(eqx.Module):
             return self.sweep.within_picture(sums, self.bins.order[lanes])
 
         rows = self.slots.attributes.shape[1] + 2
-        return self._each_round(
-            tiles, add, zeros_after(beyond, (len(tiles), rows, SIDE**2), beyond.dtype)
-        )
+        nothing = zeros_after(beyond, (len(tiles), rows, SIDE**2), beyond.dtype)
+        return self._each_round(tiles, add, nothing)
 
     @jit_unless_traced
     def limits_behind(
@@ -263,9 +262,7 @@ def sum_parts(
     # Stage 1: where the front ends in any part.
     limits = combination.largest([each.limits() for each in part] for part in parts())
     shown = [jnp.any(each > -jnp.inf, axis=1) for each in limits]
-    fronts = [
-        _listed(shows, capacity.front) for shows, capacity in zip(shown, capacities, strict=True)
-    ]
+    fronts = [_listed(shown[k], capacities[k].front) for k in views]
     nearer = [_at_tiles(limits[k], fronts[k], jnp.inf) for k in views]
     nearer = [jnp.where(each > -jnp.inf, each, jnp.inf) for each in nearer]
     # Stage 2: the sums of the front.

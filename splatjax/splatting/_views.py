@@ -28,21 +28,21 @@ class AbstractView(eqx.Module):
 
     @abc.abstractmethod
     def may_see(self, splats: Splats) -> Bool[Array, " splats"]:
-        """Say which splats face the eye, with spheres that touch the picture: cheap, and never too
-        few.
+        """Mark the splats that face the eye and whose spheres touch the picture: cheap, and never
+        too few.
         """
 
     @staticmethod
     @abc.abstractmethod
     def inside(nearness: Float[Array, "..."], quadric: Float[Array, "..."]) -> Bool[Array, "..."]:
-        """Say whether a fragment lies within the rim."""
+        """Test whether a fragment lies within the rim."""
 
     @staticmethod
     @abc.abstractmethod
     def squared_radius(
         nearness: Float[Array, "..."], quadric: Float[Array, "..."]
     ) -> Float[Array, "..."]:
-        """Give `rho^2`, in units of the splat's radius, for a fragment inside."""
+        """Compute `rho^2`, in units of the splat's radius, for a fragment inside."""
 
     @staticmethod
     @abc.abstractmethod
@@ -51,21 +51,21 @@ class AbstractView(eqx.Module):
         squared_radius: Float[Array, "..."],
         cotangent: Float[Array, "..."],
     ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-        """Give the cotangents of nearness and quadric for one of `rho^2`."""
+        """Compute the cotangents of nearness and quadric for one of `rho^2`."""
 
     @staticmethod
     @abc.abstractmethod
     def shifted(nearness: Float[Array, "..."], shift: Float[Array, "..."]) -> Float[Array, "..."]:
-        """Give the nearness of a fragment moved away from the eye by epsilon."""
+        """Compute the nearness of a fragment moved away from the eye by epsilon."""
 
     @staticmethod
     @abc.abstractmethod
     def depth(nearness: Float[Array, "..."]) -> Float[Array, "..."]:
-        """Give the depth (mm along the forward axis) of a nearness."""
+        """Compute the depth (mm along the forward axis) of a nearness."""
 
     @abc.abstractmethod
     def project(self, points: Float[Array, "3 *points"]) -> tuple[Float[Array, "*points"], ...]:
-        """Give column, row (pixels) and depth (mm) of points."""
+        """Compute column, row (pixels) and depth (mm) of points."""
 
     @abc.abstractmethod
     def slant(
@@ -75,7 +75,7 @@ class AbstractView(eqx.Module):
         depth: Float[Array, "*points"],
         normals: Float[Array, "3 *points"],
     ) -> tuple[Float[Array, "*points"], Float[Array, "*points"], Float[Array, "*points"]]:
-        """Give, for planes at projected points, two numbers and a third whose quotients are the
+        """Compute, for planes at projected points, two numbers and a third whose quotients are the
         depth's slope, mm per pixel.
 
         The third is the cosine-like factor that vanishes where a plane is seen edge on."""
@@ -84,7 +84,7 @@ class AbstractView(eqx.Module):
     def unproject(
         self, x: Float[Array, "*points"], y: Float[Array, "*points"], depth: Float[Array, "*points"]
     ) -> Float[Array, "3 *points"]:
-        """Give the point in the world at a depth under a pixel."""
+        """Compute the point in the world at a depth under a pixel."""
 
 
 def rows(

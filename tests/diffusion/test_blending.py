@@ -1,5 +1,7 @@
 """Layers of the splats, blended and continued to points of the surface."""
 
+from functools import cache
+
 import bodies
 import equinox as eqx
 import jax
@@ -7,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from splatjax._combination import OneDevice
 from splatjax.diffusion import (
     EscapeNormalization,
     LayersAtPoints,
@@ -28,39 +29,41 @@ SPACING = RADIUS * (4 * np.pi / COUNT) ** 0.5
 GOAL = 2e-3, 1e-2, 3e-2
 
 
-def blended_and_exact(width: float, jitter: float):
-    """A layer so many spacings wide, blended at the pixels of a picture, and computed there."""
-    body = bodies.sphere(COUNT, RADIUS, jitter=jitter)
+@cache
+def blended_and_exact():
+    """Return a function of a variance: the layer blended at the pixels of a picture, and computed
+    there.
+    """
+    body = bodies.sphere(COUNT, RADIUS, jitter=0.0)
     view = bodies.perspective(fov=20.0, width=SIZE, height=SIZE)
+    settings = SplattingSettings()
+    plan = DenseRasterizer().make_plan([body], [view], settings)
     x, y, z = body.centers.T
-    light = jnp.where(x + 2 * jnp.sin(y) > 0, jnp.maximum(z / RADIUS, 0), 0)  # a hard shadow
-    light = jnp.stack([light, 0.7 + 0.3 * jnp.sin(1.5 * x) * jnp.sin(y)])
+    shadowed = jnp.where(x + 2 * jnp.sin(y) > 0, jnp.maximum(z / RADIUS, 0), 0)
+    light = jnp.stack([shadowed, 0.7 + 0.3 * jnp.sin(1.5 * x) * jnp.sin(y)])
     sources = Sources(body.centers.T, body.normals.T, body.areas, light)
-    variance = jnp.asarray((width * SPACING) ** 2)
-    depth = EscapeNormalization().depth * jnp.sqrt(variance)
 
     @jax.jit
-    def evaluate(sources):
+    def evaluate(variance):
+        depth = EscapeNormalization().depth * jnp.sqrt(variance)
         layer = dense_layer(sources, sources.centers, variance, depth)
         rows = continue_from_splats(layer, sources.centers)
         rows = jnp.concatenate([rows.values, rows.slopes.reshape(9, -1), sources.centers])
-        plan, settings = DenseRasterizer().make_plan([body], [view], None), SplattingSettings()
-        sums = plan.sum_fragments(body, rows, view, settings, OneDevice())
-        seen = bodies.pictures(sums, view, settings).front
-        pixels = jnp.mgrid[:SIZE, :SIZE][::-1].astype(float) + 0.5
-        points = view.unproject(*pixels, seen.depth).reshape(3, -1)
-        values, slopes, centers = jnp.split(seen.attributes.reshape(15, -1), [3, 12])
-        layer = LayerValues(values, slopes.reshape(3, 3, -1))
-        return continue_to_points(layer, centers, points), dense_layer(
-            sources, points, variance, depth
-        ).values
+        front = bodies.drawn(body, rows, view, settings, plan).front
+        pixels = jnp.mgrid[:SIZE, :SIZE][::-1].astype(rows.dtype) + 0.5
+        points = view.unproject(*pixels, front.depth).reshape(3, -1)
+        values, slopes, centers = jnp.split(front.attributes.reshape(15, -1), [3, 12])
+        blended = LayerValues(values, slopes.reshape(3, 3, -1))
+        exact = dense_layer(sources, points, variance, depth)
+        return continue_to_points(blended, centers, points), exact.values
 
-    return (np.asarray(each) for each in evaluate(sources))
+    return evaluate
 
 
 @pytest.mark.parametrize("width", [1.4, 2.0, 3.7])
 def test_blended_layers_of_evenly_spread_splats_meet_the_goal(width):
-    for ours, theirs in zip(*blended_and_exact(width, jitter=0.0), strict=True):
+    both = blended_and_exact()(jnp.asarray((width * SPACING) ** 2))
+    for ours, theirs in zip(*(np.asarray(each) for each in both), strict=True):
         error = np.abs(ours - theirs) / np.sqrt(np.mean(theirs**2))
         found = *np.quantile(error, [0.5, 0.99]), error.max()
         assert np.all(np.asarray(found) < GOAL), (width, found)

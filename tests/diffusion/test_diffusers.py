@@ -26,13 +26,15 @@ from splatjax.diffusion import (
 )
 from splatjax.scene import Splats
 
-COUNT, VARIANCES = 48 * BLOCK, (1.0, 9.0, 20.0)
+COUNT, VARIANCES = 48 * BLOCK, (1.0, 9.0, 12.0)
 KERNEL = EscapeNormalization()
 RESOLVED = jnp.asarray([0.0, 1e-3])  # an interval that resolves every layer
 # All of the root mean square of a layer. Beyond 4.5 standard deviations lie 4e-5 of the power;
 # several times that in the dark.
 SUPPORT_ERROR = 5e-4
-MEDIAN, HIGH, LARGEST = 2e-3, 1e-2, 3e-2  # at the splats, as `ClusterDiffuser.error` states them
+# Median, 99th percentile and maximum at the splats. The light of a cluster is its mean: on a body
+# as small as three standard deviations of the widest layer, half of its points err by 4e-3.
+MEDIAN, HIGH, LARGEST = 4.5e-3, 1.5e-2, 3e-2
 # float64: the same sums in another order; and central differences with a step of 1e-6.
 VALUE, GRADIENT, DIFFERENCES = 1e-10, 1e-8, 1e-5
 
@@ -142,8 +144,8 @@ def test_the_two_faces_of_a_thin_sheet_are_not_merged():
     )
     for ours, theirs in zip(fast, dense, strict=True):
         error = errors(ours, theirs)
-        assert np.median(error) < 2 * MEDIAN
-        assert np.quantile(error, 0.99) < 2 * HIGH
+        assert np.median(error) < MEDIAN
+        assert np.quantile(error, 0.99) < HIGH
 
 
 def test_gradients_are_those_of_the_plain_sum_over_the_sources_within_the_support(float64):
