@@ -62,11 +62,35 @@ def timed(function: Callable, *given):
     return found, time.perf_counter() - start
 
 
-def untruncated(sources: diffusion.Sources, points, variances, kernel) -> list[np.ndarray]:
-    """Compute the means and the mass of every layer at points `[3, points]`, over every splat."""
-    layer = jax.jit(diffusion.dense_layer)
-    layers = zip(variances, kernel.depths(variances), strict=True)
-    return [np.asarray(layer(sources, points, *own).values) for own in layers]
+def untruncated(
+    sources: diffusion.Sources, points, light: diffusion.LayersAtPoints
+) -> tuple[np.ndarray, np.ndarray]:
+    """Compute the means and the mass of every layer at points `[3, points]`, over every splat.
+
+    Layers that no splat resolves are 0.
+    """
+    layer, channels = jax.jit(diffusion.dense_layer), len(sources.irradiance)
+    values = np.zeros((len(light.variances), channels + 1, points.shape[1]), np.float32)
+    for k in np.flatnonzero(light.resolvable):
+        own = light.variances[k], light.kernel.depths(light.variances)[k]
+        values[k] = layer(sources, points, *own).values
+    return values[:, :channels], values[:, channels]
+
+
+def layers_of(
+    light: diffusion.LayersAtPoints, picked, gaussians: sj.SumOfGaussians, exact
+) -> tuple[np.ndarray, np.ndarray]:
+    """Compute `L_k` at some of the points, and by exact means and mass there."""
+    rows = {name: getattr(light, name)[..., picked] for name in ROWS}
+    own = dataclasses.replace(light, **rows)
+    means, mass = (jnp.asarray(each) for each in exact)
+    truth, none = dataclasses.replace(own, means=means, mass=mass), jnp.zeros(means.shape[1])
+    return tuple(np.asarray(each.weigh(gaussians, none)[0]) for each in (own, truth))
+
+
+def seen_in_front(basis: sj.DiffusionBasis) -> np.ndarray:
+    """Return the indices of the points of the surface in front."""
+    return np.flatnonzero((basis.in_front > 0) & (jnp.max(basis.leaving, axis=0) > 0))
 
 
 def deviations(found: np.ndarray, exact: np.ndarray) -> np.ndarray:
@@ -84,8 +108,7 @@ def main() -> None:
     if options.white:
         scene = eqx.tree_at(lambda s: s.splats.albedo, scene, None)
     gaussians, kernel, exact = scene.material.gaussians, sj.RenderSettings().kernel, None
-    channels = gaussians.weights.shape[1]
-    none, rng = jnp.zeros(channels), np.random.default_rng(0)
+    rng = np.random.default_rng(0)
     chosen = rng.choice(scene.splats.count, options.points, replace=False)
     for error in options.errors:
         settings = sj.RenderSettings(diffuser=diffusion.ClusterDiffuser(error=error))
@@ -113,26 +136,18 @@ def main() -> None:
         # The layers at the pixels: blended, and by the sums over all splats at the same points.
         basis = sj.diffusion_basis(scene, camera, settings, plan)
         if exact is None:
-            shown = (basis.in_front > 0) & (jnp.max(basis.leaving, axis=0) > 0)
-            picked = rng.choice(np.flatnonzero(shown), options.points, replace=False)
+            picked = rng.choice(seen_in_front(basis), options.points, replace=False)
             pixels = np.asarray(basis.pixels[picked])
             points = frame.position.reshape(-1, 3)[pixels].T
-            places = points, splats.centers[chosen].T
-            exact, at_splats = (
-                np.stack(untruncated(sources, each, gaussians.variances, kernel)) for each in places
-            )
-        rows = {name: getattr(basis.light, name)[..., picked] for name in ROWS}
-        light = dataclasses.replace(basis.light, **rows)
+            exact = untruncated(sources, points, basis.light)
+            means_at_splats, _ = untruncated(sources, splats.centers[chosen].T, basis.light)
         resolved = np.flatnonzero(basis.light.resolvable)
-        truth = dataclasses.replace(
-            light, means=jnp.asarray(exact[:, :channels]), mass=jnp.asarray(exact[:, channels])
-        )
-        both = (np.asarray(each.weigh(gaussians, none)[0])[resolved] for each in (light, truth))
-        off = deviations(*both)
+        found, truth = layers_of(basis.light, picked, gaussians, exact)
+        off = deviations(found[resolved], truth[resolved])
         order = np.empty(splats.count, int)
         order[np.asarray(plan.order)[np.asarray(plan.exists)]] = np.flatnonzero(plan.exists)
         means = np.stack([np.asarray(diffused.layers[k].means)[:, order[chosen]] for k in resolved])
-        off_at_splats = deviations(means, at_splats[resolved, :channels])
+        off_at_splats = deviations(means, means_at_splats[resolved])
         print(
             f"error={error:g}: pass 4 {1e3 * seconds:.0f} ms, at all splats "
             f"{1e3 * all_seconds:.0f} ms; frame {1e3 * frame_seconds:.0f} ms\n"

@@ -10,7 +10,6 @@ import argparse
 from pathlib import Path
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from PIL import Image
@@ -18,6 +17,7 @@ from PIL import Image
 import splatjax as sj
 from splatjax import diffusion
 
+from .diffusion_error import layers_of, seen_in_front, untruncated
 from .scenes import BODIES, columns, lit
 
 VARIANCES = (4.0, 8.0, 16.0, 32.0)  # mm^2: what splats a millimeter apart carry
@@ -67,21 +67,17 @@ def main() -> None:
     light = sj.illuminate(scene, plan, settings)
     source, splats = sj.compute_irradiance(scene, plan, settings).source, scene.splats
     sources = diffusion.Sources(splats.centers.T, splats.normals.T, splats.areas, source)
-    dense, depths = jax.jit(diffusion.dense_layer), settings.kernel.depths(jnp.asarray(VARIANCES))
     layers = {"fast": [], "exact": []}
     for i, each in enumerate(cameras):
         basis = sj.diffusion_basis(scene, each, settings, plan)
         frame = sj.render(scene, each, settings, plan, light=light)
-        front = np.flatnonzero((basis.in_front > 0) & (jnp.max(basis.leaving, axis=0) > 0))
+        front = seen_in_front(basis)
         pixels = np.asarray(basis.pixels)[front]
-        points = frame.position.reshape(-1, 3)[pixels].T
-        exact = [
-            dense(sources, points, jnp.asarray(variance), depth).means
-            for variance, depth in zip(VARIANCES, depths, strict=True)
-        ]
-        for name, means in (("fast", basis.light.means[..., front]), ("exact", jnp.stack(exact))):
+        exact = untruncated(sources, frame.position.reshape(-1, 3)[pixels].T, basis.light)
+        both = layers_of(basis.light, front, scene.material.gaussians, exact)
+        for name, found in zip(layers, both, strict=True):
             picture = np.zeros((len(VARIANCES), options.width**2, 3), np.float32)
-            picture[:, pixels] = np.moveaxis(np.asarray(means), 1, 2)
+            picture[:, pixels] = np.moveaxis(found, 1, 2)
             layers[name].append(picture.reshape(-1, options.width, options.width, 3))
         print(f"  frame {i + 1} of {len(cameras)}", flush=True)
     layers = {name: np.stack(pictures) for name, pictures in layers.items()}
