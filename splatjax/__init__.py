@@ -51,7 +51,7 @@ from .io import (
     load_profile as load_profile,
 )
 from .io import read_observations as read_observations, read_profile as read_profile
-from .io import materials as materials, save_material as save_material
+from .io import list_materials as list_materials, save_material as save_material
 from .scene import Camera as Camera, DirectionalLight as DirectionalLight, Frame as Frame
 from .scene import GaussianBeam as GaussianBeam, Material as Material, PointLight as PointLight
 from .scene import Scene as Scene, Splats as Splats

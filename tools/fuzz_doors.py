@@ -25,9 +25,9 @@ def _splats(path: Path) -> object:
 
 
 def _mesh(path: Path) -> object:
-    from splatjax.io import read_mesh
+    from splatjax.io import read_textured_mesh
 
-    return read_mesh(path, mm_per_unit=1.0)
+    return read_textured_mesh(path, mm_per_unit=1.0)
 
 
 def _exr(path: Path) -> object:
@@ -38,7 +38,7 @@ def _exr(path: Path) -> object:
 
 
 def _picture(path: Path) -> object:
-    from splatjax.io._pictures import read_color
+    from splatjax.io._images import read_color
 
     return read_color(path)
 

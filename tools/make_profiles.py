@@ -15,7 +15,7 @@ import numpy as np
 
 from splatjax.fitting import FitResult, NonNegativeWeights, TotalReflectanceHeld, fit_gaussians
 from splatjax.gaussians import SumOfGaussians
-from splatjax.io import load_profile, materials, profiles_folder, save_material
+from splatjax.io import list_materials, load_profile, profiles_folder, save_material
 from splatjax.scene import Material
 
 COUNT = 6
@@ -57,7 +57,7 @@ def _rounded(values: jax.Array, digits: int = DIGITS) -> jax.Array:
 
 
 def main(names: list[str]) -> None:
-    for name in names or materials():
+    for name in names or list_materials():
         if not {"medium", "layers"} & set(
             tomllib.loads((profiles_folder() / f"{name}.toml").read_text(encoding="utf-8"))
         ):

@@ -41,7 +41,7 @@ class Materials:
         for title in ("material", "known", "total reflectance", "widest, mm", "eta", "source"):
             justify = "right" if title in ("total reflectance", "widest, mm", "eta") else "left"
             table.add_column(title, justify=justify, no_wrap=True)
-        for name in sj.materials():
+        for name in sj.list_materials():
             material = sj.load_material(name)
             reflectance = "  ".join(f"{float(share):.3f}" for share in material.total_reflectance())
             widest = float(material.gaussians.variances.max()) ** 0.5

@@ -14,7 +14,7 @@ import numpy as np
 import tyro
 
 import splatjax as sj
-from splatjax.io import check_room, fingerprint, free_bytes, material_path, own_version
+from splatjax.io import check_memory, fingerprint, free_bytes, material_path, own_version
 from splatjax.scene import Parts
 
 from ._options import MaterialName
@@ -100,9 +100,9 @@ class Shot:
             )
         if self.splats is None:
             fits = f"take {free_bytes() / _BYTES_PER_SPLAT:.0f} at most"
-            check_room(f"--count {self.count}", _BYTES_PER_SPLAT * self.count, fits)
+            check_memory(f"--count {self.count}", _BYTES_PER_SPLAT * self.count, fits)
         fits = f"take {free_bytes() / _BYTES_PER_PIXEL:.0f} pixels at most"
-        check_room(
+        check_memory(
             f"--width {self.width} --height {self.height}",
             _BYTES_PER_PIXEL * self.width * self.height,
             fits,

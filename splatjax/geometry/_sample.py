@@ -7,17 +7,20 @@ from jaxtyping import Float
 from splatjax.scene import Splats
 
 from ._cells import Cells, surface_cells
+from ._creases import faces_beyond
 from ._mesh import Mesh
-from ._rounding import rounded_area, rounded_positions
-from ._scatter import SurfacePoints, faces_beyond, mirrored, scatter
-from ._textures import Textures, lookup, perturbed_normals, texture_coordinates, worn_albedo
+from ._rounding import Rounding
+from ._scatter import SurfacePoints, mirrored, scatter
+from ._textures import Textures, albedo_at, lookup_at, perturbed_normals
+
+_PLAIN = Textures()
 
 
 def sample_mesh(
     mesh: Mesh,
     count: int,
     *,
-    textures: Textures | None = None,
+    textures: Textures = _PLAIN,
     seed: int = 0,
     rounded: bool = False,
 ) -> Splats:
@@ -27,7 +30,7 @@ def sample_mesh(
 
     - `mesh`: mm, with positive area.
     - `count`: of splats, at least 1.
-    - `textures`: looked up bilinearly at every splat; `None` for a plain surface.
+    - `textures`: looked up bilinearly at every splat.
     - `seed`: another spread of the same quality; the same seed gives the same splats.
     - `rounded`: put them where the surface is that bends as the mesh's normals do, instead of on
       flat triangles.
@@ -45,14 +48,13 @@ def sample_mesh(
 
 
 def splats_at(
-    mesh: Mesh, points: SurfacePoints, textures: Textures | None = None, *, rounded: bool = False
+    mesh: Mesh, points: SurfacePoints, textures: Textures = _PLAIN, *, rounded: bool = False
 ) -> Splats:
     """Make splats of points on a mesh, its textures baked in; the rest as `sample_mesh` has it."""
-    centers, area = (
-        (rounded_positions(mesh, points), rounded_area(mesh))
-        if rounded
-        else (points.positions(mesh), mesh.area())
-    )
+    centers, area = points.positions(mesh), mesh.area()
+    if rounded:
+        rounding = Rounding(mesh)
+        centers, area = rounding.positions(points), rounding.area()
     normals = points.normals(mesh)
     spacing = float(np.sqrt(area / len(centers)))
     cells = surface_cells(
@@ -63,16 +65,13 @@ def splats_at(
     )
     areas = cells.areas * (area / cells.areas.sum())
     radii = _radii(areas, cells)
-    albedo = worn_albedo(textures, mesh, points)
-    specular = roughness = None
-    if textures is not None:
-        uvs = texture_coordinates(mesh, points)
-        specular, roughness, tangent_space = (
-            None if picture is None else lookup(picture, uvs)
-            for picture in (textures.specular, textures.roughness, textures.normal)
-        )
-        if tangent_space is not None:
-            normals = perturbed_normals(mesh, points, normals, tangent_space)
+    specular, roughness, tangent_space = (
+        lookup_at(mesh, points, picture)
+        for picture in (textures.specular, textures.roughness, textures.normal)
+    )
+    if tangent_space is not None:
+        normals = perturbed_normals(mesh, points, normals, tangent_space)
+    albedo = albedo_at(textures, mesh, points)
     return make_splats(centers, normals, radii, areas, albedo, specular, roughness)
 
 

@@ -7,6 +7,7 @@ import scipy  # its parts are loaded where they are used, which takes a third of
 from jaxtyping import Float, Int
 
 from ._cells import Ghosts, surface_cells
+from ._creases import faces_beyond
 from ._mesh import Mesh, unit
 from ._morton import morton_order
 
@@ -88,31 +89,6 @@ def _deal(mesh: Mesh, areas: np.ndarray, count: int, random: np.random.Generator
     u, v = ((random.uniform() + index / _PLASTIC**k) % 1.0 for k in (1, 2))
     u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
     return SurfacePoints(faces, np.stack([1 - u - v, u, v], axis=-1))
-
-
-def faces_beyond(mesh: Mesh) -> Int[np.ndarray, "faces 3"]:
-    """Give, per face and corner, the face beyond the edge opposite to the corner; -1 at an open
-    edge.
-    """
-    beyond = _beyond(mesh.faces)
-    if (
-        beyond < 0
-    ).any():  # textures cut meshes open along their seams: vertices at one place are one
-        beyond = _beyond(
-            np.unique(mesh.vertices, axis=0, return_inverse=True)[1].reshape(-1)[mesh.faces]
-        )
-    return beyond
-
-
-def _beyond(faces: Int[np.ndarray, "faces 3"]) -> Int[np.ndarray, "faces 3"]:
-    edges = faces[:, [[1, 2], [2, 0], [0, 1]]].reshape(-1, 2)
-    key = edges.min(axis=1) * np.int64(faces.max() + 1) + edges.max(axis=1)
-    order = np.argsort(key, kind="stable")
-    same = key[order][1:] == key[order][:-1]
-    beyond = np.full(len(key), -1)
-    first, second = order[:-1][same], order[1:][same]
-    beyond[first], beyond[second] = second // 3, first // 3
-    return beyond.reshape(-1, 3)
 
 
 def mirrored(

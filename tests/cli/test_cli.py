@@ -33,7 +33,7 @@ eta = 1.3
 def test_materials_lists_the_library(capsys):
     assert main(["materials"]) == 0
     listed = [line.split()[0] for line in capsys.readouterr().out.splitlines()[1:]]
-    assert listed == list(sj.materials())
+    assert listed == list(sj.list_materials())
     assert "skin" in listed
 
 
@@ -432,8 +432,8 @@ def test_render_without_scattering_is_lambertian(tmp_path, capsys):
 
 XYZ = ("x", "y", "z")
 BAD_SPLATS = {
-    "empty": ([], XYZ, "empty"),
-    "nan": ([(0, 0, 0), (1, "nan", 0)], XYZ, "not finite"),
+    "empty": ([], XYZ, "no rows"),
+    "nan": ([(0, 0, 0), (1, "nan", 0)], XYZ, "1 nan 0"),
     "zero radius": ([(0, 0, 0, 0), (1, 0, 0, 1)], (*XYZ, "radius"), "positive"),
     "negative radius": ([(0, 0, 0, -1), (1, 0, 0, 1)], (*XYZ, "radius"), "positive"),
 }

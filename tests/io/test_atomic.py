@@ -25,70 +25,37 @@ from splatjax.io import (
 )
 
 
-def test_file_takes_its_name_when_the_block_ends_well(tmp_path):
-    target = tmp_path / "a.txt"
-    with atomic_path(target) as temporary:
-        assert temporary.parent == target.parent
-        assert temporary.suffix == ".txt"
-        temporary.write_text("whole")
-        assert not target.exists()
-    assert target.read_text() == "whole"
-    assert list(tmp_path.iterdir()) == [target]
-
-
 def _write_half(target):
     with atomic_path(target) as temporary:
+        assert (temporary.parent, temporary.suffix) == (target.parent, target.suffix)
         temporary.write_text("ha")
         raise RuntimeError("midway")
 
 
-def test_failure_leaves_what_stood_there_before(tmp_path):
+def test_a_file_takes_its_name_only_when_the_block_ends_well(tmp_path):
     target = tmp_path / "a.txt"
-    target.write_text("before")
+    with atomic_path(target) as temporary:
+        temporary.write_text("whole")
+        assert not target.exists()
     with pytest.raises(RuntimeError, match="midway"):
         _write_half(target)
-    assert target.read_text() == "before"
+    assert target.read_text() == "whole"
     assert list(tmp_path.iterdir()) == [target]
 
 
-def test_missing_folder_is_named_with_the_remedy(tmp_path):
-    target = tmp_path / "nowhere" / "a.txt"
-    with (
-        pytest.raises(FileNotFoundError, match="nowhere does not exist; make it first"),
-        atomic_path(target),
-    ):
-        pass
-
-
-def test_a_folder_is_no_file(tmp_path):
-    with pytest.raises(IsADirectoryError, match="name a file"), atomic_path(tmp_path):
-        pass
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        ("nowhere/a.txt", FileNotFoundError),
+        ("folder", IsADirectoryError),
+        ("file/a.txt", NotADirectoryError),
+    ],
+)
+def test_places_that_cannot_be_written_to(tmp_path, name, kind):
+    (tmp_path / "folder").mkdir()
     (tmp_path / "file").write_text("")
-    with (
-        pytest.raises(NotADirectoryError, match="is a file"),
-        atomic_path(tmp_path / "file" / "a.txt"),
-    ):
+    with pytest.raises(kind, match=name), atomic_path(tmp_path / name):
         pass
-
-
-def test_what_a_kill_left_behind_goes_when_the_file_is_written_next(tmp_path):
-    """A process that holds its temporary file keeps it; those of other files, and whatever else
-    lies there, stay.
-    """
-    target = tmp_path / "a.txt"
-    left, other, alike = (
-        tmp_path / name for name in (".a-0123abcd.txt", ".b-0123abcd.txt", ".a-0123abcx.txt")
-    )
-    for path in (left, other, alike):
-        path.write_text("half")
-    with atomic_path(target) as first:
-        assert not left.exists()
-        with atomic_path(target) as second:
-            assert first.exists()
-            second.write_text("second")
-        first.write_text("first")
-    assert target.read_text() == "first"
-    assert {path.name for path in tmp_path.iterdir()} == {"a.txt", other.name, alike.name}
 
 
 KILLED = """
@@ -100,18 +67,23 @@ with atomic_path(sys.argv[1]) as temporary:
 """
 
 
-def test_a_kill_leaves_the_file_that_stood_there(tmp_path):
-    target = tmp_path / "a.txt"
-    target.write_text("before")
-    assert (
-        subprocess.run([sys.executable, "-c", KILLED, str(target)], check=False).returncode
-        == -signal.SIGKILL
-    )
-    assert target.read_text() == "before"
-    assert len(list(tmp_path.iterdir())) == 2
-    with atomic_path(target) as temporary:
-        temporary.write_text("after")
-    assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
+def test_what_a_kill_leaves_is_removed_when_the_file_is_written_next(tmp_path):
+    """What stood there stays; and so do temporary files of processes that run, and other files."""
+    target, other = tmp_path / "a.txt", tmp_path / "b.txt"
+    for path in (target, other):
+        path.write_text("before")
+        words = [sys.executable, "-c", KILLED, str(path)]
+        assert subprocess.run(words, check=False).returncode == -signal.SIGKILL
+        assert path.read_text() == "before"
+    assert len(list(tmp_path.iterdir())) == 4
+    with atomic_path(target) as first:
+        first.write_text("first")
+        with atomic_path(target) as second:
+            assert first.exists()
+            second.write_text("second")
+    assert target.read_text() == "first"
+    left = {path.name for path in tmp_path.iterdir()} - {"a.txt", "b.txt"}
+    assert [name[:3] for name in left] == [".b-"]
 
 
 WRITERS = {

@@ -83,54 +83,31 @@ def test_all_files_are_named(listed, tmp_path):
     assert names == ["pictures.toml", "one.exr", "mask.exr", "one.exr"]
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "said"),
-    [
-        (
-            'file = "one.exr"\nmask',
-            "mask",
-            r"\[pictures 1\] has no file; it must be the name of an EXR file",
-        ),
-        ("noise = 0.02", "noise = 0", r"\[pictures 1\] noise must be a number, positive; it is 0"),
-        ("noise = 0.02", "nois = 0.02", r"has an unknown entry 'nois'; did you mean 'noise'"),
-        (
-            '"unknown"',
-            '"maybe"',
-            r"intensity must be one of known, unknown, unknown color; it is 'maybe'",
-        ),
-        (
-            "[0, 1, 50]",
-            "[0, 1]",
-            r"\[pictures 1 camera\] position must be three numbers; it is \[0.0, 1.0\]",
-        ),
-        (
-            "[0, 1, 50]",
-            "[0, 50, 0]",
-            r"\[pictures 1 camera\] up is \[0.0, 1.0, 0.0\], along the line of sight",
-        ),
-        (
-            "[0, 1, 50]",
-            "[0, 0, 0]",
-            r"\[pictures 1 camera\] the camera stands at \[0.0, 0.0, 0.0\], where it looks at",
-        ),
-        (
-            "[0, 0, -1]",
-            "[0, 0, 0]",
-            r"\[pictures 1 lights 1\] direction must be three numbers, not all 0",
-        ),
-        ("[1, 2, 3]", "[1, 2]", r"irradiance must be 3 numbers, as its picture has channels"),
-        ('"directional"', '"sun"', r"kind must be one of directional, point, beam; it is 'sun'"),
-        ("cast_shadows = false", "cast_shadows = 0", "cast_shadows must be true or false; it is 0"),
-        ("fov = 30", "fov = 200", "fov must be a number, between 0 and 180 degrees; it is 200"),
-    ],
-)
-def test_what_is_wrong_is_said(listed, old, new, said):
-    with pytest.raises(ValueError, match=said):
+BAD = [
+    ('file = "one.exr"\nmask', "mask", r"\[pictures 1\] file .* None"),
+    ("noise = 0.02", "noise = 0", r"\[pictures 1\] noise .* 0$"),
+    ("noise = 0.02", "nois = 0.02", r"\[pictures 1\] .*'nois'; did you mean 'noise'"),
+    ('"unknown"', '"maybe"', r"\[pictures 1\] intensity .*'maybe'"),
+    ("[0, 1, 50]", "[0, 1]", r"\[pictures 1 camera\] position .*\[0, 1\]"),
+    ("[0, 1, 50]", "[0, 50, 0]", r"\[pictures 1 camera\].* up is"),
+    ("[0, 1, 50]", "[0, 0, 0]", r"\[pictures 1 camera\].* the camera stands at"),
+    ("[0, 0, -1]", "[0, 0, 0]", r"\[pictures 1 lights 1\] direction .*\[0, 0, 0\]"),
+    ("[1, 2, 3]", "[1, 2]", r"\[pictures 1 lights 1\] irradiance .*\[1, 2\]"),
+    ('"directional"', '"sun"', r"\[pictures 1 lights 1\] kind .*'sun'"),
+    ("cast_shadows = false", "cast_shadows = 0", r"\[pictures 1 lights 2\] cast_shadows .* 0$"),
+    ("intensity = 5", "power = 5", r"\[pictures 1 lights 2\] .*'power'"),
+    ("fov = 30", "fov = 200", r"\[pictures 1 camera\] fov .* 200$"),
+]
+
+
+@pytest.mark.parametrize(("old", "new", "value"), BAD)
+def test_what_is_wrong_is_named(listed, old, new, value):
+    with pytest.raises(ValueError, match=value):
         sj.read_observations(listed(GOOD.replace(old, new)))
 
 
 def test_files_that_list_nothing_are_refused(listed, tmp_path):
-    with pytest.raises(ValueError, match=r"must hold one \[\[pictures\]\] or more"):
+    with pytest.raises(ValueError, match="unknown entry 'medium'"):
         sj.read_observations(listed("[medium]\n"))
     with pytest.raises(ValueError, match="is no TOML file"):
         sj.read_observations(listed("[[pictures"))

@@ -1,4 +1,4 @@
-"""Frames in OpenEXR, pictures in PNG."""
+"""Frames in OpenEXR, pictures in PNG, and those that move."""
 
 import shutil
 import subprocess
@@ -10,14 +10,10 @@ import OpenEXR
 import pytest
 from PIL import Image
 
-from splatjax.io import read_exr, write_exr, write_png
-from splatjax.io._color import linear_to_srgb
+from splatjax.io import read_exr, read_manifest, write_animation, write_exr, write_png
 from splatjax.scene import Frame
 
-TOOLS = [
-    (["exrheader"], "diffusion.4.G, 32-bit floating-point"),
-    (["oiiotool", "--info", "-v"], "diffusion.4.G"),
-]
+TOOLS = [["exrheader"], ["oiiotool", "--info", "-v"]]
 
 
 def some_frame(channels=3, gaussians=4, lights=2, height=6, width=5) -> Frame:
@@ -25,38 +21,34 @@ def some_frame(channels=3, gaussians=4, lights=2, height=6, width=5) -> Frame:
     random = np.random.default_rng(3)
 
     def noise(*shape):
-        return random.uniform(0, 1, shape).astype(np.float32)
+        return jnp.asarray(random.uniform(0, 1, shape).astype(np.float32))
 
-    layers, weights = noise(gaussians, height, width, channels), noise(gaussians, channels)
-    diffuse, specular = (
-        (layers * weights[:, None, None]).sum(axis=0),
-        noise(height, width, channels),
+    size, colors = (height, width), (height, width, channels)
+    layers, weights = noise(gaussians, *colors), noise(gaussians, channels)
+    diffuse, specular = (layers * weights[:, None, None]).sum(axis=0), noise(*colors)
+    return Frame(
+        beauty=diffuse + specular,
+        coverage=noise(*size),
+        depth=noise(*size).at[0, 0].set(jnp.inf),
+        position=noise(*size, 3),
+        normal=noise(*size, 3),
+        albedo=noise(*colors),
+        shadow=noise(lights, *size),
+        irradiance=noise(*colors),
+        layers=layers,
+        weights=weights,
+        diffuse=diffuse,
+        specular=specular,
+        handed_over=noise(gaussians),
+        overflow=jnp.zeros((), jnp.float32),
+        single_scattering=noise(*colors) if channels == 1 else None,
     )
-    depth = noise(height, width)
-    depth[0, 0] = np.inf
-    parts = {
-        "beauty": diffuse + specular,
-        "coverage": noise(height, width),
-        "depth": depth,
-        "position": noise(height, width, 3),
-        "normal": noise(height, width, 3),
-        "albedo": noise(height, width, channels),
-        "shadow": noise(lights, height, width),
-        "irradiance": noise(height, width, channels),
-        "layers": layers,
-        "weights": weights,
-        "diffuse": diffuse,
-        "specular": specular,
-        "handed_over": noise(gaussians),
-        "overflow": np.zeros((), np.float32),
-    }
-    return Frame(**{name: jnp.asarray(values) for name, values in parts.items()})
 
 
 @pytest.mark.parametrize(("channels", "lights", "gaussians"), [(3, 2, 11), (1, 0, 1), (12, 1, 3)])
 def test_frame_comes_back_bit_by_bit(tmp_path, channels, lights, gaussians):
     frame = some_frame(channels, gaussians, lights)
-    write_exr(tmp_path / "frame.exr", frame)
+    write_exr(tmp_path / "frame.exr", jax.tree.map(lambda leaf: leaf.astype(float), frame))
     back = read_exr(tmp_path / "frame.exr")
     for one, other in zip(jax.tree.leaves(frame), jax.tree.leaves(back), strict=True):
         assert other.dtype == jnp.float32
@@ -65,12 +57,12 @@ def test_frame_comes_back_bit_by_bit(tmp_path, channels, lights, gaussians):
 
 
 def test_diffuse_is_rebuilt_from_layers_and_header_alone(tmp_path):
-    write_exr(tmp_path / "frame.exr", some_frame(), variances=[0.1, 0.2, 0.4, 7.5])
-    with OpenEXR.File(str(tmp_path / "frame.exr"), separate_channels=True) as file:
-        header, planes = (
-            dict(file.header()),
-            {name: np.array(channel.pixels) for name, channel in file.channels().items()},
-        )
+    manifest = {"--width": 5, "splats": None}
+    path = tmp_path / "frame.exr"
+    write_exr(path, some_frame(), variances=[0.1, 0.2, 0.4, 7.5], manifest=manifest)
+    with OpenEXR.File(str(path), separate_channels=True) as file:
+        header = dict(file.header())
+        planes = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
     for channel, letter in enumerate("RGB"):
         rebuilt = sum(
             header[f"splatjax.weights.{k}"][channel] * planes[f"diffusion.{k}.{letter}"]
@@ -80,42 +72,17 @@ def test_diffuse_is_rebuilt_from_layers_and_header_alone(tmp_path):
     np.testing.assert_allclose(header["splatjax.variances"], [0.1, 0.2, 0.4, 7.5], rtol=1e-7)
     np.testing.assert_allclose(np.ravel(header["chromaticities"])[:2], [0.64, 0.33], rtol=1e-6)
     assert all(plane.dtype == np.float32 for plane in planes.values())
+    assert read_manifest(path) == manifest
 
 
-def test_frames_of_double_precision_are_written_in_single(tmp_path):
-    frame = jax.tree.map(
-        lambda leaf: jnp.asarray(np.asarray(leaf, np.float64), dtype=float), some_frame()
-    )
-    write_exr(tmp_path / "frame.exr", frame)
-    np.testing.assert_array_equal(
-        np.asarray(read_exr(tmp_path / "frame.exr").beauty), np.asarray(frame.beauty, np.float32)
-    )
-
-
-@pytest.mark.parametrize(
-    ("command", "said"),
-    [
-        (command, said) for command, said in TOOLS if shutil.which(command[0])
-    ],  # Debian: openexr, openimageio-tools
-)
-def test_common_tools_list_the_layers(tmp_path, command, said):
+@pytest.mark.parametrize("command", [each for each in TOOLS if shutil.which(each[0])])
+def test_common_tools_list_the_layers(tmp_path, command):
+    """Debian: openexr, openimageio-tools."""
     write_exr(tmp_path / "frame.exr", some_frame())
-    told = subprocess.run(
-        [*command, str(tmp_path / "frame.exr")], capture_output=True, text=True, check=True
-    ).stdout
-    assert said in told
-    for name in (
-        "R",
-        "A",
-        "Z",
-        "position.X",
-        "normal.Z",
-        "albedo.R",
-        "shadow.2",
-        "irradiance.B",
-        "specular.G",
-    ):
-        assert name in told
+    words = [*command, str(tmp_path / "frame.exr")]
+    printed = subprocess.run(words, capture_output=True, text=True, check=True).stdout
+    for name in ("R", "A", "Z", "position.X", "albedo.R", "shadow.2", "diffusion.4.G"):
+        assert name in printed
 
 
 def test_exr_that_cannot_be_read_is_refused(tmp_path):
@@ -123,13 +90,16 @@ def test_exr_that_cannot_be_read_is_refused(tmp_path):
         read_exr(tmp_path / "none.exr")
     write_exr(tmp_path / "frame.exr", some_frame())
     whole = (tmp_path / "frame.exr").read_bytes()
-    (tmp_path / "cut.exr").write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(ValueError, match=r"cut.exr: cannot be read as OpenEXR"):
-        read_exr(tmp_path / "cut.exr")
+    for size in range(0, len(whole), len(whole) // 40):
+        (tmp_path / "cut.exr").write_bytes(whole[:size])
+        with pytest.raises(ValueError, match=r"cut.exr: cannot be read as a picture"):
+            read_exr(tmp_path / "cut.exr")
     with OpenEXR.File({"type": OpenEXR.scanlineimage}, {"R": np.zeros((2, 2), np.float32)}) as file:
         file.write(str(tmp_path / "other.exr"))
     with pytest.raises(ValueError, match=r"other.exr: lacks .*, so it is no frame"):
         read_exr(tmp_path / "other.exr")
+    with pytest.raises(ValueError, match=r"other.exr: does not record what it was made of"):
+        read_manifest(tmp_path / "other.exr")
 
 
 def test_png_encodes_for_the_display(tmp_path):
@@ -166,13 +136,37 @@ def test_png_refuses_what_has_no_colors(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_encoding_for_the_screen_is_that_of_colour_science():
-    import colour
+@pytest.fixture
+def frames(tmp_path):
+    """Three frames of noise."""
+    paths = [tmp_path / f"{i}.png" for i in range(3)]
+    for i, path in enumerate(paths):
+        write_png(path, np.random.default_rng(i).uniform(0, 1, (6, 5, 3)))
+    return paths
 
-    linear = np.concatenate(
-        [np.linspace(-0.5, 1.5, 1001), np.geomspace(1e-6, 1, 100), [0.0031308, np.nan, np.inf]]
-    )
-    clipped = np.clip(np.nan_to_num(linear, nan=0.0), 0, 1)
-    np.testing.assert_allclose(
-        linear_to_srgb(linear), colour.cctf_encoding(clipped, function="sRGB"), atol=1e-15
-    )
+
+def test_animation_keeps_the_colors_and_the_time(tmp_path, frames):
+    write_animation(tmp_path / "film.webp", frames, frames_per_second=24.0)
+    write_animation(tmp_path / "still.webp", frames[:1])
+    with Image.open(tmp_path / "film.webp") as film, Image.open(tmp_path / "still.webp") as still:
+        assert (still.n_frames, film.n_frames, film.size, film.info["loop"]) == (1, 3, (5, 6), 0)
+        durations = []
+        for i, frame in enumerate(frames):
+            film.seek(i)
+            film.load()
+            durations.append(film.info["duration"])
+            with Image.open(frame) as image:
+                np.testing.assert_array_equal(np.asarray(film.convert("RGB")), np.asarray(image))
+    assert durations == [42, 41, 42]  # the third frame ends at 125 ms
+
+
+def test_animations_that_cannot_be_are_refused(tmp_path, frames):
+    path = tmp_path / "film.webp"
+    with pytest.raises(ValueError, match="0 frames"):
+        write_animation(path, [])
+    with pytest.raises(ValueError, match=r"from 0\.1 to 60"):
+        write_animation(path, frames, frames_per_second=0.0)
+    write_png(frames[2], np.zeros((6, 6, 3)))
+    with pytest.raises(ValueError, match=r"2\.png: is \(6, 6\) pixels"):
+        write_animation(path, frames)
+    assert not path.exists()

@@ -1,0 +1,113 @@
+"""Hard edges: which triangles meet in one, and normals that end there."""
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy  # its parts are loaded where they are used, which takes a third of a second
+from jaxtyping import Bool, Int
+
+from ._distinct import distinct
+from ._mesh import Mesh, unit
+
+_SOFT = np.cos(np.radians(10))
+"""Normals of two triangles at one place that differ by more make their edge hard."""
+
+
+class SharedEdges(NamedTuple):
+    """Edges that two triangles share. Corners and edges are numbered `3 * face + k`; edge `k` lies
+    opposite corner `k`.
+
+    **Attributes:**
+
+    - `edges`: number of the edge in either triangle.
+    - `corners`: of either triangle, those at the first end of the edge, then those at the second.
+    """
+
+    edges: Int[np.ndarray, "n 2"]
+    corners: Int[np.ndarray, "n 2 2"]
+
+
+def shared_edges(places: Int[np.ndarray, "faces 3"]) -> SharedEdges:
+    """Pair the edges of triangles, given by the places of their corners, that join the same two
+    places. Of an edge of more than two triangles each is paired with the next.
+    """
+    starts, ends = places[:, [1, 2, 0]].ravel(), places[:, [2, 0, 1]].ravel()
+    key = np.minimum(starts, ends) * np.int64(places.max(initial=0) + 1) + np.maximum(starts, ends)
+    order = np.argsort(key, kind="stable")
+    same = key[order][1:] == key[order][:-1]
+    edges = np.stack([order[:-1][same], order[1:][same]], axis=1)
+    first, second = (edges - edges % 3 + (edges % 3 + step) % 3 for step in (1, 2))
+    turned = places.ravel()[first[:, 0]] != places.ravel()[first[:, 1]]
+    first[turned, 1], second[turned, 1] = second[turned, 1], first[turned, 1]
+    return SharedEdges(edges, np.stack([first, second], axis=1))
+
+
+def hard_edges(
+    mesh: Mesh, places: Int[np.ndarray, "faces 3"]
+) -> tuple[SharedEdges, Bool[np.ndarray, " n"]]:
+    """Tell which shared edges are hard: those where the normals of two triangles differ."""
+    shared = shared_edges(places)
+    normals = mesh.normals[mesh.faces].reshape(-1, 3)[shared.corners]
+    cosines = np.einsum("nei,nei->ne", normals[:, :, 0], normals[:, :, 1])
+    return shared, cosines.min(axis=1) < _SOFT
+
+
+def faces_beyond(mesh: Mesh) -> Int[np.ndarray, "faces 3"]:
+    """Find, per triangle and corner, the triangle beyond the edge opposite to the corner; -1 where
+    the surface ends there, or the edge is hard.
+
+    Texture coordinates cut meshes open along their seams, so vertices at one place count as one.
+    """
+    (edges, _), are_hard = hard_edges(mesh, distinct(mesh.vertices)[1][mesh.faces])
+    edges = edges[~are_hard]
+    beyond = np.full(mesh.faces.size, -1)
+    beyond[edges] = edges[:, ::-1] // 3
+    return beyond.reshape(-1, 3)
+
+
+def split_creases(mesh: Mesh, degrees: float) -> Mesh:
+    """Estimate normals that a mesh lacks, and replace those that are off, so that edges are hard
+    where triangles differ by more than an angle.
+
+    Around each vertex, triangles that are joined by soft edges share a normal, the mean of theirs
+    by area. A vertex keeps its normal where that lies within the angle of all its triangles.
+
+    **Arguments:**
+
+    - `mesh`: normals of length zero are estimated.
+    - `degrees`: the angle, from 0 to 180.
+
+    **Returns:** the mesh without triangles that have no area, with as many vertices at a place as
+    there are normals.
+    """
+    cosine = np.cos(np.radians(degrees))
+    mesh = mesh.select(mesh.face_areas() > 0)
+    a, b, c = np.moveaxis(mesh.corners(), 1, 0)
+    across = np.cross(b - a, c - a)
+    facing = unit(across)
+    replaced = (mesh.normals == 0).all(axis=1)
+    off = np.einsum("fi,fki->fk", facing, mesh.normals[mesh.faces]) < cosine
+    replaced[mesh.faces[off]] = True
+    if not replaced[mesh.faces].any():
+        return mesh
+    edges, corners = shared_edges(distinct(mesh.vertices)[1][mesh.faces])
+    soft = np.einsum("ni,ni->n", *np.moveaxis(facing[edges // 3], 1, 0)) >= cosine
+    one, other = np.moveaxis(corners[soft], 2, 0).reshape(2, -1)
+    links = scipy.sparse.coo_array((np.ones(len(one)), (one, other)), shape=(mesh.faces.size,) * 2)
+    groups = scipy.sparse.csgraph.connected_components(links, directed=False)[1]
+    sums = [np.bincount(groups, np.repeat(across[:, axis], 3)) for axis in range(3)]
+    estimated = unit(np.stack(sums, axis=1))
+    # A new vertex for each pair of an old one and a group, or of an old one alone where it stays.
+    vertex = mesh.faces.ravel()
+    group = np.where(replaced[vertex], groups, -1)
+    key = vertex * np.int64(len(estimated) + 1) + group
+    _, first, faces = np.unique(key, return_index=True, return_inverse=True)
+    kept, group = vertex[first], group[first]
+    return Mesh(
+        mesh.vertices[kept],
+        faces.reshape(-1, 3),
+        np.where(group[:, None] < 0, mesh.normals[kept], estimated[group]),
+        mesh.uvs,
+        None if mesh.colors is None else mesh.colors[kept],
+        mesh.parts,
+    )

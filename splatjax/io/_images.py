@@ -1,0 +1,102 @@
+"""Pictures of every format that OpenImageIO reads, as arrays with row 0 at the top."""
+
+import os
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from ._color import srgb_to_linear
+from ._files import check_memory, existing_file
+
+_BYTES_PER_VALUE = 24.0  # in double precision, while they are decoded
+
+
+def read_planes(
+    path: str | os.PathLike[str],
+) -> tuple[dict[str, Float[np.ndarray, "height width"]], dict[str, Any], bool]:
+    """Read the channels of a picture by name; whole numbers become shares of the greatest that
+    their type holds. Nothing is decoded, and alpha is not multiplied in.
+
+    **Returns:** channels, attributes of the file, and whether it holds floating-point numbers.
+
+    **Raises:** `FileNotFoundError`, or `ValueError` when the file cannot be read, is cut short or
+    does not fit into memory.
+    """
+    import OpenImageIO as oiio  # 17 MB, so only where a picture is read
+
+    path = existing_file(path)
+    settings, pixels, spec = oiio.ImageSpec(), None, oiio.ImageSpec()
+    settings["oiio:UnassociatedAlpha"] = 1
+    file = oiio.ImageInput.open(str(path), settings)
+    if file is not None:
+        spec = file.spec()
+        values = float(spec.width) * spec.height * spec.nchannels
+        size = f"{path}: a picture of {spec.width} x {spec.height} x {spec.nchannels} numbers"
+        check_memory(size, _BYTES_PER_VALUE * values, "give a smaller one")
+        pixels = file.read_image("float")
+    fault = oiio.geterror() if file is None else file.geterror()
+    if pixels is None or fault:
+        fault = " ".join(fault.replace(f'"{path}"', "").split())
+        raise ValueError(
+            f"{path}: cannot be read as a picture ({fault}); give a whole JPEG, PNG, TIFF or "
+            "OpenEXR"
+        )
+    planes = dict(zip(spec.channelnames, np.moveaxis(pixels, -1, 0), strict=True))
+    attributes = {each.name: each.value for each in spec.extra_attribs}
+    return planes, attributes, str(spec.format) in ("half", "float", "double")
+
+
+def read_values(
+    path: str | os.PathLike[str],
+) -> tuple[Float[np.ndarray, "height width channels"], bool]:
+    """Read R, G and B of a picture, or Y alone, as `read_planes` does; and tell whether these are
+    floating-point numbers.
+    """
+    planes, _, is_linear = read_planes(path)
+    names = next((names for names in ("RGB", "Y") if set(names) <= set(planes)), None)
+    if names is None:
+        raise ValueError(f"{path}: has neither R, G and B nor Y; it has {', '.join(planes)}")
+    with np.errstate(invalid="ignore"):  # of NaN that signals
+        return np.stack([planes[name] for name in names], axis=-1).astype(np.float64), is_linear
+
+
+def read_picture(path: str | os.PathLike[str]) -> Float[np.ndarray, "height width channels"]:
+    r"""Read a picture in linear light, of OpenEXR or another format of floating-point numbers.
+
+    **Returns:** R, G and B, or Y alone, as in the file.
+
+    **Raises:** `FileNotFoundError`, or `ValueError` when the file cannot be read, has neither R, G
+    and B nor Y, or holds whole numbers, which are encoded for a display.
+    """
+    values, is_linear = read_values(path)
+    if not is_linear:
+        raise ValueError(f"{path}: is encoded for a display; give linear light, such as OpenEXR")
+    return values
+
+
+def read_map(path: str | os.PathLike[str]) -> Float[np.ndarray, "height width 3"]:
+    """Read a map that holds no color: three channels, not decoded."""
+    values, _ = read_values(path)
+    return np.broadcast_to(values, (*values.shape[:2], 3))
+
+
+def read_color(path: str | os.PathLike[str]) -> Float[np.ndarray, "height width 3"]:
+    """Read an albedo in linear light: whole numbers are sRGB, floating-point numbers are linear.
+
+    **Raises:** as `read_picture` does, and `ValueError` for values outside [0, 1].
+    """
+    values, is_linear = read_values(path)
+    if not ((values >= 0) & (values <= 1)).all():
+        raise ValueError(f"{path}: has an albedo outside [0, 1]; scale it, or remove what is NaN")
+    return np.broadcast_to(values if is_linear else srgb_to_linear(values), (*values.shape[:2], 3))
+
+
+def decode_color(encoded: bytes) -> Float[np.ndarray, "height width 3"]:
+    """Read an albedo from the contents of a picture."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "texture")
+        path.write_bytes(encoded)
+        return read_color(path)
