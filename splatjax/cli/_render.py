@@ -55,7 +55,7 @@ class Render(Shot):
                 f"--stream is {self.stream}; it is a number of splats of a PLY file, which must be "
                 "named"
             )
-        file = sj.SplatFile(self.splats, self.stream)
+        file = sj.SplatFile(self.splats, self.stream, up=self.up)
 
         def parts() -> Iterator[sj.Splats]:
             return map(self.as_shown, file())

@@ -17,7 +17,7 @@ import splatjax as sj
 from splatjax.io import check_memory, fingerprint, free_bytes, material_path, own_version
 from splatjax.scene import Parts
 
-from ._options import MaterialName
+from ._options import MaterialName, UpAxis
 from ._report import note, stage
 
 _FILL_SIDE, _FILL_ELEVATION = 25.0, 10.0  # degrees: beside the camera, away from the light
@@ -66,6 +66,8 @@ class Shot:
     albedo: bool = True
     #: Number of splats of the built-in bust.
     count: int = 200_000
+    #: Upward axis of the PLY file.
+    up: UpAxis = "y"
     #: Size of the body: at 0.2 the bust is 7 cm tall, and light goes five times as far in it.
     scale: float = 1.0
 
@@ -131,7 +133,7 @@ class Shot:
             with stage(f"making the bust with {self.count} splats"):
                 return self.as_shown(sj.bust(self.count))
         with stage(f"reading {self.splats}"):
-            return self.as_shown(sj.read_splats(self.splats))
+            return self.as_shown(sj.read_splats(self.splats, up=self.up))
 
     def as_shown(self, splats: sj.Splats) -> sj.Splats:
         """Give splats in the size that is asked for, with their albedo, or without."""

@@ -70,7 +70,8 @@ def split_creases(mesh: Mesh, degrees: float) -> Mesh:
     where triangles differ by more than an angle.
 
     Around each vertex, triangles that are joined by soft edges share a normal, the mean of theirs
-    by area. A vertex keeps its normal where that lies within the angle of all its triangles.
+    by their angles there. A vertex keeps its normal where that lies within the given angle of all
+    its triangles.
 
     **Arguments:**
 
@@ -79,12 +80,14 @@ def split_creases(mesh: Mesh, degrees: float) -> Mesh:
 
     **Returns:** the mesh without triangles that have no area, with as many vertices at a place as
     there are normals.
+
+    **Source:** Thürmer and Wüthrich 1998, "Computing Vertex Normals from Polygonal Facets", for the
+    mean by angles.
     """
     cosine = np.cos(np.radians(degrees))
     mesh = mesh.select(mesh.face_areas() > 0)
-    a, b, c = np.moveaxis(mesh.corners(), 1, 0)
-    across = np.cross(b - a, c - a)
-    facing = unit(across)
+    sides = unit(np.roll(mesh.corners(), -1, axis=1) - mesh.corners())
+    facing = unit(np.cross(sides[:, 0], sides[:, 1]))
     replaced = (mesh.normals == 0).all(axis=1)
     off = np.einsum("fi,fki->fk", facing, mesh.normals[mesh.faces]) < cosine
     replaced[mesh.faces[off]] = True
@@ -95,7 +98,9 @@ def split_creases(mesh: Mesh, degrees: float) -> Mesh:
     one, other = np.moveaxis(corners[soft], 2, 0).reshape(2, -1)
     links = scipy.sparse.coo_array((np.ones(len(one)), (one, other)), shape=(mesh.faces.size,) * 2)
     groups = scipy.sparse.csgraph.connected_components(links, directed=False)[1]
-    sums = [np.bincount(groups, np.repeat(across[:, axis], 3)) for axis in range(3)]
+    angles = np.arccos(np.clip(-np.einsum("fki,fki->fk", sides, np.roll(sides, 1, axis=1)), -1, 1))
+    shares = (angles[..., None] * facing[:, None]).reshape(-1, 3)
+    sums = [np.bincount(groups, share) for share in shares.T]
     estimated = unit(np.stack(sums, axis=1))
     # A new vertex for each pair of an old one and a group, or of an old one alone where it stays.
     vertex = mesh.faces.ravel()

@@ -10,7 +10,7 @@ from ._cells import Cells, surface_cells
 from ._creases import faces_beyond
 from ._mesh import Mesh
 from ._rounding import Rounding
-from ._scatter import SurfacePoints, mirrored, scatter
+from ._scatter import SurfacePoints, mirror_images, scatter
 from ._textures import Textures, albedo_at, lookup_at, perturbed_normals
 
 _PLAIN = Textures()
@@ -57,14 +57,10 @@ def splats_at(
         centers, area = rounding.positions(points), rounding.area()
     normals = points.normals(mesh)
     spacing = float(np.sqrt(area / len(centers)))
-    cells = surface_cells(
-        centers,
-        normals,
-        limit=spacing,
-        ghosts=mirrored(mesh, faces_beyond(mesh), centers, normals, spacing),
-    )
+    images = mirror_images(mesh, faces_beyond(mesh), centers, spacing)
+    cells = surface_cells(centers, normals, images, limit=spacing)
     areas = cells.areas * (area / cells.areas.sum())
-    radii = _radii(areas, cells)
+    radii = _radii(areas, cells, images, spacing)
     specular, roughness, tangent_space = (
         lookup_at(mesh, points, picture)
         for picture in (textures.specular, textures.roughness, textures.normal)
@@ -85,8 +81,23 @@ def covering(
     return cells.areas, _radii(cells.areas, cells)
 
 
-def _radii(areas: Float[np.ndarray, " n"], cells: Cells) -> Float[np.ndarray, " n"]:
-    return np.maximum(1.5 * np.sqrt(areas), 1.2 * cells.reaches)
+def _radii(
+    areas: Float[np.ndarray, " n"],
+    cells: Cells,
+    images: Float[np.ndarray, "n images 3"] | None = None,
+    spacing: float = 0.0,
+) -> Float[np.ndarray, " n"]:
+    """Choose radii that leave no hole, and reach little beyond the borders of the surface.
+
+    A splat is seen up to about 0.8 of its radius; a third of a spacing beyond a border, these lie
+    in a straight line, and the border itself is covered in full.
+    """
+    radii = 1.5 * np.sqrt(areas)
+    if images is not None and images.shape[1]:
+        gaps = 0.5 * np.linalg.norm(images, axis=-1)
+        clearance = np.where(gaps > 0, gaps, np.inf).min(axis=1)
+        radii = np.minimum(radii, (clearance + 0.5 * spacing) / 0.8)
+    return np.maximum(radii, 1.2 * cells.reaches)
 
 
 def make_splats(

@@ -42,7 +42,7 @@ COLUMNS = {
 _POWERS = {"centers": 1, "radii": 1, "areas": 2}  # of the unit of length
 _VALID = {
     "centers": (lambda x: np.abs(x) <= _LONGEST, "within 1e9 mm (what is mm_per_unit?)"),
-    "normals": (lambda n: n.any(axis=1, keepdims=True), "longer than zero"),
+    "normals": (lambda n: n.any(axis=0), "longer than zero"),
     "radii": (lambda r: (r > _SHORTEST**2) & (r < _LONGEST**2), "positive (what is mm_per_unit?)"),
     "areas": (lambda a: (a > _SHORTEST**2) & (a < _LONGEST**2), "positive (what is mm_per_unit?)"),
     "albedo": (lambda c: (c >= 0) & (c <= 1), "in [0, 1]; floats are linear, integers sRGB"),
@@ -185,20 +185,21 @@ def _values(
 ) -> Float[np.ndarray, "*shape"]:
     """Return a field of splats, validated."""
     with np.errstate(invalid="ignore"):  # of NaN that signals
-        values = scale * np.stack(list(columns.values()), axis=-1).astype(np.float64)
+        values = scale * np.stack(list(columns.values())).astype(np.float64)
     kind, *others = {column.dtype for column in columns.values()}
     is_encoded = field == "albedo" and not others and kind.kind in "iu"
     if is_encoded:
         values = values / np.iinfo(kind).max
     holds, expected = _VALID[field]
-    bad = np.flatnonzero(~np.all(np.isfinite(values) & holds(values), axis=-1))
+    bad = np.flatnonzero(~(np.isfinite(values) & holds(values)).all(axis=0))
     if len(bad):
         raise ValueError(
             f"{path}: {' '.join(columns)} of vertex {bad[0]} is "
-            f"{' '.join(f'{value:g}' for value in values[bad[0]])} ({len(bad)} such vertices); it "
-            f"must be finite and {expected}: fix it, or leave it out"
+            f"{' '.join(f'{value:g}' for value in values[:, bad[0]])} ({len(bad)} such vertices); "
+            f"it must be finite and {expected}: fix it, or leave it out"
         )
     if field == "normals":
-        values = unit(values / np.abs(values).max(axis=-1, keepdims=True))
+        values = values / np.abs(values).max(axis=0)
+        return unit(values.T)
     values = srgb_to_linear(values) if is_encoded else values
-    return values if len(columns) > 1 else values[:, 0]
+    return values.T if len(columns) > 1 else values[0]

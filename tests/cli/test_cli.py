@@ -290,6 +290,22 @@ def test_sample_covers_a_mesh(tmp_path, capsys):
     assert "50 mm^2" in capsys.readouterr().err
 
 
+def test_files_with_z_up_and_the_crease_angle(tmp_path):
+    """A box that is tall along z stands upright; its edges are hard up to an angle."""
+    mesh, output = tmp_path / "box.stl", tmp_path / "box.ply"
+    trimesh.creation.box((1, 1, 9)).export(mesh)
+    command = ["sample", str(mesh), "--mm-per-unit", "1", "--count", "400", "--output", str(output)]
+    largest = []
+    for options in (["--crease-angle", "91"], ["--up", "z"]):
+        assert main([*command, *options]) == 0
+        largest.append(np.abs(np.asarray(sj.read_splats(output).normals)).max(axis=1))
+    assert np.median(largest[0]) < 0.95
+    np.testing.assert_allclose(largest[1], 1, atol=1e-6)
+    assert np.ptp(np.asarray(sj.read_splats(output).centers), axis=0).argmax() == 1
+    lying = Render(splats=output, up="z", output=tmp_path / "box.exr").splats_to_show()
+    assert np.ptp(np.asarray(lying.centers), axis=0).argmax() == 2
+
+
 @pytest.mark.slow
 @pytest.mark.once
 def test_render_shows_the_bust_and_says_what_it_does(tmp_path, capsys):

@@ -129,6 +129,25 @@ def test_open_border_has_no_clumps():
     assert radii.max() < 1.6 * np.median(radii)
 
 
+def saw_tooth(teeth=40, rows=20) -> Mesh:
+    """A square sheet of 20 mm whose lower rim has teeth of 0.5 mm."""
+    x, y = np.meshgrid(np.linspace(0, 20, 2 * teeth + 1), np.linspace(0, 20, rows))
+    y[0, 1::2] -= 0.5
+    places = np.stack([x, y, 0 * x], axis=-1).reshape(-1, 3)
+    number = np.arange(len(places)).reshape(x.shape)
+    a, b, c, d = number[:-1, :-1], number[:-1, 1:], number[1:, :-1], number[1:, 1:]
+    faces = np.concatenate([np.stack(each, -1).reshape(-1, 3) for each in ((a, b, d), (a, d, c))])
+    return Mesh(places, faces, np.tile([0.0, 0.0, 1.0], (len(places), 1)))
+
+
+def test_a_jagged_border_leaves_no_specks():
+    """What lies across a notch of the border belongs to no mirror image: no cell is cut there."""
+    splats = sample_mesh(saw_tooth(), COUNT)
+    spacing = (400 / COUNT) ** 0.5
+    assert float(splats.areas.min()) > 0.35 * spacing**2
+    assert float(splats.radii.min()) > 0.9 * spacing
+
+
 def test_cells_that_coincide_share_their_area():
     points = np.stack(np.meshgrid(np.arange(20.0), np.arange(20.0), [0.0]), -1).reshape(-1, 3)
     double = np.concatenate([points, points])
@@ -232,6 +251,30 @@ def test_what_triangles_share_stays_or_moves_for_all_of_them():
     np.testing.assert_allclose(
         Rounding(mesh).positions(corners), corners.positions(mesh), atol=1e-12
     )
+
+
+def test_creases_split_normals_where_triangles_differ():
+    """A wedge of two squares: one normal for each side beyond the angle, else their mean; normals
+    that are given stay where they are near their triangles.
+    """
+    low, tip = [0.0, 0.0, 0.0], np.asarray([0.0, 1.0, 0.0])
+    fold = np.radians(50)
+    places = np.asarray([low, tip, [1, 0, 0], [-np.cos(fold), 0, -np.sin(fold)]])
+    faces = np.asarray([[0, 2, 1], [0, 1, 3]])
+    sides = np.asarray([[0, 0, 1.0], [-np.sin(fold), 0, np.cos(fold)]])
+    none = np.zeros((4, 3))
+    hard, soft = (split_creases(Mesh(places, faces, none), angle) for angle in (49.0, 51.0))
+    np.testing.assert_allclose(
+        hard.normals[hard.faces], np.repeat(sides[:, None], 3, axis=1), atol=1e-12
+    )
+    assert (len(hard.vertices), len(soft.vertices)) == (6, 4)
+    middle = sides.sum(axis=0) / np.linalg.norm(sides.sum(axis=0))
+    np.testing.assert_allclose(soft.normals[soft.faces[0, 0]], middle, atol=1e-12)
+    given = Mesh(places, faces, np.tile(middle, (4, 1)), colors=np.eye(4)[:, :3])
+    np.testing.assert_array_equal(split_creases(given, 26.0).normals, given.normals)
+    split = split_creases(given, 24.0)
+    np.testing.assert_allclose(split.normals[split.faces], hard.normals[hard.faces], atol=1e-12)
+    np.testing.assert_array_equal(split.colors[split.faces], given.colors[faces])
 
 
 def test_a_box_stays_a_box():

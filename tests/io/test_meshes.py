@@ -79,14 +79,14 @@ SUFFIXES = {
 }
 
 
-def export(mesh, folder, suffix):
+def export(mesh, folder, suffix, **options):
     """Write a mesh by trimesh; return the file."""
-    path = folder / f"a.{suffix}"
+    path, options = folder / f"a.{suffix}", SUFFIXES[suffix] | options
     if suffix == "gltf":
-        for name, data in mesh.export(file_type="gltf", include_normals=True).items():
+        for name, data in mesh.export(file_type="gltf", **options).items():
             (folder / name).write_bytes(data)
         return folder / "model.gltf"
-    mesh.export(path, **SUFFIXES[suffix])
+    mesh.export(path, **options)
     return path
 
 
