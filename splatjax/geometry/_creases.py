@@ -1,35 +1,21 @@
 """Hard edges: which triangles meet in one, and normals that end there."""
 
-from typing import NamedTuple
-
 import numpy as np
 import scipy  # its parts are loaded where they are used, which takes a third of a second
 from jaxtyping import Bool, Int
 
-from ._distinct import distinct
 from ._mesh import Mesh, unit
+from ._places import distinct
 
 _SOFT = np.cos(np.radians(10))
 """Normals of two triangles at one place that differ by more make their edge hard."""
 
 
-class SharedEdges(NamedTuple):
-    """Edges that two triangles share. Corners and edges are numbered `3 * face + k`; edge `k` lies
-    opposite corner `k`.
-
-    **Attributes:**
-
-    - `edges`: number of the edge in either triangle.
-    - `corners`: of either triangle, those at the first end of the edge, then those at the second.
-    """
-
-    edges: Int[np.ndarray, "n 2"]
-    corners: Int[np.ndarray, "n 2 2"]
-
-
-def shared_edges(places: Int[np.ndarray, "faces 3"]) -> SharedEdges:
+def shared_edges(places: Int[np.ndarray, "faces 3"]) -> Int[np.ndarray, "n 2 2"]:
     """Pair the edges of triangles, given by the places of their corners, that join the same two
     places. Of an edge of more than two triangles each is paired with the next.
+
+    **Returns:** for each end of an edge the corner of either triangle, as `3 * face + k`.
     """
     starts, ends = places[:, [1, 2, 0]].ravel(), places[:, [2, 0, 1]].ravel()
     key = np.minimum(starts, ends) * np.int64(places.max(initial=0) + 1) + np.maximum(starts, ends)
@@ -39,17 +25,17 @@ def shared_edges(places: Int[np.ndarray, "faces 3"]) -> SharedEdges:
     first, second = (edges - edges % 3 + (edges % 3 + step) % 3 for step in (1, 2))
     turned = places.ravel()[first[:, 0]] != places.ravel()[first[:, 1]]
     first[turned, 1], second[turned, 1] = second[turned, 1], first[turned, 1]
-    return SharedEdges(edges, np.stack([first, second], axis=1))
+    return np.stack([first, second], axis=1)
 
 
 def hard_edges(
     mesh: Mesh, places: Int[np.ndarray, "faces 3"]
-) -> tuple[SharedEdges, Bool[np.ndarray, " n"]]:
+) -> tuple[Int[np.ndarray, "n 2 2"], Bool[np.ndarray, " n"]]:
     """Tell which shared edges are hard: those where the normals of two triangles differ."""
-    shared = shared_edges(places)
-    normals = mesh.normals[mesh.faces].reshape(-1, 3)[shared.corners]
+    corners = shared_edges(places)
+    normals = mesh.normals[mesh.faces].reshape(-1, 3)[corners]
     cosines = np.einsum("nei,nei->ne", normals[:, :, 0], normals[:, :, 1])
-    return shared, cosines.min(axis=1) < _SOFT
+    return corners, cosines.min(axis=1) < _SOFT
 
 
 def faces_beyond(mesh: Mesh) -> Int[np.ndarray, "faces 3"]:
@@ -58,11 +44,12 @@ def faces_beyond(mesh: Mesh) -> Int[np.ndarray, "faces 3"]:
 
     Texture coordinates cut meshes open along their seams, so vertices at one place count as one.
     """
-    (edges, _), are_hard = hard_edges(mesh, distinct(mesh.vertices)[1][mesh.faces])
-    edges = edges[~are_hard]
-    beyond = np.full(mesh.faces.size, -1)
-    beyond[edges] = edges[:, ::-1] // 3
-    return beyond.reshape(-1, 3)
+    corners, are_hard = hard_edges(mesh, distinct(mesh.vertices)[1][mesh.faces])
+    faces = corners[~are_hard, 0] // 3
+    opposite = 3 - (corners[~are_hard] % 3).sum(axis=1)
+    beyond = np.full(mesh.faces.shape, -1)
+    beyond[faces, opposite] = faces[:, ::-1]
+    return beyond
 
 
 def split_creases(mesh: Mesh, degrees: float) -> Mesh:
@@ -93,10 +80,13 @@ def split_creases(mesh: Mesh, degrees: float) -> Mesh:
     replaced[mesh.faces[off]] = True
     if not replaced[mesh.faces].any():
         return mesh
-    edges, corners = shared_edges(distinct(mesh.vertices)[1][mesh.faces])
-    soft = np.einsum("ni,ni->n", *np.moveaxis(facing[edges // 3], 1, 0)) >= cosine
-    one, other = np.moveaxis(corners[soft], 2, 0).reshape(2, -1)
-    links = scipy.sparse.coo_array((np.ones(len(one)), (one, other)), shape=(mesh.faces.size,) * 2)
+    corners = shared_edges(distinct(mesh.vertices)[1][mesh.faces])
+    one, other = np.moveaxis(corners, 2, 0)
+    soft = np.einsum("ni,ni->n", facing[one[:, 0] // 3], facing[other[:, 0] // 3]) >= cosine
+    links = scipy.sparse.coo_array(
+        (np.ones(2 * soft.sum()), (one[soft].ravel(), other[soft].ravel())),
+        shape=(mesh.faces.size,) * 2,
+    )
     groups = scipy.sparse.csgraph.connected_components(links, directed=False)[1]
     angles = np.arccos(np.clip(-np.einsum("fki,fki->fk", sides, np.roll(sides, 1, axis=1)), -1, 1))
     shares = (angles[..., None] * facing[:, None]).reshape(-1, 3)

@@ -4,8 +4,8 @@ import numpy as np
 from jaxtyping import Float
 
 from ._creases import hard_edges
-from ._distinct import distinct
 from ._mesh import Mesh
+from ._places import distinct
 from ._scatter import SurfacePoints
 
 _MIDDLES = 0.5 * np.asarray([[1.0, 1, 0], [0, 1, 1], [1, 0, 1]])
@@ -32,7 +32,7 @@ class Rounding:
 
     def __init__(self, mesh: Mesh):
         place = distinct(mesh.vertices)[1]
-        (_, corners), are_hard = hard_edges(mesh, place[mesh.faces])
+        corners, are_hard = hard_edges(mesh, place[mesh.faces])
         is_smooth = np.ones(len(mesh.vertices), bool)
         is_smooth[place[mesh.faces].ravel()[corners[are_hard]]] = False
         self._mesh, self._is_smooth = mesh, is_smooth[place]

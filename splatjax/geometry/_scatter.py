@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from ._cells import surface_cells
 from ._creases import faces_beyond
 from ._mesh import Mesh, unit
-from ._morton import morton_order
+from ._places import morton_order
 
 _PLASTIC = 1.32471795724474602596  # of the R2 sequence
 _EDGE_TOLERANCE = 1e-9

@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 from splatjax.geometry import Mesh, Textures, cut_below, sample_mesh, split_creases
 from splatjax.geometry._cells import surface_cells
 from splatjax.geometry._mesh import vertex_normals
-from splatjax.geometry._morton import morton_order
+from splatjax.geometry._places import morton_order
 from splatjax.geometry._rounding import Rounding
 from splatjax.geometry._scatter import SurfacePoints
 
