@@ -8,7 +8,7 @@ import numpy as np
 from PIL import Image
 
 from splatjax import rivals
-from splatjax.io._color import linear_to_srgb
+from splatjax.io._images import linear_to_srgb
 
 
 def errors(

@@ -1,10 +1,11 @@
 """The only package that touches files: splats, meshes, pictures, materials."""
 
 from ._atomic import atomic_path as atomic_path
-from ._color import linear_to_srgb as linear_to_srgb, srgb_to_linear as srgb_to_linear
+from ._images import linear_to_srgb as linear_to_srgb, srgb_to_linear as srgb_to_linear
 from ._exr import read_exr as read_exr, read_manifest as read_manifest, write_exr as write_exr
 from ._images import read_picture as read_picture
 from ._materials import (
+    dipole_starts as dipole_starts,
     list_materials as list_materials,
     load_material as load_material,
     load_medium as load_medium,
@@ -34,4 +35,3 @@ from ._record import (
     write_record as write_record,
 )
 from ._splat_file import SplatFile as SplatFile
-from ._starts import dipole_starts as dipole_starts

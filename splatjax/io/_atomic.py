@@ -18,20 +18,15 @@ def atomic_path(path: str | os.PathLike[str]) -> Generator[Path, None, None]:
     untouched. A process that is killed can remove nothing: what it leaves is removed when the same
     file is written next on the same machine.
 
-    **Raises:** `FileNotFoundError` when the folder does not exist, `NotADirectoryError` when it is
-    none, `IsADirectoryError` when `path` is a folder, `OSError` that names `path` when it cannot be
-    written.
+    **Raises:** `FileNotFoundError` when the folder does not exist, another `OSError` that names
+    `path` when it cannot be written, such as `IsADirectoryError`.
     """
     path = Path(path)
     folder = path.parent
-    if not folder.exists():
-        raise FileNotFoundError(
-            f"{path}: the folder {folder} does not exist; make it first, or name another"
-        )
     if not folder.is_dir():
-        raise NotADirectoryError(f"{path}: {folder} is a file; name a folder that exists")
-    if path.is_dir():
-        raise IsADirectoryError(f"{path}: is a folder; name a file")
+        raise FileNotFoundError(
+            f"{path}: there is no folder {folder}; make it first, or name another"
+        )
     head = f".{path.stem}-{platform.node()}-"
     temporary = folder / f"{head}{os.getpid()}-{secrets.token_hex(4)}{path.suffix}"
     try:

@@ -13,6 +13,7 @@ import OpenEXR  # ty: ignore[import-not-found]
 from splatjax.scene import Frame
 
 from ._atomic import atomic_path
+from ._files import naming
 from ._images import read_planes
 from ._record import own_version
 
@@ -122,16 +123,13 @@ def read_manifest(path: str | os.PathLike[str]) -> dict[str, Any]:
     record.
     """
     _, header, _ = read_planes(path)
-    try:
-        manifest = json.loads(header[_MANIFEST])
-    except (KeyError, TypeError, ValueError):
-        manifest = None
-    if not isinstance(manifest, dict):
+    if not isinstance(header.get(_MANIFEST), str):
         raise ValueError(
             f"{path}: does not record what it was made of; give a picture that `splatjax render` "
             "wrote"
         )
-    return manifest
+    with naming(path):
+        return json.loads(header[_MANIFEST])
 
 
 def _layout(channels: int, lights: int, gaussians: int, has_single: bool) -> dict[str, np.ndarray]:

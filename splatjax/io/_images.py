@@ -1,4 +1,6 @@
-"""Pictures of every format that OpenImageIO reads, as arrays with row 0 at the top."""
+"""Pictures of every format that OpenImageIO reads, as arrays with row 0 at the top; and the sRGB
+transfer function (IEC 61966-2-1), both ways.
+"""
 
 import os
 import tempfile
@@ -8,7 +10,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from ._color import srgb_to_linear
 from ._files import check_memory, existing_file
 
 _BYTES_PER_VALUE = 24.0  # in double precision, while they are decoded
@@ -100,3 +101,14 @@ def decode_color(encoded: bytes) -> Float[np.ndarray, "height width 3"]:
         path = Path(folder, "texture")
         path.write_bytes(encoded)
         return read_color(path)
+
+
+def srgb_to_linear(encoded: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+    """Decode sRGB values in [0, 1] to linear light."""
+    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+
+
+def linear_to_srgb(linear: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+    """Encode linear light for an sRGB display; values beyond [0, 1] are clipped, NaN becomes 0."""
+    shown = np.where(np.isnan(linear), 0.0, np.clip(linear, 0.0, 1.0))
+    return np.where(shown <= 0.0031308, 12.92 * shown, 1.055 * shown ** (1 / 2.4) - 0.055)

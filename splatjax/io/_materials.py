@@ -8,10 +8,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 import tomli_w
 
 from splatjax.exports import plain_numbers
+from splatjax.fitting import DipoleStarts
 from splatjax.gaussians import SumOfGaussians
 from splatjax.scattering import (
     BetterDipole,
@@ -270,3 +272,19 @@ def _plain_layer(layer: Layer | Film) -> dict[str, Any]:
         return {"optical_depth": plain_numbers(layer.optical_depth)}
     thickness = {"thickness": plain_numbers(layer.thickness), "thickness_unit": THICKNESS_UNIT}
     return thickness | _plain_medium(layer.medium)
+
+
+def dipole_starts() -> DipoleStarts:
+    r"""Read where fits of 1 to 8 Gaussians to dipoles start: one descent then finds what a search
+    would.
+
+        fit_gaussians(Dipole(medium), 6, spread=VariancesPerChannel(), start=dipole_starts()(medium,
+        6))
+
+    **Returns:** a `DipoleStarts` in JAX's default precision. `tools/make_starts.py` made the table.
+    """
+    with np.load(profiles_folder() / "dipole_starts.npz") as file:
+        tables = {name: jnp.asarray(table, float) for name, table in file.items()}
+    counts = sum(name.startswith("log_variances_") for name in tables)
+    log_variances = tuple(tables[f"log_variances_{count}"] for count in range(1, counts + 1))
+    return DipoleStarts(tables["roots"], tables["etas"], log_variances)

@@ -14,10 +14,9 @@ from splatjax.geometry import complete_splats, unit
 from splatjax.scene import Splats
 
 from ._atomic import atomic_path
-from ._color import srgb_to_linear
-from ._contents import CHECKS
 from ._files import check_units, existing_file, naming, with_y_up
-from ._library import load_with_trimesh, one_sentence
+from ._images import srgb_to_linear
+from ._trimesh import CHECKS, load_with_trimesh, one_sentence
 
 _SHORTEST, _LONGEST = 1e-9, 1e9  # mm: beyond, single precision loses areas
 _COVER = (

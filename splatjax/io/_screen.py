@@ -11,7 +11,7 @@ from PIL import Image
 from splatjax.scene import Frame
 
 from ._atomic import atomic_path
-from ._color import linear_to_srgb
+from ._images import linear_to_srgb
 
 
 def write_png(

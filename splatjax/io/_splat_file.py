@@ -10,8 +10,8 @@ import numpy as np
 from splatjax.scene import Splats
 
 from ._files import check_units, existing_file
-from ._library import one_sentence
 from ._ply import COLUMNS, check_places, splat_fields
+from ._trimesh import one_sentence
 
 _PART = 1_000_000
 _COMPLETE = (

@@ -9,10 +9,9 @@ from jaxtyping import Float, Int
 
 from splatjax.geometry import unit
 
-from ._color import srgb_to_linear
-from ._contents import CHECKS
 from ._files import check_memory, with_y_up
-from ._library import load_with_trimesh, one_sentence
+from ._images import srgb_to_linear
+from ._trimesh import CHECKS, load_with_trimesh, one_sentence
 
 _BYTES_PER_CORNER = 300.0  # of a mesh, on its way from the file to splats
 _FARTHEST, _MOST_TILES = 1e12, 1e6  # units, beyond which areas overflow; repeats of a texture

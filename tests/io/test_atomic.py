@@ -48,7 +48,7 @@ def test_a_file_takes_its_name_only_when_the_block_ends_well(tmp_path):
     [
         ("nowhere/a.txt", FileNotFoundError),
         ("folder", IsADirectoryError),
-        ("file/a.txt", NotADirectoryError),
+        ("file/a.txt", FileNotFoundError),
     ],
 )
 def test_places_that_cannot_be_written_to(tmp_path, name, kind):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 from scipy.spatial import KDTree
-from test_meshes import SUFFIXES, export
+from writers import SUFFIXES, export
 
 from splatjax.io import sample_mesh
 
