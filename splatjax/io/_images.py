@@ -3,8 +3,6 @@ transfer function (IEC 61966-2-1), both ways.
 """
 
 import os
-import tempfile
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -50,20 +48,6 @@ def read_planes(
     return planes, attributes, str(spec.format) in ("half", "float", "double")
 
 
-def read_values(
-    path: str | os.PathLike[str],
-) -> tuple[Float[np.ndarray, "height width channels"], bool]:
-    """Read R, G and B of a picture, or Y alone, as `read_planes` does; and tell whether these are
-    floating-point numbers.
-    """
-    planes, _, is_linear = read_planes(path)
-    names = next((names for names in ("RGB", "Y") if set(names) <= set(planes)), None)
-    if names is None:
-        raise ValueError(f"{path}: has neither R, G and B nor Y; it has {', '.join(planes)}")
-    with np.errstate(invalid="ignore"):  # of NaN that signals
-        return np.stack([planes[name] for name in names], axis=-1).astype(np.float64), is_linear
-
-
 def read_picture(path: str | os.PathLike[str]) -> Float[np.ndarray, "height width channels"]:
     r"""Read a picture in linear light, of OpenEXR or another format of floating-point numbers.
 
@@ -72,7 +56,7 @@ def read_picture(path: str | os.PathLike[str]) -> Float[np.ndarray, "height widt
     **Raises:** `FileNotFoundError`, or `ValueError` when the file cannot be read, has neither R, G
     and B nor Y, or holds whole numbers, which are encoded for a display.
     """
-    values, is_linear = read_values(path)
+    values, is_linear = _colors(path)
     if not is_linear:
         raise ValueError(f"{path}: is encoded for a display; give linear light, such as OpenEXR")
     return values
@@ -80,7 +64,7 @@ def read_picture(path: str | os.PathLike[str]) -> Float[np.ndarray, "height widt
 
 def read_map(path: str | os.PathLike[str]) -> Float[np.ndarray, "height width 3"]:
     """Read a map that holds no color: three channels, not decoded."""
-    values, _ = read_values(path)
+    values, _ = _colors(path)
     return np.broadcast_to(values, (*values.shape[:2], 3))
 
 
@@ -89,18 +73,19 @@ def read_color(path: str | os.PathLike[str]) -> Float[np.ndarray, "height width 
 
     **Raises:** as `read_picture` does, and `ValueError` for values outside [0, 1].
     """
-    values, is_linear = read_values(path)
+    values, is_linear = _colors(path)
     if not ((values >= 0) & (values <= 1)).all():
         raise ValueError(f"{path}: has an albedo outside [0, 1]; scale it, or remove what is NaN")
     return np.broadcast_to(values if is_linear else srgb_to_linear(values), (*values.shape[:2], 3))
 
 
-def decode_color(encoded: bytes) -> Float[np.ndarray, "height width 3"]:
-    """Read an albedo from the contents of a picture."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder, "texture")
-        path.write_bytes(encoded)
-        return read_color(path)
+def _colors(path: str | os.PathLike[str]) -> tuple[Float[np.ndarray, "height width _"], bool]:
+    planes, _, is_linear = read_planes(path)
+    names = "RGB" if "R" in planes else "Y"
+    if not planes.keys() >= set(names):
+        raise ValueError(f"{path}: has neither R, G and B nor Y; it has {', '.join(planes)}")
+    with np.errstate(invalid="ignore"):  # of NaN that signals
+        return np.stack([planes[name] for name in names], axis=-1).astype(np.float64), is_linear
 
 
 def srgb_to_linear(encoded: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:

@@ -3,6 +3,7 @@
 import os
 from collections.abc import Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from splatjax.geometry import (
 from splatjax.scene import Splats
 
 from ._files import check_memory, check_units, existing_file, naming
-from ._images import decode_color, read_color, read_map
+from ._images import read_color, read_map
 from ._triangles import Piece, read_pieces
 
 _LUMA = np.asarray([0.299, 0.587, 0.114])  # of encoded color, Rec. 601
@@ -133,10 +134,10 @@ def read_textured_mesh(
 
 def _joined(pieces: Sequence[Piece], mm_per_unit: float, flip_v: bool) -> Mesh:
     """Join pieces to one mesh in mm, each a part of it; normals of length zero stay."""
-    starts = np.cumsum([0, *(len(piece.vertices) for piece in pieces[:-1])])
-    faces = [piece.faces + start for piece, start in zip(pieces, starts, strict=True)]
+    starts = np.cumsum([0, *(len(piece.mesh.vertices) for piece in pieces[:-1])])
+    faces = [piece.mesh.faces + start for piece, start in zip(pieces, starts, strict=True)]
     vertices, normals, uvs, colors = (
-        np.concatenate([getattr(piece, name) for piece in pieces])
+        np.concatenate([getattr(piece.mesh, name) for piece in pieces])
         for name in ("vertices", "normals", "uvs", "colors")
     )
     return Mesh(
@@ -151,8 +152,10 @@ def _joined(pieces: Sequence[Piece], mm_per_unit: float, flip_v: bool) -> Mesh:
 
 def _own_albedo(path: Path, pieces: Sequence[Piece]) -> np.ndarray | tuple[np.ndarray, ...] | None:
     """Decode the textures of pieces, times their plain colors; `None` if no piece has a texture."""
-    encoded = {piece.texture for piece in pieces if piece.texture}
-    with naming(path):
-        pictures = {each: decode_color(each) for each in encoded} | {None: np.ones((1, 1, 3))}
+    pictures = {None: np.ones((1, 1, 3))}
+    with naming(path), TemporaryDirectory() as folder:
+        for encoded in {piece.texture for piece in pieces if piece.texture}:
+            (file := Path(folder, "texture")).write_bytes(encoded)
+            pictures[encoded] = read_color(file)
     maps = tuple(pictures[piece.texture] * piece.color for piece in pieces)
-    return None if not encoded else maps if len(maps) > 1 else maps[0]
+    return None if len(pictures) == 1 else maps if len(maps) > 1 else maps[0]

@@ -16,7 +16,7 @@ from splatjax.scene import Splats
 from ._atomic import atomic_path
 from ._files import check_units, existing_file, naming, with_y_up
 from ._images import srgb_to_linear
-from ._trimesh import CHECKS, load_with_trimesh, one_sentence
+from ._trimesh import FORMATS, load_with_trimesh, one_sentence
 
 _SHORTEST, _LONGEST = 1e-9, 1e9  # mm: beyond, single precision loses areas
 _COVER = (
@@ -79,7 +79,7 @@ def read_splats(path: str | os.PathLike[str], *, mm_per_unit: float = 1.0, up: s
     """
     path = existing_file(path)
     check_units(path, mm_per_unit, up)
-    if path.suffix[1:].lower() in CHECKS.keys() - {"ply"}:
+    if path.suffix[1:].lower() in set(FORMATS) - {"ply"}:
         raise ValueError(f"{path}: is a mesh; {_COVER.format(path)}")
     with one_sentence(path):
         columns = load_with_trimesh(path, "ply")["columns"]

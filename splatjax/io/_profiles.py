@@ -15,7 +15,7 @@ from splatjax.scattering import Tabulated
 
 from ._atomic import atomic_path
 from ._files import check_units, naming
-from ._tables import number_of, read_rows, rounded
+from ._tables import read_rows, rounded
 
 _MM = {"mm": 1.0, "cm": 10.0, "um": 1e-3, "µm": 1e-3}
 """Units of length that the names of a table's columns may give."""
@@ -41,27 +41,26 @@ def read_profile(path: str | os.PathLike[str], *, mm_per_unit: float = 1.0) -> T
     is wrong.
     """
     check_units(Path(path), mm_per_unit)
-    lines = read_rows(path, "a profile is a CSV of radii and values")
-    if lines and math.isnan(number_of(lines[0][1][0])):
-        (number, names), *lines = lines
+    rows = read_rows(path, "a profile is a CSV of radii and values")
+    if rows and isinstance(rows[0][1][0], str):
+        (where, names), *rows = rows
         for unit, size in _MM.items():
-            is_named = re.search(rf"(?<![A-Za-z]){unit}(?![A-Za-z])", ",".join(names))
+            is_named = re.search(rf"(?<![A-Za-z]){unit}(?![A-Za-z])", ",".join(map(str, names)))
             if is_named and not math.isclose(size, mm_per_unit, rel_tol=1e-6):
                 raise ValueError(
-                    f"{path}: line {number} gives {unit}, and lengths are taken as {mm_per_unit:g} "
-                    f"mm; give mm_per_unit = {size:g} (--mm-per-unit {size:g}), or name the right "
-                    "unit"
+                    f"{where} gives {unit}, and lengths are taken as {mm_per_unit:g} mm; give "
+                    f"mm_per_unit = {size:g} (--mm-per-unit {size:g}), or name the right unit"
                 )
-    rows = [[number_of(cell) for cell in row] for _, row in lines]
-    for (number, row), values in zip(lines, rows, strict=True):
-        if len(row) < 2 or len(row) != len(rows[0]) or not np.isfinite(rounded(values)).all():
+    for where, cells in rows:
+        are_numbers = all(isinstance(cell, float) and np.isfinite(rounded(cell)) for cell in cells)
+        if not 1 < len(cells) == len(rows[0][1]) or not are_numbers:
             raise ValueError(
-                f"{path}: line {number}: {', '.join(row)} must be a radius and a value for each of "
-                f"{len(rows[0]) - 1} channels"
+                f"{where}: {', '.join(map(str, cells))} must be a radius and a value for each of "
+                f"{len(rows[0][1]) - 1} channels"
             )
     if len(rows) < 2:
         raise ValueError(f"{path}: has {len(rows)} lines of numbers; a profile needs two radii")
-    radii, values = np.split(np.asarray(rows), [1], axis=1)
+    radii, values = np.split(np.asarray([cells for _, cells in rows]), [1], axis=1)
     with naming(path):
         return Tabulated(
             jnp.asarray(radii[:, 0] * mm_per_unit, float),
@@ -82,23 +81,24 @@ def read_media(path: str | os.PathLike[str]) -> tuple[list[str], Float[np.ndarra
     is wrong.
     """
     contents = f"media are a CSV of {', '.join(_COLUMNS)}"
-    (_, head), *rows = read_rows(path, contents) or [(0, [])]
+    (_, head), *rows = read_rows(path, contents) or [("", [])]
     if not set(head) >= set(_COLUMNS) or not rows:
-        raise ValueError(f"{path}: names {', '.join(head)}, with {len(rows)} rows; {contents}")
-    names, media = [], np.empty((len(rows), 3))
-    for i, (number, row) in enumerate(rows):
-        if len(row) != len(head):
-            raise ValueError(f"{path}: line {number} has {len(row)} cells of {len(head)}; fix it")
-        cells = dict(zip(head, row, strict=True))
-        names.append(cells.get("name") or str(i + 1))
-        for j, name in enumerate(_COLUMNS):
-            media[i, j] = number_of(cells[name])
-            if not (0 <= media[i, j] < math.inf) or (media[i, j] == 0 and name != "sigma_a"):
-                raise ValueError(
-                    f"{path}: line {number}: {name} is {cells[name]!r}; it must be positive"
-                    f"{' or 0' if name == 'sigma_a' else ''}"
-                )
-    return names, media
+        raise ValueError(
+            f"{path}: names {', '.join(map(str, head))}, with {len(rows)} rows; {contents}"
+        )
+    names, media = [], []
+    for where, cells in rows:
+        entries = dict(zip(head, cells, strict=False))
+        values = [v for name in _COLUMNS if isinstance(v := entries.get(name), float)]
+        is_whole = len(cells) == len(head) and len(values) == len(_COLUMNS)
+        if not is_whole or not all(0 < v < math.inf for v in (values[0] or 1.0, *values[1:])):
+            raise ValueError(
+                f"{where}: {', '.join(map(str, cells))} must be {', '.join(head)}, positive; "
+                "sigma_a may be 0"
+            )
+        names.append(str(entries.get("name") or len(media) + 1))
+        media.append(values)
+    return names, np.asarray(media)
 
 
 def write_columns(path: str | os.PathLike[str], columns: Mapping[str, Iterable]) -> None:

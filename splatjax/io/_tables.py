@@ -34,9 +34,9 @@ def read_toml(path: Path, remedy: str) -> dict[str, Any]:
         raise ValueError(f"{path}: is no TOML file: {error}") from None
 
 
-def read_rows(path: str | os.PathLike[str], contents: str) -> list[tuple[int, list[str]]]:
-    """Read the rows of a CSV file, with the numbers of their lines; empty ones and comments (`#`)
-    are left out.
+def read_rows(path: str | os.PathLike[str], contents: str) -> list[tuple[str, list[Any]]]:
+    """Read the rows of a CSV file and where they stand; empty ones and comments (`#`) are left out.
+    Cells that are numbers are converted.
 
     **Raises:** `FileNotFoundError`, or `ValueError` when it is no text.
     """
@@ -44,20 +44,19 @@ def read_rows(path: str | os.PathLike[str], contents: str) -> list[tuple[int, li
         lines = existing_file(path).read_text(encoding="utf-8-sig").splitlines()
     except UnicodeDecodeError as error:
         raise ValueError(f"{path}: is no text file: {error}; {contents}") from None
-    rows = [
-        (number, [cell.strip() for cell in next(csv.reader([line]))])
-        for number, line in enumerate(lines, start=1)
-        if line.strip() and not line.lstrip().startswith("#")
+    rows = csv.reader(lines)
+    return [
+        (f"{path}: line {rows.line_num}", [_converted(cell) for cell in row])
+        for row in rows
+        if any(map(str.strip, row)) and not row[0].lstrip().startswith("#")
     ]
-    return [(number, row) for number, row in rows if any(row)]
 
 
-def number_of(cell: str) -> float:
-    """Return the number in a cell; NaN for what is none."""
+def _converted(cell: str) -> float | str:
     try:
         return float(cell)
     except ValueError:
-        return float("nan")
+        return cell.strip()
 
 
 class Table:

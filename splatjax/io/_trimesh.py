@@ -3,10 +3,9 @@ one sentence, and what it leaves out a warning.
 """
 
 import json
-import logging
 import re
 import warnings
-from collections.abc import Callable, Generator
+from collections.abc import Generator
 from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
@@ -16,128 +15,76 @@ from urllib.parse import unquote
 import numpy as np
 from PIL import Image
 
+FORMATS = ("glb", "gltf", "obj", "off", "ply", "stl")
+"""Suffixes of meshes."""
 _OBJ_CORNER = rb"[1-9]\d*(?:/(?:[1-9]\d*)?(?:/(?:[1-9]\d*)?)?)?"
 _OBJ_READ = rb"v[tn]?(?: +[^\s/_]+){2,7} *|f(?: +%s){3,} *" % _OBJ_CORNER
-_OBJ_UNREAD = re.compile(
-    rb"^(?!(?:%s)$)[ \t]*(?:f|v[tn]?|curv2?|surf|bzp|bsp)(?:[ \t].*)?$" % _OBJ_READ, re.MULTILINE
-)
-_GLTF_HARMLESS = re.compile("EXT_texture_webp|KHR_lights_punctual|KHR_materials_.*")
-_FAN, _FLOAT = 6, 5126
-
-
-def count_obj_triangles(data: bytes) -> int:
-    """Count the triangles of the polygons in an OBJ file.
-
-    **Raises:** `ValueError` for lines that trimesh passes over or takes for something else.
+_GLTF = rb"""
+    "extensionsRequired"\s*:\s*\[[^]]*"(?!EXT_texture_webp"|KHR_lights_punctual"|KHR_materials_)\w+"
+    |"KHR_materials_pbrSpecularGlossiness"\s*: | "sparse"\s*:\s*{ | "mode"\s*:\s*6
+    |"image/(?!png"|jpeg"|webp")[^"]*"
+    |"baseColorTexture"\s*:\s*{[^{}]*(?:"texCoord"\s*:\s*[1-9]|{\s*"KHR_texture_transform")
     """
-    data = _whole_lines(data).replace(b"\\\n", b" ")
-    faces = re.findall(rb"^f .*", data, re.MULTILINE)
-    kinds = set(b" ".join(faces).translate(None, b"0123456789").split())
-    if unread := _OBJ_UNREAD.search(data):
-        raise ValueError(f"`{unread[0][:60].decode(errors='replace')}` is not read")
-    if {b"/", b"//"} <= kinds or data.count(b"\nmtllib ") > 1:
-        raise ValueError("it mixes faces of v/vt and v//vn, or names several files of materials")
+_UNREAD = {
+    "gltf": re.compile(_GLTF, re.VERBOSE),
+    "obj": re.compile(
+        rb"^(?!(?:%s)$)[ \t]*(?:f|v[tn]?|curv2?|surf|bzp|bsp)(?:[ \t].*)?$" % _OBJ_READ
+        + rb"|^mtllib (?=(?s:.*)\nmtllib )",
+        re.MULTILINE,
+    ),
+    "ply": re.compile(rb"comment texturefile.*comment texturefile", re.DOTALL | re.IGNORECASE),
+    "stl": re.compile(rb"\A\s*solid(?!.*\bendsolid[^\n]*\s*\Z)", re.DOTALL | re.IGNORECASE),
+}
+"""What trimesh passes over or takes for something else: compressed, moved and several textures,
+fans, curves, polygons without three corners, solids without end."""
+_FLOAT = 5126
+
+
+def _count_obj(text: bytes) -> int:
+    faces = re.findall(rb"^f .*", text, re.MULTILINE)
+    if {b"/", b"//"} <= set(b" ".join(faces).translate(None, b"0123456789").split()):
+        raise ValueError("it mixes faces of v/vt and v//vn")
     return sum(len(face.split()) - 3 for face in faces)
 
 
-def count_off_triangles(data: bytes) -> int:
-    """Count the triangles that the header of an OFF file promises.
-
-    **Raises:** `ValueError` when they are not there, and for other kinds of OFF.
-    """
-    lines = _whole_lines(data).splitlines()
-    rows = [row for line in lines if (row := line.split(b"#")[0].split())]
-    if not rows or rows[0] != [b"OFF"]:
-        raise ValueError("it does not begin with a line `OFF`, the one kind that is read")
-    vertices, count = (int(word) for word in rows[1][:2])
-    polygons = rows[2 + vertices : 2 + vertices + count]
-    if len(polygons) != count or any(not 2 < int(row[0]) < min(len(row), 5) for row in polygons):
-        raise ValueError(
-            f"its header promises {vertices} vertices and {count} polygons, of 3 or 4 corners each"
-        )
-    return sum(int(row[0]) - 2 for row in polygons)
+def _count_off(text: bytes) -> int:
+    rows = [row for line in text.splitlines() if (row := line.split(b"#")[0].split())]
+    vertices, polygons = (int(word) for word in rows[1][:2])
+    promised = rows[2 + vertices : 2 + vertices + polygons]
+    if rows[0] != [b"OFF"] or len(promised) != polygons:
+        raise ValueError(f"it has no OFF header, or not its {vertices} + {polygons} rows")
+    return sum(int(row[0]) - 2 for row in promised)
 
 
-def count_stl_triangles(data: bytes) -> int:
-    """Count the triangles of an STL file, binary or text.
-
-    **Raises:** `ValueError` when it is as long as neither would be.
-    """
-    count = int.from_bytes(data[80:84], "little")
-    if len(data) == 84 + 50 * count:
-        return count
-    text = data.strip().lower()
-    if not text.startswith(b"solid") or not text.rsplit(b"\n", 1)[-1].startswith(b"endsolid"):
-        raise ValueError(f"it is no text that ends with `endsolid`, nor {count} binary triangles")
-    return len(re.findall(rb"^\s*vertex\s", text, re.MULTILINE)) // 3
-
-
-def check_ply(data: bytes) -> None:
-    """Refuse a PLY file of text that is cut short, and one of several textures."""
-    if b"format ascii" in data[:100]:
-        _whole_lines(data)
-    if data[: data.find(b"end_header")].lower().count(b"comment texturefile") > 1:
-        raise ValueError("it names several textures")
-
-
-def check_gltf(data: bytes) -> None:
-    """Refuse a glTF or GLB file with anything that trimesh passes over or takes for something
-    else.
-    """
-    is_binary = data[:4] == b"glTF"
-    text = data[20 : 20 + int.from_bytes(data[12:16], "little")] if is_binary else data
+def _check_gltf(text: bytes) -> None:
     content = json.loads(text)
-    accessors = content.get("accessors", [])
     primitives = [each for mesh in content.get("meshes", []) for each in mesh["primitives"]]
-    attributes = [
-        accessors[primitive["attributes"][name]]
-        for primitive in primitives
-        for name in ("POSITION", "TEXCOORD_0")
-        if name in primitive["attributes"]
-    ]
-    materials, images = content.get("materials", []), content.get("images", [])
-    surfaces = [each.get("pbrMetallicRoughness", {}) for each in materials]
-    textures = [surface.get("baseColorTexture", {}) for surface in surfaces]
-    needed = content.get("extensionsRequired", [])
-    faults = {
-        f"it needs {', '.join(needed)}": any(not _GLTF_HARMLESS.fullmatch(name) for name in needed),
-        "it is compressed, or has sparse accessors": any(
-            "sparse" in each or "bufferView" not in each for each in accessors
-        ),
-        "its vertices are quantized": any(each["componentType"] != _FLOAT for each in attributes),
-        "it has triangle fans": any(each.get("mode") == _FAN for each in primitives),
-        "its materials are of specular and glossiness": any(
-            "KHR_materials_pbrSpecularGlossiness" in each.get("extensions", {})
-            for each in materials
-        ),
-        "its textures are no PNG, JPEG or WebP": any(
-            each.get("mimeType", "image/png")[6:] not in ("png", "jpeg", "webp") for each in images
-        ),
-        "its textures are moved, or have coordinates of their own": any(
-            each.get("texCoord") or "KHR_texture_transform" in each.get("extensions", {})
-            for each in textures
-        ),
-    }
-    for fault, is_there in faults.items():
-        if is_there:
-            raise ValueError(f"{fault}, which trimesh does not read")
+    for name in ("POSITION", "TEXCOORD_0"):
+        used = {each["attributes"].get(name) for each in primitives} - {None}
+        if any(content["accessors"][i]["componentType"] != _FLOAT for i in used):
+            raise ValueError("its vertices are quantized")
 
 
-CHECKS: dict[str, Callable[[bytes], int | None]] = {
-    "glb": check_gltf,
-    "gltf": check_gltf,
-    "obj": count_obj_triangles,
-    "ply": check_ply,
-    "stl": count_stl_triangles,
-    "off": count_off_triangles,
-}
-"""What is checked in the contents of a file, by its suffix; some count its triangles."""
+_COUNTS = {"obj": _count_obj, "off": _count_off, "gltf": _check_gltf}
+"""How many triangles a file promises, where its format has that."""
 
 
-def _whole_lines(data: bytes) -> bytes:
-    if not data.endswith((b"\n", b"\r")):
+def _count_triangles(kind: str, data: bytes) -> int | None:
+    """Refuse what trimesh would misread, and return how many triangles the file promises."""
+    if kind == "glb":
+        kind, text = "gltf", data[20:][: int.from_bytes(data[12:16], "little")]
+    elif kind == "stl" and len(data) == 84 + 50 * int.from_bytes(data[80:84], "little"):
+        text = b""  # it is binary
+    elif kind == "ply":
+        text = data.partition(b"end_header")[0]
+    else:
+        text = data.replace(b"\r\n", b"\n").replace(b"\\\n", b" ")
+    is_lines = kind in ("obj", "off") or (kind == "ply" and b"format ascii" in text)
+    if is_lines and not data.endswith((b"\n", b"\r")):
         raise ValueError("its last line has no end")
-    return b"\n" + data.replace(b"\r\n", b"\n")
+    if kind in _UNREAD and (unread := _UNREAD[kind].search(text)):
+        raise ValueError(f"`{unread[0][:200].decode(errors='replace')}` is not read")
+    return _COUNTS[kind](text) if kind in _COUNTS else None
 
 
 @contextmanager
@@ -146,9 +93,6 @@ def one_sentence(path: Path) -> Generator[None, None, None]:
 
     **Raises:** `ValueError`; errors that already name the file pass.
     """
-    log = logging.getLogger("trimesh")
-    before = log.level
-    log.setLevel(logging.CRITICAL)  # faults are raised here
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", DeprecationWarning)  # NumPy's, of words among numbers
@@ -161,8 +105,6 @@ def one_sentence(path: Path) -> Generator[None, None, None]:
             f"{path}: cannot be read ({kind}{' '.join(str(error).split())[:200]}); it is cut "
             "short, or of a kind that is not read: export it again"
         ) from None
-    finally:
-        log.setLevel(before)
 
 
 def load_with_trimesh(path: Path, kind: str) -> dict[str, Any]:
@@ -180,7 +122,7 @@ def load_with_trimesh(path: Path, kind: str) -> dict[str, Any]:
     from trimesh.exchange import load  # takes a second, so only where it is needed
 
     folder, data = _Folder(path), path.read_bytes()
-    loaders, count = cast(dict[str, Any], load.mesh_loaders), CHECKS[kind](data)
+    loaders, count = cast(dict[str, Any], load.mesh_loaders), _count_triangles(kind, data)
     found = loaders[kind](BytesIO(data), resolver=folder, fix_texture=False)
     elements = found.get("metadata", {}).get("_ply_raw", {})
     columns = {name: _columns(name, element) for name, element in elements.items()}
@@ -205,26 +147,22 @@ def _columns(name: str, element: dict[str, Any]) -> dict[str, np.ndarray]:
 
 
 class _Folder:
-    """The files beside a mesh: a trimesh resolver that never leaves their folder."""
+    """The files beside a mesh: a resolver that notes what is missing."""
 
     def __init__(self, path: Path):
-        self.file_name, self._folder = path.name, path.parent.resolve()
+        from trimesh.resolvers import FilePathResolver  # never leaves the folder
+
+        self._files, self.file_name = FilePathResolver(str(path)), path.name
         self.faults: list[str] = []
 
     def get(self, name: str) -> bytes:
-        plain = name.strip().replace("\\", "/")
-        candidates = (plain, unquote(plain), plain.rsplit("/", 1)[-1])
-        places = [(self._folder / candidate).resolve() for candidate in candidates]
-        file = next((p for p in places if p.is_relative_to(self._folder) and p.is_file()), None)
-        if file is None:
-            self.faults.append(f"names {name!r}, which is not beside it")
-            raise FileNotFoundError(f"it {self.faults[-1]}")
-        data = file.read_bytes()
         try:
-            if file.suffix.lower() not in (".mtl", ".bin"):
+            data = self._files.get(unquote(name.replace("\\", "/")))
+            if not name.strip().lower().endswith((".mtl", ".bin")):
                 Image.open(BytesIO(data)).close()
         except Exception:  # each decoder fails in its own way
-            self.faults.append(f"names {name!r}, which is no picture that trimesh reads")
+            self.faults.append(f"names {name!r}, which is not beside it, or no picture")
+            raise
         return data
 
     __getitem__ = get

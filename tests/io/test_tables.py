@@ -39,7 +39,7 @@ def test_a_table_is_read_in_its_own_unit(tmp_path, dtype):
         (GOOD.replace("2.0", "two"), "line 5: 0.1, two, 1.0"),
         (GOOD.replace("2.0", "nan"), "line 5: 0.1, nan, 1.0"),
         (GOOD.replace("2.0, 1.0", "2.0"), "line 5: 0.1, 2.0"),
-        ("0\n1\n", "line 1: 0 "),
+        ("0\n1\n", "line 1: 0.0 "),
         (GOOD.replace("0.3,", "0.1,"), "radii"),
         (GOOD.replace("0.0,", "-1,"), "radii"),
         ("r (cm), R\n0.1, 1\n0.2, 0.5\n", r"line 1 gives cm.* mm_per_unit = 10 "),
@@ -88,9 +88,9 @@ def test_media_are_read_and_their_columns_come_back(tmp_path):
         ("", "sigma_a"),
         ("sigma_a,eta\n1,1\n", "sigma_s_prime"),
         (MEDIA.split("\n")[0] + "\n", "0 rows"),
-        (MEDIA.replace("1.5", "0"), "line 2: sigma_s_prime is '0'"),
-        (MEDIA.replace("1.5", "many"), "line 2: sigma_s_prime is 'many'"),
-        (MEDIA.replace(",1.4", ""), "line 4 has 3 cells"),
+        (MEDIA.replace("1.5", "0"), "line 2: milk, 0.0, 0.0"),
+        (MEDIA.replace("1.5", "many"), "line 2: milk, 0.0, many"),
+        (MEDIA.replace(",1.4", ""), "line 4: , 0.1, 2.0 must be name"),
     ],
 )
 def test_bad_media_are_refused_with_their_line(tmp_path, text, value):
