@@ -13,27 +13,24 @@ def cut_below(mesh: Mesh, height: float) -> Mesh:
     """
     y = mesh.corners()[..., 1]
     is_above = y >= height
-    faces = [np.flatnonzero(is_above.all(axis=1))]
-    shares = [np.broadcast_to(np.eye(3), (len(faces[0]), 3, 3))]
-    for number in (1, 2):  # corners above: the tip is kept, or the two triangles below it
-        chosen = np.flatnonzero(is_above.sum(axis=1) == number)
-        alone = (is_above[chosen] == (number == 1)).argmax(axis=1)
-        turn = (alone[:, None] + np.arange(3)) % 3
-        tip, *ends = y[chosen[:, None], turn].T
-        # Shares of the corners below, so that neighbors cut the edge between them alike.
-        pairs = [(tip, end) if number == 1 else (end, tip) for end in ends]
-        s, t = ((above - height) / (above - below) for above, below in pairs)
-        (a, b), (c, d), zero = ((1 - s, s), (1 - t, t), 0 * s)
-        a, b, c, d = (a, b, c, d) if number == 1 else (b, a, d, c)
-        first, second = [a, b, zero], [c, zero, d]
-        one, other, last = np.eye(3)[:, :, None] + np.zeros(len(chosen))
-        kept = [[one, first, second]]
-        if number == 2:
-            kept = [[first, other, last], [first, last, second]]
-        for triangle in kept:
-            share = np.moveaxis(np.asarray(triangle), -1, 0)
+    whole = np.flatnonzero(is_above.all(axis=1))
+    faces, shares = [whole], [np.broadcast_to(np.eye(3), (len(whole), 3, 3))]
+    for tip_above in (True, False):  # the tip of a triangle is kept, or the two triangles below it
+        chosen = np.flatnonzero(is_above.sum(axis=1) == (1 if tip_above else 2))
+        turn = ((is_above[chosen] == tip_above).argmax(axis=1)[:, None] + np.arange(3)) % 3
+        tip, one, other = np.moveaxis(np.eye(3)[turn], 1, 0)
+        cuts = []
+        for end in (one, other):
+            above, below = (tip, end) if tip_above else (end, tip)
+            high, low = (np.einsum("fc,fc->f", at, y[chosen]) for at in (above, below))
+            # By the corner below, so that neighbors cut the edge between them alike.
+            share = ((high - height) / (high - low))[:, None]
+            cuts.append((1 - share) * above + share * below)
+        first, second = cuts
+        halves = [(first, one, other), (first, other, second)]
+        for triangle in [(tip, first, second)] if tip_above else halves:
             faces.append(chosen)
-            shares.append(np.take_along_axis(share, turn.argsort(axis=1)[:, None], axis=2))
+            shares.append(np.stack(triangle, axis=1))
     kept, share = np.concatenate(faces), np.concatenate(shares)
 
     def at_corners(values: Any) -> Any:

@@ -25,17 +25,11 @@ def morton_order(points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
     """Give the order of points along the Morton curve of their bounding cube, 2^21 cells a side;
     ties keep their order.
     """
-    if len(points) == 0:
-        return np.zeros(0, np.int64)
     points = points.astype(np.float64)
-    low = points.min(axis=0)
-    extent = float((points.max(axis=0) - low).max()) or 1.0
-    cells = np.minimum((points - low) * (2**_BITS / extent), 2**_BITS - 1).astype(np.uint64)
-    code = (
-        _spread(cells[:, 0])
-        | (_spread(cells[:, 1]) << np.uint64(1))
-        | (_spread(cells[:, 2]) << np.uint64(2))
-    )
+    low, high = points.min(axis=0, initial=np.inf), points.max(axis=0, initial=-np.inf)
+    size = (high - low).max() or 1.0
+    cells = np.minimum((points - low) * (2**_BITS / size), 2**_BITS - 1).astype(np.uint64)
+    code = sum(_spread(axis) << np.uint64(bit) for bit, axis in enumerate(cells.T))
     return np.argsort(code, kind="stable")
 
 
@@ -45,14 +39,6 @@ def distinct(
     """Give the first point of each place, in the order of the points, and the place of every
     point.
     """
-    if len(points) == 0:
-        return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    order = np.lexsort(points.T)
-    new = np.append(True, (np.diff(points[order], axis=0) != 0).any(axis=1))
-    first = np.minimum.reduceat(order, np.flatnonzero(new))
-    kept = np.argsort(first)
-    rank = np.empty_like(kept)
-    rank[kept] = np.arange(len(kept))
-    place = np.empty(len(points), np.int64)
-    place[order] = rank[np.cumsum(new) - 1]
-    return first[kept], place
+    _, first, place = np.unique(points, axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    return first[order], np.argsort(order)[place.ravel()]

@@ -1,5 +1,7 @@
 """The only package that touches files: splats, meshes, pictures, materials."""
 
+from splatjax._memory import check_memory as check_memory, free_bytes as free_bytes
+
 from ._atomic import atomic_path as atomic_path
 from ._images import linear_to_srgb as linear_to_srgb, srgb_to_linear as srgb_to_linear
 from ._exr import read_exr as read_exr, read_manifest as read_manifest, write_exr as write_exr
@@ -22,7 +24,6 @@ from ._profiles import (
     read_profile as read_profile,
     write_columns as write_columns,
 )
-from ._files import check_memory as check_memory, free_bytes as free_bytes
 from ._meshes import read_textured_mesh as read_textured_mesh, sample_mesh as sample_mesh
 from ._observations import picture_paths as picture_paths, read_observations as read_observations
 from ._ply import read_splats as read_splats, write_splats as write_splats

@@ -1,4 +1,4 @@
-"""What is checked before a file is opened: that it exists, fits into memory, and has a unit."""
+"""What is checked before a file is opened: that it exists, and has a unit."""
 
 import math
 import os
@@ -46,40 +46,3 @@ def check_units(path: Path, mm_per_unit: float, up: str = "y") -> None:
 def with_y_up(vectors: Float[np.ndarray, "n 3"], up: str) -> Float[np.ndarray, "n 3"]:
     """Turn vectors of a file by a quarter around x, so that its upward axis becomes +y."""
     return vectors if up == "y" else vectors[:, [0, 2, 1]] * [1, 1, -1]
-
-
-def check_memory(what: str, required: float, remedy: str) -> None:
-    """Refuse what does not fit.
-
-    **Arguments:**
-
-    - `what`: is to be held in memory.
-    - `required`: bytes, about.
-    - `remedy`: what to do about it.
-
-    **Raises:** `ValueError` when less than that is free.
-    """
-    free = free_bytes()
-    if required > free:
-        raise ValueError(
-            f"{what} would take about {required / 1e9:.3g} GB of memory, and {free / 1e9:.3g} GB "
-            f"are free; {remedy}"
-        )
-
-
-def free_bytes() -> float:
-    """Measure how much memory this process may still take: what the machine has free, within the
-    limit of its address space. Infinite where neither is known.
-    """
-    try:
-        import resource  # not on Windows
-
-        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()  # Linux alone
-        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
-    except (ImportError, OSError):
-        return math.inf
-    free = min(1024.0 * int(row.split()[1]) for row in lines if row.startswith("MemAvailable:"))
-    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
-    if limit != resource.RLIM_INFINITY:
-        free = max(min(free, limit - pages * resource.getpagesize()), 0.0)
-    return free

@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from ._files import check_memory, existing_file
+from splatjax._memory import check_memory
+
+from ._files import existing_file
 
 _BYTES_PER_VALUE = 24.0  # in double precision, while they are decoded
 

@@ -7,6 +7,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from splatjax._memory import check_memory
 from splatjax.geometry import (
     Mesh,
     Textures,
@@ -16,7 +17,7 @@ from splatjax.geometry import (
 )
 from splatjax.scene import Splats
 
-from ._files import check_memory, check_units, existing_file, naming
+from ._files import check_units, existing_file, naming
 from ._images import read_color, read_map
 from ._triangles import Piece, read_pieces
 

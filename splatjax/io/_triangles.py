@@ -7,9 +7,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from splatjax._memory import check_memory
 from splatjax.geometry import Mesh, unit
 
-from ._files import check_memory, with_y_up
+from ._files import with_y_up
 from ._images import srgb_to_linear
 from ._trimesh import FORMATS, load_with_trimesh, one_sentence
 
