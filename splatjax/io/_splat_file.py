@@ -50,7 +50,7 @@ class SplatFile:
         self.path, self.part, self.mm_per_unit, self.up = existing_file(path), part, mm_per_unit, up
         check_units(self.path, mm_per_unit, up)
         if part < 1:
-            raise ValueError(f"part is {part}; it must be at least one splat")
+            raise ValueError(f"{path}: part is {part}; it must be at least one splat")
         with one_sentence(self.path), open(path, "rb") as file:
             from trimesh.exchange.ply import _parse_header  # only where it is needed
 

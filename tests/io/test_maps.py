@@ -4,27 +4,15 @@ import os
 from pathlib import Path
 
 import numpy as np
-import OpenImageIO as oiio
 import pytest
 import trimesh
 from PIL import Image
-from writers import SQUARE, TRIANGLES, UVS, ramp, square, write_ply, xyz
+from writers import SQUARE, TRIANGLES, UVS, ramp, square, write_picture, write_ply, xyz
 
 from splatjax.io import linear_to_srgb, read_picture, sample_mesh, srgb_to_linear
 from splatjax.io._images import read_color, read_map
 
 SINGLE = 1e-6
-
-
-def write_picture(path, values, kind):
-    """Write shares in [0, 1] by OpenImageIO, as a type of number."""
-    file = oiio.ImageOutput.create(str(path))
-    spec = oiio.ImageSpec(values.shape[1], values.shape[0], values.shape[2], kind)
-    spec["oiio:UnassociatedAlpha"] = 1
-    assert file.open(str(path), spec)
-    assert file.write_image(values.astype(np.float32))
-    assert file.close()
-    return path
 
 
 @pytest.mark.parametrize("channels", [1, 3, 4])
@@ -67,28 +55,6 @@ def test_decoding_is_that_of_colour_science():
         colour.cctf_encoding(np.append(np.clip(linear, 0, 1), 0), function="sRGB"),
         atol=1e-15,
     )
-
-
-@pytest.mark.parametrize("suffix", ["png", "jpg", "tif", "exr", "webp"])
-def test_a_picture_that_is_cut_short_is_refused(tmp_path, suffix):
-    values = np.random.default_rng(0).uniform(size=(40, 30, 3))
-    write_picture(tmp_path / f"whole.{suffix}", values, "float" if suffix == "exr" else "uint8")
-    data, cut = (tmp_path / f"whole.{suffix}").read_bytes(), tmp_path / f"cut.{suffix}"
-    for share in (0.02, 0.3, 0.95):
-        cut.write_bytes(data[: int(share * len(data))])
-        with pytest.raises(ValueError, match=rf"cut\.{suffix}: cannot be read as a picture"):
-            read_color(cut)
-
-
-def test_pictures_that_cannot_be(tmp_path):
-    values = np.full((2, 3, 3), 0.5)
-    values[0, 0] = 3.0
-    with pytest.raises(ValueError, match=r"a\.exr: has an albedo outside \[0, 1\]"):
-        read_color(write_picture(tmp_path / "a.exr", values, "float"))
-    with pytest.raises(ValueError, match=r"b\.tif: has neither R, G and B nor Y"):
-        read_color(write_picture(tmp_path / "b.tif", np.ones((2, 2, 2)), "uint8"))
-    with pytest.raises(FileNotFoundError, match=r"none\.png"):
-        read_color(tmp_path / "none.png")
 
 
 def heights_and_reds(splats):

@@ -1,19 +1,15 @@
 """Frames in OpenEXR, pictures in PNG, and those that move."""
 
-import shutil
-import subprocess
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import OpenEXR
+import OpenImageIO as oiio
 import pytest
 from PIL import Image
 
 from splatjax.io import read_exr, read_manifest, write_animation, write_exr, write_png
 from splatjax.scene import Frame
-
-TOOLS = [["exrheader"], ["oiiotool", "--info", "-v"]]
 
 
 def some_frame(channels=3, gaussians=4, lights=2, height=6, width=5) -> Frame:
@@ -56,117 +52,57 @@ def test_frame_comes_back_bit_by_bit(tmp_path, channels, lights, gaussians):
     assert [file.name for file in tmp_path.iterdir()] == ["frame.exr"]
 
 
-def test_diffuse_is_rebuilt_from_layers_and_header_alone(tmp_path):
-    manifest = {"--width": 5, "splats": None}
+def test_other_readers_rebuild_diffuse_from_layers_and_header_alone(tmp_path):
+    frame, variances, manifest = some_frame(), [0.1, 0.2, 0.4, 7.5], {"--width": 5, "splats": None}
     path = tmp_path / "frame.exr"
-    write_exr(path, some_frame(), variances=[0.1, 0.2, 0.4, 7.5], manifest=manifest)
-    with OpenEXR.File(str(path), separate_channels=True) as file:
+    write_exr(path, frame, variances=variances, manifest=manifest)
+    with OpenEXR.File(str(path)) as file:
         header = dict(file.header())
         planes = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
-    for channel, letter in enumerate("RGB"):
-        rebuilt = sum(
-            header[f"splatjax.weights.{k}"][channel] * planes[f"diffusion.{k}.{letter}"]
-            for k in (1, 2, 3, 4)
-        )
-        np.testing.assert_allclose(rebuilt, planes[f"diffuse.{letter}"], rtol=1e-6)
-    np.testing.assert_allclose(header["splatjax.variances"], [0.1, 0.2, 0.4, 7.5], rtol=1e-7)
+    weights = [header[f"splatjax.weights.{k}"] for k in (1, 2, 3, 4)]
+    rebuilt = sum(weights[k - 1] * planes[f"diffusion.{k}"] for k in (1, 2, 3, 4))
+    np.testing.assert_allclose(rebuilt, planes["diffuse"], rtol=1e-6)
+    np.testing.assert_allclose(header["splatjax.variances"], variances, rtol=1e-7)
     np.testing.assert_allclose(np.ravel(header["chromaticities"])[:2], [0.64, 0.33], rtol=1e-6)
     assert all(plane.dtype == np.float32 for plane in planes.values())
     assert read_manifest(path) == manifest
+    names = oiio.ImageInput.open(str(path)).spec().channelnames
+    assert {"R", "A", "Z", "position.X", "albedo.R", "shadow.2", "diffusion.4.G"} <= {*names}
 
 
-@pytest.mark.parametrize("command", [each for each in TOOLS if shutil.which(each[0])])
-def test_common_tools_list_the_layers(tmp_path, command):
-    """Debian: openexr, openimageio-tools."""
-    write_exr(tmp_path / "frame.exr", some_frame())
-    words = [*command, str(tmp_path / "frame.exr")]
-    printed = subprocess.run(words, capture_output=True, text=True, check=True).stdout
-    for name in ("R", "A", "Z", "position.X", "albedo.R", "shadow.2", "diffusion.4.G"):
-        assert name in printed
+ENCODED = {
+    "color": ([[[0, 0.2158605, 1], [0.00215, 2, -1]]], [[[0, 128, 255], [7, 255, 0]]]),
+    "gray": (np.ones((2, 3, 1)), np.full((2, 3), 255)),
+    "alpha": ([[[0.5, 0.5, 0, 0.5], [0, 0, 0, 0]]], [[[255, 255, 0, 128], [0, 0, 0, 0]]]),
+}
 
 
-def test_exr_that_cannot_be_read_is_refused(tmp_path):
-    with pytest.raises(FileNotFoundError, match="no such file"):
-        read_exr(tmp_path / "none.exr")
-    write_exr(tmp_path / "frame.exr", some_frame())
-    whole = (tmp_path / "frame.exr").read_bytes()
-    for size in range(0, len(whole), len(whole) // 40):
-        (tmp_path / "cut.exr").write_bytes(whole[:size])
-        with pytest.raises(ValueError, match=r"cut.exr: cannot be read as a picture"):
-            read_exr(tmp_path / "cut.exr")
-    with OpenEXR.File({"type": OpenEXR.scanlineimage}, {"R": np.zeros((2, 2), np.float32)}) as file:
-        file.write(str(tmp_path / "other.exr"))
-    with pytest.raises(ValueError, match=r"other.exr: lacks .*, so it is no frame"):
-        read_exr(tmp_path / "other.exr")
-    with pytest.raises(ValueError, match=r"other.exr: does not record what it was made of"):
-        read_manifest(tmp_path / "other.exr")
-
-
-def test_png_encodes_for_the_display(tmp_path):
+@pytest.mark.parametrize("name", ENCODED)
+def test_png_encodes_for_the_display(tmp_path, name):
     """sRGB: linear 0.2159 is 128 of 255, 0.0021 is a 36th (the straight part), and exposure counts
     in stops.
     """
-    picture = np.asarray([[[0.0, 0.2158605, 1.0], [0.00215, 2.0, -1.0]]])
+    picture, expected = (np.asarray(each) for each in ENCODED[name])
     write_png(tmp_path / "a.png", picture)
     with Image.open(tmp_path / "a.png") as image:
-        assert image.mode == "RGB"
-        np.testing.assert_array_equal(np.asarray(image), [[[0, 128, 255], [7, 255, 0]]])
-    write_png(tmp_path / "b.png", picture / 4, exposure=2.0)
+        np.testing.assert_array_equal(np.asarray(image), expected)
+    scale = [0.25] * 3 + [1] if name == "alpha" else 0.25
+    write_png(tmp_path / "b.png", picture * scale, exposure=2.0)
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
 
 
-def test_png_of_frames_gray_and_alpha(tmp_path):
-    frame = some_frame()
-    write_png(tmp_path / "a.png", frame)
-    write_png(tmp_path / "b.png", np.asarray(frame.beauty))
-    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
-    write_png(tmp_path / "gray.png", np.ones((2, 3, 1)))
-    with Image.open(tmp_path / "gray.png") as image:
-        assert (image.mode, image.size) == ("L", (3, 2))
-    write_png(tmp_path / "alpha.png", np.asarray([[[0.5, 0.5, 0.0, 0.5], [0.0, 0.0, 0.0, 0.0]]]))
-    with Image.open(tmp_path / "alpha.png") as image:
-        np.testing.assert_array_equal(np.asarray(image), [[[255, 255, 0, 128], [0, 0, 0, 0]]])
-
-
-def test_png_refuses_what_has_no_colors(tmp_path):
-    with pytest.raises(ValueError, match=r"a.png: a picture of 7 channels"):
-        write_png(tmp_path / "a.png", np.zeros((2, 2, 7)))
-    with pytest.raises(ValueError, match="exposure is nan"):
-        write_png(tmp_path / "a.png", np.zeros((2, 2, 3)), exposure=float("nan"))
-    assert not list(tmp_path.iterdir())
-
-
-@pytest.fixture
-def frames(tmp_path):
-    """Three frames of noise."""
-    paths = [tmp_path / f"{i}.png" for i in range(3)]
-    for i, path in enumerate(paths):
-        write_png(path, np.random.default_rng(i).uniform(0, 1, (6, 5, 3)))
-    return paths
-
-
-def test_animation_keeps_the_colors_and_the_time(tmp_path, frames):
+def test_animation_keeps_the_colors_and_the_time(tmp_path):
+    """Three frames of noise; the third ends at 125 ms."""
+    pictures = np.random.default_rng(0).integers(0, 256, (3, 6, 5, 3), np.uint8)
+    frames = [tmp_path / f"{i}.png" for i in range(3)]
+    for path, picture in zip(frames, pictures, strict=True):
+        Image.fromarray(picture).save(path)
     write_animation(tmp_path / "film.webp", frames, frames_per_second=24.0)
-    write_animation(tmp_path / "still.webp", frames[:1])
-    with Image.open(tmp_path / "film.webp") as film, Image.open(tmp_path / "still.webp") as still:
-        assert (still.n_frames, film.n_frames, film.size, film.info["loop"]) == (1, 3, (5, 6), 0)
-        durations = []
-        for i, frame in enumerate(frames):
+    durations = []
+    with Image.open(tmp_path / "film.webp") as film:
+        assert (film.n_frames, film.size, film.info["loop"]) == (3, (5, 6), 0)
+        for i, picture in enumerate(pictures):
             film.seek(i)
-            film.load()
+            np.testing.assert_array_equal(np.asarray(film.convert("RGB")), picture)
             durations.append(film.info["duration"])
-            with Image.open(frame) as image:
-                np.testing.assert_array_equal(np.asarray(film.convert("RGB")), np.asarray(image))
-    assert durations == [42, 41, 42]  # the third frame ends at 125 ms
-
-
-def test_animations_that_cannot_be_are_refused(tmp_path, frames):
-    path = tmp_path / "film.webp"
-    with pytest.raises(ValueError, match="0 frames"):
-        write_animation(path, [])
-    with pytest.raises(ValueError, match=r"from 0\.1 to 60"):
-        write_animation(path, frames, frames_per_second=0.0)
-    write_png(frames[2], np.zeros((6, 6, 3)))
-    with pytest.raises(ValueError, match=r"2\.png: is \(6, 6\) pixels"):
-        write_animation(path, frames)
-    assert not path.exists()
+    assert durations == [42, 41, 42]

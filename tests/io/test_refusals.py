@@ -2,13 +2,41 @@
 sentence that names the file, the value and the remedy.
 """
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
 from PIL import Image
-from writers import SUFFIXES, TRIANGLES, export, gltf, ramp, square, write_ply, xyz
+from writers import (
+    SUFFIXES,
+    TRIANGLES,
+    columns_of,
+    export,
+    gltf,
+    ramp,
+    some_splats,
+    square,
+    write_picture,
+    write_ply,
+    xyz,
+)
 
-from splatjax.io import read_splats, read_textured_mesh, sample_mesh
+from splatjax.io import (
+    SplatFile,
+    read_exr,
+    read_manifest,
+    read_picture,
+    read_profile,
+    read_record,
+    read_splats,
+    read_textured_mesh,
+    sample_mesh,
+    write_animation,
+    write_png,
+    write_splats,
+)
+from splatjax.io._images import read_color
+from splatjax.scene import Splats
 
 
 def read(path):
@@ -19,7 +47,7 @@ def refused(path, value, read=read, kind=ValueError):
     with pytest.raises(kind) as caught:
         read(path)
     message = str(caught.value)
-    assert (message.startswith(str(path)), value in message, "\n" in message) == (True, True, False)
+    assert (str(path.parent) in message, value in message, "\n" in message) == (True, True, False)
 
 
 def write_any(path, text):
@@ -126,46 +154,148 @@ def test_points_that_cannot_be_read(tmp_path, data, value):
     refused(write_any(tmp_path / "a.ply", data), value, read_splats)
 
 
-@pytest.mark.parametrize("suffix", SUFFIXES)
-def test_no_file_that_is_cut_short_is_read_in_silence(tmp_path, suffix):
-    """Cut at any byte; only of OBJ nobody knows how many lines there should be."""
-    path = export(trimesh.creation.box(), tmp_path, suffix)
-    data, cut = path.read_bytes(), path.with_name(f"cut{path.suffix}")
-    for size in range(0, len(data), max(1, len(data) // 150)):
-        cut.write_bytes(data[:size])
-        is_whole = size >= len(data.rstrip())
-        if not is_whole and not (suffix == "obj" and data[size - 1 : size] == b"\n"):
-            refused(cut, cut.name)
+def changed(names, value):
+    """Return columns of splats with a value at vertex 7."""
+    columns = columns_of(some_splats()) | dict.fromkeys(("specular", "red"), np.ones(50, "f4"))
+    columns |= dict.fromkeys(("green", "blue"), np.ones(50, "f4"))
+    is_there = np.arange(50) == 7
+    return columns | {name: np.where(is_there, value, columns[name]).astype("f4") for name in names}
 
 
-def test_what_is_asked_of_a_mesh_must_be_there(tmp_path):
-    path, picture = export(square(), tmp_path, "obj"), tmp_path / "ramp.png"
-    ramp().save(picture)
-    bare = write_any(tmp_path / "bare.obj", ROWS + "f 1 2 3\n")
-    flat = write_any(tmp_path / "flat.obj", "v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n")
+SCENE = ("x", "y", "z", "f_dc_0", "scale_0", "rot_0", "opacity")
 
-    def sampled(**options):
-        return lambda path: sample_mesh(path, 10, **{"mm_per_unit": 1.0, **options})
 
-    refused(tmp_path / "none.obj", "none.obj", sampled(), FileNotFoundError)
-    refused(tmp_path, "folder", sampled(), IsADirectoryError)
-    refused(path, "mm_per_unit is -1", sampled(mm_per_unit=-1.0))
-    refused(path, "up is 'x'", sampled(up="x"))
-    refused(path, "crease_angle is 181", sampled(crease_angle=181.0))
-    refused(path, "crop_min_y = 3", sampled(crop_min_y=3.0))
-    refused(path, "GB", lambda path: sample_mesh(path, 10**12, mm_per_unit=1.0))
-    refused(bare, "texture coordinates", sampled(albedo=picture))
-    refused(flat, "area", sampled())
+@pytest.mark.parametrize(
+    ("columns", "value"),
+    [
+        (changed(["x"], np.nan), "x y z of vertex 7"),
+        (changed(["nz"], np.inf), "nx ny nz of vertex 7"),
+        (changed(["nx", "ny", "nz"], 0), "nx ny nz of vertex 7 is 0 0 0"),
+        (changed(["radius"], 0), "radius of vertex 7 is 0"),
+        (changed(["area"], -2), "area of vertex 7 is -2"),
+        (changed(["red"], 3), "red green blue of vertex 7 is 3 1 1"),
+        (changed(["specular"], -1), "specular of vertex 7 is -1"),
+        (columns_of(some_splats()) | {"red": np.ones(50)}, "red green blue"),
+        (dict.fromkeys(SCENE, np.zeros(5)), "Gaussian-splatting scene"),
+    ],
+)
+def test_values_that_no_splat_may_have(tmp_path, columns, value):
+    path = write_ply(tmp_path / "a.ply", columns)
+    refused(path, value, read_splats)
+    refused(path, value if "area" in columns else "complete", lambda path: list(SplatFile(path)()))
+
+
+def sampled(**options):
+    return lambda path: sample_mesh(path, 10, **{"mm_per_unit": 1.0, **options})
+
+
+def film(frames, speed=24.0):
+    return lambda path: write_animation(
+        path, [path.with_name(name) for name in frames], frames_per_second=speed
+    )
+
+
+TWO_CHANNELS = Splats(*(jnp.ones((4, *shape)) for shape in ((3,), (3,), (), (), (2,))))
+CALLS = [
+    ("none.obj", sampled(), "no such file"),
+    ("none.exr", read_exr, "no such file"),
+    ("none.png", read_color, "no such file"),
+    ("none.ply", SplatFile, "no such file"),
+    ("none.csv", read_profile, "no such file"),
+    ("folder", sampled(), "folder"),
+    ("square.obj", sampled(mm_per_unit=-1.0), "mm_per_unit is -1"),
+    ("square.obj", sampled(up="x"), "up is 'x'"),
+    ("square.obj", sampled(crease_angle=181.0), "crease_angle is 181"),
+    ("square.obj", sampled(crop_min_y=3.0), "crop_min_y = 3"),
+    ("square.obj", lambda path: sample_mesh(path, 10**12, mm_per_unit=1.0), "GB"),
+    ("square.obj", read_splats, "is a mesh"),
+    ("bare.obj", lambda path: sampled(albedo=path.with_name("a.png"))(path), "coordinates"),
+    ("flat.obj", sampled(), "area"),
+    ("splats.ply", lambda path: SplatFile(path, part=0), "part is 0"),
+    ("splats.ply", lambda path: SplatFile(path, up="x"), "up is 'x'"),
+    ("text.ply", SplatFile, "binary"),
+    ("faces.ply", SplatFile, "complete the file first"),
+    ("few.ply", read_splats, "3 points"),
+    ("new.ply", lambda path: write_splats(path, TWO_CHANNELS), "albedo has 2 channels"),
+    ("other.exr", read_exr, "so it is no frame"),
+    ("other.exr", read_manifest, "what it was made of"),
+    ("other.exr", read_color, "R, G and B nor Y"),
+    ("bright.exr", read_color, "[0, 1]"),
+    ("a.png", read_picture, "encoded for a display"),
+    ("new.png", lambda path: write_png(path, np.zeros((2, 2, 7))), "7 channels"),
+    ("new.png", lambda path: write_png(path, POINTS[None], exposure=np.nan), "exposure is nan"),
+    ("new.webp", film([]), "0 frames"),
+    ("new.webp", film(["a.png"], 0.0), "from 0.1 to 60"),
+    ("new.webp", film(["a.png", "b.png"]), "(2, 3)"),
+    ("a.csv", lambda path: read_profile(path, mm_per_unit=0.0), "mm_per_unit is 0"),
+    ("a.csv", lambda path: read_profile(path, mm_per_unit=np.nan), "mm_per_unit is nan"),
+    ("a.csv", lambda path: read_profile(path, mm_per_unit=1.0), "mm_per_unit = 10"),
+    ("json", read_record, "is no"),
+    ("list.json", read_record, "is no"),
+]
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Files that are whole, and yet not what is asked for."""
+    (tmp_path / "folder").mkdir()
+    export(square(), tmp_path, "obj").rename(tmp_path / "square.obj")
+    write_splats(tmp_path / "splats.ply", some_splats())
+    columns, triangle = columns_of(some_splats()), [np.zeros(3, "i4")]
+    write_ply(tmp_path / "text.ply", columns, text=True)
+    write_ply(tmp_path / "faces.ply", {"x": columns["x"]}, {"vertex_index": triangle})
+    write_ply(tmp_path / "few.ply", xyz(np.eye(3)))
+    for name, size in (("a.png", (3, 2)), ("b.png", (2, 3))):
+        Image.new("RGB", size).save(tmp_path / name)
+    write_picture(tmp_path / "other.exr", np.ones((2, 2, 2)), "float")
+    write_picture(tmp_path / "bright.exr", np.full((2, 2, 3), 3.0), "float")
+    texts = {"a.csv": "radius (cm), R (1/cm^2)\n0.1, 1\n0.2, 0.5\n", "json": "{", "list.json": "[]"}
+    texts |= {"bare.obj": ROWS + "f 1 2 3\n", "flat.obj": "v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n"}
+    for name, text in texts.items():
+        (tmp_path / name).write_text(text)
+    return tmp_path
+
+
+@pytest.mark.parametrize(("name", "call", "value"), CALLS)
+def test_what_cannot_be_done_with_a_file(folder, name, call, value):
+    before = set(folder.iterdir())
+    refused(folder / name, value, call, (ValueError, OSError))
+    assert set(folder.iterdir()) == before
 
 
 def test_points_far_from_the_origin_where_precision_does_not_reach(tmp_path, x64):
-    """A body of 200 mm in the coordinates of a country, in double precision."""
+    """A body of 200 mm in the coordinates of a country, in double precision; and in parts."""
     points = POINTS.astype(float) * 100 + np.asarray([4e8, 5e8, 0])
-    path = write_ply(tmp_path / "a.ply", xyz(points))
-    if x64:
-        assert read_splats(path).count == 20
+    fields = {name: np.ones(20) for name in ("nx", "ny", "nz", "radius", "area")}
+    path = write_ply(tmp_path / "a.ply", xyz(points) | fields)
+    for read_all in (read_splats, lambda path: list(SplatFile(path, part=7)())):
+        if x64:
+            read_all(path)
+        else:
+            refused(path, "60 mm apart", read_all)
+
+
+@pytest.mark.parametrize("suffix", [*SUFFIXES, "png", "jpg", "tif", "exr", "webp"])
+def test_no_file_that_is_cut_short_is_read_in_silence(tmp_path, suffix):
+    """Cut at any byte; only of OBJ nobody knows how many lines there should be."""
+    if suffix in SUFFIXES:
+        path, readers = export(trimesh.creation.box(), tmp_path, suffix), [read]
     else:
-        refused(path, "60 mm apart", read_splats)
+        picture = np.random.default_rng(0).uniform(size=(40, 30, 3))
+        kind = "float" if suffix == "exr" else "uint8"
+        path = write_picture(tmp_path / f"a.{suffix}", picture, kind)
+        readers = [read_color]
+    if suffix == "ply":
+        write_splats(path, some_splats())
+        readers = [read_splats, SplatFile]
+    data, cut = path.read_bytes(), path.with_name(f"cut{path.suffix}")
+    for size in range(0, len(data), max(1, len(data) // 80)):
+        cut.write_bytes(data[:size])
+        is_whole = size >= len(data.rstrip()) or (
+            suffix == "obj" and data[size - 1 : size] == b"\n"
+        )
+        for reader in readers if not is_whole else ():
+            refused(cut, cut.name, reader)
 
 
 def test_textures_are_taken_from_the_files_own_folder_alone(tmp_path):

@@ -54,19 +54,6 @@ def test_a_bad_profile_is_refused_with_its_line(tmp_path, text, value):
         read_profile(path)
 
 
-def test_a_unit_or_a_file_that_cannot_be(tmp_path):
-    path = tmp_path / "one.csv"
-    with pytest.raises(FileNotFoundError, match=r"one\.csv"):
-        read_profile(path)
-    path.write_text("radius (cm), R (1/cm^2)\n0.1, 1\n0.2, 0.5\n", encoding="utf-8")
-    assert read_profile(path, mm_per_unit=10.0).radii[0] == pytest.approx(1)
-    for unit in (0.0, -1.0, float("inf"), float("nan"), 1.0):
-        with pytest.raises(ValueError, match=rf"one\.csv: .*{unit:g}"):
-            read_profile(path, mm_per_unit=unit)
-    with pytest.raises(IsADirectoryError, match="folder"):
-        read_profile(tmp_path)
-
-
 MEDIA = "name,sigma_a,sigma_s_prime,eta\nmilk, 0, 1.5, 1.3\n\n,0.1,2,1.4\n"
 
 
@@ -109,10 +96,6 @@ def test_records_come_back_and_fingerprints_tell_contents_apart(tmp_path):
     record, path = {"--frames": 12, "--fill": 0.1, "splats": None}, tmp_path / "record.json"
     write_record(path, record)
     assert read_record(path) == record == json.loads(path.read_text())
-    for broken in ("{", "[]"):
-        path.write_text(broken)
-        with pytest.raises(ValueError, match=r"record\.json: is no .*delete it"):
-            read_record(path)
     path.write_bytes(b"abc")
     assert fingerprint(path).startswith("3 bytes, SHA-256 ba7816bf")
     path.write_bytes(b"abd")

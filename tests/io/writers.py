@@ -5,8 +5,11 @@ import json
 from pathlib import Path
 
 import numpy as np
+import OpenImageIO as oiio
 import trimesh
 from PIL import Image
+
+from splatjax.geometry import complete_splats
 
 SQUARE = np.asarray([[0, 0, 0], [2, 0, 0], [2, 2, 0], [0, 2, 0]], np.float32)
 TRIANGLES = np.asarray([[0, 1, 2], [0, 2, 3]])
@@ -60,9 +63,29 @@ def write_ply(path, columns, lists=None, *, text=False, order="<", comments=()):
     return path
 
 
-def xyz(points):
-    """Return columns of points."""
-    return dict(zip("xyz", np.asarray(points).T, strict=True))
+def xyz(points, names=("x", "y", "z")):
+    """Return columns of points, or of other vectors."""
+    return dict(zip(names, np.asarray(points).T, strict=True))
+
+
+def some_splats(count=50):
+    """Return a patch of a sphere, every field given."""
+    random = np.random.default_rng(1)
+    normals = random.normal(size=(count, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    shares = random.uniform(size=(7, count))
+    fields = dict(zip(("radii", "areas", "specular", "roughness"), 0.5 + shares, strict=False))
+    return complete_splats(20 * normals, normals=normals, albedo=shares[4:].T, **fields)
+
+
+def columns_of(splats, kind="f4"):
+    """Return columns in an order of their own."""
+    columns = xyz(splats.normals, ("nx", "ny", "nz")) | {
+        "radius": splats.radii,
+        "area": splats.areas,
+    }
+    columns |= xyz(splats.centers)
+    return {name: np.asarray(columns[name], kind) for name in sorted(columns, reverse=True)}
 
 
 def square(**visual):
@@ -96,3 +119,14 @@ def ramp():
     return Image.fromarray(
         np.rint(255 * np.stack([rows, 1 - rows, 0 * rows], axis=-1)).astype(np.uint8)
     )
+
+
+def write_picture(path, values, kind):
+    """Write shares in [0, 1] by OpenImageIO, as a type of number."""
+    file = oiio.ImageOutput.create(str(path))
+    spec = oiio.ImageSpec(values.shape[1], values.shape[0], values.shape[2], kind)
+    spec["oiio:UnassociatedAlpha"] = 1
+    assert file.open(str(path), spec)
+    assert file.write_image(values.astype(np.float32))
+    assert file.close()
+    return path
