@@ -277,15 +277,6 @@ def test_creases_split_normals_where_triangles_differ():
     np.testing.assert_array_equal(split.colors[split.faces], given.colors[faces])
 
 
-def test_a_box_stays_a_box():
-    box = trimesh.creation.box(extents=(10.0, 20.0, 30.0))
-    vertices, faces = np.array(box.vertices), np.array(box.faces)
-    mesh = split_creases(Mesh(vertices, faces, vertex_normals(vertices, faces)), 40.0)
-    points, rounding = anywhere(mesh), Rounding(mesh)
-    np.testing.assert_array_equal(rounding.positions(points), points.positions(mesh))
-    assert rounding.area() == pytest.approx(2 * (200 + 300 + 600), rel=1e-12)
-
-
 def test_rounded_splats_cover_the_rounded_surface():
     splats = sample_mesh(sphere(subdivisions=2), COUNT, rounded=True)
     centers, normals = (
