@@ -26,7 +26,7 @@ class Cells(NamedTuple):
 def tangent_frames(
     normals: Float[np.ndarray, "n 3"],
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-    """Give two unit vectors that make a right-handed frame with each normal.
+    """Compute two unit vectors that make a right-handed frame with each normal.
 
     **Source:** Duff et al. 2017, "Building an Orthonormal Basis, Revisited".
     """

@@ -36,7 +36,7 @@ def complete_splats(
     - `radii`: mm; `None`: as large as the cells ask for, so that no hole is left.
     - `albedo`, `specular`, `roughness`: as `Splats` has them; never estimated.
 
-    Points that lie alone are kept, estimated as large as their neighbors are, and a warning tells
+    Points that lie alone are kept, estimated as large as their neighbors are, and a warning states
     how many there are. Points at one place share their area.
 
     **Returns:** as many splats as points, in JAX's default precision.
@@ -66,8 +66,8 @@ def complete_splats(
 
 
 def _covered(centers: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Give areas and radii; those of points that lie alone are their neighbors', lest their discs
-    hide everything.
+    """Compute areas and radii; those of points that lie alone are their neighbors', lest their
+    discs hide everything.
     """
     first, place = distinct(centers)
     places = centers[first]
@@ -90,7 +90,7 @@ def _covered(centers: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.n
 def _strays(
     points: Float[np.ndarray, "n 3"],
 ) -> tuple[Bool[np.ndarray, " n"], Int[np.ndarray, "n k"], Float[np.ndarray, " n"]]:
-    r"""Tell which points lie alone: much farther from their neighbors than these are from their
+    r"""Find points that lie alone: much farther from their neighbors than these are from their
     own, and no one's neighbors.
 
     So that neither a place where all points are sparse holds one, nor the border between dense and
@@ -105,5 +105,5 @@ def _strays(
         points, k=min(_NEIGHBORS, len(points) - 1) + 1, workers=-1
     )
     mean, near = distances[:, 1:].mean(axis=1), near[:, 1:]
-    wanted = np.bincount(near.ravel(), minlength=len(points)) > 0
-    return (mean > _ALONE * np.median(mean[near], axis=1)) & ~wanted, near, mean
+    is_neighbor = np.bincount(near.ravel(), minlength=len(points)) > 0
+    return (mean > _ALONE * np.median(mean[near], axis=1)) & ~is_neighbor, near, mean

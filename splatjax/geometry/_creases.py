@@ -31,7 +31,7 @@ def shared_edges(places: Int[np.ndarray, "faces 3"]) -> Int[np.ndarray, "n 2 2"]
 def hard_edges(
     mesh: Mesh, places: Int[np.ndarray, "faces 3"]
 ) -> tuple[Int[np.ndarray, "n 2 2"], Bool[np.ndarray, " n"]]:
-    """Tell which shared edges are hard: those where the normals of two triangles differ."""
+    """Find shared edges, and which are hard: those where the normals of two triangles differ."""
     corners = shared_edges(places)
     normals = mesh.normals[mesh.faces].reshape(-1, 3)[corners]
     cosines = np.einsum("nei,nei->ne", normals[:, :, 0], normals[:, :, 1])

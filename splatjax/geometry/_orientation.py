@@ -24,7 +24,7 @@ def outward_signs(
     near: Int[np.ndarray, "n k"],
     reaches: Float[np.ndarray, " n"],
 ) -> Signs:
-    r"""Give the signs that turn normals outward.
+    r"""Find the signs that turn normals outward.
 
     The points are looked at from all around. Where a point and its neighbors are seen from one side
     alone, it is the outer one. From there signs are carried along a minimum spanning tree of the
@@ -61,7 +61,7 @@ def outward_signs(
 
 
 def _votes(points: np.ndarray, normals: np.ndarray, pixel: float) -> tuple[Signs, Signs]:
-    """Give for how many views each normal points to the viewer less those where it points away, and
+    """Count in how many views each normal points to the viewer less those where it points away, and
     how many see it at all.
 
     A point is seen where nothing lies more than a pixel before it and the pixels around. A view
@@ -98,7 +98,7 @@ def _votes(points: np.ndarray, normals: np.ndarray, pixel: float) -> tuple[Signs
 def _agreement(
     points: np.ndarray, normals: np.ndarray, one: np.ndarray, other: np.ndarray
 ) -> Signs:
-    """Give the cosine between normals and the mirror images of others in the plane between them."""
+    """Compute cosines between normals and the mirror images of others in the plane between them."""
     between = points[other] - points[one]
     along = [np.einsum("ni,ni->n", normals[each], between) for each in (one, other)]
     squared = np.einsum("ni,ni->n", between, between)
@@ -200,8 +200,8 @@ def _winding(
     points: Float[np.ndarray, "n 3"],
     oriented: Float[np.ndarray, "n 3"],
 ) -> Float[np.ndarray, " probes"]:
-    """Give winding numbers on a surface, of points in blocks; those of a block that a probe belongs
-    to nearly cancel.
+    """Compute winding numbers on a surface, of points in blocks; those of a block that a probe
+    belongs to nearly cancel.
     """
     starts = np.arange(0, len(points), _BLOCK)
     sizes = np.diff(np.append(starts, len(points)))

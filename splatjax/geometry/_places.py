@@ -22,7 +22,7 @@ def _spread(x: np.ndarray) -> np.ndarray:
 
 
 def morton_order(points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
-    """Give the order of points along the Morton curve of their bounding cube, 2^21 cells a side;
+    """Return the order of points along the Morton curve of their bounding cube, 2^21 cells a side;
     ties keep their order.
     """
     points = points.astype(np.float64)
@@ -36,7 +36,7 @@ def morton_order(points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
 def distinct(
     points: Float[np.ndarray, "n 3"],
 ) -> tuple[Int[np.ndarray, " places"], Int[np.ndarray, " n"]]:
-    """Give the first point of each place, in the order of the points, and the place of every
+    """Return the first point of each place, in the order of the points, and the place of every
     point.
     """
     _, first, place = np.unique(points, axis=0, return_index=True, return_inverse=True)

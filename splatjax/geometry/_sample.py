@@ -50,7 +50,7 @@ def sample_mesh(
 def splats_at(
     mesh: Mesh, points: SurfacePoints, textures: Textures = _PLAIN, *, rounded: bool = False
 ) -> Splats:
-    """Make splats of points on a mesh, its textures baked in; the rest as `sample_mesh` has it."""
+    """Make splats of points on a mesh, its textures baked in; otherwise as `sample_mesh`."""
     centers, area = points.positions(mesh), mesh.area()
     if rounded:
         rounding = Rounding(mesh)
@@ -74,8 +74,8 @@ def splats_at(
 def covering(
     centers: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Give areas (mm^2) and radii (mm) of splats that cover a surface of which no more is known
-    than these points.
+    """Compute areas (mm^2) and radii (mm) of splats that cover a surface known from these points
+    alone.
     """
     cells = surface_cells(centers, normals)
     return cells.areas, _radii(cells.areas, cells)

@@ -26,17 +26,17 @@ class SurfacePoints(NamedTuple):
     barycentrics: Float[np.ndarray, "n 3"]
 
     def positions(self, mesh: Mesh) -> Float[np.ndarray, "n 3"]:
-        """Give the points, mm."""
+        """Compute the points, mm."""
         return np.einsum("nc,nci->ni", self.barycentrics, mesh.vertices[mesh.faces[self.faces]])
 
     def normals(self, mesh: Mesh) -> Float[np.ndarray, "n 3"]:
-        """Give unit normals, interpolated between those of the vertices."""
+        """Compute unit normals, interpolated between those of the vertices."""
         return unit(
             np.einsum("nc,nci->ni", self.barycentrics, mesh.normals[mesh.faces[self.faces]])
         )
 
     def take(self, order: Int[np.ndarray, " m"]) -> "SurfacePoints":
-        """Give some of the points, or all in another order."""
+        """Return some of the points, or all in another order."""
         return SurfacePoints(self.faces[order], self.barycentrics[order])
 
 
@@ -125,7 +125,7 @@ def mirror_images(
 
 
 def _barycentrics(mesh: Mesh, faces: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Give the barycentric coordinates of the points' projections to the planes of their faces."""
+    """Compute barycentric coordinates of the points' projections to the planes of their faces."""
     a, b, c = np.moveaxis(mesh.vertices[mesh.faces[faces]], 1, 0)
     ab, ac, ap = b - a, c - a, points - a
     d00, d01, d11 = (np.einsum("ni,ni->n", x, y) for x, y in ((ab, ab), (ab, ac), (ac, ac)))

@@ -29,7 +29,7 @@ def _sheets() -> Int[np.ndarray, "256 12"]:
     """Number, for each set of corners inside, the sheets of the surface that cross the edges of a
     cell; -1 for none.
 
-    Sheets are told apart so that no two of them share a vertex: on a side whose inner corners lie
+    Sheets are separated so that no two of them share a vertex: on a side whose inner corners lie
     across from each other, the surface goes around each of them.
     """
     table = np.full((256, 12), -1, np.int64)
@@ -106,7 +106,7 @@ def surface_nets(distance: Distance, low, high, spacing: float, *, slack: float 
 def _cells_near(
     distance: Distance, low, shape, spacing: float, slack: float
 ) -> Int[np.ndarray, "n 3"]:
-    """Give the cells of the finest grid whose corners may lie on both sides."""
+    """Find the cells of the finest grid whose corners may lie on both sides."""
     factor = 8
     blocks = -(-shape // factor)
     cells: np.ndarray = np.argwhere(np.ones(blocks, bool))
@@ -121,8 +121,8 @@ def _cells_near(
 
 
 def _crossings(values: Float[np.ndarray, "n 8"], sheets: Int[np.ndarray, "n 12"]):
-    """Give the cell of each vertex, and the mean of the points where its sheet crosses the edges of
-    that cell, in cells.
+    """Return the cell of each vertex, and the mean of the points where its sheet crosses the edges
+    of that cell, in cells.
     """
     a, b = np.asarray(_EDGES).T
     crossing = sheets >= 0
@@ -157,7 +157,7 @@ def _faces(cells, keys, stride, inside, vertex, vertices) -> Int[np.ndarray, "f 
 
 
 def _gradient(distance: Distance, points: Float[np.ndarray, "n 3"], step: float = 0.2):
-    """Give the unit gradient and the distance over its length, by central differences over the
+    """Compute the unit gradient and the distance over its length, by central differences over the
     corners of a tetrahedron.
     """
     corners = np.asarray([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) * step

@@ -66,8 +66,8 @@ def sample_mesh(
 
     **Returns:** splats in mm; `splatjax.geometry.sample_mesh` describes how they are spread.
 
-    **Raises:** `FileNotFoundError`, or `ValueError` that names the file and says what is wrong and
-    what would be right.
+    **Raises:** `FileNotFoundError`, or `ValueError` that names the file, the fault and the
+    remedy.
     """
     path = existing_file(path)
     check_memory(f"{path}: {count} splats", _BYTES_PER_SPLAT * count, "take fewer")

@@ -136,7 +136,7 @@ class Table:
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """Say which of the known names is nearest to one that is not; all of them, if none is near."""
+    """Suggest the known name that is nearest to an unknown one, or list all of them."""
     known = sorted(known)
     near = difflib.get_close_matches(name.lower(), known, n=1)
     return f"did you mean {near[0]!r}?" if near else f"known are {', '.join(known)}"
