@@ -3,6 +3,7 @@ one sentence, and what it leaves out a warning.
 """
 
 import json
+import logging
 import re
 import warnings
 from collections.abc import Generator
@@ -93,6 +94,9 @@ def one_sentence(path: Path) -> Generator[None, None, None]:
 
     **Raises:** `ValueError`; errors that already name the file pass.
     """
+    log = logging.getLogger("trimesh")  # it prints what is raised or left out
+    before = log.level
+    log.setLevel(logging.CRITICAL)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", DeprecationWarning)  # NumPy's, of words among numbers
@@ -105,6 +109,8 @@ def one_sentence(path: Path) -> Generator[None, None, None]:
             f"{path}: cannot be read ({kind}{' '.join(str(error).split())[:200]}); it is cut "
             "short, or of a kind that is not read: export it again"
         ) from None
+    finally:
+        log.setLevel(before)
 
 
 def load_with_trimesh(path: Path, kind: str) -> dict[str, Any]:
