@@ -12,8 +12,8 @@ LEAST_OPTIMIZATION := --xla_backend_optimization_level=0 --xla_cpu_use_fusion_em
 # Every worker of every run imports the same modules, with their shapes checked: whatever the shell says, bytecode is kept.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: setup demo test test-float32 test-x64 test-once test-long random-scenes fuzz lint bench lock docs notebooks gallery \
-    release-check
+.PHONY: setup demo test test-float32 test-x64 test-once test-long random-scenes fuzz mutants lint bench lock docs figures notebooks \
+    gallery release-check
 
 setup: $(VENV)/ready
 
@@ -62,10 +62,22 @@ random-scenes: setup
 	    $(BIN)/python -m pytest -n $(WORKERS) --dist load -q tests/splatting/test_random_bodies.py \
 	    tests/diffusion/test_random_diffusers.py
 
-# Spoilt files at every reader, at most ten minutes of each kind for each; `make fuzz FUZZ="--readers ply --inputs 10000"` for
-# less. Inputs that grow along new lines of code need atheris: `.venv/bin/uv pip install atheris`.
+# Twenty thousand spoiled files for every reader; those that fail are added to tests/io/corpus. `tools/fuzz.py` has files that
+# grow along new lines of code, by atheris.
 fuzz: setup
-	$(BIN)/python tools/fuzz.py $(FUZZ)
+	SPLATJAX_FUZZ=20000 $(BIN)/python -m pytest -n $(WORKERS) --dist load -q tests/io/test_corpus.py -k spoiled
+
+# Faults planted in one module, each against some tests: make mutants MODULE=splatjax/shading/_specular.py TESTS=tests/shading
+# Best in a worktree of its own, since the module changes while it runs. Of cosmic-ray (MIT) only this target has need.
+mutants: setup
+	VIRTUAL_ENV=$(abspath $(VENV)) $(BIN)/uv pip install --quiet cosmic-ray
+	mkdir -p out
+	printf '[cosmic-ray]\nmodule-path = "$(MODULE)"\ntimeout = 600.0\nexcluded-modules = []\n' > out/mutants.toml
+	printf 'test-command = "$(BIN)/python -m pytest -q -x $(TESTS)"\n' >> out/mutants.toml
+	printf '[cosmic-ray.distributor]\nname = "local"\n' >> out/mutants.toml
+	$(BIN)/cosmic-ray init --force out/mutants.toml out/mutants.sqlite
+	$(BIN)/cosmic-ray exec out/mutants.toml out/mutants.sqlite
+	$(BIN)/cr-report --show-diff out/mutants.sqlite | grep -A 30 SURVIVED || echo every fault was noticed
 
 bench: setup
 	$(BIN)/python -m benchmarks
@@ -91,6 +103,10 @@ out/notebooks/%.ipynb: notebooks/%.py $(SOURCES) | $(VENV)/docs
 	$(BIN)/jupytext --quiet --to ipynb --output out/notebooks/running/$*.ipynb $<
 	cd out/notebooks/running && XLA_FLAGS="$(COMPILED)$${XLA_FLAGS:+ $$XLA_FLAGS}" $(abspath $(BIN))/jupyter-execute --inplace --timeout 3600 $*.ipynb
 	mv out/notebooks/running/$*.ipynb $@
+
+# The paper's figures, into out/figures.
+figures: $(patsubst notebooks/%.py,out/notebooks/%.ipynb,$(wildcard notebooks/figure_*.py))
+	$(BIN)/python tools/docs_pages.py out/figures $^
 
 $(VENV)/docs: requirements-docs.lock $(VENV)/ready
 	VIRTUAL_ENV=$(abspath $(VENV)) $(BIN)/uv pip install --quiet --require-hashes --requirements requirements-docs.lock

@@ -138,7 +138,7 @@ def told(
             f"  {what} off by",
             ", ".join(f"{100 * w:+.1f} +- {100 * b:.1f}%" for w, b in zip(wrong, bar, strict=True)),
         )
-    print(found.words(), flush=True)
+    print(found.summary(), flush=True)
     return {
         "material": name,
         "pictures": list(pictures),

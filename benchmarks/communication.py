@@ -45,51 +45,60 @@ def counted(program: str) -> Traffic:
 
 
 @dataclasses.dataclass(frozen=True)
-class Picture:
-    """What the traffic of a picture depends on; not on the number of splats but through the
-    cells.
-    """
+class View:
+    """The capacity of a picture, or of a shadow map, in tiles."""
 
     tiles: int
-    """Of the picture."""
-    shown: int
-    """Tiles that show anything, rounded up to a share for each device."""
-    places: int
-    """The same, with those of the surface behind."""
-    maps: tuple[int, ...]
-    """Tiles of each shadow map."""
-    attributes: int
-    """Numbers that are blended per pixel."""
+    front: int
+    """Tiles with a surface in front that a plan has room for."""
+    behind: int
+    """Tiles in which a surface shows behind the front."""
+
+    def limits(self) -> int:
+        """Count the numbers that say where surfaces end: of the front, its weights, and two of what
+        lies behind.
+        """
+        return PIXELS * (self.tiles + self.front + 2 * self.behind)
+
+    @property
+    def places(self) -> int:
+        return self.front + self.behind
+
+
+@dataclasses.dataclass(frozen=True)
+class Picture:
+    """What the traffic of a picture depends on."""
+
+    camera: View
+    maps: tuple[View, ...]
+    """Of each light with shadows."""
+    rows: int
+    """Numbers that are blended per pixel, those of the layers among them."""
     channels: int
     gaussians: int
     lights: int
-    singles: int
-    """Layers that are gathered from single splats."""
-    cells: int
+    splats: int
     size: int = 4
     """Bytes of a number."""
 
     def traffic(self) -> Traffic:
-        """Give the traffic of a picture, without gradients."""
-        at_pixels = PIXELS * self.size
-        # Limits of the front, its weights, and two limits of what lies behind; of a shadow map also
-        # both surfaces' two sums.
-        summed = at_pixels * (4 * self.tiles + 8 * sum(self.maps))
-        scattered = at_pixels * self.shown * 2 * (self.attributes + 2)
-        # Depth, position, normal, coverage; shadows; layers and how they are resolved; albedo,
-        # irradiance, diffuse and specular.
-        shaded = 8 + self.lights + self.gaussians * (self.channels + 1) + 4 * self.channels
-        gathered = at_pixels * self.places * shaded
-        if self.singles:
-            gathered += at_pixels * self.places * 3
-            scattered += at_pixels * self.places * self.singles * (self.channels + 1)
-        # Area, centers, normals, energy; spread, opening, bending; first moments about centers and
-        # about normals.
-        summed += self.size * self.cells * (7 + self.channels + 3 + 6 * self.channels)
-        return Traffic(summed, scattered, gathered)
+        """Compute the traffic of a picture, without gradients."""
+        pixels = PIXELS * self.camera.places
+        # Of a shadow map every device gets both surfaces' two sums.
+        maps = sum(each.limits() + 2 * PIXELS * each.places for each in self.maps)
+        # Depth, position, normal; weight and what lies before; shadows; layers and how far they are
+        # resolved; albedo, irradiance, diffuse and specular.
+        shaded = 9 + self.lights + self.gaussians * (self.channels + 1) + 4 * self.channels
+        # Sources: center, normal, area and light.
+        sources = self.splats * (7 + self.channels)
+        return Traffic(
+            summed=self.size * (self.camera.limits() + maps),
+            scattered=self.size * pixels * (self.rows + 2),
+            gathered=self.size * (pixels * shaded + PIXELS * self.camera.front + sources),
+        )
 
     def sent(self, devices: int) -> float:
-        """Give the bytes that each device sends for a picture."""
+        """Compute the bytes that each device sends for a picture."""
         found = self.traffic()
         return Traffic(found.summed, found.scattered / devices, found.gathered).sent(devices)
 
@@ -101,24 +110,17 @@ def main() -> None:
     devices, rate = 64, 50e9
     tiles = (2048 // 8) ** 2
     picture = Picture(
-        tiles=tiles,
-        shown=tiles // 2,
-        places=tiles // 2 + tiles // 20,
-        maps=((1024 // 8) ** 2,),
-        attributes=14,
+        camera=View(tiles, tiles // 2, tiles // 20),
+        maps=(View(*[(1024 // 8) ** 2] * 3),),
+        rows=17 + 6 * 16,
         channels=3,
         gaussians=6,
         lights=1,
-        singles=0,
-        cells=0,
+        splats=0,
     )
-    for cells in (
-        0,
-        113_000_000,
-    ):  # of skin's narrowest layer, 0.043 mm, on the bust's 209,443 mm^2
-        found = dataclasses.replace(picture, cells=cells)
-        sent = found.sent(devices)
-        print(f"{cells:>11,} cells: {sent / 1e9:.2f} GB from each device, {sent / rate:.3f} s")
+    for splats in (0, 1_000_000_000):
+        sent = dataclasses.replace(picture, splats=splats).sent(devices)
+        print(f"{splats:>13,} sources: {sent / 1e9:.2f} GB from each device, {sent / rate:.3f} s")
 
 
 if __name__ == "__main__":

@@ -1,12 +1,14 @@
-"""How far pass 4 is from the untruncated sum over all splats: `python -m
+"""How far the layers of a picture are from the untruncated sums over all splats: `python -m
 benchmarks.diffusion_error`.
 
-Writes out/diffusion_error.png: the layer that errs most, every pixel as the nearest one that was
-looked at.
+Also at the splats, before they are blended. Writes out/diffusion_error.png: the layer that errs
+most, every pixel as the nearest one that was looked at.
 """
 
 import argparse
+import dataclasses
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import equinox as eqx
@@ -19,11 +21,13 @@ from scipy.spatial import cKDTree
 
 import splatjax as sj
 from splatjax import diffusion, splatting
-from splatjax.render import _lighting as lighting, _passes as wiring
+from splatjax._combination import OneDevice
 
 from .scenes import BODIES, MATERIALS, columns, lit
 
-AT_ONCE = 8  # pixels
+QUANTILES = (0.5, 0.99, 1.0)
+ROWS = ("means", "mass", "irradiance", "area", "albedo")
+"""Of `LayersAtPoints`, those with a number for each point."""
 
 
 def arguments():
@@ -37,129 +41,123 @@ def arguments():
     parser.add_argument(
         "--splats", type=int, default=683_549, help="on the prototype's head (default %(default)s)"
     )
-    parser.add_argument(
-        "--width",
-        type=int,
-        default=1024,
-        help="of the square picture, pixels (default %(default)s)",
-    )
-    parser.add_argument(
-        "--pixels", type=int, default=2000, help="random covered ones (default %(default)s)"
-    )
-    parser.add_argument(
-        "--errors",
-        type=float,
-        nargs="+",
-        default=[2e-3],
-        help="settings of ClusterDiffuser (default %(default)s)",
-    )
+    size = "of the square picture, pixels (default %(default)s)"
+    parser.add_argument("--width", type=int, default=1024, help=size)
+    zoom = "of the middle of the picture (default %(default)s)"
+    parser.add_argument("--zoom", type=float, default=1.0, help=zoom)
+    points = "random covered pixels, and random splats (default %(default)s)"
+    parser.add_argument("--points", type=int, default=2000, help=points)
+    errors = "settings of ClusterDiffuser (default %(default)s)"
+    parser.add_argument("--errors", type=float, nargs="+", default=[2e-3], help=errors)
     parser.add_argument("--white", action="store_true", help="without the map of albedo")
     return parser.parse_args()
 
 
-@jax.jit
-def untruncated(sources: diffusion.Sources, points, variance, depth):
-    """Means and last exits of a layer at points `[3, pixels]`, over every splat."""
-    centers = sources.centers - depth * sources.normals
-
-    def some(x):
-        offset = x[:, :, None] - centers[:, None]
-        weight = sources.areas * jnp.exp(-0.5 * jnp.sum(offset * offset, axis=0) / variance)
-        gathered = weight.sum(axis=1)
-        exits = gathered * jnp.exp(0.5 * depth * depth / variance) / (2 * jnp.pi * variance)
-        return jnp.concatenate([(sources.irradiance @ weight.T) / gathered, exits[None]])
-
-    found = jax.lax.map(some, points.reshape(3, -1, AT_ONCE).transpose(1, 0, 2))
-    return found.transpose(1, 0, 2).reshape(found.shape[1], -1)
+def timed(function: Callable, *given):
+    """Return what a function computes, and the seconds of its second call."""
+    function = eqx.filter_jit(function)
+    jax.block_until_ready(function(*given))
+    start = time.perf_counter()
+    found = jax.block_until_ready(function(*given))
+    return found, time.perf_counter() - start
 
 
-@jax.jit
-def diffuse(diffuser, *given):
-    return diffuser.diffuse(*given)
+def untruncated(sources: diffusion.Sources, points, variances, kernel) -> list[np.ndarray]:
+    """Compute the means and the mass of every layer at points `[3, points]`, over every splat."""
+    layer = jax.jit(diffusion.dense_layer)
+    layers = zip(variances, kernel.depths(variances), strict=True)
+    return [np.asarray(layer(sources, points, *own).values) for own in layers]
+
+
+def deviations(found: np.ndarray, exact: np.ndarray) -> np.ndarray:
+    """Compute how far rows `[gaussians, channels, points]` are off, of the root mean square of
+    each: the worst channel, `[gaussians, points]`.
+    """
+    scale = np.sqrt(np.mean(exact**2, axis=2, keepdims=True))
+    return np.max(np.abs(found - exact) / scale, axis=1)
 
 
 def main() -> None:
     options = arguments()
-    options.pixels -= options.pixels % AT_ONCE
     scene, camera = lit(columns(options.body, options.splats), options.width, options.material)
+    camera = dataclasses.replace(camera, focal_length=options.zoom * camera.focal_length)
     if options.white:
         scene = eqx.tree_at(lambda s: s.splats.albedo, scene, None)
-    settings = sj.RenderSettings()
-    plan = sj.plan(scene, camera, settings)
-    view, normalization = splatting.PerspectiveView.of(camera), settings.diffusion.normalization
-
-    @jax.jit
-    def seen_by(scene):
-        light = wiring.cast_shadows(scene, settings, plan)
-        entering = lighting.let_light_in(scene, light)
-        seen = wiring.see_surfaces(
-            scene.splats, lighting.surface_attributes(scene, light, entering), view, settings, plan
-        )
-        return wiring.sources_of(scene.splats, entering.source), seen
-
-    sources, seen = seen_by(scene)
-    receivers, atlas = seen.receivers(), seen.atlas
-    variances = scene.material.gaussians.variances
-    kernels = diffusion.Kernels.of(variances, normalization)
-    tiles, within = np.nonzero(np.asarray(seen.covered & atlas.in_front[:, None]))
-    picked = np.random.default_rng(0).choice(len(tiles), options.pixels, replace=False)
-    tiles, within = tiles[picked], within[picked]
-
-    def at_pixels(array):
-        """Give the chosen pixels of an array `[tiles, ..., pixels]` as a single tile."""
-        return jnp.moveaxis(array[tiles, ..., within], 0, -1)[None]
-
-    front = jax.tree.map(at_pixels, receivers)
-
-    def layers(means, exits, carried):
-        """`L_k` at the pixels, by the normalization and the handover."""
-        points = diffusion.Points.of(scene.material, front, means, exits, carried)
-        return np.asarray(points.layers(plan.interval, normalization, variances)[0])[:, :, 0]
-
-    exact = None
+    gaussians, kernel, exact = scene.material.gaussians, sj.RenderSettings().kernel, None
+    channels = gaussians.weights.shape[1]
+    none, rng = jnp.zeros(channels), np.random.default_rng(0)
+    chosen = rng.choice(scene.splats.count, options.points, replace=False)
     for error in options.errors:
-        diffuser = diffusion.ClusterDiffuser(error=error).planned(
-            scene.splats, kernels, plan.interval, [atlas]
-        )
-        given = diffuser, sources, kernels, seen.points, seen.covered, atlas
-        jax.block_until_ready(diffuse(*given))
-        start = time.perf_counter()
-        found = jax.block_until_ready(diffuse(*given))
-        seconds = time.perf_counter() - start
-        if float(found.needed) > 1:
-            raise SystemExit("the plan does not hold its own scene")
+        settings = sj.RenderSettings(diffuser=diffusion.ClusterDiffuser(error=error))
+        plan = sj.make_plan(scene, camera, settings)
+        source = sj.compute_irradiance(scene, plan, settings).source
+        splats = scene.splats
+        sources = diffusion.Sources(splats.centers.T, splats.normals.T, splats.areas, source)
+
+        # Pass 4 alone, of the splats that the camera may see and of all.
+        placed = jax.tree.map(lambda rows, plan=plan: rows[..., plan.order], sources)
+        areas = jnp.where(plan.exists, placed.areas, 0)
+        placed = dataclasses.replace(placed, areas=areas)
+        seen = splatting.PerspectiveView.of(camera).may_see(splats)[plan.order]
+
+        def diffuse(placed, wanted, plan=plan):
+            own = gaussians.variances, kernel, OneDevice(), wanted
+            return plan.diffusion.diffuse(placed, *own)
+
+        _, seconds = timed(diffuse, placed, seen)
+        diffused, all_seconds = timed(diffuse, placed, None)
+        frame, frame_seconds = timed(sj.render, scene, camera, settings, plan)
+        if not float(frame.overflow) <= 0:
+            raise SystemExit("the plan's capacity is exceeded by its own scene")
+
+        # The layers at the pixels: blended, and by the sums over all splats at the same points.
+        basis = sj.diffusion_basis(scene, camera, settings, plan)
         if exact is None:
-            all_kernels = zip(kernels.variances, kernels.depths, strict=True)
-            exact = jnp.stack(
-                [untruncated(sources, front.points[0], *kernel) for kernel in all_kernels]
-            )[None]
-            exact_layers = layers(exact[:, :, :-1], exact[:, :, -1], found.carried)
-        ours = layers(at_pixels(found.means), at_pixels(found.exits), found.carried)
-        scale = np.sqrt(np.mean(exact_layers**2, axis=2, keepdims=True))
-        off = np.max(np.abs(ours - exact_layers) / scale, axis=1)
-        print(
-            f"error={error:g}: pass 4 without the gain {1e3 * seconds:.0f} ms; of the RMS: median, "
-            "99th percentile, maximum"
-        )
-        for k, (each, layer) in enumerate(zip(off, diffuser.layers, strict=True)):
-            if not float(found.carried[k]):
-                continue
-            how = "every pixel gathers" if layer.nodes is None else "through nodes"
-            print(
-                f"  {variances[k] ** 0.5:5.2f} mm: {np.median(each):.1e} "
-                f"{np.quantile(each, 0.99):.1e} {each.max():.1e}  {how}"
+            shown = (basis.in_front > 0) & (jnp.max(basis.leaving, axis=0) > 0)
+            picked = rng.choice(np.flatnonzero(shown), options.points, replace=False)
+            pixels = np.asarray(basis.pixels[picked])
+            points = frame.position.reshape(-1, 3)[pixels].T
+            places = points, splats.centers[chosen].T
+            exact, at_splats = (
+                np.stack(untruncated(sources, each, gaussians.variances, kernel)) for each in places
             )
-    places, side = np.asarray(atlas.tiles), splatting.SIDE
-    down = places[tiles] // atlas.grid.across * side + within // side
-    across = places[tiles] % atlas.grid.across * side + within % side
-    covered = np.asarray(seen.covered, np.float32)[..., None]
-    rows, beside = np.nonzero(np.asarray(atlas.front_picture(jnp.asarray(covered))[..., 0]))
-    nearest = cKDTree(np.stack([down, across], axis=1)).query(np.stack([rows, beside], axis=1))[1]
-    picture = np.zeros((options.width, options.width, 3), np.uint8)
-    shades = matplotlib.colormaps["magma"](
-        0.1 + 0.9 * np.clip(np.max(off, axis=0) / 1e-2, 0, 1), bytes=True
-    )[:, :3]
-    picture[rows, beside] = shades[nearest]
+        rows = {name: getattr(basis.light, name)[..., picked] for name in ROWS}
+        light = dataclasses.replace(basis.light, **rows)
+        resolved = np.flatnonzero(basis.light.resolvable)
+        truth = dataclasses.replace(
+            light, means=jnp.asarray(exact[:, :channels]), mass=jnp.asarray(exact[:, channels])
+        )
+        both = (np.asarray(each.weigh(gaussians, none)[0])[resolved] for each in (light, truth))
+        off = deviations(*both)
+        order = np.empty(splats.count, int)
+        order[np.asarray(plan.order)[np.asarray(plan.exists)]] = np.flatnonzero(plan.exists)
+        means = np.stack([np.asarray(diffused.layers[k].means)[:, order[chosen]] for k in resolved])
+        off_at_splats = deviations(means, at_splats[resolved, :channels])
+        print(
+            f"error={error:g}: pass 4 {1e3 * seconds:.0f} ms, at all splats "
+            f"{1e3 * all_seconds:.0f} ms; frame {1e3 * frame_seconds:.0f} ms\n"
+            "of the RMS at pixels, then of the means at splats: median, 99th percentile, maximum"
+        )
+        for k, at_pixels, means in zip(resolved, off, off_at_splats, strict=True):
+            level = plan.diffusion.layers[k].level
+            how = "single splats" if level == 0 else f"clusters of level {level}"
+            numbers = (
+                " ".join(f"{np.quantile(each, q):.1e}" for q in QUANTILES)
+                for each in (at_pixels, means)
+            )
+            width = float(gaussians.variances[k]) ** 0.5
+            print(f"  {width:5.2f} mm: {'; '.join(numbers)}  {how}", flush=True)
+    draw(np.max(off, axis=0), pixels, np.asarray(frame.coverage) > 0)
+
+
+def draw(off: np.ndarray, pixels: np.ndarray, covered: np.ndarray) -> None:
+    """Draw every covered pixel as the nearest one that was looked at."""
+    looked_at = np.stack(np.divmod(pixels, covered.shape[1]), axis=1)
+    rows, across = np.nonzero(covered)
+    nearest = cKDTree(looked_at).query(np.stack([rows, across], axis=1))[1]
+    picture = np.zeros((*covered.shape, 3), np.uint8)
+    brightness = 0.1 + 0.9 * np.clip(off / 1e-2, 0, 1)
+    picture[rows, across] = matplotlib.colormaps["magma"](brightness, bytes=True)[nearest, :3]
     out = Path("out/diffusion_error.png")
     out.parent.mkdir(exist_ok=True)
     Image.fromarray(picture).save(out)

@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import splatjax as sj
-from splatjax import diffusion, splatting
-from splatjax.render import _lighting as lighting, _passes as wiring
+from splatjax import splatting
+from splatjax._combination import OneDevice
 
 from .scenes import BODIES, columns, lit
 from .yardstick import Yardstick
@@ -49,25 +49,20 @@ def rasterization(scene: sj.Scene, camera: sj.Camera, plan: sj.Plan, settings: s
 
     The picture is what the yardstick makes, and coverage: the front laid over what shows behind it.
     """
-    areas, grid = scene.splats.areas, splatting.TileGrid(camera.width, camera.height)
+    areas = scene.splats.areas
 
     def picture(camera, centers, normals, radii, albedo):
-        view, splats = (
-            splatting.PerspectiveView.of(camera),
-            sj.Splats(centers, normals, radii, areas),
-        )
+        view = splatting.PerspectiveView.of(camera)
+        splats = sj.Splats(centers, normals, radii, areas)
         rows = jnp.concatenate([normals.T, albedo.T])
-        seen = splatting.splat_surfaces(splats, rows, view, settings.splatting, plan.rasterizer)
-        front = seen.front.coverage
-        behind = (1 - front) * seen.behind.coverage
-        attributes = (
-            front[:, None] * seen.front.attributes + behind[:, None] * seen.behind.attributes
-        )
-        return grid.join(attributes), grid.join((front + behind)[:, None])[0]
+        own = settings.splatting, plan.raster, OneDevice()
+        seen = splatting.visible_surfaces(splats, rows, view, *own)
+        attributes = splatting.Surface.of(seen.rows, view).attributes
+        return seen.picture(attributes), seen.picture(jnp.ones_like(seen.before))
 
     def loss(*inputs):
         attributes, coverage = picture(*inputs)
-        return jnp.sum(jnp.mean(attributes**2, axis=(1, 2))) + jnp.mean(coverage**2)
+        return jnp.sum(jnp.mean(attributes**2, axis=(0, 1))) + jnp.mean(coverage**2)
 
     s = scene.splats
     return (
@@ -80,30 +75,23 @@ def rasterization(scene: sj.Scene, camera: sj.Camera, plan: sj.Plan, settings: s
 def passes(
     scene: sj.Scene, camera: sj.Camera, plan: sj.Plan, settings: sj.RenderSettings
 ) -> dict[str, tuple]:
-    """Each pass alone, fed with what the one before gave: name to function and arguments."""
-    view = splatting.PerspectiveView.of(camera)
+    """Parts of a frame, fed with what the part before gave: name to function and arguments."""
 
-    def shadow(scene):
-        return wiring.cast_shadows(scene, settings, plan)
+    def entering(scene):
+        return sj.compute_irradiance(scene, plan, settings)
 
-    def visible(scene, light, entering):
-        attributes = lighting.surface_attributes(scene, light, entering)
-        return wiring.see_surfaces(scene.splats, attributes, view, settings, plan)
+    def light(scene):
+        return sj.illuminate(scene, plan, settings)
 
-    def layers(scene, entering, seen):
-        sources = wiring.sources_of(scene.splats, entering.source)
-        rest = plan.interval, seen.atlas, plan.diffuser, settings.diffusion.normalization
-        return diffusion.diffusion_layers(sources, scene.material, seen.receivers(), *rest)
+    def picture(scene, light):
+        return sj.render(scene, camera, settings, plan, light=light)
 
-    light = jax.jit(shadow)(scene)
-    entering = jax.jit(lighting.let_light_in)(scene, light)
-    seen = jax.jit(visible)(scene, light, entering)
+    lit = jax.jit(light)(scene)
     jax.clear_caches()  # so that each is compiled again, and timed
     return {
-        "pass 1, shadow map": (shadow, (scene,)),
-        "irradiance": (lighting.let_light_in, (scene, light)),
-        "passes 2+3, all attributes": (visible, (scene, light, entering)),
-        "pass 4, six layers": (layers, (scene, entering, seen)),
+        "pass 1, irradiance": (entering, (scene,)),
+        "passes 1 and 4, for any camera": (light, (scene,)),
+        "passes 2, 3 and 5": (picture, (scene, lit)),
     }
 
 
@@ -116,7 +104,7 @@ def timed(function: Callable, inputs: tuple) -> float:
 def cases_of(
     scene: sj.Scene, camera: sj.Camera, plan: sj.Plan, frame_only: bool
 ) -> dict[str, tuple]:
-    """Give what is timed, by name: functions and their arguments."""
+    """Return what is timed, by name: functions and their arguments."""
     settings = sj.RenderSettings()
 
     def frame(scene):
@@ -145,13 +133,13 @@ def main() -> None:
     options = arguments()
     data = columns(options.body, options.splats)
     scene, camera = lit(data, options.width)
-    sj.plan(scene, camera)
+    sj.make_plan(scene, camera)
     start = time.perf_counter()
-    plan = sj.plan(scene, camera)
+    plan = sj.make_plan(scene, camera)
     planning = 1e3 * (time.perf_counter() - start)
     if float(sj.render(scene, camera, plan=plan).overflow) > 0:
         raise SystemExit(
-            f"{options.splats} splats at {options.width}^2: the plan does not hold its own scene"
+            f"{options.splats} splats at {options.width}^2: the plan's capacity is exceeded"
         )
     rows, compiled = {}, {}
     for name, (function, inputs) in cases_of(scene, camera, plan, options.frame_only).items():

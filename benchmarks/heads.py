@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import splatjax as sj
-from splatjax import rivals
+from splatjax import baselines
 from splatjax.geometry import Mesh, Textures, sample_mesh as sample_surface
 from splatjax.io import read_textured_mesh
 
@@ -19,7 +19,7 @@ MAP = 1024  # texels along an edge
 class Body(NamedTuple):
     """A head in front of the camera, as triangles and as splats."""
 
-    mesh: rivals.TexturedMesh
+    mesh: baselines.TexturedMesh
     splats: sj.Splats
 
 
@@ -48,7 +48,7 @@ def scanned() -> tuple[Mesh, Textures]:
 
 def bust() -> tuple[Mesh, Textures]:
     """Give the bust's head, its colors laid out by its own coordinates."""
-    mesh, textures = rivals.bust_with_textures(MAP)
+    mesh, textures = baselines.bust_with_textures(MAP)
     return before_the_camera(mesh), textures
 
 
@@ -59,7 +59,7 @@ def body_of(head: str, count: int) -> Body:
     """Give one of the heads with so many splats."""
     mesh, textures = HEADS[head]()
     return Body(
-        rivals.TexturedMesh.of(mesh, textures), sample_surface(mesh, count, textures=textures)
+        baselines.TexturedMesh.of(mesh, textures), sample_surface(mesh, count, textures=textures)
     )
 
 

@@ -123,8 +123,9 @@ class Traced:
             }
         )
         self.parameters = mi.traverse(self.scene)
+        keys = self.parameters.keys()
         self.total, self.albedo = (
-            next(key for key in self.parameters.keys() if key.endswith(f"{name}.value.value"))  # noqa: SIM118
+            next(key for key in keys if key.endswith(f"{name}.value.value"))
             for name in ("sigma_t", "albedo")
         )
 
@@ -276,7 +277,7 @@ def recovered(splatted: Splatted, medium: sj.Medium, truth: np.ndarray, options)
             jnp.asarray(jnp.inf),
         )
         walks = sj.monte_carlo([layer], PHOTONS, jax.random.key(4)).profile()
-    rule = sj.NORM_RULE.beyond(0.2 / float(np.max(medium.sigma_t_prime)))
+    rule = sj.L2_QUADRATURE.beyond(0.2 / float(np.max(medium.sigma_t_prime)))
     by_walks = splatted.picture(
         jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf), float), walks), rule
     )

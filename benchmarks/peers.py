@@ -65,7 +65,8 @@ def tell(name: str, run, coverage) -> None:
 
 def splatjax(data: dict[str, np.ndarray], width: int) -> None:
     scene, camera = lit(data, width)
-    forward, _, inputs = rasterization(scene, camera, sj.plan(scene, camera), sj.RenderSettings())
+    plan = sj.make_plan(scene, camera)
+    forward, _, inputs = rasterization(scene, camera, plan, sj.RenderSettings())
     compiled = jax.jit(forward).lower(*inputs).compile()
     tell(
         f"splatjax, passes 2+3 with normals and albedo, {len(data['p'])} splats at {width}^2",

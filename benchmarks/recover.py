@@ -24,7 +24,7 @@ from splatjax.splatting import DenseRasterizer
 from .scenes import BODIES, columns, lit
 
 COMPILED = "/jax/core/compile/backend_compile_duration"
-WEIGHTS = sj.NonNegativeWeights(sj.TotalReflectanceHeld())
+WEIGHTS = sj.NonNegativeWeights(sj.FixedTotalReflectance())
 FINE = sj.RenderSettings(diffuser=ClusterDiffuser(error=2.5e-4))
 """The default of `recover`."""
 GOAL = 6.0  # forward frames for a step, all that a search does counted
@@ -100,7 +100,7 @@ def frame_seconds(
         specular=0.0,
     )
     scene, times = sj.Scene(splats, (light,), material), []
-    plan = sj.plan(scene, camera, settings)
+    plan = sj.make_plan(scene, camera, settings)
     for _ in range(8):
         begin = time.perf_counter()
         jax.block_until_ready(sj.render(scene, camera, settings, plan))
@@ -250,7 +250,7 @@ def main() -> None:
                     flush=True,
                 )
             if pulls:
-                print(found.words())
+                print(found.summary())
                 print(f"chi-squared {float(found.chi_squared):.4f}")
                 pulls = np.stack(pulls, axis=1)
                 rows.append(

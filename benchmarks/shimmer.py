@@ -1,8 +1,9 @@
 """Whether layers shimmer under a slow turntable: `python -m benchmarks.shimmer`. Writes
 out/shimmer.png.
 
-From frame to frame of a tenth of a degree a layer changes by so much; told is by how much more or
-less it does on the fast path than by the untruncated sum, of the layer's root mean square.
+From frame to frame of a tenth of a degree a layer changes. Reported is by how much more or less it
+changes in the picture than by the untruncated sums at the points that the pixels see, of the
+layer's root mean square.
 """
 
 import argparse
@@ -16,7 +17,6 @@ from PIL import Image
 
 import splatjax as sj
 from splatjax import diffusion
-from splatjax.render import _lighting as lighting, _passes as wiring
 
 from .scenes import BODIES, columns, lit
 
@@ -62,26 +62,31 @@ def main() -> None:
     )
     middle = np.mean(np.asarray(scene.splats.centers), axis=0)
     cameras = [turned(camera, middle, options.degrees * step) for step in range(options.steps + 1)]
-    layers = {}
-    for name, settings in {
-        "fast": sj.RenderSettings(),
-        "exact": sj.RenderSettings(diffuser=diffusion.DenseDiffuser()),
-    }.items():
-        plan = sj.plan(scene, cameras, settings)
-        light = wiring.cast_shadows(scene, settings, plan)
-        irradiance = lighting.let_light_in(scene, light).source.T
-        frames = []
-        for i, each in enumerate(cameras):
-            frames.append(
-                np.asarray(
-                    jax.block_until_ready(sj.diffuse(scene, irradiance, each, settings, plan))
-                )
-            )
-            print(f"  {name}: frame {i + 1} of {len(cameras)}", flush=True)
-        layers[name] = np.stack(frames)
-    scale = np.sqrt(np.mean(layers["exact"] ** 2, axis=(0, 2, 3), where=layers["exact"] > 0))[
-        None, :, None, None
-    ]
+    settings = sj.RenderSettings()
+    plan = sj.make_plan(scene, cameras, settings)
+    light = sj.illuminate(scene, plan, settings)
+    source, splats = sj.compute_irradiance(scene, plan, settings).source, scene.splats
+    sources = diffusion.Sources(splats.centers.T, splats.normals.T, splats.areas, source)
+    dense, depths = jax.jit(diffusion.dense_layer), settings.kernel.depths(jnp.asarray(VARIANCES))
+    layers = {"fast": [], "exact": []}
+    for i, each in enumerate(cameras):
+        basis = sj.diffusion_basis(scene, each, settings, plan)
+        frame = sj.render(scene, each, settings, plan, light=light)
+        front = np.flatnonzero((basis.in_front > 0) & (jnp.max(basis.leaving, axis=0) > 0))
+        pixels = np.asarray(basis.pixels)[front]
+        points = frame.position.reshape(-1, 3)[pixels].T
+        exact = [
+            dense(sources, points, jnp.asarray(variance), depth).means
+            for variance, depth in zip(VARIANCES, depths, strict=True)
+        ]
+        for name, means in (("fast", basis.light.means[..., front]), ("exact", jnp.stack(exact))):
+            picture = np.zeros((len(VARIANCES), options.width**2, 3), np.float32)
+            picture[:, pixels] = np.moveaxis(np.asarray(means), 1, 2)
+            layers[name].append(picture.reshape(-1, options.width, options.width, 3))
+        print(f"  frame {i + 1} of {len(cameras)}", flush=True)
+    layers = {name: np.stack(pictures) for name, pictures in layers.items()}
+    scale = np.sqrt(np.mean(layers["exact"] ** 2, axis=(0, 2, 3), where=layers["exact"] > 0))
+    scale = scale[None, :, None, None]
     changes = {name: np.diff(each, axis=0) / scale for name, each in layers.items()}
     more = np.abs(changes["fast"] - changes["exact"]).max(axis=-1)
     covered = layers["exact"][1:].max(axis=(1, 4)) > 0

@@ -10,8 +10,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 import splatjax as sj
-from splatjax import rivals
-from splatjax.diffusion import AbstractNormalization
+from splatjax import baselines
+from splatjax.diffusion import AbstractDiffusionKernel
 
 REACH = 5.5  # standard deviations; what lies beyond is 3e-7 of the power
 LARGEST = 0.3  # mm: spacing of the samples of wide layers; textures have 0.45 mm to a texel
@@ -30,24 +30,24 @@ class Samples(NamedTuple):
 
 
 class Truth(NamedTuple):
-    """Means and exits of every layer at points, as pass 4 has them."""
+    """Means and kernel masses of every layer at points, as pass 4 has them."""
 
     means: np.ndarray
-    exits: np.ndarray
+    mass: np.ndarray
     own: np.ndarray
     albedo: np.ndarray
 
-    def layers(self, material: sj.Material, normalization: AbstractNormalization) -> np.ndarray:
+    def layers(self, material: sj.Material, kernel: AbstractDiffusionKernel) -> np.ndarray:
         """Give `L_k` at the points, `[gaussians, points, channels]`."""
         gaussians = material.gaussians
         weights = np.asarray(gaussians.weights)[:, :, None] * self.albedo.T[None]
         given = (
-            jnp.asarray(self.exits[:, None]),
+            jnp.asarray(self.mass[:, None]),
             gaussians.variances,
             jnp.asarray(weights),
             jnp.zeros_like(self.albedo.T),
         )
-        return self.means * np.asarray(normalization.gain(*given)).transpose(0, 2, 1)
+        return self.means * np.asarray(kernel.gain(*given)).transpose(0, 2, 1)
 
 
 def cut(pieces: int) -> np.ndarray:
@@ -63,7 +63,7 @@ def cut(pieces: int) -> np.ndarray:
 
 @jax.jit
 def _entering(mesh, light, material, faces, shares):
-    points, _ = rivals.surface_points(mesh, faces, shares)
+    points, _ = baselines.surface_points(mesh, faces, shares)
     albedo = jnp.ones_like(points.centers) if points.albedo is None else points.albedo
     return points.centers, points.normals, light.entering(points, material).source.T, albedo
 
@@ -83,12 +83,12 @@ def looked_at(mesh, light, material, faces: np.ndarray, shares: np.ndarray) -> l
 
 
 def integrate(
-    mesh: rivals.TexturedMesh,
-    light: rivals.MeshLight,
+    mesh: baselines.TexturedMesh,
+    light: baselines.MeshLight,
     material: sj.Material,
     faces: np.ndarray,
     shares: np.ndarray,
-    normalization: AbstractNormalization,
+    kernel: AbstractDiffusionKernel,
     refined: float = 1.0,
 ) -> Truth:
     """Integrate every layer at points on faces; `refined` more samples along each axis show whether
@@ -96,15 +96,15 @@ def integrate(
     """
     points, _, own, albedo = looked_at(mesh, light, material, faces, shares)
     variances = np.asarray(material.gaussians.variances, np.float64)
-    depths = np.asarray(normalization.depths(material.gaussians.variances), np.float64)
+    depths = np.asarray(kernel.depths(material.gaussians.variances), np.float64)
     widest = np.sqrt(variances.max())
-    means, exits = [], []
+    means, masses = [], []
     known: dict[float, Samples] = {}
     for variance, depth in zip(variances, depths, strict=True):
         deviation = np.sqrt(variance)
         if deviation < LEAST:
             means.append(own)
-            exits.append(np.ones(len(own)))
+            masses.append(np.ones(len(own)))
             continue
         spacing = min(deviation / PER_DEVIATION, LARGEST) / refined
         if spacing not in known:
@@ -112,7 +112,7 @@ def integrate(
             known[spacing] = sampled(mesh, light, material, points, reach, spacing)
         samples = known[spacing]
         sunk = samples.positions - depth * samples.normals
-        mean, exit_ = np.zeros_like(own), np.zeros(len(own))
+        mean, mass = np.zeros_like(own), np.zeros(len(own))
         tree = cKDTree(sunk)
         for i, point in enumerate(
             points
@@ -122,10 +122,10 @@ def integrate(
             weight = samples.areas[found] * np.exp(-0.5 * squared / variance)
             gathered = weight.sum()
             mean[i] = weight @ samples.source[found] / gathered
-            exit_[i] = gathered * np.exp(0.5 * depth**2 / variance) / (2 * np.pi * variance)
+            mass[i] = gathered * np.exp(0.5 * depth**2 / variance) / (2 * np.pi * variance)
         means.append(mean)
-        exits.append(exit_)
-    return Truth(np.stack(means), np.stack(exits), own, albedo)
+        masses.append(mass)
+    return Truth(np.stack(means), np.stack(masses), own, albedo)
 
 
 def sampled(mesh, light, material, points: np.ndarray, reach: float, spacing: float) -> Samples:

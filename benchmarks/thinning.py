@@ -7,17 +7,14 @@ it is off on both.
 
 import argparse
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import splatjax as sj
 from splatjax import diffusion
-from splatjax.diffusion._gathering import Gathering
-from splatjax.diffusion._tree import ClusterTree
-from splatjax.render import light_on_splats
-from splatjax.rivals import layer_contrast
+from splatjax.baselines import layer_contrast
+from splatjax.diffusion._clusters import Clusters, ClusterTree
 
 from .scenes import columns
 
@@ -56,15 +53,16 @@ def layer(points, centers, areas, source, variance):
     return jax.lax.map(some, points.reshape(-1, AT_ONCE, 3)).reshape(len(points), -1)
 
 
-@eqx.filter_jit
-def merged_layer(points, gathering: Gathering):
-    """The same over clusters."""
-    table = gathering.table(16, slopes=False)
-    rows = jnp.moveaxis(table, 1, 0).reshape(table.shape[1], -1)
+@jax.jit
+def merged_layer(points, clusters: Clusters, variance):
+    """The same over clusters, each as wide as its splats are spread."""
+    below = clusters.lowered(DEPTH * jnp.sqrt(variance))
+    widths = variance + below.spread
 
     def some(x):
-        squared = jnp.sum((x[:, None] - rows[:3].T[None]) ** 2, axis=2)
-        return gathering.finish(rows[4:] @ jnp.exp(-rows[3][None] * squared).T, x.T)[:-1].T
+        squared = jnp.sum((x[:, None] - below.centers.T[None]) ** 2, axis=2)
+        weight = below.areas / widths * jnp.exp(-0.5 * squared / widths)
+        return (weight @ below.irradiance.T) / jnp.sum(weight, axis=1, keepdims=True)
 
     return jax.lax.map(some, points.reshape(-1, AT_ONCE, 3)).reshape(len(points), -1)
 
@@ -90,12 +88,12 @@ def errors(splats: sj.Splats) -> list[tuple[str, float, float]]:
     ]
     middle = jnp.mean(splats.centers, axis=0)
     camera = sj.Camera.look_at(middle + jnp.asarray([0.0, 0.0, 900.0]), middle, width=16, height=16)
-    plan = sj.plan(scenes, camera, sj.RenderSettings(diffuser=diffusion.DenseDiffuser()))
+    plan = sj.make_plan(scenes, camera, sj.RenderSettings(diffuser=diffusion.DenseDiffuser()))
     spacing = float(jnp.sqrt(jnp.mean(splats.areas)))
     points = splats.centers[rng.choice(splats.count, POINTS, replace=False)]
     found = []
     for scene in scenes:
-        source = light_on_splats(scene, plan).source.T
+        source = sj.compute_irradiance(scene, plan).source.T
         for width in (each * spacing for each in AMPLIFIED if each * spacing < WIDEST):
             variance = jnp.asarray(width**2)
             below = splats.centers - DEPTH * width * splats.normals
@@ -131,16 +129,16 @@ def errors(splats: sj.Splats) -> list[tuple[str, float, float]]:
             for cell in CELLS:
                 if cell * width < spacing:
                     continue
-                tree = ClusterTree.build(splats.centers, splats.normals, [cell * width])
+                exists = np.ones(splats.count, bool)
+                geometry = np.asarray(splats.centers), np.asarray(splats.normals), exists
+                tree = ClusterTree.build(*geometry, [cell * width])
                 sources = diffusion.Sources(
                     (splats.centers - middle[None]).T, splats.normals.T, splats.areas, source.T
                 )
                 clusters = tree.levels(sources)[1]
-                gathering = Gathering.of(clusters, variance, jnp.asarray(DEPTH * width))
                 kept = float(jnp.sum(clusters.areas > 0)) / splats.count
-                record(
-                    "merged", kept, [error(merged_layer(points - middle[None], gathering))], 1.75
-                )
+                merged = merged_layer(points - middle[None], clusters, variance)
+                record("merged", kept, [error(merged)], 1.75)
     return found
 
 

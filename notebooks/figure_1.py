@@ -14,45 +14,64 @@
 # # Figure 1: splats, the surface they make, and light below it
 #
 # "Subsurface scattering using splat-based diffusion in point-based rendering", Figure 1, from the
-# built-in bust. `splatjax figure 1 --output figure_1.png` makes it larger, and from scanned heads;
-# `docs/figures.md` says what to see.
+# built-in bust. `make figures` writes the picture; `docs/figures.md` says what to see.
 
 # %%
 # %matplotlib inline
+from dataclasses import replace
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 import splatjax as sj
-from splatjax import plots, rivals
+from splatjax import baselines
+from splatjax.plots import plot_pictures
 
 # %% [markdown]
-# A bust of a third of life size, so that few splats resolve what light does in skin, under one
-# light with shadows.
+# A bust of a third of life size, so that few splats resolve what light does in skin, under a light
+# with shadows and a weak one without.
 
 # %%
-eye, middle = jnp.asarray([400.0, -30.0, 820.0]), jnp.asarray([0.0, -60.0, 0.0])
-light = sj.DirectionalLight(jnp.asarray([0.5, -0.4, -0.75]), jnp.full(3, jnp.pi))
-camera = sj.Camera.look_at(eye, middle, fov=22.0, width=192, height=192)
-bust = plots.Subject("bust", sj.bust(20_000), (light,), camera).scaled(0.3)
-skin = sj.load_material("skin")
-plots.figure_1(bust, skin, discs=3000)
+body = sj.bust(40_000).scaled(0.3)
+low, high = jnp.min(body.centers, axis=0), jnp.max(body.centers, axis=0)
+eye = (low + high) / 2 + (high[1] - low[1]) * jnp.asarray([0.9, 0.1, 1.9])
+camera = sj.Camera.look_at(eye, (low + high) / 2, fov=28.0, width=384, height=384)
+lights = (
+    sj.DirectionalLight(jnp.asarray([0.5, -0.4, -0.75]), jnp.full(3, jnp.pi)),
+    sj.DirectionalLight(jnp.asarray([-0.7, -0.2, -0.7]), jnp.full(3, 0.3), cast_shadows=False),
+)
+skin = sj.load_material("skin").white()
 
 # %% [markdown]
-# In numbers: how much light there is where none falls, because the surface turns away or lies in
-# shadow. What scatters gets there.
+# Left some of the splats, as discs with gaps between them. In the middle the surface that all
+# splats make, where light leaves the skin at the point where it enters. Right the same surface with
+# scattering.
 
 # %%
-(opaque,) = bust.drawn(skin.opaque(), rivals.deferred_splatting())
-(soft,) = bust.drawn(skin)
-unlit = (np.asarray(soft.coverage) > 0.99) & (np.asarray(opaque.diffuse).max(axis=2) < 1e-4)
-reached = float(np.asarray(soft.diffuse)[unlit].mean() / np.asarray(soft.diffuse)[~unlit].mean())
-share = np.asarray(soft.diffuse)[unlit].sum(axis=0)
-print(
-    f"{unlit.sum()} pixels have no light of their own; scattering brings {100 * reached:.1f}% of "
-    "the rest's there, mostly red"
+step = body.count // 3000
+few = jax.tree.map(lambda rows: rows[::step], body)
+discs = replace(few, radii=0.5 * (step * few.areas) ** 0.5, areas=step * few.areas)
+opaque = sj.Scene(body, lights, skin.opaque())
+left = sj.render(replace(opaque, splats=discs), camera, baselines.elliptical_points())
+middle = sj.render(opaque, camera, baselines.deferred_splatting())
+right = sj.render(replace(opaque, material=skin), camera)
+plot_pictures(
+    [[frame.beauty for frame in (left, middle, right)]],
+    ["surface splats", "light leaves where it enters", "light scatters below the surface"],
+    inches=3.6,
 )
 
+# %% [markdown]
+# In numbers: how much more light leaves the skin where the first light does not reach it. Red
+# travels farthest into the shadow.
+
 # %%
-assert unlit.sum() > 100
-assert reached > 0.003
-assert share[0] > 1.5 * share[2]
+shadow = (np.asarray(middle.coverage) > 0.99) & (np.asarray(middle.shadow)[0] < 1e-3)
+plain, scattered = (np.asarray(frame.diffuse)[shadow].mean(axis=0) for frame in (middle, right))
+gain = scattered / plain - 1
+print("in the shadow, red, green and blue are brighter by", np.round(gain, 3))
+
+# %%
+assert gain[0] > 0.03
+assert gain[0] > 3 * gain[2]

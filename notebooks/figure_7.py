@@ -14,8 +14,7 @@
 # # Figure 7: earlier point-based methods and this one
 #
 # "Subsurface scattering using splat-based diffusion in point-based rendering", Figure 7, from the
-# built-in bust. `splatjax figure 7 --output figure_7.png` makes it larger, and from scanned heads;
-# `docs/figures.md` says what to see.
+# built-in bust. `make figures` writes the picture; `docs/figures.md` says what to see.
 
 # %%
 # %matplotlib inline
@@ -23,38 +22,58 @@ import jax.numpy as jnp
 import numpy as np
 
 import splatjax as sj
-from splatjax import plots, rivals
+from splatjax import baselines
+from splatjax.plots import plot_pictures
 
 # %% [markdown]
-# A bust of a third of life size, so that few splats resolve what light does in skin, under one
-# light with shadows. Elliptical points are flat, splats that are blended are smooth, scattering is
-# soft.
+# A bust of a third of life size, so that few splats resolve what light does in skin, under a light
+# with shadows and a weak one without.
 
 # %%
-eye, middle = jnp.asarray([400.0, -30.0, 820.0]), jnp.asarray([0.0, -60.0, 0.0])
-light = sj.DirectionalLight(jnp.asarray([0.5, -0.4, -0.75]), jnp.full(3, jnp.pi))
-camera = sj.Camera.look_at(eye, middle, fov=22.0, width=192, height=192)
-bust = plots.Subject("bust", sj.bust(20_000), (light,), camera).scaled(0.3)
-skin = sj.load_material("skin")
-plots.figure_7(bust, skin)
+body = sj.bust(40_000).scaled(0.3)
+low, high = jnp.min(body.centers, axis=0), jnp.max(body.centers, axis=0)
+eye = (low + high) / 2 + (high[1] - low[1]) * jnp.asarray([0.9, 0.1, 1.9])
+camera = sj.Camera.look_at(eye, (low + high) / 2, fov=28.0, width=256, height=256)
+lights = (
+    sj.DirectionalLight(jnp.asarray([0.5, -0.4, -0.75]), jnp.full(3, jnp.pi)),
+    sj.DirectionalLight(jnp.asarray([-0.7, -0.2, -0.7]), jnp.full(3, 0.3), cast_shadows=False),
+)
+near = sj.Camera.look_at(
+    eye, low + (high - low) * jnp.asarray([0.6, 0.56, 1.0]), fov=6.0, width=256, height=256
+)
+skin = sj.load_material("skin").white()
 
 # %% [markdown]
-# In numbers: how rough the light is, as the mean step from pixel to pixel inside the bust.
-
+# Elliptical points are flat, splats that are blended are smooth, scattering is soft. Below, the
+# same from near.
 
 # %%
-def roughness(material, settings=None):
-    (frame,) = bust.drawn(material, settings)
+opaque = sj.Scene(baselines.PhongSplats.of(body), lights, skin.opaque())
+methods = {
+    "elliptical points": (opaque, baselines.elliptical_points()),
+    "EWA splatting": (opaque, baselines.ewa_splatting()),
+    "Phong splatting": (opaque, baselines.phong_splatting()),
+    "deferred splatting": (opaque, baselines.deferred_splatting()),
+    "with scattering": (sj.Scene(body, lights, skin), sj.RenderSettings()),
+}
+frames = {
+    name: [sj.render(scene, each, settings) for each in (camera, near)]
+    for name, (scene, settings) in methods.items()
+}
+rows = [[frame.beauty for frame in line] for line in zip(*frames.values(), strict=True)]
+plot_pictures(rows, list(frames))
+
+# %% [markdown]
+# In numbers: how rough the light is, as the mean step from pixel to pixel inside the body.
+
+# %%
+roughness = {}
+for name, (frame, _) in frames.items():
     inside = np.asarray(frame.coverage) > 0.99
-    luminance = np.asarray(frame.beauty).mean(axis=2)
-    steps, both = np.abs(np.diff(luminance, axis=1)), inside[:, 1:] & inside[:, :-1]
-    return float(steps[both].mean())
-
-
-flat = roughness(skin.opaque(), rivals.elliptical_points())
-blended = roughness(skin.opaque(), rivals.deferred_splatting())
-soft = roughness(skin, None)
-print(f"elliptical points {flat:.4f}, deferred splatting {blended:.4f}, with scattering {soft:.4f}")
+    steps = np.abs(np.diff(np.asarray(frame.beauty).mean(axis=2), axis=1))
+    roughness[name] = steps[inside[:, 1:] & inside[:, :-1]].mean()
+    print(f"{name}: {roughness[name]:.4f}")
 
 # %%
-assert flat > 1.3 * blended > 1.3 * soft
+assert roughness["elliptical points"] > 1.3 * roughness["deferred splatting"]
+assert roughness["deferred splatting"] > 1.05 * roughness["with scattering"]

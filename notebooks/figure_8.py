@@ -14,8 +14,8 @@
 # # Figure 8: half by texture-space diffusion, half by splats
 #
 # "Subsurface scattering using splat-based diffusion in point-based rendering", Figure 8, from the
-# built-in bust. `splatjax figure 8 --output figure_8.png` makes it larger, and from meshes with
-# texture coordinates; `docs/figures.md` says what to see.
+# built-in bust. `make figures` writes the picture; `docs/figures.md` says what to see, and how a
+# mesh with texture coordinates takes the place of the bust.
 
 # %%
 # %matplotlib inline
@@ -25,39 +25,55 @@ import jax.numpy as jnp
 import numpy as np
 
 import splatjax as sj
-from splatjax import plots, rivals
+from splatjax import baselines
 from splatjax.geometry import sample_mesh
+from splatjax.io import srgb_to_linear
+from splatjax.plots import plot_pictures
 
 # %% [markdown]
 # The head of the bust at a third of life size. Its chart is longitude and latitude seen from
 # inside, and its ears overlap there.
 
 # %%
-eye, middle = jnp.asarray([400.0, 30.0, 820.0]), jnp.asarray([0.0, 0.0, 0.0])
+SCALE, SIZE = 0.3, 256
+mesh, textures = baselines.bust_with_textures(512)
+triangles = baselines.TexturedMesh.of(mesh, textures)
+triangles = replace(triangles, vertices=SCALE * triangles.vertices)
+splats = sample_mesh(mesh, 40_000, textures=textures).scaled(SCALE)
+low, high = jnp.min(splats.centers, axis=0), jnp.max(splats.centers, axis=0)
+eye = (low + high) / 2 + (high[1] - low[1]) * jnp.asarray([1.3, 0.1, 2.7])
+camera = sj.Camera.look_at(eye, (low + high) / 2, fov=22.0, width=SIZE, height=SIZE)
 light = sj.DirectionalLight(jnp.asarray([0.5, -0.4, -0.75]), jnp.full(3, jnp.pi))
-camera = sj.Camera.look_at(eye, middle, fov=17.0, width=192, height=192)
-mesh, textures = rivals.bust_with_textures(512)
-splats = sample_mesh(mesh, 40_000, textures=textures)
-bust = plots.Subject("bust", splats, (light,), camera).scaled(0.3)
-triangles = rivals.TexturedMesh.of(mesh, textures)
-triangles = replace(triangles, vertices=0.3 * triangles.vertices)
-skin = sj.load_material("skin")
+skin = sj.load_material("skin").white()
 
 # %% [markdown]
-# Left of the line triangles with texture-space diffusion, right of it splats.
+# Left of the middle triangles with texture-space diffusion, four samples a pixel; right of it
+# splats. Beside it the difference, splats less triangles, enlarged eight times around middle gray.
 
 # %%
-plots.figure_8(bust, triangles, skin)
+ours = sj.render(sj.Scene(splats, (light,), skin), camera)
+finer = replace(camera, width=2 * SIZE, height=2 * SIZE)
+theirs = baselines.render_texture_space(triangles, (light,), skin, finer).frame
+beauty, coverage = (
+    np.asarray(layer).reshape(SIZE, 2, SIZE, 2, -1).mean(axis=(1, 3))
+    for layer in (theirs.beauty, theirs.coverage)
+)
+white = float(np.quantile(ours.beauty, 0.995))
+halves = np.concatenate([beauty[:, : SIZE // 2], ours.beauty[:, SIZE // 2 :]], axis=1) / white
+difference = 0.5 + 8 * (np.asarray(ours.beauty, np.float64) - beauty) / white
+plot_pictures(
+    [[halves, srgb_to_linear(np.clip(difference, 0, 1))]],
+    ["texture-space diffusion, splats", "difference, enlarged 8 times"],
+    white=1.0,
+    inches=4.2,
+)
 
 # %% [markdown]
 # In numbers: how far the two are apart inside the head, of the picture's root mean square.
 
 # %%
-scene = bust.scene(skin)
-ours = sj.render(scene, bust.camera)
-theirs = rivals.render_texture_space(triangles, scene.lights, scene.material, bust.camera).frame
-inside = (np.asarray(ours.coverage) > 0.99) & (np.asarray(theirs.coverage) > 0.99)
-a, b = (np.asarray(frame.beauty)[inside] for frame in (ours, theirs))
+inside = (np.asarray(ours.coverage) > 0.99) & (coverage[..., 0] > 0.99)
+a, b = np.asarray(ours.beauty)[inside], beauty[inside]
 apart = np.abs(a - b).max(axis=1) / np.sqrt(np.mean(a**2))
 print(
     f"apart by {np.median(apart):.4f} at the median, {np.quantile(apart, 0.9):.3f} in one pixel of "

@@ -37,7 +37,7 @@ with jax.enable_x64(True):
     # less than 0.1%.
     profile = sj.Dipole(medium, sj.EganFresnel())
     six = sj.fit_gaussians(profile, 6)
-    held = sj.fit_gaussians(profile, 6, weights=sj.TotalReflectanceHeld())
+    held = sj.fit_gaussians(profile, 6, weights=sj.FixedTotalReflectance())
     figure = plot_fit(
         profile,
         six.gaussians,

@@ -62,7 +62,7 @@ figure  # noqa: B018
 with jax.enable_x64(True):
     dot = measure_laser_dot(photograph, mm_per_pixel, power=power)
     guess = sj.Medium(jnp.asarray([0.05]), jnp.asarray([2.0]), potato.eta)
-    found = fit_medium(dot.profile, dot.deviation, guess, beam_variance=beam_variance, count=3)
+    found = fit_medium(dot.profile, guess, beam_variance=beam_variance, count=3)
     bars = np.sqrt(np.diagonal(np.asarray(found.covariance)[0]))
     values = np.asarray([found.medium.sigma_a[0], found.medium.sigma_s_prime[0]])
     chi_squared = float(found.chi_squared[0])

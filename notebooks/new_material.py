@@ -27,7 +27,7 @@ import splatjax as sj
 from splatjax.plots import plot_error_by_count, plot_fit
 
 # %%
-weights = sj.TotalReflectanceHeld()
+weights = sj.FixedTotalReflectance()
 with jax.enable_x64(True):
     stone = sj.Medium(
         sigma_a=jnp.asarray([0.020, 0.006, 0.015]),
@@ -44,7 +44,7 @@ figure  # noqa: B018
 # many as the picture deserves: the least, say, that leaves no channel more than two hundredths.
 # (`fit_gaussians(profile, LeastCount(0.02))` does it at once.) The sum of the weights is held at
 # the total reflectance, which keeps the energy of the picture. (Where channels differ more, some
-# weights come out slightly negative; `NonNegativeWeights(TotalReflectanceHeld())` forbids it: the
+# weights come out slightly negative; `NonNegativeWeights(FixedTotalReflectance())` forbids it: the
 # library is fitted so.)
 
 # %%

@@ -33,14 +33,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from matplotlib.figure import Figure
 
 import splatjax as sj
 from splatjax.diffusion import DenseDiffuser
+from splatjax.plots import plot_pictures
 from splatjax.splatting import DenseRasterizer
 
 SPLATS, SIZE, COUNT, STEPS, NOISE = 700, 30, 3, 30, 0.01
-HELD = sj.NonNegativeWeights(sj.TotalReflectanceHeld())
+HELD = sj.NonNegativeWeights(sj.FixedTotalReflectance())
 # Every splat at every pixel: for small pictures. Leave `settings` out for large ones.
 settings = sj.RenderSettings(rasterizer=DenseRasterizer(), diffuser=DenseDiffuser())
 
@@ -116,7 +116,7 @@ off = [
     np.asarray(getattr(found.medium, name)) / np.asarray(getattr(skin, name)) - 1
     for name in ("sigma_a", "sigma_s_prime")
 ]
-print(found.words())
+print(found.summary())
 print(f"sigma_a off by {(100 * off[0]).round(1)}%, sigma_s' by {(100 * off[1]).round(1)}%")
 
 # %%
@@ -130,35 +130,19 @@ missed = [
     np.abs(np.asarray(body.albedo) - paint)[painted & seen_well] for body in (begin, fitted.splats)
 ]
 print(f"albedo off by {np.median(missed[0]):.3f} before, {np.median(missed[1]):.3f} after (median)")
-print(f"loss {fitted.losses[0]:.4g} to {fitted.losses[fitted.best]:.3g}")
-
 
 # %%
-def shown(picture, scale: float = 1.0) -> np.ndarray:
-    return np.clip(np.nan_to_num(np.asarray(picture), nan=0.0) / scale, 0, 1) ** (1 / 2.2)
-
-
-def map_of(splats: sj.Splats) -> np.ndarray:
-    """The albedo that the camera sees."""
-    return np.asarray(sj.render(sj.Scene(splats, (lamps[0],), truth), camera, settings).albedo)
-
-
-figure = Figure(figsize=(11, 6.2), layout="constrained")
-bright = float(np.quantile(np.stack(rendered), 0.995))
-rows = (
-    (*photographs, "photographed", map_of(scenes[0].splats), "paint"),
-    (*fitted.pictures, "found", map_of(fitted.splats), "paint found"),
+maps = [
+    np.asarray(sj.render(sj.Scene(body, (lamps[0],), truth), camera, settings).albedo)
+    for body in (scenes[0].splats, fitted.splats)
+]
+shown = zip((photographs, fitted.pictures), maps, strict=True)
+plot_pictures(
+    [[*(3 * np.nan_to_num(np.asarray(x)) for x in images), paint] for images, paint in shown],
+    ["light 1", "light 2", "light 3", "paint"],
+    ["photographed", "found"],
+    white=1.0,
 )
-axes = figure.subplots(2, 4)
-for line, (*pictures, name, seen, title) in zip(axes, rows, strict=True):
-    for ax, picture, number in zip(line, pictures, (1, 2, 3), strict=False):
-        ax.imshow(shown(picture, bright))
-        ax.set_title(f"{name}, light {number}")
-    line[3].imshow(shown(seen))
-    line[3].set_title(title)
-for ax in axes.reshape(-1):
-    ax.axis("off")
-figure  # noqa: B018
 
 # %% [markdown]
 # The photographs are soft where light has spread; the map is not. Where no picture tells of a

@@ -32,7 +32,7 @@ from splatjax.plots import plot_recovery
 from splatjax.splatting import DenseRasterizer, ShadowSettings
 
 SIZE, COUNT, NOISE = 40, 4, 0.01
-HELD = sj.NonNegativeWeights(sj.TotalReflectanceHeld())
+HELD = sj.NonNegativeWeights(sj.FixedTotalReflectance())
 # Every splat at every pixel, and coarse shadows: for small pictures. Leave `settings` out for large
 # ones.
 shadows = ShadowSettings(resolution=48, bias=1.0, softness=2.0)
@@ -41,8 +41,8 @@ settings = sj.RenderSettings(
 )
 
 
+# The bust, eight times smaller, without its map: color comes from the coefficients alone.
 def figurine(count: int) -> sj.Splats:
-    """The bust, eight times smaller, without its map: color comes from the coefficients alone."""
     bust = sj.bust(count)
     return sj.Splats(bust.centers / 8, bust.normals, bust.radii / 8, bust.areas / 64)
 
@@ -58,9 +58,7 @@ with jax.enable_x64(True):
     marble = sj.load_medium("marble")
     gaussians = sj.fit_gaussians(sj.Dipole(marble), COUNT, weights=HELD).gaussians
     material = sj.Material(gaussians, eta=1.5, specular=0.0)
-    rendered = np.asarray(
-        sj.gather_picture(sj.Scene(splats, (lamp,), material), camera, settings).beauty(gaussians)
-    )
+    rendered = np.asarray(sj.render(sj.Scene(splats, (lamp,), material), camera, settings).beauty)
     deviation = NOISE * np.sqrt(np.mean(rendered**2))
     photograph = rendered + deviation * np.random.default_rng(0).normal(size=rendered.shape)
 
@@ -79,7 +77,7 @@ with jax.enable_x64(True):
         photograph, camera, (lamp,), deviation=np.full(photograph.shape, deviation)
     )
     found = sj.recover([taken], splats, start, count=COUNT, settings=settings)
-print(found.words())
+print(found.summary())
 print(f"{found.rounds} rounds, {found.steps} steps; chi-squared {float(found.chi_squared):.3f}")
 
 # %%
@@ -114,7 +112,7 @@ print(
 )
 with jax.enable_x64(True):
     predictions = sj.next_pictures(
-        found, splats, sj.usual_candidates(splats, camera), settings=settings
+        found, splats, sj.default_candidates(splats, camera), settings=settings
     )
 for prediction in predictions:
     print(prediction)

@@ -25,10 +25,10 @@
 import jax.numpy as jnp
 import numpy as np
 import optax
-from matplotlib.figure import Figure
 
 import splatjax as sj
 from splatjax.diffusion import DenseDiffuser
+from splatjax.plots import plot_pictures
 from splatjax.splatting import DenseRasterizer
 
 SPLATS, SIZE, STEPS, NOISE, RADIUS = 900, 30, 24, 0.01, 10.0
@@ -36,8 +36,8 @@ SPLATS, SIZE, STEPS, NOISE, RADIUS = 900, 30, 24, 0.01, 10.0
 settings = sj.RenderSettings(rasterizer=DenseRasterizer(), diffuser=DenseDiffuser())
 
 
+# Directions, evenly.
 def spread(count: int) -> np.ndarray:
-    """Directions, evenly."""
     i = np.arange(count) + 0.5
     z, turn = 1 - 2 * i / count, np.pi * (1 + 5**0.5) * i
     return np.stack(
@@ -51,8 +51,8 @@ def ball() -> sj.Splats:
     return sj.Splats(*(jnp.asarray(each, jnp.float32) for each in columns))
 
 
+# Bumps and dents, mm.
 def heights(ways: np.ndarray) -> np.ndarray:
-    """Bumps and dents, mm."""
     away = RADIUS * np.arccos(np.clip(ways @ spread(40).T, -1, 1))
     return np.exp(-0.5 * (away / 1.4) ** 2) @ np.where(np.arange(40) % 3, 0.7, -0.5)
 
@@ -79,8 +79,8 @@ lamps = [
 weights = jnp.asarray([[0.35, 0.35, 0.4], [0.3, 0.25, 0.2], [0.2, 0.15, 0.1]])
 
 
+# Light spreads by so many times 0.5, 1.2 and 2.8 mm.
 def material(wider: float) -> sj.Material:
-    """Light spreads by so many times 0.5, 1.2 and 2.8 mm."""
     return sj.Material(
         sj.SumOfGaussians(wider**2 * jnp.asarray([0.3, 1.5, 8.0]), weights), eta=1.5, specular=0.0
     )
@@ -123,34 +123,14 @@ for wider in (0.2, 1.0):
         seen, smooth, material(wider), [part], optimizer, steps=STEPS, settings=settings
     )
     after[wider] = degrees(found[wider].splats.normals, bumpy.normals)[facing]
-    losses = found[wider].losses
     print(
         f"light spreads {wider:g} x: normals off by {np.mean(before):.1f} degrees before, "
-        f"{np.mean(after[wider]):.1f} after; "
-        f"loss {losses[0]:.0f} to {losses[found[wider].best]:.2f}"
+        f"{np.mean(after[wider]):.1f} after"
     )
 
 # %%
-figure = Figure(figsize=(11, 6.2), layout="constrained")
-axes = figure.subplots(2, 4)
-for line, wider in zip(axes, found, strict=True):
-    fitted = found[wider].splats
-    shots = taken(smooth, wider)[0], pictures[wider][0], taken(fitted, wider)[0]
-    bright = float(np.quantile(shots[1], 0.995))
-    for ax, shot, title in zip(line, shots, ("given", "true", "found"), strict=False):
-        ax.imshow(np.clip(shot / bright, 0, 1) ** (1 / 2.2))
-        ax.set_title(f"{title}, light spreads {wider:g} x")
-        ax.axis("off")
-    normals = [
-        sj.render(sj.Scene(body, (lamps[0],), material(wider)), camera, settings).normal
-        for body in (fitted, bumpy)
-    ]
-    off = np.where(np.linalg.norm(normals[1], axis=-1) > 0.5, degrees(*normals), np.nan)
-    image = line[3].imshow(off, cmap="magma", vmin=0, vmax=15)
-    line[3].set_title("normals, degrees off")
-    line[3].axis("off")
-    figure.colorbar(image, ax=line[3], shrink=0.7)
-figure  # noqa: B018
+rows = [[taken(body, wider)[0] for body in (smooth, bumpy, found[wider].splats)] for wider in found]
+plot_pictures(rows, ["given", "true", "found"], [f"light spreads {wider:g} x" for wider in found])
 
 # %%
 assert np.mean(after[0.2]) < np.mean(after[1.0]) < 0.5 * np.mean(before)

@@ -9,16 +9,16 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from splatjax.pointwise import one_program
+from splatjax._chunking import jit_unless_traced
+from splatjax._records import check_values, numbers, record
 
 
 def gaussian(
     variance: Float[Array, "..."], squared_radius: Float[Array, "..."]
 ) -> Float[Array, "..."]:
-    r"""Give the normalized two-dimensional Gaussian of Eq. 2, `exp(-r^2 / 2v) / (2 pi v)`.
+    r"""Compute the normalized two-dimensional Gaussian of Eq. 2, `exp(-r^2 / 2v) / (2 pi v)`.
 
-    It is a function of the squared radius, so that no square root stands between a position and its
-    gradient.
+    It is a function of the squared radius, so that gradients in positions pass no square root.
 
     **Arguments:**
 
@@ -40,35 +40,34 @@ class AbstractProfile(eqx.Module):
     """
 
     singular: ClassVar[bool] = False
-    """Whether the profile goes to infinity at the origin like 1/r: the integrals of Eq. 3 and 4
-    then exist beyond a cut only.
+    """Whether the profile goes to infinity at the origin like 1/r, so that the integrals of Eq. 3
+    and 4 need a cut.
     """
 
     @abc.abstractmethod
     def __call__(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
-        """Give the profile at distance `r` (mm) from where light enters, in 1/mm^2."""
+        """Compute the profile at distance `r` (mm) from the point where light enters, 1/mm^2."""
 
     @abc.abstractmethod
     def total_reflectance(self) -> Float[Array, " channels"]:
-        """Give `2 pi` times the integral of `r profile(r)`: the share of the entering power that
-        leaves.
+        """Compute `2 pi` times the integral of `r profile(r)`: the fraction of the entering power
+        that leaves.
         """
 
     @abc.abstractmethod
     def length_scale(self) -> Float[Array, " channels"]:
-        """Give the distance (mm) over which the core of the profile changes: quadrature counts
-        radii in it.
+        """Compute the distance (mm) over which the core of the profile changes: the unit of radii
+        in quadrature.
         """
 
     def known_radii(self) -> tuple[Float[Array, " samples"], Float[Array, " samples"]] | None:
-        """Give the radii at which alone a measured profile is known, and their weights `dr` (mm);
-        None for one known everywhere.
-
-        Integrals of the profile are then sums over these.
+        """Return the radii at which a measured profile is known, and their weights `dr` (mm): its
+        integrals are sums over them. `None` for a profile known everywhere.
         """
         return None
 
 
+@record
 class SumOfGaussians(AbstractProfile):
     r"""A profile as a sum of Gaussians, `sum_i w_i G(v_i, r)` (Eq. 2).
 
@@ -81,10 +80,18 @@ class SumOfGaussians(AbstractProfile):
       Differentiable.
     """
 
-    variances: Float[Array, " gaussians"]
-    weights: Float[Array, "gaussians channels"]
+    variances: Float[Array, " gaussians"] = eqx.field(converter=numbers)
+    weights: Float[Array, "gaussians channels"] = eqx.field(converter=numbers)
 
-    @one_program
+    def __check_init__(self):
+        check_values("SumOfGaussians.variances", self.variances, "positive (mm^2)", lambda x: x > 0)
+        check_values("SumOfGaussians.weights", self.weights, "finite", lambda x: x == x)
+
+    @property
+    def channels(self) -> int:
+        return self.weights.shape[-1]
+
+    @jit_unless_traced
     def __call__(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
         squared_radius = jnp.broadcast_to((r * r)[..., None], (*r.shape, *self.variances.shape))
         variances = jnp.broadcast_to(self.variances, squared_radius.shape)
@@ -94,15 +101,13 @@ class SumOfGaussians(AbstractProfile):
         return jnp.sum(self.weights, axis=0)
 
     def length_scale(self) -> Float[Array, " channels"]:
-        """Give the standard deviation of the narrowest Gaussian, mm."""
+        """Compute the standard deviation of the narrowest Gaussian, mm."""
         return jnp.full_like(self.weights[0], jnp.sqrt(jnp.min(self.variances)))
 
     def blurred(self, variance: Float[Array, ""] | float) -> "SumOfGaussians":
-        """Give what a Gaussian beam of a variance (mm^2 per axis) makes of the profile: the
-        variances add (its convolution).
-        """
+        """Convolve the profile with a Gaussian of a variance (mm^2 per axis): variances add."""
         return SumOfGaussians(self.variances + variance, self.weights)
 
     def white(self) -> "SumOfGaussians":
-        """Give the same profile with the weights of each channel divided by their sum."""
+        """Divide the weights of each channel by their sum."""
         return SumOfGaussians(self.variances, self.weights / jnp.sum(self.weights, axis=0)[None])

@@ -48,6 +48,20 @@ def dtype():
 
 
 @pytest.fixture
+def compiled():
+    """The names of all programs that XLA compiles during a test, one after the other."""
+    names = []
+
+    def listen(event, duration, fun_name="", **_):
+        if event == "/jax/core/compile/backend_compile_duration":
+            names.append(fun_name)
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    yield names
+    jax.monitoring.unregister_event_duration_listener(listen)
+
+
+@pytest.fixture
 def monte_carlo():
     """Read a run of the public Monte Carlo code, of tests marked `shared`."""
 

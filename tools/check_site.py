@@ -1,4 +1,4 @@
-"""Hold a built site to what MkDocs does not check: `python tools/check_site.py out/site`.
+"""Check of a built site what MkDocs does not: `python tools/check_site.py out/site`.
 
 Every link and picture of every page leads to a file, and to a place in it that exists; and no page
 fetches anything from elsewhere.
@@ -9,19 +9,12 @@ from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import unquote, urldefrag
 
-_FETCHED = {
-    ("script", "src"),
-    ("img", "src"),
-    ("source", "src"),
-    ("iframe", "src"),
-    ("link", "href"),
-}
-_FOLLOWED = {("a", "href"), *_FETCHED}
+_FETCHED = {"script": "src", "img": "src", "source": "src", "iframe": "src", "link": "href"}
 _NEVER_FETCHED = {"canonical", "alternate", "prev", "next"}
 
 
 class _Page(HTMLParser):
-    """What a page links to, and the places in it that can be linked to."""
+    """The links of a page, whether each is fetched, and the places that can be linked to."""
 
     def __init__(self, path: Path):
         super().__init__()
@@ -30,47 +23,39 @@ class _Page(HTMLParser):
         self.feed(path.read_text(encoding="utf-8"))
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        named = dict(attrs)
-        self.places |= {value for value in (named.get("id"), named.get("name")) if value}
-        for name, value in attrs:
-            if value and (tag, name) in _FOLLOWED:
-                self.links.append(
-                    (value, (tag, name) in _FETCHED and named.get("rel") not in _NEVER_FETCHED)
-                )
+        values = {name: value for name, value in attrs if value}
+        self.places |= {values[name] for name in ("id", "name") if name in values}
+        link = values.get(_FETCHED.get(tag, "href" if tag == "a" else ""))
+        if link:
+            self.links.append((link, tag != "a" and values.get("rel") not in _NEVER_FETCHED))
 
 
 def faults(site: Path) -> list[str]:
-    """Give what is wrong with a site, a line for each."""
+    """Return a line for each fault of a site."""
     pages = {path: _Page(path) for path in sorted(site.rglob("*.html"))}
-    found = [f"{site}: has no pages; build it first"] if not pages else []
+    lines = [] if pages else [f"{site}: has no pages; build it first"]
     for path, page in pages.items():
         for link, fetched in page.links:
             where = f"{path.relative_to(site)}: {link}"
             if link.startswith(("https://", "http://", "//")):
-                if fetched:
-                    found.append(f"{where} is fetched from elsewhere")
+                lines += [f"{where} is fetched from elsewhere"] if fetched else []
                 continue
             if link.startswith(("data:", "mailto:", "javascript:")):
                 continue
             target, place = urldefrag(link)
             base = site if target.startswith("/") else path.parent
-            led = path if not target else (base / unquote(target).lstrip("/")).resolve()
-            if led.is_dir():
-                led = led / "index.html"
-            if not led.exists():
-                found.append(f"{where} leads nowhere")
-            elif (
-                place
-                and led in pages
-                and unquote(place) not in pages[led].places
-                and not place.startswith("__")
-            ):
-                found.append(f"{where}: there is no such place on that page")
+            file = (base / unquote(target).lstrip("/")).resolve() if target else path
+            file = file / "index.html" if file.is_dir() else file
+            places = pages[file].places if file in pages else {unquote(place)}
+            if not file.exists():
+                lines.append(f"{where} leads nowhere")
+            elif place and unquote(place) not in places and not place.startswith("__"):
+                lines.append(f"{where}: there is no such place on that page")
     for style in sorted(site.rglob("*.css")):
         text = style.read_text(encoding="utf-8")
         if any(way in text for way in ("url(http", 'url("http', "@import")):
-            found.append(f"{style.relative_to(site)} fetches from elsewhere")
-    return found
+            lines.append(f"{style.relative_to(site)} fetches from elsewhere")
+    return lines
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ import tyro
 import splatjax as sj
 from splatjax.io import save_exports
 
-from ._outputs import check_output
+from ._options import check_output
 
 
 @dataclass(frozen=True, kw_only=True)

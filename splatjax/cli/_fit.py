@@ -8,20 +8,25 @@ import jax
 import jax.numpy as jnp
 import optimistix as optx
 import tyro
-from rich.console import Console
-from rich.table import Table
 
 import splatjax as sj
+from splatjax._format import channel_names, counted
 from splatjax.fitting import AbstractWeights
 from splatjax.io import own_version, read_picture, surface_and_source
 from splatjax.scattering import measure_laser_dot
-from splatjax.words import channel_names, counted
 
 from ._fit_all import fit_all
 from ._models import Model, Reference, reference
-from ._options import OptionalFloat, OptionalPath
-from ._outputs import FIGURES, check_output, save_figure
-from ._report import note, stage
+from ._options import (
+    FIGURES,
+    OptionalFloat,
+    OptionalPath,
+    check_options,
+    check_output,
+    option_name,
+    save_figure,
+)
+from ._report import note, print_table, stage
 
 _COEFFICIENTS, _PROFILE, _PHOTOGRAPH = "coefficients", "a measured profile", "a photograph"
 _KINDS = {".csv": _PROFILE, ".exr": _PHOTOGRAPH}
@@ -30,7 +35,7 @@ _OPTIONS = {
     _PROFILE: ("mm_per_unit",),
     _PHOTOGRAPH: ("mm_per_pixel", "power"),
 }
-"""What each kind of input alone has use for."""
+"""Options that have an effect on one kind of input alone."""
 _MEDIUM = (
     "Name of a material (`splatjax materials`), or path: of a TOML file with a [medium] or "
     "[[layers]], of a CSV file with radii "
@@ -70,7 +75,7 @@ class Fit:
     error: OptionalFloat = None
     #: Of coefficients: what makes a profile of them. The layers of a material are multipoles, or
     #: are walked by Monte Carlo.
-    model: tyro.conf.EnumChoicesFromValues[Model] = Model.DIPOLE
+    model: Model = "dipole"
     #: Of photon beams and Monte Carlo, which are infinite at the origin: the fit begins at so many
     #: mean free paths, or at 0.2.
     cut: OptionalFloat = None
@@ -95,86 +100,43 @@ class Fit:
 
     def run(self) -> None:
         """Fit, print, write."""
-        if self.all:
-            self._run_all()
-            return
-        if self.output is not None:
-            check_output(self.output, (".toml",))
-        if self.plot is not None:
-            check_output(self.plot, FIGURES)
+        check_output(self.output, (".csv",) if self.all else (".toml",))
+        check_output(self.plot, FIGURES)
+        most = 8 if self.all else sj.LeastCount.largest
+        rules = {
+            "count": (1 <= self.count <= most, f"lie between 1 and {most}"),
+            "error": (self.error is None or self.error > 0, "be positive, such as 0.01"),
+        }
+        check_options(self, rules)
         with jax.enable_x64(True):
-            self._run()
+            self._run_all() if self.all else self._run()
 
     def _run_all(self) -> None:
         if self.output is None:
             raise ValueError("--all needs --output, a CSV file for what is fitted")
-        check_output(self.output, (".csv",))
-        usual = Fit(
-            medium=self.medium, all=True, count=self.count, free=self.free, output=self.output
-        )
-        if usual != self:
+        kept = ("medium", "all", "count", "free", "output")
+        if self != Fit(**{name: getattr(self, name) for name in kept}):
             raise ValueError(
                 "--all fits dipoles by --count and --free alone; leave the other options out"
             )
-        if not 1 <= self.count <= 8:
-            raise ValueError(f"--count is {self.count}; with --all it lies between 1 and 8")
-        weights = (
-            sj.FreeWeights() if self.free else sj.NonNegativeWeights(sj.TotalReflectanceHeld())
-        )
-        with jax.enable_x64(True):
-            fit_all(Path(self.medium), self.output, self.count, weights)
-
-    def _check_options(self) -> None:
-        """Refuse what has no effect on this kind of input."""
-        kind = _KINDS.get(Path(self.medium).suffix.lower(), _COEFFICIENTS)
-        given = {field.name for field in fields(self) if getattr(self, field.name) != field.default}
-        for other, names in _OPTIONS.items():
-            for name in names:
-                if other != kind and name in given:
-                    option = f"--{name.replace('_', '-')}"
-                    raise ValueError(
-                        f"{option} is for {other}, and {self.medium} is taken for {kind}; leave it "
-                        "out"
-                    )
+        fit_all(Path(self.medium), self.output, self.count, self._weights(measured=False)[0])
 
     def _run(self) -> None:
         self._check_options()
-        if self.count > (most := sj.LeastCount.largest):
-            raise ValueError(
-                f"--count is {self.count}; it lies between 1 and {most}, as many as --error takes"
-            )
-        if self.error is not None and not self.error > 0:
-            raise ValueError(f"--error is {self.error:g}; it must be positive, such as 0.01")
         coefficients = self._coefficients()
         if isinstance(coefficients, sj.Tabulated):
-            made = Reference(coefficients, sj.NORM_RULE)
+            measured, target = True, Reference(coefficients, description="measured")
+            radii = len(coefficients.radii)
+            if self.error is None and 2 * self.count > radii:
+                note(
+                    f"{self.medium} has {radii} radii, too few to tell "
+                    f"{counted(self.count, 'Gaussian')} apart: give a smaller --count"
+                )
         else:
-            made = reference(
-                coefficients, self.model, self.cut, self.photons, self.single_scattering
-            )
-        profile = made.profile
-        count = self.count if self.error is None else sj.LeastCount(self.error)
-        wanted = (
-            counted(self.count, "Gaussian")
-            if self.error is None
-            else f"Gaussians to an error of {self.error:g}"
-        )
-        if (
-            isinstance(coefficients, sj.Tabulated)
-            and self.error is None
-            and 2 * self.count > len(coefficients.radii)
-        ):
-            note(
-                f"{self.medium} has {len(coefficients.radii)} radii, too few to tell {wanted} "
-                "apart: give a smaller --count"
-            )
-        with stage(f"fitting to {self.medium}: {wanted}"):
-            weights = self._weights(coefficients)
-            fitted = jax.block_until_ready(
-                sj.fit_gaussians(profile, count, weights=weights, rule=made.rule, throw=False)
-            )
-            if fitted.result != optx.RESULTS.successful:
-                raise ValueError(self._unsettled(len(fitted.gaussians.variances)))
+            options = self.model, self.cut, self.photons, self.single_scattering
+            measured, target = False, reference(coefficients, *options)
+        weights, weights_of = self._weights(measured)
+        fitted = self._fitted(target, weights)
         _print(fitted)
         total = fitted.gaussians.total_reflectance()
         if float(jnp.max(total)) > 1 + 1e-3:
@@ -183,126 +145,123 @@ class Fit:
                 "are its unit and power right?"
             )
         if self.output is not None:
-            self._save(self.output, coefficients, made, fitted)
+            self._save(self.output, coefficients, target, fitted, weights_of)
             print(self.output)
         if self.plot is not None:
             from splatjax.plots import plot_fit  # loads matplotlib
 
-            found = len(fitted.gaussians.variances)
-            figure = plot_fit(
-                profile,
-                fitted.gaussians,
-                rule=made.rule,
-                title=f"{self.medium}, {counted(found, 'Gaussian')}",
-            )
+            title = f"{self.medium}, {counted(len(fitted.gaussians.variances), 'Gaussian')}"
+            figure = plot_fit(target.profile, fitted.gaussians, rule=target.rule, title=title)
             save_figure(figure, self.plot)
-            print(self.plot)
 
-    def _unsettled(self, count: int) -> str:
-        told = f"{self.medium}: the search for {counted(count, 'Gaussian')} did not settle"
-        if self.model is Model.MONTE_CARLO:
-            return (
-                f"{told}; {self.photons} photons tell too little apart:"
-                " give more --photons, or a smaller --count"
-            )
-        return f"{told}; give a smaller --count"
+    def _check_options(self) -> None:
+        """Refuse options that have no effect on this kind of input."""
+        kind = _KINDS.get(Path(self.medium).suffix.lower(), _COEFFICIENTS)
+        given = {field.name for field in fields(self) if getattr(self, field.name) != field.default}
+        for other, names in _OPTIONS.items():
+            without_effect = [name for name in names if other != kind and name in given]
+            if without_effect:
+                raise ValueError(
+                    f"{option_name(without_effect[0])} is for {other}, and {self.medium} is taken "
+                    f"for {kind}; leave it out"
+                )
 
     def _coefficients(self) -> sj.Dipole | sj.LayeredMultipole | sj.Tabulated:
-        match Path(self.medium).suffix.lower():
-            case ".csv":
-                return sj.read_profile(self.medium, mm_per_unit=self.mm_per_unit)
-            case ".exr":
-                if self.mm_per_pixel is None:
-                    raise ValueError(
-                        f"{self.medium}: how large is a pixel on the surface? give --mm-per-pixel"
-                    )
-                image = read_picture(self.medium)
-                try:
-                    return measure_laser_dot(image, self.mm_per_pixel, power=self.power).profile
-                except ValueError as error:
-                    raise ValueError(f"{self.medium}: {error}") from None
-            case _:
-                return sj.load_profile(self.medium)
+        suffix = Path(self.medium).suffix.lower()
+        if suffix == ".csv":
+            return sj.read_profile(self.medium, mm_per_unit=self.mm_per_unit)
+        if suffix != ".exr":
+            return sj.load_profile(self.medium)
+        if self.mm_per_pixel is None:
+            raise ValueError(
+                f"{self.medium}: how large is a pixel on the surface? give --mm-per-pixel"
+            )
+        image = read_picture(self.medium)
+        try:
+            return measure_laser_dot(image, self.mm_per_pixel, power=self.power).profile
+        except ValueError as error:
+            raise ValueError(f"{self.medium}: {error}") from None
 
-    def _weights(self, profile: sj.AbstractProfile) -> AbstractWeights:
+    def _weights(self, measured: bool) -> tuple[AbstractWeights, str]:
+        """Return the constraint on the weights, and its description."""
         if self.free:
-            return sj.FreeWeights()
-        return sj.NonNegativeWeights(
-            sj.FreeWeights() if isinstance(profile, sj.Tabulated) else sj.TotalReflectanceHeld()
-        )
+            return sj.FreeWeights(), "free"
+        if measured:
+            return sj.NonNegativeWeights(sj.FreeWeights()), "non-negative"
+        held = sj.NonNegativeWeights(sj.FixedTotalReflectance())
+        return held, "non-negative, sum held to the total reflectance"
+
+    def _fitted(self, target: Reference, weights: AbstractWeights) -> sj.FitResult:
+        count = self.count if self.error is None else sj.LeastCount(self.error)
+        number = counted(self.count, "Gaussian")
+        goal = number if self.error is None else f"Gaussians to an error of {self.error:g}"
+        with stage(f"fitting to {self.medium}: {goal}"):
+            fitted = jax.block_until_ready(
+                sj.fit_gaussians(
+                    target.profile, count, weights=weights, rule=target.rule, throw=False
+                )
+            )
+            if fitted.result != optx.RESULTS.successful:
+                number = counted(len(fitted.gaussians.variances), "Gaussian")
+                more = (
+                    f"more --photons than {self.photons}, or "
+                    if self.model == "monte-carlo"
+                    else ""
+                )
+                raise ValueError(
+                    f"{self.medium}: the search for {number} did not settle; give {more}a smaller "
+                    "--count"
+                )
+        return fitted
 
     def _save(
         self,
         output: Path,
         coefficients: sj.Dipole | sj.LayeredMultipole | sj.Tabulated,
-        made: Reference,
+        target: Reference,
         fitted: sj.FitResult,
+        weights_of: str,
     ) -> None:
-        # The index of a surface is that of the medium it bounds, if one is known; the rest is what
-        # the file says, if it says it.
-        measured = isinstance(coefficients, sj.Tabulated)
-        fitted_to = f"{'profile' if measured else 'coefficients'} of {self.medium}"
-        source = {"provenance": f"fitted by splatjax {own_version()} to the {fitted_to}"}
-        how = {
+        settings = {
             "variances_of": "all channels",
-            "weights_of": self._weights_of(measured),
+            "weights_of": weights_of,
             "error": fitted.error,
             "energy_error": fitted.energy_error,
         }
-        if measured:
-            sj.save_material(
-                sj.Material(fitted.gaussians),
-                output,
-                source=source,
-                fit={"profile": "measured"} | how,
-            )
+        if target.description is not None:
+            settings = {"profile": target.description} | settings
+        provenance = f"fitted by splatjax {own_version()} to the "
+        if isinstance(coefficients, sj.Tabulated):
+            provenance += f"profile of {self.medium}"
+            material, profile, source = sj.Material(fitted.gaussians), None, {}
         else:
-            medium = (
-                coefficients.medium
-                if isinstance(coefficients, sj.Dipole)
-                else coefficients.top.medium
-            )
-            surface, said = surface_and_source(self.medium)
-            source = said | {
-                "provenance": "; ".join(
-                    [*filter(None, [said.get("provenance")]), source["provenance"]]
-                )
-            }
-            material = sj.Material(
-                fitted.gaussians,
-                **({"eta": medium.eta[0]} | surface),
-                single_scattering=made.single,
-            )
-            known = (sj.Dipole, sj.BetterDipole, sj.PhotonBeam, sj.LayeredMultipole)
-            if not isinstance(made.profile, known):
-                model = (
-                    "photon beam"
-                    if self.model is Model.PHOTON_BEAM
-                    else f"Monte Carlo, {self.photons} photons"
-                )
-                how["profile"] = (
-                    model if made.single is None else f"{model}, without single scattering"
-                )
-            profile = made.profile if isinstance(made.profile, known) else coefficients
-            sj.save_material(material, output, profile=profile, source=source, fit=how)
-
-    def _weights_of(self, measured: bool) -> str:
-        if self.free:
-            return "free"
-        return "non-negative" if measured else "non-negative, sum held to the total reflectance"
+            provenance += f"coefficients of {self.medium}"
+            # The index of a surface is that of the medium it bounds, unless the file gives it.
+            top = coefficients if isinstance(coefficients, sj.Dipole) else coefficients.top
+            surface, source = surface_and_source(self.medium)
+            surface = {"eta": top.medium.eta[0]} | surface
+            material = sj.Material(fitted.gaussians, **surface, single_scattering=target.single)
+            profile = target.profile if target.description is None else coefficients
+        known = source.get("provenance")
+        source = source | {"provenance": f"{known}; {provenance}" if known else provenance}
+        sj.save_material(
+            material,
+            output,
+            profile=profile,
+            source=source,
+            fit=settings,
+        )
 
 
 def _print(fitted: sj.FitResult) -> None:
-    table = Table(box=None, pad_edge=False)
-    names = ", ".join(channel_names(fitted.gaussians.weights.shape[1]))
-    for title in ("variance, mm^2", f"weights ({names})"):
-        table.add_column(title, justify="right", no_wrap=True)
-    for variance, weights in zip(fitted.gaussians.variances, fitted.gaussians.weights, strict=True):
-        table.add_row(f"{float(variance):.6g}", _numbers(weights, ".5f"))
-    table.add_row("sum", _numbers(fitted.gaussians.total_reflectance(), ".5f"))
-    table.add_row("error (Eq. 4)", _numbers(fitted.error, ".2e"))
-    table.add_row("energy error", _numbers(fitted.energy_error, ".2e"))
-    Console(highlight=False).print(table)
+    gaussians = fitted.gaussians
+    names = ", ".join(channel_names(gaussians.weights.shape[1]))
+    pairs = zip(gaussians.variances, gaussians.weights, strict=True)
+    rows = [(f"{float(variance):.6g}", _numbers(weights, ".5f")) for variance, weights in pairs]
+    sums = ("sum", _numbers(gaussians.total_reflectance(), ".5f"))
+    error = ("error (Eq. 4)", _numbers(fitted.error, ".2e"))
+    energy = ("energy error", _numbers(fitted.energy_error, ".2e"))
+    print_table([("variance, mm^2", f"weights ({names})"), *rows, sums, error, energy])
 
 
 def _numbers(values: jax.Array, form: str) -> str:

@@ -1,5 +1,5 @@
-"""`splatjax fit --all`: many media, a batch at a time; what is finished stays, and all of it
-becomes one table.
+"""`splatjax fit --all`: many media, a batch at a time; finished batches are kept, and become one
+table in the end.
 """
 
 import shutil
@@ -20,16 +20,13 @@ from splatjax.io import (
     own_version,
     read_column,
     read_media,
-    read_record,
     write_columns,
-    write_record,
 )
 
-from ._processes import own_share
-from ._report import note, progress
+from ._report import note, stage
+from ._resumable import ResumableFolder
 
-_TOGETHER = 500  # media in one call
-_RECORD = "fits.json"
+_BATCH = 500  # media in one call
 
 
 def fit_all(media: Path, output: Path, count: int, weights: AbstractWeights) -> None:
@@ -40,6 +37,7 @@ def fit_all(media: Path, output: Path, count: int, weights: AbstractWeights) -> 
 
     **Raises:** `ValueError` where the folder holds fits of something else.
     """
+    names, coefficients = read_media(media)
     record = {
         "media": fingerprint(media),
         "--count": count,
@@ -47,56 +45,37 @@ def fit_all(media: Path, output: Path, count: int, weights: AbstractWeights) -> 
         "splatjax": own_version(),
         "jax": jax.__version__,
     }
-    folder = output.with_name(f"{output.name}.parts")
-    if (folder / _RECORD).exists() and read_record(folder / _RECORD) != record:
-        raise ValueError(
-            f"{folder}: holds fits of something else; delete that folder, or name another --output"
-        )
-    names, coefficients = read_media(media)
-    begins = range(0, len(names), _TOGETHER)
-    parts = [folder / f"from_{begin:08}.csv" for begin in begins]
-    missing = [i for i, part in enumerate(parts) if not part.exists()]
-    if len(missing) < len(parts):
-        note(f"{len(parts) - len(missing)} of {len(parts)} batches are there already, and kept")
-    own = own_share().of(missing)  # which waits: all have seen the same batches missing
+    path, begins = output.with_name(f"{output.name}.parts"), range(0, len(names), _BATCH)
+    parts = [path / f"from_{begin:08}.csv" for begin in begins]
+    folder = ResumableFolder(path / "fits.json", record, [(part,) for part in parts], "batches")
+    folder.check()
+    own = folder.own_missing()
     if own:
-        folder.mkdir(exist_ok=True)
-        write_record(folder / _RECORD, record)
-        with progress(
-            f"fitting {count} Gaussians to {len(names)} media, {_TOGETHER} at a time", len(own)
-        ) as one_more:
-            for i in own:
-                part = slice(begins[i], begins[i] + _TOGETHER)
-                write_columns(
-                    parts[i], {"name": names[part]} | _fitted(coefficients[part], count, weights)
-                )
-                one_more()
-    if output.exists() and not folder.exists():  # joined by another process
-        return
-    if not all(part.exists() for part in parts):
-        note(
-            "other processes are still at work; the one that finds every batch there joins them, "
-            "or the same command again"
-        )
+        folder.begin()
+        what = f"fitting {count} Gaussians to {len(names)} media, {_BATCH} at a time"
+        with stage(what, len(own)) as report:
+            for number, i in enumerate(own, 1):
+                batch = slice(begins[i], begins[i] + _BATCH)
+                columns = _fitted(coefficients[batch], count, weights)
+                write_columns(parts[i], {"name": names[batch]} | columns)
+                report(number)
+    was_joined = output.exists() and not path.exists()  # by another process
+    if was_joined or not folder.is_complete():
         return
     try:
         join_tables(output, parts)
-    except (
-        FileNotFoundError
-    ) as error:  # another process found every batch at the same time, and has joined them
+    except FileNotFoundError as error:  # another process has joined them at the same time
         if not output.exists() or str(error.filename) not in map(str, parts):
             raise
-    shutil.rmtree(folder, ignore_errors=True)
-    note(_how_many_converged(output))
-    print(output)
-
-
-def _how_many_converged(table: Path) -> str:
-    converged = read_column(table, "converged")
+    shutil.rmtree(path, ignore_errors=True)
+    converged = read_column(output, "converged")
     failed = int(np.sum(converged == 0))
-    if not failed:
-        return f"all {len(converged)} fits converged"
-    return f"{failed} of {len(converged)} fits did not converge; in their rows `converged` is 0"
+    note(
+        f"{failed} of {len(converged)} fits did not converge; in their rows `converged` is 0"
+        if failed
+        else f"all {len(converged)} fits converged"
+    )
+    print(output)
 
 
 @eqx.filter_jit
@@ -115,16 +94,16 @@ def _fit_each(coefficients: Float[Array, "media 3"], starts, count: int, weights
 def _fitted(
     coefficients: np.ndarray, count: int, weights: AbstractWeights
 ) -> dict[str, np.ndarray]:
-    """Give the columns of a batch; a smaller one is filled up, so that one program serves all."""
+    """Return the columns of a batch. A smaller batch is padded, so that one program serves all."""
     given = len(coefficients)
-    whole = np.pad(coefficients, ((0, _TOGETHER - given), (0, 0)), mode="edge")
-    found, converged = _fit_each(jnp.asarray(whole), sj.dipole_starts(), count, weights)
-    columns = dict(zip(("sigma_a", "sigma_s_prime", "eta"), coefficients.T, strict=True))
-    columns |= {f"variance_{i + 1}": found.gaussians.variances[:, i] for i in range(count)}
-    columns |= {f"weight_{i + 1}": found.gaussians.weights[:, i, 0] for i in range(count)}
+    padded = np.pad(coefficients, ((0, _BATCH - given), (0, 0)), mode="edge")
+    fitted, converged = _fit_each(jnp.asarray(padded), sj.dipole_starts(), count, weights)
+    columns = dict(zip(("sigma_a", "sigma_s_prime", "eta"), padded.T, strict=True))
+    columns |= {f"variance_{i + 1}": fitted.gaussians.variances[:, i] for i in range(count)}
+    columns |= {f"weight_{i + 1}": fitted.gaussians.weights[:, i, 0] for i in range(count)}
     columns |= {
-        "error": found.error[:, 0],
-        "energy_error": found.energy_error[:, 0],
+        "error": fitted.error[:, 0],
+        "energy_error": fitted.energy_error[:, 0],
         "converged": converged.astype(float),
     }
     return {name: np.asarray(column)[:given] for name, column in columns.items()}

@@ -1,4 +1,4 @@
-"""What `splatjax sample` and `splatjax figure` share: how a mesh wears its maps."""
+"""Options of `splatjax sample` for the maps of a mesh."""
 
 from dataclasses import dataclass
 from typing import Annotated, Any

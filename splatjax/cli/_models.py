@@ -1,37 +1,34 @@
-"""What `splatjax fit` makes of coefficients: the models of `docs/which_profile.md` by name."""
+"""The models of `docs/which_profile.md` by name: what `splatjax fit` makes of coefficients."""
 
-import sys
 from dataclasses import dataclass
-from enum import Enum
+from typing import Literal, TypeAlias
 
 import jax
 import jax.numpy as jnp
-from rich.progress import Progress
 
 import splatjax as sj
 from splatjax.scattering import AbstractRadialRule
 
+from ._report import stage
+
+Model: TypeAlias = Literal["dipole", "better-dipole", "photon-beam", "monte-carlo"]
 _CUT = 0.2  # mean free paths
-
-
-class Model(Enum):
-    """Names of the models."""
-
-    DIPOLE = "dipole"
-    BETTER_DIPOLE = "better-dipole"
-    PHOTON_BEAM = "photon-beam"
-    MONTE_CARLO = "monte-carlo"
 
 
 @dataclass(frozen=True)
 class Reference:
-    """A profile to be fitted, and where its fit begins; and what light that scatters once does
-    beside it.
+    """A profile to be fitted, and the radii at which its fit counts.
+
+    **Attributes:**
+
+    - `single`: light that scatters once, where it is kept apart from the profile.
+    - `description`: of a profile that coefficients alone do not give back.
     """
 
     profile: sj.AbstractProfile
-    rule: AbstractRadialRule
+    rule: AbstractRadialRule = sj.L2_QUADRATURE
     single: sj.SingleScattering | None = None
+    description: str | None = None
 
 
 def reference(
@@ -39,78 +36,62 @@ def reference(
     model: Model,
     cut: float | None,
     photons: int,
-    apart: bool,
+    single_scattering: bool,
 ) -> Reference:
-    """Give what a model makes of a medium or of layers; `cut` is in mean free paths, 0.2 if it is
-    not given.
+    """Return the profile of a medium or of layers by a model.
 
-    With `apart` light that scatters once is taken out of the profile.
+    **Arguments:**
 
-    **Raises:** `ValueError` for layers and a model that knows a half space alone, for a cut of what
-    is finite, and for single scattering taken out of layers or of a dipole.
+    - `cut`: mean free paths from which on a profile counts that is infinite at the origin.
+    - `single_scattering`: whether light that scatters once is taken out of the profile.
+
+    **Raises:** `ValueError` for options that do not go with the model or with layers.
     """
-    layered = isinstance(coefficients, sj.LayeredMultipole)
-    if cut is None:
-        cut = _CUT
-    elif not (model is Model.MONTE_CARLO or (model is Model.PHOTON_BEAM and not apart)):
-        what = f"--model {model.value}{' with --single-scattering' if apart else ''}"
-        raise ValueError(
-            f"--cut has no effect on {what}, which is finite at the origin; leave it out"
-        )
-    if apart:
-        return _apart(coefficients, model, cut, photons)
-    if model is Model.DIPOLE:
-        return Reference(coefficients, sj.NORM_RULE)
-    if model is Model.MONTE_CARLO:
-        layers = (
-            coefficients.layers
-            if layered
-            else (sj.Layer(coefficients.medium, jnp.asarray(jnp.inf)),)
-        )
-        return Reference(_walked(layers, photons), sj.NORM_RULE.beyond(cut))
-    if layered:
-        raise ValueError(
-            f"--model {model.value} knows a half space, and this material has layers; take dipole "
-            "or monte-carlo"
-        )
-    if model is Model.BETTER_DIPOLE:
-        return Reference(sj.BetterDipole(coefficients.medium), sj.NORM_RULE)
-    return Reference(sj.PhotonBeam(coefficients.medium), sj.NORM_RULE.beyond(cut))
-
-
-def _apart(
-    coefficients: sj.Dipole | sj.LayeredMultipole, model: Model, cut: float, photons: int
-) -> Reference:
+    option = f"--model {model}{' with --single-scattering' if single_scattering else ''}"
+    if cut is not None and option != "--model photon-beam" and model != "monte-carlo":
+        raise ValueError(f"--cut has no effect on {option}, which is finite at the origin")
+    if single_scattering and model not in ("photon-beam", "monte-carlo"):
+        raise ValueError(f"{option} is not possible; take photon-beam or monte-carlo")
+    beyond = sj.L2_QUADRATURE.beyond(_CUT if cut is None else cut)
     if isinstance(coefficients, sj.LayeredMultipole):
+        if model == "dipole":
+            return Reference(coefficients)
+        if model == "monte-carlo" and not single_scattering:
+            return _walked(coefficients.layers, photons, beyond)
         raise ValueError(
-            "--single-scattering knows a half space, and this material has layers; leave it out"
+            f"{option} is for a half space, and this material has layers; take --model dipole or "
+            "monte-carlo without --single-scattering"
         )
-    single = sj.SingleScattering(coefficients.medium)
-    match model:
-        case Model.PHOTON_BEAM:
-            return Reference(
-                sj.PhotonBeam(coefficients.medium).multiply_scattered(), sj.NORM_RULE, single
-            )
-        case Model.MONTE_CARLO:
-            found = reference(coefficients, model, cut, photons, apart=False)
-            assert isinstance(found.profile, sj.Tabulated)
-            return Reference(found.profile.without(single), found.rule, single)
-    raise ValueError(
-        f"--single-scattering is no part of --model {model.value}; take photon-beam or monte-carlo"
-    )
+    medium = coefficients.medium
+    single = sj.SingleScattering(medium)
+    if model == "monte-carlo":
+        half_space = sj.Layer(medium, jnp.asarray(jnp.inf))
+        return _walked((half_space,), photons, beyond, single if single_scattering else None)
+    if single_scattering:
+        profile = sj.PhotonBeam(medium).multiply_scattered()
+        return Reference(
+            profile, single=single, description="photon beam, without single scattering"
+        )
+    if model == "photon-beam":
+        return Reference(sj.PhotonBeam(medium), beyond)
+    return Reference(coefficients if model == "dipole" else sj.BetterDipole(medium))
 
 
-def _walked(layers: tuple[sj.Layer | sj.Film, ...], photons: int) -> sj.Tabulated:
-    """Walk in single precision, which is what photons need; the profile is then fitted in
-    double.
-    """
-    single = jax.tree.map(lambda each: each.astype(jnp.float32), list(layers))
-    with Progress(console=None, disable=not sys.stderr.isatty(), transient=True) as progress:
-        task = progress.add_task("walking photons", total=1.0)
-        found = sj.monte_carlo(
-            single,
-            photons,
-            jax.random.key(0),
-            progress=lambda done, photons: progress.update(task, completed=done / photons),
+def _walked(
+    layers: tuple[sj.Layer | sj.Film, ...],
+    photons: int,
+    rule: AbstractRadialRule,
+    single: sj.SingleScattering | None = None,
+) -> Reference:
+    """Walk in single precision, which suffices for photons; the profile is fitted in double."""
+    layers_32 = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), list(layers))
+    with stage("walking photons", photons) as report:
+        walk = sj.monte_carlo(
+            layers_32, photons, jax.random.key(0), progress=lambda done, _: report(done)
         )
-    return jax.tree.map(lambda each: each.astype(jnp.float64), found.profile())
+    profile = jax.tree.map(lambda leaf: leaf.astype(jnp.float64), walk.profile())
+    description = f"Monte Carlo, {photons} photons"
+    if single is None:
+        return Reference(profile, rule, None, description)
+    description += ", without single scattering"
+    return Reference(profile.without(single), rule, single, description)

@@ -3,16 +3,16 @@
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 import tyro
-from rich.console import Console
 
 import splatjax as sj
+from splatjax._format import counted
 from splatjax.io import (
     fingerprint,
     material_path,
@@ -21,11 +21,16 @@ from splatjax.io import (
     read_record,
     write_record,
 )
-from splatjax.words import counted
 
-from ._models import Model
-from ._options import MaterialNames, OptionalFloat, OptionalPath
-from ._outputs import FIGURES, check_output, save_figure
+from ._options import (
+    FIGURES,
+    MaterialNames,
+    OptionalFloat,
+    OptionalPath,
+    check_options,
+    check_output,
+    save_figure,
+)
 from ._report import note, stage
 
 _START = (
@@ -34,16 +39,17 @@ _START = (
 )
 _LARGEST_ETA = 3.0
 """Of any translucent solid: diamond has 2.4."""
-_MODELS = {Model.DIPOLE: sj.Dipole, Model.BETTER_DIPOLE: sj.BetterDipole}
+_COEFFICIENTS = ("sigma_a", "sigma_s_prime")
+_MODELS = {"dipole": sj.Dipole, "better-dipole": sj.BetterDipole}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Recover:
     """Find the absorption and scattering of a material from pictures of a known shape.
 
-    Both come with error bars; what the pictures do not fix is said, and which one to take next.
-    They are listed in a TOML file, each with its camera, its lights, and what is known of noise and
-    intensity:
+    Both come with error bars, with what the pictures do not fix, and with which one to take next.
+    The pictures are listed in a TOML file, each with its camera, its lights, and what is known of
+    noise and intensity:
 
         [[pictures]]
         file = "left.exr"
@@ -58,8 +64,8 @@ class Recover:
     A light is also of kind "point" (position, intensity) or "beam" (origin, direction, power,
     variance).
 
-    Albedo of the splats is not used: the coefficients carry all color. Interrupt it, and the same
-    command goes on from the best medium it knew.
+    Albedo of the splats is not used: the coefficients carry all color. After an interruption the
+    same command continues from the best medium so far.
 
     Example: splatjax recover head.ply pictures.toml --start skin1 marble --output mine.toml
     --report mine.png
@@ -76,8 +82,8 @@ class Recover:
     output: Path = Path("recovered.toml")
     #: Picture to write of what was seen, what was recovered and what is left: .png, .pdf or .svg.
     report: OptionalPath = None
-    #: dipole or better-dipole.
-    model: tyro.conf.EnumChoicesFromValues[Model] = Model.DIPOLE
+    #: What makes a profile of the coefficients.
+    model: Literal["dipole", "better-dipole"] = "dipole"
     #: Number of Gaussians.
     count: int = 6
     #: Let pixels that are far off count less: highlights, dust, what the model does not know.
@@ -90,24 +96,16 @@ class Recover:
     suggest: bool = True
 
     def run(self) -> None:
-        """Load, recover, say, write."""
+        """Load, recover, print, write."""
         check_output(self.output, (".toml",))
-        if self.report is not None:
-            check_output(self.report, FIGURES)
-        if self.model not in _MODELS:
-            raise ValueError(
-                f"--model {self.model.value} cannot be searched; take "
-                f"{' or '.join(m.value for m in _MODELS)}"
-            )
+        check_output(self.report, FIGURES)
+        in_range = self.eta is None or 1 <= self.eta <= _LARGEST_ETA
+        expected = f"lie between 1 and {_LARGEST_ETA:g}: marble has 1.5, skin 1.4"
+        check_options(self, {"eta": (in_range, expected)})
         if not self.start:
             raise ValueError("--start names no material; give one or more (`splatjax materials`)")
-        if self.eta is not None and not 1 <= self.eta <= _LARGEST_ETA:
-            raise ValueError(
-                f"--eta is {self.eta:g}; it must lie between 1 and {_LARGEST_ETA:g}: marble has "
-                "1.5, skin 1.4"
-            )
         for name in self.start:
-            sj.load_medium(name)  # says at once what is wrong with it
+            sj.load_medium(name)  # reports faults before the pictures are read
         with stage(f"reading {self.splats} and {self.pictures}"):
             observations = sj.read_observations(self.pictures)
             splats = sj.read_splats(self.splats)
@@ -116,122 +114,90 @@ class Recover:
             self._run(observations, splats)
 
     def _run(self, observations: list[sj.Observation], splats: sj.Splats) -> None:
-        starts = self._starts(observations[0].picture.shape[2])
-        surface = sj.Material(
-            sj.SumOfGaussians(jnp.ones(1), jnp.ones((1, starts[0].eta.shape[0]))),
-            eta=starts[0].eta[0],
-            specular=self.specular,
-            roughness=self.roughness,
-        )
-        begin, kept, made = time.perf_counter(), self._kept(), self._made()
+        search = self.output.with_suffix(".search.json")
+        dependencies = self._dependencies()
+        starts = self._starts(search, dependencies, observations[0].picture.shape[2])
+        begin = time.perf_counter()
 
-        def say(said: str, medium: sj.Medium) -> None:
-            note(f"{time.perf_counter() - begin:6.1f} s  {said}")
-            if medium is starts[0]:  # nothing is found yet
-                return
-            found = {
-                "sigma_a": medium.sigma_a.tolist(),
-                "sigma_s_prime": medium.sigma_s_prime.tolist(),
-            }
-            write_record(kept, {"made of": made, **found})
+        def report(what: str, medium: sj.Medium) -> None:
+            note(f"{time.perf_counter() - begin:6.1f} s  {what}")
+            if medium is not starts[0]:
+                values = {name: getattr(medium, name).tolist() for name in _COEFFICIENTS}
+                write_record(search, {"made of": dependencies, **values})
 
+        gaussians = sj.SumOfGaussians(jnp.ones(1), jnp.ones((1, starts[0].eta.shape[0])))
         recovery = sj.recover(
             observations,
             splats,
             starts,
-            surface=surface,
+            surface=sj.Material(gaussians, starts[0].eta[0], self.specular, self.roughness),
             model=_MODELS[self.model],
             count=self.count,
             loss=sj.HuberLoss() if self.robust else sj.SquaredLoss(),
-            progress=say,
+            progress=report,
             throw=False,
         )
+        effort = f"{counted(recovery.rounds, 'round')} and {counted(recovery.steps, 'step')}"
         if recovery.result != optx.RESULTS.successful:
             raise ValueError(
-                f"{self.pictures}: the search did not settle in {self._effort(recovery)}; the same "
-                "command goes on where it stopped, or --start names materials that are nearer"
+                f"{self.pictures}: the search did not settle in {effort}; the same command goes on "
+                "where it stopped, or --start names materials that are nearer"
             )
-        note(f"{time.perf_counter() - begin:6.1f} s  found, after {self._effort(recovery)}")
-        Console(highlight=False, soft_wrap=True).print(recovery.words(), markup=False)
+        note(f"{time.perf_counter() - begin:6.1f} s  found, after {effort}")
+        print(recovery.summary())
         if self.suggest:
             self._suggest(recovery, observations, splats)
         self._save(recovery)
-        kept.unlink(missing_ok=True)
+        search.unlink(missing_ok=True)
         print(self.output)
         if self.report is not None:
             from splatjax.plots import plot_recovery  # loads matplotlib
 
-            save_figure(
-                plot_recovery(
-                    recovery, title=f"{self.output.stem}: {counted(len(observations), 'picture')}"
-                ),
-                self.report,
-            )
-            print(self.report)
+            title = f"{self.output.stem}: {counted(len(observations), 'picture')}"
+            save_figure(plot_recovery(recovery, title=title), self.report)
 
-    def _starts(self, channels: int) -> list[sj.Medium]:
-        """Give the media to start from: where an interrupted search had come to, if there was
+    def _starts(self, search: Path, dependencies: dict[str, Any], channels: int) -> list[sj.Medium]:
+        """Return the media to start from: the best one of an interrupted search, if there was
         one.
         """
-        known = [sj.load_medium(name) for name in self.start]
-        for name, medium in zip(self.start, known, strict=True):
+        media = [sj.load_medium(name) for name in self.start]
+        for name, medium in zip(self.start, media, strict=True):
             if medium.eta.shape[0] != channels:
                 raise ValueError(
                     f"--start {name} has {medium.eta.shape[0]} channels, the pictures have "
                     f"{channels}; name another"
                 )
-        eta = known[0].eta if self.eta is None else jnp.full_like(known[0].eta, self.eta)
-        starts = [sj.Medium(medium.sigma_a, medium.sigma_s_prime, eta) for medium in known]
-        kept = self._kept()
-        if not kept.exists():
+        eta = media[0].eta if self.eta is None else jnp.full_like(media[0].eta, self.eta)
+        starts = [sj.Medium(medium.sigma_a, medium.sigma_s_prime, eta) for medium in media]
+        if not search.exists():
             return starts
-        record = read_record(kept)
-        if record.get("made of") != self._made():
-            note(f"{kept}: is of another search, and is not used")
+        record = read_record(search)
+        if record.get("made of") != dependencies:
+            note(f"{search}: is of another search, and is not used")
             return starts
-        note(f"{kept}: an interrupted search goes on")
-        return [
-            sj.Medium(jnp.asarray(record["sigma_a"]), jnp.asarray(record["sigma_s_prime"]), eta)
-        ]
+        note(f"{search}: an interrupted search goes on")
+        return [sj.Medium(*(jnp.asarray(record[name]) for name in _COEFFICIENTS), eta)]
 
-    def _effort(self, recovery: sj.Recovery) -> str:
-        return f"{counted(recovery.rounds, 'round')} and {counted(recovery.steps, 'step')}"
-
-    def _kept(self) -> Path:
-        return self.output.with_suffix(".search.json")
-
-    def _made(self) -> dict[str, Any]:
-        """Give all that a search depends on."""
-        files = [
-            self.splats,
-            *picture_paths(self.pictures),
-            *(material_path(name) for name in self.start),
-        ]
-        options = {
-            "model": self.model.value,
-            "count": self.count,
-            "robust": self.robust,
-            "eta": self.eta,
-            "specular": self.specular,
-        }
+    def _dependencies(self) -> dict[str, Any]:
+        """Return all that a search depends on."""
+        materials = (material_path(name) for name in self.start)
+        files = [self.splats, *picture_paths(self.pictures), *materials]
+        names = ("model", "count", "robust", "eta", "specular", "roughness")
         return {
             "files": [fingerprint(file) for file in files],
-            **options,
-            "roughness": self.roughness,
+            **{name: getattr(self, name) for name in names},
             "splatjax": own_version(),
         }
 
     def _suggest(
         self, recovery: sj.Recovery, observations: list[sj.Observation], splats: sj.Splats
     ) -> None:
-        candidates = sj.usual_candidates(
-            splats, observations[0].camera, observations[0].picture.shape[2]
-        )
+        first = observations[0]
+        candidates = sj.default_candidates(splats, first.camera, first.picture.shape[2])
         with stage(f"looking at {len(candidates)} pictures that could be taken next"):
             predictions = sj.next_pictures(recovery, splats, candidates, model=_MODELS[self.model])
         print("what one more picture would do, the best first:")
-        for prediction in predictions:
-            print(f"  {prediction}")
+        print(*(f"  {prediction}" for prediction in predictions), sep="\n")
 
     def _save(self, recovery: sj.Recovery) -> None:
         errors = recovery.relative_errors()

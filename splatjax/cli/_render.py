@@ -1,18 +1,18 @@
 """`splatjax render`: from splats and a material to a picture with all its layers."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 import splatjax as sj
 
-from ._outputs import check_output
-from ._report import stage, sweeps
-from ._shot import Shot, draw, frame_parts, towards
+from ._options import check_options, check_output
+from ._report import stage
+from ._view import ViewOptions, draw
 
 
 @dataclass(frozen=True, kw_only=True)
-class Render(Shot):
+class Render(ViewOptions):
     """Render splats, or the built-in bust: an EXR file with every layer, and a PNG file beside it.
 
     They stand under a light and a weak fill. The camera looks at the middle of the splats from far
@@ -37,41 +37,41 @@ class Render(Shot):
         """Load, render, write."""
         check_output(self.output, (".exr",))
         self.check()
-        if self.stream:
-            self._run_streamed()
-            return
-        splats, material = self.load()
-        lights = self.lights(material.gaussians.weights.shape[1], self.azimuth, self.light_azimuth)
-        scene, camera = sj.Scene(splats, lights, material), self.camera(splats, self.azimuth)
-        with stage("planning"):
-            plan = sj.plan(scene, camera)
-        with stage(f"rendering {splats.count} splats at {self.width} x {self.height}"):
-            frame = draw(scene, camera, plan)
-        self._write(frame, material)
-
-    def _run_streamed(self) -> None:
-        if self.splats is None or self.stream < 0:
-            raise ValueError(
-                f"--stream is {self.stream}; it is a number of splats of a PLY file, which must be "
-                "named"
-            )
-        file = sj.SplatFile(self.splats, self.stream, up=self.up)
-
-        def parts() -> Iterator[sj.Splats]:
-            return map(self.as_shown, file())
-
-        with stage(f"looking at {file.count} splats"):
-            camera = frame_parts(
-                parts, towards(self.azimuth, self.elevation), self.fov, self.width, self.height
-            )
-        material = self.material_for(next(parts()), sj.load_material(self.material))
-        lights = self.lights(material.gaussians.weights.shape[1], self.azimuth, self.light_azimuth)
-        with sweeps(file.count) as report:
-            frame = sj.render_streamed(parts, lights, material, camera, report=report)
-        self._write(frame, material)
-
-    def _write(self, frame: sj.Frame, material: sj.Material) -> None:
-        self.say_what_was_handed_over(frame, material)
+        is_valid = self.stream == 0 or (self.stream > 0 and self.splats is not None)
+        expected = "be a number of splats of a PLY file, which must be named"
+        check_options(self, {"stream": (is_valid, expected)})
+        file = None
+        if self.splats and self.stream:
+            file = sj.SplatFile(self.splats, self.stream, up=self.up)
+        frame, material = self._at_once() if file is None else self._streamed(file)
+        self.note_unresolved_layers(frame, material)
         with stage(f"writing {self.output} and {self.output.with_suffix('.png')}"):
             written = self.write(self.output, frame, material)
         print(*written, sep="\n")
+
+    def _at_once(self) -> tuple[sj.Frame, sj.Material]:
+        splats, material = self.load()
+        camera = self.camera(lambda: [splats], self.azimuth)
+        lights = self.lights(material, self.azimuth, self.light_azimuth)
+        scene = sj.Scene(splats, lights, material)
+        with stage("planning"):
+            plan = sj.make_plan(scene, camera)
+        with stage(f"rendering {splats.count} splats at {self.width} x {self.height}"):
+            return draw(scene, camera, plan), material
+
+    def _streamed(self, file: sj.SplatFile) -> tuple[sj.Frame, sj.Material]:
+        material = self.displayable_material()
+
+        def parts() -> Iterable[sj.Splats]:
+            return map(self.adjusted, file())
+
+        with stage(f"looking at {file.count} splats"):
+            camera = self.camera(parts, self.azimuth)
+        first = next(iter(parts()))
+        material = self.material_for(first, material)
+        lights = self.lights(material, self.azimuth, self.light_azimuth)
+        with stage("rendering the stream", file.count) as report:
+            frame = sj.render_streamed(
+                parts, lights, material, camera, report=lambda what, done: report(done, what)
+            )
+        return frame, material

@@ -1,76 +1,46 @@
-"""What a command says while it works: on stderr, so that its results on stdout stay clean."""
+"""Messages of a command while it works: on stderr, so that its results on stdout stay clean."""
 
 import contextlib
 import time
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Sequence
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-
-def _console() -> Console:
-    return Console(stderr=True, highlight=False, soft_wrap=True)
-
-
-@contextlib.contextmanager
-def stage(what: str) -> Generator[None, None, None]:
-    """Show that something is being done, and afterwards how long it took."""
-    console = _console()
-    begin = time.perf_counter()
-    with console.status(what):
-        yield
-    console.print(f"{what}: {time.perf_counter() - begin:.1f} s", markup=False)
+_CONSOLE = Console(stderr=True, highlight=False, soft_wrap=True)
 
 
 def note(what: str) -> None:
-    """Say something the user should know."""
-    _console().print(what, markup=False)
+    """Print something the user should know."""
+    _CONSOLE.print(what, markup=False)
 
 
 @contextlib.contextmanager
-def sweeps(total: int) -> Generator[Callable[[str, int], None], None, None]:
-    """Show what is being done, with how much of a total. Gives what is to be told so; where nobody
-    looks, each is a line.
-    """
-    console, begin = _console(), time.perf_counter()
-    with console.status("looking") as status:
+def stage(what: str, total: int = 0) -> Generator[Callable[..., None]]:
+    """Show that something is being done, and afterwards how long it took.
 
-        def report(what: str, done: int) -> None:
-            status.update(f"{what}: {done} of {total}")
-            if done == total:
-                console.print(
-                    f"{what}: {total} splats, {time.perf_counter() - begin:.1f} s since the "
-                    "beginning",
-                    markup=False,
-                )
+    Yields the function to call with the steps done of a total, and with what is being done where
+    that changes. Where stderr is no terminal, it prints a line at most once a second.
+    """
+    begin = last = time.perf_counter()
+    with _CONSOLE.status(what) as status:
+
+        def report(done: int, what: str = what) -> None:
+            nonlocal last
+            now = time.perf_counter()
+            left = (now - begin) / done * (total - done)
+            line = f"{what}: {done} of {total}, {left:.0f} s left"
+            status.update(line)
+            if not _CONSOLE.is_terminal and (done == total or now > last + 1):
+                last = now
+                note(line)
 
         yield report
+    note(f"{what}: {time.perf_counter() - begin:.1f} s")
 
 
-@contextlib.contextmanager
-def progress(what: str, total: int) -> Generator[Callable[[], None], None, None]:
-    """Show how many of equal steps are done, what one takes, and the time that is left. Gives what
-    is to be called after each.
-
-    Where nobody looks at a terminal, a line is printed for each.
-    """
-    console, begin, done = _console(), time.perf_counter(), 0
-
-    def step() -> str:
-        nonlocal begin, done
-        begin, before, done = time.perf_counter(), begin, done + 1
-        return f"{begin - before:.1f} s"
-
-    if not console.is_terminal:
-        yield lambda: console.print(f"{what}: {done + 1} of {total}, {step()}", markup=False)
-        return
-    columns = (
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[took]}"),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=console) as bar:
-        task = bar.add_task(what, total=total, took="")
-        yield lambda: bar.update(task, advance=1, took=step())
+def print_table(rows: Sequence[Sequence[str]]) -> None:
+    """Print rows on stdout, their columns aligned."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
+        cells = [cell.ljust(width) for cell, width in zip(row, widths, strict=True)]
+        print("  ".join(cells).rstrip())

@@ -9,8 +9,7 @@ import tyro
 import splatjax as sj
 
 from ._mesh_maps import MeshMaps
-from ._options import UpAxis
-from ._outputs import check_output
+from ._options import UpAxis, check_output
 from ._report import note, stage
 
 

@@ -2,71 +2,82 @@
 derivative.
 """
 
-from collections.abc import Sequence
-
-import jax
 import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float
 
-from splatjax.scene import Splats
-from splatjax.splatting import Atlas
+from splatjax._chunking import map_chunks
+from splatjax._combination import AbstractCombination
 
-from ._diffuser import AbstractDiffuser, Diffused, Kernels, Sources
+from ._diffuser import (
+    AbstractDiffuser,
+    AbstractDiffusionPlan,
+    Diffused,
+    LayerValues,
+    Sources,
+    layer_values,
+    split_layer,
+)
+from ._kernel import AbstractDiffusionKernel
+
+_AT_ONCE = 64  # points
 
 
 class DenseDiffuser(AbstractDiffuser):
-    """Sums over every splat at every point, a tile of points at a time. Slow and plain."""
+    """Sums over every splat at every splat. Slow and plain."""
 
-    def planned(
-        self,
-        splats: Splats,
-        kernels: Kernels,
-        interval: Float[Array, "2"],
-        atlases: Sequence[Atlas],
-    ) -> "DenseDiffuser":
-        return self
+    def make_plan(self, parts, variances, kernel, interval):
+        return DensePlan()
+
+
+class DensePlan(AbstractDiffusionPlan):
+    """What the plain diffuser needs to know: nothing."""
 
     def diffuse(
         self,
         sources: Sources,
-        kernels: Kernels,
-        points: Float[Array, "tiles 3 points"],
-        covered: Bool[Array, "tiles points"],
-        atlas: Atlas,
+        variances: Float[Array, " gaussians"],
+        kernel: AbstractDiffusionKernel,
+        combination: AbstractCombination,
+        wanted: Bool[Array, " splats"] | None = None,
     ) -> Diffused:
-        def of_tile(tile):
-            points, covered = tile
+        everywhere = combination.gather_last(sources)
+        layers = tuple(
+            dense_layer(everywhere, sources.centers, variance, depth)
+            for variance, depth in zip(variances, kernel.depths(variances), strict=True)
+        )
+        return Diffused(layers, jnp.zeros((), sources.centers.dtype))
 
-            def layer(kernel):
-                variance, depth = kernel
-                offset = points[:, :, None] - (sources.centers - depth * sources.normals)[:, None]
-                squared = jnp.sum(offset * offset, axis=0)
-                # The mean does not change when both sums are scaled: the nearest source's exponent
-                # becomes zero.
-                nearest = stop_gradient(jnp.min(squared, axis=1, keepdims=True))
-                weight = sources.areas[None] * jnp.exp(-0.5 * (squared - nearest) / variance)
-                gathered = jnp.sum(weight, axis=1)
-                # What a flat sheet gathers is one exit; far from everything this underflows,
-                # cleanly.
-                scale = jnp.exp(-0.5 * (nearest[:, 0] - depth * depth) / variance) / (
-                    2 * jnp.pi * variance
-                )
-                means = (sources.irradiance @ weight.T) / gathered[None]
-                return jnp.concatenate([means, (gathered * scale)[None]])
-
-            found = jax.lax.map(layer, (kernels.variances, kernels.depths))
-            return jnp.where(covered[None, None], found, 0.0)
-
-        channels, gaussians = sources.irradiance.shape[0], kernels.variances.shape[0]
-        none, carried = jnp.zeros((), points.dtype), jnp.ones(gaussians, points.dtype)
-        if sources.areas.shape[0] == 0:
-            found = jnp.zeros(
-                (covered.shape[0], gaussians, channels + 1, covered.shape[1]), points.dtype
-            )
-        else:
-            found = jax.lax.map(of_tile, (points, covered))
-        return Diffused(found[:, :, :channels], found[:, :, channels], carried, none)
-
-    def in_forward_mode(self) -> "DenseDiffuser":
+    def in_forward_mode(self) -> "DensePlan":
         return self
+
+
+def dense_layer(
+    sources: Sources,
+    points: Float[Array, "3 points"],
+    variance: Float[Array, ""],
+    depth: Float[Array, ""],
+) -> LayerValues:
+    """Evaluate one layer at any points, untruncated."""
+    below = sources.centers - depth * sources.normals
+
+    def evaluate(points: Float[Array, "points 3"]) -> Float[Array, "points rows"]:
+        offset = points.T[:, :, None] - below[:, None]
+        squared = jnp.sum(offset * offset, axis=0)
+        # The mean does not change when all sums are scaled: the nearest source's exponent is zero.
+        nearest = stop_gradient(jnp.min(squared, axis=1, keepdims=True))
+        weight = sources.areas[None] * jnp.exp(-0.5 * (squared - nearest) / variance)
+        light = jnp.concatenate([sources.irradiance, jnp.ones_like(sources.areas)[None]])
+        sums = light @ weight.T
+        firsts = jnp.einsum("cs,as,ps->cap", light, below, weight)
+        rows = layer_values(sums, firsts, points.T)
+        # A flat sheet has mass 1; far from everything this underflows, cleanly.
+        flat = jnp.exp(-0.5 * (nearest[:, 0] - depth * depth) / variance) / (2 * jnp.pi * variance)
+        of_mass = jnp.zeros((len(light), 4), bool).at[-1].set(True)
+        of_mass = jnp.concatenate([of_mass[:, 0], of_mass[:, 1:].reshape(-1)])
+        return (rows * jnp.where(of_mass[:, None], flat[None], 1.0)).T
+
+    if sources.areas.shape[0] == 0 or points.shape[1] == 0:
+        shape = 4 * (sources.irradiance.shape[0] + 1), points.shape[1]
+        return split_layer(jnp.zeros(shape, points.dtype), variance)
+    return split_layer(map_chunks(evaluate, points.T, at_once=_AT_ONCE).T, variance)

@@ -1,18 +1,16 @@
-"""What a diffuser does, whichever way: the diffusion integral of every layer at surface points
-(pass 4, section 4.2).
-"""
+"""The diffusion integral of every layer at points of the surface (pass 4, section 4.2)."""
 
 import abc
-from collections.abc import Sequence
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from splatjax._combination import AbstractCombination
 from splatjax.scene import Splats
-from splatjax.splatting import Atlas
 
-from ._normalization import AbstractNormalization
+from ._kernel import AbstractDiffusionKernel
 
 
 class Sources(eqx.Module):
@@ -24,99 +22,144 @@ class Sources(eqx.Module):
     irradiance: Float[Array, "channels splats"]
 
 
-class Kernels(eqx.Module):
-    """How the layers spread light: variances (mm^2), and how far below its splat each layer's
-    source lies (mm).
+class LayerValues(eqx.Module):
+    """One layer at some points.
+
+    **Attributes:**
+
+    - `values`: of each channel the weighted mean of the irradiance around, which keeps constants,
+      lies between the least and the greatest irradiance, and is linear in it; and last the mass of
+      the kernel on the surface, 1 on a flat sheet.
+    - `slopes`: of the values in space, 1/mm.
     """
 
-    variances: Float[Array, " gaussians"]
-    depths: Float[Array, " gaussians"]
+    values: Float[Array, "values points"]
+    slopes: Float[Array, "values 3 points"]
 
-    @classmethod
-    def of(
-        cls, variances: Float[Array, " gaussians"], normalization: AbstractNormalization
-    ) -> "Kernels":
-        """Give the kernels of layers as a normalization places their sources."""
-        return cls(variances, normalization.depths(variances))
+    @property
+    def means(self) -> Float[Array, "channels points"]:
+        return self.values[:-1]
+
+    @property
+    def mass(self) -> Float[Array, " points"]:
+        return self.values[-1]
 
 
 class Diffused(eqx.Module):
-    """The diffusion integrals, and what capacity they needed over what was planned."""
+    """The layers on the splats.
 
-    means: Float[Array, "tiles gaussians channels points"]
-    exits: Float[Array, "tiles gaussians points"]
-    carried: Float[Array, " gaussians"]
-    """1, or 0 for a layer that was not evaluated, being too narrow for nearly all splats."""
+    **Attributes:**
+
+    - `layers`: `None` for a layer that is too narrow for nearly all splats.
+    - `needed`: capacity needed over planned; above 1 the values are incomplete.
+    """
+
+    layers: tuple[LayerValues | None, ...]
     needed: Float[Array, ""]
 
 
-class AbstractDiffuser(eqx.Module):
-    r"""The diffusion integral at surface points `x`, over all splats near `x` in object space,
-    whichever way they face:
-
-        mean_k(x) = sum_j A_j G(v_k, |x - q_j|) E_j / sum_j A_j G(v_k, |x - q_j|),   q_j = p_j -
-        depth_k n_j
-
-    The mean keeps constants, lies between the least and the greatest E, and is linear in E. `exits`
-    is the denominator over what it is on a flat sheet, `exp(-depth_k^2 / 2 v_k)`.
-    """
-
-    @abc.abstractmethod
-    def planned(
-        self,
-        splats: Splats,
-        kernels: Kernels,
-        interval: Float[Array, "2"],
-        atlases: Sequence[Atlas],
-    ) -> "AbstractDiffuser":
-        """Give a diffuser with room for these splats, kernels and pictures; `interval` tells which
-        layers are handed over.
-        """
+class AbstractDiffusionPlan(eqx.Module):
+    """A diffuser with everything that one geometry needs."""
 
     @abc.abstractmethod
     def diffuse(
         self,
         sources: Sources,
-        kernels: Kernels,
-        points: Float[Array, "tiles 3 points"],
-        covered: Bool[Array, "tiles points"],
-        atlas: Atlas,
+        variances: Float[Array, " gaussians"],
+        kernel: AbstractDiffusionKernel,
+        combination: AbstractCombination,
+        wanted: Bool[Array, " splats"] | None = None,
     ) -> Diffused:
-        """Evaluate every layer at the covered points that the tiles of an atlas show; 0
-        elsewhere.
+        r"""Evaluate every layer at the splats, from all splats near each in object space, whichever
+        way they face:
+
+            mean_k(x) = sum_j A_j G(v_k, |x - q_j|) E_j / sum_j A_j G(v_k, |x - q_j|)
+
+        **Arguments:**
+
+        - `sources`: in the order of the plan. Differentiable.
+        - `variances`: mm^2. Differentiable.
+        - `combination`: of the parts of the splats that several devices hold.
+        - `wanted`: the splats whose layers will be looked at; all for `None`.
         """
+
+    def shares(self) -> tuple[Array, ...]:
+        """Return the arrays of which every device has a share, along their first axis."""
+        return ()
 
     @abc.abstractmethod
-    def in_forward_mode(self) -> "AbstractDiffuser":
-        """Give a diffuser of the same values that has forward mode in the kernels; it may have no
-        reverse mode.
+    def in_forward_mode(self) -> "AbstractDiffusionPlan":
+        """Return a plan with the same values that has forward mode in the variances; it may have
+        no reverse mode.
         """
 
 
-def diffuse_with_slopes(
-    diffuser: AbstractDiffuser,
+class AbstractDiffuser(eqx.Module):
+    """A way to evaluate the diffusion integral; a setting."""
+
+    @abc.abstractmethod
+    def make_plan(
+        self,
+        parts: list[Splats],
+        variances: Float[Array, " gaussians"],
+        kernel: AbstractDiffusionKernel,
+        interval: Float[Array, "2"],
+    ) -> AbstractDiffusionPlan:
+        """Find what evaluating these variances on this geometry needs. Not for traced arrays.
+
+        **Arguments:**
+
+        - `parts`: the splats, each part in the compact order in which they will be diffused;
+          several parts where several devices hold them.
+        - `interval`: from `AbstractDiffusionKernel.interval`.
+        """
+
+
+def diffuse_with_derivative(
+    plan: AbstractDiffusionPlan,
     sources: Sources,
     variances: Float[Array, " gaussians"],
-    normalization: AbstractNormalization,
-    points: Float[Array, "tiles 3 points"],
-    covered: Bool[Array, "tiles points"],
-    atlas: Atlas,
-    direction: Float[Array, " gaussians"],
+    kernel: AbstractDiffusionKernel,
+    combination: AbstractCombination,
+    wanted: Bool[Array, " splats"] | None = None,
 ) -> tuple[Diffused, Diffused]:
-    """Diffuse, and differentiate in the variances: each layer gathers by its own alone, so one
-    direction holds them all.
+    """Diffuse, and differentiate each layer in the logarithm of its own variance.
 
-    **Arguments:** as in `AbstractDiffuser.diffuse`.
-
-    - `direction`: by how much each variance moves, mm^2.
-
-    **Returns:** the integrals, and what each does per unit of `direction`.
+    Each layer depends on its own variance alone, so one direction holds all derivatives.
     """
-    forward = diffuser.in_forward_mode()
+    forward = plan.in_forward_mode()
 
     def diffuse(variances):
-        return forward.diffuse(
-            sources, Kernels.of(variances, normalization), points, covered, atlas
-        )
+        return forward.diffuse(sources, variances, kernel, combination, wanted)
 
-    return jax.jvp(diffuse, (variances,), (direction,))
+    return jax.jvp(diffuse, (variances,), (variances,))
+
+
+def layer_values(
+    light: Float[Array, "values points"],
+    firsts: Float[Array, "values 3 points"],
+    points: Float[Array, "3 points"],
+) -> Float[Array, "_ points"]:
+    r"""Divide the sums of one layer: rows of means, mass, and the slopes of both times the
+    variance; all 0 where nothing is in reach.
+
+    **Arguments:**
+
+    - `light`: `sum_j m_j w_j E_j` of each channel, and last `sum_j m_j w_j`.
+    - `firsts`: the same sums times the sources' places `q_j`.
+    """
+    mass = light[-1]
+    reached = mass > 0
+    inverse = 1 / jnp.where(reached, mass, 1.0)
+    means = light[:-1] * inverse[None]
+    # grad N = sum w E (q - x) / v, and grad (N / D) = (grad N - (N / D) grad D) / D.
+    pulls = firsts - light[:, None] * points[None]
+    slopes = (pulls[:-1] - means[:, None] * pulls[-1:]) * inverse[None, None]
+    slopes = jnp.concatenate([slopes, pulls[-1:]]).reshape(-1, mass.shape[0])
+    return jnp.where(reached[None], jnp.concatenate([means, mass[None], slopes]), 0.0)
+
+
+def split_layer(rows: Float[Array, "rows points"], variance: Float[Array, ""]) -> LayerValues:
+    """Split the rows that `layer_values` stacks."""
+    values = rows.shape[0] // 4
+    return LayerValues(rows[:values], rows[values:].reshape(values, 3, -1) / variance)

@@ -3,11 +3,9 @@ the weights.
 
 Every block of points has a list of the blocks of sources near it. Some blocks of points, one per
 *lane*, are swept together; in a *step* each lane meets the next few blocks of its list. Tables hold
-center, rate, and what is summed, one block of sources after the other.
+center, rate and the summed rows, one block of sources after the other.
 """
 
-import abc
-import math
 from collections.abc import Callable
 from functools import partial
 
@@ -15,91 +13,62 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
-from splatjax.pointwise import zeros_after
+from splatjax._chunking import zeros_after
 
-_FADING = 0.5  # of the exponent, before its largest
+from ._kernel import TruncatedGaussian
+
+FAR = -1e6  # mm from anything, yet with a square that float32 holds
 
 
 class Steps(eqx.Module):
-    """Which blocks of sources the blocks of points meet. Not differentiated."""
+    """Which blocks of sources the blocks of points meet. Not differentiated.
 
-    ids: Int[Array, "steps lanes slots"]
-    """Blocks of sources; the number of blocks, which is no block, in an empty slot."""
-    begins: Int[Array, " sweeps"]
-    """Of each sweep, its first step."""
-    ends: Int[Array, " sweeps"]
-    order: Int[Array, " points_blocks"]
-    """The block of points of each lane, sweep after sweep; one that holds no point may stand for
-    several.
+    **Attributes:**
+
+    - `ids`: blocks of sources; the number of blocks, whose block is empty, in an empty slot.
+    - `begins`, `ends`: the steps of each sweep.
+    - `order`: the block of points of each lane, sweep after sweep.
     """
 
+    ids: Int[Array, "steps lanes slots"]
+    begins: Int[Array, " sweeps"]
+    ends: Int[Array, " sweeps"]
+    order: Int[Array, " points_blocks"]
+
     def lanes(self, sweep: Int[Array, ""]) -> Int[Array, " lanes"]:
+        """Return the blocks of points of one sweep."""
         lanes = self.ids.shape[1]
         return lax.dynamic_slice_in_dim(self.order, sweep * lanes, lanes)
 
-
-class AbstractKernel(eqx.Module):
-    """What stands for `exp(-exponent)`. It comes down to zero at a largest exponent: of a step
-    there is no derivative.
-    """
-
-    @abc.abstractmethod
-    def __call__(
-        self, exponent: Float[Array, "..."]
-    ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-        """Give the weight, and minus its derivative in the exponent."""
+    def only(self, wanted: Bool[Array, " points"], block: int) -> "Steps":
+        """Leave out the sweeps none of whose points is wanted."""
+        blocks = jnp.any(wanted.reshape(-1, block), axis=1)
+        blocks = jnp.pad(blocks, (0, self.order.shape[0] - blocks.shape[0]))
+        sweeps = jnp.any(blocks[self.order].reshape(len(self.begins), -1), axis=1)
+        return Steps(self.ids, self.begins, jnp.where(sweeps, self.ends, self.begins), self.order)
 
 
-class FadedGaussian(AbstractKernel):
-    """A Gaussian that fades linearly in the last of its exponents. Static."""
-
-    largest: float = eqx.field(static=True)
-
-    def __call__(self, exponent):
-        gaussian = jnp.exp(-exponent)
-        left = jnp.clip((self.largest - exponent) / _FADING, 0, 1)
-        weight = gaussian * left
-        return weight, weight + jnp.where((left > 0) & (left < 1), gaussian / _FADING, 0.0)
-
-
-class TaperedGaussian(AbstractKernel):
-    """A Gaussian less its tangent at the rim. Static."""
-
-    largest: float = eqx.field(static=True)
-
-    def __call__(self, exponent):
-        rim = math.exp(-self.largest)
-        inside, gaussian = exponent < self.largest, jnp.exp(-exponent)
-        weight = gaussian - rim * (1 + self.largest - exponent)
-        return jnp.where(inside, weight, 0.0), jnp.where(inside, gaussian - rim, 0.0)
-
-
-def faded(support: float) -> FadedGaussian:
-    """A Gaussian that comes down to zero at so many standard deviations: itself but for the rim."""
-    return FadedGaussian(0.5 * support * support)
-
-
-def tapered(support: float) -> TaperedGaussian:
-    """A Gaussian that comes down to zero, with its derivative, at so many standard deviations."""
-    return TaperedGaussian(0.5 * support * support)
+def identity(
+    sums: Float[Array, "rows points"], points: Float[Array, "3 points"]
+) -> Float[Array, "rows points"]:
+    """Return the sums themselves."""
+    return sums
 
 
 class _Rule(eqx.Module):
-    """What is common to all sweeps. Static."""
+    """What all sweeps share. Static."""
 
-    kernel: AbstractKernel
+    kernel: TruncatedGaussian
     finish: Callable = eqx.field(static=True)
 
-    def finished(
-        self, sums: Float[Array, "lanes rows points"], points: Float[Array, "lanes 3 points"]
-    ):
+    def finished(self, sums: Float[Array, "lanes rows points"], points):
         return jax.vmap(self.finish)(sums, points)
 
     def weights(self, points, sources):
-        """Give the weights, `[lanes, sources, points]`, how they fall with the exponent, offsets
-        and squared distances.
+        """Compute weights `[lanes, sources, points]`, minus their derivatives in the exponent,
+        offsets and squared distances.
         """
         dx, dy, dz = (points[:, axis, None] - sources[:, axis, :, None] for axis in range(3))
         squared = dx * dx + dy * dy + dz * dz
@@ -117,13 +86,22 @@ class _Rule(eqx.Module):
         return lax.fori_loop(steps.begins[sweep], steps.ends[sweep], add, start)
 
 
+def points_blocks(
+    points: Float[Array, "3 points"], steps: Steps, block: int
+) -> Float[Array, "points_blocks 3 block"]:
+    """Cut points into blocks; those that fill the last sweep lie far from everything."""
+    blocks = points.reshape(3, -1, block).transpose(1, 0, 2)
+    spare = steps.order.shape[0] - blocks.shape[0]
+    return jnp.pad(blocks, ((0, spare), (0, 0), (0, 0)), constant_values=FAR)
+
+
 def source_table(
     centers: Float[Array, "3 sources"],
     rates: Float[Array, " sources"],
     rows: Float[Array, "rows sources"],
     block: int,
 ) -> Float[Array, "blocks_and_one columns block"]:
-    """Give the table of sources, `block` of them to a block; the last block is empty."""
+    """Lay out sources, `block` of them to a block; the last block is empty."""
     columns = jnp.concatenate([centers, rates[None], rows])
     return jnp.pad(
         columns.reshape(columns.shape[0], -1, block).transpose(1, 0, 2), ((0, 1), (0, 0), (0, 0))
@@ -131,16 +109,16 @@ def source_table(
 
 
 def _met(table, steps: Steps, step):
-    """Give the sources that each lane meets in a step, `[lanes, columns, sources]`, and their
+    """Read the sources that each lane meets in a step, `[lanes, columns, sources]`, and their
     blocks.
     """
     ids = lax.dynamic_index_in_dim(steps.ids, step, 0, keepdims=False)
-    found = table.at[ids].get(mode="promise_in_bounds")
-    return jnp.moveaxis(found, 1, 2).reshape(ids.shape[0], table.shape[1], -1), ids
+    sources = jnp.moveaxis(table.at[ids].get(mode="promise_in_bounds"), 1, 2)
+    return sources.reshape(ids.shape[0], table.shape[1], -1), ids
 
 
 def _swept(steps: Steps, sweep: Callable, out):
-    """Let all sweeps write what they found for their points."""
+    """Let every sweep write the values of its points."""
 
     def write(i, out):
         lanes = steps.lanes(i)
@@ -161,15 +139,13 @@ def _empty(rule: _Rule, points, table):
     sums = jax.ShapeDtypeStruct(
         (points.shape[0], table.shape[1] - 4, points.shape[2]), points.dtype
     )
-    found = jax.eval_shape(rule.finished, sums, points)
-    return zeros_after(table, found.shape, found.dtype)
+    values = jax.eval_shape(rule.finished, sums, points)
+    return zeros_after(table, values.shape, values.dtype)
 
 
 def _derivative(rule: _Rule, steps: Steps, points, table, d_table):
-    """Give what was found, and how it changes with the table; one look at each weight serves
-    both.
-    """
-    count = table.shape[1] - 4
+    """Compute values and their derivative along `d_table` from one evaluation of the weights."""
+    rows = table.shape[1] - 4
 
     def sweep(i, lanes):
         here = points.at[lanes].get(mode="promise_in_bounds")
@@ -181,17 +157,15 @@ def _derivative(rule: _Rule, steps: Steps, points, table, d_table):
             d_weights = falls * (
                 2 * sources[:, 3, :, None] * nearer - moved[:, 3, :, None] * squared
             )
-            both = jnp.einsum(
-                "lrs,lsp->lrp", jnp.concatenate([sources[:, 4:], moved[:, 4:]], axis=1), weights
-            )
-            return sums + both.at[:, count:].add(
-                jnp.einsum("lrs,lsp->lrp", sources[:, 4:], d_weights)
-            )
+            both = jnp.concatenate([sources[:, 4:], moved[:, 4:]], axis=1)
+            both = jnp.einsum("lrs,lsp->lrp", both, weights)
+            moving = jnp.einsum("lrs,lsp->lrp", sources[:, 4:], d_weights)
+            return sums + both.at[:, rows:].add(moving)
 
-        start = jnp.zeros((here.shape[0], 2 * count, here.shape[2]), here.dtype)
+        start = jnp.zeros((here.shape[0], 2 * rows, here.shape[2]), here.dtype)
         sums = lax.fori_loop(steps.begins[i], steps.ends[i], add, start)
         values, slopes = jax.jvp(
-            lambda sums: rule.finished(sums, here), (sums[:, :count],), (sums[:, count:],)
+            lambda sums: rule.finished(sums, here), (sums[:, :rows],), (sums[:, rows:],)
         )
         return jnp.concatenate([values, slopes], axis=1)
 
@@ -204,23 +178,21 @@ def _backward(rule: _Rule, steps: Steps, points, table, sums, cotangents):
     def sweep(i, carry):
         d_points, d_table = carry
         lanes = steps.lanes(i)
-        here, found, cotangent = (
+        here, total, cotangent = (
             each.at[lanes].get(mode="promise_in_bounds") for each in (points, sums, cotangents)
         )
-        _, pull = jax.vjp(rule.finished, found, here)
+        _, pull = jax.vjp(rule.finished, total, here)
         cotangent, d_finish = pull(cotangent)
 
         def add(step, carry):
             d_here, d_table = carry
             sources, ids = _met(table, steps, step)
             weights, falls, _, _ = rule.weights(here, sources)
-            # What an exponent's cotangent is multiplied by is a polynomial in point and source,
-            # seen from one of the sources: its moments over the points, and over the sources, are
-            # all that is needed.
+            # The factor of an exponent's cotangent is a polynomial in point and source, seen from
+            # one of the sources: its moments over the points and over the sources suffice.
             origin = sources[:, :3, :1]
             x, y, rate = here - origin, sources[:, :3] - origin, sources[:, 3:4]
-            # written out, so that it is done where the weights are: half the time of a product of
-            # matrices
+            # Written out, so that it is fused with the weights: half the time of a matrix product.
             pairs = zip(
                 jnp.unstack(sources[:, 4:], axis=1), jnp.unstack(cotangent, axis=1), strict=True
             )
@@ -235,8 +207,8 @@ def _backward(rule: _Rule, steps: Steps, points, table, sums, cotangents):
             d_rates = -squared - jnp.sum(y * y, axis=1, keepdims=True) * moments[:, :1]
             toward = jnp.einsum("lks,lsp->lkp", jnp.concatenate([rate, rate * y], axis=1), pulls)
             part = jnp.concatenate([d_centers, d_rates, d_rows], axis=1)
-            part = jnp.moveaxis(part.reshape(part.shape[0], part.shape[1], ids.shape[1], -1), 2, 1)
-            d_table = d_table.at[ids].add(part, mode="promise_in_bounds")
+            part = part.reshape(part.shape[0], part.shape[1], ids.shape[1], -1)
+            d_table = d_table.at[ids].add(jnp.moveaxis(part, 2, 1), mode="promise_in_bounds")
             return d_here - 2 * (x * toward[:, :1] - toward[:, 1:]), d_table
 
         d_here, d_table = lax.fori_loop(steps.begins[i], steps.ends[i], add, (d_finish, d_table))
@@ -252,7 +224,7 @@ def _sums(rule: _Rule, steps: Steps, points, table):
 
 
 def _sums_fwd(rule: _Rule, steps: Steps, points, table):
-    sums = _forward(_Rule(rule.kernel, as_they_are), steps, points, table)
+    sums = _forward(_Rule(rule.kernel, identity), steps, points, table)
     return rule.finished(sums, points), (steps, points, table, sums)
 
 
@@ -277,23 +249,21 @@ def gaussian_sums(
     points: Float[Array, "points_blocks 3 points"],
     table: Float[Array, "blocks_and_one columns block"],
     steps: Steps,
-    kernel: AbstractKernel,
+    kernel: TruncatedGaussian,
     finish: Callable[
         [Float[Array, "rows points"], Float[Array, "3 points"]], Float[Array, "values points"]
     ],
 ) -> Float[Array, "points_blocks values points"]:
-    r"""Give what follows at every point from `sum_j rows_j exp(-rate_j |x - p_j|^2)`, over the
-    blocks of sources it meets.
+    r"""Sum `rows_j exp(-rate_j |x - p_j|^2)` over the blocks of sources that every point meets.
 
     **Arguments:**
 
-    - `points`: `x`, mm; points that do not count may lie far away. Differentiable.
+    - `points`: `x`, mm, from `points_blocks`. Differentiable.
     - `table`: from `source_table`: `p_j` (mm), `rate_j` (1/mm^2) and `rows_j`. Differentiable.
-    - `kernel`: what stands for `exp`; terms beyond its rim are left out, whatever the lists hold.
-      Static.
-    - `finish`: makes values of sums and points. Static.
+    - `kernel`: stands for `exp`; terms beyond its rim vanish, whatever the lists hold. Static.
+    - `finish`: computes values from sums and points. Static.
 
-    **Returns:** 0 for blocks of points that no sweep visits.
+    **Returns:** the values; 0 for blocks of points that no sweep visits.
     """
     return _sums(_Rule(kernel, finish), steps, points, table)
 
@@ -302,19 +272,12 @@ def gaussian_sums_forward(
     points: Float[Array, "points_blocks 3 points"],
     table: Float[Array, "blocks_and_one columns block"],
     steps: Steps,
-    kernel: AbstractKernel,
+    kernel: TruncatedGaussian,
     finish: Callable[
         [Float[Array, "rows points"], Float[Array, "3 points"]], Float[Array, "values points"]
     ],
 ) -> Float[Array, "points_blocks values points"]:
-    """Give what `gaussian_sums` gives, with forward mode in the table and not reverse mode; the
+    """Sum as `gaussian_sums` does, with forward mode in the table instead of reverse mode; the
     points are constants.
     """
     return _sums_forward(_Rule(kernel, finish), steps, lax.stop_gradient(points), table)
-
-
-def as_they_are(
-    sums: Float[Array, "rows points"], points: Float[Array, "3 points"]
-) -> Float[Array, "rows points"]:
-    """Finish with the sums themselves."""
-    return sums

@@ -1,92 +1,201 @@
-"""The layers of surface points, once the light around them is gathered: handover and gain, point by
-point.
-"""
+"""The layers at points of the surface, before and after it is known how much light each carries."""
+
+from collections.abc import Sequence
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
-from splatjax.scene import Material
+from splatjax.gaussians import SumOfGaussians
 
-from ._handover import resolved_share
-from ._normalization import AbstractNormalization
+from ._diffuser import LayerValues
+from ._kernel import AbstractDiffusionKernel, resolved_fraction
 
 
-class SeenSurface(eqx.Module):
-    """What the pixels see, with what pass 3 blended for the layers that the splats are too far
-    apart to carry.
+def continue_from_splats(layer: LayerValues, centers: Float[Array, "3 splats"]) -> LayerValues:
+    """Prepare one layer of the splats for blending (Eq. 1): half of each slope goes into the mean.
+
+    `continue_to_points` computes the layer at points from the blended rows.
+    """
+    at_origin = layer.values - 0.5 * jnp.sum(layer.slopes * centers[None], axis=1)
+    return LayerValues(at_origin, layer.slopes)
+
+
+def continue_to_points(
+    blended: LayerValues, centers: Float[Array, "3 points"], points: Float[Array, "3 points"]
+) -> Float[Array, "values points"]:
+    r"""Continue a blended layer to points of the surface.
+
+    Each splat is continued along half its slope: the full slope errs as much as none, with the
+    opposite sign, so that the error is of third order in the spacing. Splats lie unevenly around a
+    point; the other half of their mean slope, from their mean center, makes up for that:
+
+        L(x) = sum w_i (L_i + s_i (x - p_i) / 2) / W + (sum w_i s_i / W) (x - sum w_i p_i / W) / 2
+
+    **Arguments:**
+
+    - `blended`: from the rows of `continue_from_splats`.
+    - `centers`: blended centers of the splats, mm, from the same origin as `points`.
+    """
+    return blended.values + jnp.sum(blended.slopes * (points - 0.5 * centers)[None], axis=1)
+
+
+class LayersAtPoints(eqx.Module):
+    r"""The light that every layer brings to points of the surface, whatever the layers weigh.
+
+    Weights enter after this, point by point: no splat is looked at again, and derivatives of every
+    kind and order exist.
+
+    **Attributes:**
+
+    - `variances`: of the layers, mm^2.
+    - `means`, `mass`: of every layer; 0 for layers that no splat resolves.
+    - `resolvable`: 0 for such a layer, else 1.
+    - `irradiance`, `area`, `albedo`: of the surface itself; area per splat in mm^2.
+    - `interval`, `kernel`: from which width layers are resolved, and how they are normalized.
+    - `derivative`: of means and mass in the logarithm of the variance; `None` where it was not
+      asked for.
     """
 
-    points: Float[Array, "tiles 3 pixels"]
-    """mm."""
-    covered: Bool[Array, "tiles pixels"]
-    irradiance: Float[Array, "tiles channels pixels"]
-    area: Float[Array, "tiles pixels"]
-    """Of a splat, mm^2."""
-    albedo: Float[Array, "tiles channels pixels"]
-    """What colors the surface, besides the Gaussians' weights."""
-
-
-class Points(eqx.Module):
-    """All that makes the layers of surface points; points, and channels, do not know of each
-    other.
-    """
-
-    weights: Float[Array, "gaussians channels #tiles #pixels"]
-    variances: Float[Array, "gaussians #channels #tiles #pixels"]
-    means: Float[Array, "gaussians channels tiles pixels"]
-    exits: Float[Array, "gaussians #channels tiles pixels"]
-    carried: Float[Array, " gaussians"]
-    once: Float[Array, "channels 1 1"]
-    irradiance: Float[Array, "channels tiles pixels"]
-    """Of the surface itself."""
-    area: Float[Array, "tiles pixels"]
-    albedo: Float[Array, "channels tiles pixels"]
+    variances: Float[Array, " gaussians"]
+    means: Float[Array, "gaussians channels points"]
+    mass: Float[Array, "gaussians points"]
+    resolvable: Float[Array, " gaussians"]
+    irradiance: Float[Array, "channels points"]
+    area: Float[Array, " points"]
+    albedo: Float[Array, "channels points"]
+    interval: Float[Array, "2"]
+    kernel: AbstractDiffusionKernel
+    derivative: (
+        tuple[Float[Array, "gaussians channels points"], Float[Array, "gaussians points"]] | None
+    )
 
     @classmethod
-    def of(cls, material: Material, seen: SeenSurface, means, exits, carried) -> "Points":
-        """Give the points that the pixels see, with the integrals of `Diffused`."""
-        gaussians = material.gaussians
-        return cls(
-            weights=gaussians.weights[:, :, None, None],
-            variances=gaussians.variances[:, None, None, None],
-            means=means.transpose(1, 2, 0, 3),
-            exits=exits.transpose(1, 0, 2)[:, None],
-            carried=carried,
-            once=(material.total_reflectance() - gaussians.total_reflectance())[:, None, None],
-            irradiance=seen.irradiance.transpose(1, 0, 2),
-            area=jnp.where(seen.covered, seen.area, 1.0),
-            albedo=seen.albedo.transpose(1, 0, 2),
-        )
-
-    def per_channel(self) -> "Points":
-        """Give every pixel and channel numbers of its own, so that one derivative is that of
-        all.
-        """
-        own = [
-            jnp.broadcast_to(each, self.means.shape)
-            for each in (self.weights, self.variances, self.exits)
-        ]
-        return eqx.tree_at(lambda at: (at.weights, at.variances, at.exits), self, own)
-
-    def layers(
-        self,
+    def of(
+        cls,
+        variances: Float[Array, " gaussians"],
+        layers: Sequence[Float[Array, "values points"] | None],
+        derivative: Sequence[Float[Array, "values points"] | None] | None,
+        irradiance: Float[Array, "channels points"],
+        area: Float[Array, " points"],
+        albedo: Float[Array, "channels points"],
         interval: Float[Array, "2"],
-        normalization: AbstractNormalization,
-        order: Float[Array, " gaussians"],
-    ) -> tuple[
-        Float[Array, "gaussians channels tiles pixels"],
-        Float[Array, "gaussians #channels tiles pixels"],
-    ]:
-        resolved = (
-            resolved_share(self.variances, self.area[None, None], interval)
-            * self.carried[:, None, None, None]
+        kernel: AbstractDiffusionKernel,
+    ) -> "LayersAtPoints":
+        """Stack layers at points; `None` stands for one that no splat resolves.
+
+        **Arguments:**
+
+        - `layers`: means of the channels first, the mass last.
+        """
+        channels, points = irradiance.shape
+
+        def stacked(layers):
+            zero = jnp.zeros((channels + 1, points), area.dtype)
+            rows = [zero if layer is None else layer for layer in layers]
+            means = [each[:channels] for each in rows]
+            return (
+                jnp.stack(means) if means else jnp.zeros((0, *irradiance.shape), area.dtype),
+                jnp.stack([each[-1] for each in rows]) if rows else zero[:0],
+            )
+
+        means, mass = stacked(layers)
+        return cls(
+            variances=variances,
+            means=means,
+            mass=mass,
+            resolvable=jnp.asarray([layer is not None for layer in layers], area.dtype),
+            irradiance=irradiance,
+            area=area,
+            albedo=albedo,
+            interval=interval,
+            kernel=kernel,
+            derivative=None if derivative is None else stacked(derivative),
         )
-        resolved = jnp.where(self.exits > 0, resolved, 0.0)  # no splat within reach
+
+    def weigh(
+        self, gaussians: SumOfGaussians, single_scattering_albedo: Float[Array, " channels"]
+    ) -> tuple[Float[Array, "gaussians channels points"], Float[Array, "gaussians points"]]:
+        r"""Compute the layers `L_k` at every point, and how much of each is the diffusion integral.
+
+        The rest, where the splats are too far apart, is the surface's own irradiance. Constants are
+        kept, and `min E <= L_k <= max E`, where the gain of the kernel is 1: everywhere for
+        `PlainMean`; for `EscapeNormalization` on flat pieces and at open edges.
+
+        **Arguments:**
+
+        - `gaussians`: the weights tell the kernel how much light is absorbed; the layers are not
+          multiplied by them.
+        - `single_scattering_albedo`: the fraction that leaves a flat piece as single scattering.
+        """
+        layers, resolved = self._weigh(
+            gaussians.weights[:, :, None],
+            gaussians.variances[:, None, None],
+            gaussians.variances,
+            single_scattering_albedo,
+            self.means,
+            self.mass[:, None],
+        )
+        return layers, resolved[:, 0]
+
+    def _weigh(self, weights, variances, order, single_scattering_albedo, means, mass):
+        resolved = resolved_fraction(variances, self.area[None, None], self.interval)
+        resolved = jnp.where(mass > 0, resolved * self.resolvable[:, None, None], 0.0)
         own = self.irradiance[None]
-        # Splats too far apart to carry a layer do not count its exits either.
-        exits = 1 + resolved * (self.exits - 1)
-        means = own + resolved * (self.means - own)
-        return normalization.gain(
-            exits, order, self.weights * self.albedo[None], self.once * self.albedo
-        ) * means, resolved
+        # Splats too far apart to resolve a layer do not tell its mass either.
+        gain = self.kernel.gain(
+            1 + resolved * (mass - 1),
+            order,
+            weights * self.albedo[None],
+            single_scattering_albedo[:, None] * self.albedo,
+        )
+        return gain * (own + resolved * (means - own)), resolved
+
+    def exitance(self, gaussians: SumOfGaussians) -> Float[Array, "channels points"]:
+        """Compute the radiant exitance `sum_k w_k L_k` of a material without single scattering.
+        Differentiable in every mode.
+
+        **Arguments:**
+
+        - `gaussians`: with the derivative, their variances may be a little off those of the layers;
+          without it they do not matter.
+        """
+        variances, means, mass = self.variances, self.means, self.mass
+        if self.derivative is not None:
+            moved = jnp.log(gaussians.variances / variances)[:, None]
+            variances = gaussians.variances
+            means = means + moved[..., None] * self.derivative[0]
+            mass = jnp.maximum(mass + moved * self.derivative[1], 0)
+        weights = gaussians.weights[:, :, None]
+        none = jnp.zeros(weights.shape[1], weights.dtype)
+        layers, _ = self._weigh(
+            weights, variances[:, None, None], variances, none, means, mass[:, None]
+        )
+        return jnp.sum(weights * layers, axis=0)
+
+    def exitance_jacobian(
+        self, gaussians: SumOfGaussians, single_scattering_albedo: Float[Array, " channels"]
+    ) -> tuple[
+        Float[Array, "gaussians channels points"], Float[Array, "gaussians channels points"]
+    ]:
+        """Differentiate the radiant exitance of every point and channel in the weights of its
+        channel, and in the variances (1/mm^2). Needs the derivative.
+        """
+        assert self.derivative is not None
+        shape, variances = self.means.shape, gaussians.variances
+        # Every point and channel has numbers of its own, so that one derivative is that of all.
+        own = (gaussians.weights[:, :, None], variances[:, None, None], self.means)
+        own = tuple(jnp.broadcast_to(each, shape) for each in (*own, self.mass[:, None]))
+
+        def exitance(weights, own_variances, means, mass):
+            layers, _ = self._weigh(
+                weights, own_variances, variances, single_scattering_albedo, means, mass
+            )
+            return jnp.sum(weights * layers, axis=0)
+
+        total, pull = jax.vjp(exitance, *own)
+        of_weights, of_variances, of_means, of_mass = pull(jnp.ones_like(total))
+        means, mass = self.derivative
+        through = (of_means * means + of_mass * mass[:, None]) / variances[:, None, None]
+        return of_weights, of_variances + through

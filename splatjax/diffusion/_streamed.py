@@ -1,9 +1,10 @@
-"""Pass 4 with splats that come a part at a time: each part adds to what the pixels gather, and is
-forgotten.
+"""Pass 4 with splats that come a part at a time, at the points that the pixels see: each part adds
+to their sums, and is forgotten.
 """
 
 import dataclasses
 import math
+from collections.abc import Iterable, Iterator
 
 import equinox as eqx
 import jax
@@ -11,201 +12,149 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from splatjax.scene import Splats
-from splatjax.splatting import BinCapacity
+from splatjax._combination import PartByPart
 
-from ._clustered import ClusterDiffuser
-from ._diffuser import Diffused, Kernels, Sources
-from ._gathering import Gathering, MeansAndExits
-from ._gaussian_sums import as_they_are
-from ._handover import resolved_share
-from ._pixels import Pixels
-from ._tree import Clusters, ClusterTree
+from ._clustered import ClusterDiffuser, layer_table, source_boxes
+from ._clusters import Clusters, ClusterTree
+from ._diffuser import Sources
+from ._gaussian_sums import FAR, Steps, gaussian_sums, identity
+from ._kernel import AbstractDiffusionKernel, TruncatedGaussian
+from ._neighbors import Boxes, find_neighbors
+from ._order import BLOCK, compact_order
+
+_SPARE = 1.3  # times the clusters of a part, so that one program serves nearly all parts
 
 
-class StreamedLayer(eqx.Module):
-    """How one layer is gathered."""
+class _Layer(eqx.Module):
+    """How one layer is summed."""
 
     variance: Float[Array, ""]
     depth: Float[Array, ""]
     edge: float = eqx.field(static=True)
-    """Of its cells, mm; 0 for single splats."""
+    truncated: TruncatedGaussian
     support: float = eqx.field(static=True)
-    carried: bool = eqx.field(static=True)
 
 
-@dataclasses.dataclass(frozen=True)
-class StreamedRoom:
-    """What there is room for so far, so that one program serves nearly all parts. It only grows."""
-
-    counts: tuple[int, ...] = ()
-    """Cells of each level."""
-    capacities: tuple[BinCapacity | None, ...] = ()
-    """Of each layer's lists."""
-
-
-class StreamedSums(eqx.Module):
-    r"""What the pixels gather of every layer, part by part.
+class StreamedDiffusion:
+    """Evaluates the layers at points, from sources that come in parts.
 
     The cells of a part are its own, so that one which two parts share counts as two: never coarser
-    than the cells of all splats together. Every pixel gathers for itself. Nothing is kept of a part
-    but the sums, which do not grow with the number of splats.
+    than the cells of all splats together. Only the sums are kept, which do not grow with the number
+    of splats.
     """
 
-    diffuser: ClusterDiffuser
-    layers: tuple[StreamedLayer, ...]
-    pixels: Pixels
-    totals: tuple[Float[Array, "tiles _ points"] | None, ...]
-    """`None` of a layer that is not carried, or not begun."""
-
-    @classmethod
-    def begin(
-        cls,
+    def __init__(
+        self,
         diffuser: ClusterDiffuser,
-        kernels: Kernels,
+        kernel: AbstractDiffusionKernel,
+        variances: Float[Array, " gaussians"],
         spacing: float,
-        fine: Float[Array, ""],
+        fine: float,
         interval: Float[Array, "2"],
-        pixels: Pixels,
-    ) -> "StreamedSums":
-        """Begin with nothing.
+        points: Float[Array, "blocks 3 block"],
+        exists: Bool[Array, "blocks block"],
+    ):
+        """Prepare for points in blocks of `BLOCK`; `spacing`, `fine` and `interval` as for
+        `ClusterDiffuser.choose_sources`.
+        """
+        sizes = np.asarray(variances, np.float64)
+        edges, supports = diffuser.choose_sources(sizes, spacing, fine, kernel, interval)
+        each = zip(variances, kernel.depths(variances), edges, supports, strict=True)
+        self.layers = [
+            _Layer(variance, depth, edge, kernel.truncated(support), support) if support else None
+            for variance, depth, edge, support in each
+        ]
+        self.cells = sorted({edge for edge in edges if edge > 0})
+        self.points = jnp.where(exists[:, None], points, FAR)
+        self.boxes = Boxes.around(
+            jnp.moveaxis(self.points, 1, 0).reshape(3, -1), exists.reshape(-1), BLOCK
+        )
+        self.counts, self.steps = (0,) * len(self.cells), [0] * len(self.layers)
+
+    def evaluate(
+        self, parts: Iterable[Sources]
+    ) -> tuple[Float[Array, "blocks values block"] | None, ...]:
+        """Sum over all parts: means and mass of each layer; `None` for one that is not resolved.
 
         **Arguments:**
 
-        - `spacing`: root of the mean area of the splats, mm.
-        - `fine`: the area (mm^2) that few splats are finer than.
-        - `interval`: from `handover_interval`.
+        - `parts`: of one size, with centers from the origin of the points; sources without area
+          bring nothing.
         """
-        shares = np.asarray(resolved_share(kernels.variances * diffuser.margin, fine, interval))
-        edges = diffuser.edges(
-            np.asarray(kernels.variances, np.float64) / diffuser.margin, spacing, shares > 0
-        )
-        layers = tuple(
-            StreamedLayer(
-                variance, depth, float(edge), diffuser.support(float(share)), bool(share > 0)
+        sums = PartByPart().own_total(self._sums(parts))
+        return tuple(None if each is None else _divide(each) for each in sums)
+
+    def _sums(self, parts: Iterable[Sources]) -> Iterator[list[Array | None]]:
+        """Iterate over the sums of each part."""
+        values = None
+        for sources in parts:
+            if values is None or self._in_reach(sources):
+                values = self._sum_part(sources)
+                yield values
+
+    def _in_reach(self, sources: Sources) -> bool:
+        """Test whether a part may bring anything to any point, by boxes."""
+        centers, exists = np.asarray(sources.centers), np.asarray(sources.areas) > 0
+        if not exists.any():
+            return False
+        low, high = centers[:, exists].min(axis=1), centers[:, exists].max(axis=1)
+        gaps = np.maximum(np.maximum(self.boxes.low - high, low - self.boxes.high), 0)
+        # Cells hold cells by their centers, and splats sink along their normals.
+        reaches = [
+            each.support
+            * math.sqrt(
+                float(each.variance) + 0.5 * (2 * math.sqrt(3) * each.edge + 2 * each.depth) ** 2
             )
-            for variance, depth, edge, share in zip(
-                kernels.variances, kernels.depths, edges, shares, strict=True
-            )
-        )
-        return cls(diffuser, layers, pixels, (None,) * len(layers))
-
-    @property
-    def cells(self) -> list[float]:
-        """Give the edges of the cells of each level, mm."""
-        return sorted({layer.edge for layer in self.layers if layer.edge > 0})
-
-    @property
-    def reach(self) -> float:
-        """Give how far from its splats' centers the light of any layer reaches at most, mm."""
-        found = [0.0]
-        for layer in self.layers:
-            depth = float(layer.depth)
-            across = math.sqrt(3) * sum(
-                cell for cell in self.cells if cell <= layer.edge
-            )  # a cell holds cells, by their centers
-            spread = (
-                0.5 * (across + 2 * depth) ** 2 if layer.edge > 0 else 0.0
-            )  # of splats that sink, each along its normal
-            if layer.carried:
-                found.append(depth + layer.support * math.sqrt(float(layer.variance) + spread))
-        return max(found)
-
-    def within_reach(self, splats: Splats) -> bool:
-        """Say whether a part may bring anything to any pixel."""
-        return bool(_within_reach(self.pixels, splats, self.reach))
-
-    def plus(self, sources: Sources, room: StreamedRoom) -> tuple["StreamedSums", StreamedRoom]:
-        """Add what a part of the splats brings; splats without area bring nothing."""
-        cells = self.cells
-        tree = ClusterTree.build(sources.centers.T, sources.normals.T, cells)
-        held = room.counts or (0,) * len(tree.counts)
-        counts = tuple(
-            had if count <= had else _roomier(count)
-            for count, had in zip(tree.counts, held, strict=True)
-        )
-        levels = _levels(tree.with_room(counts), sources, self.pixels.origin)
-        bare = dataclasses.replace(self, totals=())
-        capacities, totals = [], []
-        for i, (layer, total) in enumerate(zip(self.layers, self.totals, strict=True)):
-            if not layer.carried:
-                capacities.append(None)
-                totals.append(None)
-                continue
-            level = cells.index(layer.edge) + 1 if layer.edge > 0 else 0
-            held = room.capacities[i] if room.capacities else None
-            added, needed = (
-                (None, 2.0) if held is None else _added(bare, layer, levels[level], held, total)
-            )
-            if needed > 1:
-                found = self.diffuser.capacity_at(
-                    self.pixels.origin,
-                    levels[level],
-                    None,
-                    float(layer.variance),
-                    layer.depth,
-                    layer.support,
-                    [self.pixels.atlas],
-                )
-                held = found.grown(held, self.pixels.chunks)
-                added, _ = _added(bare, layer, levels[level], held, total)
-            capacities.append(held)
-            totals.append(added)
-        return dataclasses.replace(self, totals=tuple(totals)), StreamedRoom(
-            counts, tuple(capacities)
-        )
-
-    def found(self, channels: int) -> Diffused:
-        """Give the diffusion integrals of all parts together."""
-        carried = jnp.asarray([layer.carried for layer in self.layers], self.pixels.tiles.dtype)
-        tiles, _, points = self.pixels.tiles.shape
-        values = [
-            jnp.zeros((tiles - 1, channels + 1, points), carried.dtype)
-            if total is None
-            else _finished(total, self.pixels.tiles, MeansAndExits(channels, layer.edge > 0))
-            for layer, total in zip(self.layers, self.totals, strict=True)
+            + float(each.depth)
+            for each in self.layers
+            if each is not None
         ]
-        values = jnp.stack(values, axis=1)
-        return Diffused(
-            values[:, :, :channels], values[:, :, channels], carried, jnp.zeros((), carried.dtype)
+        return bool(np.any(np.sum(gaps * gaps, axis=1) <= max(reaches, default=0.0) ** 2))
+
+    def _sum_part(self, sources: Sources) -> list[Array | None]:
+        order = compact_order(np.asarray(sources.centers.T))
+        sources = jax.tree.map(lambda rows: rows[..., order], sources)
+        arrays = (np.asarray(each.T) for each in (sources.centers, sources.normals))
+        tree = ClusterTree.build(*arrays, np.asarray(sources.areas) > 0, self.cells)
+        self.counts = tuple(
+            had if count <= had else math.ceil(_SPARE * count / BLOCK) * BLOCK
+            for count, had in zip(tree.counts, self.counts, strict=True)
         )
+        levels = _levels(tree.with_capacity(self.counts), sources)
+        return [
+            None if each is None else self._sum_layer(i, each, levels)
+            for i, each in enumerate(self.layers)
+        ]
+
+    def _sum_layer(self, i: int, layer: _Layer, levels: list[Clusters]) -> Array:
+        clusters = levels[self.cells.index(layer.edge) + 1 if layer.edge else 0]
+        boxes, spread = source_boxes(clusters, jnp.stack([layer.depth, layer.depth]))
+        reach = layer.support * math.sqrt(float(layer.variance) + float(spread))
+        steps = find_neighbors(self.boxes, boxes, reach)
+        if steps.ids.shape[0] > self.steps[i]:
+            self.steps[i] = 1 << (steps.ids.shape[0] - 1).bit_length()
+        more = self.steps[i] - steps.ids.shape[0]
+        ids = jnp.pad(steps.ids, ((0, more), (0, 0), (0, 0)))
+        return _sum(self.points, clusters, layer, dataclasses.replace(steps, ids=ids))
 
 
 @eqx.filter_jit
-def _within_reach(pixels: Pixels, splats: Splats, reach: float) -> Bool[Array, ""]:
-    """Say whether the box around splats is within reach (mm) of the box around any tile's
-    points.
-    """
-    there, tiles = (splats.areas > 0)[None], pixels.boxes
-    centers = splats.centers.T - pixels.origin[:, None]
-    low, high = (
-        jnp.min(jnp.where(there, sign * centers, jnp.inf), axis=1, keepdims=True)
-        for sign in (1, -1)
-    )
-    gaps = jnp.maximum(jnp.maximum(tiles.low + high, low - tiles.high), 0)
-    return jnp.any(jnp.sum(gaps * gaps, axis=0) <= reach * reach)
-
-
-def _roomier(count: int) -> int:
-    return math.ceil(1.3 * count / 64) * 64
+def _levels(tree: ClusterTree, sources: Sources) -> list[Clusters]:
+    return tree.levels(sources)
 
 
 @eqx.filter_jit
-def _levels(tree: ClusterTree, sources: Sources, origin: Float[Array, "3"]) -> list[Clusters]:
-    return tree.levels(dataclasses.replace(sources, centers=sources.centers - origin[:, None]))
+def _sum(points, clusters: Clusters, layer: _Layer, steps: Steps) -> Array:
+    below = clusters.lowered(layer.depth)
+    table, _ = layer_table(below, layer.variance, layer.depth, layer.truncated, slopes=False)
+    spare = steps.order.shape[0] - points.shape[0]
+    blocks = jnp.pad(points, ((0, spare), (0, 0), (0, 0)), constant_values=FAR)
+    return gaussian_sums(blocks, table, steps, layer.truncated, identity)[: points.shape[0]]
 
 
 @eqx.filter_jit
-def _added(
-    sums: StreamedSums, layer: StreamedLayer, clusters: Clusters, capacity: BinCapacity, total
-):
-    gathering = Gathering.of(clusters, layer.variance, layer.depth)
-    found, needed = sums.diffuser.at_pixels(
-        gathering, layer.support, capacity, sums.pixels, as_they_are
-    )
-    return found if total is None else total + found, needed
-
-
-@eqx.filter_jit
-def _finished(total, tiles, finish: MeansAndExits):
-    return jax.vmap(finish)(total, tiles)[:-1]
+def _divide(sums: Float[Array, "blocks values block"]) -> Float[Array, "blocks values block"]:
+    """Divide the light by the mass; 0 where nothing is in reach."""
+    mass = sums[:, -1:]
+    means = sums[:, :-1] / jnp.where(mass > 0, mass, 1.0)
+    return jnp.where(mass > 0, jnp.concatenate([means, mass], axis=1), 0.0)

@@ -8,7 +8,7 @@ from splatjax.scattering import DiffuseTransmission
 
 
 def burley_distance(gaussians: SumOfGaussians) -> Float[Array, " channels"]:
-    r"""Give the `d` of normalized diffusion, `(exp(-r/d) + exp(-r/3d)) / (8 pi d r)`, that sends
+    r"""Compute the `d` of normalized diffusion, `(exp(-r/d) + exp(-r/3d)) / (8 pi d r)`, that sends
     light as far on average.
 
     Its mean distance is `2.5 d`; that of the Gaussians is `sum_i w_i sqrt(pi v_i / 2) / sum_i w_i`.
@@ -28,7 +28,7 @@ def burley_distance(gaussians: SumOfGaussians) -> Float[Array, " channels"]:
 
 
 def unity_shape_parameter(gaussians: SumOfGaussians) -> Float[Array, " channels"]:
-    r"""Give the shape parameter `S = 1 / d` of Unity's High Definition Render Pipeline; its
+    r"""Compute the shape parameter `S = 1 / d` of Unity's High Definition Render Pipeline; its
     scattering distance is `d`.
 
     **Returns:** 1/mm: with a world scale of 1 (a unit is a meter) the pipeline counts `d` in mm.
@@ -39,8 +39,8 @@ def unity_shape_parameter(gaussians: SumOfGaussians) -> Float[Array, " channels"
 
 
 def blender_radius(gaussians: SumOfGaussians) -> Float[Array, " channels"]:
-    r"""Give the radius for Blender's method Christensen-Burley, at scale 1: `4 pi s(A) d`, where A
-    is the total reflectance.
+    r"""Compute the radius for Blender's method Christensen-Burley, at scale 1: `4 pi s(A) d`, where
+    A is the total reflectance.
 
     Cycles takes a quarter of the radius over pi for the mean free path l, and then `d = l / s(A)`
     with the curve for diffuse transmission.

@@ -3,15 +3,16 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from splatjax._chunking import jit_unless_traced
 from splatjax.gaussians import SumOfGaussians
-from splatjax.pointwise import one_program
 
 
-@one_program
+@jit_unless_traced
 def separable_kernel(
     gaussians: SumOfGaussians, samples: int = 25, reach: float | None = None
 ) -> tuple[Float[Array, " samples"], Float[Array, "samples channels"]]:
-    r"""Give a kernel for separable subsurface scattering: one blur along each axis of the screen.
+    r"""Compute a kernel for separable subsurface scattering: one blur along each axis of the
+    screen.
 
     Offsets are denser toward the middle, `reach sign(t) t^2` for equally spaced `t` from -1 to 1; a
     weight is the profile at the offset times half the distance between the neighbors, and those of

@@ -11,7 +11,7 @@ from ._kernels import separable_kernel
 
 
 def data_sheet(gaussians: SumOfGaussians) -> dict[str, Any]:
-    r"""Give a sum of Gaussians in all the terms of this room, each with its formula, unit and
+    r"""Express a sum of Gaussians in all the terms of this package, each with its formula, unit and
     source: lists, numbers and text.
 
     **Returns:** a dictionary that JSON can hold, with the entries `gaussians`, `gpu_gems`,
@@ -76,7 +76,7 @@ def data_sheet(gaussians: SumOfGaussians) -> dict[str, Any]:
 
 
 def plain_numbers(values: Any) -> Any:
-    """Give Python numbers, as short as they can be and still be read back the same."""
+    """Convert to the shortest Python numbers that are read back exactly."""
     values = np.asarray(values)
     if values.dtype == np.float32:
         # Not `str`, which shows six digits once colour-science has been imported.

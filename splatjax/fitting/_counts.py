@@ -8,9 +8,10 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from splatjax.gaussians import AbstractProfile
-from splatjax.scattering import NORM_RULE, AbstractRadialRule
+from splatjax.scattering import L2_QUADRATURE, AbstractRadialRule
 
-from ._search import GivenVariances, InsertedGaussians, constant, ladder
+from ._problem import FitProblem, make_problem
+from ._search import GivenVariances, GreedyInsertion, constant, greedy_path
 from ._spread import AbstractSpread, SharedVariances
 from ._weights import AbstractWeights, FreeWeights
 
@@ -21,7 +22,7 @@ class ErrorByCount(eqx.Module):
     **Attributes:**
 
     - `error`: of the best sums of 1, 2, ... Gaussians.
-    - `variances`: theirs, mm^2, ascending; infinite where there are fewer. With
+    - `variances`: of these sums, mm^2, ascending; the unused last ones are infinite. With
       `VariancesPerChannel`, for each channel.
     """
 
@@ -29,10 +30,10 @@ class ErrorByCount(eqx.Module):
     variances: Float[Array, "*channels counts gaussians"]
 
     def least(self, error: float) -> int:
-        r"""Give the least number of Gaussians with which no channel exceeds an error.
+        r"""Find the least number of Gaussians with which no channel exceeds an error.
 
-        **Raises:** `ValueError` if none of them does, and inside `jit`, where the answer depends on
-        values.
+        **Raises:** `ValueError` if no number suffices, and inside `jit`, where the answer depends
+        on values.
         """
         if isinstance(self.error, Tracer):
             raise ValueError(
@@ -48,7 +49,7 @@ class ErrorByCount(eqx.Module):
         return int(np.argmax(worst <= error)) + 1
 
     def start(self, count: int) -> GivenVariances:
-        """Give where a fit of so many Gaussians starts, to finish what was found."""
+        """Return the start of a fit of so many Gaussians, which finishes this search."""
         return GivenVariances(self.variances[..., count - 1, :count])
 
 
@@ -56,16 +57,16 @@ def error_by_count(
     profile: AbstractProfile,
     largest: int = 8,
     *,
-    spread: AbstractSpread | None = None,
-    weights: AbstractWeights | None = None,
-    rule: AbstractRadialRule = NORM_RULE,
+    spread: AbstractSpread = SharedVariances(),
+    weights: AbstractWeights = FreeWeights(),
+    rule: AbstractRadialRule = L2_QUADRATURE,
 ) -> ErrorByCount:
-    r"""Find the best sums of 1, 2, ... Gaussians in one search, and what error each leaves.
+    r"""Find the best sums of 1, 2, ... Gaussians in one search, and the error of each.
 
     One compilation serves all of them; their sums of squares are those of the best fits to about
     1e-5.
 
-    **Arguments:** as `fit_gaussians` has them.
+    **Arguments:** as for `fit_gaussians`.
 
     - `largest`: number of Gaussians, at least 1.
 
@@ -74,14 +75,11 @@ def error_by_count(
     **Raises:** `ValueError` as `fit_gaussians` does.
     """
     check_count("largest", largest)
-    spread = SharedVariances() if spread is None else spread
-    return _error_by_count(
-        profile, largest, spread, FreeWeights() if weights is None else weights, rule
-    )
+    return _error_by_count(profile, largest, spread, weights, rule)
 
 
 class LeastCount(eqx.Module):
-    r"""The least number of Gaussians that reaches a wanted error in every channel.
+    r"""The least number of Gaussians that reaches a required error in every channel.
 
     **Attributes:**
 
@@ -94,7 +92,7 @@ class LeastCount(eqx.Module):
 
 
 def check_count(name: str, count: int) -> None:
-    """Raise `ValueError` for what is no number of Gaussians."""
+    """Raise `ValueError` for a number of Gaussians that is not a positive integer."""
     if isinstance(count, bool) or not isinstance(count, int) or count < 1:
         raise ValueError(f"{name} must be a whole number of Gaussians, at least 1; got {count!r}")
 
@@ -107,21 +105,17 @@ def _error_by_count(
     weights: AbstractWeights,
     rule: AbstractRadialRule,
 ) -> ErrorByCount:
-    def climb(problem, start):
-        del start
-        rungs = ladder(problem, largest)
-
-        def leave(rung, count):
+    def search(problem: FitProblem, _):
+        def summarize(point, count):
             active = jnp.arange(largest) < count
-            residuals = problem.residuals(rung, active)
-            variances = jnp.where(active, problem.variances(rung), jnp.full_like(rung, jnp.inf))
-            return jnp.sqrt(jnp.sum(residuals * residuals, axis=1)), variances
+            residuals = problem.residuals(point, active)
+            error = jnp.sqrt(jnp.sum(residuals * residuals, axis=1))
+            return error, jnp.where(active, problem.variances(point), jnp.inf)
 
-        return jax.vmap(leave)(rungs, jnp.arange(1, largest + 1))
+        points = greedy_path(problem, largest)
+        return jax.vmap(summarize)(points, jnp.arange(1, largest + 1))
 
-    problem = spread.problem(profile, weights, rule)
-    error, variances = spread.over(climb, constant(problem), InsertedGaussians())
-    error, variances = (each.astype(problem.target.dtype) for each in (error, variances))
-    if error.ndim == 3:
-        error = error[..., 0].T
-    return ErrorByCount(error, variances)
+    problem = make_problem(profile, weights, rule)
+    found = spread.over(search, constant(problem), GreedyInsertion())
+    error, variances = (values.astype(problem.target.dtype) for values in found)
+    return ErrorByCount(error[..., 0].T if error.ndim == 3 else error, variances)

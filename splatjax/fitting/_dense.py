@@ -49,15 +49,15 @@ def _invert_jvp(primals, tangents):
 def invert_moving(
     hessian: Float[Array, "gaussians gaussians"],
 ) -> Float[Array, "gaussians gaussians"]:
-    """Invert a Hessian; a Gaussian of weight zero in all channels changes nothing, and stays where
-    it is.
+    """Invert a Hessian; a Gaussian of weight zero in all channels stays where it
+    is.
     """
     still = jnp.diagonal(hessian) == 0
     return invert(hessian + jnp.diag(still.astype(hessian.dtype)))
 
 
 def normal_inverse(matrix: Float[Array, "rows columns"]) -> Float[Array, "columns columns"]:
-    """Give the inverse of `matrix^T matrix`."""
+    """Compute the inverse of `matrix^T matrix`."""
     return invert(matrix.T @ matrix)
 
 
@@ -66,7 +66,7 @@ def least_squares(
     right: Float[Array, " rows"],
     inverse: Float[Array, "columns columns"],
 ) -> Float[Array, " columns"]:
-    """Give the `x` of the least `|matrix x - right|`; `inverse` is that of the normal equations."""
+    """Find the `x` of the least `|matrix x - right|`; `inverse` is that of the normal equations."""
     solution = inverse @ (matrix.T @ right)
     return solution + inverse @ (matrix.T @ (right - matrix @ solution))
 

@@ -3,29 +3,29 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from splatjax._chunking import jit_unless_traced
 from splatjax.gaussians import AbstractProfile, SumOfGaussians
-from splatjax.pointwise import one_program
-from splatjax.scattering import NORM_RULE, AbstractRadialRule, at_own_radii
+from splatjax.scattering import L2_QUADRATURE, AbstractRadialRule, at_own_radii
 
 
 def norm_radii(
     profile: AbstractProfile, rule: AbstractRadialRule
 ) -> tuple[Float[Array, "nodes channels"], Float[Array, "nodes channels"]]:
-    """Give radii and weights of integrals of `r R^2`, or say that there is none."""
+    """Compute radii and weights of integrals of `r R^2`, where the integral exists."""
     if profile.singular and rule.reaches_origin:
         raise ValueError(
             f"{type(profile).__name__} goes to infinity like 1/r, so that the integral of r R^2 "
-            "from 0 (Eq. 3) does not exist; "
-            "state where it starts, in length scales of the profile: rule=NORM_RULE.beyond(1.0)"
+            "from 0 (Eq. 3) does not exist; state where it starts, in length scales of the "
+            "profile: rule=L2_QUADRATURE.beyond(1.0)"
         )
     return rule.radii(profile)
 
 
-@one_program
+@jit_unless_traced
 def squared_error(
-    profile: AbstractProfile, gaussians: SumOfGaussians, rule: AbstractRadialRule = NORM_RULE
+    profile: AbstractProfile, gaussians: SumOfGaussians, rule: AbstractRadialRule = L2_QUADRATURE
 ) -> Float[Array, " channels"]:
-    r"""Give the error that a fit minimizes, the integral over r of `r (R(r) - sum_i w_i G(v_i,
+    r"""Compute the error that a fit minimizes, the integral over r of `r (R(r) - sum_i w_i G(v_i,
     r))^2` (Eq. 3).
 
     **Arguments:**
@@ -46,17 +46,16 @@ def squared_error(
     return jnp.sum(dr * r * difference * difference, axis=0)
 
 
-@one_program
+@jit_unless_traced
 def relative_error(
-    profile: AbstractProfile, gaussians: SumOfGaussians, rule: AbstractRadialRule = NORM_RULE
+    profile: AbstractProfile, gaussians: SumOfGaussians, rule: AbstractRadialRule = L2_QUADRATURE
 ) -> Float[Array, " channels"]:
-    r"""Give the relative error of a fit, the root of Eq. 3 over that of the integral of `r R(r)^2`
+    r"""Compute the relative error of a fit: the root of Eq. 3 over that of the integral of `r R^2`
     (Eq. 4).
 
-    It sees the core of a profile and hardly its tail: see `FitResult.energy_error` for the energy.
+    It weights the core of a profile, hardly its tail: see `FitResult.energy_error` for the energy.
 
-    **Arguments:** as for `squared_error`, whose radii and norm it takes. Differentiable where the
-    fit is not perfect.
+    **Arguments:** as for `squared_error`. Differentiable where the fit is not perfect.
 
     **Returns:** [channels], at least 0; it depends on neither the unit of length nor the scale of
     the profile.

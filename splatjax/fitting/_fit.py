@@ -8,11 +8,11 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
 from splatjax.gaussians import AbstractProfile, SumOfGaussians
-from splatjax.scattering import NORM_RULE, AbstractRadialRule
+from splatjax.scattering import L2_QUADRATURE, AbstractRadialRule
 
 from ._counts import LeastCount, check_count, error_by_count
-from ._problem import Outcome, Problem
-from ._search import AbstractStart, InsertedGaussians, search
+from ._problem import FitProblem, make_problem
+from ._search import AbstractStart, GreedyInsertion, search
 from ._spread import AbstractSpread, SharedVariances
 from ._stationary import refine, stationary
 from ._weights import AbstractWeights, FreeWeights
@@ -46,10 +46,10 @@ def fit_gaussians(
     profile: AbstractProfile,
     count: int | LeastCount = 6,
     *,
-    spread: AbstractSpread | None = None,
-    weights: AbstractWeights | None = None,
-    start: AbstractStart | None = None,
-    rule: AbstractRadialRule = NORM_RULE,
+    spread: AbstractSpread = SharedVariances(),
+    weights: AbstractWeights = FreeWeights(),
+    start: AbstractStart = GreedyInsertion(),
+    rule: AbstractRadialRule = L2_QUADRATURE,
     throw: bool = True,
 ) -> FitResult:
     r"""Fit a sum of Gaussians to a profile: the least Eq. 3 over variances and weights.
@@ -70,9 +70,9 @@ def fit_gaussians(
     - `count`: number of Gaussians, at least 1; or `LeastCount(error)`, the least that leaves no
       more than that.
     - `spread`: `SharedVariances()` (default) or `VariancesPerChannel()`.
-    - `weights`: `FreeWeights()` (default), `TotalReflectanceHeld()`, or `NonNegativeWeights()`
+    - `weights`: `FreeWeights()` (default), `FixedTotalReflectance()`, or `NonNegativeWeights()`
       among either.
-    - `start`: `InsertedGaussians()` (default), which finds the best fit; or `GivenVariances(...)`
+    - `start`: `GreedyInsertion()` (default), which finds the best fit; or `GivenVariances(...)`
       near it, which is fast. Of a given count alone: the least one is found by inserting.
     - `rule`: radii of the integral, in length scales of the profile; or `InverseVariance()`, for
       one with standard errors.
@@ -82,28 +82,24 @@ def fit_gaussians(
 
     **Raises:** `ValueError` for a count below 1, for an error that no count reaches, for a `start`
     without a count, and for a profile that is infinite at the origin unless the rule starts beyond
-    it (`NORM_RULE.beyond`); an error with the message of `result` if `throw`.
+    it (`L2_QUADRATURE.beyond`); an error with the message of `result` if `throw`.
 
     **Source:** Kim et al. 2010, Eq. 3; variable projection: Golub and Pereyra 1973.
     """
-    if not isinstance(count, LeastCount):
-        check_count("count", count)
-    elif start is not None:
-        raise ValueError(
-            f"start is given, and {count}, which finds its own; leave start out, or give a count"
-        )
-    spread = SharedVariances() if spread is None else spread
-    weights = FreeWeights() if weights is None else weights
-    start = InsertedGaussians() if start is None else start
     if isinstance(count, LeastCount):
+        if not isinstance(start, GreedyInsertion):
+            raise ValueError(
+                f"start is given, and {count}, which finds its own; leave start out, or give a "
+                "count"
+            )
         by_count = error_by_count(profile, count.largest, spread=spread, weights=weights, rule=rule)
-        enough = by_count.least(count.error)
-        fitted = _fit_compiled(profile, enough, spread, weights, rule, by_count.start(enough))
         # Finishing a fit of shared variances may move error from one channel to another.
-        while float(jnp.max(fitted.error)) > count.error and enough < count.largest:
-            enough += 1
+        for enough in range(by_count.least(count.error), count.largest + 1):
             fitted = _fit_compiled(profile, enough, spread, weights, rule, by_count.start(enough))
+            if float(jnp.max(fitted.error)) <= count.error:
+                break
     else:
+        check_count("count", count)
         fitted = _fit_compiled(profile, count, spread, weights, rule, start)
     if throw:
         fitted = fitted.result.error_if(fitted, fitted.result != optx.RESULTS.successful)
@@ -119,23 +115,18 @@ def _fit_compiled(
     rule: AbstractRadialRule,
     start: AbstractStart,
 ) -> FitResult:
-    problem = spread.problem(profile, weights, rule)
-    found, converged = spread.over(partial(_fit_problem, count=count), problem, start)
-    energy = jnp.sum(found.gaussians.weights, axis=-2).reshape(-1)
+    problem = make_problem(profile, weights, rule)
+    fit = partial(_fit_problem, count=count)
+    (gaussians, error, covariance), converged = spread.over(fit, problem, start)
+    energy = jnp.sum(gaussians.weights, axis=-2).reshape(-1) / profile.total_reflectance() - 1
     result = optx.RESULTS.where(
         jnp.all(converged), optx.RESULTS.successful, optx.RESULTS.nonlinear_max_steps_reached
     )
-    return FitResult(
-        found.gaussians,
-        found.error.reshape(-1),
-        energy / profile.total_reflectance() - 1,
-        result,
-        found.covariance,
-    )
+    return FitResult(gaussians, error.reshape(-1), energy, result, covariance)
 
 
 def _fit_problem(
-    problem: Problem, start: AbstractStart, count: int
-) -> tuple[Outcome, Bool[Array, ""]]:
-    found, converged = refine(problem, search(problem, count, start))
-    return problem.outcome(stationary(problem, found)), converged
+    problem: FitProblem, start: AbstractStart, count: int
+) -> tuple[tuple, Bool[Array, ""]]:
+    optimum, converged = refine(problem, search(problem, count, start))
+    return problem.outcome(stationary(problem, optimum)), converged

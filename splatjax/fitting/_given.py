@@ -1,11 +1,10 @@
 """The weights of Gaussians whose variances are given: the linear half of a fit."""
 
 import jax
-import jax.numpy as jnp
-from jaxtyping import Array, Float
 
+from splatjax._records import Numbers, as_floats
 from splatjax.gaussians import AbstractProfile, SumOfGaussians
-from splatjax.scattering import NORM_RULE, AbstractRadialRule
+from splatjax.scattering import L2_QUADRATURE, AbstractRadialRule
 
 from ._problem import make_problem
 from ._weights import AbstractWeights, FreeWeights
@@ -13,10 +12,10 @@ from ._weights import AbstractWeights, FreeWeights
 
 def fit_weights(
     profile: AbstractProfile,
-    variances: Float[Array, " gaussians"],
+    variances: Numbers,
     *,
-    weights: AbstractWeights | None = None,
-    rule: AbstractRadialRule = NORM_RULE,
+    weights: AbstractWeights = FreeWeights(),
+    rule: AbstractRadialRule = L2_QUADRATURE,
 ) -> SumOfGaussians:
     r"""Fit the weights of Gaussians of given variances to a profile: the least Eq. 3 over the
     weights alone.
@@ -29,7 +28,7 @@ def fit_weights(
 
     - `profile`: 1/mm^2. Differentiable, in forward and reverse mode.
     - `variances`: mm^2, positive, all different. Constants of every derivative.
-    - `weights`: `FreeWeights()` (default), `TotalReflectanceHeld()`, or `NonNegativeWeights()`
+    - `weights`: `FreeWeights()` (default), `FixedTotalReflectance()`, or `NonNegativeWeights()`
       among either.
     - `rule`: radii of the integral, in length scales of the profile.
 
@@ -39,7 +38,6 @@ def fit_weights(
     **Raises:** `ValueError` for a profile that is infinite at the origin unless the rule starts
     beyond it.
     """
-    problem = make_problem(profile, FreeWeights() if weights is None else weights, rule)
-    variances = jax.lax.stop_gradient(variances).astype(problem.target.dtype)
-    found = problem.weighed(jnp.log(variances / (problem.unit * problem.unit)))
-    return SumOfGaussians(variances, found)
+    problem = make_problem(profile, weights, rule)
+    variances = jax.lax.stop_gradient(as_floats(variances, problem.target.dtype))
+    return SumOfGaussians(variances, problem.best_weights(problem.log_variances(variances)))

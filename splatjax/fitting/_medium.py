@@ -8,12 +8,13 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Float
 
+from splatjax._records import as_floats, check_values
 from splatjax.gaussians import AbstractProfile
 from splatjax.scattering import Dipole, Medium, Tabulated
 
 from ._dense import NormalEquations, invert
 from ._fit import fit_gaussians
-from ._search import AbstractStart, InsertedGaussians
+from ._search import AbstractStart, GreedyInsertion
 from ._spread import VariancesPerChannel
 
 _TOLERANCE = 1e-7
@@ -42,63 +43,56 @@ class MediumFit(eqx.Module):
 
 def fit_medium(
     measured: Tabulated,
-    deviation: Float[Array, "samples channels"],
     start: Medium,
     *,
     beam_variance: float = 0.0,
     model: Callable[[Medium], AbstractProfile] = Dipole,
     count: int = 6,
-    gaussians_start: AbstractStart | None = None,
+    gaussians_start: AbstractStart = GreedyInsertion(),
     throw: bool = True,
 ) -> MediumFit:
     r"""Find the absorption and scattering that explain a measured profile: weighted least squares
     on its samples.
 
-    The model goes the way of the picture: coefficients, profile, sum of Gaussians, the beam's
-    variance added to each; it is differentiated through all of it. Channels are independent. Use
-    double precision.
+    The model is that of the picture: coefficients, profile, sum of Gaussians, the variance of the
+    beam added to each; it is differentiated as a whole. Channels are independent. Use double
+    precision.
 
     **Arguments:**
 
-    - `measured`: with its scale: exitance per unit power entering, 1/mm^2.
-    - `deviation`: standard errors of its samples, 1/mm^2, positive.
+    - `measured`: with its scale, exitance per unit power entering, 1/mm^2, and with the standard
+      errors of its samples, positive.
     - `start`: where the search starts, within a factor of some ten; its `eta` is taken as known.
     - `beam_variance`: of the beam that made the dot, per axis, mm^2.
     - `model`: from a medium to its profile.
     - `count`: number of Gaussians.
-    - `gaussians_start`: where their fits start; `InsertedGaussians()` by default.
-    - `throw`: raise if the search has not converged; otherwise `result` says so.
+    - `gaussians_start`: where their fits start.
+    - `throw`: raise if the search has not converged; otherwise `result` reports it.
 
     **Returns:** a `MediumFit`.
 
-    **Raises:** `ValueError` for deviations that are not positive, and for shapes that do not match;
-    an error with the message of `result` if `throw`.
+    **Raises:** `ValueError` for deviations that are missing or not positive, and for channels that
+    do not match; an error with the message of `result` if `throw`.
     """
-    if deviation.shape != measured.values.shape or start.eta.shape != measured.values.shape[1:]:
-        shapes = f"{list(deviation.shape)} deviations, {start.eta.shape[0]} channels of start"
+    channels = measured.values.shape[1]
+    if measured.deviation is None or start.channels != channels:
         raise ValueError(
-            f"the profile has {list(measured.values.shape)} samples and channels; got {shapes}"
+            "fit_medium needs measured.deviation, the standard errors of its samples, and a start "
+            f"of {channels} channels; got {measured.deviation} and {start.channels} channels"
         )
-    if not bool(jnp.all(deviation > 0)):
-        raise ValueError(f"deviations must be positive (1/mm^2); got {float(jnp.min(deviation)):g}")
-    gaussians_start = InsertedGaussians() if gaussians_start is None else gaussians_start
-    fitted = _fit_compiled(
-        measured, deviation, start, jnp.asarray(beam_variance), model, count, gaussians_start
-    )
-    return (
-        fitted.result.error_if(fitted, fitted.result != optx.RESULTS.successful)
-        if throw
-        else fitted
-    )
+    check_values("measured.deviation", measured.deviation, "positive", lambda x: x > 0)
+    beam = as_floats(beam_variance, measured.values.dtype)
+    fitted = _fit_compiled(measured, start, beam, model, count, gaussians_start)
+    if throw:
+        return fitted.result.error_if(fitted, fitted.result != optx.RESULTS.successful)
+    return fitted
 
 
 @eqx.filter_jit
-def _fit_compiled(
-    measured, deviation, start, beam_variance, model, count, gaussians_start
-) -> MediumFit:
+def _fit_compiled(measured, start, beam_variance, model, count, gaussians_start) -> MediumFit:
     def fit_channel(values, deviation, sigma_a, sigma_s_prime, eta):
         def residuals(point, _):
-            moved = Medium(*(jnp.exp(each)[None] for each in point), eta[None])
+            moved = Medium(*jnp.exp(point), eta)
             fitted = fit_gaussians(
                 model(moved),
                 count,
@@ -113,20 +107,16 @@ def _fit_compiled(
             rtol=_TOLERANCE, atol=_TOLERANCE, linear_solver=NormalEquations()
         )
         point = jnp.log(jnp.stack([sigma_a, sigma_s_prime]))
-        found = optx.least_squares(residuals, solver, point, max_steps=_STEPS, throw=False)
+        end = optx.least_squares(residuals, solver, point, max_steps=_STEPS, throw=False)
         slopes, left = jax.jacfwd(lambda point: (residuals(point, None),) * 2, has_aux=True)(
-            found.value
+            end.value
         )
-        freedom = max(len(values) - len(point), 1)
-        return (
-            jnp.exp(found.value),
-            invert(slopes.T @ slopes),
-            left @ left / freedom,
-            found.result == optx.RESULTS.successful,
-        )
+        chi_squared = left @ left / max(len(values) - len(point), 1)
+        converged = end.result == optx.RESULTS.successful
+        return jnp.exp(end.value), invert(slopes.T @ slopes), chi_squared, converged
 
     fitted = jax.vmap(fit_channel)(
-        measured.values.T, deviation.T, start.sigma_a, start.sigma_s_prime, start.eta
+        measured.values.T, measured.deviation.T, start.sigma_a, start.sigma_s_prime, start.eta
     )
     coefficients, covariance, chi_squared, converged = fitted
     result = optx.RESULTS.where(

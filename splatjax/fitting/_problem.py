@@ -32,27 +32,14 @@ class Expansion(eqx.Module):
     residuals: Float[Array, "channels nodes"]
     jacobian: Float[Array, "channels nodes gaussians"]
 
-    def normal(self) -> Float[Array, "gaussians gaussians"]:
-        """Give half the Hessian of Gauss and Newton."""
-        return jnp.einsum("cni,cnj->ij", self.jacobian, self.jacobian)
 
-
-class Outcome(eqx.Module):
-    """The Gaussians of a problem's optimum, Eq. 4 of its channels, and the covariance that
-    `FitResult` has.
-    """
-
-    gaussians: SumOfGaussians
-    error: Float[Array, " channels"]
-    covariance: Float[Array, "parameters parameters"]
-
-
-class Problem(eqx.Module):
+class FitProblem(eqx.Module):
     r"""Eq. 3 of all channels that share their variances, each divided by its norm, at the nodes of
     a radial rule.
 
-    Variances are counted in the square of one length, `unit`, so that nothing depends on the unit
-    of length. Differentiable in `target` and `total`; nodes and units are constants.
+    Variances are counted in the square of one length, the geometric mean of the `scales` of the
+    channels, so that nothing depends on the unit of length. Differentiable in `target` and `total`;
+    nodes and scales are constants.
     """
 
     squared_radii: Float[Array, "*batch channels nodes"]
@@ -60,28 +47,33 @@ class Problem(eqx.Module):
     target: Float[Array, "*batch channels nodes"]
     norm: Float[Array, "*batch channels"]
     total: Float[Array, "*batch channels"]
-    unit: Float[Array, "*batch"]
+    scales: Float[Array, "*batch channels"]
     weights: AbstractWeights
 
+    @property
+    def squared_unit(self) -> Float[Array, ""]:
+        """The unit of variances, mm^2."""
+        return jnp.exp(2 * jnp.mean(jnp.log(self.scales)))
+
     def variances(self, log_variances: Float[Array, " gaussians"]) -> Float[Array, " gaussians"]:
-        """Give the variances, mm^2."""
-        return jnp.exp(log_variances) * self.unit * self.unit
+        """Compute the variances, mm^2."""
+        return jnp.exp(log_variances) * self.squared_unit
+
+    def log_variances(self, variances: Float[Array, " gaussians"]) -> Float[Array, " gaussians"]:
+        """Take the logarithms of given variances, mm^2, which are constants of every derivative."""
+        variances = jax.lax.stop_gradient(variances).astype(self.target.dtype)
+        return jnp.log(variances / self.squared_unit)
 
     def basis(
         self, log_variances: Float[Array, " gaussians"]
     ) -> Float[Array, "channels nodes gaussians"]:
-        """Give the Gaussians at the nodes, each scaled to a unit norm (in closed form)."""
+        """Compute the Gaussians at the nodes, each scaled to a unit norm (in closed form)."""
         variances = self.variances(log_variances)
         shape = (*self.squared_radii.shape, *variances.shape)
-        values = gaussian(
-            jnp.broadcast_to(variances, shape),
-            jnp.broadcast_to(self.squared_radii[..., None], shape),
-        )
-        return (
-            values
-            * jnp.broadcast_to(self._energies(variances), shape)
-            * self.root_weights[..., None]
-        )
+        squared_radii = jnp.broadcast_to(self.squared_radii[..., None], shape)
+        values = gaussian(jnp.broadcast_to(variances, shape), squared_radii)
+        energies = jnp.broadcast_to(self._energies(variances), shape)
+        return values * energies * self.root_weights[..., None]
 
     def solve(
         self,
@@ -91,9 +83,11 @@ class Problem(eqx.Module):
         Float[Array, "channels nodes gaussians"],
         Float[Array, "channels gaussians"],
         Float[Array, "channels gaussians gaussians"],
+        Float[Array, "channels nodes"],
     ]:
-        """Give the basis, and each channel's best coefficients and their response. Gaussians that
-        are not active count for nothing."""
+        """Find the best coefficients of each channel: the basis, the coefficients, their response
+        and the residuals. Gaussians that are not active have the coefficient 0.
+        """
         basis = self.basis(log_variances)
         energies = self._energies(self.variances(log_variances))
 
@@ -103,52 +97,47 @@ class Problem(eqx.Module):
             coefficients, response = self.weights.solve(
                 *without_idle(rows, target, energies, active), total
             )
-            return coefficients, jnp.where(
-                active[:, None] & active[None], response, jnp.zeros_like(response)
-            )
+            return coefficients, jnp.where(active[:, None] & active[None], response, 0.0)
 
         if active is not None:
-            basis = jnp.where(jnp.broadcast_to(active, basis.shape), basis, jnp.zeros_like(basis))
-        return basis, *jax.vmap(solve)(basis, self.target, self.total / self.norm)
+            basis = jnp.where(jnp.broadcast_to(active, basis.shape), basis, 0.0)
+        coefficients, response = jax.vmap(solve)(basis, self.target, self.total / self.norm)
+        residuals = self.target - jnp.einsum("cnk,ck->cn", basis, coefficients)
+        return basis, coefficients, response, residuals
 
-    def weighed(
+    def best_weights(
         self, log_variances: Float[Array, " gaussians"]
     ) -> Float[Array, "gaussians channels"]:
-        """Give the best weights."""
-        _, coefficients, _ = self.solve(log_variances)
-        return (
-            coefficients * self.norm[:, None] * self._energies(self.variances(log_variances))[None]
-        ).T
+        """Compute the weights with the least error."""
+        _, coefficients, _, _ = self.solve(log_variances)
+        energies = self._energies(self.variances(log_variances))
+        return (coefficients * self.norm[:, None] * energies[None]).T
 
     def residuals(
         self,
         log_variances: Float[Array, " gaussians"],
         active: Bool[Array, " gaussians"] | None = None,
     ) -> Float[Array, "channels nodes"]:
-        """Give what the best weights leave; the sum of squares of a channel is the square of its
-        Eq. 4.
+        """Compute the residuals of the best weights; the sum of squares of a channel is the square
+        of its Eq. 4.
         """
-        basis, coefficients, _ = self.solve(log_variances, active)
-        return self.target - jnp.einsum("cnk,ck->cn", basis, coefficients)
+        return self.solve(log_variances, active)[-1]
 
     def expand(
         self,
         log_variances: Float[Array, " gaussians"],
         active: Bool[Array, " gaussians"] | None = None,
     ) -> Expansion:
-        """Give the sum of squared residuals with its derivatives, in closed form."""
-        basis, coefficients, response = self.solve(log_variances, active)
-        residuals = self.target - jnp.einsum("cnk,ck->cn", basis, coefficients)
+        """Compute the sum of squared residuals and its derivatives in closed form."""
+        basis, coefficients, response, residuals = self.solve(log_variances, active)
         slopes, curved, moved = self._slopes(log_variances, basis, coefficients, response)
-        # How the best coefficients follow: the first term is that of a basis that leaves no
-        # residual.
+        # How the best coefficients follow: the first term is that of a basis without residuals.
         along = jnp.einsum("cnk,cn->ck", slopes, residuals)
         follow = moved + response * along[:, None, :]
         steep = slopes * coefficients[:, None, :]
         jacobian = -steep - jnp.einsum("cni,cij->cnj", basis, follow)
-        second = jnp.einsum("cni,cnj->ij", steep, jacobian) + jnp.einsum(
-            "ci,cij->ij", along, follow
-        )
+        second = jnp.einsum("cni,cnj->ij", steep, jacobian)
+        second = second + jnp.einsum("ci,cij->ij", along, follow)
         bend = jnp.sum(coefficients * jnp.einsum("cnk,cn->ck", curved, residuals), axis=0)
         return Expansion(
             cost=jnp.sum(residuals * residuals),
@@ -158,46 +147,38 @@ class Problem(eqx.Module):
             jacobian=jacobian,
         )
 
-    def gradient(self, log_variances: Float[Array, " gaussians"]) -> Float[Array, " gaussians"]:
-        """Give the gradient of the sum of squared residuals: the best weights count as constants in
-        it (envelope theorem).
+    def outcome(
+        self, log_variances: Float[Array, " gaussians"]
+    ) -> tuple[SumOfGaussians, Float[Array, " channels"], Float[Array, "parameters parameters"]]:
+        """Compute the Gaussians of an optimum, Eq. 4 of its channels, and the covariance that
+        `FitResult` describes.
         """
-        basis, coefficients, _ = self.solve(log_variances)
-        residuals = self.target - jnp.einsum("cnk,ck->cn", basis, coefficients)
-        slopes = basis * (self._reach(log_variances) - 1)
-        return -2 * jnp.einsum("ck,cnk,cn->k", coefficients, slopes, residuals)
-
-    def outcome(self, log_variances: Float[Array, " gaussians"]) -> "Outcome":
-        """Give what a fit reports of an optimum."""
-        basis, coefficients, response = self.solve(log_variances)
-        residuals = self.target - jnp.einsum("cnk,ck->cn", basis, coefficients)
+        basis, coefficients, response, residuals = self.solve(log_variances)
         squared = jnp.sum(residuals * residuals, axis=1)
         slopes, _, moved = self._slopes(log_variances, basis, coefficients, response)
         steep = slopes * coefficients[:, None, :] + jnp.einsum("cni,cij->cnj", basis, moved)
         normal = jnp.einsum("cni,cnj->ij", steep, steep)
-        ours = invert_moving(normal)
-        # To the variances themselves, and from coefficients to weights.
+        # From logarithms to variances, and from coefficients to weights.
         variances, (channels, count) = self.variances(log_variances), coefficients.shape
         scale = self.norm[:, None] * self._energies(variances)[None]
         follow = jnp.concatenate(
             [jnp.diag(variances), (moved * scale[..., None]).reshape(channels * count, count)]
         )
         own = jax.scipy.linalg.block_diag(
-            jnp.zeros_like(ours), *(response * scale[..., None] * scale[:, None, :])
+            jnp.zeros_like(normal), *(response * scale[..., None] * scale[:, None, :])
         )
-        covariance = jnp.sum(squared) * (follow @ ours @ follow.T + own)
-        # The variance of a Gaussian without weight in any channel is anything.
+        covariance = jnp.sum(squared) * (follow @ invert_moving(normal) @ follow.T + own)
+        # The variance of a Gaussian without weight in any channel is unknown.
         idle = jnp.append(jnp.diagonal(normal) == 0, jnp.zeros(channels * count, bool))
-        anything = jnp.diag(jnp.where(idle, jnp.inf, 0.0).astype(covariance.dtype))
-        return Outcome(
-            gaussians=SumOfGaussians(variances, (coefficients * scale).T),
-            error=jnp.sqrt(squared),
-            covariance=jnp.where(idle[:, None] | idle[None], anything, covariance),
-        )
+        unknown = jnp.diag(jnp.where(idle, jnp.inf, 0.0).astype(covariance.dtype))
+        covariance = jnp.where(idle[:, None] | idle[None], unknown, covariance)
+        gaussians = SumOfGaussians(variances, (coefficients * scale).T)
+        return gaussians, jnp.sqrt(squared), covariance
 
     def _slopes(self, log_variances, basis, coefficients, response):
-        """Give the first and second derivative of the basis at fixed weights, and how the
-        coefficients follow if nothing is left."""
+        """Compute the first and second derivative of the basis at fixed weights, and how the
+        coefficients follow if there are no residuals.
+        """
         reach = self._reach(log_variances) - 1
         slopes = basis * reach
         curved = basis * (reach * reach - reach - 1)
@@ -211,7 +192,7 @@ class Problem(eqx.Module):
     def _reach(
         self, log_variances: Float[Array, " gaussians"]
     ) -> Float[Array, "channels nodes gaussians"]:
-        """Give `r^2 / 2v`."""
+        """Compute `r^2 / 2v`."""
         shape = (*self.squared_radii.shape, *log_variances.shape)
         variances = jnp.broadcast_to(self.variances(log_variances), shape)
         return 0.5 * jnp.broadcast_to(self.squared_radii[..., None], shape) / variances
@@ -223,19 +204,18 @@ class Problem(eqx.Module):
 
 def make_problem(
     profile: AbstractProfile, weights: AbstractWeights, rule: AbstractRadialRule
-) -> Problem:
-    """State the fit of all channels of a profile."""
+) -> FitProblem:
+    """Set up the fit of all channels of a profile."""
     r, dr = norm_radii(profile, rule)
     values = at_own_radii(profile, r)
     norm = jnp.sqrt(jnp.sum(dr * r * values * values, axis=0))
     root_weights = jnp.sqrt(dr * r)
-    scale = jax.lax.stop_gradient(profile.length_scale())
-    return Problem(
+    return FitProblem(
         squared_radii=(r * r).T,
         root_weights=root_weights.T,
         target=(root_weights * values / jnp.broadcast_to(norm, values.shape)).T,
         norm=norm,
         total=profile.total_reflectance(),
-        unit=jnp.exp(jnp.mean(jnp.log(scale))),
+        scales=jax.lax.stop_gradient(profile.length_scale()),
         weights=weights,
     )

@@ -30,7 +30,7 @@ class DipoleStarts(eqx.Module):
     log_variances: tuple[Float[Array, "roots etas _"], ...]
 
     def __call__(self, medium: Medium, count: int) -> GivenVariances:
-        r"""Give the start of a fit of `count` Gaussians to `Dipole(medium)` with
+        r"""Compute the start of a fit of `count` Gaussians to `Dipole(medium)` with
         `VariancesPerChannel()`.
 
         **Raises:** `ValueError` for more Gaussians than the table has.
@@ -53,6 +53,6 @@ class DipoleStarts(eqx.Module):
 def _place(
     nodes: Float[Array, " nodes"], values: Float[Array, " channels"]
 ) -> Float[Array, " channels"]:
-    """Give where values lie among equally spaced nodes, in steps."""
+    """Locate values among equally spaced nodes, in steps."""
     nodes = nodes.astype(values.dtype)
     return (values - nodes[0]) / (nodes[1] - nodes[0])

@@ -2,13 +2,12 @@
 vanishes.
 """
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from ._dense import invert_moving
-from ._problem import Expansion, Problem
+from ._problem import Expansion, FitProblem
 
 _GAIN = 1e-6
 """A fit has converged when a step of Gauss and Newton would lower the sum of squares by less than
@@ -25,8 +24,10 @@ _STEP = 10.0
 """A step in log variance below this many units of rounding is none."""
 
 
-def stationary(problem: Problem, found: Float[Array, " gaussians"]) -> Float[Array, " gaussians"]:
-    r"""Give `found` with the derivative that the implicit function theorem gives it.
+def stationary(
+    problem: FitProblem, optimum: Float[Array, " gaussians"]
+) -> Float[Array, " gaussians"]:
+    r"""Differentiate an optimum by the implicit function theorem; its value is unchanged.
 
     `g(log_variances, profile) = 0` at the optimum, so `d log_variances = -H^-1 dg`, where `H`, the
     derivative of `g`, is the full Hessian of Eq. 3 after the weights are eliminated (not that of
@@ -37,60 +38,53 @@ def stationary(problem: Problem, found: Float[Array, " gaussians"]) -> Float[Arr
         hessian = jax.vmap(linear, out_axes=1)(jnp.eye(tangent.shape[0], dtype=tangent.dtype))
         return invert_moving(hessian) @ tangent
 
-    found = jax.lax.stop_gradient(found)
     return jax.lax.custom_root(
-        lambda point: problem.gradient(point), found, lambda _, guess: guess, tangent_solve
+        lambda point: problem.expand(point).gradient,
+        jax.lax.stop_gradient(optimum),
+        lambda _, guess: guess,
+        tangent_solve,
     )
 
 
 def refine(
-    problem: Problem, start: Float[Array, " gaussians"]
+    problem: FitProblem, start: Float[Array, " gaussians"]
 ) -> tuple[Float[Array, " gaussians"], Bool[Array, ""]]:
-    """Finish a fit by Newton's method with the full Hessian; also give whether no small step could
-    improve it any more.
+    """Finish a fit by Newton's method with the full Hessian; also return whether it has
+    converged.
     """
     problem, start = jax.lax.stop_gradient((problem, start))
 
     def step(state):
         best, newton, _, steps = state
-        trial = best.point - newton
+        trial = best[0] - newton
         expansion = problem.expand(trial)
-        # Once the steps are rounding, so are their gains and losses: they end the search, and are
-        # not taken.
+        # Steps of the size of rounding have gains and losses of that size: they end the search and
+        # are not taken.
         moved = (steps == 0) | (
             jnp.max(jnp.abs(newton)) > _STEP * float(jnp.finfo(trial.dtype).eps)
         )
-        better = moved & (expansion.cost < best.cost)
-        reached = _Reached(trial, expansion.cost, _gain(expansion))
+        better = moved & (expansion.cost < best[1])
+        reached = trial, expansion.cost, _gain(expansion)
         best = jax.tree.map(lambda new, old: jnp.where(better, new, old), reached, best)
         return best, invert_moving(expansion.hessian) @ expansion.gradient, better, steps + 1
 
-    nowhere = jnp.full((), jnp.inf, start.dtype)
-    state = (
-        _Reached(start, nowhere, nowhere),
-        jnp.zeros_like(start),
-        jnp.asarray(True),
-        jnp.asarray(0),
-    )
+    unknown = jnp.full((), jnp.inf, start.dtype)
+    # The best point with its cost and gain, the next step, whether to go on, and how many steps.
+    state = (start, unknown, unknown), jnp.zeros_like(start), jnp.asarray(True), jnp.asarray(0)
     best, *_ = jax.lax.while_loop(lambda state: state[2] & (state[3] <= _STEPS), step, state)
+    point, cost, gain = best
     floor = (_FLOOR * float(jnp.finfo(start.dtype).eps)) ** 2
-    return best.point, best.gain <= _GAIN * best.cost + floor
-
-
-class _Reached(eqx.Module):
-    point: Float[Array, " gaussians"]
-    cost: Float[Array, ""]
-    gain: Float[Array, ""]
+    return point, gain <= _GAIN * cost + floor
 
 
 def _gain(expansion: Expansion) -> Float[Array, ""]:
-    """Give by how much the sum of squares would fall if the residuals were linear: sound in
+    """Compute by how much the sum of squares would fall if the residuals were linear: accurate in
     float32, where the Hessian is not.
     """
-    normal = expansion.normal()
+    normal = jnp.einsum("cni,cnj->ij", expansion.jacobian, expansion.jacobian)
     squared = jnp.diagonal(normal)
-    lengths = jnp.sqrt(jnp.where(squared > 0, squared, jnp.ones_like(squared)))
+    lengths = jnp.sqrt(jnp.where(squared > 0, squared, 1.0))
     # Not half the gradient: the Jacobian is orthogonal to the basis, so that the rounding of the
-    # weights does not count.
+    # weights does not enter.
     along = jnp.einsum("cnk,cn->k", expansion.jacobian, expansion.residuals) / lengths
     return along @ invert_moving(normal / (lengths[:, None] * lengths[None])) @ along

@@ -21,7 +21,7 @@ class AbstractWeights(eqx.Module):
         energies: Float[Array, " gaussians"],
         total: Float[Array, ""],
     ) -> tuple[Float[Array, " gaussians"], Float[Array, "gaussians gaussians"]]:
-        """Give the coefficients in the set with the least `|target - basis @ coefficients|`, and
+        """Find the coefficients in the set with the least `|target - basis @ coefficients|`, and
         their response.
 
         **Arguments:** (all differentiable)
@@ -41,33 +41,20 @@ class FreeWeights(AbstractWeights):
     some per cent.
     """
 
-    def solve(
-        self,
-        basis: Float[Array, "rows gaussians"],
-        target: Float[Array, " rows"],
-        energies: Float[Array, " gaussians"],
-        total: Float[Array, ""],
-    ) -> tuple[Float[Array, " gaussians"], Float[Array, "gaussians gaussians"]]:
-        del energies, total
+    def solve(self, basis, target, energies, total):
         inverse = normal_inverse(basis)
         return least_squares(basis, target, inverse), inverse
 
 
-class TotalReflectanceHeld(AbstractWeights):
-    """Weights whose sum is the profile's total reflectance: the picture keeps its energy, at a
+class FixedTotalReflectance(AbstractWeights):
+    """Weights whose sum is the total reflectance of the profile: the picture keeps its energy, at a
     somewhat larger error.
     """
 
-    def solve(
-        self,
-        basis: Float[Array, "rows gaussians"],
-        target: Float[Array, " rows"],
-        energies: Float[Array, " gaussians"],
-        total: Float[Array, ""],
-    ) -> tuple[Float[Array, " gaussians"], Float[Array, "gaussians gaussians"]]:
+    def solve(self, basis, target, energies, total):
         inverse = normal_inverse(basis)
         free = least_squares(basis, target, inverse)
-        # The way from the free optimum to the constraint that adds least to the error.
+        # The direction from the free optimum to the constraint that adds least to the error.
         direction = inverse @ energies
         length = energies @ direction
         held = free + direction * ((total - energies @ free) / length)
@@ -75,14 +62,14 @@ class TotalReflectanceHeld(AbstractWeights):
 
 
 class NonNegativeWeights(AbstractWeights):
-    """None of the weights is below zero, as that of a mixture; otherwise as `among` has it.
+    """No weight below zero, as in a mixture; otherwise as `among`.
 
     Fits of single channels of a dipole have no negative weights anyway. Where variances are shared,
     some may become 0.
 
     **Attributes:**
 
-    - `among`: `FreeWeights()` (default) or `TotalReflectanceHeld()`.
+    - `among`: `FreeWeights()` (default) or `FixedTotalReflectance()`.
 
     **Source:** the conditions are those of Kuhn and Tucker; one index at a time is exchanged, the
     last first (Murty 1974), which ends for every positive definite problem.
@@ -90,13 +77,7 @@ class NonNegativeWeights(AbstractWeights):
 
     among: AbstractWeights = FreeWeights()
 
-    def solve(
-        self,
-        basis: Float[Array, "rows gaussians"],
-        target: Float[Array, " rows"],
-        energies: Float[Array, " gaussians"],
-        total: Float[Array, ""],
-    ) -> tuple[Float[Array, " gaussians"], Float[Array, "gaussians gaussians"]]:
+    def solve(self, basis, target, energies, total):
         count = basis.shape[1]
         tolerance = _ROUNDING * float(jnp.finfo(basis.dtype).eps)
 
@@ -106,7 +87,7 @@ class NonNegativeWeights(AbstractWeights):
         def wrong(positive):
             coefficients, _ = solved(positive)
             slope = basis.T @ (basis @ coefficients - target)
-            # What a held sum costs is the same slope for all that are not zero.
+            # A fixed sum adds the same slope to all coefficients that are not zero.
             share = jnp.where(positive, energies, 0.0)
             slope = slope - energies * (slope @ share) / jnp.maximum(share @ share, tolerance)
             return jnp.where(positive, coefficients < 0, slope < -tolerance)
@@ -117,16 +98,13 @@ class NonNegativeWeights(AbstractWeights):
             positive = positive ^ (jnp.arange(count) == last)
             return positive, wrong(positive), steps + 1
 
-        everything = jnp.ones(count, bool)
-        start = everything, wrong(everything), jnp.asarray(0)
+        start = jnp.ones(count, bool), wrong(jnp.ones(count, bool)), jnp.asarray(0)
         positive, *_ = jax.lax.while_loop(
             lambda state: jnp.any(state[1]) & (state[2] < _EXCHANGES), exchange, start
         )
         positive = jax.lax.stop_gradient(positive)
         coefficients, response = solved(positive)
-        return coefficients, jnp.where(
-            positive[:, None] & positive[None], response, jnp.zeros_like(response)
-        )
+        return coefficients, jnp.where(positive[:, None] & positive[None], response, 0.0)
 
 
 _ROUNDING = 100.0
@@ -141,15 +119,10 @@ def without_idle(
 ) -> tuple[
     Float[Array, "more_rows gaussians"], Float[Array, " more_rows"], Float[Array, " gaussians"]
 ]:
-    """Give the problem in which only the active Gaussians count: the others' coefficients are zero.
-
-    One more row for each idle column keeps the rank full.
+    """Fix the coefficients of idle Gaussians at zero: one more row for each idle column keeps the
+    rank full.
     """
-    idle = jnp.diag(jnp.where(active, jnp.zeros_like(energies), jnp.ones_like(energies)))
-    columns = jnp.where(jnp.broadcast_to(active, basis.shape), basis, jnp.zeros_like(basis))
-    rows = jnp.concatenate([columns, idle])
-    return (
-        rows,
-        jnp.concatenate([target, jnp.zeros_like(energies)]),
-        jnp.where(active, energies, jnp.zeros_like(energies)),
-    )
+    idle = jnp.diag((~active).astype(energies.dtype))
+    columns = jnp.where(jnp.broadcast_to(active, basis.shape), basis, 0.0)
+    longer = jnp.concatenate([target, jnp.zeros_like(energies)])
+    return jnp.concatenate([columns, idle]), longer, jnp.where(active, energies, 0.0)

@@ -1,5 +1,5 @@
-"""A step along the gradient of pictures: what moves, what each picture tells, and where the
-optimizer goes.
+"""A step along the gradient of pictures: the parts that move, the loss of each picture, and the
+step of the optimizer.
 """
 
 from collections.abc import Callable, Generator, Sequence
@@ -9,154 +9,148 @@ from typing import Any, Protocol, runtime_checkable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Float, PyTree
 
-from splatjax.render import Plan, render
+from splatjax.render import Plan, RenderSettings, render
 from splatjax.scene import Material, Scene, Splats
 
-from ._evidence import Evidence
-from ._parts import AbstractBodyPart, AbstractPart, AbstractShotPart, Shot
+from ._losses import (
+    AbstractBackground,
+    AbstractLoss,
+)
+from ._observation import Evidence
+from ._parts import AbstractPart, Setup
+
+Coordinates = tuple[PyTree[Array], ...]
+"""Of each part; where pictures do not share it, a tuple with those of each picture."""
 
 
 @runtime_checkable
 class GradientTransformation(Protocol):
-    """What optax calls so: a pair of functions."""
+    """An optimizer of optax: a pair of functions."""
 
     init: Callable[..., Any]
     update: Callable[..., Any]
 
 
-class Coordinates(eqx.Module):
-    """Of every part of the body, and of every part of each picture."""
+class MovableScene(eqx.Module):
+    """The material, and the parts of the scene that may move."""
 
-    body: tuple[PyTree[Array], ...]
-    shots: tuple[tuple[PyTree[Array], ...], ...]
-
-
-class World(eqx.Module):
-    """The start, and what of it may move."""
-
-    splats: Splats
     material: Material
-    middle: Float[Array, "3"]
-    body: tuple[AbstractBodyPart, ...]
+    parts: tuple[AbstractPart, ...]
     prepared: tuple[PyTree[Array], ...]
-    shot: tuple[AbstractShotPart, ...]
 
     @classmethod
-    def of(cls, splats: Splats, material: Material, parts: Sequence[AbstractPart]) -> "World":
-        body = tuple(part for part in parts if isinstance(part, AbstractBodyPart))
-        shot = tuple(part for part in parts if isinstance(part, AbstractShotPart))
-        for part in body:
-            part.check(splats)
-        return cls(
-            splats,
-            material,
-            jnp.mean(splats.centers, axis=0),
-            body,
-            tuple(each.prepared(splats) for each in body),
-            shot,
+    def of(
+        cls, splats: Splats, material: Material, parts: Sequence[AbstractPart]
+    ) -> "MovableScene":
+        return cls(material, tuple(parts), tuple(part.prepared(splats) for part in parts))
+
+    def start(self, setups: Sequence[Setup]) -> Coordinates:
+        """Return the coordinates of the start: zeros."""
+        return tuple(
+            part.coordinates(setups[0])
+            if part.shared
+            else tuple(part.coordinates(setup) for setup in setups)
+            for part in self.parts
         )
 
-    def coordinates(self) -> tuple[PyTree[Array], ...]:
-        return tuple(part.coordinates(self.splats) for part in self.body)
+    def of_picture(self, x: Coordinates, number: int) -> Coordinates:
+        """Select the coordinates that a picture depends on."""
+        return tuple(
+            own if part.shared else own[number] for part, own in zip(self.parts, x, strict=True)
+        )
 
-    def shot_coordinates(self, shot: Shot) -> tuple[PyTree[Array], ...]:
-        return tuple(part.coordinates(shot) for part in self.shot)
+    def of_all(self, pictures: Sequence[Coordinates]) -> Coordinates:
+        """Combine derivatives in the coordinates of each picture: add those of shared parts."""
+        return tuple(
+            jax.tree.map(lambda *leaves: sum(leaves[1:], leaves[0]), *own) if part.shared else own
+            for part, own in zip(self.parts, zip(*pictures, strict=True), strict=True)
+        )
 
-    def splats_at(self, x: tuple[PyTree[Array], ...]) -> Splats:
-        splats = self.splats
-        for part, its, prepared in zip(self.body, x, self.prepared, strict=True):
-            splats = part.moved(splats, its, prepared)
-        return splats
+    def moved(self, setup: Setup, x: Coordinates) -> Setup:
+        """Move the parts of a picture."""
+        for part, own, prepared in zip(self.parts, x, self.prepared, strict=True):
+            setup = part.moved(setup, own, prepared)
+        return setup
 
-    def shot_at(self, shot: Shot, x: tuple[PyTree[Array], ...]) -> Shot:
-        for part, its in zip(self.shot, x, strict=True):
-            shot = part.moved(shot, its, self.middle)
-        return shot
-
-    def unlikely(self, x: Coordinates) -> Float[Array, ""]:
-        priors = [
-            part.unlikely(its, own)
-            for part, its, own in zip(self.body, x.body, self.prepared, strict=True)
-        ]
-        return sum(priors, jnp.zeros((), self.splats.centers.dtype))
-
-
-class Seen(eqx.Module):
-    """A picture as arrays: 0 where it is not known, and which pixels may count."""
-
-    picture: Float[Array, "height width channels"]
-    deviation: Float[Array, "height width channels"]
-    known: Bool[Array, "height width"]
+    def prior(self, x: Coordinates) -> Float[Array, ""] | float:
+        return sum(
+            part.prior(one, prepared)
+            for part, own, prepared in zip(self.parts, x, self.prepared, strict=True)
+            for one in ((own,) if part.shared else own)
+        )
 
 
-class Told(eqx.Module):
-    """What a picture tells: its loss, and the gradient in the coordinates of the body and in its
-    own.
+class Evaluation(eqx.Module):
+    """A rendered picture and its loss: the sum over its values, their number, and the gradient in
+    the coordinates of the picture.
     """
 
-    value: tuple
+    loss: Float[Array, ""]
+    count: Float[Array, ""]
+    gradient: Coordinates
     overflow: Float[Array, ""]
     beauty: Float[Array, "height width channels"]
     counted: Float[Array, "height width"]
 
 
 @eqx.filter_jit
-def tell(
-    body, own, world: World, shot: Shot, seen: Seen, plan: Plan, settings, loss, background
-) -> Told:
-    """Render a picture, and differentiate its loss."""
+def evaluate(
+    x: Coordinates,
+    scene: MovableScene,
+    setup: Setup,
+    evidence: Evidence,
+    plan: Plan,
+    settings: RenderSettings,
+    loss: AbstractLoss,
+    background: AbstractBackground,
+) -> Evaluation:
+    """Render a picture at its coordinates, and differentiate its loss."""
 
-    def lost(x):
-        body, own = x
-        taken = world.shot_at(shot, own)
-        frame = render(
-            Scene(world.splats_at(body), taken.lights, world.material), taken.camera, settings, plan
-        )
-        counted = jnp.where(seen.known, background.counts(frame.coverage), 0.0)
-        counts = (counted > 0)[..., None]
-        residuals = jnp.where(counts, (frame.beauty - seen.picture) / seen.deviation, 0.0)
+    def total_loss(x):
+        moved = scene.moved(setup, x)
+        rendered = Scene(moved.splats, moved.lights, scene.material)
+        frame = render(rendered, moved.camera, settings, plan)
+        counted = jnp.where(evidence.known, background.counts(frame.coverage), 0.0)
+        residuals = (frame.beauty - evidence.picture) / evidence.deviation
+        residuals = jnp.where((counted > 0)[..., None], residuals, 0.0)
         return jnp.sum(loss.root(residuals) ** 2), (counted, frame)
 
-    (value, (counted, frame)), gradient = jax.value_and_grad(lost, has_aux=True)((body, own))
-    values = jnp.sum(counted) * frame.beauty.shape[2]
-    return Told((value, values, *gradient), frame.overflow, frame.beauty, counted)
+    (value, (counted, frame)), gradient = jax.value_and_grad(total_loss, has_aux=True)(x)
+    count = jnp.sum(counted) * frame.beauty.shape[2]
+    return Evaluation(value, count, gradient, frame.overflow, frame.beauty, counted)
 
 
 @eqx.filter_jit
-def advance(x: Coordinates, state, told, world: World, optimizer: GradientTransformation):
-    """Take a step; also give the loss before it, and whether all of it is finite."""
-    values, counts, body, own = zip(*told, strict=True)
-    unlikely, prior = jax.value_and_grad(world.unlikely)(x)
+def advance(
+    x: Coordinates,
+    state: PyTree,
+    evaluated: Sequence[tuple[Array, Array, Coordinates]],
+    scene: MovableScene,
+    optimizer: GradientTransformation,
+):
+    """Take a step; also return the loss before it, and whether loss and gradient are finite.
+
+    **Arguments:**
+
+    - `evaluated`: the loss of each picture, the number of its values, and its gradient.
+    """
+    losses, counts, gradients = zip(*evaluated, strict=True)
+    prior, prior_gradient = jax.value_and_grad(lambda x: jnp.asarray(scene.prior(x)))(x)
     count = jnp.maximum(jnp.sum(jnp.stack(counts)), 1.0)
-    summed = jax.tree.map(lambda *each: sum(each[1:], each[0]), prior.body, *body)
-    gradient = jax.tree.map(lambda leaf: leaf / count, Coordinates(summed, own))
-    value = (jnp.sum(jnp.stack(values)) + unlikely) / count
-    finite = jnp.stack(
-        [jnp.all(jnp.isfinite(leaf)) for leaf in (value, *jax.tree.leaves(gradient))]
+    gradient = jax.tree.map(
+        lambda *leaves: sum(leaves) / count, scene.of_all(gradients), prior_gradient
     )
-    with usual_promotion():
+    loss = (jnp.sum(jnp.stack(losses)) + prior) / count
+    finite = jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves((loss, gradient))])
+    with standard_promotion():
         updates, state = optimizer.update(gradient, state, x)
-    return jax.tree.map(lambda leaf, by: leaf + by, x, updates), state, value, jnp.all(finite)
+    return jax.tree.map(jnp.add, x, updates), state, loss, jnp.all(finite)
 
 
 @contextmanager
-def usual_promotion() -> Generator[None]:
-    """Optimizers are written for JAX's usual rules, whatever the user's are."""
+def standard_promotion() -> Generator[None]:
+    """Use JAX's default rules, for which optimizers are written, whatever the user has set."""
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
         yield
-
-
-def pictures_of(evidence: Evidence) -> list[Seen]:
-    """Put what was seen into arrays of the precision that is computed in."""
-    together = zip(evidence.pictures, evidence.deviations, evidence.masks, strict=True)
-    return [
-        Seen(
-            jnp.asarray(np.where(known[..., None], picture, 0.0), evidence.dtype),
-            jnp.asarray(deviation, evidence.dtype),
-            jnp.asarray(known),
-        )
-        for picture, deviation, known in together
-    ]

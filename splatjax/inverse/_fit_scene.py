@@ -1,36 +1,78 @@
-"""From pictures to what a body looks like and how they were taken: first-order, along the gradient
-of the renderer.
-"""
+"""Fit a scene to pictures along the gradient of the renderer: albedo, shape, lights and cameras."""
 
+import math
 from collections.abc import Callable, Sequence
+from typing import TypeVar
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
+from jaxtyping import DTypeLike, Float, PyTree
 
+from splatjax._records import as_floats
 from splatjax.render import Plan, RenderSettings
-from splatjax.scene import Material, Scene, Splats
+from splatjax.scene import AbstractLight, Camera, Material, Scene, Splats
 
-from ._background import AbstractBackground, UnknownBackground
 from ._descent import (
     Coordinates,
+    Evaluation,
     GradientTransformation,
-    Told,
-    World,
+    MovableScene,
     advance,
-    pictures_of,
-    tell,
-    usual_promotion,
+    evaluate,
+    standard_promotion,
 )
-from ._evidence import Evidence
-from ._fitted_scene import FittedScene
-from ._intensity import KnownIntensity
-from ._losses import AbstractLoss, SquaredLoss
-from ._observation import Observation, nothing_counts
-from ._parts import AbstractPart, Shot
-from ._plans import plans_of
+from ._layers import make_plans
+from ._losses import (
+    AbstractBackground,
+    AbstractLoss,
+    SquaredLoss,
+    UnknownBackground,
+)
+from ._observation import (
+    Evidence,
+    KnownIntensity,
+    Observation,
+    check_channels,
+    nothing_counts,
+)
+from ._parts import AbstractPart, Setup
+
+Tree = TypeVar("Tree", bound=PyTree)
+
+
+class FittedScene(eqx.Module):
+    r"""The best that a fit came by.
+
+    **Attributes:**
+
+    - `splats`: the body.
+    - `cameras`, `lights`: of each picture.
+    - `material`: as it was given.
+    - `losses`: at the start and after each step: sum of the losses of all pixels and of what the
+      priors add, over the number of values that count. About 1 where what is left is noise.
+    - `best`: the step with the least of them, which all else here is of. Static.
+    - `plans`: how many times was planned, once for the start. Static.
+    - `pictures`: what the renderer makes of it; NaN where a pixel does not count.
+    - `residuals`: pictures less what was observed.
+    - `result`: what became of it, as a message (`optimistix.RESULTS`).
+    """
+
+    splats: Splats
+    cameras: tuple[Camera, ...]
+    lights: tuple[tuple[AbstractLight, ...], ...]
+    material: Material
+    losses: Float[np.ndarray, " steps"]
+    pictures: tuple[Float[np.ndarray, "_ _ channels"], ...]
+    residuals: tuple[Float[np.ndarray, "_ _ channels"], ...]
+    result: optx.RESULTS
+    best: int = eqx.field(static=True)
+    plans: int = eqx.field(static=True)
+
+    def scene(self, picture: int = 0) -> Scene:
+        """Return the scene of a picture."""
+        return Scene(self.splats, self.lights[picture], self.material)
 
 
 def fit_scene(
@@ -41,42 +83,43 @@ def fit_scene(
     optimizer: GradientTransformation,
     *,
     steps: int,
-    loss: AbstractLoss | None = None,
-    background: AbstractBackground | None = None,
-    settings: RenderSettings | None = None,
+    loss: AbstractLoss = SquaredLoss(),
+    background: AbstractBackground = UnknownBackground(),
+    settings: RenderSettings = RenderSettings(),
     progress: Callable[[str, float], None] | None = None,
     throw: bool = True,
 ) -> FittedScene:
-    r"""Move parts of a scene along the gradient of its pictures until they look like those
-    observed.
+    r"""Move parts of a scene along the gradient of its pictures until they match the observed
+    pictures.
 
-    Each part has coordinates of its own that know no bounds and count its steps; the optimizer sees
-    nothing else, so that one learning rate serves all. What is made least is
+    Each part has unbounded coordinates that count its steps; the optimizer sees nothing else, so
+    that one learning rate serves all. The fit minimizes
 
         sum_pixels loss((rendered - observed) / deviation) + sum_coordinates (moved / expected)^2
 
-    over the number of pixels' values, the second sum over parts with a prior. Nothing is compiled
-    between steps. A plan that the scene has outgrown is made anew, from where the scene is then.
+    over the number of values of pixels, the second sum over parts with a prior. Nothing is compiled
+    between steps. Where the scene outgrows its plan, a new plan is made.
 
     **Arguments:**
 
-    - `observations`: one or more; their cameras and lights are where `CameraPoses`,
-      `LightStrengths` and `LightPlaces` start, and right if these do not move. A deviation of the
-      noise that is not given is 1% of the picture's root mean square.
-    - `splats`: the body, mm, where `AlbedoMap` and `NormalOffsets` start.
+    - `observations`: one or more; `CameraPoses`, `LightStrengths` and `LightPlaces` start from
+      their cameras and lights, which are right if these do not move. A deviation of the noise that
+      is not given is 1% of the root mean square of the picture.
+    - `splats`: the body, mm; `AlbedoMap` and `NormalOffsets` start from it.
     - `material`: known. `recover` finds coefficients.
     - `parts`: what may move, each kind once.
     - `optimizer`: any of optax whose update needs gradients alone. Its rate is in steps:
-      `optax.adam(1.0)` moves each coordinate by a step at a time at first. A rate that falls to
-      nothing, such as `optax.cosine_decay_schedule(1.0, steps)`, lets it come to rest.
+      `optax.adam(1.0)` first moves each coordinate by one step at a time. With a rate that falls to
+      zero, such as `optax.cosine_decay_schedule(1.0, steps)`, the fit comes to rest.
     - `steps`: how many.
-    - `loss`: `SquaredLoss()`, or `HuberLoss()` where some pixels are not what the model knows.
+    - `loss`: `SquaredLoss()`, or `HuberLoss()` where the model does not explain some pixels.
     - `background`: `UnknownBackground()`: only pixels that the body fills count.
-      `BlackBackground()`: all that masks leave do; cameras and outlines are then much better told.
+      `BlackBackground()`: all pixels that masks leave count, which determines cameras and outlines
+      much better.
     - `settings`: of the renderer.
-    - `progress`: told in words what is being done, and the loss.
-    - `throw`: raise when a loss or gradient is not finite; otherwise `result` says so, and what was
-      best up to then is given.
+    - `progress`: called with a description of each stage, and the loss.
+    - `throw`: raise when a loss or gradient is not finite; otherwise `result` reports it, and the
+      best scene so far is returned.
 
     **Returns:** a `FittedScene`: the best of all steps, in the precision of the splats.
 
@@ -86,104 +129,86 @@ def fit_scene(
     if `throw`.
     """
     observations, parts = list(observations), list(parts)
-    _check(observations, splats, material, parts, steps)
-    settings = RenderSettings() if settings is None else settings
-    loss = SquaredLoss() if loss is None else loss
-    background = UnknownBackground() if background is None else background
-    say = progress or _nobody
+    _check(observations, material, parts, steps)
+    report = progress or (lambda stage, loss: None)
     dtype = splats.centers.dtype
-    shots = [_cast(Shot(each.camera, each.lights), dtype) for each in observations]
-    world = World.of(_cast(splats, dtype), _cast(material, dtype), parts)
-    seen = pictures_of(Evidence(observations, dtype))
-    x = Coordinates(world.coordinates(), tuple(world.shot_coordinates(shot) for shot in shots))
+    setups = [_cast(Setup(splats, one.camera, one.lights), dtype) for one in observations]
+    scene = MovableScene.of(setups[0].splats, _cast(material, dtype), parts)
+    evidence = [Evidence.of(one, dtype) for one in observations]
+    x = scene.start(setups)
 
-    def planned(x: Coordinates) -> list[Plan]:
-        moved = [world.shot_at(shot, its) for shot, its in zip(shots, x.shots, strict=True)]
-        body = world.splats_at(x.body)
-        return plans_of(
-            [Scene(body, each.lights, world.material) for each in moved],
-            [each.camera for each in moved],
-            settings,
-        )
+    def moved(x: Coordinates) -> list[Setup]:
+        return [scene.moved(setup, scene.of_picture(x, i)) for i, setup in enumerate(setups)]
 
-    def told(x: Coordinates, plans: list[Plan]) -> list[Told]:
-        together = zip(x.shots, shots, seen, plans, strict=True)
+    def plan_all(x: Coordinates) -> list[Plan]:
+        scenes = [Scene(one.splats, one.lights, scene.material) for one in moved(x)]
+        return make_plans(scenes, [one.camera for one in moved(x)], settings)
+
+    def evaluate_all(x: Coordinates, plans: list[Plan]) -> list[Evaluation]:
         return [
-            tell(x.body, its, world, shot, one, plan, settings, loss, background)
-            for its, shot, one, plan in together
+            evaluate(scene.of_picture(x, i), scene, *one, settings, loss, background)
+            for i, one in enumerate(zip(setups, evidence, plans, strict=True))
         ]
 
-    say("planning", float("nan"))
-    plans, times = planned(x), 1
-    with usual_promotion():
+    report("planning", math.nan)
+    plans, times = plan_all(x), 1
+    with standard_promotion():
         state = optimizer.init(x)
     best, at, losses, result = None, x, [], optx.RESULTS.successful
     for step in range(steps + 1):
-        pictures = told(x, plans)
-        if max(float(each.overflow) for each in pictures) > 0:
-            say(
-                f"step {step}: the scene has outgrown its plan; planning anew",
-                losses[-1] if losses else float("nan"),
-            )
-            plans, times = planned(x), times + 1
-            pictures = told(x, plans)
-        if step == 0:
-            _check_counted(pictures)
-        ahead, state, value, finite = advance(
-            x, state, [each.value for each in pictures], world, optimizer
-        )
+        evaluations = evaluate_all(x, plans)
+        if max(float(one.overflow) for one in evaluations) > 0:
+            last = losses[-1] if losses else math.nan
+            report(f"step {step}: the scene exceeds the capacity of its plan; planning again", last)
+            plans, times = plan_all(x), times + 1
+            evaluations = evaluate_all(x, plans)
+        for i, evaluation in enumerate(evaluations if step == 0 else ()):
+            if not np.any(np.asarray(evaluation.counted) > 0):
+                raise nothing_counts(i)
+        values = [(one.loss, one.count, one.gradient) for one in evaluations]
+        ahead, state, value, finite = advance(x, state, values, scene, optimizer)
         losses.append(float(value))
         if not bool(finite):
             result = optx.RESULTS.nonfinite
             break
         if best is None or losses[-1] < losses[best]:
-            best, at, kept = step, x, pictures
-        say(f"step {step} of {steps}", losses[-1])
+            best, at, kept = step, x, evaluations
+        report(f"step {step} of {steps}", losses[-1])
         x = ahead
     if best is None:
         raise ValueError(
             "loss or gradient of the start is not finite: look for NaN in splats, lights and "
             "cameras, and for splats at a light"
         )
-    moved = [world.shot_at(shot, its) for shot, its in zip(shots, at.shots, strict=True)]
-    shown = [
-        _shown(each.beauty, each.counted, one.picture) for each, one in zip(kept, seen, strict=True)
-    ]
+    pictures = tuple(
+        np.where(np.asarray(one.counted)[..., None] > 0, np.asarray(one.beauty), np.nan)
+        for one in kept
+    )
     fitted = FittedScene(
-        splats=world.splats_at(at.body),
-        cameras=tuple(each.camera for each in moved),
-        lights=tuple(each.lights for each in moved),
-        material=world.material,
+        splats=moved(at)[0].splats,
+        cameras=tuple(one.camera for one in moved(at)),
+        lights=tuple(one.lights for one in moved(at)),
+        material=scene.material,
         losses=np.asarray(losses),
-        pictures=tuple(made for made, _ in shown),
-        residuals=tuple(left for _, left in shown),
+        pictures=pictures,
+        residuals=tuple(
+            made - np.asarray(one.picture) for made, one in zip(pictures, evidence, strict=True)
+        ),
         result=result,
         best=best,
         plans=times,
     )
-    return (
-        fitted.result.error_if(fitted, True)
-        if throw and result != optx.RESULTS.successful
-        else fitted
-    )
+    if throw and result != optx.RESULTS.successful:
+        return fitted.result.error_if(fitted, True)
+    return fitted
 
 
-def _shown(beauty, counted, picture) -> tuple[np.ndarray, np.ndarray]:
-    """Give a picture and what it is off, NaN where it does not count."""
-    made = np.where(np.asarray(counted)[..., None] > 0, np.asarray(beauty), np.nan)
-    return made, made - np.asarray(picture)
-
-
-def _cast(tree, dtype):
-    return jax.tree.map(
-        lambda leaf: jnp.asarray(np.asarray(leaf), dtype) if eqx.is_inexact_array(leaf) else leaf,
-        tree,
-    )
+def _cast(tree: Tree, dtype: DTypeLike) -> Tree:
+    return jax.tree.map(lambda leaf: as_floats(np.asarray(leaf), dtype), tree)
 
 
 def _check(
     observations: list[Observation],
-    splats: Splats,
     material: Material,
     parts: list[AbstractPart],
     steps: int,
@@ -196,26 +221,11 @@ def _check(
     kinds = [type(part).__name__ for part in parts]
     if len(set(kinds)) < len(kinds):
         raise ValueError(f"each kind of part may be given once; parts are {', '.join(kinds)}")
-    channels = material.gaussians.weights.shape[1]
-    for i, each in enumerate(observations):
-        if each.picture.shape[2] != channels:
+    channels = material.channels
+    for i, observation in enumerate(observations):
+        check_channels(i, observation, channels, "material")
+        if not isinstance(observation.intensity, KnownIntensity):
             raise ValueError(
-                f"observations[{i}].picture has {each.picture.shape[2]} channels, material has "
-                f"{channels}"
+                f"observations[{i}].intensity is {type(observation.intensity).__name__}(): that is "
+                "for recover; here LightStrengths among the parts lets lights be of any strength"
             )
-        if not isinstance(each.intensity, KnownIntensity):
-            raise ValueError(
-                f"observations[{i}].intensity is {type(each.intensity).__name__}(): that is for "
-                "recover; "
-                "here LightStrengths among the parts lets lights be of any strength"
-            )
-
-
-def _check_counted(pictures: list[Told]) -> None:
-    for i, each in enumerate(pictures):
-        if not np.any(np.asarray(each.counted) > 0):
-            raise nothing_counts(i)
-
-
-def _nobody(said: str, loss: float) -> None:
-    del said, loss

@@ -7,36 +7,40 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from splatjax.fitting import AbstractWeights
+from splatjax._format import percent
+from splatjax._records import record, several
+from splatjax.fitting import AbstractWeights, FixedTotalReflectance, NonNegativeWeights
 from splatjax.gaussians import AbstractProfile
 from splatjax.render import RenderSettings
 from splatjax.scattering import Dipole, Medium
 from splatjax.scene import AbstractLight, Camera, DirectionalLight, GaussianBeam, Splats
-from splatjax.words import percent
 
 from ._estimate import Combination, best_and_worst
-from ._evidence import Evidence
-from ._flat import Gatherer
-from ._intensity import AbstractIntensity, KnownIntensity
+from ._flat import which_count
+from ._layers import render_layers
 from ._losses import SquaredLoss
-from ._observation import Observation
-from ._problem import Fitted, solution, usual_weights
+from ._observation import (
+    AbstractIntensity,
+    Evidence,
+    KnownIntensity,
+    Observation,
+)
+from ._problem import FittedVariances, RecoveryProblem, Unknowns, solution
 from ._recovery import Recovery
 
 
+@record
 class Candidate(eqx.Module):
-    """A picture that could be taken: what it is called, from where, and under which lights. Its
-    strength may be unknown.
-    """
+    """A picture that could be taken: its name, camera and lights, whose strength may be unknown."""
 
     name: str = eqx.field(static=True)
     camera: Camera
-    lights: tuple[AbstractLight, ...]
+    lights: tuple[AbstractLight, ...] = eqx.field(converter=several)
     intensity: AbstractIntensity = KnownIntensity()
 
 
 class Prediction(eqx.Module):
-    r"""What a picture would do to the error bars.
+    r"""The error bars with another picture.
 
     **Attributes:**
 
@@ -49,10 +53,9 @@ class Prediction(eqx.Module):
 
     @property
     def worst(self) -> Combination:
-        """The combination, of all channels, that is known worst then."""
-        return max(
-            (best_and_worst(each)[1] for each in self.covariance), key=lambda each: each.deviation
-        )
+        """The combination with the largest error, of all channels."""
+        worst = [best_and_worst(covariance)[1] for covariance in self.covariance]
+        return max(worst, key=lambda combination: combination.deviation)
 
     def __str__(self) -> str:
         return (
@@ -67,25 +70,24 @@ def next_pictures(
     candidates: Sequence[Candidate],
     *,
     model: Callable[[Medium], AbstractProfile] = Dipole,
-    weights: AbstractWeights | None = None,
-    settings: RenderSettings | None = None,
+    weights: AbstractWeights = NonNegativeWeights(FixedTotalReflectance()),
+    settings: RenderSettings = RenderSettings(),
 ) -> list[Prediction]:
-    r"""Rank pictures that could be taken by how well the coefficients would be known with each of
-    them.
+    r"""Rank pictures that could be taken by the error bars of the coefficients with each of them.
 
-    Each is rendered once, of the material that was found, and differentiated; noise is taken to be
-    the same share of its brightness as in the pictures before. Information adds up, and its inverse
-    is the covariance.
+    Each is rendered once, of the recovered material, and differentiated; its noise is the same
+    fraction of its brightness as in the pictures before. Information adds up, and its inverse is
+    the covariance.
 
     **Arguments:** `model` and `weights` as in `recover`.
 
-    - `recovery`: what is known by now.
+    - `recovery`: from the pictures before.
     - `splats`: of the body.
-    - `candidates`: at least one; `usual_candidates` gives some.
+    - `candidates`: at least one; `default_candidates` gives some.
     - `settings`: of the renderer. By default those of `render`: a prediction needs no layers as
       fine as a search does.
 
-    **Returns:** predictions; first the one whose worst known combination is known best.
+    **Returns:** predictions; first the one with the least error of its worst combination.
 
     **Raises:** `ValueError` for no candidate, and for one that shows nothing of the body.
     """
@@ -93,57 +95,52 @@ def next_pictures(
     if not candidates:
         raise ValueError(
             "candidates is empty: name a picture that could be taken, or take "
-            "usual_candidates(splats, camera)"
+            "default_candidates(splats, camera)"
         )
-    weights = usual_weights() if weights is None else weights
-    settings = RenderSettings() if settings is None else settings
-    medium, dtype = recovery.medium, recovery.medium.sigma_a.dtype
-    cameras, lights = [each.camera for each in candidates], [each.lights for each in candidates]
-    gathered, _ = Gatherer(splats, settings, cameras, lights).moving(recovery.material)
-    variances = Fitted(recovery.material.gaussians.variances.astype(dtype))
+    medium, loss = recovery.medium, SquaredLoss()
+    channels, dtype = medium.channels, medium.eta.dtype
+    observations = []
+    for one in candidates:
+        dark = np.zeros((one.camera.height, one.camera.width, channels))
+        observations.append(Observation(dark, one.camera, one.lights, intensity=one.intensity))
+    rendered, _ = render_layers(splats, recovery.material, observations, settings)
+    fit = FittedVariances(recovery.material.gaussians.variances.astype(dtype), weights)
     noise = recovery.relative_noise * recovery.scale**0.5
-    before, found = len(recovery.information), []
-    for candidate, picture in zip(candidates, gathered, strict=True):
-        dark = np.zeros((candidate.camera.height, candidate.camera.width, len(medium.eta)))
-        evidence = Evidence(
-            [Observation(dark, candidate.camera, candidate.lights, intensity=candidate.intensity)],
-            dtype,
-        )
-        unknowns, factors = evidence.unknowns(medium.eta)
-        problem, _ = evidence.problem([picture], unknowns, variances, SquaredLoss(), weights, model)
-        point = unknowns.start(medium, factors)
-        seen = solution(problem, point)
-        bright = float(jnp.sqrt(jnp.mean(seen.radiance**2)))
-        deviations = noise * (bright or 1.0) / float(problem.deviation[0, 0])
-        told = np.asarray(seen.information, float) / max(deviations, np.finfo(float).tiny) ** 2
-        channels = len(medium.eta)
-        found.append(
-            Prediction(
-                candidate, recovery.covariance(_marginal(told, 2 * channels, channels, before))
-            )
-        )
-    return sorted(found, key=lambda each: each.worst.deviation)
+    predictions = []
+    for candidate, observation, picture in zip(candidates, observations, rendered, strict=True):
+        evidence = [Evidence.of(observation, dtype)]
+        unknowns = Unknowns.of(medium.eta, [candidate.intensity])
+        counted = which_count([picture], evidence)
+        problem = RecoveryProblem.of([picture], evidence, counted, unknowns, fit, loss, model)
+        at_point = solution(problem, unknowns.start(medium))
+        bright = float(jnp.sqrt(jnp.mean(at_point.radiance**2)))
+        deviation = noise * (bright or 1.0) / float(problem.deviation[0, 0])
+        scale = max(deviation, np.finfo(float).tiny) ** -2
+        information = np.asarray(at_point.information, float) * scale
+        more = _marginal(information, channels, len(recovery.information))
+        predictions.append(Prediction(candidate, recovery.covariance(more)))
+    return sorted(predictions, key=lambda prediction: prediction.worst.deviation)
 
 
-def _marginal(information: np.ndarray, own: int, channels: int, size: int) -> np.ndarray:
-    """Give what is told of coefficients and handover, whatever the picture's own factors are; with
-    room for those of others.
+def _marginal(information: np.ndarray, channels: int, size: int) -> np.ndarray:
+    """Eliminate the factors of a picture from its information about coefficients and the transition
+    to unresolved layers, and leave room for the factors of other pictures.
     """
-    kept = np.r_[:own, len(information) - channels : len(information)]
-    factors = np.arange(own, len(information) - channels)
-    told = information[np.ix_(kept, kept)]
-    if factors.size:
-        mixed = information[np.ix_(kept, factors)]
-        told = told - mixed @ np.linalg.pinv(information[np.ix_(factors, factors)]) @ mixed.T
-    there = np.r_[:own, size - channels : size]
-    whole = np.zeros((size, size))
-    whole[np.ix_(there, there)] = told
+
+    def apart(size):
+        return np.r_[: 2 * channels, size - channels : size], np.r_[2 * channels : size - channels]
+
+    kept, factors = apart(len(information))
+    mixed = information[np.ix_(kept, factors)]
+    inverse = np.linalg.pinv(information[np.ix_(factors, factors)])
+    whole, (places, _) = np.zeros((size, size)), apart(size)
+    whole[np.ix_(places, places)] = information[np.ix_(kept, kept)] - mixed @ inverse @ mixed.T
     return whole
 
 
-def usual_candidates(splats: Splats, camera: Camera, channels: int = 3) -> list[Candidate]:
-    r"""Give pictures that one could take with a camera: parallel light from the front, left, right,
-    above and behind, and a laser dot in the middle of the picture, as wide as a few splats.
+def default_candidates(splats: Splats, camera: Camera, channels: int = 3) -> list[Candidate]:
+    r"""Propose pictures that one could take with a camera: parallel light from the front, left,
+    right, above and behind, and a laser dot in the middle of the picture, as wide as a few splats.
 
     **Arguments:**
 
@@ -152,37 +149,30 @@ def usual_candidates(splats: Splats, camera: Camera, channels: int = 3) -> list[
     - `channels`: of the pictures.
     """
     right, down, forward = np.asarray(camera.rotation, float)
-    ways = {
+    directions = {
         "light from the front": forward,
         "light from the left": right + 0.3 * forward,
         "light from the right": -right + 0.3 * forward,
         "light from above": down + 0.3 * forward,
         "light from behind": -forward + 0.5 * down,
     }
-    dtype = splats.centers.dtype
-    strength = jnp.full(channels, jnp.pi, dtype)
+    strength, eye = np.full(channels, np.pi), np.asarray(camera.position, float)
+    squared_spacing = float(np.mean(splats.areas))
+    spot = _middle(splats, camera)
+    beam = GaussianBeam(eye, spot - eye, strength * squared_spacing, 4 * squared_spacing)
     lights = {
-        name: DirectionalLight(direction=jnp.asarray(way, dtype), irradiance=strength)
-        for name, way in ways.items()
-    }
-    found = [Candidate(name, camera, (light,)) for name, light in lights.items()]
-    spot, spacing = _middle(splats, camera), float(np.sqrt(np.mean(splats.areas)))
-    eye = np.asarray(camera.position, float)
-    beam = GaussianBeam(
-        jnp.asarray(eye, dtype),
-        jnp.asarray(spot - eye, dtype),
-        strength * spacing**2,
-        jnp.asarray((2 * spacing) ** 2, dtype),
-    )
-    return [*found, Candidate("a laser dot in the middle", camera, (beam,))]
+        name: DirectionalLight(direction=direction, irradiance=strength)
+        for name, direction in directions.items()
+    } | {"a laser dot in the middle": beam}
+    return [Candidate(name, camera, light) for name, light in lights.items()]
 
 
 def _middle(splats: Splats, camera: Camera) -> np.ndarray:
-    """Give the center of the nearest splat at the middle of the picture, or of the one that is next
-    to it.
-    """
-    offset = np.asarray(splats.centers, float) - np.asarray(camera.position, float)
-    across, down, depth = np.asarray(camera.rotation, float) @ offset.T
+    """Find the center of the nearest splat at the middle of the picture, or beside it."""
+    centers = np.asarray(splats.centers, float)
+    across, down, depth = (
+        np.asarray(camera.rotation, float) @ (centers - np.asarray(camera.position, float)).T
+    )
     aside = np.hypot(across, down) / np.maximum(depth, 1e-9) + np.where(depth > 0, 0.0, np.inf)
-    near = aside <= 1.5 * np.min(aside) + 2 * float(np.mean(splats.radii)) / float(np.mean(depth))
-    return np.asarray(splats.centers, float)[np.argmin(np.where(near, depth, np.inf))]
+    reach = 1.5 * np.min(aside) + 2 * float(np.mean(splats.radii)) / float(np.mean(depth))
+    return centers[np.argmin(np.where(aside <= reach, depth, np.inf))]

@@ -8,11 +8,11 @@ import numpy as np
 import scipy  # its parts are loaded where they are used, which takes a third of a second
 from jaxtyping import Array, Float, Int
 
+from splatjax._chunking import jit_unless_traced
 from splatjax.geometry import tangent_frames
-from splatjax.pointwise import one_program
 from splatjax.scene import Splats
 
-from ._parts import AbstractBodyPart
+from ._parts import AbstractPart, Setup
 
 _REACH = 2.5  # of the blur, standard deviations
 _SLOPES = 17  # splats among which slopes are measured, itself included
@@ -22,56 +22,56 @@ _SAME_SIDE = 0.3  # least cosine between normals of splats that belong together
 
 
 class OffsetTables(eqx.Module):
-    """Of each splat its neighbors: those that its offset is blurred over, and those that its slope
-    is measured among.
+    """The neighbors of each splat: those that its offset is blurred over, and those among which its
+    slope is measured.
     """
 
     blurred: Int[Array, "splats _near"]
     weights: Float[Array, "splats _near"]
     around: Int[Array, "splats _around"]
     slopes: Float[Array, "splats _around 2"]
-    """Sums of values times these are derivatives along the tangents; exact for what is quadratic in
-    them.
+    """Sums of values times these are derivatives along the tangents, exact for quadratic
+    functions of them.
     """
     tangents: Float[Array, "splats 2 3"]
     gain: Float[Array, ""]
-    """Root mean square of blurred noise whose own is 1."""
+    """Root mean square of blurred noise of root mean square 1."""
 
 
-class NormalOffsets(AbstractBodyPart):
-    r"""How far each splat has moved along the normal it starts with: a displacement map, no finer
-    than `smoothness`.
+class NormalOffsets(AbstractPart):
+    r"""The distance that each splat has moved along its normal at the start: a displacement map, no
+    finer than `smoothness`.
 
         offset = step blur(x),   center = start + offset normal
 
     The blur is a Gaussian over the surface that takes means, so that an offset moves by no more
     than its coordinates do. Normals, areas and radii follow from the slopes of the offsets among
-    the neighbors of each splat: light feels a bump by its normals. A splat farther than 2.5
-    `smoothness` from all that the pictures tell of stays exactly where it is.
+    the neighbors of each splat: a bump is lit by its normals. A splat farther than 2.5 `smoothness`
+    from all that the pictures show stays exactly where it is.
 
     **Attributes:** (static)
 
     - `step`: mm.
-    - `smoothness`: standard deviation of the blur, mm; some spacings of the splats. What is finer
-      is not looked for.
+    - `smoothness`: standard deviation of the blur, mm; some spacings of the splats. Finer bumps
+      are not searched.
     - `deviation`: how large an offset is expected to be, one standard deviation of a normal prior,
       mm.
     """
 
+    shared = True
     step: float = eqx.field(static=True)
     smoothness: float = eqx.field(static=True)
     deviation: float = eqx.field(static=True)
 
-    def check(self, splats: Splats) -> None:
+    def prepared(self, splats: Splats) -> OffsetTables:
         if splats.count < _SLOPES:
             raise ValueError(
                 f"{splats.count} splats are too few to measure slopes among; NormalOffsets needs "
                 f"{_SLOPES} at least"
             )
-
-    def prepared(self, splats: Splats) -> OffsetTables:
         centers, normals, areas = (
-            np.asarray(each, np.float64) for each in (splats.centers, splats.normals, splats.areas)
+            np.asarray(field, np.float64)
+            for field in (splats.centers, splats.normals, splats.areas)
         )
         tree, dtype = scipy.spatial.KDTree(centers), splats.centers.dtype
         count = int(
@@ -82,64 +82,63 @@ class NormalOffsets(AbstractBodyPart):
         )
         around, tangents, slopes = _slopes(tree, normals)
         gain = math.sqrt(np.mean(np.sum(weights**2, axis=1)))
-        arrays = weights, slopes, tangents, np.asarray(gain)
-        weights, slopes, tangents, gain = (jnp.asarray(each, dtype) for each in arrays)
         return OffsetTables(
             jnp.asarray(near, jnp.int32),
-            weights,
+            jnp.asarray(weights, dtype),
             jnp.asarray(around, jnp.int32),
-            slopes,
-            tangents,
-            gain,
+            jnp.asarray(slopes, dtype),
+            jnp.asarray(tangents, dtype),
+            jnp.asarray(gain, dtype),
         )
 
-    def coordinates(self, splats: Splats) -> Float[Array, " splats"]:
-        return jnp.zeros_like(splats.areas)
+    def coordinates(self, setup: Setup) -> Float[Array, " splats"]:
+        return jnp.zeros_like(setup.splats.areas)
 
-    @one_program
-    def moved(self, splats: Splats, x: Float[Array, " splats"], prepared: OffsetTables) -> Splats:
+    @jit_unless_traced
+    def moved(self, setup: Setup, x: Float[Array, " splats"], prepared: OffsetTables) -> Setup:
+        splats = setup.splats
         offsets = self.step * jnp.sum(prepared.weights * x[prepared.blurred], axis=1)
-        ways = offsets[:, None] * splats.normals
-        apart = ways[prepared.around] - ways[:, None]
-        # The tangents of the start, and how the way that each splat has gone changes along them.
+        shifts = offsets[:, None] * splats.normals
+        apart = shifts[prepared.around] - shifts[:, None]
+        # The tangents of the start, and how the offsets of the splats change along them.
         along = prepared.tangents + jnp.sum(prepared.slopes[..., None] * apart[:, :, None], axis=1)
         across = jnp.cross(along[:, 0], along[:, 1])
         stretch = jnp.sqrt(jnp.sum(across * across, axis=1))
+        moved = (
+            splats.centers + shifts,
+            across / stretch[:, None],
+            splats.areas * stretch,
+            splats.radii * jnp.sqrt(stretch),
+        )
         return eqx.tree_at(
-            lambda s: (s.centers, s.normals, s.areas, s.radii),
-            splats,
-            (
-                splats.centers + ways,
-                across / stretch[:, None],
-                splats.areas * stretch,
-                splats.radii * jnp.sqrt(stretch),
-            ),
+            lambda s: (s.splats.centers, s.splats.normals, s.splats.areas, s.splats.radii),
+            setup,
+            moved,
         )
 
-    def unlikely(self, x: Float[Array, " splats"], prepared: OffsetTables) -> Float[Array, ""]:
+    def prior(self, x: Float[Array, " splats"], prepared: OffsetTables) -> Float[Array, ""]:
         return jnp.sum((self.step * prepared.gain / self.deviation * x) ** 2)
 
 
 def _blur(
     tree: "scipy.spatial.KDTree", normals: np.ndarray, areas: np.ndarray, width: float, count: int
 ):
-    """Give neighbors and the weights of a mean over them; those beyond reach and on other sides
-    have none.
+    """Find neighbors and the weights of a mean over them; neighbors beyond reach and on another
+    side of the body have weight 0.
     """
     distances, near = tree.query(
         tree.data, k=np.arange(1, count + 1), distance_upper_bound=_REACH * width, workers=-1
     )
-    there = near < len(areas)
-    near = np.where(there, near, np.arange(len(areas))[:, None])
-    there &= np.einsum("nki,ni->nk", normals[near], normals) > _SAME_SIDE
-    weights = np.where(
-        there, np.exp(-0.5 * (np.where(there, distances, 0.0) / width) ** 2) * areas[near], 0.0
-    )
+    counts = near < len(areas)
+    near = np.where(counts, near, np.arange(len(areas))[:, None])
+    counts &= np.einsum("nki,ni->nk", normals[near], normals) > _SAME_SIDE
+    blur = np.exp(-0.5 * (np.where(counts, distances, 0.0) / width) ** 2)
+    weights = np.where(counts, blur * areas[near], 0.0)
     return near, weights / np.sum(weights, axis=1, keepdims=True)
 
 
 def _slopes(tree: "scipy.spatial.KDTree", normals: np.ndarray):
-    """Give neighbors, tangents, and the weights of derivatives along them: least squares with
+    """Find neighbors, tangents, and the weights of derivatives along them: least squares with
     quadratic terms.
     """
     around = tree.query(tree.data, k=_SLOPES, workers=-1)[1][:, 1:]

@@ -1,32 +1,37 @@
-"""Parts of a scene that may move, each in coordinates that know no bounds."""
+"""Parts of a scene that may move, each in unbounded coordinates."""
 
 import abc
 import dataclasses
+from typing import ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from splatjax.scene import AbstractLight, Camera, DirectionalLight, GaussianBeam, PointLight, Splats
+from splatjax.scene import AbstractLight, Camera, Splats
 
 _BOUNDED = 1e-3
 """An albedo moves between this and one less this: at 0 and 1 themselves the logit is infinite."""
 
 
-class Shot(eqx.Module):
-    """A camera and the lights of its picture."""
+class Setup(eqx.Module):
+    """The splats of a picture, its camera and its lights."""
 
+    splats: Splats
     camera: Camera
     lights: tuple[AbstractLight, ...]
 
 
 class AbstractPart(eqx.Module):
-    r"""What may move. Its coordinates count steps from where it starts: there they are all zero.
+    r"""A part that may move. Its coordinates count steps from its start, where they are zero.
 
     An optimizer sees coordinates in steps, so that one learning rate serves all parts: Adam at a
     rate of 1 moves each by up to one step at a time.
     """
+
+    shared: ClassVar[bool] = False
+    """Whether all pictures share the part; else each has its own."""
 
     def __check_init__(self):
         for field in dataclasses.fields(self):
@@ -36,48 +41,26 @@ class AbstractPart(eqx.Module):
                     f"{type(self).__name__}.{field.name} must be positive; got {value:g}"
                 )
 
-
-class AbstractBodyPart(AbstractPart):
-    """A part of the body, which all pictures share."""
-
-    @abc.abstractmethod
-    def check(self, splats: Splats) -> None:
-        """Raise `ValueError` for splats that do not have the part."""
-
     def prepared(self, splats: Splats) -> PyTree[Array]:
-        """Give what is found once, of the splats at the start."""
-        del splats
+        """Compute what depends on the splats at the start alone."""
+        return None
 
     @abc.abstractmethod
-    def coordinates(self, splats: Splats) -> PyTree[Array]:
-        """Give the coordinates of the start: zeros."""
+    def coordinates(self, setup: Setup) -> PyTree[Array]:
+        """Return the coordinates of the start: zeros. Raise `ValueError` without such a part."""
 
     @abc.abstractmethod
-    def moved(self, splats: Splats, x: PyTree[Array], prepared: PyTree[Array]) -> Splats:
-        """Give the splats at coordinates. Differentiable."""
+    def moved(self, setup: Setup, x: PyTree[Array], prepared: PyTree[Array]) -> Setup:
+        """Move the part to coordinates. Differentiable."""
 
-    @abc.abstractmethod
-    def unlikely(self, x: PyTree[Array], prepared: PyTree[Array]) -> Float[Array, ""]:
-        """Give what the prior adds to the loss: squares of the coordinates over what they are
-        expected to be.
+    def prior(self, x: PyTree[Array], prepared: PyTree[Array]) -> Float[Array, ""] | float:
+        """Compute what the prior adds to the loss: squares of the coordinates over their expected
+        deviations.
         """
+        return 0.0
 
 
-class AbstractShotPart(AbstractPart):
-    """A part of how pictures were taken: each has its own."""
-
-    @abc.abstractmethod
-    def coordinates(self, shot: Shot) -> PyTree[Array]:
-        """Give the coordinates of the start: zeros."""
-
-    @abc.abstractmethod
-    def moved(self, shot: Shot, x: PyTree[Array], middle: Float[Array, "3"]) -> Shot:
-        """Give camera and lights at coordinates; `middle` is that of the body, mm.
-        Differentiable.
-        """
-
-
-class AlbedoMap(AbstractBodyPart):
+class AlbedoMap(AbstractPart):
     r"""The albedo of every splat and channel, as a logit: it stays between 0 and 1.
 
         albedo = 1 / (1 + exp(-(logit(start) + step x)))
@@ -86,40 +69,36 @@ class AlbedoMap(AbstractBodyPart):
 
     - `step`: of the logit: 0.1 moves an albedo of 0.5 by 0.025.
     - `deviation`: how far from the start a logit is expected, one standard deviation of a normal
-      prior. A splat that no picture tells of stays where it started; one of which they tell next to
-      nothing stays near.
+      prior. A splat that no picture shows keeps its albedo; one that they hardly show keeps nearly
+      its albedo.
 
     Albedos that start below 0.001 or above 0.999 start there.
     """
 
+    shared = True
     step: float = eqx.field(static=True, default=0.1)
     deviation: float = eqx.field(static=True, default=3.0)
 
-    def check(self, splats: Splats) -> None:
-        if splats.albedo is None:
+    def coordinates(self, setup: Setup) -> Float[Array, "splats channels"]:
+        if setup.splats.albedo is None:
             raise ValueError(
-                "splats.albedo is None, and AlbedoMap has nothing to move: start from a map, 0.5 "
-                "everywhere for one"
+                "splats.albedo is None, and AlbedoMap has nothing to move: start from a map, such "
+                "as 0.5 everywhere"
             )
+        return jnp.zeros_like(setup.splats.albedo)
 
-    def coordinates(self, splats: Splats) -> Float[Array, "splats channels"]:
-        assert splats.albedo is not None
-        return jnp.zeros_like(splats.albedo)
+    def moved(self, setup: Setup, x: Float[Array, "splats channels"], prepared: None) -> Setup:
+        start = jnp.clip(setup.splats.albedo, _BOUNDED, 1 - _BOUNDED)
+        albedo = jax.nn.sigmoid(jax.scipy.special.logit(start) + self.step * x)
+        return eqx.tree_at(lambda s: s.splats.albedo, setup, albedo)
 
-    def moved(self, splats: Splats, x: Float[Array, "splats channels"], prepared: None) -> Splats:
-        del prepared
-        assert splats.albedo is not None
-        start = jax.scipy.special.logit(jnp.clip(splats.albedo, _BOUNDED, 1 - _BOUNDED))
-        return eqx.tree_at(lambda s: s.albedo, splats, jax.nn.sigmoid(start + self.step * x))
-
-    def unlikely(self, x: Float[Array, "splats channels"], prepared: None) -> Float[Array, ""]:
-        del prepared
+    def prior(self, x: Float[Array, "splats channels"], prepared: None) -> Float[Array, ""]:
         return jnp.sum((self.step / self.deviation * x) ** 2)
 
 
-class LightStrengths(AbstractShotPart):
-    """How strong each light of each picture is, channel by channel, as a logarithm: of irradiance,
-    intensity or power.
+class LightStrengths(AbstractPart):
+    """The strength of each light of each picture, channel by channel, as a logarithm: of
+    irradiance, intensity or power.
 
     **Attributes:** (static)
 
@@ -128,24 +107,26 @@ class LightStrengths(AbstractShotPart):
 
     step: float = eqx.field(static=True, default=0.05)
 
-    def coordinates(self, shot: Shot) -> tuple[Float[Array, " channels"], ...]:
-        return tuple(
-            jnp.zeros_like(getattr(light, _of(light, _STRENGTHS))) for light in shot.lights
+    def coordinates(self, setup: Setup) -> tuple[Float[Array, " channels"], ...]:
+        for light in setup.lights:
+            if not light.strength:
+                raise ValueError(
+                    f"{type(light).__name__}.strength names no field that LightStrengths may move"
+                )
+        return tuple(jnp.zeros_like(getattr(light, light.strength)) for light in setup.lights)
+
+    def moved(self, setup: Setup, x, prepared) -> Setup:
+        return _with_lights(
+            setup,
+            [
+                {light.strength: getattr(light, light.strength) * jnp.exp(self.step * steps)}
+                for light, steps in zip(setup.lights, x, strict=True)
+            ],
         )
 
-    def moved(
-        self, shot: Shot, x: tuple[Float[Array, " channels"], ...], middle: Float[Array, "3"]
-    ) -> Shot:
-        del middle
-        lights = []
-        for light, its in zip(shot.lights, x, strict=True):
-            name = _of(light, _STRENGTHS)
-            lights.append(_with(light, name, getattr(light, name) * jnp.exp(self.step * its)))
-        return Shot(shot.camera, tuple(lights))
 
-
-class LightPlaces(AbstractShotPart):
-    """Where each light of each picture is: directions turn, and point lights and the origins of
+class LightPlaces(AbstractPart):
+    """The place of each light of each picture: directions turn, and point lights and the origins of
     beams shift.
 
     **Attributes:** (static)
@@ -157,36 +138,29 @@ class LightPlaces(AbstractShotPart):
     turn: float = eqx.field(static=True, default=0.02)
     shift: float = eqx.field(static=True, default=1.0)
 
-    def coordinates(self, shot: Shot) -> tuple[dict[str, Float[Array, "3"]], ...]:
+    def coordinates(self, setup: Setup) -> tuple[dict[str, Float[Array, "3"]], ...]:
         return tuple(
-            {name: jnp.zeros_like(getattr(light, name)) for name in _of(light, _PLACES)}
-            for light in shot.lights
+            {name: jnp.zeros_like(getattr(light, name)) for name in _places(light)}
+            for light in setup.lights
         )
 
-    def moved(
-        self, shot: Shot, x: tuple[dict[str, Float[Array, "3"]], ...], middle: Float[Array, "3"]
-    ) -> Shot:
-        del middle
-        lights = []
-        for light, its in zip(shot.lights, x, strict=True):
-            for name in _of(light, _PLACES):
-                place = getattr(light, name)
-                to = (
-                    rotation(self.turn * its[name]) @ place
-                    if name == "direction"
-                    else place + self.shift * its[name]
-                )
-                light = _with(light, name, to)
-            lights.append(light)
-        return Shot(shot.camera, tuple(lights))
+    def moved(self, setup: Setup, x, prepared) -> Setup:
+        def move(name: str, place: Array, steps: Array) -> Array:
+            is_turned = name == "direction"
+            return rotation(self.turn * steps) @ place if is_turned else place + self.shift * steps
+
+        places = [
+            {name: move(name, getattr(light, name), steps[name]) for name in steps}
+            for light, steps in zip(setup.lights, x, strict=True)
+        ]
+        return _with_lights(setup, places)
 
 
-class CameraPoses(AbstractShotPart):
-    r"""Where each camera is and which way it looks: it turns around the middle of the splats, and
-    shifts.
+class CameraPoses(AbstractPart):
+    r"""Position and rotation of each camera: it turns around the middle of the splats, and shifts.
 
-    Turning around the body and not around the pinhole, a turn changes what is seen of it, and a
-    shift where it is in the picture: the two are not mistaken for each other.
+    A turn around the body changes which side is seen, a shift where the body is in the picture: the
+    two are not mistaken for each other, as they would be in turns around the pinhole.
 
     **Attributes:** (static)
 
@@ -197,19 +171,21 @@ class CameraPoses(AbstractShotPart):
     turn: float = eqx.field(static=True, default=2e-3)
     shift: float = eqx.field(static=True, default=0.2)
 
-    def coordinates(self, shot: Shot) -> Float[Array, "2 3"]:
-        return jnp.zeros((2, 3), shot.camera.position.dtype)
+    def prepared(self, splats: Splats) -> Float[Array, "3"]:
+        return jnp.mean(splats.centers, axis=0)
 
-    def moved(self, shot: Shot, x: Float[Array, "2 3"], middle: Float[Array, "3"]) -> Shot:
-        camera, turned = shot.camera, rotation(self.turn * x[0])
+    def coordinates(self, setup: Setup) -> Float[Array, "2 3"]:
+        return jnp.zeros((2, 3), setup.camera.position.dtype)
+
+    def moved(self, setup: Setup, x, prepared: Float[Array, "3"]) -> Setup:
+        middle, camera, turned = prepared, setup.camera, rotation(self.turn * x[0])
         position = middle + turned @ (camera.position - middle) + self.shift * x[1]
         pose = position, camera.rotation @ turned.T
-        return Shot(eqx.tree_at(lambda c: (c.position, c.rotation), camera, pose), shot.lights)
+        return eqx.tree_at(lambda s: (s.camera.position, s.camera.rotation), setup, pose)
 
 
 def rotation(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    r"""Give the rotation around a vector by its length, radians. Differentiable, also where there
-    is none.
+    r"""Compute the rotation around a vector by its length, radians. Differentiable at 0, too.
 
         R = 1 + sin(t) / t [v] + (1 - cos t) / t^2 [v]^2,   t = |v|
 
@@ -230,22 +206,17 @@ def rotation(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
     return jnp.eye(3, dtype=vector.dtype) + first * cross + second * (cross @ cross)
 
 
-def _with(light: AbstractLight, name: str, value: Array) -> AbstractLight:
-    return eqx.tree_at(lambda each: getattr(each, name), light, value)
+def _with_lights(setup: Setup, changes: list[dict[str, Array]]) -> Setup:
+    """Replace fields of the lights."""
+
+    def fields(setup):
+        lights = zip(setup.lights, changes, strict=True)
+        return [getattr(light, name) for light, values in lights for name in values]
+
+    values = [value for light in changes for value in light.values()]
+    return eqx.tree_at(fields, setup, values) if values else setup
 
 
-def _of(light: AbstractLight, names: dict):
-    if type(light) not in names:
-        known = ", ".join(kind.__name__ for kind in names)
-        raise ValueError(
-            f"what may move of a {type(light).__name__} is not known; of these it is: {known}"
-        )
-    return names[type(light)]
-
-
-_STRENGTHS = {DirectionalLight: "irradiance", PointLight: "intensity", GaussianBeam: "power"}
-_PLACES = {
-    DirectionalLight: ("direction",),
-    PointLight: ("position",),
-    GaussianBeam: ("direction", "origin"),
-}
+def _places(light: AbstractLight) -> list[str]:
+    """Name the fields of a light that say where it is."""
+    return [name for name in ("direction", "position", "origin") if hasattr(light, name)]

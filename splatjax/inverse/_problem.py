@@ -1,134 +1,146 @@
 """Coefficients in, residuals out: what the least squares solver sees."""
 
 import abc
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
+from splatjax.diffusion import resolved_fraction
 from splatjax.fitting import (
     AbstractWeights,
     GivenVariances,
-    NonNegativeWeights,
-    TotalReflectanceHeld,
     fit_gaussians,
     fit_weights,
 )
 from splatjax.gaussians import AbstractProfile, SumOfGaussians
+from splatjax.render import DiffusionBasis
 from splatjax.scattering import Medium
 
-from ._flat import FlatPictures
+from ._flat import FlatPictures, flatten, in_a_row
 from ._losses import AbstractLoss
+from ._observation import (
+    AbstractIntensity,
+    Evidence,
+)
 
 _STEPS = 64
 
 
-def usual_weights() -> AbstractWeights:
-    """Give how the materials that come with the package are fitted: weights are not negative, and
-    their sum is held.
-    """
-    return NonNegativeWeights(TotalReflectanceHeld())
-
-
 class Unknowns(eqx.Module):
-    """How the numbers to be found are laid out: log sigma_a, log sigma_s' per channel, then log
-    factors of the lights.
+    """The layout of the unknowns: log sigma_a, log sigma_s' per channel, then log factors of the
+    lights.
     """
 
     eta: Float[Array, " channels"]
     factors: Int[Array, "pictures channels"]
-    """Which factor a picture's channel has; that many as there are where its intensity is known."""
+    """The factor of each channel of each picture; the number of factors where it is known."""
+    count: int = eqx.field(static=True)
+    """Number of factors."""
+
+    @classmethod
+    def of(
+        cls, eta: Float[Array, " channels"], intensities: Sequence[AbstractIntensity]
+    ) -> "Unknowns":
+        factors, count = [], 0
+        for intensity in intensities:
+            groups = intensity.groups(len(eta))
+            factors.append(np.where(groups < 0, -1, groups + count))
+            count += int(np.max(groups)) + 1
+        factors = np.stack(factors)
+        return cls(eta, jnp.asarray(np.where(factors < 0, count, factors), jnp.int32), count)
 
     def medium(self, point: Float[Array, " unknowns"]) -> Medium:
-        channels = self.eta.shape[0]
+        channels = len(self.eta)
         return Medium(jnp.exp(point[:channels]), jnp.exp(point[channels : 2 * channels]), self.eta)
 
     def intensities(self, point: Float[Array, " unknowns"]) -> Float[Array, "pictures channels"]:
-        factors = jnp.append(point[2 * self.eta.shape[0] :], jnp.zeros((), point.dtype))
+        factors = jnp.append(point[2 * len(self.eta) :], jnp.zeros((), point.dtype))
         return jnp.exp(factors[self.factors])
 
-    def start(self, medium: Medium, count: int) -> Float[Array, " unknowns"]:
-        return jnp.concatenate(
-            [
-                jnp.log(medium.sigma_a),
-                jnp.log(medium.sigma_s_prime),
-                jnp.zeros(count, self.eta.dtype),
-            ]
-        )
+    def start(self, medium: Medium) -> Float[Array, " unknowns"]:
+        coefficients = jnp.log(jnp.concatenate([medium.sigma_a, medium.sigma_s_prime]))
+        return jnp.pad(coefficients, (0, self.count))
 
 
-class AbstractVariances(eqx.Module):
-    """Where the variances of a medium's Gaussians come from."""
+class AbstractGaussianFit(eqx.Module):
+    """How the Gaussians follow from a profile."""
 
     @abc.abstractmethod
-    def gaussians(self, profile: AbstractProfile, weights: AbstractWeights) -> SumOfGaussians:
-        """Give the Gaussians of a profile. Differentiable."""
+    def gaussians(self, profile: AbstractProfile) -> SumOfGaussians:
+        """Fit the Gaussians of a profile. Differentiable."""
 
 
-class Held(AbstractVariances):
-    """The same for all media."""
+class FixedVariances(AbstractGaussianFit):
+    """The variances are the same for all media."""
 
     variances: Float[Array, " gaussians"]
+    weights: AbstractWeights
 
-    def gaussians(self, profile: AbstractProfile, weights: AbstractWeights) -> SumOfGaussians:
-        return fit_weights(profile, self.variances, weights=weights)
+    def gaussians(self, profile: AbstractProfile) -> SumOfGaussians:
+        return fit_weights(profile, self.variances, weights=self.weights)
 
 
-class Fitted(AbstractVariances):
-    """Those of the best fit to each, near some: variances and weights move together."""
+class FittedVariances(AbstractGaussianFit):
+    """The variances are those of the best fit to each medium, and move with the weights."""
 
     near: Float[Array, " gaussians"]
+    weights: AbstractWeights
 
-    def gaussians(self, profile: AbstractProfile, weights: AbstractWeights) -> SumOfGaussians:
-        start = GivenVariances(self.near)
-        return fit_gaussians(
-            profile, len(self.near), weights=weights, start=start, throw=False
-        ).gaussians
+    def gaussians(self, profile: AbstractProfile) -> SumOfGaussians:
+        start, count = GivenVariances(self.near), len(self.near)
+        fit = fit_gaussians(profile, count, weights=self.weights, start=start, throw=False)
+        return fit.gaussians
 
 
-class Problem(eqx.Module):
-    """The pictures, what was observed, and how the one is made from coefficients."""
+class RecoveryProblem(eqx.Module):
+    """Observed pictures, and how pictures are made from coefficients."""
 
     pictures: FlatPictures
     observed: Float[Array, "channels pixels"]
     deviation: Float[Array, "channels pixels"]
     unknowns: Unknowns
-    variances: AbstractVariances
+    fit: AbstractGaussianFit
     loss: AbstractLoss
-    weights: AbstractWeights
     model: Callable[[Medium], AbstractProfile] = eqx.field(static=True)
 
+    @classmethod
+    def of(
+        cls,
+        pictures: Sequence[DiffusionBasis],
+        evidence: Sequence[Evidence],
+        counted: Sequence[np.ndarray],
+        unknowns: Unknowns,
+        fit: AbstractGaussianFit,
+        loss: AbstractLoss,
+        model: Callable[[Medium], AbstractProfile],
+    ) -> "RecoveryProblem":
+        """Compare rendered pictures with the observed ones, at the pixels that count."""
+        dtype = unknowns.eta.dtype
+        observed, deviation = (
+            jnp.asarray(in_a_row(images, counted), dtype)
+            for images in ([one.picture for one in evidence], [one.deviation for one in evidence])
+        )
+        flat = flatten(pictures, counted, dtype)
+        return cls(flat, observed, deviation, unknowns, fit, loss, model)
+
     def gaussians(self, point: Float[Array, " unknowns"]) -> SumOfGaussians:
-        return self.variances.gaussians(self.model(self.unknowns.medium(point)), self.weights)
+        return self.fit.gaussians(self.model(self.unknowns.medium(point)))
 
     def radiance(self, point: Float[Array, " unknowns"]) -> Float[Array, "channels pixels"]:
         return self.pictures.radiance(self.gaussians(point), self.unknowns.intensities(point))
 
     def residuals(self, point: Float[Array, " unknowns"]) -> Float[Array, "channels pixels"]:
-        """Give what the loss has as its square."""
+        """Compute residuals whose squares are the losses."""
         return self.loss.root((self.radiance(point) - self.observed) / self.deviation)
 
-    def handover_slopes(self, point: Float[Array, " unknowns"]) -> Float[Array, "channels pixels"]:
-        """Differentiate the residuals in the logarithm of the widths below which the renderer hands
-        layers to the surface.
-        """
 
-        def moved(by: Float[Array, ""]) -> Float[Array, "channels pixels"]:
-            return eqx.tree_at(
-                lambda its: its.pictures.light.interval,
-                self,
-                replace_fn=lambda at: at * jnp.exp(by),
-            ).residuals(point)
-
-        zero = jnp.zeros((), point.dtype)
-        return jax.jvp(moved, (zero,), (zero + 1,))[1]
-
-
-class Found(eqx.Module):
-    """Where a search ended."""
+class SearchEnd(eqx.Module):
+    """The end of a search."""
 
     point: Float[Array, " unknowns"]
     cost: Float[Array, ""]
@@ -137,8 +149,8 @@ class Found(eqx.Module):
 
 
 @eqx.filter_jit
-def search(problem: Problem, start: Float[Array, " unknowns"]) -> Found:
-    """Minimize the loss from a start: Levenberg and Marquardt's method."""
+def search(problem: RecoveryProblem, start: Float[Array, " unknowns"]) -> SearchEnd:
+    """Minimize the loss from a start by the Levenberg-Marquardt method."""
     tolerance = 1e-4 if start.dtype == jnp.float32 else 1e-7
     # In units of the start's own residual, so that damping and tolerances mean the same for any
     # noise and number of pixels.
@@ -148,24 +160,22 @@ def search(problem: Problem, start: Float[Array, " unknowns"]) -> Found:
         return problem.residuals(point) / unit
 
     solver = optx.LevenbergMarquardt(rtol=tolerance, atol=tolerance)
-    found = optx.least_squares(residuals, solver, start, problem, max_steps=_STEPS, throw=False)
-    cost = jnp.sum(problem.residuals(found.value) ** 2)
-    steps = jnp.asarray(found.stats["num_steps"])
-    return Found(
-        found.value, cost, steps, (found.result == optx.RESULTS.successful) & jnp.isfinite(cost)
-    )
+    end = optx.least_squares(residuals, solver, start, problem, max_steps=_STEPS, throw=False)
+    cost = jnp.sum(problem.residuals(end.value) ** 2)
+    converged = (end.result == optx.RESULTS.successful) & jnp.isfinite(cost)
+    return SearchEnd(end.value, cost, jnp.asarray(end.stats["num_steps"]), converged)
 
 
 class Solution(eqx.Module):
-    """What is known at a point.
+    """The solution at a point, and how well it is known.
 
     **Attributes:**
 
     - `information`: the inverse of the covariance that noise of the given deviations leaves
       (Laplace, by Gauss and Newton); after the unknowns come, channel by channel, the logarithms of
-      the widths below which layers are handed to the surface.
+      the widths below which layers are unresolved.
     - `gaussians`, `radiance`: of the point.
-    - `unresolved`: the share of the light of each channel in layers that the splats do not carry.
+    - `unresolved`: the fraction of the light of each channel in unresolved layers.
     """
 
     information: Float[Array, "all all"]
@@ -175,22 +185,27 @@ class Solution(eqx.Module):
 
 
 @eqx.filter_jit
-def solution(problem: Problem, point: Float[Array, " unknowns"]) -> Solution:
-    """Give what is known at a point: the picture, and how sharply residuals tell each unknown and
-    the handover.
+def solution(problem: RecoveryProblem, point: Float[Array, " unknowns"]) -> Solution:
+    """Compute the picture at a point, and the information about each unknown and the transition to
+    unresolved layers.
     """
 
-    def residuals(point):
-        gaussians, radiance = problem.gaussians(point), problem.radiance(point)
-        return problem.residuals(point), (gaussians, radiance)
+    def residuals(point, log_width):
+        moved = eqx.tree_at(
+            lambda one: one.pictures.light.interval,
+            problem,
+            replace_fn=lambda interval: interval * jnp.exp(log_width),
+        )
+        return moved.residuals(point), (problem.gaussians(point), problem.radiance(point))
 
-    slopes, (gaussians, radiance) = jax.jacfwd(residuals, has_aux=True)(point)
-    handover = (
-        problem.handover_slopes(point)[..., None]
-        * jnp.eye(slopes.shape[0], dtype=slopes.dtype)[:, None]
+    (slopes, of_width), (gaussians, radiance) = jax.jacfwd(residuals, (0, 1), has_aux=True)(
+        point, jnp.zeros((), point.dtype)
     )
-    slopes = jnp.concatenate([slopes, handover], axis=-1)
-    unresolved = (
-        (1 - problem.pictures.light.resolved()) @ gaussians.weights / gaussians.total_reflectance()
-    )
+    # Every channel has a width of its own.
+    of_widths = of_width[..., None] * jnp.eye(len(of_width), dtype=of_width.dtype)[:, None]
+    slopes = jnp.concatenate([slopes, of_widths], axis=-1)
+    light = problem.pictures.light
+    resolved = resolved_fraction(light.variances[:, None], light.area[None], light.interval)
+    unresolved = 1 - light.resolvable * jnp.mean(resolved, axis=1)
+    unresolved = unresolved @ gaussians.weights / gaussians.total_reflectance()
     return Solution(jnp.einsum("cpi,cpj->ij", slopes, slopes), gaussians, radiance, unresolved)

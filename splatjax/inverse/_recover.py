@@ -8,20 +8,37 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
+from splatjax._format import counted
+from splatjax._records import check_values
 from splatjax.diffusion import ClusterDiffuser
-from splatjax.fitting import AbstractWeights, fit_gaussians
+from splatjax.fitting import (
+    AbstractWeights,
+    FixedTotalReflectance,
+    NonNegativeWeights,
+    fit_gaussians,
+)
 from splatjax.gaussians import AbstractProfile, SumOfGaussians
 from splatjax.render import RenderSettings
 from splatjax.scattering import Dipole, Medium
 from splatjax.scene import Material, Splats
-from splatjax.words import counted
 
 from ._estimate import inverse
-from ._evidence import Evidence
-from ._flat import Gatherer, wide_variances
+from ._flat import in_pictures, which_count
+from ._layers import render_layers, wide_variances
 from ._losses import AbstractLoss, SquaredLoss
-from ._observation import Observation
-from ._problem import Fitted, Held, search, solution, usual_weights
+from ._observation import (
+    Evidence,
+    Observation,
+    check_channels,
+)
+from ._problem import (
+    FittedVariances,
+    FixedVariances,
+    RecoveryProblem,
+    Unknowns,
+    search,
+    solution,
+)
 from ._recovery import Recovery
 
 _FINE = RenderSettings(diffuser=ClusterDiffuser(error=2.5e-4))
@@ -30,8 +47,9 @@ the absorption.
 """
 
 _ROUNDS = 8
+_SAME_INDEX = 1e-4
 _SETTLED = 1e-3
-"""Rounds end when no coefficient moves by more than this share, or by a tenth of its error bar."""
+"""Rounds end when no coefficient moves by more than this, or by a tenth of its error bar."""
 
 
 def recover(
@@ -42,23 +60,23 @@ def recover(
     surface: Material | None = None,
     model: Callable[[Medium], AbstractProfile] = Dipole,
     count: int = 6,
-    weights: AbstractWeights | None = None,
-    loss: AbstractLoss | None = None,
-    settings: RenderSettings | None = None,
+    weights: AbstractWeights = NonNegativeWeights(FixedTotalReflectance()),
+    loss: AbstractLoss = SquaredLoss(),
+    settings: RenderSettings = _FINE,
     progress: Callable[[str, Medium], None] | None = None,
     throw: bool = True,
 ) -> Recovery:
-    r"""Find the absorption and scattering that explain pictures of a known shape: weighed least
+    r"""Find the absorption and scattering that explain pictures of a known shape: weighted least
     squares on all pixels at once.
 
-    The whole graph is in it: coefficients, profile, Gaussians, layers, picture. The layers, which
-    are dear, depend on the variances of the Gaussians alone: rendered once, they serve many steps
-    of Levenberg and Marquardt's method, each of which looks at no splat; nothing is compiled
-    between steps, nor between starts. At first the variances are held: those of `wide_variances`,
-    which serve all coefficients within a factor of three of the starts. Then, in rounds, they are
-    those of the fit to what was found, and layers move along their slopes as the fit does, until a
-    round changes nothing: what is left is the picture that `render` makes of `Recovery.material`,
-    with the derivatives of `picture_jacobian`.
+    The search differentiates the whole graph: coefficients, profile, Gaussians, layers, picture.
+    The layers, which are expensive, depend on the variances of the Gaussians alone: rendered once,
+    they serve many steps of the Levenberg-Marquardt method, which reads no splat; nothing is
+    compiled between steps, nor between starts. At first the variances are fixed: those of
+    `wide_variances` serve all coefficients within a factor of three of the starts. Then, in rounds,
+    they are those of the fit to the coefficients, and layers move along their slopes as the fit
+    does, until a round changes nothing. The final picture is the one that `render` makes of
+    `Recovery.material`, with the derivatives of `picture_jacobian`.
 
     **Arguments:**
 
@@ -67,86 +85,77 @@ def recover(
       carry color.
     - `starts`: where to search from; their `eta` is taken as known and must be the same. Of
       several, the best end is kept.
-    - `surface`: whose index, specular strength and roughness are known; its Gaussians do not
-      matter. By default the index is that of the start, without a specular lobe.
+    - `surface`: its specular strength and roughness are known, and its index, which is that of the
+      starts; its Gaussians do not matter. By default there is no specular lobe.
     - `model`: from a medium to a profile that is finite at the origin.
     - `count`: number of Gaussians.
-    - `weights`: how they are fitted; by default not negative and their sum held, as in the
+    - `weights`: how they are fitted; by default not negative and with a fixed sum, as in the
       materials that come with the package.
-    - `loss`: `SquaredLoss()`, or `HuberLoss()` where some pixels are not what the model knows.
+    - `loss`: `SquaredLoss()`, or `HuberLoss()` where the model does not explain some pixels.
     - `settings`: of the renderer. By default its layers are eight times finer than those of
       `render`: where much light comes back, a picture that is off by 0.1% means an absorption that
       is off by 2%.
-    - `progress`: told in words what is being done, and the best medium up to then.
-    - `throw`: raise if a search has not converged; otherwise `result` says so.
+    - `progress`: called with a description of each stage, and the best medium so far.
+    - `throw`: raise if a search has not converged; otherwise `result` reports it.
 
     **Returns:** a `Recovery` in JAX's default precision: under `jax.enable_x64` small errors show,
     the pictures stay as they are.
 
     **Raises:** `ValueError` for no observation or start, for channels that disagree, for starts
-    without absorption, and for a picture none of whose pixels counts; an error with the message of
-    `result` if `throw`.
+    without absorption, for different indices of surface and starts, and for a picture none of whose
+    pixels counts; an error with the message of `result` if `throw`.
     """
     starts = [_in_full(start) for start in ([starts] if isinstance(starts, Medium) else starts)]
     observations = list(observations)
-    _check(observations, splats, starts)
-    say = progress or _nobody
-    weights = usual_weights() if weights is None else weights
-    loss = SquaredLoss() if loss is None else loss
-    evidence = Evidence(observations, starts[0].sigma_a.dtype)
-    unknowns, factors = evidence.unknowns(starts[0].eta)
-    gatherer = Gatherer(
-        splats,
-        _FINE if settings is None else settings,
-        [each.camera for each in observations],
-        [each.lights for each in observations],
-    )
-    wide = _unweighed(wide_variances(starts, splats), len(starts[0].eta))
-    surface = (
-        Material(wide, eta=starts[0].eta[0], specular=0.0)
-        if surface is None
-        else surface.surface_of(wide)
-    )
+    _check(observations, splats, starts, surface)
+    report = progress or (lambda stage, medium: None)
+    eta, channels = starts[0].eta, starts[0].channels
+    evidence = [Evidence.of(one, eta.dtype) for one in observations]
+    unknowns = Unknowns.of(eta, [one.intensity for one in observations])
+    noise_is_known = all(one.deviation is not None for one in observations)
+    wide = wide_variances(starts, splats)
+    gaussians = _unweighed(wide, channels)
+    surface = surface or Material(gaussians, eta=eta[0], specular=0)
+    surface = surface.surface_of(gaussians)
 
-    def problem_of(gathered, variances):
-        return evidence.problem(gathered, unknowns, variances, loss, weights, model)
+    def problem_of(rendered, fit):
+        mask = which_count(rendered, evidence)
+        return RecoveryProblem.of(rendered, evidence, mask, unknowns, fit, loss, model)
 
-    say(
-        f"rendering {len(wide.variances)} layers of {counted(len(observations), 'picture')}",
-        starts[0],
-    )
-    problem, _ = problem_of(gatherer.held(surface), Held(wide.variances))
-    say(
+    report(f"rendering {len(wide)} layers of {counted(len(observations), 'picture')}", starts[0])
+    rendered, _ = render_layers(splats, surface, observations, settings, derivative=False)
+    problem = problem_of(rendered, FixedVariances(wide, weights))
+    report(
         f"searching from {counted(len(starts), 'start')} among {problem.observed.shape[1]} pixels",
         starts[0],
     )
-    ends = [search(problem, unknowns.start(start, factors)) for start in starts]
+    ends = [search(problem, unknowns.start(start)) for start in starts]
     costs = np.nan_to_num([float(end.cost) for end in ends], nan=np.inf)
     best = ends[int(np.argmin(costs))]
     steps, settled, plans, rounds = sum(int(end.steps) for end in ends), False, None, 0
     while not settled and rounds < _ROUNDS:
         rounds += 1
         medium = unknowns.medium(best.point)
-        say(
+        report(
             f"round {rounds}, of {_ROUNDS} at most: rendering the {count} layers of "
-            f"{_words(medium)}",
+            f"{_formatted(medium)}",
             medium,
         )
         fitted = fit_gaussians(model(medium), count, weights=weights, throw=False).gaussians
-        surface = surface.surface_of(_unweighed(fitted.variances, len(medium.eta)))
-        gathered, plans = gatherer.moving(surface, plans)
-        problem, numbers = problem_of(gathered, Fitted(fitted.variances))
+        surface = surface.surface_of(_unweighed(fitted.variances, channels))
+        rendered, plans = render_layers(splats, surface, observations, settings, plans)
+        problem = problem_of(rendered, FittedVariances(fitted.variances, weights))
         before, best = best.point, search(problem, best.point)
         steps += int(best.steps)
         reached = solution(problem, best.point)
-        chi_squared = best.cost / max(problem.observed.size - best.point.size, 1)
-        scale = 1.0 if evidence.noise_is_known else float(chi_squared)
-        told = np.asarray(reached.information, np.float64)[: best.point.size, : best.point.size]
-        deviations = np.sqrt(np.diagonal(inverse(told) * scale))
-        settled = bool(best.converged) and bool(
-            np.all(np.abs(best.point - before) <= np.maximum(_SETTLED, 0.1 * deviations))
-        )
-    pictures = evidence.shown(np.asarray(reached.radiance), numbers)
+        size = best.point.size
+        chi_squared = best.cost / max(problem.observed.size - size, 1)
+        covariance = inverse(np.asarray(reached.information, np.float64)[:size, :size])
+        deviations = np.sqrt(np.diagonal(covariance))
+        deviations *= 1.0 if noise_is_known else float(chi_squared) ** 0.5
+        moved = np.abs(best.point - before)
+        settled = bool(best.converged) and np.all(moved <= np.maximum(_SETTLED, 0.1 * deviations))
+    pictures = in_pictures(reached.radiance, which_count(rendered, evidence))
     recovery = Recovery(
         medium=unknowns.medium(best.point),
         material=surface.surface_of(reached.gaussians),
@@ -156,70 +165,71 @@ def recover(
         chi_squared=chi_squared,
         pictures=pictures,
         residuals=tuple(
-            made - seen for made, seen in zip(pictures, evidence.pictures, strict=True)
+            made - np.asarray(one.picture) for made, one in zip(pictures, evidence, strict=True)
         ),
         ends=tuple(unknowns.medium(end.point) for end in ends),
-        costs=jnp.asarray(costs, evidence.dtype),
+        costs=jnp.asarray(costs, eta.dtype),
         result=optx.RESULTS.where(
             jnp.asarray(settled), optx.RESULTS.successful, optx.RESULTS.nonlinear_max_steps_reached
         ),
-        noise_is_known=evidence.noise_is_known,
-        relative_noise=evidence.relative_noise,
+        noise_is_known=noise_is_known,
+        relative_noise=float(np.mean([one.relative_noise for one in evidence])),
         steps=steps,
         rounds=rounds,
     )
     return recovery.result.error_if(recovery, True) if throw and not settled else recovery
 
 
-def _check(observations: list[Observation], splats: Splats, starts: list[Medium]) -> None:
+def _check(
+    observations: list[Observation],
+    splats: Splats,
+    starts: list[Medium],
+    surface: Material | None,
+) -> None:
     if not observations or not starts:
         raise ValueError(
             f"one observation and one start are needed at least; got {len(observations)} and "
             f"{len(starts)}"
         )
-    channels = starts[0].eta.shape[0]
+    eta = starts[0].eta
     for i, start in enumerate(starts):
-        if start.eta.shape[0] != channels or np.any(
-            np.asarray(start.eta) != np.asarray(starts[0].eta)
-        ):
+        if not np.array_equal(start.eta, eta):
             raise ValueError(
-                f"starts[{i}].eta is {start.eta.tolist()}, that of the first "
-                f"{starts[0].eta.tolist()}: it is known, hence one"
+                f"starts[{i}].eta is {start.eta.tolist()}, that of the first {eta.tolist()}: the "
+                "index is known, hence one"
             )
-        if not np.all(np.asarray(start.sigma_a) > 0):
-            raise ValueError(
-                f"starts[{i}].sigma_a is {start.sigma_a.tolist()}: logarithms are searched, start "
-                "above 0 (1e-4 is little)"
-            )
-    for i, each in enumerate(observations):
-        if each.picture.shape[2] != channels:
-            raise ValueError(
-                f"observations[{i}].picture has {each.picture.shape[2]} channels, starts have "
-                f"{channels}"
-            )
-    if splats.albedo is not None and splats.albedo.shape[1] != channels:
+        check_values(
+            f"starts[{i}].sigma_a",
+            start.sigma_a,
+            "above 0, since logarithms are searched: 1e-4 is little",
+            lambda x: x > 0,
+        )
+    if surface is not None and not np.allclose(surface.eta, eta, rtol=_SAME_INDEX):
         raise ValueError(
-            f"splats.albedo has {splats.albedo.shape[1]} channels, starts have {channels}"
+            f"surface.eta is {float(surface.eta):g}, starts[0].eta {eta.tolist()}: a material has "
+            "one index of refraction, which recover takes as known; give it to both"
+        )
+    for i, observation in enumerate(observations):
+        check_channels(i, observation, starts[0].channels, "starts")
+    if splats.albedo is not None and splats.albedo.shape[1] != starts[0].channels:
+        raise ValueError(
+            f"splats.albedo has {splats.albedo.shape[1]} channels, starts have {starts[0].channels}"
         )
 
 
 def _in_full(medium: Medium) -> Medium:
-    """Give a medium in JAX's default precision, whichever it was loaded in."""
+    """Convert a medium to JAX's default precision."""
     return jax.tree.map(lambda leaf: leaf.astype(jnp.result_type(float)), medium)
 
 
 def _unweighed(variances: Float[Array, " gaussians"], channels: int) -> SumOfGaussians:
-    """Give Gaussians whose weights are still to come."""
+    """Make Gaussians whose weights are still unknown."""
     return SumOfGaussians(variances, jnp.zeros((len(variances), channels), variances.dtype))
 
 
-def _nobody(said: str, medium: Medium) -> None:
-    del said, medium
-
-
-def _words(medium: Medium) -> str:
+def _formatted(medium: Medium) -> str:
     values = (
-        "  ".join(f"{float(value):.3g}" for value in each)
-        for each in (medium.sigma_a, medium.sigma_s_prime)
+        "  ".join(f"{float(value):.3g}" for value in values)
+        for values in (medium.sigma_a, medium.sigma_s_prime)
     )
     return "sigma_a {}, sigma_s' {}".format(*values)

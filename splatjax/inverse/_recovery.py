@@ -1,4 +1,4 @@
-"""What was recovered, and how well it is known."""
+"""The result of a recovery: the most likely material, and its errors."""
 
 import math
 from collections.abc import Sequence
@@ -9,49 +9,55 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
+from splatjax._format import percent
 from splatjax.scattering import Medium
 from splatjax.scene import Material
-from splatjax.words import percent
 
-from ._estimate import Combination, Estimate, inverse, roots
+from ._estimate import AbstractEstimate, Estimate, inverse, roots
 
-_HANDOVER = 0.5 * math.log(2.0)
-"""How well the width is known, as a logarithm, below which layers are handed to the surface: twice
-as many splats move it by as much, and that of regular ones lies a factor of 2.5 below that of
-scattered ones."""
+_RESOLUTION = 0.5 * math.log(2.0)
+"""Standard deviation of the logarithm of the width below which a layer is unresolved: twice as many
+splats move it by as much, and that of regular ones lies a factor of 2.5 below that of scattered
+ones.
+"""
+_TOO_LARGE = 1.5
+"""Chi-squared per degree of freedom of a model that lacks something."""
+_MOST = 0.8
+"""Of the light: marble on a head of 100,000 splats has 0.6 and comes back within 1.4%, the blue of
+skin 1.0 and does not.
+"""
 
 
-class Recovery(eqx.Module):
-    r"""The most likely material, and what the pictures tell of it.
+class Recovery(AbstractEstimate):
+    r"""The most likely material, and how well the pictures determine it.
 
     **Attributes:**
 
     - `medium`: its coefficients, 1/mm.
-    - `material`: its Gaussians, and the surface that was taken as known.
-    - `intensities`: factors on the light of each picture that were found; 1 where it was known.
+    - `material`: its Gaussians, with the surface that was taken as known.
+    - `intensities`: factors on the light of each picture; 1 where the light was known.
     - `information`: inverse of the covariance that the given noise leaves: of the logarithms of
-      `sigma_a`, channel by channel, of those of `sigma_s_prime`, of the factors that were to be
-      found, and, channel by channel, of the width below which a layer is handed to the surface,
-      because the splats are too far apart to carry it.
-    - `unresolved`: the share of the light of each channel that spreads less than the splats are
+      `sigma_a`, channel by channel, of those of `sigma_s_prime`, of the unknown factors, and,
+      channel by channel, of the width below which a layer is unresolved because the splats are too
+      far apart to carry it.
+    - `unresolved`: the fraction of the light of each channel that spreads less than the splats are
       apart. A picture shows how much of it there is, not how far it goes.
-    - `chi_squared`: what the model leaves over, squared, over the noise, per degree of freedom.
-      About 1 where model and noise are right; far above, the model lacks something, and error bars
-      are too small.
+    - `chi_squared`: squared residuals over the noise, per degree of freedom. About 1 where model
+      and noise are right; far above, the model lacks something, and error bars are too small.
     - `noise_is_known`: whether all pictures came with deviations; where not, error bars are those
-      of what is left over. Static.
+      of the residuals. Static.
     - `relative_noise`: deviation of a typical pixel over the brightness of its picture. Static.
-    - `pictures`: what the model makes of the coefficients; NaN where a pixel does not count.
-    - `residuals`: pictures less what was observed.
+    - `pictures`: rendered with the coefficients; NaN where a pixel does not count.
+    - `residuals`: pictures less the observed ones.
     - `ends`, `costs`: where the search from each start ended in the first round, and the sum of its
       losses.
     - `steps`, `rounds`: of all searches. Static.
-    - `result`: what became of it, as a message (`optimistix.RESULTS`).
+    - `result`: the outcome of the search, as a message (`optimistix.RESULTS`).
 
     Error bars assume that model and shape are right and that the noise of pixels is independent:
-    they are of precision, not of truth. That a layer narrower than the splats looks as the renderer
-    makes it look is not assumed: the width of that handover counts as known to a factor of 1.4, and
-    how far the search would go astray with it is part of the bars.
+    they are of precision, not of accuracy. They do not assume that an unresolved layer looks as the
+    renderer makes it look: the width of the transition counts as known to a factor of 1.4, and the
+    error that this leaves in the search is part of the bars.
     """
 
     medium: Medium
@@ -72,167 +78,115 @@ class Recovery(eqx.Module):
 
     @property
     def scale(self) -> float:
-        """What the covariance of the given noise is to be multiplied by."""
+        """The factor on the covariance of the given noise."""
         return 1.0 if self.noise_is_known else float(self.chi_squared)
 
     def covariance(
-        self, more: Float[np.ndarray, "all all"] | None = None
+        self, more: Float[np.ndarray, "all all"] | float = 0.0, resolution: float = _RESOLUTION
     ) -> Float[np.ndarray, "channels 2 2"]:
-        """Give, for each channel, that of the logarithms of `sigma_a` and `sigma_s_prime`, whatever
-        the other unknowns are.
+        """Compute the covariance of the logarithms of `sigma_a` and `sigma_s_prime` of each
+        channel, whatever the other unknowns are.
 
-        What noise leaves, and the square of how far the handover's width, off by its deviation,
-        would lead the search astray.
+        It is that of the noise, and the square of the error of the search if the transition to
+        unresolved layers is off by its deviation.
 
         **Arguments:**
 
         - `more`: information that another picture would add.
+        - `resolution`: the deviation of the logarithm of the width below which a layer is
+          unresolved; 0 for a renderer that is right about it.
         """
-        told = self._told() if more is None else self._told() + more
-        unknowns = len(told) - self.medium.eta.shape[0]
-        noise = inverse(told[:unknowns, :unknowns])
-        if not np.all(np.isfinite(noise)):
-            return self._of_pairs(noise)
-        # The width is not searched: where pictures tell of it, they tell it to nobody.
-        astray = noise @ told[:unknowns, unknowns:] * _HANDOVER
-        return self._of_pairs(noise + astray @ astray.T)
-
-    def covariance_of_noise(self) -> Float[np.ndarray, "channels 2 2"]:
-        """Give the covariance as if the renderer were right about layers narrower than the splats:
-        what noise alone leaves.
-        """
-        unknowns = len(self.information) - self.medium.eta.shape[0]
-        return self._of_pairs(inverse(self._told()[:unknowns, :unknowns]))
-
-    def _told(self) -> Float[np.ndarray, "all all"]:
-        return np.asarray(self.information, np.float64) / max(self.scale, np.finfo(np.float64).tiny)
-
-    def _of_pairs(self, whole: Float[np.ndarray, "some some"]) -> Float[np.ndarray, "channels 2 2"]:
-        channels = self.medium.eta.shape[0]
-        return np.stack(
-            [whole[np.ix_([c, channels + c], [c, channels + c])] for c in range(channels)]
-        )
-
-    def estimate(self) -> Estimate:
-        """Give the coefficients with their covariance, without what they came from."""
-        return Estimate(self.medium, self.covariance())
-
-    def relative_errors(
-        self,
-    ) -> tuple[Float[np.ndarray, " channels"], Float[np.ndarray, " channels"]]:
-        """Give the standard deviations of the logarithms of `sigma_a` and of `sigma_s_prime`."""
-        return roots(self.covariance())
+        channels, scale = self.medium.channels, max(self.scale, np.finfo(np.float64).tiny)
+        information = np.asarray(self.information, np.float64) / scale + more
+        unknowns = len(information) - channels
+        covariance = inverse(information[:unknowns, :unknowns])
+        if np.all(np.isfinite(covariance)):
+            # The width is not searched: information about it helps no unknown.
+            astray = covariance @ information[:unknowns, unknowns:] * resolution
+            covariance = covariance + astray @ astray.T
+        pairs = np.arange(channels)[:, None] + [0, channels]
+        return covariance[pairs[:, :, None], pairs[:, None]]
 
     def noise_errors(self) -> tuple[Float[np.ndarray, " channels"], Float[np.ndarray, " channels"]]:
-        """Give those of `covariance_of_noise`: how far a search would scatter if the picture were
-        taken again.
+        """Compute the errors that noise alone leaves: how far searches of pictures that are taken
+        again would scatter.
         """
-        return roots(self.covariance_of_noise())
+        return roots(self.covariance(resolution=0.0))
 
-    def combinations(self) -> list[tuple[Combination, Combination]]:
-        """Give, for each channel, the combination of coefficients that is known best and the one
-        that is known worst.
-        """
-        return self.estimate().combinations()
-
-    def is_fixed(self) -> bool:
-        """Say whether the pictures fix both coefficients of every channel, to a tenth or better."""
-        return self.estimate().is_fixed()
-
-    def words(self, channels: Sequence[str] | None = None) -> str:
-        """Say what was found, how well, and what the pictures do not fix.
+    def summary(self, channels: Sequence[str] | None = None) -> str:
+        """Format the coefficients, their errors, and what the pictures do not determine.
 
         **Arguments:**
 
         - `channels`: their names; by default red, green and blue, or numbers.
         """
-        lines = []
-        for said, unresolved in zip(
-            self.estimate().lines(channels), np.asarray(self.unresolved), strict=True
-        ):
-            lines += said
+        summary = []
+        unresolved_light = np.asarray(self.unresolved)
+        for lines, unresolved in zip(self.lines(channels), unresolved_light, strict=True):
+            summary += lines
             if unresolved > _MOST:
-                lines.append(
+                summary.append(
                     f"  {percent(float(unresolved))} of its light spreads less than the splats are "
-                    "apart: how far, they can "
-                    "hardly show; take more splats, or a smaller piece from closer up"
+                    "apart, and hardly shows how far; take more splats, or a smaller piece from "
+                    "closer up"
                 )
         if not self.noise_is_known:
-            lines.append(
-                "error bars are those of what the model leaves over, as if its pixels were "
-                "independent"
+            summary.append(
+                "error bars are those of the residuals, as if their pixels were independent"
             )
         elif float(self.chi_squared) > _TOO_LARGE:
-            lines.append(
-                f"the model leaves {float(self.chi_squared) ** 0.5:.2g} times the noise: it lacks "
-                "something, and the error bars "
-                "are too small"
+            summary.append(
+                f"the residuals are {float(self.chi_squared) ** 0.5:.2g} times the noise: the "
+                "model lacks something, and the error bars are too small"
             )
-        return "\n".join(lines)
-
-
-_TOO_LARGE = 1.5
-_MOST = 0.8
-"""Of the light: marble on a head of 100,000 splats has 0.6 and comes back within 1.4%, the blue of
-skin 1.0 and does not.
-"""
+        return "\n".join(summary)
 
 
 def combined(recoveries: Sequence[Recovery]) -> Estimate:
-    r"""Put together what pictures tell that were searched apart: the mean of the logarithms,
-    weighed by what each knows.
+    r"""Combine recoveries from separate pictures: the mean of the logarithms, weighted by their
+    information.
 
-    A search of all pictures at once weighs their pixels by noise alone. Many pixels that do not
-    show how far light goes, for its layers are handed to the surface, then outvote a few that do.
-    Apart, each picture's error bars say which combination of the coefficients it knows, and here it
-    is asked for that alone: a coarse picture of a body for the reflectance, a close one under a
-    laser dot for how far light goes.
+    A search of all pictures at once weights their pixels by noise alone. Many pixels that do not
+    show how far light goes, because its layers are unresolved, then outvote a few that do. Apart,
+    the error bars of each picture tell which combination of the coefficients it determines, and
+    only that is used: a coarse picture of a body for the reflectance, a close one under a laser dot
+    for how far light goes.
 
     **Arguments:**
 
-    - `recoveries`: of one material. What is left of the error in each counts as independent of the
-      others'. Where a model leaves more than the noise, its share of the error bars is stretched by
-      the root of `chi_squared`.
+    - `recoveries`: of one material, with independent errors. Where residuals exceed the noise, the
+      error bars of a recovery are stretched by the root of its `chi_squared`.
 
     **Returns:** an `Estimate`.
 
-    **Raises:** `ValueError` for none, and for channels or indices of refraction that are not the
-    same in all.
+    **Raises:** `ValueError` for no recovery, and for channels or indices of refraction that differ.
     """
     if not recoveries:
-        raise ValueError("nothing to combine; give one recovery at least")
-    first = recoveries[0].medium
-    for i, each in enumerate(recoveries):
-        if each.medium.eta.shape != first.eta.shape or np.any(
-            np.asarray(each.medium.eta) != np.asarray(first.eta)
-        ):
+        raise ValueError("recoveries is empty; give one at least")
+    eta = recoveries[0].medium.eta
+    for i, recovery in enumerate(recoveries):
+        if not np.array_equal(recovery.medium.eta, eta):
             raise ValueError(
-                f"recoveries[{i}].medium.eta is {each.medium.eta.tolist()}, that of the first "
-                f"{first.eta.tolist()}: "
-                "they are of different materials"
+                f"recoveries[{i}].medium.eta is {recovery.medium.eta.tolist()}, that of the first "
+                f"{eta.tolist()}: they are of different materials"
             )
     points = np.log(
-        [np.stack([each.medium.sigma_a, each.medium.sigma_s_prime], axis=-1) for each in recoveries]
+        [np.stack([one.medium.sigma_a, one.medium.sigma_s_prime], axis=-1) for one in recoveries]
     )
-    means, covariances = [], []
-    for c in range(first.eta.shape[0]):
-        known = [_information(_stretched(each).covariance()[c]) for each in recoveries]
-        covariance = inverse(np.sum(known, axis=0))
-        told = sum(its @ point[c] for its, point in zip(known, points, strict=True))
-        # Where nothing is known there is nothing to weigh by.
-        means.append(
-            covariance @ told if np.all(np.isfinite(covariance)) else np.mean(points[:, c], axis=0)
-        )
-        covariances.append(covariance)
-    sigma_a, sigma_s_prime = jnp.exp(jnp.asarray(np.stack(means, axis=-1), first.eta.dtype))
-    return Estimate(Medium(sigma_a, sigma_s_prime, first.eta), np.stack(covariances))
+    known = np.asarray([_stretched_information(recovery) for recovery in recoveries])
+    covariance = np.stack([inverse(information) for information in known.sum(axis=0)])
+    # Channels that no recovery determines have no weights.
+    is_known = np.isfinite(covariance)
+    means = np.einsum("cij,rcjk,rck->ci", np.where(is_known, covariance, 0.0), known, points)
+    means = np.where(is_known.all(axis=2), means, points.mean(axis=0))
+    sigma_a, sigma_s_prime = jnp.exp(jnp.asarray(means.T, eta.dtype))
+    return Estimate(Medium(sigma_a, sigma_s_prime, eta), covariance)
 
 
-def _stretched(recovery: Recovery) -> Recovery:
-    """Let noise count for what the model leaves over, where that is more."""
+def _stretched_information(recovery: Recovery) -> Float[np.ndarray, "channels 2 2"]:
+    """Invert the covariance of each channel; residuals above the noise count as noise."""
     stretch = max(float(recovery.chi_squared), 1.0) if recovery.noise_is_known else 1.0
-    return eqx.tree_at(lambda its: its.information, recovery, recovery.information / stretch)
-
-
-def _information(covariance: Float[np.ndarray, "2 2"]) -> Float[np.ndarray, "2 2"]:
-    return inverse(covariance) if np.all(np.isfinite(covariance)) else np.zeros_like(covariance)
+    stretched = eqx.tree_at(lambda r: r.information, recovery, recovery.information / stretch)
+    covariance = stretched.covariance()
+    is_known = np.isfinite(covariance).all(axis=(1, 2))[:, None, None]
+    return np.where(is_known, [inverse(one) for one in covariance], 0.0)

@@ -14,7 +14,7 @@ import tomli_w
 
 from splatjax.exports import plain_numbers
 from splatjax.fitting import DipoleStarts
-from splatjax.gaussians import SumOfGaussians
+from splatjax.gaussians import AbstractProfile, SumOfGaussians
 from splatjax.scattering import (
     BetterDipole,
     Dipole,
@@ -46,7 +46,6 @@ _ASCENDING: Rule = (
 _THICKNESS: Rule = ("positive (mm), or inf", lambda x: x > 0)
 _LAYER = (*_COEFFICIENTS, "optical_depth", "thickness", "thickness_unit")
 _DEFAULT_SURFACE = {"eta": 1.4, "specular": 0.18, "roughness": 0.3}
-Profile = Dipole | BetterDipole | PhotonBeam | LayeredMultipole
 
 
 def profiles_folder() -> Path:
@@ -161,7 +160,7 @@ def save_material(
     material: Material,
     path: str | os.PathLike[str],
     *,
-    profile: Profile | None = None,
+    profile: AbstractProfile | None = None,
     source: Mapping[str, Any] | None = None,
     fit: Mapping[str, Any] | None = None,
 ) -> None:
@@ -177,8 +176,13 @@ def save_material(
     - `source`: where the numbers come from: `citation`, `provenance`, ...
     - `fit`: more to be kept in [fit]: `error`, `energy_error`, ...
 
-    **Raises:** `OSError` if the file cannot be written.
+    **Raises:** `OSError` if the file cannot be written, `ValueError` for another kind of profile.
     """
+    if not isinstance(profile, Dipole | BetterDipole | PhotonBeam | LayeredMultipole | None):
+        raise ValueError(
+            f"profile must be a Dipole, BetterDipole, PhotonBeam or LayeredMultipole, which a file "
+            f"can hold; got {type(profile).__name__}"
+        )
     tables: dict[str, Any] = {}
     if isinstance(profile, LayeredMultipole):
         tables["layers"] = [_plain_layer(layer) for layer in profile.layers]
@@ -281,7 +285,7 @@ def dipole_starts() -> DipoleStarts:
         fit_gaussians(Dipole(medium), 6, spread=VariancesPerChannel(), start=dipole_starts()(medium,
         6))
 
-    **Returns:** a `DipoleStarts` in JAX's default precision. `tools/make_starts.py` made the table.
+    **Returns:** a `DipoleStarts` in JAX's default precision. `tools/make_profiles.py` made it.
     """
     with np.load(profiles_folder() / "dipole_starts.npz") as file:
         tables = {name: jnp.asarray(table, float) for name, table in file.items()}

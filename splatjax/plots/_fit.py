@@ -9,10 +9,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
+from splatjax._format import channel_names
 from splatjax.fitting import relative_error
 from splatjax.gaussians import AbstractProfile, SumOfGaussians, gaussian
-from splatjax.scattering import NORM_RULE, AbstractRadialRule
-from splatjax.words import channel_names
+from splatjax.scattering import L2_QUADRATURE, AbstractRadialRule
 
 _RGB = ("#c0392b", "#27853f", "#2c5aa0")
 _POINTS = 400
@@ -28,7 +28,7 @@ def plot_fit(
     profile: AbstractProfile,
     gaussians: SumOfGaussians,
     *,
-    rule: AbstractRadialRule = NORM_RULE,
+    rule: AbstractRadialRule = L2_QUADRATURE,
     title: str | None = None,
 ) -> Figure:
     r"""Draw a profile and its fit, on linear and on logarithmic axes, and the difference between

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import PyTree
 
-from splatjax.devices import Devices, laid_out
+from splatjax._combination import DeviceMesh, lay_out
 
 
 def map_over(
@@ -53,7 +53,7 @@ def map_over(
 
 @eqx.filter_jit
 def _map_over(mesh: Mesh, function: Callable, shared: PyTree, batch: PyTree, count: int) -> PyTree:
-    devices = Devices.of(mesh)
+    devices = DeviceMesh.of(mesh)
     lacking = -count % devices.count
     arrays, static = eqx.partition((shared, batch), eqx.is_array)
     if lacking:
@@ -73,8 +73,8 @@ def _map_over(mesh: Mesh, function: Callable, shared: PyTree, batch: PyTree, cou
     mapped = jax.shard_map(
         share, mesh=mesh, in_specs=specs, out_specs=devices.shares, check_vma=False
     )
-    found = mapped(*laid_out(mesh, arrays, specs))
+    found = mapped(*lay_out(mesh, arrays, specs))
     if not lacking:
         return found
-    whole = laid_out(mesh, found, jax.tree.map(lambda _: PartitionSpec(), found))
+    whole = lay_out(mesh, found, jax.tree.map(lambda _: PartitionSpec(), found))
     return jax.tree.map(lambda leaf: leaf[:count], whole)

@@ -1,7 +1,6 @@
-"""The Jacobian of a picture in its material, pixel by pixel, at the price of about one more
-pass 4.
-"""
+"""The Jacobian of a picture in its material, pixel by pixel, for about one more pass 4."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import TypeVar
 
@@ -10,28 +9,18 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from splatjax import diffusion as _diffusion, splatting as _splatting
-from splatjax.devices import Devices
+from splatjax import splatting as _splatting
 from splatjax.gaussians import SumOfGaussians
-from splatjax.scene import Camera, Frame, Scene
+from splatjax.scene import Camera, Frame, Scene, stack_lights
 
+from ._attributes import SurfaceSamples
+from ._devices import on_devices
 from ._inputs import check_channels, in_one_dtype
-from ._lighting import EnteringLight, LightAtSplats, LightOnSplats, let_light_in
-from ._passes import (
-    BoundsOf,
-    SeenSurfaces,
-    ShadedSurface,
-    bounds_over,
-    cast_shadows,
-    compose,
-    see_surfaces,
-    shade,
-    sources_of,
-)
-from ._plan import plan_unless_traced
-from ._records import Plan
+from ._lighting import LightAtSplats, LightVisibility
+from ._passes import light_splats, see_and_read
+from ._plan import Plan, plan_unless_traced
 from ._settings import RenderSettings
-from ._sharded import of_all, over
+from ._shade import compose, layers_at_points, shade, single_scattering_albedo
 
 Parameters = TypeVar("Parameters", bound=PyTree)
 
@@ -102,15 +91,18 @@ class PictureJacobian(eqx.Module):
 
 
 def picture_jacobian(
-    scene: Scene, camera: Camera, settings: RenderSettings | None = None, plan: Plan | None = None
+    scene: Scene,
+    camera: Camera,
+    settings: RenderSettings = RenderSettings(),
+    plan: Plan | None = None,
 ) -> PictureJacobian:
     r"""Render, and differentiate every pixel of `beauty` in the weights and variances of the
     material.
 
-    The derivative of the very picture that `render` makes, approximations included, as reverse mode
-    gives it one pixel at a time. It costs about one more pass 4: less than two and a half frames,
-    whatever the number of pixels or parameters. With a least squares solver this is the Jacobian of
-    Gauss and Newton; from it `through` gives those in optical coefficients.
+    The derivative of the picture that `render` computes, with its approximations, as reverse mode
+    computes it one pixel at a time. It costs about one more pass 4: less than two and a half
+    frames, whatever the number of pixels or parameters. With a least squares solver this is the
+    Jacobian of Gauss and Newton; from it `through` gives those in optical coefficients.
 
     **Arguments:** as for `render`; under `jit` a plan is needed. Not itself differentiable where
     the diffuser is fast.
@@ -120,16 +112,14 @@ def picture_jacobian(
     **Raises:** `ValueError` as `render`, and for a material with single scattering under light that
     is not found at the splats.
     """
-    settings = RenderSettings() if settings is None else settings
     check_channels(scene)
     if scene.material.single_scattering is not None and not isinstance(
         settings.lighting, LightAtSplats
     ):
         raise ValueError(
             f"settings.lighting is {type(settings.lighting).__name__}, and scene.material has "
-            "single scattering, whose share of "
-            "the light is differentiated at the splats alone; give lighting=LightAtSplats(), or a "
-            "material without it"
+            "single scattering, which is differentiated at the splats alone; give "
+            "lighting=LightAtSplats(), or a material without it"
         )
     plan = plan_unless_traced(scene, camera, settings, plan)
     return _picture_jacobian(scene, camera, settings, plan)
@@ -140,86 +130,46 @@ def _picture_jacobian(
     scene: Scene, camera: Camera, settings: RenderSettings, plan: Plan
 ) -> PictureJacobian:
     scene, camera = in_one_dtype(scene, camera)
-    if plan.mesh is None:
-        return _pictured(scene, *_in_tiles(scene, camera, settings, plan))
 
-    def share(devices: Devices, scene: Scene, plan: Plan, camera: Camera) -> PictureJacobian:
-        tiles, seen, needed = _in_tiles(scene, camera, settings, plan, bounds_over(devices))
-        return _pictured(
-            scene, devices.everything(tiles), of_all(seen, devices), devices.largest(needed)
-        )
+    def passes(combination, scene, plan, camera):
+        view, groups = _splatting.PerspectiveView.of(camera), stack_lights(scene.lights)
+        given, gaussians = (settings, plan, combination), scene.material.gaussians
+        seen = view.may_see(scene.splats)
+        light = light_splats(scene, *given, derivative=True, wanted=seen)
+        visibility = LightVisibility(groups, light.visibility, light.needed)
+        attributes = settings.lighting.attributes(scene, visibility, light.irradiance)
 
-    return over(plan.mesh, share, scene, plan, camera)
+        def read(samples: SurfaceSamples):
+            own = settings.lighting.at_pixels(scene, groups, samples)
+            shaded = shade(scene, view.position, groups, samples, own, plan.interval, settings)
+            ratio = single_scattering_albedo(scene)
+            at = layers_at_points(
+                samples, own, own.source, gaussians.variances, plan.interval, settings.kernel
+            )
+            of_weights, of_variances = at.exitance_jacobian(gaussians, ratio)
+            added = samples.attributes.added_source
+            if added is not None:
+                # The light that a weight lets in has layers of its own.
+                channels = len(added)
+                layers = tuple(
+                    layer if layer is None else layer[channels:] for layer in samples.layers
+                )
+                samples = dataclasses.replace(samples, layers=layers, derivative=None)
+                at = layers_at_points(
+                    samples, own, added, gaussians.variances, plan.interval, settings.kernel
+                )
+                gained, _ = at.weigh(gaussians, ratio)
+                weighted = gaussians.weights[:, :, None] * gained
+                of_weights = of_weights + jnp.sum(weighted, axis=0)[None]
+            post = shaded.post[None]
+            return shaded, post * of_weights, post * of_variances
 
+        read_out, visible, needed = see_and_read(scene, view, light, attributes, read, *given)
+        shaded, *slopes = combination.gather(read_out)
+        visible = visible.gathered(combination)
+        frame = compose(scene, shaded, visible, needed)
+        visible = visible.invalidate_unless(needed <= 1)
+        pictures = [jnp.moveaxis(visible.picture(slope), 2, 0) for slope in slopes]
+        return PictureJacobian(frame, *pictures)
 
-class _Differentiated(eqx.Module):
-    """What the tiles show, and how radiant exitance changes there."""
-
-    shaded: ShadedSurface
-    resolved: Float[Array, "tiles gaussians pixels"]
-    weights: Float[Array, "tiles gaussians channels pixels"]
-    variances: Float[Array, "tiles gaussians channels pixels"]
-
-
-def _pictured(
-    scene: Scene, tiles: _Differentiated, seen: SeenSurfaces, needed: Float[Array, ""]
-) -> PictureJacobian:
-    seen = seen.poisoned_unless(needed <= 1)
-
-    def of_beauty(slopes: Float[Array, "tiles gaussians channels pixels"]):
-        return seen.picture(tiles.shaded.post[:, None] * slopes.transpose(0, 1, 3, 2))
-
-    frame = compose(tiles.shaded, seen, tiles.resolved, scene.material.gaussians.weights, needed)
-    return PictureJacobian(frame, of_beauty(tiles.weights), of_beauty(tiles.variances))
-
-
-def _in_tiles(
-    scene: Scene,
-    camera: Camera,
-    settings: RenderSettings,
-    plan: Plan,
-    bounds_of: BoundsOf = _splatting.Bounds.of,
-) -> tuple[_Differentiated, SeenSurfaces, Float[Array, ""]]:
-    splats, material = scene.splats, scene.material
-    view = _splatting.PerspectiveView.of(camera)
-    light = cast_shadows(scene, settings, plan, bounds_of)
-    entering, more = _entering_and_its_slope(scene, light)
-    attributes = settings.lighting.attributes(scene, light, entering)
-    if more is not None:
-        attributes["more"] = more
-    seen = see_surfaces(splats, attributes, view, settings, plan).lit(scene, light, settings)
-    rest = plan.interval, seen.atlas, plan.diffuser, settings.diffusion.normalization
-    layers, slopes, needed = _diffusion.exitance_jacobian(
-        sources_of(splats, entering.source), material, seen.receivers(), *rest
-    )
-    of_weights = slopes.weights
-    if more is not None:
-        gained, _ = _diffusion.diffusion_layers(
-            sources_of(splats, more), material, seen.receivers("more"), *rest
-        )
-        of_weights = of_weights + jnp.sum(
-            material.gaussians.weights[None, :, :, None] * gained.layers, axis=1, keepdims=True
-        )
-    shaded = shade(scene, view, light.groups, seen, layers)
-    needed = jnp.max(jnp.stack([needed, seen.needed, light.needed]))
-    return _Differentiated(shaded, layers.resolved, of_weights, slopes.variances), seen, needed
-
-
-def _entering_and_its_slope(
-    scene: Scene, light: LightOnSplats
-) -> tuple[EnteringLight, Float[Array, "channels splats"] | None]:
-    """Also give what each weight adds to the light that spreads: beside single scattering, which
-    leaves less where it grazes.
-    """
-    if scene.material.single_scattering is None:
-        return let_light_in(scene, light), None
-    weights = scene.material.gaussians.weights
-
-    def entering(more: Float[Array, " channels"]):
-        return let_light_in(
-            eqx.tree_at(lambda s: s.material.gaussians.weights, scene, weights.at[0].add(more)),
-            light,
-        )
-
-    found, slope = jax.jvp(entering, (jnp.zeros_like(weights[0]),), (jnp.ones_like(weights[0]),))
-    return found, slope.source
+    return on_devices(passes, scene, plan, camera)

@@ -1,71 +1,131 @@
-"""Where the light that enters the surface is found: at the splats, or at what the pixels see of
-them.
-"""
+"""Pass 1, and the light that enters the surface: at the splats, or at what the pixels see."""
 
 import abc
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from splatjax import diffusion as _diffusion, shading as _shading
-from splatjax.scene import Material, Scene, StackedLights
+from splatjax import diffusion as _diffusion, shading as _shading, splatting as _splatting
+from splatjax._combination import AbstractCombination
+from splatjax.scene import Material, Scene, StackedLights, stack_lights
+
+from ._attributes import SurfaceAttributes, SurfaceSamples
+from ._shadow_plan import ShadowPlan, shadow_views
 
 
-class LightOnSplats(eqx.Module):
-    """Pass 1: what of each light reaches each splat."""
+class LightVisibility(eqx.Module):
+    """Pass 1: the fraction of each light that reaches each splat.
+
+    **Attributes:**
+
+    - `groups`: lights of one kind, stacked.
+    - `visibility`: per group; `None` for lights that cast no shadows.
+    - `needed`: capacity needed over planned.
+    """
 
     groups: list[StackedLights]
-    shares: list[Float[Array, "_lights splats"] | None]
-    """Per group of lights; `None` for lights that cast no shadows."""
+    visibility: list[Float[Array, "_lights points"] | None]
     needed: Float[Array, ""]
 
 
-class EnteringLight(eqx.Module):
-    """What the light leaves below the surface of each splat, or of each point that a pixel sees."""
+class Irradiance(eqx.Module):
+    """Light below the surface of splats, or of points that the pixels see.
 
-    irradiance: Float[Array, "channels points"]
-    """That enters the surface."""
+    **Attributes:**
+
+    - `entering`: irradiance that enters the surface.
+    - `source`: that which spreads, times the root of the albedo.
+    """
+
+    entering: Float[Array, "channels points"]
     source: Float[Array, "channels points"]
-    """That spreads: times the root of the albedo."""
+
+
+def cast_shadows(
+    scene: Scene,
+    shadows: tuple[ShadowPlan | None, ...],
+    splatting: _splatting.SplattingSettings,
+    settings: _splatting.ShadowSettings,
+    combination: AbstractCombination,
+) -> LightVisibility:
+    """Make the shadow maps of all lights (4.1) and look up the splats in them."""
+    splats, groups = scene.splats, stack_lights(scene.lights)
+    bounds = _splatting.Bounds.of(splats, combination)
+    visibility, needed = [], [jnp.zeros((), splats.centers.dtype)]
+    for group, plan in zip(groups, shadows, strict=True):
+        if plan is None:
+            visibility.append(None)
+            continue
+
+        def of_light(light, plan=plan):
+            def of_view(view):
+                shadow_map = _splatting.make_shadow_map(
+                    splats, view, splatting, plan.raster, combination
+                )
+                own = map_visibility(scene, shadow_map, settings, plan.cube)
+                return own, shadow_map.needed
+
+            views = shadow_views(light, bounds, settings, plan.cube)
+            own, needed = jax.lax.map(of_view, _splatting.stack_views(views))
+            return jnp.sum(own, axis=0), jnp.maximum(jnp.max(needed), plan.closeness(light, bounds))
+
+        own, need = jax.lax.map(of_light, group.lights)
+        visibility.append(own)
+        needed.append(jnp.max(need))
+    return LightVisibility(groups, visibility, jnp.max(jnp.stack(needed)))
+
+
+def map_visibility(
+    scene: Scene,
+    shadow_map: _splatting.ShadowMap,
+    settings: _splatting.ShadowSettings,
+    cube: bool,
+) -> Float[Array, " splats"]:
+    """Look the splats up in one map: 0 for those that belong to another face of a cube."""
+    visibility = _splatting.compute_visibility(scene.splats, shadow_map, settings)
+    if cube:
+        assert isinstance(shadow_map.view, _splatting.PerspectiveView)
+        visibility *= _splatting.in_cube_face(shadow_map.view, scene.splats.centers.T)
+    return visibility
 
 
 def entering_light(
     material: Material,
-    light: LightOnSplats,
-    points: Float[Array, "points 3"],
+    light: LightVisibility,
+    positions: Float[Array, "points 3"],
     normals: Float[Array, "points 3"],
     albedo: Float[Array, "points channels"] | None,
     specular: Float[Array, " points"] | Float[Array, ""],
     roughness: Float[Array, " points"] | Float[Array, ""],
-) -> EnteringLight:
-    """Give the light that enters at points of the surface.
+) -> Irradiance:
+    """Compute the light that enters at points of the surface.
 
     **Arguments:**
 
-    - `light`: with the shares that reach these points.
+    - `light`: with the visibility at these points.
     - `normals`: unit.
     """
     f0 = _shading.fresnel_f0(material.eta)
 
     def entering(cosine):
         share = 1 - _shading.directional_albedo(cosine, f0, specular, roughness)
-        return (
-            share[None]
-            if material.single_scattering is None
-            else share[None] * material.left_to_diffuse(cosine).T
-        )
+        if material.single_scattering is None:
+            return share[None]
+        return share[None] * material.diffuse_fraction(cosine).T
 
     channels = material.gaussians.weights.shape[1]
     irradiance = _diffusion.entering_irradiance(
-        points, normals, light.groups, light.shares, entering, channels
+        positions, normals, light.groups, light.visibility, entering, channels
     )
-    return EnteringLight(
-        irradiance, irradiance if albedo is None else irradiance * _shading.albedo_root(albedo).T
-    )
+    if albedo is None:
+        return Irradiance(irradiance, irradiance)
+    return Irradiance(irradiance, irradiance * _shading.albedo_root(albedo).T)
 
 
-def let_light_in(scene: Scene, light: LightOnSplats) -> EnteringLight:
-    """The irradiance that enters at every splat."""
+def irradiate(scene: Scene, light: LightVisibility) -> Irradiance:
+    """Compute the light that enters every splat."""
     splats = scene.splats
     specular, roughness = surface_parameters(scene)
     return entering_light(
@@ -74,64 +134,52 @@ def let_light_in(scene: Scene, light: LightOnSplats) -> EnteringLight:
 
 
 def surface_parameters(scene: Scene):
-    """The material's specular strength and roughness, times the splats' own."""
+    """Multiply the material's specular strength and roughness with the splats' own."""
     splats, material = scene.splats, scene.material
-    specular = material.specular if splats.specular is None else material.specular * splats.specular
-    roughness = (
-        material.roughness if splats.roughness is None else material.roughness * splats.roughness
-    )
+    specular, roughness = material.specular, material.roughness
+    if splats.specular is not None:
+        specular = specular * splats.specular
+    if splats.roughness is not None:
+        roughness = roughness * splats.roughness
     return specular, roughness
 
 
 def surface_attributes(
-    scene: Scene, light: LightOnSplats, entering: EnteringLight
-) -> dict[str, Float[Array, "_rows splats"]]:
-    """What passes 2 and 3 blend for the passes that follow, by name."""
+    scene: Scene, light: LightVisibility, irradiance: Irradiance
+) -> SurfaceAttributes:
+    """Collect what passes 2 and 3 blend, but for the layers of pass 4."""
     splats = scene.splats
     specular, roughness = surface_parameters(scene)
-    attributes = {
-        "normal": splats.normals.T,
-        "area": splats.areas[None],
-        "source": entering.source,
-        "albedo": None if splats.albedo is None else splats.albedo.T,
-        "irradiance": None if splats.albedo is None else entering.irradiance,
-        "specular": None if splats.specular is None else specular[None],
-        "roughness": None if splats.roughness is None else roughness[None],
-    }
-    attributes |= {f"lit {i}": shares for i, shares in enumerate(light.shares)}
-    return {name: rows for name, rows in attributes.items() if rows is not None}
+    return SurfaceAttributes(
+        normals=splats.normals.T,
+        area=splats.areas[None],
+        source=irradiance.source,
+        albedo=None if splats.albedo is None else splats.albedo.T,
+        irradiance=None if splats.albedo is None else irradiance.entering,
+        specular=None if splats.specular is None else specular[None],
+        roughness=None if splats.roughness is None else roughness[None],
+        visibility=tuple(light.visibility),
+    )
 
 
 class AbstractLighting(eqx.Module):
-    """What splats carry into the picture, and what pixels make of it before light spreads and is
-    shaded.
-    """
+    """What splats carry into the picture, and what pixels make of it before light is shaded."""
 
     def attributes(
-        self, scene: Scene, light: LightOnSplats, entering: EnteringLight
-    ) -> dict[str, Float[Array, "_rows splats"]]:
-        """Give what passes 2 and 3 blend, by name: `surface_attributes`, or more."""
-        return surface_attributes(scene, light, entering)
+        self, scene: Scene, light: LightVisibility, irradiance: Irradiance
+    ) -> SurfaceAttributes:
+        """Collect what passes 2 and 3 blend: `surface_attributes`, or more in `extra`."""
+        return surface_attributes(scene, light, irradiance)
 
     @abc.abstractmethod
     def at_pixels(
-        self,
-        scene: Scene,
-        groups: list[StackedLights],
-        points: Float[Array, "tiles 3 pixels"],
-        named: dict[str, Float[Array, "tiles _rows pixels"]],
-    ) -> dict[str, Float[Array, "tiles _rows pixels"]]:
-        """Give what passes 4 and 5 read, from what was blended at the points (mm) that the pixels
-        see.
-
-        They read the names of `surface_attributes`; normals need not be unit.
-        """
+        self, scene: Scene, groups: list[StackedLights], samples: SurfaceSamples
+    ) -> SurfaceAttributes:
+        """Compute what passes 4 and 5 read from what was blended at the pixels."""
 
 
 class LightAtSplats(AbstractLighting):
-    """The irradiance of the splats, blended like all they carry: what spreads below a pixel is what
-    enters the splats there.
-    """
+    """The irradiance of the splats, blended like all they carry."""
 
-    def at_pixels(self, scene, groups, points, named):
-        return named
+    def at_pixels(self, scene, groups, samples):
+        return samples.attributes

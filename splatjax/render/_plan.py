@@ -1,35 +1,80 @@
 """What `jit`, `grad` and loops need to know of shapes, found once."""
 
 from collections.abc import Sequence
+from typing import TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jax.sharding import Mesh
-from jaxtyping import Array, Float
+from jax.experimental.multihost_utils import process_allgather
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from splatjax import diffusion as _diffusion, splatting as _splatting
+from splatjax._combination import DeviceMesh, OneDevice
 from splatjax.scene import AbstractLight, Camera, Scene, Splats, StackedLights, stack_lights
 
+from ._checks import check_scene
 from ._inputs import in_one_dtype
-from ._records import Plan, ShadowPlan, ShadowsWanted, Wanted, shadow_views, stands_among
 from ._settings import RenderSettings
-from ._sharded_plan import on_one_device, plan_over
+from ._shadow_plan import ShadowPlan, is_among, shadow_views
+
+Whole = TypeVar("Whole", bound=PyTree)
 
 
-def plan(
+class Plan(eqx.Module):
+    r"""What `jit`, `grad` and loops need to know of shapes; made by `make_plan` from concrete
+    arrays.
+
+    Capacities are static, indices are arrays. A picture that needs more than its plan holds is NaN,
+    and `overflow` is the need.
+
+    **Attributes:**
+
+    - `order`: the compact order in which the splats of each device are rendered; the last is
+      repeated to fill a block.
+    - `exists`: false for these repetitions.
+    - `shadows`: for each group of lights of a kind the capacity of its shadow maps; `None` for
+      lights that cast no shadows.
+    - `diffusion`: the clusters and neighbors of the splats.
+    - `interval`: standard deviations per spacing between which a layer becomes resolved.
+    - `raster`: the capacity of what the cameras see.
+    - `mesh`: the devices that hold the splats; `None` for one. Static.
+    - `splats`: how many it is for. Static.
+    """
+
+    order: Int[Array, " places"]
+    exists: Bool[Array, " places"]
+    shadows: tuple[ShadowPlan | None, ...]
+    diffusion: _diffusion.AbstractDiffusionPlan
+    interval: Float[Array, "2"]
+    raster: _splatting.AbstractRasterPlan
+    mesh: Mesh | None = eqx.field(static=True)
+    splats: int = eqx.field(static=True)
+
+    def specs(self, combination: DeviceMesh) -> "Plan":
+        """Specify which arrays every device has whole, and of which it has a share."""
+        specs = jax.tree.map(lambda _: PartitionSpec(), self)
+
+        def cut(plan):
+            return plan.order, plan.exists, *plan.diffusion.shares()
+
+        return eqx.tree_at(cut, specs, replace_fn=lambda _: combination.shares)
+
+
+def make_plan(
     scenes: Scene | Sequence[Scene],
     cameras: Camera | Sequence[Camera],
-    settings: RenderSettings | None = None,
+    settings: RenderSettings = RenderSettings(),
     mesh: Mesh | None = None,
 ) -> Plan:
     r"""Find the capacities and orders that rendering a scene with these cameras needs.
 
     **Arguments:** concrete, not traced.
 
-    - `scenes`: one, or several that differ in their lights alone: the same splats and material,
+    - `scenes`: one, or several that differ only in their lights: the same splats and material,
       lights of the same kinds in the same order.
     - `cameras`: all have pictures of one size.
     - `mesh`: devices over which the splats are cut when rendering; planned on one.
@@ -37,98 +82,84 @@ def plan(
     **Returns:** a `Plan` that serves every scene with every camera, and scenes and materials near
     these: variances within a factor of 1.25, splats that have moved among each other by less than a
     tenth of a layer's width, light of any strength and color. A light that casts shadows from
-    elsewhere may need more room.
+    elsewhere may need more capacity.
 
-    **Raises:** `ValueError` when cameras or scenes do not fit together.
+    **Raises:** `ValueError` when cameras or scenes do not fit together, or when the rasterizer or
+    diffuser of the settings does not work over a mesh.
     """
-    return _plan(scenes, cameras, RenderSettings() if settings is None else settings, mesh)
-
-
-def _plan(
-    scenes: Scene | Sequence[Scene],
-    cameras: Camera | Sequence[Camera],
-    settings: RenderSettings,
-    mesh: Mesh | None,
-) -> Plan:
     cameras = [cameras] if isinstance(cameras, Camera) else list(cameras)
     scenes = [scenes] if isinstance(scenes, Scene) else list(scenes)
-    if not cameras or not scenes:
-        raise ValueError(
-            f"a plan needs a scene and a camera at least, not {len(scenes)} scenes and "
-            f"{len(cameras)} cameras"
-        )
-    scene, *others = scenes if mesh is None else on_one_device(scenes)
-    cameras = cameras if mesh is None else on_one_device(cameras)
+    _check(scenes, cameras)
+    (scene, *others), cameras = _on_one_device((scenes, cameras))
     scene, others, cameras = in_one_dtype(scene, others, cameras)
-    if len({(camera.width, camera.height) for camera in cameras}) != 1:
-        sizes = sorted({(camera.width, camera.height) for camera in cameras})
-        raise ValueError(f"cameras of one plan must have pictures of one size, not {sizes}")
-    for i, other in enumerate(others, 1):
-        if not eqx.tree_equal((scene.splats, scene.material), (other.splats, other.material)):
-            raise ValueError(
-                f"scenes of one plan may differ in their lights alone, but scenes[{i}] has other "
-                "splats or material"
-            )
-    groups = _groups([each.lights for each in (scene, *others)])
     views = [_splatting.PerspectiveView.of(camera) for camera in cameras]
-    bounds = _splatting.Bounds.of(scene.splats)
-    interval = _diffusion.handover_interval(
-        _diffusion.irregularity(scene.splats), settings.diffusion
-    )
-    kernels = _diffusion.Kernels.of(
-        scene.material.gaussians.variances, settings.diffusion.normalization
-    )
-    camera = settings.rasterizer.planned(scene.splats, views, settings.splatting)
-    looks = [_look(scene.splats, view, settings.splatting, camera) for view in views]
-    shadows = [_shadows_wanted(group, bounds, settings) for group in groups]
-    wanted = Wanted(scene.splats, settings, kernels, interval, views, looks, shadows, camera)
-    return _on_one_device(wanted) if mesh is None else plan_over(mesh, wanted)
-
-
-def _on_one_device(wanted: Wanted) -> Plan:
-    splats, settings, looks = wanted.splats, wanted.settings, wanted.looks
-    shown = max(int(np.sum(np.asarray(look) > -np.inf)) for look in looks)
-    tiles = min(_splatting.round_up(shown, 1), looks[0].size)
-    atlases = [
-        _splatting.Atlas.of(look, view, tiles)
-        for look, view in zip(looks, wanted.views, strict=True)
-    ]
-    rasterizer = settings.rasterizer.for_shadows()
-    shadows = (
-        None
-        if each is None
-        else ShadowPlan(rasterizer.planned(splats, each.views, settings.splatting), each.cube)
-        for each in wanted.shadows
-    )
-    return Plan(
-        rasterizer=wanted.rasterizer,
-        tiles=tiles,
-        shadows=tuple(shadows),
-        diffuser=settings.diffuser.planned(splats, wanted.kernels, wanted.interval, atlases),
-        interval=wanted.interval,
+    splats, devices = scene.splats, 1 if mesh is None else mesh.size
+    parts, order, exists = _arrange(splats, devices)
+    bounds = _splatting.Bounds.of(fill_up(splats, max(splats.count, 1)), OneDevice())
+    interval = settings.kernel.interval(_diffusion.unevenness(splats))
+    variances = scene.material.gaussians.variances
+    raster = settings.rasterizer.make_plan(parts, views, settings.splatting)
+    plan = Plan(
+        order=order,
+        exists=exists,
+        shadows=tuple(
+            _plan_shadows(group, parts, bounds, settings)
+            for group in _groups([each.lights for each in (scene, *others)])
+        ),
+        diffusion=settings.diffuser.make_plan(parts, variances, settings.kernel, interval),
+        interval=interval,
+        raster=raster.fitted(parts, views, settings.splatting),
+        mesh=mesh,
         splats=splats.count,
     )
+    if mesh is None:
+        return plan
+    specs = plan.specs(DeviceMesh.of(mesh))
+    return jax.tree.map(
+        lambda leaf, spec: jax.device_put(leaf, NamedSharding(mesh, spec)), plan, specs
+    )
 
 
-@eqx.filter_jit
-def _look(
-    splats: Splats, view, settings: _splatting.SplattingSettings, rasterizer
-) -> Float[Array, "surfaces down across"]:
-    """Find where there is anything to see, and how far away: a tile farther on every side, and two
-    radii, for what moves.
-    """
-    nothing = jnp.zeros((0, splats.count), splats.centers.dtype)
-    seen = _splatting.farthest_depths(rasterizer.summed(splats, nothing, view, settings), view)
-    grown = jax.lax.reduce_window(seen, -jnp.inf, jax.lax.max, (1, 3, 3), (1, 1, 1), "SAME")
-    return jnp.where(grown > -jnp.inf, grown + 2 * jnp.mean(splats.radii), -jnp.inf)
+def fill_up(splats: Splats, count: int) -> Splats:
+    """Add splats that are invisible and bring no light, up to `count`."""
+    lacking = count - splats.count
+    if lacking == 0:
+        return splats
+    if splats.count == 0:
+        return jax.tree.map(lambda leaf: jnp.zeros((lacking, *leaf.shape[1:]), leaf.dtype), splats)
+    last = jax.tree.map(
+        lambda leaf: jnp.broadcast_to(leaf[-1:], (lacking, *leaf.shape[1:])), splats
+    )
+    last = eqx.tree_at(
+        lambda each: (each.normals, each.radii, each.areas), last, replace_fn=jnp.zeros_like
+    )
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), splats, last)
 
 
-def check_count(plan: Plan, scene: Scene) -> None:
-    """Raise `ValueError` for a plan that is made for another number of splats."""
-    if plan.splats not in (None, scene.splats.count):
+def arrange(splats: Splats, order: Int[Array, " places"], exists: Bool[Array, " places"]) -> Splats:
+    """Put a device's splats in the order of a plan; repeated ones are invisible and dark."""
+    placed = jax.tree.map(lambda leaf: leaf[order], splats)
+
+    def masked(leaf):
+        return jnp.where(exists.reshape(-1, *[1] * (leaf.ndim - 1)), leaf, 0)
+
+    return eqx.tree_at(
+        lambda each: (each.normals, each.radii, each.areas), placed, replace_fn=masked
+    )
+
+
+def check_plan(plan: Plan, scene: Scene, mesh: Mesh | None = None) -> None:
+    """Raise `ValueError` for a plan that was made for other splats or another mesh."""
+    if plan.splats != scene.splats.count:
         raise ValueError(
             f"the plan is for {plan.splats} splats, and the scene has {scene.splats.count}; make "
-            "it anew"
+            "another plan"
+        )
+    if mesh is not None and plan.mesh != mesh:
+        made_for = "one device" if plan.mesh is None else f"{plan.mesh}"
+        raise ValueError(
+            f"the plan is for {made_for}, not for {mesh}; make it with "
+            "splatjax.make_plan(..., mesh=mesh)"
         )
 
 
@@ -138,31 +169,77 @@ def plan_unless_traced(
     settings: RenderSettings,
     plan: Plan | None,
     mesh: Mesh | None = None,
+    is_lit: bool = True,
 ) -> Plan:
-    """Give the plan, or make one where that can be. Its own mesh need not be named.
+    """Check the scene and the plan, or make one where none is given.
 
-    **Raises:** `ValueError` for a plan of another number of splats or another mesh, or when none is
-    given under `jit`, `grad` or `vmap`.
+    **Raises:** `ValueError` for a plan of other splats or another mesh, or when none is given under
+    `jit`, `grad` or `vmap`.
     """
+    check_scene(scene, camera, is_lit)
     if plan is not None:
-        check_count(plan, scene)
-        if mesh is not None and plan.mesh != mesh:
-            made_for = "one device" if plan.mesh is None else f"{plan.mesh}"
-            raise ValueError(
-                f"the plan is for {made_for}, not for {mesh}; make it with splatjax.plan(..., "
-                "mesh=mesh)"
-            )
+        check_plan(plan, scene, mesh)
         return plan
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((scene, camera))):
         raise ValueError(
-            "under jit, grad or vmap a plan is needed: plan=splatjax.plan(scene, camera, "
-            "settings), made outside"
+            "plan is None, and under jit, grad or vmap a plan is needed: make one outside, "
+            "plan=splatjax.make_plan(scene, camera, settings)"
         )
-    return _plan(scene, camera, settings, mesh)
+    return make_plan(scene, camera, settings, mesh)
+
+
+def _check(scenes: list[Scene], cameras: list[Camera]) -> None:
+    if not cameras or not scenes:
+        raise ValueError(
+            "a plan needs at least one scene and one camera, not "
+            f"{len(scenes)} scenes and {len(cameras)} cameras"
+        )
+    sizes = sorted({(camera.width, camera.height) for camera in cameras})
+    if len(sizes) != 1:
+        raise ValueError(f"cameras of one plan must have pictures of one size, not {sizes}")
+    first = scenes[0]
+    for i, scene in enumerate(scenes[1:], 1):
+        if not eqx.tree_equal((first.splats, first.material), (scene.splats, scene.material)):
+            raise ValueError(
+                f"scenes of one plan may differ only in their lights, and scenes[{i}] has other "
+                "splats or another material"
+            )
+
+
+def _on_one_device(tree: Whole) -> Whole:
+    """Gather what may lie on several devices, and on those of several processes, for planning."""
+
+    def gathered(leaf):
+        if not isinstance(leaf, jax.Array) or isinstance(
+            leaf.sharding, jax.sharding.SingleDeviceSharding
+        ):
+            return leaf
+        whole = leaf if leaf.is_fully_addressable else process_allgather(leaf, tiled=True)
+        return jnp.asarray(np.asarray(whole))
+
+    return jax.tree.map(gathered, tree)
+
+
+def _arrange(splats: Splats, devices: int) -> tuple[list[Splats], Array, Array]:
+    """Cut the splats into a part for each device, each in a compact order; also return the orders
+    and which of their entries exist, device after device.
+    """
+    rows = max(-(-splats.count // devices), 1)
+    places = -(-rows // _diffusion.BLOCK) * _diffusion.BLOCK
+    whole, parts, orders, exist = fill_up(splats, rows * devices), [], [], []
+    for i in range(devices):
+        part = jax.tree.map(lambda leaf, i=i: leaf[i * rows : (i + 1) * rows], whole)
+        order = _diffusion.compact_order(np.asarray(part.centers))
+        exists = np.pad(i * rows + order < splats.count, (0, places - rows))
+        order = np.pad(order, (0, places - rows), mode="edge")
+        orders.append(order.astype(np.int32))
+        exist.append(exists)
+        parts.append(arrange(part, jnp.asarray(orders[-1]), jnp.asarray(exists)))
+    return parts, jnp.asarray(np.concatenate(orders)), jnp.asarray(np.concatenate(exist))
 
 
 def _groups(lights: Sequence[tuple[AbstractLight, ...]]) -> list[list[StackedLights]]:
-    """Give, for each group of lights that are rendered together, what it is in every scene."""
+    """Return for each group of lights that are rendered together its lights in every scene."""
     stacked = [stack_lights(each) for each in lights]
     kinds = [
         [(jax.tree.structure(group.lights), group.places) for group in groups] for groups in stacked
@@ -170,19 +247,24 @@ def _groups(lights: Sequence[tuple[AbstractLight, ...]]) -> list[list[StackedLig
     for i, each in enumerate(kinds):
         if each != kinds[0]:
             raise ValueError(
-                "scenes of one plan must have lights of the same kinds in the same order, but not "
-                f"so scenes[{i}]"
+                "scenes of one plan must have lights of the same kinds in the same order, and the "
+                f"lights of scenes[{i}] differ"
             )
     return [list(group) for group in zip(*stacked, strict=True)]
 
 
-def _shadows_wanted(
-    groups: Sequence[StackedLights], bounds: _splatting.Bounds, settings: RenderSettings
-) -> ShadowsWanted | None:
+def _plan_shadows(
+    groups: Sequence[StackedLights],
+    parts: Sequence[Splats],
+    bounds: _splatting.Bounds,
+    settings: RenderSettings,
+) -> ShadowPlan | None:
     if not groups[0].lights.cast_shadows:
         return None
     lights = [light for group in groups for light in group.apart()]
-    cube = stands_among(lights, bounds)
-    return ShadowsWanted(
-        [view for light in lights for view in shadow_views(light, bounds, settings, cube)], cube
-    )
+    cube = is_among(lights, bounds)
+    views = [
+        view for light in lights for view in shadow_views(light, bounds, settings.shadows, cube)
+    ]
+    rasterizer = settings.rasterizer.for_shadows()
+    return ShadowPlan(rasterizer.make_plan(parts, views, settings.splatting), cube)

@@ -1,38 +1,30 @@
-"""A picture with all its layers, and pass 4 alone."""
+"""A picture with all its layers, the light of a body without a camera, and pass 4 alone."""
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.sharding import Mesh, PartitionSpec
+from jax.sharding import Mesh
 from jaxtyping import Array, Float
 
 from splatjax import splatting as _splatting
-from splatjax.devices import Devices, laid_out
-from splatjax.scene import Camera, Frame, Scene
+from splatjax.scene import Camera, Frame, Scene, stack_lights
 
+from ._devices import on_devices
 from ._inputs import SAME, check_channels, in_one_dtype
-from ._lighting import EnteringLight, let_light_in
-from ._passes import (
-    SeenSurfaces,
-    bounds_over,
-    cast_shadows,
-    compose,
-    five_passes,
-    see_surfaces,
-    spread_light,
-)
-from ._plan import check_count, plan_unless_traced
-from ._records import Plan
+from ._lighting import Irradiance, LightVisibility, cast_shadows, irradiate, surface_attributes
+from ._passes import SplatLight, diffuse_splats, light_splats, see_and_read
+from ._plan import Plan, check_plan, plan_unless_traced
 from ._settings import RenderSettings
-from ._sharded import of_all, over
+from ._shade import compose, layers_at_points, shade, single_scattering_albedo
 
 
 def render(
     scene: Scene,
     camera: Camera,
-    settings: RenderSettings | None = None,
+    settings: RenderSettings = RenderSettings(),
     plan: Plan | None = None,
     mesh: Mesh | None = None,
+    light: SplatLight | None = None,
 ) -> Frame:
     r"""Render a picture with all its layers: shadow maps, visibility, attributes, diffusion,
     shading.
@@ -42,9 +34,11 @@ def render(
     - `scene`: splats (mm), lights and material. Differentiable; which splats are visible is not.
     - `camera`: Differentiable.
     - `settings`: how each pass works.
-    - `plan`: from `splatjax.plan`; needed under `jit`, `grad` and `vmap`, made here otherwise.
+    - `plan`: from `splatjax.make_plan`; needed under `jit`, `grad` and `vmap`, made here otherwise.
     - `mesh`: devices over which the splats are cut, whatever its axes: each holds a share, and
-      their gradients (docs/devices.md). It is the plan's where that is given.
+      their gradients (docs/devices.md). By default the mesh of the plan.
+    - `light`: from `splatjax.illuminate` with the same scene, settings and plan: passes 1 and 4,
+      which do not depend on the camera, are then not repeated. Differentiable.
 
     **Returns:** a `Frame` in the dtype of `splats.centers`; the same on every device, and to
     rounding whatever the mesh.
@@ -52,80 +46,111 @@ def render(
     **Raises:** `ValueError` when a plan is needed and not given, or is for another mesh or another
     number of splats, or when the scene's channels disagree.
     """
-    settings = RenderSettings() if settings is None else settings
     check_channels(scene)
     plan = plan_unless_traced(scene, camera, settings, plan, mesh)
-    return _render(scene, camera, settings, plan)
+    return _render(scene, camera, settings, plan, light)
 
 
 @eqx.filter_jit
-def _render(scene: Scene, camera: Camera, settings: RenderSettings, plan: Plan) -> Frame:
+def _render(
+    scene: Scene, camera: Camera, settings: RenderSettings, plan: Plan, light: SplatLight | None
+) -> Frame:
     scene, camera = in_one_dtype(scene, camera)
-    if plan.mesh is None:
-        shaded, seen, resolved, needed = five_passes(scene, camera, settings, plan)
-        return compose(shaded, seen, resolved, scene.material.gaussians.weights, needed)
 
-    def share(devices: Devices, scene: Scene, plan: Plan, camera: Camera) -> Frame:
-        shaded, seen, resolved, needed = five_passes(
-            scene, camera, settings, plan, bounds_over(devices)
-        )
-        shaded, resolved = devices.everything((shaded, resolved))
-        return compose(
-            shaded,
-            of_all(seen, devices),
-            resolved,
-            scene.material.gaussians.weights,
-            devices.largest(needed),
-        )
+    def passes(combination, scene, plan, camera, light=None):
+        view, groups = _splatting.PerspectiveView.of(camera), stack_lights(scene.lights)
+        if light is None:
+            seen = view.may_see(scene.splats)
+            light = light_splats(scene, settings, plan, combination, wanted=seen)
+        visibility = LightVisibility(groups, light.visibility, light.needed)
+        attributes = settings.lighting.attributes(scene, visibility, light.irradiance)
 
-    return over(plan.mesh, share, scene, plan, camera)
+        def read(samples):
+            own = settings.lighting.at_pixels(scene, groups, samples)
+            return shade(scene, view.position, groups, samples, own, plan.interval, settings)
+
+        given = settings, plan, combination
+        shaded, visible, needed = see_and_read(scene, view, light, attributes, read, *given)
+        shaded = combination.gather(shaded)
+        return compose(scene, shaded, visible.gathered(combination), needed)
+
+    return on_devices(passes, scene, plan, camera, placed=light)
 
 
-def light_on_splats(
-    scene: Scene, plan: Plan, settings: RenderSettings | None = None
-) -> EnteringLight:
-    r"""Give the light that enters at every splat: pass 1, and the irradiance.
+def illuminate(scene: Scene, plan: Plan, settings: RenderSettings = RenderSettings()) -> SplatLight:
+    r"""Light a body and diffuse its light: passes 1 and 4, which no camera changes.
+
+    Give the result to `render` to look at the same body from several sides.
 
     **Arguments:**
 
     - `scene`: Differentiable.
-    - `plan`: from `splatjax.plan`.
+    - `plan`: from `splatjax.make_plan`.
     - `settings`: those of the plan.
 
-    **Returns:** the irradiance, and what of it spreads: `source.T` is what `diffuse` asks for.
+    **Returns:** the light on the splats, in the order of the plan.
 
     **Raises:** `ValueError` when the channels disagree, or the plan is for another number of
     splats.
     """
     check_channels(scene)
-    check_count(plan, scene)
-    return _light_on_splats(scene, plan, RenderSettings() if settings is None else settings)
+    check_plan(plan, scene)
+    return _illuminate(scene, plan, settings)
 
 
 @eqx.filter_jit
-def _light_on_splats(scene: Scene, plan: Plan, settings: RenderSettings) -> EnteringLight:
+def _illuminate(scene: Scene, plan: Plan, settings: RenderSettings) -> SplatLight:
     (scene,) = in_one_dtype(scene)
-    if plan.mesh is None:
-        return let_light_in(scene, cast_shadows(scene, settings, plan))
 
-    def share(devices: Devices, scene: Scene, plan: Plan) -> EnteringLight:
-        return let_light_in(scene, cast_shadows(scene, settings, plan, bounds_over(devices)))
+    def passes(combination, scene, plan):
+        return light_splats(scene, settings, plan, combination)
 
-    found, count = (
-        over(plan.mesh, share, scene, plan, found=PartitionSpec(None, Devices.of(plan.mesh).axes)),
-        scene.splats.count,
-    )
-    if found.source.shape[1] == count:
-        return found
-    whole = laid_out(plan.mesh, found, jax.tree.map(lambda _: PartitionSpec(), found))
-    return jax.tree.map(lambda rows: rows[:, :count], whole)
+    return on_devices(passes, scene, plan, by_splat=True)
 
 
-def diffuse(
+def compute_irradiance(
+    scene: Scene, plan: Plan, settings: RenderSettings = RenderSettings()
+) -> Irradiance:
+    r"""Compute the light that enters at every splat: pass 1, and the irradiance.
+
+    **Arguments:** as for `illuminate`.
+
+    **Returns:** the irradiance, and that which spreads, `[channels, splats]` in the order of the
+    scene: `source.T` is what `diffuse_irradiance` takes.
+
+    **Raises:** `ValueError` as `illuminate`.
+    """
+    check_channels(scene)
+    check_plan(plan, scene)
+    return _compute_irradiance(scene, plan, settings)
+
+
+@eqx.filter_jit
+def _compute_irradiance(scene: Scene, plan: Plan, settings: RenderSettings) -> Irradiance:
+    (scene,) = in_one_dtype(scene)
+
+    def passes(combination, scene, plan):
+        maps = plan.shadows, settings.splatting, settings.shadows
+        return irradiate(scene, cast_shadows(scene, *maps, combination))
+
+    placed = on_devices(passes, scene, plan, by_splat=True)
+    count = 1 if plan.mesh is None else plan.mesh.size
+    share = max(-(-scene.splats.count // count), 1)
+    device = jnp.repeat(jnp.arange(count), len(plan.order) // count)
+    splat = jnp.where(plan.exists, device * share + plan.order, scene.splats.count)
+
+    def in_scene_order(rows):
+        empty = jnp.zeros((rows.shape[0], scene.splats.count), rows.dtype)
+        return empty.at[:, splat].set(rows, mode="drop")
+
+    return jax.tree.map(in_scene_order, placed)
+
+
+def diffuse_irradiance(
     scene: Scene,
     irradiance: Float[Array, "splats channels"],
     camera: Camera,
-    settings: RenderSettings | None = None,
+    settings: RenderSettings = RenderSettings(),
     plan: Plan | None = None,
 ) -> Float[Array, "gaussians height width channels"]:
     r"""Diffuse any irradiance of the splats below the surface: pass 4 alone, the plain layers `L_k`
@@ -143,7 +168,6 @@ def diffuse(
 
     **Raises:** `ValueError` when a plan is needed and not given, or when the channels disagree.
     """
-    settings = RenderSettings() if settings is None else settings
     check_channels(scene)
     channels = scene.material.gaussians.weights.shape[1]
     if irradiance.shape[1] != channels:
@@ -151,46 +175,35 @@ def diffuse(
             f"irradiance has {irradiance.shape[1]} channels, material.gaussians.weights has "
             f"{channels}: {SAME}"
         )
-    plan = plan_unless_traced(scene, camera, settings, plan)
-    return _diffuse(scene, irradiance, camera, settings, plan)
+    plan = plan_unless_traced(scene, camera, settings, plan, is_lit=False)
+    return _diffuse_irradiance(scene, irradiance, camera, settings, plan)
 
 
 @eqx.filter_jit
-def _diffuse(scene: Scene, irradiance, camera: Camera, settings: RenderSettings, plan: Plan):
-    scene, camera, irradiance = in_one_dtype(scene, camera, irradiance)
-    if plan.mesh is None:
-        layers, seen, needed = _layers(settings, scene, plan, camera, irradiance)
-        return _front_picture(layers, seen, needed)
-
-    def share(devices: Devices, scene: Scene, plan: Plan, camera: Camera, irradiance):
-        layers, seen, needed = _layers(settings, scene, plan, camera, irradiance)
-        return _front_picture(
-            devices.everything(layers), of_all(seen, devices), devices.largest(needed)
-        )
-
-    return over(plan.mesh, share, scene, plan, camera, rows=(irradiance,))
-
-
-def _layers(
-    settings: RenderSettings,
-    scene: Scene,
-    plan: Plan,
-    camera: Camera,
-    irradiance: Float[Array, "splats channels"],
+def _diffuse_irradiance(
+    scene: Scene, irradiance, camera: Camera, settings: RenderSettings, plan: Plan
 ):
-    """Give the plain layers in tiles, what is seen, and what room was needed over what there is."""
-    splats, view = scene.splats, _splatting.PerspectiveView.of(camera)
-    attributes = {"area": splats.areas[None], "source": irradiance.T}
-    if splats.albedo is not None:
-        attributes["albedo"] = splats.albedo.T
-    seen = see_surfaces(splats, attributes, view, settings, plan)
-    layers, needed = spread_light(scene, irradiance.T, seen, settings, plan)
-    return layers.layers, seen, jnp.maximum(needed, seen.needed)
+    scene, camera, irradiance = in_one_dtype(scene, camera, irradiance)
 
+    def passes(combination, scene, plan, camera, irradiance):
+        view, gaussians = _splatting.PerspectiveView.of(camera), scene.material.gaussians
+        source, seen = irradiance.T, view.may_see(scene.splats)
+        given = settings, plan, combination
+        layers, _, needed = diffuse_splats(scene, source, *given, wanted=seen)
+        light = SplatLight([], Irradiance(source, source), layers, None, None, needed)
+        dark = LightVisibility([], [], needed)
+        attributes = surface_attributes(scene, dark, light.irradiance)
 
-def _front_picture(
-    layers: Float[Array, "tiles gaussians channels pixels"],
-    seen: SeenSurfaces,
-    needed: Float[Array, ""],
-) -> Float[Array, "gaussians height width channels"]:
-    return seen.poisoned_unless(needed <= 1).atlas.front_picture(layers.transpose(0, 1, 3, 2))
+        def read(samples):
+            own = samples.attributes
+            at = layers_at_points(
+                samples, own, own.source, gaussians.variances, plan.interval, settings.kernel
+            )
+            return at.weigh(gaussians, single_scattering_albedo(scene))[0]
+
+        layers, visible, needed = see_and_read(scene, view, light, attributes, read, *given)
+        visible = visible.gathered(combination).invalidate_unless(needed <= 1)
+        return visible.front_picture(combination.gather(layers))
+
+    picture = on_devices(passes, scene, plan, camera, rows=(irradiance,))
+    return jnp.moveaxis(picture, 2, 0)

@@ -1,21 +1,17 @@
 """A picture of more splats than memory holds: they come a part at a time, several times over, and
 leave only sums behind.
-
-What the passes know of each other decides how often: where the front of every shadow map and of the
-camera ends; what it weighs; where what lies behind ends; the shadow maps' surfaces; then light, and
-the camera's sums; then what the pixels gather.
 """
 
+import dataclasses
 from collections.abc import Callable, Iterator, Sequence
-from functools import partial
 from typing import TypeAlias
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from splatjax import diffusion as _diffusion, splatting as _splatting
+from splatjax._combination import PartByPart
 from splatjax.scene import (
     AbstractLight,
     Camera,
@@ -28,20 +24,21 @@ from splatjax.scene import (
     stack_lights,
 )
 
+from ._attributes import SurfaceAttributes, SurfaceSamples, stack_rows
 from ._inputs import check_channels, in_one_dtype
-from ._lighting import EnteringLight, LightOnSplats, let_light_in
-from ._passes import SeenSurfaces, compose, shade, sources_of, surfaces_of
-from ._records import shadow_views, stands_among
+from ._lighting import Irradiance, LightVisibility, irradiate, map_visibility
+from ._passes import map_samples, sample_surfaces
+from ._plan import fill_up
 from ._settings import RenderSettings
-from ._sharded_plan import filled_up_to
-from ._survey import SameParts, Survey
-from ._swept_views import SweptViews, behind, blended, ends_of_surfaces, pictured
+from ._shade import compose, shade
+from ._shadow_plan import is_among, shadow_views
+from ._statistics import ReplayableStream, StreamStatistics
 
 Report: TypeAlias = Callable[[str, int], None]
 
 
 class _Map(eqx.Module):
-    """One shadow map, and whose it is."""
+    """The view of one shadow map, and the light it belongs to."""
 
     view: _splatting.AbstractView
     group: int = eqx.field(static=True)
@@ -54,169 +51,211 @@ def render_streamed(
     lights: Sequence[AbstractLight],
     material: Material,
     camera: Camera,
-    settings: RenderSettings | None = None,
+    settings: RenderSettings = RenderSettings(),
     report: Report | None = None,
 ) -> Frame:
     r"""Render splats that come a part at a time, in memory that does not grow with their number.
 
     **Arguments:**
 
-    - `parts`: gives all splats from the beginning whenever it is called, in parts of one size but
-      the last, that are complete and near in memory where they are near in space:
+    - `parts`: iterates over all splats from the beginning whenever it is called, in complete parts
+      of one size but the last, that are near in memory where they are near in space:
       `splatjax.SplatFile`, for one.
-    - `lights`, `material`, `camera`, `settings`: as for `render`; the rasterizer and the diffuser
-      are the usual ones.
-    - `report`: is told after each part what is being done, and how many splats are done.
+    - `lights`, `material`, `camera`, `settings`: as for `render`, with the default rasterizer and
+      diffuser.
+    - `report`: called after each part with what is being done, and how many splats are done.
 
-    **Returns:** what `render` gives, to rounding but for pass 4: its clusters are those of each
-    part, and every pixel gathers for itself, so that it differs by less than the diffuser's own
-    error. Without gradients.
+    **Returns:** the frame of `render`, to rounding but for pass 4: its clusters are those of each
+    part, and layers are evaluated at the points that the pixels see, so that it differs by less
+    than the error of the diffuser. Without gradients.
 
     **Raises:** `ValueError` when there are no splats, parts differ in size, are not the same each
     time, or the settings cannot be streamed.
     """
-    settings = RenderSettings() if settings is None else settings
     rasterizer, diffuser = settings.rasterizer, settings.diffuser
     if not isinstance(rasterizer, _splatting.TileRasterizer) or not isinstance(
         diffuser, _diffusion.ClusterDiffuser
     ):
         raise ValueError(
-            "only a TileRasterizer and a ClusterDiffuser can be streamed, not a "
-            f"{type(rasterizer).__name__} and a"
-            f" {type(diffuser).__name__}"
+            f"settings has a {type(rasterizer).__name__} and a {type(diffuser).__name__}; only a "
+            "TileRasterizer and a ClusterDiffuser can be streamed"
         )
+    stream = ReplayableStream(parts)
 
-    same = SameParts(parts)
-
-    def told(what: str) -> Iterator[Splats]:
+    def reported(task: str) -> Iterator[Splats]:
         done = 0
-        for part in same():
+        for part in stream():
             yield part
             done += part.count
             if report is not None:
-                report(what, done)
+                report(task, done)
 
-    survey = Survey.of(partial(told, "looking"))
+    statistics = StreamStatistics.of(lambda: reported("looking"))
 
-    def every(what: str) -> Iterator[Scene]:
-        for part in told(what):
-            whole = Scene(filled_up_to(part, survey.rows), tuple(lights), material)
+    rows = -(-statistics.rows // _diffusion.BLOCK) * _diffusion.BLOCK
+
+    def scenes(task: str) -> Iterator[Scene]:
+        for part in reported(task):
+            whole = Scene(fill_up(part, rows), tuple(lights), material)
             yield in_one_dtype(whole)[0]
 
-    first = next(iter(every("looking")))
+    first = next(iter(scenes("looking")))
     check_channels(first)
     (first, camera), groups = in_one_dtype(first, camera), stack_lights(first.lights)
     dtype = first.splats.centers.dtype
-    view, maps = _splatting.PerspectiveView.of(camera), _maps(groups, survey, settings, dtype)
-    views = SweptViews.planned(
-        every, [view, *(each.view for each in maps)], rasterizer, settings.splatting
-    )
-    limits, fronts, seconds = ends_of_surfaces(every, views, dtype)
-    shadows = views.but_the_first
-    hidden = behind(
-        every("shadow maps") if maps else iter(()), shadows, limits[1:], seconds[1:], dtype
-    )
-    surfaces = [blended(*each) for each in zip(shadows.at, fronts[1:], hidden, strict=True)]
+    bounds, view = statistics.bounds(dtype), _splatting.PerspectiveView.of(camera)
 
-    def lit(scene: Scene) -> tuple[LightOnSplats, EnteringLight]:
-        return _lit(scene, groups, maps, surfaces, settings.shadows)
+    # Pass 1: the shadow maps.
+    maps = _maps(groups, bounds, settings)
+    sums = _sum_views(scenes, "shadow maps", [each.view for each in maps], settings, _no_rows)
+    shadow_maps = [
+        _splatting.ShadowMap.of(each, shadow.view, settings.splatting)
+        for each, shadow in zip(sums, maps, strict=True)
+    ]
 
-    light, entering = lit(first)
-    sizes = {
-        name: rows.shape[0]
-        for name, rows in settings.lighting.attributes(first, light, entering).items()
-    }
-    camera_at, nothing = views.at[0], views.at[0].nothing(sum(sizes.values()), dtype)
-    both = nothing, nothing
-    for scene, shows in zip(every("what the camera sees"), views.in_the_first, strict=True):
-        if shows:
-            rows = jnp.concatenate(list(settings.lighting.attributes(scene, *lit(scene)).values()))
-            both = jax.block_until_ready(
-                pictured(scene.splats, rows, camera_at, limits[0], seconds[0], both)
-            )
-    summed = _splatting.SummedFragments(*both, jnp.zeros((), dtype))
-    tiles = max(int(jnp.sum(_splatting.farthest_depths(summed, view) > -jnp.inf)), 1)
-    surface = surfaces_of(summed, sizes, view, settings, tiles).lit(first, light, settings)
+    def lit(scene: Scene) -> tuple[LightVisibility, Irradiance]:
+        return _light(scene, groups, maps, shadow_maps, settings)
 
-    kernels = _diffusion.Kernels.of(
-        first.material.gaussians.variances, settings.diffusion.normalization
-    )
-    origin, interval = jnp.asarray(survey.middle, dtype), survey.interval(settings.diffusion, dtype)
-    pixels = _diffusion.Pixels.of(surface.points, surface.covered, origin, surface.atlas)
-    fine = jnp.asarray(survey.fine, dtype)
-    sums = _diffusion.StreamedSums.begin(diffuser, kernels, survey.spacing, fine, interval, pixels)
-    room = _diffusion.StreamedRoom()
-    for scene in every("diffusion"):
-        if sums.within_reach(scene.splats):
-            sums, room = sums.plus(sources_of(scene.splats, lit(scene)[1].source), room)
-    return _finished(
-        first,
-        view,
-        groups,
-        surface,
-        sums.found(first.material.gaussians.weights.shape[1]),
+    # Passes 2 and 3: what the camera sees.
+    like = settings.lighting.attributes(first, *lit(first))
+
+    def attributes(scene: Scene) -> Array:
+        return stack_rows(settings.lighting.attributes(scene, *lit(scene)))
+
+    (seen,) = _sum_views(scenes, "what the camera sees", [view], settings, attributes)
+    visible, samples = _sample(seen, view, settings, like, bounds.center)
+
+    # Pass 4, at the points that the pixels see.
+    unevenness = jnp.asarray(statistics.unevenness, dtype)
+    interval = settings.kernel.interval(unevenness)
+    diffusion = _diffusion.StreamedDiffusion(
+        diffuser,
+        settings.kernel,
+        first.material.gaussians.variances,
+        statistics.spacing,
+        statistics.fine,
         interval,
-        settings,
+        samples.positions - bounds.center[None, :, None],
+        samples.covered,
     )
+
+    def sources() -> Iterator[_diffusion.Sources]:
+        for scene in scenes("diffusion"):
+            splats, (_, irradiance) = scene.splats, lit(scene)
+            centers = splats.centers.T - bounds.center[:, None]
+            yield _diffusion.Sources(centers, splats.normals.T, splats.areas, irradiance.source)
+
+    layers = diffusion.evaluate(sources())
+
+    # Pass 5.
+    return _shade(first, view, groups, visible, samples, layers, interval, settings)
+
+
+def _no_rows(scene: Scene) -> Float[Array, "0 splats"]:
+    return jnp.zeros((0, scene.splats.count), scene.splats.centers.dtype)
 
 
 def _maps(
-    groups: Sequence[StackedLights], survey: Survey, settings: RenderSettings, dtype: jnp.dtype
+    groups: Sequence[StackedLights], bounds: _splatting.Bounds, settings: RenderSettings
 ) -> list[_Map]:
-    bounds, found = survey.bounds(dtype), []
+    maps = []
     for i, group in enumerate(groups):
-        if not group.lights.cast_shadows:
-            continue
-        each = group.apart()
-        cube = stands_among(each, bounds)
-        found += [
-            _Map(view, i, j, cube)
-            for j, light in enumerate(each)
-            for view in shadow_views(light, bounds, settings, cube)
-        ]
-    return found
+        if group.lights.cast_shadows:
+            lights = group.apart()
+            cube = is_among(lights, bounds)
+            maps += [
+                _Map(view, i, j, cube)
+                for j, light in enumerate(lights)
+                for view in shadow_views(light, bounds, settings.shadows, cube)
+            ]
+    return maps
+
+
+def _sum_views(
+    scenes: Callable[[str], Iterator[Scene]],
+    task: str,
+    views: Sequence[_splatting.AbstractView],
+    settings: RenderSettings,
+    rows: Callable[[Scene], Array],
+) -> list[_splatting.FragmentSums]:
+    """Sum the fragments of all parts in some views."""
+    if not views:
+        return []
+    rasterizer, splatting = settings.rasterizer, settings.splatting
+    assert isinstance(rasterizer, _splatting.TileRasterizer)
+    demands, count = [], 0
+    for scene in scenes("planning"):
+        count = scene.splats.count
+        demands.append([rasterizer.demand(scene.splats, view, splatting) for view in views])
+    plans = [
+        rasterizer.plan_for([[part[k]] for part in demands], count, view)
+        for k, view in enumerate(views)
+    ]
+
+    def parts() -> Iterator[list[_splatting.PartSweep]]:
+        for scene in scenes(task):
+            attributes = rows(scene)
+            yield [
+                _part_sweep(plan, scene.splats, attributes, view, splatting)
+                for plan, view in zip(plans, views, strict=True)
+            ]
+
+    found = _splatting.sum_parts(parts, [plan.places for plan in plans], PartByPart())
+    return [sums for sums, _ in found]
 
 
 @eqx.filter_jit
-def _lit(
+def _part_sweep(plan: _splatting.TilePlan, splats: Splats, attributes, view, splatting):
+    return plan.part_sweep(splats, attributes, view, splatting)
+
+
+@eqx.filter_jit
+def _light(
     scene: Scene,
     groups: list[StackedLights],
     maps: Sequence[_Map],
-    surfaces: Sequence[_splatting.Surfaces],
-    settings: _splatting.ShadowSettings,
-) -> tuple[LightOnSplats, EnteringLight]:
-    """Let light in through the shadow maps of all parts."""
-    shares: list = [None] * len(groups)
-    for each, surface in zip(maps, surfaces, strict=True):
-        share = _splatting.lit_share(scene.splats, each.view, surface, settings)
-        if isinstance(each.view, _splatting.PerspectiveView) and each.cube:
-            share = share * _splatting.in_cube_face(each.view, scene.splats.centers.T)
-        if shares[each.group] is None:
-            shares[each.group] = [0.0] * len(groups[each.group].places)
-        shares[each.group][each.light] = shares[each.group][each.light] + share
-    light = LightOnSplats(
-        groups,
-        [None if each is None else jnp.stack(each) for each in shares],
-        jnp.zeros((), scene.splats.centers.dtype),
-    )
-    return light, let_light_in(scene, light)
+    shadow_maps: Sequence[_splatting.ShadowMap],
+    settings: RenderSettings,
+) -> tuple[LightVisibility, Irradiance]:
+    """Look a part up in the shadow maps of all parts."""
+    visibility: list = [
+        [0.0] * len(group.places) if group.lights.cast_shadows else None for group in groups
+    ]
+    for own, shadow_map in zip(maps, shadow_maps, strict=True):
+        found = map_visibility(scene, shadow_map, settings.shadows, own.cube)
+        visibility[own.group][own.light] = visibility[own.group][own.light] + found
+    stacked = [None if each is None else jnp.stack(each) for each in visibility]
+    light = LightVisibility(groups, stacked, jnp.zeros((), scene.splats.centers.dtype))
+    return light, irradiate(scene, light)
 
 
 @eqx.filter_jit
-def _finished(
+def _sample(
+    sums: _splatting.FragmentSums,
+    view: _splatting.AbstractView,
+    settings: RenderSettings,
+    like: SurfaceAttributes,
+    origin: Float[Array, "3"],
+) -> tuple[_splatting.VisibleSurfaces, SurfaceSamples]:
+    visible = _splatting.VisibleSurfaces.of(sums, view, settings.splatting, PartByPart())
+    return visible, sample_surfaces(visible, like, origin[:, None])
+
+
+@eqx.filter_jit
+def _shade(
     scene: Scene,
     view: _splatting.PerspectiveView,
     groups: list[StackedLights],
-    surface: SeenSurfaces,
-    diffused: _diffusion.Diffused,
+    visible: _splatting.VisibleSurfaces,
+    samples: SurfaceSamples,
+    layers: tuple[Float[Array, "places values pixels"] | None, ...],
     interval: Float[Array, "2"],
     settings: RenderSettings,
 ) -> Frame:
-    material = scene.material
-    layers = _diffusion.layers_of(
-        diffused, material, surface.receivers(), interval, settings.diffusion.normalization
-    )
-    shaded = shade(scene, view, groups, surface, layers)
-    return compose(
-        shaded, surface, layers.resolved, material.gaussians.weights, jnp.zeros((), interval.dtype)
-    )
+    samples = dataclasses.replace(samples, layers=layers)
+
+    def read(samples: SurfaceSamples):
+        own = settings.lighting.at_pixels(scene, groups, samples)
+        return shade(scene, view.position, groups, samples, own, interval, settings)
+
+    return compose(scene, map_samples(read, samples), visible, visible.needed)

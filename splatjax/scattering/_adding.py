@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ._fresnel import AbstractFresnel
-from ._layers import Film, Layer
+from ._medium import Film, Layer
 from ._quadrature import unit_interval
 
 
@@ -20,8 +20,7 @@ class Response(eqx.Module):
     transmittance_up: Float[Array, "*shape"]
 
     def over(self, lower: "Response") -> "Response":
-        """Lay this on another: light goes to and fro between them, and the geometric series is
-        summed.
+        """Lay this on another: the geometric series of reflections between them is summed.
 
         **Source:** Donner and Jensen 2005 (adding, after Kubelka).
         """
@@ -37,7 +36,7 @@ class Response(eqx.Module):
 
 
 def film_response(film: Film, lit_by_beam: bool, shape: tuple[int, ...]) -> Response:
-    """Give the response of a film; `lit_by_beam` where no layer above it has scattered the light
+    """Compute the response of a film; `lit_by_beam` where no layer above has scattered the light
     that comes down.
     """
     depth = jnp.broadcast_to(film.optical_depth, shape)
@@ -47,7 +46,7 @@ def film_response(film: Film, lit_by_beam: bool, shape: tuple[int, ...]) -> Resp
 
 
 def diffuse_transmittance(optical_depth: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """Give `2 E3(t)`, the integral of `2 mu exp(-t / mu)` over the cosine: 1 at t = 0, with the
+    """Compute `2 E3(t)`, the integral of `2 mu exp(-t / mu)` over the cosine: 1 at t = 0, with the
     derivative -2.
     """
     mu, _, weights = (
@@ -65,7 +64,8 @@ def slab_response(
     fresnel_below: AbstractFresnel,
     k: Float[Array, "*shape"],
 ) -> Response:
-    r"""Give the response of a slab: the infinite series of Donner and Jensen's multipole, summed.
+    r"""Compute the response of a slab: the infinite series of Donner and Jensen's multipole,
+    summed.
 
     With `s^2 = sigma_tr^2 + k^2`, `l = 1 / sigma_t'`, extrapolated boundaries `z_a` above and `z_b`
     below, and `H = d + z_a + z_b`,
@@ -85,8 +85,7 @@ def slab_response(
     """
     medium = layer.medium
     depth = 1 / medium.sigma_t_prime
-    thickness = jnp.broadcast_to(layer.thickness.astype(depth.dtype), depth.shape)
-    thickness = jnp.where(thickness >= (1 - 1e-6) * depth, thickness, jnp.nan)
+    thickness = jnp.where(layer.thickness >= (1 - 1e-6) * depth, layer.thickness, jnp.nan)
     above = 2 / 3 * fresnel_above.boundary(medium.eta / eta_above) * depth
     below = 2 / 3 * fresnel_below.boundary(medium.eta / eta_below) * depth
     beneath, height = thickness - depth, thickness + above + below
@@ -125,7 +124,7 @@ def hyperbolic_ratio(
     fall: Float[Array, "..."],
     height: Float[Array, "..."],
 ) -> Float[Array, "..."]:
-    r"""Give `sinh(s a) cosh(s b) / sinh(s height)` with `s = sqrt(u)`, where `height = a + b +
+    r"""Compute `sinh(s a) cosh(s b) / sinh(s height)` with `s = sqrt(u)`, where `height = a + b +
     fall` and nothing is negative.
 
     An even function of s, hence smooth in u for a finite height: a series about `u = 0` keeps its

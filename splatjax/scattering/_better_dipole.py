@@ -4,15 +4,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from splatjax.gaussians import AbstractProfile
-from splatjax.pointwise import one_program
+from splatjax._chunking import jit_unless_traced
+from splatjax._records import record
 
-from ._dipole import screening
-from ._fresnel import AbstractFresnel, ExactFresnel
+from ._dipole import AbstractHalfSpace, flux_of_source, screening
+from ._fresnel import AbstractFresnel
 from ._medium import Medium
 
 
-class BetterDipole(AbstractProfile):
+@record
+class BetterDipole(AbstractHalfSpace):
     r"""The dipole of d'Eon: closer to light transport than the classical one where absorption is
     strong.
 
@@ -27,66 +28,46 @@ class BetterDipole(AbstractProfile):
     Differentiable in every coefficient and in `r`; the derivatives at `r = 0` and, for the profile,
     at `sigma_a = 0` equal the one-sided limits.
 
-    **Attributes:**
-
-    - `medium`: its coefficients, [channels].
-    - `fresnel`: the diffuse Fresnel moments: exact, or the polynomial fits of the literature.
+    **Attributes:** `medium` and `fresnel`, as for every half space.
 
     **Source:** d'Eon 2012, "A better dipole"; diffusion coefficient: Grosjean 1956.
     """
 
-    medium: Medium
-    fresnel: AbstractFresnel
-
-    def __init__(self, medium: Medium, fresnel: AbstractFresnel | None = None):
-        self.medium = medium
-        self.fresnel = ExactFresnel() if fresnel is None else fresnel
-
-    @one_program
+    @jit_unless_traced
     def __call__(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
-        medium = self.medium
-        shape = (*r.shape, *medium.sigma_a.shape)
+        shape = (*r.shape, self.medium.channels)
         squared_radius = jnp.broadcast_to((r * r)[..., None], shape)
         depth = jnp.broadcast_to(self.length_scale(), shape)
-        albedo_prime = jnp.broadcast_to(medium.albedo_prime, shape)
-        return albedo_prime * exitance_of_source(medium, self.fresnel, depth, squared_radius)
+        albedo_prime = jnp.broadcast_to(self.medium.albedo_prime, shape)
+        return albedo_prime * exitance_of_source(self.medium, self.fresnel, depth, squared_radius)
 
-    @one_program
+    @jit_unless_traced
     def total_reflectance(self) -> Float[Array, " channels"]:
-        r"""Give `2 pi` times the integral of `r R(r)` in closed form.
+        r"""Compute `2 pi` times the integral of `r R(r)` in closed form.
 
             alpha' { C_phi (exp(-s z_r) - exp(-s z_v)) / (2 D s) + C_E / 2 (exp(-s z_r) + exp(-s
             z_v)) },  s = sigma_tr
 
         **Returns:** in [0, 1]; 1 where `sigma_a = 0`, with a derivative in `sigma_a` that diverges
-        there: autodiff's is not finite.
+        there: that of autodiff is infinite.
         """
-        medium = self.medium
-        diffusion, squared_sigma_tr = grosjean(medium)
-        fluence_share, flux_share, height = _boundary(medium, self.fresnel, diffusion)
-        s, source = jnp.sqrt(squared_sigma_tr), self.length_scale()
-        near = jnp.exp(-s * source)
-        fluence = fluence_share / (2 * diffusion) * height * near * falling_share(s * height)
-        return medium.albedo_prime * (fluence + flux_share / 2 * near * (1 + jnp.exp(-s * height)))
-
-    def length_scale(self) -> Float[Array, " channels"]:
-        return 1 / self.medium.sigma_t_prime
+        squared_sigma_tr, fluence_factor, flux_factor, height = _constants(
+            self.medium, self.fresnel
+        )
+        s = jnp.sqrt(squared_sigma_tr)
+        fluence = 0.5 * fluence_factor * height * one_minus_exp_over(s * height)
+        flux = 0.5 * flux_factor * (1 + jnp.exp(-s * height))
+        return self.medium.albedo_prime * jnp.exp(-s * self.length_scale()) * (fluence + flux)
 
 
-def grosjean(medium: Medium) -> tuple[Float[Array, " channels"], Float[Array, " channels"]]:
-    """Give Grosjean's diffusion coefficient (mm) and the square of the effective transport
-    coefficient (1/mm^2).
-    """
+def _constants(medium: Medium, fresnel: AbstractFresnel):
+    """Compute `sigma_tr^2`, `C_phi / D`, `C_E` and `z_v - z_r` of each channel."""
     diffusion = (2 * medium.sigma_a + medium.sigma_s_prime) / (
         3 * medium.sigma_t_prime * medium.sigma_t_prime
     )
-    return diffusion, medium.sigma_a / diffusion
-
-
-def _boundary(medium: Medium, fresnel: AbstractFresnel, diffusion: Float[Array, " channels"]):
-    """Give C_phi, C_E, and how much higher the image lies than the source is deep, mm."""
     first, second = fresnel.first_moment(medium.eta), fresnel.second_moment(medium.eta)
-    return (1 - first) / 4, (1 - second) / 2, 4 * (1 + second) / (1 - first) * diffusion
+    height = 4 * (1 + second) / (1 - first) * diffusion
+    return medium.sigma_a / diffusion, (1 - first) / (4 * diffusion), (1 - second) / 2, height
 
 
 def exitance_of_source(
@@ -95,32 +76,22 @@ def exitance_of_source(
     depth: Float[Array, "*shape"],
     squared_radius: Float[Array, "*shape"],
 ) -> Float[Array, "*shape"]:
-    """Give the exitance, 1/mm^2, above a point source of unit power and its image; the last axis is
-    the channels.
+    """Compute the exitance, 1/mm^2, above a point source of unit power and its image; the last axis
+    is the channels.
     """
-    shape = depth.shape
-    diffusion, squared_sigma_tr = grosjean(medium)
-    factors = _boundary(medium, fresnel, diffusion)
-    fluence_share, flux_share, height = (jnp.broadcast_to(each, shape) for each in factors)
-    diffusion, squared_sigma_tr = (
-        jnp.broadcast_to(each, shape) for each in (diffusion, squared_sigma_tr)
+    squared_sigma_tr, fluence_factor, flux_factor, height = (
+        jnp.broadcast_to(constant, depth.shape) for constant in _constants(medium, fresnel)
     )
     image = depth + height
     near, far = squared_radius + depth * depth, squared_radius + image * image
-    fluence = fluence_share / diffusion * fluence_difference(squared_sigma_tr, near, far)
-
-    def flux(z, squared_distance):
-        return (
-            z
-            * screening(squared_sigma_tr * squared_distance)
-            / (squared_distance * jnp.sqrt(squared_distance))
-        )
-
-    return (fluence + flux_share * (flux(depth, near) + flux(image, far))) / (4 * jnp.pi)
+    fluence = fluence_factor * fluence_difference(squared_sigma_tr, near, far)
+    flux = flux_of_source(squared_sigma_tr, depth, near)
+    flux = flux + flux_of_source(squared_sigma_tr, image, far)
+    return (fluence + flux_factor * flux) / (4 * jnp.pi)
 
 
-def falling_share(x: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Give `(1 - exp(-x)) / x`, which is 1 at 0, for x at least 0."""
+def one_minus_exp_over(x: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Compute `(1 - exp(-x)) / x`, which is 1 at 0, for x at least 0."""
     positive = x > 0
     safe = jnp.where(positive, x, 1.0)
     return jnp.where(positive, -jnp.expm1(-safe) / safe, 1.0)
@@ -130,10 +101,10 @@ def falling_share(x: Float[Array, "..."]) -> Float[Array, "..."]:
 def fluence_difference(
     u: Float[Array, "..."], near: Float[Array, "..."], far: Float[Array, "..."]
 ) -> Float[Array, "..."]:
-    r"""Give `exp(-sqrt(u near)) / sqrt(near) - exp(-sqrt(u far)) / sqrt(far)`, where near and far
-    are squared distances.
+    r"""Compute `exp(-sqrt(u near)) / sqrt(near) - exp(-sqrt(u far)) / sqrt(far)`, where near and
+    far are squared distances.
 
-    The rule is there for `u = 0`: the infinite derivatives of the two cancel.
+    The derivative rule serves `u = 0`, where the infinite derivatives of the two terms cancel.
     """
     s, a, b = jnp.sqrt(u), jnp.sqrt(near), jnp.sqrt(far)
     return jnp.exp(-s * a) / a - jnp.exp(-s * b) / b
@@ -144,11 +115,9 @@ def _fluence_difference_jvp(primals, tangents):
     u, near, far = primals
     u_dot, near_dot, far_dot = tangents
     s, a, b = jnp.sqrt(u), jnp.sqrt(near), jnp.sqrt(far)
-    along_u = -0.5 * (b - a) * jnp.exp(-s * a) * falling_share(s * (b - a))
-    along_near, along_far = (
-        -0.5 * screening(u * near) / (near * a),
-        0.5 * screening(u * far) / (far * b),
-    )
+    along_u = -0.5 * (b - a) * jnp.exp(-s * a) * one_minus_exp_over(s * (b - a))
+    along_near = -0.5 * screening(u * near) / (near * a)
+    along_far = 0.5 * screening(u * far) / (far * b)
     return fluence_difference(
         u, near, far
     ), along_u * u_dot + along_near * near_dot + along_far * far_dot

@@ -7,10 +7,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from splatjax._chunking import jit_unless_traced
+from splatjax._records import check_values, numbers, record
 from splatjax.gaussians import AbstractProfile
-from splatjax.pointwise import one_program
-
-from ._medium import check_range
 
 
 class AbstractBurleyScaling(eqx.Module):
@@ -18,7 +17,7 @@ class AbstractBurleyScaling(eqx.Module):
 
     @abc.abstractmethod
     def __call__(self, albedo: Float[Array, " channels"]) -> Float[Array, " channels"]:
-        """Give `s`, positive; without unit."""
+        """Compute `s`, positive; without unit."""
 
 
 class Searchlight(AbstractBurleyScaling):
@@ -48,6 +47,7 @@ class DiffuseMeanFreePath(AbstractBurleyScaling):
         return 3.5 + 100 * (albedo - 0.33) ** 4
 
 
+@record
 class Burley(AbstractProfile):
     r"""Two exponentials that follow Monte Carlo profiles, single scattering included.
 
@@ -59,54 +59,33 @@ class Burley(AbstractProfile):
 
     - `albedo`: surface albedo A, the total reflectance, in [0, 1].
     - `free_path`: mm, positive.
-    - `scaling`: what kind of free path it is, and how light enters.
+    - `scaling`: the kind of free path, and how light enters: `Searchlight()` by default.
 
     **Source:** Christensen and Burley 2015, "Approximate reflectance profiles for efficient
     subsurface scattering".
     """
 
-    albedo: Float[Array, " channels"]
-    free_path: Float[Array, " channels"]
-    scaling: AbstractBurleyScaling
+    albedo: Float[Array, " channels"] = eqx.field(converter=numbers)
+    free_path: Float[Array, " channels"] = eqx.field(converter=numbers)
+    scaling: AbstractBurleyScaling = Searchlight()
 
     singular: ClassVar[bool] = True
 
-    def __init__(
-        self,
-        albedo: Float[Array, " channels"],
-        free_path: Float[Array, " channels"],
-        scaling: AbstractBurleyScaling | None = None,
-    ):
-        self.albedo = albedo
-        self.free_path = free_path
-        self.scaling = Searchlight() if scaling is None else scaling
-
     def __check_init__(self):
-        check_range("albedo", self.albedo, "in [0, 1]", lambda x: (x >= 0) & (x <= 1))
-        check_range("free_path", self.free_path, "positive (mm)", lambda x: x > 0)
+        check_values("Burley.albedo", self.albedo, "in [0, 1]", lambda x: (x >= 0) & (x <= 1))
+        check_values("Burley.free_path", self.free_path, "positive (mm)", lambda x: x > 0)
 
-    @one_program
+    @jit_unless_traced
     def __call__(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
         shape = (*r.shape, *self.albedo.shape)
         radius = jnp.broadcast_to(r[..., None], shape)
-        albedo, d = (jnp.broadcast_to(each, shape) for each in (self.albedo, self.length_scale()))
-        return (
-            albedo * (jnp.exp(-radius / d) + jnp.exp(-radius / (3 * d))) / (8 * jnp.pi * d * radius)
-        )
+        d = jnp.broadcast_to(self.length_scale(), shape)
+        exponentials = jnp.exp(-radius / d) + jnp.exp(-radius / (3 * d))
+        return jnp.broadcast_to(self.albedo, shape) * exponentials / (8 * jnp.pi * d * radius)
 
     def total_reflectance(self) -> Float[Array, " channels"]:
         return self.albedo
 
     def length_scale(self) -> Float[Array, " channels"]:
-        """Give `d`, mm."""
+        """Compute `d`, mm."""
         return self.free_path / self.scaling(self.albedo)
-
-    @one_program
-    def reflectance_within(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
-        """Give the share that leaves within a radius (mm): `A (1 - exp(-r/d)/4 - 3
-        exp(-r/3d)/4)`.
-        """
-        shape = (*r.shape, *self.albedo.shape)
-        radius = jnp.broadcast_to(r[..., None], shape)
-        albedo, d = (jnp.broadcast_to(each, shape) for each in (self.albedo, self.length_scale()))
-        return albedo * (1 - 0.25 * jnp.exp(-radius / d) - 0.75 * jnp.exp(-radius / (3 * d)))

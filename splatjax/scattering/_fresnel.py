@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from splatjax.pointwise import one_program
+from splatjax._chunking import jit_unless_traced
 
 from ._quadrature import along_first_axis, unit_legendre
 
@@ -19,7 +19,7 @@ rounding up to eta = 4.
 
 
 class AbstractFresnel(eqx.Module):
-    r"""How a smooth interface reflects diffuse light that meets it from inside.
+    r"""The reflectance of a smooth interface for diffuse light from inside.
 
     With `F(mu)` the internal reflectance, total internal reflection included, and `eta` the index
     inside over outside.
@@ -27,17 +27,17 @@ class AbstractFresnel(eqx.Module):
 
     @abc.abstractmethod
     def first_moment(self, eta: Float[Array, " channels"]) -> Float[Array, " channels"]:
-        """Give `2 C1`, twice the integral of `mu F(mu)` over [0, 1]: the diffuse reflectance Fdr,
-        in [0, 1).
+        """Compute `2 C1`, twice the integral of `mu F(mu)` over [0, 1]: the diffuse reflectance
+        Fdr, in [0, 1).
         """
 
     @abc.abstractmethod
     def second_moment(self, eta: Float[Array, " channels"]) -> Float[Array, " channels"]:
-        """Give `3 C2`, three times the integral of `mu^2 F(mu)` over [0, 1], in [0, 1)."""
+        """Compute `3 C2`, three times the integral of `mu^2 F(mu)` over [0, 1], in [0, 1)."""
 
     def boundary(self, eta: Float[Array, " channels"]) -> Float[Array, " channels"]:
-        r"""Give the boundary parameter `A = (1 + Fdr) / (1 - Fdr)` of the diffusion approximation;
-        1 at `eta = 1`.
+        r"""Compute the boundary parameter `A = (1 + Fdr) / (1 - Fdr)` of the diffusion
+        approximation; 1 at `eta = 1`.
 
         **Source:** Jensen et al. 2001, section 2.1.
         """
@@ -57,13 +57,13 @@ class ExactFresnel(AbstractFresnel):
     grows infinitely thin as `eta` goes to 1 is integrated in closed form.
     """
 
-    @one_program
+    @jit_unless_traced
     def first_moment(self, eta: Float[Array, " channels"]) -> Float[Array, " channels"]:
         ratio = _denser_over_rarer(eta)
         outside = _first_outside(ratio)
         return jnp.where(eta < 1, outside, 1 + (outside - 1) / (ratio * ratio))
 
-    @one_program
+    @jit_unless_traced
     def second_moment(self, eta: Float[Array, " channels"]) -> Float[Array, " channels"]:
         ratio = _denser_over_rarer(eta)
         cube = ratio * ratio * ratio
@@ -82,14 +82,14 @@ class EganFresnel(AbstractFresnel):
     **Source:** Egan and Hilgeman 1979; Donner and Jensen 2005; d'Eon and Irving 2011.
     """
 
-    @one_program
+    @jit_unless_traced
     def first_moment(self, eta: Float[Array, " channels"]) -> Float[Array, " channels"]:
         inverse = 1 / eta
         above = _polynomial(inverse, (0.6681, 0.7099, -1.4399)) + 0.0636 * eta
         below = _polynomial(inverse, (-0.4399, 0.7099, -0.3319, 0.0636))
         return jnp.where(eta == 1, jnp.zeros_like(eta), jnp.where(eta < 1, below, above))
 
-    @one_program
+    @jit_unless_traced
     def second_moment(self, eta: Float[Array, " channels"]) -> Float[Array, " channels"]:
         above = _polynomial(1 / eta, (-1641.1, 1376.53, -656.175, 135.926))
         above = above + eta * _polynomial(eta, (1213.67, -568.556, 164.798, -27.0181, 1.91826))
@@ -100,7 +100,7 @@ class EganFresnel(AbstractFresnel):
 def reflectance(
     inside: Float[Array, "*shape"], outside: Float[Array, "*shape"], eta: Float[Array, "*shape"]
 ) -> Float[Array, "*shape"]:
-    """Give the reflectance for unpolarized light from its cosines on either side of a smooth
+    """Compute the reflectance for unpolarized light from its cosines on either side of a smooth
     interface, from either side.
     """
     across = (eta * inside - outside) / (eta * inside + outside)
@@ -136,7 +136,7 @@ def _integral(integrand, lower: Float[Array, " channels"]) -> Float[Array, " cha
 
 
 def moment_outside(eta: Float[Array, " channels"]) -> Float[Array, " channels"]:
-    """Give twice the integral of `mu F(mu)` over the cosine on the rarer side of the interface;
+    """Compute twice the integral of `mu F(mu)` over the cosine on the rarer side of the interface;
     nothing is reflected totally.
     """
     return _first_outside(_denser_over_rarer(eta))

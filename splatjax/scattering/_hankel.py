@@ -1,10 +1,10 @@
-r"""The Hankel transform of order 0 and its inverse, by a digital filter: no oscillating integral,
-no Bessel function.
+r"""The inverse Hankel transform of order 0 by a digital filter: no oscillating integral, no Bessel
+function.
 
-In the logarithm of the radius the transform is a convolution. The kernel's Mellin transform has
-modulus 1, and what is transformed is analytic in a strip, so that sampling both at equal steps of
-the logarithm leaves errors of rounding only: about 1e-15 of the largest value, whatever the shape.
-All is a plain sum over samples of the function, which differentiates.
+In the logarithm of the radius the transform is a convolution. The Mellin transform of the kernel
+has modulus 1, and the transformed function is analytic in a strip, so that sampling both at equal
+steps of the logarithm leaves errors of rounding only: about 1e-15 of the largest value, whatever
+the shape. The result is a plain sum over samples of the function, which differentiates.
 """
 
 import functools
@@ -28,44 +28,24 @@ _TERMS = 8  # of that series; the ratio of two is below 0.0025
 _NEAR_NODES = 120
 
 
-def hankel_transform(
-    function: Callable[[Float[Array, "..."]], Float[Array, "..."]],
-    k: Float[Array, "*frequencies channels"],
-) -> Float[Array, "*frequencies channels"]:
-    r"""Give `2 pi` times the integral of `r J0(k r) f(r)`: the two-dimensional Fourier transform of
-    a round function.
-
-    **Arguments:**
-
-    - `function`: takes radii (mm) whose last axis is the channels, gives `f` of the same shape;
-      smooth in the logarithm of
-        `r`, with `r f(r)` bounded and vanishing at infinity.
-    - `k`: 1/mm, positive. Differentiable.
-
-    **Returns:** with f in 1/mm^2, no unit; about 1e-15 of the largest of `r f(r)` times `1/k`.
-
-    **Source:** Johansen and Soerensen 1979, "Fast Hankel transforms"; the filter is our own.
-    """
-    return 2 * jnp.pi * _filtered(function, k)
-
-
 def inverse_hankel_transform(
     transform: Callable[[Float[Array, "..."]], Float[Array, "..."]],
     r: Float[Array, "*radii"],
     decay: Float[Array, " channels"],
 ) -> Float[Array, "*radii channels"]:
-    r"""Give `1 / 2 pi` times the integral of `k J0(k r) F(k)`.
+    r"""Compute `1 / 2 pi` times the integral of `k J0(k r) F(k)`.
 
     **Arguments:**
 
-    - `transform`: takes `k` (1/mm) whose last axis is the channels, gives `F` of the same shape;
-      falls at
-        least like `exp(-decay k)`.
+    - `transform`: computes `F` from `k` (1/mm) whose last axis is the channels, in the same shape;
+      it falls at least like `exp(-decay k)`.
     - `r`: mm, at least 0. Differentiable, at 0 too.
     - `decay`: mm, positive: places the nodes near the origin. Not differentiated.
 
     **Returns:** 1/mm^2. Its error is about 1e-15 of the value at `r = 0` or, farther out, of `1 /
     (decay r)`: a tail that has fallen below that is rounding.
+
+    **Source:** Johansen and Soerensen 1979, "Fast Hankel transforms"; the filter is our own.
     """
     decay = jax.lax.stop_gradient(decay)
     shape = (*r.shape, *decay.shape)
@@ -81,18 +61,19 @@ def inverse_hankel_transform(
 
 
 def _filtered(function, at: Float[Array, "*some"]) -> Float[Array, "*some"]:
-    """Give the integral of `x J0(x at) function(x)`."""
+    """Compute the integral of `x J0(x at) function(x)`."""
     abscissas, weights = (
-        along_first_axis(each, (len(each), *at.shape), at.dtype) for each in _filter()
+        along_first_axis(values, (len(values), *at.shape), at.dtype) for values in _filter()
     )
     x = abscissas / at[None]
     return jnp.sum(weights * x * function(x), axis=0) / at
 
 
 def _series(transform, decay: Float[Array, " channels"]) -> list[Float[Array, " channels"]]:
-    """Give the coefficients of the integral of `k J0(k r) F(k)` in powers of `(r / 2 decay)^2`."""
+    """Expand the integral of `k J0(k r) F(k)` in powers of `(r / 2 decay)^2`."""
     nodes, weights = (
-        along_first_axis(each, (len(each), *decay.shape), decay.dtype) for each in _half_line()
+        along_first_axis(values, (len(values), *decay.shape), decay.dtype)
+        for values in _half_line()
     )
     terms = weights * transform(nodes / decay[None]) / (decay * decay)[None]
     coefficients = []

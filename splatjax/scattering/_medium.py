@@ -1,12 +1,14 @@
-"""The optical coefficients of a homogeneous scattering medium."""
+"""Optical coefficients: homogeneous media, and the layers of a stack."""
 
 import equinox as eqx
-import jax
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
+from splatjax._records import check_values, numbers, record
 
+
+@record
 class Medium(eqx.Module):
     r"""A homogeneous medium under the diffusion approximation.
 
@@ -20,14 +22,18 @@ class Medium(eqx.Module):
     not checked.
     """
 
-    sigma_a: Float[Array, " channels"]
-    sigma_s_prime: Float[Array, " channels"]
-    eta: Float[Array, " channels"]
+    sigma_a: Float[Array, " channels"] = eqx.field(converter=numbers)
+    sigma_s_prime: Float[Array, " channels"] = eqx.field(converter=numbers)
+    eta: Float[Array, " channels"] = eqx.field(converter=numbers)
 
     def __check_init__(self):
-        check_range("sigma_a", self.sigma_a, "at least 0 (1/mm)", lambda x: x >= 0)
-        check_range("sigma_s_prime", self.sigma_s_prime, "positive (1/mm)", lambda x: x > 0)
-        check_range("eta", self.eta, "positive", lambda x: x > 0)
+        check_values("Medium.sigma_a", self.sigma_a, "at least 0 (1/mm)", lambda x: x >= 0)
+        check_values("Medium.sigma_s_prime", self.sigma_s_prime, "positive (1/mm)", lambda x: x > 0)
+        check_values("Medium.eta", self.eta, "positive", lambda x: x > 0)
+
+    @property
+    def channels(self) -> int:
+        return self.sigma_a.shape[-1]
 
     @property
     def sigma_t_prime(self) -> Float[Array, " channels"]:
@@ -47,13 +53,75 @@ class Medium(eqx.Module):
         return 3 * self.sigma_a * self.sigma_t_prime
 
 
-def check_range(name: str, value, expected: str, holds, finite: bool = True) -> None:
-    """Raise if a known value is out of range; a traced one passes."""
-    if isinstance(value, Tracer) or not isinstance(value, (jax.Array, np.ndarray)):
-        return
-    known = np.asarray(value)
-    possible = np.isfinite(known) if finite else ~np.isnan(known)
-    if known.dtype.kind == "f" and not np.all(possible & holds(known)):
-        raise ValueError(
-            f"{name} must be {'finite and ' if finite else ''}{expected}; got {known.tolist()}"
+@record
+class Layer(eqx.Module):
+    r"""A slab of a scattering medium.
+
+    **Attributes:** (differentiable)
+
+    - `medium`: its coefficients, [channels].
+    - `thickness`: mm; infinite for the lowest layer of a half space.
+
+    **Raises:** `ValueError` for a negative thickness.
+    """
+
+    medium: Medium
+    thickness: Float[Array, ""] = eqx.field(converter=numbers)
+
+    def __check_init__(self):
+        check_values(
+            "Layer.thickness", self.thickness, "at least 0 (mm)", lambda x: x >= 0, finite=False
         )
+
+    @property
+    def channels(self) -> int:
+        return self.medium.channels
+
+    def check_diffusion(self) -> None:
+        """Raise `ValueError` for a slab thinner than a mean free path, whose sources would lie
+        outside of it. A traced one passes.
+        """
+        check_values(
+            "thickness * sigma_t' of a Layer",
+            self.thickness * self.medium.sigma_t_prime,
+            "at least 1 in every channel: diffusion does not hold in a thinner layer; monte_carlo "
+            "does, and a Film absorbs without scattering",
+            lambda x: x >= 1 - 1e-6,
+            finite=False,
+        )
+
+
+@record
+class Film(eqx.Module):
+    r"""A layer that absorbs and does not scatter, thinner than any distance that light spreads.
+
+    A beam from outside keeps `exp(-t)` of its power, diffuse light `2 E3(t)`, with t the optical
+    depth.
+
+    **Attributes:**
+
+    - `optical_depth`: absorption coefficient times thickness, at least 0. Differentiable.
+
+    **Source:** diffuse transmittance: the integral of `2 mu exp(-t / mu)` over the cosine.
+    """
+
+    optical_depth: Float[Array, " channels"] = eqx.field(converter=numbers)
+
+    def __check_init__(self):
+        check_values("Film.optical_depth", self.optical_depth, "at least 0", lambda x: x >= 0)
+
+
+def check_stack(layers: tuple[Layer | Film, ...]) -> None:
+    """Raise `ValueError` for a stack without a layer that scatters, or with an infinite layer above
+    another. Traced thicknesses pass.
+    """
+    if not any(isinstance(layer, Layer) for layer in layers):
+        raise ValueError(
+            f"layers must contain one that scatters; none of these {len(layers)} is a Layer"
+        )
+    for number, layer in enumerate(layers[:-1], start=1):
+        thickness = layer.thickness if isinstance(layer, Layer) else 0.0
+        if not isinstance(thickness, Tracer) and np.isinf(thickness):
+            raise ValueError(
+                f"layer {number} of {len(layers)} is infinitely thick; only the lowest may be"
+            )

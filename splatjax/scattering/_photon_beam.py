@@ -7,19 +7,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from splatjax._chunking import jit_unless_traced
+from splatjax._records import record
 from splatjax.gaussians import AbstractProfile
-from splatjax.pointwise import one_program
 
 from ._better_dipole import exitance_of_source
-from ._fresnel import AbstractFresnel, ExactFresnel
-from ._medium import Medium
+from ._dipole import AbstractHalfSpace
 from ._quadrature import along_first_axis, integrated_reflectance
 from ._single_scattering import SingleScattering
 
 _NODES = 128
 
 
-class PhotonBeam(AbstractProfile):
+@record
+class PhotonBeam(AbstractHalfSpace):
     r"""Photon beam diffusion: the better dipole's exitance averaged over a beam's depth, plus
     single scattering.
 
@@ -43,61 +44,49 @@ class PhotonBeam(AbstractProfile):
     **Source:** Habel, Christensen and Jarosz 2013, "Photon beam diffusion".
     """
 
-    medium: Medium
-    fresnel: AbstractFresnel
-
     singular: ClassVar[bool] = True
 
-    def __init__(self, medium: Medium, fresnel: AbstractFresnel | None = None):
-        self.medium = medium
-        self.fresnel = ExactFresnel() if fresnel is None else fresnel
-
-    @one_program
+    @jit_unless_traced
     def __call__(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
         return self.multiple(r) + self.single(r)
 
-    @one_program
+    @jit_unless_traced
     def multiple(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
-        """Give what was scattered more than once; finite at `r = 0`. 1/mm^2."""
+        """Compute the light scattered more than once; finite at `r = 0`. 1/mm^2."""
         medium = self.medium
-        shape = (_NODES, *r.shape, *medium.sigma_a.shape)
-        optical_depths, shares = _beam()
-        depth, share = (along_first_axis(each, shape, r.dtype) for each in (optical_depths, shares))
+        shape = (_NODES, *r.shape, medium.channels)
+        depth, weight = (along_first_axis(nodes, shape, r.dtype) for nodes in _beam())
         sigma_t_prime = jnp.broadcast_to(medium.sigma_t_prime, shape)
         depth = depth / sigma_t_prime
         squared_radius = jnp.broadcast_to((r * r)[None, ..., None], shape)
         distance = jnp.sqrt(squared_radius + depth * depth)
         kappa = -jnp.expm1(-2 * sigma_t_prime * (distance + depth))
         total = jnp.sum(
-            share * kappa * exitance_of_source(medium, self.fresnel, depth, squared_radius), axis=0
+            weight * kappa * exitance_of_source(medium, self.fresnel, depth, squared_radius), axis=0
         )
         return jnp.broadcast_to(medium.albedo_prime**2, total.shape) * total
 
     def single(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
-        """Give what was scattered once, 1/mm^2."""
+        """Compute the light scattered once, 1/mm^2."""
         return SingleScattering(self.medium)(r)
 
-    @one_program
+    @jit_unless_traced
     def total_reflectance(self) -> Float[Array, " channels"]:
-        """Give `2 pi` times the integral of `r R(r)`: single scattering exactly, multiple
+        """Compute `2 pi` times the integral of `r R(r)`: single scattering exactly, multiple
         scattering by quadrature.
         """
-        return SingleScattering(self.medium).total_reflectance() + integrated_reflectance(
-            _Multiple(self)
-        )
+        multiple = integrated_reflectance(self.multiply_scattered())
+        return SingleScattering(self.medium).total_reflectance() + multiple
 
     def multiply_scattered(self) -> AbstractProfile:
-        """Give what was scattered more than once as a profile: for a material with a
+        """Return the light scattered more than once as a profile: for a material with a
         `SingleScattering` of its own.
         """
         return _Multiple(self)
 
-    def length_scale(self) -> Float[Array, " channels"]:
-        return 1 / self.medium.sigma_t_prime
-
 
 class _Multiple(AbstractProfile):
-    """The part of a photon beam's profile that quadrature can integrate."""
+    """The light scattered more than once, which quadrature can integrate."""
 
     beam: PhotonBeam
 
@@ -113,10 +102,9 @@ class _Multiple(AbstractProfile):
 
 @functools.cache
 def _beam() -> tuple[np.ndarray, np.ndarray]:
-    """Optical depths of sources and their shares `exp(-x) dx`, at equal steps of the logarithm: all
-    scales are resolved.
+    """Optical depths of sources and their weights `exp(-x) dx`, at equal steps of the logarithm:
+    all scales are resolved.
     """
     logarithm, step = np.linspace(-30.0, 3.9, _NODES, retstep=True)
     x = np.exp(logarithm)
-    shares = step * x * np.exp(-x)
-    return x, shares
+    return x, step * x * np.exp(-x)

@@ -11,18 +11,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from splatjax._chunking import jit_unless_traced
 from splatjax.gaussians import AbstractProfile
-from splatjax.pointwise import one_program
 
 
 class AbstractRadialRule(eqx.Module):
-    """How integrals over r weigh a profile's radii."""
+    """Nodes and weights of integrals over r."""
 
     @abc.abstractmethod
     def radii(
         self, profile: AbstractProfile
     ) -> tuple[Float[Array, "nodes channels"], Float[Array, "nodes channels"]]:
-        """Give the radii and weights `dr` for each channel, mm."""
+        """Compute the radii and weights `dr` for each channel, mm."""
 
     @property
     @abc.abstractmethod
@@ -50,8 +50,8 @@ class RadialRule(AbstractRadialRule):
     near: int = eqx.field(static=True, default=8)
 
     def beyond(self, cut: float) -> "RadialRule":
-        """Give the rule that starts at `cut` length scales: for profiles that are infinite at the
-        origin, or not known there.
+        """Return the rule that starts at `cut` length scales: for profiles that are infinite or
+        unknown at the origin.
 
         **Raises:** `ValueError` unless `cut` lies between 0 and the largest radius.
         """
@@ -64,56 +64,62 @@ class RadialRule(AbstractRadialRule):
         return self.near > 0
 
     def nodes(self, dtype) -> tuple[Float[Array, " nodes"], Float[Array, " nodes"]]:
-        """Give radii and weights `dr`, in length scales, ascending."""
+        """Compute radii and weights `dr`, in length scales, ascending."""
         nodes, weights = _nodes(self.smallest, self.largest, self.count, self.near)
         return jnp.asarray(nodes, dtype), jnp.asarray(weights, dtype)
 
-    @one_program
+    @jit_unless_traced
     def radii(
         self, profile: AbstractProfile
     ) -> tuple[Float[Array, "nodes channels"], Float[Array, "nodes channels"]]:
-        """Give the radii and weights for each channel, mm. They are constants of every derivative:
-        an integral has no nodes.
+        """Compute the radii and weights for each channel, mm. They are constants of every
+        derivative: an integral has no nodes.
 
-        A measured profile has its own; those outside of the rule weigh nothing.
+        A measured profile has its own radii; those outside of the rule have weight 0.
         """
         scale = jax.lax.stop_gradient(profile.length_scale())
         known = jax.lax.stop_gradient(profile.known_radii())
-        nodes, weights = self.nodes(scale.dtype) if known is None else known
-        shape = (*nodes.shape, *scale.shape)
+        nodes = self.nodes(scale.dtype) if known is None else known
+        shape = (*nodes[0].shape, *scale.shape)
         scale = jnp.broadcast_to(scale, shape)
-        if known is not None:
-            radii, weights = (jnp.broadcast_to(each[:, None], shape) for each in known)
-            first = 0.0 if self.near else self.smallest
-            return radii, jnp.where(
-                (radii >= first * scale) & (radii <= self.largest * scale),
-                weights,
-                jnp.zeros_like(weights),
-            )
-        return jnp.broadcast_to(nodes[:, None], shape) * scale, jnp.broadcast_to(
-            weights[:, None], shape
-        ) * scale
+        radii, weights = (jnp.broadcast_to(values[:, None], shape) for values in nodes)
+        if known is None:
+            return radii * scale, weights * scale
+        first = 0.0 if self.near else self.smallest
+        inside = (radii >= first * scale) & (radii <= self.largest * scale)
+        return radii, jnp.where(inside, weights, 0.0)
+
+
+L2_QUADRATURE = RadialRule(smallest=1e-3, largest=1e4, count=192)
+"""For integrals of `r R^2` (Eq. 3 and Eq. 4): the neglected tail of a medium without absorption is
+1e-16 of the integral.
+
+A fit is accurate to the square of its error, which takes many nodes: with 128 an error of 1e-5 is
+wrong by a tenth, with 192 by 1e-7.
+"""
+
+L1_QUADRATURE = RadialRule(smallest=1e-3, largest=1e7, count=256)
+"""For integrals of `r R`, whose tails are long: without absorption they fall like 1/r, and 1e-7 is
+neglected.
+"""
 
 
 class InverseVariance(AbstractRadialRule):
-    r"""The radii of a table, each weighed by its standard error: integrals of `r f(r)^2` become
+    r"""The radii of a table, each weighted by its standard error: integrals of `r f(r)^2` become
     sums of `f^2 / deviation^2`.
 
-    A fit by it has the least chi-squared, and its `error` is the root of that over the sum of `(R /
-    deviation)^2`. Radii without an error, which no photon reached, are left out.
+    A fit with this rule has the least chi-squared, and its `error` is the root of chi-squared over
+    the sum of `(R / deviation)^2`. Radii without an error, which no photon reached, are left out.
 
     **Attributes:**
 
     - `among`: which radii count, in length scales of the profile: by default all,
-      `NORM_RULE.beyond(1.0)` for a cut.
+      `L2_QUADRATURE.beyond(1.0)` for a cut.
 
     **Raises:** `ValueError`, when used, for a profile that has no `deviation`.
     """
 
-    among: RadialRule
-
-    def __init__(self, among: RadialRule | None = None):
-        self.among = NORM_RULE if among is None else among
+    among: RadialRule = L2_QUADRATURE
 
     @property
     def reaches_origin(self) -> bool:
@@ -123,27 +129,12 @@ class InverseVariance(AbstractRadialRule):
         deviation = getattr(profile, "deviation", None)
         if deviation is None:
             raise ValueError(
-                f"{type(profile).__name__} has no standard errors to weigh by; Tabulated(radii, "
-                "values, deviation) and "
-                "monte_carlo(...).profile() have"
+                f"{type(profile).__name__} has no standard errors to weight by; Tabulated(radii, "
+                "values, deviation) and monte_carlo(...).profile() have"
             )
         r, dr = self.among.radii(profile)
         known = (dr > 0) & (deviation > 0) & (r > 0)
         return r, jnp.where(known, 1 / jnp.where(known, deviation * deviation * r, 1.0), 0.0)
-
-
-NORM_RULE = RadialRule(smallest=1e-3, largest=1e4, count=192)
-"""For integrals of `r R^2` (Eq. 3 and Eq. 4): the neglected tail of a medium without absorption is
-1e-16 of the whole.
-
-A fit is trusted to the square of its error, so that the nodes are many: with 128 an error of 1e-5
-is wrong by a tenth, with 192 by 1e-7.
-"""
-
-TOTAL_RULE = RadialRule(smallest=1e-3, largest=1e7, count=256)
-"""For integrals of `r R`, whose tails are long: without absorption they fall like 1/r, and 1e-7 is
-left out.
-"""
 
 
 @functools.cache
@@ -158,7 +149,7 @@ def _nodes(smallest: float, largest: float, count: int, near: int) -> tuple[np.n
 
 @functools.cache
 def unit_interval() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Give nodes x of the interval (0, 1), the same as 1 - x without loss, and weights: for
+    """Compute nodes x of the interval (0, 1), 1 - x without loss of digits, and weights: for
     integrands rough at either end.
 
     Takahasi and Mori's double exponential formula; analytic integrands leave about 1e-15.
@@ -172,23 +163,23 @@ def unit_interval() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def at_own_radii(
     profile: AbstractProfile, r: Float[Array, "nodes channels"]
 ) -> Float[Array, "nodes channels"]:
-    """Give each channel of a profile at its own radii (mm), in 1/mm^2."""
+    """Compute each channel of a profile at its own radii (mm), in 1/mm^2."""
     return jnp.diagonal(profile(r), axis1=1, axis2=2)
 
 
-@one_program
+@jit_unless_traced
 def integrated_reflectance(
-    profile: AbstractProfile, rule: RadialRule = TOTAL_RULE
+    profile: AbstractProfile, rule: RadialRule = L1_QUADRATURE
 ) -> Float[Array, " channels"]:
-    r"""Integrate `2 pi r R(r)` numerically: what `profile.total_reflectance()` gives in closed
+    r"""Integrate `2 pi r R(r)` numerically, where `profile.total_reflectance()` has a closed
     form.
 
     **Arguments:**
 
     - `profile`: Differentiable.
-    - `rule`: nodes; what lies beyond its largest radius is left out.
+    - `rule`: nodes; the integral ends at its largest radius.
 
-    **Returns:** the share of the entering power that leaves, [channels].
+    **Returns:** the fraction of the entering power that leaves, [channels].
     """
     r, dr = rule.radii(profile)
     return 2 * jnp.pi * jnp.sum(dr * r * at_own_radii(profile, r), axis=0)
@@ -196,11 +187,11 @@ def integrated_reflectance(
 
 @functools.cache
 def unit_legendre(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Give nodes of the interval (0, 1), and weights that sum to 1: Gauss and Legendre's rule."""
+    """Compute nodes of the interval (0, 1), and weights that sum to 1: the Gauss-Legendre rule."""
     nodes, weights = np.polynomial.legendre.leggauss(count)
     return 0.5 * (nodes + 1), 0.5 * weights
 
 
 def along_first_axis(values: np.ndarray, shape: tuple[int, ...], dtype) -> Float[Array, "..."]:
-    """Lay constants along the first axis of a shape."""
+    """Broadcast constants along the first axis of a shape."""
     return jnp.broadcast_to(jnp.asarray(values, dtype).reshape(-1, *[1] * (len(shape) - 1)), shape)

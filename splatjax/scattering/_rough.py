@@ -2,14 +2,15 @@
 
 import functools
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from splatjax.pointwise import one_program
+from splatjax._chunking import jit_unless_traced
+from splatjax._records import check_values, numbers, record
 
 from ._fresnel import AbstractFresnel, ExactFresnel, reflectance
-from ._medium import check_range
 from ._quadrature import unit_legendre
 
 _COSINES, _SLOPES, _STEEPEST = 24, 64, 4.0
@@ -18,6 +19,7 @@ frequent as none.
 """
 
 
+@record
 class RoughFresnel(AbstractFresnel):
     r"""The moments of an interface of microfacets: a rough surface over a material.
 
@@ -39,48 +41,47 @@ class RoughFresnel(AbstractFresnel):
     Donner and Jensen 2005; visible facets: Heitz 2014.
     """
 
-    roughness: Float[Array, ""]
-    smooth: AbstractFresnel
-
-    def __init__(self, roughness: Float[Array, ""] | float, smooth: AbstractFresnel | None = None):
-        self.roughness = jnp.asarray(roughness)
-        self.smooth = ExactFresnel() if smooth is None else smooth
+    roughness: Float[Array, ""] = eqx.field(converter=numbers)
+    smooth: AbstractFresnel = ExactFresnel()
 
     def __check_init__(self):
-        check_range("roughness", self.roughness, "in [0, 1]", lambda x: (x >= 0) & (x <= 1))
+        check_values(
+            "RoughFresnel.roughness", self.roughness, "in [0, 1]", lambda x: (x >= 0) & (x <= 1)
+        )
 
-    @one_program
+    @jit_unless_traced
     def first_moment(self, eta: Float[Array, " channels"]) -> Float[Array, " channels"]:
         return self.smooth.first_moment(eta) + self._excess(eta, power=1)
 
-    @one_program
+    @jit_unless_traced
     def second_moment(self, eta: Float[Array, " channels"]) -> Float[Array, " channels"]:
         return self.smooth.second_moment(eta) + self._excess(eta, power=2)
 
     def _excess(self, eta: Float[Array, " channels"], power: int) -> Float[Array, " channels"]:
-        """Give what roughness adds to a moment: the difference of two sums over the same
+        """Compute what roughness adds to a moment: the difference of two sums over the same
         cosines.
         """
         cosine, share = _cosines(eta)
         along, across, weights = (
-            jnp.asarray(each, eta.dtype)[..., None] for each in _slopes(len(cosine))
+            jnp.asarray(values, eta.dtype)[..., None] for values in _slopes(len(cosine))
         )
         slope, shape = self.roughness.astype(eta.dtype), (*along.shape[:2], len(eta))
-        # How much of a facet of slope (p, q) a direction in the plane of p sees, and at what cosine
-        # it meets it.
-        across_it = jnp.broadcast_to(jnp.sqrt(1 - cosine * cosine)[:, None], shape)
-        seen = jnp.maximum(
-            jnp.broadcast_to(cosine[:, None], shape)
-            + jnp.broadcast_to(slope * along, shape) * across_it,
-            0,
+        cosines, sines, facet_slopes, lengths, weights = (
+            jnp.broadcast_to(values, shape)
+            for values in (
+                cosine[:, None],
+                jnp.sqrt(1 - cosine * cosine)[:, None],
+                slope * along,
+                jnp.sqrt(1 + slope * slope * (along * along + across * across)),
+                weights,
+            )
         )
-        met = seen / jnp.broadcast_to(
-            jnp.sqrt(1 + slope * slope * (along * along + across * across)), shape
-        )
-        counted = jnp.broadcast_to(weights, shape) * seen
-        rough = jnp.sum(counted * _internal_reflectance(met, eta), axis=1) / jnp.sum(
-            counted, axis=1
-        )
+        # The part of a facet of slope (p, q) that a direction in the plane of p sees, and the
+        # cosine under which it meets the facet.
+        seen = jnp.maximum(cosines + facet_slopes * sines, 0)
+        reflected = _internal_reflectance(seen / lengths, eta)
+        weights = weights * seen
+        rough = jnp.sum(weights * reflected, axis=1) / jnp.sum(weights, axis=1)
         excess = rough - _internal_reflectance(cosine, eta)
         return jnp.sum((power + 1) * share * cosine**power * excess, axis=0)
 
@@ -88,8 +89,8 @@ class RoughFresnel(AbstractFresnel):
 def _internal_reflectance(
     cosine: Float[Array, "*shape channels"], eta: Float[Array, " channels"]
 ) -> Float[Array, "*shape channels"]:
-    """Give the unpolarized Fresnel reflectance at a cosine inside, where the index is `eta` times
-    that outside.
+    """Compute the unpolarized Fresnel reflectance at a cosine inside, where the index is `eta`
+    times that outside.
     """
     eta = jnp.broadcast_to(eta, cosine.shape)
     squared = 1 - eta * eta * (1 - cosine * cosine)
@@ -101,31 +102,28 @@ def _internal_reflectance(
 def _cosines(
     eta: Float[Array, " channels"],
 ) -> tuple[Float[Array, "cosines channels"], Float[Array, "cosines channels"]]:
-    """Give nodes and weights over the cosine inside, on either side of the critical angle, beyond
-    which it is as a root.
+    """Compute nodes and weights over the cosine inside, on either side of the critical angle,
+    beyond which the reflectance begins as a root.
     """
-    t, dt = (jnp.asarray(each, eta.dtype)[:, None] for each in unit_legendre(_COSINES))
+    t, dt = (jnp.asarray(values, eta.dtype)[:, None] for values in unit_legendre(_COSINES))
     denser = eta > 1
     critical = jnp.where(denser, jnp.sqrt(1 - 1 / jnp.where(denser, eta * eta, 2)), 0.0)
     shape = (_COSINES, len(eta))
-    t, dt, critical = (jnp.broadcast_to(each, shape) for each in (t, dt, critical))
-    # Below as well: what a rough interface lets through begins as a root there.
-    below, above = (
-        jnp.where(critical > 0, critical * (1 - t * t), t),
-        critical + (1 - critical) * t * t,
-    )
-    return jnp.concatenate([below, above]), jnp.concatenate(
-        [critical * 2 * t * dt, (1 - critical) * 2 * t * dt]
-    )
+    t, dt, critical = (jnp.broadcast_to(values, shape) for values in (t, dt, critical))
+    # Below as well: the transmittance of a rough interface begins as a root there.
+    below = jnp.where(critical > 0, critical * (1 - t * t), t)
+    above = critical + (1 - critical) * t * t
+    weights = [critical * 2 * t * dt, (1 - critical) * 2 * t * dt]
+    return jnp.concatenate([below, above]), jnp.concatenate(weights)
 
 
 @functools.cache
 def _slopes(cosines: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Give slopes of unit roughness along and across, and their weights up to a factor: [cosines,
-    slopes].
+    """Compute slopes of unit roughness along and across, and their weights up to a factor:
+    [cosines, slopes].
 
-    Equally spaced, which for a Gaussian is exact from whatever offset; each cosine has its own, so
-    that what the critical angle does to single sums averages out.
+    Equal spacing is exact for a Gaussian, whatever the offset. Each cosine has its own offset, so
+    that the errors of single sums at the critical angle average out.
     """
     step = 2 * _STEEPEST / _SLOPES
     offsets = np.modf(np.outer(np.arange(1, cosines + 1), (0.7548776662, 0.5698402910)))[

@@ -1,18 +1,16 @@
 """Measured profiles."""
 
-from itertools import pairwise
-
+import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
+from splatjax._chunking import jit_unless_traced
+from splatjax._records import check_values, numbers, record
 from splatjax.gaussians import AbstractProfile
-from splatjax.pointwise import one_program
-
-from ._medium import check_range
 
 
+@record
 class Tabulated(AbstractProfile):
     r"""A profile given at radii, linear in between: constant within the first radius, 0 beyond the
     last.
@@ -33,54 +31,32 @@ class Tabulated(AbstractProfile):
     shapes that do not match.
     """
 
-    radii: Float[Array, " samples"]
-    values: Float[Array, "samples channels"]
-    deviation: Float[Array, "samples channels"] | None
-    total: Float[Array, " channels"] | None
-
-    def __init__(
-        self,
-        radii: Float[Array, " samples"],
-        values: Float[Array, " samples_"] | Float[Array, "samples_ channels"],
-        deviation: Float[Array, " samples_"] | Float[Array, "samples_ channels"] | None = None,
-        total: Float[Array, " channels"] | None = None,
-    ):
-        self.radii = radii
-        self.values = values if values.ndim == 2 else values[:, None]
-        self.deviation = (
-            deviation if deviation is None or deviation.ndim == 2 else deviation[:, None]
-        )
-        self.total = total
+    radii: Float[Array, " samples"] = eqx.field(converter=numbers)
+    values: Float[Array, "samples channels"] = eqx.field(converter=numbers)
+    deviation: Float[Array, "samples channels"] | None = eqx.field(converter=numbers, default=None)
+    total: Float[Array, " channels"] | None = eqx.field(converter=numbers, default=None)
 
     def __check_init__(self):
-        samples, rows = self.radii.shape[0], self.values.shape[0]
-        if samples < 2 or rows != samples:
-            raise ValueError(
-                f"a table needs at least two radii, and a row of values for each; got {samples} "
-                f"and {rows} rows"
-            )
-        check_range("radii", self.radii, "at least 0 (mm)", lambda x: x >= 0)
-        check_range("values", self.values, "numbers (1/mm^2)", lambda x: x == x)
-        if self.deviation is not None:
-            check_range("deviation", self.deviation, "at least 0 (1/mm^2)", lambda x: x >= 0)
-        if not isinstance(self.radii, Tracer):
-            radii = np.asarray(self.radii)
-            for before, radius in pairwise(radii):
-                if radius <= before:
-                    raise ValueError(
-                        f"radii must ascend, each once; got {radius} mm after {before} mm"
-                    )
+        check_values("Tabulated.radii", self.radii, "at least 0 (mm)", lambda x: x >= 0)
+        check_values("Tabulated.values", self.values, "numbers (1/mm^2)", lambda x: x == x)
+        check_values("Tabulated.deviation", self.deviation, "at least 0 (1/mm^2)", lambda x: x >= 0)
+        if len(self.radii) < 2:
+            raise ValueError(f"Tabulated.radii must be at least two; got {len(self.radii)}")
+        check_values(
+            "the steps of Tabulated.radii",
+            jnp.diff(self.radii),
+            "positive (mm): radii ascend, each once",
+            lambda x: x > 0,
+        )
 
-    @one_program
+    @jit_unless_traced
     def __call__(self, r: Float[Array, "*radii_"]) -> Float[Array, "*radii_ channels"]:
         flat = r.reshape(-1)
         columns = [jnp.interp(flat, self.radii, column, right=0.0) for column in self.values.T]
         return jnp.stack(columns, axis=-1).reshape(*r.shape, -1)
 
     def without(self, profile: AbstractProfile) -> "Tabulated":
-        """Give what is left when a profile is taken away: of R(r) what was scattered more than
-        once, say.
-        """
+        """Subtract a profile: single scattering, for a fit of the rest."""
         if profile.singular and not isinstance(self.radii, Tracer) and self.radii[0] == 0:
             name = type(profile).__name__
             raise ValueError(
@@ -90,35 +66,31 @@ class Tabulated(AbstractProfile):
         total = None if self.total is None else self.total - profile.total_reflectance()
         return Tabulated(self.radii, self.values - profile(self.radii), self.deviation, total)
 
-    @one_program
+    @jit_unless_traced
     def total_reflectance(self) -> Float[Array, " channels"]:
-        """Give the total, or else `2 pi` times the integral of `r R(r)`, exactly that of the
+        """Return the total, or compute `2 pi` times the integral of `r R(r)`, exactly that of the
         straight lines.
         """
         if self.total is not None:
             return self.total
         a, b = self.radii[:-1], self.radii[1:]
-        lines = ((b - a) * (2 * a + b) / 6) @ self.values[:-1] + (
-            (b - a) * (a + 2 * b) / 6
-        ) @ self.values[1:]
-        return 2 * jnp.pi * (0.5 * self.radii[0] ** 2 * self.values[0] + lines)
+        starts = ((b - a) * (2 * a + b) / 6) @ self.values[:-1]
+        ends = ((b - a) * (a + 2 * b) / 6) @ self.values[1:]
+        return 2 * jnp.pi * (0.5 * self.radii[0] ** 2 * self.values[0] + starts + ends)
 
-    @one_program
+    @jit_unless_traced
     def length_scale(self) -> Float[Array, " channels"]:
-        """Give the radius, mm, within which half of the integral of `r |R|` lies, by the table's
-        own steps.
+        """Compute the radius, mm, within which half of the integral of `r |R|` lies, by the steps
+        of the table.
         """
-        share = jnp.cumsum(
-            jnp.abs(self.values)
-            * (self.radii * jnp.diff(self.radii, append=self.radii[-1:]))[:, None],
-            axis=0,
-        )
-        index = jnp.argmax(share >= 0.5 * share[-1][None], axis=0)
+        rings = self.radii * jnp.diff(self.radii, append=self.radii[-1:])
+        within = jnp.cumsum(jnp.abs(self.values) * rings[:, None], axis=0)
+        index = jnp.argmax(within >= 0.5 * within[-1][None], axis=0)
         return jnp.maximum(self.radii[index], self.radii[1])
 
     def known_radii(self) -> tuple[Float[Array, " samples"], Float[Array, " samples"]]:
-        """Give the radii and the trapezoidal rule's weights; the first also stands for the disc
-        within it.
+        """Return the radii and the weights of the trapezoidal rule; the first radius also stands
+        for the disc within it.
         """
         steps = jnp.diff(self.radii)
         weights = 0.5 * (jnp.append(steps, 0.0) + jnp.insert(steps, 0, self.radii[0]))

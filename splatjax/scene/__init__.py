@@ -2,9 +2,11 @@
 
 from ._camera import Camera as Camera
 from ._frame import Frame as Frame
-from ._lights import AbstractLight as AbstractLight, DirectionalLight as DirectionalLight
-from ._lights import GaussianBeam as GaussianBeam, PointLight as PointLight
 from ._lights import (
+    AbstractLight as AbstractLight,
+    DirectionalLight as DirectionalLight,
+    GaussianBeam as GaussianBeam,
+    PointLight as PointLight,
     stack_lights as stack_lights,
     StackedLights as StackedLights,
     sum_over_lights as sum_over_lights,

@@ -8,12 +8,15 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-_ALONG = 1e-6
-"""Sine of an angle in which single precision knows no direction."""
+from splatjax._records import Numbers, as_floats, check_values, numbers, record
+
+_PARALLEL = 1e-6
+"""Sine of an angle that single precision does not resolve."""
 _FARTHEST = 1e15
-"""Numbers that single precision can square, and multiply once more."""
+"""Single precision can square such a number, and multiply the square once more."""
 
 
+@record
 class Camera(eqx.Module):
     r"""A pinhole camera.
 
@@ -30,72 +33,74 @@ class Camera(eqx.Module):
     - `width`, `height`: of the picture, pixels. Static.
     - `near`: splats whose center is nearer than this, along the forward axis, are not drawn; mm.
       Static.
+
+    **Raises:** `ValueError` for a picture without pixels, and for numbers that are not finite.
     """
 
-    position: Float[Array, "3"]
-    rotation: Float[Array, "3 3"]
-    focal_length: Float[Array, ""]
+    position: Float[Array, "3"] = eqx.field(converter=numbers)
+    rotation: Float[Array, "3 3"] = eqx.field(converter=numbers)
+    focal_length: Float[Array, ""] = eqx.field(converter=numbers)
     width: int = eqx.field(static=True)
     height: int = eqx.field(static=True)
     near: float = eqx.field(static=True, default=1e-2)
 
+    def __check_init__(self):
+        if self.width < 1 or self.height < 1:
+            raise ValueError(
+                f"a picture of {self.width} x {self.height} pixels has no pixel; width and height "
+                "must be at least 1"
+            )
+        check_values("Camera.position", self.position, "finite (mm)", lambda x: x == x)
+        check_values("Camera.rotation", self.rotation, "finite", lambda x: x == x)
+        check_values("Camera.focal_length", self.focal_length, "positive", lambda x: x > 0)
+
     @classmethod
     def look_at(
         cls,
-        eye: Float[Array, "3"],
-        target: Float[Array, "3"],
+        eye: Numbers,
+        target: Numbers,
         *,
-        up: Float[Array, "3"] | None = None,
-        fov: float = 30.0,
+        up: Numbers | None = None,
+        fov: float | int = 30.0,
         width: int = 512,
         height: int = 512,
-        near: float = 1e-2,
+        near: float | int = 1e-2,
     ) -> "Camera":
         """Place a camera at `eye` (mm) that looks at `target` (mm), with vertical field of view
-        `fov` in degrees.
+        `fov` in degrees; `up` is y unless given.
 
         **Raises:** `ValueError` when the field of view or the size of the picture is out of range,
         and, unless they are traced, for an eye, a target and an `up` on one line.
         """
         if not 0 < fov < 180:
             raise ValueError(f"fov must lie between 0 and 180 degrees, not {fov}")
-        if width < 1 or height < 1:
-            raise ValueError(
-                f"a picture of {width} x {height} pixels has no pixel; width and height must be at "
-                "least 1"
-            )
-        up = jnp.asarray([0.0, 1.0, 0.0], eye.dtype) if up is None else up
-        _check_directions(eye, target, up)
+        up = (0.0, 1.0, 0.0) if up is None else up
+        points = as_floats([eye, target, up], name="eye, target and up")
+        if not isinstance(points, Tracer):
+            _check_directions(*np.asarray(points, np.float64))
+        eye, target, up = points
         forward = target - eye
         forward = forward / jnp.linalg.norm(forward)
         right = jnp.cross(forward, up)
         right = right / jnp.linalg.norm(right)
-        down = jnp.cross(forward, right)
-        focal_length = jnp.asarray(0.5 / math.tan(math.radians(fov) / 2), eye.dtype)
-        return cls(eye, jnp.stack([right, down, forward]), focal_length, width, height, near)
+        rotation = jnp.stack([right, jnp.cross(forward, right), forward])
+        focal_length = 0.5 / math.tan(math.radians(fov) / 2)
+        return cls(eye, rotation, as_floats(focal_length, eye.dtype), width, height, near)
 
 
-def _check_directions(
-    eye: Array | np.ndarray, target: Array | np.ndarray, up: Array | np.ndarray
-) -> None:
-    """Refuse what gives no axes; traced values are trusted."""
-    if any(isinstance(each, Tracer) for each in (eye, target, up)):
-        return
-    eye, target, upright = (np.asarray(each, np.float64) for each in (eye, target, up))
-    if not np.max(np.abs([eye, target, upright])) < _FARTHEST:
-        raise ValueError(
-            f"from the camera to its target it is {(target - eye).tolist()} mm, and up is "
-            f"{upright.tolist()}; give less"
-        )
+def _check_directions(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> None:
+    """Refuse points that define no axes."""
     forward = target - eye
-    if not np.linalg.norm(forward) > 0:
+    if not np.max(np.abs([eye, target, up])) < _FARTHEST:
         raise ValueError(
-            f"the camera stands at {eye.tolist()}, where it looks at; move one of them"
+            f"the vector from the camera to its target is {forward.tolist()} mm, and up is "
+            f"{up.tolist()}; both must be finite and below {_FARTHEST:g}"
         )
-    if not np.linalg.norm(np.cross(forward, upright)) > _ALONG * np.linalg.norm(
-        forward
-    ) * np.linalg.norm(upright):
+    if not np.linalg.norm(forward) > 0:
+        raise ValueError(f"eye and target are both {eye.tolist()}; move one of them")
+    smallest = _PARALLEL * np.linalg.norm(forward) * np.linalg.norm(up)
+    if not np.linalg.norm(np.cross(forward, up)) > smallest:
         raise ValueError(
-            f"up is {upright.tolist()}, along the line of sight; give another, such as [0, 0, -1] "
-            "to look down"
+            f"up is {up.tolist()}, along the line of sight; give another, such as [0, 0, -1] to "
+            "look down"
         )

@@ -3,13 +3,17 @@ the light.
 """
 
 import abc
+import dataclasses
 from collections.abc import Callable, Sequence
+from typing import ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
+from splatjax._records import check_values, numbers, record
 from splatjax.gaussians import gaussian
 
 _TOUCHING = 1e-6  # mm
@@ -20,12 +24,33 @@ class AbstractLight(eqx.Module):
 
     cast_shadows: eqx.AbstractVar[bool]
 
+    strength: ClassVar[str] = ""
+    """The field with the power of each channel."""
+
+    def __check_init__(self):
+        for field in dataclasses.fields(self):
+            name, values = f"{type(self).__name__}.{field.name}", getattr(self, field.name)
+            if field.name == "direction":
+                check_values(name, values, "the way light travels, not zero", np.any)
+            elif field.name == "variance":
+                check_values(name, values, "positive (mm^2)", lambda x: x > 0)
+            else:
+                check_values(name, values, "finite", lambda x: x == x)
+
+    def with_channels(self, channels: int) -> "AbstractLight":
+        """Repeat the strength of a light of one channel for so many channels."""
+        strength = getattr(self, self.strength, None)
+        if strength is None or strength.shape != (1,):
+            return self
+        repeated = jnp.broadcast_to(strength, (channels,))
+        return eqx.tree_at(lambda light: getattr(light, light.strength), self, repeated)
+
     @abc.abstractmethod
     def incidence(
         self, points: Float[Array, "*points 3"]
     ) -> tuple[Float[Array, "*points 3"], Float[Array, "*points channels"]]:
-        """Give, at points in mm, the unit direction `wi` towards the light and the irradiance on a
-        surface facing it.
+        """Compute, at points in mm, the unit direction `wi` towards the light and the irradiance
+        on a surface that faces it.
         """
 
 
@@ -35,6 +60,7 @@ def _per_channel(
     return jnp.broadcast_to(value, (*points.shape[:-1], *value.shape))
 
 
+@record
 class DirectionalLight(AbstractLight):
     r"""Parallel light from infinitely far away.
 
@@ -46,8 +72,9 @@ class DirectionalLight(AbstractLight):
     - `cast_shadows`: static.
     """
 
-    direction: Float[Array, "3"]
-    irradiance: Float[Array, " channels"]
+    direction: Float[Array, "3"] = eqx.field(converter=numbers)
+    irradiance: Float[Array, " channels"] = eqx.field(converter=numbers)
+    strength: ClassVar[str] = "irradiance"
     cast_shadows: bool = eqx.field(static=True, default=True)
 
     def incidence(
@@ -57,6 +84,7 @@ class DirectionalLight(AbstractLight):
         return jnp.broadcast_to(wi, points.shape), _per_channel(self.irradiance, points)
 
 
+@record
 class PointLight(AbstractLight):
     r"""Light from a point, falling off with the square of the distance.
 
@@ -71,8 +99,9 @@ class PointLight(AbstractLight):
     - `cast_shadows`: static.
     """
 
-    position: Float[Array, "3"]
-    intensity: Float[Array, " channels"]
+    position: Float[Array, "3"] = eqx.field(converter=numbers)
+    intensity: Float[Array, " channels"] = eqx.field(converter=numbers)
+    strength: ClassVar[str] = "intensity"
     cast_shadows: bool = eqx.field(static=True, default=True)
 
     def incidence(
@@ -86,6 +115,7 @@ class PointLight(AbstractLight):
         return wi, jnp.where(apart, _per_channel(self.intensity, points) / squared, 0.0)
 
 
+@record
 class GaussianBeam(AbstractLight):
     r"""A laser: parallel light whose power falls off as a Gaussian with the distance from its axis.
     It casts no shadows.
@@ -98,10 +128,11 @@ class GaussianBeam(AbstractLight):
     - `variance`: per axis, mm^2. Differentiable.
     """
 
-    origin: Float[Array, "3"]
-    direction: Float[Array, "3"]
-    power: Float[Array, " channels"]
-    variance: Float[Array, ""]
+    origin: Float[Array, "3"] = eqx.field(converter=numbers)
+    direction: Float[Array, "3"] = eqx.field(converter=numbers)
+    power: Float[Array, " channels"] = eqx.field(converter=numbers)
+    strength: ClassVar[str] = "power"
+    variance: Float[Array, ""] = eqx.field(converter=numbers)
     cast_shadows: bool = eqx.field(static=True, default=False, init=False)
 
     def incidence(
@@ -121,7 +152,7 @@ class StackedLights(eqx.Module):
     places: tuple[int, ...] = eqx.field(static=True)
 
     def apart(self) -> list[AbstractLight]:
-        """Give them one by one."""
+        """Return the lights one by one."""
         return [
             jax.tree.map(lambda leaf, i=i: leaf[i], self.lights) for i in range(len(self.places))
         ]
@@ -147,7 +178,7 @@ def sum_over_lights(
     contribution: Callable[[AbstractLight, Array | None], Array],
     start: Array,
 ) -> Array:
-    """Add up what lights contribute, one after the other; backward, each is computed again.
+    """Add up the contributions of lights, one after the other; backward, each is recomputed.
 
     **Arguments:**
 

@@ -6,7 +6,15 @@ from typing import TypeAlias
 import equinox as eqx
 from jaxtyping import Array, Float
 
+from splatjax._records import check_values, numbers, record
 
+_ROUNDING = 1e-5
+"""By which an albedo may leave [0, 1]."""
+_FINITE = "finite: drop such splats before rendering"
+_POSITIVE = "finite and at least 0"
+
+
+@record
 class Splats(eqx.Module):
     r"""A surface as a set of discs, one row per splat; mm, right-handed, +y up.
 
@@ -25,27 +33,44 @@ class Splats(eqx.Module):
       color.
     - `specular`: factor on the material's specular strength; `None` for 1.
     - `roughness`: factor on the material's roughness; `None` for 1.
+
+    **Raises:** `ValueError` for arrays of different lengths, for entries that are not finite, for
+    negative radii and areas, and for an albedo outside [0, 1].
     """
 
-    centers: Float[Array, "splats 3"]
-    normals: Float[Array, "splats 3"]
-    radii: Float[Array, " splats"]
-    areas: Float[Array, " splats"]
-    albedo: Float[Array, "splats channels"] | None = None
-    specular: Float[Array, " splats"] | None = None
-    roughness: Float[Array, " splats"] | None = None
+    centers: Float[Array, "splats 3"] = eqx.field(converter=numbers)
+    normals: Float[Array, "splats 3"] = eqx.field(converter=numbers)
+    radii: Float[Array, " splats"] = eqx.field(converter=numbers)
+    areas: Float[Array, " splats"] = eqx.field(converter=numbers)
+    albedo: Float[Array, "splats channels"] | None = eqx.field(converter=numbers, default=None)
+    specular: Float[Array, " splats"] | None = eqx.field(converter=numbers, default=None)
+    roughness: Float[Array, " splats"] | None = eqx.field(converter=numbers, default=None)
+
+    def __check_init__(self):
+        for name in ("centers", "normals"):
+            check_values(f"Splats.{name}", getattr(self, name), _FINITE, lambda x: x == x)
+        for name in ("radii", "areas", "specular", "roughness"):
+            check_values(f"Splats.{name}", getattr(self, name), _POSITIVE, lambda x: x >= 0)
+        check_values(
+            "Splats.albedo",
+            self.albedo,
+            "in [0, 1]: linear colors, 8-bit values divided by 255 and decoded",
+            lambda x: (x >= -_ROUNDING) & (x <= 1 + _ROUNDING),
+        )
 
     @property
     def count(self) -> int:
         return self.centers.shape[0]
 
     def scaled(self, factor: Float[Array, ""] | float) -> "Splats":
-        """Give the same body in another size, about the origin. Light goes as far as before: a
-        small one is more translucent.
+        """Scale the body about the origin. Light travels as far as before, so that a smaller body
+        is more translucent.
         """
-        grown = self.centers * factor, self.radii * factor, self.areas * (factor * factor)
-        return eqx.tree_at(lambda splats: (splats.centers, splats.radii, splats.areas), self, grown)
+        scaled = self.centers * factor, self.radii * factor, self.areas * (factor * factor)
+        return eqx.tree_at(
+            lambda splats: (splats.centers, splats.radii, splats.areas), self, scaled
+        )
 
 
 Parts: TypeAlias = Callable[[], Iterable[Splats]]
-"""What gives all splats, part by part, whenever it is called."""
+"""A function that returns all splats part by part, the same ones at every call."""

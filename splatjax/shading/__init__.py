@@ -2,7 +2,11 @@
 
 from ._albedo import average_albedo as average_albedo, directional_albedo as directional_albedo
 from ._composition import albedo_root as albedo_root, diffuse_transmission as diffuse_transmission
-from ._deferred import leaving_share as leaving_share, reflected_radiance as reflected_radiance
-from ._deferred import single_scattered_radiance as single_scattered_radiance
-from ._deferred import SurfacePoints as SurfacePoints, unit_normals as unit_normals
+from ._deferred import (
+    leaving_share as leaving_share,
+    reflected_radiance as reflected_radiance,
+    single_scattered_radiance as single_scattered_radiance,
+    SurfacePoints as SurfacePoints,
+    unit_normals as unit_normals,
+)
 from ._specular import fresnel_f0 as fresnel_f0, specular_lobe as specular_lobe

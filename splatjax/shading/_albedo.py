@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from splatjax.pointwise import in_parts
+from splatjax._chunking import map_chunks
 
 from ._specular import ROUGHNESS_RANGE, clamped_roughness
 
@@ -117,7 +117,7 @@ def _table(
                 jnp.broadcast_to(t, (len(coefficients),)),
             )
         )
-        return in_parts(lambda x: _chebyshev(over_mu, x), x.reshape(-1)).reshape(x.shape)
+        return map_chunks(lambda x: _chebyshev(over_mu, x), x.reshape(-1)).reshape(x.shape)
     x, t = jnp.broadcast_arrays(x, t)
     rows = jnp.asarray(coefficients, t.dtype)
 

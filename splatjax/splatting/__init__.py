@@ -2,42 +2,32 @@
 scattering.
 """
 
-from ._atlas import (
-    Atlas as Atlas,
-    farthest_depths as farthest_depths,
-    TILES_AT_ONCE as TILES_AT_ONCE,
-)
-from ._bins import (
-    BinCapacity as BinCapacity,
-    bin_items as bin_items,
-    Bins as Bins,
-    round_up as round_up,
-)
-from ._bins import scatter_slots as scatter_slots, SIDE as SIDE, slot_plane as slot_plane
-from ._bins import TileGrid as TileGrid, TileRanges as TileRanges
+from ._bins import BinCapacity as BinCapacity, bin_items as bin_items, Bins as Bins
+from ._bins import round_up as round_up, scatter_slots as scatter_slots, slot_plane as slot_plane
 from ._dense import DenseRasterizer as DenseRasterizer
-from ._kernel import coverage as coverage, fragment_weight as fragment_weight
 from ._footprints import Footprints as Footprints
+from ._grid import SIDE as SIDE, TileGrid as TileGrid, TileRanges as TileRanges
+from ._kernel import coverage as coverage, fragment_weight as fragment_weight
 from ._orthographic import OrthographicView as OrthographicView
 from ._perspective import PerspectiveView as PerspectiveView
-from ._rasterizer import AbstractRasterizer as AbstractRasterizer, FragmentSums as FragmentSums
-from ._rasterizer import SummedFragments as SummedFragments
+from ._rasterizer import AbstractRasterizer as AbstractRasterizer
+from ._rasterizer import AbstractRasterPlan as AbstractRasterPlan, FragmentSums as FragmentSums
 from ._settings import SplattingSettings as SplattingSettings
-from ._sharded import bounds_over as bounds_over, ShardedRasterizer as ShardedRasterizer
-from ._shadows import Bounds as Bounds, cube_views as cube_views, distant_view as distant_view
 from ._shadows import (
+    Bounds as Bounds,
+    compute_visibility as compute_visibility,
+    cube_views as cube_views,
+    distant_view as distant_view,
     in_cube_face as in_cube_face,
-    light_surfaces as light_surfaces,
-    lit_share as lit_share,
-)
-from ._shadows import (
+    make_shadow_map as make_shadow_map,
     near_view as near_view,
+    ShadowMap as ShadowMap,
     ShadowSettings as ShadowSettings,
     stack_views as stack_views,
 )
-from ._stages import gaps as gaps, Stages as Stages
-from ._surfaces import blend_fragments as blend_fragments, splat_surfaces as splat_surfaces
-from ._surfaces import Surface as Surface, Surfaces as Surfaces
-from ._sweeps import second_limits as second_limits
-from ._tiles import TileCapacity as TileCapacity, TileRasterizer as TileRasterizer
+from ._surfaces import blend_fragments as blend_fragments, Surface as Surface
+from ._surfaces import TILES_AT_ONCE as TILES_AT_ONCE, visible_surfaces as visible_surfaces
+from ._surfaces import VisibleSurfaces as VisibleSurfaces
+from ._sweeps import PartSweep as PartSweep, sum_parts as sum_parts
+from ._tiles import TilePlan as TilePlan, TileRasterizer as TileRasterizer
 from ._views import AbstractView as AbstractView

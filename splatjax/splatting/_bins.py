@@ -5,148 +5,18 @@ chunk are stored as *blocks* of `[lanes, slots]`. Nothing is dropped: the only l
 planned numbers of pairs and of blocks, and needing more than either is reported.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, DTypeLike, Float, Int
+from jaxtyping import Array, Float, Int
+
+from ._grid import TileGrid, TileRanges
 
 _ROW = 1024  # pairs sorted together; their place in the row takes the low 10 bits of a key
 _ROW_BITS = 10
-
-
-SIDE = 8
-"""Pixels along a tile."""
-
-
-class TileGrid(eqx.Module):
-    """A picture cut into square tiles, row by row; the last ones may reach beyond it."""
-
-    width: int = eqx.field(static=True)
-    height: int = eqx.field(static=True)
-    lanes: int = eqx.field(static=True, default=64)
-    slots: int = eqx.field(static=True, default=32)
-
-    @property
-    def across(self) -> int:
-        return -(-self.width // SIDE)
-
-    @property
-    def down(self) -> int:
-        return -(-self.height // SIDE)
-
-    @property
-    def count(self) -> int:
-        """Tiles of the picture."""
-        return self.across * self.down
-
-    @property
-    def tiles(self) -> int:
-        """Tiles of the picture, and a few empty ones that fill the last chunk."""
-        return -(-self.count // self.lanes) * self.lanes
-
-    def cut(self, picture: Float[Array, "rows height width"]) -> Float[Array, "tiles rows pixels"]:
-        """Cut a picture into tiles; 0 beyond its edges."""
-        rows, height, width = picture.shape
-        whole = jnp.pad(
-            picture, ((0, 0), (0, self.down * SIDE - height), (0, self.across * SIDE - width))
-        )
-        return (
-            whole.reshape(rows, self.down, SIDE, self.across, SIDE)
-            .transpose(1, 3, 0, 2, 4)
-            .reshape(self.count, rows, SIDE**2)
-        )
-
-    def join(self, tiles: Float[Array, "tiles rows pixels"]) -> Float[Array, "rows height width"]:
-        """Put a picture together from its tiles."""
-        rows = tiles.shape[1]
-        whole = tiles.reshape(self.down, self.across, rows, SIDE, SIDE).transpose(2, 0, 3, 1, 4)
-        return whole.reshape(rows, self.down * SIDE, self.across * SIDE)[
-            :, : self.height, : self.width
-        ]
-
-    def columns_and_rows(
-        self, tiles: Int[Array, " some"]
-    ) -> tuple[Int[Array, "some pixels"], Int[Array, "some pixels"]]:
-        """Give the column and the row of every pixel of some tiles."""
-        within = jnp.arange(SIDE**2, dtype=jnp.int32)
-        x = (tiles % self.across * SIDE)[:, None] + (within % SIDE)[None]
-        y = (tiles // self.across * SIDE)[:, None] + (within // SIDE)[None]
-        return x, y
-
-    def pixel(self, x: Int[Array, "..."], y: Int[Array, "..."]) -> Int[Array, "..."]:
-        """Give the number of a pixel among those of all tiles, tile by tile."""
-        return (y // SIDE * self.across + x // SIDE) * SIDE**2 + y % SIDE * SIDE + x % SIDE
-
-    def within_picture(self) -> np.ndarray | None:
-        """Say which pixels `[tiles, pixels]` lie in the picture; None if all do."""
-        if self.width % SIDE == 0 and self.height % SIDE == 0:
-            return None
-        x, y = np.arange(self.across * SIDE) < self.width, np.arange(self.down * SIDE) < self.height
-        within = y.reshape(self.down, 1, SIDE, 1) & x.reshape(1, self.across, 1, SIDE)
-        return within.reshape(self.count, SIDE**2)
-
-
-class TileRanges(eqx.Module):
-    """The rectangle of tiles that each item touches."""
-
-    left: Int[Array, " items"]
-    top: Int[Array, " items"]
-    across: Int[Array, " items"]
-    down: Int[Array, " items"]
-    """0 for an item that touches none."""
-
-    @classmethod
-    def of(
-        cls,
-        left: Float[Array, " items"],
-        right: Float[Array, " items"],
-        top: Float[Array, " items"],
-        bottom: Float[Array, " items"],
-        visible: Bool[Array, " items"],
-        grid: TileGrid,
-    ) -> "TileRanges":
-        """Find the tiles with a pixel center inside each box (pixels)."""
-        across, down = (0, grid.width - 1), (0, grid.height - 1)
-        i0, i1 = _first(left, *across) / SIDE, _last(right, *across) / SIDE
-        j0, j1 = _first(top, *down) / SIDE, _last(bottom, *down) / SIDE
-        touched = visible & (i0 <= i1) & (j0 <= j1)
-        i0, i1, j0, j1 = (jnp.floor(edge).astype(jnp.int32) for edge in (i0, i1, j0, j1))
-        return cls(i0, j0, jnp.where(touched, i1 - i0 + 1, 0), jnp.where(touched, j1 - j0 + 1, 0))
-
-    def per_tile(self, grid: TileGrid) -> Int[Array, " tiles"]:
-        """Count the items of every tile, from the corners of their rectangles."""
-        one = jnp.where(self.across * self.down > 0, 1, 0)
-        corners = jnp.zeros((grid.down + 1, grid.across + 1), jnp.int32)
-        i0, j0 = jnp.minimum(self.left, grid.across), jnp.minimum(self.top, grid.down)
-        i1, j1 = (
-            jnp.minimum(self.left + self.across, grid.across),
-            jnp.minimum(self.top + self.down, grid.down),
-        )
-        corners = (
-            corners.at[j0, i0]
-            .add(one)
-            .at[j1, i1]
-            .add(one)
-            .at[j0, i1]
-            .add(-one)
-            .at[j1, i0]
-            .add(-one)
-        )
-        counts = jnp.cumsum(jnp.cumsum(corners, axis=0), axis=1)[:-1, :-1].reshape(-1)
-        return jnp.pad(counts, (0, grid.tiles - counts.shape[0]))
-
-
-def _first(edge: Float[Array, " items"], first: int, last: int) -> Float[Array, " items"]:
-    """Give the first pixel whose center is not before an edge; `last + 1` if none is."""
-    return jnp.clip(jnp.ceil(edge - 0.5), first, last + 1)
-
-
-def _last(edge: Float[Array, " items"], first: int, last: int) -> Float[Array, " items"]:
-    """Give the last pixel whose center is not behind an edge; `first - 1` if none is."""
-    return jnp.clip(jnp.floor(edge - 0.5), first - 1, last)
 
 
 class BinCapacity(eqx.Module):
@@ -175,21 +45,6 @@ class BinCapacity(eqx.Module):
             min(round_up(chunks, 4), grid.tiles // grid.lanes),
         )
 
-    def grown(self, other: "BinCapacity | None", chunks: int) -> "BinCapacity":
-        """Give room for this and another, in powers of two, so that room soon grows no more; and
-        for so many chunks.
-        """
-        more = BinCapacity(
-            _ROW << (-(-self.pairs // _ROW) - 1).bit_length(),
-            4 << (-(-self.blocks // 4) - 1).bit_length(),
-            chunks,
-        )
-        return (
-            more
-            if other is None
-            else BinCapacity(max(more.pairs, other.pairs), max(more.blocks, other.blocks), chunks)
-        )
-
 
 def round_up(count: int, step: int) -> int:
     """Round up to the next of sixteen steps per octave, and to a multiple of `step`, with 3% to
@@ -208,29 +63,13 @@ class Bins(eqx.Module):
     """The tile of each lane, chunk after chunk."""
     first_block: Int[Array, " chunks_and_one"]
     needed: Float[Array, ""]
-    places: int = eqx.field(static=True)
-    """How many lanes, of the leading chunks, there is room for; what lies beyond has an empty list.
-    """
+    lanes: int = eqx.field(static=True)
+    """Capacity of the leading chunks, in lanes; the lists beyond are empty."""
 
     @property
     def chunks(self) -> Int[Array, ""]:
-        """How many chunks have anything in them: longer lists come first, so these lead."""
-        return jnp.minimum(_occupied(self.first_block), self.places // self.ids.shape[1])
-
-    def poison(self, dtype: DTypeLike) -> Float[Array, ""]:
-        """Give what is added to whatever is found: 0, or NaN where the lists lack room."""
-        return jnp.where(self.needed <= 1, 0.0, jnp.nan).astype(dtype)
-
-    def by_tile(
-        self, swept: Float[Array, "places ..."], count: int, fill: float = 0
-    ) -> Float[Array, "tiles ..."]:
-        """Put what was found lane by lane in the order of the tiles; `fill` for empty ones."""
-        lane = (
-            jnp.zeros_like(self.order)
-            .at[self.order]
-            .set(jnp.arange(self.order.shape[0], dtype=jnp.int32))
-        )
-        return swept.at[lane[:count]].get(mode="fill", fill_value=fill)
+        """Count the chunks with anything in them: longer lists come first, so these lead."""
+        return jnp.minimum(_occupied(self.first_block), self.lanes // self.ids.shape[1])
 
 
 def _occupied(first_block: Int[Array, " chunks_and_one"]) -> Int[Array, ""]:
@@ -312,21 +151,11 @@ def _ranks(tile: Int[Array, " pairs"], tiles: int):
     return sorted_tile, source, rank, counts[:tiles]
 
 
-def bin_items(
-    ranges: TileRanges,
-    grid: TileGrid,
-    capacity: BinCapacity,
-    meet: Callable[[Int[Array, " pairs"], Int[Array, " pairs"]], Bool[Array, " pairs"]]
-    | None = None,
-) -> Bins:
-    """List the items of every tile, in their order; if asked, only those that `meet` says the tile
-    meets. Not differentiated.
-    """
+def bin_items(ranges: TileRanges, grid: TileGrid, capacity: BinCapacity) -> Bins:
+    """List the items of every tile, in their order. Not differentiated."""
     items, lanes, slots, tiles = ranges.left.shape[0], grid.lanes, grid.slots, grid.tiles
     room = capacity.blocks * lanes * slots
     item, tile, total = _pairs(ranges, grid, capacity.pairs)
-    if meet is not None:
-        tile = jnp.where(meet(item, jnp.minimum(tile, tiles - 1)), tile, tiles)
     tile, source, rank, counts = _ranks(tile, tiles)
     item = jnp.take_along_axis(item.reshape(-1, _ROW), source, axis=1, mode="promise_in_bounds")
 

@@ -2,18 +2,17 @@
 every derivative.
 """
 
-from collections.abc import Sequence
-
 import jax
 import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float
 
+from splatjax._combination import AbstractCombination
 from splatjax.scene import Splats
 
-from ._bins import TileGrid
+from ._grid import TileGrid
 from ._kernel import fragment_weight
-from ._rasterizer import AbstractRasterizer, FragmentSums, SummedFragments, least_weight
+from ._rasterizer import AbstractRasterizer, AbstractRasterPlan, FragmentSums, least_weight
 from ._settings import SplattingSettings
 from ._views import AbstractView
 
@@ -21,63 +20,68 @@ from ._views import AbstractView
 class DenseRasterizer(AbstractRasterizer):
     """Tries every splat at every pixel. Slow and plain; forward mode and second order work."""
 
-    def planned(
-        self, splats: Splats, views: Sequence[AbstractView], settings: SplattingSettings
-    ) -> "DenseRasterizer":
-        return self
+    def make_plan(self, parts, views, settings):
+        if len(parts) > 1:
+            raise ValueError("a DenseRasterizer works on one device; give a TileRasterizer")
+        return DenseRasterPlan()
 
-    def summed(
+
+class DenseRasterPlan(AbstractRasterPlan):
+    """What the plain rasterizer needs to know: nothing."""
+
+    def sum_fragments(
         self,
         splats: Splats,
         attributes: Float[Array, "attributes splats"],
         view: AbstractView,
         settings: SplattingSettings,
-    ) -> SummedFragments:
+        combination: AbstractCombination,
+    ) -> FragmentSums:
         dtype, footprints = attributes.dtype, view.footprints(splats, settings)
+        grid = TileGrid(view.width, view.height)
         columns = jnp.arange(view.width, dtype=dtype) + 0.5
         conic = footprints.a, footprints.b, footprints.c, footprints.nearness
         least = stop_gradient(least_weight(type(view), *conic, settings.filter_radius))
 
         def picture_row(y: Float[Array, ""]):
+            # Where the ray of every pixel hits the plane of every splat, and with what weight.
             dx, dy = columns[:, None] - footprints.x[None], (y - footprints.y)[None]
-            nearness = (
-                footprints.nearness[None]
-                + footprints.slope_x[None] * dx
-                + footprints.slope_y[None] * dy
-            )
-            quadric = (
-                dx * (footprints.a[None] * dx + footprints.b[None] * dy)
-                + footprints.c[None] * dy * dy
-            )
+            slope = footprints.slope_x[None] * dx + footprints.slope_y[None] * dy
+            nearness = footprints.nearness[None] + slope
+            quadric = dx * (footprints.a[None] * dx + footprints.b[None] * dy)
+            quadric = quadric + footprints.c[None] * dy * dy
             inside = footprints.visible[None] & view.inside(nearness, quadric)
             squared_radius = jnp.where(
                 inside, view.squared_radius(jnp.where(inside, nearness, 1.0), quadric), 1.0
             )
-            weight = jnp.where(
-                inside, footprints.opacity[None] * fragment_weight(squared_radius), 0.0
-            )
+            weight = footprints.opacity[None] * fragment_weight(squared_radius)
+            weight = jnp.where(inside, weight, 0.0)
             shifted = view.shifted(nearness, footprints.shift[None])
 
-            limit = jnp.max(jnp.where(inside, shifted, -jnp.inf), axis=1)
-            front = inside & (nearness > limit[:, None])
+            def nearest(chosen: Bool[Array, "columns splats"]) -> Float[Array, " columns"]:
+                return jnp.max(jnp.where(chosen, shifted, -jnp.inf), axis=1)
 
             def summed(chosen: Bool[Array, "columns splats"]) -> Float[Array, "rows columns"]:
                 weights, hits = jnp.where(chosen, weight, 0.0), jnp.where(chosen, nearness, 0.0)
                 last = jnp.stack([jnp.sum(weights * hits, axis=1), jnp.sum(weights, axis=1)])
                 return jnp.concatenate([attributes @ weights.T, last])
 
+            # The front, and the surface behind it in pixels that it leaves open.
+            front = inside & (nearness > nearest(inside)[:, None])
             in_front = summed(front)
-            open_pixel = stop_gradient(in_front[-1]) < settings.full_coverage
-            rest = inside & ~front & open_pixel[:, None]
-            weighty = jnp.max(jnp.where(rest & (weight > least[None]), shifted, -jnp.inf), axis=1)
-            of_any = jnp.max(jnp.where(rest, shifted, -jnp.inf), axis=1)
-            limit_behind = jnp.where(weighty > -jnp.inf, weighty, of_any)
-            return in_front, summed(rest & (nearness > limit_behind[:, None]))
+            is_open = stop_gradient(in_front[-1]) < settings.full_coverage
+            rest = inside & ~front & is_open[:, None]
+            weighty = nearest(rest & (weight > least[None]))
+            limit = jnp.where(weighty > -jnp.inf, weighty, nearest(rest))
+            return in_front, summed(rest & (nearness > limit[:, None]))
 
-        grid = TileGrid(view.width, view.height)
-        if splats.count == 0:
-            empty = FragmentSums.nothing(grid.count, attributes.shape[0], dtype)
-            return SummedFragments(empty, empty, jnp.zeros((), dtype))
         both = jax.lax.map(picture_row, jnp.arange(view.height, dtype=dtype) + 0.5)
-        front, behind = (FragmentSums.of(grid.cut(each.transpose(1, 0, 2))) for each in both)
-        return SummedFragments(front, behind, jnp.zeros((), dtype))
+        return _all_tiles(*(grid.cut(each.transpose(1, 0, 2)) for each in both))
+
+
+def _all_tiles(
+    front: Float[Array, "tiles rows pixels"], behind: Float[Array, "tiles rows pixels"]
+) -> FragmentSums:
+    tiles = jnp.arange(len(front), dtype=jnp.int32)
+    rows = jnp.concatenate([front, behind])
+    return FragmentSums(jnp.tile(tiles, 2), rows, jnp.zeros((), front.dtype), len(front))

@@ -12,7 +12,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from ._bins import TileGrid, TileRanges
+from ._grid import TileGrid, TileRanges
 from ._settings import SplattingSettings
 
 EDGE_ON = 1e-5

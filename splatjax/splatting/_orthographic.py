@@ -100,14 +100,6 @@ class OrthographicView(AbstractView):
         nx, ny, nz = jnp.tensordot(self.rotation, normals, 1)
         return nx / self.scale, ny / self.scale, -nz
 
-    def pixels_per_mm(self, depth):
-        return jnp.broadcast_to(self.scale, depth.shape)
-
-    def sphere_box(self, centers, radii):
-        x, y, depth = self.project(centers)
-        half = radii * self.scale
-        return x - half, x + half, y - half, y + half, depth
-
     def unproject(self, x, y, depth):
         along = jnp.stack(
             [(x - self.width / 2) / self.scale, (y - self.height / 2) / self.scale, depth]

@@ -148,23 +148,6 @@ class PerspectiveView(AbstractView):
         mm = jnp.where(depth > self.near, depth, 1.0) / self.focal_length
         return nx * mm, ny * mm, -(nz + nx * u + ny * v)
 
-    def pixels_per_mm(self, depth):
-        return self.focal_length / jnp.maximum(depth, self.near)
-
-    def sphere_box(self, centers, radii):
-        x, y, depth = self.project(centers)
-        bounded = depth > 1.01 * radii + self.near
-        stretch = radii / jnp.where(bounded, depth - radii, 1.0)
-        half_x = jnp.where(
-            bounded, stretch * (self.focal_length + jnp.abs(x - self.width / 2)), jnp.inf
-        )
-        half_y = jnp.where(
-            bounded, stretch * (self.focal_length + jnp.abs(y - self.height / 2)), jnp.inf
-        )
-        behind = depth + radii < self.near
-        half_x = jnp.where(behind, -1.0, half_x)
-        return x - half_x, x + half_x, y - half_y, y + half_y, depth
-
     def unproject(self, x, y, depth):
         u, v = (x - self.width / 2) / self.focal_length, (y - self.height / 2) / self.focal_length
         along = jnp.stack([u * depth, v * depth, depth])

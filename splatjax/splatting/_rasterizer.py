@@ -1,18 +1,15 @@
-"""What a rasterizer does, whichever way: sums attributes over the front surface and over what lies
-right behind it.
-"""
+"""Rasterizers: sums of attributes over the front surface, and over the one right behind it."""
 
 import abc
 from collections.abc import Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
-from jax import lax
-from jaxtyping import Array, DTypeLike, Float
+from jaxtyping import Array, Float, Int
 
+from splatjax._combination import AbstractCombination
 from splatjax.scene import Splats
 
-from ._bins import SIDE
 from ._settings import SplattingSettings
 from ._views import AbstractView
 
@@ -39,78 +36,91 @@ def least_weight(
     )
 
 
+class Places(eqx.Module):
+    """How many tiles there is capacity for: of the front, and of the surface behind it. Static."""
+
+    front: int = eqx.field(static=True)
+    behind: int = eqx.field(static=True)
+
+
 class FragmentSums(eqx.Module):
-    """Of the fragments of one surface, per pixel; 0 where there is none, and in what of a tile lies
-    beyond the picture.
+    """Sums over the fragments of the pixels of some tiles.
+
+    **Attributes:**
+
+    - `tiles`: the tile at each place, first of the front, then of the surface behind; the number of
+      tiles in an empty place.
+    - `rows`: sums of weights times attributes, of weights times the nearness of the ray's hits with
+      the planes of the splats, and of weights; 0 where there is no fragment, and beyond the
+      picture.
+    - `needed`: capacity needed over planned; above 1 the sums are NaN.
+    - `front`: the number of places of the front. Static.
     """
 
-    attributes: Float[Array, "tiles attributes pixels"]
-    """Of weights times attributes."""
-    nearness: Float[Array, "tiles pixels"]
-    """Of weights times the nearness of the ray's hits with the fragments' planes."""
-    weights: Float[Array, "tiles pixels"]
-
-    @classmethod
-    def of(cls, rows: Float[Array, "tiles rows pixels"]) -> "FragmentSums":
-        """Take one row after the other: attributes, nearness, weights."""
-        attributes, nearness, weights = lax.split(rows, [rows.shape[1] - 2, 1, 1], axis=1)
-        return cls(attributes, nearness[:, 0], weights[:, 0])
-
-    @classmethod
-    def nothing(cls, tiles: int, attributes: int, dtype: DTypeLike) -> "FragmentSums":
-        """Give those of no fragment at all."""
-        return cls.of(jnp.zeros((tiles, attributes + 2, SIDE**2), dtype))
-
-    def rows(self) -> Float[Array, "tiles rows pixels"]:
-        """Give what `of` takes."""
-        return jnp.concatenate(
-            [self.attributes, self.nearness[:, None], self.weights[:, None]], axis=1
-        )
-
-
-class SummedFragments(eqx.Module):
-    """The front surface, and the surface behind it where the front leaves a gap, in the tiles of a
-    `TileGrid`.
-    """
-
-    front: FragmentSums
-    behind: FragmentSums
+    tiles: Int[Array, " places"]
+    rows: Float[Array, "places rows pixels"]
     needed: Float[Array, ""]
-    """The largest of needed over planned capacity; above 1 all is NaN."""
+    front: int = eqx.field(static=True)
 
 
-class AbstractRasterizer(eqx.Module):
-    r"""Passes 2 and 3. Fragments are weighted with `fragment_weight`, times the opacity of their
-    footprint.
-
-    The *front* of a pixel are the fragments within epsilon of the nearest one (3.1). *Behind* are,
-    in pixels that the front does not cover in full, the fragments within epsilon of the nearest one
-    that is not in front and weighs at least 0.06 (less for splats smaller than a pixel,
-    `least_weight`): the rims of splats that are seen nearly edge on do not hide the surface behind
-    them. Where none does, the nearest one counts. The choice of fragments is piecewise constant: it
-    has no derivative.
-    """
+class AbstractRasterPlan(eqx.Module):
+    """A rasterizer with the capacity that some splats need in some views."""
 
     @abc.abstractmethod
-    def planned(
-        self, splats: Splats, views: Sequence[AbstractView], settings: SplattingSettings
-    ) -> "AbstractRasterizer":
-        """Give a rasterizer with room for these splats in each of these views, all of one size. Not
-        for traced arrays.
-        """
-
-    @abc.abstractmethod
-    def summed(
+    def sum_fragments(
         self,
         splats: Splats,
         attributes: Float[Array, "attributes splats"],
         view: AbstractView,
         settings: SplattingSettings,
-    ) -> SummedFragments:
-        """Sum attributes and nearness over the fragments of every pixel."""
+        combination: AbstractCombination,
+    ) -> FragmentSums:
+        r"""Sum attributes and nearness over the fragments of every pixel (passes 2 and 3).
+
+        Fragments are weighted with `fragment_weight`, times the opacity of their footprint. The
+        *front* of a pixel are the fragments within epsilon of the nearest one (3.1). *Behind* are,
+        in pixels that the front does not cover in full, the fragments within epsilon of the nearest
+        one that is not in front and has a weight of at least 0.06 (less for splats smaller than a
+        pixel, `least_weight`): the rims of splats seen nearly edge on do not hide the surface
+        behind them. Where no fragment has that weight, the nearest one counts.
+
+        Which fragments are chosen is piecewise constant: it has no derivative.
+
+        **Arguments:**
+
+        - `splats`, `attributes`: those of this device, at least one. Differentiable.
+        - `combination`: of the parts of the splats that several devices hold.
+
+        **Returns:** the sums over the splats of this device.
+        """
+
+    def fitted(
+        self, parts: Sequence[Splats], views: Sequence[AbstractView], settings: SplattingSettings
+    ) -> "AbstractRasterPlan":
+        """Return a plan with no more capacity for the surface behind than these views need, with
+        some to spare: where attributes are many, it is most of the memory. Not for traced arrays.
+        """
+        return self
+
+
+class AbstractRasterizer(eqx.Module):
+    """A way to carry out passes 2 and 3; a setting."""
+
+    @abc.abstractmethod
+    def make_plan(
+        self,
+        parts: Sequence[Splats],
+        views: Sequence[AbstractView],
+        settings: SplattingSettings,
+    ) -> AbstractRasterPlan:
+        """Find the capacity for these splats in each of these views. Not for traced arrays.
+
+        **Arguments:**
+
+        - `parts`: of one size; several where several devices hold them.
+        - `views`: of one size.
+        """
 
     def for_shadows(self) -> "AbstractRasterizer":
-        """Give what draws the shadow maps beside it: itself, unless it is made for pictures
-        alone.
-        """
+        """Return the rasterizer of the shadow maps: itself, unless it serves pictures alone."""
         return self

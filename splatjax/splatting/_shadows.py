@@ -10,15 +10,17 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Float
 
-from splatjax.pointwise import AT_ONCE, in_parts, one_program
+from splatjax._chunking import AT_ONCE, jit_unless_traced, map_chunks
+from splatjax._combination import AbstractCombination, extreme
 from splatjax.scene import Splats
 
-from ._bins import TileGrid
+from ._grid import TileGrid
+from ._kernel import coverage
 from ._orthographic import OrthographicView
 from ._perspective import PerspectiveView
-from ._rasterizer import AbstractRasterizer
+from ._rasterizer import AbstractRasterPlan, FragmentSums
 from ._settings import SplattingSettings
-from ._surfaces import Surfaces, splat_surfaces
+from ._surfaces import Surface
 from ._views import AbstractView
 
 _NEAR = 1e-2  # mm: nearer, a splat is so large in pixels that float32 overflows
@@ -54,16 +56,23 @@ class Bounds(eqx.Module):
     radius: Float[Array, ""]
 
     @classmethod
-    @one_program
-    def of(cls, splats: Splats) -> "Bounds":
-        if splats.count == 0:
-            return cls(jnp.zeros(3, splats.centers.dtype), jnp.ones((), splats.centers.dtype))
-        center = 0.5 * (jnp.min(splats.centers, axis=0) + jnp.max(splats.centers, axis=0))
+    @jit_unless_traced
+    def of(cls, splats: Splats, combination: AbstractCombination) -> "Bounds":
+        """Enclose the splats of all parts. Those without a radius fill a part and do not count."""
+        exists = splats.radii > 0
+        high, low = (
+            sign * extreme(jnp.where(exists[:, None], sign * splats.centers, -jnp.inf), combination)
+            for sign in (1, -1)
+        )
+        center = 0.5 * (low + high)
         offset = splats.centers - center[None]
-        squared = jnp.max(jnp.sum(offset * offset, axis=1))
+        squared = jnp.where(exists, jnp.sum(offset * offset, axis=1), -jnp.inf)
+        squared = extreme(squared, combination)
         apart = squared > 0  # a single splat lies in its center, wherever it moves
         reach = jnp.where(apart, jnp.sqrt(jnp.where(apart, squared, 1.0)), 0.0)
-        return cls(center, reach + jnp.max(splats.radii))
+        radius = reach + extreme(splats.radii, combination)
+        empty = combination.largest([jnp.any(exists).astype(radius.dtype)]) == 0
+        return cls(jnp.where(empty, 0.0, center), jnp.where(empty, 1.0, radius))
 
 
 def _facing(forward: Float[Array, "3"]) -> Float[Array, "3 3"]:
@@ -142,15 +151,41 @@ def in_cube_face(
     return (along >= jnp.max(jnp.abs(offset), axis=0) * (1 - 1e-6)).astype(points.dtype)
 
 
-def light_surfaces(
-    splats: Splats, view: AbstractView, splatting: SplattingSettings, rasterizer: AbstractRasterizer
-) -> Surfaces:
-    """Make a shadow map (4.1): the surfaces that a light sees, by the camera's own passes 2
-    and 3.
-    """
-    return splat_surfaces(
-        splats, jnp.zeros((0, splats.count), splats.centers.dtype), view, splatting, rasterizer
-    )
+class ShadowMap(eqx.Module):
+    """Depth (mm) and coverage of the front surface and of the one behind it, `[tiles, pixels]`."""
+
+    view: AbstractView
+    planes: Float[Array, "4 tiles pixels"]
+    needed: Float[Array, ""]
+
+    @classmethod
+    def of(cls, sums: FragmentSums, view: AbstractView, settings: SplattingSettings) -> "ShadowMap":
+        """Blend the sums of all parts."""
+        tiles = TileGrid(view.width, view.height).count
+        surface = Surface.of(sums.rows, view)
+        covered = coverage(sums.rows[:, -1], settings.full_coverage)
+        planes = []
+        for places in (slice(sums.front), slice(sums.front, None)):
+            for values in (surface.depth, covered):
+                plane = jnp.zeros((tiles, values.shape[1]), values.dtype)
+                plane = plane.at[sums.tiles[places]].set(values[places], mode="drop")
+                planes.append(plane)
+        return cls(view, jnp.stack(planes), sums.needed)
+
+
+def make_shadow_map(
+    splats: Splats,
+    view: AbstractView,
+    splatting: SplattingSettings,
+    plan: AbstractRasterPlan,
+    combination: AbstractCombination,
+) -> ShadowMap:
+    """Make a shadow map (4.1): the surfaces that a light sees, by passes 2 and 3 of the camera."""
+    nothing = jnp.zeros((0, splats.count), splats.centers.dtype)
+    sums = plan.sum_fragments(splats, nothing, view, splatting, combination)
+    rows, needed = combination.total([sums.rows]), combination.largest([sums.needed])
+    sums = eqx.tree_at(lambda each: (each.rows, each.needed), sums, (rows, needed))
+    return ShadowMap.of(sums, view, splatting)
 
 
 def _spline(t: Float[Array, " splats"]) -> Float[Array, "3 splats"]:
@@ -160,21 +195,20 @@ def _spline(t: Float[Array, " splats"]) -> Float[Array, "3 splats"]:
     return jnp.stack([0.5 * (0.5 - t) ** 2, 0.75 - t * t, 0.5 * (0.5 + t) ** 2])
 
 
-def lit_share(
-    splats: Splats, view: AbstractView, surfaces: Surfaces, settings: ShadowSettings
+def compute_visibility(
+    splats: Splats, shadow_map: ShadowMap, settings: ShadowSettings
 ) -> Float[Array, " splats"]:
-    r"""Give the share of a light that reaches each splat, by soft comparison with its shadow map.
+    r"""Compute the fraction of a light that reaches each splat, by soft comparison with its shadow
+    map.
 
     Nine pixels are compared and averaged with a smooth spline; at each, the splat's depth is
-    continued along its own plane. Light is held up by the front surface with its coverage, and by
+    continued along its own plane. Light is blocked by the front surface with its coverage, and by
     the one behind it with what is left.
 
     **Returns:** in [0, 1]; 1 outside the map. Differentiable in the splats, the view and the map.
     """
-    both = surfaces.front, surfaces.behind
-    flat = jnp.stack(
-        [plane.reshape(-1) for each in both for plane in (each.depth, each.coverage)], axis=1
-    )
+    view = shadow_map.view
+    flat = shadow_map.planes.reshape(4, -1).T
 
     def land(centers, normals):
         x, y, depth = view.project(centers.T)
@@ -183,9 +217,9 @@ def lit_share(
         return jnp.stack([x, y, depth, across / facing, down / facing], axis=1)
 
     # Where splats land is kept: each of nine comparisons, and each of their derivatives, reads it.
-    landed = in_parts(land, splats.centers, splats.normals)
+    landed = map_chunks(land, splats.centers, splats.normals)
     # Large parts: for each, the way back adds to the whole map.
-    return in_parts(
+    return map_chunks(
         lambda part: _compared(part.T, view, flat, settings), landed, at_once=4 * AT_ONCE
     )
 

@@ -2,19 +2,23 @@
 attributes (Eq. 1).
 """
 
-from functools import partial
-
 import equinox as eqx
-import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jax.lax import stop_gradient
+from jaxtyping import Array, Bool, Float, Int
 
+from splatjax._chunking import AT_ONCE
+from splatjax._combination import AbstractCombination
 from splatjax.scene import Splats
 
+from ._grid import SIDE, TileGrid
 from ._kernel import coverage
-from ._rasterizer import AbstractRasterizer, FragmentSums
+from ._rasterizer import AbstractRasterPlan, FragmentSums
 from ._settings import SplattingSettings
 from ._views import AbstractView
+
+TILES_AT_ONCE = AT_ONCE // SIDE**2
+"""Tiles of a chunk, for what is computed chunk by chunk."""
 
 
 def blend_fragments(
@@ -27,48 +31,157 @@ def blend_fragments(
 
     **Source:** Kim et al. 2010, Eq. 1.
     """
-    there = weights != 0  # they are never negative, and NaN must stay
-    return sums * jnp.where(there, 1 / jnp.where(there, weights, 1.0), 0.0)
+    exists = weights != 0  # they are never negative, and NaN must stay
+    return sums * jnp.where(exists, 1 / jnp.where(exists, weights, 1.0), 0.0)
 
 
 class Surface(eqx.Module):
-    """One surface as pixels see it, in tiles. Where `weight_sum` is 0 there is none: attributes 0,
-    depth that of nearness 1.
+    """What the pixels of some tiles see: of each, the front surface or the one behind it.
+
+    **Attributes:**
+
+    - `attributes`: blended; 0 where there is no surface.
+    - `depth`: mm along the view's forward axis; 1 where there is no surface.
+    - `covered`: where there is one.
     """
 
     attributes: Float[Array, "tiles attributes pixels"]
     depth: Float[Array, "tiles pixels"]
-    """mm along the view's forward axis."""
-    weight_sum: Float[Array, "tiles pixels"]
-    coverage: Float[Array, "tiles pixels"]
+    covered: Bool[Array, "tiles pixels"]
 
     @classmethod
-    def of(cls, sums: FragmentSums, view: AbstractView, settings: SplattingSettings) -> "Surface":
-        """Blend the sums of a rasterizer."""
-        nearness = blend_fragments(sums.nearness, sums.weights)
-        depth = view.depth(jnp.where(sums.weights != 0, nearness, 1.0))
-        attributes = blend_fragments(sums.attributes, sums.weights[:, None])
-        return cls(attributes, depth, sums.weights, coverage(sums.weights, settings.full_coverage))
+    def of(cls, rows: Float[Array, "tiles rows pixels"], view: AbstractView) -> "Surface":
+        """Blend the rows of `FragmentSums`."""
+        nearness, weights = rows[:, -2], rows[:, -1]
+        covered = stop_gradient(weights) > 0
+        blended = jnp.where(weights != 0, blend_fragments(nearness, weights), 1.0)
+        depth = jnp.where(covered, view.depth(blended), 1.0)
+        return cls(blend_fragments(rows[:, :-2], weights[:, None]), depth, covered)
 
 
-class Surfaces(eqx.Module):
-    """What the pixels see, in the tiles of a `TileGrid`: a front surface, and what shows through
-    where it ends.
+class VisibleSurfaces(eqx.Module):
+    """What a view sees, in tiles: the surface in front, and what shows behind where it ends.
+
+    **Attributes:**
+
+    - `tiles`: the tile of each place of this device; those of the surface behind count on from
+      those of the front; twice their number in an empty place.
+    - `rows`: as in `FragmentSums`.
+    - `before`: the coverage of what lies in front of the surface behind; 0 for the front.
+    - `needed`: capacity needed over planned.
+    - `invalid_factor`: of every picture: 1, or NaN.
     """
 
-    front: Surface
-    behind: Surface
+    view: AbstractView
+    tiles: Int[Array, " places"]
+    rows: Float[Array, "places rows pixels"]
+    before: Float[Array, "places pixels"]
     needed: Float[Array, ""]
+    invalid_factor: Float[Array, ""]
+    full_coverage: float = eqx.field(static=True)
+
+    @classmethod
+    def of(
+        cls,
+        sums: FragmentSums,
+        view: AbstractView,
+        settings: SplattingSettings,
+        combination: AbstractCombination,
+    ) -> "VisibleSurfaces":
+        """Combine the sums of all devices; each keeps a share of the places."""
+        tiles = TileGrid(view.width, view.height).count
+        front, behind = sums.rows[: sums.front], sums.rows[sums.front :]
+        in_front, in_back = sums.tiles[: sums.front], sums.tiles[sums.front :]
+        front, behind = combination.own_share(front), combination.own_share(behind)
+        whole = coverage(combination.gather(front[:, -1]), settings.full_coverage)
+        whole = jnp.zeros((tiles, SIDE**2), whole.dtype).at[in_front].set(whole, mode="drop")
+        own_back = combination.own_rows(in_back)
+        before = whole.at[own_back].get(mode="fill", fill_value=0)
+        own_front = combination.own_rows(in_front)
+        own_front = jnp.where(own_front < tiles, own_front, 2 * tiles)
+        return cls(
+            view=view,
+            tiles=jnp.concatenate([own_front, tiles + own_back]),
+            rows=jnp.concatenate([front, behind]),
+            before=jnp.concatenate([jnp.zeros_like(front[:, -1]), before]),
+            needed=combination.largest([sums.needed]),
+            invalid_factor=jnp.ones_like(sums.needed),
+            full_coverage=settings.full_coverage,
+        )
+
+    def invalidate_unless(self, fits: Bool[Array, ""]) -> "VisibleSurfaces":
+        """Make every picture NaN, and its derivatives too, where a plan does not suffice."""
+        factor = jnp.where(fits, self.invalid_factor, jnp.nan).astype(self.invalid_factor.dtype)
+        return eqx.tree_at(lambda each: each.invalid_factor, self, factor)
+
+    @property
+    def grid(self) -> TileGrid:
+        return TileGrid(self.view.width, self.view.height)
+
+    @property
+    def in_front(self) -> Bool[Array, " places"]:
+        """Mark the places that hold tiles of the front surface."""
+        return self.tiles < self.grid.count
+
+    @property
+    def share(self) -> Float[Array, "places pixels"]:
+        """Compute how much of its pixel each surface covers: behind, of what the front leaves."""
+        return coverage(self.rows[:, -1], self.full_coverage) * (1 - self.before)
+
+    def gathered(self, combination: AbstractCombination) -> "VisibleSurfaces":
+        """Return the places of all devices, without their rows."""
+        tiles, before, weights = combination.gather((self.tiles, self.before, self.rows[:, -1:]))
+        parts = (tiles, before, weights)
+        return eqx.tree_at(lambda each: (each.tiles, each.before, each.rows), self, parts)
+
+    def pixels(
+        self, tiles: Int[Array, " some"]
+    ) -> tuple[Int[Array, "some pixels"], Int[Array, "some pixels"]]:
+        """Return column and row of every pixel of some tiles of either surface."""
+        return self.grid.columns_and_rows(tiles % self.grid.count)
+
+    def points(
+        self, tiles: Int[Array, " some"], depth: Float[Array, "some pixels"]
+    ) -> Float[Array, "some 3 pixels"]:
+        """Compute the points (mm) that pixels see at a depth (mm). Differentiable."""
+        x, y = (each.astype(depth.dtype) + 0.5 for each in self.pixels(tiles))
+        return jnp.moveaxis(self.view.unproject(x, y, depth), 0, 1)
+
+    def front_picture(
+        self, values: Float[Array, "places *rows pixels"], fill: float = 0.0
+    ) -> Float[Array, "height width *rows"]:
+        """Join the picture of the front surface; `fill` where there is none."""
+        tiles = jnp.full((self.grid.count, *values.shape[1:]), fill, values.dtype)
+        return self._joined(tiles.at[self.tiles].set(values, mode="drop"))
+
+    def picture(
+        self, values: Float[Array, "places *rows pixels"]
+    ) -> Float[Array, "height width *rows"]:
+        """Lay the front over what shows behind it, premultiplied by coverage."""
+        tiles = jnp.zeros((self.grid.count, *values.shape[1:]), values.dtype)
+        place = jnp.where(
+            self.tiles < 2 * self.grid.count, self.tiles % self.grid.count, self.grid.count
+        )
+        share = self.share.reshape(len(self.tiles), *[1] * (values.ndim - 2), -1)
+        return self._joined(tiles.at[place].add(share * values, mode="drop"))
+
+    def _joined(
+        self, tiles: Float[Array, "tiles *rows pixels"]
+    ) -> Float[Array, "height width *rows"]:
+        flat = tiles.reshape(tiles.shape[0], -1, tiles.shape[-1])
+        picture = jnp.moveaxis(self.grid.join(flat), 0, 2)
+        return self.invalid_factor * picture.reshape(*picture.shape[:2], *tiles.shape[1:-1])
 
 
-def splat_surfaces(
+def visible_surfaces(
     splats: Splats,
     attributes: Float[Array, "attributes splats"],
     view: AbstractView,
     settings: SplattingSettings,
-    rasterizer: AbstractRasterizer,
-) -> Surfaces:
-    r"""Find the visible surfaces and blend the attributes of their splats (passes 2 and 3).
+    plan: AbstractRasterPlan,
+    combination: AbstractCombination,
+) -> VisibleSurfaces:
+    r"""Find the visible surfaces and sum the attributes of their splats (passes 2 and 3).
 
     The nearness of each ray's hit with each splat's plane is blended like an attribute, so that a
     plane stays a plane.
@@ -78,12 +191,9 @@ def splat_surfaces(
     - `splats`: differentiable; which fragments count is not.
     - `attributes`: one row per attribute. Differentiable.
     - `view`: differentiable.
+    - `plan`: from an `AbstractRasterizer`.
 
-    **Returns:** `Surfaces`; NaN where the rasterizer's capacity was exceeded.
+    **Returns:** `VisibleSurfaces`; NaN where the capacity of the plan is exceeded.
     """
-    summed = rasterizer.summed(splats, attributes, view, settings)
-    surface = jax.checkpoint(
-        partial(Surface.of, settings=settings)
-    )  # what is blended is cheap to find again, and large
-    front, behind = (surface(each, view) for each in (summed.front, summed.behind))
-    return Surfaces(front, behind, summed.needed)
+    sums = plan.sum_fragments(splats, attributes, view, settings, combination)
+    return VisibleSurfaces.of(sums, view, settings, combination)

@@ -1,434 +1,333 @@
-"""Sweeps over the lists of tiles, with a derivative that recomputes the weights.
+"""Passes 2 and 3 tile by tile: fragments are summed per pixel, with a derivative that recomputes
+the weights.
 
-A chunk of tiles is swept twice: for the front's depth, then for the sums; tiles with a pixel that
-the front leaves open are swept twice more for what lies behind. The backward sweep needs the
-fragments' limits only. Fragments are computed relative to their tile, so that float32 suffices at
-any resolution.
+A tile is swept twice: for the depth at which the front ends, then for its sums. Tiles with a pixel
+that the front leaves open are swept twice more for the surface behind. On one device both sweeps of
+a chunk of tiles follow each other, while its splats are in the cache; of several parts of the
+splats, each stage must know what the one before found in all parts. The backward sweep needs only
+the depths at which the surfaces end.
 """
 
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from splatjax.pointwise import zeros_after
+from splatjax._chunking import jit_unless_traced, zeros_after
+from splatjax._combination import AbstractCombination, OneDevice
 
-from ._bins import SIDE, Bins, TileGrid, scatter_slots, slot_plane
-from ._kernel import fast_fragment_weight, fragment_weight_derivative
-from ._rasterizer import FragmentSums, least_weight
-from ._views import AbstractView
-
-PLANES = ("x", "y", "slope_x", "slope_y", "a", "b", "c", "nearness", "opacity")
-"""Of the footprints, that sums depend on."""
-_EMPTY = (0.0, 0.0, 0.0, 0.0, 1e12, 0.0, 1e12, 1.0, 0.0)  # covers no pixel center
+from ._bins import Bins, scatter_slots
+from ._fragments import Slots, Sweep, second_limits
+from ._grid import SIDE
+from ._rasterizer import FragmentSums, Places
 
 
-class _Lanes(eqx.Module):
-    """Tiles that are swept together: where their lists begin in the slots, and their corners."""
+class Ends(eqx.Module):
+    """Where the fragments of each place begin and end, and which lanes of the bins they are in.
 
-    row: Int[Array, " lanes"]
-    """Of the first block, in slots cut into rows of one lane each; the next block is `stride` rows
-    on.
+    **Attributes:**
+
+    - `beyond`: fragments count that are nearer than this; inf where there are none.
+    - `upto`: behind the front, fragments count that are not nearer than this.
+    - `places`: the place of each lane of the bins; the number of places for a lane without one.
+    - `lanes`: the lane of each place of the surface behind; the number of lanes for none.
     """
-    lengths: Int[Array, " lanes"]
-    """Of each lane's list, in blocks: what follows is another chunk's."""
-    blocks: Int[Array, ""]
-    x: Float[Array, "lanes 1"]
-    y: Float[Array, "lanes 1"]
-    stride: int = eqx.field(static=True)
 
-    def read(self, plane: Float[Array, "rows slots"], block) -> Float[Array, "lanes slots"]:
-        return plane.at[self.row + block * self.stride].get(mode="promise_in_bounds")
-
-    def add(
-        self, plane: Float[Array, "rows slots"], block, part: Float[Array, "lanes slots"]
-    ) -> Float[Array, "rows slots"]:
-        return plane.at[self.row + block * self.stride].add(part, mode="promise_in_bounds")
-
-    def until_end(
-        self, beyond: Float[Array, "lanes pixels"], block
-    ) -> Float[Array, "lanes pixels"]:
-        """Give limits that nothing is nearer than, for lanes whose list has ended before a
-        block.
-        """
-        return jnp.where((block < self.lengths)[:, None], beyond, jnp.inf)
+    beyond: Float[Array, "places pixels"]
+    upto: Float[Array, "behind pixels"]
+    places: Int[Array, " lanes"]
+    lanes: Int[Array, " behind"]
 
 
-class _ChunkLanes(_Lanes):
-    """The tiles of one chunk: their rows follow one another."""
-
-    def read(self, plane: Float[Array, "rows slots"], block) -> Float[Array, "lanes slots"]:
-        return lax.dynamic_slice_in_dim(plane, self.row[0] + block * self.stride, self.stride)
-
-    def add(
-        self, plane: Float[Array, "rows slots"], block, part: Float[Array, "lanes slots"]
-    ) -> Float[Array, "rows slots"]:
-        return lax.dynamic_update_slice_in_dim(
-            plane, self.read(plane, block) + part, self.row[0] + block * self.stride, 0
-        )
-
-    def until_end(
-        self, beyond: Float[Array, "lanes pixels"], block
-    ) -> Float[Array, "lanes pixels"]:
-        return beyond
-
-
-class Sweep(eqx.Module):
-    """What is static in a sweep."""
-
-    view: type[AbstractView] = eqx.field(static=True)
-    """The view's class: fragments need its formulas, not where it stands."""
-    grid: TileGrid
-    full_coverage: float = eqx.field(static=True)
-    filter_radius: float = eqx.field(static=True)
-
-    def pixels(self, dtype) -> tuple[np.ndarray, np.ndarray]:
-        """Pixel centers of a tile, from its corner. Constants: made by NumPy, or the compiler
-        computes them per fragment.
-        """
-        side = np.arange(SIDE, dtype=dtype) + np.asarray(0.5, dtype)
-        return np.tile(side, SIDE), np.repeat(side, SIDE)
-
-    def _lanes(self, kind: type[_Lanes], bins: Bins, places, dtype) -> _Lanes:
-        lanes, across = self.grid.lanes, self.grid.across
-        tiles, chunk = bins.order[places], places // lanes
-        row = bins.first_block[chunk] * lanes + places % lanes
-        lengths = bins.first_block[chunk + 1] - bins.first_block[chunk]
-        x, y = ((each * SIDE).astype(dtype)[:, None] for each in (tiles % across, tiles // across))
-        return kind(row, lengths, jnp.max(lengths), x, y, lanes)
-
-    def chunk(self, bins: Bins, i, dtype) -> _Lanes:
-        """Give the tiles of a chunk."""
-        places = i * self.grid.lanes + jnp.arange(self.grid.lanes, dtype=jnp.int32)
-        return self._lanes(_ChunkLanes, bins, places, dtype)
-
-    def picked(self, bins: Bins, places: Int[Array, " lanes"], dtype) -> _Lanes:
-        """Give tiles by their places in the order; places beyond the last are the last one's, with
-        nothing in them.
-        """
-        return self._lanes(_Lanes, bins, places, dtype)
-
-    def splats(self, planes, block, lanes: _Lanes):
-        """Read a block's splats, `[lanes, slots]` each, placed relative to their tile's corner."""
-        x, y, *rest = (lanes.read(plane, block) for plane in planes)
-        return x - lanes.x, y - lanes.y, *rest
-
-    def fragments(self, splats):
-        """Give nearness and quadric of a block's fragments, `[lanes, slots, pixels]`."""
-        x, y, sx, sy, a, b, c, e = (p[:, :, None] for p in splats[:8])
-        px, py = (jnp.asarray(p)[None, None] for p in self.pixels(x.dtype))
-        dx, dy = px - x, py - y
-        return e + sx * dx + sy * dy, dx * (a * dx + b * dy) + c * dy * dy
-
-    def limits(self, slots: "Slots", lanes: _Lanes):
-        """Find per pixel the nearest shifted fragment: the back end of the front."""
-
-        def nearest(block, limit):
-            nearness, quadric = self.fragments(self.splats(slots.planes, block, lanes))
-            shifted = self.view.shifted(nearness, lanes.read(slots.shift, block)[:, :, None])
-            return jnp.maximum(
-                limit,
-                jnp.max(jnp.where(self.view.inside(nearness, quadric), shifted, -jnp.inf), axis=1),
-            )
-
-        return lax.fori_loop(jnp.int32(0), lanes.blocks, nearest, self._nothing(lanes))
-
-    def limits_behind(self, slots: "Slots", lanes: _Lanes, front):
-        """Find the same for what lies behind the front's limits: of the fragments that weigh
-        something, and of any.
-        """
-
-        def nearest(block, limits):
-            splats = self.splats(slots.planes, block, lanes)
-            nearness, quadric = self.fragments(splats)
-            shifted = self.view.shifted(nearness, lanes.read(slots.shift, block)[:, :, None])
-            beyond = lanes.until_end(jnp.full_like(front, -jnp.inf), block)
-            squared_radius = self.squared_radii(nearness, quadric, beyond, front)
-            weight = splats[-1][:, :, None] * fast_fragment_weight(squared_radius)
-            least = least_weight(self.view, *splats[4:8], self.filter_radius)
-            each = weight > least[:, :, None], squared_radius < 1
-            found = (jnp.max(jnp.where(candidate, shifted, -jnp.inf), axis=1) for candidate in each)
-            return tuple(jnp.maximum(limit, new) for limit, new in zip(limits, found, strict=True))
-
-        return lax.fori_loop(
-            jnp.int32(0), lanes.blocks, nearest, (self._nothing(lanes), self._nothing(lanes))
-        )
-
-    def _nothing(self, lanes: _Lanes):
-        return jnp.full((lanes.row.shape[0], SIDE**2), -jnp.inf, lanes.x.dtype)
-
-    def squared_radii(self, nearness, quadric, beyond, upto):
-        """Give `rho^2`, below 1 for the fragments between two limits; 1, where the weight is 0, for
-        all others.
-        """
-        chosen = self.view.inside(nearness, quadric) & (nearness > beyond[:, None])
-        if upto is not None:
-            chosen &= nearness <= upto[:, None]
-        return jnp.where(chosen, self.view.squared_radius(nearness, quadric), 1.0)
-
-    def rows(self, splats, attributes, block, lanes: _Lanes):
-        """Give what is summed, `[lanes, slots]` each: attributes, the plane of nearness (three
-        numbers), and 1.
-        """
-        x, y, sx, sy, _, _, _, e, _ = splats
-        return [
-            *(lanes.read(row, block) for row in attributes),
-            e - sx * x - sy * y,
-            sx,
-            sy,
-            jnp.ones_like(e),
-        ]
-
-    def sums(self, slots: "Slots", lanes: _Lanes, beyond, upto):
-        """Sum attributes and nearness over the fragments between two limits, `[lanes, rows,
-        pixels]`; the weights last.
-        """
-
-        def add(block, sums):
-            splats = self.splats(slots.planes, block, lanes)
-            squared_radius = self.squared_radii(
-                *self.fragments(splats), lanes.until_end(beyond, block), upto
-            )
-            weight = splats[-1][:, :, None] * fast_fragment_weight(squared_radius)
-            rows = jnp.stack(self.rows(splats, slots.attributes, block, lanes), axis=1)
-            return sums + jnp.einsum("trs,tsp->trp", rows, weight)
-
-        start = jnp.zeros(
-            (beyond.shape[0], len(slots.attributes) + 4, beyond.shape[1]), beyond.dtype
-        )
-        sums = lax.fori_loop(jnp.int32(0), lanes.blocks, add, start)
-        px, py = self.pixels(beyond.dtype)
-        nearness = sums[:, -4] + sums[:, -3] * px[None] + sums[:, -2] * py[None]
-        return jnp.concatenate([sums[:, :-4], nearness[:, None], sums[:, -1:]], axis=1)
-
-    def add_cotangents(self, slots: "Slots", lanes: _Lanes, beyond, upto, cotangent, gradients):
-        """Add the cotangents of planes and attributes, per slot, for the fragments between two
-        limits, from those of the sums.
-        """
-        px, py = self.pixels(beyond.dtype)
-        monomials = jnp.asarray(
-            np.stack([np.ones_like(px), px, py, px * px, px * py, py * py], axis=1)
-        )
-        nearness = cotangent[:, -2]
-        plane = jnp.stack([nearness, nearness * px[None], nearness * py[None]], axis=1)
-        cotangent = jnp.concatenate([cotangent[:, :-2], plane, cotangent[:, -1:]], axis=1)
-
-        def add(block, gradients):
-            splats = self.splats(slots.planes, block, lanes)
-            nearness, quadric = self.fragments(splats)
-            squared_radius = self.squared_radii(
-                nearness, quadric, lanes.until_end(beyond, block), upto
-            )
-            weight = fast_fragment_weight(squared_radius)
-            rows, opacity = self.rows(splats, slots.attributes, block, lanes), splats[-1]
-            d_rows = jnp.moveaxis(jnp.einsum("trp,tsp->trs", cotangent, weight), 1, 0)
-            d_weight = opacity[:, :, None] * jnp.einsum(
-                "tsr,trp->tsp", jnp.stack(rows, axis=2), cotangent
-            )
-            d_squared = fragment_weight_derivative(squared_radius, weight) * d_weight
-            nearness = jnp.where(squared_radius < 1, nearness, 1.0)
-            d_nearness, d_quadric = self.view.squared_radius_vjp(
-                nearness, squared_radius, d_squared
-            )
-            # Both are polynomials in the pixel: their moments over the tile are all that is needed.
-            quad = jnp.moveaxis(d_quadric @ monomials, 2, 0)
-            near = jnp.moveaxis(d_nearness @ monomials[:, :3], 2, 0)
-            d_opacity = sum(row * d_row for row, d_row in zip(rows, d_rows, strict=True))
-            d_rows = d_rows * opacity[None]
-            d_planes = _plane_cotangents(splats, quad, near + d_rows[-4:-1])
-            parts = [*d_planes, d_opacity, *d_rows[:-4]]
-            return tuple(
-                lanes.add(whole, block, part) for whole, part in zip(gradients, parts, strict=True)
-            )
-
-        return lax.fori_loop(jnp.int32(0), lanes.blocks, add, gradients)
-
-
-class Slots(eqx.Module):
-    """What the sweeps read, gathered into slots; rows of one lane each."""
-
-    planes: list[Float[Array, "rows slots"]]
-    shift: Float[Array, "rows slots"]
-    attributes: list[Float[Array, "rows slots"]]
-
-    @classmethod
-    def gathered(cls, shift, planes, attributes, bins: Bins) -> "Slots":
-        def slots(plane, fill):
-            return slot_plane(plane, fill, bins).reshape(-1, bins.ids.shape[2])
-
-        filled = zip(planes, _EMPTY, strict=True)
-        return cls(
-            [slots(*each) for each in filled],
-            slots(shift, 0.0),
-            [slots(row, 0.0) for row in attributes],
-        )
-
-
-def picked(is_open: Bool[Array, " tiles"], lanes: int):
-    """Find the places of open tiles, a lane each, and in how many rounds; the rest of the last
-    round is empty.
-    """
-    places = jnp.nonzero(is_open, size=is_open.shape[0] + lanes, fill_value=is_open.shape[0])[
-        0
-    ].astype(jnp.int32)
-    count = jnp.sum(is_open, dtype=jnp.int32)
-
-    def pick(i):
-        picked = lax.dynamic_slice_in_dim(places, i * lanes, lanes)
-        real = picked < is_open.shape[0]
-        return jnp.where(real, picked, is_open.shape[0] - 1), real[:, None]
-
-    return pick, -(-count // lanes)
-
-
-def second_limits(
-    weighty: Float[Array, "tiles pixels"], of_any: Float[Array, "tiles pixels"]
-) -> Float[Array, "tiles pixels"]:
-    """Give where what lies behind ends, from the largest of both in all parts; inf where that is
-    nothing.
-    """
-    found = jnp.where(weighty > -jnp.inf, weighty, of_any)
-    return jnp.where(found > -jnp.inf, found, jnp.inf)
-
-
-def _forward(sweep: Sweep, bins: Bins, shift, planes, attributes):
-    """Sweep all chunks: both surfaces, tile by tile, and per pixel where they end, in lane
-    order.
-    """
-    slots, grid = Slots.gathered(shift, planes, attributes, bins), sweep.grid
-    dtype, within = planes[0].dtype, grid.within_picture()
-    poison = bins.poison(dtype)
-
-    def seen(sums, tiles):
-        """What of a tile lies beyond the picture shows nothing."""
-        if within is None:
-            return sums
-        return jnp.where(
-            jnp.asarray(within)[jnp.minimum(tiles, grid.count - 1)][:, None], sums, 0.0
-        )
-
-    def chunk(i, out):
-        tiles = sweep.chunk(bins, i, dtype)
-        limit = sweep.limits(slots, tiles)
-        sums = seen(
-            sweep.sums(slots, tiles, limit, None),
-            lax.dynamic_slice_in_dim(bins.order, i * grid.lanes, grid.lanes),
-        )
-        parts = FragmentSums.of(sums), limit
-        return jax.tree.map(
-            lambda whole, part: lax.dynamic_update_slice_in_dim(whole, part, i * grid.lanes, 0),
-            out,
-            parts,
-        )
-
-    empty = zeros_after(slots.shift, (bins.places, len(attributes) + 2, SIDE**2), dtype)
-    never = jnp.inf + empty[:, 0]
-    front, limits = lax.fori_loop(jnp.int32(0), bins.chunks, chunk, (FragmentSums.of(empty), never))
-    gaps = (front.weights < sweep.full_coverage) & (limits > -jnp.inf) & (limits < jnp.inf)
-    pick, rounds = picked(jnp.any(gaps, axis=1), grid.lanes)
-
-    def look_behind(i, out):
-        behind, seconds = out
-        places, real = pick(i)
-        lanes, limit, tiles = sweep.picked(bins, places, dtype), limits[places], bins.order[places]
-        second = second_limits(
-            *sweep.limits_behind(slots, lanes, jnp.where(gaps[places] & real, limit, -jnp.inf))
-        )
-        found = FragmentSums.of(seen(sweep.sums(slots, lanes, second, limit), tiles))
-        return jax.tree.map(
-            lambda whole, part: whole.at[tiles].add(part), behind, found
-        ), seconds.at[places].min(second)
-
-    nothing = FragmentSums.of(
-        poison + zeros_after(rounds, (grid.count, len(attributes) + 2, SIDE**2), dtype)
-    )
-    behind, seconds = lax.fori_loop(jnp.int32(0), rounds, look_behind, (nothing, never))
-    return (
-        jax.tree.map(lambda each: bins.by_tile(each, grid.count) + poison, front),
-        behind,
-        (limits, seconds),
-    )
-
-
-def backward(sweep: Sweep, bins: Bins, shift, planes, attributes, limits, cotangents):
-    """Sweep all chunks again: the cotangents of planes and attributes, per slot, then summed per
-    splat.
-    """
-    slots, grid = Slots.gathered(shift, planes, attributes, bins), sweep.grid
-    dtype, count = planes[0].dtype, len(planes) + len(attributes)
-    (limits, seconds), (d_front, d_behind) = limits, cotangents
-
-    def of_tiles(cotangent: FragmentSums, tiles):
-        return jax.tree.map(
-            lambda whole: whole.at[tiles].get(mode="fill", fill_value=0), cotangent
-        ).rows()
-
-    def chunk(i, gradients):
-        limit, tiles = (
-            lax.dynamic_slice_in_dim(each, i * grid.lanes, grid.lanes)
-            for each in (limits, bins.order)
-        )
-        return sweep.add_cotangents(
-            slots, sweep.chunk(bins, i, dtype), limit, None, of_tiles(d_front, tiles), gradients
-        )
-
-    start = tuple(zeros_after(d_front.weights, slots.shift.shape, dtype) for _ in range(count))
-    gradients = lax.fori_loop(jnp.int32(0), bins.chunks, chunk, start)
-    pick, rounds = picked(jnp.any(seconds < jnp.inf, axis=1), grid.lanes)
-
-    def look_behind(i, gradients):
-        places, real = pick(i)
-        cotangent, beyond = (
-            of_tiles(d_behind, bins.order[places]),
-            jnp.where(real, seconds[places], jnp.inf),
-        )
-        return sweep.add_cotangents(
-            slots, sweep.picked(bins, places, dtype), beyond, limits[places], cotangent, gradients
-        )
-
-    gradients = lax.fori_loop(jnp.int32(0), rounds, look_behind, gradients)
-    per_splat = tuple(scatter_slots(plane, bins, planes[0].shape[0]) for plane in gradients)
-    return per_splat[: len(planes)], per_splat[len(planes) :]
-
-
-def _plane_cotangents(splats, quad, near):
-    """Turn moments of the cotangents over the pixels into cotangents of a splat's numbers."""
-    x, y, sx, sy, a, b, c, _, _ = splats
-    m, mx, my, mxx, mxy, myy = quad
-    n, nx, ny = near
-    dx, dy = mx - x * m, my - y * m
-    dxx = mxx - 2 * x * mx + x * x * m
-    dxy = mxy - x * my - y * mx + x * y * m
-    dyy = myy - 2 * y * my + y * y * m
-    d_x = -(2 * a * dx + b * dy + sx * n)
-    d_y = -(b * dx + 2 * c * dy + sy * n)
-    return d_x, d_y, nx - x * n, ny - y * n, dxx, dxy, dyy, n
-
-
-@partial(jax.custom_vjp, nondiff_argnums=(0,))
-def sweep_tiles(
+@partial(jax.custom_vjp, nondiff_argnums=(0, 1, 2))
+def sum_fragments(
     sweep: Sweep,
+    capacity: Places,
+    combination: AbstractCombination,
     bins: Bins,
     shift: Float[Array, " splats"],
     planes: tuple[Float[Array, " splats"], ...],
-    attributes: tuple[Float[Array, " splats"], ...],
-):
-    """Sum attributes over the splats of every tile: the front surface and the one behind it."""
-    front, behind, _ = _forward(sweep, bins, shift, planes, attributes)
-    return front, behind
+    attributes: Float[Array, "splats attributes"],
+) -> FragmentSums:
+    """Sum attributes over the splats of every tile: this device's part of the sums."""
+    return _forward(sweep, capacity, combination, bins, shift, planes, attributes)[0]
 
 
-def sweep_tiles_fwd(sweep: Sweep, bins: Bins, shift, planes, attributes):
-    front, behind, limits = _forward(sweep, bins, shift, planes, attributes)
-    return (front, behind), (bins, shift, planes, attributes, limits)
+def _forward(sweep, capacity, combination, bins, shift, planes, attributes):
+    slots = Slots.gathered(shift, planes, attributes, bins)
+    if isinstance(combination, OneDevice):
+        sums, ends = _sum_chunks(sweep, capacity, bins, slots)
+    else:
+        stages = PartSweep(sweep, bins, slots)
+        ((sums, ends),) = sum_parts(lambda: [[stages]], [capacity], combination)
+    invalid = jnp.where(sums.needed <= 1, 0.0, jnp.nan).astype(shift.dtype)
+    return eqx.tree_at(lambda each: each.rows, sums, sums.rows + invalid), ends
 
 
-def sweep_tiles_bwd(sweep: Sweep, residuals, cotangents):
-    return (None, None, *backward(sweep, *residuals, cotangents))
+def _sum_fwd(sweep, capacity, combination, bins, shift, planes, attributes):
+    sums, ends = _forward(sweep, capacity, combination, bins, shift, planes, attributes)
+    return sums, (bins, shift, planes, attributes, ends)
 
 
-sweep_tiles.defvjp(sweep_tiles_fwd, sweep_tiles_bwd)
+def _sum_bwd(sweep: Sweep, capacity: Places, combination, residuals, cotangent):
+    bins, shift, planes, attributes, ends = residuals
+    slots, lanes = Slots.gathered(shift, planes, attributes, bins), sweep.grid.lanes
+    dtype, splats = shift.dtype, shift.shape[0]
+    cotangent = cotangent.rows
+
+    def front(i, gradients):
+        places = lax.dynamic_slice_in_dim(ends.places, i * lanes, lanes)
+        beyond = ends.beyond.at[places].get(mode="fill", fill_value=jnp.inf)
+        own = cotangent.at[places].get(mode="fill", fill_value=0)
+        chunk = sweep.chunk(bins, i, dtype)
+        return sweep.add_cotangents(slots, chunk, beyond, None, own, gradients)
+
+    def behind(i, gradients):
+        picked, exists = _pick(ends.lanes, i, lanes, bins)
+        beyond, own = (
+            lax.dynamic_slice_in_dim(each, capacity.front + i * lanes, lanes)
+            for each in (ends.beyond, cotangent)
+        )
+        beyond = jnp.where(exists, beyond, jnp.inf)
+        upto = lax.dynamic_slice_in_dim(ends.upto, i * lanes, lanes)
+        picked = sweep.picked(bins, picked, dtype)
+        return sweep.add_cotangents(slots, picked, beyond, upto, own, gradients)
+
+    of_planes = tuple(zeros_after(cotangent, slots.shift.shape, dtype) for _ in planes)
+    gradients = of_planes, zeros_after(cotangent, attributes.shape, dtype)
+    gradients = lax.fori_loop(jnp.int32(0), bins.chunks, front, gradients)
+    rounds = _rounds(jnp.any(ends.beyond[capacity.front :] < jnp.inf, axis=1), lanes)
+    of_planes, of_rows = lax.fori_loop(jnp.int32(0), rounds, behind, gradients)
+    return None, None, tuple(scatter_slots(each, bins, splats) for each in of_planes), of_rows
+
+
+sum_fragments.defvjp(_sum_fwd, _sum_bwd)
+
+
+def _sum_chunks(
+    sweep: Sweep, capacity: Places, bins: Bins, slots: Slots
+) -> tuple[FragmentSums, Ends]:
+    """Sweep all chunks of tiles; places are lanes."""
+    grid, dtype, lanes = sweep.grid, slots.shift.dtype, sweep.grid.lanes
+    count = capacity.front + capacity.behind
+
+    def write(whole, part, i):
+        return lax.dynamic_update_slice_in_dim(whole, part, i, 0)
+
+    # The front, chunk by chunk.
+    def chunk(i, out):
+        rows, beyond = out
+        tiles = sweep.chunk(bins, i, dtype)
+        limits = sweep.limits(slots, tiles)
+        own = lax.dynamic_slice_in_dim(bins.order, i * lanes, lanes)
+        sums = sweep.within_picture(sweep.sums(slots, tiles, limits, None), own)
+        return write(rows, sums, i * lanes), write(beyond, limits, i * lanes)
+
+    rows = zeros_after(slots.shift, (count, slots.attributes.shape[1] + 2, SIDE**2), dtype)
+    beyond = jnp.inf + zeros_after(slots.shift, (count, SIDE**2), dtype)
+    rows, beyond = lax.fori_loop(jnp.int32(0), bins.chunks, chunk, (rows, beyond))
+
+    # The surface behind, where the front leaves a pixel open.
+    front = beyond[: capacity.front]
+    gaps = (rows[: capacity.front, -1] < sweep.full_coverage) & (jnp.abs(front) < jnp.inf)
+    is_open = jnp.any(gaps, axis=1)
+    (picks,) = jnp.nonzero(is_open, size=capacity.behind, fill_value=capacity.front)
+    picks = picks.astype(jnp.int32)
+
+    def look_behind(i, out):
+        rows, beyond, upto = out
+        picked, exists = _pick(picks, i, lanes, bins)
+        tiles, limits = sweep.picked(bins, picked, dtype), front[picked]
+        open_to = jnp.where(gaps[picked] & exists, limits, -jnp.inf)
+        seconds = second_limits(*sweep.limits_behind(slots, tiles, open_to))
+        sums = sweep.sums(slots, tiles, seconds, limits)
+        sums = sweep.within_picture(sums, bins.order[picked])
+        here = capacity.front + i * lanes
+        return write(rows, sums, here), write(beyond, seconds, here), write(upto, limits, i * lanes)
+
+    upto = zeros_after(picks, (capacity.behind, SIDE**2), dtype)
+    rounds = _rounds(picks < capacity.front, lanes)
+    rows, beyond, upto = lax.fori_loop(jnp.int32(0), rounds, look_behind, (rows, beyond, upto))
+    order = jnp.minimum(jnp.append(bins.order, grid.count), grid.count)
+    own = jnp.arange(capacity.front, dtype=jnp.int32)
+    tiles = order[jnp.concatenate([own, jnp.where(picks < capacity.front, picks, len(order) - 1)])]
+    needed = jnp.sum(is_open).astype(dtype) / capacity.behind
+    needed = jnp.maximum(bins.needed.astype(dtype), needed)
+    return FragmentSums(tiles, rows, needed, capacity.front), Ends(beyond, upto, own, picks)
+
+
+class PartSweep(eqx.Module):
+    """The stages of the sweep one by one, for splats that are one part of many: the splats of
+    another part may lie in front.
+    """
+
+    sweep: Sweep
+    bins: Bins
+    slots: Slots
+
+    @jit_unless_traced
+    def limits(self) -> Float[Array, "tiles pixels"]:
+        """Find where the front ends, -inf where there is none."""
+        lanes, dtype = self.sweep.grid.lanes, self.slots.shift.dtype
+
+        def chunk(i, limits):
+            found = self.sweep.limits(self.slots, self.sweep.chunk(self.bins, i, dtype))
+            tiles = lax.dynamic_slice_in_dim(self.bins.order, i * lanes, lanes)
+            return limits.at[tiles].set(found, mode="drop")
+
+        limits = zeros_after(self.slots.shift, (self.sweep.grid.count, SIDE**2), dtype) - jnp.inf
+        return lax.fori_loop(jnp.int32(0), self.bins.chunks, chunk, limits)
+
+    @jit_unless_traced
+    def sums(
+        self,
+        tiles: Int[Array, " places"],
+        beyond: Float[Array, "places pixels"],
+        upto: Float[Array, "places pixels"] | None,
+    ) -> Float[Array, "places rows pixels"]:
+        """Sum over the fragments between two depths in the pixels of some tiles."""
+
+        def add(chunk, lanes, i):
+            farther = None if upto is None else _round_of(upto, i, self.sweep)
+            sums = self.sweep.sums(self.slots, chunk, _round_of(beyond, i, self.sweep), farther)
+            return self.sweep.within_picture(sums, self.bins.order[lanes])
+
+        rows = self.slots.attributes.shape[1] + 2
+        return self._each_round(
+            tiles, add, zeros_after(beyond, (len(tiles), rows, SIDE**2), beyond.dtype)
+        )
+
+    @jit_unless_traced
+    def limits_behind(
+        self, tiles: Int[Array, " places"], open_to: Float[Array, "places pixels"]
+    ) -> tuple[Float[Array, "places pixels"], Float[Array, "places pixels"]]:
+        """Find where the surface behind ends, of the fragments of some weight and of any; `open_to`
+        is where the front ends in open pixels, -inf in others.
+        """
+
+        def look(chunk, lanes, i):
+            return self.sweep.limits_behind(self.slots, chunk, _round_of(open_to, i, self.sweep))
+
+        nothing = zeros_after(open_to, open_to.shape, open_to.dtype) - jnp.inf
+        return self._each_round(tiles, look, (nothing, nothing))
+
+    def lanes(self, tiles: Int[Array, " places"]) -> Int[Array, " places"]:
+        """Return the lane of each tile in the bins; the number of lanes for none."""
+        swept = self.bins.lanes
+        lane = jnp.full(self.sweep.grid.tiles + 1, swept, jnp.int32)
+        lane = lane.at[self.bins.order[:swept]].set(jnp.arange(swept, dtype=jnp.int32))
+        return lane[jnp.where(tiles < self.sweep.grid.count, tiles, len(lane) - 1)]
+
+    def _each_round(self, tiles: Int[Array, " places"], function: Callable, start):
+        """Write what a function finds of so many places at a time as there are lanes."""
+        lanes, count = self.lanes(tiles), self.sweep.grid.lanes
+        dtype = self.slots.shift.dtype
+
+        def step(i, out):
+            own, exists = _pick(lanes, i, count, self.bins)
+            found = function(self.sweep.picked(self.bins, own, dtype), own, i)
+
+            def write(whole, part):
+                kept = exists.reshape(-1, *[1] * (part.ndim - 1))
+                part = jnp.where(kept, part, lax.dynamic_slice_in_dim(whole, i * count, count))
+                return lax.dynamic_update_slice_in_dim(whole, part, i * count, 0)
+
+            return jax.tree.map(write, out, found)
+
+        return lax.fori_loop(jnp.int32(0), len(tiles) // count, step, start)
+
+
+def sum_parts(
+    parts: Callable[[], Iterable[Sequence[PartSweep]]],
+    capacities: Sequence[Places],
+    combination: AbstractCombination,
+) -> list[tuple[FragmentSums, Ends]]:
+    """Sum the fragments of splats that are several parts, in several views at once.
+
+    **Arguments:**
+
+    - `parts`: iterates over the parts on this device whenever it is called; of each, the sweep of
+      every view.
+    - `capacities`: of each view.
+
+    **Returns:** for each view the sums on this device, and where they end.
+    """
+    views = range(len(capacities))
+    first = next(iter(parts()))
+    grids = [each.sweep.grid for each in first]
+    full_coverage = [each.sweep.full_coverage for each in first]
+    # Stage 1: where the front ends in any part.
+    limits = combination.largest([each.limits() for each in part] for part in parts())
+    shown = [jnp.any(each > -jnp.inf, axis=1) for each in limits]
+    fronts = [
+        _listed(shows, capacity.front) for shows, capacity in zip(shown, capacities, strict=True)
+    ]
+    nearer = [_at_tiles(limits[k], fronts[k], jnp.inf) for k in views]
+    nearer = [jnp.where(each > -jnp.inf, each, jnp.inf) for each in nearer]
+    # Stage 2: the sums of the front.
+    front = combination.own_total(
+        [each.sums(fronts[k], nearer[k], None) for k, each in enumerate(part)] for part in parts()
+    )
+    weights = combination.total([[rows[:, -1] for rows in front]])
+    # Stage 3: where the surface behind ends, in pixels that the front leaves open.
+    gaps = [(weights[k] < full_coverage[k]) & (nearer[k] < jnp.inf) for k in views]
+    is_open = [jnp.any(each, axis=1) for each in gaps]
+    picks = [_listed(is_open[k], capacities[k].behind) for k in views]
+    behind = [_at_tiles(fronts[k], picks[k], grids[k].count) for k in views]
+    upto = [_at_tiles(nearer[k], picks[k], -jnp.inf) for k in views]
+    open_to = [jnp.where(_at_tiles(gaps[k], picks[k], False), upto[k], -jnp.inf) for k in views]
+    both = combination.largest(
+        [each.limits_behind(behind[k], open_to[k]) for k, each in enumerate(part)]
+        for part in parts()
+    )
+    seconds = [second_limits(*each) for each in both]
+    # Stage 4: the sums of the surface behind.
+    rest = combination.own_total(
+        [each.sums(behind[k], seconds[k], upto[k]) for k, each in enumerate(part)]
+        for part in parts()
+    )
+    found = []
+    for k, capacity in enumerate(capacities):
+        counts = jnp.sum(shown[k]) / capacity.front, jnp.sum(is_open[k]) / capacity.behind
+        needed = jnp.maximum(*counts).astype(weights[k].dtype)
+        needed = combination.largest(
+            [jnp.maximum(first[k].bins.needed.astype(needed.dtype), needed)]
+        )
+        tiles = jnp.concatenate([fronts[k], behind[k]])
+        sums = FragmentSums(tiles, jnp.concatenate([front[k], rest[k]]), needed, capacity.front)
+        places = jnp.full(grids[k].tiles, len(tiles), jnp.int32)
+        places = places.at[fronts[k]].set(jnp.arange(capacity.front, dtype=jnp.int32), mode="drop")
+        beyond = jnp.concatenate([nearer[k], seconds[k]])
+        own = Ends(beyond, upto[k], places[first[k].bins.order], first[k].lanes(behind[k]))
+        found.append((sums, own))
+    return found
+
+
+def _listed(chosen: Bool[Array, " all"], size: int) -> Int[Array, " size"]:
+    """List the indices of the chosen ones; their number for empty places."""
+    return jnp.nonzero(chosen, size=size, fill_value=len(chosen))[0].astype(jnp.int32)
+
+
+def _at_tiles(whole: Array, tiles: Int[Array, " places"], fill) -> Array:
+    return whole.at[tiles].get(mode="fill", fill_value=fill)
+
+
+def _round_of(rows: Array, i, sweep: Sweep) -> Array:
+    return lax.dynamic_slice_in_dim(rows, i * sweep.grid.lanes, sweep.grid.lanes)
+
+
+def _pick(lanes: Int[Array, " places"], i, count: int, bins: Bins):
+    """Return the lanes of one round, and `[lanes, 1]` which exist; others are the last one."""
+    picked = lax.dynamic_slice_in_dim(lanes, i * count, count)
+    exists = picked < bins.lanes
+    return jnp.where(exists, picked, bins.lanes - 1), exists[:, None]
+
+
+def _rounds(chosen: Bool[Array, " places"], lanes: int) -> Int[Array, ""]:
+    """Count the rounds of so many lanes that visit all places up to the last chosen one."""
+    last = jnp.max(jnp.where(chosen, jnp.arange(1, len(chosen) + 1, dtype=jnp.int32), 0), initial=0)
+    return -(-last // lanes)

@@ -81,18 +81,6 @@ class AbstractView(eqx.Module):
         The third is the cosine-like factor that vanishes where a plane is seen edge on."""
 
     @abc.abstractmethod
-    def pixels_per_mm(self, depth: Float[Array, "*points"]) -> Float[Array, "*points"]:
-        """Give the size of a millimeter across the line of sight, pixels."""
-
-    @abc.abstractmethod
-    def sphere_box(
-        self, centers: Float[Array, "3 spheres"], radii: Float[Array, " spheres"]
-    ) -> tuple[Float[Array, " spheres"], ...]:
-        """Give left, right, top and bottom (pixels) of boxes around spheres, and their centers'
-        depth (mm).
-        """
-
-    @abc.abstractmethod
     def unproject(
         self, x: Float[Array, "*points"], y: Float[Array, "*points"], depth: Float[Array, "*points"]
     ) -> Float[Array, "3 *points"]:

@@ -22,13 +22,13 @@ class AbstractIncidence(eqx.Module):
         xi_angle: Float[Array, " photons"],
         eta: Float[Array, " two"],
     ) -> tuple[Direction, Float[Array, " photons"]]:
-        """Give directions inside and weights, of mean 1, by uniform numbers and the indices outside
+        """Draw directions inside and weights, of mean 1, by uniform numbers and the indices outside
         and inside.
         """
 
     @abc.abstractmethod
     def reflected(self, eta: Float[Array, " channels"]) -> Float[Array, " channels"]:
-        """Give the share of the arriving power that does not enter, by the index inside over
+        """Compute the fraction of the arriving power that does not enter, by the index inside over
         outside.
         """
 
@@ -58,5 +58,5 @@ class DiffuseIncidence(AbstractIncidence):
         return (sine * x, sine * y, cosine), weight
 
     def reflected(self, eta):
-        """Give twice the integral of `mu F(mu)` over the cosine outside."""
+        """Compute twice the integral of `mu F(mu)` over the cosine outside."""
         return jnp.where(eta < 1, 1 - (1 - moment_outside(eta)) * eta * eta, moment_outside(eta))

@@ -7,9 +7,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from splatjax.scattering import check_range
+from splatjax._records import check_values, numbers, record
 
-from ._lookup import of_layer
+from ._stack import of_layer
 
 _SINE = [(-1) ** n * math.pi ** (2 * n + 1) / math.factorial(2 * n + 1) for n in range(8)]
 _COSINE = [(-1) ** n * math.pi ** (2 * n) / math.factorial(2 * n) for n in range(9)]
@@ -22,7 +22,7 @@ class AbstractPhaseFunction(eqx.Module):
 
     @abc.abstractmethod
     def anisotropy(self, layers: int, dtype) -> Float[Array, " layers"]:
-        """Give the mean cosine `g` of each layer."""
+        """Return the mean cosine `g` of each layer."""
 
     @abc.abstractmethod
     def scatter(
@@ -32,7 +32,7 @@ class AbstractPhaseFunction(eqx.Module):
         xi_cosine: Float[Array, " photons"],
         xi_angle: Float[Array, " photons"],
     ) -> Direction:
-        """Give new unit directions from old ones, by two uniform random numbers in (0, 1) each."""
+        """Draw new unit directions by two uniform random numbers in (0, 1) each."""
 
 
 class Isotropic(AbstractPhaseFunction):
@@ -50,6 +50,7 @@ class Isotropic(AbstractPhaseFunction):
         return sine * x, sine * y, cosine
 
 
+@record
 class HenyeyGreenstein(AbstractPhaseFunction):
     r"""Henyey and Greenstein's phase function.
 
@@ -64,10 +65,12 @@ class HenyeyGreenstein(AbstractPhaseFunction):
     nothing is singular at `g = 0`.
     """
 
-    g: Float[Array, "*layers"] = eqx.field(converter=jnp.asarray)
+    g: Float[Array, "*layers"] = eqx.field(converter=numbers)
 
     def __check_init__(self):
-        check_range("g", self.g, "between -1 and 1, neither included", lambda x: abs(x) < 1)
+        check_values(
+            "HenyeyGreenstein.g", self.g, "between -1 and 1, neither included", lambda x: abs(x) < 1
+        )
 
     def anisotropy(self, layers, dtype):
         if self.g.ndim and self.g.shape[0] != layers:
@@ -106,7 +109,7 @@ class HenyeyGreenstein(AbstractPhaseFunction):
 def on_circle(
     xi: Float[Array, " photons"],
 ) -> tuple[Float[Array, " photons"], Float[Array, " photons"]]:
-    """Give a point of the unit circle for each number in (0, 1]; right to 1e-10.
+    """Compute a point of the unit circle for each number in (0, 1]; right to 1e-10.
 
     Series for a quarter of a turn, and the double angle: a library's sine is made for arguments of
     any size, and slow.

@@ -18,7 +18,7 @@ _GOLDEN = 0x9E3779B9
 def uniforms(
     key: Key[Array, ""], number: Int[Array, ""], lanes: int, dtype
 ) -> Float[Array, "four lanes"]:
-    """Give four independent numbers in (0, 1] for each lane, steps of 2^-24: the `number`-th of a
+    """Draw four independent numbers in (0, 1] for each lane, steps of 2^-24: the `number`-th of a
     key.
     """
     words = jax.random.key_data(key).reshape(-1).astype(jnp.uint32)
@@ -31,7 +31,7 @@ def uniforms(
 
 
 def evenly(key: Key[Array, ""], number: Int[Array, " lanes"], dtype) -> Float[Array, " lanes"]:
-    """Give numbers in (0, 1] that fill it evenly as `number` counts: Weyl's sequence of the golden
+    """Draw numbers in (0, 1] that fill it evenly as `number` counts: Weyl's sequence of the golden
     ratio, from a random start.
 
     Means over a smooth function of one of them are nearly exact.

@@ -9,6 +9,8 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from splatjax._chunking import jit_unless_traced
+
 from ._incidence import AbstractIncidence
 from ._phase import AbstractPhaseFunction
 from ._random import evenly, uniforms
@@ -37,7 +39,7 @@ instead (Russian roulette).
 
 
 class Walk(eqx.Module):
-    r"""What does not change while photons walk.
+    r"""The constants of a walk.
 
     **Attributes:**
 
@@ -59,7 +61,7 @@ class Walk(eqx.Module):
 
 
 def lanes_for(photons: int) -> int:
-    """Give how many photons to have on their way at once."""
+    """Choose how many photons to have on their way at once."""
     return min(_MOST_LANES, max(_LEAST_LANES, 1 << (photons // _PHOTONS_A_LANE).bit_length()))
 
 
@@ -71,19 +73,13 @@ class _State(eqx.Module):
     started: Int[Array, ""]
     round: Int[Array, ""]
 
+    @jit_unless_traced
     def unfinished(self, walk: Walk) -> Bool[Array, ""]:
-        return _any_left(self.started, walk.photons, self.photons.place)
+        return (self.started < walk.photons) | jnp.any(self.photons.place == INSIDE)
 
 
-@jax.jit
-def _any_left(
-    started: Int[Array, ""], photons: Int[Array, ""], place: Int[Array, " photons"]
-) -> Bool[Array, ""]:
-    return (started < photons) | jnp.any(place == INSIDE)
-
-
-def finish(walk: Walk, progress: Callable[[int, int], None] | None) -> Tally:
-    """Walk all photons to their end. Under `jit` in one loop, else call by call, telling progress
+def finish(walk: Walk, progress: Callable[[int, int], None]) -> Tally:
+    """Walk all photons to their end. Under `jit` in one loop, else call by call, reporting progress
     in between.
     """
     state = _start(walk)
@@ -93,9 +89,8 @@ def finish(walk: Walk, progress: Callable[[int, int], None] | None) -> Tally:
         ).tally
     while bool(state.unfinished(walk)):
         state = _advance(walk, state)
-        if progress is not None:
-            under_way = int(np.sum(np.asarray(state.photons.place) == INSIDE))
-            progress(int(state.started) - under_way, int(walk.photons))
+        under_way = int(np.sum(np.asarray(state.photons.place) == INSIDE))
+        progress(int(state.started) - under_way, int(walk.photons))
     return state.tally
 
 
@@ -103,17 +98,14 @@ def finish(walk: Walk, progress: Callable[[int, int], None] | None) -> Tally:
 def _start(walk: Walk) -> _State:
     dtype, (layers, channels) = walk.edges.dtype, walk.optics.absorption.shape
     parameters, rings = walk.slopes.absorption.shape[0], walk.edges.shape[1] - 1
-    nothing, nowhere = jnp.zeros(walk.lanes, dtype), jnp.zeros(walk.lanes, jnp.int32)
-    down = (nothing, nothing, nothing + 1)
-    photons = Photons(nothing, nothing, nothing, down, nothing, nowhere, nowhere + IDLE, nowhere)
+    zero, number = jnp.zeros(walk.lanes, dtype), jnp.zeros(walk.lanes, jnp.int32)
+    photons = Photons(zero, zero, zero, (zero, zero, zero + 1), zero, number, number + IDLE, number)
     weights = PathWeights(
         jnp.zeros((channels, walk.lanes), dtype), jnp.zeros((layers, channels, walk.lanes), dtype)
     )
-    slopes = jax.tree.map(lambda each: jnp.zeros((parameters, *each.shape), dtype), weights)
+    slopes = jax.tree.map(lambda leaf: jnp.zeros((parameters, *leaf.shape), dtype), weights)
     tally = Tally.empty(rings, layers, channels, parameters, dtype)
-    state = _State(
-        photons, weights, slopes, tally, jnp.zeros((), jnp.int32), jnp.zeros((), jnp.int32)
-    )
+    state = _State(photons, weights, slopes, tally, number[0], number[0])
     return _launch(walk, state, photons.place == IDLE)
 
 
@@ -161,8 +153,8 @@ def _round(walk: Walk, state: _State) -> _State:
     dropped = faint & (chance > _SURVIVING)
     boost = jnp.where(faint & ~dropped, 1 / _SURVIVING, jnp.ones_like(chance))
     weights, slopes = (
-        PathWeights(each.carried * jnp.broadcast_to(boost, each.carried.shape), each.absorbed)
-        for each in (weights, slopes)
+        PathWeights(part.carried * jnp.broadcast_to(boost, part.carried.shape), part.absorbed)
+        for part in (weights, slopes)
     )
     done = (
         ((photons.place != INSIDE) & (photons.place != IDLE))
@@ -183,32 +175,16 @@ def _launch(walk: Walk, state: _State, free: Bool[Array, " photons"]) -> _State:
     spread = evenly(walk.key, state.started + turn, dtype)
     direction, weight = walk.incidence.enter(spread, xi[1], walk.stack.eta[:2])
 
-    def fresh(new, old):
-        return jnp.where(begins, new, old)
-
-    old, zero = state.photons, jnp.zeros(walk.lanes, dtype)
-    photons = Photons(
-        x=fresh(zero, old.x),
-        y=fresh(zero, old.y),
-        depth=fresh(zero, old.depth),
-        direction=tuple(
-            fresh(new, each) for new, each in zip(direction, old.direction, strict=True)
-        ),
-        to_scatter=fresh(-jnp.log(xi[2]), old.to_scatter),
-        layer=fresh(jnp.zeros_like(old.layer), old.layer),
-        place=fresh(
-            jnp.full_like(old.place, INSIDE), jnp.where(free, IDLE, old.place).astype(jnp.int32)
-        ),
-        flights=fresh(jnp.zeros_like(old.flights), old.flights),
+    zero, number = jnp.zeros(walk.lanes, dtype), jnp.zeros(walk.lanes, jnp.int32)
+    fresh = Photons(zero, zero, zero, direction, -jnp.log(xi[2]), number, number + INSIDE, number)
+    photons = jax.tree.map(lambda new, old: jnp.where(begins, new, old), fresh, state.photons)
+    idle = jnp.where(free & ~begins, IDLE, photons.place)
+    photons = eqx.tree_at(lambda photons: photons.place, photons, idle)
+    weights, slopes = (
+        jax.tree.map(lambda leaf: jnp.where(jnp.broadcast_to(free, leaf.shape), 0.0, leaf), part)
+        for part in (state.weights, state.slopes)
     )
-
-    def cleared(each):
-        return jnp.where(jnp.broadcast_to(free, each.shape), jnp.zeros_like(each), each)
-
-    weights, slopes = (jax.tree.map(cleared, each) for each in (state.weights, state.slopes))
-    carried = weights.carried + jnp.broadcast_to(
-        jnp.where(begins, weight, zero), weights.carried.shape
-    )
-    weights = PathWeights(carried, weights.absorbed)
+    started_weight = jnp.broadcast_to(jnp.where(begins, weight, zero), weights.carried.shape)
+    weights = PathWeights(weights.carried + started_weight, weights.absorbed)
     started = state.started + jnp.sum(begins, dtype=jnp.int32)
     return _State(photons, weights, slopes, state.tally, started, state.round)

@@ -1,4 +1,4 @@
-"""What photons walk through: layers as arrays, and the channels that walk alike."""
+"""The layers of a walk as arrays, and the channels that share a walk."""
 
 from collections.abc import Sequence
 
@@ -14,26 +14,6 @@ from splatjax.scattering import Film, Layer
 _FILM_THICKNESS = 1e-6
 """In free paths of the first layer that scatters: so thin that no light moves sideways in a film.
 """
-
-
-def check_layers(layers: Sequence[Layer | Film]) -> None:
-    """Raise if photons could not walk here, or not farther than a layer above the lowest. Traced
-    thicknesses pass.
-    """
-    if not any(isinstance(layer, Layer) for layer in layers):
-        raise ValueError(
-            f"photons need a layer that scatters; got {len(layers)} layers, none of which is a "
-            "Layer"
-        )
-    for number, layer in enumerate(layers[:-1], start=1):
-        if (
-            isinstance(layer, Layer)
-            and not isinstance(layer.thickness, Tracer)
-            and np.isinf(np.asarray(layer.thickness))
-        ):
-            raise ValueError(
-                f"layer {number} of {len(layers)} is infinitely thick; only the lowest may be"
-            )
 
 
 class LayeredMedia(eqx.Module):
@@ -62,57 +42,51 @@ class LayeredMedia(eqx.Module):
         eta_above: Float[Array, "*channels"],
         eta_below: Float[Array, "*channels"],
     ) -> "LayeredMedia":
-        """Lay out layers from the top. A film has the index of what scatters below it, or above
-        where nothing does.
+        """Lay out layers from the top. A film has the index of the next scattering layer below it,
+        or else of the last one above.
         """
         scattering = [layer for layer in layers if isinstance(layer, Layer)]
         like = scattering[0].medium.sigma_a
         thin = _FILM_THICKNESS / jax.lax.stop_gradient(scattering[0].medium.sigma_s_prime)
         rows = []
         for number, layer in enumerate(layers):
-            if isinstance(layer, Layer):
-                medium, thickness = layer.medium, layer.thickness.astype(like.dtype)
-                sigma_s = medium.sigma_s_prime / (1 - anisotropy[number])
-                rows.append(
-                    (medium.sigma_a, sigma_s, jnp.broadcast_to(thickness, like.shape), medium.eta)
-                )
+            lower = [other for other in layers[number:] if isinstance(other, Layer)]
+            medium = (lower or scattering[-1:])[0].medium
+            if isinstance(layer, Film):
+                rows.append((layer.optical_depth / thin, jnp.zeros_like(like), thin, medium.eta))
             else:
-                below = [each for each in layers[number:] if isinstance(each, Layer)]
-                eta = (below[0] if below else scattering[-1]).medium.eta
-                rows.append((layer.optical_depth / thin, jnp.zeros_like(like), thin, eta))
+                sigma_s = medium.sigma_s_prime / (1 - anisotropy[number])
+                thickness = jnp.broadcast_to(layer.thickness, like.shape)
+                rows.append((medium.sigma_a, sigma_s, thickness, medium.eta))
         sigma_a, sigma_s, thickness, eta = (jnp.stack(column) for column in zip(*rows, strict=True))
-        above, below = (
-            jnp.broadcast_to(each.astype(like.dtype), like.shape)[None]
-            for each in (eta_above, eta_below)
-        )
+        above, below = (jnp.broadcast_to(edge, (1, len(like))) for edge in (eta_above, eta_below))
         first = next(number for number, layer in enumerate(layers) if isinstance(layer, Layer))
         return cls(sigma_a, sigma_s, thickness, jnp.concatenate([above, eta, below]), first)
 
     @property
     def unit(self) -> Float[Array, " channels"]:
-        """The free path between scatterings in the first layer that scatters, mm: walks are made in
-        it.
+        """The free path between scatterings in the first layer that scatters, mm: the unit of
+        length of walks.
         """
         return 1 / self.sigma_s[self.first]
 
     def stack(self, channel: Int[Array, ""]) -> "Stack":
-        """Give the walk of one channel."""
+        """Return the geometry of one channel, in its unit."""
         unit = self.unit[channel]
         return Stack(
             self.sigma_s[:, channel] * unit, self.thickness[:, channel] / unit, self.eta[:, channel]
         )
 
-    def alike(self) -> list[np.ndarray]:
-        """Give groups of channels, by number, whose photons walk alike: they differ in absorption
-        and in scale alone.
+    def shared_walks(self) -> list[np.ndarray]:
+        """Group the channels, by number, that differ in absorption and in scale alone: they share a
+        walk.
 
-        Under `jit` values are unknown, and each channel walks for itself.
+        Under `jit` values are unknown, and each channel has its own walk.
         """
-        channels = self.sigma_a.shape[1]
-        known = (self.sigma_s, self.thickness, self.eta)
-        if any(isinstance(each, Tracer) for each in known):
-            return [np.asarray([channel]) for channel in range(channels)]
-        sigma_s, thickness, eta = (np.asarray(each) for each in known)
+        geometry = (self.sigma_s, self.thickness, self.eta)
+        if any(isinstance(values, Tracer) for values in geometry):
+            return [np.asarray([channel]) for channel in range(self.sigma_a.shape[1])]
+        sigma_s, thickness, eta = (np.asarray(values) for values in geometry)
         unit = 1 / sigma_s[self.first]
         walks = np.concatenate([sigma_s * unit, thickness / unit, eta])
         _, group = np.unique(walks, axis=1, return_inverse=True)
@@ -133,3 +107,17 @@ class Stack(eqx.Module):
     sigma_s: Float[Array, " layers"]
     thickness: Float[Array, " layers"]
     eta: Float[Array, " layers_and_neighbors"]
+
+
+def of_layer(
+    table: Float[Array, "layers *channels"], layer: Int[Array, " photons"]
+) -> Float[Array, "*channels photons"]:
+    """Look up the entry of each photon's layer: by selections, which vectorize as a gather does
+    not.
+    """
+    shape = (*table.shape[1:], *layer.shape)
+    entry = jnp.broadcast_to(table[0][..., None], shape)
+    for number in range(1, table.shape[0]):
+        here = jnp.broadcast_to(layer == number, shape)
+        entry = jnp.where(here, jnp.broadcast_to(table[number][..., None], shape), entry)
+    return entry

@@ -31,7 +31,7 @@ class Sum(eqx.Module):
         return Sum(both, low - (both - high))
 
     def over(self, count) -> Float[Array, "..."]:
-        """Give the mean."""
+        """Compute the mean."""
         return self.high / count + self.low / count
 
 
@@ -41,7 +41,7 @@ _AT_ONCE = 32
 def total(
     counts: Float[Array, " terms"], values: Float[Array, "terms moments"]
 ) -> Float[Array, " moments"]:
-    """Give `counts @ values`, a few terms at a time: thousands of them, one after the other, are
+    """Compute `counts @ values`, a few terms at a time: thousands of them, one after the other, are
     off by 5e-5 in float32.
     """
     while counts.shape[0] % _AT_ONCE == 0:

@@ -8,9 +8,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ._interface import fresnel
-from ._lookup import of_layer
 from ._phase import AbstractPhaseFunction
-from ._stack import Stack
+from ._stack import Stack, of_layer
 
 INSIDE, ABOVE, BELOW, IDLE = 0, 1, 2, 3
 """Where a photon is; one that is idle is not on its way at all."""
@@ -32,8 +31,8 @@ class Photons(eqx.Module):
 
 
 class Flight(eqx.Module):
-    """What a flight means for weights: its length in a layer, 0 for a photon that does not fly, and
-    how it ended.
+    """The effect of a flight on weights: its length in a layer, 0 for a photon that does not fly,
+    and how it ended.
     """
 
     length: Float[Array, " photons"]
@@ -171,8 +170,8 @@ def weigh(optics: Optics, weights: PathWeights, flight: Flight) -> PathWeights:
 def _taken(
     absorption: Float[Array, "channels photons"], removal: Float[Array, "channels photons"]
 ) -> Float[Array, "channels photons"]:
-    """Give `(1 - exp(-removal)) absorption / removal`, where both are equal in value, as they are
-    on the path drawn.
+    """Compute `(1 - exp(-removal)) absorption / removal`, where both are equal in value, as they
+    are on the path drawn.
     """
     return -jnp.expm1(-absorption)
 

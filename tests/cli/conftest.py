@@ -17,7 +17,7 @@ COMPILED = "/jax/core/compile/backend_compile_duration"
 
 @pytest.fixture(autouse=True, scope="module")
 def own_cache(tmp_path_factory):
-    """Compiled code goes to a folder of the tests, and the program's settings are taken back."""
+    """Keep compiled code in a folder of the tests, and restore the settings afterwards."""
     before = {name: getattr(jax.config, name) for name in SETTINGS}
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
@@ -29,20 +29,18 @@ def own_cache(tmp_path_factory):
 
 @pytest.fixture
 def drawn(monkeypatch):
-    """The plans by which a turntable's frames are drawn, and how many programs had been compiled
-    after each.
+    """Return the plans by which a turntable's frames are drawn, and how many programs had been
+    compiled after each.
     """
-    compiled, seen = [], []
-    draw = _turntable.draw
+    compiled, seen, draw = [], [], _turntable.draw
 
-    def watched(scene, camera, plan):
-        frame = draw(scene, camera, plan)
+    def watched(scene, camera, plan, light):
+        frame = draw(scene, camera, plan, light)
         seen.append((plan, len(compiled)))
         return frame
 
     def listen(event, duration, **_):
-        if event == COMPILED:
-            compiled.append(duration)
+        compiled.extend([duration] if event == COMPILED else [])
 
     monkeypatch.setattr(_turntable, "draw", watched)
     jax.monitoring.register_event_duration_secs_listener(listen)

@@ -15,7 +15,8 @@ from splatjax.splatting import DenseRasterizer, ShadowSettings
 settings = sj.RenderSettings(
     shadows=ShadowSettings(resolution=32), rasterizer=DenseRasterizer(), diffuser=DenseDiffuser()
 )
-sj.plan, sj.render = partial(sj.plan, settings=settings), partial(sj.render, settings=settings)
+sj.make_plan = partial(sj.make_plan, settings=settings)
+sj.render = partial(sj.render, settings=settings)
 write_png = sj.write_png
 
 

@@ -1,4 +1,4 @@
-"""What the command line says of itself, and of words it does not know."""
+"""Help, versions, and words that the command line does not know."""
 
 import re
 from dataclasses import fields
@@ -11,59 +11,45 @@ from splatjax.cli import main
 from splatjax.cli._main import _COMMANDS
 
 
-def said(words: list[str], capsys: pytest.CaptureFixture[str], status: int = 0) -> str:
-    """Give what words make it say before it stops."""
-    with pytest.raises(SystemExit) as stopped:
-        main(words)
-    assert (stopped.value.code or 0) == status
-    printed = capsys.readouterr()
-    return printed.err if status else printed.out
-
-
-@pytest.fixture(autouse=True)
-def wide(monkeypatch):
-    """Give a terminal on which nothing needs to be broken."""
+@pytest.fixture
+def printed(monkeypatch, capsys):
+    """Return how to get what words print, in a terminal so wide that no line is broken."""
     monkeypatch.setenv("COLUMNS", "3000")
 
+    def run(*words, status=0):
+        with pytest.raises(SystemExit) as stopped:
+            main(words)
+        assert (stopped.value.code or 0) == status
+        captured = capsys.readouterr()
+        return captured.err if status else captured.out
 
-def test_help_lists_every_command_in_one_line_each(capsys):
-    listed = re.findall(r"• (\w+) +(.*?) *│? *\n", said(["--help"], capsys))
+    return run
+
+
+def test_help_lists_every_command_in_one_line_each(printed):
+    listed = re.findall(r"• (\w+) +(.*?) *│? *\n", printed("--help"))
     assert [name for name, _ in listed] == list(_COMMANDS)
     assert all(summary.endswith(".") and len(summary) < 100 for _, summary in listed)
-
-
-def test_no_words_at_all_are_a_call_for_help(capsys):
-    assert said([], capsys) == said(["--help"], capsys)
+    assert printed() == printed("--help")
 
 
 @pytest.mark.parametrize("command", _COMMANDS)
-def test_help_of_a_command_breaks_no_sentence(command, capsys):
-    printed = said([command, "--help"], capsys)
-    options = printed.partition("-h, --help")[2].splitlines()[1:]
-    told = [line.strip("│ ") for line in options if line[:2] in ("│ ", "  ") and line.strip("│ ")]
-    assert all(line[-1] in ".)" or (line.startswith("--") and "  " not in line) for line in told), (
-        told
-    )
-    assert len(told) >= len(fields(_COMMANDS[command])) - printed.count("positional arguments")
+def test_help_of_a_command_explains_every_option_in_whole_sentences(command, printed):
+    text = printed(command, "--help")
+    assert not [word for word in ("None", "STR", "{None}", "|FLOAT") if word in text]
+    lines = [line.strip("│ ") for line in text.partition("-h, --help")[2].splitlines()[1:]]
+    lines = [line for line in lines if line and line[0] not in "╭╰"]
+    broken = [line for line in lines if line[-1] not in ".)" and ("  " in line or line[:2] != "--")]
+    assert not broken
+    assert len(lines) >= len(fields(_COMMANDS[command])) - text.count("positional arguments")
 
 
-@pytest.mark.parametrize("command", _COMMANDS)
-def test_help_speaks_of_no_types_of_python(command, capsys):
-    printed = said([command, "--help"], capsys)
-    for word in ("None", "STR", "{None}", "|FLOAT"):
-        assert word not in printed
+def test_a_misspelt_word_is_named_with_what_would_be_right(printed):
+    text = printed("render", "--widht", "3", status=2)
+    assert "--widht" in text
+    assert text.count("--width") == 1  # of this command alone
+    assert all(command in printed("rendr", status=2) for command in _COMMANDS)
 
 
-def test_a_misspelt_option_is_compared_with_those_of_its_command_alone(capsys):
-    printed = said(["render", "--widht", "3"], capsys, status=2)
-    assert "--widht" in printed
-    assert printed.count("--width") == 1
-
-
-def test_a_misspelt_command_is_told_the_commands(capsys):
-    printed = said(["rendr"], capsys, status=2)
-    assert all(command in printed for command in _COMMANDS)
-
-
-def test_it_says_its_version(capsys):
-    assert said(["--version"], capsys) == f"splatjax {sj.__version__}, jax {jax.__version__}\n"
+def test_it_prints_its_version(printed):
+    assert printed("--version") == f"splatjax {sj.__version__}, jax {jax.__version__}\n"

@@ -12,101 +12,69 @@ from pathlib import Path
 import pytest
 from commands import ball
 
-from splatjax.cli import _processes
+from splatjax.cli._resumable import process_index_and_count
 
 pytestmark = pytest.mark.once
 
 SCRIPT = Path(__file__).parent / "one_process.py"
 FRAMES = 6
+OPTIONS = "--width 16 --height 16 --no-scattering --material marble --turn camera --frames"
 
 
-def started(command, count, **environment):
-    """Start a command in some processes, which find each other at this machine's own address; give
-    those that still run.
+def run_processes(command, count, **environment):
+    """Run a command in some processes, which find each other at this machine's own address; return
+    their statuses, and what they print on stdout and stderr.
     """
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{free.getsockname()[1]}"
-    common = (
-        os.environ
-        | {"PYTHONPATH": str(SCRIPT.parents[2]), "JAX_COORDINATOR_ADDRESS": address}
-        | environment
-    )
-    words = [sys.executable, str(SCRIPT), *map(str, command)]
-    return [
+    common = {"PYTHONPATH": str(SCRIPT.parents[2]), "JAX_COORDINATOR_ADDRESS": address}
+    numbers = [{"JAX_NUM_PROCESSES": str(count), "JAX_PROCESS_ID": str(i)} for i in range(count)]
+    pipe, words = subprocess.PIPE, [sys.executable, str(SCRIPT), *map(str, command)]
+    processes = [
         subprocess.Popen(
-            words,
-            env=common | {"JAX_NUM_PROCESSES": str(count), "JAX_PROCESS_ID": str(i)},
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
+            words, env=os.environ | common | environment | own, stdout=pipe, stderr=pipe, text=True
         )
-        for i in range(count)
+        for own in numbers
     ]
-
-
-def ended(processes):
-    """Wait for all; give their statuses and what they said."""
-    said = [process.communicate(timeout=300) for process in processes]
-    return [process.returncode for process in processes], said
+    printed = [process.communicate(timeout=300) for process in processes]
+    return [process.returncode for process in processes], *zip(*printed, strict=True)
 
 
 def contents(folder):
-    return {path.name: path.read_bytes() for path in folder.iterdir()}
+    return {path.name: path.read_bytes() for path in folder.iterdir() if path.name[0] != "."}
 
 
 def test_processes_share_a_turntable_and_one_that_is_killed_costs_no_finished_frame(tmp_path):
-    splats = ball(tmp_path / "ball.ply")
-
-    def command(folder):
-        size = (
-            "--width",
-            16,
-            "--height",
-            16,
-            "--no-scattering",
-            "--material",
-            "marble",
-            "--turn",
-            "camera",
-        )
-        return ["turntable", splats, *size, "--frames", FRAMES, "--output", tmp_path / folder]
-
-    statuses, said = ended(started(command("two"), 2))
-    assert statuses == [0, 0], said
-    whole = contents(tmp_path / "two")
+    splats, two, four = ball(tmp_path / "ball.ply"), tmp_path / "two", tmp_path / "four"
+    words = ["turntable", splats, *OPTIONS.split(), FRAMES, "--output"]
     names = {f"frame_{i:04}.{suffix}" for i in range(FRAMES) for suffix in ("exr", "png")}
+
+    statuses, out, err = run_processes([*words, two], 2)
+    assert statuses == [0, 0], err
+    whole = contents(two)
     assert whole.keys() == names | {"turntable.json", "turntable.webp"}
-    listed = [line for out, _ in said for line in out.splitlines()]
-    assert {Path(line).name for line in listed} == names | {"turntable.webp"}
+    printed = {Path(line).name for text in out for line in text.splitlines()}
+    assert printed == names | {"turntable.webp"}
 
-    statuses, said = ended(started(command("four"), 4, KILLED_BEFORE="frame_0001"))
-    assert statuses == [0, -signal.SIGKILL, 0, 0], said
-    left = contents(tmp_path / "four")
+    statuses, _, err = run_processes([*words, four], 4, KILLED_BEFORE="frame_0001")
+    assert statuses == [0, -signal.SIGKILL, 0, 0], err
     finished = {name for name in names if name[6:10] not in ("0001", "0005")}
-    assert finished | {"frame_0001.exr", "turntable.json"} == {
-        name for name in left if not name.startswith(".")
-    }
-    assert all(
-        "still at work" in error
-        for status, (_, error) in zip(statuses, said, strict=True)
-        if status == 0
-    )
-    statuses, said = ended(started(command("four"), 2))
-    assert statuses == [0, 0], said
-    assert f"4 of {FRAMES} frames are there already" in said[0][1]
-    assert contents(tmp_path / "four") == whole
+    assert contents(four).keys() == finished | {"frame_0001.exr", "turntable.json"}
+    assert ["still at work" in text for text in err] == [True, False, True, True]
+    statuses, _, err = run_processes([*words, four], 2)
+    assert statuses == [0, 0], err
+    assert f"4 of {FRAMES} frames" in err[0]
+    assert contents(four) == whole
 
 
-def test_every_item_is_one_process_share():
-    shares = [_processes.Share(i, 3).of(range(8)) for i in range(3)]
-    assert shares == [[0, 3, 6], [1, 4, 7], [2, 5]]
-
-
-def test_a_process_of_its_own_asks_nobody(monkeypatch):
+def test_one_process_waits_for_nobody(monkeypatch):
     for name in ("JAX_NUM_PROCESSES", "SLURM_STEP_NUM_TASKS", "OMPI_COMM_WORLD_SIZE"):
         monkeypatch.delenv(name, raising=False)
-    assert _processes.own_share() == _processes.Share(0, 1)
-    monkeypatch.setenv("JAX_NUM_PROCESSES", "many")
-    with pytest.raises(ValueError, match="JAX_NUM_PROCESSES is 'many'; it must be a whole number"):
-        _processes.own_share()
+    assert process_index_and_count() == (0, 1)
+    monkeypatch.setenv("JAX_NUM_PROCESSES", "1")
+    assert process_index_and_count() == (0, 1)
+    for wrong in ("many", "0"):
+        monkeypatch.setenv("JAX_NUM_PROCESSES", wrong)
+        with pytest.raises(ValueError, match=f"JAX_NUM_PROCESSES is '{wrong}'"):
+            process_index_and_count()

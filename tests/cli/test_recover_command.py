@@ -1,5 +1,5 @@
-"""`splatjax recover`: what it reads, hands over, says and writes. The search itself is tested where
-it is.
+"""`splatjax recover`: its inputs, options, messages and files. The search itself is tested where it
+is.
 """
 
 import jax.numpy as jnp
@@ -7,11 +7,10 @@ import numpy as np
 import OpenEXR
 import optimistix as optx
 import pytest
-from commands import failure, plate
+from commands import failure, plate, run
 from PIL import Image
 
 import splatjax as sj
-from splatjax.cli import main
 
 PICTURES = """[[pictures]]
 file = "one.exr"
@@ -22,42 +21,37 @@ kind = "directional"
 direction = [0, 0, -1]
 irradiance = 3
 """
-
-
-@pytest.fixture
-def files(tmp_path):
-    pixels = np.full((8, 8), 0.5, np.float32)
-    with OpenEXR.File(
-        {"type": OpenEXR.scanlineimage}, {"R": pixels, "G": pixels, "B": pixels}
-    ) as file:
-        file.write(str(tmp_path / "one.exr"))
-    pictures = tmp_path / "pictures.toml"
-    pictures.write_text(PICTURES.format(more=""))
-    return plate(tmp_path / "plate.ply"), pictures
-
-
 FOUND = (0.011, 0.022, 0.033)
 
 
 @pytest.fixture
-def search(monkeypatch):
-    """A search that finds the same whatever it sees; the first one may be interrupted, or end
-    before it has settled.
-    """
-    asked, interrupted = [], []
+def command(tmp_path):
+    pixels = np.full((8, 8), 0.5, np.float32)
+    with OpenEXR.File({"type": OpenEXR.scanlineimage}, dict.fromkeys("RGB", pixels)) as file:
+        file.write(str(tmp_path / "one.exr"))
+    (tmp_path / "pictures.toml").write_text(PICTURES.format(more=""))
+    files = plate(tmp_path / "plate.ply"), tmp_path / "pictures.toml"
+    return ["recover", *files, "--output", tmp_path / "mine.toml", "--no-suggest"]
 
-    def recover(observations, splats, starts, *, surface, model, count, loss, progress, throw):
-        assert not throw  # what it has not reached the command line says
-        asked.append((observations, splats, starts, model, count, loss))
+
+@pytest.fixture
+def search(monkeypatch):
+    """A search that finds the same for every input. Returns the arguments of its calls, and a list
+    of how the next ones end: interrupted, or before they have settled.
+    """
+    calls, ends = [], []
+
+    def recover(observations, splats, starts, *, surface, progress, throw, **options):
+        assert not throw  # the command line reports what was not reached
+        calls.append((observations, splats, starts, options))
         medium = sj.Medium(jnp.asarray(FOUND), starts[0].sigma_s_prime, starts[0].eta)
         progress("rendering", starts[0])
         progress("round 1", medium)
-        ended = interrupted.pop() if interrupted else optx.RESULTS.successful
+        ended = ends.pop() if ends else optx.RESULTS.successful
         if isinstance(ended, BaseException):
             raise ended
-        seen = np.where(
-            np.arange(64).reshape(8, 8, 1) < 40, np.asarray(observations[0].picture, float), np.nan
-        )
+        seen = np.array(observations[0].picture, float)
+        seen[5:] = np.nan
         return sj.Recovery(
             medium=medium,
             material=surface,
@@ -77,29 +71,16 @@ def search(monkeypatch):
         )
 
     monkeypatch.setattr(sj, "recover", recover)
-    return asked, interrupted
+    return calls, ends
 
 
-def test_it_writes_a_material_and_a_report_and_says_what_is_not_fixed(
-    files, search, tmp_path, capsys
+def test_it_writes_a_material_and_a_report_with_what_is_not_fixed(
+    command, search, tmp_path, capsys
 ):
     output, report = tmp_path / "mine.toml", tmp_path / "mine.png"
-    command = [
-        "recover",
-        *files,
-        "--start",
-        "skin1",
-        "marble",
-        "--output",
-        output,
-        "--report",
-        report,
-        "--robust",
-        "--no-suggest",
-    ]
-    assert main([str(word) for word in command]) == 0
+    assert run(*command, "--start", "skin1", "marble", "--report", report, "--robust") == 0
     printed = capsys.readouterr().out
-    assert "red: sigma_a 0.011 +- 1%, sigma_s' 0.74 +- 1% (1/mm)" in printed
+    assert "red: sigma_a 0.011 +- 1%, sigma_s' 0.74 +- 1%" in printed
     assert "not fixed by these pictures: sigma_s', known to 100%" in printed
     assert printed.splitlines()[-2:] == [str(output), str(report)]
     with Image.open(report) as picture:
@@ -107,89 +88,51 @@ def test_it_writes_a_material_and_a_report_and_says_what_is_not_fixed(
     np.testing.assert_allclose(sj.load_medium(output).sigma_a, FOUND, rtol=1e-6)
     assert "recovered by splatjax" in output.read_text()
     assert not list(tmp_path.glob("*.json"))
-    ((observations, splats, starts, model, count, loss),) = search[0]
+    ((observations, splats, starts, options),) = search[0]
     assert observations[0].picture.shape == (8, 8, 3)
     assert splats.albedo is None
     np.testing.assert_allclose(starts[1].sigma_a, sj.load_medium("marble").sigma_a, rtol=1e-6)
-    np.testing.assert_array_equal(starts[1].eta, starts[0].eta)  # one index, that of the first
-    assert (model, count) == (sj.Dipole, 6)
-    assert isinstance(loss, sj.HuberLoss)
+    assert (options["model"], options["count"]) == (sj.Dipole, 6)
+    assert isinstance(options["loss"], sj.HuberLoss)
 
 
-def test_the_index_of_refraction_is_that_of_the_first_start_or_the_one_given(
-    files, search, tmp_path
+@pytest.mark.parametrize(("more", "eta"), [([], 1.5), (["--eta", 1.42], 1.42)])
+def test_the_index_of_refraction_is_of_the_first_start_or_the_one_given(
+    more, eta, command, search, tmp_path
 ):
-    command = [
-        "recover",
-        *files,
-        "--start",
-        "marble",
-        "skin1",
-        "--output",
-        tmp_path / "mine.toml",
-        "--no-suggest",
-    ]
-    for more, eta in (([], 1.5), (["--eta", "1.42"], 1.42)):
-        assert main([str(word) for word in (*command, *more)]) == 0
-        for start in search[0][-1][2]:
-            np.testing.assert_allclose(start.eta, 3 * [eta], rtol=1e-6)
-        assert sj.load_material(tmp_path / "mine.toml").eta == pytest.approx(eta)
+    assert run(*command, "--start", "marble", "skin1", *more) == 0
+    for start in search[0][0][2]:
+        np.testing.assert_allclose(start.eta, 3 * [eta], rtol=1e-6)
+    assert sj.load_material(tmp_path / "mine.toml").eta == pytest.approx(eta)
 
 
-def test_interrupted_it_goes_on_where_it_was(files, search, tmp_path, capsys):
-    asked, interrupted = search
-    interrupted.append(KeyboardInterrupt())
-    command = [
-        str(word)
-        for word in ("recover", *files, "--output", tmp_path / "mine.toml", "--no-suggest")
-    ]
-    assert main(command) == 130
-    assert (tmp_path / "mine.search.json").exists()
-    assert not (tmp_path / "mine.toml").exists()
-    interrupted.append(KeyboardInterrupt())
-    assert main(command) == 130
-    assert len(asked[0][2]) == 2
-    (start,) = asked[1][2]
-    np.testing.assert_allclose(start.sigma_a, FOUND)
-    files[1].write_text(PICTURES.format(more="noise = 0.01"))
-    capsys.readouterr()
-    assert main(command) == 0
-    assert "is of another search, and is not used" in capsys.readouterr().err
-    assert len(asked[2][2]) == 2
-    assert not (tmp_path / "mine.search.json").exists()
+def test_interrupted_or_unsettled_it_continues_where_it_was(command, search, tmp_path, capsys):
+    calls, ends = search
+    output, record = tmp_path / "mine.toml", tmp_path / "mine.search.json"
+    ends += [optx.RESULTS.nonlinear_max_steps_reached, KeyboardInterrupt()]
+    for number, status in enumerate((130, 2)):
+        assert run(*command) == status
+        assert record.exists()
+        assert not output.exists()
+        assert len(calls[number][2]) == 2 - number
+    assert "pictures.toml" in capsys.readouterr().err.splitlines()[-1]
+    np.testing.assert_allclose(calls[1][2][0].sigma_a, FOUND)
+    (tmp_path / "pictures.toml").write_text(PICTURES.format(more="noise = 0.01"))
+    assert run(*command) == 0
+    assert str(record) in capsys.readouterr().err  # of another search
+    assert len(calls[2][2]) == 2
+    assert not record.exists()
 
 
-def test_what_cannot_be_is_said_in_one_line(files, search, tmp_path, capsys):
-    output = tmp_path / "mine.toml"
-    command = ["recover", *files, "--output", output]
-    assert "--model monte-carlo cannot be searched; take dipole" in failure(
-        [*command, "--model", "monte-carlo"], capsys, [output]
-    )
-    assert "must end in .toml" in failure(
-        ["recover", *files, "--output", tmp_path / "mine.exr"], capsys
-    )
-    assert "--eta is 0.9; it must lie between 1 and 3" in failure(
-        [*command, "--eta", "0.9"], capsys, [output]
-    )
-    assert "has no [medium]" in failure([*command, "--start", "skin"], capsys, [output])
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (["--output", "mine.exr"], "mine.exr"),
+        (["--eta", 0.9], "--eta is 0.9"),
+        (["--start", "skin"], "[medium]"),
+    ],
+)
+def test_options_are_checked_before_the_search(words, named, command, search, tmp_path, capsys):
+    assert named in failure([*command, *words], capsys)
     assert not search[0]
-
-
-def test_a_search_that_does_not_settle_says_so_and_is_taken_up_again(
-    files, search, tmp_path, capsys
-):
-    search[1].append(optx.RESULTS.nonlinear_max_steps_reached)
-    command = [
-        str(word)
-        for word in ("recover", *files, "--output", tmp_path / "mine.toml", "--no-suggest")
-    ]
-    assert main(command) == 2
-    said = capsys.readouterr().err.splitlines()[-1]
-    assert (
-        f"{files[1]}: the search did not settle in 1 round and 5 steps; the same command goes on "
-        "where it stopped" in said
-    )
-    assert (tmp_path / "mine.search.json").exists()
     assert not (tmp_path / "mine.toml").exists()
-    assert main(command) == 0
-    np.testing.assert_allclose(search[0][1][2][0].sigma_a, FOUND)

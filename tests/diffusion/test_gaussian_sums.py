@@ -1,125 +1,74 @@
-"""Sums over blocks of sources against plain sums; orders and lists that they rest on."""
+"""Sums over blocks of sources against plain sums; the orders and lists of blocks they rest on."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from splatjax.diffusion import BLOCK, _neighbors, compact_order
 from splatjax.diffusion._gaussian_sums import (
-    Steps,
-    as_they_are,
-    faded,
     gaussian_sums,
     gaussian_sums_forward,
+    identity,
+    points_blocks,
     source_table,
-    tapered,
 )
-from splatjax.diffusion._neighbors import Boxes, Neighbors
-from splatjax.diffusion._order import BLOCK, compact_order
+from splatjax.diffusion._kernel import TruncatedGaussian
+from splatjax.diffusion._neighbors import SOURCES, Boxes, Neighbors, find_neighbors
 
-SOURCES, ROWS, POINTS, SLOTS = 96, 3, 16, 2
+COUNT, REACH = 26 * BLOCK, 1.5
 
 
-def total_and_square(sums, points):
+def squares_and_products(sums, points):
     """A finish that mixes rows and needs the points."""
     return jnp.stack([sums[0] * points[1] + sums[2], sums[1] ** 2])
 
 
-def problem(dtype):
-    rng = np.random.default_rng(4)
-    centers = jnp.asarray(rng.uniform(-3, 3, (3, SOURCES)), dtype)
-    rates = jnp.asarray(rng.uniform(0.3, 1.2, SOURCES), dtype)
-    rows = jnp.asarray(rng.normal(size=(ROWS, SOURCES)), dtype)
-    points = jnp.asarray(rng.uniform(-3, 3, (5, 3, POINTS)), dtype)
-    return centers, rates, rows, points
+def blocks_in_space(count=COUNT):
+    centers = np.random.default_rng(3).uniform(-6, 6, (count, 3))
+    return jnp.asarray(centers[compact_order(centers)].T, float)
 
 
-def plain(points, centers, rates, rows, kernel, finish):
-    def block(x):
-        offset = x[:, None] - centers[:, :, None]
-        return finish(rows @ kernel(rates[:, None] * jnp.sum(offset * offset, axis=0))[0], x)
-
-    return jax.vmap(block)(points)
-
-
-def all_meet(blocks: int, points_blocks: int) -> Steps:
-    """Lists of everything, in two sweeps of three lanes; the last lane has no points of its own."""
-    lanes, steps = 3, -(-blocks // SLOTS)
-    ids = np.full((2 * steps, lanes, SLOTS), blocks, np.int32)
-    ids.reshape(2, steps, lanes, SLOTS)[:] = np.pad(
-        np.arange(blocks), (0, -blocks % SLOTS), constant_values=blocks
-    ).reshape(1, steps, 1, SLOTS)
-    order = np.asarray([4, 0, 2, 1, 3, 5], np.int32)
-    assert points_blocks == 5
-    return Steps(
-        jnp.asarray(ids),
-        jnp.asarray([0, steps], jnp.int32),
-        jnp.asarray([steps, 2 * steps], jnp.int32),
-        jnp.asarray(order),
+@pytest.mark.parametrize("finish", [identity, squares_and_products])
+def test_values_and_derivatives_are_those_of_plain_sums(float64, finish):
+    """Reverse mode in everything, forward mode in the sources; lanes without points included."""
+    rng, kernel = np.random.default_rng(4), TruncatedGaussian(4.0)
+    points, centers = blocks_in_space(5 * BLOCK), blocks_in_space(3 * BLOCK)
+    rates = jnp.asarray(rng.uniform(0.3, 1.2, 3 * BLOCK))
+    rows = jnp.asarray(rng.normal(size=(3, 3 * BLOCK)))
+    boxes = (
+        Boxes.around(each, jnp.ones(each.shape[1], bool), n)
+        for each, n in ((points, BLOCK), (centers, SOURCES))
     )
+    steps = find_neighbors(*boxes, (4.0 / 0.3) ** 0.5)
 
+    def ours(points, *sources, sums=gaussian_sums):
+        blocks = points_blocks(points, steps, BLOCK)
+        found = sums(blocks, source_table(*sources, SOURCES), steps, kernel, finish)
+        return found[:5].transpose(1, 0, 2).reshape(found.shape[1], -1)
 
-@pytest.mark.parametrize("finish", [as_they_are, total_and_square])
-@pytest.mark.parametrize("kernel", [faded(4.0), tapered(2.0)], ids=["faded", "tapered"])
-def test_values_and_gradients_are_those_of_plain_sums(float64, kernel, finish):
-    with jax.enable_x64(True):
-        centers, rates, rows, points = problem(jnp.float64)
-        steps = all_meet(SOURCES // 16, 5)
-        padded = jnp.pad(points, ((0, 1), (0, 0), (0, 0)), constant_values=-1e6)
+    def plain(points, centers, rates, rows):
+        offset = points[:, None] - centers[:, :, None]
+        weights, _ = kernel(rates[:, None] * jnp.sum(offset * offset, axis=0))
+        return finish(rows @ weights, points)
 
-        def ours(points, centers, rates, rows, sums=gaussian_sums):
-            return sums(points, source_table(centers, rates, rows, 16), steps, kernel, finish)[:5]
-
-        def theirs(*given):
-            return plain(*given, kernel, finish)
-
-        expected, pull = jax.vjp(theirs, points, centers, rates, rows)
-        found, push = jax.vjp(
-            lambda points, *rest: ours(jnp.concatenate([points, padded[5:]]), *rest),
-            points,
-            centers,
-            rates,
-            rows,
-        )
-        cotangent = jnp.asarray(np.random.default_rng(6).normal(size=expected.shape))
-        assert float(jnp.max(jnp.abs(expected))) > 0.5
-        np.testing.assert_allclose(found, expected, atol=1e-12)
-        for a, b in zip(push(cotangent), pull(cotangent), strict=True):
-            np.testing.assert_allclose(a, b, atol=1e-11 * float(jnp.max(jnp.abs(b))))
-        rng = np.random.default_rng(7)
-        moved = [jnp.asarray(rng.normal(size=each.shape)) for each in (centers, rates, rows)]
-        _, slope = jax.jvp(
-            lambda *rest: ours(padded, *rest, sums=gaussian_sums_forward),
-            (centers, rates, rows),
-            tuple(moved),
-        )
-        _, expected = jax.jvp(
-            lambda *rest: theirs(points, *rest), (centers, rates, rows), tuple(moved)
-        )
-        np.testing.assert_allclose(slope, expected, atol=1e-11 * float(jnp.max(jnp.abs(expected))))
-
-
-@pytest.mark.parametrize("kernel", [faded(3.0), tapered(3.0)], ids=["faded", "tapered"])
-def test_kernels_come_down_to_zero_without_a_step(kernel, float64):
-    exponents = jnp.linspace(0, 6, 60_001)
-    weight, fall = kernel(exponents)
-    assert float(weight[0]) > 0.9
-    assert np.all(np.asarray(weight)[exponents >= 4.5] == 0)
-    assert np.all(np.diff(np.asarray(weight)) <= 0)
-    rise = (
-        np.cumsum((np.asarray(fall)[1:] + np.asarray(fall)[:-1]) / 2) * 1e-4
-    )  # what its derivative says it falls by
-    np.testing.assert_allclose(weight[0] - weight[1:], rise, atol=1e-5)
-
-
-def test_a_taper_comes_down_with_its_derivative():
-    _, fall = tapered(3.0)(jnp.asarray([4.5 * (1 - 1e-5), 4.6]))
-    assert np.all(np.abs(np.asarray(fall)) < 1e-5)
+    given = points, centers, rates, rows
+    (found, push), (expected, pull) = (jax.vjp(each, *given) for each in (ours, plain))
+    assert float(jnp.max(jnp.abs(expected))) > 0.5
+    np.testing.assert_allclose(found, expected, atol=1e-12)
+    cotangent = jnp.asarray(rng.normal(size=expected.shape))
+    for a, b in zip(push(cotangent), pull(cotangent), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-11 * float(jnp.max(jnp.abs(b))))
+    ways = tuple(jnp.asarray(rng.normal(size=each.shape)) for each in given[1:])
+    (_, a), (_, b) = (
+        jax.jvp(lambda *sources, each=each: each(points, *sources), given[1:], ways)
+        for each in (lambda *g: ours(*g, sums=gaussian_sums_forward), plain)
+    )
+    np.testing.assert_allclose(a, b, atol=1e-11 * float(jnp.max(jnp.abs(b))))
 
 
 def test_blocks_of_a_compact_order_are_small():
-    rng = np.random.default_rng(1)
-    points = rng.normal(size=(4000, 3))
+    points = np.random.default_rng(1).normal(size=(4000, 3))
     points /= np.linalg.norm(points, axis=1, keepdims=True)
     order = compact_order(points)
     np.testing.assert_array_equal(np.sort(order), np.arange(4000))
@@ -131,29 +80,35 @@ def test_blocks_of_a_compact_order_are_small():
         assert np.max(extent) < 5 * even
 
 
-def test_neighbors_are_all_blocks_within_reach_and_moving_too_far_is_told(float32):
-    rng = np.random.default_rng(2)
-    centers = rng.uniform(-5, 5, (640, 3))
-    centers = jnp.asarray(centers[compact_order(centers)].T, jnp.float32)
-    there = jnp.arange(640) < 600
-    points, sources = Boxes.around(centers, there, BLOCK), Boxes.around(centers, there, 16)
-    reach = 2.0
-    found = Neighbors.find(points, sources, reach, 4, SLOTS)
-    listed = [set() for _ in range(12)]
-    for sweep, (begin, end) in enumerate(
-        zip(found.steps.begins.tolist(), found.steps.ends.tolist(), strict=True)
-    ):
-        for lane in range(4):
-            listed[sweep * 4 + lane] = set(
-                np.asarray(found.steps.ids)[begin:end, lane].ravel().tolist()
-            ) - {40}
-    apart = np.linalg.norm(np.asarray(centers)[:, :, None] - np.asarray(centers)[:, None], axis=0)
-    for block in range(10):
-        rows = np.arange(block * BLOCK, min((block + 1) * BLOCK, 600))
-        near = {int(j) // 16 for j in np.flatnonzero(np.min(apart[rows], axis=0)[:600] <= reach)}
-        assert near <= listed[block]
-        assert len(listed[block]) < 40
-    assert float(found.needed(points, sources, jnp.asarray(reach, jnp.float32))) <= 1 + 1e-6
-    moved = Boxes.around(centers + 0.2, there, BLOCK)
-    assert float(found.needed(moved, sources, jnp.asarray(1.5, jnp.float32))) <= 1
-    assert float(found.needed(moved, sources, jnp.asarray(1.8, jnp.float32))) > 1
+@pytest.mark.parametrize("at_once", [1 << 20, 40])
+def test_neighbors_are_the_boxes_within_reach_each_once(at_once, monkeypatch):
+    """Also where few boxes are tested at one go."""
+    monkeypatch.setattr(_neighbors, "_AT_ONCE", at_once)
+    centers, exists = blocks_in_space(), jnp.arange(COUNT) < COUNT - BLOCK // 2
+    points, sources = (Boxes.around(centers, exists, size) for size in (BLOCK, SOURCES))
+    gaps = jnp.maximum(points.low[:, None] - sources.high, sources.low - points.high[:, None])
+    expected = np.sum(np.maximum(gaps, 0) ** 2, axis=2) <= REACH**2
+    steps = jax.tree.map(np.asarray, find_neighbors(points, sources, REACH))
+    blocks, none = expected.shape
+    lanes = steps.ids.shape[1]
+    assert set(range(blocks)) <= set(steps.order.tolist())
+    for place, block in enumerate(steps.order):
+        sweep, lane = divmod(place, lanes)
+        row = steps.ids[steps.begins[sweep] : steps.ends[sweep], lane].reshape(-1)
+        near = np.flatnonzero(expected[block]) if block < blocks else []
+        np.testing.assert_array_equal(np.sort(row[row < none]), near)
+
+
+def test_what_has_moved_needs_as_much_more_reach():
+    centers, exists = blocks_in_space(2 * BLOCK), jnp.arange(2 * BLOCK) < 3 * BLOCK // 2
+
+    def around(points):
+        return Boxes.around(points, exists, BLOCK // 2)
+
+    boxes, reach = around(centers), jnp.asarray(REACH)
+    planned = Neighbors(find_neighbors(boxes, boxes, REACH), boxes, boxes, reach)
+    shift = jnp.asarray([[0.1], [-0.03], [0.07]])
+    for of_points, of_sources, moved in ((0.0, 0.0, 0.0), (1.0, 0.0, 0.1), (1.0, -2.0, 0.3)):
+        ends = around(centers + of_points * shift), around(centers + of_sources * shift)
+        needed = planned.needed(*ends, 0.8 * reach)
+        np.testing.assert_allclose(needed, 0.8 + 3**0.5 * moved / REACH, rtol=1e-5)

@@ -85,7 +85,7 @@ def devices() -> dict:
             "jax": alone,
             "splatjax": sj,
             "scene": made,
-            "plan": sj.plan(made, names["camera"]),
+            "plan": sj.make_plan(made, names["camera"]),
             "cameras": cameras,
         }
     )
@@ -95,6 +95,6 @@ CONTEXTS = {
     "docs/devices.md": devices,
     "docs/gradients.md": scene,
     "docs/figures.md": scene,
-    "docs/rivals.md": scene,
+    "docs/baselines.md": scene,
     "docs/recovery.md": pictures,
 }

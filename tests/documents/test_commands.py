@@ -18,7 +18,6 @@ SMALL = {
     "render": ["--width", "32", "--height", "32"],
     "turntable": ["--width", "32", "--height", "32", "--frames", "2"],
     "sample": ["--count", "1500"],
-    "figure": ["--width", "40"],
     "recover": ["--count", "3", "--no-suggest"],
 }
 """Options that make a command quick; the last one given counts."""
@@ -120,9 +119,7 @@ def test_the_commands_of_a_page_run_one_after_the_other(page, tmp_path, monkeypa
         if not command.startswith("splatjax") or given[0].startswith("-") or "--help" in given:
             continue
         small = SMALL.get(given[0], [])
-        if given[0] in ("render", "turntable", "figure") and not any(
-            word.endswith(".ply") for word in given
-        ):
+        if given[0] in ("render", "turntable") and not any(word.endswith(".ply") for word in given):
             small = [*small, "--count", "1500"]
         if "--photons" in given or "monte-carlo" in given:
             small = [*small, "--photons", "20000", "--count", "3"]

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from splatjax.fitting import (
+    FixedTotalReflectance,
     FreeWeights,
     SharedVariances,
-    TotalReflectanceHeld,
     VariancesPerChannel,
     fit_gaussians,
 )
@@ -45,7 +45,7 @@ def fit(point, spread, weights):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("spread", "weights"),
-    [(SharedVariances(), TotalReflectanceHeld()), (VariancesPerChannel(), FreeWeights())],
+    [(SharedVariances(), FixedTotalReflectance()), (VariancesPerChannel(), FreeWeights())],
 )
 def test_derivative_of_a_fit_is_that_of_refits(float64, spread, weights):
     run = eqx.filter_jit(fit)
@@ -64,8 +64,8 @@ def test_reverse_mode_through_a_slab_gives_the_derivative_of_refits(float64):
     @jax.jit
     def run(point):
         *coefficients, thickness = jnp.exp(point)
-        slab = Multipole(Layer(Medium(*(each[None] for each in coefficients)), thickness))
-        gaussians = fit_gaussians(slab, 3, weights=TotalReflectanceHeld(), throw=False).gaussians
+        slab = Multipole(Layer(Medium(*coefficients), thickness))
+        gaussians = fit_gaussians(slab, 3, weights=FixedTotalReflectance(), throw=False).gaussians
         return jnp.sum(jnp.sin(jnp.log(gaussians.variances))) + jnp.sum(
             gaussians.weights[:, 0] * jnp.arange(1.0, 4.0)
         )
@@ -82,7 +82,7 @@ def test_without_absorption_the_derivative_is_finite_and_the_limit(float64):
     """Of a free fit: its profile has a derivative there, other than its total."""
 
     def widest(sigma_a):
-        medium = Medium(sigma_a[None], jnp.ones(1), jnp.full(1, 1.3))
+        medium = Medium(sigma_a, 1.0, 1.3)
         return fit_gaussians(Dipole(medium), 2, throw=False).gaussians.variances[-1]
 
     slope = jax.jit(jax.grad(widest))
@@ -107,7 +107,7 @@ def test_where_the_fit_is_perfect_the_derivative_is_the_identity(float64):
 @pytest.mark.slow
 def test_float32_gives_the_same_derivatives(float64):
     def narrowest(sigma_a, dtype):
-        medium = Medium(sigma_a[None], jnp.ones(1, dtype), jnp.full(1, 1.3, dtype))
+        medium = Medium(sigma_a[None], 1.0, 1.3)
         return fit_gaussians(Dipole(medium), 3).gaussians.variances[0]
 
     slopes = [

@@ -7,7 +7,7 @@ import numpy as np
 import splatjax as sj
 from splatjax.inverse import wide_variances
 
-HELD = sj.NonNegativeWeights(sj.TotalReflectanceHeld())
+HELD = sj.NonNegativeWeights(sj.FixedTotalReflectance())
 
 
 def medium(sigma_a=(0.02, 0.2), sigma_s_prime=(1.0, 0.7)):

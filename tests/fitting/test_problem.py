@@ -5,14 +5,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.optimize import least_squares
 
 from splatjax.fitting import (
+    FixedTotalReflectance,
     FreeWeights,
     LeastCount,
     NonNegativeWeights,
-    TotalReflectanceHeld,
-    VariancesPerChannel,
     error_by_count,
     fit_gaussians,
     relative_error,
@@ -20,7 +18,7 @@ from splatjax.fitting import (
 from splatjax.fitting._problem import make_problem
 from splatjax.gaussians import SumOfGaussians
 from splatjax.io import load_medium
-from splatjax.scattering import NORM_RULE, Dipole, Medium
+from splatjax.scattering import L2_QUADRATURE, Dipole
 
 EXACT = 1e-12
 POINT = jnp.asarray([-3.2, -1.9, 0.1, 2.2])
@@ -32,11 +30,11 @@ def marble() -> Dipole:
 
 
 @pytest.mark.parametrize(
-    "weights", [FreeWeights(), TotalReflectanceHeld(), NonNegativeWeights(TotalReflectanceHeld())]
+    "weights", [FreeWeights(), FixedTotalReflectance(), NonNegativeWeights(FixedTotalReflectance())]
 )
 @pytest.mark.parametrize("active", [None, (True, True, True, False)])
 def test_the_expansion_is_that_of_automatic_differentiation(float64, weights, active):
-    problem = make_problem(marble(), weights, NORM_RULE)
+    problem = make_problem(marble(), weights, L2_QUADRATURE)
     active = None if active is None else jnp.asarray(active)
     point = POINT.astype(float)
 
@@ -61,8 +59,6 @@ def test_the_expansion_is_that_of_automatic_differentiation(float64, weights, ac
     ):
         assert np.max(np.abs(automatic)) > 0
         np.testing.assert_allclose(closed, automatic, atol=EXACT * float(np.max(np.abs(automatic))))
-    if active is None:
-        np.testing.assert_allclose(problem.gradient(point), gradient, atol=EXACT)
 
 
 def test_covariance_is_that_of_a_fit_of_all_parameters(float64):
@@ -71,7 +67,7 @@ def test_covariance_is_that_of_a_fit_of_all_parameters(float64):
     """
     profile = marble()
     fitted = fit_gaussians(profile, 3)
-    problem = make_problem(profile, FreeWeights(), NORM_RULE)
+    problem = make_problem(profile, FreeWeights(), L2_QUADRATURE)
     r = jnp.sqrt(problem.squared_radii)
 
     def residuals(parameters):
@@ -89,7 +85,7 @@ def test_covariance_is_that_of_a_fit_of_all_parameters(float64):
 
 
 def test_held_weights_do_not_vary_together(float64):
-    fitted = fit_gaussians(marble(), 2, weights=TotalReflectanceHeld())
+    fitted = fit_gaussians(marble(), 2, weights=FixedTotalReflectance())
     weights = np.asarray(fitted.covariance)[2:, 2:]
     of_sum = weights[:2, :2].sum()
     assert abs(of_sum) < 1e-12 * np.trace(weights)
@@ -98,9 +94,9 @@ def test_held_weights_do_not_vary_together(float64):
 
 def test_the_variance_of_a_gaussian_without_weight_is_anything(float64):
     one = SumOfGaussians(jnp.asarray([1.0]), jnp.asarray([[0.5]]))
-    problem = make_problem(one, NonNegativeWeights(), NORM_RULE)
+    problem = make_problem(one, NonNegativeWeights(), L2_QUADRATURE)
     # Next to the truth: what the second Gaussian would add is negative.
-    covariance = problem.outcome(jnp.log(jnp.asarray([0.9, 0.4]))).covariance
+    _, _, covariance = problem.outcome(jnp.log(jnp.asarray([0.9, 0.4])))
     assert np.isinf(covariance[1, 1])
     assert np.all(np.isfinite(np.delete(np.diag(covariance), 1)))
 
@@ -135,31 +131,3 @@ def test_the_least_count_that_reaches_an_error(float64):
         ValueError, match="largest must be a whole number of Gaussians, at least 1; got 0"
     ):
         error_by_count(marble(), 0)
-
-
-def test_media_in_no_table_are_fitted_as_well_as_from_many_starts(float64):
-    """Random reduced albedo and index; MINPACK from twelve random starts each."""
-    noise = np.random.default_rng(1)
-    absorbed = 10 ** noise.uniform(-4, -0.1, 6)
-    profile = Dipole(
-        Medium(*(jnp.asarray(each) for each in (absorbed, 1 - absorbed, noise.uniform(1, 1.8, 6))))
-    )
-    problems = VariancesPerChannel().problem(profile, FreeWeights(), NORM_RULE)
-    expand = eqx.filter_jit(lambda problem, point: problem.expand(point))
-    best = []
-    for channel in range(6):
-        problem = jax.tree.map(lambda leaf, channel=channel: leaf[channel], problems)
-        errors = []
-        for _ in range(12):
-            start = np.sort(noise.uniform(-5, 4, 6))
-            found = least_squares(
-                lambda point, problem=problem: np.asarray(expand(problem, point).residuals[0]),
-                start,
-                jac=lambda point, problem=problem: np.asarray(expand(problem, point).jacobian[0]),
-                method="lm",
-            )
-            errors.append(np.sqrt(2 * found.cost))
-        best.append(min(errors))
-    found = fit_gaussians(profile, 6, spread=VariancesPerChannel()).error
-    print("error over the best of twelve starts:", np.asarray(found) / best)
-    assert np.max(np.asarray(found) / best) < BEST_OF_STARTS

@@ -22,7 +22,7 @@ def write_evidence(title: str, world: World, name: str, way: jax.Array, step: fl
     **Returns:** the path of a PNG; derivatives are red where positive, blue where negative, all in
     one scale.
     """
-    plan = sj.plan(world.scene, world.camera, PLAIN)
+    plan = sj.make_plan(world.scene, world.camera, PLAIN)
 
     @jax.jit
     def beauty(leaf):

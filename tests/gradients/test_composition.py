@@ -26,7 +26,7 @@ def graph(path: str):
     other = sj.Camera.look_at(
         jnp.asarray([2.0, -4.0, 41.0]), jnp.zeros(3), fov=32.0, width=20, height=20
     )
-    plan = sj.plan(world.scene, [world.camera, other], settings)
+    plan = sj.make_plan(world.scene, [world.camera, other], settings)
 
     def parts(scene):
         return scene.material.gaussians.weights, scene.lights[1].origin

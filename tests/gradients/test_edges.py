@@ -57,7 +57,7 @@ def rendered():
     settings = (
         FAST  # what it is compared with elsewhere, the plain path, gives the same digits here
     )
-    plan = sj.plan(scene, camera, settings)
+    plan = sj.make_plan(scene, camera, settings)
     of_sheet = np.arange(scene.splats.count) < sheet
     ways = [
         jnp.asarray(which[:, None] * np.asarray([1.0, 0.3, 0.0])) for which in (~of_sheet, of_sheet)

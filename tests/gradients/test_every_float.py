@@ -49,7 +49,7 @@ def rendered(world: str, path: str, precision=jnp.float64):
     """
     start, settings = WORLDS[world].make(), WORLDS[world].paths[path]
     start = jax.tree.map(lambda leaf: leaf.astype(precision), start)
-    plan = sj.plan(start.scene, start.camera, settings)
+    plan = sj.make_plan(start.scene, start.camera, settings)
 
     @jax.jit
     def loss_and_gradient(world: World):
@@ -136,7 +136,7 @@ def test_float32_gradients_are_those_of_float64(path):
 def test_forward_mode_of_the_plain_path_is_its_reverse_mode():
     with jax.enable_x64(True):
         start, gradient, _ = rendered("sun and beam", "plain")
-        plan = sj.plan(start.scene, start.camera, PLAIN)
+        plan = sj.make_plan(start.scene, start.camera, PLAIN)
         rng = np.random.default_rng(21)
         tangent = jax.tree.map(lambda leaf: jnp.asarray(rng.normal(size=leaf.shape)), start)
 

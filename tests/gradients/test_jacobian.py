@@ -13,7 +13,7 @@ import pytest
 from worlds import FAST, PLAIN, view
 
 import splatjax as sj
-from splatjax.diffusion import DiffusionSettings, PlainMean
+from splatjax.diffusion import PlainMean
 
 pytestmark = [pytest.mark.slow, pytest.mark.once]
 
@@ -22,9 +22,7 @@ ROW_BY_ROW = 1e-5  # asked; 1e-12 measured
 
 
 def scene(single: bool) -> sj.Scene:
-    """A bumpy ball with albedo; a layer handed over, one of splats, one of clusters, through
-    nodes.
-    """
+    """A bumpy ball with albedo; an unresolved layer, one of splats, and one of clusters."""
     body = bodies.bumpy(300)
     albedo = jnp.asarray(np.random.default_rng(12).uniform(0.2, 0.9, (body.count, 2)))
     splats = sj.Splats(body.centers, body.normals, body.radii, body.areas, albedo)
@@ -51,7 +49,7 @@ CASES = {"fast": (FAST, True), "plain": (PLAIN, False)}
 def rendered(case: str):
     settings, single = CASES[case]
     start, camera = scene(single), view(*CAMERA)
-    plan = sj.plan(start, camera, settings)
+    plan = sj.make_plan(start, camera, settings)
 
     def beauty(gaussians):
         return sj.render(
@@ -99,7 +97,7 @@ def test_single_scattering_leaves_less_to_the_gaussians_where_light_grazes():
     """
     with jax.enable_x64(True):
         start, _, _, jacobian = rendered("fast")
-        left = start.material.left_to_diffuse(jnp.asarray([0.05]))
+        left = start.material.diffuse_fraction(jnp.asarray([0.05]))
     assert np.min(np.asarray(left)) < 0.97
     assert np.min(np.asarray(jacobian.weights)) < 0
 
@@ -145,7 +143,7 @@ def test_through_the_fit_it_is_the_derivative_in_the_coefficients():
         }
         start, camera = scene(False), view(*CAMERA)
         start = eqx.tree_at(lambda s: s.material.gaussians, start, gaussians_of(coefficients))
-        plan = sj.plan(start, camera, PLAIN)
+        plan = sj.make_plan(start, camera, PLAIN)
 
         def beauty(coefficients):
             moved = eqx.tree_at(lambda s: s.material.gaussians, start, gaussians_of(coefficients))
@@ -175,7 +173,7 @@ def test_with_the_plain_mean_the_layers_are_the_derivative_in_the_weights():
     settings = sj.RenderSettings(
         rasterizer=PLAIN.rasterizer,
         diffuser=PLAIN.diffuser,
-        diffusion=DiffusionSettings(normalization=PlainMean()),
+        kernel=PlainMean(),
     )
     with jax.enable_x64(True):
         jacobian = sj.picture_jacobian(scene(False), view(*CAMERA), settings)

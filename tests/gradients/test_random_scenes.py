@@ -21,18 +21,14 @@ from hypothesis.extra.numpy import arrays
 from worlds import World, named, with_leaf
 
 import splatjax as sj
-from splatjax.diffusion import ClusterDiffuser, DenseDiffuser
-from splatjax.diffusion._clustered import LayerPlan, NodePlan
-from splatjax.diffusion._neighbors import Boxes, Neighbors
-from splatjax.diffusion._pixels import tile_grid
-from splatjax.splatting import (
-    BinCapacity,
-    DenseRasterizer,
-    ShadowSettings,
-    TileCapacity,
-    TileGrid,
-    TileRasterizer,
-)
+from splatjax.diffusion import DenseDiffuser
+from splatjax.diffusion._clustered import LayerPlan
+from splatjax.diffusion._neighbors import Boxes, Neighbors, find_neighbors
+from splatjax.splatting import DenseRasterizer, ShadowSettings
+from splatjax.splatting._bins import BinCapacity
+from splatjax.splatting._grid import TileGrid
+from splatjax.splatting._rasterizer import Places
+from splatjax.splatting._tiles import TilePlan
 
 pytestmark = [pytest.mark.slow, pytest.mark.once]
 
@@ -211,7 +207,7 @@ def loss_and_gradient(shape: Shape):
         settings = sj.RenderSettings(
             shadows=SHADOWS, rasterizer=DenseRasterizer(), diffuser=DenseDiffuser()
         )
-    plan = roomy(sj.plan(*typical(shape), settings), shape)
+    plan = roomy(sj.make_plan(*typical(shape), settings), shape)
 
     @jax.jit
     def found(world: World, factors: jax.Array):
@@ -274,53 +270,36 @@ def typical(shape: Shape) -> tuple[sj.Scene, sj.Camera]:
 
 def roomy(plan: sj.Plan, shape: Shape) -> sj.Plan:
     """Give every list room for everything, and every layer any variance."""
-    rasterizer = plan.rasterizer
 
     def widened(part):
-        if isinstance(part, TileRasterizer):
-            size = (shape.width, shape.height) if part is rasterizer else (SHADOWS.resolution,) * 2
-            tiles = TileGrid(*size, part.lanes).tiles
-            room = BinCapacity(*_room(shape.splats, tiles, part.lanes, part.slots))
-            return TileRasterizer(part.lanes, part.slots, TileCapacity(max(shape.splats, 1), room))
-        if isinstance(part, ClusterDiffuser):
-            assert part.layers is not None
-            grid = tile_grid(shape.width, shape.height, 1)
-            room = BinCapacity(*_room(2 * 64, grid.tiles, grid.lanes, grid.slots))
-            layers = tuple(
-                LayerPlan(
-                    each.level,
-                    each.support,
-                    jnp.zeros(()),
-                    jnp.full((), jnp.inf),
-                    None if each.capacity is None else room,
-                    far_reaching(each.nodes),
-                )
-                for each in part.layers
-            )
-            return eqx.tree_at(
-                lambda d: d.layers, part, layers, is_leaf=lambda leaf: isinstance(leaf, tuple)
-            )
+        if isinstance(part, TilePlan):
+            of_camera = part is plan.raster
+            size = (shape.width, shape.height) if of_camera else (SHADOWS.resolution,) * 2
+            rasterizer = part.rasterizer
+            tiles = TileGrid(*size, rasterizer.lanes).tiles
+            room = _room(shape.splats, tiles, rasterizer.lanes, rasterizer.slots)
+            places = Places(tiles, tiles)
+            return TilePlan(rasterizer, max(shape.splats, 1), BinCapacity(*room), places)
+        if isinstance(part, LayerPlan):
+            none, endless = jnp.zeros(()), jnp.full((), jnp.inf)
+            return LayerPlan(part.level, part.support, none, endless, far_reaching(part.neighbors))
         return part
 
-    tiles = tile_grid(shape.width, shape.height, 1)
-    plan = dataclasses.replace(plan, tiles=tiles.across * tiles.down)
-    return jax.tree.map(
-        widened, plan, is_leaf=lambda part: isinstance(part, TileRasterizer | ClusterDiffuser)
-    )
+    return jax.tree.map(widened, plan, is_leaf=lambda part: isinstance(part, TilePlan | LayerPlan))
 
 
 FARTHEST = 1e15  # mm, to which all is near
 
 
-def far_reaching(nodes: NodePlan | None) -> NodePlan | None:
-    if nodes is None:
+def far_reaching(neighbors: Neighbors | None) -> Neighbors | None:
+    if neighbors is None:
         return None
-    points, sources = nodes.neighbors.points, nodes.neighbors.sources
-    everywhere = Boxes(jnp.full_like(points.low, -FARTHEST), jnp.full_like(points.high, FARTHEST))
-    all_sources = Boxes(
-        jnp.full_like(sources.low, -FARTHEST), jnp.full_like(sources.high, FARTHEST)
-    )
-    return NodePlan(Neighbors.find(everywhere, all_sources, 10 * FARTHEST, 1, 4), nodes.deviations)
+
+    def anywhere(boxes: Boxes) -> Boxes:
+        return Boxes(jnp.full_like(boxes.low, -FARTHEST), jnp.full_like(boxes.high, FARTHEST))
+
+    boxes = anywhere(neighbors.points), anywhere(neighbors.sources)
+    return Neighbors(find_neighbors(*boxes, 10 * FARTHEST), *boxes, jnp.asarray(10 * FARTHEST))
 
 
 def _room(items: int, tiles: int, lanes: int, slots: int) -> tuple[int, int, int]:

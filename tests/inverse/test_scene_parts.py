@@ -8,7 +8,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import splatjax as sj
-from splatjax.inverse._parts import Shot, rotation
+from splatjax.inverse._parts import Setup, rotation
+
+CAMERA = sj.Camera.look_at([3, 0, 9], [1, 1, 0], width=4, height=4)
+
+
+def moved_by(part, splats: sj.Splats, x) -> sj.Splats:
+    return part.moved(Setup(splats, CAMERA, ()), x, part.prepared(splats)).splats
 
 
 @pytest.mark.parametrize("length", [0.0, 1e-9, 0.05, 0.0999, 0.1001, 1.0, 3.0])
@@ -28,46 +34,37 @@ def test_a_rotation_has_a_derivative_where_there_is_none():
 
 
 def test_lights_move_each_in_its_own_way():
-    camera = sj.Camera.look_at(jnp.asarray([0.0, 0.0, 9.0]), jnp.zeros(3), width=4, height=4)
-    lights = (
-        sj.PointLight(jnp.asarray([1.0, 2.0, 3.0]), jnp.asarray([4.0, 5.0])),
-        sj.GaussianBeam(
-            jnp.asarray([1.0, 2.0, 3.0]),
-            jnp.asarray([0.0, 0.0, -2.0]),
-            jnp.asarray([4.0, 5.0]),
-            jnp.asarray(1.0),
-        ),
-    )
-    shot, middle = Shot(camera, lights), jnp.zeros(3)
+    camera = sj.Camera.look_at([0, 0, 9], [0, 0, 0], width=4, height=4)
+    beam = sj.GaussianBeam([1, 2, 3], [0, 0, -2], power=[4, 5], variance=1)
+    lights = sj.PointLight([1, 2, 3], intensity=[4, 5]), beam
+    setup = Setup(bodies.sphere(20), camera, lights)
     places, strengths = sj.LightPlaces(turn=0.1, shift=2.0), sj.LightStrengths(step=0.5)
-    x = jax.tree.map(jnp.ones_like, places.coordinates(shot))
-    lamp, beam = places.moved(shot, x, middle).lights
+    x = jax.tree.map(jnp.ones_like, places.coordinates(setup))
+    lamp, beam = places.moved(setup, x, None).lights
     np.testing.assert_allclose(lamp.position, [3, 4, 5])
     np.testing.assert_allclose(beam.origin, [3, 4, 5])
     np.testing.assert_allclose(
         beam.direction, Rotation.from_rotvec([0.1, 0.1, 0.1]).apply([0, 0, -2]), rtol=1e-5
     )
     x = (jnp.asarray([0.0, 1.0]), jnp.asarray([2.0, 0.0]))
-    lamp, beam = strengths.moved(shot, x, middle).lights
+    lamp, beam = strengths.moved(setup, x, None).lights
     np.testing.assert_allclose(lamp.intensity, [4, 5 * np.exp(0.5)], rtol=1e-6)
     np.testing.assert_allclose(beam.power, [4 * np.exp(1), 5], rtol=1e-6)
 
 
 def test_a_camera_turns_around_the_body():
     """The middle stays where it was in the picture, and as far away."""
-    camera = sj.Camera.look_at(
-        jnp.asarray([3.0, 0.0, 9.0]), jnp.asarray([1.0, 1.0, 0.0]), width=4, height=4
-    )
+    camera = CAMERA
     middle, part = jnp.asarray([0.5, -1.0, 0.3]), sj.CameraPoses(turn=0.2, shift=0.5)
 
-    def place(shot):
-        return shot.camera.rotation @ (middle - shot.camera.position)
+    def place(setup):
+        return setup.camera.rotation @ (middle - setup.camera.position)
 
-    shot = Shot(camera, ())
-    turned = part.moved(shot, jnp.asarray([[1.0, -2.0, 0.5], [0.0, 0.0, 0.0]]), middle)
+    setup = Setup(bodies.sphere(20), camera, ())
+    turned = part.moved(setup, jnp.asarray([[1.0, -2.0, 0.5], [0.0, 0.0, 0.0]]), middle)
     assert float(jnp.linalg.norm(turned.camera.position - camera.position)) > 1
-    np.testing.assert_allclose(place(turned), place(shot), atol=1e-5)
-    shifted = part.moved(shot, jnp.asarray([[0.0, 0.0, 0.0], [1.0, 2.0, 3.0]]), middle)
+    np.testing.assert_allclose(place(turned), place(setup), atol=1e-5)
+    shifted = part.moved(setup, jnp.asarray([[0.0, 0.0, 0.0], [1.0, 2.0, 3.0]]), middle)
     np.testing.assert_allclose(shifted.camera.position - camera.position, [0.5, 1, 1.5], atol=1e-6)
     np.testing.assert_allclose(shifted.camera.rotation, camera.rotation, atol=1e-6)
 
@@ -78,13 +75,13 @@ def test_an_albedo_stays_between_0_and_1():
     splats = sj.Splats(body.centers, body.normals, body.radii, body.areas, albedo)
     part = sj.AlbedoMap(step=0.5)
     for by in (-1e3, 0.0, 1e3):
-        moved = part.moved(splats, jnp.full((20, 2), by), None).albedo
+        moved = moved_by(part, splats, jnp.full((20, 2), by)).albedo
         assert float(jnp.min(moved)) >= 0
         assert float(jnp.max(moved)) <= 1
         if by == 0:
             np.testing.assert_allclose(moved[1:-1], albedo[1:-1], rtol=1e-4)
     np.testing.assert_allclose(
-        part.moved(splats, jnp.ones((20, 2)), None).albedo[10, 0],
+        moved_by(part, splats, jnp.ones((20, 2))).albedo[10, 0],
         1 / (1 + (19 / 20) * np.exp(-0.5)),
         rtol=1e-5,
     )
@@ -104,7 +101,7 @@ def test_normals_and_areas_follow_a_paraboloid():
     heights = 0.3 + 0.1 * x - 0.05 * y + 0.02 * x * x + 0.03 * x * y - 0.01 * y * y
     slopes = np.stack([0.1 + 0.04 * x + 0.03 * y, -0.05 + 0.03 * x - 0.02 * y], axis=1)
     part = sj.NormalOffsets(step=1.0, smoothness=1e-3, deviation=1.0)  # next to no blur
-    moved = part.moved(sheet, jnp.asarray(heights, float), part.prepared(sheet))
+    moved = moved_by(part, sheet, jnp.asarray(heights, float))
     stretch = np.sqrt(1 + np.sum(slopes**2, axis=1))
     normals = np.concatenate([-slopes, np.ones((len(x), 1))], axis=1) / stretch[:, None]
     np.testing.assert_allclose(moved.centers[:, 2], heights, atol=1e-6)
@@ -115,7 +112,7 @@ def test_normals_and_areas_follow_a_paraboloid():
 def test_a_ball_that_grows_stays_a_ball():
     ball = bodies.sphere(400)
     part = sj.NormalOffsets(step=0.5, smoothness=2.0, deviation=1.0)
-    moved = part.moved(ball, jnp.full(400, 2.0), part.prepared(ball))
+    moved = moved_by(part, ball, jnp.full(400, 2.0))
     np.testing.assert_allclose(jnp.linalg.norm(moved.centers, axis=1), 11.0, rtol=1e-5)
     np.testing.assert_allclose(jnp.sum(moved.normals * ball.normals, axis=1), 1.0, atol=1e-4)
     np.testing.assert_allclose(moved.areas, 1.21 * ball.areas, rtol=2e-2)
@@ -129,10 +126,9 @@ def test_offsets_are_means_of_coordinates_over_the_same_side_of_a_sheet():
     )
     both = bodies.joined(near, behind)
     part = sj.NormalOffsets(step=0.1, smoothness=1.0, deviation=0.3)
-    tables = part.prepared(both)
     x = np.random.default_rng(3).normal(size=both.count)
     x[near.count :] = 0
-    moved = part.moved(both, jnp.asarray(x, float), tables)
+    moved = moved_by(part, both, jnp.asarray(x, float))
     offsets = np.asarray(moved.centers[:, 2] - both.centers[:, 2])
     assert 0 < np.max(np.abs(offsets)) < 0.1 * np.max(np.abs(x))
     np.testing.assert_array_equal(offsets[near.count :], 0)
@@ -140,9 +136,9 @@ def test_offsets_are_means_of_coordinates_over_the_same_side_of_a_sheet():
     # The prior: coordinates that make offsets of its deviation cost one each.
     noise = np.random.default_rng(4).normal(size=both.count)
     offsets = np.asarray(
-        part.moved(both, jnp.asarray(noise, float), tables).centers[:, 2] - both.centers[:, 2]
+        moved_by(part, both, jnp.asarray(noise, float)).centers[:, 2] - both.centers[:, 2]
     )
     expected = both.count * (np.sqrt(np.mean(offsets**2)) / 0.3) ** 2
     np.testing.assert_allclose(
-        part.unlikely(jnp.asarray(noise, float), tables), expected, rtol=0.15
+        part.prior(jnp.asarray(noise, float), part.prepared(both)), expected, rtol=0.15
     )

@@ -178,7 +178,7 @@ BAD = [
     (layered(SLAB.replace("2.0", "inf"), SLAB), r"\[\[layers\]\]: layer 1 of 2"),
     (layered(SLAB, "optical_depth = [0.1, 0.2]\n"), r"\[1, 2\] channels"),
     (layered("optical_depth = [-0.1]\n", SLAB), r"\[layers 1\] optical_depth .*\[-0.1\]"),
-    (layered("optical_depth = [0.1]\n"), r"none of which is a Layer"),
+    (layered("optical_depth = [0.1]\n"), r"none of these 1 is a Layer"),
     (GOOD_MEDIUM + layered(SLAB), r"both \[medium\] and \[\[layers\]\]"),
     ("layers = 3\n", r"layers must be one table or more; it is 3"),
     (GOOD_MEDIUM.replace("[0.1]", "[-0.1]"), r"\[medium\] sigma_a .*\[-0.1\]"),

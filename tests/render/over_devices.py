@@ -13,7 +13,6 @@ from scenes import sphere
 import splatjax as sj
 from benchmarks.communication import Picture, counted
 from splatjax.diffusion import DenseDiffuser
-from splatjax.render import light_on_splats
 from splatjax.splatting import DenseRasterizer, ShadowSettings
 
 SETTINGS = sj.RenderSettings(shadows=ShadowSettings(resolution=32))
@@ -91,9 +90,9 @@ def splats_cut() -> dict:
     """One device against eight that each hold a share of the splats."""
     world, eye = scene(), camera()
     mesh = jax.make_mesh((4, 2), ("hosts", "devices"))
-    plans = [sj.plan(world, eye, SETTINGS), sj.plan(world, eye, SETTINGS, mesh=mesh)]
+    plans = [sj.make_plan(world, eye, SETTINGS), sj.make_plan(world, eye, SETTINGS, mesh=mesh)]
     ((_, one), d_one), ((_, many), d_many) = (pictured(world, eye, plan) for plan in plans)
-    kinds = [[layer.level > 0, layer.nodes is not None] for layer in plans[0].diffuser.layers]
+    kinds = [layer.neighbors and layer.level for layer in plans[0].diffusion.layers]
     return {
         "frame": apart(one, many),
         "gradients": apart(d_one, d_many),
@@ -112,13 +111,13 @@ def more_than_pictures_cut() -> dict:
         world.material.gaussians.variances, world.material.gaussians.weights[::-1]
     )
     found = []
-    for plan in (sj.plan(world, eye, SETTINGS), sj.plan(world, eye, SETTINGS, mesh=mesh)):
-        light = light_on_splats(world, plan, SETTINGS)
-        gathered = sj.gather_picture_and_slopes(world, eye, SETTINGS, plan)
+    for plan in (sj.make_plan(world, eye, SETTINGS), sj.make_plan(world, eye, SETTINGS, mesh=mesh)):
+        light = sj.compute_irradiance(world, plan, SETTINGS)
+        gathered = sj.diffusion_basis(world, eye, SETTINGS, plan, derivative=True)
         found.append(
             {
                 "light": light,
-                "diffused": sj.diffuse(world, light.source.T, eye, SETTINGS, plan),
+                "diffused": sj.diffuse_irradiance(world, light.source.T, eye, SETTINGS, plan),
                 "gathered": (gathered.beauty(other), gathered.coverage),
                 "jacobian": sj.picture_jacobian(world, eye, SETTINGS, plan),
             }
@@ -132,7 +131,7 @@ def traffic() -> dict:
     """
     mesh = jax.make_mesh((8,), ("splats",))
     world = scene(1504)
-    plan = sj.plan(world, camera(), SETTINGS, mesh=mesh)
+    plan = sj.make_plan(world, camera(), SETTINGS, mesh=mesh)
     world = eqx.tree_at(
         lambda each: each.splats,
         world,
@@ -178,7 +177,7 @@ def views_cut() -> dict:
     )
     world, cameras = scene(97), [camera(angle) for angle in (0.0, 1.0, 2.0)]
     world = sj.Scene(world.splats, world.lights[1:], world.material)
-    plan = sj.plan(world, cameras, settings)
+    plan = sj.make_plan(world, cameras, settings)
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *cameras)
     mesh = jax.make_mesh((8,), ("views",))
 
@@ -209,7 +208,7 @@ def gradients_at_home() -> dict:
     """
     mesh = jax.make_mesh((8,), ("splats",))
     world = scene(1504)
-    plan = sj.plan(world, camera(), SETTINGS, mesh=mesh)
+    plan = sj.make_plan(world, camera(), SETTINGS, mesh=mesh)
     splats = jax.device_put(world.splats, NamedSharding(mesh, PartitionSpec("splats")))
 
     def covered(splats):

@@ -26,12 +26,13 @@ def main(what: str, index: int, count: int, port: int) -> dict:
     world, eye = (
         scene(1504, variances=(16.0, 100.0)),
         camera(),
-    )  # one layer of single splats, and one through nodes
+    )  # a layer of single splats, and one of clusters
     cut = NamedSharding(mesh, PartitionSpec("splats"))
     splats = jax.tree.map(lambda leaf: jax.device_put(leaf, cut), world.splats)
 
     def found(splats, mesh):
-        plan = sj.plan(sj.Scene(splats, world.lights, world.material), eye, SETTINGS, mesh=mesh)
+        cut_scene = sj.Scene(splats, world.lights, world.material)
+        plan = sj.make_plan(cut_scene, eye, SETTINGS, mesh=mesh)
 
         def draw(splats, plan):
             return sj.render(sj.Scene(splats, world.lights, world.material), eye, SETTINGS, plan)

@@ -47,9 +47,9 @@ def layer_error(variance: float, kind: str, slant: float) -> float:
     cameras = {each: camera_over(4 * deviation, 48, each) for each in SLANTS}
     camera, plan = (
         cameras[slant],
-        sj.plan(scene, list(cameras.values()), EXACT),
+        sj.make_plan(scene, list(cameras.values()), EXACT),
     )  # one plan is one program
-    layer = np.asarray(sj.diffuse(scene, beam(splats), camera, EXACT, plan))[0, ..., 0]
+    layer = np.asarray(sj.diffuse_irradiance(scene, beam(splats), camera, EXACT, plan))[0, ..., 0]
     squared = np.sum(positions(camera)[..., :2] ** 2, axis=-1)
     truth = np.exp(-squared / (2 * variance)) / (2 * np.pi * variance)
     seen = truth > PEAK_SHARE * truth.max()
@@ -83,7 +83,7 @@ def test_the_sum_of_layers_is_the_profile():
     material = sj.Material(skin())
     scene = sj.Scene(splats, (), material)
     camera = camera_over(2.0, 48)
-    layers = sj.diffuse(scene, jnp.tile(beam(splats), (1, 3)), camera, EXACT)
+    layers = sj.diffuse_irradiance(scene, jnp.tile(beam(splats), (1, 3)), camera, EXACT)
     total = np.asarray(jnp.sum(layers * material.gaussians.weights[:, None, None], axis=0))
     radius = np.sqrt(np.sum(positions(camera)[..., :2] ** 2, axis=-1))
     truth = np.asarray(material.gaussians(jnp.asarray(radius, float)))

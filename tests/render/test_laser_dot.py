@@ -48,7 +48,7 @@ def test_a_rendered_dot_gives_the_coefficients_back_within_their_error_bars():
         image = photograph(medium)
         dot = measure_laser_dot(image, 2 * HALF_WIDTH / PIXELS, power=POWER)
         start = sj.Medium(medium.sigma_a * 3, medium.sigma_s_prime / 2, medium.eta)
-        found = fit_medium(dot.profile, dot.deviation, start, beam_variance=BEAM, count=COUNT)
+        found = fit_medium(dot.profile, start, beam_variance=BEAM, count=COUNT)
     errors = np.sqrt(np.diagonal(np.asarray(found.covariance), axis1=1, axis2=2))
     truth, back = (np.stack([m.sigma_a, m.sigma_s_prime], axis=1) for m in (medium, found.medium))
     away = np.log(back / truth) / errors

@@ -18,6 +18,7 @@ EXITANCE_TOLERANCE = 1e-3
 PLAIN = sj.RenderSettings(
     shadows=ShadowSettings(resolution=32), rasterizer=DenseRasterizer(), diffuser=DenseDiffuser()
 )
+TILES = sj.RenderSettings(diffuser=DenseDiffuser())
 EXACT = sj.RenderSettings(diffuser=ClusterDiffuser(error=0.0))
 
 
@@ -197,7 +198,7 @@ def test_a_plan_that_does_not_suffice_poisons_the_picture_and_says_so():
     scene = sj.Scene(
         sheet(0.25, 1.0), (lamp(),), material
     )  # that of the test of splats that move: one program
-    plan = sj.plan(scene, camera)
+    plan = sj.make_plan(scene, camera)
     wider = eqx.tree_at(
         lambda s: s.material.gaussians.variances, scene, scene.material.gaussians.variances * 2
     )
@@ -208,31 +209,28 @@ def test_a_plan_that_does_not_suffice_poisons_the_picture_and_says_so():
 
 
 @pytest.mark.once
-def test_too_few_tiles_poison_all_that_is_made_of_them_and_its_derivative():
+def test_a_plan_for_too_few_splats_poisons_all_that_is_made_of_them_and_its_derivative():
     scene, camera = (
         sj.Scene(sheet(1.0, 6.0), (lamp(),), sj.Material(two_gaussians())),
         camera_over(5.0, 16),
     )
-    plan = sj.plan(scene, camera, PLAIN)
-    short = dataclasses.replace(plan, tiles=1)
+    plan = sj.make_plan(scene, camera, TILES)
+    short = dataclasses.replace(plan, raster=dataclasses.replace(plan.raster, splats=1))
     frame, slope = jax.value_and_grad(
         lambda radii: jnp.sum(
             sj.render(
-                eqx.tree_at(lambda s: s.splats.radii, scene, radii), camera, PLAIN, short
+                eqx.tree_at(lambda s: s.splats.radii, scene, radii), camera, TILES, short
             ).beauty
         )
     )(scene.splats.radii)
     assert np.isnan(float(frame))
     assert np.any(np.isnan(np.asarray(slope)))  # where a pixel sees the splat: no step can be taken
-    jacobian = sj.picture_jacobian(scene, camera, PLAIN, short)
+    jacobian = sj.picture_jacobian(scene, camera, TILES, short)
     assert float(jacobian.frame.overflow) > 1
     assert np.all(np.isnan(np.asarray(jacobian.weights)))
-    assert np.all(
-        np.isnan(
-            np.asarray(sj.diffuse(scene, jnp.ones((scene.splats.count, 3)), camera, PLAIN, short))
-        )
-    )
-    assert float(sj.render(scene, camera, PLAIN, plan).overflow) == 0
+    ones = jnp.ones((scene.splats.count, 3))
+    assert np.all(np.isnan(sj.diffuse_irradiance(scene, ones, camera, TILES, short)))
+    assert float(sj.render(scene, camera, TILES, plan).overflow) == 0
 
 
 @pytest.mark.once
@@ -243,7 +241,7 @@ def test_a_plan_holds_for_splats_that_move_a_little():
     camera = camera_over(5.0, 32)
     small = sheet(0.25, 1.0)
     material = sj.Material(two_gaussians())
-    plan = sj.plan(sj.Scene(small, (lamp(),), material), camera)
+    plan = sj.make_plan(sj.Scene(small, (lamp(),), material), camera)
     for offset in ([0.1, 0.1, 0.0], [-0.1, 0.1, 0.1], [0.0, -0.1, -0.1]):
         moved = eqx.tree_at(lambda s: s.centers, small, small.centers + jnp.asarray([offset]))
         assert (
@@ -260,7 +258,7 @@ def test_a_light_that_has_come_among_the_splats_needs_another_plan():
         light = sj.PointLight(jnp.asarray([0.0, 0.0, height]), jnp.ones(3))
         return sj.Scene(splats, (light,), sj.Material(two_gaussians()))
 
-    plan = sj.plan(scene(20.0), camera, PLAIN)
+    plan = sj.make_plan(scene(20.0), camera, PLAIN)
     assert float(sj.render(scene(12.0), camera, PLAIN, plan).overflow) == 0
     for height in (1.0, 0.0):
         frame = sj.render(scene(height), camera, PLAIN, plan)
@@ -269,6 +267,6 @@ def test_a_light_that_has_come_among_the_splats_needs_another_plan():
 
 
 def test_channels_that_disagree_are_refused():
-    scene = sj.Scene(sheet(1.0, 3.0), (lamp((1.0,)),), sj.Material(skin()))
-    with pytest.raises(ValueError, match=r"lights\[0\] has 1 channels"):
+    scene = sj.Scene(sheet(1.0, 3.0), (lamp((1.0, 1.0)),), sj.Material(skin()))
+    with pytest.raises(ValueError, match=r"lights\[0\] has 2 channels"):
         sj.render(scene, camera_over(2.0, 8))

@@ -8,8 +8,6 @@ from scenes import sheet, two_gaussians
 
 import splatjax as sj
 from splatjax.diffusion import DenseDiffuser
-from splatjax.render import light_on_splats
-from splatjax.render._sharded_plan import on_one_device
 from splatjax.scene import AbstractLight
 
 SETTINGS = sj.RenderSettings(diffuser=DenseDiffuser())  # which needs no plan
@@ -34,12 +32,11 @@ def test_a_plan_of_several_scenes_has_room_for_the_shadows_of_each():
     camera = camera_at(20.0)
     steep, grazing = scene_under(lamp(0.0, 0.0, -1.0)), scene_under(lamp(0.99, 0.0, -0.14))
     alone = [
-        sj.plan(scene, camera, SETTINGS).shadows[0].rasterizer.capacity.bins
-        for scene in (steep, grazing)
+        sj.make_plan(scene, camera, SETTINGS).shadows[0].raster.bins for scene in (steep, grazing)
     ]
     assert alone[0].pairs > alone[1].pairs
     for scenes in ([steep, grazing], [grazing, steep]):
-        together = sj.plan(scenes, camera, SETTINGS).shadows[0].rasterizer.capacity.bins
+        together = sj.make_plan(scenes, camera, SETTINGS).shadows[0].raster.bins
         assert together == alone[0]
 
 
@@ -48,47 +45,37 @@ def test_a_lamp_among_the_splats_in_one_scene_has_six_faces_in_all():
     far, near = (
         scene_under(sj.PointLight(jnp.asarray([0.0, 0.0, z]), jnp.ones(3))) for z in (30.0, 1.0)
     )
-    assert sj.plan([far, near], camera_at(20.0), SETTINGS).shadows[0].cube
-    assert not sj.plan([far, far], camera_at(20.0), SETTINGS).shadows[0].cube
+    assert sj.make_plan([far, near], camera_at(20.0), SETTINGS).shadows[0].cube
+    assert not sj.make_plan([far, far], camera_at(20.0), SETTINGS).shadows[0].cube
 
 
 def test_scenes_that_differ_in_more_than_their_lights_are_refused():
     camera, scene = camera_at(20.0), scene_under(lamp(0.0, 0.0, -1.0))
     with pytest.raises(ValueError, match=r"scenes\[1\] has other splats"):
-        sj.plan(
+        sj.make_plan(
             [scene, scene_under(lamp(0.0, 0.0, -1.0), splats=sheet(1.0, 4.0))], camera, SETTINGS
         )
     for other in (scene_under(), scene_under(lamp(0.0, 0.0, -1.0, cast_shadows=False))):
         with pytest.raises(ValueError, match=r"lights of the same kinds.*scenes\[2\]"):
-            sj.plan([scene, scene, other], camera, SETTINGS)
+            sj.make_plan([scene, scene, other], camera, SETTINGS)
 
 
 def test_a_mesh_needs_renderers_that_can_be_cut_and_a_plan_of_its_own():
     mesh, camera, scene = jax.make_mesh((1,), ("splats",)), camera_at(20.0), scene_under()
-    with pytest.raises(ValueError, match="must be a ClusterDiffuser, not a DenseDiffuser"):
-        sj.plan(scene, camera, SETTINGS, mesh=mesh)
+    with pytest.raises(ValueError, match="DenseDiffuser"):
+        sj.make_plan(scene, camera, SETTINGS, mesh=mesh)
     with pytest.raises(ValueError, match="the plan is for one device"):
-        sj.render(scene, camera, SETTINGS, sj.plan(scene, camera, SETTINGS), mesh=mesh)
-
-
-def test_planning_gathers_from_a_mesh_of_one_device_too():
-    sharding = jax.sharding.NamedSharding(
-        jax.make_mesh((1,), ("splats",)), jax.sharding.PartitionSpec("splats")
-    )
-    assert isinstance(
-        on_one_device(jax.device_put(jnp.ones(3), sharding)).sharding,
-        jax.sharding.SingleDeviceSharding,
-    )
+        sj.render(scene, camera, SETTINGS, sj.make_plan(scene, camera, SETTINGS), mesh=mesh)
 
 
 def test_a_plan_for_other_splats_is_refused():
     camera, scene = camera_at(20.0), scene_under()
-    plan = sj.plan(scene, camera, SETTINGS)
+    plan = sj.make_plan(scene, camera, SETTINGS)
     calls = (
         lambda scene, plan: sj.render(scene, camera, SETTINGS, plan),
-        lambda scene, plan: sj.gather_picture(scene, camera, SETTINGS, plan),
+        lambda scene, plan: sj.diffusion_basis(scene, camera, SETTINGS, plan),
         lambda scene, plan: sj.picture_jacobian(scene, camera, SETTINGS, plan),
-        lambda scene, plan: light_on_splats(scene, plan, SETTINGS),
+        lambda scene, plan: sj.compute_irradiance(scene, plan, SETTINGS),
     )
     other = scene_under(splats=sheet(1.0, 4.0))
     for call in calls:
@@ -129,4 +116,4 @@ def test_a_light_of_ones_own_shines_without_shadows_and_is_told_so_with_them():
     with pytest.raises(
         ValueError, match="Sky: no shadow map is known for it; give one with cast_shadows=False"
     ):
-        sj.plan(scene_under(Sky(jnp.ones(3), cast_shadows=True)), camera, SETTINGS)
+        sj.make_plan(scene_under(Sky(jnp.ones(3), cast_shadows=True)), camera, SETTINGS)

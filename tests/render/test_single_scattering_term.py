@@ -101,12 +101,12 @@ def test_no_more_leaves_than_came_however_the_light_grazes(eta):
             sj.SumOfGaussians(jnp.asarray([1.0]), jnp.asarray([[rest]])), single_scattering=single
         )
         for each in (lit, lit.white()):
-            diffused = each.gaussians.total_reflectance()[None] * each.left_to_diffuse(mu)
-            leaving = each.single_scattering.leaving(mu) + diffused
+            diffused = each.gaussians.total_reflectance()[None] * each.diffuse_fraction(mu)
+            leaving = each.single_scattering.directional_albedo(mu) + diffused
             assert np.all(np.asarray(leaving) <= 1 + 2e-3)
             if absorbing == 0:
                 np.testing.assert_allclose(np.asarray(leaving), 1, atol=2e-3)
-        np.testing.assert_allclose(np.asarray(lit.left_to_diffuse(mu[:1])), 1, atol=2e-3)
+        np.testing.assert_allclose(np.asarray(lit.diffuse_fraction(mu[:1])), 1, atol=2e-3)
 
 
 @pytest.mark.once

@@ -1,4 +1,4 @@
-"""The Hankel pair: known transforms, each other's inverse, derivatives."""
+"""The inverse Hankel transform: known transforms, precision, derivatives."""
 
 import jax
 import jax.numpy as jnp
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from splatjax.scattering import hankel_transform, inverse_hankel_transform
+from splatjax.scattering import inverse_hankel_transform
 
 ROUNDING = 1e-13
 """Of the value at the origin; 1e-15 is reached."""
@@ -35,24 +35,15 @@ def test_transform_of_a_point_source(float64, sigma):
     assert np.max(np.abs(found - expected) / scale) < ROUNDING
 
 
-def test_a_gaussian_stays_one(float64):
-    """`exp(-r^2 / 2v) / (2 pi v)` and `exp(-v k^2 / 2)`, both ways."""
-    variance = jnp.asarray([0.3, 7.0])
-    k = jnp.broadcast_to(jnp.geomspace(1e-2, 2, 30)[:, None], (30, 2))
-
-    def gaussian(r):
-        v = jnp.broadcast_to(variance, r.shape)
-        return jnp.exp(-r * r / (2 * v)) / (2 * jnp.pi * v)
+def test_transform_of_a_gaussian(float64):
+    variance, r = np.array([0.3, 7.0]), np.linspace(0, 3, 20)
 
     def transform(k):
-        return jnp.exp(-0.5 * k * k * jnp.broadcast_to(variance, k.shape))
+        return jnp.exp(-0.5 * k * k * jnp.broadcast_to(jnp.asarray(variance), k.shape))
 
-    np.testing.assert_allclose(hankel_transform(gaussian, k), transform(k), atol=1e-11)
-    r = jnp.linspace(0, 3, 20)
-    expected = gaussian(jnp.broadcast_to(r[:, None], (20, 2)))
-    np.testing.assert_allclose(
-        inverse_hankel_transform(transform, r, jnp.sqrt(variance)), expected, atol=1e-12
-    )
+    found = inverse_hankel_transform(transform, jnp.asarray(r), jnp.sqrt(jnp.asarray(variance)))
+    expected = np.exp(-(r[:, None] ** 2) / (2 * variance)) / (2 * np.pi * variance)
+    np.testing.assert_allclose(found, expected, atol=1e-12)
 
 
 def test_in_the_precision_of_the_run(dtype):

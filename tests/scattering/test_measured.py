@@ -5,10 +5,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from splatjax.fitting import NonNegativeWeights, TotalReflectanceHeld, fit_gaussians, relative_error
+from splatjax.fitting import (
+    FixedTotalReflectance,
+    fit_gaussians,
+)
 from splatjax.gaussians import SumOfGaussians
 from splatjax.scattering import (
-    NORM_RULE,
+    L2_QUADRATURE,
     InverseVariance,
     Tabulated,
     integrated_reflectance,
@@ -38,7 +41,7 @@ def test_integrals_of_a_table_are_sums_over_its_radii(float64):
     r = jnp.linspace(0.1, 6.0, 300)
     table = Tabulated(r, truth()(r))
     np.testing.assert_allclose(integrated_reflectance(table), table.total_reflectance(), rtol=1e-3)
-    beyond = NORM_RULE.beyond(1.0)
+    beyond = L2_QUADRATURE.beyond(1.0)
     radii, weights = beyond.radii(table)
     np.testing.assert_array_equal(
         np.asarray(weights) > 0, np.asarray(radii) >= np.asarray(table.length_scale())
@@ -67,22 +70,6 @@ def test_a_table_is_fitted_over_its_own_radii_alone(float64):
     np.testing.assert_allclose(fitted.gaussians.weights, truth().weights, rtol=1e-6)
 
 
-def test_covariance_of_a_measured_fit_is_the_scatter_of_its_repetitions(float64):
-    """Noise of equal weight in Eq. 3: the residuals' sum over the degrees of freedom scales the
-    covariance.
-    """
-    r = jnp.linspace(0.05, 5.0, 80)
-    deviation = 0.002 / jnp.sqrt(r)
-    noise = np.random.default_rng(0).normal(size=(200, 80, 1))
-    values = jnp.asarray(np.asarray(truth()(r))[:, :1] + np.asarray(deviation)[:, None] * noise)
-    fitted = eqx.filter_jit(
-        eqx.filter_vmap(lambda values: fit_gaussians(Tabulated(r, values), 2, throw=False))
-    )(values)
-    found = np.concatenate([fitted.gaussians.variances, fitted.gaussians.weights[..., 0]], axis=1)
-    stated = np.asarray(fitted.covariance) / (80 - 4)
-    np.testing.assert_allclose(np.cov(found.T), np.median(stated, axis=0), rtol=0.3, atol=2e-7)
-
-
 def test_a_fit_weighed_by_its_errors_is_the_likeliest(float64):
     """Noise of very different sizes: the scatter of repetitions is as stated, and less than by the
     integral's weights.
@@ -97,7 +84,7 @@ def test_a_fit_weighed_by_its_errors_is_the_likeliest(float64):
         return fit_gaussians(Tabulated(r, values, deviation), 2, rule=rule, throw=False)
 
     fits = eqx.filter_jit(eqx.filter_vmap(fit, in_axes=(0, None)))
-    found, plain = fits(values, InverseVariance()), fits(values, NORM_RULE)
+    found, plain = fits(values, InverseVariance()), fits(values, L2_QUADRATURE)
     parameters = np.concatenate(
         [found.gaussians.variances, found.gaussians.weights[..., 0]], axis=1
     )
@@ -112,7 +99,7 @@ def test_a_fit_weighed_by_its_errors_is_the_likeliest(float64):
 
 def test_weighing_needs_errors(float64):
     r = jnp.linspace(0.05, 5.0, 30)
-    with pytest.raises(ValueError, match="Tabulated has no standard errors to weigh by"):
+    with pytest.raises(ValueError, match="Tabulated has no standard errors"):
         fit_gaussians(Tabulated(r, truth()(r)), 2, rule=InverseVariance())
     with pytest.raises(ValueError, match="SumOfGaussians has no standard errors"):
         fit_gaussians(truth(), 2, rule=InverseVariance())
@@ -127,7 +114,7 @@ def test_a_total_that_is_known_is_held(float64):
     r = jnp.linspace(0.05, 2.0, 60)
     table = Tabulated(r, truth()(r), total=truth().total_reflectance())
     assert Tabulated(r, truth()(r)).total_reflectance()[0] < 0.85 * table.total_reflectance()[0]
-    fitted = fit_gaussians(table, 2, weights=TotalReflectanceHeld())
+    fitted = fit_gaussians(table, 2, weights=FixedTotalReflectance())
     np.testing.assert_allclose(fitted.gaussians.weights, truth().weights, rtol=1e-6)
 
 
@@ -135,7 +122,7 @@ def test_a_photograph_gives_the_profile_and_its_noise(float64):
     noise = 0.01
     dot = measure_laser_dot(photograph(noise=noise), MM_PER_PIXEL, power=2.0)
     np.testing.assert_allclose(dot.center, [60.2, 61.3], atol=0.1)
-    away = (dot.profile.values - truth()(dot.profile.radii)) / dot.deviation
+    away = (dot.profile.values - truth()(dot.profile.radii)) / dot.profile.deviation
     assert np.max(np.abs(away)) < 4.5
     np.testing.assert_allclose(np.std(away), 1, atol=0.25)
 
@@ -185,30 +172,18 @@ def test_saturated_rings_are_left_out(float64):
         measure_laser_dot(image, MM_PER_PIXEL, power=2.0, saturation=0.0)
 
 
-def test_a_measured_profile_is_fitted_without_negative_weights(float64):
-    dot = measure_laser_dot(photograph(noise=0.02), MM_PER_PIXEL, power=2.0)
-    fitted = fit_gaussians(dot.profile, 3, weights=NonNegativeWeights(), throw=False)
-    assert np.all(np.asarray(fitted.gaussians.weights) >= 0)
-    assert np.max(np.asarray(relative_error(dot.profile, fitted.gaussians))) < 0.05
-
-
 @pytest.mark.parametrize(
     ("change", "complaint"),
     [
-        ({"mm_per_pixel": 0.0}, "mm_per_pixel must be positive; got 0"),
-        ({"power": -1.0}, "power must be positive; got -1"),
-        ({"power": np.asarray([2.0, -1.0])}, "power must be positive; got -1"),
-        ({"step": 0.5}, "step must be at least 1 pixel; got 0.5"),
+        ({"mm_per_pixel": 0.0}, "mm_per_pixel must be positive"),
+        ({"power": -1.0}, "power must be positive"),
+        ({"power": np.asarray([2.0, -1.0])}, "power must be positive"),
+        ({"step": 0.5}, "step must be at least 1 pixel"),
         ({"center": (-3.0, 4.0)}, "center -3, 4 is outside of the picture of 121 x 121 pixels"),
+        ({"image": np.full((3, 3, 1), np.nan)}, "image must be finite"),
     ],
 )
 def test_bad_arguments_of_a_measurement_are_refused(change, complaint):
+    arguments = {"image": photograph(), "mm_per_pixel": MM_PER_PIXEL, "power": 1.0}
     with pytest.raises(ValueError, match=complaint):
-        measure_laser_dot(photograph(), **({"mm_per_pixel": MM_PER_PIXEL, "power": 1.0} | change))
-
-
-def test_a_pixel_that_is_no_number_is_named():
-    image = photograph()
-    image[7, 9, 1] = np.nan
-    with pytest.raises(ValueError, match="pixel 9, 7 is not finite"):
-        measure_laser_dot(image, MM_PER_PIXEL, power=1.0)
+        measure_laser_dot(**(arguments | change))

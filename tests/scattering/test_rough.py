@@ -120,9 +120,3 @@ def test_half_spaces_take_a_rough_surface(float64):
             model(medium, RoughFresnel(0.5)).total_reflectance() - model(medium).total_reflectance()
         )
         assert 1e-4 < abs(float(change[0])) < 0.1
-
-
-@pytest.mark.parametrize("roughness", [-0.1, 1.5])
-def test_an_impossible_roughness_is_refused(roughness):
-    with pytest.raises(ValueError, match=rf"roughness must be .*in \[0, 1\].*{roughness}"):
-        RoughFresnel(roughness)

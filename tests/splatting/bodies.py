@@ -5,22 +5,23 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from splatjax._combination import OneDevice
 from splatjax.scene import Camera, Splats
 from splatjax.splatting import (
-    Atlas,
+    AbstractRasterPlan,
+    AbstractView,
     FragmentSums,
     OrthographicView,
     PerspectiveView,
-    SummedFragments,
+    SplattingSettings,
     Surface,
     TileGrid,
-    farthest_depths,
-    splat_surfaces,
+    coverage,
 )
 
 
 def splats(centers, normals, radii, areas=None) -> Splats:
-    """Make splats in JAX's default precision from NumPy arrays of any."""
+    """Make splats in JAX's default precision; areas, unless given, from the radii."""
     normals = np.asarray(normals, float)
     normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
     radii = np.broadcast_to(np.asarray(radii, float), len(normals))
@@ -76,12 +77,7 @@ def bumpy(count: int, radius: float = 10.0, seed: int = 0) -> Splats:
 
 
 def joined(*bodies: Splats) -> Splats:
-    return Splats(
-        *(
-            jnp.concatenate([getattr(b, name) for b in bodies])
-            for name in ("centers", "normals", "radii", "areas")
-        )
-    )
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *bodies)
 
 
 def sheet(
@@ -115,7 +111,7 @@ def orthographic(scale=1.2, width=40, height=32) -> OrthographicView:
 
 
 class Pictures(eqx.Module):
-    """A `Surface`, put together from its tiles."""
+    """A surface as pictures: attributes in rows, depth in mm."""
 
     attributes: jax.Array
     depth: jax.Array
@@ -124,40 +120,38 @@ class Pictures(eqx.Module):
 
 
 class Drawn(eqx.Module):
-    """What `splat_surfaces` gives, as pictures."""
+    """The surface in front and the one behind it, and the capacity needed over planned."""
 
     front: Pictures
     behind: Pictures
     needed: jax.Array
 
 
-def drawn(body: Splats, rows, view, settings, rasterizer) -> Drawn:
-    surfaces, grid = (
-        splat_surfaces(body, rows, view, settings, rasterizer),
-        TileGrid(view.width, view.height),
-    )
-
-    def pictures(each: Surface) -> Pictures:
-        planes = grid.join(jnp.stack([each.depth, each.weight_sum, each.coverage], axis=1))
-        return Pictures(grid.join(each.attributes), *planes)
-
-    return Drawn(pictures(surfaces.front), pictures(surfaces.behind), surfaces.needed)
+def drawn(
+    body: Splats,
+    rows: jax.Array,
+    view: AbstractView,
+    settings: SplattingSettings,
+    plan: AbstractRasterPlan,
+) -> Drawn:
+    """Sum and blend the fragments of both surfaces."""
+    return pictures(plan.sum_fragments(body, rows, view, settings, OneDevice()), view, settings)
 
 
-def packed(depths, weight_sums, view):
-    """The atlas of a front surface and one behind it `[2, height, width]`, their points in it (mm),
-    and which are covered.
-    """
-    grid = TileGrid(view.width, view.height)
-    tiles = [grid.cut(jnp.stack(planes)) for planes in zip(depths, weight_sums, strict=True)]
-    sums = [
-        FragmentSums(
-            each[:, :0], each[:, 1] / jnp.where(each[:, 1] > 0, each[:, 0], 1.0), each[:, 1]
+def pictures(sums: FragmentSums, view: AbstractView, settings: SplattingSettings) -> Drawn:
+    """Join the tiles of both surfaces; where there is no surface all is 0, but the depth 1."""
+    grid, surface = TileGrid(view.width, view.height), Surface.of(sums.rows, view)
+    weights = sums.rows[:, -1]
+    planes = jnp.stack([surface.depth - 1, weights, coverage(weights, settings.full_coverage)], 1)
+    planes = jnp.concatenate([surface.attributes, planes], axis=1)
+
+    def join(places: slice) -> Pictures:
+        tiles = jnp.zeros((grid.count, *planes.shape[1:]), planes.dtype)
+        *attributes, depth, weight_sum, covered = grid.join(
+            tiles.at[sums.tiles[places]].set(planes[places], mode="drop")
         )
-        for each in tiles
-    ]
-    farthest = farthest_depths(SummedFragments(*sums, jnp.zeros((), depths.dtype)), view)
-    atlas = Atlas.of(farthest, view, farthest.size)
-    rows = atlas.pack(*tiles)
-    covered = rows[:, 1] > 0
-    return atlas, atlas.points(jnp.where(covered, rows[:, 0], 1.0)).transpose(1, 0, 2), covered
+        empty = jnp.zeros((0, view.height, view.width), planes.dtype)
+        attributes = jnp.stack(attributes) if attributes else empty
+        return Pictures(attributes, depth + 1, weight_sum, covered)
+
+    return Drawn(join(slice(sums.front)), join(slice(sums.front, None)), sums.needed)

@@ -1,4 +1,4 @@
-"""Lists per tile against every pair tried one by one."""
+"""Lists per tile against every pair tried one by one; their capacity; pixels in tiles."""
 
 import jax
 import jax.numpy as jnp
@@ -10,120 +10,117 @@ from splatjax.splatting import (
     TileGrid,
     TileRanges,
     bin_items,
+    round_up,
     scatter_slots,
     slot_plane,
 )
 
 GRID = TileGrid(61, 45, lanes=4, slots=4)
 COUNT = 900
+KINDS = ("scattered", "all in one tile", "off screen", "infinite")
 
 
 def boxes(kind):
+    """Left, right, top, bottom of items, and which are visible."""
     rng = np.random.default_rng(11)
-    middle, half = (
-        rng.uniform(-10, 70, (2, COUNT)),
-        np.exp(rng.uniform(np.log(0.1), np.log(30.0), (2, COUNT))),
-    )
+    middle = rng.uniform(-10, 70, (2, COUNT))
+    half = np.exp(rng.uniform(np.log(0.1), np.log(30.0), (2, COUNT)))
     if kind == "all in one tile":
         middle, half = rng.uniform(17, 23, (2, COUNT)), np.full((2, COUNT), 0.9)
     if kind == "off screen":
         middle, half = rng.uniform(-90, -40, (2, COUNT)), np.full((2, COUNT), 20.0)
     if kind == "infinite":
         half = np.where(rng.uniform(size=half.shape) < 0.05, np.inf, half)
-    return (
-        middle[0] - half[0],
-        middle[0] + half[0],
-        middle[1] - half[1],
-        middle[1] + half[1],
-        rng.uniform(size=COUNT) < 0.9,
-    )
+    (left, top), (right, bottom) = middle - half, middle + half
+    return left, right, top, bottom, rng.uniform(size=COUNT) < 0.9
 
 
 def brute_force(left, right, top, bottom, visible):
-    """Every item with a pixel center of the tile inside its box."""
-    pairs = set()
-    for tile in range(GRID.across * GRID.down):
-        columns = (
-            np.arange(tile % GRID.across * 8, min(tile % GRID.across * 8 + 8, GRID.width)) + 0.5
-        )
-        rows = (
-            np.arange(tile // GRID.across * 8, min(tile // GRID.across * 8 + 8, GRID.height)) + 0.5
-        )
-        in_x = ((columns >= left[:, None]) & (columns <= right[:, None])).any(1)
-        in_y = ((rows >= top[:, None]) & (rows <= bottom[:, None])).any(1)
-        pairs |= {(tile, int(item)) for item in np.nonzero(in_x & in_y & visible)[0]}
-    return pairs
+    """Every tile and item with a pixel center of the tile inside the item's box."""
+    tiles = np.arange(GRID.count)
+    x, y = (np.asarray(each) + 0.5 for each in GRID.columns_and_rows(jnp.asarray(tiles)))
+    x, y = np.where(GRID.within_picture(), x, np.nan), y
+    column, row = (each[:, None] for each in (x, y))
+    in_x = (column >= left[:, None]) & (column <= right[:, None])
+    in_y = (row >= top[:, None]) & (row <= bottom[:, None])
+    return set(zip(*np.nonzero(np.any(in_x & in_y, axis=2) & visible), strict=True))
 
 
 @jax.jit
 def ranges_of(left, right, top, bottom, visible):
-    return TileRanges.of(left, right, top, bottom, visible, GRID)
-
-
-def listed(bins):
-    """The lists of a `Bins`, tile by tile, in order."""
-    ids, order, first = np.asarray(bins.ids), np.asarray(bins.order), np.asarray(bins.first_block)
-    lists = {}
-    for place, tile in enumerate(order):
-        chunk, lane = divmod(place, GRID.lanes)
-        row = ids[first[chunk] : first[chunk + 1], lane].reshape(-1)
-        lists[int(tile)] = row[row < COUNT].tolist()
-    return lists
-
-
-KINDS = ("scattered", "all in one tile", "off screen", "infinite")
+    ranges = TileRanges.of(left, right, top, bottom, visible, GRID)
+    return ranges, ranges.per_tile(GRID)
 
 
 def every_kind():
     given = [boxes(kind) for kind in KINDS]
-    ranges = [
-        ranges_of(*(jnp.asarray(each, float) for each in box[:4]), jnp.asarray(box[4]))
-        for box in given
-    ]
-    return given, ranges
+    return given, [ranges_of(*(jnp.asarray(each) for each in box)) for box in given]
 
 
-@jax.jit
-def per_tile(ranges):
-    return ranges.per_tile(GRID)
+def lists_of(bins):
+    """The list of each tile, in order."""
+    ids, first = np.asarray(bins.ids), np.asarray(bins.first_block)
+    lists = {}
+    for place, tile in enumerate(np.asarray(bins.order).tolist()):
+        chunk, lane = divmod(place, GRID.lanes)
+        row = ids[first[chunk] : first[chunk + 1], lane].reshape(-1)
+        lists[tile] = row[row < COUNT].tolist()
+    return lists
 
 
 def test_lists_hold_exactly_the_pairs_of_brute_force_in_order():
     given, ranges = every_kind()
-    capacity = BinCapacity.for_counts([per_tile(each) for each in ranges], GRID)
-    binned = jax.jit(lambda r: bin_items(r, GRID, capacity))
-    for kind, box, item_ranges in zip(KINDS, given, ranges, strict=True):
+    capacity = BinCapacity.for_counts([counts for _, counts in ranges], GRID)
+    binned = jax.jit(lambda each: bin_items(each, GRID, capacity))
+    for kind, box, (item_ranges, counts) in zip(KINDS, given, ranges, strict=True):
         bins = binned(item_ranges)
-        lists = listed(bins)
-        expected = brute_force(*box)
-        assert {(tile, item) for tile, items in lists.items() for item in items} == expected, kind
-        assert sum(map(len, lists.values())) == len(expected), f"{kind}: a pair is listed twice"
+        lists = lists_of(bins)
+        pairs = [(tile, item) for tile, items in lists.items() for item in items]
+        assert sorted(pairs) == sorted(brute_force(*box)), kind
         assert all(items == sorted(items) for items in lists.values()), kind
-        assert 0 <= float(bins.needed) <= 1
-        counts = np.asarray(per_tile(item_ranges))
         assert [len(lists[tile]) for tile in range(GRID.tiles)] == counts.tolist(), kind
+        assert 0 <= float(bins.needed) <= 1
 
 
-@pytest.mark.parametrize(
-    "short", [{"pairs": 1024}, {"blocks": 1}, {"chunks": 1}], ids=lambda short: next(iter(short))
-)
+@pytest.mark.parametrize("short", [{"pairs": 1024}, {"blocks": 1}, {"chunks": 1}], ids=str)
 def test_too_small_a_capacity_is_reported(short):
     _, ranges = every_kind()
-    enough = BinCapacity.for_counts([per_tile(each) for each in ranges], GRID)
-    capacity = BinCapacity(
-        **({"pairs": enough.pairs, "blocks": enough.blocks, "chunks": enough.chunks} | short)
-    )
-    needed = float(jax.jit(lambda r: bin_items(r, GRID, capacity))(ranges[3]).needed)
-    assert needed > 1
+    enough = BinCapacity.for_counts([counts for _, counts in ranges], GRID)
+    named = {name: getattr(enough, name) for name in ("pairs", "blocks", "chunks")} | short
+    needed = jax.jit(lambda each: bin_items(each, GRID, BinCapacity(**named)).needed)
+    assert float(needed(ranges[3][0])) > 1
+
+
+def test_capacity_is_for_the_longest_list_of_every_chunk():
+    grid = TileGrid(64, 64, lanes=4, slots=8)  # 64 tiles
+    counts = np.zeros(64, int)
+    counts[[3, 9, 17, 40, 41]] = 100, 20, 9, 9, 1  # chunks of 13 and 1 blocks
+    for given, (pairs, blocks, chunks) in (
+        ([counts, counts[::-1] // 2], (139, 14, 2)),
+        ([np.zeros(64, int)], (1, 1, 1)),
+    ):
+        capacity = BinCapacity.for_counts([jnp.asarray(each) for each in given], grid)
+        expected = round_up(pairs, 1024), round_up(blocks, 4), round_up(chunks, 4)
+        assert (capacity.pairs, capacity.blocks, capacity.chunks) == expected
+    assert BinCapacity.for_counts([jnp.ones(64, int)], grid).chunks == 16  # no more than there are
+
+
+@pytest.mark.parametrize("step", [1, 4, 1024])
+def test_rounding_up_leaves_three_percent_and_takes_few_sizes(step):
+    counts = np.arange(0, 40_000, 7)
+    rounded = np.asarray([round_up(int(count), step) for count in counts])
+    assert np.all((rounded >= 1.03 * counts - 1) & (rounded > counts) & (rounded % step == 0))
+    assert np.all(rounded <= 1.03 * counts * (1 + 1 / 16) + step + 2)
+    assert len(np.unique(rounded[(counts > 16_384) & (counts < 32_768)])) <= 17
 
 
 def test_scatter_is_the_transpose_of_the_gather(dtype):
-    _, ranges = every_kind()
-    capacity = BinCapacity.for_counts([per_tile(ranges[0])], GRID)
+    ranges, counts = every_kind()[1][0]
+    capacity = BinCapacity.for_counts([counts], GRID)
 
     @jax.jit
     def both_ways(values, slots):
-        bins = bin_items(ranges[0], GRID, capacity)
+        bins = bin_items(ranges, GRID, capacity)
         gathered = slot_plane(values, 0.0, bins)
         return jnp.vdot(gathered, slots), jnp.vdot(values, scatter_slots(slots, bins, COUNT))
 
@@ -133,20 +130,17 @@ def test_scatter_is_the_transpose_of_the_gather(dtype):
     np.testing.assert_allclose(*both_ways(values, slots), rtol=1e-4)
 
 
-def test_tiles_are_cut_and_joined():
-    picture = jnp.asarray(np.random.default_rng(2).normal(size=(3, GRID.height, GRID.width)), float)
-    tiles = GRID.cut(picture)
-    assert tiles.shape == (GRID.count, 3, 64)
-    np.testing.assert_array_equal(np.asarray(GRID.join(tiles)), np.asarray(picture))
-    within = GRID.within_picture()
-    assert within.sum() == GRID.width * GRID.height
-    assert not np.any(np.asarray(tiles)[np.broadcast_to(~within[:, None], tiles.shape)])
-    assert TileGrid(64, 48).within_picture() is None
-
-
 def test_pixels_are_numbered_tile_by_tile():
     x, y = np.meshgrid(np.arange(GRID.width), np.arange(GRID.height))
-    numbers = np.asarray(GRID.cut(jnp.asarray(np.stack([x, y]), float)), int)
-    found = np.asarray(GRID.pixel(jnp.asarray(x), jnp.asarray(y))).reshape(-1)
+    picture = jnp.asarray(np.stack([x, y]), float)
+    tiles = GRID.cut(picture)
+    np.testing.assert_array_equal(GRID.join(tiles), picture)
+    within = GRID.within_picture()
+    assert within.sum() == x.size
+    assert not np.any(np.asarray(tiles).transpose(0, 2, 1)[~within])
+    assert TileGrid(64, 48).within_picture() is None
+    numbers = np.asarray(GRID.pixel(jnp.asarray(x), jnp.asarray(y))).reshape(-1)
     for row, expected in enumerate((x, y)):
-        np.testing.assert_array_equal(numbers[:, row].reshape(-1)[found], expected.reshape(-1))
+        np.testing.assert_array_equal(
+            np.asarray(tiles)[:, row].reshape(-1)[numbers], expected.ravel()
+        )

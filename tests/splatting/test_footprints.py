@@ -1,4 +1,6 @@
-"""Footprints against rays cut with planes, their boxes, and the law of the screen filter."""
+"""Footprints against rays cut with planes, their boxes, the law of the screen filter, and which
+splats a view may see.
+"""
 
 import bodies
 import equinox as eqx
@@ -8,18 +10,14 @@ import numpy as np
 import pytest
 
 from splatjax.splatting import SplattingSettings, fragment_weight
+from splatjax.splatting._views import MARGIN
 
 NO_FILTER = SplattingSettings(filter_radius=1e-4)
-FINE = {
-    "width": 40_000,
-    "height": 32_000,
-}  # the quarter pixel that keeps slopes finite is nothing here
-AGREEMENT = {
-    "float64": 2e-5,
-    "float32": 2e-3,
-}  # x64: that quarter pixel; float32: slanted discs cancel by tan^2
+# In pixels so fine, the quarter pixel that keeps slopes finite is nothing.
+FINE = {"width": 40_000, "height": 32_000}
+# float64: that quarter pixel; float32: slanted discs cancel by the squared tangent.
+AGREEMENT = {"float64": 2e-5, "float32": 2e-3}
 POWER_ERROR = 0.045  # of a filter of radius root 2 on the pixels' grid
-
 VIEWS = {"perspective": bodies.perspective, "orthographic": bodies.orthographic}
 FINE_VIEWS = {
     "perspective": lambda: bodies.perspective(**FINE),
@@ -34,36 +32,47 @@ def scattered(count=60, seed=3):
     return bodies.splats(rng.uniform(-9, 9, (count, 3)), normals, rng.uniform(0.5, 5.0, count))
 
 
-def offsets(footprints, reach=1.25, steps=17):
-    """Pixels in and around every box, `[splats, samples]`."""
+def footprints_of(view, body, settings=SplattingSettings()):
+    footprints = jax.jit(lambda body: view.footprints(body, settings))(body)
+    box = footprints.left, footprints.right, footprints.top, footprints.bottom
+    return footprints, np.stack([np.asarray(each, float) for each in box])
+
+
+def around(box, reach, steps):
+    """Columns and rows in and around every box, `[splats, samples]`."""
     grid = np.linspace(-reach, reach, steps)
     u, v = (each.reshape(1, -1) for each in np.meshgrid(grid, grid))
-    left, right, top, bottom = (np.asarray(each)[:, None] for each in _box(footprints))
-    return 0.5 * (left + right) + 0.5 * (right - left) * u, 0.5 * (top + bottom) + 0.5 * (
-        bottom - top
-    ) * v
-
-
-def _box(footprints):
-    return footprints.left, footprints.right, footprints.top, footprints.bottom
+    left, right, top, bottom = box[:, :, None]
+    return (left + right + (right - left) * u) / 2, (top + bottom + (bottom - top) * v) / 2
 
 
 @eqx.filter_jit
 def fragments(footprints, view, x, y):
-    """Give which are inside the rim, rho^2 and depth at pixels `[splats, samples]`."""
+    """Return which are seen, rho^2 and depth at pixels `[splats, samples]`."""
     f = jax.tree.map(lambda leaf: leaf[:, None], footprints)
-    dx, dy = x - f.x, y - f.y
+    dx, dy = jnp.asarray(x, f.x.dtype) - f.x, jnp.asarray(y, f.x.dtype) - f.y
     nearness = f.nearness + f.slope_x * dx + f.slope_y * dy
     quadric = f.a * dx * dx + f.b * dx * dy + f.c * dy * dy
-    return (
-        view.inside(nearness, quadric),
-        view.squared_radius(nearness, quadric),
-        view.depth(nearness),
+    seen = f.visible & view.inside(nearness, quadric)
+    return seen, view.squared_radius(nearness, quadric), view.depth(nearness)
+
+
+@eqx.filter_jit
+def power(body, view):
+    """Add up the weights of every splat over all pixels."""
+    footprints = view.footprints(body, SplattingSettings())
+    grid = (jnp.arange(size, dtype=body.radii.dtype) + 0.5 for size in (view.width, view.height))
+    x, y = (
+        jnp.broadcast_to(each.reshape(1, -1), (body.count, each.size))
+        for each in jnp.meshgrid(*grid)
     )
+    seen, squared_radius, _ = fragments(footprints, view, x, y)
+    weight = jnp.where(seen, fragment_weight(jnp.where(seen, squared_radius, 1.0)), 0.0)
+    return jnp.sum(weight, axis=1), footprints.opacity
 
 
 def rays(view, x, y):
-    """Give where rays through pixels start, and where they go; float64."""
+    """Return where rays through pixels start, and where they go; float64."""
     rotation, position = np.asarray(view.rotation, float), np.asarray(view.position, float)
     x, y = np.asarray(x, float) - view.width / 2, np.asarray(y, float) - view.height / 2
     if hasattr(view, "focal_length"):
@@ -77,11 +86,9 @@ def rays(view, x, y):
 @pytest.mark.parametrize("kind", VIEWS)
 def test_fragments_are_where_rays_meet_discs(kind, dtype):
     view, body = FINE_VIEWS[kind](), scattered()
-    footprints = jax.jit(lambda s: view.footprints(s, NO_FILTER))(body)
-    x, y = offsets(footprints)
-    _, squared_radius, depth = fragments(
-        footprints, view, jnp.asarray(x, dtype), jnp.asarray(y, dtype)
-    )
+    footprints, box = footprints_of(view, body, NO_FILTER)
+    x, y = around(box, 1.25, 17)
+    _, squared_radius, depth = (np.asarray(each) for each in fragments(footprints, view, x, y))
     start, along = rays(view, x, y)
     centers, normals = (np.asarray(each, float)[:, None] for each in (body.centers, body.normals))
     t = np.sum((centers - start) * normals, -1) / np.sum(along * normals, -1)
@@ -90,49 +97,33 @@ def test_fragments_are_where_rays_meet_discs(kind, dtype):
     facing = -np.sum(along * normals, -1) / np.linalg.norm(along, axis=-1)
     chosen = np.asarray(footprints.visible)[:, None] & (facing > 0.15) & (expected < 2) & (t > 1)
     assert np.mean(chosen) > 0.2
-    tolerance = AGREEMENT[str(dtype)]
-    np.testing.assert_allclose(
-        np.asarray(squared_radius)[chosen], expected[chosen], rtol=tolerance, atol=tolerance
-    )
     forward = (hit - np.asarray(view.position, float)) @ np.asarray(view.rotation, float)[2]
-    np.testing.assert_allclose(
-        np.asarray(depth)[chosen], forward[chosen], rtol=tolerance, atol=tolerance
-    )
+    tolerance = {"rtol": AGREEMENT[str(dtype)], "atol": AGREEMENT[str(dtype)]}
+    np.testing.assert_allclose(squared_radius[chosen], expected[chosen], **tolerance)
+    np.testing.assert_allclose(depth[chosen], forward[chosen], **tolerance)
 
 
 @pytest.mark.parametrize("kind", VIEWS)
-def test_boxes_hold_the_rim_exactly(kind, dtype):
+def test_boxes_hold_the_rim_exactly_and_all_that_is_inside(kind):
     view, body = FINE_VIEWS[kind](), scattered()
-    footprints = jax.jit(lambda s: view.footprints(s, NO_FILTER))(body)
+    footprints, box = footprints_of(view, body, NO_FILTER)
     normals = np.asarray(body.normals, float)
     a = np.cross(normals, [[0.3, 1.0, 0.2]])
     a /= np.linalg.norm(a, axis=1, keepdims=True)
     angle = np.linspace(0, 2 * np.pi, 1441)[None, :, None]
     rim = np.cos(angle) * a[:, None] + np.sin(angle) * np.cross(normals, a)[:, None]
-    rim = (
-        np.asarray(body.centers, float)[:, None]
-        + np.asarray(body.radii, float)[:, None, None] * rim
-    )
-    column, row, _ = (
-        np.asarray(each) for each in view.project(jnp.asarray(rim.transpose(2, 0, 1), dtype))
-    )
-    found = np.stack([np.asarray(each) for each in _box(footprints)])
+    rim = np.asarray(body.centers)[:, None] + np.asarray(body.radii)[:, None, None] * rim
+    column, row, _ = view.project(jnp.asarray(rim.transpose(2, 0, 1), float))
     expected = np.stack([column.min(1), column.max(1), row.min(1), row.max(1)])
     visible = np.asarray(footprints.visible)
     assert visible.sum() > 30
-    np.testing.assert_allclose(
-        found[:, visible], expected[:, visible], atol=0.05
-    )  # of radii of 500 pixels and more
-
-
-@pytest.mark.parametrize("kind", VIEWS)
-def test_nothing_inside_the_rim_lies_outside_the_box(kind, dtype):
+    # Of radii of 500 pixels and more.
+    np.testing.assert_allclose(box[:, visible], expected[:, visible], atol=0.05)
     view = VIEWS[kind]()
-    footprints = jax.jit(lambda s: view.footprints(s, SplattingSettings()))(scattered())
-    x, y = offsets(footprints, reach=1.6, steps=41)
-    inside, _, _ = fragments(footprints, view, jnp.asarray(x, dtype), jnp.asarray(y, dtype))
-    inside = np.asarray(inside & footprints.visible[:, None])
-    left, right, top, bottom = (np.asarray(each)[:, None] for each in _box(footprints))
+    footprints, box = footprints_of(view, body)
+    x, y = around(box, 1.6, 41)
+    inside, _, _ = fragments(footprints, view, x, y)
+    left, right, top, bottom = box[:, :, None]
     slack = 1e-4 * (right - left + bottom - top)
     in_box = (x > left - slack) & (x < right + slack) & (y > top - slack) & (y < bottom + slack)
     assert np.sum(inside) > 1000
@@ -144,61 +135,21 @@ def test_power_of_small_splats_does_not_depend_on_where_they_lie(kind):
     """The weights of a splat add up to its projected area times the kernel's mean, be it larger or
     smaller than a pixel.
     """
-    view = (
-        bodies.perspective(width=24, height=24)
-        if kind == "perspective"
-        else bodies.orthographic(width=24, height=24)
-    )
-    rng = np.random.default_rng(5)
-    count, across = 192, np.asarray(view.rotation, float)[:2]
-    centers = rng.uniform(-0.7, 0.7, (count, 2)) @ across
+    view = VIEWS[kind](width=24, height=24)
+    rng, count, axes = np.random.default_rng(5), 192, np.asarray(view.rotation, float)
+    centers = rng.uniform(-0.7, 0.7, (count, 2)) @ axes[:2]
     radii = np.exp(rng.uniform(np.log(1e-3), np.log(2.0), count))
-    normals = rng.normal(size=(count, 3)) * 0.5 - np.asarray(view.rotation, float)[2]
-    body = bodies.splats(centers, normals, radii)
-    grid = jnp.arange(24, dtype=float) + 0.5
-    x, y = (
-        jnp.broadcast_to(each.reshape(1, -1), (count, 576)) for each in jnp.meshgrid(grid, grid)
-    )
-
-    @jax.jit
-    def power(body):
-        footprints = view.footprints(body, SplattingSettings())
-        inside, squared_radius, _ = fragments(footprints, view, x, y)
-        weight = jnp.where(inside, fragment_weight(jnp.where(inside, squared_radius, 1.0)), 0.0)
-        return footprints.opacity * jnp.sum(weight, axis=1)
-
-    _, along = rays(view, np.full((1,), 12.0), np.full((1,), 12.0))
-    cosine = -np.asarray(body.normals, float) @ (along[0] / np.linalg.norm(along[0]))
+    body = bodies.splats(centers, rng.normal(size=(count, 3)) * 0.5 - axes[2], radii)
+    cosine = -np.asarray(body.normals, float) @ axes[2]
     mean_weight = (1 - np.exp(-4)) / 4 - 3 * np.exp(-4)
-    pixels = np.asarray(body.radii, float) * float(view.pixels_per_mm(jnp.asarray(40.0)))
-    expected = np.pi * pixels**2 * cosine * mean_weight
-    small = cosine > 0.3
-    tilt = np.where(
-        hasattr(view, "focal_length"), 0.03, 0.0
-    )  # what the center's depth and slant leave out
-    np.testing.assert_allclose(
-        np.asarray(power(body))[small], expected[small], rtol=POWER_ERROR + tilt
-    )
-
-
-def test_splats_beside_the_eye_do_not_veil_the_picture(dtype):
-    """A splat barely before the eye's plane, far to the side: nothing of it is seen, in float32
-    neither.
-    """
-    view = bodies.perspective(eye=(0.0, 0.0, 0.0), target=(0.0, 0.0, -1.0), width=64, height=64)
-    angle = np.linspace(0, 2 * np.pi, 24, endpoint=False)
-    depth = np.exp(np.linspace(np.log(0.011), np.log(1.0), 24))
-    centers = np.stack([50 * np.cos(angle), 50 * np.sin(angle), -depth], 1)
-    body = bodies.splats(
-        centers, np.random.default_rng(6).normal(size=(24, 3)) * 0.5 - centers / 50, 5.0
-    )
-    footprints = jax.jit(lambda s: view.footprints(s, SplattingSettings()))(body)
-    x, y = (
-        jnp.asarray(np.tile(each.reshape(1, -1), (24, 1)), dtype)
-        for each in np.mgrid[0.5:64:4, 0.5:64:4]
-    )
-    inside, _, _ = fragments(footprints, view, x, y)
-    assert not bool(jnp.any(inside & footprints.visible[:, None]))
+    is_perspective = kind == "perspective"
+    scale = float(view.focal_length) / 40 if is_perspective else float(view.scale)
+    expected = np.pi * (radii * scale) ** 2 * cosine * mean_weight
+    weights, opacity = (np.asarray(each) for each in power(body, view))
+    chosen = cosine > 0.3
+    tilt = 0.03 if is_perspective else 0.0  # what the center's depth and slant leave out
+    found = (weights * opacity)[chosen]
+    np.testing.assert_allclose(found, expected[chosen], rtol=POWER_ERROR + tilt)
 
 
 def test_the_filter_is_the_narrowest_that_keeps_power_to_four_percent():
@@ -206,17 +157,58 @@ def test_the_filter_is_the_narrowest_that_keeps_power_to_four_percent():
     the narrower the filter.
     """
     view = bodies.orthographic(width=24, height=24)
-    places = np.linspace(0, 1, 16, endpoint=False) / float(view.pixels_per_mm(jnp.asarray(40.0)))
-    across, toward = np.asarray(view.rotation, float)[:2], np.asarray(view.rotation, float)[2]
-    centers = np.stack([each.ravel() for each in np.meshgrid(places, places)], axis=1) @ across
-    body = bodies.splats(centers, np.tile(-toward, (256, 1)), np.full(256, 1e-3))
-    x, y = (
-        jnp.asarray(np.tile(each.reshape(1, -1), (256, 1)), float)
-        for each in np.mgrid[0.5:24, 0.5:24]
-    )
-    footprints = jax.jit(lambda s: view.footprints(s, SplattingSettings()))(body)
-    inside, squared_radius, _ = jax.jit(lambda f: fragments(f, view, x, y))(footprints)
-    weights = np.sum(
-        np.where(inside, fragment_weight(jnp.where(inside, squared_radius, 1.0)), 0.0), axis=1
-    )
+    places = np.linspace(0, 1, 16, endpoint=False) / float(view.scale)
+    axes = np.asarray(view.rotation, float)
+    centers = np.stack([each.ravel() for each in np.meshgrid(places, places)], axis=1) @ axes[:2]
+    body = bodies.splats(centers, np.tile(-axes[2], (256, 1)), np.full(256, 1e-3))
+    weights = np.asarray(power(body, view)[0])
     assert 0.5 * POWER_ERROR < np.ptp(weights) / np.mean(weights) < POWER_ERROR
+
+
+def test_splats_beside_the_eye_do_not_veil_the_picture():
+    """A splat barely before the eye's plane, far to the side: nothing of it is seen, in float32
+    neither.
+    """
+    view = bodies.perspective(eye=(0.0, 0.0, 0.0), target=(0.0, 0.0, -1.0), width=64, height=64)
+    angle = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    depth = np.exp(np.linspace(np.log(0.011), np.log(1.0), 24))
+    centers = np.stack([50 * np.cos(angle), 50 * np.sin(angle), -depth], 1)
+    normals = np.random.default_rng(6).normal(size=(24, 3)) * 0.5 - centers / 50
+    weights, _ = power(bodies.splats(centers, normals, 5.0), view)
+    assert not np.any(weights)
+
+
+@pytest.mark.parametrize("kind", VIEWS)
+def test_spheres_that_touch_the_picture_may_be_seen_where_they_face_the_eye(kind):
+    """Spheres beside each edge of the picture and its margin, missing it by a part of their
+    radius.
+    """
+    view, rng, count = VIEWS[kind](width=48, height=30), np.random.default_rng(8), 400
+    axes, eye = np.asarray(view.rotation, float), np.asarray(view.position, float)
+    # Points on the margin's edges: left, right, top, bottom.
+    radii, depth = rng.uniform(0.05, 3.0, count), rng.uniform(5, 25, count)
+    edge, along = rng.integers(0, 4, count), rng.uniform(0.1, 0.9, count)
+    size = np.where(edge < 2, view.width, view.height)
+    across = np.where(edge % 2 == 0, -MARGIN, size + MARGIN)
+    column = np.where(edge < 2, across, along * view.width)
+    row = np.where(edge < 2, along * view.height, across)
+    column, row, depth = (jnp.asarray(each, float) for each in (column, row, depth))
+    touched = np.asarray(view.unproject(column, row, depth), float).T
+    # The planes through those edges: through the eye in perspective.
+    side = np.where(edge % 2 == 0, -1.0, 1.0)[:, None]
+    toward, forward = np.tile(-axes[2], (count, 1)), np.zeros((count, 1))
+    if kind == "perspective":
+        forward = -(0.5 * size + MARGIN)[:, None] / float(view.focal_length)
+    outward = side * axes[np.where(edge < 2, 0, 1)] + forward * axes[2]
+    outward /= np.linalg.norm(outward, axis=1, keepdims=True)
+    may_see = jax.jit(lambda body: view.may_see(body))
+    for off in (-2.5, -1.0, -0.02, 0.02, 1.0):
+        centers = touched + (1 + off) * radii[:, None] * outward
+        if kind == "perspective":
+            toward = eye - centers
+        found = may_see(bodies.splats(centers, toward, radii))
+        np.testing.assert_array_equal(found, np.full(count, off < 0), err_msg=str(off))
+        assert not np.any(may_see(bodies.splats(centers, -toward, radii)))
+    if kind == "perspective":  # nothing at the eye's own plane or behind it
+        behind = eye - np.linspace(-0.5 * view.near, 5, 7)[:, None] * axes[2]
+        assert not np.any(view.may_see(bodies.splats(behind, np.tile(axes[2], (7, 1)), 1.0)))

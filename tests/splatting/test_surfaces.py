@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from splatjax.splatting import DenseRasterizer, OrthographicView, SplattingSettings, TileRasterizer
-from splatjax.splatting._sweeps import second_limits
 
 SETTINGS = SplattingSettings()
 VIEWS = {"perspective": bodies.perspective, "orthographic": bodies.orthographic}
@@ -16,10 +15,20 @@ PLANE = 1e-5  # of the distance: float32's rounding, and what the quarter pixel 
 DISTANCE = 40.0
 
 
-def drawn(view, body, rows, rasterizer=None):
-    """Draw with the plain rasterizer, unless another is given."""
-    rasterizer = DenseRasterizer() if rasterizer is None else rasterizer
-    return jax.jit(lambda s, r: bodies.drawn(s, r, view, SETTINGS, rasterizer))(body, rows)
+RASTERIZERS = {"plain": DenseRasterizer(), "tiles": TileRasterizer(lanes=8, slots=16)}
+
+
+def drawn(view, body, rows=None, rasterizer="plain"):
+    """Draw rows of attributes, or none."""
+    plan = RASTERIZERS[rasterizer].make_plan([body], [view], SETTINGS)
+    rows = jnp.zeros((0, body.count)) if rows is None else rows
+    return jax.jit(lambda body, rows: bodies.drawn(body, rows, view, SETTINGS, plan))(body, rows)
+
+
+def seen_through(surfaces) -> tuple[np.ndarray, np.ndarray]:
+    """Return the coverage of the front, and that of both surfaces together."""
+    front, behind = np.asarray(surfaces.front.coverage), np.asarray(surfaces.behind.coverage)
+    return front, front + (1 - front) * behind
 
 
 @pytest.mark.parametrize("kind", VIEWS)
@@ -56,7 +65,7 @@ def seen_sphere(view, radius, share):
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_coverage_is_one_inside_a_closed_surface(seed):
     view, radius = bodies.perspective(width=48, height=48), 11.0
-    surfaces = drawn(view, bodies.sphere(1500, radius, seed=seed), jnp.zeros((0, 1500)))
+    surfaces = drawn(view, bodies.sphere(1500, radius, seed=seed))
     inside, outside = seen_sphere(view, radius, 0.93), ~seen_sphere(view, radius, 1.15)
     front = np.asarray(surfaces.front.coverage)
     assert inside.sum() > 600
@@ -65,10 +74,10 @@ def test_coverage_is_one_inside_a_closed_surface(seed):
 
 
 @pytest.mark.once
-@pytest.mark.parametrize("rasterizer", ["plain", "tiles"])
-def test_two_silhouettes_in_one_pixel_leave_no_gap(rasterizer):
-    """Two small spheres whose outlines coincide, before a large one: neither rim may hide what lies
-    behind both.
+@pytest.mark.parametrize("rasterizer", RASTERIZERS)
+def test_inner_silhouettes_leave_no_gap(rasterizer):
+    """Small spheres before a large one: where they end, the large one shows. The outlines of the
+    first two coincide: neither rim may hide what lies behind both.
     """
     view, radius = bodies.perspective(width=64, height=64), 12.0
     near, far, small = 20.0, 15.0, 3.0
@@ -76,40 +85,19 @@ def test_two_silhouettes_in_one_pixel_leave_no_gap(rasterizer):
     twin = small * (DISTANCE - far) / (DISTANCE - near)
     places = [along * [DISTANCE - z, DISTANCE - z, z] for z in (near, far)]
     body = bodies.joined(
-        bodies.joined(bodies.sphere(1400, radius), bodies.sphere(400, small, places[0], seed=1)),
+        bodies.sphere(1400, radius),
+        bodies.sphere(400, small, places[0], seed=1),
         bodies.sphere(400, twin, places[1], seed=2),
+        bodies.sphere(300, 2.0, (-5.0, 4.0, 17.0), seed=1),
     )
-    tiles = TileRasterizer(lanes=8, slots=16).planned(body, [view], SETTINGS)
-    surfaces = drawn(
-        view,
-        body,
-        jnp.zeros((0, body.count)),
-        DenseRasterizer() if rasterizer == "plain" else tiles,
-    )
-    front, behind = np.asarray(surfaces.front.coverage), np.asarray(surfaces.behind.coverage)
-    inside = seen_sphere(view, radius, 0.9)
-    assert (inside & (front < 1)).sum() >= 8, "the silhouettes lie between pixels"
-    assert np.min((front + (1 - front) * behind)[inside]) > 1 - 1e-6
-
-
-@pytest.mark.once
-@pytest.mark.parametrize("rasterizer", ["plain", "tiles"])
-def test_an_inner_silhouette_leaves_no_gap(rasterizer):
-    """A small sphere before a large one: where the small one ends, the large one shows."""
-    view, radius = bodies.perspective(width=48, height=48), 12.0
-    body = bodies.joined(
-        bodies.sphere(1400, radius), bodies.sphere(300, 3.0, (1.5, -1.0, 17.0), seed=1)
-    )
-    near = jnp.concatenate([jnp.zeros((1, 1400)), jnp.ones((1, 300))], axis=1)
-    tiles = TileRasterizer(lanes=8, slots=16).planned(body, [view], SETTINGS)
-    surfaces = drawn(view, body, near, DenseRasterizer() if rasterizer == "plain" else tiles)
-    front, behind = np.asarray(surfaces.front.coverage), np.asarray(surfaces.behind.coverage)
-    inside = seen_sphere(view, radius, 0.9)
+    is_small = (jnp.arange(body.count) >= 1400).astype(float)
+    surfaces = drawn(view, body, is_small[None], rasterizer)
+    (front, both), inside = seen_through(surfaces), seen_sphere(view, radius, 0.9)
     edge = inside & (front < 1)
-    assert edge.sum() >= 8, "the silhouette lies between pixels"
-    assert np.min((front + (1 - front) * behind)[inside]) > 1 - 1e-6
+    assert edge.sum() >= 16, "the silhouettes lie between pixels"
+    assert np.min(both[inside]) > 1 - 1e-6
     assert np.all(np.asarray(surfaces.front.attributes[0])[edge] > 0.99)
-    assert np.all(np.asarray(surfaces.behind.attributes[0])[edge] < 0.01)
+    assert np.median(np.asarray(surfaces.behind.attributes[0])[edge]) < 0.01
 
 
 def limb(pixel: float, radius: float):
@@ -134,7 +122,7 @@ def limb(pixel: float, radius: float):
 
 
 @pytest.mark.once
-@pytest.mark.parametrize("rasterizer", ["plain", "tiles"])
+@pytest.mark.parametrize("rasterizer", RASTERIZERS)
 @pytest.mark.parametrize("kind", VIEWS)
 def test_an_edge_hides_nothing_behind_it_however_small_the_splats(kind, rasterizer):
     """Fragments of splats smaller than a pixel weigh less than those that the surface behind an
@@ -151,28 +139,20 @@ def test_an_edge_hides_nothing_behind_it_however_small_the_splats(kind, rasteriz
         facing = jnp.diag(jnp.asarray([1.0, -1.0, -1.0]))
         view = OrthographicView(jnp.zeros(3), facing, jnp.asarray(1 / pixel), width, height)
     body = limb(pixel, 0.3)
-    tiles = TileRasterizer(lanes=2, slots=16).planned(body, [view], SETTINGS)
-    surfaces = drawn(
-        view,
-        body,
-        jnp.zeros((0, body.count)),
-        DenseRasterizer() if rasterizer == "plain" else tiles,
-    )
-    front, behind = np.asarray(surfaces.front.coverage), np.asarray(surfaces.behind.coverage)
+    front, both = seen_through(drawn(view, body, None, rasterizer))
     assert np.any(front < 1), "the edge lies between pixels"
-    assert np.min(front + (1 - front) * behind) > 1 - 1e-6
+    assert np.min(both) > 1 - 1e-6
 
 
 def test_coverage_of_a_silhouette_is_differentiable(float64):
     """Moving a disc before nothing changes its coverage by central differences."""
     view = bodies.perspective(width=24, height=24)
-    body = bodies.sphere(200, 6.0)
+    body, ramp = bodies.sphere(200, 6.0), jnp.arange(24, dtype=float)
 
     @jax.jit
     def covered(shift):
         moved = eqx.tree_at(lambda s: s.centers, body, body.centers + shift[None])
-        surfaces = bodies.drawn(moved, jnp.zeros((0, 200)), view, SETTINGS, DenseRasterizer())
-        ramp = jnp.arange(24, dtype=float)
+        surfaces = drawn(view, moved)
         return jnp.sum(surfaces.front.coverage * (ramp[None] + 2 * ramp[:, None]))
 
     shift, step = jnp.asarray([0.1, -0.2, 0.3]), 1e-6
@@ -180,12 +160,3 @@ def test_coverage_of_a_silhouette_is_differentiable(float64):
     steps = step * jnp.eye(3)
     differences = [float(covered(shift + d) - covered(shift - d)) / (2 * step) for d in steps]
     np.testing.assert_allclose(gradient, differences, rtol=1e-5)
-
-
-def test_what_lies_behind_ends_where_something_weighs_or_else_where_anything_is(dtype):
-    nothing = -jnp.inf
-    weighty, of_any = (
-        jnp.asarray([[-5.0, nothing, nothing]], dtype),
-        jnp.asarray([[-2.0, -3.0, nothing]], dtype),
-    )
-    np.testing.assert_array_equal(second_limits(weighty, of_any), [[-5.0, -3.0, jnp.inf]])

@@ -1,0 +1,150 @@
+"""How partial results of parts of the splats are combined: on one device there is one part, over a
+mesh each device holds one, and a stream brings one after the other.
+"""
+
+import abc
+import functools
+from collections.abc import Callable, Iterable
+from typing import TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.lax import stop_gradient
+from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Array, Float, PyTree, Shaped
+
+Partial = TypeVar("Partial", bound=PyTree)
+
+
+class AbstractCombination(eqx.Module):
+    """Combines what was computed for each part. Static.
+
+    Partial results are given one after the other, one for each part that this process holds.
+    """
+
+    @abc.abstractmethod
+    def own_total(self, partials: Iterable[Partial]) -> Partial:
+        """Sum over the parts on this device. Differentiable."""
+
+    @abc.abstractmethod
+    def largest(self, partials: Iterable[Partial]) -> Partial:
+        """Take the maximum over all parts, as a constant of the derivative."""
+
+    def total(self, partials: Iterable[Partial]) -> Partial:
+        """Sum over all parts. Differentiable."""
+        return self.own_total(partials)
+
+    def own_share(self, rows: Float[Array, "rows ..."]) -> Float[Array, "share ..."]:
+        """Sum the rows of all devices, and keep this device's share of them. Differentiable."""
+        return rows
+
+    def own_rows(self, rows: Shaped[Array, "rows ..."]) -> Shaped[Array, "share ..."]:
+        """Keep this device's share of rows that are the same on all devices."""
+        return rows
+
+    def gather(self, share: Partial) -> Partial:
+        """Concatenate the shares of all devices along the first axis. Differentiable."""
+        return share
+
+    def gather_last(self, share: Partial) -> Partial:
+        """Concatenate the shares of all devices along the last axis. Differentiable."""
+        return share
+
+
+class OneDevice(AbstractCombination):
+    """There is one part, and it is the whole."""
+
+    def own_total(self, partials):
+        (whole,) = partials
+        return whole
+
+    def largest(self, partials):
+        (whole,) = partials
+        return jax.tree.map(stop_gradient, whole)
+
+
+class DeviceMesh(AbstractCombination):
+    """Each device of a mesh holds one part, whatever the axes of the mesh: inside `jax.shard_map`,
+    by the collectives of JAX.
+    """
+
+    axes: tuple[str, ...] = eqx.field(static=True)
+    count: int = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, mesh: Mesh) -> "DeviceMesh":
+        return cls(tuple(mesh.axis_names), mesh.size)
+
+    @property
+    def shares(self) -> PartitionSpec:
+        """Specify that rows are cut into a share for each device."""
+        return PartitionSpec(self.axes)
+
+    def own_total(self, partials):
+        (own,) = partials
+        return own
+
+    def largest(self, partials):
+        (own,) = partials
+        return jax.tree.map(lambda leaf: jax.lax.pmax(stop_gradient(leaf), self.axes), own)
+
+    def total(self, partials):
+        return jax.lax.psum(self.own_total(partials), self.axes)
+
+    def own_share(self, rows):
+        return jax.lax.psum_scatter(rows, self.axes, scatter_dimension=0, tiled=True)
+
+    def own_rows(self, rows):
+        share = rows.shape[0] // self.count
+        return jax.lax.dynamic_slice_in_dim(rows, jax.lax.axis_index(self.axes) * share, share)
+
+    def gather(self, share):
+        return jax.tree.map(
+            lambda rows: jax.lax.all_gather(rows, self.axes, axis=0, tiled=True), share
+        )
+
+    def gather_last(self, share):
+        turned = jax.tree.map(lambda rows: jnp.moveaxis(rows, -1, 0), share)
+        return jax.tree.map(lambda rows: jnp.moveaxis(rows, 0, -1), self.gather(turned))
+
+
+class PartByPart(AbstractCombination):
+    """Parts come one after the other, and nothing is kept of a part but its result."""
+
+    def own_total(self, partials):
+        return _fold(jnp.add, partials)
+
+    def largest(self, partials):
+        return _fold(jnp.maximum, partials)
+
+
+def _fold(operation: Callable[[Array, Array], Array], partials: Iterable[Partial]) -> Partial:
+    def combine(so_far, part):
+        # Parts that are read ahead of the computation would pile up.
+        return jax.block_until_ready(jax.tree.map(operation, so_far, part))
+
+    return functools.reduce(combine, partials)
+
+
+def extreme(
+    values: Float[Array, "rows *more"], combination: AbstractCombination
+) -> Float[Array, "*more"]:
+    """Take the maximum over the rows of all parts. Equal rows share the derivative."""
+    largest = combination.largest([jnp.max(values, axis=0)])
+    equal = values == largest[None]
+    sums = (
+        jnp.sum(jnp.where(equal, values, 0), axis=0),
+        jnp.sum(equal, axis=0).astype(values.dtype),
+    )
+    total, count = combination.total([sums])
+    return largest + total / count - stop_gradient(total / count)
+
+
+def lay_out(mesh: Mesh, trees: Partial, specs: Partial) -> Partial:
+    """Lay arrays out over a mesh with explicit axes; `shard_map` itself does so for others."""
+    if AxisType.Explicit not in mesh.axis_types:
+        return trees
+    return jax.tree.map(
+        lambda leaf, spec: jax.reshard(leaf, NamedSharding(mesh, spec)), trees, specs
+    )

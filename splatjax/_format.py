@@ -1,0 +1,22 @@
+"""Format counts, errors and channel names for people to read."""
+
+import math
+
+
+def channel_names(count: int) -> tuple[str, ...]:
+    """Return default names of channels: red, green and blue for three of them."""
+    if count == 3:
+        return ("red", "green", "blue")
+    return tuple(f"channel {channel + 1}" for channel in range(count))
+
+
+def counted(count: int, noun: str) -> str:
+    """Format a count of things with a noun whose plural ends in s."""
+    return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
+def percent(fraction: float) -> str:
+    """Format a relative error as a percentage with two significant digits."""
+    if not math.isfinite(fraction) or fraction > 10:
+        return "anything"
+    return f"{float(f'{100 * fraction:.2g}'):g}%"

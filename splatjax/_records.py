@@ -1,0 +1,214 @@
+"""Records that take what people type: numbers, lists, tuples and NumPy arrays.
+
+    @record
+    class Medium(eqx.Module):
+        sigma_a: Float[Array, " channels"] = eqx.field(converter=numbers)
+        sigma_s_prime: Float[Array, " channels"] = eqx.field(converter=numbers)
+        eta: Float[Array, " channels"] = eqx.field(converter=numbers)
+
+`Medium([0.02, 0.01], [1.1, 1.3], eta=1.4)` has three arrays of two channels. An annotation states
+the axes of a field, and its converter states, to type checkers as well, what may be given. `record`
+converts all fields together: the length and the precision of one depend on the others. Ranges of
+values are checked by `check_values` in `__check_init__`.
+"""
+
+import dataclasses
+import inspect
+from collections.abc import Callable, Sequence
+from types import NoneType, UnionType
+from typing import Any, TypeAlias, TypeVar, get_args, get_origin
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jax.typing import ArrayLike
+from jaxtyping import Array, DTypeLike
+
+Class = TypeVar("Class", bound=type)
+Item = TypeVar("Item")
+Numbers: TypeAlias = ArrayLike | Sequence[Any] | jax.ShapeDtypeStruct
+"""Numbers, lists, tuples and arrays: everything that can be read as an array."""
+
+
+def numbers(values: Numbers | None) -> Any:
+    """Mark, as the converter of a field, that it takes numbers of any kind."""
+    return values
+
+
+def several(values: Item | Sequence[Item]) -> Any:
+    """Mark that a field takes a list or tuple of records, or a single one."""
+    return values
+
+
+def record(cls: Class) -> Class:
+    r"""Convert the arguments of a class of records before its `__init__` sees them.
+
+    - Fields of `numbers` become strongly typed arrays of floats, in the precision of the first
+      array given, arrays in other records first, else in JAX's default. A number is repeated along
+      axes whose lengths other fields give; the `channels` of a record among the fields count. An
+      array that lacks its last axis `channels` has one channel.
+    - Fields of `several` records become tuples.
+    - Fields of records are refused when they are records of other classes, or numbers.
+
+    Traced values are converted like others. `None` and objects that are no numbers, such as the
+    placeholders of JAX, pass unchanged. Records that JAX unflattens are not converted again.
+
+    **Raises:** `ValueError`, when a record is made, naming the field, its shape or class, and what
+    would be right.
+    """
+    initialize, signature = cls.__init__, inspect.signature(cls)
+    axes, classes = {}, {}
+    for field in dataclasses.fields(cls):  # ty: ignore[invalid-argument-type]
+        is_tuple = get_origin(field.type) is tuple
+        annotation = get_args(field.type)[0] if is_tuple else field.type
+        kinds = get_args(annotation) if isinstance(annotation, UnionType) else (annotation,)
+        if field.metadata.get("converter") is numbers:
+            axes[field.name] = kinds[0].dim_str.split()  # ty: ignore[missing-union-attribute]
+        elif all(inspect.isclass(kind) and issubclass(kind, _RECORDS) for kind in kinds):
+            classes[field.name] = kinds, is_tuple
+
+    def __init__(self, *args, **kwargs):
+        try:
+            given = signature.bind(*args, **kwargs)
+        except TypeError as error:
+            wanted = f"{cls.__name__}{inspect.signature(cls)}"
+            raise TypeError(f"{error}; give {wanted}") from None
+        given.apply_defaults()
+        values, records = given.arguments, []
+        for name, (kinds, is_tuple) in classes.items():
+            is_many = isinstance(values[name], list | tuple)
+            parts = tuple(values[name]) if is_tuple and is_many else (values[name],)
+            for part in parts:
+                if not isinstance(part, kinds) and not _is_placeholder(part):
+                    wanted = " or ".join(
+                        f"{kind.__name__}{inspect.signature(kind)}" for kind in kinds
+                    )
+                    raise ValueError(
+                        f"{cls.__name__}.{name} must be {wanted}; got {type(part).__name__}"
+                    )
+            values[name] = parts if is_tuple else parts[0]
+            records += parts
+        initialize(self, **(values | _converted(cls.__name__, axes, values, records)))
+
+    # No annotations here: runtime type checkers would refuse arguments before their conversion.
+    own = inspect.Parameter("self", inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    others = [part.replace(annotation=part.empty) for part in signature.parameters.values()]
+    __init__.__signature__ = inspect.Signature([own, *others])  # ty: ignore[missing-attribute]
+    cls.__init__ = __init__  # ty: ignore[invalid-assignment]
+    return cls
+
+
+def as_floats(values: Numbers, dtype: DTypeLike | None = None, name: str = "values") -> Array:
+    """Convert numbers to a strongly typed array of floats, by default in their own precision."""
+    dtype = dtype or _precision(values)
+    if isinstance(values, jax.Array) and values.dtype == dtype and not values.weak_type:
+        return values
+    try:
+        return jnp.asarray(values, dtype)
+    except (TypeError, ValueError):
+        raise ValueError(
+            f"{name} must be numbers, in rows of equal length; got {values!r}"
+        ) from None
+
+
+def check_values(
+    name: str,
+    values: Any,
+    requirement: str,
+    holds: Callable[[np.ndarray], Any],
+    finite: bool = True,
+) -> None:
+    r"""Check every entry of an array. Unknown entries, as under `jit`, pass.
+
+    **Arguments:**
+
+    - `name`: of the values, for the error.
+    - `values`: an array; other objects pass.
+    - `requirement`: completes "must be", with the remedy.
+    - `holds`: returns for each entry whether it meets the requirement, which two numbers meet only
+      if all between them do.
+    - `finite`: whether infinite entries are refused. NaN always is.
+
+    **Raises:** `ValueError` with the number of entries that fail, and the first of them.
+    """
+    is_array = isinstance(values, jax.Array | np.ndarray) and not isinstance(values, Tracer)
+    if not is_array or not values.size or not getattr(values, "is_fully_addressable", True):
+        return
+
+    def is_good(entries):
+        return holds(entries) & (np.isfinite(entries) if finite else ~np.isnan(entries))
+
+    known = np.asarray(values)
+    if not np.all(is_good(np.stack([known.min(), known.max()]))):
+        good = is_good(known)
+        place = tuple(np.argwhere(~good)[0].tolist())
+        raise ValueError(
+            f"{name} must be {requirement}; {np.sum(~good)} of {known.size} entries are not, the "
+            f"first is {known[place]:g}{f' at {list(place)}' if place else ''}"
+        )
+
+
+_RECORDS = (eqx.Module, NoneType)
+
+
+def _is_placeholder(value: Any) -> bool:
+    """Return whether a value is `None` or an object of JAX that stands for an array or a record."""
+    known = bool | int | float | complex | str | list | tuple | eqx.Module
+    return not isinstance(value, known) and not hasattr(value, "__array__")
+
+
+def _converted(
+    record: str, axes: dict[str, list[str]], values: dict[str, Any], records: list
+) -> dict[str, Array]:
+    """Convert the values of all fields of numbers."""
+    given = {name: values[name] for name in axes if not _is_placeholder(values[name])}
+    precision = _precision([records, list(given.values())])
+    arrays = {
+        name: as_floats(value, precision, f"{record}.{name}") for name, value in given.items()
+    }
+    channels = [part.channels for part in records if hasattr(part, "channels")]
+    lengths = {"channels": channels[0]} if channels else {}
+    # Numbers come last, when the lengths of axes are known.
+    return {
+        name: _shaped(f"{record}.{name}", array, axes[name], lengths)
+        for name, array in sorted(arrays.items(), key=lambda item: item[1].ndim == 0)
+    }
+
+
+def _shaped(where: str, array: Array, axes: list[str], lengths: dict[str, int]) -> Array:
+    """Add the axes that a number or a single channel lacks, and add the lengths of all axes to the
+    known ones.
+    """
+    if any(axis.startswith("*") for axis in axes):
+        return array
+    if array.ndim == 0 and axes and all(axis in lengths for axis in axes):
+        return jnp.broadcast_to(array, [lengths[axis] for axis in axes])
+    if array.ndim == len(axes) - 1 and axes[-1] == "channels":
+        array = array[..., None]
+    wanted = [int(axis) if axis.isdigit() else lengths.get(axis, axis) for axis in axes]
+    # A string is an axis whose length no other field gives.
+    matches = [
+        own == length or isinstance(length, str)
+        for own, length in zip(array.shape, wanted, strict=False)
+    ]
+    if array.ndim != len(axes) or not all(matches):
+        raise ValueError(
+            f"{where} has shape {list(array.shape)}; give it [{', '.join(axes)}] = "
+            f"[{', '.join(map(str, wanted))}], like the other fields"
+            f"{' (make batches by jax.vmap)' if array.ndim > len(axes) else ''}"
+        )
+    lengths |= dict(zip(axes, array.shape, strict=True))
+    return array
+
+
+def _precision(tree: Any) -> Any:
+    """Return the precision of the first array of floats; numbers of other kinds have none."""
+    for leaf in jax.tree.leaves(tree):
+        is_strong = isinstance(leaf, jax.Array | np.ndarray) and not getattr(
+            leaf, "weak_type", False
+        )
+        if is_strong and jnp.issubdtype(leaf.dtype, jnp.floating):
+            return jax.dtypes.canonicalize_dtype(max(leaf.dtype, np.dtype(np.float32)))
+    return jnp.result_type(float)

@@ -1,0 +1,52 @@
+"""Blended splats, by any kernel: what the fragments of the front carry, normalized (Eq. 1)."""
+
+import jax
+import jax.numpy as jnp
+from jax.lax import stop_gradient
+from jaxtyping import Array, Float
+
+from splatjax.splatting import AbstractView, blend_fragments
+
+from ._kernels import AbstractSplatKernel
+from ._tiles import AbstractListRasterizer, Lists
+
+
+class BlendingRasterizer(AbstractListRasterizer):
+    r"""Blends the fragments within epsilon of the nearest one.
+
+    A pixel with any fragment is covered whole, one with none not at all: silhouettes are hard, and
+    holes are holes. Which fragments count, and coverage, have no derivative.
+
+    **Attributes:**
+
+    - `kernel`: what a splat leaves in a pixel.
+    """
+
+    kernel: AbstractSplatKernel
+
+    def front(
+        self, lists: Lists, attributes: Float[Array, "attributes splats"], view: AbstractView
+    ) -> Float[Array, "places rows pixels"]:
+        def nearest(ids, footprints, dx, dy):
+            fragments = self.kernel.fragments(footprints, view, dx, dy)
+            shifted = view.shifted(fragments.nearness, footprints.shift)
+            return jnp.max(jnp.where(fragments.is_inside, shifted, -jnp.inf), axis=1)
+
+        limits = stop_gradient(lists.reduce_blocks(jax.ops.segment_max, lists.map_blocks(nearest)))
+
+        def blend(ids, footprints, dx, dy, limit):
+            fragments = self.kernel.fragments(footprints, view, dx, dy)
+            in_front = fragments.is_inside & (fragments.nearness > limit[:, None])
+            weight = jnp.where(in_front, fragments.weight, 0.0)
+            rows = attributes.at[:, ids].get(mode="fill", fill_value=0)
+            sums = jnp.einsum("rts,tsp->trp", rows, weight)
+            own = jnp.stack(
+                [jnp.sum(weight * fragments.nearness, axis=1), jnp.sum(weight, axis=1)], axis=1
+            )
+            return jnp.concatenate([sums, own], axis=1)
+
+        sums = lists.reduce_blocks(jax.ops.segment_sum, lists.map_blocks(blend, limits))
+        sums = sums.reshape(-1, *sums.shape[2:])
+        weights = sums[:, -1:]
+        is_covered = (weights > 0).astype(sums.dtype)
+        return jnp.concatenate([blend_fragments(sums[:, :-1], weights), is_covered], axis=1)

@@ -1,0 +1,46 @@
+"""The bust as methods that work in textures need it."""
+
+import numpy as np
+
+from splatjax.geometry import Mesh, Textures, bust_mesh, complexion, cut_below
+
+from ._mesh_raster import Landing, capacity_for
+from ._texture_space import rasterize_in_texture
+from ._textured_mesh import TexturedMesh
+
+_NECK = -105.0  # mm: below it the chart would show the shoulders over the chest
+_RIM = 0.002  # of the texture, that stays free along its edges
+
+
+def bust_with_textures(texels: int) -> tuple[Mesh, Textures]:
+    r"""Give the head of the bust as a mesh whose colors lie in textures, laid out by its own
+    coordinates.
+
+    These are longitude and latitude seen from inside the head: the ears, the nostrils and the neck
+    overlap in them, and the nearest texel's color there is that of one of the parts.
+
+    **Arguments:**
+
+    - `texels`: along each edge of the textures.
+
+    **Returns:** the mesh as `splatjax.geometry.bust_mesh` makes it, cut off at the neck (mm), and
+    its albedo (linear), specular and roughness (factors), `[texels, texels, ...]`.
+
+    **Raises:** `ValueError` for no texels.
+    """
+    if texels < 1:
+        raise ValueError(f"texels is {texels}; a texture has at least 1 along each edge")
+    mesh = cut_below(bust_mesh(), _NECK)
+    assert mesh.uvs is not None
+    low, high = mesh.uvs.min(axis=(0, 1)), mesh.uvs.max(axis=(0, 1))
+    mesh = Mesh(
+        mesh.vertices,
+        mesh.faces,
+        mesh.normals,
+        _RIM + (1 - 2 * _RIM) * (mesh.uvs - low) / (high - low),
+    )
+    bare = TexturedMesh.of(mesh)
+    capacity = capacity_for(Landing.in_texture(bare.uvs, texels))
+    points = rasterize_in_texture(bare, texels, capacity).points
+    colors = complexion(np.asarray(points.centers, np.float64))
+    return mesh, Textures(*(rows.reshape(texels, texels, *rows.shape[1:]) for rows in colors))

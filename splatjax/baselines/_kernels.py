@@ -1,0 +1,183 @@
+"""What a splat leaves in the pixels around it: where its fragments lie, and what they weigh."""
+
+import abc
+import dataclasses
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax.lax import stop_gradient
+from jaxtyping import Array, Bool, Float
+
+from splatjax.scene import Splats
+from splatjax.splatting import AbstractView, Footprints, SplattingSettings, fragment_weight
+
+_NO_FILTER = 1e-3  # pixels: a footprint needs some width
+
+
+class Fragments(eqx.Module):
+    """Of some splats in some pixels."""
+
+    weight: Float[Array, "..."]
+    """0 where a splat leaves nothing."""
+    nearness: Float[Array, "..."]
+    is_inside: Bool[Array, "..."]
+
+
+class AbstractSplatKernel(eqx.Module):
+    """The footprint of a splat. All weigh their fragments by `splatjax.splatting.fragment_weight`,
+    of a squared radius each.
+    """
+
+    @abc.abstractmethod
+    def footprints(
+        self, splats: Splats, view: AbstractView, settings: SplattingSettings
+    ) -> Footprints:
+        """Project splats; the boxes hold all fragments."""
+
+    @abc.abstractmethod
+    def squared_radius(
+        self,
+        f: Footprints,
+        view: AbstractView,
+        dx: Float[Array, "..."],
+        dy: Float[Array, "..."],
+        nearness: Float[Array, "..."],
+    ) -> Float[Array, "..."]:
+        """Give `rho^2` at offsets from the center (pixels); 1 or more where a splat leaves
+        nothing.
+        """
+
+    def nearness(
+        self, f: Footprints, view: AbstractView, dx: Float[Array, "..."], dy: Float[Array, "..."]
+    ) -> Float[Array, "..."]:
+        """Give how near the plane of the splat is: hit by the ray, as everywhere in this
+        renderer.
+        """
+        return f.nearness + f.slope_x * dx + f.slope_y * dy
+
+    def fragments(
+        self, f: Footprints, view: AbstractView, dx: Float[Array, "..."], dy: Float[Array, "..."]
+    ) -> Fragments:
+        """Give fragments at offsets from the center. Differentiable in the footprints."""
+        nearness = self.nearness(f, view, dx, dy)
+        squared = self.squared_radius(f, view, dx, dy, nearness)
+        is_inside = f.visible & (squared < 1)
+        weight = jnp.where(is_inside, fragment_weight(jnp.where(is_inside, squared, 1.0)), 0.0)
+        return Fragments(f.opacity * weight, jnp.where(is_inside, nearness, 1.0), is_inside)
+
+
+class DiscKernel(AbstractSplatKernel):
+    """The disc itself, seen in exact perspective: no filter. What is smaller than a pixel is
+    missed, or stands for all of it.
+
+    **Source:** Zwicker et al. 2004, "Perspective Accurate Splatting"; Botsch et al. 2004, "Phong
+    Splatting".
+    """
+
+    def footprints(self, splats, view, settings):
+        return view.footprints(splats, dataclasses.replace(settings, filter_radius=_NO_FILTER))
+
+    def squared_radius(self, f, view, dx, dy, nearness):
+        return _in_perspective(f, view, dx, dy, nearness)
+
+
+class EwaKernel(AbstractSplatKernel):
+    r"""The elliptical weighted average: the disc's Gaussian, projected by the affine map at its
+    center, blurred by the pixel's.
+
+    In the picture the kernel is `exp(-d^T (J V J^T + I)^-1 d / 2)` and its like, with the pixel's
+    filter of variance `I`, cut where the renderer's kernel ends. The projection is exact at the
+    center alone: large splats near the eye may part, and leave holes.
+
+    **Attributes:**
+
+    - `filter_variance`: of the pixel's filter, pixels squared. Static.
+
+    **Source:** Zwicker et al. 2001, "Surface Splatting", section 4.2; Heckbert 1989, "Fundamentals
+    of Texture Mapping and Image Warping".
+    """
+
+    filter_variance: float = eqx.field(static=True, default=1.0)
+
+    def footprints(self, splats, view, settings):
+        # exp(-4 rho^2) has an eighth of the squared radius as its variance
+        f = view.footprints(
+            splats, dataclasses.replace(settings, filter_radius=(8 * self.filter_variance) ** 0.5)
+        )
+        a, b, c = stop_gradient(self._quadric(f, view))
+        determinant = a * c - 0.25 * b * b
+        x, y = stop_gradient(f.x), stop_gradient(f.y)
+        across, down = jnp.sqrt(c / determinant), jnp.sqrt(a / determinant)
+        return dataclasses.replace(
+            f, left=x - across, right=x + across, top=y - down, bottom=y + down
+        )
+
+    def squared_radius(self, f, view, dx, dy, nearness):
+        a, b, c = self._quadric(f, view)
+        return dx * (a * dx + b * dy) + c * dy * dy
+
+    @staticmethod
+    def _quadric(f: Footprints, view: AbstractView):
+        """Give the ellipse of the affine map: the one in perspective, with the nearness of the
+        center everywhere.
+        """
+        nearness = jnp.where(f.visible, f.nearness, 1.0)
+        return tuple(view.squared_radius(nearness, coefficient) for coefficient in (f.a, f.b, f.c))
+
+
+class DiscOrPixelKernel(AbstractSplatKernel):
+    r"""The disc in exact perspective, or a circle of a pixel's size around its center, whichever
+    weighs more.
+
+    `rho^2 = min(rho_disc^2, d^2 / 2)`: an approximation of the elliptical weighted average that
+    leaves no splat smaller than a pixel, at the price of weights that are not those of a
+    convolution.
+
+    **Attributes:**
+
+    - `pixel_radius`: of the circle, pixels. Static.
+
+    **Source:** Botsch et al. 2005, "High-Quality Surface Splatting on Today's GPUs", section 5.
+    """
+
+    pixel_radius: float = eqx.field(static=True, default=2**0.5)
+
+    def footprints(self, splats, view, settings):
+        f, reach = DiscKernel().footprints(splats, view, settings), self.pixel_radius
+        x, y = stop_gradient(f.x), stop_gradient(f.y)
+        wide = view.footprints(splats, dataclasses.replace(settings, filter_radius=reach))
+        return dataclasses.replace(
+            f,
+            shift=wide.shift,
+            opacity=jnp.where(f.visible, jnp.ones_like(f.opacity), 0.0),
+            left=jnp.minimum(f.left, x - reach),
+            right=jnp.maximum(f.right, x + reach),
+            top=jnp.minimum(f.top, y - reach),
+            bottom=jnp.maximum(f.bottom, y + reach),
+        )
+
+    def nearness(self, f, view, dx, dy):
+        """What lies beyond the disc is as near as the disc's rim: planes seen edge on would come
+        too close.
+        """
+        plane = super().nearness(f, view, dx, dy)
+        squared = _in_perspective(f, view, dx, dy, plane)
+        beyond = stop_gradient(squared) > 1
+        shrink = jnp.where(
+            beyond, 1 / jnp.sqrt(jnp.where(beyond, jnp.minimum(squared, 1e12), 1.0)), 1.0
+        )
+        return super().nearness(f, view, shrink * dx, shrink * dy)
+
+    def squared_radius(self, f, view, dx, dy, nearness):
+        disc = _in_perspective(f, view, dx, dy, super().nearness(f, view, dx, dy))
+        return jnp.minimum(disc, (dx * dx + dy * dy) / self.pixel_radius**2)
+
+
+def _in_perspective(f: Footprints, view: AbstractView, dx, dy, nearness) -> Float[Array, "..."]:
+    """Give `rho^2` of the ray's hit with the disc's plane; infinite where the ray misses the
+    rim.
+    """
+    quadric = dx * (f.a * dx + f.b * dy) + f.c * dy * dy
+    inside = f.visible & view.inside(nearness, quadric)
+    nearness, quadric = jnp.where(inside, nearness, 1.0), jnp.where(inside, quadric, 0.0)
+    return jnp.where(inside, view.squared_radius(nearness, quadric), jnp.inf)

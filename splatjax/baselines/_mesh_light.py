@@ -1,0 +1,157 @@
+"""Light on a mesh: shadow maps of its faces, compared as those of splats are, and what enters the
+surface.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from splatjax import splatting as _splatting
+from splatjax.render import Irradiance, LightVisibility, entering_light
+from splatjax.scene import (
+    AbstractLight,
+    DirectionalLight,
+    Material,
+    PointLight,
+    Splats,
+    stack_lights,
+)
+
+from ._mesh_raster import Landing, barycentrics, capacity_for, interpolate, see_faces
+from ._textured_mesh import TexturedMesh
+
+
+class MeshShadow(eqx.Module):
+    """What one light sees of a mesh."""
+
+    light: AbstractLight
+    depths: _splatting.ShadowMap
+    attributes: Float[Array, "tiles 5 pixels"]
+    """Texture coordinates and normal."""
+
+
+class MeshLight(eqx.Module):
+    """Lights, and their shadow maps: `None` for one that casts no shadows. In the order of the
+    scene.
+    """
+
+    lights: tuple[AbstractLight, ...]
+    shadows: tuple[MeshShadow | None, ...]
+    settings: _splatting.ShadowSettings
+    needed: Float[Array, ""]
+
+    def on(self, points: Splats) -> LightVisibility:
+        """Compute the fraction of each light that reaches points of the surface. Differentiable."""
+        groups = stack_lights(self.lights)
+        shares = []
+        for group in groups:
+            maps = [self.shadows[place] for place in group.places]
+            visible = [
+                _splatting.compute_visibility(points, shadow.depths, self.settings)
+                for shadow in maps
+                if shadow is not None
+            ]
+            shares.append(jnp.stack(visible) if visible else None)
+        return LightVisibility(groups, shares, self.needed)
+
+    def entering(self, points: Splats, material: Material) -> Irradiance:
+        """Compute the light that enters the surface at points, by the renderer's own interface."""
+        specular, roughness = (
+            own if factor is None else own * factor
+            for own, factor in (
+                (material.specular, points.specular),
+                (material.roughness, points.roughness),
+            )
+        )
+        return entering_light(
+            material,
+            self.on(points),
+            points.centers,
+            points.normals,
+            points.albedo,
+            specular,
+            roughness,
+        )
+
+
+def light_views(
+    mesh: TexturedMesh, lights: tuple[AbstractLight, ...], settings: _splatting.ShadowSettings
+) -> list[_splatting.AbstractView | None]:
+    """Give the view of each light; `None` for one that casts no shadows."""
+    bounds = mesh.bounds()
+    views: list[_splatting.AbstractView | None] = []
+    for light in lights:
+        if not light.cast_shadows:
+            views.append(None)
+        elif isinstance(light, DirectionalLight):
+            views.append(_splatting.distant_view(light.direction, bounds, settings))
+        elif isinstance(light, PointLight):
+            views.append(_splatting.near_view(light.position, bounds, settings))
+        else:
+            raise ValueError(
+                f"{type(light).__name__}: no shadow map of a mesh is known for it; give one with "
+                "cast_shadows=False"
+            )
+    return views
+
+
+def shadow_capacities(
+    mesh: TexturedMesh, lights: tuple[AbstractLight, ...], settings: _splatting.ShadowSettings
+) -> tuple[int | None, ...]:
+    """Return the capacity that each light's shadow map needs; of concrete lights.
+
+    **Raises:** `ValueError` for a point light that casts shadows from within the mesh's bounding
+    sphere.
+    """
+    bounds = mesh.bounds()
+    for i, light in enumerate(lights):
+        if isinstance(light, PointLight) and light.cast_shadows:
+            distance = float(jnp.linalg.norm(light.position - bounds.center))
+            if distance < 1.05 * float(bounds.radius):
+                raise ValueError(
+                    f"lights[{i}] stands {distance:g} mm from the middle of the mesh, within its "
+                    "bounding sphere of radius "
+                    f"{float(bounds.radius):g} mm; move it out, or let it cast no shadows"
+                )
+    corners, views = mesh.corners(), light_views(mesh, lights, settings)
+    return tuple(
+        None if view is None else capacity_for(Landing.in_view(corners, view)) for view in views
+    )
+
+
+def mesh_light(
+    mesh: TexturedMesh,
+    lights: tuple[AbstractLight, ...],
+    settings: _splatting.ShadowSettings,
+    capacities: tuple[int | None, ...],
+) -> MeshLight:
+    r"""Make the shadow maps of a mesh (4.1, of triangles). Differentiable in depth, not in what
+    hides what.
+
+    **Arguments:**
+
+    - `capacities`: from `shadow_capacities`.
+
+    **Returns:** a `MeshLight`.
+    """
+    corners, shadows, needed = mesh.corners(), [], jnp.zeros((), mesh.vertices.dtype)
+    views = light_views(mesh, lights, settings)
+    for light, view, capacity in zip(lights, views, capacities, strict=True):
+        if view is None or capacity is None:
+            shadows.append(None)
+            continue
+        landing = Landing.in_view(corners, view)
+        seen = see_faces(landing, capacity)
+        carried = jnp.concatenate(
+            [mesh.uvs, mesh.normals[mesh.faces], landing.depth[..., None]], axis=2
+        )
+        surface = interpolate(carried, seen, barycentrics(landing, seen)).transpose(2, 0, 1)
+        grid = _splatting.TileGrid(view.width, view.height)
+        depth = grid.cut(jnp.where(seen.covered, surface[5], 1.0)[None])[:, 0]
+        coverage = grid.cut(seen.covered.astype(surface.dtype)[None])[:, 0]
+        nothing = jnp.zeros_like(depth)
+        planes = jnp.stack([depth, coverage, nothing, nothing])
+        depths = _splatting.ShadowMap(view, planes, seen.needed)
+        shadows.append(MeshShadow(light, depths, grid.cut(surface[:5])))
+        needed = jnp.maximum(needed, seen.needed)
+    return MeshLight(lights, tuple(shadows), settings, needed)

@@ -1,0 +1,60 @@
+"""The point-based methods that the paper measures itself against, each as settings of this
+renderer.
+"""
+
+from dataclasses import replace
+
+from splatjax.render import LightAtSplats, RenderSettings
+
+from ._blending import BlendingRasterizer
+from ._kernels import DiscKernel, DiscOrPixelKernel, EwaKernel
+from ._lighting import LightAtPixels, NormalFields
+from ._nearest import NearestRasterizer
+
+_DEFAULTS = RenderSettings()
+
+
+def elliptical_points(settings: RenderSettings = _DEFAULTS) -> RenderSettings:
+    """Return settings that draw elliptical points: the nearest splat wins, and has one color, as in
+    flat shading.
+
+    Neither color nor normals are interpolated, and nothing is filtered. Figure 7, left.
+    """
+    return replace(settings, rasterizer=NearestRasterizer(), lighting=LightAtSplats())
+
+
+def ewa_splatting(settings: RenderSettings = _DEFAULTS) -> RenderSettings:
+    """Return settings that splat surfaces with the elliptical weighted average: the splat's kernel
+    blurred by the pixel's.
+
+    The projection is affine; where splats are large in the picture and the perspective strong,
+    small holes open. Shading is per pixel.
+
+    **Source:** Zwicker et al. 2001, "Surface Splatting".
+    """
+    return replace(settings, rasterizer=BlendingRasterizer(EwaKernel()), lighting=LightAtPixels())
+
+
+def phong_splatting(settings: RenderSettings = _DEFAULTS) -> RenderSettings:
+    """Return settings for Phong splatting: normals vary linearly within each splat, and nothing is
+    filtered in the picture.
+
+    Few splats suffice for a smooth surface; splats smaller than a pixel alias. The scene holds
+    `PhongSplats`.
+
+    **Source:** Botsch et al. 2004, "Phong Splatting".
+    """
+    rasterizer = BlendingRasterizer(DiscKernel())
+    return replace(settings, rasterizer=rasterizer, lighting=NormalFields())
+
+
+def deferred_splatting(settings: RenderSettings = _DEFAULTS) -> RenderSettings:
+    """Return settings for high-quality deferred splatting: attributes are blended, with a filter
+    for small splats, then shaded.
+
+    Figure 7, middle.
+
+    **Source:** Botsch et al. 2005, "High-Quality Surface Splatting on Today's GPUs".
+    """
+    rasterizer = BlendingRasterizer(DiscOrPixelKernel())
+    return replace(settings, rasterizer=rasterizer, lighting=LightAtPixels())

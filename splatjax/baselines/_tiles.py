@@ -1,0 +1,143 @@
+"""Lists of splats per tile, walked block by block in the plainest way: nothing is kept back, and
+every derivative is there.
+"""
+
+import abc
+from collections.abc import Callable
+from typing import TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, PyTree
+
+from splatjax.scene import Splats
+from splatjax.splatting import (
+    AbstractRasterizer,
+    AbstractRasterPlan,
+    AbstractView,
+    BinCapacity,
+    Bins,
+    Footprints,
+    FragmentSums,
+    SplattingSettings,
+    TileGrid,
+    TileRasterizer,
+    bin_items,
+)
+
+from ._kernels import AbstractSplatKernel
+
+Result = TypeVar("Result", bound=PyTree)
+
+
+class AbstractListRasterizer(AbstractRasterizer):
+    """Passes 2 and 3 by a kernel, over lists of splats. Shadow maps are the renderer's: baselines
+    differ in the picture alone.
+    """
+
+    kernel: eqx.AbstractVar[AbstractSplatKernel]
+
+    def make_plan(self, parts, views, settings):
+        if len(parts) > 1:
+            raise ValueError(
+                f"a {type(self).__name__} works on one device; give a TileRasterizer for a mesh"
+            )
+        counts = [_demand(self.kernel, parts[0], view, settings) for view in views]
+        grid = TileGrid(views[0].width, views[0].height)
+        return ListPlan(self, BinCapacity.for_counts(counts, grid))
+
+    def for_shadows(self) -> AbstractRasterizer:
+        return TileRasterizer()
+
+    @abc.abstractmethod
+    def front(
+        self, lists: "Lists", attributes: Float[Array, "attributes splats"], view: AbstractView
+    ) -> Float[Array, "places rows pixels"]:
+        """Compute the rows of the front surface, as in `FragmentSums`, lane by lane of the
+        lists.
+        """
+
+
+class ListPlan(AbstractRasterPlan):
+    """The capacity of the lists of an `AbstractListRasterizer`. Nothing is shown behind the
+    front.
+    """
+
+    rasterizer: AbstractListRasterizer
+    capacity: BinCapacity
+
+    def sum_fragments(
+        self,
+        splats: Splats,
+        attributes: Float[Array, "attributes splats"],
+        view: AbstractView,
+        settings: SplattingSettings,
+        combination,
+    ) -> FragmentSums:
+        grid = TileGrid(view.width, view.height)
+        footprints = self.rasterizer.kernel.footprints(splats, view, settings)
+        bins = bin_items(footprints.ranges(grid), grid, self.capacity)
+        block = jnp.arange(bins.ids.shape[0], dtype=jnp.int32)
+        chunk = jnp.searchsorted(bins.first_block, block, side="right") - 1
+        lists = Lists(footprints, bins, chunk.astype(jnp.int32), grid)
+        rows, within = self.rasterizer.front(lists, attributes, view), grid.within_picture()
+        if within is not None:
+            shown = jnp.asarray(within)[jnp.minimum(bins.order, grid.count - 1)]
+            rows = jnp.where(shown[:, None], rows, 0.0)
+        needed = bins.needed.astype(rows.dtype)
+        rows = rows + jnp.where(needed <= 1, 0.0, jnp.nan).astype(rows.dtype)
+        return FragmentSums(jnp.minimum(bins.order, grid.count), rows, needed, len(rows))
+
+
+class Lists(eqx.Module):
+    """The splats of every tile, in blocks of `[lanes, slots]`; the blocks of a chunk hold the lists
+    of the same tiles.
+    """
+
+    footprints: Footprints
+    bins: Bins
+    chunk: Int[Array, " blocks"]
+    """The number of chunks for a block that holds nothing."""
+    grid: TileGrid
+
+    def map_blocks(self, look: Callable[..., Result], *more) -> Result:
+        """Look at every block, one after the other: its splats `[lanes, slots]`, what more there is
+        of its chunk, and offsets.
+
+        **Arguments:**
+
+        - `look`: of ids `[lanes, slots]`, footprints `[lanes, slots, 1]`, offsets in x and y
+          `[lanes, slots, pixels]` and of each of `more` `[lanes, ...]`.
+        - `more`: of every tile, as `reduce_blocks` returns it.
+        """
+        grid, dtype = self.grid, self.footprints.x.dtype
+        last = self.bins.order.shape[0] // grid.lanes - 1
+
+        @jax.checkpoint
+        def one(ids, chunk):
+            chunk = jnp.minimum(chunk, last)
+            tile = jax.lax.dynamic_slice_in_dim(self.bins.order, chunk * grid.lanes, grid.lanes)
+            x, y = (pixel.astype(dtype)[:, None] + 0.5 for pixel in grid.columns_and_rows(tile))
+            own = jax.tree.map(
+                lambda plane: plane.at[ids].get(mode="fill", fill_value=0)[:, :, None],
+                self.footprints,
+            )
+            return look(ids, own, x - own.x, y - own.y, *(values[chunk] for values in more))
+
+        return jax.lax.map(lambda block: one(*block), (self.bins.ids, self.chunk))
+
+    def reduce_blocks(self, combine: Callable, results: jax.Array) -> jax.Array:
+        """Combine what the blocks of each chunk found, by a segment reduction: `[chunks, lanes,
+        ...]`.
+        """
+        chunks = self.bins.order.shape[0] // self.grid.lanes
+        return combine(results, self.chunk, num_segments=chunks, indices_are_sorted=True)
+
+
+@eqx.filter_jit
+def _demand(
+    kernel: AbstractSplatKernel, splats: Splats, view: AbstractView, settings: SplattingSettings
+):
+    grid = TileGrid(view.width, view.height)
+    return kernel.footprints(splats, view, settings).ranges(grid).per_tile(grid)

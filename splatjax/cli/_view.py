@@ -1,0 +1,241 @@
+"""Options that `splatjax render` and `splatjax turntable` share: splats, camera and lights."""
+
+import math
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+
+import splatjax as sj
+from splatjax._memory import check_memory, free_bytes
+from splatjax.io import fingerprint, material_path, own_version
+from splatjax.render import check_displayable
+from splatjax.scene import Parts
+
+from ._options import MaterialName, Rules, UpAxis, check_options, option_name
+from ._report import note, stage
+
+# Degrees: the fill stands beside the camera, on the side away from the light.
+_FILL_SIDE, _FILL_ELEVATION = 25.0, 10.0
+_NOT_IN_PICTURES = ("splats", "output", "fps")
+# Lower bounds of the memory needed: what does not fit by these does not fit.
+_BYTES_PER_SPLAT, _BYTES_PER_PIXEL = 1000.0, 500.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewOptions:
+    """Splats of one material, a camera that sees all of them, a light and a weak fill."""
+
+    #: PLY file of splats, in mm (`splatjax sample` makes one). Without it, the built-in bust.
+    splats: Annotated[
+        tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="[SPLATS]", help_behavior_hint="")
+    ] = None
+    #: The file or folder to write.
+    output: Path
+    #: Name of a material (`splatjax materials`), or path of a TOML file.
+    material: MaterialName = "skin"
+    #: Width of the picture, pixels.
+    width: int = 512
+    #: Height of the picture, pixels.
+    height: int = 512
+    #: Of the camera, seen from the middle of the splats.
+    azimuth: float = 25.0
+    #: Of the camera; between -90 and 90, both excluded.
+    elevation: float = 0.0
+    #: Vertical field of view.
+    fov: float = 25.0
+    #: Of the place the light comes from; beyond 90 it stands behind.
+    light_azimuth: float = -20.0
+    #: Of the place the light comes from.
+    light_elevation: float = 30.0
+    #: Strength of a second light without shadows, beside the camera, relative to the first. 0 for
+    #: none.
+    fill: float = 0.1
+    #: Of the PNG, in stops: each doubles its brightness. The EXR is never changed by it.
+    exposure: float = 0.0
+    #: Whether light spreads below the surface. Without, it leaves where it enters, in the same
+    #: color.
+    scattering: bool = True
+    #: Whether to use the albedo of the splats, which the built-in bust has. Without, color is the
+    #: material's own.
+    albedo: bool = True
+    #: Number of splats of the built-in bust.
+    count: int = 200_000
+    #: Size of the body: at 0.2 the bust is 7 cm tall, and light goes five times as far in it.
+    scale: float = 1.0
+    #: Upward axis of the PLY file.
+    up: UpAxis = "y"
+
+    def check(self, more_rules: Rules | None = None) -> None:
+        """Raise `ValueError` for options that break a rule, or that need more memory than there
+        is.
+        """
+        finite, positive = "be a finite number", "be 1 or more"
+        rules: Rules = {
+            "fill": (0 <= self.fill < math.inf, "be 0 or more"),
+            "scale": (0 < self.scale < math.inf, "be a positive factor"),
+            "azimuth": (math.isfinite(self.azimuth), finite),
+            "light_azimuth": (math.isfinite(self.light_azimuth), finite),
+            "light_elevation": (math.isfinite(self.light_elevation), finite),
+            "exposure": (math.isfinite(self.exposure), finite),
+            "width": (self.width >= 1, positive),
+            "height": (self.height >= 1, positive),
+            "count": (self.count >= 1, positive),
+            "fov": (0 < self.fov < 180, "lie between 0 and 180 degrees, both excluded"),
+            "elevation": (
+                -90 < self.elevation < 90,
+                "lie between -90 and 90 degrees, both excluded",
+            ),
+        }
+        check_options(self, rules | (more_rules or {}))
+        if self.splats is None:
+            most = f"take {free_bytes() / _BYTES_PER_SPLAT:.0f} at most"
+            check_memory(f"--count {self.count}", _BYTES_PER_SPLAT * self.count, most)
+        size = f"--width {self.width} --height {self.height}"
+        most = f"take {free_bytes() / _BYTES_PER_PIXEL:.0f} pixels at most"
+        check_memory(size, _BYTES_PER_PIXEL * self.width * self.height, most)
+
+    def load(self) -> tuple[sj.Splats, sj.Material]:
+        """Return the splats, and the material with which they are rendered."""
+        material = self.displayable_material()
+        if self.splats is None:
+            with stage(f"making the bust with {self.count} splats"):
+                splats = sj.bust(self.count)
+        else:
+            with stage(f"reading {self.splats}"):
+                splats = sj.read_splats(self.splats, up=self.up)
+        splats = self.adjusted(splats)
+        return splats, self.material_for(splats, material)
+
+    def displayable_material(self) -> sj.Material:
+        """Load the material; raise `ValueError` for one whose channels no PNG file shows."""
+        material = sj.load_material(self.material)
+        check_displayable(material.channels)
+        return material
+
+    def material_for(self, splats: sj.Splats, material: sj.Material) -> sj.Material:
+        """Return a material with which splats are rendered."""
+        if splats.albedo is not None:
+            material = material.white()
+            note(
+                f"color is the splats' own albedo, and {self.material} only spreads the light; "
+                "--no-albedo shows its own color"
+            )
+        material = in_color(material)
+        return material if self.scattering else material.opaque()
+
+    def adjusted(self, splats: sj.Splats) -> sj.Splats:
+        """Return splats at the scale of the options, with or without their albedo."""
+        splats = splats if self.scale == 1 else splats.scaled(self.scale)
+        return splats if self.albedo else replace(splats, albedo=None)
+
+    def lights(
+        self, material: sj.Material, azimuth: float, light_azimuth: float
+    ) -> tuple[sj.DirectionalLight, ...]:
+        """Return the light, in the channels of a material, and the fill beside a camera at an
+        azimuth: always on the same side of it.
+        """
+        # The first light gives a white diffuser that faces it the radiance 1.
+        irradiance = jnp.full(material.gaussians.weights.shape[1], jnp.pi)
+        towards = -direction_to(light_azimuth, self.light_elevation)
+        light = sj.DirectionalLight(direction=towards, irradiance=irradiance)
+        if self.fill == 0:
+            return (light,)
+        side = math.copysign(_FILL_SIDE, math.remainder(self.azimuth - self.light_azimuth, 360))
+        towards = -direction_to(azimuth + side, _FILL_ELEVATION)
+        fill = sj.DirectionalLight(
+            direction=towards, irradiance=self.fill * irradiance, cast_shadows=False
+        )
+        return light, fill
+
+    def camera(self, parts: Parts, azimuth: float) -> sj.Camera:
+        """Place a camera at an azimuth so that the bounding sphere of the splats, which come in
+        parts, just fits the narrower side of the picture.
+        """
+        boxes = [(np.min(part.centers, axis=0), np.max(part.centers, axis=0)) for part in parts()]
+        low, high = np.min([box[0] for box in boxes], axis=0), np.max([b[1] for b in boxes], axis=0)
+        middle = (low + high) / 2
+        reaches = [
+            np.linalg.norm(np.asarray(part.centers) - middle, axis=1) + np.asarray(part.radii)
+            for part in parts()
+        ]
+        radius = float(max(np.max(reach) for reach in reaches))
+        narrower = min(1.0, self.width / self.height)
+        half_angle = math.atan(math.tan(math.radians(self.fov) / 2) * narrower)
+        target = jnp.asarray(middle)
+        away = direction_to(azimuth, self.elevation).astype(target.dtype)
+        eye = target + radius / math.sin(half_angle) * away
+        return sj.Camera.look_at(eye, target, fov=self.fov, width=self.width, height=self.height)
+
+    def write(self, path: Path, frame: sj.Frame, material: sj.Material) -> tuple[Path, Path]:
+        """Write the picture with all its layers, and the PNG file beside it; return both paths."""
+        picture = path.with_suffix(".png")
+        variances = material.gaussians.variances.tolist()
+        sj.write_exr(path, frame, variances=variances, manifest=self.manifest())
+        sj.write_png(picture, frame, exposure=self.exposure)
+        return path, picture
+
+    def manifest(self) -> dict[str, Any]:
+        """Return all that the pictures depend on: options by their names, contents of the files
+        they name, and versions.
+        """
+        fields = asdict(self).items()
+        options = {option_name(f): value for f, value in fields if f not in _NOT_IN_PICTURES}
+        splats = f"{self.splats.name}, {fingerprint(self.splats)}" if self.splats else None
+        material = material_path(self.material).read_text(encoding="utf-8")
+        return options | {
+            "splats": splats or "the built-in bust",
+            "contents of --material": material,
+            "precision": str(jnp.result_type(float)),
+            "splatjax": own_version(),
+            "jax": jax.__version__,
+        }
+
+    def note_unresolved_layers(self, frame: sj.Frame, material: sj.Material) -> None:
+        """Name the layers that are narrower than the splats."""
+        unresolved = np.asarray(frame.handed_over) > 0.5
+        widths = np.sqrt(np.asarray(material.gaussians.variances))[unresolved]
+        if self.scattering and len(widths):
+            note(
+                "narrower than the splats, so that the surface's own light stands for them: "
+                f"Gaussians of standard deviations {', '.join(f'{w:.3g}' for w in widths)} mm; "
+                "more splats show them, or a smaller body (--scale)"
+            )
+
+
+def draw(
+    scene: sj.Scene, camera: sj.Camera, plan: sj.Plan, light: sj.SplatLight | None = None
+) -> sj.Frame:
+    """Render, and wait for the picture; by the light of `sj.illuminate`, if it is given.
+
+    **Raises:** `ValueError` when the plan's capacity is exceeded.
+    """
+    frame = jax.block_until_ready(sj.render(scene, camera, plan=plan, light=light))
+    if not frame.overflow <= 0:
+        needed = float(frame.overflow)
+        raise ValueError(f"the plan's capacity is exceeded: {needed:.2f} times of it is needed")
+    return frame
+
+
+def in_color(material: sj.Material) -> sj.Material:
+    """Return a material of one channel with the same weights for red, green and blue."""
+    weights = material.gaussians.weights
+    if weights.shape[1] != 1:
+        return material
+    single = jax.tree.map(lambda x: jnp.broadcast_to(x, 3), material.single_scattering)
+    weights = jnp.broadcast_to(weights, (len(weights), 3))
+    gaussians = sj.SumOfGaussians(material.gaussians.variances, weights)
+    return replace(material, gaussians=gaussians, single_scattering=single)
+
+
+def direction_to(azimuth: float, elevation: float) -> jax.Array:
+    """Return the unit vector from the middle towards a place on the sky, given in degrees."""
+    azimuth, elevation = math.radians(azimuth), math.radians(elevation)
+    across = math.cos(elevation)
+    return jnp.asarray(
+        [math.sin(azimuth) * across, math.sin(elevation), math.cos(azimuth) * across], float
+    )

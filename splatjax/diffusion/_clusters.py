@@ -1,0 +1,202 @@
+"""Splats merged into clusters: fewer sources for wider layers (section 4.2, Figure 5)."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from ._diffuser import Sources
+from ._order import BLOCK, compact_order
+
+
+class Clusters(eqx.Module):
+    """Sources that stand for one or more splats. An empty one has no area.
+
+    **Attributes:**
+
+    - `centers`, `normals`: means over the area; mean normals are shorter than one where the surface
+      bends.
+    - `areas`, `irradiance`: sums of the areas, mm^2, and means over them.
+    - `spread`: half the mean squared distance of the splats from the center: the variance per axis
+      of a flat cluster, mm^2.
+    - `divergence`: mean product of the offsets from center and mean normal, mm: positive where the
+      surface is convex.
+    - `normal_spread`: mean square of the offset from the mean normal.
+    """
+
+    centers: Float[Array, "3 clusters"]
+    normals: Float[Array, "3 clusters"]
+    areas: Float[Array, " clusters"]
+    irradiance: Float[Array, "channels clusters"]
+    spread: Float[Array, " clusters"]
+    divergence: Float[Array, " clusters"]
+    normal_spread: Float[Array, " clusters"]
+
+    @classmethod
+    def of(cls, sources: Sources) -> "Clusters":
+        """Take each splat as a cluster of its own."""
+        zero = jnp.zeros_like(sources.areas)
+        return cls(
+            centers=sources.centers,
+            normals=sources.normals,
+            areas=sources.areas,
+            irradiance=sources.irradiance,
+            spread=zero,
+            divergence=zero,
+            normal_spread=zero,
+        )
+
+    def lowered(self, depth: Float[Array, ""]) -> "Clusters":
+        """Move the splats of every cluster against their normals by `depth` (mm)."""
+        spread = self.spread - depth * self.divergence + 0.5 * depth * depth * self.normal_spread
+        return Clusters(
+            centers=self.centers - depth * self.normals,
+            normals=self.normals,
+            areas=self.areas,
+            irradiance=self.irradiance,
+            spread=jnp.maximum(spread, 0),
+            divergence=self.divergence - depth * self.normal_spread,
+            normal_spread=self.normal_spread,
+        )
+
+    def merged(self, parents: Int[Array, " clusters"], count: int) -> "Clusters":
+        """Merge into `count` parents. Area and energy are kept. Differentiable."""
+
+        def totals(rows: Float[Array, "rows clusters"]) -> Float[Array, "rows parents"]:
+            return jax.vmap(lambda row: jax.ops.segment_sum(row, parents, count))(rows)
+
+        def mean(rows: Float[Array, "rows clusters"]) -> Float[Array, "rows parents"]:
+            return totals(self.areas[None] * rows) * inverse
+
+        # Means over the area of the children.
+        areas = totals(self.areas[None])[0]
+        inverse = 1 / jnp.where(areas > 0, areas, 1.0)[None]
+        means = mean(jnp.concatenate([self.centers, self.normals, self.irradiance]))
+        centers, normals, irradiance = means[:3], means[3:6], means[6:]
+        # Second moments about these means, with those of the children (parallel axis theorem).
+        offset = self.centers - centers[:, parents]
+        normal_offset = self.normals - normals[:, parents]
+        spread, divergence, normal_spread = mean(
+            jnp.stack(
+                [
+                    self.spread + 0.5 * jnp.sum(offset * offset, axis=0),
+                    self.divergence + jnp.sum(offset * normal_offset, axis=0),
+                    self.normal_spread + jnp.sum(normal_offset * normal_offset, axis=0),
+                ]
+            )
+        )
+        return Clusters(
+            centers=centers,
+            normals=normals,
+            areas=areas,
+            irradiance=irradiance,
+            spread=spread,
+            divergence=divergence,
+            normal_spread=normal_spread,
+        )
+
+
+class ClusterTree(eqx.Module):
+    """Nested cells around the splats. Which splats share a cell is not differentiated.
+
+    **Attributes:**
+
+    - `parents`: for each level, the cell of every cluster of the level before; of every splat, for
+      the first.
+    - `counts`: clusters of each level. Static.
+    """
+
+    parents: tuple[Int[Array, " _"], ...]
+    counts: tuple[int, ...] = eqx.field(static=True)
+
+    @classmethod
+    def build(
+        cls,
+        centers: Float[np.ndarray, "splats 3"],
+        normals: Float[np.ndarray, "splats 3"],
+        exists: Bool[np.ndarray, " splats"],
+        cells: Sequence[float],
+    ) -> "ClusterTree":
+        """Sort splats, and the clusters of each level, into cells by their centers.
+
+        A cell holds only clusters that face one way: the two sides of a thin sheet are apart.
+
+        **Arguments:**
+
+        - `exists`: false for splats that fill a block.
+        - `cells`: edges of the cells of each level, mm, ascending.
+        """
+        parents, counts = [], []
+        positions, facing = centers[exists], normals[exists]
+        members, slots = np.ones(len(positions)), np.flatnonzero(exists)
+        before = len(exists)
+        for cell in cells:
+            # Cells are numbered along a grid, then split by side, then sorted into a compact order.
+            index = np.floor((positions - positions.min(axis=0)) / cell).astype(np.int64)
+            extent = index.max(axis=0) + 1
+            key = (index[:, 0] * extent[1] + index[:, 1]) * extent[2] + index[:, 2]
+            parent = _split_by_side(np.unique(key, return_inverse=True)[1].reshape(-1), facing)
+            inside = np.bincount(parent, members)
+            positions, facing = (
+                _sums(parent, members[:, None] * rows) / inside[:, None]
+                for rows in (positions, facing)
+            )
+            order = compact_order(positions)
+            rank = np.empty(len(order), np.int32)
+            rank[order] = np.arange(len(order), dtype=np.int32)
+            of_slot = np.zeros(before, np.int32)
+            of_slot[slots] = rank[parent]
+            parents.append(jnp.asarray(of_slot))
+            positions, facing, members = positions[order], facing[order], inside[order]
+            slots, before = np.arange(len(order)), _round_up(len(order))
+            counts.append(before)
+        return cls(tuple(parents), tuple(counts))
+
+    def with_capacity(self, counts: Sequence[int]) -> "ClusterTree":
+        """Add empty clusters to every level up to `counts`."""
+        before = (self.parents[0].shape[0], *counts) if self.parents else ()
+        parents = tuple(
+            jnp.pad(each, (0, count - each.shape[0]))
+            for each, count in zip(self.parents, before, strict=False)
+        )
+        return ClusterTree(parents, tuple(counts))
+
+    def levels(self, sources: Sources) -> list[Clusters]:
+        """Compute the clusters of every level, the splats themselves first."""
+        levels = [Clusters.of(sources)]
+        for parents, count in zip(self.parents, self.counts, strict=True):
+            levels.append(levels[-1].merged(parents, count))
+        return levels
+
+
+def _sums(groups: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Sum the rows of each group."""
+    return np.stack([np.bincount(groups, column) for column in rows.T], axis=1)
+
+
+def _split_by_side(groups: np.ndarray, facing: np.ndarray) -> np.ndarray:
+    """Split each group by the side of its main axis that its members face; number without gaps."""
+    rows, columns = np.triu_indices(3)
+    products = np.empty((groups.max() + 1, 3, 3))
+    products[:, rows, columns] = products[:, columns, rows] = _sums(
+        groups, facing[:, rows] * facing[:, columns]
+    )
+    axes = np.linalg.eigh(products)[1][:, :, -1]
+    sides = 2 * groups + (np.sum(facing * axes[groups], axis=1) < 0)
+    return (np.cumsum(np.bincount(sides) > 0) - 1)[sides]
+
+
+def blocks_of(count: int) -> int:
+    """Round up to whole blocks."""
+    return max(-(-count // BLOCK), 1) * BLOCK
+
+
+def _round_up(count: int) -> int:
+    """Round up to the next of sixteen steps per octave and to whole blocks, so that a moving
+    surface needs no other program.
+    """
+    grain = 1 << max(count.bit_length() - 5, 0)
+    return blocks_of(-(-count // grain) * grain)

@@ -1,0 +1,232 @@
+"""The kernel of splat-based diffusion: how light spreads in a layer, where that is cut off, by what
+the gathered light is divided, and which layers the splats are too far apart to resolve.
+"""
+
+import abc
+import functools
+import math
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.lax import stop_gradient
+from jaxtyping import Array, Float
+
+from splatjax.scene import Splats
+
+_ROOT_DEGREE = 4
+_FADE = 0.5  # of the exponent, before its largest
+_LEAST_TRUNCATED, _MOST_TRUNCATED = 4e-5, 0.1  # of the power: 4.5 and 2.1 standard deviations
+_LEAST_SHARE = 1e-3  # of the diffusion integral in a layer that counts at all
+_UNEVEN = 0.05  # from which on splats count as scattered
+_SLACK = 1e-5
+_TINY_ENERGY = 1e-12  # left for the widest layers when their probability is not needed
+_ROUNDING = 0.05  # of the mass of a flat sheet: the corner of the gain is rounded over this excess
+SAMPLED_SPLATS = 64
+"""Splats whose neighbors are measured to find how evenly all are spread."""
+
+
+class TruncatedGaussian(eqx.Module):
+    """`exp(-exponent)`, faded linearly to zero in the last half unit before the largest exponent.
+
+    A step has no derivative that automatic differentiation sees; the fade has one. In float32 the
+    exponential is the eighth power of a polynomial, within 4e-5 and at half the time, and its
+    derivative is that of the polynomial. Static.
+    """
+
+    largest: float = eqx.field(static=True)
+
+    def __call__(self, exponent: Float[Array, "..."]) -> tuple[Float[Array, "..."], ...]:
+        """Compute the weight, and minus its derivative in the exponent."""
+        gaussian, falls = self._gaussian(exponent)
+        left = (self.largest - exponent) / _FADE
+        fades = left < 1
+        weight = jnp.where(fades, gaussian * left, gaussian)
+        falls = jnp.where(fades, falls * left + gaussian / _FADE, falls)
+        inside = exponent < self.largest
+        return jnp.where(inside, weight, 0.0), jnp.where(inside, falls, 0.0)
+
+    def _gaussian(self, exponent: Float[Array, "..."]) -> tuple[Float[Array, "..."], ...]:
+        if exponent.dtype != jnp.float32:
+            gaussian = jnp.exp(-exponent)
+            return gaussian, gaussian
+        coefficients = _root_coefficients(self.largest)
+        root = jnp.full_like(exponent, coefficients[0])
+        slope = jnp.zeros_like(exponent)
+        for coefficient in coefficients[1:]:
+            root, slope = root * exponent + coefficient, slope * exponent + root
+        square = root * root
+        fourth = square * square
+        return fourth * fourth, -8 * fourth * square * root * slope
+
+    def integral(self, exponent: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Integrate the weight from an exponent (below the fade) on: the kernel's integral over a
+        plane, in units of that of the Gaussian.
+        """
+        return jnp.exp(-exponent) - 2 * math.exp(-self.largest) * math.expm1(_FADE)
+
+
+@functools.cache
+def _root_coefficients(largest: float) -> tuple[float, ...]:
+    """Fit the polynomial, highest power first, whose eighth power is `exp(-x)` up to `largest`."""
+    x = np.polynomial.chebyshev.chebpts1(64) * largest / 2 + largest / 2
+    # Weighted between an even error of the weight and an even relative error.
+    found = np.polynomial.Polynomial.fit(x, np.exp(-x / 8), _ROOT_DEGREE, w=np.exp(-3 * x / 8))
+    return tuple(float(each) for each in found.convert().coef[::-1])
+
+
+class AbstractDiffusionKernel(eqx.Module):
+    r"""How one layer of light spreads from splats at `p_j` with normals `n_j` to a point `x`:
+
+        L_k(x) = gain_k(x) sum_j A_j G(v_k, |x - q_j|) E_j / sum_j A_j G(v_k, |x - q_j|)
+        q_j = p_j - depth sqrt(v_k) n_j
+
+    Layers too narrow for the spacing of the splats (the root of a splat's area) are replaced by the
+    surface's own irradiance, in a smooth step of the standard deviation per spacing. Splats on a
+    regular grid resolve narrower layers than scattered ones.
+
+    **Attributes:** (static)
+
+    - `depth`: how far below its splat the source of a layer lies, in standard deviations.
+    - `regular`, `scattered`: standard deviations per spacing at which a layer begins to be resolved
+      and is fully resolved, on a regular grid and for scattered splats.
+    """
+
+    depth: eqx.AbstractVar[float]
+    regular: eqx.AbstractVar[tuple[float, float]]
+    scattered: eqx.AbstractVar[tuple[float, float]]
+
+    def depths(self, variances: Float[Array, " gaussians"]) -> Float[Array, " gaussians"]:
+        """Compute how far below its splat the source of each layer lies, mm."""
+        return self.depth * jnp.sqrt(variances)
+
+    def support(self, error: float, share: float) -> float:
+        """Choose the radius, in standard deviations, beyond which half of `error` of a layer's
+        power lies, when the diffusion integral is only a `share` of the layer.
+
+        In eighths, so that nearly equal plans are equal to the compiler.
+        """
+        truncated = max(0.5 * error / max(share, _LEAST_SHARE), _LEAST_TRUNCATED)
+        return round(8 * math.sqrt(2 * math.log(1 / min(truncated, _MOST_TRUNCATED)))) / 8
+
+    def truncated(self, support: float) -> TruncatedGaussian:
+        """Build the kernel that is zero beyond `support` standard deviations."""
+        return TruncatedGaussian(0.5 * support * support)
+
+    def interval(self, unevenness: Float[Array, ""]) -> Float[Array, "2"]:
+        """Compute between which standard deviations per spacing layers become resolved."""
+        regular, scattered = (
+            jnp.asarray(each, unevenness.dtype) for each in (self.regular, self.scattered)
+        )
+        return regular + jnp.clip(unevenness / _UNEVEN, 0, 1) * (scattered - regular)
+
+    @abc.abstractmethod
+    def gain(
+        self,
+        mass: Float[Array, "gaussians #channels *points"],
+        variances: Float[Array, " gaussians"],
+        energies: Float[Array, "gaussians channels *points"],
+        single_scattering_albedo: Float[Array, "channels *points"],
+    ) -> Float[Array, "gaussians #channels *points"]:
+        r"""Compute the factor of each layer on the mean over the splats around a point.
+
+        **Arguments:**
+
+        - `mass`: of the kernel on the surface, `sum_j A_j G(v_k, |x - q_j|)` over its value on a
+          flat sheet: 1 there, 2 in a sheet much thinner than the layer is wide, less at open edges.
+        - `variances`: mm^2; only their order counts.
+        - `energies`: weights times the albedo at the point: the fraction of the light that leaves a
+          flat piece as each layer.
+        - `single_scattering_albedo`: the fraction that leaves as single scattering.
+        """
+
+
+class PlainMean(AbstractDiffusionKernel):
+    """The kernel of the paper: the mean over the splats around. Constants are kept on any shape.
+
+    **Source:** Kim et al. 2010, section 4.2.
+    """
+
+    depth: float = eqx.field(static=True, default=0.0)
+    regular: tuple[float, float] = eqx.field(static=True, default=(0.4, 0.8))
+    scattered: tuple[float, float] = eqx.field(static=True, default=(1.0, 2.0))
+
+    def gain(self, mass, variances, energies, single_scattering_albedo):
+        return jnp.ones_like(mass)
+
+
+class EscapeNormalization(AbstractDiffusionKernel):
+    r"""A kernel whose light escapes sooner where a part is thin or convex, so that less is
+    absorbed.
+
+    Light spreads from layer to layer, the narrow ones first. Of the light still inside, the
+    fraction `p_k = w_k / (W_k + 1 - W)` leaves a flat surface as layer k, where `W_k` is the energy
+    of the layers as wide or wider and `W` that of all layers and of single scattering, each times
+    the albedo. Where the surface holds `S_k` times the kernel mass of a flat sheet, the odds
+    `p_k / (1 - p_k)` grow S_k-fold, and the wider layers share what is left:
+
+        gain_k = S_k / prod_(j <= k) (1 + p_j (S_j - 1))    where S > 1; S counts as 1 elsewhere
+
+    The gain is 1 on flat pieces and at open edges. For non-negative weights with a sum of at most
+    one, no more light leaves than entered, `sum_k w_k gain_k <= 1`, and all of it leaves when
+    nothing is absorbed (`W = 1`). Negative weights, which a free fit may have, count as zero. The
+    corner at `S = 1` is rounded over 0.05.
+
+    The source lies below its splat, since the light that leaves has been inside: a part facing away
+    is nearer through thin material, and a part across an air gap is farther.
+
+    **Source:** fitted to path tracing: docs/bodies.md.
+    """
+
+    depth: float = eqx.field(static=True, default=0.75)
+    regular: tuple[float, float] = eqx.field(static=True, default=(0.4, 0.8))
+    scattered: tuple[float, float] = eqx.field(static=True, default=(1.0, 2.0))
+
+    def gain(self, mass, variances, energies, single_scattering_albedo):
+        energies = jnp.where(energies >= 0, energies, 0.0)
+        absorbed = 1 - jnp.sum(energies, axis=0) - single_scattering_albedo
+        # White is white to rounding: its derivative must not be taken at a corner.
+        absorbed = jnp.where(absorbed >= -_SLACK, absorbed, 0.0)[None]
+        # Row k of `not_wider` marks the layers that are as narrow as layer k or narrower.
+        rank = jnp.argsort(jnp.argsort(variances))
+        not_wider = (rank[None] <= rank[:, None]).astype(mass.dtype)
+        inside = jnp.tensordot(not_wider.T, energies, 1) + absorbed
+        leaving = energies / jnp.where(inside > _TINY_ENERGY, inside, 1.0)
+        excess = jnp.maximum(mass - 1, 0)
+        excess = excess * excess / (excess + _ROUNDING)
+        return (1 + excess) * jnp.exp(-jnp.tensordot(not_wider, jnp.log(1 + leaving * excess), 1))
+
+
+def resolved_fraction(
+    variance: Float[Array, "..."], area: Float[Array, "..."], interval: Float[Array, "2"]
+) -> Float[Array, "..."]:
+    """Compute how much of a layer is the diffusion integral, and not the surface's own irradiance.
+
+    A smooth step of variance over the area of a splat; `interval` is from
+    `AbstractDiffusionKernel.interval`.
+    """
+    begin, end = interval[0] ** 2, interval[1] ** 2
+    t = jnp.clip((variance / area - begin) / (end - begin), 0, 1)
+    return t * t * (3 - 2 * t)
+
+
+@eqx.filter_jit
+def unevenness(splats: Splats) -> Float[Array, ""]:
+    r"""Measure how unevenly the splats are spread: 0 on a regular grid, about 0.5 at random.
+
+    It is the relative standard deviation, over 64 splats, of the distance to the nearest splat over
+    the root of the area. A number of the geometry; not differentiated.
+    """
+    if splats.count < 2:
+        return jnp.zeros((), splats.centers.dtype)
+    sampled = jnp.linspace(0, splats.count - 1, min(SAMPLED_SPLATS, splats.count)).astype(jnp.int32)
+    centers = stop_gradient(splats.centers).T
+
+    def nearest(i):
+        offset = centers - centers[:, i][:, None]
+        squared = jnp.sum(offset * offset, axis=0).at[i].set(jnp.inf)
+        return jnp.sqrt(jnp.min(squared) / stop_gradient(splats.areas[i]))
+
+    distance = jax.lax.map(nearest, sampled)
+    return jnp.std(distance) / jnp.maximum(jnp.mean(distance), jnp.finfo(distance.dtype).tiny)

@@ -1,0 +1,110 @@
+"""What the splats carry into the picture, and what passes 4 and 5 read of it at the pixels."""
+
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, PyTree
+
+from splatjax import diffusion as _diffusion
+
+
+class SurfaceAttributes(eqx.Module):
+    """Rows that passes 2 and 3 blend (Eq. 1), along the last axis of every array: of the splats, or
+    of the points that the pixels see.
+
+    **Attributes:**
+
+    - `normals`: of the splats; blended ones are not of unit length.
+    - `area`: per splat, mm^2.
+    - `source`: irradiance that spreads below the surface.
+    - `albedo`, `irradiance`, `specular`, `roughness`: `None` where the splats carry none;
+      `irradiance` is then `source`.
+    - `visibility`: per group of lights, of each light; `None` for lights that cast no shadows.
+    - `layers`, `derivative`: the layers of pass 4 as `continue_from_splats` prepares them, and
+      their derivatives; `centers` are the splats', mm from an origin.
+    - `added_source`: the derivative of `source` in a weight of the Gaussians, where it has one.
+    - `extra`: what another `AbstractLighting` needs.
+    """
+
+    normals: Float[Array, "3 points"]
+    area: Float[Array, "1 points"]
+    source: Float[Array, "channels points"]
+    albedo: Float[Array, "channels points"] | None
+    irradiance: Float[Array, "channels points"] | None
+    specular: Float[Array, "1 points"] | None
+    roughness: Float[Array, "1 points"] | None
+    visibility: tuple[Float[Array, "_lights points"] | None, ...]
+    centers: Float[Array, "3 points"] | None = None
+    layers: tuple[_diffusion.LayerValues | None, ...] = ()
+    derivative: tuple[_diffusion.LayerValues | None, ...] | None = None
+    added_source: Float[Array, "channels points"] | None = None
+    extra: Any = None
+
+    def with_layers(
+        self,
+        layers: tuple[_diffusion.LayerValues | None, ...],
+        derivative: tuple[_diffusion.LayerValues | None, ...] | None,
+        added_source: Float[Array, "channels splats"] | None,
+        centers: Float[Array, "3 splats"],
+    ) -> "SurfaceAttributes":
+        """Add the layers of the splats to what is blended."""
+
+        def prepared(layers):
+            return tuple(
+                layer and _diffusion.continue_from_splats(layer, centers) for layer in layers
+            )
+
+        return dataclasses.replace(
+            self,
+            centers=centers,
+            layers=prepared(layers),
+            derivative=None if derivative is None else prepared(derivative),
+            added_source=added_source,
+        )
+
+    def without_layers(self) -> "SurfaceAttributes":
+        """Leave out the layers, once they are continued to the points seen."""
+        return dataclasses.replace(self, centers=None, layers=(), derivative=None)
+
+
+class SurfaceSamples(eqx.Module):
+    """What the pixels of some tiles see, along the last axis.
+
+    **Attributes:**
+
+    - `attributes`: blended.
+    - `positions`: mm.
+    - `depth`: mm along the camera's forward axis.
+    - `covered`: where there is a surface.
+    - `layers`: of each Gaussian, means and mass at the positions; `None` for one that no splat
+      resolves.
+    - `derivative`: of the layers in the logarithms of their variances; `None` where not asked for.
+    """
+
+    attributes: SurfaceAttributes
+    positions: Float[Array, "3 points"]
+    depth: Float[Array, " points"]
+    covered: Bool[Array, " points"]
+    layers: tuple[Float[Array, "values points"] | None, ...]
+    derivative: tuple[Float[Array, "values points"] | None, ...] | None
+
+
+def stack_rows(rows: PyTree[Float[Array, "... points"]]) -> Float[Array, "all points"]:
+    """Stack the rows of a tree of arrays."""
+    leaves = jax.tree.leaves(rows)
+    return jnp.concatenate([leaf.reshape(-1, leaf.shape[-1]) for leaf in leaves])
+
+
+def split_rows(stacked: Float[Array, "all points"], like: PyTree) -> PyTree:
+    """Undo `stack_rows`, for a tree of arrays that differs from `like` in its last axis alone."""
+    leaves, structure = jax.tree.flatten(like)
+    sizes = [leaf.size // leaf.shape[-1] for leaf in leaves]
+    parts = jax.lax.split(stacked, sizes, axis=0)
+    points = stacked.shape[1]
+    split = [
+        part.reshape(*leaf.shape[:-1], points) for part, leaf in zip(parts, leaves, strict=True)
+    ]
+    return structure.unflatten(split)

@@ -1,0 +1,172 @@
+"""A picture for any weights: everything that they do not change is rendered once."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from splatjax import diffusion as _diffusion, splatting as _splatting
+from splatjax.gaussians import SumOfGaussians
+from splatjax.scene import Camera, Scene, stack_lights
+
+from ._attributes import SurfaceSamples
+from ._devices import on_devices
+from ._inputs import check_channels, in_one_dtype
+from ._lighting import LightVisibility
+from ._passes import in_a_row, light_splats, see_and_read
+from ._plan import Plan, plan_unless_traced
+from ._settings import RenderSettings
+from ._shade import layers_at_points, shade
+
+
+class DiffusionBasis(eqx.Module):
+    r"""A picture for weights that are still to come.
+
+    Its points are those that the pixels see: of the surface in front, and of the one that shows
+    behind its silhouettes.
+
+    **Attributes:**
+
+    - `light`: the layers at every point.
+    - `leaving`: from radiant exitance to the pixel's radiance, with the point's share of the pixel;
+      0 where no point is.
+    - `pixels`: the pixel of each point, counted row by row.
+    - `in_front`: 1 for a point of the surface in front, else 0.
+    - `specular`: radiance, premultiplied.
+    - `coverage`: in [0, 1].
+    - `overflow`: as in a `Frame`; where it is above 0, pictures are NaN.
+    """
+
+    light: _diffusion.LayersAtPoints
+    leaving: Float[Array, "#channels points"]
+    pixels: Int[Array, " points"]
+    in_front: Float[Array, " points"]
+    specular: Float[Array, "height width channels"]
+    coverage: Float[Array, "height width"]
+    overflow: Float[Array, ""]
+
+    def beauty(self, gaussians: SumOfGaussians) -> Float[Array, "height width channels"]:
+        """Compute the picture that `render` makes of these Gaussians. Differentiable in every mode.
+
+        **Arguments:**
+
+        - `gaussians`: the variances count as those that were rendered; with the derivative they may
+          be a little off, to first order.
+        """
+        radiance = self.leaving * self.light.exitance(gaussians)
+        height, width, channels = self.specular.shape
+        diffuse = jnp.zeros((channels, height * width), radiance.dtype)
+        diffuse = diffuse.at[:, self.pixels].add(radiance)
+        return diffuse.T.reshape(height, width, channels) + self.specular
+
+
+class _Read(eqx.Module):
+    """What a basis needs of the surface samples."""
+
+    means: Float[Array, "gaussians channels points"]
+    mass: Float[Array, "gaussians points"]
+    derivative: tuple | None
+    irradiance: Float[Array, "channels points"]
+    area: Float[Array, " points"]
+    albedo: Float[Array, "channels points"]
+    post: Float[Array, "#channels points"]
+    specular: Float[Array, "channels points"]
+
+
+def diffusion_basis(
+    scene: Scene,
+    camera: Camera,
+    settings: RenderSettings = RenderSettings(),
+    plan: Plan | None = None,
+    derivative: bool = False,
+) -> DiffusionBasis:
+    r"""Render everything that the weights of the material do not change: the picture of all
+    materials with its variances.
+
+    It costs about as much as the picture. Many materials can then be looked at, differentiated or
+    fitted in a moment each.
+
+    **Arguments:** as for `render`; the weights of `scene.material` do not matter.
+
+    - `derivative`: also differentiate the layers in their variances, for about one more pass 4. The
+      picture then has the derivatives of `picture_jacobian`, by weights and variances that are made
+      of anything.
+
+    **Returns:** a `DiffusionBasis`; NaN where the plan does not suffice.
+
+    **Raises:** `ValueError` as `render`, and for a material with single scattering, beside which
+    the light that enters depends on the weights.
+    """
+    check_channels(scene)
+    if scene.material.single_scattering is not None:
+        raise ValueError(
+            "scene.material has single scattering, beside which less light enters as the weights "
+            "grow; render each material by itself, or give one with single_scattering=None"
+        )
+    plan = plan_unless_traced(scene, camera, settings, plan)
+    return _diffusion_basis(scene, camera, settings, plan, derivative)
+
+
+@eqx.filter_jit
+def _diffusion_basis(
+    scene: Scene, camera: Camera, settings: RenderSettings, plan: Plan, derivative: bool
+) -> DiffusionBasis:
+    scene, camera = in_one_dtype(scene, camera)
+
+    def passes(combination, scene, plan, camera):
+        view, groups = _splatting.PerspectiveView.of(camera), stack_lights(scene.lights)
+        given, gaussians = (settings, plan, combination), scene.material.gaussians
+        seen = view.may_see(scene.splats)
+        light = light_splats(scene, *given, derivative=derivative, wanted=seen)
+        visibility = LightVisibility(groups, light.visibility, light.needed)
+        attributes = settings.lighting.attributes(scene, visibility, light.irradiance)
+
+        def read(samples: SurfaceSamples) -> _Read:
+            own = settings.lighting.at_pixels(scene, groups, samples)
+            shaded = shade(scene, view.position, groups, samples, own, plan.interval, settings)
+            at = layers_at_points(
+                samples, own, own.source, gaussians.variances, plan.interval, settings.kernel
+            )
+            return _Read(
+                means=at.means,
+                mass=at.mass,
+                derivative=at.derivative,
+                irradiance=at.irradiance,
+                area=at.area,
+                albedo=at.albedo,
+                post=shaded.post,
+                specular=shaded.specular,
+            )
+
+        tiles, visible, needed = see_and_read(scene, view, light, attributes, read, *given)
+        tiles, visible = combination.gather(tiles), visible.gathered(combination)
+        visible = visible.invalidate_unless(needed <= 1)
+        rows = jax.tree.map(in_a_row, tiles)
+        leaving = visible.invalid_factor * visible.share.reshape(1, -1) * rows.post
+        x, y = visible.pixels(visible.tiles)
+        x, y = jnp.minimum(x, view.width - 1), jnp.minimum(y, view.height - 1)
+        in_front = jnp.broadcast_to(visible.in_front[:, None], x.shape)
+        resolvable = [layer is not None for layer in light.layers]
+        at = _diffusion.LayersAtPoints(
+            variances=gaussians.variances,
+            means=rows.means,
+            mass=rows.mass,
+            resolvable=jnp.asarray(resolvable, leaving.dtype),
+            irradiance=rows.irradiance,
+            area=rows.area,
+            albedo=rows.albedo,
+            interval=plan.interval,
+            kernel=settings.kernel,
+            derivative=rows.derivative,
+        )
+        return DiffusionBasis(
+            light=at,
+            leaving=leaving,
+            pixels=(y * view.width + x).reshape(-1),
+            in_front=in_front.reshape(-1).astype(leaving.dtype),
+            specular=visible.picture(tiles.specular),
+            coverage=visible.picture(jnp.ones_like(tiles.area)),
+            overflow=jnp.where(needed <= 1, 0.0, needed),
+        )
+
+    return on_devices(passes, scene, plan, camera)

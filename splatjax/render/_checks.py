@@ -1,0 +1,130 @@
+"""Checks of a scene before it is rendered: memory, and warnings about scenes that nobody means."""
+
+import functools
+import warnings
+from collections.abc import Iterator
+
+import jax
+import numpy as np
+from jax.core import Tracer
+
+from splatjax._memory import check_memory
+from splatjax.scene import Camera, Scene, Splats
+
+_BYTES_PER_SPLAT, _BYTES_PER_PIXEL = 1000.0, 500.0
+"""At least: a picture that needs more than is free by these does not fit."""
+_SAMPLE = 4096
+"""Splats, evenly picked, by which the shape of a body is judged."""
+_CLOSED = 0.15
+"""Sum of the normals of a closed body, by area, as a fraction of the area. An open neck leaves
+0.08, a hemisphere 0.5.
+"""
+_SOLID = 0.05
+"""Volume of a body that is no sheet, as a fraction of that of a sphere of its area."""
+_OPAQUE = 2e-3
+"""Millimeters below which a material is meant to be opaque, as `Material.opaque` makes it."""
+_RATIO = 1000.0
+"""Size of a body over the distance that light travels below its surface, or the inverse."""
+
+
+def check_scene(scene: Scene, camera: Camera, is_lit: bool = True) -> None:
+    r"""Refuse a picture that does not fit into memory, and warn of what makes it black or
+    meaningless: no light, inverted normals, a camera inside the body, a body a thousand times
+    larger or smaller than the length scale of its material.
+
+    Traced scenes pass, and those spread over several processes. Each warning is shown once.
+
+    **Arguments:**
+
+    - `is_lit`: false where the irradiance is given and the lights do not matter.
+
+    **Raises:** `ValueError` when the memory of the device does not suffice.
+    """
+    leaves = [leaf for leaf in jax.tree.leaves((scene, camera)) if isinstance(leaf, jax.Array)]
+    if any(isinstance(leaf, Tracer) or not leaf.is_fully_addressable for leaf in leaves):
+        return
+    count, pixels = scene.splats.count, camera.width * camera.height
+    check_memory(
+        f"a picture of {camera.width} x {camera.height} pixels with {count} splats",
+        _BYTES_PER_SPLAT * count + _BYTES_PER_PIXEL * pixels,
+        "take fewer pixels, thin the splats, or render them by render_streamed",
+        _device_memory(scene.splats),
+    )
+    for message in _doubts(scene, camera, is_lit):
+        _warn_once(message)
+
+
+def check_displayable(channels: int) -> None:
+    """Raise `ValueError` for a number of channels that no PNG file shows, before rendering it."""
+    if channels not in (1, 3):
+        raise ValueError(
+            f"a picture of {channels} channels has no colors for a PNG file; convert the material "
+            "to 1 or 3 channels, or write an EXR file from Python"
+        )
+
+
+@functools.cache
+def _warn_once(message: str) -> None:
+    """Warn, unless it has been done: Python itself forgets whenever a library changes filters."""
+    warnings.warn(message, stacklevel=4)
+
+
+def _device_memory(splats: Splats) -> float | None:
+    """Read the free memory of an accelerator; `None` on a CPU."""
+    device = next(iter(splats.centers.devices()))
+    stats = None if device.platform == "cpu" else device.memory_stats()
+    return None if not stats else float(stats["bytes_limit"] - stats["bytes_in_use"])
+
+
+def _doubts(scene: Scene, camera: Camera, is_lit: bool) -> Iterator[str]:
+    """Say what is hardly meant."""
+    if is_lit and not any(np.any(np.asarray(_strength(light)) != 0) for light in scene.lights):
+        yield "the scene has no light, and the picture will be black; add one to Scene.lights"
+    if scene.splats.count == 0:
+        return
+    step = -(-scene.splats.count // _SAMPLE)
+    centers, normals, areas = (
+        np.asarray(field)[::step].astype(np.float64)
+        for field in (scene.splats.centers, scene.splats.normals, scene.splats.areas)
+    )
+    areas = areas * (scene.splats.count / len(areas))
+    area = max(np.sum(areas), np.finfo(float).tiny)
+    is_closed = np.linalg.norm(areas @ normals) < _CLOSED * area
+    middle = areas @ centers / area
+    volume = areas @ np.sum(normals * (centers - middle), axis=1) / 3
+    sphere = area**1.5 / (6 * np.sqrt(np.pi))
+    if is_closed and volume < -_SOLID * sphere:
+        yield (
+            "the normals of the splats point into the body; turn them around, or its surface is "
+            "seen and lit from behind"
+        )
+    elif is_closed and _winding_number(centers, normals, areas, camera) > 0.5:
+        yield "the camera is inside the body, and sees its surface from behind; move it outside"
+    gaussians = scene.material.gaussians
+    variances, weights = (
+        np.asarray(x, np.float64) for x in (gaussians.variances, gaussians.weights)
+    )
+    if np.all(weights.sum(axis=0) > 0):
+        reach = np.sqrt(np.max(variances @ weights / weights.sum(axis=0)))
+        size = np.linalg.norm(np.ptp(centers, axis=0))
+        if reach > _OPAQUE and not 1 / _RATIO < size / reach < _RATIO:
+            yield (
+                f"the body is {size:.3g} mm large, and light travels {reach:.3g} mm below its "
+                "surface; check the units (mm), or scale the body by Splats.scaled"
+            )
+
+
+def _strength(light) -> jax.Array | float:
+    return getattr(light, light.strength, 1.0) if light.strength else 1.0
+
+
+def _winding_number(centers, normals, areas, camera: Camera) -> float:
+    """Add up the solid angles, over 4 pi, under which a point sees the outside of splats from
+    within: 1 inside a closed body, 0 outside.
+    """
+    offsets = centers - np.asarray(camera.position, np.float64)
+    squared = np.maximum(np.sum(offsets * offsets, axis=1), np.finfo(float).tiny)
+    cosines = np.sum(normals * offsets, axis=1) / np.sqrt(squared)
+    # No splat is seen under more than half of all directions.
+    angles = np.minimum(areas / squared, 2 * np.pi)
+    return float(cosines @ angles) / (4 * np.pi)

@@ -1,0 +1,92 @@
+"""Where the passes run: on one device, or with the splats cut over the devices of a mesh."""
+
+from collections.abc import Callable
+from typing import TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.sharding import PartitionSpec
+from jaxtyping import Array, Float, PyTree
+
+from splatjax._combination import AbstractCombination, DeviceMesh, OneDevice, lay_out
+from splatjax.scene import Scene
+
+from ._plan import Plan, arrange, fill_up
+
+Result = TypeVar("Result", bound=PyTree)
+
+
+def on_devices(
+    function: Callable[..., Result],
+    scene: Scene,
+    plan: Plan,
+    *whole: PyTree,
+    rows: tuple[PyTree[Float[Array, "splats ..."]], ...] = (),
+    placed: PyTree = None,
+    by_splat: bool = False,
+) -> Result:
+    """Run a function on the devices of a plan, each with its own splats in the order of the plan.
+    Gradients go back to where the splats are.
+
+    **Arguments:**
+
+    - `function`: of the combination, scene and plan of a device, then of `whole`, `rows` and, if
+      given, `placed`.
+    - `whole`: what every device has whole.
+    - `rows`: one for each splat, in the order of the scene.
+    - `placed`: what an earlier call computed along the splats, in the order of the plan.
+    - `by_splat`: the results lie along the splats, in the order of the plan; otherwise they are the
+      same on all devices.
+    """
+    count = 1 if plan.mesh is None else plan.mesh.size
+    filled = max(-(-scene.splats.count // count), 1) * count
+    scene = Scene(fill_up(scene.splats, filled), scene.lights, scene.material)
+    rows = jax.tree.map(lambda row: jnp.pad(row, ((0, filled - len(row)), (0, 0))), rows)
+    extra = () if placed is None else (placed,)
+
+    def run(combination: AbstractCombination, scene: Scene, plan: Plan, whole, rows, extra):
+        splats = arrange(scene.splats, plan.order, plan.exists)
+        scene = Scene(splats, scene.lights, scene.material)
+        rows = jax.tree.map(lambda row: row[plan.order], rows)
+        return function(combination, scene, plan, *whole, *rows, *extra)
+
+    given = scene, plan, whole, rows, extra
+    if plan.mesh is None:
+        return run(OneDevice(), *given)
+    devices = DeviceMesh.of(plan.mesh)
+    specs = jax.tree.map(lambda _: PartitionSpec(), (scene, plan, whole))
+    of_splats = jax.tree.map(lambda _: devices.shares, (scene.splats, rows))
+    of_scene = eqx.tree_at(lambda each: each.splats, specs[0], of_splats[0])
+    specs = (
+        of_scene,
+        plan.specs(devices),
+        specs[2],
+        of_splats[1],
+        along_splats(extra, devices),
+    )
+    out_specs = PartitionSpec()
+    if by_splat:
+        shapes = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), given)
+        results = jax.eval_shape(lambda given: run(OneDevice(), *given), shapes)
+        out_specs = along_splats(results, devices)
+    # Without a check of what varies over devices: custom derivatives and loops have no rules for
+    # it.
+    mapped = jax.shard_map(
+        lambda *given: run(devices, *given),
+        mesh=plan.mesh,
+        in_specs=specs,
+        out_specs=out_specs,
+        check_vma=False,
+    )
+    return mapped(*lay_out(plan.mesh, given, specs))
+
+
+def along_splats(tree: PyTree, devices: DeviceMesh) -> PyTree:
+    """Specify that arrays are cut along their last axis, and that numbers are the same."""
+    return jax.tree.map(
+        lambda leaf: (
+            PartitionSpec(*[None] * (leaf.ndim - 1), devices.axes) if leaf.ndim else PartitionSpec()
+        ),
+        tree,
+    )

@@ -1,0 +1,175 @@
+"""Pass 5: the surface samples shaded, and laid together to a frame."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from splatjax import diffusion as _diffusion, shading as _shading, splatting as _splatting
+from splatjax.scene import Frame, Scene, StackedLights
+
+from ._attributes import SurfaceAttributes, SurfaceSamples
+from ._settings import RenderSettings
+
+
+class ShadedSurface(eqx.Module):
+    """The surface samples, shaded; nothing is premultiplied.
+
+    **Attributes:**
+
+    - `post`: from a layer to the radiance towards the eye; 0 where there is no surface.
+    - `layers`: of each Gaussian, times `post`, Gaussian by Gaussian.
+    - `diffuse`: their weighted sum.
+    - `resolved`: the fraction of each layer that is the diffusion integral.
+    """
+
+    depth: Float[Array, " points"]
+    positions: Float[Array, "3 points"]
+    normals: Float[Array, "3 points"]
+    albedo: Float[Array, "channels points"]
+    shadow: Float[Array, "lights points"]
+    irradiance: Float[Array, "channels points"]
+    post: Float[Array, "#channels points"]
+    layers: Float[Array, "gaussians channels points"]
+    diffuse: Float[Array, "channels points"]
+    specular: Float[Array, "channels points"]
+    single_scattering: Float[Array, "channels points"] | None
+    resolved: Float[Array, "gaussians points"]
+
+
+def layers_at_points(
+    samples: SurfaceSamples,
+    attributes: SurfaceAttributes,
+    source: Float[Array, "channels points"],
+    variances: Float[Array, " gaussians"],
+    interval: Float[Array, "2"],
+    kernel: _diffusion.AbstractDiffusionKernel,
+) -> _diffusion.LayersAtPoints:
+    """Collect what makes the layers of the samples.
+
+    **Arguments:**
+
+    - `source`: the surface's own irradiance, for layers that the splats do not resolve; the layers
+      have its channels first, or its channels after those of `attributes.source`.
+    """
+    albedo = attributes.albedo
+    return _diffusion.LayersAtPoints.of(
+        variances,
+        samples.layers,
+        samples.derivative,
+        source,
+        jnp.where(samples.covered, attributes.area[0], 1.0),
+        jnp.ones_like(source) if albedo is None else albedo,
+        interval,
+        kernel,
+    )
+
+
+def shade(
+    scene: Scene,
+    eye: Float[Array, "3"],
+    groups: list[StackedLights],
+    samples: SurfaceSamples,
+    attributes: SurfaceAttributes,
+    interval: Float[Array, "2"],
+    settings: RenderSettings,
+) -> ShadedSurface:
+    """Shade the samples: the layers, the specular lobe, and single scattering."""
+    material, covered = scene.material, samples.covered
+    f0 = _shading.fresnel_f0(material.eta)
+    to_eye = eye[:, None] - samples.positions
+    points = _shading.SurfacePoints(
+        positions=samples.positions.T,
+        normals=_shading.unit_normals(attributes.normals.T),
+        outgoing=(to_eye / jnp.sqrt(jnp.sum(to_eye * to_eye, axis=0, keepdims=True))).T,
+        specular=material.specular if attributes.specular is None else attributes.specular[0],
+        roughness=material.roughness if attributes.roughness is None else attributes.roughness[0],
+        lit=list(attributes.visibility),
+    )
+    gaussians = material.gaussians
+    channels, post = gaussians.weights.shape[1], _shading.leaving_share(points, f0)[None] / jnp.pi
+    albedo = jnp.ones_like(attributes.source) if attributes.albedo is None else attributes.albedo
+    if attributes.albedo is not None:
+        post = post * _shading.albedo_root(albedo)
+    single = None
+    if material.single_scattering is not None:
+        single = _shading.single_scattered_radiance(points, groups, f0, material.single_scattering)
+        single = jnp.where(covered[None], single.T, 0.0)
+        if attributes.albedo is not None:
+            single = single * _shading.albedo_root(albedo) ** 2
+    at = layers_at_points(
+        samples, attributes, attributes.source, gaussians.variances, interval, settings.kernel
+    )
+    layers, resolved = at.weigh(gaussians, single_scattering_albedo(scene))
+    layers = jnp.where(covered[None, None], post[None] * layers, 0.0)
+    specular = _shading.reflected_radiance(points, groups, f0, channels).T
+    shadow = _shadows_in_order(attributes.visibility, groups, samples.depth)
+    return ShadedSurface(
+        depth=jnp.where(covered, samples.depth, jnp.inf),
+        positions=jnp.where(covered[None], samples.positions, 0.0),
+        normals=points.normals.T,
+        albedo=albedo,
+        shadow=jnp.where(covered[None], shadow, 1.0),
+        irradiance=attributes.source if attributes.irradiance is None else attributes.irradiance,
+        post=jnp.where(covered[None], post, 0.0),
+        layers=layers,
+        diffuse=jnp.sum(gaussians.weights[:, :, None] * layers, axis=0),
+        specular=jnp.where(covered[None], specular, 0.0),
+        single_scattering=single,
+        resolved=resolved,
+    )
+
+
+def single_scattering_albedo(scene: Scene) -> Float[Array, " channels"]:
+    """Compute the fraction of the light that leaves a flat piece as single scattering."""
+    material = scene.material
+    return material.total_reflectance() - material.gaussians.total_reflectance()
+
+
+def compose(
+    scene: Scene,
+    shaded: ShadedSurface,
+    visible: _splatting.VisibleSurfaces,
+    needed: Float[Array, ""],
+) -> Frame:
+    """Lay the front over what shows behind it; all is NaN where the plan does not suffice.
+
+    **Arguments:**
+
+    - `shaded`: with arrays `[places, *rows, pixels]`.
+    """
+    visible = visible.invalidate_unless(needed <= 1)
+    front, picture = visible.front_picture, visible.picture
+    diffuse, specular = picture(shaded.diffuse), picture(shaded.specular)
+    single = None if shaded.single_scattering is None else picture(shaded.single_scattering)
+    drawn = (visible.share > 0) & visible.in_front[:, None]
+    drawn = drawn.astype(shaded.depth.dtype)
+    unresolved = jnp.sum((1 - shaded.resolved) * drawn[:, None], axis=(0, 2))
+    return Frame(
+        beauty=diffuse + specular if single is None else diffuse + single + specular,
+        coverage=picture(jnp.ones_like(shaded.depth)),
+        depth=front(shaded.depth, jnp.inf),
+        position=front(shaded.positions),
+        normal=front(shaded.normals),
+        albedo=picture(shaded.albedo),
+        shadow=jnp.moveaxis(front(shaded.shadow, 1.0), -1, 0),
+        irradiance=picture(shaded.irradiance),
+        layers=jnp.moveaxis(picture(shaded.layers), 2, 0),
+        weights=scene.material.gaussians.weights,
+        diffuse=diffuse,
+        specular=specular,
+        handed_over=visible.invalid_factor * unresolved / jnp.maximum(jnp.sum(drawn), 1),
+        overflow=jnp.where(needed <= 1, 0.0, needed),
+        single_scattering=single,
+    )
+
+
+def _shadows_in_order(
+    visibility, groups: list[StackedLights], depth: Float[Array, " points"]
+) -> Float[Array, "lights points"]:
+    """Sort the visibility of the lights into the scene's order; 1 where a light casts none."""
+    planes = [jnp.ones_like(depth)] * sum(len(group.places) for group in groups)
+    for group, own in zip(groups, visibility, strict=True):
+        if own is not None:
+            for row, place in enumerate(group.places):
+                planes[place] = own[row]
+    return jnp.stack(planes) if planes else jnp.zeros((0, *depth.shape), depth.dtype)

@@ -1,0 +1,139 @@
+"""What must be known of all splats before a picture of a stream can be begun."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from splatjax import diffusion as _diffusion, splatting as _splatting
+from splatjax.scene import Parts, Splats
+
+_CHANGED = (
+    "parts must be the same each time that they are called; give the same splats in the same order"
+)
+
+
+class ReplayableStream:
+    """Parts that must be the same each time: what is known of one is used when it comes again."""
+
+    def __init__(self, parts: Parts):
+        self.parts, self.marks = parts, None
+
+    def __call__(self) -> Iterator[Splats]:
+        """Iterate over all splats from the beginning.
+
+        **Raises:** `ValueError` when a part differs from the first time, or there are fewer or
+        more.
+        """
+        marks = []
+        for part in self.parts():
+            marks.append(np.asarray(_mark(part)))
+            self._check(marks)
+            yield part
+        self.marks = marks if self.marks is None else self.marks
+        if len(marks) != len(self.marks):
+            raise ValueError(_CHANGED)
+
+    def _check(self, marks: list[np.ndarray]) -> None:
+        if self.marks is None:
+            return
+        expected = self.marks[len(marks) - 1 : len(marks)]
+        if not np.array_equal(marks[-1:], expected, equal_nan=True):
+            raise ValueError(_CHANGED)
+
+
+@jax.jit
+def _mark(splats: Splats) -> Float[Array, " leaves"]:
+    return jnp.stack([jnp.sum(leaf) for leaf in jax.tree.leaves(splats)])
+
+
+@dataclass(frozen=True)
+class StreamStatistics:
+    """Numbers of all splats of a stream. Lengths in mm.
+
+    **Attributes:**
+
+    - `count`, `rows`: splats in all, and in every part but the last.
+    - `middle`, `reach`: of the box around all centers, and from there to the farthest rim.
+    - `spacing`: root of the mean area.
+    - `fine`: area that one splat in a hundred is finer than.
+    - `unevenness`: as `diffusion.unevenness`, but that neighbors are those in the same part.
+    """
+
+    count: int
+    rows: int
+    middle: np.ndarray
+    reach: float
+    spacing: float
+    fine: float
+    unevenness: float
+
+    @classmethod
+    def of(cls, parts: Parts) -> "StreamStatistics":
+        """Look at all parts twice, and keep the areas of the finest.
+
+        **Raises:** `ValueError` when there are no splats, or a part is larger than the first, or
+        smaller and not the last.
+        """
+        # Sizes, extent and areas.
+        sizes, low, high, area, radius = [], [], [], 0.0, 0.0
+        for part in parts():
+            if part.count:
+                centers = np.asarray(part.centers)
+                sizes.append(part.count)
+                low.append([axis.min() for axis in centers.T])  # quicker than over an axis of three
+                high.append([axis.max() for axis in centers.T])
+                area += float(np.asarray(part.areas).sum(dtype=np.float64))
+                radius = max(radius, float(part.radii.max()))
+        if not sizes:
+            raise ValueError("parts has no splats; give at least one")
+        if any(size != sizes[0] for size in sizes[:-1]) or sizes[-1] > sizes[0]:
+            raise ValueError(
+                "parts must be of one size, but the last, which may be smaller; these have "
+                f"{sizes} splats"
+            )
+        # How far the farthest splat is, the finest areas, and the distances of some neighbors.
+        middle, squared, begin, near = (np.min(low, axis=0) + np.max(high, axis=0)) / 2, 0.0, 0, []
+        count = sum(sizes)
+        sampled = np.linspace(0, count - 1, min(_diffusion.SAMPLED_SPLATS, count)).astype(int)
+        rank, finest = _diffusion.FINEST * (count - 1), np.zeros(0)
+        for part in parts():
+            own = sampled[(sampled >= begin) & (sampled < begin + part.count)] - begin
+            far = np.max(_squares(np.asarray(part.centers), middle), initial=0)
+            squared, begin = max(squared, float(far)), begin + part.count
+            near += _nearest(part, own)
+            finest = np.sort(np.concatenate([finest, np.asarray(part.areas)]))[: int(rank) + 2]
+        return cls(
+            count=count,
+            rows=sizes[0],
+            middle=middle,
+            reach=math.sqrt(squared) + radius,
+            spacing=math.sqrt(area / count),
+            fine=float(np.interp(rank, np.arange(len(finest)), finest)),
+            unevenness=float(np.std(near) / max(np.mean(near), 1e-300)),
+        )
+
+    def bounds(self, dtype) -> _splatting.Bounds:
+        """Return the sphere around all discs."""
+        return _splatting.Bounds(jnp.asarray(self.middle, dtype), jnp.asarray(self.reach, dtype))
+
+
+def _squares(centers: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """Compute squared distances, axis by axis, which is quicker."""
+    return sum((axis - at) ** 2 for axis, at in zip(centers.T, place, strict=True))
+
+
+def _nearest(part: Splats, sampled: np.ndarray) -> list[float]:
+    """Compute the distance of splats to the nearest other one of their part, over the root of their
+    area; 0 for the only one.
+    """
+    centers, areas, distances = np.asarray(part.centers), np.asarray(part.areas), []
+    for i in sampled:
+        squared = np.delete(_squares(centers, centers[i]), i)
+        nearest = math.sqrt(np.min(squared, initial=np.inf) / areas[i]) if len(squared) else 0.0
+        distances.append(nearest)
+    return distances

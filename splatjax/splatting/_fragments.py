@@ -1,0 +1,320 @@
+"""The fragments of splats in the pixels of tiles: what is found of them along a tile's list, and
+the cotangents of the splats.
+
+Fragments are computed relative to their tile, so that float32 suffices at any resolution.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float, Int, Shaped
+
+from ._bins import Bins, slot_plane
+from ._grid import SIDE, TileGrid
+from ._kernel import fast_fragment_weight, fragment_weight_derivative
+from ._rasterizer import least_weight
+from ._views import AbstractView
+
+PLANES = ("x", "y", "slope_x", "slope_y", "a", "b", "c", "nearness", "opacity")
+"""Of the footprints, that sums depend on."""
+_EMPTY = (0.0, 0.0, 0.0, 0.0, 1e12, 0.0, 1e12, 1.0, 0.0)  # covers no pixel center
+
+
+class Lanes(eqx.Module):
+    """Tiles that are swept together: where their lists begin in the slots, and their corners."""
+
+    row: Int[Array, " lanes"]
+    """Of the first block, in slots cut into rows of one lane each; the next block is `stride` rows
+    on.
+    """
+    lengths: Int[Array, " lanes"]
+    """Of each lane's list, in blocks: what follows is another chunk's."""
+    blocks: Int[Array, ""]
+    x: Float[Array, "lanes 1"]
+    y: Float[Array, "lanes 1"]
+    stride: int = eqx.field(static=True)
+
+    def read(self, plane: Shaped[Array, "rows slots"], block) -> Shaped[Array, "lanes slots"]:
+        return plane.at[self.row + block * self.stride].get(mode="promise_in_bounds")
+
+    def add(
+        self, plane: Float[Array, "rows slots"], block, part: Float[Array, "lanes slots"]
+    ) -> Float[Array, "rows slots"]:
+        return plane.at[self.row + block * self.stride].add(part, mode="promise_in_bounds")
+
+    def until_end(
+        self, beyond: Float[Array, "lanes pixels"], block
+    ) -> Float[Array, "lanes pixels"]:
+        """Give limits that nothing is nearer than, for lanes whose list has ended before a
+        block.
+        """
+        return jnp.where((block < self.lengths)[:, None], beyond, jnp.inf)
+
+
+class ChunkLanes(Lanes):
+    """The tiles of one chunk: their rows follow one another."""
+
+    def read(self, plane: Shaped[Array, "rows slots"], block) -> Shaped[Array, "lanes slots"]:
+        return lax.dynamic_slice_in_dim(plane, self.row[0] + block * self.stride, self.stride)
+
+    def add(
+        self, plane: Float[Array, "rows slots"], block, part: Float[Array, "lanes slots"]
+    ) -> Float[Array, "rows slots"]:
+        return lax.dynamic_update_slice_in_dim(
+            plane, self.read(plane, block) + part, self.row[0] + block * self.stride, 0
+        )
+
+    def until_end(
+        self, beyond: Float[Array, "lanes pixels"], block
+    ) -> Float[Array, "lanes pixels"]:
+        return beyond
+
+
+class Sweep(eqx.Module):
+    """What is static in a sweep."""
+
+    view: type[AbstractView] = eqx.field(static=True)
+    """The view's class: fragments need its formulas, not where it stands."""
+    grid: TileGrid
+    full_coverage: float = eqx.field(static=True)
+    filter_radius: float = eqx.field(static=True)
+
+    def within_picture(
+        self, sums: Float[Array, "lanes rows pixels"], tiles: Int[Array, " lanes"]
+    ) -> Float[Array, "lanes rows pixels"]:
+        """Set to zero what lies in a tile but beyond the picture."""
+        within = self.grid.within_picture()
+        if within is None:
+            return sums
+        within = jnp.asarray(within)[jnp.minimum(tiles, self.grid.count - 1)]
+        return jnp.where(within[:, None], sums, 0.0)
+
+    def pixels(self, dtype) -> tuple[np.ndarray, np.ndarray]:
+        """Pixel centers of a tile, from its corner. Constants: made by NumPy, or the compiler
+        computes them per fragment.
+        """
+        side = np.arange(SIDE, dtype=dtype) + np.asarray(0.5, dtype)
+        return np.tile(side, SIDE), np.repeat(side, SIDE)
+
+    def _lanes(self, kind: type[Lanes], bins: Bins, places, dtype) -> Lanes:
+        lanes, across = self.grid.lanes, self.grid.across
+        tiles, chunk = bins.order[places], places // lanes
+        row = bins.first_block[chunk] * lanes + places % lanes
+        lengths = bins.first_block[chunk + 1] - bins.first_block[chunk]
+        x, y = ((each * SIDE).astype(dtype)[:, None] for each in (tiles % across, tiles // across))
+        return kind(row, lengths, jnp.max(lengths), x, y, lanes)
+
+    def chunk(self, bins: Bins, i, dtype) -> Lanes:
+        """Give the tiles of a chunk."""
+        places = i * self.grid.lanes + jnp.arange(self.grid.lanes, dtype=jnp.int32)
+        return self._lanes(ChunkLanes, bins, places, dtype)
+
+    def picked(self, bins: Bins, places: Int[Array, " lanes"], dtype) -> Lanes:
+        """Give tiles by their places in the order; places beyond the last are the last one's, with
+        nothing in them.
+        """
+        return self._lanes(Lanes, bins, places, dtype)
+
+    def splats(self, planes, block, lanes: Lanes):
+        """Read a block's splats, `[lanes, slots]` each, placed relative to their tile's corner."""
+        x, y, *rest = (lanes.read(plane, block) for plane in planes)
+        return x - lanes.x, y - lanes.y, *rest
+
+    def fragments(self, splats):
+        """Give nearness and quadric of a block's fragments, `[lanes, slots, pixels]`."""
+        x, y, sx, sy, a, b, c, e = (p[:, :, None] for p in splats[:8])
+        px, py = (jnp.asarray(p)[None, None] for p in self.pixels(x.dtype))
+        dx, dy = px - x, py - y
+        return e + sx * dx + sy * dy, dx * (a * dx + b * dy) + c * dy * dy
+
+    def limits(self, slots: "Slots", lanes: Lanes):
+        """Find per pixel the nearest shifted fragment: the back end of the front."""
+
+        def nearest(block, limit):
+            nearness, quadric = self.fragments(self.splats(slots.planes, block, lanes))
+            shifted = self.view.shifted(nearness, lanes.read(slots.shift, block)[:, :, None])
+            return jnp.maximum(
+                limit,
+                jnp.max(jnp.where(self.view.inside(nearness, quadric), shifted, -jnp.inf), axis=1),
+            )
+
+        return lax.fori_loop(jnp.int32(0), lanes.blocks, nearest, self._nothing(lanes))
+
+    def limits_behind(self, slots: "Slots", lanes: Lanes, front):
+        """Find the same for what lies behind the front's limits: of the fragments that weigh
+        something, and of any.
+        """
+
+        def nearest(block, limits):
+            splats = self.splats(slots.planes, block, lanes)
+            nearness, quadric = self.fragments(splats)
+            shifted = self.view.shifted(nearness, lanes.read(slots.shift, block)[:, :, None])
+            beyond = lanes.until_end(jnp.full_like(front, -jnp.inf), block)
+            squared_radius = self.squared_radii(nearness, quadric, beyond, front)
+            weight = splats[-1][:, :, None] * fast_fragment_weight(squared_radius)
+            least = least_weight(self.view, *splats[4:8], self.filter_radius)
+            each = weight > least[:, :, None], squared_radius < 1
+            found = (jnp.max(jnp.where(candidate, shifted, -jnp.inf), axis=1) for candidate in each)
+            return tuple(jnp.maximum(limit, new) for limit, new in zip(limits, found, strict=True))
+
+        return lax.fori_loop(
+            jnp.int32(0), lanes.blocks, nearest, (self._nothing(lanes), self._nothing(lanes))
+        )
+
+    def _nothing(self, lanes: Lanes):
+        return jnp.full((lanes.row.shape[0], SIDE**2), -jnp.inf, lanes.x.dtype)
+
+    def squared_radii(self, nearness, quadric, beyond, upto):
+        """Give `rho^2`, below 1 for the fragments between two limits; 1, where the weight is 0, for
+        all others.
+        """
+        chosen = self.view.inside(nearness, quadric) & (nearness > beyond[:, None])
+        if upto is not None:
+            chosen &= nearness <= upto[:, None]
+        return jnp.where(chosen, self.view.squared_radius(nearness, quadric), 1.0)
+
+    def nearness_rows(self, splats):
+        """Return `[lanes, 4, slots]`: the plane of nearness over the tile (three rows) and 1."""
+        x, y, sx, sy, _, _, _, e, _ = splats
+        return jnp.stack([e - sx * x - sy * y, sx, sy, jnp.ones_like(e)], axis=1)
+
+    def sums(self, slots: "Slots", lanes: Lanes, beyond, upto):
+        """Sum attributes and nearness over the fragments between two limits, `[lanes, rows,
+        pixels]`; the weights last.
+        """
+
+        def add(block, sums):
+            splats = self.splats(slots.planes, block, lanes)
+            squared_radius = self.squared_radii(
+                *self.fragments(splats), lanes.until_end(beyond, block), upto
+            )
+            weight = splats[-1][:, :, None] * fast_fragment_weight(squared_radius)
+            rows = slots.rows(lanes.read(slots.ids, block))
+            attributes, nearness = sums
+            return (
+                attributes + jnp.einsum("tsr,tsp->trp", rows, weight),
+                nearness + jnp.einsum("trs,tsp->trp", self.nearness_rows(splats), weight),
+            )
+
+        places, pixels = beyond.shape
+        start = tuple(
+            jnp.zeros((places, rows, pixels), beyond.dtype)
+            for rows in (slots.attributes.shape[1], 4)
+        )
+        attributes, nearness = lax.fori_loop(jnp.int32(0), lanes.blocks, add, start)
+        px, py = self.pixels(beyond.dtype)
+        plane = nearness[:, 0] + nearness[:, 1] * px[None] + nearness[:, 2] * py[None]
+        return jnp.concatenate([attributes, plane[:, None], nearness[:, 3:]], axis=1)
+
+    def add_cotangents(self, slots: "Slots", lanes: Lanes, beyond, upto, cotangent, gradients):
+        """Add the cotangents of planes, per slot, and of attributes, per splat, for the fragments
+        between two limits, from those of the sums.
+        """
+        px, py = self.pixels(beyond.dtype)
+        monomials = jnp.asarray(
+            np.stack([np.ones_like(px), px, py, px * px, px * py, py * py], axis=1)
+        )
+        of_attributes, of_nearness = cotangent[:, :-2], cotangent[:, -2]
+        of_plane = jnp.stack(
+            [of_nearness, of_nearness * px[None], of_nearness * py[None], cotangent[:, -1]], axis=1
+        )
+
+        def add(block, gradients):
+            splats = self.splats(slots.planes, block, lanes)
+            nearness, quadric = self.fragments(splats)
+            squared_radius = self.squared_radii(
+                nearness, quadric, lanes.until_end(beyond, block), upto
+            )
+            weight = fast_fragment_weight(squared_radius)
+            ids, opacity = lanes.read(slots.ids, block), splats[-1]
+            attributes, plane = slots.rows(ids), self.nearness_rows(splats)
+            # Cotangents of the summed rows, per slot, for a weight without opacity.
+            d_attributes = jnp.einsum("trp,tsp->tsr", of_attributes, weight)
+            d_plane = jnp.einsum("trp,tsp->trs", of_plane, weight)
+            d_opacity = jnp.sum(attributes * d_attributes, axis=2) + jnp.sum(
+                plane * d_plane, axis=1
+            )
+            # Cotangents of the weights, and through them of nearness and quadric.
+            d_weight = jnp.einsum("tsr,trp->tsp", attributes, of_attributes)
+            d_weight = d_weight + jnp.einsum("trs,trp->tsp", plane, of_plane)
+            d_weight = opacity[:, :, None] * d_weight
+            d_squared = fragment_weight_derivative(squared_radius, weight) * d_weight
+            nearness = jnp.where(squared_radius < 1, nearness, 1.0)
+            d_nearness, d_quadric = self.view.squared_radius_vjp(
+                nearness, squared_radius, d_squared
+            )
+            # Both are polynomials in the pixel: their moments over the tile suffice.
+            quad = jnp.moveaxis(d_quadric @ monomials, 2, 0)
+            near = jnp.moveaxis(d_nearness @ monomials[:, :3], 2, 0)
+            near = near + jnp.moveaxis(d_plane[:, :3], 1, 0) * opacity[None]
+            of_planes, of_rows = gradients
+            parts = *_plane_cotangents(splats, quad, near), d_opacity
+            return (
+                tuple(
+                    lanes.add(*each) for each in zip(of_planes, (block,) * 9, parts, strict=True)
+                ),
+                of_rows.at[ids].add(d_attributes * opacity[:, :, None], mode="drop"),
+            )
+
+        return lax.fori_loop(jnp.int32(0), lanes.blocks, add, gradients)
+
+
+class Slots(eqx.Module):
+    """What the sweeps read: planes gathered into slots, in rows of one lane each, and attributes
+    splat by splat, which are too many to be kept in slots.
+    """
+
+    ids: Int[Array, "rows slots"]
+    planes: list[Float[Array, "rows slots"]]
+    shift: Float[Array, "rows slots"]
+    attributes: Float[Array, "splats attributes"]
+
+    @classmethod
+    def gathered(
+        cls,
+        shift: Float[Array, " splats"],
+        planes: tuple[Float[Array, " splats"], ...],
+        attributes: Float[Array, "splats attributes"],
+        bins: Bins,
+    ) -> "Slots":
+        """Gather splats into the slots of the bins."""
+        width = bins.ids.shape[2]
+
+        def slots(plane, fill):
+            return slot_plane(plane, fill, bins).reshape(-1, width)
+
+        return cls(
+            ids=bins.ids.reshape(-1, width),
+            planes=[slots(*each) for each in zip(planes, _EMPTY, strict=True)],
+            shift=slots(shift, 0.0),
+            attributes=attributes,
+        )
+
+    def rows(self, ids: Int[Array, "lanes slots"]) -> Float[Array, "lanes slots attributes"]:
+        """Read the attributes of some slots; 0 in empty ones."""
+        return self.attributes.at[ids].get(mode="fill", fill_value=0)
+
+
+def _plane_cotangents(splats, quad, near):
+    """Turn moments of the cotangents over the pixels into cotangents of a splat's numbers."""
+    x, y, sx, sy, a, b, c, _, _ = splats
+    m, mx, my, mxx, mxy, myy = quad
+    n, nx, ny = near
+    dx, dy = mx - x * m, my - y * m
+    dxx = mxx - 2 * x * mx + x * x * m
+    dxy = mxy - x * my - y * mx + x * y * m
+    dyy = myy - 2 * y * my + y * y * m
+    d_x = -(2 * a * dx + b * dy + sx * n)
+    d_y = -(b * dx + 2 * c * dy + sy * n)
+    return d_x, d_y, nx - x * n, ny - y * n, dxx, dxy, dyy, n
+
+
+def second_limits(
+    weighty: Float[Array, "places pixels"], of_any: Float[Array, "places pixels"]
+) -> Float[Array, "places pixels"]:
+    """Choose where the surface behind ends, from the largest of both in all parts; inf where there
+    is none.
+    """
+    limits = jnp.where(weighty > -jnp.inf, weighty, of_any)
+    return jnp.where(limits > -jnp.inf, limits, jnp.inf)

@@ -1,0 +1,137 @@
+"""A picture cut into tiles, and the tiles that rectangles touch."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+SIDE = 8
+"""Pixels along a tile."""
+
+
+class TileGrid(eqx.Module):
+    """A picture cut into square tiles, row by row; the last ones may reach beyond it."""
+
+    width: int = eqx.field(static=True)
+    height: int = eqx.field(static=True)
+    lanes: int = eqx.field(static=True, default=64)
+    slots: int = eqx.field(static=True, default=32)
+
+    @property
+    def across(self) -> int:
+        return -(-self.width // SIDE)
+
+    @property
+    def down(self) -> int:
+        return -(-self.height // SIDE)
+
+    @property
+    def count(self) -> int:
+        """Tiles of the picture."""
+        return self.across * self.down
+
+    @property
+    def tiles(self) -> int:
+        """Tiles of the picture, and a few empty ones that fill the last chunk."""
+        return -(-self.count // self.lanes) * self.lanes
+
+    def cut(self, picture: Float[Array, "rows height width"]) -> Float[Array, "tiles rows pixels"]:
+        """Cut a picture into tiles; 0 beyond its edges."""
+        rows, height, width = picture.shape
+        whole = jnp.pad(
+            picture, ((0, 0), (0, self.down * SIDE - height), (0, self.across * SIDE - width))
+        )
+        return (
+            whole.reshape(rows, self.down, SIDE, self.across, SIDE)
+            .transpose(1, 3, 0, 2, 4)
+            .reshape(self.count, rows, SIDE**2)
+        )
+
+    def join(self, tiles: Float[Array, "tiles rows pixels"]) -> Float[Array, "rows height width"]:
+        """Put a picture together from its tiles."""
+        rows = tiles.shape[1]
+        whole = tiles.reshape(self.down, self.across, rows, SIDE, SIDE).transpose(2, 0, 3, 1, 4)
+        return whole.reshape(rows, self.down * SIDE, self.across * SIDE)[
+            :, : self.height, : self.width
+        ]
+
+    def columns_and_rows(
+        self, tiles: Int[Array, " some"]
+    ) -> tuple[Int[Array, "some pixels"], Int[Array, "some pixels"]]:
+        """Give the column and the row of every pixel of some tiles."""
+        within = jnp.arange(SIDE**2, dtype=jnp.int32)
+        x = (tiles % self.across * SIDE)[:, None] + (within % SIDE)[None]
+        y = (tiles // self.across * SIDE)[:, None] + (within // SIDE)[None]
+        return x, y
+
+    def pixel(self, x: Int[Array, "..."], y: Int[Array, "..."]) -> Int[Array, "..."]:
+        """Give the number of a pixel among those of all tiles, tile by tile."""
+        return (y // SIDE * self.across + x // SIDE) * SIDE**2 + y % SIDE * SIDE + x % SIDE
+
+    def within_picture(self) -> np.ndarray | None:
+        """Say which pixels `[tiles, pixels]` lie in the picture; None if all do."""
+        if self.width % SIDE == 0 and self.height % SIDE == 0:
+            return None
+        x, y = np.arange(self.across * SIDE) < self.width, np.arange(self.down * SIDE) < self.height
+        within = y.reshape(self.down, 1, SIDE, 1) & x.reshape(1, self.across, 1, SIDE)
+        return within.reshape(self.count, SIDE**2)
+
+
+class TileRanges(eqx.Module):
+    """The rectangle of tiles that each item touches."""
+
+    left: Int[Array, " items"]
+    top: Int[Array, " items"]
+    across: Int[Array, " items"]
+    down: Int[Array, " items"]
+    """0 for an item that touches none."""
+
+    @classmethod
+    def of(
+        cls,
+        left: Float[Array, " items"],
+        right: Float[Array, " items"],
+        top: Float[Array, " items"],
+        bottom: Float[Array, " items"],
+        visible: Bool[Array, " items"],
+        grid: TileGrid,
+    ) -> "TileRanges":
+        """Find the tiles with a pixel center inside each box (pixels)."""
+        across, down = (0, grid.width - 1), (0, grid.height - 1)
+        i0, i1 = _first(left, *across) / SIDE, _last(right, *across) / SIDE
+        j0, j1 = _first(top, *down) / SIDE, _last(bottom, *down) / SIDE
+        touched = visible & (i0 <= i1) & (j0 <= j1)
+        i0, i1, j0, j1 = (jnp.floor(edge).astype(jnp.int32) for edge in (i0, i1, j0, j1))
+        return cls(i0, j0, jnp.where(touched, i1 - i0 + 1, 0), jnp.where(touched, j1 - j0 + 1, 0))
+
+    def per_tile(self, grid: TileGrid) -> Int[Array, " tiles"]:
+        """Count the items of every tile, from the corners of their rectangles."""
+        one = jnp.where(self.across * self.down > 0, 1, 0)
+        corners = jnp.zeros((grid.down + 1, grid.across + 1), jnp.int32)
+        i0, j0 = jnp.minimum(self.left, grid.across), jnp.minimum(self.top, grid.down)
+        i1, j1 = (
+            jnp.minimum(self.left + self.across, grid.across),
+            jnp.minimum(self.top + self.down, grid.down),
+        )
+        corners = (
+            corners.at[j0, i0]
+            .add(one)
+            .at[j1, i1]
+            .add(one)
+            .at[j0, i1]
+            .add(-one)
+            .at[j1, i0]
+            .add(-one)
+        )
+        counts = jnp.cumsum(jnp.cumsum(corners, axis=0), axis=1)[:-1, :-1].reshape(-1)
+        return jnp.pad(counts, (0, grid.tiles - counts.shape[0]))
+
+
+def _first(edge: Float[Array, " items"], first: int, last: int) -> Float[Array, " items"]:
+    """Give the first pixel whose center is not before an edge; `last + 1` if none is."""
+    return jnp.clip(jnp.ceil(edge - 0.5), first, last + 1)
+
+
+def _last(edge: Float[Array, " items"], first: int, last: int) -> Float[Array, " items"]:
+    """Give the last pixel whose center is not behind an edge; `first - 1` if none is."""
+    return jnp.clip(jnp.floor(edge - 0.5), first - 1, last)

@@ -1,0 +1,89 @@
+"""A flat plane whose chart is stretched, and what it is painted with."""
+
+import jax.numpy as jnp
+import numpy as np
+
+import splatjax as sj
+from splatjax.diffusion import AbstractDiffusionKernel, PlainMean, Sources, dense_layer
+from splatjax.geometry import Mesh, Textures
+
+HALF = 12.0
+"""mm, from the middle to the edges."""
+
+
+def plane(stretch: float, quads: int = 6, half: float = HALF) -> Mesh:
+    """A square at z = 0 that faces +z; `stretch` times as many mm along u as along v, its chart in
+    the middle of the texture.
+    """
+    line = np.linspace(-1.0, 1.0, quads + 1)
+    x, y = np.meshgrid(line, line)
+    flat = np.stack([x.reshape(-1), y.reshape(-1)], axis=1)
+    first = (np.arange(quads)[:, None] * (quads + 1) + np.arange(quads)).reshape(-1)
+    step = quads + 1
+    faces = np.concatenate(
+        [
+            np.stack([first, first + 1, first + step + 1], 1),
+            np.stack([first, first + step + 1, first + step], 1),
+        ]
+    )
+    vertices = np.column_stack([half * flat, np.zeros(len(flat))])
+    normals = np.tile([0.0, 0.0, 1.0], (len(flat), 1))
+    return Mesh(vertices, faces, normals, coordinates(vertices, stretch, half)[faces])
+
+
+def coordinates(points: np.ndarray, stretch: float, half: float = HALF) -> np.ndarray:
+    """Where points of the plane lie in the texture."""
+    return 0.5 + 0.45 * points[:, :2] / half / np.asarray([stretch, 1.0])
+
+
+def spots(points: np.ndarray) -> np.ndarray:
+    """Albedo of a plane with soft-edged spots and bars of several colors, some as small as the
+    layers are wide.
+    """
+    x, y = points[:, 0], points[:, 1]
+    fine = 0.5 + 0.5 * np.tanh(3 * np.sin(1.6 * x) * np.sin(1.3 * y + 0.4))
+    bars = 0.5 + 0.5 * np.tanh(4 * np.sin(0.9 * x + 0.3 * y))
+    disc = 0.5 - 0.5 * np.tanh(2 * (np.hypot(x - 1, y + 2) - 3))
+    return 0.1 + 0.85 * np.stack([fine, bars, disc], axis=1)
+
+
+def painted(stretch: float, size: int) -> Textures:
+    """The spots as a texture."""
+    row, column = np.indices((size, size)).reshape(2, -1)
+    uvs = np.stack([(column + 0.5) / size, 1 - (row + 0.5) / size], axis=1)
+    points = (uvs - 0.5) / 0.45 * HALF * np.asarray([stretch, 1.0])
+    return Textures(albedo=spots(points).reshape(size, size, 3))
+
+
+def splatted(points: np.ndarray, gaussians: sj.SumOfGaussians, spacing: float = 0.3) -> np.ndarray:
+    """The layers of the plane by splat diffusion, unlit but for its paint: `[gaussians, points,
+    channels]`.
+    """
+    line = np.arange(-HALF + spacing / 2, HALF, spacing)
+    x, y = (each.reshape(-1) for each in np.meshgrid(line, line))
+    centers = np.stack([x, y, np.zeros_like(x)])
+    light = np.sqrt(spots(centers.T))
+    arrays = centers, np.tile([[0.0], [0.0], [1.0]], x.size), np.full(x.size, spacing**2), light.T
+    sources = Sources(*(jnp.asarray(each, float) for each in arrays))
+    means, _ = gathered(sources, gaussians.variances, PlainMean(), points)
+    return means.transpose(0, 2, 1)
+
+
+def gathered(
+    sources: Sources, variances, kernel: AbstractDiffusionKernel, points: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The mean of every layer at points and its kernel mass, from all splats."""
+    places = jnp.asarray(points.T, float)
+    layers = [
+        dense_layer(sources, places, variance, depth)
+        for variance, depth in zip(variances, kernel.depths(variances), strict=True)
+    ]
+    return np.stack([each.means for each in layers]), np.stack([each.mass for each in layers])
+
+
+def camera_over(half: float, pixels: int) -> sj.Camera:
+    """A camera far above the middle of the plane that sees `half` mm to each side."""
+    fov = float(2 * np.degrees(np.arctan(1 / 40)))
+    return sj.Camera.look_at(
+        jnp.asarray([0.0, 0.0, 40 * half]), jnp.zeros(3), fov=fov, width=pixels, height=pixels
+    )

@@ -1,0 +1,305 @@
+"""What each point-based method is known for: flat points, aliasing, holes, curved normals; and that
+none invents a color.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import splatjax as sj
+from splatjax._combination import OneDevice
+from splatjax.baselines import (
+    BlendingRasterizer,
+    DiscKernel,
+    DiscOrPixelKernel,
+    EwaKernel,
+    LightAtPixels,
+    NearestRasterizer,
+    PhongSplats,
+    deferred_splatting,
+    elliptical_points,
+    normal_slopes,
+    phong_splatting,
+)
+from splatjax.splatting import PerspectiveView, SplattingSettings, Surface, visible_surfaces
+
+SETTINGS = SplattingSettings()
+RASTERIZERS = {
+    "elliptical": NearestRasterizer(),
+    "ewa": BlendingRasterizer(EwaKernel()),
+    "phong": BlendingRasterizer(DiscKernel()),
+    "deferred": BlendingRasterizer(DiscOrPixelKernel()),
+}
+BLENDING = ("ewa", "phong", "deferred")
+SIZE = 48
+
+
+def plane(half_width: float, spacing: float, jitter: float = 0.0) -> sj.Splats:
+    """A sheet at z = 0 that faces +z."""
+    line = np.arange(-half_width, half_width + 1e-9, spacing)
+    x, y = (each.reshape(-1) for each in np.meshgrid(line, line))
+    x, y = (
+        np.stack([x, y]) + np.random.default_rng(3).uniform(-jitter, jitter, (2, x.size)) * spacing
+    )
+    flat = np.zeros_like(x)
+    centers, normals = np.stack([x, y, flat], 1), np.stack([flat, flat, flat + 1], 1)
+    areas = np.full(x.size, spacing**2)
+    return splats_of(centers, normals, areas)
+
+
+def splats_of(centers, normals, areas) -> sj.Splats:
+    columns = centers, normals, 1.5 * np.sqrt(areas), areas
+    return sj.Splats(*(jnp.asarray(column, float) for column in columns))
+
+
+def ball(count: int, radius: float = 10.0) -> sj.Splats:
+    i = np.arange(count) + 0.5
+    z, turn = 1 - 2 * i / count, np.pi * (1 + 5**0.5) * i
+    across = np.sqrt(1 - z * z)
+    normals = np.stack([np.cos(turn) * across, np.sin(turn) * across, z], 1)
+    areas = np.full(count, 4 * np.pi * radius**2 / count)
+    return splats_of(radius * normals, normals, areas)
+
+
+def camera(eye, fov: float = 30.0, target=(0.0, 0.0, 0.0)) -> sj.Camera:
+    return sj.Camera.look_at(
+        jnp.asarray(eye, float), jnp.asarray(target, float), fov=fov, width=SIZE, height=SIZE
+    )
+
+
+def seen_by(name: str, splats: sj.Splats, view: PerspectiveView):
+    """Return how a view draws the splats, moved by less than a plan can hold, with rows of
+    attributes: pictures of the rows, of coverage and of depth.
+    """
+    plan = RASTERIZERS[name].make_plan([splats], [view], SETTINGS)
+
+    def draw(splats, rows, view):
+        visible = visible_surfaces(splats, rows, view, SETTINGS, plan, OneDevice())
+        surface = Surface.of(visible.rows, view)
+        depth = jnp.where(surface.covered, surface.depth, 0.0)
+        pictures = surface.attributes, visible.share, depth
+        return tuple(visible.front_picture(each) for each in pictures)
+
+    return jax.jit(draw)
+
+
+def drawn(name: str, splats: sj.Splats, rows, *cameras: sj.Camera):
+    """Return what each camera sees of rows of attributes, and where it sees anything."""
+    views = [PerspectiveView.of(each) for each in cameras]
+    found = [seen_by(name, splats, view)(splats, rows, view)[:2] for view in views]
+    attributes, coverage = (np.stack(pictures) for pictures in zip(*found, strict=True))
+    return np.moveaxis(attributes, 3, 1), coverage
+
+
+@pytest.fixture(scope="module")
+def far_checkers():
+    """Pictures of black and white squares smaller than a pixel, from cameras that shift by
+    fractions of a pixel.
+    """
+    sheet = plane(11.0, 0.125)
+    checkers = jnp.asarray(
+        (np.floor(np.asarray(sheet.centers[:, :2]) / 0.25 + 0.25).sum(1) % 2)[None], float
+    )
+    # 48 pixels of 0.42 mm: 1.7 squares, 3.3 splats along each
+    shifts = np.linspace(0, 0.4, 5)
+    cameras = [camera((s, 0.6 * s, 75.0), fov=15.2, target=(s, 0.6 * s, 0.0)) for s in shifts]
+    return {
+        name: drawn(name, sheet, checkers, *cameras)[0][:, 0, 6:-6, 6:-6] for name in RASTERIZERS
+    }
+
+
+@pytest.mark.once
+def test_squares_smaller_than_a_pixel_are_gray_and_still_with_a_filter_and_alias_without(
+    far_checkers,
+):
+    """The mean of the squares is gray, 1/2: all contrast is an alias, and so is all power below
+    half of Nyquist.
+    """
+
+    def low(pictures):
+        picture = pictures[0] - pictures[0].mean()
+        power = np.abs(np.fft.fft2(picture)) ** 2 / picture.size**2
+        f = np.abs(np.fft.fftfreq(picture.shape[0]))
+        return power[(f[:, None] < 0.25) & (f[None] < 0.25)].sum()
+
+    contrast, flicker, aliases = (
+        {name: measure(pictures) for name, pictures in far_checkers.items()}
+        for measure in (np.std, lambda pictures: np.mean(np.std(pictures, axis=0)), low)
+    )
+    np.testing.assert_allclose(np.mean(far_checkers["ewa"]), 0.5, atol=0.02)
+    assert contrast["elliptical"] > 0.45  # black and white, as if thrown by a coin: 1/2
+    assert contrast["phong"] > 0.2
+    assert contrast["ewa"] < contrast["deferred"] < 0.6 * contrast["phong"]
+    assert contrast["ewa"] < 0.02
+    assert flicker["ewa"] < min(0.01, flicker["elliptical"] / 20, flicker["phong"] / 5)
+    assert aliases["ewa"] < min(1e-2 * aliases["elliptical"], 0.1 * aliases["phong"])
+
+
+@pytest.mark.once
+@pytest.mark.parametrize("name", RASTERIZERS)
+def test_a_plane_of_one_color_has_exactly_that_color_and_lies_where_it_lies(name):
+    sheet, color = plane(9.0, 0.8, jitter=0.3), 0.7
+    seen = camera((4.0, -9.0, 14.0), fov=20.0)
+    view = PerspectiveView.of(seen)
+    rows = jnp.full((1, sheet.count), color)
+    attributes, coverage, depth = seen_by(name, sheet, view)(sheet, rows, view)
+    inside = np.asarray(coverage) > 0
+    assert inside.mean() > 0.95
+    np.testing.assert_allclose(np.asarray(attributes[..., 0])[inside], color, rtol=1e-5)
+    y, x = np.mgrid[:SIZE, :SIZE] + 0.5
+    points = view.unproject(jnp.asarray(x, float), jnp.asarray(y, float), depth)
+    np.testing.assert_allclose(np.asarray(points[2])[inside], 0.0, atol=2e-3)
+
+
+@pytest.mark.once
+@pytest.mark.parametrize("name", RASTERIZERS)
+def test_what_is_nearer_hides_what_is_behind(name):
+    near, far = plane(6.0, 1.0, jitter=0.2), plane(6.0, 1.0, jitter=0.2)
+    both = [
+        jnp.concatenate([getattr(far, each), getattr(near, each)])
+        for each in ("centers", "normals", "radii", "areas")
+    ]
+    both[0] = both[0].at[: far.count, 2].add(-8.0)
+    colors = jnp.concatenate([jnp.zeros((1, far.count)), jnp.ones((1, near.count))], axis=1)
+    seen, covered = drawn(name, sj.Splats(*both), colors, camera((0.0, 0.0, 20.0), fov=20.0))
+    assert np.all(covered > 0)
+    np.testing.assert_allclose(seen, 1.0, rtol=1e-6)
+
+
+@pytest.mark.once
+def test_elliptical_points_have_one_color_each_and_blended_ones_more():
+    """Every color is some splat's own where the nearest wins; a blend has colors between them."""
+    sheet = plane(6.0, 1.5, jitter=0.2)
+    own = np.random.default_rng(0).uniform(size=(1, sheet.count))
+    seen = camera((0.0, 3.0, 20.0), fov=25.0)
+    shares = {}
+    for name in RASTERIZERS:
+        colors, covered = drawn(name, sheet, jnp.asarray(own, float), seen)
+        colors = colors[0, 0][covered[0] > 0]
+        nearest = np.min(np.abs(colors[:, None] - own[0][None].astype(colors.dtype)), axis=1)
+        shares[name] = np.mean(nearest < 1e-6)
+        assert colors.min() >= own.min() - 1e-6
+        assert colors.max() <= own.max() + 1e-6
+    assert shares["elliptical"] == 1
+    assert all(shares[name] < 0.2 for name in BLENDING)
+
+
+@pytest.mark.once
+def test_an_affine_projection_leaves_holes_near_the_eye_and_an_exact_one_leaves_none():
+    """Discs that touch in space part in the picture, where each is drawn as its center is seen."""
+    floor = plane(48.0, 8.0)
+    sheet = dataclasses.replace(floor, radii=0.72 * jnp.sqrt(floor.areas))
+    seen = camera((2.4, -30.0, 4.0), fov=75.0, target=(2.4, -18.0, 0.0))
+    holes = {}
+    for name in ("ewa", "phong", "deferred"):
+        covered = drawn(name, sheet, jnp.ones((1, sheet.count)), seen)[1][0]
+        holes[name] = np.mean(covered[SIZE // 2 :] == 0)
+    assert holes["phong"] == 0
+    assert holes["deferred"] == 0
+    assert holes["ewa"] > 0.1
+
+
+def lit_ball(settings: sj.RenderSettings, count: int):
+    """Render a ball that lies off the origin: root mean square errors of its normals (degrees) and
+    of its light.
+    """
+    middle = np.asarray([7.0, -4.0, 3.0])
+    body = ball(count)
+    body = dataclasses.replace(body, centers=body.centers + jnp.asarray(middle, float)[None])
+    lamp = sj.DirectionalLight(
+        jnp.asarray([0.4, -0.3, -1.0]), jnp.full(1, np.pi), cast_shadows=False
+    )
+    material = sj.Material(sj.SumOfGaussians(jnp.asarray([1e-6]), jnp.ones((1, 1))), specular=0.0)
+    body = PhongSplats.of(body)
+    scene, seen = (
+        sj.Scene(body, (lamp,), material),
+        camera(middle + np.asarray([0.0, 0.0, 60.0]), 18.0, middle),
+    )
+    frame = sj.render(scene, seen, settings)
+    inside = np.asarray(frame.coverage) > 0.99
+    position = np.asarray(frame.position)[inside] - middle[None]
+    true = position / np.linalg.norm(position, axis=1, keepdims=True)
+    inner = true[:, 2] > 0.4
+    normals = np.asarray(frame.normal)[inside]
+    angle = np.degrees(np.arccos(np.clip(np.sum(normals * true, axis=1), -1, 1)))[inner]
+    towards = -np.asarray(lamp.direction) / np.linalg.norm(np.asarray(lamp.direction))
+    off = (np.asarray(frame.beauty)[inside][:, 0] - np.maximum(true @ towards, 0))[inner]
+    return np.sqrt(np.mean(angle**2)), np.sqrt(np.mean(off**2))
+
+
+@pytest.mark.once
+@pytest.mark.long
+def test_normals_that_vary_within_splats_are_closer_to_the_sphere_than_blended_and_flat_ones():
+    """A sphere of 150 splats, under the light of a white diffuser."""
+    baselines = {
+        "elliptical": elliptical_points(),
+        "deferred": deferred_splatting(),
+        "phong": phong_splatting(),
+    }
+    angles, shades = {}, {}
+    for name, settings in baselines.items():
+        angles[name], shades[name] = lit_ball(settings, 150)
+    assert angles["phong"] < 0.5 * angles["deferred"]
+    assert angles["deferred"] < 0.5 * angles["elliptical"]
+    assert shades["phong"] < 0.5 * shades["deferred"] < 0.5 * shades["elliptical"]
+
+
+@pytest.mark.once
+def test_slopes_of_a_sphere_are_its_curvature_and_those_of_a_plane_are_none():
+    body = ball(600, radius=10.0)
+    slopes, normals = np.asarray(normal_slopes(body), float), np.asarray(body.normals, float)
+    expected = (np.eye(3)[None] - normals[:, :, None] * normals[:, None]) / 10.0
+    off = np.abs(slopes - expected)  # of 0.1; largest where the spiral of splats begins and ends
+    assert np.quantile(off, 0.99) < 0.005
+    assert np.max(off) < 0.015
+    assert np.max(np.abs(normal_slopes(plane(3.0, 1.0)))) == 0
+
+
+@pytest.mark.long
+@pytest.mark.once
+def test_a_baseline_renders_what_the_renderer_does_with_scattering_and_shadow():
+    """Where splats are smaller than what bends it makes little matter whether irradiance is blended
+    or found per pixel.
+    """
+    body = ball(1500)
+    body = dataclasses.replace(
+        body, albedo=jnp.broadcast_to(jnp.asarray([0.9, 0.6, 0.3]), (body.count, 3))
+    )
+    lamp = sj.DirectionalLight(jnp.asarray([0.4, -0.3, -1.0]), jnp.full(3, np.pi))
+    scene, seen = (
+        sj.Scene(body, (lamp,), sj.load_material("skin").white()),
+        camera((0.0, 0.0, 60.0), fov=22.0),
+    )
+    own = sj.render(scene, seen)
+    inner = np.asarray(own.normal[..., 2]) > 0.3
+    for settings in (sj.RenderSettings(lighting=LightAtPixels()), deferred_splatting()):
+        off = (np.asarray(sj.render(scene, seen, settings).beauty) - np.asarray(own.beauty))[inner]
+        assert np.sqrt(np.mean(off**2)) < 0.02, (
+            settings.rasterizer
+        )  # of radiance up to 1; most of it where the light grazes
+
+
+@pytest.mark.parametrize("name", RASTERIZERS)
+def test_what_is_blended_has_derivatives(name, float64):
+    """Of what the splats carry and of where they are, as far as no fragment comes or goes: against
+    differences.
+    """
+    sheet = plane(2.0, 0.7, jitter=0.2)
+    view = PerspectiveView.of(camera((1.0, 2.0, 12.0), fov=15.0))
+    draw = seen_by(name, sheet, view)
+    rows = jnp.asarray(np.random.default_rng(1).uniform(size=(1, sheet.count)))
+    turn = jnp.asarray(np.random.default_rng(2).normal(size=(SIZE, SIZE)))
+    direction = jnp.asarray(np.random.default_rng(5).normal(size=sheet.centers.shape))
+
+    @jax.jit
+    def total(step):
+        moved = dataclasses.replace(sheet, centers=sheet.centers + step * direction)
+        attributes, _, depth = draw(moved, rows * (1 + step), view)
+        return jnp.sum(turn * attributes[..., 0]) + jnp.sum(turn * depth)
+
+    step = 1e-8  # a longer one changes which splat some pixel shows
+    expected = (total(step) - total(-step)) / (2 * step)
+    np.testing.assert_allclose(jax.jit(jax.grad(total))(0.0), expected, rtol=1e-3)

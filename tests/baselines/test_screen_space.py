@@ -1,0 +1,145 @@
+"""Screen-space diffusion: on a frontal plane it is a convolution, and one kernel is not the sum of
+its Gaussians.
+"""
+
+import dataclasses
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from planes import camera_over, spots
+from scipy.signal import fftconvolve
+
+import splatjax as sj
+from splatjax import baselines
+
+SIZE, HALF = 128, 12.0
+TWO = sj.SumOfGaussians(
+    jnp.asarray([0.3, 2.0], float), jnp.asarray([[0.5, 0.4, 0.3], [0.5, 0.6, 0.7]], float)
+)
+ONE = sj.SumOfGaussians(jnp.asarray([1.0], float), jnp.ones((1, 3)))
+CAMERA = camera_over(HALF, SIZE)
+INSIDE = slice(SIZE // 4, -SIZE // 4)
+
+
+def flat(light: np.ndarray) -> sj.Frame:
+    """The buffers of a frontal plane that carries this light and reflects all of it."""
+    row, column = np.indices((SIZE, SIZE))
+    x, y = (column + 0.5) / SIZE * 2 * HALF - HALF, HALF - (row + 0.5) / SIZE * 2 * HALF
+    position = jnp.asarray(np.stack([x, y, 0 * x], axis=2), float)
+    ones, none = jnp.ones((SIZE, SIZE)), jnp.zeros((SIZE, SIZE, 3))
+    normal = none.at[..., 2].set(1.0)
+    depth, irradiance = 40 * HALF * ones, jnp.asarray(light, float)
+    layers, weights = none[None], jnp.ones((1, 3))
+    black = none, none, jnp.zeros(1), jnp.zeros(())
+    return sj.Frame(
+        none,
+        ones,
+        depth,
+        position,
+        normal,
+        none + 1,
+        ones[None],
+        irradiance,
+        layers,
+        weights,
+        *black,
+    )
+
+
+def picture_of(function) -> np.ndarray:
+    row, column = np.indices((SIZE, SIZE)).reshape(2, -1)
+    points = np.stack(
+        [(column + 0.5) / SIZE * 2 * HALF - HALF, HALF - (row + 0.5) / SIZE * 2 * HALF], axis=1
+    )
+    return function(points).reshape(SIZE, SIZE, 3)
+
+
+def convolved(light: np.ndarray, gaussians: sj.SumOfGaussians) -> np.ndarray:
+    """The two-dimensional convolution with the profile, over whole pixels; right but for what comes
+    from beyond the picture.
+    """
+    step = 2 * HALF / SIZE
+    line = np.arange(-SIZE // 2, SIZE // 2 + 1) * step
+    x, y = np.meshgrid(line, line)
+    total = np.zeros_like(light)
+    for variance, weights in zip(
+        np.asarray(gaussians.variances), np.asarray(gaussians.weights), strict=True
+    ):
+        kernel = np.exp(-(x**2 + y**2) / (2 * variance))
+        for channel, weight in enumerate(weights):
+            total[..., channel] += weight * fftconvolve(
+                light[..., channel], kernel / kernel.sum(), mode="same"
+            )
+    return total
+
+
+@eqx.filter_jit
+def exitance(frame, gaussians, kernel):
+    material = sj.Material(gaussians, specular=0.0)
+    return jnp.pi * baselines.diffuse_on_screen(frame, CAMERA, material, kernel).diffuse
+
+
+def off_by(
+    light: np.ndarray, gaussians: sj.SumOfGaussians, kernel: baselines.AbstractScreenKernel
+) -> float:
+    """The largest difference from the convolution, of its peak, away from the edges."""
+    found, truth = np.asarray(exitance(flat(light), gaussians, kernel)), convolved(light, gaussians)
+    return float(np.max(np.abs(found - truth)[INSIDE, INSIDE]) / np.max(truth))
+
+
+@pytest.fixture(scope="module")
+def spotted():
+    return picture_of(spots)
+
+
+@pytest.fixture(scope="module")
+def edge():
+    return picture_of(lambda points: np.repeat((points[:, :1] > 0.7) * 1.0, 3, axis=1))
+
+
+PASSES, SHIPPED = baselines.GaussianPasses(reach=32), baselines.ShippedKernel()
+
+
+@pytest.mark.once
+def test_gaussian_by_gaussian_it_is_the_convolution(spotted):
+    assert off_by(spotted, TWO, PASSES) < 2e-4  # 1.9e-5
+
+
+@pytest.mark.once
+def test_one_kernel_is_the_convolution_for_one_gaussian_alone(spotted):
+    """But for its taps, which end at twice the root of the mean squared distance."""
+    assert off_by(spotted, ONE, SHIPPED) < 5e-2  # 3.8e-2
+    assert off_by(spotted, TWO, SHIPPED) > 8e-2  # 9.0e-2
+
+
+@pytest.mark.once
+def test_a_preintegrated_kernel_is_right_along_straight_edges_and_the_shipped_one_is_not(
+    edge, spotted
+):
+    preintegrated = baselines.PreintegratedKernel()
+    assert off_by(edge, TWO, preintegrated) < 4e-2  # 3.5e-2, the ends of its taps
+    assert off_by(edge, TWO, SHIPPED) > 6e-2  # 6.3e-2
+    assert off_by(spotted, TWO, preintegrated) > 6e-2  # 6.8e-2
+
+
+@pytest.mark.once
+@pytest.mark.parametrize("kernel", [PASSES, SHIPPED])
+def test_constant_light_stays_constant_and_does_not_jump_to_another_surface(kernel):
+    """The right half of the picture lies 100 mm farther away, and is dark; a corner shows
+    nothing.
+    """
+    right = np.indices((SIZE, SIZE))[1] >= SIZE // 2
+    corner = np.indices((SIZE, SIZE)).sum(axis=0) < 20
+    frame = flat(np.repeat(np.where(right, 0.0, 1.0)[..., None], 3, axis=2))
+    depth = jnp.where(
+        jnp.asarray(corner), jnp.inf, frame.depth + jnp.asarray(np.where(right, 100.0, 0.0), float)
+    )
+    coverage = jnp.where(jnp.asarray(corner), 0.0, frame.coverage)
+    irradiance = frame.irradiance * coverage[..., None]
+    frame = dataclasses.replace(frame, depth=depth, coverage=coverage, irradiance=irradiance)
+    found = np.asarray(exitance(frame, TWO, kernel))
+    np.testing.assert_allclose(found[right], 0.0, atol=1e-6)
+    np.testing.assert_allclose(found[~right & ~corner], 1.0, rtol=1e-5)
+    np.testing.assert_allclose(found[corner], 0.0, atol=1e-6)

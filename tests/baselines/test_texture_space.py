@@ -1,0 +1,192 @@
+"""Texture-space diffusion: on a flat plane it is splat diffusion, if it knows how the chart is
+stretched.
+"""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+from planes import HALF, camera_over, coordinates, gathered, painted, plane, splatted
+
+import splatjax as sj
+from splatjax import baselines
+from splatjax.diffusion import EscapeNormalization, PlainMean, Sources
+from splatjax.geometry import Mesh
+
+SIZE = 192
+TWO = sj.SumOfGaussians(
+    jnp.asarray([3.0, 0.5], float), jnp.asarray([[0.5, 0.6, 0.7], [0.5, 0.4, 0.3]], float)
+)
+"""The wider first: layers keep the order of the Gaussians."""
+DULL = sj.Material(TWO, specular=0.0)
+FRONTAL = sj.DirectionalLight(jnp.asarray([0.0, 0.0, -1.0]), jnp.ones(3), cast_shadows=False)
+STILL = baselines.TextureSpaceSettings(
+    SIZE, baselines.StretchCorrected(), baselines.OpaqueParts(), PlainMean()
+)
+
+
+@eqx.filter_jit
+def diffused(mesh, settings, plan, uvs):
+    light = baselines.mesh_light(mesh, (FRONTAL,), settings.shadows, plan.shadows)
+    texels = baselines.rasterize_in_texture(mesh, settings.resolution, plan.texture)
+    texture = baselines.diffuse_in_texture(mesh, texels, light, DULL, settings, plan.reaches)
+    return baselines.look_up_layers(texture, uvs), texture.renormalized
+
+
+def off_by(stretch: float, correction: baselines.AbstractStretch) -> float:
+    """How far the layers of the painted plane are from those of splats, of the peak; away from its
+    edges.
+    """
+    settings = dataclasses.replace(STILL, stretch=correction)
+    mesh = baselines.TexturedMesh.of(plane(stretch), painted(stretch, SIZE))
+    plan = baselines.plan_texture_space(mesh, (FRONTAL,), DULL, camera_over(6.0, 8), settings)
+    line = np.linspace(-HALF / 2, HALF / 2, 16)
+    points = np.column_stack(
+        [*(each.reshape(-1) for each in np.meshgrid(line, line)), np.zeros(256)]
+    )
+    ours, lost = diffused(mesh, settings, plan, jnp.asarray(coordinates(points, stretch), float))
+    assert 0 < lost[1] < lost[0] < 0.2
+    truth = splatted(points, TWO)
+    return float(np.max(np.abs(np.asarray(ours) - truth)) / np.max(truth))
+
+
+@pytest.mark.once
+@pytest.mark.parametrize(
+    ("stretch", "correction", "least", "most"),
+    [
+        (1.0, baselines.StretchCorrected(), 0, 2e-3),  # 1.4e-3
+        (1.0, baselines.Uncorrected(), 0, 2e-3),
+        (3.0, baselines.StretchCorrected(), 0, 1e-2),  # 7.6e-3: texels are 3 times as long
+        (3.0, baselines.Uncorrected(), 5e-2, 1),  # 1.1e-1
+    ],
+)
+def test_on_a_plane_it_is_splat_diffusion_if_stretch_is_corrected(stretch, correction, least, most):
+    assert least < off_by(stretch, correction) < most
+
+
+@pytest.fixture(scope="module")
+def sheet():
+    """A white plane with sharp edges, from in front, seen with a rim of nothing around."""
+    mesh = baselines.TexturedMesh.of(plane(2.0))
+    settings = dataclasses.replace(
+        STILL,
+        resolution=64,
+        thin_parts=baselines.TranslucentShadowMap(),
+        kernel=EscapeNormalization(),
+    )
+    lights = (dataclasses.replace(FRONTAL, cast_shadows=True),)
+    camera = camera_over(15.0, 32)
+    plan = baselines.plan_texture_space(mesh, lights, DULL, camera, settings)
+    return mesh, lights, camera, settings, plan
+
+
+@pytest.mark.once
+def test_constant_light_stays_constant_up_to_the_edges(sheet):
+    mesh, lights, camera, settings, plan = sheet
+    found = baselines.render_texture_space(mesh, lights, DULL, camera, settings, plan)
+    on_chart = np.asarray(found.texture.layers)[:, np.asarray(found.texture.valid) > 0]
+    np.testing.assert_allclose(on_chart, 1.0, atol=1e-5)
+    frame = found.frame
+    covered = np.asarray(frame.coverage) > 0
+    assert np.mean(covered) == pytest.approx(0.64, abs=0.04)
+    np.testing.assert_allclose(np.asarray(frame.beauty)[covered], 1 / np.pi, rtol=1e-5)
+    rebuilt = jnp.einsum("gyxc,gc->yxc", frame.layers, frame.weights)
+    np.testing.assert_allclose(np.asarray(frame.diffuse), np.asarray(rebuilt), atol=1e-6)
+    assert np.all(np.isinf(np.asarray(frame.depth)[~covered]))
+    assert frame.overflow == 0
+
+
+@pytest.mark.once
+def test_beyond_its_capacity_the_picture_is_nan(sheet):
+    mesh, lights, camera, settings, plan = sheet
+    small = dataclasses.replace(plan, camera=100)
+    frame = baselines.render_texture_space(mesh, lights, DULL, camera, settings, small).frame
+    assert frame.overflow > 1
+    assert np.all(np.isnan(np.asarray(frame.beauty)[np.asarray(frame.depth) < np.inf]))
+
+
+@pytest.mark.once
+def test_bad_input_is_refused(sheet):
+    mesh, lights, camera, settings, _ = sheet
+    bare, lamp = plane(1.0), sj.PointLight(jnp.asarray([0.0, 0.0, 2.0]), jnp.ones(3))
+    with pytest.raises(ValueError, match="no texture coordinates"):
+        baselines.TexturedMesh.of(Mesh(bare.vertices, bare.faces, bare.normals))
+    uvs = bare.uvs * [1.0, 2.0] + [0.0, 0.05]
+    with pytest.raises(ValueError, match=r"0.05 to 1.95"):
+        baselines.TexturedMesh.of(Mesh(bare.vertices, bare.faces, bare.normals, uvs))
+    with pytest.raises(ValueError, match=r"lights\[0\] stands 2 mm"):
+        baselines.plan_texture_space(mesh, (lamp,), DULL, camera, settings)
+    render = jax.jit(lambda mesh: baselines.render_texture_space(mesh, lights, DULL, camera))
+    with pytest.raises(ValueError, match="plan"):
+        render(mesh)
+
+
+def slab(thickness: float) -> Mesh:
+    """Two parallel planes that face away from each other; their charts lie side by side."""
+    front = plane(1.0)
+    turn = np.asarray([-1.0, 1.0, -1.0])
+    vertices = np.concatenate([front.vertices, front.vertices * turn - [0.0, 0.0, thickness]])
+    faces = np.concatenate([front.faces, front.faces + len(front.vertices)])
+    halved = front.uvs * np.asarray([0.5, 1.0])
+    uvs = np.concatenate([halved, halved + np.asarray([0.5, 0.0])])
+    return Mesh(vertices, faces, np.concatenate([front.normals, front.normals * turn]), uvs)
+
+
+@pytest.mark.once
+@pytest.mark.long
+def test_through_a_slab_comes_what_comes_through_splats():
+    """Lit from behind: the share and the gain are those of two sheets of splats."""
+    thickness, settings = 1.5, dataclasses.replace(STILL, resolution=96)
+    settings = dataclasses.replace(
+        settings, thin_parts=baselines.TranslucentShadowMap(), kernel=EscapeNormalization()
+    )
+    mesh, camera = baselines.TexturedMesh.of(slab(thickness)), camera_over(3.0, 4)
+    lights = (sj.DirectionalLight(jnp.asarray([0.0, 0.0, 1.0]), jnp.ones(3)),)
+    found = baselines.render_texture_space(mesh, lights, DULL, camera, settings).frame
+    ours = np.pi * np.asarray(found.layers)[:, 2, 2]
+
+    line = np.arange(-11.7, 12, 0.6)
+    x, y = (each.reshape(-1) for each in np.meshgrid(line, line))
+    side = np.repeat([1.0, -1.0], x.size)
+    centers = np.stack([np.tile(x, 2), np.tile(y, 2), np.where(side > 0, 0.0, -thickness)])
+    light = np.tile(np.where(side > 0, 0.0, 1.0), (3, 1))
+    arrays = centers, np.stack([0 * side, 0 * side, side]), np.full(side.size, 0.36), light
+    sources, kernel = Sources(*(jnp.asarray(each, float) for each in arrays)), EscapeNormalization()
+    means, mass = gathered(sources, TWO.variances, kernel, np.zeros((1, 3)))
+    mass, weights = jnp.asarray(mass[:, None]), TWO.weights[..., None]
+    gain = kernel.gain(mass, TWO.variances, weights, jnp.zeros((3, 1)))
+    truth = np.asarray(gain * means)[..., 0]
+    assert np.all(truth[0] > 0.05)
+    np.testing.assert_allclose(ours, truth, atol=5e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.long
+def test_a_picture_has_the_derivatives_that_differences_say(float64):
+    settings = dataclasses.replace(STILL, resolution=40)
+    mesh = baselines.TexturedMesh.of(plane(1.4), painted(1.4, 24))
+    camera = camera_over(6.0, 8)
+    lights = (dataclasses.replace(FRONTAL, direction=jnp.asarray([0.3, 0.2, -1.0])),)
+    plan = baselines.plan_texture_space(mesh, lights, DULL, camera, settings)
+    pattern = jnp.sin(jnp.arange(8.0 * 8 * 3)).reshape(8, 8, 3)
+
+    @jax.jit
+    def seen(variances, albedo, direction, normals):
+        painted_mesh = eqx.tree_at(
+            lambda each: (each.albedo, each.normals), mesh, (albedo, normals)
+        )
+        material = sj.Material(sj.SumOfGaussians(variances, TWO.weights), specular=0.2)
+        light = (dataclasses.replace(lights[0], direction=direction),)
+        return jnp.sum(
+            pattern
+            * baselines.render_texture_space(
+                painted_mesh, light, material, camera, settings, plan
+            ).frame.beauty
+        )
+
+    given = TWO.variances, mesh.albedo, lights[0].direction, mesh.normals
+    check_grads(seen, given, order=1, modes=["rev"], rtol=1e-5, atol=1e-5)

@@ -1,0 +1,254 @@
+"""The kernel of pass 4: where it ends, which layers are resolved, and the laws of its gain; sheets
+against Monte Carlo.
+"""
+
+import bodies
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from splatjax.diffusion import (
+    EscapeNormalization,
+    LayersAtPoints,
+    PlainMean,
+    Sources,
+    dense_layer,
+    resolved_fraction,
+    unevenness,
+)
+from splatjax.gaussians import SumOfGaussians
+from splatjax.scattering import Medium, SingleScattering
+
+KERNEL = EscapeNormalization()
+# Six Gaussians on the reflectance of half spaces of sigma_t = 1/mm, isotropic scattering, no change
+# of index; albedo 0.9, 0.98 and 0.998. `fit_gaussians` on four million walks, non-negative, totals
+# held.
+VARIANCES = np.asarray([0.01265, 0.0577, 0.2458, 1.1161, 5.3668, 36.784])
+WEIGHTS = np.asarray(
+    [
+        [0.02739, 0.03848, 0.08084],
+        [0.05131, 0.05521, 0.05484],
+        [0.08196, 0.09944, 0.10425],
+        [0.12977, 0.16921, 0.17898],
+        [0.08900, 0.20930, 0.25600],
+        [0.03544, 0.09939, 0.20445],
+    ]
+)
+# What a sheet of so many mm lets through of light from straight above, that which never met it left
+# out: 400,000 walks.
+THROUGH = {
+    2.0: [0.2198, 0.3138, 0.3433],
+    4.0: [0.1096, 0.2290, 0.2828],
+    8.0: [0.0156, 0.0880, 0.1627],
+}
+
+
+@eqx.filter_jit
+def gains(mass, weights, variances=VARIANCES, once=0.0, kernel=KERNEL):
+    """Gains `[gaussians, channels]` for kernel masses `[gaussians]`, or one mass for all."""
+    weights, variances = jnp.asarray(weights, float), jnp.asarray(variances, float)
+    mass = jnp.broadcast_to(jnp.asarray(mass, float), variances.shape)[:, None]
+    return kernel.gain(mass, variances, weights, jnp.full(weights.shape[1], once))
+
+
+def returned(mass, weights, *given):
+    """The fraction that leaves, per channel."""
+    return np.sum(weights * np.asarray(gains(mass, weights, *given)), axis=0)
+
+
+WHITE = WEIGHTS / WEIGHTS.sum(axis=0)
+
+
+@pytest.mark.parametrize("support", [3.75, 4.5])
+def test_the_kernel_falls_to_zero_without_a_step(support, float64):
+    kernel = KERNEL.truncated(support)
+    exponents = jnp.linspace(0, 12, 120_001)
+    weight, fall = (np.asarray(each) for each in kernel(exponents))
+    assert np.all(weight[exponents >= kernel.largest] == 0)
+    assert np.all(np.diff(weight) <= 0)
+    np.testing.assert_allclose(weight[:60_000], np.exp(-exponents[:60_000]), rtol=1e-12)
+    integral = np.cumsum((fall[1:] + fall[:-1]) / 2) * 1e-4
+    np.testing.assert_allclose(weight[0] - weight[1:], integral, atol=1e-5)
+    # Its integral over a plane.
+    power = np.sum(weight) * 1e-4
+    np.testing.assert_allclose(kernel.integral(jnp.zeros(())), power, rtol=1e-4)
+    in_float32 = kernel(exponents.astype(jnp.float32))
+    for ours, theirs in zip(in_float32, (weight, fall), strict=True):
+        np.testing.assert_allclose(ours, theirs, atol=2e-4)
+
+
+def test_what_lies_beyond_the_support_is_half_of_the_error():
+    for error, share in ((2e-3, 1.0), (2e-3, 0.1), (1e-2, 1.0), (0.0, 1.0)):
+        beyond = np.exp(-0.5 * KERNEL.support(error, share) ** 2)
+        assert 0.6 < beyond / min(max(0.5 * error / share, 4e-5), 0.1) < 1.7
+
+
+def test_resolved_fraction_rises_smoothly_from_none_to_all(float64):
+    interval, area, step = jnp.asarray([1.2, 2.4]), 0.25, 1e-6
+    variances = jnp.linspace(0.1, 1.5, 1401)
+
+    def share(variance, area):
+        return resolved_fraction(variance, area, interval)
+
+    found = jax.vmap(jax.value_and_grad(share, argnums=(0, 1)), (0, None))
+    values, slopes = jax.jit(found)(variances, jnp.asarray(area))
+    assert np.all(values[variances < 0.3599] == 0)
+    assert np.all(values[variances > 1.4401] == 1)
+    assert np.all(slopes[0] >= 0)
+    assert np.all((values > 0) & (values < 1), where=(variances > 0.361) & (variances < 1.439))
+    bend = 6 / 1.08**2
+    assert np.max(np.abs(np.diff(slopes[0]))) < bend * 1.01 * 1.4 / 1400, "the slope jumps"
+    for k, (of_variance, of_area) in enumerate(((step, 0.0), (0.0, step))):
+        ends = (
+            share(variances + s * of_variance, jnp.asarray(area + s * of_area)) for s in (1, -1)
+        )
+        upper, lower = ends
+        np.testing.assert_allclose(slopes[k], (upper - lower) / (2 * step), atol=2e-5)
+
+
+def test_unevenness_distinguishes_grids_from_scattered_splats(dtype):
+    grid = bodies.sheet(10.0, 0.5)
+    assert float(unevenness(grid)) < 1e-3
+    jitter = np.random.default_rng(4).uniform(-0.125, 0.125, grid.centers.shape) * [1, 1, 0]
+    moved = grid.centers + jnp.asarray(jitter, dtype)
+    assert float(unevenness(bodies.splats(moved, grid.normals, grid.radii, grid.areas))) > 0.1
+    # The standard deviation over the mean, of every sixth splat: areas in other units change
+    # nothing.
+    body = bodies.sphere(379)
+    centers = np.asarray(body.centers, float)
+    apart = np.linalg.norm(centers[::6, None] - centers[None], axis=2) + 1e9 * np.eye(379)[::6]
+    nearest = apart.min(axis=1)
+    for areas in (body.areas, 9 * body.areas):
+        found = float(unevenness(bodies.splats(centers, body.normals, body.radii, areas)))
+        np.testing.assert_allclose(found, nearest.std() / nearest.mean(), rtol=1e-4)
+    assert float(unevenness(bodies.splats([[0.0, 0, 0]], [[0.0, 0, 1]], 1.0))) == 0
+    for uneven, interval in ((0.0, KERNEL.regular), (1.0, KERNEL.scattered)):
+        found = KERNEL.interval(jnp.asarray(uneven, dtype))
+        np.testing.assert_allclose(found, interval, rtol=1e-6)
+
+
+@pytest.mark.parametrize("mass", [0.0, 0.4, 1.0])
+def test_flat_pieces_and_open_edges_keep_their_mean(mass):
+    np.testing.assert_array_equal(gains(mass, WEIGHTS), 1)
+    np.testing.assert_array_equal(gains(mass + 2, WEIGHTS, VARIANCES, 0.0, PlainMean()), 1)
+
+
+def test_what_absorbs_nothing_returns_all_whatever_the_shape():
+    for mass in (3.0, np.linspace(1.1, 2.5, 6)):
+        np.testing.assert_allclose(returned(mass, WHITE), 1, rtol=1e-5)
+    single = SingleScattering(Medium([0.0], [1.0], 1.4))
+    once = float(single.total_reflectance()[0])
+    rest = (1 - once) * np.asarray([[0.4], [0.6]])
+    np.testing.assert_allclose(returned(2.5, rest, [1.0, 4.0], once), 1 - once, rtol=1e-5)
+    assert np.all(returned(2.5, rest, [1.0, 4.0]) > 1.01 * (1 - once))
+
+
+def test_nothing_returns_more_than_it_receives_and_more_mass_lets_out_more():
+    rng = np.random.default_rng(4)
+    for _ in range(20):
+        weights = rng.exponential(size=(6, 2))
+        weights *= rng.uniform(0.1, 1, size=2) / weights.sum(0)
+        assert np.all(returned(1 + 3 * rng.exponential(size=6), weights) <= 1 + 1e-5)
+    out = [returned(mass, WEIGHTS) for mass in (1.0, 1.5, 2.0)]
+    assert np.all(np.diff(out, axis=0) > 0.02)
+    wide_alone = gains(np.repeat([1.0, 2.0], 3), WEIGHTS)
+    assert np.all(gains(2.0, WEIGHTS)[3:] < wide_alone[3:]), "less is left for wider layers"
+    darker = gains(2.0, 0.5 * WEIGHTS)
+    assert np.all(darker > gains(2.0, WEIGHTS)), "the darker gains more of what it would lose"
+
+
+def test_odds_of_leaving_grow_as_the_mass():
+    """For one Gaussian that is all there is: far above the rounded corner."""
+    weights = np.asarray([[0.3, 0.8]])
+    for mass in (40.0, 200.0):
+        leaving = returned(mass, weights, [1.0])
+        odds = mass * weights[0] / (1 - weights[0])
+        np.testing.assert_allclose(leaving / (1 - leaving), odds, rtol=0.05)
+
+
+def test_layers_need_no_order_and_negative_weights_count_as_none():
+    mass = np.linspace(1.1, 2.5, 6)
+    turned = gains(mass[::-1], WEIGHTS[::-1], VARIANCES[::-1])
+    np.testing.assert_allclose(turned[::-1], gains(mass, WEIGHTS), rtol=1e-6)
+    signed = np.asarray([[0.5], [-0.2], [0.3]])
+    ours, theirs = (gains(2.0, each, [1.0, 2.0, 3.0]) for each in (signed, np.maximum(signed, 0)))
+    np.testing.assert_allclose(ours, theirs, rtol=1e-6)
+
+
+def test_gradients_at_the_corners_are_the_limits():
+    """At weights of zero the limit from above, at no weights at all finite, at a mass of one
+    rounded.
+    """
+
+    def out(w):
+        weights = jnp.stack([w, jnp.asarray(0.4)])[:, None]
+        return jnp.sum(weights * gains(2.0, weights, [1.0, 4.0]))
+
+    step, zero = 2e-3, jnp.asarray(0.0)
+    slope = float(out(zero + step) - out(zero)) / step
+    np.testing.assert_allclose(float(jax.grad(out)(zero)), slope, rtol=1e-2)
+    of_mass = jax.grad(lambda mass: jnp.sum(gains(mass, WEIGHTS)))
+    assert float(of_mass(1.0)) == 0
+    assert 0 < float(of_mass(1.001)) < 0.05 * float(of_mass(1.2))
+    of_weights = jax.grad(lambda weights: jnp.sum(gains(2.0, weights)))
+    almost = np.asarray([0.5, 0.5, 0.0, 0.0, 0.0, np.finfo(np.float32).tiny])[:, None]
+    for weights in (np.zeros((6, 1)), np.eye(6)[:, :1], almost):
+        assert np.all(np.isfinite(of_weights(jnp.asarray(weights, float))))
+
+
+@eqx.filter_jit
+def sheet_at_origin(thickness, half, spacing, light, variances, kernel) -> jax.Array:
+    """Means and mass `[gaussians, 2]` in the middle of a wide sheet's upper face; `light` enters
+    the upper and the lower face.
+    """
+    line = jnp.arange(-half, half + 0.1, spacing)
+    x, y = (each.reshape(-1) for each in jnp.meshgrid(line, line))
+    zero, up = jnp.zeros_like(x), jnp.zeros((3, x.size)).at[2].set(1)
+    flat = jnp.stack([x, y, zero])
+    centers = jnp.concatenate([flat, flat - thickness * up], axis=1)
+    entering = jnp.repeat(jnp.asarray(light, float), x.size)[None]
+    areas = jnp.full(2 * x.size, spacing**2)
+    sources = Sources(centers, jnp.concatenate([up, -up], axis=1), areas, entering)
+    depths, at = kernel.depths(variances), jnp.zeros((3, 1))
+    layers = (
+        dense_layer(sources, at, variance, depth)
+        for variance, depth in zip(variances, depths, strict=True)
+    )
+    return jnp.stack([layer.values[:, 0] for layer in layers])
+
+
+@pytest.mark.parametrize("thickness", list(THROUGH))
+def test_sheets_let_through_what_walks_say(thickness):
+    """Far better than the mean over the splats, which loses from a third to three quarters of
+    it.
+    """
+    truth, spacing = np.asarray(THROUGH[thickness]), 0.6
+    off = []
+    for kernel in (KERNEL, PlainMean()):
+        given = thickness, 30.0, spacing, (0.0, 1.0), jnp.asarray(VARIANCES, float), kernel
+        means, mass = np.asarray(sheet_at_origin(*given)).T
+        # The others are too narrow for the splats, and do not reach through.
+        resolved = spacing**2 < VARIANCES
+        means, mass = np.where(resolved, means, 0.0), np.where(resolved, mass, 1.0)
+        layers = means[:, None] * np.asarray(gains(mass, WEIGHTS, VARIANCES, 0.0, kernel))
+        off.append(np.abs(np.sum(WEIGHTS * layers, axis=0) / truth - 1)[truth > 0.05])
+    assert np.all(off[0] < 0.35), off
+    assert np.all(off[0] < 0.6 * off[1]), off
+
+
+@pytest.mark.parametrize("interval", [(0.1, 0.2), (0.5, 3.0), (1.0, 5.0)])
+def test_a_thin_white_sheet_returns_what_it_receives_whatever_is_resolved(interval):
+    """Lit evenly from both sides: layers that are resolved, unresolved, and in between."""
+    spacing, variances = 0.5, jnp.asarray([0.3, 1.0, 4.0])
+    weights = jnp.asarray([[0.3], [0.3], [0.4]])
+    rows = sheet_at_origin(0.5, 10.0, spacing, (1.0, 1.0), variances, KERNEL)
+    one, area = jnp.ones((1, 1)), jnp.full(1, spacing**2)
+    given = one, area, one, jnp.asarray(interval), KERNEL
+    at = LayersAtPoints.of(variances, list(rows[:, :, None]), None, *given)
+    _, resolved = at.weigh(SumOfGaussians(variances, weights), jnp.zeros(1))
+    assert np.any(resolved > 0)
+    white, grey = (at.exitance(SumOfGaussians(variances, w)) for w in (weights, 0.5 * weights))
+    np.testing.assert_allclose(white, 1, rtol=1e-4)
+    assert 0.5 < float(grey[0, 0]) < 1

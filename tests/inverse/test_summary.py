@@ -1,0 +1,208 @@
+"""What a recovery reports: principal axes of a covariance, and their summary."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import pytest
+
+import splatjax as sj
+from splatjax.inverse import Recovery
+
+
+def recovery(
+    information, chi_squared=1.0, noise_is_known=True, channels=1, unresolved=0.0, handover=None
+) -> Recovery:
+    """A recovery of which nothing is known but this; no layer is handed to the surface, unless told
+    how that is mixed in.
+    """
+    if handover is None:
+        information = np.pad(information, (0, channels))
+    else:
+        information = np.block(
+            [[information, np.asarray(handover)[:-1, None]], [np.asarray(handover)[None]]]
+        )
+    medium = sj.Medium(jnp.full(channels, 0.02), 1.5, 1.3)
+    gaussians = sj.SumOfGaussians([1], jnp.full((1, channels), 0.5))
+    return Recovery(
+        medium=medium,
+        material=sj.Material(gaussians),
+        intensities=jnp.ones((1, channels)),
+        information=jnp.asarray(information, float),
+        unresolved=jnp.full(channels, unresolved),
+        chi_squared=jnp.asarray(chi_squared),
+        pictures=(),
+        residuals=(),
+        ends=(),
+        costs=jnp.zeros(1),
+        result=optx.RESULTS.successful,
+        noise_is_known=noise_is_known,
+        relative_noise=0.01,
+        steps=1,
+        rounds=1,
+    )
+
+
+def along(best: float, worst: float, angle: float) -> np.ndarray:
+    """Information of a medium whose best known combination lies at an angle to the axis of
+    sigma_a.
+    """
+    axes = np.asarray([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    return axes @ np.diag([best**-2, worst**-2]) @ axes.T
+
+
+def test_what_is_not_fixed_is_reported():
+    """The reduced albedo is known to 1%, the mean free path to 50%."""
+    found = recovery(along(0.01, 0.5, -np.pi / 4))
+    ((best, worst),) = found.combinations()
+    np.testing.assert_allclose([best.deviation, worst.deviation], [0.01, 0.5], rtol=1e-4)
+    np.testing.assert_allclose(best.powers, (1, -1), rtol=1e-3)
+    np.testing.assert_allclose(worst.powers, (1, 1), rtol=1e-3)
+    assert not found.is_fixed()
+    expected = "sigma_a sigma_s', known to 50%; they fix sigma_a / sigma_s' to 1%"
+    assert f"not fixed by these pictures: {expected}" in found.summary(["red"])
+    np.testing.assert_allclose(
+        found.relative_errors(), np.full((2, 1), np.sqrt((0.01**2 + 0.5**2) / 2)), rtol=1e-4
+    )
+
+
+@pytest.mark.parametrize(
+    ("information", "more", "said", "unsaid"),
+    [
+        (along(0.01, 1.5, -np.pi / 4), {"unresolved": 0.998}, "known to 150%", "anything"),
+        (along(0.01, 1.5, -np.pi / 4), {"unresolved": 0.998}, "+- 110%", "anything"),
+        (along(0.01, 0.02, 0.3), {"unresolved": 0.97}, "97% of its light", "not fixed"),
+        (along(0.01, 0.02, 0.3), {"unresolved": 0.5}, "+-", "splats"),
+        (along(0.01, 0.02, 0.3), {"chi_squared": 9.0}, "3 times the noise", "not fixed"),
+        (along(0.01, 0.02, 0.3), {"noise_is_known": False}, "of the residuals", "times"),
+        (np.zeros((2, 2)), {}, "anything", "nan"),
+        (np.full((2, 2), np.nan), {}, "anything", "nan"),
+        (np.diag([4.0, 0.0]), {}, "anything", "nan"),
+    ],
+)
+def test_a_summary_reports_what_matters(information, more, said, unsaid):
+    found = recovery(information, **more)
+    assert said in found.summary()
+    assert unsaid not in found.summary()
+    assert found.is_fixed() == ("not fixed" not in found.summary())
+    assert np.all(np.isfinite(found.relative_errors())) == ("anything" not in found.summary())
+
+
+def test_what_only_the_handover_tells_is_known_no_better_than_the_handover():
+    """The mean free path changes the picture as the width of the handover does, the other way
+    round: they are told together.
+    """
+    own, path = along(1e-3, 1e-2, -np.pi / 4), np.asarray([1, 1]) / np.sqrt(2)
+    along_path = path @ own @ path
+    mixed = np.append(-along_path * path, along_path)
+    found = recovery(own, handover=mixed, unresolved=1.0)
+    best, worst = found.combinations()[0]
+    np.testing.assert_allclose(best.deviation, 1e-3, rtol=1e-3)
+    np.testing.assert_allclose(worst.deviation, np.hypot(0.5 * np.log(2), 1e-2), rtol=1e-3)
+    assert not found.is_fixed()
+    assert "not fixed by these pictures: sigma_a sigma_s', known to 35%" in found.summary()
+    np.testing.assert_allclose(found.noise_errors(), recovery(own).relative_errors(), rtol=1e-6)
+    np.testing.assert_allclose(
+        found.noise_errors(), np.full((2, 1), np.sqrt((1e-6 + 1e-4) / 2)), rtol=1e-3
+    )
+
+
+def test_a_picture_without_a_handover_makes_up_for_one_with_as_far_as_it_weighs():
+    """A search weighs pixels by their noise, whatever the handover does to them: a weak close
+    picture changes little.
+    """
+    own, path = along(1e-3, 1e-2, -np.pi / 4), np.asarray([1, 1]) / np.sqrt(2)
+    weighs = path @ own @ path
+    found = recovery(own, handover=np.append(-weighs * path, weighs))
+    for deviation in (1e-1, 1e-2, 1e-3):
+        close = np.pad(along(deviation, deviation, 0.0), (0, 1))
+        share = weighs / (weighs + deviation**-2)
+        expected = np.hypot(0.5 * np.log(2) * share, 1 / np.sqrt(weighs + deviation**-2))
+        np.testing.assert_allclose(
+            np.sqrt(np.linalg.eigvalsh(found.covariance(close)[0])[-1]), expected, rtol=1e-4
+        )
+
+
+def test_without_noise_given_the_bars_are_those_of_what_is_left():
+    known = recovery(along(0.01, 0.02, 0.3), chi_squared=9.0)
+    unknown = recovery(along(0.01, 0.02, 0.3), chi_squared=9.0, noise_is_known=False)
+    np.testing.assert_allclose(unknown.covariance(), 9 * known.covariance(), rtol=1e-5)
+
+
+def test_an_unknown_intensity_widens_the_bars():
+    """Where it does the same as the absorption does, they are infinite."""
+    parallel = np.asarray([[4.0, 1.0, 4.0], [1.0, 3.0, 1.0], [4.0, 1.0, 4.0]])
+    apart = parallel + np.diag([0, 0, 2.0])
+    (at_once,) = recovery(apart).covariance()
+    np.testing.assert_allclose(at_once, np.linalg.inv(apart)[:2, :2], rtol=1e-4)
+    found = recovery(parallel)
+    assert found.combinations()[0][1].deviation > 1e3
+    assert "anything" in found.summary()
+
+
+def test_a_suggestion_needs_candidates():
+    splats = sj.Splats([[0, 0, 0]], [[0, 0, 1]], 1, 1)
+    with pytest.raises(ValueError, match="candidates is empty"):
+        sj.next_pictures(recovery(np.eye(2)), splats, [])
+
+
+def test_what_is_combined_is_the_mean_by_what_each_knows():
+    """One knows the reduced albedo, the other scattering: together both, whichever comes first."""
+    ratio = recovery(along(0.01, 0.5, -np.pi / 4))
+    medium = sj.Medium(0.03, 1.5, 1.3)
+    path = eqx.tree_at(lambda r: r.medium, recovery(np.diag([0.3**-2, 0.02**-2])), medium)
+    found = sj.combined([ratio, path])
+    assert found.is_fixed()
+    assert not ratio.is_fixed()
+    known = [np.linalg.inv(each.covariance()[0]) for each in (ratio, path)]
+    points = [
+        np.log([float(each.medium.sigma_a[0]), float(each.medium.sigma_s_prime[0])])
+        for each in (ratio, path)
+    ]
+    expected = np.linalg.solve(known[0] + known[1], known[0] @ points[0] + known[1] @ points[1])
+    np.testing.assert_allclose(
+        np.log([found.medium.sigma_a[0], found.medium.sigma_s_prime[0]]), expected, rtol=1e-5
+    )
+    np.testing.assert_allclose(found.covariance()[0], np.linalg.inv(known[0] + known[1]), rtol=1e-4)
+    np.testing.assert_allclose(
+        sj.combined([path, ratio]).medium.sigma_a, found.medium.sigma_a, rtol=1e-6
+    )
+    assert "not fixed" not in found.summary()
+
+
+def test_one_alone_stays_what_it_is_and_one_that_knows_nothing_adds_nothing():
+    known, nothing = recovery(along(0.01, 0.5, -np.pi / 4)), recovery(np.zeros((2, 2)))
+    for given in ([known], [known, nothing]):
+        found = sj.combined(given)
+        np.testing.assert_allclose(
+            found.medium.sigma_s_prime, known.medium.sigma_s_prime, rtol=1e-5
+        )
+        np.testing.assert_allclose(found.relative_errors(), known.relative_errors(), rtol=1e-4)
+        assert found.summary() == known.summary()
+    found = sj.combined([nothing, nothing])
+    np.testing.assert_allclose(found.medium.sigma_a, nothing.medium.sigma_a, rtol=1e-6)
+    assert "anything" in found.summary()
+
+
+def test_a_model_that_leaves_much_counts_for_less():
+    info = along(0.01, 0.02, 0.3)
+    good, bad, unknown = (
+        recovery(info),
+        recovery(info, chi_squared=9.0),
+        recovery(info, chi_squared=9.0, noise_is_known=False),
+    )
+    np.testing.assert_allclose(
+        sj.combined([bad]).relative_errors(), 3 * np.asarray(good.relative_errors()), rtol=1e-6
+    )
+    np.testing.assert_allclose(
+        sj.combined([unknown]).relative_errors(), unknown.relative_errors(), rtol=1e-6
+    )
+
+
+def test_what_does_not_belong_together_is_refused():
+    one = recovery(along(0.01, 0.02, 0.3))
+    other = eqx.tree_at(lambda r: r.medium.eta, one, one.medium.eta + 0.1)
+    with pytest.raises(ValueError, match="recoveries is empty"):
+        sj.combined([])
+    with pytest.raises(ValueError, match=r"recoveries\[1\].medium.eta is .* different materials"):
+        sj.combined([one, other])

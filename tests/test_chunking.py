@@ -1,0 +1,101 @@
+"""Parts give what the whole gives, in value and in every derivative."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from splatjax._chunking import jit_unless_traced, map_chunks, zeros_after
+
+
+def squares_and_lengths(scale, record):
+    points, factors = record["points"], record["factors"]
+    return {
+        "scaled": scale * points * factors[:, None],
+        "length": jnp.sqrt(jnp.sum(points * points, axis=1)) + scale,
+    }
+
+
+@pytest.mark.parametrize("at_once", [1, 3, 4, 11, 12])
+def test_parts_give_what_the_whole_gives(at_once):
+    keys = jax.random.split(jax.random.key(0), 2)
+    record = {
+        "points": jax.random.normal(keys[0], (11, 3)),
+        "factors": jax.random.normal(keys[1], (11,)),
+    }
+    scale = jnp.asarray(1.5)
+
+    def loss(scale, record, run):
+        found = run(lambda part: squares_and_lengths(scale, part), record)
+        return jnp.sum(jnp.sin(found["scaled"])) + jnp.sum(found["length"] ** 2), found
+
+    def parts(function, tree):
+        return map_chunks(function, tree, at_once=at_once)
+
+    def whole(function, tree):
+        return function(tree)
+
+    derivative = jax.jit(jax.grad(loss, argnums=(0, 1), has_aux=True), static_argnums=2)
+    close = {"rtol": 1e-5, "atol": 1e-6}
+    for got, expected in zip(
+        jax.tree.leaves(derivative(scale, record, parts)),
+        jax.tree.leaves(derivative(scale, record, whole)),
+        strict=True,
+    ):
+        np.testing.assert_allclose(np.asarray(got), np.asarray(expected), **close)
+    moved = scale, record
+    along = jax.jit(
+        lambda run: jax.jvp(lambda s, r: loss(s, r, run)[0], moved, moved)[1], static_argnums=0
+    )
+    forward, plain = along(parts), along(whole)
+    np.testing.assert_allclose(float(forward), float(plain), **close)
+
+
+def test_a_part_that_is_filled_up_adds_nothing():
+    """What fills the last part is a copy of the last point: no zero of which a norm has no
+    derivative.
+    """
+    points = jnp.ones((5, 3))
+    slope = jax.jit(
+        jax.grad(
+            lambda p: jnp.sum(map_chunks(lambda part: jnp.linalg.norm(part, axis=1), p, at_once=3))
+        )
+    )(points)
+    np.testing.assert_allclose(np.asarray(slope), 1 / np.sqrt(3), rtol=1e-6)
+
+
+def test_zeros_wait_for_what_must_be_known_and_are_zeros_whatever_it_is():
+    make = jax.jit(lambda known: zeros_after(known, (2, 3), jnp.float32))
+    for known in (-1.0, 0.0, 5.0, np.nan, np.inf):
+        found = make(jnp.full((4, 1), known))
+        assert found.dtype == jnp.float32
+        np.testing.assert_array_equal(found, np.zeros((2, 3)))
+    assert "compare" in make.lower(jnp.zeros((4, 1))).compile().as_text()  # not made a constant of
+
+
+class Curve(eqx.Module):
+    @jit_unless_traced
+    def __call__(self, x):
+        return jnp.sin(3 * x) * x + jnp.cos(x) / (1 + x * x)
+
+
+def test_a_compiled_function_compiles_once_and_binds_as_a_method():
+    compiled, x = [], jnp.linspace(0.0, 1.0, 23)
+
+    def listen(event, duration, **_):
+        compiled.extend([duration] * (event == "/jax/core/compile/backend_compile_duration"))
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    values = Curve()(x)
+    jax.monitoring.unregister_event_duration_listener(listen)
+    assert len(compiled) == 1
+    at = np.asarray(x)
+    np.testing.assert_allclose(values, np.sin(3 * at) * at + np.cos(at) / (1 + at * at), rtol=1e-5)
+    np.testing.assert_allclose(jax.jit(Curve())(x), values, rtol=1e-6)
+    slope = jax.jit(jax.grad(lambda x: Curve()(x)))(x[7])
+    np.testing.assert_allclose(
+        slope, jax.grad(lambda x: jnp.sin(3 * x) * x + jnp.cos(x) / (1 + x * x))(x[7]), rtol=1e-5
+    )
+    within = {step.primitive.name for step in jax.make_jaxpr(lambda x: Curve()(x))(x).eqns}
+    assert "sin" in within

@@ -1,0 +1,246 @@
+"""Records take numbers, lists and tuples, convert them once, and refuse nonsense by name."""
+
+import time
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import splatjax as sj
+from splatjax._records import check_values
+from splatjax.diffusion import DenseDiffuser
+from splatjax.fitting import GivenVariances
+from splatjax.inverse import Candidate, Observation
+from splatjax.scattering import RoughFresnel
+from splatjax.splatting import DenseRasterizer
+from splatjax.transport import HenyeyGreenstein
+
+CENTERS = [[0, 0, 0], [1, 0, 0]]
+NORMALS = ((0, 0, 1), (0, 0, 1))
+
+
+def medium() -> sj.Medium:
+    return sj.Medium([0.02, 0.006, 0.015], (1.1, 1.3, 1.5), eta=1.4)
+
+
+def material() -> sj.Material:
+    return sj.Material(sj.SumOfGaussians([0.1, 2], [[0.3, 0.3, 0.2], [0.5, 0.4, 0.2]]))
+
+
+def splats(**fields) -> sj.Splats:
+    return sj.Splats(
+        **{"centers": CENTERS, "normals": NORMALS, "radii": 1, "areas": np.pi, **fields}
+    )
+
+
+def light() -> sj.DirectionalLight:
+    return sj.DirectionalLight([0.5, -0.5, -1], irradiance=3.14)
+
+
+def camera() -> sj.Camera:
+    return sj.Camera.look_at((66, 4, 140), (0, -9, 0), fov=30, width=2, height=2)
+
+
+RECORDS = {
+    "Medium": medium,
+    "Layer": lambda: sj.Layer(medium(), 3),
+    "Film": lambda: sj.Film(0.3),
+    "Dipole": lambda: sj.Dipole(medium()),
+    "Multipole": lambda: sj.Multipole(sj.Layer(medium(), 3), eta_above=1.2),
+    "LayeredMultipole": lambda: sj.LayeredMultipole([sj.Film(0.1), sj.Layer(medium(), np.inf)]),
+    "Burley": lambda: sj.Burley([0.8, 0.5], 1),
+    "Tabulated": lambda: sj.Tabulated([0, 1, 2], [3, 2, 1], deviation=(0.1, 0.1, 0.1), total=[1]),
+    "SingleScattering": lambda: sj.SingleScattering(medium()),
+    "RoughFresnel": lambda: RoughFresnel(1),
+    "SumOfGaussians": lambda: sj.SumOfGaussians([0.1, 2], weights=[0.3, 0.5]),
+    "Material": lambda: sj.Material(material().gaussians, eta=1, roughness=np.float64(0.5)),
+    "Splats": lambda: splats(albedo=[[0.5, 0, 1]] * 2, roughness=1),
+    "DirectionalLight": light,
+    "PointLight": lambda: sj.PointLight((0, 0, 9), np.arange(3)),
+    "GaussianBeam": lambda: sj.GaussianBeam([0, 0, 9], [0, 0, -1], power=1, variance=2),
+    "Camera": camera,
+    "Scene": lambda: sj.Scene(splats(), light(), material()),
+    "Observation": lambda: Observation(np.ones((2, 2, 3)), camera(), [light()], deviation=0.01),
+    "Candidate": lambda: Candidate("front", camera(), light()),
+    "HenyeyGreenstein": lambda: HenyeyGreenstein([0.5, 0]),
+    "GivenVariances": lambda: GivenVariances((0.1, 2)),
+}
+
+
+@pytest.mark.parametrize("make", RECORDS.values(), ids=RECORDS)
+def test_numbers_lists_and_tuples_become_strongly_typed_arrays(make):
+    for leaf in jax.tree.leaves(make()):
+        assert isinstance(leaf, jax.Array)
+        assert not leaf.weak_type
+        assert leaf.dtype in (jnp.result_type(float), jnp.bool_)
+
+
+def test_a_number_stands_for_every_entry_of_an_axis_that_others_have():
+    np.testing.assert_array_equal(medium().eta, jnp.full(3, 1.4))
+    assert sj.Multipole(sj.Layer(medium(), 3)).eta_above.shape == (3,)
+    assert sj.SingleScattering(medium(), 0.5).strength.shape == (3,)
+    assert splats().radii.shape == splats(specular=0.5).specular.shape == (2,)
+    assert sj.Medium(0.1, 1, 1.4).eta.shape == (1,)
+    assert sj.SumOfGaussians([0.1, 2], [0.3, 0.5]).weights.shape == (2, 1)
+    assert Observation(np.ones((2, 2, 3)), camera(), light(), deviation=1).deviation.shape == (
+        2,
+        2,
+        3,
+    )
+    scene = sj.Scene(splats(), light(), material())
+    assert [one.irradiance.shape for one in scene.lights] == [(3,)]
+    assert isinstance(sj.Scene(splats(), [light(), light()], material()).lights, tuple)
+
+
+def test_precision_follows_records_then_arrays_then_jax(x64):
+    single = jnp.float32
+    assert sj.Medium(np.ones(2, np.float32), [1, 1], 1.4).eta.dtype == single
+    assert sj.Layer(sj.Medium(jnp.ones(2, single), 1, 1.4), 3.0).thickness.dtype == single
+    assert sj.Film(np.float32(1)).optical_depth.dtype == jnp.result_type(float)
+    with jax.enable_x64(True):
+        assert sj.Medium(np.ones(2), np.ones(2, np.float32), 1.4).eta.dtype == jnp.float64
+        assert sj.Medium(np.ones(2, np.float32), [1, 1], 1.4).eta.dtype == single
+
+
+def test_traced_values_and_placeholders_pass_through_transformations():
+    def eta(value):
+        return sj.Medium([0.1, 0.2], 1.0, eta=value).eta
+
+    np.testing.assert_array_equal(jax.jit(eta)(2.0), [2, 2])
+    np.testing.assert_array_equal(jax.jacfwd(eta)(2.0), [1, 1])
+    np.testing.assert_array_equal(jax.vmap(eta)(jnp.asarray([1.0, 2.0])), [[1, 1], [2, 2]])
+    array = jnp.ones(3)
+    assert sj.Medium(array, array, array).eta is array
+    shapes = jax.eval_shape(lambda: medium())
+    assert sj.Medium(shapes.sigma_a, shapes.sigma_s_prime, shapes.eta).eta is shapes.eta
+    batched = jax.vmap(lambda _: medium())(jnp.zeros(4))
+    assert batched.eta.shape == (4, 3)
+    placeholder = object()
+    changed = eqx.tree_at(lambda one: one.eta, medium(), placeholder)
+    assert changed.eta is placeholder
+    assert jax.tree.map(lambda _: placeholder, medium()).eta is placeholder
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: sj.Multipole(medium()), r"Multipole.layer must be Layer\(medium, thickness\)"),
+        (
+            lambda: sj.LayeredMultipole([medium()]),
+            r"LayeredMultipole.layers must be Layer.* or Film",
+        ),
+        (lambda: sj.Layer(1.0, 2.0), "Layer.medium must be Medium"),
+        (lambda: sj.Scene(splats(), 3.0, material()), "Scene.lights must be AbstractLight"),
+        (lambda: sj.Material(medium()), "Material.gaussians must be SumOfGaussians"),
+        (lambda: sj.Medium("a", 1, 1), "Medium.sigma_a must be numbers"),
+        (lambda: sj.Medium([[1, 2], [3]], 1, 1), "Medium.sigma_a must be numbers, in rows"),
+        (
+            lambda: sj.Medium([1, 2], [1, 2, 3], 1),
+            r"Medium.sigma_s_prime has shape \[3\].* = \[2\]",
+        ),
+        (lambda: sj.SumOfGaussians([1, 2], [[1, 2, 3]]), r"weights has shape \[1, 3\]"),
+        (
+            lambda: sj.save_material(
+                material(), "x.toml", profile=sj.Multipole(sj.Layer(medium(), 3))
+            ),
+            "profile must be a Dipole, .* or LayeredMultipole.* got Multipole",
+        ),
+        (lambda: splats(normals=[[0, 0, 1]]), r"Splats.normals has shape \[1, 3\].* = \[2, 3\]"),
+        (lambda: splats(radii=[1, 2, 3]), r"Splats.radii has shape \[3\]"),
+        (lambda: splats(areas=[1]), r"Splats.areas has shape \[1\]"),
+        (lambda: splats(albedo=[[1, 1, 1]]), r"Splats.albedo has shape \[1, 3\]"),
+        (lambda: splats(centers=[0, 0, 1]), r"Splats.centers has shape \[3\]"),
+        (lambda: sj.DirectionalLight([1, 0], 1), r"DirectionalLight.direction has shape \[2\]"),
+        (lambda: splats(centers=[[0, 0, 0], [np.nan, 0, np.inf]]), "Splats.centers.*2 of 6"),
+        (lambda: splats(normals=[[0, 0, np.nan]] * 2), "Splats.normals.*2 of 6"),
+        (lambda: splats(radii=-1), "Splats.radii.*2 of 2"),
+        (lambda: splats(areas=[np.inf, 1]), "Splats.areas.*1 of 2"),
+        (lambda: splats(albedo=[[0, 1, 1.5], [0, np.nan, 1]]), r"albedo.*in \[0, 1\].*2 of 6.*1.5"),
+        (lambda: sj.DirectionalLight([0, 0, 0], 1), "DirectionalLight.direction.*not zero"),
+        (lambda: sj.GaussianBeam([0, 0, 0], [0, 0, 0], 1, 1), "GaussianBeam.direction"),
+        (lambda: sj.GaussianBeam([0, 0, 0], [0, 0, 1], 1, 0), "GaussianBeam.variance"),
+        (lambda: sj.PointLight([0, 0, np.inf], 1), "PointLight.position"),
+        (lambda: sj.DirectionalLight([1, 0, 0], [1, np.nan, 1]), "irradiance.*1 of 3"),
+        (lambda: sj.Material(material().gaussians, roughness=-0.1), "Material.roughness"),
+        (lambda: sj.SumOfGaussians([0, 1], [1, 1]), "SumOfGaussians.variances"),
+        (lambda: Observation(np.ones((3, 2, 3)), camera(), light()), "picture has 3 x 2 pixels"),
+        (lambda: Observation(np.ones((2, 2, 3)), camera(), light(), deviation=0), "deviation"),
+    ],
+)
+def test_nonsense_is_refused_by_field_and_count(make, said):
+    with pytest.raises(ValueError, match=said):
+        make()
+
+
+def test_what_lacks_arguments_says_which_it_has():
+    with pytest.raises(TypeError, match=r"give Multipole\(layer, \*, eta_above=1"):
+        sj.Multipole(medium(), -1.0)
+
+
+def test_profiles_of_python_numbers_have_a_reflectance():
+    slab = sj.Layer(medium(), 3)
+    for profile in (
+        sj.Dipole(medium()),
+        sj.Multipole(slab, eta_above=1.2),
+        sj.LayeredMultipole([sj.Film(0.1), slab, sj.Layer(medium(), np.inf)]),
+        sj.Burley([0.8, 0.5], 1),
+    ):
+        total = np.asarray(profile.total_reflectance())
+        assert np.all((total > 0) & (total < 1))
+
+
+def test_numbers_of_any_type_compile_a_picture_once(compiled):
+    """Weakly typed numbers would compile it again."""
+    plain = sj.RenderSettings(rasterizer=DenseRasterizer(), diffuser=DenseDiffuser())
+    weak = jnp.asarray(1.3)  # as JAX makes it of a Python number
+    scenes = [
+        sj.Scene(
+            splats(radii=number),
+            sj.DirectionalLight([0.5, -0.5, -1], [number, 1, 1], cast_shadows=False),
+            sj.Material(material().gaussians, eta=number),
+        )
+        for number in (1.3, np.float64(1.3), weak, jnp.full((), 1.3), np.float32(1.3))
+    ]
+    plan = sj.make_plan(scenes[0], camera(), plain)
+    sj.render(scenes[0], camera(), plain, plan)
+    assert "jit(_render)" in compiled
+    compiled.clear()
+    for scene in scenes:
+        sj.render(scene, camera(), plain, plan)
+    assert compiled == []
+
+
+@pytest.mark.slow
+@pytest.mark.once
+def test_sixteen_media_and_eight_counts_compile_eight_fits(compiled):
+    """An index of refraction that is a Python number would compile each medium's."""
+    for i in range(16):
+        profile = sj.Dipole(sj.Medium([0.01 * (i + 1)], [1.1], eta=1.2 + 0.02 * i))
+        for count in range(1, 9):
+            sj.fit_gaussians(profile, count, throw=False)
+    assert compiled.count("jit(_fit_compiled)") == 8
+
+
+def test_unknown_values_are_not_checked():
+    assert np.isnan(jax.jit(lambda x: sj.Medium(x, 1.0, 1.4).sigma_a)(jnp.nan))
+
+
+def test_a_head_is_checked_in_ten_milliseconds():
+    count = 683_549
+    ones = np.ones((count, 3), np.float32)
+    fields = [jnp.asarray(array) for array in (ones, ones, ones[:, 0], ones[:, 0], ones)]
+    times = []
+    for _ in range(10):
+        start = time.process_time()
+        sj.Splats(*fields)
+        times.append(time.process_time() - start)
+    assert min(times) < 0.01
+
+
+def test_a_check_names_count_and_first_entry():
+    values = np.arange(6.0).reshape(2, 3)
+    with pytest.raises(ValueError, match=r"x must be small; 2 of 6 entries .* is 4 at \[1, 1\]"):
+        check_values("x", values, "small", lambda x: x < 4)
+    check_values("x", np.full(2, np.inf), "at least 0", lambda x: x >= 0, finite=False)
