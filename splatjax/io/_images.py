@@ -38,7 +38,10 @@ def read_planes(
         size = f"{path}: a picture of {spec.width} x {spec.height} x {spec.nchannels} numbers"
         check_memory(size, _BYTES_PER_VALUE * values, "give a smaller one")
         pixels = file.read_image("float")
-    fault = oiio.geterror() if file is None else file.geterror()
+    try:
+        fault = oiio.geterror() if file is None else file.geterror()
+    except UnicodeDecodeError:  # it repeats bytes of the file
+        fault = "its header is damaged"
     if pixels is None or fault:
         fault = " ".join(fault.replace(f'"{path}"', "").split())
         raise ValueError(

@@ -125,6 +125,7 @@ class Table:
             values = np.broadcast_to(values, [n or 1 for n in shape])
         fits = values.ndim == len(shape) and values.size > 0 and values.dtype.kind in "iuf"
         fits = fits and all(n in (None, m) for n, m in zip(shape, values.shape, strict=True))
+        fits = fits and not any(isinstance(value, bool) for value in np.asarray(given, object).flat)
         if not fits or not np.all(rule[1](rounded(values))):
             rows = "rows of " if len(shape) > 1 else ""
             count = f"{shape[0] or 'a list of'} {rows}numbers" if shape else "a number"

@@ -77,7 +77,7 @@ BAD = [
     ('"unknown"', '"maybe"', r"\[pictures 1\] intensity .*'maybe'"),
     ("[0, 1, 50]", "[0, 1]", r"\[pictures 1 camera\] position .*\[0, 1\]"),
     ("[0, 1, 50]", "[0, 50, 0]", r"\[pictures 1 camera\].* up is"),
-    ("[0, 1, 50]", "[0, 0, 0]", r"\[pictures 1 camera\] eye and target are both"),
+    ("[0, 1, 50]", "[0, 0, 0]", r"\[pictures 1 camera\]: eye and target are both"),
     ("[0, 0, -1]", "[0, 0, 0]", r"\[pictures 1 lights 1\] direction .*\[0, 0, 0\]"),
     ("[1, 2, 3]", "[1, 2]", r"\[pictures 1 lights 1\] irradiance .*\[1, 2\]"),
     ('"directional"', '"sun"', r"\[pictures 1 lights 1\] kind .*'sun'"),
