@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from splatjax.geometry import Mesh, Textures
-from splatjax.geometry._morton import morton_order
+from splatjax.geometry._places import morton_order
 from splatjax.geometry._scatter import SurfacePoints
-from splatjax.geometry._textures import lookup, perturbed_normals, texture_coordinates, worn_albedo
+from splatjax.geometry._textures import albedo_at, lookup_at, perturbed_normals
 from splatjax.io import atomic_path
 
 COLUMNS = ("x", "y", "z", "nx", "ny", "nz", "radius", "area", "red", "green", "blue")
@@ -57,13 +57,12 @@ def _rows(
     of, corners = cut(mesh.corners()[faces], counts)
     points = SurfacePoints(faces[of], corners[:, :, :3].mean(axis=1))
     flat, normals = points.positions(mesh), points.normals(mesh)
-    if textures.normal is not None:
-        normals = perturbed_normals(
-            mesh, points, normals, lookup(textures.normal, texture_coordinates(mesh, points))
-        )
+    tangent_space = lookup_at(mesh, points, textures.normal)
+    if tangent_space is not None:
+        normals = perturbed_normals(mesh, points, normals, tangent_space)
     area = (areas / np.maximum(counts, 1))[of]
     reach = np.linalg.norm(corners[:, :, 3:] - flat[:, None], axis=2).max(axis=1)
-    albedo = worn_albedo(textures, mesh, points)
+    albedo = albedo_at(textures, mesh, points)
     assert albedo is not None
     return np.column_stack(
         [

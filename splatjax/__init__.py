@@ -35,7 +35,7 @@ from .io import (
     load_profile as load_profile,
     read_observations as read_observations,
     read_profile as read_profile,
-    materials as materials,
+    list_materials as list_materials,
     save_material as save_material,
 )
 from .scattering import (

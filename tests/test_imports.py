@@ -6,6 +6,7 @@ import sys
 
 LATER = [
     "IPython",
+    "OpenImageIO",
     "colour",
     "matplotlib",
     "optax",

@@ -73,7 +73,7 @@ def main(names: list[str]) -> None:
     if names == ["--starts"]:
         write_starts(profiles_folder() / "dipole_starts.npz")
         return
-    for name in names or sj.materials():
+    for name in names or sj.list_materials():
         path = profiles_folder() / f"{name}.toml"
         tables = tomllib.loads(path.read_text(encoding="utf-8"))
         if {"medium", "layers"} & set(tables):

@@ -38,7 +38,7 @@ class Materials:
             print(material_path(self.material).read_text(encoding="utf-8"), end="")
             return
         titles = ("material", "known", "total reflectance", "widest, mm", "eta", "source")
-        print_table([titles, *map(_row, sj.materials())])
+        print_table([titles, *map(_row, sj.list_materials())])
 
 
 def _row(name: str) -> tuple[str, ...]:

@@ -4,7 +4,7 @@ What takes more than a line to explain is a `help`: breaks in docstrings are kep
 """
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
 OptionalPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="")]
 OptionalFloat = Annotated[float | None, tyro.conf.arg(metavar="FLOAT", help_behavior_hint="")]
+UpAxis = Literal["y", "z"]
 MaterialName = Annotated[str, tyro.conf.arg(metavar="MATERIAL")]
 MaterialNames = Annotated[tuple[str, ...], tyro.conf.arg(metavar="MATERIAL [MATERIAL ...]")]
 Rules = dict[str, tuple[bool, str]]

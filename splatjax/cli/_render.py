@@ -40,7 +40,9 @@ class Render(ViewOptions):
         is_valid = self.stream == 0 or (self.stream > 0 and self.splats is not None)
         expected = "be a number of splats of a PLY file, which must be named"
         check_options(self, {"stream": (is_valid, expected)})
-        file = sj.SplatFile(self.splats, self.stream) if self.splats and self.stream else None
+        file = None
+        if self.splats and self.stream:
+            file = sj.SplatFile(self.splats, self.stream, up=self.up)
         frame, material = self._at_once() if file is None else self._streamed(file)
         self.note_unresolved_layers(frame, material)
         with stage(f"writing {self.output} and {self.output.with_suffix('.png')}"):

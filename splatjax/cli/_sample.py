@@ -9,13 +9,13 @@ import tyro
 import splatjax as sj
 
 from ._mesh_maps import MeshMaps
-from ._options import check_output
+from ._options import UpAxis, check_output
 from ._report import note, stage
 
 
 @dataclass(frozen=True, kw_only=True)
 class Sample(MeshMaps):
-    """Cover a mesh with splats that wear its maps, and write them as PLY, in mm.
+    """Cover a mesh with splats that carry its maps, and write them as PLY, in mm.
 
     The mesh is a GLB, glTF, OBJ, PLY, STL or OFF file.
 
@@ -33,9 +33,14 @@ class Sample(MeshMaps):
     count: int = 200_000
     #: Another spread of the same quality.
     seed: int = 0
-    #: Put splats where the surface is that bends as the mesh's normals do; otherwise on its flat
+    #: Put splats on the surface that bends as the mesh's normals do; otherwise on its flat
     #: triangles.
     rounded: bool = True
+    #: Upward axis of the file; splats have +y up.
+    up: UpAxis = "y"
+    #: Degrees: edges are hard where triangles differ by more, and the file has no normals or
+    #: smooth ones.
+    crease_angle: float = 40.0
 
     def run(self) -> None:
         """Read, sample, write."""
@@ -47,6 +52,8 @@ class Sample(MeshMaps):
                 mm_per_unit=self.mm_per_unit,
                 seed=self.seed,
                 rounded=self.rounded,
+                up=self.up,
+                crease_angle=self.crease_angle,
                 **self.worn(),
             )
         with stage(f"writing {self.output}"):

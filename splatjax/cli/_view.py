@@ -16,7 +16,7 @@ from splatjax.io import fingerprint, material_path, own_version
 from splatjax.render import check_displayable
 from splatjax.scene import Parts
 
-from ._options import MaterialName, Rules, check_options, option_name
+from ._options import MaterialName, Rules, UpAxis, check_options, option_name
 from ._report import note, stage
 
 # Degrees: the fill stands beside the camera, on the side away from the light.
@@ -67,6 +67,8 @@ class ViewOptions:
     count: int = 200_000
     #: Size of the body: at 0.2 the bust is 7 cm tall, and light goes five times as far in it.
     scale: float = 1.0
+    #: Upward axis of the PLY file.
+    up: UpAxis = "y"
 
     def check(self, more_rules: Rules | None = None) -> None:
         """Raise `ValueError` for options that break a rule, or that need more memory than there
@@ -100,9 +102,12 @@ class ViewOptions:
     def load(self) -> tuple[sj.Splats, sj.Material]:
         """Return the splats, and the material with which they are rendered."""
         material = self.displayable_material()
-        what = f"making the bust with {self.count} splats" if self.splats is None else ""
-        with stage(what or f"reading {self.splats}"):
-            splats = sj.bust(self.count) if self.splats is None else sj.read_splats(self.splats)
+        if self.splats is None:
+            with stage(f"making the bust with {self.count} splats"):
+                splats = sj.bust(self.count)
+        else:
+            with stage(f"reading {self.splats}"):
+                splats = sj.read_splats(self.splats, up=self.up)
         splats = self.adjusted(splats)
         return splats, self.material_for(splats, material)
 

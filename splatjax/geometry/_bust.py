@@ -17,7 +17,7 @@ _MIDDLE = np.asarray([0.0, -30.0, -10.0])
 
 
 def bust_mesh(*, spacing: float = 1.4) -> Mesh:
-    r"""Give a head with neck and shoulders as a closed mesh, life-size: mm, +y up, facing +z, eyes
+    r"""Make a head with neck and shoulders as a closed mesh, life-size: mm, +y up, facing +z, eyes
     near y = 0.
 
     **Arguments:**
@@ -41,7 +41,7 @@ def bust_mesh(*, spacing: float = 1.4) -> Mesh:
 
 
 def bust(count: int = 200_000, *, seed: int = 0) -> Splats:
-    r"""Give the bust as splats, in the colors of skin.
+    r"""Make the bust as splats, in the colors of skin.
 
     **Arguments:**
 
@@ -49,8 +49,8 @@ def bust(count: int = 200_000, *, seed: int = 0) -> Splats:
     - `seed`: another spread of the same quality; the same seed gives the same splats.
 
     **Returns:** splats in Morton order with albedo, specular and roughness, in JAX's default
-    precision; their areas add up to that of the mesh. `splatjax.geometry.sample_mesh` says how they
-    are spread.
+    precision; their areas add up to that of the mesh. `splatjax.geometry.sample_mesh` describes
+    how they are spread.
 
     **Raises:** `ValueError` when `count` is below 1.
     """

@@ -23,19 +23,10 @@ class Cells(NamedTuple):
     to_centroids: Float[np.ndarray, "n 3"]
 
 
-class Ghosts(NamedTuple):
-    """Points beyond the open border of a surface that end the cells before it, as mirror images do;
-    with unit normals.
-    """
-
-    points: Float[np.ndarray, "m 3"]
-    normals: Float[np.ndarray, "m 3"]
-
-
 def tangent_frames(
     normals: Float[np.ndarray, "n 3"],
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-    """Give two unit vectors that make a right-handed frame with each normal.
+    """Compute two unit vectors that make a right-handed frame with each normal.
 
     **Source:** Duff et al. 2017, "Building an Orthonormal Basis, Revisited".
     """
@@ -52,11 +43,11 @@ def tangent_frames(
 def surface_cells(
     points: Float[np.ndarray, "n 3"],
     normals: Float[np.ndarray, "n 3"],
+    images: Float[np.ndarray, "n images 3"] | None = None,
     *,
     neighbors: int = 16,
     directions: int = 32,
     limit: float | None = None,
-    ghosts: Ghosts | None = None,
 ) -> Cells:
     r"""Measure the Voronoi cell of each point in its tangent plane.
 
@@ -70,8 +61,9 @@ def surface_cells(
 
     - `points`: mm; fast when they come in Morton order.
     - `normals`: unit.
+    - `images`: ways from each point to its mirror images at the borders of the surface, where its
+      cell ends; zero for none.
     - `neighbors`: how many nearest points are looked at.
-    - `ghosts`: have no cells of their own, but end those of others.
     - `limit`: mm; `None`: 0.75 of the mean distance to the six nearest points.
     - `directions`: of the quadrature. With 32 the area is good to about 1 %.
 
@@ -81,21 +73,25 @@ def surface_cells(
     count = len(points)
     if count == 1:
         return Cells(np.ones(1), np.ones(1), np.zeros((1, 3)))
-    everyone, single = points, normals.astype(np.float32)
-    if ghosts is not None:
-        everyone = np.concatenate([points, ghosts.points])
-        single = np.concatenate([single, ghosts.normals.astype(np.float32)])
-    neighbors = min(neighbors, len(everyone) - 1)
-    tree = scipy.spatial.KDTree(everyone, balanced_tree=False, compact_nodes=False)
+    single = normals.astype(np.float32)
+    images = np.zeros((count, 0, 3), np.float32) if images is None else images
+    neighbors = min(neighbors, count - 1)
+    tree = scipy.spatial.KDTree(points, balanced_tree=False, compact_nodes=False)
     distances, near = tree.query(points, k=neighbors + 1, workers=-1)
     angles = (np.arange(directions) + 0.5) * (2 * np.pi / directions)
     fan = np.stack([np.cos(angles), np.sin(angles)]).astype(np.float32)
 
     def measure(start: int) -> Cells:
         part = slice(start, min(start + _CHUNK, count))
-        others = near[part, 1:]
-        offsets = (everyone[others] - points[part, None]).astype(np.float32)
-        return _measure(offsets, distances[part, 1:], single[part], single[others], fan, limit)
+        others, own, mirrored = near[part, 1:], single[part], images[part]
+        gaps = np.linalg.norm(mirrored, axis=-1)
+        ways = np.concatenate([points[others] - points[part, None], mirrored], axis=1)
+        lengths = np.concatenate([distances[part, 1:], np.where(gaps > 0, gaps, np.inf)], axis=1)
+        theirs = [single[others], np.broadcast_to(own[:, None], mirrored.shape)]
+        nearest = distances[part, 1:7]
+        around = nearest.sum(axis=1) / np.maximum((nearest > 0).sum(axis=1), 1)
+        end = _OPEN_END * around if limit is None else np.full(len(own), limit)
+        return _measure(ways.astype(np.float32), lengths, own, np.concatenate(theirs, 1), end, fan)
 
     with ThreadPoolExecutor() as pool:
         return Cells(
@@ -103,24 +99,20 @@ def surface_cells(
         )
 
 
-def _measure(offsets, distances, own, theirs, fan, limit: float | None) -> Cells:
-    """Measure cells from the way to their neighbors, the normals of both, and a fan of
-    directions.
+def _measure(ways, lengths, own, theirs, end, fan) -> Cells:
+    """Measure cells from the ways to neighbors, how long they are, the normals of both, where a
+    cell ends at the latest, and a fan of directions.
     """
     tangent, bitangent = tangent_frames(own)
     across = np.stack(
-        [np.einsum("nki,ni->nk", offsets, axis) for axis in (tangent, bitangent)], axis=-1
+        [np.einsum("nki,ni->nk", ways, axis) for axis in (tangent, bitangent)], axis=-1
     )
-    squared = np.square(distances).astype(np.float32)
+    squared = np.square(lengths).astype(np.float32)
     coincident = squared == 0
     same_side = np.einsum("nki,ni->nk", theirs, own) > 0.1
     squared = np.where(same_side & ~coincident, squared, np.inf)
-    nearest = distances[:, :6]
-    around = nearest.sum(axis=1) / np.maximum((nearest > 0).sum(axis=1), 1)
-    end = np.full(len(own), limit) if limit is not None else _OPEN_END * around
-    inverse = (across @ fan) * (2 / squared)[
-        ..., None
-    ]  # of the distance to the border; negative behind the point
+    # Of the distance to the border of the cell; negative behind the point.
+    inverse = (across @ fan) * (2 / squared)[..., None]
     border = 1 / np.maximum(inverse.max(axis=1), 1 / np.maximum(end, 1e-12)[:, None])
     step = 2 * np.pi / fan.shape[1]
     area = 0.5 * step * np.einsum("nd,nd->n", border, border)

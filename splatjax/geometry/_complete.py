@@ -3,15 +3,17 @@
 import warnings
 
 import numpy as np
-from jaxtyping import Float
+import scipy  # its parts are loaded where they are used, which takes a third of a second
+from jaxtyping import Bool, Float, Int
 
 from splatjax.scene import Splats
 
-from ._distinct import distinct
-from ._morton import morton_order
 from ._normals import estimate_normals
+from ._places import distinct, morton_order
 from ._sample import covering, make_splats
-from ._strays import strays
+
+_NEIGHBORS = 8
+_ALONE = 5.0  # times farther from its neighbors than they are from theirs
 
 
 def complete_splats(
@@ -34,7 +36,7 @@ def complete_splats(
     - `radii`: mm; `None`: as large as the cells ask for, so that no hole is left.
     - `albedo`, `specular`, `roughness`: as `Splats` has them; never estimated.
 
-    Points that lie alone are kept, estimated as large as their neighbors are, and a warning tells
+    Points that lie alone are kept, estimated as large as their neighbors are, and a warning states
     how many there are. Points at one place share their area.
 
     **Returns:** as many splats as points, in JAX's default precision.
@@ -64,13 +66,13 @@ def complete_splats(
 
 
 def _covered(centers: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Give areas and radii; those of points that lie alone are their neighbors', lest their discs
-    hide everything.
+    """Compute areas and radii; those of points that lie alone are their neighbors', lest their
+    discs hide everything.
     """
     first, place = distinct(centers)
     places = centers[first]
     areas, radii = covering(places, normals[first])
-    alone, near, distances = strays(places)
+    alone, near, distances = _strays(places)
     if alone.any():
         areas[alone], radii[alone] = (
             np.median(each[near[alone]], axis=1) for each in (areas, radii)
@@ -83,3 +85,25 @@ def _covered(centers: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.n
             stacklevel=3,
         )
     return (areas / np.bincount(place))[place], radii[place]
+
+
+def _strays(
+    points: Float[np.ndarray, "n 3"],
+) -> tuple[Bool[np.ndarray, " n"], Int[np.ndarray, "n k"], Float[np.ndarray, " n"]]:
+    r"""Find points that lie alone: much farther from their neighbors than these are from their
+    own, and no one's neighbors.
+
+    So that neither a place where all points are sparse holds one, nor the border between dense and
+    sparse.
+
+    **Returns:** whether each is one, its nearest neighbors, and its mean distance to them, mm.
+
+    **Source:** after Breunig et al. 2000, "LOF: Identifying Density-Based Local Outliers", medians
+    in the place of means.
+    """
+    distances, near = scipy.spatial.KDTree(points).query(
+        points, k=min(_NEIGHBORS, len(points) - 1) + 1, workers=-1
+    )
+    mean, near = distances[:, 1:].mean(axis=1), near[:, 1:]
+    is_neighbor = np.bincount(near.ravel(), minlength=len(points)) > 0
+    return (mean > _ALONE * np.median(mean[near], axis=1)) & ~is_neighbor, near, mean

@@ -15,37 +15,34 @@ _SCALP = np.asarray([0.47, 0.335, 0.285])
 def complexion(
     points: Float[np.ndarray, "n 3"],
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Give linear albedo in (0, 1), and the factors on specular strength and roughness, at points
+    """Return linear albedo in (0, 1), and the factors on specular strength and roughness, at points
     of the bust (mm).
     """
     x, y, z = points.T
-    side = np.abs(x)
-    front = smooth_step(z, 20, 60)
-    blood = 0.6 * bump(side, 44, 18) * bump(y, -26, 17) * front  # cheeks
-    blood = blood + 0.6 * bump(x, 0, 15) * bump(y, -40, 15) * smooth_step(z, 78, 104)  # nose
-    blood = blood + 0.25 * bump(x, 0, 18) * bump(y, -98, 12) * front  # chin
-    blood = blood + 0.9 * smooth_step(side, 72, 84) * bump(y, -10, 42) * bump(z, -14, 34)  # ears
-    blood = blood + 0.35 * bump(side, 31, 17) * bump(y, -3, 10) * smooth_step(z, 55, 66)  # lids
-    blood = blood + 0.10 * _mottling(points, 17.0, 3) + 0.07 * _mottling(points, 5.0, 5)
-    albedo = _SKIN * _BLOOD ** np.clip(blood, -0.5, 1.6)[:, None]
-    albedo = (
-        albedo
-        * (1 + 0.02 * _mottling(points, 28.0, 7) + 0.025 * _mottling(points, 2.2, 11))[:, None]
+    side, front = np.abs(x), smooth_step(z, 20, 60)
+    lips, oily = _lips(side, y, z), bump(x, 0, 26) * smooth_step(y, -60, -10) * front
+    blood = (
+        0.6 * bump(side, 44, 18) * bump(y, -26, 17) * front  # cheeks
+        + 0.6 * bump(x, 0, 15) * bump(y, -40, 15) * smooth_step(z, 78, 104)  # nose
+        + 0.25 * bump(x, 0, 18) * bump(y, -98, 12) * front  # chin
+        + 0.9 * smooth_step(side, 72, 84) * bump(y, -10, 42) * bump(z, -14, 34)  # ears
+        + 0.35 * bump(side, 31, 17) * bump(y, -3, 10) * smooth_step(z, 55, 66)  # lids
+        + 0.10 * _mottling(points, 17.0, 3)
+        + 0.07 * _mottling(points, 5.0, 5)
     )
-    albedo = _mix(albedo, _SCALP, 0.55 * _scalp(x, y, z) * (1 + 0.12 * _mottling(points, 1.6, 13)))
-    lips = _lips(side, y, z)
-    albedo = _mix(albedo, _LIPS, 0.95 * lips)
-    albedo = _mix(albedo, _HAIR, 0.85 * _brows(points, side, y, z))
-    albedo = _mix(albedo, _HAIR, 0.8 * _lashes(side, y, z))
-    oily = bump(x, 0, 26) * smooth_step(y, -60, -10) * front
+    spots = 1 + 0.02 * _mottling(points, 28.0, 7) + 0.025 * _mottling(points, 2.2, 11)
+    albedo = _SKIN * _BLOOD ** np.clip(blood, -0.5, 1.6)[:, None] * spots[:, None]
+    stubble = 0.55 * _scalp(x, y, z) * (1 + 0.12 * _mottling(points, 1.6, 13))
+    for color, share in (
+        (_SCALP, stubble),
+        (_LIPS, 0.95 * lips),
+        (_HAIR, 0.85 * _brows(points, side, y, z)),
+        (_HAIR, 0.8 * _lashes(side, y, z)),
+    ):
+        share = np.clip(share, 0.0, 1.0)[:, None]
+        albedo = albedo * (1 - share) + color * share
     specular = 1 + 0.25 * oily + 0.5 * lips + 0.12 * _mottling(points, 2.2, 17)
-    roughness = 1 - 0.15 * oily - 0.3 * lips
-    return np.clip(albedo, 0.01, 0.95), specular, roughness
-
-
-def _mix(albedo, color, share):
-    share = np.clip(share, 0.0, 1.0)[:, None]
-    return albedo * (1 - share) + color * share
+    return np.clip(albedo, 0.01, 0.95), specular, 1 - 0.15 * oily - 0.3 * lips
 
 
 def _scalp(x, y, z):
@@ -65,38 +62,26 @@ def _lips(side, y, z):
 
 def _brows(points, side, y, z):
     """Brows: an arch, with single hairs along it."""
-    arch = (
-        25.5
-        + 6.0 * np.sin(np.clip((side - 12) / 44, 0, 1) * np.pi * 0.62)
-        - 0.16 * np.maximum(side - 42, 0)
-    )
-    width = 4.4 - 0.06 * np.clip(side - 14, 0, 42)
-    shape = (
-        bump(y, arch, width)
-        * smooth_step(side, 9, 17)
-        * smooth_step(side, 57, 46)
-        * smooth_step(z, 30, 45)
-    )
+    rise = np.sin(np.clip((side - 12) / 44, 0, 1) * np.pi * 0.62)
+    arch = 25.5 + 6.0 * rise - 0.16 * np.maximum(side - 42, 0)
+    across = bump(y, arch, 4.4 - 0.06 * np.clip(side - 14, 0, 42)) * smooth_step(z, 30, 45)
     hairs = 0.5 + 0.5 * np.sin(3.1 * side + 2.2 * (y - arch) + 2.0 * _mottling(points, 2.5, 19))
-    return shape * (0.65 + 0.35 * hairs)
+    return across * smooth_step(side, 9, 17) * smooth_step(side, 57, 46) * (0.65 + 0.35 * hairs)
 
 
 def _lashes(side, y, z):
     across = side - 31
-    parting = -6.5 + 0.012 * across**2 - 0.02 * across
-    return (
-        bump(y, parting - 0.6, 0.9) * smooth_step(np.abs(across), 17, 13) * smooth_step(z, 55, 62)
-    )
+    lid = bump(y, -6.5 + 0.012 * across**2 - 0.02 * across - 0.6, 0.9)
+    return lid * smooth_step(np.abs(across), 17, 13) * smooth_step(z, 55, 62)
 
 
 def _mottling(points: Float[np.ndarray, "n 3"], size: float, seed: int) -> Float[np.ndarray, " n"]:
-    """Give smooth noise of about unit variance whose patches are of the given size, mm: 16 waves in
-    random directions.
+    """Compute smooth noise of about unit variance whose patches are of the given size, mm: 16 waves
+    in random directions.
     """
     random = np.random.default_rng(seed)
     directions = random.normal(size=(3, 16))
     directions *= (np.pi / size) * random.uniform(0.4, 1.6, 16) / np.linalg.norm(directions, axis=0)
-    waves = (points.astype(np.float32) @ directions.astype(np.float32)) + random.uniform(
-        0, 2 * np.pi, 16
-    ).astype(np.float32)
+    phases = random.uniform(0, 2 * np.pi, 16).astype(np.float32)
+    waves = points.astype(np.float32) @ directions.astype(np.float32) + phases
     return np.sin(waves).sum(axis=1) * np.float32(np.sqrt(2 / 16))

@@ -30,27 +30,27 @@ class Mesh(eqx.Module):
     parts: Int[np.ndarray, " faces"] | None = None
 
     def corners(self) -> Float[np.ndarray, "faces 3 3"]:
-        """Give the positions of each triangle's corners, mm."""
+        """Return the positions of each triangle's corners, mm."""
         return self.vertices[self.faces]
 
     def face_areas(self) -> Float[np.ndarray, " faces"]:
-        """Give the area of each triangle, mm^2."""
+        """Compute the area of each triangle, mm^2."""
         a, b, c = np.moveaxis(self.corners(), 1, 0)
         return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=-1)
 
     def area(self) -> float:
-        """Give the area of the surface, mm^2."""
+        """Compute the area of the surface, mm^2."""
         return float(self.face_areas().sum())
 
     def volume(self) -> float:
-        """Give the enclosed volume, mm^3: positive for a closed mesh whose triangles face outward
-        (divergence theorem).
+        """Compute the enclosed volume, mm^3: positive for a closed mesh whose triangles face
+        outward (divergence theorem).
         """
         a, b, c = np.moveaxis(self.corners(), 1, 0)
         return float(np.einsum("fi,fi->", a, np.cross(b, c)) / 6)
 
     def select(self, keep) -> "Mesh":
-        """Give the mesh of the chosen faces (a mask or indices); vertices are kept as they are."""
+        """Return the mesh of the chosen faces (a mask or indices), with all vertices."""
         uvs, parts = (None if each is None else each[keep] for each in (self.uvs, self.parts))
         return Mesh(self.vertices, self.faces[keep], self.normals, uvs, self.colors, parts)
 
@@ -58,7 +58,7 @@ class Mesh(eqx.Module):
 def vertex_normals(
     vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
 ) -> Float[np.ndarray, "vertices 3"]:
-    """Give unit vertex normals as the area-weighted mean of those of the faces around; +y for a
+    """Compute unit vertex normals as the area-weighted mean of those of the faces around; +y for a
     vertex without faces.
     """
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
@@ -74,7 +74,7 @@ def vertex_normals(
 
 
 def unit(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
-    """Give vectors of length one; +y for those of length zero."""
+    """Scale vectors to length one; +y for those of length zero."""
     x, y, z = np.moveaxis(vectors, -1, 0)  # sums over an axis of three are slow
     length = np.sqrt(x * x + y * y + z * z)[..., None]
     up = np.asarray([0.0, 1.0, 0.0], vectors.dtype)

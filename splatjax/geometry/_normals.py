@@ -4,9 +4,8 @@ import numpy as np
 import scipy  # its parts are loaded where they are used, which takes a third of a second
 from jaxtyping import Float, Int
 
-from ._distinct import distinct
-from ._morton import morton_order
 from ._orientation import outward_signs
+from ._places import distinct, morton_order
 
 _CHUNK = 1 << 16
 _BEYOND = 1.05  # of the distance of the farthest neighbor, so that it counts a little
@@ -17,14 +16,14 @@ _FLAT = 1e-3  # of a window's squared size: planes that are off by less are as g
 def estimate_normals(
     points: Float[np.ndarray, "n 3"], *, neighbors: int = 12
 ) -> Float[np.ndarray, "n 3"]:
-    r"""Give unit normals of points on a surface, all on its outer side.
+    r"""Estimate unit normals of points on a surface, all on its outer side.
 
     Around each point there is a plane in which the nearest ones vary least (principal components,
     of which near ones count more). A point's normal is the mean of those of its own plane and its
     neighbors', each by how little it is off its own points and this one: at an edge the planes of
     one side remain, at a second sheet close by those of the point's own, and where there is noise
-    many count. What can be seen from outside faces whoever sees it; the rest follows its neighbors,
-    and a surface open to both sides faces away from its middle at the farthest point.
+    many count. What can be seen from outside faces whoever sees it; what is hidden follows its
+    neighbors, and a surface open to both sides faces away from its middle at the farthest point.
 
     **Arguments:**
 
@@ -65,7 +64,7 @@ def _planes(
     distances: Float[np.ndarray, "n k"],
     near: Int[np.ndarray, "n k"],
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
-    """Give the middle, the normal and the mean squared distance (mm^2) of the plane through each
+    """Compute the middle, the normal and the mean squared distance (mm^2) of the plane through each
     point's window.
     """
     distances, near = distances[:, : _WINDOW + 1], near[:, : _WINDOW + 1]

@@ -6,13 +6,15 @@ import numpy as np
 import scipy  # its parts are loaded where they are used, which takes a third of a second
 from jaxtyping import Float, Int
 
-from ._cells import Ghosts, surface_cells
+from ._cells import surface_cells
+from ._creases import faces_beyond
 from ._mesh import Mesh, unit
-from ._morton import morton_order
+from ._places import morton_order
 
 _PLASTIC = 1.32471795724474602596  # of the R2 sequence
 _EDGE_TOLERANCE = 1e-9
 _WALK = 64
+_PIECE, _IMAGES = 0.25, 8  # spacings of a border that are looked at together; how many of these
 
 
 class SurfacePoints(NamedTuple):
@@ -24,17 +26,17 @@ class SurfacePoints(NamedTuple):
     barycentrics: Float[np.ndarray, "n 3"]
 
     def positions(self, mesh: Mesh) -> Float[np.ndarray, "n 3"]:
-        """Give the points, mm."""
+        """Compute the points, mm."""
         return np.einsum("nc,nci->ni", self.barycentrics, mesh.vertices[mesh.faces[self.faces]])
 
     def normals(self, mesh: Mesh) -> Float[np.ndarray, "n 3"]:
-        """Give unit normals, interpolated between those of the vertices."""
+        """Compute unit normals, interpolated between those of the vertices."""
         return unit(
             np.einsum("nc,nci->ni", self.barycentrics, mesh.normals[mesh.faces[self.faces]])
         )
 
     def take(self, order: Int[np.ndarray, " m"]) -> "SurfacePoints":
-        """Give some of the points, or all in another order."""
+        """Return some of the points, or all in another order."""
         return SurfacePoints(self.faces[order], self.barycentrics[order])
 
 
@@ -69,9 +71,9 @@ def scatter(mesh: Mesh, count: int, *, seed: int = 0, relaxations: int = 4) -> S
         spacing = float(np.sqrt(areas.sum() / count))
         for _ in range(relaxations):
             positions, normals = points.positions(mesh), points.normals(mesh)
-            ghosts = mirrored(mesh, beyond, positions, normals, spacing)
+            images = mirror_images(mesh, beyond, positions, spacing)
             cells = surface_cells(
-                positions, normals, neighbors=10, directions=12, limit=spacing, ghosts=ghosts
+                positions, normals, images, neighbors=10, directions=12, limit=spacing
             )
             points = _settle(mesh, beyond, points.faces, positions + 1.3 * cells.to_centroids)
     return points.take(
@@ -90,71 +92,40 @@ def _deal(mesh: Mesh, areas: np.ndarray, count: int, random: np.random.Generator
     return SurfacePoints(faces, np.stack([1 - u - v, u, v], axis=-1))
 
 
-def faces_beyond(mesh: Mesh) -> Int[np.ndarray, "faces 3"]:
-    """Give, per face and corner, the face beyond the edge opposite to the corner; -1 at an open
-    edge.
-    """
-    beyond = _beyond(mesh.faces)
-    if (
-        beyond < 0
-    ).any():  # textures cut meshes open along their seams: vertices at one place are one
-        beyond = _beyond(
-            np.unique(mesh.vertices, axis=0, return_inverse=True)[1].reshape(-1)[mesh.faces]
-        )
-    return beyond
-
-
-def _beyond(faces: Int[np.ndarray, "faces 3"]) -> Int[np.ndarray, "faces 3"]:
-    edges = faces[:, [[1, 2], [2, 0], [0, 1]]].reshape(-1, 2)
-    key = edges.min(axis=1) * np.int64(faces.max() + 1) + edges.max(axis=1)
-    order = np.argsort(key, kind="stable")
-    same = key[order][1:] == key[order][:-1]
-    beyond = np.full(len(key), -1)
-    first, second = order[:-1][same], order[1:][same]
-    beyond[first], beyond[second] = second // 3, first // 3
-    return beyond.reshape(-1, 3)
-
-
-def mirrored(
+def mirror_images(
     mesh: Mesh,
     beyond: Int[np.ndarray, "faces 3"],
     points: Float[np.ndarray, "n 3"],
-    normals: Float[np.ndarray, "n 3"],
     spacing: float,
-) -> Ghosts | None:
-    """Mirror points at the open border of a mesh, those within 1.5 spacings of it; `None` where the
-    mesh is closed.
+) -> Float[np.ndarray, "n images 3"]:
+    """Mirror each point at the borders of a mesh within about a spacing of it.
+
+    **Returns:** the way to each image; zero where there is none.
     """
     faces, corners = np.nonzero(beyond < 0)
     if not len(faces):
-        return None
+        return np.zeros((len(points), 0, 3), np.float32)
     starts, ends = (mesh.vertices[mesh.faces[faces, (corners + step) % 3]] for step in (1, 2))
-    lengths = np.linalg.norm(ends - starts, axis=1)
-    pieces = np.maximum(np.ceil(lengths / (0.1 * spacing)).astype(np.int64), 1)
+    squared = ((ends - starts) ** 2).sum(axis=1)
+    pieces = np.maximum(np.ceil(np.sqrt(squared) / (_PIECE * spacing)).astype(np.int64), 1)
     edge = np.repeat(np.arange(len(faces)), pieces)
-    share = (np.arange(len(edge)) - np.repeat(np.cumsum(pieces) - pieces, pieces) + 0.5) / pieces[
-        edge
-    ]
-    marks = starts[edge] + share[:, None] * (ends - starts)[edge]
-    distance, mark = scipy.spatial.KDTree(marks).query(
-        points, distance_upper_bound=1.5 * spacing, workers=-1
+    index = np.arange(len(edge)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+    marks = starts[edge] + ((index + 0.5) / pieces[edge])[:, None] * (ends - starts)[edge]
+    distances, mark = scipy.spatial.KDTree(marks).query(
+        points, k=_IMAGES, distance_upper_bound=1.5 * spacing, workers=-1
     )
-    near = np.flatnonzero(np.isfinite(distance))
-    edge = edge[mark[near]]
-    along = (ends - starts)[edge] / lengths[edge, None]
-    offset = points[near] - starts[edge]
-    share = np.clip(np.einsum("ni,ni->n", offset, along), 0.0, lengths[edge])
-    foot = starts[edge] + share[:, None] * along
-    gap = np.linalg.norm(foot - points[near], axis=1)
-    near, foot = (
-        near[gap > 1e-3 * spacing],
-        foot[gap > 1e-3 * spacing],
-    )  # on the border itself a point is its own image
-    return Ghosts(2 * foot - points[near], normals[near])
+    near = np.flatnonzero(np.isfinite(distances[:, 0]))
+    edge = np.append(edge, 0)[mark[near]]
+    start, along = starts[edge], (ends - starts)[edge]
+    share = np.einsum("nki,nki->nk", points[near, None] - start, along) / squared[edge]
+    ways = start + np.clip(share, 0, 1)[..., None] * along - points[near, None]
+    images = np.zeros((len(points), _IMAGES, 3), np.float32)
+    images[near] = np.where(np.isfinite(distances[near])[..., None], 2 * ways, 0.0)
+    return images
 
 
 def _barycentrics(mesh: Mesh, faces: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Give the barycentric coordinates of the points' projections to the planes of their faces."""
+    """Compute barycentric coordinates of the points' projections to the planes of their faces."""
     a, b, c = np.moveaxis(mesh.vertices[mesh.faces[faces]], 1, 0)
     ab, ac, ap = b - a, c - a, points - a
     d00, d01, d11 = (np.einsum("ni,ni->n", x, y) for x, y in ((ab, ab), (ab, ac), (ac, ac)))

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
+import scipy  # its parts are loaded where they are used, which takes a third of a second
 from jaxtyping import Float, Int
 
 from ._mesh import Mesh, unit
@@ -25,32 +26,27 @@ _SIDES = [
 
 
 def _sheets() -> Int[np.ndarray, "256 12"]:
-    """Give, for each set of corners inside, which sheet of the surface crosses each edge of a cell;
-    -1 for none.
+    """Number, for each set of corners inside, the sheets of the surface that cross the edges of a
+    cell; -1 for none.
 
-    Sheets are told apart so that no two of them share a vertex: on a side whose inner corners lie
+    Sheets are separated so that no two of them share a vertex: on a side whose inner corners lie
     across from each other, the surface goes around each of them.
     """
     table = np.full((256, 12), -1, np.int64)
     for corners in range(256):
-        sheet = [
-            edge if (corners >> a & 1) != (corners >> b & 1) else -1
-            for edge, (a, b) in enumerate(_EDGES)
-        ]
+        inside = [corners >> corner & 1 for corner in range(8)]
+        crossed = np.asarray([inside[a] != inside[b] for a, b in _EDGES])
+        joined = np.eye(12)
         for side in _SIDES:
-            around = [
-                _EDGES.index((min(pair), max(pair)))
-                for pair in zip(side, (*side[1:], side[0]), strict=True)
-            ]
-            crossed = [edge for edge in around if sheet[edge] >= 0]
-            pairs = [tuple(crossed)] if len(crossed) == 2 else []
-            if len(crossed) == 4:
-                pairs = [(around[k - 1], around[k]) for k in range(4) if corners >> side[k] & 1]
-            for first, second in pairs:
-                old, new = sheet[second], sheet[first]
-                sheet = [new if label == old else label for label in sheet]
-        labels = sorted({label for label in sheet if label >= 0})
-        table[corners] = [labels.index(label) if label >= 0 else -1 for label in sheet]
+            turns = zip(side, (*side[1:], side[0]), strict=True)
+            around = [_EDGES.index((min(pair), max(pair))) for pair in turns]
+            pairs = [[edge for edge in around if crossed[edge]]]
+            if len(pairs[0]) == 4:
+                pairs = [[around[k - 1], around[k]] for k in range(4) if inside[side[k]]]
+            for pair in pairs:
+                joined[np.ix_(pair, pair)] = 1
+        sheets = scipy.sparse.csgraph.connected_components(joined, directed=False)[1]
+        table[corners, crossed] = np.unique(sheets[crossed], return_inverse=True)[1]
     return table
 
 
@@ -110,7 +106,7 @@ def surface_nets(distance: Distance, low, high, spacing: float, *, slack: float 
 def _cells_near(
     distance: Distance, low, shape, spacing: float, slack: float
 ) -> Int[np.ndarray, "n 3"]:
-    """Give the cells of the finest grid whose corners may lie on both sides."""
+    """Find the cells of the finest grid whose corners may lie on both sides."""
     factor = 8
     blocks = -(-shape // factor)
     cells: np.ndarray = np.argwhere(np.ones(blocks, bool))
@@ -125,8 +121,8 @@ def _cells_near(
 
 
 def _crossings(values: Float[np.ndarray, "n 8"], sheets: Int[np.ndarray, "n 12"]):
-    """Give the cell of each vertex, and the mean of the points where its sheet crosses the edges of
-    that cell, in cells.
+    """Return the cell of each vertex, and the mean of the points where its sheet crosses the edges
+    of that cell, in cells.
     """
     a, b = np.asarray(_EDGES).T
     crossing = sheets >= 0
@@ -143,34 +139,25 @@ def _faces(cells, keys, stride, inside, vertex, vertices) -> Int[np.ndarray, "f 
     """Make two triangles of the four cells around each grid edge that the surface crosses, split
     along the shorter diagonal.
     """
-    order = np.argsort(keys)
-    ordered = keys[order]
-    triangles = []
+    order, triangles = np.argsort(keys), []
     for axis in range(3):
         bit, second, third = (4 >> (axis + step) % 3 for step in range(3))
-        start_inside = inside[:, 0]
-        chosen = np.flatnonzero(start_inside != inside[:, bit])
+        chosen = np.flatnonzero(inside[:, 0] != inside[:, bit])
         around = []
         for corner in (0, second, second | third, third):  # of the cell, where the edge begins
-            key = keys[chosen] - _CORNERS[corner] @ stride
-            place = np.minimum(np.searchsorted(ordered, key), len(ordered) - 1)
-            if not (ordered[place] == key).all():
-                raise ValueError(
-                    "the surface leaves the box, or its distance is too far from true; widen the "
-                    "box or the slack"
-                )
+            place = np.searchsorted(keys[order], keys[chosen] - _CORNERS[corner] @ stride)
             around.append(vertex[order[place], _EDGES.index((corner, corner | bit))])
         quad = np.stack(around, axis=-1)
-        quad = np.where(start_inside[chosen, None], quad, quad[:, ::-1])
+        quad = np.where(inside[chosen, :1], quad, quad[:, ::-1])
         a, b, c, d = (vertices[quad[:, corner]] for corner in range(4))
-        first = ((a - c) ** 2).sum(axis=1) <= ((b - d) ** 2).sum(axis=1)
-        split = np.where(first[:, None], quad[:, [0, 1, 2, 0, 2, 3]], quad[:, [0, 1, 3, 1, 2, 3]])
-        triangles.append(split.reshape(-1, 3))
+        is_first = ((a - c) ** 2).sum(axis=1) <= ((b - d) ** 2).sum(axis=1)
+        halves = quad[:, [0, 1, 2, 0, 2, 3]], quad[:, [0, 1, 3, 1, 2, 3]]
+        triangles.append(np.where(is_first[:, None], *halves).reshape(-1, 3))
     return np.concatenate(triangles)
 
 
 def _gradient(distance: Distance, points: Float[np.ndarray, "n 3"], step: float = 0.2):
-    """Give the unit gradient and the distance over its length, by central differences over the
+    """Compute the unit gradient and the distance over its length, by central differences over the
     corners of a tetrahedron.
     """
     corners = np.asarray([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) * step

@@ -2,6 +2,7 @@
 
 import equinox as eqx
 import numpy as np
+import scipy  # its parts are loaded where they are used, which takes a third of a second
 from jaxtyping import Float
 
 from ._mesh import Mesh, unit
@@ -9,8 +10,7 @@ from ._scatter import SurfacePoints
 
 
 class Textures(eqx.Module):
-    r"""Pictures that a mesh wears; NumPy arrays, row 0 at the top, values linear. They repeat
-    beyond [0, 1].
+    r"""Maps of a mesh; NumPy arrays, row 0 at the top, values linear. They repeat beyond [0, 1].
 
     **Attributes:**
 
@@ -37,65 +37,53 @@ def lookup(
     pixels, repeating it.
     """
     height, width = picture.shape[:2]
-    x = uvs[:, 0] * width - 0.5
-    y = (1 - uvs[:, 1]) * height - 0.5
-    left, top = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
-    trailing = (slice(None),) + (None,) * (picture.ndim - 2)
-    right_share, bottom_share = (x - left)[trailing], (y - top)[trailing]
-    rows, columns = (top % height, (top + 1) % height), (left % width, (left + 1) % width)
-    upper = (
-        picture[rows[0], columns[0]] * (1 - right_share)
-        + picture[rows[0], columns[1]] * right_share
-    )
-    lower = (
-        picture[rows[1], columns[0]] * (1 - right_share)
-        + picture[rows[1], columns[1]] * right_share
-    )
-    return upper * (1 - bottom_share) + lower * bottom_share
+    at = (1 - uvs[:, 1]) * height - 0.5, uvs[:, 0] * width - 0.5
+    planes = picture.reshape(height, width, -1)
+    values = [
+        scipy.ndimage.map_coordinates(plane, at, order=1, mode="grid-wrap")
+        for plane in np.moveaxis(planes, -1, 0)
+    ]
+    return np.stack(values, axis=-1).reshape(len(uvs), *picture.shape[2:])
 
 
-def worn_albedo(
-    textures: Textures | None, mesh: Mesh, points: SurfacePoints
-) -> Float[np.ndarray, "n channels"] | None:
-    """Give the albedo of points on a mesh: of its textures, times the colors of its vertices;
-    `None` where it has neither.
+def lookup_at(
+    mesh: Mesh, points: SurfacePoints, picture: Float[np.ndarray, "h w *channels"] | None
+) -> Float[np.ndarray, "n *channels"] | None:
+    """Look a picture up at points on a mesh; `None` for no picture.
+
+    **Raises:** `ValueError` when the mesh has no texture coordinates.
     """
-    colors = None
-    if mesh.colors is not None:
-        colors = np.clip(
-            np.einsum("nc,nci->ni", points.barycentrics, mesh.colors[mesh.faces[points.faces]]),
-            0.0,
-            1.0,
-        )
-    pictures = None if textures is None else textures.albedo
-    if pictures is None:
-        return colors
-    uvs = texture_coordinates(mesh, points)
-    if isinstance(pictures, tuple):
-        assert mesh.parts is not None
-        parts = mesh.parts[points.faces]
-        worn = np.empty((len(parts), pictures[0].shape[-1]))
-        for number, picture in enumerate(pictures):
-            there = parts == number
-            worn[there] = (
-                picture[0, 0] if picture.shape[:2] == (1, 1) else lookup(picture, uvs[there])
-            )
-    else:
-        worn = lookup(pictures, uvs)
-    return worn if colors is None else worn * colors
-
-
-def texture_coordinates(mesh: Mesh, points: SurfacePoints) -> Float[np.ndarray, "n 2"]:
-    """Give the texture coordinates of points on a mesh.
-
-    **Raises:** `ValueError` when the mesh has none.
-    """
+    if picture is None:
+        return None
     if mesh.uvs is None:
         raise ValueError(
             "the mesh has no texture coordinates, so no texture can be laid on it; give a mesh "
             "with UVs, or no textures"
         )
-    return np.einsum("nc,nci->ni", points.barycentrics, mesh.uvs[points.faces])
+    return lookup(picture, np.einsum("nc,nci->ni", points.barycentrics, mesh.uvs[points.faces]))
+
+
+def albedo_at(
+    textures: Textures, mesh: Mesh, points: SurfacePoints
+) -> Float[np.ndarray, "n channels"] | None:
+    """Return the albedo of points on a mesh: of its textures, times the colors of its vertices;
+    `None` where it has neither.
+    """
+    if isinstance(textures.albedo, tuple):
+        assert mesh.parts is not None
+        albedo = np.empty((len(points.faces), 3))
+        for part, picture in enumerate(textures.albedo):
+            chosen = np.flatnonzero(mesh.parts[points.faces] == part)
+            is_plain = picture.shape[:2] == (1, 1)
+            own = points.take(chosen)
+            albedo[chosen] = picture[0, 0] if is_plain else lookup_at(mesh, own, picture)
+    else:
+        albedo = lookup_at(mesh, points, textures.albedo)
+    if mesh.colors is None:
+        return albedo
+    colors = mesh.colors[mesh.faces[points.faces]]
+    colors = np.clip(np.einsum("nc,nci->ni", points.barycentrics, colors), 0.0, 1.0)
+    return colors if albedo is None else albedo * colors
 
 
 def perturbed_normals(

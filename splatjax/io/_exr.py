@@ -3,12 +3,7 @@
 import errno
 import json
 import os
-import sys
-import tempfile
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from contextlib import contextmanager, redirect_stdout
-from io import StringIO
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax.numpy as jnp
@@ -18,19 +13,13 @@ import OpenEXR  # ty: ignore[import-not-found]
 from splatjax.scene import Frame
 
 from ._atomic import atomic_path
-from ._files import existing_file
-from ._room import check_room
-from ._version import own_version
+from ._files import naming
+from ._images import read_planes
+from ._record import own_version
 
 _REC709_D65 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
-_WEIGHTS = "splatjax.weights.{}"
+_WEIGHTS, _VARIANCES, _MANIFEST = "splatjax.weights.", "splatjax.variances", "splatjax.manifest"
 _SINGLE = "single_scattering"
-_MANIFEST = "splatjax.manifest"
-_VARIANCES, _HANDED_OVER, _OVERFLOW = (
-    "splatjax.variances",
-    "splatjax.handed_over",
-    "splatjax.overflow",
-)
 
 
 def write_exr(
@@ -61,10 +50,8 @@ def write_exr(
 
     **Raises:** `FileNotFoundError` when the folder does not exist.
     """
-    planes = {
-        name: np.ascontiguousarray(np.asarray(plane, np.float32)) for name, plane in _planes(frame)
-    }
-    header: dict = {
+    gaussians, channels = frame.weights.shape
+    header: dict[str, Any] = {
         "compression": OpenEXR.ZIP_COMPRESSION,
         "type": OpenEXR.scanlineimage,
         "software": f"splatjax {own_version()}",
@@ -72,25 +59,31 @@ def write_exr(
             "Linear light. Depth and position in mm; depth, position and normal are "
             "not premultiplied."
         ),
-        _HANDED_OVER: _floats(frame.handed_over),
-        _OVERFLOW: float(frame.overflow),
+        "splatjax.handed_over": _floats(frame.handed_over),
+        "splatjax.overflow": float(frame.overflow),
     }
-    if frame.beauty.shape[-1] == 3:
+    if channels == 3:
         header |= {"chromaticities": _REC709_D65, "colorInteropID": "lin_rec709_scene"}
-    header |= {
-        _WEIGHTS.format(k): _floats(weights)
-        for k, weights in enumerate(np.asarray(frame.weights), 1)
-    }
+    weights = np.asarray(frame.weights)
+    header |= {f"{_WEIGHTS}{k}": _floats(row) for k, row in enumerate(weights, 1)}
     if variances is not None:
         header[_VARIANCES] = _floats(variances)
     if manifest is not None:
         header[_MANIFEST] = json.dumps(manifest)
+    planes: dict[str, np.ndarray] = {}
+    has_single = frame.single_scattering is not None
+    for field, names in _layout(channels, len(frame.shadow), gaussians, has_single).items():
+        values = np.asarray(getattr(frame, field), np.float32)
+        if field != "shadow" and names.ndim:
+            values = np.moveaxis(values, -1, names.ndim - 1)
+        values = np.ascontiguousarray(values.reshape(-1, *frame.coverage.shape))
+        planes |= dict(zip(names.ravel(), values, strict=True))
     with atomic_path(path) as temporary, OpenEXR.File(header, planes) as file:
         try:
             file.write(str(temporary))
         except Exception as error:  # the package raises whatever its C++ side throws
-            said = " ".join(str(error).replace(str(temporary), "").split())
-            raise OSError(errno.EIO, said, str(temporary)) from None
+            reason = " ".join(str(error).replace(str(temporary), "").split())
+            raise OSError(errno.EIO, reason, str(temporary)) from None
 
 
 def read_exr(path: str | os.PathLike[str]) -> Frame:
@@ -99,194 +92,67 @@ def read_exr(path: str | os.PathLike[str]) -> Frame:
     **Raises:** `FileNotFoundError`, or `ValueError` when the file cannot be read or lacks the
     layers of a frame.
     """
-    path = Path(path)
-    header, planes = _read(path)
+    planes, header, _ = read_planes(path)
+    channels = 3 if "R" in planes else sum(name.startswith("beauty.") for name in planes)
+    gaussians = sum(name.startswith(_WEIGHTS) for name in header)
+    lights = sum(name.startswith("shadow.") for name in planes)
+    has_single = any(name.startswith(_SINGLE) for name in planes)
+    arrays: dict[str, np.ndarray] = {}
     try:
-        return _frame(header, planes)
-    except KeyError as error:
+        weights = [header[f"{_WEIGHTS}{k}"] for k in range(1, gaussians + 1)]
+        arrays["weights"] = np.reshape(weights, (gaussians, channels))
+        arrays["handed_over"] = np.reshape(header["splatjax.handed_over"], gaussians)
+        arrays["overflow"] = np.reshape(header["splatjax.overflow"], ())
+        for field, names in _layout(channels, lights, gaussians, has_single).items():
+            values = np.asarray([planes[name] for name in names.ravel()])
+            values = values.reshape(*names.shape, *planes["A"].shape)
+            arrays[field] = values if field == "shadow" else np.moveaxis(values, names.ndim - 1, -1)
+    except (KeyError, ValueError) as error:
         raise ValueError(
-            f"{path}: lacks {error.args[0]}, so it is no frame; give a file written by write_exr"
-        ) from error
-    except (TypeError, ValueError) as error:
-        said = " ".join(str(error).split())
-        raise ValueError(
-            f"{path}: has no weights as a frame has ({said}); give a file written by write_exr"
+            f"{path}: lacks {' '.join(str(error).split())}, so it is no frame; give a file written "
+            "by write_exr"
         ) from None
+    return Frame(**{name: jnp.asarray(array, jnp.float32) for name, array in arrays.items()})
 
 
 def read_manifest(path: str | os.PathLike[str]) -> dict[str, Any]:
     r"""Read what a picture was made of: versions, settings, material, as the command line writes
     it.
 
-    **Raises:** `FileNotFoundError`, or `ValueError` when the file cannot be read or does not say
-    it.
+    **Raises:** `FileNotFoundError`, or `ValueError` when the file cannot be read or has no such
+    record.
     """
-    path = Path(path)
-    header, _ = _read(path)
-    try:
-        found = json.loads(header[_MANIFEST])
-    except (KeyError, TypeError, ValueError):
-        found = None
-    if not isinstance(found, dict):
+    _, header, _ = read_planes(path)
+    if not isinstance(header.get(_MANIFEST), str):
         raise ValueError(
-            f"{path}: does not say what it was made of; give a picture that `splatjax render` wrote"
+            f"{path}: does not record what it was made of; give a picture that `splatjax render` "
+            "wrote"
         )
-    return found
+    with naming(path):
+        return json.loads(header[_MANIFEST])
 
 
-def read_picture(path: str | os.PathLike[str]) -> np.ndarray:
-    r"""Read the colors of an OpenEXR file of any origin: R, G and B, or Y alone.
-
-    **Returns:** [height, width, channels], as they stand in the file, in double precision.
-
-    **Raises:** `FileNotFoundError`, or `ValueError` when the file cannot be read or has neither.
+def _layout(channels: int, lights: int, gaussians: int, has_single: bool) -> dict[str, np.ndarray]:
+    """Name the planes of each field of a frame: arrays of the field's other axes than height and
+    width.
     """
-    path = Path(path)
-    _, planes = _read(path)
-    for names in ("RGB", "Y"):
-        if set(names) <= set(planes):
-            with np.errstate(invalid="ignore"):  # of NaN that signals
-                return np.stack([planes[name] for name in names], axis=-1).astype(np.float64)
-    raise ValueError(f"{path}: has neither R, G and B nor Y; it has {', '.join(sorted(planes))}")
 
+    def colors(layer: str) -> list[str]:
+        return [f"{layer}.{k}" for k in ("RGB" if channels == 3 else range(1, channels + 1))]
 
-def _read(path: Path) -> tuple[dict, dict[str, np.ndarray]]:
-    existing_file(path)
-    said: list[str] = []
-    try:
-        with _overheard(said):
-            with OpenEXR.File(str(path), header_only=True) as file:
-                header = dict(file.header())
-            low, high = (np.asarray(corner, np.int64) for corner in header["dataWindow"])
-            pixels, channels = float(np.prod(high - low + 1)), len(header["channels"])
-            check_room(
-                f"{path}: a picture of {pixels:.3g} pixels and {channels} channels",
-                12.0 * pixels * channels,
-                "give less",
-            )
-            with OpenEXR.File(str(path), separate_channels=True) as file:
-                planes = {
-                    name: np.array(channel.pixels) for name, channel in file.channels().items()
-                }
-        if said:
-            raise ValueError
-    except (
-        Exception
-    ) as error:  # the package raises whatever its C++ side throws, or says it and goes on without
-        if str(error).startswith(f"{path}: a picture"):
-            raise
-        reason = " ".join((said[0] if said else str(error)).replace(f"{path}: ", "").split())
-        raise ValueError(
-            f"{path}: cannot be read as OpenEXR ({reason}); it is cut short or of another format"
-        ) from None
-    if len({plane.shape for plane in planes.values()}) != 1:
-        raise ValueError(
-            f"{path}: has channels of several sizes, which are not read here; write all in full"
-        )
-    return header, planes
-
-
-@contextmanager
-def _overheard(said: list[str]) -> Generator[None, None, None]:
-    """Take down what the package's C++ side prints, and writes to the standard error of the
-    process.
-    """
-    sys.stderr.flush()
-    with tempfile.TemporaryFile() as heard, redirect_stdout(StringIO()) as printed:
-        kept = os.dup(2)
-        try:
-            os.dup2(heard.fileno(), 2)
-            yield
-        finally:
-            os.dup2(kept, 2)
-            os.close(kept)
-            heard.seek(0)
-            lines = (
-                heard.read().decode("utf-8", "replace").splitlines()
-                + printed.getvalue().splitlines()
-            )
-            said.extend(line for line in lines if line.strip())
-
-
-def _floats(values) -> list[float]:
-    return [float(value) for value in np.asarray(values, np.float32)]
-
-
-def _names(layer: str, channels: int) -> list[str]:
-    return (
-        [f"{layer}.{letter}" for letter in "RGB"]
-        if channels == 3
-        else [f"{layer}.{k}" for k in range(1, channels + 1)]
-    )
-
-
-def _beauty_names(channels: int) -> list[str]:
-    return list("RGB") if channels == 3 else _names("beauty", channels)
-
-
-def _planes(frame: Frame) -> Iterator[tuple[str, np.ndarray]]:
-    channels = frame.beauty.shape[-1]
-
-    def split(names, picture):
-        return zip(names, np.moveaxis(np.asarray(picture), -1, 0), strict=True)
-
-    yield from split(_beauty_names(channels), frame.beauty)
-    yield "A", np.asarray(frame.coverage)
-    yield "Z", np.asarray(frame.depth)
-    for layer in ("position", "normal"):
-        yield from split([f"{layer}.{axis}" for axis in "XYZ"], getattr(frame, layer))
-    for layer in ("albedo", "irradiance", "diffuse", "specular"):
-        yield from split(_names(layer, channels), getattr(frame, layer))
-    if frame.single_scattering is not None:
-        yield from split(_names(_SINGLE, channels), frame.single_scattering)
-    for number, shadow in enumerate(np.asarray(frame.shadow), 1):
-        yield f"shadow.{number}", shadow
-    for number, picture in enumerate(np.asarray(frame.layers), 1):
-        yield from split(_names(f"diffusion.{number}", channels), picture)
-
-
-def _frame(header: dict, planes: dict[str, np.ndarray]) -> Frame:
-    colored = "R" in planes
-    channels = 3 if colored else _count(lambda k: f"beauty.{k}" in planes)
-    if channels == 0:
-        raise KeyError("R, G, B")
-    gaussians = _count(lambda k: _WEIGHTS.format(k) in header)
-    lights = _count(lambda k: f"shadow.{k}" in planes)
-    shape = planes["A"].shape
-
-    def picture(names):
-        return np.stack([planes[name] for name in names], axis=-1)
-
-    def stacked(pictures, *each):
-        return np.stack(pictures) if pictures else np.zeros((0, *each), np.float32)
-
-    weights = [np.asarray(header[_WEIGHTS.format(k)], np.float32) for k in range(1, gaussians + 1)]
-    layers = [picture(_names(f"diffusion.{k}", channels)) for k in range(1, gaussians + 1)]
-    arrays = {
-        "beauty": picture(_beauty_names(channels)),
-        "coverage": planes["A"],
-        "depth": planes["Z"],
-        **{
-            layer: picture([f"{layer}.{axis}" for axis in "XYZ"])
-            for layer in ("position", "normal")
-        },
-        **{
-            layer: picture(_names(layer, channels))
-            for layer in ("albedo", "irradiance", "diffuse", "specular")
-        },
-        "shadow": stacked([planes[f"shadow.{k}"] for k in range(1, lights + 1)], *shape),
-        "layers": stacked(layers, *shape, channels),
-        "weights": stacked(weights, channels),
-        "handed_over": np.asarray(header[_HANDED_OVER], np.float32),
-        "overflow": np.asarray(header[_OVERFLOW], np.float32),
+    color = ["albedo", "irradiance", "diffuse", "specular", *([_SINGLE] if has_single else [])]
+    diffusion = [colors(f"diffusion.{k}") for k in range(1, gaussians + 1)]
+    layout: dict[str, Any] = {
+        "beauty": list("RGB") if channels == 3 else colors("beauty"),
+        "coverage": "A",
+        "depth": "Z",
+        **{layer: [f"{layer}.{axis}" for axis in "XYZ"] for layer in ("position", "normal")},
+        **{layer: colors(layer) for layer in color},
+        "shadow": [f"shadow.{k}" for k in range(1, lights + 1)],
+        "layers": np.reshape(diffusion, (gaussians, channels)),
     }
-    if _names(_SINGLE, channels)[0] in planes:
-        arrays[_SINGLE] = picture(_names(_SINGLE, channels))
-    return Frame(**{name: jnp.asarray(array) for name, array in arrays.items()})
+    return {field: np.asarray(names) for field, names in layout.items()}
 
 
-def _count(exists: Callable[[int], bool]) -> int:
-    number = 0
-    while exists(number + 1):
-        number += 1
-    return number
+def _floats(values: Any) -> list[float]:
+    return [float(value) for value in np.asarray(values, np.float32)]

@@ -1,13 +1,17 @@
-"""What every reader asks of a file before it looks inside."""
+"""What is checked before a file is opened: that it exists, and has a unit."""
 
 import math
 import os
+from collections.abc import Generator
+from contextlib import contextmanager
 from pathlib import Path
-from urllib.parse import unquote
+
+import numpy as np
+from jaxtyping import Float
 
 
 def existing_file(path: str | os.PathLike[str]) -> Path:
-    """Give the path of a file that is there.
+    """Return the path of a file that exists.
 
     **Raises:** `FileNotFoundError`, or `IsADirectoryError` when it is a folder.
     """
@@ -19,40 +23,26 @@ def existing_file(path: str | os.PathLike[str]) -> Path:
     return path
 
 
-def check_unit(path: Path, mm_per_unit: float) -> None:
-    """Refuse a length of the unit (mm) that is none."""
+@contextmanager
+def naming(where: str | os.PathLike[str]) -> Generator[None, None, None]:
+    """Let errors name the file, or the place in it, whose contents they refuse."""
+    try:
+        yield
+    except (ValueError, FileNotFoundError) as error:
+        raise type(error)(f"{where}: {error}") from None
+
+
+def check_units(path: Path, mm_per_unit: float, up: str = "y") -> None:
+    """Refuse a length of the unit (mm), or an upward axis, that cannot be."""
     if not 0 < mm_per_unit < math.inf:
         raise ValueError(
             f"{path}: mm_per_unit is {mm_per_unit}; it must be the positive length of the file's "
             "unit in mm"
         )
+    if up not in ("y", "z"):
+        raise ValueError(f'{path}: up is {up!r}; it must be "y" or "z", the file\'s upward axis')
 
 
-def file_beside(path: Path, name: str, *, encoded: bool = False) -> Path:
-    """Give the file that another one names: in the same folder or below it, wherever the other came
-    from.
-
-    **Arguments:**
-
-    - `path`: of the file that names it.
-    - `name`: as it stands there, with slashes of either kind.
-    - `encoded`: whether it is a URI, with %20 for a space.
-
-    **Raises:** `ValueError` for a name that leads out of the folder, `FileNotFoundError` when there
-    is no such file.
-    """
-    plain = (unquote(name) if encoded else name).replace("\\", "/")
-    if not plain or "\0" in plain:
-        raise ValueError(f"{path}: names a file {name!r}; that is no name")
-    folder = path.parent.resolve()
-    found = (folder / plain).resolve()
-    if plain[1:2] == ":" or not found.is_relative_to(folder):
-        raise ValueError(
-            f"{path}: names {name!r}, which lies outside its folder; put that file beside it, and "
-            "name it so"
-        )
-    if not found.is_file():
-        raise FileNotFoundError(
-            f"{path}: names {name!r}, and there is no such file beside it; put it there"
-        )
-    return found
+def with_y_up(vectors: Float[np.ndarray, "n 3"], up: str) -> Float[np.ndarray, "n 3"]:
+    """Turn vectors of a file by a quarter around x, so that its upward axis becomes +y."""
+    return vectors if up == "y" else vectors[:, [0, 2, 1]] * [1, 1, -1]

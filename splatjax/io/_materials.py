@@ -4,20 +4,20 @@ them.
 
 import os
 import re
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 import tomli_w
 
 from splatjax.exports import plain_numbers
+from splatjax.fitting import DipoleStarts
 from splatjax.gaussians import AbstractProfile, SumOfGaussians
 from splatjax.scattering import (
     BetterDipole,
     Dipole,
-    ExactFresnel,
     Film,
     Layer,
     LayeredMultipole,
@@ -28,44 +28,53 @@ from splatjax.scattering import (
 from splatjax.scene import Material
 
 from ._atomic import atomic_path
-from ._tables import Table, as_array, nearest
+from ._files import naming
+from ._tables import AT_LEAST_0, FINITE, POSITIVE, Rule, Table, nearest, read_toml
 
-COEFFICIENT_UNIT = "1/mm"
-VARIANCE_UNIT = "mm^2"
-THICKNESS_UNIT = "mm"
-_COEFFICIENTS = {"unit", "sigma_a", "sigma_s_prime", "eta"}
+COEFFICIENT_UNIT, VARIANCE_UNIT, THICKNESS_UNIT = "1/mm", "mm^2", "mm"
+_COEFFICIENTS = ("unit", "sigma_a", "sigma_s_prime", "eta")
 _TABLES = ("medium", "layers", "surface", "single_scattering", "source", "fit")
+_SURFACE = {
+    "eta": POSITIVE,
+    "specular": AT_LEAST_0,
+    "roughness": ("in (0, 1]", lambda x: (x > 0) & (x <= 1)),
+}
+_ASCENDING: Rule = (
+    "positive, finite and ascending",
+    lambda x: POSITIVE[1](x).all() and (np.diff(x) > 0).all(),
+)
+_THICKNESS: Rule = ("positive (mm), or inf", lambda x: x > 0)
+_LAYER = (*_COEFFICIENTS, "optical_depth", "thickness", "thickness_unit")
+_DEFAULT_SURFACE = {"eta": 1.4, "specular": 0.18, "roughness": 0.3}
 
 
 def profiles_folder() -> Path:
-    """Give the folder of the materials that come with the package: inside the wheel, or at the top
-    of a checkout.
+    """Return the folder of the materials that come with the package: inside the wheel, or at the
+    top of a checkout.
     """
     package = Path(__file__).resolve().parents[1]
     in_wheel = package / "_profiles"
     return in_wheel if in_wheel.is_dir() else package.parent / "profiles"
 
 
-def materials() -> tuple[str, ...]:
-    """Give the names of the materials that come with the package, in alphabetical order."""
+def list_materials() -> tuple[str, ...]:
+    """Return the names of the materials that come with the package, in alphabetical order."""
     return tuple(sorted(path.stem for path in profiles_folder().glob("*.toml")))
 
 
 def material_path(name_or_path: str | os.PathLike[str]) -> Path:
-    """Give the file behind what `load_material` takes: that of a name, or the path itself.
+    """Return the file behind what `load_material` takes: that of a name, or the path itself.
 
     **Raises:** `ValueError` for an unknown name.
     """
     path = Path(name_or_path)
     if not isinstance(name_or_path, str) or path.suffix or len(path.parts) != 1:
         return path
-    known = materials()
-    if name_or_path in known:
+    if name_or_path in list_materials():
         return profiles_folder() / f"{name_or_path}.toml"
-    hint = nearest(name_or_path, known)
     raise ValueError(
-        f"{name_or_path}: is no known material; {hint} (a file is named by its path: "
-        f"./{name_or_path}.toml)"
+        f"{name_or_path}: is no known material; {nearest(name_or_path, list_materials())} (a file "
+        f"is named by its path: ./{name_or_path}.toml)"
     )
 
 
@@ -74,51 +83,43 @@ def load_material(name_or_path: str | os.PathLike[str]) -> Material:
 
     **Arguments:**
 
-    - `name_or_path`: one of `materials()`, or the path of a TOML file.
+    - `name_or_path`: one of `list_materials()`, or the path of a TOML file.
 
     **Returns:** a `Material` in JAX's default precision; variances in mm^2, ascending.
 
     **Raises:** `ValueError` for an unknown name, and for a file that is no material: what is wrong,
     and what would be right.
     """
-    path, tables = _read(name_or_path)
-    if "fit" not in tables:
-        fitted = path.with_name(f"{path.stem}_fitted.toml")
+    tables, _ = _read(name_or_path)
+    if "fit" not in tables.entries:
+        path, fitted = tables.path, tables.path.with_name(f"{tables.path.stem}_fitted.toml")
         raise ValueError(
             f"{path}: has no [fit]; take what `splatjax fit {path} --output {fitted}` makes of its "
             "coefficients"
         )
-    fit = Table(path, "fit", tables["fit"])
-    fit.unit(VARIANCE_UNIT)
-    variances = fit.numbers("variances", "positive (mm^2)", lambda x: x > 0)
-    if np.any(np.diff(variances) <= 0):
-        raise ValueError(
-            f"{path}: [fit] variances must ascend, each once; got {variances.tolist()}"
-        )
-    weights = fit.matrix("weights", len(variances))
+    fit = tables.table("fit", tables.entries["fit"])
+    fit.one_of("unit", [VARIANCE_UNIT])
+    variances = fit.numbers("variances", _ASCENDING, (None,))
+    weights = fit.numbers("weights", FINITE, (len(variances), None))
     single = None
-    if "single_scattering" in tables:
-        single = _single_scattering(
-            Table(path, "single_scattering", tables["single_scattering"]), weights.shape[1]
-        )
-    surface = {"eta": 1.4, "specular": 0.18, "roughness": 0.3} | _surface(path, tables)
-    return Material(
-        SumOfGaussians(as_array(variances), as_array(weights)), **surface, single_scattering=single
-    )
+    if "single_scattering" in tables.entries:
+        table = tables.table("single_scattering", (*_COEFFICIENTS, "strength"))
+        strength = table.numbers("strength", AT_LEAST_0, weights.shape[1:], 1.0)
+        single = SingleScattering(_medium(table, weights.shape[1]), strength)
+    surface = _DEFAULT_SURFACE | _surface(tables)
+    return Material(SumOfGaussians(variances, weights), **surface, single_scattering=single)
 
 
 def surface_and_source(
     name_or_path: str | os.PathLike[str],
 ) -> tuple[dict[str, float], dict[str, Any]]:
-    r"""Give what a file says of a material besides its coefficients: its surface, as `Material`
+    r"""Return what a file says of a material besides its coefficients: its surface, as `Material`
     takes it, and its [source].
 
     **Raises:** `ValueError` as `load_material` does.
     """
-    path, tables = _read(name_or_path)
-    source = tables.get("source", {})
-    Table(path, "source", source)
-    return _surface(path, tables), source
+    tables, _ = _read(name_or_path)
+    return _surface(tables), tables.entries.get("source", {})
 
 
 def load_medium(name_or_path: str | os.PathLike[str]) -> Medium:
@@ -126,22 +127,18 @@ def load_medium(name_or_path: str | os.PathLike[str]) -> Medium:
 
     **Arguments:**
 
-    - `name_or_path`: one of `materials()`, or the path of a TOML file.
+    - `name_or_path`: one of `list_materials()`, or the path of a TOML file.
 
     **Returns:** a `Medium` in JAX's default precision; coefficients in 1/mm.
 
     **Raises:** `ValueError` as `load_material` does, and for a material that was published without
     coefficients.
     """
-    path, tables = _read(name_or_path)
-    if "medium" not in tables:
-        have = (
-            "layers (`load_profile`)"
-            if "layers" in tables
-            else "Gaussians, ready for `splatjax render` or `load_material`"
-        )
-        raise ValueError(f"{path}: has no [medium]; known are only its {have}")
-    return _medium(Table(path, "medium", tables["medium"]))
+    tables, profile = _read(name_or_path)
+    if isinstance(profile, Dipole):
+        return profile.medium
+    have = "layers (`load_profile`)" if profile else "Gaussians (`load_material`)"
+    raise ValueError(f"{tables.path}: has no [medium]; known are only its {have}")
 
 
 def load_profile(name_or_path: str | os.PathLike[str]) -> Dipole | LayeredMultipole:
@@ -149,18 +146,14 @@ def load_profile(name_or_path: str | os.PathLike[str]) -> Dipole | LayeredMultip
 
     **Arguments:**
 
-    - `name_or_path`: one of `materials()`, or the path of a TOML file.
+    - `name_or_path`: one of `list_materials()`, or the path of a TOML file.
 
     **Returns:** the `Dipole` of a [medium], or the `LayeredMultipole` of [[layers]], in JAX's
     default precision.
 
-    **Raises:** `ValueError` as `load_material` does, and for a material that was published without
-    coefficients.
+    **Raises:** `ValueError` as `load_medium` does.
     """
-    path, tables = _read(name_or_path)
-    if "layers" in tables:
-        return _layered(path, tables["layers"])
-    return Dipole(load_medium(path))
+    return _read(name_or_path)[1] or Dipole(load_medium(name_or_path))
 
 
 def save_material(
@@ -195,201 +188,107 @@ def save_material(
         tables["layers"] = [_plain_layer(layer) for layer in profile.layers]
     elif profile is not None:
         tables["medium"] = _plain_medium(profile.medium)
-    surface = {"eta": material.eta, "specular": material.specular, "roughness": material.roughness}
-    tables["surface"] = {name: plain_numbers(value) for name, value in surface.items()}
-    if material.single_scattering is not None:
-        strength = plain_numbers(material.single_scattering.strength)
-        tables["single_scattering"] = {
-            **_plain_medium(material.single_scattering.medium),
-            "strength": strength,
-        }
+    tables["surface"] = {name: plain_numbers(getattr(material, name)) for name in _SURFACE}
+    single, gaussians = material.single_scattering, material.gaussians
+    description = f"{type(profile).__name__}, {type(getattr(profile, 'fresnel', None)).__name__}"
+    if single is not None:
+        strength = {"strength": plain_numbers(single.strength)}
+        tables["single_scattering"] = _plain_medium(single.medium) | strength
     tables["source"] = dict(source or {})
-    gaussians = material.gaussians
     tables["fit"] = {
         "unit": VARIANCE_UNIT,
         "variances": plain_numbers(gaussians.variances),
         "weights": plain_numbers(gaussians.weights),
-        **({} if profile is None else {"profile": _description(profile)}),
+        **({} if profile is None else {"profile": description}),
         **{
             name: value if isinstance(value, str | int | float) else plain_numbers(value)
             for name, value in (fit or {}).items()
         },
     }
-    with atomic_path(path) as temporary:
-        temporary.write_text(_one_line_arrays(tomli_w.dumps(tables)), encoding="utf-8")
-
-
-def _surface(path: Path, tables: dict[str, Any]) -> dict[str, float]:
-    surface = Table(path, "surface", tables.get("surface", {}))
-    surface.only({"eta", "specular", "roughness"})
-    physical = {
-        "eta": ("positive", lambda x: x > 0),
-        "specular": ("at least 0", lambda x: x >= 0),
-        "roughness": ("in (0, 1]", lambda x: 0 < x <= 1),
-    }
-    return {name: surface.number(name, *physical[name], 0.0) for name in surface.table}
-
-
-def _description(profile: Dipole | BetterDipole | PhotonBeam | LayeredMultipole) -> str:
-    moments = (
-        "exact Fresnel moments"
-        if isinstance(profile.fresnel, ExactFresnel)
-        else "fitted Fresnel moments"
+    number = r"-?(?:[\d.]+(?:e[+-]?\d+)?|inf|nan)"  # arrays of numbers on one line
+    text = re.sub(
+        rf"\[\s+((?:{number},\s+)+)\]",
+        lambda rows: "[" + ", ".join(rows[1].replace(",", " ").split()) + "]",
+        tomli_w.dumps(tables),
     )
-    match profile:
-        case Dipole():
-            model = "classical dipole"
-        case BetterDipole():
-            model = "better dipole"
-        case PhotonBeam():
-            model = "photon beam with single scattering"
-        case LayeredMultipole():
-            model = f"multipole of {len(profile.layers)} layers"
-    return f"{model}, {moments}"
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def _read(name_or_path: str | os.PathLike[str]) -> tuple[Table, Dipole | LayeredMultipole | None]:
+    """Read and check all tables of a material, and its coefficients."""
+    path = material_path(name_or_path)
+    entries = read_toml(path, "check the path, or name a material (`list_materials()`)")
+    tables = Table(path, "", entries, _TABLES)
+    kinds = {"medium", "layers"} & entries.keys()
+    if len(kinds) > 1 or not (kinds or "fit" in entries):
+        has = "both [medium] and [[layers]]" if kinds else "no [medium], [[layers]] or [fit]"
+        raise ValueError(f"{path}: has {has}; a material has one of them")
+    _surface(tables)
+    if "medium" in entries:
+        return tables, Dipole(_medium(tables.table("medium", (*_COEFFICIENTS, "sigma_s"))))
+    layers = [_layer(each) for each in tables.tables("layers", _LAYER)] if kinds else []
+    counts = {(x.optical_depth if isinstance(x, Film) else x.medium.eta).size for x in layers}
+    if len(counts) > 1:
+        raise ValueError(
+            f"{path}: [[layers]] have {sorted(counts)} channels; give one count to all"
+        )
+    with naming(f"{path}: [[layers]]"):
+        return tables, LayeredMultipole(layers) if layers else None
+
+
+def _surface(tables: Table) -> dict[str, float]:
+    if "surface" not in tables.entries:
+        return {}
+    surface = tables.table("surface", _SURFACE)
+    return {name: float(surface.numbers(name, _SURFACE[name], ())) for name in surface.entries}
+
+
+def _layer(table: Table) -> Layer | Film:
+    if "optical_depth" in table.entries:
+        return Film(table.numbers("optical_depth", AT_LEAST_0, (None,)))
+    table.one_of("thickness_unit", [THICKNESS_UNIT])
+    layer = Layer(_medium(table), table.numbers("thickness", _THICKNESS, ()))
+    with naming(table.where):
+        layer.check_diffusion()
+    return layer
+
+
+def _medium(table: Table, channels: int | None = None) -> Medium:
+    if "sigma_s" in table.entries:
+        raise ValueError(
+            f"{table.where} has sigma_s = {table.entries['sigma_s']}; give sigma_s_prime = (1 - g) "
+            "sigma_s, with the mean cosine g"
+        )
+    table.one_of("unit", [COEFFICIENT_UNIT])
+    sigma_a = table.numbers("sigma_a", AT_LEAST_0, (channels,))
+    sigma_s_prime = table.numbers("sigma_s_prime", POSITIVE, sigma_a.shape)
+    return Medium(sigma_a, sigma_s_prime, table.numbers("eta", POSITIVE, sigma_a.shape))
 
 
 def _plain_medium(medium: Medium) -> dict[str, Any]:
-    coefficients = {
-        "sigma_a": medium.sigma_a,
-        "sigma_s_prime": medium.sigma_s_prime,
-        "eta": medium.eta,
-    }
-    return {
-        "unit": COEFFICIENT_UNIT,
-        **{name: plain_numbers(values) for name, values in coefficients.items()},
-    }
+    values = {name: plain_numbers(getattr(medium, name)) for name in _COEFFICIENTS[1:]}
+    return {"unit": COEFFICIENT_UNIT, **values}
 
 
 def _plain_layer(layer: Layer | Film) -> dict[str, Any]:
     if isinstance(layer, Film):
         return {"optical_depth": plain_numbers(layer.optical_depth)}
-    return {
-        "thickness": plain_numbers(layer.thickness),
-        "thickness_unit": THICKNESS_UNIT,
-        **_plain_medium(layer.medium),
-    }
+    thickness = {"thickness": plain_numbers(layer.thickness), "thickness_unit": THICKNESS_UNIT}
+    return thickness | _plain_medium(layer.medium)
 
 
-def _layered(path: Path, found: Any) -> LayeredMultipole:
-    if not isinstance(found, list) or not found:
-        raise ValueError(
-            f"{path}: [[layers]] must be one table or more, from the top; it is {found!r}"
-        )
-    layers = [
-        _layer(Table(path, f"layers {number}", table))
-        for number, table in enumerate(found, start=1)
-    ]
-    counts = {
-        layer.optical_depth.shape[0] if isinstance(layer, Film) else layer.medium.eta.shape[0]
-        for layer in layers
-    }
-    if len(counts) != 1:
-        raise ValueError(
-            f"{path}: [[layers]] must all have one number per channel; they have {sorted(counts)} "
-            "channels"
-        )
-    try:
-        return LayeredMultipole(layers)
-    except ValueError as error:
-        raise ValueError(f"{path}: [[layers]]: {error}") from None
+def dipole_starts() -> DipoleStarts:
+    r"""Read where fits of 1 to 8 Gaussians to dipoles start: one descent then finds what a search
+    would.
 
+        fit_gaussians(Dipole(medium), 6, spread=VariancesPerChannel(), start=dipole_starts()(medium,
+        6))
 
-def _layer(table: Table) -> Layer | Film:
-    table.only(_COEFFICIENTS | {"optical_depth", "thickness", "thickness_unit"})
-    if "optical_depth" in table.table:
-        return Film(as_array(table.numbers("optical_depth", "at least 0", lambda x: x >= 0)))
-    table.unit(THICKNESS_UNIT, "thickness_unit")
-    thickness = table.thickness("thickness")
-    try:
-        layer = Layer(_medium(table), as_array(thickness))
-        layer.check_diffusion()
-    except ValueError as error:
-        if str(error).startswith(table.where):
-            raise
-        raise ValueError(f"{table.where} {error}") from None
-    return layer
-
-
-def _single_scattering(table: Table, channels: int) -> SingleScattering:
-    table.only(_COEFFICIENTS | {"strength"})
-    medium = _medium(table)
-    strength = np.ones(len(medium.eta))
-    if "strength" in table.table:
-        strength = table.numbers("strength", "at least 0", lambda x: x >= 0, channels=len(strength))
-    if not len(medium.eta) == len(strength) == channels:
-        counts = f"{len(medium.eta)} and {len(strength)}"
-        raise ValueError(
-            f"{table.where} coefficients and strength must have {channels} channels, as [fit] has; "
-            f"they have {counts}"
-        )
-    return SingleScattering(medium, as_array(strength))
-
-
-def _medium(medium: Table) -> Medium:
-    medium.unit(COEFFICIENT_UNIT)
-    sigma_a = medium.numbers("sigma_a", "at least 0 (1/mm)", lambda x: x >= 0)
-    sigma_s_prime = medium.numbers("sigma_s_prime", "positive (1/mm)", lambda x: x > 0)
-    eta = medium.numbers("eta", "positive", lambda x: x > 0, channels=len(sigma_a))
-    if not len(sigma_a) == len(sigma_s_prime) == len(eta):
-        counts = f"{len(sigma_a)}, {len(sigma_s_prime)} and {len(eta)}"
-        raise ValueError(
-            f"{medium.where} sigma_a, sigma_s_prime and eta must have one number per channel; they "
-            f"have {counts}"
-        )
-    return Medium(as_array(sigma_a), as_array(sigma_s_prime), as_array(eta))
-
-
-def _read(name_or_path: str | os.PathLike[str]) -> tuple[Path, dict[str, Any]]:
-    path = material_path(name_or_path)
-    try:
-        tables = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ValueError(
-            f"{path}: cannot be read ({error.strerror}); check the path, or name a material "
-            "(`materials()`)"
-        ) from None
-    except UnicodeDecodeError:
-        raise ValueError(
-            f"{path}: is no TOML file, and no text at all; a material is one"
-        ) from None
-    except tomllib.TOMLDecodeError as error:
-        raise ValueError(f"{path}: is no TOML file: {error}") from None
-    unknown = sorted(set(tables) - set(_TABLES))
-    if unknown:
-        known = (
-            "a material has [medium] or [[layers]], [surface], [single_scattering], "
-            "[source] and [fit]"
-        )
-        raise ValueError(
-            f"{path}: has an unknown entry {unknown[0]!r}; {nearest(unknown[0], _TABLES)} ({known})"
-        )
-    if not {"medium", "layers", "fit"} & set(tables):
-        raise ValueError(
-            f"{path}: has neither [medium] nor [[layers]] nor [fit]; a material needs one of them"
-        )
-    if {"medium", "layers"} <= set(tables):
-        raise ValueError(
-            f"{path}: has both [medium] and [[layers]]; a material is one or the other"
-        )
-    _surface(path, tables)
-    if "medium" in tables:
-        medium = Table(path, "medium", tables["medium"])
-        if "sigma_s" in medium.table:
-            raise ValueError(
-                f"{medium.where} has sigma_s; give sigma_s_prime = (1 - g) sigma_s, with the mean "
-                "cosine g"
-            )
-        medium.only(_COEFFICIENTS)
-        _medium(medium)
-    if "layers" in tables:
-        _layered(path, tables["layers"])
-    return path, tables
-
-
-def _one_line_arrays(text: str) -> str:
-    number = r"-?(?:[\d.]+(?:e[+-]?\d+)?|inf|nan)"
-    return re.sub(
-        rf"\[\s+((?:{number},\s+)+)\]",
-        lambda m: "[" + ", ".join(m[1].replace(",", " ").split()) + "]",
-        text,
-    )
+    **Returns:** a `DipoleStarts` in JAX's default precision. `tools/make_profiles.py` made it.
+    """
+    with np.load(profiles_folder() / "dipole_starts.npz") as file:
+        tables = {name: jnp.asarray(table, float) for name, table in file.items()}
+    counts = sum(name.startswith("log_variances_") for name in tables)
+    log_variances = tuple(tables[f"log_variances_{count}"] for count in range(1, counts + 1))
+    return DipoleStarts(tables["roots"], tables["etas"], log_variances)

@@ -2,34 +2,55 @@
 
 import os
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-import plyfile
+from jaxtyping import Float
 
 from splatjax.geometry import complete_splats, unit
 from splatjax.scene import Splats
 
 from ._atomic import atomic_path
-from ._files import check_unit, existing_file
-from ._mesh import MESHES_ALONE
-from ._pieces import moderate
-from ._ply_columns import Table, colors_of, columns_of, normals_of, places_of, vertex_table
-from ._ply_tables import read_ply
+from ._files import check_units, existing_file, naming, with_y_up
+from ._images import srgb_to_linear
+from ._trimesh import FORMATS, load_with_trimesh, one_sentence
 
-RADIUS = ("radius", "radii")
-AREA = ("area", "areas")
 _SHORTEST, _LONGEST = 1e-9, 1e9  # mm: beyond, single precision loses areas
-_LARGEST = 1e6
 _COVER = (
-    "cover it with splats first: `splatjax sample {} --mm-per-unit ... --output "
-    "...`, or sample_mesh"
+    "cover it with splats first: `splatjax sample {} --mm-per-unit ... --output ...`, or "
+    "sample_mesh"
 )
-_GAUSSIAN_SPLATTING = ("f_dc_0", "scale_0", "rot_0")
+_GAUSSIAN_SPLATTING = {"f_dc_0", "scale_0", "rot_0"}
+COLUMNS = {
+    "centers": [("x", "y", "z")],
+    "normals": [("nx", "ny", "nz")],
+    "radii": [("radius",), ("radii",)],
+    "areas": [("area",), ("areas",)],
+    "albedo": [
+        ("red", "green", "blue"),
+        ("r", "g", "b"),
+        ("diffuse_red", "diffuse_green", "diffuse_blue"),
+    ],
+    "specular": [("specular",)],
+    "roughness": [("roughness",)],
+}
+"""Columns of the vertices of a PLY file, by the fields of splats that they stand for."""
+_POWERS = {"centers": 1, "radii": 1, "areas": 2}  # of the unit of length
+_VALID = {
+    "centers": (lambda x: np.abs(x) <= _LONGEST, "within 1e9 mm (what is mm_per_unit?)"),
+    "normals": (lambda n: n.any(axis=0), "longer than zero"),
+    "radii": (lambda r: (r > _SHORTEST**2) & (r < _LONGEST**2), "positive (what is mm_per_unit?)"),
+    "areas": (lambda a: (a > _SHORTEST**2) & (a < _LONGEST**2), "positive (what is mm_per_unit?)"),
+    "albedo": (lambda c: (c >= 0) & (c <= 1), "in [0, 1]; floats are linear, integers sRGB"),
+    "specular": (lambda f: (f >= 0) & (f <= 1e6), "a factor on the material's, from 0 to 1e6"),
+    "roughness": (lambda f: (f >= 0) & (f <= 1e6), "a factor on the material's, from 0 to 1e6"),
+}
 
 
-def read_splats(path: str | os.PathLike[str], *, mm_per_unit: float = 1.0) -> Splats:
+def read_splats(path: str | os.PathLike[str], *, mm_per_unit: float = 1.0, up: str = "y") -> Splats:
     r"""Read splats from the vertices of a PLY file: ASCII or binary of either byte order,
     properties in any order.
 
@@ -48,6 +69,7 @@ def read_splats(path: str | os.PathLike[str], *, mm_per_unit: float = 1.0) -> Sp
     **Arguments:**
 
     - `mm_per_unit`: length of the file's unit, mm.
+    - `up`: the file's upward axis, `"y"` or `"z"`; splats have +y up.
 
     **Returns:** splats in mm, in JAX's default precision and in Morton order.
 
@@ -56,45 +78,22 @@ def read_splats(path: str | os.PathLike[str], *, mm_per_unit: float = 1.0) -> Sp
     Gaussian-splatting scene.
     """
     path = existing_file(path)
-    check_unit(path, mm_per_unit)
-    if path.suffix.lower() in MESHES_ALONE:
+    check_units(path, mm_per_unit, up)
+    if path.suffix[1:].lower() in set(FORMATS) - {"ply"}:
         raise ValueError(f"{path}: is a mesh; {_COVER.format(path)}")
-    file = read_ply(path)
-    vertices = vertex_table(path, file)
-    if all(name in vertices for name in _GAUSSIAN_SPLATTING):
-        raise ValueError(
-            f"{path}: is a Gaussian-splatting scene (f_dc, scale, rot, opacity): its fuzzy "
-            "ellipsoids carry baked radiance and no"
-            " surface; give a PLY of surface points (x y z, and nx ny nz, radius, red green blue "
-            "where known)"
-        )
-    centers = places_of(path, vertices)
-    normals = normals_of(path, vertices)
-    radii, areas = (
-        positive_of(path, vertices, RADIUS, mm_per_unit),
-        positive_of(path, vertices, AREA, mm_per_unit**2),
-    )
-    check_place(path, centers * mm_per_unit, estimated=radii is None or areas is None)
-    if radii is None and file.rows("face"):
+    with one_sentence(path):
+        columns = load_with_trimesh(path, "ply")["columns"]
+        fields = splat_fields(path, columns.get("vertex", {}), mm_per_unit, up)
+    centers = fields.pop("centers")
+    check_places(path, centers, estimated=fields["radii"] is None or fields["areas"] is None)
+    if fields["radii"] is None and columns.get("face"):
         warnings.warn(
             f"{path}: has faces, and only their corners are taken, as points; "
             f"{_COVER.format(path)}",
             stacklevel=2,
         )
-    albedo = colors_of(path, vertices)
-    specular, roughness = (factor_of(path, vertices, name) for name in ("specular", "roughness"))
-    try:
-        return complete_splats(
-            centers * mm_per_unit,
-            normals=None if normals is None else unit(moderate(normals)),
-            radii=radii,
-            areas=areas,
-            albedo=albedo,
-            specular=specular,
-            roughness=roughness,
-        )
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
+    with naming(path):
+        return complete_splats(centers, **fields)
 
 
 def write_splats(path: str | os.PathLike[str], splats: Splats) -> None:
@@ -106,91 +105,100 @@ def write_splats(path: str | os.PathLike[str], splats: Splats) -> None:
     **Raises:** `FileNotFoundError` when the folder does not exist, `ValueError` for an albedo that
     has not three channels.
     """
-    path = Path(path)
-    columns = {
-        **dict(zip(("x", "y", "z"), np.asarray(splats.centers).T, strict=True)),
-        **dict(zip(("nx", "ny", "nz"), np.asarray(splats.normals).T, strict=True)),
-        "radius": np.asarray(splats.radii),
-        "area": np.asarray(splats.areas),
-    }
-    if splats.albedo is not None:
-        if splats.albedo.shape[-1] != 3:
-            raise ValueError(
-                f"{path}: albedo has {splats.albedo.shape[-1]} channels; a PLY holds red, green "
-                "and blue"
-            )
-        columns |= dict(zip(("red", "green", "blue"), np.asarray(splats.albedo).T, strict=True))
-    for name in ("specular", "roughness"):
-        if (values := getattr(splats, name)) is not None:
-            columns[name] = np.asarray(values)
-    table = np.empty(splats.count, [(name, "<f4") for name in columns])
-    for name, values in columns.items():
-        table[name] = values
-    comments = ["lengths in mm", "red green blue are linear albedo, Rec. 709 primaries"]
-    element = plyfile.PlyElement.describe(table, "vertex")
+    path, names, columns = Path(path), [], []
+    for field, aliases in COLUMNS.items():
+        values = getattr(splats, field)
+        if values is not None:
+            table = np.asarray(values, "<f4").reshape(splats.count, -1)
+            if table.shape[1] != len(aliases[0]):
+                raise ValueError(
+                    f"{path}: {field} has {table.shape[1]} channels; a PLY holds "
+                    f"{', '.join(aliases[0])}"
+                )
+            names += aliases[0]
+            columns.append(table)
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        "comment lengths in mm",
+        "comment red green blue are linear albedo, Rec. 709 primaries",
+        f"element vertex {splats.count}",
+        *(f"property float {name}" for name in names),
+        "end_header\n",
+    ]
     with atomic_path(path) as temporary:
-        plyfile.PlyData([element], text=False, byte_order="<", comments=comments).write(
-            str(temporary)
+        temporary.write_bytes("\n".join(header).encode() + np.hstack(columns).tobytes())
+
+
+def splat_fields(
+    path: Path, columns: Mapping[str, np.ndarray], mm_per_unit: float, up: str
+) -> dict[str, Any]:
+    """Return the fields of splats that columns hold, in mm and with +y up; `None` for others.
+
+    **Raises:** `ValueError` for values that are not finite, or that no splat may have.
+    """
+    if columns.keys() >= _GAUSSIAN_SPLATTING:
+        raise ValueError(
+            f"{path}: is a Gaussian-splatting scene (f_dc, scale, rot, opacity): its fuzzy "
+            "ellipsoids carry baked radiance and no surface; give a PLY of surface points (x y z, "
+            "and nx ny nz, radius, red green blue where known)"
         )
+    single = {name: column for name, column in columns.items() if column.dtype.kind in "iuf"}
+    single = {name: column for name, column in single.items() if column.ndim == 1}
+    fields: dict[str, Any] = dict.fromkeys(COLUMNS)
+    for field, aliases in COLUMNS.items():
+        names = next((names for names in aliases if single.keys() & set(names)), aliases[0])
+        if single.keys() >= set(names):
+            scale = mm_per_unit ** _POWERS.get(field, 0)
+            fields[field] = _values(path, field, {name: single[name] for name in names}, scale)
+        elif single.keys() & set(names) or field == "centers":
+            raise ValueError(
+                f"{path}: its vertices have {', '.join(single) or 'no rows'}, and not all of "
+                f"{' '.join(names)}: write all of them"
+            )
+    fields["centers"] = with_y_up(fields["centers"], up)
+    if fields["normals"] is not None:
+        fields["normals"] = with_y_up(fields["normals"], up)
+    return fields
 
 
-def check_place(path: Path, centers: np.ndarray, *, estimated: bool) -> None:
+def check_places(path: Path, centers: Float[np.ndarray, "n 3"], *, estimated: bool) -> None:
     """Refuse points that lie where numbers of JAX's default precision cannot tell them apart."""
     low, high = centers.min(axis=0), centers.max(axis=0)
     reach, extent = float(np.abs([low, high]).max()), float((high - low).max())
-    if not reach <= _LONGEST:
-        raise ValueError(
-            f"{path}: its points reach {reach:.3g} mm; give its unit (mm_per_unit), or scale it"
-        )
+    resolved = float(jnp.finfo(jnp.result_type(float)).eps) * reach
     if estimated and extent < 1e3 * _SHORTEST:
         raise ValueError(
-            f"{path}: its {len(centers)} points lie within {extent:.3g} mm; give its unit "
-            "(mm_per_unit), or scale it"
+            f"{path}: its points lie within {extent:.3g} mm; give its unit (mm_per_unit), or scale "
+            "it"
         )
-    resolved = float(jnp.finfo(jnp.result_type(float)).eps) * reach
     if 0 < extent < 1e4 * resolved:
         raise ValueError(
             f"{path}: its points lie {reach:.3g} mm from the origin, where single precision tells "
-            f"{resolved:.2g} mm apart, and it"
-            f" is {extent:.3g} mm large; move it to the origin"
+            f"{resolved:.2g} mm apart, and it is {extent:.3g} mm large; move it to the origin"
         )
 
 
-def positive_of(
-    path: Path,
-    vertices: Table,
-    aliases: tuple[str, ...],
-    scale: float,
-    then: str = "to have it estimated",
-) -> np.ndarray | None:
-    """Give radii or areas, in mm; where they are left out, `then` says what is to be done."""
-    name = next((alias for alias in aliases if alias in vertices), None)
-    values = None if name is None else columns_of(path, vertices, (name,))
-    if values is None:
-        return None
-    values = values[:, 0]
-    bad = np.flatnonzero(values <= 0)
+def _values(
+    path: Path, field: str, columns: dict[str, np.ndarray], scale: float
+) -> Float[np.ndarray, "*shape"]:
+    """Return a field of splats, validated."""
+    with np.errstate(invalid="ignore"):  # of NaN that signals
+        values = scale * np.stack(list(columns.values())).astype(np.float64)
+    kind, *others = {column.dtype for column in columns.values()}
+    is_encoded = field == "albedo" and not others and kind.kind in "iu"
+    if is_encoded:
+        values = values / np.iinfo(kind).max
+    holds, expected = _VALID[field]
+    bad = np.flatnonzero(~(np.isfinite(values) & holds(values)).all(axis=0))
     if len(bad):
         raise ValueError(
-            f"{path}: the {name} of vertex {bad[0]} is {values[bad[0]]:g} ({len(bad)} such "
-            "vertices); it must be positive,"
-            f" or leave {name} out {then}"
+            f"{path}: {' '.join(columns)} of vertex {bad[0]} is "
+            f"{' '.join(f'{value:g}' for value in values[:, bad[0]])} ({len(bad)} such vertices); "
+            f"it must be finite and {expected}: fix it, or leave it out"
         )
-    if values.max() * scale > _LONGEST**2 or values.min() * scale < _SHORTEST**2:
-        said = f"{name} ranges from {values.min():.3g} to {values.max():.3g}"
-        raise ValueError(f"{path}: {said}; give its unit (mm_per_unit), or mend it")
-    return values * scale
-
-
-def factor_of(path: Path, vertices: Table, name: str) -> np.ndarray | None:
-    """Give a column of factors on what the material has; `None` if there is none."""
-    values = columns_of(path, vertices, (name,))
-    if values is None:
-        return None
-    reached = values.min() if values.min() < 0 else values.max()
-    if not 0 <= reached <= _LARGEST:
-        raise ValueError(
-            f"{path}: {name} reaches {reached:g}; it is a factor on the material's, from 0 to "
-            f"{_LARGEST:g}"
-        )
-    return values[:, 0]
+    if field == "normals":
+        values = values / np.abs(values).max(axis=0)
+        return unit(values.T)
+    values = srgb_to_linear(values) if is_encoded else values
+    return values.T if len(columns) > 1 else values[0]

@@ -1,21 +1,25 @@
-"""Measured profiles."""
+"""Measured profiles, and many media, as CSV files."""
 
 import csv
 import math
 import os
 import re
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from splatjax.scattering import Tabulated
 
-from ._files import check_unit, existing_file
-from ._tables import rounded
+from ._atomic import atomic_path
+from ._files import check_units, naming
+from ._tables import read_rows, rounded
 
-_UNITS = {"mm": 1.0, "cm": 10.0, "um": 1e-3, "µm": 1e-3}
-"""Units of length that the names of a table's columns may speak of, mm."""
+_MM = {"mm": 1.0, "cm": 10.0, "um": 1e-3, "µm": 1e-3}
+"""Units of length that the names of a table's columns may give."""
+_COLUMNS = "sigma_a", "sigma_s_prime", "eta"
 
 
 def read_profile(path: str | os.PathLike[str], *, mm_per_unit: float = 1.0) -> Tabulated:
@@ -23,7 +27,7 @@ def read_profile(path: str | os.PathLike[str], *, mm_per_unit: float = 1.0) -> T
     channel.
 
     Empty lines and those that begin with `#` are left out; a first line of names may stand above.
-    If it speaks of a unit of length, that must be the one given. Radii ascend.
+    If it gives a unit of length, that must be `mm_per_unit`. Radii ascend.
 
     **Arguments:**
 
@@ -36,74 +40,89 @@ def read_profile(path: str | os.PathLike[str], *, mm_per_unit: float = 1.0) -> T
     **Raises:** `FileNotFoundError`, and `ValueError` for what is no such table: file, line and what
     is wrong.
     """
-    path = existing_file(path)
-    check_unit(path, mm_per_unit)
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except UnicodeDecodeError as error:
-        raise ValueError(
-            f"{path}: is no text file: {error}; a profile is a CSV of radii and values"
-        ) from None
-    rows: list[list[float]] = []
-    named = False
-    for number, line in enumerate(lines, start=1):
-        if not line.strip() or line.lstrip().startswith("#"):
-            continue
-        cells = [cell.strip() for cell in next(csv.reader([line]))]
-        if not rows and not named and not _is_number(cells[0]):
-            named = True
-            _check_named_unit(path, number, line, mm_per_unit)
-            continue
-        bad = next(
-            (
-                cell
-                for cell in cells
-                if not _is_number(cell) or not math.isfinite(rounded(float(cell)))
-            ),
-            None,
-        )
-        if bad is not None:
+    check_units(Path(path), mm_per_unit)
+    rows = read_rows(path, "a profile is a CSV of radii and values")
+    if rows and isinstance(rows[0][1][0], str):
+        (where, names), *rows = rows
+        for unit, size in _MM.items():
+            is_named = re.search(rf"(?<![A-Za-z]){unit}(?![A-Za-z])", ",".join(map(str, names)))
+            if is_named and not math.isclose(size, mm_per_unit, rel_tol=1e-6):
+                raise ValueError(
+                    f"{where} gives {unit}, and lengths are taken as {mm_per_unit:g} mm; give "
+                    f"mm_per_unit = {size:g} (--mm-per-unit {size:g}), or name the right unit"
+                )
+    for where, cells in rows:
+        are_numbers = all(isinstance(cell, float) and np.isfinite(rounded(cell)) for cell in cells)
+        if not 1 < len(cells) == len(rows[0][1]) or not are_numbers:
             raise ValueError(
-                f"{path}: line {number}: {bad!r} is no number; give a radius and a value for each "
-                "channel"
+                f"{where}: {', '.join(map(str, cells))} must be a radius and a value for each of "
+                f"{len(rows[0][1]) - 1} channels"
             )
-        if len(cells) < 2 or (rows and len(cells) != len(rows[0])):
-            wanted = f"{len(rows[0])} as above" if rows else "a radius and at least one value"
-            raise ValueError(f"{path}: line {number}: has {len(cells)} numbers; expected {wanted}")
-        rows.append([float(cell) for cell in cells])
     if len(rows) < 2:
-        raise ValueError(
-            f"{path}: has {len(rows)} lines of numbers; a profile needs two radii at least"
-        )
-    table = np.asarray(rows)
-    dtype = jnp.result_type(float)
-    try:
+        raise ValueError(f"{path}: has {len(rows)} lines of numbers; a profile needs two radii")
+    radii, values = np.split(np.asarray([cells for _, cells in rows]), [1], axis=1)
+    with naming(path):
         return Tabulated(
-            jnp.asarray(table[:, 0] * mm_per_unit, dtype),
-            jnp.asarray(table[:, 1:] / mm_per_unit**2, dtype),
+            jnp.asarray(radii[:, 0] * mm_per_unit, float),
+            jnp.asarray(values / mm_per_unit**2, float),
         )
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
 
 
-def _check_named_unit(path: Path, number: int, line: str, mm_per_unit: float) -> None:
-    """Refuse names that speak of another unit of length than is given, such as `r (cm)`; mm where
-    none is given.
+def read_media(path: str | os.PathLike[str]) -> tuple[list[str], Float[np.ndarray, "media 3"]]:
+    r"""Read media from a CSV file: a first line of names, then a line for each medium of one
+    channel.
+
+    Columns are `sigma_a` and `sigma_s_prime` (1/mm), `eta`, and `name` if there is one. Empty lines
+    are left out.
+
+    **Returns:** the names, numbers where there are none, and the three coefficients of each.
+
+    **Raises:** `FileNotFoundError`, and `ValueError` for what is no such table: file, line and what
+    is wrong.
     """
-    for unit, size in _UNITS.items():
-        if re.search(rf"(?<![A-Za-z]){unit}(?![A-Za-z])", line) and not math.isclose(
-            size, mm_per_unit, rel_tol=1e-6
-        ):
+    contents = f"media are a CSV of {', '.join(_COLUMNS)}"
+    (_, head), *rows = read_rows(path, contents) or [("", [])]
+    if not set(head) >= set(_COLUMNS) or not rows:
+        raise ValueError(
+            f"{path}: names {', '.join(map(str, head))}, with {len(rows)} rows; {contents}"
+        )
+    names, media = [], []
+    for where, cells in rows:
+        entries = dict(zip(head, cells, strict=False))
+        values = [v for name in _COLUMNS if isinstance(v := entries.get(name), float)]
+        is_whole = len(cells) == len(head) and len(values) == len(_COLUMNS)
+        if not is_whole or not all(0 < v < math.inf for v in (values[0] or 1.0, *values[1:])):
             raise ValueError(
-                f"{path}: line {number} speaks of {unit}, and lengths are taken as {mm_per_unit:g} "
-                "mm; "
-                f"give mm_per_unit = {size:g} (--mm-per-unit {size:g}), or name the right unit"
+                f"{where}: {', '.join(map(str, cells))} must be {', '.join(head)}, positive; "
+                "sigma_a may be 0"
             )
+        names.append(str(entries.get("name") or len(media) + 1))
+        media.append(values)
+    return names, np.asarray(media)
 
 
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True
+def write_columns(path: str | os.PathLike[str], columns: Mapping[str, Iterable]) -> None:
+    """Write a CSV table, whole or not at all; numbers so that they are read back as they are.
+
+    **Raises:** `FileNotFoundError` when the folder does not exist.
+    """
+    plain = (
+        [cell if isinstance(cell, str) else repr(float(cell)) for cell in column]
+        for column in columns.values()
+    )
+    with atomic_path(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
+        csv.writer(file, lineterminator="\n").writerows([columns, *zip(*plain, strict=True)])
+
+
+def read_column(path: str | os.PathLike[str], name: str) -> Float[np.ndarray, " rows"]:
+    """Read a column of numbers that `write_columns` has written."""
+    with open(path, newline="", encoding="utf-8") as file:
+        return np.asarray([float(row[name]) for row in csv.DictReader(file)])
+
+
+def join_tables(path: str | os.PathLike[str], parts: Sequence[Path]) -> None:
+    """Write tables with the same columns as one, in their order, whole or not at all."""
+    with atomic_path(path) as temporary, open(temporary, "w", encoding="utf-8") as file:
+        for i, part in enumerate(parts):
+            head, rows = part.read_text(encoding="utf-8").split("\n", 1)
+            file.write(rows if i else f"{head}\n{rows}")

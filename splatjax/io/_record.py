@@ -4,14 +4,26 @@ import hashlib
 import json
 import os
 from collections.abc import Mapping
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
+
+from splatjax.exports import data_sheet
+from splatjax.scene import Material
 
 from ._atomic import atomic_path
 
 
+def own_version() -> str:
+    """Return the version of the package that is installed."""
+    try:
+        return version("splatjax")
+    except PackageNotFoundError:
+        return "(not installed)"
+
+
 def fingerprint(path: str | os.PathLike[str]) -> str:
-    """Give what tells the contents of a file from those of others: its size and its SHA-256.
+    """Return what distinguishes the contents of a file: its size and its SHA-256.
 
     **Raises:** `OSError` when the file cannot be read.
     """
@@ -43,3 +55,18 @@ def read_record(path: str | os.PathLike[str]) -> dict[str, Any]:
     if not isinstance(record, dict):
         raise ValueError(f"{path}: is no record; delete it, or name another folder")
     return record
+
+
+def save_exports(material: Material, path: str | os.PathLike[str]) -> None:
+    r"""Write a material's Gaussians in the terms of other renderers to a JSON file
+    (`splatjax.exports.data_sheet`), whole or not at all.
+
+    **Raises:** `ValueError` for a material with single scattering as a term of its own, which other
+    renderers have no number for; `OSError` if the file cannot be written.
+    """
+    if material.single_scattering is not None:
+        raise ValueError(
+            f"{path}: the material has single scattering besides its Gaussians; fit it without, "
+            "then export"
+        )
+    write_record(path, data_sheet(material.gaussians))

@@ -1,7 +1,10 @@
-"""Tables of TOML files, and the errors that say what an entry must be."""
+"""Tables of TOML and CSV files, and the errors that say what an entry must be."""
 
+import csv
 import difflib
-from collections.abc import Iterable
+import os
+import tomllib
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -9,110 +12,140 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from ._files import existing_file
+
+POSITIVE = "positive", lambda x: (x > 0) & (x < np.inf)
+AT_LEAST_0 = "finite and at least 0", lambda x: (x >= 0) & (x < np.inf)
+FINITE = "finite", np.isfinite
+Rule = tuple[str, Callable[[np.ndarray], Any]]
+"""What numbers must be, in words and as a function of their rounded values."""
+
+
+def read_toml(path: Path, remedy: str) -> dict[str, Any]:
+    """Read all tables of a TOML file.
+
+    **Raises:** `ValueError` when it cannot be read.
+    """
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be read ({error.strerror}); {remedy}") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path}: is no TOML file: {error}") from None
+
+
+def read_rows(path: str | os.PathLike[str], contents: str) -> list[tuple[str, list[Any]]]:
+    """Read the rows of a CSV file and where they stand; empty ones and comments (`#`) are left out.
+    Cells that are numbers are converted.
+
+    **Raises:** `FileNotFoundError`, or `ValueError` when it is no text.
+    """
+    try:
+        lines = existing_file(path).read_text(encoding="utf-8-sig").splitlines()
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path}: is no text file: {error}; {contents}") from None
+    rows = csv.reader(lines)
+    return [
+        (f"{path}: line {rows.line_num}", [_converted(cell) for cell in row])
+        for row in rows
+        if any(map(str.strip, row)) and not row[0].lstrip().startswith("#")
+    ]
+
+
+def _converted(cell: str) -> float | str:
+    try:
+        return float(cell)
+    except ValueError:
+        return cell.strip()
+
 
 class Table:
-    """One table of a file, and what its entries must be."""
+    """A table of a TOML file, whose entries are checked as they are read.
 
-    def __init__(self, path: Path, name: str, table: Any):
-        if not isinstance(table, dict):
-            raise ValueError(f"{path}: [{name}] must be a table; it is {table!r}")
-        self.where, self.table = f"{path}: [{name}]", table
+    **Raises:** `ValueError` for what is no table, and for an entry that is not among the `known`.
+    """
 
-    def entry(self, name: str, expected: str) -> Any:
-        """Give whatever stands there."""
-        if name not in self.table:
-            raise ValueError(f"{self.where} has no {name}; it must be {expected}")
-        return self.table[name]
-
-    def only(self, known: set[str]) -> None:
-        """Refuse what is not known."""
-        unknown = sorted(set(self.table) - known)
+    def __init__(self, path: Path, name: str, entries: Any, known: Iterable[str]):
+        self.path, self.name, self.entries = path, name, entries
+        self.where = f"{path}: [{name}]" if name else f"{path}:"
+        if not isinstance(entries, dict):
+            raise ValueError(f"{self.where} must be a table; it is {entries!r}")
+        unknown = sorted(entries.keys() - known)
         if unknown:
             raise ValueError(
                 f"{self.where} has an unknown entry {unknown[0]!r}; {nearest(unknown[0], known)}"
             )
 
-    def unit(self, expected: str, name: str = "unit") -> None:
-        """Refuse numbers in another unit, and such as do not say theirs."""
-        if name not in self.table:
-            raise ValueError(
-                f'{self.where} has no {name}; convert the numbers, and say {name} = "{expected}"'
-            )
-        if (found := self.table[name]) != expected:
-            raise ValueError(
-                f'{self.where} {name} must be "{expected}"; it is {found!r}: '
-                "convert the numbers, then name the unit"
-            )
+    def table(self, name: str, known: Iterable[str]) -> "Table":
+        """Return a table within this one."""
+        return Table(self.path, f"{self.name} {name}".strip(), self.entries.get(name), known)
 
-    def numbers(self, name: str, expected: str, holds, channels: int | None = None) -> np.ndarray:
-        """Give a list of numbers; a single one stands for all channels, if their number is
-        given.
+    def tables(self, name: str, known: Iterable[str]) -> "list[Table]":
+        """Return a list of tables within this one, from 1."""
+        given = self.entries.get(name)
+        if not isinstance(given, list) or not given:
+            raise ValueError(f"{self.where} {name} must be one table or more; it is {given!r}")
+        return [
+            Table(self.path, f"{self.name} {name} {number}".strip(), entries, known)
+            for number, entries in enumerate(given, start=1)
+        ]
+
+    def one_of(self, name: str, choices: Iterable[Any], default: Any = None) -> Any:
+        """Return an entry that is one of some choices."""
+        value = self.entries.get(name, default)
+        if (type(value), value) not in [(type(choice), choice) for choice in choices]:
+            raise ValueError(
+                f"{self.where} {name} must be {' or '.join(map(repr, choices))}; it is {value!r}"
+            )
+        return value
+
+    def numbers(
+        self,
+        name: str,
+        rule: Rule,
+        shape: tuple[int | None, ...],
+        default: float | None = None,
+        *,
+        fill: bool = True,
+    ) -> Array:
+        """Return numbers in JAX's default precision.
+
+        **Arguments:**
+
+        - `shape`: `None` stands for any count.
+        - `default`: of an entry that is left out; `None`: it must be there.
+        - `fill`: whether one number stands for all where the count is known.
         """
-        found = self.entry(name, f"a list of numbers, {expected}")
-        if channels is not None and _is_number(found):
-            found = [found] * channels
-        if not isinstance(found, list) or not found or not all(_is_number(x) for x in found):
+        given = self.entries.get(name, default)
+        try:
+            values = np.asarray(given)
+        except ValueError:  # rows of several lengths
+            values = np.asarray(None)
+        if fill and values.ndim == 0 and None not in shape:
+            values = np.broadcast_to(values, [n or 1 for n in shape])
+        fits = values.ndim == len(shape) and values.size > 0 and values.dtype.kind in "iuf"
+        fits = fits and all(n in (None, m) for n, m in zip(shape, values.shape, strict=True))
+        fits = fits and not any(isinstance(value, bool) for value in np.asarray(given, object).flat)
+        if not fits or not np.all(rule[1](rounded(values))):
+            rows = "rows of " if len(shape) > 1 else ""
+            count = f"{shape[0] or 'a list of'} {rows}numbers" if shape else "a number"
             raise ValueError(
-                f"{self.where} {name} must be a list of numbers, {expected}; it is {found!r}"
+                f"{self.where} {name} must be {count}, {rule[0]}; it is "
+                f"{'missing' if given is None else repr(given)}"
             )
-        values = np.asarray(found, np.float64)
-        if not np.all(np.isfinite(rounded(values)) & holds(rounded(values))):
-            raise ValueError(f"{self.where} {name} must be finite and {expected}; it is {found!r}")
-        return values
-
-    def thickness(self, name: str) -> np.ndarray:
-        """Give a positive number of mm, which may be infinite."""
-        found = self.entry(name, "a number of mm, or inf")
-        if not _is_number(found) or not rounded(found) > 0:
-            raise ValueError(f"{self.where} {name} must be positive (mm), or inf; it is {found!r}")
-        return np.asarray(found, np.float64)
-
-    def number(self, name: str, expected: str, holds, default: float) -> float:
-        """Give one finite number, or what it is where the file says nothing."""
-        found = self.table.get(name, default)
-        if not _is_number(found) or not np.isfinite(rounded(found)) or not holds(rounded(found)):
-            raise ValueError(f"{self.where} {name} must be a number, {expected}; it is {found!r}")
-        return float(found)
-
-    def matrix(self, name: str, rows: int) -> np.ndarray:
-        """Give a list of lists of finite numbers: so many, all equally long."""
-        found = self.entry(name, "a list of numbers per Gaussian, one per channel")
-        regular = isinstance(found, list) and all(isinstance(row, list) and row for row in found)
-        if not regular or not all(
-            _is_number(x) and np.isfinite(rounded(x)) for row in found for x in row
-        ):
-            raise ValueError(
-                f"{self.where} {name} must be a list of finite numbers per Gaussian, one per "
-                f"channel; it is {found!r}"
-            )
-        if len(found) != rows or len({len(row) for row in found}) != 1:
-            lengths = [len(row) for row in found]
-            raise ValueError(
-                f"{self.where} {name} must have {rows} rows, one per variance, of equal length; "
-                f"its rows have {lengths}"
-            )
-        return np.asarray(found, np.float64)
+        return jnp.asarray(rounded(values))
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """Say which of the known names is nearest to one that is not; all of them, if none is near."""
+    """Suggest the known name that is nearest to an unknown one, or list all of them."""
     known = sorted(known)
     near = difflib.get_close_matches(name.lower(), known, n=1)
     return f"did you mean {near[0]!r}?" if near else f"known are {', '.join(known)}"
 
 
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
-
-
 def rounded(values: Any) -> np.ndarray:
-    """Give numbers as they are in JAX's default precision: what is too large is infinite there,
-    what is too small is 0.
+    """Round numbers to JAX's default precision: what is too large becomes infinite, what is too
+    small 0.
     """
     with np.errstate(over="ignore", under="ignore"):
         return np.asarray(values, np.float64).astype(jnp.result_type(float))
-
-
-def as_array(values: np.ndarray) -> Array:
-    """Give an array in JAX's default precision."""
-    return jnp.asarray(values, jnp.result_type(float))

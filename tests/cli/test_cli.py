@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import trimesh
 from commands import plate, run
 from jax.experimental.compilation_cache import compilation_cache
 from PIL import Image
@@ -25,7 +26,7 @@ SMALL = ["--count", "5000", "--width", "64", "--height", "64"]
 def test_materials_lists_the_library_with_its_sources(capsys):
     assert run("materials") == 0
     lines = {line.split()[0]: line for line in capsys.readouterr().out.splitlines()[1:]}
-    assert list(lines) == list(sj.materials())
+    assert list(lines) == list(sj.list_materials())
     assert re.search(r"Gaussians .* d'Eon et al. 2007", lines["skin"])
     assert re.search(r"layers .* Donner et al. 2005", lines["skin_layers"])
     assert re.search(r"coefficients .* Jensen et al. 2001", lines["marble"])
@@ -57,6 +58,22 @@ def test_sample_covers_a_mesh(tmp_path, capsys):
     np.testing.assert_allclose(float(jnp.sum(splats.areas)), 50.0, rtol=1e-3)
     assert float(jnp.min(splats.centers[:, 1])) >= 5 - 1e-4
     assert "50 mm^2" in capsys.readouterr().err
+
+
+def test_files_with_z_up_and_the_crease_angle(tmp_path):
+    """A box that is tall along z stands upright; its edges are hard up to an angle."""
+    mesh, output = tmp_path / "box.stl", tmp_path / "box.ply"
+    trimesh.creation.box((1, 1, 9)).export(mesh)
+    command = ["sample", mesh, "--mm-per-unit", "1", "--count", "400", "--output", output]
+    largest = []
+    for options in (["--crease-angle", "91"], ["--up", "z"]):
+        assert run(*command, *options) == 0
+        largest.append(np.abs(np.asarray(sj.read_splats(output).normals)).max(axis=1))
+    assert np.median(largest[0]) < 0.95
+    np.testing.assert_allclose(largest[1], 1, atol=1e-6)
+    assert np.ptp(np.asarray(sj.read_splats(output).centers), axis=0).argmax() == 1
+    lying, _ = Render(splats=output, up="z").load()
+    assert np.ptp(np.asarray(lying.centers), axis=0).argmax() == 2
 
 
 @pytest.mark.slow

@@ -61,7 +61,7 @@ REFUSED = {
     "render plate.ply --stream 5": ["plate.ply", "binary"],
     # Contents.
     "render empty.ply": ["empty.ply", "empty"],
-    "render nan.ply": ["nan.ply", "not finite"],
+    "render nan.ply": ["nan.ply", "1 nan 0"],
     "render zero.ply": ["zero.ply", "radius", "positive"],
     "render negative.ply": ["negative.ply", "radius", "positive"],
     "fit negative.toml": ["negative.toml", "sigma_a"],

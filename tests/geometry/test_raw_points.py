@@ -48,11 +48,6 @@ def test_given_fields_are_kept():
     np.testing.assert_allclose(np.asarray(splats.radii)[near], radii, rtol=1e-6)
 
 
-def test_too_few_points_are_refused():
-    with pytest.raises(ValueError, match="3 points are too few"):
-        complete_splats(np.eye(3))
-
-
 def plane(count=900, spacing=1.0, seed=0):
     """Points of a jittered square grid at height zero."""
     side = round(count**0.5)

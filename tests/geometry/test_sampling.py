@@ -5,11 +5,11 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 
-from splatjax.geometry import Mesh, Textures, cut_below, sample_mesh
+from splatjax.geometry import Mesh, Textures, cut_below, sample_mesh, split_creases
 from splatjax.geometry._cells import surface_cells
 from splatjax.geometry._mesh import vertex_normals
-from splatjax.geometry._morton import morton_order
-from splatjax.geometry._rounding import rounded_area, rounded_positions
+from splatjax.geometry._places import morton_order
+from splatjax.geometry._rounding import Rounding
 from splatjax.geometry._scatter import SurfacePoints
 
 COUNT = 3000
@@ -129,6 +129,25 @@ def test_open_border_has_no_clumps():
     assert radii.max() < 1.6 * np.median(radii)
 
 
+def saw_tooth(teeth=40, rows=20) -> Mesh:
+    """A square sheet of 20 mm whose lower rim has teeth of 0.5 mm."""
+    x, y = np.meshgrid(np.linspace(0, 20, 2 * teeth + 1), np.linspace(0, 20, rows))
+    y[0, 1::2] -= 0.5
+    places = np.stack([x, y, 0 * x], axis=-1).reshape(-1, 3)
+    number = np.arange(len(places)).reshape(x.shape)
+    a, b, c, d = number[:-1, :-1], number[:-1, 1:], number[1:, :-1], number[1:, 1:]
+    faces = np.concatenate([np.stack(each, -1).reshape(-1, 3) for each in ((a, b, d), (a, d, c))])
+    return Mesh(places, faces, np.tile([0.0, 0.0, 1.0], (len(places), 1)))
+
+
+def test_a_jagged_border_leaves_no_specks():
+    """What lies across a notch of the border belongs to no mirror image: no cell is cut there."""
+    splats = sample_mesh(saw_tooth(), COUNT)
+    spacing = (400 / COUNT) ** 0.5
+    assert float(splats.areas.min()) > 0.35 * spacing**2
+    assert float(splats.radii.min()) > 0.9 * spacing
+
+
 def test_cells_that_coincide_share_their_area():
     points = np.stack(np.meshgrid(np.arange(20.0), np.arange(20.0), [0.0]), -1).reshape(-1, 3)
     double = np.concatenate([points, points])
@@ -201,11 +220,11 @@ def test_a_rounded_sphere_is_round_to_fourth_order():
         mesh = sphere(subdivisions=subdivisions)
         points = anywhere(mesh)
         flat.append(np.max(np.abs(np.linalg.norm(points.positions(mesh), axis=1) - 50)))
-        off.append(np.max(np.abs(np.linalg.norm(rounded_positions(mesh, points), axis=1) - 50)))
+        off.append(np.max(np.abs(np.linalg.norm(Rounding(mesh).positions(points), axis=1) - 50)))
     assert off[0] < 0.03 * flat[0]
     assert off[1] < off[0] / 14
     whole = 4 * np.pi * 50**2
-    assert abs(rounded_area(sphere()) / whole - 1) < 1e-4
+    assert abs(Rounding(sphere()).area() / whole - 1) < 1e-4
     assert sphere().area() / whole - 1 < -4e-3
 
 
@@ -222,7 +241,7 @@ def test_what_triangles_share_stays_or_moves_for_all_of_them():
         ):
             points = SurfacePoints(every, np.broadcast_to(way, (len(every), 3)))
             for at, plain in zip(
-                rounded_positions(mesh, points), points.positions(mesh), strict=True
+                Rounding(mesh).positions(points), points.positions(mesh), strict=True
             ):
                 np.testing.assert_allclose(
                     found.setdefault(tuple(plain.round(6)), at), at, atol=1e-9
@@ -230,19 +249,32 @@ def test_what_triangles_share_stays_or_moves_for_all_of_them():
     assert len(found) == len(every) * 3  # two points on each edge, and two triangles
     corners = SurfacePoints(every, np.broadcast_to([1.0, 0, 0], (len(every), 3)))
     np.testing.assert_allclose(
-        rounded_positions(mesh, corners), corners.positions(mesh), atol=1e-12
+        Rounding(mesh).positions(corners), corners.positions(mesh), atol=1e-12
     )
 
 
-def test_a_box_stays_a_box():
-    box = trimesh.creation.box(extents=(10.0, 20.0, 30.0))
-    vertices, faces = np.array(box.vertices), np.array(box.faces)
-    mesh = Mesh(
-        vertices, faces, vertex_normals(vertices, faces)
-    )  # smooth at its edges, as where a file has no normals
-    points = anywhere(mesh)
-    np.testing.assert_array_equal(rounded_positions(mesh, points), points.positions(mesh))
-    assert rounded_area(mesh) == pytest.approx(2 * (200 + 300 + 600), rel=1e-12)
+def test_creases_split_normals_where_triangles_differ():
+    """A wedge of two squares: one normal for each side beyond the angle, else their mean; normals
+    that are given stay where they are near their triangles.
+    """
+    low, tip = [0.0, 0.0, 0.0], np.asarray([0.0, 1.0, 0.0])
+    fold = np.radians(50)
+    places = np.asarray([low, tip, [1, 0, 0], [-np.cos(fold), 0, -np.sin(fold)]])
+    faces = np.asarray([[0, 2, 1], [0, 1, 3]])
+    sides = np.asarray([[0, 0, 1.0], [-np.sin(fold), 0, np.cos(fold)]])
+    none = np.zeros((4, 3))
+    hard, soft = (split_creases(Mesh(places, faces, none), angle) for angle in (49.0, 51.0))
+    np.testing.assert_allclose(
+        hard.normals[hard.faces], np.repeat(sides[:, None], 3, axis=1), atol=1e-12
+    )
+    assert (len(hard.vertices), len(soft.vertices)) == (6, 4)
+    middle = sides.sum(axis=0) / np.linalg.norm(sides.sum(axis=0))
+    np.testing.assert_allclose(soft.normals[soft.faces[0, 0]], middle, atol=1e-12)
+    given = Mesh(places, faces, np.tile(middle, (4, 1)), colors=np.eye(4)[:, :3])
+    np.testing.assert_array_equal(split_creases(given, 26.0).normals, given.normals)
+    split = split_creases(given, 24.0)
+    np.testing.assert_allclose(split.normals[split.faces], hard.normals[hard.faces], atol=1e-12)
+    np.testing.assert_array_equal(split.colors[split.faces], given.colors[faces])
 
 
 def test_rounded_splats_cover_the_rounded_surface():

@@ -88,7 +88,7 @@ TEXTS = {
 READERS: dict[str, Callable[[Path], object]] = {
     "ply": sj.read_splats,
     **dict.fromkeys(
-        ("ply_mesh", "obj", "glb", "stl", "off"), partial(io.read_mesh, mm_per_unit=1.0)
+        ("ply_mesh", "obj", "glb", "stl", "off"), partial(io.read_textured_mesh, mm_per_unit=1.0)
     ),
     "exr": lambda path: (io.read_picture(path), sj.read_exr(path)),
     "picture": lambda path: io.read_textured_mesh(

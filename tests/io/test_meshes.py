@@ -1,249 +1,144 @@
-"""Meshes from GLB and OBJ files with their maps, compared with files that other libraries or hands
-have written.
-"""
+"""Meshes from files that other libraries write and that the formats' own texts show."""
 
-import os
-import struct
-from io import BytesIO
-from pathlib import Path
-
+import meshio
 import numpy as np
-import pygltflib
 import pytest
+import trimesh
 from PIL import Image
+from scipy.spatial import KDTree
+from writers import SUFFIXES, export, write_ply, xyz
 
-from splatjax.io import sample_mesh
+from splatjax.io import read_textured_mesh, srgb_to_linear
 
-CORNERS = np.asarray([[0, 0, 0], [2, 0, 0], [2, 2, 0], [0, 2, 0]], np.float32)
-V_UP = np.asarray([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)  # v = 1 at the top of the square
-TRIANGLES = np.asarray([0, 1, 2, 0, 2, 3], np.uint16)
-QUANTUM = 1 / 255
+MM = 2.0
+DIGITS = 2e-5
+"""Files hold some six digits."""
+BODIES = {
+    "ball": trimesh.creation.icosphere(subdivisions=1, radius=3.0).apply_translation([1, 1, 1]),
+    "tube": trimesh.creation.annulus(1.0, 2.0, 1.5, sections=8).apply_translation([-20, 0, 0]),
+    "sheet": trimesh.Trimesh(
+        [[0, 0, 0], [1, 0, 0], [1, 1, 0.2], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]], process=False
+    ),
+}
 
 
-def ramp(path=None):
-    """A picture that is red at the top, row 0, and green at the bottom."""
-    rows = np.linspace(1, 0, 64)[:, None] * np.ones(8)
-    image = Image.fromarray(
-        np.rint(255 * np.stack([rows, 1 - rows, 0 * rows], axis=-1)).astype(np.uint8)
+def with_attributes(body):
+    """Return a body with normals that are not quite its own, and colors of 8 bits."""
+    mesh, random = BODIES[body], np.random.default_rng(0)
+    normals = mesh.vertex_normals + 0.05 * random.normal(size=mesh.vertices.shape)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    colors = random.integers(0, 256, mesh.vertices.shape, dtype=np.uint8)
+    return np.array(mesh.vertices), np.array(mesh.faces), normals, colors
+
+
+def described(vertices, faces):
+    """Return the middle of triangles and twice their areas, along their normals."""
+    a, b, c = np.moveaxis(np.asarray(vertices, float)[faces], 1, 0)
+    return np.concatenate([(a + b + c) / 3, np.cross(b - a, c - a)], axis=1)
+
+
+def compare(path, vertices, faces, normals=None, colors=None, **options):
+    """Read a file and compare its triangles; normals and linear colors vertex by vertex."""
+    mesh, textures = read_textured_mesh(path, mm_per_unit=MM, crease_angle=180.0, **options)
+    expected, tolerance = MM * np.asarray(vertices, float), DIGITS * MM * np.abs(vertices).max()
+    assert len(mesh.faces) == len(faces)
+    distance, _ = KDTree(described(mesh.vertices, mesh.faces)).query(described(expected, faces))
+    assert distance.max() < 10 * tolerance
+    at = KDTree(mesh.vertices).query(expected[np.unique(faces)])[1]
+    assert (mesh.colors is None) == (colors is None)
+    for found, given in ((mesh.normals, normals), (mesh.colors, colors)):
+        if given is not None:
+            np.testing.assert_allclose(found[at], given[np.unique(faces)], atol=1e-4)
+    return mesh, textures
+
+
+@pytest.mark.parametrize("body", BODIES)
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_files_of_trimesh(tmp_path, suffix, body):
+    vertices, faces, normals, colors = with_attributes(body)
+    is_bare = suffix.endswith(("stl", "off"))
+    mesh = trimesh.Trimesh(vertices, faces, vertex_normals=normals, process=False)
+    mesh.visual = mesh.visual if is_bare else trimesh.visual.ColorVisuals(vertex_colors=colors)
+    linear = colors / 255 if suffix in ("glb", "gltf") else srgb_to_linear(colors / 255)
+    path, linear = export(mesh, tmp_path, suffix), None if is_bare else linear
+    compare(path, vertices, faces, None if is_bare else normals, linear)
+    compare(path, vertices[:, [0, 2, 1]] * [1, 1, -1], faces, None, linear, up="z")
+
+
+@pytest.mark.parametrize("kind", ["ply", "ascii.ply", "obj", "stl", "ascii.stl", "off"])
+def test_files_of_meshio(tmp_path, kind):
+    vertices, faces, _, _ = with_attributes("tube")
+    how = {"binary": not kind.startswith("ascii")} if kind.endswith(("ply", "stl")) else {}
+    meshio.write(tmp_path / f"a.{kind}", meshio.Mesh(vertices, [("triangle", faces)]), **how)
+    compare(tmp_path / f"a.{kind}", vertices, faces)
+
+
+@pytest.mark.parametrize(("text", "order"), [(True, "<"), (False, "<"), (False, ">")])
+@pytest.mark.parametrize("color", ["u1", "u2", "f4"])
+def test_ply_of_any_order_and_type(tmp_path, text, order, color):
+    vertices, faces, normals, colors = with_attributes("ball")
+    shares, greatest = colors / 255, 1 if color == "f4" else np.iinfo(color).max
+    stored = shares if color == "f4" else np.rint(shares * greatest)
+    columns = {"nz": normals[:, 2], **xyz(vertices), "nx": normals[:, 0]}
+    columns |= dict(
+        zip(("blue", "red", "green"), stored[:, [2, 0, 1]].astype(color).T, strict=True)
     )
-    if path is not None:
-        image.save(path)
-    return image
+    columns["ny"] = normals[:, 1].astype("f4")
+    lists = {"vertex_indices": faces.astype("i4")}
+    path = write_ply(tmp_path / "a.ply", columns, lists, text=text, order=order)
+    compare(path, vertices, faces, normals, shares if color == "f4" else srgb_to_linear(shares))
 
 
-def write_obj(path):
-    """OBJ: v grows upward."""
-    lines = (
-        [f"v {x} {y} {z}" for x, y, z in CORNERS] + [f"vt {u} {v}" for u, v in V_UP] + ["vn 0 0 1"]
-    )
-    path.write_text("\n".join([*lines, "f 1/1/1 2/2/1 3/3/1", "f 1/1/1 3/3/1 4/4/1"]) + "\n")
-
-
-def write_glb(path, uvs, *, texture=None):
-    """glTF: v grows downward."""
-    buffers = [TRIANGLES.tobytes(), CORNERS.tobytes(), uvs.astype(np.float32).tobytes()]
-    if texture is not None:
-        encoded = BytesIO()
-        texture.save(encoded, format="PNG")
-        buffers.append(encoded.getvalue())
-    starts = np.cumsum([0, *map(len, buffers)])
-    gltf = pygltflib.GLTF2(
-        scene=0,
-        scenes=[pygltflib.Scene(nodes=[0])],
-        nodes=[pygltflib.Node(mesh=0)],
-        meshes=[
-            pygltflib.Mesh(
-                primitives=[
-                    pygltflib.Primitive(
-                        attributes=pygltflib.Attributes(POSITION=1, TEXCOORD_0=2),
-                        indices=0,
-                        material=None if texture is None else 0,
-                    )
-                ]
-            )
-        ],
-        accessors=[
-            pygltflib.Accessor(
-                bufferView=0, componentType=pygltflib.UNSIGNED_SHORT, count=6, type=pygltflib.SCALAR
-            ),
-            pygltflib.Accessor(
-                bufferView=1,
-                componentType=pygltflib.FLOAT,
-                count=4,
-                type=pygltflib.VEC3,
-                min=[0, 0, 0],
-                max=[2, 2, 0],
-            ),
-            pygltflib.Accessor(
-                bufferView=2, componentType=pygltflib.FLOAT, count=4, type=pygltflib.VEC2
-            ),
-        ],
-        bufferViews=[
-            pygltflib.BufferView(buffer=0, byteOffset=int(start), byteLength=len(data))
-            for start, data in zip(starts, buffers, strict=False)
-        ],
-        buffers=[pygltflib.Buffer(byteLength=int(starts[-1]))],
-    )
-    if texture is not None:
-        gltf.images = [pygltflib.Image(bufferView=3, mimeType="image/png")]
-        gltf.textures = [pygltflib.Texture(source=0)]
-        gltf.materials = [
-            pygltflib.Material(
-                pbrMetallicRoughness=pygltflib.PbrMetallicRoughness(
-                    baseColorTexture=pygltflib.TextureInfo(index=0)
-                )
-            )
-        ]
-    gltf.set_binary_blob(b"".join(buffers))
-    gltf.save_binary(str(path))
-
-
-def reds(splats):
-    """The red of the ramp, in sRGB again, beside the height in the square, both in [0, 1]."""
-    albedo = np.asarray(splats.albedo, np.float64)
-    encoded = np.where(
-        albedo <= 0.0031308, 12.92 * albedo, 1.055 * np.maximum(albedo, 1e-9) ** (1 / 2.4) - 0.055
-    )
-    height = np.asarray(splats.centers)[:, 1] / np.asarray(splats.centers)[:, 1].max()
-    inner = np.abs(height - 0.5) < 0.48
-    return encoded[inner, 0], height[inner]
-
-
-@pytest.fixture
-def folder(tmp_path):
-    ramp(tmp_path / "ramp.png")
-    write_obj(tmp_path / "square.obj")
-    write_glb(tmp_path / "square.glb", V_UP * [1, -1] + [0, 1])
-    write_glb(tmp_path / "careless.glb", V_UP)
-    write_glb(tmp_path / "dressed.glb", V_UP * [1, -1] + [0, 1], texture=ramp())
-    return tmp_path
-
-
-@pytest.mark.parametrize(
-    ("name", "v_up", "rises"),
-    [
-        ("square.obj", None, True),
-        ("square.obj", True, True),
-        ("square.obj", False, False),
-        ("square.glb", None, True),
-        ("square.glb", False, True),
-        ("careless.glb", None, False),
-        ("careless.glb", True, True),
-    ],
-)
-def test_map_stands_upright(folder, name, v_up, rises):
-    """Red, at the top of the picture, is at the top of the square; glTF has v down, OBJ up, and a
-    file may be careless.
-    """
-    splats = sample_mesh(folder / name, 300, mm_per_unit=5.0, albedo=folder / "ramp.png", v_up=v_up)
-    red, height = reds(splats)
-    np.testing.assert_allclose(red, height if rises else 1 - height, atol=0.03)
-    np.testing.assert_allclose(float(splats.areas.sum()), 100, rtol=1e-5)
-
-
-def test_texture_within_the_file_is_worn(folder):
-    red, height = reds(sample_mesh(folder / "dressed.glb", 300, mm_per_unit=5.0))
-    np.testing.assert_allclose(red, height, atol=0.03)
-    assert sample_mesh(folder / "square.glb", 10, mm_per_unit=5.0).albedo is None
-
-
-def test_specular_and_normal_maps(folder):
-    Image.fromarray(np.full((4, 4), 51, np.uint8)).save(folder / "specular.png")
-    tilted = np.rint(255 * (np.asarray([0.6, 0.0, 0.8]) * 0.5 + 0.5) * np.ones((4, 4, 1))).astype(
-        np.uint8
-    )
-    Image.fromarray(tilted).save(folder / "normal.png")
-    splats = sample_mesh(
-        folder / "square.obj",
-        50,
-        mm_per_unit=1.0,
-        specular=folder / "specular.png",
-        normal=folder / "normal.png",
-    )
-    assert splats.albedo is None
-    np.testing.assert_allclose(np.asarray(splats.specular), 0.2, rtol=1e-6)
-    np.testing.assert_allclose(
-        np.asarray(splats.normals), np.tile([0.6, 0, 0.8], (50, 1)), atol=2 * QUANTUM
-    )
-
-
-def test_crop_cuts_the_mesh_at_a_height_in_file_units(folder):
-    splats = sample_mesh(folder / "square.obj", 200, mm_per_unit=5.0, crop_min_y=0.5)
-    assert float(splats.centers[:, 1].min()) >= 2.5 - 1e-5
-    np.testing.assert_allclose(float(splats.areas.sum()), 75, rtol=1e-5)
-    with pytest.raises(
-        ValueError, match=r"square.obj: crop_min_y = 3 leaves nothing; the mesh ends at y = 2 in"
+def test_scenes_keep_their_places_and_their_textures(tmp_path):
+    """Two balls with textures of their own, one turned, moved and mirrored, and one plain ball."""
+    vertices, faces, _, _ = with_attributes("ball")
+    material, scene = trimesh.visual.material.PBRMaterial, trimesh.Scene()
+    pictures = [Image.new("RGB", (4, 4), color) for color in ((255, 0, 0), (0, 128, 0))]
+    materials = [material(baseColorTexture=picture) for picture in pictures]
+    turn = trimesh.transformations.euler_matrix(0.3, -0.5, 1.0)
+    turn[:3, 3] = [10, 20, 30]
+    places = [np.eye(4), turn @ np.diag([-2.0, 1.0, 1.0, 1.0]), turn]
+    for own, place in zip(
+        [*materials, material(baseColorFactor=[0, 0, 255, 255])], places, strict=True
     ):
-        sample_mesh(folder / "square.obj", 200, mm_per_unit=5.0, crop_min_y=3.0)
+        visual = trimesh.visual.TextureVisuals(uv=vertices[:, :2], material=own)
+        ball = trimesh.Trimesh(vertices, faces, visual=visual, process=False)
+        scene.add_geometry(ball, transform=place)
+    moved = [vertices @ place[:3, :3].T + place[:3, 3] for place in places]
+    turned = [each + i * len(vertices) for i, each in enumerate((faces, faces[:, ::-1], faces))]
+    path = export(scene, tmp_path, "glb")
+    mesh, textures = compare(path, np.concatenate(moved), np.concatenate(turned))
+    colors = {}
+    for part, picture in enumerate(textures.albedo):
+        middle = mesh.corners()[mesh.parts == part].mean(axis=(0, 1)) / MM
+        nearest = np.argmin([np.linalg.norm(middle - each.mean(axis=0)) for each in moved])
+        colors[nearest] = picture[0, 0]
+    expected = [(1, 0, 0), (0, 0.2158605, 0), (0, 0, 1)]
+    np.testing.assert_allclose([colors[i] for i in range(3)], expected, atol=1e-6)
 
 
-def test_meshes_that_cannot_be_used_are_refused(folder):
-    def refused(kind, said, name, **options):
-        with pytest.raises(kind, match=said) as caught:
-            sample_mesh(folder / name, 10, **{"mm_per_unit": 1.0, **options})
-        assert "\n" not in str(caught.value)
+CUBE = [[0, 0, 0], [0, 0, 1], [0, 1, 1], [0, 1, 0], [1, 0, 0], [1, 0, 1], [1, 1, 1], [1, 1, 0]]
+QUADS = [[0, 1, 2, 3], [7, 6, 5, 4], [0, 4, 5, 1], [1, 5, 6, 2], [2, 6, 7, 3], [3, 7, 4, 0]]
+ROWS = "\n".join(" ".join(map(str, row)) for row in CUBE)
+EXAMPLES = {
+    "cube.ply": "ply\nformat ascii 1.0\ncomment made by Greg Turk\nelement vertex 8\n"
+    "property float x\nproperty float y\nproperty float z\nelement face 6\n"
+    f"property list uchar int vertex_index\nend_header\n{ROWS}\n"
+    + "".join("4 {} {} {} {}\n".format(*quad) for quad in QUADS),
+    "cube.off": "OFF\n# of Geomview's manual: polygons with colors\n8 6 12\n"
+    f"{ROWS}\n" + "".join("4 {} {} {} {}  255 0 0 # red\n".format(*quad) for quad in QUADS),
+    "cube.obj": "# Wavefront, appendix B1\r\ng cube\r\ns off\r\n"
+    + "".join(f"v {row} 1.0\r\n" for row in ROWS.split("\n"))
+    + "".join("f {} \\\n{} {} {}\r\n".format(*(i + 1 for i in quad)) for quad in QUADS[1:])
+    + "f 1 2 3\nf 1 3 4\n",
+}
 
-    refused(FileNotFoundError, r"none.glb: there is no such file", "none.glb")
-    refused(
-        FileNotFoundError,
-        r"none.png: there is no such file",
-        "square.obj",
-        albedo=folder / "none.png",
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_examples_of_the_formats_own_texts(tmp_path, name):
+    """Of OBJ, one side is two triangles: polygons may be mixed."""
+    (tmp_path / name).write_bytes(EXAMPLES[name].encode())
+    mesh, _ = read_textured_mesh(tmp_path / name, mm_per_unit=MM)
+    np.testing.assert_allclose(
+        (len(mesh.faces), mesh.volume(), mesh.area()), (12, MM**3, 6 * MM**2)
     )
-    refused(
-        ValueError, r"ramp.png: .png is no mesh format known here; give one of .glb", "ramp.png"
-    )
-    refused(
-        ValueError,
-        r"square.obj: cannot be read as a picture",
-        "square.obj",
-        albedo=folder / "square.obj",
-    )
-    refused(ValueError, "mm_per_unit is -1", "square.obj", mm_per_unit=-1.0)
-    (folder / "cut.glb").write_bytes((folder / "square.glb").read_bytes()[:200])
-    refused(
-        ValueError, r"cut.glb: cannot be read as glTF: its header promises 844 bytes", "cut.glb"
-    )
-    (folder / "points.obj").write_text("v 0 0 0\nv 1 0 0\n")
-    refused(ValueError, r"points.obj: ", "points.obj")
-    (folder / "bare.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
-    refused(
-        ValueError, r"bare.obj: has no texture coordinates", "bare.obj", albedo=folder / "ramp.png"
-    )
-    (folder / "flat.obj").write_text("v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n")
-    refused(ValueError, r"flat.obj: the mesh has no area", "flat.obj")
-    (folder / "nan.obj").write_text("v 0 0 0\nv nan 0 0\nv 2 1 0\nf 1 2 3\n")
-    refused(ValueError, r"nan.obj: has vertices that are not finite", "nan.obj")
-
-
-def test_glb_is_what_it_says(folder):
-    magic, version, length = struct.unpack("<4sII", (folder / "square.glb").read_bytes()[:12])
-    assert (magic, version) == (b"glTF", 2)
-    assert length == (folder / "square.glb").stat().st_size
-
-
-@pytest.mark.shared
-def test_scanned_head_wears_its_lips_on_its_mouth():
-    """The scan's GLB keeps v up. Lips are redder than the chin; with the wrong flip they would land
-    on it.
-    """
-    folder = Path(os.environ["SPLATJAX_SHARED"]) / "data" / "lee_perry_smith"
-    options = {"mm_per_unit": 53.0, "albedo": folder / "Map-COL.jpg", "crop_min_y": -0.9}
-    right, wrong = (
-        sample_mesh(folder / "LeePerrySmith.glb", 30_000, v_up=v_up, **options)
-        for v_up in (True, False)
-    )
-
-    def redness(splats, low, high):
-        x, y, z = np.asarray(splats.centers).T
-        there = (np.abs(x) < 12) & (y > low) & (y < high) & (z > 90)
-        assert there.sum() > 30
-        red, green, blue = np.asarray(splats.albedo)[there].mean(axis=0)
-        return 2 * red / (green + blue)
-
-    mouth, chin = LIPS_AND_CHIN
-    assert redness(right, *mouth) > 1.15 * redness(right, *chin)
-    assert redness(wrong, *mouth) < 1.15 * redness(wrong, *chin)
-
-
-LIPS_AND_CHIN = ((17.0, 29.0), (-12.0, 5.0))  # heights on the scan, mm

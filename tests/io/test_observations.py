@@ -1,8 +1,8 @@
 """Which pictures were taken, and how: what a file says is what is read, and what it may not say."""
 
 import numpy as np
-import OpenEXR
 import pytest
+from writers import write_picture
 
 import splatjax as sj
 from splatjax.io import picture_paths
@@ -35,27 +35,19 @@ variance = 0.5
 """
 
 
-def write_picture(path, planes):
-    with OpenEXR.File({"type": OpenEXR.scanlineimage}, planes) as file:
-        file.write(str(path))
-
-
 @pytest.fixture
-def listed(tmp_path):
-    red = np.arange(12, dtype=np.float32).reshape(3, 4)
-    write_picture(tmp_path / "one.exr", {"R": red, "G": red + 1, "B": red + 2})
-    write_picture(tmp_path / "mask.exr", {"Y": (red > 5).astype(np.float32)})
-
-    def write(text: str):
-        path = tmp_path / "pictures.toml"
-        path.write_text(text)
-        return path
-
-    return write
+def path(tmp_path):
+    red = np.arange(12.0).reshape(3, 4, 1)
+    write_picture(tmp_path / "one.exr", red + np.arange(3), "float")
+    write_picture(tmp_path / "mask.exr", red > 5, "float")
+    return tmp_path / "pictures.toml"
 
 
-def test_what_is_written_is_read(listed):
-    first, second = sj.read_observations(listed(GOOD))
+def test_what_is_written_is_read(path):
+    path.write_text(GOOD)
+    first, second = sj.read_observations(path)
+    names = [each.name for each in picture_paths(path)]
+    assert names == ["pictures.toml", "one.exr", "mask.exr", "one.exr"]
     assert first.picture.shape == (3, 4, 3)
     np.testing.assert_array_equal(first.picture[1, 2], [6, 7, 8])
     np.testing.assert_array_equal(first.mask, np.arange(12).reshape(3, 4) > 5)
@@ -78,63 +70,28 @@ def test_what_is_written_is_read(listed):
     assert float(beam.variance) == 0.5
 
 
-def test_all_files_are_named(listed, tmp_path):
-    names = [path.name for path in picture_paths(listed(GOOD))]
-    assert names == ["pictures.toml", "one.exr", "mask.exr", "one.exr"]
+BAD = [
+    ('file = "one.exr"\nmask', "mask", r"\[pictures 1\] file .* None"),
+    ("noise = 0.02", "noise = 0", r"\[pictures 1\] noise .* 0$"),
+    ("noise = 0.02", "nois = 0.02", r"\[pictures 1\] .*'nois'; did you mean 'noise'"),
+    ('"unknown"', '"maybe"', r"\[pictures 1\] intensity .*'maybe'"),
+    ("[0, 1, 50]", "[0, 1]", r"\[pictures 1 camera\] position .*\[0, 1\]"),
+    ("[0, 1, 50]", "[0, 50, 0]", r"\[pictures 1 camera\].* up is"),
+    ("[0, 1, 50]", "[0, 0, 0]", r"\[pictures 1 camera\]: eye and target are both"),
+    ("[0, 0, -1]", "[0, 0, 0]", r"\[pictures 1 lights 1\] direction .*\[0, 0, 0\]"),
+    ("[1, 2, 3]", "[1, 2]", r"\[pictures 1 lights 1\] irradiance .*\[1, 2\]"),
+    ('"directional"', '"sun"', r"\[pictures 1 lights 1\] kind .*'sun'"),
+    ("cast_shadows = false", "cast_shadows = 0", r"\[pictures 1 lights 2\] cast_shadows .* 0$"),
+    ("intensity = 5", "power = 5", r"\[pictures 1 lights 2\] .*'power'"),
+    (GOOD, "[medium]\n", "unknown entry 'medium'"),
+    (GOOD, "[[pictures", "is no TOML file"),
+    ("one.exr", "gone.exr", r"gone\.exr"),
+    ("fov = 30", "fov = 200", r"\[pictures 1 camera\] fov .* 200$"),
+]
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "said"),
-    [
-        (
-            'file = "one.exr"\nmask',
-            "mask",
-            r"\[pictures 1\] has no file; it must be the name of an EXR file",
-        ),
-        ("noise = 0.02", "noise = 0", r"\[pictures 1\] noise must be a number, positive; it is 0"),
-        ("noise = 0.02", "nois = 0.02", r"has an unknown entry 'nois'; did you mean 'noise'"),
-        (
-            '"unknown"',
-            '"maybe"',
-            r"intensity must be one of known, unknown, unknown color; it is 'maybe'",
-        ),
-        (
-            "[0, 1, 50]",
-            "[0, 1]",
-            r"\[pictures 1 camera\] position must be three numbers; it is \[0.0, 1.0\]",
-        ),
-        (
-            "[0, 1, 50]",
-            "[0, 50, 0]",
-            r"\[pictures 1 camera\] up is \[0.0, 1.0, 0.0\], along the line of sight",
-        ),
-        (
-            "[0, 1, 50]",
-            "[0, 0, 0]",
-            r"\[pictures 1 camera\] eye and target are both \[0.0, 0.0, 0.0\]",
-        ),
-        (
-            "[0, 0, -1]",
-            "[0, 0, 0]",
-            r"\[pictures 1 lights 1\] direction must be three numbers, not all 0",
-        ),
-        ("[1, 2, 3]", "[1, 2]", r"irradiance must be 3 numbers, as its picture has channels"),
-        ('"directional"', '"sun"', r"kind must be one of directional, point, beam; it is 'sun'"),
-        ("cast_shadows = false", "cast_shadows = 0", "cast_shadows must be true or false; it is 0"),
-        ("fov = 30", "fov = 200", "fov must be a number, between 0 and 180 degrees; it is 200"),
-    ],
-)
-def test_what_is_wrong_is_said(listed, old, new, said):
-    with pytest.raises(ValueError, match=said):
-        sj.read_observations(listed(GOOD.replace(old, new)))
-
-
-def test_files_that_list_nothing_are_refused(listed, tmp_path):
-    with pytest.raises(ValueError, match=r"must hold one \[\[pictures\]\] or more"):
-        sj.read_observations(listed("[medium]\n"))
-    with pytest.raises(ValueError, match="is no TOML file"):
-        sj.read_observations(listed("[[pictures"))
-    with pytest.raises(ValueError, match="cannot be read"):
-        sj.read_observations(tmp_path / "none.toml")
-    with pytest.raises(FileNotFoundError, match=r"gone\.exr"):
-        sj.read_observations(listed(GOOD.replace("one.exr", "gone.exr")))
+@pytest.mark.parametrize(("old", "new", "value"), BAD)
+def test_what_is_wrong_is_named(path, old, new, value):
+    path.write_text(GOOD.replace(old, new))
+    with pytest.raises((ValueError, FileNotFoundError), match=value):
+        sj.read_observations(path)

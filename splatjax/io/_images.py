@@ -1,0 +1,104 @@
+"""Pictures of every format that OpenImageIO reads, as arrays with row 0 at the top; and the sRGB
+transfer function (IEC 61966-2-1), both ways.
+"""
+
+import os
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from splatjax._memory import check_memory
+
+from ._files import existing_file
+
+_BYTES_PER_VALUE = 24.0  # in double precision, while they are decoded
+
+
+def read_planes(
+    path: str | os.PathLike[str],
+) -> tuple[dict[str, Float[np.ndarray, "height width"]], dict[str, Any], bool]:
+    """Read the channels of a picture by name; whole numbers become shares of the greatest that
+    their type holds. Nothing is decoded, and alpha is not multiplied in.
+
+    **Returns:** channels, attributes of the file, and whether it holds floating-point numbers.
+
+    **Raises:** `FileNotFoundError`, or `ValueError` when the file cannot be read, is cut short or
+    does not fit into memory.
+    """
+    import OpenImageIO as oiio  # 17 MB, so only where a picture is read
+
+    path = existing_file(path)
+    settings, pixels, spec = oiio.ImageSpec(), None, oiio.ImageSpec()
+    settings["oiio:UnassociatedAlpha"] = 1
+    file = oiio.ImageInput.open(str(path), settings)
+    if file is not None:
+        spec = file.spec()
+        values = float(spec.width) * spec.height * spec.nchannels
+        size = f"{path}: a picture of {spec.width} x {spec.height} x {spec.nchannels} numbers"
+        check_memory(size, _BYTES_PER_VALUE * values, "give a smaller one")
+        pixels = file.read_image("float")
+    try:
+        fault = oiio.geterror() if file is None else file.geterror()
+    except UnicodeDecodeError:  # it repeats bytes of the file
+        fault = "its header is damaged"
+    if pixels is None or fault:
+        fault = " ".join(fault.replace(f'"{path}"', "").split())
+        raise ValueError(
+            f"{path}: cannot be read as a picture ({fault}); give a whole JPEG, PNG, TIFF or "
+            "OpenEXR"
+        )
+    planes = dict(zip(spec.channelnames, np.moveaxis(pixels, -1, 0), strict=True))
+    attributes = {each.name: each.value for each in spec.extra_attribs}
+    return planes, attributes, str(spec.format) in ("half", "float", "double")
+
+
+def read_picture(path: str | os.PathLike[str]) -> Float[np.ndarray, "height width channels"]:
+    r"""Read a picture in linear light, of OpenEXR or another format of floating-point numbers.
+
+    **Returns:** R, G and B, or Y alone, as in the file.
+
+    **Raises:** `FileNotFoundError`, or `ValueError` when the file cannot be read, has neither R, G
+    and B nor Y, or holds whole numbers, which are encoded for a display.
+    """
+    values, is_linear = _colors(path)
+    if not is_linear:
+        raise ValueError(f"{path}: is encoded for a display; give linear light, such as OpenEXR")
+    return values
+
+
+def read_map(path: str | os.PathLike[str]) -> Float[np.ndarray, "height width 3"]:
+    """Read a map that holds no color: three channels, not decoded."""
+    values, _ = _colors(path)
+    return np.broadcast_to(values, (*values.shape[:2], 3))
+
+
+def read_color(path: str | os.PathLike[str]) -> Float[np.ndarray, "height width 3"]:
+    """Read an albedo in linear light: whole numbers are sRGB, floating-point numbers are linear.
+
+    **Raises:** as `read_picture` does, and `ValueError` for values outside [0, 1].
+    """
+    values, is_linear = _colors(path)
+    if not ((values >= 0) & (values <= 1)).all():
+        raise ValueError(f"{path}: has an albedo outside [0, 1]; scale it, or remove what is NaN")
+    return np.broadcast_to(values if is_linear else srgb_to_linear(values), (*values.shape[:2], 3))
+
+
+def _colors(path: str | os.PathLike[str]) -> tuple[Float[np.ndarray, "height width _"], bool]:
+    planes, _, is_linear = read_planes(path)
+    names = "RGB" if "R" in planes else "Y"
+    if not planes.keys() >= set(names):
+        raise ValueError(f"{path}: has neither R, G and B nor Y; it has {', '.join(planes)}")
+    with np.errstate(invalid="ignore"):  # of NaN that signals
+        return np.stack([planes[name] for name in names], axis=-1).astype(np.float64), is_linear
+
+
+def srgb_to_linear(encoded: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+    """Decode sRGB values in [0, 1] to linear light."""
+    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+
+
+def linear_to_srgb(linear: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+    """Encode linear light for an sRGB display; values beyond [0, 1] are clipped, NaN becomes 0."""
+    shown = np.where(np.isnan(linear), 0.0, np.clip(linear, 0.0, 1.0))
+    return np.where(shown <= 0.0031308, 12.92 * shown, 1.055 * shown ** (1 / 2.4) - 0.055)

@@ -1,0 +1,174 @@
+"""Files read by trimesh: what it would misread in silence is refused before, what it raises becomes
+one sentence, and what it leaves out a warning.
+"""
+
+import json
+import logging
+import re
+import warnings
+from collections.abc import Generator
+from contextlib import contextmanager
+from io import BytesIO
+from pathlib import Path
+from typing import Any, cast
+from urllib.parse import unquote
+
+import numpy as np
+from PIL import Image
+
+FORMATS = ("glb", "gltf", "obj", "off", "ply", "stl")
+"""Suffixes of meshes."""
+_OBJ_CORNER = rb"[1-9]\d*(?:/(?:[1-9]\d*)?(?:/(?:[1-9]\d*)?)?)?"
+_OBJ_READ = rb"v[tn]?(?: +[^\s/_]+){2,7} *|f(?: +%s){3,} *" % _OBJ_CORNER
+_GLTF = rb"""
+    "extensionsRequired"\s*:\s*\[[^]]*"(?!EXT_texture_webp"|KHR_lights_punctual"|KHR_materials_)\w+"
+    |"KHR_materials_pbrSpecularGlossiness"\s*: | "sparse"\s*:\s*{ | "mode"\s*:\s*6
+    |"image/(?!png"|jpeg"|webp")[^"]*"
+    |"baseColorTexture"\s*:\s*{[^{}]*(?:"texCoord"\s*:\s*[1-9]|{\s*"KHR_texture_transform")
+    """
+_UNREAD = {
+    "gltf": re.compile(_GLTF, re.VERBOSE),
+    "obj": re.compile(
+        rb"^(?!(?:%s)$)[ \t]*(?:f|v[tn]?|curv2?|surf|bzp|bsp)(?:[ \t].*)?$" % _OBJ_READ
+        + rb"|^mtllib (?=(?s:.*)\nmtllib )",
+        re.MULTILINE,
+    ),
+    "ply": re.compile(rb"comment texturefile.*comment texturefile", re.DOTALL | re.IGNORECASE),
+    "stl": re.compile(rb"\A\s*solid(?!.*\bendsolid[^\n]*\s*\Z)", re.DOTALL | re.IGNORECASE),
+}
+"""What trimesh passes over or takes for something else: compressed, moved and several textures,
+fans, curves, polygons without three corners, solids without end."""
+_FLOAT = 5126
+
+
+def _count_obj(text: bytes) -> int:
+    faces = re.findall(rb"^f .*", text, re.MULTILINE)
+    if {b"/", b"//"} <= set(b" ".join(faces).translate(None, b"0123456789").split()):
+        raise ValueError("it mixes faces of v/vt and v//vn")
+    return sum(len(face.split()) - 3 for face in faces)
+
+
+def _count_off(text: bytes) -> int:
+    rows = [row for line in text.splitlines() if (row := line.split(b"#")[0].split())]
+    vertices, polygons = (int(word) for word in rows[1][:2])
+    promised = rows[2 + vertices : 2 + vertices + polygons]
+    if rows[0] != [b"OFF"] or len(promised) != polygons:
+        raise ValueError(f"it has no OFF header, or not its {vertices} + {polygons} rows")
+    return sum(int(row[0]) - 2 for row in promised)
+
+
+def _check_gltf(text: bytes) -> None:
+    content = json.loads(text)
+    primitives = [each for mesh in content.get("meshes", []) for each in mesh["primitives"]]
+    for name in ("POSITION", "TEXCOORD_0"):
+        used = {each["attributes"].get(name) for each in primitives} - {None}
+        if any(content["accessors"][i]["componentType"] != _FLOAT for i in used):
+            raise ValueError("its vertices are quantized")
+
+
+_COUNTS = {"obj": _count_obj, "off": _count_off, "gltf": _check_gltf}
+"""How many triangles a file promises, where its format has that."""
+
+
+def _count_triangles(kind: str, data: bytes) -> int | None:
+    """Refuse what trimesh would misread, and return how many triangles the file promises."""
+    if kind == "glb":
+        kind, text = "gltf", data[20:][: int.from_bytes(data[12:16], "little")]
+    elif kind == "stl" and len(data) == 84 + 50 * int.from_bytes(data[80:84], "little"):
+        text = b""  # it is binary
+    elif kind == "ply":
+        text = data.partition(b"end_header")[0]
+    else:
+        text = data.replace(b"\r\n", b"\n").replace(b"\\\n", b" ")
+    is_lines = kind in ("obj", "off") or (kind == "ply" and b"format ascii" in text)
+    if is_lines and not data.endswith((b"\n", b"\r")):
+        raise ValueError("its last line has no end")
+    if kind in _UNREAD and (unread := _UNREAD[kind].search(text)):
+        raise ValueError(f"`{unread[0][:200].decode(errors='replace')}` is not read")
+    return _COUNTS[kind](text) if kind in _COUNTS else None
+
+
+@contextmanager
+def one_sentence(path: Path) -> Generator[None, None, None]:
+    """Turn whatever a library raises into an error that names the file, the reason and the remedy.
+
+    **Raises:** `ValueError`; errors that already name the file pass.
+    """
+    log = logging.getLogger("trimesh")  # it prints what is raised or left out
+    before = log.level
+    log.setLevel(logging.CRITICAL)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", DeprecationWarning)  # NumPy's, of words among numbers
+            yield
+    except Exception as error:  # each reader fails in its own way
+        if isinstance(error, (ValueError, OSError)) and str(error).startswith(str(path)):
+            raise
+        kind = "" if isinstance(error, ValueError) else f"{type(error).__name__} "
+        raise ValueError(
+            f"{path}: cannot be read ({kind}{' '.join(str(error).split())[:200]}); it is cut "
+            "short, or of a kind that is not read: export it again"
+        ) from None
+    finally:
+        log.setLevel(before)
+
+
+def load_with_trimesh(path: Path, kind: str) -> dict[str, Any]:
+    """Read a file of some kind by trimesh.
+
+    Pictures and materials that are missing or unreadable are left out, with a warning.
+
+    **Returns:** the arguments of its meshes, as the file has them; its `contents`; `triangles`,
+    how many it promises, where it does; and of a PLY file `columns`, the properties of each
+    element.
+
+    **Raises:** `ValueError` for contents that trimesh would misread, and when it reads fewer rows
+    than a PLY file promises.
+    """
+    from trimesh.exchange import load  # takes a second, so only where it is needed
+
+    folder, data = _Folder(path), path.read_bytes()
+    loaders, count = cast(dict[str, Any], load.mesh_loaders), _count_triangles(kind, data)
+    found = loaders[kind](BytesIO(data), resolver=folder, fix_texture=False)
+    elements = found.get("metadata", {}).get("_ply_raw", {})
+    columns = {name: _columns(name, element) for name, element in elements.items()}
+    for fault in folder.faults:
+        warnings.warn(f"{path}: {fault}, and its colors are left out", stacklevel=2)
+    return found | {"triangles": count, "contents": data, "columns": columns}
+
+
+def _columns(name: str, element: dict[str, Any]) -> dict[str, np.ndarray]:
+    """Return the properties of an element of a PLY file: a number or a list for each row."""
+    columns = {}
+    for key in element["properties"] if element["length"] else ():
+        column = np.asarray(element["data"][key])
+        if column.dtype.names:
+            sizes, column = column["f0"], column["f1"]
+            if np.ptp(sizes):
+                raise ValueError(f"{key} are lists of several lengths, such as mixed polygons")
+        if len(column) != element["length"]:
+            raise ValueError(f"its header promises {element['length']} rows of {name}")
+        columns[key] = column[:, 0] if column.shape[1:] == (1,) else column
+    return columns
+
+
+class _Folder:
+    """The files beside a mesh: a resolver that notes what is missing."""
+
+    def __init__(self, path: Path):
+        from trimesh.resolvers import FilePathResolver  # never leaves the folder
+
+        self._files, self.file_name = FilePathResolver(str(path)), path.name
+        self.faults: list[str] = []
+
+    def get(self, name: str) -> bytes:
+        try:
+            data = self._files.get(unquote(name.replace("\\", "/")))
+            if not name.strip().lower().endswith((".mtl", ".bin")):
+                Image.open(BytesIO(data)).close()
+        except Exception:  # each decoder fails in its own way
+            self.faults.append(f"names {name!r}, which is not beside it, or no picture")
+            raise
+        return data
+
+    __getitem__ = get

@@ -1,0 +1,102 @@
+"""Measured profiles and media as CSV, exports and records as JSON."""
+
+import json
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from splatjax.io import (
+    fingerprint,
+    join_tables,
+    load_material,
+    read_column,
+    read_media,
+    read_profile,
+    read_record,
+    save_exports,
+    write_columns,
+    write_record,
+)
+
+GOOD = "r,red,green\n# measured in cm\n0.0, 4.0, 3.0\n\n0.1, 2.0, 1.0\n0.3, 0.5, 0.25\n"
+
+
+def test_a_table_is_read_in_its_own_unit(tmp_path, dtype):
+    (tmp_path / "milk.csv").write_text(GOOD)
+    profile = read_profile(tmp_path / "milk.csv", mm_per_unit=10.0)
+    assert profile.radii.dtype == jnp.result_type(float)
+    np.testing.assert_allclose(profile.radii, [0, 1, 3], rtol=1e-6)
+    expected = np.asarray([[4, 3], [2, 1], [0.5, 0.25]]) / 100
+    np.testing.assert_allclose(profile.values, expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("", "0 lines"),
+        ("r,R\n0,1\n", "1 lines"),
+        (GOOD.replace("2.0", "two"), "line 5: 0.1, two, 1.0"),
+        (GOOD.replace("2.0", "nan"), "line 5: 0.1, nan, 1.0"),
+        (GOOD.replace("2.0, 1.0", "2.0"), "line 5: 0.1, 2.0"),
+        ("0\n1\n", "line 1: 0.0 "),
+        (GOOD.replace("0.3,", "0.1,"), "radii"),
+        (GOOD.replace("0.0,", "-1,"), "radii"),
+        ("r (cm), R\n0.1, 1\n0.2, 0.5\n", r"line 1 gives cm.* mm_per_unit = 10 "),
+        ("r (um), R\n0.1, 1\n0.2, 0.5\n", r"line 1 gives um.* mm_per_unit = 0.001 "),
+        (b"\xff\xfe", "text"),
+    ],
+)
+def test_a_bad_profile_is_refused_with_its_line(tmp_path, text, value):
+    path = tmp_path / "bad.csv"
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    with pytest.raises(ValueError, match=rf"bad.csv: .*{value}"):
+        read_profile(path)
+
+
+MEDIA = "name,sigma_a,sigma_s_prime,eta\nmilk, 0, 1.5, 1.3\n\n,0.1,2,1.4\n"
+
+
+def test_media_are_read_and_their_columns_come_back(tmp_path):
+    (tmp_path / "media.csv").write_text(MEDIA)
+    names, media = read_media(tmp_path / "media.csv")
+    assert names == ["milk", "2"]
+    np.testing.assert_array_equal(media, [[0, 1.5, 1.3], [0.1, 2, 1.4]])
+    parts = [tmp_path / "a.csv", tmp_path / "b.csv"]
+    for part, row in zip(parts, media, strict=True):
+        write_columns(part, {"name": ["x"], "eta": row[2:] / 3})
+    join_tables(tmp_path / "all.csv", parts)
+    np.testing.assert_array_equal(read_column(tmp_path / "all.csv", "eta"), media[:, 2] / 3)
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("", "sigma_a"),
+        ("sigma_a,eta\n1,1\n", "sigma_s_prime"),
+        (MEDIA.split("\n")[0] + "\n", "0 rows"),
+        (MEDIA.replace("1.5", "0"), "line 2: milk, 0.0, 0.0"),
+        (MEDIA.replace("1.5", "many"), "line 2: milk, 0.0, many"),
+        (MEDIA.replace(",1.4", ""), "line 4: , 0.1, 2.0 must be name"),
+    ],
+)
+def test_bad_media_are_refused_with_their_line(tmp_path, text, value):
+    (tmp_path / "bad.csv").write_text(text)
+    with pytest.raises(ValueError, match=rf"bad.csv: .*{value}"):
+        read_media(tmp_path / "bad.csv")
+
+
+def test_exports_are_written_whole(tmp_path):
+    path, variances = tmp_path / "skin.json", [0.0064, 0.0484, 0.187, 0.567, 1.99, 7.41]
+    save_exports(load_material("skin"), path)
+    np.testing.assert_allclose(read_record(path)["gaussians"]["variances"], variances)
+
+
+def test_records_come_back_and_fingerprints_tell_contents_apart(tmp_path):
+    record, path = {"--frames": 12, "--fill": 0.1, "splats": None}, tmp_path / "record.json"
+    write_record(path, record)
+    assert read_record(path) == record == json.loads(path.read_text())
+    path.write_bytes(b"abc")
+    assert fingerprint(path).startswith("3 bytes, SHA-256 ba7816bf")
+    path.write_bytes(b"abd")
+    assert not fingerprint(path).endswith("ba7816bf")

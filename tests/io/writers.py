@@ -1,0 +1,132 @@
+"""Small files of meshes and points, written as their formats prescribe."""
+
+import base64
+import json
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO as oiio
+import trimesh
+from PIL import Image
+
+from splatjax.geometry import complete_splats
+
+SQUARE = np.asarray([[0, 0, 0], [2, 0, 0], [2, 2, 0], [0, 2, 0]], np.float32)
+TRIANGLES = np.asarray([[0, 1, 2], [0, 2, 3]])
+UVS = SQUARE[:, :2] / 2  # v = 1 at the top of the square
+SUFFIXES = {
+    "ply": {"vertex_normal": True},
+    "ascii.ply": {"vertex_normal": True, "encoding": "ascii"},
+    "obj": {"include_normals": True},
+    "glb": {"include_normals": True},
+    "gltf": {"include_normals": True},
+    "stl": {},
+    "ascii.stl": {"file_type": "stl_ascii"},
+    "off": {},
+}
+"""Formats, and the options by which trimesh writes them with normals."""
+_PLY_TYPES = {"u1": "uchar", "u2": "ushort", "i4": "int", "f4": "float", "f8": "double"}
+
+
+def export(mesh, folder, suffix, **options):
+    """Write a mesh or a scene by trimesh; return the file."""
+    path, options = Path(folder, f"a.{suffix}"), SUFFIXES[suffix] | options
+    if suffix != "gltf":
+        mesh.export(path, **options)
+        return path
+    for name, data in mesh.export(file_type="gltf", **options).items():
+        Path(folder, name).write_bytes(data)
+    return Path(folder, "model.gltf")
+
+
+def write_ply(path, columns, lists=None, *, text=False, order="<", comments=()):
+    """Write columns of vertices of any type, in their order, and lists of faces by their names."""
+    kind = "ascii" if text else {"<": "binary_little_endian", ">": "binary_big_endian"}[order]
+    table = np.rec.fromarrays([np.asarray(column) for column in columns.values()])
+    header = ["ply", f"format {kind} 1.0", *(f"comment {line}" for line in comments)]
+    header.append(f"element vertex {len(table)}")
+    for name, column in columns.items():
+        header.append(f"property {_PLY_TYPES[np.asarray(column).dtype.str[1:]]} {name}")
+    polygons = list(zip(*lists.values(), strict=True)) if lists else []
+    header += [f"element face {len(polygons)}"] if lists else []
+    for name, values in (lists or {}).items():
+        header.append(f"property list uchar {_PLY_TYPES[values[0].dtype.str[1:]]} {name}")
+    if text:
+        rows = [" ".join(map(repr, row.tolist())) for row in table]
+        rows += [" ".join(f"{len(v)} {' '.join(map(str, v))}" for v in row) for row in polygons]
+        body = "".join(f"{row}\n" for row in rows).encode()
+    else:
+        body = table.astype(table.dtype.newbyteorder(order)).tobytes()
+        for values in (values for row in polygons for values in row):
+            body += bytes([len(values)]) + values.astype(values.dtype.newbyteorder(order)).tobytes()
+    path.write_bytes("\n".join([*header, "end_header\n"]).encode() + body)
+    return path
+
+
+def xyz(points, names=("x", "y", "z")):
+    """Return columns of points, or of other vectors."""
+    return dict(zip(names, np.asarray(points).T, strict=True))
+
+
+def some_splats(count=50):
+    """Return a patch of a sphere, every field given."""
+    random = np.random.default_rng(1)
+    normals = random.normal(size=(count, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    shares = random.uniform(size=(7, count))
+    fields = dict(zip(("radii", "areas", "specular", "roughness"), 0.5 + shares, strict=False))
+    return complete_splats(20 * normals, normals=normals, albedo=shares[4:].T, **fields)
+
+
+def columns_of(splats, kind="f4"):
+    """Return columns in an order of their own."""
+    columns = xyz(splats.normals, ("nx", "ny", "nz")) | {
+        "radius": splats.radii,
+        "area": splats.areas,
+    }
+    columns |= xyz(splats.centers)
+    return {name: np.asarray(columns[name], kind) for name in sorted(columns, reverse=True)}
+
+
+def square(**visual):
+    """Return the square as trimesh has it, with texture coordinates."""
+    made = trimesh.visual.TextureVisuals(uv=UVS, **visual)
+    return trimesh.Trimesh(SQUARE, TRIANGLES, visual=made, process=False)
+
+
+def gltf(path, mesh=None, **changes):
+    """Write the square, or another mesh, as glTF with its data in the file, and with changed
+    entries: `mesh_0_primitives_0_mode=6` changes that of the first primitive.
+    """
+    files = (mesh or square()).export(file_type="gltf")
+    content = json.loads(files["model.gltf"])
+    for buffer in content["buffers"]:
+        data = base64.b64encode(files[buffer["uri"]]).decode()
+        buffer["uri"] = f"data:application/octet-stream;base64,{data}"
+    for name, value in changes.items():
+        *outer, last = [int(key) if key.isdigit() else key for key in name.split("_")]
+        place = content
+        for key in outer:
+            place = place[key]
+        place[last] = value
+    path.write_text(json.dumps(content))
+    return path
+
+
+def ramp():
+    """Return a picture that is red at the top, row 0, and green at the bottom."""
+    rows = np.linspace(1, 0, 64)[:, None] * np.ones(8)
+    return Image.fromarray(
+        np.rint(255 * np.stack([rows, 1 - rows, 0 * rows], axis=-1)).astype(np.uint8)
+    )
+
+
+def write_picture(path, values, kind):
+    """Write shares in [0, 1] by OpenImageIO, as a type of number."""
+    file = oiio.ImageOutput.create(str(path))
+    spec = oiio.ImageSpec(values.shape[1], values.shape[0], values.shape[2], kind)
+    spec["oiio:UnassociatedAlpha"] = 1
+    assert file.open(str(path), spec)
+    assert file.write_image(values.astype(np.float32))
+    assert file.close()
+    return path
