@@ -147,10 +147,10 @@ class ClusterDiffuser(AbstractDiffuser):
     ) -> Neighbors:
         """Find the sources of one layer within reach of the splats of every part."""
         depths = kernel.depths(jnp.stack([variance, largest]))
-        boxes, spread = source_boxes(clusters, depths)
+        boxes = source_boxes(clusters, depths[0])
         # Sources of a wider layer lie deeper than those of the boxes.
         sinking = math.sqrt(3) * float(depths[1] - depths[0])
-        reach = support * math.sqrt(float(largest) + float(spread)) + sinking
+        reach = support * math.sqrt(float(largest)) + sinking
         points = [_target_boxes(part.centers.T - origin[:, None]) for part in parts]
         steps = _same_size([find_neighbors(each, boxes, reach) for each in points])
         points = jax.tree.map(lambda *rows: jnp.concatenate(rows), *points)
@@ -212,7 +212,7 @@ class ClusterPlan(AbstractDiffusionPlan):
                 continue
             given = levels[layer.level], points, variance, depth
             found, missed = self._layer(*given, kernel, layer.support, layer.neighbors, wanted)
-            values.append(split_layer(found, variance))
+            values.append(split_layer(found, 2 * in_sums(variance)))
             needed.append(missed)
         largest_need = jnp.max(jnp.stack(needed)) if needed else jnp.zeros((), variances.dtype)
         return Diffused(tuple(values), combination.largest([largest_need]))
@@ -224,15 +224,15 @@ class ClusterPlan(AbstractDiffusionPlan):
         steps = neighbors.steps if wanted is None else neighbors.steps.only(wanted, BLOCK)
         below = clusters.lowered(depth)
         truncated = kernel.truncated(support)
-        table, widest = layer_table(below, variance, depth, truncated)
+        table = layer_table(below, variance, depth, truncated)
         finish = LayerFinish(below.irradiance.shape[0])
-        blocks = points_blocks(points, steps, BLOCK)
+        blocks = points_blocks(points * in_sums(variance), steps, BLOCK)
         sums = self.sums(blocks, table, steps, truncated, finish)
         found = sums[: points.shape[1] // BLOCK].transpose(1, 0, 2).reshape(sums.shape[1], -1)
         needed = neighbors.needed(
             _target_boxes(points),
             Boxes.around(below.centers, below.areas > 0, SOURCES),
-            support * stop_gradient(jnp.sqrt(widest)),
+            support * stop_gradient(jnp.sqrt(variance)),
         )
         return found, needed.astype(found.dtype)
 
@@ -255,21 +255,23 @@ def layer_table(
     depth: Float[Array, ""],
     truncated: TruncatedGaussian,
     slopes: bool = True,
-) -> tuple[Float[Array, "blocks_and_one columns block"], Float[Array, ""]]:
-    """Lay out the sources of one layer: light, mass and, for slopes, first moments of both. Also
-    return the largest variance of a source.
-    """
-    widths = variance + below.spread
+) -> Float[Array, "blocks_and_one columns block"]:
+    """Lay out the sources of one layer: light, mass and, for slopes, the first moments of both."""
     # A flat sheet has mass 1.
-    flat = 1 / (2 * jnp.pi * widths * truncated.integral(0.5 * depth * depth / widths))
+    flat = 1 / (2 * jnp.pi * variance * truncated.integral(0.5 * depth * depth / variance))
     mass = (below.areas * flat)[None]
     light = jnp.concatenate([mass * below.irradiance, mass])
+    centers = below.centers * in_sums(variance)
     rows = light
     if slopes:
-        firsts = light[:, None] * below.centers[None]
+        firsts = light[:, None] * centers[None]
         rows = jnp.concatenate([light, firsts.reshape(-1, light.shape[1])])
-    table = source_table(below.centers, 0.5 / widths, rows, SOURCES)
-    return table, jnp.max(widths, where=below.areas > 0, initial=0)
+    return source_table(centers, rows, SOURCES)
+
+
+def in_sums(variance: Float[Array, ""]) -> Float[Array, ""]:
+    """Compute the length of a millimeter in `gaussian_sums`, whose exponent is a squared length."""
+    return jnp.sqrt(0.5 / variance)
 
 
 def _target_boxes(points: Float[Array, "3 points"]) -> Boxes:
@@ -285,11 +287,9 @@ def _levels(tree: ClusterTree, sources: Sources) -> tuple[Float[Array, "3"], lis
 
 
 @eqx.filter_jit
-def source_boxes(clusters: Clusters, depths: Float[Array, "2"]) -> tuple[Boxes, Float[Array, ""]]:
-    """Enclose the sources at the first depth, and find their greatest spread at either."""
-    below, exists = clusters.lowered(depths[0]), clusters.areas > 0
-    spread = jnp.maximum(jnp.max(below.spread), jnp.max(clusters.lowered(depths[1]).spread))
-    return Boxes.around(below.centers, exists, SOURCES), spread
+def source_boxes(clusters: Clusters, depth: Float[Array, ""]) -> Boxes:
+    """Enclose the sources of a layer."""
+    return Boxes.around(clusters.lowered(depth).centers, clusters.areas > 0, SOURCES)
 
 
 def _same_size(steps: Sequence[Steps]) -> Steps:

@@ -1,5 +1,6 @@
 """Splats merged into clusters: fewer sources for wider layers (section 4.2, Figure 5)."""
 
+import dataclasses
 from collections.abc import Sequence
 
 import equinox as eqx
@@ -20,47 +21,21 @@ class Clusters(eqx.Module):
     - `centers`, `normals`: means over the area; mean normals are shorter than one where the surface
       bends.
     - `areas`, `irradiance`: sums of the areas, mm^2, and means over them.
-    - `spread`: half the mean squared distance of the splats from the center: the variance per axis
-      of a flat cluster, mm^2.
-    - `divergence`: mean product of the offsets from center and mean normal, mm: positive where the
-      surface is convex.
-    - `normal_spread`: mean square of the offset from the mean normal.
     """
 
     centers: Float[Array, "3 clusters"]
     normals: Float[Array, "3 clusters"]
     areas: Float[Array, " clusters"]
     irradiance: Float[Array, "channels clusters"]
-    spread: Float[Array, " clusters"]
-    divergence: Float[Array, " clusters"]
-    normal_spread: Float[Array, " clusters"]
 
     @classmethod
     def of(cls, sources: Sources) -> "Clusters":
         """Take each splat as a cluster of its own."""
-        zero = jnp.zeros_like(sources.areas)
-        return cls(
-            centers=sources.centers,
-            normals=sources.normals,
-            areas=sources.areas,
-            irradiance=sources.irradiance,
-            spread=zero,
-            divergence=zero,
-            normal_spread=zero,
-        )
+        return cls(sources.centers, sources.normals, sources.areas, sources.irradiance)
 
     def lowered(self, depth: Float[Array, ""]) -> "Clusters":
-        """Move the splats of every cluster against their normals by `depth` (mm)."""
-        spread = self.spread - depth * self.divergence + 0.5 * depth * depth * self.normal_spread
-        return Clusters(
-            centers=self.centers - depth * self.normals,
-            normals=self.normals,
-            areas=self.areas,
-            irradiance=self.irradiance,
-            spread=jnp.maximum(spread, 0),
-            divergence=self.divergence - depth * self.normal_spread,
-            normal_spread=self.normal_spread,
-        )
+        """Move every cluster against its normal by `depth` (mm)."""
+        return dataclasses.replace(self, centers=self.centers - depth * self.normals)
 
     def merged(self, parents: Int[Array, " clusters"], count: int) -> "Clusters":
         """Merge into `count` parents. Area and energy are kept. Differentiable."""
@@ -68,35 +43,11 @@ class Clusters(eqx.Module):
         def totals(rows: Float[Array, "rows clusters"]) -> Float[Array, "rows parents"]:
             return jax.vmap(lambda row: jax.ops.segment_sum(row, parents, count))(rows)
 
-        def mean(rows: Float[Array, "rows clusters"]) -> Float[Array, "rows parents"]:
-            return totals(self.areas[None] * rows) * inverse
-
         # Means over the area of the children.
         areas = totals(self.areas[None])[0]
-        inverse = 1 / jnp.where(areas > 0, areas, 1.0)[None]
-        means = mean(jnp.concatenate([self.centers, self.normals, self.irradiance]))
-        centers, normals, irradiance = means[:3], means[3:6], means[6:]
-        # Second moments about these means, with those of the children (parallel axis theorem).
-        offset = self.centers - centers[:, parents]
-        normal_offset = self.normals - normals[:, parents]
-        spread, divergence, normal_spread = mean(
-            jnp.stack(
-                [
-                    self.spread + 0.5 * jnp.sum(offset * offset, axis=0),
-                    self.divergence + jnp.sum(offset * normal_offset, axis=0),
-                    self.normal_spread + jnp.sum(normal_offset * normal_offset, axis=0),
-                ]
-            )
-        )
-        return Clusters(
-            centers=centers,
-            normals=normals,
-            areas=areas,
-            irradiance=irradiance,
-            spread=spread,
-            divergence=divergence,
-            normal_spread=normal_spread,
-        )
+        rows = jnp.concatenate([self.centers, self.normals, self.irradiance])
+        means = totals(self.areas[None] * rows) / jnp.where(areas > 0, areas, 1.0)[None]
+        return Clusters(means[:3], means[3:6], areas, means[6:])
 
 
 class ClusterTree(eqx.Module):

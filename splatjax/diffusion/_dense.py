@@ -83,5 +83,5 @@ def dense_layer(
 
     if sources.areas.shape[0] == 0 or points.shape[1] == 0:
         shape = 4 * (sources.irradiance.shape[0] + 1), points.shape[1]
-        return split_layer(jnp.zeros(shape, points.dtype), variance)
-    return split_layer(map_chunks(evaluate, points.T, at_once=_AT_ONCE).T, variance)
+        return split_layer(jnp.zeros(shape, points.dtype), 1 / variance)
+    return split_layer(map_chunks(evaluate, points.T, at_once=_AT_ONCE).T, 1 / variance)

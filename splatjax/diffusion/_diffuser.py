@@ -142,8 +142,8 @@ def layer_values(
     firsts: Float[Array, "values 3 points"],
     points: Float[Array, "3 points"],
 ) -> Float[Array, "_ points"]:
-    r"""Divide the sums of one layer: rows of means, mass, and the slopes of both times the
-    variance; all 0 where nothing is in reach.
+    r"""Divide the sums of one layer: rows of means, mass, and the slopes of both but for a
+    factor; all 0 where nothing is in reach.
 
     **Arguments:**
 
@@ -161,7 +161,7 @@ def layer_values(
     return jnp.where(reached[None], jnp.concatenate([means, mass[None], slopes]), 0.0)
 
 
-def split_layer(rows: Float[Array, "rows points"], variance: Float[Array, ""]) -> LayerValues:
-    """Split the rows that `layer_values` stacks."""
+def split_layer(rows: Float[Array, "rows points"], scale: Float[Array, ""]) -> LayerValues:
+    """Split the rows that `layer_values` stacks; `scale` makes slopes of them (1/mm)."""
     values = rows.shape[0] // 4
-    return LayerValues(rows[:values], rows[values:].reshape(values, 3, -1) / variance)
+    return LayerValues(rows[:values], rows[values:].reshape(values, 3, -1) * scale)

@@ -3,7 +3,8 @@ the weights.
 
 Every block of points has a list of the blocks of sources near it. Some blocks of points, one per
 *lane*, are swept together; in a *step* each lane meets the next few blocks of its list. Tables hold
-center, rate and the summed rows, one block of sources after the other.
+centers and the summed rows, one block of sources after the other. The unit of length is the
+standard deviation times the root of 2.
 """
 
 from collections.abc import Callable
@@ -68,11 +69,11 @@ class _Rule(eqx.Module):
 
     def weights(self, points, sources):
         """Compute weights `[lanes, sources, points]`, minus their derivatives in the exponent,
-        offsets and squared distances.
+        and offsets.
         """
         dx, dy, dz = (points[:, axis, None] - sources[:, axis, :, None] for axis in range(3))
         squared = dx * dx + dy * dy + dz * dz
-        return *self.kernel(sources[:, 3, :, None] * squared), (dx, dy, dz), squared
+        return *self.kernel(squared), (dx, dy, dz)
 
     def sums(self, steps: Steps, sweep, here, table):
         """Sum over all that a sweep's points meet."""
@@ -80,9 +81,9 @@ class _Rule(eqx.Module):
         def add(step, sums):
             sources, _ = _met(table, steps, step)
             weights, *_ = self.weights(here, sources)
-            return sums + jnp.einsum("lrs,lsp->lrp", sources[:, 4:], weights)
+            return sums + jnp.einsum("lrs,lsp->lrp", sources[:, 3:], weights)
 
-        start = jnp.zeros((here.shape[0], table.shape[1] - 4, here.shape[2]), here.dtype)
+        start = jnp.zeros((here.shape[0], table.shape[1] - 3, here.shape[2]), here.dtype)
         return lax.fori_loop(steps.begins[sweep], steps.ends[sweep], add, start)
 
 
@@ -97,12 +98,11 @@ def points_blocks(
 
 def source_table(
     centers: Float[Array, "3 sources"],
-    rates: Float[Array, " sources"],
     rows: Float[Array, "rows sources"],
     block: int,
 ) -> Float[Array, "blocks_and_one columns block"]:
     """Lay out sources, `block` of them to a block; the last block is empty."""
-    columns = jnp.concatenate([centers, rates[None], rows])
+    columns = jnp.concatenate([centers, rows])
     return jnp.pad(
         columns.reshape(columns.shape[0], -1, block).transpose(1, 0, 2), ((0, 1), (0, 0), (0, 0))
     )
@@ -137,36 +137,36 @@ def _forward(rule: _Rule, steps: Steps, points, table):
 
 def _empty(rule: _Rule, points, table):
     sums = jax.ShapeDtypeStruct(
-        (points.shape[0], table.shape[1] - 4, points.shape[2]), points.dtype
+        (points.shape[0], table.shape[1] - 3, points.shape[2]), points.dtype
     )
     values = jax.eval_shape(rule.finished, sums, points)
     return zeros_after(table, values.shape, values.dtype)
 
 
-def _derivative(rule: _Rule, steps: Steps, points, table, d_table):
-    """Compute the values and their derivative along `d_table`; weights are evaluated once."""
-    rows = table.shape[1] - 4
+def _derivative(rule: _Rule, steps: Steps, points, table, d_points, d_table):
+    """Compute the values and their derivative along a direction; weights are evaluated once."""
+    rows = table.shape[1] - 3
 
     def sweep(i, lanes):
-        here = points.at[lanes].get(mode="promise_in_bounds")
+        here, d_here = (each.at[lanes].get(mode="promise_in_bounds") for each in (points, d_points))
 
         def add(step, sums):
             (sources, _), (moved, _) = _met(table, steps, step), _met(d_table, steps, step)
-            weights, falls, offsets, squared = rule.weights(here, sources)
-            nearer = sum(offset * moved[:, axis, :, None] for axis, offset in enumerate(offsets))
-            d_weights = falls * (
-                2 * sources[:, 3, :, None] * nearer - moved[:, 3, :, None] * squared
+            weights, falls, offsets = rule.weights(here, sources)
+            nearer = sum(
+                offset * (moved[:, axis, :, None] - d_here[:, axis, None])
+                for axis, offset in enumerate(offsets)
             )
-            both = jnp.concatenate([sources[:, 4:], moved[:, 4:]], axis=1)
+            d_weights = 2 * falls * nearer
+            both = jnp.concatenate([sources[:, 3:], moved[:, 3:]], axis=1)
             both = jnp.einsum("lrs,lsp->lrp", both, weights)
-            moving = jnp.einsum("lrs,lsp->lrp", sources[:, 4:], d_weights)
+            moving = jnp.einsum("lrs,lsp->lrp", sources[:, 3:], d_weights)
             return sums + both.at[:, rows:].add(moving)
 
         start = jnp.zeros((here.shape[0], 2 * rows, here.shape[2]), here.dtype)
         sums = lax.fori_loop(steps.begins[i], steps.ends[i], add, start)
-        values, slopes = jax.jvp(
-            lambda sums: rule.finished(sums, here), (sums[:, :rows],), (sums[:, rows:],)
-        )
+        along = sums[:, rows:], d_here
+        values, slopes = jax.jvp(rule.finished, (sums[:, :rows], here), along)
         return jnp.concatenate([values, slopes], axis=1)
 
     empty = _empty(rule, points, table)
@@ -187,26 +187,23 @@ def _backward(rule: _Rule, steps: Steps, points, table, sums, cotangents):
         def add(step, carry):
             d_here, d_table = carry
             sources, ids = _met(table, steps, step)
-            weights, falls, _, _ = rule.weights(here, sources)
+            weights, falls, _ = rule.weights(here, sources)
             # The factor of an exponent's cotangent is a polynomial in point and source, seen from
             # one of the sources: its moments over the points and over the sources suffice.
             origin = sources[:, :3, :1]
-            x, y, rate = here - origin, sources[:, :3] - origin, sources[:, 3:4]
+            x, y = here - origin, sources[:, :3] - origin
             # Written out, so that it is fused with the weights: half the time of a matrix product.
             pairs = zip(
-                jnp.unstack(sources[:, 4:], axis=1), jnp.unstack(cotangent, axis=1), strict=True
+                jnp.unstack(sources[:, 3:], axis=1), jnp.unstack(cotangent, axis=1), strict=True
             )
             pulls = falls * sum(row[:, :, None] * each[:, None] for row, each in pairs)
-            of_points = jnp.concatenate(
-                [jnp.ones_like(x[:, :1]), x, jnp.sum(x * x, axis=1, keepdims=True)], axis=1
-            )
+            of_points = jnp.concatenate([jnp.ones_like(x[:, :1]), x], axis=1)
             moments = jnp.einsum("lkp,lsp->lks", of_points, pulls)
             d_rows = jnp.einsum("lrp,lsp->lrs", cotangent, weights)
-            d_centers = 2 * rate * (moments[:, 1:4] - y * moments[:, :1])
-            squared = moments[:, 4:] - 2 * jnp.sum(y * moments[:, 1:4], axis=1, keepdims=True)
-            d_rates = -squared - jnp.sum(y * y, axis=1, keepdims=True) * moments[:, :1]
-            toward = jnp.einsum("lks,lsp->lkp", jnp.concatenate([rate, rate * y], axis=1), pulls)
-            part = jnp.concatenate([d_centers, d_rates, d_rows], axis=1)
+            d_centers = 2 * (moments[:, 1:] - y * moments[:, :1])
+            of_sources = jnp.concatenate([jnp.ones_like(y[:, :1]), y], axis=1)
+            toward = jnp.einsum("lks,lsp->lkp", of_sources, pulls)
+            part = jnp.concatenate([d_centers, d_rows], axis=1)
             part = part.reshape(part.shape[0], part.shape[1], ids.shape[1], -1)
             d_table = d_table.at[ids].add(jnp.moveaxis(part, 2, 1), mode="promise_in_bounds")
             return d_here - 2 * (x * toward[:, :1] - toward[:, 1:]), d_table
@@ -242,7 +239,7 @@ def _sums_forward(rule: _Rule, steps: Steps, points, table):
 
 @_sums_forward.defjvp
 def _sums_jvp(rule: _Rule, primals, tangents):
-    return _derivative(rule, *primals, tangents[2])
+    return _derivative(rule, *primals, *tangents[1:])
 
 
 def gaussian_sums(
@@ -254,12 +251,12 @@ def gaussian_sums(
         [Float[Array, "rows points"], Float[Array, "3 points"]], Float[Array, "values points"]
     ],
 ) -> Float[Array, "points_blocks values points"]:
-    r"""Sum `rows_j exp(-rate_j |x - p_j|^2)` over the blocks of sources that every point meets.
+    r"""Sum `rows_j exp(-|x - p_j|^2)` over the blocks of sources that every point meets.
 
     **Arguments:**
 
-    - `points`: `x`, mm, from `points_blocks`. Differentiable.
-    - `table`: from `source_table`: `p_j` (mm), `rate_j` (1/mm^2) and `rows_j`. Differentiable.
+    - `points`: `x`, from `points_blocks`. Differentiable.
+    - `table`: from `source_table`: `p_j` and `rows_j`. Differentiable.
     - `kernel`: stands for `exp`; terms beyond its rim vanish, whatever the lists hold. Static.
     - `finish`: computes values from sums and points. Static.
 
@@ -277,7 +274,5 @@ def gaussian_sums_forward(
         [Float[Array, "rows points"], Float[Array, "3 points"]], Float[Array, "values points"]
     ],
 ) -> Float[Array, "points_blocks values points"]:
-    """Sum as `gaussian_sums` does, with forward mode in the table instead of reverse mode; the
-    points are constants.
-    """
-    return _sums_forward(_Rule(kernel, finish), steps, lax.stop_gradient(points), table)
+    """Sum as `gaussian_sums` does, with forward mode instead of reverse mode."""
+    return _sums_forward(_Rule(kernel, finish), steps, points, table)

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float
 
 from splatjax._combination import PartByPart
 
-from ._clustered import ClusterDiffuser, layer_table, source_boxes
+from ._clustered import ClusterDiffuser, in_sums, layer_table, source_boxes
 from ._clusters import Clusters, ClusterTree
 from ._diffuser import Sources
 from ._gaussian_sums import FAR, Steps, gaussian_sums, identity
@@ -99,13 +99,9 @@ class StreamedDiffusion:
             return False
         low, high = centers[:, exists].min(axis=1), centers[:, exists].max(axis=1)
         gaps = np.maximum(np.maximum(self.boxes.low - high, low - self.boxes.high), 0)
-        # Cells hold cells by their centers, and splats sink along their normals.
+        # Sources lie below their splats.
         reaches = [
-            each.support
-            * math.sqrt(
-                float(each.variance) + 0.5 * (2 * math.sqrt(3) * each.edge + 2 * each.depth) ** 2
-            )
-            + float(each.depth)
+            each.support * math.sqrt(float(each.variance)) + float(each.depth)
             for each in self.layers
             if each is not None
         ]
@@ -128,9 +124,8 @@ class StreamedDiffusion:
 
     def _sum_layer(self, i: int, layer: _Layer, levels: list[Clusters]) -> Array:
         clusters = levels[self.cells.index(layer.edge) + 1 if layer.edge else 0]
-        boxes, spread = source_boxes(clusters, jnp.stack([layer.depth, layer.depth]))
-        reach = layer.support * math.sqrt(float(layer.variance) + float(spread))
-        steps = find_neighbors(self.boxes, boxes, reach)
+        reach = layer.support * math.sqrt(float(layer.variance))
+        steps = find_neighbors(self.boxes, source_boxes(clusters, layer.depth), reach)
         if steps.ids.shape[0] > self.steps[i]:
             self.steps[i] = 1 << (steps.ids.shape[0] - 1).bit_length()
         more = self.steps[i] - steps.ids.shape[0]
@@ -146,8 +141,9 @@ def _levels(tree: ClusterTree, sources: Sources) -> list[Clusters]:
 @eqx.filter_jit
 def _sum(points, clusters: Clusters, layer: _Layer, steps: Steps) -> Array:
     below = clusters.lowered(layer.depth)
-    table, _ = layer_table(below, layer.variance, layer.depth, layer.truncated, slopes=False)
+    table = layer_table(below, layer.variance, layer.depth, layer.truncated, slopes=False)
     spare = steps.order.shape[0] - points.shape[0]
+    points = points * in_sums(layer.variance)
     blocks = jnp.pad(points, ((0, spare), (0, 0), (0, 0)), constant_values=FAR)
     return gaussian_sums(blocks, table, steps, layer.truncated, identity)[: points.shape[0]]
 
