@@ -98,7 +98,8 @@ class StreamedDiffusion:
         if not exists.any():
             return False
         low, high = centers[:, exists].min(axis=1), centers[:, exists].max(axis=1)
-        gaps = np.maximum(np.maximum(self.boxes.low - high, low - self.boxes.high), 0)
+        own_low, own_high = np.asarray(self.boxes.low), np.asarray(self.boxes.high)
+        gaps = np.maximum(np.maximum(own_low - high, low - own_high), 0)
         # Sources lie below their splats.
         reaches = [
             each.support * math.sqrt(float(each.variance)) + float(each.depth)

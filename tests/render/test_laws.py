@@ -178,6 +178,7 @@ def test_light_is_added_linearly():
 
 
 @pytest.mark.once
+@pytest.mark.filterwarnings("ignore:the scene has no light")
 def test_no_splats_and_no_lights_give_an_empty_and_a_black_picture():
     material = sj.Material(two_gaussians())
     camera = camera_over(5.0, 16)

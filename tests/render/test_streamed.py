@@ -138,7 +138,7 @@ def test_what_cannot_be_streamed_is_refused(splats):
     parts = [jax.tree.map(lambda leaf, size=size: leaf[:size], splats) for size in (10, 20)]
     for others in ([parts[1], parts[0]], [parts[0]], [parts[0], parts[0], parts[0]]):
         each = iter([[parts[0], parts[0]], others])
-        with pytest.raises(ValueError, match="not the same each time"):
+        with pytest.raises(ValueError, match="must be the same each time"):
             sj.render_streamed(lambda each=each: iter(next(each)), LIGHTS, MATERIAL, CAMERA)
     with pytest.raises(ValueError, match="of one size"):
         sj.render_streamed(lambda: iter(parts), LIGHTS, MATERIAL, CAMERA)
