@@ -11,8 +11,6 @@ from splatjax.splatting import (
     TileRanges,
     bin_items,
     round_up,
-    scatter_slots,
-    slot_plane,
 )
 
 GRID = TileGrid(61, 45, lanes=4, slots=4)
@@ -91,20 +89,6 @@ def test_too_small_a_capacity_is_reported(short):
     assert float(needed(ranges[3][0])) > 1
 
 
-def test_capacity_is_for_the_longest_list_of_every_chunk():
-    grid = TileGrid(64, 64, lanes=4, slots=8)  # 64 tiles
-    counts = np.zeros(64, int)
-    counts[[3, 9, 17, 40, 41]] = 100, 20, 9, 9, 1  # chunks of 13 and 1 blocks
-    for given, (pairs, blocks, chunks) in (
-        ([counts, counts[::-1] // 2], (139, 14, 2)),
-        ([np.zeros(64, int)], (1, 1, 1)),
-    ):
-        capacity = BinCapacity.for_counts([jnp.asarray(each) for each in given], grid)
-        expected = round_up(pairs, 1024), round_up(blocks, 4), round_up(chunks, 4)
-        assert (capacity.pairs, capacity.blocks, capacity.chunks) == expected
-    assert BinCapacity.for_counts([jnp.ones(64, int)], grid).chunks == 16  # no more than there are
-
-
 @pytest.mark.parametrize("step", [1, 4, 1024])
 def test_rounding_up_leaves_three_percent_and_takes_few_sizes(step):
     counts = np.arange(0, 40_000, 7)
@@ -112,22 +96,6 @@ def test_rounding_up_leaves_three_percent_and_takes_few_sizes(step):
     assert np.all((rounded >= 1.03 * counts - 1) & (rounded > counts) & (rounded % step == 0))
     assert np.all(rounded <= 1.03 * counts * (1 + 1 / 16) + step + 2)
     assert len(np.unique(rounded[(counts > 16_384) & (counts < 32_768)])) <= 17
-
-
-def test_scatter_is_the_transpose_of_the_gather(dtype):
-    ranges, counts = every_kind()[1][0]
-    capacity = BinCapacity.for_counts([counts], GRID)
-
-    @jax.jit
-    def both_ways(values, slots):
-        bins = bin_items(ranges, GRID, capacity)
-        gathered = slot_plane(values, 0.0, bins)
-        return jnp.vdot(gathered, slots), jnp.vdot(values, scatter_slots(slots, bins, COUNT))
-
-    rng = np.random.default_rng(1)
-    values = jnp.asarray(rng.normal(size=COUNT), dtype)
-    slots = jnp.asarray(rng.normal(size=(capacity.blocks, GRID.lanes, GRID.slots)), dtype)
-    np.testing.assert_allclose(*both_ways(values, slots), rtol=1e-4)
 
 
 def test_pixels_are_numbered_tile_by_tile():

@@ -1,6 +1,4 @@
-"""Footprints against rays cut with planes, their boxes, the law of the screen filter, and which
-splats a view may see.
-"""
+"""Footprints against rays cut with planes, and the law of the screen filter."""
 
 import bodies
 import equinox as eqx
@@ -10,7 +8,6 @@ import numpy as np
 import pytest
 
 from splatjax.splatting import SplattingSettings, fragment_weight
-from splatjax.splatting._views import MARGIN
 
 NO_FILTER = SplattingSettings(filter_radius=1e-4)
 # In pixels so fine, the quarter pixel that keeps slopes finite is nothing.
@@ -104,33 +101,6 @@ def test_fragments_are_where_rays_meet_discs(kind, dtype):
 
 
 @pytest.mark.parametrize("kind", VIEWS)
-def test_boxes_hold_the_rim_exactly_and_all_that_is_inside(kind):
-    view, body = FINE_VIEWS[kind](), scattered()
-    footprints, box = footprints_of(view, body, NO_FILTER)
-    normals = np.asarray(body.normals, float)
-    a = np.cross(normals, [[0.3, 1.0, 0.2]])
-    a /= np.linalg.norm(a, axis=1, keepdims=True)
-    angle = np.linspace(0, 2 * np.pi, 1441)[None, :, None]
-    rim = np.cos(angle) * a[:, None] + np.sin(angle) * np.cross(normals, a)[:, None]
-    rim = np.asarray(body.centers)[:, None] + np.asarray(body.radii)[:, None, None] * rim
-    column, row, _ = view.project(jnp.asarray(rim.transpose(2, 0, 1), float))
-    expected = np.stack([column.min(1), column.max(1), row.min(1), row.max(1)])
-    visible = np.asarray(footprints.visible)
-    assert visible.sum() > 30
-    # Of radii of 500 pixels and more.
-    np.testing.assert_allclose(box[:, visible], expected[:, visible], atol=0.05)
-    view = VIEWS[kind]()
-    footprints, box = footprints_of(view, body)
-    x, y = around(box, 1.6, 41)
-    inside, _, _ = fragments(footprints, view, x, y)
-    left, right, top, bottom = box[:, :, None]
-    slack = 1e-4 * (right - left + bottom - top)
-    in_box = (x > left - slack) & (x < right + slack) & (y > top - slack) & (y < bottom + slack)
-    assert np.sum(inside) > 1000
-    assert not np.any(inside & ~in_box)
-
-
-@pytest.mark.parametrize("kind", VIEWS)
 def test_power_of_small_splats_does_not_depend_on_where_they_lie(kind):
     """The weights of a splat add up to its projected area times the kernel's mean, be it larger or
     smaller than a pixel.
@@ -163,52 +133,3 @@ def test_the_filter_is_the_narrowest_that_keeps_power_to_four_percent():
     body = bodies.splats(centers, np.tile(-axes[2], (256, 1)), np.full(256, 1e-3))
     weights = np.asarray(power(body, view)[0])
     assert 0.5 * POWER_ERROR < np.ptp(weights) / np.mean(weights) < POWER_ERROR
-
-
-def test_splats_beside_the_eye_do_not_veil_the_picture():
-    """A splat barely before the eye's plane, far to the side: nothing of it is seen, in float32
-    neither.
-    """
-    view = bodies.perspective(eye=(0.0, 0.0, 0.0), target=(0.0, 0.0, -1.0), width=64, height=64)
-    angle = np.linspace(0, 2 * np.pi, 24, endpoint=False)
-    depth = np.exp(np.linspace(np.log(0.011), np.log(1.0), 24))
-    centers = np.stack([50 * np.cos(angle), 50 * np.sin(angle), -depth], 1)
-    normals = np.random.default_rng(6).normal(size=(24, 3)) * 0.5 - centers / 50
-    weights, _ = power(bodies.splats(centers, normals, 5.0), view)
-    assert not np.any(weights)
-
-
-@pytest.mark.parametrize("kind", VIEWS)
-def test_spheres_that_touch_the_picture_may_be_seen_where_they_face_the_eye(kind):
-    """Spheres beside each edge of the picture and its margin, missing it by a part of their
-    radius.
-    """
-    view, rng, count = VIEWS[kind](width=48, height=30), np.random.default_rng(8), 400
-    axes, eye = np.asarray(view.rotation, float), np.asarray(view.position, float)
-    # Points on the margin's edges: left, right, top, bottom.
-    radii, depth = rng.uniform(0.05, 3.0, count), rng.uniform(5, 25, count)
-    edge, along = rng.integers(0, 4, count), rng.uniform(0.1, 0.9, count)
-    size = np.where(edge < 2, view.width, view.height)
-    across = np.where(edge % 2 == 0, -MARGIN, size + MARGIN)
-    column = np.where(edge < 2, across, along * view.width)
-    row = np.where(edge < 2, along * view.height, across)
-    column, row, depth = (jnp.asarray(each, float) for each in (column, row, depth))
-    touched = np.asarray(view.unproject(column, row, depth), float).T
-    # The planes through those edges: through the eye in perspective.
-    side = np.where(edge % 2 == 0, -1.0, 1.0)[:, None]
-    toward, forward = np.tile(-axes[2], (count, 1)), np.zeros((count, 1))
-    if kind == "perspective":
-        forward = -(0.5 * size + MARGIN)[:, None] / float(view.focal_length)
-    outward = side * axes[np.where(edge < 2, 0, 1)] + forward * axes[2]
-    outward /= np.linalg.norm(outward, axis=1, keepdims=True)
-    may_see = jax.jit(lambda body: view.may_see(body))
-    for off in (-2.5, -1.0, -0.02, 0.02, 1.0):
-        centers = touched + (1 + off) * radii[:, None] * outward
-        if kind == "perspective":
-            toward = eye - centers
-        found = may_see(bodies.splats(centers, toward, radii))
-        np.testing.assert_array_equal(found, np.full(count, off < 0), err_msg=str(off))
-        assert not np.any(may_see(bodies.splats(centers, -toward, radii)))
-    if kind == "perspective":  # nothing at the eye's own plane or behind it
-        behind = eye - np.linspace(-0.5 * view.near, 5, 7)[:, None] * axes[2]
-        assert not np.any(view.may_see(bodies.splats(behind, np.tile(axes[2], (7, 1)), 1.0)))
