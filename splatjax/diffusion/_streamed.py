@@ -98,7 +98,8 @@ class StreamedDiffusion:
         if not exists.any():
             return False
         low, high = centers[:, exists].min(axis=1), centers[:, exists].max(axis=1)
-        gaps = np.maximum(np.maximum(self.boxes.low - high, low - self.boxes.high), 0)
+        begins, ends = np.asarray(self.boxes.low), np.asarray(self.boxes.high)
+        gaps = np.maximum(np.maximum(begins - high, low - ends), 0)
         # Cells hold cells by their centers, and splats sink along their normals.
         reaches = [
             each.support

@@ -26,6 +26,7 @@ from ._lighting import (
 from ._plan import Plan
 from ._settings import RenderSettings
 
+Samples = TypeVar("Samples", bound=PyTree)
 Values = TypeVar("Values", bound=PyTree)
 Read = Callable[[SurfaceSamples], Values]
 """Reads what a picture needs off the surface samples: pointwise, along their last axis."""
@@ -178,12 +179,12 @@ def sample_surfaces(
     return map_chunks(blend, visible.rows, visible.tiles, at_once=_splatting.TILES_AT_ONCE)
 
 
-def map_samples(read: Read[Values], samples: SurfaceSamples) -> Values:
+def map_samples(read: Callable[[Samples], Values], samples: Samples) -> Values:
     """Read samples, a chunk of places at a time.
 
     **Arguments:**
 
-    - `samples`: with arrays `[places, *rows, pixels]`.
+    - `samples`: `SurfaceSamples`, or a tree with more, with arrays `[places, *rows, pixels]`.
 
     **Returns:** for each array `[*rows, points]` that `read` returns, `[places, *rows, pixels]`.
     """
