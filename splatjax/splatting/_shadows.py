@@ -71,7 +71,7 @@ class Bounds(eqx.Module):
         apart = squared > 0  # a single splat lies in its center, wherever it moves
         reach = jnp.where(apart, jnp.sqrt(jnp.where(apart, squared, 1.0)), 0.0)
         radius = reach + extreme(splats.radii, combination)
-        empty = combination.largest([jnp.any(exists).astype(radius.dtype)]) < 1
+        empty = combination.largest([jnp.any(exists).astype(radius.dtype)]) == 0
         return cls(jnp.where(empty, 0.0, center), jnp.where(empty, 1.0, radius))
 
 

@@ -149,7 +149,7 @@ def _sum_chunks(
         here = capacity.front + i * lanes
         return write(rows, sums, here), write(beyond, seconds, here), write(upto, limits, i * lanes)
 
-    upto = zeros_after(front, (capacity.behind, SIDE**2), dtype)
+    upto = zeros_after(picks, (capacity.behind, SIDE**2), dtype)
     rounds = _rounds(picks < capacity.front, lanes)
     rows, beyond, upto = lax.fori_loop(jnp.int32(0), rounds, look_behind, (rows, beyond, upto))
     order = jnp.minimum(jnp.append(bins.order, grid.count), grid.count)
