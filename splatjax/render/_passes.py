@@ -26,6 +26,7 @@ from ._lighting import (
 from ._plan import Plan
 from ._settings import RenderSettings
 
+Samples = TypeVar("Samples", bound=PyTree)
 Values = TypeVar("Values", bound=PyTree)
 Read = Callable[[SurfaceSamples], Values]
 """Reads what a picture needs off the surface samples: pointwise, along their last axis."""
@@ -164,26 +165,43 @@ def sample_surfaces(
             own = attributes.centers, positions - origin
             return tuple(each and _diffusion.continue_to_points(each, *own) for each in layers)
 
-        slopes = attributes.derivative
+        def where_positive(values, layers):
+            return tuple(
+                None if own is None else jnp.where(_darker_than_black(layer, channels), 0.0, own)
+                for own, layer in zip(values, layers, strict=True)
+            )
+
+        channels = len(attributes.source)
+        layers, slopes = continued(attributes.layers), attributes.derivative
         samples = SurfaceSamples(
             attributes=attributes.without_layers(),
             positions=positions,
             depth=in_a_row(surface.depth),
             covered=in_a_row(surface.covered),
-            layers=continued(attributes.layers),
-            derivative=None if slopes is None else continued(slopes),
+            layers=where_positive(layers, layers),
+            derivative=None if slopes is None else where_positive(continued(slopes), layers),
         )
         return jax.tree.map(_by_place, samples)
 
     return map_chunks(blend, visible.rows, visible.tiles, at_once=_splatting.TILES_AT_ONCE)
 
 
-def map_samples(read: Read[Values], samples: SurfaceSamples) -> Values:
+def _darker_than_black(
+    layer: Float[Array, "values points"], channels: int
+) -> Bool[Array, "values points"]:
+    """Mark the means and the mass of a layer that its slopes have carried below zero, at the rim of
+    what is lit. The rows of a derivative, between them, may be negative.
+    """
+    row = jnp.arange(len(layer))
+    return (layer < 0) & ((row < channels) | (row == len(layer) - 1))[:, None]
+
+
+def map_samples(read: Callable[[Samples], Values], samples: Samples) -> Values:
     """Read samples, a chunk of places at a time.
 
     **Arguments:**
 
-    - `samples`: with arrays `[places, *rows, pixels]`.
+    - `samples`: `SurfaceSamples`, or a tree with more, with arrays `[places, *rows, pixels]`.
 
     **Returns:** for each array `[*rows, points]` that `read` returns, `[places, *rows, pixels]`.
     """

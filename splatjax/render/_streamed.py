@@ -252,10 +252,9 @@ def _shade(
     interval: Float[Array, "2"],
     settings: RenderSettings,
 ) -> Frame:
-    samples = dataclasses.replace(samples, layers=layers)
-
-    def read(samples: SurfaceSamples):
+    def read(given: tuple[SurfaceSamples, tuple]):
+        samples = dataclasses.replace(given[0], layers=given[1])
         own = settings.lighting.at_pixels(scene, groups, samples)
         return shade(scene, view.position, groups, samples, own, interval, settings)
 
-    return compose(scene, map_samples(read, samples), visible, visible.needed)
+    return compose(scene, map_samples(read, (samples, layers)), visible, visible.needed)
