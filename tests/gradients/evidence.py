@@ -34,10 +34,9 @@ def write_evidence(title: str, world: World, name: str, way: jax.Array, step: fl
     difference = np.asarray(beauty(leaf + step * way) - beauty(leaf - step * way)) / (2 * step)
     derivative = np.asarray(jax.jit(partial(jax.jvp, beauty))((leaf,), (way,))[1])
     scale = max(np.abs(difference).max(), np.abs(derivative).max(), np.finfo(float).tiny)
-    gray = (
-        np.repeat((picture / max(picture.max(), np.finfo(float).tiny))[..., None], 3, axis=-1)
-        ** 0.45
-    )
+    # Wide layers, continued to faint pixels of a dark rim, may be a little below zero.
+    gray = np.maximum(picture, 0) / max(picture.max(), np.finfo(float).tiny)
+    gray = np.repeat(gray[..., None], 3, axis=-1) ** 0.45
     rows = [
         gray,
         *(signed(each / scale) for each in (difference, derivative, derivative - difference)),

@@ -92,7 +92,7 @@ def test_gradient_is_that_of_central_differences(world, path, name):
             )
 
 
-PATHS_AGREE = 0.02  # of the norm: the support of the Gaussians, clusters and nodes
+PATHS_AGREE = 0.02  # of the norm: the support of the Gaussians, and clusters
 CENTERS_AGREE = 0.1  # where every splat moves through the window of what is in front
 
 
