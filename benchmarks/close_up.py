@@ -129,7 +129,10 @@ def cameras(
 
 
 def told(
-    found: sj.Recovery | sj.Estimate, medium: sj.Medium, name: str, pictures: Sequence[str]
+    found: sj.inverse.Recovery | sj.inverse.Estimate,
+    medium: sj.Medium,
+    name: str,
+    pictures: Sequence[str],
 ) -> dict:
     """Print what was found, and give it as a row."""
     off, bars = errors(found, medium), np.stack(found.relative_errors())
@@ -174,7 +177,7 @@ def main() -> None:
                     theirs, camera, [light], medium, 8, OTHERWISE[options.otherwise]
                 )
                 deviation = np.full(picture.shape, options.noise * np.sqrt(np.mean(picture**2)))
-                seen[title] = sj.Observation(picture, camera, (light,), deviation=deviation)
+                seen[title] = sj.inverse.Observation(picture, camera, (light,), deviation=deviation)
                 Path("out").mkdir(exist_ok=True)
                 sj.write_png(
                     f"out/close_up_{name}_{title.replace(' ', '_')}.png",
@@ -183,7 +186,7 @@ def main() -> None:
             apart = {}
             for case in cases:
                 begin = time.perf_counter()
-                found = sj.recover(
+                found = sj.inverse.recover(
                     [seen[title] for title in case], ours, starts(medium, options.off), throw=False
                 )
                 print(f"\n{name} from {' and '.join(case)}, {time.perf_counter() - begin:.0f} s:")
@@ -195,7 +198,12 @@ def main() -> None:
                 closest = [title for title in (HEAD, LASER, LAMP) if title in apart][:2]
                 print(f"\n{name} from {' and '.join(closest)}, each searched apart, combined:")
                 rows.append(
-                    told(sj.combined([apart[title] for title in closest]), medium, name, closest)
+                    told(
+                        sj.inverse.combined([apart[title] for title in closest]),
+                        medium,
+                        name,
+                        closest,
+                    )
                 )
                 Path("out/close_up.json").write_text(json.dumps(rows, indent=1) + "\n")
 

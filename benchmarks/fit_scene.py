@@ -75,7 +75,7 @@ def main() -> None:
     ) -> None:
         together = zip(pictures(true), shots, strict=True)
         seen = [
-            sj.Observation(picture, cam, (light,), deviation=sd)
+            sj.inverse.Observation(picture, cam, (light,), deviation=sd)
             for (picture, sd), (cam, light) in together
         ]
         optimizer = optax.adam(optax.cosine_decay_schedule(2.0, options.steps), b2=0.9)
@@ -85,7 +85,7 @@ def main() -> None:
             times.append(time.perf_counter())
             programs.append(compiled.count)
 
-        found = sj.fit_scene(
+        found = sj.inverse.fit_scene(
             seen,
             begin,
             material,
@@ -108,14 +108,14 @@ def main() -> None:
         )
 
     right = [(camera, light) for light in lights]
-    filled, black = sj.UnknownBackground(), sj.BlackBackground()
+    filled, black = sj.inverse.UnknownBackground(), sj.inverse.BlackBackground()
     gray = eqx.tree_at(lambda s: s.albedo, splats, jnp.full_like(splats.albedo, 0.5))
 
     def of_albedo(body, cameras, lights):
         error = np.median(np.abs(np.asarray(body.albedo - splats.albedo))[well])
         return f"{error:.4f} of albedo (median)"
 
-    fit("albedo", splats, gray, right, [sj.AlbedoMap()], filled, of_albedo)
+    fit("albedo", splats, gray, right, [sj.inverse.AlbedoMap()], filled, of_albedo)
 
     turns = [
         Rotation.from_rotvec(np.radians(12) * way / np.linalg.norm(way))
@@ -139,7 +139,15 @@ def main() -> None:
         off = max(float(jnp.max(jnp.abs(ours.irradiance / jnp.pi - 1))) for ours in found)
         return f"{way:.2f} degrees and {100 * off:.2f}% (worst)"
 
-    fit("lights", splats, splats, dim, [sj.LightStrengths(), sj.LightPlaces()], filled, of_lights)
+    fit(
+        "lights",
+        splats,
+        splats,
+        dim,
+        [sj.inverse.LightStrengths(), sj.inverse.LightPlaces()],
+        filled,
+        of_lights,
+    )
 
     turn = Rotation.from_rotvec([0.02, -0.03, 0.02])
     turned = jnp.asarray(turn.as_matrix(), jnp.float32)
@@ -154,10 +162,10 @@ def main() -> None:
         off = max(float(jnp.linalg.norm(each.position - camera.position)) for each in found)
         return f"{way:.3f} degrees and {off:.2f} mm (worst)"
 
-    poses = [sj.CameraPoses(turn=1e-3, shift=0.5)]
+    poses = [sj.inverse.CameraPoses(turn=1e-3, shift=0.5)]
     fit("camera", splats, splats, [(moved, light) for light in lights], poses, black, of_cameras)
 
-    part = sj.NormalOffsets(step=0.1, smoothness=6.0, deviation=1.5)
+    part = sj.inverse.NormalOffsets(step=0.1, smoothness=6.0, deviation=1.5)
     tables = part.prepared(splats)
     x = jnp.asarray(
         rng.normal(size=splats.count) * 1.5 / part.step / float(tables.gain), jnp.float32

@@ -29,7 +29,7 @@ EYE, FOV = (0.0, 0.0, 80.0), 17.0
 WAY = (-1.0, -1.0, -1.0)
 IRRADIANCE = float(np.pi)
 DEPTH = 4000  # of paths; Russian roulette from a tenth of it on
-MODELS = {"dipole": sj.Dipole, "better dipole": sj.BetterDipole}
+MODELS = {"dipole": sj.Dipole, "better dipole": sj.scattering.BetterDipole}
 PHOTONS = 300_000
 RATE = 0.1  # Adam's, in logarithms of coefficients: from afar to nearly nothing by a cosine
 
@@ -227,9 +227,12 @@ class Splatted:
 
     def recover(
         self, picture: np.ndarray, medium: sj.Medium, model, away: float
-    ) -> tuple[sj.Recovery, float]:
-        seen, begin = sj.Observation(picture, self.camera, (self.light,)), time.process_time()
-        return sj.recover(
+    ) -> tuple[sj.inverse.Recovery, float]:
+        seen, begin = (
+            sj.inverse.Observation(picture, self.camera, (self.light,)),
+            time.process_time(),
+        )
+        return sj.inverse.recover(
             [seen], self.splats, starts(medium, away), model=model, throw=False
         ), time.process_time() - begin
 
@@ -276,8 +279,8 @@ def recovered(splatted: Splatted, medium: sj.Medium, truth: np.ndarray, options)
             jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf), float), medium),
             jnp.asarray(jnp.inf),
         )
-        walks = sj.monte_carlo([layer], PHOTONS, jax.random.key(4)).profile()
-    rule = sj.L2_QUADRATURE.beyond(0.2 / float(np.max(medium.sigma_t_prime)))
+        walks = sj.transport.monte_carlo([layer], PHOTONS, jax.random.key(4)).profile()
+    rule = sj.scattering.L2_QUADRATURE.beyond(0.2 / float(np.max(medium.sigma_t_prime)))
     by_walks = splatted.picture(
         jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf), float), walks), rule
     )

@@ -24,7 +24,7 @@ from splatjax.splatting import DenseRasterizer
 from .scenes import BODIES, columns, lit
 
 COMPILED = "/jax/core/compile/backend_compile_duration"
-WEIGHTS = sj.NonNegativeWeights(sj.FixedTotalReflectance())
+WEIGHTS = sj.fitting.NonNegativeWeights(sj.fitting.FixedTotalReflectance())
 FINE = sj.RenderSettings(diffuser=ClusterDiffuser(error=2.5e-4))
 """The default of `recover`."""
 GOAL = 6.0  # forward frames for a step, all that a search does counted
@@ -126,7 +126,7 @@ class Compilations:
         self.count += event == COMPILED
 
 
-def errors(recovery: sj.Recovery | sj.Estimate, medium: sj.Medium) -> np.ndarray:
+def errors(recovery: sj.inverse.Recovery | sj.inverse.Estimate, medium: sj.Medium) -> np.ndarray:
     """Give what each coefficient is off, as a share: two rows of channels."""
     pairs = (
         (recovery.medium.sigma_a, medium.sigma_a),
@@ -166,11 +166,11 @@ def main() -> None:
         deviations = deviations or [None] * len(pictures)
         together = zip(pictures, lights, deviations, strict=True)
         observations = [
-            sj.Observation(picture, camera, (light,), deviation=sd)
+            sj.inverse.Observation(picture, camera, (light,), deviation=sd)
             for picture, light, sd in together
         ]
         before, start = compiled.count, time.perf_counter()
-        found = sj.recover(observations, splats, begin, throw=False)
+        found = sj.inverse.recover(observations, splats, begin, throw=False)
         return found, time.perf_counter() - start, compiled.count - before
 
     def tell(name, case, found, seconds, programs, medium):

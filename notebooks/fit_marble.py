@@ -35,9 +35,9 @@ with jax.enable_x64(True):
     medium = sj.load_medium("marble")
     # The published fit used the polynomial Fresnel moments, which differ from the exact ones by
     # less than 0.1%.
-    profile = sj.Dipole(medium, sj.EganFresnel())
+    profile = sj.Dipole(medium, sj.scattering.EganFresnel())
     six = sj.fit_gaussians(profile, 6)
-    held = sj.fit_gaussians(profile, 6, weights=sj.FixedTotalReflectance())
+    held = sj.fit_gaussians(profile, 6, weights=sj.fitting.FixedTotalReflectance())
     figure = plot_fit(
         profile,
         six.gaussians,
@@ -66,7 +66,7 @@ for name, fit in (("free", six), ("sum held", held)):
 
 # %%
 with jax.enable_x64(True):
-    four = sj.fit_gaussians(profile, 4, spread=sj.VariancesPerChannel())
+    four = sj.fit_gaussians(profile, 4, spread=sj.fitting.VariancesPerChannel())
 variances, weights = (
     np.asarray(four.gaussians.variances[1]),
     np.asarray(four.gaussians.weights[1, :, 0]),

@@ -33,7 +33,9 @@ import splatjax as sj
 # %%
 # From coefficients (1/mm) to profile to Gaussians: the fit is differentiated implicitly.
 def gaussians_of(medium: sj.Medium) -> sj.SumOfGaussians:
-    return sj.fit_gaussians(sj.Dipole(medium), 4, weights=sj.FixedTotalReflectance()).gaussians
+    return sj.fit_gaussians(
+        sj.Dipole(medium), 4, weights=sj.fitting.FixedTotalReflectance()
+    ).gaussians
 
 
 def scene_of(gaussians: sj.SumOfGaussians, count: int) -> sj.Scene:

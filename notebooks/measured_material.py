@@ -79,8 +79,8 @@ print(f"chi squared per degree of freedom {chi_squared:.2f}")
 with jax.enable_x64(True):
     rows = np.column_stack([dot.profile.radii, dot.profile.values])
     np.savetxt("potato.csv", rows, delimiter=",", header="radius (mm), R (1/mm^2)")
-    table = sj.read_profile("potato.csv")
-    fitted = sj.fit_gaussians(table, 3, weights=sj.NonNegativeWeights())
+    table = sj.io.read_profile("potato.csv")
+    fitted = sj.fit_gaussians(table, 3, weights=sj.fitting.NonNegativeWeights())
     error = float(fitted.error[0])
     figure = plot_fit(table, fitted.gaussians, title="potato, measured, three Gaussians")
 figure  # noqa: B018

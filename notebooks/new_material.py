@@ -27,7 +27,7 @@ import splatjax as sj
 from splatjax.plots import plot_error_by_count, plot_fit
 
 # %%
-weights = sj.FixedTotalReflectance()
+weights = sj.fitting.FixedTotalReflectance()
 with jax.enable_x64(True):
     stone = sj.Medium(
         sigma_a=jnp.asarray([0.020, 0.006, 0.015]),
@@ -35,7 +35,7 @@ with jax.enable_x64(True):
         eta=jnp.full(3, 1.6),
     )
     profile = sj.Dipole(stone)
-    by_count = sj.error_by_count(profile, 6, weights=weights)
+    by_count = sj.fitting.error_by_count(profile, 6, weights=weights)
     figure = plot_error_by_count(by_count, title="what each Gaussian gains")
 figure  # noqa: B018
 

@@ -40,7 +40,7 @@ from splatjax.plots import plot_pictures
 from splatjax.splatting import DenseRasterizer
 
 SPLATS, SIZE, COUNT, STEPS, NOISE = 700, 30, 3, 30, 0.01
-HELD = sj.NonNegativeWeights(sj.FixedTotalReflectance())
+HELD = sj.fitting.NonNegativeWeights(sj.fitting.FixedTotalReflectance())
 # Every splat at every pixel: for small pictures. Leave `settings` out for large ones.
 settings = sj.RenderSettings(rasterizer=DenseRasterizer(), diffuser=DenseDiffuser())
 
@@ -100,10 +100,10 @@ bare = np.asarray(frames[0].position)[..., 1] < border - 0.3
 
 
 # %%
-def observed(mask) -> list[sj.Observation]:
+def observed(mask) -> list[sj.inverse.Observation]:
     together = zip(photographs, lamps, deviations, strict=True)
     return [
-        sj.Observation(picture, camera, (lamp,), mask=mask, deviation=sd)
+        sj.inverse.Observation(picture, camera, (lamp,), mask=mask, deviation=sd)
         for picture, lamp, sd in together
     ]
 
@@ -111,7 +111,7 @@ def observed(mask) -> list[sj.Observation]:
 begin = with_map(figurine, np.where(painted[:, None], 0.5, 1.0) * np.ones(3))
 with jax.enable_x64(True):
     start = sj.Medium(skin.sigma_a * 2, skin.sigma_s_prime / 2, skin.eta)
-    found = sj.recover(observed(bare), begin, start, count=COUNT, settings=settings)
+    found = sj.inverse.recover(observed(bare), begin, start, count=COUNT, settings=settings)
 off = [
     np.asarray(getattr(found.medium, name)) / np.asarray(getattr(skin, name)) - 1
     for name in ("sigma_a", "sigma_s_prime")
@@ -121,8 +121,8 @@ print(f"sigma_a off by {(100 * off[0]).round(1)}%, sigma_s' by {(100 * off[1]).r
 
 # %%
 optimizer = optax.adam(optax.cosine_decay_schedule(2.0, STEPS), b2=0.9)
-parts = [sj.AlbedoMap(step=0.2)]
-fitted = sj.fit_scene(
+parts = [sj.inverse.AlbedoMap(step=0.2)]
+fitted = sj.inverse.fit_scene(
     observed(None), begin, found.material, parts, optimizer, steps=STEPS, settings=settings
 )
 seen_well = np.sum(np.asarray(figurine.normals) * np.asarray(camera.rotation[2]), axis=1) < -0.4

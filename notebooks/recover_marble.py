@@ -32,7 +32,7 @@ from splatjax.plots import plot_recovery
 from splatjax.splatting import DenseRasterizer, ShadowSettings
 
 SIZE, COUNT, NOISE = 40, 4, 0.01
-HELD = sj.NonNegativeWeights(sj.FixedTotalReflectance())
+HELD = sj.fitting.NonNegativeWeights(sj.fitting.FixedTotalReflectance())
 # Every splat at every pixel, and coarse shadows: for small pictures. Leave `settings` out for large
 # ones.
 shadows = ShadowSettings(resolution=48, bias=1.0, softness=2.0)
@@ -73,10 +73,10 @@ with jax.enable_x64(True):
 with jax.enable_x64(True):
     skin = sj.load_medium("skin1")
     start = sj.Medium(skin.sigma_a, skin.sigma_s_prime, marble.eta)
-    taken = sj.Observation(
+    taken = sj.inverse.Observation(
         photograph, camera, (lamp,), deviation=np.full(photograph.shape, deviation)
     )
-    found = sj.recover([taken], splats, start, count=COUNT, settings=settings)
+    found = sj.inverse.recover([taken], splats, start, count=COUNT, settings=settings)
 print(found.summary())
 print(f"{found.rounds} rounds, {found.steps} steps; chi-squared {float(found.chi_squared):.3f}")
 
@@ -111,8 +111,8 @@ print(
     f"red: {best} is known to {100 * best.deviation:.2g}%, {worst} to {100 * worst.deviation:.2g}%"
 )
 with jax.enable_x64(True):
-    predictions = sj.next_pictures(
-        found, splats, sj.default_candidates(splats, camera), settings=settings
+    predictions = sj.inverse.next_pictures(
+        found, splats, sj.inverse.default_candidates(splats, camera), settings=settings
     )
 for prediction in predictions:
     print(prediction)

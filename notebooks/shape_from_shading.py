@@ -62,7 +62,7 @@ def degrees(a, b) -> np.ndarray:
 
 
 smooth = ball()
-as_given = sj.NormalOffsets(
+as_given = sj.inverse.NormalOffsets(
     step=1.0, smoothness=1e-3, deviation=1.0
 )  # no blur: heights are what they are
 bumpy = as_given.moved(
@@ -101,7 +101,7 @@ def taken(splats: sj.Splats, wider: float) -> list[np.ndarray]:
     ]
 
 
-part = sj.NormalOffsets(step=0.04, smoothness=1.0, deviation=0.4)
+part = sj.inverse.NormalOffsets(step=0.04, smoothness=1.0, deviation=0.4)
 facing = np.asarray(smooth.normals)[:, 2] > 0.5
 before = degrees(smooth.normals, bumpy.normals)[facing]
 found, pictures, after = {}, {}, {}
@@ -111,7 +111,7 @@ for wider in (0.2, 1.0):
     for picture, lamp in zip(pictures[wider], lamps, strict=True):
         deviation = np.full(picture.shape, NOISE * np.sqrt(np.mean(picture**2)))
         seen.append(
-            sj.Observation(
+            sj.inverse.Observation(
                 picture + deviation * rng.normal(size=picture.shape),
                 camera,
                 (lamp,),
@@ -119,7 +119,7 @@ for wider in (0.2, 1.0):
             )
         )
     optimizer = optax.adam(optax.cosine_decay_schedule(2.0, STEPS), b2=0.9)
-    found[wider] = sj.fit_scene(
+    found[wider] = sj.inverse.fit_scene(
         seen, smooth, material(wider), [part], optimizer, steps=STEPS, settings=settings
     )
     after[wider] = degrees(found[wider].splats.normals, bumpy.normals)[facing]

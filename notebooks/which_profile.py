@@ -15,7 +15,7 @@
 #
 # Every model below turns the same coefficients into a profile. They differ near the source, where
 # diffusion is a poor picture of light, and they agree far away. The dots are the truth: photons,
-# walked by `sj.monte_carlo`, with their standard errors. All is drawn over radii counted
+# walked by `sj.transport.monte_carlo`, with their standard errors. All is drawn over radii counted
 # in mean free paths, $r \sigma_t'$. [The page](../docs/which_profile.md) has the numbers for many
 # media.
 
@@ -34,13 +34,17 @@ media = {
     "skin, red": (0.032, 0.74, 1.3),
     "skin, blue": (0.48, 1.01, 1.3),
 }
-models = {"Dipole": sj.Dipole, "BetterDipole": sj.BetterDipole, "PhotonBeam": sj.PhotonBeam}
+models = {
+    "Dipole": sj.Dipole,
+    "BetterDipole": sj.scattering.BetterDipole,
+    "PhotonBeam": sj.scattering.PhotonBeam,
+}
 
 
-def burley(medium: sj.Medium) -> sj.Burley:
+def burley(medium: sj.Medium) -> sj.scattering.Burley:
     """With the albedo that the photon beam has; its length is the mean free path."""
-    albedo = sj.PhotonBeam(medium).total_reflectance()
-    return sj.Burley(albedo, 1 / (medium.sigma_a + medium.sigma_s_prime))
+    albedo = sj.scattering.PhotonBeam(medium).total_reflectance()
+    return sj.scattering.Burley(albedo, 1 / (medium.sigma_a + medium.sigma_s_prime))
 
 
 # %%
@@ -48,7 +52,7 @@ truth = {}
 for name, numbers in media.items():
     medium = sj.Medium(*(jnp.asarray([x], jnp.float32) for x in numbers))
     edges = jnp.geomspace(0.08, 20.0, 41, dtype=jnp.float32) / medium.sigma_t_prime
-    truth[name] = sj.monte_carlo(
+    truth[name] = sj.transport.monte_carlo(
         [sj.Layer(medium, jnp.asarray(jnp.inf))], 100_000, jax.random.key(1), edges=edges
     )
 
@@ -110,8 +114,8 @@ for name in media:
 
 # %%
 with jax.enable_x64(True):
-    beam = sj.PhotonBeam(sj.Medium(*(jnp.asarray([x]) for x in media["marble, green"])))
-    fitted = sj.fit_gaussians(beam, 4, rule=sj.L2_QUADRATURE.beyond(1.0))
+    beam = sj.scattering.PhotonBeam(sj.Medium(*(jnp.asarray([x]) for x in media["marble, green"])))
+    fitted = sj.fit_gaussians(beam, 4, rule=sj.scattering.L2_QUADRATURE.beyond(1.0))
     error = float(fitted.error[0])
 print("E beyond one mean free path", round(error, 4))
 
@@ -123,7 +127,10 @@ print("E beyond one mean free path", round(error, 4))
 photons = truth["marble, green"]
 with jax.enable_x64(True):
     profile = jax.tree.map(lambda leaf: leaf.astype(jnp.float64), photons.profile())
-    rule, held = sj.InverseVariance(sj.L2_QUADRATURE.beyond(0.2)), sj.FixedTotalReflectance()
+    rule, held = (
+        sj.scattering.InverseVariance(sj.scattering.L2_QUADRATURE.beyond(0.2)),
+        sj.fitting.FixedTotalReflectance(),
+    )
     true_fit = sj.fit_gaussians(profile, 5, weights=held, rule=rule, throw=False)
     energy = float(true_fit.energy_error[0])
 print("weights", np.asarray(true_fit.gaussians.weights)[:, 0].round(4), "energy error", energy)

@@ -48,10 +48,12 @@ RECORDS = {
     "Layer": lambda: sj.Layer(medium(), 3),
     "Film": lambda: sj.Film(0.3),
     "Dipole": lambda: sj.Dipole(medium()),
-    "Multipole": lambda: sj.Multipole(sj.Layer(medium(), 3), eta_above=1.2),
+    "Multipole": lambda: sj.scattering.Multipole(sj.Layer(medium(), 3), eta_above=1.2),
     "LayeredMultipole": lambda: sj.LayeredMultipole([sj.Film(0.1), sj.Layer(medium(), np.inf)]),
-    "Burley": lambda: sj.Burley([0.8, 0.5], 1),
-    "Tabulated": lambda: sj.Tabulated([0, 1, 2], [3, 2, 1], deviation=(0.1, 0.1, 0.1), total=[1]),
+    "Burley": lambda: sj.scattering.Burley([0.8, 0.5], 1),
+    "Tabulated": lambda: sj.scattering.Tabulated(
+        [0, 1, 2], [3, 2, 1], deviation=(0.1, 0.1, 0.1), total=[1]
+    ),
     "SingleScattering": lambda: sj.SingleScattering(medium()),
     "RoughFresnel": lambda: RoughFresnel(1),
     "SumOfGaussians": lambda: sj.SumOfGaussians([0.1, 2], weights=[0.3, 0.5]),
@@ -79,7 +81,7 @@ def test_numbers_lists_and_tuples_become_strongly_typed_arrays(make):
 
 def test_a_number_stands_for_every_entry_of_an_axis_that_others_have():
     np.testing.assert_array_equal(medium().eta, jnp.full(3, 1.4))
-    assert sj.Multipole(sj.Layer(medium(), 3)).eta_above.shape == (3,)
+    assert sj.scattering.Multipole(sj.Layer(medium(), 3)).eta_above.shape == (3,)
     assert sj.SingleScattering(medium(), 0.5).strength.shape == (3,)
     assert splats().radii.shape == splats(specular=0.5).specular.shape == (2,)
     assert sj.Medium(0.1, 1, 1.4).eta.shape == (1,)
@@ -126,7 +128,10 @@ def test_traced_values_and_placeholders_pass_through_transformations():
 @pytest.mark.parametrize(
     ("make", "said"),
     [
-        (lambda: sj.Multipole(medium()), r"Multipole.layer must be Layer\(medium, thickness\)"),
+        (
+            lambda: sj.scattering.Multipole(medium()),
+            r"Multipole.layer must be Layer\(medium, thickness\)",
+        ),
         (
             lambda: sj.LayeredMultipole([medium()]),
             r"LayeredMultipole.layers must be Layer.* or Film",
@@ -143,7 +148,7 @@ def test_traced_values_and_placeholders_pass_through_transformations():
         (lambda: sj.SumOfGaussians([1, 2], [[1, 2, 3]]), r"weights has shape \[1, 3\]"),
         (
             lambda: sj.save_material(
-                material(), "x.toml", profile=sj.Multipole(sj.Layer(medium(), 3))
+                material(), "x.toml", profile=sj.scattering.Multipole(sj.Layer(medium(), 3))
             ),
             "profile must be a Dipole, .* or LayeredMultipole.* got Multipole",
         ),
@@ -176,16 +181,16 @@ def test_nonsense_is_refused_by_field_and_count(make, said):
 
 def test_arguments_that_a_record_does_not_have_are_refused():
     with pytest.raises(TypeError, match="too many positional arguments"):
-        sj.Multipole(medium(), -1.0)
+        sj.scattering.Multipole(medium(), -1.0)
 
 
 def test_profiles_of_python_numbers_have_a_reflectance():
     slab = sj.Layer(medium(), 3)
     for profile in (
         sj.Dipole(medium()),
-        sj.Multipole(slab, eta_above=1.2),
+        sj.scattering.Multipole(slab, eta_above=1.2),
         sj.LayeredMultipole([sj.Film(0.1), slab, sj.Layer(medium(), np.inf)]),
-        sj.Burley([0.8, 0.5], 1),
+        sj.scattering.Burley([0.8, 0.5], 1),
     ):
         total = np.asarray(profile.total_reflectance())
         assert np.all((total > 0) & (total < 1))

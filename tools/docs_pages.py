@@ -143,7 +143,7 @@ def _api_pages() -> Iterator[tuple[str, str]]:
     """Yield a page for each package, and a list of what `import splatjax` gives."""
     rows = []
     for node in ast.parse((ROOT / "splatjax" / "__init__.py").read_text(encoding="utf-8")).body:
-        if isinstance(node, ast.ImportFrom):
+        if isinstance(node, ast.ImportFrom) and node.module:
             rows += [(name.name, f"splatjax.{node.module}", node.module) for name in node.names]
     known = _documented()
     lines = ["| | package |", "| --- | --- |"]

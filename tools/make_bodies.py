@@ -125,7 +125,7 @@ def models() -> dict[str, tuple[sj.Material, sj.RenderSettings]]:
     albedo = jnp.asarray(ALBEDO)
     medium = sj.Medium(SIGMA_T * (1 - albedo), SIGMA_T * albedo, jnp.ones(len(ALBEDO)))
     half_space = [sj.Layer(medium, jnp.asarray(jnp.inf))]
-    profile = sj.monte_carlo(half_space, PHOTONS, jax.random.key(4)).profile()
+    profile = sj.transport.monte_carlo(half_space, PHOTONS, jax.random.key(4)).profile()
     single = sj.SingleScattering(medium)
     whole, parted = material(profile), material(profile.without(single), single)
     even = SplattingSettings(full_coverage=EVEN)
@@ -137,12 +137,14 @@ def models() -> dict[str, tuple[sj.Material, sj.RenderSettings]]:
     }
 
 
-def material(profile: sj.Tabulated, single: sj.SingleScattering | None = None) -> sj.Material:
+def material(
+    profile: sj.scattering.Tabulated, single: sj.SingleScattering | None = None
+) -> sj.Material:
     """Fit six Gaussians to a reflectance, its total held; the surface itself reflects nothing."""
-    weights = sj.NonNegativeWeights(sj.FixedTotalReflectance())
+    weights = sj.fitting.NonNegativeWeights(sj.fitting.FixedTotalReflectance())
     with jax.enable_x64(True):
         profile = jax.tree.map(lambda leaf: leaf.astype(jnp.float64), profile)
-        rule = sj.L2_QUADRATURE.beyond(0.2 / SIGMA_T)
+        rule = sj.scattering.L2_QUADRATURE.beyond(0.2 / SIGMA_T)
         gaussians = sj.fit_gaussians(profile, 6, weights=weights, rule=rule).gaussians
     gaussians = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), gaussians)
     return sj.Material(gaussians, eta=1.0, specular=0.0, single_scattering=single)

@@ -23,7 +23,7 @@ from splatjax.geometry import Mesh, sample_mesh, vertex_normals
 from splatjax.io import linear_to_srgb
 
 FOLDER = Path(__file__).resolve().parents[1] / "out" / "gallery"
-HELD = sj.NonNegativeWeights(sj.FixedTotalReflectance())
+HELD = sj.fitting.NonNegativeWeights(sj.fitting.FixedTotalReflectance())
 WARM, BLUE = (1.0, 0.97, 0.92), (0.8, 0.9, 1.0)
 
 
@@ -39,7 +39,7 @@ def sun(x, y, z, strength=1.0, tint=(1.0, 1.0, 1.0), cast_shadows=True) -> sj.Di
 fill = partial(sun, cast_shadows=False)
 
 
-def fitted(profile: sj.AbstractProfile, eta: float, specular: float, roughness: float):
+def fitted(profile: sj.gaussians.AbstractProfile, eta: float, specular: float, roughness: float):
     """Return a material whose Gaussians are fitted to a profile."""
     gaussians = sj.fit_gaussians(profile, 6, weights=HELD).gaussians
     return sj.Material(gaussians, eta=eta, specular=specular, roughness=roughness)
@@ -132,7 +132,7 @@ def milk_glass(_: sj.Splats, side: int) -> np.ndarray:
     angle = np.arctan2(vertices[:, 0], vertices[:, 2])
     vertices[:, [0, 2]] *= (1 + 0.03 * np.cos(14 * angle))[:, None]
     glass = medium([0.0015, 0.002, 0.0028], [1.6, 1.9, 2.3], 1.5)
-    opal = fitted(sj.BetterDipole(glass), 1.5, 1.0, 0.07)
+    opal = fitted(sj.scattering.BetterDipole(glass), 1.5, 1.0, 0.07)
     lamp = sj.PointLight(jnp.asarray([0.0, 60.0, 0.0]), jnp.asarray([7000.0, 4000.0, 1800.0]))
     lights = lamp, sun(-0.9, 0.6, 0.5, 0.45, (0.75, 0.88, 1.0)), fill(0.6, 0.1, 0.8, 0.04)
     splats = covered(vertices, faces, 300_000)
@@ -182,7 +182,7 @@ def wax(_: sj.Splats, side: int) -> np.ndarray:
     rim = sum(height * np.sin(number * angle + phase) for height, number, phase in waves)
     vertices[:, 1] += np.clip((vertices[:, 1] - 50) / 30, 0, 1) * rim
     candle = medium([0.0006, 0.0022, 0.009], [0.9, 1.0, 1.15], 1.44)
-    paraffin = fitted(sj.BetterDipole(candle), 1.44, 0.6, 0.2)
+    paraffin = fitted(sj.scattering.BetterDipole(candle), 1.44, 0.6, 0.2)
     flame = sj.PointLight(jnp.asarray([0.0, 69.0, 0.0]), jnp.asarray([5200.0, 3400.0, 1700.0]))
     dusk = (0.6, 0.75, 1.0)
     lights = flame, sun(-0.8, 0.5, -0.9, 0.25, dusk), sun(0.8, 0.5, 0.8, 0.05, dusk)
@@ -214,8 +214,10 @@ def inverse(_: sj.Splats, side: int) -> np.ndarray:
     deviation = np.full(rendered.shape, 0.01 * np.sqrt(np.mean(rendered**2)))
     photograph = rendered + deviation * np.random.default_rng(0).normal(size=rendered.shape)
     with jax.enable_x64(True):
-        observation = sj.Observation(photograph, camera, lights, deviation=deviation)
-        recovery = sj.recover([observation], splats, start, progress=lambda what, _: print(what))
+        observation = sj.inverse.Observation(photograph, camera, lights, deviation=deviation)
+        recovery = sj.inverse.recover(
+            [observation], splats, start, progress=lambda what, _: print(what)
+        )
     print(recovery.summary())
     for name in ("sigma_a", "sigma_s_prime"):
         ratio = np.asarray(getattr(recovery.medium, name)) / np.asarray(getattr(marble, name))

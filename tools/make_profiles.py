@@ -30,14 +30,14 @@ SETTINGS = {
 }
 
 
-def fit_material(name: str) -> sj.FitResult:
+def fit_material(name: str) -> sj.fitting.FitResult:
     """Return the fit that a material is shipped with."""
     with jax.enable_x64(True):
-        weights = sj.NonNegativeWeights(sj.FixedTotalReflectance())
+        weights = sj.fitting.NonNegativeWeights(sj.fitting.FixedTotalReflectance())
         return sj.fit_gaussians(sj.load_profile(name), COUNT, weights=weights)
 
 
-def write(name: str, path: Path, tables: dict) -> sj.FitResult:
+def write(name: str, path: Path, tables: dict) -> sj.fitting.FitResult:
     """Write a material's file with a new fit."""
     fitted = fit_material(name)
     with jax.enable_x64(True):
@@ -57,7 +57,7 @@ def rounded(values: jax.Array, digits: int) -> jax.Array:
 def write_starts(path: Path) -> None:
     """Tabulate the logarithms of the best variances."""
     absorbed, eta = (grid.ravel() for grid in np.meshgrid(ROOTS**2, ETAS, indexing="ij"))
-    tables, spread = {}, sj.VariancesPerChannel()
+    tables, spread = {}, sj.fitting.VariancesPerChannel()
     with jax.enable_x64(True):
         medium = sj.Medium(jnp.asarray(absorbed), jnp.asarray(1 - absorbed), jnp.asarray(eta))
         for count in range(1, 9):

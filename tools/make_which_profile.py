@@ -30,15 +30,17 @@ TITLES += [f"at {place:g}" for place in PLACES]
 KEY = jax.random.key(2010)
 
 
-def burley(medium: sj.Medium) -> sj.Burley:
+def burley(medium: sj.Medium) -> sj.scattering.Burley:
     """Return Burley's curve with the better dipole's color; its length is the mean free path."""
-    return sj.Burley(sj.BetterDipole(medium).total_reflectance(), 1 / medium.sigma_t_prime)
+    return sj.scattering.Burley(
+        sj.scattering.BetterDipole(medium).total_reflectance(), 1 / medium.sigma_t_prime
+    )
 
 
 HALF_SPACES = {
     "Dipole": sj.Dipole,
-    "BetterDipole": sj.BetterDipole,
-    "PhotonBeam": sj.PhotonBeam,
+    "BetterDipole": sj.scattering.BetterDipole,
+    "PhotonBeam": sj.scattering.PhotonBeam,
     "Burley": burley,
 }
 
@@ -64,7 +66,7 @@ def slabs(photons: int) -> Iterator[str]:
             total = f"{float(truth.total_reflectance.value[0]):.4f}"
             yield row(name, total, "Multipole", "refused", "", *[""] * len(PLACES))
             continue
-        slab = sj.Multipole(layer)
+        slab = sj.scattering.Multipole(layer)
         yield from rows(f"{name}, reflected", truth, {"Multipole": slab}, 0)
         below = {"Multipole": slab.transmitted()}
         yield from rows(f"{name}, transmitted", truth, below, 0, below=True)
@@ -78,11 +80,11 @@ def layers(photons: int) -> Iterator[str]:
         yield from rows(f"skin_layers, {name}", truth, {"LayeredMultipole": skin}, channel)
 
 
-def walk(stack, photons: int, number: int) -> sj.MonteCarlo:
+def walk(stack, photons: int, number: int) -> sj.transport.MonteCarlo:
     """Walk in float32, whatever the precision of the models."""
     stack = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), list(stack))
     key, edges = jax.random.fold_in(KEY, number), jnp.asarray(RINGS, jnp.float32)
-    return sj.monte_carlo(stack, photons, key, edges=edges, progress=report)
+    return sj.transport.monte_carlo(stack, photons, key, edges=edges, progress=report)
 
 
 def report(done: int, photons: int) -> None:
@@ -94,7 +96,7 @@ def row(*cells: str) -> str:
 
 
 def rows(
-    name: str, truth: sj.MonteCarlo, models: dict, channel: int, below: bool = False
+    name: str, truth: sj.transport.MonteCarlo, models: dict, channel: int, below: bool = False
 ) -> Iterator[str]:
     """Yield a row for each model: how far off its total is, Eq. 4 beyond one mean free path, and
     ratios by ring where the truth is known to 10%.

@@ -102,7 +102,7 @@ class Fit:
         """Fit, print, write."""
         check_output(self.output, (".csv",) if self.all else (".toml",))
         check_output(self.plot, FIGURES)
-        most = 8 if self.all else sj.LeastCount.largest
+        most = 8 if self.all else sj.fitting.LeastCount.largest
         rules = {
             "count": (1 <= self.count <= most, f"lie between 1 and {most}"),
             "error": (self.error is None or self.error > 0, "be positive, such as 0.01"),
@@ -124,7 +124,7 @@ class Fit:
     def _run(self) -> None:
         self._check_options()
         coefficients = self._coefficients()
-        if isinstance(coefficients, sj.Tabulated):
+        if isinstance(coefficients, sj.scattering.Tabulated):
             measured, target = True, Reference(coefficients, description="measured")
             radii = len(coefficients.radii)
             if self.error is None and 2 * self.count > radii:
@@ -166,10 +166,10 @@ class Fit:
                     f"for {kind}; leave it out"
                 )
 
-    def _coefficients(self) -> sj.Dipole | sj.LayeredMultipole | sj.Tabulated:
+    def _coefficients(self) -> sj.Dipole | sj.LayeredMultipole | sj.scattering.Tabulated:
         suffix = Path(self.medium).suffix.lower()
         if suffix == ".csv":
-            return sj.read_profile(self.medium, mm_per_unit=self.mm_per_unit)
+            return sj.io.read_profile(self.medium, mm_per_unit=self.mm_per_unit)
         if suffix != ".exr":
             return sj.load_profile(self.medium)
         if self.mm_per_pixel is None:
@@ -185,14 +185,14 @@ class Fit:
     def _weights(self, measured: bool) -> tuple[AbstractWeights, str]:
         """Return the constraint on the weights, and its description."""
         if self.free:
-            return sj.FreeWeights(), "free"
+            return sj.fitting.FreeWeights(), "free"
         if measured:
-            return sj.NonNegativeWeights(sj.FreeWeights()), "non-negative"
-        held = sj.NonNegativeWeights(sj.FixedTotalReflectance())
+            return sj.fitting.NonNegativeWeights(sj.fitting.FreeWeights()), "non-negative"
+        held = sj.fitting.NonNegativeWeights(sj.fitting.FixedTotalReflectance())
         return held, "non-negative, sum held to the total reflectance"
 
-    def _fitted(self, target: Reference, weights: AbstractWeights) -> sj.FitResult:
-        count = self.count if self.error is None else sj.LeastCount(self.error)
+    def _fitted(self, target: Reference, weights: AbstractWeights) -> sj.fitting.FitResult:
+        count = self.count if self.error is None else sj.fitting.LeastCount(self.error)
         number = counted(self.count, "Gaussian")
         goal = number if self.error is None else f"Gaussians to an error of {self.error:g}"
         with stage(f"fitting to {self.medium}: {goal}"):
@@ -217,9 +217,9 @@ class Fit:
     def _save(
         self,
         output: Path,
-        coefficients: sj.Dipole | sj.LayeredMultipole | sj.Tabulated,
+        coefficients: sj.Dipole | sj.LayeredMultipole | sj.scattering.Tabulated,
         target: Reference,
-        fitted: sj.FitResult,
+        fitted: sj.fitting.FitResult,
         weights_of: str,
     ) -> None:
         settings = {
@@ -231,7 +231,7 @@ class Fit:
         if target.description is not None:
             settings = {"profile": target.description} | settings
         provenance = f"fitted by splatjax {own_version()} to the "
-        if isinstance(coefficients, sj.Tabulated):
+        if isinstance(coefficients, sj.scattering.Tabulated):
             provenance += f"profile of {self.medium}"
             material, profile, source = sj.Material(fitted.gaussians), None, {}
         else:
@@ -253,7 +253,7 @@ class Fit:
         )
 
 
-def _print(fitted: sj.FitResult) -> None:
+def _print(fitted: sj.fitting.FitResult) -> None:
     gaussians = fitted.gaussians
     names = ", ".join(channel_names(gaussians.weights.shape[1]))
     pairs = zip(gaussians.variances, gaussians.weights, strict=True)

@@ -82,7 +82,7 @@ def fit_all(media: Path, output: Path, count: int, weights: AbstractWeights) -> 
 def _fit_each(coefficients: Float[Array, "media 3"], starts, count: int, weights: AbstractWeights):
     def fit(row):
         medium = sj.Medium(row[0:1], row[1:2], row[2:3])
-        start = sj.GivenVariances(starts(medium, count).variances[0])
+        start = sj.fitting.GivenVariances(starts(medium, count).variances[0])
         fitted = sj.fit_gaussians(
             sj.Dipole(medium), count, start=start, weights=weights, throw=False
         )
@@ -97,7 +97,7 @@ def _fitted(
     """Return the columns of a batch. A smaller batch is padded, so that one program serves all."""
     given = len(coefficients)
     padded = np.pad(coefficients, ((0, _BATCH - given), (0, 0)), mode="edge")
-    fitted, converged = _fit_each(jnp.asarray(padded), sj.dipole_starts(), count, weights)
+    fitted, converged = _fit_each(jnp.asarray(padded), sj.io.dipole_starts(), count, weights)
     columns = dict(zip(("sigma_a", "sigma_s_prime", "eta"), padded.T, strict=True))
     columns |= {f"variance_{i + 1}": fitted.gaussians.variances[:, i] for i in range(count)}
     columns |= {f"weight_{i + 1}": fitted.gaussians.weights[:, i, 0] for i in range(count)}

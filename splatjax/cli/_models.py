@@ -25,8 +25,8 @@ class Reference:
     - `description`: of a profile that coefficients alone do not give back.
     """
 
-    profile: sj.AbstractProfile
-    rule: AbstractRadialRule = sj.L2_QUADRATURE
+    profile: sj.gaussians.AbstractProfile
+    rule: AbstractRadialRule = sj.scattering.L2_QUADRATURE
     single: sj.SingleScattering | None = None
     description: str | None = None
 
@@ -52,7 +52,7 @@ def reference(
         raise ValueError(f"--cut has no effect on {option}, which is finite at the origin")
     if single_scattering and model not in ("photon-beam", "monte-carlo"):
         raise ValueError(f"{option} is not possible; take photon-beam or monte-carlo")
-    beyond = sj.L2_QUADRATURE.beyond(_CUT if cut is None else cut)
+    beyond = sj.scattering.L2_QUADRATURE.beyond(_CUT if cut is None else cut)
     if isinstance(coefficients, sj.LayeredMultipole):
         if model == "dipole":
             return Reference(coefficients)
@@ -68,13 +68,13 @@ def reference(
         half_space = sj.Layer(medium, jnp.asarray(jnp.inf))
         return _walked((half_space,), photons, beyond, single if single_scattering else None)
     if single_scattering:
-        profile = sj.PhotonBeam(medium).multiply_scattered()
+        profile = sj.scattering.PhotonBeam(medium).multiply_scattered()
         return Reference(
             profile, single=single, description="photon beam, without single scattering"
         )
     if model == "photon-beam":
-        return Reference(sj.PhotonBeam(medium), beyond)
-    return Reference(coefficients if model == "dipole" else sj.BetterDipole(medium))
+        return Reference(sj.scattering.PhotonBeam(medium), beyond)
+    return Reference(coefficients if model == "dipole" else sj.scattering.BetterDipole(medium))
 
 
 def _walked(
@@ -86,7 +86,7 @@ def _walked(
     """Walk in single precision, which suffices for photons; the profile is fitted in double."""
     layers_32 = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), list(layers))
     with stage("walking photons", photons) as report:
-        walk = sj.monte_carlo(
+        walk = sj.transport.monte_carlo(
             layers_32, photons, jax.random.key(0), progress=lambda done, _: report(done)
         )
     profile = jax.tree.map(lambda leaf: leaf.astype(jnp.float64), walk.profile())

@@ -40,7 +40,7 @@ _START = (
 _LARGEST_ETA = 3.0
 """Of any translucent solid: diamond has 2.4."""
 _COEFFICIENTS = ("sigma_a", "sigma_s_prime")
-_MODELS = {"dipole": sj.Dipole, "better-dipole": sj.BetterDipole}
+_MODELS = {"dipole": sj.Dipole, "better-dipole": sj.scattering.BetterDipole}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,13 +107,13 @@ class Recover:
         for name in self.start:
             sj.load_medium(name)  # reports faults before the pictures are read
         with stage(f"reading {self.splats} and {self.pictures}"):
-            observations = sj.read_observations(self.pictures)
+            observations = sj.io.read_observations(self.pictures)
             splats = sj.read_splats(self.splats)
         splats = sj.Splats(splats.centers, splats.normals, splats.radii, splats.areas)
         with jax.enable_x64(True):
             self._run(observations, splats)
 
-    def _run(self, observations: list[sj.Observation], splats: sj.Splats) -> None:
+    def _run(self, observations: list[sj.inverse.Observation], splats: sj.Splats) -> None:
         search = self.output.with_suffix(".search.json")
         dependencies = self._dependencies()
         starts = self._starts(search, dependencies, observations[0].picture.shape[2])
@@ -126,14 +126,14 @@ class Recover:
                 write_record(search, {"made of": dependencies, **values})
 
         gaussians = sj.SumOfGaussians(jnp.ones(1), jnp.ones((1, starts[0].eta.shape[0])))
-        recovery = sj.recover(
+        recovery = sj.inverse.recover(
             observations,
             splats,
             starts,
             surface=sj.Material(gaussians, starts[0].eta[0], self.specular, self.roughness),
             model=_MODELS[self.model],
             count=self.count,
-            loss=sj.HuberLoss() if self.robust else sj.SquaredLoss(),
+            loss=sj.inverse.HuberLoss() if self.robust else sj.inverse.SquaredLoss(),
             progress=report,
             throw=False,
         )
@@ -190,16 +190,21 @@ class Recover:
         }
 
     def _suggest(
-        self, recovery: sj.Recovery, observations: list[sj.Observation], splats: sj.Splats
+        self,
+        recovery: sj.inverse.Recovery,
+        observations: list[sj.inverse.Observation],
+        splats: sj.Splats,
     ) -> None:
         first = observations[0]
-        candidates = sj.default_candidates(splats, first.camera, first.picture.shape[2])
+        candidates = sj.inverse.default_candidates(splats, first.camera, first.picture.shape[2])
         with stage(f"looking at {len(candidates)} pictures that could be taken next"):
-            predictions = sj.next_pictures(recovery, splats, candidates, model=_MODELS[self.model])
+            predictions = sj.inverse.next_pictures(
+                recovery, splats, candidates, model=_MODELS[self.model]
+            )
         print("what one more picture would do, the best first:")
         print(*(f"  {prediction}" for prediction in predictions), sep="\n")
 
-    def _save(self, recovery: sj.Recovery) -> None:
+    def _save(self, recovery: sj.inverse.Recovery) -> None:
         errors = recovery.relative_errors()
         sj.save_material(
             recovery.material,

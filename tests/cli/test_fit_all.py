@@ -52,7 +52,7 @@ def test_a_table_of_media_becomes_a_table_of_fits_and_is_continued(
     assert all(float(row["converged"]) == 1 for row in rows)
     with jax.enable_x64(True):
         medium = sj.Medium(*(jnp.asarray([value]) for value in (0.03, 0.7, 1.2)))
-        weights = sj.NonNegativeWeights(sj.FixedTotalReflectance())
+        weights = sj.fitting.NonNegativeWeights(sj.fitting.FixedTotalReflectance())
         alone = sj.fit_gaussians(sj.Dipole(medium), 2, weights=weights)
         expected = [*alone.gaussians.variances, *alone.gaussians.weights[:, 0], alone.error[0]]
         columns = ("variance_1", "variance_2", "weight_1", "weight_2", "error")

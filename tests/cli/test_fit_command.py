@@ -126,9 +126,11 @@ def test_a_fit_that_does_not_settle_names_the_remedy(words, remedy, monkeypatch,
     def unsettled(profile, count, **_):
         gaussians = sj.SumOfGaussians(jnp.ones(count), jnp.ones((count, 3)))
         result = optx.RESULTS.nonlinear_max_steps_reached
-        return sj.FitResult(gaussians, jnp.ones(3), jnp.ones(3), result, jnp.eye(4 * count))
+        return sj.fitting.FitResult(gaussians, jnp.ones(3), jnp.ones(3), result, jnp.eye(4 * count))
 
-    walked = sj.Tabulated(jnp.arange(1.0, 5.0), jnp.ones((4, 3)), jnp.ones((4, 3)), jnp.ones(3))
+    walked = sj.scattering.Tabulated(
+        jnp.arange(1.0, 5.0), jnp.ones((4, 3)), jnp.ones((4, 3)), jnp.ones(3)
+    )
     monkeypatch.setattr(sj, "fit_gaussians", unsettled)
     monkeypatch.setattr(_models, "_walked", lambda *_: _models.Reference(walked))
     output = tmp_path / "mine.toml"

@@ -52,7 +52,7 @@ def search(monkeypatch):
             raise ended
         seen = np.array(observations[0].picture, float)
         seen[5:] = np.nan
-        return sj.Recovery(
+        return sj.inverse.Recovery(
             medium=medium,
             material=surface,
             intensities=jnp.ones((1, 3)),
@@ -93,7 +93,7 @@ def test_it_writes_a_material_and_a_report_with_what_is_not_fixed(
     assert splats.albedo is None
     np.testing.assert_allclose(starts[1].sigma_a, sj.load_medium("marble").sigma_a, rtol=1e-6)
     assert (options["model"], options["count"]) == (sj.Dipole, 6)
-    assert isinstance(options["loss"], sj.HuberLoss)
+    assert isinstance(options["loss"], sj.inverse.HuberLoss)
 
 
 @pytest.mark.parametrize(("more", "eta"), [([], 1.5), (["--eta", 1.42], 1.42)])

@@ -7,7 +7,7 @@ import numpy as np
 import splatjax as sj
 from splatjax.inverse import wide_variances
 
-HELD = sj.NonNegativeWeights(sj.FixedTotalReflectance())
+HELD = sj.fitting.NonNegativeWeights(sj.fitting.FixedTotalReflectance())
 
 
 def medium(sigma_a=(0.02, 0.2), sigma_s_prime=(1.0, 0.7)):
@@ -19,7 +19,7 @@ def medium(sigma_a=(0.02, 0.2), sigma_s_prime=(1.0, 0.7)):
 def test_with_the_variances_of_a_fit_they_are_its_weights(float64):
     """Of a material that comes with the package: with as many digits as its file has."""
     fitted = sj.load_material("marble").gaussians
-    found = sj.fit_weights(sj.load_profile("marble"), fitted.variances, weights=HELD)
+    found = sj.fitting.fit_weights(sj.load_profile("marble"), fitted.variances, weights=HELD)
     np.testing.assert_allclose(found.weights, fitted.weights, atol=1e-7)
     np.testing.assert_array_equal(found.variances, fitted.variances)
 
@@ -35,8 +35,8 @@ def test_wide_variances_serve_all_media_near(float64):
     @jax.jit
     def error(sigma_a, sigma_s_prime):
         profile = sj.Dipole(sj.Medium(sigma_a, sigma_s_prime, near.eta))
-        found = sj.fit_weights(profile, variances, weights=HELD)
-        return sj.relative_error(
+        found = sj.fitting.fit_weights(profile, variances, weights=HELD)
+        return sj.fitting.relative_error(
             profile, found
         ), found.total_reflectance() / profile.total_reflectance() - 1
 
@@ -53,7 +53,7 @@ def test_they_have_derivatives_in_the_coefficients(float64):
     @jax.jit
     def weights(point):
         profile = sj.Dipole(sj.Medium(jnp.exp(point[:2]), jnp.exp(point[2:]), jnp.full(2, 1.3)))
-        return sj.fit_weights(profile, variances, weights=HELD).weights
+        return sj.fitting.fit_weights(profile, variances, weights=HELD).weights
 
     point, way, step = (
         jnp.log(jnp.asarray([0.02, 0.2, 1.0, 0.7])),

@@ -21,11 +21,11 @@ from splatjax.splatting import DenseRasterizer, ShadowSettings
 PLAIN = sj.RenderSettings(rasterizer=DenseRasterizer(), diffuser=DenseDiffuser())
 SIZE = 16
 PARTS = (
-    sj.AlbedoMap(step=0.2),
-    sj.NormalOffsets(step=0.02, smoothness=2.0, deviation=0.5),
-    sj.LightStrengths(),
-    sj.LightPlaces(),
-    sj.CameraPoses(turn=4e-3),
+    sj.inverse.AlbedoMap(step=0.2),
+    sj.inverse.NormalOffsets(step=0.02, smoothness=2.0, deviation=0.5),
+    sj.inverse.LightStrengths(),
+    sj.inverse.LightPlaces(),
+    sj.inverse.CameraPoses(turn=4e-3),
 )
 
 
@@ -61,21 +61,21 @@ def evaluate(splats: sj.Splats, light: sj.DirectionalLight, picture=0.0, x=None)
     """Evaluate a picture by the program that all fits of this file run."""
     scene, setup = MovableScene.of(splats, material(), PARTS), Setup(splats, camera(), (light,))
     picture = np.broadcast_to(picture, (SIZE, SIZE, 2))
-    evidence = Evidence.of(sj.Observation(picture, camera(), light), jnp.zeros(()).dtype)
+    evidence = Evidence.of(sj.inverse.Observation(picture, camera(), light), jnp.zeros(()).dtype)
     plan = sj.make_plan(sj.Scene(splats, light, material()), camera(), PLAIN)
     x = scene.of_picture(scene.start([setup]), 0) if x is None else x
-    settings = PLAIN, sj.SquaredLoss(), sj.BlackBackground()
+    settings = PLAIN, sj.inverse.SquaredLoss(), sj.inverse.BlackBackground()
     return _descent.evaluate(x, scene, setup, evidence, plan, *settings)
 
 
-def observations(shots=None, x=None, **more) -> list[sj.Observation]:
+def observations(shots=None, x=None, **more) -> list[sj.inverse.Observation]:
     """Pictures of the body, or of it at coordinates, under each light; said to be taken otherwise,
     if that is given.
     """
     pictures = [np.asarray(evaluate(body(), light, x=x).beauty) for light in lights()]
     shots = [(camera(), (light,)) for light in lights()] if shots is None else shots
     return [
-        sj.Observation(picture, *shot, **more)
+        sj.inverse.Observation(picture, *shot, **more)
         for picture, shot in zip(pictures, shots, strict=True)
     ]
 
@@ -93,20 +93,20 @@ def chosen(kinds, coordinates):
     )
 
 
-def fitted(*kinds: type, steps: int, seen=None, splats=None, **more) -> sj.FittedScene:
+def fitted(*kinds: type, steps: int, seen=None, splats=None, **more) -> sj.inverse.FittedScene:
     optimizer = optax.chain(
         optax.adam(optax.cosine_decay_schedule(2.0, steps), b2=0.9), only(*kinds)
     )
     seen = observations() if seen is None else seen
     splats = body() if splats is None else splats
-    return sj.fit_scene(
+    return sj.inverse.fit_scene(
         seen,
         splats,
         material(),
         PARTS,
         optimizer,
         steps=steps,
-        background=sj.BlackBackground(),
+        background=sj.inverse.BlackBackground(),
         settings=PLAIN,
         **more,
     )
@@ -159,7 +159,7 @@ class TestFitScene:
 
     def test_an_albedo_map_comes_back_and_splats_unseen_do_not_move(self):
         gray = with_albedo(body(), np.full(body().albedo.shape, 0.5))
-        found = fitted(sj.AlbedoMap, steps=60, splats=gray)
+        found = fitted(sj.inverse.AlbedoMap, steps=60, splats=gray)
         seen, unseen = seen_well(gray), np.abs(np.asarray(gray.centers)[:, 0]) > 20
         errors = np.abs(np.asarray(found.splats.albedo - body().albedo))
         assert np.median(errors[seen]) < 0.03
@@ -171,7 +171,9 @@ class TestFitScene:
             (camera(), sj.DirectionalLight(way, light.irradiance * factor, cast_shadows=False))
             for light, (factor, way) in zip(lights(), off, strict=True)
         ]
-        found = fitted(sj.LightStrengths, sj.LightPlaces, steps=60, seen=observations(begin))
+        found = fitted(
+            sj.inverse.LightStrengths, sj.inverse.LightPlaces, steps=60, seen=observations(begin)
+        )
         for (ours,), true in zip(found.lights, lights(), strict=True):
             assert degrees(ours.direction, true.direction) < 2  # 14 at the start
             np.testing.assert_allclose(ours.irradiance, true.irradiance, rtol=3e-2)
@@ -184,7 +186,9 @@ class TestFitScene:
             lambda c: (c.position, c.rotation), right, (position, right.rotation @ turned.T)
         )
         found = fitted(
-            sj.CameraPoses, steps=120, seen=observations([(off, (light,)) for light in lights()])
+            sj.inverse.CameraPoses,
+            steps=120,
+            seen=observations([(off, (light,)) for light in lights()]),
         )
         for ours in found.cameras:
             assert np.linalg.norm(ours.position - right.position) < 0.2  # mm; 2.4 at the start
@@ -197,7 +201,7 @@ class TestFitScene:
         x = jnp.asarray(40 * np.random.default_rng(4).normal(size=body().count))
         dented = part.moved(setup, x, part.prepared(body())).splats
         own = (zeros[0], x, *(one[0] for one in zeros[2:]))
-        found = fitted(sj.NormalOffsets, steps=60, seen=observations(x=own))
+        found = fitted(sj.inverse.NormalOffsets, steps=60, seen=observations(x=own))
         before, after = (
             degrees(each.normals, dented.normals)[seen_well(dented)]
             for each in (body(), found.splats)
@@ -208,7 +212,9 @@ class TestFitScene:
 
     def test_nothing_is_compiled_between_steps(self, compiled):
         counts = []
-        fitted(sj.AlbedoMap, steps=4, progress=lambda said, loss: counts.append(len(compiled)))
+        fitted(
+            sj.inverse.AlbedoMap, steps=4, progress=lambda said, loss: counts.append(len(compiled))
+        )
         assert counts[0] < counts[2]  # the listener hears what the first step compiles
         assert counts[2] == counts[-1]
 
@@ -247,7 +253,7 @@ def stand_in(monkeypatch, reach: float, spoiled: float = np.inf) -> list[float]:
     return made
 
 
-def lifted(target: float, settings, spoilt=(), **more) -> tuple[sj.FittedScene, list[str]]:
+def lifted(target: float, settings, spoilt=(), **more) -> tuple[sj.inverse.FittedScene, list[str]]:
     """Fit a stand-in that starts at 0.5; settings tell stand-ins apart that are otherwise alike to
     the compiler.
 
@@ -258,10 +264,10 @@ def lifted(target: float, settings, spoilt=(), **more) -> tuple[sj.FittedScene, 
     picture[list(spoilt)] = 90.0
     picture[:5], picture[5, :, 1] = 90.0, np.nan
     mask, deviation = np.arange(SIZE)[:, None] > 4 * np.ones(SIZE), np.full(picture.shape, 0.01)
-    seen = sj.Observation(picture, camera(), (lights()[0],), mask=mask, deviation=deviation)
+    seen = sj.inverse.Observation(picture, camera(), (lights()[0],), mask=mask, deviation=deviation)
     optimizer = optax.adam(optax.cosine_decay_schedule(1.0, 40))
-    parts = [sj.AlbedoMap(deviation=1e3)]
-    found = sj.fit_scene(
+    parts = [sj.inverse.AlbedoMap(deviation=1e3)]
+    found = sj.inverse.fit_scene(
         [seen],
         splats,
         material(),
@@ -295,7 +301,7 @@ def test_a_robust_loss_is_not_misled_by_rows_that_shine(monkeypatch):
     """
     stand_in(monkeypatch, reach=np.inf)
     settings = sj.RenderSettings(shadows=ShadowSettings(resolution=105))
-    found, _ = lifted(0.8, settings, spoilt=(8, 13), loss=sj.HuberLoss())
+    found, _ = lifted(0.8, settings, spoilt=(8, 13), loss=sj.inverse.HuberLoss())
     np.testing.assert_allclose(found.splats.albedo, 0.8, atol=0.01)
     misled, _ = lifted(0.8, settings, spoilt=(8, 13))
     assert float(jnp.min(misled.splats.albedo)) > 0.85
@@ -318,8 +324,10 @@ def test_what_is_no_number_ends_the_fit_at_the_best_before_it(monkeypatch):
 
 def test_pixels_that_a_body_does_not_fill_count_before_black_alone():
     coverage = jnp.asarray([[0.0, 0.5, 0.9989, 0.9991, 1.0]])
-    np.testing.assert_array_equal(sj.UnknownBackground().counts(coverage), [[0, 0, 0, 1, 1]])
-    np.testing.assert_array_equal(sj.BlackBackground().counts(coverage), np.ones((1, 5)))
+    np.testing.assert_array_equal(
+        sj.inverse.UnknownBackground().counts(coverage), [[0, 0, 0, 1, 1]]
+    )
+    np.testing.assert_array_equal(sj.inverse.BlackBackground().counts(coverage), np.ones((1, 5)))
 
 
 @pytest.mark.parametrize(
@@ -327,32 +335,40 @@ def test_pixels_that_a_body_does_not_fill_count_before_black_alone():
     [
         ({"parts": ()}, "one part and one step are needed at least; got 1, 0 and 1"),
         ({"observations": (), "steps": 0}, "got 0, 1 and 0"),
-        ({"parts": (sj.AlbedoMap(), sj.AlbedoMap(1.0))}, "parts are AlbedoMap, AlbedoMap"),
+        (
+            {"parts": (sj.inverse.AlbedoMap(), sj.inverse.AlbedoMap(1.0))},
+            "parts are AlbedoMap, AlbedoMap",
+        ),
         ({"splats": bodies.sphere(20)}, r"splats\.albedo is None, and AlbedoMap has nothing"),
         (
-            {"splats": bodies.sphere(16), "parts": (sj.NormalOffsets(0.1, 1.0, 1.0),)},
+            {"splats": bodies.sphere(16), "parts": (sj.inverse.NormalOffsets(0.1, 1.0, 1.0),)},
             "16 splats are too few to measure slopes among; NormalOffsets needs 17",
         ),
         ({"channels": 3}, r"observations\[0\]\.picture has 3 channels, material has 2"),
-        ({"intensity": sj.UnknownColor()}, r"observations\[0\]\.intensity is UnknownColor\(\)"),
+        (
+            {"intensity": sj.inverse.UnknownColor()},
+            r"observations\[0\]\.intensity is UnknownColor\(\)",
+        ),
     ],
 )
 def test_what_cannot_be_fitted_is_refused(change, said):
     picture = np.ones((SIZE, SIZE, change.pop("channels", 2)))
-    intensity = change.pop("intensity", sj.KnownIntensity())
+    intensity = change.pop("intensity", sj.inverse.KnownIntensity())
     arguments = {
-        "observations": [sj.Observation(picture, camera(), lights()[0], intensity=intensity)],
+        "observations": [
+            sj.inverse.Observation(picture, camera(), lights()[0], intensity=intensity)
+        ],
         "splats": with_albedo(bodies.sphere(20), np.full((20, 2), 0.5)),
-        "parts": [sj.AlbedoMap()],
+        "parts": [sj.inverse.AlbedoMap()],
         "steps": 1,
     }
     with pytest.raises(ValueError, match=said):
-        sj.fit_scene(material=material(), optimizer=optax.adam(1.0), **(arguments | change))
+        sj.inverse.fit_scene(material=material(), optimizer=optax.adam(1.0), **(arguments | change))
 
 
 def test_a_step_that_moves_nothing_is_refused():
     with pytest.raises(ValueError, match=r"LightStrengths\.step must be positive; got 0"):
-        sj.LightStrengths(step=0.0)
+        sj.inverse.LightStrengths(step=0.0)
 
 
 def test_a_picture_none_of_whose_pixels_counts_is_refused(monkeypatch):

@@ -34,7 +34,7 @@ splats.
 """
 SIZE = 24
 COUNT = 4
-HELD = sj.NonNegativeWeights(sj.FixedTotalReflectance())
+HELD = sj.fitting.NonNegativeWeights(sj.fitting.FixedTotalReflectance())
 STRONGER = 1.7
 """The second light, than is given."""
 NOISE = 0.01
@@ -75,23 +75,23 @@ def taken():
 
 
 def observations(pictures, deviation=None):
-    intensities = sj.KnownIntensity(), sj.UnknownIntensity()
+    intensities = sj.inverse.KnownIntensity(), sj.inverse.UnknownIntensity()
     return [
-        sj.Observation(picture, camera(), light, deviation=deviation, intensity=intensity)
+        sj.inverse.Observation(picture, camera(), light, deviation=deviation, intensity=intensity)
         for picture, light, intensity in zip(pictures, lights(), intensities, strict=True)
     ]
 
 
-def recovered(pictures, starts, deviation=None, **more) -> sj.Recovery:
+def recovered(pictures, starts, deviation=None, **more) -> sj.inverse.Recovery:
     media = [
         jax.tree.map(lambda leaf: leaf.astype(jnp.float32), medium(*off)) for off in starts
     ]  # as they are loaded elsewhere
-    return sj.recover(
+    return sj.inverse.recover(
         observations(pictures, deviation), taken()[0], media, count=COUNT, settings=PLAIN, **more
     )
 
 
-def errors(found: sj.Recovery) -> np.ndarray:
+def errors(found: sj.inverse.Recovery) -> np.ndarray:
     """Compute the errors of the logarithms of both coefficients."""
     truth = medium()
     return np.stack(
@@ -103,7 +103,7 @@ def errors(found: sj.Recovery) -> np.ndarray:
 
 
 @cache
-def without_noise() -> sj.Recovery:
+def without_noise() -> sj.inverse.Recovery:
     return recovered(taken()[1], STARTS)
 
 
@@ -165,8 +165,8 @@ class TestRecover:
             found = recovered(spoiled, STARTS[:1], deviation, loss=loss, throw=False)
             return np.max(np.abs(errors(found)))
 
-        assert off(sj.SquaredLoss()) > 0.5
-        assert off(sj.HuberLoss()) < 0.05
+        assert off(sj.inverse.SquaredLoss()) > 0.5
+        assert off(sj.inverse.HuberLoss()) < 0.05
 
     @pytest.mark.long
     def test_one_picture_of_unknown_strength_does_not_fix_both_coefficients_and_a_second_one_does(
@@ -174,17 +174,17 @@ class TestRecover:
     ):
         noise = 2.5 * NOISE
         (_, alone), splats = observations(taken()[1], noise), taken()[0]
-        found = sj.recover([alone], splats, medium(1.5, 0.7), count=COUNT, settings=PLAIN)
+        found = sj.inverse.recover([alone], splats, medium(1.5, 0.7), count=COUNT, settings=PLAIN)
         assert not found.is_fixed()
         assert "not fixed by these pictures" in found.summary()
         dot = sj.GaussianBeam(
             camera().position, -camera().position, jnp.full(2, 20.0), jnp.asarray(2.0)
         )
         candidates = [
-            sj.Candidate("lamp", camera(), (lights()[0],)),
-            sj.Candidate("dot", camera(), (dot,)),
+            sj.inverse.Candidate("lamp", camera(), (lights()[0],)),
+            sj.inverse.Candidate("dot", camera(), (dot,)),
         ]
-        first, second = sj.next_pictures(found, splats, candidates, settings=PLAIN)
+        first, second = sj.inverse.next_pictures(found, splats, candidates, settings=PLAIN)
         assert {first.candidate.name, second.candidate.name} == {"lamp", "dot"}
         assert (
             first.worst.deviation
@@ -203,12 +203,12 @@ class TestRecover:
     def test_another_picture_can_only_tell_more(self):
         found, (splats, _) = without_noise(), taken()
         candidates = [
-            sj.Candidate("as before", camera(), (lights()[0],)),
-            sj.Candidate(
-                "as before, of unknown color", camera(), (lights()[0],), sj.UnknownColor()
+            sj.inverse.Candidate("as before", camera(), (lights()[0],)),
+            sj.inverse.Candidate(
+                "as before, of unknown color", camera(), (lights()[0],), sj.inverse.UnknownColor()
             ),
         ]
-        first, second = sj.next_pictures(found, splats, candidates, settings=PLAIN)
+        first, second = sj.inverse.next_pictures(found, splats, candidates, settings=PLAIN)
         assert first.candidate.name == "as before"  # its light's strength is known
         now = max(worst.deviation for _, worst in found.combinations())
         assert first.worst.deviation < second.worst.deviation <= now * (1 + 1e-9)
@@ -234,9 +234,11 @@ def half_resolved():
     )
     first, noise = jnp.zeros(points, jnp.int32), jnp.full((2, points), 0.01)
     flat = FlatPictures(light, jnp.ones((2, points)), jnp.zeros((2, points)), first[:0], first)
-    unknowns = Unknowns.of(medium().eta, [sj.KnownIntensity()])
+    unknowns = Unknowns.of(medium().eta, [sj.inverse.KnownIntensity()])
     fit = FixedVariances(light.variances, HELD)
-    problem = RecoveryProblem(flat, noise, noise, unknowns, fit, sj.SquaredLoss(), sj.Dipole)
+    problem = RecoveryProblem(
+        flat, noise, noise, unknowns, fit, sj.inverse.SquaredLoss(), sj.Dipole
+    )
     return problem, unknowns.start(medium())
 
 
@@ -287,7 +289,7 @@ def test_pixels_that_are_masked_unknown_or_not_filled_do_not_count():
     seen[:, 10, 1] = np.nan
     mask = np.arange(SIZE)[:, None] > 8 * np.ones(SIZE)
     light = sj.DirectionalLight(jnp.asarray([0.0, 0.0, -1.0]), jnp.ones(2), cast_shadows=False)
-    observation = sj.Observation(seen, camera(), light, mask=mask)
+    observation = sj.inverse.Observation(seen, camera(), light, mask=mask)
     expected = np.ones((SIZE, SIZE), bool)
     expected[:9], expected[:, 10] = False, False
     known = Evidence.of(observation, jnp.zeros(()).dtype).known
@@ -295,7 +297,7 @@ def test_pixels_that_are_masked_unknown_or_not_filled_do_not_count():
 
 
 def test_the_smooth_loss_bends():
-    loss = sj.HuberLoss(2.0)
+    loss = sj.inverse.HuberLoss(2.0)
     r = jnp.asarray([-1e3, -3.0, 0.0, 1e-3, 3.0])
     np.testing.assert_allclose(
         loss.root(r) ** 2,
@@ -306,7 +308,7 @@ def test_the_smooth_loss_bends():
     np.testing.assert_allclose(loss.root(r[3]) / r[3], 1.0, rtol=1e-6)
     assert float(loss.root(r)[0]) < 0
     with pytest.raises(ValueError, match="bend must be positive"):
-        sj.HuberLoss(0.0)
+        sj.inverse.HuberLoss(0.0)
 
 
 @pytest.mark.parametrize(
@@ -325,7 +327,7 @@ def test_the_smooth_loss_bends():
 def test_what_cannot_be_recovered_is_refused(change, said):
     light = sj.DirectionalLight([0, 0, -1], [1, 1], cast_shadows=False)
     picture = np.ones((SIZE, SIZE, change.pop("channels", 2)))
-    seen = [sj.Observation(picture, camera(), light)]
+    seen = [sj.inverse.Observation(picture, camera(), light)]
     arguments = {"observations": seen, "splats": bodies.sphere(60), "starts": medium()}
     with pytest.raises(ValueError, match=said):
-        sj.recover(**(arguments | change))
+        sj.inverse.recover(**(arguments | change))

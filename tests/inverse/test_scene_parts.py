@@ -38,7 +38,10 @@ def test_lights_move_each_in_its_own_way():
     beam = sj.GaussianBeam([1, 2, 3], [0, 0, -2], power=[4, 5], variance=1)
     lights = sj.PointLight([1, 2, 3], intensity=[4, 5]), beam
     setup = Setup(bodies.sphere(20), camera, lights)
-    places, strengths = sj.LightPlaces(turn=0.1, shift=2.0), sj.LightStrengths(step=0.5)
+    places, strengths = (
+        sj.inverse.LightPlaces(turn=0.1, shift=2.0),
+        sj.inverse.LightStrengths(step=0.5),
+    )
     x = jax.tree.map(jnp.ones_like, places.coordinates(setup))
     lamp, beam = places.moved(setup, x, None).lights
     np.testing.assert_allclose(lamp.position, [3, 4, 5])
@@ -55,7 +58,7 @@ def test_lights_move_each_in_its_own_way():
 def test_a_camera_turns_around_the_body():
     """The middle stays where it was in the picture, and as far away."""
     camera = CAMERA
-    middle, part = jnp.asarray([0.5, -1.0, 0.3]), sj.CameraPoses(turn=0.2, shift=0.5)
+    middle, part = jnp.asarray([0.5, -1.0, 0.3]), sj.inverse.CameraPoses(turn=0.2, shift=0.5)
 
     def place(setup):
         return setup.camera.rotation @ (middle - setup.camera.position)
@@ -73,7 +76,7 @@ def test_an_albedo_stays_between_0_and_1():
     body = bodies.sphere(20)
     albedo = jnp.linspace(0.0, 1.0, 40).reshape(20, 2)
     splats = sj.Splats(body.centers, body.normals, body.radii, body.areas, albedo)
-    part = sj.AlbedoMap(step=0.5)
+    part = sj.inverse.AlbedoMap(step=0.5)
     for by in (-1e3, 0.0, 1e3):
         moved = moved_by(part, splats, jnp.full((20, 2), by)).albedo
         assert float(jnp.min(moved)) >= 0
@@ -100,7 +103,7 @@ def test_normals_and_areas_follow_a_paraboloid():
     x, y, _ = np.asarray(sheet.centers).T
     heights = 0.3 + 0.1 * x - 0.05 * y + 0.02 * x * x + 0.03 * x * y - 0.01 * y * y
     slopes = np.stack([0.1 + 0.04 * x + 0.03 * y, -0.05 + 0.03 * x - 0.02 * y], axis=1)
-    part = sj.NormalOffsets(step=1.0, smoothness=1e-3, deviation=1.0)  # next to no blur
+    part = sj.inverse.NormalOffsets(step=1.0, smoothness=1e-3, deviation=1.0)  # next to no blur
     moved = moved_by(part, sheet, jnp.asarray(heights, float))
     stretch = np.sqrt(1 + np.sum(slopes**2, axis=1))
     normals = np.concatenate([-slopes, np.ones((len(x), 1))], axis=1) / stretch[:, None]
@@ -111,7 +114,7 @@ def test_normals_and_areas_follow_a_paraboloid():
 
 def test_a_ball_that_grows_stays_a_ball():
     ball = bodies.sphere(400)
-    part = sj.NormalOffsets(step=0.5, smoothness=2.0, deviation=1.0)
+    part = sj.inverse.NormalOffsets(step=0.5, smoothness=2.0, deviation=1.0)
     moved = moved_by(part, ball, jnp.full(400, 2.0))
     np.testing.assert_allclose(jnp.linalg.norm(moved.centers, axis=1), 11.0, rtol=1e-5)
     np.testing.assert_allclose(jnp.sum(moved.normals * ball.normals, axis=1), 1.0, atol=1e-4)
@@ -125,7 +128,7 @@ def test_offsets_are_means_of_coordinates_over_the_same_side_of_a_sheet():
         far.centers - jnp.asarray([[0.0, 0.0, 0.2]]), -far.normals, far.radii, far.areas
     )
     both = bodies.joined(near, behind)
-    part = sj.NormalOffsets(step=0.1, smoothness=1.0, deviation=0.3)
+    part = sj.inverse.NormalOffsets(step=0.1, smoothness=1.0, deviation=0.3)
     x = np.random.default_rng(3).normal(size=both.count)
     x[near.count :] = 0
     moved = moved_by(part, both, jnp.asarray(x, float))

@@ -143,7 +143,7 @@ def test_an_unknown_intensity_widens_the_bars():
 def test_a_suggestion_needs_candidates():
     splats = sj.Splats([[0, 0, 0]], [[0, 0, 1]], 1, 1)
     with pytest.raises(ValueError, match="candidates is empty"):
-        sj.next_pictures(recovery(np.eye(2)), splats, [])
+        sj.inverse.next_pictures(recovery(np.eye(2)), splats, [])
 
 
 def test_what_is_combined_is_the_mean_by_what_each_knows():
@@ -151,7 +151,7 @@ def test_what_is_combined_is_the_mean_by_what_each_knows():
     ratio = recovery(along(0.01, 0.5, -np.pi / 4))
     medium = sj.Medium(0.03, 1.5, 1.3)
     path = eqx.tree_at(lambda r: r.medium, recovery(np.diag([0.3**-2, 0.02**-2])), medium)
-    found = sj.combined([ratio, path])
+    found = sj.inverse.combined([ratio, path])
     assert found.is_fixed()
     assert not ratio.is_fixed()
     known = [np.linalg.inv(each.covariance()[0]) for each in (ratio, path)]
@@ -165,7 +165,7 @@ def test_what_is_combined_is_the_mean_by_what_each_knows():
     )
     np.testing.assert_allclose(found.covariance()[0], np.linalg.inv(known[0] + known[1]), rtol=1e-4)
     np.testing.assert_allclose(
-        sj.combined([path, ratio]).medium.sigma_a, found.medium.sigma_a, rtol=1e-6
+        sj.inverse.combined([path, ratio]).medium.sigma_a, found.medium.sigma_a, rtol=1e-6
     )
     assert "not fixed" not in found.summary()
 
@@ -173,13 +173,13 @@ def test_what_is_combined_is_the_mean_by_what_each_knows():
 def test_one_alone_stays_what_it_is_and_one_that_knows_nothing_adds_nothing():
     known, nothing = recovery(along(0.01, 0.5, -np.pi / 4)), recovery(np.zeros((2, 2)))
     for given in ([known], [known, nothing]):
-        found = sj.combined(given)
+        found = sj.inverse.combined(given)
         np.testing.assert_allclose(
             found.medium.sigma_s_prime, known.medium.sigma_s_prime, rtol=1e-5
         )
         np.testing.assert_allclose(found.relative_errors(), known.relative_errors(), rtol=1e-4)
         assert found.summary() == known.summary()
-    found = sj.combined([nothing, nothing])
+    found = sj.inverse.combined([nothing, nothing])
     np.testing.assert_allclose(found.medium.sigma_a, nothing.medium.sigma_a, rtol=1e-6)
     assert "anything" in found.summary()
 
@@ -192,10 +192,12 @@ def test_a_model_that_leaves_much_counts_for_less():
         recovery(info, chi_squared=9.0, noise_is_known=False),
     )
     np.testing.assert_allclose(
-        sj.combined([bad]).relative_errors(), 3 * np.asarray(good.relative_errors()), rtol=1e-6
+        sj.inverse.combined([bad]).relative_errors(),
+        3 * np.asarray(good.relative_errors()),
+        rtol=1e-6,
     )
     np.testing.assert_allclose(
-        sj.combined([unknown]).relative_errors(), unknown.relative_errors(), rtol=1e-6
+        sj.inverse.combined([unknown]).relative_errors(), unknown.relative_errors(), rtol=1e-6
     )
 
 
@@ -203,6 +205,6 @@ def test_what_does_not_belong_together_is_refused():
     one = recovery(along(0.01, 0.02, 0.3))
     other = eqx.tree_at(lambda r: r.medium.eta, one, one.medium.eta + 0.1)
     with pytest.raises(ValueError, match="recoveries is empty"):
-        sj.combined([])
+        sj.inverse.combined([])
     with pytest.raises(ValueError, match=r"recoveries\[1\].medium.eta is .* different materials"):
-        sj.combined([one, other])
+        sj.inverse.combined([one, other])

@@ -95,8 +95,8 @@ READERS: dict[str, Callable[[Path], object]] = {
         path.with_name("square.obj"), mm_per_unit=1.0, albedo=path
     ),
     "material": lambda path: (sj.load_profile(path), sj.load_material(path)),
-    "observations": sj.read_observations,
-    "profile": sj.read_profile,
+    "observations": sj.io.read_observations,
+    "profile": sj.io.read_profile,
     "record": io.read_record,
 }
 

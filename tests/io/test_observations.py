@@ -45,7 +45,7 @@ def path(tmp_path):
 
 def test_what_is_written_is_read(path):
     path.write_text(GOOD)
-    first, second = sj.read_observations(path)
+    first, second = sj.io.read_observations(path)
     names = [each.name for each in picture_paths(path)]
     assert names == ["pictures.toml", "one.exr", "mask.exr", "one.exr"]
     assert first.picture.shape == (3, 4, 3)
@@ -53,7 +53,7 @@ def test_what_is_written_is_read(path):
     np.testing.assert_array_equal(first.mask, np.arange(12).reshape(3, 4) > 5)
     size = np.sqrt(np.mean(np.asarray(first.picture)[np.asarray(first.mask)] ** 2))
     np.testing.assert_allclose(first.deviation, 0.02 * size, rtol=1e-6)
-    assert isinstance(first.intensity, sj.UnknownIntensity)
+    assert isinstance(first.intensity, sj.inverse.UnknownIntensity)
     assert (first.camera.width, first.camera.height) == (4, 3)
     np.testing.assert_allclose(first.camera.position, [0, 1, 50])
     sun, lamp = first.lights
@@ -64,7 +64,7 @@ def test_what_is_written_is_read(path):
     assert not lamp.cast_shadows
     assert second.mask is None
     assert second.deviation is None
-    assert isinstance(second.intensity, sj.KnownIntensity)
+    assert isinstance(second.intensity, sj.inverse.KnownIntensity)
     (beam,) = second.lights
     assert isinstance(beam, sj.GaussianBeam)
     assert float(beam.variance) == 0.5
@@ -94,4 +94,4 @@ BAD = [
 def test_what_is_wrong_is_named(path, old, new, value):
     path.write_text(GOOD.replace(old, new))
     with pytest.raises((ValueError, FileNotFoundError), match=value):
-        sj.read_observations(path)
+        sj.io.read_observations(path)

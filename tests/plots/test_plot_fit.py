@@ -56,8 +56,10 @@ def test_one_channel_and_a_perfect_fit(dtype):
 
 def test_what_was_not_fitted_is_shaded_and_not_counted(float64, dtype):
     """A photon beam is infinite at the origin: only a rule with a cut has an error at all."""
-    beam = sj.PhotonBeam(sj.Medium(*(jnp.asarray([x], dtype) for x in (0.0041, 2.62, 1.5))))
-    rule = sj.L2_QUADRATURE.beyond(0.5)
+    beam = sj.scattering.PhotonBeam(
+        sj.Medium(*(jnp.asarray([x], dtype) for x in (0.0041, 2.62, 1.5)))
+    )
+    rule = sj.scattering.L2_QUADRATURE.beyond(0.5)
     fitted = sj.fit_gaussians(beam, 2, rule=rule)
     figure = plot_fit(beam, fitted.gaussians, rule=rule)
     legend = figure.axes[0].get_legend().get_texts()[0].get_text()

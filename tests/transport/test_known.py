@@ -33,8 +33,8 @@ def within(estimate, reference, deviation) -> None:
 def test_van_de_hulsts_slab(float32, score):
     """Albedo 0.9, g 0.75, optical thickness 2, indices matched: van de Hulst 1980, table 35."""
     slab = layer(1.0, 9 * 0.25, 1.0, 0.2)
-    found = sj.monte_carlo(
-        [slab], score * 625_000, KEY, edges=ONE_RING, phase=sj.HenyeyGreenstein(0.75)
+    found = sj.transport.monte_carlo(
+        [slab], score * 625_000, KEY, edges=ONE_RING, phase=sj.transport.HenyeyGreenstein(0.75)
     )
     within(found.total_reflectance, 0.09739, 4e-4 / score**0.5)
     within(found.total_transmittance, 0.66096, 4e-4 / score**0.5)
@@ -43,7 +43,7 @@ def test_van_de_hulsts_slab(float32, score):
 @SCORES
 def test_giovanellis_half_space(float32, score):
     """Albedo 0.9, isotropic, index 1.5: Giovanelli 1955. What the surface reflects is counted."""
-    found = sj.monte_carlo(
+    found = sj.transport.monte_carlo(
         [layer(1.0, 9.0, 1.5)], score * 750_000, KEY, edges=jnp.linspace(0.0, 4.0, EDGES)
     )
     np.testing.assert_allclose(found.specular, 0.04, rtol=1e-6)
@@ -65,7 +65,9 @@ def test_chandrasekhars_half_space(float32, score):
     four.
     """
     albedo = np.asarray([0.2, 0.5, 0.9, 0.95])
-    found = sj.monte_carlo([layer(1 / albedo - 1, 1.0, 1.0)], score * 900_000, KEY, edges=ONE_RING)
+    found = sj.transport.monte_carlo(
+        [layer(1 / albedo - 1, 1.0, 1.0)], score * 900_000, KEY, edges=ONE_RING
+    )
     within(
         found.total_reflectance, [0.03523052, 0.11522588, 0.41494748, 0.53554099], 4e-4 / score**0.5
     )
@@ -102,7 +104,7 @@ def test_ring_by_ring(float32, monte_carlo, name):
     (one,) = inputs["layers"]
     thickness = one["d"] if one["d"] < 1e7 else float("inf")
     edges = inputs["dr"] * jnp.arange(EDGES, dtype=jnp.float32)
-    found = sj.monte_carlo(
+    found = sj.transport.monte_carlo(
         [layer(one["mua"], one["mus"], one["n"], thickness)], photons, KEY, edges=edges
     )
     entering = 1 - data["Rsp"]
@@ -123,11 +125,13 @@ def test_ring_by_ring(float32, monte_carlo, name):
 def test_what_is_reported_adds_up(float32):
     film = sj.Film(jnp.asarray([0.1]))
     stack = [film, layer(0.2, 1.0, 1.4, 0.5), layer(0.05, 3.0, 1.3, 2.0)]
-    found = sj.monte_carlo(stack, 200_000, KEY, eta_below=1.5, incidence=sj.DiffuseIncidence())
+    found = sj.transport.monte_carlo(
+        stack, 200_000, KEY, eta_below=1.5, incidence=sj.transport.DiffuseIncidence()
+    )
     assert isinstance(found, MonteCarlo)
     assert np.all(np.abs(found.balance()) < 1e-5)
     assert np.all(np.asarray(found.absorbed.value) > 0.01)
-    few = sj.monte_carlo(
+    few = sj.transport.monte_carlo(
         [layer(0.0, 2.0, 1.4)], 100_000, KEY, edges=jnp.linspace(0.0, 4.0, EDGES), flights=200
     )
     assert few.unfinished.value[0] > 0.05

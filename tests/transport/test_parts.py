@@ -49,7 +49,7 @@ def test_henyey_and_greensteins_angles(float64, g):
     for start in ((0.0, 0.0, 1.0), (0.6, 0.0, -0.8), (0.0, 0.0, -1.0)):
         before = tuple(jnp.full_like(xi, each) for each in start)
         angle = (xi * 7919) % 1.0
-        after = sj.HenyeyGreenstein(jnp.asarray(g)).scatter(
+        after = sj.transport.HenyeyGreenstein(jnp.asarray(g)).scatter(
             before, jnp.zeros(xi.shape, jnp.int32), xi, angle
         )
         np.testing.assert_allclose(sum(each * each for each in after), 1, rtol=1e-12)
@@ -77,7 +77,7 @@ def test_reflectance_has_the_moments_of_diffusion(float64, eta):
 @pytest.mark.parametrize("eta", [1.0, 1.4, 1 / 1.3])
 def test_diffuse_light_enters_with_unit_power(float64, eta):
     xi = (jnp.arange(400_000.0) + 0.5) / 400_000
-    (x, _, z), weight = sj.DiffuseIncidence().enter(xi, xi, jnp.asarray([1.0, eta]))
+    (x, _, z), weight = sj.transport.DiffuseIncidence().enter(xi, xi, jnp.asarray([1.0, eta]))
     np.testing.assert_allclose(jnp.mean(weight), 1, atol=2e-6)
     assert np.all(np.asarray(z) >= 0)
     assert np.max(np.abs(x)) <= min(1, 1 / eta) + 1e-9
@@ -99,7 +99,7 @@ def test_sums_keep_what_rounding_takes(dtype):
 
 def test_rings_are_where_they_say(dtype):
     edges = jnp.geomspace(0.1, 2.0, 129, dtype=dtype)
-    found = sj.monte_carlo(HALF_SPACE, 65_536, KEY, edges=edges)
+    found = sj.transport.monte_carlo(HALF_SPACE, 65_536, KEY, edges=edges)
     a, b = (np.asarray(edges, np.float64)[part] for part in (slice(None, -1), slice(1, None)))
     np.testing.assert_allclose(found.radii, 2 / 3 * (b**3 - a**3) / (b**2 - a**2), rtol=1e-6)
     area = np.pi * np.diff(np.asarray(edges) ** 2)
@@ -113,7 +113,7 @@ def test_rings_are_where_they_say(dtype):
 
 def test_progress_is_told(float32):
     told = []
-    sj.monte_carlo(
+    sj.transport.monte_carlo(
         HALF_SPACE, 2_000_000, KEY, progress=lambda done, photons: told.append((done, photons))
     )
     assert len(told) > 1
@@ -130,10 +130,12 @@ def test_bad_arguments_are_refused():
         (([half_space], 2**30, KEY), "photons must be .* below 2\\^30"),
     ):
         with pytest.raises(ValueError, match=message):
-            sj.monte_carlo(*arguments)
+            sj.transport.monte_carlo(*arguments)
     with pytest.raises(ValueError, match="steps of edges"):
-        sj.monte_carlo([half_space], 10, KEY, edges=jnp.asarray([0.0, 1.0, 1.0]))
+        sj.transport.monte_carlo([half_space], 10, KEY, edges=jnp.asarray([0.0, 1.0, 1.0]))
     with pytest.raises(ValueError, match=r"HenyeyGreenstein\.g must be between -1 and 1"):
-        sj.HenyeyGreenstein(jnp.asarray(1.0))
+        sj.transport.HenyeyGreenstein(jnp.asarray(1.0))
     with pytest.raises(ValueError, match="one for each of the 1 layers; got 2"):
-        sj.monte_carlo([half_space], 10, KEY, phase=sj.HenyeyGreenstein(jnp.zeros(2)))
+        sj.transport.monte_carlo(
+            [half_space], 10, KEY, phase=sj.transport.HenyeyGreenstein(jnp.zeros(2))
+        )

@@ -24,7 +24,7 @@ def test_absorption_by_differences_of_the_same_walks(float64):
     step = 1e-4
 
     def estimate(sigma_a):
-        return sj.monte_carlo(slab(sigma_a, 2.0), 3_000, KEY, edges=EDGES)
+        return sj.transport.monte_carlo(slab(sigma_a, 2.0), 3_000, KEY, edges=EDGES)
 
     at = jnp.asarray(0.2)
     value, slope = jax.jvp(estimate, (at,), (jnp.asarray(1.0),))
@@ -54,9 +54,11 @@ def test_scattering_by_differences_of_other_walks(float32, score):
     # A long step: dividing by it magnifies the errors of the differences, and what they bend over
     # it is a tenth of those.
     photons, step = score * 250_000, 0.2
-    _, _, by_scattering = sj.path_derivatives(slab(0.2, 2.0), photons, KEY)
+    _, _, by_scattering = sj.transport.path_derivatives(slab(0.2, 2.0), photons, KEY)
     below, above = (
-        sj.monte_carlo(slab(0.2, 2.0 + sign * step), photons, jax.random.fold_in(KEY, sign + 2))
+        sj.transport.monte_carlo(
+            slab(0.2, 2.0 + sign * step), photons, jax.random.fold_in(KEY, sign + 2)
+        )
         for sign in (-1, 1)
     )
     for name in ("total_reflectance", "total_transmittance", "absorbed"):
@@ -77,7 +79,9 @@ def test_a_half_space_knows_albedo_alone(float32):
     """`sigma_a dR/dsigma_a + sigma_s dR/dsigma_s = 0` for the total, and what is not reflected is
     absorbed.
     """
-    found, by_absorption, by_scattering = sj.path_derivatives([layer(0.2, 1.0, 1.3)], 400_000, KEY)
+    found, by_absorption, by_scattering = sj.transport.path_derivatives(
+        [layer(0.2, 1.0, 1.3)], 400_000, KEY
+    )
     along = (
         0.2 * by_absorption.total_reflectance.value + 1.0 * by_scattering.total_reflectance.value
     )
@@ -97,7 +101,7 @@ def test_a_half_space_knows_albedo_alone(float32):
 
 def test_errors_of_derivatives_are_their_spread(float32):
     runs = [
-        sj.path_derivatives([layer(0.2, 1.0, 1.3)], 4_000, jax.random.key(seed))[1:]
+        sj.transport.path_derivatives([layer(0.2, 1.0, 1.3)], 4_000, jax.random.key(seed))[1:]
         for seed in range(25)
     ]
     for each in zip(*runs, strict=True):
@@ -111,7 +115,9 @@ def test_reverse_mode_is_forward_mode():
     rows = jnp.asarray(np.random.default_rng(3).normal(size=10))
 
     def loss(coefficients):
-        found = sj.monte_carlo(slab(coefficients[0], coefficients[1]), 2_000, KEY, edges=EDGES)
+        found = sj.transport.monte_carlo(
+            slab(coefficients[0], coefficients[1]), 2_000, KEY, edges=EDGES
+        )
         return (
             rows @ found.reflected.value[:, 0]
             + found.absorbed.value[1, 0]
@@ -130,9 +136,9 @@ def test_without_absorption_it_is_the_limit(float64):
     """The path lengths of all that leaves: one-sided differences of the same walks tend to it."""
 
     def reflectance(sigma_a):
-        return sj.monte_carlo([layer(sigma_a, 2.0, 1.4, 1.0)], 2_000, KEY).total_reflectance.value[
-            0
-        ]
+        return sj.transport.monte_carlo(
+            [layer(sigma_a, 2.0, 1.4, 1.0)], 2_000, KEY
+        ).total_reflectance.value[0]
 
     slope = jax.grad(reflectance)(jnp.asarray([0.0]))[0]
     quotients = [
@@ -146,7 +152,7 @@ def test_the_depth_of_a_film(float64):
 
     def reflectance(depth):
         stack = [sj.Film(depth), layer(0.1, 2.0, 1.4, 1.0)]
-        return sj.monte_carlo(stack, 2_000, KEY, edges=EDGES).total_reflectance.value[0]
+        return sj.transport.monte_carlo(stack, 2_000, KEY, edges=EDGES).total_reflectance.value[0]
 
     at, step = jnp.asarray([0.2]), 1e-4
     slope = jax.grad(reflectance)(at)[0]
@@ -158,9 +164,9 @@ def test_the_depth_of_a_film(float64):
 
 def test_what_paths_do_not_know_is_refused(dtype):
     def reflectance(thickness, eta):
-        return sj.monte_carlo([layer(0.2, 2.0, eta, thickness)], 100, KEY).total_reflectance.value[
-            0
-        ]
+        return sj.transport.monte_carlo(
+            [layer(0.2, 2.0, eta, thickness)], 100, KEY
+        ).total_reflectance.value[0]
 
     for argument, name in enumerate(("thickness", "eta")):
         with pytest.raises(ValueError, match=f"no derivative in {name}"):

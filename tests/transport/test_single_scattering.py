@@ -21,7 +21,7 @@ def single(albedo=0.9, eta=1.0, channels=1):
 @pytest.mark.parametrize("eta", ETAS)
 def test_it_is_what_walks_scatter_where_hardly_any_light_scatters_twice(eta, float32):
     albedo = 2e-3
-    found = sj.monte_carlo(
+    found = sj.transport.monte_carlo(
         [layer(1 - albedo, albedo, eta)],
         1_000_000,
         jax.random.key(7),
@@ -107,7 +107,9 @@ def test_gradients_at_matched_indices_are_the_limits_and_finite_at_grazing_angle
 def test_a_table_without_it_is_the_rest():
     ours = single(channels=2)
     radii = jnp.asarray([0.1, 0.5, 2.0])
-    table = sj.Tabulated(radii, 2 * ours(radii), total=2 * ours.total_reflectance()).without(ours)
+    table = sj.scattering.Tabulated(
+        radii, 2 * ours(radii), total=2 * ours.total_reflectance()
+    ).without(ours)
     np.testing.assert_allclose(np.asarray(table.values), np.asarray(ours(radii)), rtol=1e-5)
     np.testing.assert_allclose(
         np.asarray(table.total), np.asarray(ours.total_reflectance()), rtol=1e-5
@@ -115,13 +117,15 @@ def test_a_table_without_it_is_the_rest():
 
 
 def test_a_table_from_zero_is_refused():
-    table = sj.Tabulated(jnp.asarray([0.0, 1.0]), jnp.ones((2, 1)))
+    table = sj.scattering.Tabulated(jnp.asarray([0.0, 1.0]), jnp.ones((2, 1)))
     with pytest.raises(ValueError, match="infinite at r = 0"):
         table.without(single())
 
 
 def test_photon_beam_is_it_and_the_rest():
-    beam = sj.PhotonBeam(sj.Medium(jnp.asarray([0.02]), jnp.asarray([0.8]), jnp.asarray([1.3])))
+    beam = sj.scattering.PhotonBeam(
+        sj.Medium(jnp.asarray([0.02]), jnp.asarray([0.8]), jnp.asarray([1.3]))
+    )
     rest, once = beam.multiply_scattered(), SingleScattering(beam.medium)
     r = jnp.asarray([0.2, 1.0, 4.0])
     np.testing.assert_allclose(np.asarray(rest(r) + once(r)), np.asarray(beam(r)), rtol=1e-5)
