@@ -22,7 +22,7 @@ import splatjax as sj
 from .clouds import write_cloud
 from .heads import HEADS, conditions
 
-_NOT_PICTURES = ("weights", "handed_over", "overflow")
+_NOT_PICTURES = ("weights", "unresolved_fraction", "overflow")
 
 
 def arguments():

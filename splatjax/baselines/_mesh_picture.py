@@ -200,7 +200,7 @@ def _shaded(
         weights=material.gaussians.weights,
         diffuse=diffuse,
         specular=specular,
-        handed_over=jnp.zeros(layers.shape[0], depth.dtype),
+        unresolved_fraction=jnp.zeros(layers.shape[0], depth.dtype),
         overflow=jnp.where(needed <= 1, 0.0, needed),
         single_scattering=single,
     )

@@ -185,7 +185,7 @@ def diffuse_on_screen(
             frame.weights,
             frame.diffuse,
             frame.beauty,
-            frame.handed_over,
+            frame.unresolved_fraction,
         ),
         frame,
         (layers, weights, diffuse, beauty, jnp.zeros_like(weights[:, 0])),

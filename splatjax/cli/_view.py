@@ -197,7 +197,7 @@ class ViewOptions:
 
     def note_unresolved_layers(self, frame: sj.Frame, material: sj.Material) -> None:
         """Name the layers that are narrower than the splats."""
-        unresolved = np.asarray(frame.handed_over) > 0.5
+        unresolved = np.asarray(frame.unresolved_fraction) > 0.5
         widths = np.sqrt(np.asarray(material.gaussians.variances))[unresolved]
         if self.scattering and len(widths):
             note(

@@ -59,7 +59,7 @@ def write_exr(
             "Linear light. Depth and position in mm; depth, position and normal are "
             "not premultiplied."
         ),
-        "splatjax.handed_over": _floats(frame.handed_over),
+        "splatjax.unresolved_fraction": _floats(frame.unresolved_fraction),
         "splatjax.overflow": float(frame.overflow),
     }
     if channels == 3:
@@ -101,7 +101,9 @@ def read_exr(path: str | os.PathLike[str]) -> Frame:
     try:
         weights = [header[f"{_WEIGHTS}{k}"] for k in range(1, gaussians + 1)]
         arrays["weights"] = np.reshape(weights, (gaussians, channels))
-        arrays["handed_over"] = np.reshape(header["splatjax.handed_over"], gaussians)
+        arrays["unresolved_fraction"] = np.reshape(
+            header["splatjax.unresolved_fraction"], gaussians
+        )
         arrays["overflow"] = np.reshape(header["splatjax.overflow"], ())
         for field, names in _layout(channels, lights, gaussians, has_single).items():
             values = np.asarray([planes[name] for name in names.ravel()])

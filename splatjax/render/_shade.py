@@ -160,7 +160,7 @@ def compose(
         weights=scene.material.gaussians.weights,
         diffuse=diffuse,
         specular=specular,
-        handed_over=visible.invalid_factor * unresolved / jnp.maximum(jnp.sum(drawn), 1),
+        unresolved_fraction=visible.invalid_factor * unresolved / jnp.maximum(jnp.sum(drawn), 1),
         overflow=jnp.where(needed <= 1, 0.0, needed),
         single_scattering=single,
     )

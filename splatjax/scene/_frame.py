@@ -25,8 +25,8 @@ class Frame(eqx.Module):
     - `layers`: one per Gaussian, `post * transmission / pi * L_k`.
     - `weights`: those the picture was made with.
     - `diffuse`, `specular`: radiance.
-    - `handed_over`: per Gaussian, the share of the covered pixels for which the splats are too far
-      apart to carry the layer, so that it is the surface's own irradiance.
+    - `unresolved_fraction`: per Gaussian, the fraction of the covered pixels for which the splats
+      are too far apart to resolve the layer, so that it is the surface's own irradiance.
     - `single_scattering`: radiance, premultiplied; `None` when the material has none.
     - `overflow`: what the plan lacks: 0 when the picture fits, else the largest of needed over
       planned, and the picture is NaN.
@@ -44,6 +44,6 @@ class Frame(eqx.Module):
     weights: Float[Array, "gaussians channels"]
     diffuse: Float[Array, "height width channels"]
     specular: Float[Array, "height width channels"]
-    handed_over: Float[Array, " gaussians"]
+    unresolved_fraction: Float[Array, " gaussians"]
     overflow: Float[Array, ""]
     single_scattering: Float[Array, "height width channels"] | None = None

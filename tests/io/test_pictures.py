@@ -35,7 +35,7 @@ def some_frame(channels=3, gaussians=4, lights=2, height=6, width=5) -> Frame:
         weights=weights,
         diffuse=diffuse,
         specular=specular,
-        handed_over=noise(gaussians),
+        unresolved_fraction=noise(gaussians),
         overflow=jnp.zeros((), jnp.float32),
         single_scattering=noise(*colors) if channels == 1 else None,
     )

@@ -78,7 +78,7 @@ def apart(one, other):
         "shadow",
         "irradiance",
         "specular",
-        "handed_over",
+        "unresolved_fraction",
     ):
         x, y = np.asarray(getattr(one, name)), np.asarray(getattr(other, name))
         finite = np.isfinite(x)
