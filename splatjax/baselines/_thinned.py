@@ -7,6 +7,7 @@ import dataclasses
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from splatjax.diffusion import (
     AbstractDiffuser,
@@ -15,10 +16,12 @@ from splatjax.diffusion import (
     dense_layer,
 )
 
+_GOLDEN = (5**0.5 - 1) / 2
+
 
 class ThinnedDiffuser(AbstractDiffuser):
-    r"""Sums over every `keep`-th splat alone, for all splats. What is kept lies evenly: a plan
-    puts splats that are near in space near in memory.
+    r"""Sums over one splat of every `keep` alone, for all splats. What is kept lies evenly: a
+    plan puts splats that are near in space near in memory.
 
     The renderer's own `ClusterDiffuser` merges splats instead, which errs far less for as many.
 
@@ -41,7 +44,12 @@ class ThinnedPlan(AbstractDiffusionPlan):
     keep: int = eqx.field(static=True)
 
     def diffuse(self, sources, variances, kernel, combination, wanted=None):
-        kept = jax.tree.map(lambda rows: rows[..., :: self.keep], combination.gather_last(sources))
+        everywhere = combination.gather_last(sources)
+        group = np.arange(-(-everywhere.areas.shape[0] // self.keep))
+        # The first of each group would lie at the same side of all groups.
+        chosen = group * self.keep + (group * _GOLDEN % 1 * self.keep).astype(int)
+        chosen = np.minimum(chosen, everywhere.areas.shape[0] - 1)
+        kept = jax.tree.map(lambda rows: rows[..., chosen], everywhere)
         whole = combination.total([jnp.sum(sources.areas)])
         kept = dataclasses.replace(kept, areas=kept.areas * (whole / jnp.sum(kept.areas)))
         layers = tuple(

@@ -18,6 +18,7 @@ from splatjax.gaussians import AbstractProfile, SumOfGaussians
 from splatjax.scattering import (
     BetterDipole,
     Dipole,
+    ExactFresnel,
     Film,
     Layer,
     LayeredMultipole,
@@ -45,6 +46,13 @@ _ASCENDING: Rule = (
 )
 _THICKNESS: Rule = ("positive (mm), or inf", lambda x: x > 0)
 _LAYER = (*_COEFFICIENTS, "optical_depth", "thickness", "thickness_unit")
+_MODELS: dict[type, str] = {
+    Dipole: "classical dipole",
+    BetterDipole: "better dipole",
+    PhotonBeam: "photon beam with single scattering",
+    LayeredMultipole: "multipole",
+}
+"""What [fit] calls a profile whose coefficients the file holds."""
 _DEFAULT_SURFACE = {"eta": 1.4, "specular": 0.18, "roughness": 0.3}
 
 
@@ -190,7 +198,6 @@ def save_material(
         tables["medium"] = _plain_medium(profile.medium)
     tables["surface"] = {name: plain_numbers(getattr(material, name)) for name in _SURFACE}
     single, gaussians = material.single_scattering, material.gaussians
-    description = f"{type(profile).__name__}, {type(getattr(profile, 'fresnel', None)).__name__}"
     if single is not None:
         strength = {"strength": plain_numbers(single.strength)}
         tables["single_scattering"] = _plain_medium(single.medium) | strength
@@ -199,7 +206,7 @@ def save_material(
         "unit": VARIANCE_UNIT,
         "variances": plain_numbers(gaussians.variances),
         "weights": plain_numbers(gaussians.weights),
-        **({} if profile is None else {"profile": description}),
+        **({} if profile is None else {"profile": _description(profile)}),
         **{
             name: value if isinstance(value, str | int | float) else plain_numbers(value)
             for name, value in (fit or {}).items()
@@ -264,6 +271,12 @@ def _medium(table: Table, channels: int | None = None) -> Medium:
     sigma_a = table.numbers("sigma_a", AT_LEAST_0, (channels,))
     sigma_s_prime = table.numbers("sigma_s_prime", POSITIVE, sigma_a.shape)
     return Medium(sigma_a, sigma_s_prime, table.numbers("eta", POSITIVE, sigma_a.shape))
+
+
+def _description(profile: Dipole | BetterDipole | PhotonBeam | LayeredMultipole) -> str:
+    layers = f" of {len(profile.layers)} layers" if isinstance(profile, LayeredMultipole) else ""
+    moments = "exact" if isinstance(profile.fresnel, ExactFresnel) else "fitted"
+    return f"{_MODELS[type(profile)]}{layers}, {moments} Fresnel moments"
 
 
 def _plain_medium(medium: Medium) -> dict[str, Any]:

@@ -144,7 +144,8 @@ def test_a_saved_material_comes_back_bit_for_bit(dtype, tmp_path, kind):
     )
     for ours, theirs in zip(given, read, strict=True):
         np.testing.assert_array_equal(ours, theirs)
-    assert f'profile = "{kind}, ExactFresnel"' in path.read_text()
+    model = "classical dipole" if kind == "Dipole" else "multipole of 3 layers"
+    assert f'profile = "{model}, exact Fresnel moments"' in path.read_text()
 
 
 @pytest.mark.parametrize(

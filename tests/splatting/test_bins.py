@@ -35,7 +35,7 @@ def boxes(kind):
 
 def brute_force(left, right, top, bottom, visible):
     """Every tile and item with a pixel center of the tile inside the item's box."""
-    tiles = np.arange(GRID.count)
+    tiles = np.arange(GRID.count, dtype=np.int32)
     x, y = (np.asarray(each) + 0.5 for each in GRID.columns_and_rows(jnp.asarray(tiles)))
     x, y = np.where(GRID.within_picture(), x, np.nan), y
     column, row = (each[:, None] for each in (x, y))
