@@ -36,8 +36,11 @@ WRITERS = {
 
 
 @pytest.fixture
-def small_files():
-    """No file may grow beyond 4 kB: what a full disk does, without one."""
+def small_files(monkeypatch):
+    """No file may grow beyond 4 kB: what a full disk does, without one. Python would keep half of a
+    module's bytecode and never read it again.
+    """
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (4096, before[1]))
     yield
