@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from splatjax.gaussians import SumOfGaussians
@@ -23,9 +24,13 @@ def continue_from_splats(layer: LayerValues, centers: Float[Array, "3 splats"]) 
 
 
 def continue_to_points(
-    blended: LayerValues, centers: Float[Array, "3 points"], points: Float[Array, "3 points"]
-) -> Float[Array, "values points"]:
-    r"""Continue a blended layer to points of the surface.
+    blended: LayerValues,
+    derivative: LayerValues | None,
+    centers: Float[Array, "3 points"],
+    points: Float[Array, "3 points"],
+    channels: int,
+) -> tuple[Float[Array, "values points"], Float[Array, "values points"] | None]:
+    r"""Continue a blended layer, and its derivative, to points of the surface.
 
     Each splat is continued along half its slope: the full slope errs as much as none, with the
     opposite sign, so that the error is of third order in the spacing. Splats lie unevenly around a
@@ -33,12 +38,30 @@ def continue_to_points(
 
         L(x) = sum w_i (L_i + s_i (x - p_i) / 2) / W + (sum w_i s_i / W) (x - sum w_i p_i / W) / 2
 
+    Where that is no neighborhood, as where a pixel blends two surfaces, the slope does not carry:
+    light and mass stay between 0 and twice what they are at the mean center.
+
     **Arguments:**
 
-    - `blended`: from the rows of `continue_from_splats`.
+    - `blended`: from the rows of `continue_from_splats`: means of each channel, perhaps those of
+      the derivative of the source, and mass.
+    - `derivative`: of the same rows; `None` where it is not asked for.
     - `centers`: blended centers of the splats, mm, from the same origin as `points`.
     """
-    return blended.values + jnp.sum(blended.slopes * (points - 0.5 * centers)[None], axis=1)
+
+    def parts(rows: LayerValues):
+        at_centers = rows.values + 0.5 * jnp.sum(rows.slopes * centers[None], axis=1)
+        return at_centers, jnp.sum(rows.slopes * (points - centers)[None], axis=1)
+
+    value, change = parts(blended)
+    # Rows of derivatives are limited where those of the light itself are.
+    light = np.append(np.arange(len(value) - 1) % channels, len(value) - 1)
+    below, above = ((value + change < 0) | (value < 0))[light], (change > value)[light]
+
+    def limited(value, change):
+        return jnp.where(below, 0.0, jnp.where(above, 2 * value, value + change))
+
+    return limited(value, change), None if derivative is None else limited(*parts(derivative))
 
 
 class LayersAtPoints(eqx.Module):

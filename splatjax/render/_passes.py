@@ -161,39 +161,25 @@ def sample_surfaces(
         attributes = split_rows(in_a_row(surface.attributes), like)
         positions = in_a_row(visible.points(tiles, surface.depth))
 
-        def continued(layers):
-            own = attributes.centers, positions - origin
-            return tuple(each and _diffusion.continue_to_points(each, *own) for each in layers)
-
-        def where_positive(values, layers):
-            return tuple(
-                None if own is None else jnp.where(_darker_than_black(layer, channels), 0.0, own)
-                for own, layer in zip(values, layers, strict=True)
-            )
-
-        channels = len(attributes.source)
-        layers, slopes = continued(attributes.layers), attributes.derivative
+        own, channels = (attributes.centers, positions - origin), len(attributes.source)
+        slopes = attributes.derivative
+        continued = [
+            (None, None)
+            if layer is None
+            else _diffusion.continue_to_points(layer, slopes and slopes[i], *own, channels)
+            for i, layer in enumerate(attributes.layers)
+        ]
         samples = SurfaceSamples(
             attributes=attributes.without_layers(),
             positions=positions,
             depth=in_a_row(surface.depth),
             covered=in_a_row(surface.covered),
-            layers=where_positive(layers, layers),
-            derivative=None if slopes is None else where_positive(continued(slopes), layers),
+            layers=tuple(layer for layer, _ in continued),
+            derivative=None if slopes is None else tuple(slope for _, slope in continued),
         )
         return jax.tree.map(_by_place, samples)
 
     return map_chunks(blend, visible.rows, visible.tiles, at_once=_splatting.TILES_AT_ONCE)
-
-
-def _darker_than_black(
-    layer: Float[Array, "values points"], channels: int
-) -> Bool[Array, "values points"]:
-    """Mark the means and the mass of a layer that its slopes have carried below zero, at the rim of
-    what is lit. The rows of a derivative, between them, may be negative.
-    """
-    row = jnp.arange(len(layer))
-    return (layer < 0) & ((row < channels) | (row == len(layer) - 1))[:, None]
 
 
 def map_samples(read: Callable[[Samples], Values], samples: Samples) -> Values:

@@ -55,7 +55,8 @@ def blended_and_exact():
         values, slopes, centers = jnp.split(front.attributes.reshape(15, -1), [3, 12])
         blended = LayerValues(values, slopes.reshape(3, 3, -1))
         exact = dense_layer(sources, points, variance, depth)
-        return continue_to_points(blended, centers, points), exact.values
+        found, _ = continue_to_points(blended, None, centers, points, channels=2)
+        return found, exact.values
 
     return evaluate
 
@@ -75,13 +76,20 @@ def test_a_linear_layer_is_continued_exactly_whatever_the_weights():
     centers, point = rng.normal(size=(3, 40)), rng.normal(size=(3, 1))
     weights, slope = rng.uniform(size=(40, 1)), rng.normal(size=(2, 3))
     slopes = np.broadcast_to(slope[:, :, None], (2, 3, 40))
-    layer = LayerValues(*(jnp.asarray(each, float) for each in (slope @ centers, slopes)))
+    layer = LayerValues(*(jnp.asarray(each, float) for each in (10 + slope @ centers, slopes)))
     centers, point, weights = (jnp.asarray(each, float) for each in (centers, point, weights))
     rows = continue_from_splats(layer, centers)
     blended = jax.tree.map(lambda leaf: leaf @ (weights / jnp.sum(weights)), rows)
     mean_center = centers @ (weights / jnp.sum(weights))
-    found = continue_to_points(blended, mean_center, point)
-    np.testing.assert_allclose(found, slope @ np.asarray(point), rtol=1e-4, atol=1e-5)
+    found, _ = continue_to_points(blended, None, mean_center, point, channels=1)
+    np.testing.assert_allclose(found, 10 + slope @ np.asarray(point), rtol=1e-4)
+    # Far away it stays between 0 and twice the middle, and its derivative is that of the limit.
+    for way in (1, -1):
+        far = mean_center + 1e3 * way * jnp.asarray(slope[:1].T, float)
+        found, derivative = continue_to_points(blended, blended, mean_center, far, channels=1)
+        middle = 10 + slope[:1] @ np.asarray(mean_center)
+        np.testing.assert_allclose(found[:1], 2 * middle if way > 0 else 0, rtol=1e-4)
+        np.testing.assert_array_equal(derivative, found)
 
 
 def layers_at_points(kernel):
