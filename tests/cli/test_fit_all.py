@@ -71,11 +71,11 @@ def test_it_reports_how_many_did_not_converge(media, tmp_path, monkeypatch, caps
     ("text", "named"),
     [
         ("", ["sigma_a"]),
-        (HEAD, ["no medium"]),
-        (f"{HEAD}a,1,2\n", ["medium 1", "3 cells"]),
-        (f"{HEAD}a,1,0,1.3\n", ["sigma_s_prime", "medium 1", "'0'"]),
-        (f"{HEAD}a,1,1,1.3\nb,-1,1,1.3\n", ["sigma_a", "medium 2", "'-1'"]),
-        (f"{HEAD}a,1,1,glass\n", ["eta", "medium 1", "'glass'"]),
+        (HEAD, ["0 rows"]),
+        (f"{HEAD}a,1,2\n", ["line 2", "a, 1.0, 2.0"]),
+        (f"{HEAD}a,1,0,1.3\n", ["line 2", "a, 1.0, 0.0, 1.3"]),
+        (f"{HEAD}a,1,1,1.3\nb,-1,1,1.3\n", ["line 3", "b, -1.0, 1.0, 1.3"]),
+        (f"{HEAD}a,1,1,glass\n", ["line 2", "a, 1.0, 1.0, glass"]),
     ],
 )
 def test_a_faulty_table_is_one_line(text, named, media, tmp_path, capsys):
