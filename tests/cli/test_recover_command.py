@@ -70,7 +70,7 @@ def search(monkeypatch):
             rounds=1,
         )
 
-    monkeypatch.setattr(sj, "recover", recover)
+    monkeypatch.setattr(sj.inverse, "recover", recover)
     return calls, ends
 
 
