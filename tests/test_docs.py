@@ -56,7 +56,7 @@ def test_links_lead_to_files(page):
 @pytest.mark.once
 def test_the_program_of_the_readme_runs(tmp_path, monkeypatch):
     program = re.search(r"```python\n(.*?)```", README, re.DOTALL).group(1)
-    small = program.replace("100_000", "2_000").replace("fov=30.0", "fov=30.0, width=48, height=48")
+    small = program.replace("100_000", "2_000").replace("fov=30", "fov=30, width=48, height=48")
     assert small.count("2_000") == 1
     assert small.count("width=48") == 1
     monkeypatch.chdir(tmp_path)

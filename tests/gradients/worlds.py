@@ -193,7 +193,11 @@ def declared(kind: type) -> Iterator[str]:
 
 def _ours(abstract: type) -> list[type]:
     """Give the kinds of something that the package has; tests may have more."""
-    return [kind for kind in abstract.__subclasses__() if kind.__module__.startswith("splatjax.")]
+    kinds = []
+    for kind in abstract.__subclasses__():
+        if kind.__module__.startswith("splatjax."):
+            kinds += _ours(kind) if kind.__name__.startswith("Abstract") else [kind]
+    return kinds
 
 
 def _mentioned(annotation) -> list:
