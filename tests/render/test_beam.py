@@ -60,7 +60,13 @@ def sheet_of(variance: float, kind: str) -> tuple[sj.Scene, float]:
 @pytest.mark.slow
 @pytest.mark.once
 @pytest.mark.parametrize("kind", ["grid", "jittered", "graded"])
-@pytest.mark.parametrize("variance", [SKIN_VARIANCES[0], 1.99, MARBLE_VARIANCES[-1]])
+@pytest.mark.parametrize(
+    "variance",
+    [
+        1.99,
+        *(pytest.param(v, marks=pytest.mark.long) for v in (*SKIN_VARIANCES, *MARBLE_VARIANCES)),
+    ],
+)
 def test_a_beam_on_a_sheet_is_the_gaussian_of_each_layer_at_the_splats(kind, variance):
     scene, deviation = sheet_of(variance, kind)
     splats, variances = scene.splats, scene.material.gaussians.variances
