@@ -18,6 +18,7 @@ from splatjax.render._plan import arrange
 EXACT = sj.RenderSettings(diffuser=ClusterDiffuser(error=0.0))
 MARBLE_VARIANCES = tuple(load_material("marble").gaussians.variances.tolist())
 SLANTS = (0.0, 50.0)
+KINDS = ["jittered", *(pytest.param(kind, marks=pytest.mark.long) for kind in ("grid", "graded"))]
 PEAK_SHARE = 1e-3  # a layer is compared where it exceeds this share of its peak
 BEAM_TOLERANCE = 0.01
 BLENDED_TOLERANCE = 0.03  # 0.026 measured, of jittered splats where the light is a thousandth
@@ -59,7 +60,7 @@ def sheet_of(variance: float, kind: str) -> tuple[sj.Scene, float]:
 
 @pytest.mark.slow
 @pytest.mark.once
-@pytest.mark.parametrize("kind", ["grid", "jittered", "graded"])
+@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(
     "variance",
     [
@@ -90,7 +91,7 @@ def test_a_beam_on_a_sheet_is_the_gaussian_of_each_layer_at_the_splats(kind, var
 
 @pytest.mark.slow
 @pytest.mark.once
-@pytest.mark.parametrize("kind", ["grid", "jittered", "graded"])
+@pytest.mark.parametrize("kind", KINDS)
 def test_a_beam_on_a_sheet_is_the_gaussian_in_the_picture(kind):
     """Blending adds to the error where splats are uneven."""
     variance = 1.99  # of any other, the picture is a larger or a smaller one
@@ -124,7 +125,8 @@ def test_the_sum_of_layers_is_the_profile():
 
 @pytest.mark.slow
 @pytest.mark.once
-@pytest.mark.parametrize("name", ["skin", pytest.param("marble", marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["skin", "marble"])
 def test_a_wide_beam_with_default_settings_is_the_widened_profile(name):
     material = load_material(name)
     half_width = 30.0

@@ -71,9 +71,8 @@ def test_views_on_eight_devices_are_those_of_one():
     assert max(answer["gradients"].values()) < ROUNDING, answer["gradients"]
 
 
-@pytest.mark.parametrize(
-    ("what", "count"), [("picture", 2), pytest.param("gradients", 4, marks=pytest.mark.long)]
-)
+@pytest.mark.long
+@pytest.mark.parametrize(("what", "count"), [("picture", 2), ("gradients", 4)])
 def test_splats_of_several_processes_make_what_those_of_one_do(what, count):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))

@@ -153,6 +153,7 @@ def test_a_picture_is_the_middle_of_a_larger_one(float64):
 
 
 @pytest.mark.once
+@pytest.mark.long
 def test_parts_of_the_splats_sum_to_the_whole():
     """Splats of one part lie before those of another, wherever they are cut; beyond the picture
     nothing is summed.
@@ -185,6 +186,7 @@ def test_parts_of_the_splats_sum_to_the_whole():
 
 
 @pytest.mark.once
+@pytest.mark.long
 def test_too_small_a_capacity_makes_the_sums_nan_and_is_reported():
     """Never a wrong picture; and where there is little behind the front, little capacity for it."""
     view, body = bodies.perspective(width=96, height=96), bodies.bumpy(500)
