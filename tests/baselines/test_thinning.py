@@ -63,6 +63,7 @@ def randomly(x, ratio, contrast):
     return float(contrast) * x * np.sqrt(1 - ratio) / (2 * np.sqrt(np.pi))
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.once
 def test_left_out_at_random_splats_err_as_independent_ones_do():

@@ -95,6 +95,7 @@ def test_white_furnace():
 
 @pytest.mark.slow
 @pytest.mark.once
+@pytest.mark.long
 def test_energy_does_not_depend_on_how_finely_half_the_sheet_is_splatted():
     coarse, fine = sheet(0.4, 16.0), sheet(0.2, 16.0)
     # cells of the coarse sheet end at x = 0.2, and there those of the shifted fine one begin
