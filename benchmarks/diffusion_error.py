@@ -26,8 +26,6 @@ from splatjax._combination import OneDevice
 from .scenes import BODIES, MATERIALS, columns, lit
 
 QUANTILES = (0.5, 0.99, 1.0)
-ROWS = ("means", "mass", "irradiance", "area", "albedo")
-"""Of `LayersAtPoints`, those with a number for each point."""
 
 
 def arguments():
@@ -71,7 +69,7 @@ def untruncated(
     """
     layer, channels = jax.jit(diffusion.dense_layer), len(sources.irradiance)
     values = np.zeros((len(light.variances), channels + 1, points.shape[1]), np.float32)
-    for k in np.flatnonzero(light.resolvable):
+    for k in np.flatnonzero(np.any(light.mass > 0, axis=1)):
         own = light.variances[k], light.kernel.depths(light.variances)[k]
         values[k] = layer(sources, points, *own).values
     return values[:, :channels], values[:, channels]
@@ -81,8 +79,7 @@ def layers_of(
     light: diffusion.LayersAtPoints, picked, gaussians: sj.SumOfGaussians, exact
 ) -> tuple[np.ndarray, np.ndarray]:
     """Compute `L_k` at some of the points, and by exact means and mass there."""
-    rows = {name: getattr(light, name)[..., picked] for name in ROWS}
-    own = dataclasses.replace(light, **rows)
+    own = eqx.tree_at(lambda each: each.rows, light, [row[..., picked] for row in light.rows])
     means, mass = (jnp.asarray(each) for each in exact)
     truth, none = dataclasses.replace(own, means=means, mass=mass), jnp.zeros(means.shape[1])
     return tuple(np.asarray(each.weigh(gaussians, none)[0]) for each in (own, truth))
@@ -141,7 +138,7 @@ def main() -> None:
             points = frame.position.reshape(-1, 3)[pixels].T
             exact = untruncated(sources, points, basis.light)
             means_at_splats, _ = untruncated(sources, splats.centers[chosen].T, basis.light)
-        resolved = np.flatnonzero(basis.light.resolvable)
+        resolved = np.flatnonzero(np.any(basis.light.mass > 0, axis=1))
         found, truth = layers_of(basis.light, picked, gaussians, exact)
         off = deviations(found[resolved], truth[resolved])
         order = np.empty(splats.count, int)

@@ -74,7 +74,6 @@ class LayersAtPoints(eqx.Module):
 
     - `variances`: of the layers, mm^2.
     - `means`, `mass`: of every layer; 0 for layers that no splat resolves.
-    - `resolvable`: 0 for such a layer, else 1.
     - `irradiance`, `area`, `albedo`: of the surface itself; area per splat in mm^2.
     - `interval`, `kernel`: from which width layers are resolved, and how they are normalized.
     - `derivative`: of means and mass in the logarithm of the variance; `None` where it was not
@@ -84,7 +83,6 @@ class LayersAtPoints(eqx.Module):
     variances: Float[Array, " gaussians"]
     means: Float[Array, "gaussians channels points"]
     mass: Float[Array, "gaussians points"]
-    resolvable: Float[Array, " gaussians"]
     irradiance: Float[Array, "channels points"]
     area: Float[Array, " points"]
     albedo: Float[Array, "channels points"]
@@ -128,7 +126,6 @@ class LayersAtPoints(eqx.Module):
             variances=variances,
             means=means,
             mass=mass,
-            resolvable=jnp.asarray([layer is not None for layer in layers], area.dtype),
             irradiance=irradiance,
             area=area,
             albedo=albedo,
@@ -136,6 +133,12 @@ class LayersAtPoints(eqx.Module):
             kernel=kernel,
             derivative=None if derivative is None else stacked(derivative),
         )
+
+    @property
+    def rows(self) -> tuple[Float[Array, "... points"], ...]:
+        """What lies along the points: means, mass, irradiance, area, albedo; and the derivative."""
+        own = self.means, self.mass, self.irradiance, self.area, self.albedo
+        return own if self.derivative is None else (*own, *self.derivative)
 
     def weigh(
         self, gaussians: SumOfGaussians, single_scattering_albedo: Float[Array, " channels"]
@@ -164,7 +167,7 @@ class LayersAtPoints(eqx.Module):
 
     def _weigh(self, weights, variances, order, single_scattering_albedo, means, mass):
         resolved = resolved_fraction(variances, self.area[None, None], self.interval)
-        resolved = jnp.where(mass > 0, resolved * self.resolvable[:, None, None], 0.0)
+        resolved = jnp.where(mass > 0, resolved, 0.0)
         own = self.irradiance[None]
         # Splats too far apart to resolve a layer do not tell its mass either.
         gain = self.kernel.gain(
@@ -203,9 +206,12 @@ class LayersAtPoints(eqx.Module):
         Float[Array, "gaussians channels points"], Float[Array, "gaussians channels points"]
     ]:
         """Differentiate the radiant exitance of every point and channel in the weights of its
-        channel, and in the variances (1/mm^2). Needs the derivative.
+        channel, and in the variances (1/mm^2).
+
+        **Raises:** `ValueError` without the derivative of the layers.
         """
-        assert self.derivative is not None
+        if self.derivative is None:
+            raise ValueError("derivative is None; compute the layers with derivative=True")
         shape, variances = self.means.shape, gaussians.variances
         # Every point and channel has numbers of its own, so that one derivative is that of all.
         own = (gaussians.weights[:, :, None], variances[:, None, None], self.means)

@@ -96,7 +96,7 @@ def flatten(
     light = jax.tree.map(lambda leaf: leaf.astype(dtype), pictures[0].light)
     number = np.repeat(np.arange(len(counted)), [np.sum(mask) for mask in counted])
     return FlatPictures(
-        light=eqx.tree_at(_rows, light, rows),
+        light=eqx.tree_at(lambda each: each.rows, light, rows),
         leaving=leaving,
         specular=jnp.asarray(in_a_row([one.specular for one in pictures], counted), dtype),
         behind=jnp.asarray(pixel[order[total:]], jnp.int32),
@@ -104,12 +104,6 @@ def flatten(
     )
 
 
-def _rows(light: LayersAtPoints):
-    """Select the arrays along the points."""
-    slopes = () if light.derivative is None else light.derivative
-    return light.means, light.mass, light.irradiance, light.area, light.albedo, *slopes
-
-
 def _by_point(picture: DiffusionBasis):
     leaving = jnp.broadcast_to(picture.leaving, picture.light.irradiance.shape)
-    return jax.tree.map(np.asarray, (_rows(picture.light), leaving))
+    return jax.tree.map(np.asarray, (picture.light.rows, leaving))

@@ -198,6 +198,6 @@ def solution(problem: RecoveryProblem, point: Float[Array, " unknowns"]) -> Solu
     slopes = jnp.concatenate([slopes, of_widths], axis=-1)
     light = problem.pictures.light
     resolved = resolved_fraction(light.variances[:, None], light.area[None], light.interval)
-    unresolved = 1 - light.resolvable * jnp.mean(resolved, axis=1)
+    unresolved = 1 - jnp.mean(jnp.where(light.mass > 0, resolved, 0.0), axis=1)
     unresolved = unresolved @ gaussians.weights / gaussians.total_reflectance()
     return Solution(jnp.einsum("cpi,cpj->ij", slopes, slopes), gaussians, radiance, unresolved)

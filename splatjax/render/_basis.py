@@ -1,22 +1,19 @@
 """A picture for any weights: everything that they do not change is rendered once."""
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from splatjax import diffusion as _diffusion, splatting as _splatting
+from splatjax.diffusion import LayersAtPoints
 from splatjax.gaussians import SumOfGaussians
-from splatjax.scene import Camera, Scene, stack_lights
+from splatjax.scene import Camera, Scene
 
-from ._attributes import SurfaceSamples
 from ._devices import on_devices
 from ._inputs import check_channels, in_one_dtype
-from ._lighting import LightVisibility
-from ._passes import in_a_row, light_splats, see_and_read
+from ._passes import in_a_row, look
 from ._plan import Plan, plan_unless_traced
 from ._settings import RenderSettings
-from ._shade import layers_at_points, shade
+from ._shade import ShadedSurface
 
 
 class DiffusionBasis(eqx.Module):
@@ -37,7 +34,7 @@ class DiffusionBasis(eqx.Module):
     - `overflow`: as in a `Frame`; where it is above 0, pictures are NaN.
     """
 
-    light: _diffusion.LayersAtPoints
+    light: LayersAtPoints
     leaving: Float[Array, "#channels points"]
     pixels: Int[Array, " points"]
     in_front: Float[Array, " points"]
@@ -58,19 +55,6 @@ class DiffusionBasis(eqx.Module):
         diffuse = jnp.zeros((channels, height * width), radiance.dtype)
         diffuse = diffuse.at[:, self.pixels].add(radiance)
         return diffuse.T.reshape(height, width, channels) + self.specular
-
-
-class _Read(eqx.Module):
-    """What a basis needs of the surface samples."""
-
-    means: Float[Array, "gaussians channels points"]
-    mass: Float[Array, "gaussians points"]
-    derivative: tuple | None
-    irradiance: Float[Array, "channels points"]
-    area: Float[Array, " points"]
-    albedo: Float[Array, "channels points"]
-    post: Float[Array, "#channels points"]
-    specular: Float[Array, "channels points"]
 
 
 def diffusion_basis(
@@ -114,59 +98,35 @@ def _diffusion_basis(
     scene, camera = in_one_dtype(scene, camera)
 
     def passes(combination, scene, plan, camera):
-        view, groups = _splatting.PerspectiveView.of(camera), stack_lights(scene.lights)
-        given, gaussians = (settings, plan, combination), scene.material.gaussians
-        seen = view.may_see(scene.splats)
-        light = light_splats(scene, *given, derivative=derivative, wanted=seen)
-        visibility = LightVisibility(groups, light.visibility, light.needed)
-        attributes = settings.lighting.attributes(scene, visibility, light.irradiance)
+        def read(shaded: ShadedSurface, at: LayersAtPoints, _):
+            return (*at.rows, shaded.post), shaded.specular
 
-        def read(samples: SurfaceSamples) -> _Read:
-            own = settings.lighting.at_pixels(scene, groups, samples)
-            shaded = shade(scene, view.position, groups, samples, own, plan.interval, settings)
-            at = layers_at_points(
-                samples, own, own.source, gaussians.variances, plan.interval, settings.kernel
-            )
-            return _Read(
-                means=at.means,
-                mass=at.mass,
-                derivative=at.derivative,
-                irradiance=at.irradiance,
-                area=at.area,
-                albedo=at.albedo,
-                post=shaded.post,
-                specular=shaded.specular,
-            )
-
-        tiles, visible, needed = see_and_read(scene, view, light, attributes, read, *given)
-        tiles, visible = combination.gather(tiles), visible.gathered(combination)
-        visible = visible.invalidate_unless(needed <= 1)
-        rows = jax.tree.map(in_a_row, tiles)
-        leaving = visible.invalid_factor * visible.share.reshape(1, -1) * rows.post
-        x, y = visible.pixels(visible.tiles)
-        x, y = jnp.minimum(x, view.width - 1), jnp.minimum(y, view.height - 1)
-        in_front = jnp.broadcast_to(visible.in_front[:, None], x.shape)
-        resolvable = [layer is not None for layer in light.layers]
-        at = _diffusion.LayersAtPoints(
-            variances=gaussians.variances,
-            means=rows.means,
-            mass=rows.mass,
-            resolvable=jnp.asarray(resolvable, leaving.dtype),
-            irradiance=rows.irradiance,
-            area=rows.area,
-            albedo=rows.albedo,
+        (rows, specular), visible = look(
+            scene, camera, settings, plan, combination, read, derivative=derivative
+        )
+        means, mass, irradiance, area, albedo, *slopes, post = map(in_a_row, rows)
+        light = LayersAtPoints(
+            variances=scene.material.gaussians.variances,
+            means=means,
+            mass=mass,
+            irradiance=irradiance,
+            area=area,
+            albedo=albedo,
             interval=plan.interval,
             kernel=settings.kernel,
-            derivative=rows.derivative,
+            derivative=(slopes[0], slopes[1]) if derivative else None,
         )
+        x, y = visible.pixels(visible.tiles)
+        x, y = jnp.minimum(x, camera.width - 1), jnp.minimum(y, camera.height - 1)
+        in_front = jnp.broadcast_to(visible.in_front[:, None], x.shape)
         return DiffusionBasis(
-            light=at,
-            leaving=leaving,
-            pixels=(y * view.width + x).reshape(-1),
-            in_front=in_front.reshape(-1).astype(leaving.dtype),
-            specular=visible.picture(tiles.specular),
-            coverage=visible.picture(jnp.ones_like(tiles.area)),
-            overflow=jnp.where(needed <= 1, 0.0, needed),
+            light=light,
+            leaving=visible.invalid_factor * visible.share.reshape(1, -1) * post,
+            pixels=(y * camera.width + x).reshape(-1),
+            in_front=in_front.reshape(-1).astype(post.dtype),
+            specular=visible.picture(specular),
+            coverage=visible.picture(jnp.ones_like(specular[:, 0])),
+            overflow=visible.overflow,
         )
 
     return on_devices(passes, scene, plan, camera)

@@ -9,18 +9,18 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from splatjax import splatting as _splatting
+from splatjax.diffusion import LayersAtPoints
 from splatjax.gaussians import SumOfGaussians
-from splatjax.scene import Camera, Frame, Scene, stack_lights
+from splatjax.scene import Camera, Frame, Scene
 
 from ._attributes import SurfaceSamples
 from ._devices import on_devices
 from ._inputs import check_channels, in_one_dtype
-from ._lighting import LightAtSplats, LightVisibility
-from ._passes import light_splats, see_and_read
+from ._lighting import LightAtSplats
+from ._passes import look
 from ._plan import Plan, plan_unless_traced
 from ._settings import RenderSettings
-from ._shade import compose, layers_at_points, shade, single_scattering_albedo
+from ._shade import ShadedSurface, compose, layers_at_points, single_scattering_albedo
 
 Parameters = TypeVar("Parameters", bound=PyTree)
 
@@ -132,44 +132,28 @@ def _picture_jacobian(
     scene, camera = in_one_dtype(scene, camera)
 
     def passes(combination, scene, plan, camera):
-        view, groups = _splatting.PerspectiveView.of(camera), stack_lights(scene.lights)
-        given, gaussians = (settings, plan, combination), scene.material.gaussians
-        seen = view.may_see(scene.splats)
-        light = light_splats(scene, *given, derivative=True, wanted=seen)
-        visibility = LightVisibility(groups, light.visibility, light.needed)
-        attributes = settings.lighting.attributes(scene, visibility, light.irradiance)
+        gaussians, ratio = scene.material.gaussians, single_scattering_albedo(scene)
 
-        def read(samples: SurfaceSamples):
-            own = settings.lighting.at_pixels(scene, groups, samples)
-            shaded = shade(scene, view.position, groups, samples, own, plan.interval, settings)
-            ratio = single_scattering_albedo(scene)
-            at = layers_at_points(
-                samples, own, own.source, gaussians.variances, plan.interval, settings.kernel
-            )
+        def read(shaded: ShadedSurface, at: LayersAtPoints, samples: SurfaceSamples):
             of_weights, of_variances = at.exitance_jacobian(gaussians, ratio)
             added = samples.attributes.added_source
             if added is not None:
                 # The light that a weight lets in has layers of its own.
-                channels = len(added)
                 layers = tuple(
-                    layer if layer is None else layer[channels:] for layer in samples.layers
+                    None if layer is None else layer[len(added) :] for layer in samples.layers
                 )
                 samples = dataclasses.replace(samples, layers=layers, derivative=None)
-                at = layers_at_points(
-                    samples, own, added, gaussians.variances, plan.interval, settings.kernel
-                )
-                gained, _ = at.weigh(gaussians, ratio)
+                own = samples.attributes, added, plan.interval, settings.kernel
+                gained, _ = layers_at_points(scene, samples, *own).weigh(gaussians, ratio)
                 weighted = gaussians.weights[:, :, None] * gained
                 of_weights = of_weights + jnp.sum(weighted, axis=0)[None]
             post = shaded.post[None]
             return shaded, post * of_weights, post * of_variances
 
-        read_out, visible, needed = see_and_read(scene, view, light, attributes, read, *given)
-        shaded, *slopes = combination.gather(read_out)
-        visible = visible.gathered(combination)
-        frame = compose(scene, shaded, visible, needed)
-        visible = visible.invalidate_unless(needed <= 1)
+        (shaded, *slopes), visible = look(
+            scene, camera, settings, plan, combination, read, derivative=True
+        )
         pictures = [jnp.moveaxis(visible.picture(slope), 2, 0) for slope in slopes]
-        return PictureJacobian(frame, *pictures)
+        return PictureJacobian(compose(scene, shaded, visible), *pictures)
 
     return on_devices(passes, scene, plan, camera)

@@ -2,6 +2,7 @@
 samples, and between devices how partial results are combined. No mathematics lives here.
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import TypeVar
 
@@ -14,7 +15,7 @@ from jaxtyping import Array, Bool, Float, PyTree, Shaped
 from splatjax import diffusion as _diffusion, splatting as _splatting
 from splatjax._chunking import map_chunks
 from splatjax._combination import AbstractCombination
-from splatjax.scene import Scene
+from splatjax.scene import Camera, Scene, stack_lights
 
 from ._attributes import SurfaceAttributes, SurfaceSamples, split_rows, stack_rows
 from ._lighting import (
@@ -25,11 +26,10 @@ from ._lighting import (
 )
 from ._plan import Plan
 from ._settings import RenderSettings
+from ._shade import ShadedSurface, shade
 
 Samples = TypeVar("Samples", bound=PyTree)
 Values = TypeVar("Values", bound=PyTree)
-Read = Callable[[SurfaceSamples], Values]
-"""Reads what a picture needs off the surface samples: pointwise, along their last axis."""
 
 
 class SplatLight(eqx.Module):
@@ -116,21 +116,35 @@ def diffuse_splats(
     return diffused.layers, slopes.layers, diffused.needed
 
 
-def see_and_read(
+def look(
     scene: Scene,
-    view: _splatting.AbstractView,
-    light: SplatLight,
-    attributes: SurfaceAttributes,
-    read: Read[Values],
+    camera: Camera,
     settings: RenderSettings,
     plan: Plan,
     combination: AbstractCombination,
-) -> tuple[Values, _splatting.VisibleSurfaces, Float[Array, ""]]:
-    """Passes 2 and 3: blend the splats' attributes and layers, and read the samples.
+    read: Callable[[ShadedSurface, _diffusion.LayersAtPoints, SurfaceSamples], Values],
+    light: SplatLight | None = None,
+    derivative: bool = False,
+) -> tuple[Values, _splatting.VisibleSurfaces]:
+    """All passes: light the splats, see them, shade what is seen, and read what a picture needs.
 
-    **Returns:** what was read, for each place of this device; the places; and the capacity needed
-    over planned.
+    **Arguments:**
+
+    - `read`: pointwise, along the last axis.
+    - `light`: from `light_splats`; computed here for `None`.
+    - `derivative`: also differentiate the layers in the material's Gaussians.
+
+    **Returns:** what was read, for each place; and the places, with the capacity needed of all
+    passes.
     """
+    view, groups = _splatting.PerspectiveView.of(camera), stack_lights(scene.lights)
+    if light is None:
+        seen = view.may_see(scene.splats)
+        light = light_splats(scene, settings, plan, combination, derivative, seen)
+
+    # Passes 2 and 3: blend the splats' attributes and layers.
+    visibility = LightVisibility(groups, light.visibility, light.needed)
+    attributes = settings.lighting.attributes(scene, visibility, light.irradiance)
     origin = stop_gradient(_splatting.Bounds.of(scene.splats, combination).center)[:, None]
     attributes = attributes.with_layers(
         light.layers, light.derivative, light.added_source, scene.splats.centers.T - origin
@@ -138,8 +152,16 @@ def see_and_read(
     visible = _splatting.visible_surfaces(
         scene.splats, stack_rows(attributes), view, settings.splatting, plan.raster, combination
     )
-    samples = sample_surfaces(visible, attributes, origin)
-    return map_samples(read, samples), visible, jnp.maximum(light.needed, visible.needed)
+
+    # Pass 5: shade the points that are seen.
+    def shade_and_read(samples: SurfaceSamples) -> Values:
+        shaded, layers = shade(scene, view.position, groups, samples, plan.interval, settings)
+        return read(shaded, layers, samples)
+
+    values = map_samples(shade_and_read, sample_surfaces(visible, attributes, origin))
+    needed = jnp.maximum(light.needed, visible.needed)
+    visible = dataclasses.replace(visible.gathered(combination), needed=needed)
+    return combination.gather(values), visible
 
 
 def sample_surfaces(

@@ -1,21 +1,23 @@
 """A picture with all its layers, the light of a body without a camera, and pass 4 alone."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh
 from jaxtyping import Array, Float
 
-from splatjax import splatting as _splatting
-from splatjax.scene import Camera, Frame, Scene, stack_lights
+from splatjax.scene import Camera, Frame, Scene
+from splatjax.splatting import PerspectiveView
 
 from ._devices import on_devices
 from ._inputs import SAME, check_channels, in_one_dtype
-from ._lighting import Irradiance, LightVisibility, cast_shadows, irradiate, surface_attributes
-from ._passes import SplatLight, diffuse_splats, light_splats, see_and_read
+from ._lighting import Irradiance, LightAtSplats, cast_shadows, irradiate
+from ._passes import SplatLight, diffuse_splats, light_splats, look
 from ._plan import Plan, check_plan, plan_unless_traced
 from ._settings import RenderSettings
-from ._shade import compose, layers_at_points, shade, single_scattering_albedo
+from ._shade import compose, single_scattering_albedo
 
 
 def render(
@@ -58,21 +60,10 @@ def _render(
     scene, camera = in_one_dtype(scene, camera)
 
     def passes(combination, scene, plan, camera, light=None):
-        view, groups = _splatting.PerspectiveView.of(camera), stack_lights(scene.lights)
-        if light is None:
-            seen = view.may_see(scene.splats)
-            light = light_splats(scene, settings, plan, combination, wanted=seen)
-        visibility = LightVisibility(groups, light.visibility, light.needed)
-        attributes = settings.lighting.attributes(scene, visibility, light.irradiance)
+        def read(shaded, *_):
+            return shaded
 
-        def read(samples):
-            own = settings.lighting.at_pixels(scene, groups, samples)
-            return shade(scene, view.position, groups, samples, own, plan.interval, settings)
-
-        given = settings, plan, combination
-        shaded, visible, needed = see_and_read(scene, view, light, attributes, read, *given)
-        shaded = combination.gather(shaded)
-        return compose(scene, shaded, visible.gathered(combination), needed)
+        return compose(scene, *look(scene, camera, settings, plan, combination, read, light))
 
     return on_devices(passes, scene, plan, camera, placed=light)
 
@@ -185,25 +176,20 @@ def _diffuse_irradiance(
 ):
     scene, camera, irradiance = in_one_dtype(scene, camera, irradiance)
 
+    dark = Scene(scene.splats, (), scene.material)
+    plain = dataclasses.replace(settings, lighting=LightAtSplats())
+
     def passes(combination, scene, plan, camera, irradiance):
-        view, gaussians = _splatting.PerspectiveView.of(camera), scene.material.gaussians
-        source, seen = irradiance.T, view.may_see(scene.splats)
+        source, seen = irradiance.T, PerspectiveView.of(camera).may_see(scene.splats)
         given = settings, plan, combination
         layers, _, needed = diffuse_splats(scene, source, *given, wanted=seen)
         light = SplatLight([], Irradiance(source, source), layers, None, None, needed)
-        dark = LightVisibility([], [], needed)
-        attributes = surface_attributes(scene, dark, light.irradiance)
 
-        def read(samples):
-            own = samples.attributes
-            at = layers_at_points(
-                samples, own, own.source, gaussians.variances, plan.interval, settings.kernel
-            )
-            return at.weigh(gaussians, single_scattering_albedo(scene))[0]
+        def read(shaded, layers, samples):
+            return layers.weigh(scene.material.gaussians, single_scattering_albedo(scene))[0]
 
-        layers, visible, needed = see_and_read(scene, view, light, attributes, read, *given)
-        visible = visible.gathered(combination).invalidate_unless(needed <= 1)
-        return visible.front_picture(combination.gather(layers))
+        layers, visible = look(scene, camera, plain, plan, combination, read, light)
+        return visible.front_picture(layers)
 
-    picture = on_devices(passes, scene, plan, camera, rows=(irradiance,))
+    picture = on_devices(passes, dark, plan, camera, rows=(irradiance,))
     return jnp.moveaxis(picture, 2, 0)

@@ -37,10 +37,10 @@ class ShadedSurface(eqx.Module):
 
 
 def layers_at_points(
+    scene: Scene,
     samples: SurfaceSamples,
     attributes: SurfaceAttributes,
     source: Float[Array, "channels points"],
-    variances: Float[Array, " gaussians"],
     interval: Float[Array, "2"],
     kernel: _diffusion.AbstractDiffusionKernel,
 ) -> _diffusion.LayersAtPoints:
@@ -49,11 +49,11 @@ def layers_at_points(
     **Arguments:**
 
     - `source`: the surface's own irradiance, for layers that the splats do not resolve; the layers
-      have its channels first, or its channels after those of `attributes.source`.
+      of the samples begin with its channels.
     """
     albedo = attributes.albedo
     return _diffusion.LayersAtPoints.of(
-        variances,
+        scene.material.gaussians.variances,
         samples.layers,
         samples.derivative,
         source,
@@ -69,12 +69,14 @@ def shade(
     eye: Float[Array, "3"],
     groups: list[StackedLights],
     samples: SurfaceSamples,
-    attributes: SurfaceAttributes,
     interval: Float[Array, "2"],
     settings: RenderSettings,
-) -> ShadedSurface:
-    """Shade the samples: the layers, the specular lobe, and single scattering."""
+) -> tuple[ShadedSurface, _diffusion.LayersAtPoints]:
+    """Shade the samples: the layers, the specular lobe, and single scattering. Also return what
+    the layers were made of.
+    """
     material, covered = scene.material, samples.covered
+    attributes = settings.lighting.at_pixels(scene, groups, samples)
     f0 = _shading.fresnel_f0(material.eta)
     to_eye = eye[:, None] - samples.positions
     points = _shading.SurfacePoints(
@@ -90,7 +92,8 @@ def shade(
     )
     gaussians = material.gaussians
     channels, post = gaussians.weights.shape[1], _shading.leaving_share(points, f0)[None] / jnp.pi
-    albedo = jnp.ones_like(attributes.source) if attributes.albedo is None else attributes.albedo
+    at = layers_at_points(scene, samples, attributes, attributes.source, interval, settings.kernel)
+    albedo = at.albedo
     if attributes.albedo is not None:
         post = post * _shading.albedo_root(albedo)
     single = None
@@ -99,14 +102,11 @@ def shade(
         single = jnp.where(covered[None], single.T, 0.0)
         if attributes.albedo is not None:
             single = single * _shading.albedo_root(albedo) ** 2
-    at = layers_at_points(
-        samples, attributes, attributes.source, gaussians.variances, interval, settings.kernel
-    )
     layers, resolved = at.weigh(gaussians, single_scattering_albedo(scene))
     layers = jnp.where(covered[None, None], post[None] * layers, 0.0)
     specular = _shading.reflected_radiance(points, groups, f0, channels).T
     shadow = _shadows_in_order(attributes.visibility, groups, len(scene.lights), samples.depth)
-    return ShadedSurface(
+    shaded = ShadedSurface(
         depth=jnp.where(covered, samples.depth, jnp.inf),
         positions=jnp.where(covered[None], samples.positions, 0.0),
         normals=points.normals.T,
@@ -120,6 +120,7 @@ def shade(
         single_scattering=single,
         resolved=resolved,
     )
+    return shaded, at
 
 
 def single_scattering_albedo(scene: Scene) -> Float[Array, " channels"]:
@@ -132,7 +133,6 @@ def compose(
     scene: Scene,
     shaded: ShadedSurface,
     visible: _splatting.VisibleSurfaces,
-    needed: Float[Array, ""],
 ) -> Frame:
     """Lay the front over what shows behind it; all is NaN where the plan does not suffice.
 
@@ -140,7 +140,6 @@ def compose(
 
     - `shaded`: with arrays `[places, *rows, pixels]`.
     """
-    visible = visible.invalidate_unless(needed <= 1)
     front, picture = visible.front_picture, visible.picture
     diffuse, specular = picture(shaded.diffuse), picture(shaded.specular)
     single = None if shaded.single_scattering is None else picture(shaded.single_scattering)
@@ -161,7 +160,7 @@ def compose(
         diffuse=diffuse,
         specular=specular,
         unresolved_fraction=visible.invalid_factor * unresolved / jnp.maximum(jnp.sum(drawn), 1),
-        overflow=jnp.where(needed <= 1, 0.0, needed),
+        overflow=visible.overflow,
         single_scattering=single,
     )
 

@@ -254,7 +254,6 @@ def _shade(
 ) -> Frame:
     def read(given: tuple[SurfaceSamples, tuple]):
         samples = dataclasses.replace(given[0], layers=given[1])
-        own = settings.lighting.at_pixels(scene, groups, samples)
-        return shade(scene, view.position, groups, samples, own, interval, settings)
+        return shade(scene, view.position, groups, samples, interval, settings)[0]
 
-    return compose(scene, map_samples(read, (samples, layers)), visible, visible.needed)
+    return compose(scene, map_samples(read, (samples, layers)), visible)

@@ -64,20 +64,20 @@ class VisibleSurfaces(eqx.Module):
 
     **Attributes:**
 
-    - `tiles`: the tile of each place of this device; those of the surface behind count on from
-      those of the front; twice their number in an empty place.
+    - `tiles`: the tile of each place of this device; the number of tiles in an empty place.
+    - `in_front`: whether a place is of the surface in front, and not of the one behind.
     - `rows`: as in `FragmentSums`.
     - `before`: the coverage of what lies in front of the surface behind; 0 for the front.
-    - `needed`: capacity needed over planned.
-    - `invalid_factor`: of every picture: 1, or NaN.
+    - `needed`: capacity needed over planned. Above 1 every picture is NaN, and so are its
+      derivatives.
     """
 
     view: AbstractView
     tiles: Int[Array, " places"]
+    in_front: Bool[Array, " places"]
     rows: Float[Array, "places rows pixels"]
     before: Float[Array, "places pixels"]
     needed: Float[Array, ""]
-    invalid_factor: Float[Array, ""]
     full_coverage: float = eqx.field(static=True)
 
     @classmethod
@@ -97,31 +97,30 @@ class VisibleSurfaces(eqx.Module):
         whole = jnp.zeros((tiles, SIDE**2), whole.dtype).at[in_front].set(whole, mode="drop")
         own_back = combination.own_rows(in_back)
         before = whole.at[own_back].get(mode="fill", fill_value=0)
-        own_front = combination.own_rows(in_front)
-        own_front = jnp.where(own_front < tiles, own_front, 2 * tiles)
+        own = jnp.concatenate([combination.own_rows(in_front), own_back])
         return cls(
             view=view,
-            tiles=jnp.concatenate([own_front, tiles + own_back]),
+            tiles=own,
+            in_front=jnp.arange(len(own)) < len(own) - len(own_back),
             rows=jnp.concatenate([front, behind]),
             before=jnp.concatenate([jnp.zeros_like(front[:, -1]), before]),
             needed=combination.largest([sums.needed]),
-            invalid_factor=jnp.ones_like(sums.needed),
             full_coverage=settings.full_coverage,
         )
 
-    def invalidate_unless(self, fits: Bool[Array, ""]) -> "VisibleSurfaces":
-        """Make every picture NaN, and its derivatives too, where a plan does not suffice."""
-        factor = jnp.where(fits, self.invalid_factor, jnp.nan).astype(self.invalid_factor.dtype)
-        return eqx.tree_at(lambda each: each.invalid_factor, self, factor)
+    @property
+    def overflow(self) -> Float[Array, ""]:
+        """The capacity needed over planned where that does not suffice, else 0."""
+        return jnp.where(self.needed <= 1, 0.0, self.needed)
+
+    @property
+    def invalid_factor(self) -> Float[Array, ""]:
+        """The factor of every picture: 1, or NaN where the plan does not suffice."""
+        return jnp.where(self.needed <= 1, 1.0, jnp.nan).astype(self.needed.dtype)
 
     @property
     def grid(self) -> TileGrid:
         return TileGrid(self.view.width, self.view.height)
-
-    @property
-    def in_front(self) -> Bool[Array, " places"]:
-        """Mark the places that hold tiles of the front surface."""
-        return self.tiles < self.grid.count
 
     @property
     def share(self) -> Float[Array, "places pixels"]:
@@ -130,15 +129,18 @@ class VisibleSurfaces(eqx.Module):
 
     def gathered(self, combination: AbstractCombination) -> "VisibleSurfaces":
         """Return the places of all devices, without their rows."""
-        tiles, before, weights = combination.gather((self.tiles, self.before, self.rows[:, -1:]))
-        parts = (tiles, before, weights)
-        return eqx.tree_at(lambda each: (each.tiles, each.before, each.rows), self, parts)
+
+        def of_places(each):
+            return each.tiles, each.in_front, each.before, each.rows
+
+        parts = combination.gather((*of_places(self)[:3], self.rows[:, -1:]))
+        return eqx.tree_at(of_places, self, parts)
 
     def pixels(
         self, tiles: Int[Array, " some"]
     ) -> tuple[Int[Array, "some pixels"], Int[Array, "some pixels"]]:
         """Return column and row of every pixel of some tiles of either surface."""
-        return self.grid.columns_and_rows(tiles % self.grid.count)
+        return self.grid.columns_and_rows(tiles)
 
     def points(
         self, tiles: Int[Array, " some"], depth: Float[Array, "some pixels"]
@@ -152,18 +154,16 @@ class VisibleSurfaces(eqx.Module):
     ) -> Float[Array, "height width *rows"]:
         """Join the picture of the front surface; `fill` where there is none."""
         tiles = jnp.full((self.grid.count, *values.shape[1:]), fill, values.dtype)
-        return self._joined(tiles.at[self.tiles].set(values, mode="drop"))
+        place = jnp.where(self.in_front, self.tiles, self.grid.count)
+        return self._joined(tiles.at[place].set(values, mode="drop"))
 
     def picture(
         self, values: Float[Array, "places *rows pixels"]
     ) -> Float[Array, "height width *rows"]:
         """Lay the front over what shows behind it, premultiplied by coverage."""
         tiles = jnp.zeros((self.grid.count, *values.shape[1:]), values.dtype)
-        place = jnp.where(
-            self.tiles < 2 * self.grid.count, self.tiles % self.grid.count, self.grid.count
-        )
         share = self.share.reshape(len(self.tiles), *[1] * (values.ndim - 2), -1)
-        return self._joined(tiles.at[place].add(share * values, mode="drop"))
+        return self._joined(tiles.at[self.tiles].add(share * values, mode="drop"))
 
     def _joined(
         self, tiles: Float[Array, "tiles *rows pixels"]

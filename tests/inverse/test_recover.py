@@ -224,7 +224,6 @@ def half_resolved():
         variances=jnp.asarray([1.5, 2.5, 9.0]),
         means=jnp.asarray(rng.uniform(0.5, 1.0, (3, 2, points))),
         mass=jnp.ones((3, points)),
-        resolvable=jnp.ones(3),
         irradiance=jnp.asarray(rng.uniform(0.0, 2.0, (2, points))),
         area=jnp.ones(points),
         albedo=jnp.ones((2, points)),
