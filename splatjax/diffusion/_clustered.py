@@ -24,10 +24,9 @@ from ._diffuser import (
     split_layer,
 )
 from ._gaussian_sums import (
-    Steps,
+    Lists,
     gaussian_sums,
     gaussian_sums_forward,
-    points_blocks,
     source_table,
 )
 from ._kernel import AbstractDiffusionKernel, TruncatedGaussian, resolved_fraction
@@ -39,7 +38,7 @@ FINEST = 0.01
 resolve it.
 """
 _CELL = 0.6  # edge of the cells, in standard deviations, for an error of 2e-3; error ~ edge^3
-_WORTHWHILE = 2.0  # edge of the cells, in spacings, from which on merging splats pays
+_WORTHWHILE = 1.1  # edge of the cells, in spacings, from which on merging splats pays
 
 
 class LayerPlan(eqx.Module):
@@ -61,7 +60,7 @@ class LayerPlan(eqx.Module):
 
 
 class ClusterDiffuser(AbstractDiffuser):
-    r"""Sums over the splats near each splat; for layers wider than about 3.3 spacings, over
+    r"""Sums over the splats near each splat; for layers wider than about two spacings, over
     clusters.
 
     **Attributes:** (static)
@@ -152,9 +151,9 @@ class ClusterDiffuser(AbstractDiffuser):
         sinking = math.sqrt(3) * float(depths[1] - depths[0])
         reach = support * math.sqrt(float(largest)) + sinking
         points = [_target_boxes(part.centers.T - origin[:, None]) for part in parts]
-        steps = _same_size([find_neighbors(each, boxes, reach) for each in points])
+        lists = _same_size([find_neighbors(each, boxes, reach) for each in points])
         points = jax.tree.map(lambda *rows: jnp.concatenate(rows), *points)
-        return Neighbors(steps, points, boxes, jnp.asarray(reach, largest.dtype))
+        return Neighbors(lists, points, boxes, jnp.asarray(reach, largest.dtype))
 
 
 class ClusterPlan(AbstractDiffusionPlan):
@@ -173,7 +172,7 @@ class ClusterPlan(AbstractDiffusionPlan):
 
     def shares(self):
         found = [each.neighbors for each in self.layers if each.neighbors is not None]
-        return tuple(jax.tree.leaves([(each.steps, each.points) for each in found]))
+        return tuple(jax.tree.leaves([(each.lists, each.points) for each in found]))
 
     def in_forward_mode(self) -> "ClusterPlan":
         return dataclasses.replace(self, sums=gaussian_sums_forward)
@@ -221,14 +220,14 @@ class ClusterPlan(AbstractDiffusionPlan):
         self, clusters, points, variance, depth, kernel, support, neighbors: Neighbors, wanted
     ):
         """Evaluate one layer at points; also return its need of reach over the planned one."""
-        steps = neighbors.steps if wanted is None else neighbors.steps.only(wanted, BLOCK)
+        lists = neighbors.lists if wanted is None else neighbors.lists.only(wanted)
         below = clusters.lowered(depth)
         truncated = kernel.truncated(support)
         table = layer_table(below, variance, depth, truncated)
         finish = LayerFinish(below.irradiance.shape[0])
-        blocks = points_blocks(points * in_sums(variance), steps, BLOCK)
-        sums = self.sums(blocks, table, steps, truncated, finish)
-        found = sums[: points.shape[1] // BLOCK].transpose(1, 0, 2).reshape(sums.shape[1], -1)
+        blocks = (points * in_sums(variance)).reshape(3, -1, BLOCK).transpose(1, 0, 2)
+        sums = self.sums(blocks, table, lists, truncated, finish)
+        found = sums.transpose(1, 0, 2).reshape(sums.shape[1], -1)
         needed = neighbors.needed(
             _target_boxes(points),
             Boxes.around(below.centers, below.areas > 0, SOURCES),
@@ -292,14 +291,13 @@ def source_boxes(clusters: Clusters, depth: Float[Array, ""]) -> Boxes:
     return Boxes.around(clusters.lowered(depth).centers, clusters.areas > 0, SOURCES)
 
 
-def _same_size(steps: Sequence[Steps]) -> Steps:
-    """Concatenate the steps of every part, padded to one size."""
-    most = max(each.ids.shape[0] for each in steps)
+def _same_size(lists: Sequence[Lists]) -> Lists:
+    """Concatenate the lists of every part, padded to one size."""
+    most = max(len(each.rows) for each in lists)
     padded = [
         dataclasses.replace(
-            each,
-            ids=jnp.pad(each.ids, ((0, most - each.ids.shape[0]), (0, 0), (0, 0)), mode="edge"),
+            each, rows=jnp.pad(each.rows, ((0, most - len(each.rows)), (0, 0)), mode="edge")
         )
-        for each in steps
+        for each in lists
     ]
     return jax.tree.map(lambda *rows: jnp.concatenate(rows), *padded)

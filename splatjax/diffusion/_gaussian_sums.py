@@ -1,10 +1,10 @@
 """Sums of Gaussians around blocks of sources at blocks of points, with a derivative that recomputes
 the weights.
 
-Every block of points has a list of the blocks of sources near it. Some blocks of points, one per
-*lane*, are swept together; in a *step* each lane meets the next few blocks of its list. Tables hold
-centers and the summed rows, one block of sources after the other. The unit of length is the
-standard deviation times the root of 2.
+Every block of points has a list of the blocks of sources near it. Blocks of points with lists of
+about one length are swept together, one per *lane*; in a step each lane meets the sources of the
+next row of its list. Tables hold centers and the summed rows, one block of sources after the other.
+The unit of length is the standard deviation times the root of 2.
 """
 
 from collections.abc import Callable
@@ -23,32 +23,72 @@ from ._kernel import TruncatedGaussian
 FAR = -1e6  # mm from anything, yet with a square that float32 holds
 
 
-class Steps(eqx.Module):
+LANES = 64
+"""Blocks of points that are swept together."""
+
+
+class Lists(eqx.Module):
     """Which blocks of sources the blocks of points meet. Not differentiated.
 
     **Attributes:**
 
-    - `ids`: blocks of sources; the number of blocks, whose block is empty, in an empty slot.
-    - `begins`, `ends`: the steps of each sweep.
-    - `order`: the block of points of each lane, sweep after sweep.
+    - `rows`: blocks of sources, so many to a row; the number of blocks, whose block is empty, in
+      what is left of a row, and in the last row.
+    - `first`, `counts`: the rows of each block of points.
+    - `order`: of the blocks of points, those with the longest lists first.
     """
 
-    ids: Int[Array, "steps lanes slots"]
-    begins: Int[Array, " sweeps"]
-    ends: Int[Array, " sweeps"]
+    rows: Int[Array, "rows width"]
+    first: Int[Array, " points_blocks"]
+    counts: Int[Array, " points_blocks"]
     order: Int[Array, " points_blocks"]
 
-    def lanes(self, sweep: Int[Array, ""]) -> Int[Array, " lanes"]:
-        """Return the blocks of points of one sweep."""
-        lanes = self.ids.shape[1]
-        return lax.dynamic_slice_in_dim(self.order, sweep * lanes, lanes)
+    def only(self, wanted: Bool[Array, " points"]) -> "Lists":
+        """Leave out the blocks none of whose points is wanted."""
+        counts = jnp.where(jnp.any(wanted.reshape(len(self.counts), -1), axis=1), self.counts, 0)
+        order = self.order[jnp.argsort(counts[self.order] == 0)]
+        return Lists(self.rows, self.first, counts, order)
 
-    def only(self, wanted: Bool[Array, " points"], block: int) -> "Steps":
-        """Leave out the sweeps none of whose points is wanted."""
-        blocks = jnp.any(wanted.reshape(-1, block), axis=1)
-        blocks = jnp.pad(blocks, (0, self.order.shape[0] - blocks.shape[0]))
-        sweeps = jnp.any(blocks[self.order].reshape(len(self.begins), -1), axis=1)
-        return Steps(self.ids, self.begins, jnp.where(sweeps, self.ends, self.begins), self.order)
+    def sweep(self, sweep: Callable, out):
+        """Apply `sweep(lanes, out)` to all blocks with a list."""
+        blocks = len(self.order)
+        lanes = min(LANES, blocks)
+        order = jnp.pad(self.order, (0, -blocks % lanes), constant_values=blocks)
+        sweeps = (jnp.sum(self.counts > 0) + lanes - 1) // lanes
+
+        def step(i, out):
+            blocks = lax.dynamic_slice_in_dim(order, i * lanes, lanes)
+            first, counts = (
+                each.at[blocks].get(mode="fill", fill_value=0) for each in (self.first, self.counts)
+            )
+            return sweep(Lanes(blocks, first, counts), out)
+
+        return lax.fori_loop(jnp.zeros_like(sweeps), sweeps, step, out)
+
+
+class Lanes(eqx.Module):
+    """Blocks of points that are swept together, and their lists; the number of blocks in a lane
+    without one.
+    """
+
+    blocks: Int[Array, " lanes"]
+    first: Int[Array, " lanes"]
+    counts: Int[Array, " lanes"]
+
+    def read(self, rows: Float[Array, "points_blocks ..."], fill=0.0):
+        return rows.at[self.blocks].get(mode="fill", fill_value=fill)
+
+    def write(self, rows: Float[Array, "points_blocks ..."], values):
+        return rows.at[self.blocks].set(values, mode="drop")
+
+    def each_row(self, lists: Lists, add: Callable, start):
+        """Apply `add(ids, carry)` to the blocks of sources `[lanes, width]` of row after row."""
+
+        def step(i, carry):
+            row = jnp.where(i < self.counts, self.first + i, len(lists.rows) - 1)
+            return add(lists.rows.at[row].get(mode="promise_in_bounds"), carry)
+
+        return lax.fori_loop(0, jnp.max(self.counts), step, start)
 
 
 def identity(
@@ -75,25 +115,16 @@ class _Rule(eqx.Module):
         squared = dx * dx + dy * dy + dz * dz
         return *self.kernel(squared), (dx, dy, dz)
 
-    def sums(self, steps: Steps, sweep, here, table):
+    def sums(self, lists: Lists, lanes: Lanes, here, table):
         """Sum over all that a sweep's points meet."""
 
-        def add(step, sums):
-            sources, _ = _met(table, steps, step)
+        def add(ids, sums):
+            sources = _met(table, ids)
             weights, *_ = self.weights(here, sources)
             return sums + jnp.einsum("lrs,lsp->lrp", sources[:, 3:], weights)
 
         start = jnp.zeros((here.shape[0], table.shape[1] - 3, here.shape[2]), here.dtype)
-        return lax.fori_loop(steps.begins[sweep], steps.ends[sweep], add, start)
-
-
-def points_blocks(
-    points: Float[Array, "3 points"], steps: Steps, block: int
-) -> Float[Array, "points_blocks 3 block"]:
-    """Cut points into blocks; those that fill the last sweep lie far from everything."""
-    blocks = points.reshape(3, -1, block).transpose(1, 0, 2)
-    spare = steps.order.shape[0] - blocks.shape[0]
-    return jnp.pad(blocks, ((0, spare), (0, 0), (0, 0)), constant_values=FAR)
+        return lanes.each_row(lists, add, start)
 
 
 def source_table(
@@ -108,31 +139,18 @@ def source_table(
     )
 
 
-def _met(table, steps: Steps, step):
-    """Read the sources that each lane meets in a step, `[lanes, columns, sources]`, and their
-    blocks.
-    """
-    ids = lax.dynamic_index_in_dim(steps.ids, step, 0, keepdims=False)
+def _met(table, ids):
+    """Read the sources that each lane meets, `[lanes, columns, sources]`."""
     sources = jnp.moveaxis(table.at[ids].get(mode="promise_in_bounds"), 1, 2)
-    return sources.reshape(ids.shape[0], table.shape[1], -1), ids
+    return sources.reshape(ids.shape[0], table.shape[1], -1)
 
 
-def _swept(steps: Steps, sweep: Callable, out):
-    """Let every sweep write the values of its points."""
+def _forward(rule: _Rule, lists: Lists, points, table):
+    def sweep(lanes, out):
+        here = lanes.read(points, FAR)
+        return lanes.write(out, rule.finished(rule.sums(lists, lanes, here, table), here))
 
-    def write(i, out):
-        lanes = steps.lanes(i)
-        return out.at[lanes].set(sweep(i, lanes), mode="promise_in_bounds")
-
-    return lax.fori_loop(0, steps.begins.shape[0], write, out)
-
-
-def _forward(rule: _Rule, steps: Steps, points, table):
-    def sweep(i, lanes):
-        here = points.at[lanes].get(mode="promise_in_bounds")
-        return rule.finished(rule.sums(steps, i, here, table), here)
-
-    return _swept(steps, sweep, _empty(rule, points, table))
+    return lists.sweep(sweep, _empty(rule, points, table))
 
 
 def _empty(rule: _Rule, points, table):
@@ -143,15 +161,15 @@ def _empty(rule: _Rule, points, table):
     return zeros_after(table, values.shape, values.dtype)
 
 
-def _derivative(rule: _Rule, steps: Steps, points, table, d_points, d_table):
+def _derivative(rule: _Rule, lists: Lists, points, table, d_points, d_table):
     """Compute the values and their derivative along a direction; weights are evaluated once."""
     rows = table.shape[1] - 3
 
-    def sweep(i, lanes):
-        here, d_here = (each.at[lanes].get(mode="promise_in_bounds") for each in (points, d_points))
+    def sweep(lanes, out):
+        here, d_here = lanes.read(points, FAR), lanes.read(d_points)
 
-        def add(step, sums):
-            (sources, _), (moved, _) = _met(table, steps, step), _met(d_table, steps, step)
+        def add(ids, sums):
+            sources, moved = _met(table, ids), _met(d_table, ids)
             weights, falls, offsets = rule.weights(here, sources)
             nearer = sum(
                 offset * (moved[:, axis, :, None] - d_here[:, axis, None])
@@ -164,29 +182,26 @@ def _derivative(rule: _Rule, steps: Steps, points, table, d_points, d_table):
             return sums + both.at[:, rows:].add(moving)
 
         start = jnp.zeros((here.shape[0], 2 * rows, here.shape[2]), here.dtype)
-        sums = lax.fori_loop(steps.begins[i], steps.ends[i], add, start)
+        sums = lanes.each_row(lists, add, start)
         along = sums[:, rows:], d_here
         values, slopes = jax.jvp(rule.finished, (sums[:, :rows], here), along)
-        return jnp.concatenate([values, slopes], axis=1)
+        return lanes.write(out, jnp.concatenate([values, slopes], axis=1))
 
     empty = _empty(rule, points, table)
-    out = _swept(steps, sweep, jnp.concatenate([empty, empty], axis=1))
+    out = lists.sweep(sweep, jnp.concatenate([empty, empty], axis=1))
     return out[:, : empty.shape[1]], out[:, empty.shape[1] :]
 
 
-def _backward(rule: _Rule, steps: Steps, points, table, sums, cotangents):
-    def sweep(i, carry):
+def _backward(rule: _Rule, lists: Lists, points, table, sums, cotangents):
+    def sweep(lanes, carry):
         d_points, d_table = carry
-        lanes = steps.lanes(i)
-        here, total, cotangent = (
-            each.at[lanes].get(mode="promise_in_bounds") for each in (points, sums, cotangents)
-        )
+        here, total, cotangent = lanes.read(points, FAR), lanes.read(sums), lanes.read(cotangents)
         _, pull = jax.vjp(rule.finished, total, here)
         cotangent, d_finish = pull(cotangent)
 
-        def add(step, carry):
+        def add(ids, carry):
             d_here, d_table = carry
-            sources, ids = _met(table, steps, step)
+            sources = _met(table, ids)
             weights, falls, _ = rule.weights(here, sources)
             # The factor of an exponent's cotangent is a polynomial in point and source, seen from
             # one of the sources: its moments over the points and over the sources suffice.
@@ -208,21 +223,21 @@ def _backward(rule: _Rule, steps: Steps, points, table, sums, cotangents):
             d_table = d_table.at[ids].add(jnp.moveaxis(part, 2, 1), mode="promise_in_bounds")
             return d_here - 2 * (x * toward[:, :1] - toward[:, 1:]), d_table
 
-        d_here, d_table = lax.fori_loop(steps.begins[i], steps.ends[i], add, (d_finish, d_table))
-        return d_points.at[lanes].set(d_here, mode="promise_in_bounds"), d_table
+        d_here, d_table = lanes.each_row(lists, add, (d_finish, d_table))
+        return lanes.write(d_points, d_here), d_table
 
     start = tuple(zeros_after(cotangents, each.shape, each.dtype) for each in (points, table))
-    return lax.fori_loop(0, steps.begins.shape[0], sweep, start)
+    return lists.sweep(sweep, start)
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0,))
-def _sums(rule: _Rule, steps: Steps, points, table):
-    return _forward(rule, steps, points, table)
+def _sums(rule: _Rule, lists: Lists, points, table):
+    return _forward(rule, lists, points, table)
 
 
-def _sums_fwd(rule: _Rule, steps: Steps, points, table):
-    sums = _forward(_Rule(rule.kernel, identity), steps, points, table)
-    return rule.finished(sums, points), (steps, points, table, sums)
+def _sums_fwd(rule: _Rule, lists: Lists, points, table):
+    sums = _forward(_Rule(rule.kernel, identity), lists, points, table)
+    return rule.finished(sums, points), (lists, points, table, sums)
 
 
 def _sums_bwd(rule: _Rule, residuals, cotangents):
@@ -233,8 +248,8 @@ _sums.defvjp(_sums_fwd, _sums_bwd)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _sums_forward(rule: _Rule, steps: Steps, points, table):
-    return _forward(rule, steps, points, table)
+def _sums_forward(rule: _Rule, lists: Lists, points, table):
+    return _forward(rule, lists, points, table)
 
 
 @_sums_forward.defjvp
@@ -245,7 +260,7 @@ def _sums_jvp(rule: _Rule, primals, tangents):
 def gaussian_sums(
     points: Float[Array, "points_blocks 3 points"],
     table: Float[Array, "blocks_and_one columns block"],
-    steps: Steps,
+    lists: Lists,
     kernel: TruncatedGaussian,
     finish: Callable[
         [Float[Array, "rows points"], Float[Array, "3 points"]], Float[Array, "values points"]
@@ -255,24 +270,24 @@ def gaussian_sums(
 
     **Arguments:**
 
-    - `points`: `x`, from `points_blocks`. Differentiable.
+    - `points`: `x`. Differentiable.
     - `table`: from `source_table`: `p_j` and `rows_j`. Differentiable.
     - `kernel`: stands for `exp`; terms beyond its rim vanish, whatever the lists hold. Static.
     - `finish`: computes values from sums and points. Static.
 
-    **Returns:** the values; 0 for blocks of points that no sweep visits.
+    **Returns:** the values; 0 for blocks of points without a list.
     """
-    return _sums(_Rule(kernel, finish), steps, points, table)
+    return _sums(_Rule(kernel, finish), lists, points, table)
 
 
 def gaussian_sums_forward(
     points: Float[Array, "points_blocks 3 points"],
     table: Float[Array, "blocks_and_one columns block"],
-    steps: Steps,
+    lists: Lists,
     kernel: TruncatedGaussian,
     finish: Callable[
         [Float[Array, "rows points"], Float[Array, "3 points"]], Float[Array, "values points"]
     ],
 ) -> Float[Array, "points_blocks values points"]:
     """Sum as `gaussian_sums` does, with forward mode instead of reverse mode."""
-    return _sums_forward(_Rule(kernel, finish), steps, points, table)
+    return _sums_forward(_Rule(kernel, finish), lists, points, table)

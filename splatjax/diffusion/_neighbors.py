@@ -1,7 +1,6 @@
 """Which blocks of sources lie near which blocks of points, found once for a geometry."""
 
 import math
-from collections.abc import Iterator
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,15 +10,14 @@ from jaxtyping import Array, Bool, Float
 
 from splatjax.splatting import round_up
 
-from ._gaussian_sums import Steps
+from ._gaussian_sums import Lists
 
-LANES = 64
-SLOTS = 8
-"""Blocks of sources that each lane meets in a step."""
-SOURCES = 16
+SOURCES = 8
 """Sources of a block."""
-_AT_ONCE = 1 << 20  # pairs of boxes tested together
-_FAN = 32  # blocks of sources tested as one at first
+WIDTH = 16
+"""Blocks of sources in a row of a list."""
+_AT_ONCE = 1 << 18  # pairs of boxes whose parts are tested together
+_FAN = 4  # parts of a box of a coarser level
 
 
 class Boxes(eqx.Module):
@@ -49,7 +47,7 @@ class Boxes(eqx.Module):
 class Neighbors(eqx.Module):
     """The blocks of sources within reach of every block of points, and what the search assumed."""
 
-    steps: Steps
+    lists: Lists
     points: Boxes
     sources: Boxes
     reach: Float[Array, ""]
@@ -60,64 +58,77 @@ class Neighbors(eqx.Module):
         return (reach + math.sqrt(3) * moved) / self.reach
 
 
-def find_neighbors(points: Boxes, sources: Boxes, reach: float) -> Steps:
+def find_neighbors(points: Boxes, sources: Boxes, reach: float) -> Lists:
     """Search for the blocks of sources within `reach` (mm) of every block of points.
 
-    The number of steps is rounded up, so that nearby geometries need no other program. Not for
+    The number of rows is rounded up, so that nearby geometries need no other program. Not for
     traced arrays.
     """
-    boxes = (
-        np.asarray(each, np.float64)
-        for each in (points.low, points.high, sources.low, sources.high)
-    )
-    pairs = list(_pairs_in_reach(*boxes, reach))
-    of, near = (np.concatenate(each) for each in zip(*pairs, strict=True))
+    of, near = _pairs_in_reach(_levels(points), _levels(sources), reach)
     blocks, empty = points.low.shape[0], sources.low.shape[0]
-    lanes = min(LANES, blocks)
-    counts = np.bincount(of, minlength=blocks)
-    rank = np.arange(len(of)) - (np.cumsum(counts) - counts)[of]
-    # Lanes that are swept together have lists of about one length.
-    order = np.argsort(-(-counts // SLOTS), kind="stable")
-    sweeps = -(-blocks // lanes)
-    spare = sweeps * lanes - blocks  # lanes of the last sweep with no block and an empty list
-    order = np.concatenate([order, np.arange(blocks, blocks + spare)])
-    lane = np.empty(blocks + spare, np.int64)
-    lane[order] = np.arange(blocks + spare)
-    longest = np.pad(-(-counts // SLOTS), (0, spare))[order].reshape(sweeps, lanes).max(axis=1)
-    ends = np.cumsum(longest)
-    ids = np.full((round_up(int(ends[-1]), 1), lanes, SLOTS), empty, np.int32)
-    step = (ends - longest)[lane[of] // lanes] + rank // SLOTS
-    ids[step, lane[of] % lanes, rank % SLOTS] = near
-    return Steps(*(jnp.asarray(each, jnp.int32) for each in (ids, ends - longest, ends, order)))
+    by_block = np.argsort(of, kind="stable")
+    of, near = of[by_block], near[by_block]
+    lengths = np.bincount(of, minlength=blocks)
+    counts = -(-lengths // WIDTH)
+    first, begins = (np.cumsum(each) - each for each in (counts, lengths))
+    ids = np.full((round_up(int(counts.sum()), 1), WIDTH), empty, np.int32)
+    ids.reshape(-1)[(first * WIDTH - begins)[of] + np.arange(len(of))] = near
+    order = np.argsort(-counts, kind="stable")
+    return Lists(*(jnp.asarray(each, jnp.int32) for each in (ids, first, counts, order)))
 
 
-def _pairs_in_reach(
-    point_low, point_high, low, high, reach: float
-) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield pairs of blocks of points and of sources whose boxes are in reach, by block of points.
-
-    Sources are tested many blocks at a time first, then one by one.
+def _levels(boxes: Boxes) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return the corners `[3, boxes]` of boxes, and of ever coarser boxes around `_FAN` of them;
+    empty boxes fill each level.
     """
-    fans = -(-len(low) // _FAN)
-    padding = ((0, fans * _FAN - len(low)), (0, 0))
-    low, high = (
-        np.pad(low, padding, constant_values=np.inf),
-        np.pad(high, padding, constant_values=-np.inf),
-    )
-    fan_low = low.reshape(fans, _FAN, 3).min(axis=1)
-    fan_high = high.reshape(fans, _FAN, 3).max(axis=1)
-    step = max(_AT_ONCE // max(fans, 1), 1)
-    for begin in range(0, len(point_low), step):
-        part = slice(begin, begin + step)
-        block, fan = np.nonzero(
-            _in_reach(point_low[part, None], point_high[part, None], fan_low, fan_high, reach)
-        )
-        block = np.repeat(block + begin, _FAN)
-        source = (fan[:, None] * _FAN + np.arange(_FAN)).reshape(-1)
-        near = _in_reach(point_low[block], point_high[block], low[source], high[source], reach)
-        yield block[near], source[near]
+    levels = [(np.asarray(boxes.low).T, np.asarray(boxes.high).T)]
+    while True:
+        corners = []
+        for rows, empty in zip(levels[-1], (np.inf, -np.inf), strict=True):
+            lacking = ((0, 0), (0, -rows.shape[1] % _FAN))
+            corners.append(np.pad(rows, lacking, constant_values=empty))
+        levels[-1] = low, high = corners[0], corners[1]
+        if low.shape[1] <= _FAN:
+            return levels
+        coarser = low.reshape(3, -1, _FAN).min(axis=2), high.reshape(3, -1, _FAN).max(axis=2)
+        levels.append(coarser)
 
 
-def _in_reach(low_a, high_a, low_b, high_b, reach: float) -> np.ndarray:
+def _pairs_in_reach(points: list, sources: list, reach: float) -> tuple[np.ndarray, np.ndarray]:
+    """Find the pairs of boxes of the finest levels that are in reach of each other."""
+    none, level = np.zeros(0, np.int32), max(len(points), len(sources)) - 1
+    found = [(none, none)]
+    own, other = (np.arange(each[-1][0].shape[1], dtype=np.int32) for each in (points, sources))
+    todo = [(level, *(each.reshape(-1) for each in np.meshgrid(own, other)))]
+    while todo:
+        level, own, other = todo.pop()
+        corners = *_taken(points, level, own), *_taken(sources, level, other)
+        near = np.flatnonzero(_are_in_reach(*corners, reach))
+        own, other = own[near], other[near]
+        if level == 0:
+            found.append((own, other))
+            continue
+        for begin in range(0, len(near), _AT_ONCE):
+            part = slice(begin, begin + _AT_ONCE)
+            own_parts = _parts(points, level, own[part])[:, :, None]
+            parts = np.broadcast_arrays(own_parts, _parts(sources, level, other[part])[:, None])
+            todo.append((level - 1, *(each.reshape(-1) for each in parts)))
+    own, other = (np.concatenate(each) for each in zip(*found, strict=True))
+    return own, other
+
+
+def _taken(levels: list, level: int, boxes: np.ndarray) -> list[np.ndarray]:
+    """Read the corners of boxes of a level, of the coarsest one if there are not so many."""
+    return [rows[:, boxes] for rows in levels[min(level, len(levels) - 1)]]
+
+
+def _parts(levels: list, level: int, boxes: np.ndarray) -> np.ndarray:
+    """Return the parts of each box, of the next finer level."""
+    if level >= len(levels):
+        return boxes[:, None]
+    return boxes[:, None] * _FAN + np.arange(_FAN, dtype=boxes.dtype)
+
+
+def _are_in_reach(low_a, high_a, low_b, high_b, reach: float) -> np.ndarray:
     apart = np.maximum(np.maximum(low_a - high_b, low_b - high_a), 0)
-    return np.sum(apart * apart, axis=-1) <= reach * reach
+    return np.sum(apart * apart, axis=0) <= reach * reach

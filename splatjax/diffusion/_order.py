@@ -2,16 +2,16 @@
 
 import numpy as np
 
-BLOCK = 64
-"""Points of one block; blocks, and their halves, quarters and eighths, are compact."""
+BLOCK = 32
+"""Points of one block; blocks, and their halves and quarters, are compact."""
 
 
-_TOGETHER = 64 * BLOCK  # split side by side from here on
+_TOGETHER = 128 * BLOCK  # split side by side from here on
 
 
 def compact_order(points: np.ndarray) -> np.ndarray:
     """Find the order `[points]` of a k-d tree whose leaves hold `BLOCK` points, but the last, and
-    are sorted down to eighths.
+    are sorted down to quarters.
 
     **Arguments:** `points`: `[points, 3]`.
     """
@@ -38,10 +38,10 @@ def compact_order(points: np.ndarray) -> np.ndarray:
 
 
 def _halve(order: np.ndarray, place: np.ndarray, size: int) -> None:
-    """Split parts of one size in halves, along their longest axes, down to eighths of a block. In
+    """Split parts of one size in halves, along their longest axes, down to quarters of a block. In
     place.
     """
-    while size > BLOCK // 8:
+    while size > BLOCK // 4:
         parts = place.reshape(3, -1, size)
         longest = np.argmax(np.ptp(parts, axis=2), axis=0)
         rows = np.arange(parts.shape[1])

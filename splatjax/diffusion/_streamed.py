@@ -17,7 +17,7 @@ from splatjax._combination import PartByPart
 from ._clustered import ClusterDiffuser, in_sums, layer_table, source_boxes
 from ._clusters import Clusters, ClusterTree
 from ._diffuser import Sources
-from ._gaussian_sums import FAR, Steps, gaussian_sums, identity
+from ._gaussian_sums import FAR, Lists, gaussian_sums, identity
 from ._kernel import AbstractDiffusionKernel, TruncatedGaussian
 from ._neighbors import Boxes, find_neighbors
 from ._order import BLOCK, compact_order
@@ -54,7 +54,7 @@ class StreamedDiffusion:
         points: Float[Array, "blocks 3 block"],
         exists: Bool[Array, "blocks block"],
     ):
-        """Prepare for points in blocks of `BLOCK`; `spacing`, `fine` and `interval` as for
+        """Prepare for points in compact blocks; `spacing`, `fine` and `interval` as for
         `ClusterDiffuser.choose_sources`.
         """
         sizes = np.asarray(variances, np.float64)
@@ -67,9 +67,9 @@ class StreamedDiffusion:
         self.cells = sorted({edge for edge in edges if edge > 0})
         self.points = jnp.where(exists[:, None], points, FAR)
         self.boxes = Boxes.around(
-            jnp.moveaxis(self.points, 1, 0).reshape(3, -1), exists.reshape(-1), BLOCK
+            jnp.moveaxis(self.points, 1, 0).reshape(3, -1), exists.reshape(-1), points.shape[2]
         )
-        self.counts, self.steps = (0,) * len(self.cells), [0] * len(self.layers)
+        self.counts, self.rows = (0,) * len(self.cells), [0] * len(self.layers)
 
     def evaluate(
         self, parts: Iterable[Sources]
@@ -126,12 +126,12 @@ class StreamedDiffusion:
     def _sum_layer(self, i: int, layer: _Layer, levels: list[Clusters]) -> Array:
         clusters = levels[self.cells.index(layer.edge) + 1 if layer.edge else 0]
         reach = layer.support * math.sqrt(float(layer.variance))
-        steps = find_neighbors(self.boxes, source_boxes(clusters, layer.depth), reach)
-        if steps.ids.shape[0] > self.steps[i]:
-            self.steps[i] = 1 << (steps.ids.shape[0] - 1).bit_length()
-        more = self.steps[i] - steps.ids.shape[0]
-        ids = jnp.pad(steps.ids, ((0, more), (0, 0), (0, 0)))
-        return _sum(self.points, clusters, layer, dataclasses.replace(steps, ids=ids))
+        lists = find_neighbors(self.boxes, source_boxes(clusters, layer.depth), reach)
+        if len(lists.rows) > self.rows[i]:
+            self.rows[i] = 1 << (len(lists.rows) - 1).bit_length()
+        more = self.rows[i] - len(lists.rows)
+        rows = jnp.pad(lists.rows, ((0, more), (0, 0)), mode="edge")
+        return _sum(self.points, clusters, layer, dataclasses.replace(lists, rows=rows))
 
 
 @eqx.filter_jit
@@ -140,13 +140,11 @@ def _levels(tree: ClusterTree, sources: Sources) -> list[Clusters]:
 
 
 @eqx.filter_jit
-def _sum(points, clusters: Clusters, layer: _Layer, steps: Steps) -> Array:
+def _sum(points, clusters: Clusters, layer: _Layer, lists: Lists) -> Array:
     below = clusters.lowered(layer.depth)
     table = layer_table(below, layer.variance, layer.depth, layer.truncated, slopes=False)
-    spare = steps.order.shape[0] - points.shape[0]
-    points = points * in_sums(layer.variance)
-    blocks = jnp.pad(points, ((0, spare), (0, 0), (0, 0)), constant_values=FAR)
-    return gaussian_sums(blocks, table, steps, layer.truncated, identity)[: points.shape[0]]
+    blocks = points * in_sums(layer.variance)
+    return gaussian_sums(blocks, table, lists, layer.truncated, identity)
 
 
 @eqx.filter_jit

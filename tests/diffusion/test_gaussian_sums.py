@@ -9,7 +9,6 @@ from splatjax.diffusion import BLOCK, _neighbors, compact_order
 from splatjax.diffusion._gaussian_sums import (
     gaussian_sums,
     gaussian_sums_forward,
-    points_blocks,
     source_table,
 )
 from splatjax.diffusion._kernel import TruncatedGaussian
@@ -37,12 +36,12 @@ def test_values_and_derivatives_are_those_of_plain_sums(float64):
         Boxes.around(each, jnp.ones(each.shape[1], bool), n)
         for each, n in ((points, BLOCK), (centers, SOURCES))
     )
-    steps = find_neighbors(*boxes, 4.0**0.5)
+    lists = find_neighbors(*boxes, 4.0**0.5)
 
     def ours(points, *sources, sums=gaussian_sums):
-        blocks = points_blocks(points, steps, BLOCK)
-        found = sums(blocks, source_table(*sources, SOURCES), steps, kernel, squares_and_products)
-        return found[:5].transpose(1, 0, 2).reshape(found.shape[1], -1)
+        blocks = points.reshape(3, -1, BLOCK).transpose(1, 0, 2)
+        found = sums(blocks, source_table(*sources, SOURCES), lists, kernel, squares_and_products)
+        return found.transpose(1, 0, 2).reshape(found.shape[1], -1)
 
     def plain(points, centers, rows):
         offset = points[:, None] - centers[:, :, None]
@@ -69,7 +68,7 @@ def test_blocks_of_a_compact_order_are_small():
     points /= np.linalg.norm(points, axis=1, keepdims=True)
     order = compact_order(points)
     np.testing.assert_array_equal(np.sort(order), np.arange(4000))
-    for size in (BLOCK, BLOCK // 4, BLOCK // 8):
+    for size in (2 * BLOCK, BLOCK, BLOCK // 2, BLOCK // 4):
         blocks = points[order[: 4000 // size * size]].reshape(-1, size, 3)
         extent = np.max(np.ptp(blocks, axis=1), axis=1)
         even = np.sqrt(4 * np.pi * size / 4000)  # edge of a square with its share of the sphere
@@ -87,15 +86,10 @@ def test_neighbors_are_the_boxes_within_reach_each_once(at_once, monkeypatch):
         points.low[:, None] - sources.high[None], sources.low[None] - points.high[:, None]
     )
     expected = np.sum(np.maximum(gaps, 0) ** 2, axis=2) <= REACH**2
-    steps = jax.tree.map(np.asarray, find_neighbors(points, sources, REACH))
-    blocks, none = expected.shape
-    lanes = steps.ids.shape[1]
-    assert set(range(blocks)) <= set(steps.order.tolist())
-    for place, block in enumerate(steps.order):
-        sweep, lane = divmod(place, lanes)
-        row = steps.ids[steps.begins[sweep] : steps.ends[sweep], lane].reshape(-1)
-        near = np.flatnonzero(expected[block]) if block < blocks else []
-        np.testing.assert_array_equal(np.sort(row[row < none]), near)
+    lists = jax.tree.map(np.asarray, find_neighbors(points, sources, REACH))
+    for block, near in enumerate(expected):
+        row = lists.rows[lists.first[block] :][: lists.counts[block]].reshape(-1)
+        np.testing.assert_array_equal(np.sort(row[row < len(near)]), np.flatnonzero(near))
 
 
 def test_what_has_moved_needs_as_much_more_reach():

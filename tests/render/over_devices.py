@@ -11,7 +11,7 @@ from jax.sharding import NamedSharding, PartitionSpec
 from scenes import sphere
 
 import splatjax as sj
-from benchmarks.communication import Picture, counted
+from benchmarks.communication import Picture, View, counted
 from splatjax.diffusion import DenseDiffuser
 from splatjax.splatting import DenseRasterizer, ShadowSettings
 
@@ -21,7 +21,7 @@ PLACE = np.asarray(
 )  # mm; where the balls stand, away from the origin of all coordinates
 
 
-def scene(count: int = 1501, variances=(0.1, 16.0, 100.0)) -> sj.Scene:
+def scene(count: int = 1501, variances=(0.1, 12.5, 100.0)) -> sj.Scene:
     """Two balls, the last splats before the first, of a number that eight does not divide; layers
     of three kinds.
     """
@@ -143,18 +143,16 @@ def traffic() -> dict:
         )
     )
     found = counted(program.lower(world.splats).compile().as_text())
-    layers = [layer for layer in plan.diffuser.whole.layers if layer.capacity is not None]
+    layers = sum(layer.neighbors is not None for layer in plan.diffusion.layers)
+    shadows = [each.raster for each in plan.shadows if each is not None]
     picture = Picture(
-        tiles=30,
-        shown=8 * plan.rasterizer.share,
-        places=8 * plan.tiles,
-        maps=(16,),
-        attributes=14,
+        camera=View(30, *_capacity(plan.raster)),
+        maps=tuple(View(16, *_capacity(each)) for each in shadows),
+        rows=17 + 16 * layers,
         channels=3,
         gaussians=3,
         lights=2,
-        singles=sum(layer.level == 0 for layer in layers),
-        cells=plan.diffuser.cells,
+        splats=len(plan.order),
     )
     model = picture.traffic()
     model = {
@@ -164,6 +162,10 @@ def traffic() -> dict:
         "sent": picture.sent(8),
     }
     return {"model": model, "counted": vars(found) | {"sent": found.sent(8)}}
+
+
+def _capacity(raster) -> tuple[int, int]:
+    return raster.places.front, raster.places.behind
 
 
 def views_cut() -> dict:
