@@ -12,7 +12,7 @@ import tyro
 import splatjax as sj
 from splatjax._format import channel_names, counted
 from splatjax.fitting import AbstractWeights
-from splatjax.io import own_version, read_picture, surface_and_source
+from splatjax.io import read_picture, surface_and_source
 from splatjax.scattering import measure_laser_dot
 
 from ._fit_all import fit_all
@@ -31,7 +31,7 @@ from ._report import note, print_table, stage
 _COEFFICIENTS, _PROFILE, _PHOTOGRAPH = "coefficients", "a measured profile", "a photograph"
 _KINDS = {".csv": _PROFILE, ".exr": _PHOTOGRAPH}
 _OPTIONS = {
-    _COEFFICIENTS: ("model", "cut", "photons", "single_scattering"),
+    _COEFFICIENTS: ("model", "photons", "single_scattering"),
     _PROFILE: ("mm_per_unit",),
     _PHOTOGRAPH: ("mm_per_pixel", "power"),
 }
@@ -76,9 +76,6 @@ class Fit:
     #: Of coefficients: what makes a profile of them. The layers of a material are multipoles, or
     #: are walked by Monte Carlo.
     model: Model = "dipole"
-    #: Of photon beams and Monte Carlo, which are infinite at the origin: the fit begins at so many
-    #: mean free paths, or at 0.2.
-    cut: OptionalFloat = None
     #: Of Monte Carlo: how many walk.
     photons: int = 1_000_000
     #: Of photon beams and Monte Carlo: keep light that scatters once as a term of its own, and fit
@@ -133,7 +130,7 @@ class Fit:
                     f"{counted(self.count, 'Gaussian')} apart: give a smaller --count"
                 )
         else:
-            options = self.model, self.cut, self.photons, self.single_scattering
+            options = self.model, self.photons, self.single_scattering
             measured, target = False, reference(coefficients, *options)
         weights, weights_of = self._weights(measured)
         fitted = self._fitted(target, weights)
@@ -196,20 +193,15 @@ class Fit:
         number = counted(self.count, "Gaussian")
         goal = number if self.error is None else f"Gaussians to an error of {self.error:g}"
         with stage(f"fitting to {self.medium}: {goal}"):
-            fitted = jax.block_until_ready(
-                sj.fit_gaussians(
-                    target.profile, count, weights=weights, rule=target.rule, throw=False
-                )
+            fitted = sj.fit_gaussians(
+                target.profile, count, weights=weights, rule=target.rule, throw=False
             )
-            if fitted.result != optx.RESULTS.successful:
+            if jax.block_until_ready(fitted).result != optx.RESULTS.successful:
                 number = counted(len(fitted.gaussians.variances), "Gaussian")
-                more = (
-                    f"more --photons than {self.photons}, or "
-                    if self.model == "monte-carlo"
-                    else ""
-                )
+                is_walked = self.model == "monte-carlo"
                 raise ValueError(
-                    f"{self.medium}: the search for {number} did not settle; give {more}a smaller "
+                    f"{self.medium}: the search for {number} did not settle; give "
+                    f"{f'more --photons than {self.photons}, or ' if is_walked else ''}a smaller "
                     "--count"
                 )
         return fitted
@@ -230,7 +222,7 @@ class Fit:
         }
         if target.description is not None:
             settings = {"profile": target.description} | settings
-        provenance = f"fitted by splatjax {own_version()} to the "
+        provenance = f"fitted by splatjax {sj.__version__} to the "
         if isinstance(coefficients, sj.scattering.Tabulated):
             provenance += f"profile of {self.medium}"
             material, profile, source = sj.Material(fitted.gaussians), None, {}

@@ -14,17 +14,10 @@ from jaxtyping import Array, Float
 
 import splatjax as sj
 from splatjax.fitting import AbstractWeights
-from splatjax.io import (
-    fingerprint,
-    join_tables,
-    own_version,
-    read_column,
-    read_media,
-    write_columns,
-)
+from splatjax.io import fingerprint, read_columns, read_media, write_columns
 
-from ._report import note, stage
-from ._resumable import ResumableFolder
+from ._report import note
+from ._resumable import complete
 
 _BATCH = 500  # media in one call
 
@@ -42,38 +35,36 @@ def fit_all(media: Path, output: Path, count: int, weights: AbstractWeights) -> 
         "media": fingerprint(media),
         "--count": count,
         "weights": type(weights).__name__,
-        "splatjax": own_version(),
+        "splatjax": sj.__version__,
         "jax": jax.__version__,
     }
     path, begins = output.with_name(f"{output.name}.parts"), range(0, len(names), _BATCH)
     parts = [path / f"from_{begin:08}.csv" for begin in begins]
-    folder = ResumableFolder(path / "fits.json", record, [(part,) for part in parts], "batches")
-    folder.check()
-    own = folder.own_missing()
-    if own:
-        folder.begin()
-        what = f"fitting {count} Gaussians to {len(names)} media, {_BATCH} at a time"
-        with stage(what, len(own)) as report:
-            for number, i in enumerate(own, 1):
-                batch = slice(begins[i], begins[i] + _BATCH)
-                columns = _fitted(coefficients[batch], count, weights)
-                write_columns(parts[i], {"name": names[batch]} | columns)
-                report(number)
-    was_joined = output.exists() and not path.exists()  # by another process
-    if was_joined or not folder.is_complete():
+
+    def fit(i: int) -> None:
+        batch = slice(begins[i], begins[i] + _BATCH)
+        columns = _fitted(coefficients[batch], count, weights)
+        write_columns(parts[i], {"name": names[batch]} | columns)
+
+    what = f"fitting {count} Gaussians to {len(names)} media, {_BATCH} at a time"
+    items = [(part,) for part in parts]
+    done = complete(path / "fits.json", record, items, lambda: fit, name="batches", what=what)
+    if len(done) < len(parts):
         return
     try:
-        join_tables(output, parts)
-    except FileNotFoundError as error:  # another process has joined them at the same time
-        if not output.exists() or str(error.filename) not in map(str, parts):
+        tables = [read_columns(part) for part in parts]
+    except FileNotFoundError:  # another process has joined them at the same time
+        if not output.exists():
             raise
+        return
+    columns = {name: [cell for table in tables for cell in table[name]] for name in tables[0]}
+    write_columns(output, columns)
     shutil.rmtree(path, ignore_errors=True)
-    converged = read_column(output, "converged")
-    failed = int(np.sum(converged == 0))
+    failed = columns["converged"].count("0.0")
     note(
-        f"{failed} of {len(converged)} fits did not converge; in their rows `converged` is 0"
+        f"{failed} of {len(names)} fits did not converge; in their rows `converged` is 0"
         if failed
-        else f"all {len(converged)} fits converged"
+        else f"all {len(names)} fits converged"
     )
     print(output)
 

@@ -13,12 +13,11 @@ import equinox as eqx
 import jax
 import tyro
 
-from splatjax.io import own_version
+import splatjax as sj
 
 from ._environment import prepare_jax
-from ._export import Export
 from ._fit import Fit
-from ._materials import Materials
+from ._materials import Export, Materials
 from ._recover import Recover
 from ._render import Render
 from ._report import note
@@ -87,14 +86,14 @@ def parsed(words: list[str]) -> Any:
     name, *rest = words or ["--help"]
     style = (tyro.conf.PositionalMetavarFromFieldName,)
     if name == "--version":
-        print(f"splatjax {own_version()}, jax {jax.__version__}")
+        print(f"splatjax {sj.__version__}, jax {jax.__version__}")
         raise SystemExit
     if name in _COMMANDS:
         return tyro.cli(_COMMANDS[name], prog=f"splatjax {name}", args=rest, config=style)
-    commands: list[Any] = []
-    for key, command in _COMMANDS.items():
-        summary = (command.__doc__ or "").partition("\n")[0]
-        commands.append(Annotated[command, tyro.conf.subcommand(key, description=summary)])
+    commands: list[Any] = [
+        Annotated[kind, tyro.conf.subcommand(key, description=str(kind.__doc__).partition("\n")[0])]
+        for key, kind in _COMMANDS.items()
+    ]
     return tyro.cli(
         functools.reduce(operator.or_, commands),
         prog="splatjax",

@@ -1,14 +1,19 @@
-"""`splatjax materials`: what is in the library."""
+"""`splatjax materials`: what is in the library; `splatjax export`: it in the terms of other
+renderers.
+"""
 
 import re
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated
 
+import jax
 import tyro
 
 import splatjax as sj
-from splatjax.io import material_path, surface_and_source
+from splatjax.io import material_path, save_exports, surface_and_source
 
+from ._options import check_output
 from ._report import print_table
 
 _MATERIAL = (
@@ -39,6 +44,29 @@ class Materials:
             return
         titles = ("material", "known", "total reflectance", "widest, mm", "eta", "source")
         print_table([titles, *map(_row, sj.list_materials())])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Export:
+    """Write a material's Gaussians as JSON for other renderers.
+
+    Each entry with formula, unit and source: GPU Gems weights, a kernel for separable subsurface
+    scattering, Burley's d, the shape parameter of Unity's HDRP, Blender's radius.
+
+    Example: splatjax export skin --output skin.json
+    """
+
+    #: Name of a material (`splatjax materials`), or path of a TOML file with a [fit].
+    material: tyro.conf.Positional[str]
+    #: JSON file to write.
+    output: Path
+
+    def run(self) -> None:
+        """Load, write."""
+        check_output(self.output, (".json",))
+        with jax.enable_x64(True):
+            save_exports(sj.load_material(self.material), self.output)
+        print(self.output)
 
 
 def _row(name: str) -> tuple[str, ...]:

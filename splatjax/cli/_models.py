@@ -12,7 +12,8 @@ from splatjax.scattering import AbstractRadialRule
 from ._report import stage
 
 Model: TypeAlias = Literal["dipole", "better-dipole", "photon-beam", "monte-carlo"]
-_CUT = 0.2  # mean free paths
+_BEYOND = sj.scattering.L2_QUADRATURE.beyond(0.2)
+"""Radii for profiles that are infinite at the origin: from so many mean free paths on."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +35,6 @@ class Reference:
 def reference(
     coefficients: sj.Dipole | sj.LayeredMultipole,
     model: Model,
-    cut: float | None,
     photons: int,
     single_scattering: bool,
 ) -> Reference:
@@ -42,48 +42,41 @@ def reference(
 
     **Arguments:**
 
-    - `cut`: mean free paths from which on a profile counts that is infinite at the origin.
     - `single_scattering`: whether light that scatters once is taken out of the profile.
 
     **Raises:** `ValueError` for options that do not go with the model or with layers.
     """
     option = f"--model {model}{' with --single-scattering' if single_scattering else ''}"
-    if cut is not None and option != "--model photon-beam" and model != "monte-carlo":
-        raise ValueError(f"--cut has no effect on {option}, which is finite at the origin")
     if single_scattering and model not in ("photon-beam", "monte-carlo"):
         raise ValueError(f"{option} is not possible; take photon-beam or monte-carlo")
-    beyond = sj.scattering.L2_QUADRATURE.beyond(_CUT if cut is None else cut)
-    if isinstance(coefficients, sj.LayeredMultipole):
-        if model == "dipole":
-            return Reference(coefficients)
-        if model == "monte-carlo" and not single_scattering:
-            return _walked(coefficients.layers, photons, beyond)
+    is_layered = isinstance(coefficients, sj.LayeredMultipole)
+    if is_layered and (single_scattering or model not in ("dipole", "monte-carlo")):
         raise ValueError(
             f"{option} is for a half space, and this material has layers; take --model dipole or "
             "monte-carlo without --single-scattering"
         )
-    medium = coefficients.medium
-    single = sj.SingleScattering(medium)
     if model == "monte-carlo":
-        half_space = sj.Layer(medium, jnp.asarray(jnp.inf))
-        return _walked((half_space,), photons, beyond, single if single_scattering else None)
-    if single_scattering:
-        profile = sj.scattering.PhotonBeam(medium).multiply_scattered()
-        return Reference(
-            profile, single=single, description="photon beam, without single scattering"
-        )
-    if model == "photon-beam":
-        return Reference(sj.scattering.PhotonBeam(medium), beyond)
-    return Reference(coefficients if model == "dipole" else sj.scattering.BetterDipole(medium))
+        return _walked(coefficients, photons, single_scattering)
+    if is_layered or model == "dipole":
+        return Reference(coefficients)
+    if model == "better-dipole":
+        return Reference(sj.scattering.BetterDipole(coefficients.medium))
+    beam = sj.scattering.PhotonBeam(coefficients.medium)
+    if not single_scattering:
+        return Reference(beam, _BEYOND)
+    single = sj.SingleScattering(coefficients.medium)
+    description = "photon beam, without single scattering"
+    return Reference(beam.multiply_scattered(), single=single, description=description)
 
 
 def _walked(
-    layers: tuple[sj.Layer | sj.Film, ...],
+    coefficients: sj.Dipole | sj.LayeredMultipole,
     photons: int,
-    rule: AbstractRadialRule,
-    single: sj.SingleScattering | None = None,
+    single_scattering: bool,
 ) -> Reference:
     """Walk in single precision, which suffices for photons; the profile is fitted in double."""
+    is_layered = isinstance(coefficients, sj.LayeredMultipole)
+    layers = coefficients.layers if is_layered else [sj.Layer(coefficients.medium, jnp.inf)]
     layers_32 = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), list(layers))
     with stage("walking photons", photons) as report:
         walk = sj.transport.monte_carlo(
@@ -91,7 +84,8 @@ def _walked(
         )
     profile = jax.tree.map(lambda leaf: leaf.astype(jnp.float64), walk.profile())
     description = f"Monte Carlo, {photons} photons"
-    if single is None:
-        return Reference(profile, rule, None, description)
+    if is_layered or not single_scattering:
+        return Reference(profile, _BEYOND, None, description)
+    single = sj.SingleScattering(coefficients.medium)
     description += ", without single scattering"
-    return Reference(profile.without(single), rule, single, description)
+    return Reference(profile.without(single), _BEYOND, single, description)

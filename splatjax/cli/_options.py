@@ -16,8 +16,6 @@ if TYPE_CHECKING:
 OptionalPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="")]
 OptionalFloat = Annotated[float | None, tyro.conf.arg(metavar="FLOAT", help_behavior_hint="")]
 UpAxis = Literal["y", "z"]
-MaterialName = Annotated[str, tyro.conf.arg(metavar="MATERIAL")]
-MaterialNames = Annotated[tuple[str, ...], tyro.conf.arg(metavar="MATERIAL [MATERIAL ...]")]
 Rules = dict[str, tuple[bool, str]]
 """By field of a command, whether its value is valid, and what it must do."""
 FIGURES = (".png", ".pdf", ".svg")

@@ -16,7 +16,6 @@ from splatjax._format import counted
 from splatjax.io import (
     fingerprint,
     material_path,
-    own_version,
     picture_paths,
     read_record,
     write_record,
@@ -24,7 +23,6 @@ from splatjax.io import (
 
 from ._options import (
     FIGURES,
-    MaterialNames,
     OptionalFloat,
     OptionalPath,
     check_options,
@@ -75,7 +73,9 @@ class Recover:
     splats: tyro.conf.Positional[Path]
     #: TOML file that lists the pictures.
     pictures: tyro.conf.Positional[Path]
-    start: Annotated[MaterialNames, tyro.conf.arg(help=_START)] = ("skin1", "marble")
+    start: Annotated[
+        tuple[str, ...], tyro.conf.arg(metavar="MATERIAL [MATERIAL ...]", help=_START)
+    ] = ("skin1", "marble")
     #: Index of refraction, which is not searched. Without it, that of the first start.
     eta: OptionalFloat = None
     #: TOML file to write the material to.
@@ -186,7 +186,7 @@ class Recover:
         return {
             "files": [fingerprint(file) for file in files],
             **{name: getattr(self, name) for name in names},
-            "splatjax": own_version(),
+            "splatjax": sj.__version__,
         }
 
     def _suggest(
@@ -212,7 +212,7 @@ class Recover:
             profile=_MODELS[self.model](recovery.medium),
             source={
                 "provenance": (
-                    f"recovered by splatjax {own_version()} from the pictures of "
+                    f"recovered by splatjax {sj.__version__} from the pictures of "
                     f"{self.pictures.name}, on the shape {self.splats.name}"
                 ),
                 "relative_error_of_sigma_a": np.asarray(errors[0]).tolist(),

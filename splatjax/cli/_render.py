@@ -40,10 +40,9 @@ class Render(ViewOptions):
         is_valid = self.stream == 0 or (self.stream > 0 and self.splats is not None)
         expected = "be a number of splats of a PLY file, which must be named"
         check_options(self, {"stream": (is_valid, expected)})
-        file = None
-        if self.splats and self.stream:
-            file = sj.SplatFile(self.splats, self.stream, up=self.up)
-        frame, material = self._at_once() if file is None else self._streamed(file)
+        frame, material = (
+            self._streamed(self.splats) if self.splats and self.stream else self._at_once()
+        )
         self.note_unresolved_layers(frame, material)
         with stage(f"writing {self.output} and {self.output.with_suffix('.png')}"):
             written = self.write(self.output, frame, material)
@@ -59,7 +58,8 @@ class Render(ViewOptions):
         with stage(f"rendering {splats.count} splats at {self.width} x {self.height}"):
             return draw(scene, camera, plan), material
 
-    def _streamed(self, file: sj.SplatFile) -> tuple[sj.Frame, sj.Material]:
+    def _streamed(self, path: Path) -> tuple[sj.Frame, sj.Material]:
+        file = sj.SplatFile(path, self.stream, up=self.up)
         material = self.displayable_material()
 
         def parts() -> Iterable[sj.Splats]:

@@ -3,8 +3,7 @@ same command continues.
 """
 
 import os
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,73 +12,83 @@ from jax.extend.backend import clear_backends
 
 from splatjax.io import read_record, write_record
 
-from ._report import note
+from ._report import note, stage
 
 # Variables that hold how many processes a launcher has started; the first that is set counts.
 _COUNTS = "JAX_NUM_PROCESSES", "SLURM_STEP_NUM_TASKS", "OMPI_COMM_WORLD_SIZE"
 
 
-@dataclass(frozen=True)
-class ResumableFolder:
-    """The files of a command, and beside them a record of what they are made of.
+def complete(
+    record_path: Path,
+    record: Mapping[str, Any],
+    items: Sequence[tuple[Path, ...]],
+    prepare: Callable[[], Callable[[int], None]],
+    *,
+    name: str,
+    what: str,
+) -> Sequence[int]:
+    """Make the missing items that are this process's. All processes wait until each has seen the
+    same ones missing.
 
-    **Attributes:**
+    **Arguments:**
 
     - `record_path`: of the record, in the folder of the files.
     - `record`: what the files depend on.
     - `items`: the files of each item.
-    - `what`: the items, as a message calls them.
+    - `prepare`: called where an item is missing; returns the function that makes item i.
+    - `name`: of the items, in messages.
+    - `what`: is done, for the message.
+
+    **Returns:** all items; where other processes are still at work, those of this one.
+
+    **Raises:** `ValueError` when the folder holds files that are made of something else.
     """
+    _check_record(record_path, record, items)
+    missing, folder = _missing(items), record_path.parent
+    if len(missing) < len(items):
+        note(f"{len(items) - len(missing)} of {len(items)} {name} are there already, and are kept")
+    index, processes = process_index_and_count()
+    own = missing[index::processes]
+    if own:
+        make = prepare()
+        folder.mkdir(exist_ok=True)
+        write_record(record_path, record)
+        try:
+            with stage(what, len(own)) as report:
+                for number, i in enumerate(own, 1):
+                    make(i)
+                    report(number)
+        except (KeyboardInterrupt, OSError):
+            note(f"the {name} in {folder} are whole; run the same command again to continue")
+            raise
+    left = _missing(items)
+    if left and folder.exists():
+        note(
+            f"other processes are still at work on {len(left)} {name}; the last of them joins all, "
+            "or the same command does when it is run again"
+        )
+    return own if left else range(len(items))
 
-    record_path: Path
-    record: Mapping[str, Any]
-    items: Sequence[tuple[Path, ...]]
-    what: str
 
-    def check(self) -> None:
-        """Raise `ValueError` when the folder holds files that are made of something else."""
-        path, remedy = self.record_path, "name another --output, or delete that folder"
-        if not path.exists():
-            files = [file for item in self.items for file in item if file.exists()]
-            if files:
-                raise ValueError(f"{files[0]}: has no record of what it is made of; {remedy}")
-            return
-        old, new = read_record(path), self.record
-        changes = [
-            f"{name} is {new.get(name)}, but was {old.get(name)}"
-            for name in sorted(old.keys() | new.keys())
-            if old.get(name) != new.get(name)
-        ]
-        if changes:
-            raise ValueError(f"{path}: the files beside it differ: {'; '.join(changes)}; {remedy}")
+def _missing(items: Sequence[tuple[Path, ...]]) -> list[int]:
+    return [i for i, files in enumerate(items) if not all(file.exists() for file in files)]
 
-    def missing(self) -> list[int]:
-        """Return the items that have yet to be made."""
-        return [i for i, item in enumerate(self.items) if not all(file.exists() for file in item)]
 
-    def own_missing(self) -> list[int]:
-        """Return the missing items that are this process's to make. All processes wait here until
-        each has seen the same ones missing.
-        """
-        missing, count = self.missing(), len(self.items)
-        if len(missing) < count:
-            note(f"{count - len(missing)} of {count} {self.what} are there already, and are kept")
-        index, processes = process_index_and_count()
-        return missing[index::processes]
-
-    def begin(self) -> None:
-        """Make the folder, and write the record."""
-        self.record_path.parent.mkdir(exist_ok=True)
-        write_record(self.record_path, self.record)
-
-    def is_complete(self) -> bool:
-        """Return whether all items are there; if not, other processes are still at work."""
-        if missing := self.missing():
-            note(
-                f"other processes are still at work on {len(missing)} {self.what}; the last of "
-                "them joins all, or the same command does when it is run again"
-            )
-        return not missing
+def _check_record(path: Path, record: Mapping[str, Any], items: Sequence[tuple[Path, ...]]) -> None:
+    remedy = "name another --output, or delete that folder"
+    if not path.exists():
+        files = [file for item in items for file in item if file.exists()]
+        if files:
+            raise ValueError(f"{files[0]}: has no record of what it is made of; {remedy}")
+        return
+    before = read_record(path)
+    changes = [
+        f"{name} is {record.get(name)}, but was {before.get(name)}"
+        for name in sorted(before.keys() | record.keys())
+        if before.get(name) != record.get(name)
+    ]
+    if changes:
+        raise ValueError(f"{path}: the files beside it differ: {'; '.join(changes)}; {remedy}")
 
 
 def process_index_and_count() -> tuple[int, int]:
@@ -91,14 +100,14 @@ def process_index_and_count() -> tuple[int, int]:
 
     **Raises:** `ValueError` when the environment names several processes, and not which this is.
     """
-    counts = [count for name in _COUNTS if (count := _number(name, least=1)) is not None]
-    if not counts or counts[0] == 1:
+    counts = [os.environ[name] for name in _COUNTS if name in os.environ]
+    if not counts or counts[0] in ("0", "1"):
         return 0, 1
+    names = {"num_processes": "JAX_NUM_PROCESSES", "process_id": "JAX_PROCESS_ID"}
+    given = {key: os.environ[name] for key, name in names.items() if name in os.environ}
     try:
-        jax.distributed.initialize(
-            num_processes=_number("JAX_NUM_PROCESSES", least=1),
-            process_id=_number("JAX_PROCESS_ID", least=0),
-        )
+        numbers: dict[str, Any] = {key: int(number) for key, number in given.items()}
+        jax.distributed.initialize(**numbers)
     except (ValueError, TypeError) as error:
         raise ValueError(
             f"several processes were started, but not all of them is known: {error} Set "
@@ -109,10 +118,3 @@ def process_index_and_count() -> tuple[int, int]:
     jax.distributed.shutdown()
     clear_backends()
     return place
-
-
-def _number(name: str, least: int) -> int | None:
-    given = os.environ.get(name)
-    if given is not None and not (given.isdecimal() and int(given) >= least):
-        raise ValueError(f"{name} is {given!r}; it must be a whole number, {least} or more")
-    return None if given is None else int(given)

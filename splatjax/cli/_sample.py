@@ -2,19 +2,25 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import tyro
 
 import splatjax as sj
 
-from ._mesh_maps import MeshMaps
-from ._options import UpAxis, check_output
+from ._options import OptionalFloat, OptionalPath, UpAxis, check_output
 from ._report import note, stage
+
+_V_UP = (
+    "Whether v = 0 is the lower edge of a map. Without it, as the format prescribes: OBJ yes, glTF "
+    "and GLB no. If lips land on "
+    "the chin, say True."
+)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sample(MeshMaps):
+class Sample:
     """Cover a mesh with splats that carry its maps, and write them as PLY, in mm.
 
     The mesh is a GLB, glTF, OBJ, PLY, STL or OFF file.
@@ -41,35 +47,34 @@ class Sample(MeshMaps):
     #: Degrees: edges are hard where triangles differ by more, and the file has no normals or
     #: smooth ones.
     crease_angle: float = 40.0
+    #: Map of the mesh's diffuse color, sRGB. Without it, the texture that the file itself carries,
+    #: if any.
+    albedo: OptionalPath = None
+    #: Gray map: factor on the material's specular strength.
+    specular: OptionalPath = None
+    #: Tangent-space normal map; green points up.
+    normal: OptionalPath = None
+    v_up: Annotated[
+        bool | None, tyro.conf.arg(metavar="{True,False}", help=_V_UP, help_behavior_hint="")
+    ] = None
+    #: Cut off what lies below this height, in the file's unit.
+    crop_min_y: OptionalFloat = None
 
     def run(self) -> None:
         """Read, sample, write."""
         check_output(self.output, (".ply",))
+        placed = ("mesh", "count", "output")
+        options = {name: value for name, value in vars(self).items() if name not in placed}
         with stage(f"sampling {self.mesh} with {self.count} splats"):
-            splats = sj.sample_mesh(
-                self.mesh,
-                self.count,
-                mm_per_unit=self.mm_per_unit,
-                seed=self.seed,
-                rounded=self.rounded,
-                up=self.up,
-                crease_angle=self.crease_angle,
-                **self.worn(),
-            )
+            splats = sj.sample_mesh(self.mesh, self.count, **options)
         with stage(f"writing {self.output}"):
             sj.write_splats(self.output, splats)
-        carried = [
-            name
-            for name in ("albedo", "specular", "roughness")
-            if getattr(splats, name) is not None
-        ]
+        maps = ("albedo", "specular", "roughness")
+        carried = [name for name in maps if getattr(splats, name) is not None]
         size = np.ptp(np.asarray(splats.centers), axis=0)
-        area = float(splats.areas.sum())
-        covered = (
-            f"{splats.count} splats on {area:.4g} mm^2, with {', '.join(carried) or 'no maps'}"
-        )
         note(
-            f"{covered}; the body is {size[0]:.3g} mm wide, {size[1]:.3g} high and {size[2]:.3g} "
-            "deep"
+            f"{splats.count} splats on {float(splats.areas.sum()):.4g} mm^2, with "
+            f"{', '.join(carried) or 'no maps'}; the body is {size[0]:.3g} mm wide, {size[1]:.3g} "
+            f"high and {size[2]:.3g} deep"
         )
         print(self.output)

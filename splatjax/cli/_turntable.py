@@ -1,6 +1,7 @@
 """`splatjax turntable`: the frames of an animation, continued where it was interrupted."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -12,8 +13,8 @@ import splatjax as sj
 from splatjax.io import fingerprint, material_path, write_animation
 
 from ._options import check_folder
-from ._report import note, stage
-from ._resumable import ResumableFolder
+from ._report import stage
+from ._resumable import complete
 from ._view import ViewOptions, draw
 
 _LARGEST = 16_383  # pixels along a side of a WebP file
@@ -77,19 +78,16 @@ class Turntable(ViewOptions):
         record = self.manifest() | {"contents of --material": material}
         names = [self.output / f"frame_{i:04}" for i in range(self.frames)]
         paths = [(name.with_suffix(".exr"), name.with_suffix(".png")) for name in names]
-        folder = ResumableFolder(self.output / "turntable.json", record, paths, "frames")
-        folder.check()
-        own = folder.own_missing()
-        if own:
-            self._render(own, folder)
-        if not folder.is_complete():
-            print(*(path for i in own for path in paths[i]), sep="\n")
-            return
-        animation = self.output / "turntable.webp"
-        with stage(f"writing {animation}"):
-            pictures = [picture for _, picture in paths]
-            write_animation(animation, pictures, frames_per_second=self.fps)
-        print(*(path for both in paths for path in both), animation, sep="\n")
+        what = f"rendering {self.frames} frames at {self.width} x {self.height}"
+        record_path, prepare = self.output / "turntable.json", lambda: self._prepare(paths)
+        done = complete(record_path, record, paths, prepare, name="frames", what=what)
+        written = [path for i in done for path in paths[i]]
+        if len(done) == self.frames:
+            written.append(self.output / "turntable.webp")
+            with stage(f"writing {written[-1]}"):
+                pictures = [picture for _, picture in paths]
+                write_animation(written[-1], pictures, frames_per_second=self.fps)
+        print(*written, sep="\n")
 
     def azimuths(self, frame: int) -> tuple[float, float]:
         """Return the azimuths of camera and light."""
@@ -99,7 +97,8 @@ class Turntable(ViewOptions):
             self.light_azimuth + (0 if self.turn == "camera" else turned),
         )
 
-    def _render(self, missing: list[int], folder: ResumableFolder) -> None:
+    def _prepare(self, paths: list[tuple[Path, Path]]) -> Callable[[int], None]:
+        """Load and plan; return the function that renders and writes frame i."""
         splats, material = self.load()
         places = [self.azimuths(i) for i in range(self.frames)]
         scenes = [sj.Scene(splats, self.lights(material, *place), material) for place in places]
@@ -107,20 +106,15 @@ class Turntable(ViewOptions):
         # The plan is for all frames, so that an interruption changes none.
         with stage(f"planning {self.frames} frames"):
             plan = sj.make_plan(scenes, cameras)
-        folder.begin()
         light = None
         if self.turn == "camera" and self.fill == 0:
             # No light moves: passes 1 and 4 are the same in every frame.
             with stage("lighting the splats"):
                 light = jax.block_until_ready(sj.illuminate(scenes[0], plan))
-        what = f"rendering {splats.count} splats at {self.width} x {self.height}"
-        try:
-            with stage(what, len(missing)) as report:
-                for number, i in enumerate(missing, 1):
-                    frame = draw(scenes[i], cameras[i], plan, light)
-                    self.write(folder.items[i][0], frame, material)
-                    report(number)
-        except (KeyboardInterrupt, OSError):
-            note(f"the frames in {self.output} are whole; run the same command again to continue")
-            raise
-        self.note_unresolved_layers(frame, material)
+
+        def make(i: int) -> None:
+            frame = draw(scenes[i], cameras[i], plan, light)
+            self.note_unresolved_layers(frame, material)
+            self.write(paths[i][0], frame, material)
+
+        return make

@@ -1,5 +1,6 @@
 """Options that `splatjax render` and `splatjax turntable` share: splats, camera and lights."""
 
+import functools
 import math
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -11,17 +12,18 @@ import numpy as np
 import tyro
 
 import splatjax as sj
-from splatjax._memory import check_memory, free_bytes
-from splatjax.io import fingerprint, material_path, own_version
+from splatjax._memory import check_memory
+from splatjax.io import fingerprint, material_path
 from splatjax.render import check_displayable
 from splatjax.scene import Parts
 
-from ._options import MaterialName, Rules, UpAxis, check_options, option_name
+from ._options import Rules, UpAxis, check_options, option_name
 from ._report import note, stage
 
 # Degrees: the fill stands beside the camera, on the side away from the light.
 _FILL_SIDE, _FILL_ELEVATION = 25.0, 10.0
 _NOT_IN_PICTURES = ("splats", "output", "fps")
+_note_once = functools.cache(note)
 # Lower bounds of the memory needed: what does not fit by these does not fit.
 _BYTES_PER_SPLAT, _BYTES_PER_PIXEL = 1000.0, 500.0
 
@@ -37,7 +39,7 @@ class ViewOptions:
     #: The file or folder to write.
     output: Path
     #: Name of a material (`splatjax materials`), or path of a TOML file.
-    material: MaterialName = "skin"
+    material: Annotated[str, tyro.conf.arg(metavar="MATERIAL")] = "skin"
     #: Width of the picture, pixels.
     width: int = 512
     #: Height of the picture, pixels.
@@ -92,12 +94,12 @@ class ViewOptions:
             ),
         }
         check_options(self, rules | (more_rules or {}))
-        if self.splats is None:
-            most = f"take {free_bytes() / _BYTES_PER_SPLAT:.0f} at most"
-            check_memory(f"--count {self.count}", _BYTES_PER_SPLAT * self.count, most)
-        size = f"--width {self.width} --height {self.height}"
-        most = f"take {free_bytes() / _BYTES_PER_PIXEL:.0f} pixels at most"
-        check_memory(size, _BYTES_PER_PIXEL * self.width * self.height, most)
+        count = 0 if self.splats else self.count
+        check_memory(
+            f"--width {self.width} --height {self.height}{f' --count {count}' if count else ''}",
+            _BYTES_PER_SPLAT * count + _BYTES_PER_PIXEL * self.width * self.height,
+            "take fewer pixels or splats",
+        )
 
     def load(self) -> tuple[sj.Splats, sj.Material]:
         """Return the splats, and the material with which they are rendered."""
@@ -166,10 +168,8 @@ class ViewOptions:
         radius = float(max(np.max(reach) for reach in reaches))
         narrower = min(1.0, self.width / self.height)
         half_angle = math.atan(math.tan(math.radians(self.fov) / 2) * narrower)
-        target = jnp.asarray(middle)
-        away = direction_to(azimuth, self.elevation).astype(target.dtype)
-        eye = target + radius / math.sin(half_angle) * away
-        return sj.Camera.look_at(eye, target, fov=self.fov, width=self.width, height=self.height)
+        eye = middle + radius / math.sin(half_angle) * direction_to(azimuth, self.elevation)
+        return sj.Camera.look_at(eye, middle, fov=self.fov, width=self.width, height=self.height)
 
     def write(self, path: Path, frame: sj.Frame, material: sj.Material) -> tuple[Path, Path]:
         """Write the picture with all its layers, and the PNG file beside it; return both paths."""
@@ -191,7 +191,7 @@ class ViewOptions:
             "splats": splats or "the built-in bust",
             "contents of --material": material,
             "precision": str(jnp.result_type(float)),
-            "splatjax": own_version(),
+            "splatjax": sj.__version__,
             "jax": jax.__version__,
         }
 
@@ -200,7 +200,7 @@ class ViewOptions:
         unresolved = np.asarray(frame.unresolved_fraction) > 0.5
         widths = np.sqrt(np.asarray(material.gaussians.variances))[unresolved]
         if self.scattering and len(widths):
-            note(
+            _note_once(
                 "narrower than the splats, so that the surface's own light stands for them: "
                 f"Gaussians of standard deviations {', '.join(f'{w:.3g}' for w in widths)} mm; "
                 "more splats show them, or a smaller body (--scale)"
@@ -232,10 +232,8 @@ def in_color(material: sj.Material) -> sj.Material:
     return replace(material, gaussians=gaussians, single_scattering=single)
 
 
-def direction_to(azimuth: float, elevation: float) -> jax.Array:
+def direction_to(azimuth: float, elevation: float) -> np.ndarray:
     """Return the unit vector from the middle towards a place on the sky, given in degrees."""
     azimuth, elevation = math.radians(azimuth), math.radians(elevation)
     across = math.cos(elevation)
-    return jnp.asarray(
-        [math.sin(azimuth) * across, math.sin(elevation), math.cos(azimuth) * across], float
-    )
+    return np.asarray([math.sin(azimuth) * across, math.sin(elevation), math.cos(azimuth) * across])

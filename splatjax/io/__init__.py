@@ -1,11 +1,14 @@
 """The only package that touches files: splats, meshes, pictures, materials."""
 
-from splatjax._memory import check_memory as check_memory, free_bytes as free_bytes
-
-from ._atomic import atomic_path as atomic_path
-from ._images import linear_to_srgb as linear_to_srgb, srgb_to_linear as srgb_to_linear
+from ._files import atomic_path as atomic_path
 from ._exr import read_exr as read_exr, read_manifest as read_manifest, write_exr as write_exr
-from ._images import read_picture as read_picture
+from ._images import (
+    linear_to_srgb as linear_to_srgb,
+    read_picture as read_picture,
+    srgb_to_linear as srgb_to_linear,
+    write_animation as write_animation,
+    write_png as write_png,
+)
 from ._materials import (
     dipole_starts as dipole_starts,
     list_materials as list_materials,
@@ -18,21 +21,21 @@ from ._materials import (
     surface_and_source as surface_and_source,
 )
 from ._profiles import (
-    join_tables as join_tables,
-    read_column as read_column,
+    read_columns as read_columns,
     read_media as read_media,
     read_profile as read_profile,
     write_columns as write_columns,
 )
 from ._meshes import read_textured_mesh as read_textured_mesh, sample_mesh as sample_mesh
 from ._observations import picture_paths as picture_paths, read_observations as read_observations
-from ._ply import read_splats as read_splats, write_splats as write_splats
-from ._screen import write_animation as write_animation, write_png as write_png
+from ._ply import (
+    SplatFile as SplatFile,
+    read_splats as read_splats,
+    write_splats as write_splats,
+)
 from ._record import (
     fingerprint as fingerprint,
-    own_version as own_version,
     read_record as read_record,
     save_exports as save_exports,
     write_record as write_record,
 )
-from ._splat_file import SplatFile as SplatFile

@@ -12,10 +12,8 @@ import OpenEXR  # ty: ignore[import-not-found]
 
 from splatjax.scene import Frame
 
-from ._atomic import atomic_path
-from ._files import naming
+from ._files import atomic_path, naming
 from ._images import read_planes
-from ._record import own_version
 
 _REC709_D65 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 _WEIGHTS, _VARIANCES, _MANIFEST = "splatjax.weights.", "splatjax.variances", "splatjax.manifest"
@@ -50,22 +48,23 @@ def write_exr(
 
     **Raises:** `FileNotFoundError` when the folder does not exist.
     """
+    from splatjax import __version__  # known when the whole package is imported
+
     gaussians, channels = frame.weights.shape
     header: dict[str, Any] = {
         "compression": OpenEXR.ZIP_COMPRESSION,
         "type": OpenEXR.scanlineimage,
-        "software": f"splatjax {own_version()}",
+        "software": f"splatjax {__version__}",
         "comments": (
             "Linear light. Depth and position in mm; depth, position and normal are "
             "not premultiplied."
         ),
         "splatjax.unresolved_fraction": _floats(frame.unresolved_fraction),
         "splatjax.overflow": float(frame.overflow),
+        **{f"{_WEIGHTS}{k}": _floats(row) for k, row in enumerate(np.asarray(frame.weights), 1)},
     }
     if channels == 3:
         header |= {"chromaticities": _REC709_D65, "colorInteropID": "lin_rec709_scene"}
-    weights = np.asarray(frame.weights)
-    header |= {f"{_WEIGHTS}{k}": _floats(row) for k, row in enumerate(weights, 1)}
     if variances is not None:
         header[_VARIANCES] = _floats(variances)
     if manifest is not None:
@@ -97,14 +96,13 @@ def read_exr(path: str | os.PathLike[str]) -> Frame:
     gaussians = sum(name.startswith(_WEIGHTS) for name in header)
     lights = sum(name.startswith("shadow.") for name in planes)
     has_single = any(name.startswith(_SINGLE) for name in planes)
-    arrays: dict[str, np.ndarray] = {}
     try:
         weights = [header[f"{_WEIGHTS}{k}"] for k in range(1, gaussians + 1)]
-        arrays["weights"] = np.reshape(weights, (gaussians, channels))
-        arrays["unresolved_fraction"] = np.reshape(
-            header["splatjax.unresolved_fraction"], gaussians
-        )
-        arrays["overflow"] = np.reshape(header["splatjax.overflow"], ())
+        arrays = {
+            "weights": np.reshape(weights, (gaussians, channels)),
+            "unresolved_fraction": np.reshape(header["splatjax.unresolved_fraction"], gaussians),
+            "overflow": np.reshape(header["splatjax.overflow"], ()),
+        }
         for field, names in _layout(channels, lights, gaussians, has_single).items():
             values = np.asarray([planes[name] for name in names.ravel()])
             values = values.reshape(*names.shape, *planes["A"].shape)

@@ -1,9 +1,12 @@
-"""What is checked before a file is opened: that it exists, and has a unit."""
+"""What is checked before a file is opened: that it exists, and has a unit; and files that are
+written whole or not at all.
+"""
 
 import math
 import os
+import secrets
 from collections.abc import Generator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
@@ -46,3 +49,41 @@ def check_units(path: Path, mm_per_unit: float, up: str = "y") -> None:
 def with_y_up(vectors: Float[np.ndarray, "n 3"], up: str) -> Float[np.ndarray, "n 3"]:
     """Turn vectors of a file by a quarter around x, so that its upward axis becomes +y."""
     return vectors if up == "y" else vectors[:, [0, 2, 1]] * [1, 1, -1]
+
+
+@contextmanager
+def atomic_path(path: str | os.PathLike[str]) -> Generator[Path, None, None]:
+    """Yield a temporary path beside `path`, with its suffix, to write to; it takes the name `path`
+    when the block ends well.
+
+    When the block raises, the temporary file is removed and what stood at `path` before is
+    untouched. Only a process that is killed leaves it behind.
+
+    **Raises:** `FileNotFoundError` when the folder does not exist, another `OSError` that names
+    `path` when it cannot be written, such as `IsADirectoryError`.
+    """
+    path = Path(path)
+    folder = path.parent
+    if not folder.is_dir():
+        raise FileNotFoundError(
+            f"{path}: there is no folder {folder}; make it first, or name another"
+        )
+    temporary = folder / f".{path.stem}-{secrets.token_hex(8)}{path.suffix}"
+    try:
+        temporary.touch(exist_ok=False)
+        yield temporary
+        with open(temporary, "rb") as file:
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except OSError as error:
+        if error.filename not in (None, str(temporary), temporary):
+            raise
+        reason = error.strerror or " ".join(str(error).split())
+        raise type(error)(
+            error.errno,
+            f"cannot be written: {reason}; what stood there before is untouched",
+            str(path),
+        ) from error
+    finally:
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)

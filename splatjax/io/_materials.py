@@ -11,7 +11,9 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 import tomli_w
+from jaxtyping import Array
 
+from splatjax._records import check_values
 from splatjax.exports import plain_numbers
 from splatjax.fitting import DipoleStarts
 from splatjax.gaussians import AbstractProfile, SumOfGaussians
@@ -28,23 +30,13 @@ from splatjax.scattering import (
 )
 from splatjax.scene import Material
 
-from ._atomic import atomic_path
-from ._files import naming
-from ._tables import AT_LEAST_0, FINITE, POSITIVE, Rule, Table, nearest, read_toml
+from ._files import atomic_path, naming
+from ._tables import Table, nearest, read_toml
 
 COEFFICIENT_UNIT, VARIANCE_UNIT, THICKNESS_UNIT = "1/mm", "mm^2", "mm"
 _COEFFICIENTS = ("unit", "sigma_a", "sigma_s_prime", "eta")
 _TABLES = ("medium", "layers", "surface", "single_scattering", "source", "fit")
-_SURFACE = {
-    "eta": POSITIVE,
-    "specular": AT_LEAST_0,
-    "roughness": ("in (0, 1]", lambda x: (x > 0) & (x <= 1)),
-}
-_ASCENDING: Rule = (
-    "positive, finite and ascending",
-    lambda x: POSITIVE[1](x).all() and (np.diff(x) > 0).all(),
-)
-_THICKNESS: Rule = ("positive (mm), or inf", lambda x: x > 0)
+_SURFACE = ("eta", "specular", "roughness")
 _LAYER = (*_COEFFICIENTS, "optical_depth", "thickness", "thickness_unit")
 _MODELS: dict[type, str] = {
     Dipole: "classical dipole",
@@ -53,7 +45,6 @@ _MODELS: dict[type, str] = {
     LayeredMultipole: "multipole",
 }
 """What [fit] calls a profile whose coefficients the file holds."""
-_DEFAULT_SURFACE = {"eta": 1.4, "specular": 0.18, "roughness": 0.3}
 
 
 def profiles_folder() -> Path:
@@ -107,20 +98,22 @@ def load_material(name_or_path: str | os.PathLike[str]) -> Material:
         )
     fit = tables.table("fit", tables.entries["fit"])
     fit.one_of("unit", [VARIANCE_UNIT])
-    variances = fit.numbers("variances", _ASCENDING, (None,))
-    weights = fit.numbers("weights", FINITE, (len(variances), None))
+    gaussians = fit.make(SumOfGaussians, fit.numbers("variances"), fit.numbers("weights"))
+    steps, requirement = np.diff(gaussians.variances), "positive: variances ascend"
+    fit.make(check_values, "the steps of variances", steps, requirement, lambda x: x > 0)
     single = None
     if "single_scattering" in tables.entries:
         table = tables.table("single_scattering", (*_COEFFICIENTS, "strength"))
-        strength = table.numbers("strength", AT_LEAST_0, weights.shape[1:], 1.0)
-        single = SingleScattering(_medium(table, weights.shape[1]), strength)
-    surface = _DEFAULT_SURFACE | _surface(tables)
-    return Material(SumOfGaussians(variances, weights), **surface, single_scattering=single)
+        single = table.make(SingleScattering, _medium(table), table.numbers("strength", 1.0))
+        _check_channels(
+            tables, "[fit] and [single_scattering]", gaussians.channels, single.channels
+        )
+    return Material(gaussians, **_surface(tables), single_scattering=single)
 
 
 def surface_and_source(
     name_or_path: str | os.PathLike[str],
-) -> tuple[dict[str, float], dict[str, Any]]:
+) -> tuple[dict[str, Array], dict[str, Any]]:
     r"""Return what a file says of a material besides its coefficients: its surface, as `Material`
     takes it, and its [source].
 
@@ -196,20 +189,22 @@ def save_material(
         tables["layers"] = [_plain_layer(layer) for layer in profile.layers]
     elif profile is not None:
         tables["medium"] = _plain_medium(profile.medium)
-    tables["surface"] = {name: plain_numbers(getattr(material, name)) for name in _SURFACE}
     single, gaussians = material.single_scattering, material.gaussians
     if single is not None:
         strength = {"strength": plain_numbers(single.strength)}
         tables["single_scattering"] = _plain_medium(single.medium) | strength
-    tables["source"] = dict(source or {})
-    tables["fit"] = {
-        "unit": VARIANCE_UNIT,
-        "variances": plain_numbers(gaussians.variances),
-        "weights": plain_numbers(gaussians.weights),
-        **({} if profile is None else {"profile": _description(profile)}),
-        **{
-            name: value if isinstance(value, str | int | float) else plain_numbers(value)
-            for name, value in (fit or {}).items()
+    tables |= {
+        "surface": {name: plain_numbers(getattr(material, name)) for name in _SURFACE},
+        "source": dict(source or {}),
+        "fit": {
+            "unit": VARIANCE_UNIT,
+            "variances": plain_numbers(gaussians.variances),
+            "weights": plain_numbers(gaussians.weights),
+            **({} if profile is None else {"profile": _description(profile)}),
+            **{
+                name: value if isinstance(value, str | int | float) else plain_numbers(value)
+                for name, value in (fit or {}).items()
+            },
         },
     }
     number = r"-?(?:[\d.]+(?:e[+-]?\d+)?|inf|nan)"  # arrays of numbers on one line
@@ -225,52 +220,63 @@ def save_material(
 def _read(name_or_path: str | os.PathLike[str]) -> tuple[Table, Dipole | LayeredMultipole | None]:
     """Read and check all tables of a material, and its coefficients."""
     path = material_path(name_or_path)
-    entries = read_toml(path, "check the path, or name a material (`list_materials()`)")
-    tables = Table(path, "", entries, _TABLES)
-    kinds = {"medium", "layers"} & entries.keys()
-    if len(kinds) > 1 or not (kinds or "fit" in entries):
+    tables = Table(
+        path,
+        "",
+        read_toml(path, "check the path, or name a material (`list_materials()`)"),
+        _TABLES,
+    )
+    kinds = {"medium", "layers"} & tables.entries.keys()
+    if len(kinds) > 1 or not (kinds or "fit" in tables.entries):
         has = "both [medium] and [[layers]]" if kinds else "no [medium], [[layers]] or [fit]"
         raise ValueError(f"{path}: has {has}; a material has one of them")
     _surface(tables)
-    if "medium" in entries:
+    if "medium" in kinds:
         return tables, Dipole(_medium(tables.table("medium", (*_COEFFICIENTS, "sigma_s"))))
-    layers = [_layer(each) for each in tables.tables("layers", _LAYER)] if kinds else []
-    counts = {(x.optical_depth if isinstance(x, Film) else x.medium.eta).size for x in layers}
-    if len(counts) > 1:
-        raise ValueError(
-            f"{path}: [[layers]] have {sorted(counts)} channels; give one count to all"
-        )
+    if not kinds:
+        return tables, None
+    layers = [_layer(each) for each in tables.tables("layers", _LAYER)]
+    counts = [x.optical_depth.size if isinstance(x, Film) else x.channels for x in layers]
+    _check_channels(tables, "[[layers]]", *counts)
     with naming(f"{path}: [[layers]]"):
-        return tables, LayeredMultipole(layers) if layers else None
+        return tables, LayeredMultipole(layers)
 
 
-def _surface(tables: Table) -> dict[str, float]:
+def _surface(tables: Table) -> dict[str, Array]:
     if "surface" not in tables.entries:
         return {}
-    surface = tables.table("surface", _SURFACE)
-    return {name: float(surface.numbers(name, _SURFACE[name], ())) for name in surface.entries}
+    table = tables.table("surface", _SURFACE)
+    surface = {name: table.numbers(name) for name in table.entries}
+    table.make(Material, SumOfGaussians([1.0], [[1.0]]), **surface)  # checks them
+    roughness, requirement = surface.get("roughness"), "in (0, 1]"
+    table.make(check_values, "roughness", roughness, requirement, lambda x: (x > 0) & (x <= 1))
+    return surface
 
 
 def _layer(table: Table) -> Layer | Film:
     if "optical_depth" in table.entries:
-        return Film(table.numbers("optical_depth", AT_LEAST_0, (None,)))
+        return table.make(Film, table.numbers("optical_depth"))
     table.one_of("thickness_unit", [THICKNESS_UNIT])
-    layer = Layer(_medium(table), table.numbers("thickness", _THICKNESS, ()))
-    with naming(table.where):
-        layer.check_diffusion()
+    layer = table.make(Layer, _medium(table), table.numbers("thickness"))
+    table.make(layer.check_diffusion)
     return layer
 
 
-def _medium(table: Table, channels: int | None = None) -> Medium:
+def _medium(table: Table) -> Medium:
     if "sigma_s" in table.entries:
         raise ValueError(
             f"{table.where} has sigma_s = {table.entries['sigma_s']}; give sigma_s_prime = (1 - g) "
             "sigma_s, with the mean cosine g"
         )
     table.one_of("unit", [COEFFICIENT_UNIT])
-    sigma_a = table.numbers("sigma_a", AT_LEAST_0, (channels,))
-    sigma_s_prime = table.numbers("sigma_s_prime", POSITIVE, sigma_a.shape)
-    return Medium(sigma_a, sigma_s_prime, table.numbers("eta", POSITIVE, sigma_a.shape))
+    return table.make(Medium, *(table.numbers(name) for name in _COEFFICIENTS[1:]))
+
+
+def _check_channels(tables: Table, names: str, *counts: int) -> None:
+    if len(set(counts)) > 1:
+        raise ValueError(
+            f"{tables.where} {names} have {sorted(set(counts))} channels; give one count to all"
+        )
 
 
 def _description(profile: Dipole | BetterDipole | PhotonBeam | LayeredMultipole) -> str:

@@ -1,18 +1,20 @@
 """Pictures that were taken, and how: a TOML file that names them, with cameras and lights."""
 
 import os
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
+from splatjax._records import check_values
 from splatjax.inverse import KnownIntensity, Observation, UnknownColor, UnknownIntensity
 from splatjax.scene import AbstractLight, Camera, DirectionalLight, GaussianBeam, PointLight
 
 from ._files import naming
 from ._images import read_picture
-from ._tables import AT_LEAST_0, FINITE, POSITIVE, Rule, Table, read_toml
+from ._tables import Table, read_toml
 
 _INTENSITIES = {"known": KnownIntensity, "unknown": UnknownIntensity, "unknown color": UnknownColor}
 _ENTRIES = ("file", "mask", "noise", "intensity", "camera", "lights")
@@ -22,10 +24,7 @@ _LIGHTS = {
     "point": (PointLight, ("position", "intensity", "cast_shadows")),
     "beam": (GaussianBeam, ("origin", "direction", "power", "variance")),
 }
-_DIRECTION: Rule = ("finite, not all 0", lambda x: np.isfinite(x).all() and np.any(x))
 _LIGHT_ENTRIES = {"kind"}.union(*(names for _, names in _LIGHTS.values()))
-_VECTORS = {"direction": _DIRECTION, "position": FINITE, "origin": FINITE}
-_FOV: Rule = ("between 0 and 180 (degrees)", lambda x: (x > 0) & (x < 180))
 
 
 def read_observations(path: str | os.PathLike[str]) -> list[Observation]:
@@ -67,30 +66,30 @@ def picture_paths(path: str | os.PathLike[str]) -> list[Path]:
 
 def _observation(table: Table) -> Observation:
     picture = _picture(table, "file")
-    height, width, channels = picture.shape
     mask = deviation = None
     if "mask" in table.entries:
         mask = np.any(_picture(table, "mask") > 0, axis=-1)
     if "noise" in table.entries:
+        noise = table.numbers("noise")
+        table.make(check_values, "noise", noise, "positive", lambda x: x > 0)
         known = np.all(np.isfinite(picture), axis=-1)
         known &= True if mask is None or mask.shape != known.shape else mask
         size = np.sqrt(np.mean(np.square(picture[known]))) if known.any() else 0.0
-        deviation = jnp.full(picture.shape, table.numbers("noise", POSITIVE, ()) * (size or 1.0))
-    given = table.table("camera", _CAMERA)
-    view: dict[str, Any] = {
-        name: given.numbers(name, FINITE, (3,), fill=False)
-        for name in ("position", "target", "up")
-        if name != "up" or name in given.entries
-    }
-    view["fov"] = float(given.numbers("fov", _FOV, (), 25.0))
-    with naming(given.where):
-        camera = Camera.look_at(
-            view.pop("position"), view.pop("target"), **view, width=width, height=height
-        )
-    lights = tuple(_light(each, channels) for each in table.tables("lights", _LIGHT_ENTRIES))
-    intensity = _INTENSITIES[table.one_of("intensity", _INTENSITIES, "known")]()
-    with naming(table.where):
-        return Observation(jnp.asarray(picture, float), camera, lights, mask, deviation, intensity)
+        deviation = noise * (size or 1.0)
+    camera = table.table("camera", _CAMERA)
+    vectors = [camera.numbers(name).tolist() for name in ("position", "target")]
+    up = camera.numbers("up").tolist() if "up" in camera.entries else None
+    height, width, channels = picture.shape
+    look_at = partial(Camera.look_at, up=up, fov=camera.number("fov", 25.0))
+    return table.make(
+        Observation,
+        jnp.asarray(picture, float),
+        camera.make(look_at, *vectors, width=width, height=height),
+        tuple(_light(each, channels) for each in table.tables("lights", _LIGHT_ENTRIES)),
+        mask,
+        deviation,
+        _INTENSITIES[table.one_of("intensity", _INTENSITIES, "known")](),
+    )
 
 
 def _picture(table: Table, name: str) -> np.ndarray:
@@ -103,13 +102,15 @@ def _picture(table: Table, name: str) -> np.ndarray:
 
 def _light(table: Table, channels: int) -> AbstractLight:
     light, names = _LIGHTS[table.one_of("kind", _LIGHTS)]
-    table, values = Table(table.path, table.name, table.entries, ("kind", *names)), {}
-    for name in names:
-        if name == "cast_shadows":
-            values[name] = table.one_of(name, (True, False), True)
-        elif name in _VECTORS:
-            values[name] = table.numbers(name, _VECTORS[name], (3,), fill=False)
-        else:
-            shape = () if name == "variance" else (channels,)
-            values[name] = table.numbers(name, AT_LEAST_0, shape)
-    return light(**values)
+    table = Table(table.path, table.name, table.entries, ("kind", *names))
+    values: dict[str, Any] = {name: table.numbers(name) for name in names if name != "cast_shadows"}
+    strength = values[light.strength]
+    table.make(check_values, light.strength, strength, "at least 0", lambda x: x >= 0)
+    if strength.size not in (1, channels):
+        raise ValueError(
+            f"{table.where} {light.strength} is {strength.tolist()}, for a picture of {channels} "
+            "channels; give one number, or one for each channel"
+        )
+    if "cast_shadows" in names:
+        values["cast_shadows"] = table.one_of("cast_shadows", (True, False), True)
+    return table.make(light, **values).with_channels(channels)

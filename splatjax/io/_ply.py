@@ -1,8 +1,8 @@
-"""Splats in PLY files."""
+"""Splats in PLY files, read at once or, of files that are larger than memory, a part at a time."""
 
 import os
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +13,7 @@ from jaxtyping import Float
 from splatjax.geometry import complete_splats, unit
 from splatjax.scene import Splats
 
-from ._atomic import atomic_path
-from ._files import check_units, existing_file, naming, with_y_up
+from ._files import atomic_path, check_units, existing_file, naming, with_y_up
 from ._images import srgb_to_linear
 from ._trimesh import FORMATS, load_with_trimesh, one_sentence
 
@@ -23,8 +22,12 @@ _COVER = (
     "cover it with splats first: `splatjax sample {} --mm-per-unit ... --output ...`, or "
     "sample_mesh"
 )
+_COMPLETE = (
+    "complete the file first: splatjax.write_splats(complete, splatjax.read_splats(path)) "
+    "estimates normals, radii and areas, and `splatjax sample` of a mesh writes them"
+)
 _GAUSSIAN_SPLATTING = {"f_dc_0", "scale_0", "rot_0"}
-COLUMNS = {
+_COLUMNS = {
     "centers": [("x", "y", "z")],
     "normals": [("nx", "ny", "nz")],
     "radii": [("radius",), ("radii",)],
@@ -83,9 +86,9 @@ def read_splats(path: str | os.PathLike[str], *, mm_per_unit: float = 1.0, up: s
         raise ValueError(f"{path}: is a mesh; {_COVER.format(path)}")
     with one_sentence(path):
         columns = load_with_trimesh(path, "ply")["columns"]
-        fields = splat_fields(path, columns.get("vertex", {}), mm_per_unit, up)
+        fields = _splat_fields(path, columns.get("vertex", {}), mm_per_unit, up)
     centers = fields.pop("centers")
-    check_places(path, centers, estimated=fields["radii"] is None or fields["areas"] is None)
+    _check_places(path, centers, estimated=fields["radii"] is None or fields["areas"] is None)
     if fields["radii"] is None and columns.get("face"):
         warnings.warn(
             f"{path}: has faces, and only their corners are taken, as points; "
@@ -106,7 +109,7 @@ def write_splats(path: str | os.PathLike[str], splats: Splats) -> None:
     has not three channels.
     """
     path, names, columns = Path(path), [], []
-    for field, aliases in COLUMNS.items():
+    for field, aliases in _COLUMNS.items():
         values = getattr(splats, field)
         if values is not None:
             table = np.asarray(values, "<f4").reshape(splats.count, -1)
@@ -130,7 +133,87 @@ def write_splats(path: str | os.PathLike[str], splats: Splats) -> None:
         temporary.write_bytes("\n".join(header).encode() + np.hstack(columns).tobytes())
 
 
-def splat_fields(
+class SplatFile:
+    r"""Complete splats in a binary PLY file, read a part at a time: what `splatjax.render_streamed`
+    asks for.
+
+    Their order is that of the file: splats that are near in space should be near in it
+    (`read_splats` sorts, a stream cannot).
+
+    **Arguments:**
+
+    - `path`: a PLY file whose vertices have `x y z`, `nx ny nz`, `radius` and `area`, as
+      `read_splats` reads them, stand first, and have no lists.
+    - `part`: splats of a part; about 1 kB of memory each.
+    - `mm_per_unit`: length of the file's unit, mm.
+    - `up`: the file's upward axis, `"y"` or `"z"`.
+
+    **Raises:** `FileNotFoundError`, or `ValueError` when the file is no binary PLY, is cut short,
+    or lacks one of these.
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        part: int = 1_000_000,
+        *,
+        mm_per_unit: float = 1.0,
+        up: str = "y",
+    ):
+        self.path, self.part, self.mm_per_unit, self.up = existing_file(path), part, mm_per_unit, up
+        check_units(self.path, mm_per_unit, up)
+        if part < 1:
+            raise ValueError(f"{path}: part is {part}; it must be at least one splat")
+        with one_sentence(self.path), open(path, "rb") as file:
+            from trimesh.exchange.ply import _parse_header  # only where it is needed
+
+            elements, is_text, _ = _parse_header(file)
+            name, vertices = next(iter(elements.items()))
+            kinds = vertices["properties"]
+            if is_text or name != "vertex" or any("LIST" in kind for kind in kinds.values()):
+                raise ValueError("its vertices do not stand first, as binary without lists")
+            self.count, self._offset = vertices["length"], file.tell()
+            self._names, self._columns = tuple(kinds), np.dtype(list(kinds.items()))
+            self._rows(0, self.count)  # raises where the file is cut short
+        for field in ("normals", "radii", "areas"):
+            if not any(kinds.keys() >= set(names) for names in _COLUMNS[field]):
+                raise ValueError(
+                    f"{path}: its vertices have no {' '.join(_COLUMNS[field][0])}, which cannot be "
+                    f"estimated part by part; {_COMPLETE}"
+                )
+
+    def __call__(self) -> Iterator[Splats]:
+        """Yield all splats from the beginning, in mm and in JAX's default precision, in parts of
+        one size but the last.
+
+        **Raises:** `ValueError` when numbers are not finite, or not as `read_splats` reads them;
+        how large the whole is turns out at the end.
+        """
+        corners, dtype = [], jnp.result_type(float)
+        for begin in range(0, self.count, self.part):
+            rows = self._rows(begin, min(self.part, self.count - begin))
+            where = self.path.with_name(f"{self.path.name}, from vertex {begin}")
+            columns: dict[str, np.ndarray] = {name: rows[name] for name in self._names}
+            try:
+                fields = _splat_fields(where, columns, self.mm_per_unit, self.up)
+            except ValueError as error:
+                raise ValueError(f"{error}; or {_COMPLETE}") from None
+            corners += [fields["centers"].min(axis=0), fields["centers"].max(axis=0)]
+            arrays: dict[str, Any] = {
+                name: jnp.asarray(values, dtype)
+                for name, values in fields.items()
+                if values is not None
+            }
+            yield Splats(**arrays)
+        _check_places(self.path, np.stack(corners), estimated=False)
+
+    def _rows(self, begin: int, count: int) -> np.memmap:
+        """Map a part alone: pages of a larger map that were read would count as memory."""
+        offset = self._offset + begin * self._columns.itemsize
+        return np.memmap(self.path, self._columns, "r", offset, count)
+
+
+def _splat_fields(
     path: Path, columns: Mapping[str, np.ndarray], mm_per_unit: float, up: str
 ) -> dict[str, Any]:
     """Return the fields of splats that columns hold, in mm and with +y up; `None` for others.
@@ -145,8 +228,8 @@ def splat_fields(
         )
     single = {name: column for name, column in columns.items() if column.dtype.kind in "iuf"}
     single = {name: column for name, column in single.items() if column.ndim == 1}
-    fields: dict[str, Any] = dict.fromkeys(COLUMNS)
-    for field, aliases in COLUMNS.items():
+    fields: dict[str, Any] = dict.fromkeys(_COLUMNS)
+    for field, aliases in _COLUMNS.items():
         names = next((names for names in aliases if single.keys() & set(names)), aliases[0])
         if single.keys() >= set(names):
             scale = mm_per_unit ** _POWERS.get(field, 0)
@@ -162,7 +245,7 @@ def splat_fields(
     return fields
 
 
-def check_places(path: Path, centers: Float[np.ndarray, "n 3"], *, estimated: bool) -> None:
+def _check_places(path: Path, centers: Float[np.ndarray, "n 3"], *, estimated: bool) -> None:
     """Refuse points that lie where numbers of JAX's default precision cannot tell them apart."""
     low, high = centers.min(axis=0), centers.max(axis=0)
     reach, extent = float(np.abs([low, high]).max()), float((high - low).max())

@@ -4,7 +4,7 @@ import csv
 import math
 import os
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -13,9 +13,8 @@ from jaxtyping import Float
 
 from splatjax.scattering import Tabulated
 
-from ._atomic import atomic_path
-from ._files import check_units, naming
-from ._tables import read_rows, rounded
+from ._files import atomic_path, check_units, existing_file, naming
+from ._tables import rounded
 
 _MM = {"mm": 1.0, "cm": 10.0, "um": 1e-3, "µm": 1e-3}
 """Units of length that the names of a table's columns may give."""
@@ -41,26 +40,27 @@ def read_profile(path: str | os.PathLike[str], *, mm_per_unit: float = 1.0) -> T
     is wrong.
     """
     check_units(Path(path), mm_per_unit)
-    rows = read_rows(path, "a profile is a CSV of radii and values")
-    if rows and isinstance(rows[0][1][0], str):
+    rows = _read_rows(path, "a profile is a CSV of radii and values")
+    if rows and _number(rows[0][1][0]) is None:
         (where, names), *rows = rows
         for unit, size in _MM.items():
-            is_named = re.search(rf"(?<![A-Za-z]){unit}(?![A-Za-z])", ",".join(map(str, names)))
+            is_named = re.search(rf"(?<![A-Za-z]){unit}(?![A-Za-z])", ",".join(names))
             if is_named and not math.isclose(size, mm_per_unit, rel_tol=1e-6):
                 raise ValueError(
                     f"{where} gives {unit}, and lengths are taken as {mm_per_unit:g} mm; give "
                     f"mm_per_unit = {size:g} (--mm-per-unit {size:g}), or name the right unit"
                 )
-    for where, cells in rows:
-        are_numbers = all(isinstance(cell, float) and np.isfinite(rounded(cell)) for cell in cells)
-        if not 1 < len(cells) == len(rows[0][1]) or not are_numbers:
-            raise ValueError(
-                f"{where}: {', '.join(map(str, cells))} must be a radius and a value for each of "
-                f"{len(rows[0][1]) - 1} channels"
-            )
     if len(rows) < 2:
         raise ValueError(f"{path}: has {len(rows)} lines of numbers; a profile needs two radii")
-    radii, values = np.split(np.asarray([cells for _, cells in rows]), [1], axis=1)
+    table, count = [], len(rows[0][1])
+    for where, cells in rows:
+        table.append([_number(cell) for cell in cells])
+        if not 1 < len(cells) == count or not np.isfinite(rounded(table[-1])).all():
+            raise ValueError(
+                f"{where}: {', '.join(cells)} must be a radius and a value for each of {count - 1} "
+                "channels"
+            )
+    radii, values = np.split(np.asarray(table), [1], axis=1)
     with naming(path):
         return Tabulated(
             jnp.asarray(radii[:, 0] * mm_per_unit, float),
@@ -81,23 +81,20 @@ def read_media(path: str | os.PathLike[str]) -> tuple[list[str], Float[np.ndarra
     is wrong.
     """
     contents = f"media are a CSV of {', '.join(_COLUMNS)}"
-    (_, head), *rows = read_rows(path, contents) or [("", [])]
+    (_, head), *rows = _read_rows(path, contents) or [("", [])]
     if not set(head) >= set(_COLUMNS) or not rows:
-        raise ValueError(
-            f"{path}: names {', '.join(map(str, head))}, with {len(rows)} rows; {contents}"
-        )
+        raise ValueError(f"{path}: names {', '.join(head)}, with {len(rows)} rows; {contents}")
     names, media = [], []
     for where, cells in rows:
         entries = dict(zip(head, cells, strict=False))
-        values = [v for name in _COLUMNS if isinstance(v := entries.get(name), float)]
-        is_whole = len(cells) == len(head) and len(values) == len(_COLUMNS)
-        if not is_whole or not all(0 < v < math.inf for v in (values[0] or 1.0, *values[1:])):
+        medium = np.asarray([_number(entries.get(name, "")) for name in _COLUMNS], float)
+        is_valid = np.isfinite(medium).all() and medium[0] >= 0 and (medium[1:] > 0).all()
+        if len(cells) != len(head) or not is_valid:
             raise ValueError(
-                f"{where}: {', '.join(map(str, cells))} must be {', '.join(head)}, positive; "
-                "sigma_a may be 0"
+                f"{where}: {', '.join(cells)} must be {', '.join(head)}, positive; sigma_a may be 0"
             )
-        names.append(str(entries.get("name") or len(media) + 1))
-        media.append(values)
+        names.append(entries.get("name") or str(len(media) + 1))
+        media.append(medium)
     return names, np.asarray(media)
 
 
@@ -114,15 +111,32 @@ def write_columns(path: str | os.PathLike[str], columns: Mapping[str, Iterable])
         csv.writer(file, lineterminator="\n").writerows([columns, *zip(*plain, strict=True)])
 
 
-def read_column(path: str | os.PathLike[str], name: str) -> Float[np.ndarray, " rows"]:
-    """Read a column of numbers that `write_columns` has written."""
+def read_columns(path: str | os.PathLike[str]) -> dict[str, tuple[str, ...]]:
+    """Read the cells of a table that `write_columns` has written."""
     with open(path, newline="", encoding="utf-8") as file:
-        return np.asarray([float(row[name]) for row in csv.DictReader(file)])
+        head, *rows = csv.reader(file)
+    return dict(zip(head, zip(*rows, strict=True), strict=True))
 
 
-def join_tables(path: str | os.PathLike[str], parts: Sequence[Path]) -> None:
-    """Write tables with the same columns as one, in their order, whole or not at all."""
-    with atomic_path(path) as temporary, open(temporary, "w", encoding="utf-8") as file:
-        for i, part in enumerate(parts):
-            head, rows = part.read_text(encoding="utf-8").split("\n", 1)
-            file.write(rows if i else f"{head}\n{rows}")
+def _read_rows(path: str | os.PathLike[str], contents: str) -> list[tuple[str, list[str]]]:
+    """Read the rows of a CSV file and where they stand; empty ones and comments (`#`) are left out.
+
+    **Raises:** `FileNotFoundError`, or `ValueError` when it is no text.
+    """
+    try:
+        lines = existing_file(path).read_text(encoding="utf-8-sig").splitlines()
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path}: is no text file: {error}; {contents}") from None
+    rows = csv.reader(lines)
+    return [
+        (f"{path}: line {rows.line_num}", [cell.strip() for cell in row])
+        for row in rows
+        if any(map(str.strip, row)) and not row[0].lstrip().startswith("#")
+    ]
+
+
+def _number(cell: str) -> float | None:
+    try:
+        return float(cell)
+    except ValueError:
+        return None

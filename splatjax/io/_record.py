@@ -4,22 +4,13 @@ import hashlib
 import json
 import os
 from collections.abc import Mapping
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 from splatjax.exports import data_sheet
 from splatjax.scene import Material
 
-from ._atomic import atomic_path
-
-
-def own_version() -> str:
-    """Return the version of the package that is installed."""
-    try:
-        return version("splatjax")
-    except PackageNotFoundError:
-        return "(not installed)"
+from ._files import atomic_path
 
 
 def fingerprint(path: str | os.PathLike[str]) -> str:

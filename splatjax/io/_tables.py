@@ -1,24 +1,20 @@
-"""Tables of TOML and CSV files, and the errors that say what an entry must be."""
+"""Tables of TOML files, and the errors that say what an entry must be."""
 
-import csv
 import difflib
-import os
 import tomllib
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ._files import existing_file
+from ._files import naming
 
-POSITIVE = "positive", lambda x: (x > 0) & (x < np.inf)
-AT_LEAST_0 = "finite and at least 0", lambda x: (x >= 0) & (x < np.inf)
-FINITE = "finite", np.isfinite
-Rule = tuple[str, Callable[[np.ndarray], Any]]
-"""What numbers must be, in words and as a function of their rounded values."""
+Made = TypeVar("Made")
 
 
 def read_toml(path: Path, remedy: str) -> dict[str, Any]:
@@ -32,31 +28,6 @@ def read_toml(path: Path, remedy: str) -> dict[str, Any]:
         raise ValueError(f"{path}: cannot be read ({error.strerror}); {remedy}") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ValueError(f"{path}: is no TOML file: {error}") from None
-
-
-def read_rows(path: str | os.PathLike[str], contents: str) -> list[tuple[str, list[Any]]]:
-    """Read the rows of a CSV file and where they stand; empty ones and comments (`#`) are left out.
-    Cells that are numbers are converted.
-
-    **Raises:** `FileNotFoundError`, or `ValueError` when it is no text.
-    """
-    try:
-        lines = existing_file(path).read_text(encoding="utf-8-sig").splitlines()
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{path}: is no text file: {error}; {contents}") from None
-    rows = csv.reader(lines)
-    return [
-        (f"{path}: line {rows.line_num}", [_converted(cell) for cell in row])
-        for row in rows
-        if any(map(str.strip, row)) and not row[0].lstrip().startswith("#")
-    ]
-
-
-def _converted(cell: str) -> float | str:
-    try:
-        return float(cell)
-    except ValueError:
-        return cell.strip()
 
 
 class Table:
@@ -99,41 +70,32 @@ class Table:
             )
         return value
 
-    def numbers(
-        self,
-        name: str,
-        rule: Rule,
-        shape: tuple[int | None, ...],
-        default: float | None = None,
-        *,
-        fill: bool = True,
-    ) -> Array:
-        """Return numbers in JAX's default precision.
+    def numbers(self, name: str, default: float | None = None) -> Array:
+        """Return a number, a list of numbers or rows of them, in JAX's default precision.
 
-        **Arguments:**
-
-        - `shape`: `None` stands for any count.
-        - `default`: of an entry that is left out; `None`: it must be there.
-        - `fill`: whether one number stands for all where the count is known.
+        Ranges and shapes are checked by the records that are made of them (`make`).
         """
         given = self.entries.get(name, default)
-        try:
-            values = np.asarray(given)
-        except ValueError:  # rows of several lengths
-            values = np.asarray(None)
-        if fill and values.ndim == 0 and None not in shape:
-            values = np.broadcast_to(values, [n or 1 for n in shape])
-        fits = values.ndim == len(shape) and values.size > 0 and values.dtype.kind in "iuf"
-        fits = fits and all(n in (None, m) for n, m in zip(shape, values.shape, strict=True))
-        fits = fits and not any(isinstance(value, bool) for value in np.asarray(given, object).flat)
-        if not fits or not np.all(rule[1](rounded(values))):
-            rows = "rows of " if len(shape) > 1 else ""
-            count = f"{shape[0] or 'a list of'} {rows}numbers" if shape else "a number"
-            raise ValueError(
-                f"{self.where} {name} must be {count}, {rule[0]}; it is "
-                f"{'missing' if given is None else repr(given)}"
-            )
-        return jnp.asarray(rounded(values))
+        kinds = {type(leaf) for leaf in jax.tree.leaves(given)}
+        if kinds and kinds <= {int, float}:
+            with suppress(TypeError, ValueError, OverflowError):  # rows of several lengths
+                return jnp.asarray(rounded(given))
+        raise ValueError(
+            f"{self.where} {name} must be a number, a list of numbers or rows of equal length; it "
+            f"is {'missing' if given is None else repr(given)}"
+        )
+
+    def number(self, name: str, default: float | None = None) -> float:
+        """Return a single number."""
+        values = self.numbers(name, default)
+        if values.ndim:
+            raise ValueError(f"{self.where} {name} must be one number; it is {values.tolist()}")
+        return float(values)
+
+    def make(self, make: Callable[..., Made], *args: Any, **named: Any) -> Made:
+        """Make a record of entries; errors that it raises name the table."""
+        with naming(self.where):
+            return make(*args, **named)
 
 
 def nearest(name: str, known: Iterable[str]) -> str:

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+import splatjax as sj
 from splatjax.cli import main
 
 
@@ -20,25 +21,13 @@ def failure(words, capsys):
     return captured.err
 
 
-def write_ply(path, rows, names):
-    properties = [f"property float {name}" for name in names]
-    head = ["ply", "format ascii 1.0", f"element vertex {len(rows)}", *properties, "end_header"]
-    path.write_text("\n".join([*head, *(" ".join(map(str, row)) for row in rows)]) + "\n")
-    return path
-
-
-def write_splats(path, centers, normals, radius, area):
-    rows = [
-        (*center, *normal, radius, area) for center, normal in zip(centers, normals, strict=True)
-    ]
-    return write_ply(path, rows, ("x", "y", "z", "nx", "ny", "nz", "radius", "area"))
-
-
 def plate(path):
     """Write an even plate of 20 x 20 mm that faces +z, without albedo."""
     places = np.linspace(-9.5, 9.5, 20)
-    centers = [(x, y, 0) for x in places for y in places]
-    return write_splats(path, centers, len(centers) * [(0, 0, 1)], 1.5, 1)
+    y, x = map(np.ravel, np.meshgrid(places, places, indexing="ij"))
+    normals = np.tile([0.0, 0.0, 1.0], (len(x), 1))
+    sj.write_splats(path, sj.Splats(np.stack([x, y, 0 * x], axis=1), normals, 1.5, 1.0))
+    return path
 
 
 def ball(path, radius=10.0, count=300):
@@ -50,4 +39,15 @@ def ball(path, radius=10.0, count=300):
     across = np.sqrt(1 - z * z)
     normals = np.stack([across * np.sin(longitude), z, across * np.cos(longitude)], axis=1)
     area = 4 * np.pi * radius**2 / count
-    return write_splats(path, radius * normals, normals, 0.9 * np.sqrt(area), area)
+    sj.write_splats(path, sj.Splats(radius * normals, normals, 0.9 * np.sqrt(area), area))
+    return path
+
+
+def contents(folder):
+    """Return what files there are, and what is in them."""
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def frame_names(*numbers):
+    """Return the names of the files of frames of a turntable."""
+    return {f"frame_{i:04}.{suffix}" for i in numbers for suffix in ("exr", "png")}

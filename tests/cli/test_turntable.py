@@ -7,7 +7,7 @@ from functools import partial
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from commands import ball, failure, run
+from commands import ball, contents, failure, frame_names, run
 from PIL import Image
 
 import splatjax as sj
@@ -55,14 +55,6 @@ def command(splats, folder, *more, turn="camera"):
     ]
 
 
-def names(*frames):
-    return {f"frame_{i:04}.{suffix}" for i in frames for suffix in ("exr", "png")}
-
-
-def contents(folder):
-    return {path.name: path.read_bytes() for path in folder.iterdir()}
-
-
 @pytest.fixture(scope="module")
 def around(splats, tmp_path_factory):
     """The folder of a turn of the camera, not to be written to."""
@@ -80,7 +72,7 @@ def test_frames_and_animation_are_made_by_one_program(splats, tmp_path, drawn, c
     folder = tmp_path / "turn"
     assert run(*command(splats, folder)) == 0
     captured = capsys.readouterr()
-    expected = [*sorted(names(*range(FRAMES))), "turntable.webp"]
+    expected = [*sorted(frame_names(*range(FRAMES))), "turntable.webp"]
     assert captured.out.splitlines() == [str(folder / name) for name in expected]
     assert contents(folder).keys() == {*expected, "turntable.json"}
     assert f"{FRAMES} of {FRAMES}, " in captured.err
@@ -125,21 +117,6 @@ def test_camera_keeps_its_distance_and_the_fill_its_place_beside_it():
     np.testing.assert_allclose(fills, np.broadcast_to(fills[0], (9, 3)), atol=1e-5)
 
 
-def test_only_missing_frames_are_rendered_and_they_are_the_same(splats, copied, drawn, capsys):
-    before = contents(copied)
-    for name in ("frame_0002.png", "frame_0003.exr", "turntable.webp"):
-        (copied / name).unlink()
-    assert run(*command(splats, copied)) == 0
-    assert f"2 of {FRAMES} frames" in capsys.readouterr().err
-    assert len(drawn) == 2
-    assert contents(copied) == before
-    assert run(*command(splats, copied, "--fps", 10)) == 0
-    assert len(drawn) == 2  # another speed needs no rendering
-    with Image.open(copied / "turntable.webp") as film:
-        film.load()
-        assert film.info["duration"] == 100
-
-
 @pytest.mark.parametrize(
     ("error", "status"), [(KeyboardInterrupt(), 130), (OSError(28, "No space left", "a.png"), 2)]
 )
@@ -158,12 +135,17 @@ def test_interrupted_frames_are_whole_and_the_rest_follows(
     captured = capsys.readouterr()
     assert captured.out == ""
     assert "the same command again" in captured.err
-    assert contents(folder).keys() == names(0) | {"frame_0001.exr", "turntable.json"}
+    assert contents(folder).keys() == frame_names(0) | {"frame_0001.exr", "turntable.json"}
     monkeypatch.setattr(sj, "write_png", write_png)
     drawn.clear()
     assert run(*command(splats, folder)) == 0
     assert len(drawn) == FRAMES - 1
     assert contents(folder) == contents(around)
+    assert run(*command(splats, folder, "--fps", 10)) == 0
+    assert len(drawn) == FRAMES - 1  # another speed needs no rendering
+    with Image.open(folder / "turntable.webp") as film:
+        film.load()
+        assert film.info["duration"] == 100
 
 
 def test_frames_of_something_else_are_refused(splats, copied, tmp_path, drawn, capsys):
@@ -194,20 +176,3 @@ def test_an_orbit_under_lights_that_stand_still_is_lit_once(splats, tmp_path, mo
     assert run("render", *still, "--output", alone) == 0
     frames = [sj.read_exr(path) for path in (folder / "frame_0001.exr", alone)]
     np.testing.assert_allclose(*(np.asarray(frame.beauty) for frame in frames), atol=1e-5)
-
-
-def test_light_goes_around_a_camera_that_stands_still(splats, tmp_path):
-    folder, alone = tmp_path / "light", tmp_path / "alone.exr"
-    still = ("--azimuth", 0, "--light-elevation", 0)
-    assert run(*command(splats, folder, "--light-azimuth", 0, *still, turn="light")) == 0
-    frames = [sj.read_exr(folder / f"frame_{i:04}.exr") for i in range(FRAMES)]
-    for frame in frames[1:]:
-        np.testing.assert_array_equal(np.asarray(frame.position), np.asarray(frames[0].position))
-    front, right, back, left = (np.asarray(frame.diffuse).sum(axis=-1) for frame in frames)
-    assert front.sum() > right.sum() > back.sum()
-    assert right[:, 8:].sum() > 2 * right[:, :8].sum()
-    assert left[:, :8].sum() > 2 * left[:, 8:].sum()
-    words = command(splats, alone, "--light-azimuth", -90, *still)
-    assert run("render", *words[1 : words.index("--frames")], *words[-6:], "--output", alone) == 0
-    expected = np.asarray(frames[3].beauty)
-    np.testing.assert_allclose(np.asarray(sj.read_exr(alone).beauty), expected, atol=1e-5)

@@ -47,12 +47,8 @@ def named_files(page: Path) -> dict[str, str]:
     """Give the files that a page says to write: fences that begin with their name, `#
     name.toml`.
     """
-    found = {}
-    for body in fences(page, "toml"):
-        first = re.match(r"# (\S+\.toml)\n", body)
-        if first:
-            found[first[1]] = body
-    return found
+    matches = [(re.match(r"# (\S+\.toml)\n", body), body) for body in fences(page, "toml")]
+    return {first[1]: body for first, body in matches if first}
 
 
 def programs(page: Path) -> list[str]:

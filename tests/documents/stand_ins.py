@@ -40,12 +40,7 @@ def _splats(path: Path) -> None:
 
 def _points(path: Path) -> None:
     points = trimesh.sample.sample_surface_even(_ball(), 1200, seed=0)[0] * 53
-    rows = "\n".join("{:.4f} {:.4f} {:.4f}".format(*point) for point in points)
-    header = (
-        f"ply\nformat ascii 1.0\nelement vertex {len(points)}\nproperty float "
-        "x\nproperty float y\nproperty float z\nend_header\n"
-    )
-    path.write_text(f"{header}{rows}\n", encoding="utf-8")
+    trimesh.PointCloud(points).export(path)
 
 
 def _map(path: Path) -> None:

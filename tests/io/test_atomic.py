@@ -1,9 +1,6 @@
 """Files are written whole or not at all."""
 
-import os
 import resource
-import signal
-import subprocess
 import sys
 from pathlib import Path
 
@@ -83,38 +80,3 @@ def test_a_file_takes_its_name_only_when_the_block_ends_well(tmp_path, name, kin
         _write_half(tmp_path / name)
     assert (tmp_path / "file").read_text() == "before"
     assert len(list(tmp_path.iterdir())) == 2
-
-
-KILLED = """
-import os, signal, sys
-from splatjax.io import atomic_path
-with atomic_path(sys.argv[1]) as temporary:
-    temporary.write_text("ha")
-    os.kill(os.getpid(), signal.SIGKILL)
-"""
-
-
-def test_what_a_kill_leaves_is_removed_when_the_file_is_written_next(tmp_path):
-    """What stood there stays; and so do temporary files of processes that run, and other files."""
-    target, other = tmp_path / "a.txt", tmp_path / "b.txt"
-    for path in (target, other):
-        words = [sys.executable, "-c", KILLED, str(path)]
-        assert subprocess.run(words, check=False).returncode == -signal.SIGKILL
-        assert not path.exists()
-    with atomic_path(target) as first, atomic_path(target) as second:
-        first.write_text("first")
-        second.write_text("second")
-    assert target.read_text() == "first"
-    assert [name[:3] for name in os.listdir(tmp_path) if name != "a.txt"] == [".b-"]
-
-
-def test_processes_that_write_the_same_file_do_not_remove_what_others_write(tmp_path):
-    write = (
-        "import sys\nfrom splatjax.io import write_record\nfor i in range(40): "
-        "write_record(sys.argv[1], {'i': i})"
-    )
-    words = [sys.executable, "-c", write, str(tmp_path / "same.json")]
-    writers = [subprocess.Popen(words, stderr=subprocess.PIPE, text=True) for _ in range(3)]
-    said = [writer.communicate(timeout=300)[1] for writer in writers]
-    assert [writer.returncode for writer in writers] == [0, 0, 0], said
-    assert os.listdir(tmp_path) == ["same.json"]

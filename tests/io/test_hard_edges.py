@@ -65,16 +65,6 @@ def test_normals_end_at_hard_edges(tmp_path, body, kind, rounded):
     np.testing.assert_allclose(float(splats.areas.sum()), mesh.area, rtol=2e-3)
 
 
-def test_the_angle_is_an_option(tmp_path):
-    """Edges of 90 degrees are hard up to there, and then shade like those of a pillow."""
-    path, medians = export(BODIES["box"], tmp_path, "stl"), []
-    for angle in (0.0, 89.0, 91.0):
-        splats = sample_mesh(path, COUNT, mm_per_unit=1.0, crease_angle=angle)
-        medians.append(np.median(angles_to_body(splats, "box")[0]))
-    np.testing.assert_allclose(medians[:2], 0, atol=0.1)
-    assert medians[2] > 10
-
-
 def test_splats_reach_little_beyond_hard_edges(tmp_path):
     """Seen up to 0.8 of their radius, at most 0.7 spacings; at corners too."""
     path = export(BODIES["box"], tmp_path, "off")

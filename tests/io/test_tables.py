@@ -8,13 +8,10 @@ import pytest
 
 from splatjax.io import (
     fingerprint,
-    join_tables,
-    load_material,
-    read_column,
+    read_columns,
     read_media,
     read_profile,
     read_record,
-    save_exports,
     write_columns,
     write_record,
 )
@@ -39,7 +36,7 @@ def test_a_table_is_read_in_its_own_unit(tmp_path, dtype):
         (GOOD.replace("2.0", "two"), "line 5: 0.1, two, 1.0"),
         (GOOD.replace("2.0", "nan"), "line 5: 0.1, nan, 1.0"),
         (GOOD.replace("2.0, 1.0", "2.0"), "line 5: 0.1, 2.0"),
-        ("0\n1\n", "line 1: 0.0 "),
+        ("0\n1\n", "line 1: 0 "),
         (GOOD.replace("0.3,", "0.1,"), "radii"),
         (GOOD.replace("0.0,", "-1,"), "radii"),
         ("r (cm), R\n0.1, 1\n0.2, 0.5\n", r"line 1 gives cm.* mm_per_unit = 10 "),
@@ -54,19 +51,18 @@ def test_a_bad_profile_is_refused_with_its_line(tmp_path, text, value):
         read_profile(path)
 
 
-MEDIA = "name,sigma_a,sigma_s_prime,eta\nmilk, 0, 1.5, 1.3\n\n,0.1,2,1.4\n"
+MEDIA = "name,sigma_a,sigma_s_prime,eta\nmilk, 0, 1.5, 1.3\n\n,0.1,2,1.4\n1,1,1,1\n"
 
 
 def test_media_are_read_and_their_columns_come_back(tmp_path):
     (tmp_path / "media.csv").write_text(MEDIA)
     names, media = read_media(tmp_path / "media.csv")
-    assert names == ["milk", "2"]
-    np.testing.assert_array_equal(media, [[0, 1.5, 1.3], [0.1, 2, 1.4]])
-    parts = [tmp_path / "a.csv", tmp_path / "b.csv"]
-    for part, row in zip(parts, media, strict=True):
-        write_columns(part, {"name": ["x"], "eta": row[2:] / 3})
-    join_tables(tmp_path / "all.csv", parts)
-    np.testing.assert_array_equal(read_column(tmp_path / "all.csv", "eta"), media[:, 2] / 3)
+    assert names == ["milk", "2", "1"]
+    np.testing.assert_array_equal(media, [[0, 1.5, 1.3], [0.1, 2, 1.4], [1, 1, 1]])
+    write_columns(tmp_path / "back.csv", {"name": names, "eta": media[:, 2] / 3})
+    columns = read_columns(tmp_path / "back.csv")
+    assert columns["name"] == tuple(names)
+    np.testing.assert_array_equal(np.asarray(columns["eta"], float), media[:, 2] / 3)
 
 
 @pytest.mark.parametrize(
@@ -75,21 +71,16 @@ def test_media_are_read_and_their_columns_come_back(tmp_path):
         ("", "sigma_a"),
         ("sigma_a,eta\n1,1\n", "sigma_s_prime"),
         (MEDIA.split("\n")[0] + "\n", "0 rows"),
-        (MEDIA.replace("1.5", "0"), "line 2: milk, 0.0, 0.0"),
-        (MEDIA.replace("1.5", "many"), "line 2: milk, 0.0, many"),
-        (MEDIA.replace(",1.4", ""), "line 4: , 0.1, 2.0 must be name"),
+        (MEDIA.replace("1.5", "0"), "line 2: milk, 0, 0,"),
+        (MEDIA.replace("0.1,", "-0.1,"), "line 4: , -0.1, 2"),
+        (MEDIA.replace("1.5", "many"), "line 2: milk, 0, many"),
+        (MEDIA.replace(",1.4", ""), "line 4: , 0.1, 2 must be name"),
     ],
 )
 def test_bad_media_are_refused_with_their_line(tmp_path, text, value):
     (tmp_path / "bad.csv").write_text(text)
     with pytest.raises(ValueError, match=rf"bad.csv: .*{value}"):
         read_media(tmp_path / "bad.csv")
-
-
-def test_exports_are_written_whole(tmp_path):
-    path, variances = tmp_path / "skin.json", [0.0064, 0.0484, 0.187, 0.567, 1.99, 7.41]
-    save_exports(load_material("skin"), path)
-    np.testing.assert_allclose(read_record(path)["gaussians"]["variances"], variances)
 
 
 def test_records_come_back_and_fingerprints_tell_contents_apart(tmp_path):
