@@ -63,7 +63,14 @@ def scatter(mesh: Mesh, count: int, *, seed: int = 0, relaxations: int = 4) -> S
         raise ValueError(
             "the mesh has no area; it needs at least one triangle that is not degenerate"
         )
-    points = _deal(mesh, areas, count, np.random.default_rng(seed))
+    random = np.random.default_rng(seed)
+    along = morton_order(mesh.corners().mean(axis=1))
+    ends = np.cumsum(areas[along])
+    places = (np.arange(count) + random.uniform()) * (ends[-1] / count)
+    faces = along[np.minimum(np.searchsorted(ends, places, side="right"), len(ends) - 1)]
+    u, v = ((random.uniform() + np.arange(1, count + 1) / _PLASTIC**k) % 1.0 for k in (1, 2))
+    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
+    points = SurfacePoints(faces, np.stack([1 - u - v, u, v], axis=-1))
     points = points.take(morton_order(points.positions(mesh)))
     if relaxations and count > 1:
         beyond = faces_beyond(mesh)
@@ -78,17 +85,6 @@ def scatter(mesh: Mesh, count: int, *, seed: int = 0, relaxations: int = 4) -> S
     return points.take(
         morton_order(points.positions(mesh).astype(np.float32))
     )  # as it will be seen in single precision
-
-
-def _deal(mesh: Mesh, areas: np.ndarray, count: int, random: np.random.Generator) -> SurfacePoints:
-    along = morton_order(mesh.corners().mean(axis=1))
-    ends = np.cumsum(areas[along])
-    positions = (np.arange(count) + random.uniform()) * (ends[-1] / count)
-    faces = along[np.minimum(np.searchsorted(ends, positions, side="right"), len(ends) - 1)]
-    index = np.arange(1, count + 1)
-    u, v = ((random.uniform() + index / _PLASTIC**k) % 1.0 for k in (1, 2))
-    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
-    return SurfacePoints(faces, np.stack([1 - u - v, u, v], axis=-1))
 
 
 def mirror_images(
@@ -126,10 +122,11 @@ def mirror_images(
 def _barycentrics(mesh: Mesh, faces: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Compute barycentric coordinates of the points' projections to the planes of their faces."""
     a, b, c = np.moveaxis(mesh.vertices[mesh.faces[faces]], 1, 0)
-    normal = np.cross(b - a, c - a)
-    squared = np.maximum(np.einsum("ni,ni->n", normal, normal), 1e-30)
-    v = np.einsum("ni,ni->n", np.cross(points - a, c - a), normal) / squared
-    w = np.einsum("ni,ni->n", np.cross(b - a, points - a), normal) / squared
+    ways = np.stack([b - a, c - a, points - a])
+    (d00, d01, d20), (_, d11, d21), _ = np.einsum("ani,bni->abn", ways, ways)
+    determinant = np.maximum(d00 * d11 - d01 * d01, 1e-30)
+    v = (d11 * d20 - d01 * d21) / determinant
+    w = (d00 * d21 - d01 * d20) / determinant
     return np.stack([1 - v - w, v, w], axis=-1)
 
 
