@@ -2,7 +2,7 @@
 runs.
 """
 
-import importlib
+import pkgutil
 import re
 from pathlib import Path
 
@@ -18,13 +18,12 @@ PAGES = [
 
 
 def named_objects(text):
-    return sorted(set(re.findall(r"`(splatjax(?:\.\w+)+)`", text)))
+    return list(dict.fromkeys(re.findall(r"`(splatjax(?:\.\w+)+)`", text)))
 
 
 @pytest.mark.parametrize("name", named_objects(EQUATIONS))
 def test_every_named_object_exists_and_says_what_it_is(name):
-    module, _, attribute = name.rpartition(".")
-    named = getattr(importlib.import_module(module), attribute)
+    named = pkgutil.resolve_name(name)
     assert callable(named)
     assert named.__doc__
 
@@ -33,17 +32,9 @@ def test_every_named_object_exists_and_says_what_it_is(name):
     "row", ["Eq. 1", "Eq. 2", "Eq. 3", "Eq. 4", "Pass 1", "Pass 2", "Pass 3", "Pass 4", "Pass 5"]
 )
 def test_every_equation_and_pass_has_its_row(row):
-    lines = [line for line in EQUATIONS.splitlines() if line.startswith(f"| {row} |")]
-    assert len(lines) == 1
-    assert named_objects(lines[0])
-
-
-@pytest.mark.parametrize("equation", [1, 2, 3, 4])
-def test_the_function_of_an_equation_names_it(equation):
-    line = next(line for line in EQUATIONS.splitlines() if line.startswith(f"| Eq. {equation} |"))
-    name = re.search(r"`(splatjax(?:\.\w+)+)`", line).group(1)
-    module, _, attribute = name.rpartition(".")
-    assert f"Eq. {equation}" in getattr(importlib.import_module(module), attribute).__doc__
+    (line,) = (line for line in EQUATIONS.splitlines() if line.startswith(f"| {row} |"))
+    function = pkgutil.resolve_name(named_objects(line)[0])
+    assert row.startswith("Pass") or row in function.__doc__
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())

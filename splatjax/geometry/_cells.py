@@ -78,7 +78,8 @@ def surface_cells(
     neighbors = min(neighbors, count - 1)
     tree = scipy.spatial.KDTree(points, balanced_tree=False, compact_nodes=False)
     distances, near = tree.query(points, k=neighbors + 1, workers=-1)
-    angles = (np.arange(directions) + 0.5) * (2 * np.pi / directions)
+    step = 2 * np.pi / directions
+    angles = (np.arange(directions) + 0.5) * step
     fan = np.stack([np.cos(angles), np.sin(angles)]).astype(np.float32)
 
     def measure(start: int) -> Cells:
@@ -87,35 +88,25 @@ def surface_cells(
         gaps = np.linalg.norm(mirrored, axis=-1)
         ways = np.concatenate([points[others] - points[part, None], mirrored], axis=1)
         lengths = np.concatenate([distances[part, 1:], np.where(gaps > 0, gaps, np.inf)], axis=1)
+        squared = np.square(lengths).astype(np.float32)
+        coincident = squared == 0
         theirs = [single[others], np.broadcast_to(own[:, None], mirrored.shape)]
+        same_side = np.einsum("nki,ni->nk", np.concatenate(theirs, 1), own) > 0.1
+        squared = np.where(same_side & ~coincident, squared, np.inf)
+        axes = np.stack(tangent_frames(own))
+        across = np.einsum("nki,ani->nka", ways.astype(np.float32), axes)
+        # Of the distance to the border of the cell; negative behind the point.
+        inverse = (across @ fan) * (2 / squared)[..., None]
         nearest = distances[part, 1:7]
         around = nearest.sum(axis=1) / np.maximum((nearest > 0).sum(axis=1), 1)
         end = _OPEN_END * around if limit is None else np.full(len(own), limit)
-        return _measure(ways.astype(np.float32), lengths, own, np.concatenate(theirs, 1), end, fan)
+        border = 1 / np.maximum(inverse.max(axis=1), 1 / np.maximum(end, 1e-12)[:, None])
+        area = 0.5 * step * np.einsum("nd,nd->n", border, border)
+        moment = (step / 3) * (border**3 @ fan.T) / np.maximum(area, 1e-30)[:, None]
+        to_centroid = np.einsum("na,ani->ni", moment, axes)
+        return Cells(area / (1 + coincident.sum(axis=1)), border.max(axis=1), to_centroid)
 
     with ThreadPoolExecutor() as pool:
         return Cells(
             *map(np.concatenate, zip(*pool.map(measure, range(0, count, _CHUNK)), strict=True))
         )
-
-
-def _measure(ways, lengths, own, theirs, end, fan) -> Cells:
-    """Measure cells from the ways to neighbors, how long they are, the normals of both, where a
-    cell ends at the latest, and a fan of directions.
-    """
-    tangent, bitangent = tangent_frames(own)
-    across = np.stack(
-        [np.einsum("nki,ni->nk", ways, axis) for axis in (tangent, bitangent)], axis=-1
-    )
-    squared = np.square(lengths).astype(np.float32)
-    coincident = squared == 0
-    same_side = np.einsum("nki,ni->nk", theirs, own) > 0.1
-    squared = np.where(same_side & ~coincident, squared, np.inf)
-    # Of the distance to the border of the cell; negative behind the point.
-    inverse = (across @ fan) * (2 / squared)[..., None]
-    border = 1 / np.maximum(inverse.max(axis=1), 1 / np.maximum(end, 1e-12)[:, None])
-    step = 2 * np.pi / fan.shape[1]
-    area = 0.5 * step * np.einsum("nd,nd->n", border, border)
-    moment = (step / 3) * (border**3 @ fan.T) / np.maximum(area, 1e-30)[:, None]
-    to_centroid = moment[:, :1] * tangent + moment[:, 1:] * bitangent
-    return Cells(area / (1 + coincident.sum(axis=1)), border.max(axis=1), to_centroid)

@@ -1,10 +1,11 @@
-"""Normals of raw points."""
+"""Normals of raw points, and which side of their surface is outside."""
+
+from collections.abc import Sequence
 
 import numpy as np
 import scipy  # its parts are loaded where they are used, which takes a third of a second
 from jaxtyping import Float, Int
 
-from ._orientation import outward_signs
 from ._places import distinct, morton_order
 
 _CHUNK = 1 << 16
@@ -81,3 +82,214 @@ def _planes(
         variances, ways = np.linalg.eigh((shares * around).swapaxes(1, 2) @ around)
         normals[part], off[part] = ways[..., 0], np.maximum(variances[:, 0], 0) / whole[:, 0]
     return middles, normals, off
+
+
+_VIEWS = 32
+_SURE = 0.7  # share of the votes by which one side wins
+_DOUBT = 0.5  # votes that nobody cast: a side seen once is not sure yet
+_SMOOTH = 0.99  # agreement of neighbors in one patch
+_LEAST_PATCH = 100
+_BLOCK, _PROBES = 32, 256  # points that are seen from afar as one; of a patch that are looked at
+_CLEAR = 0.05
+_ROOT = 1e-9  # cost of being one; a zero would be no edge
+
+Signs = Float[np.ndarray, " n"]
+
+
+def outward_signs(
+    points: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"],
+    near: Int[np.ndarray, "n k"],
+    reaches: Float[np.ndarray, " n"],
+) -> Signs:
+    r"""Find the signs that turn normals outward.
+
+    The points are looked at from all around. Where a point and its neighbors are seen from one side
+    alone, it is the outer one. From there signs are carried along a minimum spanning tree of the
+    neighborhood graph. Neighbors at `p_i` and `p_j` agree as far as one normal is the mirror image
+    of the other in the plane between the points, as on a circle, around an edge and across a thin
+    sheet, and the cost of an edge is `1.001 - |agreement|`. A part that is seen from both sides
+    alike, or not at all, is turned away from its middle at its farthest point. What hides within a
+    body is a hollow (`_turn_cavities`).
+
+    **Arguments:**
+
+    - `normals`: unit, of either sign.
+    - `near`: neighbors of each point, without itself, each at another place.
+    - `reaches`: mm, how far away the last of them is.
+
+    **Source:** Hoppe et al. 1992, section 3.3; König and Gumhold 2009, "Consistent Propagation of
+    Normal Orientations in Point Clouds", for agreement around edges.
+    """
+    votes, cast = _votes(points, normals, 0.6 * float(np.quantile(reaches, 0.99)))
+    around, cast_around = votes.copy(), cast.copy()
+    for each in near.T:
+        around += votes[each] * np.sign(np.einsum("ni,ni->n", normals, normals[each]))
+        cast_around += cast[each]
+    sure = np.abs(around) > _SURE * (cast_around + _DOUBT * (1 + near.shape[1]))
+    signs, patches = _carried(
+        points, normals, near, np.flatnonzero(sure), np.where(around < 0, -1.0, 1.0)
+    )
+    if not sure.any() or not patches:
+        return signs
+    areas = np.pi / near.shape[1] * reaches**2
+    _turn_cavities(points, (areas * signs)[:, None] * normals, patches, signs)
+    sure[np.concatenate(patches)] = True  # and what lies between them follows
+    return _carried(points, normals, near, np.flatnonzero(sure), signs)[0]
+
+
+def _votes(points: np.ndarray, normals: np.ndarray, pixel: float) -> tuple[Signs, Signs]:
+    """Count in how many views each normal points to the viewer less those where it points away, and
+    how many see it at all.
+
+    A point is seen where nothing lies more than a pixel before it and the pixels around. A view
+    counts by its squared cosine.
+    """
+    index = np.arange(_VIEWS) + 0.5  # on a spiral around the sphere
+    height, angle = 1 - 2 * index / _VIEWS, index * np.pi * (3 - np.sqrt(5))
+    low, high = points.min(axis=0), points.max(axis=0)
+    pixel = max(pixel, float((high - low).max()) / 4096, 1e-30)
+    single, facing = (points - 0.5 * (low + high)).astype(np.float32), normals.astype(np.float32)
+    votes, cast = np.zeros(len(points), np.float32), np.zeros(len(points), np.float32)
+    for z, turn in zip(height, angle, strict=True):
+        r = np.sqrt(1 - z * z)
+        frame = [
+            [-np.sin(turn), np.cos(turn), 0],
+            [-z * np.cos(turn), -z * np.sin(turn), r],
+            [r * np.cos(turn), r * np.sin(turn), z],
+        ]
+        across, up, towards = np.asarray(frame, np.float32) @ single.T
+        columns, rows = (
+            np.floor((each - each.min()) / pixel).astype(np.int64) for each in (across, up)
+        )
+        width = columns.max() + 1
+        place = rows * width + columns
+        nearest = np.full((rows.max() + 1, width), -np.inf, np.float32)
+        np.maximum.at(nearest.reshape(-1), place, towards)
+        nearest = scipy.ndimage.maximum_filter(nearest, 3, mode="nearest").reshape(-1)
+        cosine = np.where(towards >= nearest[place] - pixel, facing @ frame[2], 0)
+        votes += cosine * np.abs(cosine)
+        cast += cosine * cosine
+    return votes, cast
+
+
+def _agreement(
+    points: np.ndarray, normals: np.ndarray, one: np.ndarray, other: np.ndarray
+) -> Signs:
+    """Compute cosines between normals and the mirror images of others in the plane between them."""
+    between = points[other] - points[one]
+    along = [np.einsum("ni,ni->n", normals[each], between) for each in (one, other)]
+    squared = np.einsum("ni,ni->n", between, between)
+    return np.einsum("ni,ni->n", normals[one], normals[other]) - 2 * along[0] * along[1] / squared
+
+
+def _carried(
+    points: np.ndarray, normals: np.ndarray, near: np.ndarray, sure: np.ndarray, signs: Signs
+) -> tuple[Signs, list[np.ndarray]]:
+    """Carry signs from points that are sure of theirs to all others; return also which of these
+    hang together smoothly.
+    """
+    count, neighbors = near.shape
+    free = np.setdiff1d(np.arange(count), sure, assume_unique=True)
+    start, end = np.repeat(free, neighbors), near[free].ravel()
+    low, high = np.divmod(
+        np.unique(np.minimum(start, end) * np.int64(count) + np.maximum(start, end)), count
+    )
+    agreement = _agreement(points, normals, low, high)
+    cost = 1.001 - np.minimum(np.abs(agreement), 1.0)
+    parts = _components(cost, low, high, count)
+    # Each part without a sure point has its farthest one turned away from its middle.
+    sizes = np.bincount(parts)
+    middles = np.stack([np.bincount(parts, axis) / sizes for axis in points.T], axis=-1)
+    outward = points - middles[parts]
+    by_distance = np.argsort(np.einsum("ni,ni->n", outward, outward), kind="stable")
+    farthest = np.full(len(sizes), -1)
+    farthest[parts[by_distance]] = by_distance  # the last one written is the farthest
+    farthest[parts[sure]] = -1
+    farthest = farthest[farthest >= 0]
+    facing = np.einsum("ni,ni->n", normals[farthest], outward[farthest])
+    signs[farthest] = np.where(facing < 0, -1.0, 1.0)
+    # All roots hang on one more node; each other point follows the one ahead of it in the tree.
+    roots = np.concatenate([sure, farthest])
+    ends = np.concatenate([low, roots]), np.concatenate([high, np.full(len(roots), count)])
+    costs = np.concatenate([cost, np.full(len(roots), _ROOT)])
+    tree = scipy.sparse.csgraph.minimum_spanning_tree(
+        scipy.sparse.coo_array((costs, ends), shape=(count + 1, count + 1)).tocsr()
+    )
+    ahead = scipy.sparse.csgraph.breadth_first_order(tree, count, directed=False)[1]
+    ahead[count] = count
+    inner = np.flatnonzero(ahead[:count] < count)
+    signs[inner] = np.where(_agreement(points, normals, inner, ahead[inner]) < 0, -1.0, 1.0)
+    signs = np.append(signs, 1.0)
+    while not (ahead == count).all():  # pointer doubling: as many rounds as its depth has bits
+        signs *= signs[ahead]
+        ahead = ahead[ahead]
+    is_free = np.isin(np.arange(count), free)
+    smooth = agreement * signs[low] * signs[high] > _SMOOTH
+    smooth &= is_free[low] & is_free[high]
+    parts = _components(cost[smooth], low[smooth], high[smooth], count)
+    order = np.argsort(parts, kind="stable")
+    patches = np.split(order, np.flatnonzero(np.diff(parts[order])) + 1)
+    return signs[:count], [patch for patch in patches if len(patch) >= _LEAST_PATCH]
+
+
+def _components(cost: np.ndarray, one: np.ndarray, other: np.ndarray, count: int) -> np.ndarray:
+    graph = scipy.sparse.coo_array((cost, (one, other)), shape=(count, count))
+    return scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
+
+
+def _turn_cavities(
+    points: Float[np.ndarray, "n 3"],
+    oriented: Float[np.ndarray, "n 3"],
+    patches: Sequence[Int[np.ndarray, " _"]],
+    signs: Float[np.ndarray, " n"],
+) -> None:
+    r"""Turn patches around, in place, that would make a body within a body.
+
+    The winding number of a surface is 0 outside, 1 inside and on the surface itself their mean,
+    1/2. A patch is turned when that brings the number on it, of everything else and of itself,
+    nearer to 1/2: a shell within a body makes it 3/2 where it faces outward, and 1/2 where it faces
+    its middle. The greatest patch comes first.
+
+    **Arguments:**
+
+    - `points`: mm, near each other in their order as far as may be.
+    - `oriented`: normals as long as the point's area, mm^2; those of turned patches are turned.
+    - `patches`: points of each.
+    - `signs`: those of turned patches are turned.
+
+    **Source:** Barill et al. 2018, "Fast Winding Numbers for Soups and Clouds", equation 4; Xu et
+    al. 2023, "Globally Consistent Normal Orientation for Point Clouds by Regularizing the
+    Winding-Number Field".
+    """
+    for patch in sorted(patches, key=len, reverse=True):
+        probes = points[
+            patch[np.linspace(0, len(patch) - 1, min(len(patch), _PROBES)).astype(np.int64)]
+        ]
+        everything = np.median(_winding(probes, points, oriented))
+        own = np.median(_winding(probes, points[patch], oriented[patch]))
+        if (everything - own - 0.5) * own > _CLEAR:
+            signs[patch] *= -1
+            oriented[patch] *= -1
+
+
+def _winding(
+    probes: Float[np.ndarray, "probes 3"],
+    points: Float[np.ndarray, "n 3"],
+    oriented: Float[np.ndarray, "n 3"],
+) -> Float[np.ndarray, " probes"]:
+    """Compute winding numbers on a surface, of points in blocks; those of a block that a probe
+    belongs to nearly cancel.
+    """
+    starts = np.arange(0, len(points), _BLOCK)
+    sizes = np.diff(np.append(starts, len(points)))
+    middles, normals = (
+        np.add.reduceat(points, starts) / sizes[:, None],
+        np.add.reduceat(oriented, starts),
+    )
+    found = np.empty(len(probes))
+    for i, probe in enumerate(probes):  # one by one, in memory that does not grow with both
+        way = middles - probe[None]
+        cubed = np.einsum("bi,bi->b", way, way) ** 1.5
+        found[i] = (np.einsum("bi,bi->b", way, normals) / np.where(cubed > 0, cubed, np.inf)).sum()
+    return found / (4 * np.pi)

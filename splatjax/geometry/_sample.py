@@ -1,16 +1,18 @@
-"""From a triangle mesh to splats."""
+"""Splats: of a triangle mesh, or of points that lack normals, radii or areas."""
 
-import jax.numpy as jnp
+import warnings
+
 import numpy as np
+import scipy  # its parts are loaded where they are used, which takes a third of a second
 from jaxtyping import Float
 
 from splatjax.scene import Splats
 
 from ._cells import Cells, surface_cells
-from ._creases import faces_beyond
-from ._mesh import Mesh
-from ._rounding import Rounding
-from ._scatter import SurfacePoints, mirror_images, scatter
+from ._mesh import Mesh, faces_beyond
+from ._normals import estimate_normals
+from ._places import distinct, morton_order
+from ._scatter import Rounding, SurfacePoints, mirror_images, scatter
 from ._textures import Textures, albedo_at, lookup_at, perturbed_normals
 
 _PLAIN = Textures()
@@ -68,17 +70,7 @@ def splats_at(
     if tangent_space is not None:
         normals = perturbed_normals(mesh, points, normals, tangent_space)
     albedo = albedo_at(textures, mesh, points)
-    return make_splats(centers, normals, radii, areas, albedo, specular, roughness)
-
-
-def covering(
-    centers: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Compute areas (mm^2) and radii (mm) of splats that cover a surface known from these points
-    alone.
-    """
-    cells = surface_cells(centers, normals)
-    return cells.areas, _radii(cells.areas, cells)
+    return Splats(centers, normals, radii, areas, albedo, specular, roughness)
 
 
 def _radii(
@@ -100,13 +92,89 @@ def _radii(
     return np.maximum(radii, 1.2 * cells.reaches)
 
 
-def make_splats(
-    centers, normals, radii, areas, albedo=None, specular=None, roughness=None
+_NEIGHBORS = 8
+_ALONE = 5.0  # times farther from its neighbors than they are from theirs
+
+
+def complete_splats(
+    centers: Float[np.ndarray, "splats 3"],
+    *,
+    normals: Float[np.ndarray, "splats 3"] | None = None,
+    radii: Float[np.ndarray, " splats"] | None = None,
+    areas: Float[np.ndarray, " splats"] | None = None,
+    albedo: Float[np.ndarray, "splats channels"] | None = None,
+    specular: Float[np.ndarray, " splats"] | None = None,
+    roughness: Float[np.ndarray, " splats"] | None = None,
 ) -> Splats:
-    """Put host arrays into a record, in JAX's default precision."""
+    """Make splats of points, estimating what is not given, and put them in Morton order.
 
-    def there(array):
-        return jnp.asarray(np.asarray(array, np.float64), dtype=float)
+    **Arguments:**
 
-    maps = (None if array is None else there(array) for array in (albedo, specular, roughness))
-    return Splats(there(centers), there(normals), there(radii), there(areas), *maps)
+    - `centers`: mm, at least one.
+    - `normals`: unit; `None`: from neighbors (`estimate_normals`).
+    - `areas`: mm^2; `None`: those of the Voronoi cells in the tangent planes.
+    - `radii`: mm; `None`: as large as the cells ask for, so that no hole is left.
+    - `albedo`, `specular`, `roughness`: as `Splats` has them; never estimated.
+
+    Points that lie alone are kept, estimated as large as their neighbors are, and a warning states
+    how many there are. Points at one place share their area.
+
+    **Returns:** as many splats as points, in JAX's default precision.
+
+    **Raises:** `ValueError` when something must be estimated and there are fewer than four points
+    at different places.
+    """
+    estimated = normals is None or areas is None or radii is None
+    if estimated and (count := len(distinct(centers)[0])) < 4:
+        raise ValueError(
+            f"{count} points are too few to estimate normals, radii and areas from; give at least "
+            "4, or all three"
+        )
+    order = morton_order(centers.astype(np.float32))
+    centers = centers[order].astype(np.float64)
+    normals, radii, areas, albedo, specular, roughness = (
+        None if array is None else array[order]
+        for array in (normals, radii, areas, albedo, specular, roughness)
+    )
+    if normals is None:
+        normals = estimate_normals(centers)
+    if radii is None or areas is None:
+        cell_areas, cell_radii = _covered(centers, normals)
+        areas = cell_areas if areas is None else areas
+        radii = cell_radii if radii is None else radii
+    return Splats(centers, normals, radii, areas, albedo, specular, roughness)
+
+
+def _covered(centers: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    r"""Compute areas and radii; those of points that lie alone are their neighbors', lest their
+    discs hide everything.
+
+    A point lies alone when it is much farther from its neighbors than these are from their own, and
+    no one's neighbor: so neither a place where all points are sparse holds one, nor the border
+    between dense and sparse.
+
+    **Source:** after Breunig et al. 2000, "LOF: Identifying Density-Based Local Outliers", medians
+    in the place of means.
+    """
+    first, place = distinct(centers)
+    places = centers[first]
+    cells = surface_cells(places, normals[first])
+    areas, radii = cells.areas, _radii(cells.areas, cells)
+    distances, near = scipy.spatial.KDTree(places).query(
+        places, k=min(_NEIGHBORS, len(places) - 1) + 1, workers=-1
+    )
+    distances, near = distances[:, 1:].mean(axis=1), near[:, 1:]
+    is_neighbor = np.bincount(near.ravel(), minlength=len(places)) > 0
+    alone = (distances > _ALONE * np.median(distances[near], axis=1)) & ~is_neighbor
+    if alone.any():
+        areas[alone], radii[alone] = (
+            np.median(each[near[alone]], axis=1) for each in (areas, radii)
+        )
+        warnings.warn(
+            f"{alone.sum()} of {len(centers)} points lie alone, one of them "
+            f"{distances[alone].max():.3g} mm from its neighbors;"
+            " they are kept, as specks as large as those: remove them if they are noise of a "
+            "scanner",
+            stacklevel=3,
+        )
+    return (areas / np.bincount(place))[place], radii[place]

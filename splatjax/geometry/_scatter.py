@@ -1,4 +1,4 @@
-"""Points spread evenly over a triangle mesh."""
+"""Points spread evenly over a triangle mesh: on its triangles, or where its normals round it."""
 
 from typing import NamedTuple
 
@@ -7,9 +7,8 @@ import scipy  # its parts are loaded where they are used, which takes a third of
 from jaxtyping import Float, Int
 
 from ._cells import surface_cells
-from ._creases import faces_beyond
-from ._mesh import Mesh, unit
-from ._places import morton_order
+from ._mesh import Mesh, faces_beyond, hard_edges, unit
+from ._places import distinct, morton_order
 
 _PLASTIC = 1.32471795724474602596  # of the R2 sequence
 _EDGE_TOLERANCE = 1e-9
@@ -64,7 +63,14 @@ def scatter(mesh: Mesh, count: int, *, seed: int = 0, relaxations: int = 4) -> S
         raise ValueError(
             "the mesh has no area; it needs at least one triangle that is not degenerate"
         )
-    points = _deal(mesh, areas, count, np.random.default_rng(seed))
+    random = np.random.default_rng(seed)
+    along = morton_order(mesh.corners().mean(axis=1))
+    ends = np.cumsum(areas[along])
+    places = (np.arange(count) + random.uniform()) * (ends[-1] / count)
+    faces = along[np.minimum(np.searchsorted(ends, places, side="right"), len(ends) - 1)]
+    u, v = ((random.uniform() + np.arange(1, count + 1) / _PLASTIC**k) % 1.0 for k in (1, 2))
+    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
+    points = SurfacePoints(faces, np.stack([1 - u - v, u, v], axis=-1))
     points = points.take(morton_order(points.positions(mesh)))
     if relaxations and count > 1:
         beyond = faces_beyond(mesh)
@@ -79,17 +85,6 @@ def scatter(mesh: Mesh, count: int, *, seed: int = 0, relaxations: int = 4) -> S
     return points.take(
         morton_order(points.positions(mesh).astype(np.float32))
     )  # as it will be seen in single precision
-
-
-def _deal(mesh: Mesh, areas: np.ndarray, count: int, random: np.random.Generator) -> SurfacePoints:
-    along = morton_order(mesh.corners().mean(axis=1))
-    ends = np.cumsum(areas[along])
-    positions = (np.arange(count) + random.uniform()) * (ends[-1] / count)
-    faces = along[np.minimum(np.searchsorted(ends, positions, side="right"), len(ends) - 1)]
-    index = np.arange(1, count + 1)
-    u, v = ((random.uniform() + index / _PLASTIC**k) % 1.0 for k in (1, 2))
-    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
-    return SurfacePoints(faces, np.stack([1 - u - v, u, v], axis=-1))
 
 
 def mirror_images(
@@ -127,9 +122,8 @@ def mirror_images(
 def _barycentrics(mesh: Mesh, faces: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Compute barycentric coordinates of the points' projections to the planes of their faces."""
     a, b, c = np.moveaxis(mesh.vertices[mesh.faces[faces]], 1, 0)
-    ab, ac, ap = b - a, c - a, points - a
-    d00, d01, d11 = (np.einsum("ni,ni->n", x, y) for x, y in ((ab, ab), (ab, ac), (ac, ac)))
-    d20, d21 = (np.einsum("ni,ni->n", ap, x) for x in (ab, ac))
+    ways = np.stack([b - a, c - a, points - a])
+    (d00, d01, d20), (_, d11, d21), _ = np.einsum("ani,bni->abn", ways, ways)
     determinant = np.maximum(d00 * d11 - d01 * d01, 1e-30)
     v = (d11 * d20 - d01 * d21) / determinant
     w = (d00 * d21 - d01 * d20) / determinant
@@ -151,3 +145,60 @@ def _settle(mesh: Mesh, beyond: np.ndarray, faces: np.ndarray, points: np.ndarra
         outside = outside[barycentrics[outside].min(axis=1) < -_EDGE_TOLERANCE]
     barycentrics = np.maximum(barycentrics, 0)
     return SurfacePoints(faces, barycentrics / barycentrics.sum(axis=1, keepdims=True))
+
+
+_MIDDLES = 0.5 * np.asarray([[1.0, 1, 0], [0, 1, 1], [1, 0, 1]])
+_QUARTERS = np.asarray([[0, 3, 5], [1, 4, 3], [2, 5, 4], [3, 4, 5]])
+"""Of a triangle with the middles of its edges after its corners."""
+
+
+class Rounding:
+    r"""The surface that bends as the normals of a mesh do, instead of its flat triangles.
+
+    Flat triangles under smooth normals shade themselves where the normals still face the light,
+    triangle by triangle: a ragged edge between light and shadow. The surface through the vertices
+    that has the normals there lies, to second order,
+
+        x + 1/2 sum_i u_i ((v_i - x) . n_i) n_i
+
+    from a point `x` of a triangle, with corners `v_i`, normals `n_i` and barycentric coordinates
+    `u_i`. That is a sum over edges, so that neighbors meet. Edges stay straight at the vertices of
+    hard edges: a box stays a box.
+
+    **Source:** Boubekeur and Alexa 2008, "Phong tessellation", with the weight (they prefer 3/4)
+    that keeps spheres round.
+    """
+
+    def __init__(self, mesh: Mesh):
+        place = distinct(mesh.vertices)[1]
+        corners, are_hard = hard_edges(mesh, place[mesh.faces])
+        is_smooth = np.ones(len(mesh.vertices), bool)
+        is_smooth[place[mesh.faces].ravel()[corners[are_hard]]] = False
+        self._mesh, self._is_smooth = mesh, is_smooth[place]
+
+    def positions(self, points: SurfacePoints) -> Float[np.ndarray, "n 3"]:
+        """Return points of the mesh moved from its triangles to the surface, mm."""
+        mesh, faces, moved = self._mesh, points.faces, points.positions(self._mesh)
+        for one, other in ((0, 1), (1, 2), (2, 0)):
+            v, w = mesh.faces[faces, one], mesh.faces[faces, other]
+            edge = mesh.vertices[w] - mesh.vertices[v]
+            away = [
+                np.einsum("ni,ni->n", edge, mesh.normals[at])[:, None] * mesh.normals[at]
+                for at in (v, w)
+            ]
+            share = 0.5 * points.barycentrics[:, one] * points.barycentrics[:, other]
+            share = np.where(self._is_smooth[v] & self._is_smooth[w], share, 0.0)
+            moved += share[:, None] * (away[1] - away[0])
+        return moved
+
+    def area(self) -> float:
+        """Measure the area of the surface, mm^2, by halving edges once and extrapolating."""
+        every = np.arange(len(self._mesh.faces))
+        middles = [
+            self.positions(SurfacePoints(every, np.broadcast_to(middle, (len(every), 3))))
+            for middle in _MIDDLES
+        ]
+        corners = np.concatenate([self._mesh.corners(), np.stack(middles, axis=1)], axis=1)
+        a, b, c = np.moveaxis(corners[:, _QUARTERS], 2, 0)
+        halved = 0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=-1).sum())
+        return halved + (halved - self._mesh.area()) / 3

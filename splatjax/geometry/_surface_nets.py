@@ -11,6 +11,8 @@ from ._mesh import Mesh, unit
 
 Distance = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, " n"]]
 _CHUNK = 1 << 14
+_STEP = 0.2  # mm
+_TETRAHEDRON = _STEP * np.asarray([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
 _CORNERS = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(-1, 3)
 _EDGES = [
     (a, a | bit) for bit in (4, 2, 1) for a in range(8) if not a & bit
@@ -98,7 +100,12 @@ def surface_nets(distance: Distance, low, high, spacing: float, *, slack: float 
     faces = _faces(cells, cells @ stride, stride, inside, first[:, None] + sheets, vertices)
     normals = np.zeros_like(vertices)
     for _ in range(2):
-        normals, level = _gradient(distance, vertices)
+        # The gradient by central differences over the corners of a tetrahedron.
+        levels = in_chunks(distance, (vertices[:, None] + _TETRAHEDRON).reshape(-1, 3))
+        levels = levels.reshape(-1, 4)
+        slope = levels @ _TETRAHEDRON / (4 * _STEP * _STEP)
+        length = np.maximum(np.linalg.norm(slope, axis=1), 1e-3)
+        normals, level = slope / length[:, None], levels.mean(axis=1) / length
         vertices = vertices - np.clip(level, -0.3 * spacing, 0.3 * spacing)[:, None] * normals
     return Mesh(vertices, faces, unit(normals))  # those of the second step, which is tiny
 
@@ -154,14 +161,3 @@ def _faces(cells, keys, stride, inside, vertex, vertices) -> Int[np.ndarray, "f 
         halves = quad[:, [0, 1, 2, 0, 2, 3]], quad[:, [0, 1, 3, 1, 2, 3]]
         triangles.append(np.where(is_first[:, None], *halves).reshape(-1, 3))
     return np.concatenate(triangles)
-
-
-def _gradient(distance: Distance, points: Float[np.ndarray, "n 3"], step: float = 0.2):
-    """Compute the unit gradient and the distance over its length, by central differences over the
-    corners of a tetrahedron.
-    """
-    corners = np.asarray([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) * step
-    levels = in_chunks(distance, (points[:, None] + corners).reshape(-1, 3)).reshape(-1, 4)
-    slope = levels @ corners / (4 * step * step)
-    length = np.maximum(np.linalg.norm(slope, axis=1), 1e-3)
-    return slope / length[:, None], levels.mean(axis=1) / length

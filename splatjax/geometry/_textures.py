@@ -30,26 +30,11 @@ class Textures(eqx.Module):
     normal: Float[np.ndarray, "h4 w4 3"] | None = None
 
 
-def lookup(
-    picture: Float[np.ndarray, "h w *channels"], uvs: Float[np.ndarray, "n 2"]
-) -> Float[np.ndarray, "n *channels"]:
-    """Look a picture up at texture coordinates (v up), bilinearly between the centers of its
-    pixels, repeating it.
-    """
-    height, width = picture.shape[:2]
-    at = (1 - uvs[:, 1]) * height - 0.5, uvs[:, 0] * width - 0.5
-    planes = picture.reshape(height, width, -1)
-    values = [
-        scipy.ndimage.map_coordinates(plane, at, order=1, mode="grid-wrap")
-        for plane in np.moveaxis(planes, -1, 0)
-    ]
-    return np.stack(values, axis=-1).reshape(len(uvs), *picture.shape[2:])
-
-
 def lookup_at(
     mesh: Mesh, points: SurfacePoints, picture: Float[np.ndarray, "h w *channels"] | None
 ) -> Float[np.ndarray, "n *channels"] | None:
-    """Look a picture up at points on a mesh; `None` for no picture.
+    """Look a picture up at points on a mesh, bilinearly between the centers of its pixels,
+    repeating it; `None` for no picture.
 
     **Raises:** `ValueError` when the mesh has no texture coordinates.
     """
@@ -60,7 +45,14 @@ def lookup_at(
             "the mesh has no texture coordinates, so no texture can be laid on it; give a mesh "
             "with UVs, or no textures"
         )
-    return lookup(picture, np.einsum("nc,nci->ni", points.barycentrics, mesh.uvs[points.faces]))
+    u, v = np.einsum("nc,nci->in", points.barycentrics, mesh.uvs[points.faces])
+    height, width = picture.shape[:2]
+    at = (1 - v) * height - 0.5, u * width - 0.5
+    planes = np.moveaxis(picture.reshape(height, width, -1), -1, 0)
+    values = [
+        scipy.ndimage.map_coordinates(plane, at, order=1, mode="grid-wrap") for plane in planes
+    ]
+    return np.stack(values, axis=-1).reshape(len(u), *picture.shape[2:])
 
 
 def albedo_at(

@@ -2,18 +2,18 @@
 shape.
 """
 
-from ._losses import (
+from ._fit_scene import (
+    fit_scene as fit_scene,
+    FittedScene as FittedScene,
+    GradientTransformation as GradientTransformation,
+)
+from ._observation import (
     AbstractBackground as AbstractBackground,
     BlackBackground as BlackBackground,
     UnknownBackground as UnknownBackground,
     AbstractLoss as AbstractLoss,
     HuberLoss as HuberLoss,
     SquaredLoss as SquaredLoss,
-)
-from ._descent import GradientTransformation as GradientTransformation
-from ._fit_scene import fit_scene as fit_scene, FittedScene as FittedScene
-from ._layers import wide_variances as wide_variances
-from ._observation import (
     AbstractIntensity as AbstractIntensity,
     KnownIntensity as KnownIntensity,
     UnknownColor as UnknownColor,
@@ -34,6 +34,6 @@ from ._parts import (
     LightPlaces as LightPlaces,
     LightStrengths as LightStrengths,
 )
+from ._problem import wide_variances as wide_variances
 from ._recover import recover as recover
-from ._estimate import Estimate as Estimate
-from ._recovery import combined as combined, Recovery as Recovery
+from ._recovery import combined as combined, Estimate as Estimate, Recovery as Recovery

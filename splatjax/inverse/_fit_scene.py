@@ -2,33 +2,150 @@
 
 import math
 from collections.abc import Callable, Sequence
-from typing import TypeVar
+from typing import Any, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jaxtyping import DTypeLike, Float, PyTree
+from jaxtyping import Array, Float, PyTree
 
 from splatjax._records import as_floats
-from splatjax.render import Plan, RenderSettings
-from splatjax.scene import AbstractLight, Camera, Material, Scene, Splats
+from splatjax.render import Plan, RenderSettings, render
+from splatjax.scene import AbstractLight, Camera, Material, Splats
 
-from ._descent import (
-    Coordinates,
-    Evaluation,
-    GradientTransformation,
-    MovableScene,
-    advance,
-    evaluate,
-    standard_promotion,
+from ._observation import (
+    AbstractBackground,
+    AbstractLoss,
+    Evidence,
+    KnownIntensity,
+    Observation,
+    SquaredLoss,
+    UnknownBackground,
+    check_channels,
+    check_counted,
+    compared,
 )
-from ._layers import make_plans
-from ._losses import AbstractBackground, AbstractLoss, SquaredLoss, UnknownBackground
-from ._observation import Evidence, KnownIntensity, Observation, check_channels, nothing_counts
 from ._parts import AbstractPart, Setup
+from ._problem import make_plans
 
-Tree = TypeVar("Tree", bound=PyTree)
+Coordinates = tuple[PyTree[Array], ...]
+"""Of each part; where pictures do not share it, a tuple with those of each picture."""
+
+
+@runtime_checkable
+class GradientTransformation(Protocol):
+    """An optimizer of optax: a pair of functions."""
+
+    init: Callable[..., Any]
+    update: Callable[..., Any]
+
+
+class MovableScene(eqx.Module):
+    """The material, and the parts of the scene that may move."""
+
+    material: Material
+    parts: tuple[AbstractPart, ...]
+    prepared: tuple[PyTree[Array], ...]
+
+    @classmethod
+    def of(
+        cls, splats: Splats, material: Material, parts: Sequence[AbstractPart]
+    ) -> "MovableScene":
+        return cls(material, tuple(parts), tuple(part.prepared(splats) for part in parts))
+
+    def start(self, setups: Sequence[Setup]) -> Coordinates:
+        """Return the coordinates of the start: zeros."""
+        return tuple(
+            part.coordinates(setups[0])
+            if part.shared
+            else tuple(part.coordinates(setup) for setup in setups)
+            for part in self.parts
+        )
+
+    def of_picture(self, x: Coordinates, number: int) -> Coordinates:
+        """Select the coordinates that a picture depends on."""
+        return tuple(
+            own if part.shared else own[number] for part, own in zip(self.parts, x, strict=True)
+        )
+
+    def of_all(self, pictures: Sequence[Coordinates]) -> Coordinates:
+        """Combine derivatives in the coordinates of each picture: add those of shared parts."""
+        return tuple(
+            jax.tree.map(lambda *leaves: sum(leaves[1:], leaves[0]), *own) if part.shared else own
+            for part, own in zip(self.parts, zip(*pictures, strict=True), strict=True)
+        )
+
+    def moved(self, setup: Setup, x: Coordinates) -> Setup:
+        """Move the parts of a picture."""
+        for part, own, prepared in zip(self.parts, x, self.prepared, strict=True):
+            setup = part.moved(setup, own, prepared)
+        return setup
+
+    def prior(self, x: Coordinates) -> Float[Array, ""] | float:
+        return sum(
+            part.prior(one, prepared)
+            for part, own, prepared in zip(self.parts, x, self.prepared, strict=True)
+            for one in ((own,) if part.shared else own)
+        )
+
+
+class Evaluation(eqx.Module):
+    """A rendered picture and its loss: the sum over its values, and the gradient in the coordinates
+    of the picture.
+    """
+
+    loss: Float[Array, ""]
+    gradient: Coordinates
+    overflow: Float[Array, ""]
+    beauty: Float[Array, "height width channels"]
+    counted: Float[Array, "height width"]
+
+
+@eqx.filter_jit
+def evaluate(
+    x: Coordinates,
+    scene: MovableScene,
+    setup: Setup,
+    evidence: Evidence,
+    plan: Plan,
+    settings: RenderSettings,
+    loss: AbstractLoss,
+    background: AbstractBackground,
+) -> Evaluation:
+    """Render a picture at its coordinates, and differentiate its loss."""
+
+    def total_loss(x):
+        moved = scene.moved(setup, x)
+        frame = render(moved.scene(scene.material), moved.camera, settings, plan)
+        counted = evidence.counted(frame.coverage, background)
+        residuals = evidence.residuals(frame.beauty, counted, loss)
+        return jnp.sum(residuals**2), (counted, frame)
+
+    (value, (counted, frame)), gradient = jax.value_and_grad(total_loss, has_aux=True)(x)
+    return Evaluation(value, gradient, frame.overflow, frame.beauty, counted)
+
+
+@eqx.filter_jit
+def advance(
+    x: Coordinates,
+    state: PyTree,
+    evaluations: Sequence[Evaluation],
+    scene: MovableScene,
+    optimizer: GradientTransformation,
+):
+    """Take a step; also return the loss before it, and whether loss and gradient are finite."""
+    prior, prior_gradient = jax.value_and_grad(lambda x: jnp.asarray(scene.prior(x)))(x)
+    counts = [jnp.sum(one.counted) * one.beauty.shape[2] for one in evaluations]
+    count = jnp.maximum(sum(counts), 1.0)
+    gradients = scene.of_all([one.gradient for one in evaluations])
+    gradient = jax.tree.map(lambda *leaves: sum(leaves) / count, gradients, prior_gradient)
+    loss = (sum(one.loss for one in evaluations) + prior) / count
+    finite = jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves((loss, gradient))])
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+        updates, state = optimizer.update(gradient, state, x)
+    return jax.tree.map(jnp.add, x, updates), state, loss, jnp.all(finite)
 
 
 class FittedScene(eqx.Module):
@@ -58,10 +175,6 @@ class FittedScene(eqx.Module):
     result: optx.RESULTS
     best: int = eqx.field(static=True)
     plans: int = eqx.field(static=True)
-
-    def scene(self, picture: int = 0) -> Scene:
-        """Return the scene of a picture."""
-        return Scene(self.splats, self.lights[picture], self.material)
 
 
 def fit_scene(
@@ -121,17 +234,16 @@ def fit_scene(
     _check(observations, material, parts, steps)
     report = progress or (lambda stage, loss: None)
     dtype = splats.centers.dtype
-    setups = [_cast(Setup(splats, one.camera, one.lights), dtype) for one in observations]
-    scene = MovableScene.of(setups[0].splats, _cast(material, dtype), parts)
+    setups, material = jax.tree.map(
+        lambda leaf: as_floats(np.asarray(leaf), dtype),
+        ([Setup(splats, one.camera, one.lights) for one in observations], material),
+    )
+    scene = MovableScene.of(setups[0].splats, material, parts)
     evidence = [Evidence.of(one, dtype) for one in observations]
     x = scene.start(setups)
 
     def moved(x: Coordinates) -> list[Setup]:
         return [scene.moved(setup, scene.of_picture(x, i)) for i, setup in enumerate(setups)]
-
-    def plan_all(x: Coordinates) -> list[Plan]:
-        scenes = [Scene(one.splats, one.lights, scene.material) for one in moved(x)]
-        return make_plans(scenes, [one.camera for one in moved(x)], settings)
 
     def evaluate_all(x: Coordinates, plans: list[Plan]) -> list[Evaluation]:
         return [
@@ -140,8 +252,9 @@ def fit_scene(
         ]
 
     report("planning", math.nan)
-    plans, times = plan_all(x), 1
-    with standard_promotion():
+    plans, times = make_plans(moved(x), material, settings), 1
+    # Optimizers are written for JAX's default rules, whatever the user has set.
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
         state = optimizer.init(x)
     best, at, losses, result = None, x, [], optx.RESULTS.successful
     for step in range(steps + 1):
@@ -149,13 +262,11 @@ def fit_scene(
         if max(float(one.overflow) for one in evaluations) > 0:
             last = losses[-1] if losses else math.nan
             report(f"step {step}: the scene exceeds the capacity of its plan; planning again", last)
-            plans, times = plan_all(x), times + 1
+            plans, times = make_plans(moved(x), material, settings), times + 1
             evaluations = evaluate_all(x, plans)
-        for i, evaluation in enumerate(evaluations if step == 0 else ()):
-            if not np.any(np.asarray(evaluation.counted) > 0):
-                raise nothing_counts(i)
-        values = [(one.loss, one.count, one.gradient) for one in evaluations]
-        ahead, state, value, finite = advance(x, state, values, scene, optimizer)
+        if step == 0:
+            check_counted([one.counted for one in evaluations])
+        ahead, state, value, finite = advance(x, state, evaluations, scene, optimizer)
         losses.append(float(value))
         if not bool(finite):
             result = optx.RESULTS.nonfinite
@@ -169,38 +280,28 @@ def fit_scene(
             "loss or gradient of the start is not finite: look for NaN in splats, lights and "
             "cameras, and for splats at a light"
         )
-    pictures = tuple(
-        np.where(np.asarray(one.counted)[..., None] > 0, np.asarray(one.beauty), np.nan)
-        for one in kept
+    pictures, residuals = compared(
+        [one.beauty for one in kept], [one.counted for one in kept], evidence
     )
+    setups = moved(at)
     fitted = FittedScene(
-        splats=moved(at)[0].splats,
-        cameras=tuple(one.camera for one in moved(at)),
-        lights=tuple(one.lights for one in moved(at)),
-        material=scene.material,
+        splats=setups[0].splats,
+        cameras=tuple(one.camera for one in setups),
+        lights=tuple(one.lights for one in setups),
+        material=material,
         losses=np.asarray(losses),
         pictures=pictures,
-        residuals=tuple(
-            made - np.asarray(one.picture) for made, one in zip(pictures, evidence, strict=True)
-        ),
+        residuals=residuals,
         result=result,
         best=best,
         plans=times,
     )
-    if throw and result != optx.RESULTS.successful:
-        return fitted.result.error_if(fitted, True)
-    return fitted
-
-
-def _cast(tree: Tree, dtype: DTypeLike) -> Tree:
-    return jax.tree.map(lambda leaf: as_floats(np.asarray(leaf), dtype), tree)
+    failed = result != optx.RESULTS.successful
+    return result.error_if(fitted, True) if throw and failed else fitted
 
 
 def _check(
-    observations: list[Observation],
-    material: Material,
-    parts: list[AbstractPart],
-    steps: int,
+    observations: list[Observation], material: Material, parts: list[AbstractPart], steps: int
 ) -> None:
     if not observations or not parts or steps < 1:
         raise ValueError(
@@ -210,9 +311,8 @@ def _check(
     kinds = [type(part).__name__ for part in parts]
     if len(set(kinds)) < len(kinds):
         raise ValueError(f"each kind of part may be given once; parts are {', '.join(kinds)}")
-    channels = material.channels
+    check_channels(observations, material.channels, "material")
     for i, observation in enumerate(observations):
-        check_channels(i, observation, channels, "material")
         if not isinstance(observation.intensity, KnownIntensity):
             raise ValueError(
                 f"observations[{i}].intensity is {type(observation.intensity).__name__}(): that is "

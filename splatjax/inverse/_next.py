@@ -15,13 +15,10 @@ from splatjax.render import RenderSettings
 from splatjax.scattering import Dipole, Medium
 from splatjax.scene import AbstractLight, Camera, DirectionalLight, GaussianBeam, Splats
 
-from ._estimate import Combination, best_and_worst
-from ._flat import which_count
-from ._layers import render_layers
-from ._losses import SquaredLoss
-from ._observation import AbstractIntensity, Evidence, KnownIntensity, Observation
-from ._problem import FittedVariances, RecoveryProblem, Unknowns, solution
-from ._recovery import Recovery
+from ._observation import AbstractIntensity, Evidence, KnownIntensity, SquaredLoss
+from ._parts import Setup
+from ._problem import RecoveryProblem, Unknowns, fit_near, render_layers, solution
+from ._recovery import Combination, Recovery, best_and_worst
 
 
 @record
@@ -94,23 +91,22 @@ def next_pictures(
         )
     medium, loss = recovery.medium, SquaredLoss()
     channels, dtype = medium.channels, medium.eta.dtype
-    observations = []
-    for one in candidates:
-        dark = np.zeros((one.camera.height, one.camera.width, channels))
-        observations.append(Observation(dark, one.camera, one.lights, intensity=one.intensity))
-    rendered, _ = render_layers(splats, recovery.material, observations, settings)
-    fit = FittedVariances(recovery.material.gaussians.variances.astype(dtype), weights)
+    setups = [Setup(splats, one.camera, one.lights) for one in candidates]
+    pictures, _ = render_layers(setups, recovery.material, settings)
+    near = recovery.material.gaussians.variances.astype(dtype)
+    fit = eqx.Partial(fit_near, near=near, weights=weights)
     noise = recovery.relative_noise * recovery.scale**0.5
     predictions = []
-    for candidate, observation, picture in zip(candidates, observations, rendered, strict=True):
-        evidence = [Evidence.of(observation, dtype)]
+    for candidate, picture in zip(candidates, pictures, strict=True):
+        dark = jnp.zeros_like(picture.specular, dtype)
+        known = jnp.ones(dark.shape[:2], bool)
+        evidence = Evidence(dark, jnp.ones_like(dark), known, relative_noise=1.0)
         unknowns = Unknowns.of(medium.eta, [candidate.intensity])
-        counted = which_count([picture], evidence)
-        problem = RecoveryProblem.of([picture], evidence, counted, unknowns, fit, loss, model)
+        problem = RecoveryProblem.of([picture], [evidence], unknowns, fit, loss, model)
         at_point = solution(problem, unknowns.start(medium))
-        bright = float(jnp.sqrt(jnp.mean(at_point.radiance**2)))
-        deviation = noise * (bright or 1.0) / float(problem.deviation[0, 0])
-        scale = max(deviation, np.finfo(float).tiny) ** -2
+        radiance = np.asarray(at_point.radiance[0])[np.asarray(problem.counted[0]) > 0]
+        bright = float(np.sqrt(np.mean(radiance**2)))
+        scale = max(noise * (bright or 1.0), np.finfo(float).tiny) ** -2
         information = np.asarray(at_point.information, float) * scale
         more = _marginal(information, channels, len(recovery.information))
         predictions.append(Prediction(candidate, recovery.covariance(more)))
@@ -153,21 +149,15 @@ def default_candidates(splats: Splats, camera: Camera, channels: int = 3) -> lis
     }
     strength, eye = np.full(channels, np.pi), np.asarray(camera.position, float)
     squared_spacing = float(np.mean(splats.areas))
-    spot = _middle(splats, camera)
+    # The center of the nearest splat at the middle of the picture, or beside it.
+    centers = np.asarray(splats.centers, float)
+    across, below, depth = np.stack([right, down, forward]) @ (centers - eye).T
+    aside = np.hypot(across, below) / np.maximum(depth, 1e-9) + np.where(depth > 0, 0.0, np.inf)
+    reach = 1.5 * np.min(aside) + 2 * float(np.mean(splats.radii)) / float(np.mean(depth))
+    spot = centers[np.argmin(np.where(aside <= reach, depth, np.inf))]
     beam = GaussianBeam(eye, spot - eye, strength * squared_spacing, 4 * squared_spacing)
     lights = {
         name: DirectionalLight(direction=direction, irradiance=strength)
         for name, direction in directions.items()
     } | {"a laser dot in the middle": beam}
     return [Candidate(name, camera, light) for name, light in lights.items()]
-
-
-def _middle(splats: Splats, camera: Camera) -> np.ndarray:
-    """Find the center of the nearest splat at the middle of the picture, or beside it."""
-    centers = np.asarray(splats.centers, float)
-    across, down, depth = (
-        np.asarray(camera.rotation, float) @ (centers - np.asarray(camera.position, float)).T
-    )
-    aside = np.hypot(across, down) / np.maximum(depth, 1e-9) + np.where(depth > 0, 0.0, np.inf)
-    reach = 1.5 * np.min(aside) + 2 * float(np.mean(splats.radii)) / float(np.mean(depth))
-    return centers[np.argmin(np.where(aside <= reach, depth, np.inf))]

@@ -1,15 +1,19 @@
-"""A picture that was taken, and how."""
+"""A picture that was taken and how, which of its pixels count, and how much their residuals do."""
 
 import abc
+from collections.abc import Sequence
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, DTypeLike, Float
 
-from splatjax._records import Numbers, check_values, numbers, record, several
+from splatjax._records import check_values, numbers, record, several
 from splatjax.scene import AbstractLight, Camera
 
+_FILLED = 0.999
+"""Coverage of a pixel behind which nothing else is seen."""
 _UNKNOWN_NOISE = 0.01
 """Deviation of pictures that come without one, as a fraction of their brightness: error bars do not
 depend on it.
@@ -51,10 +55,6 @@ class UnknownColor(AbstractIntensity):
         return np.arange(channels)
 
 
-def _to_mask(values: Numbers | None) -> Array | None:
-    return None if values is None else jnp.asarray(values, bool)
-
-
 @record
 class Observation(eqx.Module):
     r"""A picture of the body, linear light, and how it was taken.
@@ -78,7 +78,9 @@ class Observation(eqx.Module):
     picture: Float[Array, "height width channels"] = eqx.field(converter=numbers)
     camera: Camera
     lights: tuple[AbstractLight, ...] = eqx.field(converter=several)
-    mask: Bool[Array, "height width"] | None = eqx.field(converter=_to_mask, default=None)
+    mask: Bool[Array, "height width"] | None = eqx.field(
+        converter=lambda values: None if values is None else jnp.asarray(values, bool), default=None
+    )
     deviation: Float[Array, "height width channels"] | None = eqx.field(
         converter=numbers, default=None
     )
@@ -94,6 +96,77 @@ class Observation(eqx.Module):
                     f"camera {size[0]} x {size[1]} (height, width)"
                 )
         check_values("Observation.deviation", self.deviation, "positive", lambda x: x > 0)
+
+
+class AbstractLoss(eqx.Module):
+    """The loss of a pixel, as a function of its residual in units of its deviation."""
+
+    @abc.abstractmethod
+    def root(self, residuals: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Compute the root of the loss, with the sign of the residual: near zero the
+        residual itself.
+        """
+
+
+class SquaredLoss(AbstractLoss):
+    """The square: right for noise that is normal, misled by every highlight that the model does not
+    know.
+    """
+
+    def root(self, residuals: Float[Array, "..."]) -> Float[Array, "..."]:
+        return residuals
+
+
+class HuberLoss(AbstractLoss):
+    r"""The square for small residuals and twice the absolute value times the bend for large ones,
+    smoothly.
+
+        loss(r) = 2 b^2 (sqrt(1 + r^2 / b^2) - 1)
+
+    **Attributes:**
+
+    - `bend`: deviations at which one becomes the other, positive. Static.
+
+    **Raises:** `ValueError` for a bend that is not positive.
+
+    **Source:** Huber 1964; in this smooth form Charbonnier and others 1997.
+    """
+
+    bend: float = eqx.field(static=True, default=2.0)
+
+    def __check_init__(self):
+        if not self.bend > 0:
+            raise ValueError(f"bend must be positive (deviations); got {self.bend:g}")
+
+    def root(self, residuals: Float[Array, "..."]) -> Float[Array, "..."]:
+        squared = (residuals / self.bend) ** 2
+        return residuals * jnp.sqrt(2 / (1 + jnp.sqrt(1 + squared)))
+
+
+class AbstractBackground(eqx.Module):
+    """Which pixels count, by how much of them the body covers."""
+
+    @abc.abstractmethod
+    def counts(self, coverage: Float[Array, "height width"]) -> Float[Array, "height width"]:
+        """Return 1 for pixels that count, 0 for others; constant to the derivative."""
+
+
+class UnknownBackground(AbstractBackground):
+    """Anything: pixels that the body does not fill do not count. A silhouette then tells
+    nothing.
+    """
+
+    def counts(self, coverage: Float[Array, "height width"]) -> Float[Array, "height width"]:
+        return jax.lax.stop_gradient(jnp.where(coverage > _FILLED, 1.0, 0.0).astype(coverage.dtype))
+
+
+class BlackBackground(AbstractBackground):
+    """Nothing that sends light: all pixels count, and where the body ends is what tells most of a
+    camera's pose.
+    """
+
+    def counts(self, coverage: Float[Array, "height width"]) -> Float[Array, "height width"]:
+        return jnp.ones_like(coverage)
 
 
 class Evidence(eqx.Module):
@@ -127,19 +200,55 @@ class Evidence(eqx.Module):
         arrays = jnp.asarray(picture, dtype), jnp.asarray(deviation, dtype), jnp.asarray(known)
         return cls(*arrays, relative_noise=float(np.median(deviation)) / brightness)
 
+    def counted(
+        self, coverage: Float[Array, "height width"], background: AbstractBackground
+    ) -> Float[Array, "height width"]:
+        """Return 1 for pixels that count, else 0."""
+        return jnp.where(self.known, background.counts(coverage), 0.0)
 
-def nothing_counts(number: int) -> ValueError:
-    """Make the error for an observation without a pixel that counts."""
-    return ValueError(
-        f"no pixel of observations[{number}] counts: none is filled by the splats, left by the "
-        "mask and of known color; check camera, mask and NaN"
-    )
+    def residuals(
+        self,
+        picture: Float[Array, "height width channels"],
+        counted: Float[Array, "height width"],
+        loss: AbstractLoss,
+    ) -> Float[Array, "height width channels"]:
+        """Compute residuals whose squares are the losses; 0 where a pixel does not count."""
+        residuals = (picture - self.picture) / self.deviation
+        return loss.root(jnp.where(counted[..., None] > 0, residuals, 0.0))
 
 
-def check_channels(number: int, observation: Observation, channels: int, source: str) -> None:
+def check_channels(observations: Sequence[Observation], channels: int, source: str) -> None:
     """Raise `ValueError` for a picture of another number of channels than its source has."""
-    found = observation.picture.shape[2]
-    if found != channels:
-        raise ValueError(
-            f"observations[{number}].picture has {found} channels, {source} has {channels}"
-        )
+    for i, observation in enumerate(observations):
+        found = observation.picture.shape[2]
+        if found != channels:
+            raise ValueError(
+                f"observations[{i}].picture has {found} channels, {source} has {channels}"
+            )
+
+
+def check_counted(counted: Sequence[Float[Array, "height width"]]) -> None:
+    """Raise `ValueError` for an observation without a pixel that counts."""
+    for i, pixels in enumerate(counted):
+        if not np.any(pixels):
+            raise ValueError(
+                f"no pixel of observations[{i}] counts: none is filled by the splats, left by the "
+                "mask and of known color; check camera, mask and NaN"
+            )
+
+
+def compared(
+    pictures: Sequence[Float[Array, "_ _ channels"]],
+    counted: Sequence[Float[Array, "_ _"]],
+    evidence: Sequence[Evidence],
+) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
+    """Return the pictures, NaN where pixels do not count, and what is left of them without the
+    observed ones.
+    """
+    made = tuple(
+        np.where(np.asarray(pixels)[..., None] > 0, picture, np.nan)
+        for picture, pixels in zip(pictures, counted, strict=True)
+    )
+    return made, tuple(
+        picture - np.asarray(one.picture) for picture, one in zip(made, evidence, strict=True)
+    )

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from splatjax.scene import AbstractLight, Camera, Splats
+from splatjax.scene import AbstractLight, Camera, Material, Scene, Splats
 
 _BOUNDED = 1e-3
 """An albedo moves between this and one less this: at 0 and 1 themselves the logit is infinite."""
@@ -21,6 +21,9 @@ class Setup(eqx.Module):
     splats: Splats
     camera: Camera
     lights: tuple[AbstractLight, ...]
+
+    def scene(self, material: Material) -> Scene:
+        return Scene(self.splats, self.lights, material)
 
 
 class AbstractPart(eqx.Module):
@@ -140,7 +143,11 @@ class LightPlaces(AbstractPart):
 
     def coordinates(self, setup: Setup) -> tuple[dict[str, Float[Array, "3"]], ...]:
         return tuple(
-            {name: jnp.zeros_like(getattr(light, name)) for name in _places(light)}
+            {
+                name: jnp.zeros_like(getattr(light, name))
+                for name in ("direction", "position", "origin")
+                if hasattr(light, name)
+            }
             for light in setup.lights
         )
 
@@ -208,15 +215,8 @@ def rotation(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
 
 def _with_lights(setup: Setup, changes: list[dict[str, Array]]) -> Setup:
     """Replace fields of the lights."""
-
-    def fields(setup):
-        lights = zip(setup.lights, changes, strict=True)
-        return [getattr(light, name) for light, values in lights for name in values]
-
-    values = [value for light in changes for value in light.values()]
-    return eqx.tree_at(fields, setup, values) if values else setup
-
-
-def _places(light: AbstractLight) -> list[str]:
-    """Name the fields of a light that say where it is."""
-    return [name for name in ("direction", "position", "origin") if hasattr(light, name)]
+    lights = list(setup.lights)
+    for i, values in enumerate(changes):
+        for name, value in values.items():
+            lights[i] = eqx.tree_at(lambda light, name=name: getattr(light, name), lights[i], value)
+    return Setup(setup.splats, setup.camera, tuple(lights))

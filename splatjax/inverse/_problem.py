@@ -1,6 +1,8 @@
-"""Coefficients in, residuals out: what the least squares solver sees."""
+"""Coefficients in, residuals out: what the least squares solver sees, made of pictures with all
+their layers, which serve many materials.
+"""
 
-import abc
+import math
 from collections.abc import Callable, Sequence
 
 import equinox as eqx
@@ -8,19 +10,99 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, DTypeLike, Float, Int
 
 from splatjax.diffusion import resolved_fraction
-from splatjax.fitting import AbstractWeights, GivenVariances, fit_gaussians, fit_weights
+from splatjax.fitting import AbstractWeights, GivenVariances, fit_gaussians
 from splatjax.gaussians import AbstractProfile, SumOfGaussians
-from splatjax.render import DiffusionBasis
+from splatjax.render import DiffusionBasis, Plan, RenderSettings, diffusion_basis, make_plan
 from splatjax.scattering import Medium
+from splatjax.scene import Material, Splats
 
-from ._flat import FlatPictures, flatten, in_a_row
-from ._losses import AbstractLoss
-from ._observation import AbstractIntensity, Evidence
+from ._observation import (
+    AbstractIntensity,
+    AbstractLoss,
+    Evidence,
+    UnknownBackground,
+    check_counted,
+)
+from ._parts import Setup
 
 _STEPS = 64
+_LARGER = 3.0
+"""Of a wide range: the ratio of neighboring variances. It leaves dipoles an error of 0.2%."""
+_NARROWEST, _WIDEST = 0.05, 200.0
+"""Squared mean free paths: where the Gaussians of a dipole's fit lie, and beyond."""
+_GRID = math.log(1.15)
+"""Between the log variances that plans are made for; a plan holds for more than that."""
+_REACH = 10.0
+"""In variance: of coefficients that are off by a factor of three at the start."""
+
+
+def make_plans(setups: Sequence[Setup], material: Material, settings: RenderSettings) -> list[Plan]:
+    """Make a plan for each picture. Pictures that may share one do, so that nothing is compiled
+    twice.
+    """
+    keys = [(one.camera.width, one.camera.height, jax.tree.structure(one.lights)) for one in setups]
+    plans = {}
+    for key in dict.fromkeys(keys):
+        alike = [one for one, other in zip(setups, keys, strict=True) if other == key]
+        scenes, cameras = [one.scene(material) for one in alike], [one.camera for one in alike]
+        plans[key] = make_plan(scenes, cameras, settings)
+    return [plans[key] for key in keys]
+
+
+def render_layers(
+    setups: Sequence[Setup],
+    material: Material,
+    settings: RenderSettings,
+    plans: list[Plan] | None = None,
+    derivative: bool = True,
+) -> tuple[list[DiffusionBasis], list[Plan]]:
+    """Render all that weights do not change, one picture after the other.
+
+    **Arguments:**
+
+    - `plans`: used if they suffice.
+    - `derivative`: whether variances may be a little off those of the material.
+
+    **Returns:** the pictures, and the plans that they were rendered with.
+    """
+
+    def render(plans):
+        return [
+            jax.block_until_ready(
+                diffusion_basis(one.scene(material), one.camera, settings, plan, derivative)
+            )
+            for one, plan in zip(setups, plans, strict=True)
+        ]
+
+    pictures = render(plans) if plans else []
+    if not pictures or any(float(picture.overflow) > 0 for picture in pictures):
+        # On a coarse grid, so that nearly equal materials have plans of the same shapes, and one
+        # program.
+        variances = jnp.round(jnp.log(material.gaussians.variances) / _GRID) * _GRID
+        rounded = SumOfGaussians(jnp.exp(variances), material.gaussians.weights)
+        plans = make_plans(setups, material.surface_of(rounded), settings)
+        pictures = render(plans)
+    return pictures, plans or []
+
+
+def wide_variances(media: Sequence[Medium], splats: Splats) -> Float[Array, " gaussians"]:
+    r"""Choose variances (mm^2) that serve all media near some: each three times the one before.
+
+    They hold what coefficients up to three times as large, or as small, make of a dipole. None is
+    much wider than the body.
+    """
+    paths = np.concatenate([1 / np.asarray(medium.sigma_t_prime, np.float64) for medium in media])
+    root = np.concatenate([np.asarray(medium.squared_sigma_tr, np.float64) for medium in media])
+    squared_diffuse = 1 / np.maximum(root, 1e-12)
+    low = _NARROWEST * np.min(paths**2) / _REACH
+    high = np.max(np.maximum(_WIDEST * paths**2, 3 * squared_diffuse)) * _REACH
+    size = float(np.sum(np.var(np.asarray(splats.centers, np.float64), axis=0)))
+    high = max(min(high, size), _LARGER * low)
+    count = max(2, math.ceil(math.log(high / low) / math.log(_LARGER)) + 1)
+    return jnp.asarray(low * _LARGER ** np.arange(count), media[0].sigma_a.dtype)
 
 
 class Unknowns(eqx.Module):
@@ -59,44 +141,29 @@ class Unknowns(eqx.Module):
         return jnp.pad(coefficients, (0, self.count))
 
 
-class AbstractGaussianFit(eqx.Module):
-    """How the Gaussians follow from a profile."""
-
-    @abc.abstractmethod
-    def gaussians(self, profile: AbstractProfile) -> SumOfGaussians:
-        """Fit the Gaussians of a profile. Differentiable."""
-
-
-class FixedVariances(AbstractGaussianFit):
-    """The variances are the same for all media."""
-
-    variances: Float[Array, " gaussians"]
-    weights: AbstractWeights
-
-    def gaussians(self, profile: AbstractProfile) -> SumOfGaussians:
-        return fit_weights(profile, self.variances, weights=self.weights)
-
-
-class FittedVariances(AbstractGaussianFit):
-    """The variances are those of the best fit to each medium, and move with the weights."""
-
-    near: Float[Array, " gaussians"]
-    weights: AbstractWeights
-
-    def gaussians(self, profile: AbstractProfile) -> SumOfGaussians:
-        start, count = GivenVariances(self.near), len(self.near)
-        fit = fit_gaussians(profile, count, weights=self.weights, start=start, throw=False)
-        return fit.gaussians
+def fit_near(
+    profile: AbstractProfile, near: Float[Array, " gaussians"], weights: AbstractWeights
+) -> SumOfGaussians:
+    """Fit Gaussians whose variances lie near given ones, and move as the profile does."""
+    start = GivenVariances(near)
+    return fit_gaussians(profile, len(near), weights=weights, start=start, throw=False).gaussians
 
 
 class RecoveryProblem(eqx.Module):
-    """Observed pictures, and how pictures are made from coefficients."""
+    """Observed pictures, and how pictures are made from coefficients.
 
-    pictures: FlatPictures
-    observed: Float[Array, "channels pixels"]
-    deviation: Float[Array, "channels pixels"]
+    **Attributes:**
+
+    - `pictures`: of all materials, with the points alone that light pixels that count.
+    - `counted`: 1 for pixels that count, else 0.
+    - `fit`: the Gaussians of a profile. Differentiable.
+    """
+
+    pictures: tuple[DiffusionBasis, ...]
+    counted: tuple[Float[Array, "_ _"], ...]
+    evidence: tuple[Evidence, ...]
     unknowns: Unknowns
-    fit: AbstractGaussianFit
+    fit: Callable[[AbstractProfile], SumOfGaussians]
     loss: AbstractLoss
     model: Callable[[Medium], AbstractProfile] = eqx.field(static=True)
 
@@ -105,30 +172,55 @@ class RecoveryProblem(eqx.Module):
         cls,
         pictures: Sequence[DiffusionBasis],
         evidence: Sequence[Evidence],
-        counted: Sequence[np.ndarray],
         unknowns: Unknowns,
-        fit: AbstractGaussianFit,
+        fit: Callable[[AbstractProfile], SumOfGaussians],
         loss: AbstractLoss,
         model: Callable[[Medium], AbstractProfile],
     ) -> "RecoveryProblem":
-        """Compare rendered pictures with the observed ones, at the pixels that count."""
-        dtype = unknowns.eta.dtype
-        observed, deviation = (
-            jnp.asarray(in_a_row(images, counted), dtype)
-            for images in ([one.picture for one in evidence], [one.deviation for one in evidence])
-        )
-        flat = flatten(pictures, counted, dtype)
-        return cls(flat, observed, deviation, unknowns, fit, loss, model)
+        """Compare rendered pictures with the observed ones, at the pixels that the body fills."""
+        dtype, background, kept, counted = unknowns.eta.dtype, UnknownBackground(), [], []
+        for picture, one in zip(pictures, evidence, strict=True):
+            counted.append(one.counted(picture.coverage.astype(dtype), background))
+            is_lit = np.any(np.asarray(picture.leaving) > 0, axis=0)
+            is_lit &= np.asarray(counted[-1]).reshape(-1)[np.asarray(picture.pixels)] > 0
+            kept.append(_with_points(picture, np.flatnonzero(is_lit), dtype))
+        check_counted(counted)
+        return cls(tuple(kept), tuple(counted), tuple(evidence), unknowns, fit, loss, model)
+
+    @property
+    def pixels(self) -> int:
+        """The number of pixels that count."""
+        return int(sum(np.sum(counted) for counted in self.counted))
 
     def gaussians(self, point: Float[Array, " unknowns"]) -> SumOfGaussians:
-        return self.fit.gaussians(self.model(self.unknowns.medium(point)))
+        return self.fit(self.model(self.unknowns.medium(point)))
 
-    def radiance(self, point: Float[Array, " unknowns"]) -> Float[Array, "channels pixels"]:
-        return self.pictures.radiance(self.gaussians(point), self.unknowns.intensities(point))
+    def radiance(
+        self, point: Float[Array, " unknowns"]
+    ) -> tuple[Float[Array, "_ _ channels"], ...]:
+        gaussians, intensities = self.gaussians(point), self.unknowns.intensities(point)
+        return tuple(
+            intensity[None, None] * picture.beauty(gaussians)
+            for intensity, picture in zip(intensities, self.pictures, strict=True)
+        )
 
-    def residuals(self, point: Float[Array, " unknowns"]) -> Float[Array, "channels pixels"]:
-        """Compute residuals whose squares are the losses."""
-        return self.loss.root((self.radiance(point) - self.observed) / self.deviation)
+    def residuals(self, point: Float[Array, " unknowns"]) -> Float[Array, "pixels channels"]:
+        """Compute residuals whose squares are the losses; 0 where a pixel does not count."""
+        together = zip(self.evidence, self.radiance(point), self.counted, strict=True)
+        residuals = [one.residuals(*made, self.loss) for one, *made in together]
+        return jnp.concatenate([each.reshape(-1, each.shape[-1]) for each in residuals])
+
+
+def _with_points(picture: DiffusionBasis, kept: np.ndarray, dtype: DTypeLike) -> DiffusionBasis:
+    """Keep some points of a picture, in the precision of a search."""
+
+    def along_points(picture):
+        return *picture.light.rows, picture.leaving, picture.in_front, picture.pixels
+
+    picture = eqx.tree_at(along_points, picture, replace_fn=lambda leaf: leaf[..., kept])
+    return jax.tree.map(
+        lambda leaf: leaf.astype(dtype) if eqx.is_inexact_array(leaf) else leaf, picture
+    )
 
 
 class SearchEnd(eqx.Module):
@@ -172,19 +264,19 @@ class Solution(eqx.Module):
 
     information: Float[Array, "all all"]
     gaussians: SumOfGaussians
-    radiance: Float[Array, "channels pixels"]
+    radiance: tuple[Float[Array, "_ _ channels"], ...]
     unresolved: Float[Array, " channels"]
 
 
 @eqx.filter_jit
 def solution(problem: RecoveryProblem, point: Float[Array, " unknowns"]) -> Solution:
-    """Compute the picture at a point, and the information about each unknown and the transition to
+    """Compute the pictures at a point, and the information about each unknown and the transition to
     unresolved layers.
     """
 
     def residuals(point, log_width):
         moved = eqx.tree_at(
-            lambda one: one.pictures.light.interval,
+            lambda one: [picture.light.interval for picture in one.pictures],
             problem,
             replace_fn=lambda interval: interval * jnp.exp(log_width),
         )
@@ -194,10 +286,12 @@ def solution(problem: RecoveryProblem, point: Float[Array, " unknowns"]) -> Solu
         point, jnp.zeros((), point.dtype)
     )
     # Every channel has a width of its own.
-    of_widths = of_width[..., None] * jnp.eye(len(of_width), dtype=of_width.dtype)[:, None]
+    of_widths = of_width[..., None] * jnp.eye(of_width.shape[1], dtype=of_width.dtype)[None]
     slopes = jnp.concatenate([slopes, of_widths], axis=-1)
-    light = problem.pictures.light
-    resolved = resolved_fraction(light.variances[:, None], light.area[None], light.interval)
-    unresolved = 1 - jnp.mean(jnp.where(light.mass > 0, resolved, 0.0), axis=1)
+    light = problem.pictures[0].light
+    areas = jnp.concatenate([picture.light.area for picture in problem.pictures])
+    mass = jnp.concatenate([picture.light.mass for picture in problem.pictures], axis=1)
+    resolved = resolved_fraction(light.variances[:, None], areas[None], light.interval)
+    unresolved = 1 - jnp.mean(jnp.where(mass > 0, resolved, 0.0), axis=1)
     unresolved = unresolved @ gaussians.weights / gaussians.total_reflectance()
-    return Solution(jnp.einsum("cpi,cpj->ij", slopes, slopes), gaussians, radiance, unresolved)
+    return Solution(jnp.einsum("pci,pcj->ij", slopes, slopes), gaussians, radiance, unresolved)

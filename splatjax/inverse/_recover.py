@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,19 +17,32 @@ from splatjax.fitting import (
     FixedTotalReflectance,
     NonNegativeWeights,
     fit_gaussians,
+    fit_weights,
 )
 from splatjax.gaussians import AbstractProfile, SumOfGaussians
 from splatjax.render import RenderSettings
 from splatjax.scattering import Dipole, Medium
 from splatjax.scene import Material, Splats
 
-from ._estimate import inverse
-from ._flat import in_pictures, which_count
-from ._layers import render_layers, wide_variances
-from ._losses import AbstractLoss, SquaredLoss
-from ._observation import Evidence, Observation, check_channels
-from ._problem import FittedVariances, FixedVariances, RecoveryProblem, Unknowns, search, solution
-from ._recovery import Recovery
+from ._observation import (
+    AbstractLoss,
+    Evidence,
+    Observation,
+    SquaredLoss,
+    check_channels,
+    compared,
+)
+from ._parts import Setup
+from ._problem import (
+    RecoveryProblem,
+    Unknowns,
+    fit_near,
+    render_layers,
+    search,
+    solution,
+    wide_variances,
+)
+from ._recovery import Recovery, inverse
 
 _FINE = RenderSettings(diffuser=ClusterDiffuser(error=2.5e-4))
 """Layers eight times finer than a picture needs: where much light comes back, 0.1% of it is 2% of
@@ -94,29 +108,29 @@ def recover(
     without absorption, for different indices of surface and starts, and for a picture none of whose
     pixels counts; an error with the message of `result` if `throw`.
     """
-    starts = [_in_full(start) for start in ([starts] if isinstance(starts, Medium) else starts)]
-    observations = list(observations)
+    starts = [starts] if isinstance(starts, Medium) else starts
+    dtype, observations = jnp.result_type(float), list(observations)
+    starts = [jax.tree.map(lambda leaf: leaf.astype(dtype), start) for start in starts]
     _check(observations, splats, starts, surface)
     report = progress or (lambda stage, medium: None)
     eta, channels = starts[0].eta, starts[0].channels
-    evidence = [Evidence.of(one, eta.dtype) for one in observations]
+    setups = [Setup(splats, one.camera, one.lights) for one in observations]
+    evidence = [Evidence.of(one, dtype) for one in observations]
     unknowns = Unknowns.of(eta, [one.intensity for one in observations])
     noise_is_known = all(one.deviation is not None for one in observations)
     wide = wide_variances(starts, splats)
-    gaussians = _unweighed(wide, channels)
-    surface = surface or Material(gaussians, eta=eta[0], specular=0)
-    surface = surface.surface_of(gaussians)
+    surface = surface or Material(_unweighed(wide, channels), eta=eta[0], specular=0)
 
-    def problem_of(rendered, fit):
-        mask = which_count(rendered, evidence)
-        return RecoveryProblem.of(rendered, evidence, mask, unknowns, fit, loss, model)
+    def problem_at(variances, fit, plans=None, derivative=True):
+        material = surface.surface_of(_unweighed(variances, channels))
+        pictures, plans = render_layers(setups, material, settings, plans, derivative)
+        return RecoveryProblem.of(pictures, evidence, unknowns, fit, loss, model), plans
 
     report(f"rendering {len(wide)} layers of {counted(len(observations), 'picture')}", starts[0])
-    rendered, _ = render_layers(splats, surface, observations, settings, derivative=False)
-    problem = problem_of(rendered, FixedVariances(wide, weights))
+    fit = eqx.Partial(fit_weights, variances=wide, weights=weights)
+    problem, _ = problem_at(wide, fit, derivative=False)
     report(
-        f"searching from {counted(len(starts), 'start')} among {problem.observed.shape[1]} pixels",
-        starts[0],
+        f"searching from {counted(len(starts), 'start')} among {problem.pixels} pixels", starts[0]
     )
     ends = [search(problem, unknowns.start(start)) for start in starts]
     costs = np.nan_to_num([float(end.cost) for end in ends], nan=np.inf)
@@ -125,26 +139,29 @@ def recover(
     while not settled and rounds < _ROUNDS:
         rounds += 1
         medium = unknowns.medium(best.point)
+        sigma_a, sigma_s_prime = (
+            "  ".join(f"{float(value):.3g}" for value in values)
+            for values in (medium.sigma_a, medium.sigma_s_prime)
+        )
         report(
             f"round {rounds}, of {_ROUNDS} at most: rendering the {count} layers of "
-            f"{_formatted(medium)}",
+            f"sigma_a {sigma_a}, sigma_s' {sigma_s_prime}",
             medium,
         )
         fitted = fit_gaussians(model(medium), count, weights=weights, throw=False).gaussians
-        surface = surface.surface_of(_unweighed(fitted.variances, channels))
-        rendered, plans = render_layers(splats, surface, observations, settings, plans)
-        problem = problem_of(rendered, FittedVariances(fitted.variances, weights))
+        fit = eqx.Partial(fit_near, near=fitted.variances, weights=weights)
+        problem, plans = problem_at(fitted.variances, fit, plans)
         before, best = best.point, search(problem, best.point)
         steps += int(best.steps)
         reached = solution(problem, best.point)
         size = best.point.size
-        chi_squared = best.cost / max(problem.observed.size - size, 1)
+        chi_squared = best.cost / max(problem.pixels * channels - size, 1)
         covariance = inverse(np.asarray(reached.information, np.float64)[:size, :size])
         deviations = np.sqrt(np.diagonal(covariance))
         deviations *= 1.0 if noise_is_known else float(chi_squared) ** 0.5
         moved = np.abs(best.point - before)
         settled = bool(best.converged) and np.all(moved <= np.maximum(_SETTLED, 0.1 * deviations))
-    pictures = in_pictures(reached.radiance, which_count(rendered, evidence))
+    pictures, residuals = compared(reached.radiance, problem.counted, evidence)
     recovery = Recovery(
         medium=unknowns.medium(best.point),
         material=surface.surface_of(reached.gaussians),
@@ -153,11 +170,9 @@ def recover(
         unresolved=reached.unresolved,
         chi_squared=chi_squared,
         pictures=pictures,
-        residuals=tuple(
-            made - np.asarray(one.picture) for made, one in zip(pictures, evidence, strict=True)
-        ),
+        residuals=residuals,
         ends=tuple(unknowns.medium(end.point) for end in ends),
-        costs=jnp.asarray(costs, eta.dtype),
+        costs=jnp.asarray(costs, dtype),
         result=optx.RESULTS.where(
             jnp.asarray(settled), optx.RESULTS.successful, optx.RESULTS.nonlinear_max_steps_reached
         ),
@@ -198,27 +213,13 @@ def _check(
             f"surface.eta is {float(surface.eta):g}, starts[0].eta {eta.tolist()}: a material has "
             "one index of refraction, which recover takes as known; give it to both"
         )
-    for i, observation in enumerate(observations):
-        check_channels(i, observation, starts[0].channels, "starts")
+    check_channels(observations, starts[0].channels, "starts")
     if splats.albedo is not None and splats.albedo.shape[1] != starts[0].channels:
         raise ValueError(
             f"splats.albedo has {splats.albedo.shape[1]} channels, starts have {starts[0].channels}"
         )
 
 
-def _in_full(medium: Medium) -> Medium:
-    """Convert a medium to JAX's default precision."""
-    return jax.tree.map(lambda leaf: leaf.astype(jnp.result_type(float)), medium)
-
-
 def _unweighed(variances: Float[Array, " gaussians"], channels: int) -> SumOfGaussians:
     """Make Gaussians whose weights are still unknown."""
     return SumOfGaussians(variances, jnp.zeros((len(variances), channels), variances.dtype))
-
-
-def _formatted(medium: Medium) -> str:
-    values = (
-        "  ".join(f"{float(value):.3g}" for value in values)
-        for values in (medium.sigma_a, medium.sigma_s_prime)
-    )
-    return "sigma_a {}, sigma_s' {}".format(*values)

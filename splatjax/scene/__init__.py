@@ -1,7 +1,6 @@
 """Plain records: what is drawn, what with, and what comes out. No algorithms."""
 
 from ._camera import Camera as Camera
-from ._frame import Frame as Frame
 from ._lights import (
     AbstractLight as AbstractLight,
     AbstractLightSample as AbstractLightSample,
@@ -12,6 +11,10 @@ from ._lights import (
     StackedLights as StackedLights,
     sum_over_lights as sum_over_lights,
 )
-from ._material import Material as Material
-from ._scene import Scene as Scene
-from ._splats import Parts as Parts, Splats as Splats
+from ._scene import (
+    Frame as Frame,
+    Material as Material,
+    Parts as Parts,
+    Scene as Scene,
+    Splats as Splats,
+)

@@ -76,31 +76,26 @@ class Camera(eqx.Module):
             raise ValueError(f"fov must lie between 0 and 180 degrees, not {fov}")
         up = (0.0, 1.0, 0.0) if up is None else up
         points = as_floats([eye, target, up], name="eye, target and up")
-        if not isinstance(points, Tracer):
-            _check_directions(*np.asarray(points, np.float64))
         eye, target, up = points
         forward = target - eye
+        if not isinstance(points, Tracer):
+            known, way = np.asarray(points, np.float64), np.asarray(forward, np.float64)
+            if not np.max(np.abs(known)) < _FARTHEST:
+                raise ValueError(
+                    f"the vector from the camera to its target is {way.tolist()} mm, and up is "
+                    f"{known[2].tolist()}; both must be finite and below {_FARTHEST:g}"
+                )
+            if not np.linalg.norm(way) > 0:
+                raise ValueError(f"eye and target are both {known[0].tolist()}; move one of them")
+            smallest = _PARALLEL * np.linalg.norm(way) * np.linalg.norm(known[2])
+            if not np.linalg.norm(np.cross(way, known[2])) > smallest:
+                raise ValueError(
+                    f"up is {known[2].tolist()}, along the line of sight; give another, such as "
+                    "[0, 0, -1] to look down"
+                )
         forward = forward / jnp.linalg.norm(forward)
         right = jnp.cross(forward, up)
         right = right / jnp.linalg.norm(right)
         rotation = jnp.stack([right, jnp.cross(forward, right), forward])
         focal_length = 0.5 / math.tan(math.radians(fov) / 2)
         return cls(eye, rotation, as_floats(focal_length, eye.dtype), width, height, near)
-
-
-def _check_directions(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> None:
-    """Refuse points that define no axes."""
-    forward = target - eye
-    if not np.max(np.abs([eye, target, up])) < _FARTHEST:
-        raise ValueError(
-            f"the vector from the camera to its target is {forward.tolist()} mm, and up is "
-            f"{up.tolist()}; both must be finite and below {_FARTHEST:g}"
-        )
-    if not np.linalg.norm(forward) > 0:
-        raise ValueError(f"eye and target are both {eye.tolist()}; move one of them")
-    smallest = _PARALLEL * np.linalg.norm(forward) * np.linalg.norm(up)
-    if not np.linalg.norm(np.cross(forward, up)) > smallest:
-        raise ValueError(
-            f"up is {up.tolist()}, along the line of sight; give another, such as [0, 0, -1] to "
-            "look down"
-        )

@@ -1,12 +1,163 @@
-"""All that is seen by a camera."""
+"""What is drawn, splats of a material under lights, and the finished picture with its layers."""
+
+from collections.abc import Callable, Iterable
+from typing import TypeAlias
 
 import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
 
-from splatjax._records import record, several
+from splatjax._records import check_values, numbers, record, several
+from splatjax.gaussians import SumOfGaussians
+from splatjax.scattering import SingleScattering
 
 from ._lights import AbstractLight
-from ._material import Material
-from ._splats import Splats
+
+_ROUNDING = 1e-5
+"""By which an albedo may leave [0, 1]."""
+_FINITE = "finite: drop such splats before rendering"
+_POSITIVE = "finite and at least 0"
+
+
+@record
+class Splats(eqx.Module):
+    r"""A surface as a set of discs, one row per splat; mm, right-handed, +y up.
+
+    Nearby splats should be near in memory (`read_splats` and `sample_mesh` sort them so); the
+    picture does not depend on the order, only the time it takes.
+
+    **Attributes:** (all differentiable unless said otherwise)
+
+    - `centers`: mm. Visibility is discontinuous in them; coverage and shading are smooth.
+    - `normals`: unit vectors, outward.
+    - `radii`: mm, positive. Discs overlap so that they leave no hole: about 1.5 times the root of
+      the area.
+    - `areas`: the area of the surface that each splat stands for, mm^2. They add up to the
+      surface's area. (The discs overlap, so `pi r^2` is not the area.)
+    - `albedo`: diffuse color, linear, in [0, 1]; `None` where the material's weights alone carry
+      color.
+    - `specular`: factor on the material's specular strength; `None` for 1.
+    - `roughness`: factor on the material's roughness; `None` for 1.
+
+    **Raises:** `ValueError` for arrays of different lengths, for entries that are not finite, for
+    negative radii and areas, and for an albedo outside [0, 1].
+    """
+
+    centers: Float[Array, "splats 3"] = eqx.field(converter=numbers)
+    normals: Float[Array, "splats 3"] = eqx.field(converter=numbers)
+    radii: Float[Array, " splats"] = eqx.field(converter=numbers)
+    areas: Float[Array, " splats"] = eqx.field(converter=numbers)
+    albedo: Float[Array, "splats channels"] | None = eqx.field(converter=numbers, default=None)
+    specular: Float[Array, " splats"] | None = eqx.field(converter=numbers, default=None)
+    roughness: Float[Array, " splats"] | None = eqx.field(converter=numbers, default=None)
+
+    def __check_init__(self):
+        for name in ("centers", "normals"):
+            check_values(f"Splats.{name}", getattr(self, name), _FINITE, lambda x: x == x)
+        for name in ("radii", "areas", "specular", "roughness"):
+            check_values(f"Splats.{name}", getattr(self, name), _POSITIVE, lambda x: x >= 0)
+        check_values(
+            "Splats.albedo",
+            self.albedo,
+            "in [0, 1]: linear colors, 8-bit values divided by 255 and decoded",
+            lambda x: (x >= -_ROUNDING) & (x <= 1 + _ROUNDING),
+        )
+
+    @property
+    def count(self) -> int:
+        return self.centers.shape[0]
+
+    def scaled(self, factor: Float[Array, ""] | float) -> "Splats":
+        """Scale the body about the origin. Light travels as far as before, so that a smaller body
+        is more translucent.
+        """
+        scaled = self.centers * factor, self.radii * factor, self.areas * (factor * factor)
+        return eqx.tree_at(
+            lambda splats: (splats.centers, splats.radii, splats.areas), self, scaled
+        )
+
+
+Parts: TypeAlias = Callable[[], Iterable[Splats]]
+"""A function that returns all splats part by part, the same ones at every call."""
+
+
+_NARROW = 1e-6  # mm^2: far below any splat, so that the layer is unresolved
+
+
+@record
+class Material(eqx.Module):
+    r"""A translucent material: how light spreads below the surface, and how the surface itself
+    reflects.
+
+    **Attributes:** (all differentiable)
+
+    - `gaussians`: the diffusion profile; the picture's diffuse reflectance is the sum of its
+      weights.
+    - `eta`: index of refraction relative to air, for the Fresnel term of the specular lobe.
+    - `specular`: strength of the specular lobe (rho_s).
+    - `roughness`: of the specular lobe (m, root mean square slope), at least 0.
+    - `single_scattering`: light that scatters once, as a term of its own; the Gaussians then stand
+      for the rest. `None`: they stand for all.
+    """
+
+    gaussians: SumOfGaussians
+    eta: Float[Array, ""] = eqx.field(converter=numbers, default=1.4)
+    specular: Float[Array, ""] = eqx.field(converter=numbers, default=0.18)
+    roughness: Float[Array, ""] = eqx.field(converter=numbers, default=0.3)
+    single_scattering: SingleScattering | None = None
+
+    def __check_init__(self):
+        check_values("Material.eta", self.eta, "positive", lambda x: x > 0)
+        check_values("Material.specular", self.specular, "at least 0", lambda x: x >= 0)
+        check_values("Material.roughness", self.roughness, "at least 0", lambda x: x >= 0)
+
+    @property
+    def channels(self) -> int:
+        return self.gaussians.channels
+
+    def total_reflectance(self) -> Float[Array, " channels"]:
+        """Compute the fraction of the light entering a flat piece along its normal that leaves it
+        again.
+        """
+        total = self.gaussians.total_reflectance()
+        if self.single_scattering is None:
+            return total
+        return total + self.single_scattering.total_reflectance()
+
+    def diffuse_fraction(self, mu_i: Float[Array, "*points"]) -> Float[Array, "*points channels"]:
+        """Compute the factor on the Gaussians for light that enters under the cosine `mu_i`; 1
+        along the normal.
+
+        Grazing light leaves after one scattering more often than light along the normal. Where that
+        and the total reflectance of the Gaussians would exceed 1, the Gaussians are scaled to the
+        difference.
+        """
+        if self.single_scattering is None:
+            return jnp.ones((*mu_i.shape, self.channels), mu_i.dtype)
+        left = jnp.maximum(1 - self.single_scattering.directional_albedo(mu_i), 0)
+        total = jnp.broadcast_to(self.gaussians.total_reflectance(), left.shape)
+        return jnp.where(left < total, left / jnp.where(left < total, total, 1.0), 1.0)
+
+    def surface_of(self, gaussians: SumOfGaussians) -> "Material":
+        """Return a material of other Gaussians with this surface, without single scattering."""
+        return Material(gaussians, self.eta, self.specular, self.roughness)
+
+    def opaque(self) -> "Material":
+        """Return the material without scattering below the surface: one Gaussian narrower than any
+        splat has the total reflectance.
+        """
+        variances = jnp.full_like(self.gaussians.variances, _NARROW, shape=(1,))
+        return self.surface_of(SumOfGaussians(variances, self.total_reflectance()[None]))
+
+    def white(self) -> "Material":
+        """Scale the total reflectance to one in every channel, so that an albedo map alone carries
+        color.
+        """
+        total, single = self.total_reflectance(), self.single_scattering
+        gaussians = SumOfGaussians(self.gaussians.variances, self.gaussians.weights / total[None])
+        if single is not None:
+            single = SingleScattering(single.medium, single.strength / total)
+        return Material(gaussians, self.eta, self.specular, self.roughness, single)
 
 
 @record
@@ -24,3 +175,48 @@ class Scene(eqx.Module):
     def __post_init__(self):
         channels = self.material.channels
         self.lights = tuple(light.with_channels(channels) for light in self.lights)
+
+
+class Frame(eqx.Module):
+    r"""A picture, linear light, row 0 at the top.
+
+    `beauty`, `diffuse`, `specular`, `layers`, `albedo` and `irradiance` are premultiplied by
+    coverage; `depth`, `position` and `normal` are those of the front surface and are not. `diffuse
+    = sum_k weights_k layers_k` everywhere.
+
+    **Attributes:**
+
+    - `beauty`: `diffuse + specular`, and `single_scattering` where there is one; radiance.
+    - `coverage`: in [0, 1].
+    - `depth`: along the camera's forward axis, mm; inf where there is nothing.
+    - `position`: world space, mm; 0 where there is nothing.
+    - `normal`: world space, unit; 0 where there is nothing.
+    - `albedo`: of the splats; 1 where they carry none.
+    - `shadow`: per light, 1 lit and 0 in shadow, not premultiplied; 1 where there is nothing.
+    - `irradiance`: that enters the surface: cosine, shadow and the loss to the specular lobe
+      included.
+    - `layers`: one per Gaussian, `post * transmission / pi * L_k`.
+    - `weights`: those the picture was made with.
+    - `diffuse`, `specular`: radiance.
+    - `unresolved_fraction`: per Gaussian, the fraction of the covered pixels for which the splats
+      are too far apart to resolve the layer, so that it is the surface's own irradiance.
+    - `single_scattering`: radiance, premultiplied; `None` when the material has none.
+    - `overflow`: what the plan lacks: 0 when the picture fits, else the largest of needed over
+      planned, and the picture is NaN.
+    """
+
+    beauty: Float[Array, "height width channels"]
+    coverage: Float[Array, "height width"]
+    depth: Float[Array, "height width"]
+    position: Float[Array, "height width 3"]
+    normal: Float[Array, "height width 3"]
+    albedo: Float[Array, "height width channels"]
+    shadow: Float[Array, "lights height width"]
+    irradiance: Float[Array, "height width channels"]
+    layers: Float[Array, "gaussians height width channels"]
+    weights: Float[Array, "gaussians channels"]
+    diffuse: Float[Array, "height width channels"]
+    specular: Float[Array, "height width channels"]
+    unresolved_fraction: Float[Array, " gaussians"]
+    overflow: Float[Array, ""]
+    single_scattering: Float[Array, "height width channels"] | None = None

@@ -17,6 +17,11 @@ def moved_by(part, splats: sj.Splats, x) -> sj.Splats:
     return part.moved(Setup(splats, CAMERA, ()), x, part.prepared(splats)).splats
 
 
+def test_a_step_that_moves_nothing_is_refused():
+    with pytest.raises(ValueError, match=r"LightStrengths\.step must be positive; got 0"):
+        sj.inverse.LightStrengths(step=0.0)
+
+
 @pytest.mark.parametrize("length", [0.0, 1e-9, 0.05, 0.0999, 0.1001, 1.0, 3.0])
 def test_a_rotation_is_that_of_its_vector(length, x64):
     vector = length * np.asarray([2.0, -1.0, 2.0]) / 3
