@@ -38,7 +38,7 @@ FINEST = 0.01
 resolve it.
 """
 _CELL = 0.6  # edge of the cells, in standard deviations, for an error of 2e-3; error ~ edge^3
-_WORTHWHILE = 1.1  # edge of the cells, in spacings, from which on merging splats pays
+_WORTHWHILE = 1.5  # edge of the cells, in spacings, from which on merging splats pays
 
 
 class LayerPlan(eqx.Module):
@@ -60,7 +60,7 @@ class LayerPlan(eqx.Module):
 
 
 class ClusterDiffuser(AbstractDiffuser):
-    r"""Sums over the splats near each splat; for layers wider than about two spacings, over
+    r"""Sums over the splats near each splat; for layers wider than about 2.8 spacings, over
     clusters.
 
     **Attributes:** (static)
