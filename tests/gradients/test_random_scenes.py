@@ -360,7 +360,7 @@ def test_gradients_are_finite_at_degenerate_places(case):
     assert is_finite(SHAPE, world)
 
 
-@pytest.mark.parametrize("count", [0, 1])
+@pytest.mark.parametrize("count", [0, pytest.param(1, marks=pytest.mark.long)])
 def test_gradients_are_finite_with_one_splat_and_with_none(count):
     shape = Shape(count, 1, "s", fast=False)
     assert is_finite(shape, typical(shape))
