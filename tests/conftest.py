@@ -87,16 +87,26 @@ def _left_out(item) -> bool:
     return "float64" in item.fixturenames
 
 
+# Beside tests marked `once`: what JAX has little part in.
+ONCE = ("io/test_corpus", "io/test_atomic", "geometry/test_raw_points", "test_imports")
+
+
+@pytest.hookimpl(tryfirst=True)  # before pytest chooses by marks
 def pytest_collection_modifyitems(config, items):
     """Leave out, and say so, what cannot run or need not run twice."""
+    for item in items:
+        if any(name in item.nodeid for name in ONCE):
+            item.add_marker("once")
     # The longest files first, so that no worker is left alone with one in the end.
     longest = (
-        "test_notebooks",
+        "tests/inverse",
         "gradients/test_every_float",
         "tests/gradients",
+        "tests/fitting",
         "tests/transport",
         "tests/render",
         "tests/cli",
+        "tests/baselines",
     )
     items.sort(
         key=lambda item: next(

@@ -1,5 +1,6 @@
 """A flat plane whose chart is stretched, and what it is painted with."""
 
+import bodies
 import jax.numpy as jnp
 import numpy as np
 
@@ -59,12 +60,9 @@ def splatted(points: np.ndarray, gaussians: sj.SumOfGaussians, spacing: float = 
     """The layers of the plane by splat diffusion, unlit but for its paint: `[gaussians, points,
     channels]`.
     """
-    line = np.arange(-HALF + spacing / 2, HALF, spacing)
-    x, y = (each.reshape(-1) for each in np.meshgrid(line, line))
-    centers = np.stack([x, y, np.zeros_like(x)])
-    light = np.sqrt(spots(centers.T))
-    arrays = centers, np.tile([[0.0], [0.0], [1.0]], x.size), np.full(x.size, spacing**2), light.T
-    sources = Sources(*(jnp.asarray(each, float) for each in arrays))
+    body = bodies.sheet(HALF - spacing / 2, spacing)
+    light = jnp.asarray(np.sqrt(spots(np.asarray(body.centers))).T, float)
+    sources = Sources(body.centers.T, body.normals.T, body.areas, light)
     means, _ = gathered(sources, gaussians.variances, PlainMean(), points)
     return means.transpose(0, 2, 1)
 
@@ -79,11 +77,3 @@ def gathered(
         for variance, depth in zip(variances, kernel.depths(variances), strict=True)
     ]
     return np.stack([each.means for each in layers]), np.stack([each.mass for each in layers])
-
-
-def camera_over(half: float, pixels: int) -> sj.Camera:
-    """A camera far above the middle of the plane that sees `half` mm to each side."""
-    fov = float(2 * np.degrees(np.arctan(1 / 40)))
-    return sj.Camera.look_at(
-        jnp.asarray([0.0, 0.0, 40 * half]), jnp.zeros(3), fov=fov, width=pixels, height=pixels
-    )

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from bodies import hits
 from jax.test_util import check_grads
 from planes import plane
 
@@ -20,18 +21,6 @@ CAMERA = sj.Camera.look_at(
 def seen_from(camera, corners):
     landing = baselines.Landing.in_view(corners, PerspectiveView.of(camera))
     return landing, baselines.see_faces(landing, baselines.capacity_for(landing))
-
-
-def hits(camera):
-    """Where the rays through the pixel centers meet z = 0."""
-    x, y = (each.reshape(-1) + 0.5 for each in np.indices((camera.height, camera.width))[::-1])
-    view = PerspectiveView.of(camera)
-    far = np.asarray(
-        view.unproject(jnp.asarray(x, float), jnp.asarray(y, float), jnp.ones(x.size))
-    ).T
-    eye = np.asarray(camera.position)
-    way = far - eye
-    return (eye - way * (eye[2] / way[:, 2])[:, None]).reshape(camera.height, camera.width, 3)
 
 
 @pytest.fixture

@@ -4,6 +4,7 @@ none invents a color.
 
 import dataclasses
 
+import bodies
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -38,43 +39,22 @@ SIZE = 48
 
 
 def plane(half_width: float, spacing: float, jitter: float = 0.0) -> sj.Splats:
-    """A sheet at z = 0 that faces +z."""
-    line = np.arange(-half_width, half_width + 1e-9, spacing)
-    x, y = (each.reshape(-1) for each in np.meshgrid(line, line))
-    x, y = (
-        np.stack([x, y]) + np.random.default_rng(3).uniform(-jitter, jitter, (2, x.size)) * spacing
-    )
-    flat = np.zeros_like(x)
-    centers, normals = np.stack([x, y, flat], 1), np.stack([flat, flat, flat + 1], 1)
-    areas = np.full(x.size, spacing**2)
-    return splats_of(centers, normals, areas)
-
-
-def splats_of(centers, normals, areas) -> sj.Splats:
-    columns = centers, normals, 1.5 * np.sqrt(areas), areas
-    return sj.Splats(*(jnp.asarray(column, float) for column in columns))
-
-
-def ball(count: int, radius: float = 10.0) -> sj.Splats:
-    i = np.arange(count) + 0.5
-    z, turn = 1 - 2 * i / count, np.pi * (1 + 5**0.5) * i
-    across = np.sqrt(1 - z * z)
-    normals = np.stack([np.cos(turn) * across, np.sin(turn) * across, z], 1)
-    areas = np.full(count, 4 * np.pi * radius**2 / count)
-    return splats_of(radius * normals, normals, areas)
+    """A sheet at z = 0 that faces +z; `jitter` in spacings."""
+    sheet = bodies.sheet(half_width, spacing)
+    moves = np.random.default_rng(3).uniform(-jitter, jitter, (sheet.count, 3))
+    moves = jnp.asarray(moves * [spacing, spacing, 0], float)
+    return dataclasses.replace(sheet, centers=sheet.centers + moves)
 
 
 def camera(eye, fov: float = 30.0, target=(0.0, 0.0, 0.0)) -> sj.Camera:
-    return sj.Camera.look_at(
-        jnp.asarray(eye, float), jnp.asarray(target, float), fov=fov, width=SIZE, height=SIZE
-    )
+    return sj.Camera.look_at(eye, target, fov=fov, width=SIZE, height=SIZE)
 
 
-def seen_by(name: str, splats: sj.Splats, view: PerspectiveView):
-    """Return how a view draws the splats, moved by less than a plan can hold, with rows of
-    attributes: pictures of the rows, of coverage and of depth.
+def seen_by(name: str, splats: sj.Splats, *views: PerspectiveView):
+    """Return how any of the views draws the splats, moved by less than a plan can hold, with rows
+    of attributes: pictures of the rows, of coverage and of depth.
     """
-    plan = RASTERIZERS[name].make_plan([splats], [view], SETTINGS)
+    plan = RASTERIZERS[name].make_plan([splats], views, SETTINGS)
 
     def draw(splats, rows, view):
         visible = visible_surfaces(splats, rows, view, SETTINGS, plan, OneDevice())
@@ -89,7 +69,8 @@ def seen_by(name: str, splats: sj.Splats, view: PerspectiveView):
 def drawn(name: str, splats: sj.Splats, rows, *cameras: sj.Camera):
     """Return what each camera sees of rows of attributes, and where it sees anything."""
     views = [PerspectiveView.of(each) for each in cameras]
-    found = [seen_by(name, splats, view)(splats, rows, view)[:2] for view in views]
+    draw = seen_by(name, splats, *views)
+    found = [draw(splats, rows, view)[:2] for view in views]
     attributes, coverage = (np.stack(pictures) for pictures in zip(*found, strict=True))
     return np.moveaxis(attributes, 3, 1), coverage
 
@@ -157,14 +138,12 @@ def test_a_plane_of_one_color_has_exactly_that_color_and_lies_where_it_lies(name
 @pytest.mark.once
 @pytest.mark.parametrize("name", RASTERIZERS)
 def test_what_is_nearer_hides_what_is_behind(name):
-    near, far = plane(6.0, 1.0, jitter=0.2), plane(6.0, 1.0, jitter=0.2)
-    both = [
-        jnp.concatenate([getattr(far, each), getattr(near, each)])
-        for each in ("centers", "normals", "radii", "areas")
-    ]
-    both[0] = both[0].at[: far.count, 2].add(-8.0)
+    near = plane(6.0, 1.0, jitter=0.2)
+    far = dataclasses.replace(near, centers=near.centers - jnp.asarray([[0.0, 0.0, 8.0]]))
     colors = jnp.concatenate([jnp.zeros((1, far.count)), jnp.ones((1, near.count))], axis=1)
-    seen, covered = drawn(name, sj.Splats(*both), colors, camera((0.0, 0.0, 20.0), fov=20.0))
+    seen, covered = drawn(
+        name, bodies.joined(far, near), colors, camera((0.0, 0.0, 20.0), fov=20.0)
+    )
     assert np.all(covered > 0)
     np.testing.assert_allclose(seen, 1.0, rtol=1e-6)
 
@@ -207,16 +186,12 @@ def lit_ball(settings: sj.RenderSettings, count: int):
     of its light.
     """
     middle = np.asarray([7.0, -4.0, 3.0])
-    body = ball(count)
-    body = dataclasses.replace(body, centers=body.centers + jnp.asarray(middle, float)[None])
-    lamp = sj.DirectionalLight(
-        jnp.asarray([0.4, -0.3, -1.0]), jnp.full(1, np.pi), cast_shadows=False
-    )
-    material = sj.Material(sj.SumOfGaussians(jnp.asarray([1e-6]), jnp.ones((1, 1))), specular=0.0)
-    body = PhongSplats.of(body)
+    lamp = sj.DirectionalLight([0.4, -0.3, -1.0], [np.pi], cast_shadows=False)
+    material = sj.Material(sj.SumOfGaussians([1e-6], [[1.0]]), specular=0.0)
+    body = PhongSplats.of(bodies.sphere(count, 10.0, middle, jitter=0.0))
     scene, seen = (
         sj.Scene(body, (lamp,), material),
-        camera(middle + np.asarray([0.0, 0.0, 60.0]), 18.0, middle),
+        camera(middle + np.asarray([0, 0, 60]), 18.0, middle),
     )
     frame = sj.render(scene, seen, settings)
     inside = np.asarray(frame.coverage) > 0.99
@@ -234,22 +209,15 @@ def lit_ball(settings: sj.RenderSettings, count: int):
 @pytest.mark.long
 def test_normals_that_vary_within_splats_are_closer_to_the_sphere_than_blended_and_flat_ones():
     """A sphere of 150 splats, under the light of a white diffuser."""
-    baselines = {
-        "elliptical": elliptical_points(),
-        "deferred": deferred_splatting(),
-        "phong": phong_splatting(),
-    }
-    angles, shades = {}, {}
-    for name, settings in baselines.items():
-        angles[name], shades[name] = lit_ball(settings, 150)
-    assert angles["phong"] < 0.5 * angles["deferred"]
-    assert angles["deferred"] < 0.5 * angles["elliptical"]
-    assert shades["phong"] < 0.5 * shades["deferred"] < 0.5 * shades["elliptical"]
+    methods = phong_splatting(), deferred_splatting(), elliptical_points()
+    angles, shades = zip(*(lit_ball(settings, 150) for settings in methods), strict=True)
+    assert angles[0] < 0.5 * angles[1] < 0.25 * angles[2]
+    assert shades[0] < 0.5 * shades[1] < 0.5 * shades[2]
 
 
 @pytest.mark.once
 def test_slopes_of_a_sphere_are_its_curvature_and_those_of_a_plane_are_none():
-    body = ball(600, radius=10.0)
+    body = bodies.sphere(600, jitter=0.0)
     slopes, normals = np.asarray(normal_slopes(body), float), np.asarray(body.normals, float)
     expected = (np.eye(3)[None] - normals[:, :, None] * normals[:, None]) / 10.0
     off = np.abs(slopes - expected)  # of 0.1; largest where the spiral of splats begins and ends
@@ -264,15 +232,13 @@ def test_a_baseline_renders_what_the_renderer_does_with_scattering_and_shadow():
     """Where splats are smaller than what bends it makes little matter whether irradiance is blended
     or found per pixel.
     """
-    body = ball(1500)
+    body = bodies.sphere(1500, jitter=0.0)
     body = dataclasses.replace(
         body, albedo=jnp.broadcast_to(jnp.asarray([0.9, 0.6, 0.3]), (body.count, 3))
     )
-    lamp = sj.DirectionalLight(jnp.asarray([0.4, -0.3, -1.0]), jnp.full(3, np.pi))
-    scene, seen = (
-        sj.Scene(body, (lamp,), sj.load_material("skin").white()),
-        camera((0.0, 0.0, 60.0), fov=22.0),
-    )
+    lamp = sj.DirectionalLight([0.4, -0.3, -1.0], [np.pi] * 3)
+    scene = sj.Scene(body, (lamp,), sj.load_material("skin").white())
+    seen = camera((0.0, 0.0, 60.0), fov=22.0)
     own = sj.render(scene, seen)
     inner = np.asarray(own.normal[..., 2]) > 0.3
     for settings in (sj.RenderSettings(lighting=LightAtPixels()), deferred_splatting()):

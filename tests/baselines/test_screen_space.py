@@ -8,7 +8,8 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from planes import camera_over, spots
+from bodies import camera_over, hits
+from planes import spots
 from scipy.signal import fftconvolve
 
 import splatjax as sj
@@ -25,34 +26,17 @@ INSIDE = slice(SIZE // 4, -SIZE // 4)
 
 def flat(light: np.ndarray) -> sj.Frame:
     """The buffers of a frontal plane that carries this light and reflects all of it."""
-    row, column = np.indices((SIZE, SIZE))
-    x, y = (column + 0.5) / SIZE * 2 * HALF - HALF, HALF - (row + 0.5) / SIZE * 2 * HALF
-    position = jnp.asarray(np.stack([x, y, 0 * x], axis=2), float)
+    position = jnp.asarray(hits(CAMERA), float)
     ones, none = jnp.ones((SIZE, SIZE)), jnp.zeros((SIZE, SIZE, 3))
     normal = none.at[..., 2].set(1.0)
     depth, irradiance = 40 * HALF * ones, jnp.asarray(light, float)
-    layers, weights = none[None], jnp.ones((1, 3))
-    black = none, none, jnp.zeros(1), jnp.zeros(())
-    return sj.Frame(
-        none,
-        ones,
-        depth,
-        position,
-        normal,
-        none + 1,
-        ones[None],
-        irradiance,
-        layers,
-        weights,
-        *black,
-    )
+    shadow, layers, weights = ones[None], none[None], jnp.ones((1, 3))
+    given = none, ones, depth, position, normal, none + 1, shadow, irradiance, layers, weights
+    return sj.Frame(*given, none, none, jnp.zeros(1), jnp.zeros(()))
 
 
 def picture_of(function) -> np.ndarray:
-    row, column = np.indices((SIZE, SIZE)).reshape(2, -1)
-    points = np.stack(
-        [(column + 0.5) / SIZE * 2 * HALF - HALF, HALF - (row + 0.5) / SIZE * 2 * HALF], axis=1
-    )
+    points = hits(CAMERA)[..., :2].reshape(-1, 2)
     return function(points).reshape(SIZE, SIZE, 3)
 
 
@@ -67,11 +51,8 @@ def convolved(light: np.ndarray, gaussians: sj.SumOfGaussians) -> np.ndarray:
     for variance, weights in zip(
         np.asarray(gaussians.variances), np.asarray(gaussians.weights), strict=True
     ):
-        kernel = np.exp(-(x**2 + y**2) / (2 * variance))
-        for channel, weight in enumerate(weights):
-            total[..., channel] += weight * fftconvolve(
-                light[..., channel], kernel / kernel.sum(), mode="same"
-            )
+        kernel = np.exp(-(x**2 + y**2) / (2 * variance))[..., None]
+        total += weights * fftconvolve(light, kernel / kernel.sum(), mode="same", axes=(0, 1))
     return total
 
 

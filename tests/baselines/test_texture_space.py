@@ -4,13 +4,15 @@ stretched.
 
 import dataclasses
 
+import bodies
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from bodies import camera_over
 from jax.test_util import check_grads
-from planes import HALF, camera_over, coordinates, gathered, painted, plane, splatted
+from planes import HALF, coordinates, gathered, painted, plane, splatted
 
 import splatjax as sj
 from splatjax import baselines
@@ -45,9 +47,7 @@ def off_by(stretch: float, correction: baselines.AbstractStretch) -> float:
     mesh = baselines.TexturedMesh.of(plane(stretch), painted(stretch, SIZE))
     plan = baselines.plan_texture_space(mesh, (FRONTAL,), DULL, camera_over(6.0, 8), settings)
     line = np.linspace(-HALF / 2, HALF / 2, 16)
-    points = np.column_stack(
-        [*(each.reshape(-1) for each in np.meshgrid(line, line)), np.zeros(256)]
-    )
+    points = np.stack(np.meshgrid(line, line, [0.0]), axis=-1).reshape(-1, 3)
     ours, lost = diffused(mesh, settings, plan, jnp.asarray(coordinates(points, stretch), float))
     assert 0 < lost[1] < lost[0] < 0.2
     truth = splatted(points, TWO)
@@ -59,7 +59,6 @@ def off_by(stretch: float, correction: baselines.AbstractStretch) -> float:
     ("stretch", "correction", "least", "most"),
     [
         (1.0, baselines.StretchCorrected(), 0, 2e-3),  # 1.4e-3
-        (1.0, baselines.Uncorrected(), 0, 2e-3),
         (3.0, baselines.StretchCorrected(), 0, 1e-2),  # 7.6e-3: texels are 3 times as long
         (3.0, baselines.Uncorrected(), 5e-2, 1),  # 1.1e-1
     ],
@@ -101,10 +100,13 @@ def test_constant_light_stays_constant_up_to_the_edges(sheet):
 
 
 @pytest.mark.once
-def test_beyond_its_capacity_the_picture_is_nan(sheet):
-    mesh, lights, camera, settings, plan = sheet
-    small = dataclasses.replace(plan, camera=100)
-    frame = baselines.render_texture_space(mesh, lights, DULL, camera, settings, small).frame
+def test_beyond_its_capacity_the_picture_is_nan():
+    mesh, camera = baselines.TexturedMesh.of(plane(1.0)), camera_over(15.0, 16)
+    settings = dataclasses.replace(STILL, resolution=24)
+    plan = baselines.plan_texture_space(mesh, (FRONTAL,), DULL, camera, settings)
+    small = dataclasses.replace(plan, camera=10)
+    given = mesh, (FRONTAL,), DULL, camera, settings, small
+    frame = baselines.render_texture_space(*given).frame
     assert frame.overflow > 1
     assert np.all(np.isnan(np.asarray(frame.beauty)[np.asarray(frame.depth) < np.inf]))
 
@@ -145,17 +147,14 @@ def test_through_a_slab_comes_what_comes_through_splats():
         settings, thin_parts=baselines.TranslucentShadowMap(), kernel=EscapeNormalization()
     )
     mesh, camera = baselines.TexturedMesh.of(slab(thickness)), camera_over(3.0, 4)
-    lights = (sj.DirectionalLight(jnp.asarray([0.0, 0.0, 1.0]), jnp.ones(3)),)
+    lights = (sj.DirectionalLight([0, 0, 1], jnp.ones(3)),)
     found = baselines.render_texture_space(mesh, lights, DULL, camera, settings).frame
     ours = np.pi * np.asarray(found.layers)[:, 2, 2]
 
-    line = np.arange(-11.7, 12, 0.6)
-    x, y = (each.reshape(-1) for each in np.meshgrid(line, line))
-    side = np.repeat([1.0, -1.0], x.size)
-    centers = np.stack([np.tile(x, 2), np.tile(y, 2), np.where(side > 0, 0.0, -thickness)])
-    light = np.tile(np.where(side > 0, 0.0, 1.0), (3, 1))
-    arrays = centers, np.stack([0 * side, 0 * side, side]), np.full(side.size, 0.36), light
-    sources, kernel = Sources(*(jnp.asarray(each, float) for each in arrays)), EscapeNormalization()
+    faces = bodies.sheet(11.7, 0.6), bodies.sheet(11.7, 0.6, (0, 0, -1), (0, 0, -thickness))
+    body, kernel = bodies.joined(*faces), EscapeNormalization()
+    light = jnp.maximum(jnp.tile(-body.normals[:, 2], (3, 1)), 0)
+    sources = Sources(body.centers.T, body.normals.T, body.areas, light)
     means, mass = gathered(sources, TWO.variances, kernel, np.zeros((1, 3)))
     mass, weights = jnp.asarray(mass[:, None]), TWO.weights[..., None]
     gain = kernel.gain(mass, TWO.variances, weights, jnp.zeros((3, 1)))

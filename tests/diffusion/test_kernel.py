@@ -190,25 +190,18 @@ def test_gradients_at_the_corners_are_the_limits():
         assert np.all(np.isfinite(of_weights(jnp.asarray(weights, float))))
 
 
-@eqx.filter_jit
 def sheet_at_origin(thickness, half, spacing, light, variances, kernel) -> jax.Array:
     """Means and mass `[gaussians, 2]` in the middle of a wide sheet's upper face; `light` enters
     the upper and the lower face.
     """
-    line = jnp.arange(-half, half + 0.1, spacing)
-    x, y = (each.reshape(-1) for each in jnp.meshgrid(line, line))
-    zero, up = jnp.zeros_like(x), jnp.zeros((3, x.size)).at[2].set(1)
-    flat = jnp.stack([x, y, zero])
-    centers = jnp.concatenate([flat, flat - thickness * up], axis=1)
-    entering = jnp.repeat(jnp.asarray(light, float), x.size)[None]
-    areas = jnp.full(2 * x.size, spacing**2)
-    sources = Sources(centers, jnp.concatenate([up, -up], axis=1), areas, entering)
-    depths, at = kernel.depths(variances), jnp.zeros((3, 1))
-    layers = (
-        dense_layer(sources, at, variance, depth)
-        for variance, depth in zip(variances, depths, strict=True)
+    upper = bodies.sheet(half, spacing)
+    lower = bodies.sheet(half, spacing, (0, 0, -1), (0, 0, -thickness))
+    body, entering = bodies.joined(upper, lower), jnp.repeat(jnp.asarray(light), upper.count)
+    sources = Sources(body.centers.T, body.normals.T, body.areas, entering[None])
+    at_origin = jax.jit(lambda *given: dense_layer(sources, jnp.zeros((3, 1)), *given).values[:, 0])
+    return jnp.stack(
+        [at_origin(*each) for each in zip(variances, kernel.depths(variances), strict=True)]
     )
-    return jnp.stack([layer.values[:, 0] for layer in layers])
 
 
 @pytest.mark.parametrize("thickness", list(THROUGH))

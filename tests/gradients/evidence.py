@@ -6,7 +6,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from PIL import Image
+from matplotlib.image import imsave
 from worlds import PLAIN, World, named, with_leaf
 
 import splatjax as sj
@@ -30,27 +30,14 @@ def write_evidence(title: str, world: World, name: str, way: jax.Array, step: fl
         return jnp.mean(sj.render(moved.scene, moved.camera, PLAIN, plan).beauty, axis=-1)
 
     leaf = named(world)[name]
-    picture = np.asarray(beauty(leaf))
-    difference = np.asarray(beauty(leaf + step * way) - beauty(leaf - step * way)) / (2 * step)
-    derivative = np.asarray(jax.jit(partial(jax.jvp, beauty))((leaf,), (way,))[1])
+    difference = (beauty(leaf + step * way) - beauty(leaf - step * way)) / (2 * step)
+    derivative = jax.jit(partial(jax.jvp, beauty))((leaf,), (way,))[1]
     scale = max(np.abs(difference).max(), np.abs(derivative).max(), np.finfo(float).tiny)
-    # Wide layers, continued to faint pixels of a dark rim, may be a little below zero.
-    gray = np.maximum(picture, 0) / max(picture.max(), np.finfo(float).tiny)
-    gray = np.repeat(gray[..., None], 3, axis=-1) ** 0.45
-    rows = [
-        gray,
-        *(signed(each / scale) for each in (difference, derivative, derivative - difference)),
-    ]
-    pixels = (255 * np.clip(np.concatenate(rows), 0, 1)).astype(np.uint8)
+    rows = [each / scale for each in (difference, derivative, derivative - difference)]
+    picture = beauty(leaf)
+    pixels = np.concatenate([picture / max(picture.max(), np.finfo(float).tiny), *rows])
+    pixels = pixels.repeat(ENLARGED, axis=0).repeat(ENLARGED, axis=1)
     FOLDER.mkdir(parents=True, exist_ok=True)
     path = FOLDER / f"{title.replace(' ', '_')}.png"
-    Image.fromarray(pixels).resize(
-        (ENLARGED * pixels.shape[1], ENLARGED * pixels.shape[0]), Image.Resampling.NEAREST
-    ).save(path)
+    imsave(path, pixels, cmap="bwr", vmin=-1, vmax=1)
     return path
-
-
-def signed(values: np.ndarray) -> np.ndarray:
-    """Color values in [-1, 1]: white for none, red above, blue below."""
-    above, below = np.maximum(values, 0), np.maximum(-values, 0)
-    return np.stack([1 - below, 1 - above - below, 1 - above], axis=-1)

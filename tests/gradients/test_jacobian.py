@@ -13,7 +13,6 @@ import pytest
 from worlds import FAST, PLAIN, view
 
 import splatjax as sj
-from splatjax.diffusion import PlainMean
 
 pytestmark = [pytest.mark.slow, pytest.mark.once]
 
@@ -26,18 +25,10 @@ def scene(single: bool) -> sj.Scene:
     body = bodies.bumpy(300)
     albedo = jnp.asarray(np.random.default_rng(12).uniform(0.2, 0.9, (body.count, 2)))
     splats = sj.Splats(body.centers, body.normals, body.radii, body.areas, albedo)
-    gaussians = sj.SumOfGaussians(
-        jnp.asarray([1.3, 12.0, 150.0]), jnp.asarray([[0.3, 0.2], [0.2, 0.3], [0.2, 0.2]])
-    )
-    once = None
-    if single:
-        medium = sj.Medium(
-            jnp.asarray([0.1, 0.05]), jnp.asarray([0.9, 1.2]), jnp.asarray([1.3, 1.0])
-        )
-        once = sj.SingleScattering(medium)
-    light = sj.DirectionalLight(
-        jnp.asarray([-1.0, -0.4, -0.1]), jnp.asarray([2.0, 3.0]), cast_shadows=False
-    )
+    gaussians = sj.SumOfGaussians([1.3, 12.0, 150.0], [[0.3, 0.2], [0.2, 0.3], [0.2, 0.2]])
+    medium = sj.Medium([0.1, 0.05], [0.9, 1.2], [1.3, 1.0])
+    once = sj.SingleScattering(medium) if single else None
+    light = sj.DirectionalLight([-1.0, -0.4, -0.1], [2.0, 3.0], cast_shadows=False)
     return sj.Scene(splats, (light,), sj.Material(gaussians, single_scattering=once))
 
 
@@ -89,16 +80,8 @@ def test_it_is_reverse_mode_row_by_row():
         error = np.linalg.norm((ours - np.asarray(theirs)).reshape(300, -1), axis=1)
         assert np.all(norm > 0)
         assert np.max(error / norm) < ROW_BY_ROW
-
-
-def test_single_scattering_leaves_less_to_the_gaussians_where_light_grazes():
-    """Then a weight moves the light that enters, which the row-by-row test would miss if no light
-    grazed.
-    """
-    with jax.enable_x64(True):
-        start, _, _, jacobian = rendered("fast")
-        left = start.material.diffuse_fraction(jnp.asarray([0.05]))
-    assert np.min(np.asarray(left)) < 0.97
+    # Under light that grazes, single scattering leaves less to the Gaussians: then a weight moves
+    # the light that enters.
     assert np.min(np.asarray(jacobian.weights)) < 0
 
 
@@ -169,17 +152,6 @@ def test_through_the_fit_it_is_the_derivative_in_the_coefficients():
             )
 
 
-def test_with_the_plain_mean_the_layers_are_the_derivative_in_the_weights():
-    settings = sj.RenderSettings(
-        rasterizer=PLAIN.rasterizer,
-        diffuser=PLAIN.diffuser,
-        kernel=PlainMean(),
-    )
-    with jax.enable_x64(True):
-        jacobian = sj.picture_jacobian(scene(False), view(*CAMERA), settings)
-    np.testing.assert_allclose(jacobian.weights, jacobian.frame.layers, rtol=1e-12, atol=1e-15)
-
-
 def test_a_function_of_other_gaussians_is_refused():
     with jax.enable_x64(True):
         *_, jacobian = rendered("plain")
@@ -188,15 +160,3 @@ def test_a_function_of_other_gaussians_is_refused():
             match=r"has \[2, 2\] Gaussians and channels, the picture was made with \[3, 2\]",
         ):
             jacobian.through(lambda w: sj.SumOfGaussians(jnp.ones(2), w), jnp.ones((2, 2)))
-
-
-def test_a_plan_that_does_not_suffice_makes_it_nan_and_says_so():
-    with jax.enable_x64(True):
-        start, _, plan, _ = rendered("fast")
-        wider = eqx.tree_at(
-            lambda s: s.material.gaussians.variances, start, 4 * start.material.gaussians.variances
-        )
-        jacobian = sj.picture_jacobian(wider, view(*CAMERA), FAST, plan)
-    assert float(jacobian.frame.overflow) > 1
-    assert np.all(np.isnan(jacobian.weights))
-    assert np.all(np.isnan(jacobian.variances))

@@ -7,8 +7,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from bodies import apart, joined, sphere
 from jax.sharding import NamedSharding, PartitionSpec
-from scenes import sphere
 
 import splatjax as sj
 from benchmarks.communication import Picture, View, counted
@@ -16,35 +16,24 @@ from splatjax.diffusion import DenseDiffuser
 from splatjax.splatting import DenseRasterizer, ShadowSettings
 
 SETTINGS = sj.RenderSettings(shadows=ShadowSettings(resolution=32))
-PLACE = np.asarray(
-    [40.0, -25.0, 15.0]
-)  # mm; where the balls stand, away from the origin of all coordinates
+PLACE = np.asarray([40.0, -25.0, 15.0])
+"""mm; where the balls stand, away from the origin of all coordinates."""
 
 
 def scene(count: int = 1501, variances=(0.1, 12.5, 100.0)) -> sj.Scene:
     """Two balls, the last splats before the first, of a number that eight does not divide; layers
     of three kinds.
     """
-    behind, before = sphere(count - count // 5, 20.0), sphere(count // 5, 6.0)
-    before = eqx.tree_at(
-        lambda ball: ball.centers, before, before.centers + jnp.asarray([[-8.0, 6.0, 30.0]], float)
-    )
-    splats = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), behind, before)
-    shade = 0.6 + 0.3 * jnp.sin(splats.centers / 5)
-    splats = eqx.tree_at(
-        lambda each: each.centers, splats, splats.centers + jnp.asarray(PLACE[None], float)
-    )
+    behind = sphere(count - count // 5, 20.0, PLACE, jitter=0.0)
+    before = sphere(count // 5, 6.0, PLACE + np.asarray([-8.0, 6.0, 30.0]), jitter=0.0)
+    splats = joined(behind, before)
+    shade = 0.6 + 0.3 * jnp.sin((splats.centers - jnp.asarray(PLACE[None], float)) / 5)
     splats = eqx.tree_at(lambda each: each.albedo, splats, shade, is_leaf=lambda leaf: leaf is None)
-    weights = jnp.asarray([[0.2, 0.1, 0.1], [0.3, 0.3, 0.2], [0.3, 0.2, 0.1]], float)[
-        -len(variances) :
-    ]
-    material = sj.Material(sj.SumOfGaussians(jnp.asarray(variances, float), weights))
-    sun = sj.DirectionalLight(jnp.asarray([0.4, -0.5, -1.0], float), jnp.ones(3))
-    lamp = sj.PointLight(
-        jnp.asarray(PLACE + np.asarray([-60.0, 10.0, 20.0]), float),
-        2000 * jnp.ones(3),
-        cast_shadows=False,
-    )
+    weights = [[0.2, 0.1, 0.1], [0.3, 0.3, 0.2], [0.3, 0.2, 0.1]][-len(variances) :]
+    material = sj.Material(sj.SumOfGaussians(variances, weights))
+    sun = sj.DirectionalLight([0.4, -0.5, -1.0], jnp.ones(3))
+    place = PLACE + np.asarray([-60.0, 10.0, 20.0])
+    lamp = sj.PointLight(place, 2000 * jnp.ones(3), cast_shadows=False)
     return sj.Scene(splats, (sun, lamp), material)
 
 
@@ -55,35 +44,15 @@ def camera(angle: float = 0.0) -> sj.Camera:
 
 @eqx.filter_jit
 def pictured(scene: sj.Scene, camera: sj.Camera, plan: sj.Plan):
-    """Give a loss that looks at every pixel, with all its derivatives, and the picture."""
+    """Give the derivatives of a loss that looks at every pixel, and the picture."""
 
     def loss(of):
         frame = sj.render(*of, SETTINGS, plan)
-        wave = jnp.sin(jnp.arange(frame.beauty.size, dtype=frame.beauty.dtype)).reshape(
-            frame.beauty.shape
-        )
-        return jnp.sum(wave * frame.beauty) + jnp.sum(frame.coverage**2) + 1e-3 * jnp.sum(
-            wave * frame.position
-        ), frame
+        wave = jnp.sin(jnp.arange(frame.beauty.size, dtype=float)).reshape(frame.beauty.shape)
+        total = jnp.sum(wave * (frame.beauty + 1e-3 * frame.position))
+        return total + jnp.sum(frame.coverage**2), frame
 
-    return eqx.filter_value_and_grad(loss, has_aux=True)((scene, camera))
-
-
-def apart(one, other) -> dict[str, float]:
-    """Give by how much each of two trees' leaves differ, over the largest number in it; infinite
-    numbers must be the same.
-    """
-    found = {}
-    for (path, x), y in zip(
-        jax.tree_util.tree_leaves_with_path(one), jax.tree.leaves(other), strict=True
-    ):
-        x, y = np.asarray(x), np.asarray(y)
-        finite = np.isfinite(x)
-        same = x.shape == y.shape and np.array_equal(finite, np.isfinite(y))
-        x, y = np.where(finite, x, 0), np.where(finite, y, 0)
-        error = np.max(np.abs(x - y)) / max(np.max(np.abs(x)), 1e-30)
-        found[jax.tree_util.keystr(path)] = float(error) if same else float("inf")
-    return found
+    return eqx.filter_grad(loss, has_aux=True)((scene, camera))
 
 
 def splats_cut() -> dict:
@@ -91,14 +60,11 @@ def splats_cut() -> dict:
     world, eye = scene(), camera()
     mesh = jax.make_mesh((4, 2), ("hosts", "devices"))
     plans = [sj.make_plan(world, eye, SETTINGS), sj.make_plan(world, eye, SETTINGS, mesh=mesh)]
-    ((_, one), d_one), ((_, many), d_many) = (pictured(world, eye, plan) for plan in plans)
-    kinds = [layer.neighbors and layer.level for layer in plans[0].diffusion.layers]
-    return {
-        "frame": apart(one, many),
-        "gradients": apart(d_one, d_many),
-        "overflow": float(many.overflow),
-        "layers": kinds,
-    }
+    # Layers that are not resolved, from single splats, from clusters.
+    assert [each.neighbors and each.level for each in plans[0].diffusion.layers] == [None, 0, 1]
+    one, many = (pictured(world, eye, plan) for plan in plans)
+    assert many[1].overflow == 0
+    return apart(one, many)
 
 
 def more_than_pictures_cut() -> dict:
@@ -110,19 +76,16 @@ def more_than_pictures_cut() -> dict:
     other = sj.SumOfGaussians(
         world.material.gaussians.variances, world.material.gaussians.weights[::-1]
     )
-    found = []
-    for plan in (sj.make_plan(world, eye, SETTINGS), sj.make_plan(world, eye, SETTINGS, mesh=mesh)):
+
+    def found(mesh):
+        plan = sj.make_plan(world, eye, SETTINGS, mesh=mesh)
         light = sj.compute_irradiance(world, plan, SETTINGS)
         gathered = sj.diffusion_basis(world, eye, SETTINGS, plan, derivative=True)
-        found.append(
-            {
-                "light": light,
-                "diffused": sj.diffuse_irradiance(world, light.source.T, eye, SETTINGS, plan),
-                "gathered": (gathered.beauty(other), gathered.coverage),
-                "jacobian": sj.picture_jacobian(world, eye, SETTINGS, plan),
-            }
-        )
-    return apart(*found)
+        diffused = sj.diffuse_irradiance(world, light.source.T, eye, SETTINGS, plan)
+        jacobian = sj.picture_jacobian(world, eye, SETTINGS, plan)
+        return light, diffused, gathered.beauty(other), gathered.coverage, jacobian
+
+    return apart(found(None), found(mesh))
 
 
 def traffic() -> dict:
@@ -197,37 +160,14 @@ def views_cut() -> dict:
         frames = sj.map_over(mesh, draw, *of)
         return losses(frames), frames
 
-    ((_, one), d_one), ((_, many), d_many) = (
-        eqx.filter_jit(eqx.filter_value_and_grad(each, has_aux=True))((world, stacked))
+    one, many = (
+        eqx.filter_jit(eqx.filter_grad(each, has_aux=True))((world, stacked))
         for each in (one_by_one, over_devices)
     )
-    return {"frame": apart(one, many), "gradients": apart(d_one, d_many)}
-
-
-def gradients_at_home() -> dict:
-    """Where the gradients of the splats lie, that lie on eight devices: of coverage alone, which is
-    soon compiled.
-    """
-    mesh = jax.make_mesh((8,), ("splats",))
-    world = scene(1504)
-    plan = sj.make_plan(world, camera(), SETTINGS, mesh=mesh)
-    splats = jax.device_put(world.splats, NamedSharding(mesh, PartitionSpec("splats")))
-
-    def covered(splats):
-        return jnp.sum(
-            sj.render(
-                sj.Scene(splats, world.lights, world.material), camera(), SETTINGS, plan
-            ).coverage
-        )
-
-    found = jax.jit(jax.grad(covered))(splats)
-    return {
-        "rows": [shard.data.shape[0] for shard in found.centers.addressable_shards],
-        "spec": str(found.centers.sharding.spec),
-    }
+    return apart(one, many)
 
 
 if __name__ == "__main__":
     jax.config.update("jax_numpy_rank_promotion", "raise")
     jax.config.update("jax_numpy_dtype_promotion", "strict")
-    print(json.dumps({name: globals()[name]() for name in sys.argv[1:]}))
+    print(json.dumps(globals()[sys.argv[1]]()))

@@ -10,9 +10,10 @@ import sys
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from bodies import apart
 from jax.experimental.multihost_utils import process_allgather
 from jax.sharding import NamedSharding, PartitionSpec
-from over_devices import SETTINGS, apart, camera, scene
+from over_devices import SETTINGS, camera, scene
 
 import splatjax as sj
 

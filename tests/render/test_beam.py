@@ -6,17 +6,21 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import SKIN_VARIANCES, camera_over, sheet, skin
+from bodies import camera_over, hits, splats
+from scipy.spatial import ConvexHull, Voronoi
 
 import splatjax as sj
 from splatjax._combination import OneDevice
 from splatjax.diffusion import BLOCK, ClusterDiffuser, Sources, compact_order
 from splatjax.gaussians import gaussian
-from splatjax.io import load_material
 from splatjax.render._plan import arrange
 
 EXACT = sj.RenderSettings(diffuser=ClusterDiffuser(error=0.0))
-MARBLE_VARIANCES = tuple(load_material("marble").gaussians.variances.tolist())
+VARIANCES = [
+    variance
+    for name in ("skin", "marble")
+    for variance in sj.load_material(name).gaussians.variances.tolist()
+]
 SLANTS = (0.0, 50.0)
 KINDS = ["jittered", *(pytest.param(kind, marks=pytest.mark.long) for kind in ("grid", "graded"))]
 PEAK_SHARE = 1e-3  # a layer is compared where it exceeds this share of its peak
@@ -25,22 +29,50 @@ BLENDED_TOLERANCE = 0.03  # 0.026 measured, of jittered splats where the light i
 WIDE_TOLERANCE = 0.045  # with clusters; 0.038 measured, where the light is a hundredth
 
 
+def sheet(spacing: float, half_width: float, kind: str = "grid") -> sj.Splats:
+    """A flat sheet at z = 0 that faces +z; a splat at the origin. Areas are exact but for
+    `jittered`, where they are the mean.
+    """
+    count = round(half_width / spacing)
+    line = np.arange(-count, count + 1) * spacing
+    x, y = (each.reshape(-1) for each in np.meshgrid(line, line))
+    areas = np.full(x.size, spacing * spacing)
+    if kind == "jittered":
+        jitter = np.random.default_rng(7).uniform(-0.25, 0.25, (2, x.size)) * spacing
+        jitter[:, x.size // 2] = 0
+        x, y = x + jitter[0], y + jitter[1]
+        areas = voronoi_areas(np.stack([x, y], 1), spacing, half_width)
+    if kind == "graded":
+        # u -> x(u) with dx/du rising smoothly from 0.4 to 1.6: areas 4:1 from left to right, exact
+        # by the map's Jacobian
+        longer = np.arange(-3 * count, 3 * count + 1) * spacing
+        u, y = (each.reshape(-1) for each in np.meshgrid(longer, line))
+        stretch = 0.3 * half_width
+        x = u + 0.6 * stretch * np.log(np.cosh(u / stretch))
+        areas = spacing * spacing * (1 + 0.6 * np.tanh(u / stretch))
+        inside = np.abs(x) <= half_width
+        x, y, areas = x[inside], y[inside], areas[inside]
+    centers = np.stack([x, y, np.zeros_like(x)], 1)
+    return splats(centers, np.tile([0, 0, 1], (x.size, 1)), 1.5 * np.sqrt(areas), areas)
+
+
+def voronoi_areas(points: np.ndarray, spacing: float, half_width: float) -> np.ndarray:
+    """Exact areas of the Voronoi cells inside the sheet; cells at the border are given the
+    grid's.
+    """
+    diagram = Voronoi(points)
+    areas = np.full(len(points), spacing * spacing)
+    inside = np.max(np.abs(points), axis=1) <= half_width - 2 * spacing
+    for i in np.flatnonzero(inside):
+        corners = diagram.vertices[diagram.regions[diagram.point_region[i]]]
+        areas[i] = ConvexHull(corners).volume  # which is the area, of polygons
+    return areas
+
+
 def beam(splats: sj.Splats) -> jnp.ndarray:
     """Unit power into the splat at the origin."""
     at = int(jnp.argmin(jnp.sum(splats.centers**2, axis=1)))
     return jnp.zeros((splats.count, 1)).at[at].set(1 / splats.areas[at])
-
-
-def positions(camera: sj.Camera) -> np.ndarray:
-    """Where the camera's rays meet the plane z = 0."""
-    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    focal = float(camera.focal_length) * camera.height
-    rays = np.stack(
-        [(x - camera.width / 2) / focal, (y - camera.height / 2) / focal, np.ones_like(x)], -1
-    )
-    rays = rays @ np.asarray(camera.rotation, np.float64)
-    eye = np.asarray(camera.position, np.float64)
-    return eye + rays * (-eye[2] / rays[..., 2:])
 
 
 def error_of(layer: np.ndarray, squared: np.ndarray, variance: float) -> float:
@@ -65,20 +97,20 @@ def sheet_of(variance: float, kind: str) -> tuple[sj.Scene, float]:
     "variance",
     [
         1.99,
-        *(pytest.param(v, marks=pytest.mark.long) for v in (*SKIN_VARIANCES, *MARBLE_VARIANCES)),
+        *(pytest.param(v, marks=pytest.mark.long) for v in VARIANCES),
     ],
 )
 def test_a_beam_on_a_sheet_is_the_gaussian_of_each_layer_at_the_splats(kind, variance):
     scene, deviation = sheet_of(variance, kind)
-    splats, variances = scene.splats, scene.material.gaussians.variances
-    order = compact_order(np.asarray(splats.centers))
+    body, variances = scene.splats, scene.material.gaussians.variances
+    order = compact_order(np.asarray(body.centers))
     order = np.pad(order, (0, -len(order) % BLOCK), mode="edge")
-    exists = jnp.arange(len(order)) < splats.count
-    placed = arrange(splats, jnp.asarray(order), exists)
+    exists = jnp.arange(len(order)) < body.count
+    placed = arrange(body, jnp.asarray(order), exists)
     given = variances, EXACT.kernel
     interval = EXACT.kernel.interval(jnp.ones(()))
     plan = EXACT.diffuser.make_plan([placed], *given, interval)
-    light = jnp.where(exists[:, None], beam(splats)[order], 0).T
+    light = jnp.where(exists[:, None], beam(body)[order], 0).T
     sources = Sources(placed.centers.T, placed.normals.T, placed.areas, light)
     diffused = eqx.filter_jit(plan.diffuse)(sources, *given, OneDevice())
     assert float(diffused.needed) <= 1
@@ -101,26 +133,8 @@ def test_a_beam_on_a_sheet_is_the_gaussian_in_the_picture(kind):
     tolerance = BEAM_TOLERANCE if kind == "grid" else BLENDED_TOLERANCE
     for camera in cameras:
         layer = sj.diffuse_irradiance(scene, beam(scene.splats), camera, EXACT, plan)
-        squared = np.sum(positions(camera)[..., :2] ** 2, axis=-1)
+        squared = np.sum(hits(camera)[..., :2] ** 2, axis=-1)
         assert error_of(np.asarray(layer)[0, ..., 0], squared, variance) < tolerance
-
-
-@pytest.mark.slow
-@pytest.mark.once
-@pytest.mark.long
-def test_the_sum_of_layers_is_the_profile():
-    # wide enough that what the widest layer loses beyond the border does not come back in the
-    # normalization
-    splats = sheet(0.05, 10.5)
-    material = sj.Material(skin())
-    scene = sj.Scene(splats, (), material)
-    camera = camera_over(2.0, 48)
-    layers = sj.diffuse_irradiance(scene, jnp.tile(beam(splats), (1, 3)), camera, EXACT)
-    total = np.asarray(jnp.sum(layers * material.gaussians.weights[:, None, None], axis=0))
-    radius = np.sqrt(np.sum(positions(camera)[..., :2] ** 2, axis=-1))
-    truth = np.asarray(material.gaussians(jnp.asarray(radius, float)))
-    seen = truth > PEAK_SHARE * truth.max(axis=(0, 1))
-    assert np.max(np.abs(total / truth - 1)[seen]) < BEAM_TOLERANCE
 
 
 @pytest.mark.slow
@@ -128,29 +142,17 @@ def test_the_sum_of_layers_is_the_profile():
 @pytest.mark.long
 @pytest.mark.parametrize("name", ["skin", "marble"])
 def test_a_wide_beam_with_default_settings_is_the_widened_profile(name):
-    material = load_material(name)
-    half_width = 30.0
-    splats = sheet(0.18, half_width)  # wide enough for marble's widest layer
-    light = sj.GaussianBeam(
-        jnp.asarray([0.0, 0.0, 10.0]), jnp.asarray([0.0, 0.0, -1.0]), jnp.ones(3), jnp.asarray(1.0)
-    )
-    scene = sj.Scene(
-        splats, (light,), eqx.tree_at(lambda m: m.specular, material, jnp.asarray(0.0))
-    )
+    material = sj.load_material(name)
+    splats = sheet(0.18, 30.0)  # wide enough for marble's widest layer
+    light = sj.GaussianBeam([0, 0, 10], [0, 0, -1], jnp.ones(3), 1)
+    material = eqx.tree_at(lambda m: m.specular, material, jnp.asarray(0.0))
+    scene = sj.Scene(splats, (light,), material)
     camera = camera_over(9.0, 144)
     frame = sj.render(scene, camera)
     exitance = np.pi * np.asarray(frame.diffuse)
-    squared = np.sum(positions(camera)[..., :2] ** 2, axis=-1)
-    variances = np.asarray(material.gaussians.variances, np.float64)
-    weights = np.asarray(material.gaussians.weights, np.float64)
-    kernels = np.stack(
-        [
-            np.asarray(gaussian(jnp.asarray(v + 1.0, float), jnp.asarray(squared, float)))
-            for v in variances
-        ],
-        -1,
-    )
-    truth = kernels @ weights
+    squared = np.sum(hits(camera)[..., :2] ** 2, axis=-1)
+    widened = sj.SumOfGaussians(material.gaussians.variances + 1.0, material.gaussians.weights)
+    truth = np.asarray(widened(jnp.asarray(np.sqrt(squared), float)))
     seen = truth > 1e-2 * truth.max(axis=(0, 1))
     assert np.max(np.abs(exitance / truth - 1)[seen]) < WIDE_TOLERANCE
 

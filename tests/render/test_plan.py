@@ -4,19 +4,24 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import pytest
-from scenes import sheet, two_gaussians
+from bodies import joined, sheet, two_gaussians
 
 import splatjax as sj
 from splatjax.diffusion import DenseDiffuser
 from splatjax.scene import AbstractLight, AbstractLightSample
-from splatjax.splatting import DenseRasterizer
+from splatjax.splatting import DenseRasterizer, ShadowSettings
+
+pytestmark = pytest.mark.once
 
 SETTINGS = sj.RenderSettings(diffuser=DenseDiffuser())  # which needs no plan
+PLAIN = sj.RenderSettings(
+    shadows=ShadowSettings(resolution=64), rasterizer=DenseRasterizer(), diffuser=DenseDiffuser()
+)
 
 
 def scene_under(*lights: AbstractLight, splats: sj.Splats | None = None) -> sj.Scene:
     return sj.Scene(
-        sheet(1.0, 5.0) if splats is None else splats, lights, sj.Material(two_gaussians())
+        sheet(5.0, 1.0) if splats is None else splats, lights, sj.Material(two_gaussians())
     )
 
 
@@ -24,62 +29,58 @@ def lamp(*direction: float, cast_shadows: bool = True) -> sj.DirectionalLight:
     return sj.DirectionalLight(jnp.asarray(direction, float), jnp.ones(3), cast_shadows)
 
 
-def camera_at(z: float) -> sj.Camera:
-    return sj.Camera.look_at(jnp.asarray([0.0, 0.0, z]), jnp.zeros(3), width=8, height=8)
+CAMERA = sj.Camera.look_at([0, 0, 20], [0, 0, 0], width=8, height=8)
 
 
-@pytest.mark.once
 def test_a_plan_of_several_scenes_has_room_for_the_shadows_of_each():
-    camera = camera_at(20.0)
     steep, grazing = scene_under(lamp(0.0, 0.0, -1.0)), scene_under(lamp(0.99, 0.0, -0.14))
     alone = [
-        sj.make_plan(scene, camera, SETTINGS).shadows[0].raster.bins for scene in (steep, grazing)
+        sj.make_plan(scene, CAMERA, SETTINGS).shadows[0].raster.bins for scene in (steep, grazing)
     ]
     assert alone[0].pairs > alone[1].pairs
     for scenes in ([steep, grazing], [grazing, steep]):
-        together = sj.make_plan(scenes, camera, SETTINGS).shadows[0].raster.bins
+        together = sj.make_plan(scenes, CAMERA, SETTINGS).shadows[0].raster.bins
         assert together == alone[0]
 
 
-@pytest.mark.once
 def test_a_lamp_among_the_splats_in_one_scene_has_six_faces_in_all():
     far, near = (
         scene_under(sj.PointLight(jnp.asarray([0.0, 0.0, z]), jnp.ones(3))) for z in (30.0, 1.0)
     )
-    assert sj.make_plan([far, near], camera_at(20.0), SETTINGS).shadows[0].cube
-    assert not sj.make_plan([far, far], camera_at(20.0), SETTINGS).shadows[0].cube
+    assert sj.make_plan([far, near], CAMERA, SETTINGS).shadows[0].cube
+    assert not sj.make_plan([far, far], CAMERA, SETTINGS).shadows[0].cube
 
 
 def test_scenes_that_differ_in_more_than_their_lights_are_refused():
-    camera, scene = camera_at(20.0), scene_under(lamp(0.0, 0.0, -1.0))
+    scene = scene_under(lamp(0.0, 0.0, -1.0))
     with pytest.raises(ValueError, match=r"scenes\[1\] has other splats"):
         sj.make_plan(
-            [scene, scene_under(lamp(0.0, 0.0, -1.0), splats=sheet(1.0, 4.0))], camera, SETTINGS
+            [scene, scene_under(lamp(0.0, 0.0, -1.0), splats=sheet(4.0, 1.0))], CAMERA, SETTINGS
         )
     for other in (scene_under(), scene_under(lamp(0.0, 0.0, -1.0, cast_shadows=False))):
         with pytest.raises(ValueError, match=r"lights of the same kinds.*scenes\[2\]"):
-            sj.make_plan([scene, scene, other], camera, SETTINGS)
+            sj.make_plan([scene, scene, other], CAMERA, SETTINGS)
 
 
 def test_a_mesh_needs_renderers_that_can_be_cut_and_a_plan_of_its_own():
-    mesh, camera = jax.make_mesh((1,), ("splats",)), camera_at(20.0)
+    mesh = jax.make_mesh((1,), ("splats",))
     scene = scene_under(lamp(0.0, 0.0, -1.0))
     with pytest.raises(ValueError, match="a DenseRasterizer works on one device"):
         DenseRasterizer().make_plan([scene.splats, scene.splats], [], SETTINGS.splatting)
     with pytest.raises(ValueError, match="the plan is for one device"):
-        sj.render(scene, camera, SETTINGS, sj.make_plan(scene, camera, SETTINGS), mesh=mesh)
+        sj.render(scene, CAMERA, SETTINGS, sj.make_plan(scene, CAMERA, SETTINGS), mesh=mesh)
 
 
 def test_a_plan_for_other_splats_is_refused():
-    camera, scene = camera_at(20.0), scene_under(lamp(0.0, 0.0, -1.0))
-    plan = sj.make_plan(scene, camera, SETTINGS)
+    scene = scene_under(lamp(0.0, 0.0, -1.0))
+    plan = sj.make_plan(scene, CAMERA, SETTINGS)
     calls = (
-        lambda scene, plan: sj.render(scene, camera, SETTINGS, plan),
-        lambda scene, plan: sj.diffusion_basis(scene, camera, SETTINGS, plan),
-        lambda scene, plan: sj.picture_jacobian(scene, camera, SETTINGS, plan),
+        lambda scene, plan: sj.render(scene, CAMERA, SETTINGS, plan),
+        lambda scene, plan: sj.diffusion_basis(scene, CAMERA, SETTINGS, plan),
+        lambda scene, plan: sj.picture_jacobian(scene, CAMERA, SETTINGS, plan),
         lambda scene, plan: sj.compute_irradiance(scene, plan, SETTINGS),
     )
-    other = scene_under(lamp(0.0, 0.0, -1.0), splats=sheet(1.0, 4.0))
+    other = scene_under(lamp(0.0, 0.0, -1.0), splats=sheet(4.0, 1.0))
     for call in calls:
         with pytest.raises(
             ValueError,
@@ -111,14 +112,13 @@ class Sky(AbstractLightSample):
 
 
 def test_a_light_of_ones_own_shines_without_shadows_and_is_told_so_with_them():
-    camera = camera_at(20.0)
-    shown = sj.render(scene_under(Sky(jnp.full(3, 2.0))), camera, settings=SETTINGS)
-    lit = sj.render(scene_under(lamp(0, 0, -2, cast_shadows=False)), camera, settings=SETTINGS)
+    shown = sj.render(scene_under(Sky(jnp.full(3, 2.0))), CAMERA, settings=PLAIN)
+    lit = sj.render(scene_under(lamp(0, 0, -2, cast_shadows=False)), CAMERA, settings=PLAIN)
     assert jnp.allclose(shown.beauty, 2 * lit.beauty, rtol=1e-5)
     with pytest.raises(
         ValueError, match="Sky has no shadow map; give a light with cast_shadows=False"
     ):
-        sj.make_plan(scene_under(Sky(jnp.ones(3), cast_shadows=True)), camera, SETTINGS)
+        sj.make_plan(scene_under(Sky(jnp.ones(3), cast_shadows=True)), CAMERA, PLAIN)
 
 
 class Sun(AbstractLight):
@@ -131,16 +131,15 @@ class Sun(AbstractLight):
         return tuple(sj.DirectionalLight(each, self.irradiance) for each in self.directions)
 
 
-@pytest.mark.once
 def test_a_light_of_many_samples_is_the_sum_of_them_and_has_one_row():
-    camera, ball = camera_at(20.0), sheet(1.0, 5.0)
-    blocker = eqx.tree_at(lambda s: s.centers, sheet(0.5, 1.0), replace_fn=lambda c: c + 2.0)
-    splats = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), ball, blocker)
+    ball = sheet(5.0, 1.0)
+    blocker = eqx.tree_at(lambda s: s.centers, sheet(1.0, 0.5), replace_fn=lambda c: c + 2.0)
+    splats = joined(ball, blocker)
     directions = jnp.asarray([[0.0, 0.0, -1.0], [0.6, 0.0, -0.8], [-0.6, 0.1, -0.8]])
     irradiance = jnp.asarray([1.0, 2.0, 3.0])
-    sun = sj.render(scene_under(Sun(directions, irradiance), splats=splats), camera, SETTINGS)
+    sun = sj.render(scene_under(Sun(directions, irradiance), splats=splats), CAMERA, PLAIN)
     lamps = [sj.DirectionalLight(each, irradiance) for each in directions]
-    apart = sj.render(scene_under(*lamps, splats=splats), camera, SETTINGS)
+    apart = sj.render(scene_under(*lamps, splats=splats), CAMERA, PLAIN)
     assert jnp.allclose(sun.diffuse, apart.diffuse, rtol=1e-5)
     assert sun.shadow.shape == (1, 8, 8)
     assert float(jnp.max(jnp.abs(sun.shadow[0] - jnp.mean(apart.shadow, axis=0)))) < 0.2

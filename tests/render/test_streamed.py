@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import sphere
+from bodies import apart, joined, sphere
 
 import splatjax as sj
 from splatjax.diffusion import FINEST, DenseDiffuser
@@ -19,6 +19,17 @@ ROUNDING = 3e-5  # of the largest number of its kind: sums of a thousand terms, 
 LAYERS = 2.5e-2  # 99% of the pixels; at points here and at splats there, with clusters of each part
 RIMS = 0.1  # where a pixel blends two surfaces, 0.07 measured
 SHADOWS = ShadowSettings(resolution=32)
+FIELDS = (
+    "coverage",
+    "depth",
+    "position",
+    "normal",
+    "albedo",
+    "shadow",
+    "irradiance",
+    "specular",
+    "unresolved_fraction",
+)
 LIGHTS = (
     sj.DirectionalLight(jnp.asarray([0.4, -0.5, -1.0], float), jnp.ones(3)),
     sj.PointLight(jnp.asarray([-60.0, 10.0, 20.0], float), 2000 * jnp.ones(3), cast_shadows=False),
@@ -39,16 +50,11 @@ def splats():
     """A ball, a smaller one before it that casts its shadow on it, and one so far behind it that
     nothing is seen of it.
     """
-    balls = (
-        (sphere(1400, 20.0), (0.0, 0.0, 0.0)),
-        (sphere(300, 6.0), (-8.0, 6.0, 30.0)),
-        (sphere(500, 6.0), (-25.0, -7.0, -97.0)),
+    cloud = joined(
+        sphere(1400, 20.0, jitter=0.0),
+        sphere(300, 6.0, (-8.0, 6.0, 30.0), jitter=0.0),
+        sphere(500, 6.0, (-25.0, -7.0, -97.0), jitter=0.0),
     )
-    balls = (
-        eqx.tree_at(lambda of: of.centers, ball, ball.centers + jnp.asarray([at], float))
-        for ball, at in balls
-    )
-    cloud = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *balls)
     return eqx.tree_at(
         lambda each: each.albedo,
         cloud,
@@ -63,29 +69,6 @@ def in_parts(splats, size):
             yield jax.tree.map(lambda leaf: leaf[begin : begin + size], splats)  # noqa: B023
 
     return parts
-
-
-def apart(one, other):
-    """Give by how much each field of two frames differs, over the largest number in it; infinite
-    numbers must be the same.
-    """
-    found = {}
-    for name in (
-        "coverage",
-        "depth",
-        "position",
-        "normal",
-        "albedo",
-        "shadow",
-        "irradiance",
-        "specular",
-        "unresolved_fraction",
-    ):
-        x, y = np.asarray(getattr(one, name)), np.asarray(getattr(other, name))
-        finite = np.isfinite(x)
-        np.testing.assert_array_equal(finite, np.isfinite(y))
-        found[name] = np.abs(x[finite] - y[finite]).max() / np.abs(x[finite]).max()
-    return found
 
 
 def test_parts_make_the_picture_of_all_at_once(splats, monkeypatch):
@@ -108,7 +91,7 @@ def test_parts_make_the_picture_of_all_at_once(splats, monkeypatch):
     assert [count for what, count in done if what == "diffusion"] == counts
     assert [count for what, count in done if what == "looking"][:16] == 2 * counts
     assert len(built) < len(counts)  # nothing is in reach of the last ball, which is not seen
-    found = apart(whole, streamed)
+    found = apart(*({name: getattr(frame, name) for name in FIELDS} for frame in (whole, streamed)))
     assert max(found.values()) < ROUNDING, found
     for ours, theirs in zip(streamed.layers, whole.layers, strict=True):
         error = np.abs(ours - theirs)[np.asarray(whole.coverage) > 0] / np.max(theirs)

@@ -1,13 +1,13 @@
 """Small random scenes of one shape, the first of each sequence of one kind alone: what goes wrong
 goes wrong at some of these.
 
-A scene of a seed is always the same. Each is drawn in the coordinates of the view that sees it: `x`
-and `y` in pixels, depth in mm, so that every kind is met whatever the view.
+A scene of a seed is always the same. Each is drawn where a view sees it: `x` and `y` in pixels,
+depth in mm, so that every kind is met whatever the view.
 """
 
-import dataclasses
 import os
 
+import bodies
 import jax.numpy as jnp
 import numpy as np
 
@@ -42,52 +42,17 @@ def seeds(in_suite: int) -> range:
     return range(max(in_suite, ALL // 20))
 
 
-@dataclasses.dataclass(frozen=True)
-class Sight:
-    """A view's numbers, in NumPy's float64."""
-
-    position: np.ndarray
-    rotation: np.ndarray
-    pixels: float
-    """Focal length in pixels, or pixels per mm."""
-    perspective: bool
-    width: int
-    height: int
-
-    def view(self) -> AbstractView:
-        position, rotation, pixels = (
-            jnp.asarray(each, float) for each in (self.position, self.rotation, self.pixels)
-        )
-        if self.perspective:
-            return PerspectiveView(position, rotation, pixels, self.width, self.height, NEAR)
-        return OrthographicView(position, rotation, pixels, self.width, self.height)
-
-    def mm(self, depth: np.ndarray) -> np.ndarray:
-        """Size of a pixel at a depth."""
-        return depth / self.pixels if self.perspective else np.full_like(depth, 1 / self.pixels)
-
-    def places(self, x, y, depth) -> np.ndarray:
-        """Points under pixels, in the view's own axes."""
-        across = np.stack([x - self.width / 2, y - self.height / 2], 1) * self.mm(depth)[:, None]
-        return np.concatenate([across, depth[:, None]], 1)
-
-    def rays(self, places: np.ndarray) -> np.ndarray:
-        """Unit vectors from the eye to points in the view's own axes."""
-        if not self.perspective:
-            return np.tile([0.0, 0.0, 1.0], (len(places), 1))
-        return places / np.linalg.norm(places, axis=1, keepdims=True)
-
-
-def sight(rng: np.random.Generator, perspective: bool, width: int, height: int) -> Sight:
+def sight(rng: np.random.Generator, perspective: bool, width: int, height: int) -> AbstractView:
     """A view from anywhere to anywhere."""
     rotation, _ = np.linalg.qr(rng.normal(size=(3, 3)))
     rotation[2] *= np.linalg.det(rotation)
-    pixels = (
-        height / (2 * np.tan(np.radians(rng.uniform(10, 50))))
-        if perspective
-        else rng.uniform(0.4, 2.5)
-    )
-    return Sight(rng.normal(size=3) * 10, rotation, pixels, perspective, width, height)
+    focal_length = height / (2 * np.tan(np.radians(rng.uniform(10, 50))))  # in pixels
+    scale = rng.uniform(0.4, 2.5)  # in pixels per mm
+    given = rng.normal(size=3) * 10, rotation, focal_length if perspective else scale
+    given = (jnp.asarray(each, float) for each in given)
+    if perspective:
+        return PerspectiveView(*given, width, height, NEAR)
+    return OrthographicView(*given, width, height)
 
 
 def random_body(
@@ -106,10 +71,8 @@ def random_body(
     places, normals, radii = (
         np.stack(each)[which, np.arange(count)] for each in zip(*parts, strict=True)
     )
-    centers = places @ seen.rotation + seen.position
     areas = (radii / 1.5) ** 2 * rng.uniform(0.5, 2, count)
-    arrays = centers, normals @ seen.rotation, radii, areas
-    return Splats(*(jnp.asarray(each, float) for each in arrays)), seen.view()
+    return bodies.splats(places, normals, radii, areas), seen
 
 
 def disagreement(found, expected) -> float:
@@ -124,9 +87,10 @@ def disagreement(found, expected) -> float:
     return float(np.max(np.abs(found - expected) / (size + typical), initial=0.0))
 
 
-def _drawn(kind: str, rng: np.random.Generator, count: int, seen: Sight):
-    """Give places, normals (in the view's own axes) and radii of splats of one kind."""
-    width, height = seen.width, seen.height
+def _drawn(kind: str, rng: np.random.Generator, count: int, seen: AbstractView):
+    """Give places, normals and radii of splats of one kind."""
+    width, height, perspective = seen.width, seen.height, isinstance(seen, PerspectiveView)
+    pixels = float(seen.focal_length if perspective else seen.scale)
     x, y = rng.uniform(0, width, count), rng.uniform(0, height, count)
     depth = np.exp(rng.uniform(np.log(4.0), np.log(rng.choice([5.0, 40.0])), count))
     size = np.exp(rng.uniform(np.log(0.6), np.log(6.0), count))  # radius in pixels
@@ -150,18 +114,19 @@ def _drawn(kind: str, rng: np.random.Generator, count: int, seen: Sight):
         depth = NEAR * np.exp(rng.uniform(-1, 5, count))
         size = np.exp(rng.uniform(0, 6, count))
     if kind == "in one tile":
-        x, y, size = (
-            (rng.uniform(8.2, 15.8, count) for _ in range(2)),
-            None,
-            rng.uniform(0.3, 2, count),
-        )
-        x, y = x
+        x, y = rng.uniform(8.2, 15.8, (2, count))
+        size = rng.uniform(0.3, 2, count)
     if kind == "in one place":
         x, y, depth = (np.repeat(each[:1], count) for each in (x, y, depth))
     if kind == "two sheets":
         depth, size = np.full(count, depth[0]), rng.uniform(2, 6, count)
-    places = seen.places(x, y, depth)
-    rays = seen.rays(places)
+    mm = depth / pixels if perspective else np.full_like(depth, 1 / pixels)  # of a pixel
+    across = np.stack([x - width / 2, y - height / 2]) * mm
+    position, axes = np.asarray(seen.position, float), np.asarray(seen.rotation, float)
+    places = np.stack([*across, depth], axis=1) @ axes
+    distance = np.linalg.norm(places, axis=1, keepdims=True)
+    rays = places / distance if perspective else np.tile(axes[2], (count, 1))
+    places += position
     random = rng.normal(size=(count, 3))
     across = np.cross(rays, random)
     across /= np.linalg.norm(across, axis=1, keepdims=True)
@@ -178,12 +143,12 @@ def _drawn(kind: str, rng: np.random.Generator, count: int, seen: Sight):
             across - rays * (rng.choice([-1, 1], count) * 10 ** rng.uniform(-9, -1, count))[:, None]
         )
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    radii = size * seen.mm(np.abs(depth))
+    radii = size * np.abs(mm)
     if kind == "two sheets":
         settings = SplattingSettings()
         radii = np.full(count, radii[0])
         normals = -rays
-        reach = np.hypot(radii, settings.filter_radius * seen.mm(depth))
+        reach = np.hypot(radii, settings.filter_radius * mm)
         apart = settings.epsilon_z * reach * rng.choice([0.5, 0.97, 1.03, 2.5])
         places += np.where(np.arange(count) % 2, apart, 0)[:, None] * rays
     if kind == "alone":

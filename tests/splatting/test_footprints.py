@@ -14,6 +14,7 @@ NO_FILTER = SplattingSettings(filter_radius=1e-4)
 FINE = {"width": 40_000, "height": 32_000}
 # float64: that quarter pixel; float32: slanted discs cancel by the squared tangent.
 AGREEMENT = {"float64": 2e-5, "float32": 2e-3}
+DISTANCE = 40.0  # mm
 POWER_ERROR = 0.045  # of a filter of radius root 2 on the pixels' grid
 VIEWS = {"perspective": bodies.perspective, "orthographic": bodies.orthographic}
 FINE_VIEWS = {
@@ -68,16 +69,10 @@ def power(body, view):
     return jnp.sum(weight, axis=1), footprints.opacity
 
 
-def rays(view, x, y):
-    """Return where rays through pixels start, and where they go; float64."""
-    rotation, position = np.asarray(view.rotation, float), np.asarray(view.position, float)
-    x, y = np.asarray(x, float) - view.width / 2, np.asarray(y, float) - view.height / 2
-    if hasattr(view, "focal_length"):
-        f = float(view.focal_length)
-        along = np.stack([x / f, y / f, np.ones_like(x)], -1) @ rotation
-        return np.broadcast_to(position, along.shape), along
-    start = position + np.stack([x, y, np.zeros_like(x)], -1) / float(view.scale) @ rotation
-    return start, np.broadcast_to(rotation[2], start.shape)
+def at_depth(view, x, y, depth):
+    """Points of the rays through pixels: `[splats, samples, 3]`."""
+    given = (jnp.asarray(each, float) for each in (x, y, np.full_like(x, depth)))
+    return np.moveaxis(np.asarray(view.unproject(*given), float), 0, -1)
 
 
 @pytest.mark.parametrize("kind", VIEWS)
@@ -86,7 +81,8 @@ def test_fragments_are_where_rays_meet_discs(kind, dtype):
     footprints, box = footprints_of(view, body, NO_FILTER)
     x, y = around(box, 1.25, 17)
     _, squared_radius, depth = (np.asarray(each) for each in fragments(footprints, view, x, y))
-    start, along = rays(view, x, y)
+    start = at_depth(view, x, y, 0.0)
+    along = (at_depth(view, x, y, DISTANCE) - start) / DISTANCE
     centers, normals = (np.asarray(each, float)[:, None] for each in (body.centers, body.normals))
     t = np.sum((centers - start) * normals, -1) / np.sum(along * normals, -1)
     hit = start + t[..., None] * along

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from random_bodies import KINDS, disagreement, random_body, seeds
 
-from splatjax._combination import OneDevice, PartByPart
+from splatjax._combination import OneDevice
 from splatjax.splatting import (
     BinCapacity,
     DenseRasterizer,
@@ -24,7 +24,6 @@ from splatjax.splatting import (
     TileGrid,
     TilePlan,
     TileRasterizer,
-    sum_parts,
 )
 
 WIDTH, HEIGHT = 21, 18
@@ -150,39 +149,6 @@ def test_a_picture_is_the_middle_of_a_larger_one(float64):
         small, large = weights(*random_body(seed, 24, True, WIDTH, HEIGHT))
         for ours, theirs in zip(small, large, strict=True):
             assert disagreement(ours, theirs[border:-border, border:-border]) < VALUE, seed
-
-
-@pytest.mark.once
-@pytest.mark.long
-def test_parts_of_the_splats_sum_to_the_whole():
-    """Splats of one part lie before those of another, wherever they are cut; beyond the picture
-    nothing is summed.
-    """
-    body, view = random_body(len(KINDS) + 3, 24, True, WIDTH, HEIGHT)
-    rows = jnp.asarray(np.random.default_rng(5).normal(size=(2, 24)), float)
-    plan = roomy(view, 24)
-    whole = jax.jit(lambda *given: plan.sum_fragments(*given, view, SETTINGS, OneDevice()))
-    whole = whole(body, rows)
-    within = TileGrid(WIDTH, HEIGHT).within_picture()
-    tiles = np.asarray(whole.tiles)
-    weights = np.asarray(whole.rows[:, -1])[tiles < len(within)]
-    assert not np.any(weights[~within[tiles[tiles < len(within)]]])
-
-    @jax.jit
-    def part_by_part(body, rows):
-        def parts():
-            for part in (slice(0, 10), slice(10, 24)):
-                cut = jax.tree.map(lambda leaf, part=part: leaf[part], body)
-                yield [plan.part_sweep(cut, rows[:, part], view, SETTINGS)]
-
-        return sum_parts(parts, [plan.places], PartByPart())[0][0]
-
-    both = part_by_part(body, rows), whole
-    pictures = [bodies.pictures(sums, view, SETTINGS) for sums in both]
-    ours, theirs = ((each.front, each.behind) for each in pictures)
-    assert float(jnp.sum(theirs[1].weight_sum > 0)) > 5
-    for found, expected in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
-        np.testing.assert_allclose(found, expected, atol=VALUE32 * float(jnp.max(expected)))
 
 
 @pytest.mark.once

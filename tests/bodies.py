@@ -1,4 +1,4 @@
-"""Bodies and views to splat: normals and areas are those of the surface."""
+"""Bodies and views to splat, shared by all tests: normals and areas are those of the surface."""
 
 import equinox as eqx
 import jax
@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from splatjax._combination import OneDevice
+from splatjax.gaussians import SumOfGaussians
 from splatjax.scene import Camera, Splats
 from splatjax.splatting import (
     AbstractRasterPlan,
@@ -108,6 +109,46 @@ def orthographic(scale=1.2, width=40, height=32) -> OrthographicView:
     right /= np.linalg.norm(right)
     rotation = jnp.asarray(np.stack([right, np.cross(forward, right), forward]), float)
     return OrthographicView(jnp.zeros(3), rotation, jnp.asarray(scale, float), width, height)
+
+
+def camera_over(half_view: float, pixels: int, slant: float = 0.0) -> Camera:
+    """A camera far above the origin that sees `half_view` mm to each side; `slant` in degrees."""
+    distance, angle = 40 * half_view, np.radians(slant)
+    eye = [0.0, -distance * np.sin(angle), distance * np.cos(angle)]
+    fov = 2 * np.degrees(np.arctan(1 / 40))
+    return Camera.look_at(eye, [0, 0, 0], fov=fov, width=pixels, height=pixels)
+
+
+def hits(camera: Camera) -> np.ndarray:
+    """Where the rays through the pixels meet z = 0: `[height, width, 3]`."""
+    y, x = np.indices((camera.height, camera.width)) + 0.5
+    eye = np.asarray(camera.position, float)
+    given = (jnp.asarray(each, float) for each in (x, y, np.full_like(x, np.linalg.norm(eye))))
+    ways = np.moveaxis(np.asarray(PerspectiveView.of(camera).unproject(*given), float), 0, -1) - eye
+    return eye - ways * (eye[2] / ways[..., 2:])
+
+
+def two_gaussians() -> SumOfGaussians:
+    """A material of two layers, for laws that hold for any number: each more takes its time to
+    compile.
+    """
+    return SumOfGaussians([0.5, 3.0], [[0.3, 0.2, 0.1], [0.4, 0.3, 0.2]])
+
+
+def apart(one, other) -> dict[str, float]:
+    """Compute by how much the leaves of two trees differ, of the largest number in each; infinite
+    numbers must be the same.
+    """
+    errors = {}
+    leaves = zip(jax.tree_util.tree_leaves_with_path(one), jax.tree.leaves(other), strict=True)
+    for (path, x), y in leaves:
+        x, y = np.asarray(x), np.asarray(y)
+        finite = np.isfinite(x)
+        np.testing.assert_array_equal(finite, np.isfinite(y))
+        largest = max(np.max(np.abs(x[finite]), initial=0.0), 1e-30)
+        error = np.max(np.abs(x[finite] - y[finite]), initial=0.0) / largest
+        errors[jax.tree_util.keystr(path)] = float(error)
+    return errors
 
 
 class Pictures(eqx.Module):
