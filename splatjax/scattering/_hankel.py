@@ -60,7 +60,8 @@ def inverse_hankel_transform(
     far = jnp.sum(weights * x * transform(x), axis=0) / at
     # Near it: a series in (r / 2 decay)^2, whose coefficients are moments of F.
     nodes, moments = (jnp.asarray(values, decay.dtype) for values in _half_line())
-    coefficients = moments @ transform(nodes[:, None] / decay[None]) / (decay * decay)[None]
+    terms = transform(nodes[:, None] / decay[None]) / (decay * decay)[None]
+    coefficients = jnp.sum(moments[..., None] * terms[None], axis=1)
     squared = jnp.where(near, 0.25 * radius * radius / (scale * scale), 0.0)
     about_origin = jnp.polyval(
         coefficients.reshape(_TERMS, *[1] * r.ndim, *decay.shape), squared, unroll=_TERMS

@@ -10,11 +10,11 @@ from splatjax._chunking import jit_unless_traced
 from splatjax._records import Numbers, check_values, numbers, record
 from splatjax.gaussians import AbstractProfile
 
+# Fraction of the peak above which pixels determine the center.
 _CORE = 0.2
-"""Fraction of the peak above which pixels determine the center."""
 
+# Of a ring: with fewer, its scatter hardly determines the error of its mean.
 _LEAST_PIXELS = 12
-"""Of a ring: with fewer, its scatter hardly determines the error of its mean."""
 
 
 @record
@@ -162,13 +162,16 @@ def measure_laser_dot(
     check_values("power", entering, "positive", lambda x: x > 0)
     check_values("step", np.asarray(float(step)), "at least 1 pixel", lambda x: x >= 1 - 1e-9)
     height, width = pixels.shape[:2]
-    x0, y0 = _centroid(pixels) if center is None else center
+    y, x = np.mgrid[:height, :width] + 0.5
+    light = pixels.sum(axis=2)
+    core = np.where(light > _CORE * light.max(), light, 0.0)
+    centroid = [float((core * each).sum() / core.sum()) for each in (x, y)]
+    x0, y0 = centroid if center is None else center
     inside = min(x0, y0, width - x0, height - y0)
     if not inside > 0:
         raise ValueError(
             f"center {x0:g}, {y0:g} is outside of the picture of {width} x {height} pixels"
         )
-    y, x = np.mgrid[:height, :width] + 0.5
     radius = np.hypot(x - x0, y - y0)
     last = inside if largest is None else min(largest / mm_per_pixel, inside)
     within = radius <= last
@@ -189,13 +192,6 @@ def measure_laser_dot(
         Tabulated(*map(np.stack, zip(*samples, strict=True))),
         jnp.asarray([x0, y0], jnp.result_type(float)),
     )
-
-
-def _centroid(pixels: np.ndarray) -> tuple[float, float]:
-    light = pixels.sum(axis=2)
-    light = np.where(light > _CORE * light.max(), light, 0.0)
-    y, x = np.mgrid[: light.shape[0], : light.shape[1]] + 0.5
-    return float((light * x).sum() / light.sum()), float((light * y).sum() / light.sum())
 
 
 def _rings(radius: np.ndarray, step: float) -> list[np.ndarray]:
