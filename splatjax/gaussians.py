@@ -93,9 +93,8 @@ class SumOfGaussians(AbstractProfile):
 
     @jit_unless_traced
     def __call__(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
-        squared_radius = jnp.broadcast_to((r * r)[..., None], (*r.shape, *self.variances.shape))
-        variances = jnp.broadcast_to(self.variances, squared_radius.shape)
-        return jnp.dot(gaussian(variances, squared_radius), self.weights)
+        variances = self.variances.reshape(*[1] * r.ndim, -1)
+        return jnp.dot(gaussian(variances, (r * r)[..., None]), self.weights)
 
     def total_reflectance(self) -> Float[Array, " channels"]:
         return jnp.sum(self.weights, axis=0)

@@ -11,7 +11,6 @@ from splatjax._records import check_values
 from splatjax.diffusion import DenseDiffuser
 from splatjax.fitting import GivenVariances
 from splatjax.inverse import Candidate, Observation
-from splatjax.scattering import RoughFresnel
 from splatjax.splatting import DenseRasterizer
 from splatjax.transport import HenyeyGreenstein
 
@@ -53,7 +52,6 @@ RECORDS = {
         [0, 1, 2], [3, 2, 1], deviation=(0.1, 0.1, 0.1), total=[1]
     ),
     "SingleScattering": lambda: sj.SingleScattering(medium()),
-    "RoughFresnel": lambda: RoughFresnel(1),
     "SumOfGaussians": lambda: sj.SumOfGaussians([0.1, 2], weights=[0.3, 0.5]),
     "Material": lambda: sj.Material(material().gaussians, eta=1, roughness=np.float64(0.5)),
     "Splats": lambda: splats(albedo=[[0.5, 0, 1]] * 2, roughness=1),

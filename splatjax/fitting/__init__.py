@@ -1,22 +1,24 @@
 """From a profile to a sum of Gaussians: Eq. 3 and Eq. 4."""
 
-from ._counts import (
+from ._fit import (
     error_by_count as error_by_count,
     ErrorByCount as ErrorByCount,
+    fit_gaussians as fit_gaussians,
+    fit_weights as fit_weights,
+    FitResult as FitResult,
     LeastCount as LeastCount,
 )
-from ._errors import relative_error as relative_error, squared_error as squared_error
-from ._fit import fit_gaussians as fit_gaussians, FitResult as FitResult, fit_weights as fit_weights
 from ._medium import fit_medium as fit_medium, MediumFit as MediumFit
+from ._problem import relative_error as relative_error, squared_error as squared_error
 from ._search import (
     AbstractStart as AbstractStart,
+    DipoleStarts as DipoleStarts,
     GivenVariances as GivenVariances,
     GreedyInsertion as GreedyInsertion,
     AbstractSpread as AbstractSpread,
     SharedVariances as SharedVariances,
     VariancesPerChannel as VariancesPerChannel,
 )
-from ._starts import DipoleStarts as DipoleStarts
 from ._weights import (
     AbstractWeights as AbstractWeights,
     FixedTotalReflectance as FixedTotalReflectance,

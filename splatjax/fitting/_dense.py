@@ -21,21 +21,14 @@ from lineax.internal import (
 @jax.custom_jvp
 def invert(matrix: Float[Array, "columns columns"]) -> Float[Array, "columns columns"]:
     """Invert a positive definite matrix by Gauss and Jordan's elimination, without pivoting."""
-    index = jnp.arange(matrix.shape[0])
 
     def eliminate(column, matrix):
-        here = index == column
-        pivot = matrix[column, column]
-        zeros = jnp.zeros_like(matrix[column])
-        left = jnp.where(here, zeros, matrix[:, column]) / pivot
-        row = jnp.where(here, zeros, matrix[column])
-        others = matrix - left[:, None] * row[None, :]
-        at_row = jnp.broadcast_to(here[:, None], matrix.shape)
-        at_column = jnp.broadcast_to(here[None, :], matrix.shape)
-        unit = jnp.where(here, 1 / pivot, zeros)
-        return jnp.where(
-            at_column, (unit - left)[:, None], jnp.where(at_row, (row / pivot)[None, :], others)
-        )
+        here = jnp.arange(matrix.shape[0]) == column
+        # The unit vector takes the place of the column, and turns into that of the inverse.
+        replaced = jnp.where(here[None], here[:, None].astype(matrix.dtype), matrix)
+        row = replaced[column] / matrix[column, column]
+        reduced = replaced - matrix[:, column][:, None] * row[None]
+        return jnp.where(here[:, None], row[None], reduced)
 
     return jax.lax.fori_loop(0, matrix.shape[0], eliminate, matrix)
 
@@ -56,11 +49,6 @@ def invert_moving(
     return invert(hessian + jnp.diag(still.astype(hessian.dtype)))
 
 
-def normal_inverse(matrix: Float[Array, "rows columns"]) -> Float[Array, "columns columns"]:
-    """Compute the inverse of `matrix^T matrix`."""
-    return invert(matrix.T @ matrix)
-
-
 def least_squares(
     matrix: Float[Array, "rows columns"],
     right: Float[Array, " rows"],
@@ -77,7 +65,7 @@ class NormalEquations(lx.AbstractLinearSolver):
     def init(self, operator, options):
         del options
         matrix = operator.as_matrix()
-        return matrix, normal_inverse(matrix), False, pack_structures(operator)
+        return matrix, invert(matrix.T @ matrix), False, pack_structures(operator)
 
     def compute(self, state, vector, options):
         del options

@@ -1,5 +1,5 @@
-"""The fit as a function of the logarithms of the variances alone: the weights are solved inside
-(variable projection).
+"""What a fit minimizes (Eq. 3) and reports (Eq. 4); and the fit as a function of the logarithms of
+the variances alone: the weights are solved inside (variable projection).
 """
 
 import equinox as eqx
@@ -7,12 +7,73 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from splatjax._chunking import jit_unless_traced
 from splatjax.gaussians import AbstractProfile, SumOfGaussians, gaussian
-from splatjax.scattering import AbstractRadialRule, at_own_radii
+from splatjax.scattering import L2_QUADRATURE, AbstractRadialRule, at_own_radii
 
 from ._dense import invert_moving
-from ._errors import norm_radii
 from ._weights import AbstractWeights, without_idle
+
+
+def norm_radii(
+    profile: AbstractProfile, rule: AbstractRadialRule
+) -> tuple[Float[Array, "nodes channels"], Float[Array, "nodes channels"]]:
+    """Compute radii and weights of integrals of `r R^2`, where the integral exists."""
+    if profile.singular and rule.reaches_origin:
+        raise ValueError(
+            f"{type(profile).__name__} goes to infinity like 1/r, so that the integral of r R^2 "
+            "from 0 (Eq. 3) does not exist; state where it starts, in length scales of the "
+            "profile: rule=L2_QUADRATURE.beyond(1.0)"
+        )
+    return rule.radii(profile)
+
+
+@jit_unless_traced
+def squared_error(
+    profile: AbstractProfile, gaussians: SumOfGaussians, rule: AbstractRadialRule = L2_QUADRATURE
+) -> Float[Array, " channels"]:
+    r"""Compute the error that a fit minimizes, the integral over r of `r (R(r) - sum_i w_i G(v_i,
+    r))^2` (Eq. 3).
+
+    **Arguments:**
+
+    - `profile`: the reference, 1/mm^2. Differentiable.
+    - `gaussians`: with as many channels. Differentiable.
+    - `rule`: radii of the integral, in length scales of `profile`.
+
+    **Returns:** [channels], 1/mm^2, at least 0.
+
+    **Raises:** `ValueError` for a profile that is infinite at the origin, unless the rule starts
+    beyond it.
+
+    **Source:** Kim et al. 2010, Eq. 3 (d'Eon, Luebke and Enderton 2007).
+    """
+    r, dr = norm_radii(profile, rule)
+    difference = at_own_radii(profile, r) - at_own_radii(gaussians, r)
+    return jnp.sum(dr * r * difference * difference, axis=0)
+
+
+@jit_unless_traced
+def relative_error(
+    profile: AbstractProfile, gaussians: SumOfGaussians, rule: AbstractRadialRule = L2_QUADRATURE
+) -> Float[Array, " channels"]:
+    r"""Compute the relative error of a fit: the root of Eq. 3 over that of the integral of `r R^2`
+    (Eq. 4).
+
+    It weights the core of a profile, hardly its tail: see `FitResult.energy_error` for the energy.
+
+    **Arguments:** as for `squared_error`. Differentiable where the fit is not perfect.
+
+    **Returns:** [channels], at least 0; it depends on neither the unit of length nor the scale of
+    the profile.
+
+    **Source:** Kim et al. 2010, Eq. 4.
+    """
+    r, dr = norm_radii(profile, rule)
+    values = at_own_radii(profile, r)
+    return jnp.sqrt(
+        squared_error(profile, gaussians, rule) / jnp.sum(dr * r * values * values, axis=0)
+    )
 
 
 class Expansion(eqx.Module):
@@ -64,17 +125,6 @@ class FitProblem(eqx.Module):
         variances = jax.lax.stop_gradient(variances).astype(self.target.dtype)
         return jnp.log(variances / self.squared_unit)
 
-    def basis(
-        self, log_variances: Float[Array, " gaussians"]
-    ) -> Float[Array, "channels nodes gaussians"]:
-        """Compute the Gaussians at the nodes, each scaled to a unit norm (in closed form)."""
-        variances = self.variances(log_variances)
-        shape = (*self.squared_radii.shape, *variances.shape)
-        squared_radii = jnp.broadcast_to(self.squared_radii[..., None], shape)
-        values = gaussian(jnp.broadcast_to(variances, shape), squared_radii)
-        energies = jnp.broadcast_to(self._energies(variances), shape)
-        return values * energies * self.root_weights[..., None]
-
     def solve(
         self,
         log_variances: Float[Array, " gaussians"],
@@ -88,8 +138,11 @@ class FitProblem(eqx.Module):
         """Find the best coefficients of each channel: the basis, the coefficients, their response
         and the residuals. Gaussians that are not active have the coefficient 0.
         """
-        basis = self.basis(log_variances)
-        energies = self._energies(self.variances(log_variances))
+        variances = self.variances(log_variances)
+        energies = self.energies(variances)
+        # The Gaussians at the nodes, each scaled to a unit norm (in closed form).
+        basis = gaussian(variances[None, None], self.squared_radii[..., None])
+        basis = basis * energies[None, None] * self.root_weights[..., None]
 
         def solve(rows, target, total):
             if active is None:
@@ -104,14 +157,6 @@ class FitProblem(eqx.Module):
         coefficients, response = jax.vmap(solve)(basis, self.target, self.total / self.norm)
         residuals = self.target - jnp.einsum("cnk,ck->cn", basis, coefficients)
         return basis, coefficients, response, residuals
-
-    def best_weights(
-        self, log_variances: Float[Array, " gaussians"]
-    ) -> Float[Array, "gaussians channels"]:
-        """Compute the weights with the least error."""
-        _, coefficients, _, _ = self.solve(log_variances)
-        energies = self._energies(self.variances(log_variances))
-        return (coefficients * self.norm[:, None] * energies[None]).T
 
     def residuals(
         self,
@@ -160,7 +205,7 @@ class FitProblem(eqx.Module):
         normal = jnp.einsum("cni,cnj->ij", steep, steep)
         # From logarithms to variances, and from coefficients to weights.
         variances, (channels, count) = self.variances(log_variances), coefficients.shape
-        scale = self.norm[:, None] * self._energies(variances)[None]
+        scale = self.norm[:, None] * self.energies(variances)[None]
         follow = jnp.concatenate(
             [jnp.diag(variances), (moved * scale[..., None]).reshape(channels * count, count)]
         )
@@ -179,9 +224,10 @@ class FitProblem(eqx.Module):
         """Compute the first and second derivative of the basis at fixed weights, and how the
         coefficients follow if there are no residuals.
         """
-        reach = self._reach(log_variances) - 1
-        slopes = basis * reach
-        curved = basis * (reach * reach - reach - 1)
+        variances = self.variances(log_variances)[None, None]
+        growth = 0.5 * self.squared_radii[..., None] / variances - 1
+        slopes = basis * growth
+        curved = basis * (growth * growth - growth - 1)
         moved = -jnp.einsum(
             "cij,cjk->cik",
             response,
@@ -189,15 +235,7 @@ class FitProblem(eqx.Module):
         )
         return slopes, curved, moved
 
-    def _reach(
-        self, log_variances: Float[Array, " gaussians"]
-    ) -> Float[Array, "channels nodes gaussians"]:
-        """Compute `r^2 / 2v`."""
-        shape = (*self.squared_radii.shape, *log_variances.shape)
-        variances = jnp.broadcast_to(self.variances(log_variances), shape)
-        return 0.5 * jnp.broadcast_to(self.squared_radii[..., None], shape) / variances
-
-    def _energies(self, variances: Float[Array, " gaussians"]) -> Float[Array, " gaussians"]:
+    def energies(self, variances: Float[Array, " gaussians"]) -> Float[Array, " gaussians"]:
         """The weight of a Gaussian of unit norm: the integral of r G(v, r)^2 is 1 / (8 pi^2 v)."""
         return jnp.sqrt(8 * jnp.pi**2 * variances)
 

@@ -8,24 +8,25 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
+from jax.scipy.ndimage import map_coordinates
 from jaxtyping import Array, Bool, Float, Int
 
 from splatjax._records import numbers, record
+from splatjax.scattering import Medium
 
 from ._dense import NormalEquations
 from ._problem import FitProblem
 
+# Log variances, in squared length scales, between which a single Gaussian starts.
 _FIRST = (-3.0, 4.0)
-"""Log variances, in squared length scales, between which a single Gaussian starts."""
 
+# How far, in log variance, a Gaussian starts outside the previous ones: neighbors lie 1.4 to 2.2
+# apart.
 _OUTWARD = 1.5
-"""How far, in log variance, a Gaussian starts outside the previous ones: neighbors lie 1.4 to 2.2
-apart.
-"""
 
 _TOLERANCE = 1e-3
+# Enough to tell the starts apart, and for Newton's method to finish from the best of them.
 _STEPS = 64
-"""Enough to tell the starts apart, and for Newton's method to finish from the best of them."""
 
 
 class AbstractStart(eqx.Module):
@@ -78,9 +79,48 @@ class GivenVariances(AbstractStart):
         return jnp.sort(_descend(problem, problem.log_variances(self.variances), None)[0])
 
 
-def search(problem: FitProblem, count: int, start: AbstractStart) -> Float[Array, " gaussians"]:
-    """Find nearly the best log variances, ascending. No derivative passes."""
-    return start.search(constant(problem), count).astype(problem.target.dtype)
+class DipoleStarts(eqx.Module):
+    r"""Variances of the best fits to dipoles, per channel, over reduced albedo and index of
+    refraction.
+
+    Counted in squared mean free paths they depend on nothing else. They are tabulated over `sqrt(1
+    - alpha')`, in which they are smooth, and interpolated linearly in their logarithms; beyond the
+    table's ends the last entry serves.
+
+    **Attributes:**
+
+    - `roots`: of `1 - alpha'`, equally spaced.
+    - `etas`: equally spaced.
+    - `log_variances`: one array per number of Gaussians, from 1 on.
+    """
+
+    roots: Float[Array, " roots"]
+    etas: Float[Array, " etas"]
+    log_variances: tuple[Float[Array, "roots etas _"], ...]
+
+    def __call__(self, medium: Medium, count: int) -> GivenVariances:
+        r"""Compute the start of a fit of `count` Gaussians to `Dipole(medium)` with
+        `VariancesPerChannel()`.
+
+        **Raises:** `ValueError` for more Gaussians than the table has.
+        """
+        if not 1 <= count <= len(self.log_variances):
+            raise ValueError(
+                f"starts are tabulated for 1 to {len(self.log_variances)} Gaussians; got {count}"
+            )
+        dtype = medium.eta.dtype
+        root = jnp.sqrt(medium.sigma_a / medium.sigma_t_prime)
+        tables = self.log_variances[count - 1], self.roots, self.etas
+        table, roots, etas = (values.astype(dtype) for values in tables)
+        place = [
+            (values - nodes[0]) / (nodes[1] - nodes[0])
+            for nodes, values in ((roots, root), (etas, medium.eta))
+        ]
+        columns = [
+            map_coordinates(table[..., i], place, order=1, mode="nearest") for i in range(count)
+        ]
+        length = 1 / medium.sigma_t_prime
+        return GivenVariances(jnp.exp(jnp.stack(columns, axis=-1)) * (length * length)[:, None])
 
 
 def constant(problem: FitProblem) -> FitProblem:

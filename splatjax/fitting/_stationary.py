@@ -9,19 +9,17 @@ from jaxtyping import Array, Bool, Float
 from ._dense import invert_moving
 from ._problem import Expansion, FitProblem
 
+# A fit has converged when a step of Gauss and Newton would lower the sum of squares by less than
+# this share of it,
 _GAIN = 1e-6
-"""A fit has converged when a step of Gauss and Newton would lower the sum of squares by less than
-this share of it,
-"""
 
+# or by less than the square of this many units of rounding of the profile's norm: there is no more
+# in the numbers.
 _FLOOR = 100.0
-"""or by less than the square of this many units of rounding of the profile's norm: there is no more
-in the numbers.
-"""
 
 _STEPS = 32
+# A step in log variance below this many units of rounding is none.
 _STEP = 10.0
-"""A step in log variance below this many units of rounding is none."""
 
 
 def stationary(

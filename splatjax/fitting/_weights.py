@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from ._dense import least_squares, normal_inverse
+from ._dense import invert, least_squares
 
 
 class AbstractWeights(eqx.Module):
@@ -42,7 +42,7 @@ class FreeWeights(AbstractWeights):
     """
 
     def solve(self, basis, target, energies, total):
-        inverse = normal_inverse(basis)
+        inverse = invert(basis.T @ basis)
         return least_squares(basis, target, inverse), inverse
 
 
@@ -52,7 +52,7 @@ class FixedTotalReflectance(AbstractWeights):
     """
 
     def solve(self, basis, target, energies, total):
-        inverse = normal_inverse(basis)
+        inverse = invert(basis.T @ basis)
         free = least_squares(basis, target, inverse)
         # The direction from the free optimum to the constraint that adds least to the error.
         direction = inverse @ energies

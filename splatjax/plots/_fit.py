@@ -1,27 +1,26 @@
-"""A profile, the Gaussians fitted to it, and what they leave."""
+"""A profile, the Gaussians fitted to it, what they leave, and what more of them gain."""
 
 from collections.abc import Sequence
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 from splatjax._format import channel_names
-from splatjax.fitting import relative_error
+from splatjax.fitting import ErrorByCount, relative_error
 from splatjax.gaussians import AbstractProfile, SumOfGaussians, gaussian
 from splatjax.scattering import L2_QUADRATURE, AbstractRadialRule
 
 _RGB = ("#c0392b", "#27853f", "#2c5aa0")
 _POINTS = 400
+# Share of its peak down to which a profile is drawn.
 _TAIL = 1e-7
-"""Share of its peak down to which a profile is drawn."""
+# Radii of a measurement, up to which each is marked.
 _FEW = 60
-"""Radii of a measurement, up to which each is marked."""
+# Relative error of the energy that is rounding.
 _HELD = 1e-6
-"""Relative error of the energy that is rounding."""
 
 
 def plot_fit(
@@ -53,95 +52,59 @@ def plot_fit(
     error = np.asarray(relative_error(profile, gaussians, rule))
     energy = np.asarray(gaussians.total_reflectance() / profile.total_reflectance() - 1)
     radii = np.asarray(r)
-    colors, names = colors_of(len(error)), channel_names(len(error))
+    left = radii[:, None] * (fitted - reference) / np.max(radii[:, None] * reference, axis=0)
 
     figure = Figure(figsize=(10, 7.5), layout="constrained")
-    grid = figure.add_gridspec(2, 2, height_ratios=(3, 2))
-    linear, log, residual = (
-        figure.add_subplot(grid[0, 0]),
-        figure.add_subplot(grid[0, 1]),
-        figure.add_subplot(grid[1, :]),
+    panels = figure.subplot_mosaic(
+        [["linear", "log"], ["residual", "residual"]], height_ratios=(3, 2)
     )
+    linear, log, residual = panels["linear"], panels["log"], panels["residual"]
 
-    dense = (
-        r if len(r) > _FEW else jnp.geomspace(r[0], r[-1], _POINTS, dtype=r.dtype)
-    )  # what the fit is between few radii
+    # What the fit is between few radii.
+    dense = r if len(r) > _FEW else jnp.geomspace(r[0], r[-1], _POINTS, dtype=r.dtype)
     between, of_fit = np.asarray(dense), np.asarray(gaussians(dense), np.float64)
+    parts = gaussian(gaussians.variances[None], (dense * dense)[:, None])
+    parts = parts * jnp.mean(gaussians.weights, axis=1)[None]
+    log.loglog(between, np.asarray(parts), color="0.75", linewidth=0.8, zorder=1)
     marker, width = (None, 3.0) if len(r) > _FEW else ("o", 0.8)
-    for part in single_gaussians(gaussians, dense).T:
-        log.loglog(between, part, color="0.75", linewidth=0.8, zorder=1)
-    for channel, color in enumerate(colors):
+    names = channel_names(len(error))
+    for channel, color in enumerate(_colors(len(error))):
         held = "held" if abs(energy[channel]) < _HELD else f"{energy[channel]:+.2e}"
         label = f"{names[channel]}: E = {error[channel]:.2e}, energy {held}"
-        linear.plot(
-            radii,
-            radii * reference[:, channel],
-            color=color,
-            alpha=0.35,
-            linewidth=width,
-            marker=marker,
-        )
+        given = reference[:, channel]
+        linear.plot(radii, radii * given, color=color, alpha=0.35, linewidth=width, marker=marker)
         linear.plot(between, between * of_fit[:, channel], color=color, linewidth=1.2, label=label)
-        log.loglog(
-            radii, reference[:, channel], color=color, alpha=0.35, linewidth=width, marker=marker
-        )
+        log.loglog(radii, given, color=color, alpha=0.35, linewidth=width, marker=marker)
         log.loglog(between, of_fit[:, channel], color=color, linewidth=1.2)
-        difference = radii * (fitted[:, channel] - reference[:, channel])
-        share = difference / np.max(radii * reference[:, channel])
-        residual.semilogx(radii, share, color=color, linewidth=1.2, marker=marker)
+        residual.semilogx(radii, left[:, channel], color=color, linewidth=1.2, marker=marker)
 
-    linear.set(
-        xlabel="r (mm)", ylabel="r R(r) (1/mm)", xlim=(0, _core(radii, reference)), ylim=(0, None)
-    )
+    # The radius within which the widest channel keeps four fifths of the energy that is drawn.
+    ring = np.cumsum(np.gradient(radii)[:, None] * radii[:, None] * reference, axis=0)
+    core = radii[np.argmax(ring >= 0.8 * ring[-1], axis=0).max()]
+    linear.set(xlabel="r (mm)", ylabel="r R(r) (1/mm)", xlim=(0, core), ylim=(0, None))
     linear.set_title("profile (wide) and fit (narrow)", fontsize="medium")
     linear.legend(fontsize="small", frameon=False)
-    bottom = _TAIL * reference.max()
-    log.set(
-        xlabel="r (mm)",
-        ylabel="R(r) (1/mm²)",
-        xlim=(radii[0], radii[-1]),
-        ylim=(bottom, 3 * max(reference.max(), fitted.max())),
-    )
+    highest, ends = reference.max(), (radii[0], radii[-1])
+    heights = (_TAIL * highest, 3 * max(highest, fitted.max()))
+    log.set(xlabel="r (mm)", ylabel="R(r) (1/mm²)", xlim=ends, ylim=heights)
     log.set_title("logarithmic, with each Gaussian (gray)", fontsize="medium")
     residual.axhline(0, color="0.6", linewidth=0.8)
-    residual.set(xlabel="r (mm)", ylabel="r (fit - R) / max r R", xlim=(radii[0], radii[-1]))
+    residual.set(xlabel="r (mm)", ylabel="r (fit - R) / max r R", xlim=ends)
     residual.set_title("residual", fontsize="medium")
     if not rule.reaches_origin:
-        _shade(rule, profile, (log, residual))
-        counts = radii >= _begin(rule, profile)
-        left = radii[:, None] * (fitted - reference) / np.max(radii[:, None] * reference, axis=0)
-        residual.set_ylim(1.3 * min(left[counts].min(), -1e-3), 1.3 * max(left[counts].max(), 1e-3))
+        nodes, weights = (np.asarray(each) for each in rule.radii(profile))
+        begin = float(nodes[weights > 0].min())
+        for axes in (log, residual):
+            axes.axvspan(ends[0], begin, color="0.93", zorder=0)
+        below = residual.get_xaxis_transform()
+        residual.text(begin, 0.03, "not fitted ", ha="right", transform=below, fontsize="small")
+        counts = left[radii >= begin]
+        residual.set_ylim(1.3 * min(counts.min(), -1e-3), 1.3 * max(counts.max(), 1e-3))
     for axis in (log.xaxis, residual.xaxis):
-        axis.set_minor_formatter(
-            NullFormatter()
-        )  # over less than a decade their labels would overlap
+        axis.set_minor_formatter(NullFormatter())  # within a decade their labels would overlap
     if title is not None:
         figure.suptitle(title)
     return figure
-
-
-def _begin(rule: AbstractRadialRule, profile: AbstractProfile) -> float:
-    """The radius, mm, from which on some channel is fitted."""
-    r, dr = (np.asarray(each) for each in rule.radii(profile))
-    return float(r[dr > 0].min())
-
-
-def _shade(rule: AbstractRadialRule, profile: AbstractProfile, axes: Sequence[Axes]) -> None:
-    for each in axes:
-        each.axvspan(each.get_xlim()[0], _begin(rule, profile), color="0.93", zorder=0)
-    axes[-1].text(
-        _begin(rule, profile),
-        0.03,
-        "not fitted ",
-        ha="right",
-        transform=axes[-1].get_xaxis_transform(),
-        fontsize="small",
-    )
-
-
-def colors_of(channels: int) -> Sequence[str]:
-    """Give a color for each channel: red, green and blue for three."""
-    return _RGB if channels == 3 else [f"C{channel}" for channel in range(channels)]
 
 
 def _radii(profile: AbstractProfile) -> Float[Array, " radii"]:
@@ -150,29 +113,36 @@ def _radii(profile: AbstractProfile) -> Float[Array, " radii"]:
     known = profile.known_radii()
     if known is not None:
         return known[0][known[0] > 0]
-    scale = np.asarray(profile.length_scale(), np.float64)
-    r = jnp.geomspace(
-        0.02 * scale.min(), 1e3 * scale.max(), 4 * _POINTS, dtype=profile.length_scale().dtype
-    )
+    scale = profile.length_scale()
+    least, most = 0.02 * scale.min(), 1e3 * scale.max()
+    r = jnp.geomspace(least, most, 4 * _POINTS, dtype=scale.dtype)
     values = np.asarray(profile(r))
-    visible = np.any(values > _TAIL * values.max(), axis=1)
-    last = np.flatnonzero(visible)[-1]
-    return jnp.geomspace(r[0], r[last], _POINTS, dtype=r.dtype)
+    last = np.flatnonzero(np.any(values > _TAIL * values.max(), axis=1))[-1]
+    return jnp.geomspace(least, r[last], _POINTS, dtype=r.dtype)
 
 
-def _core(radii: np.ndarray, reference: np.ndarray) -> float:
-    """The radius within which a channel keeps four fifths of the energy that is drawn, of the
-    widest channel.
+def _colors(channels: int) -> Sequence[str]:
+    return _RGB if channels == 3 else [f"C{channel}" for channel in range(channels)]
+
+
+def plot_error_by_count(by_count: ErrorByCount, *, title: str | None = None) -> Figure:
+    r"""Draw the error (Eq. 4) of each channel over the number of Gaussians, on a logarithmic axis.
+
+    **Arguments:**
+
+    - `by_count`: of `error_by_count`.
+    - `title`: of the figure.
+
+    **Returns:** a matplotlib `Figure`, which no window shows; `figure.savefig(path)` writes it.
     """
-    ring = np.cumsum(np.gradient(radii)[:, None] * radii[:, None] * reference, axis=0)
-    within = np.argmax(ring >= 0.8 * ring[-1], axis=0)
-    return float(radii[within.max()])
-
-
-def single_gaussians(gaussians: SumOfGaussians, r: Float[Array, " radii"]) -> np.ndarray:
-    """Give each Gaussian of a sum, with the mean weight of the channels: [radii, gaussians]."""
-    shape = (*r.shape, *gaussians.variances.shape)
-    values = gaussian(
-        jnp.broadcast_to(gaussians.variances, shape), jnp.broadcast_to((r * r)[:, None], shape)
-    )
-    return np.asarray(values * jnp.broadcast_to(jnp.mean(gaussians.weights, axis=1), shape))
+    error = np.asarray(by_count.error)
+    counts = np.arange(1, len(error) + 1)
+    figure = Figure(figsize=(6, 4), layout="constrained")
+    axes = figure.add_subplot()
+    for channel, color in enumerate(_colors(error.shape[1])):
+        axes.semilogy(counts, error[:, channel], "o-", color=color, markersize=4, linewidth=1.2)
+    axes.set(xlabel="number of Gaussians", ylabel="E (Eq. 4)", xticks=counts)
+    axes.grid(axis="y", color="0.9")
+    if title is not None:
+        figure.suptitle(title)
+    return figure

@@ -1,6 +1,5 @@
 """Media, interfaces, layers and reference profiles."""
 
-from ._better_dipole import BetterDipole as BetterDipole
 from ._burley import (
     AbstractBurleyScaling as AbstractBurleyScaling,
     Burley as Burley,
@@ -8,7 +7,12 @@ from ._burley import (
     DiffuseTransmission as DiffuseTransmission,
     Searchlight as Searchlight,
 )
-from ._dipole import AbstractHalfSpace as AbstractHalfSpace, Dipole as Dipole
+from ._dipole import (
+    AbstractDipole as AbstractDipole,
+    AbstractHalfSpace as AbstractHalfSpace,
+    BetterDipole as BetterDipole,
+    Dipole as Dipole,
+)
 from ._fresnel import (
     AbstractFresnel as AbstractFresnel,
     EganFresnel as EganFresnel,
@@ -17,9 +21,8 @@ from ._fresnel import (
     reflectance as reflectance,
 )
 from ._hankel import inverse_hankel_transform as inverse_hankel_transform
-from ._laser_dot import LaserDot as LaserDot, measure_laser_dot as measure_laser_dot
 from ._medium import check_stack as check_stack, Film as Film, Layer as Layer, Medium as Medium
-from ._photon_beam import PhotonBeam as PhotonBeam
+from ._photon_beam import PhotonBeam as PhotonBeam, SingleScattering as SingleScattering
 from ._quadrature import (
     AbstractRadialRule as AbstractRadialRule,
     at_own_radii as at_own_radii,
@@ -29,12 +32,14 @@ from ._quadrature import (
     L2_QUADRATURE as L2_QUADRATURE,
     RadialRule as RadialRule,
 )
-from ._rough import RoughFresnel as RoughFresnel
-from ._single_scattering import SingleScattering as SingleScattering
 from ._slab import (
     AbstractSlabProfile as AbstractSlabProfile,
     LayeredMultipole as LayeredMultipole,
     Multipole as Multipole,
     Transmitted as Transmitted,
 )
-from ._tabulated import Tabulated as Tabulated
+from ._tabulated import (
+    LaserDot as LaserDot,
+    measure_laser_dot as measure_laser_dot,
+    Tabulated as Tabulated,
+)

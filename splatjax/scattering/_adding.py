@@ -60,8 +60,7 @@ def slab_response(
     layer: Layer,
     eta_above: Float[Array, " channels"],
     eta_below: Float[Array, " channels"],
-    fresnel_above: AbstractFresnel,
-    fresnel_below: AbstractFresnel,
+    fresnel: AbstractFresnel,
     k: Float[Array, "*shape"],
 ) -> Response:
     r"""Compute the response of a slab: the infinite series of Donner and Jensen's multipole,
@@ -78,7 +77,7 @@ def slab_response(
     **Arguments:**
 
     - `eta_above`, `eta_below`: indices of the neighbors relative to air.
-    - `fresnel_above`, `fresnel_below`: the diffuse Fresnel moments of either side.
+    - `fresnel`: the diffuse Fresnel moments of either side.
     - `k`: 1/mm, at least 0; the last axis is the channels.
 
     **Source:** image positions: Donner and Jensen 2005; the sum is our own.
@@ -86,20 +85,13 @@ def slab_response(
     medium = layer.medium
     depth = 1 / medium.sigma_t_prime
     thickness = jnp.where(layer.thickness >= (1 - 1e-6) * depth, layer.thickness, jnp.nan)
-    above = 2 / 3 * fresnel_above.boundary(medium.eta / eta_above) * depth
-    below = 2 / 3 * fresnel_below.boundary(medium.eta / eta_below) * depth
-    beneath, height = thickness - depth, thickness + above + below
-    albedo, depth, above, below, beneath, height, squared_sigma_tr = (
+    above, below = (
+        2 / 3 * fresnel.boundary(medium.eta / eta) * depth for eta in (eta_above, eta_below)
+    )
+    lengths = depth, above, below, thickness - depth, thickness + above + below
+    albedo, squared_sigma_tr, depth, above, below, beneath, height = (
         jnp.broadcast_to(each, k.shape)
-        for each in (
-            medium.albedo_prime,
-            depth,
-            above,
-            below,
-            beneath,
-            height,
-            medium.squared_sigma_tr,
-        )
+        for each in (medium.albedo_prime, medium.squared_sigma_tr, *lengths)
     )
     u = squared_sigma_tr + k * k
 
@@ -137,8 +129,10 @@ def hyperbolic_ratio(
     width = jnp.where(finite, a, 1.0)
     # Near 0, as a sum of logarithms of sinh(x) / x and of cosh(x).
     v = jnp.where(small, u, 0.0)
-    logarithm = _log_sinhc(v * width * width) + _log_cosh(v * b * b) - _log_sinhc(v * reach * reach)
-    series = width / reach * jnp.exp(logarithm)
+    y = v * b * b
+    log_cosh = y * (1 / 2 - y * (1 / 12 - y * (1 / 45 - y * (17 / 2520))))
+    log_sinhs = _log_sinhc(v * width * width) - _log_sinhc(v * reach * reach)
+    series = width / reach * jnp.exp(log_sinhs + log_cosh)
     s = jnp.sqrt(jnp.where(small, 1 / (reach * reach), u))
     upper = jnp.where(finite, -jnp.expm1(-2 * s * width), 1.0)
     lower = jnp.where(finite, -jnp.expm1(-2 * s * reach), 1.0)
@@ -151,8 +145,3 @@ def hyperbolic_ratio(
 def _log_sinhc(y):
     """`log(sinh(x) / x)` for small `y = x^2`."""
     return y * (1 / 6 - y * (1 / 180 - y * (1 / 2835 - y / 37800)))
-
-
-def _log_cosh(y):
-    """`log(cosh(x))` for small `y = x^2`."""
-    return y * (1 / 2 - y * (1 / 12 - y * (1 / 45 - y * (17 / 2520))))

@@ -1,4 +1,6 @@
-"""The classical dipole."""
+"""The classical dipole, and one that counts fluence and flux."""
+
+import abc
 
 import jax
 import jax.numpy as jnp
@@ -29,66 +31,114 @@ class AbstractHalfSpace(AbstractProfile):
         return 1 / self.medium.sigma_t_prime
 
 
+class AbstractDipole(AbstractHalfSpace):
+    r"""A source one mean free path `z_r` below the surface, its mirror image at `z_v = z_r + h`
+    above:
+
+        R(r) = alpha' / (4 pi) * { C_phi / D [exp(-s d_r) / d_r - exp(-s d_v) / d_v]
+                                   + C_E * sum over z in (z_r, z_v) of
+                                     z (1 + s d) exp(-s d) / d^3 },
+
+    with `s = sigma_tr` and `d^2 = r^2 + z^2`.
+
+    Fresnel transmission at entry and exit is not part of it. Differentiable in every coefficient
+    and in `r`; the derivatives at `r = 0` and, for the profile, at `sigma_a = 0` equal the
+    one-sided limits.
+    """
+
+    @abc.abstractmethod
+    def boundary(self) -> tuple[Array, Array, Array, Array | None]:
+        """Compute `sigma_tr^2`, `h`, `C_E`, and `C_phi / D`: None where fluence does not count."""
+
+    @jit_unless_traced
+    def __call__(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
+        shape = (*r.shape, self.medium.channels)
+        squared_radius = jnp.broadcast_to((r * r)[..., None], shape)
+        depth = jnp.broadcast_to(self.length_scale(), shape)
+        albedo_prime = jnp.broadcast_to(self.medium.albedo_prime, shape)
+        return albedo_prime * self.exitance(depth, squared_radius)
+
+    def exitance(
+        self, depth: Float[Array, "*shape"], squared_radius: Float[Array, "*shape"]
+    ) -> Float[Array, "*shape"]:
+        """Compute the exitance, 1/mm^2, above a point source of unit power and its image; the last
+        axis is the channels.
+        """
+        u, height, flux, fluence = jax.tree.map(
+            lambda constant: jnp.broadcast_to(constant, depth.shape), self.boundary()
+        )
+        image = depth + height
+        near, far = squared_radius + depth * depth, squared_radius + image * image
+        exitance = flux * sum(
+            z * screening(u * squared) / (squared * jnp.sqrt(squared))
+            for z, squared in ((depth, near), (image, far))
+        )
+        if fluence is not None:
+            exitance = exitance + fluence * fluence_difference(u, near, far)
+        return exitance / (4 * jnp.pi)
+
+    @jit_unless_traced
+    def total_reflectance(self) -> Float[Array, " channels"]:
+        r"""Compute `2 pi` times the integral of `r R(r)` in closed form.
+
+            alpha'/2 exp(-s z_r) { C_E (1 + exp(-s h)) + C_phi / D (1 - exp(-s h)) / s }
+
+        **Returns:** in [0, 1]; 1 where `sigma_a = 0`. There its derivative in `sigma_a` diverges
+        like `-sigma_a^(-1/2)`, so that autodiff returns infinity at `sigma_a = 0`, on purpose.
+
+        **Source:** Jensen et al. 2001, section 2.4, for the classical dipole.
+        """
+        squared_sigma_tr, height, flux, fluence = self.boundary()
+        s = jnp.sqrt(squared_sigma_tr)
+        total = flux * (1 + jnp.exp(-s * height))
+        if fluence is not None:
+            total = total + fluence * height * one_minus_exp_over(s * height)
+        return 0.5 * self.medium.albedo_prime * jnp.exp(-s * self.length_scale()) * total
+
+
 @record
-class Dipole(AbstractHalfSpace):
-    r"""The dipole of a semi-infinite medium: a source one mean free path below the surface, its
-    mirror image above.
+class Dipole(AbstractDipole):
+    r"""The dipole of a semi-infinite medium.
 
     With `z_r = 1 / sigma_t'`, `z_v = z_r (1 + 4A/3)` and `d^2 = r^2 + z^2`,
 
         R(r) = alpha' / (4 pi) * sum over z in (z_r, z_v) of z (1 + sigma_tr d) exp(-sigma_tr d) /
         d^3.
 
-    Fresnel transmission at entry and exit is not part of it. Differentiable in every coefficient
-    and in `r`; the derivatives at `r = 0` and, for the profile, at `sigma_a = 0` equal the
-    one-sided limits.
-
     **Attributes:** `medium` and `fresnel`, as for every half space.
 
     **Source:** Jensen, Marschner, Levoy and Hanrahan 2001, Eq. 4 (with both depths positive).
     """
 
-    @jit_unless_traced
-    def __call__(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
+    def boundary(self):
         medium = self.medium
-        shape = (*r.shape, medium.channels)
-        squared_radius = jnp.broadcast_to((r * r)[..., None], shape)
-        squared_sigma_tr = jnp.broadcast_to(medium.squared_sigma_tr, shape)
-        total = jnp.zeros(shape, squared_radius.dtype)
-        source = self.length_scale()
-        image = source * (1 + 4 / 3 * self.fresnel.boundary(medium.eta))
-        for depth in (source, image):
-            z = jnp.broadcast_to(depth, shape)
-            total = total + flux_of_source(squared_sigma_tr, z, squared_radius + z * z)
-        return jnp.broadcast_to(medium.albedo_prime, shape) / (4 * jnp.pi) * total
-
-    @jit_unless_traced
-    def total_reflectance(self) -> Float[Array, " channels"]:
-        r"""Compute `2 pi` times the integral of `r R(r)` in closed form.
-
-            alpha'/2 (1 + exp(-(4/3) A s)) exp(-s),  s = sqrt(3 (1 - alpha'))
-
-        **Returns:** in [0, 1]; 1 where `sigma_a = 0`. There its derivative in `sigma_a` diverges
-        like `-sigma_a^(-1/2)`, so that autodiff returns infinity at `sigma_a = 0`, on purpose.
-
-        **Source:** Jensen et al. 2001, section 2.4.
-        """
-        medium = self.medium
-        s = jnp.sqrt(3 * medium.sigma_a / medium.sigma_t_prime)
-        boundary = self.fresnel.boundary(medium.eta)
-        return 0.5 * medium.albedo_prime * (1 + jnp.exp(-4 / 3 * boundary * s)) * jnp.exp(-s)
+        height = 4 / 3 * self.fresnel.boundary(medium.eta) / medium.sigma_t_prime
+        return medium.squared_sigma_tr, height, jnp.ones_like(height), None
 
 
-def flux_of_source(
-    squared_sigma_tr: Float[Array, "..."],
-    depth: Float[Array, "..."],
-    squared_distance: Float[Array, "..."],
-) -> Float[Array, "..."]:
-    """Compute `z (1 + sigma_tr d) exp(-sigma_tr d) / d^3`: the flux, times 4 pi, through the
-    surface at a distance d from a source at depth z. 1/mm^2.
+@record
+class BetterDipole(AbstractDipole):
+    r"""The dipole of d'Eon, with Grosjean's diffusion coefficient and an exitance that counts
+    fluence and flux: closer to light transport than the classical one where absorption is strong.
+
+    With `D = (2 sigma_a + sigma_s') / (3 sigma_t'^2)`, `sigma_tr^2 = sigma_a / D`, `A = (1 + 3 C2)
+    / (1 - 2 C1)`, `z_r = 1 / sigma_t'`, `z_v = z_r + 4 A D`, `C_phi = (1 - 2 C1) / 4` and `C_E = (1
+    - 3 C2) / 2`.
+
+    **Attributes:** `medium` and `fresnel`, as for every half space.
+
+    **Source:** d'Eon 2012, "A better dipole"; diffusion coefficient: Grosjean 1956.
     """
-    screened = screening(squared_sigma_tr * squared_distance)
-    return depth * screened / (squared_distance * jnp.sqrt(squared_distance))
+
+    def boundary(self):
+        medium, eta = self.medium, self.medium.eta
+        diffusion = (2 * medium.sigma_a + medium.sigma_s_prime) / (
+            3 * medium.sigma_t_prime * medium.sigma_t_prime
+        )
+        first, second = self.fresnel.first_moment(eta), self.fresnel.second_moment(eta)
+        height = 4 * (1 + second) / (1 - first) * diffusion
+        fluence = (1 - first) / (4 * diffusion)
+        return medium.sigma_a / diffusion, height, (1 - second) / 2, fluence
 
 
 @jax.custom_jvp
@@ -106,3 +156,36 @@ def screening(y: Float[Array, "..."]) -> Float[Array, "..."]:
 def _screening_jvp(primals, tangents):
     (y,), (y_dot,) = primals, tangents
     return screening(y), -0.5 * jnp.exp(-jnp.sqrt(y)) * y_dot
+
+
+def one_minus_exp_over(x: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Compute `(1 - exp(-x)) / x`, which is 1 at 0, for x at least 0."""
+    positive = x > 0
+    safe = jnp.where(positive, x, 1.0)
+    return jnp.where(positive, -jnp.expm1(-safe) / safe, 1.0)
+
+
+@jax.custom_jvp
+def fluence_difference(
+    u: Float[Array, "..."], near: Float[Array, "..."], far: Float[Array, "..."]
+) -> Float[Array, "..."]:
+    r"""Compute `exp(-sqrt(u near)) / sqrt(near) - exp(-sqrt(u far)) / sqrt(far)`, where near and
+    far are squared distances.
+
+    The derivative rule serves `u = 0`, where the infinite derivatives of the two terms cancel.
+    """
+    s, a, b = jnp.sqrt(u), jnp.sqrt(near), jnp.sqrt(far)
+    return jnp.exp(-s * a) / a - jnp.exp(-s * b) / b
+
+
+@fluence_difference.defjvp
+def _fluence_difference_jvp(primals, tangents):
+    u, near, far = primals
+    u_dot, near_dot, far_dot = tangents
+    s, a, b = jnp.sqrt(u), jnp.sqrt(near), jnp.sqrt(far)
+    along_u = -0.5 * (b - a) * jnp.exp(-s * a) * one_minus_exp_over(s * (b - a))
+    along_near = -0.5 * screening(u * near) / (near * a)
+    along_far = 0.5 * screening(u * far) / (far * b)
+    return fluence_difference(
+        u, near, far
+    ), along_u * u_dot + along_near * near_dot + along_far * far_dot

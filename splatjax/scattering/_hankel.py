@@ -51,36 +51,22 @@ def inverse_hankel_transform(
     shape = (*r.shape, *decay.shape)
     radius, scale = jnp.broadcast_to(r[..., None], shape), jnp.broadcast_to(decay, shape)
     near = radius < _NEAR * scale
-    far = _filtered(transform, jnp.where(near, scale, radius))
-    coefficients = _series(transform, decay)
-    squared = jnp.where(near, 0.25 * radius * radius / (scale * scale), 0.0)
-    about_origin = jnp.zeros(shape, far.dtype)
-    for coefficient in coefficients[::-1]:
-        about_origin = about_origin * squared + jnp.broadcast_to(coefficient, shape)
-    return jnp.where(near, about_origin, far) / (2 * jnp.pi)
-
-
-def _filtered(function, at: Float[Array, "*some"]) -> Float[Array, "*some"]:
-    """Compute the integral of `x J0(x at) function(x)`."""
+    # Far from the axis: the integral of x J0(x) F(x / r), over r^2.
+    at = jnp.where(near, scale, radius)
     abscissas, weights = (
-        along_first_axis(values, (len(values), *at.shape), at.dtype) for values in _filter()
+        along_first_axis(values, (len(values), *shape), at.dtype) for values in _filter()
     )
     x = abscissas / at[None]
-    return jnp.sum(weights * x * function(x), axis=0) / at
-
-
-def _series(transform, decay: Float[Array, " channels"]) -> list[Float[Array, " channels"]]:
-    """Expand the integral of `k J0(k r) F(k)` in powers of `(r / 2 decay)^2`."""
-    nodes, weights = (
-        along_first_axis(values, (len(values), *decay.shape), decay.dtype)
-        for values in _half_line()
+    far = jnp.sum(weights * x * transform(x), axis=0) / at
+    # Near it: a series in (r / 2 decay)^2, whose coefficients are moments of F.
+    nodes, moments = (jnp.asarray(values, decay.dtype) for values in _half_line())
+    terms = transform(nodes[:, None] / decay[None]) / (decay * decay)[None]
+    coefficients = jnp.sum(moments[..., None] * terms[None], axis=1)
+    squared = jnp.where(near, 0.25 * radius * radius / (scale * scale), 0.0)
+    about_origin = jnp.polyval(
+        coefficients.reshape(_TERMS, *[1] * r.ndim, *decay.shape), squared, unroll=_TERMS
     )
-    terms = weights * transform(nodes / decay[None]) / (decay * decay)[None]
-    coefficients = []
-    for power in range(_TERMS):
-        coefficients.append(jnp.sum(terms, axis=0))
-        terms = terms * nodes * nodes * (-1 / (power + 1) ** 2)
-    return coefficients
+    return jnp.where(near, about_origin, far) / (2 * jnp.pi)
 
 
 @functools.cache
@@ -108,9 +94,11 @@ def _filter() -> tuple[np.ndarray, np.ndarray]:
 
 @functools.cache
 def _half_line() -> tuple[np.ndarray, np.ndarray]:
-    """Nodes and weights for the integral of `k f(k)` over k > 0, f like `exp(-k)`: `log k = t -
-    exp(-t)`, equal steps of t.
+    """Nodes for integrals over k > 0 of functions like `exp(-k)`, `log k = t - exp(-t)` at equal
+    steps of t; and weights of `k J0(2 k x)` in powers of `x^2`, the highest first: [powers, nodes].
     """
     t, step = np.linspace(-2.6, 3.65, _NEAR_NODES, retstep=True)
     nodes = np.exp(t - np.exp(-t))
-    return nodes, step * nodes * nodes * (1 + np.exp(-t))
+    power = np.arange(_TERMS)[::-1, None]
+    bessel = (-1.0) ** power * nodes ** (2 * power) / scipy.special.factorial(power) ** 2
+    return nodes, bessel * step * nodes * nodes * (1 + np.exp(-t))

@@ -1,22 +1,147 @@
-"""A beam of sources instead of one, and light that scatters once."""
+"""Light that scatters once, and a beam of sources for the rest."""
 
 import functools
 from typing import ClassVar
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jax.lax import stop_gradient
 from jaxtyping import Array, Float
 
 from splatjax._chunking import jit_unless_traced
-from splatjax._records import record
+from splatjax._records import numbers, record
 from splatjax.gaussians import AbstractProfile
 
-from ._better_dipole import exitance_of_source
-from ._dipole import AbstractHalfSpace
-from ._quadrature import along_first_axis, integrated_reflectance
-from ._single_scattering import SingleScattering
+from ._dipole import AbstractHalfSpace, BetterDipole
+from ._fresnel import moment_outside, reflectance
+from ._medium import Medium
+from ._quadrature import along_first_axis, integrated_reflectance, unit_interval, unit_legendre
 
 _NODES = 128
+_LEAST_COSINE = 1e-4
+_COSINES = 10
+
+
+@record
+class SingleScattering(AbstractProfile):
+    r"""Light scattered once in a half space, isotropically with the reduced coefficient: as a
+    profile, and as radiance in a picture.
+
+    The profile is that of light along the normal: after the scattering it travels to the surface,
+    attenuated, and through it with the Fresnel transmittance. With theta the angle inside,
+
+        R1(r) = alpha' sigma_t' / (4 pi r) * integral of exp(-sigma_t' r cot(theta / 2)) (1 - F)
+        cos(theta) d theta.
+
+    Infinite at the origin like 1/r. Differentiable in every coefficient, and for `r > 0`.
+
+    **Attributes:**
+
+    - `medium`: its coefficients, [channels].
+    - `strength`: a factor on all of it, [channels]; 1 but for materials made white.
+
+    **Source:** Habel, Christensen and Jarosz 2013 (profile); Hanrahan and Krueger 1993 (radiance).
+    """
+
+    medium: Medium
+    strength: Float[Array, " channels"] = eqx.field(converter=numbers, default=1.0)
+
+    singular: ClassVar[bool] = True
+
+    @property
+    def channels(self) -> int:
+        return self.medium.channels
+
+    @jit_unless_traced
+    def __call__(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
+        shape = (*r.shape, self.channels)
+        half_angle, weight = (
+            jnp.expand_dims(angles, tuple(range(1, 1 + r.ndim))) for angles in self._escaping()
+        )
+        radius = jnp.broadcast_to(r[..., None], shape)
+        path = radius * jnp.broadcast_to(self.medium.sigma_t_prime, shape)
+        total = jnp.sum(weight * jnp.exp(-path[None] / half_angle), axis=0)
+        scattering = jnp.broadcast_to(self.strength * self.medium.sigma_s_prime, shape)
+        return scattering * total / (4 * jnp.pi * radius)
+
+    @jit_unless_traced
+    def total_reflectance(self) -> Float[Array, " channels"]:
+        half_angle, weight = self._escaping()
+        return self.strength * 0.5 * self.medium.albedo_prime * jnp.sum(weight * half_angle, axis=0)
+
+    def length_scale(self) -> Float[Array, " channels"]:
+        return 1 / self.medium.sigma_t_prime
+
+    @jit_unless_traced
+    def reflected(
+        self, mu_i: Float[Array, "*points"], mu_o: Float[Array, "*points"]
+    ) -> Float[Array, "*points channels"]:
+        r"""Compute the radiance towards `wo` per irradiance that has entered from `wi`, of a flat
+        and evenly lit piece:
+
+            alpha' / 4 pi * (1 - F(mu_o)) / (eta^2 (mu_i' + mu_o')),
+
+        with the cosines `mu'` refracted. Times `mu_o` and integrated over all directions, with
+        light along the normal, it is the total reflectance.
+
+        **Arguments:** `mu_i`, `mu_o`: cosines of `wi` and `wo` outside, in [0, 1]; kept above 1e-4.
+        Differentiable.
+        """
+        shape = (*mu_i.shape, self.channels)
+        scattered = jnp.broadcast_to(self.strength * self.medium.albedo_prime, shape)
+        eta = jnp.broadcast_to(self.medium.eta, shape)
+        mu_i, mu_o = (
+            jnp.broadcast_to(jnp.maximum(mu, _LEAST_COSINE)[..., None], shape)
+            for mu in (mu_i, mu_o)
+        )
+        inside_i, inside_o = (
+            jnp.sqrt(jnp.maximum(mu * mu + (eta * eta - 1), _LEAST_COSINE**2)) / eta
+            for mu in (mu_i, mu_o)
+        )
+        transmitted = 1 - reflectance(inside_o, mu_o, eta)
+        return scattered * transmitted / (4 * jnp.pi * eta * eta * (inside_i + inside_o))
+
+    @jit_unless_traced
+    def directional_albedo(self, mu_i: Float[Array, "*points"]) -> Float[Array, "*points channels"]:
+        """Compute the fraction of the light entering under the cosine `mu_i` that leaves after one
+        scattering, with an error of 1e-3.
+        """
+        total = jnp.zeros((*mu_i.shape, self.channels), mu_i.dtype)
+        for node, weight in zip(*unit_legendre(_COSINES), strict=True):
+            # mu = t^2: the radiance has a root at grazing angles.
+            radiance = self.reflected(mu_i, jnp.full_like(mu_i, node * node))
+            total = total + float(4 * np.pi * weight * node**3) * radiance
+        return total
+
+    def _escaping(self) -> tuple[Float[Array, "angles channels"], Float[Array, "angles channels"]]:
+        """Compute `tan(theta / 2)` of the angles at which light leaves, and their weights `(1 - F)
+        cos(theta) d theta`.
+
+        The angle is measured on the rarer side, where it takes all values: `sin(theta) = min(1, 1 /
+        eta) sin(psi)`.
+        """
+        eta = self.medium.eta
+        x, beyond, weights = (
+            along_first_axis(nodes, (len(nodes), *eta.shape), eta.dtype)
+            for nodes in unit_interval()
+        )
+        sine, cosine = jnp.sin(0.5 * jnp.pi * x), jnp.sin(0.5 * jnp.pi * beyond)
+        eta = jnp.broadcast_to(eta, x.shape)
+        inside, outside = jnp.where(eta < 1, 1.0, 1 / eta), jnp.where(eta < 1, eta, 1.0)
+        cos_in, cos_out = (
+            jnp.sqrt(cosine**2 + (1 - scale**2) * sine**2) for scale in (inside, outside)
+        )
+        reflected, weights = reflectance(cos_in, cos_out, eta), 0.5 * jnp.pi * weights * cosine
+        # As eta goes to 1, light is reflected at grazing angles alone, which get infinitely few
+        # nodes: the quadrature keeps its value and loses its derivative. One more node, at the
+        # grazing angle, restores the closed form.
+        missed = jnp.sum(weights * reflected * sine, axis=0) - 0.5 * moment_outside(self.medium.eta)
+        grazing = stop_gradient(inside[0] / (1 + jnp.sqrt(1 - inside[0] ** 2)))
+        half_angle = jnp.concatenate([inside * sine / (1 + cos_in), grazing[None]])
+        return half_angle, jnp.concatenate(
+            [weights * (1 - reflected) * inside, (inside[0] * missed)[None]]
+        )
 
 
 @record
@@ -48,56 +173,39 @@ class PhotonBeam(AbstractHalfSpace):
 
     @jit_unless_traced
     def __call__(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
-        return self.multiple(r) + self.single(r)
-
-    @jit_unless_traced
-    def multiple(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
-        """Compute the light scattered more than once; finite at `r = 0`. 1/mm^2."""
-        medium = self.medium
-        shape = (_NODES, *r.shape, medium.channels)
-        depth, weight = (along_first_axis(nodes, shape, r.dtype) for nodes in _beam())
-        sigma_t_prime = jnp.broadcast_to(medium.sigma_t_prime, shape)
-        depth = depth / sigma_t_prime
-        squared_radius = jnp.broadcast_to((r * r)[None, ..., None], shape)
-        distance = jnp.sqrt(squared_radius + depth * depth)
-        kappa = -jnp.expm1(-2 * sigma_t_prime * (distance + depth))
-        total = jnp.sum(
-            weight * kappa * exitance_of_source(medium, self.fresnel, depth, squared_radius), axis=0
-        )
-        return jnp.broadcast_to(medium.albedo_prime**2, total.shape) * total
-
-    def single(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
-        """Compute the light scattered once, 1/mm^2."""
-        return SingleScattering(self.medium)(r)
+        return self.multiply_scattered()(r) + SingleScattering(self.medium)(r)
 
     @jit_unless_traced
     def total_reflectance(self) -> Float[Array, " channels"]:
         """Compute `2 pi` times the integral of `r R(r)`: single scattering exactly, multiple
         scattering by quadrature.
         """
-        multiple = integrated_reflectance(self.multiply_scattered())
-        return SingleScattering(self.medium).total_reflectance() + multiple
+        single = SingleScattering(self.medium).total_reflectance()
+        return self.multiply_scattered().total_reflectance() + single
 
     def multiply_scattered(self) -> AbstractProfile:
-        """Return the light scattered more than once as a profile: for a material with a
-        `SingleScattering` of its own.
+        """Return the light scattered more than once as a profile, finite at `r = 0`: for a material
+        with a `SingleScattering` of its own.
         """
-        return _Multiple(self)
+        return _MultipleScattering(self.medium, self.fresnel)
 
 
-class _Multiple(AbstractProfile):
-    """The light scattered more than once, which quadrature can integrate."""
-
-    beam: PhotonBeam
-
-    def __call__(self, r):
-        return self.beam.multiple(r)
+class _MultipleScattering(AbstractHalfSpace):
+    @jit_unless_traced
+    def __call__(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
+        shape = (_NODES, *r.shape, self.medium.channels)
+        depth, weight = (along_first_axis(nodes, shape, r.dtype) for nodes in _beam())
+        sigma_t_prime = jnp.broadcast_to(self.medium.sigma_t_prime, shape)
+        depth = depth / sigma_t_prime
+        squared_radius = jnp.broadcast_to((r * r)[None, ..., None], shape)
+        distance = jnp.sqrt(squared_radius + depth * depth)
+        kappa = -jnp.expm1(-2 * sigma_t_prime * (distance + depth))
+        exitance = BetterDipole(self.medium, self.fresnel).exitance(depth, squared_radius)
+        total = jnp.sum(weight * kappa * exitance, axis=0)
+        return jnp.broadcast_to(self.medium.albedo_prime**2, total.shape) * total
 
     def total_reflectance(self):
         return integrated_reflectance(self)
-
-    def length_scale(self):
-        return self.beam.length_scale()
 
 
 @functools.cache

@@ -63,11 +63,6 @@ class RadialRule(AbstractRadialRule):
     def reaches_origin(self) -> bool:
         return self.near > 0
 
-    def nodes(self, dtype) -> tuple[Float[Array, " nodes"], Float[Array, " nodes"]]:
-        """Compute radii and weights `dr`, in length scales, ascending."""
-        nodes, weights = _nodes(self.smallest, self.largest, self.count, self.near)
-        return jnp.asarray(nodes, dtype), jnp.asarray(weights, dtype)
-
     @jit_unless_traced
     def radii(
         self, profile: AbstractProfile
@@ -79,10 +74,12 @@ class RadialRule(AbstractRadialRule):
         """
         scale = jax.lax.stop_gradient(profile.length_scale())
         known = jax.lax.stop_gradient(profile.known_radii())
-        nodes = self.nodes(scale.dtype) if known is None else known
+        nodes = known or _nodes(self.smallest, self.largest, self.count, self.near)
         shape = (*nodes[0].shape, *scale.shape)
+        radii, weights = (
+            jnp.broadcast_to(jnp.asarray(values, scale.dtype)[:, None], shape) for values in nodes
+        )
         scale = jnp.broadcast_to(scale, shape)
-        radii, weights = (jnp.broadcast_to(values[:, None], shape) for values in nodes)
         if known is None:
             return radii * scale, weights * scale
         first = 0.0 if self.near else self.smallest
@@ -139,12 +136,13 @@ class InverseVariance(AbstractRadialRule):
 
 @functools.cache
 def _nodes(smallest: float, largest: float, count: int, near: int) -> tuple[np.ndarray, np.ndarray]:
-    near_nodes, near_weights = np.polynomial.legendre.leggauss(near) if near else np.zeros((2, 0))
-    log_nodes, log_weights = np.polynomial.legendre.leggauss(count)
-    half = 0.5 * np.log(largest / smallest)
-    radii = smallest * np.exp(half * (log_nodes + 1))
-    nodes = np.concatenate([0.5 * smallest * (near_nodes + 1), radii])
-    return nodes, np.concatenate([0.5 * smallest * near_weights, half * radii * log_weights])
+    """Compute radii and weights `dr`, in length scales, ascending."""
+    near_nodes, near_weights = unit_legendre(near) if near else np.zeros((2, 0))
+    log_nodes, log_weights = unit_legendre(count)
+    length = np.log(largest / smallest)
+    radii = smallest * np.exp(length * log_nodes)
+    nodes = np.concatenate([smallest * near_nodes, radii])
+    return nodes, np.concatenate([smallest * near_weights, length * radii * log_weights])
 
 
 @functools.cache

@@ -28,13 +28,11 @@ class AbstractSlabProfile(AbstractProfile):
 
     - `eta_above`, `eta_below`: indices of the neighbors relative to air, [channels].
     - `fresnel`: the diffuse Fresnel moments.
-    - `surface`: those of the topmost interface, if it is another: `RoughFresnel(...)`.
     """
 
     eta_above: Float[Array, " channels"] = eqx.field(converter=numbers, default=1.0, kw_only=True)
     eta_below: Float[Array, " channels"] = eqx.field(converter=numbers, default=1.0, kw_only=True)
     fresnel: AbstractFresnel = eqx.field(default=ExactFresnel(), kw_only=True)
-    surface: AbstractFresnel | None = eqx.field(default=None, kw_only=True)
 
     @property
     @abc.abstractmethod
@@ -61,15 +59,14 @@ class AbstractSlabProfile(AbstractProfile):
     def response(self, k: Float[Array, "*frequencies channels"]) -> Response:
         """Compute reflectance and transmittance at spatial frequencies `k` (1/mm, at least 0)."""
         etas = [self.eta_above, *(layer.medium.eta for layer in self._scattering()), self.eta_below]
-        above = self.fresnel if self.surface is None else self.surface
         responses, passed = [], 0
         for layer in self.stack:
             if isinstance(layer, Film):
                 responses.append(film_response(layer, passed == 0, k.shape))
             else:
                 neighbors = etas[passed], etas[passed + 2]
-                responses.append(slab_response(layer, *neighbors, above, self.fresnel, k))
-                above, passed = self.fresnel, passed + 1
+                responses.append(slab_response(layer, *neighbors, self.fresnel, k))
+                passed += 1
         return reduce(Response.over, responses)
 
     def decay_lengths(self) -> tuple[Float[Array, " channels"], Float[Array, " channels"]]:
@@ -146,7 +143,7 @@ class Multipole(AbstractSlabProfile):
     **Attributes:**
 
     - `layer`: medium and thickness.
-    - `eta_above`, `eta_below`, `fresnel`, `surface`: as `AbstractSlabProfile` has them.
+    - `eta_above`, `eta_below`, `fresnel`: as `AbstractSlabProfile` has them.
 
     **Raises:** `ValueError` for a layer thinner than one mean free path `1 / sigma_t'` in any
     channel: its sources would lie outside of it. Under `jit` that is unknown, and the profile NaN.
@@ -176,7 +173,7 @@ class LayeredMultipole(AbstractSlabProfile):
 
     - `layers`: `Layer` and `Film`, from the top; at least one scatters. Only the lowest may be
       infinite.
-    - `eta_above`, `eta_below`, `fresnel`, `surface`: as `AbstractSlabProfile` has them.
+    - `eta_above`, `eta_below`, `fresnel`: as `AbstractSlabProfile` has them.
 
     **Raises:** `ValueError` for no scattering layer, for an infinite layer with another below it,
     and for a layer thinner than one mean free path `1 / sigma_t'` in any channel. Under `jit` that

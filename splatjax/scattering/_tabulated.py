@@ -1,13 +1,20 @@
-"""Measured profiles."""
+"""Measured profiles: from tables, and from photographs of a laser dot."""
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from splatjax._chunking import jit_unless_traced
-from splatjax._records import check_values, numbers, record
+from splatjax._records import Numbers, check_values, numbers, record
 from splatjax.gaussians import AbstractProfile
+
+# Fraction of the peak above which pixels determine the center.
+_CORE = 0.2
+
+# Of a ring: with fewer, its scatter hardly determines the error of its mean.
+_LEAST_PIXELS = 12
 
 
 @record
@@ -95,3 +102,118 @@ class Tabulated(AbstractProfile):
         steps = jnp.diff(self.radii)
         weights = 0.5 * (jnp.append(steps, 0.0) + jnp.insert(steps, 0, self.radii[0]))
         return self.radii, weights
+
+
+class LaserDot(eqx.Module):
+    r"""The measurement of a laser dot on a flat material.
+
+    **Attributes:**
+
+    - `profile`: means over rings, with their standard errors, 1/mm^2: the profile of the material
+      convolved with that of the beam.
+    - `center`: of the dot, pixels: x to the right and y down, from the upper left corner of the
+      picture.
+    """
+
+    profile: Tabulated
+    center: Float[Array, "2"]
+
+
+def measure_laser_dot(
+    image: Float[np.ndarray, "height width channels"] | Float[Array, "height width channels"],
+    mm_per_pixel: float,
+    *,
+    power: Numbers,
+    center: tuple[float, float] | None = None,
+    saturation: float | None = None,
+    largest: float | None = None,
+    step: float = 1.0,
+) -> LaserDot:
+    r"""Measure the profile in a photograph of a laser dot: means over rings, with their standard
+    errors.
+
+    The picture is taken from straight above, with a long lens, of a flat and homogeneous piece; a
+    dark frame is subtracted, and specular reflection is kept away from the camera. Exitance is `pi`
+    times radiance.
+
+    **Arguments:**
+
+    - `image`: linear radiance.
+    - `mm_per_pixel`: on the surface, positive.
+    - `power`: entering the material, positive, for all channels or for each: in W if the image is
+      in W/(mm^2 sr). It scales the profile, and with it the total reflectance.
+    - `center`: x and y in pixels; by default the centroid of the pixels above a fifth of the peak.
+    - `saturation`: the value at which pixels saturate; a ring with such a pixel is left out.
+    - `largest`: radius of the last ring, mm; by default that of the largest circle inside the
+      picture.
+    - `step`: width of a ring, pixels, at least 1.
+
+    **Returns:** a `LaserDot`. The radius of a ring is the root mean square of those of its pixels,
+    as the middle of a profile is flat; its standard error does not count the scatter due to the
+    slope across the ring. Rings of fewer than twelve pixels are joined to the next.
+
+    **Raises:** `ValueError` for pixels that are not finite, a length or power that is not positive,
+    a center outside of the picture, and if fewer than two rings are left.
+    """
+    pixels = np.asarray(image, np.float64)
+    entering = np.broadcast_to(np.asarray(power, np.float64), pixels.shape[2:])
+    check_values("image", pixels, "finite: crop such pixels away", lambda x: x == x)
+    check_values("mm_per_pixel", np.asarray(float(mm_per_pixel)), "positive", lambda x: x > 0)
+    check_values("power", entering, "positive", lambda x: x > 0)
+    check_values("step", np.asarray(float(step)), "at least 1 pixel", lambda x: x >= 1 - 1e-9)
+    height, width = pixels.shape[:2]
+    y, x = np.mgrid[:height, :width] + 0.5
+    light = pixels.sum(axis=2)
+    core = np.where(light > _CORE * light.max(), light, 0.0)
+    centroid = [float((core * each).sum() / core.sum()) for each in (x, y)]
+    x0, y0 = centroid if center is None else center
+    inside = min(x0, y0, width - x0, height - y0)
+    if not inside > 0:
+        raise ValueError(
+            f"center {x0:g}, {y0:g} is outside of the picture of {width} x {height} pixels"
+        )
+    radius = np.hypot(x - x0, y - y0)
+    last = inside if largest is None else min(largest / mm_per_pixel, inside)
+    within = radius <= last
+    values, squared = pixels[within] * (np.pi / entering), radius[within] ** 2
+    is_saturated = (pixels[within] >= (np.inf if saturation is None else saturation)).any(axis=1)
+    rings = _rings(radius[within], step)
+    samples = [
+        (mm_per_pixel * np.sqrt(squared[ring].mean()), *_mean(values[ring], squared[ring]))
+        for ring in rings
+        if not is_saturated[ring].any()
+    ]
+    if len(samples) < 2:
+        raise ValueError(
+            f"a profile needs at least two rings; {len(samples)} of {len(rings)} are inside and "
+            "not saturated"
+        )
+    return LaserDot(
+        Tabulated(*map(np.stack, zip(*samples, strict=True))),
+        jnp.asarray([x0, y0], jnp.result_type(float)),
+    )
+
+
+def _rings(radius: np.ndarray, step: float) -> list[np.ndarray]:
+    """Collect the indices of the pixels of each ring, from the center; rings too small to have a
+    scatter are joined.
+    """
+    order = np.argsort(radius, kind="stable")
+    edges = np.searchsorted(radius[order], np.arange(step, radius.max() + step, step))
+    rings, begin = [], 0
+    for end in edges:
+        if end - begin >= _LEAST_PIXELS:
+            rings.append(order[begin:end])
+            begin = end
+    return rings
+
+
+def _mean(values: np.ndarray, squared_radius: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Compute the mean of each channel and its standard error, without the slope across the
+    ring.
+    """
+    mean, offset = values.mean(axis=0), squared_radius - squared_radius.mean()
+    slope = offset @ (values - mean) / max(offset @ offset, np.finfo(float).tiny)
+    left = values - mean - offset[:, None] * slope
+    free = max(len(values) - 2, 1)
+    return mean, np.sqrt((left * left).sum(axis=0) / free / len(values))

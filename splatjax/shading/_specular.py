@@ -1,10 +1,26 @@
-"""The specular lobe of Kelemen and Szirmay-Kalos, and its Fresnel term."""
+"""The specular lobe of Kelemen and Szirmay-Kalos, its Fresnel term, and how much light it takes:
+its directional and its average albedo, tabulated.
+"""
 
+import functools
+from collections.abc import Sequence
+
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
+
+from splatjax._chunking import map_chunks
 
 ROUGHNESS_RANGE = (0.05, 1.0)
 _LEAST_HALF_COSINE = 1e-4  # of N.(L+V): below it the lobe's pole is cut
+
+# Chebyshev nodes in sqrt(mu) and in log m. The square root resolves the steep part at grazing
+# angles, where the albedo goes like mu log mu; with these degrees the error is at most 1.3e-4 (a)
+# and 1.2e-4 (b) for every mu and m in range.
+_MU_NODES = 18
+_ROUGHNESS_NODES = 12
+_LEAST_MU = 1e-5
 
 
 def fresnel_f0(eta: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -77,3 +93,163 @@ def specular_lobe(
     grazing = (1 - half_cosine) ** 5
     fresnel = f0 + (1 - f0) * grazing
     return jnp.where(seen, specular * fresnel * spread * ratio / squared_cosine, 0.0)
+
+
+def _nodes(count: int) -> np.ndarray:
+    return np.cos(np.pi * (np.arange(count) + 0.5) / count)
+
+
+def _lobe_quadrature(
+    mu: np.ndarray, roughness: np.ndarray, nodes: tuple[int, int] = (64, 32)
+) -> np.ndarray:
+    """Integrate the lobe over incident directions, with F = 1 and with F = (1 - H.V)^5; stacked, in
+    float64.
+
+    In the slopes p of the half vector the integral is that of a Gaussian, `exp(-p^2 / m^2) / (pi
+    m^2)`, times `2 - mu (1 + p^2) / (mu - p_x sin)`, over the disc of radius `1 / mu` around
+    `(-tan, 0)`, whose rim are the directions that graze the surface. Nodes crowd at the rim near
+    the origin; beyond five m the Gaussian is nothing.
+    """
+    mu, roughness = (x[..., None, None] for x in np.broadcast_arrays(mu, roughness))
+    sine = np.sqrt(1 - mu * mu)
+    low = np.maximum(-(1 + sine) / mu, -5 * roughness)
+    high = np.minimum(mu / (1 + sine), 5 * roughness)
+    x, x_weights = np.polynomial.legendre.leggauss(nodes[0])
+    angle = np.pi / 4 * (x + 1)
+    px = low + (high - low) * np.sin(angle)[:, None]
+    px_weights = (high - low) * (np.pi / 4 * x_weights * np.cos(angle))[:, None]
+    y, y_weights = np.polynomial.legendre.leggauss(nodes[1])
+    reach = np.minimum(np.sqrt(np.maximum(1 - px * px - 2 * px * sine / mu, 0)), 5 * roughness)
+    py = reach * (y + 1) / 2
+    squared = px * px + py * py
+    towards = mu - px * sine
+    half_cosine = np.clip(towards / np.sqrt(1 + squared), 0, 1)
+    density = np.exp(-squared / roughness**2) / (np.pi * roughness**2)
+    integrand = (
+        density * np.maximum(2 - mu * (1 + squared) / towards, 0) * px_weights * reach * y_weights
+    )
+    return np.stack([integrand.sum((-1, -2)), (integrand * (1 - half_cosine) ** 5).sum((-1, -2))])
+
+
+@functools.cache
+def _tables() -> tuple[np.ndarray, np.ndarray]:
+    """Give the Chebyshev coefficients of (a, b) over sqrt(mu) and log m, and those of their
+    averages over log m.
+    """
+    mu = ((1 + _nodes(_MU_NODES)) / 2) ** 2
+    low, high = np.log(ROUGHNESS_RANGE)
+    roughness = np.exp(low + (high - low) * (1 + _nodes(_ROUGHNESS_NODES)) / 2)
+    values = _lobe_quadrature(mu[:, None], roughness)
+    chebvander = np.polynomial.chebyshev.chebvander
+    to_mu = np.linalg.inv(chebvander(_nodes(_MU_NODES), _MU_NODES - 1))
+    to_roughness = np.linalg.inv(chebvander(_nodes(_ROUGHNESS_NODES), _ROUGHNESS_NODES - 1))
+    coefficients = to_mu @ values @ to_roughness.T
+    # 2 mu dmu = 4 u^3 du with u = sqrt(mu): the average is exactly that of the interpolant.
+    x, weights = np.polynomial.legendre.leggauss(_MU_NODES)
+    average = (2 * weights * ((1 + x) / 2) ** 3) @ chebvander(x, _MU_NODES - 1)
+    return coefficients, np.einsum("i,tij->tj", average, coefficients)
+
+
+def _chebyshev(coefficients: Sequence, x: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Evaluate a Chebyshev series, whose coefficients broadcast against `x`, by Clenshaw's
+    recurrence.
+    """
+    last, before = jnp.zeros_like(x), jnp.zeros_like(x)
+    for index in range(len(coefficients) - 1, 0, -1):
+        last, before = 2 * x * last - before + coefficients[index], last
+    return x * last - before + coefficients[0]
+
+
+def _roughness_coordinate(roughness: Float[Array, "..."]) -> Float[Array, "..."]:
+    low, high = (float(x) for x in np.log(ROUGHNESS_RANGE))
+    return (2 * jnp.log(clamped_roughness(roughness)) - (low + high)) / (high - low)
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _table(
+    key: tuple[int, int, int], x: Float[Array, "..."], t: Float[Array, "..."]
+) -> Float[Array, "..."]:
+    """Evaluate table a (0) or b (1), differentiated so many times in either coordinate. Its
+    derivatives are tables too: one number is kept for the way back, not the whole recurrence.
+    """
+    (table, in_mu, in_roughness), chebder = key, np.polynomial.chebyshev.chebder
+    coefficients = chebder(chebder(_tables()[0][table], in_mu, axis=0), in_roughness, axis=1)
+    if t.ndim == 0:
+        over_mu = list(
+            _chebyshev(
+                list(jnp.asarray(coefficients.T, t.dtype)),
+                jnp.broadcast_to(t, (len(coefficients),)),
+            )
+        )
+        return map_chunks(lambda x: _chebyshev(over_mu, x), x.reshape(-1)).reshape(x.shape)
+    x, t = jnp.broadcast_arrays(x, t)
+    rows = jnp.asarray(coefficients, t.dtype)
+
+    def clenshaw(carry, row):
+        last, before = carry
+        return (2 * x * last - before + _chebyshev(list(row), t), last), None
+
+    # A loop over the rows: written out, they would be a thousand operations for every use.
+    (last, before), _ = jax.lax.scan(
+        clenshaw, (jnp.zeros_like(x), jnp.zeros_like(x)), rows[1:], reverse=True
+    )
+    return x * last - before + _chebyshev(list(rows[0]), t)
+
+
+@_table.defjvp
+def _table_jvp(key, primals, tangents):
+    (x, t), (x_dot, t_dot) = primals, tangents
+    table, in_mu, in_roughness = key
+    in_x = _table((table, in_mu + 1, in_roughness), x, t) * x_dot
+    return _table(key, x, t), in_x + _table((table, in_mu, in_roughness + 1), x, t) * t_dot
+
+
+def directional_albedo(
+    mu: Float[Array, "..."],
+    f0: Float[Array, "..."],
+    specular: Float[Array, "..."],
+    roughness: Float[Array, "..."],
+) -> Float[Array, "..."]:
+    r"""Give the share of the light from one direction that the specular lobe reflects, `rho(mu)`.
+
+    `rho = specular (f0 a(mu, m) + (1 - f0) b(mu, m))`: Schlick's term splits the integral of
+    `specular_lobe` over the hemisphere into two tables, computed once by quadrature and kept as
+    Chebyshev series in `sqrt(mu)` and `log m`.
+
+    **Arguments:** scalars, or arrays that broadcast; a scalar `f0` and a scalar `roughness` make it
+    cheapest.
+
+    - `mu`: cosine of the direction with the normal, clamped to [1e-5, 1]. Differentiable; the slope
+      at `mu = 0` diverges like `log mu` and is cut to 0 below 1e-5.
+    - `f0`: reflectance at normal incidence. Differentiable.
+    - `specular`: strength rho_s. Differentiable.
+    - `roughness`: m, clamped to [0.05, 1] as in the lobe. Differentiable.
+
+    **Returns:** in [0, 1], within 2e-4 of the integral (times `specular`). With `specular <= 1` the
+    integral never exceeds one; where a larger `specular` would make it, rho is cut to 1 with
+    gradient 0: then nothing enters, and the lobe makes energy.
+
+    **Source:** the lobe of Kelemen and Szirmay-Kalos 2001, as normalized in `specular_lobe`.
+    """
+    x = 2 * jnp.sqrt(jnp.clip(mu, _LEAST_MU, 1.0)) - 1
+    t = _roughness_coordinate(roughness)
+    share = f0 * _table((0, 0, 0), x, t) + (1 - f0) * _table((1, 0, 0), x, t)
+    return jnp.clip(specular * share, 0.0, 1.0)
+
+
+def average_albedo(
+    f0: Float[Array, "..."], specular: Float[Array, "..."], roughness: Float[Array, "..."]
+) -> Float[Array, "..."]:
+    r"""Give the share of uniform light that the specular lobe reflects, `2 int_0^1 rho(mu) mu dmu`.
+
+    It is the exact integral of the series that `directional_albedo` evaluates, so that nothing is
+    lost between the two.
+
+    **Arguments:** as in `directional_albedo`.
+
+    **Returns:** in [0, 1].
+    """
+    t = _roughness_coordinate(roughness)
+    _, averages = _tables()
+    constant, grazing = (_chebyshev(table.tolist(), t) for table in averages)
+    return jnp.clip(specular * (f0 * constant + (1 - f0) * grazing), 0.0, 1.0)

@@ -1,5 +1,6 @@
 """Profiles by random walks: the reference that diffusion approximates."""
 
+import functools
 from collections.abc import Callable, Sequence
 
 import equinox as eqx
@@ -11,14 +12,17 @@ from jaxtyping import Array, Float, Int, Key
 from splatjax._records import Numbers, as_floats, check_values
 from splatjax.scattering import Film, Layer, check_stack
 
-from ._incidence import AbstractIncidence, NormalIncidence
-from ._phase import AbstractPhaseFunction, Isotropic
+from ._directions import AbstractIncidence, AbstractPhaseFunction, Isotropic, NormalIncidence
 from ._results import AbstractTallies, MonteCarlo, PathDerivatives, SampleMean, assemble
-from ._rounds import Setup, Walk, finish, lanes_for
+from ._rounds import Setup, Walk, finish
 from ._stack import LayeredMedia
 from ._walk import Optics
 
 _FLIGHTS = 20_000
+
+# Photons on their way at once: their state stays in the cache of a core or two, and few lanes wait
+# for the last photon.
+_MOST_LANES, _LEAST_LANES, _PHOTONS_A_LANE = 16384, 1024, 8
 
 
 def monte_carlo(
@@ -127,29 +131,26 @@ def _set_up(
     steps = jnp.diff(edges)
     check_values("the steps of edges", steps, "positive (mm): edges must ascend", lambda x: x > 0)
     numbers = jnp.asarray(photons, jnp.int32), jnp.asarray(flights, jnp.int32)
-    return media, Setup(edges, incidence, phase, key, *numbers, lanes_for(photons))
+    lanes = max(_LEAST_LANES, 1 << (photons // _PHOTONS_A_LANE).bit_length())
+    return media, Setup(edges, incidence, phase, key, *numbers, min(_MOST_LANES, lanes))
 
 
 @eqx.filter_jit
 def _prepare(layers, phase: AbstractPhaseFunction, eta_above, eta_below, edges):
-    """Lay out the media, and rings that suit them."""
-    anisotropy = phase.anisotropy(len(layers), eta_above.dtype)
-    media = LayeredMedia.of(layers, anisotropy, eta_above, eta_below)
-    return media, _default_edges(media, anisotropy) if edges is None else edges
-
-
-def _default_edges(
-    media: LayeredMedia, anisotropy: Float[Array, " layers"]
-) -> Float[Array, " edges"]:
-    """Rings from a fiftieth of the least mean free path to where hardly any light leaves."""
-    media = jax.lax.stop_gradient(media)
-    sigma_a, sigma_s = media.sigma_a[media.first], media.sigma_s[media.first]
-    free_path = 1 / (sigma_a + sigma_s * (1 - anisotropy[media.first]))
-    sigma_tr = jnp.sqrt(3 * sigma_a / free_path)
-    fallen = 20 / jnp.maximum(sigma_tr, 1e-6 / free_path) + 10 * free_path
+    """Lay out the media, and rings from a fiftieth of the least mean free path to where hardly any
+    light leaves, unless there are others.
+    """
+    media = LayeredMedia.of(
+        layers, phase.anisotropy(len(layers), eta_above.dtype), eta_above, eta_below
+    )
+    if edges is not None:
+        return media, edges
+    top = jax.lax.stop_gradient(layers[media.first].medium)
+    free_path = 1 / top.sigma_t_prime
+    fallen = 20 / jnp.maximum(jnp.sqrt(top.squared_sigma_tr), 1e-6 / free_path) + 10 * free_path
     first, last = 0.02 * jnp.min(free_path), jnp.max(jnp.minimum(200 * free_path, fallen))
     growing = first * (last / first) ** jnp.linspace(0, 1, 128, dtype=first.dtype)
-    return jnp.concatenate([jnp.zeros(1, first.dtype), growing])
+    return media, jnp.concatenate([jnp.zeros(1, first.dtype), growing])
 
 
 @eqx.filter_custom_jvp
@@ -184,10 +185,10 @@ def _along(
 
     def tangent_of(name: str) -> SampleMean:
         zero = jnp.zeros_like(getattr(result, name).value)
-        total = zero
-        for by, tangent in pairs:
-            total = total + jnp.einsum("l...c,lc->...c", getattr(by, name).value, tangent)
-        return SampleMean(total, zero)
+        slopes = (
+            jnp.einsum("l...c,lc->...c", getattr(by, name).value, tangent) for by, tangent in pairs
+        )
+        return SampleMean(sum(slopes, start=zero), zero)
 
     return MonteCarlo(
         edges=jnp.zeros_like(result.edges),
@@ -203,7 +204,12 @@ def _walk_all(media: LayeredMedia, setup: Setup, with_derivatives: bool, progres
         walk = _walk_of(
             media, setup, jnp.asarray(number), jnp.asarray(group.astype(np.int32)), with_derivatives
         )
-        tallies.append(finish(walk, _share_of(progress, number, len(groups))))
+        report = progress and (
+            lambda done, photons, before=number: progress(
+                before * photons + done, len(groups) * photons
+            )
+        )
+        tallies.append(finish(walk, report))
     order = jnp.asarray(np.argsort(np.concatenate(groups)).astype(np.int32))
     specular = setup.incidence.reflected(media.eta[1] / media.eta[0])
     layers = media.sigma_a.shape[0] if with_derivatives else 0
@@ -221,15 +227,12 @@ def _walk_of(
     """Set up the walk of a group of channels, in the free paths of the first of them."""
     unit = media.unit[group]
     coefficients = media.sigma_a[:, group], media.sigma_s[:, group]
-
-    def optics(sigma_a, sigma_s) -> Optics:
-        return Optics.of(sigma_a, sigma_s, unit)
-
+    optics = functools.partial(Optics.of, unit=unit)
     # A direction for the absorption of each layer, then one for the scattering of each.
     layers = media.sigma_a.shape[0]
-    directions = jnp.eye(2 * layers, dtype=unit.dtype).reshape(2 * layers, 2, layers, 1)
-    directions = jnp.broadcast_to(directions, (2 * layers, 2, layers, len(group)))
-    directions = directions if with_derivatives else directions[:0]
+    slopes = 2 * layers if with_derivatives else 0
+    directions = jnp.eye(slopes, 2 * layers, dtype=unit.dtype).reshape(slopes, 2, layers, 1)
+    directions = jnp.broadcast_to(directions, (slopes, 2, layers, len(group)))
     slopes = jax.vmap(lambda along: jax.jvp(optics, coefficients, tuple(along))[1])(directions)
     return Walk(
         setup=setup,
@@ -239,13 +242,3 @@ def _walk_of(
         slopes=slopes,
         edges=setup.edges[None] / jax.lax.stop_gradient(unit)[:, None],
     )
-
-
-def _share_of(
-    progress: Callable[[int, int], None] | None, number: int, groups: int
-) -> Callable[[int, int], None]:
-    def report(done: int, photons: int) -> None:
-        if progress is not None:
-            progress(number * photons + done, groups * photons)
-
-    return report

@@ -1,4 +1,6 @@
-"""Photons by the lane: each lane takes the next photon when it is done with one."""
+"""Photons by the lane: each lane takes the next photon when it is done with one. Uniform random
+numbers by counting.
+"""
 
 from collections.abc import Callable
 
@@ -7,35 +9,27 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
 from splatjax._chunking import jit_unless_traced
 
-from ._incidence import AbstractIncidence
-from ._phase import AbstractPhaseFunction
-from ._random import evenly, uniforms
+from ._directions import AbstractIncidence, AbstractPhaseFunction
+from ._results import Sum, Tally
 from ._stack import Stack
-from ._tally import Tally
 from ._walk import IDLE, INSIDE, Optics, PathWeights, Photons, fly, weigh
 
-_MOST_LANES, _LEAST_LANES, _PHOTONS_A_LANE = 16384, 1024, 8
-"""Photons on their way at once: their state stays in the cache of a core or two, and few lanes wait
-for the last photon.
-"""
-
+# Flights between two looks at who is done.
 _FLIGHTS = 4
-"""Flights between two looks at who is done."""
 
+# Rounds of one compiled call: a second or so, after which progress is told.
 _ROUNDS = 256
-"""Rounds of one compiled call: a second or so, after which progress is told."""
 
+# Rounds between two looks at whether all are done.
 _UNWATCHED = 8
-"""Rounds between two looks at whether all are done."""
 
+# A photon that carries less than this is given up, except for this share, which carries more
+# instead (Russian roulette).
 _LEAST, _SURVIVING = 1e-4, 0.1
-"""A photon that carries less than this is given up, except for this share, which carries more
-instead (Russian roulette).
-"""
 
 
 class Setup(eqx.Module):
@@ -69,11 +63,6 @@ class Walk(eqx.Module):
     edges: Float[Array, "channels edges"]
 
 
-def lanes_for(photons: int) -> int:
-    """Choose how many photons to have on their way at once."""
-    return min(_MOST_LANES, max(_LEAST_LANES, 1 << (photons // _PHOTONS_A_LANE).bit_length()))
-
-
 class _State(eqx.Module):
     photons: Photons
     weights: PathWeights
@@ -87,7 +76,7 @@ class _State(eqx.Module):
         return (self.started < walk.setup.photons) | jnp.any(self.photons.place == INSIDE)
 
 
-def finish(walk: Walk, progress: Callable[[int, int], None]) -> Tally:
+def finish(walk: Walk, progress: Callable[[int, int], None] | None) -> Tally:
     """Walk all photons to their end. Under `jit` in one loop, else call by call, reporting progress
     in between.
     """
@@ -98,8 +87,9 @@ def finish(walk: Walk, progress: Callable[[int, int], None]) -> Tally:
         ).tally
     while bool(state.unfinished(walk)):
         state = _advance(walk, state)
-        under_way = int(np.sum(np.asarray(state.photons.place) == INSIDE))
-        progress(int(state.started) - under_way, int(walk.setup.photons))
+        if progress is not None:
+            under_way = int(np.sum(np.asarray(state.photons.place) == INSIDE))
+            progress(int(state.started) - under_way, int(walk.setup.photons))
     return state.tally
 
 
@@ -114,7 +104,11 @@ def _start(walk: Walk) -> _State:
         jnp.zeros((layers, channels, walk.setup.lanes), dtype),
     )
     slopes = jax.tree.map(lambda leaf: jnp.zeros((parameters, *leaf.shape), dtype), weights)
-    tally = Tally.empty(rings, layers, channels, parameters, dtype)
+    moments = 2 + 2 * parameters
+    tally = Tally(
+        Sum.zeros((channels, 2 * (rings + 1) + 1, moments), dtype),
+        Sum.zeros((layers, channels, moments), dtype),
+    )
     state = _State(photons, weights, slopes, tally, number[0], number[0])
     return _launch(walk, state, photons.place == IDLE)
 
@@ -122,14 +116,11 @@ def _start(walk: Walk) -> _State:
 @eqx.filter_jit
 def _advance(walk: Walk, state: _State) -> _State:
     last = state.round + _ROUNDS
-
-    def goes_on(state):
-        return (state.round < last) & state.unfinished(walk)
-
-    def some(state):
-        return jax.lax.fori_loop(0, _UNWATCHED, lambda _, state: _round(walk, state), state)
-
-    return jax.lax.while_loop(goes_on, some, state)
+    return jax.lax.while_loop(
+        lambda state: (state.round < last) & state.unfinished(walk),
+        lambda state: jax.lax.fori_loop(0, _UNWATCHED, lambda _, state: _round(walk, state), state),
+        state,
+    )
 
 
 def _round(walk: Walk, state: _State) -> _State:
@@ -186,10 +177,9 @@ def _launch(walk: Walk, state: _State, free: Bool[Array, " photons"]) -> _State:
     direction, weight = walk.setup.incidence.enter(spread, xi[1], walk.stack.eta[:2])
 
     zero, number = jnp.zeros(walk.setup.lanes, dtype), jnp.zeros(walk.setup.lanes, jnp.int32)
-    fresh = Photons(zero, zero, zero, direction, -jnp.log(xi[2]), number, number + INSIDE, number)
-    photons = jax.tree.map(lambda new, old: jnp.where(begins, new, old), fresh, state.photons)
-    idle = jnp.where(free & ~begins, IDLE, photons.place)
-    photons = eqx.tree_at(lambda photons: photons.place, photons, idle)
+    place = jnp.where(begins, INSIDE, IDLE)
+    fresh = Photons(zero, zero, zero, direction, -jnp.log(xi[2]), number, place, number)
+    photons = jax.tree.map(lambda new, old: jnp.where(free, new, old), fresh, state.photons)
     weights, slopes = (
         jax.tree.map(lambda leaf: jnp.where(jnp.broadcast_to(free, leaf.shape), 0.0, leaf), part)
         for part in (state.weights, state.slopes)
@@ -198,3 +188,61 @@ def _launch(walk: Walk, state: _State, free: Bool[Array, " photons"]) -> _State:
     weights = PathWeights(weights.carried + started_weight, weights.absorbed)
     started = state.started + jnp.sum(begins, dtype=jnp.int32)
     return _State(photons, weights, slopes, state.tally, started, state.round)
+
+
+_ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
+_PARITY = 0x1BD11BDA
+_CIPHER_ROUNDS = 20
+# 2^32 over the golden ratio.
+_GOLDEN = 0x9E3779B9
+
+
+def uniforms(
+    key: Key[Array, ""], number: Int[Array, ""], lanes: int, dtype
+) -> Float[Array, "four lanes"]:
+    """Draw four independent numbers in (0, 1] for each lane, steps of 2^-24: the `number`-th of a
+    key.
+
+    In one pass: `jax.random` gives the same numbers, but on a CPU it lowers each round of the
+    cipher to a loop over memory, which takes longer than all the physics of a flight.
+    """
+    words = jax.random.key_data(key).reshape(-1).astype(jnp.uint32)
+    lane = jnp.arange(lanes, dtype=jnp.uint32)
+    count = jnp.broadcast_to(2 * number.astype(jnp.uint32), (lanes,))
+    pairs = [threefry(words[0], words[-1], lane, count + jnp.uint32(half)) for half in (0, 1)]
+    return jnp.stack(
+        [((word >> 8) + jnp.uint32(1)).astype(dtype) * 2.0**-24 for pair in pairs for word in pair]
+    )
+
+
+def evenly(key: Key[Array, ""], number: Int[Array, " lanes"], dtype) -> Float[Array, " lanes"]:
+    """Draw numbers in (0, 1] that fill it evenly as `number` counts: Weyl's sequence of the golden
+    ratio, from a random start.
+
+    Means over a smooth function of one of them are nearly exact.
+    """
+    start = jax.random.bits(key, (), jnp.uint32)
+    word = number.astype(jnp.uint32) * jnp.uint32(_GOLDEN) + start
+    return ((word >> 8) + jnp.uint32(1)).astype(dtype) * 2.0**-24
+
+
+def threefry(
+    first: UInt32[Array, ""],
+    second: UInt32[Array, ""],
+    x: UInt32[Array, " lanes"],
+    y: UInt32[Array, " lanes"],
+) -> tuple[UInt32[Array, " lanes"], UInt32[Array, " lanes"]]:
+    """Encipher pairs of words: Threefry 2x32 with 20 rounds.
+
+    **Source:** Salmon et al. 2011, "Parallel random numbers: as easy as 1, 2, 3".
+    """
+    keys = (first, second, first ^ second ^ jnp.uint32(_PARITY))
+    x, y = x + keys[0], y + keys[1]
+    for number in range(_CIPHER_ROUNDS):
+        distance = _ROTATIONS[number // 4 % 2][number % 4]
+        x = x + y
+        y = ((y << distance) | (y >> (32 - distance))) ^ x
+        if number % 4 == 3:
+            group = number // 4 + 1
+            x, y = x + keys[group % 3], y + keys[(group + 1) % 3] + jnp.uint32(group)
+    return x, y

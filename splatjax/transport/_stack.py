@@ -11,9 +11,8 @@ from jaxtyping import Array, Float, Int
 
 from splatjax.scattering import Film, Layer
 
+# In free paths of the first layer that scatters: so thin that no light moves sideways in a film.
 _FILM_THICKNESS = 1e-6
-"""In free paths of the first layer that scatters: so thin that no light moves sideways in a film.
-"""
 
 
 class LayeredMedia(eqx.Module):

@@ -7,9 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from splatjax.scattering import reflectance
-
-from ._phase import AbstractPhaseFunction
+from ._directions import AbstractPhaseFunction, Direction, fresnel
 from ._stack import Stack, of_layer
 
 INSIDE, ABOVE, BELOW, IDLE = 0, 1, 2, 3
@@ -24,7 +22,7 @@ class Photons(eqx.Module):
     x: Float[Array, " photons"]
     y: Float[Array, " photons"]
     depth: Float[Array, " photons"]
-    direction: tuple[Float[Array, " photons"], Float[Array, " photons"], Float[Array, " photons"]]
+    direction: Direction
     to_scatter: Float[Array, " photons"]
     layer: Int[Array, " photons"]
     place: Int[Array, " photons"]
@@ -126,26 +124,23 @@ def fly(
         arrives_on_top, 0.0, of_layer(stack.thickness, jnp.where(stays, after, layer))
     )
 
-    def now(new, old):
-        return jnp.where(inside, new, old)
-
     moved = Photons(
         x=photons.x + ux * length,
         y=photons.y + uy * length,
-        depth=now(jnp.where(scattered, photons.depth + uz * length, at_interface), photons.depth),
+        depth=jnp.where(scattered, photons.depth + uz * length, at_interface),
         direction=(
-            now(jnp.where(scattered, turned[0], ux * bent), ux),
-            now(jnp.where(scattered, turned[1], uy * bent), uy),
-            now(jnp.where(scattered, turned[2], up_again), uz),
+            jnp.where(scattered, turned[0], ux * bent),
+            jnp.where(scattered, turned[1], uy * bent),
+            jnp.where(scattered, turned[2], up_again),
         ),
-        to_scatter=now(
-            jnp.where(scattered, -jnp.log(xi[2]), photons.to_scatter - to_interface * sigma_s),
-            photons.to_scatter,
+        to_scatter=jnp.where(
+            scattered, -jnp.log(xi[2]), photons.to_scatter - to_interface * sigma_s
         ),
-        layer=now(jnp.where(scattered | ~stays, layer, after), layer),
-        place=now(jnp.where(scattered, INSIDE, left), photons.place),
-        flights=photons.flights + inside.astype(jnp.int32),
+        layer=jnp.where(scattered | ~stays, layer, after),
+        place=jnp.where(scattered, INSIDE, left),
+        flights=photons.flights + 1,
     )
+    moved = jax.tree.map(lambda new, old: jnp.where(inside, new, old), moved, photons)
     return moved, Flight(length, layer, scattered & inside)
 
 
@@ -184,22 +179,3 @@ def _taken_jvp(primals, tangents):
     taken = -jnp.expm1(-absorption)
     mean = jnp.where(absorption > 0, taken / jnp.where(absorption > 0, absorption, 1.0), 1.0)
     return taken, jnp.exp(-absorption) * removing + mean * (absorbing - removing)
-
-
-def fresnel(
-    cosine: Float[Array, " photons"],
-    eta_from: Float[Array, " photons"],
-    eta_to: Float[Array, " photons"],
-) -> tuple[Float[Array, " photons"], Float[Array, " photons"]]:
-    """Compute the reflectance for unpolarized light that arrives under `cosine` (0 to 1), and the
-    cosine of the transmitted light.
-
-    Total internal reflection is 1, with a cosine of 0. Between equal indices nothing is reflected
-    or bent, exactly.
-    """
-    ratio = eta_from / eta_to
-    squared = 1 - ratio * ratio * (1 - cosine * cosine)
-    matched = eta_from == eta_to
-    onward = jnp.where(matched, cosine, jnp.sqrt(jnp.maximum(squared, 0.0)))
-    reflected = jnp.where(squared > 0, reflectance(cosine, onward, ratio), 1.0)
-    return jnp.where(matched, 0.0, reflected), onward

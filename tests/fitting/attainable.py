@@ -6,6 +6,7 @@ at least three starts.
 """
 
 # fmt: off
+# Of the red, green and blue channels, each with variances of its own; free weights.
 PER_CHANNEL = {
     "apple": (
         (2.826e-01, 9.004e-02, 3.191e-02, 1.194e-02, 4.707e-03, 1.901e-03, 7.887e-04, 3.332e-04),
@@ -68,8 +69,8 @@ PER_CHANNEL = {
         (2.721e-01, 8.346e-02, 2.780e-02, 9.815e-03, 3.624e-03, 1.375e-03, 5.360e-04, 2.130e-04),
     ),
 }
-"""Of the red, green and blue channels, each with variances of its own; free weights."""
 
+# Root mean square over the channels, which share their variances; free weights.
 SHARED_FREE = {
     "apple": (2.67e-01, 8.82e-02, 3.13e-02, 1.21e-02, 4.75e-03, 1.89e-03, 8.38e-04, 3.45e-04),
     "chicken1": (4.56e-01, 1.65e-01, 5.45e-02, 1.94e-02, 7.83e-03, 2.75e-03, 1.07e-03, 4.17e-04),
@@ -84,8 +85,8 @@ SHARED_FREE = {
     "spectralon": (3.30e-01, 1.34e-01, 5.44e-02, 2.34e-02, 1.13e-02, 5.27e-03, 2.71e-03, 1.40e-03),
     "wholemilk": (3.06e-01, 1.12e-01, 4.44e-02, 1.79e-02, 7.98e-03, 3.44e-03, 1.64e-03, 7.54e-04),
 }
-"""Root mean square over the channels, which share their variances; free weights."""
 
+# The same with weights that are not negative and sum to the total reflectance.
 SHARED_HELD = {
     "apple": (5.16e-01, 1.27e-01, 4.24e-02, 1.50e-02, 5.55e-03, 2.17e-03, 9.35e-04, 3.86e-04),
     "chicken1": (6.54e-01, 2.26e-01, 7.16e-02, 2.24e-02, 8.73e-03, 3.33e-03, 1.24e-03, 4.57e-04),
@@ -100,4 +101,3 @@ SHARED_HELD = {
     "spectralon": (6.63e-01, 2.03e-01, 8.37e-02, 3.39e-02, 1.59e-02, 7.47e-03, 3.64e-03, 1.91e-03),
     "wholemilk": (6.04e-01, 1.62e-01, 6.28e-02, 2.31e-02, 9.79e-03, 4.13e-03, 1.89e-03, 8.68e-04),
 }
-"""The same with weights that are not negative and sum to the total reflectance."""

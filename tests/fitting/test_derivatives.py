@@ -16,16 +16,16 @@ from splatjax.fitting import (
 from splatjax.gaussians import SumOfGaussians
 from splatjax.scattering import Dipole, Layer, Medium, Multipole
 
+# Asked of the derivative; central differences with steps of 1e-4 relative err by 1e-7.
 REFITS = 1e-4
-"""Asked of the derivative; central differences with steps of 1e-4 relative err by 1e-7."""
 
 STEP = 1e-4
 
+# The Hessian of a fit with an error of 1e-2 loses some three of float32's seven digits.
 IN_FLOAT32 = 1e-3
-"""The Hessian of a fit with an error of 1e-2 loses some three of float32's seven digits."""
 
+# Logarithms of sigma_a, sigma_s' and eta of marble's red and blue.
 POINT = np.log([0.0021, 0.0071, 2.19, 3.0, 1.5, 1.5])
-"""Logarithms of sigma_a, sigma_s' and eta of marble's red and blue."""
 
 
 def fit(point, spread, weights):

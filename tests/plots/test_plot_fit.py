@@ -1,4 +1,4 @@
-"""What a plot of a fit must show."""
+"""What plots of fits, and of errors over counts, must show."""
 
 import jax.numpy as jnp
 import matplotlib.pyplot
@@ -6,52 +6,34 @@ import numpy as np
 import pytest
 
 import splatjax as sj
+from splatjax.fitting import ErrorByCount
 from splatjax.gaussians import SumOfGaussians
 from splatjax.io import load_material, load_medium
-from splatjax.plots import plot_fit
+from splatjax.plots import plot_error_by_count, plot_fit
 from splatjax.scattering import Dipole, Tabulated
 
 
-@pytest.fixture
-def figure():
-    return plot_fit(
-        Dipole(load_medium("marble")), load_material("marble").gaussians, title="marble"
-    )
-
-
-def test_axes_have_names_and_units(figure):
-    assert len(figure.axes) == 3
-    for axes in figure.axes:
-        assert "(mm)" in axes.get_xlabel()
-        assert axes.get_ylabel()
+def test_a_figure_has_names_units_error_and_energy_and_is_drawn_outside_of_pyplot(tmp_path):
+    gaussians = load_material("marble").gaussians
+    figure = plot_fit(Dipole(load_medium("marble")), gaussians, title="marble")
+    assert [axes.get_xlabel() for axes in figure.axes] == ["r (mm)"] * 3
     assert "1/mm²" in figure.axes[1].get_ylabel()
-
-
-def test_legend_gives_error_and_energy(figure):
     labels = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
-    assert len(labels) == 3
     assert labels[0].startswith("red: E = 4.2")
     assert [label.partition(":")[0] for label in labels] == ["red", "green", "blue"]
     assert all(label.endswith("energy held") for label in labels)
-
-
-def test_legend_gives_the_energy_that_is_missed():
-    gaussians = load_material("marble").gaussians
-    less = SumOfGaussians(gaussians.variances, 0.99 * gaussians.weights)
-    label = plot_fit(gaussians, less).axes[0].get_legend().get_texts()[0].get_text()
-    assert label.endswith("energy -1.00e-02")
-
-
-def test_it_is_drawn_outside_of_pyplot_and_written(figure, tmp_path):
     assert matplotlib.pyplot.get_fignums() == []
     figure.savefig(tmp_path / "fit.png")
     assert (tmp_path / "fit.png").stat().st_size > 10_000
 
 
-def test_one_channel_and_a_perfect_fit(dtype):
+def test_a_perfect_fit_of_one_channel_and_the_energy_that_another_misses(dtype):
     gaussians = SumOfGaussians(jnp.asarray([0.1, 2.0], dtype), jnp.asarray([[0.3], [0.4]], dtype))
-    residual = plot_fit(gaussians, gaussians).axes[2].lines[0].get_ydata()
-    np.testing.assert_array_equal(residual, 0)
+    less = SumOfGaussians(gaussians.variances, 0.99 * gaussians.weights)
+    perfect, misses = (plot_fit(gaussians, fit).axes for fit in (gaussians, less))
+    np.testing.assert_array_equal(perfect[2].lines[0].get_ydata(), 0)
+    label = misses[0].get_legend().get_texts()[0].get_text()
+    assert label.endswith("energy -1.00e-02")
 
 
 def test_what_was_not_fitted_is_shaded_and_not_counted(float64, dtype):
@@ -84,3 +66,12 @@ def test_few_radii_are_marked_and_the_fit_is_drawn_between_them():
     np.testing.assert_allclose(given.get_xdata(), radii)
     assert len(drawn.get_xdata()) > 100
     np.testing.assert_allclose(drawn.get_xdata()[[0, -1]], [0.5, 8.0], rtol=1e-5)
+
+
+def test_every_count_and_channel_is_drawn_on_a_logarithmic_axis():
+    error = jnp.asarray([[0.3, 0.2, 0.1], [0.03, 0.02, 0.01]])
+    axes = plot_error_by_count(ErrorByCount(error, jnp.ones((2, 2))), title="three").axes[0]
+    assert axes.get_yscale() == "log"
+    assert "E" in axes.get_ylabel()
+    np.testing.assert_array_equal(axes.get_xticks(), [1, 2])
+    np.testing.assert_array_equal([line.get_ydata() for line in axes.lines], np.asarray(error).T)

@@ -11,17 +11,17 @@ from scipy.integrate import quad
 
 from splatjax.scattering import EganFresnel, ExactFresnel
 
+# Two accurate quadratures of one integral differ by rounding.
 EXACT = 1e-12
-"""Two accurate quadratures of one integral differ by rounding."""
 
+# The published table has six digits.
 PRINTED = 6e-7
-"""The published table has six digits."""
 
+# How far the published polynomials may be from the integrals they fit, between 1/1.5 and 1.5.
 POLYNOMIAL = 6e-3
-"""How far the published polynomials may be from the integrals they fit, between 1/1.5 and 1.5."""
 
+# Extrapolated from 1e-5 and 2e-5 away, where the slopes differ from the limit by e log e.
 ONE_SIDED = 1e-3
-"""Extrapolated from 1e-5 and 2e-5 away, where the slopes differ from the limit by e log e."""
 
 INDICES = (1 / 1.5, 1 / 1.3, 0.97, 1.05, 1.1, 1.3, 1.4, 1.5, 2.5)
 

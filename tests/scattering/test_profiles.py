@@ -1,4 +1,6 @@
-"""Laws that every model obeys: energy, units, sign, derivatives and their one-sided limits."""
+"""Laws that every model obeys: energy, units, sign, derivatives and their one-sided limits; and
+what is published of the models.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -6,12 +8,16 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
+from splatjax.io import load_medium
 from splatjax.scattering import (
+    L1_QUADRATURE,
     BetterDipole,
     Burley,
     DiffuseMeanFreePath,
     DiffuseTransmission,
     Dipole,
+    EganFresnel,
+    ExactFresnel,
     Film,
     Layer,
     LayeredMultipole,
@@ -19,15 +25,15 @@ from splatjax.scattering import (
     Multipole,
     PhotonBeam,
     RadialRule,
-    RoughFresnel,
     Searchlight,
     Tabulated,
+    at_own_radii,
     integrated_reflectance,
 )
 
 UNITS = 1e-12
+# Extrapolated one-sided quotients.
 LIMIT = 1e-4
-"""Extrapolated one-sided quotients."""
 
 
 def medium(sigma_a=(0.0041, 0.17), sigma_s_prime=(2.62, 0.88), eta=(1.5, 1.3), scale=1.0) -> Medium:
@@ -131,6 +137,62 @@ def test_flat_at_the_axis(dtype, name):
     np.testing.assert_array_equal(slope, 0)
 
 
+CLOSED_FORM = 1e-9  # of a total against quadrature: what is asked; 1e-15 is reached
+PRINTED = 0.012  # Jensen's table prints two digits of coefficients and totals
+
+# Jensen et al. 2001, Table 1, diffuse reflectance.
+PRINTED_TOTALS = {
+    "apple": (0.85, 0.84, 0.53),
+    "chicken1": (0.31, 0.15, 0.10),
+    "chicken2": (0.32, 0.16, 0.10),
+    "cream": (0.98, 0.90, 0.73),
+    "ketchup": (0.16, 0.01, 0.00),
+    "marble": (0.83, 0.79, 0.75),
+    "potato": (0.77, 0.62, 0.21),
+    "skimmilk": (0.81, 0.81, 0.69),
+    "skin1": (0.44, 0.22, 0.13),
+    "skin2": (0.63, 0.44, 0.34),
+    "spectralon": (1.00, 1.00, 1.00),
+    "wholemilk": (0.91, 0.88, 0.76),
+}
+
+
+@pytest.mark.parametrize("fresnel", [ExactFresnel(), EganFresnel()])
+@pytest.mark.parametrize("name", PRINTED_TOTALS)
+def test_closed_form_total_is_the_integral(float64, name, fresnel):
+    profile = Dipole(load_medium(name), fresnel)
+    total = integrated_reflectance(profile)
+    if name == "spectralon":
+        # Without absorption R falls as r^-3 beyond the last node: the rest of the integral of 2 pi
+        # r R is 2 pi r^2 R.
+        end = L1_QUADRATURE.largest * profile.length_scale()
+        total = total + 2 * jnp.pi * end**2 * at_own_radii(profile, end[None])[0]
+    np.testing.assert_allclose(total, profile.total_reflectance(), rtol=CLOSED_FORM)
+
+
+@pytest.mark.parametrize("name", PRINTED_TOTALS)
+def test_totals_are_those_printed(name):
+    difference = np.asarray(Dipole(load_medium(name)).total_reflectance()) - np.asarray(
+        PRINTED_TOTALS[name]
+    )
+    if name == "chicken1":
+        difference = difference[:2]  # blue is printed as 0.10; its printed coefficients give 0.126
+    assert np.max(np.abs(difference)) < PRINTED
+
+
+def test_total_is_one_without_absorption_and_less_with_it(dtype):
+    def totals(sigma_a):
+        return Dipole(Medium(sigma_a, 1.0, eta=1.4)).total_reflectance()
+
+    sigma_a = jnp.asarray([0.0, 1e-3, 1.0], dtype)
+    found = np.asarray(totals(sigma_a))
+    assert found[0] == 1
+    assert np.all(np.diff(found) < 0)
+    assert np.all(found > 0)
+    # The derivative diverges there; a finite number would be wrong.
+    assert not np.isfinite(jax.grad(lambda x: totals(x)[0])(sigma_a)[0])
+
+
 # Christensen and Burley 2015, worked out by hand.
 SCALINGS = {
     Searchlight(): {0.1: 4.151, 0.8: 1.05, 1.0: 0.906},
@@ -161,20 +223,9 @@ def test_a_table_gives_what_it_holds(float64):
     )
     cells = np.linspace(0, 4, 400_001)
     middle = 0.5 * (cells[1:] + cells[:-1])
-    sums = (
-        2
-        * np.pi
-        * np.sum(middle * np.asarray(table(jnp.asarray(middle)))[:, 0])
-        * (cells[1] - cells[0])
-    )
+    values = np.asarray(table(jnp.asarray(middle)))[:, 0]
+    sums = 2 * np.pi * np.sum(middle * values) * (cells[1] - cells[0])
     np.testing.assert_allclose(table.total_reflectance(), sums, rtol=1e-9)
-    fine = jnp.linspace(0.0, 60.0, 4000)
-    dipole = Dipole(medium())
-    np.testing.assert_allclose(
-        Tabulated(fine, dipole(fine)).total_reflectance()[1],
-        dipole.total_reflectance()[1],
-        rtol=1e-3,
-    )
 
 
 @pytest.mark.shared
@@ -221,8 +272,6 @@ def test_distances_from_monte_carlo(float64, monte_carlo, run, coefficients, dis
         (lambda x: Burley(0.5, x), "Burley.free_path"),
         (lambda x: Film(x - 0.1), "Film.optical_depth"),
         (lambda x: Layer(medium(), x - 1), "Layer.thickness"),
-        (lambda x: RoughFresnel(x - 0.1), "RoughFresnel.roughness"),
-        (lambda x: RoughFresnel(x + 1.5), "RoughFresnel.roughness"),
         (lambda x: Tabulated([0, 1, 1 + x], [1, 1, 1]), "steps of Tabulated.radii"),
         (lambda x: Tabulated([-1 + x, 1], [1, 1]), "Tabulated.radii"),
         (lambda x: Tabulated([0, 1], [1.0, x / x]), "Tabulated.values"),

@@ -10,16 +10,16 @@ import splatjax as sj
 from splatjax.transport import MonteCarlo
 
 KEY = jax.random.key(2026)
+# Standard errors by which an estimate may be off.
 ERRORS = 3
-"""Standard errors by which an estimate may be off."""
+# As many as the rings of the other program have at most: one number of rings is one program.
 EDGES = 400
-"""As many as the rings of the other program have at most: one number of rings is one program."""
+# Where totals alone are asked for: sorting photons into rings takes a third of the time.
 ONE_RING = jnp.asarray([0.0, 1.0])
-"""Where totals alone are asked for: sorting photons into rings takes a third of the time."""
 
 
+# How many times the photons of the suite, for half the error.
 SCORES = pytest.mark.parametrize("score", [1, pytest.param(4, marks=pytest.mark.long)])
-"""How many times the photons of the suite, for half the error."""
 
 
 def within(estimate, reference, deviation) -> None:

@@ -9,12 +9,11 @@ import splatjax as sj
 
 KEY = jax.random.key(7)
 PHOTONS, FEW = 400_000, 10_000
+# Of rings given here: as many as there are by default, so that walks alike in their layers are one
+# program.
 EDGES = 129
-"""Of rings given here: as many as there are by default, so that walks alike in their layers are one
-program.
-"""
+# Standard errors between two estimates: of some dozens here, none should be farther off.
 ERRORS = 3.5
-"""Standard errors between two estimates: of some dozens here, none should be farther off."""
 
 
 def agree(one, other, rtol=0.0) -> None:
@@ -38,9 +37,6 @@ def test_a_split_slab_is_the_whole(float32):
         split.absorbed.value.sum(0), jnp.linalg.norm(split.absorbed.deviation, axis=0)
     )
     agree(whole.absorbed, absorbed)
-    through = whole.transmitted_profile()
-    np.testing.assert_array_equal(through.total_reflectance(), whole.total_transmittance.value)
-    np.testing.assert_array_equal(through.values, whole.transmitted.value)
     # Ring by ring, where many photons leave.
     many = np.asarray(whole.reflected.deviation[:, 0]) < 0.05 * np.asarray(
         whole.reflected.value[:, 0]
@@ -145,14 +141,3 @@ def test_the_same_key_gives_the_same_numbers(dtype):
     )
     np.testing.assert_array_equal(one.reflected.value, again.reflected.value)
     assert np.any(np.asarray(one.reflected.value) != np.asarray(other.reflected.value))
-
-
-def test_errors_are_the_spread_of_estimates(float32):
-    """Twenty-five runs scatter as much as each says of itself."""
-    runs = [
-        sj.transport.monte_carlo([layer(0.2, 1.0, 1.3)], FEW, jax.random.key(seed))
-        for seed in range(25)
-    ]
-    values = np.asarray([run.total_reflectance.value[0] for run in runs])
-    said = np.mean([run.total_reflectance.deviation[0] for run in runs])
-    assert 0.65 < np.std(values, ddof=1) / said < 1.4

@@ -1,4 +1,4 @@
-"""Phase functions: into which direction a photon is scattered."""
+"""Directions of photons: how they enter, are refracted, and are scattered."""
 
 import abc
 import math
@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from splatjax._records import check_values, numbers, record
+from splatjax.scattering import moment_outside, reflectance
 
 from ._stack import of_layer
 
@@ -15,6 +16,56 @@ _SINE = [(-1) ** n * math.pi ** (2 * n + 1) / math.factorial(2 * n + 1) for n in
 _COSINE = [(-1) ** n * math.pi ** (2 * n) / math.factorial(2 * n) for n in range(9)]
 
 Direction = tuple[Float[Array, " photons"], Float[Array, " photons"], Float[Array, " photons"]]
+
+
+class AbstractIncidence(eqx.Module):
+    """A narrow beam's directions, as they are inside the surface. Powers count what enters."""
+
+    @abc.abstractmethod
+    def enter(
+        self,
+        xi_cosine: Float[Array, " photons"],
+        xi_angle: Float[Array, " photons"],
+        eta: Float[Array, " two"],
+    ) -> tuple[Direction, Float[Array, " photons"]]:
+        """Draw directions inside and weights, of mean 1, by uniform numbers and the indices outside
+        and inside.
+        """
+
+    @abc.abstractmethod
+    def reflected(self, eta: Float[Array, " channels"]) -> Float[Array, " channels"]:
+        """Compute the fraction of the arriving power that does not enter, by the index inside over
+        outside.
+        """
+
+
+class NormalIncidence(AbstractIncidence):
+    """Along the normal."""
+
+    def enter(self, xi_cosine, xi_angle, eta):
+        zero, one = jnp.zeros_like(xi_cosine), jnp.ones_like(xi_cosine)
+        return (zero, zero, one), one
+
+    def reflected(self, eta):
+        return ((eta - 1) / (eta + 1)) ** 2
+
+
+class DiffuseIncidence(AbstractIncidence):
+    """From all directions above, equally bright: a white sky."""
+
+    def enter(self, xi_cosine, xi_angle, eta):
+        outside, inside = (jnp.broadcast_to(each, xi_cosine.shape) for each in eta)
+        reflectance, cosine = fresnel(jnp.sqrt(xi_cosine), outside, inside)
+        sine = jnp.sqrt(jnp.maximum(1 - cosine * cosine, 0.0))
+        weight = (1 - reflectance) / jnp.broadcast_to(
+            1 - self.reflected(eta[1:] / eta[:1])[0], xi_cosine.shape
+        )
+        x, y = on_circle(xi_angle)
+        return (sine * x, sine * y, cosine), weight
+
+    def reflected(self, eta):
+        """Compute twice the integral of `mu F(mu)` over the cosine outside."""
+        return jnp.where(eta < 1, 1 - (1 - moment_outside(eta)) * eta * eta, moment_outside(eta))
 
 
 class AbstractPhaseFunction(eqx.Module):
@@ -106,6 +157,25 @@ class HenyeyGreenstein(AbstractPhaseFunction):
         return turned[0] * scale, turned[1] * scale, turned[2] * scale
 
 
+def fresnel(
+    cosine: Float[Array, " photons"],
+    eta_from: Float[Array, " photons"],
+    eta_to: Float[Array, " photons"],
+) -> tuple[Float[Array, " photons"], Float[Array, " photons"]]:
+    """Compute the reflectance for unpolarized light that arrives under `cosine` (0 to 1), and the
+    cosine of the transmitted light.
+
+    Total internal reflection is 1, with a cosine of 0. Between equal indices nothing is reflected
+    or bent, exactly.
+    """
+    ratio = eta_from / eta_to
+    squared = 1 - ratio * ratio * (1 - cosine * cosine)
+    matched = eta_from == eta_to
+    onward = jnp.where(matched, cosine, jnp.sqrt(jnp.maximum(squared, 0.0)))
+    reflected = jnp.where(squared > 0, reflectance(cosine, onward, ratio), 1.0)
+    return jnp.where(matched, 0.0, reflected), onward
+
+
 def on_circle(
     xi: Float[Array, " photons"],
 ) -> tuple[Float[Array, " photons"], Float[Array, " photons"]]:
@@ -116,10 +186,8 @@ def on_circle(
     """
     half_turns = xi - 0.5
     squared = half_turns * half_turns
-    sine, cosine = jnp.full_like(xi, _SINE[-1]), jnp.full_like(xi, _COSINE[-1])
-    for coefficient in reversed(_SINE[:-1]):
-        sine = sine * squared + coefficient
-    for coefficient in reversed(_COSINE[:-1]):
-        cosine = cosine * squared + coefficient
+    sine, cosine = (
+        jnp.polyval(jnp.asarray(series[::-1], xi.dtype), squared) for series in (_SINE, _COSINE)
+    )
     sine = sine * half_turns
     return (cosine - sine) * (cosine + sine), 2 * sine * cosine

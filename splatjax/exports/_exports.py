@@ -1,0 +1,183 @@
+"""A sum of Gaussians in the terms of other renderers: one length that stands for the whole profile,
+blurs of screen space, and everything at once as plain numbers and words.
+"""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from splatjax._chunking import jit_unless_traced
+from splatjax.gaussians import SumOfGaussians
+from splatjax.scattering import DiffuseTransmission
+
+
+def burley_distance(gaussians: SumOfGaussians) -> Float[Array, " channels"]:
+    r"""Compute the `d` of normalized diffusion, `(exp(-r/d) + exp(-r/3d)) / (8 pi d r)`, that sends
+    light as far on average.
+
+    Its mean distance is `2.5 d`; that of the Gaussians is `sum_i w_i sqrt(pi v_i / 2) / sum_i w_i`.
+    The curves differ: normalized diffusion is infinite at the origin.
+
+    **Arguments:**
+
+    - `gaussians`: Differentiable.
+
+    **Returns:** mm.
+
+    **Source:** the profile is that of Christensen and Burley 2015; matching the mean distance is
+    ours.
+    """
+    distances = jnp.sqrt(0.5 * jnp.pi * gaussians.variances)
+    return distances @ gaussians.weights / (2.5 * gaussians.total_reflectance())
+
+
+def unity_shape_parameter(gaussians: SumOfGaussians) -> Float[Array, " channels"]:
+    r"""Compute the shape parameter `S = 1 / d` of Unity's High Definition Render Pipeline; its
+    scattering distance is `d`.
+
+    **Returns:** 1/mm: with a world scale of 1 (a unit is a meter) the pipeline counts `d` in mm.
+
+    **Source:** Unity Technologies, Graphics repository, `DiffusionProfileSettings.UpdateKernel`.
+    """
+    return 1 / burley_distance(gaussians)
+
+
+def blender_radius(gaussians: SumOfGaussians) -> Float[Array, " channels"]:
+    r"""Compute the radius for Blender's method Christensen-Burley, at scale 1: `4 pi s(A) d`, where
+    A is the total reflectance.
+
+    Cycles takes a quarter of the radius over pi for the mean free path l, and then `d = l / s(A)`
+    with the curve for diffuse transmission.
+
+    **Returns:** mm; in Blender's unit of length, the meter, a thousandth of that.
+
+    **Source:** Blender Foundation, Cycles, `kernel/closure/bssrdf.h`; Christensen and Burley 2015,
+    Eq. 6.
+    """
+    return (
+        4
+        * jnp.pi
+        * DiffuseTransmission()(gaussians.total_reflectance())
+        * burley_distance(gaussians)
+    )
+
+
+@jit_unless_traced
+def separable_kernel(
+    gaussians: SumOfGaussians, samples: int = 25, reach: float | None = None
+) -> tuple[Float[Array, " samples"], Float[Array, "samples channels"]]:
+    r"""Compute a kernel for separable subsurface scattering: one blur along each axis of the
+    screen.
+
+    Offsets are denser toward the middle, `reach sign(t) t^2` for equally spaced `t` from -1 to 1; a
+    weight is the profile at the offset times half the distance between the neighbors, and those of
+    a channel add up to 1. Two such blurs in turn are not the radial profile, unless it is one
+    Gaussian.
+
+    **Arguments:**
+
+    - `gaussians`: Differentiable.
+    - `samples`: odd, at least 3.
+    - `reach`: largest offset, mm; by default twice the root of the mean squared distance per axis
+      of the widest channel.
+
+    **Returns:** offsets, mm, ascending, and the weights at them.
+
+    **Raises:** `ValueError` for an even number of samples, or fewer than 3.
+
+    **Source:** Jimenez et al. 2015, "Separable subsurface scattering", and the code that comes with
+    it.
+    """
+    if samples < 3 or samples % 2 == 0:
+        raise ValueError(
+            f"samples must be odd and at least 3, so that one is in the middle; got {samples}"
+        )
+    if reach is None:
+        farthest = 2 * jnp.sqrt(
+            jnp.max(gaussians.variances @ gaussians.weights / gaussians.total_reflectance())
+        )
+    else:
+        farthest = jnp.asarray(reach, gaussians.variances.dtype)
+    t = jnp.linspace(-1.0, 1.0, samples, dtype=gaussians.variances.dtype)
+    offsets = farthest * jnp.sign(t) * t * t
+    steps = jnp.pad(jnp.diff(offsets), 1)
+    weights = 0.5 * (steps[1:] + steps[:-1])[:, None] * gaussians(offsets)
+    return offsets, weights / jnp.sum(weights, axis=0)[None]
+
+
+def data_sheet(gaussians: SumOfGaussians) -> dict[str, Any]:
+    r"""Express a sum of Gaussians in all the terms of this package, each with its formula, unit and
+    source: lists, numbers and text.
+
+    **Returns:** a dictionary that JSON can hold, with the entries `gaussians`, `gpu_gems`,
+    `separable_kernel`, `burley`, `unity` and `blender`.
+    """
+    offsets, weights = separable_kernel(gaussians)
+    return {
+        "gaussians": {
+            "formula": "R(r) = sum_i w_i exp(-r^2 / (2 v_i)) / (2 pi v_i)",
+            "unit": (
+                "variances in mm^2 per axis; R in 1/mm^2; a row of weights per "
+                "Gaussian, a number per channel"
+            ),
+            "source": "d'Eon, Luebke and Enderton 2007",
+            "variances": plain_numbers(gaussians.variances),
+            "weights": plain_numbers(gaussians.weights),
+            "total_reflectance": plain_numbers(gaussians.total_reflectance()),
+        },
+        "gpu_gems": {
+            "formula": "weights divided by their sum per channel: the color comes from the texture",
+            "unit": "variances in mm^2 per axis",
+            "source": "d'Eon and Luebke 2007, GPU Gems 3, chapter 14",
+            "variances": plain_numbers(gaussians.variances),
+            "weights": plain_numbers(gaussians.white().weights),
+        },
+        "separable_kernel": {
+            "formula": (
+                "w_j = R(x_j) (x_(j+1) - x_(j-1)) / 2, divided by their sum per "
+                "channel; blurred along x, then along y"
+            ),
+            "unit": "offsets in mm",
+            "source": "Jimenez et al. 2015, Separable subsurface scattering",
+            "offsets": plain_numbers(offsets),
+            "weights": plain_numbers(weights),
+        },
+        "burley": {
+            "formula": (
+                "R(r) = A (exp(-r / d) + exp(-r / 3d)) / (8 pi d r); d = mean distance / 2.5"
+            ),
+            "unit": "d in mm",
+            "source": "Christensen and Burley 2015; d matches the mean distance",
+            "albedo": plain_numbers(gaussians.total_reflectance()),
+            "d": plain_numbers(burley_distance(gaussians)),
+        },
+        "unity": {
+            "formula": "S = 1 / d; scattering distance d",
+            "unit": "S in 1/mm, d in mm, at a world scale of 1",
+            "source": "Unity HDRP, DiffusionProfileSettings",
+            "shape_parameter": plain_numbers(unity_shape_parameter(gaussians)),
+            "scattering_distance": plain_numbers(burley_distance(gaussians)),
+        },
+        "blender": {
+            "formula": "radius = 4 pi s(A) d with s(A) = 1.9 - A + 3.5 (A - 0.8)^2",
+            "unit": "mm, at scale 1; a thousandth of it in Blender's meters",
+            "source": (
+                "Blender, Cycles, bssrdf.h, method Christensen-Burley; Christensen "
+                "and Burley 2015, Eq. 6"
+            ),
+            "radius": plain_numbers(blender_radius(gaussians)),
+        },
+    }
+
+
+def plain_numbers(values: Any) -> Any:
+    """Convert to the shortest Python numbers that are read back exactly."""
+    values = np.asarray(values)
+    if values.dtype == np.float32:
+        # Not `str`, which shows six digits once colour-science has been imported.
+        return np.vectorize(lambda x: float(np.format_float_scientific(x)), otypes=[object])(
+            values
+        ).tolist()
+    return values.tolist()
