@@ -135,7 +135,7 @@ class LayersAtPoints(eqx.Module):
         )
 
     @property
-    def rows(self) -> tuple[Float[Array, "... points"], ...]:
+    def rows(self) -> tuple:
         """What lies along the points: means, mass, irradiance, area, albedo; and the derivative."""
         own = self.means, self.mass, self.irradiance, self.area, self.albedo
         return own if self.derivative is None else (*own, *self.derivative)

@@ -100,7 +100,7 @@ def next_pictures(
     for candidate, picture in zip(candidates, pictures, strict=True):
         dark = jnp.zeros_like(picture.specular, dtype)
         known = jnp.ones(dark.shape[:2], bool)
-        evidence = Evidence(dark, jnp.ones_like(dark), known, relative_noise=1.0)
+        evidence = Evidence(dark, jnp.ones_like(dark), known, jnp.ones((), dark.dtype))
         unknowns = Unknowns.of(medium.eta, [candidate.intensity])
         problem = RecoveryProblem.of([picture], [evidence], unknowns, fit, loss, model)
         at_point = solution(problem, unknowns.start(medium))

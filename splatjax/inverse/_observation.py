@@ -177,13 +177,13 @@ class Evidence(eqx.Module):
     - `picture`: 0 where it is unknown.
     - `deviation`: of its noise.
     - `known`: which pixels may count.
-    - `relative_noise`: the deviation of a typical pixel over the brightness of the picture. Static.
+    - `relative_noise`: the deviation of a typical pixel over the brightness of the picture.
     """
 
     picture: Float[Array, "height width channels"]
     deviation: Float[Array, "height width channels"]
     known: Bool[Array, "height width"]
-    relative_noise: float = eqx.field(static=True)
+    relative_noise: Float[Array, ""]
 
     @classmethod
     def of(cls, observation: Observation, dtype: DTypeLike) -> "Evidence":
@@ -198,7 +198,7 @@ class Evidence(eqx.Module):
         if observation.deviation is not None:
             deviation = np.asarray(observation.deviation, np.float64)
         arrays = jnp.asarray(picture, dtype), jnp.asarray(deviation, dtype), jnp.asarray(known)
-        return cls(*arrays, relative_noise=float(np.median(deviation)) / brightness)
+        return cls(*arrays, jnp.asarray(np.median(deviation) / brightness, dtype))
 
     def counted(
         self, coverage: Float[Array, "height width"], background: AbstractBackground
