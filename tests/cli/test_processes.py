@@ -41,6 +41,7 @@ def run_processes(command, count, **environment):
     return [process.returncode for process in processes], *zip(*printed, strict=True)
 
 
+@pytest.mark.long
 def test_processes_share_a_turntable_and_one_that_is_killed_costs_no_finished_frame(tmp_path):
     splats, two, four = ball(tmp_path / "ball.ply"), tmp_path / "two", tmp_path / "four"
     words = ["turntable", splats, *OPTIONS.split(), FRAMES, "--output"]
