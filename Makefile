@@ -49,18 +49,14 @@ test-x64: setup
 test-once: setup
 	XLA_FLAGS="$(LEAST_OPTIMIZATION) $$XLA_FLAGS" $(PYTEST) -m "once and not long"
 
-# What `make test` has no time for: notebooks that take more than half a minute.
+# What `make test` has no time for.
 test-long: setup
 	XLA_FLAGS="$(LEAST_OPTIMIZATION) $$XLA_FLAGS" $(BIN)/python -m pytest -n $(WORKERS) --dist load -m long
 
-# Ten thousand scenes and losses, in both precisions: no gradient of a finite loss may be infinite or no number. Five hundred of
-# each kind by the fast paths and by plain ones.
+# Ten thousand scenes and losses, in both precisions: no gradient of a finite loss may be infinite or no number.
 random-scenes: setup
 	SPLATJAX_RANDOM_SCENES=10000 XLA_FLAGS="$(LEAST_OPTIMIZATION) $$XLA_FLAGS" \
 	    $(BIN)/python -m pytest -n $(WORKERS) --dist load -q tests/gradients/test_random_scenes.py
-	SPLATJAX_RANDOM_SCENES=10000 JAX_ENABLE_X64=1 XLA_FLAGS="$(LEAST_OPTIMIZATION) $$XLA_FLAGS" \
-	    $(BIN)/python -m pytest -n $(WORKERS) --dist load -q tests/splatting/test_random_bodies.py \
-	    tests/diffusion/test_random_diffusers.py
 
 # Twenty thousand spoiled files for every reader; those that fail are added to tests/io/corpus. `tools/fuzz.py` has files that
 # grow along new lines of code, by atheris.

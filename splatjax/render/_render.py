@@ -5,9 +5,10 @@ import dataclasses
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.sharding import Mesh
+from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Float
 
+from splatjax._combination import lay_out
 from splatjax.scene import Camera, Frame, Scene
 from splatjax.splatting import PerspectiveView
 
@@ -124,8 +125,10 @@ def _compute_irradiance(scene: Scene, plan: Plan, settings: RenderSettings) -> I
         maps = plan.shadows, settings.splatting, settings.shadows
         return irradiate(scene, cast_shadows(scene, *maps, combination))
 
-    placed = on_devices(passes, scene, plan, by_splat=True)
-    count = 1 if plan.mesh is None else plan.mesh.size
+    placed, count = on_devices(passes, scene, plan, by_splat=True), 1
+    if plan.mesh is not None:
+        placed = lay_out(plan.mesh, placed, jax.tree.map(lambda _: PartitionSpec(), placed))
+        count = plan.mesh.size
     share = max(-(-scene.splats.count // count), 1)
     device = jnp.repeat(jnp.arange(count), len(plan.order) // count)
     splat = jnp.where(plan.exists, device * share + plan.order, scene.splats.count)

@@ -84,6 +84,7 @@ def sheet():
 
 
 @pytest.mark.once
+@pytest.mark.long
 def test_constant_light_stays_constant_up_to_the_edges(sheet):
     mesh, lights, camera, settings, plan = sheet
     found = baselines.render_texture_space(mesh, lights, DULL, camera, settings, plan)
@@ -100,6 +101,7 @@ def test_constant_light_stays_constant_up_to_the_edges(sheet):
 
 
 @pytest.mark.once
+@pytest.mark.long
 def test_beyond_its_capacity_the_picture_is_nan():
     mesh, camera = baselines.TexturedMesh.of(plane(1.0)), camera_over(15.0, 16)
     settings = dataclasses.replace(STILL, resolution=24)

@@ -98,6 +98,7 @@ def test_even_light_has_no_contrast_and_a_checkered_one_has_all():
 
 
 @pytest.mark.once
+@pytest.mark.long
 def test_layers_of_fewer_splats_keep_constants_and_those_of_all_are_the_plain_ones():
     body = bodies.bumpy(1200)
     material = sj.Material(sj.SumOfGaussians([4.0, 9.0], [[0.5], [0.5]]))

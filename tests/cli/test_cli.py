@@ -104,6 +104,7 @@ def test_color_is_of_the_albedo_or_of_the_material(albedo, tmp_path, capsys):
 
 @pytest.mark.slow
 @pytest.mark.once
+@pytest.mark.long
 def test_render_without_scattering_is_lambertian(tmp_path):
     splats, output = plate(tmp_path / "plate.ply"), tmp_path / "plate.exr"
     view = "--width 32 --height 32 --azimuth 0 --light-azimuth 0 --light-elevation 60 --fill 0"

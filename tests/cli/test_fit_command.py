@@ -52,13 +52,19 @@ def test_it_prints_and_writes_a_material_that_loads(tmp_path, capsys):
     ("words", "description", "rtol"),
     [
         ("--model better-dipole", "better dipole, exact", 0.12),
-        ("--model photon-beam", "photon beam with", 0.1),
-        ("--model monte-carlo --photons 20000", "Monte Carlo, 20000 photons", 0.05),
         ("--model photon-beam --single-scattering", "without single scattering", 0.1),
-        (
+        pytest.param("--model photon-beam", "photon beam with", 0.1, marks=pytest.mark.long),
+        pytest.param(
+            "--model monte-carlo --photons 20000",
+            "Monte Carlo, 20000 photons",
+            0.05,
+            marks=pytest.mark.long,
+        ),
+        pytest.param(
             "--model monte-carlo --photons 20000 --single-scattering",
             "without single scattering",
             0.05,
+            marks=pytest.mark.long,
         ),
     ],
 )

@@ -23,8 +23,9 @@ pytestmark = [pytest.mark.slow, pytest.mark.once]  # in float64 whatever the pre
 
 STEP = 1e-6  # of a parameter's own scale
 AGREEMENT = 1e-5  # relative; rounding over the step leaves about 1e-9
+LONG = "lamp inside", "sun and beam"  # what they add to the other worlds, long tests show
 RECORDS = [
-    (world, path, name)
+    pytest.param(world, path, name, marks=[pytest.mark.long] if world in LONG else [])
     for world, small in WORLDS.items()
     for path in small.paths
     for name in named(jax.eval_shape(small.make))
