@@ -125,13 +125,14 @@ def _compute_irradiance(scene: Scene, plan: Plan, settings: RenderSettings) -> I
         maps = plan.shadows, settings.splatting, settings.shadows
         return irradiate(scene, cast_shadows(scene, *maps, combination))
 
-    placed, count = on_devices(passes, scene, plan, by_splat=True), 1
+    found, count = (on_devices(passes, scene, plan, by_splat=True), plan.order, plan.exists), 1
     if plan.mesh is not None:
-        placed = lay_out(plan.mesh, placed, jax.tree.map(lambda _: PartitionSpec(), placed))
+        found = lay_out(plan.mesh, found, jax.tree.map(lambda _: PartitionSpec(), found))
         count = plan.mesh.size
+    placed, order, exists = found
     share = max(-(-scene.splats.count // count), 1)
-    device = jnp.repeat(jnp.arange(count), len(plan.order) // count)
-    splat = jnp.where(plan.exists, device * share + plan.order, scene.splats.count)
+    device = jnp.repeat(jnp.arange(count), len(order) // count)
+    splat = jnp.where(exists, device * share + order, scene.splats.count)
 
     def in_scene_order(rows):
         empty = jnp.zeros((rows.shape[0], scene.splats.count), rows.dtype)
