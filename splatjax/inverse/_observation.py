@@ -47,8 +47,8 @@ class UnknownIntensity(AbstractIntensity):
 
 
 class UnknownColor(AbstractIntensity):
-    """A factor for each channel. What then tells of the material is how the light is spread over
-    the picture alone.
+    """A factor for each channel. The only evidence of the material is then how the light is spread
+    over the picture.
     """
 
     def groups(self, channels: int) -> np.ndarray:
@@ -152,7 +152,7 @@ class AbstractBackground(eqx.Module):
 
 
 class UnknownBackground(AbstractBackground):
-    """Anything: pixels that the body does not fill do not count. A silhouette then tells
+    """Anything: pixels that the body does not fill do not count. A silhouette then shows
     nothing.
     """
 
@@ -161,7 +161,7 @@ class UnknownBackground(AbstractBackground):
 
 
 class BlackBackground(AbstractBackground):
-    """Nothing that sends light: all pixels count, and where the body ends is what tells most of a
+    """Nothing that sends light: all pixels count, and where the body ends is what shows most of a
     camera's pose.
     """
 

@@ -21,7 +21,7 @@ from ._walk import IDLE, INSIDE, Optics, PathWeights, Photons, fly, weigh
 # Flights between two looks at who is done.
 _FLIGHTS = 4
 
-# Rounds of one compiled call: a second or so, after which progress is told.
+# Rounds of one compiled call: a second or so, after which progress is reported.
 _ROUNDS = 256
 
 # Rounds between two looks at whether all are done.

@@ -172,7 +172,7 @@ class TestRecover:
         assert list(left.values()) == sorted(left.values())
         now = max(worst.deviation for _, worst in found.combinations())
         assert max(left["lamp"], left["dot"]) < 0.1 < now
-        # A lamp of known strength tells more, and no picture can tell less than nothing.
+        # A lamp of known strength adds more, and no picture adds less than nothing.
         assert left["lamp"] < left["color"] <= now * (1 + 1e-9)
         assert f"{ranked[0].candidate.name}: the worst known, " in str(ranked[0])
         both = recovered(taken()[1], STARTS[:1], noise)
