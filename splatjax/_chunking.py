@@ -7,7 +7,7 @@ from typing import TypeVar, cast
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, DTypeLike, PyTree
+from jaxtyping import Array, DTypeLike, Int, PyTree, Shaped
 
 Result = TypeVar("Result", bound=PyTree)
 Function = TypeVar("Function", bound=Callable)
@@ -82,6 +82,24 @@ def _planes(leaf: Array):
 
 def _vectors(leaf):
     return jnp.stack(leaf.planes, axis=1) if isinstance(leaf, _Planes) else leaf
+
+
+def take_points(
+    rows: Shaped[Array, "*rows points"], chosen: Int[Array, " chosen"]
+) -> Shaped[Array, "*rows chosen"]:
+    """Take points, in ascending order, of arrays that lie along their last axis; 0 for indices from
+    the number of points on.
+    """
+    if rows.size == 0:
+        return jnp.zeros((*rows.shape[:-1], len(chosen)), rows.dtype)
+    # Row by row, so that derivatives are planes too, put together once: that of slices is a sum.
+    count = rows.shape[-1]
+    planes = jax.lax.split(rows.reshape(-1, count), [1] * (rows.size // count))
+    taken = [
+        plane[0].at[chosen].get(mode="fill", fill_value=0, indices_are_sorted=True)
+        for plane in planes
+    ]
+    return jnp.stack(taken).reshape(*rows.shape[:-1], len(chosen))
 
 
 def zeros_after(known: Array, shape: tuple[int, ...], dtype: DTypeLike) -> Array:

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from splatjax._chunking import take_points
 from splatjax.diffusion import (
     AbstractDiffuser,
     AbstractDiffusionPlan,
@@ -43,7 +44,7 @@ class ThinnedPlan(AbstractDiffusionPlan):
 
     keep: int = eqx.field(static=True)
 
-    def diffuse(self, sources, variances, kernel, combination, wanted=None):
+    def diffuse(self, sources, variances, kernel, combination, at=None):
         everywhere = combination.gather_last(sources)
         group = np.arange(-(-everywhere.areas.shape[0] // self.keep))
         # The first of each group would lie at the same side of all groups.
@@ -52,8 +53,9 @@ class ThinnedPlan(AbstractDiffusionPlan):
         kept = jax.tree.map(lambda rows: rows[..., chosen], everywhere)
         whole = combination.total([jnp.sum(sources.areas)])
         kept = dataclasses.replace(kept, areas=kept.areas * (whole / jnp.sum(kept.areas)))
+        points = sources.centers if at is None else take_points(sources.centers, at)
         layers = tuple(
-            dense_layer(kept, sources.centers, variance, depth)
+            dense_layer(kept, points, variance, depth)
             for variance, depth in zip(variances, kernel.depths(variances), strict=True)
         )
         return Diffused(layers, jnp.zeros((), sources.centers.dtype))

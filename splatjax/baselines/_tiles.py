@@ -85,9 +85,8 @@ class ListPlan(AbstractRasterPlan):
         if within is not None:
             shown = jnp.asarray(within)[jnp.minimum(bins.order, grid.count - 1)]
             rows = jnp.where(shown[:, None], rows, 0.0)
-        needed = bins.needed.astype(rows.dtype)
-        rows = rows + jnp.where(needed <= 1, 0.0, jnp.nan).astype(rows.dtype)
-        return FragmentSums(jnp.minimum(bins.order, grid.count), rows, needed, len(rows))
+        tiles = jnp.minimum(bins.order, grid.count)
+        return FragmentSums(tiles, rows, bins.needed.astype(rows.dtype), len(rows))
 
 
 class Lists(eqx.Module):

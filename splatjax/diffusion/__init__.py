@@ -22,8 +22,7 @@ from ._kernel import (
     EscapeNormalization as EscapeNormalization,
     PlainMean as PlainMean,
     resolved_fraction as resolved_fraction,
-    SAMPLED_SPLATS as SAMPLED_SPLATS,
     unevenness as unevenness,
 )
 from ._streamed import StreamedDiffusion as StreamedDiffusion
-from ._order import BLOCK as BLOCK, compact_order as compact_order
+from ._clusters import BLOCK as BLOCK, compact_order as compact_order

@@ -3,42 +3,43 @@
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.lax import stop_gradient
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float, Int
 
 from splatjax._combination import AbstractCombination
 from splatjax.scene import Splats
 
-from ._clusters import Clusters, ClusterTree
+from ._clusters import BLOCK, Clusters, ClusterTree
 from ._diffuser import (
     AbstractDiffuser,
     AbstractDiffusionPlan,
     Diffused,
+    LayerValues,
     Sources,
     layer_values,
     split_layer,
 )
 from ._gaussian_sums import (
     Lists,
+    SourceTable,
     gaussian_sums,
     gaussian_sums_forward,
-    source_table,
 )
 from ._kernel import AbstractDiffusionKernel, TruncatedGaussian, resolved_fraction
 from ._neighbors import SOURCES, Boxes, Neighbors, find_neighbors
-from ._order import BLOCK
 
 FINEST = 0.01
 """Quantile of the areas of the splats: a layer counts as resolved as far as splats of that area
 resolve it.
 """
 _CELL = 0.6  # edge of the cells, in standard deviations, for an error of 2e-3; error ~ edge^3
-_WORTHWHILE = 1.5  # edge of the cells, in spacings, from which on merging splats pays
+_WORTHWHILE = 1.2  # edge of the cells, in spacings, from which on merging splats pays
 
 
 class LayerPlan(eqx.Module):
@@ -60,7 +61,7 @@ class LayerPlan(eqx.Module):
 
 
 class ClusterDiffuser(AbstractDiffuser):
-    r"""Sums over the splats near each splat; for layers wider than about 2.8 spacings, over
+    r"""Sums over the splats near each splat; for layers wider than about 2.2 spacings, over
     clusters.
 
     **Attributes:** (static)
@@ -86,8 +87,8 @@ class ClusterDiffuser(AbstractDiffuser):
             np.concatenate([np.asarray(getattr(part, name)) for part in parts])
             for name in ("centers", "normals", "areas")
         )
-        exists = areas > 0
-        sizes, (edges, supports) = np.asarray(variances, np.float64), ([], [])
+        exists, sizes = areas > 0, np.asarray(variances, np.float64)
+        edges, supports = [0.0] * len(sizes), [0.0] * len(sizes)
         if exists.any():
             spacing = math.sqrt(areas[exists].mean())
             fine = float(np.quantile(areas[exists], FINEST))
@@ -95,24 +96,27 @@ class ClusterDiffuser(AbstractDiffuser):
         cells = sorted({edge for edge in edges if edge > 0})
         tree = ClusterTree.build(centers, normals, exists, cells)
         rows = (jnp.asarray(each) for each in (centers.T, normals.T, areas, areas[None]))
-        sources = Sources(*rows)
-        origin, levels = _levels(tree, sources)
-        dtype, layers = variances.dtype, []
-        for i, variance in enumerate(sizes):
-            level, support, neighbors = 0, 0.0, None
-            if exists.any() and supports[i] > 0:
-                level = cells.index(edges[i]) + 1 if edges[i] > 0 else 0
-                support = supports[i]
-                largest = jnp.asarray(variance * self.margin, dtype)
-                neighbors = self._find(
-                    parts, origin, levels[level], variances[i], largest, kernel, support
-                )
-            smallest, largest = (
-                jnp.asarray(bound, dtype)
-                for bound in (variance / self.margin, variance * self.margin)
-            )
-            layers.append(LayerPlan(level, support, smallest, largest, neighbors))
-        return ClusterPlan(tree, tuple(layers))
+        origin, clusters = _levels(tree, Sources(*rows))
+        levels = [cells.index(edge) + 1 if edge > 0 else 0 for edge in edges]
+        smallest, largest = (
+            [jnp.asarray(size * factor, variances.dtype) for size in sizes]
+            for factor in (1 / self.margin, self.margin)
+        )
+        # The search is NumPy's, and runs beside that for the other layers.
+        points = [_target_boxes(part.centers.T - origin[:, None]) for part in parts]
+        sources = [
+            _sources_in_reach(clusters[levels[i]], kernel, variances[i], largest[i], supports[i])
+            for i in range(len(sizes))
+        ]
+        with ThreadPoolExecutor() as pool:
+            lists = pool.map(lambda each: _find(points, *each), sources)
+        whole = jax.tree.map(lambda *rows: jnp.concatenate(rows), *points)
+        neighbors = [
+            None if each is None else Neighbors(each, whole, boxes, reach)
+            for each, (boxes, reach) in zip(lists, sources, strict=True)
+        ]
+        each = zip(levels, supports, smallest, largest, neighbors, strict=True)
+        return ClusterPlan(tree, tuple(LayerPlan(*layer) for layer in each))
 
     def choose_sources(
         self,
@@ -140,20 +144,6 @@ class ClusterDiffuser(AbstractDiffuser):
             kernel.support(self.error, float(share)) if share > 0 else 0.0 for share in shares
         ]
         return edges.tolist(), supports
-
-    def _find(
-        self, parts, origin, clusters: Clusters, variance, largest, kernel, support: float
-    ) -> Neighbors:
-        """Find the sources of one layer within reach of the splats of every part."""
-        depths = kernel.depths(jnp.stack([variance, largest]))
-        boxes = source_boxes(clusters, depths[0])
-        # Sources of a wider layer lie deeper than those of the boxes.
-        sinking = math.sqrt(3) * float(depths[1] - depths[0])
-        reach = support * math.sqrt(float(largest)) + sinking
-        points = [_target_boxes(part.centers.T - origin[:, None]) for part in parts]
-        lists = _same_size([find_neighbors(each, boxes, reach) for each in points])
-        points = jax.tree.map(lambda *rows: jnp.concatenate(rows), *points)
-        return Neighbors(lists, points, boxes, jnp.asarray(reach, largest.dtype))
 
 
 class ClusterPlan(AbstractDiffusionPlan):
@@ -183,7 +173,7 @@ class ClusterPlan(AbstractDiffusionPlan):
         variances: Float[Array, " gaussians"],
         kernel: AbstractDiffusionKernel,
         combination: AbstractCombination,
-        wanted: Bool[Array, " splats"] | None = None,
+        at: Int[Array, " points"] | None = None,
     ) -> Diffused:
         if variances.shape[0] != len(self.layers):
             raise ValueError(
@@ -210,42 +200,40 @@ class ClusterPlan(AbstractDiffusionPlan):
                 values.append(None)
                 continue
             given = levels[layer.level], points, variance, depth
-            found, missed = self._layer(*given, kernel, layer.support, layer.neighbors, wanted)
-            values.append(split_layer(found, 2 * in_sums(variance)))
+            found, missed = self._layer(*given, kernel, layer.support, layer.neighbors, at)
+            values.append(found)
             needed.append(missed)
         largest_need = jnp.max(jnp.stack(needed)) if needed else jnp.zeros((), variances.dtype)
         return Diffused(tuple(values), combination.largest([largest_need]))
 
     def _layer(
-        self, clusters, points, variance, depth, kernel, support, neighbors: Neighbors, wanted
-    ):
+        self, clusters, points, variance, depth, kernel, support, neighbors: Neighbors, at
+    ) -> tuple[LayerValues, Array]:
         """Evaluate one layer at points; also return its need of reach over the planned one."""
-        lists = neighbors.lists if wanted is None else neighbors.lists.only(wanted)
+        lists = neighbors.lists if at is None else neighbors.lists.only(at // BLOCK)
         below = clusters.lowered(depth)
         truncated = kernel.truncated(support)
         table = layer_table(below, variance, depth, truncated)
-        finish = LayerFinish(below.irradiance.shape[0])
         blocks = (points * in_sums(variance)).reshape(3, -1, BLOCK).transpose(1, 0, 2)
-        sums = self.sums(blocks, table, lists, truncated, finish)
-        found = sums.transpose(1, 0, 2).reshape(sums.shape[1], -1)
+        values = self.sums(blocks, table, lists, truncated, divided)
+        if at is None:
+            found = values.transpose(1, 0, 2).reshape(values.shape[1], -1)
+        else:
+            found = values.at[at // BLOCK, :, at % BLOCK].get(mode="fill", fill_value=0).T
         needed = neighbors.needed(
             _target_boxes(points),
             Boxes.around(below.centers, below.areas > 0, SOURCES),
             support * stop_gradient(jnp.sqrt(variance)),
         )
-        return found, needed.astype(found.dtype)
+        return split_layer(found, 2 * in_sums(variance)), needed.astype(found.dtype)
 
 
-class LayerFinish(eqx.Module):
-    """Computes the rows of `layer_values` from the sums of a table. Static."""
-
-    channels: int = eqx.field(static=True)
-
-    def __call__(
-        self, sums: Float[Array, "rows points"], points: Float[Array, "3 points"]
-    ) -> Float[Array, "values points"]:
-        light, firsts = sums[: self.channels + 1], sums[self.channels + 1 :]
-        return layer_values(light, firsts.reshape(self.channels + 1, 3, -1), points)
+def divided(
+    sums: Float[Array, "rows points"], points: Float[Array, "3 points"]
+) -> Float[Array, "values points"]:
+    """Compute the rows of `layer_values` from the sums of a table with slopes."""
+    moments = sums.reshape(-1, 4, sums.shape[1])
+    return layer_values(moments[:, 0], moments[:, 1:], points)
 
 
 def layer_table(
@@ -254,18 +242,21 @@ def layer_table(
     depth: Float[Array, ""],
     truncated: TruncatedGaussian,
     slopes: bool = True,
-) -> Float[Array, "blocks_and_one columns block"]:
-    """Lay out the sources of one layer: light, mass and, for slopes, the first moments of both."""
+) -> SourceTable:
+    """Lay out the sources of one layer: light and mass, each followed by its first moments if
+    slopes are asked for.
+    """
     # A flat sheet has mass 1.
     flat = 1 / (2 * jnp.pi * variance * truncated.integral(0.5 * depth * depth / variance))
     mass = (below.areas * flat)[None]
-    light = jnp.concatenate([mass * below.irradiance, mass])
-    centers = below.centers * in_sums(variance)
-    rows = light
+    centers = (below.centers * in_sums(variance)).reshape(3, -1, SOURCES)
+    light = jnp.concatenate([mass * below.irradiance, mass]).reshape(-1, *centers.shape[1:])
+    moments = jnp.ones_like(centers[:1])
     if slopes:
-        firsts = light[:, None] * centers[None]
-        rows = jnp.concatenate([light, firsts.reshape(-1, light.shape[1])])
-    return source_table(centers, rows, SOURCES)
+        moments = jnp.concatenate([moments, centers])
+    light, moments = (each.transpose(1, 0, 2) for each in (light, moments))
+    rows = light[:, :, None] * moments[:, None]
+    return SourceTable(tuple(centers), rows.reshape(len(rows), -1, SOURCES))
 
 
 def in_sums(variance: Float[Array, ""]) -> Float[Array, ""]:
@@ -291,13 +282,27 @@ def source_boxes(clusters: Clusters, depth: Float[Array, ""]) -> Boxes:
     return Boxes.around(clusters.lowered(depth).centers, clusters.areas > 0, SOURCES)
 
 
-def _same_size(lists: Sequence[Lists]) -> Lists:
-    """Concatenate the lists of every part, padded to one size."""
-    most = max(len(each.rows) for each in lists)
+def _sources_in_reach(
+    clusters: Clusters, kernel: AbstractDiffusionKernel, variance, largest, support: float
+) -> tuple[Boxes, Float[Array, ""]]:
+    """Enclose the sources of a layer, and compute how near they are, mm; 0 without support."""
+    depths = kernel.depths(jnp.stack([variance, largest]))
+    # Sources of a wider layer lie deeper than those of the boxes.
+    sinking = math.sqrt(3) * float(depths[1] - depths[0])
+    reach = support * math.sqrt(float(largest)) + sinking if support > 0 else 0.0
+    return source_boxes(clusters, depths[0]), jnp.asarray(reach, largest.dtype)
+
+
+def _find(points: Sequence[Boxes], sources: Boxes, reach: Float[Array, ""]) -> Lists | None:
+    """Find the neighbors of every part, with lists padded to one size; `None` for no reach."""
+    if reach == 0:
+        return None
+    parts = [find_neighbors(each, sources, float(reach)) for each in points]
+    most = max(len(each.rows) for each in parts)
     padded = [
         dataclasses.replace(
             each, rows=jnp.pad(each.rows, ((0, most - len(each.rows)), (0, 0)), mode="edge")
         )
-        for each in lists
+        for each in parts
     ]
     return jax.tree.map(lambda *rows: jnp.concatenate(rows), *padded)

@@ -1,4 +1,6 @@
-"""Splats merged into clusters: fewer sources for wider layers (section 4.2, Figure 5)."""
+"""Splats in a compact order, and merged into clusters: fewer sources for wider layers (section
+4.2, Figure 5).
+"""
 
 import dataclasses
 from collections.abc import Sequence
@@ -10,7 +12,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ._diffuser import Sources
-from ._order import BLOCK, compact_order
+
+BLOCK = 32
+"""Points of one block; blocks, and their halves and quarters, are compact."""
+_TOGETHER = 128 * BLOCK  # split side by side from here on
 
 
 class Clusters(eqx.Module):
@@ -129,14 +134,22 @@ def _sums(groups: np.ndarray, rows: np.ndarray) -> np.ndarray:
 
 
 def _split_by_side(groups: np.ndarray, facing: np.ndarray) -> np.ndarray:
-    """Split each group by the side of its main axis that its members face; number without gaps."""
+    """Split each group whose members face both ways, by the side of its main axis that they face;
+    number without gaps.
+    """
+    backs = np.sum(facing * _sums(groups, facing)[groups], axis=1) <= 0
+    is_split = np.zeros(groups.max() + 1, bool)
+    is_split[groups[backs]] = True
+    chosen = np.flatnonzero(is_split[groups])
+    own, ways = (np.cumsum(is_split) - 1)[groups[chosen]], facing[chosen]
     rows, columns = np.triu_indices(3)
-    products = np.empty((groups.max() + 1, 3, 3))
+    products = np.empty((np.sum(is_split), 3, 3))
     products[:, rows, columns] = products[:, columns, rows] = _sums(
-        groups, facing[:, rows] * facing[:, columns]
+        own, ways[:, rows] * ways[:, columns]
     )
     axes = np.linalg.eigh(products)[1][:, :, -1]
-    sides = 2 * groups + (np.sum(facing * axes[groups], axis=1) < 0)
+    sides = 2 * groups
+    sides[chosen] += np.sum(ways * axes[own], axis=1) < 0
     return (np.cumsum(np.bincount(sides) > 0) - 1)[sides]
 
 
@@ -151,3 +164,46 @@ def _round_up(count: int) -> int:
     """
     grain = 1 << max(count.bit_length() - 5, 0)
     return blocks_of(-(-count // grain) * grain)
+
+
+def compact_order(points: np.ndarray) -> np.ndarray:
+    """Find the order `[points]` of a k-d tree whose leaves hold `BLOCK` points, but the last, and
+    are sorted down to quarters.
+
+    **Arguments:** `points`: `[points, 3]`.
+    """
+    order, place = (
+        np.arange(len(points)),
+        np.array(points.T, np.float32, order="C"),
+    )  # turned together: near in memory
+    todo = [(0, len(points))]
+    while todo:
+        begin, end = todo.pop()
+        step = _TOGETHER if end - begin > _TOGETHER else BLOCK
+        if end - begin <= step or end - begin == _TOGETHER:
+            continue
+        middle = begin + -(-(end - begin) // (2 * step)) * step
+        part = place[:, begin:end]
+        turn = np.argpartition(part[np.argmax(np.ptp(part, axis=1))], middle - begin - 1)
+        order[begin:end], place[:, begin:end] = order[begin:end][turn], part[:, turn]
+        todo += [(begin, middle), (middle, end)]
+    together, whole = (len(points) // size * size for size in (_TOGETHER, BLOCK))
+    for begin in range(0, together, _TOGETHER):
+        _halve(order[begin : begin + _TOGETHER], place[:, begin : begin + _TOGETHER], _TOGETHER)
+    _halve(order[together:whole], place[:, together:whole], BLOCK)
+    return order
+
+
+def _halve(order: np.ndarray, place: np.ndarray, size: int) -> None:
+    """Split parts of one size in halves, along their longest axes, down to quarters of a block. In
+    place.
+    """
+    while size > BLOCK // 4:
+        parts = place.reshape(3, -1, size)
+        longest = np.argmax(np.ptp(parts, axis=2), axis=0)
+        rows = np.arange(parts.shape[1])
+        turn = (
+            np.argpartition(parts[longest, rows], size // 2, axis=1) + rows[:, None] * size
+        ).reshape(-1)
+        order[:], place[:] = order[turn], place[:, turn]
+        size //= 2

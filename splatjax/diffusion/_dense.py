@@ -4,9 +4,9 @@ derivative.
 
 import jax.numpy as jnp
 from jax.lax import stop_gradient
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float, Int
 
-from splatjax._chunking import map_chunks
+from splatjax._chunking import map_chunks, take_points
 from splatjax._combination import AbstractCombination
 
 from ._diffuser import (
@@ -39,11 +39,12 @@ class DensePlan(AbstractDiffusionPlan):
         variances: Float[Array, " gaussians"],
         kernel: AbstractDiffusionKernel,
         combination: AbstractCombination,
-        wanted: Bool[Array, " splats"] | None = None,
+        at: Int[Array, " points"] | None = None,
     ) -> Diffused:
         everywhere = combination.gather_last(sources)
+        points = sources.centers if at is None else take_points(sources.centers, at)
         layers = tuple(
-            dense_layer(everywhere, sources.centers, variance, depth)
+            dense_layer(everywhere, points, variance, depth)
             for variance, depth in zip(variances, kernel.depths(variances), strict=True)
         )
         return Diffused(layers, jnp.zeros((), sources.centers.dtype))

@@ -5,7 +5,7 @@ import abc
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float, Int
 
 from splatjax._combination import AbstractCombination
 from splatjax.scene import Splats
@@ -68,7 +68,7 @@ class AbstractDiffusionPlan(eqx.Module):
         variances: Float[Array, " gaussians"],
         kernel: AbstractDiffusionKernel,
         combination: AbstractCombination,
-        wanted: Bool[Array, " splats"] | None = None,
+        at: Int[Array, " points"] | None = None,
     ) -> Diffused:
         r"""Evaluate every layer at the splats, from all splats near each in object space, whichever
         way they face:
@@ -80,8 +80,8 @@ class AbstractDiffusionPlan(eqx.Module):
         - `sources`: in the order of the plan. Differentiable.
         - `variances`: mm^2. Differentiable.
         - `combination`: of the parts of the splats that several devices hold.
-        - `wanted`: the splats whose layers will be read; the values of others may be 0. All for
-          `None`.
+        - `at`: the splats at which the layers are evaluated, in ascending order; there are none
+          from the number of splats on. All for `None`.
         """
 
     def shares(self) -> tuple[Array, ...]:
@@ -123,7 +123,7 @@ def diffuse_with_derivative(
     variances: Float[Array, " gaussians"],
     kernel: AbstractDiffusionKernel,
     combination: AbstractCombination,
-    wanted: Bool[Array, " splats"] | None = None,
+    at: Int[Array, " points"] | None = None,
 ) -> tuple[Diffused, Diffused]:
     """Diffuse, and differentiate each layer in the logarithm of its own variance.
 
@@ -132,7 +132,7 @@ def diffuse_with_derivative(
     forward = plan.in_forward_mode()
 
     def diffuse(variances):
-        return forward.diffuse(sources, variances, kernel, combination, wanted)
+        return forward.diffuse(sources, variances, kernel, combination, at)
 
     return jax.jvp(diffuse, (variances,), (variances,))
 

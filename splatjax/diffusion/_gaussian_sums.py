@@ -3,8 +3,7 @@ the weights.
 
 Every block of points has a list of the blocks of sources near it. Blocks of points with lists of
 about one length are swept together, one per *lane*; in a step each lane meets the sources of the
-next row of its list. Tables hold centers and the summed rows, one block of sources after the other.
-The unit of length is the standard deviation times the root of 2.
+next row of its list. The unit of length is the standard deviation times the root of 2.
 """
 
 from collections.abc import Callable
@@ -14,7 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from splatjax._chunking import zeros_after
 
@@ -43,9 +42,10 @@ class Lists(eqx.Module):
     counts: Int[Array, " points_blocks"]
     order: Int[Array, " points_blocks"]
 
-    def only(self, wanted: Bool[Array, " points"]) -> "Lists":
-        """Leave out the blocks none of whose points is wanted."""
-        counts = jnp.where(jnp.any(wanted.reshape(len(self.counts), -1), axis=1), self.counts, 0)
+    def only(self, blocks: Int[Array, " some"]) -> "Lists":
+        """Leave out all other blocks of points."""
+        chosen = jnp.zeros(len(self.counts), bool).at[blocks].set(True, mode="drop")
+        counts = jnp.where(chosen, self.counts, 0)
         order = self.order[jnp.argsort(counts[self.order] == 0)]
         return Lists(self.rows, self.first, counts, order)
 
@@ -91,6 +91,44 @@ class Lanes(eqx.Module):
         return lax.fori_loop(0, jnp.max(self.counts), step, start)
 
 
+class SourceTable(eqx.Module):
+    """Sources in blocks; or those that each lane of a sweep meets.
+
+    **Attributes:**
+
+    - `centers`: apart by axis, which is quicker.
+    - `rows`: to be summed.
+    """
+
+    centers: tuple[Float[Array, "blocks block"], ...]
+    rows: Float[Array, "blocks rows block"]
+
+    @classmethod
+    def of(
+        cls, centers: Float[Array, "3 sources"], rows: Float[Array, "rows sources"], block: int
+    ) -> "SourceTable":
+        """Lay out sources, `block` of them to a block."""
+        rows = rows.reshape(len(rows), -1, block).transpose(1, 0, 2)
+        return cls(tuple(centers.reshape(3, -1, block)), rows)
+
+    def met(self, ids: Int[Array, "lanes width"]) -> "SourceTable":
+        """Read what each lane meets, `[lanes, sources]` and `[lanes, rows, sources]`."""
+        x, y, z, rows = (
+            each.at[ids].get(mode="fill", fill_value=0) for each in (*self.centers, self.rows)
+        )
+        rows = jnp.moveaxis(rows, 1, 2).reshape(len(ids), rows.shape[2], -1)
+        return SourceTable(tuple(each.reshape(len(ids), -1) for each in (x, y, z)), rows)
+
+    def add(self, ids: Int[Array, "lanes width"], met: "SourceTable") -> "SourceTable":
+        """Add to the sources that each lane meets."""
+
+        def added(table, part):
+            part = part.reshape(*part.shape[:-1], ids.shape[1], -1)
+            return table.at[ids].add(jnp.moveaxis(part, -2, 1), mode="drop")
+
+        return jax.tree.map(added, self, met)
+
+
 def identity(
     sums: Float[Array, "rows points"], points: Float[Array, "3 points"]
 ) -> Float[Array, "rows points"]:
@@ -107,11 +145,14 @@ class _Rule(eqx.Module):
     def finished(self, sums: Float[Array, "lanes rows points"], points):
         return jax.vmap(self.finish)(sums, points)
 
-    def weights(self, points, sources):
+    def weights(self, points, sources: SourceTable):
         """Compute weights `[lanes, sources, points]`, minus their derivatives in the exponent,
         and offsets.
         """
-        dx, dy, dz = (points[:, axis, None] - sources[:, axis, :, None] for axis in range(3))
+        dx, dy, dz = (
+            points[:, axis, None] - center[:, :, None]
+            for axis, center in enumerate(sources.centers)
+        )
         squared = dx * dx + dy * dy + dz * dz
         return *self.kernel(squared), (dx, dy, dz)
 
@@ -119,30 +160,12 @@ class _Rule(eqx.Module):
         """Sum over all that a sweep's points meet."""
 
         def add(ids, sums):
-            sources = _met(table, ids)
+            sources = table.met(ids)
             weights, *_ = self.weights(here, sources)
-            return sums + jnp.einsum("lrs,lsp->lrp", sources[:, 3:], weights)
+            return sums + jnp.einsum("lrs,lsp->lrp", sources.rows, weights)
 
-        start = jnp.zeros((here.shape[0], table.shape[1] - 3, here.shape[2]), here.dtype)
+        start = jnp.zeros((here.shape[0], table.rows.shape[1], here.shape[2]), here.dtype)
         return lanes.each_row(lists, add, start)
-
-
-def source_table(
-    centers: Float[Array, "3 sources"],
-    rows: Float[Array, "rows sources"],
-    block: int,
-) -> Float[Array, "blocks_and_one columns block"]:
-    """Lay out sources, `block` of them to a block; the last block is empty."""
-    columns = jnp.concatenate([centers, rows])
-    return jnp.pad(
-        columns.reshape(columns.shape[0], -1, block).transpose(1, 0, 2), ((0, 1), (0, 0), (0, 0))
-    )
-
-
-def _met(table, ids):
-    """Read the sources that each lane meets, `[lanes, columns, sources]`."""
-    sources = jnp.moveaxis(table.at[ids].get(mode="promise_in_bounds"), 1, 2)
-    return sources.reshape(ids.shape[0], table.shape[1], -1)
 
 
 def _forward(rule: _Rule, lists: Lists, points, table):
@@ -154,31 +177,29 @@ def _forward(rule: _Rule, lists: Lists, points, table):
 
 
 def _empty(rule: _Rule, points, table):
-    sums = jax.ShapeDtypeStruct(
-        (points.shape[0], table.shape[1] - 3, points.shape[2]), points.dtype
-    )
-    values = jax.eval_shape(rule.finished, sums, points)
-    return zeros_after(table, values.shape, values.dtype)
+    shape = points.shape[0], table.rows.shape[1], points.shape[2]
+    values = jax.eval_shape(rule.finished, jax.ShapeDtypeStruct(shape, points.dtype), points)
+    return zeros_after(table.rows, values.shape, values.dtype)
 
 
 def _derivative(rule: _Rule, lists: Lists, points, table, d_points, d_table):
     """Compute the values and their derivative along a direction; weights are evaluated once."""
-    rows = table.shape[1] - 3
+    rows = table.rows.shape[1]
 
     def sweep(lanes, out):
         here, d_here = lanes.read(points, FAR), lanes.read(d_points)
 
         def add(ids, sums):
-            sources, moved = _met(table, ids), _met(d_table, ids)
+            sources, moved = table.met(ids), d_table.met(ids)
             weights, falls, offsets = rule.weights(here, sources)
             nearer = sum(
-                offset * (moved[:, axis, :, None] - d_here[:, axis, None])
-                for axis, offset in enumerate(offsets)
+                offset * (center[:, :, None] - d_here[:, axis, None])
+                for axis, (offset, center) in enumerate(zip(offsets, moved.centers, strict=True))
             )
             d_weights = 2 * falls * nearer
-            both = jnp.concatenate([sources[:, 3:], moved[:, 3:]], axis=1)
+            both = jnp.concatenate([sources.rows, moved.rows], axis=1)
             both = jnp.einsum("lrs,lsp->lrp", both, weights)
-            moving = jnp.einsum("lrs,lsp->lrp", sources[:, 3:], d_weights)
+            moving = jnp.einsum("lrs,lsp->lrp", sources.rows, d_weights)
             return sums + both.at[:, rows:].add(moving)
 
         start = jnp.zeros((here.shape[0], 2 * rows, here.shape[2]), here.dtype)
@@ -201,15 +222,16 @@ def _backward(rule: _Rule, lists: Lists, points, table, sums, cotangents):
 
         def add(ids, carry):
             d_here, d_table = carry
-            sources = _met(table, ids)
+            sources = table.met(ids)
             weights, falls, _ = rule.weights(here, sources)
             # The factor of an exponent's cotangent is a polynomial in point and source, seen from
             # one of the sources: its moments over the points and over the sources suffice.
-            origin = sources[:, :3, :1]
-            x, y = here - origin, sources[:, :3] - origin
+            centers = jnp.stack(sources.centers, axis=1)
+            origin = centers[:, :, :1]
+            x, y = here - origin, centers - origin
             # Written out, so that it is fused with the weights: half the time of a matrix product.
             pairs = zip(
-                jnp.unstack(sources[:, 3:], axis=1), jnp.unstack(cotangent, axis=1), strict=True
+                jnp.unstack(sources.rows, axis=1), jnp.unstack(cotangent, axis=1), strict=True
             )
             pulls = falls * sum(row[:, :, None] * each[:, None] for row, each in pairs)
             of_points = jnp.concatenate([jnp.ones_like(x[:, :1]), x], axis=1)
@@ -218,15 +240,15 @@ def _backward(rule: _Rule, lists: Lists, points, table, sums, cotangents):
             d_centers = 2 * (moments[:, 1:] - y * moments[:, :1])
             of_sources = jnp.concatenate([jnp.ones_like(y[:, :1]), y], axis=1)
             toward = jnp.einsum("lks,lsp->lkp", of_sources, pulls)
-            part = jnp.concatenate([d_centers, d_rows], axis=1)
-            part = part.reshape(part.shape[0], part.shape[1], ids.shape[1], -1)
-            d_table = d_table.at[ids].add(jnp.moveaxis(part, 2, 1), mode="promise_in_bounds")
+            d_table = d_table.add(ids, SourceTable(tuple(jnp.unstack(d_centers, axis=1)), d_rows))
             return d_here - 2 * (x * toward[:, :1] - toward[:, 1:]), d_table
 
         d_here, d_table = lanes.each_row(lists, add, (d_finish, d_table))
         return lanes.write(d_points, d_here), d_table
 
-    start = tuple(zeros_after(cotangents, each.shape, each.dtype) for each in (points, table))
+    start = jax.tree.map(
+        lambda each: zeros_after(cotangents, each.shape, each.dtype), (points, table)
+    )
     return lists.sweep(sweep, start)
 
 
@@ -259,7 +281,7 @@ def _sums_jvp(rule: _Rule, primals, tangents):
 
 def gaussian_sums(
     points: Float[Array, "points_blocks 3 points"],
-    table: Float[Array, "blocks_and_one columns block"],
+    table: SourceTable,
     lists: Lists,
     kernel: TruncatedGaussian,
     finish: Callable[
@@ -271,7 +293,7 @@ def gaussian_sums(
     **Arguments:**
 
     - `points`: `x`. Differentiable.
-    - `table`: from `source_table`: `p_j` and `rows_j`. Differentiable.
+    - `table`: `p_j` and `rows_j`. Differentiable.
     - `kernel`: stands for `exp`; terms beyond its rim vanish, whatever the lists hold. Static.
     - `finish`: computes values from sums and points. Static.
 
@@ -282,7 +304,7 @@ def gaussian_sums(
 
 def gaussian_sums_forward(
     points: Float[Array, "points_blocks 3 points"],
-    table: Float[Array, "blocks_and_one columns block"],
+    table: SourceTable,
     lists: Lists,
     kernel: TruncatedGaussian,
     finish: Callable[

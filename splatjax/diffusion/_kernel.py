@@ -23,8 +23,7 @@ _UNEVEN = 0.05  # from which on splats count as scattered
 _SLACK = 1e-5
 _TINY_ENERGY = 1e-12  # left for the widest layers when their probability is not needed
 _ROUNDING = 0.05  # of the mass of a flat sheet: the corner of the gain is rounded over this excess
-SAMPLED_SPLATS = 64
-"""Splats whose neighbors are measured to find how evenly all are spread."""
+_SAMPLE = 64  # splats whose neighbors are measured to find how evenly all are spread
 
 
 class TruncatedGaussian(eqx.Module):
@@ -220,7 +219,7 @@ def unevenness(splats: Splats) -> Float[Array, ""]:
     """
     if splats.count < 2:
         return jnp.zeros((), splats.centers.dtype)
-    sampled = jnp.linspace(0, splats.count - 1, min(SAMPLED_SPLATS, splats.count)).astype(jnp.int32)
+    sampled = jnp.linspace(0, splats.count - 1, min(_SAMPLE, splats.count)).astype(jnp.int32)
     centers = stop_gradient(splats.centers).T
 
     def nearest(i):

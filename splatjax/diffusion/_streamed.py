@@ -15,12 +15,11 @@ from jaxtyping import Array, Bool, Float
 from splatjax._combination import PartByPart
 
 from ._clustered import ClusterDiffuser, in_sums, layer_table, source_boxes
-from ._clusters import Clusters, ClusterTree
+from ._clusters import BLOCK, Clusters, ClusterTree, compact_order
 from ._diffuser import Sources
 from ._gaussian_sums import FAR, Lists, gaussian_sums, identity
 from ._kernel import AbstractDiffusionKernel, TruncatedGaussian
 from ._neighbors import Boxes, find_neighbors
-from ._order import BLOCK, compact_order
 
 _SPARE = 1.3  # times the clusters of a part, so that one program serves nearly all parts
 

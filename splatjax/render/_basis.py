@@ -1,5 +1,7 @@
 """A picture for any weights: everything that they do not change is rendered once."""
 
+from functools import partial
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
@@ -8,9 +10,9 @@ from splatjax.diffusion import LayersAtPoints
 from splatjax.gaussians import SumOfGaussians
 from splatjax.scene import Camera, Scene
 
+from ._checks import check_channels, in_one_dtype
 from ._devices import on_devices
-from ._inputs import check_channels, in_one_dtype
-from ._passes import in_a_row, look
+from ._passes import in_a_row, light_splats, look
 from ._plan import Plan, plan_unless_traced
 from ._settings import RenderSettings
 from ._shade import ShadedSurface
@@ -101,9 +103,8 @@ def _diffusion_basis(
         def read(shaded: ShadedSurface, at: LayersAtPoints, _):
             return (*at.rows, shaded.post), shaded.specular
 
-        (rows, specular), visible = look(
-            scene, camera, settings, plan, combination, read, derivative=derivative
-        )
+        light_at = partial(light_splats, scene, settings, plan, combination, derivative=derivative)
+        (rows, specular), visible = look(scene, camera, settings, plan, combination, light_at, read)
         means, mass, irradiance, area, albedo, *slopes, post = map(in_a_row, rows)
         light = LayersAtPoints(
             variances=scene.material.gaussians.variances,

@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 from typing import TypeVar
 
 import equinox as eqx
@@ -14,10 +15,10 @@ from splatjax.gaussians import SumOfGaussians
 from splatjax.scene import Camera, Frame, Scene
 
 from ._attributes import SurfaceSamples
+from ._checks import check_channels, in_one_dtype
 from ._devices import on_devices
-from ._inputs import check_channels, in_one_dtype
 from ._lighting import LightAtSplats
-from ._passes import look
+from ._passes import light_splats, look
 from ._plan import Plan, plan_unless_traced
 from ._settings import RenderSettings
 from ._shade import ShadedSurface, compose, layers_at_points, single_scattering_albedo
@@ -150,8 +151,9 @@ def _picture_jacobian(
             post = shaded.post[None]
             return shaded, post * of_weights, post * of_variances
 
+        light_at = partial(light_splats, scene, settings, plan, combination, derivative=True)
         (shaded, *slopes), visible = look(
-            scene, camera, settings, plan, combination, read, derivative=True
+            scene, camera, settings, plan, combination, light_at, read
         )
         pictures = [jnp.moveaxis(visible.picture(slope), 2, 0) for slope in slopes]
         return PictureJacobian(compose(scene, shaded, visible), *pictures)

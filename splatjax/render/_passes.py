@@ -10,10 +10,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.lax import stop_gradient
-from jaxtyping import Array, Bool, Float, PyTree, Shaped
+from jaxtyping import Array, Float, Int, PyTree, Shaped
 
 from splatjax import diffusion as _diffusion, splatting as _splatting
-from splatjax._chunking import map_chunks
+from splatjax._chunking import map_chunks, take_points
 from splatjax._combination import AbstractCombination
 from splatjax.scene import Camera, Scene, stack_lights
 
@@ -53,21 +53,25 @@ class SplatLight(eqx.Module):
     added_source: Float[Array, "channels splats"] | None
     needed: Float[Array, ""]
 
+    def take(self, chosen: Int[Array, " chosen"]) -> "SplatLight":
+        """Return the light of some splats."""
+        return jax.tree.map(lambda leaf: take_points(leaf, chosen) if leaf.ndim else leaf, self)
+
 
 def light_splats(
     scene: Scene,
     settings: RenderSettings,
     plan: Plan,
     combination: AbstractCombination,
+    at: Int[Array, " chosen"] | None = None,
     derivative: bool = False,
-    wanted: Bool[Array, " splats"] | None = None,
 ) -> SplatLight:
     """Passes 1 and 4: light the splats, and diffuse their irradiance among them.
 
     **Arguments:**
 
+    - `at`: the splats whose light is returned, in ascending order; all for `None`.
     - `derivative`: also differentiate the layers in the material's Gaussians.
-    - `wanted`: the splats that will be looked at; all for `None`.
     """
     light = cast_shadows(scene, plan.shadows, settings.splatting, settings.shadows, combination)
     irradiance, added = irradiate(scene, light), None
@@ -75,10 +79,12 @@ def light_splats(
         irradiance, added = _irradiate_and_differentiate(scene, light)
     source = irradiance.source if added is None else jnp.concatenate([irradiance.source, added])
     layers, slopes, needed = diffuse_splats(
-        scene, source, settings, plan, combination, derivative, wanted
+        scene, source, settings, plan, combination, at, derivative
     )
     needed = jnp.maximum(needed, light.needed)
-    return SplatLight(light.visibility, irradiance, layers, slopes, added, needed)
+    own = SplatLight(light.visibility, irradiance, (), None, added, needed)
+    own = own if at is None else own.take(at)
+    return dataclasses.replace(own, layers=layers, derivative=slopes)
 
 
 def _irradiate_and_differentiate(scene: Scene, light: LightVisibility):
@@ -102,13 +108,13 @@ def diffuse_splats(
     settings: RenderSettings,
     plan: Plan,
     combination: AbstractCombination,
+    at: Int[Array, " chosen"] | None = None,
     derivative: bool = False,
-    wanted: Bool[Array, " splats"] | None = None,
 ):
     """Pass 4: return the layers of the splats, their derivatives, and the capacity needed."""
     splats, variances = scene.splats, scene.material.gaussians.variances
     sources = _diffusion.Sources(splats.centers.T, splats.normals.T, splats.areas, source)
-    given = sources, variances, settings.kernel, combination, wanted
+    given = sources, variances, settings.kernel, combination, at
     if not derivative:
         diffused = plan.diffusion.diffuse(*given)
         return diffused.layers, None, diffused.needed
@@ -122,35 +128,34 @@ def look(
     settings: RenderSettings,
     plan: Plan,
     combination: AbstractCombination,
+    light_at: Callable[[Int[Array, " chosen"]], SplatLight],
     read: Callable[[ShadedSurface, _diffusion.LayersAtPoints, SurfaceSamples], Values],
-    light: SplatLight | None = None,
-    derivative: bool = False,
 ) -> tuple[Values, _splatting.VisibleSurfaces]:
     """All passes: light the splats, see them, shade what is seen, and read what a picture needs.
 
     **Arguments:**
 
+    - `light_at`: passes 1 and 4, for the splats that the camera may see: `light_splats`.
     - `read`: pointwise, along the last axis.
-    - `light`: from `light_splats`; computed here for `None`.
-    - `derivative`: also differentiate the layers in the material's Gaussians.
 
     **Returns:** what was read, for each place; and the places, with the capacity needed of all
     passes.
     """
     view, groups = _splatting.PerspectiveView.of(camera), stack_lights(scene.lights)
-    if light is None:
-        seen = view.may_see(scene.splats)
-        light = light_splats(scene, settings, plan, combination, derivative, seen)
+    chosen, chosen_needed = plan.raster.choose(scene.splats, view)
+    light = light_at(chosen)
 
-    # Passes 2 and 3: blend the splats' attributes and layers.
+    # Passes 2 and 3: blend the attributes and layers of the splats that may be seen.
+    splats = scene.splats.take(chosen)
+    shown = Scene(splats, scene.lights, scene.material)
     visibility = LightVisibility(groups, light.visibility, light.needed)
-    attributes = settings.lighting.attributes(scene, visibility, light.irradiance)
+    attributes = settings.lighting.attributes(shown, visibility, light.irradiance)
     origin = stop_gradient(_splatting.Bounds.of(scene.splats, combination).center)[:, None]
     attributes = attributes.with_layers(
-        light.layers, light.derivative, light.added_source, scene.splats.centers.T - origin
+        light.layers, light.derivative, light.added_source, splats.centers.T - origin
     )
     visible = _splatting.visible_surfaces(
-        scene.splats, stack_rows(attributes), view, settings.splatting, plan.raster, combination
+        splats, stack_rows(attributes), view, settings.splatting, plan.raster, combination
     )
 
     # Pass 5: shade the points that are seen.
@@ -159,7 +164,8 @@ def look(
         return read(shaded, layers, samples)
 
     values = map_samples(shade_and_read, sample_surfaces(visible, attributes, origin))
-    needed = jnp.maximum(light.needed, visible.needed)
+    needed = combination.largest([jnp.maximum(chosen_needed, light.needed)])
+    needed = jnp.maximum(needed, visible.needed)
     visible = dataclasses.replace(visible.gathered(combination), needed=needed)
     return combination.gather(values), visible
 

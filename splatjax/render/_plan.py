@@ -16,8 +16,7 @@ from splatjax import diffusion as _diffusion, splatting as _splatting
 from splatjax._combination import DeviceMesh, OneDevice
 from splatjax.scene import AbstractLight, Camera, Scene, Splats, StackedLights, stack_lights
 
-from ._checks import check_scene
-from ._inputs import in_one_dtype
+from ._checks import check_scene, in_one_dtype
 from ._settings import RenderSettings
 from ._shadow_plan import ShadowPlan, is_among, shadow_views
 

@@ -1,6 +1,7 @@
 """A picture with all its layers, the light of a body without a camera, and pass 4 alone."""
 
 import dataclasses
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -8,12 +9,12 @@ import jax.numpy as jnp
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Float
 
+from splatjax._chunking import take_points
 from splatjax._combination import lay_out
 from splatjax.scene import Camera, Frame, Scene
-from splatjax.splatting import PerspectiveView
 
+from ._checks import SAME, check_channels, in_one_dtype
 from ._devices import on_devices
-from ._inputs import SAME, check_channels, in_one_dtype
 from ._lighting import Irradiance, LightAtSplats, cast_shadows, irradiate
 from ._passes import SplatLight, diffuse_splats, light_splats, look
 from ._plan import Plan, check_plan, plan_unless_traced
@@ -64,7 +65,9 @@ def _render(
         def read(shaded, *_):
             return shaded
 
-        return compose(scene, *look(scene, camera, settings, plan, combination, read, light))
+        own = scene, camera, settings, plan, combination
+        light_at = partial(light_splats, scene, settings, plan, combination)
+        return compose(scene, *look(*own, light_at if light is None else light.take, read))
 
     return on_devices(passes, scene, plan, camera, placed=light)
 
@@ -184,15 +187,19 @@ def _diffuse_irradiance(
     plain = dataclasses.replace(settings, lighting=LightAtSplats())
 
     def passes(combination, scene, plan, camera, irradiance):
-        source, seen = irradiance.T, PerspectiveView.of(camera).may_see(scene.splats)
-        given = settings, plan, combination
-        layers, _, needed = diffuse_splats(scene, source, *given, wanted=seen)
-        light = SplatLight([], Irradiance(source, source), layers, None, None, needed)
+        source = irradiance.T
+
+        def light_at(chosen):
+            layers, _, needed = diffuse_splats(
+                scene, source, settings, plan, combination, at=chosen
+            )
+            own = Irradiance(*[take_points(source, chosen)] * 2)
+            return SplatLight([], own, layers, None, None, needed)
 
         def read(shaded, layers, samples):
             return layers.weigh(scene.material.gaussians, single_scattering_albedo(scene))[0]
 
-        layers, visible = look(scene, camera, plain, plan, combination, read, light)
+        layers, visible = look(scene, camera, plain, plan, combination, light_at, read)
         return visible.front_picture(layers)
 
     picture = on_devices(passes, dark, plan, camera, rows=(irradiance,))

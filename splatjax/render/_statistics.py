@@ -61,7 +61,7 @@ class StreamStatistics:
     - `middle`, `reach`: of the box around all centers, and from there to the farthest rim.
     - `spacing`: root of the mean area.
     - `fine`: area that one splat in a hundred is finer than.
-    - `unevenness`: as `diffusion.unevenness`, but that neighbors are those in the same part.
+    - `unevenness`: the mean over the splats of that of their part.
     """
 
     count: int
@@ -96,44 +96,26 @@ class StreamStatistics:
                 "parts must be of one size, but the last, which may be smaller; these have "
                 f"{sizes} splats"
             )
-        # How far the farthest splat is, the finest areas, and the distances of some neighbors.
-        middle, squared, begin, near = (np.min(low, axis=0) + np.max(high, axis=0)) / 2, 0.0, 0, []
-        count = sum(sizes)
-        sampled = np.linspace(0, count - 1, min(_diffusion.SAMPLED_SPLATS, count)).astype(int)
-        rank, finest = _diffusion.FINEST * (count - 1), np.zeros(0)
+        # How far the farthest splat is, the finest areas, and how evenly splats are spread.
+        middle = (np.min(low, axis=0) + np.max(high, axis=0)) / 2
+        farthest, finest, uneven, count = 0.0, np.zeros(0), [], sum(sizes)
+        rank = _diffusion.FINEST * (count - 1)
         for part in parts():
-            own = sampled[(sampled >= begin) & (sampled < begin + part.count)] - begin
-            far = np.max(_squares(np.asarray(part.centers), middle), initial=0)
-            squared, begin = max(squared, float(far)), begin + part.count
-            near += _nearest(part, own)
-            finest = np.sort(np.concatenate([finest, np.asarray(part.areas)]))[: int(rank) + 2]
+            if part.count:
+                away = (np.asarray(part.centers) - middle).T
+                farthest = max(farthest, float(np.max(sum(axis * axis for axis in away))))
+                finest = np.sort(np.concatenate([finest, np.asarray(part.areas)]))[: int(rank) + 2]
+                uneven.append(float(_diffusion.unevenness(part)))
         return cls(
             count=count,
             rows=sizes[0],
             middle=middle,
-            reach=math.sqrt(squared) + radius,
+            reach=math.sqrt(farthest) + radius,
             spacing=math.sqrt(area / count),
             fine=float(np.interp(rank, np.arange(len(finest)), finest)),
-            unevenness=float(np.std(near) / max(np.mean(near), 1e-300)),
+            unevenness=float(np.average(uneven, weights=sizes)),
         )
 
     def bounds(self, dtype) -> _splatting.Bounds:
         """Return the sphere around all discs."""
         return _splatting.Bounds(jnp.asarray(self.middle, dtype), jnp.asarray(self.reach, dtype))
-
-
-def _squares(centers: np.ndarray, place: np.ndarray) -> np.ndarray:
-    """Compute squared distances, axis by axis, which is quicker."""
-    return sum((axis - at) ** 2 for axis, at in zip(centers.T, place, strict=True))
-
-
-def _nearest(part: Splats, sampled: np.ndarray) -> list[float]:
-    """Compute the distance of splats to the nearest other one of their part, over the root of their
-    area; 0 for the only one.
-    """
-    centers, areas, distances = np.asarray(part.centers), np.asarray(part.areas), []
-    for i in sampled:
-        squared = np.delete(_squares(centers, centers[i]), i)
-        nearest = math.sqrt(np.min(squared, initial=np.inf) / areas[i]) if len(squared) else 0.0
-        distances.append(nearest)
-    return distances

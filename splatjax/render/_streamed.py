@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from splatjax import diffusion as _diffusion, splatting as _splatting
+from splatjax._chunking import take_points
 from splatjax._combination import PartByPart
 from splatjax.scene import (
     AbstractLight,
@@ -25,7 +26,7 @@ from splatjax.scene import (
 )
 
 from ._attributes import SurfaceAttributes, SurfaceSamples, stack_rows
-from ._inputs import check_channels, in_one_dtype
+from ._checks import check_channels, in_one_dtype
 from ._lighting import Irradiance, LightVisibility, irradiate, map_visibility
 from ._passes import map_samples, sample_surfaces
 from ._plan import fill_up
@@ -206,7 +207,9 @@ def _sum_views(
 
 @eqx.filter_jit
 def _part_sweep(plan: _splatting.TilePlan, splats: Splats, attributes, view, splatting):
-    return plan.part_sweep(splats, attributes, view, splatting)
+    chosen, _ = plan.choose(splats, view)
+    attributes = take_points(attributes, chosen)
+    return plan.part_sweep(splats.take(chosen), attributes, view, splatting)
 
 
 @eqx.filter_jit

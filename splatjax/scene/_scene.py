@@ -4,9 +4,11 @@ from collections.abc import Callable, Iterable
 from typing import TypeAlias
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
+from splatjax._chunking import take_points
 from splatjax._records import check_values, numbers, record, several
 from splatjax.gaussians import SumOfGaussians
 from splatjax.scattering import SingleScattering
@@ -75,6 +77,12 @@ class Splats(eqx.Module):
         return eqx.tree_at(
             lambda splats: (splats.centers, splats.radii, splats.areas), self, scaled
         )
+
+    def take(self, chosen: Int[Array, " chosen"]) -> "Splats":
+        """Return the splats of these indices, in ascending order; splats that are invisible and
+        bring no light for indices from the number of splats on.
+        """
+        return jax.tree.map(lambda leaf: take_points(leaf.T, chosen).T, self)
 
 
 Parts: TypeAlias = Callable[[], Iterable[Splats]]

@@ -174,10 +174,13 @@ class Sweep(eqx.Module):
             chosen &= nearness <= upto[:, None]
         return jnp.where(chosen, self.view.squared_radius(nearness, quadric), 1.0)
 
-    def nearness_rows(self, splats):
-        """Return `[lanes, 4, slots]`: the plane of nearness over the tile (three rows) and 1."""
+    def rows(self, slots: "Slots", ids, splats):
+        """Return `[lanes, slots, rows]`: attributes, the plane of nearness over the tile (three
+        rows) and 1.
+        """
         x, y, sx, sy, _, _, _, e, _ = splats
-        return jnp.stack([e - sx * x - sy * y, sx, sy, jnp.ones_like(e)], axis=1)
+        nearness = jnp.stack([e - sx * x - sy * y, sx, sy, jnp.ones_like(e)], axis=2)
+        return jnp.concatenate([slots.rows(ids), nearness], axis=2)
 
     def sums(self, slots: "Slots", lanes: Lanes, beyond, upto):
         """Sum attributes and nearness over the fragments between two limits, `[lanes, rows,
@@ -190,19 +193,14 @@ class Sweep(eqx.Module):
                 *self.fragments(splats), lanes.until_end(beyond, block), upto
             )
             weight = splats[-1][:, :, None] * fast_fragment_weight(squared_radius)
-            rows = slots.rows(lanes.read(slots.ids, block))
-            attributes, nearness = sums
-            return (
-                attributes + jnp.einsum("tsr,tsp->trp", rows, weight),
-                nearness + jnp.einsum("trs,tsp->trp", self.nearness_rows(splats), weight),
-            )
+            rows = self.rows(slots, lanes.read(slots.ids, block), splats)
+            # Turned, which costs less than it saves in the product.
+            return sums + jnp.einsum("trs,tsp->trp", jnp.swapaxes(rows, 1, 2), weight)
 
-        places, pixels = beyond.shape
-        start = tuple(
-            jnp.zeros((places, rows, pixels), beyond.dtype)
-            for rows in (slots.attributes.shape[1], 4)
-        )
-        attributes, nearness = lax.fori_loop(jnp.int32(0), lanes.blocks, add, start)
+        (places, pixels), rows = beyond.shape, slots.attributes.shape[1]
+        start = jnp.zeros((places, rows + 4, pixels), beyond.dtype)
+        sums = lax.fori_loop(jnp.int32(0), lanes.blocks, add, start)
+        attributes, nearness = sums[:, :rows], sums[:, rows:]
         px, py = self.pixels(beyond.dtype)
         plane = nearness[:, 0] + nearness[:, 1] * px[None] + nearness[:, 2] * py[None]
         return jnp.concatenate([attributes, plane[:, None], nearness[:, 3:]], axis=1)
@@ -215,10 +213,9 @@ class Sweep(eqx.Module):
         monomials = jnp.asarray(
             np.stack([np.ones_like(px), px, py, px * px, px * py, py * py], axis=1)
         )
-        of_attributes, of_nearness = cotangent[:, :-2], cotangent[:, -2]
-        of_plane = jnp.stack(
-            [of_nearness, of_nearness * px[None], of_nearness * py[None], cotangent[:, -1]], axis=1
-        )
+        count, of_nearness = cotangent.shape[1] - 2, cotangent[:, -2:-1]
+        of_plane = [of_nearness, of_nearness * px[None, None], of_nearness * py[None, None]]
+        of_rows = jnp.concatenate([cotangent[:, :-2], *of_plane, cotangent[:, -1:]], axis=1)
 
         def add(block, gradients):
             splats = self.splats(slots.planes, block, lanes)
@@ -228,17 +225,12 @@ class Sweep(eqx.Module):
             )
             weight = fast_fragment_weight(squared_radius)
             ids, opacity = lanes.read(slots.ids, block), splats[-1]
-            attributes, plane = slots.rows(ids), self.nearness_rows(splats)
+            rows = self.rows(slots, ids, splats)
             # Cotangents of the summed rows, per slot, for a weight without opacity.
-            d_attributes = jnp.einsum("trp,tsp->tsr", of_attributes, weight)
-            d_plane = jnp.einsum("trp,tsp->trs", of_plane, weight)
-            d_opacity = jnp.sum(attributes * d_attributes, axis=2) + jnp.sum(
-                plane * d_plane, axis=1
-            )
+            d_rows = jnp.einsum("tsp,trp->tsr", weight, of_rows)
+            d_opacity = jnp.sum(rows * d_rows, axis=2)
             # Cotangents of the weights, and through them of nearness and quadric.
-            d_weight = jnp.einsum("tsr,trp->tsp", attributes, of_attributes)
-            d_weight = d_weight + jnp.einsum("trs,trp->tsp", plane, of_plane)
-            d_weight = opacity[:, :, None] * d_weight
+            d_weight = opacity[:, :, None] * jnp.einsum("tsr,trp->tsp", rows, of_rows)
             d_squared = fragment_weight_derivative(squared_radius, weight) * d_weight
             nearness = jnp.where(squared_radius < 1, nearness, 1.0)
             d_nearness, d_quadric = self.view.squared_radius_vjp(
@@ -247,14 +239,15 @@ class Sweep(eqx.Module):
             # Both are polynomials in the pixel: their moments over the tile suffice.
             quad = jnp.moveaxis(d_quadric @ monomials, 2, 0)
             near = jnp.moveaxis(d_nearness @ monomials[:, :3], 2, 0)
-            near = near + jnp.moveaxis(d_plane[:, :3], 1, 0) * opacity[None]
-            of_planes, of_rows = gradients
+            d_rows = d_rows * opacity[:, :, None]
+            near = near + jnp.moveaxis(d_rows[:, :, count : count + 3], 2, 0)
+            of_planes, of_attributes = gradients
             parts = *_plane_cotangents(splats, quad, near), d_opacity
             return (
                 tuple(
                     lanes.add(*each) for each in zip(of_planes, (block,) * 9, parts, strict=True)
                 ),
-                of_rows.at[ids].add(d_attributes * opacity[:, :, None], mode="drop"),
+                of_attributes.at[ids].add(d_rows[:, :, :count], mode="drop"),
             )
 
         return lax.fori_loop(jnp.int32(0), lanes.blocks, add, gradients)

@@ -7,8 +7,7 @@ from jaxtyping import Array, Float
 
 from splatjax.scene import Camera, Splats
 
-from ._footprints import EDGE_ON, Footprints, epsilon_of, filtered
-from ._settings import SplattingSettings
+from ._footprints import EDGE_ON, Footprints, SplattingSettings, epsilon_of, filtered
 from ._views import MARGIN, AbstractView, rows
 
 

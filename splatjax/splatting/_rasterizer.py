@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Int
 from splatjax._combination import AbstractCombination
 from splatjax.scene import Splats
 
-from ._settings import SplattingSettings
+from ._footprints import SplattingSettings
 from ._views import AbstractView
 
 LEAST_WEIGHT = 0.06  # of a fragment that decides where the surface behind the front is
@@ -53,7 +53,7 @@ class FragmentSums(eqx.Module):
     - `rows`: sums of weights times attributes, of weights times the nearness of the ray's hits with
       the planes of the splats, and of weights; 0 where there is no fragment, and beyond the
       picture.
-    - `needed`: capacity needed over planned; above 1 the sums are NaN.
+    - `needed`: capacity needed over planned; above 1 the sums are incomplete.
     - `front`: the number of places of the front. Static.
     """
 
@@ -63,8 +63,22 @@ class FragmentSums(eqx.Module):
     front: int = eqx.field(static=True)
 
 
+def invalid_factor(needed: Float[Array, ""]) -> Float[Array, ""]:
+    """Compute the factor of what is made of sums: 1, or NaN where the plan did not suffice."""
+    return jnp.where(needed <= 1, 1.0, jnp.nan).astype(needed.dtype)
+
+
 class AbstractRasterPlan(eqx.Module):
     """A rasterizer with the capacity that some splats need in some views."""
+
+    def choose(
+        self, splats: Splats, view: AbstractView
+    ) -> tuple[Int[Array, " chosen"], Float[Array, ""]]:
+        """List the splats that a view may see, in order; the number of splats in what is left of
+        the capacity. Also compute the capacity needed over planned.
+        """
+        every = jnp.arange(splats.count, dtype=jnp.int32)
+        return every, jnp.zeros((), splats.centers.dtype)
 
     @abc.abstractmethod
     def sum_fragments(

@@ -14,12 +14,12 @@ from splatjax._chunking import AT_ONCE, jit_unless_traced, map_chunks
 from splatjax._combination import AbstractCombination, extreme
 from splatjax.scene import Splats
 
+from ._footprints import SplattingSettings
 from ._grid import TileGrid
 from ._kernel import coverage
 from ._orthographic import OrthographicView
 from ._perspective import PerspectiveView
-from ._rasterizer import AbstractRasterPlan, FragmentSums
-from ._settings import SplattingSettings
+from ._rasterizer import AbstractRasterPlan, FragmentSums, invalid_factor
 from ._surfaces import Surface
 from ._views import AbstractView
 
@@ -172,7 +172,7 @@ class ShadowMap(eqx.Module):
                 plane = jnp.zeros((tiles, values.shape[1]), values.dtype)
                 plane = plane.at[sums.tiles[places]].set(values[places], mode="drop")
                 planes.append(plane)
-        return cls(view, jnp.stack(planes), sums.needed)
+        return cls(view, invalid_factor(sums.needed) * jnp.stack(planes), sums.needed)
 
 
 def make_shadow_map(
@@ -183,9 +183,11 @@ def make_shadow_map(
     combination: AbstractCombination,
 ) -> ShadowMap:
     """Make a shadow map (4.1): the surfaces that a light sees, by passes 2 and 3 of the camera."""
-    nothing = jnp.zeros((0, splats.count), splats.centers.dtype)
-    sums = plan.sum_fragments(splats, nothing, view, splatting, combination)
-    rows, needed = combination.total([sums.rows]), combination.largest([sums.needed])
+    chosen, needed = plan.choose(splats, view)
+    nothing = jnp.zeros((0, len(chosen)), splats.centers.dtype)
+    sums = plan.sum_fragments(splats.take(chosen), nothing, view, splatting, combination)
+    needed = combination.largest([jnp.maximum(needed, sums.needed)])
+    rows = combination.total([sums.rows])
     sums = eqx.tree_at(lambda each: (each.rows, each.needed), sums, (rows, needed))
     return ShadowMap.of(sums, view, splatting)
 

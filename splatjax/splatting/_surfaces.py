@@ -11,10 +11,10 @@ from splatjax._chunking import AT_ONCE
 from splatjax._combination import AbstractCombination
 from splatjax.scene import Splats
 
+from ._footprints import SplattingSettings
 from ._grid import SIDE, TileGrid
 from ._kernel import coverage
-from ._rasterizer import AbstractRasterPlan, FragmentSums
-from ._settings import SplattingSettings
+from ._rasterizer import AbstractRasterPlan, FragmentSums, invalid_factor
 from ._views import AbstractView
 
 TILES_AT_ONCE = AT_ONCE // SIDE**2
@@ -116,7 +116,7 @@ class VisibleSurfaces(eqx.Module):
     @property
     def invalid_factor(self) -> Float[Array, ""]:
         """The factor of every picture: 1, or NaN where the plan does not suffice."""
-        return jnp.where(self.needed <= 1, 1.0, jnp.nan).astype(self.needed.dtype)
+        return invalid_factor(self.needed)
 
     @property
     def grid(self) -> TileGrid:
@@ -194,7 +194,7 @@ def visible_surfaces(
     - `plan`: from an `AbstractRasterizer`.
 
     **Returns:** the surfaces; where the capacity of the plan is exceeded, `needed` is above 1 and
-    the rows are NaN.
+    every picture is NaN.
     """
     sums = plan.sum_fragments(splats, attributes, view, settings, combination)
     return VisibleSurfaces.of(sums, view, settings, combination)

@@ -60,12 +60,10 @@ def sum_fragments(
 def _forward(sweep, capacity, combination, bins, shift, planes, attributes):
     slots = Slots.gathered(shift, planes, attributes, bins)
     if isinstance(combination, OneDevice):
-        sums, ends = _sum_chunks(sweep, capacity, bins, slots)
-    else:
-        stages = PartSweep(sweep, bins, slots)
-        ((sums, ends),) = sum_parts(lambda: [[stages]], [capacity], combination)
-    invalid = jnp.where(sums.needed <= 1, 0.0, jnp.nan).astype(shift.dtype)
-    return eqx.tree_at(lambda each: each.rows, sums, sums.rows + invalid), ends
+        return _sum_chunks(sweep, capacity, bins, slots)
+    stages = PartSweep(sweep, bins, slots)
+    (found,) = sum_parts(lambda: [[stages]], [capacity], combination)
+    return found
 
 
 def _sum_fwd(sweep, capacity, combination, bins, shift, planes, attributes):

@@ -8,19 +8,18 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jax.lax import stop_gradient
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from splatjax._chunking import map_chunks
 from splatjax._combination import AbstractCombination, OneDevice
 from splatjax.scene import Splats
 
 from ._bins import BinCapacity, Bins, bin_items, round_up
+from ._footprints import SplattingSettings
 from ._fragments import PLANES, Slots, Sweep
 from ._grid import TileGrid
 from ._rasterizer import AbstractRasterizer, AbstractRasterPlan, FragmentSums, Places
-from ._settings import SplattingSettings
 from ._sweeps import PartSweep, sum_fragments
 from ._views import AbstractView
 
@@ -104,6 +103,16 @@ class TilePlan(AbstractRasterPlan):
         behind = -(-int(_SPARE * most + 1) // grain) * grain
         return dataclasses.replace(self, places=Places(self.places.front, behind))
 
+    def choose(
+        self, splats: Splats, view: AbstractView
+    ) -> tuple[Int[Array, " chosen"], Float[Array, ""]]:
+        may_be_seen = view.may_see(splats)
+        ends = jnp.cumsum(may_be_seen.astype(jnp.int32))
+        every = jnp.arange(splats.count, dtype=jnp.int32)
+        listed = jnp.full(self.splats, splats.count, jnp.int32)
+        listed = listed.at[jnp.where(may_be_seen, ends - 1, self.splats)].set(every, mode="drop")
+        return listed, (ends[-1] / self.splats).astype(splats.centers.dtype)
+
     def sum_fragments(
         self,
         splats: Splats,
@@ -136,26 +145,16 @@ class TilePlan(AbstractRasterPlan):
         return PartSweep(each.sweep, each.bins, slots)
 
     def _bin(self, splats: Splats, attributes, view: AbstractView, settings) -> "_Binned":
-        """Project the splats that may be seen, and list them by tile."""
+        """Project the splats, and list them by tile."""
         grid = self.rasterizer.grid(view)
-        chosen, seen = _compacted(view.may_see(splats), self.splats)
-        splats = jax.tree.map(
-            lambda leaf: (
-                jnp.stack(_taken(leaf.T, chosen), axis=-1)
-                if leaf.ndim == 2
-                else _taken(leaf[None], chosen)[0]
-            ),
-            splats,
-        )
         footprints = map_chunks(lambda part: view.footprints(part, settings), splats)
         bins = bin_items(footprints.ranges(grid), grid, self.bins)
-        needed = jnp.maximum(bins.needed, seen / self.splats)
         return _Binned(
             sweep=Sweep(type(view), grid, settings.full_coverage, settings.filter_radius),
-            bins=eqx.tree_at(lambda each: each.needed, bins, needed),
+            bins=bins,
             shift=stop_gradient(footprints.shift),
             planes=tuple(getattr(footprints, name) for name in PLANES),
-            attributes=attributes.T.at[chosen].get(mode="fill", fill_value=0),
+            attributes=attributes.T,
         )
 
 
@@ -179,28 +178,7 @@ def _demand(splats: Splats, view: AbstractView, settings: SplattingSettings, gri
 @eqx.filter_jit
 def _tiles_behind(splats: Splats, view: AbstractView, settings: SplattingSettings, plan: TilePlan):
     """Count the tiles in which a surface shows behind the front."""
-    nothing = jnp.zeros((0, splats.count), splats.centers.dtype)
-    sums = plan.sum_fragments(splats, nothing, view, settings, OneDevice())
+    chosen, _ = plan.choose(splats, view)
+    nothing = jnp.zeros((0, len(chosen)), splats.centers.dtype)
+    sums = plan.sum_fragments(splats.take(chosen), nothing, view, settings, OneDevice())
     return jnp.sum(sums.tiles[sums.front :] < plan.rasterizer.grid(view).count)
-
-
-def _compacted(
-    chosen: Bool[Array, " splats"], capacity: int
-) -> tuple[Int[Array, " capacity"], Int[Array, ""]]:
-    """List the chosen splats in order, then the number of all, which is none; and count them."""
-    ends = jnp.cumsum(chosen.astype(jnp.int32))
-    count = chosen.shape[0]
-    target = jnp.where(chosen, ends - 1, capacity)
-    listed = jnp.full(capacity, count, jnp.int32)
-    return listed.at[target].set(jnp.arange(count, dtype=jnp.int32), mode="drop"), ends[-1]
-
-
-def _taken(
-    rows: Float[Array, "rows splats"], chosen: Int[Array, " capacity"]
-) -> list[Float[Array, " capacity"]]:
-    """Take columns, 0 for those that are none; row by row, so that derivatives are planes too."""
-    # The derivative of a split is put together once; that of slices is a sum.
-    split = lax.split(rows, [1] * rows.shape[0])
-    return [
-        row[0].at[chosen].get(mode="fill", fill_value=0, indices_are_sorted=True) for row in split
-    ]

@@ -7,8 +7,7 @@ from jaxtyping import Array, Bool, Float
 
 from splatjax.scene import Splats
 
-from ._footprints import Footprints
-from ._settings import SplattingSettings
+from ._footprints import Footprints, SplattingSettings
 
 MARGIN = 8.0
 """Pixels around the picture; the screen filter reaches beyond a sphere."""

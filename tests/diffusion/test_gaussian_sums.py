@@ -7,9 +7,9 @@ import pytest
 
 from splatjax.diffusion import BLOCK, _neighbors, compact_order
 from splatjax.diffusion._gaussian_sums import (
+    SourceTable,
     gaussian_sums,
     gaussian_sums_forward,
-    source_table,
 )
 from splatjax.diffusion._kernel import TruncatedGaussian
 from splatjax.diffusion._neighbors import SOURCES, Boxes, Neighbors, find_neighbors
@@ -40,7 +40,7 @@ def test_values_and_derivatives_are_those_of_plain_sums(float64):
 
     def ours(points, *sources, sums=gaussian_sums):
         blocks = points.reshape(3, -1, BLOCK).transpose(1, 0, 2)
-        found = sums(blocks, source_table(*sources, SOURCES), lists, kernel, squares_and_products)
+        found = sums(blocks, SourceTable.of(*sources, SOURCES), lists, kernel, squares_and_products)
         return found.transpose(1, 0, 2).reshape(found.shape[1], -1)
 
     def plain(points, centers, rows):
