@@ -13,8 +13,7 @@ import tyro
 import splatjax as sj
 from splatjax.io import material_path, save_exports, surface_and_source
 
-from ._options import check_output
-from ._report import print_table
+from ._terminal import check_output, print_table
 
 _MATERIAL = (
     "Print the file of this one: coefficients, source, Gaussians. A beginning of "

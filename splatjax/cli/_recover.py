@@ -21,22 +21,23 @@ from splatjax.io import (
     write_record,
 )
 
-from ._options import (
+from ._terminal import (
     FIGURES,
     OptionalFloat,
     OptionalPath,
     check_options,
     check_output,
+    note,
     save_figure,
+    stage,
 )
-from ._report import note, stage
 
 _START = (
     "Materials to start from, within a factor of three in both coefficients: names, "
     "or paths of TOML files. The best end counts."
 )
+# Of any translucent solid: diamond has 2.4.
 _LARGEST_ETA = 3.0
-"""Of any translucent solid: diamond has 2.4."""
 _COEFFICIENTS = ("sigma_a", "sigma_s_prime")
 _MODELS = {"dipole": sj.Dipole, "better-dipole": sj.scattering.BetterDipole}
 

@@ -6,8 +6,7 @@ from pathlib import Path
 
 import splatjax as sj
 
-from ._options import check_options, check_output
-from ._report import stage
+from ._terminal import check_options, check_output, stage
 from ._view import ViewOptions, draw
 
 

@@ -9,8 +9,7 @@ import tyro
 
 import splatjax as sj
 
-from ._options import OptionalFloat, OptionalPath, UpAxis, check_output
-from ._report import note, stage
+from ._terminal import OptionalFloat, OptionalPath, UpAxis, check_output, note, stage
 
 _V_UP = (
     "Whether v = 0 is the lower edge of a map. Without it, as the format prescribes: OBJ yes, glTF "

@@ -12,9 +12,8 @@ import tyro
 import splatjax as sj
 from splatjax.io import fingerprint, material_path, write_animation
 
-from ._options import check_folder
-from ._report import stage
 from ._resumable import complete
+from ._terminal import check_folder, stage
 from ._view import ViewOptions, draw
 
 _LARGEST = 16_383  # pixels along a side of a WebP file

@@ -17,8 +17,7 @@ from splatjax.io import fingerprint, material_path
 from splatjax.render import check_displayable
 from splatjax.scene import Parts
 
-from ._options import Rules, UpAxis, check_options, option_name
-from ._report import note, stage
+from ._terminal import Rules, UpAxis, check_options, note, option_name, stage
 
 # Degrees: the fill stands beside the camera, on the side away from the light.
 _FILL_SIDE, _FILL_ELEVATION = 25.0, 10.0

@@ -21,8 +21,9 @@ from ._search import (
     SharedVariances,
     constant,
     greedy_path,
+    refine,
+    stationary,
 )
-from ._stationary import refine, stationary
 from ._weights import AbstractWeights, FreeWeights
 
 

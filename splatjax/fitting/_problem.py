@@ -12,7 +12,7 @@ from splatjax.gaussians import AbstractProfile, SumOfGaussians, gaussian
 from splatjax.scattering import L2_QUADRATURE, AbstractRadialRule, at_own_radii
 
 from ._dense import invert_moving
-from ._weights import AbstractWeights, without_idle
+from ._weights import AbstractWeights
 
 
 def norm_radii(
@@ -147,10 +147,7 @@ class FitProblem(eqx.Module):
         def solve(rows, target, total):
             if active is None:
                 return self.weights.solve(rows, target, energies, total)
-            coefficients, response = self.weights.solve(
-                *without_idle(rows, target, energies, active), total
-            )
-            return coefficients, jnp.where(active[:, None] & active[None], response, 0.0)
+            return self.weights.solve_active(rows, target, energies, total, active)
 
         if active is not None:
             basis = jnp.where(jnp.broadcast_to(active, basis.shape), basis, 0.0)

@@ -9,6 +9,9 @@ from jaxtyping import Array, Bool, Float
 
 from ._dense import invert, least_squares
 
+_ROUNDING = 100.0
+_EXCHANGES = 64
+
 
 class AbstractWeights(eqx.Module):
     """The weights that a fit may choose from: a set that does not depend on the variances."""
@@ -34,6 +37,27 @@ class AbstractWeights(eqx.Module):
 
         **Returns:** the coefficients, and their derivative in `basis^T target`, which is symmetric.
         """
+
+    def solve_active(
+        self,
+        basis: Float[Array, "rows gaussians"],
+        target: Float[Array, " rows"],
+        energies: Float[Array, " gaussians"],
+        total: Float[Array, ""],
+        active: Bool[Array, " gaussians"],
+    ) -> tuple[Float[Array, " gaussians"], Float[Array, "gaussians gaussians"]]:
+        """Solve with the coefficients of idle Gaussians fixed at zero: one more row for each idle
+        column keeps the rank full.
+        """
+        idle = jnp.diag((~active).astype(energies.dtype))
+        columns = jnp.where(jnp.broadcast_to(active, basis.shape), basis, 0.0)
+        coefficients, response = self.solve(
+            jnp.concatenate([columns, idle]),
+            jnp.concatenate([target, jnp.zeros_like(energies)]),
+            jnp.where(active, energies, 0.0),
+            total,
+        )
+        return coefficients, jnp.where(active[:, None] & active[None], response, 0.0)
 
 
 class FreeWeights(AbstractWeights):
@@ -81,11 +105,8 @@ class NonNegativeWeights(AbstractWeights):
         count = basis.shape[1]
         tolerance = _ROUNDING * float(jnp.finfo(basis.dtype).eps)
 
-        def solved(positive):
-            return self.among.solve(*without_idle(basis, target, energies, positive), total)
-
         def wrong(positive):
-            coefficients, _ = solved(positive)
+            coefficients, _ = self.among.solve_active(basis, target, energies, total, positive)
             slope = basis.T @ (basis @ coefficients - target)
             # A fixed sum adds the same slope to all coefficients that are not zero.
             share = jnp.where(positive, energies, 0.0)
@@ -103,26 +124,4 @@ class NonNegativeWeights(AbstractWeights):
             lambda state: jnp.any(state[1]) & (state[2] < _EXCHANGES), exchange, start
         )
         positive = jax.lax.stop_gradient(positive)
-        coefficients, response = solved(positive)
-        return coefficients, jnp.where(positive[:, None] & positive[None], response, 0.0)
-
-
-_ROUNDING = 100.0
-_EXCHANGES = 64
-
-
-def without_idle(
-    basis: Float[Array, "rows gaussians"],
-    target: Float[Array, " rows"],
-    energies: Float[Array, " gaussians"],
-    active: Bool[Array, " gaussians"],
-) -> tuple[
-    Float[Array, "more_rows gaussians"], Float[Array, " more_rows"], Float[Array, " gaussians"]
-]:
-    """Fix the coefficients of idle Gaussians at zero: one more row for each idle column keeps the
-    rank full.
-    """
-    idle = jnp.diag((~active).astype(energies.dtype))
-    columns = jnp.where(jnp.broadcast_to(active, basis.shape), basis, 0.0)
-    longer = jnp.concatenate([target, jnp.zeros_like(energies)])
-    return jnp.concatenate([columns, idle]), longer, jnp.where(active, energies, 0.0)
+        return self.among.solve_active(basis, target, energies, total, positive)

@@ -30,8 +30,8 @@ from ._observation import (
 from ._parts import AbstractPart, Setup
 from ._problem import make_plans
 
+# Of each part; where pictures do not share it, a tuple with those of each picture.
 Coordinates = tuple[PyTree[Array], ...]
-"""Of each part; where pictures do not share it, a tuple with those of each picture."""
 
 
 @runtime_checkable

@@ -12,12 +12,11 @@ from jaxtyping import Array, Bool, DTypeLike, Float
 from splatjax._records import check_values, numbers, record, several
 from splatjax.scene import AbstractLight, Camera
 
+# Coverage of a pixel behind which nothing else is seen.
 _FILLED = 0.999
-"""Coverage of a pixel behind which nothing else is seen."""
+# Deviation of pictures that come without one, as a fraction of their brightness: error bars do not
+# depend on it.
 _UNKNOWN_NOISE = 0.01
-"""Deviation of pictures that come without one, as a fraction of their brightness: error bars do not
-depend on it.
-"""
 
 
 class AbstractIntensity(eqx.Module):

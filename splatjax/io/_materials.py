@@ -38,13 +38,13 @@ _COEFFICIENTS = ("unit", "sigma_a", "sigma_s_prime", "eta")
 _TABLES = ("medium", "layers", "surface", "single_scattering", "source", "fit")
 _SURFACE = ("eta", "specular", "roughness")
 _LAYER = (*_COEFFICIENTS, "optical_depth", "thickness", "thickness_unit")
+# What [fit] calls a profile whose coefficients the file holds.
 _MODELS: dict[type, str] = {
     Dipole: "classical dipole",
     BetterDipole: "better dipole",
     PhotonBeam: "photon beam with single scattering",
     LayeredMultipole: "multipole",
 }
-"""What [fit] calls a profile whose coefficients the file holds."""
 
 
 def profiles_folder() -> Path:

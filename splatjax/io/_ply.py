@@ -27,6 +27,7 @@ _COMPLETE = (
     "estimates normals, radii and areas, and `splatjax sample` of a mesh writes them"
 )
 _GAUSSIAN_SPLATTING = {"f_dc_0", "scale_0", "rot_0"}
+# Columns of the vertices of a PLY file, by the fields of splats that they stand for.
 _COLUMNS = {
     "centers": [("x", "y", "z")],
     "normals": [("nx", "ny", "nz")],
@@ -40,7 +41,6 @@ _COLUMNS = {
     "specular": [("specular",)],
     "roughness": [("roughness",)],
 }
-"""Columns of the vertices of a PLY file, by the fields of splats that they stand for."""
 _POWERS = {"centers": 1, "radii": 1, "areas": 2}  # of the unit of length
 _VALID = {
     "centers": (lambda x: np.abs(x) <= _LONGEST, "within 1e9 mm (what is mm_per_unit?)"),

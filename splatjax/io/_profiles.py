@@ -16,8 +16,8 @@ from splatjax.scattering import Tabulated
 from ._files import atomic_path, check_units, existing_file, naming
 from ._tables import rounded
 
+# Units of length that the names of a table's columns may give.
 _MM = {"mm": 1.0, "cm": 10.0, "um": 1e-3, "µm": 1e-3}
-"""Units of length that the names of a table's columns may give."""
 _COLUMNS = "sigma_a", "sigma_s_prime", "eta"
 
 

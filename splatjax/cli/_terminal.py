@@ -1,12 +1,17 @@
-"""Types of options, as help shows them; checks of options and outputs before the work begins.
+"""What commands share: types of options as help shows them, checks of options and outputs before
+the work begins, and messages while it lasts: on stderr, so that results on stdout stay clean.
 
 What takes more than a line to explain is a `help`: breaks in docstrings are kept.
 """
 
+import contextlib
+import time
+from collections.abc import Callable, Generator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
+from rich.console import Console
 
 from splatjax.io import atomic_path
 
@@ -16,10 +21,11 @@ if TYPE_CHECKING:
 OptionalPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="")]
 OptionalFloat = Annotated[float | None, tyro.conf.arg(metavar="FLOAT", help_behavior_hint="")]
 UpAxis = Literal["y", "z"]
+# By field of a command, whether its value is valid, and what it must do.
 Rules = dict[str, tuple[bool, str]]
-"""By field of a command, whether its value is valid, and what it must do."""
+# Suffixes of drawings.
 FIGURES = (".png", ".pdf", ".svg")
-"""Suffixes of drawings."""
+_CONSOLE = Console(stderr=True, highlight=False, soft_wrap=True)
 
 
 def option_name(field: str) -> str:
@@ -60,3 +66,40 @@ def save_figure(figure: "Figure", path: Path) -> None:
     with atomic_path(path) as temporary:
         figure.savefig(temporary, format=path.suffix[1:].lower())
     print(path)
+
+
+def note(what: str) -> None:
+    """Print something the user should know."""
+    _CONSOLE.print(what, markup=False)
+
+
+@contextlib.contextmanager
+def stage(what: str, total: int = 0) -> Generator[Callable[..., None]]:
+    """Show that something is being done, and afterwards how long it took.
+
+    Yields the function to call with the steps done of a total, and with what is being done where
+    that changes. Where stderr is no terminal, it prints a line at most once a second.
+    """
+    begin = last = time.perf_counter()
+    with _CONSOLE.status(what) as status:
+
+        def report(done: int, what: str = what) -> None:
+            nonlocal last
+            now = time.perf_counter()
+            left = (now - begin) / done * (total - done)
+            line = f"{what}: {done} of {total}, {left:.0f} s left"
+            status.update(line)
+            if not _CONSOLE.is_terminal and (done == total or now > last + 1):
+                last = now
+                note(line)
+
+        yield report
+    note(f"{what}: {time.perf_counter() - begin:.1f} s")
+
+
+def print_table(rows: Sequence[Sequence[str]]) -> None:
+    """Print rows on stdout, their columns aligned."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
+        cells = [cell.ljust(width) for cell, width in zip(row, widths, strict=True)]
+        print("  ".join(cells).rstrip())
