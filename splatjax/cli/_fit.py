@@ -11,8 +11,6 @@ import tyro
 
 import splatjax as sj
 from splatjax._format import channel_names, counted
-from splatjax.io import read_picture, surface_and_source
-from splatjax.scattering import measure_laser_dot
 
 from ._fit_all import fit_all
 from ._models import Model, Reference, reference
@@ -37,18 +35,6 @@ _OPTIONS = {
     _PROFILE: ("mm_per_unit",),
     _PHOTOGRAPH: ("mm_per_pixel", "power"),
 }
-_MEDIUM = (
-    "Name of a material (`splatjax materials`), or path: of a TOML file with a [medium] or "
-    "[[layers]], of a CSV file with radii "
-    "and a column per channel, or of an EXR file with a linear photograph of a laser dot."
-)
-_ALL = (
-    "Fit all media of a CSV file, whose columns are sigma_a, sigma_s_prime (1/mm), eta, and a name "
-    "if you like; --output is a "
-    "CSV file then. Batches that are finished stay: after an interruption, run the same command "
-    "again. Where a launcher has "
-    "started several processes (docs/devices.md), they share the work."
-)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,7 +54,14 @@ class Fit:
               splatjax fit media.csv --all --output fits.csv
     """
 
-    medium: Annotated[tyro.conf.Positional[str], tyro.conf.arg(help=_MEDIUM)]
+    medium: Annotated[
+        tyro.conf.Positional[str],
+        tyro.conf.arg(
+            help="Name of a material (`splatjax materials`), or path: of a TOML file with a "
+            "[medium] or [[layers]], of a CSV file with radii and a column per channel, or of an "
+            "EXR file with a linear photograph of a laser dot."
+        ),
+    ]
     #: Number of Gaussians.
     count: int = 6
     #: Take the least number of Gaussians, up to 12, that leaves no channel a larger error (Eq. 4),
@@ -88,14 +81,21 @@ class Fit:
     mm_per_pixel: OptionalFloat = None
     #: Of a photograph: the light that enters the material, in W if the picture is in W/(mm^2 sr).
     power: float = 1.0
-    all: Annotated[bool, tyro.conf.arg(help=_ALL)] = False
+    all: Annotated[
+        bool,
+        tyro.conf.arg(
+            help="Fit all media of a CSV file, whose columns are sigma_a, sigma_s_prime (1/mm), "
+            "eta, and a name if you like; --output is a CSV file then. Batches that are finished "
+            "stay: after an interruption, run the same command again. Where a launcher has started "
+            "several processes (docs/devices.md), they share the work."
+        ),
+    ] = False
     #: TOML file to write the material to.
     output: OptionalPath = None
     #: Picture to write of profile, fit and error: .png, .pdf or .svg.
     plot: OptionalPath = None
 
     def run(self) -> None:
-        """Fit, print, write."""
         check_output(self.output, (".csv",) if self.all else (".toml",))
         check_output(self.plot, FIGURES)
         most = 8 if self.all else sj.fitting.LeastCount.largest
@@ -169,9 +169,10 @@ class Fit:
             raise ValueError(
                 f"{self.medium}: how large is a pixel on the surface? give --mm-per-pixel"
             )
-        image = read_picture(self.medium)
+        image = sj.io.read_picture(self.medium)
         try:
-            return measure_laser_dot(image, self.mm_per_pixel, power=self.power).profile
+            dot = sj.scattering.measure_laser_dot(image, self.mm_per_pixel, power=self.power)
+            return dot.profile
         except ValueError as error:
             raise ValueError(f"{self.medium}: {error}") from None
 
@@ -216,7 +217,7 @@ class Fit:
         else:
             # The index of a surface is that of the medium it bounds, unless the file gives it.
             top = coefficients if isinstance(coefficients, sj.Dipole) else coefficients.top
-            surface, source = surface_and_source(self.medium)
+            surface, source = sj.io.surface_and_source(self.medium)
             surface = {"eta": top.medium.eta[0]} | surface
             material = sj.Material(fitted.gaussians, **surface, single_scattering=target.single)
             profile = target.profile if target.description is None else coefficients

@@ -24,10 +24,9 @@ import splatjax as sj
 from ._fit import Fit
 from ._materials import Export, Materials
 from ._recover import Recover
-from ._render import Render
+from ._render import Render, Turntable
 from ._sample import Sample
 from ._terminal import note
-from ._turntable import Turntable
 
 _COMMANDS = {
     "materials": Materials,

@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 
 import splatjax as sj
-from splatjax.scattering import AbstractRadialRule
 
 from ._terminal import stage
 
@@ -30,7 +29,7 @@ class Reference:
     """
 
     profile: sj.gaussians.AbstractProfile
-    rule: AbstractRadialRule = sj.scattering.L2_QUADRATURE
+    rule: sj.scattering.AbstractRadialRule = sj.scattering.L2_QUADRATURE
     single: sj.SingleScattering | None = None
     description: str | None = None
     weights: sj.fitting.AbstractWeights = MEDIUM_WEIGHTS

@@ -8,15 +8,12 @@ import contextlib
 import time
 from collections.abc import Callable, Generator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 from rich.console import Console
 
 from splatjax.io import atomic_path
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 OptionalPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="")]
 OptionalFloat = Annotated[float | None, tyro.conf.arg(metavar="FLOAT", help_behavior_hint="")]
@@ -61,8 +58,8 @@ def check_folder(path: Path) -> None:
         raise FileNotFoundError(f"{path}: there is no folder {path.parent}; make it first")
 
 
-def save_figure(figure: "Figure", path: Path) -> None:
-    """Write a drawing, whole or not at all, and print its path."""
+def save_figure(figure: Any, path: Path) -> None:
+    """Write a drawing of matplotlib, whole or not at all, and print its path."""
     with atomic_path(path) as temporary:
         figure.savefig(temporary, format=path.suffix[1:].lower())
     print(path)

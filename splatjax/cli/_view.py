@@ -13,9 +13,7 @@ import tyro
 
 import splatjax as sj
 from splatjax._memory import check_memory
-from splatjax.io import fingerprint, material_path
 from splatjax.render import check_displayable
-from splatjax.scene import Parts
 
 from ._terminal import Rules, UpAxis, check_options, note, option_name, stage
 
@@ -153,7 +151,7 @@ class ViewOptions:
         )
         return light, fill
 
-    def camera(self, parts: Parts, azimuth: float) -> sj.Camera:
+    def camera(self, parts: sj.scene.Parts, azimuth: float) -> sj.Camera:
         """Place a camera at an azimuth so that the bounding sphere of the splats, which come in
         parts, just fits the narrower side of the picture.
         """
@@ -184,8 +182,8 @@ class ViewOptions:
         """
         fields = asdict(self).items()
         options = {option_name(f): value for f, value in fields if f not in _NOT_IN_PICTURES}
-        splats = f"{self.splats.name}, {fingerprint(self.splats)}" if self.splats else None
-        material = material_path(self.material).read_text(encoding="utf-8")
+        splats = f"{self.splats.name}, {sj.io.fingerprint(self.splats)}" if self.splats else None
+        material = sj.io.material_path(self.material).read_text(encoding="utf-8")
         return options | {
             "splats": splats or "the built-in bust",
             "contents of --material": material,

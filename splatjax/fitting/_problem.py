@@ -11,8 +11,7 @@ from splatjax._chunking import jit_unless_traced
 from splatjax.gaussians import AbstractProfile, SumOfGaussians, gaussian
 from splatjax.scattering import L2_QUADRATURE, AbstractRadialRule, at_own_radii
 
-from ._dense import invert_moving
-from ._weights import AbstractWeights
+from ._weights import AbstractWeights, invert_moving
 
 
 def norm_radii(

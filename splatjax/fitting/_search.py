@@ -16,8 +16,8 @@ from jaxtyping import Array, Bool, Float, Int
 from splatjax._records import numbers, record
 from splatjax.scattering import Medium
 
-from ._dense import NormalEquations, invert_moving
 from ._problem import Expansion, FitProblem
+from ._weights import NormalEquations, invert_moving
 
 # Log variances, in squared length scales, between which a single Gaussian starts.
 _FIRST = (-3.0, 4.0)

@@ -37,7 +37,6 @@ COEFFICIENT_UNIT, VARIANCE_UNIT, THICKNESS_UNIT = "1/mm", "mm^2", "mm"
 _COEFFICIENTS = ("unit", "sigma_a", "sigma_s_prime", "eta")
 _TABLES = ("medium", "layers", "surface", "single_scattering", "source", "fit")
 _SURFACE = ("eta", "specular", "roughness")
-_LAYER = (*_COEFFICIENTS, "optical_depth", "thickness", "thickness_unit")
 # What [fit] calls a profile whose coefficients the file holds.
 _MODELS: dict[type, str] = {
     Dipole: "classical dipole",
@@ -235,7 +234,8 @@ def _read(name_or_path: str | os.PathLike[str]) -> tuple[Table, Dipole | Layered
         return tables, Dipole(_medium(tables.table("medium", (*_COEFFICIENTS, "sigma_s"))))
     if not kinds:
         return tables, None
-    layers = [_layer(each) for each in tables.tables("layers", _LAYER)]
+    known = (*_COEFFICIENTS, "optical_depth", "thickness", "thickness_unit")
+    layers = [_layer(each) for each in tables.tables("layers", known)]
     counts = [x.optical_depth.size if isinstance(x, Film) else x.channels for x in layers]
     _check_channels(tables, "[[layers]]", *counts)
     with naming(f"{path}: [[layers]]"):

@@ -17,8 +17,6 @@ from ._images import read_picture
 from ._tables import Table, read_toml
 
 _INTENSITIES = {"known": KnownIntensity, "unknown": UnknownIntensity, "unknown color": UnknownColor}
-_ENTRIES = ("file", "mask", "noise", "intensity", "camera", "lights")
-_CAMERA = ("position", "target", "up", "fov")
 _LIGHTS = {
     "directional": (DirectionalLight, ("direction", "irradiance", "cast_shadows")),
     "point": (PointLight, ("position", "intensity", "cast_shadows")),
@@ -53,7 +51,8 @@ def read_observations(path: str | os.PathLike[str]) -> list[Observation]:
     """
     path = Path(path)
     file = Table(path, "", read_toml(path, "name one that lists pictures"), ["pictures"])
-    return [_observation(table) for table in file.tables("pictures", _ENTRIES)]
+    entries = ("file", "mask", "noise", "intensity", "camera", "lights")
+    return [_observation(table) for table in file.tables("pictures", entries)]
 
 
 def picture_paths(path: str | os.PathLike[str]) -> list[Path]:
@@ -76,7 +75,7 @@ def _observation(table: Table) -> Observation:
         known &= True if mask is None or mask.shape != known.shape else mask
         size = np.sqrt(np.mean(np.square(picture[known]))) if known.any() else 0.0
         deviation = noise * (size or 1.0)
-    camera = table.table("camera", _CAMERA)
+    camera = table.table("camera", ("position", "target", "up", "fov"))
     vectors = [camera.numbers(name).tolist() for name in ("position", "target")]
     up = camera.numbers("up").tolist() if "up" in camera.entries else None
     height, width, channels = picture.shape

@@ -189,7 +189,7 @@ class SplatFile:
         **Raises:** `ValueError` when numbers are not finite, or not as `read_splats` reads them;
         how large the whole is turns out at the end.
         """
-        corners, dtype = [], jnp.result_type(float)
+        corners = []
         for begin in range(0, self.count, self.part):
             rows = self._rows(begin, min(self.part, self.count - begin))
             where = self.path.with_name(f"{self.path.name}, from vertex {begin}")
@@ -199,12 +199,7 @@ class SplatFile:
             except ValueError as error:
                 raise ValueError(f"{error}; or {_COMPLETE}") from None
             corners += [fields["centers"].min(axis=0), fields["centers"].max(axis=0)]
-            arrays: dict[str, Any] = {
-                name: jnp.asarray(values, dtype)
-                for name, values in fields.items()
-                if values is not None
-            }
-            yield Splats(**arrays)
+            yield Splats(**fields)
         _check_places(self.path, np.stack(corners), estimated=False)
 
     def _rows(self, begin: int, count: int) -> np.memmap:
