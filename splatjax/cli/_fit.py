@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Annotated
 
 import jax
-import jax.numpy as jnp
 import optimistix as optx
 import tyro
 
@@ -132,7 +131,7 @@ class Fit:
         fitted = self._fitted(target)
         _print(fitted)
         total = fitted.gaussians.total_reflectance()
-        if float(jnp.max(total)) > 1 + 1e-3:
+        if float(total.max()) > 1 + 1e-3:
             note(
                 f"{self.medium} sends back {_numbers(total, '.3g')} times the light it is given: "
                 "are its unit and power right?"

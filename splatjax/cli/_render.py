@@ -69,15 +69,13 @@ class Render(ViewOptions):
 
     def _streamed(self, path: Path) -> tuple[sj.Frame, sj.Material]:
         file = sj.SplatFile(path, self.stream, up=self.up)
-        material = self.displayable_material()
 
         def parts() -> Iterable[sj.Splats]:
             return map(self.adjusted, file())
 
         with stage(f"looking at {file.count} splats"):
             camera = self.camera(parts, self.azimuth)
-        first = next(iter(parts()))
-        material = self.material_for(first, material)
+        material = self.material_for(next(iter(parts())))
         lights = self.lights(material, self.azimuth, self.light_azimuth)
         with stage("rendering the stream", file.count) as report:
             frame = sj.render_streamed(

@@ -70,8 +70,8 @@ class ViewOptions:
     up: UpAxis = "y"
 
     def check(self, more_rules: Rules | None = None) -> None:
-        """Raise `ValueError` for options that break a rule, or that need more memory than there
-        is.
+        """Raise `ValueError` for options that break a rule, for a material that no PNG file shows,
+        and for more memory than there is.
         """
         finite, positive = "be a finite number", "be 1 or more"
         rules: Rules = {
@@ -91,6 +91,7 @@ class ViewOptions:
             ),
         }
         check_options(self, rules | (more_rules or {}))
+        check_displayable(sj.load_material(self.material).channels)
         count = 0 if self.splats else self.count
         check_memory(
             f"--width {self.width} --height {self.height}{f' --count {count}' if count else ''}",
@@ -100,7 +101,6 @@ class ViewOptions:
 
     def load(self) -> tuple[sj.Splats, sj.Material]:
         """Return the splats, and the material with which they are rendered."""
-        material = self.displayable_material()
         if self.splats is None:
             with stage(f"making the bust with {self.count} splats"):
                 splats = sj.bust(self.count)
@@ -108,16 +108,10 @@ class ViewOptions:
             with stage(f"reading {self.splats}"):
                 splats = sj.read_splats(self.splats, up=self.up)
         splats = self.adjusted(splats)
-        return splats, self.material_for(splats, material)
+        return splats, self.material_for(splats)
 
-    def displayable_material(self) -> sj.Material:
-        """Load the material; raise `ValueError` for one whose channels no PNG file shows."""
+    def material_for(self, splats: sj.Splats) -> sj.Material:
         material = sj.load_material(self.material)
-        check_displayable(material.channels)
-        return material
-
-    def material_for(self, splats: sj.Splats, material: sj.Material) -> sj.Material:
-        """Return a material with which splats are rendered."""
         if splats.albedo is not None:
             material = material.white()
             note(

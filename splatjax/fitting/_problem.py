@@ -116,7 +116,6 @@ class FitProblem(eqx.Module):
         return jnp.exp(2 * jnp.mean(jnp.log(self.scales)))
 
     def variances(self, log_variances: Float[Array, " gaussians"]) -> Float[Array, " gaussians"]:
-        """Compute the variances, mm^2."""
         return jnp.exp(log_variances) * self.squared_unit
 
     def log_variances(self, variances: Float[Array, " gaussians"]) -> Float[Array, " gaussians"]:
@@ -148,8 +147,6 @@ class FitProblem(eqx.Module):
                 return self.weights.solve(rows, target, energies, total)
             return self.weights.solve_active(rows, target, energies, total, active)
 
-        if active is not None:
-            basis = jnp.where(jnp.broadcast_to(active, basis.shape), basis, 0.0)
         coefficients, response = jax.vmap(solve)(basis, self.target, self.total / self.norm)
         residuals = self.target - jnp.einsum("cnk,ck->cn", basis, coefficients)
         return basis, coefficients, response, residuals

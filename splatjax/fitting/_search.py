@@ -52,10 +52,6 @@ class AbstractStart(eqx.Module):
         precision.
         """
 
-    def of_channels(self, channels: int) -> "AbstractStart":
-        """Return the starts of so many channels with separate variances, along a leading axis."""
-        return self
-
 
 class GreedyInsertion(AbstractStart):
     """From the best fit with one Gaussian fewer, and so on down to one: a Gaussian is inserted in
@@ -79,10 +75,6 @@ class GivenVariances(AbstractStart):
     """
 
     variances: Float[Array, "*channels gaussians"] = eqx.field(converter=numbers)
-
-    def of_channels(self, channels: int) -> "GivenVariances":
-        count = self.variances.shape[-1]
-        return GivenVariances(jnp.broadcast_to(self.variances, (channels, count)))
 
     def search(self, problem: FitProblem, count: int) -> Float[Array, " gaussians"]:
         if self.variances.shape != (count,):
@@ -248,7 +240,10 @@ class VariancesPerChannel(AbstractSpread):
 
     def over(self, function, problem, start):
         channels = jax.tree.map(lambda values: values[:, None], problem)
-        return jax.vmap(function)(channels, start.of_channels(problem.norm.shape[0]))
+        starts = jax.tree.map(
+            lambda values: jnp.broadcast_to(values, (*problem.norm.shape, values.shape[-1])), start
+        )
+        return jax.vmap(function)(channels, starts)
 
 
 def stationary(

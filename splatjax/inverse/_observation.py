@@ -4,7 +4,6 @@ import abc
 from collections.abc import Sequence
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, DTypeLike, Float
@@ -156,7 +155,7 @@ class UnknownBackground(AbstractBackground):
     """
 
     def counts(self, coverage: Float[Array, "height width"]) -> Float[Array, "height width"]:
-        return jax.lax.stop_gradient(jnp.where(coverage > _FILLED, 1.0, 0.0).astype(coverage.dtype))
+        return (coverage > _FILLED).astype(coverage.dtype)
 
 
 class BlackBackground(AbstractBackground):

@@ -1,7 +1,5 @@
 """A surface that moves along its normals, smoothly, and what becomes of its splats."""
 
-import math
-
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -84,7 +82,7 @@ class NormalOffsets(AbstractPart):
             tree, normals, areas, self.smoothness, -(-count // _ROUNDED) * _ROUNDED
         )
         around, tangents, slopes = _slopes(tree, normals)
-        gain = math.sqrt(np.mean(np.sum(weights**2, axis=1)))
+        gain = np.sqrt(np.mean(np.sum(weights**2, axis=1)))
         return OffsetTables(
             jnp.asarray(near, jnp.int32),
             jnp.asarray(weights, dtype),

@@ -208,7 +208,6 @@ class RecoveryProblem(eqx.Module):
         )
 
     def residuals(self, point: Float[Array, " unknowns"]) -> Float[Array, "pixels channels"]:
-        """Compute residuals whose squares are the losses; 0 where a pixel does not count."""
         together = zip(self.evidence, self.radiance(point), self.counted, strict=True)
         residuals = [one.residuals(*made, self.loss) for one, *made in together]
         return jnp.concatenate([each.reshape(-1, each.shape[-1]) for each in residuals])
@@ -227,8 +226,6 @@ def _with_points(picture: DiffusionBasis, kept: np.ndarray, dtype: DTypeLike) ->
 
 
 class SearchEnd(eqx.Module):
-    """The end of a search."""
-
     point: Float[Array, " unknowns"]
     cost: Float[Array, ""]
     steps: Int[Array, ""]

@@ -3,7 +3,6 @@ recovery, and of several.
 """
 
 import abc
-import math
 from collections.abc import Sequence
 
 import equinox as eqx
@@ -146,7 +145,7 @@ def _power(name: str, power: float) -> str:
 # Standard deviation of the logarithm of the width below which a layer is unresolved: twice as many
 # splats move it by as much, and that of regular ones lies a factor of 2.5 below that of scattered
 # ones.
-_RESOLUTION = 0.5 * math.log(2.0)
+_RESOLUTION = 0.5 * np.log(2.0)
 # Chi-squared per degree of freedom of a model that lacks something.
 _TOO_LARGE = 1.5
 # Of the light: marble on a head of 100,000 splats has 0.6 and comes back within 1.4%, the blue of

@@ -4,13 +4,12 @@ whole or not at all; and records as JSON, of what a file is made of.
 
 import hashlib
 import json
-import math
 import os
 import secrets
 from collections.abc import Generator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from jaxtyping import Float
@@ -18,8 +17,10 @@ from jaxtyping import Float
 from splatjax.exports import data_sheet
 from splatjax.scene import Material
 
+StrPath: TypeAlias = str | os.PathLike[str]
 
-def existing_file(path: str | os.PathLike[str]) -> Path:
+
+def existing_file(path: StrPath) -> Path:
     """Return the path of a file that exists.
 
     **Raises:** `FileNotFoundError`, or `IsADirectoryError` when it is a folder.
@@ -33,7 +34,7 @@ def existing_file(path: str | os.PathLike[str]) -> Path:
 
 
 @contextmanager
-def naming(where: str | os.PathLike[str]) -> Generator[None, None, None]:
+def naming(where: StrPath) -> Generator[None, None, None]:
     """Let errors name the file, or the place in it, whose contents they refuse."""
     try:
         yield
@@ -41,9 +42,9 @@ def naming(where: str | os.PathLike[str]) -> Generator[None, None, None]:
         raise type(error)(f"{where}: {error}") from None
 
 
-def check_units(path: Path, mm_per_unit: float, up: str = "y") -> None:
+def check_units(path: StrPath, mm_per_unit: float, up: str = "y") -> None:
     """Refuse a length of the unit (mm), or an upward axis, that cannot be."""
-    if not 0 < mm_per_unit < math.inf:
+    if not 0 < mm_per_unit < np.inf:
         raise ValueError(
             f"{path}: mm_per_unit is {mm_per_unit}; it must be the positive length of the file's "
             "unit in mm"
@@ -58,7 +59,7 @@ def with_y_up(vectors: Float[np.ndarray, "n 3"], up: str) -> Float[np.ndarray, "
 
 
 @contextmanager
-def atomic_path(path: str | os.PathLike[str]) -> Generator[Path, None, None]:
+def atomic_path(path: StrPath) -> Generator[Path, None, None]:
     """Yield a temporary path beside `path`, with its suffix, to write to; it takes the name `path`
     when the block ends well.
 
@@ -95,7 +96,7 @@ def atomic_path(path: str | os.PathLike[str]) -> Generator[Path, None, None]:
             temporary.unlink(missing_ok=True)
 
 
-def fingerprint(path: str | os.PathLike[str]) -> str:
+def fingerprint(path: StrPath) -> str:
     """Return what distinguishes the contents of a file: its size and its SHA-256.
 
     **Raises:** `OSError` when the file cannot be read.
@@ -105,7 +106,7 @@ def fingerprint(path: str | os.PathLike[str]) -> str:
         return f"{file.tell()} bytes, SHA-256 {digest}"
 
 
-def write_record(path: str | os.PathLike[str], record: Mapping[str, Any]) -> None:
+def write_record(path: StrPath, record: Mapping[str, Any]) -> None:
     """Write a record as JSON, whole or not at all.
 
     **Raises:** `FileNotFoundError` when the folder does not exist.
@@ -114,7 +115,7 @@ def write_record(path: str | os.PathLike[str], record: Mapping[str, Any]) -> Non
         temporary.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
 
 
-def read_record(path: str | os.PathLike[str]) -> dict[str, Any]:
+def read_record(path: StrPath) -> dict[str, Any]:
     """Read what `write_record` wrote.
 
     **Raises:** `FileNotFoundError`, or `ValueError` when the file is no record.
@@ -130,7 +131,7 @@ def read_record(path: str | os.PathLike[str]) -> dict[str, Any]:
     return record
 
 
-def save_exports(material: Material, path: str | os.PathLike[str]) -> None:
+def save_exports(material: Material, path: StrPath) -> None:
     r"""Write a material's Gaussians in the terms of other renderers to a JSON file
     (`splatjax.exports.data_sheet`), whole or not at all.
 

@@ -2,7 +2,6 @@
 them, checked once, whatever the format.
 """
 
-import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,7 +22,7 @@ from splatjax.geometry import (
 )
 from splatjax.scene import Splats
 
-from ._files import check_units, existing_file, naming, with_y_up
+from ._files import StrPath, check_units, existing_file, naming, with_y_up
 from ._images import read_color, read_map, srgb_to_linear
 from ._trimesh import FORMATS, load_with_trimesh, one_sentence
 
@@ -33,7 +32,6 @@ _BYTES_PER_CORNER = 300.0  # of a mesh, on its way from the file to splats
 _FARTHEST, _MOST_TILES = 1e12, 1e6  # units, beyond which areas overflow; repeats of a texture
 _BORDER = 1e-3  # of a texture: coordinates may be off by this much
 _ENDS = re.compile(rb'"wrap[ST]" *: *(33071|33648)')  # a texture of glTF that does not repeat
-Name = str | os.PathLike[str]
 
 
 class Piece(NamedTuple):
@@ -50,13 +48,13 @@ class Piece(NamedTuple):
 
 
 def sample_mesh(
-    path: Name,
+    path: StrPath,
     count: int,
     *,
     mm_per_unit: float,
-    albedo: Name | None = None,
-    specular: Name | None = None,
-    normal: Name | None = None,
+    albedo: StrPath | None = None,
+    specular: StrPath | None = None,
+    normal: StrPath | None = None,
     v_up: bool | None = None,
     up: str = "y",
     crop_min_y: float | None = None,
@@ -109,12 +107,12 @@ def sample_mesh(
 
 
 def read_textured_mesh(
-    path: Name,
+    path: StrPath,
     *,
     mm_per_unit: float,
-    albedo: Name | None = None,
-    specular: Name | None = None,
-    normal: Name | None = None,
+    albedo: StrPath | None = None,
+    specular: StrPath | None = None,
+    normal: StrPath | None = None,
     v_up: bool | None = None,
     up: str = "y",
     crop_min_y: float | None = None,

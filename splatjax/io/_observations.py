@@ -1,18 +1,15 @@
 """Pictures that were taken, and how: a TOML file that names them, with cameras and lights."""
 
-import os
-from functools import partial
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from splatjax._records import check_values
 from splatjax.inverse import KnownIntensity, Observation, UnknownColor, UnknownIntensity
 from splatjax.scene import AbstractLight, Camera, DirectionalLight, GaussianBeam, PointLight
 
-from ._files import naming
+from ._files import StrPath, naming
 from ._images import read_picture
 from ._tables import Table, read_toml
 
@@ -25,7 +22,7 @@ _LIGHTS = {
 _LIGHT_ENTRIES = {"kind"}.union(*(names for _, names in _LIGHTS.values()))
 
 
-def read_observations(path: str | os.PathLike[str]) -> list[Observation]:
+def read_observations(path: StrPath) -> list[Observation]:
     r"""Read which pictures were taken, and how.
 
         [[pictures]]
@@ -55,7 +52,7 @@ def read_observations(path: str | os.PathLike[str]) -> list[Observation]:
     return [_observation(table) for table in file.tables("pictures", entries)]
 
 
-def picture_paths(path: str | os.PathLike[str]) -> list[Path]:
+def picture_paths(path: StrPath) -> list[Path]:
     """Return the files that the observations of a file are read from, itself first."""
     path = Path(path)
     pictures = read_toml(path, "name one that lists pictures")["pictures"]
@@ -79,11 +76,11 @@ def _observation(table: Table) -> Observation:
     vectors = [camera.numbers(name).tolist() for name in ("position", "target")]
     up = camera.numbers("up").tolist() if "up" in camera.entries else None
     height, width, channels = picture.shape
-    look_at = partial(Camera.look_at, up=up, fov=camera.number("fov", 25.0))
+    fov = camera.number("fov", 25.0)
     return table.make(
         Observation,
-        jnp.asarray(picture, float),
-        camera.make(look_at, *vectors, width=width, height=height),
+        picture,
+        camera.make(Camera.look_at, *vectors, up=up, fov=fov, width=width, height=height),
         tuple(_light(each, channels) for each in table.tables("lights", _LIGHT_ENTRIES)),
         mask,
         deviation,

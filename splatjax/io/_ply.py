@@ -1,6 +1,5 @@
 """Splats in PLY files, read at once or, of files that are larger than memory, a part at a time."""
 
-import os
 import warnings
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -13,7 +12,7 @@ from jaxtyping import Float
 from splatjax.geometry import complete_splats, unit
 from splatjax.scene import Splats
 
-from ._files import atomic_path, check_units, existing_file, naming, with_y_up
+from ._files import StrPath, atomic_path, check_units, existing_file, naming, with_y_up
 from ._images import srgb_to_linear
 from ._trimesh import FORMATS, load_with_trimesh, one_sentence
 
@@ -53,7 +52,7 @@ _VALID = {
 }
 
 
-def read_splats(path: str | os.PathLike[str], *, mm_per_unit: float = 1.0, up: str = "y") -> Splats:
+def read_splats(path: StrPath, *, mm_per_unit: float = 1.0, up: str = "y") -> Splats:
     r"""Read splats from the vertices of a PLY file: ASCII or binary of either byte order,
     properties in any order.
 
@@ -99,7 +98,7 @@ def read_splats(path: str | os.PathLike[str], *, mm_per_unit: float = 1.0, up: s
         return complete_splats(centers, **fields)
 
 
-def write_splats(path: str | os.PathLike[str], splats: Splats) -> None:
+def write_splats(path: StrPath, splats: Splats) -> None:
     r"""Write splats to a binary PLY file, in mm, as float32, whole or not at all.
 
     Albedo of three channels is written as linear `red green blue` floats (no loss), so that
@@ -154,7 +153,7 @@ class SplatFile:
 
     def __init__(
         self,
-        path: str | os.PathLike[str],
+        path: StrPath,
         part: int = 1_000_000,
         *,
         mm_per_unit: float = 1.0,
@@ -260,7 +259,6 @@ def _check_places(path: Path, centers: Float[np.ndarray, "n 3"], *, estimated: b
 def _values(
     path: Path, field: str, columns: dict[str, np.ndarray], scale: float
 ) -> Float[np.ndarray, "*shape"]:
-    """Return a field of splats, validated."""
     with np.errstate(invalid="ignore"):  # of NaN that signals
         values = scale * np.stack(list(columns.values())).astype(np.float64)
     kind, *others = {column.dtype for column in columns.values()}
