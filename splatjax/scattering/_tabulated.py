@@ -64,10 +64,10 @@ class Tabulated(AbstractProfile):
     def without(self, profile: AbstractProfile) -> "Tabulated":
         """Subtract a profile: single scattering, for a fit of the rest."""
         if profile.singular:
-            known = (
+            requirement = (
                 f"above 0, since {type(profile).__name__} is infinite at r = 0: leave that row out"
             )
-            check_values("Tabulated.radii", self.radii, known, lambda x: x > 0)
+            check_values("Tabulated.radii", self.radii, requirement, lambda x: x > 0)
         total = None if self.total is None else self.total - profile.total_reflectance()
         return Tabulated(self.radii, self.values - profile(self.radii), self.deviation, total)
 
