@@ -5,49 +5,35 @@ from pathlib import Path
 from typing import Annotated
 
 import jax
-import jax.numpy as jnp
 import optimistix as optx
 import tyro
 
 import splatjax as sj
 from splatjax._format import channel_names, counted
-from splatjax.fitting import AbstractWeights
-from splatjax.io import read_picture, surface_and_source
-from splatjax.scattering import measure_laser_dot
 
 from ._fit_all import fit_all
 from ._models import Model, Reference, reference
-from ._options import (
+from ._terminal import (
     FIGURES,
     OptionalFloat,
     OptionalPath,
     check_options,
     check_output,
+    note,
     option_name,
+    print_table,
     save_figure,
+    stage,
 )
-from ._report import note, print_table, stage
 
 _COEFFICIENTS, _PROFILE, _PHOTOGRAPH = "coefficients", "a measured profile", "a photograph"
 _KINDS = {".csv": _PROFILE, ".exr": _PHOTOGRAPH}
+# Options that have an effect on one kind of input alone.
 _OPTIONS = {
     _COEFFICIENTS: ("model", "photons", "single_scattering"),
     _PROFILE: ("mm_per_unit",),
     _PHOTOGRAPH: ("mm_per_pixel", "power"),
 }
-"""Options that have an effect on one kind of input alone."""
-_MEDIUM = (
-    "Name of a material (`splatjax materials`), or path: of a TOML file with a [medium] or "
-    "[[layers]], of a CSV file with radii "
-    "and a column per channel, or of an EXR file with a linear photograph of a laser dot."
-)
-_ALL = (
-    "Fit all media of a CSV file, whose columns are sigma_a, sigma_s_prime (1/mm), eta, and a name "
-    "if you like; --output is a "
-    "CSV file then. Batches that are finished stay: after an interruption, run the same command "
-    "again. Where a launcher has "
-    "started several processes (docs/devices.md), they share the work."
-)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,8 +43,8 @@ class Fit:
     The profile is that of a medium, that of layers, a measured one, or that of a laser dot in a
     photograph. Double precision. Variances are shared by the channels. Weights are not negative,
     and their sum is held at the total reflectance of the profile, so that the picture keeps its
-    energy, unless --free is given. To measured profiles, whose totals are not known, weights are
-    fitted freely, but not below zero.
+    energy. To measured profiles, whose totals are not known, weights are fitted freely, but not
+    below zero.
 
     A medium is taken for what --model says: the dipole, which publications use, or one that comes
     nearer to the truth, or the truth itself (docs/which_profile.md).
@@ -67,7 +53,14 @@ class Fit:
               splatjax fit media.csv --all --output fits.csv
     """
 
-    medium: Annotated[tyro.conf.Positional[str], tyro.conf.arg(help=_MEDIUM)]
+    medium: Annotated[
+        tyro.conf.Positional[str],
+        tyro.conf.arg(
+            help="Name of a material (`splatjax materials`), or path: of a TOML file with a "
+            "[medium] or [[layers]], of a CSV file with radii and a column per channel, or of an "
+            "EXR file with a linear photograph of a laser dot."
+        ),
+    ]
     #: Number of Gaussians.
     count: int = 6
     #: Take the least number of Gaussians, up to 12, that leaves no channel a larger error (Eq. 4),
@@ -81,22 +74,27 @@ class Fit:
     #: Of photon beams and Monte Carlo: keep light that scatters once as a term of its own, and fit
     #: Gaussians to the rest.
     single_scattering: bool = False
-    #: Leave the weights free: the least error of Eq. 3, which may miss some of the energy.
-    free: bool = False
     #: Of a CSV file: its unit of length, mm.
     mm_per_unit: float = 1.0
     #: Of a photograph: the size of a pixel on the surface, mm.
     mm_per_pixel: OptionalFloat = None
     #: Of a photograph: the light that enters the material, in W if the picture is in W/(mm^2 sr).
     power: float = 1.0
-    all: Annotated[bool, tyro.conf.arg(help=_ALL)] = False
+    all: Annotated[
+        bool,
+        tyro.conf.arg(
+            help="Fit all media of a CSV file, whose columns are sigma_a, sigma_s_prime (1/mm), "
+            "eta, and a name if you like; --output is a CSV file then. Batches that are finished "
+            "stay: after an interruption, run the same command again. Where a launcher has started "
+            "several processes (docs/devices.md), they share the work."
+        ),
+    ] = False
     #: TOML file to write the material to.
     output: OptionalPath = None
     #: Picture to write of profile, fit and error: .png, .pdf or .svg.
     plot: OptionalPath = None
 
     def run(self) -> None:
-        """Fit, print, write."""
         check_output(self.output, (".csv",) if self.all else (".toml",))
         check_output(self.plot, FIGURES)
         most = 8 if self.all else sj.fitting.LeastCount.largest
@@ -111,18 +109,17 @@ class Fit:
     def _run_all(self) -> None:
         if self.output is None:
             raise ValueError("--all needs --output, a CSV file for what is fitted")
-        kept = ("medium", "all", "count", "free", "output")
+        kept = ("medium", "all", "count", "output")
         if self != Fit(**{name: getattr(self, name) for name in kept}):
-            raise ValueError(
-                "--all fits dipoles by --count and --free alone; leave the other options out"
-            )
-        fit_all(Path(self.medium), self.output, self.count, self._weights(measured=False)[0])
+            raise ValueError("--all fits dipoles by --count alone; leave the other options out")
+        fit_all(Path(self.medium), self.output, self.count)
 
     def _run(self) -> None:
         self._check_options()
         coefficients = self._coefficients()
         if isinstance(coefficients, sj.scattering.Tabulated):
-            measured, target = True, Reference(coefficients, description="measured")
+            weights = sj.fitting.NonNegativeWeights(sj.fitting.FreeWeights())
+            target = Reference(coefficients, description="measured", weights=weights)
             radii = len(coefficients.radii)
             if self.error is None and 2 * self.count > radii:
                 note(
@@ -130,19 +127,17 @@ class Fit:
                     f"{counted(self.count, 'Gaussian')} apart: give a smaller --count"
                 )
         else:
-            options = self.model, self.photons, self.single_scattering
-            measured, target = False, reference(coefficients, *options)
-        weights, weights_of = self._weights(measured)
-        fitted = self._fitted(target, weights)
+            target = reference(coefficients, self.model, self.photons, self.single_scattering)
+        fitted = self._fitted(target)
         _print(fitted)
         total = fitted.gaussians.total_reflectance()
-        if float(jnp.max(total)) > 1 + 1e-3:
+        if float(total.max()) > 1 + 1e-3:
             note(
                 f"{self.medium} sends back {_numbers(total, '.3g')} times the light it is given: "
                 "are its unit and power right?"
             )
         if self.output is not None:
-            self._save(self.output, coefficients, target, fitted, weights_of)
+            self._save(self.output, coefficients, target, fitted)
             print(self.output)
         if self.plot is not None:
             from splatjax.plots import plot_fit  # loads matplotlib
@@ -173,28 +168,20 @@ class Fit:
             raise ValueError(
                 f"{self.medium}: how large is a pixel on the surface? give --mm-per-pixel"
             )
-        image = read_picture(self.medium)
+        image = sj.io.read_picture(self.medium)
         try:
-            return measure_laser_dot(image, self.mm_per_pixel, power=self.power).profile
+            dot = sj.scattering.measure_laser_dot(image, self.mm_per_pixel, power=self.power)
+            return dot.profile
         except ValueError as error:
             raise ValueError(f"{self.medium}: {error}") from None
 
-    def _weights(self, measured: bool) -> tuple[AbstractWeights, str]:
-        """Return the constraint on the weights, and its description."""
-        if self.free:
-            return sj.fitting.FreeWeights(), "free"
-        if measured:
-            return sj.fitting.NonNegativeWeights(sj.fitting.FreeWeights()), "non-negative"
-        held = sj.fitting.NonNegativeWeights(sj.fitting.FixedTotalReflectance())
-        return held, "non-negative, sum held to the total reflectance"
-
-    def _fitted(self, target: Reference, weights: AbstractWeights) -> sj.fitting.FitResult:
+    def _fitted(self, target: Reference) -> sj.fitting.FitResult:
         count = self.count if self.error is None else sj.fitting.LeastCount(self.error)
         number = counted(self.count, "Gaussian")
         goal = number if self.error is None else f"Gaussians to an error of {self.error:g}"
         with stage(f"fitting to {self.medium}: {goal}"):
             fitted = sj.fit_gaussians(
-                target.profile, count, weights=weights, rule=target.rule, throw=False
+                target.profile, count, weights=target.weights, rule=target.rule, throw=False
             )
             if jax.block_until_ready(fitted).result != optx.RESULTS.successful:
                 number = counted(len(fitted.gaussians.variances), "Gaussian")
@@ -212,25 +199,24 @@ class Fit:
         coefficients: sj.Dipole | sj.LayeredMultipole | sj.scattering.Tabulated,
         target: Reference,
         fitted: sj.fitting.FitResult,
-        weights_of: str,
     ) -> None:
+        is_measured = isinstance(coefficients, sj.scattering.Tabulated)
+        held = "" if is_measured else ", sum held to the total reflectance"
         settings = {
+            **({} if target.description is None else {"profile": target.description}),
             "variances_of": "all channels",
-            "weights_of": weights_of,
+            "weights_of": f"non-negative{held}",
             "error": fitted.error,
             "energy_error": fitted.energy_error,
         }
-        if target.description is not None:
-            settings = {"profile": target.description} | settings
-        provenance = f"fitted by splatjax {sj.__version__} to the "
+        target_of = "profile" if is_measured else "coefficients"
+        provenance = f"fitted by splatjax {sj.__version__} to the {target_of} of {self.medium}"
         if isinstance(coefficients, sj.scattering.Tabulated):
-            provenance += f"profile of {self.medium}"
             material, profile, source = sj.Material(fitted.gaussians), None, {}
         else:
-            provenance += f"coefficients of {self.medium}"
             # The index of a surface is that of the medium it bounds, unless the file gives it.
             top = coefficients if isinstance(coefficients, sj.Dipole) else coefficients.top
-            surface, source = surface_and_source(self.medium)
+            surface, source = sj.io.surface_and_source(self.medium)
             surface = {"eta": top.medium.eta[0]} | surface
             material = sj.Material(fitted.gaussians, **surface, single_scattering=target.single)
             profile = target.profile if target.description is None else coefficients

@@ -13,16 +13,16 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 import splatjax as sj
-from splatjax.fitting import AbstractWeights
 from splatjax.io import fingerprint, read_columns, read_media, write_columns
 
-from ._report import note
+from ._models import MEDIUM_WEIGHTS
 from ._resumable import complete
+from ._terminal import note
 
 _BATCH = 500  # media in one call
 
 
-def fit_all(media: Path, output: Path, count: int, weights: AbstractWeights) -> None:
+def fit_all(media: Path, output: Path, count: int) -> None:
     """Fit sums of Gaussians to the dipoles of the media of a table, and write one table.
 
     Batches lie in a folder beside it until all are there. Where a launcher has started several
@@ -34,7 +34,6 @@ def fit_all(media: Path, output: Path, count: int, weights: AbstractWeights) -> 
     record = {
         "media": fingerprint(media),
         "--count": count,
-        "weights": type(weights).__name__,
         "splatjax": sj.__version__,
         "jax": jax.__version__,
     }
@@ -43,7 +42,7 @@ def fit_all(media: Path, output: Path, count: int, weights: AbstractWeights) -> 
 
     def fit(i: int) -> None:
         batch = slice(begins[i], begins[i] + _BATCH)
-        columns = _fitted(coefficients[batch], count, weights)
+        columns = _fitted(coefficients[batch], count)
         write_columns(parts[i], {"name": names[batch]} | columns)
 
     what = f"fitting {count} Gaussians to {len(names)} media, {_BATCH} at a time"
@@ -70,25 +69,22 @@ def fit_all(media: Path, output: Path, count: int, weights: AbstractWeights) -> 
 
 
 @eqx.filter_jit
-def _fit_each(coefficients: Float[Array, "media 3"], starts, count: int, weights: AbstractWeights):
+def _fit_each(coefficients: Float[Array, "media 3"], starts: sj.fitting.DipoleStarts, count: int):
     def fit(row):
         medium = sj.Medium(row[0:1], row[1:2], row[2:3])
         start = sj.fitting.GivenVariances(starts(medium, count).variances[0])
-        fitted = sj.fit_gaussians(
-            sj.Dipole(medium), count, start=start, weights=weights, throw=False
-        )
+        profile = sj.Dipole(medium)
+        fitted = sj.fit_gaussians(profile, count, start=start, weights=MEDIUM_WEIGHTS, throw=False)
         return fitted, fitted.result == optx.RESULTS.successful
 
     return eqx.filter_vmap(fit)(coefficients)
 
 
-def _fitted(
-    coefficients: np.ndarray, count: int, weights: AbstractWeights
-) -> dict[str, np.ndarray]:
+def _fitted(coefficients: np.ndarray, count: int) -> dict[str, np.ndarray]:
     """Return the columns of a batch. A smaller batch is padded, so that one program serves all."""
     given = len(coefficients)
     padded = np.pad(coefficients, ((0, _BATCH - given), (0, 0)), mode="edge")
-    fitted, converged = _fit_each(jnp.asarray(padded), sj.io.dipole_starts(), count, weights)
+    fitted, converged = _fit_each(jnp.asarray(padded), sj.io.dipole_starts(), count)
     columns = dict(zip(("sigma_a", "sigma_s_prime", "eta"), padded.T, strict=True))
     columns |= {f"variance_{i + 1}": fitted.gaussians.variances[:, i] for i in range(count)}
     columns |= {f"weight_{i + 1}": fitted.gaussians.weights[:, i, 0] for i in range(count)}

@@ -11,15 +11,8 @@ import jax
 import tyro
 
 import splatjax as sj
-from splatjax.io import material_path, save_exports, surface_and_source
 
-from ._options import check_output
-from ._report import print_table
-
-_MATERIAL = (
-    "Print the file of this one: coefficients, source, Gaussians. A beginning of "
-    "one's own. Without it, list all."
-)
+from ._terminal import check_output, print_table
 
 
 @dataclass(frozen=True)
@@ -34,13 +27,17 @@ class Materials:
 
     material: Annotated[
         tyro.conf.Positional[str | None],
-        tyro.conf.arg(metavar="[MATERIAL]", help=_MATERIAL, help_behavior_hint=""),
+        tyro.conf.arg(
+            metavar="[MATERIAL]",
+            help="Print the file of this one: coefficients, source, Gaussians. A beginning of "
+            "one's own. Without it, list all.",
+            help_behavior_hint="",
+        ),
     ] = None
 
     def run(self) -> None:
-        """Print one line per material, or the file of one."""
         if self.material is not None:
-            print(material_path(self.material).read_text(encoding="utf-8"), end="")
+            print(sj.io.material_path(self.material).read_text(encoding="utf-8"), end="")
             return
         titles = ("material", "known", "total reflectance", "widest, mm", "eta", "source")
         print_table([titles, *map(_row, sj.list_materials())])
@@ -62,15 +59,14 @@ class Export:
     output: Path
 
     def run(self) -> None:
-        """Load, write."""
         check_output(self.output, (".json",))
         with jax.enable_x64(True):
-            save_exports(sj.load_material(self.material), self.output)
+            sj.io.save_exports(sj.load_material(self.material), self.output)
         print(self.output)
 
 
 def _row(name: str) -> tuple[str, ...]:
-    material, (_, source) = sj.load_material(name), surface_and_source(name)
+    material, (_, source) = sj.load_material(name), sj.io.surface_and_source(name)
     try:
         layered = isinstance(sj.load_profile(name), sj.LayeredMultipole)
         known = "layers" if layered else "coefficients"

@@ -7,13 +7,14 @@ import jax
 import jax.numpy as jnp
 
 import splatjax as sj
-from splatjax.scattering import AbstractRadialRule
 
-from ._report import stage
+from ._terminal import stage
 
 Model: TypeAlias = Literal["dipole", "better-dipole", "photon-beam", "monte-carlo"]
+# Weights of the fit to a medium: the picture keeps its energy.
+MEDIUM_WEIGHTS = sj.fitting.NonNegativeWeights(sj.fitting.FixedTotalReflectance())
+# Radii for profiles that are infinite at the origin: from so many mean free paths on.
 _BEYOND = sj.scattering.L2_QUADRATURE.beyond(0.2)
-"""Radii for profiles that are infinite at the origin: from so many mean free paths on."""
 
 
 @dataclass(frozen=True)
@@ -24,12 +25,14 @@ class Reference:
 
     - `single`: light that scatters once, where it is kept apart from the profile.
     - `description`: of a profile that coefficients alone do not give back.
+    - `weights`: those that the fit may choose from.
     """
 
     profile: sj.gaussians.AbstractProfile
-    rule: AbstractRadialRule = sj.scattering.L2_QUADRATURE
+    rule: sj.scattering.AbstractRadialRule = sj.scattering.L2_QUADRATURE
     single: sj.SingleScattering | None = None
     description: str | None = None
+    weights: sj.fitting.AbstractWeights = MEDIUM_WEIGHTS
 
 
 def reference(

@@ -13,30 +13,20 @@ import tyro
 
 import splatjax as sj
 from splatjax._format import counted
-from splatjax.io import (
-    fingerprint,
-    material_path,
-    picture_paths,
-    read_record,
-    write_record,
-)
 
-from ._options import (
+from ._terminal import (
     FIGURES,
     OptionalFloat,
     OptionalPath,
     check_options,
     check_output,
+    note,
     save_figure,
+    stage,
 )
-from ._report import note, stage
 
-_START = (
-    "Materials to start from, within a factor of three in both coefficients: names, "
-    "or paths of TOML files. The best end counts."
-)
+# Of any translucent solid: diamond has 2.4.
 _LARGEST_ETA = 3.0
-"""Of any translucent solid: diamond has 2.4."""
 _COEFFICIENTS = ("sigma_a", "sigma_s_prime")
 _MODELS = {"dipole": sj.Dipole, "better-dipole": sj.scattering.BetterDipole}
 
@@ -74,7 +64,12 @@ class Recover:
     #: TOML file that lists the pictures.
     pictures: tyro.conf.Positional[Path]
     start: Annotated[
-        tuple[str, ...], tyro.conf.arg(metavar="MATERIAL [MATERIAL ...]", help=_START)
+        tuple[str, ...],
+        tyro.conf.arg(
+            metavar="MATERIAL [MATERIAL ...]",
+            help="Materials to start from, within a factor of three in both coefficients: names, "
+            "or paths of TOML files. The best end counts.",
+        ),
     ] = ("skin1", "marble")
     #: Index of refraction, which is not searched. Without it, that of the first start.
     eta: OptionalFloat = None
@@ -96,7 +91,6 @@ class Recover:
     suggest: bool = True
 
     def run(self) -> None:
-        """Load, recover, print, write."""
         check_output(self.output, (".toml",))
         check_output(self.report, FIGURES)
         in_range = self.eta is None or 1 <= self.eta <= _LARGEST_ETA
@@ -115,7 +109,14 @@ class Recover:
 
     def _run(self, observations: list[sj.inverse.Observation], splats: sj.Splats) -> None:
         search = self.output.with_suffix(".search.json")
-        dependencies = self._dependencies()
+        materials = map(sj.io.material_path, self.start)
+        files = [self.splats, *sj.io.picture_paths(self.pictures), *materials]
+        names = ("model", "count", "robust", "eta", "specular", "roughness")
+        dependencies = {
+            "files": [sj.io.fingerprint(file) for file in files],
+            **{name: getattr(self, name) for name in names},
+            "splatjax": sj.__version__,
+        }
         starts = self._starts(search, dependencies, observations[0].picture.shape[2])
         begin = time.perf_counter()
 
@@ -123,7 +124,7 @@ class Recover:
             note(f"{time.perf_counter() - begin:6.1f} s  {what}")
             if medium is not starts[0]:
                 values = {name: getattr(medium, name).tolist() for name in _COEFFICIENTS}
-                write_record(search, {"made of": dependencies, **values})
+                sj.io.write_record(search, {"made of": dependencies, **values})
 
         gaussians = sj.SumOfGaussians(jnp.ones(1), jnp.ones((1, starts[0].eta.shape[0])))
         recovery = sj.inverse.recover(
@@ -171,23 +172,12 @@ class Recover:
         starts = [sj.Medium(medium.sigma_a, medium.sigma_s_prime, eta) for medium in media]
         if not search.exists():
             return starts
-        record = read_record(search)
+        record = sj.io.read_record(search)
         if record.get("made of") != dependencies:
             note(f"{search}: is of another search, and is not used")
             return starts
         note(f"{search}: an interrupted search goes on")
         return [sj.Medium(*(jnp.asarray(record[name]) for name in _COEFFICIENTS), eta)]
-
-    def _dependencies(self) -> dict[str, Any]:
-        """Return all that a search depends on."""
-        materials = (material_path(name) for name in self.start)
-        files = [self.splats, *picture_paths(self.pictures), *materials]
-        names = ("model", "count", "robust", "eta", "specular", "roughness")
-        return {
-            "files": [fingerprint(file) for file in files],
-            **{name: getattr(self, name) for name in names},
-            "splatjax": sj.__version__,
-        }
 
     def _suggest(
         self,

@@ -12,7 +12,7 @@ from jax.extend.backend import clear_backends
 
 from splatjax.io import read_record, write_record
 
-from ._report import note, stage
+from ._terminal import note, stage
 
 # Variables that hold how many processes a launcher has started; the first that is set counts.
 _COUNTS = "JAX_NUM_PROCESSES", "SLURM_STEP_NUM_TASKS", "OMPI_COMM_WORLD_SIZE"

@@ -9,14 +9,7 @@ import tyro
 
 import splatjax as sj
 
-from ._options import OptionalFloat, OptionalPath, UpAxis, check_output
-from ._report import note, stage
-
-_V_UP = (
-    "Whether v = 0 is the lower edge of a map. Without it, as the format prescribes: OBJ yes, glTF "
-    "and GLB no. If lips land on "
-    "the chin, say True."
-)
+from ._terminal import OptionalFloat, OptionalPath, UpAxis, check_output, note, stage
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,13 +48,18 @@ class Sample:
     #: Tangent-space normal map; green points up.
     normal: OptionalPath = None
     v_up: Annotated[
-        bool | None, tyro.conf.arg(metavar="{True,False}", help=_V_UP, help_behavior_hint="")
+        bool | None,
+        tyro.conf.arg(
+            metavar="{True,False}",
+            help="Whether v = 0 is the lower edge of a map. Without it, as the format prescribes: "
+            "OBJ yes, glTF and GLB no. If lips land on the chin, say True.",
+            help_behavior_hint="",
+        ),
     ] = None
     #: Cut off what lies below this height, in the file's unit.
     crop_min_y: OptionalFloat = None
 
     def run(self) -> None:
-        """Read, sample, write."""
         check_output(self.output, (".ply",))
         placed = ("mesh", "count", "output")
         options = {name: value for name, value in vars(self).items() if name not in placed}

@@ -13,12 +13,9 @@ import tyro
 
 import splatjax as sj
 from splatjax._memory import check_memory
-from splatjax.io import fingerprint, material_path
 from splatjax.render import check_displayable
-from splatjax.scene import Parts
 
-from ._options import Rules, UpAxis, check_options, option_name
-from ._report import note, stage
+from ._terminal import Rules, UpAxis, check_options, note, option_name, stage
 
 # Degrees: the fill stands beside the camera, on the side away from the light.
 _FILL_SIDE, _FILL_ELEVATION = 25.0, 10.0
@@ -73,8 +70,8 @@ class ViewOptions:
     up: UpAxis = "y"
 
     def check(self, more_rules: Rules | None = None) -> None:
-        """Raise `ValueError` for options that break a rule, or that need more memory than there
-        is.
+        """Raise `ValueError` for options that break a rule, for a material that no PNG file shows,
+        and for more memory than there is.
         """
         finite, positive = "be a finite number", "be 1 or more"
         rules: Rules = {
@@ -94,6 +91,7 @@ class ViewOptions:
             ),
         }
         check_options(self, rules | (more_rules or {}))
+        check_displayable(sj.load_material(self.material).channels)
         count = 0 if self.splats else self.count
         check_memory(
             f"--width {self.width} --height {self.height}{f' --count {count}' if count else ''}",
@@ -103,7 +101,6 @@ class ViewOptions:
 
     def load(self) -> tuple[sj.Splats, sj.Material]:
         """Return the splats, and the material with which they are rendered."""
-        material = self.displayable_material()
         if self.splats is None:
             with stage(f"making the bust with {self.count} splats"):
                 splats = sj.bust(self.count)
@@ -111,16 +108,10 @@ class ViewOptions:
             with stage(f"reading {self.splats}"):
                 splats = sj.read_splats(self.splats, up=self.up)
         splats = self.adjusted(splats)
-        return splats, self.material_for(splats, material)
+        return splats, self.material_for(splats)
 
-    def displayable_material(self) -> sj.Material:
-        """Load the material; raise `ValueError` for one whose channels no PNG file shows."""
+    def material_for(self, splats: sj.Splats) -> sj.Material:
         material = sj.load_material(self.material)
-        check_displayable(material.channels)
-        return material
-
-    def material_for(self, splats: sj.Splats, material: sj.Material) -> sj.Material:
-        """Return a material with which splats are rendered."""
         if splats.albedo is not None:
             material = material.white()
             note(
@@ -154,7 +145,7 @@ class ViewOptions:
         )
         return light, fill
 
-    def camera(self, parts: Parts, azimuth: float) -> sj.Camera:
+    def camera(self, parts: sj.scene.Parts, azimuth: float) -> sj.Camera:
         """Place a camera at an azimuth so that the bounding sphere of the splats, which come in
         parts, just fits the narrower side of the picture.
         """
@@ -185,8 +176,8 @@ class ViewOptions:
         """
         fields = asdict(self).items()
         options = {option_name(f): value for f, value in fields if f not in _NOT_IN_PICTURES}
-        splats = f"{self.splats.name}, {fingerprint(self.splats)}" if self.splats else None
-        material = material_path(self.material).read_text(encoding="utf-8")
+        splats = f"{self.splats.name}, {sj.io.fingerprint(self.splats)}" if self.splats else None
+        material = sj.io.material_path(self.material).read_text(encoding="utf-8")
         return options | {
             "splats": splats or "the built-in bust",
             "contents of --material": material,

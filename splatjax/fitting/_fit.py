@@ -8,6 +8,7 @@ import optimistix as optx
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
+from splatjax._chunking import jit_unless_traced
 from splatjax._records import Numbers, as_floats
 from splatjax.gaussians import AbstractProfile, SumOfGaussians
 from splatjax.scattering import L2_QUADRATURE, AbstractRadialRule
@@ -21,8 +22,9 @@ from ._search import (
     SharedVariances,
     constant,
     greedy_path,
+    refine,
+    stationary,
 )
-from ._stationary import refine, stationary
 from ._weights import AbstractWeights, FreeWeights
 
 
@@ -63,6 +65,7 @@ class ErrorByCount(eqx.Module):
         return GivenVariances(self.variances[..., count - 1, :count])
 
 
+@jit_unless_traced
 def error_by_count(
     profile: AbstractProfile,
     largest: int = 8,
@@ -85,7 +88,21 @@ def error_by_count(
     **Raises:** `ValueError` as `fit_gaussians` does.
     """
     check_count("largest", largest)
-    return _error_by_count(profile, largest, spread, weights, rule)
+
+    def search(problem: FitProblem, _):
+        def summarize(point, count):
+            active = jnp.arange(largest) < count
+            residuals = problem.residuals(point, active)
+            error = jnp.sqrt(jnp.sum(residuals * residuals, axis=1))
+            return error, jnp.where(active, problem.variances(point), jnp.inf)
+
+        points = greedy_path(problem, largest)
+        return jax.vmap(summarize)(points, jnp.arange(1, largest + 1))
+
+    problem = make_problem(profile, weights, rule)
+    found = spread.over(search, constant(problem), GreedyInsertion())
+    error, variances = (values.astype(problem.target.dtype) for values in found)
+    return ErrorByCount(error[..., 0].T if error.ndim == 3 else error, variances)
 
 
 class LeastCount(eqx.Module):
@@ -105,30 +122,6 @@ def check_count(name: str, count: int) -> None:
     """Raise `ValueError` for a number of Gaussians that is not a positive integer."""
     if isinstance(count, bool) or not isinstance(count, int) or count < 1:
         raise ValueError(f"{name} must be a whole number of Gaussians, at least 1; got {count!r}")
-
-
-@eqx.filter_jit
-def _error_by_count(
-    profile: AbstractProfile,
-    largest: int,
-    spread: AbstractSpread,
-    weights: AbstractWeights,
-    rule: AbstractRadialRule,
-) -> ErrorByCount:
-    def search(problem: FitProblem, _):
-        def summarize(point, count):
-            active = jnp.arange(largest) < count
-            residuals = problem.residuals(point, active)
-            error = jnp.sqrt(jnp.sum(residuals * residuals, axis=1))
-            return error, jnp.where(active, problem.variances(point), jnp.inf)
-
-        points = greedy_path(problem, largest)
-        return jax.vmap(summarize)(points, jnp.arange(1, largest + 1))
-
-    problem = make_problem(profile, weights, rule)
-    found = spread.over(search, constant(problem), GreedyInsertion())
-    error, variances = (values.astype(problem.target.dtype) for values in found)
-    return ErrorByCount(error[..., 0].T if error.ndim == 3 else error, variances)
 
 
 class FitResult(eqx.Module):

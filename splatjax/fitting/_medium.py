@@ -12,9 +12,9 @@ from splatjax._records import as_floats, check_values
 from splatjax.gaussians import AbstractProfile
 from splatjax.scattering import Dipole, Medium, Tabulated
 
-from ._dense import NormalEquations, invert
 from ._fit import fit_gaussians
 from ._search import AbstractStart, GreedyInsertion, VariancesPerChannel
+from ._weights import NormalEquations, invert
 
 _TOLERANCE = 1e-7
 _STEPS = 64

@@ -11,8 +11,7 @@ from splatjax._chunking import jit_unless_traced
 from splatjax.gaussians import AbstractProfile, SumOfGaussians, gaussian
 from splatjax.scattering import L2_QUADRATURE, AbstractRadialRule, at_own_radii
 
-from ._dense import invert_moving
-from ._weights import AbstractWeights, without_idle
+from ._weights import AbstractWeights, invert_moving
 
 
 def norm_radii(
@@ -117,7 +116,6 @@ class FitProblem(eqx.Module):
         return jnp.exp(2 * jnp.mean(jnp.log(self.scales)))
 
     def variances(self, log_variances: Float[Array, " gaussians"]) -> Float[Array, " gaussians"]:
-        """Compute the variances, mm^2."""
         return jnp.exp(log_variances) * self.squared_unit
 
     def log_variances(self, variances: Float[Array, " gaussians"]) -> Float[Array, " gaussians"]:
@@ -147,13 +145,8 @@ class FitProblem(eqx.Module):
         def solve(rows, target, total):
             if active is None:
                 return self.weights.solve(rows, target, energies, total)
-            coefficients, response = self.weights.solve(
-                *without_idle(rows, target, energies, active), total
-            )
-            return coefficients, jnp.where(active[:, None] & active[None], response, 0.0)
+            return self.weights.solve_active(rows, target, energies, total, active)
 
-        if active is not None:
-            basis = jnp.where(jnp.broadcast_to(active, basis.shape), basis, 0.0)
         coefficients, response = jax.vmap(solve)(basis, self.target, self.total / self.norm)
         residuals = self.target - jnp.einsum("cnk,ck->cn", basis, coefficients)
         return basis, coefficients, response, residuals

@@ -1,6 +1,5 @@
 """Fit a scene to pictures along the gradient of the renderer: albedo, shape, lights and cameras."""
 
-import math
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol, runtime_checkable
 
@@ -30,8 +29,8 @@ from ._observation import (
 from ._parts import AbstractPart, Setup
 from ._problem import make_plans
 
+# Of each part; where pictures do not share it, a tuple with those of each picture.
 Coordinates = tuple[PyTree[Array], ...]
-"""Of each part; where pictures do not share it, a tuple with those of each picture."""
 
 
 @runtime_checkable
@@ -78,7 +77,6 @@ class MovableScene(eqx.Module):
         )
 
     def moved(self, setup: Setup, x: Coordinates) -> Setup:
-        """Move the parts of a picture."""
         for part, own, prepared in zip(self.parts, x, self.prepared, strict=True):
             setup = part.moved(setup, own, prepared)
         return setup
@@ -251,7 +249,7 @@ def fit_scene(
             for i, one in enumerate(zip(setups, evidence, plans, strict=True))
         ]
 
-    report("planning", math.nan)
+    report("planning", np.nan)
     plans, times = make_plans(moved(x), material, settings), 1
     # Optimizers are written for JAX's default rules, whatever the user has set.
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
@@ -260,7 +258,7 @@ def fit_scene(
     for step in range(steps + 1):
         evaluations = evaluate_all(x, plans)
         if max(float(one.overflow) for one in evaluations) > 0:
-            last = losses[-1] if losses else math.nan
+            last = losses[-1] if losses else np.nan
             report(f"step {step}: the scene exceeds the capacity of its plan; planning again", last)
             plans, times = make_plans(moved(x), material, settings), times + 1
             evaluations = evaluate_all(x, plans)

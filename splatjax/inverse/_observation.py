@@ -4,7 +4,6 @@ import abc
 from collections.abc import Sequence
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, DTypeLike, Float
@@ -12,12 +11,11 @@ from jaxtyping import Array, Bool, DTypeLike, Float
 from splatjax._records import check_values, numbers, record, several
 from splatjax.scene import AbstractLight, Camera
 
+# Coverage of a pixel behind which nothing else is seen.
 _FILLED = 0.999
-"""Coverage of a pixel behind which nothing else is seen."""
+# Deviation of pictures that come without one, as a fraction of their brightness: error bars do not
+# depend on it.
 _UNKNOWN_NOISE = 0.01
-"""Deviation of pictures that come without one, as a fraction of their brightness: error bars do not
-depend on it.
-"""
 
 
 class AbstractIntensity(eqx.Module):
@@ -157,7 +155,7 @@ class UnknownBackground(AbstractBackground):
     """
 
     def counts(self, coverage: Float[Array, "height width"]) -> Float[Array, "height width"]:
-        return jax.lax.stop_gradient(jnp.where(coverage > _FILLED, 1.0, 0.0).astype(coverage.dtype))
+        return (coverage > _FILLED).astype(coverage.dtype)
 
 
 class BlackBackground(AbstractBackground):

@@ -1,7 +1,5 @@
 """A surface that moves along its normals, smoothly, and what becomes of its splats."""
 
-import math
-
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -16,26 +14,29 @@ from ._parts import AbstractPart, Setup
 
 _REACH = 2.5  # of the blur, standard deviations
 _SLOPES = 17  # splats among which slopes are measured, itself included
+# Tables hold a multiple of so many neighbors: one program serves bodies that are nearly alike.
 _ROUNDED = 16
-"""Neighbors are given room for a multiple of this, so that bodies nearly alike need one program."""
 _SAME_SIDE = 0.3  # least cosine between normals of splats that belong together
 
 
 class OffsetTables(eqx.Module):
-    """The neighbors of each splat: those that its offset is blurred over, and those among which its
-    slope is measured.
+    r"""The neighbors of each splat.
+
+    **Attributes:**
+
+    - `blurred`, `weights`: those that its offset is blurred over, and the weights of their mean.
+    - `around`: those among which its slope is measured.
+    - `slopes`: sums of values times these are derivatives along the `tangents`, exact for quadratic
+      functions of them.
+    - `gain`: root mean square of blurred noise of root mean square 1.
     """
 
     blurred: Int[Array, "splats _near"]
     weights: Float[Array, "splats _near"]
     around: Int[Array, "splats _around"]
     slopes: Float[Array, "splats _around 2"]
-    """Sums of values times these are derivatives along the tangents, exact for quadratic
-    functions of them.
-    """
     tangents: Float[Array, "splats 2 3"]
     gain: Float[Array, ""]
-    """Root mean square of blurred noise of root mean square 1."""
 
 
 class NormalOffsets(AbstractPart):
@@ -81,7 +82,7 @@ class NormalOffsets(AbstractPart):
             tree, normals, areas, self.smoothness, -(-count // _ROUNDED) * _ROUNDED
         )
         around, tangents, slopes = _slopes(tree, normals)
-        gain = math.sqrt(np.mean(np.sum(weights**2, axis=1)))
+        gain = np.sqrt(np.mean(np.sum(weights**2, axis=1)))
         return OffsetTables(
             jnp.asarray(near, jnp.int32),
             jnp.asarray(weights, dtype),

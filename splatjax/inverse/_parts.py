@@ -11,8 +11,8 @@ from jaxtyping import Array, Float, PyTree
 
 from splatjax.scene import AbstractLight, Camera, Material, Scene, Splats
 
+# An albedo moves between this and one less this: at 0 and 1 themselves the logit is infinite.
 _BOUNDED = 1e-3
-"""An albedo moves between this and one less this: at 0 and 1 themselves the logit is infinite."""
 
 
 class Setup(eqx.Module):
@@ -119,13 +119,11 @@ class LightStrengths(AbstractPart):
         return tuple(jnp.zeros_like(getattr(light, light.strength)) for light in setup.lights)
 
     def moved(self, setup: Setup, x, prepared) -> Setup:
-        return _with_lights(
-            setup,
-            [
-                {light.strength: getattr(light, light.strength) * jnp.exp(self.step * steps)}
-                for light, steps in zip(setup.lights, x, strict=True)
-            ],
-        )
+        def move(light: AbstractLight, steps: Array) -> AbstractLight:
+            strength = getattr(light, light.strength) * jnp.exp(self.step * steps)
+            return dataclasses.replace(light, **{light.strength: strength})
+
+        return dataclasses.replace(setup, lights=tuple(map(move, setup.lights, x)))
 
 
 class LightPlaces(AbstractPart):
@@ -152,15 +150,16 @@ class LightPlaces(AbstractPart):
         )
 
     def moved(self, setup: Setup, x, prepared) -> Setup:
-        def move(name: str, place: Array, steps: Array) -> Array:
-            is_turned = name == "direction"
-            return rotation(self.turn * steps) @ place if is_turned else place + self.shift * steps
+        def move(light: AbstractLight, steps: dict[str, Array]) -> AbstractLight:
+            places = {
+                name: rotation(self.turn * step) @ getattr(light, name)
+                if name == "direction"
+                else getattr(light, name) + self.shift * step
+                for name, step in steps.items()
+            }
+            return dataclasses.replace(light, **places)
 
-        places = [
-            {name: move(name, getattr(light, name), steps[name]) for name in steps}
-            for light, steps in zip(setup.lights, x, strict=True)
-        ]
-        return _with_lights(setup, places)
+        return dataclasses.replace(setup, lights=tuple(map(move, setup.lights, x)))
 
 
 class CameraPoses(AbstractPart):
@@ -211,12 +210,3 @@ def rotation(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
     zero = jnp.zeros_like(x)
     cross = jnp.stack([jnp.stack(row) for row in ((zero, -z, y), (z, zero, -x), (-y, x, zero))])
     return jnp.eye(3, dtype=vector.dtype) + first * cross + second * (cross @ cross)
-
-
-def _with_lights(setup: Setup, changes: list[dict[str, Array]]) -> Setup:
-    """Replace fields of the lights."""
-    lights = list(setup.lights)
-    for i, values in enumerate(changes):
-        for name, value in values.items():
-            lights[i] = eqx.tree_at(lambda light, name=name: getattr(light, name), lights[i], value)
-    return Setup(setup.splats, setup.camera, tuple(lights))

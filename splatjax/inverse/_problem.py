@@ -29,14 +29,14 @@ from ._observation import (
 from ._parts import Setup
 
 _STEPS = 64
+# Of a wide range: the ratio of neighboring variances. It leaves dipoles an error of 0.2%.
 _LARGER = 3.0
-"""Of a wide range: the ratio of neighboring variances. It leaves dipoles an error of 0.2%."""
+# Squared mean free paths: where the Gaussians of a dipole's fit lie, and beyond.
 _NARROWEST, _WIDEST = 0.05, 200.0
-"""Squared mean free paths: where the Gaussians of a dipole's fit lie, and beyond."""
+# Between the log variances that plans are made for; a plan holds for more than that.
 _GRID = math.log(1.15)
-"""Between the log variances that plans are made for; a plan holds for more than that."""
+# In variance: of coefficients that are off by a factor of three at the start.
 _REACH = 10.0
-"""In variance: of coefficients that are off by a factor of three at the start."""
 
 
 def make_plans(setups: Sequence[Setup], material: Material, settings: RenderSettings) -> list[Plan]:
@@ -106,15 +106,18 @@ def wide_variances(media: Sequence[Medium], splats: Splats) -> Float[Array, " ga
 
 
 class Unknowns(eqx.Module):
-    """The layout of the unknowns: log sigma_a, log sigma_s' per channel, then log factors of the
+    r"""The layout of the unknowns: log sigma_a, log sigma_s' per channel, then log factors of the
     lights.
+
+    **Attributes:**
+
+    - `factors`: the factor of each channel of each picture; `count` where it is known.
+    - `count`: number of factors.
     """
 
     eta: Float[Array, " channels"]
     factors: Int[Array, "pictures channels"]
-    """The factor of each channel of each picture; the number of factors where it is known."""
     count: int = eqx.field(static=True)
-    """Number of factors."""
 
     @classmethod
     def of(
@@ -205,7 +208,6 @@ class RecoveryProblem(eqx.Module):
         )
 
     def residuals(self, point: Float[Array, " unknowns"]) -> Float[Array, "pixels channels"]:
-        """Compute residuals whose squares are the losses; 0 where a pixel does not count."""
         together = zip(self.evidence, self.radiance(point), self.counted, strict=True)
         residuals = [one.residuals(*made, self.loss) for one, *made in together]
         return jnp.concatenate([each.reshape(-1, each.shape[-1]) for each in residuals])
@@ -213,19 +215,17 @@ class RecoveryProblem(eqx.Module):
 
 def _with_points(picture: DiffusionBasis, kept: np.ndarray, dtype: DTypeLike) -> DiffusionBasis:
     """Keep some points of a picture, in the precision of a search."""
-
-    def along_points(picture):
-        return *picture.light.rows, picture.leaving, picture.in_front, picture.pixels
-
-    picture = eqx.tree_at(along_points, picture, replace_fn=lambda leaf: leaf[..., kept])
+    picture = eqx.tree_at(
+        lambda p: (*p.light.rows, p.leaving, p.in_front, p.pixels),
+        picture,
+        replace_fn=lambda leaf: leaf[..., kept],
+    )
     return jax.tree.map(
         lambda leaf: leaf.astype(dtype) if eqx.is_inexact_array(leaf) else leaf, picture
     )
 
 
 class SearchEnd(eqx.Module):
-    """The end of a search."""
-
     point: Float[Array, " unknowns"]
     cost: Float[Array, ""]
     steps: Int[Array, ""]

@@ -44,15 +44,14 @@ from ._problem import (
 )
 from ._recovery import Recovery, inverse
 
+# Layers eight times finer than a picture needs: where much light comes back, 0.1% of it is 2% of
+# the absorption.
 _FINE = RenderSettings(diffuser=ClusterDiffuser(error=2.5e-4))
-"""Layers eight times finer than a picture needs: where much light comes back, 0.1% of it is 2% of
-the absorption.
-"""
 
 _ROUNDS = 8
 _SAME_INDEX = 1e-4
+# Rounds end when no coefficient moves by more than this, or by a tenth of its error bar.
 _SETTLED = 1e-3
-"""Rounds end when no coefficient moves by more than this, or by a tenth of its error bar."""
 
 
 def recover(

@@ -3,7 +3,6 @@ recovery, and of several.
 """
 
 import abc
-import math
 from collections.abc import Sequence
 
 import equinox as eqx
@@ -16,8 +15,8 @@ from splatjax._format import channel_names, percent
 from splatjax.scattering import Medium
 from splatjax.scene import Material
 
+# A combination with a larger relative error counts as not fixed.
 _FIXED = 0.1
-"""A combination with a larger relative error counts as not fixed."""
 
 
 class Combination(eqx.Module):
@@ -143,17 +142,15 @@ def _power(name: str, power: float) -> str:
     return name if round(power, 2) == 1 else f"{name}^{power:.2g}"
 
 
-_RESOLUTION = 0.5 * math.log(2.0)
-"""Standard deviation of the logarithm of the width below which a layer is unresolved: twice as many
-splats move it by as much, and that of regular ones lies a factor of 2.5 below that of scattered
-ones.
-"""
+# Standard deviation of the logarithm of the width below which a layer is unresolved: twice as many
+# splats move it by as much, and that of regular ones lies a factor of 2.5 below that of scattered
+# ones.
+_RESOLUTION = 0.5 * np.log(2.0)
+# Chi-squared per degree of freedom of a model that lacks something.
 _TOO_LARGE = 1.5
-"""Chi-squared per degree of freedom of a model that lacks something."""
+# Of the light: marble on a head of 100,000 splats has 0.6 and comes back within 1.4%, the blue of
+# skin 1.0 and does not.
 _MOST = 0.8
-"""Of the light: marble on a head of 100,000 splats has 0.6 and comes back within 1.4%, the blue of
-skin 1.0 and does not.
-"""
 
 
 class Recovery(AbstractEstimate):

@@ -1,6 +1,12 @@
 """The only package that touches files: splats, meshes, pictures, materials."""
 
-from ._files import atomic_path as atomic_path
+from ._files import (
+    atomic_path as atomic_path,
+    fingerprint as fingerprint,
+    read_record as read_record,
+    save_exports as save_exports,
+    write_record as write_record,
+)
 from ._exr import read_exr as read_exr, read_manifest as read_manifest, write_exr as write_exr
 from ._images import (
     linear_to_srgb as linear_to_srgb,
@@ -32,10 +38,4 @@ from ._ply import (
     SplatFile as SplatFile,
     read_splats as read_splats,
     write_splats as write_splats,
-)
-from ._record import (
-    fingerprint as fingerprint,
-    read_record as read_record,
-    save_exports as save_exports,
-    write_record as write_record,
 )

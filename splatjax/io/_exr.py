@@ -2,7 +2,6 @@
 
 import errno
 import json
-import os
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -12,7 +11,7 @@ import OpenEXR  # ty: ignore[import-not-found]
 
 from splatjax.scene import Frame
 
-from ._files import atomic_path, naming
+from ._files import StrPath, atomic_path, naming
 from ._images import read_planes
 
 _REC709_D65 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
@@ -21,7 +20,7 @@ _SINGLE = "single_scattering"
 
 
 def write_exr(
-    path: str | os.PathLike[str],
+    path: StrPath,
     frame: Frame,
     *,
     variances: Sequence[float] | None = None,
@@ -85,7 +84,7 @@ def write_exr(
             raise OSError(errno.EIO, reason, str(temporary)) from None
 
 
-def read_exr(path: str | os.PathLike[str]) -> Frame:
+def read_exr(path: StrPath) -> Frame:
     r"""Read a frame that `write_exr` wrote: what was single precision comes back bit by bit.
 
     **Raises:** `FileNotFoundError`, or `ValueError` when the file cannot be read or lacks the
@@ -115,7 +114,7 @@ def read_exr(path: str | os.PathLike[str]) -> Frame:
     return Frame(**{name: jnp.asarray(array, jnp.float32) for name, array in arrays.items()})
 
 
-def read_manifest(path: str | os.PathLike[str]) -> dict[str, Any]:
+def read_manifest(path: StrPath) -> dict[str, Any]:
     r"""Read what a picture was made of: versions, settings, material, as the command line writes
     it.
 

@@ -1,19 +1,26 @@
-"""What is checked before a file is opened: that it exists, and has a unit; and files that are
-written whole or not at all.
+"""What is checked before a file is opened: that it exists, and has a unit; files that are written
+whole or not at all; and records as JSON, of what a file is made of.
 """
 
-import math
+import hashlib
+import json
 import os
 import secrets
-from collections.abc import Generator
+from collections.abc import Generator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any, TypeAlias
 
 import numpy as np
 from jaxtyping import Float
 
+from splatjax.exports import data_sheet
+from splatjax.scene import Material
 
-def existing_file(path: str | os.PathLike[str]) -> Path:
+StrPath: TypeAlias = str | os.PathLike[str]
+
+
+def existing_file(path: StrPath) -> Path:
     """Return the path of a file that exists.
 
     **Raises:** `FileNotFoundError`, or `IsADirectoryError` when it is a folder.
@@ -27,7 +34,7 @@ def existing_file(path: str | os.PathLike[str]) -> Path:
 
 
 @contextmanager
-def naming(where: str | os.PathLike[str]) -> Generator[None, None, None]:
+def naming(where: StrPath) -> Generator[None, None, None]:
     """Let errors name the file, or the place in it, whose contents they refuse."""
     try:
         yield
@@ -35,9 +42,9 @@ def naming(where: str | os.PathLike[str]) -> Generator[None, None, None]:
         raise type(error)(f"{where}: {error}") from None
 
 
-def check_units(path: Path, mm_per_unit: float, up: str = "y") -> None:
+def check_units(path: StrPath, mm_per_unit: float, up: str = "y") -> None:
     """Refuse a length of the unit (mm), or an upward axis, that cannot be."""
-    if not 0 < mm_per_unit < math.inf:
+    if not 0 < mm_per_unit < np.inf:
         raise ValueError(
             f"{path}: mm_per_unit is {mm_per_unit}; it must be the positive length of the file's "
             "unit in mm"
@@ -52,7 +59,7 @@ def with_y_up(vectors: Float[np.ndarray, "n 3"], up: str) -> Float[np.ndarray, "
 
 
 @contextmanager
-def atomic_path(path: str | os.PathLike[str]) -> Generator[Path, None, None]:
+def atomic_path(path: StrPath) -> Generator[Path, None, None]:
     """Yield a temporary path beside `path`, with its suffix, to write to; it takes the name `path`
     when the block ends well.
 
@@ -87,3 +94,53 @@ def atomic_path(path: str | os.PathLike[str]) -> Generator[Path, None, None]:
     finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
+
+
+def fingerprint(path: StrPath) -> str:
+    """Return what distinguishes the contents of a file: its size and its SHA-256.
+
+    **Raises:** `OSError` when the file cannot be read.
+    """
+    with open(path, "rb") as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+        return f"{file.tell()} bytes, SHA-256 {digest}"
+
+
+def write_record(path: StrPath, record: Mapping[str, Any]) -> None:
+    """Write a record as JSON, whole or not at all.
+
+    **Raises:** `FileNotFoundError` when the folder does not exist.
+    """
+    with atomic_path(path) as temporary:
+        temporary.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
+
+
+def read_record(path: StrPath) -> dict[str, Any]:
+    """Read what `write_record` wrote.
+
+    **Raises:** `FileNotFoundError`, or `ValueError` when the file is no record.
+    """
+    try:
+        record = json.loads(Path(path).read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(
+            f"{path}: is no JSON file ({error}); delete it, or name another folder"
+        ) from None
+    if not isinstance(record, dict):
+        raise ValueError(f"{path}: is no record; delete it, or name another folder")
+    return record
+
+
+def save_exports(material: Material, path: StrPath) -> None:
+    r"""Write a material's Gaussians in the terms of other renderers to a JSON file
+    (`splatjax.exports.data_sheet`), whole or not at all.
+
+    **Raises:** `ValueError` for a material with single scattering as a term of its own, which other
+    renderers have no number for; `OSError` if the file cannot be written.
+    """
+    if material.single_scattering is not None:
+        raise ValueError(
+            f"{path}: the material has single scattering besides its Gaussians; fit it without, "
+            "then export"
+        )
+    write_record(path, data_sheet(material.gaussians))

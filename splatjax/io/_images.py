@@ -2,8 +2,6 @@
 for the screen; and the sRGB transfer function (IEC 61966-2-1), both ways.
 """
 
-import itertools
-import os
 from collections.abc import Sequence
 from typing import Any
 
@@ -14,13 +12,13 @@ from PIL import Image
 from splatjax._memory import check_memory
 from splatjax.scene import Frame
 
-from ._files import atomic_path, existing_file
+from ._files import StrPath, atomic_path, existing_file
 
 _BYTES_PER_VALUE = 24.0  # in double precision, while they are decoded
 
 
 def read_planes(
-    path: str | os.PathLike[str],
+    path: StrPath,
 ) -> tuple[dict[str, Float[np.ndarray, "height width"]], dict[str, Any], bool]:
     """Read the channels of a picture by name; whole numbers become shares of the greatest that
     their type holds. Nothing is decoded, and alpha is not multiplied in.
@@ -57,7 +55,7 @@ def read_planes(
     return planes, attributes, str(spec.format) in ("half", "float", "double")
 
 
-def read_picture(path: str | os.PathLike[str]) -> Float[np.ndarray, "height width channels"]:
+def read_picture(path: StrPath) -> Float[np.ndarray, "height width channels"]:
     r"""Read a picture in linear light, of OpenEXR or another format of floating-point numbers.
 
     **Returns:** R, G and B, or Y alone, as in the file.
@@ -71,13 +69,13 @@ def read_picture(path: str | os.PathLike[str]) -> Float[np.ndarray, "height widt
     return values
 
 
-def read_map(path: str | os.PathLike[str]) -> Float[np.ndarray, "height width 3"]:
+def read_map(path: StrPath) -> Float[np.ndarray, "height width 3"]:
     """Read a map that holds no color: three channels, not decoded."""
     values, _ = _colors(path)
     return np.broadcast_to(values, (*values.shape[:2], 3))
 
 
-def read_color(path: str | os.PathLike[str]) -> Float[np.ndarray, "height width 3"]:
+def read_color(path: StrPath) -> Float[np.ndarray, "height width 3"]:
     """Read an albedo in linear light: whole numbers are sRGB, floating-point numbers are linear.
 
     **Raises:** as `read_picture` does, and `ValueError` for values outside [0, 1].
@@ -88,7 +86,7 @@ def read_color(path: str | os.PathLike[str]) -> Float[np.ndarray, "height width 
     return np.broadcast_to(values if is_linear else srgb_to_linear(values), (*values.shape[:2], 3))
 
 
-def _colors(path: str | os.PathLike[str]) -> tuple[Float[np.ndarray, "height width _"], bool]:
+def _colors(path: StrPath) -> tuple[Float[np.ndarray, "height width _"], bool]:
     planes, _, is_linear = read_planes(path)
     names = "RGB" if "R" in planes else "Y"
     if not planes.keys() >= set(names):
@@ -109,7 +107,7 @@ def linear_to_srgb(linear: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
 
 
 def write_png(
-    path: str | os.PathLike[str],
+    path: StrPath,
     picture: Frame | Float[np.ndarray, "height width channels"],
     *,
     exposure: float = 0.0,
@@ -146,8 +144,8 @@ def write_png(
 
 
 def write_animation(
-    path: str | os.PathLike[str],
-    frames: Sequence[str | os.PathLike[str]],
+    path: StrPath,
+    frames: Sequence[StrPath],
     *,
     frames_per_second: float = 24.0,
 ) -> None:
@@ -170,7 +168,7 @@ def write_animation(
         )
     # Whole milliseconds, but every frame begins when it should.
     begins = [round(1000 * i / frames_per_second) for i in range(len(frames) + 1)]
-    durations = [end - begin for begin, end in itertools.pairwise(begins)]
+    durations = np.diff(begins).tolist()
     options = {"save_all": True, "duration": durations, "loop": 0, "lossless": True}
     with atomic_path(path) as temporary:
         _Film(frames).save(temporary, format="WEBP", **options)
@@ -179,7 +177,7 @@ def write_animation(
 class _Film(Image.Image):
     """Files as one picture of many frames, so that one at a time is in memory."""
 
-    def __init__(self, frames: Sequence[str | os.PathLike[str]]):
+    def __init__(self, frames: Sequence[StrPath]):
         super().__init__()
         self._frames, self.n_frames = frames, len(frames)
         self.seek(0)

@@ -2,7 +2,6 @@
 them.
 """
 
-import os
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -30,21 +29,20 @@ from splatjax.scattering import (
 )
 from splatjax.scene import Material
 
-from ._files import atomic_path, naming
+from ._files import StrPath, atomic_path, naming
 from ._tables import Table, nearest, read_toml
 
 COEFFICIENT_UNIT, VARIANCE_UNIT, THICKNESS_UNIT = "1/mm", "mm^2", "mm"
 _COEFFICIENTS = ("unit", "sigma_a", "sigma_s_prime", "eta")
 _TABLES = ("medium", "layers", "surface", "single_scattering", "source", "fit")
 _SURFACE = ("eta", "specular", "roughness")
-_LAYER = (*_COEFFICIENTS, "optical_depth", "thickness", "thickness_unit")
+# What [fit] calls a profile whose coefficients the file holds.
 _MODELS: dict[type, str] = {
     Dipole: "classical dipole",
     BetterDipole: "better dipole",
     PhotonBeam: "photon beam with single scattering",
     LayeredMultipole: "multipole",
 }
-"""What [fit] calls a profile whose coefficients the file holds."""
 
 
 def profiles_folder() -> Path:
@@ -61,7 +59,7 @@ def list_materials() -> tuple[str, ...]:
     return tuple(sorted(path.stem for path in profiles_folder().glob("*.toml")))
 
 
-def material_path(name_or_path: str | os.PathLike[str]) -> Path:
+def material_path(name_or_path: StrPath) -> Path:
     """Return the file behind what `load_material` takes: that of a name, or the path itself.
 
     **Raises:** `ValueError` for an unknown name.
@@ -77,7 +75,7 @@ def material_path(name_or_path: str | os.PathLike[str]) -> Path:
     )
 
 
-def load_material(name_or_path: str | os.PathLike[str]) -> Material:
+def load_material(name_or_path: StrPath) -> Material:
     r"""Load a material: its fitted Gaussians and its surface.
 
     **Arguments:**
@@ -112,7 +110,7 @@ def load_material(name_or_path: str | os.PathLike[str]) -> Material:
 
 
 def surface_and_source(
-    name_or_path: str | os.PathLike[str],
+    name_or_path: StrPath,
 ) -> tuple[dict[str, Array], dict[str, Any]]:
     r"""Return what a file says of a material besides its coefficients: its surface, as `Material`
     takes it, and its [source].
@@ -123,7 +121,7 @@ def surface_and_source(
     return _surface(tables), tables.entries.get("source", {})
 
 
-def load_medium(name_or_path: str | os.PathLike[str]) -> Medium:
+def load_medium(name_or_path: StrPath) -> Medium:
     r"""Load the optical coefficients of a material.
 
     **Arguments:**
@@ -142,7 +140,7 @@ def load_medium(name_or_path: str | os.PathLike[str]) -> Medium:
     raise ValueError(f"{tables.path}: has no [medium]; known are only its {have}")
 
 
-def load_profile(name_or_path: str | os.PathLike[str]) -> Dipole | LayeredMultipole:
+def load_profile(name_or_path: StrPath) -> Dipole | LayeredMultipole:
     r"""Load the coefficients of a material as the profile that its Gaussians stand for.
 
     **Arguments:**
@@ -159,7 +157,7 @@ def load_profile(name_or_path: str | os.PathLike[str]) -> Dipole | LayeredMultip
 
 def save_material(
     material: Material,
-    path: str | os.PathLike[str],
+    path: StrPath,
     *,
     profile: AbstractProfile | None = None,
     source: Mapping[str, Any] | None = None,
@@ -217,7 +215,7 @@ def save_material(
         temporary.write_text(text, encoding="utf-8")
 
 
-def _read(name_or_path: str | os.PathLike[str]) -> tuple[Table, Dipole | LayeredMultipole | None]:
+def _read(name_or_path: StrPath) -> tuple[Table, Dipole | LayeredMultipole | None]:
     """Read and check all tables of a material, and its coefficients."""
     path = material_path(name_or_path)
     tables = Table(
@@ -235,7 +233,8 @@ def _read(name_or_path: str | os.PathLike[str]) -> tuple[Table, Dipole | Layered
         return tables, Dipole(_medium(tables.table("medium", (*_COEFFICIENTS, "sigma_s"))))
     if not kinds:
         return tables, None
-    layers = [_layer(each) for each in tables.tables("layers", _LAYER)]
+    known = (*_COEFFICIENTS, "optical_depth", "thickness", "thickness_unit")
+    layers = [_layer(each) for each in tables.tables("layers", known)]
     counts = [x.optical_depth.size if isinstance(x, Film) else x.channels for x in layers]
     _check_channels(tables, "[[layers]]", *counts)
     with naming(f"{path}: [[layers]]"):

@@ -1,24 +1,19 @@
 """Pictures that were taken, and how: a TOML file that names them, with cameras and lights."""
 
-import os
-from functools import partial
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from splatjax._records import check_values
 from splatjax.inverse import KnownIntensity, Observation, UnknownColor, UnknownIntensity
 from splatjax.scene import AbstractLight, Camera, DirectionalLight, GaussianBeam, PointLight
 
-from ._files import naming
+from ._files import StrPath, naming
 from ._images import read_picture
 from ._tables import Table, read_toml
 
 _INTENSITIES = {"known": KnownIntensity, "unknown": UnknownIntensity, "unknown color": UnknownColor}
-_ENTRIES = ("file", "mask", "noise", "intensity", "camera", "lights")
-_CAMERA = ("position", "target", "up", "fov")
 _LIGHTS = {
     "directional": (DirectionalLight, ("direction", "irradiance", "cast_shadows")),
     "point": (PointLight, ("position", "intensity", "cast_shadows")),
@@ -27,7 +22,7 @@ _LIGHTS = {
 _LIGHT_ENTRIES = {"kind"}.union(*(names for _, names in _LIGHTS.values()))
 
 
-def read_observations(path: str | os.PathLike[str]) -> list[Observation]:
+def read_observations(path: StrPath) -> list[Observation]:
     r"""Read which pictures were taken, and how.
 
         [[pictures]]
@@ -53,10 +48,11 @@ def read_observations(path: str | os.PathLike[str]) -> list[Observation]:
     """
     path = Path(path)
     file = Table(path, "", read_toml(path, "name one that lists pictures"), ["pictures"])
-    return [_observation(table) for table in file.tables("pictures", _ENTRIES)]
+    entries = ("file", "mask", "noise", "intensity", "camera", "lights")
+    return [_observation(table) for table in file.tables("pictures", entries)]
 
 
-def picture_paths(path: str | os.PathLike[str]) -> list[Path]:
+def picture_paths(path: StrPath) -> list[Path]:
     """Return the files that the observations of a file are read from, itself first."""
     path = Path(path)
     pictures = read_toml(path, "name one that lists pictures")["pictures"]
@@ -76,15 +72,15 @@ def _observation(table: Table) -> Observation:
         known &= True if mask is None or mask.shape != known.shape else mask
         size = np.sqrt(np.mean(np.square(picture[known]))) if known.any() else 0.0
         deviation = noise * (size or 1.0)
-    camera = table.table("camera", _CAMERA)
+    camera = table.table("camera", ("position", "target", "up", "fov"))
     vectors = [camera.numbers(name).tolist() for name in ("position", "target")]
     up = camera.numbers("up").tolist() if "up" in camera.entries else None
     height, width, channels = picture.shape
-    look_at = partial(Camera.look_at, up=up, fov=camera.number("fov", 25.0))
+    fov = camera.number("fov", 25.0)
     return table.make(
         Observation,
-        jnp.asarray(picture, float),
-        camera.make(look_at, *vectors, width=width, height=height),
+        picture,
+        camera.make(Camera.look_at, *vectors, up=up, fov=fov, width=width, height=height),
         tuple(_light(each, channels) for each in table.tables("lights", _LIGHT_ENTRIES)),
         mask,
         deviation,

@@ -1,6 +1,5 @@
 """Splats in PLY files, read at once or, of files that are larger than memory, a part at a time."""
 
-import os
 import warnings
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -13,7 +12,7 @@ from jaxtyping import Float
 from splatjax.geometry import complete_splats, unit
 from splatjax.scene import Splats
 
-from ._files import atomic_path, check_units, existing_file, naming, with_y_up
+from ._files import StrPath, atomic_path, check_units, existing_file, naming, with_y_up
 from ._images import srgb_to_linear
 from ._trimesh import FORMATS, load_with_trimesh, one_sentence
 
@@ -27,6 +26,7 @@ _COMPLETE = (
     "estimates normals, radii and areas, and `splatjax sample` of a mesh writes them"
 )
 _GAUSSIAN_SPLATTING = {"f_dc_0", "scale_0", "rot_0"}
+# Columns of the vertices of a PLY file, by the fields of splats that they stand for.
 _COLUMNS = {
     "centers": [("x", "y", "z")],
     "normals": [("nx", "ny", "nz")],
@@ -40,7 +40,6 @@ _COLUMNS = {
     "specular": [("specular",)],
     "roughness": [("roughness",)],
 }
-"""Columns of the vertices of a PLY file, by the fields of splats that they stand for."""
 _POWERS = {"centers": 1, "radii": 1, "areas": 2}  # of the unit of length
 _VALID = {
     "centers": (lambda x: np.abs(x) <= _LONGEST, "within 1e9 mm (what is mm_per_unit?)"),
@@ -53,7 +52,7 @@ _VALID = {
 }
 
 
-def read_splats(path: str | os.PathLike[str], *, mm_per_unit: float = 1.0, up: str = "y") -> Splats:
+def read_splats(path: StrPath, *, mm_per_unit: float = 1.0, up: str = "y") -> Splats:
     r"""Read splats from the vertices of a PLY file: ASCII or binary of either byte order,
     properties in any order.
 
@@ -99,7 +98,7 @@ def read_splats(path: str | os.PathLike[str], *, mm_per_unit: float = 1.0, up: s
         return complete_splats(centers, **fields)
 
 
-def write_splats(path: str | os.PathLike[str], splats: Splats) -> None:
+def write_splats(path: StrPath, splats: Splats) -> None:
     r"""Write splats to a binary PLY file, in mm, as float32, whole or not at all.
 
     Albedo of three channels is written as linear `red green blue` floats (no loss), so that
@@ -154,7 +153,7 @@ class SplatFile:
 
     def __init__(
         self,
-        path: str | os.PathLike[str],
+        path: StrPath,
         part: int = 1_000_000,
         *,
         mm_per_unit: float = 1.0,
@@ -189,7 +188,7 @@ class SplatFile:
         **Raises:** `ValueError` when numbers are not finite, or not as `read_splats` reads them;
         how large the whole is turns out at the end.
         """
-        corners, dtype = [], jnp.result_type(float)
+        corners = []
         for begin in range(0, self.count, self.part):
             rows = self._rows(begin, min(self.part, self.count - begin))
             where = self.path.with_name(f"{self.path.name}, from vertex {begin}")
@@ -199,12 +198,7 @@ class SplatFile:
             except ValueError as error:
                 raise ValueError(f"{error}; or {_COMPLETE}") from None
             corners += [fields["centers"].min(axis=0), fields["centers"].max(axis=0)]
-            arrays: dict[str, Any] = {
-                name: jnp.asarray(values, dtype)
-                for name, values in fields.items()
-                if values is not None
-            }
-            yield Splats(**arrays)
+            yield Splats(**fields)
         _check_places(self.path, np.stack(corners), estimated=False)
 
     def _rows(self, begin: int, count: int) -> np.memmap:
@@ -265,7 +259,6 @@ def _check_places(path: Path, centers: Float[np.ndarray, "n 3"], *, estimated: b
 def _values(
     path: Path, field: str, columns: dict[str, np.ndarray], scale: float
 ) -> Float[np.ndarray, "*shape"]:
-    """Return a field of splats, validated."""
     with np.errstate(invalid="ignore"):  # of NaN that signals
         values = scale * np.stack(list(columns.values())).astype(np.float64)
     kind, *others = {column.dtype for column in columns.values()}

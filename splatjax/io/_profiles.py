@@ -1,11 +1,8 @@
 """Measured profiles, and many media, as CSV files."""
 
 import csv
-import math
-import os
 import re
 from collections.abc import Iterable, Mapping
-from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -13,15 +10,15 @@ from jaxtyping import Float
 
 from splatjax.scattering import Tabulated
 
-from ._files import atomic_path, check_units, existing_file, naming
+from ._files import StrPath, atomic_path, check_units, existing_file, naming
 from ._tables import rounded
 
+# Units of length that the names of a table's columns may give.
 _MM = {"mm": 1.0, "cm": 10.0, "um": 1e-3, "µm": 1e-3}
-"""Units of length that the names of a table's columns may give."""
 _COLUMNS = "sigma_a", "sigma_s_prime", "eta"
 
 
-def read_profile(path: str | os.PathLike[str], *, mm_per_unit: float = 1.0) -> Tabulated:
+def read_profile(path: StrPath, *, mm_per_unit: float = 1.0) -> Tabulated:
     r"""Read a measured profile from a CSV file: a column of radii, and one of values for each
     channel.
 
@@ -39,13 +36,13 @@ def read_profile(path: str | os.PathLike[str], *, mm_per_unit: float = 1.0) -> T
     **Raises:** `FileNotFoundError`, and `ValueError` for what is no such table: file, line and what
     is wrong.
     """
-    check_units(Path(path), mm_per_unit)
+    check_units(path, mm_per_unit)
     rows = _read_rows(path, "a profile is a CSV of radii and values")
     if rows and _number(rows[0][1][0]) is None:
         (where, names), *rows = rows
         for unit, size in _MM.items():
             is_named = re.search(rf"(?<![A-Za-z]){unit}(?![A-Za-z])", ",".join(names))
-            if is_named and not math.isclose(size, mm_per_unit, rel_tol=1e-6):
+            if is_named and not np.isclose(size, mm_per_unit, rtol=1e-6, atol=0):
                 raise ValueError(
                     f"{where} gives {unit}, and lengths are taken as {mm_per_unit:g} mm; give "
                     f"mm_per_unit = {size:g} (--mm-per-unit {size:g}), or name the right unit"
@@ -68,7 +65,7 @@ def read_profile(path: str | os.PathLike[str], *, mm_per_unit: float = 1.0) -> T
         )
 
 
-def read_media(path: str | os.PathLike[str]) -> tuple[list[str], Float[np.ndarray, "media 3"]]:
+def read_media(path: StrPath) -> tuple[list[str], Float[np.ndarray, "media 3"]]:
     r"""Read media from a CSV file: a first line of names, then a line for each medium of one
     channel.
 
@@ -98,7 +95,7 @@ def read_media(path: str | os.PathLike[str]) -> tuple[list[str], Float[np.ndarra
     return names, np.asarray(media)
 
 
-def write_columns(path: str | os.PathLike[str], columns: Mapping[str, Iterable]) -> None:
+def write_columns(path: StrPath, columns: Mapping[str, Iterable]) -> None:
     """Write a CSV table, whole or not at all; numbers so that they are read back as they are.
 
     **Raises:** `FileNotFoundError` when the folder does not exist.
@@ -111,14 +108,14 @@ def write_columns(path: str | os.PathLike[str], columns: Mapping[str, Iterable])
         csv.writer(file, lineterminator="\n").writerows([columns, *zip(*plain, strict=True)])
 
 
-def read_columns(path: str | os.PathLike[str]) -> dict[str, tuple[str, ...]]:
+def read_columns(path: StrPath) -> dict[str, tuple[str, ...]]:
     """Read the cells of a table that `write_columns` has written."""
     with open(path, newline="", encoding="utf-8") as file:
         head, *rows = csv.reader(file)
     return dict(zip(head, zip(*rows, strict=True), strict=True))
 
 
-def _read_rows(path: str | os.PathLike[str], contents: str) -> list[tuple[str, list[str]]]:
+def _read_rows(path: StrPath, contents: str) -> list[tuple[str, list[str]]]:
     """Read the rows of a CSV file and where they stand; empty ones and comments (`#`) are left out.
 
     **Raises:** `FileNotFoundError`, or `ValueError` when it is no text.

@@ -48,7 +48,6 @@ class Table:
             )
 
     def table(self, name: str, known: Iterable[str]) -> "Table":
-        """Return a table within this one."""
         return Table(self.path, f"{self.name} {name}".strip(), self.entries.get(name), known)
 
     def tables(self, name: str, known: Iterable[str]) -> "list[Table]":
@@ -86,7 +85,6 @@ class Table:
         )
 
     def number(self, name: str, default: float | None = None) -> float:
-        """Return a single number."""
         values = self.numbers(name, default)
         if values.ndim:
             raise ValueError(f"{self.where} {name} must be one number; it is {values.tolist()}")

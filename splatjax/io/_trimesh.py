@@ -16,8 +16,8 @@ from urllib.parse import unquote
 import numpy as np
 from PIL import Image
 
+# Suffixes of meshes.
 FORMATS = ("glb", "gltf", "obj", "off", "ply", "stl")
-"""Suffixes of meshes."""
 _OBJ_CORNER = rb"[1-9]\d*(?:/(?:[1-9]\d*)?(?:/(?:[1-9]\d*)?)?)?"
 _OBJ_READ = rb"v[tn]?(?: +[^\s/_]+){2,7} *|f(?: +%s){3,} *" % _OBJ_CORNER
 _GLTF = rb"""
@@ -26,6 +26,8 @@ _GLTF = rb"""
     |"image/(?!png"|jpeg"|webp")[^"]*"
     |"baseColorTexture"\s*:\s*{[^{}]*(?:"texCoord"\s*:\s*[1-9]|{\s*"KHR_texture_transform")
     """
+# What trimesh passes over or takes for something else: compressed, moved and several textures,
+# fans, curves, polygons without three corners, solids without end.
 _UNREAD = {
     "gltf": re.compile(_GLTF, re.VERBOSE),
     "obj": re.compile(
@@ -36,8 +38,6 @@ _UNREAD = {
     "ply": re.compile(rb"comment texturefile.*comment texturefile", re.DOTALL | re.IGNORECASE),
     "stl": re.compile(rb"\A\s*solid(?!.*\bendsolid[^\n]*\s*\Z)", re.DOTALL | re.IGNORECASE),
 }
-"""What trimesh passes over or takes for something else: compressed, moved and several textures,
-fans, curves, polygons without three corners, solids without end."""
 _FLOAT = 5126
 
 
@@ -66,8 +66,8 @@ def _check_gltf(text: bytes) -> None:
             raise ValueError("its vertices are quantized")
 
 
+# How many triangles a file promises, where its format has that.
 _COUNTS = {"obj": _count_obj, "off": _count_off, "gltf": _check_gltf}
-"""How many triangles a file promises, where its format has that."""
 
 
 def _count_triangles(kind: str, data: bytes) -> int | None:

@@ -3,7 +3,6 @@
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from splatjax._chunking import jit_unless_traced
@@ -64,12 +63,11 @@ class Tabulated(AbstractProfile):
 
     def without(self, profile: AbstractProfile) -> "Tabulated":
         """Subtract a profile: single scattering, for a fit of the rest."""
-        if profile.singular and not isinstance(self.radii, Tracer) and self.radii[0] == 0:
-            name = type(profile).__name__
-            raise ValueError(
-                f"{name} is infinite at r = 0, so it cannot be taken from a table that begins "
-                "there; leave that row out"
+        if profile.singular:
+            requirement = (
+                f"above 0, since {type(profile).__name__} is infinite at r = 0: leave that row out"
             )
+            check_values("Tabulated.radii", self.radii, requirement, lambda x: x > 0)
         total = None if self.total is None else self.total - profile.total_reflectance()
         return Tabulated(self.radii, self.values - profile(self.radii), self.deviation, total)
 

@@ -1,6 +1,5 @@
 """Profiles by random walks: the reference that diffusion approximates."""
 
-import functools
 from collections.abc import Callable, Sequence
 
 import equinox as eqx
@@ -227,7 +226,10 @@ def _walk_of(
     """Set up the walk of a group of channels, in the free paths of the first of them."""
     unit = media.unit[group]
     coefficients = media.sigma_a[:, group], media.sigma_s[:, group]
-    optics = functools.partial(Optics.of, unit=unit)
+
+    def optics(sigma_a, sigma_s):
+        return Optics.of(sigma_a, sigma_s, unit)
+
     # A direction for the absorption of each layer, then one for the scattering of each.
     layers = media.sigma_a.shape[0]
     slopes = 2 * layers if with_derivatives else 0

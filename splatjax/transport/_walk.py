@@ -10,8 +10,8 @@ from jaxtyping import Array, Bool, Float, Int
 from ._directions import AbstractPhaseFunction, Direction, fresnel
 from ._stack import Stack, of_layer
 
+# Where a photon is; one that is idle is not on its way at all.
 INSIDE, ABOVE, BELOW, IDLE = 0, 1, 2, 3
-"""Where a photon is; one that is idle is not on its way at all."""
 
 
 class Photons(eqx.Module):

@@ -4,7 +4,7 @@ import jax
 import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
-from splatjax.cli import _turntable
+from splatjax.cli import _render
 
 SETTINGS = (
     "jax_compilation_cache_dir",
@@ -32,7 +32,7 @@ def drawn(monkeypatch):
     """Return the plans by which a turntable's frames are drawn, and how many programs had been
     compiled after each.
     """
-    compiled, seen, draw = [], [], _turntable.draw
+    compiled, seen, draw = [], [], _render.draw
 
     def watched(scene, camera, plan, light):
         frame = draw(scene, camera, plan, light)
@@ -42,7 +42,7 @@ def drawn(monkeypatch):
     def listen(event, duration, **_):
         compiled.extend([duration] if event == COMPILED else [])
 
-    monkeypatch.setattr(_turntable, "draw", watched)
+    monkeypatch.setattr(_render, "draw", watched)
     jax.monitoring.register_event_duration_secs_listener(listen)
     yield seen
     jax.monitoring.unregister_event_duration_listener(listen)

@@ -13,7 +13,7 @@ from jax.experimental.compilation_cache import compilation_cache
 from PIL import Image
 
 import splatjax as sj
-from splatjax.cli._environment import cache_folder, prepare_jax
+from splatjax.cli._main import cache_folder, prepare_jax
 from splatjax.cli._render import Render
 from splatjax.cli._view import direction_to
 from splatjax.io import read_manifest, read_record

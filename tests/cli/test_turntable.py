@@ -11,7 +11,7 @@ from commands import ball, contents, failure, frame_names, run
 from PIL import Image
 
 import splatjax as sj
-from splatjax.cli._turntable import Turntable
+from splatjax.cli._render import Turntable
 from splatjax.diffusion import DenseDiffuser
 from splatjax.splatting import DenseRasterizer, ShadowSettings
 

@@ -16,14 +16,14 @@ from splatjax.fitting import (
     GreedyInsertion,
     NonNegativeWeights,
     VariancesPerChannel,
-    _stationary,
+    _search,
     error_by_count,
     fit_gaussians,
     relative_error,
     squared_error,
 )
 from splatjax.fitting._problem import make_problem
-from splatjax.fitting._stationary import refine
+from splatjax.fitting._search import refine
 from splatjax.gaussians import SumOfGaussians
 from splatjax.io import dipole_starts, load_medium, load_profile
 from splatjax.scattering import (
@@ -222,7 +222,7 @@ def test_the_search_says_when_it_gave_up(float64, monkeypatch):
     problem = make_problem(profile, FreeWeights(), L2_QUADRATURE)
     found, converged = refine(problem, GreedyInsertion().search(problem, 2))
     assert bool(converged)
-    monkeypatch.setattr(_stationary, "_STEPS", 0)
+    monkeypatch.setattr(_search, "_NEWTON_STEPS", 0)
     start = found + jnp.asarray([0.3, 0.0])
     unmoved, converged = refine(problem, start)
     np.testing.assert_array_equal(unmoved, start)
