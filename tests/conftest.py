@@ -21,7 +21,6 @@ gc.set_threshold(100_000, 20, 20)
 
 @pytest.fixture
 def x64() -> bool:
-    """Whether the suite runs in float64."""
     return bool(jax.config.jax_enable_x64)
 
 
@@ -42,8 +41,14 @@ def float32(x64):
 
 
 @pytest.fixture
+def double():
+    """Search in float64, whatever the suite runs in."""
+    with jax.enable_x64(True):
+        yield
+
+
+@pytest.fixture
 def dtype():
-    """The precision under test."""
     return jnp.zeros(()).dtype
 
 

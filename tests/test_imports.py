@@ -1,10 +1,16 @@
-"""`import splatjax` is quick: what takes long to import is imported where it is used."""
+"""`import splatjax` is quick: what takes long to import is imported where it is used. No package
+that splatjax installs, or is tested with, is under a copyleft license.
+"""
 
 import json
 import pkgutil
+import re
 import subprocess
 import sys
+from importlib.metadata import distributions
 from types import ModuleType
+
+import pytest
 
 import splatjax
 
@@ -37,3 +43,23 @@ def test_public_names_are_few_and_submodules_documented():
     packages = {each.name for each in pkgutil.iter_modules(splatjax.__path__)}
     described = {name for name in packages if f"{name}`" in splatjax.__doc__}
     assert {name for name in packages - described if name[0] != "_"} == {"cli", "render"}
+
+
+COPYLEFT = re.compile(r"\b(A|L)?GPL|General Public License", re.IGNORECASE)
+MENTIONED = {
+    "scipy": "BSD; its wheels hold libgfortran, under the GPL with an exception for libraries",
+    "matplotlib": "PSF; its text compares itself with the GPL",
+}
+"""Packages whose license mentions such a license without being one."""
+
+
+@pytest.mark.once
+def test_no_installed_package_is_copyleft():
+    found = {}
+    for package in distributions():
+        meta = package.metadata
+        classifiers = [line for line in meta.get_all("Classifier", []) if "License" in line]
+        texts = [meta.get("License-Expression"), meta.get("License"), *classifiers]
+        if any(COPYLEFT.search(text) for text in texts if text):
+            found[meta["Name"].lower()] = texts
+    assert found.keys() <= MENTIONED.keys()

@@ -33,7 +33,6 @@ def plane(stretch: float, quads: int = 6, half: float = HALF) -> Mesh:
 
 
 def coordinates(points: np.ndarray, stretch: float, half: float = HALF) -> np.ndarray:
-    """Where points of the plane lie in the texture."""
     return 0.5 + 0.45 * points[:, :2] / half / np.asarray([stretch, 1.0])
 
 
@@ -49,7 +48,6 @@ def spots(points: np.ndarray) -> np.ndarray:
 
 
 def painted(stretch: float, size: int) -> Textures:
-    """The spots as a texture."""
     row, column = np.indices((size, size)).reshape(2, -1)
     uvs = np.stack([(column + 0.5) / size, 1 - (row + 0.5) / size], axis=1)
     points = (uvs - 0.5) / 0.45 * HALF * np.asarray([stretch, 1.0])
@@ -70,7 +68,6 @@ def splatted(points: np.ndarray, gaussians: sj.SumOfGaussians, spacing: float = 
 def gathered(
     sources: Sources, variances, kernel: AbstractDiffusionKernel, points: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The mean of every layer at points and its kernel mass, from all splats."""
     places = jnp.asarray(points.T, float)
     layers = [
         dense_layer(sources, places, variance, depth)

@@ -1,5 +1,5 @@
 """Texture-space diffusion: on a flat plane it is splat diffusion, if it knows how the chart is
-stretched.
+stretched. What a pixel sees of triangles; and the bust with its colors in textures.
 """
 
 import dataclasses
@@ -10,14 +10,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from bodies import camera_over
+from bodies import camera_over, hits
 from jax.test_util import check_grads
 from planes import HALF, coordinates, gathered, painted, plane, splatted
 
 import splatjax as sj
 from splatjax import baselines
 from splatjax.diffusion import EscapeNormalization, PlainMean, Sources
-from splatjax.geometry import Mesh
+from splatjax.geometry import Mesh, complexion
+from splatjax.splatting import PerspectiveView
 
 SIZE = 192
 TWO = sj.SumOfGaussians(
@@ -69,7 +70,6 @@ def test_on_a_plane_it_is_splat_diffusion_if_stretch_is_corrected(stretch, corre
 
 @pytest.fixture(scope="module")
 def sheet():
-    """A white plane with sharp edges, from in front, seen with a rim of nothing around."""
     mesh = baselines.TexturedMesh.of(plane(2.0))
     settings = dataclasses.replace(
         STILL,
@@ -117,20 +117,28 @@ def test_beyond_its_capacity_the_picture_is_nan():
 def test_bad_input_is_refused(sheet):
     mesh, lights, camera, settings, _ = sheet
     bare, lamp = plane(1.0), sj.PointLight(jnp.asarray([0.0, 0.0, 2.0]), jnp.ones(3))
-    with pytest.raises(ValueError, match="no texture coordinates"):
-        baselines.TexturedMesh.of(Mesh(bare.vertices, bare.faces, bare.normals))
-    uvs = bare.uvs * [1.0, 2.0] + [0.0, 0.05]
-    with pytest.raises(ValueError, match=r"0.05 to 1.95"):
-        baselines.TexturedMesh.of(Mesh(bare.vertices, bare.faces, bare.normals, uvs))
-    with pytest.raises(ValueError, match=r"lights\[0\] stands 2 mm"):
-        baselines.plan_texture_space(mesh, (lamp,), DULL, camera, settings)
+    beyond = bare.uvs * [1.0, 2.0] + [0.0, 0.05]
     render = jax.jit(lambda mesh: baselines.render_texture_space(mesh, lights, DULL, camera))
-    with pytest.raises(ValueError, match="plan"):
-        render(mesh)
+    for refused, said in (
+        (
+            lambda: baselines.TexturedMesh.of(Mesh(bare.vertices, bare.faces, bare.normals)),
+            "no texture coordinates",
+        ),
+        (
+            lambda: baselines.TexturedMesh.of(dataclasses.replace(bare, uvs=beyond)),
+            r"0.05 to 1.95",
+        ),
+        (
+            lambda: baselines.plan_texture_space(mesh, (lamp,), DULL, camera, settings),
+            r"lights\[0\] stands 2 mm",
+        ),
+        (lambda: render(mesh), "plan"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            refused()
 
 
 def slab(thickness: float) -> Mesh:
-    """Two parallel planes that face away from each other; their charts lie side by side."""
     front = plane(1.0)
     turn = np.asarray([-1.0, 1.0, -1.0])
     vertices = np.concatenate([front.vertices, front.vertices * turn - [0.0, 0.0, thickness]])
@@ -191,3 +199,96 @@ def test_a_picture_has_the_derivatives_that_differences_say(float64):
 
     given = TWO.variances, mesh.albedo, lights[0].direction, mesh.normals
     check_grads(seen, given, order=1, modes=["rev"], rtol=1e-5, atol=1e-5)
+
+
+PIXELS = 24
+CAMERA = sj.Camera.look_at(
+    jnp.asarray([6.0, -9.0, 18.0]), jnp.zeros(3), fov=40.0, width=PIXELS, height=PIXELS
+)
+
+
+def seen_from(camera, corners):
+    landing = baselines.Landing.in_view(corners, PerspectiveView.of(camera))
+    return landing, baselines.see_faces(landing, baselines.capacity_for(landing))
+
+
+@pytest.fixture
+def corners():
+    mesh = plane(1.0)
+    return jnp.asarray(mesh.corners(), float)
+
+
+@pytest.mark.once
+def test_a_slanted_plane_is_seen_where_its_rays_meet_it_and_has_no_cracks(corners):
+    landing, seen = seen_from(CAMERA, corners)
+    positions = baselines.interpolate(corners, seen, baselines.barycentrics(landing, seen))
+    expected, covered = hits(CAMERA), np.asarray(seen.covered)
+    assert np.array_equal(covered, np.abs(expected).max(axis=2) < 12)
+    assert 0.5 < np.mean(covered) < 1
+    np.testing.assert_allclose(np.asarray(positions)[covered], expected[covered], atol=2e-4)
+    assert float(seen.needed) <= 1
+    assert float(baselines.see_faces(landing, 100).needed) > 1
+
+
+@pytest.mark.once
+def test_the_nearest_face_hides_the_others_and_backs_and_faces_before_the_eye_are_not_drawn(
+    corners,
+):
+    nearer = corners + jnp.asarray([0.0, 0.0, 2.0])[None, None]
+    back = corners[:, ::-1] + jnp.asarray([0.0, 0.0, 4.0])[None, None]
+    behind = corners[:1].at[0, 0].set(jnp.asarray([6.0, -9.0, 30.0]))
+    _, seen = seen_from(CAMERA, jnp.concatenate([corners, nearer, back, behind]))
+    faces = np.asarray(seen.faces)[np.asarray(seen.covered)]
+    assert np.all(faces < 2 * len(corners))
+    assert np.asarray(seen.faces)[PIXELS // 2, PIXELS // 2] >= len(corners)
+
+
+@pytest.mark.once
+def test_faces_cover_a_texture_without_gaps_mirrored_or_not():
+    mesh = plane(1.0)
+    for uvs in (mesh.uvs, mesh.uvs * [-1.0, 1.0] + [1.0, 0.0]):
+        landing = baselines.Landing.in_texture(jnp.asarray(uvs, float), 40)
+        covered = np.asarray(baselines.see_faces(landing, baselines.capacity_for(landing)).covered)
+        assert np.array_equal(covered, np.pad(np.ones((36, 36), bool), 2))
+
+
+@pytest.mark.slow
+def test_attributes_have_the_derivatives_that_differences_say(float64, corners):
+    _, seen = seen_from(CAMERA, corners)
+    values = jnp.sin(corners) + 2.0
+
+    @jax.jit
+    def picture(corners, values, focal_length):
+        camera = sj.Camera(CAMERA.position, CAMERA.rotation, focal_length, PIXELS, PIXELS)
+        landing = baselines.Landing.in_view(corners, PerspectiveView.of(camera))
+        return jnp.sum(
+            jnp.sin(baselines.interpolate(values, seen, baselines.barycentrics(landing, seen)))
+        )
+
+    check_grads(
+        picture,
+        (corners, values, CAMERA.focal_length.astype(float)),
+        order=1,
+        modes=["fwd", "rev"],
+        rtol=1e-6,
+        atol=1e-6,
+    )
+
+
+@pytest.mark.once
+@pytest.mark.long
+def test_the_face_of_the_bust_has_its_colors_in_textures():
+    mesh, textures = baselines.bust_with_textures(512)
+    triangles = baselines.TexturedMesh.of(mesh, textures)
+    middles = mesh.corners().mean(axis=1)
+    face = (middles[:, 2] > 40) & (np.abs(middles[:, 0]) < 50)  # what nothing overlaps
+    uvs = jnp.asarray(mesh.uvs[face].mean(axis=1), float)
+    found = np.asarray(baselines.look_up(triangles.albedo, uvs))
+    expected, specular, roughness = complexion(middles[face])
+    off = np.abs(found - expected).max(axis=1)
+    assert np.median(off) < 0.01
+    assert np.quantile(off, 0.95) < 0.05
+    assert np.std(expected[:, 0]) > 0.03
+    for picture, values in ((triangles.specular, specular), (triangles.roughness, roughness)):
+        found = np.asarray(baselines.look_up(picture, uvs)).reshape(-1)
+        assert np.median(np.abs(found - values)) < 0.02

@@ -7,7 +7,6 @@ from splatjax.cli import main
 
 
 def run(*words):
-    """Run a command; return its exit status."""
     return main([str(word) for word in words])
 
 
@@ -22,7 +21,6 @@ def failure(words, capsys):
 
 
 def plate(path):
-    """Write an even plate of 20 x 20 mm that faces +z, without albedo."""
     places = np.linspace(-9.5, 9.5, 20)
     y, x = map(np.ravel, np.meshgrid(places, places, indexing="ij"))
     normals = np.tile([0.0, 0.0, 1.0], (len(x), 1))
@@ -44,10 +42,8 @@ def ball(path, radius=10.0, count=300):
 
 
 def contents(folder):
-    """Return what files there are, and what is in them."""
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
 def frame_names(*numbers):
-    """Return the names of the files of frames of a turntable."""
     return {f"frame_{i:04}.{suffix}" for i in numbers for suffix in ("exr", "png")}

@@ -1,9 +1,13 @@
 """The command line is run in process: its settings are those of the whole process."""
 
+from functools import partial
+
 import jax
 import pytest
+from bodies import PLAIN
 from jax.experimental.compilation_cache import compilation_cache
 
+import splatjax as sj
 from splatjax.cli import _render
 
 SETTINGS = (
@@ -25,6 +29,15 @@ def own_cache(tmp_path_factory):
     for name, value in before.items():
         jax.config.update(name, value)
     compilation_cache.reset_cache()
+
+
+@pytest.fixture(scope="module")
+def plain():
+    """Plain renderers, whose program is small: what is tested here does not depend on them."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("make_plan", "illuminate", "render"):
+            patch.setattr(sj, name, partial(getattr(sj, name), settings=PLAIN))
+        yield
 
 
 @pytest.fixture

@@ -1,6 +1,9 @@
-"""`splatjax fit` of coefficients, tables and photographs."""
+"""`splatjax fit` of coefficients, tables and photographs, and of many media into one table."""
 
+import csv
 import tomllib
+import unittest.mock
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -8,11 +11,14 @@ import numpy as np
 import OpenEXR
 import optimistix as optx
 import pytest
+from bodies import assert_close
 from commands import failure, run
 from PIL import Image
 
 import splatjax as sj
-from splatjax.cli import _models
+from splatjax.cli import _fit_all, _models
+
+pytestmark = pytest.mark.once
 
 SKIN = [0.4395, 0.2133, 0.1155]  # what leaves skin1, by Monte Carlo (MCML)
 OWN = """[medium]
@@ -33,21 +39,32 @@ def reflectance(path):
     return np.asarray(sj.load_material(path).gaussians.total_reflectance())
 
 
-@pytest.mark.once
+@pytest.fixture
+def fits_end_as(monkeypatch):
+    """Return how to make every fit end at once, with a result."""
+
+    def ended(result, profile, count, **_):
+        total = profile.total_reflectance()
+        weights, unknown = jnp.stack([total / count] * count), jnp.ones(len(total))
+        gaussians, covariance = sj.SumOfGaussians(jnp.ones(count), weights), jnp.eye(4 * count)
+        return sj.fitting.FitResult(gaussians, unknown, unknown, result, covariance)
+
+    return lambda result: monkeypatch.setattr(sj, "fit_gaussians", partial(ended, result))
+
+
 def test_it_prints_and_writes_a_material_that_loads(tmp_path, capsys):
     output, plot = tmp_path / "mine.toml", tmp_path / "mine.png"
-    assert run("fit", "skin1", "--count", "2", "--output", output, "--plot", plot) == 0
+    assert run("fit", "skin1", "--count", "1", "--output", output, "--plot", plot) == 0
     printed = capsys.readouterr().out
     assert "error (Eq. 4)" in printed
     assert printed.splitlines()[-2:] == [str(output), str(plot)]
     with Image.open(plot) as picture:
         assert min(picture.size) > 400
-    assert sj.load_material(output).gaussians.weights.shape == (2, 3)
+    assert sj.load_material(output).gaussians.weights.shape == (1, 3)
     total = np.asarray(sj.Dipole(sj.load_medium("skin1")).total_reflectance())
     np.testing.assert_allclose(reflectance(output), total, rtol=1e-5)
 
 
-@pytest.mark.once
 @pytest.mark.parametrize(
     ("words", "description", "rtol"),
     [
@@ -70,7 +87,7 @@ def test_it_prints_and_writes_a_material_that_loads(tmp_path, capsys):
 )
 def test_it_takes_the_model_that_is_asked_for(words, description, rtol, tmp_path):
     output = tmp_path / "skin.toml"
-    assert run("fit", "skin1", *words.split(), "--count", 3, "--output", output) == 0
+    assert run("fit", "skin1", *words.split(), "--count", 1, "--output", output) == 0
     assert description in output.read_text()
     material, total = sj.load_material(output), reflectance(output)
     if material.single_scattering is not None:
@@ -80,7 +97,6 @@ def test_it_takes_the_model_that_is_asked_for(words, description, rtol, tmp_path
     np.testing.assert_allclose(total, SKIN, rtol=rtol)
 
 
-@pytest.mark.once
 def test_it_takes_a_table_and_the_least_count(tmp_path):
     table, output = tmp_path / "measured.csv", tmp_path / "measured.toml"
     r = np.linspace(0.01, 0.5, 40)
@@ -88,11 +104,9 @@ def test_it_takes_a_table_and_the_least_count(tmp_path):
     np.savetxt(table, rows, delimiter=",", header="r (cm), R (1/cm^2)")
     assert run("fit", table, "--mm-per-unit", 10, "--error", "1e-4", "--output", output) == 0
     gaussians = sj.load_material(output).gaussians
-    np.testing.assert_allclose(gaussians.variances, [2.0], rtol=1e-5)
-    np.testing.assert_allclose(gaussians.weights, [[4 * np.pi / 100]], rtol=1e-5)
+    assert_close(gaussians, sj.SumOfGaussians([2.0], [[4 * np.pi / 100]]), rtol=1e-5)
 
 
-@pytest.mark.once
 def test_it_takes_a_photograph_and_the_size_of_its_pixels(tmp_path, capsys):
     photograph, output = tmp_path / "dot.exr", tmp_path / "dot.toml"
     y, x = (np.mgrid[:60, :60] - 29.5) * 0.2
@@ -103,11 +117,9 @@ def test_it_takes_a_photograph_and_the_size_of_its_pixels(tmp_path, capsys):
     assert "--mm-per-pixel" in failure(command, capsys)
     assert run(*command, "--mm-per-pixel", 0.2) == 0
     gaussians = sj.load_material(output).gaussians
-    np.testing.assert_allclose(gaussians.variances, [2.0], rtol=0.01)
-    np.testing.assert_allclose(gaussians.weights, [[1.0]], rtol=0.01)
+    assert_close(gaussians, sj.SumOfGaussians([2.0], [[1.0]]), rtol=0.01)
 
 
-@pytest.mark.once
 @pytest.mark.parametrize(
     ("values", "count", "noted"),
     [
@@ -116,11 +128,14 @@ def test_it_takes_a_photograph_and_the_size_of_its_pixels(tmp_path, capsys):
         ((0.084, 0.037, 0.0096, 0.00124), 3, "4 radii"),
     ],
 )
-def test_it_notes_too_much_light_and_too_few_radii(values, count, noted, tmp_path, capsys):
+def test_it_notes_too_much_light_and_too_few_radii(
+    values, count, noted, fits_end_as, tmp_path, capsys
+):
+    fits_end_as(optx.RESULTS.successful)
     rows = zip((0.5, 1, 2, 4), values, strict=True)
     lines = ["r (mm), R", *(f"{r}, {value}" for r, value in rows)]
     (tmp_path / "few.csv").write_text("\n".join(lines))
-    run("fit", tmp_path / "few.csv", "--count", count)
+    assert run("fit", tmp_path / "few.csv", "--count", count) == 0
     notes = [line for line in capsys.readouterr().err.splitlines() if "few.csv " in line]
     assert (noted is None and not notes) or any(noted in line for line in notes)
 
@@ -128,16 +143,13 @@ def test_it_notes_too_much_light_and_too_few_radii(values, count, noted, tmp_pat
 @pytest.mark.parametrize(
     ("words", "remedy"), [("", "--count"), ("--model monte-carlo --photons 200", "--photons")]
 )
-def test_a_fit_that_does_not_settle_names_the_remedy(words, remedy, monkeypatch, tmp_path, capsys):
-    def unsettled(profile, count, **_):
-        gaussians = sj.SumOfGaussians(jnp.ones(count), jnp.ones((count, 3)))
-        result = optx.RESULTS.nonlinear_max_steps_reached
-        return sj.fitting.FitResult(gaussians, jnp.ones(3), jnp.ones(3), result, jnp.eye(4 * count))
-
+def test_a_fit_that_does_not_settle_names_the_remedy(
+    words, remedy, fits_end_as, monkeypatch, tmp_path, capsys
+):
+    fits_end_as(optx.RESULTS.nonlinear_max_steps_reached)
     walked = sj.scattering.Tabulated(
         jnp.arange(1.0, 5.0), jnp.ones((4, 3)), jnp.ones((4, 3)), jnp.ones(3)
     )
-    monkeypatch.setattr(sj, "fit_gaussians", unsettled)
     monkeypatch.setattr(_models, "_walked", lambda *_: _models.Reference(walked))
     output = tmp_path / "mine.toml"
     line = failure(["fit", "skin1", *words.split(), "--output", output], capsys)
@@ -146,7 +158,6 @@ def test_a_fit_that_does_not_settle_names_the_remedy(words, remedy, monkeypatch,
     assert not output.exists()
 
 
-@pytest.mark.once
 def test_a_fit_to_its_own_file_keeps_what_stood_there(tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text(OWN)
@@ -160,3 +171,63 @@ def test_a_fit_to_its_own_file_keeps_what_stood_there(tmp_path):
     with jax.enable_x64(True):
         assert run("fit", path, "--count", 1, "--output", path) == 0
     assert tomllib.loads(path.read_text())["surface"] == after["surface"]
+
+
+HEAD = "name,sigma_a,sigma_s_prime,eta\n"
+MEDIA = ["a,0.002,2.6,1.5", "b,0.5,1.0,1.3", "c,0.0,3.0,1.4", "d,0.03,0.7,1.2", "e,0.1,8.0,1.0"]
+
+
+@pytest.fixture
+def media(tmp_path):
+    (tmp_path / "media.csv").write_text(HEAD + "\n".join(MEDIA) + "\n")
+    return tmp_path / "media.csv"
+
+
+def test_a_table_of_media_becomes_a_table_of_fits_and_is_continued(
+    media, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.setattr(_fit_all, "_BATCH", 2)
+    output = tmp_path / "fits.csv"
+    words = ["fit", media, "--all", "--count", 2, "--output", output]
+    with monkeypatch.context() as patch:
+        interruption = unittest.mock.Mock(side_effect=KeyboardInterrupt)
+        patch.setattr(_fit_all, "read_columns", interruption)
+        assert run(*words) == 130
+    capsys.readouterr()
+    assert run(*words) == 0
+    captured = capsys.readouterr()
+    assert captured.out == f"{output}\n"
+    assert "3 of 3 batches" in captured.err
+    assert sorted(tmp_path.iterdir()) == [output, media]
+    rows = list(csv.DictReader(output.read_text().splitlines()))
+    assert [row["name"] for row in rows] == [line[0] for line in MEDIA]
+    assert all(float(row["converged"]) == 1 for row in rows)
+    with jax.enable_x64(True):
+        medium = sj.Medium(*(jnp.asarray([value]) for value in (0.03, 0.7, 1.2)))
+        weights = sj.fitting.NonNegativeWeights(sj.fitting.FixedTotalReflectance())
+        alone = sj.fit_gaussians(sj.Dipole(medium), 2, weights=weights)
+        expected = [*alone.gaussians.variances, *alone.gaussians.weights[:, 0], alone.error[0]]
+        columns = ("variance_1", "variance_2", "weight_1", "weight_2", "error")
+        found = [float(rows[3][column]) for column in columns]
+        np.testing.assert_allclose(found, np.asarray(expected), rtol=1e-6)
+
+
+def test_it_reports_how_many_did_not_converge(media, tmp_path, monkeypatch, capsys):
+    columns = {"error": np.zeros(5), "converged": np.asarray([1.0, 0.0, 1.0, 1.0, 0.0])}
+    monkeypatch.setattr(_fit_all, "_fitted", lambda *_: columns)
+    assert run("fit", media, "--all", "--output", tmp_path / "fits.csv") == 0
+    assert "2 of 5 fits" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        ([], "--output"),
+        (["--output", "nowhere/fits.csv"], "no folder"),
+        (["--output", "fits.csv", "--error", 0.1], "leave the other options out"),
+        (["--output", "fits.csv", "--count", 9], "--count is 9"),
+    ],
+)
+def test_options_that_all_media_cannot_have_are_refused(words, named, media, capsys, monkeypatch):
+    monkeypatch.chdir(media.parent)
+    assert named in failure(["fit", media, "--all", *words], capsys)

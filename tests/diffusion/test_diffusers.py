@@ -64,7 +64,6 @@ def planned(diffuser, body: Splats, variances=VARIANCES):
 
 @eqx.filter_jit
 def run(plan, sources, variances):
-    """Values and slopes of all layers, stacked, and the capacity needed."""
     diffused = plan.diffuse(sources, variances, KERNEL, OneDevice())
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *diffused.layers), diffused.needed
 

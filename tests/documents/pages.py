@@ -15,12 +15,10 @@ _QUOTED = re.compile(r"`((?:splatjax|make|python) [^`]*)`")
 
 
 def name(page: Path) -> str:
-    """Give the name of a page in the repository."""
     return page.relative_to(ROOT).as_posix()
 
 
 def fences(page: Path, language: str) -> list[str]:
-    """Give what stands in a page in fences of a language."""
     return [
         body
         for found, body in _FENCE.findall(page.read_text(encoding="utf-8"))
@@ -49,8 +47,3 @@ def named_files(page: Path) -> dict[str, str]:
     """
     matches = [(re.match(r"# (\S+\.toml)\n", body), body) for body in fences(page, "toml")]
     return {first[1]: body for first, body in matches if first}
-
-
-def programs(page: Path) -> list[str]:
-    """Give the Python of a page, fence by fence."""
-    return fences(page, "python")

@@ -1,12 +1,18 @@
-"""Small files under the names that pages use for a reader's own."""
+"""Small files under the names that pages use for a reader's own; and what reference pages take for
+granted, small. Pages that teach stand for themselves.
+"""
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import OpenEXR
+import optax
 import trimesh
+from jax.sharding import NamedSharding, PartitionSpec
 from PIL import Image
 
 import splatjax as sj
@@ -125,3 +131,41 @@ def lay_out_frame(folder: Path, text: str) -> None:
         _splats(folder / "head.ply")
         options = ["--width", "32", "--height", "32", "--output", str(folder / "head.exr")]
         assert main(["render", str(folder / "head.ply"), *options]) == 0
+
+
+WITH_CONTEXT = {
+    f"docs/{name}.md" for name in ("devices", "gradients", "figures", "baselines", "recovery")
+}
+
+
+def context() -> dict[str, Any]:
+    bust = sj.bust(900)
+    splats = sj.Splats(bust.centers / 8, bust.normals, bust.radii / 8, bust.areas / 64)
+    camera = sj.Camera.look_at([8, 0, 70], [0, -3.5, 0], fov=32.0, width=_SIDE, height=_SIDE)
+    lights = (sj.DirectionalLight([-1, -0.3, -0.4], jnp.full(3, jnp.pi)),)
+    marble = sj.load_material("marble")
+    material = sj.Material(marble.gaussians, eta=1.5, specular=0.0)
+    scene = sj.Scene(splats, lights, material)
+    plan = sj.make_plan(scene, camera)
+    picture = np.asarray(sj.render(scene, camera, plan=plan).beauty)
+    return {
+        "jax": jax,
+        "jnp": jnp,
+        "np": np,
+        "optax": optax,
+        "sj": sj,
+        "splatjax": sj,
+        "NamedSharding": NamedSharding,
+        "PartitionSpec": PartitionSpec,
+        "splats": splats,
+        "camera": camera,
+        "cameras": jax.tree.map(lambda leaf: jnp.stack([leaf] * jax.device_count()), camera),
+        "lights": lights,
+        "medium": sj.load_medium("marble"),
+        "material": material,
+        "scene": scene,
+        "plan": plan,
+        "picture": picture,
+        "noise": np.full(picture.shape, 0.01 * float(np.sqrt(np.mean(picture**2)))),
+        "target": jnp.zeros((_SIDE, _SIDE, 3)),
+    }

@@ -9,17 +9,15 @@ import equinox as eqx
 import jax
 import numpy as np
 import pytest
-from contexts import PAGES as WITH_CONTEXT, context
-from pages import PAGES, name, programs
-from stand_ins import lay_out, lay_out_frame
+from pages import PAGES, fences, name
+from stand_ins import WITH_CONTEXT, context, lay_out, lay_out_frame
 
 import splatjax as sj
 
-WITH_PROGRAMS = [pytest.param(page, id=name(page)) for page in PAGES if programs(page)]
+WITH_PROGRAMS = [pytest.param(page, id=name(page)) for page in PAGES if fences(page, "python")]
 
 
 def _small(program: str) -> str:
-    """Give a program with fewer splats and pixels."""
     program = re.sub(r"sj\.bust\([\d_]+\)", "sj.bust(1_500)", program)
     program = re.sub(r"(sample_mesh\([^,]*, )[\d_]+", r"\g<1>1_500", program)
     program = program.replace("512, 512", "32, 32")
@@ -27,7 +25,6 @@ def _small(program: str) -> str:
 
 
 def _attribute(node: ast.expr):
-    """Look up a dotted name of the library."""
     if isinstance(node, ast.Name) and node.id == "sj":
         return sj
     owner = _attribute(node.value) if isinstance(node, ast.Attribute) else None
@@ -36,7 +33,7 @@ def _attribute(node: ast.expr):
 
 @pytest.mark.parametrize("page", WITH_PROGRAMS)
 def test_what_programs_name_is_there(page):
-    for node in ast.walk(ast.parse("\n".join(programs(page)))):
+    for node in ast.walk(ast.parse("\n".join(fences(page, "python")))):
         if isinstance(node, ast.ImportFrom) and node.module.startswith("splatjax"):
             module = importlib.import_module(node.module)
             for alias in node.names:
@@ -54,12 +51,12 @@ def test_what_programs_name_is_there(page):
 @pytest.mark.parametrize("page", WITH_PROGRAMS)
 def test_the_programs_of_a_page_run_one_after_the_other(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    text = "\n".join(programs(page))
+    text = "\n".join(fences(page, "python"))
     lay_out(tmp_path, text)
     lay_out_frame(tmp_path, text)
     monkeypatch.setattr(jax.distributed, "initialize", lambda: None)
     names = context() if name(page) in WITH_CONTEXT else {}
-    for program in programs(page):
+    for program in fences(page, "python"):
         exec(compile(_small(program), name(page), "exec"), names)
     for what, value in names.items():
         for leaf in jax.tree.leaves(eqx.filter(value, eqx.is_inexact_array)):

@@ -4,7 +4,6 @@ import json
 
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
 from splatjax.exports import (
     blender_radius,
@@ -74,12 +73,6 @@ def test_separable_kernel_of_one_gaussian_is_its_blur(float64):
     np.testing.assert_allclose(jnp.sum(weights), 1, rtol=1e-12)
     np.testing.assert_allclose(jnp.sum(weights[:, 0] * offsets**2), 2.0, rtol=1e-3)
     np.testing.assert_allclose(offsets, -offsets[::-1], atol=1e-12)
-
-
-@pytest.mark.parametrize("samples", [1, 4, 24])
-def test_a_kernel_without_a_middle_is_refused(dtype, samples):
-    with pytest.raises(ValueError, match=f"samples must be odd and at least 3.*got {samples}"):
-        separable_kernel(load_material("skin").gaussians, samples)
 
 
 def test_the_sheet_is_json_with_formulas_and_sources(dtype):

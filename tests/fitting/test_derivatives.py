@@ -1,20 +1,35 @@
-"""The derivative of a fit against fits of moved coefficients."""
+"""The derivative of a fit against fits of moved coefficients; the closed forms of variable
+projection, and what follows from them. Weights for given variances: against solvers of others, by
+hand and by trying all subsets; those of a fit, and of layers that serve many media.
+"""
+
+from itertools import combinations
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix as optx
 import pytest
+from scipy.optimize import nnls
 
+import splatjax as sj
 from splatjax.fitting import (
     FixedTotalReflectance,
     FreeWeights,
+    LeastCount,
+    NonNegativeWeights,
     SharedVariances,
     VariancesPerChannel,
+    error_by_count,
     fit_gaussians,
+    relative_error,
 )
+from splatjax.fitting._problem import make_problem
 from splatjax.gaussians import SumOfGaussians
-from splatjax.scattering import Dipole, Layer, Medium, Multipole
+from splatjax.inverse import wide_variances
+from splatjax.io import load_medium
+from splatjax.scattering import L2_QUADRATURE, Dipole, EganFresnel, Layer, Medium, Multipole
 
 # Asked of the derivative; central differences with steps of 1e-4 relative err by 1e-7.
 REFITS = 1e-4
@@ -29,9 +44,6 @@ POINT = np.log([0.0021, 0.0071, 2.19, 3.0, 1.5, 1.5])
 
 
 def fit(point, spread, weights):
-    """Logarithms of variances and weights of a fit to a dipole, from the logarithms of its
-    coefficients.
-    """
     sigma_a, sigma_s_prime, eta = jnp.exp(point).reshape(3, 2)
     fitted = fit_gaussians(
         Dipole(Medium(sigma_a, sigma_s_prime, eta)), 3, spread=spread, weights=weights
@@ -59,8 +71,6 @@ def test_derivative_of_a_fit_is_that_of_refits(float64, spread, weights):
 
 
 def test_reverse_mode_through_a_slab_gives_the_derivative_of_refits(float64):
-    """In absorption, scattering, index and thickness."""
-
     @jax.jit
     def run(point):
         *coefficients, thickness = jnp.exp(point)
@@ -115,3 +125,237 @@ def test_float32_gives_the_same_derivatives(float64):
     ]
     assert slopes[0].dtype == jnp.float32
     np.testing.assert_allclose(*slopes, rtol=IN_FLOAT32)
+
+
+EXACT = 1e-12
+LOG_VARIANCES = jnp.asarray([-3.2, -1.9, 0.1, 2.2])
+
+
+def marble() -> Dipole:
+    return Dipole(load_medium("marble"))
+
+
+@pytest.mark.parametrize(
+    "weights", [FreeWeights(), FixedTotalReflectance(), NonNegativeWeights(FixedTotalReflectance())]
+)
+@pytest.mark.parametrize("active", [None, (True, True, True, False)])
+def test_the_expansion_is_that_of_automatic_differentiation(float64, weights, active):
+    problem = make_problem(marble(), weights, L2_QUADRATURE)
+    active = None if active is None else jnp.asarray(active)
+    point = LOG_VARIANCES.astype(float)
+
+    @jax.jit
+    def both(point):
+        def cost(point):
+            return jnp.sum(problem.residuals(point, active) ** 2)
+
+        slopes = jax.jacfwd(lambda point: problem.residuals(point, active))(point)
+        return (
+            problem.expand(point, active),
+            slopes,
+            jax.jacfwd(cost)(point),
+            jax.jacfwd(jax.jacfwd(cost))(point),
+        )
+
+    found, jacobian, gradient, hessian = both(point)
+    for closed, automatic in (
+        (found.jacobian, jacobian),
+        (found.gradient, gradient),
+        (found.hessian, hessian),
+    ):
+        assert np.max(np.abs(automatic)) > 0
+        np.testing.assert_allclose(closed, automatic, atol=EXACT * float(np.max(np.abs(automatic))))
+
+
+def test_covariance_is_that_of_a_fit_of_all_parameters(float64):
+    """By Gauss and Newton: the inverse normal matrix of the Jacobian in variances and weights,
+    times the sum of squares.
+    """
+    profile = marble()
+    fitted = fit_gaussians(profile, 3)
+    problem = make_problem(profile, FreeWeights(), L2_QUADRATURE)
+    r = jnp.sqrt(problem.squared_radii)
+
+    def residuals(parameters):
+        gaussians = SumOfGaussians(parameters[:3], parameters[3:].reshape(3, 3).T)
+        values = jnp.stack([gaussians(r[channel])[:, channel] for channel in range(3)])
+        return (problem.target - problem.root_weights * values / problem.norm[:, None]).ravel()
+
+    best = jnp.concatenate([fitted.gaussians.variances, fitted.gaussians.weights.T.ravel()])
+    jacobian = np.asarray(jax.jit(jax.jacfwd(residuals))(best))
+    expected = np.linalg.inv(jacobian.T @ jacobian) * float(jnp.sum(residuals(best) ** 2))
+    scale = np.sqrt(np.diag(expected))
+    np.testing.assert_allclose(
+        fitted.covariance / np.outer(scale, scale), expected / np.outer(scale, scale), atol=1e-8
+    )
+
+
+def test_held_weights_do_not_vary_together(float64):
+    fitted = fit_gaussians(marble(), 2, weights=FixedTotalReflectance())
+    weights = np.asarray(fitted.covariance)[2:, 2:]
+    of_sum = weights[:2, :2].sum()
+    assert abs(of_sum) < 1e-12 * np.trace(weights)
+    assert np.all(np.linalg.eigvalsh(weights) > -1e-12 * np.trace(weights))
+
+
+def test_the_variance_of_a_gaussian_without_weight_is_anything(float64):
+    one = SumOfGaussians(jnp.asarray([1.0]), jnp.asarray([[0.5]]))
+    problem = make_problem(one, NonNegativeWeights(), L2_QUADRATURE)
+    # Next to the truth: what the second Gaussian would add is negative.
+    _, _, covariance = problem.outcome(jnp.log(jnp.asarray([0.9, 0.4])))
+    assert np.isinf(covariance[1, 1])
+    assert np.all(np.isfinite(np.delete(np.diag(covariance), 1)))
+
+
+def test_the_least_count_that_reaches_an_error(float64):
+    by_count = error_by_count(marble(), 4)
+    worst = np.max(np.asarray(by_count.error), axis=1)
+    assert np.all(np.diff(worst) < 0)
+    assert by_count.least(float(worst[2])) == 3
+    wanted = 1.01 * float(worst[2])
+    fitted = fit_gaussians(marble(), LeastCount(wanted, largest=4))
+    assert np.max(np.asarray(fitted.error)) <= wanted
+    assert fitted.gaussians.variances.shape == (3,)
+    np.testing.assert_allclose(
+        np.linalg.norm(fitted.error), np.linalg.norm(by_count.error[2]), rtol=1e-4
+    )
+    np.testing.assert_allclose(relative_error(marble(), fitted.gaussians), fitted.error, rtol=1e-9)
+    for refused, message in (
+        (lambda: by_count.least(1e-6), "an error of 1e-06 is not reached: 4 Gaussians leave"),
+        (
+            lambda: fit_gaussians(marble(), LeastCount(wanted), start=by_count.start(3)),
+            r"start is given, and LeastCount\(",
+        ),
+        (
+            lambda: eqx.filter_jit(lambda found: found.least(0.1))(by_count),
+            "depends on values; find it outside of jit",
+        ),
+        (lambda: error_by_count(marble(), 0), "largest must be .* at least 1; got 0"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            refused()
+
+
+SOLVED = 1e-9
+
+
+def problem(seed: int):
+    noise = np.random.default_rng(seed)
+    x = np.linspace(-2, 2, 40)[:, None]
+    basis = np.exp(-((x - np.linspace(-1.5, 1.5, 6)) ** 2))
+    basis /= np.linalg.norm(basis, axis=0)
+    target = noise.normal(size=40)
+    return basis, target / np.linalg.norm(target), noise.uniform(0.5, 2, 6), 1.3
+
+
+def solve(weights, basis, target, energies, total):
+    coefficients, _ = weights.solve(
+        *(jnp.asarray(each) for each in (basis, target, energies)), jnp.asarray(total)
+    )
+    return np.asarray(coefficients)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_non_negative_weights_are_those_of_lawson_and_hanson(float64, seed):
+    basis, target, energies, total = problem(seed)
+    found = solve(NonNegativeWeights(), basis, target, energies, total)
+    np.testing.assert_allclose(found, nnls(basis, target)[0], atol=SOLVED)
+    assert np.all(found >= 0)
+    assert np.any(solve(FreeWeights(), basis, target, energies, total) < 0)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_non_negative_weights_of_a_held_sum_are_the_best_of_all_subsets(float64, seed):
+    basis, target, energies, total = problem(seed)
+    best = np.inf
+    for size in range(1, 7):
+        for subset in map(list, combinations(range(6), size)):
+            # Lagrange's equations of the equality alone.
+            gram = basis[:, subset].T @ basis[:, subset]
+            edge = energies[subset]
+            system = np.block([[gram, edge[:, None]], [edge[None], np.zeros((1, 1))]])
+            weights = np.linalg.solve(system, np.append(basis[:, subset].T @ target, total))[:-1]
+            if np.all(weights >= 0):
+                best = min(best, np.linalg.norm(target - basis[:, subset] @ weights))
+    found = solve(NonNegativeWeights(FixedTotalReflectance()), basis, target, energies, total)
+    assert np.all(found >= 0)
+    np.testing.assert_allclose(energies @ found, total, rtol=SOLVED)
+    np.testing.assert_allclose(np.linalg.norm(target - basis @ found), best, rtol=SOLVED)
+
+
+def test_a_fit_with_weights_at_zero_converges_and_has_the_derivative_of_refits(float64):
+    """Ketchup's channels lie so far apart that some weights vanish."""
+    medium = load_medium("ketchup")
+
+    def fit(scale):
+        moved = Medium(medium.sigma_a * scale, medium.sigma_s_prime, medium.eta)
+        return fit_gaussians(
+            Dipole(moved, EganFresnel()), 3, weights=NonNegativeWeights(), throw=False
+        )
+
+    @jax.jit
+    def fit_and_slope(scale):
+        fitted, slope = jax.jvp(fit, (scale,), (jnp.ones_like(scale),))
+        return fitted.gaussians, slope.gaussians.variances, fitted.result == optx.RESULTS.successful
+
+    gaussians, slope, converged = fit_and_slope(jnp.asarray(1.0))
+    assert bool(converged)
+    assert np.all(gaussians.weights >= 0)
+    assert np.sum(np.asarray(gaussians.weights) == 0) >= 1
+    step = 1e-4
+    there, back = (fit_and_slope(jnp.asarray(1 + h))[0].variances for h in (step, -step))
+    np.testing.assert_allclose(slope, (there - back) / (2 * step), rtol=1e-4)
+
+
+HELD = NonNegativeWeights(FixedTotalReflectance())
+
+
+def test_with_the_variances_of_a_fit_they_are_its_weights(float64):
+    """Of a material that comes with the package: with as many digits as its file has."""
+    fitted = sj.load_material("marble").gaussians
+    found = sj.fitting.fit_weights(sj.load_profile("marble"), fitted.variances, weights=HELD)
+    np.testing.assert_allclose(found.weights, fitted.weights, atol=1e-7)
+    np.testing.assert_array_equal(found.variances, fitted.variances)
+
+
+def test_wide_variances_serve_all_media_near(float64):
+    near = sj.Medium([0.02, 0.2], [1.0, 0.7], 1.3)
+    variances = wide_variances(
+        [near], sj.Splats(jnp.asarray(np.eye(3) * 1e4), jnp.eye(3), jnp.ones(3), jnp.ones(3))
+    )
+    assert len(variances) < 20
+
+    @jax.jit
+    def error(sigma_a, sigma_s_prime):
+        profile = sj.Dipole(sj.Medium(sigma_a, sigma_s_prime, near.eta))
+        found = sj.fitting.fit_weights(profile, variances, weights=HELD)
+        return sj.fitting.relative_error(
+            profile, found
+        ), found.total_reflectance() / profile.total_reflectance() - 1
+
+    for a in (1 / 3, 1, 3):
+        for s in (1 / 3, 1, 3):
+            errors, energy = error(near.sigma_a * a, near.sigma_s_prime * s)
+            assert np.max(errors) < 0.004
+            assert np.max(np.abs(energy)) < 1e-12
+
+
+def test_they_have_derivatives_in_the_coefficients(float64):
+    variances = jnp.asarray([0.05, 0.3, 2.0, 15.0])
+
+    @jax.jit
+    def weights(point):
+        profile = sj.Dipole(sj.Medium(jnp.exp(point[:2]), jnp.exp(point[2:]), jnp.full(2, 1.3)))
+        return sj.fitting.fit_weights(profile, variances, weights=HELD).weights
+
+    point, way, step = (
+        jnp.log(jnp.asarray([0.02, 0.2, 1.0, 0.7])),
+        jnp.asarray([0.7, -0.4, 0.5, 1.0]),
+        1e-5,
+    )
+    _, slope = jax.jvp(weights, (point,), (way,))
+    difference = (weights(point + step * way) - weights(point - step * way)) / (2 * step)
+    # Nodes of the integrals are constants of the derivative, and they move with the medium: an
+    # integral has none.
+    np.testing.assert_allclose(slope, difference, atol=1e-6 * float(jnp.max(jnp.abs(slope))))
+    assert float(jnp.max(jnp.abs(slope))) > 0.01

@@ -7,6 +7,7 @@ import numpy as np
 import optimistix as optx
 import pytest
 from attainable import PER_CHANNEL, SHARED_FREE, SHARED_HELD
+from bodies import assert_close
 
 import splatjax as sj
 from splatjax.fitting import (
@@ -68,13 +69,11 @@ def together(error) -> float:
 
 
 def test_a_sum_of_gaussians_is_found_again_from_anywhere(float64):
-    """The error of what can be represented is rounding, and the Gaussians come back."""
     truth = SumOfGaussians([0.05, 0.4, 3.0], [[0.3, 0.1], [0.2, 0.5], [0.1, 0.2]])
     near = GivenVariances(truth.variances * jnp.asarray([1.3, 0.7, 1.4]))
     for start in (GreedyInsertion(), near):
         fitted = fit_gaussians(truth, 3, start=start)
-        np.testing.assert_allclose(fitted.gaussians.variances, truth.variances, rtol=1e-6)
-        np.testing.assert_allclose(fitted.gaussians.weights, truth.weights, rtol=1e-6)
+        assert_close(fitted.gaussians, truth, rtol=1e-6)
         assert np.max(np.asarray(fitted.error)) < 1e-7
     with pytest.raises(ValueError, match=r"GivenVariances.variances must be 2, .* got \[3\]"):
         fit_gaussians(truth, 2, start=near)
@@ -127,28 +126,21 @@ def test_held_energy_is_held_at_little_cost(float64):
     in_cm = Medium(medium.sigma_a * 10, medium.sigma_s_prime * 10, medium.eta)
     other = fit_gaussians(Dipole(in_cm, EganFresnel()), 4)
     np.testing.assert_allclose(other.error, free.error, rtol=1e-9)
-    np.testing.assert_allclose(other.gaussians.weights, free.gaussians.weights, rtol=SAME_OPTIMUM)
-    np.testing.assert_allclose(
-        other.gaussians.variances * 100, free.gaussians.variances, rtol=SAME_OPTIMUM
-    )
+    expected = SumOfGaussians(free.gaussians.variances / 100, free.gaussians.weights)
+    assert_close(other.gaussians, expected, rtol=SAME_OPTIMUM)
 
 
 def test_green_marble_is_the_published_fit(float64):
     fitted = fit_gaussians(Dipole(MARBLE_GREEN, EganFresnel()), 4)
     assert float(fitted.error[0]) <= 0.0126
-    np.testing.assert_allclose(
-        fitted.gaussians.variances, [0.0363, 0.1461, 0.9114, 7.010], rtol=PUBLISHED
-    )
-    np.testing.assert_allclose(
-        fitted.gaussians.weights[:, 0], [0.0704, 0.1839, 0.2060, 0.2882], rtol=PUBLISHED
-    )
+    variances, weights = [0.0363, 0.1461, 0.9114, 7.010], [0.0704, 0.1839, 0.2060, 0.2882]
+    assert_close(fitted.gaussians, SumOfGaussians(variances, weights), rtol=PUBLISHED)
 
 
 HELD_ABOVE_ZERO = NonNegativeWeights(FixedTotalReflectance())
 
 
 def all_channels() -> Dipole:
-    """Of all media, as the channels of one."""
     coefficients = [jax.tree.leaves(load_medium(name)) for name in PER_CHANNEL]
     return Dipole(
         Medium(*(jnp.concatenate(each) for each in zip(*coefficients, strict=True))), EganFresnel()
@@ -189,8 +181,6 @@ def test_a_profile_without_a_norm_is_refused(dtype):
     for function in (fit_gaussians, lambda beam: relative_error(beam, SumOfGaussians([1], [1]))):
         with pytest.raises(ValueError, match=r"PhotonBeam goes to infinity.*L2_QUADRATURE.beyond"):
             function(PhotonBeam(MARBLE_GREEN))
-    with pytest.raises(ValueError, match=r"cut must be between 0 and .* length scales; got 0"):
-        L2_QUADRATURE.beyond(0.0)
 
 
 def test_beyond_a_cut_a_photon_beam_is_fitted(float64):
@@ -217,7 +207,6 @@ def test_float32_reaches_its_floor_and_calls_it_success():
 
 
 def test_the_search_says_when_it_gave_up(float64, monkeypatch):
-    """Far from the optimum nothing is called a success."""
     profile = media("skin2")
     problem = make_problem(profile, FreeWeights(), L2_QUADRATURE)
     found, converged = refine(problem, GreedyInsertion().search(problem, 2))
@@ -231,18 +220,10 @@ def test_the_search_says_when_it_gave_up(float64, monkeypatch):
 
 def test_from_tabulated_starts_one_descent_finds_the_best_fits(float64):
     profile = all_channels()
-    medium, start = profile.medium, dipole_starts()(profile.medium, 6)
+    start = dipole_starts()(profile.medium, 6)
     found = fit_gaussians(profile, 6, spread=VariancesPerChannel(), start=start)
     best = [error[5] for channels in PER_CHANNEL.values() for error in channels]
     assert np.max(np.asarray(found.error) / best) < BAR
-    with pytest.raises(ValueError, match="starts are tabulated for 1 to 8 Gaussians; got 9"):
-        dipole_starts()(medium, 9)
-
-
-@pytest.mark.parametrize("count", [0, -1, True])
-def test_a_count_that_cannot_be_is_refused(dtype, count):
-    with pytest.raises(ValueError, match=rf"count must be .* got {count!r}"):
-        fit_gaussians(media("skin1"), count)
 
 
 @pytest.mark.once

@@ -1,4 +1,4 @@
-"""Laws of splats on a mesh: areas, coverage, evenness, order."""
+"""Laws of splats on a mesh: areas, coverage, evenness, order. Laws of the procedural bust."""
 
 import itertools
 
@@ -10,6 +10,8 @@ from scipy.spatial import cKDTree
 from splatjax.geometry import (
     Mesh,
     Textures,
+    bust,
+    bust_mesh,
     cut_below,
     sample_mesh,
     split_creases,
@@ -30,10 +32,12 @@ def sphere(radius=50.0, subdivisions=3) -> Mesh:
 
 
 def square(side=10.0) -> Mesh:
-    """A square in the xy plane, u along x and v along y, facing +z."""
     vertices = np.asarray([[0, 0, 0], [side, 0, 0], [side, side, 0], [0, side, 0]], float)
     faces = np.asarray([[0, 1, 2], [0, 2, 3]])
     return Mesh(vertices, faces, np.tile([0.0, 0.0, 1.0], (4, 1)), vertices[faces][..., :2] / side)
+
+
+FLAT = Mesh(np.zeros((3, 3)), np.asarray([[0, 1, 2]]), np.tile([0.0, 1.0, 0.0], (3, 1)))
 
 
 @pytest.fixture(scope="module")
@@ -41,8 +45,10 @@ def splats():
     return sample_mesh(sphere(), COUNT)
 
 
-def test_areas_add_up_to_the_surface(splats, dtype):
-    assert splats.count == COUNT
+@pytest.mark.parametrize("count", [1, 2, 5, COUNT])
+def test_areas_add_up_to_the_surface(count, dtype):
+    splats = sample_mesh(sphere(), count)
+    assert splats.count == count
     assert splats.areas.dtype == dtype
     np.testing.assert_allclose(
         float(np.asarray(splats.areas, np.float64).sum()), sphere().area(), rtol=SINGLE
@@ -50,7 +56,7 @@ def test_areas_add_up_to_the_surface(splats, dtype):
     assert float(splats.areas.min()) > 0
 
 
-def test_areas_are_those_of_voronoi_cells(splats):
+def test_areas_are_those_of_voronoi_cells():
     """On a sheet the cells are compared with exact counts of a fine grid of nearest neighbors."""
     sheet = sample_mesh(square(), 400)
     grid = (np.stack(np.meshgrid(np.arange(600), np.arange(600)), -1).reshape(-1, 2) + 0.5) / 60
@@ -115,13 +121,6 @@ def test_nearby_splats_are_near_in_memory(splats):
     assert np.median(step) < 3 * np.sqrt(sphere().area() / COUNT)
 
 
-@pytest.mark.parametrize("count", [1, 2, 5])
-def test_a_handful_of_splats(count):
-    splats = sample_mesh(sphere(), count)
-    assert splats.count == count
-    np.testing.assert_allclose(float(splats.areas.sum()), sphere().area(), rtol=SINGLE)
-
-
 def test_cut_keeps_what_is_above_the_plane():
     upper = cut_below(sphere(subdivisions=4), 20.0)
     assert upper.vertices[upper.faces, 1].min() >= 20 - 1e-9
@@ -131,7 +130,6 @@ def test_cut_keeps_what_is_above_the_plane():
 
 
 def saw_tooth(teeth=40, rows=20) -> Mesh:
-    """A square sheet of 20 mm whose lower rim has teeth of 0.5 mm."""
     x, y = np.meshgrid(np.linspace(0, 20, 2 * teeth + 1), np.linspace(0, 20, rows))
     y[0, 1::2] -= 0.5
     places = np.stack([x, y, 0 * x], axis=-1).reshape(-1, 3)
@@ -196,18 +194,20 @@ def test_normal_map_tilts_along_u_and_v(mirrored):
     np.testing.assert_allclose(along_v, np.tile([0, 0.6, 0.8], (20, 1)), atol=1e-6)
 
 
-def test_what_cannot_be_sampled_is_refused():
-    flat = Mesh(np.zeros((3, 3)), np.asarray([[0, 1, 2]]), np.tile([0.0, 1.0, 0.0], (3, 1)))
-    with pytest.raises(ValueError, match="count is 0"):
-        sample_mesh(sphere(), 0)
-    with pytest.raises(ValueError, match="no area"):
-        sample_mesh(flat, 10)
-    with pytest.raises(ValueError, match="no texture coordinates"):
-        sample_mesh(sphere(), 10, textures=Textures(albedo=np.ones((2, 2, 3))))
+@pytest.mark.parametrize(
+    ("mesh", "count", "textures", "said"),
+    [
+        (sphere(), 0, Textures(), "count is 0"),
+        (FLAT, 10, Textures(), "no area"),
+        (sphere(), 10, Textures(albedo=np.ones((2, 2, 3))), "no texture coordinates"),
+    ],
+)
+def test_what_cannot_be_sampled_is_refused(mesh, count, textures, said):
+    with pytest.raises(ValueError, match=said):
+        sample_mesh(mesh, count, textures=textures)
 
 
 def anywhere(mesh: Mesh, each: int = 20) -> SurfacePoints:
-    """Points all over the triangles of a mesh."""
     shares = np.random.default_rng(0).dirichlet(np.ones(3), each * len(mesh.faces))
     return SurfacePoints(np.repeat(np.arange(len(mesh.faces)), each), shares)
 
@@ -279,3 +279,75 @@ def test_rounded_splats_cover_the_rounded_surface():
     np.testing.assert_allclose(
         np.asarray(splats.areas, np.float64).sum(), 4 * np.pi * 50**2, rtol=1e-3
     )
+
+
+numpy_alone = pytest.mark.once
+"""The mesh is made and measured in NumPy, whatever JAX's precision."""
+
+
+@pytest.fixture(scope="module")
+def mesh():
+    return bust_mesh()
+
+
+@numpy_alone
+def test_bust_is_closed_and_faces_outward(mesh):
+    """Every edge belongs to two triangles, which run along it in opposite directions; and Euler's
+    number of one body without a hole.
+    """
+    body = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    assert body.is_watertight
+    assert body.is_winding_consistent
+    assert body.volume > 0
+    assert body.euler_number == 2
+
+
+@numpy_alone
+def test_bust_is_life_size(mesh):
+    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+    np.testing.assert_allclose((high - low)[0], 230, atol=25)
+    np.testing.assert_allclose(
+        low[0], -high[0], atol=0.3
+    )  # the same on both sides, but for the grid
+    assert 110 < high[1] < 120
+    head = mesh.vertices[mesh.vertices[:, 1] > 30]
+    np.testing.assert_allclose(np.ptp(head[:, 0]), 155, atol=8)
+    np.testing.assert_allclose(np.ptp(head[:, 2]), 190, atol=12)
+
+
+@numpy_alone
+def test_normals_of_the_bust_agree_with_its_triangles(mesh):
+    a, b, c = np.moveaxis(mesh.corners(), 1, 0)
+    face_normals = np.cross(b - a, c - a)
+    agreement = np.einsum("fi,fi->f", face_normals, mesh.normals[mesh.faces].mean(axis=1))
+    areas = mesh.face_areas()
+    assert areas[agreement < 0].sum() < 2e-3 * areas.sum()  # in the folds of lids and nostrils
+
+
+@numpy_alone
+def test_texture_coordinates_cover_the_unit_square_once(mesh):
+    assert mesh.uvs.min() >= 0
+    assert mesh.uvs[..., 1].max() <= 1
+    across = np.ptp(mesh.uvs[..., 0], axis=1) > 0.5  # those around the poles
+    assert across.sum() <= 20
+    signed_areas = np.linalg.det(mesh.uvs[:, 1:] - mesh.uvs[:, :1]) / 2
+    np.testing.assert_allclose(signed_areas.sum(), 1, rtol=0.02)
+
+
+def test_splats_of_the_bust(dtype):
+    splats = bust(5000)
+    assert splats.count == 5000
+    assert splats.centers.dtype == dtype
+    np.testing.assert_allclose(float(splats.areas.sum()), 213_000, rtol=0.05)
+    assert float(splats.albedo.min()) > 0
+    assert float(splats.albedo.max()) < 1
+
+
+def test_a_scaled_body_has_its_shape_and_the_square_of_its_area():
+    splats = bust(500)
+    small = splats.scaled(0.25)
+    np.testing.assert_allclose(small.centers, 0.25 * splats.centers, rtol=1e-6)
+    np.testing.assert_array_equal(small.normals, splats.normals)
+    np.testing.assert_array_equal(small.albedo, splats.albedo)
+    np.testing.assert_allclose(small.radii, 0.25 * splats.radii, rtol=1e-5)
+    np.testing.assert_allclose(small.areas, splats.areas / 16, rtol=1e-5)

@@ -2,28 +2,48 @@
 in float64.
 
 A step must change neither which splats are visible nor which surface a shadow map sees; at 1e-6 of
-a parameter's scale the chosen directions do not. What the picture does over longer ways is in
-`test_edges.py`.
+a parameter's scale the chosen directions do not.
+
+Gradients where things end: silhouettes against nothing and over a surface, edges of shadows. The
+picture is smooth there. Against central differences, and over a way as long as a pixel: what the
+gradients along it add up to is what the picture does. That leaves little to the jumps that have no
+gradient, of fragments that enter or leave the front surface.
 """
 
-from functools import cache
+import dataclasses
+from functools import cache, partial
+from pathlib import Path
 
+import bodies
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from evidence import write_evidence
+from matplotlib.image import imsave
 from PIL import Image
-from worlds import PLAIN, WORLDS, World, fields_of, named, with_leaf
+from scipy.ndimage import binary_dilation
+from worlds import FAST, PLAIN, WORLDS, World, fields_of, named, uneven, view, with_leaf
 
 import splatjax as sj
+from splatjax.diffusion import DenseDiffuser
 from splatjax.scene import AbstractLight
 
-pytestmark = [pytest.mark.slow, pytest.mark.once]  # in float64 whatever the precision of the run
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.once,
+    pytest.mark.usefixtures("double"),
+]  # in float64 whatever the precision of the run
 
 STEP = 1e-6  # of a parameter's own scale
 AGREEMENT = 1e-5  # relative; rounding over the step leaves about 1e-9
-LONG = "lamp inside", "sun and beam"  # what they add to the other worlds, long tests show
+ENLARGED = 8
+FOLDER = Path("out/gradients")
+LONG = (
+    "lamp inside",
+    "sun and beam",
+    "ball over sheet",
+)  # what they add to the other worlds, long tests show
 RECORDS = [
     pytest.param(world, path, name, marks=[pytest.mark.long] if world in LONG else [])
     for world, small in WORLDS.items()
@@ -71,7 +91,6 @@ def rendered(world: str, path: str, precision=jnp.float64):
 
 
 def direction_of(name: str, leaf: jax.Array) -> jax.Array:
-    """A random way to go, in the parameter's own scale."""
     way = np.random.default_rng(len(name)).normal(size=leaf.shape)
     if name.endswith("normals"):  # they are unit vectors: turn them
         normals = np.asarray(leaf)
@@ -79,23 +98,49 @@ def direction_of(name: str, leaf: jax.Array) -> jax.Array:
     return jnp.asarray(way * np.mean(np.abs(leaf)))
 
 
+def write_evidence(title: str, world: World, name: str, way: jax.Array, step: float) -> Path:
+    """Write the picture, its derivative along `way` by differences, that of the plain path in
+    forward mode, and their difference.
+
+    **Returns:** the path of a PNG; derivatives are red where positive, blue where negative, all in
+    one scale.
+    """
+    plan = sj.make_plan(world.scene, world.camera, PLAIN)
+
+    @jax.jit
+    def beauty(leaf):
+        moved = with_leaf(world, name, leaf)
+        return jnp.mean(sj.render(moved.scene, moved.camera, PLAIN, plan).beauty, axis=-1)
+
+    leaf = named(world)[name]
+    difference = (beauty(leaf + step * way) - beauty(leaf - step * way)) / (2 * step)
+    derivative = jax.jit(partial(jax.jvp, beauty))((leaf,), (way,))[1]
+    scale = max(np.abs(difference).max(), np.abs(derivative).max(), np.finfo(float).tiny)
+    rows = [each / scale for each in (difference, derivative, derivative - difference)]
+    picture = beauty(leaf)
+    pixels = np.concatenate([picture / max(picture.max(), np.finfo(float).tiny), *rows])
+    pixels = pixels.repeat(ENLARGED, axis=0).repeat(ENLARGED, axis=1)
+    FOLDER.mkdir(parents=True, exist_ok=True)
+    path = FOLDER / f"{title.replace(' ', '_')}.png"
+    imsave(path, pixels, cmap="bwr", vmin=-1, vmax=1)
+    return path
+
+
 @pytest.mark.parametrize(("world", "path", "name"), RECORDS)
 def test_gradient_is_that_of_central_differences(world, path, name):
-    with jax.enable_x64(True):
-        start, gradient, value = rendered(world, path)
-        leaf, derivative = named(start)[name], np.asarray(named(gradient)[name])
-        assert np.all(np.isfinite(derivative))
-        way = direction_of(name, leaf)
-        ends = [value(with_leaf(start, name, leaf + step * way)) for step in (STEP, -STEP)]
-        difference = (ends[0] - ends[1]) / (2 * STEP)
-        expected = np.vdot(derivative, way)
-        assert abs(difference) > 1e-7
-        if not np.isclose(expected, difference, rtol=AGREEMENT, atol=0):
-            where = write_evidence(f"{world} {path} {name}", start, name, way, STEP)
-            pytest.fail(
-                f"gradient along {name}: {expected:.12g}, by differences {difference:.12g}; see "
-                f"{where}"
-            )
+    start, gradient, value = rendered(world, path)
+    leaf, derivative = named(start)[name], np.asarray(named(gradient)[name])
+    assert np.all(np.isfinite(derivative))
+    way = direction_of(name, leaf)
+    ends = [value(with_leaf(start, name, leaf + step * way)) for step in (STEP, -STEP)]
+    difference = (ends[0] - ends[1]) / (2 * STEP)
+    expected = np.vdot(derivative, way)
+    assert abs(difference) > 1e-7
+    if not np.isclose(expected, difference, rtol=AGREEMENT, atol=0):
+        where = write_evidence(f"{world} {path} {name}", start, name, way, STEP)
+        pytest.fail(
+            f"gradient along {name}: {expected:.12g}, by differences {difference:.12g}; see {where}"
+        )
 
 
 PATHS_AGREE = 0.02  # of the norm: the support of the Gaussians, and clusters
@@ -103,7 +148,6 @@ CENTERS_AGREE = 0.1  # where every splat moves through the window of what is in 
 
 
 def differences(found: World, expected: World) -> dict[str, float]:
-    """Of gradients, in shares of the norm."""
     pairs = {
         name: (np.asarray(named(found)[name], float), np.asarray(each))
         for name, each in named(expected).items()
@@ -114,8 +158,7 @@ def differences(found: World, expected: World) -> dict[str, float]:
 
 
 def test_fast_and_plain_gradients_agree():
-    with jax.enable_x64(True):
-        errors = differences(*(rendered("lamp and maps", path)[1] for path in ("fast", "plain")))
+    errors = differences(*(rendered("lamp and maps", path)[1] for path in ("fast", "plain")))
     print({name: f"{error:.1e}" for name, error in errors.items()})
     for name, error in errors.items():
         assert error < (CENTERS_AGREE if "centers" in name or "camera" in name else PATHS_AGREE), (
@@ -126,47 +169,145 @@ def test_fast_and_plain_gradients_agree():
 IN_FLOAT32 = 1e-4  # of the norm; 3e-5 measured, 5e-6 but for the specular strength
 
 
-@pytest.mark.parametrize("path", ["plain", pytest.param("fast", marks=pytest.mark.long)])
-def test_float32_gradients_are_those_of_float64(path):
-    with jax.enable_x64(True):
-        single, double = (
-            rendered("lamp and maps", path, jnp.float32)[1],
-            rendered("lamp and maps", path)[1],
-        )
-        assert {leaf.dtype for leaf in jax.tree.leaves(single)} == {jnp.dtype(jnp.float32)}
-        errors = differences(single, double)
+@pytest.mark.parametrize(
+    ("world", "path"),
+    [
+        ("scattered once", "plain"),
+        pytest.param("lamp and maps", "plain", marks=pytest.mark.long),
+        pytest.param("lamp and maps", "fast", marks=pytest.mark.long),
+    ],
+)
+def test_float32_gradients_are_those_of_float64(world, path):
+    single, double = rendered(world, path, jnp.float32)[1], rendered(world, path)[1]
+    assert {leaf.dtype for leaf in jax.tree.leaves(single)} == {jnp.dtype(jnp.float32)}
+    errors = differences(single, double)
     print({name: f"{error:.1e}" for name, error in errors.items()})
     assert max(errors.values()) < IN_FLOAT32, errors
 
 
 def test_forward_mode_of_the_plain_path_is_its_reverse_mode():
-    with jax.enable_x64(True):
-        start, gradient, _ = rendered("sun and beam", "plain")
-        plan = sj.make_plan(start.scene, start.camera, PLAIN)
-        rng = np.random.default_rng(21)
-        tangent = jax.tree.map(lambda leaf: jnp.asarray(rng.normal(size=leaf.shape)), start)
+    start, gradient, _ = rendered("scattered once", "plain")
+    plan = sj.make_plan(start.scene, start.camera, PLAIN)
+    rng = np.random.default_rng(21)
+    tangent = jax.tree.map(lambda leaf: jnp.asarray(rng.normal(size=leaf.shape)), start)
 
-        @jax.jit
-        def forward(world: World, tangent: World):
-            return jax.jvp(
-                lambda w: loss(sj.render(w.scene, w.camera, PLAIN, plan)), (world,), (tangent,)
-            )[1]
+    @jax.jit
+    def forward(world: World, tangent: World):
+        return jax.jvp(
+            lambda w: loss(sj.render(w.scene, w.camera, PLAIN, plan)), (world,), (tangent,)
+        )[1]
 
-        products = jax.tree.map(lambda g, t: float(jnp.vdot(g, t)), gradient, tangent)
-        found, expected = float(forward(start, tangent)), sum(jax.tree.leaves(products))
+    products = jax.tree.map(lambda g, t: float(jnp.vdot(g, t)), gradient, tangent)
+    found, expected = float(forward(start, tangent)), sum(jax.tree.leaves(products))
     np.testing.assert_allclose(found, expected, rtol=1e-9)
 
 
+@pytest.mark.long
 def test_a_wrong_gradient_leaves_pictures(tmp_path, monkeypatch):
     """Derivatives by differences and in forward mode look alike: what is between them is blank."""
     monkeypatch.chdir(tmp_path)
-    with jax.enable_x64(True):
-        start = WORLDS["sun and beam"].make()
-        name = "scene.lights.0.direction"
-        path = write_evidence("sun", start, name, direction_of(name, named(start)[name]), STEP)
+    start = WORLDS["sun and beam"].make()
+    name = "scene.lights.0.direction"
+    path = write_evidence("sun", start, name, direction_of(name, named(start)[name]), STEP)
     pixels = np.asarray(Image.open(path).convert("RGB"), float)
     picture, by_differences, forward, between = np.split(pixels, 4)
     assert np.ptp(picture) > 200
     assert np.ptp(by_differences) > 200
     assert np.max(np.abs(by_differences - forward)) <= 1
     assert np.min(between) >= 253
+
+
+SIZE = 32
+EDGES_AGREE = 1e-3
+OVER_A_PIXEL = 1e-2
+EDGE_STEP = 1e-4  # mm
+POINTS = 16  # along a way
+BALL = 4.5
+
+
+@cache
+def moved_apart():
+    """A ball over a sheet that ends within the picture: a function of how far the ball, the sheet
+    and the light are moved, which gives a weighed sum of beauty, the frame, and the gradient.
+
+    All in one program: each takes its time to compile.
+    """
+    sheet = bodies.sheet(8.0, 1.2, center=(-2.7, 0.2, -6.0))
+    body = uneven(bodies.joined(sheet, bodies.sphere(500, BALL, (1.0, 0.5, 4.0))))
+    light = sj.DirectionalLight([-0.5, -0.3, -1.0], [2.0, 3.0])
+    scene = sj.Scene(body, (light,), sj.Material(sj.SumOfGaussians([0.5], [[0.5, 0.3]])))
+    camera = view((3.0, 2.0, 40.0), 30.0, SIZE)
+    # The plain path gives the same digits here. Of the diffuser, nothing is tested.
+    settings = dataclasses.replace(FAST, diffuser=DenseDiffuser())
+    plan = sj.make_plan(scene, camera, settings)
+    of_sheet = np.arange(body.count) < sheet.count
+    ways = [
+        jnp.asarray(which[:, None] * np.asarray([1.0, 0.3, 0.0])) for which in (~of_sheet, of_sheet)
+    ]
+
+    def summed(moved, share):
+        centers = scene.splats.centers + moved[0] * ways[0] + moved[1] * ways[1]
+        direction = scene.lights[0].direction + moved[2] * jnp.asarray([0.0, 1.0, 0.0])
+        there = eqx.tree_at(
+            lambda s: (s.splats.centers, s.lights[0].direction), scene, (centers, direction)
+        )
+        frame = sj.render(there, camera, settings, plan)
+        return jnp.sum(share * frame.beauty), frame
+
+    return jax.jit(jax.value_and_grad(summed, has_aux=True))
+
+
+def edges(frame: sj.Frame) -> dict[str, np.ndarray]:
+    depth, coverage, shadow = (
+        np.asarray(each) for each in (frame.depth, frame.coverage, frame.shadow[0])
+    )
+    front = np.where(np.isfinite(depth), depth, 0)
+    steep = np.hypot(*np.gradient(front)) > 2
+    inside = np.asarray(coverage) == 1
+    outer = (coverage > 0) & (coverage < 1)
+    far = front > 44  # the sheet
+    inner = steep & inside & ~binary_dilation(coverage == 0, iterations=2)
+    return {
+        "outer": outer,
+        "inner": inner,
+        "shadow": (shadow > 0.05) & (shadow < 0.95) & far & ~steep & inside,
+    }
+
+
+# What is looked at, what moves (ball, sheet, light), and how far: a pixel is 0.67 mm at the ball;
+# the shadow falls 10 mm deep.
+CASES = {
+    "outer-sheet": ("outer", 1, 0.67),
+    "inner-ball": ("inner", 0, 0.67),
+    "shadow-ball": ("shadow", 0, 0.67),
+    "shadow-light": ("shadow", 2, 0.067),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_edges_move_as_their_gradient_says(case):
+    where, which, far = CASES[case]
+    found = moved_apart()
+    (_, frame), _ = found(jnp.zeros(3), jnp.zeros((SIZE, SIZE, 2)))
+    mask = edges(frame)[where]
+    assert np.sum(mask) >= 15
+    share = jnp.asarray(
+        mask[..., None] * np.random.default_rng(1).uniform(-0.5, 1, (SIZE, SIZE, 2))
+    )
+    way = np.eye(3)[which]
+
+    def at(t):
+        (value, _), gradient = found(jnp.asarray(t * way), share)
+        return float(value), float(gradient[which])
+
+    start, slope = at(0.0)
+    difference = (at(EDGE_STEP)[0] - at(-EDGE_STEP)[0]) / (2 * EDGE_STEP)
+    np.testing.assert_allclose(slope, difference, rtol=EDGES_AGREE)
+    slopes = [at((i + 0.5) / POINTS * far)[1] for i in range(POINTS)]
+    moved, followed = at(far)[0] - start, far * np.mean(slopes)
+    print(
+        f"{case}: gradient {slope:.6f}, differences {difference:.6f}; over a pixel {followed:.5f}, "
+        f"picture {moved:.5f}"
+    )
+    assert abs(moved) > 0.01 * abs(start)
+    assert abs(followed - moved) < OVER_A_PIXEL * far * np.mean(np.abs(slopes))

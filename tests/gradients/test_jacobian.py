@@ -1,5 +1,5 @@
 """The Jacobian of a picture in its material: equal to reverse mode row by row, and to the fit's own
-derivative behind it.
+derivative behind it. How derivatives compose with `jit`, `vmap` and `lax.map`.
 """
 
 from functools import cache
@@ -10,11 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from worlds import FAST, PLAIN, view
+from worlds import FAST, PLAIN, WORLDS, view
 
 import splatjax as sj
 
-pytestmark = [pytest.mark.slow, pytest.mark.once]
+pytestmark = [pytest.mark.slow, pytest.mark.once, pytest.mark.usefixtures("double")]
 
 SIZE = 32
 ROW_BY_ROW = 1e-5  # asked; 1e-12 measured
@@ -52,24 +52,22 @@ def rendered(case: str):
 
 @pytest.mark.long
 def test_it_is_reverse_mode_row_by_row():
-    """With every part that a material can have."""
-    with jax.enable_x64(True):
-        start, beauty, _, jacobian = rendered("fast")
-        assert float(jacobian.frame.overflow) == 0
-        gaussians = start.material.gaussians
+    start, beauty, _, jacobian = rendered("fast")
+    assert float(jacobian.frame.overflow) == 0
+    gaussians = start.material.gaussians
 
-        @jax.jit
-        def some_rows(gaussians, places):
-            picture, pull = jax.vjp(beauty, gaussians)
+    @jax.jit
+    def some_rows(gaussians, places):
+        picture, pull = jax.vjp(beauty, gaussians)
 
-            def row(place):
-                return pull(jnp.zeros(picture.size).at[place].set(1.0).reshape(picture.shape))[0]
+        def row(place):
+            return pull(jnp.zeros(picture.size).at[place].set(1.0).reshape(picture.shape))[0]
 
-            return picture, jax.lax.map(row, places)
+        return picture, jax.lax.map(row, places)
 
-        lit = np.flatnonzero(np.asarray(jacobian.frame.beauty).reshape(-1))
-        places = jnp.asarray(np.random.default_rng(2).choice(lit, 300, replace=False))
-        picture, expected = some_rows(gaussians, places)
+    lit = np.flatnonzero(np.asarray(jacobian.frame.beauty).reshape(-1))
+    places = jnp.asarray(np.random.default_rng(2).choice(lit, 300, replace=False))
+    picture, expected = some_rows(gaussians, places)
     np.testing.assert_allclose(jacobian.frame.beauty, picture, rtol=1e-12, atol=1e-15)
     y, x, channel = np.unravel_index(np.asarray(places), picture.shape)
     weights = np.zeros(expected.weights.shape)
@@ -85,26 +83,26 @@ def test_it_is_reverse_mode_row_by_row():
     assert np.min(np.asarray(jacobian.weights)) < 0
 
 
+@pytest.mark.long
 def test_along_a_change_it_is_the_forward_derivative_of_the_plain_path():
     rng = np.random.default_rng(5)
-    with jax.enable_x64(True):
-        start, beauty, plan, jacobian = rendered("plain")
-        change = jax.tree.map(
-            lambda leaf: jnp.asarray(rng.normal(size=leaf.shape)), start.material.gaussians
-        )
-        expected = jax.jit(lambda g, c: jax.jvp(beauty, (g,), (c,))[1])(
-            start.material.gaussians, change
-        )
+    start, beauty, plan, jacobian = rendered("plain")
+    change = jax.tree.map(
+        lambda leaf: jnp.asarray(rng.normal(size=leaf.shape)), start.material.gaussians
+    )
+    expected = jax.jit(lambda g, c: jax.jvp(beauty, (g,), (c,))[1])(
+        start.material.gaussians, change
+    )
 
-        @jax.jit
-        def along(gaussians):
-            moved = eqx.tree_at(lambda s: s.material.gaussians, start, gaussians)
-            return sj.picture_jacobian(moved, view(*CAMERA), PLAIN, plan).along(change)
+    @jax.jit
+    def along(gaussians):
+        moved = eqx.tree_at(lambda s: s.material.gaussians, start, gaussians)
+        return sj.picture_jacobian(moved, view(*CAMERA), PLAIN, plan).along(change)
 
-        np.testing.assert_allclose(
-            along(start.material.gaussians), jacobian.along(change), rtol=1e-9, atol=1e-12
-        )
-        found = jacobian.along(change)
+    np.testing.assert_allclose(
+        along(start.material.gaussians), jacobian.along(change), rtol=1e-9, atol=1e-12
+    )
+    found = jacobian.along(change)
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12 * np.max(np.abs(expected)))
 
 
@@ -114,35 +112,33 @@ def medium_of(coefficients):
 
 
 def gaussians_of(coefficients):
-    return sj.fit_gaussians(sj.Dipole(medium_of(coefficients)), 3, throw=False).gaussians
+    return sj.fit_gaussians(sj.Dipole(medium_of(coefficients)), 2, throw=False).gaussians
 
 
 def test_through_the_fit_it_is_the_derivative_in_the_coefficients():
     """Against reverse mode through profile, fit and picture at once, pixel by pixel."""
-    with jax.enable_x64(True):
-        coefficients = {
-            "sigma_a": jnp.asarray([0.02, 0.05]),
-            "sigma_s_prime": jnp.asarray([0.4, 0.6]),
-        }
-        start, camera = scene(False), view(*CAMERA)
-        start = eqx.tree_at(lambda s: s.material.gaussians, start, gaussians_of(coefficients))
-        plan = sj.make_plan(start, camera, PLAIN)
+    coefficients = {
+        "sigma_a": jnp.asarray([0.02, 0.05]),
+        "sigma_s_prime": jnp.asarray([0.4, 0.6]),
+    }
+    start, camera = scene(False), view(*CAMERA)
+    start = eqx.tree_at(lambda s: s.material.gaussians, start, gaussians_of(coefficients))
+    plan = sj.make_plan(start, camera, PLAIN)
 
-        def beauty(coefficients):
-            moved = eqx.tree_at(lambda s: s.material.gaussians, start, gaussians_of(coefficients))
-            return sj.render(moved, camera, PLAIN, plan).beauty
+    def beauty(coefficients):
+        moved = eqx.tree_at(lambda s: s.material.gaussians, start, gaussians_of(coefficients))
+        return sj.render(moved, camera, PLAIN, plan).beauty
 
-        jacobian = sj.picture_jacobian(start, camera, PLAIN, plan).through(
-            gaussians_of, coefficients
-        )
-        places = [(16, 16, 0), (12, 20, 1), (20, 12, 1)]
+    of_gaussians = sj.picture_jacobian(start, camera, PLAIN, plan)
+    jacobian = of_gaussians.through(gaussians_of, coefficients)
+    places = [(16, 16, 0), (12, 20, 1), (20, 12, 1)]
 
-        @jax.jit
-        def rows(coefficients):
-            picture, pull = jax.vjp(beauty, coefficients)
-            return [pull(jnp.zeros_like(picture).at[place].set(1.0))[0] for place in places]
+    @jax.jit
+    def rows(coefficients):
+        picture, pull = jax.vjp(beauty, coefficients)
+        return [pull(jnp.zeros_like(picture).at[place].set(1.0))[0] for place in places]
 
-        expected = rows(coefficients)
+    expected = rows(coefficients)
     assert jacobian["sigma_a"].shape == (SIZE, SIZE, 2, 2)
     for place, row in zip(places, expected, strict=True):
         for name, each in row.items():
@@ -150,13 +146,71 @@ def test_through_the_fit_it_is_the_derivative_in_the_coefficients():
             np.testing.assert_allclose(
                 jacobian[name][place], each, rtol=ROW_BY_ROW, atol=1e-9 * np.max(np.abs(each))
             )
+    with pytest.raises(ValueError, match=r"\[1, 2\] Gaussians .* was made with \[2, 2\]"):
+        of_gaussians.through(lambda w: sj.SumOfGaussians(jnp.ones(1), w), jnp.ones((1, 2)))
 
 
-def test_a_function_of_other_gaussians_is_refused():
-    with jax.enable_x64(True):
-        *_, jacobian = rendered("plain")
-        with pytest.raises(
-            ValueError,
-            match=r"has \[2, 2\] Gaussians and channels, the picture was made with \[3, 2\]",
-        ):
-            jacobian.through(lambda w: sj.SumOfGaussians(jnp.ones(2), w), jnp.ones((2, 2)))
+@cache
+def graph(path: str):
+    world = WORLDS["sun and beam"].make()
+    settings = {"fast": FAST, "plain": PLAIN}[path]
+    other = sj.Camera.look_at(
+        jnp.asarray([2.0, -4.0, 41.0]), jnp.zeros(3), fov=32.0, width=20, height=20
+    )
+    plan = sj.make_plan(world.scene, [world.camera, other], settings)
+
+    def parts(scene):
+        return scene.material.gaussians.weights, scene.lights[1].origin
+
+    def loss(point, camera):
+        scene = eqx.tree_at(parts, world.scene, point)
+        return jnp.mean(sj.render(scene, camera, settings, plan).beauty ** 2)
+
+    return loss, parts(world.scene), [world.camera, other]
+
+
+@pytest.mark.long
+def test_many_cameras_by_map_and_many_materials_by_vmap_are_those_one_by_one():
+    loss, point, cameras = graph("fast")
+    gradient = jax.grad(loss)
+    alone = jax.jit(gradient)(point, cameras[1])
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *cameras)
+    mapped = jax.jit(lambda cameras: jax.lax.map(lambda camera: gradient(point, camera), cameras))(
+        stacked
+    )
+    mapped_over = jax.jit(jax.vmap(gradient, in_axes=(None, 0)))(point, stacked)
+    for found in (mapped, mapped_over):
+        for ours, theirs in zip(found, alone, strict=True):
+            np.testing.assert_allclose(ours[1], theirs, rtol=1e-9, atol=1e-13)
+
+
+def test_the_plain_path_has_second_derivatives():
+    loss, point, (camera, _) = graph("plain")
+    rng = np.random.default_rng(7)
+    way = tuple(jnp.asarray(rng.normal(size=each.shape)) for each in point)
+
+    @jax.jit
+    def gradient_and_product(point):
+        return jax.jvp(lambda p: jax.grad(loss)(p, camera), (point,), (way,))
+
+    step = 1e-5
+    (_, product), *ends = (
+        gradient_and_product(tuple(p + s * w for p, w in zip(point, way, strict=True)))
+        for s in (0, step, -step)
+    )
+    for found, above, below in zip(product, ends[0][0], ends[1][0], strict=True):
+        expected = (above - below) / (2 * step)
+        assert np.max(np.abs(expected)) > 0
+        np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-8 * np.max(np.abs(expected)))
+
+
+def test_the_fast_path_refuses_forward_mode_in_words():
+    loss, point, (camera, _) = graph("fast")
+    with pytest.raises(TypeError, match="forward-mode"):
+        jax.jvp(lambda p: loss(p, camera), (point,), (point,))
+
+
+def test_a_traced_scene_needs_a_plan():
+    world = WORLDS["sun and beam"].make()
+    with pytest.raises(ValueError, match="a plan is needed"):
+        jax.grad(lambda c: jnp.mean(sj.render(world.scene, c).beauty))(world.camera)

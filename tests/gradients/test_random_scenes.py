@@ -184,7 +184,6 @@ LAYERS = (
 
 @cache
 def loss_and_gradient(shape: Shape):
-    """Compiled once per shape, with room for every splat everywhere."""
     settings = sj.RenderSettings(shadows=SHADOWS)
     if not shape.fast:
         settings = sj.RenderSettings(
@@ -245,8 +244,6 @@ def typical(shape: Shape) -> World:
 
 
 def roomy(plan: sj.Plan, shape: Shape) -> sj.Plan:
-    """Give every list room for everything, and every layer any variance."""
-
     def widened(part):
         if isinstance(part, TilePlan):
             of_camera = part is plan.raster
@@ -279,13 +276,11 @@ def far_reaching(neighbors: Neighbors | None) -> Neighbors | None:
 
 
 def _room(items: int, tiles: int, lanes: int, slots: int) -> tuple[int, int, int]:
-    """Pairs, blocks and chunks when every tile lists every item."""
     chunks = -(-tiles // lanes)
     return max(1024, -(-items * tiles // 1024) * 1024), chunks * max(-(-items // slots), 1), chunks
 
 
 def is_finite(shape: Shape, world: World, factors=None) -> bool:
-    """Whether the loss is; if so, its gradient must be."""
     factors = jnp.ones(len(LAYERS)) if factors is None else jnp.asarray(factors, shape.precision)
     loss, gradient = loss_and_gradient(shape)(world, factors)
     if not np.isfinite(loss):
@@ -360,9 +355,11 @@ def test_gradients_are_finite_at_degenerate_places(case):
     assert is_finite(SHAPE, world)
 
 
-@pytest.mark.parametrize("count", [0, pytest.param(1, marks=pytest.mark.long)])
-def test_gradients_are_finite_with_one_splat_and_with_none(count):
-    shape = Shape(count, 1, "s", fast=False)
+@pytest.mark.parametrize(
+    ("count", "lights"), [(0, "d"), *(pytest.param(n, "s", marks=pytest.mark.long) for n in (0, 1))]
+)
+def test_gradients_are_finite_with_one_splat_and_with_none(count, lights):
+    shape = Shape(count, 1, lights, fast=False)
     assert is_finite(shape, typical(shape))
 
 

@@ -10,12 +10,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from bodies import view
 
 import splatjax as sj
 from splatjax.diffusion import DenseDiffuser
 from splatjax.splatting import DenseRasterizer, ShadowSettings, TileRasterizer
 
-SIZE = 20  # pixels along a side
 SHADOWS = ShadowSettings(resolution=32, bias=1.5, softness=3.0)
 FAST = sj.RenderSettings(shadows=SHADOWS, rasterizer=TileRasterizer(lanes=8, slots=16))
 PLAIN = sj.RenderSettings(shadows=SHADOWS, rasterizer=DenseRasterizer(), diffuser=DenseDiffuser())
@@ -23,16 +23,12 @@ COARSE = dataclasses.replace(PLAIN, shadows=dataclasses.replace(SHADOWS, resolut
 
 
 class World(eqx.Module):
-    """All that a picture depends on."""
-
     scene: sj.Scene
     camera: sj.Camera
 
 
 @dataclasses.dataclass(frozen=True)
 class Small:
-    """A small world, and how it is rendered."""
-
     make: Callable[[], World]
     paths: dict[str, sj.RenderSettings] = dataclasses.field(
         default_factory=lambda: {"plain": PLAIN}
@@ -43,15 +39,9 @@ def _gaussians() -> sj.SumOfGaussians:
     return sj.SumOfGaussians([4.0, 30.0], [[0.5, 0.3], [0.2, 0.6]])
 
 
-def view(eye=(6.0, 4.0, 40.0), fov=32.0, size=SIZE) -> sj.Camera:
-    return sj.Camera.look_at(jnp.asarray(eye), jnp.zeros(3), fov=fov, width=size, height=size)
-
-
 def _colored(body: sj.Splats, seed: int = 12) -> sj.Splats:
     albedo = np.random.default_rng(seed).uniform(0.2, 0.9, (body.count, 2))
-    return eqx.tree_at(
-        lambda s: s.albedo, body, jnp.asarray(albedo), is_leaf=lambda leaf: leaf is None
-    )
+    return bodies.with_albedo(body, albedo)
 
 
 def uneven(body: sj.Splats) -> sj.Splats:
@@ -76,7 +66,6 @@ def lamp_and_maps() -> World:
 
 
 def sun_and_beam() -> World:
-    """Light from far away, and a laser; neither casts a shadow."""
     lights = (
         sj.DirectionalLight([-0.6, -0.4, -0.7], [2.0, 3.0], cast_shadows=False),
         sj.GaussianBeam([2.0, 3.0, 30.0], [-0.1, 0.1, -1.0], [400.0, 600.0], 20.0),
@@ -85,7 +74,6 @@ def sun_and_beam() -> World:
 
 
 def lamp_inside() -> World:
-    """A point light between two bodies: the six faces of a cube."""
     body = uneven(
         bodies.joined(
             bodies.sphere(120, 6.0, (-7.0, 0.0, 0.0)),
@@ -97,7 +85,6 @@ def lamp_inside() -> World:
 
 
 def ball_over_sheet() -> World:
-    """A silhouette inside the picture, and the edge of a shadow."""
     body = uneven(
         bodies.joined(
             bodies.sheet(14.0, 2.2, center=(0.3, 0.2, -6.0)),
@@ -109,7 +96,6 @@ def ball_over_sheet() -> World:
 
 
 def scattered_once() -> World:
-    """Single scattering, some of it under light that grazes."""
     medium = sj.Medium([0.1, 0.05], [0.9, 1.2], [1.3, 1.5])
     single = sj.SingleScattering(medium, [0.9, 1.0])
     gaussians = sj.SumOfGaussians([4.0, 30.0], [[0.4, 0.5], [0.3, 0.3]])
@@ -130,7 +116,6 @@ WORLDS = {
 
 
 def named(world: World) -> dict[str, jax.Array]:
-    """Every leaf by its path, such as `scene.lights.0.direction`."""
     leaves, _ = jax.tree_util.tree_flatten_with_path(world)
     return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
 
@@ -142,7 +127,6 @@ def with_leaf(world: World, name: str, value: jax.Array) -> World:
 
 
 def fields_of(record: eqx.Module) -> Iterator[tuple[str, bool]]:
-    """Name the fields of a record and of the records in it, and say whether they are given."""
     for field in dataclasses.fields(record):
         value = getattr(record, field.name)
         for each in value if isinstance(value, tuple) else (value,):

@@ -1,6 +1,6 @@
 """What was moved comes back: albedo, lights, cameras, shape. What no picture tells of stays."""
 
-from functools import cache
+from functools import cache, partial
 
 import bodies
 import equinox as eqx
@@ -9,17 +9,17 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+from bodies import PLAIN, assert_close, lights_from_two_sides as lights, view, with_albedo
 
 import splatjax as sj
-from splatjax.diffusion import DenseDiffuser
 from splatjax.inverse import _fit_scene
 from splatjax.inverse._fit_scene import MovableScene
 from splatjax.inverse._observation import Evidence
 from splatjax.inverse._parts import Setup, rotation
-from splatjax.splatting import DenseRasterizer, ShadowSettings
+from splatjax.splatting import ShadowSettings
 
-PLAIN = sj.RenderSettings(rasterizer=DenseRasterizer(), diffuser=DenseDiffuser())
 SIZE = 16
+camera = partial(view, size=SIZE)
 PARTS = (
     sj.inverse.AlbedoMap(step=0.2),
     sj.inverse.NormalOffsets(step=0.02, smoothness=2.0, deviation=0.5),
@@ -27,15 +27,6 @@ PARTS = (
     sj.inverse.LightPlaces(),
     sj.inverse.CameraPoses(turn=4e-3),
 )
-
-
-def lights():
-    ways = [-1.0, -0.4, -0.3], [0.8, -0.2, -0.6]
-    return [sj.DirectionalLight(way, [2.0, 3.0], cast_shadows=False) for way in ways]
-
-
-def camera() -> sj.Camera:
-    return sj.Camera.look_at([6, 4, 40], [0, 0, 0], fov=32.0, width=SIZE, height=SIZE)
 
 
 def material() -> sj.Material:
@@ -49,12 +40,6 @@ def body() -> sj.Splats:
     aside = [bodies.sphere(18, 4.0, center=(x, 0.0, 0.0)) for x in (-60.0, 60.0)]
     splats = bodies.joined(bodies.bumpy(160), *aside)
     return with_albedo(splats, np.random.default_rng(2).uniform(0.3, 0.9, (splats.count, 2)))
-
-
-def with_albedo(splats: sj.Splats, albedo) -> sj.Splats:
-    return eqx.tree_at(
-        lambda s: s.albedo, splats, jnp.asarray(albedo), is_leaf=lambda leaf: leaf is None
-    )
 
 
 def evaluate(splats: sj.Splats, light: sj.DirectionalLight, picture=0.0, x=None):
@@ -86,7 +71,6 @@ def only(*kinds: type) -> optax.GradientTransformation:
 
 
 def chosen(kinds, coordinates):
-    """Set the coordinates of other parts to zero."""
     return tuple(
         own if isinstance(part, kinds) else jax.tree.map(jnp.zeros_like, own)
         for part, own in zip(PARTS, coordinates, strict=True)
@@ -153,9 +137,7 @@ class TestFitScene:
         found = fitted(*map(type, PARTS), steps=2)
         assert found.losses[0] < 1e-20
         assert found.best == 0
-        np.testing.assert_allclose(found.splats.centers, body().centers, atol=1e-12)
-        np.testing.assert_allclose(found.splats.normals, body().normals, atol=1e-12)
-        np.testing.assert_allclose(found.splats.albedo, body().albedo, atol=1e-12)
+        assert_close(found.splats, body(), atol=1e-12)
 
     def test_an_albedo_map_comes_back_and_splats_unseen_do_not_move(self):
         gray = with_albedo(body(), np.full(body().albedo.shape, 0.5))
@@ -220,8 +202,6 @@ class TestFitScene:
 
 
 class Frame(eqx.Module):
-    """What a fit asks of a picture."""
-
     beauty: jax.Array
     coverage: jax.Array
     overflow: jax.Array

@@ -2,7 +2,7 @@
 known.
 """
 
-from functools import cache
+from functools import cache, partial
 
 import bodies
 import equinox as eqx
@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from bodies import lights_from_two_sides as lights
 
 import splatjax as sj
 from splatjax.diffusion import (
@@ -32,7 +33,8 @@ PLAIN = sj.RenderSettings(
 splats.
 """
 SIZE = 24
-COUNT = 4
+camera = partial(bodies.view, size=SIZE)
+COUNT = 3
 HELD = sj.fitting.NonNegativeWeights(sj.fitting.FixedTotalReflectance())
 STRONGER = 1.7
 """The second light, than is given."""
@@ -48,18 +50,8 @@ def medium(times_a=1.0, times_s=1.0) -> sj.Medium:
 STARTS = [(3, 1 / 3), (1 / 3, 3)]
 
 
-def camera() -> sj.Camera:
-    return sj.Camera.look_at([6, 4, 40], [0, 0, 0], fov=32.0, width=SIZE, height=SIZE)
-
-
-def lights():
-    ways = [-1.0, -0.4, -0.3], [0.8, -0.2, -0.6]
-    return [sj.DirectionalLight(way, [2.0, 3.0], cast_shadows=False) for way in ways]
-
-
 @cache
 def taken():
-    """A bumpy ball, and its pictures under two lights."""
     splats = bodies.bumpy(200)
     gaussians = sj.fit_gaussians(sj.Dipole(medium()), COUNT, weights=HELD).gaussians
     scenes = [
@@ -91,7 +83,6 @@ def recovered(pictures, starts, deviation=None, **more) -> sj.inverse.Recovery:
 
 
 def errors(found: sj.inverse.Recovery) -> np.ndarray:
-    """Compute the errors of the logarithms of both coefficients."""
     truth = medium()
     return np.stack(
         [
@@ -110,10 +101,14 @@ def without_noise() -> sj.inverse.Recovery:
 @pytest.mark.once
 @pytest.mark.usefixtures("double")
 class TestRecover:
+    @pytest.mark.long
+    def test_another_loss_finds_them_too(self):
+        found = recovered(taken()[1], STARTS[:1], loss=sj.inverse.HuberLoss())
+        assert np.max(np.abs(errors(found))) < ROUNDS
+
     def test_it_finds_the_coefficients_from_starts_a_factor_of_three_off(self):
         found = without_noise()
-        np.testing.assert_allclose(found.medium.sigma_a, medium().sigma_a, rtol=ROUNDS)
-        np.testing.assert_allclose(found.medium.sigma_s_prime, medium().sigma_s_prime, rtol=ROUNDS)
+        assert np.max(np.abs(errors(found))) < ROUNDS
         np.testing.assert_allclose(found.intensities, [[1, 1], [STRONGER, STRONGER]], rtol=1e-4)
         first, second = found.ends
         np.testing.assert_allclose(first.sigma_a, second.sigma_a, rtol=1e-2)
@@ -218,7 +213,6 @@ def half_resolved():
 
 
 def wider(problem, by):
-    """Scale the widths below which layers are unresolved."""
     return eqx.tree_at(
         lambda one: one.pictures[0].light.interval,
         problem,
@@ -282,8 +276,6 @@ def test_the_smooth_loss_bends():
     )
     np.testing.assert_allclose(loss.root(r[3]) / r[3], 1.0, rtol=1e-6)
     assert float(loss.root(r)[0]) < 0
-    with pytest.raises(ValueError, match="bend must be positive"):
-        sj.inverse.HuberLoss(0.0)
 
 
 @pytest.mark.parametrize(

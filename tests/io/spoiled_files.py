@@ -8,15 +8,13 @@ from functools import partial
 from pathlib import Path
 
 import hypothesis.strategies as st
-import jax.numpy as jnp
 import numpy as np
 import trimesh
 from PIL import Image
+from writers import some_frame
 
 import splatjax as sj
 from splatjax import io
-from splatjax.diffusion import DenseDiffuser
-from splatjax.splatting import DenseRasterizer
 
 WORDS = (
     *(b"0", b"-1", b"1", b"255", b"65536", b"2147483647", b"4294967296", b"9223372036854775808"),
@@ -102,7 +100,6 @@ READERS: dict[str, Callable[[Path], object]] = {
 
 
 def seeds(name: str, folder: Path) -> list[Path]:
-    """Write small files that a reader reads, and return their paths."""
     suffix, texts = TEXTS.get(name, (f".{name}", []))
     paths = [folder / f"{number}{suffix}" for number in range(len(texts))]
     for path, text in zip(paths, texts, strict=True):
@@ -122,11 +119,7 @@ def seeds(name: str, folder: Path) -> list[Path]:
             paths.append(folder / file)
             picture.save(paths[-1])
     elif name in ("exr", "observations"):
-        camera = sj.Camera.look_at(jnp.asarray([0.0, 0, 500]), jnp.zeros(3), width=4, height=3)
-        light = sj.DirectionalLight(jnp.asarray([0.0, 0, -1]), jnp.ones(3))
-        scene = sj.Scene(sj.bust(9), (light,), sj.load_material("marble").opaque())
-        settings = sj.RenderSettings(rasterizer=DenseRasterizer(), diffuser=DenseDiffuser())
-        sj.write_exr(folder / "a.exr", sj.render(scene, camera, settings))
+        sj.write_exr(folder / "a.exr", some_frame())
         paths += [folder / "a.exr"] if name == "exr" else []
     return paths
 

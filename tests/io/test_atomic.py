@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_pictures import some_frame
+from writers import some_frame
 
 from splatjax.geometry import complete_splats
 from splatjax.io import (

@@ -1,14 +1,22 @@
-"""Meshes from files that other libraries write and that the formats' own texts show."""
+"""Meshes from files that other libraries write and that the formats' own texts show; where they
+have hard edges, normals end there, and splats do too. Splats in PLY files, at once or a part at a
+time.
+"""
 
+import functools
+
+import jax
+import jax.numpy as jnp
 import meshio
 import numpy as np
 import pytest
 import trimesh
 from PIL import Image
 from scipy.spatial import KDTree
-from writers import SUFFIXES, export, write_ply, xyz
+from writers import SUFFIXES, columns_of, export, some_splats, write_ply, xyz
 
-from splatjax.io import read_textured_mesh, srgb_to_linear
+import splatjax as sj
+from splatjax.io import read_textured_mesh, sample_mesh, srgb_to_linear
 
 MM = 2.0
 DIGITS = 2e-5
@@ -32,7 +40,6 @@ def with_attributes(body):
 
 
 def described(vertices, faces):
-    """Return the middle of triangles and twice their areas, along their normals."""
     a, b, c = np.moveaxis(np.asarray(vertices, float)[faces], 1, 0)
     return np.concatenate([(a + b + c) / 3, np.cross(b - a, c - a)], axis=1)
 
@@ -143,3 +150,129 @@ def test_examples_of_the_formats_own_texts(tmp_path, name):
         (len(mesh.faces), trimesh.Trimesh(mesh.vertices, mesh.faces).volume, mesh.area()),
         (12, MM**3, 6 * MM**2),
     )
+
+
+COUNT = 800
+FACET = 4.0
+"""Degrees: round sides are of 48 facets, whose normals are this much off in the middle."""
+
+
+def plate():
+    rib = trimesh.creation.box((3, 30, 8))
+    rib.apply_translation((25, 0, 2))
+    return trimesh.util.concatenate([trimesh.creation.annulus(6, 14, 4, sections=48), rib])
+
+
+HARD_BODIES = {
+    "box": trimesh.creation.box((20, 24, 16)),
+    "cylinder": trimesh.creation.cylinder(10, 24, sections=48),
+    "plate": plate(),
+}
+
+
+@functools.cache
+def points_of(body):
+    points, faces = trimesh.sample.sample_surface(HARD_BODIES[body], 40_000, seed=0)
+    return KDTree(points), HARD_BODIES[body].face_normals[faces]
+
+
+def angles_to_body(splats, body):
+    """Return how far normals of splats are off those of the triangles there, in degrees, and the
+    distances of splats from the body.
+    """
+    tree, normals = points_of(body)
+    distance, near = tree.query(np.asarray(splats.centers), k=8)
+    cosines = np.einsum("nki,ni->nk", normals[near], np.asarray(splats.normals))
+    return np.degrees(np.arccos(np.clip(cosines, -1, 1).max(axis=1))), distance[:, 0]
+
+
+@pytest.mark.parametrize("rounded", [True, False])
+@pytest.mark.parametrize("kind", [*SUFFIXES, "smooth ply", "smooth obj", "smooth glb"])
+@pytest.mark.parametrize("body", HARD_BODIES)
+def test_normals_end_at_hard_edges(tmp_path, body, kind, rounded):
+    """Files without normals, and files whose normals are the mean of all faces around a vertex."""
+    mesh = HARD_BODIES[body].copy()
+    if kind.startswith("smooth"):
+        mesh.vertex_normals = np.array(mesh.vertex_normals)
+        path = export(mesh, tmp_path, kind.split()[1])
+    else:
+        options = {"ply": {"vertex_normal": False}, "obj": {"include_normals": False}}
+        options |= {"glb": {"include_normals": False}, "gltf": {"include_normals": False}}
+        path = export(mesh, tmp_path, kind, **options.get(kind.split(".")[-1], {}))
+    splats = sample_mesh(path, COUNT, mm_per_unit=1.0, rounded=rounded)
+    angles, distances = angles_to_body(splats, body)
+    assert angles.max() < (0.1 if body == "box" else FACET)
+    assert distances.max() < 0.5
+    np.testing.assert_allclose(float(splats.areas.sum()), mesh.area, rtol=2e-3)
+
+
+def test_splats_reach_little_beyond_hard_edges(tmp_path):
+    """Seen up to 0.8 of their radius, at most 0.7 spacings; at corners too."""
+    path = export(HARD_BODIES["box"], tmp_path, "off")
+    splats = sample_mesh(path, COUNT, mm_per_unit=1.0)
+    centers, normals = np.asarray(splats.centers), np.asarray(splats.normals)
+    spacing = (HARD_BODIES["box"].area / COUNT) ** 0.5
+    beyond = np.abs(centers) + 0.8 * np.asarray(splats.radii)[:, None] - [10, 12, 8]
+    assert beyond[np.abs(normals) < 0.5].max() < 0.7 * spacing
+
+
+SINGLE = 1e-6
+
+
+def assert_same(one, other):
+    orders = np.argsort(one.radii), np.argsort(other.radii)
+    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
+        np.testing.assert_allclose(b[orders[1]], a[orders[0]], rtol=SINGLE, atol=20 * SINGLE)
+
+
+def test_splats_come_back_at_once_and_in_parts(tmp_path):
+    splats, path = some_splats(), tmp_path / "a.ply"
+    sj.write_splats(path, splats)
+    assert_same(splats, sj.read_splats(path))
+    vertices = meshio.read(path)
+    np.testing.assert_array_equal(vertices.points, np.asarray(splats.centers, np.float32))
+    np.testing.assert_array_equal(
+        vertices.point_data["radius"], np.asarray(splats.radii, np.float32)
+    )
+    file = sj.SplatFile(path, part=20, mm_per_unit=2.0, up="z")
+    for parts in (list(file()), list(file())):
+        assert [part.count for part in parts] == [20, 20, 10]
+    together = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+    assert_same(sj.read_splats(path, mm_per_unit=2.0, up="z"), together)
+
+
+@pytest.mark.parametrize("kind", ["f4", "f8"])
+@pytest.mark.parametrize(("text", "order"), [(True, "<"), (False, "<"), (False, ">")])
+def test_every_encoding_unit_and_axis(tmp_path, text, order, kind):
+    splats, comments = some_splats(), ["Größe in cm"]
+    columns = columns_of(splats, kind)
+    path = write_ply(tmp_path / "a.ply", columns, text=text, order=order, comments=comments)
+    turned = [
+        vectors[:, [0, 2, 1]] * [1.0, 1, -1]
+        for vectors in map(np.asarray, (splats.centers, splats.normals))
+    ]
+    fields = 10 * turned[0], turned[1], 10 * splats.radii, 100 * splats.areas
+    expected = sj.Splats(*(jnp.asarray(field, float) for field in fields))
+    assert_same(expected, sj.read_splats(path, mm_per_unit=10.0, up="z"))
+
+
+@pytest.mark.parametrize(
+    ("kind", "scale", "green"),
+    [("u1", 1, 0.2158605), ("u2", 257, 0.2158605), ("f4", 1 / 255, 128 / 255)],
+)
+def test_integers_are_srgb_and_floats_are_linear(tmp_path, kind, scale, green):
+    values = zip(("red", "green", "blue"), (255, 128, 0), strict=True)
+    colors = {name: np.full(50, value * scale, kind) for name, value in values}
+    path = write_ply(tmp_path / "a.ply", columns_of(some_splats()) | colors)
+    np.testing.assert_allclose(sj.read_splats(path).albedo[0], [1, green, 0], atol=1e-6)
+
+
+def test_raw_points_are_completed_and_faces_without_radii_are_told(tmp_path):
+    path = tmp_path / "a.ply"
+    trimesh.creation.icosphere(radius=20.0).export(path)
+    with pytest.warns(UserWarning, match=r"a\.ply: has faces.*splatjax sample"):
+        splats = sj.read_splats(path)
+    outward = np.asarray(splats.centers) / 20
+    assert (np.asarray(splats.normals) * outward).sum(axis=1).min() > 0.99
+    np.testing.assert_allclose(np.asarray(splats.areas).sum(), 4 * np.pi * 400, rtol=0.01)
+    assert (np.asarray(splats.radii) > np.sqrt(np.asarray(splats.areas))).all()

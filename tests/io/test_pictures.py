@@ -1,4 +1,6 @@
-"""Frames in OpenEXR, pictures in PNG, and those that move."""
+"""Frames in OpenEXR, pictures in PNG, and those that move. Maps of every kind of numbers, baked
+where the texture coordinates of each format say.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -6,39 +8,22 @@ import numpy as np
 import OpenEXR
 import OpenImageIO as oiio
 import pytest
+import trimesh
 from PIL import Image
+from writers import SQUARE, TRIANGLES, UVS, ramp, some_frame, square, write_picture, write_ply, xyz
 
-from splatjax.io import read_exr, read_manifest, write_animation, write_exr, write_png
-from splatjax.scene import Frame
-
-
-def some_frame(channels=3, gaussians=4, lights=2, height=6, width=5) -> Frame:
-    """A frame of noise whose diffuse part is the weighted sum of its layers."""
-    random = np.random.default_rng(3)
-
-    def noise(*shape):
-        return jnp.asarray(random.uniform(0, 1, shape).astype(np.float32))
-
-    size, colors = (height, width), (height, width, channels)
-    layers, weights = noise(gaussians, *colors), noise(gaussians, channels)
-    diffuse, specular = (layers * weights[:, None, None]).sum(axis=0), noise(*colors)
-    return Frame(
-        beauty=diffuse + specular,
-        coverage=noise(*size),
-        depth=noise(*size).at[0, 0].set(jnp.inf),
-        position=noise(*size, 3),
-        normal=noise(*size, 3),
-        albedo=noise(*colors),
-        shadow=noise(lights, *size),
-        irradiance=noise(*colors),
-        layers=layers,
-        weights=weights,
-        diffuse=diffuse,
-        specular=specular,
-        unresolved_fraction=noise(gaussians),
-        overflow=jnp.zeros((), jnp.float32),
-        single_scattering=noise(*colors) if channels == 1 else None,
-    )
+from splatjax.io import (
+    linear_to_srgb,
+    read_exr,
+    read_manifest,
+    read_picture,
+    sample_mesh,
+    srgb_to_linear,
+    write_animation,
+    write_exr,
+    write_png,
+)
+from splatjax.io._images import read_color, read_map
 
 
 @pytest.mark.parametrize(("channels", "lights", "gaussians"), [(3, 2, 11), (1, 0, 1), (12, 1, 3)])
@@ -106,3 +91,115 @@ def test_animation_keeps_the_colors_and_the_time(tmp_path):
             np.testing.assert_array_equal(np.asarray(film.convert("RGB")), picture)
             durations.append(film.info["duration"])
     assert durations == [42, 41, 42]
+
+
+SINGLE = 1e-6
+
+
+@pytest.mark.parametrize("channels", [1, 3, 4])
+@pytest.mark.parametrize(
+    ("suffix", "kind", "levels"),
+    [
+        ("png", "uint8", 255),
+        ("png", "uint16", 65535),
+        ("tif", "uint8", 255),
+        ("tif", "uint16", 65535),
+        ("tif", "float", None),
+        ("exr", "float", None),
+    ],
+)
+def test_pictures_of_every_kind_of_number(tmp_path, suffix, kind, levels, channels):
+    """An albedo of whole numbers is sRGB, one of floats linear; other maps are not decoded."""
+    shares = np.random.default_rng(channels).uniform(size=(5, 7, channels)).astype(np.float32)
+    shares = np.rint(shares * levels) / levels if levels else shares.astype(float)
+    path = write_picture(tmp_path / f"a.{suffix}", shares, kind)
+    color = np.broadcast_to(shares[..., :3], (5, 7, 3))
+    albedo = srgb_to_linear(color) if levels else color
+    np.testing.assert_allclose(read_color(path), albedo, atol=SINGLE)
+    np.testing.assert_allclose(read_map(path), color, atol=SINGLE)
+    if levels is None:
+        np.testing.assert_array_equal(read_picture(path), shares[..., : 3 if channels > 1 else 1])
+    else:
+        with pytest.raises(ValueError, match=rf"a\.{suffix}: is encoded for a display"):
+            read_picture(path)
+
+
+def test_decoding_is_that_of_colour_science():
+    import colour
+
+    encoded, linear = np.linspace(0, 1, 4097), np.linspace(-0.5, 1.5, 4097)
+    np.testing.assert_allclose(
+        srgb_to_linear(encoded), colour.cctf_decoding(encoded, function="sRGB"), atol=1e-15
+    )
+    np.testing.assert_allclose(
+        linear_to_srgb(np.append(linear, np.nan)),
+        colour.cctf_encoding(np.append(np.clip(linear, 0, 1), 0), function="sRGB"),
+        atol=1e-15,
+    )
+
+
+def heights_and_reds(splats):
+    height = np.asarray(splats.centers)[:, 1] / np.asarray(splats.centers)[:, 1].max()
+    inner = np.abs(height - 0.5) < 0.48
+    return height[inner], linear_to_srgb(np.asarray(splats.albedo, float)[inner, 0])
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """The square with and without its texture, in formats that have v up and down."""
+    ramp().save(tmp_path / "ramp.png")
+    plain, texture = trimesh.visual.material.PBRMaterial(), ["TextureFile ramp.png"]
+    careless = square(material=plain)
+    careless.visual.uv = careless.visual.uv * [1, -1] + [0, 1]
+    careless.export(tmp_path / "careless.glb")
+    square(material=plain).export(tmp_path / "square.glb")
+    square(material=plain).export(tmp_path / "square.obj", include_texture=True)
+    textured = square(material=trimesh.visual.material.PBRMaterial(baseColorTexture=ramp()))
+    textured.export(tmp_path / "textured.glb")
+    square(image=ramp()).export(tmp_path / "textured.obj", mtl_name="textured.mtl")
+    columns = xyz(SQUARE) | dict(zip("st", UVS.astype("f4").T, strict=True))
+    lists = {"vertex_index": TRIANGLES.astype("i4")}
+    write_ply(tmp_path / "textured.ply", columns, lists, comments=texture)
+    lists["texcoord"] = UVS[TRIANGLES].reshape(2, 6).astype("f4")
+    write_ply(tmp_path / "wedges.ply", xyz(SQUARE), lists, comments=texture)
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("name", "v_up", "rises"),
+    [
+        ("square.obj", None, True),
+        ("square.obj", True, True),
+        ("square.obj", False, False),
+        ("square.glb", None, True),
+        ("square.glb", False, True),
+        ("careless.glb", None, False),
+        ("careless.glb", True, True),
+        ("textured.glb", None, True),
+        ("textured.obj", None, True),
+        ("textured.ply", None, True),
+        ("wedges.ply", None, True),
+    ],
+)
+def test_maps_stand_upright(folder, name, v_up, rises):
+    """Red, at the top of the picture, is at the top of the square; glTF has v down, others up, and
+    a file may be careless.
+    """
+    albedo = None if name[0] in "tw" else folder / "ramp.png"
+    splats = sample_mesh(folder / name, 300, mm_per_unit=5.0, albedo=albedo, v_up=v_up)
+    height, red = heights_and_reds(splats)
+    np.testing.assert_allclose(red, height if rises else 1 - height, atol=0.03)
+    np.testing.assert_allclose(float(splats.areas.sum()), 100, rtol=1e-5)
+
+
+def test_specular_and_normal_maps(folder):
+    Image.fromarray(np.full((4, 4), 51, np.uint8)).save(folder / "specular.png")
+    tilted = 255 * (np.asarray([0.6, 0.0, 0.8]) * 0.5 + 0.5) * np.ones((4, 4, 1))
+    Image.fromarray(np.rint(tilted).astype(np.uint8)).save(folder / "normal.png")
+    maps = {"specular": folder / "specular.png", "normal": folder / "normal.png"}
+    splats = sample_mesh(folder / "square.obj", 50, mm_per_unit=1.0, **maps)
+    assert splats.albedo is None
+    np.testing.assert_allclose(np.asarray(splats.specular), 0.2, rtol=1e-6)
+    np.testing.assert_allclose(
+        np.asarray(splats.normals), np.tile([0.6, 0, 0.8], (50, 1)), atol=2 / 255
+    )

@@ -155,7 +155,6 @@ def test_points_that_cannot_be_read(tmp_path, data, value):
 
 
 def changed(names, value):
-    """Return columns of splats with a value at vertex 7."""
     columns = columns_of(some_splats()) | dict.fromkeys(("specular", "red"), np.ones(50, "f4"))
     columns |= dict.fromkeys(("green", "blue"), np.ones(50, "f4"))
     is_there = np.arange(50) == 7

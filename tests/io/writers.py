@@ -1,15 +1,17 @@
-"""Small files of meshes and points, written as their formats prescribe."""
+"""Small files of meshes and points, written as their formats prescribe; and a frame to write."""
 
 import base64
 import json
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 import OpenImageIO as oiio
 import trimesh
 from PIL import Image
 
 from splatjax.geometry import complete_splats
+from splatjax.scene import Frame
 
 SQUARE = np.asarray([[0, 0, 0], [2, 0, 0], [2, 2, 0], [0, 2, 0]], np.float32)
 TRIANGLES = np.asarray([[0, 1, 2], [0, 2, 3]])
@@ -29,7 +31,6 @@ _PLY_TYPES = {"u1": "uchar", "u2": "ushort", "i4": "int", "f4": "float", "f8": "
 
 
 def export(mesh, folder, suffix, **options):
-    """Write a mesh or a scene by trimesh; return the file."""
     path, options = Path(folder, f"a.{suffix}"), SUFFIXES[suffix] | options
     if suffix != "gltf":
         mesh.export(path, **options)
@@ -64,12 +65,10 @@ def write_ply(path, columns, lists=None, *, text=False, order="<", comments=()):
 
 
 def xyz(points, names=("x", "y", "z")):
-    """Return columns of points, or of other vectors."""
     return dict(zip(names, np.asarray(points).T, strict=True))
 
 
 def some_splats(count=50):
-    """Return a patch of a sphere, every field given."""
     random = np.random.default_rng(1)
     normals = random.normal(size=(count, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
@@ -78,8 +77,36 @@ def some_splats(count=50):
     return complete_splats(20 * normals, normals=normals, albedo=shares[4:].T, **fields)
 
 
+def some_frame(channels=3, gaussians=4, lights=2, height=6, width=5) -> Frame:
+    """A frame of noise whose diffuse part is the weighted sum of its layers."""
+    random = np.random.default_rng(3)
+
+    def noise(*shape):
+        return jnp.asarray(random.uniform(0, 1, shape).astype(np.float32))
+
+    size, colors = (height, width), (height, width, channels)
+    layers, weights = noise(gaussians, *colors), noise(gaussians, channels)
+    diffuse, specular = (layers * weights[:, None, None]).sum(axis=0), noise(*colors)
+    return Frame(
+        beauty=diffuse + specular,
+        coverage=noise(*size),
+        depth=noise(*size).at[0, 0].set(jnp.inf),
+        position=noise(*size, 3),
+        normal=noise(*size, 3),
+        albedo=noise(*colors),
+        shadow=noise(lights, *size),
+        irradiance=noise(*colors),
+        layers=layers,
+        weights=weights,
+        diffuse=diffuse,
+        specular=specular,
+        unresolved_fraction=noise(gaussians),
+        overflow=jnp.zeros((), jnp.float32),
+        single_scattering=noise(*colors) if channels == 1 else None,
+    )
+
+
 def columns_of(splats, kind="f4"):
-    """Return columns in an order of their own."""
     columns = xyz(splats.normals, ("nx", "ny", "nz")) | {
         "radius": splats.radii,
         "area": splats.areas,
@@ -89,7 +116,6 @@ def columns_of(splats, kind="f4"):
 
 
 def square(**visual):
-    """Return the square as trimesh has it, with texture coordinates."""
     made = trimesh.visual.TextureVisuals(uv=UVS, **visual)
     return trimesh.Trimesh(SQUARE, TRIANGLES, visual=made, process=False)
 
@@ -114,7 +140,6 @@ def gltf(path, mesh=None, **changes):
 
 
 def ramp():
-    """Return a picture that is red at the top, row 0, and green at the bottom."""
     rows = np.linspace(1, 0, 64)[:, None] * np.ones(8)
     return Image.fromarray(
         np.rint(255 * np.stack([rows, 1 - rows, 0 * rows], axis=-1)).astype(np.uint8)
@@ -122,7 +147,6 @@ def ramp():
 
 
 def write_picture(path, values, kind):
-    """Write shares in [0, 1] by OpenImageIO, as a type of number."""
     file = oiio.ImageOutput.create(str(path))
     spec = oiio.ImageSpec(values.shape[1], values.shape[0], values.shape[2], kind)
     spec["oiio:UnassociatedAlpha"] = 1

@@ -1,4 +1,4 @@
-"""Run by test_devices.py in a process of its own, with eight devices: what they find, as JSON."""
+"""Run by test_devices.py in processes of their own: what their devices find, as JSON."""
 
 import json
 import sys
@@ -7,13 +7,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from bodies import apart, joined, sphere
+from bodies import PLAIN, apart, joined, sphere, with_albedo
+from jax.experimental.multihost_utils import process_allgather
 from jax.sharding import NamedSharding, PartitionSpec
 
 import splatjax as sj
 from benchmarks.communication import Picture, View, counted
-from splatjax.diffusion import DenseDiffuser
-from splatjax.splatting import DenseRasterizer, ShadowSettings
+from splatjax.splatting import ShadowSettings
 
 SETTINGS = sj.RenderSettings(shadows=ShadowSettings(resolution=32))
 PLACE = np.asarray([40.0, -25.0, 15.0])
@@ -28,7 +28,7 @@ def scene(count: int = 1501, variances=(0.1, 12.5, 100.0)) -> sj.Scene:
     before = sphere(count // 5, 6.0, PLACE + np.asarray([-8.0, 6.0, 30.0]), jitter=0.0)
     splats = joined(behind, before)
     shade = 0.6 + 0.3 * jnp.sin((splats.centers - jnp.asarray(PLACE[None], float)) / 5)
-    splats = eqx.tree_at(lambda each: each.albedo, splats, shade, is_leaf=lambda leaf: leaf is None)
+    splats = with_albedo(splats, shade)
     weights = [[0.2, 0.1, 0.1], [0.3, 0.3, 0.2], [0.3, 0.2, 0.1]][-len(variances) :]
     material = sj.Material(sj.SumOfGaussians(variances, weights))
     sun = sj.DirectionalLight([0.4, -0.5, -1.0], jnp.ones(3))
@@ -44,8 +44,6 @@ def camera(angle: float = 0.0) -> sj.Camera:
 
 @eqx.filter_jit
 def pictured(scene: sj.Scene, camera: sj.Camera, plan: sj.Plan):
-    """Give the derivatives of a loss that looks at every pixel, and the picture."""
-
     def loss(of):
         frame = sj.render(*of, SETTINGS, plan)
         wave = jnp.sin(jnp.arange(frame.beauty.size, dtype=float)).reshape(frame.beauty.shape)
@@ -56,7 +54,6 @@ def pictured(scene: sj.Scene, camera: sj.Camera, plan: sj.Plan):
 
 
 def splats_cut() -> dict:
-    """One device against eight that each hold a share of the splats."""
     world, eye = scene(), camera()
     mesh = jax.make_mesh((4, 2), ("hosts", "devices"))
     plans = [sj.make_plan(world, eye, SETTINGS), sj.make_plan(world, eye, SETTINGS, mesh=mesh)]
@@ -69,7 +66,6 @@ def splats_cut() -> dict:
 
 
 def _with_one_lobe(found):
-    """Put the derivatives in a lobe's three numbers together, to be compared with the largest."""
     material = found[0][0].material
     lobe = jnp.stack([material.eta, material.specular, material.roughness])
     return lobe, eqx.tree_at(lambda each: each[0][0].material, found, material.gaussians)
@@ -140,17 +136,9 @@ def _capacity(raster) -> tuple[int, int]:
 
 
 def views_cut() -> dict:
-    """A batch of cameras over the devices against one camera after the other, by plain renderers:
-    their program is small.
-    """
-    settings = sj.RenderSettings(
-        shadows=ShadowSettings(resolution=16),
-        rasterizer=DenseRasterizer(),
-        diffuser=DenseDiffuser(),
-    )
     world, cameras = scene(97), [camera(angle) for angle in (0.0, 1.0, 2.0)]
     world = sj.Scene(world.splats, world.lights[1:], world.material)
-    plan = sj.make_plan(world, cameras, settings)
+    plan = sj.make_plan(world, cameras, PLAIN)
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *cameras)
     mesh = jax.make_mesh((8,), ("views",))
 
@@ -158,7 +146,7 @@ def views_cut() -> dict:
         return jnp.sum(frames.beauty**2) + jnp.sum(frames.coverage)
 
     def draw(scene, camera):
-        return sj.render(scene, camera, settings, plan)
+        return sj.render(scene, camera, PLAIN, plan)
 
     def one_by_one(of):
         frames = jax.lax.map(lambda camera: draw(of[0], camera), of[1])
@@ -175,7 +163,48 @@ def views_cut() -> dict:
     return apart(one, many)
 
 
+def over_processes(what: str, index: str, count: str, port: str) -> dict:
+    """The splats of one scene on the devices of several processes, of which this is one: the
+    picture, or the gradients of what soon compiles. The first process compares with one device of
+    its own.
+    """
+    jax.distributed.initialize(f"127.0.0.1:{port}", int(count), int(index))
+    mesh = jax.make_mesh((jax.device_count(),), ("splats",))
+    world, eye = (
+        scene(1504, variances=(16.0, 100.0)),
+        camera(),
+    )  # a layer of single splats, and one of clusters
+    cut = NamedSharding(mesh, PartitionSpec("splats"))
+    splats = jax.tree.map(lambda leaf: jax.device_put(leaf, cut), world.splats)
+
+    def found(splats, mesh):
+        cut_scene = sj.Scene(splats, world.lights, world.material)
+        plan = sj.make_plan(cut_scene, eye, SETTINGS, mesh=mesh)
+
+        def draw(splats, plan):
+            return sj.render(sj.Scene(splats, world.lights, world.material), eye, SETTINGS, plan)
+
+        if what == "picture":
+            return draw(splats, plan)
+        return eqx.filter_jit(
+            eqx.filter_grad(lambda splats, plan: jnp.sum(draw(splats, plan).coverage ** 2))
+        )(splats, plan)
+
+    answer = found(splats, mesh)
+    if what == "gradients":
+        rows = [shard.data.shape[0] for shard in answer.centers.addressable_shards]
+        answer = process_allgather(answer, tiled=True)
+    else:
+        rows = []
+    return {
+        "devices": jax.device_count(),
+        "rows": rows,
+        "apart": apart(found(world.splats, None), answer) if index == "0" else {},
+    }
+
+
 if __name__ == "__main__":
     jax.config.update("jax_numpy_rank_promotion", "raise")
     jax.config.update("jax_numpy_dtype_promotion", "strict")
-    print(json.dumps(globals()[sys.argv[1]]()))
+    question, *given = sys.argv[1:]
+    print(json.dumps(globals()[question](*given)))

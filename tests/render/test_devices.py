@@ -1,7 +1,8 @@
 """Eight devices give what one gives, and send each other what the model says. They need a process
-of their own.
+of their own. Same input, same bits: in another process, on another number of processors.
 """
 
+import importlib.util
 import json
 import os
 import socket
@@ -33,7 +34,6 @@ def answers(commands, devices):
 
 
 def on_eight(question):
-    """What eight devices find."""
     return answers([[HERE / "over_devices.py", question]], 8)[0]
 
 
@@ -66,9 +66,28 @@ def test_splats_of_several_processes_make_what_those_of_one_do(what, count):
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     found = answers(
-        [[HERE / "over_processes.py", what, i, count, port] for i in range(count)], 4 // count
+        [[HERE / "over_devices.py", "over_processes", what, i, count, port] for i in range(count)],
+        4 // count,
     )
     for answer in found:
         assert answer["devices"] == 4
         assert answer["rows"] == ([376] * (4 // count) if what == "gradients" else [])
     assert max(found[0]["apart"].values()) < ROUNDING, found[0]
+
+
+@pytest.fixture
+def same_bits():
+    spec = importlib.util.spec_from_file_location(
+        "same_bits", Path(__file__).parent.parent.parent / "tools" / "same_bits.py"
+    )
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.long
+def test_everything_is_the_same_on_one_processor_and_on_all(same_bits):
+    everyone = os.sched_getaffinity(0)
+    assert same_bits.in_a_process({min(everyone)}) == same_bits.in_a_process(everyone)

@@ -1,4 +1,6 @@
-"""Energy, white, interfaces, limits, and what silhouettes cover."""
+"""Energy, white, interfaces, limits, and what silhouettes cover; single scattering as a term of its
+own.
+"""
 
 import dataclasses
 
@@ -7,17 +9,24 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from bodies import camera_over, directions, joined, sheet, sphere, two_gaussians
+from bodies import (
+    PLAIN,
+    assert_close,
+    camera_over,
+    directions,
+    joined,
+    sheet,
+    sphere,
+    two_gaussians,
+    with_albedo,
+)
 
 import splatjax as sj
 from splatjax.diffusion import ClusterDiffuser, DenseDiffuser
 from splatjax.render import _checks
-from splatjax.splatting import DenseRasterizer, ShadowSettings
+from splatjax.scattering import SingleScattering
 
 EXITANCE_TOLERANCE = 1e-3
-PLAIN = sj.RenderSettings(
-    shadows=ShadowSettings(resolution=32), rasterizer=DenseRasterizer(), diffuser=DenseDiffuser()
-)
 TILES = sj.RenderSettings(diffuser=DenseDiffuser())
 EXACT = sj.RenderSettings(diffuser=ClusterDiffuser(error=0.0))
 
@@ -59,9 +68,9 @@ def test_white_material_with_an_albedo_map_gives_the_albedo(albedo):
     """And so a white diffuser that faces pi has radiance one."""
     splats = sheet(20.0, 1.0)
     colors = jnp.tile(jnp.asarray(albedo, float), (splats.count, 1))
-    splats = eqx.tree_at(lambda s: s.albedo, splats, colors, is_leaf=lambda leaf: leaf is None)
-    scene = sj.Scene(splats, (lamp((np.pi,) * 3),), matte(sj.Material(two_gaussians())).white())
-    radiance = middle(sj.render(scene, camera_over(5.0, 32)).beauty)
+    material = matte(sj.Material(two_gaussians())).white()
+    scene = sj.Scene(with_albedo(splats, colors), (lamp((np.pi,) * 3),), material)
+    radiance = middle(sj.render(scene, camera_over(5.0, 32), PLAIN).beauty)
     np.testing.assert_allclose(
         radiance, np.broadcast_to(albedo, radiance.shape), rtol=EXITANCE_TOLERANCE
     )
@@ -118,7 +127,7 @@ def test_light_is_added_linearly_and_layers_add_up_to_the_picture():
     pictures = []
     for one, other in ((bright, colored), (bright, none), (none, colored)):
         lights = lamp(one, (-1.0, 0.0, -0.2), cast_shadows=True), lamp(other, (0.5, -1.0, -0.7))
-        frame = sj.render(sj.Scene(splats, lights, material), camera_over(60.0, 24))
+        frame = sj.render(sj.Scene(splats, lights, material), camera_over(60.0, 24), PLAIN)
         pictures.append(frame.beauty)
         total = np.einsum("kc,khwc->hwc", frame.weights, frame.layers)
         np.testing.assert_allclose(frame.diffuse, total, atol=1e-6)
@@ -164,7 +173,8 @@ def test_a_plan_holds_for_splats_that_move_a_little_and_else_poisons_the_picture
 
 @pytest.mark.once
 def test_a_plan_for_too_few_splats_poisons_all_that_is_made_of_them_and_its_derivative():
-    scene = sj.Scene(sheet(6.0, 1.0), (lamp(),), sj.Material(two_gaussians()))
+    material = sj.Material(sj.SumOfGaussians([1.0], [[0.5, 0.4, 0.3]]))
+    scene = sj.Scene(sheet(6.0, 1.0), (lamp(),), material)
     camera = camera_over(5.0, 16)
     plan = sj.make_plan(scene, camera, TILES)
     short = dataclasses.replace(plan, raster=dataclasses.replace(plan.raster, splats=1))
@@ -203,7 +213,77 @@ def test_a_light_that_has_come_among_the_splats_needs_another_plan():
         assert np.all(np.isnan(np.asarray(frame.beauty)))
 
 
-def test_channels_that_disagree_are_refused():
-    scene = sj.Scene(sheet(3.0, 1.0), (lamp((1.0, 1.0)),), sj.Material(two_gaussians()))
-    with pytest.raises(ValueError, match=r"lights\[0\] has 2 channels"):
-        sj.render(scene, camera_over(2.0, 8))
+COLORS = (0.25, 0.5, 1.0)
+
+
+def with_single_scattering(eta=1.3):
+    medium = sj.Medium([0.1, 0.02, 0.5], [0.9, 0.98, 0.5], jnp.full(3, eta))
+    gaussians = sj.SumOfGaussians([1.0, 4.0], [[0.1, 0.2, 0.05], [0.1, 0.3, 0.02]])
+    return sj.Material(gaussians, eta=eta, specular=0.0, single_scattering=SingleScattering(medium))
+
+
+def picture(with_single_scattering):
+    splats = sheet(3.0, 0.2)
+    colors = jnp.broadcast_to(jnp.asarray(COLORS, float), splats.centers.shape)
+    splats = with_albedo(splats, colors)
+    light = sj.DirectionalLight([0.6, 0.0, -0.8], [1.0, 2.0, 3.0], cast_shadows=False)
+    camera = sj.Camera.look_at([0, 3, 4], [0, 0, 0], fov=2, width=4, height=4)
+    return sj.render(sj.Scene(splats, (light,), with_single_scattering), camera, PLAIN)
+
+
+@pytest.fixture(scope="module")
+def frame():
+    return picture(with_single_scattering())
+
+
+@pytest.mark.once
+def test_it_is_its_formula_and_part_of_the_beauty(frame):
+    """The albedo colors it as it colors the rest."""
+    lit, entered = with_single_scattering(), 0.8 * np.asarray([1.0, 2.0, 3.0])
+    reflected = lit.single_scattering.reflected(jnp.asarray(0.8), jnp.asarray(0.8))
+    expected = np.asarray(reflected) * entered * COLORS
+    np.testing.assert_allclose(frame.single_scattering[2, 2], expected, rtol=1e-3)
+    parts = frame.diffuse + frame.specular + frame.single_scattering
+    np.testing.assert_allclose(frame.beauty, parts, rtol=1e-6)
+    plain = picture(lit.surface_of(lit.gaussians))
+    assert plain.single_scattering is None
+    np.testing.assert_allclose(plain.diffuse, frame.diffuse, rtol=1e-5)
+
+
+def test_white_returns_all():
+    white = with_single_scattering().white()
+    np.testing.assert_allclose(np.asarray(white.total_reflectance()), 1, rtol=1e-5)
+    ratio = np.asarray(with_single_scattering().total_reflectance())
+    np.testing.assert_allclose(np.asarray(white.single_scattering.strength), 1 / ratio, rtol=1e-5)
+
+
+@pytest.mark.parametrize("eta", [1.0, 1.3])
+def test_no_more_leaves_than_came_however_the_light_grazes(eta):
+    """What scatters once and what diffuses add up to one at most, and to one where nothing is
+    absorbed or reflected.
+    """
+    mu = jnp.asarray([1.0, 0.5, 0.2, 0.05, 0.0])
+    for absorbing in (0.0, 0.002, 0.1):
+        medium = sj.Medium([absorbing], [1 - absorbing], eta)
+        single = SingleScattering(medium)
+        rest = (0.95 if absorbing else 1.0) * (1 - single.total_reflectance())
+        lit = sj.Material(sj.SumOfGaussians([1.0], rest[None]), single_scattering=single)
+        for each in (lit, lit.white()):
+            diffused = each.gaussians.total_reflectance()[None] * each.diffuse_fraction(mu)
+            leaving = each.single_scattering.directional_albedo(mu) + diffused
+            assert np.all(np.asarray(leaving) <= 1 + 2e-3)
+            if absorbing == 0:
+                np.testing.assert_allclose(np.asarray(leaving), 1, atol=2e-3)
+        np.testing.assert_allclose(np.asarray(lit.diffuse_fraction(mu[:1])), 1, atol=2e-3)
+
+
+@pytest.mark.once
+def test_files_keep_it(tmp_path, frame):
+    lit = with_single_scattering().white()
+    sj.save_material(lit, tmp_path / "jade.toml")
+    assert_close(sj.load_material(tmp_path / "jade.toml"), lit, rtol=1e-6)
+    sj.write_exr(tmp_path / "jade.exr", frame)
+    read = sj.read_exr(tmp_path / "jade.exr")
+    np.testing.assert_array_equal(
+        read.single_scattering, np.asarray(frame.single_scattering, np.float32)
+    )

@@ -104,31 +104,25 @@ def test_derivatives(float64, model):
 
 
 @models
-def test_derivative_without_absorption_is_the_one_sided_limit(float64, model):
-    @jax.jit
-    def values(sigma_a):
-        return model(medium(sigma_a[None], (1.4,), (1.3,)), 1.0)(jnp.asarray([0.3, 1.5]))[:, 0]
+@pytest.mark.parametrize("argument", ["sigma_a", "eta"])
+def test_derivative_at_a_limit_is_that_from_above(float64, model, argument):
+    """Without absorption, and at equal indices."""
+    # The neighbor above the multipole has 1.2.
+    limits = {"sigma_a": 0.0, "eta": 1.2 if model is MODELS["multipole"] else 1.0}
+    others = {"sigma_a": (0.1,), "sigma_s_prime": (1.4,), "eta": (1.3,)}
 
-    zero, h = jnp.asarray(0.0), 1e-7
-    # A profile goes as sigma_a and sigma_a^(3/2): two quotients, extrapolated in the root of the
-    # step.
-    quotients = [(values(jnp.asarray(step)) - values(zero)) / step for step in (h, 4 * h)]
-    exact = jax.jacfwd(values)(zero)
+    @jax.jit
+    def values(x):
+        given = others | {argument: x[None]}
+        return model(medium(**given), 1.0)(jnp.asarray([0.3, 1.5]))[:, 0]
+
+    at, h = jnp.asarray(limits[argument]), 1e-7
+    # A profile goes as sigma_a and sigma_a^(3/2), moments of the Fresnel reflectance as
+    # (eta - 1)^(3/2): two quotients, extrapolated in the root of the step.
+    quotients = [(values(at + step) - values(at)) / step for step in (h, 4 * h)]
+    exact = jax.jacfwd(values)(at)
     assert np.all(exact != 0)
     np.testing.assert_allclose(exact, 2 * quotients[0] - quotients[1], rtol=LIMIT)
-
-
-@models
-def test_derivative_at_equal_indices_is_the_limit_from_above(float64, model):
-    @jax.jit
-    def values(eta):
-        return model(medium((0.1,), (1.4,), eta[None]), 1.0)(jnp.asarray([0.3, 1.5]))[:, 0]
-
-    # The neighbor above the multipole has 1.2. Moments of the Fresnel reflectance go as (eta -
-    # 1)^(3/2).
-    one, h = jnp.asarray(1.2 if model is MODELS["multipole"] else 1.0), 1e-7
-    quotients = [(values(one + step) - values(one)) / step for step in (h, 4 * h)]
-    np.testing.assert_allclose(jax.jacfwd(values)(one), 2 * quotients[0] - quotients[1], rtol=LIMIT)
 
 
 @pytest.mark.parametrize("name", [name for name in MODELS if name not in SINGULAR])

@@ -95,7 +95,7 @@ DEGENERATE = {
 @jax.jit
 @partial(jax.value_and_grad, argnums=tuple(range(6)))
 def total_and_slopes(normal, wi, wo, f0, specular, roughness):
-    return jnp.sum(specular_lobe(normal, wi, wo, f0=f0, specular=specular, roughness=roughness))
+    return jnp.sum(lobe_at(normal, wi, wo, f0, specular, roughness))
 
 
 @pytest.mark.parametrize("place", DEGENERATE)
@@ -116,12 +116,8 @@ def test_degenerate_places_are_finite(place, roughness, dtype):
 def test_gradients_of_the_lobe(float64):
     wi, wo = jnp.asarray(random_directions(8, 6)), jnp.asarray(random_directions(8, 7))
     normal = jnp.asarray(unit(random_directions(8, 8) + np.asarray([0, 0, 3.0])))
-
-    def value(normal, wi, wo, f0, specular, roughness):
-        return specular_lobe(normal, wi, wo, f0=f0, specular=specular, roughness=roughness)
-
     scalars = (jnp.asarray(0.05), jnp.asarray(0.5), jnp.asarray(0.4))
-    check_grads(jax.jit(value), (normal, wi, wo, *scalars), order=2, rtol=1e-5)
+    check_grads(jax.jit(lobe_at), (normal, wi, wo, *scalars), order=2, rtol=1e-5)
 
 
 def test_root_of_albedo_and_its_floor(dtype):
@@ -173,7 +169,6 @@ def lobe(wi, wo, f0, roughness):
 
 
 def integrated(mu, f0, roughness):
-    """Integrate `specular_lobe` over incident directions, in float64."""
     with jax.enable_x64(True):
         wi, weights = hemisphere()
         wo = np.asarray([[np.sqrt(1 - mu * mu), 0.0, mu]])
@@ -187,7 +182,6 @@ def arrays(dtype, *values):
 
 
 def random_places(count, seed):
-    """Give random cosines and roughnesses in [0.1, 1]."""
     rng = np.random.default_rng(seed)
     return rng.uniform(0.02, 1, count), rng.uniform(0.1, 1, count)
 

@@ -43,7 +43,6 @@ def seeds(in_suite: int) -> range:
 
 
 def sight(rng: np.random.Generator, perspective: bool, width: int, height: int) -> AbstractView:
-    """A view from anywhere to anywhere."""
     rotation, _ = np.linalg.qr(rng.normal(size=(3, 3)))
     rotation[2] *= np.linalg.det(rotation)
     focal_length = height / (2 * np.tan(np.radians(rng.uniform(10, 50))))  # in pixels
@@ -58,7 +57,6 @@ def sight(rng: np.random.Generator, perspective: bool, width: int, height: int) 
 def random_body(
     seed: int, count: int, perspective: bool, width: int, height: int
 ) -> tuple[Splats, AbstractView]:
-    """Draw `count` splats and what sees them."""
     rng = np.random.default_rng([seed, count, perspective])
     seen = sight(rng, perspective, width, height)
     kinds = (
@@ -88,7 +86,6 @@ def disagreement(found, expected) -> float:
 
 
 def _drawn(kind: str, rng: np.random.Generator, count: int, seen: AbstractView):
-    """Give places, normals and radii of splats of one kind."""
     width, height, perspective = seen.width, seen.height, isinstance(seen, PerspectiveView)
     pixels = float(seen.focal_length if perspective else seen.scale)
     x, y = rng.uniform(0, width, count), rng.uniform(0, height, count)

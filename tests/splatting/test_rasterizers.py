@@ -1,5 +1,6 @@
 """The tile rasterizer gives what the plain one gives, in value and gradient, on random scenes; what
-a picture must be at degenerate places; what a plan cannot hold.
+a picture must be at degenerate places; what a plan cannot hold. Lists per tile against every pair
+tried one by one.
 
 Nothing is left out for being near a tie: no two numbers that are compared are equal but for
 rounding, since what is drawn is drawn from a continuum, and splats in one place differ from the
@@ -23,7 +24,9 @@ from splatjax.splatting import (
     SplattingSettings,
     TileGrid,
     TilePlan,
+    TileRanges,
     TileRasterizer,
+    bin_items,
 )
 
 WIDTH, HEIGHT = 21, 18
@@ -92,7 +95,6 @@ def by_both(count: int, perspective: bool):
 
 
 def open_tiles(weight_sum: jax.Array, full: float) -> int:
-    """Count the tiles with a pixel that the front covers in part."""
     gaps = (weight_sum > 0) & (weight_sum < full)
     tiles = TileGrid(WIDTH, HEIGHT).cut(gaps[None].astype(float))
     return int(jnp.sum(jnp.any(tiles > 0, axis=(1, 2))))
@@ -171,3 +173,42 @@ def test_too_small_a_capacity_makes_the_sums_nan_and_is_reported():
         sums = sums(body, rows, view, SETTINGS, OneDevice())
         assert (float(sums.needed) > 1) == bool(short), short
         assert np.all(np.isnan(sums.rows)) == bool(short), short
+
+
+GRID = TileGrid(61, 45, lanes=4, slots=4)
+ITEMS = 900
+BOXES = ("scattered", "all in one tile", "off screen", "infinite")
+
+
+def boxes(kind):
+    rng = np.random.default_rng(11)
+    middle = rng.uniform(-10, 70, (2, ITEMS))
+    half = np.exp(rng.uniform(np.log(0.1), np.log(30.0), (2, ITEMS)))
+    if kind == "all in one tile":
+        middle, half = rng.uniform(17, 23, (2, ITEMS)), np.full((2, ITEMS), 0.9)
+    if kind == "off screen":
+        middle, half = rng.uniform(-90, -40, (2, ITEMS)), np.full((2, ITEMS), 20.0)
+    if kind == "infinite":
+        half = np.where(rng.uniform(size=half.shape) < 0.05, np.inf, half)
+    (left, top), (right, bottom) = middle - half, middle + half
+    return left, right, top, bottom, rng.uniform(size=ITEMS) < 0.9
+
+
+@jax.jit
+def ranges_of(left, right, top, bottom, visible):
+    ranges = TileRanges.of(left, right, top, bottom, visible, GRID)
+    return ranges, ranges.per_tile(GRID)
+
+
+def every_kind():
+    given = [boxes(kind) for kind in BOXES]
+    return given, [ranges_of(*(jnp.asarray(each) for each in box)) for box in given]
+
+
+@pytest.mark.parametrize("short", [{"pairs": 1024}, {"blocks": 1}, {"chunks": 1}], ids=str)
+def test_too_small_a_capacity_is_reported(short):
+    _, ranges = every_kind()
+    enough = BinCapacity.for_counts([counts for _, counts in ranges], GRID)
+    named = {name: getattr(enough, name) for name in ("pairs", "blocks", "chunks")} | short
+    needed = jax.jit(lambda each: bin_items(each, GRID, BinCapacity(**named)).needed)
+    assert float(needed(ranges[3][0])) > 1

@@ -39,7 +39,6 @@ LIGHTS = {
 
 
 def scene():
-    """A floor that faces up, and a disc of small splats above it."""
     floor = bodies.sheet(HALF, 1.0)
     disc = bodies.sheet(RADIUS, 0.5, center=(0.0, 0.0, HEIGHT))
     within = np.hypot(*np.asarray(disc.centers)[:, :2].T) <= RADIUS

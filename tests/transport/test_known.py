@@ -1,13 +1,20 @@
-"""Numbers that nobody here made."""
+"""Numbers that nobody here made. Random numbers, directions, interfaces, sums, and what is refused;
+light that scatters once: against walks in media that hardly scatter twice, and closed forms.
+"""
 
 import jax
+import jax.extend
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from media import layer
 
 import splatjax as sj
+from splatjax.scattering import ExactFresnel, SingleScattering
 from splatjax.transport import MonteCarlo
+from splatjax.transport._directions import fresnel
+from splatjax.transport._results import Sum, total
+from splatjax.transport._rounds import threefry, uniforms
 
 KEY = jax.random.key(2026)
 # Standard errors by which an estimate may be off.
@@ -23,7 +30,6 @@ SCORES = pytest.mark.parametrize("score", [1, pytest.param(4, marks=pytest.mark.
 
 
 def within(estimate, reference, deviation) -> None:
-    """Hold an estimate to a reference, and its error below what makes that worth something."""
     value, error = np.asarray(estimate.value), np.asarray(estimate.deviation)
     assert np.all(error < deviation), error
     assert np.all(np.abs(value - reference) < ERRORS * error), (value, reference, error)
@@ -74,9 +80,6 @@ def test_chandrasekhars_half_space(float32, score):
 
 
 def chi_squared(ours, photons, theirs, their_photons, places) -> None:
-    """Hold rings to those of another program. It gives no errors: they are ours, by the number of
-    photons.
-    """
     value, error = (
         np.asarray(each)[: len(places), 0][places] for each in (ours.value, ours.deviation)
     )
@@ -136,3 +139,242 @@ def test_what_is_reported_adds_up(float32):
     )
     assert few.unfinished.value[0] > 0.05
     assert abs(few.balance()[0]) < 1e-6
+
+
+KEY_OF_PARTS = jax.random.key(5)
+HALF_SPACE = [layer([0.1, 0.1], 1.0, 1.0)]
+
+
+def test_threefry_is_that_of_jax():
+    words = jnp.arange(8, dtype=jnp.uint32) * jnp.uint32(0x9E3779B9)
+    keys = jnp.asarray([0x13198A2E, 0x03707344], jnp.uint32)
+    theirs = jax.extend.random.threefry_2x32(keys, words)
+    ours = jnp.concatenate(threefry(keys[0], keys[1], words[:4], words[4:]))
+    np.testing.assert_array_equal(ours, theirs)
+
+
+def test_uniforms_are_uniform_and_independent(dtype):
+    numbers = np.concatenate(
+        [uniforms(KEY_OF_PARTS, jnp.asarray(n), 4096, dtype) for n in range(50)], axis=1
+    )
+    assert numbers.dtype == dtype
+    assert numbers.min() > 0
+    assert numbers.max() <= 1
+    counts = np.stack([np.histogram(row, 64, (0, 1))[0] for row in numbers])
+    expected = numbers.shape[1] / 64
+    chi = np.sum((counts - expected) ** 2 / expected, axis=1)
+    assert np.all(np.abs(chi - 63) < 5 * np.sqrt(2 * 63))
+    correlation = np.corrcoef(np.concatenate([numbers[:, 1:], numbers[:, :-1]]))
+    assert np.all(np.abs(correlation - np.eye(8)) < 5 / np.sqrt(numbers.shape[1]))
+
+
+@pytest.mark.parametrize("g", [-0.6, 0.0, 1e-6, 0.5, 0.95])
+def test_henyey_and_greensteins_angles(float64, g):
+    """Its moments are the powers of g: the mean Legendre polynomials of the cosine. The direction
+    itself is a unit vector.
+    """
+    xi = (jnp.arange(200_000.0) + 0.5) / 200_000
+    for start in ((0.0, 0.0, 1.0), (0.6, 0.0, -0.8), (0.0, 0.0, -1.0)):
+        before = tuple(jnp.full_like(xi, each) for each in start)
+        angle = (xi * 7919) % 1.0
+        after = sj.transport.HenyeyGreenstein(jnp.asarray(g)).scatter(
+            before, jnp.zeros(xi.shape, jnp.int32), xi, angle
+        )
+        np.testing.assert_allclose(sum(each * each for each in after), 1, rtol=1e-12)
+        cosine = np.asarray(sum(a * b for a, b in zip(before, after, strict=True)))
+        np.testing.assert_allclose(cosine.mean(), g, atol=1e-6)
+        np.testing.assert_allclose((1.5 * cosine**2 - 0.5).mean(), g * g, atol=1e-6)
+        # No direction about the axis is preferred.
+        across = np.stack([np.asarray(each) for each in after]).mean(axis=1)
+        np.testing.assert_allclose(across, g * np.asarray(start), atol=1e-4)
+
+
+@pytest.mark.parametrize("eta", [1.3, 1.0, 1 / 1.5])
+def test_reflectance_has_the_moments_of_diffusion(float64, eta):
+    mu = (jnp.arange(400_000.0) + 0.5) / 400_000
+    reflectance, onward = fresnel(mu, jnp.full_like(mu, eta), jnp.ones_like(mu))
+    moment = 2 * jnp.mean(mu * reflectance)
+    np.testing.assert_allclose(
+        moment, ExactFresnel().first_moment(jnp.asarray([eta]))[0], atol=2e-6
+    )
+    # Snell's law, where light goes on.
+    goes = np.asarray(reflectance) < 1
+    np.testing.assert_allclose((1 - onward**2)[goes], (eta**2 * (1 - mu**2))[goes], atol=1e-12)
+
+
+@pytest.mark.parametrize("eta", [1.0, 1.4, 1 / 1.3])
+def test_diffuse_light_enters_with_unit_power(float64, eta):
+    xi = (jnp.arange(400_000.0) + 0.5) / 400_000
+    (x, _, z), weight = sj.transport.DiffuseIncidence().enter(xi, xi, jnp.asarray([1.0, eta]))
+    np.testing.assert_allclose(jnp.mean(weight), 1, atol=2e-6)
+    assert np.all(np.asarray(z) >= 0)
+    assert np.max(np.abs(x)) <= min(1, 1 / eta) + 1e-9
+
+
+def test_sums_keep_what_rounding_takes(dtype):
+    term = jnp.asarray(0.1, jnp.float32)
+    added = jax.lax.fori_loop(
+        0, 300_000, lambda _, each: each.plus(term), Sum.zeros((), jnp.float32)
+    )
+    np.testing.assert_allclose(added.over(300_000), np.float32(0.1), rtol=1e-7)
+    naive = jax.lax.fori_loop(0, 300_000, lambda _, each: each + term, jnp.zeros((), jnp.float32))
+    assert abs(float(naive) / 30_000 - 1) > 1e-4
+    values = jnp.full((8192, 2), 0.1, jnp.float32)
+    np.testing.assert_allclose(
+        total(jnp.ones(8192, jnp.float32), values), 8192 * np.float32(0.1), rtol=2e-6
+    )
+
+
+def test_rings_are_where_they_say(dtype):
+    edges = jnp.geomspace(0.1, 2.0, 129, dtype=dtype)
+    found = sj.transport.monte_carlo(HALF_SPACE, 65_536, KEY_OF_PARTS, edges=edges)
+    a, b = (np.asarray(edges, np.float64)[part] for part in (slice(None, -1), slice(1, None)))
+    np.testing.assert_allclose(found.radii, 2 / 3 * (b**3 - a**3) / (b**2 - a**2), rtol=1e-6)
+    area = np.pi * np.diff(np.asarray(edges) ** 2)
+    inside = np.sum(np.asarray(found.reflected.value)[:, 0] * area)
+    # What leaves within the first edge and beyond the last is in no ring, and in the total.
+    assert 0.2 < inside < 0.9 * float(found.total_reflectance.value[0])
+    profile = found.profile()
+    np.testing.assert_array_equal(profile.deviation, found.reflected.deviation)
+    np.testing.assert_allclose(profile(found.radii), found.reflected.value, rtol=1e-6)
+
+
+def test_progress_is_told(float32):
+    told = []
+
+    def tell(done, photons):
+        told.append((done, photons))
+
+    sj.transport.monte_carlo(HALF_SPACE, 2_000_000, KEY_OF_PARTS, progress=tell)
+    assert len(told) > 1
+    assert told == sorted(told)
+    assert told[-1] == (2_000_000, 2_000_000)
+
+
+@pytest.mark.parametrize(
+    ("layers", "settings", "message"),
+    [
+        (HALF_SPACE * 2, {}, "layer 1 of 2 is infinitely thick"),
+        ([sj.Film(0.0)], {}, "none of these 1 is a Layer"),
+        (HALF_SPACE, {"photons": 1}, "photons must be at least 2"),
+        (HALF_SPACE, {"photons": 2**30}, "photons must be .* below 2\\^30"),
+        (HALF_SPACE, {"edges": [0.0, 1.0, 1.0]}, "steps of edges"),
+        (HALF_SPACE, {"phase": sj.transport.HenyeyGreenstein([0, 0])}, "of the 1 layers; got 2"),
+    ],
+)
+def test_bad_arguments_are_refused(layers, settings, message):
+    with pytest.raises(ValueError, match=message):
+        sj.transport.monte_carlo(layers, key=KEY_OF_PARTS, **({"photons": 10} | settings))
+
+
+ETAS = (1.0, 1.4)
+
+
+def single(albedo=0.9, eta=1.0, channels=1):
+    return SingleScattering(sj.Medium([1 - albedo] * channels, albedo, eta))
+
+
+@pytest.mark.parametrize("eta", ETAS)
+def test_it_is_what_walks_scatter_where_hardly_any_light_scatters_twice(eta, float32):
+    albedo = 2e-3
+    found = sj.transport.monte_carlo(
+        [layer(1 - albedo, albedo, eta)],
+        1_000_000,
+        jax.random.key(7),
+        edges=jnp.geomspace(0.05, 6.0, 12),
+    )
+    ours = single(albedo, eta)
+    total = found.total_reflectance
+    # What scatters twice adds less than the albedo to one.
+    slack = 4 * total.deviation + albedo * total.value
+    assert abs(float((ours.total_reflectance() - total.value)[0])) < float(slack[0])
+    profile = found.profile()
+    # Within a ring the profile is steep: compare energies, by many radii a ring.
+    edges = np.asarray(found.edges)
+    r = np.linspace(edges[1:-2], edges[2:-1], 101)
+    middle = 0.5 * (r[1:] + r[:-1])
+    values = np.asarray(ours(jnp.asarray(middle)))[..., 0]
+    rings = np.mean(values * middle, axis=0) / np.mean(middle, axis=0)
+    difference = np.abs(rings - np.asarray(profile.values[1:-1, 0]))
+    assert np.all(difference < 4 * profile.deviation[1:-1, 0] + 3 * albedo * rings)
+
+
+@pytest.mark.parametrize("eta", ETAS)
+def test_radiance_integrates_to_the_total_and_to_the_directional_albedo(eta):
+    ours, mu_i = single(eta=eta), jnp.asarray([1.0, 0.3, 0.0])
+    nodes, weights = np.polynomial.legendre.leggauss(400)
+    mu, weights = 0.25 * (nodes + 1) ** 2, 0.5 * (nodes + 1) * weights
+    mu_o = jnp.broadcast_to(jnp.asarray(mu)[:, None], (len(mu), 3))
+    radiance = np.asarray(ours.reflected(jnp.broadcast_to(mu_i, mu_o.shape), mu_o))[..., 0]
+    found = 2 * np.pi * (weights * mu) @ radiance
+    np.testing.assert_allclose(found, ours.directional_albedo(mu_i)[:, 0], rtol=2e-3)
+    np.testing.assert_allclose(found[0], ours.total_reflectance()[0], rtol=1e-4)
+
+
+def test_matched_indices_have_the_closed_forms():
+    """Chandrasekhar 1960: `alpha / 4 pi (mu + mu_0)`, and `alpha (1 - log 2) / 2` in all along the
+    normal.
+    """
+    ours = single(0.7)
+    np.testing.assert_allclose(
+        float(ours.total_reflectance()[0]), 0.35 * (1 - np.log(2)), rtol=1e-5
+    )
+    mu_i, mu_o = jnp.asarray([1.0, 0.3, 0.05]), jnp.asarray([0.2, 0.9, 0.05])
+    expected = 0.7 / (4 * np.pi * np.asarray(mu_i + mu_o))
+    np.testing.assert_allclose(np.asarray(ours.reflected(mu_i, mu_o))[:, 0], expected, rtol=1e-5)
+
+
+def test_it_is_reciprocal():
+    """The radiance per irradiance outside is the same both ways, once what enters is counted as
+    what leaves.
+    """
+    ours = single(eta=1.5)
+    there, back = (
+        ours.reflected(*pair)[0]
+        for pair in (map(jnp.asarray, (0.9, 0.2)), map(jnp.asarray, (0.2, 0.9)))
+    )
+
+    def enters(mu):
+        inside = np.sqrt(1 - (1 - mu * mu) / 2.25)
+        across, along = (
+            (mu - 1.5 * inside) / (mu + 1.5 * inside),
+            (inside - 1.5 * mu) / (inside + 1.5 * mu),
+        )
+        return 1 - 0.5 * (across**2 + along**2)
+
+    np.testing.assert_allclose(float(there) * enters(0.9), float(back) * enters(0.2), rtol=1e-5)
+
+
+def test_gradients_at_matched_indices_are_the_limits_and_finite_at_grazing_angles(float64):
+    @jax.jit
+    def radiance(eta, mu_i, mu_o):
+        return single(0.9, eta).reflected(mu_i, mu_o)[0]
+
+    slope = jax.jit(jax.grad(radiance))
+    for mu in ((0.7, 0.4), (1.0, 1.0), (0.0, 0.5), (0.5, 0.0), (0.0, 0.0)):
+        found = float(slope(1.0, *mu))
+        assert np.isfinite(found)
+        if min(mu) > 0:
+            step = 1e-5
+            expected = float(radiance(1 + step, *mu) - radiance(1 - step, *mu)) / (2 * step)
+            np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-8)
+
+
+def test_a_table_without_it_is_the_rest():
+    ours = single(channels=2)
+    radii = jnp.asarray([0.1, 0.5, 2.0])
+    table = sj.scattering.Tabulated(radii, 2 * ours(radii), total=2 * ours.total_reflectance())
+    rest = table.without(ours)
+    np.testing.assert_allclose(rest.values, ours(radii), rtol=1e-5)
+    np.testing.assert_allclose(rest.total, ours.total_reflectance(), rtol=1e-5)
+
+
+def test_photon_beam_is_it_and_the_rest():
+    beam = sj.scattering.PhotonBeam(
+        sj.Medium(jnp.asarray([0.02]), jnp.asarray([0.8]), jnp.asarray([1.3]))
+    )
+    rest, once = beam.multiply_scattered(), SingleScattering(beam.medium)
+    r = jnp.asarray([0.2, 1.0, 4.0])
+    np.testing.assert_allclose(np.asarray(rest(r) + once(r)), np.asarray(beam(r)), rtol=1e-5)
+    total = rest.total_reflectance() + once.total_reflectance()
+    np.testing.assert_allclose(np.asarray(total), np.asarray(beam.total_reflectance()), rtol=1e-5)
