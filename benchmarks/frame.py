@@ -57,7 +57,7 @@ def rasterization(scene: sj.Scene, camera: sj.Camera, plan: sj.Plan, settings: s
         rows = jnp.concatenate([normals.T, albedo.T])
         own = settings.splatting, plan.raster, OneDevice()
         seen = splatting.visible_surfaces(splats, rows, view, *own)
-        attributes = splatting.Surface.of(seen.rows, view).attributes
+        attributes = splatting.Surface.of(seen.rows, view, seen.needed).attributes
         return seen.picture(attributes), seen.picture(jnp.ones_like(seen.before))
 
     def loss(*inputs):

@@ -102,14 +102,15 @@ class ClusterDiffuser(AbstractDiffuser):
             [jnp.asarray(size * factor, variances.dtype) for size in sizes]
             for factor in (1 / self.margin, self.margin)
         )
-        # The search is NumPy's, and runs beside that for the other layers.
+        # The search is NumPy's, and runs beside that for the other layers. (JAX's precision may
+        # be that of one thread.)
         points = [_target_boxes(part.centers.T - origin[:, None]) for part in parts]
         sources = [
             _sources_in_reach(clusters[levels[i]], kernel, variances[i], largest[i], supports[i])
             for i in range(len(sizes))
         ]
         with ThreadPoolExecutor() as pool:
-            lists = pool.map(lambda each: _find(points, *each), sources)
+            lists = pool.map(lambda each: _find(points, each[0], np.asarray(each[1])), sources)
         whole = jax.tree.map(lambda *rows: jnp.concatenate(rows), *points)
         neighbors = [
             None if each is None else Neighbors(each, whole, boxes, reach)
@@ -293,7 +294,7 @@ def _sources_in_reach(
     return source_boxes(clusters, depths[0]), jnp.asarray(reach, largest.dtype)
 
 
-def _find(points: Sequence[Boxes], sources: Boxes, reach: Float[Array, ""]) -> Lists | None:
+def _find(points: Sequence[Boxes], sources: Boxes, reach: np.ndarray) -> Lists | None:
     """Find the neighbors of every part, with lists padded to one size; `None` for no reach."""
     if reach == 0:
         return None

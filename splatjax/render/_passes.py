@@ -158,16 +158,16 @@ def look(
         splats, stack_rows(attributes), view, settings.splatting, plan.raster, combination
     )
 
+    needed = combination.largest([jnp.maximum(chosen_needed, light.needed)])
+    visible = dataclasses.replace(visible, needed=jnp.maximum(needed, visible.needed))
+
     # Pass 5: shade the points that are seen.
     def shade_and_read(samples: SurfaceSamples) -> Values:
         shaded, layers = shade(scene, view.position, groups, samples, plan.interval, settings)
         return read(shaded, layers, samples)
 
     values = map_samples(shade_and_read, sample_surfaces(visible, attributes, origin))
-    needed = combination.largest([jnp.maximum(chosen_needed, light.needed)])
-    needed = jnp.maximum(needed, visible.needed)
-    visible = dataclasses.replace(visible.gathered(combination), needed=needed)
-    return combination.gather(values), visible
+    return combination.gather(values), visible.gathered(combination)
 
 
 def sample_surfaces(
@@ -185,7 +185,7 @@ def sample_surfaces(
     like = jax.eval_shape(lambda: like)
 
     def blend(rows, tiles):
-        surface = _splatting.Surface.of(rows, visible.view)
+        surface = _splatting.Surface.of(rows, visible.view, visible.needed)
         attributes = split_rows(in_a_row(surface.attributes), like)
         positions = in_a_row(visible.points(tiles, surface.depth))
 

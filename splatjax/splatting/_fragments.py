@@ -52,25 +52,6 @@ class Lanes(eqx.Module):
         return jnp.where((block < self.lengths)[:, None], beyond, jnp.inf)
 
 
-class ChunkLanes(Lanes):
-    """The tiles of one chunk: their rows follow one another."""
-
-    def read(self, plane: Shaped[Array, "rows slots"], block) -> Shaped[Array, "lanes slots"]:
-        return lax.dynamic_slice_in_dim(plane, self.row[0] + block * self.stride, self.stride)
-
-    def add(
-        self, plane: Float[Array, "rows slots"], block, part: Float[Array, "lanes slots"]
-    ) -> Float[Array, "rows slots"]:
-        return lax.dynamic_update_slice_in_dim(
-            plane, self.read(plane, block) + part, self.row[0] + block * self.stride, 0
-        )
-
-    def until_end(
-        self, beyond: Float[Array, "lanes pixels"], block
-    ) -> Float[Array, "lanes pixels"]:
-        return beyond
-
-
 class Sweep(eqx.Module):
     """What is static in a sweep."""
 
@@ -97,24 +78,17 @@ class Sweep(eqx.Module):
         side = np.arange(SIDE, dtype=dtype) + np.asarray(0.5, dtype)
         return np.tile(side, SIDE), np.repeat(side, SIDE)
 
-    def _lanes(self, kind: type[Lanes], bins: Bins, places, dtype) -> Lanes:
-        lanes, across = self.grid.lanes, self.grid.across
+    def lanes(self, bins: Bins, places: Int[Array, " lanes"], dtype) -> Lanes:
+        """Return tiles by their places in the order of the bins; from their number on there is
+        nothing.
+        """
+        lanes, across, exist = self.grid.lanes, self.grid.across, places < bins.lanes
+        places = jnp.minimum(places, bins.lanes - 1)
         tiles, chunk = bins.order[places], places // lanes
         row = bins.first_block[chunk] * lanes + places % lanes
-        lengths = bins.first_block[chunk + 1] - bins.first_block[chunk]
+        lengths = jnp.where(exist, bins.first_block[chunk + 1] - bins.first_block[chunk], 0)
         x, y = ((each * SIDE).astype(dtype)[:, None] for each in (tiles % across, tiles // across))
-        return kind(row, lengths, jnp.max(lengths), x, y, lanes)
-
-    def chunk(self, bins: Bins, i, dtype) -> Lanes:
-        """Return the tiles of a chunk."""
-        places = i * self.grid.lanes + jnp.arange(self.grid.lanes, dtype=jnp.int32)
-        return self._lanes(ChunkLanes, bins, places, dtype)
-
-    def picked(self, bins: Bins, places: Int[Array, " lanes"], dtype) -> Lanes:
-        """Return tiles by their places in the order; places beyond the last are the last one's,
-        with nothing in them.
-        """
-        return self._lanes(Lanes, bins, places, dtype)
+        return Lanes(row, lengths, jnp.max(lengths), x, y, lanes)
 
     def splats(self, planes, block, lanes: Lanes):
         """Read a block's splats, `[lanes, slots]` each, placed relative to their tile's corner."""
@@ -169,9 +143,8 @@ class Sweep(eqx.Module):
         """Compute `rho^2`, below 1 for the fragments between two limits; 1, where the weight is 0,
         for all others.
         """
-        chosen = self.view.inside(nearness, quadric) & (nearness > beyond[:, None])
-        if upto is not None:
-            chosen &= nearness <= upto[:, None]
+        between = (nearness > beyond[:, None]) & (nearness <= upto[:, None])
+        chosen = self.view.inside(nearness, quadric) & between
         return jnp.where(chosen, self.view.squared_radius(nearness, quadric), 1.0)
 
     def rows(self, slots: "Slots", ids, splats):
@@ -194,8 +167,9 @@ class Sweep(eqx.Module):
             )
             weight = splats[-1][:, :, None] * fast_fragment_weight(squared_radius)
             rows = self.rows(slots, lanes.read(slots.ids, block), splats)
-            # Turned, which costs less than it saves in the product.
-            return sums + jnp.einsum("trs,tsp->trp", jnp.swapaxes(rows, 1, 2), weight)
+            # Turned in memory, which costs less than it saves in the product.
+            rows = lax.optimization_barrier(jnp.swapaxes(rows, 1, 2))
+            return sums + jnp.einsum("trs,tsp->trp", rows, weight)
 
         (places, pixels), rows = beyond.shape, slots.attributes.shape[1]
         start = jnp.zeros((places, rows + 4, pixels), beyond.dtype)

@@ -164,7 +164,7 @@ class ShadowMap(eqx.Module):
     def of(cls, sums: FragmentSums, view: AbstractView, settings: SplattingSettings) -> "ShadowMap":
         """Blend the sums of all parts."""
         tiles = TileGrid(view.width, view.height).count
-        surface = Surface.of(sums.rows, view)
+        surface = Surface.of(sums.rows, view, sums.needed)
         covered = coverage(sums.rows[:, -1], settings.full_coverage)
         planes = []
         for places in (slice(sums.front), slice(sums.front, None)):

@@ -50,9 +50,13 @@ class Surface(eqx.Module):
     covered: Bool[Array, "tiles pixels"]
 
     @classmethod
-    def of(cls, rows: Float[Array, "tiles rows pixels"], view: AbstractView) -> "Surface":
-        """Blend the rows of `FragmentSums`."""
-        nearness, weights = rows[:, -2], rows[:, -1]
+    def of(
+        cls, rows: Float[Array, "tiles rows pixels"], view: AbstractView, needed: Float[Array, ""]
+    ) -> "Surface":
+        """Blend the rows of `FragmentSums`. Where more capacity was needed than planned, all is
+        NaN, and so are derivatives.
+        """
+        nearness, weights = rows[:, -2], rows[:, -1] * invalid_factor(needed)
         covered = stop_gradient(weights) > 0
         blended = jnp.where(weights != 0, blend_fragments(nearness, weights), 1.0)
         depth = jnp.where(covered, view.depth(blended), 1.0)
