@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from splatjax.geometry import Mesh, Textures
-from splatjax.geometry._places import morton_order
+from splatjax.geometry._mesh import morton_order
 from splatjax.geometry._scatter import SurfacePoints
 from splatjax.geometry._textures import albedo_at, lookup_at, perturbed_normals
 from splatjax.io import atomic_path

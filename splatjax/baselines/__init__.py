@@ -14,7 +14,7 @@ from ._lighting import (
     NormalFields as NormalFields,
     PhongSplats as PhongSplats,
 )
-from ._measures import exitance as exitance
+from ._methods import exitance as exitance
 from ._mesh_light import (
     mesh_light as mesh_light,
     MeshLight as MeshLight,

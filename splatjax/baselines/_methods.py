@@ -4,7 +4,12 @@ renderer.
 
 from dataclasses import replace
 
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from splatjax import shading as _shading
 from splatjax.render import LightAtSplats, RenderSettings
+from splatjax.scene import Frame
 
 from ._blending import BlendingRasterizer
 from ._kernels import DiscKernel, DiscOrPixelKernel, EwaKernel
@@ -58,3 +63,15 @@ def deferred_splatting(settings: RenderSettings = _DEFAULTS) -> RenderSettings:
     """
     rasterizer = BlendingRasterizer(DiscOrPixelKernel())
     return replace(settings, rasterizer=rasterizer, lighting=LightAtPixels())
+
+
+def exitance(frame: Frame) -> Float[Array, "height width channels"]:
+    """Give the radiant exitance of a picture before the albedo colors what leaves; of a surface
+    that reflects nothing itself.
+
+    What is left is how light has spread: the weighted layers `L_k`; 0 where there is nothing.
+    """
+    is_covered = frame.coverage > 0
+    share = jnp.where(is_covered, frame.coverage, 1.0)[..., None]
+    spread = jnp.pi * frame.diffuse / (share * _shading.albedo_root(frame.albedo / share))
+    return jnp.where(is_covered[..., None], spread, 0.0)

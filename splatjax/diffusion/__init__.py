@@ -16,7 +16,7 @@ from ._diffuser import (
     LayerValues as LayerValues,
     Sources as Sources,
 )
-from ._irradiance import entering_irradiance as entering_irradiance
+from ._diffuser import entering_irradiance as entering_irradiance
 from ._kernel import (
     AbstractDiffusionKernel as AbstractDiffusionKernel,
     EscapeNormalization as EscapeNormalization,

@@ -2,7 +2,7 @@
 
 from ._bust import bust as bust, bust_mesh as bust_mesh, complexion as complexion
 from ._cells import tangent_frames as tangent_frames
-from ._places import distinct as distinct
+from ._mesh import distinct as distinct
 from ._mesh import (
     cut_below as cut_below,
     Mesh as Mesh,

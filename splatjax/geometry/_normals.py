@@ -6,7 +6,7 @@ import numpy as np
 import scipy  # its parts are loaded where they are used, which takes a third of a second
 from jaxtyping import Float, Int
 
-from ._places import distinct, morton_order
+from ._mesh import distinct, morton_order
 
 _CHUNK = 1 << 16
 _BEYOND = 1.05  # of the distance of the farthest neighbor, so that it counts a little

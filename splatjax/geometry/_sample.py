@@ -9,9 +9,8 @@ from jaxtyping import Float
 from splatjax.scene import Splats
 
 from ._cells import Cells, surface_cells
-from ._mesh import Mesh, faces_beyond
+from ._mesh import Mesh, distinct, faces_beyond, morton_order
 from ._normals import estimate_normals
-from ._places import distinct, morton_order
 from ._scatter import Rounding, SurfacePoints, mirror_images, scatter
 from ._textures import Textures, albedo_at, lookup_at, perturbed_normals
 

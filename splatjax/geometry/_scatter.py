@@ -7,8 +7,7 @@ import scipy  # its parts are loaded where they are used, which takes a third of
 from jaxtyping import Float, Int
 
 from ._cells import surface_cells
-from ._mesh import Mesh, faces_beyond, hard_edges, unit
-from ._places import distinct, morton_order
+from ._mesh import Mesh, distinct, faces_beyond, hard_edges, morton_order, unit
 
 _PLASTIC = 1.32471795724474602596  # of the R2 sequence
 _EDGE_TOLERANCE = 1e-9

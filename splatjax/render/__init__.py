@@ -2,7 +2,7 @@
 
 from ._attributes import SurfaceAttributes as SurfaceAttributes, SurfaceSamples as SurfaceSamples
 from ._basis import diffusion_basis as diffusion_basis, DiffusionBasis as DiffusionBasis
-from ._batches import map_over as map_over
+from ._devices import map_over as map_over
 from ._checks import check_displayable as check_displayable, check_scene as check_scene
 from ._jacobian import picture_jacobian as picture_jacobian, PictureJacobian as PictureJacobian
 from ._lighting import AbstractLighting as AbstractLighting, entering_light as entering_light
@@ -13,5 +13,5 @@ from ._plan import make_plan as make_plan, Plan as Plan
 from ._render import compute_irradiance as compute_irradiance
 from ._render import diffuse_irradiance as diffuse_irradiance, illuminate as illuminate
 from ._render import render as render
-from ._settings import RenderSettings as RenderSettings
+from ._plan import RenderSettings as RenderSettings
 from ._streamed import render_streamed as render_streamed

@@ -13,8 +13,7 @@ from splatjax.scene import Camera, Scene
 from ._checks import check_channels, in_one_dtype
 from ._devices import on_devices
 from ._passes import in_a_row, light_splats, look
-from ._plan import Plan, plan_unless_traced
-from ._settings import RenderSettings
+from ._plan import Plan, RenderSettings, plan_unless_traced
 from ._shade import ShadedSurface
 
 

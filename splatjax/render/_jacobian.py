@@ -19,8 +19,7 @@ from ._checks import check_channels, in_one_dtype
 from ._devices import on_devices
 from ._lighting import LightAtSplats
 from ._passes import light_splats, look
-from ._plan import Plan, plan_unless_traced
-from ._settings import RenderSettings
+from ._plan import Plan, RenderSettings, plan_unless_traced
 from ._shade import ShadedSurface, compose, layers_at_points, single_scattering_albedo
 
 Parameters = TypeVar("Parameters", bound=PyTree)

@@ -24,8 +24,7 @@ from ._lighting import (
     cast_shadows,
     irradiate,
 )
-from ._plan import Plan
-from ._settings import RenderSettings
+from ._plan import Plan, RenderSettings
 from ._shade import ShadedSurface, shade
 
 Samples = TypeVar("Samples", bound=PyTree)

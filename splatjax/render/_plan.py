@@ -1,4 +1,4 @@
-"""What `jit`, `grad` and loops need to know of shapes, found once."""
+"""How a picture is made, and what `jit`, `grad` and loops need to know of shapes, found once."""
 
 from collections.abc import Sequence
 from typing import TypeVar
@@ -17,8 +17,31 @@ from splatjax._combination import DeviceMesh, OneDevice
 from splatjax.scene import AbstractLight, Camera, Scene, Splats, StackedLights, stack_lights
 
 from ._checks import check_scene, in_one_dtype
-from ._settings import RenderSettings
-from ._shadow_plan import ShadowPlan, is_among, shadow_views
+from ._lighting import AbstractLighting, LightAtSplats, ShadowPlan, is_among, shadow_views
+
+
+class RenderSettings(eqx.Module):
+    r"""How each pass works.
+
+    **Attributes:**
+
+    - `splatting`: passes 2 and 3: epsilon-z, the screen filter.
+    - `shadows`: pass 1: resolution and bias of shadow maps.
+    - `kernel`: pass 4: how a layer spreads, is normalized, and when the splats resolve it:
+      `EscapeNormalization()`, or `PlainMean()`, the paper's.
+    - `rasterizer`: `TileRasterizer()`, or `DenseRasterizer()`, the plain reference.
+    - `diffuser`: `ClusterDiffuser()`, or `DenseDiffuser()`, the plain reference.
+    - `lighting`: what the splats carry into the picture: `LightAtSplats()` blends their irradiance;
+      `splatjax.baselines` has others.
+    """
+
+    splatting: _splatting.SplattingSettings = _splatting.SplattingSettings()
+    shadows: _splatting.ShadowSettings = _splatting.ShadowSettings()
+    kernel: _diffusion.AbstractDiffusionKernel = _diffusion.EscapeNormalization()
+    rasterizer: _splatting.AbstractRasterizer = _splatting.TileRasterizer()
+    diffuser: _diffusion.AbstractDiffuser = _diffusion.ClusterDiffuser()
+    lighting: AbstractLighting = LightAtSplats()
+
 
 Whole = TypeVar("Whole", bound=PyTree)
 

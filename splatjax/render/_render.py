@@ -17,8 +17,7 @@ from ._checks import SAME, check_channels, in_one_dtype
 from ._devices import on_devices
 from ._lighting import Irradiance, LightAtSplats, cast_shadows, irradiate
 from ._passes import SplatLight, diffuse_splats, light_splats, look
-from ._plan import Plan, check_plan, plan_unless_traced
-from ._settings import RenderSettings
+from ._plan import Plan, RenderSettings, check_plan, plan_unless_traced
 from ._shade import compose, single_scattering_albedo
 
 

@@ -27,12 +27,17 @@ from splatjax.scene import (
 
 from ._attributes import SurfaceAttributes, SurfaceSamples, stack_rows
 from ._checks import check_channels, in_one_dtype
-from ._lighting import Irradiance, LightVisibility, irradiate, map_visibility
+from ._lighting import (
+    Irradiance,
+    LightVisibility,
+    irradiate,
+    is_among,
+    map_visibility,
+    shadow_views,
+)
 from ._passes import map_samples, sample_surfaces
-from ._plan import fill_up
-from ._settings import RenderSettings
+from ._plan import RenderSettings, fill_up
 from ._shade import compose, shade
-from ._shadow_plan import is_among, shadow_views
 from ._statistics import ReplayableStream, StreamStatistics
 
 Report: TypeAlias = Callable[[str, int], None]

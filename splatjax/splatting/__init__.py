@@ -5,11 +5,11 @@ scattering.
 from ._bins import BinCapacity as BinCapacity, bin_items as bin_items, Bins as Bins
 from ._bins import round_up as round_up, scatter_slots as scatter_slots, slot_plane as slot_plane
 from ._dense import DenseRasterizer as DenseRasterizer
-from ._footprints import Footprints as Footprints, SplattingSettings as SplattingSettings
+from ._views import Footprints as Footprints, SplattingSettings as SplattingSettings
 from ._grid import SIDE as SIDE, TileGrid as TileGrid, TileRanges as TileRanges
 from ._kernel import coverage as coverage, fragment_weight as fragment_weight
-from ._orthographic import OrthographicView as OrthographicView
-from ._perspective import PerspectiveView as PerspectiveView
+from ._projections import OrthographicView as OrthographicView
+from ._projections import PerspectiveView as PerspectiveView
 from ._rasterizer import AbstractRasterizer as AbstractRasterizer
 from ._rasterizer import AbstractRasterPlan as AbstractRasterPlan, FragmentSums as FragmentSums
 from ._shadows import (

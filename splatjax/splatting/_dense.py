@@ -10,11 +10,10 @@ from jaxtyping import Array, Bool, Float
 from splatjax._combination import AbstractCombination
 from splatjax.scene import Splats
 
-from ._footprints import SplattingSettings
 from ._grid import TileGrid
 from ._kernel import fragment_weight
 from ._rasterizer import AbstractRasterizer, AbstractRasterPlan, FragmentSums, least_weight
-from ._views import AbstractView
+from ._views import AbstractView, SplattingSettings
 
 
 class DenseRasterizer(AbstractRasterizer):

@@ -10,8 +10,7 @@ from jaxtyping import Array, Float, Int
 from splatjax._combination import AbstractCombination
 from splatjax.scene import Splats
 
-from ._footprints import SplattingSettings
-from ._views import AbstractView
+from ._views import AbstractView, SplattingSettings
 
 LEAST_WEIGHT = 0.06  # of a fragment that decides where the surface behind the front is
 

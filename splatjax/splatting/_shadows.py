@@ -14,14 +14,12 @@ from splatjax._chunking import AT_ONCE, jit_unless_traced, map_chunks
 from splatjax._combination import AbstractCombination, extreme
 from splatjax.scene import Splats
 
-from ._footprints import SplattingSettings
 from ._grid import TileGrid
 from ._kernel import coverage
-from ._orthographic import OrthographicView
-from ._perspective import PerspectiveView
+from ._projections import OrthographicView, PerspectiveView
 from ._rasterizer import AbstractRasterPlan, FragmentSums, invalid_factor
 from ._surfaces import Surface
-from ._views import AbstractView
+from ._views import AbstractView, SplattingSettings
 
 _NEAR = 1e-2  # mm: nearer, a splat is so large in pixels that float32 overflows
 

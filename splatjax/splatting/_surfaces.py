@@ -11,11 +11,10 @@ from splatjax._chunking import AT_ONCE
 from splatjax._combination import AbstractCombination
 from splatjax.scene import Splats
 
-from ._footprints import SplattingSettings
 from ._grid import SIDE, TileGrid
 from ._kernel import coverage
 from ._rasterizer import AbstractRasterPlan, FragmentSums, invalid_factor
-from ._views import AbstractView
+from ._views import AbstractView, SplattingSettings
 
 TILES_AT_ONCE = AT_ONCE // SIDE**2
 """Tiles of a chunk, for what is computed chunk by chunk."""

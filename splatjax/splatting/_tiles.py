@@ -16,12 +16,11 @@ from splatjax._combination import AbstractCombination, OneDevice
 from splatjax.scene import Splats
 
 from ._bins import BinCapacity, Bins, bin_items, round_up
-from ._footprints import SplattingSettings
 from ._fragments import PLANES, Slots, Sweep
 from ._grid import TileGrid
 from ._rasterizer import AbstractRasterizer, AbstractRasterPlan, FragmentSums, Places
 from ._sweeps import PartSweep, sum_fragments
-from ._views import AbstractView
+from ._views import AbstractView, SplattingSettings
 
 _STEP = 1024  # of the planned number of splats
 _SPARE = 1.5  # times the tiles with a surface behind that planning found

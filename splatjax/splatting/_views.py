@@ -1,13 +1,111 @@
-"""What a view is: a projection of splats onto pixels."""
+"""A splat is a disc. In the picture its rim is an ellipse, and a fragment of it is described by
+numbers that are polynomials in the offset `d` (pixels) from the projected center:
+
+    nearness  e(d)  = nearness + slope . d          1 / z in perspective, -z without
+    quadric   n(d)  = a dx^2 + b dx dy + c dy^2
+    rho^2           = n / e^2 in perspective, n without: 1 on the rim
+
+so that the surface in front has the largest nearness and no fragment needs a square root.
+"""
 
 import abc
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from splatjax.scene import Splats
 
-from ._footprints import Footprints, SplattingSettings
+from ._grid import TileGrid, TileRanges
+
+EDGE_ON = 1e-5
+"""Cosine to the line of sight, below which float32 does not know which side of a splat is seen."""
+_SLOPE_FILTER = 0.25  # pixels; see `filtered`
+
+
+class SplattingSettings(eqx.Module):
+    r"""How splats become a surface. All static.
+
+    **Attributes:**
+
+    - `filter_radius`: of the screen filter, pixels, positive. At the root of 2 the weights of a
+      splat smaller than a pixel add up to the same over the pixels, wherever it lies between them,
+      to 4%.
+    - `epsilon_z`: fragments within this many radii behind the front belong to it (3.1).
+    - `largest_slope`: slanted splats have epsilon lengthened by `1 / cos`, up to this factor.
+    - `full_coverage`: weight sum from which on a pixel is covered. Splats whose radius is 1.5 times
+      the root of their area, scattered at random, have at least 0.2 inside a closed surface.
+    """
+
+    filter_radius: float = eqx.field(static=True, default=2**0.5)
+    epsilon_z: float = eqx.field(static=True, default=1.5)
+    largest_slope: float = eqx.field(static=True, default=3.0)
+    full_coverage: float = eqx.field(static=True, default=0.15)
+
+
+class Footprints(eqx.Module):
+    """The projected splats, one array per number. Pixels, origin top left, unless said
+    otherwise.
+    """
+
+    x: Float[Array, " splats"]
+    y: Float[Array, " splats"]
+    slope_x: Float[Array, " splats"]
+    slope_y: Float[Array, " splats"]
+    a: Float[Array, " splats"]
+    b: Float[Array, " splats"]
+    c: Float[Array, " splats"]
+    nearness: Float[Array, " splats"]
+    shift: Float[Array, " splats"]
+    """How the surface is moved away by epsilon (3.1); not differentiated."""
+    opacity: Float[Array, " splats"]
+    """What the screen filter leaves of the peak weight: 1 for large frontal splats, 0 edge on."""
+    left: Float[Array, " splats"]
+    right: Float[Array, " splats"]
+    top: Float[Array, " splats"]
+    bottom: Float[Array, " splats"]
+    """The rim's bounding box. Not differentiated."""
+    visible: Bool[Array, " splats"]
+
+    def ranges(self, grid: TileGrid) -> TileRanges:
+        """Find the tiles that each splat may touch."""
+        return TileRanges.of(self.left, self.right, self.top, self.bottom, self.visible, grid)
+
+
+def filtered(xx, xy, yy, root, dx, dy, vx, vy, filter_radius):
+    """Widen the rim's ellipse by the screen filter: its inverse, the plane's slope, the ellipse,
+    its determinant's root.
+
+    The ellipse `d^T S^-1 d = 1` grows to `S + f^2 I`; `root` is that of `det S`, `(dx, dy)` is `det
+    S slope` and `(vx, vy)` is `S slope`: the slope itself is infinite edge on, so a quarter of a
+    pixel is added to `S` before it is divided by it. Hits stay on the plane of every splat that a
+    pixel can resolve. No term cancels another: float32 holds however slanted the splat.
+    """
+    determinant, trace, fine = root * root, xx + yy, _SLOPE_FILTER**2
+    slanted = determinant + fine * (trace + fine)
+    slope_x, slope_y = (dx + fine * vx) / slanted, (dy + fine * vy) / slanted
+    wide = filter_radius**2
+    determinant = determinant + wide * (trace + wide)
+    xx, yy = xx + wide, yy + wide
+    return (
+        yy / determinant,
+        -2 * xy / determinant,
+        xx / determinant,
+        slope_x,
+        slope_y,
+        xx,
+        yy,
+        jnp.sqrt(determinant),
+    )
+
+
+def epsilon_of(radii, filter_radius, cosine, settings: SplattingSettings):
+    """Compute the depth (mm) within which fragments belong to one surface: in radii, more on
+    slanted splats.
+    """
+    reach = jnp.sqrt(radii * radii + filter_radius * filter_radius)
+    return settings.epsilon_z * reach / jnp.maximum(cosine, 1 / settings.largest_slope)
+
 
 MARGIN = 8.0
 """Pixels around the picture; the screen filter reaches beyond a sphere."""

@@ -18,7 +18,7 @@ from splatjax.geometry import (
     vertex_normals,
 )
 from splatjax.geometry._cells import surface_cells
-from splatjax.geometry._places import morton_order
+from splatjax.geometry._mesh import morton_order
 from splatjax.geometry._scatter import Rounding, SurfacePoints
 
 COUNT = 3000
