@@ -91,8 +91,8 @@ def smooth_step(x: np.ndarray, low: Size | np.ndarray, high: Size | np.ndarray) 
 
 
 LOW, HIGH = (-140.0, -226.0, -125.0), (140.0, 124.0, 125.0)
+# Where a primitive lies: as it is, on both sides, or on both without a crease down the middle.
 _ONE, _BOTH, _BLUNT = range(3)
-"""Where a primitive lies: as it is, on both sides, or on both without a crease down the middle."""
 _SKULL: Part = [
     (ellipsoid, _ONE, (0, 40, -14), (75, 73, 90)),
     (join, 20, (ellipsoid, _ONE, (0, 36, -40), (75, 62, 64))),

@@ -79,8 +79,8 @@ def unit(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
     return np.where(length > 0, vectors / np.where(length > 0, length, 1), up)
 
 
+# Normals of two triangles at one place that differ by more make their edge hard.
 _SOFT = np.cos(np.radians(10))
-"""Normals of two triangles at one place that differ by more make their edge hard."""
 
 
 def shared_edges(places: Int[np.ndarray, "faces 3"]) -> Int[np.ndarray, "n 2 2"]:

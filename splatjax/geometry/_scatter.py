@@ -147,8 +147,8 @@ def _settle(mesh: Mesh, beyond: np.ndarray, faces: np.ndarray, points: np.ndarra
 
 
 _MIDDLES = 0.5 * np.asarray([[1.0, 1, 0], [0, 1, 1], [1, 0, 1]])
+# Of a triangle with the middles of its edges after its corners.
 _QUARTERS = np.asarray([[0, 3, 5], [1, 4, 3], [2, 5, 4], [3, 4, 5]])
-"""Of a triangle with the middles of its edges after its corners."""
 
 
 class Rounding:

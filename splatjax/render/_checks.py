@@ -12,20 +12,17 @@ from jax.core import Tracer
 from splatjax._memory import check_memory
 from splatjax.scene import Camera, Scene, Splats
 
+# At least: a picture that needs more than is free by these does not fit.
 _BYTES_PER_SPLAT, _BYTES_PER_PIXEL = 1000.0, 500.0
-"""At least: a picture that needs more than is free by these does not fit."""
-_SAMPLE = 4096
-"""Splats, evenly picked, by which the shape of a body is judged."""
+_SAMPLE = 4096  # splats, evenly picked, by which the shape of a body is judged
+# Sum of the normals of a closed body, by area, as a fraction of the area. An open neck leaves
+# 0.08, a hemisphere 0.5.
 _CLOSED = 0.15
-"""Sum of the normals of a closed body, by area, as a fraction of the area. An open neck leaves
-0.08, a hemisphere 0.5.
-"""
-_SOLID = 0.05
-"""Volume of a body that is no sheet, as a fraction of that of a sphere of its area."""
+_SOLID = 0.05  # volume of a body that is no sheet, as a fraction of that of a sphere of its area
+# Millimeters below which a material is meant to be opaque, as `Material.opaque` makes it.
 _OPAQUE = 2e-3
-"""Millimeters below which a material is meant to be opaque, as `Material.opaque` makes it."""
+# Size of a body over the distance that light travels below its surface, or the inverse.
 _RATIO = 1000.0
-"""Size of a body over the distance that light travels below its surface, or the inverse."""
 
 
 def check_scene(scene: Scene, camera: Camera, is_lit: bool = True) -> None:

@@ -10,10 +10,8 @@ from jaxtyping import Array, Float
 
 from splatjax._records import Numbers, as_floats, check_values, numbers, record
 
-_PARALLEL = 1e-6
-"""Sine of an angle that single precision does not resolve."""
-_FARTHEST = 1e15
-"""Single precision can square such a number, and multiply the square once more."""
+_PARALLEL = 1e-6  # sine of an angle that single precision does not resolve
+_FARTHEST = 1e15  # single precision can square such a number, and multiply the square once more
 
 
 @record

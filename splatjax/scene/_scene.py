@@ -15,8 +15,7 @@ from splatjax.scattering import SingleScattering
 
 from ._lights import AbstractLight
 
-_ROUNDING = 1e-5
-"""By which an albedo may leave [0, 1]."""
+_ROUNDING = 1e-5  # by which an albedo may leave [0, 1]
 _FINITE = "finite: drop such splats before rendering"
 _POSITIVE = "finite and at least 0"
 
