@@ -53,8 +53,9 @@ def rasterization(scene: sj.Scene, camera: sj.Camera, plan: sj.Plan, settings: s
 
     def picture(camera, centers, normals, radii, albedo):
         view = splatting.PerspectiveView.of(camera)
-        splats = sj.Splats(centers, normals, radii, areas)
-        rows = jnp.concatenate([normals.T, albedo.T])
+        splats = sj.Splats(centers, normals, radii, areas, albedo)
+        splats = splats.take(plan.raster.choose(splats, view)[0])
+        rows = jnp.concatenate([splats.normals.T, splats.albedo.T])
         own = settings.splatting, plan.raster, OneDevice()
         seen = splatting.visible_surfaces(splats, rows, view, *own)
         attributes = splatting.Surface.of(seen.rows, view, seen.needed).attributes
