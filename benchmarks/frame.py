@@ -56,8 +56,9 @@ def rasterization(scene: sj.Scene, camera: sj.Camera, plan: sj.Plan, settings: s
         splats = sj.Splats(centers, normals, radii, areas, albedo)
         splats = splats.take(plan.raster.choose(splats, view)[0])
         rows = jnp.concatenate([splats.normals.T, splats.albedo.T])
-        own = settings.splatting, plan.raster, OneDevice()
-        seen = splatting.visible_surfaces(splats, rows, view, *own)
+        seen = splatting.visible_surfaces(
+            splats, rows, view, settings.splatting, plan.raster, OneDevice()
+        )
         attributes = splatting.Surface.of(seen.rows, view, seen.needed).attributes
         return seen.picture(attributes), seen.picture(jnp.ones_like(seen.before))
 
