@@ -86,15 +86,15 @@ class Picture:
         pixels = PIXELS * self.camera.places
         # Of a shadow map every device gets both surfaces' two sums.
         maps = sum(each.limits() + 2 * PIXELS * each.places for each in self.maps)
-        # Depth, position, normal; weight and what lies before; shadows; layers and how far they are
-        # resolved; albedo, irradiance, diffuse and specular.
-        shaded = 9 + self.lights + self.gaussians * (self.channels + 1) + 4 * self.channels
+        # Depth, position, normal; weight, twice, and what lies before; shadows; layers and how far
+        # they are resolved; albedo, irradiance, diffuse and specular.
+        shaded = 10 + self.lights + self.gaussians * (self.channels + 1) + 4 * self.channels
         # Sources: center, normal, area and light.
         sources = self.splats * (7 + self.channels)
         return Traffic(
             summed=self.size * (self.camera.limits() + maps),
             scattered=self.size * pixels * (self.rows + 2),
-            gathered=self.size * (pixels * shaded + PIXELS * self.camera.front + sources),
+            gathered=self.size * (pixels * shaded + sources),
         )
 
     def sent(self, devices: int) -> float:

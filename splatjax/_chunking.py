@@ -102,21 +102,21 @@ def take_points(
     return jnp.stack(taken).reshape(*rows.shape[:-1], len(chosen))
 
 
-def zeros_after(known: Array, shape: tuple[int, ...], dtype: DTypeLike) -> Array:
-    r"""Return zeros for a loop to write into, allocated only after another array is known.
+def zeros_after(known: PyTree[Array], shape: tuple[int, ...], dtype: DTypeLike) -> Array:
+    r"""Return zeros for a loop to write into, allocated only after other arrays are known.
 
     A compiler allocates constants early and keeps one copy for all loops that begin with them;
-    each loop then copies it. Without this dependency the gradient of a frame takes an eighth more
-    memory.
+    each loop then copies it. Without this dependency a frame takes a third more memory, and its
+    gradient an eighth.
 
     **Arguments:**
 
-    - `known`: any array with at least one element: the last input of the loop to be computed.
+    - `known`: the last inputs of the loop to be computed; at least one element in all.
     - `shape`, `dtype`: of the zeros.
     """
-    zero = jnp.minimum(
-        (known.reshape(-1)[0] > 0).astype(jnp.int32), 0
-    )  # always 0, which the compiler cannot infer
+    first = [leaf.reshape(-1)[0] > 0 for leaf in jax.tree.leaves(known) if leaf.size]
+    # Always 0, which the compiler cannot infer.
+    zero = jnp.minimum(jnp.stack(first).astype(jnp.int32).sum(), 0)
     return jnp.full(shape, zero.astype(dtype))
 
 

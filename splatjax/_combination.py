@@ -14,6 +14,7 @@ from jax.lax import stop_gradient
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float, PyTree, Shaped
 
+Part = TypeVar("Part")
 Partial = TypeVar("Partial", bound=PyTree)
 
 
@@ -24,16 +25,20 @@ class AbstractCombination(eqx.Module):
     """
 
     @abc.abstractmethod
-    def own_total(self, partials: Iterable[Partial]) -> Partial:
-        """Sum over the parts on this device. Differentiable."""
+    def total(self, partials: Iterable[Partial]) -> Partial:
+        """Sum over all parts. Differentiable."""
 
     @abc.abstractmethod
     def largest(self, partials: Iterable[Partial]) -> Partial:
         """Take the maximum over all parts, as a constant of the derivative."""
 
-    def total(self, partials: Iterable[Partial]) -> Partial:
-        """Sum over all parts. Differentiable."""
-        return self.own_total(partials)
+    def fold(
+        self, add: Callable[[Partial, Part], Partial], start: Partial, parts: Iterable[Part]
+    ) -> Partial:
+        """Add the parts on this device to what is there, one after the other: `add(so_far, part)`
+        returns the sum. Differentiable.
+        """
+        return functools.reduce(add, parts, start)
 
     def own_share(self, rows: Float[Array, "rows ..."]) -> Float[Array, "share ..."]:
         """Sum the rows of all devices, and keep this device's share of them. Differentiable."""
@@ -55,7 +60,7 @@ class AbstractCombination(eqx.Module):
 class OneDevice(AbstractCombination):
     """There is one part, and it is the whole."""
 
-    def own_total(self, partials):
+    def total(self, partials):
         (whole,) = partials
         return whole
 
@@ -81,16 +86,13 @@ class DeviceMesh(AbstractCombination):
         """Specify that rows are cut into a share for each device."""
         return PartitionSpec(self.axes)
 
-    def own_total(self, partials):
+    def total(self, partials):
         (own,) = partials
-        return own
+        return jax.lax.psum(own, self.axes)
 
     def largest(self, partials):
         (own,) = partials
         return jax.tree.map(lambda leaf: jax.lax.pmax(stop_gradient(leaf), self.axes), own)
-
-    def total(self, partials):
-        return jax.lax.psum(self.own_total(partials), self.axes)
 
     def own_share(self, rows):
         return jax.lax.psum_scatter(rows, self.axes, scatter_dimension=0, tiled=True)
@@ -112,19 +114,19 @@ class DeviceMesh(AbstractCombination):
 class PartByPart(AbstractCombination):
     """Parts come one after the other, and nothing is kept of a part but its result."""
 
-    def own_total(self, partials):
-        return _fold(jnp.add, partials)
+    def total(self, partials):
+        return self._combine(jnp.add, partials)
 
     def largest(self, partials):
-        return _fold(jnp.maximum, partials)
+        return self._combine(jnp.maximum, partials)
 
+    def _combine(self, operation: Callable[[Array, Array], Array], partials: Iterable[Partial]):
+        others = iter(partials)
+        return self.fold(functools.partial(jax.tree.map, operation), next(others), others)
 
-def _fold(operation: Callable[[Array, Array], Array], partials: Iterable[Partial]) -> Partial:
-    def combine(so_far, part):
+    def fold(self, add, start, parts):
         # Parts that are read ahead of the computation would pile up.
-        return jax.block_until_ready(jax.tree.map(operation, so_far, part))
-
-    return functools.reduce(combine, partials)
+        return functools.reduce(lambda *given: jax.block_until_ready(add(*given)), parts, start)
 
 
 def extreme(

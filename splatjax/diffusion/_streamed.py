@@ -80,7 +80,7 @@ class StreamedDiffusion:
         - `parts`: of one size, with centers from the origin of the points; sources without area
           bring nothing.
         """
-        sums = PartByPart().own_total(self._sums(parts))
+        sums = PartByPart().total(self._sums(parts))
         return tuple(None if each is None else _divide(each) for each in sums)
 
     def _sums(self, parts: Iterable[Sources]) -> Iterator[list[Array | None]]:

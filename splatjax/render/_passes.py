@@ -4,6 +4,7 @@ samples, and between devices how partial results are combined. No mathematics li
 
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 from typing import TypeVar
 
 import equinox as eqx
@@ -27,7 +28,6 @@ from ._lighting import (
 from ._plan import Plan, RenderSettings
 from ._shade import ShadedSurface, shade
 
-Samples = TypeVar("Samples", bound=PyTree)
 Values = TypeVar("Values", bound=PyTree)
 
 
@@ -162,67 +162,70 @@ def look(
 
     # Pass 5: shade the points that are seen.
     def shade_and_read(samples: SurfaceSamples) -> Values:
+        samples = jax.tree.map(in_a_row, samples)
         shaded, layers = shade(scene, view.position, groups, samples, plan.interval, settings)
         return read(shaded, layers, samples)
 
-    values = map_samples(shade_and_read, sample_surfaces(visible, attributes, origin))
+    sample = partial(sample_surfaces, visible, attributes, origin)
+    samples = map_places(sample, visible.rows, visible.tiles)
+    values = map_places(shade_and_read, samples)
     return combination.gather(values), visible.gathered(combination)
 
 
 def sample_surfaces(
-    visible: _splatting.VisibleSurfaces, like: SurfaceAttributes, origin: Float[Array, "3 1"]
+    visible: _splatting.VisibleSurfaces,
+    like: SurfaceAttributes,
+    origin: Float[Array, "3 1"],
+    rows: Float[Array, "places rows pixels"],
+    tiles: Int[Array, " places"],
 ) -> SurfaceSamples:
-    """Blend the sums of every place, and continue the layers of the splats to the points seen.
+    """Blend the sums of some places, and continue the layers of the splats to the points seen.
 
     **Arguments:**
 
+    - `visible`: of all places.
     - `like`: the attributes whose rows were summed.
     - `origin`: from which the splats' centers among them are counted.
-
-    **Returns:** the samples, with arrays `[places, rows, pixels]`.
+    - `rows`, `tiles`: those of `visible`, of these places.
     """
     like = jax.eval_shape(lambda: like)
+    surface = _splatting.Surface.of(rows, visible.view, visible.needed)
+    attributes = split_rows(in_a_row(surface.attributes), like)
+    positions = in_a_row(visible.points(tiles, surface.depth))
 
-    def blend(rows, tiles):
-        surface = _splatting.Surface.of(rows, visible.view, visible.needed)
-        attributes = split_rows(in_a_row(surface.attributes), like)
-        positions = in_a_row(visible.points(tiles, surface.depth))
-
-        own, channels = (attributes.centers, positions - origin), len(attributes.source)
-        slopes = attributes.derivative
-        continued = [
-            (None, None)
-            if layer is None
-            else _diffusion.continue_to_points(layer, slopes and slopes[i], *own, channels)
-            for i, layer in enumerate(attributes.layers)
-        ]
-        samples = SurfaceSamples(
-            attributes=attributes.without_layers(),
-            positions=positions,
-            depth=in_a_row(surface.depth),
-            covered=in_a_row(surface.covered),
-            layers=tuple(layer for layer, _ in continued),
-            derivative=None if slopes is None else tuple(slope for _, slope in continued),
-        )
-        return jax.tree.map(_by_place, samples)
-
-    return map_chunks(blend, visible.rows, visible.tiles, at_once=_splatting.TILES_AT_ONCE)
+    own, channels = (attributes.centers, positions - origin), len(attributes.source)
+    slopes = attributes.derivative
+    continued = [
+        (None, None)
+        if layer is None
+        else _diffusion.continue_to_points(layer, slopes and slopes[i], *own, channels)
+        for i, layer in enumerate(attributes.layers)
+    ]
+    return SurfaceSamples(
+        attributes=attributes.without_layers(),
+        positions=positions,
+        depth=in_a_row(surface.depth),
+        covered=in_a_row(surface.covered),
+        layers=tuple(layer for layer, _ in continued),
+        derivative=None if slopes is None else tuple(slope for _, slope in continued),
+    )
 
 
-def map_samples(read: Callable[[Samples], Values], samples: Samples) -> Values:
-    """Read samples, a chunk of places at a time.
+def map_places(function: Callable[..., Values], *given: PyTree) -> Values:
+    """Apply a pointwise function to chunks of places.
 
     **Arguments:**
 
-    - `samples`: `SurfaceSamples`, or a tree with more, with arrays `[places, *rows, pixels]`.
+    - `function`: returns arrays `[*rows, points]`, the pixels of its places in a row.
+    - `given`: arrays along the places.
 
-    **Returns:** for each array `[*rows, points]` that `read` returns, `[places, *rows, pixels]`.
+    **Returns:** the same arrays, `[places, *rows, pixels]`.
     """
 
-    def chunk(samples):
-        return jax.tree.map(_by_place, read(jax.tree.map(in_a_row, samples)))
+    def chunk(*given):
+        return jax.tree.map(_by_place, function(*given))
 
-    return map_chunks(chunk, samples, at_once=_splatting.TILES_AT_ONCE)
+    return map_chunks(chunk, *given, at_once=_splatting.TILES_AT_ONCE)
 
 
 def in_a_row(values: Shaped[Array, "places *rows pixels"]) -> Shaped[Array, "*rows points"]:

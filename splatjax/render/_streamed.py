@@ -4,9 +4,11 @@ leave only sums behind.
 
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import TypeAlias
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -35,7 +37,7 @@ from ._lighting import (
     map_visibility,
     shadow_views,
 )
-from ._passes import map_samples, sample_surfaces
+from ._passes import in_a_row, map_places, sample_surfaces
 from ._plan import RenderSettings, fill_up
 from ._shade import compose, shade
 from ._statistics import ReplayableStream, StreamStatistics
@@ -246,7 +248,8 @@ def _sample(
     origin: Float[Array, "3"],
 ) -> tuple[_splatting.VisibleSurfaces, SurfaceSamples]:
     visible = _splatting.VisibleSurfaces.of(sums, view, settings.splatting, PartByPart())
-    return visible, sample_surfaces(visible, like, origin[:, None])
+    sample = partial(sample_surfaces, visible, like, origin[:, None])
+    return visible, map_places(sample, visible.rows, visible.tiles)
 
 
 @eqx.filter_jit
@@ -260,8 +263,9 @@ def _shade(
     interval: Float[Array, "2"],
     settings: RenderSettings,
 ) -> Frame:
-    def read(given: tuple[SurfaceSamples, tuple]):
-        samples = dataclasses.replace(given[0], layers=given[1])
+    def shade_places(samples: SurfaceSamples, layers):
+        samples, layers = jax.tree.map(in_a_row, (samples, layers))
+        samples = dataclasses.replace(samples, layers=layers)
         return shade(scene, view.position, groups, samples, interval, settings)[0]
 
-    return compose(scene, map_samples(read, (samples, layers)), visible)
+    return compose(scene, map_places(shade_places, samples, layers), visible)

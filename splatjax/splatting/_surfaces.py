@@ -92,21 +92,21 @@ class VisibleSurfaces(eqx.Module):
         combination: AbstractCombination,
     ) -> "VisibleSurfaces":
         """Combine the sums of all devices; each keeps a share of the places."""
-        tiles = TileGrid(view.width, view.height).count
-        front, behind = sums.rows[: sums.front], sums.rows[sums.front :]
-        in_front, in_back = sums.tiles[: sums.front], sums.tiles[sums.front :]
-        front, behind = combination.own_share(front), combination.own_share(behind)
-        whole = coverage(combination.gather(front[:, -1]), settings.full_coverage)
-        whole = jnp.zeros((tiles, SIDE**2), whole.dtype).at[in_front].set(whole, mode="drop")
-        own_back = combination.own_rows(in_back)
-        before = whole.at[own_back].get(mode="fill", fill_value=0)
-        own = jnp.concatenate([combination.own_rows(in_front), own_back])
+        count = TileGrid(view.width, view.height).count
+        in_front = jnp.arange(len(sums.tiles)) < sums.front
+        rows, tiles = combination.own_share(sums.rows), combination.own_rows(sums.tiles)
+        # What the front covers of the tiles, wherever it was shaded.
+        covered = coverage(combination.gather(rows[:, -1]), settings.full_coverage)
+        front = jnp.zeros((count, SIDE**2), covered.dtype)
+        front = front.at[sums.tiles[: sums.front]].set(covered[: sums.front], mode="drop")
+        own_front = combination.own_rows(in_front)
+        before = front.at[tiles].get(mode="fill", fill_value=0)
         return cls(
             view=view,
-            tiles=own,
-            in_front=jnp.arange(len(own)) < len(own) - len(own_back),
-            rows=jnp.concatenate([front, behind]),
-            before=jnp.concatenate([jnp.zeros_like(front[:, -1]), before]),
+            tiles=tiles,
+            in_front=own_front,
+            rows=rows,
+            before=jnp.where(own_front[:, None], 0.0, before),
             needed=combination.largest([sums.needed]),
             full_coverage=settings.full_coverage,
         )

@@ -7,6 +7,7 @@ know what the one before found in all parts of the splats. The backward sweep ne
 at which the surfaces end.
 """
 
+import dataclasses
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 
@@ -33,11 +34,50 @@ class Spans(eqx.Module):
     - `tiles`: the tile at each place; the number of tiles for none.
     - `beyond`: fragments count that are nearer than this; inf where there are none.
     - `upto`: fragments count that are not nearer than this.
+    - `needed`: places needed over planned.
     """
 
     tiles: Int[Array, " places"]
     beyond: Float[Array, "places pixels"]
     upto: Float[Array, "places pixels"]
+    needed: Float[Array, ""]
+
+    @classmethod
+    def front(
+        cls, limits: Float[Array, "tiles pixels"], lengths: Int[Array, " tiles"], size: int
+    ) -> "Spans":
+        """Choose the places of the front. Longer lists come first: tiles that are swept together
+        have lists of about one length.
+        """
+        order = jnp.argsort(-lengths)
+        shown = jnp.any(limits > -jnp.inf, axis=1)
+        tiles = _taken(order.astype(jnp.int32), _listed(shown[order], size), len(order))
+        beyond = _taken(limits, tiles, jnp.inf)
+        beyond = jnp.where(beyond > -jnp.inf, beyond, jnp.inf)
+        needed = (jnp.sum(shown) / size).astype(limits.dtype)
+        return cls(tiles, beyond, jnp.full_like(beyond, jnp.inf), needed)
+
+    def opened(self, is_open: Bool[Array, "places pixels"], size: int, none: int) -> "Spans":
+        """Choose the places with pixels that the front leaves open: behind what `upto` says, and
+        in open pixels alone what `beyond` says.
+        """
+        is_open &= self.beyond < jnp.inf
+        chosen = jnp.any(is_open, axis=1)
+        picked = _listed(chosen, size)
+        upto = _taken(self.beyond, picked, -jnp.inf)
+        open_to = jnp.where(_taken(is_open, picked, False), upto, -jnp.inf)
+        needed = (jnp.sum(chosen) / size).astype(upto.dtype)
+        return Spans(_taken(self.tiles, picked, none), open_to, upto, needed)
+
+    def followed_by(self, behind: "Spans") -> "Spans":
+        """Append the places of the surface behind."""
+        needed = jnp.maximum(self.needed, behind.needed)
+        return Spans(
+            tiles=jnp.concatenate([self.tiles, behind.tiles]),
+            beyond=jnp.concatenate([self.beyond, behind.beyond]),
+            upto=jnp.concatenate([self.upto, behind.upto]),
+            needed=needed,
+        )
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0, 1, 2))
@@ -103,18 +143,24 @@ class PartSweep(eqx.Module):
         lengths = jnp.repeat(jnp.diff(self.bins.first_block), grid.lanes)
         return limits, jnp.zeros(grid.count, jnp.int32).at[order].set(lengths, mode="drop")
 
+    def nothing(self, front: Spans, capacity: Places) -> Float[Array, "places rows pixels"]:
+        """Return sums over no fragments, for the places of both surfaces."""
+        shape = capacity.front + capacity.behind, self.slots.attributes.shape[1] + 2, SIDE**2
+        return zeros_after((front.beyond, self.slots.attributes), shape, front.beyond.dtype)
+
     @jit_unless_traced
-    def sums(self, spans: Spans) -> Float[Array, "places rows pixels"]:
-        """Sum over the fragments of some spans."""
+    def add_sums(
+        self, spans: Spans, rows: Float[Array, "places rows pixels"], first: int
+    ) -> Float[Array, "places rows pixels"]:
+        """Add the sums over the fragments of some spans to rows, from a first place on."""
 
-        def add(i, lanes: Lanes, beyond, upto, tiles, out):
+        def add(i, lanes: Lanes, beyond, upto, tiles, rows):
             sums = self.sweep.sums(self.slots, lanes, beyond, upto)
-            return _write(out, self.sweep.within_picture(sums, tiles), i)
+            own = lax.dynamic_slice_in_dim(rows, first + i, len(tiles))
+            return _write(rows, own + self.sweep.within_picture(sums, tiles), first + i)
 
-        shape = len(spans.tiles), self.slots.attributes.shape[1] + 2, SIDE**2
-        nothing = zeros_after(spans.beyond, shape, spans.beyond.dtype)
         given = spans.beyond, spans.upto, spans.tiles
-        return self.each_round(spans.tiles, given, add, nothing)
+        return self.each_round(spans.tiles, given, add, rows)
 
     @jit_unless_traced
     def limits_behind(
@@ -166,75 +212,40 @@ def sum_parts(
 
     **Returns:** for each view the sums on this device, and over what.
     """
-    first = next(iter(parts()))
+    first, views = next(iter(parts())), range(len(capacities))
     # Stage 1: where the front ends in any part.
     limits = combination.largest([each.limits() for each in part] for part in parts())
-    fronts = [_front(*each, own) for each, own in zip(limits, capacities, strict=True)]
+    fronts = [Spans.front(*limits[k], capacities[k].front) for k in views]
+
     # Stage 2: the sums of the front.
-    sums = combination.own_total(
-        [each.sums(spans) for each, (spans, _) in zip(part, fronts, strict=True)]
-        for part in parts()
-    )
-    weights = combination.total([[rows[:, -1] for rows in sums]])
+    def add_front(rows, part):
+        return [part[k].add_sums(fronts[k], rows[k], 0) for k in views]
+
+    nothing = [first[k].nothing(fronts[k], capacities[k]) for k in views]
+    rows = combination.fold(add_front, nothing, parts())
     # Stage 3: where the surface behind ends, in pixels that the front leaves open.
-    opened = [
-        _opened(spans, weights[k] < first[k].sweep.full_coverage, own, first[k].sweep.grid.count)
-        for k, ((spans, _), own) in enumerate(zip(fronts, capacities, strict=True))
-    ]
+    weights = combination.total([[rows[k][: capacities[k].front, -1] for k in views]])
+    opened = []
+    for k, own in enumerate(capacities):
+        sweep = first[k].sweep
+        is_open = weights[k] < sweep.full_coverage
+        opened.append(fronts[k].opened(is_open, own.behind, sweep.grid.count))
     limits = combination.largest(
-        [each.limits_behind(spans) for each, (spans, _) in zip(part, opened, strict=True)]
-        for part in parts()
+        [part[k].limits_behind(opened[k]) for k in views] for part in parts()
     )
-    behind = [
-        eqx.tree_at(lambda each: each.beyond, spans, second_limits(*each))
-        for each, (spans, _) in zip(limits, opened, strict=True)
-    ]
+    behind = [dataclasses.replace(opened[k], beyond=second_limits(*limits[k])) for k in views]
+
     # Stage 4: the sums of the surface behind.
-    rest = combination.own_total(
-        [each.sums(spans) for each, spans in zip(part, behind, strict=True)] for part in parts()
-    )
+    def add_behind(rows, part):
+        return [part[k].add_sums(behind[k], rows[k], capacities[k].front) for k in views]
+
+    rows = combination.fold(add_behind, rows, parts())
     found = []
-    for k, capacity in enumerate(capacities):
-        spans, rows = jax.tree.map(
-            lambda whole, part, front=capacity.front: whole.at[front:].set(part),
-            (fronts[k][0], sums[k]),
-            (behind[k], rest[k]),
-        )
-        needs = first[k].bins.needed, fronts[k][1], opened[k][1]
-        needed = combination.largest(
-            [jnp.max(jnp.stack([each.astype(rows.dtype) for each in needs]))]
-        )
-        found.append((FragmentSums(spans.tiles, rows, needed, capacity.front), spans))
+    for k, own in enumerate(capacities):
+        spans = fronts[k].followed_by(behind[k])
+        needed = combination.largest([jnp.maximum(spans.needed, first[k].bins.needed)])
+        found.append((FragmentSums(spans.tiles, rows[k], needed, own.front), spans))
     return found
-
-
-def _front(limits, lengths, capacity: Places) -> tuple[Spans, Float[Array, ""]]:
-    """Choose the places of the front, and leave room for those behind; also return the places
-    needed over planned.
-
-    Longer lists come first: tiles that are swept together have lists of about one length.
-    """
-    order = jnp.argsort(-lengths)
-    shown = jnp.any(limits > -jnp.inf, axis=1)
-    picked = _listed(shown[order], capacity.front)
-    picked = jnp.pad(picked, (0, capacity.behind), constant_values=len(order))
-    tiles = _taken(order.astype(jnp.int32), picked, len(order))
-    beyond = _taken(limits, tiles, jnp.inf)
-    beyond = jnp.where(beyond > -jnp.inf, beyond, jnp.inf)
-    return Spans(tiles, beyond, jnp.full_like(beyond, jnp.inf)), jnp.sum(shown) / capacity.front
-
-
-def _opened(front: Spans, is_open, capacity: Places, count: int) -> tuple[Spans, Float[Array, ""]]:
-    """Choose the places with pixels that the front leaves open: behind what `upto` says, and in
-    open pixels alone what `beyond` says; also return the places needed over planned.
-    """
-    is_open &= front.beyond < jnp.inf
-    chosen = jnp.any(is_open, axis=1)
-    picked = _listed(chosen, capacity.behind)
-    tiles = _taken(front.tiles, picked, count)
-    upto = _taken(front.beyond, picked, -jnp.inf)
-    open_to = jnp.where(_taken(is_open, picked, False), upto, -jnp.inf)
-    return Spans(tiles, open_to, upto), jnp.sum(chosen) / capacity.behind
 
 
 def _listed(chosen: Bool[Array, " all"], size: int) -> Int[Array, " size"]:
