@@ -1,6 +1,8 @@
 """A flat plane whose chart is stretched, and what it is painted with."""
 
 import bodies
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -65,12 +67,13 @@ def splatted(points: np.ndarray, gaussians: sj.SumOfGaussians, spacing: float = 
     return means.transpose(0, 2, 1)
 
 
+@eqx.filter_jit
 def gathered(
     sources: Sources, variances, kernel: AbstractDiffusionKernel, points: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[jax.Array, jax.Array]:
     places = jnp.asarray(points.T, float)
     layers = [
         dense_layer(sources, places, variance, depth)
         for variance, depth in zip(variances, kernel.depths(variances), strict=True)
     ]
-    return np.stack([each.means for each in layers]), np.stack([each.mass for each in layers])
+    return jnp.stack([each.means for each in layers]), jnp.stack([each.mass for each in layers])

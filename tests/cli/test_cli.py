@@ -22,7 +22,7 @@ from splatjax.cli._render import Render
 from splatjax.cli._view import direction_to
 from splatjax.io import read_manifest, read_record
 
-SMALL = ["--count", "5000", "--width", "64", "--height", "64"]
+SMALL = ["--count", "1500", "--width", "64", "--height", "64"]
 
 
 def test_materials_lists_the_library_with_its_sources(capsys):
@@ -72,7 +72,7 @@ def test_sample_covers_a_mesh_that_may_have_z_up(tmp_path, capsys):
 
 @pytest.mark.slow
 @pytest.mark.once
-def test_render_shows_the_bust_and_its_manifest_makes_the_same_picture(tmp_path, capsys):
+def test_render_shows_the_bust_and_its_manifest_makes_the_same_picture(plain, tmp_path, capsys):
     output, picture = tmp_path / "bust.exr", tmp_path / "bust.png"
     assert run("render", *SMALL, "--output", output) == 0
     assert capsys.readouterr().out.splitlines() == [str(output), str(picture)]

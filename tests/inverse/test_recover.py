@@ -244,7 +244,7 @@ class TestUnresolvedLayers:
     def test_a_search_goes_astray_with_the_width_as_its_bars_say(self):
         """The picture of a width a little off, searched as if it were not."""
         (problem, point), by = half_resolved(), 0.01
-        (picture,) = wider(problem, by).radiance(point)
+        (picture,) = jax.jit(lambda by: wider(problem, by).radiance(point))(by)
         observed = eqx.tree_at(lambda one: one.evidence[0].picture, problem, picture)
         information = np.asarray(solution(problem, point).information)
         expected = np.linalg.inv(information[:4, :4]) @ information[:4, 4:] @ np.full(2, by)

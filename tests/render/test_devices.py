@@ -41,7 +41,8 @@ def on_eight(question):
 @pytest.mark.parametrize(
     "question",
     [
-        "splats_cut",
+        "light_and_unshadowed_splats_cut",
+        pytest.param("splats_cut", marks=pytest.mark.long),
         pytest.param("more_than_pictures_cut", marks=pytest.mark.long),
         pytest.param("views_cut", marks=pytest.mark.long),
     ],

@@ -52,7 +52,7 @@ def middle(picture: jnp.ndarray) -> np.ndarray:
 def test_exitance_over_irradiance_is_the_total_reflectance_of_marble():
     material = matte(sj.load_material("marble"))
     scene = sj.Scene(sheet(30.0, 1.0), (lamp(),), material)
-    frame = sj.render(scene, camera_over(8.0, 32))
+    frame = sj.render(scene, camera_over(8.0, 32), PLAIN)
     exitance = np.pi * middle(frame.diffuse)
     reflectance = np.asarray(material.gaussians.total_reflectance())
     np.testing.assert_allclose(
@@ -86,7 +86,7 @@ def test_white_furnace():
     lights = tuple(lamp((4 * np.pi / count,) * 3, way) for way in directions(count, jitter=0.0))
     scene = sj.Scene(sphere(4000, 50.0), lights, sj.Material(two_gaussians().white()))
     camera = sj.Camera.look_at([0, 0, 400], [0, 0, 0], fov=16, width=32, height=32)
-    frame = sj.render(scene, camera)
+    frame = sj.render(scene, camera, PLAIN)
     covered = np.asarray(frame.coverage) > 0.999
     radiance = np.asarray(frame.beauty)[covered]
     assert covered.sum() > 600
@@ -139,7 +139,7 @@ def test_light_is_added_linearly_and_layers_add_up_to_the_picture():
 def test_no_splats_and_no_lights_give_an_empty_and_a_black_picture():
     material, camera = sj.Material(two_gaussians()), camera_over(5.0, 16)
     nothing = sj.Splats(jnp.zeros((0, 3)), jnp.zeros((0, 3)), jnp.zeros(0), jnp.zeros(0))
-    empty = sj.render(sj.Scene(nothing, (lamp(),), material), camera)
+    empty = sj.render(sj.Scene(nothing, (lamp(),), material), camera, PLAIN)
     assert np.all(empty.coverage == 0)
     assert np.all(empty.beauty == 0)
     assert np.all(np.isinf(empty.depth))
