@@ -103,10 +103,7 @@ def load_material(name_or_path: StrPath) -> Material:
     if "single_scattering" in tables.entries:
         table = tables.table("single_scattering", (*_COEFFICIENTS, "strength"))
         single = table.make(SingleScattering, _medium(table), table.numbers("strength", 1.0))
-        _check_channels(
-            tables, "[fit] and [single_scattering]", gaussians.channels, single.channels
-        )
-    return Material(gaussians, **_surface(tables), single_scattering=single)
+    return fit.make(Material, gaussians, **_surface(tables), single_scattering=single)
 
 
 def surface_and_source(
@@ -235,8 +232,6 @@ def _read(name_or_path: StrPath) -> tuple[Table, Dipole | LayeredMultipole | Non
         return tables, None
     known = (*_COEFFICIENTS, "optical_depth", "thickness", "thickness_unit")
     layers = [_layer(each) for each in tables.tables("layers", known)]
-    counts = [x.optical_depth.size if isinstance(x, Film) else x.channels for x in layers]
-    _check_channels(tables, "[[layers]]", *counts)
     with naming(f"{path}: [[layers]]"):
         return tables, LayeredMultipole(layers)
 
@@ -269,13 +264,6 @@ def _medium(table: Table) -> Medium:
         )
     table.one_of("unit", [COEFFICIENT_UNIT])
     return table.make(Medium, *(table.numbers(name) for name in _COEFFICIENTS[1:]))
-
-
-def _check_channels(tables: Table, names: str, *counts: int) -> None:
-    if len(set(counts)) > 1:
-        raise ValueError(
-            f"{tables.where} {names} have {sorted(set(counts))} channels; give one count to all"
-        )
 
 
 def _description(profile: Dipole | BetterDipole | PhotonBeam | LayeredMultipole) -> str:

@@ -105,6 +105,9 @@ class Material(eqx.Module):
     - `roughness`: of the specular lobe (m, root mean square slope), at least 0.
     - `single_scattering`: light that scatters once, as a term of its own; the Gaussians then stand
       for the rest. `None`: they stand for all.
+
+    **Raises:** `ValueError` for a value out of range, and for single scattering of another number
+    of channels than the Gaussians have.
     """
 
     gaussians: SumOfGaussians
@@ -117,6 +120,12 @@ class Material(eqx.Module):
         check_values("Material.eta", self.eta, "positive", lambda x: x > 0)
         check_values("Material.specular", self.specular, "at least 0", lambda x: x >= 0)
         check_values("Material.roughness", self.roughness, "at least 0", lambda x: x >= 0)
+        single = self.single_scattering
+        if single is not None and single.channels != self.channels:
+            raise ValueError(
+                f"Material.single_scattering has {single.channels} channels, Material.gaussians "
+                f"has {self.channels}; give both the same"
+            )
 
     @property
     def channels(self) -> int:
