@@ -26,13 +26,13 @@ from ._next import (
     next_pictures as next_pictures,
     default_candidates as default_candidates,
 )
-from ._offsets import NormalOffsets as NormalOffsets
 from ._parts import (
     AbstractPart as AbstractPart,
     AlbedoMap as AlbedoMap,
     CameraPoses as CameraPoses,
     LightPlaces as LightPlaces,
     LightStrengths as LightStrengths,
+    NormalOffsets as NormalOffsets,
 )
 from ._problem import wide_variances as wide_variances
 from ._recover import recover as recover
