@@ -20,13 +20,13 @@ from splatjax._format import channel_names, counted
 from splatjax.io import fingerprint, read_columns, read_media, write_columns
 
 from ._models import MEDIUM_WEIGHTS, Model, Reference, reference
-from ._resumable import complete
 from ._terminal import (
     FIGURES,
     OptionalFloat,
     OptionalPath,
     check_options,
     check_output,
+    complete,
     note,
     option_name,
     print_table,
@@ -177,11 +177,9 @@ class Fit:
                 f"{self.medium}: how large is a pixel on the surface? give --mm-per-pixel"
             )
         image = sj.io.read_picture(self.medium)
-        try:
+        with sj.io.naming(self.medium):
             dot = sj.scattering.measure_laser_dot(image, self.mm_per_pixel, power=self.power)
             return dot.profile
-        except ValueError as error:
-            raise ValueError(f"{self.medium}: {error}") from None
 
     def _fitted(self, target: Reference) -> sj.fitting.FitResult:
         count = self.count if self.error is None else sj.fitting.LeastCount(self.error)
@@ -208,8 +206,8 @@ class Fit:
         target: Reference,
         fitted: sj.fitting.FitResult,
     ) -> None:
-        is_measured = isinstance(coefficients, sj.scattering.Tabulated)
-        held = "" if is_measured else ", sum held to the total reflectance"
+        known = None if isinstance(coefficients, sj.scattering.Tabulated) else coefficients
+        held = "" if known is None else ", sum held to the total reflectance"
         settings = {
             **({} if target.description is None else {"profile": target.description}),
             "variances_of": "all channels",
@@ -217,24 +215,20 @@ class Fit:
             "error": fitted.error,
             "energy_error": fitted.energy_error,
         }
-        target_of = "profile" if is_measured else "coefficients"
-        provenance = f"fitted by splatjax {sj.__version__} to the {target_of} of {self.medium}"
-        if isinstance(coefficients, sj.scattering.Tabulated):
-            material, profile, source = sj.Material(fitted.gaussians), None, {}
-        else:
+        surface, source = {}, {}
+        if known is not None:
             # The index of a surface is that of the medium it bounds, unless the file gives it.
-            top = coefficients if isinstance(coefficients, sj.Dipole) else coefficients.top
+            top = known if isinstance(known, sj.Dipole) else known.top
             surface, source = sj.io.surface_and_source(self.medium)
             surface = {"eta": top.medium.eta[0]} | surface
-            material = sj.Material(fitted.gaussians, **surface, single_scattering=target.single)
-            profile = target.profile if target.description is None else coefficients
-        known = source.get("provenance")
-        source = source | {"provenance": f"{known}; {provenance}" if known else provenance}
+        target_of = "profile" if known is None else "coefficients"
+        fitted_by = f"fitted by splatjax {sj.__version__} to the {target_of} of {self.medium}"
+        provenance = "; ".join(filter(None, [source.get("provenance"), fitted_by]))
         sj.save_material(
-            material,
+            sj.Material(fitted.gaussians, **surface, single_scattering=target.single),
             output,
-            profile=profile,
-            source=source,
+            profile=target.profile if target.description is None else known,
+            source=source | {"provenance": provenance},
             fit=settings,
         )
 

@@ -3,6 +3,7 @@
 from ._files import (
     atomic_path as atomic_path,
     fingerprint as fingerprint,
+    naming as naming,
     read_record as read_record,
     save_exports as save_exports,
     write_record as write_record,
