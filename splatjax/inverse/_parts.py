@@ -12,6 +12,7 @@ import scipy  # its parts are loaded where they are used, which takes a third of
 from jaxtyping import Array, Float, Int, PyTree
 
 from splatjax._chunking import jit_unless_traced
+from splatjax._records import check_values
 from splatjax.geometry import tangent_frames
 from splatjax.scene import AbstractLight, Camera, Material, Scene, Splats
 
@@ -42,11 +43,12 @@ class AbstractPart(eqx.Module):
 
     def __check_init__(self):
         for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
-            if not value > 0:
-                raise ValueError(
-                    f"{type(self).__name__}.{field.name} must be positive; got {value:g}"
-                )
+            check_values(
+                f"{type(self).__name__}.{field.name}",
+                getattr(self, field.name),
+                "positive",
+                lambda x: x > 0,
+            )
 
     def prepared(self, splats: Splats) -> PyTree[Array]:
         """Compute what depends on the splats at the start alone."""
@@ -269,11 +271,12 @@ class NormalOffsets(AbstractPart):
     deviation: float = eqx.field(static=True)
 
     def prepared(self, splats: Splats) -> OffsetTables:
-        if splats.count < _SLOPES:
-            raise ValueError(
-                f"{splats.count} splats are too few to measure slopes among; NormalOffsets needs "
-                f"{_SLOPES} at least"
-            )
+        check_values(
+            "the number of splats",
+            splats.count,
+            f"at least {_SLOPES} for NormalOffsets, which measures slopes among them",
+            lambda x: x >= _SLOPES,
+        )
         centers, normals, areas = (
             np.asarray(field, np.float64)
             for field in (splats.centers, splats.normals, splats.areas)
