@@ -97,8 +97,13 @@ def load_material(name_or_path: StrPath) -> Material:
     fit = tables.table("fit", tables.entries["fit"])
     fit.one_of("unit", [VARIANCE_UNIT])
     gaussians = fit.make(SumOfGaussians, fit.numbers("variances"), fit.numbers("weights"))
-    steps, requirement = np.diff(gaussians.variances), "positive: variances ascend"
-    fit.make(check_values, "the steps of variances", steps, requirement, lambda x: x > 0)
+    fit.make(
+        check_values,
+        "the steps of variances",
+        np.diff(gaussians.variances),
+        "positive: variances ascend",
+        lambda x: x > 0,
+    )
     single = None
     if "single_scattering" in tables.entries:
         table = tables.table("single_scattering", (*_COEFFICIENTS, "strength"))
@@ -242,8 +247,13 @@ def _surface(tables: Table) -> dict[str, Array]:
     table = tables.table("surface", _SURFACE)
     surface = {name: table.numbers(name) for name in table.entries}
     table.make(Material, SumOfGaussians([1.0], [[1.0]]), **surface)  # checks them
-    roughness, requirement = surface.get("roughness"), "in (0, 1]"
-    table.make(check_values, "roughness", roughness, requirement, lambda x: (x > 0) & (x <= 1))
+    table.make(
+        check_values,
+        "roughness",
+        surface.get("roughness"),
+        "in (0, 1]",
+        lambda x: (x > 0) & (x <= 1),
+    )
     return surface
 
 

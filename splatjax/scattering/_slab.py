@@ -250,13 +250,9 @@ class AbstractSlabProfile(AbstractProfile):
         """Compute the fraction of the entering power that leaves below."""
         return self.response(jnp.zeros_like(self.length_scale())).transmittance_down
 
-    def transmitted(self) -> "Transmitted":
-        """Return the transmittance as a profile, to be fitted like any other."""
-        return Transmitted(self)
-
 
 class Transmitted(AbstractProfile):
-    """The light that leaves a slab on the far side, as a profile."""
+    """The light that leaves a slab on the far side, as a profile, to be fitted like any other."""
 
     slab: AbstractSlabProfile
 
