@@ -311,9 +311,9 @@ class LayeredMultipole(AbstractSlabProfile):
       infinite.
     - `eta_above`, `eta_below`, `fresnel`: as `AbstractSlabProfile` has them.
 
-    **Raises:** `ValueError` for no scattering layer, for an infinite layer with another below it,
-    and for a layer thinner than one mean free path `1 / sigma_t'` in any channel. Under `jit` that
-    is unknown, and the profile NaN.
+    **Raises:** `ValueError` for no scattering layer, for numbers of channels that differ, for an
+    infinite layer with another below it, and for a layer thinner than one mean free path `1 /
+    sigma_t'` in any channel. Under `jit` that is unknown, and the profile NaN.
 
     **Source:** Donner and Jensen 2005, "Light diffusion in multi-layered translucent materials".
     """

@@ -46,7 +46,9 @@ class Tabulated(AbstractProfile):
         check_values("Tabulated.radii", self.radii, "at least 0 (mm)", lambda x: x >= 0)
         check_values("Tabulated.values", self.values, "numbers (1/mm^2)", lambda x: x == x)
         check_values("Tabulated.deviation", self.deviation, "at least 0 (1/mm^2)", lambda x: x >= 0)
-        check_values("the number of radii", len(self.radii), "at least 2", lambda x: x >= 2)
+        check_values(
+            "the number of Tabulated.radii", len(self.radii), "at least 2", lambda x: x >= 2
+        )
         check_values(
             "the steps of Tabulated.radii",
             jnp.diff(self.radii),

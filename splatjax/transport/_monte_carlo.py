@@ -146,9 +146,9 @@ def monte_carlo(
 
     **Returns:** a `MonteCarlo`.
 
-    **Raises:** `ValueError` for no scattering layer, for an infinite layer above another, for a
-    number of photons below 2 or not below 2^30, for edges that do not ascend, and for derivatives
-    in other arguments.
+    **Raises:** `ValueError` for no scattering layer, for numbers of channels that differ, for an
+    infinite layer above another, for a number of photons below 2 or not below 2^30, for edges that
+    do not ascend, and for derivatives in other arguments.
 
     **Source:** Wang, Jacques and Zheng 1995 (MCML); one walk for many absorptions: Kienle and
     Patterson 1996; path weights: Hayakawa et al. 2001.
