@@ -9,8 +9,8 @@ import numpy as np
 
 from splatjax.geometry import Mesh, Textures
 from splatjax.geometry._mesh import morton_order
+from splatjax.geometry._sample import albedo_at, lookup_at, perturbed_normals
 from splatjax.geometry._scatter import SurfacePoints
-from splatjax.geometry._textures import albedo_at, lookup_at, perturbed_normals
 from splatjax.io import atomic_path
 
 COLUMNS = ("x", "y", "z", "nx", "ny", "nz", "radius", "area", "red", "green", "blue")

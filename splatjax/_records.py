@@ -120,21 +120,22 @@ def check_values(
     holds: Callable[[np.ndarray], Any],
     finite: bool = True,
 ) -> None:
-    r"""Check every entry of an array. Unknown entries, as under `jit`, pass.
+    r"""Check a number, or every entry of an array. Unknown entries, as under `jit`, pass.
 
     **Arguments:**
 
     - `name`: of the values, for the error.
-    - `values`: an array; other objects pass.
+    - `values`: a number or an array; other objects pass.
     - `requirement`: completes "must be", with the remedy.
     - `holds`: returns for each entry whether it meets the requirement, which two numbers meet only
       if all between them do.
     - `finite`: whether infinite entries are refused. NaN always is.
 
-    **Raises:** `ValueError` with the number of entries that fail, and the first of them.
+    **Raises:** `ValueError` with the number, or how many entries fail and the first of them.
     """
-    is_array = isinstance(values, jax.Array | np.ndarray) and not isinstance(values, Tracer)
-    if not is_array or not values.size or not getattr(values, "is_fully_addressable", True):
+    kinds = jax.Array | np.ndarray | np.number | int | float
+    is_known = isinstance(values, kinds) and not isinstance(values, Tracer)
+    if not is_known or not np.size(values) or not getattr(values, "is_fully_addressable", True):
         return
 
     def is_good(entries):
@@ -144,9 +145,10 @@ def check_values(
     if not np.all(is_good(np.stack([known.min(), known.max()]))):
         good = is_good(known)
         place = tuple(np.argwhere(~good)[0].tolist())
+        found = f"{np.sum(~good)} of {known.size} entries are not, the first is" if place else "got"
         raise ValueError(
-            f"{name} must be {requirement}; {np.sum(~good)} of {known.size} entries are not, the "
-            f"first is {known[place]:g}{f' at {list(place)}' if place else ''}"
+            f"{name} must be {requirement}; {found} {known[place]:g}"
+            f"{f' at {list(place)}' if place else ''}"
         )
 
 

@@ -15,7 +15,8 @@ from splatjax.scattering import DiffuseTransmission
 
 def burley_distance(gaussians: SumOfGaussians) -> Float[Array, " channels"]:
     r"""Compute the `d` of normalized diffusion, `(exp(-r/d) + exp(-r/3d)) / (8 pi d r)`, that sends
-    light as far on average.
+    light as far on average. It is the scattering distance of Unity's High Definition Render
+    Pipeline, whose shape parameter is `1 / d`.
 
     Its mean distance is `2.5 d`; that of the Gaussians is `sum_i w_i sqrt(pi v_i / 2) / sum_i w_i`.
     The curves differ: normalized diffusion is infinite at the origin.
@@ -31,17 +32,6 @@ def burley_distance(gaussians: SumOfGaussians) -> Float[Array, " channels"]:
     """
     distances = jnp.sqrt(0.5 * jnp.pi * gaussians.variances)
     return distances @ gaussians.weights / (2.5 * gaussians.total_reflectance())
-
-
-def unity_shape_parameter(gaussians: SumOfGaussians) -> Float[Array, " channels"]:
-    r"""Compute the shape parameter `S = 1 / d` of Unity's High Definition Render Pipeline; its
-    scattering distance is `d`.
-
-    **Returns:** 1/mm: with a world scale of 1 (a unit is a meter) the pipeline counts `d` in mm.
-
-    **Source:** Unity Technologies, Graphics repository, `DiffusionProfileSettings.UpdateKernel`.
-    """
-    return 1 / burley_distance(gaussians)
 
 
 def blender_radius(gaussians: SumOfGaussians) -> Float[Array, " channels"]:
@@ -94,12 +84,8 @@ def separable_kernel(
         raise ValueError(
             f"samples must be odd and at least 3, so that one is in the middle; got {samples}"
         )
-    if reach is None:
-        farthest = 2 * jnp.sqrt(
-            jnp.max(gaussians.variances @ gaussians.weights / gaussians.total_reflectance())
-        )
-    else:
-        farthest = jnp.asarray(reach, gaussians.variances.dtype)
+    squared = gaussians.variances @ gaussians.weights / gaussians.total_reflectance()
+    farthest = 2 * jnp.sqrt(jnp.max(squared)) if reach is None else reach
     t = jnp.linspace(-1.0, 1.0, samples, dtype=gaussians.variances.dtype)
     offsets = farthest * jnp.sign(t) * t * t
     steps = jnp.pad(jnp.diff(offsets), 1)
@@ -156,8 +142,8 @@ def data_sheet(gaussians: SumOfGaussians) -> dict[str, Any]:
         "unity": {
             "formula": "S = 1 / d; scattering distance d",
             "unit": "S in 1/mm, d in mm, at a world scale of 1",
-            "source": "Unity HDRP, DiffusionProfileSettings",
-            "shape_parameter": plain_numbers(unity_shape_parameter(gaussians)),
+            "source": "Unity HDRP, DiffusionProfileSettings.UpdateKernel",
+            "shape_parameter": plain_numbers(1 / burley_distance(gaussians)),
             "scattering_distance": plain_numbers(burley_distance(gaussians)),
         },
         "blender": {

@@ -68,7 +68,7 @@ def slabs(photons: int) -> Iterator[str]:
             continue
         slab = sj.scattering.Multipole(layer)
         yield from rows(f"{name}, reflected", truth, {"Multipole": slab}, 0)
-        below = {"Multipole": slab.transmitted()}
+        below = {"Multipole": sj.scattering.Transmitted(slab)}
         yield from rows(f"{name}, transmitted", truth, below, 0, below=True)
 
 

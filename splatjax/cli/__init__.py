@@ -1,4 +1,4 @@
-"""The command line, `splatjax COMMAND`: a file for a command or two. It calls the public interface
+"""The command line, `splatjax COMMAND`: a file for a few commands. It calls the public interface
 alone.
 """
 

@@ -1,24 +1,32 @@
-"""`splatjax fit`: from optical coefficients to a sum of Gaussians."""
+"""`splatjax fit`: from optical coefficients to a sum of Gaussians; with --all, those of many media,
+a batch at a time: finished batches are kept, and become one table in the end.
+"""
 
+import shutil
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
 import tyro
+from jaxtyping import Array, Float
 
 import splatjax as sj
 from splatjax._format import channel_names, counted
+from splatjax.io import fingerprint, read_columns, read_media, write_columns
 
-from ._fit_all import fit_all
-from ._models import Model, Reference, reference
+from ._models import MEDIUM_WEIGHTS, Model, Reference, reference
 from ._terminal import (
     FIGURES,
     OptionalFloat,
     OptionalPath,
     check_options,
     check_output,
+    complete,
     note,
     option_name,
     print_table,
@@ -169,11 +177,9 @@ class Fit:
                 f"{self.medium}: how large is a pixel on the surface? give --mm-per-pixel"
             )
         image = sj.io.read_picture(self.medium)
-        try:
+        with sj.io.naming(self.medium):
             dot = sj.scattering.measure_laser_dot(image, self.mm_per_pixel, power=self.power)
             return dot.profile
-        except ValueError as error:
-            raise ValueError(f"{self.medium}: {error}") from None
 
     def _fitted(self, target: Reference) -> sj.fitting.FitResult:
         count = self.count if self.error is None else sj.fitting.LeastCount(self.error)
@@ -200,8 +206,8 @@ class Fit:
         target: Reference,
         fitted: sj.fitting.FitResult,
     ) -> None:
-        is_measured = isinstance(coefficients, sj.scattering.Tabulated)
-        held = "" if is_measured else ", sum held to the total reflectance"
+        known = None if isinstance(coefficients, sj.scattering.Tabulated) else coefficients
+        held = "" if known is None else ", sum held to the total reflectance"
         settings = {
             **({} if target.description is None else {"profile": target.description}),
             "variances_of": "all channels",
@@ -209,24 +215,20 @@ class Fit:
             "error": fitted.error,
             "energy_error": fitted.energy_error,
         }
-        target_of = "profile" if is_measured else "coefficients"
-        provenance = f"fitted by splatjax {sj.__version__} to the {target_of} of {self.medium}"
-        if isinstance(coefficients, sj.scattering.Tabulated):
-            material, profile, source = sj.Material(fitted.gaussians), None, {}
-        else:
+        surface, source = {}, {}
+        if known is not None:
             # The index of a surface is that of the medium it bounds, unless the file gives it.
-            top = coefficients if isinstance(coefficients, sj.Dipole) else coefficients.top
+            top = known if isinstance(known, sj.Dipole) else known.top
             surface, source = sj.io.surface_and_source(self.medium)
             surface = {"eta": top.medium.eta[0]} | surface
-            material = sj.Material(fitted.gaussians, **surface, single_scattering=target.single)
-            profile = target.profile if target.description is None else coefficients
-        known = source.get("provenance")
-        source = source | {"provenance": f"{known}; {provenance}" if known else provenance}
+        target_of = "profile" if known is None else "coefficients"
+        fitted_by = f"fitted by splatjax {sj.__version__} to the {target_of} of {self.medium}"
+        provenance = "; ".join(filter(None, [source.get("provenance"), fitted_by]))
         sj.save_material(
-            material,
+            sj.Material(fitted.gaussians, **surface, single_scattering=target.single),
             output,
-            profile=profile,
-            source=source,
+            profile=target.profile if target.description is None else known,
+            source=source | {"provenance": provenance},
             fit=settings,
         )
 
@@ -244,3 +246,80 @@ def _print(fitted: sj.fitting.FitResult) -> None:
 
 def _numbers(values: jax.Array, form: str) -> str:
     return "  ".join(f"{float(value):{form}}" for value in values)
+
+
+_BATCH = 500  # media in one call
+
+
+def fit_all(media: Path, output: Path, count: int) -> None:
+    """Fit sums of Gaussians to the dipoles of the media of a table, and write one table.
+
+    Batches lie in a folder beside it until all are there. Where a launcher has started several
+    processes they share them.
+
+    **Raises:** `ValueError` where the folder holds fits of something else.
+    """
+    names, coefficients = read_media(media)
+    record = {
+        "media": fingerprint(media),
+        "--count": count,
+        "splatjax": sj.__version__,
+        "jax": jax.__version__,
+    }
+    path, begins = output.with_name(f"{output.name}.parts"), range(0, len(names), _BATCH)
+    parts = [path / f"from_{begin:08}.csv" for begin in begins]
+
+    def fit(i: int) -> None:
+        batch = slice(begins[i], begins[i] + _BATCH)
+        columns = _fit_batch(coefficients[batch], count)
+        write_columns(parts[i], {"name": names[batch]} | columns)
+
+    what = f"fitting {count} Gaussians to {len(names)} media, {_BATCH} at a time"
+    items = [(part,) for part in parts]
+    done = complete(path / "fits.json", record, items, lambda: fit, name="batches", what=what)
+    if len(done) < len(parts):
+        return
+    try:
+        tables = [read_columns(part) for part in parts]
+    except FileNotFoundError:  # another process has joined them at the same time
+        if not output.exists():
+            raise
+        return
+    columns = {name: [cell for table in tables for cell in table[name]] for name in tables[0]}
+    write_columns(output, columns)
+    shutil.rmtree(path, ignore_errors=True)
+    failed = columns["converged"].count("0.0")
+    note(
+        f"{failed} of {len(names)} fits did not converge; in their rows `converged` is 0"
+        if failed
+        else f"all {len(names)} fits converged"
+    )
+    print(output)
+
+
+@eqx.filter_jit
+def _fit_each(coefficients: Float[Array, "media 3"], starts: sj.fitting.DipoleStarts, count: int):
+    def fit(row):
+        medium = sj.Medium(row[0:1], row[1:2], row[2:3])
+        start = sj.fitting.GivenVariances(starts(medium, count).variances[0])
+        profile = sj.Dipole(medium)
+        fitted = sj.fit_gaussians(profile, count, start=start, weights=MEDIUM_WEIGHTS, throw=False)
+        return fitted, fitted.result == optx.RESULTS.successful
+
+    return eqx.filter_vmap(fit)(coefficients)
+
+
+def _fit_batch(coefficients: np.ndarray, count: int) -> dict[str, np.ndarray]:
+    """Return the columns of a batch. A smaller batch is padded, so that one program serves all."""
+    given = len(coefficients)
+    padded = np.pad(coefficients, ((0, _BATCH - given), (0, 0)), mode="edge")
+    fitted, converged = _fit_each(jnp.asarray(padded), sj.io.dipole_starts(), count)
+    columns = dict(zip(("sigma_a", "sigma_s_prime", "eta"), padded.T, strict=True))
+    columns |= {f"variance_{i + 1}": fitted.gaussians.variances[:, i] for i in range(count)}
+    columns |= {f"weight_{i + 1}": fitted.gaussians.weights[:, i, 0] for i in range(count)}
+    columns |= {
+        "error": fitted.error[:, 0],
+        "energy_error": fitted.energy_error[:, 0],
+        "converged": converged.astype(float),
+    }
+    return {name: np.asarray(column)[:given] for name, column in columns.items()}

@@ -22,10 +22,9 @@ import tyro
 import splatjax as sj
 
 from ._fit import Fit
-from ._materials import Export, Materials
+from ._materials import Export, Materials, Sample
 from ._recover import Recover
 from ._render import Render, Turntable
-from ._sample import Sample
 from ._terminal import note
 
 _COMMANDS = {

@@ -1,5 +1,5 @@
 """`splatjax materials`: what is in the library; `splatjax export`: it in the terms of other
-renderers.
+renderers; `splatjax sample`: from a mesh with its maps to splats.
 """
 
 import re
@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import Annotated
 
 import jax
+import numpy as np
 import tyro
 
 import splatjax as sj
 
-from ._terminal import check_output, print_table
+from ._terminal import OptionalFloat, OptionalPath, UpAxis, check_output, note, print_table, stage
 
 
 @dataclass(frozen=True)
@@ -78,3 +79,69 @@ def _row(name: str) -> tuple[str, ...]:
     first, *others = re.split(r", | and ", authors)
     publication = f"{first}{' et al.' if others else ''} {year}"
     return name, known, reflectance, f"{widest:.3g}", f"{float(material.eta):.3g}", publication
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sample:
+    """Cover a mesh with splats that carry its maps, and write them as PLY, in mm.
+
+    The mesh is a GLB, glTF, OBJ, PLY, STL or OFF file.
+
+    Example: splatjax sample head.glb --albedo color.jpg --mm-per-unit 53 --count 683549 --output
+    head.ply
+    """
+
+    #: The file of the mesh.
+    mesh: tyro.conf.Positional[Path]
+    #: Length of the file's unit, mm: 1000 for meters.
+    mm_per_unit: float
+    #: The PLY file to write.
+    output: Path
+    #: Number of splats.
+    count: int = 200_000
+    #: Another spread of the same quality.
+    seed: int = 0
+    #: Put splats on the surface that bends as the mesh's normals do; otherwise on its flat
+    #: triangles.
+    rounded: bool = True
+    #: Upward axis of the file; splats have +y up.
+    up: UpAxis = "y"
+    #: Degrees: edges are hard where triangles differ by more, and the file has no normals or
+    #: smooth ones.
+    crease_angle: float = 40.0
+    #: Map of the mesh's diffuse color, sRGB. Without it, the texture that the file itself carries,
+    #: if any.
+    albedo: OptionalPath = None
+    #: Gray map: factor on the material's specular strength.
+    specular: OptionalPath = None
+    #: Tangent-space normal map; green points up.
+    normal: OptionalPath = None
+    v_up: Annotated[
+        bool | None,
+        tyro.conf.arg(
+            metavar="{True,False}",
+            help="Whether v = 0 is the lower edge of a map. Without it, as the format prescribes: "
+            "OBJ yes, glTF and GLB no. If lips land on the chin, say True.",
+            help_behavior_hint="",
+        ),
+    ] = None
+    #: Cut off what lies below this height, in the file's unit.
+    crop_min_y: OptionalFloat = None
+
+    def run(self) -> None:
+        check_output(self.output, (".ply",))
+        placed = ("mesh", "count", "output")
+        options = {name: value for name, value in vars(self).items() if name not in placed}
+        with stage(f"sampling {self.mesh} with {self.count} splats"):
+            splats = sj.sample_mesh(self.mesh, self.count, **options)
+        with stage(f"writing {self.output}"):
+            sj.write_splats(self.output, splats)
+        maps = ("albedo", "specular", "roughness")
+        carried = [name for name in maps if getattr(splats, name) is not None]
+        size = np.ptp(np.asarray(splats.centers), axis=0)
+        note(
+            f"{splats.count} splats on {float(splats.areas.sum()):.4g} mm^2, with "
+            f"{', '.join(carried) or 'no maps'}; the body is {size[0]:.3g} mm wide, {size[1]:.3g} "
+            f"high and {size[2]:.3g} deep"
+        )
+        print(self.output)

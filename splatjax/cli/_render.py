@@ -13,8 +13,7 @@ import tyro
 
 import splatjax as sj
 
-from ._resumable import complete
-from ._terminal import check_folder, check_options, check_output, stage
+from ._terminal import check_folder, check_options, check_output, complete, stage
 from ._view import ViewOptions, draw
 
 _LARGEST = 16_383  # pixels along a side of a WebP file

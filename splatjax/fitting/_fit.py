@@ -207,9 +207,8 @@ def fit_gaussians(
     else:
         check_count("count", count)
         fitted = _fit_compiled(profile, count, spread, weights, rule, start)
-    if throw:
-        fitted = fitted.result.error_if(fitted, fitted.result != optx.RESULTS.successful)
-    return fitted
+    failed = fitted.result != optx.RESULTS.successful
+    return fitted.result.error_if(fitted, failed) if throw else fitted
 
 
 @eqx.filter_jit

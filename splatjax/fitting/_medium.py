@@ -82,9 +82,8 @@ def fit_medium(
     check_values("measured.deviation", measured.deviation, "positive", lambda x: x > 0)
     beam = as_floats(beam_variance, measured.values.dtype)
     fitted = _fit_compiled(measured, start, beam, model, count, gaussians_start)
-    if throw:
-        return fitted.result.error_if(fitted, fitted.result != optx.RESULTS.successful)
-    return fitted
+    failed = fitted.result != optx.RESULTS.successful
+    return fitted.result.error_if(fitted, failed) if throw else fitted
 
 
 @eqx.filter_jit
@@ -114,10 +113,9 @@ def _fit_compiled(measured, start, beam_variance, model, count, gaussians_start)
         converged = end.result == optx.RESULTS.successful
         return jnp.exp(end.value), invert(slopes.T @ slopes), chi_squared, converged
 
-    fitted = jax.vmap(fit_channel)(
+    coefficients, covariance, chi_squared, converged = jax.vmap(fit_channel)(
         measured.values.T, measured.deviation.T, start.sigma_a, start.sigma_s_prime, start.eta
     )
-    coefficients, covariance, chi_squared, converged = fitted
     result = optx.RESULTS.where(
         jnp.all(converged), optx.RESULTS.successful, optx.RESULTS.nonlinear_max_steps_reached
     )

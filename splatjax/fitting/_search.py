@@ -13,7 +13,7 @@ import optimistix as optx
 from jax.scipy.ndimage import map_coordinates
 from jaxtyping import Array, Bool, Float, Int
 
-from splatjax._records import numbers, record
+from splatjax._records import check_values, numbers, record
 from splatjax.scattering import Medium
 
 from ._problem import Expansion, FitProblem
@@ -110,10 +110,12 @@ class DipoleStarts(eqx.Module):
 
         **Raises:** `ValueError` for more Gaussians than the table has.
         """
-        if not 1 <= count <= len(self.log_variances):
-            raise ValueError(
-                f"starts are tabulated for 1 to {len(self.log_variances)} Gaussians; got {count}"
-            )
+        check_values(
+            "count",
+            count,
+            f"from 1 to {len(self.log_variances)}, the numbers of Gaussians in the table",
+            lambda x: (x >= 1) & (x <= len(self.log_variances)),
+        )
         dtype = medium.eta.dtype
         root = jnp.sqrt(medium.sigma_a / medium.sigma_t_prime)
         tables = self.log_variances[count - 1], self.roots, self.etas

@@ -70,12 +70,10 @@ class NormalEquations(lx.AbstractLinearSolver):
     """A lineax solver for tall systems of full column rank, and for their transposes."""
 
     def init(self, operator, options):
-        del options
         matrix = operator.as_matrix()
         return matrix, invert(matrix.T @ matrix), False, pack_structures(operator)
 
     def compute(self, state, vector, options):
-        del options
         matrix, inverse, transposed, structures = state
         right = ravel_vector(vector, structures)
         # The transposed system is wide: its shortest solution.

@@ -184,22 +184,20 @@ def cut_below(mesh: Mesh, height: float) -> Mesh:
     """Return what lies above `y = height` (mm), triangles across the plane cut along it; the border
     stays open. Each triangle has vertices of its own.
     """
-    y = mesh.corners()[..., 1]
-    is_above = y >= height
+    y = mesh.corners()[..., 1] - height
+    is_above = y >= 0
     whole = np.flatnonzero(is_above.all(axis=1))
     faces, shares = [whole], [np.broadcast_to(np.eye(3), (len(whole), 3, 3))]
     for tip_above in (True, False):  # the tip of a triangle is kept, or the two triangles below it
         chosen = np.flatnonzero(is_above.sum(axis=1) == (1 if tip_above else 2))
         turn = ((is_above[chosen] == tip_above).argmax(axis=1)[:, None] + np.arange(3)) % 3
         tip, one, other = np.moveaxis(np.eye(3)[turn], 1, 0)
-        cuts = []
-        for end in (one, other):
-            above, below = (tip, end) if tip_above else (end, tip)
-            high, low = (np.einsum("fc,fc->f", at, y[chosen]) for at in (above, below))
-            # By the corner below, so that neighbors cut the edge between them alike.
-            share = ((high - height) / (high - low))[:, None]
-            cuts.append((1 - share) * above + share * below)
-        first, second = cuts
+        # Symmetric in the ends of an edge, so that neighbors cut the edge between them alike.
+        off_tip, *off_ends = np.abs(np.take_along_axis(y[chosen], turn, axis=1)).T[..., None]
+        first, second = (
+            (off_end * tip + off_tip * end) / (off_end + off_tip)
+            for end, off_end in zip((one, other), off_ends, strict=True)
+        )
         halves = [(first, one, other), (first, other, second)]
         for triangle in [(tip, first, second)] if tip_above else halves:
             faces.append(chosen)

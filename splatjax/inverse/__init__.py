@@ -20,20 +20,20 @@ from ._observation import (
     UnknownIntensity as UnknownIntensity,
     Observation as Observation,
 )
-from ._next import (
-    Candidate as Candidate,
-    Prediction as Prediction,
-    next_pictures as next_pictures,
-    default_candidates as default_candidates,
-)
-from ._offsets import NormalOffsets as NormalOffsets
 from ._parts import (
     AbstractPart as AbstractPart,
     AlbedoMap as AlbedoMap,
     CameraPoses as CameraPoses,
     LightPlaces as LightPlaces,
     LightStrengths as LightStrengths,
+    NormalOffsets as NormalOffsets,
 )
 from ._problem import wide_variances as wide_variances
-from ._recover import recover as recover
+from ._recover import (
+    Candidate as Candidate,
+    default_candidates as default_candidates,
+    next_pictures as next_pictures,
+    Prediction as Prediction,
+    recover as recover,
+)
 from ._recovery import combined as combined, Estimate as Estimate, Recovery as Recovery

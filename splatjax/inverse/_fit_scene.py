@@ -294,8 +294,7 @@ def fit_scene(
         best=best,
         plans=times,
     )
-    failed = result != optx.RESULTS.successful
-    return result.error_if(fitted, True) if throw and failed else fitted
+    return result.error_if(fitted, result != optx.RESULTS.successful) if throw else fitted
 
 
 def _check(

@@ -133,8 +133,7 @@ class HuberLoss(AbstractLoss):
     bend: float = eqx.field(static=True, default=2.0)
 
     def __check_init__(self):
-        if not self.bend > 0:
-            raise ValueError(f"bend must be positive (deviations); got {self.bend:g}")
+        check_values("HuberLoss.bend", self.bend, "positive (deviations)", lambda x: x > 0)
 
     def root(self, residuals: Float[Array, "..."]) -> Float[Array, "..."]:
         squared = (residuals / self.bend) ** 2

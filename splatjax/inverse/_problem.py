@@ -225,16 +225,13 @@ def _with_points(picture: DiffusionBasis, kept: np.ndarray, dtype: DTypeLike) ->
     )
 
 
-class SearchEnd(eqx.Module):
-    point: Float[Array, " unknowns"]
-    cost: Float[Array, ""]
-    steps: Int[Array, ""]
-    converged: Bool[Array, ""]
-
-
 @eqx.filter_jit
-def search(problem: RecoveryProblem, start: Float[Array, " unknowns"]) -> SearchEnd:
-    """Minimize the loss from a start by the Levenberg-Marquardt method."""
+def search(
+    problem: RecoveryProblem, start: Float[Array, " unknowns"]
+) -> tuple[Float[Array, " unknowns"], Float[Array, ""], Int[Array, ""], Bool[Array, ""]]:
+    """Minimize the loss from a start by the Levenberg-Marquardt method: where it ends, the loss
+    there, the number of steps, and whether it has converged.
+    """
     tolerance = 1e-4 if start.dtype == jnp.float32 else 1e-7
     # In units of the start's own residual, so that damping and tolerances mean the same for any
     # noise and number of pixels.
@@ -247,7 +244,7 @@ def search(problem: RecoveryProblem, start: Float[Array, " unknowns"]) -> Search
     end = optx.least_squares(residuals, solver, start, problem, max_steps=_STEPS, throw=False)
     cost = jnp.sum(problem.residuals(end.value) ** 2)
     converged = (end.result == optx.RESULTS.successful) & jnp.isfinite(cost)
-    return SearchEnd(end.value, cost, jnp.asarray(end.stats["num_steps"]), converged)
+    return end.value, cost, jnp.asarray(end.stats["num_steps"]), converged
 
 
 class Solution(eqx.Module):

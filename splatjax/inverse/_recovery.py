@@ -246,12 +246,11 @@ class Recovery(AbstractEstimate):
         - `channels`: their names; by default red, green and blue, or numbers.
         """
         summary = []
-        unresolved_light = np.asarray(self.unresolved)
-        for lines, unresolved in zip(self.lines(channels), unresolved_light, strict=True):
+        for lines, unresolved in zip(self.lines(channels), self.unresolved.tolist(), strict=True):
             summary += lines
             if unresolved > _MOST:
                 summary.append(
-                    f"  {percent(float(unresolved))} of its light spreads less than the splats are "
+                    f"  {percent(unresolved)} of its light spreads less than the splats are "
                     "apart, and hardly shows how far; take more splats, or a smaller piece from "
                     "closer up"
                 )

@@ -3,16 +3,19 @@
 from ._files import (
     atomic_path as atomic_path,
     fingerprint as fingerprint,
+    naming as naming,
     read_record as read_record,
     save_exports as save_exports,
     write_record as write_record,
 )
-from ._exr import read_exr as read_exr, read_manifest as read_manifest, write_exr as write_exr
 from ._images import (
     linear_to_srgb as linear_to_srgb,
+    read_exr as read_exr,
+    read_manifest as read_manifest,
     read_picture as read_picture,
     srgb_to_linear as srgb_to_linear,
     write_animation as write_animation,
+    write_exr as write_exr,
     write_png as write_png,
 )
 from ._materials import (
@@ -26,7 +29,7 @@ from ._materials import (
     save_material as save_material,
     surface_and_source as surface_and_source,
 )
-from ._profiles import (
+from ._tables import (
     read_columns as read_columns,
     read_media as read_media,
     read_profile as read_profile,

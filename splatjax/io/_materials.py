@@ -97,16 +97,18 @@ def load_material(name_or_path: StrPath) -> Material:
     fit = tables.table("fit", tables.entries["fit"])
     fit.one_of("unit", [VARIANCE_UNIT])
     gaussians = fit.make(SumOfGaussians, fit.numbers("variances"), fit.numbers("weights"))
-    steps, requirement = np.diff(gaussians.variances), "positive: variances ascend"
-    fit.make(check_values, "the steps of variances", steps, requirement, lambda x: x > 0)
+    fit.make(
+        check_values,
+        "the steps of variances",
+        np.diff(gaussians.variances),
+        "positive: variances ascend",
+        lambda x: x > 0,
+    )
     single = None
     if "single_scattering" in tables.entries:
         table = tables.table("single_scattering", (*_COEFFICIENTS, "strength"))
         single = table.make(SingleScattering, _medium(table), table.numbers("strength", 1.0))
-        _check_channels(
-            tables, "[fit] and [single_scattering]", gaussians.channels, single.channels
-        )
-    return Material(gaussians, **_surface(tables), single_scattering=single)
+    return fit.make(Material, gaussians, **_surface(tables), single_scattering=single)
 
 
 def surface_and_source(
@@ -235,8 +237,6 @@ def _read(name_or_path: StrPath) -> tuple[Table, Dipole | LayeredMultipole | Non
         return tables, None
     known = (*_COEFFICIENTS, "optical_depth", "thickness", "thickness_unit")
     layers = [_layer(each) for each in tables.tables("layers", known)]
-    counts = [x.optical_depth.size if isinstance(x, Film) else x.channels for x in layers]
-    _check_channels(tables, "[[layers]]", *counts)
     with naming(f"{path}: [[layers]]"):
         return tables, LayeredMultipole(layers)
 
@@ -247,8 +247,13 @@ def _surface(tables: Table) -> dict[str, Array]:
     table = tables.table("surface", _SURFACE)
     surface = {name: table.numbers(name) for name in table.entries}
     table.make(Material, SumOfGaussians([1.0], [[1.0]]), **surface)  # checks them
-    roughness, requirement = surface.get("roughness"), "in (0, 1]"
-    table.make(check_values, "roughness", roughness, requirement, lambda x: (x > 0) & (x <= 1))
+    table.make(
+        check_values,
+        "roughness",
+        surface.get("roughness"),
+        "in (0, 1]",
+        lambda x: (x > 0) & (x <= 1),
+    )
     return surface
 
 
@@ -269,13 +274,6 @@ def _medium(table: Table) -> Medium:
         )
     table.one_of("unit", [COEFFICIENT_UNIT])
     return table.make(Medium, *(table.numbers(name) for name in _COEFFICIENTS[1:]))
-
-
-def _check_channels(tables: Table, names: str, *counts: int) -> None:
-    if len(set(counts)) > 1:
-        raise ValueError(
-            f"{tables.where} {names} have {sorted(set(counts))} channels; give one count to all"
-        )
 
 
 def _description(profile: Dipole | BetterDipole | PhotonBeam | LayeredMultipole) -> str:

@@ -1,8 +1,12 @@
-"""Tables of TOML files, and the errors that say what an entry must be."""
+"""Tables in files: TOML, with errors that say what an entry must be; measured profiles, and many
+media, as CSV.
+"""
 
+import csv
 import difflib
+import re
 import tomllib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeVar
@@ -10,9 +14,11 @@ from typing import Any, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
-from ._files import naming
+from splatjax.scattering import Tabulated
+
+from ._files import StrPath, atomic_path, check_units, existing_file, naming
 
 Made = TypeVar("Made")
 
@@ -109,3 +115,129 @@ def rounded(values: Any) -> np.ndarray:
     """
     with np.errstate(over="ignore", under="ignore"):
         return np.asarray(values, np.float64).astype(jnp.result_type(float))
+
+
+# Units of length that the names of a table's columns may give.
+_MM = {"mm": 1.0, "cm": 10.0, "um": 1e-3, "µm": 1e-3}
+_COLUMNS = "sigma_a", "sigma_s_prime", "eta"
+
+
+def read_profile(path: StrPath, *, mm_per_unit: float = 1.0) -> Tabulated:
+    r"""Read a measured profile from a CSV file: a column of radii, and one of values for each
+    channel.
+
+    Empty lines and those that begin with `#` are left out; a first line of names may stand above.
+    If it gives a unit of length, that must be `mm_per_unit`. Radii ascend.
+
+    **Arguments:**
+
+    - `path`: of the file.
+    - `mm_per_unit`: of the file's unit of length, in which the radii are; values are counted in one
+      over its square.
+
+    **Returns:** a `Tabulated` in JAX's default precision, mm and 1/mm^2.
+
+    **Raises:** `FileNotFoundError`, and `ValueError` for what is no such table: file, line and what
+    is wrong.
+    """
+    check_units(path, mm_per_unit)
+    rows = _read_rows(path, "a profile is a CSV of radii and values")
+    if rows and _number(rows[0][1][0]) is None:
+        (where, names), *rows = rows
+        for unit, size in _MM.items():
+            is_named = re.search(rf"(?<![A-Za-z]){unit}(?![A-Za-z])", ",".join(names))
+            if is_named and not np.isclose(size, mm_per_unit, rtol=1e-6, atol=0):
+                raise ValueError(
+                    f"{where} gives {unit}, and lengths are taken as {mm_per_unit:g} mm; give "
+                    f"mm_per_unit = {size:g} (--mm-per-unit {size:g}), or name the right unit"
+                )
+    if len(rows) < 2:
+        raise ValueError(f"{path}: has {len(rows)} lines of numbers; a profile needs two radii")
+    table, count = [], len(rows[0][1])
+    for where, cells in rows:
+        table.append([_number(cell) for cell in cells])
+        if not 1 < len(cells) == count or not np.isfinite(rounded(table[-1])).all():
+            raise ValueError(
+                f"{where}: {', '.join(cells)} must be a radius and a value for each of {count - 1} "
+                "channels"
+            )
+    radii, values = np.split(np.asarray(table), [1], axis=1)
+    with naming(path):
+        return Tabulated(
+            jnp.asarray(radii[:, 0] * mm_per_unit, float),
+            jnp.asarray(values / mm_per_unit**2, float),
+        )
+
+
+def read_media(path: StrPath) -> tuple[list[str], Float[np.ndarray, "media 3"]]:
+    r"""Read media from a CSV file: a first line of names, then a line for each medium of one
+    channel.
+
+    Columns are `sigma_a` and `sigma_s_prime` (1/mm), `eta`, and `name` if there is one. Empty lines
+    are left out.
+
+    **Returns:** the names, numbers where there are none, and the three coefficients of each.
+
+    **Raises:** `FileNotFoundError`, and `ValueError` for what is no such table: file, line and what
+    is wrong.
+    """
+    contents = f"media are a CSV of {', '.join(_COLUMNS)}"
+    (_, head), *rows = _read_rows(path, contents) or [("", [])]
+    if not set(head) >= set(_COLUMNS) or not rows:
+        raise ValueError(f"{path}: names {', '.join(head)}, with {len(rows)} rows; {contents}")
+    names, media = [], []
+    for where, cells in rows:
+        entries = dict(zip(head, cells, strict=False))
+        medium = np.asarray([_number(entries.get(name, "")) for name in _COLUMNS], float)
+        is_valid = np.isfinite(medium).all() and medium[0] >= 0 and (medium[1:] > 0).all()
+        if len(cells) != len(head) or not is_valid:
+            raise ValueError(
+                f"{where}: {', '.join(cells)} must be {', '.join(head)}, positive; sigma_a may be 0"
+            )
+        names.append(entries.get("name") or str(len(media) + 1))
+        media.append(medium)
+    return names, np.asarray(media)
+
+
+def write_columns(path: StrPath, columns: Mapping[str, Iterable]) -> None:
+    """Write a CSV table, whole or not at all; numbers so that they are read back as they are.
+
+    **Raises:** `FileNotFoundError` when the folder does not exist.
+    """
+    plain = (
+        [cell if isinstance(cell, str) else repr(float(cell)) for cell in column]
+        for column in columns.values()
+    )
+    with atomic_path(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
+        csv.writer(file, lineterminator="\n").writerows([columns, *zip(*plain, strict=True)])
+
+
+def read_columns(path: StrPath) -> dict[str, tuple[str, ...]]:
+    """Read the cells of a table that `write_columns` has written."""
+    with open(path, newline="", encoding="utf-8") as file:
+        head, *rows = csv.reader(file)
+    return dict(zip(head, zip(*rows, strict=True), strict=True))
+
+
+def _read_rows(path: StrPath, contents: str) -> list[tuple[str, list[str]]]:
+    """Read the rows of a CSV file and where they stand; empty ones and comments (`#`) are left out.
+
+    **Raises:** `FileNotFoundError`, or `ValueError` when it is no text.
+    """
+    try:
+        lines = existing_file(path).read_text(encoding="utf-8-sig").splitlines()
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path}: is no text file: {error}; {contents}") from None
+    rows = csv.reader(lines)
+    return [
+        (f"{path}: line {rows.line_num}", [cell.strip() for cell in row])
+        for row in rows
+        if any(map(str.strip, row)) and not row[0].lstrip().startswith("#")
+    ]
+
+
+def _number(cell: str) -> float | None:
+    try:
+        return float(cell)
+    except ValueError:
+        return None

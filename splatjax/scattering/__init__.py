@@ -20,13 +20,13 @@ from ._fresnel import (
     moment_outside as moment_outside,
     reflectance as reflectance,
 )
-from ._hankel import inverse_hankel_transform as inverse_hankel_transform
 from ._medium import check_stack as check_stack, Film as Film, Layer as Layer, Medium as Medium
 from ._photon_beam import PhotonBeam as PhotonBeam, SingleScattering as SingleScattering
 from ._quadrature import (
     AbstractRadialRule as AbstractRadialRule,
     at_own_radii as at_own_radii,
     integrated_reflectance as integrated_reflectance,
+    inverse_hankel_transform as inverse_hankel_transform,
     InverseVariance as InverseVariance,
     L1_QUADRATURE as L1_QUADRATURE,
     L2_QUADRATURE as L2_QUADRATURE,

@@ -112,13 +112,19 @@ class Film(eqx.Module):
 
 
 def check_stack(layers: tuple[Layer | Film, ...]) -> None:
-    """Raise `ValueError` for a stack without a layer that scatters, or with an infinite layer above
-    another. Traced thicknesses pass.
+    """Raise `ValueError` for a stack without a layer that scatters, for numbers of channels that
+    differ (a film of one channel serves all), and for an infinite layer above another. Traced
+    thicknesses pass.
     """
-    if not any(isinstance(layer, Layer) for layer in layers):
+    scattering = {layer.channels for layer in layers if isinstance(layer, Layer)}
+    if not scattering:
         raise ValueError(
             f"layers must contain one that scatters; none of these {len(layers)} is a Layer"
         )
+    films = {layer.optical_depth.shape[-1] for layer in layers if isinstance(layer, Film)}
+    counts = scattering | (films - {1})
+    if len(counts) > 1:
+        raise ValueError(f"layers have {sorted(counts)} channels; give one count to all")
     for number, layer in enumerate(layers[:-1], start=1):
         thickness = layer.thickness if isinstance(layer, Layer) else 0.0
         if not isinstance(thickness, Tracer) and np.isinf(thickness):

@@ -46,8 +46,9 @@ class Tabulated(AbstractProfile):
         check_values("Tabulated.radii", self.radii, "at least 0 (mm)", lambda x: x >= 0)
         check_values("Tabulated.values", self.values, "numbers (1/mm^2)", lambda x: x == x)
         check_values("Tabulated.deviation", self.deviation, "at least 0 (1/mm^2)", lambda x: x >= 0)
-        if len(self.radii) < 2:
-            raise ValueError(f"Tabulated.radii must be at least two; got {len(self.radii)}")
+        check_values(
+            "the number of Tabulated.radii", len(self.radii), "at least 2", lambda x: x >= 2
+        )
         check_values(
             "the steps of Tabulated.radii",
             jnp.diff(self.radii),
@@ -156,9 +157,9 @@ def measure_laser_dot(
     pixels = np.asarray(image, np.float64)
     entering = np.broadcast_to(np.asarray(power, np.float64), pixels.shape[2:])
     check_values("image", pixels, "finite: crop such pixels away", lambda x: x == x)
-    check_values("mm_per_pixel", np.asarray(float(mm_per_pixel)), "positive", lambda x: x > 0)
+    check_values("mm_per_pixel", mm_per_pixel, "positive", lambda x: x > 0)
     check_values("power", entering, "positive", lambda x: x > 0)
-    check_values("step", np.asarray(float(step)), "at least 1 pixel", lambda x: x >= 1 - 1e-9)
+    check_values("step", step, "at least 1 pixel", lambda x: x >= 1 - 1e-9)
     height, width = pixels.shape[:2]
     y, x = np.mgrid[:height, :width] + 0.5
     light = pixels.sum(axis=2)
@@ -181,11 +182,12 @@ def measure_laser_dot(
         for ring in rings
         if not is_saturated[ring].any()
     ]
-    if len(samples) < 2:
-        raise ValueError(
-            f"a profile needs at least two rings; {len(samples)} of {len(rings)} are inside and "
-            "not saturated"
-        )
+    check_values(
+        f"the rings, of {len(rings)}, that are not saturated",
+        len(samples),
+        "at least 2 for a profile",
+        lambda x: x >= 2,
+    )
     return LaserDot(
         Tabulated(*map(np.stack, zip(*samples, strict=True))),
         jnp.asarray([x0, y0], jnp.result_type(float)),

@@ -1,6 +1,5 @@
 """Plain records: what is drawn, what with, and what comes out. No algorithms."""
 
-from ._camera import Camera as Camera
 from ._lights import (
     AbstractLight as AbstractLight,
     AbstractLightSample as AbstractLightSample,
@@ -12,6 +11,7 @@ from ._lights import (
     sum_over_lights as sum_over_lights,
 )
 from ._scene import (
+    Camera as Camera,
     Frame as Frame,
     Material as Material,
     Parts as Parts,

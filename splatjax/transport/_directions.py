@@ -10,8 +10,6 @@ from jaxtyping import Array, Float, Int
 from splatjax._records import check_values, numbers, record
 from splatjax.scattering import moment_outside, reflectance
 
-from ._stack import of_layer
-
 _SINE = [(-1) ** n * math.pi ** (2 * n + 1) / math.factorial(2 * n + 1) for n in range(8)]
 _COSINE = [(-1) ** n * math.pi ** (2 * n) / math.factorial(2 * n) for n in range(9)]
 
@@ -191,3 +189,17 @@ def on_circle(
     )
     sine = sine * half_turns
     return (cosine - sine) * (cosine + sine), 2 * sine * cosine
+
+
+def of_layer(
+    table: Float[Array, "layers *channels"], layer: Int[Array, " photons"]
+) -> Float[Array, "*channels photons"]:
+    """Look up the entry of each photon's layer: by selections, which vectorize as a gather does
+    not.
+    """
+    shape = (*table.shape[1:], *layer.shape)
+    entry = jnp.broadcast_to(table[0][..., None], shape)
+    for number in range(1, table.shape[0]):
+        here = jnp.broadcast_to(layer == number, shape)
+        entry = jnp.where(here, jnp.broadcast_to(table[number][..., None], shape), entry)
+    return entry

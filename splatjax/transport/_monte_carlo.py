@@ -1,4 +1,6 @@
-"""Profiles by random walks: the reference that diffusion approximates."""
+"""Profiles by random walks, the reference that diffusion approximates; the layers of the walks as
+arrays, and the channels that share a walk.
+"""
 
 from collections.abc import Callable, Sequence
 
@@ -6,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float, Int, Key
 
 from splatjax._records import Numbers, as_floats, check_values
@@ -14,14 +17,93 @@ from splatjax.scattering import Film, Layer, check_stack
 from ._directions import AbstractIncidence, AbstractPhaseFunction, Isotropic, NormalIncidence
 from ._results import AbstractTallies, MonteCarlo, PathDerivatives, SampleMean, assemble
 from ._rounds import Setup, Walk, finish
-from ._stack import LayeredMedia
-from ._walk import Optics
+from ._walk import Optics, Stack
 
 _FLIGHTS = 20_000
 
 # Photons on their way at once: their state stays in the cache of a core or two, and few lanes wait
 # for the last photon.
 _MOST_LANES, _LEAST_LANES, _PHOTONS_A_LANE = 16384, 1024, 8
+
+# In free paths of the first layer that scatters: so thin that no light moves sideways in a film.
+_FILM_THICKNESS = 1e-6
+
+
+class LayeredMedia(eqx.Module):
+    r"""Layers, films among them, as arrays over all channels.
+
+    **Attributes:**
+
+    - `sigma_a`, `sigma_s`: 1/mm; a film does not scatter, and has its optical depth over its
+      thickness.
+    - `thickness`: mm.
+    - `eta`: indices relative to air, those of the neighbors above and below included.
+    - `first`: number of the uppermost layer that scatters.
+    """
+
+    sigma_a: Float[Array, "layers channels"]
+    sigma_s: Float[Array, "layers channels"]
+    thickness: Float[Array, "layers channels"]
+    eta: Float[Array, "layers_and_neighbors channels"]
+    first: int = eqx.field(static=True)
+
+    @classmethod
+    def of(
+        cls,
+        layers: Sequence[Layer | Film],
+        anisotropy: Float[Array, " layers"],
+        eta_above: Float[Array, "*channels"],
+        eta_below: Float[Array, "*channels"],
+    ) -> "LayeredMedia":
+        """Lay out layers from the top. A film has the index of the next scattering layer below it,
+        or else of the last one above.
+        """
+        scattering = [layer for layer in layers if isinstance(layer, Layer)]
+        like = scattering[0].medium.sigma_a
+        thin = _FILM_THICKNESS / jax.lax.stop_gradient(scattering[0].medium.sigma_s_prime)
+        rows = []
+        for number, layer in enumerate(layers):
+            lower = [other for other in layers[number:] if isinstance(other, Layer)]
+            medium = (lower or scattering[-1:])[0].medium
+            if isinstance(layer, Film):
+                rows.append((layer.optical_depth / thin, jnp.zeros_like(like), thin, medium.eta))
+            else:
+                sigma_s = medium.sigma_s_prime / (1 - anisotropy[number])
+                thickness = jnp.broadcast_to(layer.thickness, like.shape)
+                rows.append((medium.sigma_a, sigma_s, thickness, medium.eta))
+        sigma_a, sigma_s, thickness, eta = (jnp.stack(column) for column in zip(*rows, strict=True))
+        above, below = (jnp.broadcast_to(edge, (1, len(like))) for edge in (eta_above, eta_below))
+        first = next(number for number, layer in enumerate(layers) if isinstance(layer, Layer))
+        return cls(sigma_a, sigma_s, thickness, jnp.concatenate([above, eta, below]), first)
+
+    @property
+    def unit(self) -> Float[Array, " channels"]:
+        """The free path between scatterings in the first layer that scatters, mm: the unit of
+        length of walks.
+        """
+        return 1 / self.sigma_s[self.first]
+
+    def stack(self, channel: Int[Array, ""]) -> Stack:
+        """Return the geometry of one channel, in its unit."""
+        unit = self.unit[channel]
+        return Stack(
+            self.sigma_s[:, channel] * unit, self.thickness[:, channel] / unit, self.eta[:, channel]
+        )
+
+    def shared_walks(self) -> list[np.ndarray]:
+        """Group the channels, by number, that differ in absorption and in scale alone: they share a
+        walk.
+
+        Under `jit` values are unknown, and each channel has its own walk.
+        """
+        geometry = (self.sigma_s, self.thickness, self.eta)
+        if any(isinstance(values, Tracer) for values in geometry):
+            return [np.asarray([channel]) for channel in range(self.sigma_a.shape[1])]
+        sigma_s, thickness, eta = (np.asarray(values) for values in geometry)
+        unit = 1 / sigma_s[self.first]
+        walks = np.concatenate([sigma_s * unit, thickness / unit, eta])
+        _, group = np.unique(walks, axis=1, return_inverse=True)
+        return [np.flatnonzero(group == number) for number in range(group.max() + 1)]
 
 
 def monte_carlo(
@@ -64,9 +146,9 @@ def monte_carlo(
 
     **Returns:** a `MonteCarlo`.
 
-    **Raises:** `ValueError` for no scattering layer, for an infinite layer above another, for a
-    number of photons below 2 or not below 2^30, for edges that do not ascend, and for derivatives
-    in other arguments.
+    **Raises:** `ValueError` for no scattering layer, for numbers of channels that differ, for an
+    infinite layer above another, for a number of photons below 2 or not below 2^30, for edges that
+    do not ascend, and for derivatives in other arguments.
 
     **Source:** Wang, Jacques and Zheng 1995 (MCML); one walk for many absorptions: Kienle and
     Patterson 1996; path weights: Hayakawa et al. 2001.
@@ -118,8 +200,12 @@ def _set_up(
 ) -> tuple[LayeredMedia, Setup]:
     """Check and complete the arguments of `monte_carlo`."""
     for name, number, least in (("photons", photons, 2), ("flights", flights, 1)):
-        if not least <= number < 2**30:
-            raise ValueError(f"{name} must be at least {least}, and below 2^30; got {number}")
+        check_values(
+            name,
+            number,
+            f"at least {least}, and below 2^30",
+            lambda x, least=least: (x >= least) & (x < 2**30),
+        )
     layers = tuple(layers)
     check_stack(layers)
     dtype = next(layer.medium.sigma_a.dtype for layer in layers if isinstance(layer, Layer))
@@ -127,8 +213,12 @@ def _set_up(
     edges = None if edges is None else as_floats(edges, dtype)
     media, edges = _prepare(layers, phase, above, below, edges)
     check_values("edges", edges, "at least two, from 0 mm on", lambda x: (x >= 0) & (len(x) > 1))
-    steps = jnp.diff(edges)
-    check_values("the steps of edges", steps, "positive (mm): edges must ascend", lambda x: x > 0)
+    check_values(
+        "the steps of edges",
+        jnp.diff(edges),
+        "positive (mm): edges must ascend",
+        lambda x: x > 0,
+    )
     numbers = jnp.asarray(photons, jnp.int32), jnp.asarray(flights, jnp.int32)
     lanes = max(_LEAST_LANES, 1 << (photons // _PHOTONS_A_LANE).bit_length())
     return media, Setup(edges, incidence, phase, key, *numbers, min(_MOST_LANES, lanes))

@@ -188,13 +188,6 @@ class MonteCarlo(AbstractTallies):
         total = self.total_reflectance.value
         return Tabulated(self.radii, self.reflected.value, self.reflected.deviation, total)
 
-    def balance(self) -> Float[Array, " channels"]:
-        """Compute all light that is accounted for, less 1: rounding, and the chance by which faint
-        photons are given up.
-        """
-        parts = (self.total_reflectance, self.total_transmittance, self.unfinished)
-        return sum(part.value for part in parts) + jnp.sum(self.absorbed.value, axis=0) - 1
-
 
 @eqx.filter_jit
 def assemble(

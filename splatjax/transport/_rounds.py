@@ -15,8 +15,7 @@ from splatjax._chunking import jit_unless_traced
 
 from ._directions import AbstractIncidence, AbstractPhaseFunction
 from ._results import Sum, Tally
-from ._stack import Stack
-from ._walk import IDLE, INSIDE, Optics, PathWeights, Photons, fly, weigh
+from ._walk import IDLE, INSIDE, Optics, PathWeights, Photons, Stack, fly, weigh
 
 # Flights between two looks at who is done.
 _FLIGHTS = 4

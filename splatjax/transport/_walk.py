@@ -7,11 +7,26 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ._directions import AbstractPhaseFunction, Direction, fresnel
-from ._stack import Stack, of_layer
+from ._directions import AbstractPhaseFunction, Direction, fresnel, of_layer
 
 # Where a photon is; one that is idle is not on its way at all.
 INSIDE, ABOVE, BELOW, IDLE = 0, 1, 2, 3
+
+
+class Stack(eqx.Module):
+    r"""The geometry of a walk, in free paths of the first layer that scatters. A constant of every
+    derivative.
+
+    **Attributes:**
+
+    - `sigma_s`: scattering coefficients; 0 in a film.
+    - `thickness`: of each layer.
+    - `eta`: indices relative to air, those of the neighbors above and below included.
+    """
+
+    sigma_s: Float[Array, " layers"]
+    thickness: Float[Array, " layers"]
+    eta: Float[Array, " layers_and_neighbors"]
 
 
 class Photons(eqx.Module):

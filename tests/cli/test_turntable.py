@@ -19,7 +19,7 @@ from PIL import Image
 
 import splatjax as sj
 from splatjax.cli._render import Turntable
-from splatjax.cli._resumable import process_index_and_count
+from splatjax.cli._terminal import process_index_and_count
 
 pytestmark = [pytest.mark.once, pytest.mark.usefixtures("plain")]
 

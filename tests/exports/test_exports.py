@@ -10,7 +10,6 @@ from splatjax.exports import (
     burley_distance,
     data_sheet,
     separable_kernel,
-    unity_shape_parameter,
 )
 from splatjax.gaussians import SumOfGaussians
 from splatjax.io import load_material
@@ -34,9 +33,8 @@ def test_lengths_scale_and_stay_related(dtype):
     larger = SumOfGaussians(gaussians.variances * 4, gaussians.weights)
     np.testing.assert_allclose(burley_distance(larger), 2 * burley_distance(gaussians), rtol=1e-6)
     np.testing.assert_allclose(blender_radius(larger), 2 * blender_radius(gaussians), rtol=1e-6)
-    np.testing.assert_allclose(
-        unity_shape_parameter(gaussians) * burley_distance(gaussians), 1, rtol=1e-6
-    )
+    unity = np.asarray(data_sheet(gaussians)["unity"]["shape_parameter"])
+    np.testing.assert_allclose(unity * burley_distance(gaussians), 1, rtol=1e-6)
     # As Cycles reads it: a quarter of the radius over pi is the mean free path.
     path = 0.25 * blender_radius(gaussians) / np.pi
     burley = Burley(gaussians.total_reflectance(), path, DiffuseTransmission())

@@ -18,9 +18,8 @@ from splatjax.geometry import (
     split_creases,
     vertex_normals,
 )
-from splatjax.geometry._cells import surface_cells
 from splatjax.geometry._mesh import morton_order
-from splatjax.geometry._scatter import Rounding, SurfacePoints
+from splatjax.geometry._scatter import Rounding, SurfacePoints, surface_cells
 
 COUNT = 3000
 SINGLE = 2e-6  # relative: a sum of thousands of float32

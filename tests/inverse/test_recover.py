@@ -249,7 +249,7 @@ class TestUnresolvedLayers:
         information = np.asarray(solution(problem, point).information)
         expected = np.linalg.inv(information[:4, :4]) @ information[:4, 4:] @ np.full(2, by)
         assert np.max(np.abs(expected)) > 1e-3
-        moved = search(observed, point).point - point
+        moved = search(observed, point)[0] - point
         np.testing.assert_allclose(moved, expected, atol=0.05 * np.max(np.abs(expected)))
 
 

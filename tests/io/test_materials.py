@@ -195,7 +195,7 @@ BAD = [
         + GOOD_MEDIUM.replace("medium", "single_scattering")
         .replace("[", "[1, ")
         .replace("[1, s", "[s"),
-        r"\[single_scattering\] have \[1, 2\] channels",
+        r"single_scattering has 2 channels, Material.gaussians has 1",
     ),
     (GOOD_FIT + "[surface]\nroughness = 1.5\n", r"\[surface\].*roughness .* 1\.5$"),
 ]

@@ -22,7 +22,7 @@ from splatjax.scattering import (
     Multipole,
     inverse_hankel_transform,
 )
-from splatjax.scattering._adding import Response, diffuse_transmittance, hyperbolic_ratio
+from splatjax.scattering._slab import Response, diffuse_transmittance, hyperbolic_ratio
 
 INFINITE = float("inf")
 MARBLE_GREEN = (0.0041, 2.62, 1.5)

@@ -164,7 +164,7 @@ def test_saturated_rings_are_left_out(float64):
     np.testing.assert_allclose(dot.profile.values, truth()(dot.profile.radii), rtol=0.03)
     assert float(jnp.max(dot.profile.values)) < np.pi * limit / 2
     with pytest.raises(
-        ValueError, match=r"at least two rings; 0 of \d+ are inside and not saturated"
+        ValueError, match=r"rings, of \d+, that are not saturated must be at least 2.*got 0"
     ):
         measure_laser_dot(image, MM_PER_PIXEL, power=2.0, saturation=0.0)
 

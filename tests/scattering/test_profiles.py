@@ -27,6 +27,7 @@ from splatjax.scattering import (
     RadialRule,
     Searchlight,
     Tabulated,
+    Transmitted,
     at_own_radii,
     integrated_reflectance,
 )
@@ -51,7 +52,7 @@ MODELS = {
     "better dipole": lambda m, scale: BetterDipole(m),
     "photon beam": lambda m, scale: PhotonBeam(m),
     "multipole": lambda m, scale: Multipole(Layer(m, 2.5 / scale), eta_above=1.2),
-    "transmitted": lambda m, scale: Multipole(Layer(m, 2.5 / scale)).transmitted(),
+    "transmitted": lambda m, scale: Transmitted(Multipole(Layer(m, 2.5 / scale))),
     "layered": layers,
 }
 SINGULAR = ("photon beam",)
