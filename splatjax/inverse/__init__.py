@@ -2,6 +2,12 @@
 shape.
 """
 
+from ._candidates import (
+    Candidate as Candidate,
+    default_candidates as default_candidates,
+    next_pictures as next_pictures,
+    Prediction as Prediction,
+)
 from ._fit_scene import (
     fit_scene as fit_scene,
     FittedScene as FittedScene,
@@ -20,20 +26,14 @@ from ._observation import (
     UnknownIntensity as UnknownIntensity,
     Observation as Observation,
 )
+from ._offsets import NormalOffsets as NormalOffsets
 from ._parts import (
     AbstractPart as AbstractPart,
     AlbedoMap as AlbedoMap,
     CameraPoses as CameraPoses,
     LightPlaces as LightPlaces,
     LightStrengths as LightStrengths,
-    NormalOffsets as NormalOffsets,
 )
 from ._problem import wide_variances as wide_variances
-from ._recover import (
-    Candidate as Candidate,
-    default_candidates as default_candidates,
-    next_pictures as next_pictures,
-    Prediction as Prediction,
-    recover as recover,
-)
+from ._recover import recover as recover
 from ._recovery import combined as combined, Estimate as Estimate, Recovery as Recovery

@@ -134,8 +134,7 @@ def write_png(
     channels = values.shape[-1]
     if channels not in (1, 3, 4):
         raise ValueError(
-            f"{path}: a picture of {channels} channels has no colors to show; convert it to 1, 3 "
-            "or 4 channels"
+            f"{path}: a picture of {channels} channels cannot be shown; give 1, 3 or 4"
         )
     if not np.isfinite(exposure):
         raise ValueError(f"{path}: exposure is {exposure}; it must be a finite number of stops")
@@ -149,10 +148,7 @@ def write_png(
 
 
 def write_animation(
-    path: StrPath,
-    frames: Sequence[StrPath],
-    *,
-    frames_per_second: float = 24.0,
+    path: StrPath, frames: Sequence[StrPath], *, frames_per_second: float = 24.0
 ) -> None:
     r"""Join pictures to one animated WebP file that begins again for ever, whole or not at all.
 
@@ -210,8 +206,7 @@ def write_exr(
     variances: Sequence[float] | None = None,
     manifest: Mapping[str, Any] | None = None,
 ) -> None:
-    r"""Write a frame with all its layers to one OpenEXR file, single precision, whole or not at
-    all.
+    r"""Write a frame and all its layers to an OpenEXR file, single precision, whole or not at all.
 
     | channels | what they are |
     | --- | --- |
@@ -238,10 +233,7 @@ def write_exr(
         "compression": OpenEXR.ZIP_COMPRESSION,
         "type": OpenEXR.scanlineimage,
         "software": f"splatjax {__version__}",
-        "comments": (
-            "Linear light. Depth and position in mm; depth, position and normal are "
-            "not premultiplied."
-        ),
+        "comments": "Linear light; mm. Depth, position and normal are not premultiplied.",
         "splatjax.unresolved_fraction": _floats(frame.unresolved_fraction),
         "splatjax.overflow": float(frame.overflow),
         **{f"{_WEIGHTS}{k}": _floats(row) for k, row in enumerate(np.asarray(frame.weights), 1)},
@@ -299,18 +291,15 @@ def read_exr(path: StrPath) -> Frame:
 
 
 def read_manifest(path: StrPath) -> dict[str, Any]:
-    r"""Read what a picture was made of: versions, settings, material, as the command line writes
-    it.
+    r"""Read what a picture was made of, as the command line records it: settings, material.
 
     **Raises:** `FileNotFoundError`, or `ValueError` when the file cannot be read or has no such
     record.
     """
     _, header, _ = read_planes(path)
     if not isinstance(header.get(_MANIFEST), str):
-        raise ValueError(
-            f"{path}: does not record what it was made of; give a picture that `splatjax render` "
-            "wrote"
-        )
+        remedy = "give a picture that `splatjax render` wrote"
+        raise ValueError(f"{path}: does not record what it was made of; {remedy}")
     with naming(path):
         return json.loads(header[_MANIFEST])
 

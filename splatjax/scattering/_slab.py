@@ -19,9 +19,7 @@ from ._quadrature import inverse_hankel_transform, unit_interval
 
 
 class Response(eqx.Module):
-    """Reflectance and transmittance of a stack of layers in the Hankel domain, for light from above
-    and from below.
-    """
+    """Reflectance and transmittance of layers, in the Hankel domain, from above and from below."""
 
     reflectance_above: Float[Array, "*shape"]
     transmittance_down: Float[Array, "*shape"]

@@ -1,6 +1,4 @@
-"""What is drawn, splats of a material under lights; the camera; and the finished picture with its
-layers.
-"""
+"""What is drawn, splats of a material under lights; the camera; and the finished picture."""
 
 import math
 from collections.abc import Callable, Iterable

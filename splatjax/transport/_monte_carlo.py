@@ -1,6 +1,4 @@
-"""Profiles by random walks, the reference that diffusion approximates; the layers of the walks as
-arrays, and the channels that share a walk.
-"""
+"""Profiles by random walks, the reference that diffusion approximates."""
 
 from collections.abc import Callable, Sequence
 
@@ -213,12 +211,8 @@ def _set_up(
     edges = None if edges is None else as_floats(edges, dtype)
     media, edges = _prepare(layers, phase, above, below, edges)
     check_values("edges", edges, "at least two, from 0 mm on", lambda x: (x >= 0) & (len(x) > 1))
-    check_values(
-        "the steps of edges",
-        jnp.diff(edges),
-        "positive (mm): edges must ascend",
-        lambda x: x > 0,
-    )
+    steps = jnp.diff(edges)
+    check_values("the steps of edges", steps, "positive (mm): edges must ascend", lambda x: x > 0)
     numbers = jnp.asarray(photons, jnp.int32), jnp.asarray(flights, jnp.int32)
     lanes = max(_LEAST_LANES, 1 << (photons // _PHOTONS_A_LANE).bit_length())
     return media, Setup(edges, incidence, phase, key, *numbers, min(_MOST_LANES, lanes))
@@ -226,9 +220,7 @@ def _set_up(
 
 @eqx.filter_jit
 def _prepare(layers, phase: AbstractPhaseFunction, eta_above, eta_below, edges):
-    """Lay out the media, and rings from a fiftieth of the least mean free path to where hardly any
-    light leaves, unless there are others.
-    """
+    """Lay out the media, and, unless there are others, rings as far as light leaves."""
     media = LayeredMedia.of(
         layers, phase.anisotropy(len(layers), eta_above.dtype), eta_above, eta_below
     )
