@@ -244,20 +244,14 @@ def layer_table(
     truncated: TruncatedGaussian,
     slopes: bool = True,
 ) -> SourceTable:
-    """Lay out the sources of one layer: light and mass, each followed by its first moments if
-    slopes are asked for.
+    """Lay out the sources of one layer: light and mass, with their first moments if slopes are
+    asked for.
     """
     # A flat sheet has mass 1.
     flat = 1 / (2 * jnp.pi * variance * truncated.integral(0.5 * depth * depth / variance))
     mass = (below.areas * flat)[None]
-    centers = (below.centers * in_sums(variance)).reshape(3, -1, SOURCES)
-    light = jnp.concatenate([mass * below.irradiance, mass]).reshape(-1, *centers.shape[1:])
-    moments = jnp.ones_like(centers[:1])
-    if slopes:
-        moments = jnp.concatenate([moments, centers])
-    light, moments = (each.transpose(1, 0, 2) for each in (light, moments))
-    rows = light[:, :, None] * moments[:, None]
-    return SourceTable(tuple(centers), rows.reshape(len(rows), -1, SOURCES))
+    light = jnp.concatenate([mass * below.irradiance, mass])
+    return SourceTable.of(below.centers * in_sums(variance), light, SOURCES, slopes)
 
 
 def in_sums(variance: Float[Array, ""]) -> Float[Array, ""]:

@@ -98,18 +98,38 @@ class SourceTable(eqx.Module):
 
     - `centers`: apart by axis, which is quicker.
     - `rows`: to be summed.
+    - `moments`: whether each row is followed, in the sums, by its first moments: itself times the
+      centers. Static.
     """
 
     centers: tuple[Float[Array, "blocks block"], ...]
     rows: Float[Array, "blocks rows block"]
+    moments: bool = eqx.field(static=True)
 
     @classmethod
     def of(
-        cls, centers: Float[Array, "3 sources"], rows: Float[Array, "rows sources"], block: int
+        cls,
+        centers: Float[Array, "3 sources"],
+        rows: Float[Array, "rows sources"],
+        block: int,
+        moments: bool,
     ) -> "SourceTable":
         """Lay out sources, `block` of them to a block."""
         rows = rows.reshape(len(rows), -1, block).transpose(1, 0, 2)
-        return cls(tuple(centers.reshape(3, -1, block)), rows)
+        return cls(tuple(centers.reshape(3, -1, block)), rows, moments)
+
+    @property
+    def count(self) -> int:
+        """The number of sums."""
+        return self.rows.shape[1] * (4 if self.moments else 1)
+
+    def summed(self) -> Float[Array, "blocks sums block"]:
+        """Compute what is summed."""
+        if not self.moments:
+            return self.rows
+        factors = jnp.stack([jnp.ones_like(self.centers[0]), *self.centers], axis=1)
+        products = self.rows[:, :, None] * factors[:, None]
+        return products.reshape(len(products), -1, products.shape[3])
 
     def met(self, ids: Int[Array, "lanes width"]) -> "SourceTable":
         """Read what each lane meets, `[lanes, sources]` and `[lanes, rows, sources]`."""
@@ -117,7 +137,8 @@ class SourceTable(eqx.Module):
             each.at[ids].get(mode="fill", fill_value=0) for each in (*self.centers, self.rows)
         )
         rows = jnp.moveaxis(rows, 1, 2).reshape(len(ids), rows.shape[2], -1)
-        return SourceTable(tuple(each.reshape(len(ids), -1) for each in (x, y, z)), rows)
+        centers = tuple(each.reshape(len(ids), -1) for each in (x, y, z))
+        return SourceTable(centers, rows, self.moments)
 
     def add(self, ids: Int[Array, "lanes width"], met: "SourceTable") -> "SourceTable":
         """Add to the sources that each lane meets."""
@@ -162,9 +183,9 @@ class _Rule(eqx.Module):
         def add(ids, sums):
             sources = table.met(ids)
             weights, *_ = self.weights(here, sources)
-            return sums + jnp.einsum("lrs,lsp->lrp", sources.rows, weights)
+            return sums + jnp.einsum("lrs,lsp->lrp", sources.summed(), weights)
 
-        start = jnp.zeros((here.shape[0], table.rows.shape[1], here.shape[2]), here.dtype)
+        start = jnp.zeros((here.shape[0], table.count, here.shape[2]), here.dtype)
         return lanes.each_row(lists, add, start)
 
 
@@ -177,14 +198,14 @@ def _forward(rule: _Rule, lists: Lists, points, table):
 
 
 def _empty(rule: _Rule, points, table):
-    shape = points.shape[0], table.rows.shape[1], points.shape[2]
+    shape = points.shape[0], table.count, points.shape[2]
     values = jax.eval_shape(rule.finished, jax.ShapeDtypeStruct(shape, points.dtype), points)
     return zeros_after(table.rows, values.shape, values.dtype)
 
 
 def _derivative(rule: _Rule, lists: Lists, points, table, d_points, d_table):
     """Compute the values and their derivative along a direction; weights are evaluated once."""
-    rows = table.rows.shape[1]
+    count = table.count
 
     def sweep(lanes, out):
         here, d_here = lanes.read(points, FAR), lanes.read(d_points)
@@ -197,15 +218,16 @@ def _derivative(rule: _Rule, lists: Lists, points, table, d_points, d_table):
                 for axis, (offset, center) in enumerate(zip(offsets, moved.centers, strict=True))
             )
             d_weights = 2 * falls * nearer
-            both = jnp.concatenate([sources.rows, moved.rows], axis=1)
+            rows, d_rows = jax.jvp(SourceTable.summed, (sources,), (moved,))
+            both = jnp.concatenate([rows, d_rows], axis=1)
             both = jnp.einsum("lrs,lsp->lrp", both, weights)
-            moving = jnp.einsum("lrs,lsp->lrp", sources.rows, d_weights)
-            return sums + both.at[:, rows:].add(moving)
+            moving = jnp.einsum("lrs,lsp->lrp", rows, d_weights)
+            return sums + both.at[:, count:].add(moving)
 
-        start = jnp.zeros((here.shape[0], 2 * rows, here.shape[2]), here.dtype)
+        start = jnp.zeros((here.shape[0], 2 * count, here.shape[2]), here.dtype)
         sums = lanes.each_row(lists, add, start)
-        along = sums[:, rows:], d_here
-        values, slopes = jax.jvp(rule.finished, (sums[:, :rows], here), along)
+        along = sums[:, count:], d_here
+        values, slopes = jax.jvp(rule.finished, (sums[:, :count], here), along)
         return lanes.write(out, jnp.concatenate([values, slopes], axis=1))
 
     empty = _empty(rule, points, table)
@@ -230,9 +252,8 @@ def _backward(rule: _Rule, lists: Lists, points, table, sums, cotangents):
             origin = centers[:, :, :1]
             x, y = here - origin, centers - origin
             # Written out, so that it is fused with the weights: half the time of a matrix product.
-            pairs = zip(
-                jnp.unstack(sources.rows, axis=1), jnp.unstack(cotangent, axis=1), strict=True
-            )
+            rows, pull_rows = jax.vjp(SourceTable.summed, sources)
+            pairs = zip(jnp.unstack(rows, axis=1), jnp.unstack(cotangent, axis=1), strict=True)
             pulls = falls * sum(row[:, :, None] * each[:, None] for row, each in pairs)
             of_points = jnp.concatenate([jnp.ones_like(x[:, :1]), x], axis=1)
             moments = jnp.einsum("lkp,lsp->lks", of_points, pulls)
@@ -240,7 +261,10 @@ def _backward(rule: _Rule, lists: Lists, points, table, sums, cotangents):
             d_centers = 2 * (moments[:, 1:] - y * moments[:, :1])
             of_sources = jnp.concatenate([jnp.ones_like(y[:, :1]), y], axis=1)
             toward = jnp.einsum("lks,lsp->lkp", of_sources, pulls)
-            d_table = d_table.add(ids, SourceTable(tuple(jnp.unstack(d_centers, axis=1)), d_rows))
+            (d_sources,) = pull_rows(d_rows)
+            moved = tuple(jnp.unstack(d_centers, axis=1))
+            moved = jax.tree.map(jnp.add, d_sources.centers, moved)
+            d_table = d_table.add(ids, SourceTable(moved, d_sources.rows, table.moments))
             return d_here - 2 * (x * toward[:, :1] - toward[:, 1:]), d_table
 
         d_here, d_table = lanes.each_row(lists, add, (d_finish, d_table))
