@@ -59,7 +59,7 @@ def rasterization(scene: sj.Scene, camera: sj.Camera, plan: sj.Plan, settings: s
         seen = splatting.visible_surfaces(
             splats, rows, view, settings.splatting, plan.raster, OneDevice()
         )
-        attributes = splatting.Surface.of(seen.rows, view, seen.needed).attributes
+        attributes = splatting.Surface.of(seen.sums, view, seen.needed).attributes
         return seen.picture(attributes), seen.picture(jnp.ones_like(seen.before))
 
     def loss(*inputs):

@@ -40,7 +40,7 @@ class AbstractCombination(eqx.Module):
         """
         return functools.reduce(add, parts, start)
 
-    def own_share(self, rows: Float[Array, "rows ..."]) -> Float[Array, "share ..."]:
+    def own_share(self, rows: Partial) -> Partial:
         """Sum the rows of all devices, and keep this device's share of them. Differentiable."""
         return rows
 

@@ -208,8 +208,8 @@ def drawn(
 
 def pictures(sums: FragmentSums, view: AbstractView, settings: SplattingSettings) -> Drawn:
     """Join the tiles of both surfaces; where there is no surface all is 0, but the depth 1."""
-    grid, surface = TileGrid(view.width, view.height), Surface.of(sums.rows, view, sums.needed)
-    weights = sums.rows[:, -1]
+    grid, surface = TileGrid(view.width, view.height), Surface.of(sums.sums, view, sums.needed)
+    weights = sums.sums.weights
     planes = jnp.stack([surface.depth - 1, weights, coverage(weights, settings.full_coverage)], 1)
     planes = jnp.concatenate([surface.attributes, planes], axis=1)
 

@@ -20,6 +20,7 @@ from splatjax.splatting import (
     Bins,
     Footprints,
     FragmentSums,
+    PixelSums,
     SplattingSettings,
     TileGrid,
     TileRasterizer,
@@ -86,7 +87,8 @@ class ListPlan(AbstractRasterPlan):
             shown = jnp.asarray(within)[jnp.minimum(bins.order, grid.count - 1)]
             rows = jnp.where(shown[:, None], rows, 0.0)
         tiles = jnp.minimum(bins.order, grid.count)
-        return FragmentSums(tiles, rows, bins.needed.astype(rows.dtype), len(rows))
+        sums = PixelSums(rows[:, :-1], rows[:, -1])
+        return FragmentSums(tiles, sums, bins.needed.astype(rows.dtype), len(rows))
 
 
 class Lists(eqx.Module):

@@ -167,7 +167,7 @@ def look(
         return read(shaded, layers, samples)
 
     sample = partial(sample_surfaces, visible, attributes, origin)
-    samples = map_places(sample, visible.rows, visible.tiles)
+    samples = map_places(sample, visible.sums, visible.tiles)
     values = map_places(shade_and_read, samples)
     return combination.gather(values), visible.gathered(combination)
 
@@ -176,7 +176,7 @@ def sample_surfaces(
     visible: _splatting.VisibleSurfaces,
     like: SurfaceAttributes,
     origin: Float[Array, "3 1"],
-    rows: Float[Array, "places rows pixels"],
+    sums: _splatting.PixelSums,
     tiles: Int[Array, " places"],
 ) -> SurfaceSamples:
     """Blend the sums of some places, and continue the layers of the splats to the points seen.
@@ -186,10 +186,10 @@ def sample_surfaces(
     - `visible`: of all places.
     - `like`: the attributes whose rows were summed.
     - `origin`: from which the splats' centers among them are counted.
-    - `rows`, `tiles`: those of `visible`, of these places.
+    - `sums`, `tiles`: those of `visible`, of these places.
     """
     like = jax.eval_shape(lambda: like)
-    surface = _splatting.Surface.of(rows, visible.view, visible.needed)
+    surface = _splatting.Surface.of(sums, visible.view, visible.needed)
     attributes = split_rows(in_a_row(surface.attributes), like)
     positions = in_a_row(visible.points(tiles, surface.depth))
 

@@ -249,7 +249,7 @@ def _sample(
 ) -> tuple[_splatting.VisibleSurfaces, SurfaceSamples]:
     visible = _splatting.VisibleSurfaces.of(sums, view, settings.splatting, PartByPart())
     sample = partial(sample_surfaces, visible, like, origin[:, None])
-    return visible, map_places(sample, visible.rows, visible.tiles)
+    return visible, map_places(sample, visible.sums, visible.tiles)
 
 
 @eqx.filter_jit

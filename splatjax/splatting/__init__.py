@@ -12,6 +12,7 @@ from ._projections import OrthographicView as OrthographicView
 from ._projections import PerspectiveView as PerspectiveView
 from ._rasterizer import AbstractRasterizer as AbstractRasterizer
 from ._rasterizer import AbstractRasterPlan as AbstractRasterPlan, FragmentSums as FragmentSums
+from ._rasterizer import PixelSums as PixelSums
 from ._shadows import (
     Bounds as Bounds,
     compute_visibility as compute_visibility,

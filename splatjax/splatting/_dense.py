@@ -12,7 +12,13 @@ from splatjax.scene import Splats
 
 from ._grid import TileGrid
 from ._kernel import fragment_weight
-from ._rasterizer import AbstractRasterizer, AbstractRasterPlan, FragmentSums, least_weight
+from ._rasterizer import (
+    AbstractRasterizer,
+    AbstractRasterPlan,
+    FragmentSums,
+    PixelSums,
+    least_weight,
+)
 from ._views import AbstractView, SplattingSettings
 
 
@@ -89,4 +95,5 @@ def _all_tiles(
 ) -> FragmentSums:
     tiles = jnp.arange(len(front), dtype=jnp.int32)
     rows = jnp.concatenate([front, behind])
-    return FragmentSums(jnp.tile(tiles, 2), rows, jnp.zeros((), front.dtype), len(front))
+    sums = PixelSums(rows[:, :-1], rows[:, -1])
+    return FragmentSums(jnp.tile(tiles, 2), sums, jnp.zeros((), front.dtype), len(front))

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int, Shaped
 from ._bins import Bins, slot_plane
 from ._grid import SIDE, TileGrid
 from ._kernel import fast_fragment_weight, fragment_weight_derivative
-from ._rasterizer import least_weight
+from ._rasterizer import PixelSums, least_weight
 from ._views import AbstractView
 
 PLANES = ("x", "y", "slope_x", "slope_y", "a", "b", "c", "nearness", "opacity")
@@ -61,15 +61,14 @@ class Sweep(eqx.Module):
     full_coverage: float = eqx.field(static=True)
     filter_radius: float = eqx.field(static=True)
 
-    def within_picture(
-        self, sums: Float[Array, "lanes rows pixels"], tiles: Int[Array, " lanes"]
-    ) -> Float[Array, "lanes rows pixels"]:
+    def within_picture(self, sums: PixelSums, tiles: Int[Array, " lanes"]) -> PixelSums:
         """Set to zero what lies in a tile but beyond the picture."""
         within = self.grid.within_picture()
         if within is None:
             return sums
         within = jnp.asarray(within)[jnp.minimum(tiles, self.grid.count - 1)]
-        return jnp.where(within[:, None], sums, 0.0)
+        rows = jnp.where(within[:, None], sums.rows, 0.0)
+        return PixelSums(rows, jnp.where(within, sums.weights, 0.0))
 
     def pixels(self, dtype) -> tuple[np.ndarray, np.ndarray]:
         """Pixel centers of a tile, from its corner. Constants: made by NumPy, or the compiler
@@ -155,10 +154,8 @@ class Sweep(eqx.Module):
         nearness = jnp.stack([e - sx * x - sy * y, sx, sy, jnp.ones_like(e)], axis=2)
         return jnp.concatenate([slots.rows(ids), nearness], axis=2)
 
-    def sums(self, slots: "Slots", lanes: Lanes, beyond, upto):
-        """Sum attributes and nearness over the fragments between two limits, `[lanes, rows,
-        pixels]`; the weights last.
-        """
+    def sums(self, slots: "Slots", lanes: Lanes, beyond, upto) -> PixelSums:
+        """Sum over the fragments between two limits."""
 
         def add(block, sums):
             splats = self.splats(slots.planes, block, lanes)
@@ -177,9 +174,11 @@ class Sweep(eqx.Module):
         attributes, nearness = sums[:, :rows], sums[:, rows:]
         px, py = self.pixels(beyond.dtype)
         plane = nearness[:, 0] + nearness[:, 1] * px[None] + nearness[:, 2] * py[None]
-        return jnp.concatenate([attributes, plane[:, None], nearness[:, 3:]], axis=1)
+        return PixelSums(jnp.concatenate([attributes, plane[:, None]], axis=1), nearness[:, 3])
 
-    def add_cotangents(self, slots: "Slots", lanes: Lanes, beyond, upto, cotangent, gradients):
+    def add_cotangents(
+        self, slots: "Slots", lanes: Lanes, beyond, upto, cotangent: PixelSums, gradients
+    ):
         """Add the cotangents of planes, per slot, and of attributes, per splat, for the fragments
         between two limits, from those of the sums.
         """
@@ -187,9 +186,10 @@ class Sweep(eqx.Module):
         monomials = jnp.asarray(
             np.stack([np.ones_like(px), px, py, px * px, px * py, py * py], axis=1)
         )
-        count, of_nearness = cotangent.shape[1] - 2, cotangent[:, -2:-1]
-        of_plane = [of_nearness, of_nearness * px[None, None], of_nearness * py[None, None]]
-        of_rows = jnp.concatenate([cotangent[:, :-2], *of_plane, cotangent[:, -1:]], axis=1)
+        count, of_nearness = slots.attributes.shape[1], cotangent.rows[:, -1:]
+        of_plane = [of_nearness * px[None, None], of_nearness * py[None, None]]
+        of_weights = cotangent.weights[:, None]
+        of_rows = jnp.concatenate([cotangent.rows, *of_plane, of_weights], axis=1)
 
         def add(block, gradients):
             splats = self.splats(slots.planes, block, lanes)

@@ -42,6 +42,20 @@ class Places(eqx.Module):
     behind: int = eqx.field(static=True)
 
 
+class PixelSums(eqx.Module):
+    """Sums over the fragments of pixels; 0 where there is none, and beyond the picture.
+
+    **Attributes:**
+
+    - `rows`: of weights times attributes, and last of weights times the nearness of the ray's hits
+      with the planes of the splats.
+    - `weights`: of weights.
+    """
+
+    rows: Float[Array, "places rows pixels"]
+    weights: Float[Array, "places pixels"]
+
+
 class FragmentSums(eqx.Module):
     """Sums over the fragments of the pixels of some tiles.
 
@@ -49,15 +63,13 @@ class FragmentSums(eqx.Module):
 
     - `tiles`: the tile at each place, first of the front, then of the surface behind; the number of
       tiles in an empty place.
-    - `rows`: sums of weights times attributes, of weights times the nearness of the ray's hits with
-      the planes of the splats, and of weights; 0 where there is no fragment, and beyond the
-      picture.
+    - `sums`: of each place.
     - `needed`: capacity needed over planned; above 1 the sums are incomplete.
     - `front`: the number of places of the front. Static.
     """
 
     tiles: Int[Array, " places"]
-    rows: Float[Array, "places rows pixels"]
+    sums: PixelSums
     needed: Float[Array, ""]
     front: int = eqx.field(static=True)
 

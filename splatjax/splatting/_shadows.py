@@ -162,8 +162,8 @@ class ShadowMap(eqx.Module):
     def of(cls, sums: FragmentSums, view: AbstractView, settings: SplattingSettings) -> "ShadowMap":
         """Blend the sums of all parts."""
         tiles = TileGrid(view.width, view.height).count
-        surface = Surface.of(sums.rows, view, sums.needed)
-        covered = coverage(sums.rows[:, -1], settings.full_coverage)
+        surface = Surface.of(sums.sums, view, sums.needed)
+        covered = coverage(sums.sums.weights, settings.full_coverage)
         planes = []
         for places in (slice(sums.front), slice(sums.front, None)):
             for values in (surface.depth, covered):
@@ -185,8 +185,8 @@ def make_shadow_map(
     nothing = jnp.zeros((0, len(chosen)), splats.centers.dtype)
     sums = plan.sum_fragments(splats.take(chosen), nothing, view, splatting, combination)
     needed = combination.largest([jnp.maximum(needed, sums.needed)])
-    rows = combination.total([sums.rows])
-    sums = eqx.tree_at(lambda each: (each.rows, each.needed), sums, (rows, needed))
+    total = combination.total([sums.sums])
+    sums = eqx.tree_at(lambda each: (each.sums, each.needed), sums, (total, needed))
     return ShadowMap.of(sums, view, splatting)
 
 

@@ -13,7 +13,7 @@ from splatjax.scene import Splats
 
 from ._grid import SIDE, TileGrid
 from ._kernel import coverage
-from ._rasterizer import AbstractRasterPlan, FragmentSums, invalid_factor
+from ._rasterizer import AbstractRasterPlan, FragmentSums, PixelSums, invalid_factor
 from ._views import AbstractView, SplattingSettings
 
 TILES_AT_ONCE = AT_ONCE // SIDE**2
@@ -49,17 +49,15 @@ class Surface(eqx.Module):
     covered: Bool[Array, "tiles pixels"]
 
     @classmethod
-    def of(
-        cls, rows: Float[Array, "tiles rows pixels"], view: AbstractView, needed: Float[Array, ""]
-    ) -> "Surface":
-        """Blend the rows of `FragmentSums`. Where more capacity was needed than planned, all is
-        NaN, and so are derivatives.
+    def of(cls, sums: PixelSums, view: AbstractView, needed: Float[Array, ""]) -> "Surface":
+        """Blend sums. Where more capacity was needed than planned, all is NaN, and so are
+        derivatives.
         """
-        nearness, weights = rows[:, -2], rows[:, -1] * invalid_factor(needed)
+        nearness, weights = sums.rows[:, -1], sums.weights * invalid_factor(needed)
         covered = stop_gradient(weights) > 0
         blended = jnp.where(weights != 0, blend_fragments(nearness, weights), 1.0)
         depth = jnp.where(covered, view.depth(blended), 1.0)
-        return cls(blend_fragments(rows[:, :-2], weights[:, None]), depth, covered)
+        return cls(blend_fragments(sums.rows[:, :-1], weights[:, None]), depth, covered)
 
 
 class VisibleSurfaces(eqx.Module):
@@ -69,7 +67,7 @@ class VisibleSurfaces(eqx.Module):
 
     - `tiles`: the tile of each place of this device; the number of tiles in an empty place.
     - `in_front`: whether a place is of the surface in front, and not of the one behind.
-    - `rows`: as in `FragmentSums`.
+    - `sums`: of the fragments.
     - `before`: the coverage of what lies in front of the surface behind; 0 for the front.
     - `needed`: capacity needed over planned. Above 1 every picture is NaN, and so are its
       derivatives.
@@ -78,7 +76,7 @@ class VisibleSurfaces(eqx.Module):
     view: AbstractView
     tiles: Int[Array, " places"]
     in_front: Bool[Array, " places"]
-    rows: Float[Array, "places rows pixels"]
+    sums: PixelSums
     before: Float[Array, "places pixels"]
     needed: Float[Array, ""]
     full_coverage: float = eqx.field(static=True)
@@ -94,9 +92,9 @@ class VisibleSurfaces(eqx.Module):
         """Combine the sums of all devices; each keeps a share of the places."""
         count = TileGrid(view.width, view.height).count
         in_front = jnp.arange(len(sums.tiles)) < sums.front
-        rows, tiles = combination.own_share(sums.rows), combination.own_rows(sums.tiles)
+        own, tiles = combination.own_share(sums.sums), combination.own_rows(sums.tiles)
         # What the front covers of the tiles, wherever it was shaded.
-        covered = coverage(combination.gather(rows[:, -1]), settings.full_coverage)
+        covered = coverage(combination.gather(own.weights), settings.full_coverage)
         front = jnp.zeros((count, SIDE**2), covered.dtype)
         front = front.at[sums.tiles[: sums.front]].set(covered[: sums.front], mode="drop")
         own_front = combination.own_rows(in_front)
@@ -105,7 +103,7 @@ class VisibleSurfaces(eqx.Module):
             view=view,
             tiles=tiles,
             in_front=own_front,
-            rows=rows,
+            sums=own,
             before=jnp.where(own_front[:, None], 0.0, before),
             needed=combination.largest([sums.needed]),
             full_coverage=settings.full_coverage,
@@ -128,15 +126,16 @@ class VisibleSurfaces(eqx.Module):
     @property
     def share(self) -> Float[Array, "places pixels"]:
         """Compute how much of its pixel each surface covers: behind, of what the front leaves."""
-        return coverage(self.rows[:, -1], self.full_coverage) * (1 - self.before)
+        return coverage(self.sums.weights, self.full_coverage) * (1 - self.before)
 
     def gathered(self, combination: AbstractCombination) -> "VisibleSurfaces":
-        """Return the places of all devices, without their rows."""
+        """Return the places of all devices, without the rows of their sums."""
 
         def of_places(each):
-            return each.tiles, each.in_front, each.before, each.rows
+            return each.tiles, each.in_front, each.before, each.sums
 
-        parts = combination.gather((*of_places(self)[:3], self.rows[:, -1:]))
+        *places, sums = of_places(self)
+        parts = combination.gather((*places, PixelSums(sums.rows[:, :0], sums.weights)))
         return eqx.tree_at(of_places, self, parts)
 
     def pixels(

@@ -23,7 +23,7 @@ from splatjax._combination import AbstractCombination
 from ._bins import Bins, scatter_slots
 from ._fragments import Lanes, Slots, Sweep, second_limits
 from ._grid import SIDE
-from ._rasterizer import FragmentSums, Places
+from ._rasterizer import FragmentSums, PixelSums, Places
 
 
 class Spans(eqx.Module):
@@ -103,10 +103,10 @@ def _sum_fwd(sweep, capacity, combination, bins, shift, planes, attributes):
 def _sum_bwd(sweep: Sweep, capacity: Places, combination, residuals, cotangent):
     bins, shift, planes, attributes, spans = residuals
     part = PartSweep(sweep, bins, Slots.gathered(shift, planes, attributes, bins))
-    dtype, cotangent = shift.dtype, cotangent.rows
+    dtype, cotangent = shift.dtype, cotangent.sums
 
-    def add(_, lanes: Lanes, beyond, upto, rows, gradients):
-        return sweep.add_cotangents(part.slots, lanes, beyond, upto, rows, gradients)
+    def add(_, *given):
+        return sweep.add_cotangents(part.slots, *given)
 
     of_planes = tuple(zeros_after(cotangent, part.slots.shift.shape, dtype) for _ in planes)
     gradients = of_planes, zeros_after(cotangent, attributes.shape, dtype)
@@ -143,24 +143,26 @@ class PartSweep(eqx.Module):
         lengths = jnp.repeat(jnp.diff(self.bins.first_block), grid.lanes)
         return limits, jnp.zeros(grid.count, jnp.int32).at[order].set(lengths, mode="drop")
 
-    def nothing(self, front: Spans, capacity: Places) -> Float[Array, "places rows pixels"]:
+    def nothing(self, front: Spans, capacity: Places) -> PixelSums:
         """Return sums over no fragments, for the places of both surfaces."""
-        shape = capacity.front + capacity.behind, self.slots.attributes.shape[1] + 2, SIDE**2
-        return zeros_after((front.beyond, self.slots.attributes), shape, front.beyond.dtype)
+        places, attributes = capacity.front + capacity.behind, self.slots.attributes
+        known, dtype = (front.beyond, attributes), front.beyond.dtype
+        rows = zeros_after(known, (places, attributes.shape[1] + 1, SIDE**2), dtype)
+        return PixelSums(rows, zeros_after(known, (places, SIDE**2), dtype))
 
     @jit_unless_traced
-    def add_sums(
-        self, spans: Spans, rows: Float[Array, "places rows pixels"], first: int
-    ) -> Float[Array, "places rows pixels"]:
-        """Add the sums over the fragments of some spans to rows, from a first place on."""
+    def add_sums(self, spans: Spans, so_far: PixelSums, first: int) -> PixelSums:
+        """Add the sums over the fragments of some spans to others, from a first place on."""
 
-        def add(i, lanes: Lanes, beyond, upto, tiles, rows):
-            sums = self.sweep.sums(self.slots, lanes, beyond, upto)
-            own = lax.dynamic_slice_in_dim(rows, first + i, len(tiles))
-            return _write(rows, own + self.sweep.within_picture(sums, tiles), first + i)
+        def add(i, lanes: Lanes, beyond, upto, tiles, so_far):
+            sums = self.sweep.within_picture(
+                self.sweep.sums(self.slots, lanes, beyond, upto), tiles
+            )
+            own = _sliced(so_far, first + i, len(tiles))
+            return _write(so_far, jax.tree.map(jnp.add, own, sums), first + i)
 
         given = spans.beyond, spans.upto, spans.tiles
-        return self.each_round(spans.tiles, given, add, rows)
+        return self.each_round(spans.tiles, given, add, so_far)
 
     @jit_unless_traced
     def limits_behind(
@@ -187,8 +189,7 @@ class PartSweep(eqx.Module):
 
         def step(i, out):
             here = i * grid.lanes
-            parts = (lax.dynamic_slice_in_dim(each, here, grid.lanes) for each in (own, *given))
-            picked, *rest = parts
+            picked, *rest = _sliced((own, *given), here, grid.lanes)
             return function(here, self.sweep.lanes(bins, picked, dtype), *rest, out)
 
         places = jnp.arange(1, len(tiles) + 1, dtype=jnp.int32)
@@ -218,13 +219,13 @@ def sum_parts(
     fronts = [Spans.front(*limits[k], capacities[k].front) for k in views]
 
     # Stage 2: the sums of the front.
-    def add_front(rows, part):
-        return [part[k].add_sums(fronts[k], rows[k], 0) for k in views]
+    def add_front(sums, part):
+        return [part[k].add_sums(fronts[k], sums[k], 0) for k in views]
 
     nothing = [first[k].nothing(fronts[k], capacities[k]) for k in views]
-    rows = combination.fold(add_front, nothing, parts())
+    sums = combination.fold(add_front, nothing, parts())
     # Stage 3: where the surface behind ends, in pixels that the front leaves open.
-    weights = combination.total([[rows[k][: capacities[k].front, -1] for k in views]])
+    weights = combination.total([[sums[k].weights[: capacities[k].front] for k in views]])
     opened = []
     for k, own in enumerate(capacities):
         sweep = first[k].sweep
@@ -236,15 +237,15 @@ def sum_parts(
     behind = [dataclasses.replace(opened[k], beyond=second_limits(*limits[k])) for k in views]
 
     # Stage 4: the sums of the surface behind.
-    def add_behind(rows, part):
-        return [part[k].add_sums(behind[k], rows[k], capacities[k].front) for k in views]
+    def add_behind(sums, part):
+        return [part[k].add_sums(behind[k], sums[k], capacities[k].front) for k in views]
 
-    rows = combination.fold(add_behind, rows, parts())
+    sums = combination.fold(add_behind, sums, parts())
     found = []
     for k, own in enumerate(capacities):
         spans = fronts[k].followed_by(behind[k])
         needed = combination.largest([jnp.maximum(spans.needed, first[k].bins.needed)])
-        found.append((FragmentSums(spans.tiles, rows[k], needed, own.front), spans))
+        found.append((FragmentSums(spans.tiles, sums[k], needed, own.front), spans))
     return found
 
 
@@ -255,6 +256,11 @@ def _listed(chosen: Bool[Array, " all"], size: int) -> Int[Array, " size"]:
 
 def _taken(whole: Array, places: Int[Array, " places"], fill) -> Array:
     return whole.at[places].get(mode="fill", fill_value=fill)
+
+
+def _sliced(whole, place, size: int):
+    """Read so many rows from a place on."""
+    return jax.tree.map(lambda each: lax.dynamic_slice_in_dim(each, place, size), whole)
 
 
 def _write(out, parts, place):

@@ -67,7 +67,7 @@ def seen_by(name: str, splats: sj.Splats, *views: PerspectiveView):
 
     def draw(splats, rows, view):
         visible = visible_surfaces(splats, rows, view, SETTINGS, plan, OneDevice())
-        surface = Surface.of(visible.rows, view, visible.needed)
+        surface = Surface.of(visible.sums, view, visible.needed)
         depth = jnp.where(surface.covered, surface.depth, 0.0)
         pictures = surface.attributes, visible.share, depth
         return tuple(visible.front_picture(each) for each in pictures)

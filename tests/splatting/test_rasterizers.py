@@ -172,7 +172,7 @@ def test_too_small_a_capacity_makes_the_sums_nan_and_is_reported():
         sums = jax.jit(tried.sum_fragments, static_argnums=(3, 4))
         sums = sums(body, rows, view, SETTINGS, OneDevice())
         assert (float(sums.needed) > 1) == bool(short), short
-        assert np.all(np.isnan(sums.rows)) == bool(short), short
+        assert np.all(np.isnan(sums.sums.rows)) == bool(short), short
 
 
 GRID = TileGrid(61, 45, lanes=4, slots=4)
