@@ -167,8 +167,13 @@ def look(
         return read(shaded, layers, samples)
 
     sample = partial(sample_surfaces, visible, attributes, origin)
-    samples = map_places(sample, visible.sums, visible.tiles)
-    values = map_places(shade_and_read, samples)
+
+    # Apart, so that samples are materialized, and in large chunks, so that few of them are.
+    def sample_and_read(sums, tiles) -> Values:
+        return map_places(shade_and_read, map_places(sample, sums, tiles))
+
+    at_once = 2 * _splatting.TILES_AT_ONCE
+    values = map_chunks(sample_and_read, visible.sums, visible.tiles, at_once=at_once)
     return combination.gather(values), visible.gathered(combination)
 
 
