@@ -244,7 +244,8 @@ def sum_parts(
     found = []
     for k, own in enumerate(capacities):
         spans = fronts[k].followed_by(behind[k])
-        needed = combination.largest([jnp.maximum(spans.needed, first[k].bins.needed)])
+        lists = first[k].bins.needed.astype(spans.needed.dtype)
+        needed = combination.largest([jnp.maximum(spans.needed, lists)])
         found.append((FragmentSums(spans.tiles, sums[k], needed, own.front), spans))
     return found
 
