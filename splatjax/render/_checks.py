@@ -147,10 +147,6 @@ def check_channels(scene: Scene) -> None:
     found = {}
     if scene.splats.albedo is not None:
         found["splats.albedo"] = scene.splats.albedo.shape[1]
-    if scene.material.single_scattering is not None:
-        found["material.single_scattering.medium"] = (
-            scene.material.single_scattering.medium.sigma_a.shape[0]
-        )
     point = jax.ShapeDtypeStruct((1, 3), scene.splats.centers.dtype)
     for i, light in enumerate(scene.lights):
         for sample in light.samples():
