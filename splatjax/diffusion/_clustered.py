@@ -12,6 +12,7 @@ import numpy as np
 from jax.lax import stop_gradient
 from jaxtyping import Array, Float, Int
 
+from splatjax._chunking import zeros_after
 from splatjax._combination import AbstractCombination
 from splatjax.scene import Splats
 
@@ -25,14 +26,9 @@ from ._diffuser import (
     layer_values,
     split_layer,
 )
-from ._gaussian_sums import (
-    Lists,
-    SourceTable,
-    gaussian_sums,
-    gaussian_sums_forward,
-)
+from ._gaussian_sums import SourceTable, gaussian_sums, gaussian_sums_forward
 from ._kernel import AbstractDiffusionKernel, TruncatedGaussian, resolved_fraction
-from ._neighbors import SOURCES, Boxes, Neighbors, find_neighbors
+from ._neighbors import SOURCES, Boxes, Lists, Neighbors, find_neighbors
 
 FINEST = 0.01
 """Quantile of the areas of the splats: a layer counts as resolved as far as splats of that area
@@ -220,13 +216,31 @@ class ClusterPlan(AbstractDiffusionPlan):
         if at is None:
             found = values.transpose(1, 0, 2).reshape(values.shape[1], -1)
         else:
-            found = values.at[at // BLOCK, :, at % BLOCK].get(mode="fill", fill_value=0).T
+            found = _take_from_blocks(values, at)
         needed = neighbors.needed(
             _target_boxes(points),
             Boxes.around(below.centers, below.areas > 0, SOURCES),
             support * stop_gradient(jnp.sqrt(variance)),
         )
         return split_layer(found, 2 * in_sums(variance)), needed.astype(found.dtype)
+
+
+def _take_from_blocks(
+    values: Float[Array, "blocks rows block"], at: Int[Array, " points"]
+) -> Float[Array, "rows points"]:
+    """Take points out of blocks; 0 for indices from the number of points on."""
+
+    def index(values, at):
+        return values.at[at // BLOCK, :, at % BLOCK]
+
+    def take(at, values):
+        return index(values, at).get(mode="fill", fill_value=0).T
+
+    # JAX's own transpose begins with constant zeros, which XLA allocates for all layers at once.
+    def scatter(at, taken):
+        return index(zeros_after(taken, values.shape, values.dtype), at).add(taken.T, mode="drop")
+
+    return jax.custom_derivatives.linear_call(take, scatter, at, values)
 
 
 def divided(

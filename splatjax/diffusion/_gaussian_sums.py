@@ -12,83 +12,14 @@ from functools import partial
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Float, Int
 
 from splatjax._chunking import zeros_after
 
 from ._kernel import TruncatedGaussian
+from ._neighbors import Lanes, Lists
 
 FAR = -1e6  # mm from anything, yet with a square that float32 holds
-
-
-LANES = 64
-"""Blocks of points that are swept together."""
-
-
-class Lists(eqx.Module):
-    """Which blocks of sources the blocks of points meet. Not differentiated.
-
-    **Attributes:**
-
-    - `rows`: blocks of sources, so many to a row; the number of blocks, whose block is empty, in
-      what is left of a row, and in the last row.
-    - `first`, `counts`: the rows of each block of points.
-    - `order`: of the blocks of points, those with the longest lists first.
-    """
-
-    rows: Int[Array, "rows width"]
-    first: Int[Array, " points_blocks"]
-    counts: Int[Array, " points_blocks"]
-    order: Int[Array, " points_blocks"]
-
-    def only(self, blocks: Int[Array, " some"]) -> "Lists":
-        """Leave out all other blocks of points."""
-        chosen = jnp.zeros(len(self.counts), bool).at[blocks].set(True, mode="drop")
-        counts = jnp.where(chosen, self.counts, 0)
-        order = self.order[jnp.argsort(counts[self.order] == 0)]
-        return Lists(self.rows, self.first, counts, order)
-
-    def sweep(self, sweep: Callable, out):
-        """Apply `sweep(lanes, out)` to all blocks with a list."""
-        blocks = len(self.order)
-        lanes = min(LANES, blocks)
-        order = jnp.pad(self.order, (0, -blocks % lanes), constant_values=blocks)
-        sweeps = (jnp.sum(self.counts > 0) + lanes - 1) // lanes
-
-        def step(i, out):
-            blocks = lax.dynamic_slice_in_dim(order, i * lanes, lanes)
-            first, counts = (
-                each.at[blocks].get(mode="fill", fill_value=0) for each in (self.first, self.counts)
-            )
-            return sweep(Lanes(blocks, first, counts), out)
-
-        return lax.fori_loop(jnp.zeros_like(sweeps), sweeps, step, out)
-
-
-class Lanes(eqx.Module):
-    """Blocks of points that are swept together, and their lists; the number of blocks in a lane
-    without one.
-    """
-
-    blocks: Int[Array, " lanes"]
-    first: Int[Array, " lanes"]
-    counts: Int[Array, " lanes"]
-
-    def read(self, rows: Float[Array, "points_blocks ..."], fill=0.0):
-        return rows.at[self.blocks].get(mode="fill", fill_value=fill)
-
-    def write(self, rows: Float[Array, "points_blocks ..."], values):
-        return rows.at[self.blocks].set(values, mode="drop")
-
-    def each_row(self, lists: Lists, add: Callable, start):
-        """Apply `add(ids, carry)` to the blocks of sources `[lanes, width]` of row after row."""
-
-        def step(i, carry):
-            row = jnp.where(i < self.counts, self.first + i, len(lists.rows) - 1)
-            return add(lists.rows.at[row].get(mode="promise_in_bounds"), carry)
-
-        return lax.fori_loop(0, jnp.max(self.counts), step, start)
 
 
 class SourceTable(eqx.Module):

@@ -17,9 +17,9 @@ from splatjax._combination import PartByPart
 from ._clustered import ClusterDiffuser, in_sums, layer_table, source_boxes
 from ._clusters import BLOCK, Clusters, ClusterTree, compact_order
 from ._diffuser import Sources
-from ._gaussian_sums import FAR, Lists, gaussian_sums, identity
+from ._gaussian_sums import FAR, gaussian_sums, identity
 from ._kernel import AbstractDiffusionKernel, TruncatedGaussian
-from ._neighbors import Boxes, find_neighbors
+from ._neighbors import Boxes, Lists, find_neighbors
 
 _SPARE = 1.3  # times the clusters of a part, so that one program serves nearly all parts
 
