@@ -59,6 +59,3 @@ class ThinnedPlan(AbstractDiffusionPlan):
             for variance, depth in zip(variances, kernel.depths(variances), strict=True)
         )
         return Diffused(layers, jnp.zeros((), sources.centers.dtype))
-
-    def in_forward_mode(self) -> "ThinnedPlan":
-        return self

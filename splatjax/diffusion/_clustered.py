@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import equinox as eqx
@@ -26,7 +26,7 @@ from ._diffuser import (
     layer_values,
     split_layer,
 )
-from ._gaussian_sums import SourceTable, gaussian_sums, gaussian_sums_forward
+from ._gaussian_sums import SourceTable, gaussian_sums
 from ._kernel import AbstractDiffusionKernel, TruncatedGaussian, resolved_fraction
 from ._neighbors import SOURCES, Boxes, Lists, Neighbors, find_neighbors
 
@@ -150,19 +150,14 @@ class ClusterPlan(AbstractDiffusionPlan):
 
     - `tree`: the clusters of all splats.
     - `layers`: one plan per Gaussian.
-    - `sums`: `gaussian_sums`, which has reverse mode, or `gaussian_sums_forward`. Static.
     """
 
     tree: ClusterTree
     layers: tuple[LayerPlan, ...]
-    sums: Callable[..., Array] = eqx.field(static=True, default=gaussian_sums)
 
     def shares(self):
         found = [each.neighbors for each in self.layers if each.neighbors is not None]
         return tuple(jax.tree.leaves([(each.lists, each.points) for each in found]))
-
-    def in_forward_mode(self) -> "ClusterPlan":
-        return dataclasses.replace(self, sums=gaussian_sums_forward)
 
     def diffuse(
         self,
@@ -212,7 +207,7 @@ class ClusterPlan(AbstractDiffusionPlan):
         truncated = kernel.truncated(support)
         table = layer_table(below, variance, depth, truncated)
         blocks = (points * in_sums(variance)).reshape(3, -1, BLOCK).transpose(1, 0, 2)
-        values = self.sums(blocks, table, lists, truncated, divided)
+        values = gaussian_sums(blocks, table, lists, truncated, divided)
         if at is None:
             found = values.transpose(1, 0, 2).reshape(values.shape[1], -1)
         else:

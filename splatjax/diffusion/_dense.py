@@ -49,9 +49,6 @@ class DensePlan(AbstractDiffusionPlan):
         )
         return Diffused(layers, jnp.zeros((), sources.centers.dtype))
 
-    def in_forward_mode(self) -> "DensePlan":
-        return self
-
 
 def dense_layer(
     sources: Sources,

@@ -91,12 +91,6 @@ class AbstractDiffusionPlan(eqx.Module):
         """Return the arrays of which every device has a share, along their first axis."""
         return ()
 
-    @abc.abstractmethod
-    def in_forward_mode(self) -> "AbstractDiffusionPlan":
-        """Return a plan with the same values that has forward mode in the variances; it may have
-        no reverse mode.
-        """
-
 
 class AbstractDiffuser(eqx.Module):
     """A way to evaluate the diffusion integral; a setting."""
@@ -132,10 +126,9 @@ def diffuse_with_derivative(
 
     Each layer depends on its own variance alone, so one direction holds all derivatives.
     """
-    forward = plan.in_forward_mode()
 
     def diffuse(variances):
-        return forward.diffuse(sources, variances, kernel, combination, at)
+        return plan.diffuse(sources, variances, kernel, combination, at)
 
     return jax.jvp(diffuse, (variances,), (variances,))
 

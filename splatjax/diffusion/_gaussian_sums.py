@@ -1,5 +1,5 @@
-"""Sums of Gaussians around blocks of sources at blocks of points, with a derivative that recomputes
-the weights.
+"""Sums of Gaussians around blocks of sources at blocks of points, with derivatives in forward and
+reverse mode that recompute the weights.
 
 Every block of points has a list of the blocks of sources near it. Blocks of points with lists of
 about one length are swept together, one per *lane*; in a step each lane meets the sources of the
@@ -134,39 +134,37 @@ def _empty(rule: _Rule, points, table):
     return zeros_after(table.rows, values.shape, values.dtype)
 
 
-def _derivative(rule: _Rule, lists: Lists, points, table, d_points, d_table):
-    """Compute the values and their derivative along a direction; weights are evaluated once."""
-    count = table.count
+def _derivative(rule: _Rule, residuals, moved):
+    """Compute the derivative of the values along a direction."""
+    (lists, points, table, sums), (d_points, d_table) = residuals, moved
 
     def sweep(lanes, out):
         here, d_here = lanes.read(points, FAR), lanes.read(d_points)
 
-        def add(ids, sums):
-            sources, moved = table.met(ids), d_table.met(ids)
+        def add(ids, d_sums):
+            sources, d_sources = table.met(ids), d_table.met(ids)
             weights, falls, offsets = rule.weights(here, sources)
             nearer = sum(
                 offset * (center[:, :, None] - d_here[:, axis, None])
-                for axis, (offset, center) in enumerate(zip(offsets, moved.centers, strict=True))
+                for axis, (offset, center) in enumerate(
+                    zip(offsets, d_sources.centers, strict=True)
+                )
             )
-            d_weights = 2 * falls * nearer
-            rows, d_rows = jax.jvp(SourceTable.summed, (sources,), (moved,))
-            both = jnp.concatenate([rows, d_rows], axis=1)
-            both = jnp.einsum("lrs,lsp->lrp", both, weights)
-            moving = jnp.einsum("lrs,lsp->lrp", rows, d_weights)
-            return sums + both.at[:, count:].add(moving)
+            rows, d_rows = jax.jvp(SourceTable.summed, (sources,), (d_sources,))
+            d_sums += jnp.einsum("lrs,lsp->lrp", d_rows, weights)
+            return d_sums + jnp.einsum("lrs,lsp->lrp", rows, 2 * falls * nearer)
 
-        start = jnp.zeros((here.shape[0], 2 * count, here.shape[2]), here.dtype)
-        sums = lanes.each_row(lists, add, start)
-        along = sums[:, count:], d_here
-        values, slopes = jax.jvp(rule.finished, (sums[:, :count], here), along)
-        return lanes.write(out, jnp.concatenate([values, slopes], axis=1))
+        total = lanes.read(sums)
+        d_total = lanes.each_row(lists, add, jnp.zeros_like(total))
+        return lanes.write(out, jax.jvp(rule.finished, (total, here), (d_total, d_here))[1])
 
-    empty = _empty(rule, points, table)
-    out = lists.sweep(sweep, jnp.concatenate([empty, empty], axis=1))
-    return out[:, : empty.shape[1]], out[:, empty.shape[1] :]
+    return lists.sweep(sweep, _empty(rule, points, table))
 
 
-def _backward(rule: _Rule, lists: Lists, points, table, sums, cotangents):
+def _backward(rule: _Rule, residuals, cotangents):
+    """Compute the transpose of `_derivative`."""
+    lists, points, table, sums = residuals
+
     def sweep(lanes, carry):
         d_points, d_table = carry
         here, total, cotangent = lanes.read(points, FAR), lanes.read(sums), lanes.read(cotangents)
@@ -207,31 +205,20 @@ def _backward(rule: _Rule, lists: Lists, points, table, sums, cotangents):
     return lists.sweep(sweep, start)
 
 
-@partial(jax.custom_vjp, nondiff_argnums=(0,))
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _sums(rule: _Rule, lists: Lists, points, table):
     return _forward(rule, lists, points, table)
 
 
-def _sums_fwd(rule: _Rule, lists: Lists, points, table):
-    sums = _forward(_Rule(rule.kernel, identity), lists, points, table)
-    return rule.finished(sums, points), (lists, points, table, sums)
-
-
-def _sums_bwd(rule: _Rule, residuals, cotangents):
-    return (None, *_backward(rule, *residuals, cotangents))
-
-
-_sums.defvjp(_sums_fwd, _sums_bwd)
-
-
-@partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _sums_forward(rule: _Rule, lists: Lists, points, table):
-    return _forward(rule, lists, points, table)
-
-
-@_sums_forward.defjvp
+@_sums.defjvp
 def _sums_jvp(rule: _Rule, primals, tangents):
-    return _derivative(rule, *primals, *tangents[1:])
+    _, points, _ = primals
+    sums = _forward(_Rule(rule.kernel, identity), *primals)
+    # Linear in the direction, with a transpose of its own: forward and reverse mode.
+    derivative, transpose = partial(_derivative, rule), partial(_backward, rule)
+    given = (*primals, sums)
+    moved = jax.custom_derivatives.linear_call(derivative, transpose, given, tangents[1:])
+    return rule.finished(sums, points), moved
 
 
 def gaussian_sums(
@@ -255,16 +242,3 @@ def gaussian_sums(
     **Returns:** the values; 0 for blocks of points without a list.
     """
     return _sums(_Rule(kernel, finish), lists, points, table)
-
-
-def gaussian_sums_forward(
-    points: Float[Array, "points_blocks 3 points"],
-    table: SourceTable,
-    lists: Lists,
-    kernel: TruncatedGaussian,
-    finish: Callable[
-        [Float[Array, "rows points"], Float[Array, "3 points"]], Float[Array, "values points"]
-    ],
-) -> Float[Array, "points_blocks values points"]:
-    """Sum as `gaussian_sums` does, with forward mode instead of reverse mode."""
-    return _sums_forward(_Rule(kernel, finish), lists, points, table)
