@@ -1,8 +1,6 @@
 """Free memory, compared with the memory that a computation requires before it begins."""
 
-import math
-import os
-from pathlib import Path
+import psutil
 
 
 def check_memory(what: str, required: float, remedy: str, capacity: float | None = None) -> None:
@@ -29,18 +27,12 @@ def free_bytes() -> float:
     """Read how much memory this process may still take: the free memory of the machine, within the
     limit of the address space.
     """
+    free = float(psutil.virtual_memory().available)
     try:
         import resource  # not on Windows
     except ImportError:
-        return math.inf
-    page = os.sysconf("SC_PAGE_SIZE")
-    free = float(page * os.sysconf("SC_PHYS_PAGES"))
-    try:
-        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
-        taken = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0]) * page
-    except OSError:  # not on Linux
         return free
-    available = [line.split()[1] for line in lines if line.startswith("MemAvailable:")]
-    free = min(free, *(1024.0 * int(kilobytes) for kilobytes in available))
     limit = resource.getrlimit(resource.RLIMIT_AS)[0]
-    return free if limit == resource.RLIM_INFINITY else max(min(free, limit - taken), 0.0)
+    if limit == resource.RLIM_INFINITY:
+        return free
+    return max(min(free, limit - psutil.Process().memory_info().vms), 0.0)

@@ -107,8 +107,7 @@ def plot_fit(
         residual.set_ylim(1.3 * min(counts.min(), -1e-3), 1.3 * max(counts.max(), 1e-3))
     for axis in (log.xaxis, residual.xaxis):
         axis.set_minor_formatter(NullFormatter())  # within a decade their labels would overlap
-    if title is not None:
-        figure.suptitle(title)
+    figure.suptitle(title or "")
     return figure
 
 
@@ -148,8 +147,7 @@ def plot_error_by_count(by_count: ErrorByCount, *, title: str | None = None) -> 
         axes.semilogy(counts, error[:, channel], "o-", color=color, markersize=4, linewidth=1.2)
     axes.set(xlabel="number of Gaussians", ylabel="E (Eq. 4)", xticks=counts)
     axes.grid(axis="y", color="0.9")
-    if title is not None:
-        figure.suptitle(title)
+    figure.suptitle(title or "")
     return figure
 
 
@@ -227,8 +225,7 @@ def plot_recovery(recovery: Recovery, *, title: str | None = None) -> Figure:
         figure.colorbar(image, ax=line[2], label="% of the picture", shrink=0.8)
         for ax in line:
             ax.set(xticks=[], yticks=[])
-    if title is not None:
-        figure.suptitle(title)
+    figure.suptitle(title or "")
     return figure
 
 

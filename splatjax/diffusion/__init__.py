@@ -5,18 +5,21 @@ from ._points import (
     continue_to_points as continue_to_points,
     LayersAtPoints as LayersAtPoints,
 )
-from ._clustered import ClusterDiffuser as ClusterDiffuser, ClusterPlan as ClusterPlan
-from ._clustered import FINEST as FINEST
+from ._clustered import (
+    ClusterDiffuser as ClusterDiffuser,
+    ClusterPlan as ClusterPlan,
+    FINEST as FINEST,
+)
 from ._dense import dense_layer as dense_layer, DenseDiffuser as DenseDiffuser
 from ._diffuser import (
     AbstractDiffuser as AbstractDiffuser,
     AbstractDiffusionPlan as AbstractDiffusionPlan,
     diffuse_with_derivative as diffuse_with_derivative,
     Diffused as Diffused,
+    entering_irradiance as entering_irradiance,
     LayerValues as LayerValues,
     Sources as Sources,
 )
-from ._diffuser import entering_irradiance as entering_irradiance
 from ._kernel import (
     AbstractDiffusionKernel as AbstractDiffusionKernel,
     EscapeNormalization as EscapeNormalization,

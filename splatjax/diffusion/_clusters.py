@@ -11,6 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from splatjax.splatting import round_up
+
 from ._diffuser import Sources
 
 BLOCK = 32
@@ -107,7 +109,7 @@ class ClusterTree(eqx.Module):
             of_slot[slots] = rank[parent]
             parents.append(jnp.asarray(of_slot))
             positions, facing, members = positions[order], facing[order], inside[order]
-            slots, before = np.arange(len(order)), _round_up(len(order))
+            slots, before = np.arange(len(order)), round_up(len(order), BLOCK)
             counts.append(before)
         return cls(tuple(parents), tuple(counts))
 
@@ -151,19 +153,6 @@ def _split_by_side(groups: np.ndarray, facing: np.ndarray) -> np.ndarray:
     sides = 2 * groups
     sides[chosen] += np.sum(ways * axes[own], axis=1) < 0
     return (np.cumsum(np.bincount(sides) > 0) - 1)[sides]
-
-
-def blocks_of(count: int) -> int:
-    """Round up to whole blocks."""
-    return max(-(-count // BLOCK), 1) * BLOCK
-
-
-def _round_up(count: int) -> int:
-    """Round up to the next of sixteen steps per octave and to whole blocks, so that a moving
-    surface needs no other program.
-    """
-    grain = 1 << max(count.bit_length() - 5, 0)
-    return blocks_of(-(-count // grain) * grain)
 
 
 def compact_order(points: np.ndarray) -> np.ndarray:

@@ -18,7 +18,7 @@ WIDTH = 16
 """Blocks of sources in a row of a list."""
 LANES = 64
 """Blocks of points that are swept together."""
-_AT_ONCE = 1 << 18  # pairs of boxes whose parts are tested together
+_AT_ONCE = 1 << 13  # pairs of boxes whose parts are tested together: they stay in cache
 _FAN = 4  # parts of a box of a coarser level
 
 
@@ -131,7 +131,7 @@ def find_neighbors(points: Boxes, sources: Boxes, reach: float) -> Lists:
     The number of rows is rounded up, so that nearby geometries need no other program. Not for
     traced arrays.
     """
-    of, near = _pairs_in_reach(_levels(points), _levels(sources), reach)
+    of, near = _pairs_in_reach(points, sources, reach)
     blocks, empty = points.low.shape[0], sources.low.shape[0]
     by_block = np.argsort(of, kind="stable")
     of, near = of[by_block], near[by_block]
@@ -144,58 +144,46 @@ def find_neighbors(points: Boxes, sources: Boxes, reach: float) -> Lists:
     return Lists(*(jnp.asarray(each, jnp.int32) for each in (ids, first, counts, order)))
 
 
-def _levels(boxes: Boxes) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return the corners `[3, boxes]` of boxes, and of ever coarser boxes around `_FAN` of them;
-    empty boxes fill each level.
+def _levels(boxes: Boxes, depth: int) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return the corners `[3, parents, parts]` of boxes, `_FAN` of them to a parent, and of ever
+    coarser boxes around these; empty boxes fill each level.
     """
-    levels = [(np.asarray(boxes.low).T, np.asarray(boxes.high).T)]
-    while True:
-        corners = []
-        for rows, empty in zip(levels[-1], (np.inf, -np.inf), strict=True):
-            lacking = ((0, 0), (0, -rows.shape[1] % _FAN))
-            corners.append(np.pad(rows, lacking, constant_values=empty))
-        levels[-1] = low, high = corners[0], corners[1]
-        if low.shape[1] <= _FAN:
-            return levels
-        coarser = low.reshape(3, -1, _FAN).min(axis=2), high.reshape(3, -1, _FAN).max(axis=2)
-        levels.append(coarser)
+    levels, corners = [], (np.asarray(boxes.low).T, np.asarray(boxes.high).T)
+    for _ in range(depth):
+        lacking = ((0, 0), (0, -corners[0].shape[1] % _FAN))
+        low, high = (
+            np.pad(each, lacking, constant_values=empty).reshape(3, -1, _FAN)
+            for each, empty in zip(corners, (np.inf, -np.inf), strict=True)
+        )
+        levels.append((low, high))
+        corners = low.min(axis=2), high.max(axis=2)
+    return levels
 
 
-def _pairs_in_reach(points: list, sources: list, reach: float) -> tuple[np.ndarray, np.ndarray]:
-    """Find the pairs of boxes of the finest levels that are in reach of each other."""
-    none, level = np.zeros(0, np.int32), max(len(points), len(sources)) - 1
-    found = [(none, none)]
-    own, other = (np.arange(each[-1][0].shape[1], dtype=np.int32) for each in (points, sources))
-    todo = [(level, *(each.reshape(-1) for each in np.meshgrid(own, other)))]
+def _pairs_in_reach(points: Boxes, sources: Boxes, reach: float) -> tuple[np.ndarray, np.ndarray]:
+    """Find the pairs of boxes that are in reach of each other, from coarse to fine."""
+    depth = math.ceil(math.log(max(len(points.low), len(sources.low), 2), _FAN))
+    each = zip(_levels(points, depth), _levels(sources, depth), strict=True)
+    levels = [(*of_points, *of_sources) for of_points, of_sources in each]
+    root, none = np.zeros(1, np.int32), np.zeros(0, np.int32)
+    todo, found = [(depth - 1, root, root)], [(none, none)]
     while todo:
         level, own, other = todo.pop()
-        corners = *_taken(points, level, own), *_taken(sources, level, other)
-        near = np.flatnonzero(_are_in_reach(*corners, reach))
-        own, other = own[near], other[near]
-        if level == 0:
-            found.append((own, other))
-            continue
-        for begin in range(0, len(near), _AT_ONCE):
-            part = slice(begin, begin + _AT_ONCE)
-            own_parts = _parts(points, level, own[part])[:, :, None]
-            parts = np.broadcast_arrays(own_parts, _parts(sources, level, other[part])[:, None])
-            todo.append((level - 1, *(each.reshape(-1) for each in parts)))
+        for begin in range(0, len(own), _AT_ONCE):
+            a, b = own[begin : begin + _AT_ONCE], other[begin : begin + _AT_ONCE]
+            gaps = (
+                np.maximum(
+                    low_a[a][:, :, None] - high_b[b][:, None],
+                    low_b[b][:, None] - high_a[a][:, :, None],
+                )
+                for low_a, high_a, low_b, high_b in zip(*levels[level], strict=True)
+            )
+            squared = sum(np.square(np.maximum(gap, 0)) for gap in gaps)
+            pair, part, other_part = np.nonzero(squared <= reach * reach)
+            pairs = a[pair] * _FAN + part, b[pair] * _FAN + other_part
+            if level == 0:
+                found.append(pairs)
+            else:
+                todo.append((level - 1, *pairs))
     own, other = (np.concatenate(each) for each in zip(*found, strict=True))
     return own, other
-
-
-def _taken(levels: list, level: int, boxes: np.ndarray) -> list[np.ndarray]:
-    """Read the corners of boxes of a level, of the coarsest one if there are not so many."""
-    return [rows[:, boxes] for rows in levels[min(level, len(levels) - 1)]]
-
-
-def _parts(levels: list, level: int, boxes: np.ndarray) -> np.ndarray:
-    """Return the parts of each box, of the next finer level."""
-    if level >= len(levels):
-        return boxes[:, None]
-    return boxes[:, None] * _FAN + np.arange(_FAN, dtype=boxes.dtype)
-
-
-def _are_in_reach(low_a, high_a, low_b, high_b, reach: float) -> np.ndarray:
-    apart = np.maximum(np.maximum(low_a - high_b, low_b - high_a), 0)
-    return np.sum(apart * apart, axis=0) <= reach * reach

@@ -159,24 +159,19 @@ class LayersAtPoints(eqx.Module):
           multiplied by them.
         - `single_scattering_albedo`: the fraction that leaves a flat piece as single scattering.
         """
-        layers, resolved = self._weigh(
-            gaussians.weights[:, :, None],
-            gaussians.variances[:, None, None],
-            gaussians.variances,
-            single_scattering_albedo,
-            self.means,
-            self.mass[:, None],
-        )
+        weights, variances = gaussians.weights[:, :, None], self.variances[:, None, None]
+        given = weights, variances, single_scattering_albedo, self.means, self.mass[:, None]
+        layers, resolved = self._weigh(*given)
         return layers, resolved[:, 0]
 
-    def _weigh(self, weights, variances, order, single_scattering_albedo, means, mass):
+    def _weigh(self, weights, variances, single_scattering_albedo, means, mass):
         resolved = resolved_fraction(variances, self.area[None, None], self.interval)
         resolved = jnp.where(mass > 0, resolved, 0.0)
         own = self.irradiance[None]
         # Splats too far apart to resolve a layer do not tell its mass either.
         gain = self.kernel.gain(
             1 + resolved * (mass - 1),
-            order,
+            self.variances,
             weights * self.albedo[None],
             single_scattering_albedo[:, None] * self.albedo,
         )
@@ -191,17 +186,19 @@ class LayersAtPoints(eqx.Module):
         - `gaussians`: with the derivative, their variances may be a little off those of the layers;
           without it they do not matter.
         """
-        variances, means, mass = self.variances, self.means, self.mass
-        if self.derivative is not None:
-            moved = jnp.log(gaussians.variances / variances)[:, None]
-            variances = gaussians.variances
-            means = means + moved[..., None] * self.derivative[0]
-            mass = jnp.maximum(mass + moved * self.derivative[1], 0)
-        weights = gaussians.weights[:, :, None]
-        none = jnp.zeros(weights.shape[1], weights.dtype)
-        layers, _ = self._weigh(
-            weights, variances[:, None, None], variances, none, means, mass[:, None]
-        )
+        weights, variances = gaussians.weights[:, :, None], gaussians.variances[:, None, None]
+        return self._exitance(weights, variances, jnp.zeros_like(weights[0, :, 0]))
+
+    def _exitance(self, weights, variances, single_scattering_albedo):
+        own = self.variances[:, None, None]
+        means, mass = self.means, self.mass[:, None]
+        if self.derivative is None:
+            variances = own
+        else:
+            moved = jnp.log(variances / own)
+            means = means + moved * self.derivative[0]
+            mass = jnp.maximum(mass + moved * self.derivative[1][:, None], 0)
+        layers, _ = self._weigh(weights, variances, single_scattering_albedo, means, mass)
         return jnp.sum(weights * layers, axis=0)
 
     def exitance_jacobian(
@@ -216,19 +213,12 @@ class LayersAtPoints(eqx.Module):
         """
         if self.derivative is None:
             raise ValueError("derivative is None; compute the layers with derivative=True")
-        shape, variances = self.means.shape, gaussians.variances
         # Every point and channel has numbers of its own, so that one derivative is that of all.
-        own = (gaussians.weights[:, :, None], variances[:, None, None], self.means)
-        own = tuple(jnp.broadcast_to(each, shape) for each in (*own, self.mass[:, None]))
+        own = gaussians.weights[:, :, None], gaussians.variances[:, None, None]
+        own = tuple(jnp.broadcast_to(each, self.means.shape) for each in own)
 
-        def exitance(weights, own_variances, means, mass):
-            layers, _ = self._weigh(
-                weights, own_variances, variances, single_scattering_albedo, means, mass
-            )
-            return jnp.sum(weights * layers, axis=0)
+        def exitance(weights, variances):
+            return self._exitance(weights, variances, single_scattering_albedo)
 
         total, pull = jax.vjp(exitance, *own)
-        of_weights, of_variances, of_means, of_mass = pull(jnp.ones_like(total))
-        means, mass = self.derivative
-        through = (of_means * means + of_mass * mass[:, None]) / variances[:, None, None]
-        return of_weights, of_variances + through
+        return pull(jnp.ones_like(total))

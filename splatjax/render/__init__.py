@@ -5,13 +5,20 @@ from ._basis import diffusion_basis as diffusion_basis, DiffusionBasis as Diffus
 from ._devices import map_over as map_over
 from ._checks import check_displayable as check_displayable, check_scene as check_scene
 from ._jacobian import picture_jacobian as picture_jacobian, PictureJacobian as PictureJacobian
-from ._lighting import AbstractLighting as AbstractLighting, entering_light as entering_light
-from ._lighting import Irradiance as Irradiance, LightAtSplats as LightAtSplats
-from ._lighting import LightVisibility as LightVisibility, surface_attributes as surface_attributes
+from ._lighting import (
+    AbstractLighting as AbstractLighting,
+    entering_light as entering_light,
+    Irradiance as Irradiance,
+    LightAtSplats as LightAtSplats,
+    LightVisibility as LightVisibility,
+    surface_attributes as surface_attributes,
+)
 from ._passes import SplatLight as SplatLight
-from ._plan import make_plan as make_plan, Plan as Plan
-from ._render import compute_irradiance as compute_irradiance
-from ._render import diffuse_irradiance as diffuse_irradiance, illuminate as illuminate
-from ._render import render as render
-from ._plan import RenderSettings as RenderSettings
+from ._plan import make_plan as make_plan, Plan as Plan, RenderSettings as RenderSettings
+from ._render import (
+    compute_irradiance as compute_irradiance,
+    diffuse_irradiance as diffuse_irradiance,
+    illuminate as illuminate,
+    render as render,
+)
 from ._streamed import render_streamed as render_streamed

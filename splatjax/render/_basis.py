@@ -10,7 +10,7 @@ from splatjax.diffusion import LayersAtPoints
 from splatjax.gaussians import SumOfGaussians
 from splatjax.scene import Camera, Scene
 
-from ._checks import check_channels, in_one_dtype
+from ._checks import in_one_dtype
 from ._devices import on_devices
 from ._passes import in_a_row, light_splats, look
 from ._plan import Plan, RenderSettings, plan_unless_traced
@@ -82,7 +82,6 @@ def diffusion_basis(
     **Raises:** `ValueError` as `render`, and for a material with single scattering, beside which
     the light that enters depends on the weights.
     """
-    check_channels(scene)
     if scene.material.single_scattering is not None:
         raise ValueError(
             "scene.material has single scattering, beside which less light enters as the weights "

@@ -26,18 +26,21 @@ _RATIO = 1000.0
 
 
 def check_scene(scene: Scene, camera: Camera, is_lit: bool = True) -> None:
-    r"""Refuse a picture that does not fit into memory, and warn of what makes it black or
-    meaningless: no light, inverted normals, a camera inside the body, a body a thousand times
-    larger or smaller than the length scale of its material.
+    r"""Refuse a picture whose channels disagree or that does not fit into memory, and warn of what
+    makes it black or meaningless: no light, inverted normals, a camera inside the body, a body a
+    thousand times larger or smaller than the length scale of its material.
 
-    Traced scenes pass, and those spread over several processes. Each warning is shown once.
+    Of traced scenes, and of those spread over several processes, only the channels are checked.
+    Each warning is shown once.
 
     **Arguments:**
 
     - `is_lit`: false where the irradiance is given and the lights do not matter.
 
-    **Raises:** `ValueError` when the memory of the device does not suffice.
+    **Raises:** `ValueError` when the channels disagree, or the memory of the device does not
+    suffice.
     """
+    check_channels(scene)
     leaves = [leaf for leaf in jax.tree.leaves((scene, camera)) if isinstance(leaf, jax.Array)]
     if any(isinstance(leaf, Tracer) or not leaf.is_fully_addressable for leaf in leaves):
         return

@@ -15,7 +15,7 @@ from splatjax.gaussians import SumOfGaussians
 from splatjax.scene import Camera, Frame, Scene
 
 from ._attributes import SurfaceSamples
-from ._checks import check_channels, in_one_dtype
+from ._checks import in_one_dtype
 from ._devices import on_devices
 from ._lighting import LightAtSplats
 from ._passes import light_splats, look
@@ -112,7 +112,6 @@ def picture_jacobian(
     **Raises:** `ValueError` as `render`, and for a material with single scattering under light that
     is not found at the splats.
     """
-    check_channels(scene)
     if scene.material.single_scattering is not None and not isinstance(
         settings.lighting, LightAtSplats
     ):

@@ -49,7 +49,6 @@ def render(
     **Raises:** `ValueError` when a plan is needed and not given, or is for another mesh or another
     number of splats, or when the scene's channels disagree.
     """
-    check_channels(scene)
     plan = plan_unless_traced(scene, camera, settings, plan, mesh)
     return _render(scene, camera, settings, plan, light)
 
@@ -165,7 +164,6 @@ def diffuse_irradiance(
 
     **Raises:** `ValueError` when a plan is needed and not given, or when the channels disagree.
     """
-    check_channels(scene)
     channels = scene.material.gaussians.weights.shape[1]
     if irradiance.shape[1] != channels:
         raise ValueError(

@@ -2,17 +2,29 @@
 scattering.
 """
 
-from ._bins import BinCapacity as BinCapacity, bin_items as bin_items, Bins as Bins
-from ._bins import round_up as round_up, scatter_slots as scatter_slots, slot_plane as slot_plane
+from ._bins import (
+    bin_items as bin_items,
+    BinCapacity as BinCapacity,
+    Bins as Bins,
+    round_up as round_up,
+    scatter_slots as scatter_slots,
+    slot_plane as slot_plane,
+)
 from ._dense import DenseRasterizer as DenseRasterizer
-from ._views import Footprints as Footprints, SplattingSettings as SplattingSettings
+from ._views import (
+    AbstractView as AbstractView,
+    Footprints as Footprints,
+    SplattingSettings as SplattingSettings,
+)
 from ._grid import SIDE as SIDE, TileGrid as TileGrid, TileRanges as TileRanges
 from ._kernel import coverage as coverage, fragment_weight as fragment_weight
-from ._projections import OrthographicView as OrthographicView
-from ._projections import PerspectiveView as PerspectiveView
-from ._rasterizer import AbstractRasterizer as AbstractRasterizer
-from ._rasterizer import AbstractRasterPlan as AbstractRasterPlan, FragmentSums as FragmentSums
-from ._rasterizer import PixelSums as PixelSums
+from ._projections import OrthographicView as OrthographicView, PerspectiveView as PerspectiveView
+from ._rasterizer import (
+    AbstractRasterizer as AbstractRasterizer,
+    AbstractRasterPlan as AbstractRasterPlan,
+    FragmentSums as FragmentSums,
+    PixelSums as PixelSums,
+)
 from ._shadows import (
     Bounds as Bounds,
     compute_visibility as compute_visibility,
@@ -25,9 +37,12 @@ from ._shadows import (
     ShadowSettings as ShadowSettings,
     stack_views as stack_views,
 )
-from ._surfaces import blend_fragments as blend_fragments, Surface as Surface
-from ._surfaces import TILES_AT_ONCE as TILES_AT_ONCE, visible_surfaces as visible_surfaces
-from ._surfaces import VisibleSurfaces as VisibleSurfaces
+from ._surfaces import (
+    blend_fragments as blend_fragments,
+    Surface as Surface,
+    TILES_AT_ONCE as TILES_AT_ONCE,
+    visible_surfaces as visible_surfaces,
+    VisibleSurfaces as VisibleSurfaces,
+)
 from ._sweeps import PartSweep as PartSweep, sum_parts as sum_parts
 from ._tiles import TilePlan as TilePlan, TileRasterizer as TileRasterizer
-from ._views import AbstractView as AbstractView
