@@ -16,7 +16,7 @@ SOURCES = 8
 """Sources of a block."""
 WIDTH = 16
 """Blocks of sources in a row of a list."""
-LANES = 64
+LANES = 128
 """Blocks of points that are swept together."""
 _AT_ONCE = 1 << 13  # pairs of boxes whose parts are tested together: they stay in cache
 _FAN = 4  # parts of a box of a coarser level
