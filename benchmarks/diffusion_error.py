@@ -143,7 +143,9 @@ def main() -> None:
         off = deviations(found[resolved], truth[resolved])
         order = np.empty(splats.count, int)
         order[np.asarray(plan.order)[np.asarray(plan.exists)]] = np.flatnonzero(plan.exists)
-        means = np.stack([np.asarray(diffused.layers[k].means)[:, order[chosen]] for k in resolved])
+        means = np.stack(
+            [np.asarray(diffused.layers[k].values[:-1])[:, order[chosen]] for k in resolved]
+        )
         off_at_splats = deviations(means, means_at_splats[resolved])
         print(
             f"error={error:g}: pass 4 {1e3 * seconds:.0f} ms, at all splats "

@@ -14,7 +14,7 @@ import numpy as np
 import splatjax as sj
 from splatjax import diffusion
 from splatjax.baselines import layer_contrast
-from splatjax.diffusion._clusters import Clusters, ClusterTree
+from splatjax.diffusion._clusters import ClusterTree
 
 from .scenes import columns
 
@@ -54,7 +54,7 @@ def layer(points, centers, areas, source, variance):
 
 
 @jax.jit
-def merged_layer(points, clusters: Clusters, variance):
+def merged_layer(points, clusters: diffusion.Sources, variance):
     """The same over clusters, each as wide as its splats are spread."""
     below = clusters.lowered(DEPTH * jnp.sqrt(variance))
     widths = variance + below.spread

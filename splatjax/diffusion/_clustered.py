@@ -16,7 +16,7 @@ from splatjax._chunking import zeros_after
 from splatjax._combination import AbstractCombination
 from splatjax.scene import Splats
 
-from ._clusters import BLOCK, Clusters, ClusterTree
+from ._clusters import BLOCK, ClusterTree
 from ._diffuser import (
     AbstractDiffuser,
     AbstractDiffusionPlan,
@@ -175,7 +175,7 @@ class ClusterPlan(AbstractDiffusionPlan):
         # Every device gathers the sources of all, and evaluates the layers at its own splats.
         everywhere = combination.gather_last(sources)
         origin = stop_gradient(jnp.mean(everywhere.centers, axis=1))[:, None]
-        levels: list[Clusters] = []
+        levels: list[Sources] = []
         if any(layer.neighbors is not None for layer in self.layers):
             centered = dataclasses.replace(everywhere, centers=everywhere.centers - origin)
             levels = self.tree.levels(centered)
@@ -247,7 +247,7 @@ def divided(
 
 
 def layer_table(
-    below: Clusters,
+    below: Sources,
     variance: Float[Array, ""],
     depth: Float[Array, ""],
     truncated: TruncatedGaussian,
@@ -273,7 +273,7 @@ def _target_boxes(points: Float[Array, "3 points"]) -> Boxes:
 
 
 @eqx.filter_jit
-def _levels(tree: ClusterTree, sources: Sources) -> tuple[Float[Array, "3"], list[Clusters]]:
+def _levels(tree: ClusterTree, sources: Sources) -> tuple[Float[Array, "3"], list[Sources]]:
     """Compute the mean of the centers, and the clusters of every level about it."""
     origin = jnp.mean(sources.centers, axis=1)
     centered = dataclasses.replace(sources, centers=sources.centers - origin[:, None])
@@ -281,13 +281,13 @@ def _levels(tree: ClusterTree, sources: Sources) -> tuple[Float[Array, "3"], lis
 
 
 @eqx.filter_jit
-def source_boxes(clusters: Clusters, depth: Float[Array, ""]) -> Boxes:
+def source_boxes(clusters: Sources, depth: Float[Array, ""]) -> Boxes:
     """Enclose the sources of a layer."""
     return Boxes.around(clusters.lowered(depth).centers, clusters.areas > 0, SOURCES)
 
 
 def _sources_in_reach(
-    clusters: Clusters, kernel: AbstractDiffusionKernel, variance, largest, support: float
+    clusters: Sources, kernel: AbstractDiffusionKernel, variance, largest, support: float
 ) -> tuple[Boxes, Float[Array, ""]]:
     """Enclose the sources of a layer, and compute how near they are, mm; 0 without support."""
     depths = kernel.depths(jnp.stack([variance, largest]))

@@ -2,11 +2,9 @@
 4.2, Figure 5).
 """
 
-import dataclasses
 from collections.abc import Sequence
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -18,43 +16,6 @@ from ._diffuser import Sources
 BLOCK = 32
 """Points of one block; blocks, and their halves and quarters, are compact."""
 _TOGETHER = 128 * BLOCK  # split side by side from here on
-
-
-class Clusters(eqx.Module):
-    """Sources that stand for one or more splats. An empty one has no area.
-
-    **Attributes:**
-
-    - `centers`, `normals`: means over the area; mean normals are shorter than one where the surface
-      bends.
-    - `areas`, `irradiance`: sums of the areas, mm^2, and means over them.
-    """
-
-    centers: Float[Array, "3 clusters"]
-    normals: Float[Array, "3 clusters"]
-    areas: Float[Array, " clusters"]
-    irradiance: Float[Array, "channels clusters"]
-
-    @classmethod
-    def of(cls, sources: Sources) -> "Clusters":
-        """Take each splat as a cluster of its own."""
-        return cls(sources.centers, sources.normals, sources.areas, sources.irradiance)
-
-    def lowered(self, depth: Float[Array, ""]) -> "Clusters":
-        """Move every cluster against its normal by `depth` (mm)."""
-        return dataclasses.replace(self, centers=self.centers - depth * self.normals)
-
-    def merged(self, parents: Int[Array, " clusters"], count: int) -> "Clusters":
-        """Merge into `count` parents. Area and energy are kept. Differentiable."""
-
-        def totals(rows: Float[Array, "rows clusters"]) -> Float[Array, "rows parents"]:
-            return jax.vmap(lambda row: jax.ops.segment_sum(row, parents, count))(rows)
-
-        # Means over the area of the children.
-        areas = totals(self.areas[None])[0]
-        rows = jnp.concatenate([self.centers, self.normals, self.irradiance])
-        means = totals(self.areas[None] * rows) / jnp.where(areas > 0, areas, 1.0)[None]
-        return Clusters(means[:3], means[3:6], areas, means[6:])
 
 
 class ClusterTree(eqx.Module):
@@ -122,9 +83,9 @@ class ClusterTree(eqx.Module):
         )
         return ClusterTree(parents, tuple(counts))
 
-    def levels(self, sources: Sources) -> list[Clusters]:
+    def levels(self, sources: Sources) -> list[Sources]:
         """Compute the clusters of every level, the splats themselves first."""
-        levels = [Clusters.of(sources)]
+        levels = [sources]
         for parents, count in zip(self.parents, self.counts, strict=True):
             levels.append(levels[-1].merged(parents, count))
         return levels

@@ -3,6 +3,7 @@
 """
 
 import abc
+import dataclasses
 from collections.abc import Callable
 
 import equinox as eqx
@@ -17,12 +18,36 @@ from ._kernel import AbstractDiffusionKernel
 
 
 class Sources(eqx.Module):
-    """The splats as sources of diffused light."""
+    """The splats as sources of diffused light, or clusters that stand for several of them. An empty
+    cluster has no area.
 
-    centers: Float[Array, "3 splats"]
-    normals: Float[Array, "3 splats"]
-    areas: Float[Array, " splats"]
-    irradiance: Float[Array, "channels splats"]
+    **Attributes:**
+
+    - `centers`, `normals`: of clusters means over the area; mean normals are shorter than one where
+      the surface bends.
+    - `areas`, `irradiance`: of clusters sums of the areas, mm^2, and means over them.
+    """
+
+    centers: Float[Array, "3 sources"]
+    normals: Float[Array, "3 sources"]
+    areas: Float[Array, " sources"]
+    irradiance: Float[Array, "channels sources"]
+
+    def lowered(self, depth: Float[Array, ""]) -> "Sources":
+        """Move every source against its normal by `depth` (mm)."""
+        return dataclasses.replace(self, centers=self.centers - depth * self.normals)
+
+    def merged(self, parents: Int[Array, " sources"], count: int) -> "Sources":
+        """Merge into `count` parents. Area and energy are kept. Differentiable."""
+
+        def totals(rows: Float[Array, "rows sources"]) -> Float[Array, "rows parents"]:
+            return jax.vmap(lambda row: jax.ops.segment_sum(row, parents, count))(rows)
+
+        # Means over the area of the children.
+        areas = totals(self.areas[None])[0]
+        rows = jnp.concatenate([self.centers, self.normals, self.irradiance])
+        means = totals(self.areas[None] * rows) / jnp.where(areas > 0, areas, 1.0)[None]
+        return Sources(means[:3], means[3:6], areas, means[6:])
 
 
 class LayerValues(eqx.Module):
@@ -38,14 +63,6 @@ class LayerValues(eqx.Module):
 
     values: Float[Array, "values points"]
     slopes: Float[Array, "values 3 points"]
-
-    @property
-    def means(self) -> Float[Array, "channels points"]:
-        return self.values[:-1]
-
-    @property
-    def mass(self) -> Float[Array, " points"]:
-        return self.values[-1]
 
 
 class Diffused(eqx.Module):

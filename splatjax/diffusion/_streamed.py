@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 from splatjax._combination import PartByPart
 
 from ._clustered import ClusterDiffuser, in_sums, layer_table, source_boxes
-from ._clusters import BLOCK, Clusters, ClusterTree, compact_order
+from ._clusters import BLOCK, ClusterTree, compact_order
 from ._diffuser import Sources
 from ._gaussian_sums import FAR, gaussian_sums, identity
 from ._kernel import AbstractDiffusionKernel, TruncatedGaussian
@@ -122,7 +122,7 @@ class StreamedDiffusion:
             for i, each in enumerate(self.layers)
         ]
 
-    def _sum_layer(self, i: int, layer: _Layer, levels: list[Clusters]) -> Array:
+    def _sum_layer(self, i: int, layer: _Layer, levels: list[Sources]) -> Array:
         clusters = levels[self.cells.index(layer.edge) + 1 if layer.edge else 0]
         reach = layer.support * math.sqrt(float(layer.variance))
         lists = find_neighbors(self.boxes, source_boxes(clusters, layer.depth), reach)
@@ -134,12 +134,12 @@ class StreamedDiffusion:
 
 
 @eqx.filter_jit
-def _levels(tree: ClusterTree, sources: Sources) -> list[Clusters]:
+def _levels(tree: ClusterTree, sources: Sources) -> list[Sources]:
     return tree.levels(sources)
 
 
 @eqx.filter_jit
-def _sum(points, clusters: Clusters, layer: _Layer, lists: Lists) -> Array:
+def _sum(points, clusters: Sources, layer: _Layer, lists: Lists) -> Array:
     below = clusters.lowered(layer.depth)
     table = layer_table(below, layer.variance, layer.depth, layer.truncated, slopes=False)
     blocks = points * in_sums(layer.variance)

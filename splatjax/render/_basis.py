@@ -9,6 +9,7 @@ from jaxtyping import Array, Float, Int
 from splatjax.diffusion import LayersAtPoints
 from splatjax.gaussians import SumOfGaussians
 from splatjax.scene import Camera, Scene
+from splatjax.splatting import invalid_factor
 
 from ._checks import in_one_dtype
 from ._devices import on_devices
@@ -115,12 +116,12 @@ def _diffusion_basis(
             kernel=settings.kernel,
             derivative=(slopes[0], slopes[1]) if derivative else None,
         )
-        x, y = visible.pixels(visible.tiles)
+        x, y = visible.grid.columns_and_rows(visible.tiles)
         x, y = jnp.minimum(x, camera.width - 1), jnp.minimum(y, camera.height - 1)
         in_front = jnp.broadcast_to(visible.in_front[:, None], x.shape)
         return DiffusionBasis(
             light=light,
-            leaving=visible.invalid_factor * visible.share.reshape(1, -1) * post,
+            leaving=invalid_factor(visible.needed) * visible.share.reshape(1, -1) * post,
             pixels=(y * camera.width + x).reshape(-1),
             in_front=in_front.reshape(-1).astype(post.dtype),
             specular=visible.picture(specular),

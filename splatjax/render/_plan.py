@@ -144,18 +144,12 @@ def make_plan(
 
 def fill_up(splats: Splats, count: int) -> Splats:
     """Add splats that are invisible and bring no light, up to `count`."""
-    lacking = count - splats.count
-    if lacking == 0:
+    if splats.count == count:
         return splats
     if splats.count == 0:
-        return jax.tree.map(lambda leaf: jnp.zeros((lacking, *leaf.shape[1:]), leaf.dtype), splats)
-    last = jax.tree.map(
-        lambda leaf: jnp.broadcast_to(leaf[-1:], (lacking, *leaf.shape[1:])), splats
-    )
-    last = eqx.tree_at(
-        lambda each: (each.normals, each.radii, each.areas), last, replace_fn=jnp.zeros_like
-    )
-    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), splats, last)
+        return jax.tree.map(lambda leaf: jnp.zeros((count, *leaf.shape[1:]), leaf.dtype), splats)
+    every = jnp.arange(count, dtype=jnp.int32)
+    return arrange(splats, jnp.minimum(every, splats.count - 1), every < splats.count)
 
 
 def arrange(splats: Splats, order: Int[Array, " places"], exists: Bool[Array, " places"]) -> Splats:

@@ -143,8 +143,8 @@ def compose(
     front, picture = visible.front_picture, visible.picture
     diffuse, specular = picture(shaded.diffuse), picture(shaded.specular)
     single = None if shaded.single_scattering is None else picture(shaded.single_scattering)
-    drawn = (visible.share > 0) & visible.in_front[:, None]
-    drawn = drawn.astype(shaded.depth.dtype)
+    invalid = _splatting.invalid_factor(visible.needed)
+    drawn = ((visible.share > 0) & visible.in_front[:, None]).astype(invalid.dtype)
     unresolved = jnp.sum((1 - shaded.resolved) * drawn[:, None], axis=(0, 2))
     return Frame(
         beauty=diffuse + specular if single is None else diffuse + single + specular,
@@ -159,7 +159,7 @@ def compose(
         weights=scene.material.gaussians.weights,
         diffuse=diffuse,
         specular=specular,
-        unresolved_fraction=visible.invalid_factor * unresolved / jnp.maximum(jnp.sum(drawn), 1),
+        unresolved_fraction=invalid * unresolved / jnp.maximum(jnp.sum(drawn), 1),
         overflow=visible.overflow,
         single_scattering=single,
     )

@@ -32,17 +32,12 @@ class ReplayableStream:
         marks = []
         for part in self.parts():
             marks.append(np.asarray(_mark(part)))
-            self._check(marks)
+            expected = marks if self.marks is None else self.marks[: len(marks)]
+            if not np.array_equal(marks[-1:], expected[len(marks) - 1 :], equal_nan=True):
+                raise ValueError(_CHANGED)
             yield part
         self.marks = marks if self.marks is None else self.marks
         if len(marks) != len(self.marks):
-            raise ValueError(_CHANGED)
-
-    def _check(self, marks: list[np.ndarray]) -> None:
-        if self.marks is None:
-            return
-        expected = self.marks[len(marks) - 1 : len(marks)]
-        if not np.array_equal(marks[-1:], expected, equal_nan=True):
             raise ValueError(_CHANGED)
 
 
@@ -57,14 +52,13 @@ class StreamStatistics:
 
     **Attributes:**
 
-    - `count`, `rows`: splats in all, and in every part but the last.
+    - `rows`: splats in every part but the last.
     - `middle`, `reach`: of the box around all centers, and from there to the farthest rim.
     - `spacing`: root of the mean area.
     - `fine`: area that one splat in a hundred is finer than.
     - `unevenness`: the mean over the splats of that of their part.
     """
 
-    count: int
     rows: int
     middle: np.ndarray
     reach: float
@@ -107,7 +101,6 @@ class StreamStatistics:
                 finest = np.sort(np.concatenate([finest, np.asarray(part.areas)]))[: int(rank) + 2]
                 uneven.append(float(_diffusion.unevenness(part)))
         return cls(
-            count=count,
             rows=sizes[0],
             middle=middle,
             reach=math.sqrt(farthest) + radius,

@@ -174,26 +174,17 @@ def _table(
     """
     (table, in_mu, in_roughness), chebder = key, np.polynomial.chebyshev.chebder
     coefficients = chebder(chebder(_tables()[0][table], in_mu, axis=0), in_roughness, axis=1)
+
+    def over_mu(t: Float[Array, " points"]) -> list[Float[Array, " points"]]:
+        rows = list(jnp.asarray(coefficients.T, t.dtype)[:, :, None])
+        return list(_chebyshev(rows, jnp.broadcast_to(t, (len(coefficients), *t.shape))))
+
     if t.ndim == 0:
-        over_mu = list(
-            _chebyshev(
-                list(jnp.asarray(coefficients.T, t.dtype)),
-                jnp.broadcast_to(t, (len(coefficients),)),
-            )
-        )
-        return map_chunks(lambda x: _chebyshev(over_mu, x), x.reshape(-1)).reshape(x.shape)
+        own = over_mu(t[None])
+        return map_chunks(lambda x: _chebyshev(own, x), x.reshape(-1)).reshape(x.shape)
     x, t = jnp.broadcast_arrays(x, t)
-    rows = jnp.asarray(coefficients, t.dtype)
-
-    def clenshaw(carry, row):
-        last, before = carry
-        return (2 * x * last - before + _chebyshev(list(row), t), last), None
-
-    # A loop over the rows: written out, they would be a thousand operations for every use.
-    (last, before), _ = jax.lax.scan(
-        clenshaw, (jnp.zeros_like(x), jnp.zeros_like(x)), rows[1:], reverse=True
-    )
-    return x * last - before + _chebyshev(list(rows[0]), t)
+    flat = x.reshape(-1), t.reshape(-1)
+    return map_chunks(lambda x, t: _chebyshev(over_mu(t), x), *flat).reshape(x.shape)
 
 
 @_table.defjvp

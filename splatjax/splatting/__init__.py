@@ -23,6 +23,7 @@ from ._rasterizer import (
     AbstractRasterizer as AbstractRasterizer,
     AbstractRasterPlan as AbstractRasterPlan,
     FragmentSums as FragmentSums,
+    invalid_factor as invalid_factor,
     PixelSums as PixelSums,
 )
 from ._shadows import (

@@ -115,11 +115,6 @@ class VisibleSurfaces(eqx.Module):
         return jnp.where(self.needed <= 1, 0.0, self.needed)
 
     @property
-    def invalid_factor(self) -> Float[Array, ""]:
-        """The factor of every picture: 1, or NaN where the plan does not suffice."""
-        return invalid_factor(self.needed)
-
-    @property
     def grid(self) -> TileGrid:
         return TileGrid(self.view.width, self.view.height)
 
@@ -138,17 +133,11 @@ class VisibleSurfaces(eqx.Module):
         parts = combination.gather((*places, PixelSums(sums.rows[:, :0], sums.weights)))
         return eqx.tree_at(of_places, self, parts)
 
-    def pixels(
-        self, tiles: Int[Array, " some"]
-    ) -> tuple[Int[Array, "some pixels"], Int[Array, "some pixels"]]:
-        """Return column and row of every pixel of some tiles of either surface."""
-        return self.grid.columns_and_rows(tiles)
-
     def points(
         self, tiles: Int[Array, " some"], depth: Float[Array, "some pixels"]
     ) -> Float[Array, "some 3 pixels"]:
         """Compute the points (mm) that pixels see at a depth (mm). Differentiable."""
-        x, y = (each.astype(depth.dtype) + 0.5 for each in self.pixels(tiles))
+        x, y = (each.astype(depth.dtype) + 0.5 for each in self.grid.columns_and_rows(tiles))
         return jnp.moveaxis(self.view.unproject(x, y, depth), 0, 1)
 
     def front_picture(
@@ -172,7 +161,7 @@ class VisibleSurfaces(eqx.Module):
     ) -> Float[Array, "height width *rows"]:
         flat = tiles.reshape(tiles.shape[0], -1, tiles.shape[-1])
         picture = jnp.moveaxis(self.grid.join(flat), 0, 2)
-        return self.invalid_factor * picture.reshape(*picture.shape[:2], *tiles.shape[1:-1])
+        return invalid_factor(self.needed) * picture.reshape(*picture.shape[:2], *tiles.shape[1:-1])
 
 
 def visible_surfaces(

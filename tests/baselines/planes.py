@@ -76,4 +76,6 @@ def gathered(
         dense_layer(sources, places, variance, depth)
         for variance, depth in zip(variances, kernel.depths(variances), strict=True)
     ]
-    return jnp.stack([each.means for each in layers]), jnp.stack([each.mass for each in layers])
+    return jnp.stack([each.values[:-1] for each in layers]), jnp.stack(
+        [each.values[-1] for each in layers]
+    )
