@@ -53,20 +53,6 @@ def layer(points, centers, areas, source, variance):
     return jax.lax.map(some, points.reshape(-1, AT_ONCE, 3)).reshape(len(points), -1)
 
 
-@jax.jit
-def merged_layer(points, clusters: diffusion.Sources, variance):
-    """The same over clusters, each as wide as its splats are spread."""
-    below = clusters.lowered(DEPTH * jnp.sqrt(variance))
-    widths = variance + below.spread
-
-    def some(x):
-        squared = jnp.sum((x[:, None] - below.centers.T[None]) ** 2, axis=2)
-        weight = below.areas / widths * jnp.exp(-0.5 * squared / widths)
-        return (weight @ below.irradiance.T) / jnp.sum(weight, axis=1, keepdims=True)
-
-    return jax.lax.map(some, points.reshape(-1, AT_ONCE, 3)).reshape(len(points), -1)
-
-
 def body(name: str, count: int) -> sj.Splats:
     if name == "bust":
         return sj.bust(count)
@@ -137,7 +123,9 @@ def errors(splats: sj.Splats) -> list[tuple[str, float, float]]:
                 )
                 clusters = tree.levels(sources)[1]
                 kept = float(jnp.sum(clusters.areas > 0)) / splats.count
-                merged = merged_layer(points - middle[None], clusters, variance)
+                lowered = clusters.lowered(DEPTH * jnp.sqrt(variance)).centers.T
+                given = lowered, clusters.areas, clusters.irradiance.T, variance
+                merged = layer(points - middle[None], *given)
                 record("merged", kept, [error(merged)], 1.75)
     return found
 
