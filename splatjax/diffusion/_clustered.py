@@ -55,6 +55,48 @@ class LayerPlan(eqx.Module):
     largest: Float[Array, ""]
     neighbors: Neighbors | None
 
+    def evaluate(
+        self,
+        levels: Sequence[Sources],
+        points: Float[Array, "3 splats"],
+        variance: Float[Array, ""],
+        depth: Float[Array, ""],
+        kernel: AbstractDiffusionKernel,
+        at: Int[Array, " points"] | None,
+    ) -> tuple[LayerValues | None, Float[Array, ""]]:
+        """Evaluate the layer at all splats, or at some of them.
+
+        **Arguments:**
+
+        - `levels`: the clusters of every level.
+        - `points`: the centers of the splats.
+        - `depth`: how far below its splat a source lies, mm.
+
+        **Returns:** the layer, and the capacity needed over planned.
+        """
+        smallest, largest = (each.astype(variance.dtype) for each in (self.smallest, self.largest))
+        needed = jnp.maximum(smallest / variance, variance / largest) * (1 - 1e-6)
+        if self.neighbors is None:
+            return None, needed
+        # Sink the sources, and sum over those near each block of points.
+        below, truncated = levels[self.level].lowered(depth), kernel.truncated(self.support)
+        table = layer_table(below, variance, depth, truncated)
+        blocks = (points * units_per_mm(variance)).reshape(3, -1, BLOCK).transpose(1, 0, 2)
+        lists = self.neighbors.lists if at is None else self.neighbors.lists.only(at // BLOCK)
+        values = gaussian_sums(blocks, table, lists, truncated, divided)
+        if at is None:
+            rows = values.transpose(1, 0, 2).reshape(values.shape[1], -1)
+        else:
+            rows = _take_from_blocks(values, at)
+        reach = self.neighbors.needed(
+            _target_boxes(points),
+            source_boxes(below),
+            self.support * stop_gradient(jnp.sqrt(variance)),
+        )
+        # Slopes are moments in mm over v, and the moments are in units of sqrt(2 v).
+        layer = split_layer(rows, 2 * units_per_mm(variance))
+        return layer, jnp.maximum(needed, reach.astype(needed.dtype))
+
 
 class ClusterDiffuser(AbstractDiffuser):
     r"""Sums over the splats near each splat; for layers wider than about 2.2 spacings, over
@@ -62,10 +104,10 @@ class ClusterDiffuser(AbstractDiffuser):
 
     **Attributes:** (static)
 
-    - `error`: the error of half of the points of a layer, of the layer's root mean square, where
-      light changes much within the layer's width; one point in a hundred errs five times as much.
-      Half of it is the power beyond the support of a layer. 0 merges no splats and truncates 4e-5
-      of the power.
+    - `error`: median error of a layer over its points, relative to the layer's root mean square,
+      for light that varies within the layer's width; the 99th percentile is five times as large.
+      Half of it is spent on truncation. With 0, nothing is merged and 4e-5 of the power is
+      truncated.
     - `margin`: a plan holds while the variances stay within this factor of those it was made for.
     """
 
@@ -98,13 +140,13 @@ class ClusterDiffuser(AbstractDiffuser):
             [jnp.asarray(size * factor, variances.dtype) for size in sizes]
             for factor in (1 / self.margin, self.margin)
         )
-        # The search is NumPy's, and runs beside that for the other layers. (JAX's precision may
-        # be that of one thread.)
         points = [_target_boxes(part.centers.T - origin[:, None]) for part in parts]
         sources = [
-            _sources_in_reach(clusters[levels[i]], kernel, variances[i], largest[i], supports[i])
+            _boxes_and_reach(clusters[levels[i]], kernel, variances[i], largest[i], supports[i])
             for i in range(len(sizes))
         ]
+        # Search all layers in parallel. Only NumPy computes in the threads, since JAX's precision
+        # may be set for one thread.
         with ThreadPoolExecutor() as pool:
             lists = pool.map(lambda each: _find(points, each[0], np.asarray(each[1])), sources)
         whole = jax.tree.map(lambda *rows: jnp.concatenate(rows), *points)
@@ -180,44 +222,14 @@ class ClusterPlan(AbstractDiffusionPlan):
             centered = dataclasses.replace(everywhere, centers=everywhere.centers - origin)
             levels = self.tree.levels(centered)
         points = sources.centers - origin
-        values, needed = [], []
-        for layer, variance, depth in zip(
-            self.layers, variances, kernel.depths(variances), strict=True
-        ):
-            smallest, largest = (
-                bound.astype(variance.dtype) for bound in (layer.smallest, layer.largest)
-            )
-            needed.append(jnp.maximum(smallest / variance, variance / largest) * (1 - 1e-6))
-            if layer.neighbors is None:
-                values.append(None)
-                continue
-            given = levels[layer.level], points, variance, depth
-            found, missed = self._layer(*given, kernel, layer.support, layer.neighbors, at)
-            values.append(found)
-            needed.append(missed)
-        largest_need = jnp.max(jnp.stack(needed)) if needed else jnp.zeros((), variances.dtype)
-        return Diffused(tuple(values), combination.largest([largest_need]))
-
-    def _layer(
-        self, clusters, points, variance, depth, kernel, support, neighbors: Neighbors, at
-    ) -> tuple[LayerValues, Array]:
-        """Evaluate one layer at points; also return its need of reach over the planned one."""
-        lists = neighbors.lists if at is None else neighbors.lists.only(at // BLOCK)
-        below = clusters.lowered(depth)
-        truncated = kernel.truncated(support)
-        table = layer_table(below, variance, depth, truncated)
-        blocks = (points * in_sums(variance)).reshape(3, -1, BLOCK).transpose(1, 0, 2)
-        values = gaussian_sums(blocks, table, lists, truncated, divided)
-        if at is None:
-            found = values.transpose(1, 0, 2).reshape(values.shape[1], -1)
-        else:
-            found = _take_from_blocks(values, at)
-        needed = neighbors.needed(
-            _target_boxes(points),
-            Boxes.around(below.centers, below.areas > 0, SOURCES),
-            support * stop_gradient(jnp.sqrt(variance)),
-        )
-        return split_layer(found, 2 * in_sums(variance)), needed.astype(found.dtype)
+        depths = kernel.depths(variances)
+        evaluated = [
+            layer.evaluate(levels, points, variance, depth, kernel, at)
+            for layer, variance, depth in zip(self.layers, variances, depths, strict=True)
+        ]
+        needed = jnp.stack([jnp.zeros((), variances.dtype), *(need for _, need in evaluated)])
+        layers = tuple(layer for layer, _ in evaluated)
+        return Diffused(layers, combination.largest([jnp.max(needed)]))
 
 
 def _take_from_blocks(
@@ -242,8 +254,8 @@ def divided(
     sums: Float[Array, "rows points"], points: Float[Array, "3 points"]
 ) -> Float[Array, "values points"]:
     """Compute the rows of `layer_values` from the sums of a table with slopes."""
-    moments = sums.reshape(-1, 4, sums.shape[1])
-    return layer_values(moments[:, 0], moments[:, 1:], points)
+    light, *first_moments = sums.reshape(4, -1, sums.shape[1])
+    return layer_values(light, jnp.stack(first_moments, axis=1), points)
 
 
 def layer_table(
@@ -260,11 +272,11 @@ def layer_table(
     flat = 1 / (2 * jnp.pi * variance * truncated.integral(0.5 * depth * depth / variance))
     mass = (below.areas * flat)[None]
     light = jnp.concatenate([mass * below.irradiance, mass])
-    return SourceTable.of(below.centers * in_sums(variance), light, SOURCES, slopes)
+    return SourceTable.of(below.centers * units_per_mm(variance), light, SOURCES, slopes)
 
 
-def in_sums(variance: Float[Array, ""]) -> Float[Array, ""]:
-    """Compute the length of a millimeter in `gaussian_sums`, whose exponent is a squared length."""
+def units_per_mm(variance: Float[Array, ""]) -> Float[Array, ""]:
+    """Compute how many units of length of `gaussian_sums`, `sqrt(2 v)`, are in a millimeter."""
     return jnp.sqrt(0.5 / variance)
 
 
@@ -281,20 +293,22 @@ def _levels(tree: ClusterTree, sources: Sources) -> tuple[Float[Array, "3"], lis
 
 
 @eqx.filter_jit
-def source_boxes(clusters: Sources, depth: Float[Array, ""]) -> Boxes:
-    """Enclose the sources of a layer."""
-    return Boxes.around(clusters.lowered(depth).centers, clusters.areas > 0, SOURCES)
+def source_boxes(below: Sources) -> Boxes:
+    """Enclose the sources of a layer, sunk below their splats. Not differentiated."""
+    return Boxes.around(below.centers, below.areas > 0, SOURCES)
 
 
-def _sources_in_reach(
+def _boxes_and_reach(
     clusters: Sources, kernel: AbstractDiffusionKernel, variance, largest, support: float
 ) -> tuple[Boxes, Float[Array, ""]]:
-    """Enclose the sources of a layer, and compute how near they are, mm; 0 without support."""
+    """Enclose the sources of a layer in boxes, and compute the distance (mm) within which they
+    matter; 0 for a layer without support.
+    """
     depths = kernel.depths(jnp.stack([variance, largest]))
     # Sources of a wider layer lie deeper than those of the boxes.
     sinking = math.sqrt(3) * float(depths[1] - depths[0])
     reach = support * math.sqrt(float(largest)) + sinking if support > 0 else 0.0
-    return source_boxes(clusters, depths[0]), jnp.asarray(reach, largest.dtype)
+    return source_boxes(clusters.lowered(depths[0])), jnp.asarray(reach, largest.dtype)
 
 
 def _find(points: Sequence[Boxes], sources: Boxes, reach: np.ndarray) -> Lists | None:

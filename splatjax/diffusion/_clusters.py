@@ -122,10 +122,8 @@ def compact_order(points: np.ndarray) -> np.ndarray:
 
     **Arguments:** `points`: `[points, 3]`.
     """
-    order, place = (
-        np.arange(len(points)),
-        np.array(points.T, np.float32, order="C"),
-    )  # turned together: near in memory
+    # Turned together with the order: what is compared next is near in memory.
+    order, coordinates = np.arange(len(points)), np.array(points.T, np.float32, order="C")
     todo = [(0, len(points))]
     while todo:
         begin, end = todo.pop()
@@ -133,27 +131,28 @@ def compact_order(points: np.ndarray) -> np.ndarray:
         if end - begin <= step or end - begin == _TOGETHER:
             continue
         middle = begin + -(-(end - begin) // (2 * step)) * step
-        part = place[:, begin:end]
+        part = coordinates[:, begin:end]
         turn = np.argpartition(part[np.argmax(np.ptp(part, axis=1))], middle - begin - 1)
-        order[begin:end], place[:, begin:end] = order[begin:end][turn], part[:, turn]
+        order[begin:end], coordinates[:, begin:end] = order[begin:end][turn], part[:, turn]
         todo += [(begin, middle), (middle, end)]
     together, whole = (len(points) // size * size for size in (_TOGETHER, BLOCK))
     for begin in range(0, together, _TOGETHER):
-        _halve(order[begin : begin + _TOGETHER], place[:, begin : begin + _TOGETHER], _TOGETHER)
-    _halve(order[together:whole], place[:, together:whole], BLOCK)
+        part = slice(begin, begin + _TOGETHER)
+        _halve(order[part], coordinates[:, part], _TOGETHER)
+    _halve(order[together:whole], coordinates[:, together:whole], BLOCK)
     return order
 
 
-def _halve(order: np.ndarray, place: np.ndarray, size: int) -> None:
+def _halve(order: np.ndarray, coordinates: np.ndarray, size: int) -> None:
     """Split parts of one size in halves, along their longest axes, down to quarters of a block. In
     place.
     """
     while size > BLOCK // 4:
-        parts = place.reshape(3, -1, size)
+        parts = coordinates.reshape(3, -1, size)
         longest = np.argmax(np.ptp(parts, axis=2), axis=0)
         rows = np.arange(parts.shape[1])
         turn = (
             np.argpartition(parts[longest, rows], size // 2, axis=1) + rows[:, None] * size
         ).reshape(-1)
-        order[:], place[:] = order[turn], place[:, turn]
+        order[:], coordinates[:] = order[turn], coordinates[:, turn]
         size //= 2

@@ -150,28 +150,38 @@ def diffuse_with_derivative(
     return jax.jvp(diffuse, (variances,), (variances,))
 
 
+def divide_by_mass(
+    sums: Float[Array, "*rows values points"],
+) -> Float[Array, "*rows values points"]:
+    """Divide the light of each channel by the mass, which comes last; 0 where nothing is in
+    reach.
+    """
+    light, mass = sums[..., :-1, :], sums[..., -1:, :]
+    means = light / jnp.where(mass > 0, mass, 1.0)
+    return jnp.where(mass > 0, jnp.concatenate([means, mass], axis=-2), 0.0)
+
+
 def layer_values(
-    light: Float[Array, "values points"],
-    firsts: Float[Array, "values 3 points"],
+    sums: Float[Array, "values points"],
+    first_moments: Float[Array, "values 3 points"],
     points: Float[Array, "3 points"],
 ) -> Float[Array, "_ points"]:
-    r"""Divide the sums of one layer: rows of means, mass, and the slopes of both but for a
-    factor; all 0 where nothing is in reach.
+    r"""Divide the sums of one layer: rows of means, mass, and the slopes of both, in units that
+    `split_layer` scales to 1/mm; all 0 where nothing is in reach.
 
     **Arguments:**
 
-    - `light`: `sum_j m_j w_j E_j` of each channel, and last `sum_j m_j w_j`.
-    - `firsts`: the same sums times the sources' places `q_j`.
+    - `sums`: `sum_j m_j w_j E_j` of each channel, and last `sum_j m_j w_j`.
+    - `first_moments`: the same sums times the sources' places `q_j`.
     """
-    mass = light[-1]
-    reached = mass > 0
-    inverse = 1 / jnp.where(reached, mass, 1.0)
-    means = light[:-1] * inverse[None]
+    values = divide_by_mass(sums)
+    means, mass = values[:-1], values[-1]
     # grad N = sum w E (q - x) / v, and grad (N / D) = (grad N - (N / D) grad D) / D.
-    pulls = firsts - light[:, None] * points[None]
-    slopes = (pulls[:-1] - means[:, None] * pulls[-1:]) * inverse[None, None]
-    slopes = jnp.concatenate([slopes, pulls[-1:]]).reshape(-1, mass.shape[0])
-    return jnp.where(reached[None], jnp.concatenate([means, mass[None], slopes]), 0.0)
+    gradients = first_moments - sums[:, None] * points[None]
+    slopes = gradients[:-1] - means[:, None] * gradients[-1:]
+    slopes = slopes / jnp.where(mass > 0, mass, 1.0)[None, None]
+    slopes = jnp.concatenate([slopes, gradients[-1:]]).reshape(-1, mass.shape[0])
+    return jnp.concatenate([values, jnp.where(mass[None] > 0, slopes, 0.0)])
 
 
 def split_layer(rows: Float[Array, "rows points"], scale: Float[Array, ""]) -> LayerValues:

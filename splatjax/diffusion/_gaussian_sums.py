@@ -6,6 +6,7 @@ about one length are swept together, one per *lane*; in a step each lane meets t
 next row of its list. The unit of length is the standard deviation times the root of 2.
 """
 
+import functools
 from collections.abc import Callable
 from functools import partial
 
@@ -17,9 +18,9 @@ from jaxtyping import Array, Float, Int
 from splatjax._chunking import zeros_after
 
 from ._kernel import TruncatedGaussian
-from ._neighbors import Lanes, Lists
+from ._neighbors import Lists, PointBlocks
 
-FAR = -1e6  # mm from anything, yet with a square that float32 holds
+FAR = -1e6  # from anything, in any unit in use here, yet with a square that float32 holds
 
 
 class SourceTable(eqx.Module):
@@ -29,8 +30,8 @@ class SourceTable(eqx.Module):
 
     - `centers`: apart by axis, which is quicker.
     - `rows`: to be summed.
-    - `moments`: whether each row is followed, in the sums, by its first moments: itself times the
-      centers. Static.
+    - `moments`: whether the sums also hold first moments. They are then
+      `[rows, rows * x, rows * y, rows * z]`, each in the order of `rows`. Static.
     """
 
     centers: tuple[Float[Array, "blocks block"], ...]
@@ -54,16 +55,31 @@ class SourceTable(eqx.Module):
         """The number of sums."""
         return self.rows.shape[1] * (4 if self.moments else 1)
 
-    def summed(self) -> Float[Array, "blocks sums block"]:
+    def rows_and_moments(self) -> Float[Array, "blocks sums block"]:
         """Compute what is summed."""
         if not self.moments:
             return self.rows
-        factors = jnp.stack([jnp.ones_like(self.centers[0]), *self.centers], axis=1)
-        products = self.rows[:, :, None] * factors[:, None]
-        return products.reshape(len(products), -1, products.shape[3])
+        moments = [self.rows * center[:, None] for center in self.centers]
+        return jnp.concatenate([self.rows, *moments], axis=1)
 
-    def met(self, ids: Int[Array, "lanes width"]) -> "SourceTable":
-        """Read what each lane meets, `[lanes, sources]` and `[lanes, rows, sources]`."""
+    def contract(
+        self, cotangents: Float[Array, "lanes sums points"]
+    ) -> Float[Array, "lanes sources points"]:
+        """Sum the products of `rows_and_moments` with the cotangents of their sums.
+
+        Written out, so that it is fused with the weights: half the time of a matrix product.
+        """
+        of_sums, rows = jnp.unstack(cotangents[:, :, None], axis=1), jnp.unstack(self.rows, axis=1)
+        terms = []
+        for i, row in enumerate(rows):
+            of_row, *of_moments = of_sums[i :: len(rows)]
+            for center, of_moment in zip(self.centers, of_moments, strict=self.moments):
+                of_row = of_row + center[..., None] * of_moment
+            terms.append(row[..., None] * of_row)
+        return functools.reduce(jnp.add, terms)
+
+    def gather(self, ids: Int[Array, "lanes width"]) -> "SourceTable":
+        """Read the blocks that each lane meets, `[lanes, sources]` and `[lanes, rows, sources]`."""
         x, y, z, rows = (
             each.at[ids].get(mode="fill", fill_value=0) for each in (*self.centers, self.rows)
         )
@@ -71,14 +87,16 @@ class SourceTable(eqx.Module):
         centers = tuple(each.reshape(len(ids), -1) for each in (x, y, z))
         return SourceTable(centers, rows, self.moments)
 
-    def add(self, ids: Int[Array, "lanes width"], met: "SourceTable") -> "SourceTable":
-        """Add to the sources that each lane meets."""
+    def scatter_add(
+        self, ids: Int[Array, "lanes width"], cotangents: "SourceTable"
+    ) -> "SourceTable":
+        """Add to the sources that each lane meets: the transpose of `gather`."""
 
         def added(table, part):
             part = part.reshape(*part.shape[:-1], ids.shape[1], -1)
             return table.at[ids].add(jnp.moveaxis(part, -2, 1), mode="drop")
 
-        return jax.tree.map(added, self, met)
+        return jax.tree.map(added, self, cotangents)
 
 
 def identity(
@@ -108,13 +126,13 @@ class _Rule(eqx.Module):
         squared = dx * dx + dy * dy + dz * dz
         return *self.kernel(squared), (dx, dy, dz)
 
-    def sums(self, lists: Lists, lanes: Lanes, here, table):
+    def sums(self, lists: Lists, lanes: PointBlocks, here, table):
         """Sum over all that a sweep's points meet."""
 
         def add(ids, sums):
-            sources = table.met(ids)
+            sources = table.gather(ids)
             weights, *_ = self.weights(here, sources)
-            return sums + jnp.einsum("lrs,lsp->lrp", sources.summed(), weights)
+            return sums + jnp.einsum("lrs,lsp->lrp", sources.rows_and_moments(), weights)
 
         start = jnp.zeros((here.shape[0], table.count, here.shape[2]), here.dtype)
         return lanes.each_row(lists, add, start)
@@ -142,17 +160,17 @@ def _derivative(rule: _Rule, residuals, moved):
         here, d_here = lanes.read(points, FAR), lanes.read(d_points)
 
         def add(ids, d_sums):
-            sources, d_sources = table.met(ids), d_table.met(ids)
-            weights, falls, offsets = rule.weights(here, sources)
-            nearer = sum(
+            sources, d_sources = table.gather(ids), d_table.gather(ids)
+            weights, minus_slopes, offsets = rule.weights(here, sources)
+            minus_half_change = sum(
                 offset * (center[:, :, None] - d_here[:, axis, None])
                 for axis, (offset, center) in enumerate(
                     zip(offsets, d_sources.centers, strict=True)
                 )
             )
-            rows, d_rows = jax.jvp(SourceTable.summed, (sources,), (d_sources,))
+            rows, d_rows = jax.jvp(SourceTable.rows_and_moments, (sources,), (d_sources,))
             d_sums += jnp.einsum("lrs,lsp->lrp", d_rows, weights)
-            return d_sums + jnp.einsum("lrs,lsp->lrp", rows, 2 * falls * nearer)
+            return d_sums + jnp.einsum("lrs,lsp->lrp", rows, 2 * minus_slopes * minus_half_change)
 
         total = lanes.read(sums)
         d_total = lanes.each_row(lists, add, jnp.zeros_like(total))
@@ -162,7 +180,16 @@ def _derivative(rule: _Rule, residuals, moved):
 
 
 def _backward(rule: _Rule, residuals, cotangents):
-    """Compute the transpose of `_derivative`."""
+    """Compute the transpose of `_derivative`.
+
+    With `e = |x - p|^2` and `g = -dw / de * (rows_and_moments . cotangent)` for every pair of a
+    point x and a source at p:
+
+        d x = -2 sum_p g (x - p),    d p = 2 sum_x g (x - p)
+
+    Both are moments of `g` over one side. Points and sources are counted from one of the sources,
+    so that float32 does not cancel.
+    """
     lists, points, table, sums = residuals
 
     def sweep(lanes, carry):
@@ -173,28 +200,28 @@ def _backward(rule: _Rule, residuals, cotangents):
 
         def add(ids, carry):
             d_here, d_table = carry
-            sources = table.met(ids)
-            weights, falls, _ = rule.weights(here, sources)
-            # The factor of an exponent's cotangent is a polynomial in point and source, seen from
-            # one of the sources: its moments over the points and over the sources suffice.
+            sources = table.gather(ids)
+            weights, minus_slopes, _ = rule.weights(here, sources)
             centers = jnp.stack(sources.centers, axis=1)
             origin = centers[:, :, :1]
-            x, y = here - origin, centers - origin
-            # Written out, so that it is fused with the weights: half the time of a matrix product.
-            rows, pull_rows = jax.vjp(SourceTable.summed, sources)
-            pairs = zip(jnp.unstack(rows, axis=1), jnp.unstack(cotangent, axis=1), strict=True)
-            pulls = falls * sum(row[:, :, None] * each[:, None] for row, each in pairs)
-            of_points = jnp.concatenate([jnp.ones_like(x[:, :1]), x], axis=1)
-            moments = jnp.einsum("lkp,lsp->lks", of_points, pulls)
+            x, p = here - origin, centers - origin
+            _, pull_rows = jax.vjp(SourceTable.rows_and_moments, sources)
+            g = minus_slopes * sources.contract(cotangent)
+            # Sum over the points: the cotangents of the sources.
+            one_and_x = jnp.concatenate([jnp.ones_like(x[:, :1]), x], axis=1)
+            over_points = jnp.einsum("lkp,lsp->lks", one_and_x, g)
             d_rows = jnp.einsum("lrp,lsp->lrs", cotangent, weights)
-            d_centers = 2 * (moments[:, 1:] - y * moments[:, :1])
-            of_sources = jnp.concatenate([jnp.ones_like(y[:, :1]), y], axis=1)
-            toward = jnp.einsum("lks,lsp->lkp", of_sources, pulls)
+            d_centers = 2 * (over_points[:, 1:] - p * over_points[:, :1])
             (d_sources,) = pull_rows(d_rows)
-            moved = tuple(jnp.unstack(d_centers, axis=1))
-            moved = jax.tree.map(jnp.add, d_sources.centers, moved)
-            d_table = d_table.add(ids, SourceTable(moved, d_sources.rows, table.moments))
-            return d_here - 2 * (x * toward[:, :1] - toward[:, 1:]), d_table
+            d_centers = jax.tree.map(
+                jnp.add, d_sources.centers, tuple(jnp.unstack(d_centers, axis=1))
+            )
+            d_sources = SourceTable(d_centers, d_sources.rows, table.moments)
+            # Sum over the sources: the cotangents of the points.
+            one_and_p = jnp.concatenate([jnp.ones_like(p[:, :1]), p], axis=1)
+            over_sources = jnp.einsum("lks,lsp->lkp", one_and_p, g)
+            d_here = d_here - 2 * (x * over_sources[:, :1] - over_sources[:, 1:])
+            return d_here, d_table.scatter_add(ids, d_sources)
 
         d_here, d_table = lanes.each_row(lists, add, (d_finish, d_table))
         return lanes.write(d_points, d_here), d_table

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from splatjax.scene import Splats
 
 _ROOT_DEGREE = 4
-_FADE = 0.5  # of the exponent, before its largest
+_FADE = 0.5  # the last part of the exponent, over which the kernel fades to zero
 _LEAST_TRUNCATED, _MOST_TRUNCATED = 4e-5, 0.1  # of the power: 4.5 and 2.1 standard deviations
 _LEAST_SHARE = 1e-3  # of the diffusion integral in a layer that counts at all
 _UNEVEN = 0.05  # from which on splats count as scattered
@@ -27,7 +27,7 @@ _SAMPLE = 64  # splats whose neighbors are measured to find how evenly all are s
 
 
 class TruncatedGaussian(eqx.Module):
-    """`exp(-exponent)`, faded linearly to zero in the last half unit before the largest exponent.
+    """`exp(-exponent)`, faded linearly to zero in the last `_FADE` before the largest exponent.
 
     A step has no derivative that automatic differentiation sees; the fade has one. In float32 the
     exponential is the eighth power of a polynomial, within 4e-5 and at half the time, and its
@@ -38,13 +38,13 @@ class TruncatedGaussian(eqx.Module):
 
     def __call__(self, exponent: Float[Array, "..."]) -> tuple[Float[Array, "..."], ...]:
         """Compute the weight, and minus its derivative in the exponent."""
-        gaussian, falls = self._gaussian(exponent)
+        gaussian, minus_slope = self._gaussian(exponent)
         left = (self.largest - exponent) / _FADE
         fades = left < 1
         weight = jnp.where(fades, gaussian * left, gaussian)
-        falls = jnp.where(fades, falls * left + gaussian / _FADE, falls)
+        minus_slope = jnp.where(fades, minus_slope * left + gaussian / _FADE, minus_slope)
         inside = exponent < self.largest
-        return jnp.where(inside, weight, 0.0), jnp.where(inside, falls, 0.0)
+        return jnp.where(inside, weight, 0.0), jnp.where(inside, minus_slope, 0.0)
 
     def _gaussian(self, exponent: Float[Array, "..."]) -> tuple[Float[Array, "..."], ...]:
         if exponent.dtype != jnp.float32:
@@ -63,7 +63,7 @@ class TruncatedGaussian(eqx.Module):
         """Integrate the weight from an exponent (below the fade) on: the kernel's integral over a
         plane, in units of that of the Gaussian.
         """
-        return jnp.exp(-exponent) - 2 * math.exp(-self.largest) * math.expm1(_FADE)
+        return jnp.exp(-exponent) - math.exp(-self.largest) * math.expm1(_FADE) / _FADE
 
 
 @functools.cache
@@ -191,10 +191,11 @@ class EscapeNormalization(AbstractDiffusionKernel):
         rank = jnp.argsort(jnp.argsort(variances))
         not_wider = (rank[None] <= rank[:, None]).astype(mass.dtype)
         inside = jnp.tensordot(not_wider.T, energies, 1) + absorbed
-        leaving = energies / jnp.where(inside > _TINY_ENERGY, inside, 1.0)
+        escape_probability = energies / jnp.where(inside > _TINY_ENERGY, inside, 1.0)
         excess = jnp.maximum(mass - 1, 0)
         excess = excess * excess / (excess + _ROUNDING)
-        return (1 + excess) * jnp.exp(-jnp.tensordot(not_wider, jnp.log(1 + leaving * excess), 1))
+        stays = jnp.log(1 + escape_probability * excess)
+        return (1 + excess) * jnp.exp(-jnp.tensordot(not_wider, stays, 1))
 
 
 def resolved_fraction(

@@ -42,11 +42,12 @@ class Lists(eqx.Module):
         """Leave out all other blocks of points."""
         chosen = jnp.zeros(len(self.counts), bool).at[blocks].set(True, mode="drop")
         counts = jnp.where(chosen, self.counts, 0)
+        # A stable sort: blocks without a list come last.
         order = self.order[jnp.argsort(counts[self.order] == 0)]
         return Lists(self.rows, self.first, counts, order)
 
     def sweep(self, sweep: Callable, out):
-        """Apply `sweep(lanes, out)` to all blocks with a list."""
+        """Apply `sweep(lanes, out)` to all blocks with a list, `LANES` of them at a time."""
         blocks = len(self.order)
         lanes = min(LANES, blocks)
         order = jnp.pad(self.order, (0, -blocks % lanes), constant_values=blocks)
@@ -57,12 +58,12 @@ class Lists(eqx.Module):
             first, counts = (
                 each.at[blocks].get(mode="fill", fill_value=0) for each in (self.first, self.counts)
             )
-            return sweep(Lanes(blocks, first, counts), out)
+            return sweep(PointBlocks(blocks, first, counts), out)
 
         return lax.fori_loop(jnp.zeros_like(sweeps), sweeps, step, out)
 
 
-class Lanes(eqx.Module):
+class PointBlocks(eqx.Module):
     """Blocks of points that are swept together, and their lists; the number of blocks in a lane
     without one.
     """
@@ -138,6 +139,7 @@ def find_neighbors(points: Boxes, sources: Boxes, reach: float) -> Lists:
     lengths = np.bincount(of, minlength=blocks)
     counts = -(-lengths // WIDTH)
     first, begins = (np.cumsum(each) - each for each in (counts, lengths))
+    # At least one row, the last, stays empty: lanes whose list has ended read it.
     ids = np.full((round_up(int(counts.sum()), 1), WIDTH), empty, np.int32)
     ids.reshape(-1)[(first * WIDTH - begins)[of] + np.arange(len(of))] = near
     order = np.argsort(-counts, kind="stable")

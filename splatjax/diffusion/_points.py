@@ -1,4 +1,6 @@
-"""The layers at points of the surface, before and after it is known how much light each carries."""
+"""Continue the layers from splats to points of the surface, and weigh them with a material's
+Gaussians.
+"""
 
 from collections.abc import Sequence
 
@@ -19,13 +21,15 @@ def continue_from_splats(layer: LayerValues, centers: Float[Array, "3 splats"]) 
 
     `continue_to_points` computes the layer at points from the blended rows.
     """
-    return LayerValues(layer.values - 0.5 * _change(layer, centers), layer.slopes)
+    return LayerValues(layer.values - 0.5 * _along_slopes(layer, centers), layer.slopes)
 
 
-def _change(layer: LayerValues, offsets: Float[Array, "3 points"]) -> Float[Array, "values points"]:
+def _along_slopes(
+    layer: LayerValues, offsets: Float[Array, "3 points"]
+) -> Float[Array, "values points"]:
     # Written out, so that it is fused with what reads it: a third of the time of a reduction.
-    along = layer.slopes * offsets[None]
-    return along[:, 0] + along[:, 1] + along[:, 2]
+    x, y, z = jax.lax.split(layer.slopes * offsets[None], (1, 1, 1), axis=1)
+    return (x + y + z)[:, 0]
 
 
 def continue_to_points(
@@ -54,13 +58,17 @@ def continue_to_points(
     - `centers`: blended centers of the splats, mm, from the same origin as `points`.
     """
 
+    # The value at the mean center, and the change from there to the point: together the sum above.
     def parts(rows: LayerValues):
-        return rows.values + 0.5 * _change(rows, centers), _change(rows, points - centers)
+        return rows.values + 0.5 * _along_slopes(rows, centers), _along_slopes(
+            rows, points - centers
+        )
 
     value, change = parts(blended)
-    # Rows of derivatives are limited where those of the light itself are.
-    light = np.append(np.arange(len(value) - 1) % channels, len(value) - 1)
-    below, above = ((value + change < 0) | (value < 0))[light], (change > value)[light]
+    # Row i is limited where row `limited_like[i]` is: derivatives like the light itself.
+    limited_like = np.append(np.arange(len(value) - 1) % channels, len(value) - 1)
+    is_below, is_above = (value + change < 0) | (value < 0), change > value
+    below, above = is_below[limited_like], is_above[limited_like]
 
     def limited(value, change):
         return jnp.where(below, 0.0, jnp.where(above, 2 * value, value + change))

@@ -14,9 +14,9 @@ from jaxtyping import Array, Bool, Float
 
 from splatjax._combination import PartByPart
 
-from ._clustered import ClusterDiffuser, in_sums, layer_table, source_boxes
+from ._clustered import ClusterDiffuser, layer_table, source_boxes, units_per_mm
 from ._clusters import BLOCK, ClusterTree, compact_order
-from ._diffuser import Sources
+from ._diffuser import Sources, divide_by_mass
 from ._gaussian_sums import FAR, gaussian_sums, identity
 from ._kernel import AbstractDiffusionKernel, TruncatedGaussian
 from ._neighbors import Boxes, Lists, find_neighbors
@@ -81,15 +81,16 @@ class StreamedDiffusion:
           bring nothing.
         """
         sums = PartByPart().total(self._sums(parts))
-        return tuple(None if each is None else _divide(each) for each in sums)
+        return tuple(
+            None if each is None else eqx.filter_jit(divide_by_mass)(each) for each in sums
+        )
 
     def _sums(self, parts: Iterable[Sources]) -> Iterator[list[Array | None]]:
         """Iterate over the sums of each part."""
-        values = None
-        for sources in parts:
-            if values is None or self._in_reach(sources):
-                values = self._sum_part(sources)
-                yield values
+        # The first part is always summed, so that there is a result.
+        for i, sources in enumerate(parts):
+            if i == 0 or self._in_reach(sources):
+                yield self._sum_part(sources)
 
     def _in_reach(self, sources: Sources) -> bool:
         """Test whether a part may bring anything to any point, by boxes."""
@@ -125,7 +126,7 @@ class StreamedDiffusion:
     def _sum_layer(self, i: int, layer: _Layer, levels: list[Sources]) -> Array:
         clusters = levels[self.cells.index(layer.edge) + 1 if layer.edge else 0]
         reach = layer.support * math.sqrt(float(layer.variance))
-        lists = find_neighbors(self.boxes, source_boxes(clusters, layer.depth), reach)
+        lists = find_neighbors(self.boxes, source_boxes(clusters.lowered(layer.depth)), reach)
         if len(lists.rows) > self.rows[i]:
             self.rows[i] = 1 << (len(lists.rows) - 1).bit_length()
         more = self.rows[i] - len(lists.rows)
@@ -142,13 +143,5 @@ def _levels(tree: ClusterTree, sources: Sources) -> list[Sources]:
 def _sum(points, clusters: Sources, layer: _Layer, lists: Lists) -> Array:
     below = clusters.lowered(layer.depth)
     table = layer_table(below, layer.variance, layer.depth, layer.truncated, slopes=False)
-    blocks = points * in_sums(layer.variance)
+    blocks = points * units_per_mm(layer.variance)
     return gaussian_sums(blocks, table, lists, layer.truncated, identity)
-
-
-@eqx.filter_jit
-def _divide(sums: Float[Array, "blocks values block"]) -> Float[Array, "blocks values block"]:
-    """Divide the light by the mass; 0 where nothing is in reach."""
-    mass = sums[:, -1:]
-    means = sums[:, :-1] / jnp.where(mass > 0, mass, 1.0)
-    return jnp.where(mass > 0, jnp.concatenate([means, mass], axis=1), 0.0)
