@@ -3,11 +3,11 @@ its directional and its average albedo, tabulated.
 """
 
 import functools
-from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float
 
 from splatjax._chunking import map_chunks
@@ -21,6 +21,7 @@ _LEAST_HALF_COSINE = 1e-4  # of N.(L+V): below it the lobe's pole is cut
 _MU_NODES = 18
 _ROUGHNESS_NODES = 12
 _LEAST_MU = 1e-5
+_AT_ONCE = 1 << 14  # points whose polynomials are in memory
 
 
 def fresnel_f0(eta: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -150,49 +151,37 @@ def _tables() -> tuple[np.ndarray, np.ndarray]:
     return coefficients, np.einsum("i,tij->tj", average, coefficients)
 
 
-def _chebyshev(coefficients: Sequence, x: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Evaluate a Chebyshev series, whose coefficients broadcast against `x`, by Clenshaw's
-    recurrence.
-    """
-    last, before = jnp.zeros_like(x), jnp.zeros_like(x)
-    for index in range(len(coefficients) - 1, 0, -1):
-        last, before = 2 * x * last - before + coefficients[index], last
-    return x * last - before + coefficients[0]
+@functools.partial(jax.custom_jvp, nondiff_argnums=(1,))
+def _chebyshev_basis(x: Float[Array, "*points"], count: int) -> Float[Array, "basis *points"]:
+    """Evaluate the first Chebyshev polynomials `T_n(x)`, in a loop: it compiles quickly."""
+
+    def add(n, rows):
+        following = 2 * x * rows[n - 1] - rows[n - 2]
+        return rows.at[n].set(following)
+
+    rows = jnp.zeros((count, *x.shape), x.dtype).at[0].set(1).at[1].set(x)
+    return lax.fori_loop(2, count, add, rows)
 
 
-def _roughness_coordinate(roughness: Float[Array, "..."]) -> Float[Array, "..."]:
+@_chebyshev_basis.defjvp
+def _chebyshev_basis_jvp(count, primals, tangents):
+    # The derivatives of the polynomials are sums of the polynomials.
+    basis = _chebyshev_basis(*primals, count)
+    derivatives = np.pad(np.polynomial.chebyshev.chebder(np.eye(count)), ((0, 1), (0, 0))).T
+    slopes = jnp.tensordot(jnp.asarray(derivatives, basis.dtype), basis, 1)
+    return basis, slopes * tangents[0][None]
+
+
+def _roughness_basis(roughness: Float[Array, "*points"]) -> Float[Array, "basis *points"]:
     low, high = (float(x) for x in np.log(ROUGHNESS_RANGE))
-    return (2 * jnp.log(clamped_roughness(roughness)) - (low + high)) / (high - low)
+    t = (2 * jnp.log(clamped_roughness(roughness)) - (low + high)) / (high - low)
+    return _chebyshev_basis(t, _ROUGHNESS_NODES)
 
 
-@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _table(
-    key: tuple[int, int, int], x: Float[Array, "..."], t: Float[Array, "..."]
-) -> Float[Array, "..."]:
-    """Evaluate table a (0) or b (1), differentiated so many times in either coordinate. Its
-    derivatives are tables too: one number is kept for the way back, not the whole recurrence.
-    """
-    (table, in_mu, in_roughness), chebder = key, np.polynomial.chebyshev.chebder
-    coefficients = chebder(chebder(_tables()[0][table], in_mu, axis=0), in_roughness, axis=1)
-
-    def over_mu(t: Float[Array, " points"]) -> list[Float[Array, " points"]]:
-        rows = list(jnp.asarray(coefficients.T, t.dtype)[:, :, None])
-        return list(_chebyshev(rows, jnp.broadcast_to(t, (len(coefficients), *t.shape))))
-
-    if t.ndim == 0:
-        own = over_mu(t[None])
-        return map_chunks(lambda x: _chebyshev(own, x), x.reshape(-1)).reshape(x.shape)
-    x, t = jnp.broadcast_arrays(x, t)
-    flat = x.reshape(-1), t.reshape(-1)
-    return map_chunks(lambda x, t: _chebyshev(over_mu(t), x), *flat).reshape(x.shape)
-
-
-@_table.defjvp
-def _table_jvp(key, primals, tangents):
-    (x, t), (x_dot, t_dot) = primals, tangents
-    table, in_mu, in_roughness = key
-    in_x = _table((table, in_mu + 1, in_roughness), x, t) * x_dot
-    return _table(key, x, t), in_x + _table((table, in_mu, in_roughness + 1), x, t) * t_dot
+def _with_fresnel(tables: np.ndarray, f0: Float[Array, ""]) -> Float[Array, "..."]:
+    """Combine the coefficients of tables (a, b) by Schlick's term."""
+    constant, grazing = jnp.asarray(tables, f0.dtype)
+    return f0 * constant + (1 - f0) * grazing
 
 
 def directional_albedo(
@@ -207,8 +196,7 @@ def directional_albedo(
     `specular_lobe` over the hemisphere into two tables, computed once by quadrature and kept as
     Chebyshev series in `sqrt(mu)` and `log m`.
 
-    **Arguments:** scalars, or arrays that broadcast; a scalar `f0` and a scalar `roughness` make it
-    cheapest.
+    **Arguments:** scalars, or arrays that broadcast; a scalar `roughness` makes it cheapest.
 
     - `mu`: cosine of the direction with the normal, clamped to [1e-5, 1]. Differentiable; the slope
       at `mu = 0` diverges like `log mu` and is cut to 0 below 1e-5.
@@ -222,10 +210,22 @@ def directional_albedo(
 
     **Source:** the lobe of Kelemen and Szirmay-Kalos 2001, as normalized in `specular_lobe`.
     """
-    x = 2 * jnp.sqrt(jnp.clip(mu, _LEAST_MU, 1.0)) - 1
-    t = _roughness_coordinate(roughness)
-    share = f0 * _table((0, 0, 0), x, t) + (1 - f0) * _table((1, 0, 0), x, t)
-    return jnp.clip(specular * share, 0.0, 1.0)
+    coefficients = _with_fresnel(_tables()[0], f0)
+
+    def over_mu(mu, along_mu):
+        x = 2 * jnp.sqrt(jnp.clip(mu, _LEAST_MU, 1.0)) - 1
+        return jnp.sum(_chebyshev_basis(x, _MU_NODES) * along_mu, axis=0)
+
+    def mapped(mu, roughness):
+        return over_mu(mu, coefficients @ _roughness_basis(roughness))
+
+    if roughness.ndim == 0:
+        along_mu = (coefficients @ _roughness_basis(roughness))[:, None]
+        share = map_chunks(lambda mu: over_mu(mu, along_mu), mu.reshape(-1), at_once=_AT_ONCE)
+    else:
+        mu, roughness = jnp.broadcast_arrays(mu, roughness)
+        share = map_chunks(mapped, mu.reshape(-1), roughness.reshape(-1), at_once=_AT_ONCE)
+    return jnp.clip(specular * share.reshape(mu.shape), 0.0, 1.0)
 
 
 def average_albedo(
@@ -240,7 +240,8 @@ def average_albedo(
 
     **Returns:** in [0, 1].
     """
-    t = _roughness_coordinate(roughness)
-    _, averages = _tables()
-    constant, grazing = (_chebyshev(table.tolist(), t) for table in averages)
-    return jnp.clip(specular * (f0 * constant + (1 - f0) * grazing), 0.0, 1.0)
+    coefficients = _with_fresnel(_tables()[1], f0)
+    share = map_chunks(
+        lambda each: coefficients @ _roughness_basis(each), roughness.reshape(-1), at_once=_AT_ONCE
+    )
+    return jnp.clip(specular * share.reshape(roughness.shape), 0.0, 1.0)
