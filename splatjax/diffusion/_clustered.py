@@ -4,6 +4,7 @@ import dataclasses
 import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -28,7 +29,7 @@ from ._diffuser import (
 )
 from ._gaussian_sums import SourceTable, gaussian_sums
 from ._kernel import AbstractDiffusionKernel, TruncatedGaussian, resolved_fraction
-from ._neighbors import SOURCES, Boxes, Lists, Neighbors, find_neighbors
+from ._neighbors import SOURCES, Boxes, Neighbors, find_neighbors
 
 FINEST = 0.01
 """Quantile of the areas of the splats: a layer counts as resolved as far as splats of that area
@@ -126,35 +127,41 @@ class ClusterDiffuser(AbstractDiffuser):
             for name in ("centers", "normals", "areas")
         )
         exists, sizes = areas > 0, np.asarray(variances, np.float64)
-        edges, supports = [0.0] * len(sizes), [0.0] * len(sizes)
+        edges, supports = np.zeros(len(sizes)), np.zeros(len(sizes))
         if exists.any():
             spacing = math.sqrt(areas[exists].mean())
             fine = float(np.quantile(areas[exists], FINEST))
             edges, supports = self.choose_sources(sizes, spacing, fine, kernel, interval)
-        cells = sorted({edge for edge in edges if edge > 0})
+        cells = np.unique(edges[edges > 0]).tolist()
+        levels = tuple(cells.index(edge) + 1 if edge > 0 else 0 for edge in edges.tolist())
         tree = ClusterTree.build(centers, normals, exists, cells)
         rows = (jnp.asarray(each) for each in (centers.T, normals.T, areas, areas[None]))
-        origin, clusters = _levels(tree, Sources(*rows))
-        levels = [cells.index(edge) + 1 if edge > 0 else 0 for edge in edges]
-        smallest, largest = (
-            [jnp.asarray(size * factor, variances.dtype) for size in sizes]
-            for factor in (1 / self.margin, self.margin)
+        points, boxes, sinking = _enclose(
+            tree, Sources(*rows), variances, self.margin, kernel, levels
         )
-        points = [_target_boxes(part.centers.T - origin[:, None]) for part in parts]
-        sources = [
-            _boxes_and_reach(clusters[levels[i]], kernel, variances[i], largest[i], supports[i])
-            for i in range(len(sizes))
-        ]
+        # Sources of a wider layer lie deeper than those of the boxes.
+        sinking = math.sqrt(3) * np.asarray(sinking, np.float64)
+        reaches = np.where(supports > 0, supports * np.sqrt(sizes * self.margin) + sinking, 0)
+
         # Search all layers in parallel. Only NumPy computes in the threads, since JAX's precision
         # may be set for one thread.
         with ThreadPoolExecutor() as pool:
-            lists = pool.map(lambda each: _find(points, each[0], np.asarray(each[1])), sources)
-        whole = jax.tree.map(lambda *rows: jnp.concatenate(rows), *points)
+            find = partial(find_neighbors, points, parts=len(parts))
+            lists = [
+                reach and pool.submit(find, sources, reach)
+                for sources, reach in zip(boxes, reaches.tolist(), strict=True)
+            ]
         neighbors = [
-            None if each is None else Neighbors(each, whole, boxes, reach)
-            for each, (boxes, reach) in zip(lists, sources, strict=True)
+            Neighbors(each.result(), points, sources, reach) if each else None
+            for each, sources, reach in zip(
+                lists, boxes, jnp.asarray(reaches, variances.dtype), strict=True
+            )
         ]
-        each = zip(levels, supports, smallest, largest, neighbors, strict=True)
+        smallest, largest = (
+            list(jnp.asarray(bound, variances.dtype))
+            for bound in (sizes / self.margin, sizes * self.margin)
+        )
+        each = zip(levels, supports.tolist(), smallest, largest, neighbors, strict=True)
         return ClusterPlan(tree, tuple(LayerPlan(*layer) for layer in each))
 
     def choose_sources(
@@ -164,7 +171,7 @@ class ClusterDiffuser(AbstractDiffuser):
         fine: float,
         kernel: AbstractDiffusionKernel,
         interval: Float[Array, "2"],
-    ) -> tuple[list[float], list[float]]:
+    ) -> tuple[Float[np.ndarray, " gaussians"], Float[np.ndarray, " gaussians"]]:
         """Choose for each layer the edge of its cells (mm; 0 for single splats), and its support
         (standard deviations; 0 where it is not resolved).
 
@@ -173,16 +180,14 @@ class ClusterDiffuser(AbstractDiffuser):
         - `spacing`: root of the mean area of the splats, mm.
         - `fine`: area that only `FINEST` of the splats are finer than, mm^2.
         """
-        widest, area = (
-            jnp.asarray(each, interval.dtype) for each in (variances * self.margin, fine)
-        )
-        shares = np.asarray(resolved_fraction(widest, area, interval))
+        given = (jnp.asarray(each, interval.dtype) for each in (variances * self.margin, fine))
+        shares = np.asarray(eqx.filter_jit(resolved_fraction)(*given, interval), np.float64)
         edges = _CELL * (self.error / 2e-3) ** (1 / 3) * np.sqrt(variances / self.margin)
         edges = np.where((shares > 0) & (edges > _WORTHWHILE * spacing), edges, 0.0)
         supports = [
-            kernel.support(self.error, float(share)) if share > 0 else 0.0 for share in shares
+            kernel.support(self.error, share) if share > 0 else 0.0 for share in shares.tolist()
         ]
-        return edges.tolist(), supports
+        return edges, np.array(supports)
 
 
 class ClusterPlan(AbstractDiffusionPlan):
@@ -285,42 +290,28 @@ def _target_boxes(points: Float[Array, "3 points"]) -> Boxes:
 
 
 @eqx.filter_jit
-def _levels(tree: ClusterTree, sources: Sources) -> tuple[Float[Array, "3"], list[Sources]]:
-    """Compute the mean of the centers, and the clusters of every level about it."""
-    origin = jnp.mean(sources.centers, axis=1)
-    centered = dataclasses.replace(sources, centers=sources.centers - origin[:, None])
-    return origin, tree.levels(centered)
+def _enclose(
+    tree: ClusterTree,
+    sources: Sources,
+    variances: Float[Array, " gaussians"],
+    margin: float,
+    kernel: AbstractDiffusionKernel,
+    levels: tuple[int, ...],
+) -> tuple[Boxes, list[Boxes], Float[Array, " gaussians"]]:
+    """Enclose the blocks of points, and the blocks of sources of every layer; also compute how much
+    deeper the sources of the widest layer lie for which a plan holds, mm.
+    """
+    centers = sources.centers - jnp.mean(sources.centers, axis=1)[:, None]
+    clusters = tree.levels(dataclasses.replace(sources, centers=centers))
+    depths = kernel.depths(variances)
+    boxes = [
+        source_boxes(clusters[level].lowered(depth))
+        for level, depth in zip(levels, depths, strict=True)
+    ]
+    return _target_boxes(centers), boxes, kernel.depths(variances * margin) - depths
 
 
 @eqx.filter_jit
 def source_boxes(below: Sources) -> Boxes:
     """Enclose the sources of a layer, sunk below their splats. Not differentiated."""
     return Boxes.around(below.centers, below.areas > 0, SOURCES)
-
-
-def _boxes_and_reach(
-    clusters: Sources, kernel: AbstractDiffusionKernel, variance, largest, support: float
-) -> tuple[Boxes, Float[Array, ""]]:
-    """Enclose the sources of a layer in boxes, and compute the distance (mm) within which they
-    matter; 0 for a layer without support.
-    """
-    depths = kernel.depths(jnp.stack([variance, largest]))
-    # Sources of a wider layer lie deeper than those of the boxes.
-    sinking = math.sqrt(3) * float(depths[1] - depths[0])
-    reach = support * math.sqrt(float(largest)) + sinking if support > 0 else 0.0
-    return source_boxes(clusters.lowered(depths[0])), jnp.asarray(reach, largest.dtype)
-
-
-def _find(points: Sequence[Boxes], sources: Boxes, reach: np.ndarray) -> Lists | None:
-    """Find the neighbors of every part, with lists padded to one size; `None` for no reach."""
-    if reach == 0:
-        return None
-    parts = [find_neighbors(each, sources, float(reach)) for each in points]
-    most = max(len(each.rows) for each in parts)
-    padded = [
-        dataclasses.replace(
-            each, rows=jnp.pad(each.rows, ((0, most - len(each.rows)), (0, 0)), mode="edge")
-        )
-        for each in parts
-    ]
-    return jax.tree.map(lambda *rows: jnp.concatenate(rows), *padded)

@@ -126,31 +126,51 @@ class Neighbors(eqx.Module):
         return (reach + math.sqrt(3) * moved) / self.reach
 
 
-def find_neighbors(points: Boxes, sources: Boxes, reach: float) -> Lists:
+def find_neighbors(
+    points: Boxes, sources: Boxes, reach: float, parts: int = 1, least: int = 0
+) -> Lists:
     """Search for the blocks of sources within `reach` (mm) of every block of points.
 
     The number of rows is rounded up, so that nearby geometries need no other program. Not for
     traced arrays.
+
+    **Arguments:**
+
+    - `parts`: equal parts of the points, each with lists of its own, one after the other.
+    - `least`: rows of each part.
     """
-    of, near = _pairs_in_reach(points, sources, reach)
-    blocks, empty = points.low.shape[0], sources.low.shape[0]
+    corners = (np.split(np.asarray(corner), parts) for corner in (points.low, points.high))
+    found = [_list(low, high, sources, reach) for low, high in zip(*corners, strict=True)]
+    # At least one row, the last, stays empty: lanes whose list has ended read it.
+    count = max(least, *(round_up(len(ids), 1) for ids, *_ in found))
+    padded = [
+        (np.pad(ids, ((0, count - len(ids)), (0, 0)), constant_values=len(sources.low)), *each)
+        for ids, *each in found
+    ]
+    whole = (np.concatenate(each) for each in zip(*padded, strict=True))
+    return Lists(*(jnp.asarray(each, jnp.int32) for each in whole))
+
+
+def _list(low: np.ndarray, high: np.ndarray, sources: Boxes, reach: float):
+    """Return the rows of blocks of sources; for every block of points its first row and their
+    number; and the order of the blocks.
+    """
+    of, near = _pairs_in_reach((low, high), (sources.low, sources.high), reach)
     by_block = np.argsort(of, kind="stable")
     of, near = of[by_block], near[by_block]
-    lengths = np.bincount(of, minlength=blocks)
+    lengths = np.bincount(of, minlength=len(low))
     counts = -(-lengths // WIDTH)
     first, begins = (np.cumsum(each) - each for each in (counts, lengths))
-    # At least one row, the last, stays empty: lanes whose list has ended read it.
-    ids = np.full((round_up(int(counts.sum()), 1), WIDTH), empty, np.int32)
+    ids = np.full((counts.sum(), WIDTH), len(sources.low), np.int32)
     ids.reshape(-1)[(first * WIDTH - begins)[of] + np.arange(len(of))] = near
-    order = np.argsort(-counts, kind="stable")
-    return Lists(*(jnp.asarray(each, jnp.int32) for each in (ids, first, counts, order)))
+    return ids, first, counts, np.argsort(-counts, kind="stable")
 
 
-def _levels(boxes: Boxes, depth: int) -> list[tuple[np.ndarray, np.ndarray]]:
+def _levels(corners: tuple, depth: int) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return the corners `[3, parents, parts]` of boxes, `_FAN` of them to a parent, and of ever
     coarser boxes around these; empty boxes fill each level.
     """
-    levels, corners = [], (np.asarray(boxes.low).T, np.asarray(boxes.high).T)
+    levels, corners = [], tuple(np.asarray(corner).T for corner in corners)
     for _ in range(depth):
         lacking = ((0, 0), (0, -corners[0].shape[1] % _FAN))
         low, high = (
@@ -162,9 +182,11 @@ def _levels(boxes: Boxes, depth: int) -> list[tuple[np.ndarray, np.ndarray]]:
     return levels
 
 
-def _pairs_in_reach(points: Boxes, sources: Boxes, reach: float) -> tuple[np.ndarray, np.ndarray]:
-    """Find the pairs of boxes that are in reach of each other, from coarse to fine."""
-    depth = math.ceil(math.log(max(len(points.low), len(sources.low), 2), _FAN))
+def _pairs_in_reach(points: tuple, sources: tuple, reach: float) -> tuple[np.ndarray, np.ndarray]:
+    """Find the pairs of boxes, given by their corners, that are in reach of each other, from coarse
+    to fine.
+    """
+    depth = math.ceil(math.log(max(len(points[0]), len(sources[0]), 2), _FAN))
     each = zip(_levels(points, depth), _levels(sources, depth), strict=True)
     levels = [(*of_points, *of_sources) for of_points, of_sources in each]
     root, none = np.zeros(1, np.int32), np.zeros(0, np.int32)

@@ -2,7 +2,6 @@
 to their sums, and is forgotten.
 """
 
-import dataclasses
 import math
 from collections.abc import Iterable, Iterator
 
@@ -58,12 +57,14 @@ class StreamedDiffusion:
         """
         sizes = np.asarray(variances, np.float64)
         edges, supports = diffuser.choose_sources(sizes, spacing, fine, kernel, interval)
-        each = zip(variances, kernel.depths(variances), edges, supports, strict=True)
+        each = zip(
+            variances, kernel.depths(variances), edges.tolist(), supports.tolist(), strict=True
+        )
         self.layers = [
             _Layer(variance, depth, edge, kernel.truncated(support), support) if support else None
             for variance, depth, edge, support in each
         ]
-        self.cells = sorted({edge for edge in edges if edge > 0})
+        self.cells = np.unique(edges[edges > 0]).tolist()
         self.points = jnp.where(exists[:, None], points, FAR)
         self.boxes = Boxes.around(
             jnp.moveaxis(self.points, 1, 0).reshape(3, -1), exists.reshape(-1), points.shape[2]
@@ -126,12 +127,10 @@ class StreamedDiffusion:
     def _sum_layer(self, i: int, layer: _Layer, levels: list[Sources]) -> Array:
         clusters = levels[self.cells.index(layer.edge) + 1 if layer.edge else 0]
         reach = layer.support * math.sqrt(float(layer.variance))
-        lists = find_neighbors(self.boxes, source_boxes(clusters.lowered(layer.depth)), reach)
-        if len(lists.rows) > self.rows[i]:
-            self.rows[i] = 1 << (len(lists.rows) - 1).bit_length()
-        more = self.rows[i] - len(lists.rows)
-        rows = jnp.pad(lists.rows, ((0, more), (0, 0)), mode="edge")
-        return _sum(self.points, clusters, layer, dataclasses.replace(lists, rows=rows))
+        around = source_boxes(clusters.lowered(layer.depth))
+        lists = find_neighbors(self.boxes, around, reach, least=self.rows[i])
+        self.rows[i] = len(lists.rows)
+        return _sum(self.points, clusters, layer, lists)
 
 
 @eqx.filter_jit
