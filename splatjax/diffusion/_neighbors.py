@@ -10,7 +10,7 @@ from jax import lax
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
-from splatjax.splatting import round_up
+from splatjax._chunking import with_spare
 
 SOURCES = 8
 """Sources of a block."""
@@ -138,7 +138,7 @@ def find_neighbors(points: Boxes, sources: Boxes, reach: float) -> Lists:
     lengths = np.bincount(of, minlength=blocks)
     counts = -(-lengths // WIDTH)
     first, begins = (np.cumsum(each) - each for each in (counts, lengths))
-    ids = np.full((round_up(int(counts.sum()), 1), WIDTH), empty, np.int32)
+    ids = np.full((with_spare(int(counts.sum()), 1), WIDTH), empty, np.int32)
     ids.reshape(-1)[(first * WIDTH - begins)[of] + np.arange(len(of))] = near
     order = np.argsort(-counts, kind="stable")
     return Lists(*(jnp.asarray(each, jnp.int32) for each in (ids, first, counts, order)))

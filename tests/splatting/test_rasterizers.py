@@ -51,7 +51,7 @@ def settings_of(perspective: bool) -> SplattingSettings:
 
 def roomy(view, count: int) -> TilePlan:
     """Make a plan with capacity for every splat in every tile: one program for all scenes."""
-    everywhere = jnp.full(TILES.grid(view).tiles, count)
+    everywhere = jnp.full(TILES.grid(view).padded_count, count)
     return TILES.plan_for([[(everywhere[0], everywhere)]], count, view)
 
 
@@ -212,3 +212,24 @@ def test_too_small_a_capacity_is_reported(short):
     named = {name: getattr(enough, name) for name in ("pairs", "blocks", "chunks")} | short
     needed = jax.jit(lambda each: bin_items(each, GRID, BinCapacity(**named)).needed)
     assert float(needed(ranges[3][0])) > 1
+
+
+def test_long_lists_in_a_large_picture_keep_all_items():
+    """Two lists of one chunk, longer than the rest of a 32-bit number beside that of a tile."""
+    grid, counts = TileGrid(8192, 8192, lanes=2, slots=1), [3000, 4000, 10, 10]
+    tiles = jnp.repeat(jnp.arange(4, dtype=jnp.int32), jnp.asarray(counts))
+    one = jnp.ones_like(tiles)
+    ranges = TileRanges(tiles, 0 * one, one, one)
+    capacity = BinCapacity.for_counts([jnp.asarray(counts)], grid)
+    bins = jax.jit(lambda ranges: bin_items(ranges, grid, capacity))(ranges)
+    assert float(bins.needed) <= 1
+    ids = np.asarray(bins.ids).ravel()
+    np.testing.assert_array_equal(np.sort(ids[ids < len(tiles)]), np.arange(len(tiles)))
+
+
+def test_too_many_tiles_are_refused():
+    """A picture whose tiles have numbers too large to be sorted."""
+    view = bodies.perspective(width=1 << 14, height=1 << 14)
+    with pytest.raises(ValueError, match=r"16384 x 16384"):
+        TileRasterizer().make_plan([bodies.bumpy(9)], [view], SETTINGS)
+    assert TileGrid(1 << 14, (1 << 14) - 8).padded_count < 1 << 22
