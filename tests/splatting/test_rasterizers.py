@@ -215,7 +215,7 @@ def test_too_small_a_capacity_is_reported(short):
 
 
 def test_long_lists_in_a_large_picture_keep_all_items():
-    """Two lists of one chunk, longer than the rest of a 32-bit number beside that of a tile."""
+    """Two lists of one chunk, so long that a sort key of 32 bits does not hold length and tile."""
     grid, counts = TileGrid(8192, 8192, lanes=2, slots=1), [3000, 4000, 10, 10]
     tiles = jnp.repeat(jnp.arange(4, dtype=jnp.int32), jnp.asarray(counts))
     one = jnp.ones_like(tiles)
