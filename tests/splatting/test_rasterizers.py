@@ -27,6 +27,7 @@ from splatjax.splatting import (
     TileRanges,
     TileRasterizer,
     bin_items,
+    make_shadow_map,
 )
 
 WIDTH, HEIGHT = 21, 18
@@ -155,10 +156,9 @@ def test_a_picture_is_the_middle_of_a_larger_one(float64):
 
 @pytest.mark.once
 @pytest.mark.long
-def test_too_small_a_capacity_makes_the_sums_nan_and_is_reported():
+def test_too_small_a_capacity_makes_the_picture_nan_and_is_reported():
     """Never a wrong picture; and where there is little behind the front, little capacity for it."""
     view, body = bodies.perspective(width=96, height=96), bodies.bumpy(500)
-    rows = jnp.ones((1, 500))
     whole = TileRasterizer(lanes=2, slots=16).make_plan([body], [view], SETTINGS)
     plan = whole.fitted([body], [view], SETTINGS)
     assert plan.places.behind < whole.places.behind
@@ -169,10 +169,10 @@ def test_too_small_a_capacity_makes_the_sums_nan_and_is_reported():
         {"places": dataclasses.replace(plan.places, behind=2)},
     ):
         tried = dataclasses.replace(plan, **short)
-        sums = jax.jit(tried.sum_fragments, static_argnums=(3, 4))
-        sums = sums(body, rows, view, SETTINGS, OneDevice())
-        assert (float(sums.needed) > 1) == bool(short), short
-        assert np.all(np.isnan(sums.sums.rows)) == bool(short), short
+        make = jax.jit(make_shadow_map, static_argnums=(2, 3, 4))
+        seen = make(body, view, SETTINGS, tried, OneDevice())
+        assert (float(seen.needed) > 1) == bool(short), short
+        assert np.all(np.isnan(seen.planes) == bool(short)), short
 
 
 GRID = TileGrid(61, 45, lanes=4, slots=4)
