@@ -1,4 +1,6 @@
-"""Compute functions of many points chunk by chunk, and many steps as one program."""
+"""Compute functions of many points chunk by chunk, and many steps as one program; and the planned
+capacities of arrays whose shapes are static.
+"""
 
 import functools
 from collections.abc import Callable
@@ -7,7 +9,7 @@ from typing import TypeVar, cast
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, DTypeLike, Int, PyTree, Shaped
+from jaxtyping import Array, DTypeLike, Float, Int, PyTree, Shaped
 
 Result = TypeVar("Result", bound=PyTree)
 Function = TypeVar("Function", bound=Callable)
@@ -100,6 +102,24 @@ def take_points(
         for plane in planes
     ]
     return jnp.stack(taken).reshape(*rows.shape[:-1], len(chosen))
+
+
+def with_spare(count: int, step: int) -> int:
+    """Plan the capacity for a count: 3% more and at least one more, rounded up to the next of
+    sixteen steps per octave and to a multiple of `step`, so that nearby counts need no other
+    program.
+    """
+    count = int(count * 1.03) + 1
+    grain = max(1 << max(count.bit_length() - 5, 0), step)
+    return -(-count // grain) * grain
+
+
+def needed_over_planned(needed: Int[Array, ""], planned: int) -> Float[Array, ""]:
+    """Compute the capacity needed over planned: above 1 if and only if more is needed, which the
+    rounding of a quotient hides from 16.7 million on.
+    """
+    ratio = needed.astype(jnp.float32) / planned
+    return jnp.where(needed > planned, jnp.maximum(ratio, 1 + jnp.finfo(ratio.dtype).eps), ratio)
 
 
 def zeros_after(known: PyTree[Array], shape: tuple[int, ...], dtype: DTypeLike) -> Array:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from bodies import assert_close
 
-from splatjax._chunking import jit_unless_traced, map_chunks, zeros_after
+from splatjax._chunking import jit_unless_traced, map_chunks, needed_over_planned, zeros_after
 
 
 def squares_and_lengths(scale, record):
@@ -86,3 +86,11 @@ def test_a_compiled_function_compiles_once_and_binds_as_a_method(compiled):
     np.testing.assert_allclose(jax.jit(Curve())(x), values, rtol=1e-6)
     within = {step.primitive.name for step in jax.make_jaxpr(lambda x: Curve()(x))(x).eqns}
     assert "sin" in within
+
+
+@pytest.mark.parametrize("planned", [1, 3, 1000, 20_971_520, 2**31 - 2])
+def test_one_more_than_planned_is_reported_however_much_was_planned(planned):
+    ratio = jax.jit(lambda needed: needed_over_planned(needed, planned))
+    assert float(ratio(jnp.int32(planned))) == 1
+    assert float(ratio(jnp.int32(planned + 1))) > 1
+    assert float(ratio(jnp.int32(0))) == 0

@@ -15,7 +15,8 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
-from splatjax.splatting import AbstractView, PerspectiveView, round_up
+from splatjax._chunking import with_spare
+from splatjax.splatting import AbstractView, PerspectiveView
 
 # of a face's extent, by which it is larger: a pixel on an edge belongs to both faces, never to none
 _ON_THE_EDGE = 1e-4
@@ -97,7 +98,7 @@ def capacity_for(landing: Landing) -> int:
     motion.
     """
     _, _, across, down = landing.boxes()
-    return round_up(9 * int(jnp.sum(across * down)) // 8, 1024)
+    return with_spare(9 * int(jnp.sum(across * down)) // 8, 1024)
 
 
 def see_faces(landing: Landing, capacity: int) -> SeenFaces:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Float
 
-from splatjax.splatting import SIDE, TileGrid
+from splatjax.splatting import TILE_SIDE, TileGrid
 
 from ._mesh_light import MeshLight, MeshShadow
 from ._textured_mesh import SurfaceTexels
@@ -104,7 +104,7 @@ class TranslucentShadowMap(AbstractThinParts):
         x, y, depth = view.project(points.T)
         column = jnp.clip(stop_gradient(jnp.floor(x)).astype(jnp.int32), 0, view.width - 1)
         row = jnp.clip(stop_gradient(jnp.floor(y)).astype(jnp.int32), 0, view.height - 1)
-        tile, pixel = jnp.divmod(TileGrid(view.width, view.height).pixel(column, row), SIDE**2)
+        tile, pixel = jnp.divmod(TileGrid(view.width, view.height).pixel(column, row), TILE_SIDE**2)
         entered, lit = shadow.attributes[tile, :, pixel].T, coverage[tile, pixel] > 0
         entry = view.unproject(
             x, y, jnp.where(lit, jnp.minimum(front[tile, pixel], depth), depth)

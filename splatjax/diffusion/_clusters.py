@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from splatjax.splatting import round_up
+from splatjax._chunking import with_spare
 
 from ._diffuser import Sources
 
@@ -70,7 +70,7 @@ class ClusterTree(eqx.Module):
             of_slot[slots] = rank[parent]
             parents.append(jnp.asarray(of_slot))
             positions, facing, members = positions[order], facing[order], inside[order]
-            slots, before = np.arange(len(order)), round_up(len(order), BLOCK)
+            slots, before = np.arange(len(order)), with_spare(len(order), BLOCK)
             counts.append(before)
         return cls(tuple(parents), tuple(counts))
 

@@ -13,6 +13,7 @@ import numpy as np
 from jax.lax import stop_gradient
 from jaxtyping import Array, Float
 
+from splatjax._smooth import smooth_step
 from splatjax.scene import Splats
 
 _ROOT_DEGREE = 4
@@ -206,9 +207,7 @@ def resolved_fraction(
     A smooth step of variance over the area of a splat; `interval` is from
     `AbstractDiffusionKernel.interval`.
     """
-    begin, end = interval[0] ** 2, interval[1] ** 2
-    t = jnp.clip((variance / area - begin) / (end - begin), 0, 1)
-    return t * t * (3 - 2 * t)
+    return smooth_step(variance / area, interval[0] ** 2, interval[1] ** 2)
 
 
 @eqx.filter_jit

@@ -10,7 +10,7 @@ from jax import lax
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
-from splatjax.splatting import round_up
+from splatjax._chunking import with_spare
 
 SOURCES = 8
 """Sources of a block."""
@@ -142,7 +142,7 @@ def find_neighbors(
     corners = (np.split(np.asarray(corner), parts) for corner in (points.low, points.high))
     found = [_list(low, high, sources, reach) for low, high in zip(*corners, strict=True)]
     # At least one row, the last, stays empty: lanes whose list has ended read it.
-    count = max(least, *(round_up(len(ids), 1) for ids, *_ in found))
+    count = max(least, *(with_spare(len(ids), 1) for ids, *_ in found))
     padded = [
         (np.pad(ids, ((0, count - len(ids)), (0, 0)), constant_values=len(sources.low)), *each)
         for ids, *each in found

@@ -6,9 +6,10 @@ Its head is modeled in clay: serene, eyes closed; mm, +y up, facing +z, eyes nea
 import numpy as np
 from jaxtyping import Float
 
+from splatjax._smooth import smooth_step
 from splatjax.scene import Splats
 
-from ._distances import Part, above, bump, carve, ellipsoid, join, keep, limb, model, smooth_step
+from ._distances import Part, above, bump, carve, ellipsoid, join, keep, limb, model
 from ._mesh import Mesh
 from ._sample import splats_at
 from ._scatter import scatter

@@ -79,9 +79,3 @@ def keep(a: np.ndarray, b: np.ndarray, softness: Size) -> np.ndarray:
 def bump(x: np.ndarray, center: Size | np.ndarray, width: Size | np.ndarray) -> np.ndarray:
     """Compute `exp(-(x - center)^2 / width^2)`: clay put on, or taken off."""
     return np.exp(-(((x - center) / width) ** 2))
-
-
-def smooth_step(x: np.ndarray, low: Size | np.ndarray, high: Size | np.ndarray) -> np.ndarray:
-    """Compute 0 below `low`, 1 above `high`, a cubic between; reversed when `low > high`."""
-    t = np.clip((x - low) / (high - low), 0.0, 1.0)
-    return t * t * (3 - 2 * t)

@@ -239,6 +239,6 @@ def in_a_row(values: Shaped[Array, "places *rows pixels"]) -> Shaped[Array, "*ro
 
 
 def _by_place(values: Shaped[Array, "*rows points"]) -> Shaped[Array, "places *rows pixels"]:
-    pixels = _splatting.SIDE**2
+    pixels = _splatting.TILE_SIDE**2
     rows = values.reshape(*values.shape[:-1], values.shape[-1] // pixels, pixels)
     return jnp.moveaxis(rows, -2, 0)

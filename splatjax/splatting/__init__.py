@@ -6,7 +6,6 @@ from ._bins import (
     bin_items as bin_items,
     BinCapacity as BinCapacity,
     Bins as Bins,
-    round_up as round_up,
     scatter_slots as scatter_slots,
     slot_plane as slot_plane,
 )
@@ -16,7 +15,7 @@ from ._views import (
     Footprints as Footprints,
     SplattingSettings as SplattingSettings,
 )
-from ._grid import SIDE as SIDE, TileGrid as TileGrid, TileRanges as TileRanges
+from ._grid import TILE_SIDE as TILE_SIDE, TileGrid as TileGrid, TileRanges as TileRanges
 from ._kernel import coverage as coverage, fragment_weight as fragment_weight
 from ._projections import OrthographicView as OrthographicView, PerspectiveView as PerspectiveView
 from ._rasterizer import (

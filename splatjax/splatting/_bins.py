@@ -13,10 +13,12 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from ._grid import TileGrid, TileRanges
+from splatjax._chunking import needed_over_planned, with_spare
 
-_ROW = 1024  # pairs sorted together; their place in the row takes the low 10 bits of a key
-_ROW_BITS = 10
+from ._grid import TILE_BITS, TileGrid, TileRanges
+
+_ROW_BITS = 32 - TILE_BITS  # of a sort key: the number of a pair in its row
+_ROW = 1 << _ROW_BITS  # pairs sorted together
 
 
 class BinCapacity(eqx.Module):
@@ -28,9 +30,7 @@ class BinCapacity(eqx.Module):
 
     @classmethod
     def for_counts(cls, per_tile: Sequence[Int[Array, " tiles"]], grid: TileGrid) -> "BinCapacity":
-        """Choose the capacity for each of these numbers of items per tile, rounded up so that
-        nearby ones need no other program.
-        """
+        """Choose the capacity for each of these numbers of items per tile."""
         pairs = blocks = chunks = 1
         for tiles in per_tile:
             counts = np.asarray(tiles, np.int64)
@@ -38,19 +38,10 @@ class BinCapacity(eqx.Module):
             pairs, blocks = max(pairs, int(counts.sum())), max(blocks, int(longest.sum()))
             chunks = max(chunks, int((longest > 0).sum()))
         return cls(
-            round_up(pairs, _ROW),
-            round_up(blocks, 4),
-            min(round_up(chunks, 4), grid.tiles // grid.lanes),
+            with_spare(pairs, _ROW),
+            with_spare(blocks, 4),
+            min(with_spare(chunks, 4), grid.padded_count // grid.lanes),
         )
-
-
-def round_up(count: int, step: int) -> int:
-    """Round up to the next of sixteen steps per octave, and to a multiple of `step`, with 3% to
-    spare.
-    """
-    count = int(count * 1.03) + 1
-    grain = max(1 << max(count.bit_length() - 5, 0), step)
-    return -(-count // grain) * grain
 
 
 class Bins(eqx.Module):
@@ -60,14 +51,16 @@ class Bins(eqx.Module):
     order: Int[Array, " tiles"]
     """The tile of each lane, chunk after chunk."""
     first_block: Int[Array, " chunks_and_one"]
+    """Of each chunk; the last entry is the number of all blocks."""
     needed: Float[Array, ""]
-    lanes: int = eqx.field(static=True)
+    """Capacity needed over planned; above 1 the lists are incomplete."""
+    planned_lanes: int = eqx.field(static=True)
     """Capacity of the leading chunks, in lanes; the lists beyond are empty."""
 
     @property
     def chunks(self) -> Int[Array, ""]:
         """Count the chunks with anything in them: longer lists come first, so these lead."""
-        return jnp.minimum(_occupied(self.first_block), self.lanes // self.ids.shape[1])
+        return jnp.minimum(_occupied(self.first_block), self.planned_lanes // self.ids.shape[1])
 
 
 def _occupied(first_block: Int[Array, " chunks_and_one"]) -> Int[Array, ""]:
@@ -88,7 +81,9 @@ def _running_max(values: Int[Array, " pairs"]) -> Int[Array, " pairs"]:
 
 
 def _pairs(ranges: TileRanges, grid: TileGrid, capacity: int):
-    """List all pairs of item and tile, item after item; `grid.tiles` where there is none."""
+    """List all pairs of item and tile, item after item; `grid.padded_count` where there is none.
+    Also compute the capacity needed over planned.
+    """
     counts = ranges.across * ranges.down
     ends = jnp.cumsum(counts)
     begins, total = ends - counts, ends[-1]
@@ -108,62 +103,66 @@ def _pairs(ranges: TileRanges, grid: TileGrid, capacity: int):
     local, across = pair - of_item(begins), jnp.maximum(of_item(ranges.across), 1)
     down = ((local.astype(jnp.float32) + 0.5) / across.astype(jnp.float32)).astype(
         jnp.int32
-    )  # exact below 4 million
+    )  # exact, since an item has fewer than 2^22 tiles
     tile = of_item(corner) + local + down * (grid.across - across)
-    return item, jnp.where(pair < total, tile, grid.tiles), jnp.sum(counts.astype(jnp.float32))
+    # The integer is exact but may wrap around; the float rounds but does not wrap around.
+    needed = jnp.sum(counts.astype(jnp.float32)) / capacity
+    needed = jnp.maximum(needed, needed_over_planned(total, capacity))
+    return item, jnp.where(pair < total, tile, grid.padded_count), needed
 
 
 def _ranks(tile: Int[Array, " pairs"], tiles: int):
-    """Number the pairs of each tile in order: rows are sorted apart, and counts carried from row to
-    row.
+    """Compute the rank of each pair in its tile's list, in rows that are sorted by tile.
+
+    Returns, for the sorted pairs, tile, column before sorting and rank; and the counts per tile.
     """
-    place = jnp.arange(_ROW, dtype=jnp.uint32)[None]
-    keys = (tile.astype(jnp.uint32).reshape(-1, _ROW) << _ROW_BITS) | place
+    # Sort each row by tile; the low bits keep the order within a tile.
+    column = jnp.arange(_ROW, dtype=jnp.uint32)[None]
+    keys = (tile.astype(jnp.uint32).reshape(-1, _ROW) << _ROW_BITS) | column
     parts = jnp.array_split(keys, 2)  # a sort runs on one core; several run side by side
     keys = jnp.concatenate([lax.sort(part, dimension=1, is_stable=False) for part in parts])
-    sorted_tile, source = (
-        (keys >> _ROW_BITS).astype(jnp.int32),
-        (keys & (_ROW - 1)).astype(jnp.int32),
-    )
+    sorted_tile = (keys >> _ROW_BITS).astype(jnp.int32)
+    column_before = (keys & (_ROW - 1)).astype(jnp.int32)
+
+    # Mark the last pair of each tile in its row, and find for every pair where its tile ends.
     rows = keys.shape[0]
     ends = jnp.concatenate(
         [sorted_tile[:, 1:] != sorted_tile[:, :-1], jnp.ones((rows, 1), bool)], axis=1
     )
-    position = jnp.arange(_ROW, dtype=jnp.int32)[None]
+    column_after = jnp.arange(_ROW, dtype=jnp.int32)[None]
 
     def earliest(carry, value):
         carry = jnp.minimum(carry, value)
         return carry, carry
 
-    candidates = jnp.where(ends, position, _ROW).T
+    candidates = jnp.where(ends, column_after, _ROW).T
     run_end = lax.scan(earliest, jnp.full(rows, _ROW, jnp.int32), candidates, reverse=True)[1].T
 
+    # Carry the counts from row to row. A rank is the count after the row, less the pairs of the
+    # tile from here to the end of the row.
     def count_on(counts, row):
         tiles_of_row, from_end = row
         counts = counts.at[tiles_of_row].add(1, mode="promise_in_bounds")
         return counts, counts.at[tiles_of_row].get(mode="promise_in_bounds") - from_end
 
     counts, rank = lax.scan(
-        count_on, jnp.zeros(tiles + 1, jnp.int32), (sorted_tile, run_end - position + 1)
+        count_on, jnp.zeros(tiles + 1, jnp.int32), (sorted_tile, run_end - column_after + 1)
     )
-    return sorted_tile, source, rank, counts[:tiles]
+    return sorted_tile, column_before, rank, counts[:tiles]
 
 
 def bin_items(ranges: TileRanges, grid: TileGrid, capacity: BinCapacity) -> Bins:
     """List the items of every tile, in their order. Not differentiated."""
-    items, lanes, slots, tiles = ranges.left.shape[0], grid.lanes, grid.slots, grid.tiles
+    items, lanes, slots, tiles = ranges.left.shape[0], grid.lanes, grid.slots, grid.padded_count
     size = capacity.blocks * lanes * slots
     # List the pairs item after item, and number the pairs of each tile.
-    item, tile, total = _pairs(ranges, grid, capacity.pairs)
-    tile, source, rank, counts = _ranks(tile, tiles)
-    item = jnp.take_along_axis(item.reshape(-1, _ROW), source, axis=1, mode="promise_in_bounds")
+    item, tile, pairs = _pairs(ranges, grid, capacity.pairs)
+    tile, column, rank, counts = _ranks(tile, tiles)
+    item = jnp.take_along_axis(item.reshape(-1, _ROW), column, axis=1, mode="promise_in_bounds")
 
     # Longest lists first; equal ones in scan order, so that the lanes of a chunk are neighbors.
     lengths = -(-counts // slots)
-    bits = (tiles - 1).bit_length()
-    longest = (1 << (31 - bits)) - 1
-    keys = ((longest - jnp.minimum(lengths, longest)) << bits) | jnp.arange(tiles, dtype=jnp.int32)
-    order = lax.sort(keys, is_stable=False) & ((1 << bits) - 1)
+    order = jnp.argsort(-lengths, stable=True).astype(jnp.int32)
     first_block = jnp.concatenate([jnp.zeros(1, jnp.int32), jnp.cumsum(lengths[order[::lanes]])])
 
     # Where each tile begins among the slots, and from there the slot of every pair.
@@ -178,10 +177,9 @@ def bin_items(ranges: TileRanges, grid: TileGrid, capacity: BinCapacity) -> Bins
     ids = jnp.full(size, items, jnp.int32).at[target.reshape(-1)].set(item.reshape(-1), mode="drop")
 
     # What was needed, of what was planned.
-    blocks, chunks = first_block[-1].astype(jnp.float32), _occupied(first_block).astype(jnp.float32)
-    needed = jnp.maximum(
-        total / capacity.pairs, jnp.maximum(blocks / capacity.blocks, chunks / capacity.chunks)
-    )
+    blocks = needed_over_planned(first_block[-1], capacity.blocks)
+    chunks = needed_over_planned(_occupied(first_block), capacity.chunks)
+    needed = jnp.maximum(pairs, jnp.maximum(blocks, chunks))
     return Bins(
         ids.reshape(capacity.blocks, lanes, slots),
         order,

@@ -32,7 +32,7 @@ class DenseRasterizer(AbstractRasterizer):
 
 
 class DenseRasterPlan(AbstractRasterPlan):
-    """What the plain rasterizer needs to know: nothing."""
+    """The plan of the plain rasterizer, which needs no capacity."""
 
     def sum_fragments(
         self,
@@ -87,7 +87,7 @@ class DenseRasterPlan(AbstractRasterPlan):
             return in_front, summed(rest & (nearness > limit[:, None]))
 
         both = jax.lax.map(picture_row, jnp.arange(view.height, dtype=dtype) + 0.5)
-        return _all_tiles(*(grid.cut(each.transpose(1, 0, 2)) for each in both))
+        return _all_tiles(*(grid.cut(surface.transpose(1, 0, 2)) for surface in both))
 
 
 def _all_tiles(

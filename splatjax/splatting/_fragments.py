@@ -11,7 +11,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int, Shaped
 
 from ._bins import Bins, slot_plane
-from ._grid import SIDE, TileGrid
+from ._grid import TILE_SIDE, TileGrid
 from ._kernel import fast_fragment_weight, fragment_weight_derivative
 from ._rasterizer import PixelSums, least_weight
 from ._views import AbstractView
@@ -25,11 +25,11 @@ class Lanes(eqx.Module):
     """Tiles that are swept together: where their lists begin in the slots, and their corners."""
 
     row: Int[Array, " lanes"]
-    """Of the first block, in slots cut into rows of one lane each; the next block is `stride` rows
-    on.
+    """Row of the lane's first block in `Slots`, whose arrays are `[blocks * lanes, slots]`; block b
+    is at `row + b * stride`.
     """
     lengths: Int[Array, " lanes"]
-    """Of each lane's list, in blocks: what follows is another chunk's."""
+    """Of the lane's chunk, in blocks; the blocks after it belong to the next chunk."""
     blocks: Int[Array, ""]
     x: Float[Array, "lanes 1"]
     y: Float[Array, "lanes 1"]
@@ -44,16 +44,14 @@ class Lanes(eqx.Module):
         return plane.at[self.row + block * self.stride].add(part, mode="promise_in_bounds")
 
     def until_end(
-        self, beyond: Float[Array, "lanes pixels"], block
+        self, far_limit: Float[Array, "lanes pixels"], block
     ) -> Float[Array, "lanes pixels"]:
-        """Return limits that nothing is nearer than, for lanes whose list has ended before a
-        block.
-        """
-        return jnp.where((block < self.lengths)[:, None], beyond, jnp.inf)
+        """Exclude all fragments of the lanes whose list has ended before a block."""
+        return jnp.where((block < self.lengths)[:, None], far_limit, jnp.inf)
 
 
 class Sweep(eqx.Module):
-    """What is static in a sweep."""
+    """The settings of a sweep, and its inner loops over the blocks of some lanes."""
 
     view: type[AbstractView] = eqx.field(static=True)
     """The view's class: fragments need its formulas, not where it stands."""
@@ -74,19 +72,23 @@ class Sweep(eqx.Module):
         """Pixel centers of a tile, from its corner. Constants: made by NumPy, or the compiler
         computes them per fragment.
         """
-        side = np.arange(SIDE, dtype=dtype) + np.asarray(0.5, dtype)
-        return np.tile(side, SIDE), np.repeat(side, SIDE)
+        side = np.arange(TILE_SIDE, dtype=dtype) + np.asarray(0.5, dtype)
+        return np.tile(side, TILE_SIDE), np.repeat(side, TILE_SIDE)
 
-    def lanes(self, bins: Bins, places: Int[Array, " lanes"], dtype) -> Lanes:
-        """Return tiles by their places in the order of the bins; from their number on there is
-        nothing.
+    def lanes(self, bins: Bins, lane_numbers: Int[Array, " lanes"], dtype) -> Lanes:
+        """Look up lanes by their number in `bins.order`; those from `bins.planned_lanes` on are
+        empty and have length 0.
         """
-        lanes, across, exist = self.grid.lanes, self.grid.across, places < bins.lanes
-        places = jnp.minimum(places, bins.lanes - 1)
-        tiles, chunk = bins.order[places], places // lanes
-        row = bins.first_block[chunk] * lanes + places % lanes
+        lanes, across = self.grid.lanes, self.grid.across
+        exist = lane_numbers < bins.planned_lanes
+        lane_numbers = jnp.minimum(lane_numbers, bins.planned_lanes - 1)
+        tiles, chunk = bins.order[lane_numbers], lane_numbers // lanes
+        row = bins.first_block[chunk] * lanes + lane_numbers % lanes
         lengths = jnp.where(exist, bins.first_block[chunk + 1] - bins.first_block[chunk], 0)
-        x, y = ((each * SIDE).astype(dtype)[:, None] for each in (tiles % across, tiles // across))
+        x, y = (
+            (index * TILE_SIDE).astype(dtype)[:, None]
+            for index in (tiles % across, tiles // across)
+        )
         return Lanes(row, lengths, jnp.max(lengths), x, y, lanes)
 
     def splats(self, planes, block, lanes: Lanes):
@@ -102,8 +104,9 @@ class Sweep(eqx.Module):
         return e + sx * dx + sy * dy, dx * (a * dx + b * dy) + c * dy * dy
 
     def limits(self, slots: "Slots", lanes: Lanes):
-        """Find per pixel the nearest shifted fragment: the back end of the front."""
+        """Find per pixel the nearest shifted fragment: the far limit of the front."""
 
+        # These lanes are one chunk: their lists have equal length, so none ends early.
         def nearest(block, limit):
             nearness, quadric = self.fragments(self.splats(slots.planes, block, lanes))
             shifted = self.view.shifted(nearness, lanes.read(slots.shift, block)[:, :, None])
@@ -112,37 +115,37 @@ class Sweep(eqx.Module):
                 jnp.max(jnp.where(self.view.inside(nearness, quadric), shifted, -jnp.inf), axis=1),
             )
 
-        return lax.fori_loop(jnp.int32(0), lanes.blocks, nearest, self._nothing(lanes))
+        return lax.fori_loop(jnp.int32(0), lanes.blocks, nearest, self._no_limit(lanes))
 
-    def limits_behind(self, slots: "Slots", lanes: Lanes, front):
-        """Find the same for what lies behind the front's limits: of the fragments that weigh
-        something, and of any.
+    def limits_behind(self, slots: "Slots", lanes: Lanes, open_limit):
+        """Find the same for what lies behind the front, whose far limit is `open_limit` in open
+        pixels and -inf in others: of the fragments that weigh something, and of any.
         """
 
         def nearest(block, limits):
             splats = self.splats(slots.planes, block, lanes)
             nearness, quadric = self.fragments(splats)
             shifted = self.view.shifted(nearness, lanes.read(slots.shift, block)[:, :, None])
-            beyond = lanes.until_end(jnp.full_like(front, -jnp.inf), block)
-            squared_radius = self.squared_radii(nearness, quadric, beyond, front)
+            far_limit = lanes.until_end(jnp.full_like(open_limit, -jnp.inf), block)
+            squared_radius = self.squared_radii(nearness, quadric, far_limit, open_limit)
             weight = splats[-1][:, :, None] * fast_fragment_weight(squared_radius)
             least = least_weight(self.view, *splats[4:8], self.filter_radius)
-            each = weight > least[:, :, None], squared_radius < 1
-            found = (jnp.max(jnp.where(candidate, shifted, -jnp.inf), axis=1) for candidate in each)
-            return tuple(jnp.maximum(limit, new) for limit, new in zip(limits, found, strict=True))
+            chosen = weight > least[:, :, None], squared_radius < 1
+            new = (jnp.max(jnp.where(which, shifted, -jnp.inf), axis=1) for which in chosen)
+            return tuple(jnp.maximum(*pair) for pair in zip(limits, new, strict=True))
 
         return lax.fori_loop(
-            jnp.int32(0), lanes.blocks, nearest, (self._nothing(lanes), self._nothing(lanes))
+            jnp.int32(0), lanes.blocks, nearest, (self._no_limit(lanes), self._no_limit(lanes))
         )
 
-    def _nothing(self, lanes: Lanes):
-        return jnp.full((lanes.row.shape[0], SIDE**2), -jnp.inf, lanes.x.dtype)
+    def _no_limit(self, lanes: Lanes):
+        return jnp.full((lanes.row.shape[0], TILE_SIDE**2), -jnp.inf, lanes.x.dtype)
 
-    def squared_radii(self, nearness, quadric, beyond, upto):
+    def squared_radii(self, nearness, quadric, far_limit, near_limit):
         """Compute `rho^2`, below 1 for the fragments between two limits; 1, where the weight is 0,
         for all others.
         """
-        between = (nearness > beyond[:, None]) & (nearness <= upto[:, None])
+        between = (nearness > far_limit[:, None]) & (nearness <= near_limit[:, None])
         chosen = self.view.inside(nearness, quadric) & between
         return jnp.where(chosen, self.view.squared_radius(nearness, quadric), 1.0)
 
@@ -154,13 +157,13 @@ class Sweep(eqx.Module):
         nearness = jnp.stack([e - sx * x - sy * y, sx, sy, jnp.ones_like(e)], axis=2)
         return jnp.concatenate([slots.rows(ids), nearness], axis=2)
 
-    def sums(self, slots: "Slots", lanes: Lanes, beyond, upto) -> PixelSums:
+    def sums(self, slots: "Slots", lanes: Lanes, far_limit, near_limit) -> PixelSums:
         """Sum over the fragments between two limits."""
 
         def add(block, sums):
             splats = self.splats(slots.planes, block, lanes)
             squared_radius = self.squared_radii(
-                *self.fragments(splats), lanes.until_end(beyond, block), upto
+                *self.fragments(splats), lanes.until_end(far_limit, block), near_limit
             )
             weight = splats[-1][:, :, None] * fast_fragment_weight(squared_radius)
             rows = self.rows(slots, lanes.read(slots.ids, block), splats)
@@ -168,21 +171,27 @@ class Sweep(eqx.Module):
             rows = lax.optimization_barrier(jnp.swapaxes(rows, 1, 2))
             return sums + jnp.einsum("trs,tsp->trp", rows, weight)
 
-        (places, pixels), rows = beyond.shape, slots.attributes.shape[1]
-        start = jnp.zeros((places, rows + 4, pixels), beyond.dtype)
+        (places, pixels), rows = far_limit.shape, slots.attributes.shape[1]
+        start = jnp.zeros((places, rows + 4, pixels), far_limit.dtype)
         sums = lax.fori_loop(jnp.int32(0), lanes.blocks, add, start)
         attributes, nearness = sums[:, :rows], sums[:, rows:]
-        px, py = self.pixels(beyond.dtype)
+        px, py = self.pixels(far_limit.dtype)
         plane = nearness[:, 0] + nearness[:, 1] * px[None] + nearness[:, 2] * py[None]
         return PixelSums(jnp.concatenate([attributes, plane[:, None]], axis=1), nearness[:, 3])
 
     def add_cotangents(
-        self, slots: "Slots", lanes: Lanes, beyond, upto, cotangent: PixelSums, gradients
+        self,
+        slots: "Slots",
+        lanes: Lanes,
+        far_limit,
+        near_limit,
+        cotangent: PixelSums,
+        gradients,
     ):
         """Add the cotangents of planes, per slot, and of attributes, per splat, for the fragments
         between two limits, from those of the sums.
         """
-        px, py = self.pixels(beyond.dtype)
+        px, py = self.pixels(far_limit.dtype)
         monomials = jnp.asarray(
             np.stack([np.ones_like(px), px, py, px * px, px * py, py * py], axis=1)
         )
@@ -195,7 +204,7 @@ class Sweep(eqx.Module):
             splats = self.splats(slots.planes, block, lanes)
             nearness, quadric = self.fragments(splats)
             squared_radius = self.squared_radii(
-                nearness, quadric, lanes.until_end(beyond, block), upto
+                nearness, quadric, lanes.until_end(far_limit, block), near_limit
             )
             weight = fast_fragment_weight(squared_radius)
             ids, opacity = lanes.read(slots.ids, block), splats[-1]
@@ -216,10 +225,11 @@ class Sweep(eqx.Module):
             d_rows = d_rows * opacity[:, :, None]
             near = near + jnp.moveaxis(d_rows[:, :, count : count + 3], 2, 0)
             of_planes, of_attributes = gradients
-            parts = *_plane_cotangents(splats, quad, near), d_opacity
+            d_planes = *_plane_cotangents(splats, quad, near), d_opacity
             return (
                 tuple(
-                    lanes.add(*each) for each in zip(of_planes, (block,) * 9, parts, strict=True)
+                    lanes.add(total, block, new)
+                    for total, new in zip(of_planes, d_planes, strict=True)
                 ),
                 of_attributes.at[ids].add(d_rows[:, :, :count], mode="drop"),
             )
@@ -253,7 +263,7 @@ class Slots(eqx.Module):
 
         return cls(
             ids=bins.ids.reshape(-1, width),
-            planes=[slots(*each) for each in zip(planes, _EMPTY, strict=True)],
+            planes=[slots(plane, fill) for plane, fill in zip(planes, _EMPTY, strict=True)],
             shift=slots(shift, 0.0),
             attributes=attributes,
         )

@@ -5,8 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-SIDE = 8
+TILE_SIDE = 8
 """Pixels along a tile."""
+TILE_BITS = 22  # in a sort key of 32, for the number of a tile
 
 
 class TileGrid(eqx.Module):
@@ -17,13 +18,20 @@ class TileGrid(eqx.Module):
     lanes: int = eqx.field(static=True, default=64)
     slots: int = eqx.field(static=True, default=32)
 
+    def __check_init__(self):
+        if self.padded_count >= 1 << TILE_BITS:
+            raise ValueError(
+                f"a picture of {self.width} x {self.height} pixels takes {self.padded_count} "
+                f"tiles, and fewer than {1 << TILE_BITS} can be sorted; render fewer pixels"
+            )
+
     @property
     def across(self) -> int:
-        return -(-self.width // SIDE)
+        return -(-self.width // TILE_SIDE)
 
     @property
     def down(self) -> int:
-        return -(-self.height // SIDE)
+        return -(-self.height // TILE_SIDE)
 
     @property
     def count(self) -> int:
@@ -31,7 +39,7 @@ class TileGrid(eqx.Module):
         return self.across * self.down
 
     @property
-    def tiles(self) -> int:
+    def padded_count(self) -> int:
         """Tiles of the picture, and a few empty ones that fill the last chunk."""
         return -(-self.count // self.lanes) * self.lanes
 
@@ -39,19 +47,22 @@ class TileGrid(eqx.Module):
         """Cut a picture into tiles; 0 beyond its edges."""
         rows, height, width = picture.shape
         whole = jnp.pad(
-            picture, ((0, 0), (0, self.down * SIDE - height), (0, self.across * SIDE - width))
+            picture,
+            ((0, 0), (0, self.down * TILE_SIDE - height), (0, self.across * TILE_SIDE - width)),
         )
         return (
-            whole.reshape(rows, self.down, SIDE, self.across, SIDE)
+            whole.reshape(rows, self.down, TILE_SIDE, self.across, TILE_SIDE)
             .transpose(1, 3, 0, 2, 4)
-            .reshape(self.count, rows, SIDE**2)
+            .reshape(self.count, rows, TILE_SIDE**2)
         )
 
     def join(self, tiles: Float[Array, "tiles rows pixels"]) -> Float[Array, "rows height width"]:
         """Put a picture together from its tiles."""
         rows = tiles.shape[1]
-        whole = tiles.reshape(self.down, self.across, rows, SIDE, SIDE).transpose(2, 0, 3, 1, 4)
-        return whole.reshape(rows, self.down * SIDE, self.across * SIDE)[
+        whole = tiles.reshape(self.down, self.across, rows, TILE_SIDE, TILE_SIDE).transpose(
+            2, 0, 3, 1, 4
+        )
+        return whole.reshape(rows, self.down * TILE_SIDE, self.across * TILE_SIDE)[
             :, : self.height, : self.width
         ]
 
@@ -59,22 +70,29 @@ class TileGrid(eqx.Module):
         self, tiles: Int[Array, " some"]
     ) -> tuple[Int[Array, "some pixels"], Int[Array, "some pixels"]]:
         """Return the column and the row of every pixel of some tiles."""
-        within = jnp.arange(SIDE**2, dtype=jnp.int32)
-        x = (tiles % self.across * SIDE)[:, None] + (within % SIDE)[None]
-        y = (tiles // self.across * SIDE)[:, None] + (within // SIDE)[None]
+        within = jnp.arange(TILE_SIDE**2, dtype=jnp.int32)
+        x = (tiles % self.across * TILE_SIDE)[:, None] + (within % TILE_SIDE)[None]
+        y = (tiles // self.across * TILE_SIDE)[:, None] + (within // TILE_SIDE)[None]
         return x, y
 
     def pixel(self, x: Int[Array, "..."], y: Int[Array, "..."]) -> Int[Array, "..."]:
         """Return the number of a pixel among those of all tiles, tile by tile."""
-        return (y // SIDE * self.across + x // SIDE) * SIDE**2 + y % SIDE * SIDE + x % SIDE
+        return (
+            (y // TILE_SIDE * self.across + x // TILE_SIDE) * TILE_SIDE**2
+            + y % TILE_SIDE * TILE_SIDE
+            + x % TILE_SIDE
+        )
 
     def within_picture(self) -> np.ndarray | None:
         """Mark the pixels `[tiles, pixels]` that lie in the picture; None if all do."""
-        if self.width % SIDE == 0 and self.height % SIDE == 0:
+        if self.width % TILE_SIDE == 0 and self.height % TILE_SIDE == 0:
             return None
-        x, y = np.arange(self.across * SIDE) < self.width, np.arange(self.down * SIDE) < self.height
-        within = y.reshape(self.down, 1, SIDE, 1) & x.reshape(1, self.across, 1, SIDE)
-        return within.reshape(self.count, SIDE**2)
+        x, y = (
+            np.arange(self.across * TILE_SIDE) < self.width,
+            np.arange(self.down * TILE_SIDE) < self.height,
+        )
+        within = y.reshape(self.down, 1, TILE_SIDE, 1) & x.reshape(1, self.across, 1, TILE_SIDE)
+        return within.reshape(self.count, TILE_SIDE**2)
 
 
 class TileRanges(eqx.Module):
@@ -98,8 +116,8 @@ class TileRanges(eqx.Module):
     ) -> "TileRanges":
         """Find the tiles with a pixel center inside each box (pixels)."""
         across, down = (0, grid.width - 1), (0, grid.height - 1)
-        i0, i1 = _first(left, *across) / SIDE, _last(right, *across) / SIDE
-        j0, j1 = _first(top, *down) / SIDE, _last(bottom, *down) / SIDE
+        i0, i1 = _first(left, *across) / TILE_SIDE, _last(right, *across) / TILE_SIDE
+        j0, j1 = _first(top, *down) / TILE_SIDE, _last(bottom, *down) / TILE_SIDE
         touched = visible & (i0 <= i1) & (j0 <= j1)
         i0, i1, j0, j1 = (jnp.floor(edge).astype(jnp.int32) for edge in (i0, i1, j0, j1))
         return cls(i0, j0, jnp.where(touched, i1 - i0 + 1, 0), jnp.where(touched, j1 - j0 + 1, 0))
@@ -124,7 +142,7 @@ class TileRanges(eqx.Module):
             .add(-one)
         )
         counts = jnp.cumsum(jnp.cumsum(corners, axis=0), axis=1)[:-1, :-1].reshape(-1)
-        return jnp.pad(counts, (0, grid.tiles - counts.shape[0]))
+        return jnp.pad(counts, (0, grid.padded_count - counts.shape[0]))
 
 
 def _first(edge: Float[Array, " items"], first: int, last: int) -> Float[Array, " items"]:

@@ -5,6 +5,8 @@ import math
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from splatjax._smooth import smooth_step
+
 _AT_RIM = math.exp(-4.0)
 
 
@@ -60,5 +62,4 @@ def coverage(weight_sum: Float[Array, "..."], full: float) -> Float[Array, "..."
     """Compute the fraction of a pixel that a surface covers: a smooth step of the sum of its
     weights, 1 from `full` on.
     """
-    t = jnp.clip(weight_sum / full, 0, 1)
-    return t * t * (3 - 2 * t)
+    return smooth_step(weight_sum, 0, full)

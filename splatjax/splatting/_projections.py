@@ -14,8 +14,8 @@ from ._views import (
     Footprints,
     SplattingSettings,
     epsilon_of,
-    filtered,
-    rows,
+    rotate,
+    widen_ellipse,
 )
 
 
@@ -32,54 +32,67 @@ class PerspectiveView(AbstractView):
 
     @classmethod
     def of(cls, camera: Camera) -> "PerspectiveView":
-        focal_length = camera.focal_length * camera.height
         return cls(
             position=camera.position,
             rotation=camera.rotation,
-            focal_length=focal_length,
+            focal_length=camera.focal_length * camera.height,
             width=camera.width,
             height=camera.height,
             near=camera.near,
         )
 
     def footprints(self, splats: Splats, settings: SplattingSettings) -> Footprints:
-        px, py, pz = rows(self.rotation, (splats.centers - self.position[None]).T)
+        px, py, pz = rotate(self.rotation, (splats.centers - self.position[None]).T)
         in_sight = self._in_sight(px, py, pz, splats.radii)
         pz = jnp.where(in_sight, pz, 1.0)
         u, v, scale = px / pz, py / pz, self.focal_length / pz
-        # All below is homogeneous in the normal and the radius (pixels): the normal is taken that
-        # long.
+        # All below is homogeneous in the normal and the radius r (pixels): the normal n is taken
+        # that long.
         radius = splats.radii * self.focal_length / pz
         nx, ny, nz = (
-            n * splats.radii * self.focal_length / pz for n in rows(self.rotation, splats.normals.T)
+            n * splats.radii * self.focal_length / pz
+            for n in rotate(self.rotation, splats.normals.T)
         )
+        # r times the cosine to the line of sight, times the length of (u, v, 1).
         facing = -(nx * u + ny * v + nz)
         visible = in_sight & (facing > EDGE_ON * radius)
-        # The disc's ellipse: S = r^2 P (I - n n^T) P^T, with P = [[1, 0, -u], [0, 1, -v]].
-        an, bn = u * nx + nz, v * ny + nz
-        xx = ny * ny * (1 + u * u) + an * an
-        xy = u * ny * bn + v * nx * an - nx * ny
-        yy = nx * nx * (1 + v * v) + bn * bn
-        across, along = radius * facing, radius * radius
-        dx, dy = -facing * along * nx / self.focal_length, -facing * along * ny / self.focal_length
-        vx = (along * u + (nx - u * nz) * nz) / self.focal_length
-        vy = (along * v + (ny - v * nz) * nz) / self.focal_length
-        a, b, c, gx, gy, xx, yy, root = filtered(
-            xx, xy, yy, across, dx, dy, vx, vy, settings.filter_radius
+        # The disc's ellipse: S = P (r^2 I - n n^T) P^T, with P = [[1, 0, -u], [0, 1, -v]]. With r^2
+        # = nx^2 + ny^2 + nz^2, squares remain instead of differences.
+        tilt_x, tilt_y = u * nx + nz, v * ny + nz
+        xx = ny * ny * (1 + u * u) + tilt_x * tilt_x
+        xy = u * ny * tilt_y + v * nx * tilt_x - nx * ny
+        yy = nx * nx * (1 + v * v) + tilt_y * tilt_y
+        root_determinant, squared_radius = radius * facing, radius * radius
+        # Slopes are relative here: those of nearness over the nearness of the center.
+        ellipse = widen_ellipse(
+            xx,
+            xy,
+            yy,
+            root_determinant=root_determinant,
+            det_slope=(
+                -facing * squared_radius * nx / self.focal_length,
+                -facing * squared_radius * ny / self.focal_length,
+            ),
+            s_slope=(
+                (squared_radius * u + (nx - u * nz) * nz) / self.focal_length,
+                (squared_radius * v + (ny - v * nz) * nz) / self.focal_length,
+            ),
+            filter_radius=settings.filter_radius,
         )
-        opacity = jnp.where(visible, across / root, 0.0)
         inverse = 1 / pz
         square = inverse * inverse
-        # The rim is a conic; its box is exact while the splat does not reach the plane of the
-        # pinhole.
-        ux, uy = xx * gx + xy * gy, xy * gx + yy * gy
-        kappa = stop_gradient(1 - (gx * ux + gy * uy))
+        # With the relative slope g, the rim is the conic d^T S^-1 d = (1 + g . d)^2: an ellipse
+        # while 1 - g^T S g is positive, where the splat does not reach the plane of the pinhole.
+        (a, b, c), (gx, gy), (xx, yy) = ellipse.quadric, ellipse.slope, ellipse.diagonal
+        s_gx, s_gy = xx * gx + xy * gy, xy * gx + yy * gy
+        kappa = stop_gradient(1 - (gx * s_gx + gy * s_gy))
         bounded = kappa > 1e-3
         kappa = jnp.where(bounded, kappa, 1.0)
         x, y = self.width / 2 + self.focal_length * u, self.height / 2 + self.focal_length * v
-        mid_x, mid_y = stop_gradient(ux / kappa), stop_gradient(uy / kappa)
-        half_x = stop_gradient(jnp.sqrt(jnp.where(bounded, (xx + ux * mid_x) / kappa, jnp.inf)))
-        half_y = stop_gradient(jnp.sqrt(jnp.where(bounded, (yy + uy * mid_y) / kappa, jnp.inf)))
+        mid_x, mid_y = stop_gradient(s_gx / kappa), stop_gradient(s_gy / kappa)
+        squared_x, squared_y = (xx + s_gx * mid_x) / kappa, (yy + s_gy * mid_y) / kappa
+        half_x = stop_gradient(jnp.sqrt(jnp.where(bounded, squared_x, jnp.inf)))
+        half_y = stop_gradient(jnp.sqrt(jnp.where(bounded, squared_y, jnp.inf)))
         cosine = facing / (radius * jnp.sqrt(1 + u * u + v * v))
         epsilon = epsilon_of(splats.radii, settings.filter_radius / scale, cosine, settings)
         return Footprints(
@@ -92,7 +105,7 @@ class PerspectiveView(AbstractView):
             c=c * square,
             nearness=inverse,
             shift=stop_gradient(1 / (1 + epsilon * inverse)),
-            opacity=opacity,
+            opacity=jnp.where(visible, root_determinant / ellipse.root_determinant, 0.0),
             left=stop_gradient(x) + mid_x - half_x,
             right=stop_gradient(x) + mid_x + half_x,
             top=stop_gradient(y) + mid_y - half_y,
@@ -101,8 +114,8 @@ class PerspectiveView(AbstractView):
         )
 
     def may_see(self, splats):
-        px, py, pz = rows(self.rotation, (splats.centers - self.position[None]).T)
-        nx, ny, nz = rows(self.rotation, splats.normals.T)
+        px, py, pz = rotate(self.rotation, (splats.centers - self.position[None]).T)
+        nx, ny, nz = rotate(self.rotation, splats.normals.T)
         return self._in_sight(px, py, pz, splats.radii) & (nx * px + ny * py + nz * pz < 0)
 
     def _in_sight(self, x, y, z, radii):
@@ -149,7 +162,7 @@ class PerspectiveView(AbstractView):
         )
         return column, row, z
 
-    def slant(self, x, y, depth, normals):
+    def depth_slope(self, x, y, depth, normals):
         nx, ny, nz = jnp.tensordot(self.rotation, normals, 1)
         u, v = (x - self.width / 2) / self.focal_length, (y - self.height / 2) / self.focal_length
         mm = jnp.where(depth > self.near, depth, 1.0) / self.focal_length
@@ -176,35 +189,36 @@ class OrthographicView(AbstractView):
     height: int = eqx.field(static=True)
 
     def footprints(self, splats: Splats, settings: SplattingSettings) -> Footprints:
-        px, py, pz = rows(self.rotation, (splats.centers - self.position[None]).T)
-        nx, ny, nz = rows(self.rotation, splats.normals.T)
+        px, py, pz = rotate(self.rotation, (splats.centers - self.position[None]).T)
+        nx, ny, nz = rotate(self.rotation, splats.normals.T)
         visible = nz < -EDGE_ON
-        squared = (splats.radii * self.scale) ** 2
-        xx, xy, yy = (
-            squared * (ny * ny + nz * nz),
-            squared * (-nx * ny),
-            squared * (nx * nx + nz * nz),
-        )
-        across, along = -squared * nz, squared / self.scale
-        dx, dy = across * along * nx, across * along * ny
-        vx, vy = -along * nz * nx, -along * nz * ny
-        a, b, c, gx, gy, xx, yy, root = filtered(
-            xx, xy, yy, across, dx, dy, vx, vy, settings.filter_radius
+        squared_radius = (splats.radii * self.scale) ** 2
+        root_determinant, per_pixel = -squared_radius * nz, squared_radius / self.scale
+        # Slopes are those of the depth, mm per pixel.
+        ellipse = widen_ellipse(
+            squared_radius * (ny * ny + nz * nz),
+            squared_radius * (-nx * ny),
+            squared_radius * (nx * nx + nz * nz),
+            root_determinant=root_determinant,
+            det_slope=(root_determinant * per_pixel * nx, root_determinant * per_pixel * ny),
+            s_slope=(-per_pixel * nz * nx, -per_pixel * nz * ny),
+            filter_radius=settings.filter_radius,
         )
         x, y = self.width / 2 + self.scale * px, self.height / 2 + self.scale * py
-        half_x, half_y = jnp.sqrt(xx), jnp.sqrt(yy)
+        (a, b, c), (depth_slope_x, depth_slope_y) = ellipse.quadric, ellipse.slope
+        half_x, half_y = (jnp.sqrt(squared) for squared in ellipse.diagonal)
         filter_radius = jnp.broadcast_to(settings.filter_radius / self.scale, splats.radii.shape)
         return Footprints(
             x=x,
             y=y,
-            slope_x=-gx,
-            slope_y=-gy,
+            slope_x=-depth_slope_x,
+            slope_y=-depth_slope_y,
             a=a,
             b=b,
             c=c,
             nearness=-pz,
             shift=stop_gradient(epsilon_of(splats.radii, filter_radius, -nz, settings)),
-            opacity=jnp.where(visible, across / root, 0.0),
+            opacity=jnp.where(visible, root_determinant / ellipse.root_determinant, 0.0),
             left=stop_gradient(x - half_x),
             right=stop_gradient(x + half_x),
             top=stop_gradient(y - half_y),
@@ -213,8 +227,8 @@ class OrthographicView(AbstractView):
         )
 
     def may_see(self, splats):
-        x, y, _ = rows(self.rotation, (splats.centers - self.position[None]).T)
-        _, _, facing = rows(self.rotation, splats.normals.T)
+        x, y, _ = rotate(self.rotation, (splats.centers - self.position[None]).T)
+        _, _, facing = rotate(self.rotation, splats.normals.T)
         inside_x = jnp.abs(x) < 0.5 * (self.width + 2 * MARGIN) / self.scale + splats.radii
         return (
             inside_x
@@ -247,7 +261,7 @@ class OrthographicView(AbstractView):
         x, y, z = jnp.tensordot(self.rotation, offset, 1)
         return self.width / 2 + self.scale * x, self.height / 2 + self.scale * y, z
 
-    def slant(self, x, y, depth, normals):
+    def depth_slope(self, x, y, depth, normals):
         nx, ny, nz = jnp.tensordot(self.rotation, normals, 1)
         return nx / self.scale, ny / self.scale, -nz
 

@@ -35,7 +35,7 @@ def least_weight(
     )
 
 
-class Places(eqx.Module):
+class SurfaceCapacity(eqx.Module):
     """Capacity for tiles of the front, and of the surface behind it. Static."""
 
     front: int = eqx.field(static=True)
@@ -103,11 +103,12 @@ class AbstractRasterPlan(eqx.Module):
         r"""Sum attributes and nearness over the fragments of every pixel (passes 2 and 3).
 
         Fragments are weighted with `fragment_weight`, times the opacity of their footprint. The
-        *front* of a pixel are the fragments within epsilon of the nearest one (3.1). *Behind* are,
-        in pixels that the front does not cover in full, the fragments within epsilon of the nearest
-        one that is not in front and has a weight of at least 0.06 (less for splats smaller than a
-        pixel, `least_weight`): the rims of splats seen nearly edge on do not hide the surface
-        behind them. Where no fragment has that weight, the nearest one counts.
+        *front* of a pixel are the fragments nearer than `min_i (depth_i + epsilon_i)` (3.1).
+        *Behind* are, in pixels that the front does not cover in full, the fragments nearer than
+        that minimum over those that are not in front and have a weight of at least 0.06 (less for
+        splats smaller than a pixel, `least_weight`): the rims of splats seen nearly edge on do not
+        hide the surface behind them. Where no fragment has that weight, the minimum is over all
+        that are not in front.
 
         Which fragments are chosen is piecewise constant: it has no derivative.
 

@@ -12,9 +12,10 @@ from jaxtyping import Array, Float
 
 from splatjax._chunking import AT_ONCE, jit_unless_traced, map_chunks
 from splatjax._combination import AbstractCombination, extreme
+from splatjax._smooth import smooth_step
 from splatjax.scene import Splats
 
-from ._grid import TileGrid
+from ._grid import TILE_SIDE, TileGrid
 from ._kernel import coverage
 from ._projections import OrthographicView, PerspectiveView
 from ._rasterizer import AbstractRasterPlan, FragmentSums, invalid_factor
@@ -73,7 +74,7 @@ class Bounds(eqx.Module):
         return cls(jnp.where(empty, 0.0, center), jnp.where(empty, 1.0, radius))
 
 
-def _facing(forward: Float[Array, "3"]) -> Float[Array, "3 3"]:
+def _rotation_towards(forward: Float[Array, "3"]) -> Float[Array, "3 3"]:
     """Build a rotation whose third row is `forward`; the other two are smooth in it wherever it is
     not along an axis' flip.
     """
@@ -93,7 +94,7 @@ def distant_view(
     """Make the view of what a directional light sees: the bounding sphere, in parallel."""
     size = settings.resolution
     scale = 0.5 * (size - 4) / bounds.radius
-    rotation = _facing(direction / jnp.linalg.norm(direction))
+    rotation = _rotation_towards(direction / jnp.linalg.norm(direction))
     return OrthographicView(
         position=bounds.center, rotation=rotation, scale=scale, width=size, height=size
     )
@@ -112,7 +113,7 @@ def near_view(
     size = settings.resolution
     return PerspectiveView(
         position=position,
-        rotation=_facing(to_center / distance),
+        rotation=_rotation_towards(to_center / distance),
         focal_length=0.5 * (size - 4) / tangent,
         width=size,
         height=size,
@@ -130,7 +131,7 @@ def cube_views(position: Float[Array, "3"], settings: ShadowSettings) -> list[Pe
     return [
         PerspectiveView(
             position=position,
-            rotation=_facing(axis),
+            rotation=_rotation_towards(axis),
             focal_length=focal_length,
             width=size,
             height=size,
@@ -161,16 +162,15 @@ class ShadowMap(eqx.Module):
     @classmethod
     def of(cls, sums: FragmentSums, view: AbstractView, settings: SplattingSettings) -> "ShadowMap":
         """Blend the sums of all parts."""
-        tiles = TileGrid(view.width, view.height).count
         surface = Surface.of(sums.sums, view, sums.needed)
         covered = coverage(sums.sums.weights, settings.full_coverage)
-        planes = []
-        for places in (slice(sums.front), slice(sums.front, None)):
-            for values in (surface.depth, covered):
-                plane = jnp.zeros((tiles, values.shape[1]), values.dtype)
-                plane = plane.at[sums.tiles[places]].set(values[places], mode="drop")
-                planes.append(plane)
-        return cls(view, invalid_factor(sums.needed) * jnp.stack(planes), sums.needed)
+        of_places = jnp.stack([surface.depth, covered])
+        empty = jnp.zeros((2, TileGrid(view.width, view.height).count, TILE_SIDE**2), covered.dtype)
+        planes = [
+            empty.at[:, sums.tiles[places]].set(of_places[:, places], mode="drop")
+            for places in (slice(sums.front), slice(sums.front, None))
+        ]
+        return cls(view, invalid_factor(sums.needed) * jnp.concatenate(planes), sums.needed)
 
 
 def make_shadow_map(
@@ -182,11 +182,11 @@ def make_shadow_map(
 ) -> ShadowMap:
     """Make a shadow map (4.1): the surfaces that a light sees, by passes 2 and 3 of the camera."""
     chosen, needed = plan.choose(splats, view)
-    nothing = jnp.zeros((0, len(chosen)), splats.centers.dtype)
-    sums = plan.sum_fragments(splats.take(chosen), nothing, view, splatting, combination)
+    no_rows = jnp.zeros((0, len(chosen)), splats.centers.dtype)
+    sums = plan.sum_fragments(splats.take(chosen), no_rows, view, splatting, combination)
     needed = combination.largest([jnp.maximum(needed, sums.needed)])
     total = combination.total([sums.sums])
-    sums = eqx.tree_at(lambda each: (each.sums, each.needed), sums, (total, needed))
+    sums = eqx.tree_at(lambda sums: (sums.sums, sums.needed), sums, (total, needed))
     return ShadowMap.of(sums, view, splatting)
 
 
@@ -214,13 +214,13 @@ def compute_visibility(
 
     def land(centers, normals):
         x, y, depth = view.project(centers.T)
-        across, down, facing = view.slant(x, y, depth, normals.T)
+        across, down, facing = view.depth_slope(x, y, depth, normals.T)
         facing = jnp.maximum(facing, 1 / settings.largest_slope)
         return jnp.stack([x, y, depth, across / facing, down / facing], axis=1)
 
     # Where splats land is kept: each of nine comparisons, and each of their derivatives, reads it.
     landed = map_chunks(land, splats.centers, splats.normals)
-    # Large parts: for each, the way back adds to the whole map.
+    # Few large parts: backward, each adds into an array as large as the map.
     return map_chunks(
         lambda part: _compared(part.T, view, flat, settings), landed, at_once=4 * AT_ONCE
     )
@@ -252,14 +252,15 @@ def _compared(
     down = slope_y[None, None] * (step_y.astype(x.dtype) - ty[None, None])
     here = depth[None, None] + across + down
 
-    def hidden(depth, coverage):
-        t = jnp.clip((here - depth - settings.bias) / settings.softness, 0, 1)
-        return coverage * t * t * (3 - 2 * t)
+    def hidden(map_depth, map_coverage):
+        beyond = here - map_depth - settings.bias
+        return map_coverage * smooth_step(beyond, 0, settings.softness)
 
-    front, coverage, behind, coverage_behind = jnp.unstack(
+    front_depth, front_coverage, behind_depth, behind_coverage = jnp.unstack(
         flat.at[index].get(mode="promise_in_bounds"), axis=-1
     )
-    blocked = hidden(front, coverage) + (1 - coverage) * hidden(behind, coverage_behind)
+    behind = (1 - front_coverage) * hidden(behind_depth, behind_coverage)
+    blocked = hidden(front_depth, front_coverage) + behind
     weights = _spline(tx)[:, None] * _spline(ty)[None]
     blocked = jnp.sum(weights * jnp.where(inside, blocked, 0.0), axis=(0, 1))
     return jnp.maximum(1 - blocked, 0)  # rounding must not make light negative

@@ -11,12 +11,12 @@ from splatjax._chunking import AT_ONCE
 from splatjax._combination import AbstractCombination
 from splatjax.scene import Splats
 
-from ._grid import SIDE, TileGrid
+from ._grid import TILE_SIDE, TileGrid
 from ._kernel import coverage
 from ._rasterizer import AbstractRasterPlan, FragmentSums, PixelSums, invalid_factor
 from ._views import AbstractView, SplattingSettings
 
-TILES_AT_ONCE = AT_ONCE // SIDE**2
+TILES_AT_ONCE = AT_ONCE // TILE_SIDE**2
 """Tiles of a chunk, for what is computed chunk by chunk."""
 
 
@@ -92,10 +92,10 @@ class VisibleSurfaces(eqx.Module):
         """Combine the sums of all devices; each keeps a share of the places."""
         count = TileGrid(view.width, view.height).count
         in_front = jnp.arange(len(sums.tiles)) < sums.front
-        own, tiles = combination.own_share(sums.sums), combination.own_rows(sums.tiles)
+        share, tiles = combination.own_share(sums.sums), combination.own_rows(sums.tiles)
         # What the front covers of the tiles, wherever it was shaded.
-        covered = coverage(combination.gather(own.weights), settings.full_coverage)
-        front = jnp.zeros((count, SIDE**2), covered.dtype)
+        covered = coverage(combination.gather(share.weights), settings.full_coverage)
+        front = jnp.zeros((count, TILE_SIDE**2), covered.dtype)
         front = front.at[sums.tiles[: sums.front]].set(covered[: sums.front], mode="drop")
         own_front = combination.own_rows(in_front)
         before = front.at[tiles].get(mode="fill", fill_value=0)
@@ -103,7 +103,7 @@ class VisibleSurfaces(eqx.Module):
             view=view,
             tiles=tiles,
             in_front=own_front,
-            sums=own,
+            sums=share,
             before=jnp.where(own_front[:, None], 0.0, before),
             needed=combination.largest([sums.needed]),
             full_coverage=settings.full_coverage,
@@ -126,8 +126,8 @@ class VisibleSurfaces(eqx.Module):
     def gathered(self, combination: AbstractCombination) -> "VisibleSurfaces":
         """Return the places of all devices, without the rows of their sums."""
 
-        def of_places(each):
-            return each.tiles, each.in_front, each.before, each.sums
+        def of_places(surfaces):
+            return surfaces.tiles, surfaces.in_front, surfaces.before, surfaces.sums
 
         *places, sums = of_places(self)
         parts = combination.gather((*places, PixelSums(sums.rows[:, :0], sums.weights)))
@@ -137,7 +137,7 @@ class VisibleSurfaces(eqx.Module):
         self, tiles: Int[Array, " some"], depth: Float[Array, "some pixels"]
     ) -> Float[Array, "some 3 pixels"]:
         """Compute the points (mm) that pixels see at a depth (mm). Differentiable."""
-        x, y = (each.astype(depth.dtype) + 0.5 for each in self.grid.columns_and_rows(tiles))
+        x, y = (index.astype(depth.dtype) + 0.5 for index in self.grid.columns_and_rows(tiles))
         return jnp.moveaxis(self.view.unproject(x, y, depth), 0, 1)
 
     def front_picture(

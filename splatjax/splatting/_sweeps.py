@@ -7,7 +7,6 @@ know what the one before found in all parts of the splats. The backward sweep ne
 at which the surfaces end.
 """
 
-import dataclasses
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 
@@ -17,29 +16,29 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from splatjax._chunking import jit_unless_traced, zeros_after
+from splatjax._chunking import jit_unless_traced, needed_over_planned, zeros_after
 from splatjax._combination import AbstractCombination
 
 from ._bins import Bins, scatter_slots
 from ._fragments import Lanes, Slots, Sweep, second_limits
-from ._grid import SIDE
-from ._rasterizer import FragmentSums, PixelSums, Places
+from ._grid import TILE_SIDE
+from ._rasterizer import FragmentSums, PixelSums, SurfaceCapacity
 
 
 class Spans(eqx.Module):
-    """Which fragments are summed, in the pixels of some tiles: those between two depths.
+    """Which fragments are summed, in the pixels of some tiles: those between two depths, with
+    `far_limit < nearness <= near_limit`.
 
     **Attributes:**
 
-    - `tiles`: the tile at each place; the number of tiles for none.
-    - `beyond`: fragments count that are nearer than this; inf where there are none.
-    - `upto`: fragments count that are not nearer than this.
+    - `tiles`: the tile at each place; the number of tiles in an empty place.
+    - `far_limit`, `near_limit`: nearness. `far_limit` is inf where there is no fragment.
     - `needed`: places needed over planned.
     """
 
     tiles: Int[Array, " places"]
-    beyond: Float[Array, "places pixels"]
-    upto: Float[Array, "places pixels"]
+    far_limit: Float[Array, "places pixels"]
+    near_limit: Float[Array, "places pixels"]
     needed: Float[Array, ""]
 
     @classmethod
@@ -52,38 +51,39 @@ class Spans(eqx.Module):
         order = jnp.argsort(-lengths)
         shown = jnp.any(limits > -jnp.inf, axis=1)
         tiles = _taken(order.astype(jnp.int32), _listed(shown[order], size), len(order))
-        beyond = _taken(limits, tiles, jnp.inf)
-        beyond = jnp.where(beyond > -jnp.inf, beyond, jnp.inf)
-        needed = (jnp.sum(shown) / size).astype(limits.dtype)
-        return cls(tiles, beyond, jnp.full_like(beyond, jnp.inf), needed)
+        far_limit = _taken(limits, tiles, jnp.inf)
+        far_limit = jnp.where(far_limit > -jnp.inf, far_limit, jnp.inf)
+        needed = needed_over_planned(jnp.sum(shown), size).astype(limits.dtype)
+        return cls(tiles, far_limit, jnp.full_like(far_limit, jnp.inf), needed)
 
-    def opened(self, is_open: Bool[Array, "places pixels"], size: int, none: int) -> "Spans":
-        """Choose the places with pixels that the front leaves open: behind what `upto` says, and
-        in open pixels alone what `beyond` says.
+    def opened(self, is_open: Bool[Array, "places pixels"], size: int, none: int):
+        """Choose the places with pixels that the front leaves open.
+
+        Returns their tiles, the near limit of the surface behind, the same in open pixels alone
+        and -inf in others, and the places needed over planned.
         """
-        is_open &= self.beyond < jnp.inf
+        is_open &= self.far_limit < jnp.inf
         chosen = jnp.any(is_open, axis=1)
-        picked = _listed(chosen, size)
-        upto = _taken(self.beyond, picked, -jnp.inf)
-        open_to = jnp.where(_taken(is_open, picked, False), upto, -jnp.inf)
-        needed = (jnp.sum(chosen) / size).astype(upto.dtype)
-        return Spans(_taken(self.tiles, picked, none), open_to, upto, needed)
+        listed = _listed(chosen, size)
+        near_limit = _taken(self.far_limit, listed, -jnp.inf)
+        open_limit = jnp.where(_taken(is_open, listed, False), near_limit, -jnp.inf)
+        needed = needed_over_planned(jnp.sum(chosen), size).astype(near_limit.dtype)
+        return _taken(self.tiles, listed, none), near_limit, open_limit, needed
 
     def followed_by(self, behind: "Spans") -> "Spans":
         """Append the places of the surface behind."""
-        needed = jnp.maximum(self.needed, behind.needed)
         return Spans(
             tiles=jnp.concatenate([self.tiles, behind.tiles]),
-            beyond=jnp.concatenate([self.beyond, behind.beyond]),
-            upto=jnp.concatenate([self.upto, behind.upto]),
-            needed=needed,
+            far_limit=jnp.concatenate([self.far_limit, behind.far_limit]),
+            near_limit=jnp.concatenate([self.near_limit, behind.near_limit]),
+            needed=jnp.maximum(self.needed, behind.needed),
         )
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0, 1, 2))
-def sum_fragments(
+def sum_tile_fragments(
     sweep: Sweep,
-    capacity: Places,
+    capacity: SurfaceCapacity,
     combination: AbstractCombination,
     bins: Bins,
     shift: Float[Array, " splats"],
@@ -100,23 +100,23 @@ def _sum_fwd(sweep, capacity, combination, bins, shift, planes, attributes):
     return sums, (bins, shift, planes, attributes, spans)
 
 
-def _sum_bwd(sweep: Sweep, capacity: Places, combination, residuals, cotangent):
+def _sum_bwd(sweep: Sweep, capacity: SurfaceCapacity, combination, residuals, cotangent):
     bins, shift, planes, attributes, spans = residuals
     part = PartSweep(sweep, bins, Slots.gathered(shift, planes, attributes, bins))
     dtype, cotangent = shift.dtype, cotangent.sums
 
-    def add(_, *given):
-        return sweep.add_cotangents(part.slots, *given)
+    def add(_, *arguments):
+        return sweep.add_cotangents(part.slots, *arguments)
 
     of_planes = tuple(zeros_after(cotangent, part.slots.shift.shape, dtype) for _ in planes)
     gradients = of_planes, zeros_after(cotangent, attributes.shape, dtype)
-    given = spans.beyond, spans.upto, cotangent
+    given = spans.far_limit, spans.near_limit, cotangent
     of_planes, of_rows = part.each_round(spans.tiles, given, add, gradients)
-    slots = (scatter_slots(each, bins, shift.shape[0]) for each in of_planes)
-    return None, None, tuple(slots), of_rows
+    of_splats = (scatter_slots(slots, bins, shift.shape[0]) for slots in of_planes)
+    return None, None, tuple(of_splats), of_rows
 
 
-sum_fragments.defvjp(_sum_fwd, _sum_bwd)
+sum_tile_fragments.defvjp(_sum_fwd, _sum_bwd)
 
 
 class PartSweep(eqx.Module):
@@ -134,73 +134,75 @@ class PartSweep(eqx.Module):
         grid, order, dtype = self.sweep.grid, self.bins.order, self.slots.shift.dtype
 
         def chunk(i, limits):
-            own = i * grid.lanes + jnp.arange(grid.lanes, dtype=jnp.int32)
-            found = self.sweep.limits(self.slots, self.sweep.lanes(self.bins, own, dtype))
-            return limits.at[order[own]].set(found, mode="drop")
+            lane_numbers = i * grid.lanes + jnp.arange(grid.lanes, dtype=jnp.int32)
+            new = self.sweep.limits(self.slots, self.sweep.lanes(self.bins, lane_numbers, dtype))
+            return limits.at[order[lane_numbers]].set(new, mode="drop")
 
-        limits = zeros_after(self.slots.shift, (grid.count, SIDE**2), dtype) - jnp.inf
+        limits = zeros_after(self.slots.shift, (grid.count, TILE_SIDE**2), dtype) - jnp.inf
         limits = lax.fori_loop(jnp.int32(0), self.bins.chunks, chunk, limits)
         lengths = jnp.repeat(jnp.diff(self.bins.first_block), grid.lanes)
         return limits, jnp.zeros(grid.count, jnp.int32).at[order].set(lengths, mode="drop")
 
-    def nothing(self, front: Spans, capacity: Places) -> PixelSums:
+    def empty_sums(self, front: Spans, capacity: SurfaceCapacity) -> PixelSums:
         """Return sums over no fragments, for the places of both surfaces."""
         places, attributes = capacity.front + capacity.behind, self.slots.attributes
-        known, dtype = (front.beyond, attributes), front.beyond.dtype
-        rows = zeros_after(known, (places, attributes.shape[1] + 1, SIDE**2), dtype)
-        return PixelSums(rows, zeros_after(known, (places, SIDE**2), dtype))
+        known, dtype = (front.far_limit, attributes), front.far_limit.dtype
+        rows = zeros_after(known, (places, attributes.shape[1] + 1, TILE_SIDE**2), dtype)
+        return PixelSums(rows, zeros_after(known, (places, TILE_SIDE**2), dtype))
 
     @jit_unless_traced
     def add_sums(self, spans: Spans, so_far: PixelSums, first: int) -> PixelSums:
         """Add the sums over the fragments of some spans to others, from a first place on."""
 
-        def add(i, lanes: Lanes, beyond, upto, tiles, so_far):
+        def add(i, lanes: Lanes, far_limit, near_limit, tiles, so_far):
             sums = self.sweep.within_picture(
-                self.sweep.sums(self.slots, lanes, beyond, upto), tiles
+                self.sweep.sums(self.slots, lanes, far_limit, near_limit), tiles
             )
-            own = _sliced(so_far, first + i, len(tiles))
-            return _write(so_far, jax.tree.map(jnp.add, own, sums), first + i)
+            before = _sliced(so_far, first + i, len(tiles))
+            return _write(so_far, jax.tree.map(jnp.add, before, sums), first + i)
 
-        given = spans.beyond, spans.upto, spans.tiles
+        given = spans.far_limit, spans.near_limit, spans.tiles
         return self.each_round(spans.tiles, given, add, so_far)
 
     @jit_unless_traced
     def limits_behind(
-        self, spans: Spans
+        self, tiles: Int[Array, " places"], open_limit: Float[Array, "places pixels"]
     ) -> tuple[Float[Array, "places pixels"], Float[Array, "places pixels"]]:
-        """Find where the surface behind ends, of the fragments of some weight and of any; `beyond`
-        is where the front ends in open pixels, -inf in others.
+        """Find where the surface behind ends, of the fragments of some weight and of any;
+        `open_limit` is where the front ends in open pixels, -inf in others.
         """
 
-        def look(i, lanes: Lanes, open_to, out):
-            return _write(out, self.sweep.limits_behind(self.slots, lanes, open_to), i)
+        def look(i, lanes: Lanes, open_limit, limits):
+            return _write(limits, self.sweep.limits_behind(self.slots, lanes, open_limit), i)
 
-        nothing = zeros_after(spans.beyond, spans.beyond.shape, spans.beyond.dtype) - jnp.inf
-        return self.each_round(spans.tiles, (spans.beyond,), look, (nothing, nothing))
+        none = zeros_after(open_limit, open_limit.shape, open_limit.dtype) - jnp.inf
+        return self.each_round(tiles, (open_limit,), look, (none, none))
 
     def each_round(self, tiles: Int[Array, " places"], given, function: Callable, out):
         """Apply `function(first place, lanes, *given, out)` to as many places at a time as there
         are lanes, up to the last tile.
         """
         grid, bins, dtype = self.sweep.grid, self.bins, self.slots.shift.dtype
-        lane = jnp.full(grid.tiles + 1, bins.lanes, jnp.int32)
-        lane = lane.at[bins.order[: bins.lanes]].set(jnp.arange(bins.lanes, dtype=jnp.int32))
-        own = lane[jnp.where(tiles < grid.count, tiles, len(lane) - 1)]
+        planned = bins.planned_lanes
+        # The lane of every tile, and of every place; `planned` where the list is empty.
+        of_tile = jnp.full(grid.padded_count + 1, planned, jnp.int32)
+        of_tile = of_tile.at[bins.order[:planned]].set(jnp.arange(planned, dtype=jnp.int32))
+        of_place = of_tile[jnp.where(tiles < grid.count, tiles, grid.padded_count)]
 
         def step(i, out):
-            here = i * grid.lanes
-            picked, *rest = _sliced((own, *given), here, grid.lanes)
-            return function(here, self.sweep.lanes(bins, picked, dtype), *rest, out)
+            first = i * grid.lanes
+            lane_numbers, *arguments = _sliced((of_place, *given), first, grid.lanes)
+            return function(first, self.sweep.lanes(bins, lane_numbers, dtype), *arguments, out)
 
-        places = jnp.arange(1, len(tiles) + 1, dtype=jnp.int32)
-        last = jnp.max(jnp.where(tiles < grid.count, places, 0), initial=0)
+        ends = jnp.arange(1, len(tiles) + 1, dtype=jnp.int32)
+        last = jnp.max(jnp.where(tiles < grid.count, ends, 0), initial=0)
         rounds = -(-last // grid.lanes)
         return lax.fori_loop(jnp.zeros_like(rounds), rounds, step, out)
 
 
 def sum_parts(
     parts: Callable[[], Iterable[Sequence[PartSweep]]],
-    capacities: Sequence[Places],
+    capacities: Sequence[SurfaceCapacity],
     combination: AbstractCombination,
 ) -> list[tuple[FragmentSums, Spans]]:
     """Sum the fragments of splats that are several parts, in several views at once.
@@ -215,39 +217,44 @@ def sum_parts(
     """
     first, views = next(iter(parts())), range(len(capacities))
     # Stage 1: where the front ends in any part.
-    limits = combination.largest([each.limits() for each in part] for part in parts())
+    limits = combination.largest([sweep.limits() for sweep in part] for part in parts())
     fronts = [Spans.front(*limits[k], capacities[k].front) for k in views]
 
     # Stage 2: the sums of the front.
     def add_front(sums, part):
         return [part[k].add_sums(fronts[k], sums[k], 0) for k in views]
 
-    nothing = [first[k].nothing(fronts[k], capacities[k]) for k in views]
-    sums = combination.fold(add_front, nothing, parts())
+    empty_sums = [first[k].empty_sums(fronts[k], capacities[k]) for k in views]
+    sums = combination.fold(add_front, empty_sums, parts())
     # Stage 3: where the surface behind ends, in pixels that the front leaves open.
     weights = combination.total([[sums[k].weights[: capacities[k].front] for k in views]])
     opened = []
-    for k, own in enumerate(capacities):
+    for k, capacity in enumerate(capacities):
         sweep = first[k].sweep
         is_open = weights[k] < sweep.full_coverage
-        opened.append(fronts[k].opened(is_open, own.behind, sweep.grid.count))
+        opened.append(fronts[k].opened(is_open, capacity.behind, sweep.grid.count))
+    tiles, near_limits, open_limits, needed = zip(*opened, strict=True)
     limits = combination.largest(
-        [part[k].limits_behind(opened[k]) for k in views] for part in parts()
+        [part[k].limits_behind(tiles[k], open_limits[k]) for k in views] for part in parts()
     )
-    behind = [dataclasses.replace(opened[k], beyond=second_limits(*limits[k])) for k in views]
 
     # Stage 4: the sums of the surface behind.
+    far_limits = [second_limits(*limits[k]) for k in views]
+    behind = [Spans(*span) for span in zip(tiles, far_limits, near_limits, needed, strict=True)]
+
     def add_behind(sums, part):
         return [part[k].add_sums(behind[k], sums[k], capacities[k].front) for k in views]
 
     sums = combination.fold(add_behind, sums, parts())
-    found = []
-    for k, own in enumerate(capacities):
+    results = []
+    for k, capacity in enumerate(capacities):
         spans = fronts[k].followed_by(behind[k])
+        # Of the first part alone: a device has one, or it streams parts for which the capacity of
+        # the lists was planned.
         lists = first[k].bins.needed.astype(spans.needed.dtype)
         needed = combination.largest([jnp.maximum(spans.needed, lists)])
-        found.append((FragmentSums(spans.tiles, sums[k], needed, own.front), spans))
-    return found
+        results.append((FragmentSums(spans.tiles, sums[k], needed, capacity.front), spans))
+    return results
 
 
 def _listed(chosen: Bool[Array, " all"], size: int) -> Int[Array, " size"]:
@@ -261,7 +268,7 @@ def _taken(whole: Array, places: Int[Array, " places"], fill) -> Array:
 
 def _sliced(whole, place, size: int):
     """Read so many rows from a place on."""
-    return jax.tree.map(lambda each: lax.dynamic_slice_in_dim(each, place, size), whole)
+    return jax.tree.map(lambda rows: lax.dynamic_slice_in_dim(rows, place, size), whole)
 
 
 def _write(out, parts, place):

@@ -11,15 +11,15 @@ import numpy as np
 from jax.lax import stop_gradient
 from jaxtyping import Array, Float, Int
 
-from splatjax._chunking import map_chunks
+from splatjax._chunking import map_chunks, needed_over_planned, with_spare
 from splatjax._combination import AbstractCombination, OneDevice
 from splatjax.scene import Splats
 
-from ._bins import BinCapacity, Bins, bin_items, round_up
+from ._bins import BinCapacity, bin_items
 from ._fragments import PLANES, Slots, Sweep
 from ._grid import TileGrid
-from ._rasterizer import AbstractRasterizer, AbstractRasterPlan, FragmentSums, Places
-from ._sweeps import PartSweep, sum_fragments
+from ._rasterizer import AbstractRasterizer, AbstractRasterPlan, FragmentSums, SurfaceCapacity
+from ._sweeps import PartSweep, sum_tile_fragments
 from ._views import AbstractView, SplattingSettings
 
 _STEP = 1024  # of the planned number of splats
@@ -43,11 +43,13 @@ class TileRasterizer(AbstractRasterizer):
         demands = [[self.demand(part, view, settings) for view in views] for part in parts]
         return self.plan_for(demands, parts[0].count, views[0])
 
+    @eqx.filter_jit
     def demand(
         self, splats: Splats, view: AbstractView, settings: SplattingSettings
     ) -> tuple[Array, Int[Array, " tiles"]]:
         """Count the splats that may be seen, and the splats of every tile."""
-        return _demand(splats, view, settings, self.grid(view))
+        ranges = view.footprints(splats, settings).ranges(self.grid(view))
+        return jnp.sum(view.may_see(splats)), ranges.per_tile(self.grid(view))
 
     def plan_for(
         self,
@@ -57,18 +59,18 @@ class TileRasterizer(AbstractRasterizer):
     ) -> "TilePlan":
         """Make the plan for the demand of each part in each view, of so many splats at most."""
         grid = self.grid(view)
-        seen = round_up(max(int(seen) for part in demands for seen, _ in part), _STEP)
+        seen = with_spare(max(int(seen) for part in demands for seen, _ in part), _STEP)
         bins = BinCapacity.for_counts([tiles for part in demands for _, tiles in part], grid)
         front = bins.chunks * self.lanes
         if len(demands) > 1:
             # Places are shared by the parts: there is one for each tile that any part touches.
             touched = [
-                np.any([np.asarray(tiles) > 0 for _, tiles in each], axis=0)
-                for each in zip(*demands, strict=True)
+                np.any([np.asarray(tiles) > 0 for _, tiles in of_view], axis=0)
+                for of_view in zip(*demands, strict=True)
             ]
             grain = math.lcm(self.lanes, len(demands))
-            front = round_up(max(int(np.sum(tiles)) for tiles in touched), grain)
-        return TilePlan(self, min(seen, splats), bins, Places(front, front))
+            front = with_spare(max(int(np.sum(tiles)) for tiles in touched), grain)
+        return TilePlan(self, min(seen, splats), bins, SurfaceCapacity(front, front))
 
     def grid(self, view: AbstractView) -> TileGrid:
         """Cut the picture of a view into tiles."""
@@ -82,13 +84,14 @@ class TilePlan(AbstractRasterPlan):
 
     - `rasterizer`: its setting.
     - `splats`: splats that may be seen.
-    - `bins`, `places`: of the lists, and of the tiles with a surface.
+    - `bins`: capacity of the lists.
+    - `places`: capacity for the tiles with a surface.
     """
 
     rasterizer: TileRasterizer
     splats: int = eqx.field(static=True)
     bins: BinCapacity
-    places: Places
+    places: SurfaceCapacity
 
     def fitted(
         self, parts: Sequence[Splats], views: Sequence[AbstractView], settings: SplattingSettings
@@ -100,7 +103,7 @@ class TilePlan(AbstractRasterPlan):
         most = max(int(_tiles_behind(whole, view, settings, plan)) for view in views)
         grain = math.lcm(self.rasterizer.lanes, len(parts))
         behind = -(-int(_SPARE * most + 1) // grain) * grain
-        return dataclasses.replace(self, places=Places(self.places.front, behind))
+        return dataclasses.replace(self, places=SurfaceCapacity(self.places.front, behind))
 
     def choose(
         self, splats: Splats, view: AbstractView
@@ -110,7 +113,8 @@ class TilePlan(AbstractRasterPlan):
         every = jnp.arange(splats.count, dtype=jnp.int32)
         listed = jnp.full(self.splats, splats.count, jnp.int32)
         listed = listed.at[jnp.where(may_be_seen, ends - 1, self.splats)].set(every, mode="drop")
-        return listed, (ends[-1] / self.splats).astype(splats.centers.dtype)
+        needed = needed_over_planned(ends[-1], self.splats)
+        return listed, needed.astype(splats.centers.dtype)
 
     def sum_fragments(
         self,
@@ -120,16 +124,8 @@ class TilePlan(AbstractRasterPlan):
         settings: SplattingSettings,
         combination: AbstractCombination,
     ) -> FragmentSums:
-        binned = self._bin(splats, attributes, view, settings)
-        return sum_fragments(
-            binned.sweep,
-            self.places,
-            combination,
-            binned.bins,
-            binned.shift,
-            binned.planes,
-            binned.attributes,
-        )
+        sweep, *binned = self._bin(splats, attributes, view, settings)
+        return sum_tile_fragments(sweep, self.places, combination, *binned)
 
     def part_sweep(
         self,
@@ -139,45 +135,28 @@ class TilePlan(AbstractRasterPlan):
         settings: SplattingSettings,
     ) -> PartSweep:
         """Prepare the stages of the sweep for one of several parts of the splats."""
-        each = self._bin(splats, attributes, view, settings)
-        slots = Slots.gathered(each.shift, each.planes, each.attributes, each.bins)
-        return PartSweep(each.sweep, each.bins, slots)
+        sweep, bins, *binned = self._bin(splats, attributes, view, settings)
+        return PartSweep(sweep, bins, Slots.gathered(*binned, bins))
 
-    def _bin(self, splats: Splats, attributes, view: AbstractView, settings) -> "_Binned":
-        """Project the splats, and list them by tile."""
+    def _bin(self, splats: Splats, attributes, view: AbstractView, settings: SplattingSettings):
+        """Project the splats, and list them by tile. Returns what a sweep reads: its settings, the
+        lists, and the shifts, planes and attributes of the splats.
+        """
         grid = self.rasterizer.grid(view)
         footprints = map_chunks(lambda part: view.footprints(part, settings), splats)
-        bins = bin_items(footprints.ranges(grid), grid, self.bins)
-        return _Binned(
-            sweep=Sweep(type(view), grid, settings.full_coverage, settings.filter_radius),
-            bins=bins,
-            shift=stop_gradient(footprints.shift),
-            planes=tuple(getattr(footprints, name) for name in PLANES),
-            attributes=attributes.T,
+        return (
+            Sweep(type(view), grid, settings.full_coverage, settings.filter_radius),
+            bin_items(footprints.ranges(grid), grid, self.bins),
+            stop_gradient(footprints.shift),
+            tuple(getattr(footprints, name) for name in PLANES),
+            attributes.T,
         )
-
-
-class _Binned(eqx.Module):
-    """What a sweep over the tiles reads."""
-
-    sweep: Sweep
-    bins: Bins
-    shift: Float[Array, " seen"]
-    planes: tuple[Float[Array, " seen"], ...]
-    attributes: Float[Array, "seen attributes"]
-
-
-@eqx.filter_jit
-def _demand(splats: Splats, view: AbstractView, settings: SplattingSettings, grid: TileGrid):
-    """Count the splats that may be seen, and the splats of every tile."""
-    ranges = view.footprints(splats, settings).ranges(grid)
-    return jnp.sum(view.may_see(splats)), ranges.per_tile(grid)
 
 
 @eqx.filter_jit
 def _tiles_behind(splats: Splats, view: AbstractView, settings: SplattingSettings, plan: TilePlan):
     """Count the tiles in which a surface shows behind the front."""
     chosen, _ = plan.choose(splats, view)
-    nothing = jnp.zeros((0, len(chosen)), splats.centers.dtype)
-    sums = plan.sum_fragments(splats.take(chosen), nothing, view, settings, OneDevice())
+    no_rows = jnp.zeros((0, len(chosen)), splats.centers.dtype)
+    sums = plan.sum_fragments(splats.take(chosen), no_rows, view, settings, OneDevice())
     return jnp.sum(sums.tiles[sums.front :] < plan.rasterizer.grid(view).count)

@@ -20,7 +20,7 @@ from ._grid import TileGrid, TileRanges
 
 EDGE_ON = 1e-5
 """Cosine to the line of sight, below which float32 does not know which side of a splat is seen."""
-_SLOPE_FILTER = 0.25  # pixels; see `filtered`
+_SLOPE_FILTER = 0.25  # pixels; see `widen_ellipse`
 
 
 class SplattingSettings(eqx.Module):
@@ -57,7 +57,9 @@ class Footprints(eqx.Module):
     c: Float[Array, " splats"]
     nearness: Float[Array, " splats"]
     shift: Float[Array, " splats"]
-    """How the surface is moved away by epsilon (3.1); not differentiated."""
+    """How the surface is moved away by epsilon (3.1): a factor on nearness in perspective,
+    subtracted from it in an orthographic view. Not differentiated.
+    """
     opacity: Float[Array, " splats"]
     """What the screen filter leaves of the peak weight: 1 for large frontal splats, 0 edge on."""
     left: Float[Array, " splats"]
@@ -72,30 +74,52 @@ class Footprints(eqx.Module):
         return TileRanges.of(self.left, self.right, self.top, self.bottom, self.visible, grid)
 
 
-def filtered(xx, xy, yy, root, dx, dy, vx, vy, filter_radius):
-    """Widen the rim's ellipse by the screen filter: its inverse, the plane's slope, the ellipse,
-    its determinant's root.
+class FilteredEllipse(eqx.Module):
+    """The rim's ellipse, widened by the screen filter (pixels).
 
-    The ellipse `d^T S^-1 d = 1` grows to `S + f^2 I`; `root` is that of `det S`, `(dx, dy)` is `det
-    S slope` and `(vx, vy)` is `S slope`: the slope itself is infinite edge on, so a quarter of a
+    **Attributes:**
+
+    - `quadric`: the numbers a, b, c of `a dx^2 + b dx dy + c dy^2`, which is 1 on the ellipse.
+    - `slope`: of the plane along x and y, in the unit of the slopes that were given.
+    - `diagonal`: xx and yy, the squares of half the width and half the height.
+    - `root_determinant`: the product of the ellipse's half axes.
+    """
+
+    quadric: tuple[Float[Array, " splats"], ...]
+    slope: tuple[Float[Array, " splats"], ...]
+    diagonal: tuple[Float[Array, " splats"], ...]
+    root_determinant: Float[Array, " splats"]
+
+
+def widen_ellipse(
+    xx: Float[Array, " splats"],
+    xy: Float[Array, " splats"],
+    yy: Float[Array, " splats"],
+    *,
+    root_determinant: Float[Array, " splats"],
+    det_slope: tuple[Float[Array, " splats"], ...],
+    s_slope: tuple[Float[Array, " splats"], ...],
+    filter_radius: float,
+) -> FilteredEllipse:
+    """Widen the ellipse `d^T S^-1 d = 1`, with `S = [[xx, xy], [xy, yy]]`, by the screen filter.
+
+    The slope of the splat's plane is given as `det_slope`, which is `det S` times the slope, and
+    `s_slope`, which is `S` times the slope: the slope itself is infinite edge on, so a quarter of a
     pixel is added to `S` before it is divided by it. Hits stay on the plane of every splat that a
     pixel can resolve. No term cancels another: float32 holds however slanted the splat.
     """
-    determinant, trace, fine = root * root, xx + yy, _SLOPE_FILTER**2
+    determinant, trace, fine = root_determinant * root_determinant, xx + yy, _SLOPE_FILTER**2
     slanted = determinant + fine * (trace + fine)
-    slope_x, slope_y = (dx + fine * vx) / slanted, (dy + fine * vy) / slanted
+    slopes = zip(det_slope, s_slope, strict=True)
+    # The filter adds f^2 I: xy is unchanged.
     wide = filter_radius**2
     determinant = determinant + wide * (trace + wide)
     xx, yy = xx + wide, yy + wide
-    return (
-        yy / determinant,
-        -2 * xy / determinant,
-        xx / determinant,
-        slope_x,
-        slope_y,
-        xx,
-        yy,
-        jnp.sqrt(determinant),
+    return FilteredEllipse(
+        quadric=(yy / determinant, -2 * xy / determinant, xx / determinant),
+        slope=tuple((of_det + fine * of_s) / slanted for of_det, of_s in slopes),
+        diagonal=(xx, yy),
+        root_determinant=jnp.sqrt(determinant),
     )
 
 
@@ -165,17 +189,19 @@ class AbstractView(eqx.Module):
         """Compute column, row (pixels) and depth (mm) of points."""
 
     @abc.abstractmethod
-    def slant(
+    def depth_slope(
         self,
         x: Float[Array, "*points"],
         y: Float[Array, "*points"],
         depth: Float[Array, "*points"],
         normals: Float[Array, "3 *points"],
     ) -> tuple[Float[Array, "*points"], Float[Array, "*points"], Float[Array, "*points"]]:
-        """Compute, for planes at projected points, two numbers and a third whose quotients are the
-        depth's slope, mm per pixel.
+        """Compute the slope of the depth over the picture, for planes through projected points, as
+        numerators and denominator `(across, down, facing)`: `d depth / dx = across / facing`,
+        `d depth / dy = down / facing`, mm per pixel.
 
-        The third is the cosine-like factor that vanishes where a plane is seen edge on."""
+        `facing` vanishes where the plane is seen edge on, so the caller limits it before dividing.
+        """
 
     @abc.abstractmethod
     def unproject(
@@ -184,9 +210,9 @@ class AbstractView(eqx.Module):
         """Compute the point in the world at a depth under a pixel."""
 
 
-def rows(
-    matrix: Float[Array, "3 3"], vectors: Float[Array, "3 splats"]
+def rotate(
+    rotation: Float[Array, "3 3"], vectors: Float[Array, "3 splats"]
 ) -> tuple[Float[Array, " splats"], ...]:
-    """Multiply by a matrix, as three planes."""
+    """Rotate vectors; the components are three planes."""
     x, y, z = vectors
-    return tuple(matrix[i, 0] * x + matrix[i, 1] * y + matrix[i, 2] * z for i in range(3))
+    return tuple(rotation[i, 0] * x + rotation[i, 1] * y + rotation[i, 2] * z for i in range(3))

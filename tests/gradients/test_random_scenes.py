@@ -26,7 +26,7 @@ from splatjax.diffusion._neighbors import Boxes, Neighbors, find_neighbors
 from splatjax.splatting import DenseRasterizer, ShadowSettings
 from splatjax.splatting._bins import BinCapacity
 from splatjax.splatting._grid import TileGrid
-from splatjax.splatting._rasterizer import Places
+from splatjax.splatting._rasterizer import SurfaceCapacity
 from splatjax.splatting._tiles import TilePlan
 
 pytestmark = [pytest.mark.slow, pytest.mark.once]
@@ -249,9 +249,9 @@ def roomy(plan: sj.Plan, shape: Shape) -> sj.Plan:
             of_camera = part is plan.raster
             size = (shape.width, shape.height) if of_camera else (SHADOWS.resolution,) * 2
             rasterizer = part.rasterizer
-            tiles = TileGrid(*size, rasterizer.lanes).tiles
+            tiles = TileGrid(*size, rasterizer.lanes).padded_count
             room = _room(shape.splats, tiles, rasterizer.lanes, rasterizer.slots)
-            places = Places(tiles, tiles)
+            places = SurfaceCapacity(tiles, tiles)
             return TilePlan(rasterizer, max(shape.splats, 1), BinCapacity(*room), places)
         if isinstance(part, LayerPlan):
             none, endless = jnp.zeros(()), jnp.full((), jnp.inf)

@@ -27,6 +27,7 @@ from splatjax.splatting import (
     TileRanges,
     TileRasterizer,
     bin_items,
+    make_shadow_map,
 )
 
 WIDTH, HEIGHT = 21, 18
@@ -51,7 +52,7 @@ def settings_of(perspective: bool) -> SplattingSettings:
 
 def roomy(view, count: int) -> TilePlan:
     """Make a plan with capacity for every splat in every tile: one program for all scenes."""
-    everywhere = jnp.full(TILES.grid(view).tiles, count)
+    everywhere = jnp.full(TILES.grid(view).padded_count, count)
     return TILES.plan_for([[(everywhere[0], everywhere)]], count, view)
 
 
@@ -155,10 +156,9 @@ def test_a_picture_is_the_middle_of_a_larger_one(float64):
 
 @pytest.mark.once
 @pytest.mark.long
-def test_too_small_a_capacity_makes_the_sums_nan_and_is_reported():
+def test_too_small_a_capacity_makes_the_picture_nan_and_is_reported():
     """Never a wrong picture; and where there is little behind the front, little capacity for it."""
     view, body = bodies.perspective(width=96, height=96), bodies.bumpy(500)
-    rows = jnp.ones((1, 500))
     whole = TileRasterizer(lanes=2, slots=16).make_plan([body], [view], SETTINGS)
     plan = whole.fitted([body], [view], SETTINGS)
     assert plan.places.behind < whole.places.behind
@@ -169,10 +169,10 @@ def test_too_small_a_capacity_makes_the_sums_nan_and_is_reported():
         {"places": dataclasses.replace(plan.places, behind=2)},
     ):
         tried = dataclasses.replace(plan, **short)
-        sums = jax.jit(tried.sum_fragments, static_argnums=(3, 4))
-        sums = sums(body, rows, view, SETTINGS, OneDevice())
-        assert (float(sums.needed) > 1) == bool(short), short
-        assert np.all(np.isnan(sums.sums.rows)) == bool(short), short
+        make = jax.jit(make_shadow_map, static_argnums=(2, 3, 4))
+        seen = make(body, view, SETTINGS, tried, OneDevice())
+        assert (float(seen.needed) > 1) == bool(short), short
+        assert np.all(np.isnan(seen.planes) == bool(short)), short
 
 
 GRID = TileGrid(61, 45, lanes=4, slots=4)
@@ -212,3 +212,24 @@ def test_too_small_a_capacity_is_reported(short):
     named = {name: getattr(enough, name) for name in ("pairs", "blocks", "chunks")} | short
     needed = jax.jit(lambda each: bin_items(each, GRID, BinCapacity(**named)).needed)
     assert float(needed(ranges[3][0])) > 1
+
+
+def test_long_lists_in_a_large_picture_keep_all_items():
+    """Two lists of one chunk, so long that a sort key of 32 bits does not hold length and tile."""
+    grid, counts = TileGrid(8192, 8192, lanes=2, slots=1), [3000, 4000, 10, 10]
+    tiles = jnp.repeat(jnp.arange(4, dtype=jnp.int32), jnp.asarray(counts))
+    one = jnp.ones_like(tiles)
+    ranges = TileRanges(tiles, 0 * one, one, one)
+    capacity = BinCapacity.for_counts([jnp.asarray(counts)], grid)
+    bins = jax.jit(lambda ranges: bin_items(ranges, grid, capacity))(ranges)
+    assert float(bins.needed) <= 1
+    ids = np.asarray(bins.ids).ravel()
+    np.testing.assert_array_equal(np.sort(ids[ids < len(tiles)]), np.arange(len(tiles)))
+
+
+def test_too_many_tiles_are_refused():
+    """A picture whose tiles have numbers too large to be sorted."""
+    view = bodies.perspective(width=1 << 14, height=1 << 14)
+    with pytest.raises(ValueError, match=r"16384 x 16384"):
+        TileRasterizer().make_plan([bodies.bumpy(9)], [view], SETTINGS)
+    assert TileGrid(1 << 14, (1 << 14) - 8).padded_count < 1 << 22

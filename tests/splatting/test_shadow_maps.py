@@ -14,7 +14,7 @@ from jax.test_util import check_grads
 
 from splatjax._combination import OneDevice
 from splatjax.splatting import (
-    SIDE,
+    TILE_SIDE,
     Bounds,
     OrthographicView,
     ShadowMap,
@@ -106,7 +106,7 @@ def test_each_surface_blocks_what_reaches_it():
     settings = ShadowSettings(resolution=size, bias=0.4, softness=0.8)
     view = OrthographicView(jnp.zeros(3), jnp.eye(3), jnp.asarray(2.0), size, size)
     planes = jnp.asarray([front, covers, behind, covers_behind])[:, None, None]
-    planes = jnp.broadcast_to(planes, (4, (size // SIDE) ** 2, SIDE**2))
+    planes = jnp.broadcast_to(planes, (4, (size // TILE_SIDE) ** 2, TILE_SIDE**2))
     column, depth = (
         each.reshape(-1)
         for each in np.meshgrid(np.linspace(-1.7, 34.2, 38), np.linspace(2.9, 6.1, 33))
