@@ -52,14 +52,14 @@ class StreamStatistics:
 
     **Attributes:**
 
-    - `rows`: splats in every part but the last.
+    - `part_size`: splats in every part but the last.
     - `middle`, `reach`: of the box around all centers, and from there to the farthest rim.
     - `spacing`: root of the mean area.
     - `fine`: area that one splat in a hundred is finer than.
     - `unevenness`: the mean over the splats of that of their part.
     """
 
-    rows: int
+    part_size: int
     middle: np.ndarray
     reach: float
     spacing: float
@@ -101,7 +101,7 @@ class StreamStatistics:
                 finest = np.sort(np.concatenate([finest, np.asarray(part.areas)]))[: int(rank) + 2]
                 uneven.append(float(_diffusion.unevenness(part)))
         return cls(
-            rows=sizes[0],
+            part_size=sizes[0],
             middle=middle,
             reach=math.sqrt(farthest) + radius,
             spacing=math.sqrt(area / count),

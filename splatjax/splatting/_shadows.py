@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from splatjax._chunking import AT_ONCE, jit_unless_traced, map_chunks
 from splatjax._combination import AbstractCombination, extreme
-from splatjax.scene import Splats
+from splatjax.scene import Splats, rotation_towards
 
 from ._grid import TileGrid
 from ._kernel import coverage
@@ -73,18 +73,16 @@ class Bounds(eqx.Module):
         return cls(jnp.where(empty, 0.0, center), jnp.where(empty, 1.0, radius))
 
 
-def _facing(forward: Float[Array, "3"]) -> Float[Array, "3 3"]:
+def _rotation_towards(forward: Float[Array, "3"]) -> Float[Array, "3 3"]:
     """Build a rotation whose third row is `forward`; the other two are smooth in it wherever it is
     not along an axis' flip.
     """
-    helper = jnp.where(
+    up = jnp.where(
         jnp.abs(stop_gradient(forward[1])) < 0.9,
         jnp.asarray([0.0, 1.0, 0.0], forward.dtype),
         jnp.asarray([1.0, 0.0, 0.0], forward.dtype),
     )
-    right = jnp.cross(forward, helper)
-    right = right / jnp.linalg.norm(right)
-    return jnp.stack([right, jnp.cross(forward, right), forward])
+    return rotation_towards(forward, up)
 
 
 def distant_view(
@@ -93,7 +91,7 @@ def distant_view(
     """Make the view of what a directional light sees: the bounding sphere, in parallel."""
     size = settings.resolution
     scale = 0.5 * (size - 4) / bounds.radius
-    rotation = _facing(direction / jnp.linalg.norm(direction))
+    rotation = _rotation_towards(direction / jnp.linalg.norm(direction))
     return OrthographicView(
         position=bounds.center, rotation=rotation, scale=scale, width=size, height=size
     )
@@ -112,7 +110,7 @@ def near_view(
     size = settings.resolution
     return PerspectiveView(
         position=position,
-        rotation=_facing(to_center / distance),
+        rotation=_rotation_towards(to_center / distance),
         focal_length=0.5 * (size - 4) / tangent,
         width=size,
         height=size,
@@ -130,7 +128,7 @@ def cube_views(position: Float[Array, "3"], settings: ShadowSettings) -> list[Pe
     return [
         PerspectiveView(
             position=position,
-            rotation=_facing(axis),
+            rotation=_rotation_towards(axis),
             focal_length=focal_length,
             width=size,
             height=size,

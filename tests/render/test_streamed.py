@@ -162,7 +162,7 @@ def test_it_is_the_picture_of_any_weights(planned):
     np.testing.assert_allclose(gathered.coverage, frame.coverage, rtol=1e-4, atol=1e-5)
     # The narrowest layer is resolved nowhere, the widest everywhere.
     _, resolved = gathered.light.weigh(gaussians_of(ONE), jnp.zeros(2))
-    seen = np.asarray(gathered.leaving[0]) > 0
+    seen = np.asarray(gathered.pixel_radiance_per_exitance[0]) > 0
     narrow, middle, wide = np.asarray(resolved)[:, seen].mean(axis=1)
     assert narrow < 1e-3 < middle <= wide
     np.testing.assert_allclose(wide, 1, rtol=1e-3)
