@@ -191,10 +191,12 @@ class EscapeNormalization(AbstractDiffusionKernel):
         rank = jnp.argsort(jnp.argsort(variances))
         not_wider = (rank[None] <= rank[:, None]).astype(mass.dtype)
         inside = jnp.tensordot(not_wider.T, energies, 1) + absorbed
-        leaving = energies / jnp.where(inside > _TINY_ENERGY, inside, 1.0)
+        escape_probability = energies / jnp.where(inside > _TINY_ENERGY, inside, 1.0)
         excess = jnp.maximum(mass - 1, 0)
         excess = excess * excess / (excess + _ROUNDING)
-        return (1 + excess) * jnp.exp(-jnp.tensordot(not_wider, jnp.log(1 + leaving * excess), 1))
+        return (1 + excess) * jnp.exp(
+            -jnp.tensordot(not_wider, jnp.log(1 + escape_probability * excess), 1)
+        )
 
 
 def resolved_fraction(
