@@ -87,7 +87,9 @@ def layers_of(
 
 def seen_in_front(basis: sj.DiffusionBasis) -> np.ndarray:
     """Return the indices of the points of the surface in front."""
-    return np.flatnonzero((basis.in_front > 0) & (jnp.max(basis.leaving, axis=0) > 0))
+    return np.flatnonzero(
+        (basis.in_front > 0) & (jnp.max(basis.pixel_radiance_per_exitance, axis=0) > 0)
+    )
 
 
 def deviations(found: np.ndarray, exact: np.ndarray) -> np.ndarray:

@@ -21,14 +21,14 @@ class BlurSums(eqx.Module):
     """Weight of all taps."""
 
     def renormalized(self) -> Float[Array, "rows height width"]:
-        """Give the mean over what was trusted; 0 where nothing was."""
+        """Compute the mean over what was trusted; 0 where nothing was."""
         is_trusted = self.trusted > 0
         return jnp.where(
             is_trusted[None], self.sums / jnp.where(is_trusted, self.trusted, 1.0)[None], 0.0
         )
 
     def filled(self, own: Float[Array, "rows height width"]) -> Float[Array, "rows height width"]:
-        """Give the mean over all taps, the pixel's own value standing for what was not trusted."""
+        """Compute the mean over all taps, with the pixel's own value for what was not trusted."""
         return (self.sums + (self.total - self.trusted)[None] * own) / self.total[None]
 
 
@@ -86,7 +86,7 @@ def blur_along(
 
 
 def _rate(variance: Float[Array, "height width"]) -> Float[Array, "height width"]:
-    """Give the `rate` of weights `exp(-rate s^2)` on whole pixels whose variance is as asked
+    """Find the `rate` of weights `exp(-rate s^2)` on whole pixels whose variance is as asked
     for.
     """
     narrow = variance < 0.5

@@ -13,7 +13,7 @@ _RIM = 0.002  # of the texture, that stays free along its edges
 
 
 def bust_with_textures(texels: int) -> tuple[Mesh, Textures]:
-    r"""Give the head of the bust as a mesh whose colors lie in textures, laid out by its own
+    r"""Make the head of the bust as a mesh whose colors lie in textures, laid out by its own
     coordinates.
 
     These are longitude and latitude seen from inside the head: the ears, the nostrils and the neck

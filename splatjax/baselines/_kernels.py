@@ -43,14 +43,14 @@ class AbstractSplatKernel(eqx.Module):
         dy: Float[Array, "..."],
         nearness: Float[Array, "..."],
     ) -> Float[Array, "..."]:
-        """Give `rho^2` at offsets from the center (pixels); 1 or more where a splat leaves
+        """Compute `rho^2` at offsets from the center (pixels); 1 or more where a splat leaves
         nothing.
         """
 
     def nearness(
         self, f: Footprints, view: AbstractView, dx: Float[Array, "..."], dy: Float[Array, "..."]
     ) -> Float[Array, "..."]:
-        """Give how near the plane of the splat is: hit by the ray, as everywhere in this
+        """Compute the nearness of the splat's plane: where the ray hits it, as everywhere in this
         renderer.
         """
         return f.nearness + f.slope_x * dx + f.slope_y * dy
@@ -58,7 +58,7 @@ class AbstractSplatKernel(eqx.Module):
     def fragments(
         self, f: Footprints, view: AbstractView, dx: Float[Array, "..."], dy: Float[Array, "..."]
     ) -> Fragments:
-        """Give fragments at offsets from the center. Differentiable in the footprints."""
+        """Compute fragments at offsets from the center. Differentiable in the footprints."""
         nearness = self.nearness(f, view, dx, dy)
         squared = self.squared_radius(f, view, dx, dy, nearness)
         is_inside = f.visible & (squared < 1)
@@ -118,7 +118,7 @@ class EwaKernel(AbstractSplatKernel):
 
     @staticmethod
     def _quadric(f: Footprints, view: AbstractView):
-        """Give the ellipse of the affine map: the one in perspective, with the nearness of the
+        """Compute the ellipse of the affine map: the one in perspective, with the nearness of the
         center everywhere.
         """
         nearness = jnp.where(f.visible, f.nearness, 1.0)
@@ -174,7 +174,7 @@ class DiscOrPixelKernel(AbstractSplatKernel):
 
 
 def _in_perspective(f: Footprints, view: AbstractView, dx, dy, nearness) -> Float[Array, "..."]:
-    """Give `rho^2` of the ray's hit with the disc's plane; infinite where the ray misses the
+    """Compute `rho^2` of the ray's hit with the disc's plane; infinite where the ray misses the
     rim.
     """
     quadric = dx * (f.a * dx + f.b * dy) + f.c * dy * dy

@@ -14,7 +14,7 @@ from splatjax.render import (
     LightVisibility,
     SurfaceAttributes,
     SurfaceSamples,
-    entering_light,
+    irradiance_at_points,
     surface_attributes,
 )
 from splatjax.scene import Scene, Splats, StackedLights
@@ -81,7 +81,7 @@ class NormalFields(AbstractLighting):
 
 
 def normal_slopes(splats: Splats, neighbors: int = _NEIGHBORS) -> Float[Array, "splats 3 3"]:
-    r"""Give how normals turn around each splat, by least squares over its neighbors in the plane of
+    r"""Fit how normals turn around each splat, by least squares over its neighbors in the plane of
     the splat, 1/mm.
 
     **Arguments:**
@@ -122,7 +122,7 @@ def _lit(
         for group, rows in zip(groups, blended.visibility, strict=True)
     ]
     light = LightVisibility(groups, lit, jnp.zeros((), normals.dtype))
-    entering = entering_light(
+    entering = irradiance_at_points(
         material,
         light,
         samples.positions.T,

@@ -7,12 +7,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from splatjax import splatting as _splatting
-from splatjax.render import Irradiance, LightVisibility, entering_light
+from splatjax.render import Irradiance, LightVisibility, irradiance_at_splats
 from splatjax.scene import (
     AbstractLightSample,
     DirectionalLight,
     Material,
     PointLight,
+    Scene,
     Splats,
     stack_lights,
 )
@@ -45,7 +46,7 @@ class MeshLight(eqx.Module):
         groups = stack_lights(self.lights)
         shares = []
         for group in groups:
-            maps = [self.shadows[place] for place in group.places]
+            maps = [self.shadows[index] for index in group.light_indices]
             visible = [
                 _splatting.compute_visibility(points, shadow.depths, self.settings)
                 for shadow in maps
@@ -56,28 +57,13 @@ class MeshLight(eqx.Module):
 
     def entering(self, points: Splats, material: Material) -> Irradiance:
         """Compute the light that enters the surface at points, by the renderer's own interface."""
-        specular, roughness = (
-            own if factor is None else own * factor
-            for own, factor in (
-                (material.specular, points.specular),
-                (material.roughness, points.roughness),
-            )
-        )
-        return entering_light(
-            material,
-            self.on(points),
-            points.centers,
-            points.normals,
-            points.albedo,
-            specular,
-            roughness,
-        )
+        return irradiance_at_splats(Scene(points, self.lights, material), self.on(points))
 
 
 def light_views(
     mesh: TexturedMesh, lights: tuple[AbstractLightSample, ...], settings: _splatting.ShadowSettings
 ) -> list[_splatting.AbstractView | None]:
-    """Give the view of each light; `None` for one that casts no shadows."""
+    """Return the view of each light; `None` for one that casts no shadows."""
     bounds = mesh.bounds()
     views: list[_splatting.AbstractView | None] = []
     for light in lights:

@@ -160,11 +160,11 @@ def _shaded(
         roughness=material.roughness
         if points.roughness is None
         else material.roughness * points.roughness,
-        lit=received.visibility,
+        visibility=received.visibility,
     )
     covered = seen.seen.covered
     drawn = jnp.where(needed <= 1, 1.0, jnp.nan) * covered.reshape(-1, 1).astype(depth.dtype)
-    post = drawn * _shading.leaving_share(surface, f0)[:, None] / jnp.pi
+    per_exitance = drawn * _shading.exit_transmission(surface, f0)[:, None] / jnp.pi
     albedo = (
         jnp.ones((len(points.centers), channels), depth.dtype)
         if points.albedo is None
@@ -176,17 +176,17 @@ def _shaded(
         single = _shading.single_scattered_radiance(
             surface, received.groups, f0, material.single_scattering
         )
-        single = seen.picture(drawn * single * root**2)
-    layers = (post * root)[None] * layers
+        single = seen.picture(drawn * single.T * root**2)
+    layers = (per_exitance * root)[None] * layers
     diffuse = seen.picture(jnp.sum(material.gaussians.weights[:, None] * layers, axis=0))
     specular = seen.picture(
-        drawn * _shading.reflected_radiance(surface, received.groups, f0, channels)
+        drawn * _shading.reflected_radiance(surface, received.groups, f0, channels).T
     )
     shadow = jnp.ones((len(light.lights), *covered.shape), depth.dtype)
     for group, shares in zip(received.groups, received.visibility, strict=True):
         if shares is not None:
             shares = jnp.where(covered[None], shares.reshape(-1, *covered.shape), 1.0)
-            shadow = shadow.at[jnp.asarray(group.places)].set(shares)
+            shadow = shadow.at[jnp.asarray(group.light_indices)].set(shares)
     return Frame(
         beauty=diffuse + specular if single is None else diffuse + single + specular,
         coverage=seen.picture(drawn[:, 0]),

@@ -68,7 +68,7 @@ class Landing(eqx.Module):
         return cls(x, y, jnp.ones_like(x), jnp.zeros_like(x), shown, resolution, resolution)
 
     def boxes(self) -> tuple[Int[Array, " faces"], ...]:
-        """Give the first column and row whose centers a face may cover, and how many; none of a
+        """Find the first column and row whose centers a face may cover, and how many; none of a
         face that is not drawn.
         """
         begin, size = [], []
@@ -142,7 +142,7 @@ def see_faces(landing: Landing, capacity: int) -> SeenFaces:
 
 
 def barycentrics(landing: Landing, seen: SeenFaces) -> Float[Array, "height width 3"]:
-    """Give the perspective-correct coordinates of what every pixel center sees, adding up to 1.
+    """Compute the perspective-correct coordinates of what every pixel center sees, adding up to 1.
     Differentiable in the landing.
 
     Where a pixel sees nothing they are those of a face's middle.
@@ -184,7 +184,7 @@ def _barycentrics(landing: Landing, face, column, row, valid=None) -> Float[Arra
 
 
 def _turn(x: Float[Array, "faces 3"], y: Float[Array, "faces 3"]) -> Float[Array, " faces"]:
-    """Give twice the area of a triangle in the picture, positive when its corners turn from x
+    """Compute twice the area of a triangle in the picture, positive when its corners turn from x
     towards y.
     """
     x, y = stop_gradient(x), stop_gradient(y)

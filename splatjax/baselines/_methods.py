@@ -66,7 +66,7 @@ def deferred_splatting(settings: RenderSettings = _DEFAULTS) -> RenderSettings:
 
 
 def exitance(frame: Frame) -> Float[Array, "height width channels"]:
-    """Give the radiant exitance of a picture before the albedo colors what leaves; of a surface
+    """Compute the radiant exitance of a picture before the albedo colors what leaves; of a surface
     that reflects nothing itself.
 
     What is left is how light has spread: the weighted layers `L_k`; 0 where there is nothing.

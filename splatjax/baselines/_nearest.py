@@ -12,8 +12,8 @@ from ._tiles import AbstractListRasterizer, Lists
 
 
 class NearestRasterizer(AbstractListRasterizer):
-    """Gives every pixel the attributes of the nearest splat there, and covers it whole. Which one
-    it is has no derivative.
+    """Takes for every pixel the attributes of the nearest splat there, and covers it whole. Which
+    splat it is has no derivative.
     """
 
     kernel: AbstractSplatKernel = DiscKernel()

@@ -35,7 +35,7 @@ class AbstractScreenKernel(eqx.Module):
         pixels_per_mm: Float[Array, "height width"],
         gaussians: SumOfGaussians,
     ) -> tuple[Float[Array, "layers channels height width"], Float[Array, "layers channels"]]:
-        """Give layers, and the weights with which they add up to the radiant exitance.
+        """Compute layers, and the weights with which they add up to the radiant exitance.
         Differentiable in the light's colors.
         """
 
@@ -75,7 +75,7 @@ class AbstractOneKernel(AbstractScreenKernel):
     def taps(
         self, gaussians: SumOfGaussians
     ) -> tuple[Float[Array, " samples"], Float[Array, "samples channels"]]:
-        """Give offsets (mm), and weights that add up to 1 in each channel."""
+        """Return offsets (mm), and weights that add up to 1 in each channel."""
 
     def diffuse(self, source, depth, pixels_per_mm, gaussians):
         offsets, weights = self.taps(gaussians)
@@ -173,10 +173,9 @@ def diffuse_on_screen(
         material.roughness,
         [],
     )
-    post = (
-        frame.coverage * _shading.leaving_share(surface, _shading.fresnel_f0(material.eta)) / jnp.pi
-    )
-    layers = (post[..., None] * root)[None] * layers.transpose(0, 2, 3, 1)
+    transmission = _shading.exit_transmission(surface, _shading.fresnel_f0(material.eta))
+    per_exitance = frame.coverage * transmission / jnp.pi
+    layers = (per_exitance[..., None] * root)[None] * layers.transpose(0, 2, 3, 1)
     diffuse = jnp.sum(weights[:, None, None] * layers, axis=0)
     beauty = frame.beauty - frame.diffuse + diffuse
     return eqx.tree_at(
@@ -193,8 +192,8 @@ def diffuse_on_screen(
 
 
 def _follows(depth: Float[Array, "height width"], reach: Float[Array, ""]):
-    """Give how much a tap counts whose depth differs: less and less up to `reach` mm, nothing where
-    there is no surface.
+    """Weigh a tap whose depth differs: less and less up to `reach` mm, nothing where there is no
+    surface.
     """
     return lambda tap: jnp.where(tap > 0, jnp.clip(1 - jnp.abs(tap - depth) / reach, 0, 1), 0.0)
 

@@ -34,7 +34,7 @@ class AbstractStretch(eqx.Module):
         along_v: Float[Array, "height width"],
         valid: Float[Array, "height width"],
     ) -> tuple[Float[Array, "height width"], Float[Array, "height width"]]:
-        """Give what the blur takes for a texel's extent along u and v, mm, of what it is."""
+        """Convert a texel's extent along u and v, mm, to that which the blur uses."""
 
 
 class StretchCorrected(AbstractStretch):
@@ -99,7 +99,7 @@ def rasterize_in_texture(mesh: TexturedMesh, resolution: int, capacity: int) -> 
 
 
 def stretch_map(mesh: TexturedMesh, texels: SurfaceTexels) -> Float[Array, "2 height width"]:
-    """Give the extent of every texel along u and along v, mm; that of an average one between the
+    """Compute the extent of every texel along u and v, mm; that of an average one between the
     charts.
     """
     seen = texels.seen
@@ -114,8 +114,8 @@ def reaches_of(
     extents: Float[Array, "2 height width"],
     valid: Float[Array, "height width"],
 ) -> tuple[int, ...]:
-    """Give how far each step of the blurs must reach, texels, for concrete variances and extents;
-    per step first u, then v.
+    """Compute how far each step of the blurs must reach, texels, for concrete variances and
+    extents; per step first u, then v.
     """
     widths = np.sqrt(np.diff(np.sort(np.asarray(variances, np.float64)), prepend=0.0))
     on_chart = np.asarray(extents)[:, np.asarray(valid) > 0]
@@ -193,7 +193,7 @@ def diffuse_in_texture(
 def look_up_layers(
     texture: TextureLayers, uvs: Float[Array, "points 2"]
 ) -> Float[Array, "gaussians points channels"]:
-    """Give the layers at texture coordinates, bilinearly by the texels on the charts."""
+    """Interpolate the layers at texture coordinates, bilinearly by the texels on the charts."""
     gaussians, height, width, channels = texture.layers.shape
     picture = texture.layers.transpose(1, 2, 0, 3).reshape(height, width, -1)
     return (

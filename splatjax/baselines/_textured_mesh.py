@@ -65,18 +65,18 @@ class TexturedMesh(eqx.Module):
         return cls(vertices, jnp.asarray(mesh.faces, jnp.int32), normals, uvs, *maps)
 
     def corners(self) -> Float[Array, "faces 3 3"]:
-        """Give the positions of each triangle's corners, mm."""
+        """Return the positions of each triangle's corners, mm."""
         return self.vertices[self.faces]
 
     def bounds(self) -> Bounds:
-        """Give the sphere around it that shadow maps are laid around."""
+        """Find the sphere around it that shadow maps are laid around."""
         corners = self.corners().reshape(-1, 3)  # a mesh that was cut has vertices without faces
         center = 0.5 * (jnp.min(corners, axis=0) + jnp.max(corners, axis=0))
         offset = corners - center[None]
         return Bounds(center, 1.001 * jnp.sqrt(jnp.max(jnp.sum(offset * offset, axis=1))))
 
     def lengths(self) -> tuple[Float[Array, " faces"], Float[Array, " faces"]]:
-        """Give how many mm of the surface a step of one along u, and along v, is; 0 on a face
+        """Compute how many mm of the surface a step of one along u, and along v, is; 0 on a face
         without a chart.
         """
         along_u, along_v, _ = self._along()
@@ -85,7 +85,7 @@ class TexturedMesh(eqx.Module):
     def _along(
         self,
     ) -> tuple[Float[Array, "faces 3"], Float[Array, "faces 3"], Float[Array, " faces"]]:
-        """Give the derivatives of the position in u and v, and twice the area of the chart,
+        """Compute the derivatives of the position in u and v, and twice the area of the chart,
         negative where it is mirrored.
         """
         corners = self.corners()
@@ -115,8 +115,8 @@ class SurfaceTexels(eqx.Module):
 
 
 def surface_texels(mesh: TexturedMesh, landing: Landing, seen: SeenFaces) -> SurfaceTexels:
-    """Give position, normal and textures of what every pixel of a landing sees. Differentiable in
-    the mesh and the landing.
+    """Interpolate position, normal and textures of what every pixel of a landing sees.
+    Differentiable in the mesh and the landing.
 
     Where a pixel sees nothing, position and normal are 0.
     """
@@ -132,7 +132,7 @@ def surface_texels(mesh: TexturedMesh, landing: Landing, seen: SeenFaces) -> Sur
 def surface_points(
     mesh: TexturedMesh, faces: Int[Array, " points"], shares: Float[Array, "points 3"]
 ) -> tuple[Splats, Float[Array, "points 2"]]:
-    r"""Give points of a mesh with its textures, as splats without extent, and their texture
+    r"""Return points of a mesh with its textures, as splats without extent, and their texture
     coordinates. Differentiable.
 
     **Arguments:**
@@ -186,7 +186,7 @@ def look_up_charts(
 
 
 def _four(uvs: Float[Array, "points 2"], height: int, width: int):
-    """Give weights, rows and columns of the four pixels around points."""
+    """Compute weights, rows and columns of the four pixels around points."""
     x, y = uvs[:, 0] * width - 0.5, (1 - uvs[:, 1]) * height - 0.5
     left, top = jnp.floor(x), jnp.floor(y)
     a, b = x - left, y - top

@@ -19,7 +19,7 @@ def thinning_error(
     ratio: Float[Array, "..."],
     contrast: Float[Array, "..."],
 ) -> Float[Array, "..."]:
-    r"""Give the error of a layer that is made of a part of the splats, spread evenly: root mean
+    r"""Estimate the error of a layer that is made of a part of the splats, spread evenly: root mean
     square, of the layer's own.
 
         E = 0.2 s x^(3/2) (1 - q)^(1/2),    x = (h / sigma) q^(-1/2)
@@ -53,7 +53,7 @@ def splats_that_suffice(
     error: Float[Array, "..."],
     contrast: Float[Array, "..."],
 ) -> Float[Array, "..."]:
-    r"""Give the ratio of the splats of which a layer errs by no more than `error`: the inverse of
+    r"""Find the ratio of the splats of which a layer errs by no more than `error`: the inverse of
     `thinning_error`.
 
     To the root `(1 - q)^(1/2)`, which counts as 1: a little too many, where most of them stay.
@@ -70,7 +70,7 @@ def splats_that_suffice(
 def layer_contrast(
     splats: Splats, source: Float[Array, "splats channels"], variance: Float[Array, ""]
 ) -> Float[Array, ""]:
-    r"""Give how uneven light is within the width of a layer: `s`, of the layer's root mean square.
+    r"""Measure how uneven light is within a layer's width: `s`, of the layer's root mean square.
 
     The standard deviation of the light under `G(v / 2, r)`, which is the square of the layer's
     Gaussian; root mean square over 512 splats, evenly chosen, and over the channels.

@@ -36,8 +36,8 @@ class FarSide(eqx.Module):
         variance: Float[Array, ""],
         depth: Float[Array, ""],
     ):
-        """Give what the far side weighs against the texel's own surroundings, `[lights, points]`,
-        in a layer.
+        """Compute the weight of the far side against the texel's own surroundings in a layer,
+        `[lights, points]`.
         """
         is_far = nearness > 0
         thickness = -self.scale * jnp.log(jnp.where(is_far, nearness, 1.0))

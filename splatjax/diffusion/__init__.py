@@ -16,7 +16,6 @@ from ._diffuser import (
     AbstractDiffusionPlan as AbstractDiffusionPlan,
     diffuse_with_derivative as diffuse_with_derivative,
     Diffused as Diffused,
-    entering_irradiance as entering_irradiance,
     LayerValues as LayerValues,
     Sources as Sources,
 )

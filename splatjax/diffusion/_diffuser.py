@@ -1,10 +1,7 @@
-"""The irradiance that enters at points of the surface, and its diffusion integral for every layer
-(pass 4, section 4.2).
-"""
+"""The diffusion integral of the irradiance for every layer (pass 4, section 4.2)."""
 
 import abc
 import dataclasses
-from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -12,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from splatjax._combination import AbstractCombination
-from splatjax.scene import Splats, StackedLights, sum_over_lights
+from splatjax.scene import Splats
 
 from ._kernel import AbstractDiffusionKernel
 
@@ -188,35 +185,3 @@ def split_layer(rows: Float[Array, "rows points"], scale: Float[Array, ""]) -> L
     """Split the rows that `layer_values` stacks; `scale` makes slopes of them (1/mm)."""
     values = rows.shape[0] // 4
     return LayerValues(rows[:values], rows[values:].reshape(values, 3, -1) * scale)
-
-
-def entering_irradiance(
-    points: Float[Array, "splats 3"],
-    normals: Float[Array, "splats 3"],
-    groups: list[StackedLights],
-    lit: list[Float[Array, "_lights splats"] | None],
-    entering: Callable[[Float[Array, " splats"]], Float[Array, "#channels splats"]],
-    channels: int,
-) -> Float[Array, "channels splats"]:
-    r"""Compute the irradiance that enters the surface, `sum_lights irradiance max(n . wi, 0) lit
-    entering(n . wi)`.
-
-    **Arguments:**
-
-    - `lit`: for each group the share of each light that reaches each splat; `None` for lights that
-      cast no shadows.
-    - `entering`: the share that is left to diffuse, as a function of the cosine; one row for all
-      channels, or one for each.
-
-    **Returns:** linear in the lights. Differentiable in everything; the horizon is a kink.
-    """
-
-    def entering_of(light, share):
-        wi, irradiance = light.incidence(points)
-        cosine = jnp.maximum(jnp.sum(wi * normals, axis=-1), 0)
-        received = cosine if share is None else cosine * share
-        return irradiance.T * (received[None] * entering(cosine))
-
-    return sum_over_lights(
-        groups, lit, entering_of, jnp.zeros((channels, points.shape[0]), points.dtype)
-    )

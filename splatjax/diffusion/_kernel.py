@@ -215,7 +215,8 @@ def unevenness(splats: Splats) -> Float[Array, ""]:
     r"""Measure how unevenly the splats are spread: 0 on a regular grid, about 0.5 at random.
 
     It is the relative standard deviation, over 64 splats, of the distance to the nearest splat over
-    the root of the area. A number of the geometry; not differentiated.
+    the root of the area. Splats without area do not count. A number of the geometry; not
+    differentiated.
     """
     if splats.count < 2:
         return jnp.zeros((), splats.centers.dtype)
@@ -224,8 +225,11 @@ def unevenness(splats: Splats) -> Float[Array, ""]:
 
     def nearest(i):
         offset = centers - centers[:, i][:, None]
-        squared = jnp.sum(offset * offset, axis=0).at[i].set(jnp.inf)
+        squared = jnp.where(splats.areas > 0, jnp.sum(offset * offset, axis=0), jnp.inf)
+        squared = squared.at[i].set(jnp.inf)
         return jnp.sqrt(jnp.min(squared) / stop_gradient(splats.areas[i]))
 
     distance = jax.lax.map(nearest, sampled)
-    return jnp.std(distance) / jnp.maximum(jnp.mean(distance), jnp.finfo(distance.dtype).tiny)
+    counts = jnp.isfinite(distance)
+    mean = jnp.maximum(jnp.mean(distance, where=counts), jnp.finfo(distance.dtype).tiny)
+    return jnp.where(jnp.any(counts), jnp.std(distance, where=counts) / mean, 0.0)

@@ -69,7 +69,7 @@ class StreamedDiffusion:
         self.boxes = Boxes.around(
             jnp.moveaxis(self.points, 1, 0).reshape(3, -1), exists.reshape(-1), points.shape[2]
         )
-        self.counts, self.rows = (0,) * len(self.cells), [0] * len(self.layers)
+        self.cluster_capacity, self.list_capacity = (0,) * len(self.cells), [0] * len(self.layers)
 
     def evaluate(
         self, parts: Iterable[Sources]
@@ -87,10 +87,13 @@ class StreamedDiffusion:
         )
 
     def _sums(self, parts: Iterable[Sources]) -> Iterator[list[Array | None]]:
-        """Iterate over the sums of each part."""
-        # The first part is always summed, so that there is a result.
+        """Iterate over the sums of each part that brings anything, after zeros."""
         for i, sources in enumerate(parts):
-            if i == 0 or self._in_reach(sources):
+            if i == 0:
+                blocks, _, block = self.points.shape
+                dark = jnp.zeros((blocks, len(sources.irradiance) + 1, block), self.points.dtype)
+                yield [None if layer is None else dark for layer in self.layers]
+            if self._in_reach(sources):
                 yield self._sum_part(sources)
 
     def _in_reach(self, sources: Sources) -> bool:
@@ -114,11 +117,11 @@ class StreamedDiffusion:
         sources = jax.tree.map(lambda rows: rows[..., order], sources)
         arrays = (np.asarray(each.T) for each in (sources.centers, sources.normals))
         tree = ClusterTree.build(*arrays, np.asarray(sources.areas) > 0, self.cells)
-        self.counts = tuple(
+        self.cluster_capacity = tuple(
             had if count <= had else math.ceil(_SPARE * count / BLOCK) * BLOCK
-            for count, had in zip(tree.counts, self.counts, strict=True)
+            for count, had in zip(tree.counts, self.cluster_capacity, strict=True)
         )
-        levels = _levels(tree.with_capacity(self.counts), sources)
+        levels = _levels(tree.with_capacity(self.cluster_capacity), sources)
         return [
             None if each is None else self._sum_layer(i, each, levels)
             for i, each in enumerate(self.layers)
@@ -128,8 +131,8 @@ class StreamedDiffusion:
         clusters = levels[self.cells.index(layer.edge) + 1 if layer.edge else 0]
         reach = layer.support * math.sqrt(float(layer.variance))
         around = source_boxes(clusters.lowered(layer.depth))
-        lists = find_neighbors(self.boxes, around, reach, least=self.rows[i])
-        self.rows[i] = len(lists.rows)
+        lists = find_neighbors(self.boxes, around, reach, least=self.list_capacity[i])
+        self.list_capacity[i] = len(lists.rows)
         return _sum(self.points, clusters, layer, lists)
 
 

@@ -23,7 +23,7 @@ class AbstractIntensity(eqx.Module):
 
     @abc.abstractmethod
     def groups(self, channels: int) -> np.ndarray:
-        """Give, for each channel, the number of its factor among those of the picture; -1 where it
+        """Return for each channel the number of its factor among those of the picture; -1 where it
         is known to be 1.
         """
 

@@ -184,7 +184,7 @@ class RecoveryProblem(eqx.Module):
         dtype, background, kept, counted = unknowns.eta.dtype, UnknownBackground(), [], []
         for picture, one in zip(pictures, evidence, strict=True):
             counted.append(one.counted(picture.coverage.astype(dtype), background))
-            is_lit = np.any(np.asarray(picture.leaving) > 0, axis=0)
+            is_lit = np.any(np.asarray(picture.pixel_radiance_per_exitance) > 0, axis=0)
             is_lit &= np.asarray(counted[-1]).reshape(-1)[np.asarray(picture.pixels)] > 0
             kept.append(_with_points(picture, np.flatnonzero(is_lit), dtype))
         check_counted(counted)
@@ -216,7 +216,7 @@ class RecoveryProblem(eqx.Module):
 def _with_points(picture: DiffusionBasis, kept: np.ndarray, dtype: DTypeLike) -> DiffusionBasis:
     """Keep some points of a picture, in the precision of a search."""
     picture = eqx.tree_at(
-        lambda p: (*p.light.rows, p.leaving, p.in_front, p.pixels),
+        lambda p: (*p.light.rows, p.pixel_radiance_per_exitance, p.in_front, p.pixels),
         picture,
         replace_fn=lambda leaf: leaf[..., kept],
     )

@@ -1,4 +1,7 @@
-"""The five passes, wired: plan what shapes they need, then render. No mathematics lives here."""
+"""The five passes, wired: plan what shapes they need, then render.
+
+The formulas of the passes are in splatting, diffusion and shading.
+"""
 
 from ._attributes import SurfaceAttributes as SurfaceAttributes, SurfaceSamples as SurfaceSamples
 from ._basis import diffusion_basis as diffusion_basis, DiffusionBasis as DiffusionBasis
@@ -7,8 +10,9 @@ from ._checks import check_displayable as check_displayable, check_scene as chec
 from ._jacobian import picture_jacobian as picture_jacobian, PictureJacobian as PictureJacobian
 from ._lighting import (
     AbstractLighting as AbstractLighting,
-    entering_light as entering_light,
     Irradiance as Irradiance,
+    irradiance_at_points as irradiance_at_points,
+    irradiance_at_splats as irradiance_at_splats,
     LightAtSplats as LightAtSplats,
     LightVisibility as LightVisibility,
     surface_attributes as surface_attributes,

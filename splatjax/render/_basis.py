@@ -3,6 +3,7 @@
 from functools import partial
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
@@ -13,9 +14,12 @@ from splatjax.splatting import invalid_factor
 
 from ._checks import in_one_dtype
 from ._devices import on_devices
-from ._passes import in_a_row, light_splats, look
+from ._passes import in_a_row, light_splats, see_and_shade
 from ._plan import Plan, RenderSettings, plan_unless_traced
 from ._shade import ShadedSurface
+
+# Fields of `LayersAtPoints` that lie along the points.
+_ALONG_POINTS = ("means", "mass", "irradiance", "area", "albedo", "derivative")
 
 
 class DiffusionBasis(eqx.Module):
@@ -27,8 +31,8 @@ class DiffusionBasis(eqx.Module):
     **Attributes:**
 
     - `light`: the layers at every point.
-    - `leaving`: from radiant exitance to the pixel's radiance, with the point's share of the pixel;
-      0 where no point is.
+    - `pixel_radiance_per_exitance`: towards the eye, with the point's share of the pixel; 0 where
+      no point is.
     - `pixels`: the pixel of each point, counted row by row.
     - `in_front`: 1 for a point of the surface in front, else 0.
     - `specular`: radiance, premultiplied.
@@ -37,7 +41,7 @@ class DiffusionBasis(eqx.Module):
     """
 
     light: LayersAtPoints
-    leaving: Float[Array, "#channels points"]
+    pixel_radiance_per_exitance: Float[Array, "#channels points"]
     pixels: Int[Array, " points"]
     in_front: Float[Array, " points"]
     specular: Float[Array, "height width channels"]
@@ -52,7 +56,7 @@ class DiffusionBasis(eqx.Module):
         - `gaussians`: the variances count as those that were rendered; with the derivative they may
           be a little off, to first order.
         """
-        radiance = self.leaving * self.light.exitance(gaussians)
+        radiance = self.pixel_radiance_per_exitance * self.light.exitance(gaussians)
         height, width, channels = self.specular.shape
         diffuse = jnp.zeros((channels, height * width), radiance.dtype)
         diffuse = diffuse.at[:, self.pixels].add(radiance)
@@ -100,30 +104,33 @@ def _diffusion_basis(
 
     def passes(combination, scene, plan, camera):
         def read(shaded: ShadedSurface, at: LayersAtPoints, _):
-            return (*at.rows, shaded.post), shaded.specular
+            return (
+                {name: getattr(at, name) for name in _ALONG_POINTS},
+                shaded.radiance_per_exitance,
+                shaded.specular,
+            )
 
         light_at = partial(light_splats, scene, settings, plan, combination, derivative=derivative)
-        (rows, specular), visible = look(scene, camera, settings, plan, combination, light_at, read)
-        means, mass, irradiance, area, albedo, *slopes, post = map(in_a_row, rows)
+        (*rows, specular), visible = see_and_shade(
+            scene, camera, settings, plan, combination, light_at, read
+        )
+        layers, per_exitance = jax.tree.map(in_a_row, rows)
         light = LayersAtPoints(
             variances=scene.material.gaussians.variances,
-            means=means,
-            mass=mass,
-            irradiance=irradiance,
-            area=area,
-            albedo=albedo,
             interval=plan.interval,
             kernel=settings.kernel,
-            derivative=(slopes[0], slopes[1]) if derivative else None,
+            **layers,
         )
         x, y = visible.grid.columns_and_rows(visible.tiles)
         x, y = jnp.minimum(x, camera.width - 1), jnp.minimum(y, camera.height - 1)
         in_front = jnp.broadcast_to(visible.in_front[:, None], x.shape)
         return DiffusionBasis(
             light=light,
-            leaving=invalid_factor(visible.needed) * visible.share.reshape(1, -1) * post,
+            pixel_radiance_per_exitance=(
+                invalid_factor(visible.needed) * visible.share.reshape(1, -1) * per_exitance
+            ),
             pixels=(y * camera.width + x).reshape(-1),
-            in_front=in_front.reshape(-1).astype(post.dtype),
+            in_front=in_front.reshape(-1).astype(per_exitance.dtype),
             specular=visible.picture(specular),
             coverage=visible.picture(jnp.ones_like(specular[:, 0])),
             overflow=visible.overflow,

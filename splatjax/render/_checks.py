@@ -131,9 +131,6 @@ def _winding_number(centers, normals, areas, camera: Camera) -> float:
     return float(cosines @ angles) / (4 * np.pi)
 
 
-SAME = "give both the same number"
-
-
 def in_one_dtype(scene: Scene, *rest):
     """Cast every float to the dtype of the splats' centers, once."""
     dtype = scene.splats.centers.dtype
@@ -145,19 +142,20 @@ def in_one_dtype(scene: Scene, *rest):
 
 
 def check_channels(scene: Scene) -> None:
-    """All that carries color must have as many channels as the material's weights."""
+    """Raise `ValueError` unless albedo and lights have the material's channels."""
     channels = scene.material.gaussians.weights.shape[1]
-    found = {}
+    counts = {}
     if scene.splats.albedo is not None:
-        found["splats.albedo"] = scene.splats.albedo.shape[1]
+        counts["splats.albedo"] = scene.splats.albedo.shape[1]
     point = jax.ShapeDtypeStruct((1, 3), scene.splats.centers.dtype)
     for i, light in enumerate(scene.lights):
         for sample in light.samples():
-            found[f"lights[{i}]"] = eqx.filter_eval_shape(
+            counts[f"lights[{i}]"] = eqx.filter_eval_shape(
                 lambda sample, x: sample.incidence(x)[1], sample, point
             ).shape[1]
-    for name, count in found.items():
+    for name, count in counts.items():
         if count != channels:
             raise ValueError(
-                f"{name} has {count} channels, material.gaussians.weights has {channels}: {SAME}"
+                f"{name} has {count} channels, material.gaussians.weights has {channels}; "
+                "give both the same number"
             )

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, PyTree
 from splatjax._combination import AbstractCombination, DeviceMesh, OneDevice, lay_out
 from splatjax.scene import Scene
 
-from ._plan import Plan, arrange, fill_up
+from ._plan import Plan, arrange, fill_up, splats_per_device
 
 Result = TypeVar("Result", bound=PyTree)
 
@@ -41,8 +41,8 @@ def on_devices(
     - `by_splat`: the results lie along the splats, in the order of the plan; otherwise they are the
       same on all devices.
     """
-    count = 1 if plan.mesh is None else plan.mesh.size
-    filled = max(-(-scene.splats.count // count), 1) * count
+    count, share = splats_per_device(scene.splats.count, plan.mesh)
+    filled = count * share
     scene = Scene(fill_up(scene.splats, filled), scene.lights, scene.material)
     rows = jax.tree.map(lambda row: jnp.pad(row, ((0, filled - len(row)), (0, 0))), rows)
     extra = () if placed is None else (placed,)
@@ -57,14 +57,13 @@ def on_devices(
     if plan.mesh is None:
         return run(OneDevice(), *given)
     devices = DeviceMesh.of(plan.mesh)
-    specs = jax.tree.map(lambda _: PartitionSpec(), (scene, plan, whole))
-    of_splats = jax.tree.map(lambda _: devices.shares, (scene.splats, rows))
-    of_scene = eqx.tree_at(lambda each: each.splats, specs[0], of_splats[0])
+    of_scene, of_whole = jax.tree.map(lambda _: PartitionSpec(), (scene, whole))
+    of_splats, of_rows = jax.tree.map(lambda _: devices.shares, (scene.splats, rows))
     specs = (
-        of_scene,
+        eqx.tree_at(lambda scene: scene.splats, of_scene, of_splats),
         plan.specs(devices),
-        specs[2],
-        of_splats[1],
+        of_whole,
+        of_rows,
         along_splats(extra, devices),
     )
     out_specs = PartitionSpec()
@@ -155,8 +154,8 @@ def _map_over(mesh: Mesh, function: Callable, shared: PyTree, batch: PyTree, cou
     mapped = jax.shard_map(
         share, mesh=mesh, in_specs=specs, out_specs=devices.shares, check_vma=False
     )
-    found = mapped(*lay_out(mesh, arrays, specs))
+    results = mapped(*lay_out(mesh, arrays, specs))
     if not lacking:
-        return found
-    whole = lay_out(mesh, found, jax.tree.map(lambda _: PartitionSpec(), found))
+        return results
+    whole = lay_out(mesh, results, jax.tree.map(lambda _: PartitionSpec(), results))
     return jax.tree.map(lambda leaf: leaf[:count], whole)

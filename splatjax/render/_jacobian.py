@@ -18,9 +18,9 @@ from ._attributes import SurfaceSamples
 from ._checks import in_one_dtype
 from ._devices import on_devices
 from ._lighting import LightAtSplats
-from ._passes import light_splats, look
+from ._passes import light_splats, see_and_shade
 from ._plan import Plan, RenderSettings, plan_unless_traced
-from ._shade import ShadedSurface, compose, layers_at_points, single_scattering_albedo
+from ._shade import ShadedSurface, compose, layers_at_points
 
 Parameters = TypeVar("Parameters", bound=PyTree)
 
@@ -41,14 +41,14 @@ class PictureJacobian(eqx.Module):
     variances: Float[Array, "gaussians height width channels"]
 
     def along(self, change: SumOfGaussians) -> Float[Array, "height width channels"]:
-        """Give what `beauty` does along a change of weights and variances: a derivative picture."""
+        """Differentiate `beauty` along a change of weights and variances: a derivative picture."""
         moved = jnp.tensordot(change.variances, self.variances, 1)
         return moved + jnp.sum(change.weights[:, None, None] * self.weights, axis=0)
 
     def through(
         self, gaussians_of: Callable[[Parameters], SumOfGaussians], parameters: Parameters
     ) -> Parameters:
-        r"""Give the Jacobian in what the Gaussians were made of: coefficients, thicknesses,
+        r"""Compute the Jacobian in what the Gaussians were made of: coefficients, thicknesses,
         anything.
 
         **Arguments:**
@@ -73,17 +73,17 @@ class PictureJacobian(eqx.Module):
                 "the picture was made with "
                 f"{list(shape)}: give the function that made the picture's material"
             )
-        slopes = jax.jacfwd(gaussians_of)(parameters)
+        jacobian = jax.jacfwd(gaussians_of)(parameters)
         leaves, structure = jax.tree.flatten(parameters)
-        of_variances = structure.flatten_up_to(slopes.variances)
-        of_weights = structure.flatten_up_to(slopes.weights)
+        of_variances = structure.flatten_up_to(jacobian.variances)
+        of_weights = structure.flatten_up_to(jacobian.weights)
 
         def chain(of_variances, of_weights, leaf):
             of_variances = of_variances.reshape(shape[0], -1).astype(dtype)
             of_weights = of_weights.reshape(*shape, -1).astype(dtype)
-            found = jnp.einsum("khwc,kp->hwcp", self.variances, of_variances)
-            found = found + jnp.einsum("khwc,kcp->hwcp", self.weights, of_weights)
-            return found.reshape(*found.shape[:3], *jnp.shape(leaf))
+            of_beauty = jnp.einsum("khwc,kp->hwcp", self.variances, of_variances)
+            of_beauty = of_beauty + jnp.einsum("khwc,kcp->hwcp", self.weights, of_weights)
+            return of_beauty.reshape(*of_beauty.shape[:3], *jnp.shape(leaf))
 
         return structure.unflatten(
             [chain(v, w, leaf) for v, w, leaf in zip(of_variances, of_weights, leaves, strict=True)]
@@ -104,8 +104,8 @@ def picture_jacobian(
     frames, whatever the number of pixels or parameters. With a least squares solver this is the
     Jacobian of Gauss and Newton; from it `through` gives those in optical coefficients.
 
-    **Arguments:** as for `render`; under `jit` a plan is needed. Not itself differentiable where
-    the diffuser is fast.
+    **Arguments:** as for `render`; under `jit` a plan is needed. With `ClusterDiffuser`, it cannot
+    be differentiated again.
 
     **Returns:** a `PictureJacobian`; NaN where the plan does not suffice.
 
@@ -131,10 +131,11 @@ def _picture_jacobian(
     scene, camera = in_one_dtype(scene, camera)
 
     def passes(combination, scene, plan, camera):
-        gaussians, ratio = scene.material.gaussians, single_scattering_albedo(scene)
+        material = scene.material
+        weighing = material.gaussians, material.single_scattering_albedo()
 
         def read(shaded: ShadedSurface, at: LayersAtPoints, samples: SurfaceSamples):
-            of_weights, of_variances = at.exitance_jacobian(gaussians, ratio)
+            of_weights, of_variances = at.exitance_jacobian(*weighing)
             added = samples.attributes.added_source
             if added is not None:
                 # The light that a weight lets in has layers of its own.
@@ -142,18 +143,19 @@ def _picture_jacobian(
                     None if layer is None else layer[len(added) :] for layer in samples.layers
                 )
                 samples = dataclasses.replace(samples, layers=layers, derivative=None)
-                own = samples.attributes, added, plan.interval, settings.kernel
-                gained, _ = layers_at_points(scene, samples, *own).weigh(gaussians, ratio)
-                weighted = gaussians.weights[:, :, None] * gained
+                gained, _ = layers_at_points(
+                    scene, samples, samples.attributes, added, plan.interval, settings.kernel
+                ).weigh(*weighing)
+                weighted = material.gaussians.weights[:, :, None] * gained
                 of_weights = of_weights + jnp.sum(weighted, axis=0)[None]
-            post = shaded.post[None]
-            return shaded, post * of_weights, post * of_variances
+            per_exitance = shaded.radiance_per_exitance[None]
+            return shaded, per_exitance * of_weights, per_exitance * of_variances
 
         light_at = partial(light_splats, scene, settings, plan, combination, derivative=True)
-        (shaded, *slopes), visible = look(
+        (shaded, *derivatives), visible = see_and_shade(
             scene, camera, settings, plan, combination, light_at, read
         )
-        pictures = [jnp.moveaxis(visible.picture(slope), 2, 0) for slope in slopes]
+        pictures = [jnp.moveaxis(visible.picture(values), 2, 0) for values in derivatives]
         return PictureJacobian(compose(scene, shaded, visible), *pictures)
 
     return on_devices(passes, scene, plan, camera)

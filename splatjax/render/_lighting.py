@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from splatjax import diffusion as _diffusion, shading as _shading, splatting as _splatting
+from splatjax import shading as _shading, splatting as _splatting
 from splatjax._combination import AbstractCombination
 from splatjax.scene import (
     AbstractLightSample,
@@ -44,16 +44,20 @@ class ShadowPlan(eqx.Module):
         return jax.lax.stop_gradient(bounds.radius / distance)
 
 
-def is_among(lights: Sequence[AbstractLightSample], bounds: _splatting.Bounds) -> bool:
-    """Test whether a point light is among the splats, or nearly so: then all of its group need a
-    cube. Not for traced arrays.
+def plan_views(
+    lights: Sequence[AbstractLightSample],
+    bounds: _splatting.Bounds,
+    settings: _splatting.ShadowSettings,
+) -> tuple[list[Sequence[_splatting.AbstractView]], bool]:
+    """Return the views of the shadow maps of each light of a group, and whether they are faces of
+    cubes: all are where one light is among the splats, or nearly so. Not for traced arrays.
     """
-    distances = (
-        float(jnp.linalg.norm(light.position - bounds.center))
+    cube = any(
+        float(jnp.linalg.norm(light.position - bounds.center)) < _NEARLY * float(bounds.radius)
         for light in lights
         if isinstance(light, PointLight)
     )
-    return any(distance < _NEARLY * float(bounds.radius) for distance in distances)
+    return [shadow_views(light, bounds, settings, cube) for light in lights], cube
 
 
 def shadow_views(
@@ -94,12 +98,10 @@ class LightVisibility(eqx.Module):
         """Average the visibility of each light's samples by the light that each would bring."""
 
         def received(light):
-            wi, irradiance = light.incidence(positions)
-            cosine = jnp.maximum(jnp.sum(wi * normals, axis=-1), 0)
-            return cosine * jnp.sum(irradiance, axis=-1)
+            return jnp.sum(_shading.received_light(light, None, positions, normals)[2], axis=0)
 
         def mean(group: StackedLights, rows):
-            if rows is None or len(group.distinct) == len(group.places):
+            if rows is None or len(group.distinct) == len(group.light_indices):
                 return rows
             return group.mean_per_light(rows, jax.lax.map(received, group.lights))
 
@@ -112,7 +114,7 @@ class Irradiance(eqx.Module):
     **Attributes:**
 
     - `entering`: irradiance that enters the surface.
-    - `source`: that which spreads, times the root of the albedo.
+    - `source`: `entering` times the root of the albedo: what pass 4 diffuses.
     """
 
     entering: Float[Array, "channels points"]
@@ -121,14 +123,19 @@ class Irradiance(eqx.Module):
 
 def cast_shadows(
     scene: Scene,
+    bounds: _splatting.Bounds,
     shadows: tuple[ShadowPlan | None, ...],
     splatting: _splatting.SplattingSettings,
     settings: _splatting.ShadowSettings,
     combination: AbstractCombination,
 ) -> LightVisibility:
-    """Make the shadow maps of all lights (4.1) and look up the splats in them."""
+    """Make the shadow maps of all lights (4.1) and look up the splats in them.
+
+    **Arguments:**
+
+    - `bounds`: of the splats of all devices.
+    """
     splats, groups = scene.splats, stack_lights(scene.lights)
-    bounds = _splatting.Bounds.of(splats, combination)
     visibility, needed = [], [jnp.zeros((), splats.centers.dtype)]
     for group, plan in zip(groups, shadows, strict=True):
         if plan is None:
@@ -140,16 +147,17 @@ def cast_shadows(
                 shadow_map = _splatting.make_shadow_map(
                     splats, view, splatting, plan.raster, combination
                 )
-                own = map_visibility(scene, shadow_map, settings, plan.cube)
-                return own, shadow_map.needed
+                visible = map_visibility(scene, shadow_map, settings, plan.cube)
+                return visible, shadow_map.needed
 
             views = shadow_views(light, bounds, settings, plan.cube)
-            own, needed = jax.lax.map(of_view, _splatting.stack_views(views))
-            return jnp.sum(own, axis=0), jnp.maximum(jnp.max(needed), plan.closeness(light, bounds))
+            visible, needed = jax.lax.map(of_view, _splatting.stack_views(views))
+            closeness = plan.closeness(light, bounds)
+            return jnp.sum(visible, axis=0), jnp.maximum(jnp.max(needed), closeness)
 
-        own, need = jax.lax.map(of_light, group.lights)
-        visibility.append(own)
-        needed.append(jnp.max(need))
+        visible, needed_by_light = jax.lax.map(of_light, group.lights)
+        visibility.append(visible)
+        needed.append(jnp.max(needed_by_light))
     return LightVisibility(groups, visibility, jnp.max(jnp.stack(needed)))
 
 
@@ -167,7 +175,7 @@ def map_visibility(
     return visibility
 
 
-def entering_light(
+def irradiance_at_points(
     material: Material,
     light: LightVisibility,
     positions: Float[Array, "points 3"],
@@ -185,28 +193,25 @@ def entering_light(
     """
     f0 = _shading.fresnel_f0(material.eta)
 
-    def entering(cosine):
-        share = 1 - _shading.directional_albedo(cosine, f0, specular, roughness)
+    def enters(_, cosine):
+        fraction = 1 - _shading.directional_albedo(cosine, f0, specular, roughness)
         if material.single_scattering is None:
-            return share[None]
-        return share[None] * material.diffuse_fraction(cosine).T
+            return fraction[None]
+        return fraction[None] * material.diffuse_fraction(cosine).T
 
-    channels = material.gaussians.weights.shape[1]
-    irradiance = _diffusion.entering_irradiance(
-        positions, normals, light.groups, light.visibility, entering, channels
+    irradiance = _shading.sum_received(
+        positions, normals, light.groups, light.visibility, enters, material.channels
     )
     if albedo is None:
         return Irradiance(irradiance, irradiance)
     return Irradiance(irradiance, irradiance * _shading.albedo_root(albedo).T)
 
 
-def irradiate(scene: Scene, light: LightVisibility) -> Irradiance:
+def irradiance_at_splats(scene: Scene, light: LightVisibility) -> Irradiance:
     """Compute the light that enters every splat."""
     splats = scene.splats
-    specular, roughness = surface_parameters(scene)
-    return entering_light(
-        scene.material, light, splats.centers, splats.normals, splats.albedo, specular, roughness
-    )
+    points = splats.centers, splats.normals, splats.albedo
+    return irradiance_at_points(scene.material, light, *points, *surface_parameters(scene))
 
 
 def surface_parameters(scene: Scene):

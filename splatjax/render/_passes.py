@@ -1,5 +1,6 @@
 """The five passes, wired once: what differs between pictures is what is read of the surface
-samples, and between devices how partial results are combined. No mathematics lives here.
+samples, and between devices how partial results are combined. The formulas of the passes are in
+splatting, diffusion and shading.
 """
 
 import dataclasses
@@ -19,12 +20,7 @@ from splatjax._combination import AbstractCombination
 from splatjax.scene import Camera, Scene, stack_lights
 
 from ._attributes import SurfaceAttributes, SurfaceSamples, split_rows, stack_rows
-from ._lighting import (
-    Irradiance,
-    LightVisibility,
-    cast_shadows,
-    irradiate,
-)
+from ._lighting import Irradiance, LightVisibility, cast_shadows, irradiance_at_splats
 from ._plan import Plan, RenderSettings
 from ._shade import ShadedSurface, shade
 
@@ -32,7 +28,7 @@ Values = TypeVar("Values", bound=PyTree)
 
 
 class SplatLight(eqx.Module):
-    """The light of a body before anyone looks at it: passes 1 and 4 on the splats.
+    """Passes 1 and 4 on the splats, which do not depend on the camera.
 
     **Attributes:** along the splats, in the order of the plan
 
@@ -62,43 +58,54 @@ def light_splats(
     settings: RenderSettings,
     plan: Plan,
     combination: AbstractCombination,
+    bounds: _splatting.Bounds,
     at: Int[Array, " chosen"] | None = None,
     derivative: bool = False,
 ) -> SplatLight:
-    """Passes 1 and 4: light the splats, and diffuse their irradiance among them.
+    """Light the splats, and diffuse their irradiance among them: passes 1 and 4.
 
     **Arguments:**
 
+    - `bounds`: of the splats of all devices.
     - `at`: the splats whose light is returned, in ascending order; all for `None`.
     - `derivative`: also differentiate the layers in the material's Gaussians.
     """
-    light = cast_shadows(scene, plan.shadows, settings.splatting, settings.shadows, combination)
-    irradiance, added = irradiate(scene, light), None
+    light = cast_shadows(
+        scene, bounds, plan.shadows, settings.splatting, settings.shadows, combination
+    )
+    irradiance, added = irradiance_at_splats(scene, light), None
     if derivative and scene.material.single_scattering is not None:
-        irradiance, added = _irradiate_and_differentiate(scene, light)
+        irradiance, added = _differentiated_irradiance(scene, light)
     source = irradiance.source if added is None else jnp.concatenate([irradiance.source, added])
-    layers, slopes, needed = diffuse_splats(
+    layers, log_variance_derivative, needed = diffuse_splats(
         scene, source, settings, plan, combination, at, derivative
     )
     needed = jnp.maximum(needed, light.needed)
-    own = SplatLight(light.visibility, irradiance, (), None, added, needed)
-    own = own if at is None else own.take(at)
-    return dataclasses.replace(own, layers=layers, derivative=slopes)
+    splat_light = SplatLight(light.visibility, irradiance, (), None, added, needed)
+    splat_light = splat_light if at is None else splat_light.take(at)
+    # The layers are already those at `at`: they are added after the others are taken.
+    return dataclasses.replace(splat_light, layers=layers, derivative=log_variance_derivative)
 
 
-def _irradiate_and_differentiate(scene: Scene, light: LightVisibility):
-    """Also compute what each weight adds to the light that spreads: beside single scattering, which
-    leaves less of it where light grazes.
+def _differentiated_irradiance(
+    scene: Scene, light: LightVisibility
+) -> tuple[Irradiance, Float[Array, "channels splats"]]:
+    """Compute the irradiance, and also differentiate the source in the weights.
+
+    With single scattering, less light is left for the Gaussians where it grazes; this depends only
+    on the sum of the weights, so one weight is moved.
     """
     weights = scene.material.gaussians.weights
 
-    def irradiance(more: Float[Array, " channels"]):
-        moved = weights.at[0].add(more)
-        return irradiate(eqx.tree_at(lambda s: s.material.gaussians.weights, scene, moved), light)
+    def irradiance(change: Float[Array, " channels"]):
+        moved = weights.at[0].add(change)
+        return irradiance_at_splats(
+            eqx.tree_at(lambda s: s.material.gaussians.weights, scene, moved), light
+        )
 
     zero, one = jnp.zeros_like(weights[0]), jnp.ones_like(weights[0])
-    found, slope = jax.jvp(irradiance, (zero,), (one,))
-    return found, slope.source
+    value, derivative = jax.jvp(irradiance, (zero,), (one,))
+    return value, derivative.source
 
 
 def diffuse_splats(
@@ -110,31 +117,34 @@ def diffuse_splats(
     at: Int[Array, " chosen"] | None = None,
     derivative: bool = False,
 ):
-    """Pass 4: return the layers of the splats, their derivatives, and the capacity needed."""
+    """Diffuse (pass 4): return the layers of the splats, their derivatives in the logarithms of
+    the variances, and the capacity needed.
+    """
     splats, variances = scene.splats, scene.material.gaussians.variances
     sources = _diffusion.Sources(splats.centers.T, splats.normals.T, splats.areas, source)
     given = sources, variances, settings.kernel, combination, at
     if not derivative:
         diffused = plan.diffusion.diffuse(*given)
         return diffused.layers, None, diffused.needed
-    diffused, slopes = _diffusion.diffuse_with_derivative(plan.diffusion, *given)
-    return diffused.layers, slopes.layers, diffused.needed
+    diffused, differentiated = _diffusion.diffuse_with_derivative(plan.diffusion, *given)
+    return diffused.layers, differentiated.layers, diffused.needed
 
 
-def look(
+def see_and_shade(
     scene: Scene,
     camera: Camera,
     settings: RenderSettings,
     plan: Plan,
     combination: AbstractCombination,
-    light_at: Callable[[Int[Array, " chosen"]], SplatLight],
+    light_at: Callable[[_splatting.Bounds, Int[Array, " chosen"]], SplatLight],
     read: Callable[[ShadedSurface, _diffusion.LayersAtPoints, SurfaceSamples], Values],
 ) -> tuple[Values, _splatting.VisibleSurfaces]:
-    """All passes: light the splats, see them, shade what is seen, and read what a picture needs.
+    """Light the splats, see them, shade what is seen, and read what a picture needs: all passes.
 
     **Arguments:**
 
-    - `light_at`: passes 1 and 4, for the splats that the camera may see: `light_splats`.
+    - `light_at`: passes 1 and 4, of the bounds of all splats, for those that the camera may see:
+      `light_splats`.
     - `read`: pointwise, along the last axis.
 
     **Returns:** what was read, for each place; and the places, with the capacity needed of all
@@ -142,14 +152,15 @@ def look(
     """
     view, groups = _splatting.PerspectiveView.of(camera), stack_lights(scene.lights)
     chosen, chosen_needed = plan.raster.choose(scene.splats, view)
-    light = light_at(chosen)
+    bounds = _splatting.Bounds.of(scene.splats, combination)
+    light = light_at(bounds, chosen)
 
     # Passes 2 and 3: blend the attributes and layers of the splats that may be seen.
     splats = scene.splats.take(chosen)
     shown = Scene(splats, scene.lights, scene.material)
     visibility = LightVisibility(groups, light.visibility, light.needed)
     attributes = settings.lighting.attributes(shown, visibility, light.irradiance)
-    origin = stop_gradient(_splatting.Bounds.of(scene.splats, combination).center)[:, None]
+    origin = stop_gradient(bounds.center)[:, None]
     attributes = attributes.with_layers(
         light.layers, light.derivative, light.added_source, splats.centers.T - origin
     )
@@ -198,12 +209,14 @@ def sample_surfaces(
     attributes = split_rows(in_a_row(surface.attributes), like)
     positions = in_a_row(visible.points(tiles, surface.depth))
 
-    own, channels = (attributes.centers, positions - origin), len(attributes.source)
-    slopes = attributes.derivative
+    derivative = attributes.derivative
+    points = positions - origin
     continued = [
         (None, None)
         if layer is None
-        else _diffusion.continue_to_points(layer, slopes and slopes[i], *own, channels)
+        else _diffusion.continue_to_points(
+            layer, derivative and derivative[i], attributes.centers, points, len(attributes.source)
+        )
         for i, layer in enumerate(attributes.layers)
     ]
     return SurfaceSamples(
@@ -212,7 +225,7 @@ def sample_surfaces(
         depth=in_a_row(surface.depth),
         covered=in_a_row(surface.covered),
         layers=tuple(layer for layer, _ in continued),
-        derivative=None if slopes is None else tuple(slope for _, slope in continued),
+        derivative=None if derivative is None else tuple(change for _, change in continued),
     )
 
 
@@ -227,10 +240,11 @@ def map_places(function: Callable[..., Values], *given: PyTree) -> Values:
     **Returns:** the same arrays, `[places, *rows, pixels]`.
     """
 
-    def chunk(*given):
-        return jax.tree.map(_by_place, function(*given))
-
-    return map_chunks(chunk, *given, at_once=_splatting.TILES_AT_ONCE)
+    return map_chunks(
+        lambda *given: jax.tree.map(_by_place, function(*given)),
+        *given,
+        at_once=_splatting.TILES_AT_ONCE,
+    )
 
 
 def in_a_row(values: Shaped[Array, "places *rows pixels"]) -> Shaped[Array, "*rows points"]:

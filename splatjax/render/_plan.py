@@ -17,7 +17,7 @@ from splatjax._combination import DeviceMesh, OneDevice
 from splatjax.scene import AbstractLight, Camera, Scene, Splats, StackedLights, stack_lights
 
 from ._checks import check_scene, in_one_dtype
-from ._lighting import AbstractLighting, LightAtSplats, ShadowPlan, is_among, shadow_views
+from ._lighting import AbstractLighting, LightAtSplats, ShadowPlan, plan_views
 
 
 class RenderSettings(eqx.Module):
@@ -78,12 +78,11 @@ class Plan(eqx.Module):
 
     def specs(self, combination: DeviceMesh) -> "Plan":
         """Specify which arrays every device has whole, and of which it has a share."""
-        specs = jax.tree.map(lambda _: PartitionSpec(), self)
-
-        def cut(plan):
-            return plan.order, plan.exists, *plan.diffusion.shares()
-
-        return eqx.tree_at(cut, specs, replace_fn=lambda _: combination.shares)
+        return eqx.tree_at(
+            lambda plan: (plan.order, plan.exists, *plan.diffusion.shares()),
+            jax.tree.map(lambda _: PartitionSpec(), self),
+            replace_fn=lambda _: combination.shares,
+        )
 
 
 def make_plan(
@@ -115,8 +114,8 @@ def make_plan(
     (scene, *others), cameras = _on_one_device((scenes, cameras))
     scene, others, cameras = in_one_dtype(scene, others, cameras)
     views = [_splatting.PerspectiveView.of(camera) for camera in cameras]
-    splats, devices = scene.splats, 1 if mesh is None else mesh.size
-    parts, order, exists = _arrange(splats, devices)
+    splats = scene.splats
+    parts, order, exists = _cut_and_order(splats, mesh)
     bounds = _splatting.Bounds.of(fill_up(splats, max(splats.count, 1)), OneDevice())
     interval = settings.kernel.interval(_diffusion.unevenness(splats))
     variances = scene.material.gaussians.variances
@@ -126,7 +125,7 @@ def make_plan(
         exists=exists,
         shadows=tuple(
             _plan_shadows(group, parts, bounds, settings)
-            for group in _groups([each.lights for each in (scene, *others)])
+            for group in _groups([scene.lights for scene in (scene, *others)])
         ),
         diffusion=settings.diffuser.make_plan(parts, variances, settings.kernel, interval),
         interval=interval,
@@ -140,6 +139,12 @@ def make_plan(
     return jax.tree.map(
         lambda leaf, spec: jax.device_put(leaf, NamedSharding(mesh, spec)), plan, specs
     )
+
+
+def splats_per_device(count: int, mesh: Mesh | None) -> tuple[int, int]:
+    """Return the number of devices, and how many of `count` splats each has: at least one."""
+    devices = 1 if mesh is None else mesh.size
+    return devices, max(-(-count // devices), 1)
 
 
 def fill_up(splats: Splats, count: int) -> Splats:
@@ -160,7 +165,7 @@ def arrange(splats: Splats, order: Int[Array, " places"], exists: Bool[Array, " 
         return jnp.where(exists.reshape(-1, *[1] * (leaf.ndim - 1)), leaf, 0)
 
     return eqx.tree_at(
-        lambda each: (each.normals, each.radii, each.areas), placed, replace_fn=masked
+        lambda splats: (splats.normals, splats.radii, splats.areas), placed, replace_fn=masked
     )
 
 
@@ -236,18 +241,18 @@ def _on_one_device(tree: Whole) -> Whole:
     return jax.tree.map(gathered, tree)
 
 
-def _arrange(splats: Splats, devices: int) -> tuple[list[Splats], Array, Array]:
+def _cut_and_order(splats: Splats, mesh: Mesh | None) -> tuple[list[Splats], Array, Array]:
     """Cut the splats into a part for each device, each in a compact order; also return the orders
     and which of their entries exist, device after device.
     """
-    rows = max(-(-splats.count // devices), 1)
-    places = -(-rows // _diffusion.BLOCK) * _diffusion.BLOCK
-    whole, parts, orders, exist = fill_up(splats, rows * devices), [], [], []
+    devices, share = splats_per_device(splats.count, mesh)
+    filling = (0, -share % _diffusion.BLOCK)
+    whole, parts, orders, exist = fill_up(splats, share * devices), [], [], []
     for i in range(devices):
-        part = jax.tree.map(lambda leaf, i=i: leaf[i * rows : (i + 1) * rows], whole)
+        part = jax.tree.map(lambda leaf, i=i: leaf[i * share : (i + 1) * share], whole)
         order = _diffusion.compact_order(np.asarray(part.centers))
-        exists = np.pad(i * rows + order < splats.count, (0, places - rows))
-        order = np.pad(order, (0, places - rows), mode="edge")
+        exists = np.pad(i * share + order < splats.count, filling)
+        order = np.pad(order, filling, mode="edge")
         orders.append(order.astype(np.int32))
         exist.append(exists)
         parts.append(arrange(part, jnp.asarray(orders[-1]), jnp.asarray(exists)))
@@ -256,12 +261,13 @@ def _arrange(splats: Splats, devices: int) -> tuple[list[Splats], Array, Array]:
 
 def _groups(lights: Sequence[tuple[AbstractLight, ...]]) -> list[list[StackedLights]]:
     """Return for each group of lights that are rendered together its lights in every scene."""
-    stacked = [stack_lights(each) for each in lights]
+    stacked = [stack_lights(of_scene) for of_scene in lights]
     kinds = [
-        [(jax.tree.structure(group.lights), group.places) for group in groups] for groups in stacked
+        [(jax.tree.structure(group.lights), group.light_indices) for group in groups]
+        for groups in stacked
     ]
-    for i, each in enumerate(kinds):
-        if each != kinds[0]:
+    for i, kinds_of_scene in enumerate(kinds):
+        if kinds_of_scene != kinds[0]:
             raise ValueError(
                 "scenes of one plan must have lights of the same kinds in the same order, and the "
                 f"lights of scenes[{i}] differ"
@@ -278,9 +284,7 @@ def _plan_shadows(
     if not groups[0].lights.cast_shadows:
         return None
     lights = [light for group in groups for light in group.apart()]
-    cube = is_among(lights, bounds)
-    views = [
-        view for light in lights for view in shadow_views(light, bounds, settings.shadows, cube)
-    ]
+    of_lights, cube = plan_views(lights, bounds, settings.shadows)
+    views = [view for views in of_lights for view in views]
     rasterizer = settings.rasterizer.for_shadows()
     return ShadowPlan(rasterizer.make_plan(parts, views, settings.splatting), cube)

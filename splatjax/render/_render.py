@@ -12,13 +12,14 @@ from jaxtyping import Array, Float
 from splatjax._chunking import take_points
 from splatjax._combination import lay_out
 from splatjax.scene import Camera, Frame, Scene
+from splatjax.splatting import Bounds
 
-from ._checks import SAME, check_channels, in_one_dtype
+from ._checks import check_channels, in_one_dtype
 from ._devices import on_devices
-from ._lighting import Irradiance, LightAtSplats, cast_shadows, irradiate
-from ._passes import SplatLight, diffuse_splats, light_splats, look
-from ._plan import Plan, RenderSettings, check_plan, plan_unless_traced
-from ._shade import compose, single_scattering_albedo
+from ._lighting import Irradiance, LightAtSplats, cast_shadows, irradiance_at_splats
+from ._passes import SplatLight, diffuse_splats, light_splats, see_and_shade
+from ._plan import Plan, RenderSettings, check_plan, plan_unless_traced, splats_per_device
+from ._shade import compose
 
 
 def render(
@@ -60,12 +61,17 @@ def _render(
     scene, camera = in_one_dtype(scene, camera)
 
     def passes(combination, scene, plan, camera, light=None):
-        def read(shaded, *_):
-            return shaded
-
-        own = scene, camera, settings, plan, combination
         light_at = partial(light_splats, scene, settings, plan, combination)
-        return compose(scene, *look(*own, light_at if light is None else light.take, read))
+        shaded, visible = see_and_shade(
+            scene,
+            camera,
+            settings,
+            plan,
+            combination,
+            light_at if light is None else lambda _, chosen: light.take(chosen),
+            read=lambda shaded, *_: shaded,
+        )
+        return compose(scene, shaded, visible)
 
     return on_devices(passes, scene, plan, camera, placed=light)
 
@@ -96,7 +102,8 @@ def _illuminate(scene: Scene, plan: Plan, settings: RenderSettings) -> SplatLigh
     (scene,) = in_one_dtype(scene)
 
     def passes(combination, scene, plan):
-        return light_splats(scene, settings, plan, combination)
+        bounds = Bounds.of(scene.splats, combination)
+        return light_splats(scene, settings, plan, combination, bounds)
 
     return on_devices(passes, scene, plan, by_splat=True)
 
@@ -123,23 +130,25 @@ def _compute_irradiance(scene: Scene, plan: Plan, settings: RenderSettings) -> I
     (scene,) = in_one_dtype(scene)
 
     def passes(combination, scene, plan):
-        maps = plan.shadows, settings.splatting, settings.shadows
-        return irradiate(scene, cast_shadows(scene, *maps, combination))
+        bounds = Bounds.of(scene.splats, combination)
+        light = cast_shadows(
+            scene, bounds, plan.shadows, settings.splatting, settings.shadows, combination
+        )
+        return irradiance_at_splats(scene, light)
 
-    found, count = (on_devices(passes, scene, plan, by_splat=True), plan.order, plan.exists), 1
+    placed = on_devices(passes, scene, plan, by_splat=True), plan.order, plan.exists
     if plan.mesh is not None:
-        found = lay_out(plan.mesh, found, jax.tree.map(lambda _: PartitionSpec(), found))
-        count = plan.mesh.size
-    placed, order, exists = found
-    share = max(-(-scene.splats.count // count), 1)
-    device = jnp.repeat(jnp.arange(count), len(order) // count)
+        placed = lay_out(plan.mesh, placed, jax.tree.map(lambda _: PartitionSpec(), placed))
+    irradiance, order, exists = placed
+    devices, share = splats_per_device(scene.splats.count, plan.mesh)
+    device = jnp.repeat(jnp.arange(devices), len(order) // devices)
     splat = jnp.where(exists, device * share + order, scene.splats.count)
 
     def in_scene_order(rows):
         empty = jnp.zeros((rows.shape[0], scene.splats.count), rows.dtype)
         return empty.at[:, splat].set(rows, mode="drop")
 
-    return jax.tree.map(in_scene_order, placed)
+    return jax.tree.map(in_scene_order, irradiance)
 
 
 def diffuse_irradiance(
@@ -168,7 +177,7 @@ def diffuse_irradiance(
     if irradiance.shape[1] != channels:
         raise ValueError(
             f"irradiance has {irradiance.shape[1]} channels, material.gaussians.weights has "
-            f"{channels}: {SAME}"
+            f"{channels}; give both the same number"
         )
     plan = plan_unless_traced(scene, camera, settings, plan, is_lit=False)
     return _diffuse_irradiance(scene, irradiance, camera, settings, plan)
@@ -186,17 +195,20 @@ def _diffuse_irradiance(
     def passes(combination, scene, plan, camera, irradiance):
         source = irradiance.T
 
-        def light_at(chosen):
+        def light_at(_, chosen):
             layers, _, needed = diffuse_splats(
                 scene, source, settings, plan, combination, at=chosen
             )
-            own = Irradiance(*[take_points(source, chosen)] * 2)
-            return SplatLight([], own, layers, None, None, needed)
+            seen = take_points(source, chosen)
+            irradiance = Irradiance(entering=seen, source=seen)
+            return SplatLight([], irradiance, layers, None, None, needed)
 
         def read(shaded, layers, samples):
-            return layers.weigh(scene.material.gaussians, single_scattering_albedo(scene))[0]
+            return layers.weigh(
+                scene.material.gaussians, scene.material.single_scattering_albedo()
+            )[0]
 
-        layers, visible = look(scene, camera, plain, plan, combination, light_at, read)
+        layers, visible = see_and_shade(scene, camera, plain, plan, combination, light_at, read)
         return visible.front_picture(layers)
 
     picture = on_devices(passes, dark, plan, camera, rows=(irradiance,))

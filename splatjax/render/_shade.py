@@ -16,8 +16,9 @@ class ShadedSurface(eqx.Module):
 
     **Attributes:**
 
-    - `post`: from a layer to the radiance towards the eye; 0 where there is no surface.
-    - `layers`: of each Gaussian, times `post`, Gaussian by Gaussian.
+    - `radiance_per_exitance`: towards the eye, `sqrt(albedo) exit_transmission / pi`; 0 where there
+      is no surface.
+    - `layers`: of each Gaussian, times `radiance_per_exitance`, Gaussian by Gaussian.
     - `diffuse`: their weighted sum.
     - `resolved`: the fraction of each layer that is the diffusion integral.
     """
@@ -28,7 +29,7 @@ class ShadedSurface(eqx.Module):
     albedo: Float[Array, "channels points"]
     shadow: Float[Array, "lights points"]
     irradiance: Float[Array, "channels points"]
-    post: Float[Array, "#channels points"]
+    radiance_per_exitance: Float[Array, "#channels points"]
     layers: Float[Array, "gaussians channels points"]
     diffuse: Float[Array, "channels points"]
     specular: Float[Array, "channels points"]
@@ -85,26 +86,26 @@ def shade(
         outgoing=(to_eye / jnp.sqrt(jnp.sum(to_eye * to_eye, axis=0, keepdims=True))).T,
         specular=material.specular if attributes.specular is None else attributes.specular[0],
         roughness=material.roughness if attributes.roughness is None else attributes.roughness[0],
-        lit=[
+        visibility=[
             None if rows is None else group.per_sample(rows)
             for group, rows in zip(groups, attributes.visibility, strict=True)
         ],
     )
     gaussians = material.gaussians
-    channels, post = gaussians.weights.shape[1], _shading.leaving_share(points, f0)[None] / jnp.pi
     at = layers_at_points(scene, samples, attributes, attributes.source, interval, settings.kernel)
     albedo = at.albedo
+    per_exitance = _shading.exit_transmission(points, f0)[None] / jnp.pi
     if attributes.albedo is not None:
-        post = post * _shading.albedo_root(albedo)
+        per_exitance = per_exitance * _shading.albedo_root(albedo)
     single = None
     if material.single_scattering is not None:
         single = _shading.single_scattered_radiance(points, groups, f0, material.single_scattering)
-        single = jnp.where(covered[None], single.T, 0.0)
+        single = jnp.where(covered[None], single, 0.0)
         if attributes.albedo is not None:
             single = single * _shading.albedo_root(albedo) ** 2
-    layers, resolved = at.weigh(gaussians, single_scattering_albedo(scene))
-    layers = jnp.where(covered[None, None], post[None] * layers, 0.0)
-    specular = _shading.reflected_radiance(points, groups, f0, channels).T
+    layers, resolved = at.weigh(gaussians, material.single_scattering_albedo())
+    layers = jnp.where(covered[None, None], per_exitance[None] * layers, 0.0)
+    specular = _shading.reflected_radiance(points, groups, f0, material.channels)
     shadow = _shadows_in_order(attributes.visibility, groups, len(scene.lights), samples.depth)
     shaded = ShadedSurface(
         depth=jnp.where(covered, samples.depth, jnp.inf),
@@ -113,7 +114,7 @@ def shade(
         albedo=albedo,
         shadow=jnp.where(covered[None], shadow, 1.0),
         irradiance=attributes.source if attributes.irradiance is None else attributes.irradiance,
-        post=jnp.where(covered[None], post, 0.0),
+        radiance_per_exitance=jnp.where(covered[None], per_exitance, 0.0),
         layers=layers,
         diffuse=jnp.sum(gaussians.weights[:, :, None] * layers, axis=0),
         specular=jnp.where(covered[None], specular, 0.0),
@@ -121,12 +122,6 @@ def shade(
         resolved=resolved,
     )
     return shaded, at
-
-
-def single_scattering_albedo(scene: Scene) -> Float[Array, " channels"]:
-    """Compute the fraction of the light that leaves a flat piece as single scattering."""
-    material = scene.material
-    return material.total_reflectance() - material.gaussians.total_reflectance()
 
 
 def compose(
@@ -170,8 +165,8 @@ def _shadows_in_order(
 ) -> Float[Array, "lights points"]:
     """Sort the visibility of the lights into the scene's order; 1 where a light casts none."""
     planes = [jnp.ones_like(depth)] * lights
-    for group, own in zip(groups, visibility, strict=True):
-        if own is not None:
-            for row, place in enumerate(group.distinct):
-                planes[place] = own[row]
+    for group, rows in zip(groups, visibility, strict=True):
+        if rows is not None:
+            for index, row in zip(group.distinct, rows, strict=True):
+                planes[index] = row
     return jnp.stack(planes) if planes else jnp.zeros((0, *depth.shape), depth.dtype)

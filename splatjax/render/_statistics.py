@@ -30,10 +30,10 @@ class ReplayableStream:
         more.
         """
         marks = []
-        for part in self.parts():
+        for i, part in enumerate(self.parts()):
             marks.append(np.asarray(_mark(part)))
-            expected = marks if self.marks is None else self.marks[: len(marks)]
-            if not np.array_equal(marks[-1:], expected[len(marks) - 1 :], equal_nan=True):
+            expected = marks if self.marks is None else self.marks
+            if i == len(expected) or not np.array_equal(marks[i], expected[i], equal_nan=True):
                 raise ValueError(_CHANGED)
             yield part
         self.marks = marks if self.marks is None else self.marks
@@ -52,14 +52,14 @@ class StreamStatistics:
 
     **Attributes:**
 
-    - `rows`: splats in every part but the last.
+    - `part_size`: splats in every part but the last.
     - `middle`, `reach`: of the box around all centers, and from there to the farthest rim.
-    - `spacing`: root of the mean area.
-    - `fine`: area that one splat in a hundred is finer than.
-    - `unevenness`: the mean over the splats of that of their part.
+    - `spacing`, `fine`: root of the mean area of the splats that have one, and the area that one in
+      a hundred of these is finer than; infinite where none has.
+    - `unevenness`: the mean over the same splats of that of their part.
     """
 
-    rows: int
+    part_size: int
     middle: np.ndarray
     reach: float
     spacing: float
@@ -74,11 +74,12 @@ class StreamStatistics:
         smaller and not the last.
         """
         # Sizes, extent and areas.
-        sizes, low, high, area, radius = [], [], [], 0.0, 0.0
+        sizes, low, high, area, count, radius = [], [], [], 0.0, 0, 0.0
         for part in parts():
             if part.count:
                 centers = np.asarray(part.centers)
                 sizes.append(part.count)
+                count += np.count_nonzero(np.asarray(part.areas))
                 low.append([axis.min() for axis in centers.T])  # quicker than over an axis of three
                 high.append([axis.max() for axis in centers.T])
                 area += float(np.asarray(part.areas).sum(dtype=np.float64))
@@ -92,21 +93,21 @@ class StreamStatistics:
             )
         # How far the farthest splat is, the finest areas, and how evenly splats are spread.
         middle = (np.min(low, axis=0) + np.max(high, axis=0)) / 2
-        farthest, finest, uneven, count = 0.0, np.zeros(0), [], sum(sizes)
-        rank = _diffusion.FINEST * (count - 1)
+        farthest, finest, uneven = 0.0, np.zeros(0), 0.0
+        rank = _diffusion.FINEST * max(count - 1, 0)
         for part in parts():
             if part.count:
-                away = (np.asarray(part.centers) - middle).T
+                away, areas = (np.asarray(part.centers) - middle).T, np.asarray(part.areas)
                 farthest = max(farthest, float(np.max(sum(axis * axis for axis in away))))
-                finest = np.sort(np.concatenate([finest, np.asarray(part.areas)]))[: int(rank) + 2]
-                uneven.append(float(_diffusion.unevenness(part)))
+                finest = np.sort(np.concatenate([finest, areas[areas > 0]]))[: int(rank) + 2]
+                uneven += np.count_nonzero(areas) * float(_diffusion.unevenness(part))
         return cls(
-            rows=sizes[0],
+            part_size=sizes[0],
             middle=middle,
             reach=math.sqrt(farthest) + radius,
-            spacing=math.sqrt(area / count),
-            fine=float(np.interp(rank, np.arange(len(finest)), finest)),
-            unevenness=float(np.average(uneven, weights=sizes)),
+            spacing=math.sqrt(area / count) if count else math.inf,
+            fine=float(np.interp(rank, np.arange(len(finest)), finest)) if count else math.inf,
+            unevenness=uneven / max(count, 1),
         )
 
     def bounds(self, dtype) -> _splatting.Bounds:

@@ -32,10 +32,9 @@ from ._checks import check_channels, in_one_dtype
 from ._lighting import (
     Irradiance,
     LightVisibility,
-    irradiate,
-    is_among,
+    irradiance_at_splats,
     map_visibility,
-    shadow_views,
+    plan_views,
 )
 from ._passes import in_a_row, map_places, sample_surfaces
 from ._plan import RenderSettings, fill_up
@@ -100,11 +99,11 @@ def render_streamed(
 
     statistics = StreamStatistics.of(lambda: reported("looking"))
 
-    rows = -(-statistics.rows // _diffusion.BLOCK) * _diffusion.BLOCK
+    part_size = -(-statistics.part_size // _diffusion.BLOCK) * _diffusion.BLOCK
 
     def scenes(task: str) -> Iterator[Scene]:
         for part in reported(task):
-            whole = Scene(fill_up(part, rows), tuple(lights), material)
+            whole = Scene(fill_up(part, part_size), tuple(lights), material)
             yield in_one_dtype(whole)[0]
 
     first = next(iter(scenes("looking")))
@@ -115,27 +114,34 @@ def render_streamed(
 
     # Pass 1: the shadow maps.
     maps = _maps(groups, bounds, settings)
-    sums = _sum_views(scenes, "shadow maps", [each.view for each in maps], settings, _no_rows)
+    sums = _sum_views(
+        scenes,
+        "shadow maps",
+        [shadow.view for shadow in maps],
+        settings,
+        lambda scene: jnp.zeros((0, scene.splats.count), dtype),
+    )
     shadow_maps = [
-        _splatting.ShadowMap.of(each, shadow.view, settings.splatting)
-        for each, shadow in zip(sums, maps, strict=True)
+        _splatting.ShadowMap.of(of_view, shadow.view, settings.splatting)
+        for of_view, shadow in zip(sums, maps, strict=True)
     ]
 
-    def lit(scene: Scene) -> tuple[LightVisibility, Irradiance]:
-        return _light(scene, groups, maps, shadow_maps, settings)
+    light = partial(_light, groups=groups, maps=maps, shadow_maps=shadow_maps, settings=settings)
 
     # Passes 2 and 3: what the camera sees.
-    like = settings.lighting.attributes(first, *lit(first))
+    like = settings.lighting.attributes(first, *light(first))
 
-    def attributes(scene: Scene) -> Array:
-        return stack_rows(settings.lighting.attributes(scene, *lit(scene)))
-
-    (seen,) = _sum_views(scenes, "what the camera sees", [view], settings, attributes)
+    (seen,) = _sum_views(
+        scenes,
+        "what the camera sees",
+        [view],
+        settings,
+        lambda scene: stack_rows(settings.lighting.attributes(scene, *light(scene))),
+    )
     visible, samples = _sample(seen, view, settings, like, bounds.center)
 
     # Pass 4, at the points that the pixels see.
-    unevenness = jnp.asarray(statistics.unevenness, dtype)
-    interval = settings.kernel.interval(unevenness)
+    interval = settings.kernel.interval(jnp.asarray(statistics.unevenness, dtype))
     diffusion = _diffusion.StreamedDiffusion(
         diffuser,
         settings.kernel,
@@ -149,7 +155,7 @@ def render_streamed(
 
     def sources() -> Iterator[_diffusion.Sources]:
         for scene in scenes("diffusion"):
-            splats, (_, irradiance) = scene.splats, lit(scene)
+            splats, (_, irradiance) = scene.splats, light(scene)
             centers = splats.centers.T - bounds.center[:, None]
             yield _diffusion.Sources(centers, splats.normals.T, splats.areas, irradiance.source)
 
@@ -159,23 +165,14 @@ def render_streamed(
     return _shade(first, view, groups, visible, samples, layers, interval, settings)
 
 
-def _no_rows(scene: Scene) -> Float[Array, "0 splats"]:
-    return jnp.zeros((0, scene.splats.count), scene.splats.centers.dtype)
-
-
 def _maps(
     groups: Sequence[StackedLights], bounds: _splatting.Bounds, settings: RenderSettings
 ) -> list[_Map]:
     maps = []
     for i, group in enumerate(groups):
         if group.lights.cast_shadows:
-            lights = group.apart()
-            cube = is_among(lights, bounds)
-            maps += [
-                _Map(view, i, j, cube)
-                for j, light in enumerate(lights)
-                for view in shadow_views(light, bounds, settings.shadows, cube)
-            ]
+            of_lights, cube = plan_views(group.apart(), bounds, settings.shadows)
+            maps += [_Map(view, i, j, cube) for j, views in enumerate(of_lights) for view in views]
     return maps
 
 
@@ -208,8 +205,8 @@ def _sum_views(
                 for plan, view in zip(plans, views, strict=True)
             ]
 
-    found = _splatting.sum_parts(parts, [plan.places for plan in plans], PartByPart())
-    return [sums for sums, _ in found]
+    summed = _splatting.sum_parts(parts, [plan.places for plan in plans], PartByPart())
+    return [sums for sums, _ in summed]
 
 
 @eqx.filter_jit
@@ -229,14 +226,14 @@ def _light(
 ) -> tuple[LightVisibility, Irradiance]:
     """Look a part up in the shadow maps of all parts."""
     visibility: list = [
-        [0.0] * len(group.places) if group.lights.cast_shadows else None for group in groups
+        [0.0] * len(group.light_indices) if group.lights.cast_shadows else None for group in groups
     ]
-    for own, shadow_map in zip(maps, shadow_maps, strict=True):
-        found = map_visibility(scene, shadow_map, settings.shadows, own.cube)
-        visibility[own.group][own.light] = visibility[own.group][own.light] + found
-    stacked = [None if each is None else jnp.stack(each) for each in visibility]
+    for shadow, shadow_map in zip(maps, shadow_maps, strict=True):
+        of_group = visibility[shadow.group]
+        of_group[shadow.light] += map_visibility(scene, shadow_map, settings.shadows, shadow.cube)
+    stacked = [None if of_group is None else jnp.stack(of_group) for of_group in visibility]
     light = LightVisibility(groups, stacked, jnp.zeros((), scene.splats.centers.dtype))
-    return light, irradiate(scene, light)
+    return light, irradiance_at_splats(scene, light)
 
 
 @eqx.filter_jit

@@ -8,13 +8,13 @@ from ._lights import (
     PointLight as PointLight,
     stack_lights as stack_lights,
     StackedLights as StackedLights,
-    sum_over_lights as sum_over_lights,
 )
 from ._scene import (
     Camera as Camera,
     Frame as Frame,
     Material as Material,
     Parts as Parts,
+    rotation_towards as rotation_towards,
     Scene as Scene,
     Splats as Splats,
 )

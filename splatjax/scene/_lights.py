@@ -4,7 +4,6 @@ the light.
 
 import abc
 import dataclasses
-from collections.abc import Callable, Sequence
 from typing import ClassVar
 
 import equinox as eqx
@@ -164,75 +163,51 @@ class GaussianBeam(AbstractLightSample):
 
 
 class StackedLights(eqx.Module):
-    """Samples of lights of one kind, their leaves stacked, and for each the place of its light in
+    """Samples of lights of one kind, their leaves stacked, and for each the index of its light in
     the scene's tuple.
     """
 
     lights: AbstractLightSample
-    places: tuple[int, ...] = eqx.field(static=True)
+    light_indices: tuple[int, ...] = eqx.field(static=True)
 
     @property
     def distinct(self) -> tuple[int, ...]:
-        """List the places of the lights, each once."""
-        return tuple(dict.fromkeys(self.places))
+        """List the indices of the lights, each once."""
+        return tuple(dict.fromkeys(self.light_indices))
 
     def mean_per_light(
         self, rows: Float[Array, "samples points"], weights: Float[Array, "samples points"]
     ) -> Float[Array, "lights points"]:
         """Average the rows of the samples of each light."""
-        member = jnp.asarray([[of == place for of in self.places] for place in self.distinct])
-        member = member.astype(rows.dtype)
+        light, sample = jnp.asarray(self.distinct)[:, None], jnp.asarray(self.light_indices)[None]
+        member = (light == sample).astype(rows.dtype)
         total = member @ weights
         mean = member @ (weights * rows) / jnp.where(total > 0, total, 1.0)
         return jnp.where(total > 0, mean, 1.0)
 
     def per_sample(self, rows: Float[Array, "lights points"]) -> Float[Array, "samples points"]:
         """Repeat the row of each light for its samples."""
-        if len(self.distinct) == len(self.places):
+        if len(self.distinct) == len(self.light_indices):
             return rows
-        return rows[jnp.asarray([self.distinct.index(place) for place in self.places])]
+        return rows[jnp.asarray([self.distinct.index(index) for index in self.light_indices])]
 
     def apart(self) -> list[AbstractLightSample]:
         """Return the samples one by one."""
         return [
-            jax.tree.map(lambda leaf, i=i: leaf[i], self.lights) for i in range(len(self.places))
+            jax.tree.map(lambda leaf, i=i: leaf[i], self.lights)
+            for i in range(len(self.light_indices))
         ]
 
 
 def stack_lights(lights: tuple[AbstractLight, ...]) -> list[StackedLights]:
     """Stack samples of equal kind, so that any number of them is computed by one loop."""
     kinds: dict[object, list[tuple[int, AbstractLightSample]]] = {}
-    for place, light in enumerate(lights):
+    for index, light in enumerate(lights):
         for sample in light.samples():
-            kinds.setdefault(jax.tree.structure(sample), []).append((place, sample))
+            kinds.setdefault(jax.tree.structure(sample), []).append((index, sample))
     groups = []
     for members in kinds.values():
-        places, samples = zip(*members, strict=True)
+        indices, samples = zip(*members, strict=True)
         stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *samples)
-        groups.append(StackedLights(stacked, places))
+        groups.append(StackedLights(stacked, indices))
     return groups
-
-
-def sum_over_lights(
-    groups: list[StackedLights],
-    shares: Sequence[Array | None],
-    contribution: Callable[[AbstractLightSample, Array | None], Array],
-    start: Array,
-) -> Array:
-    """Add up the contributions of lights, one after the other; backward, each is recomputed.
-
-    **Arguments:**
-
-    - `shares`: for each group what of each light arrives, lights first; `None` for lights that cast
-      no shadows.
-    - `contribution`: of a light, and its share.
-    - `start`: what they are added to.
-    """
-
-    @jax.checkpoint
-    def add(total, light_and_share):
-        return total + contribution(*light_and_share), None
-
-    for group, share in zip(groups, shares, strict=True):
-        start, _ = jax.lax.scan(add, start, (group.lights, share))
-    return start

@@ -99,12 +99,16 @@ class Camera(eqx.Module):
                     f"up is {known[2].tolist()}, along the line of sight; give another, such as "
                     "[0, 0, -1] to look down"
                 )
-        forward = forward / jnp.linalg.norm(forward)
-        right = jnp.cross(forward, up)
-        right = right / jnp.linalg.norm(right)
-        rotation = jnp.stack([right, jnp.cross(forward, right), forward])
+        rotation = rotation_towards(forward / jnp.linalg.norm(forward), up)
         focal_length = 0.5 / math.tan(math.radians(fov) / 2)
         return cls(eye, rotation, as_floats(focal_length, eye.dtype), width, height, near)
+
+
+def rotation_towards(forward: Float[Array, "3"], up: Float[Array, "3"]) -> Float[Array, "3 3"]:
+    """Build the rotation whose rows point right, down and along `forward`, a unit vector."""
+    right = jnp.cross(forward, up)
+    right = right / jnp.linalg.norm(right)
+    return jnp.stack([right, jnp.cross(forward, right), forward])
 
 
 _ROUNDING = 1e-5  # by which an albedo may leave [0, 1]
@@ -165,9 +169,7 @@ class Splats(eqx.Module):
         is more translucent.
         """
         scaled = self.centers * factor, self.radii * factor, self.areas * (factor * factor)
-        return eqx.tree_at(
-            lambda splats: (splats.centers, splats.radii, splats.areas), self, scaled
-        )
+        return eqx.tree_at(lambda body: (body.centers, body.radii, body.areas), self, scaled)
 
     def take(self, chosen: Int[Array, " chosen"]) -> "Splats":
         """Return the splats of these indices, in ascending order; splats that are invisible and
@@ -224,13 +226,14 @@ class Material(eqx.Module):
         return self.gaussians.channels
 
     def total_reflectance(self) -> Float[Array, " channels"]:
-        """Compute the fraction of the light entering a flat piece along its normal that leaves it
-        again.
-        """
-        total = self.gaussians.total_reflectance()
+        """Compute the fraction of the light entering a flat piece along its normal that leaves."""
+        return self.gaussians.total_reflectance() + self.single_scattering_albedo()
+
+    def single_scattering_albedo(self) -> Float[Array, " channels"]:
+        """Compute the part of the total reflectance that is light scattered once."""
         if self.single_scattering is None:
-            return total
-        return total + self.single_scattering.total_reflectance()
+            return jnp.zeros_like(self.gaussians.weights, shape=self.channels)
+        return self.single_scattering.total_reflectance()
 
     def diffuse_fraction(self, mu_i: Float[Array, "*points"]) -> Float[Array, "*points channels"]:
         """Compute the factor on the Gaussians for light that enters under the cosine `mu_i`; 1
@@ -251,16 +254,12 @@ class Material(eqx.Module):
         return Material(gaussians, self.eta, self.specular, self.roughness)
 
     def opaque(self) -> "Material":
-        """Return the material without scattering below the surface: one Gaussian narrower than any
-        splat has the total reflectance.
-        """
+        """Replace scattering by one Gaussian, narrower than any splat, of the total reflectance."""
         variances = jnp.full_like(self.gaussians.variances, _NARROW, shape=(1,))
         return self.surface_of(SumOfGaussians(variances, self.total_reflectance()[None]))
 
     def white(self) -> "Material":
-        """Scale the total reflectance to one in every channel, so that an albedo map alone carries
-        color.
-        """
+        """Scale the total reflectance to 1 per channel, so that an albedo map alone has color."""
         total, single = self.total_reflectance(), self.single_scattering
         gaussians = SumOfGaussians(self.gaussians.variances, self.gaussians.weights / total[None])
         if single is not None:
@@ -303,7 +302,7 @@ class Frame(eqx.Module):
     - `shadow`: per light, 1 lit and 0 in shadow, not premultiplied; 1 where there is nothing.
     - `irradiance`: that enters the surface: cosine, shadow and the loss to the specular lobe
       included.
-    - `layers`: one per Gaussian, `post * transmission / pi * L_k`.
+    - `layers`: one per Gaussian, `sqrt(albedo) exit_transmission / pi * L_k`.
     - `weights`: those the picture was made with.
     - `diffuse`, `specular`: radiance.
     - `unresolved_fraction`: per Gaussian, the fraction of the covered pixels for which the splats

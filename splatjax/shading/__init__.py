@@ -1,11 +1,13 @@
-"""Pass 5: the rough interface. What it reflects, and what it leaves to the light below."""
+"""The light that a surface receives, and pass 5: what the rough interface does with it."""
 
 from ._deferred import (
     albedo_root as albedo_root,
     diffuse_transmission as diffuse_transmission,
-    leaving_share as leaving_share,
+    exit_transmission as exit_transmission,
+    received_light as received_light,
     reflected_radiance as reflected_radiance,
     single_scattered_radiance as single_scattered_radiance,
+    sum_received as sum_received,
     SurfacePoints as SurfacePoints,
     unit_normals as unit_normals,
 )

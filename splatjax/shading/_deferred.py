@@ -1,13 +1,16 @@
-"""Pass 5: deferred shading of one visible surface (section 4.1): what the rough interface reflects,
-how the diffuse light leaves through it, and how a map of albedo colors that.
+"""The light that a surface receives, and pass 5: deferred shading (section 4.1). What the rough
+interface reflects, how the diffuse light leaves through it, and how a map of albedo colors that.
 """
 
+from collections.abc import Callable
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from splatjax.scattering import SingleScattering
-from splatjax.scene import StackedLights, sum_over_lights
+from splatjax.scene import AbstractLightSample, StackedLights
 
 from ._specular import average_albedo, directional_albedo, specular_lobe
 
@@ -21,7 +24,7 @@ def diffuse_transmission(
     specular: Float[Array, "..."],
     roughness: Float[Array, "..."],
 ) -> Float[Array, "..."]:
-    r"""Give the angular factor of the diffuse light that leaves, `(1 - rho(mu)) / (1 - rho_avg)`.
+    r"""Compute the angular factor of diffuse light that leaves, `(1 - rho(mu)) / (1 - rho_avg)`.
 
     The radiance of a surface of radiant exitance `M` is `M diffuse_transmission(mu_o) / pi`. Since
     the factor's average, weighted with `2 mu`, is one, the light that leaves is exactly `M`.
@@ -40,7 +43,7 @@ def diffuse_transmission(
 
 
 def albedo_root(albedo: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Give `sqrt(max(albedo, 1e-4))`: half of the color acts before the light spreads, half after.
+    """Compute `sqrt(max(albedo, 1e-4))`: half of the color acts before light spreads, half after.
 
     **Arguments:**
 
@@ -63,7 +66,8 @@ class SurfacePoints(eqx.Module):
 
     - `normals`: unit, or zero where there is no surface.
     - `outgoing`: `wo`, unit, towards the eye.
-    - `lit`: per group of lights, as the splats received it.
+    - `visibility`: per group the fraction of each light that arrives; `None` for lights that cast
+      no shadows.
     """
 
     positions: Float[Array, "*pixels 3"]
@@ -71,49 +75,101 @@ class SurfacePoints(eqx.Module):
     outgoing: Float[Array, "*pixels 3"]
     specular: Float[Array, "*pixels"] | Float[Array, ""]
     roughness: Float[Array, "*pixels"] | Float[Array, ""]
-    lit: list[Float[Array, "_lights *pixels"] | None]
+    visibility: list[Float[Array, "_lights *pixels"] | None]
 
 
 def unit_normals(normals: Float[Array, "*pixels 3"]) -> Float[Array, "*pixels 3"]:
-    """Give blended normals unit length; zero stays zero, with a zero gradient: no direction is
+    """Scale blended normals to unit length; zero stays zero, with a zero gradient: no direction is
     better than another.
     """
     squared = jnp.sum(normals * normals, axis=-1, keepdims=True)
-    there = squared > 0
-    return jnp.where(there, normals / jnp.sqrt(jnp.where(there, squared, 1.0)), 0.0)
+    is_surface = squared > 0
+    return jnp.where(is_surface, normals / jnp.sqrt(jnp.where(is_surface, squared, 1.0)), 0.0)
 
 
-def leaving_share(points: SurfacePoints, f0: Float[Array, ""]) -> Float[Array, "*pixels"]:
-    """Give the share of diffused light that leaves towards the eye, `(1 - rho(wo)) / (1 -
+def _cosine(
+    normals: Float[Array, "*pixels 3"], directions: Float[Array, "*pixels 3"]
+) -> Float[Array, "*pixels"]:
+    """Compute the cosine between unit vectors; 0 below the horizon, which is a kink."""
+    return jnp.maximum(jnp.sum(normals * directions, axis=-1), 0)
+
+
+def received_light(
+    light: AbstractLightSample,
+    visibility: Float[Array, "*pixels"] | None,
+    points: Float[Array, "*pixels 3"],
+    normals: Float[Array, "*pixels 3"],
+) -> tuple[Float[Array, "*pixels 3"], Float[Array, "*pixels"], Float[Array, "channels *pixels"]]:
+    """Compute `wi`, the cosine `n . wi`, and the irradiance that the surface receives from a light:
+    cosine and visibility included.
+    """
+    wi, irradiance = light.incidence(points)
+    cosine = _cosine(normals, wi)
+    received = cosine if visibility is None else cosine * visibility
+    return wi, cosine, jnp.moveaxis(irradiance, -1, 0) * received[None]
+
+
+def sum_received(
+    points: Float[Array, "*pixels 3"],
+    normals: Float[Array, "*pixels 3"],
+    groups: list[StackedLights],
+    visibility: list[Float[Array, "_lights *pixels"] | None],
+    factor: Callable[
+        [Float[Array, "*pixels 3"], Float[Array, "*pixels"]], Float[Array, "#channels *pixels"]
+    ],
+    channels: int,
+) -> Float[Array, "channels *pixels"]:
+    r"""Sum the light that a surface receives, `sum_lights irradiance max(n . wi, 0) visibility
+    factor(wi, n . wi)`: light after light, each recomputed backward.
+
+    **Arguments:**
+
+    - `normals`: unit.
+    - `visibility`: for each group the fraction of each light that reaches each point; `None` for
+      lights that cast no shadows.
+    - `factor`: what becomes of the light: the fraction that is left to diffuse, or the reflectance
+      towards the eye; one row for all channels, or one for each.
+
+    **Returns:** linear in the lights. Differentiable in everything; the horizon is a kink.
+    """
+
+    @jax.checkpoint
+    def add(total, light_and_visibility):
+        wi, cosine, received = received_light(*light_and_visibility, points, normals)
+        return total + received * factor(wi, cosine), None
+
+    total = jnp.zeros((channels, *points.shape[:-1]), points.dtype)
+    for group, visible in zip(groups, visibility, strict=True):
+        total, _ = jax.lax.scan(add, total, (group.lights, visible))
+    return total
+
+
+def exit_transmission(points: SurfacePoints, f0: Float[Array, ""]) -> Float[Array, "*pixels"]:
+    """Compute the factor on diffuse light that leaves towards the eye, `(1 - rho(wo)) / (1 -
     rho_avg)`: on average 1.
     """
-    cosine = jnp.maximum(jnp.sum(points.normals * points.outgoing, axis=-1), 0)
+    cosine = _cosine(points.normals, points.outgoing)
     return diffuse_transmission(cosine, f0, points.specular, points.roughness)
 
 
 def reflected_radiance(
     points: SurfacePoints, groups: list[StackedLights], f0: Float[Array, ""], channels: int
-) -> Float[Array, "*pixels channels"]:
-    """Give the specular radiance towards the eye: Kelemen / Szirmay-Kalos, each light in its own
+) -> Float[Array, "channels *pixels"]:
+    """Compute the specular radiance towards the eye: Kelemen / Szirmay-Kalos, each light in its own
     shadow.
     """
 
-    def reflected(light, share):
-        wi, irradiance = light.incidence(points.positions)
-        lobe = specular_lobe(
+    def lobe(wi, _):
+        return specular_lobe(
             points.normals,
             wi,
             points.outgoing,
             f0=f0,
             specular=points.specular,
             roughness=points.roughness,
-        )
-        received = lobe * jnp.maximum(jnp.sum(wi * points.normals, axis=-1), 0)
-        received = received if share is None else received * share
-        return received[..., None] * irradiance
+        )[None]
 
-    dark = jnp.zeros((*points.positions.shape[:-1], channels), points.positions.dtype)
-    return sum_over_lights(groups, points.lit, reflected, dark)
+    return sum_received(points.positions, points.normals, groups, points.visibility, lobe, channels)
 
 
 def single_scattered_radiance(
@@ -121,21 +177,19 @@ def single_scattered_radiance(
     groups: list[StackedLights],
     f0: Float[Array, ""],
     single: SingleScattering,
-) -> Float[Array, "*pixels channels"]:
-    """Give the radiance of light that entered where it leaves and scattered once, each light in its
-    own shadow.
+) -> Float[Array, "channels *pixels"]:
+    """Compute the radiance of light that entered where it leaves and scattered once, each light in
+    its own shadow.
 
     What the specular lobe reflects does not enter. The surface counts as flat and evenly lit over a
     mean free path.
     """
-    towards_eye = jnp.maximum(jnp.sum(points.normals * points.outgoing, axis=-1), 0)
+    to_eye = _cosine(points.normals, points.outgoing)
 
-    def scattered(light, share):
-        wi, irradiance = light.incidence(points.positions)
-        cosine = jnp.maximum(jnp.sum(wi * points.normals, axis=-1), 0)
-        entered = cosine * (1 - directional_albedo(cosine, f0, points.specular, points.roughness))
-        entered = entered if share is None else entered * share
-        return single.reflected(cosine, towards_eye) * entered[..., None] * irradiance
+    def scattered(_, cosine):
+        enters = 1 - directional_albedo(cosine, f0, points.specular, points.roughness)
+        return jnp.moveaxis(single.reflected(cosine, to_eye), -1, 0) * enters[None]
 
-    dark = jnp.zeros((*points.positions.shape[:-1], single.channels), points.positions.dtype)
-    return sum_over_lights(groups, points.lit, scattered, dark)
+    return sum_received(
+        points.positions, points.normals, groups, points.visibility, scattered, single.channels
+    )

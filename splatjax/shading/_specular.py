@@ -25,7 +25,7 @@ _AT_ONCE = 1 << 14  # points whose polynomials are in memory
 
 
 def fresnel_f0(eta: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Give the reflectance at normal incidence, `((eta - 1) / (eta + 1))^2`.
+    """Compute the reflectance at normal incidence, `((eta - 1) / (eta + 1))^2`.
 
     **Arguments:**
 
@@ -38,9 +38,7 @@ def fresnel_f0(eta: Float[Array, "..."]) -> Float[Array, "..."]:
 
 
 def clamped_roughness(roughness: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Give the roughness that lobe and albedo both use: clamped to [0.05, 1], with gradient 0
-    outside.
-    """
+    """Clamp the roughness to [0.05, 1], for lobe and albedo alike, with gradient 0 outside."""
     return jnp.clip(roughness, *ROUGHNESS_RANGE)
 
 
@@ -53,7 +51,7 @@ def specular_lobe(
     specular: Float[Array, "..."],
     roughness: Float[Array, "..."],
 ) -> Float[Array, "*points"]:
-    r"""Give the reflectance of a rough interface, `f = specular PH F(H.V) / |wi + wo|^2`.
+    r"""Compute the reflectance of a rough interface, `f = specular PH F(H.V) / |wi + wo|^2`.
 
     With `a` the angle between the normal and the half vector, `PH = exp(-tan^2 a / m^2) / (pi m^2
     cos^4 a)`; the half vector `wi + wo` is not normalized in the quotient. `F` is Schlick's. The
@@ -134,7 +132,7 @@ def _lobe_quadrature(
 
 @functools.cache
 def _tables() -> tuple[np.ndarray, np.ndarray]:
-    """Give the Chebyshev coefficients of (a, b) over sqrt(mu) and log m, and those of their
+    """Compute the Chebyshev coefficients of (a, b) over sqrt(mu) and log m, and those of their
     averages over log m.
     """
     mu = ((1 + _nodes(_MU_NODES)) / 2) ** 2
@@ -190,7 +188,7 @@ def directional_albedo(
     specular: Float[Array, "..."],
     roughness: Float[Array, "..."],
 ) -> Float[Array, "..."]:
-    r"""Give the share of the light from one direction that the specular lobe reflects, `rho(mu)`.
+    r"""Compute the fraction of light from one direction that the specular lobe reflects, `rho(mu)`.
 
     `rho = specular (f0 a(mu, m) + (1 - f0) b(mu, m))`: Schlick's term splits the integral of
     `specular_lobe` over the hemisphere into two tables, computed once by quadrature and kept as
@@ -231,7 +229,8 @@ def directional_albedo(
 def average_albedo(
     f0: Float[Array, "..."], specular: Float[Array, "..."], roughness: Float[Array, "..."]
 ) -> Float[Array, "..."]:
-    r"""Give the share of uniform light that the specular lobe reflects, `2 int_0^1 rho(mu) mu dmu`.
+    r"""Compute the fraction of uniform light that the specular lobe reflects, `2 int_0^1 rho(mu) mu
+    dmu`.
 
     It is the exact integral of the series that `directional_albedo` evaluates, so that nothing is
     lost between the two.

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from splatjax._chunking import AT_ONCE, jit_unless_traced, map_chunks
 from splatjax._combination import AbstractCombination, extreme
 from splatjax._smooth import smooth_step
-from splatjax.scene import Splats
+from splatjax.scene import Splats, rotation_towards
 
 from ._grid import TILE_SIDE, TileGrid
 from ._kernel import coverage
@@ -78,14 +78,12 @@ def _rotation_towards(forward: Float[Array, "3"]) -> Float[Array, "3 3"]:
     """Build a rotation whose third row is `forward`; the other two are smooth in it wherever it is
     not along an axis' flip.
     """
-    helper = jnp.where(
+    up = jnp.where(
         jnp.abs(stop_gradient(forward[1])) < 0.9,
         jnp.asarray([0.0, 1.0, 0.0], forward.dtype),
         jnp.asarray([1.0, 0.0, 0.0], forward.dtype),
     )
-    right = jnp.cross(forward, helper)
-    right = right / jnp.linalg.norm(right)
-    return jnp.stack([right, jnp.cross(forward, right), forward])
+    return rotation_towards(forward, up)
 
 
 def distant_view(

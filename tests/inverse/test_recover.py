@@ -195,7 +195,7 @@ def half_resolved():
     )
     picture = sj.DiffusionBasis(
         light=light,
-        leaving=jnp.ones((2, points)),
+        pixel_radiance_per_exitance=jnp.ones((2, points)),
         pixels=jnp.arange(points),
         in_front=jnp.ones(points),
         specular=jnp.zeros((1, points, 2)),

@@ -107,6 +107,41 @@ def test_how_fine_the_splats_are_is_found_of_all(splats, size):
     assert fine == pytest.approx(np.quantile(np.asarray(areas, np.float64), FINEST), rel=1e-6)
 
 
+def without_area(splats, bare):
+    """The splats with areas of zero where `bare`, still seen."""
+    areas = jnp.where(jnp.asarray(bare), 0.0, splats.areas)
+    return eqx.tree_at(lambda cloud: cloud.areas, splats, areas)
+
+
+@pytest.mark.parametrize("begins_bare", [False, True])
+def test_splats_without_area_do_not_count(splats, begins_bare):
+    """They bring no light, in a part of their own or not: sizes are those of the other splats."""
+    index = np.arange(splats.count)
+    bare = index < 300 if begins_bare else index % 10 == 0
+    cloud, rest = without_area(splats, bare), jax.tree.map(lambda leaf: leaf[~bare], splats)
+    statistics, of_rest = (StreamStatistics.of(in_parts(s, 300)) for s in (cloud, rest))
+    assert statistics.spacing == pytest.approx(of_rest.spacing, rel=1e-5)
+    assert statistics.fine == pytest.approx(of_rest.fine, rel=1e-5)
+    assert 0 < statistics.unevenness < 1
+
+
+@pytest.mark.parametrize("are_all", [False, True])
+def test_the_first_part_or_all_may_have_no_area(splats, are_all):
+    """The picture is that of all at once, up to the clusters of the parts."""
+    cloud = without_area(splats, np.ones(splats.count, bool))
+    if not are_all:  # a part that is not seen, before the splats
+        hidden = jax.tree.map(lambda leaf: leaf[:300], cloud)
+        hidden = eqx.tree_at(lambda cloud: cloud.radii, hidden, jnp.zeros(300))
+        cloud = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), hidden, splats)
+    settings = sj.RenderSettings(shadows=SHADOWS)
+    whole = sj.render(sj.Scene(cloud, LIGHTS, MATERIAL), CAMERA, settings)
+    streamed = sj.render_streamed(in_parts(cloud, 300), LIGHTS, MATERIAL, CAMERA, settings)
+    assert float(whole.unresolved_fraction[-1]) == are_all
+    for ours, theirs in zip(streamed.layers, whole.layers, strict=True):
+        error = np.abs(ours - theirs)[np.asarray(whole.coverage) > 0] / np.max(theirs)
+        assert np.quantile(error, 0.99) < LAYERS
+
+
 def test_what_cannot_be_streamed_is_refused(splats):
     small, large = (jax.tree.map(lambda leaf, size=size: leaf[:size], splats) for size in (10, 20))
     plain, default = sj.RenderSettings(diffuser=DenseDiffuser()), sj.RenderSettings()
@@ -162,7 +197,7 @@ def test_it_is_the_picture_of_any_weights(planned):
     np.testing.assert_allclose(gathered.coverage, frame.coverage, rtol=1e-4, atol=1e-5)
     # The narrowest layer is resolved nowhere, the widest everywhere.
     _, resolved = gathered.light.weigh(gaussians_of(ONE), jnp.zeros(2))
-    seen = np.asarray(gathered.leaving[0]) > 0
+    seen = np.asarray(gathered.pixel_radiance_per_exitance[0]) > 0
     narrow, middle, wide = np.asarray(resolved)[:, seen].mean(axis=1)
     assert narrow < 1e-3 < middle <= wide
     np.testing.assert_allclose(wide, 1, rtol=1e-3)
