@@ -45,15 +45,15 @@ class LayerPlan(eqx.Module):
     **Attributes:**
 
     - `level`: of the clusters that are its sources; 0 for the splats themselves. Static.
-    - `support`: radius beyond which sources are left out, standard deviations. Static.
     - `smallest`, `largest`: variances, mm^2.
-    - `neighbors`: `None` for a layer that no splat of note resolves at any variance of the range.
+    - `truncated`, `neighbors`: the kernel, and what it reaches; `None` for a layer that no splat of
+      note resolves at any variance of the range.
     """
 
     level: int = eqx.field(static=True)
-    support: float = eqx.field(static=True)
     smallest: Float[Array, ""]
     largest: Float[Array, ""]
+    truncated: TruncatedGaussian | None
     neighbors: Neighbors | None
 
     def evaluate(
@@ -62,7 +62,6 @@ class LayerPlan(eqx.Module):
         points: Float[Array, "3 splats"],
         variance: Float[Array, ""],
         depth: Float[Array, ""],
-        kernel: AbstractDiffusionKernel,
         at: Int[Array, " points"] | None,
     ) -> tuple[LayerValues | None, Float[Array, ""]]:
         """Evaluate the layer at all splats, or at some of them.
@@ -77,14 +76,14 @@ class LayerPlan(eqx.Module):
         """
         smallest, largest = (each.astype(variance.dtype) for each in (self.smallest, self.largest))
         needed = jnp.maximum(smallest / variance, variance / largest) * (1 - 1e-6)
-        if self.neighbors is None:
+        if self.neighbors is None or self.truncated is None:
             return None, needed
         # Sink the sources, and sum over those near each block of points.
-        below, truncated = levels[self.level].lowered(depth), kernel.truncated(self.support)
-        table = layer_table(below, variance, depth, truncated)
+        below = levels[self.level].lowered(depth)
+        table = layer_table(below, variance, depth, self.truncated)
         blocks = (points * units_per_mm(variance)).reshape(3, -1, BLOCK).transpose(1, 0, 2)
         lists = self.neighbors.lists if at is None else self.neighbors.lists.only(at // BLOCK)
-        values = gaussian_sums(blocks, table, lists, truncated, divided)
+        values = gaussian_sums(blocks, table, lists, self.truncated, divided)
         if at is None:
             rows = values.transpose(1, 0, 2).reshape(values.shape[1], -1)
         else:
@@ -92,7 +91,7 @@ class LayerPlan(eqx.Module):
         reach = self.neighbors.needed(
             _target_boxes(points),
             source_boxes(below),
-            self.support * stop_gradient(jnp.sqrt(variance)),
+            stop_gradient(jnp.sqrt(2 * self.truncated.largest * variance)).astype(points.dtype),
         )
         # Slopes are moments in mm over v, and the moments are in units of sqrt(2 v).
         layer = split_layer(rows, 2 * units_per_mm(variance))
@@ -161,7 +160,8 @@ class ClusterDiffuser(AbstractDiffuser):
             list(jnp.asarray(bound, variances.dtype))
             for bound in (sizes / self.margin, sizes * self.margin)
         )
-        each = zip(levels, supports.tolist(), smallest, largest, neighbors, strict=True)
+        kernels = [kernel.truncated(support) if support else None for support in supports.tolist()]
+        each = zip(levels, smallest, largest, kernels, neighbors, strict=True)
         return ClusterPlan(tree, tuple(LayerPlan(*layer) for layer in each))
 
     def choose_sources(
@@ -229,7 +229,7 @@ class ClusterPlan(AbstractDiffusionPlan):
         points = sources.centers - origin
         depths = kernel.depths(variances)
         evaluated = [
-            layer.evaluate(levels, points, variance, depth, kernel, at)
+            layer.evaluate(levels, points, variance, depth, at)
             for layer, variance, depth in zip(self.layers, variances, depths, strict=True)
         ]
         needed = jnp.stack([jnp.zeros((), variances.dtype), *(need for _, need in evaluated)])

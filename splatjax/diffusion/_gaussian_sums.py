@@ -8,7 +8,6 @@ next row of its list. The unit of length is the standard deviation times the roo
 
 import functools
 from collections.abc import Callable
-from functools import partial
 
 import equinox as eqx
 import jax
@@ -107,7 +106,7 @@ def identity(
 
 
 class _Rule(eqx.Module):
-    """What all sweeps share. Static."""
+    """What all sweeps share."""
 
     kernel: TruncatedGaussian
     finish: Callable = eqx.field(static=True)
@@ -152,9 +151,9 @@ def _empty(rule: _Rule, points, table):
     return zeros_after(table.rows, values.shape, values.dtype)
 
 
-def _derivative(rule: _Rule, residuals, moved):
+def _derivative(residuals, moved):
     """Compute the derivative of the values along a direction."""
-    (lists, points, table, sums), (d_points, d_table) = residuals, moved
+    (rule, lists, points, table, sums), (d_points, d_table) = residuals, moved
 
     def sweep(lanes, out):
         here, d_here = lanes.read(points, FAR), lanes.read(d_points)
@@ -179,7 +178,7 @@ def _derivative(rule: _Rule, residuals, moved):
     return lists.sweep(sweep, _empty(rule, points, table))
 
 
-def _backward(rule: _Rule, residuals, cotangents):
+def _backward(residuals, cotangents):
     """Compute the transpose of `_derivative`.
 
     With `e = |x - p|^2` and `g = -dw / de * (rows_and_moments . cotangent)` for every pair of a
@@ -190,7 +189,7 @@ def _backward(rule: _Rule, residuals, cotangents):
     Both are moments of `g` over one side. Points and sources are counted from one of the sources,
     so that float32 does not cancel.
     """
-    lists, points, table, sums = residuals
+    rule, lists, points, table, sums = residuals
 
     def sweep(lanes, carry):
         d_points, d_table = carry
@@ -232,19 +231,18 @@ def _backward(rule: _Rule, residuals, cotangents):
     return lists.sweep(sweep, start)
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(0,))
+@jax.custom_jvp
 def _sums(rule: _Rule, lists: Lists, points, table):
     return _forward(rule, lists, points, table)
 
 
 @_sums.defjvp
-def _sums_jvp(rule: _Rule, primals, tangents):
-    _, points, _ = primals
-    sums = _forward(_Rule(rule.kernel, identity), *primals)
+def _sums_jvp(primals, tangents):
+    rule, _, points, _ = primals
+    sums = _forward(_Rule(rule.kernel, identity), *primals[1:])
     # Linear in the direction, with a transpose of its own: forward and reverse mode.
-    derivative, transpose = partial(_derivative, rule), partial(_backward, rule)
     given = (*primals, sums)
-    moved = jax.custom_derivatives.linear_call(derivative, transpose, given, tangents[1:])
+    moved = jax.custom_derivatives.linear_call(_derivative, _backward, given, tangents[2:])
     return rule.finished(sums, points), moved
 
 
@@ -263,7 +261,7 @@ def gaussian_sums(
 
     - `points`: `x`. Differentiable.
     - `table`: `p_j` and `rows_j`. Differentiable.
-    - `kernel`: stands for `exp`; terms beyond its rim vanish, whatever the lists hold. Static.
+    - `kernel`: stands for `exp`; terms beyond its rim vanish, whatever the lists hold.
     - `finish`: computes values from sums and points. Static.
 
     **Returns:** the values; 0 for blocks of points without a list.

@@ -3,7 +3,6 @@ the gathered light is divided, and which layers the splats are too far apart to 
 """
 
 import abc
-import functools
 import math
 
 import equinox as eqx
@@ -32,29 +31,43 @@ class TruncatedGaussian(eqx.Module):
 
     A step has no derivative that automatic differentiation sees; the fade has one. In float32 the
     exponential is the eighth power of a polynomial, within 4e-5 and at half the time, and its
-    derivative is that of the polynomial. Static.
+    derivative is that of the polynomial.
+
+    **Attributes:** not differentiated
+
+    - `largest`: exponent.
+    - `coefficients`: of the polynomial, highest power first.
     """
 
-    largest: float = eqx.field(static=True)
+    largest: Float[Array, ""]
+    coefficients: Float[Array, " powers"]
+
+    @classmethod
+    def up_to(cls, largest: float) -> "TruncatedGaussian":
+        """Fit the polynomial whose eighth power is `exp(-x)` up to `largest`."""
+        x = np.polynomial.chebyshev.chebpts1(64) * largest / 2 + largest / 2
+        # Weighted between an even error of the weight and an even relative error.
+        fit = np.polynomial.Polynomial.fit(x, np.exp(-x / 8), _ROOT_DEGREE, w=np.exp(-3 * x / 8))
+        return cls(jnp.asarray(largest, float), jnp.asarray(fit.convert().coef[::-1], float))
 
     def __call__(self, exponent: Float[Array, "..."]) -> tuple[Float[Array, "..."], ...]:
         """Compute the weight, and minus its derivative in the exponent."""
         gaussian, minus_slope = self._gaussian(exponent)
-        left = (self.largest - exponent) / _FADE
+        largest = self.largest.astype(exponent.dtype)
+        left = (largest - exponent) / _FADE
         fades = left < 1
         weight = jnp.where(fades, gaussian * left, gaussian)
         minus_slope = jnp.where(fades, minus_slope * left + gaussian / _FADE, minus_slope)
-        inside = exponent < self.largest
+        inside = exponent < largest
         return jnp.where(inside, weight, 0.0), jnp.where(inside, minus_slope, 0.0)
 
     def _gaussian(self, exponent: Float[Array, "..."]) -> tuple[Float[Array, "..."], ...]:
         if exponent.dtype != jnp.float32:
             gaussian = jnp.exp(-exponent)
             return gaussian, gaussian
-        coefficients = _root_coefficients(self.largest)
-        root = jnp.full_like(exponent, coefficients[0])
-        slope = jnp.zeros_like(exponent)
-        for coefficient in coefficients[1:]:
+        first, *others = self.coefficients.astype(exponent.dtype)
+        root, slope = jnp.full_like(exponent, first), jnp.zeros_like(exponent)
+        for coefficient in others:
             root, slope = root * exponent + coefficient, slope * exponent + root
         square = root * root
         fourth = square * square
@@ -64,16 +77,8 @@ class TruncatedGaussian(eqx.Module):
         """Integrate the weight from an exponent (below the fade) on: the kernel's integral over a
         plane, in units of that of the Gaussian.
         """
-        return jnp.exp(-exponent) - math.exp(-self.largest) * math.expm1(_FADE) / _FADE
-
-
-@functools.cache
-def _root_coefficients(largest: float) -> tuple[float, ...]:
-    """Fit the polynomial, highest power first, whose eighth power is `exp(-x)` up to `largest`."""
-    x = np.polynomial.chebyshev.chebpts1(64) * largest / 2 + largest / 2
-    # Weighted between an even error of the weight and an even relative error.
-    found = np.polynomial.Polynomial.fit(x, np.exp(-x / 8), _ROOT_DEGREE, w=np.exp(-3 * x / 8))
-    return tuple(float(each) for each in found.convert().coef[::-1])
+        beyond = jnp.exp(-self.largest.astype(exponent.dtype))
+        return jnp.exp(-exponent) - beyond * (math.expm1(_FADE) / _FADE)
 
 
 class AbstractDiffusionKernel(eqx.Module):
@@ -104,15 +109,13 @@ class AbstractDiffusionKernel(eqx.Module):
     def support(self, error: float, share: float) -> float:
         """Choose the radius, in standard deviations, beyond which half of `error` of a layer's
         power lies, when the diffusion integral is only a `share` of the layer.
-
-        In eighths, so that nearly equal plans are equal to the compiler.
         """
         truncated = max(0.5 * error / max(share, _LEAST_SHARE), _LEAST_TRUNCATED)
-        return round(8 * math.sqrt(2 * math.log(1 / min(truncated, _MOST_TRUNCATED)))) / 8
+        return math.sqrt(2 * math.log(1 / min(truncated, _MOST_TRUNCATED)))
 
     def truncated(self, support: float) -> TruncatedGaussian:
         """Build the kernel that is zero beyond `support` standard deviations."""
-        return TruncatedGaussian(0.5 * support * support)
+        return TruncatedGaussian.up_to(0.5 * support * support)
 
     def interval(self, unevenness: Float[Array, ""]) -> Float[Array, "2"]:
         """Compute between which standard deviations per spacing layers become resolved."""

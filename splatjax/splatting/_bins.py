@@ -31,7 +31,7 @@ class BinCapacity(eqx.Module):
     @classmethod
     def for_counts(cls, per_tile: Sequence[Int[Array, " tiles"]], grid: TileGrid) -> "BinCapacity":
         """Choose the capacity for each of these numbers of items per tile."""
-        pairs = blocks = chunks = 1
+        pairs, blocks, chunks, whole = 1, 1, 1, grid.padded_count // grid.lanes
         for tiles in per_tile:
             counts = np.asarray(tiles, np.int64)
             longest = np.sort(-(-counts // grid.slots))[::-1][:: grid.lanes]
@@ -40,7 +40,7 @@ class BinCapacity(eqx.Module):
         return cls(
             with_spare(pairs, _ROW),
             with_spare(blocks, 4),
-            min(with_spare(chunks, 4), grid.padded_count // grid.lanes),
+            min(max(with_spare(chunks, -(-grid.half // 4)), grid.half), whole),
         )
 
 

@@ -7,6 +7,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 TILE_SIDE = 8
 """Pixels along a tile."""
+_HALF = 128
 TILE_BITS = 22  # in a sort key of 32, for the number of a tile
 
 
@@ -42,6 +43,13 @@ class TileGrid(eqx.Module):
     def padded_count(self) -> int:
         """Tiles of the picture, and a few empty ones that fill the last chunk."""
         return -(-self.count // self.lanes) * self.lanes
+
+    @property
+    def half(self) -> int:
+        """Chunks of half of the picture, or of a picture of 1024 x 1024 pixels where it is larger:
+        capacities are planned in parts of it, so that many bodies share a program.
+        """
+        return min(-(-self.padded_count // (2 * self.lanes)), _HALF)
 
     def cut(self, picture: Float[Array, "rows height width"]) -> Float[Array, "tiles rows pixels"]:
         """Cut a picture into tiles; 0 beyond its edges."""

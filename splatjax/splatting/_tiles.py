@@ -59,7 +59,8 @@ class TileRasterizer(AbstractRasterizer):
     ) -> "TilePlan":
         """Make the plan for the demand of each part in each view, of so many splats at most."""
         grid = self.grid(view)
-        seen = with_spare(max(int(seen) for part in demands for seen, _ in part), _STEP)
+        step = max(_STEP, splats // 16)
+        seen = with_spare(max(int(seen) for part in demands for seen, _ in part), step)
         bins = BinCapacity.for_counts([tiles for part in demands for _, tiles in part], grid)
         front = bins.chunks * self.lanes
         if len(demands) > 1:
@@ -101,7 +102,8 @@ class TilePlan(AbstractRasterPlan):
             whole = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
             plan = self.rasterizer.make_plan([whole], views, settings)
         most = max(int(_tiles_behind(whole, view, settings, plan)) for view in views)
-        grain = math.lcm(self.rasterizer.lanes, len(parts))
+        step = -(-self.rasterizer.grid(views[0]).half // 8)
+        grain = math.lcm(self.rasterizer.lanes * step, len(parts))
         behind = -(-int(_SPARE * most + 1) // grain) * grain
         return dataclasses.replace(self, places=SurfaceCapacity(self.places.front, behind))
 

@@ -168,7 +168,7 @@ def test_gradients_are_those_of_the_plain_sum_over_the_sources_within_the_suppor
         found = []
         light = jnp.concatenate([sources.irradiance, jnp.ones((1, body.count))])
         for layer, variance in zip(plan.layers, variances, strict=True):
-            largest, depth = 0.5 * layer.support**2, KERNEL.depth * jnp.sqrt(variance)
+            largest, depth = layer.truncated.largest, KERNEL.depth * jnp.sqrt(variance)
             below = sources.centers - depth * sources.normals
             offset = below[:, None] - sources.centers[:, :, None]
             exponent = 0.5 * jnp.sum(offset * offset, axis=0) / variance

@@ -255,7 +255,8 @@ def roomy(plan: sj.Plan, shape: Shape) -> sj.Plan:
             return TilePlan(rasterizer, max(shape.splats, 1), BinCapacity(*room), places)
         if isinstance(part, LayerPlan):
             none, endless = jnp.zeros(()), jnp.full((), jnp.inf)
-            return LayerPlan(part.level, part.support, none, endless, far_reaching(part.neighbors))
+            neighbors = far_reaching(part.neighbors)
+            return LayerPlan(part.level, none, endless, part.truncated, neighbors)
         return part
 
     return jax.tree.map(widened, plan, is_leaf=lambda part: isinstance(part, TilePlan | LayerPlan))
