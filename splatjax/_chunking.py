@@ -104,17 +104,17 @@ def take_points(
     return jnp.stack(taken).reshape(*rows.shape[:-1], len(chosen))
 
 
-def rounded_up(count: int, step: int) -> int:
-    """Round up to the next of eight steps per octave, and to a multiple of `step`, so that nearby
-    counts need no other program.
+def rounded_up(count: int, step: int, per_octave: int = 8) -> int:
+    """Round up to the next of so many steps per octave, a power of 2, and to a multiple of `step`,
+    so that nearby counts need no other program.
     """
-    grain = max(1 << max(count.bit_length() - 4, 0), step)
+    grain = max(1 << max(count.bit_length() - per_octave.bit_length(), 0), step)
     return -(-count // grain) * grain
 
 
-def with_spare(count: int, step: int) -> int:
+def with_spare(count: int, step: int, per_octave: int = 8) -> int:
     """Plan the capacity for a count: 3% more and at least one more, rounded up."""
-    return rounded_up(int(count * 1.03) + 1, step)
+    return rounded_up(int(count * 1.03) + 1, step, per_octave)
 
 
 def needed_over_planned(needed: Int[Array, ""], planned: int) -> Float[Array, ""]:

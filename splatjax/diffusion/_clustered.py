@@ -60,6 +60,7 @@ class LayerPlan(eqx.Module):
         self,
         levels: Sequence[Sources],
         points: Float[Array, "3 splats"],
+        around: Boxes,
         variance: Float[Array, ""],
         depth: Float[Array, ""],
         at: Int[Array, " points"] | None,
@@ -69,7 +70,7 @@ class LayerPlan(eqx.Module):
         **Arguments:**
 
         - `levels`: the clusters of every level.
-        - `points`: the centers of the splats.
+        - `points`, `around`: the centers of the splats, and boxes around their blocks.
         - `depth`: how far below its splat a source lies, mm.
 
         **Returns:** the layer, and the capacity needed over planned.
@@ -89,7 +90,7 @@ class LayerPlan(eqx.Module):
         else:
             rows = _take_from_blocks(values, at)
         reach = self.neighbors.needed(
-            _target_boxes(points),
+            around,
             source_boxes(below),
             stop_gradient(jnp.sqrt(2 * self.truncated.largest * variance)).astype(points.dtype),
         )
@@ -227,9 +228,9 @@ class ClusterPlan(AbstractDiffusionPlan):
             centered = dataclasses.replace(everywhere, centers=everywhere.centers - origin)
             levels = self.tree.levels(centered)
         points = sources.centers - origin
-        depths = kernel.depths(variances)
+        depths, around = kernel.depths(variances), _target_boxes(points, sources.areas)
         evaluated = [
-            layer.evaluate(levels, points, variance, depth, at)
+            layer.evaluate(levels, points, around, variance, depth, at)
             for layer, variance, depth in zip(self.layers, variances, depths, strict=True)
         ]
         needed = jnp.stack([jnp.zeros((), variances.dtype), *(need for _, need in evaluated)])
@@ -285,8 +286,10 @@ def units_per_mm(variance: Float[Array, ""]) -> Float[Array, ""]:
     return jnp.sqrt(0.5 / variance)
 
 
-def _target_boxes(points: Float[Array, "3 points"]) -> Boxes:
-    return Boxes.around(points, jnp.ones(points.shape[1], bool), BLOCK)
+def _target_boxes(points: Float[Array, "3 points"], areas: Float[Array, " points"]) -> Boxes:
+    """Enclose the blocks of points; a block of splats without area is empty."""
+    exists = jnp.any((areas > 0).reshape(-1, BLOCK), axis=1)
+    return Boxes.around(points, jnp.repeat(exists, BLOCK), BLOCK)
 
 
 @eqx.filter_jit
@@ -308,7 +311,8 @@ def _enclose(
         source_boxes(clusters[level].lowered(depth))
         for level, depth in zip(levels, depths, strict=True)
     ]
-    return _target_boxes(centers), boxes, kernel.depths(variances * margin) - depths
+    targets = _target_boxes(centers, sources.areas)
+    return targets, boxes, kernel.depths(variances * margin) - depths
 
 
 @eqx.filter_jit

@@ -70,7 +70,7 @@ class ClusterTree(eqx.Module):
             of_slot[slots] = rank[parent]
             parents.append(jnp.asarray(of_slot))
             positions, facing, members = positions[order], facing[order], inside[order]
-            slots, before = np.arange(len(order)), with_spare(len(order), BLOCK)
+            slots, before = np.arange(len(order)), with_spare(len(order), BLOCK, per_octave=2)
             counts.append(before)
         return cls(tuple(parents), tuple(counts))
 

@@ -18,6 +18,7 @@ WIDTH = 16
 """Blocks of sources in a row of a list."""
 LANES = 128
 """Blocks of points that are swept together."""
+_ROWS = 7  # for every block of points: more than most bodies need, so that they share a program
 _AT_ONCE = 1 << 13  # pairs of boxes whose parts are tested together: they stay in cache
 _FAN = 4  # parts of a box of a coarser level
 
@@ -142,7 +143,8 @@ def find_neighbors(
     corners = (np.split(np.asarray(corner), parts) for corner in (points.low, points.high))
     found = [_list(low, high, sources, reach) for low, high in zip(*corners, strict=True)]
     # At least one row, the last, stays empty: lanes whose list has ended read it.
-    count = max(least, *(with_spare(len(ids), 1) for ids, *_ in found))
+    least = max(least, _ROWS * len(found[0][1]))
+    count = max(least, *(with_spare(len(ids), 1, per_octave=2) for ids, *_ in found))
     padded = [
         (np.pad(ids, ((0, count - len(ids)), (0, 0)), constant_values=len(sources.low)), *each)
         for ids, *each in found

@@ -19,7 +19,7 @@ from ._checks import in_one_dtype
 from ._devices import on_devices
 from ._lighting import LightAtSplats
 from ._passes import light_splats, see_and_shade
-from ._plan import Plan, RenderSettings, plan_unless_traced
+from ._plan import Plan, RenderSettings, filled_like, plan_unless_traced
 from ._shade import ShadedSurface, compose, layers_at_points
 
 Parameters = TypeVar("Parameters", bound=PyTree)
@@ -120,7 +120,7 @@ def picture_jacobian(
             "single scattering, which is differentiated at the splats alone; give "
             "lighting=LightAtSplats(), or a material without it"
         )
-    plan = plan_unless_traced(scene, camera, settings, plan)
+    scene, plan = filled_like(scene, plan_unless_traced(scene, camera, settings, plan))
     return _picture_jacobian(scene, camera, settings, plan)
 
 

@@ -1,5 +1,6 @@
 """How a picture is made, and what `jit`, `grad` and loops need to know of shapes, found once."""
 
+import dataclasses
 from collections.abc import Sequence
 from typing import TypeVar
 
@@ -13,6 +14,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from splatjax import diffusion as _diffusion, splatting as _splatting
+from splatjax._chunking import rounded_up
 from splatjax._combination import DeviceMesh, OneDevice
 from splatjax.scene import AbstractLight, Camera, Scene, Splats, StackedLights, stack_lights
 
@@ -114,10 +116,8 @@ def make_plan(
     (scene, *others), cameras = _on_one_device((scenes, cameras))
     scene, others, cameras = in_one_dtype(scene, others, cameras)
     views = [_splatting.PerspectiveView.of(camera) for camera in cameras]
-    splats = scene.splats
-    parts, order, exists = _cut_and_order(splats, mesh)
-    bounds = _splatting.Bounds.of(fill_up(splats, max(splats.count, 1)), OneDevice())
-    interval = settings.kernel.interval(_diffusion.unevenness(splats))
+    parts, order, exists = _cut_and_order(scene.splats, mesh)
+    bounds, interval = _measure(parts, settings.kernel)
     variances = scene.material.gaussians.variances
     raster = settings.rasterizer.make_plan(parts, views, settings.splatting)
     plan = Plan(
@@ -131,7 +131,7 @@ def make_plan(
         interval=interval,
         raster=raster.fitted(parts, views, settings.splatting),
         mesh=mesh,
-        splats=splats.count,
+        splats=scene.splats.count,
     )
     if mesh is None:
         return plan
@@ -157,12 +157,36 @@ def fill_up(splats: Splats, count: int) -> Splats:
     return arrange(splats, jnp.minimum(every, splats.count - 1), every < splats.count)
 
 
-def arrange(splats: Splats, order: Int[Array, " places"], exists: Bool[Array, " places"]) -> Splats:
+def filled_like(scene: Scene, plan: Plan) -> tuple[Scene, Plan]:
+    """Fill up the splats of a scene to the length of its plan, so that bodies of about as many
+    splats share a program; no entry of the plan's order stands for the filling. Scenes that are
+    traced, or cut over devices, stay as they are.
+    """
+    lacking = len(plan.order) - scene.splats.count
+    leaves = jax.tree.leaves(scene.splats)
+    if plan.mesh is not None or lacking <= 0 or any(isinstance(leaf, Tracer) for leaf in leaves):
+        return scene, plan
+
+    def fill(leaf):
+        zeros = np.zeros((lacking, *leaf.shape[1:]), leaf.dtype)
+        return jnp.asarray(np.concatenate([np.asarray(leaf), zeros]))  # compiles nothing
+
+    splats = jax.tree.map(fill, scene.splats)
+    scene = eqx.tree_at(lambda scene: scene.splats, scene, splats)
+    return scene, dataclasses.replace(plan, splats=len(plan.order))
+
+
+def arrange(
+    splats: Splats,
+    order: Int[Array, " places"] | Int[np.ndarray, " places"],
+    exists: Bool[Array, " places"] | Bool[np.ndarray, " places"],
+) -> Splats:
     """Put a device's splats in the order of a plan; repeated ones are invisible and dark."""
     placed = jax.tree.map(lambda leaf: leaf[order], splats)
 
     def masked(leaf):
-        return jnp.where(exists.reshape(-1, *[1] * (leaf.ndim - 1)), leaf, 0)
+        where = np.where if isinstance(leaf, np.ndarray) else jnp.where
+        return where(exists.reshape(-1, *[1] * (leaf.ndim - 1)), leaf, 0)
 
     return eqx.tree_at(
         lambda splats: (splats.normals, splats.radii, splats.areas), placed, replace_fn=masked
@@ -246,17 +270,24 @@ def _cut_and_order(splats: Splats, mesh: Mesh | None) -> tuple[list[Splats], Arr
     and which of their entries exist, device after device.
     """
     devices, share = splats_per_device(splats.count, mesh)
-    filling = (0, -share % _diffusion.BLOCK)
-    whole, parts, orders, exist = fill_up(splats, share * devices), [], [], []
+    filling = (0, rounded_up(share, _diffusion.BLOCK) - share)
+    whole = jax.tree.map(np.asarray, fill_up(splats, share * devices))
+    parts, orders, exist = [], [], []
     for i in range(devices):
         part = jax.tree.map(lambda leaf, i=i: leaf[i * share : (i + 1) * share], whole)
-        order = _diffusion.compact_order(np.asarray(part.centers))
-        exists = np.pad(i * share + order < splats.count, filling)
-        order = np.pad(order, filling, mode="edge")
-        orders.append(order.astype(np.int32))
-        exist.append(exists)
-        parts.append(arrange(part, jnp.asarray(orders[-1]), jnp.asarray(exists)))
+        order = _diffusion.compact_order(part.centers).astype(np.int32)
+        exist.append(np.pad(i * share + order < splats.count, filling))
+        orders.append(np.pad(order, filling, mode="edge"))
+        parts.append(jax.tree.map(jnp.asarray, arrange(part, orders[-1], exist[-1])))
     return parts, jnp.asarray(np.concatenate(orders)), jnp.asarray(np.concatenate(exist))
+
+
+@eqx.filter_jit
+def _measure(parts: Sequence[Splats], kernel: _diffusion.AbstractDiffusionKernel):
+    """Compute the bounds of the splats, and from which width they resolve a layer."""
+    splats = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
+    interval = kernel.interval(_diffusion.unevenness(splats))
+    return _splatting.Bounds.of(splats, OneDevice()), interval
 
 
 def _groups(lights: Sequence[tuple[AbstractLight, ...]]) -> list[list[StackedLights]]:

@@ -18,7 +18,14 @@ from ._checks import check_channels, in_one_dtype
 from ._devices import on_devices
 from ._lighting import Irradiance, LightAtSplats, cast_shadows, irradiance_at_splats
 from ._passes import SplatLight, diffuse_splats, light_splats, see_and_shade
-from ._plan import Plan, RenderSettings, check_plan, plan_unless_traced, splats_per_device
+from ._plan import (
+    Plan,
+    RenderSettings,
+    check_plan,
+    filled_like,
+    plan_unless_traced,
+    splats_per_device,
+)
 from ._shade import compose
 
 
@@ -50,7 +57,7 @@ def render(
     **Raises:** `ValueError` when a plan is needed and not given, or is for another mesh or another
     number of splats, or when the scene's channels disagree.
     """
-    plan = plan_unless_traced(scene, camera, settings, plan, mesh)
+    scene, plan = filled_like(scene, plan_unless_traced(scene, camera, settings, plan, mesh))
     return _render(scene, camera, settings, plan, light)
 
 
@@ -94,7 +101,7 @@ def illuminate(scene: Scene, plan: Plan, settings: RenderSettings = RenderSettin
     """
     check_channels(scene)
     check_plan(plan, scene)
-    return _illuminate(scene, plan, settings)
+    return _illuminate(*filled_like(scene, plan), settings)
 
 
 @eqx.filter_jit

@@ -38,8 +38,8 @@ class BinCapacity(eqx.Module):
             pairs, blocks = max(pairs, int(counts.sum())), max(blocks, int(longest.sum()))
             chunks = max(chunks, int((longest > 0).sum()))
         return cls(
-            with_spare(pairs, _ROW),
-            with_spare(blocks, 4),
+            with_spare(pairs, _ROW, per_octave=4),
+            with_spare(blocks, 4, per_octave=2),
             min(max(with_spare(chunks, -(-grid.half // 4)), grid.half), whole),
         )
 
