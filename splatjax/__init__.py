@@ -14,6 +14,7 @@ imported by their names.
 """
 
 from . import (
+    cache as cache,
     diffusion as diffusion,
     exports as exports,
     fitting as fitting,

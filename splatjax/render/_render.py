@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from splatjax._chunking import take_points
 from splatjax._combination import lay_out
+from splatjax.cache import kept_jit
 from splatjax.scene import Camera, Frame, Scene
 
 from ._checks import SAME, check_channels, in_one_dtype
@@ -53,7 +54,7 @@ def render(
     return _render(scene, camera, settings, plan, light)
 
 
-@eqx.filter_jit
+@kept_jit
 def _render(
     scene: Scene, camera: Camera, settings: RenderSettings, plan: Plan, light: SplatLight | None
 ) -> Frame:
@@ -91,7 +92,7 @@ def illuminate(scene: Scene, plan: Plan, settings: RenderSettings = RenderSettin
     return _illuminate(scene, plan, settings)
 
 
-@eqx.filter_jit
+@kept_jit
 def _illuminate(scene: Scene, plan: Plan, settings: RenderSettings) -> SplatLight:
     (scene,) = in_one_dtype(scene)
 
