@@ -15,6 +15,7 @@ import hashlib
 import os
 import pickle
 import platform
+import re
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -23,7 +24,6 @@ from typing import Any, TypeVar, cast
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import jaxlib
 import numpy as np
 from jax.core import Tracer
@@ -34,14 +34,16 @@ Function = TypeVar("Function", bound=Callable)
 
 _LARGEST = 1 << 30  # bytes in the folder, beyond which what was not used for longest is deleted
 _DIGEST = 32  # bytes
+_LEAST_TIME = "jax_persistent_cache_min_compile_time_secs"
 # JAX's settings, unless its environment variables decide otherwise.
 _SETTINGS = {
     # Planning runs many small programs, each compiled in a moment and together in seconds.
-    "jax_persistent_cache_min_compile_time_secs": 0.0,
+    _LEAST_TIME: 0.0,
     # XLA logs an error of 4,000 characters for each program that it takes from the cache and runs
     # (JAX issue 38445).
     "jax_logging_level": "CRITICAL",
 }
+_EFFECTLESS = re.compile("cache|log|platform")  # settings of JAX that no result depends on
 _folder: Path | None = None
 _programs: dict[str, Callable] = {}
 
@@ -60,17 +62,19 @@ def keep(folder: str | os.PathLike[str] | None = None) -> Path:
 
     **Arguments:**
 
-    - `folder`: made where it is missing. By default that of the command line, for each kind of
-      processor: `splatjax` in `XDG_CACHE_HOME`, or in `~/.cache`. It may be deleted at any time;
-      besides JAX's own files it takes 1 GB at most.
+    - `folder`: made where it is missing. By default that of the command line: `splatjax/jax` in
+      the absolute path `XDG_CACHE_HOME`, or in `~/.cache`. It may be deleted at any time; besides
+      JAX's own files it takes 1 GB at most.
 
-    **Returns:** the folder.
+    **Returns:** the folder in it for this kind of processor.
 
     **Raises:** `OSError` when it cannot be made; `PermissionError` when it belongs to another user,
     or others may write to it.
     """
     global _folder
-    whole = default_folder() if folder is None else Path(folder)
+    base = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    base = base if base.is_absolute() else Path.home() / ".cache"
+    whole = Path(folder or base / "splatjax" / "jax") / _processor()
     kept_folder = whole / "kept"
     kept_folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     if not _is_private(kept_folder):
@@ -85,21 +89,17 @@ def keep(folder: str | os.PathLike[str] | None = None) -> Path:
     return whole
 
 
-def default_folder() -> Path:
-    """Return the folder of the command line.
-
-    It is one for each kind of processor: home folders are shared by machines, and JAX keeps the
-    code of all under one name. A relative `XDG_CACHE_HOME` is ignored.
+def _processor() -> str:
+    """Return a name for the kind of processor: home folders are shared by machines, and JAX keeps
+    the code of all under one name.
     """
-    base = Path(os.environ.get("XDG_CACHE_HOME", ""))
-    base = base if base.is_absolute() else Path.home() / ".cache"
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:
         lines = []
     flags = [line for line in lines if line.startswith(("flags", "Features"))]
     digest = hashlib.sha256((flags or [platform.processor()])[0].encode()).hexdigest()[:12]
-    return base / "splatjax" / "jax" / f"{platform.machine()}-{digest}"
+    return f"{platform.machine()}-{digest}"
 
 
 def kept(function: Function) -> Function:
@@ -114,7 +114,7 @@ def kept(function: Function) -> Function:
         if result is None:
             result = jax.tree.map(np.asarray, function(*arguments, **named))
             _write(name, result)
-        return jax.tree.map(jnp.asarray, result)
+        return jax.device_put(result)  # compiles nothing, unlike jnp.asarray
 
     return cast("Function", called)
 
@@ -130,23 +130,24 @@ def kept_jit(function: Function) -> Function:
         name = _name(function, arguments, by_contents=False)
         if name is None:
             return compiled(*arguments)
+        leaves = jax.tree.leaves(arguments)
         if name not in _programs:
-            _programs[name] = _loaded(name, arguments) or _compiled(name, function, arguments)
-        return _programs[name](jax.tree.leaves(arguments))
+            with suppress(Exception):  # whatever is wrong with a file, it is made again
+                program = _loaded(_read(name), leaves)
+                result = jax.block_until_ready(program(leaves))
+                _programs[name] = program
+                return result
+            _programs[name] = _compiled(name, function, arguments)
+        return _programs[name](leaves)
 
     return cast("Function", called)
 
 
-def _loaded(name: str, arguments: Any) -> Callable | None:
-    leaves = jax.tree.leaves(arguments)
-    with suppress(Exception):  # whatever is wrong with a file, it is made again
-        program, result = _read(name)
-        given = jax.tree.structure(((leaves,), {}))
-        devices = list(leaves[0].devices())
-        return deserialize_and_load(
-            program, given, jax.tree.structure(result), devices[0].client, devices
-        )
-    return None
+def _loaded(content: tuple[bytes, Any], leaves: list[jax.Array]) -> Callable:
+    program, result = content
+    structures = jax.tree.structure(((leaves,), {})), jax.tree.structure(result)
+    devices = list(leaves[0].devices())
+    return deserialize_and_load(program, *structures, devices[0].client, devices)
 
 
 def _compiled(name: str, function: Callable, arguments: Any) -> Callable:
@@ -156,7 +157,13 @@ def _compiled(name: str, function: Callable, arguments: Any) -> Callable:
     def of_leaves(leaves):
         return function(*jax.tree.unflatten(structure, leaves))
 
-    program = jax.jit(of_leaves).lower(leaves).compile()
+    before = jax.config.jax_persistent_cache_min_compile_time_secs  # ty: ignore[missing-attribute]
+    try:
+        # Not in JAX's cache as well: what is taken from there and kept once more lacks kernels.
+        jax.config.update(_LEAST_TIME, float("inf"))
+        program = jax.jit(of_leaves).lower(leaves).compile()
+    finally:
+        jax.config.update(_LEAST_TIME, before)
     with suppress(Exception):  # not every program can be kept
         content, _, returned = serialize(program)
         _write(name, (content, jax.tree.unflatten(returned, range(returned.num_leaves))))
@@ -196,7 +203,7 @@ def _name(function: Callable, arguments: Any, *, by_contents: bool) -> str | Non
         numbers,
         [(array.aval, contents.get(id(array))) for array in arrays],
         [(device, device.device_kind, device.client.platform_version) for device in devices],
-        sorted(jax.config.values.items()),
+        sorted(item for item in jax.config.values.items() if not _EFFECTLESS.search(item[0])),
         os.environ.get("XLA_FLAGS"),
         [module.__version__ for module in (jax, jaxlib, np, eqx)],
         platform.python_version(),

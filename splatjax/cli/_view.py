@@ -133,7 +133,7 @@ class ViewOptions:
         azimuth: always on the same side of it.
         """
         # The first light gives a white diffuser that faces it the radiance 1.
-        irradiance = jnp.full(material.gaussians.weights.shape[1], jnp.pi)
+        irradiance = np.full(material.gaussians.weights.shape[1], np.pi)
         towards = -direction_to(light_azimuth, self.light_elevation)
         light = sj.DirectionalLight(direction=towards, irradiance=irradiance)
         if self.fill == 0:
@@ -149,7 +149,8 @@ class ViewOptions:
         """Place a camera at an azimuth so that the bounding sphere of the splats, which come in
         parts, just fits the narrower side of the picture.
         """
-        boxes = [(np.min(part.centers, axis=0), np.max(part.centers, axis=0)) for part in parts()]
+        bodies = (np.asarray(part.centers) for part in parts())
+        boxes = [(np.min(body, axis=0), np.max(body, axis=0)) for body in bodies]
         low, high = np.min([box[0] for box in boxes], axis=0), np.max([b[1] for b in boxes], axis=0)
         middle = (low + high) / 2
         reaches = [
