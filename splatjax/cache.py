@@ -2,24 +2,27 @@
 the bust, plans, and compiled pictures.
 
     import splatjax as sj
+
     sj.cache.keep()
 
-Nothing is kept before this call. An entry is used again only where everything that it depends on is
-the same: its inputs, the source of splatjax, the versions of JAX and others, JAX's settings, and
-the processor. Entries are pickled: the folder must belong to the user, and nobody else may write to
-it. What is damaged or foreign there is ignored and replaced.
+Nothing is kept before this call. A file is used again only where everything that it depends on is
+the same: inputs, the source of splatjax, the versions of JAX and others, JAX's settings, and the
+processor. Files are pickled: the folder must belong to the user, and nobody else may write to it.
+What is damaged or foreign there is ignored and replaced.
 """
 
 import functools
 import hashlib
+import itertools
 import os
 import pickle
 import platform
 import re
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
+from types import FunctionType
 from typing import Any, TypeVar, cast
 
 import equinox as eqx
@@ -33,7 +36,7 @@ from jax.tree_util import PyTreeDef
 Function = TypeVar("Function", bound=Callable)
 
 _LARGEST = 1 << 30  # bytes in the folder, beyond which what was not used for longest is deleted
-_DIGEST = 32  # bytes
+_EFFECTLESS = re.compile("cache|log|platform")  # settings of JAX that no result depends on
 _LEAST_TIME = "jax_persistent_cache_min_compile_time_secs"
 # JAX's settings, unless its environment variables decide otherwise.
 _SETTINGS = {
@@ -43,22 +46,21 @@ _SETTINGS = {
     # (JAX issue 38445).
     "jax_logging_level": "CRITICAL",
 }
-_EFFECTLESS = re.compile("cache|log|platform")  # settings of JAX that no result depends on
 _folder: Path | None = None
 _programs: dict[str, Callable] = {}
 
 
 def keep(folder: str | os.PathLike[str] | None = None) -> Path:
-    r"""Keep what takes long at the start of a program, and take it from there where it is.
+    r"""Keep what takes long at the start of a program, and take it from there at the next start.
 
-    `splatjax.bust`, `splatjax.make_plan`, `splatjax.illuminate` and `splatjax.render` on one
-    device, called outside `jit` and `grad`, are then quick from the second start on. What JAX
-    compiles itself, gradients among it, is kept in its compilation cache in the same folder. To be
-    called once, before anything is computed.
+    `splatjax.bust`, `splatjax.make_plan`, `splatjax.illuminate` and `splatjax.render`, called
+    outside `jit`, `grad` and `vmap` on one device, are then quick from the second start on. What
+    JAX compiles for other programs, gradients among them, is kept by its own compilation cache in
+    the same folder. To be called once, before anything is computed.
 
-    It sets `jax_compilation_cache_dir`, unless it is set, `jax_persistent_cache_min_compile_time`
-    and `jax_logging_level`, unless environment variables set them. `JAX_ENABLE_COMPILATION_CACHE=0`
-    keeps nothing.
+    It sets `jax_compilation_cache_dir` where nothing has set it, and
+    `jax_persistent_cache_min_compile_time_secs` and `jax_logging_level` where no environment
+    variable does. With `JAX_ENABLE_COMPILATION_CACHE=0`, nothing is kept.
 
     **Arguments:**
 
@@ -74,7 +76,7 @@ def keep(folder: str | os.PathLike[str] | None = None) -> Path:
     global _folder
     base = Path(os.environ.get("XDG_CACHE_HOME", ""))
     base = base if base.is_absolute() else Path.home() / ".cache"
-    whole = Path(folder or base / "splatjax" / "jax") / _processor()
+    whole = Path(folder or base / "splatjax" / "jax").absolute() / _processor()
     kept_folder = whole / "kept"
     kept_folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     if not _is_private(kept_folder):
@@ -84,50 +86,36 @@ def keep(folder: str | os.PathLike[str] | None = None) -> Path:
     for name, value in _SETTINGS.items():
         if name.upper() not in os.environ:
             jax.config.update(name, value)
-    _source()  # now: files may change while the program runs
+    _source()  # now, since files may change while the program runs
     _folder = kept_folder
     return whole
 
 
-def _processor() -> str:
-    """Return a name for the kind of processor: home folders are shared by machines, and JAX keeps
-    the code of all under one name.
-    """
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
-    except OSError:
-        lines = []
-    flags = [line for line in lines if line.startswith(("flags", "Features"))]
-    digest = hashlib.sha256((flags or [platform.processor()])[0].encode()).hexdigest()[:12]
-    return f"{platform.machine()}-{digest}"
-
-
 def kept(function: Function) -> Function:
-    """Let `keep` keep the results of a function of arrays and numbers, by all that they hold."""
+    """Let `keep` keep the results of a function of arrays and numbers, by the values of these."""
 
     @functools.wraps(function)
     def called(*arguments, **named):
-        name = _name(function, (arguments, named), by_contents=True)
+        name = _name(function, (arguments, named), by_values=True)
         if name is None:
             return function(*arguments, **named)
         result = _read(name)
         if result is None:
-            result = jax.tree.map(np.asarray, function(*arguments, **named))
-            _write(name, result)
+            result = _write(name, jax.tree.map(np.asarray, function(*arguments, **named)))
         return jax.device_put(result)  # compiles nothing, unlike jnp.asarray
 
     return cast("Function", called)
 
 
 def kept_jit(function: Function) -> Function:
-    """Compile a function, as `eqx.filter_jit` does, and let `keep` keep its programs; they are
-    found by the structure and shapes of the arguments, without tracing.
+    """Compile a function of arrays, as `eqx.filter_jit` does, and let `keep` keep its programs, by
+    the structure and the shapes of the arguments, so that nothing is traced.
     """
     compiled = eqx.filter_jit(function)
 
     @functools.wraps(function)
     def called(*arguments):
-        name = _name(function, arguments, by_contents=False)
+        name = _name(function, arguments, by_values=False)
         if name is None:
             return compiled(*arguments)
         leaves = jax.tree.leaves(arguments)
@@ -150,83 +138,85 @@ def _loaded(content: tuple[bytes, Any], leaves: list[jax.Array]) -> Callable:
     return deserialize_and_load(program, *structures, devices[0].client, devices)
 
 
-def _compiled(name: str, function: Callable, arguments: Any) -> Callable:
+def _compiled(name: str, function: Callable, arguments: tuple) -> Callable:
     leaves, structure = jax.tree.flatten(arguments)
 
-    # A list of arrays: JAX cannot make records of what it puts into the arguments of what it loads.
+    # Of a list of arrays: a program that is loaded cannot make records of its arguments.
     def of_leaves(leaves):
         return function(*jax.tree.unflatten(structure, leaves))
 
-    before = jax.config.jax_persistent_cache_min_compile_time_secs  # ty: ignore[missing-attribute]
+    before = jax.config.values[_LEAST_TIME]
+    # Not in JAX's cache as well: what is taken from there and serialized again lacks kernels.
+    jax.config.update(_LEAST_TIME, float("inf"))
     try:
-        # Not in JAX's cache as well: what is taken from there and kept once more lacks kernels.
-        jax.config.update(_LEAST_TIME, float("inf"))
         program = jax.jit(of_leaves).lower(leaves).compile()
     finally:
         jax.config.update(_LEAST_TIME, before)
-    with suppress(Exception):  # not every program can be kept
+    with suppress(Exception):  # not every program can be serialized
         content, _, returned = serialize(program)
         _write(name, (content, jax.tree.unflatten(returned, range(returned.num_leaves))))
     return program
 
 
-def _name(function: Callable, arguments: Any, *, by_contents: bool) -> str | None:
-    """Return the name of the file for what a function makes of its arguments; `None` for what is
-    not kept: nothing before `keep`; nothing under `jit`, `grad` or `vmap`, on several devices, or
-    that code outside splatjax has a part in.
+def _name(function: Callable, arguments: Any, *, by_values: bool) -> str | None:
+    """Return the name of the file for a function and its arguments. `None` where nothing is kept:
+    before `keep`, while JAX traces, on several devices, and where code from outside splatjax has a
+    part in it.
     """
-    if _folder is None or not jax.config.jax_enable_compilation_cache:  # ty: ignore[missing-attribute]
-        return None
     leaves, structure = jax.tree.flatten(arguments)
     arrays = [leaf for leaf in leaves if isinstance(leaf, jax.Array)]
-    if any(isinstance(array, Tracer) for array in arrays):
-        return None
-    devices = {device for array in arrays for device in array.devices()}
-    kinds = [f"{kind.__module__}.{kind.__qualname__}" for kind in _kinds(structure)]
-    numbers = [leaf for leaf in leaves if type(leaf) in (bool, int, float)]
-    is_own = all(kind.startswith(("builtins.", "splatjax.")) for kind in kinds)
-    # Objects and functions among the static fields show their address, or nothing of their code.
+    numbers = [leaf for leaf in leaves if by_values and type(leaf) in (bool, int, float)]
     if (
-        len(devices) > 1
-        or not is_own
-        or "<" in str(structure)
+        _folder is None
+        or not jax.config.jax_enable_compilation_cache  # ty: ignore[missing-attribute]
         or len(arrays) + len(numbers) < len(leaves)
-        or (numbers and not by_contents)
+        or any(isinstance(array, Tracer) for array in arrays)
+        or len(devices := {device for array in arrays for device in array.devices()}) > 1
+        or not all(kind.startswith(("builtins.", "splatjax.")) for kind in _kinds(structure))
+        or "<" in str(structure)  # a static function or object, which its text does not describe
     ):
         return None
-    unique = {id(array): array for array in arrays if by_contents}
-    contents = {key: hashlib.blake2b(np.asarray(unique[key]).tobytes()).digest() for key in unique}
+    name = cast("FunctionType", function).__name__
+    different = {id(array): array for array in arrays if by_values}
+    values = {key: _digest(np.asarray(array).tobytes()) for key, array in different.items()}
     depends_on = (
-        f"{function.__module__}.{function.__qualname__}",
-        kinds,
-        structure,
-        numbers,
-        [(array.aval, contents.get(id(array))) for array in arrays],
+        f"{function.__module__}.{name}",
+        (structure, _kinds(structure), numbers),
+        [(array.aval, values.get(id(array))) for array in arrays],
         [(device, device.device_kind, device.client.platform_version) for device in devices],
         sorted(item for item in jax.config.values.items() if not _EFFECTLESS.search(item[0])),
-        os.environ.get("XLA_FLAGS"),
-        [module.__version__ for module in (jax, jaxlib, np, eqx)],
-        platform.python_version(),
-        _source(),
+        (os.environ.get("XLA_FLAGS"), platform.python_version(), _processor(), _source()),
+        [module.__version__ for module in (jax, jaxlib, eqx, np)],
     )
-    return f"{function.__name__.strip('_')}-{hashlib.sha256(repr(depends_on).encode()).hexdigest()}"
+    return f"{name.strip('_')}-{_digest(repr(depends_on).encode()).hex()}"
 
 
-def _kinds(structure: PyTreeDef) -> Iterator[type]:
-    """Iterate over the classes of the nodes of a tree."""
-    data = structure.node_data()
-    if data is not None:
-        yield data[0]
-        for child in structure.children():
-            yield from _kinds(child)
+def _kinds(structure: PyTreeDef) -> list[str]:
+    """Return the classes of the nodes of a tree."""
+    node = structure.node_data()
+    below = itertools.chain(*map(_kinds, structure.children()))
+    return [] if node is None else [f"{node[0].__module__}.{node[0].__qualname__}", *below]
 
 
 @functools.cache
-def _source() -> str:
-    digest = hashlib.sha256()
-    for path in sorted(Path(__file__).parent.rglob("*.py")):
-        digest.update(path.read_bytes())
-    return digest.hexdigest()
+def _processor() -> str:
+    """Return a name for the kind of processor: home folders are shared by machines, and JAX keeps
+    the code of all under one name.
+    """
+    path = Path("/proc/cpuinfo")
+    text = path.read_text(encoding="utf-8", errors="replace") if path.exists() else ""
+    flags = re.search("^(flags|Features).*", text, re.MULTILINE)
+    digest = hashlib.sha256((flags[0] if flags else platform.processor()).encode()).hexdigest()
+    return f"{platform.machine()}-{digest[:12]}"
+
+
+@functools.cache
+def _source() -> bytes:
+    return _digest(*(path.read_bytes() for path in sorted(Path(__file__).parent.rglob("*.py"))))
+
+
+def _digest(*contents: bytes) -> bytes:
+    return hashlib.sha256(b"".join(contents)).digest()
 
 
 def _is_private(path: Path) -> bool:
@@ -236,39 +226,32 @@ def _is_private(path: Path) -> bool:
 
 
 def _read(name: str) -> Any:
-    """Read what `_write` wrote under a name; `None` where there is no such file, or a damaged one,
-    or one of another name.
-    """
+    """Read what `_write` wrote under this name, `None` where nothing sound is there."""
     path = cast("Path", _folder) / name
     with suppress(Exception):
-        if _is_private(path):
-            content = path.read_bytes()
-            if content[:_DIGEST] == _digest(name, content[_DIGEST:]):
-                os.utime(path)
-                return pickle.loads(content[_DIGEST:])
+        digest, packed = (content := path.read_bytes())[:32], content[32:]
+        if _is_private(path) and digest == _digest(name.encode(), packed):
+            os.utime(path)
+            return pickle.loads(packed)
     return None
 
 
-def _write(name: str, content: Any) -> None:
-    """Write a file, whole or not at all; delete what was not used for longest."""
+def _write(name: str, content: Any) -> Any:
+    """Write a file, whole or not at all; delete what was not used for longest; return what was
+    written.
+    """
     folder = cast("Path", _folder)
-    with suppress(Exception):  # without it, it is made again at the next start
+    with suppress(Exception):  # what cannot be kept is made again at the next start
         packed = pickle.dumps(content)
         if len(packed) > _LARGEST // 4:
-            return
-        handle, temporary = tempfile.mkstemp(dir=folder)
-        try:
-            with open(handle, "wb") as file:
-                file.write(_digest(name, packed) + packed)
-            os.replace(temporary, folder / name)
-        finally:
-            Path(temporary).unlink(missing_ok=True)
+            return content
+        with suppress(FileNotFoundError), tempfile.NamedTemporaryFile(dir=folder) as file:
+            file.write(_digest(name.encode(), packed) + packed)
+            file.flush()
+            os.replace(file.name, folder / name)  # so that closing it finds no file
         total = 0
         for path in sorted(folder.iterdir(), key=lambda path: path.stat().st_mtime, reverse=True):
             total += path.stat().st_size
             if total > _LARGEST:
                 path.unlink(missing_ok=True)
-
-
-def _digest(name: str, packed: bytes) -> bytes:
-    return hashlib.blake2b(name.encode() + packed, digest_size=_DIGEST).digest()
+    return content
