@@ -13,22 +13,19 @@ What is damaged or foreign there is ignored and replaced.
 
 import functools
 import hashlib
-import itertools
 import os
 import pickle
 import platform
 import re
 import tempfile
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
-from types import FunctionType
 from typing import Any, TypeVar, cast
 
 import equinox as eqx
 import jax
 import jaxlib
-import numpy as np
 from jax.core import Tracer
 from jax.experimental.serialize_executable import deserialize_and_load, serialize
 from jax.tree_util import PyTreeDef
@@ -47,7 +44,7 @@ _SETTINGS = {
     "jax_logging_level": "CRITICAL",
 }
 _folder: Path | None = None
-_programs: dict[str, Callable] = {}
+_programs: dict[Path, Callable] = {}
 
 
 def keep(folder: str | os.PathLike[str] | None = None) -> Path:
@@ -96,12 +93,12 @@ def kept(function: Function) -> Function:
 
     @functools.wraps(function)
     def called(*arguments, **named):
-        name = _name(function, (arguments, named), by_values=True)
-        if name is None:
+        path = _path(function, (arguments, named), by_values=True)
+        if path is None:
             return function(*arguments, **named)
-        result = _read(name)
+        result = _read(path)
         if result is None:
-            result = _write(name, jax.tree.map(np.asarray, function(*arguments, **named)))
+            result = _write(path, jax.device_get(function(*arguments, **named)))
         return jax.device_put(result)  # compiles nothing, unlike jnp.asarray
 
     return cast("Function", called)
@@ -115,51 +112,43 @@ def kept_jit(function: Function) -> Function:
 
     @functools.wraps(function)
     def called(*arguments):
-        name = _name(function, arguments, by_values=False)
-        if name is None:
+        path = _path(function, arguments, by_values=False)
+        if path is None:
             return compiled(*arguments)
         leaves = jax.tree.leaves(arguments)
-        if name not in _programs:
+        if path not in _programs:
             with suppress(Exception):  # whatever is wrong with a file, it is made again
-                program = _loaded(_read(name), leaves)
+                content, returned = _read(path)
+                structures = jax.tree.structure(((leaves,), {})), jax.tree.structure(returned)
+                devices = list(leaves[0].devices())
+                program = deserialize_and_load(content, *structures, devices[0].client, devices)
                 result = jax.block_until_ready(program(leaves))
-                _programs[name] = program
+                _programs[path] = program
                 return result
-            _programs[name] = _compiled(name, function, arguments)
-        return _programs[name](leaves)
+            _programs[path] = _compiled(path, function, arguments)
+        return _programs[path](leaves)
 
     return cast("Function", called)
 
 
-def _loaded(content: tuple[bytes, Any], leaves: list[jax.Array]) -> Callable:
-    program, result = content
-    structures = jax.tree.structure(((leaves,), {})), jax.tree.structure(result)
-    devices = list(leaves[0].devices())
-    return deserialize_and_load(program, *structures, devices[0].client, devices)
-
-
-def _compiled(name: str, function: Callable, arguments: tuple) -> Callable:
+def _compiled(path: Path, function: Callable, arguments: tuple) -> Callable:
     leaves, structure = jax.tree.flatten(arguments)
 
     # Of a list of arrays: a program that is loaded cannot make records of its arguments.
-    def of_leaves(leaves):
-        return function(*jax.tree.unflatten(structure, leaves))
-
-    before = jax.config.values[_LEAST_TIME]
-    # Not in JAX's cache as well: what is taken from there and serialized again lacks kernels.
-    jax.config.update(_LEAST_TIME, float("inf"))
-    try:
-        program = jax.jit(of_leaves).lower(leaves).compile()
-    finally:
-        jax.config.update(_LEAST_TIME, before)
+    of_leaves = jax.jit(lambda leaves: function(*jax.tree.unflatten(structure, leaves)))
+    with ExitStack() as stack:
+        # Not in JAX's cache as well: what is taken from there and serialized again lacks kernels.
+        stack.callback(jax.config.update, _LEAST_TIME, jax.config.values[_LEAST_TIME])
+        jax.config.update(_LEAST_TIME, float("inf"))
+        program = of_leaves.lower(leaves).compile()
     with suppress(Exception):  # not every program can be serialized
         content, _, returned = serialize(program)
-        _write(name, (content, jax.tree.unflatten(returned, range(returned.num_leaves))))
+        _write(path, (content, jax.tree.unflatten(returned, range(returned.num_leaves))))
     return program
 
 
-def _name(function: Callable, arguments: Any, *, by_values: bool) -> str | None:
-    """Return the name of the file for a function and its arguments. `None` where nothing is kept:
+def _path(function: Any, arguments: Any, *, by_values: bool) -> Path | None:
+    """Return the path of the file for a function and its arguments. `None` where nothing is kept:
     before `keep`, while JAX traces, on several devices, and where code from outside splatjax has a
     part in it.
     """
@@ -176,26 +165,25 @@ def _name(function: Callable, arguments: Any, *, by_values: bool) -> str | None:
         or "<" in str(structure)  # a static function or object, which its text does not describe
     ):
         return None
-    name = cast("FunctionType", function).__name__
     different = {id(array): array for array in arrays if by_values}
-    values = {key: _digest(np.asarray(array).tobytes()) for key, array in different.items()}
+    values = {key: _digest(jax.device_get(array).tobytes()) for key, array in different.items()}
     depends_on = (
-        f"{function.__module__}.{name}",
+        f"{function.__module__}.{function.__name__}",
         (structure, _kinds(structure), numbers),
         [(array.aval, values.get(id(array))) for array in arrays],
         [(device, device.device_kind, device.client.platform_version) for device in devices],
         sorted(item for item in jax.config.values.items() if not _EFFECTLESS.search(item[0])),
         (os.environ.get("XLA_FLAGS"), platform.python_version(), _processor(), _source()),
-        [module.__version__ for module in (jax, jaxlib, eqx, np)],
+        [module.__version__ for module in (jax, jaxlib, eqx)],
     )
-    return f"{name.strip('_')}-{_digest(repr(depends_on).encode()).hex()}"
+    return _folder / f"{function.__name__}-{_digest(repr(depends_on).encode()).hex()}".strip("_")
 
 
 def _kinds(structure: PyTreeDef) -> list[str]:
     """Return the classes of the nodes of a tree."""
     node = structure.node_data()
-    below = itertools.chain(*map(_kinds, structure.children()))
-    return [] if node is None else [f"{node[0].__module__}.{node[0].__qualname__}", *below]
+    own = [] if node is None else [f"{node[0].__module__}.{node[0].__qualname__}"]
+    return own + [kind for child in structure.children() for kind in _kinds(child)]
 
 
 @functools.cache
@@ -225,33 +213,31 @@ def _is_private(path: Path) -> bool:
     return hasattr(os, "getuid") and status.st_uid == os.getuid() and not status.st_mode & 0o022
 
 
-def _read(name: str) -> Any:
-    """Read what `_write` wrote under this name, `None` where nothing sound is there."""
-    path = cast("Path", _folder) / name
+def _read(path: Path) -> Any:
+    """Read what `_write` wrote to this path, `None` where nothing sound is there."""
     with suppress(Exception):
-        digest, packed = (content := path.read_bytes())[:32], content[32:]
-        if _is_private(path) and digest == _digest(name.encode(), packed):
+        content = path.read_bytes()
+        if _is_private(path) and content[:32] == _digest(path.name.encode(), content[32:]):
             os.utime(path)
-            return pickle.loads(packed)
+            return pickle.loads(content[32:])
     return None
 
 
-def _write(name: str, content: Any) -> Any:
-    """Write a file, whole or not at all; delete what was not used for longest; return what was
-    written.
+def _write(path: Path, content: Any) -> Any:
+    """Write a file, whole or not at all; delete what was not used for longest; return the
+    content.
     """
-    folder = cast("Path", _folder)
     with suppress(Exception):  # what cannot be kept is made again at the next start
         packed = pickle.dumps(content)
         if len(packed) > _LARGEST // 4:
             return content
-        with suppress(FileNotFoundError), tempfile.NamedTemporaryFile(dir=folder) as file:
-            file.write(_digest(name.encode(), packed) + packed)
+        with suppress(FileNotFoundError), tempfile.NamedTemporaryFile(dir=path.parent) as file:
+            file.write(_digest(path.name.encode(), packed) + packed)
             file.flush()
-            os.replace(file.name, folder / name)  # so that closing it finds no file
+            os.replace(file.name, path)  # so that there is nothing to delete in the end
         total = 0
-        for path in sorted(folder.iterdir(), key=lambda path: path.stat().st_mtime, reverse=True):
-            total += path.stat().st_size
+        for each in sorted(path.parent.iterdir(), key=lambda each: -each.stat().st_mtime):
+            total += each.stat().st_size
             if total > _LARGEST:
-                path.unlink(missing_ok=True)
+                each.unlink(missing_ok=True)
     return content

@@ -101,13 +101,11 @@ class ViewOptions:
 
     def load(self) -> tuple[sj.Splats, sj.Material]:
         """Return the splats, and the material with which they are rendered."""
-        if self.splats is None:
-            with stage(f"making the bust with {self.count} splats"):
-                splats = sj.bust(self.count)
-        else:
-            with stage(f"reading {self.splats}"):
-                splats = sj.read_splats(self.splats, up=self.up)
-        splats = self.adjusted(splats)
+        with stage(
+            f"reading {self.splats}" if self.splats else f"making the bust with {self.count} splats"
+        ):
+            whole = sj.read_splats(self.splats, up=self.up) if self.splats else sj.bust(self.count)
+        splats = self.adjusted(whole)
         return splats, self.material_for(splats)
 
     def material_for(self, splats: sj.Splats) -> sj.Material:
@@ -136,14 +134,12 @@ class ViewOptions:
         irradiance = np.full(material.gaussians.weights.shape[1], np.pi)
         towards = -direction_to(light_azimuth, self.light_elevation)
         light = sj.DirectionalLight(direction=towards, irradiance=irradiance)
-        if self.fill == 0:
-            return (light,)
         side = math.copysign(_FILL_SIDE, math.remainder(self.azimuth - self.light_azimuth, 360))
         towards = -direction_to(azimuth + side, _FILL_ELEVATION)
         fill = sj.DirectionalLight(
             direction=towards, irradiance=self.fill * irradiance, cast_shadows=False
         )
-        return light, fill
+        return (light, fill) if self.fill else (light,)
 
     def camera(self, parts: sj.scene.Parts, azimuth: float) -> sj.Camera:
         """Place a camera at an azimuth so that the bounding sphere of the splats, which come in
@@ -208,8 +204,9 @@ def draw(
     """
     frame = jax.block_until_ready(sj.render(scene, camera, plan=plan, light=light))
     if not frame.overflow <= 0:
-        needed = float(frame.overflow)
-        raise ValueError(f"the plan's capacity is exceeded: {needed:.2f} times of it is needed")
+        raise ValueError(
+            f"the plan's capacity is exceeded: {float(frame.overflow):.2f} times of it is needed"
+        )
     return frame
 
 
@@ -218,10 +215,14 @@ def in_color(material: sj.Material) -> sj.Material:
     weights = material.gaussians.weights
     if weights.shape[1] != 1:
         return material
-    single = jax.tree.map(lambda x: jnp.broadcast_to(x, 3), material.single_scattering)
     weights = jnp.broadcast_to(weights, (len(weights), 3))
-    gaussians = sj.SumOfGaussians(material.gaussians.variances, weights)
-    return replace(material, gaussians=gaussians, single_scattering=single)
+    return replace(
+        material,
+        gaussians=sj.SumOfGaussians(material.gaussians.variances, weights),
+        single_scattering=jax.tree.map(
+            lambda x: jnp.broadcast_to(x, 3), material.single_scattering
+        ),
+    )
 
 
 def direction_to(azimuth: float, elevation: float) -> np.ndarray:
