@@ -24,6 +24,7 @@ def total(values):
 
 
 keep(sys.argv[1])
-if sys.argv[2:] == ["killed"]:
+killed = sys.argv[2:] == ["killed"]
+if killed:
     os.replace = lambda *_: os.kill(os.getpid(), signal.SIGKILL)
-print(total(squares(1000))["sum"])
+print(total(squares(1001 if killed else 1000))["sum"])  # another file, which is surely missing

@@ -214,19 +214,22 @@ def test_nothing_is_kept_of_code_of_the_user_or_while_jax_traces(
 
 
 def test_what_was_not_used_for_longest_is_deleted(folder, squares, monkeypatch):
-    squares(jnp.zeros(1000))
-    squares(jnp.ones(1000))
-    old, used = sorted(folder.iterdir(), key=lambda path: path.stat().st_mtime_ns)
+    def values(start, kilobytes=10):
+        return jnp.arange(start, start + kilobytes * 1000, dtype=jnp.uint8)
+
+    squares(values(0))
+    (used,) = folder.iterdir()
+    squares(values(1))
+    (old,) = set(folder.iterdir()) - {used}
     for path, age in ((used, 300), (old, 200)):
         os.utime(path, (0, time.time() - age))
-    squares(jnp.ones(1000))
-    monkeypatch.setattr(cache, "_LARGEST", 20_000)
-    squares(jnp.zeros(5000))  # larger than a quarter of the limit
+    squares(values(0))
+    monkeypatch.setattr(cache, "_LARGEST", 44_000)
+    squares(values(2, 12))  # more than a quarter
     assert set(folder.iterdir()) == {old, used}
-    squares(jnp.zeros(900))
-    monkeypatch.setattr(cache, "_LARGEST", 10_000)
-    squares(jnp.zeros(500))
-    assert len(list(folder.iterdir())) == 2
+    squares(values(3)), squares(values(4)), squares(values(5))
+    assert len(list(folder.iterdir())) == 4
+    assert used.exists()
     assert not old.exists()
 
 
