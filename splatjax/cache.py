@@ -67,8 +67,8 @@ def keep(folder: str | os.PathLike[str] | None = None) -> Path:
 
     **Returns:** the folder in it for this kind of processor.
 
-    **Raises:** `OSError` when it cannot be made; `PermissionError` when it belongs to another user,
-    or others may write to it.
+    **Raises:** `OSError` when it cannot be made; `PermissionError` when `kept` in it belongs to
+    another user, or others may write to it: then JAX's cache alone is used.
     """
     global _folder
     base = Path(os.environ.get("XDG_CACHE_HOME", ""))
@@ -76,13 +76,13 @@ def keep(folder: str | os.PathLike[str] | None = None) -> Path:
     whole = Path(folder or base / "splatjax" / "jax").absolute() / _processor()
     kept_folder = whole / "kept"
     kept_folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    if not _is_private(kept_folder):
-        raise PermissionError(f"{kept_folder}: others may write to it; delete it")
     if jax.config.jax_compilation_cache_dir is None:  # ty: ignore[missing-attribute]
         jax.config.update("jax_compilation_cache_dir", str(whole))
     for name, value in _SETTINGS.items():
         if name.upper() not in os.environ:
             jax.config.update(name, value)
+    if not _is_private(kept_folder):  # or the system does not show whose it is
+        raise PermissionError(f"{kept_folder}: others than you may write to it; delete it")
     _source()  # now, since files may change while the program runs
     _folder = kept_folder
     return whole

@@ -233,10 +233,16 @@ def test_what_was_not_used_for_longest_is_deleted(folder, squares, monkeypatch):
     assert not old.exists()
 
 
-def test_a_folder_that_others_may_write_to_is_not_used(folder, tmp_path, squares, made):
+def test_a_folder_that_others_may_write_to_is_not_used(
+    folder, tmp_path, squares, made, monkeypatch
+):
+    monkeypatch.setattr(cache, "_folder", None)
     folder.chmod(0o777)
-    with pytest.raises(PermissionError, match="kept: others may write to it"):
+    with pytest.raises(PermissionError, match="kept: others than you may write to it"):
         cache.keep(tmp_path)
+    squares(jnp.ones(3)), squares(jnp.ones(3))
+    assert made == ["squares", "squares"]
+    assert list(folder.iterdir()) == []
 
 
 def test_the_default_is_the_cache_folder_of_the_user(tmp_path, monkeypatch):
