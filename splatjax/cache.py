@@ -71,6 +71,9 @@ def keep(folder: str | os.PathLike[str] | None = None) -> Path:
     another user, or others may write to it: then JAX's cache alone is used.
     """
     global _folder
+    for name, value in _SETTINGS.items():
+        if name.upper() not in os.environ:
+            jax.config.update(name, value)
     base = Path(os.environ.get("XDG_CACHE_HOME", ""))
     base = base if base.is_absolute() else Path.home() / ".cache"
     whole = Path(folder or base / "splatjax" / "jax").absolute() / _processor()
@@ -78,9 +81,6 @@ def keep(folder: str | os.PathLike[str] | None = None) -> Path:
     kept_folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     if jax.config.jax_compilation_cache_dir is None:  # ty: ignore[missing-attribute]
         jax.config.update("jax_compilation_cache_dir", str(whole))
-    for name, value in _SETTINGS.items():
-        if name.upper() not in os.environ:
-            jax.config.update(name, value)
     if not _is_private(kept_folder):  # or the system does not show whose it is
         raise PermissionError(f"{kept_folder}: others than you may write to it; delete it")
     _source()  # now, since files may change while the program runs
