@@ -8,12 +8,14 @@ throughout. What most programs need has a name here; the rest is in submodules:
 - `inverse`: materials and scenes from pictures.
 - `scene`, `geometry`: records and bodies; `io`: files; `exports`: fits for other renderers.
 - `splatting`, `diffusion`, `shading`: the passes, and their settings.
+- `cache`: what a program keeps for its next start.
 
 `splatjax.baselines` (methods to compare with) and `splatjax.plots` (which needs matplotlib) are
 imported by their names.
 """
 
 from . import (
+    cache as cache,
     diffusion as diffusion,
     exports as exports,
     fitting as fitting,

@@ -44,6 +44,7 @@ PACKAGES = (
     "baselines",
     "exports",
     "io",
+    "cache",
     "plots",
 )
 _LINK = re.compile(r"(\]\()([^)#\s]+)(#[^)\s]*)?(\))")

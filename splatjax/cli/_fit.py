@@ -191,11 +191,10 @@ class Fit:
             )
             if jax.block_until_ready(fitted).result != optx.RESULTS.successful:
                 number = counted(len(fitted.gaussians.variances), "Gaussian")
-                is_walked = self.model == "monte-carlo"
+                more = f"more --photons than {self.photons}, or "
                 raise ValueError(
                     f"{self.medium}: the search for {number} did not settle; give "
-                    f"{f'more --photons than {self.photons}, or ' if is_walked else ''}a smaller "
-                    "--count"
+                    f"{more if self.model == 'monte-carlo' else ''}a smaller --count"
                 )
         return fitted
 
@@ -208,28 +207,27 @@ class Fit:
     ) -> None:
         known = None if isinstance(coefficients, sj.scattering.Tabulated) else coefficients
         held = "" if known is None else ", sum held to the total reflectance"
-        settings = {
-            **({} if target.description is None else {"profile": target.description}),
-            "variances_of": "all channels",
-            "weights_of": f"non-negative{held}",
-            "error": fitted.error,
-            "energy_error": fitted.energy_error,
-        }
         surface, source = {}, {}
         if known is not None:
             # The index of a surface is that of the medium it bounds, unless the file gives it.
             top = known if isinstance(known, sj.Dipole) else known.top
             surface, source = sj.io.surface_and_source(self.medium)
             surface = {"eta": top.medium.eta[0]} | surface
-        target_of = "profile" if known is None else "coefficients"
-        fitted_by = f"fitted by splatjax {sj.__version__} to the {target_of} of {self.medium}"
+        target_of = f"{'profile' if known is None else 'coefficients'} of {self.medium}"
+        fitted_by = f"fitted by splatjax {sj.__version__} to the {target_of}"
         provenance = "; ".join(filter(None, [source.get("provenance"), fitted_by]))
         sj.save_material(
             sj.Material(fitted.gaussians, **surface, single_scattering=target.single),
             output,
             profile=target.profile if target.description is None else known,
             source=source | {"provenance": provenance},
-            fit=settings,
+            fit={
+                **({} if target.description is None else {"profile": target.description}),
+                "variances_of": "all channels",
+                "weights_of": f"non-negative{held}",
+                "error": fitted.error,
+                "energy_error": fitted.energy_error,
+            },
         )
 
 
@@ -237,11 +235,15 @@ def _print(fitted: sj.fitting.FitResult) -> None:
     gaussians = fitted.gaussians
     names = ", ".join(channel_names(gaussians.weights.shape[1]))
     pairs = zip(gaussians.variances, gaussians.weights, strict=True)
-    rows = [(f"{float(variance):.6g}", _numbers(weights, ".5f")) for variance, weights in pairs]
-    sums = ("sum", _numbers(gaussians.total_reflectance(), ".5f"))
-    error = ("error (Eq. 4)", _numbers(fitted.error, ".2e"))
-    energy = ("energy error", _numbers(fitted.energy_error, ".2e"))
-    print_table([("variance, mm^2", f"weights ({names})"), *rows, sums, error, energy])
+    print_table(
+        [
+            ("variance, mm^2", f"weights ({names})"),
+            *((f"{float(variance):.6g}", _numbers(row, ".5f")) for variance, row in pairs),
+            ("sum", _numbers(gaussians.total_reflectance(), ".5f")),
+            ("error (Eq. 4)", _numbers(fitted.error, ".2e")),
+            ("energy error", _numbers(fitted.energy_error, ".2e")),
+        ]
+    )
 
 
 def _numbers(values: jax.Array, form: str) -> str:
@@ -260,23 +262,26 @@ def fit_all(media: Path, output: Path, count: int) -> None:
     **Raises:** `ValueError` where the folder holds fits of something else.
     """
     names, coefficients = read_media(media)
-    record = {
-        "media": fingerprint(media),
-        "--count": count,
-        "splatjax": sj.__version__,
-        "jax": jax.__version__,
-    }
     path, begins = output.with_name(f"{output.name}.parts"), range(0, len(names), _BATCH)
     parts = [path / f"from_{begin:08}.csv" for begin in begins]
 
     def fit(i: int) -> None:
         batch = slice(begins[i], begins[i] + _BATCH)
-        columns = _fit_batch(coefficients[batch], count)
-        write_columns(parts[i], {"name": names[batch]} | columns)
+        write_columns(parts[i], {"name": names[batch]} | _fit_batch(coefficients[batch], count))
 
-    what = f"fitting {count} Gaussians to {len(names)} media, {_BATCH} at a time"
-    items = [(part,) for part in parts]
-    done = complete(path / "fits.json", record, items, lambda: fit, name="batches", what=what)
+    done = complete(
+        path / "fits.json",
+        {
+            "media": fingerprint(media),
+            "--count": count,
+            "splatjax": sj.__version__,
+            "jax": jax.__version__,
+        },
+        [(part,) for part in parts],
+        lambda: fit,
+        name="batches",
+        what=f"fitting {count} Gaussians to {len(names)} media, {_BATCH} at a time",
+    )
     if len(done) < len(parts):
         return
     try:
@@ -314,10 +319,10 @@ def _fit_batch(coefficients: np.ndarray, count: int) -> dict[str, np.ndarray]:
     given = len(coefficients)
     padded = np.pad(coefficients, ((0, _BATCH - given), (0, 0)), mode="edge")
     fitted, converged = _fit_each(jnp.asarray(padded), sj.io.dipole_starts(), count)
-    columns = dict(zip(("sigma_a", "sigma_s_prime", "eta"), padded.T, strict=True))
-    columns |= {f"variance_{i + 1}": fitted.gaussians.variances[:, i] for i in range(count)}
-    columns |= {f"weight_{i + 1}": fitted.gaussians.weights[:, i, 0] for i in range(count)}
-    columns |= {
+    columns = {
+        **dict(zip(("sigma_a", "sigma_s_prime", "eta"), padded.T, strict=True)),
+        **{f"variance_{i + 1}": fitted.gaussians.variances[:, i] for i in range(count)},
+        **{f"weight_{i + 1}": fitted.gaussians.weights[:, i, 0] for i in range(count)},
         "error": fitted.error[:, 0],
         "energy_error": fitted.energy_error[:, 0],
         "converged": converged.astype(float),

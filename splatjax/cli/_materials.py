@@ -74,11 +74,16 @@ def _row(name: str) -> tuple[str, ...]:
     except ValueError:
         known = "Gaussians"
     reflectance = "  ".join(f"{float(total):.3f}" for total in material.total_reflectance())
-    widest = float(material.gaussians.variances.max()) ** 0.5
     authors, year = re.findall(r"^(.+?) (\d{4})", source["citation"])[0]
     first, *others = re.split(r", | and ", authors)
-    publication = f"{first}{' et al.' if others else ''} {year}"
-    return name, known, reflectance, f"{widest:.3g}", f"{float(material.eta):.3g}", publication
+    return (
+        name,
+        known,
+        reflectance,
+        f"{float(material.gaussians.variances.max()) ** 0.5:.3g}",
+        f"{float(material.eta):.3g}",
+        f"{first}{' et al.' if others else ''} {year}",
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,14 +135,16 @@ class Sample:
 
     def run(self) -> None:
         check_output(self.output, (".ply",))
-        placed = ("mesh", "count", "output")
-        options = {name: value for name, value in vars(self).items() if name not in placed}
+        options = {key: vars(self)[key] for key in vars(self).keys() - {"mesh", "count", "output"}}
         with stage(f"sampling {self.mesh} with {self.count} splats"):
             splats = sj.sample_mesh(self.mesh, self.count, **options)
         with stage(f"writing {self.output}"):
             sj.write_splats(self.output, splats)
-        maps = ("albedo", "specular", "roughness")
-        carried = [name for name in maps if getattr(splats, name) is not None]
+        carried = [
+            name
+            for name in ("albedo", "specular", "roughness")
+            if getattr(splats, name) is not None
+        ]
         size = np.ptp(np.asarray(splats.centers), axis=0)
         note(
             f"{splats.count} splats on {float(splats.areas.sum()):.4g} mm^2, with "

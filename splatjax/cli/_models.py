@@ -67,9 +67,11 @@ def reference(
     beam = sj.scattering.PhotonBeam(coefficients.medium)
     if not single_scattering:
         return Reference(beam, _BEYOND)
-    single = sj.SingleScattering(coefficients.medium)
-    description = "photon beam, without single scattering"
-    return Reference(beam.multiply_scattered(), single=single, description=description)
+    return Reference(
+        beam.multiply_scattered(),
+        single=sj.SingleScattering(coefficients.medium),
+        description="photon beam, without single scattering",
+    )
 
 
 def _walked(

@@ -93,9 +93,8 @@ class Recover:
     def run(self) -> None:
         check_output(self.output, (".toml",))
         check_output(self.report, FIGURES)
-        in_range = self.eta is None or 1 <= self.eta <= _LARGEST_ETA
-        expected = f"lie between 1 and {_LARGEST_ETA:g}: marble has 1.5, skin 1.4"
-        check_options(self, {"eta": (in_range, expected)})
+        must = f"lie between 1 and {_LARGEST_ETA:g}: marble has 1.5, skin 1.4"
+        check_options(self, {"eta": (self.eta is None or 1 <= self.eta <= _LARGEST_ETA, must)})
         if not self.start:
             raise ValueError("--start names no material; give one or more (`splatjax materials`)")
         for name in self.start:
@@ -111,10 +110,14 @@ class Recover:
         search = self.output.with_suffix(".search.json")
         materials = map(sj.io.material_path, self.start)
         files = [self.splats, *sj.io.picture_paths(self.pictures), *materials]
-        names = ("model", "count", "robust", "eta", "specular", "roughness")
         dependencies = {
             "files": [sj.io.fingerprint(file) for file in files],
-            **{name: getattr(self, name) for name in names},
+            "model": self.model,
+            "count": self.count,
+            "robust": self.robust,
+            "eta": self.eta,
+            "specular": self.specular,
+            "roughness": self.roughness,
             "splatjax": sj.__version__,
         }
         starts = self._starts(search, dependencies, observations[0].picture.shape[2])

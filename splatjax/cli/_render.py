@@ -124,14 +124,18 @@ class Turntable(ViewOptions):
 
     def run(self) -> None:
         in_webp = f"be {_LARGEST} at most in turntable.webp"
-        turns = self.degrees != 0 and math.isfinite(self.degrees)
-        most = f"lie between 1 and {_MOST_FRAMES}"
         self.check(
             {
-                "frames": (1 <= self.frames <= _MOST_FRAMES, most),
+                "frames": (
+                    1 <= self.frames <= _MOST_FRAMES,
+                    f"lie between 1 and {_MOST_FRAMES}",
+                ),
                 "width": (1 <= self.width <= _LARGEST, in_webp),
                 "height": (1 <= self.height <= _LARGEST, in_webp),
-                "degrees": (turns, "be a finite number other than 0"),
+                "degrees": (
+                    self.degrees != 0 and math.isfinite(self.degrees),
+                    "be a finite number other than 0",
+                ),
                 "fps": (0.1 <= self.fps <= 60, "lie between 0.1 and 60"),
             }
         )
@@ -139,18 +143,23 @@ class Turntable(ViewOptions):
             raise ValueError(f"{self.output}: is a file; give the name of a folder")
         check_folder(self.output)
         material = sj.io.fingerprint(sj.io.material_path(self.material))
-        record = self.manifest() | {"contents of --material": material}
         names = [self.output / f"frame_{i:04}" for i in range(self.frames)]
         paths = [(name.with_suffix(".exr"), name.with_suffix(".png")) for name in names]
-        what = f"rendering {self.frames} frames at {self.width} x {self.height}"
-        record_path, prepare = self.output / "turntable.json", lambda: self._prepare(paths)
-        done = complete(record_path, record, paths, prepare, name="frames", what=what)
+        done = complete(
+            self.output / "turntable.json",
+            self.manifest() | {"contents of --material": material},
+            paths,
+            lambda: self._prepare(paths),
+            name="frames",
+            what=f"rendering {self.frames} frames at {self.width} x {self.height}",
+        )
         written = [path for i in done for path in paths[i]]
         if len(done) == self.frames:
             written.append(self.output / "turntable.webp")
             with stage(f"writing {written[-1]}"):
-                pictures = [picture for _, picture in paths]
-                sj.io.write_animation(written[-1], pictures, frames_per_second=self.fps)
+                sj.io.write_animation(
+                    written[-1], [picture for _, picture in paths], frames_per_second=self.fps
+                )
         print(*written, sep="\n")
 
     def azimuths(self, frame: int) -> tuple[float, float]:

@@ -101,13 +101,11 @@ class ViewOptions:
 
     def load(self) -> tuple[sj.Splats, sj.Material]:
         """Return the splats, and the material with which they are rendered."""
-        if self.splats is None:
-            with stage(f"making the bust with {self.count} splats"):
-                splats = sj.bust(self.count)
-        else:
-            with stage(f"reading {self.splats}"):
-                splats = sj.read_splats(self.splats, up=self.up)
-        splats = self.adjusted(splats)
+        with stage(
+            f"reading {self.splats}" if self.splats else f"making the bust with {self.count} splats"
+        ):
+            whole = sj.read_splats(self.splats, up=self.up) if self.splats else sj.bust(self.count)
+        splats = self.adjusted(whole)
         return splats, self.material_for(splats)
 
     def material_for(self, splats: sj.Splats) -> sj.Material:
@@ -133,23 +131,22 @@ class ViewOptions:
         azimuth: always on the same side of it.
         """
         # The first light gives a white diffuser that faces it the radiance 1.
-        irradiance = jnp.full(material.gaussians.weights.shape[1], jnp.pi)
+        irradiance = np.full(material.gaussians.weights.shape[1], np.pi)
         towards = -direction_to(light_azimuth, self.light_elevation)
         light = sj.DirectionalLight(direction=towards, irradiance=irradiance)
-        if self.fill == 0:
-            return (light,)
         side = math.copysign(_FILL_SIDE, math.remainder(self.azimuth - self.light_azimuth, 360))
         towards = -direction_to(azimuth + side, _FILL_ELEVATION)
         fill = sj.DirectionalLight(
             direction=towards, irradiance=self.fill * irradiance, cast_shadows=False
         )
-        return light, fill
+        return (light, fill) if self.fill else (light,)
 
     def camera(self, parts: sj.scene.Parts, azimuth: float) -> sj.Camera:
         """Place a camera at an azimuth so that the bounding sphere of the splats, which come in
         parts, just fits the narrower side of the picture.
         """
-        boxes = [(np.min(part.centers, axis=0), np.max(part.centers, axis=0)) for part in parts()]
+        bodies = (np.asarray(part.centers) for part in parts())
+        boxes = [(np.min(body, axis=0), np.max(body, axis=0)) for body in bodies]
         low, high = np.min([box[0] for box in boxes], axis=0), np.max([b[1] for b in boxes], axis=0)
         middle = (low + high) / 2
         reaches = [
@@ -207,8 +204,9 @@ def draw(
     """
     frame = jax.block_until_ready(sj.render(scene, camera, plan=plan, light=light))
     if not frame.overflow <= 0:
-        needed = float(frame.overflow)
-        raise ValueError(f"the plan's capacity is exceeded: {needed:.2f} times of it is needed")
+        raise ValueError(
+            f"the plan's capacity is exceeded: {float(frame.overflow):.2f} times of it is needed"
+        )
     return frame
 
 
@@ -217,10 +215,14 @@ def in_color(material: sj.Material) -> sj.Material:
     weights = material.gaussians.weights
     if weights.shape[1] != 1:
         return material
-    single = jax.tree.map(lambda x: jnp.broadcast_to(x, 3), material.single_scattering)
     weights = jnp.broadcast_to(weights, (len(weights), 3))
-    gaussians = sj.SumOfGaussians(material.gaussians.variances, weights)
-    return replace(material, gaussians=gaussians, single_scattering=single)
+    return replace(
+        material,
+        gaussians=sj.SumOfGaussians(material.gaussians.variances, weights),
+        single_scattering=jax.tree.map(
+            lambda x: jnp.broadcast_to(x, 3), material.single_scattering
+        ),
+    )
 
 
 def direction_to(azimuth: float, elevation: float) -> np.ndarray:

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from splatjax._smooth import smooth_step
+from splatjax.cache import kept
 from splatjax.scene import Splats
 
 from ._distances import Part, above, bump, carve, ellipsoid, join, keep, limb, model
@@ -180,6 +181,7 @@ def bust_mesh(*, spacing: float = 1.4) -> Mesh:
     return Mesh(mesh.vertices, mesh.faces, mesh.normals, np.stack([u, v], axis=-1))
 
 
+@kept
 def bust(count: int = 200_000, *, seed: int = 0) -> Splats:
     r"""Make the bust as splats, in the colors of skin.
 

@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from splatjax import diffusion as _diffusion, splatting as _splatting
 from splatjax._chunking import rounded_up
 from splatjax._combination import DeviceMesh, OneDevice
+from splatjax.cache import kept
 from splatjax.scene import AbstractLight, Camera, Scene, Splats, StackedLights, stack_lights
 
 from ._checks import check_scene, in_one_dtype
@@ -87,6 +88,7 @@ class Plan(eqx.Module):
         )
 
 
+@kept
 def make_plan(
     scenes: Scene | Sequence[Scene],
     cameras: Camera | Sequence[Camera],

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from splatjax._chunking import take_points
 from splatjax._combination import lay_out
+from splatjax.cache import kept_jit
 from splatjax.scene import Camera, Frame, Scene
 from splatjax.splatting import Bounds
 
@@ -61,7 +62,7 @@ def render(
     return _render(scene, camera, settings, plan, light)
 
 
-@eqx.filter_jit
+@kept_jit
 def _render(
     scene: Scene, camera: Camera, settings: RenderSettings, plan: Plan, light: SplatLight | None
 ) -> Frame:
@@ -104,7 +105,7 @@ def illuminate(scene: Scene, plan: Plan, settings: RenderSettings = RenderSettin
     return _illuminate(*filled_like(scene, plan), settings)
 
 
-@eqx.filter_jit
+@kept_jit
 def _illuminate(scene: Scene, plan: Plan, settings: RenderSettings) -> SplatLight:
     (scene,) = in_one_dtype(scene)
 

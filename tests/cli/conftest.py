@@ -25,6 +25,7 @@ def own_cache(tmp_path_factory):
     before = {name: getattr(jax.config, name) for name in SETTINGS}
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        patch.setattr(sj.cache, "_folder", None)
         yield
     for name, value in before.items():
         jax.config.update(name, value)

@@ -1,0 +1,243 @@
+"""What takes long at the start of a program, kept for the next start in a folder of the user's own:
+the bust, plans, and compiled pictures.
+
+    import splatjax as sj
+
+    sj.cache.keep()
+
+Nothing is kept before this call. A file is used again only where everything that it depends on is
+the same: inputs, the source of splatjax, the versions of JAX and others, JAX's settings, and the
+processor. Files are pickled: the folder must belong to the user, and nobody else may write to it.
+What is damaged or foreign there is ignored and replaced.
+"""
+
+import functools
+import hashlib
+import os
+import pickle
+import platform
+import re
+import tempfile
+from collections.abc import Callable
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+import equinox as eqx
+import jax
+import jaxlib
+from jax.core import Tracer
+from jax.experimental.serialize_executable import deserialize_and_load, serialize
+from jax.tree_util import PyTreeDef
+
+Function = TypeVar("Function", bound=Callable)
+
+_LARGEST = 1 << 30  # bytes in the folder, beyond which what was not used for longest is deleted
+_EFFECTLESS = re.compile("cache|log|platform")  # settings of JAX that no result depends on
+_LEAST_TIME = "jax_persistent_cache_min_compile_time_secs"
+# JAX's settings, unless its environment variables decide otherwise.
+_SETTINGS = {
+    # Planning runs many small programs, each compiled in a moment and together in seconds.
+    _LEAST_TIME: 0.0,
+    # XLA logs an error of 4,000 characters for each program that it takes from the cache and runs
+    # (JAX issue 38445).
+    "jax_logging_level": "CRITICAL",
+}
+_folder: Path | None = None
+_programs: dict[Path, Callable] = {}
+
+
+def keep(folder: str | os.PathLike[str] | None = None) -> Path:
+    r"""Keep what takes long at the start of a program, and take it from there at the next start.
+
+    `splatjax.bust`, `splatjax.make_plan`, `splatjax.illuminate` and `splatjax.render`, called
+    outside `jit`, `grad` and `vmap` on one device, are then quick from the second start on. What
+    JAX compiles for other programs, gradients among them, is kept by its own compilation cache in
+    the same folder. To be called once, before anything is computed.
+
+    It sets `jax_compilation_cache_dir` where nothing has set it, and
+    `jax_persistent_cache_min_compile_time_secs` and `jax_logging_level` where no environment
+    variable does. With `JAX_ENABLE_COMPILATION_CACHE=0`, nothing is kept.
+
+    **Arguments:**
+
+    - `folder`: made where it is missing. By default that of the command line: `splatjax/jax` in
+      the absolute path `XDG_CACHE_HOME`, or in `~/.cache`. It may be deleted at any time; besides
+      JAX's own files it takes 1 GB at most.
+
+    **Returns:** the folder in it for this kind of processor.
+
+    **Raises:** `OSError` when it cannot be made; `PermissionError` when `kept` in it belongs to
+    another user, or others may write to it: then JAX's cache alone is used.
+    """
+    global _folder
+    for name, value in _SETTINGS.items():
+        if name.upper() not in os.environ:
+            jax.config.update(name, value)
+    base = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    base = base if base.is_absolute() else Path.home() / ".cache"
+    whole = Path(folder or base / "splatjax" / "jax").absolute() / _processor()
+    kept_folder = whole / "kept"
+    kept_folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    if jax.config.jax_compilation_cache_dir is None:  # ty: ignore[missing-attribute]
+        jax.config.update("jax_compilation_cache_dir", str(whole))
+    if not _is_private(kept_folder):  # or the system does not show whose it is
+        raise PermissionError(f"{kept_folder}: others than you may write to it; delete it")
+    _source()  # now, since files may change while the program runs
+    _folder = kept_folder
+    return whole
+
+
+def kept(function: Function) -> Function:
+    """Let `keep` keep the results of a function of arrays and numbers, by the values of these."""
+
+    @functools.wraps(function)
+    def called(*arguments, **named):
+        path = _path(function, (arguments, named), by_values=True)
+        if path is None:
+            return function(*arguments, **named)
+        result = _read(path)
+        if result is None:
+            result = _write(path, jax.device_get(function(*arguments, **named)))
+        return jax.device_put(result)  # compiles nothing, unlike jnp.asarray
+
+    return cast("Function", called)
+
+
+def kept_jit(function: Function) -> Function:
+    """Compile a function of arrays, as `eqx.filter_jit` does, and let `keep` keep its programs, by
+    the structure and the shapes of the arguments, so that nothing is traced.
+    """
+    compiled = eqx.filter_jit(function)
+
+    @functools.wraps(function)
+    def called(*arguments):
+        path = _path(function, arguments, by_values=False)
+        if path is None:
+            return compiled(*arguments)
+        leaves = jax.tree.leaves(arguments)
+        if path not in _programs:
+            with suppress(Exception):  # whatever is wrong with a file, it is made again
+                content, returned = _read(path)
+                structures = jax.tree.structure(((leaves,), {})), jax.tree.structure(returned)
+                devices = list(leaves[0].devices())
+                program = deserialize_and_load(content, *structures, devices[0].client, devices)
+                result = jax.block_until_ready(program(leaves))
+                _programs[path] = program
+                return result
+            _programs[path] = _compiled(path, function, arguments)
+        return _programs[path](leaves)
+
+    return cast("Function", called)
+
+
+def _compiled(path: Path, function: Callable, arguments: tuple) -> Callable:
+    leaves, structure = jax.tree.flatten(arguments)
+
+    # Of a list of arrays: a program that is loaded cannot make records of its arguments.
+    of_leaves = jax.jit(lambda leaves: function(*jax.tree.unflatten(structure, leaves)))
+    with ExitStack() as stack:
+        # Not in JAX's cache as well: what is taken from there and serialized again lacks kernels.
+        stack.callback(jax.config.update, _LEAST_TIME, jax.config.values[_LEAST_TIME])
+        jax.config.update(_LEAST_TIME, float("inf"))
+        program = of_leaves.lower(leaves).compile()
+    with suppress(Exception):  # not every program can be serialized
+        content, _, returned = serialize(program)
+        _write(path, (content, jax.tree.unflatten(returned, range(returned.num_leaves))))
+    return program
+
+
+def _path(function: Any, arguments: Any, *, by_values: bool) -> Path | None:
+    """Return the path of the file for a function and its arguments. `None` where nothing is kept:
+    before `keep`, while JAX traces, on several devices, and where code from outside splatjax has a
+    part in it.
+    """
+    leaves, structure = jax.tree.flatten(arguments)
+    arrays = [leaf for leaf in leaves if isinstance(leaf, jax.Array)]
+    numbers = [leaf for leaf in leaves if by_values and type(leaf) in (bool, int, float)]
+    if (
+        _folder is None
+        or not jax.config.jax_enable_compilation_cache  # ty: ignore[missing-attribute]
+        or len(arrays) + len(numbers) < len(leaves)
+        or any(isinstance(array, Tracer) for array in arrays)
+        or len(devices := {device for array in arrays for device in array.devices()}) > 1
+        or not all(kind.startswith(("builtins.", "splatjax.")) for kind in _kinds(structure))
+        or "<" in str(structure)  # a static function or object, which its text does not describe
+    ):
+        return None
+    different = {id(array): array for array in arrays if by_values}
+    values = {key: _digest(jax.device_get(array).tobytes()) for key, array in different.items()}
+    depends_on = (
+        f"{function.__module__}.{function.__name__}",
+        (structure, _kinds(structure), numbers),
+        [(array.aval, values.get(id(array))) for array in arrays],
+        [(device, device.device_kind, device.client.platform_version) for device in devices],
+        sorted(item for item in jax.config.values.items() if not _EFFECTLESS.search(item[0])),
+        (os.environ.get("XLA_FLAGS"), platform.python_version(), _processor(), _source()),
+        [module.__version__ for module in (jax, jaxlib, eqx)],
+    )
+    return _folder / f"{function.__name__}-{_digest(repr(depends_on).encode()).hex()}".strip("_")
+
+
+def _kinds(structure: PyTreeDef) -> list[str]:
+    """Return the classes of the nodes of a tree."""
+    node = structure.node_data()
+    own = [] if node is None else [f"{node[0].__module__}.{node[0].__qualname__}"]
+    return own + [kind for child in structure.children() for kind in _kinds(child)]
+
+
+@functools.cache
+def _processor() -> str:
+    """Return a name for the kind of processor: home folders are shared by machines, and JAX keeps
+    the code of all under one name.
+    """
+    path = Path("/proc/cpuinfo")
+    text = path.read_text(encoding="utf-8", errors="replace") if path.exists() else ""
+    flags = re.search("^(flags|Features).*", text, re.MULTILINE)
+    digest = hashlib.sha256((flags[0] if flags else platform.processor()).encode()).hexdigest()
+    return f"{platform.machine()}-{digest[:12]}"
+
+
+@functools.cache
+def _source() -> bytes:
+    return _digest(*(path.read_bytes() for path in sorted(Path(__file__).parent.rglob("*.py"))))
+
+
+def _digest(*contents: bytes) -> bytes:
+    return hashlib.sha256(b"".join(contents)).digest()
+
+
+def _is_private(path: Path) -> bool:
+    """Return whether a file or folder belongs to the user, and nobody else may write to it."""
+    status = path.stat()
+    return hasattr(os, "getuid") and status.st_uid == os.getuid() and not status.st_mode & 0o022
+
+
+def _read(path: Path) -> Any:
+    """Read what `_write` wrote to this path, `None` where nothing sound is there."""
+    with suppress(Exception):
+        content = path.read_bytes()
+        if _is_private(path) and content[:32] == _digest(path.name.encode(), content[32:]):
+            os.utime(path)
+            return pickle.loads(content[32:])
+    return None
+
+
+def _write(path: Path, content: Any) -> Any:
+    """Write a file, whole or not at all; delete what was not used for longest; return the
+    content.
+    """
+    with suppress(Exception):  # what cannot be kept is made again at the next start
+        packed = pickle.dumps(content)
+        if len(packed) > _LARGEST // 4:
+            return content
+        with suppress(FileNotFoundError), tempfile.NamedTemporaryFile(dir=path.parent) as file:
+            file.write(_digest(path.name.encode(), packed) + packed)
+            file.flush()
+            os.replace(file.name, path)  # so that there is nothing to delete in the end
+        total = 0
+        for each in sorted(path.parent.iterdir(), key=lambda each: -each.stat().st_mtime):
+            total += each.stat().st_size
+            if total > _LARGEST:
+                each.unlink(missing_ok=True)
+    return content
