@@ -205,3 +205,22 @@ def test_a_picture_that_does_not_fit_is_refused_before_it_is_rendered(monkeypatc
     monkeypatch.setattr(_checks, "_device_memory", lambda splats: 1e6)
     with pytest.raises(ValueError, match=r"2000 splats would take .* 0.001 GB are free"):
         check_scene(scene(), camera())
+
+
+def test_other_bodies_lights_and_cameras_of_about_one_size_compile_nothing(compiled):
+    def render(body: sj.Splats, eye=(66, 4, 140), towards=(0.5, -0.5, -1.0)):
+        scene = sj.Scene(body, [lamp(*towards)], sj.load_material("skin"))
+        camera = sj.Camera.look_at(eye, (0, -9, 0), fov=30, width=64, height=64)
+        return sj.render(scene, camera).beauty
+
+    bust, larger, fewer = sj.bust(4_000).scaled(0.2), sj.bust(4_000).scaled(0.21), sj.bust(3_850)
+    fewer, first = fewer.scaled(0.2), render(bust)
+    compiled.clear()
+    others = [
+        render(larger),
+        render(fewer),
+        render(bust, eye=(-60, 24, 140)),
+        render(bust, towards=(-0.5, -0.3, -1.0)),
+    ]
+    assert compiled == []
+    assert all(np.all(np.isfinite(other)) and not np.array_equal(other, first) for other in others)
