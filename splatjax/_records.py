@@ -4,12 +4,14 @@
     class Medium(eqx.Module):
         sigma_a: Float[Array, " channels"] = eqx.field(converter=numbers)
         sigma_s_prime: Float[Array, " channels"] = eqx.field(converter=numbers)
-        eta: Float[Array, " channels"] = eqx.field(converter=numbers)
+        eta: Float[Array, " channels"] = eqx.field(
+            converter=numbers, metadata=valid("positive", lambda x: x > 0)
+        )
 
 `Medium([0.02, 0.01], [1.1, 1.3], eta=1.4)` has three arrays of two channels. An annotation states
 the axes of a field, and its converter states, to type checkers as well, what may be given. `record`
-converts all fields together: the length and the precision of one depend on the others. Ranges of
-values are checked by `check_values` in `__check_init__`.
+converts all fields together: the length and the precision of one depend on the others. The range
+of a field stands in its metadata (`valid`); what concerns several is checked in `__check_init__`.
 """
 
 import dataclasses
@@ -42,6 +44,13 @@ def several(values: Item | Sequence[Item]) -> Any:
     return values
 
 
+def valid(
+    requirement: str, holds: Callable[[np.ndarray], Any] = lambda x: x == x, finite: bool = True
+) -> dict[str, Any]:
+    """State, as the metadata of a field, which values it may have, as `check_values` takes it."""
+    return {"valid": (requirement, holds, finite)}
+
+
 def record(cls: Class) -> Class:
     r"""Convert the arguments of a class of records before its `__init__` sees them.
 
@@ -51,6 +60,7 @@ def record(cls: Class) -> Class:
       array that lacks its last axis `channels` has one channel.
     - Fields of `several` records become tuples.
     - Fields of records are refused when they are records of other classes, or numbers.
+    - Values that are not `valid` are refused.
 
     Traced values are converted like others. `None` and objects that are no numbers, such as the
     placeholders of JAX, pass unchanged. Records that JAX unflattens are not converted again.
@@ -59,8 +69,10 @@ def record(cls: Class) -> Class:
     would be right.
     """
     initialize, signature = cls.__init__, inspect.signature(cls)
-    axes, classes = {}, {}
+    axes, classes, ranges = {}, {}, {}
     for field in dataclasses.fields(cls):  # ty: ignore[invalid-argument-type]
+        if "valid" in field.metadata:
+            ranges[field.name] = field.metadata["valid"]
         is_tuple = get_origin(field.type) is tuple
         annotation = get_args(field.type)[0] if is_tuple else field.type
         kinds = get_args(annotation) if isinstance(annotation, UnionType) else (annotation,)
@@ -91,6 +103,8 @@ def record(cls: Class) -> Class:
             values[name] = parts if is_tuple else parts[0]
             records += parts
         initialize(self, **(values | _converted(cls.__name__, axes, values, records)))
+        for name, requirement in ranges.items():
+            check_values(f"{cls.__name__}.{name}", getattr(self, name), *requirement)
 
     # No annotations here: runtime type checkers would refuse arguments before their conversion.
     own = inspect.Parameter("self", inspect.Parameter.POSITIONAL_OR_KEYWORD)

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from splatjax._chunking import jit_unless_traced
-from splatjax._records import check_values, numbers, record
+from splatjax._records import numbers, record, valid
 
 
 def gaussian(
@@ -80,12 +80,12 @@ class SumOfGaussians(AbstractProfile):
       Differentiable.
     """
 
-    variances: Float[Array, " gaussians"] = eqx.field(converter=numbers)
-    weights: Float[Array, "gaussians channels"] = eqx.field(converter=numbers)
-
-    def __check_init__(self):
-        check_values("SumOfGaussians.variances", self.variances, "positive (mm^2)", lambda x: x > 0)
-        check_values("SumOfGaussians.weights", self.weights, "finite", lambda x: x == x)
+    variances: Float[Array, " gaussians"] = eqx.field(
+        converter=numbers, metadata=valid("positive (mm^2)", lambda x: x > 0)
+    )
+    weights: Float[Array, "gaussians channels"] = eqx.field(
+        converter=numbers, metadata=valid("finite")
+    )
 
     @property
     def channels(self) -> int:

@@ -101,8 +101,14 @@ def plot_fit(
         begin = float(nodes[weights > 0].min())
         for axes in (log, residual):
             axes.axvspan(ends[0], begin, color="0.93", zorder=0)
-        below = residual.get_xaxis_transform()
-        residual.text(begin, 0.03, "not fitted ", ha="right", transform=below, fontsize="small")
+        residual.text(
+            begin,
+            0.03,
+            "not fitted ",
+            ha="right",
+            transform=residual.get_xaxis_transform(),
+            fontsize="small",
+        )
         counts = left[radii >= begin]
         residual.set_ylim(1.3 * min(counts.min(), -1e-3), 1.3 * max(counts.max(), 1e-3))
     for axis in (log.xaxis, residual.xaxis):
@@ -174,8 +180,11 @@ def plot_pictures(
     **Returns:** a matplotlib `Figure`, which no window shows; `figure.savefig(path)` writes it.
     """
     height, width = np.shape(rows[0][0])[:2]
-    size = (inches * width / height * len(titles), inches * len(rows) + 0.2)
-    figure = Figure(figsize=size, dpi=150, layout="constrained")
+    figure = Figure(
+        figsize=(inches * width / height * len(titles), inches * len(rows) + 0.2),
+        dpi=150,
+        layout="constrained",
+    )
     grid = figure.subplots(len(rows), len(titles), squeeze=False)
     for number, (line, pictures) in enumerate(zip(grid, rows, strict=True)):
         values = np.stack([np.asarray(picture, np.float64) for picture in pictures])

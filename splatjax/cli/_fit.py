@@ -115,15 +115,57 @@ class Fit:
             self._run_all() if self.all else self._run()
 
     def _run_all(self) -> None:
+        """Fit the dipoles of the media of a table, in batches that lie in a folder until all are
+        there: the processes of a launcher share them.
+        """
         if self.output is None:
             raise ValueError("--all needs --output, a CSV file for what is fitted")
-        kept = ("medium", "all", "count", "output")
-        if self != Fit(**{name: getattr(self, name) for name in kept}):
+        if self != Fit(medium=self.medium, all=True, count=self.count, output=self.output):
             raise ValueError("--all fits dipoles by --count alone; leave the other options out")
-        fit_all(Path(self.medium), self.output, self.count)
+        names, coefficients = read_media(Path(self.medium))
+        path = self.output.with_name(f"{self.output.name}.parts")
+        begins = range(0, len(names), _BATCH)
+        parts = [path / f"from_{begin:08}.csv" for begin in begins]
+
+        def fit(i: int) -> None:
+            batch = slice(begins[i], begins[i] + _BATCH)
+            write_columns(
+                parts[i], {"name": names[batch]} | _fit_batch(coefficients[batch], self.count)
+            )
+
+        done = complete(
+            path / "fits.json",
+            {
+                "media": fingerprint(self.medium),
+                "--count": self.count,
+                "splatjax": sj.__version__,
+                "jax": jax.__version__,
+            },
+            [(part,) for part in parts],
+            lambda: fit,
+            name="batches",
+            what=f"fitting {self.count} Gaussians to {len(names)} media, {_BATCH} at a time",
+        )
+        if len(done) < len(parts):
+            return
+        try:
+            tables = [read_columns(part) for part in parts]
+        except FileNotFoundError:  # another process has joined them at the same time
+            if not self.output.exists():
+                raise
+            return
+        columns = {name: [cell for table in tables for cell in table[name]] for name in tables[0]}
+        write_columns(self.output, columns)
+        shutil.rmtree(path, ignore_errors=True)
+        failed = columns["converged"].count("0.0")
+        note(
+            f"{failed} of {len(names)} fits did not converge; in their rows `converged` is 0"
+            if failed
+            else f"all {len(names)} fits converged"
+        )
+        print(self.output)
 
     def _run(self) -> None:
-        self._check_options()
         coefficients = self._coefficients()
         if isinstance(coefficients, sj.scattering.Tabulated):
             weights = sj.fitting.NonNegativeWeights(sj.fitting.FreeWeights())
@@ -154,8 +196,8 @@ class Fit:
             figure = plot_fit(target.profile, fitted.gaussians, rule=target.rule, title=title)
             save_figure(figure, self.plot)
 
-    def _check_options(self) -> None:
-        """Refuse options that have no effect on this kind of input."""
+    def _coefficients(self) -> sj.Dipole | sj.LayeredMultipole | sj.scattering.Tabulated:
+        """Read the input; refuse options that have no effect on its kind."""
         kind = _KINDS.get(Path(self.medium).suffix.lower(), _COEFFICIENTS)
         given = {field.name for field in fields(self) if getattr(self, field.name) != field.default}
         for other, names in _OPTIONS.items():
@@ -165,12 +207,9 @@ class Fit:
                     f"{option_name(without_effect[0])} is for {other}, and {self.medium} is taken "
                     f"for {kind}; leave it out"
                 )
-
-    def _coefficients(self) -> sj.Dipole | sj.LayeredMultipole | sj.scattering.Tabulated:
-        suffix = Path(self.medium).suffix.lower()
-        if suffix == ".csv":
+        if kind == _PROFILE:
             return sj.io.read_profile(self.medium, mm_per_unit=self.mm_per_unit)
-        if suffix != ".exr":
+        if kind == _COEFFICIENTS:
             return sj.load_profile(self.medium)
         if self.mm_per_pixel is None:
             raise ValueError(
@@ -183,17 +222,20 @@ class Fit:
 
     def _fitted(self, target: Reference) -> sj.fitting.FitResult:
         count = self.count if self.error is None else sj.fitting.LeastCount(self.error)
-        number = counted(self.count, "Gaussian")
-        goal = number if self.error is None else f"Gaussians to an error of {self.error:g}"
+        goal = (
+            counted(self.count, "Gaussian")
+            if self.error is None
+            else f"Gaussians to an error of {self.error:g}"
+        )
         with stage(f"fitting to {self.medium}: {goal}"):
             fitted = sj.fit_gaussians(
                 target.profile, count, weights=target.weights, rule=target.rule, throw=False
             )
             if jax.block_until_ready(fitted).result != optx.RESULTS.successful:
-                number = counted(len(fitted.gaussians.variances), "Gaussian")
                 more = f"more --photons than {self.photons}, or "
                 raise ValueError(
-                    f"{self.medium}: the search for {number} did not settle; give "
+                    f"{self.medium}: the search for "
+                    f"{counted(len(fitted.gaussians.variances), 'Gaussian')} did not settle; give "
                     f"{more if self.model == 'monte-carlo' else ''}a smaller --count"
                 )
         return fitted
@@ -206,15 +248,16 @@ class Fit:
         fitted: sj.fitting.FitResult,
     ) -> None:
         known = None if isinstance(coefficients, sj.scattering.Tabulated) else coefficients
-        held = "" if known is None else ", sum held to the total reflectance"
         surface, source = {}, {}
         if known is not None:
             # The index of a surface is that of the medium it bounds, unless the file gives it.
             top = known if isinstance(known, sj.Dipole) else known.top
             surface, source = sj.io.surface_and_source(self.medium)
             surface = {"eta": top.medium.eta[0]} | surface
-        target_of = f"{'profile' if known is None else 'coefficients'} of {self.medium}"
-        fitted_by = f"fitted by splatjax {sj.__version__} to the {target_of}"
+        fitted_by = (
+            f"fitted by splatjax {sj.__version__} to the "
+            f"{'profile' if known is None else 'coefficients'} of {self.medium}"
+        )
         provenance = "; ".join(filter(None, [source.get("provenance"), fitted_by]))
         sj.save_material(
             sj.Material(fitted.gaussians, **surface, single_scattering=target.single),
@@ -224,7 +267,11 @@ class Fit:
             fit={
                 **({} if target.description is None else {"profile": target.description}),
                 "variances_of": "all channels",
-                "weights_of": f"non-negative{held}",
+                "weights_of": (
+                    "non-negative"
+                    if known is None
+                    else "non-negative, sum held to the total reflectance"
+                ),
                 "error": fitted.error,
                 "energy_error": fitted.energy_error,
             },
@@ -253,62 +300,14 @@ def _numbers(values: jax.Array, form: str) -> str:
 _BATCH = 500  # media in one call
 
 
-def fit_all(media: Path, output: Path, count: int) -> None:
-    """Fit sums of Gaussians to the dipoles of the media of a table, and write one table.
-
-    Batches lie in a folder beside it until all are there. Where a launcher has started several
-    processes they share them.
-
-    **Raises:** `ValueError` where the folder holds fits of something else.
-    """
-    names, coefficients = read_media(media)
-    path, begins = output.with_name(f"{output.name}.parts"), range(0, len(names), _BATCH)
-    parts = [path / f"from_{begin:08}.csv" for begin in begins]
-
-    def fit(i: int) -> None:
-        batch = slice(begins[i], begins[i] + _BATCH)
-        write_columns(parts[i], {"name": names[batch]} | _fit_batch(coefficients[batch], count))
-
-    done = complete(
-        path / "fits.json",
-        {
-            "media": fingerprint(media),
-            "--count": count,
-            "splatjax": sj.__version__,
-            "jax": jax.__version__,
-        },
-        [(part,) for part in parts],
-        lambda: fit,
-        name="batches",
-        what=f"fitting {count} Gaussians to {len(names)} media, {_BATCH} at a time",
-    )
-    if len(done) < len(parts):
-        return
-    try:
-        tables = [read_columns(part) for part in parts]
-    except FileNotFoundError:  # another process has joined them at the same time
-        if not output.exists():
-            raise
-        return
-    columns = {name: [cell for table in tables for cell in table[name]] for name in tables[0]}
-    write_columns(output, columns)
-    shutil.rmtree(path, ignore_errors=True)
-    failed = columns["converged"].count("0.0")
-    note(
-        f"{failed} of {len(names)} fits did not converge; in their rows `converged` is 0"
-        if failed
-        else f"all {len(names)} fits converged"
-    )
-    print(output)
-
-
 @eqx.filter_jit
 def _fit_each(coefficients: Float[Array, "media 3"], starts: sj.fitting.DipoleStarts, count: int):
     def fit(row):
         medium = sj.Medium(row[0:1], row[1:2], row[2:3])
         start = sj.fitting.GivenVariances(starts(medium, count).variances[0])
-        profile = sj.Dipole(medium)
-        fitted = sj.fit_gaussians(profile, count, start=start, weights=MEDIUM_WEIGHTS, throw=False)
+        fitted = sj.fit_gaussians(
+            sj.Dipole(medium), count, start=start, weights=MEDIUM_WEIGHTS, throw=False
+        )
         return fitted, fitted.result == optx.RESULTS.successful
 
     return eqx.filter_vmap(fit)(coefficients)

@@ -117,9 +117,9 @@ def _message(error: Exception) -> tuple[str, int]:
         return "this takes more memory than there is; take fewer splats, or a smaller picture", 2
     if isinstance(error, ValueError | OSError | eqx.EquinoxRuntimeError):
         return line or type(error).__name__, 2
-    name = type(error).__name__
     return (
-        f"a fault of splatjax itself: {name}: {line}; please report it with what {_DEBUG} shows",
+        f"a fault of splatjax itself: {type(error).__name__}: {line}; please report it with what "
+        f"{_DEBUG} shows",
         1,
     )
 

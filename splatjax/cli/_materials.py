@@ -73,13 +73,12 @@ def _row(name: str) -> tuple[str, ...]:
         known = "layers" if layered else "coefficients"
     except ValueError:
         known = "Gaussians"
-    reflectance = "  ".join(f"{float(total):.3f}" for total in material.total_reflectance())
     authors, year = re.findall(r"^(.+?) (\d{4})", source["citation"])[0]
     first, *others = re.split(r", | and ", authors)
     return (
         name,
         known,
-        reflectance,
+        "  ".join(f"{float(total):.3f}" for total in material.total_reflectance()),
         f"{float(material.gaussians.variances.max()) ** 0.5:.3g}",
         f"{float(material.eta):.3g}",
         f"{first}{' et al.' if others else ''} {year}",

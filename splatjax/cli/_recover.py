@@ -93,8 +93,15 @@ class Recover:
     def run(self) -> None:
         check_output(self.output, (".toml",))
         check_output(self.report, FIGURES)
-        must = f"lie between 1 and {_LARGEST_ETA:g}: marble has 1.5, skin 1.4"
-        check_options(self, {"eta": (self.eta is None or 1 <= self.eta <= _LARGEST_ETA, must)})
+        check_options(
+            self,
+            {
+                "eta": (
+                    self.eta is None or 1 <= self.eta <= _LARGEST_ETA,
+                    f"lie between 1 and {_LARGEST_ETA:g}: marble has 1.5, skin 1.4",
+                )
+            },
+        )
         if not self.start:
             raise ValueError("--start names no material; give one or more (`splatjax materials`)")
         for name in self.start:
@@ -108,8 +115,11 @@ class Recover:
 
     def _run(self, observations: list[sj.inverse.Observation], splats: sj.Splats) -> None:
         search = self.output.with_suffix(".search.json")
-        materials = map(sj.io.material_path, self.start)
-        files = [self.splats, *sj.io.picture_paths(self.pictures), *materials]
+        files = [
+            self.splats,
+            *sj.io.picture_paths(self.pictures),
+            *map(sj.io.material_path, self.start),
+        ]
         dependencies = {
             "files": [sj.io.fingerprint(file) for file in files],
             "model": self.model,

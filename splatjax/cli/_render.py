@@ -59,8 +59,7 @@ class Render(ViewOptions):
     def _at_once(self) -> tuple[sj.Frame, sj.Material]:
         splats, material = self.load()
         camera = self.camera(lambda: [splats], self.azimuth)
-        lights = self.lights(material, self.azimuth, self.light_azimuth)
-        scene = sj.Scene(splats, lights, material)
+        scene = sj.Scene(splats, self.lights(material, self.azimuth, self.light_azimuth), material)
         with stage("planning"):
             plan = sj.make_plan(scene, camera)
         with stage(f"rendering {splats.count} splats at {self.width} x {self.height}"):
@@ -142,12 +141,16 @@ class Turntable(ViewOptions):
         if self.output.exists() and not self.output.is_dir():
             raise ValueError(f"{self.output}: is a file; give the name of a folder")
         check_folder(self.output)
-        material = sj.io.fingerprint(sj.io.material_path(self.material))
-        names = [self.output / f"frame_{i:04}" for i in range(self.frames)]
-        paths = [(name.with_suffix(".exr"), name.with_suffix(".png")) for name in names]
+        paths = [
+            (self.output / f"frame_{i:04}.exr", self.output / f"frame_{i:04}.png")
+            for i in range(self.frames)
+        ]
         done = complete(
             self.output / "turntable.json",
-            self.manifest() | {"contents of --material": material},
+            {
+                **self.manifest(),
+                "contents of --material": sj.io.fingerprint(sj.io.material_path(self.material)),
+            },
             paths,
             lambda: self._prepare(paths),
             name="frames",

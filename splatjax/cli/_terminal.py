@@ -196,9 +196,10 @@ def process_index_and_count() -> tuple[int, int]:
     if not counts or counts[0] in ("0", "1"):
         return 0, 1
     names = {"num_processes": "JAX_NUM_PROCESSES", "process_id": "JAX_PROCESS_ID"}
-    given = {key: os.environ[name] for key, name in names.items() if name in os.environ}
     try:
-        numbers: dict[str, Any] = {key: int(number) for key, number in given.items()}
+        numbers: dict[str, Any] = {
+            key: int(os.environ[name]) for key, name in names.items() if name in os.environ
+        }
         jax.distributed.initialize(**numbers)
     except (ValueError, TypeError) as error:
         raise ValueError(

@@ -104,8 +104,9 @@ class ViewOptions:
         with stage(
             f"reading {self.splats}" if self.splats else f"making the bust with {self.count} splats"
         ):
-            whole = sj.read_splats(self.splats, up=self.up) if self.splats else sj.bust(self.count)
-        splats = self.adjusted(whole)
+            splats = self.adjusted(
+                sj.read_splats(self.splats, up=self.up) if self.splats else sj.bust(self.count)
+            )
         return splats, self.material_for(splats)
 
     def material_for(self, splats: sj.Splats) -> sj.Material:
@@ -116,7 +117,15 @@ class ViewOptions:
                 f"color is the splats' own albedo, and {self.material} only spreads the light; "
                 "--no-albedo shows its own color"
             )
-        material = in_color(material)
+        if material.channels == 1:  # the same weights for red, green and blue
+            weights = jnp.tile(material.gaussians.weights, 3)
+            material = replace(
+                material,
+                gaussians=sj.SumOfGaussians(material.gaussians.variances, weights),
+                single_scattering=jax.tree.map(
+                    lambda leaf: jnp.tile(leaf, 3), material.single_scattering
+                ),
+            )
         return material if self.scattering else material.opaque()
 
     def adjusted(self, splats: sj.Splats) -> sj.Splats:
@@ -131,13 +140,15 @@ class ViewOptions:
         azimuth: always on the same side of it.
         """
         # The first light gives a white diffuser that faces it the radiance 1.
-        irradiance = np.full(material.gaussians.weights.shape[1], np.pi)
-        towards = -direction_to(light_azimuth, self.light_elevation)
-        light = sj.DirectionalLight(direction=towards, irradiance=irradiance)
+        irradiance = np.full(material.channels, np.pi)
+        light = sj.DirectionalLight(
+            direction=-direction_to(light_azimuth, self.light_elevation), irradiance=irradiance
+        )
         side = math.copysign(_FILL_SIDE, math.remainder(self.azimuth - self.light_azimuth, 360))
-        towards = -direction_to(azimuth + side, _FILL_ELEVATION)
         fill = sj.DirectionalLight(
-            direction=towards, irradiance=self.fill * irradiance, cast_shadows=False
+            direction=-direction_to(azimuth + side, _FILL_ELEVATION),
+            irradiance=self.fill * irradiance,
+            cast_shadows=False,
         )
         return (light, fill) if self.fill else (light,)
 
@@ -145,8 +156,10 @@ class ViewOptions:
         """Place a camera at an azimuth so that the bounding sphere of the splats, which come in
         parts, just fits the narrower side of the picture.
         """
-        bodies = (np.asarray(part.centers) for part in parts())
-        boxes = [(np.min(body, axis=0), np.max(body, axis=0)) for body in bodies]
+        boxes = [
+            (np.min(body, axis=0), np.max(body, axis=0))
+            for body in (np.asarray(part.centers) for part in parts())
+        ]
         low, high = np.min([box[0] for box in boxes], axis=0), np.max([b[1] for b in boxes], axis=0)
         middle = (low + high) / 2
         reaches = [
@@ -154,16 +167,21 @@ class ViewOptions:
             for part in parts()
         ]
         radius = float(max(np.max(reach) for reach in reaches))
-        narrower = min(1.0, self.width / self.height)
-        half_angle = math.atan(math.tan(math.radians(self.fov) / 2) * narrower)
+        half_angle = math.atan(
+            math.tan(math.radians(self.fov) / 2) * min(1.0, self.width / self.height)
+        )
         eye = middle + radius / math.sin(half_angle) * direction_to(azimuth, self.elevation)
         return sj.Camera.look_at(eye, middle, fov=self.fov, width=self.width, height=self.height)
 
     def write(self, path: Path, frame: sj.Frame, material: sj.Material) -> tuple[Path, Path]:
         """Write the picture with all its layers, and the PNG file beside it; return both paths."""
         picture = path.with_suffix(".png")
-        variances = material.gaussians.variances.tolist()
-        sj.write_exr(path, frame, variances=variances, manifest=self.manifest())
+        sj.write_exr(
+            path,
+            frame,
+            variances=material.gaussians.variances.tolist(),
+            manifest=self.manifest(),
+        )
         sj.write_png(picture, frame, exposure=self.exposure)
         return path, picture
 
@@ -171,13 +189,17 @@ class ViewOptions:
         """Return all that the pictures depend on: options by their names, contents of the files
         they name, and versions.
         """
-        fields = asdict(self).items()
-        options = {option_name(f): value for f, value in fields if f not in _NOT_IN_PICTURES}
+        options = {
+            option_name(field): value
+            for field, value in asdict(self).items()
+            if field not in _NOT_IN_PICTURES
+        }
         splats = f"{self.splats.name}, {sj.io.fingerprint(self.splats)}" if self.splats else None
-        material = sj.io.material_path(self.material).read_text(encoding="utf-8")
         return options | {
             "splats": splats or "the built-in bust",
-            "contents of --material": material,
+            "contents of --material": sj.io.material_path(self.material).read_text(
+                encoding="utf-8"
+            ),
             "precision": str(jnp.result_type(float)),
             "splatjax": sj.__version__,
             "jax": jax.__version__,
@@ -208,21 +230,6 @@ def draw(
             f"the plan's capacity is exceeded: {float(frame.overflow):.2f} times of it is needed"
         )
     return frame
-
-
-def in_color(material: sj.Material) -> sj.Material:
-    """Return a material of one channel with the same weights for red, green and blue."""
-    weights = material.gaussians.weights
-    if weights.shape[1] != 1:
-        return material
-    weights = jnp.broadcast_to(weights, (len(weights), 3))
-    return replace(
-        material,
-        gaussians=sj.SumOfGaussians(material.gaussians.variances, weights),
-        single_scattering=jax.tree.map(
-            lambda x: jnp.broadcast_to(x, 3), material.single_scattering
-        ),
-    )
 
 
 def direction_to(azimuth: float, elevation: float) -> np.ndarray:

@@ -53,10 +53,9 @@ class ErrorByCount(eqx.Module):
             )
         worst = np.max(np.asarray(self.error), axis=1)
         if not error > 0 or not np.any(worst <= error):
-            left = f"{len(worst)} Gaussians leave {worst[-1]:.2e} (worst channel)"
             raise ValueError(
-                f"an error of {error:g} is not reached: {left}; ask for that, or allow more "
-                "Gaussians"
+                f"an error of {error:g} is not reached: {len(worst)} Gaussians leave "
+                f"{worst[-1]:.2e} (worst channel); ask for that, or allow more Gaussians"
             )
         return int(np.argmax(worst <= error)) + 1
 
@@ -96,12 +95,13 @@ def error_by_count(
             error = jnp.sqrt(jnp.sum(residuals * residuals, axis=1))
             return error, jnp.where(active, problem.variances(point), jnp.inf)
 
-        points = greedy_path(problem, largest)
-        return jax.vmap(summarize)(points, jnp.arange(1, largest + 1))
+        return jax.vmap(summarize)(greedy_path(problem, largest), jnp.arange(1, largest + 1))
 
     problem = make_problem(profile, weights, rule)
-    found = spread.over(search, constant(problem), GreedyInsertion())
-    error, variances = (values.astype(problem.target.dtype) for values in found)
+    error, variances = (
+        values.astype(problem.target.dtype)
+        for values in spread.over(search, constant(problem), GreedyInsertion())
+    )
     return ErrorByCount(error[..., 0].T if error.ndim == 3 else error, variances)
 
 

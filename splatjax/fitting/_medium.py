@@ -80,8 +80,14 @@ def fit_medium(
             f"of {channels} channels; got {measured.deviation} and {start.channels} channels"
         )
     check_values("measured.deviation", measured.deviation, "positive", lambda x: x > 0)
-    beam = as_floats(beam_variance, measured.values.dtype)
-    fitted = _fit_compiled(measured, start, beam, model, count, gaussians_start)
+    fitted = _fit_compiled(
+        measured,
+        start,
+        as_floats(beam_variance, measured.values.dtype),
+        model,
+        count,
+        gaussians_start,
+    )
     failed = fitted.result != optx.RESULTS.successful
     return fitted.result.error_if(fitted, failed) if throw else fitted
 
@@ -90,9 +96,8 @@ def fit_medium(
 def _fit_compiled(measured, start, beam_variance, model, count, gaussians_start) -> MediumFit:
     def fit_channel(values, deviation, sigma_a, sigma_s_prime, eta):
         def residuals(point, _):
-            moved = Medium(*jnp.exp(point), eta)
             fitted = fit_gaussians(
-                model(moved),
+                model(Medium(*jnp.exp(point), eta)),
                 count,
                 spread=VariancesPerChannel(),
                 start=gaussians_start,
@@ -110,8 +115,12 @@ def _fit_compiled(measured, start, beam_variance, model, count, gaussians_start)
             end.value
         )
         chi_squared = left @ left / max(len(values) - len(point), 1)
-        converged = end.result == optx.RESULTS.successful
-        return jnp.exp(end.value), invert(slopes.T @ slopes), chi_squared, converged
+        return (
+            jnp.exp(end.value),
+            invert(slopes.T @ slopes),
+            chi_squared,
+            end.result == optx.RESULTS.successful,
+        )
 
     coefficients, covariance, chi_squared, converged = jax.vmap(fit_channel)(
         measured.values.T, measured.deviation.T, start.sigma_a, start.sigma_s_prime, start.eta

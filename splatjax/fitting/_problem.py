@@ -210,8 +210,7 @@ class FitProblem(eqx.Module):
         idle = jnp.append(jnp.diagonal(normal) == 0, jnp.zeros(channels * count, bool))
         unknown = jnp.diag(jnp.where(idle, jnp.inf, 0.0).astype(covariance.dtype))
         covariance = jnp.where(idle[:, None] | idle[None], unknown, covariance)
-        gaussians = SumOfGaussians(variances, (coefficients * scale).T)
-        return gaussians, jnp.sqrt(squared), covariance
+        return SumOfGaussians(variances, (coefficients * scale).T), jnp.sqrt(squared), covariance
 
     def _slopes(self, log_variances, basis, coefficients, response):
         """Compute the first and second derivative of the basis at fixed weights, and how the

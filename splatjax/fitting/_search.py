@@ -116,10 +116,11 @@ class DipoleStarts(eqx.Module):
             f"from 1 to {len(self.log_variances)}, the numbers of Gaussians in the table",
             lambda x: (x >= 1) & (x <= len(self.log_variances)),
         )
-        dtype = medium.eta.dtype
         root = jnp.sqrt(medium.sigma_a / medium.sigma_t_prime)
-        tables = self.log_variances[count - 1], self.roots, self.etas
-        table, roots, etas = (values.astype(dtype) for values in tables)
+        table, roots, etas = (
+            values.astype(medium.eta.dtype)
+            for values in (self.log_variances[count - 1], self.roots, self.etas)
+        )
         place = [
             (values - nodes[0]) / (nodes[1] - nodes[0])
             for nodes, values in ((roots, root), (etas, medium.eta))

@@ -156,8 +156,7 @@ class FixedTotalReflectance(AbstractWeights):
     """
 
     def solve(self, basis, target, energies, total):
-        inverse = invert(basis.T @ basis)
-        free = least_squares(basis, target, inverse)
+        free, inverse = FreeWeights().solve(basis, target, energies, total)
         # The direction from the free optimum to the constraint that adds least to the error.
         direction = inverse @ energies
         length = energies @ direction

@@ -85,8 +85,10 @@ def head_distance(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
     """
     x, y, z = (np.ascontiguousarray(points[:, axis]) for axis in range(3))
     side = np.abs(x)
-    views = [(x, y, z), (side, y, z), (np.sqrt(x * x + 144), y, z)]
-    body = model([_HEAD, (join, 30, _TORSO)], views)
+    body = model(
+        [_HEAD, (join, 30, _TORSO)],
+        [(x, y, z), (side, y, z), (np.sqrt(x * x + 144), y, z)],
+    )
     near = np.flatnonzero((z > 25) & (y > -125) & (y < 60) & (side < 75))
     if len(near):
         body[near] = _face(body[near], x[near], y[near], z[near], side[near])
@@ -199,8 +201,13 @@ def bust(count: int = 200_000, *, seed: int = 0) -> Splats:
     mesh = bust_mesh()
     points = scatter(mesh, count, seed=seed, relaxations=2)
     splats = splats_at(mesh, points)
-    colors = complexion(points.positions(mesh))
-    return Splats(splats.centers, splats.normals, splats.radii, splats.areas, *colors)
+    return Splats(
+        splats.centers,
+        splats.normals,
+        splats.radii,
+        splats.areas,
+        *complexion(points.positions(mesh)),
+    )
 
 
 _SKIN = np.asarray([0.60, 0.375, 0.285])

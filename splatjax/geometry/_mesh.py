@@ -61,14 +61,8 @@ def vertex_normals(
     """
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
     face_normals = np.cross(b - a, c - a)
-    normals = np.stack(
-        [
-            np.bincount(faces.ravel(), np.repeat(face_normals[:, axis], 3), len(vertices))
-            for axis in range(3)
-        ],
-        axis=-1,
-    )
-    return unit(normals)
+    sums = [np.bincount(faces.ravel(), np.repeat(x, 3), len(vertices)) for x in face_normals.T]
+    return unit(np.stack(sums, axis=-1))
 
 
 def unit(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
@@ -152,8 +146,7 @@ def split_creases(mesh: Mesh, degrees: float) -> Mesh:
     replaced[mesh.faces[off]] = True
     if not replaced[mesh.faces].any():
         return mesh
-    corners = shared_edges(distinct(mesh.vertices)[1][mesh.faces])
-    one, other = np.moveaxis(corners, 2, 0)
+    one, other = np.moveaxis(shared_edges(distinct(mesh.vertices)[1][mesh.faces]), 2, 0)
     soft = np.einsum("ni,ni->n", facing[one[:, 0] // 3], facing[other[:, 0] // 3]) >= cosine
     links = scipy.sparse.coo_array(
         (np.ones(2 * soft.sum()), (one[soft].ravel(), other[soft].ravel())),
@@ -162,8 +155,7 @@ def split_creases(mesh: Mesh, degrees: float) -> Mesh:
     groups = scipy.sparse.csgraph.connected_components(links, directed=False)[1]
     angles = np.arccos(np.clip(-np.einsum("fki,fki->fk", sides, np.roll(sides, 1, axis=1)), -1, 1))
     shares = (angles[..., None] * facing[:, None]).reshape(-1, 3)
-    sums = [np.bincount(groups, share) for share in shares.T]
-    estimated = unit(np.stack(sums, axis=1))
+    estimated = unit(np.stack([np.bincount(groups, share) for share in shares.T], axis=1))
     # A new vertex for each pair of an old one and a group, or of an old one alone where it stays.
     vertex = mesh.faces.ravel()
     group = np.where(replaced[vertex], groups, -1)
@@ -202,18 +194,17 @@ def cut_below(mesh: Mesh, height: float) -> Mesh:
         for triangle in [(tip, first, second)] if tip_above else halves:
             faces.append(chosen)
             shares.append(np.stack(triangle, axis=1))
-    kept, share = np.concatenate(faces), np.concatenate(shares)
+    cut, share = mesh.select(np.concatenate(faces)), np.concatenate(shares)
 
     def at_corners(values: Any) -> Any:
-        return None if values is None else np.einsum("fkc,fci->fki", share, values[kept])
+        return None if values is None else np.einsum("fkc,fci->fki", share, values)
 
-    at_vertices = [
-        at_corners(each[mesh.faces]).reshape(-1, 3) for each in (mesh.vertices, mesh.normals)
-    ]
-    colors = None if mesh.colors is None else at_corners(mesh.colors[mesh.faces]).reshape(-1, 3)
-    numbers = np.arange(3 * len(kept)).reshape(-1, 3)
-    parts = None if mesh.parts is None else mesh.parts[kept]
-    return Mesh(at_vertices[0], numbers, unit(at_vertices[1]), at_corners(mesh.uvs), colors, parts)
+    vertices, normals = (
+        at_corners(each[cut.faces]).reshape(-1, 3) for each in (mesh.vertices, mesh.normals)
+    )
+    colors = None if mesh.colors is None else at_corners(mesh.colors[cut.faces]).reshape(-1, 3)
+    numbers = np.arange(cut.faces.size).reshape(-1, 3)
+    return Mesh(vertices, numbers, unit(normals), at_corners(cut.uvs), colors, cut.parts)
 
 
 _BITS = 21

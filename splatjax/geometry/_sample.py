@@ -53,9 +53,9 @@ def lookup_at(
     u, v = np.einsum("nc,nci->in", points.barycentrics, mesh.uvs[points.faces])
     height, width = picture.shape[:2]
     at = (1 - v) * height - 0.5, u * width - 0.5
-    planes = np.moveaxis(picture.reshape(height, width, -1), -1, 0)
     values = [
-        scipy.ndimage.map_coordinates(plane, at, order=1, mode="grid-wrap") for plane in planes
+        scipy.ndimage.map_coordinates(plane, at, order=1, mode="grid-wrap")
+        for plane in np.moveaxis(picture.reshape(height, width, -1), -1, 0)
     ]
     return np.stack(values, axis=-1).reshape(len(u), *picture.shape[2:])
 
@@ -72,14 +72,15 @@ def albedo_at(
         for part, picture in enumerate(textures.albedo):
             chosen = np.flatnonzero(mesh.parts[points.faces] == part)
             is_plain = picture.shape[:2] == (1, 1)
-            own = points.take(chosen)
-            albedo[chosen] = picture[0, 0] if is_plain else lookup_at(mesh, own, picture)
+            albedo[chosen] = (
+                picture[0, 0] if is_plain else lookup_at(mesh, points.take(chosen), picture)
+            )
     else:
         albedo = lookup_at(mesh, points, textures.albedo)
     if mesh.colors is None:
         return albedo
-    colors = mesh.colors[mesh.faces[points.faces]]
-    colors = np.clip(np.einsum("nc,nci->ni", points.barycentrics, colors), 0.0, 1.0)
+    at_corners = mesh.colors[mesh.faces[points.faces]]
+    colors = np.clip(np.einsum("nc,nci->ni", points.barycentrics, at_corners), 0.0, 1.0)
     return colors if albedo is None else albedo * colors
 
 
@@ -138,8 +139,7 @@ def sample_mesh(
     **Raises:** `ValueError` for a count below 1, a mesh without area, or textures on a mesh without
     UVs.
     """
-    points = scatter(mesh, count, seed=seed)
-    return splats_at(mesh, points, textures, rounded=rounded)
+    return splats_at(mesh, scatter(mesh, count, seed=seed), textures, rounded=rounded)
 
 
 def splats_at(
@@ -162,8 +162,9 @@ def splats_at(
     )
     if tangent_space is not None:
         normals = perturbed_normals(mesh, points, normals, tangent_space)
-    albedo = albedo_at(textures, mesh, points)
-    return Splats(centers, normals, radii, areas, albedo, specular, roughness)
+    return Splats(
+        centers, normals, radii, areas, albedo_at(textures, mesh, points), specular, roughness
+    )
 
 
 def _radii(

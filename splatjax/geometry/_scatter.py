@@ -181,9 +181,13 @@ def scatter(mesh: Mesh, count: int, *, seed: int = 0, relaxations: int = 4) -> S
         spacing = float(np.sqrt(areas.sum() / count))
         for _ in range(relaxations):
             positions, normals = points.positions(mesh), points.normals(mesh)
-            images = mirror_images(mesh, beyond, positions, spacing)
             cells = surface_cells(
-                positions, normals, images, neighbors=10, directions=12, limit=spacing
+                positions,
+                normals,
+                mirror_images(mesh, beyond, positions, spacing),
+                neighbors=10,
+                directions=12,
+                limit=spacing,
             )
             points = _settle(mesh, beyond, points.faces, positions + 1.3 * cells.to_centroids)
     return points.take(

@@ -84,8 +84,7 @@ def surface_nets(distance: Distance, low, high, spacing: float, *, slack: float 
     shape = np.ceil((np.asarray(high, np.float64) - low) / spacing).astype(np.int64)
     cells = _cells_near(distance, low, shape, spacing, slack)
     stride = np.asarray([(shape[1] + 32) * (shape[2] + 32), shape[2] + 32, 1])
-    corners = cells[:, None] + _CORNERS
-    keys, where = np.unique(corners @ stride, return_inverse=True)
+    keys, where = np.unique((cells[:, None] + _CORNERS) @ stride, return_inverse=True)
     where = where.reshape(-1, 8)
     at = np.stack([keys // stride[0], keys % stride[0] // stride[1], keys % stride[1]], axis=-1)
     values = in_chunks(distance, low + spacing * at)
@@ -115,8 +114,7 @@ def _cells_near(
 ) -> Int[np.ndarray, "n 3"]:
     """Find the cells of the finest grid whose corners may lie on both sides."""
     factor = 8
-    blocks = -(-shape // factor)
-    cells: np.ndarray = np.argwhere(np.ones(blocks, bool))
+    cells: np.ndarray = np.argwhere(np.ones(-(-shape // factor), bool))
     while True:
         size = factor * spacing
         level = in_chunks(distance, low + size * (cells + 0.5))

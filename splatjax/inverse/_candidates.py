@@ -89,25 +89,30 @@ def next_pictures(
             "default_candidates(splats, camera)"
         )
     medium, loss = recovery.medium, SquaredLoss()
-    channels, dtype = medium.channels, medium.eta.dtype
+    dtype = medium.eta.dtype
     setups = [Setup(splats, one.camera, one.lights) for one in candidates]
     pictures, _ = render_layers(setups, recovery.material, settings)
-    near = recovery.material.gaussians.variances.astype(dtype)
-    fit = eqx.Partial(fit_near, near=near, weights=weights)
+    fit = eqx.Partial(
+        fit_near, near=recovery.material.gaussians.variances.astype(dtype), weights=weights
+    )
     noise = recovery.relative_noise * recovery.scale**0.5
     predictions = []
     for candidate, picture in zip(candidates, pictures, strict=True):
         dark = np.zeros(picture.specular.shape)
-        observation = Observation(dark, candidate.camera, candidate.lights, deviation=1)
-        evidence = Evidence.of(observation, dtype)
+        evidence = Evidence.of(
+            Observation(dark, candidate.camera, candidate.lights, deviation=1), dtype
+        )
         unknowns = Unknowns.of(medium.eta, [candidate.intensity])
         problem = RecoveryProblem.of([picture], [evidence], unknowns, fit, loss, model)
         at_point = solution(problem, unknowns.start(medium))
         radiance = np.asarray(at_point.radiance[0])[np.asarray(problem.counted[0]) > 0]
         bright = float(np.sqrt(np.mean(radiance**2)))
         scale = max(noise * (bright or 1.0), np.finfo(float).tiny) ** -2
-        information = np.asarray(at_point.information, float) * scale
-        more = _marginal(information, channels, len(recovery.information))
+        more = _marginal(
+            np.asarray(at_point.information, float) * scale,
+            medium.channels,
+            len(recovery.information),
+        )
         predictions.append(Prediction(candidate, recovery.covariance(more)))
     return sorted(predictions, key=lambda prediction: prediction.worst.deviation)
 
@@ -116,17 +121,13 @@ def _marginal(information: np.ndarray, channels: int, size: int) -> np.ndarray:
     """Eliminate the factors of a picture from its information about coefficients and the transition
     to unresolved layers, and leave room for the factors of other pictures.
     """
-
-    def apart(size):
-        return np.r_[: 2 * channels, size - channels : size], np.r_[2 * channels : size - channels]
-
-    kept, factors = apart(len(information))
+    kept = np.r_[: 2 * channels, -channels:0]  # whatever the number of factors between them
+    factors = np.arange(2 * channels, len(information) - channels)
     mixed = information[np.ix_(kept, factors)]
     pseudo_inverse = np.linalg.pinv(information[np.ix_(factors, factors)])
-    whole, (places, _) = np.zeros((size, size)), apart(size)
-    marginal = information[np.ix_(kept, kept)] - mixed @ pseudo_inverse @ mixed.T
-    whole[np.ix_(places, places)] = marginal
-    return whole
+    marginal, corner = np.zeros((size, size)), np.ix_(kept, kept)
+    marginal[corner] = information[corner] - mixed @ pseudo_inverse @ mixed.T
+    return marginal
 
 
 def default_candidates(splats: Splats, camera: Camera, channels: int = 3) -> list[Candidate]:

@@ -258,8 +258,10 @@ def fit_scene(
     for step in range(steps + 1):
         evaluations = evaluate_all(x, plans)
         if max(float(one.overflow) for one in evaluations) > 0:
-            last = losses[-1] if losses else np.nan
-            report(f"step {step}: the scene exceeds the capacity of its plan; planning again", last)
+            report(
+                f"step {step}: the scene exceeds the capacity of its plan; planning again",
+                losses[-1] if losses else np.nan,
+            )
             plans, times = make_plans(moved(x), material, settings), times + 1
             evaluations = evaluate_all(x, plans)
         if step == 0:

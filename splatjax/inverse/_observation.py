@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, DTypeLike, Float
 
-from splatjax._records import check_values, numbers, record, several
+from splatjax._records import numbers, record, several, valid
 from splatjax.scene import AbstractLight, Camera
 
 # Coverage of a pixel behind which nothing else is seen.
@@ -80,7 +80,7 @@ class Observation(eqx.Module):
         converter=lambda values: None if values is None else jnp.asarray(values, bool), default=None
     )
     deviation: Float[Array, "height width channels"] | None = eqx.field(
-        converter=numbers, default=None
+        converter=numbers, default=None, metadata=valid("positive", lambda x: x > 0)
     )
     intensity: AbstractIntensity = KnownIntensity()
 
@@ -93,7 +93,6 @@ class Observation(eqx.Module):
                     f"Observation.{name} has {value.shape[0]} x {value.shape[1]} pixels, its "
                     f"camera {size[0]} x {size[1]} (height, width)"
                 )
-        check_values("Observation.deviation", self.deviation, "positive", lambda x: x > 0)
 
 
 class AbstractLoss(eqx.Module):
@@ -115,6 +114,7 @@ class SquaredLoss(AbstractLoss):
         return residuals
 
 
+@record
 class HuberLoss(AbstractLoss):
     r"""The square for small residuals and twice the absolute value times the bend for large ones,
     smoothly.
@@ -130,10 +130,9 @@ class HuberLoss(AbstractLoss):
     **Source:** Huber 1964; in this smooth form Charbonnier and others 1997.
     """
 
-    bend: float = eqx.field(static=True, default=2.0)
-
-    def __check_init__(self):
-        check_values("HuberLoss.bend", self.bend, "positive (deviations)", lambda x: x > 0)
+    bend: float = eqx.field(
+        static=True, default=2.0, metadata=valid("positive (deviations)", lambda x: x > 0)
+    )
 
     def root(self, residuals: Float[Array, "..."]) -> Float[Array, "..."]:
         squared = (residuals / self.bend) ** 2
@@ -189,13 +188,18 @@ class Evidence(eqx.Module):
         if observation.mask is not None:
             known &= np.asarray(observation.mask)
         picture = np.where(known[..., None], picture, 0.0)
-        brightness = float(np.sqrt(np.mean(picture[known] ** 2))) if known.any() else 0.0
-        brightness = brightness or 1.0
-        deviation = np.full(picture.shape, _UNKNOWN_NOISE * brightness)
-        if observation.deviation is not None:
-            deviation = np.asarray(observation.deviation, np.float64)
-        arrays = jnp.asarray(picture, dtype), jnp.asarray(deviation, dtype), jnp.asarray(known)
-        return cls(*arrays, jnp.asarray(np.median(deviation) / brightness, dtype))
+        brightness = (float(np.sqrt(np.mean(picture[known] ** 2))) if known.any() else 0.0) or 1.0
+        deviation = (
+            np.full(picture.shape, _UNKNOWN_NOISE * brightness)
+            if observation.deviation is None
+            else np.asarray(observation.deviation, np.float64)
+        )
+        return cls(
+            jnp.asarray(picture, dtype),
+            jnp.asarray(deviation, dtype),
+            jnp.asarray(known),
+            jnp.asarray(np.median(deviation) / brightness, dtype),
+        )
 
     def counted(
         self, coverage: Float[Array, "height width"], background: AbstractBackground

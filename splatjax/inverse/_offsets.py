@@ -84,14 +84,13 @@ class NormalOffsets(AbstractPart):
             tree, normals, areas, self.smoothness, -(-count // _ROUNDED) * _ROUNDED
         )
         around, tangents, slopes = _slopes(tree, normals)
-        gain = np.sqrt(np.mean(np.sum(weights**2, axis=1)))
         return OffsetTables(
             jnp.asarray(near, jnp.int32),
             jnp.asarray(weights, dtype),
             jnp.asarray(around, jnp.int32),
             jnp.asarray(slopes, dtype),
             jnp.asarray(tangents, dtype),
-            jnp.asarray(gain, dtype),
+            jnp.asarray(np.sqrt(np.mean(np.sum(weights**2, axis=1))), dtype),
         )
 
     def coordinates(self, setup: Setup) -> Float[Array, " splats"]:

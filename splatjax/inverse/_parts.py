@@ -188,8 +188,11 @@ class CameraPoses(AbstractPart):
     def moved(self, setup: Setup, x, prepared: Float[Array, "3"]) -> Setup:
         middle, camera, turned = prepared, setup.camera, rotation(self.turn * x[0])
         position = middle + turned @ (camera.position - middle) + self.shift * x[1]
-        pose = position, camera.rotation @ turned.T
-        return eqx.tree_at(lambda s: (s.camera.position, s.camera.rotation), setup, pose)
+        return eqx.tree_at(
+            lambda s: (s.camera.position, s.camera.rotation),
+            setup,
+            (position, camera.rotation @ turned.T),
+        )
 
 
 def rotation(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:

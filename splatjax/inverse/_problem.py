@@ -148,8 +148,9 @@ def fit_near(
     profile: AbstractProfile, near: Float[Array, " gaussians"], weights: AbstractWeights
 ) -> SumOfGaussians:
     """Fit Gaussians whose variances lie near given ones, and move as the profile does."""
-    start = GivenVariances(near)
-    return fit_gaussians(profile, len(near), weights=weights, start=start, throw=False).gaussians
+    return fit_gaussians(
+        profile, len(near), weights=weights, start=GivenVariances(near), throw=False
+    ).gaussians
 
 
 class RecoveryProblem(eqx.Module):

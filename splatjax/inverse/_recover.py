@@ -107,9 +107,11 @@ def recover(
     without absorption, for different indices of surface and starts, and for a picture none of whose
     pixels counts; an error with the message of `result` if `throw`.
     """
-    starts = [starts] if isinstance(starts, Medium) else starts
     dtype, observations = jnp.result_type(float), list(observations)
-    starts = [jax.tree.map(lambda leaf: leaf.astype(dtype), start) for start in starts]
+    starts = [
+        jax.tree.map(lambda leaf: leaf.astype(dtype), start)
+        for start in ([starts] if isinstance(starts, Medium) else starts)
+    ]
     _check(observations, splats, starts, surface)
     report = progress or (lambda stage, medium: None)
     eta, channels = starts[0].eta, starts[0].channels
@@ -121,8 +123,13 @@ def recover(
     surface = surface or Material(_unweighed(wide, channels), eta=eta[0], specular=0)
 
     def problem_at(variances, fit, plans=None, derivative=True):
-        material = surface.surface_of(_unweighed(variances, channels))
-        pictures, plans = render_layers(setups, material, settings, plans, derivative)
+        pictures, plans = render_layers(
+            setups,
+            surface.surface_of(_unweighed(variances, channels)),
+            settings,
+            plans,
+            derivative,
+        )
         return RecoveryProblem.of(pictures, evidence, unknowns, fit, loss, model), plans
 
     report(f"rendering {len(wide)} layers of {counted(len(observations), 'picture')}", starts[0])
@@ -131,8 +138,9 @@ def recover(
     report(
         f"searching from {counted(len(starts), 'start')} among {problem.pixels} pixels", starts[0]
     )
-    ends = [search(problem, unknowns.start(start)) for start in starts]
-    points, costs, steps, _ = zip(*ends, strict=True)
+    points, costs, steps, _ = zip(
+        *(search(problem, unknowns.start(start)) for start in starts), strict=True
+    )
     costs = np.nan_to_num(np.asarray(costs, float), nan=np.inf)
     point, steps = points[int(np.argmin(costs))], sum(map(int, steps))
     settled, plans, rounds = False, None, 0
@@ -157,10 +165,11 @@ def recover(
         reached, size = solution(problem, point), point.size
         chi_squared = cost / max(problem.pixels * channels - size, 1)
         covariance = inverse(np.asarray(reached.information, np.float64)[:size, :size])
-        deviations = np.sqrt(np.diagonal(covariance))
-        deviations *= 1.0 if noise_is_known else float(chi_squared) ** 0.5
-        moved = np.abs(point - before)
-        settled = bool(converged) and np.all(moved <= np.maximum(_SETTLED, 0.1 * deviations))
+        scale = 1.0 if noise_is_known else float(chi_squared) ** 0.5
+        deviations = scale * np.sqrt(np.diagonal(covariance))
+        settled = bool(converged) and np.all(
+            np.abs(point - before) <= np.maximum(_SETTLED, 0.1 * deviations)
+        )
     pictures, residuals = compared(reached.radiance, problem.counted, evidence)
     recovery = Recovery(
         medium=unknowns.medium(point),

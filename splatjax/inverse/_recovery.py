@@ -54,7 +54,8 @@ class AbstractEstimate(eqx.Module):
         self,
     ) -> tuple[Float[np.ndarray, " channels"], Float[np.ndarray, " channels"]]:
         """Compute the standard deviations of the logarithms of `sigma_a` and of `sigma_s_prime`."""
-        return roots(self.covariance())
+        deviations = np.sqrt(np.diagonal(self.covariance(), axis1=1, axis2=2))
+        return deviations[:, 0], deviations[:, 1]
 
     def combinations(self) -> list[tuple[Combination, Combination]]:
         """Find, for each channel, the combination of coefficients with the least error and the one
@@ -115,14 +116,6 @@ def best_and_worst(covariance: Float[np.ndarray, "2 2"]) -> tuple[Combination, C
         for (a, s), deviation in zip(axes.T, deviations, strict=True)
     )
     return best, worst
-
-
-def roots(
-    covariances: Float[np.ndarray, "channels 2 2"],
-) -> tuple[Float[np.ndarray, " channels"], Float[np.ndarray, " channels"]]:
-    """Compute the standard deviations of both coefficients."""
-    deviations = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
-    return deviations[:, 0], deviations[:, 1]
 
 
 def inverse(
@@ -236,7 +229,7 @@ class Recovery(AbstractEstimate):
         """Compute the errors that noise alone leaves: how far searches of pictures that are taken
         again would scatter.
         """
-        return roots(self.covariance(resolution=0.0))
+        return Estimate(self.medium, self.covariance(resolution=0.0)).relative_errors()
 
     def summary(self, channels: Sequence[str] | None = None) -> str:
         """Format the coefficients, their errors, and what the pictures do not determine.

@@ -169,8 +169,7 @@ def write_animation(
         )
     # Whole milliseconds, but every frame begins when it should.
     begins = [round(1000 * i / frames_per_second) for i in range(len(frames) + 1)]
-    durations = np.diff(begins).tolist()
-    options = {"save_all": True, "duration": durations, "loop": 0, "lossless": True}
+    options = {"save_all": True, "duration": np.diff(begins).tolist(), "loop": 0, "lossless": True}
     with atomic_path(path) as temporary:
         _Film(frames).save(temporary, format="WEBP", **options)
 
@@ -313,7 +312,6 @@ def _layout(channels: int, lights: int, gaussians: int, has_single: bool) -> dic
         return [f"{layer}.{k}" for k in ("RGB" if channels == 3 else range(1, channels + 1))]
 
     color = ["albedo", "irradiance", "diffuse", "specular", *([_SINGLE] if has_single else [])]
-    diffusion = [colors(f"diffusion.{k}") for k in range(1, gaussians + 1)]
     layout: dict[str, Any] = {
         "beauty": list("RGB") if channels == 3 else colors("beauty"),
         "coverage": "A",
@@ -321,7 +319,9 @@ def _layout(channels: int, lights: int, gaussians: int, has_single: bool) -> dic
         **{layer: [f"{layer}.{axis}" for axis in "XYZ"] for layer in ("position", "normal")},
         **{layer: colors(layer) for layer in color},
         "shadow": [f"shadow.{k}" for k in range(1, lights + 1)],
-        "layers": np.reshape(diffusion, (gaussians, channels)),
+        "layers": np.reshape(
+            [colors(f"diffusion.{k}") for k in range(1, gaussians + 1)], (gaussians, channels)
+        ),
     }
     return {field: np.asarray(names) for field, names in layout.items()}
 

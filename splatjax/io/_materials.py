@@ -191,8 +191,10 @@ def save_material(
         tables["medium"] = _plain_medium(profile.medium)
     single, gaussians = material.single_scattering, material.gaussians
     if single is not None:
-        strength = {"strength": plain_numbers(single.strength)}
-        tables["single_scattering"] = _plain_medium(single.medium) | strength
+        tables["single_scattering"] = {
+            **_plain_medium(single.medium),
+            "strength": plain_numbers(single.strength),
+        }
     tables |= {
         "surface": {name: plain_numbers(getattr(material, name)) for name in _SURFACE},
         "source": dict(source or {}),
@@ -283,15 +285,20 @@ def _description(profile: Dipole | BetterDipole | PhotonBeam | LayeredMultipole)
 
 
 def _plain_medium(medium: Medium) -> dict[str, Any]:
-    values = {name: plain_numbers(getattr(medium, name)) for name in _COEFFICIENTS[1:]}
-    return {"unit": COEFFICIENT_UNIT, **values}
+    return {
+        "unit": COEFFICIENT_UNIT,
+        **{name: plain_numbers(getattr(medium, name)) for name in _COEFFICIENTS[1:]},
+    }
 
 
 def _plain_layer(layer: Layer | Film) -> dict[str, Any]:
     if isinstance(layer, Film):
         return {"optical_depth": plain_numbers(layer.optical_depth)}
-    thickness = {"thickness": plain_numbers(layer.thickness), "thickness_unit": THICKNESS_UNIT}
-    return thickness | _plain_medium(layer.medium)
+    return {
+        "thickness": plain_numbers(layer.thickness),
+        "thickness_unit": THICKNESS_UNIT,
+        **_plain_medium(layer.medium),
+    }
 
 
 def dipole_starts() -> DipoleStarts:

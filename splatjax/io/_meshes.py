@@ -184,8 +184,11 @@ def _read_pieces(path: Path, up: str) -> list[Piece]:
                 f"{path}: holds no triangle; give a triangle mesh, or read points with read_splats"
             )
         corners = sum(3 * len(each.mesh.faces) + len(each.mesh.vertices) for each, _ in placed)
-        size = f"{path}: a scene of {corners} corners"
-        check_memory(size, _BYTES_PER_CORNER * corners, "export a part of it")
+        check_memory(
+            f"{path}: a scene of {corners} corners",
+            _BYTES_PER_CORNER * corners,
+            "export a part of it",
+        )
         repeats = not _ENDS.search(found["contents"])
         return [_placed(piece, matrix, up, repeats) for piece, matrix in placed]
 

@@ -48,23 +48,27 @@ def read_observations(path: StrPath) -> list[Observation]:
     """
     path = Path(path)
     file = Table(path, "", read_toml(path, "name one that lists pictures"), ["pictures"])
-    entries = ("file", "mask", "noise", "intensity", "camera", "lights")
-    return [_observation(table) for table in file.tables("pictures", entries)]
+    return [
+        _observation(table)
+        for table in file.tables(
+            "pictures", ("file", "mask", "noise", "intensity", "camera", "lights")
+        )
+    ]
 
 
 def picture_paths(path: StrPath) -> list[Path]:
     """Return the files that the observations of a file are read from, itself first."""
     path = Path(path)
     pictures = read_toml(path, "name one that lists pictures")["pictures"]
-    names = [each[name] for each in pictures for name in ("file", "mask") if name in each]
-    return [path, *(path.parent / name for name in names)]
+    return [path] + [
+        path.parent / each[name] for each in pictures for name in ("file", "mask") if name in each
+    ]
 
 
 def _observation(table: Table) -> Observation:
     picture = _picture(table, "file")
-    mask = deviation = None
-    if "mask" in table.entries:
-        mask = np.any(_picture(table, "mask") > 0, axis=-1)
+    has_mask, deviation = "mask" in table.entries, None
+    mask = np.any(_picture(table, "mask") > 0, axis=-1) if has_mask else None
     if "noise" in table.entries:
         noise = table.numbers("noise")
         table.make(check_values, "noise", noise, "positive", lambda x: x > 0)
@@ -76,11 +80,17 @@ def _observation(table: Table) -> Observation:
     vectors = [camera.numbers(name).tolist() for name in ("position", "target")]
     up = camera.numbers("up").tolist() if "up" in camera.entries else None
     height, width, channels = picture.shape
-    fov = camera.number("fov", 25.0)
     return table.make(
         Observation,
         picture,
-        camera.make(Camera.look_at, *vectors, up=up, fov=fov, width=width, height=height),
+        camera.make(
+            Camera.look_at,
+            *vectors,
+            up=up,
+            fov=camera.number("fov", 25.0),
+            width=width,
+            height=height,
+        ),
         tuple(_light(each, channels) for each in table.tables("lights", _LIGHT_ENTRIES)),
         mask,
         deviation,

@@ -220,8 +220,11 @@ def _splat_fields(
             "ellipsoids carry baked radiance and no surface; give a PLY of surface points (x y z, "
             "and nx ny nz, radius, red green blue where known)"
         )
-    single = {name: column for name, column in columns.items() if column.dtype.kind in "iuf"}
-    single = {name: column for name, column in single.items() if column.ndim == 1}
+    single = {
+        name: column
+        for name, column in columns.items()
+        if column.dtype.kind in "iuf" and column.ndim == 1
+    }
     fields: dict[str, Any] = dict.fromkeys(_COLUMNS)
     for field, aliases in _COLUMNS.items():
         names = next((names for names in aliases if single.keys() & set(names)), aliases[0])

@@ -130,8 +130,10 @@ def load_with_trimesh(path: Path, kind: str) -> dict[str, Any]:
     folder, data = _Folder(path), path.read_bytes()
     loaders, count = cast(dict[str, Any], load.mesh_loaders), _count_triangles(kind, data)
     found = loaders[kind](BytesIO(data), resolver=folder, fix_texture=False)
-    elements = found.get("metadata", {}).get("_ply_raw", {})
-    columns = {name: _columns(name, element) for name, element in elements.items()}
+    columns = {
+        name: _columns(name, element)
+        for name, element in found.get("metadata", {}).get("_ply_raw", {}).items()
+    }
     for fault in folder.faults:
         warnings.warn(f"{path}: {fault}, and its colors are left out", stacklevel=2)
     return found | {"triangles": count, "contents": data, "columns": columns}

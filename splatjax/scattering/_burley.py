@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from splatjax._chunking import jit_unless_traced
-from splatjax._records import check_values, numbers, record
+from splatjax._records import numbers, record, valid
 from splatjax.gaussians import AbstractProfile
 
 
@@ -65,15 +65,15 @@ class Burley(AbstractProfile):
     subsurface scattering".
     """
 
-    albedo: Float[Array, " channels"] = eqx.field(converter=numbers)
-    free_path: Float[Array, " channels"] = eqx.field(converter=numbers)
+    albedo: Float[Array, " channels"] = eqx.field(
+        converter=numbers, metadata=valid("in [0, 1]", lambda x: (x >= 0) & (x <= 1))
+    )
+    free_path: Float[Array, " channels"] = eqx.field(
+        converter=numbers, metadata=valid("positive (mm)", lambda x: x > 0)
+    )
     scaling: AbstractBurleyScaling = Searchlight()
 
     singular: ClassVar[bool] = True
-
-    def __check_init__(self):
-        check_values("Burley.albedo", self.albedo, "in [0, 1]", lambda x: (x >= 0) & (x <= 1))
-        check_values("Burley.free_path", self.free_path, "positive (mm)", lambda x: x > 0)
 
     @jit_unless_traced
     def __call__(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:

@@ -55,8 +55,9 @@ class AbstractDipole(AbstractHalfSpace):
         shape = (*r.shape, self.medium.channels)
         squared_radius = jnp.broadcast_to((r * r)[..., None], shape)
         depth = jnp.broadcast_to(self.length_scale(), shape)
-        albedo_prime = jnp.broadcast_to(self.medium.albedo_prime, shape)
-        return albedo_prime * self.exitance(depth, squared_radius)
+        return jnp.broadcast_to(self.medium.albedo_prime, shape) * self.exitance(
+            depth, squared_radius
+        )
 
     def exitance(
         self, depth: Float[Array, "*shape"], squared_radius: Float[Array, "*shape"]

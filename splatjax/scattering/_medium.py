@@ -5,7 +5,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from splatjax._records import check_values, numbers, record
+from splatjax._records import check_values, numbers, record, valid
 
 
 @record
@@ -22,14 +22,15 @@ class Medium(eqx.Module):
     not checked.
     """
 
-    sigma_a: Float[Array, " channels"] = eqx.field(converter=numbers)
-    sigma_s_prime: Float[Array, " channels"] = eqx.field(converter=numbers)
-    eta: Float[Array, " channels"] = eqx.field(converter=numbers)
-
-    def __check_init__(self):
-        check_values("Medium.sigma_a", self.sigma_a, "at least 0 (1/mm)", lambda x: x >= 0)
-        check_values("Medium.sigma_s_prime", self.sigma_s_prime, "positive (1/mm)", lambda x: x > 0)
-        check_values("Medium.eta", self.eta, "positive", lambda x: x > 0)
+    sigma_a: Float[Array, " channels"] = eqx.field(
+        converter=numbers, metadata=valid("at least 0 (1/mm)", lambda x: x >= 0)
+    )
+    sigma_s_prime: Float[Array, " channels"] = eqx.field(
+        converter=numbers, metadata=valid("positive (1/mm)", lambda x: x > 0)
+    )
+    eta: Float[Array, " channels"] = eqx.field(
+        converter=numbers, metadata=valid("positive", lambda x: x > 0)
+    )
 
     @property
     def channels(self) -> int:
@@ -66,12 +67,9 @@ class Layer(eqx.Module):
     """
 
     medium: Medium
-    thickness: Float[Array, ""] = eqx.field(converter=numbers)
-
-    def __check_init__(self):
-        check_values(
-            "Layer.thickness", self.thickness, "at least 0 (mm)", lambda x: x >= 0, finite=False
-        )
+    thickness: Float[Array, ""] = eqx.field(
+        converter=numbers, metadata=valid("at least 0 (mm)", lambda x: x >= 0, finite=False)
+    )
 
     @property
     def channels(self) -> int:
@@ -105,10 +103,9 @@ class Film(eqx.Module):
     **Source:** diffuse transmittance: the integral of `2 mu exp(-t / mu)` over the cosine.
     """
 
-    optical_depth: Float[Array, " channels"] = eqx.field(converter=numbers)
-
-    def __check_init__(self):
-        check_values("Film.optical_depth", self.optical_depth, "at least 0", lambda x: x >= 0)
+    optical_depth: Float[Array, " channels"] = eqx.field(
+        converter=numbers, metadata=valid("at least 0", lambda x: x >= 0)
+    )
 
 
 def check_stack(layers: tuple[Layer | Film, ...]) -> None:

@@ -180,8 +180,10 @@ class PhotonBeam(AbstractHalfSpace):
         """Compute `2 pi` times the integral of `r R(r)`: single scattering exactly, multiple
         scattering by quadrature.
         """
-        single = SingleScattering(self.medium).total_reflectance()
-        return self.multiply_scattered().total_reflectance() + single
+        return (
+            self.multiply_scattered().total_reflectance()
+            + SingleScattering(self.medium).total_reflectance()
+        )
 
     def multiply_scattered(self) -> AbstractProfile:
         """Return the light scattered more than once as a profile, finite at `r = 0`: for a material

@@ -154,9 +154,8 @@ def _log_sinhc(y):
     return y * (1 / 6 - y * (1 / 180 - y * (1 / 2835 - y / 37800)))
 
 
-_SHALLOWEST = (
-    1e-3  # mean free paths: the quadrature does not resolve a source nearer to the surface
-)
+# Mean free paths: the quadrature does not resolve a source nearer to the surface.
+_SHALLOWEST = 1e-3
 
 
 class AbstractSlabProfile(AbstractProfile):

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from splatjax._chunking import jit_unless_traced
-from splatjax._records import Numbers, check_values, numbers, record
+from splatjax._records import Numbers, check_values, numbers, record, valid
 from splatjax.gaussians import AbstractProfile
 
 # Fraction of the peak above which pixels determine the center.
@@ -37,15 +37,20 @@ class Tabulated(AbstractProfile):
     shapes that do not match.
     """
 
-    radii: Float[Array, " samples"] = eqx.field(converter=numbers)
-    values: Float[Array, "samples channels"] = eqx.field(converter=numbers)
-    deviation: Float[Array, "samples channels"] | None = eqx.field(converter=numbers, default=None)
+    radii: Float[Array, " samples"] = eqx.field(
+        converter=numbers, metadata=valid("at least 0 (mm)", lambda x: x >= 0)
+    )
+    values: Float[Array, "samples channels"] = eqx.field(
+        converter=numbers, metadata=valid("numbers (1/mm^2)")
+    )
+    deviation: Float[Array, "samples channels"] | None = eqx.field(
+        converter=numbers,
+        default=None,
+        metadata=valid("at least 0 (1/mm^2)", lambda x: x >= 0),
+    )
     total: Float[Array, " channels"] | None = eqx.field(converter=numbers, default=None)
 
     def __check_init__(self):
-        check_values("Tabulated.radii", self.radii, "at least 0 (mm)", lambda x: x >= 0)
-        check_values("Tabulated.values", self.values, "numbers (1/mm^2)", lambda x: x == x)
-        check_values("Tabulated.deviation", self.deviation, "at least 0 (1/mm^2)", lambda x: x >= 0)
         check_values(
             "the number of Tabulated.radii", len(self.radii), "at least 2", lambda x: x >= 2
         )

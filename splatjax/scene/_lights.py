@@ -16,6 +16,11 @@ from splatjax._records import check_values, numbers, record
 from splatjax.gaussians import gaussian
 
 _TOUCHING = 1e-6  # mm
+# Of fields of lights: what they must be, and whether they are. All others must be finite.
+_EXPECTED = {
+    "direction": ("the way light travels, not zero", np.any),
+    "variance": ("positive (mm^2)", lambda x: x > 0),
+}
 
 
 class AbstractLight(eqx.Module):
@@ -25,22 +30,20 @@ class AbstractLight(eqx.Module):
     """The field with the power of each channel."""
 
     def __check_init__(self):
-        for field in dataclasses.fields(self):
-            name, values = f"{type(self).__name__}.{field.name}", getattr(self, field.name)
-            if field.name == "direction":
-                check_values(name, values, "the way light travels, not zero", np.any)
-            elif field.name == "variance":
-                check_values(name, values, "positive (mm^2)", lambda x: x > 0)
-            else:
-                check_values(name, values, "finite", lambda x: x == x)
+        for name in (field.name for field in dataclasses.fields(self)):
+            expected = _EXPECTED.get(name, ("finite", lambda x: x == x))
+            check_values(f"{type(self).__name__}.{name}", getattr(self, name), *expected)
 
     def with_channels(self, channels: int) -> "AbstractLight":
         """Repeat the strength of a light of one channel for so many channels."""
         strength = getattr(self, self.strength, None)
         if strength is None or strength.shape != (1,):
             return self
-        repeated = jnp.broadcast_to(strength, (channels,))
-        return eqx.tree_at(lambda light: getattr(light, light.strength), self, repeated)
+        return eqx.tree_at(
+            lambda light: getattr(light, light.strength),
+            self,
+            jnp.broadcast_to(strength, (channels,)),
+        )
 
     @abc.abstractmethod
     def samples(self) -> tuple["AbstractLightSample", ...]:
@@ -208,6 +211,7 @@ def stack_lights(lights: tuple[AbstractLight, ...]) -> list[StackedLights]:
     groups = []
     for members in kinds.values():
         indices, samples = zip(*members, strict=True)
-        stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *samples)
-        groups.append(StackedLights(stacked, indices))
+        groups.append(
+            StackedLights(jax.tree.map(lambda *leaves: jnp.stack(leaves), *samples), indices)
+        )
     return groups

@@ -12,7 +12,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
 from splatjax._chunking import take_points
-from splatjax._records import Numbers, as_floats, check_values, numbers, record, several
+from splatjax._records import Numbers, as_floats, check_values, numbers, record, several, valid
 from splatjax.gaussians import SumOfGaussians
 from splatjax.scattering import SingleScattering
 
@@ -43,9 +43,11 @@ class Camera(eqx.Module):
     **Raises:** `ValueError` for a picture without pixels, and for numbers that are not finite.
     """
 
-    position: Float[Array, "3"] = eqx.field(converter=numbers)
-    rotation: Float[Array, "3 3"] = eqx.field(converter=numbers)
-    focal_length: Float[Array, ""] = eqx.field(converter=numbers)
+    position: Float[Array, "3"] = eqx.field(converter=numbers, metadata=valid("finite (mm)"))
+    rotation: Float[Array, "3 3"] = eqx.field(converter=numbers, metadata=valid("finite"))
+    focal_length: Float[Array, ""] = eqx.field(
+        converter=numbers, metadata=valid("positive", lambda x: x > 0)
+    )
     width: int = eqx.field(static=True)
     height: int = eqx.field(static=True)
     near: float = eqx.field(static=True, default=1e-2)
@@ -56,9 +58,6 @@ class Camera(eqx.Module):
                 f"a picture of {self.width} x {self.height} pixels has no pixel; width and height "
                 "must be at least 1"
             )
-        check_values("Camera.position", self.position, "finite (mm)", lambda x: x == x)
-        check_values("Camera.rotation", self.rotation, "finite", lambda x: x == x)
-        check_values("Camera.focal_length", self.focal_length, "positive", lambda x: x > 0)
 
     @classmethod
     def look_at(
@@ -100,8 +99,8 @@ class Camera(eqx.Module):
                     "[0, 0, -1] to look down"
                 )
         rotation = rotation_towards(forward / jnp.linalg.norm(forward), up)
-        focal_length = 0.5 / math.tan(math.radians(fov) / 2)
-        return cls(eye, rotation, as_floats(focal_length, eye.dtype), width, height, near)
+        focal_length = as_floats(0.5 / math.tan(math.radians(fov) / 2), eye.dtype)
+        return cls(eye, rotation, focal_length, width, height, near)
 
 
 def rotation_towards(forward: Float[Array, "3"], up: Float[Array, "3"]) -> Float[Array, "3 3"]:
@@ -112,8 +111,8 @@ def rotation_towards(forward: Float[Array, "3"], up: Float[Array, "3"]) -> Float
 
 
 _ROUNDING = 1e-5  # by which an albedo may leave [0, 1]
-_FINITE = "finite: drop such splats before rendering"
-_POSITIVE = "finite and at least 0"
+_FINITE = valid("finite: drop such splats before rendering")
+_NOT_NEGATIVE = valid("finite and at least 0", lambda x: x >= 0)
 
 
 @record
@@ -140,25 +139,24 @@ class Splats(eqx.Module):
     negative radii and areas, and for an albedo outside [0, 1].
     """
 
-    centers: Float[Array, "splats 3"] = eqx.field(converter=numbers)
-    normals: Float[Array, "splats 3"] = eqx.field(converter=numbers)
-    radii: Float[Array, " splats"] = eqx.field(converter=numbers)
-    areas: Float[Array, " splats"] = eqx.field(converter=numbers)
-    albedo: Float[Array, "splats channels"] | None = eqx.field(converter=numbers, default=None)
-    specular: Float[Array, " splats"] | None = eqx.field(converter=numbers, default=None)
-    roughness: Float[Array, " splats"] | None = eqx.field(converter=numbers, default=None)
-
-    def __check_init__(self):
-        for name in ("centers", "normals"):
-            check_values(f"Splats.{name}", getattr(self, name), _FINITE, lambda x: x == x)
-        for name in ("radii", "areas", "specular", "roughness"):
-            check_values(f"Splats.{name}", getattr(self, name), _POSITIVE, lambda x: x >= 0)
-        check_values(
-            "Splats.albedo",
-            self.albedo,
+    centers: Float[Array, "splats 3"] = eqx.field(converter=numbers, metadata=_FINITE)
+    normals: Float[Array, "splats 3"] = eqx.field(converter=numbers, metadata=_FINITE)
+    radii: Float[Array, " splats"] = eqx.field(converter=numbers, metadata=_NOT_NEGATIVE)
+    areas: Float[Array, " splats"] = eqx.field(converter=numbers, metadata=_NOT_NEGATIVE)
+    albedo: Float[Array, "splats channels"] | None = eqx.field(
+        converter=numbers,
+        default=None,
+        metadata=valid(
             "in [0, 1]: linear colors, 8-bit values divided by 255 and decoded",
             lambda x: (x >= -_ROUNDING) & (x <= 1 + _ROUNDING),
-        )
+        ),
+    )
+    specular: Float[Array, " splats"] | None = eqx.field(
+        converter=numbers, default=None, metadata=_NOT_NEGATIVE
+    )
+    roughness: Float[Array, " splats"] | None = eqx.field(
+        converter=numbers, default=None, metadata=_NOT_NEGATIVE
+    )
 
     @property
     def count(self) -> int:
@@ -205,15 +203,18 @@ class Material(eqx.Module):
     """
 
     gaussians: SumOfGaussians
-    eta: Float[Array, ""] = eqx.field(converter=numbers, default=1.4)
-    specular: Float[Array, ""] = eqx.field(converter=numbers, default=0.18)
-    roughness: Float[Array, ""] = eqx.field(converter=numbers, default=0.3)
+    eta: Float[Array, ""] = eqx.field(
+        converter=numbers, default=1.4, metadata=valid("positive", lambda x: x > 0)
+    )
+    specular: Float[Array, ""] = eqx.field(
+        converter=numbers, default=0.18, metadata=valid("at least 0", lambda x: x >= 0)
+    )
+    roughness: Float[Array, ""] = eqx.field(
+        converter=numbers, default=0.3, metadata=valid("at least 0", lambda x: x >= 0)
+    )
     single_scattering: SingleScattering | None = None
 
     def __check_init__(self):
-        check_values("Material.eta", self.eta, "positive", lambda x: x > 0)
-        check_values("Material.specular", self.specular, "at least 0", lambda x: x >= 0)
-        check_values("Material.roughness", self.roughness, "at least 0", lambda x: x >= 0)
         single = self.single_scattering
         if single is not None and single.channels != self.channels:
             raise ValueError(
@@ -280,8 +281,7 @@ class Scene(eqx.Module):
     material: Material
 
     def __post_init__(self):
-        channels = self.material.channels
-        self.lights = tuple(light.with_channels(channels) for light in self.lights)
+        self.lights = tuple(light.with_channels(self.material.channels) for light in self.lights)
 
 
 class Frame(eqx.Module):

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from splatjax._records import check_values, numbers, record
+from splatjax._records import numbers, record, valid
 from splatjax.scattering import moment_outside, reflectance
 
 _SINE = [(-1) ** n * math.pi ** (2 * n + 1) / math.factorial(2 * n + 1) for n in range(8)]
@@ -114,12 +114,10 @@ class HenyeyGreenstein(AbstractPhaseFunction):
     nothing is singular at `g = 0`.
     """
 
-    g: Float[Array, "*layers"] = eqx.field(converter=numbers)
-
-    def __check_init__(self):
-        check_values(
-            "HenyeyGreenstein.g", self.g, "between -1 and 1, neither included", lambda x: abs(x) < 1
-        )
+    g: Float[Array, "*layers"] = eqx.field(
+        converter=numbers,
+        metadata=valid("between -1 and 1, neither included", lambda x: abs(x) < 1),
+    )
 
     def anisotropy(self, layers, dtype):
         if self.g.ndim and self.g.shape[0] != layers:

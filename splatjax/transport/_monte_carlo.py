@@ -81,13 +81,6 @@ class LayeredMedia(eqx.Module):
         """
         return 1 / self.sigma_s[self.first]
 
-    def stack(self, channel: Int[Array, ""]) -> Stack:
-        """Return the geometry of one channel, in its unit."""
-        unit = self.unit[channel]
-        return Stack(
-            self.sigma_s[:, channel] * unit, self.thickness[:, channel] / unit, self.eta[:, channel]
-        )
-
     def shared_walks(self) -> list[np.ndarray]:
         """Group the channels, by number, that differ in absorption and in scale alone: they share a
         walk.
@@ -99,8 +92,9 @@ class LayeredMedia(eqx.Module):
             return [np.asarray([channel]) for channel in range(self.sigma_a.shape[1])]
         sigma_s, thickness, eta = (np.asarray(values) for values in geometry)
         unit = 1 / sigma_s[self.first]
-        walks = np.concatenate([sigma_s * unit, thickness / unit, eta])
-        _, group = np.unique(walks, axis=1, return_inverse=True)
+        _, group = np.unique(
+            np.concatenate([sigma_s * unit, thickness / unit, eta]), axis=1, return_inverse=True
+        )
         return [np.flatnonzero(group == number) for number in range(group.max() + 1)]
 
 
@@ -308,6 +302,8 @@ def _walk_of(
     """Set up the walk of a group of channels, in the free paths of the first of them."""
     unit = media.unit[group]
     coefficients = media.sigma_a[:, group], media.sigma_s[:, group]
+    thickness, eta = media.thickness[:, group[0]], media.eta[:, group[0]]
+    stack = Stack(media.sigma_s[:, group[0]] * unit[0], thickness / unit[0], eta)
 
     def optics(sigma_a, sigma_s):
         return Optics.of(sigma_a, sigma_s, unit)
@@ -321,7 +317,7 @@ def _walk_of(
     return Walk(
         setup=setup,
         key=jax.random.fold_in(setup.key, number),
-        stack=jax.lax.stop_gradient(media.stack(group[0])),
+        stack=jax.lax.stop_gradient(stack),
         optics=optics(*coefficients),
         slopes=slopes,
         edges=setup.edges[None] / jax.lax.stop_gradient(unit)[:, None],

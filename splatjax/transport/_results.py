@@ -185,8 +185,12 @@ class MonteCarlo(AbstractTallies):
 
     def profile(self) -> Tabulated:
         """Return the reflectance as a profile; its total includes light beyond the last ring."""
-        total = self.total_reflectance.value
-        return Tabulated(self.radii, self.reflected.value, self.reflected.deviation, total)
+        return Tabulated(
+            self.radii,
+            self.reflected.value,
+            self.reflected.deviation,
+            self.total_reflectance.value,
+        )
 
 
 @eqx.filter_jit

@@ -108,8 +108,11 @@ def _start(walk: Walk) -> _State:
         Sum.zeros((channels, 2 * (rings + 1) + 1, moments), dtype),
         Sum.zeros((layers, channels, moments), dtype),
     )
-    state = _State(photons, weights, slopes, tally, number[0], number[0])
-    return _launch(walk, state, photons.place == IDLE)
+    return _launch(
+        walk,
+        _State(photons, weights, slopes, tally, number[0], number[0]),
+        photons.place == IDLE,
+    )
 
 
 @eqx.filter_jit
@@ -185,8 +188,14 @@ def _launch(walk: Walk, state: _State, free: Bool[Array, " photons"]) -> _State:
     )
     started_weight = jnp.broadcast_to(jnp.where(begins, weight, zero), weights.carried.shape)
     weights = PathWeights(weights.carried + started_weight, weights.absorbed)
-    started = state.started + jnp.sum(begins, dtype=jnp.int32)
-    return _State(photons, weights, slopes, state.tally, started, state.round)
+    return _State(
+        photons,
+        weights,
+        slopes,
+        state.tally,
+        started=state.started + jnp.sum(begins, dtype=jnp.int32),
+        round=state.round,
+    )
 
 
 _ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
@@ -220,8 +229,7 @@ def evenly(key: Key[Array, ""], number: Int[Array, " lanes"], dtype) -> Float[Ar
 
     Means over a smooth function of one of them are nearly exact.
     """
-    start = jax.random.bits(key, (), jnp.uint32)
-    word = number.astype(jnp.uint32) * jnp.uint32(_GOLDEN) + start
+    word = number.astype(jnp.uint32) * jnp.uint32(_GOLDEN) + jax.random.bits(key, (), jnp.uint32)
     return ((word >> 8) + jnp.uint32(1)).astype(dtype) * 2.0**-24
 
 
