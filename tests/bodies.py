@@ -30,9 +30,13 @@ PLAIN = RenderSettings(
 """Plain renderers, which compile in a third of the time."""
 
 
+def unit(vectors) -> np.ndarray:
+    vectors = np.asarray(vectors, float)
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
 def splats(centers, normals, radii, areas=None) -> Splats:
-    normals = np.asarray(normals, float)
-    normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = unit(normals)
     radii = np.broadcast_to(np.asarray(radii, float), len(normals))
     areas = (radii / 1.5) ** 2 if areas is None else areas
     return Splats(*(jnp.asarray(each, float) for each in (centers, normals, radii, areas)))
@@ -45,7 +49,7 @@ def directions(count: int, jitter: float = 0.35, seed: int = 0) -> np.ndarray:
     across = np.sqrt(1 - z * z)
     u = np.stack([np.cos(turn) * across, np.sin(turn) * across, z], 1)
     u += np.random.default_rng(seed).normal(size=u.shape) * jitter * np.sqrt(4 * np.pi / count)
-    return u / np.linalg.norm(u, axis=1, keepdims=True)
+    return unit(u)
 
 
 def sphere(
@@ -67,16 +71,11 @@ def bumpy(count: int, radius: float = 10.0, seed: int = 0) -> Splats:
 
     u = directions(count, seed=seed)
     helper = np.where(np.abs(u[:, :1]) < 0.9, [[1.0, 0, 0]], [[0, 1.0, 0]])
-    a = np.cross(u, helper)
-    a /= np.linalg.norm(a, axis=1, keepdims=True)
+    a = unit(np.cross(u, helper))
     step = 1e-5
 
     def tangent(t):
-        ends = [
-            surface(each / np.linalg.norm(each, axis=1, keepdims=True))
-            for each in (u + step * t, u - step * t)
-        ]
-        return (ends[0] - ends[1]) / (2 * step)
+        return (surface(unit(u + step * t)) - surface(unit(u - step * t))) / (2 * step)
 
     normal = np.cross(tangent(a), tangent(np.cross(u, a)))
     density = np.linalg.norm(normal, axis=1)
@@ -95,15 +94,20 @@ def joined(*bodies: Splats) -> Splats:
 
 
 def sheet(
-    half_width: float, spacing: float, normal=(0.0, 0.0, 1.0), center=(0.0, 0.0, 0.0)
+    half_width: float,
+    spacing: float,
+    normal=(0.0, 0.0, 1.0),
+    center=(0.0, 0.0, 0.0),
+    jitter: float = 0.0,
 ) -> Splats:
-    """A flat sheet of splats on a grid."""
-    normal = np.asarray(normal, float) / np.linalg.norm(normal)
-    a = np.cross(normal, [1.0, 0, 0] if abs(normal[0]) < 0.9 else [0, 1.0, 0])
-    a /= np.linalg.norm(a)
+    """A flat sheet of splats on a grid, off it by up to `jitter` in spacings."""
+    normal = unit(normal)
+    a = unit(np.cross(normal, [1.0, 0, 0] if abs(normal[0]) < 0.9 else [0, 1.0, 0]))
     line = np.arange(-half_width, half_width + 1e-9, spacing)
     x, y = (each.reshape(-1, 1) for each in np.meshgrid(line, line))
-    centers = np.asarray(center) + x * a + y * np.cross(normal, a)
+    moves = spacing * np.random.default_rng(3).uniform(-jitter, jitter, (len(x), 3))
+    moves = moves @ (np.eye(3) - np.outer(normal, normal))  # in the plane
+    centers = np.asarray(center) + x * a + y * np.cross(normal, a) + moves
     return splats(centers, np.tile(normal, (len(x), 1)), 1.5 * spacing)
 
 
@@ -116,10 +120,8 @@ def perspective(
 
 def orthographic(scale=1.2, width=40, height=32) -> OrthographicView:
     """Look along a slanted axis at the origin."""
-    forward = np.asarray([0.2, -0.3, -1.0])
-    forward /= np.linalg.norm(forward)
-    right = np.cross(forward, [0, 1.0, 0])
-    right /= np.linalg.norm(right)
+    forward = unit([0.2, -0.3, -1.0])
+    right = unit(np.cross(forward, [0, 1.0, 0]))
     rotation = jnp.asarray(np.stack([right, np.cross(forward, right), forward]), float)
     return OrthographicView(jnp.zeros(3), rotation, jnp.asarray(scale, float), width, height)
 

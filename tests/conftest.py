@@ -10,6 +10,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import pytest
+from jax.experimental.compilation_cache import compilation_cache
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
@@ -64,6 +65,25 @@ def compiled():
     jax.monitoring.register_event_duration_secs_listener(listen)
     yield names
     jax.monitoring.unregister_event_duration_listener(listen)
+
+
+@pytest.fixture
+def events():
+    """The names of what else JAX reports during a test, one after the other."""
+    names = []
+    jax.monitoring.register_event_listener(listener := lambda name, **_: names.append(name))
+    yield names
+    jax.monitoring.unregister_event_listener(listener)
+
+
+@pytest.fixture(scope="module")
+def jax_settings():
+    """Restore JAX's settings after the tests of a file."""
+    before = dict(jax.config.values)
+    yield
+    for name, value in before.items() - jax.config.values.items():
+        jax.config.update(name, value)
+    compilation_cache.reset_cache()
 
 
 @pytest.fixture

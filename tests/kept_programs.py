@@ -1,30 +1,35 @@
-"""A program that keeps what it makes in the folder it is given, as test_cache.py starts it several
-times over; killed before its first file has a name, where it is told to be.
+"""Two functions that are kept, and a list of what is made. As a program, both are called with the
+folder it is given; killed before its first file has a name, where it is told to be.
 """
 
 import os
 import signal
 import sys
 
+import jax
 import jax.numpy as jnp
 
 from splatjax.cache import keep, kept, kept_jit
 
+made = []
+
 
 @kept
-def squares(count):
-    print("made squares")
-    return jnp.arange(count) ** 2
+def squares(values, power=2):
+    made.append("squares")
+    return {"squares": jnp.asarray(values) ** power}
 
 
 @kept_jit
-def total(values):
-    print("made total")
-    return {"sum": jnp.sum(jnp.sin(values))}
+def total(tree):
+    made.append("total")
+    return {"sum": sum(jnp.sum(jnp.sin(leaf)) for leaf in jax.tree.leaves(tree))}
 
 
-keep(sys.argv[1])
-killed = sys.argv[2:] == ["killed"]
-if killed:
-    os.replace = lambda *_: os.kill(os.getpid(), signal.SIGKILL)
-print(total(squares(1001 if killed else 1000))["sum"])  # another file, which is surely missing
+if __name__ == "__main__":
+    keep(sys.argv[1])
+    killed = sys.argv[2:] == ["killed"]
+    if killed:
+        os.replace = lambda *_: os.kill(os.getpid(), signal.SIGKILL)
+    values = squares(jnp.arange(1001.0 if killed else 1000.0))  # a file that is surely missing
+    print(total(values)["sum"], *made)

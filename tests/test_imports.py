@@ -1,5 +1,6 @@
-"""`import splatjax` is quick: what takes long to import is imported where it is used. No package
-that splatjax installs, or is tested with, is under a copyleft license.
+"""`import splatjax` is quick: what takes long to import is imported where it is used. It
+changes no setting of JAX. No package that splatjax installs, or is tested with, is under a
+copyleft license.
 """
 
 import json
@@ -29,8 +30,15 @@ LATER = [
 ]
 
 
-def test_what_takes_long_is_imported_where_it_is_used():
-    program = "import json, sys, splatjax; print(json.dumps(sorted(sys.modules)))"
+def test_importing_is_quick_and_changes_no_setting_of_jax():
+    program = """
+import json, sys, equinox, jax
+before = dict(jax.config.values)
+import splatjax
+print(json.dumps(sorted(sys.modules)))
+import splatjax.cli
+assert before == jax.config.values
+"""
     said = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, check=True
     ).stdout

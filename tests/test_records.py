@@ -10,7 +10,6 @@ import pytest
 from bodies import PLAIN
 
 import splatjax as sj
-from splatjax._records import check_values
 from splatjax.baselines import bust_with_textures
 from splatjax.fitting import GivenVariances
 from splatjax.inverse import Candidate, Observation
@@ -255,10 +254,3 @@ def test_numbers_of_any_type_compile_a_picture_once(compiled):
 
 def test_unknown_values_are_not_checked():
     assert np.isnan(jax.jit(lambda x: sj.Medium(x, 1.0, 1.4).sigma_a)(jnp.nan))
-
-
-def test_a_check_names_count_and_first_entry():
-    values = np.arange(6.0).reshape(2, 3)
-    with pytest.raises(ValueError, match=r"x must be small; 2 of 6 entries .* is 4 at \[1, 1\]"):
-        check_values("x", values, "small", lambda x: x < 4)
-    check_values("x", np.full(2, np.inf), "at least 0", lambda x: x >= 0, finite=False)

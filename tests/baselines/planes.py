@@ -19,8 +19,7 @@ def plane(stretch: float, quads: int = 6, half: float = HALF) -> Mesh:
     the middle of the texture.
     """
     line = np.linspace(-1.0, 1.0, quads + 1)
-    x, y = np.meshgrid(line, line)
-    flat = np.stack([x.reshape(-1), y.reshape(-1)], axis=1)
+    flat = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
     first = (np.arange(quads)[:, None] * (quads + 1) + np.arange(quads)).reshape(-1)
     step = quads + 1
     faces = np.concatenate(

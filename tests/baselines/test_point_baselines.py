@@ -47,14 +47,6 @@ BLENDING = ("ewa", "phong", "deferred")
 SIZE = 48
 
 
-def plane(half_width: float, spacing: float, jitter: float = 0.0) -> sj.Splats:
-    """A sheet at z = 0 that faces +z; `jitter` in spacings."""
-    sheet = bodies.sheet(half_width, spacing)
-    moves = np.random.default_rng(3).uniform(-jitter, jitter, (sheet.count, 3))
-    moves = jnp.asarray(moves * [spacing, spacing, 0], float)
-    return dataclasses.replace(sheet, centers=sheet.centers + moves)
-
-
 def camera(eye, fov: float = 30.0, target=(0.0, 0.0, 0.0)) -> sj.Camera:
     return sj.Camera.look_at(eye, target, fov=fov, width=SIZE, height=SIZE)
 
@@ -88,7 +80,7 @@ def far_checkers():
     """Pictures of black and white squares smaller than a pixel, from cameras that shift by
     fractions of a pixel.
     """
-    sheet = plane(11.0, 0.125)
+    sheet = bodies.sheet(11.0, 0.125)
     checkers = jnp.asarray(
         (np.floor(np.asarray(sheet.centers[:, :2]) / 0.25 + 0.25).sum(1) % 2)[None], float
     )
@@ -130,7 +122,7 @@ def test_squares_smaller_than_a_pixel_are_gray_and_still_with_a_filter_and_alias
 @pytest.mark.once
 @pytest.mark.parametrize("name", RASTERIZERS)
 def test_a_plane_of_one_color_has_exactly_that_color_and_lies_where_it_lies(name):
-    sheet, color = plane(9.0, 0.8, jitter=0.3), 0.7
+    sheet, color = bodies.sheet(9.0, 0.8, jitter=0.3), 0.7
     seen = camera((4.0, -9.0, 14.0), fov=20.0)
     view = PerspectiveView.of(seen)
     rows = jnp.full((1, sheet.count), color)
@@ -146,7 +138,7 @@ def test_a_plane_of_one_color_has_exactly_that_color_and_lies_where_it_lies(name
 @pytest.mark.once
 @pytest.mark.parametrize("name", RASTERIZERS)
 def test_what_is_nearer_hides_what_is_behind(name):
-    near = plane(6.0, 1.0, jitter=0.2)
+    near = bodies.sheet(6.0, 1.0, jitter=0.2)
     far = dataclasses.replace(near, centers=near.centers - jnp.asarray([[0.0, 0.0, 8.0]]))
     colors = jnp.concatenate([jnp.zeros((1, far.count)), jnp.ones((1, near.count))], axis=1)
     seen, covered = drawn(
@@ -158,7 +150,7 @@ def test_what_is_nearer_hides_what_is_behind(name):
 
 @pytest.mark.once
 def test_elliptical_points_have_one_color_each_and_blended_ones_more():
-    sheet = plane(6.0, 1.5, jitter=0.2)
+    sheet = bodies.sheet(6.0, 1.5, jitter=0.2)
     own = np.random.default_rng(0).uniform(size=(1, sheet.count))
     seen = camera((0.0, 3.0, 20.0), fov=25.0)
     shares = {}
@@ -176,7 +168,7 @@ def test_elliptical_points_have_one_color_each_and_blended_ones_more():
 @pytest.mark.once
 def test_an_affine_projection_leaves_holes_near_the_eye_and_an_exact_one_leaves_none():
     """Discs that touch in space part in the picture, where each is drawn as its center is seen."""
-    floor = plane(48.0, 8.0)
+    floor = bodies.sheet(48.0, 8.0)
     sheet = dataclasses.replace(floor, radii=0.72 * jnp.sqrt(floor.areas))
     seen = camera((2.4, -30.0, 4.0), fov=75.0, target=(2.4, -18.0, 0.0))
     holes = {}
@@ -203,11 +195,11 @@ def lit_ball(settings: sj.RenderSettings, count: int):
     frame = sj.render(scene, seen, settings)
     inside = np.asarray(frame.coverage) > 0.99
     position = np.asarray(frame.position)[inside] - middle[None]
-    true = position / np.linalg.norm(position, axis=1, keepdims=True)
+    true = bodies.unit(position)
     inner = true[:, 2] > 0.4
     normals = np.asarray(frame.normal)[inside]
     angle = np.degrees(np.arccos(np.clip(np.sum(normals * true, axis=1), -1, 1)))[inner]
-    towards = -np.asarray(lamp.direction) / np.linalg.norm(np.asarray(lamp.direction))
+    towards = bodies.unit(-lamp.direction)
     off = (np.asarray(frame.beauty)[inside][:, 0] - np.maximum(true @ towards, 0))[inner]
     return np.sqrt(np.mean(angle**2)), np.sqrt(np.mean(off**2))
 
@@ -229,7 +221,7 @@ def test_slopes_of_a_sphere_are_its_curvature_and_those_of_a_plane_are_none():
     off = np.abs(slopes - expected)  # of 0.1; largest where the spiral of splats begins and ends
     assert np.quantile(off, 0.99) < 0.005
     assert np.max(off) < 0.015
-    assert np.max(np.abs(normal_slopes(plane(3.0, 1.0)))) == 0
+    assert np.max(np.abs(normal_slopes(bodies.sheet(3.0, 1.0)))) == 0
 
 
 @pytest.mark.long
@@ -259,7 +251,7 @@ def test_what_is_blended_has_derivatives(name, float64):
     """Of what the splats carry and of where they are, as far as no fragment comes or goes: against
     differences.
     """
-    sheet = plane(2.0, 0.7, jitter=0.2)
+    sheet = bodies.sheet(2.0, 0.7, jitter=0.2)
     view = PerspectiveView.of(camera((1.0, 2.0, 12.0), fov=15.0))
     draw = seen_by(name, sheet, view)
     rows = jnp.asarray(np.random.default_rng(1).uniform(size=(1, sheet.count)))

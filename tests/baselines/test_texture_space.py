@@ -214,8 +214,7 @@ def seen_from(camera, corners):
 
 @pytest.fixture
 def corners():
-    mesh = plane(1.0)
-    return jnp.asarray(mesh.corners(), float)
+    return jnp.asarray(plane(1.0).corners(), float)
 
 
 @pytest.mark.once

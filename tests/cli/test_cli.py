@@ -5,15 +5,16 @@ messages and files: the search itself is tested where it is.
 import re
 from pathlib import Path
 
+import bodies
 import jax
 import jax.numpy as jnp
 import numpy as np
-import OpenEXR
 import optimistix as optx
 import pytest
 import trimesh
 from commands import failure, plate, run
 from jax.experimental.compilation_cache import compilation_cache
+from pictures import write_picture
 from PIL import Image
 
 import splatjax as sj
@@ -97,8 +98,7 @@ def test_render_shows_the_bust_and_its_manifest_makes_the_same_picture(plain, tm
 def test_color_is_of_the_albedo_or_of_the_material(albedo, tmp_path, capsys):
     path = tmp_path / "painted.ply"
     bare = sj.read_splats(plate(path))
-    columns = bare.centers, bare.normals, bare.radii, bare.areas
-    sj.write_splats(path, sj.Splats(*columns, jnp.full_like(bare.centers, 0.5)))
+    sj.write_splats(path, bodies.with_albedo(bare, jnp.full_like(bare.centers, 0.5)))
     splats, material = Render(splats=path, material="marble", albedo=albedo).load()
     assert (splats.albedo is not None) == albedo
     total = 1.0 if albedo else sj.load_material("marble").gaussians.total_reflectance()
@@ -124,10 +124,8 @@ def test_render_without_scattering_is_lambertian(tmp_path):
 
 @pytest.mark.parametrize(("width", "height"), [(64, 64), (128, 64), (64, 128)])
 def test_camera_frames_the_bounding_sphere_at_any_scale(width, height):
-    places = np.random.default_rng(3).normal(size=(500, 3))
-    places = 40 * places / np.linalg.norm(places, axis=1, keepdims=True) + [5.0, -20.0, 3.0]
-    columns = places, np.tile([0.0, 0.0, 1.0], (500, 1)), np.ones(500), np.ones(500)
-    splats = sj.Splats(*(jnp.asarray(column, float) for column in columns))
+    places = 40 * bodies.unit(np.random.default_rng(3).normal(size=(500, 3))) + [5.0, -20.0, 3.0]
+    splats = bodies.splats(places, np.tile([0.0, 0.0, 1.0], (500, 1)), 1.0)
     options = Render(width=width, height=height, elevation=20.0)
     camera = options.camera(lambda: [splats], 30.0)
     local = (places - np.asarray(camera.position)) @ np.asarray(camera.rotation).T
@@ -146,19 +144,16 @@ def test_azimuth_turns_from_the_front_to_the_side(place, direction):
     np.testing.assert_allclose(np.asarray(direction_to(*place)), direction, atol=1e-6)
 
 
-def test_what_was_compiled_is_taken_from_the_cache_in_silence(tmp_path, monkeypatch, capfd):
+def test_what_was_compiled_is_taken_from_the_cache_in_silence(tmp_path, monkeypatch, events, capfd):
     """XLA logs an error for whatever it takes from there."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     jax.config.update("jax_compilation_cache_dir", None)
     prepare_jax()
     assert Path(jax.config.jax_compilation_cache_dir).parent == tmp_path / "splatjax" / "jax"
     compilation_cache.reset_cache()
-    events = []
-    jax.monitoring.register_event_listener(listener := lambda event, **_: events.append(event))
     for hits in (0, 1):  # a new function, of the same program
         jax.jit(lambda x: jnp.cumsum(jnp.sin(x)))(jnp.ones(9)).block_until_ready()
         assert events.count("/jax/compilation_cache/cache_hits") >= hits
-    jax.monitoring.unregister_event_listener(listener)
     assert capfd.readouterr().err == ""
 
 
@@ -176,9 +171,7 @@ FOUND = (0.011, 0.022, 0.033)
 
 @pytest.fixture
 def command(tmp_path):
-    pixels = np.full((8, 8), 0.5, np.float32)
-    with OpenEXR.File({"type": OpenEXR.scanlineimage}, dict.fromkeys("RGB", pixels)) as file:
-        file.write(str(tmp_path / "one.exr"))
+    write_picture(tmp_path / "one.exr", np.full((8, 8, 3), 0.5))
     (tmp_path / "pictures.toml").write_text(PICTURES.format(more=""))
     files = plate(tmp_path / "plate.ply"), tmp_path / "pictures.toml"
     return ["recover", *files, "--output", tmp_path / "mine.toml", "--no-suggest"]

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import warnings
 from dataclasses import fields
+from unittest import mock
 
 import equinox as eqx
 import jax
@@ -123,17 +124,6 @@ def test_what_memory_cannot_hold_is_refused_with_what_it_could(words, folder, ca
     assert re.search(r"[\d.e+]+ GB .* GB are free; take fewer", line)
 
 
-@pytest.fixture
-def failing(monkeypatch):
-    def with_error(error):
-        def fail(self):
-            raise error
-
-        monkeypatch.setattr(_materials.Materials, "run", fail)
-
-    return with_error
-
-
 FULL = OSError(28, "No space left on device", "a.exr")
 
 
@@ -148,8 +138,8 @@ FULL = OSError(28, "No space left on device", "a.exr")
         (KeyboardInterrupt(), 130, "splatjax: interrupted\n"),
     ],
 )
-def test_status_tells_whose_fault_it_is(error, status, named, failing, capsys):
-    failing(error)
+def test_status_tells_whose_fault_it_is(error, status, named, monkeypatch, capsys):
+    monkeypatch.setattr(_materials.Materials, "run", mock.Mock(side_effect=error))
     assert run("materials") == status
     captured = capsys.readouterr()
     assert named in captured.err
@@ -166,8 +156,9 @@ def test_a_check_in_compiled_code_is_one_sentence(monkeypatch, capsys):
 
 
 @pytest.mark.parametrize("words", [["--debug", "materials"], ["materials", "--debug"]])
-def test_debug_shows_where_it_arose(words, failing, capsys):
-    failing(ValueError("a.ply: is empty"))
+def test_debug_shows_where_it_arose(words, monkeypatch, capsys):
+    failing = mock.Mock(side_effect=ValueError("a.ply: is empty"))
+    monkeypatch.setattr(_materials.Materials, "run", failing)
     assert run(*words) == 2
     lines = capsys.readouterr().err.splitlines()
     assert lines[0].startswith("Traceback")

@@ -8,11 +8,11 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-import OpenEXR
 import optimistix as optx
 import pytest
 from bodies import assert_close
 from commands import failure, run
+from pictures import write_picture
 from PIL import Image
 
 import splatjax as sj
@@ -111,8 +111,7 @@ def test_it_takes_a_photograph_and_the_size_of_its_pixels(tmp_path, capsys):
     photograph, output = tmp_path / "dot.exr", tmp_path / "dot.toml"
     y, x = (np.mgrid[:60, :60] - 29.5) * 0.2
     radiance = 3 / np.pi * np.exp(-(x * x + y * y) / 4) / (4 * np.pi)
-    with OpenEXR.File({"type": OpenEXR.scanlineimage}, {"Y": radiance.astype(np.float32)}) as file:
-        file.write(str(photograph))
+    write_picture(photograph, radiance[..., None])
     command = ["fit", photograph, "--count", 1, "--power", 3, "--output", output]
     assert "--mm-per-pixel" in failure(command, capsys)
     assert run(*command, "--mm-per-pixel", 0.2) == 0
@@ -190,8 +189,7 @@ def test_a_table_of_media_becomes_a_table_of_fits_and_is_continued(
     output = tmp_path / "fits.csv"
     words = ["fit", media, "--all", "--count", 2, "--output", output]
     with monkeypatch.context() as patch:
-        interruption = unittest.mock.Mock(side_effect=KeyboardInterrupt)
-        patch.setattr(_fit, "read_columns", interruption)
+        patch.setattr(_fit, "read_columns", unittest.mock.Mock(side_effect=KeyboardInterrupt))
         assert run(*words) == 130
     capsys.readouterr()
     assert run(*words) == 0

@@ -3,19 +3,18 @@ several processes.
 """
 
 import itertools
-import os
 import shutil
 import signal
-import socket
-import subprocess
-import sys
+from functools import partial
 from pathlib import Path
+from unittest import mock
 
-import jax.numpy as jnp
+import bodies
 import numpy as np
 import pytest
 from commands import ball, contents, failure, frame_names, run
 from PIL import Image
+from processes import free_port, run_together
 
 import splatjax as sj
 from splatjax.cli._render import Turntable
@@ -31,14 +30,14 @@ def splats(tmp_path_factory):
     return ball(tmp_path_factory.mktemp("splats") / "ball.ply")
 
 
-def command(splats, folder, *more, turn="camera"):
+def command(splats, folder, *more, turn="camera", frames=FRAMES):
     size = ("--width", 16, "--height", 16, "--no-scattering", "--material", "marble")
     return [
         "turntable",
         splats,
         *size,
         "--frames",
-        FRAMES,
+        frames,
         "--output",
         folder,
         "--turn",
@@ -93,8 +92,7 @@ def test_a_full_turn_does_not_repeat(turn, degrees, camera_step, light_step):
 
 def test_camera_keeps_its_distance_and_the_fill_its_place_beside_it():
     places = np.random.default_rng(3).normal(size=(50, 3)) * np.asarray([30.0, 10.0, 5.0]) + 20
-    centers, ones = jnp.asarray(places, float), jnp.ones(50)
-    splats = sj.Splats(centers, jnp.ones((50, 3)) / 3**0.5, ones, ones)
+    splats = bodies.splats(places, np.ones((50, 3)), 1.0)
     middle = (places.min(axis=0) + places.max(axis=0)) / 2
     options, marble = Turntable(elevation=20.0), sj.load_material("marble")
     azimuths = np.arange(0.0, 360.0, 40.0).tolist()
@@ -153,16 +151,12 @@ def test_frames_of_something_else_are_refused(splats, copied, tmp_path, drawn, c
 
 
 def test_an_orbit_under_lights_that_stand_still_is_lit_once(splats, tmp_path, monkeypatch):
-    folder, alone, lit, illuminate = tmp_path / "orbit", tmp_path / "alone.exr", [], sj.illuminate
-
-    def counted(scene, plan):
-        lit.append(plan)
-        return illuminate(scene, plan)
-
-    monkeypatch.setattr(sj, "illuminate", counted)
+    folder, alone = tmp_path / "orbit", tmp_path / "alone.exr"
+    illuminate = mock.Mock(wraps=sj.illuminate)
+    monkeypatch.setattr(sj, "illuminate", illuminate)
     words = command(splats, folder, "--fill", 0)
     assert run(*words) == 0
-    assert len(lit) == 1
+    assert illuminate.call_count == 1
     still = [*words[1 : words.index("--frames")], "--fill", 0, "--azimuth", 115]
     assert run("render", *still, "--output", alone) == 0
     frames = [sj.read_exr(path) for path in (folder / "frame_0001.exr", alone)]
@@ -171,48 +165,40 @@ def test_an_orbit_under_lights_that_stand_still_is_lit_once(splats, tmp_path, mo
 
 SCRIPT = Path(__file__).parent / "one_process.py"
 SHARED_FRAMES = 6
-OPTIONS = "--width 16 --height 16 --no-scattering --material marble --turn camera --frames"
 
 
 def run_processes(command, count, **environment):
     """Run a command in some processes, which find each other at this machine's own address; return
     their statuses, and what they print on stdout and stderr.
     """
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        address = f"127.0.0.1:{free.getsockname()[1]}"
-    common = {"PYTHONPATH": str(SCRIPT.parents[2]), "JAX_COORDINATOR_ADDRESS": address}
-    numbers = [{"JAX_NUM_PROCESSES": str(count), "JAX_PROCESS_ID": str(i)} for i in range(count)]
-    pipe, words = subprocess.PIPE, [sys.executable, str(SCRIPT), *map(str, command)]
-    processes = [
-        subprocess.Popen(
-            words, env=os.environ | common | environment | own, stdout=pipe, stderr=pipe, text=True
-        )
-        for own in numbers
-    ]
-    printed = [process.communicate(timeout=300) for process in processes]
-    return [process.returncode for process in processes], *zip(*printed, strict=True)
+    environment |= {
+        "PYTHONPATH": str(SCRIPT.parents[2]),
+        "JAX_COORDINATOR_ADDRESS": f"127.0.0.1:{free_port()}",
+        "JAX_NUM_PROCESSES": str(count),
+    }
+    numbers = [{"JAX_PROCESS_ID": str(i)} for i in range(count)]
+    return run_together(*(([SCRIPT, *command], environment | own) for own in numbers))
 
 
 @pytest.mark.long
 def test_processes_share_a_turntable_and_one_that_is_killed_costs_no_finished_frame(tmp_path):
     splats, two, four = ball(tmp_path / "ball.ply"), tmp_path / "two", tmp_path / "four"
-    words = ["turntable", splats, *OPTIONS.split(), SHARED_FRAMES, "--output"]
+    shared = partial(command, splats, frames=SHARED_FRAMES)
     names = frame_names(*range(SHARED_FRAMES))
 
-    statuses, out, err = run_processes([*words, two], 2)
+    statuses, out, err = run_processes(shared(two), 2)
     assert statuses == [0, 0], err
     whole = contents(two)
     assert whole.keys() == names | {"turntable.json", "turntable.webp"}
     printed = {Path(line).name for text in out for line in text.splitlines()}
     assert printed == names | {"turntable.webp"}
 
-    statuses, _, err = run_processes([*words, four], 4, KILLED_BEFORE="frame_0001")
+    statuses, _, err = run_processes(shared(four), 4, KILLED_BEFORE="frame_0001")
     assert statuses == [0, -signal.SIGKILL, 0, 0], err
     finished = {name for name in names if name[6:10] not in ("0001", "0005")}
     assert contents(four).keys() == finished | {"frame_0001.exr", "turntable.json"}
     assert ["still at work" in text for text in err] == [True, False, True, True]
-    statuses, _, err = run_processes([*words, four], 2)
+    statuses, _, err = run_processes(shared(four), 2)
     assert statuses == [0, 0], err
     assert f"4 of {SHARED_FRAMES} frames" in err[0]
     assert contents(four) == whole

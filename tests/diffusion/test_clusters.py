@@ -20,9 +20,9 @@ levels_of = eqx.filter_jit(lambda tree, sources: tree.levels(sources))
 def sources_and_tree(cells=CELLS):
     body, rng = bodies.bumpy(COUNT), np.random.default_rng(2)
     irradiance = jnp.asarray(rng.uniform(size=(2, COUNT)), float)
-    sources = Sources(body.centers.T, body.normals.T, 0.01 * body.areas, irradiance)
     exists = np.arange(COUNT) % 16 > 0
-    sources = eqx.tree_at(lambda s: s.areas, sources, jnp.where(exists, sources.areas, 0.0))
+    areas = jnp.where(exists, 0.01 * body.areas, 0.0)
+    sources = Sources(body.centers.T, body.normals.T, areas, irradiance)
     given = np.asarray(body.centers), np.asarray(body.normals), exists
     return sources, ClusterTree.build(*given, cells)
 
@@ -34,9 +34,9 @@ def of_splats(tree):
 
 def test_merging_keeps_areas_and_means():
     sources, tree = sources_and_tree()
-    given = (sources.centers, sources.normals, sources.irradiance)
-    centers, normals, irradiance = (np.asarray(each, float) for each in given)
-    areas = np.asarray(sources.areas, float)
+    centers, normals, areas, irradiance = (
+        np.asarray(each, float) for each in jax.tree.leaves(sources)
+    )
     splats, *levels = levels_of(tree, sources)
     np.testing.assert_array_equal(splats.areas, sources.areas)
     for clusters, place in zip(levels, of_splats(tree), strict=True):
@@ -68,17 +68,8 @@ def test_a_cluster_fills_no_more_than_its_cell_and_none_is_lost():
     assert exists.sum() > numbers[0] > numbers[1] > numbers[2] >= 1
 
 
-SOURCES_IN_SPACE, REACH = 26 * BLOCK, 1.5
-
-
-def blocks_in_space(count=SOURCES_IN_SPACE):
-    centers = np.random.default_rng(3).uniform(-6, 6, (count, 3))
-    return jnp.asarray(centers[compact_order(centers)].T, float)
-
-
 def test_blocks_of_a_compact_order_are_small():
-    points = np.random.default_rng(1).normal(size=(4000, 3))
-    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    points = bodies.unit(np.random.default_rng(1).normal(size=(4000, 3)))
     order = compact_order(points)
     np.testing.assert_array_equal(np.sort(order), np.arange(4000))
     for size in (2 * BLOCK, BLOCK, BLOCK // 2, BLOCK // 4):
@@ -92,16 +83,16 @@ def test_blocks_of_a_compact_order_are_small():
 @pytest.mark.parametrize("at_once", [1 << 20, 40])
 def test_neighbors_are_the_boxes_within_reach_each_once(at_once, monkeypatch):
     monkeypatch.setattr(_neighbors, "_AT_ONCE", at_once)
-    centers, exists = (
-        blocks_in_space(),
-        jnp.arange(SOURCES_IN_SPACE) < SOURCES_IN_SPACE - BLOCK // 2,
-    )
+    count, reach = 26 * BLOCK, 1.5
+    places = np.random.default_rng(3).uniform(-6, 6, (count, 3))
+    centers = jnp.asarray(places[compact_order(places)].T, float)
+    exists = jnp.arange(count) < count - BLOCK // 2
     points, sources = (Boxes.around(centers, exists, size) for size in (BLOCK, SOURCES))
     gaps = jnp.maximum(
         points.low[:, None] - sources.high[None], sources.low[None] - points.high[:, None]
     )
-    expected = np.sum(np.maximum(gaps, 0) ** 2, axis=2) <= REACH**2
-    lists = jax.tree.map(np.asarray, find_neighbors(points, sources, REACH))
+    expected = np.sum(np.maximum(gaps, 0) ** 2, axis=2) <= reach**2
+    lists = jax.tree.map(np.asarray, find_neighbors(points, sources, reach))
     for block, near in enumerate(expected):
         row = lists.rows[lists.first[block] :][: lists.counts[block]].reshape(-1)
         np.testing.assert_array_equal(np.sort(row[row < len(near)]), np.flatnonzero(near))

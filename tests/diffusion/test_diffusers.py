@@ -175,7 +175,7 @@ def test_gradients_are_those_of_the_plain_sum_over_the_sources_within_the_suppor
             # Fading over the last half of an exponent.
             fade = jnp.clip(2 * (largest - exponent), 0, 1)
             weight = jnp.exp(-exponent) * fade * sources.areas[None]
-            cut = 2 * np.exp(-largest) * np.expm1(0.5)
+            cut = 2 * jnp.exp(-largest) * np.expm1(0.5)
             flat = 2 * jnp.pi * variance * (jnp.exp(-0.5 * depth**2 / variance) - cut)
             sums, pulls = light @ weight.T, jnp.einsum("cj,aij,ij->cai", light, offset, weight)
             means = sums[:-1] / sums[-1:]
@@ -206,7 +206,7 @@ def test_gradients_through_clusters_are_those_of_differences(float64):
     variances = jnp.asarray([20.0, 60.0])
     plan = planned(ClusterDiffuser(), body, variances)
     # So wide a support that no difference steps over its rim.
-    layers = [dataclasses.replace(layer, support=7.0) for layer in plan.layers]
+    layers = [dataclasses.replace(layer, truncated=KERNEL.truncated(7.0)) for layer in plan.layers]
     plan = dataclasses.replace(plan, layers=tuple(layers))
     assert [layer.level for layer in plan.layers] == [1, 2]
     factors = jnp.asarray(np.random.default_rng(1).normal(size=(2, 5, body.count)))

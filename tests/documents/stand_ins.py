@@ -9,10 +9,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import OpenEXR
 import optax
 import trimesh
 from jax.sharding import NamedSharding, PartitionSpec
+from pictures import write_picture
 from PIL import Image
 
 import splatjax as sj
@@ -65,18 +65,10 @@ def _measured(path: Path) -> None:
     )
 
 
-def _exr(path: Path, picture: np.ndarray) -> None:
-    planes = {
-        name: np.ascontiguousarray(picture[..., k], np.float32) for k, name in enumerate("RGB")
-    }
-    with OpenEXR.File({"type": OpenEXR.scanlineimage}, planes) as file:
-        file.write(str(path))
-
-
 def _dot(path: Path) -> None:
     y, x = (np.mgrid[:120, :120] - 59.5) * 0.1
     gaussians = sj.load_material("marble").gaussians
-    _exr(path, np.asarray(gaussians(jnp.hypot(x, y)), np.float64) * 5 / np.pi)
+    write_picture(path, np.asarray(gaussians(jnp.hypot(x, y)), np.float64) * 5 / np.pi)
 
 
 def _marble(splats: sj.Splats, specular: float, **view) -> np.ndarray:
@@ -90,14 +82,14 @@ def _marble(splats: sj.Splats, specular: float, **view) -> np.ndarray:
 
 def _photograph(path: Path) -> None:
     splats = sj.read_splats(path.with_name("head.ply"))
-    _exr(path, _marble(splats, specular=0.0, eye=[0, 0, 500], target=[0, -20, 0], fov=25))
+    write_picture(path, _marble(splats, specular=0.0, eye=[0, 0, 500], target=[0, -20, 0], fov=25))
 
 
 def _figurine(path: Path) -> None:
     splats = sj.bust(1_500).scaled(0.2)
     sj.write_splats(path, dataclasses.replace(splats, albedo=None))
     picture = _marble(splats, specular=0.18, eye=[0, 0, 130], target=[0, -8, 0], fov=30)
-    _exr(path.with_suffix(".exr"), picture)
+    write_picture(path.with_suffix(".exr"), picture)
 
 
 _MADE = {

@@ -132,7 +132,6 @@ def test_the_commands_of_a_page_run_one_after_the_other(page, tmp_path, monkeypa
 
 
 EQUATIONS = (ROOT / "docs" / "equations.md").read_text(encoding="utf-8")
-README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 
 def named_objects(text):
@@ -159,16 +158,3 @@ def test_every_equation_and_pass_has_its_row(row):
 def test_links_lead_to_files(page):
     for target in re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", page.read_text(encoding="utf-8")):
         assert target.startswith("https://") or (page.parent / target).exists(), target
-
-
-@pytest.mark.slow
-@pytest.mark.once
-def test_the_program_of_the_readme_runs(tmp_path, monkeypatch):
-    program = re.search(r"```python\n(.*?)```", README, re.DOTALL).group(1)
-    small = program.replace("100_000", "2_000").replace("fov=30", "fov=30, width=48, height=48")
-    assert small.count("2_000") == 1
-    assert small.count("width=48") == 1
-    monkeypatch.chdir(tmp_path)
-    exec(compile(small, "README.md", "exec"), {})
-    assert (tmp_path / "bust.exr").exists()
-    assert (tmp_path / "bust.png").exists()

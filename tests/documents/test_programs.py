@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import numpy as np
 import pytest
-from pages import PAGES, fences, name
+from pages import PAGES, ROOT, fences, name
 from stand_ins import WITH_CONTEXT, context, lay_out, lay_out_frame
 
 import splatjax as sj
@@ -44,6 +44,15 @@ def test_what_programs_name_is_there(page):
         if isinstance(node, ast.Call) and called is not None:
             known = inspect.signature(called).parameters
             assert {word.arg for word in node.keywords} <= set(known), called
+
+
+@pytest.mark.slow
+@pytest.mark.once
+def test_the_first_program_of_the_readme_runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    first, *_ = fences(ROOT / "README.md", "python")
+    exec(compile(_small(first), "README.md", "exec"), {})
+    assert {path.name for path in tmp_path.iterdir()} == {"bust.exr", "bust.png"}
 
 
 @pytest.mark.long

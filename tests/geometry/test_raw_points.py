@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from bodies import unit
 
 from splatjax.geometry import bust_mesh, complete_splats, estimate_normals
 from splatjax.geometry._scatter import scatter
@@ -26,8 +27,7 @@ def test_normals_point_outward_on_a_head(on_the_bust):
 
 def test_two_bodies_are_each_turned_outward():
     random = np.random.default_rng(0)
-    ball = random.normal(size=(800, 3))
-    ball /= np.linalg.norm(ball, axis=1, keepdims=True)
+    ball = unit(random.normal(size=(800, 3)))
     normals = estimate_normals(np.concatenate([ball, ball + np.asarray([10.0, 0.0, 0.0])]))
     assert (np.einsum("ni,ni->n", normals, np.concatenate([ball, ball])) > 0).all()
 
@@ -137,8 +137,7 @@ def test_a_hollow_within_a_body_faces_its_middle():
     none.
     """
     random = np.random.default_rng(1)
-    ways = random.normal(size=(8_000, 3))
-    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+    ways = unit(random.normal(size=(8_000, 3)))
     outer = np.arange(8_000) < 6_000
     agreement = np.einsum(
         "ni,ni->n", estimate_normals(np.where(outer, 20.0, 11.0)[:, None] * ways), ways

@@ -22,9 +22,8 @@ ROW_BY_ROW = 1e-5  # asked; 1e-12 measured
 
 def scene(single: bool) -> sj.Scene:
     """A bumpy ball with albedo; an unresolved layer, one of splats, and one of clusters."""
-    body = bodies.bumpy(300)
-    albedo = jnp.asarray(np.random.default_rng(12).uniform(0.2, 0.9, (body.count, 2)))
-    splats = sj.Splats(body.centers, body.normals, body.radii, body.areas, albedo)
+    albedo = np.random.default_rng(12).uniform(0.2, 0.9, (300, 2))
+    splats = bodies.with_albedo(bodies.bumpy(300), albedo)
     gaussians = sj.SumOfGaussians([1.3, 12.0, 150.0], [[0.3, 0.2], [0.2, 0.3], [0.2, 0.2]])
     medium = sj.Medium([0.1, 0.05], [0.9, 1.2], [1.3, 1.0])
     once = sj.SingleScattering(medium) if single else None
@@ -106,13 +105,8 @@ def test_along_a_change_it_is_the_forward_derivative_of_the_plain_path():
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12 * np.max(np.abs(expected)))
 
 
-def medium_of(coefficients):
-    sigma_a, sigma_s_prime = coefficients["sigma_a"], coefficients["sigma_s_prime"]
-    return sj.Medium(sigma_a, sigma_s_prime, jnp.full_like(sigma_a, 1.3))
-
-
 def gaussians_of(coefficients):
-    return sj.fit_gaussians(sj.Dipole(medium_of(coefficients)), 2, throw=False).gaussians
+    return sj.fit_gaussians(sj.Dipole(sj.Medium(**coefficients, eta=1.3)), 2, throw=False).gaussians
 
 
 def test_through_the_fit_it_is_the_derivative_in_the_coefficients():
@@ -176,8 +170,7 @@ def test_many_cameras_by_map_and_many_materials_by_vmap_are_those_one_by_one():
     )
     mapped_over = jax.jit(jax.vmap(gradient, in_axes=(None, 0)))(point, stacked)
     for found in (mapped, mapped_over):
-        for ours, theirs in zip(found, alone, strict=True):
-            np.testing.assert_allclose(ours[1], theirs, rtol=1e-9, atol=1e-13)
+        bodies.assert_close([each[1] for each in found], alone, rtol=1e-9, atol=1e-13)
 
 
 def test_the_plain_path_has_forward_mode_and_second_derivatives():

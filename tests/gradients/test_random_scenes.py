@@ -15,15 +15,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from bodies import unit
 from hypothesis import HealthCheck, Phase, given, settings, strategies as st
 from hypothesis.extra.numpy import arrays
-from worlds import World, named, with_leaf
+from worlds import PLAIN, World, named, with_leaf
 
 import splatjax as sj
-from splatjax.diffusion import DenseDiffuser
 from splatjax.diffusion._clustered import LayerPlan
 from splatjax.diffusion._neighbors import Boxes, Neighbors, find_neighbors
-from splatjax.splatting import DenseRasterizer, ShadowSettings
+from splatjax.splatting import ShadowSettings
 from splatjax.splatting._bins import BinCapacity
 from splatjax.splatting._grid import TileGrid
 from splatjax.splatting._rasterizer import SurfaceCapacity
@@ -160,8 +160,7 @@ def contents(draw, shape: Shape) -> list[np.ndarray]:
             numbers[name] = between(*ends, *leaf.shape)
 
     forward = directions(3)
-    right = np.cross(forward, np.eye(3)[np.argmin(np.abs(forward))])
-    right /= np.linalg.norm(right)
+    right = unit(np.cross(forward, np.eye(3)[np.argmin(np.abs(forward))]))
     numbers["camera.rotation"] = np.stack([right, np.cross(forward, right), forward])
     is_towards_splats = draw(st.booleans())
     eye = -between(5, 40) * forward if is_towards_splats else between(-40, 40, 3)
@@ -184,11 +183,7 @@ LAYERS = (
 
 @cache
 def loss_and_gradient(shape: Shape):
-    settings = sj.RenderSettings(shadows=SHADOWS)
-    if not shape.fast:
-        settings = sj.RenderSettings(
-            shadows=SHADOWS, rasterizer=DenseRasterizer(), diffuser=DenseDiffuser()
-        )
+    settings = dataclasses.replace(sj.RenderSettings() if shape.fast else PLAIN, shadows=SHADOWS)
     start = typical(shape)
     plan = roomy(sj.make_plan(start.scene, start.camera, settings), shape)
 

@@ -13,12 +13,11 @@ import numpy as np
 from bodies import view
 
 import splatjax as sj
-from splatjax.diffusion import DenseDiffuser
-from splatjax.splatting import DenseRasterizer, ShadowSettings, TileRasterizer
+from splatjax.splatting import ShadowSettings, TileRasterizer
 
 SHADOWS = ShadowSettings(resolution=32, bias=1.5, softness=3.0)
 FAST = sj.RenderSettings(shadows=SHADOWS, rasterizer=TileRasterizer(lanes=8, slots=16))
-PLAIN = sj.RenderSettings(shadows=SHADOWS, rasterizer=DenseRasterizer(), diffuser=DenseDiffuser())
+PLAIN = dataclasses.replace(bodies.PLAIN, shadows=SHADOWS)
 COARSE = dataclasses.replace(PLAIN, shadows=dataclasses.replace(SHADOWS, resolution=16))
 
 

@@ -253,18 +253,6 @@ class TestUnresolvedLayers:
         np.testing.assert_allclose(moved, expected, atol=0.05 * np.max(np.abs(expected)))
 
 
-def test_pixels_that_are_masked_unknown_or_not_filled_do_not_count():
-    seen = np.ones((SIZE, SIZE, 2))
-    seen[:, 10, 1] = np.nan
-    mask = np.arange(SIZE)[:, None] > 8 * np.ones(SIZE)
-    light = sj.DirectionalLight(jnp.asarray([0.0, 0.0, -1.0]), jnp.ones(2), cast_shadows=False)
-    observation = sj.inverse.Observation(seen, camera(), light, mask=mask)
-    expected = np.ones((SIZE, SIZE), bool)
-    expected[:9], expected[:, 10] = False, False
-    known = Evidence.of(observation, jnp.zeros(()).dtype).known
-    np.testing.assert_array_equal(known, expected)
-
-
 def test_the_smooth_loss_bends():
     loss = sj.inverse.HuberLoss(2.0)
     r = jnp.asarray([-1e3, -3.0, 0.0, 1e-3, 3.0])

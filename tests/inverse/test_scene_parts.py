@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 import splatjax as sj
 from splatjax.inverse._parts import Setup, rotation
 
+FLAT = bodies.sheet(5.0, 0.5, jitter=0.2)
 CAMERA = sj.Camera.look_at([3, 0, 9], [1, 1, 0], width=4, height=4)
 
 
@@ -56,25 +57,23 @@ def test_lights_move_each_in_its_own_way():
 
 
 def test_a_camera_turns_around_the_body():
-    camera = CAMERA
     middle, part = jnp.asarray([0.5, -1.0, 0.3]), sj.inverse.CameraPoses(turn=0.2, shift=0.5)
 
     def place(setup):
         return setup.camera.rotation @ (middle - setup.camera.position)
 
-    setup = Setup(bodies.sphere(20), camera, ())
+    setup = Setup(bodies.sphere(20), CAMERA, ())
     turned = part.moved(setup, jnp.asarray([[1.0, -2.0, 0.5], [0.0, 0.0, 0.0]]), middle)
-    assert float(jnp.linalg.norm(turned.camera.position - camera.position)) > 1
+    assert float(jnp.linalg.norm(turned.camera.position - CAMERA.position)) > 1
     np.testing.assert_allclose(place(turned), place(setup), atol=1e-5)
     shifted = part.moved(setup, jnp.asarray([[0.0, 0.0, 0.0], [1.0, 2.0, 3.0]]), middle)
-    np.testing.assert_allclose(shifted.camera.position - camera.position, [0.5, 1, 1.5], atol=1e-6)
-    np.testing.assert_allclose(shifted.camera.rotation, camera.rotation, atol=1e-6)
+    np.testing.assert_allclose(shifted.camera.position - CAMERA.position, [0.5, 1, 1.5], atol=1e-6)
+    np.testing.assert_allclose(shifted.camera.rotation, CAMERA.rotation, atol=1e-6)
 
 
 def test_an_albedo_stays_between_0_and_1():
-    body = bodies.sphere(20)
     albedo = jnp.linspace(0.0, 1.0, 40).reshape(20, 2)
-    splats = sj.Splats(body.centers, body.normals, body.radii, body.areas, albedo)
+    splats = bodies.with_albedo(bodies.sphere(20), albedo)
     part = sj.inverse.AlbedoMap(step=0.5)
     for by in (-1e3, 0.0, 1e3):
         moved = moved_by(part, splats, jnp.full((20, 2), by)).albedo
@@ -89,15 +88,8 @@ def test_an_albedo_stays_between_0_and_1():
     )
 
 
-def flat() -> sj.Splats:
-    sheet = bodies.sheet(5.0, 0.5)
-    jitter = np.random.default_rng(1).uniform(-0.1, 0.1, (sheet.count, 2))
-    centers = np.asarray(sheet.centers) + np.pad(jitter, ((0, 0), (0, 1)))
-    return bodies.splats(centers, sheet.normals, sheet.radii)
-
-
 def test_normals_and_areas_follow_a_paraboloid():
-    sheet = flat()
+    sheet = FLAT
     x, y, _ = np.asarray(sheet.centers).T
     heights = 0.3 + 0.1 * x - 0.05 * y + 0.02 * x * x + 0.03 * x * y - 0.01 * y * y
     slopes = np.stack([0.1 + 0.04 * x + 0.03 * y, -0.05 + 0.03 * x - 0.02 * y], axis=1)
@@ -121,19 +113,18 @@ def test_a_ball_that_grows_stays_a_ball():
 
 
 def test_offsets_are_means_of_coordinates_over_the_same_side_of_a_sheet():
-    near, far = flat(), flat()
     behind = sj.Splats(
-        far.centers - jnp.asarray([[0.0, 0.0, 0.2]]), -far.normals, far.radii, far.areas
+        FLAT.centers - jnp.asarray([[0.0, 0.0, 0.2]]), -FLAT.normals, FLAT.radii, FLAT.areas
     )
-    both = bodies.joined(near, behind)
+    both = bodies.joined(FLAT, behind)
     part = sj.inverse.NormalOffsets(step=0.1, smoothness=1.0, deviation=0.3)
     x = np.random.default_rng(3).normal(size=both.count)
-    x[near.count :] = 0
+    x[FLAT.count :] = 0
     moved = moved_by(part, both, jnp.asarray(x, float))
     offsets = np.asarray(moved.centers[:, 2] - both.centers[:, 2])
     assert 0 < np.max(np.abs(offsets)) < 0.1 * np.max(np.abs(x))
-    np.testing.assert_array_equal(offsets[near.count :], 0)
-    np.testing.assert_allclose(moved.normals[near.count :], behind.normals, atol=1e-6)
+    np.testing.assert_array_equal(offsets[FLAT.count :], 0)
+    np.testing.assert_allclose(moved.normals[FLAT.count :], behind.normals, atol=1e-6)
     # The prior: coordinates that make offsets of its deviation cost one each.
     noise = np.random.default_rng(4).normal(size=both.count)
     offsets = np.asarray(

@@ -11,6 +11,7 @@ import meshio
 import numpy as np
 import pytest
 import trimesh
+from bodies import unit
 from PIL import Image
 from scipy.spatial import KDTree
 from writers import SUFFIXES, columns_of, export, some_splats, write_ply, xyz
@@ -33,8 +34,7 @@ BODIES = {
 def with_attributes(body):
     """Return a body with normals that are not quite its own, and colors of 8 bits."""
     mesh, random = BODIES[body], np.random.default_rng(0)
-    normals = mesh.vertex_normals + 0.05 * random.normal(size=mesh.vertices.shape)
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = unit(mesh.vertex_normals + 0.05 * random.normal(size=mesh.vertices.shape))
     colors = random.integers(0, 256, mesh.vertices.shape, dtype=np.uint8)
     return np.array(mesh.vertices), np.array(mesh.faces), normals, colors
 
@@ -157,16 +157,11 @@ FACET = 4.0
 """Degrees: round sides are of 48 facets, whose normals are this much off in the middle."""
 
 
-def plate():
-    rib = trimesh.creation.box((3, 30, 8))
-    rib.apply_translation((25, 0, 2))
-    return trimesh.util.concatenate([trimesh.creation.annulus(6, 14, 4, sections=48), rib])
-
-
 HARD_BODIES = {
     "box": trimesh.creation.box((20, 24, 16)),
     "cylinder": trimesh.creation.cylinder(10, 24, sections=48),
-    "plate": plate(),
+    "plate with a rib": trimesh.creation.annulus(6, 14, 4, sections=48)
+    + trimesh.creation.box((3, 30, 8)).apply_translation((25, 0, 2)),
 }
 
 

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
+from pictures import write_picture
 from PIL import Image
 from writers import (
     SUFFIXES,
@@ -16,7 +17,6 @@ from writers import (
     ramp,
     some_splats,
     square,
-    write_picture,
     write_ply,
     xyz,
 )

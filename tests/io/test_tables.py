@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from writers import write_picture
+from pictures import write_picture
 
 import splatjax as sj
 from splatjax.io import (

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
-import OpenImageIO as oiio
 import trimesh
+from bodies import unit
 from PIL import Image
 
 from splatjax.geometry import complete_splats
@@ -70,8 +70,7 @@ def xyz(points, names=("x", "y", "z")):
 
 def some_splats(count=50):
     random = np.random.default_rng(1)
-    normals = random.normal(size=(count, 3))
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = unit(random.normal(size=(count, 3)))
     shares = random.uniform(size=(7, count))
     fields = dict(zip(("radii", "areas", "specular", "roughness"), 0.5 + shares, strict=False))
     return complete_splats(20 * normals, normals=normals, albedo=shares[4:].T, **fields)
@@ -144,13 +143,3 @@ def ramp():
     return Image.fromarray(
         np.rint(255 * np.stack([rows, 1 - rows, 0 * rows], axis=-1)).astype(np.uint8)
     )
-
-
-def write_picture(path, values, kind):
-    file = oiio.ImageOutput.create(str(path))
-    spec = oiio.ImageSpec(values.shape[1], values.shape[0], values.shape[2], kind)
-    spec["oiio:UnassociatedAlpha"] = 1
-    assert file.open(str(path), spec)
-    assert file.write_image(values.astype(np.float32))
-    assert file.close()
-    return path

@@ -2,15 +2,13 @@
 of their own. Same input, same bits: in another process, on another number of processors.
 """
 
-import importlib.util
 import json
 import os
-import socket
-import subprocess
-import sys
+import runpy
 from pathlib import Path
 
 import pytest
+from processes import free_port, run_together
 
 pytestmark = pytest.mark.once
 
@@ -21,16 +19,14 @@ ROUNDING = 3e-5  # of the largest number of its kind: sums of a thousand terms, 
 def answers(commands, devices):
     """Run scripts beside each other, each with so many devices; give what they print."""
     flags = f"--xla_force_host_platform_device_count={devices} {os.environ.get('XLA_FLAGS', '')}"
-    environment = os.environ | {
+    environment = {
         "XLA_FLAGS": flags,
         "JAX_PLATFORMS": "cpu",
         "PYTHONPATH": os.pathsep.join([str(HERE.parents[1]), str(HERE.parent)]),
     }
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "env": environment}
-    running = [subprocess.Popen([sys.executable, *map(str, words)], **pipes) for words in commands]
-    said = [process.communicate(timeout=600) for process in running]
-    assert all(process.returncode == 0 for process in running), said
-    return [json.loads(out.splitlines()[-1]) for out, _ in said]
+    statuses, printed, errors = run_together(*((words, environment) for words in commands))
+    assert not any(statuses), errors
+    return [json.loads(out.splitlines()[-1]) for out in printed]
 
 
 def on_eight(question):
@@ -63,9 +59,7 @@ def test_devices_send_each_other_what_the_model_says():
 @pytest.mark.long
 @pytest.mark.parametrize(("what", "count"), [("picture", 2), ("gradients", 4)])
 def test_splats_of_several_processes_make_what_those_of_one_do(what, count):
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+    port = free_port()
     found = answers(
         [[HERE / "over_devices.py", "over_processes", what, i, count, port] for i in range(count)],
         4 // count,
@@ -76,19 +70,8 @@ def test_splats_of_several_processes_make_what_those_of_one_do(what, count):
     assert max(found[0]["apart"].values()) < ROUNDING, found[0]
 
 
-@pytest.fixture
-def same_bits():
-    spec = importlib.util.spec_from_file_location(
-        "same_bits", Path(__file__).parent.parent.parent / "tools" / "same_bits.py"
-    )
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 @pytest.mark.long
-def test_everything_is_the_same_on_one_processor_and_on_all(same_bits):
+def test_everything_is_the_same_on_one_processor_and_on_all():
+    digests = runpy.run_path(str(HERE.parents[1] / "tools" / "same_bits.py"))["in_a_process"]
     everyone = os.sched_getaffinity(0)
-    assert same_bits.in_a_process({min(everyone)}) == same_bits.in_a_process(everyone)
+    assert digests({min(everyone)}) == digests(everyone)

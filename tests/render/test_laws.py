@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from bodies import (
     PLAIN,
-    assert_close,
     camera_over,
     directions,
     joined,
@@ -104,11 +103,10 @@ def test_energy_does_not_depend_on_how_finely_half_the_sheet_is_splatted():
         lambda s: s.centers, fine, fine.centers + jnp.asarray([[0.1, 0.1, 0.0]], float)
     )
     left, right = np.asarray(coarse.centers)[:, 0] < 0.1, np.asarray(fine.centers)[:, 0] > 0.25
-    halves = (
+    mixed = joined(
         jax.tree.map(lambda leaf: leaf[left], coarse),
         jax.tree.map(lambda leaf: leaf[right], fine),
     )
-    mixed = joined(*halves)
     gaussians = sj.SumOfGaussians([2.0, 5.0], [[0.5], [0.5]])
     beam = sj.GaussianBeam([0, 0, 10], [0, 0, -1], jnp.ones(1), 1)
     camera = camera_over(5.0, 32)
@@ -232,15 +230,11 @@ def picture(with_single_scattering):
     return sj.render(sj.Scene(splats, (light,), with_single_scattering), camera, PLAIN)
 
 
-@pytest.fixture(scope="module")
-def frame():
-    return picture(with_single_scattering())
-
-
 @pytest.mark.once
-def test_it_is_its_formula_and_part_of_the_beauty(frame):
+def test_it_is_its_formula_and_part_of_the_beauty():
     """The albedo colors it as it colors the rest."""
     lit, entered = with_single_scattering(), 0.8 * np.asarray([1.0, 2.0, 3.0])
+    frame = picture(lit)
     reflected = lit.single_scattering.reflected(jnp.asarray(0.8), jnp.asarray(0.8))
     expected = np.asarray(reflected) * entered * COLORS
     np.testing.assert_allclose(frame.single_scattering[2, 2], expected, rtol=1e-3)
@@ -276,15 +270,3 @@ def test_no_more_leaves_than_came_however_the_light_grazes(eta):
             if absorbing == 0:
                 np.testing.assert_allclose(np.asarray(leaving), 1, atol=2e-3)
         np.testing.assert_allclose(np.asarray(lit.diffuse_fraction(mu[:1])), 1, atol=2e-3)
-
-
-@pytest.mark.once
-def test_files_keep_it(tmp_path, frame):
-    lit = with_single_scattering().white()
-    sj.save_material(lit, tmp_path / "jade.toml")
-    assert_close(sj.load_material(tmp_path / "jade.toml"), lit, rtol=1e-6)
-    sj.write_exr(tmp_path / "jade.exr", frame)
-    read = sj.read_exr(tmp_path / "jade.exr")
-    np.testing.assert_array_equal(
-        read.single_scattering, np.asarray(frame.single_scattering, np.float32)
-    )

@@ -149,10 +149,8 @@ def test_a_light_of_many_samples_is_the_sum_of_them_and_has_one_row():
     assert float(jnp.sum(sun.specular) / jnp.sum(apart.specular)) == pytest.approx(1, abs=0.1)
 
 
-def scene(splats: sj.Splats | None = None, lights=None) -> sj.Scene:
-    gaussians = sj.SumOfGaussians([0.1, 2], [[0.3, 0.3, 0.2], [0.5, 0.4, 0.2]])
-    lights = sj.DirectionalLight([0, 0, -1], 3.14) if lights is None else lights
-    return sj.Scene(sphere(2000) if splats is None else splats, lights, sj.Material(gaussians))
+def scene(splats: sj.Splats | None = None, lights=(lamp(0, 0, -1),)) -> sj.Scene:
+    return scene_under(*lights, splats=sphere(2000) if splats is None else splats)
 
 
 def camera(distance: float = 50.0) -> sj.Camera:
@@ -166,7 +164,7 @@ FLIPPED = eqx.tree_at(lambda splats: splats.normals, sphere(2000), replace_fn=la
     ("wrong", "distance", "said"),
     [
         (scene(lights=[]), 50, "no light"),
-        (scene(lights=sj.PointLight([0, 0, 50], 0)), 50, "no light"),
+        (scene(lights=[sj.PointLight([0, 0, 50], 0)]), 50, "no light"),
         (scene(FLIPPED), 50, "normals of the splats point into the body"),
         (scene(), 3, "camera is inside the body"),
         (scene(sphere(2000, 0.0002)), 50, "check the units"),
@@ -193,7 +191,7 @@ def test_a_scene_that_nobody_means_is_warned_of_once(wrong, distance, said):
 )
 def test_other_scenes_pass(right):
     check_scene(right, camera(50_000.0))
-    jax.jit(lambda light: check_scene(scene(lights=light), camera()))(
+    jax.jit(lambda light: check_scene(scene(lights=[light]), camera()))(
         sj.DirectionalLight([0, 0, -1], 0)
     )
 

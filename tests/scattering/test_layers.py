@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.test_util import check_grads
+from media import INFINITE, layer, reflectance
 from scipy.integrate import quad
 from scipy.special import expn
 
@@ -22,14 +23,9 @@ from splatjax.scattering import (
     Multipole,
     inverse_hankel_transform,
 )
-from splatjax.scattering._slab import Response, diffuse_transmittance, hyperbolic_ratio
+from splatjax.scattering._slab import diffuse_transmittance, hyperbolic_ratio
 
-INFINITE = float("inf")
 MARBLE_GREEN = (0.0041, 2.62, 1.5)
-
-
-def layer(sigma_a, sigma_s_prime, eta, thickness) -> Layer:
-    return Layer(Medium(sigma_a, sigma_s_prime, eta), thickness)
 
 
 def image_sum(slab: Layer, eta_above: float, eta_below: float, r: np.ndarray, images: int):
@@ -107,21 +103,6 @@ def test_the_sum_of_images_has_its_derivatives_where_it_is_expanded(float64):
     exact = np.sinh(s * 1.3) * np.cosh(s * 0.4) / np.sinh(s * 2.3)
     np.testing.assert_allclose(ratio(jnp.asarray(s * s)), exact, rtol=1e-14)
     np.testing.assert_allclose(ratio(jnp.asarray(0.0)), 1.3 / 2.3, rtol=1e-14)
-
-
-def random_response(key) -> Response:
-    return Response(*jax.random.uniform(key, (4, 7), minval=0.0, maxval=0.45))
-
-
-def test_adding_sums_the_series_and_is_associative(float64):
-    a, b, c = (random_response(key) for key in jax.random.split(jax.random.key(3), 3))
-    left, right = a.over(b).over(c), a.over(b.over(c))
-    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-12), left, right)
-    series = sum((b.reflectance_above * a.reflectance_below) ** n for n in range(60))
-    both, through = a.over(b), a.transmittance_down * series
-    np.testing.assert_allclose(both.transmittance_down, through * b.transmittance_down, rtol=1e-12)
-    inner = through * b.reflectance_above * a.transmittance_up
-    np.testing.assert_allclose(both.reflectance_above, a.reflectance_above + inner, rtol=1e-12)
 
 
 def test_a_stack_of_one_is_its_layer_and_a_film_of_no_depth_changes_nothing(float64):
@@ -296,17 +277,6 @@ TABLE = (
     (1 / 1.3, 0.061132, 0.061788, 0.035350, 0.035378),
     (1 / 1.5, 0.091778, 0.092825, 0.063048, 0.063068),
 )
-
-
-def reflectance(mu: float, eta: float) -> float:
-    """Fresnel's equations for unpolarized light from inside, with total internal reflection."""
-    squared_sine = eta * eta * (1 - mu * mu)
-    if squared_sine >= 1:
-        return 1.0
-    outside = np.sqrt(1 - squared_sine)
-    across = (eta * mu - outside) / (eta * mu + outside)
-    along = (mu - eta * outside) / (mu + eta * outside)
-    return 0.5 * (across**2 + along**2)
 
 
 def moment(eta: float, power: int) -> float:

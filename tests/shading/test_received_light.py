@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from bodies import unit
 
 from splatjax.scene import DirectionalLight, GaussianBeam, PointLight, stack_lights
 from splatjax.shading import sum_received
@@ -12,10 +13,6 @@ from splatjax.shading import sum_received
 DIRECTIONS = np.asarray([[0.3, -2.0, -1.0], [1.0, 0.2, -0.4]])
 PLACE, ORIGIN, AXIS = np.asarray([[8.0, 20.0, 15.0], [1.0, 2.0, 30.0], [0.1, 0.0, -1.0]])
 STRENGTHS = np.asarray([[1.0, 2, 3], [0.5, 0.1, 0.2], [900.0, 500, 100], [4.0, 5, 6]])
-
-
-def unit(v):
-    return v / np.linalg.norm(v, axis=-1, keepdims=True)
 
 
 @pytest.mark.parametrize("count", [300, 20_000, 40_000])
@@ -55,9 +52,3 @@ def test_irradiance_is_the_sum_of_the_formulas(count, dtype):
     expected += np.outer(STRENGTHS[2], point * shares[2])
     expected += np.outer(STRENGTHS[1], received(-unit(DIRECTIONS[1])) * shares[3])
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-6)
-
-
-def test_no_light_is_dark():
-    body = bodies.bumpy(20)
-    found = sum_received(body.centers, body.normals, [], [], lambda _, c: c[None], 3)
-    np.testing.assert_array_equal(found, np.zeros((3, 20)))

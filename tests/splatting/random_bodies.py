@@ -124,9 +124,7 @@ def _drawn(kind: str, rng: np.random.Generator, count: int, seen: AbstractView):
     distance = np.linalg.norm(places, axis=1, keepdims=True)
     rays = places / distance if perspective else np.tile(axes[2], (count, 1))
     places += position
-    random = rng.normal(size=(count, 3))
-    across = np.cross(rays, random)
-    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    across = bodies.unit(np.cross(rays, rng.normal(size=(count, 3))))
     slope = np.abs(rng.normal(size=count)) * steepest
     if kind == "in one place" and rng.uniform() < 0.5:
         across, slope, size = (np.repeat(each[:1], count, axis=0) for each in (across, slope, size))
@@ -139,7 +137,7 @@ def _drawn(kind: str, rng: np.random.Generator, count: int, seen: AbstractView):
         normals = (
             across - rays * (rng.choice([-1, 1], count) * 10 ** rng.uniform(-9, -1, count))[:, None]
         )
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = bodies.unit(normals)
     radii = size * np.abs(mm)
     if kind == "two sheets":
         settings = SplattingSettings()

@@ -196,11 +196,9 @@ def test_a_constant_is_kept_and_a_plane_stays_a_plane(kind, dtype):
     """Large enough splats: a quarter of a pixel is added to the ellipse that a slope is
     divided by.
     """
-    normal = np.asarray([0.4, 0.3, 1.0]) / np.linalg.norm([0.4, 0.3, 1.0])
-    view = VIEWS[kind]()
+    view, normal = VIEWS[kind](), bodies.unit([0.4, 0.3, 1.0])
     if kind == "orthographic":
-        normal = -np.asarray(view.rotation, float)[2] + [0.3, 0.3, 0.0]
-        normal /= np.linalg.norm(normal)
+        normal = bodies.unit([0.3, 0.3, 0.0] - np.asarray(view.rotation, float)[2])
     body = bodies.sheet(30.0, 2.0, normal)
     surfaces = drawn(view, body, jnp.full((1, body.count), 0.3))
     assert float(jnp.min(surfaces.front.coverage)) == 1

@@ -176,8 +176,7 @@ def test_a_sphere_does_not_shadow_itself(kind):
     if kind == "cube":
         faces = [np.asarray(in_cube_face(view, body.centers.T)) for view in views]
         visible = [face * each for face, each in zip(faces, visible, strict=True)]
-    wi = np.asarray(toward, float) - (0 if kind == "distant" else np.asarray(body.centers, float))
-    wi = wi / np.linalg.norm(wi, axis=-1, keepdims=True)
+    wi = bodies.unit(np.asarray(toward) - (0 if kind == "distant" else np.asarray(body.centers)))
     cosine = np.sum(wi * np.asarray(body.normals, float), axis=1)
     assert np.min(sum(visible)[cosine > 0.2]) > 0.99
     assert kind == "cube" or np.max(sum(visible)[cosine < -0.3]) < 0.01

@@ -134,15 +134,6 @@ def test_a_film_is_a_thin_layer_that_absorbs(float32):
     assert film.total_reflectance.value[0] < 0.6 * bare.total_reflectance.value[0]
 
 
-def test_the_same_key_gives_the_same_numbers(dtype):
-    stack = [layer(0.1, 1.0, 1.4, 2.0)]
-    one, again, other = (
-        sj.transport.monte_carlo(stack, FEW, jax.random.key(seed)) for seed in (1, 1, 2)
-    )
-    np.testing.assert_array_equal(one.reflected.value, again.reflected.value)
-    assert np.any(np.asarray(one.reflected.value) != np.asarray(other.reflected.value))
-
-
 KEY_OF_PATHS = jax.random.key(11)
 RINGS = jnp.linspace(0.0, 3.0, 11)
 
