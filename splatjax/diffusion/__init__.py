@@ -8,7 +8,7 @@ from ._points import (
 from ._clustered import (
     ClusterDiffuser as ClusterDiffuser,
     ClusterPlan as ClusterPlan,
-    FINEST as FINEST,
+    FINE_QUANTILE as FINE_QUANTILE,
 )
 from ._dense import dense_layer as dense_layer, DenseDiffuser as DenseDiffuser
 from ._diffuser import (
@@ -27,4 +27,4 @@ from ._kernel import (
     unevenness as unevenness,
 )
 from ._streamed import StreamedDiffusion as StreamedDiffusion
-from ._clusters import BLOCK as BLOCK, compact_order as compact_order
+from ._clusters import POINTS_PER_BLOCK as POINTS_PER_BLOCK, compact_order as compact_order

@@ -17,7 +17,7 @@ from splatjax._chunking import zeros_after
 from splatjax._combination import AbstractCombination
 from splatjax.scene import Splats
 
-from ._clusters import BLOCK, ClusterTree
+from ._clusters import POINTS_PER_BLOCK, ClusterTree
 from ._diffuser import (
     AbstractDiffuser,
     AbstractDiffusionPlan,
@@ -29,9 +29,9 @@ from ._diffuser import (
 )
 from ._gaussian_sums import SourceTable, gaussian_sums
 from ._kernel import AbstractDiffusionKernel, TruncatedGaussian, resolved_fraction
-from ._neighbors import SOURCES, Boxes, Neighbors, find_neighbors
+from ._neighbors import SOURCES_PER_BLOCK, Boxes, Neighbors, find_neighbors
 
-FINEST = 0.01
+FINE_QUANTILE = 0.01
 """Quantile of the areas of the splats: a layer counts as resolved as far as splats of that area
 resolve it.
 """
@@ -82,8 +82,14 @@ class LayerPlan(eqx.Module):
         # Sink the sources, and sum over those near each block of points.
         below = levels[self.level].lowered(depth)
         table = layer_table(below, variance, depth, self.truncated)
-        blocks = (points * units_per_mm(variance)).reshape(3, -1, BLOCK).transpose(1, 0, 2)
-        lists = self.neighbors.lists if at is None else self.neighbors.lists.only(at // BLOCK)
+        blocks = (
+            (points * units_per_mm(variance)).reshape(3, -1, POINTS_PER_BLOCK).transpose(1, 0, 2)
+        )
+        lists = (
+            self.neighbors.lists
+            if at is None
+            else self.neighbors.lists.only(at // POINTS_PER_BLOCK)
+        )
         values = gaussian_sums(blocks, table, lists, self.truncated, divided)
         if at is None:
             rows = values.transpose(1, 0, 2).reshape(values.shape[1], -1)
@@ -130,7 +136,7 @@ class ClusterDiffuser(AbstractDiffuser):
         edges, supports = np.zeros(len(sizes)), np.zeros(len(sizes))
         if exists.any():
             spacing = math.sqrt(areas[exists].mean())
-            fine = float(np.quantile(areas[exists], FINEST))
+            fine = float(np.quantile(areas[exists], FINE_QUANTILE))
             edges, supports = self.choose_sources(sizes, spacing, fine, kernel, interval)
         cells = np.unique(edges[edges > 0]).tolist()
         levels = tuple(cells.index(edge) + 1 if edge > 0 else 0 for edge in edges.tolist())
@@ -179,7 +185,7 @@ class ClusterDiffuser(AbstractDiffuser):
         **Arguments:**
 
         - `spacing`: root of the mean area of the splats, mm.
-        - `fine`: area that only `FINEST` of the splats are finer than, mm^2.
+        - `fine`: area that only `FINE_QUANTILE` of the splats are finer than, mm^2.
         """
         given = (jnp.asarray(each, interval.dtype) for each in (variances * self.margin, fine))
         shares = np.asarray(eqx.filter_jit(resolved_fraction)(*given, interval), np.float64)
@@ -244,7 +250,7 @@ def _take_from_blocks(
     """Take points out of blocks; 0 for indices from the number of points on."""
 
     def index(values, at):
-        return values.at[at // BLOCK, :, at % BLOCK]
+        return values.at[at // POINTS_PER_BLOCK, :, at % POINTS_PER_BLOCK]
 
     def take(at, values):
         return index(values, at).get(mode="fill", fill_value=0).T
@@ -278,7 +284,7 @@ def layer_table(
     flat = 1 / (2 * jnp.pi * variance * truncated.integral(0.5 * depth * depth / variance))
     mass = (below.areas * flat)[None]
     light = jnp.concatenate([mass * below.irradiance, mass])
-    return SourceTable.of(below.centers * units_per_mm(variance), light, SOURCES, slopes)
+    return SourceTable.of(below.centers * units_per_mm(variance), light, SOURCES_PER_BLOCK, slopes)
 
 
 def units_per_mm(variance: Float[Array, ""]) -> Float[Array, ""]:
@@ -288,8 +294,8 @@ def units_per_mm(variance: Float[Array, ""]) -> Float[Array, ""]:
 
 def _target_boxes(points: Float[Array, "3 points"], areas: Float[Array, " points"]) -> Boxes:
     """Enclose the blocks of points; a block of splats without area is empty."""
-    exists = jnp.any((areas > 0).reshape(-1, BLOCK), axis=1)
-    return Boxes.around(points, jnp.repeat(exists, BLOCK), BLOCK)
+    exists = jnp.any((areas > 0).reshape(-1, POINTS_PER_BLOCK), axis=1)
+    return Boxes.around(points, jnp.repeat(exists, POINTS_PER_BLOCK), POINTS_PER_BLOCK)
 
 
 @eqx.filter_jit
@@ -318,4 +324,4 @@ def _enclose(
 @eqx.filter_jit
 def source_boxes(below: Sources) -> Boxes:
     """Enclose the sources of a layer, sunk below their splats. Not differentiated."""
-    return Boxes.around(below.centers, below.areas > 0, SOURCES)
+    return Boxes.around(below.centers, below.areas > 0, SOURCES_PER_BLOCK)

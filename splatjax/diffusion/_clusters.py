@@ -13,9 +13,9 @@ from splatjax._chunking import with_spare
 
 from ._diffuser import Sources
 
-BLOCK = 32
+POINTS_PER_BLOCK = 32
 """Points of one block; blocks, and their halves and quarters, are compact."""
-_TOGETHER = 128 * BLOCK  # split side by side from here on
+_TOGETHER = 128 * POINTS_PER_BLOCK  # split side by side from here on
 
 
 class ClusterTree(eqx.Module):
@@ -70,7 +70,10 @@ class ClusterTree(eqx.Module):
             of_slot[slots] = rank[parent]
             parents.append(jnp.asarray(of_slot))
             positions, facing, members = positions[order], facing[order], inside[order]
-            slots, before = np.arange(len(order)), with_spare(len(order), BLOCK, per_octave=2)
+            slots, before = (
+                np.arange(len(order)),
+                with_spare(len(order), POINTS_PER_BLOCK, per_octave=2),
+            )
             counts.append(before)
         return cls(tuple(parents), tuple(counts))
 
@@ -117,8 +120,8 @@ def _split_by_side(groups: np.ndarray, facing: np.ndarray) -> np.ndarray:
 
 
 def compact_order(points: np.ndarray) -> np.ndarray:
-    """Find the order `[points]` of a k-d tree whose leaves hold `BLOCK` points, but the last, and
-    are sorted down to quarters.
+    """Find the order `[points]` of a k-d tree whose leaves hold a block of points, but the last,
+    and are sorted down to quarters of it.
 
     **Arguments:** `points`: `[points, 3]`.
     """
@@ -127,7 +130,7 @@ def compact_order(points: np.ndarray) -> np.ndarray:
     todo = [(0, len(points))]
     while todo:
         begin, end = todo.pop()
-        step = _TOGETHER if end - begin > _TOGETHER else BLOCK
+        step = _TOGETHER if end - begin > _TOGETHER else POINTS_PER_BLOCK
         if end - begin <= step or end - begin == _TOGETHER:
             continue
         middle = begin + -(-(end - begin) // (2 * step)) * step
@@ -135,11 +138,11 @@ def compact_order(points: np.ndarray) -> np.ndarray:
         turn = np.argpartition(part[np.argmax(np.ptp(part, axis=1))], middle - begin - 1)
         order[begin:end], coordinates[:, begin:end] = order[begin:end][turn], part[:, turn]
         todo += [(begin, middle), (middle, end)]
-    together, whole = (len(points) // size * size for size in (_TOGETHER, BLOCK))
+    together, whole = (len(points) // size * size for size in (_TOGETHER, POINTS_PER_BLOCK))
     for begin in range(0, together, _TOGETHER):
         part = slice(begin, begin + _TOGETHER)
         _halve(order[part], coordinates[:, part], _TOGETHER)
-    _halve(order[together:whole], coordinates[:, together:whole], BLOCK)
+    _halve(order[together:whole], coordinates[:, together:whole], POINTS_PER_BLOCK)
     return order
 
 
@@ -147,7 +150,7 @@ def _halve(order: np.ndarray, coordinates: np.ndarray, size: int) -> None:
     """Split parts of one size in halves, along their longest axes, down to quarters of a block. In
     place.
     """
-    while size > BLOCK // 4:
+    while size > POINTS_PER_BLOCK // 4:
         parts = coordinates.reshape(3, -1, size)
         longest = np.argmax(np.ptp(parts, axis=2), axis=0)
         rows = np.arange(parts.shape[1])

@@ -122,8 +122,8 @@ class AbstractDiffuser(eqx.Module):
         **Arguments:**
 
         - `parts`: the splats, each part in the compact order in which they will be diffused
-          (`compact_order`) and filled up to whole blocks of `BLOCK` by splats without area; several
-          parts where several devices hold them.
+          (`compact_order`) and filled up to whole blocks by splats without area; several parts
+          where several devices hold them.
         - `interval`: from `AbstractDiffusionKernel.interval`.
         """
 

@@ -12,9 +12,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from splatjax._chunking import with_spare
 
-SOURCES = 8
+SOURCES_PER_BLOCK = 8
 """Sources of a block."""
-WIDTH = 16
+BLOCKS_PER_ROW = 16
 """Blocks of sources in a row of a list."""
 LANES = 128
 """Blocks of points that are swept together."""
@@ -161,10 +161,10 @@ def _list(low: np.ndarray, high: np.ndarray, sources: Boxes, reach: float):
     by_block = np.argsort(of, kind="stable")
     of, near = of[by_block], near[by_block]
     lengths = np.bincount(of, minlength=len(low))
-    counts = -(-lengths // WIDTH)
+    counts = -(-lengths // BLOCKS_PER_ROW)
     first, begins = (np.cumsum(each) - each for each in (counts, lengths))
-    ids = np.full((counts.sum(), WIDTH), len(sources.low), np.int32)
-    ids.reshape(-1)[(first * WIDTH - begins)[of] + np.arange(len(of))] = near
+    ids = np.full((counts.sum(), BLOCKS_PER_ROW), len(sources.low), np.int32)
+    ids.reshape(-1)[(first * BLOCKS_PER_ROW - begins)[of] + np.arange(len(of))] = near
     return ids, first, counts, np.argsort(-counts, kind="stable")
 
 

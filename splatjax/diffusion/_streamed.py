@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float
 from splatjax._combination import PartByPart
 
 from ._clustered import ClusterDiffuser, layer_table, source_boxes, units_per_mm
-from ._clusters import BLOCK, ClusterTree, compact_order
+from ._clusters import POINTS_PER_BLOCK, ClusterTree, compact_order
 from ._diffuser import Sources, divide_by_mass
 from ._gaussian_sums import FAR, gaussian_sums, identity
 from ._kernel import AbstractDiffusionKernel, TruncatedGaussian
@@ -118,7 +118,7 @@ class StreamedDiffusion:
         arrays = (np.asarray(each.T) for each in (sources.centers, sources.normals))
         tree = ClusterTree.build(*arrays, np.asarray(sources.areas) > 0, self.cells)
         self.cluster_capacity = tuple(
-            had if count <= had else math.ceil(_SPARE * count / BLOCK) * BLOCK
+            had if count <= had else math.ceil(_SPARE * count / POINTS_PER_BLOCK) * POINTS_PER_BLOCK
             for count, had in zip(tree.counts, self.cluster_capacity, strict=True)
         )
         levels = _levels(tree.with_capacity(self.cluster_capacity), sources)

@@ -272,7 +272,7 @@ def _cut_and_order(splats: Splats, mesh: Mesh | None) -> tuple[list[Splats], Arr
     and which of their entries exist, device after device.
     """
     devices, share = splats_per_device(splats.count, mesh)
-    filling = (0, rounded_up(share, _diffusion.BLOCK) - share)
+    filling = (0, rounded_up(share, _diffusion.POINTS_PER_BLOCK) - share)
     whole = jax.tree.map(np.asarray, fill_up(splats, share * devices))
     parts, orders, exist = [], [], []
     for i in range(devices):

@@ -94,7 +94,7 @@ class StreamStatistics:
         # How far the farthest splat is, the finest areas, and how evenly splats are spread.
         middle = (np.min(low, axis=0) + np.max(high, axis=0)) / 2
         farthest, finest, uneven = 0.0, np.zeros(0), 0.0
-        rank = _diffusion.FINEST * max(count - 1, 0)
+        rank = _diffusion.FINE_QUANTILE * max(count - 1, 0)
         for part in parts():
             if part.count:
                 away, areas = (np.asarray(part.centers) - middle).T, np.asarray(part.areas)

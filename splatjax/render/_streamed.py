@@ -99,7 +99,9 @@ def render_streamed(
 
     statistics = StreamStatistics.of(lambda: reported("looking"))
 
-    part_size = -(-statistics.part_size // _diffusion.BLOCK) * _diffusion.BLOCK
+    part_size = (
+        -(-statistics.part_size // _diffusion.POINTS_PER_BLOCK) * _diffusion.POINTS_PER_BLOCK
+    )
 
     def scenes(task: str) -> Iterator[Scene]:
         for part in reported(task):

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from splatjax.diffusion import BLOCK, Sources, _neighbors, compact_order
+from splatjax.diffusion import POINTS_PER_BLOCK, Sources, _neighbors, compact_order
 from splatjax.diffusion._clusters import ClusterTree
-from splatjax.diffusion._neighbors import SOURCES, Boxes, find_neighbors
+from splatjax.diffusion._neighbors import SOURCES_PER_BLOCK, Boxes, find_neighbors
 
 CELLS, COUNT = [2.0, 4.0, 16.0], 800
 levels_of = eqx.filter_jit(lambda tree, sources: tree.levels(sources))
@@ -60,7 +60,7 @@ def test_a_cluster_fills_no_more_than_its_cell_and_none_is_lost():
     for place, count, level in zip(of_splats(tree), tree.counts, range(3), strict=True):
         own = place[exists]
         numbers.append(len(np.unique(own)))
-        assert numbers[-1] <= count <= 1.2 * numbers[-1] + BLOCK
+        assert numbers[-1] <= count <= 1.2 * numbers[-1] + POINTS_PER_BLOCK
         edge = sum(CELLS[: level + 1])  # a cell takes in all of the clusters whose centers it holds
         for cluster in np.unique(own)[::7]:
             extent = np.ptp(centers[:, exists][:, own == cluster], axis=1)
@@ -72,7 +72,12 @@ def test_blocks_of_a_compact_order_are_small():
     points = bodies.unit(np.random.default_rng(1).normal(size=(4000, 3)))
     order = compact_order(points)
     np.testing.assert_array_equal(np.sort(order), np.arange(4000))
-    for size in (2 * BLOCK, BLOCK, BLOCK // 2, BLOCK // 4):
+    for size in (
+        2 * POINTS_PER_BLOCK,
+        POINTS_PER_BLOCK,
+        POINTS_PER_BLOCK // 2,
+        POINTS_PER_BLOCK // 4,
+    ):
         blocks = points[order[: 4000 // size * size]].reshape(-1, size, 3)
         extent = np.max(np.ptp(blocks, axis=1), axis=1)
         even = np.sqrt(4 * np.pi * size / 4000)  # edge of a square with its share of the sphere
@@ -83,11 +88,13 @@ def test_blocks_of_a_compact_order_are_small():
 @pytest.mark.parametrize("at_once", [1 << 20, 40])
 def test_neighbors_are_the_boxes_within_reach_each_once(at_once, monkeypatch):
     monkeypatch.setattr(_neighbors, "_AT_ONCE", at_once)
-    count, reach = 26 * BLOCK, 1.5
+    count, reach = 26 * POINTS_PER_BLOCK, 1.5
     places = np.random.default_rng(3).uniform(-6, 6, (count, 3))
     centers = jnp.asarray(places[compact_order(places)].T, float)
-    exists = jnp.arange(count) < count - BLOCK // 2
-    points, sources = (Boxes.around(centers, exists, size) for size in (BLOCK, SOURCES))
+    exists = jnp.arange(count) < count - POINTS_PER_BLOCK // 2
+    points, sources = (
+        Boxes.around(centers, exists, size) for size in (POINTS_PER_BLOCK, SOURCES_PER_BLOCK)
+    )
     gaps = jnp.maximum(
         points.low[:, None] - sources.high[None], sources.low[None] - points.high[:, None]
     )

@@ -15,7 +15,7 @@ from jax.test_util import check_grads
 
 from splatjax._combination import OneDevice
 from splatjax.diffusion import (
-    BLOCK,
+    POINTS_PER_BLOCK,
     ClusterDiffuser,
     DenseDiffuser,
     EscapeNormalization,
@@ -26,7 +26,7 @@ from splatjax.diffusion import (
 )
 from splatjax.scene import Splats
 
-COUNT, VARIANCES = 48 * BLOCK, (1.0, 9.0, 12.0)
+COUNT, VARIANCES = 48 * POINTS_PER_BLOCK, (1.0, 9.0, 12.0)
 KERNEL = EscapeNormalization()
 RESOLVED = jnp.asarray([0.0, 1e-3])  # an interval that resolves every layer
 # All of the root mean square of a layer. Beyond 4.5 standard deviations lie 4e-5 of the power;
@@ -151,7 +151,7 @@ def test_gradients_are_those_of_the_plain_sum_over_the_sources_within_the_suppor
     """With `error=0` nothing is merged, and what is left out is known to the last source: so the
     fast sums are held to rounding. Forward mode too.
     """
-    body, sources = scene(8 * BLOCK)
+    body, sources = scene(8 * POINTS_PER_BLOCK)
     variances = jnp.asarray([0.6, 9.0])
     plan = planned(ClusterDiffuser(error=0.0), body, variances)
     rng = np.random.default_rng(4)
@@ -202,7 +202,7 @@ def test_gradients_are_those_of_the_plain_sum_over_the_sources_within_the_suppor
 
 
 def test_gradients_through_clusters_are_those_of_differences(float64):
-    body, sources = scene(16 * BLOCK)
+    body, sources = scene(16 * POINTS_PER_BLOCK)
     variances = jnp.asarray([20.0, 60.0])
     plan = planned(ClusterDiffuser(), body, variances)
     # So wide a support that no difference steps over its rim.
@@ -222,7 +222,7 @@ def test_gradients_through_clusters_are_those_of_differences(float64):
 
 def test_far_from_every_source_gradients_are_finite():
     """As in an unresolved layer: nothing reaches a point between splats."""
-    _, sources = scene(8 * BLOCK)
+    _, sources = scene(8 * POINTS_PER_BLOCK)
     points = 1.01 * sources.centers[:, :9]
 
     def total(variance):
@@ -234,7 +234,7 @@ def test_far_from_every_source_gradients_are_finite():
 
 
 def test_outside_its_plan_the_diffuser_reports_it():
-    body, sources = scene(8 * BLOCK)
+    body, sources = scene(8 * POINTS_PER_BLOCK)
     plan = planned(ClusterDiffuser(), body)
 
     def needed(factor=1.0, stretch=1.0):

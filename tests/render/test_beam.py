@@ -12,7 +12,7 @@ from scipy.spatial import ConvexHull, Voronoi
 
 import splatjax as sj
 from splatjax._combination import OneDevice
-from splatjax.diffusion import BLOCK, ClusterDiffuser, Sources, compact_order
+from splatjax.diffusion import POINTS_PER_BLOCK, ClusterDiffuser, Sources, compact_order
 from splatjax.fitting import fit_medium
 from splatjax.render._plan import arrange
 from splatjax.scattering import measure_laser_dot
@@ -95,7 +95,7 @@ def test_a_beam_on_a_sheet_is_the_gaussian_of_each_layer_at_the_splats(kind, var
     scene, deviation = sheet_of(variance, kind)
     body, variances = scene.splats, scene.material.gaussians.variances
     order = compact_order(np.asarray(body.centers))
-    order = np.pad(order, (0, -len(order) % BLOCK), mode="edge")
+    order = np.pad(order, (0, -len(order) % POINTS_PER_BLOCK), mode="edge")
     exists = jnp.arange(len(order)) < body.count
     placed = arrange(body, jnp.asarray(order), exists)
     given = variances, EXACT.kernel

@@ -10,7 +10,7 @@ import pytest
 from bodies import PLAIN, apart, camera_over, joined, sheet, sphere, with_albedo
 
 import splatjax as sj
-from splatjax.diffusion import FINEST, DenseDiffuser
+from splatjax.diffusion import FINE_QUANTILE, DenseDiffuser
 from splatjax.diffusion._clusters import ClusterTree
 from splatjax.render._statistics import StreamStatistics
 from splatjax.splatting import ShadowSettings
@@ -104,7 +104,9 @@ def test_how_fine_the_splats_are_is_found_of_all(splats, size):
     )
     splats = eqx.tree_at(lambda each: each.areas, splats, areas)
     fine = StreamStatistics.of(in_parts(splats, size)).fine
-    assert fine == pytest.approx(np.quantile(np.asarray(areas, np.float64), FINEST), rel=1e-6)
+    assert fine == pytest.approx(
+        np.quantile(np.asarray(areas, np.float64), FINE_QUANTILE), rel=1e-6
+    )
 
 
 def without_area(splats, bare):
