@@ -104,9 +104,8 @@ class ViewOptions:
         with stage(
             f"reading {self.splats}" if self.splats else f"making the bust with {self.count} splats"
         ):
-            splats = self.adjusted(
-                sj.read_splats(self.splats, up=self.up) if self.splats else sj.bust(self.count)
-            )
+            whole = sj.read_splats(self.splats, up=self.up) if self.splats else sj.bust(self.count)
+            splats = self.adjusted(whole)
         return splats, self.material_for(splats)
 
     def material_for(self, splats: sj.Splats) -> sj.Material:
@@ -141,9 +140,8 @@ class ViewOptions:
         """
         # The first light gives a white diffuser that faces it the radiance 1.
         irradiance = np.full(material.channels, np.pi)
-        light = sj.DirectionalLight(
-            direction=-direction_to(light_azimuth, self.light_elevation), irradiance=irradiance
-        )
+        towards = -direction_to(light_azimuth, self.light_elevation)
+        light = sj.DirectionalLight(direction=towards, irradiance=irradiance)
         side = math.copysign(_FILL_SIDE, math.remainder(self.azimuth - self.light_azimuth, 360))
         fill = sj.DirectionalLight(
             direction=-direction_to(azimuth + side, _FILL_ELEVATION),
@@ -156,10 +154,8 @@ class ViewOptions:
         """Place a camera at an azimuth so that the bounding sphere of the splats, which come in
         parts, just fits the narrower side of the picture.
         """
-        boxes = [
-            (np.min(body, axis=0), np.max(body, axis=0))
-            for body in (np.asarray(part.centers) for part in parts())
-        ]
+        bodies = (np.asarray(part.centers) for part in parts())
+        boxes = [(np.min(body, axis=0), np.max(body, axis=0)) for body in bodies]
         low, high = np.min([box[0] for box in boxes], axis=0), np.max([b[1] for b in boxes], axis=0)
         middle = (low + high) / 2
         reaches = [
@@ -167,21 +163,16 @@ class ViewOptions:
             for part in parts()
         ]
         radius = float(max(np.max(reach) for reach in reaches))
-        half_angle = math.atan(
-            math.tan(math.radians(self.fov) / 2) * min(1.0, self.width / self.height)
-        )
+        narrower = min(1.0, self.width / self.height)
+        half_angle = math.atan(math.tan(math.radians(self.fov) / 2) * narrower)
         eye = middle + radius / math.sin(half_angle) * direction_to(azimuth, self.elevation)
         return sj.Camera.look_at(eye, middle, fov=self.fov, width=self.width, height=self.height)
 
     def write(self, path: Path, frame: sj.Frame, material: sj.Material) -> tuple[Path, Path]:
         """Write the picture with all its layers, and the PNG file beside it; return both paths."""
         picture = path.with_suffix(".png")
-        sj.write_exr(
-            path,
-            frame,
-            variances=material.gaussians.variances.tolist(),
-            manifest=self.manifest(),
-        )
+        variances = material.gaussians.variances.tolist()
+        sj.write_exr(path, frame, variances=variances, manifest=self.manifest())
         sj.write_png(picture, frame, exposure=self.exposure)
         return path, picture
 
@@ -194,12 +185,11 @@ class ViewOptions:
             for field, value in asdict(self).items()
             if field not in _NOT_IN_PICTURES
         }
+        material = sj.io.material_path(self.material).read_text(encoding="utf-8")
         splats = f"{self.splats.name}, {sj.io.fingerprint(self.splats)}" if self.splats else None
         return options | {
             "splats": splats or "the built-in bust",
-            "contents of --material": sj.io.material_path(self.material).read_text(
-                encoding="utf-8"
-            ),
+            "contents of --material": material,
             "precision": str(jnp.result_type(float)),
             "splatjax": sj.__version__,
             "jax": jax.__version__,

@@ -171,14 +171,14 @@ def layer_values(
     - `sums`: `sum_j m_j w_j E_j` of each channel, and last `sum_j m_j w_j`.
     - `first_moments`: the same sums times the sources' places `q_j`.
     """
-    values = divide_by_mass(sums)
-    means, mass = values[:-1], values[-1]
+    mass = sums[-1]
+    inverse = 1 / jnp.where(mass > 0, mass, 1.0)
+    means = sums[:-1] * inverse[None]
     # grad N = sum w E (q - x) / v, and grad (N / D) = (grad N - (N / D) grad D) / D.
     gradients = first_moments - sums[:, None] * points[None]
-    slopes = gradients[:-1] - means[:, None] * gradients[-1:]
-    slopes = slopes / jnp.where(mass > 0, mass, 1.0)[None, None]
+    slopes = (gradients[:-1] - means[:, None] * gradients[-1:]) * inverse[None, None]
     slopes = jnp.concatenate([slopes, gradients[-1:]]).reshape(-1, mass.shape[0])
-    return jnp.concatenate([values, jnp.where(mass[None] > 0, slopes, 0.0)])
+    return jnp.where(mass[None] > 0, jnp.concatenate([means, mass[None], slopes]), 0.0)
 
 
 def split_layer(rows: Float[Array, "rows points"], scale: Float[Array, ""]) -> LayerValues:

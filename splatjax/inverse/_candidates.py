@@ -92,27 +92,22 @@ def next_pictures(
     dtype = medium.eta.dtype
     setups = [Setup(splats, one.camera, one.lights) for one in candidates]
     pictures, _ = render_layers(setups, recovery.material, settings)
-    fit = eqx.Partial(
-        fit_near, near=recovery.material.gaussians.variances.astype(dtype), weights=weights
-    )
+    near = recovery.material.gaussians.variances.astype(dtype)
+    fit = eqx.Partial(fit_near, near=near, weights=weights)
     noise = recovery.relative_noise * recovery.scale**0.5
     predictions = []
     for candidate, picture in zip(candidates, pictures, strict=True):
         dark = np.zeros(picture.specular.shape)
-        evidence = Evidence.of(
-            Observation(dark, candidate.camera, candidate.lights, deviation=1), dtype
-        )
+        observation = Observation(dark, candidate.camera, candidate.lights, deviation=1)
+        evidence = Evidence.of(observation, dtype)
         unknowns = Unknowns.of(medium.eta, [candidate.intensity])
         problem = RecoveryProblem.of([picture], [evidence], unknowns, fit, loss, model)
         at_point = solution(problem, unknowns.start(medium))
         radiance = np.asarray(at_point.radiance[0])[np.asarray(problem.counted[0]) > 0]
         bright = float(np.sqrt(np.mean(radiance**2)))
         scale = max(noise * (bright or 1.0), np.finfo(float).tiny) ** -2
-        more = _marginal(
-            np.asarray(at_point.information, float) * scale,
-            medium.channels,
-            len(recovery.information),
-        )
+        information = np.asarray(at_point.information, float) * scale
+        more = _marginal(information, medium.channels, len(recovery.information))
         predictions.append(Prediction(candidate, recovery.covariance(more)))
     return sorted(predictions, key=lambda prediction: prediction.worst.deviation)
 

@@ -123,13 +123,8 @@ def recover(
     surface = surface or Material(_unweighed(wide, channels), eta=eta[0], specular=0)
 
     def problem_at(variances, fit, plans=None, derivative=True):
-        pictures, plans = render_layers(
-            setups,
-            surface.surface_of(_unweighed(variances, channels)),
-            settings,
-            plans,
-            derivative,
-        )
+        material = surface.surface_of(_unweighed(variances, channels))
+        pictures, plans = render_layers(setups, material, settings, plans, derivative)
         return RecoveryProblem.of(pictures, evidence, unknowns, fit, loss, model), plans
 
     report(f"rendering {len(wide)} layers of {counted(len(observations), 'picture')}", starts[0])
@@ -138,9 +133,8 @@ def recover(
     report(
         f"searching from {counted(len(starts), 'start')} among {problem.pixels} pixels", starts[0]
     )
-    points, costs, steps, _ = zip(
-        *(search(problem, unknowns.start(start)) for start in starts), strict=True
-    )
+    ends = [search(problem, unknowns.start(start)) for start in starts]
+    points, costs, steps, _ = zip(*ends, strict=True)
     costs = np.nan_to_num(np.asarray(costs, float), nan=np.inf)
     point, steps = points[int(np.argmin(costs))], sum(map(int, steps))
     settled, plans, rounds = False, None, 0
@@ -167,9 +161,8 @@ def recover(
         covariance = inverse(np.asarray(reached.information, np.float64)[:size, :size])
         scale = 1.0 if noise_is_known else float(chi_squared) ** 0.5
         deviations = scale * np.sqrt(np.diagonal(covariance))
-        settled = bool(converged) and np.all(
-            np.abs(point - before) <= np.maximum(_SETTLED, 0.1 * deviations)
-        )
+        moved = np.abs(point - before)
+        settled = bool(converged) and np.all(moved <= np.maximum(_SETTLED, 0.1 * deviations))
     pictures, residuals = compared(reached.radiance, problem.counted, evidence)
     recovery = Recovery(
         medium=unknowns.medium(point),

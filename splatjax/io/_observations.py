@@ -48,12 +48,8 @@ def read_observations(path: StrPath) -> list[Observation]:
     """
     path = Path(path)
     file = Table(path, "", read_toml(path, "name one that lists pictures"), ["pictures"])
-    return [
-        _observation(table)
-        for table in file.tables(
-            "pictures", ("file", "mask", "noise", "intensity", "camera", "lights")
-        )
-    ]
+    entries = ("file", "mask", "noise", "intensity", "camera", "lights")
+    return [_observation(table) for table in file.tables("pictures", entries)]
 
 
 def picture_paths(path: StrPath) -> list[Path]:

@@ -39,11 +39,8 @@ class AbstractLight(eqx.Module):
         strength = getattr(self, self.strength, None)
         if strength is None or strength.shape != (1,):
             return self
-        return eqx.tree_at(
-            lambda light: getattr(light, light.strength),
-            self,
-            jnp.broadcast_to(strength, (channels,)),
-        )
+        repeated = jnp.broadcast_to(strength, (channels,))
+        return eqx.tree_at(lambda light: getattr(light, light.strength), self, repeated)
 
     @abc.abstractmethod
     def samples(self) -> tuple["AbstractLightSample", ...]:
@@ -211,7 +208,6 @@ def stack_lights(lights: tuple[AbstractLight, ...]) -> list[StackedLights]:
     groups = []
     for members in kinds.values():
         indices, samples = zip(*members, strict=True)
-        groups.append(
-            StackedLights(jax.tree.map(lambda *leaves: jnp.stack(leaves), *samples), indices)
-        )
+        stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *samples)
+        groups.append(StackedLights(stacked, indices))
     return groups

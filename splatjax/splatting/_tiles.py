@@ -59,7 +59,7 @@ class TileRasterizer(AbstractRasterizer):
     ) -> "TilePlan":
         """Make the plan for the demand of each part in each view, of so many splats at most."""
         grid = self.grid(view)
-        step = max(_STEP, splats // 16)
+        step = max(_STEP, splats // 32)
         seen = with_spare(max(int(seen) for part in demands for seen, _ in part), step)
         bins = BinCapacity.for_counts([tiles for part in demands for _, tiles in part], grid)
         front = bins.chunks * self.lanes

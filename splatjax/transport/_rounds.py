@@ -108,11 +108,8 @@ def _start(walk: Walk) -> _State:
         Sum.zeros((channels, 2 * (rings + 1) + 1, moments), dtype),
         Sum.zeros((layers, channels, moments), dtype),
     )
-    return _launch(
-        walk,
-        _State(photons, weights, slopes, tally, number[0], number[0]),
-        photons.place == IDLE,
-    )
+    state = _State(photons, weights, slopes, tally, number[0], number[0])
+    return _launch(walk, state, photons.place == IDLE)
 
 
 @eqx.filter_jit
