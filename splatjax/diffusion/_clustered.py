@@ -95,10 +95,11 @@ class LayerPlan(eqx.Module):
             rows = values.transpose(1, 0, 2).reshape(values.shape[1], -1)
         else:
             rows = _take_from_blocks(values, at)
+        largest_exponent = self.truncated.largest.astype(variance.dtype)
         reach = self.neighbors.needed(
             around,
             source_boxes(below),
-            stop_gradient(jnp.sqrt(2 * self.truncated.largest * variance)).astype(points.dtype),
+            stop_gradient(jnp.sqrt(2 * largest_exponent * variance)).astype(points.dtype),
         )
         # Slopes are moments in mm over v, and the moments are in units of sqrt(2 v).
         layer = split_layer(rows, 2 * units_per_mm(variance))
