@@ -120,7 +120,9 @@ def main() -> None:
         placed = jax.tree.map(lambda rows, plan=plan: rows[..., plan.order], sources)
         areas = jnp.where(plan.exists, placed.areas, 0)
         placed = dataclasses.replace(placed, areas=areas)
-        seen = splatting.PerspectiveView.of(camera).may_see(splats)[plan.order]
+        view, body = splatting.PerspectiveView.of(camera), splats.take(plan.order)
+        body = eqx.tree_at(lambda s: s.radii, body, jnp.where(plan.exists, body.radii, 0))
+        seen, _ = plan.raster.choose(body, view)
 
         def diffuse(placed, wanted, plan=plan):
             own = gaussians.variances, kernel, OneDevice(), wanted
@@ -145,18 +147,19 @@ def main() -> None:
         off = deviations(found[resolved], truth[resolved])
         order = np.empty(splats.count, int)
         order[np.asarray(plan.order)[np.asarray(plan.exists)]] = np.flatnonzero(plan.exists)
-        means = np.stack(
-            [np.asarray(diffused.layers[k].values[:-1])[:, order[chosen]] for k in resolved]
-        )
+        planned = np.asarray(plan.diffusion.gaussians).tolist()
+        layers = [planned.index(k) for k in resolved]
+        means = np.asarray(diffused.layers.values[:, :-1])[layers][:, :, order[chosen]]
         off_at_splats = deviations(means, means_at_splats[resolved])
         print(
             f"error={error:g}: pass 4 {1e3 * seconds:.0f} ms, at all splats "
             f"{1e3 * all_seconds:.0f} ms; frame {1e3 * frame_seconds:.0f} ms\n"
             "of the RMS at pixels, then of the means at splats: median, 99th percentile, maximum"
         )
-        for k, at_pixels, means in zip(resolved, off, off_at_splats, strict=True):
-            level = plan.diffusion.layers[k].level
-            how = "single splats" if level == 0 else f"clusters of level {level}"
+        sources = [len(np.unique(plan.diffusion.sources.parents[layer])) for layer in layers]
+        each = zip(resolved, sources, off, off_at_splats, strict=True)
+        for k, count, at_pixels, means in each:
+            how = f"{count} sources"
             numbers = (
                 " ".join(f"{np.quantile(each, q):.1e}" for q in QUANTILES)
                 for each in (at_pixels, means)

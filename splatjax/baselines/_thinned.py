@@ -8,13 +8,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Int
 
 from splatjax._chunking import take_points
 from splatjax.diffusion import (
     AbstractDiffuser,
     AbstractDiffusionPlan,
     Diffused,
-    dense_layer,
+    dense_layers,
 )
 
 _GOLDEN = (5**0.5 - 1) / 2
@@ -36,12 +37,13 @@ class ThinnedDiffuser(AbstractDiffuser):
     keep: int = eqx.field(static=True)
 
     def make_plan(self, parts, variances, kernel, interval):
-        return ThinnedPlan(self.keep)
+        return ThinnedPlan(jnp.arange(len(variances), dtype=jnp.int32), self.keep)
 
 
 class ThinnedPlan(AbstractDiffusionPlan):
     """What sums over fewer splats need to know: how many are left out."""
 
+    gaussians: Int[Array, " layers"]
     keep: int = eqx.field(static=True)
 
     def diffuse(self, sources, variances, kernel, combination, at=None):
@@ -51,11 +53,8 @@ class ThinnedPlan(AbstractDiffusionPlan):
         chosen = group * self.keep + (group * _GOLDEN % 1 * self.keep).astype(int)
         chosen = np.minimum(chosen, everywhere.areas.shape[0] - 1)
         kept = jax.tree.map(lambda rows: rows[..., chosen], everywhere)
-        whole = combination.total([jnp.sum(sources.areas)])
-        kept = dataclasses.replace(kept, areas=kept.areas * (whole / jnp.sum(kept.areas)))
+        stands_for = combination.total([jnp.sum(sources.areas)]) / jnp.sum(kept.areas)
+        kept = dataclasses.replace(kept, areas=kept.areas * stands_for)
         points = sources.centers if at is None else take_points(sources.centers, at)
-        layers = tuple(
-            dense_layer(kept, points, variance, depth)
-            for variance, depth in zip(variances, kernel.depths(variances), strict=True)
-        )
+        layers = dense_layers(kept, points, variances, kernel)
         return Diffused(layers, jnp.zeros((), sources.centers.dtype))

@@ -10,7 +10,11 @@ from ._clustered import (
     ClusterPlan as ClusterPlan,
     FINE_QUANTILE as FINE_QUANTILE,
 )
-from ._dense import dense_layer as dense_layer, DenseDiffuser as DenseDiffuser
+from ._dense import (
+    dense_layer as dense_layer,
+    dense_layers as dense_layers,
+    DenseDiffuser as DenseDiffuser,
+)
 from ._diffuser import (
     AbstractDiffuser as AbstractDiffuser,
     AbstractDiffusionPlan as AbstractDiffusionPlan,

@@ -5,31 +5,42 @@
 from collections.abc import Sequence
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
-
-from splatjax._chunking import with_spare
 
 from ._diffuser import Sources
 
 POINTS_PER_BLOCK = 32
 """Points of one block; blocks, and their halves and quarters, are compact."""
+SOURCES_PER_BLOCK = 8
+"""Sources of a block."""
 _TOGETHER = 128 * POINTS_PER_BLOCK  # split side by side from here on
 
 
-class ClusterTree(eqx.Module):
-    """Nested cells around the splats. Which splats share a cell is not differentiated.
-
-    **Attributes:**
-
-    - `parents`: for each level, the cell of every cluster of the level before; of every splat, for
-      the first.
-    - `counts`: clusters of each level. Static.
+class SunkSources(eqx.Module):
+    """The sources of all layers: means over the areas of their splats, which are sunk below the
+    surface; and sums of the areas. A source without splats has none.
     """
 
-    parents: tuple[Int[Array, " _"], ...]
-    counts: tuple[int, ...] = eqx.field(static=True)
+    centers: Float[Array, "3 sources"]
+    areas: Float[Array, " sources"]
+    irradiance: Float[Array, "channels sources"]
+
+
+class LayerSources(eqx.Module):
+    """The sources of every layer: its splats sunk below the surface, or clusters of them.
+
+    **Attributes:** which splats share a cluster is not differentiated
+
+    - `parents`: for each layer the source that each splat is part of, beyond all for none; those of
+      all layers are counted in one sequence.
+    - `layers`: the layer of every block of sources.
+    """
+
+    parents: Int[Array, "layers splats"]
+    layers: Int[Array, " blocks"]
 
     @classmethod
     def build(
@@ -37,61 +48,101 @@ class ClusterTree(eqx.Module):
         centers: Float[np.ndarray, "splats 3"],
         normals: Float[np.ndarray, "splats 3"],
         exists: Bool[np.ndarray, " splats"],
-        cells: Sequence[float],
-    ) -> "ClusterTree":
-        """Sort splats, and the clusters of each level, into cells by their centers.
+        edges: Sequence[float],
+        least: int = 0,
+    ) -> "LayerSources":
+        """Find the sources of layers.
 
-        A cell holds only clusters that face one way: the two sides of a thin sheet are apart.
+        The capacity is rounded up to halves of the number of splats, so that materials share a
+        program.
 
         **Arguments:**
 
         - `exists`: false for splats that fill a block.
-        - `cells`: edges of the cells of each level, mm, ascending.
+        - `edges`: of the cells of each layer, mm; 0 for single splats, inf for none.
+        - `least`: sources for which there is room.
         """
-        parents, counts = [], []
-        positions, facing = centers[exists], normals[exists]
-        members, slots = np.ones(len(positions)), np.flatnonzero(exists)
-        before = len(exists)
-        for cell in cells:
-            # Cells are numbered along a grid, then split by side, then sorted into a compact order.
-            index = np.floor((positions - positions.min(axis=0)) / cell).astype(np.int64)
-            extent = index.max(axis=0) + 1
-            key = (index[:, 0] * extent[1] + index[:, 1]) * extent[2] + index[:, 2]
-            parent = _split_by_side(np.unique(key, return_inverse=True)[1].reshape(-1), facing)
-            inside = np.bincount(parent, members)
-            positions, facing = (
-                _sums(parent, members[:, None] * rows) / inside[:, None]
-                for rows in (positions, facing)
-            )
-            order = compact_order(positions)
-            rank = np.empty(len(order), np.int32)
-            rank[order] = np.arange(len(order), dtype=np.int32)
-            of_slot = np.zeros(before, np.int32)
-            of_slot[slots] = rank[parent]
-            parents.append(jnp.asarray(of_slot))
-            positions, facing, members = positions[order], facing[order], inside[order]
-            slots, before = (
-                np.arange(len(order)),
-                with_spare(len(order), POINTS_PER_BLOCK, per_octave=2),
-            )
-            counts.append(before)
-        return cls(tuple(parents), tuple(counts))
+        cells = sorted({edge for edge in edges if 0 < edge < np.inf})
+        nested = dict(zip(cells, nested_cells(centers, normals, exists, cells), strict=True))
+        nested[0.0] = np.arange(len(exists), dtype=np.int32), len(exists)
+        nested[np.inf] = np.full(len(exists), np.iinfo(np.int32).max // 2, np.int32), 0
+        parents, layers, count = [], [], 0
+        for layer, (own, members) in enumerate(nested[edge] for edge in edges):
+            parents.append(count + own)
+            blocks = -(-members // SOURCES_PER_BLOCK)
+            layers.append(np.full(blocks, layer, np.int32))
+            count += blocks * SOURCES_PER_BLOCK
+        half = -(-len(exists) // (2 * SOURCES_PER_BLOCK)) * SOURCES_PER_BLOCK
+        room = max(-(-count // half), len(edges)) * half
+        layers.append(np.zeros((max(room, least) - count) // SOURCES_PER_BLOCK, np.int32))
+        return cls(jnp.asarray(np.stack(parents)), jnp.asarray(np.concatenate(layers)))
 
-    def with_capacity(self, counts: Sequence[int]) -> "ClusterTree":
-        """Add empty clusters to every level up to `counts`."""
-        before = (self.parents[0].shape[0], *counts) if self.parents else ()
-        parents = tuple(
-            jnp.pad(each, (0, count - each.shape[0]))
-            for each, count in zip(self.parents, before, strict=False)
+    @property
+    def count(self) -> int:
+        """The number of sources."""
+        return SOURCES_PER_BLOCK * len(self.layers)
+
+    def merged(self, splats: Sources, depths: Float[Array, " layers"]) -> SunkSources:
+        """Sink the splats below the surface by the depth of each layer, mm, and merge them. Area
+        and energy are kept. Differentiable.
+        """
+
+        def totals(rows: Float[Array, "#layers splats"]) -> Float[Array, " sources"]:
+            every = jnp.broadcast_to(rows, self.parents.shape)
+            return jax.ops.segment_sum(every.reshape(-1), self.parents.reshape(-1), self.count)
+
+        areas = totals(splats.areas[None])
+        inverse = 1 / jnp.where(areas > 0, areas, 1.0)
+        sunk = splats.centers[:, None] - depths[None, :, None] * splats.normals[:, None]
+        return SunkSources(
+            centers=jnp.stack([totals(splats.areas[None] * row) * inverse for row in sunk]),
+            areas=areas,
+            irradiance=jnp.stack(
+                [totals((splats.areas * row)[None]) * inverse for row in splats.irradiance]
+            ),
         )
-        return ClusterTree(parents, tuple(counts))
 
-    def levels(self, sources: Sources) -> list[Sources]:
-        """Compute the clusters of every level, the splats themselves first."""
-        levels = [sources]
-        for parents, count in zip(self.parents, self.counts, strict=True):
-            levels.append(levels[-1].merged(parents, count))
-        return levels
+
+def nested_cells(
+    centers: Float[np.ndarray, "splats 3"],
+    normals: Float[np.ndarray, "splats 3"],
+    exists: Bool[np.ndarray, " splats"],
+    cells: Sequence[float],
+) -> list[tuple[Int[np.ndarray, " splats"], int]]:
+    """Sort splats into cells by their centers, and these into larger cells by theirs.
+
+    A cell holds only splats that face one way: the two sides of a thin sheet are apart.
+
+    **Arguments:**
+
+    - `exists`: false for splats that fill a block; they count as in the first cell.
+    - `cells`: edges of the cells of each level, mm, ascending.
+
+    **Returns:** for each level the cell of every splat, in a compact order, and the number of
+    cells.
+    """
+    levels = []
+    positions, facing = centers[exists], normals[exists]
+    members, of_splats = np.ones(len(positions)), np.arange(len(positions))
+    for cell in cells:
+        # Cells are numbered along a grid, then split by side, then sorted into a compact order.
+        index = np.floor((positions - positions.min(axis=0)) / cell).astype(np.int64)
+        extent = index.max(axis=0) + 1
+        key = (index[:, 0] * extent[1] + index[:, 1]) * extent[2] + index[:, 2]
+        parent = _split_by_side(np.unique(key, return_inverse=True)[1].reshape(-1), facing)
+        inside = np.bincount(parent, members)
+        positions, facing = (
+            _sums(parent, members[:, None] * rows) / inside[:, None] for rows in (positions, facing)
+        )
+        order = compact_order(positions)
+        rank = np.empty(len(order), np.int32)
+        rank[order] = np.arange(len(order), dtype=np.int32)
+        positions, facing, members = positions[order], facing[order], inside[order]
+        of_splats = rank[parent][of_splats]
+        own = np.zeros(len(exists), np.int32)
+        own[exists] = of_splats
+        levels.append((own, len(order)))
+    return levels
 
 
 def _sums(groups: np.ndarray, rows: np.ndarray) -> np.ndarray:

@@ -2,6 +2,7 @@
 derivative.
 """
 
+import jax
 import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Float, Int
@@ -16,7 +17,6 @@ from ._diffuser import (
     LayerValues,
     Sources,
     layer_values,
-    split_layer,
 )
 from ._kernel import AbstractDiffusionKernel
 
@@ -27,11 +27,13 @@ class DenseDiffuser(AbstractDiffuser):
     """Sums over every splat at every splat. Slow and plain."""
 
     def make_plan(self, parts, variances, kernel, interval):
-        return DensePlan()
+        return DensePlan(jnp.arange(len(variances), dtype=jnp.int32))
 
 
 class DensePlan(AbstractDiffusionPlan):
-    """What the plain diffuser needs to know: nothing."""
+    """What the plain diffuser needs to know: how many layers there are."""
+
+    gaussians: Int[Array, " layers"]
 
     def diffuse(
         self,
@@ -43,11 +45,19 @@ class DensePlan(AbstractDiffusionPlan):
     ) -> Diffused:
         everywhere = combination.gather_last(sources)
         points = sources.centers if at is None else take_points(sources.centers, at)
-        layers = tuple(
-            dense_layer(everywhere, points, variance, depth)
-            for variance, depth in zip(variances, kernel.depths(variances), strict=True)
-        )
+        layers = dense_layers(everywhere, points, variances, kernel)
         return Diffused(layers, jnp.zeros((), sources.centers.dtype))
+
+
+def dense_layers(
+    sources: Sources,
+    points: Float[Array, "3 points"],
+    variances: Float[Array, " gaussians"],
+    kernel: AbstractDiffusionKernel,
+) -> LayerValues:
+    """Evaluate layers at any points, untruncated."""
+    given = variances, kernel.depths(variances)
+    return jax.lax.map(lambda layer: dense_layer(sources, points, *layer), given)
 
 
 def dense_layer(
@@ -60,7 +70,7 @@ def dense_layer(
     # Sink the sources below their splats.
     below = sources.centers - depth * sources.normals
 
-    def evaluate(points: Float[Array, "points 3"]) -> Float[Array, "points rows"]:
+    def evaluate(points: Float[Array, "points 3"]):
         # Squared distances of all points from all sources.
         offset = below[:, None] - points.T[:, :, None]
         squared = jnp.sum(offset * offset, axis=0)
@@ -70,16 +80,15 @@ def dense_layer(
         weight = sources.areas[None] * jnp.exp(-0.5 * (squared - nearest) / variance)
         # Sum light and mass, and their first moments about the point; divide them.
         light = jnp.concatenate([sources.irradiance, jnp.ones_like(sources.areas)[None]])
-        firsts = jnp.einsum("cs,aps,ps->cap", light, offset, weight)
-        rows = layer_values(light @ weight.T, firsts, jnp.zeros_like(points.T))
-        # Scale the mass and its slopes, so that a flat sheet has mass 1; far from all sources the
-        # factor underflows to 0.
+        moments = jnp.concatenate([jnp.ones_like(offset[:1]), offset])
+        sums = jnp.einsum("cs,aps,ps->cap", light, moments, weight)
+        # The mass of a flat sheet; far from all sources the factor underflows to 0.
         flat = jnp.exp(-0.5 * (nearest[:, 0] - depth * depth) / variance) / (2 * jnp.pi * variance)
-        of_mass = jnp.zeros((len(light), 4), bool).at[-1].set(True)
-        of_mass = jnp.concatenate([of_mass[:, 0], of_mass[:, 1:].reshape(-1)])
-        return (rows * jnp.where(of_mass[:, None], flat[None], 1.0)).T
+        layer = layer_values(sums, jnp.zeros_like(points.T), 1 / variance[None], flat)
+        return jax.tree.map(lambda rows: jnp.moveaxis(rows, -1, 0), layer)
 
     if sources.areas.shape[0] == 0 or points.shape[1] == 0:
-        shape = 4 * (sources.irradiance.shape[0] + 1), points.shape[1]
-        return split_layer(jnp.zeros(shape, points.dtype), 1 / variance)
-    return split_layer(map_chunks(evaluate, points.T, at_once=_AT_ONCE).T, 1 / variance)
+        rows, count = sources.irradiance.shape[0] + 1, points.shape[1]
+        return LayerValues(*(jnp.zeros((rows, *x, count), points.dtype) for x in ((), (3,))))
+    layer = map_chunks(evaluate, points.T, at_once=_AT_ONCE)
+    return jax.tree.map(lambda rows: jnp.moveaxis(rows, 0, -1), layer)

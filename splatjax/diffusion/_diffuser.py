@@ -1,7 +1,6 @@
 """The diffusion integral of the irradiance for every layer (pass 4, section 4.2)."""
 
 import abc
-import dataclasses
 
 import equinox as eqx
 import jax
@@ -15,40 +14,16 @@ from ._kernel import AbstractDiffusionKernel
 
 
 class Sources(eqx.Module):
-    """The splats as sources of diffused light, or clusters that stand for several of them. An empty
-    cluster has no area.
-
-    **Attributes:**
-
-    - `centers`, `normals`: of clusters means over the area; mean normals are shorter than one where
-      the surface bends.
-    - `areas`, `irradiance`: of clusters sums of the areas, mm^2, and means over them.
-    """
+    """The splats as sources of diffused light."""
 
     centers: Float[Array, "3 sources"]
     normals: Float[Array, "3 sources"]
     areas: Float[Array, " sources"]
     irradiance: Float[Array, "channels sources"]
 
-    def lowered(self, depth: Float[Array, ""]) -> "Sources":
-        """Move every source against its normal by `depth` (mm)."""
-        return dataclasses.replace(self, centers=self.centers - depth * self.normals)
-
-    def merged(self, parents: Int[Array, " sources"], count: int) -> "Sources":
-        """Merge into `count` parents. Area and energy are kept. Differentiable."""
-
-        def totals(rows: Float[Array, "rows sources"]) -> Float[Array, "rows parents"]:
-            return jax.vmap(lambda row: jax.ops.segment_sum(row, parents, count))(rows)
-
-        # Means over the area of the children.
-        areas = totals(self.areas[None])[0]
-        rows = jnp.concatenate([self.centers, self.normals, self.irradiance])
-        means = totals(self.areas[None] * rows) / jnp.where(areas > 0, areas, 1.0)[None]
-        return Sources(means[:3], means[3:6], areas, means[6:])
-
 
 class LayerValues(eqx.Module):
-    """One layer at some points.
+    """Layers at some points.
 
     **Attributes:**
 
@@ -58,8 +33,8 @@ class LayerValues(eqx.Module):
     - `slopes`: of the values in space, 1/mm.
     """
 
-    values: Float[Array, "values points"]
-    slopes: Float[Array, "values 3 points"]
+    values: Float[Array, "*layers values points"]
+    slopes: Float[Array, "*layers values 3 points"]
 
 
 class Diffused(eqx.Module):
@@ -67,16 +42,24 @@ class Diffused(eqx.Module):
 
     **Attributes:**
 
-    - `layers`: one for each Gaussian; `None` for a layer that is too narrow for nearly all splats.
+    - `layers`: in the order of `AbstractDiffusionPlan.gaussians`.
     - `needed`: capacity needed over planned; above 1 the values are incomplete.
     """
 
-    layers: tuple[LayerValues | None, ...]
+    layers: LayerValues
     needed: Float[Array, ""]
 
 
 class AbstractDiffusionPlan(eqx.Module):
-    """A diffuser with everything that one geometry needs."""
+    """A diffuser with everything that one geometry needs.
+
+    **Attributes:**
+
+    - `gaussians`: the Gaussian of each layer that is evaluated; their number for a layer that only
+      fills up. Others are too narrow for nearly all splats.
+    """
+
+    gaussians: eqx.AbstractVar[Int[Array, " layers"]]
 
     @abc.abstractmethod
     def diffuse(
@@ -87,7 +70,7 @@ class AbstractDiffusionPlan(eqx.Module):
         combination: AbstractCombination,
         at: Int[Array, " points"] | None = None,
     ) -> Diffused:
-        r"""Evaluate every layer at the splats, from all splats near each in object space, whichever
+        r"""Evaluate the layers at the splats, from all splats near each in object space, whichever
         way they face:
 
             mean_k(x) = sum_j A_j G(v_k, |x - q_j|) E_j / sum_j A_j G(v_k, |x - q_j|)
@@ -154,34 +137,34 @@ def divide_by_mass(
     reach.
     """
     light, mass = sums[..., :-1, :], sums[..., -1:, :]
-    means = light / jnp.where(mass > 0, mass, 1.0)
-    return jnp.where(mass > 0, jnp.concatenate([means, mass], axis=-2), 0.0)
+    return jnp.concatenate([light / jnp.where(mass > 0, mass, 1.0), mass], axis=-2)
 
 
 def layer_values(
-    sums: Float[Array, "values points"],
-    first_moments: Float[Array, "values 3 points"],
-    points: Float[Array, "3 points"],
-) -> Float[Array, "_ points"]:
-    r"""Divide the sums of one layer: rows of means, mass, and the slopes of both, in units that
-    `split_layer` scales to 1/mm; all 0 where nothing is in reach.
+    sums: Float[Array, "*layers values 4 points"],
+    points: Float[Array, "*layers 3 points"],
+    per_mm: Float[Array, "*layers #points"],
+    per_flat: Float[Array, "*layers #points"],
+) -> LayerValues:
+    r"""Compute layers and their slopes from sums over sources; 0 where nothing is in reach.
 
     **Arguments:**
 
-    - `sums`: `sum_j m_j w_j E_j` of each channel, and last `sum_j m_j w_j`.
-    - `first_moments`: the same sums times the sources' places `q_j`.
+    - `sums`: of light in each channel, and last of mass: `sum_j m_j w_j (1, q_j)`, the places
+      `q_j` of the sources counted from one origin with `points`.
+    - `per_mm`: from the unit of the places to that of the slopes.
+    - `per_flat`: from the mass to that over a flat sheet's.
     """
-    mass = sums[-1]
-    inverse = 1 / jnp.where(mass > 0, mass, 1.0)
-    means = sums[:-1] * inverse[None]
+    total, first_moments = sums[..., 0, :], sums[..., 1:, :]
+    values = divide_by_mass(total)
     # grad N = sum w E (q - x) / v, and grad (N / D) = (grad N - (N / D) grad D) / D.
-    gradients = first_moments - sums[:, None] * points[None]
-    slopes = (gradients[:-1] - means[:, None] * gradients[-1:]) * inverse[None, None]
-    slopes = jnp.concatenate([slopes, gradients[-1:]]).reshape(-1, mass.shape[0])
-    return jnp.where(mass[None] > 0, jnp.concatenate([means, mass[None], slopes]), 0.0)
-
-
-def split_layer(rows: Float[Array, "rows points"], scale: Float[Array, ""]) -> LayerValues:
-    """Split the rows that `layer_values` stacks; `scale` makes slopes of them (1/mm)."""
-    values = rows.shape[0] // 4
-    return LayerValues(rows[:values], rows[values:].reshape(values, 3, -1) * scale)
+    gradients = first_moments - total[..., None, :] * points[..., None, :, :]
+    mass, of_mass = total[..., -1:, :], gradients[..., -1:, :, :]
+    of_means = gradients[..., :-1, :, :] - values[..., :-1, None, :] * of_mass
+    of_means = of_means / jnp.where(mass > 0, mass, 1.0)[..., None, :]
+    # A flat sheet has mass 1.
+    row, slope = per_flat[..., None, :], per_mm[..., None, None, :]
+    return LayerValues(
+        jnp.concatenate([values[..., :-1, :], row * values[..., -1:, :]], axis=-2),
+        slope * jnp.concatenate([of_means, row[..., None, :] * of_mass], axis=-3),
+    )

@@ -1,13 +1,12 @@
-"""Sums of Gaussians around blocks of sources at blocks of points, with derivatives in forward and
-reverse mode that recompute the weights.
+"""Sums of Gaussians around blocks of sources at blocks of points, for all layers in one sweep, with
+derivatives in forward and reverse mode that recompute the weights.
 
-Every block of points has a list of the blocks of sources near it. Blocks of points with lists of
-about one length are swept together, one per *lane*; in a step each lane meets the sources of the
-next row of its list. The unit of length is the standard deviation times the root of 2.
+In every layer, a block of points has a list of the blocks of sources near it. Lists of about one
+length are swept together, one per *lane*; in a step each lane meets the sources of the next row of
+its list. The unit of length is the layer's standard deviation times the root of 2.
 """
 
 import functools
-from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -17,7 +16,7 @@ from jaxtyping import Array, Float, Int
 from splatjax._chunking import zeros_after
 
 from ._kernel import TruncatedGaussian
-from ._neighbors import Lists, PointBlocks
+from ._neighbors import Lanes, Lists
 
 FAR = -1e6  # from anything, in any unit in use here, yet with a square that float32 holds
 
@@ -29,25 +28,13 @@ class SourceTable(eqx.Module):
 
     - `centers`: apart by axis, which is quicker.
     - `rows`: to be summed.
-    - `moments`: whether the sums also hold first moments. They are then
-      `[rows, rows * x, rows * y, rows * z]`, each in the order of `rows`. Static.
+    - `moments`: whether first moments are summed too: each row is then followed by itself times x,
+      y and z. Static.
     """
 
     centers: tuple[Float[Array, "blocks block"], ...]
     rows: Float[Array, "blocks rows block"]
     moments: bool = eqx.field(static=True)
-
-    @classmethod
-    def of(
-        cls,
-        centers: Float[Array, "3 sources"],
-        rows: Float[Array, "rows sources"],
-        block: int,
-        moments: bool,
-    ) -> "SourceTable":
-        """Lay out sources, `block` of them to a block."""
-        rows = rows.reshape(len(rows), -1, block).transpose(1, 0, 2)
-        return cls(tuple(centers.reshape(3, -1, block)), rows, moments)
 
     @property
     def count(self) -> int:
@@ -58,8 +45,10 @@ class SourceTable(eqx.Module):
         """Compute what is summed."""
         if not self.moments:
             return self.rows
-        moments = [self.rows * center[:, None] for center in self.centers]
-        return jnp.concatenate([self.rows, *moments], axis=1)
+        each = jnp.stack(
+            [self.rows, *(self.rows * center[:, None] for center in self.centers)], axis=2
+        )
+        return each.reshape(len(each), -1, each.shape[-1])
 
     def contract(
         self, cotangents: Float[Array, "lanes sums points"]
@@ -69,9 +58,9 @@ class SourceTable(eqx.Module):
         Written out, so that it is fused with the weights: half the time of a matrix product.
         """
         of_sums, rows = jnp.unstack(cotangents[:, :, None], axis=1), jnp.unstack(self.rows, axis=1)
-        terms = []
+        per_row, terms = len(of_sums) // len(rows), []
         for i, row in enumerate(rows):
-            of_row, *of_moments = of_sums[i :: len(rows)]
+            of_row, *of_moments = of_sums[i * per_row :][:per_row]
             for center, of_moment in zip(self.centers, of_moments, strict=self.moments):
                 of_row = of_row + center[..., None] * of_moment
             terms.append(row[..., None] * of_row)
@@ -98,84 +87,106 @@ class SourceTable(eqx.Module):
         return jax.tree.map(added, self, cotangents)
 
 
-def identity(
-    sums: Float[Array, "rows points"], points: Float[Array, "3 points"]
-) -> Float[Array, "rows points"]:
-    """Return the sums themselves."""
-    return sums
+class Wanted(eqx.Module):
+    """The points at which sums are wanted.
+
+    **Attributes:**
+
+    - `ranks`: of every point among them, in any order; their number for all others.
+    - `count`: their number. Static.
+    """
+
+    ranks: Int[Array, "points_blocks block"]
+    count: int = eqx.field(static=True)
+
+    def _at(self, lanes: Lanes) -> tuple:
+        """Index the layer, all sums, and the points of each lane."""
+        layer, block = jnp.divmod(lanes.lists, len(self.ranks))
+        return layer[:, None], slice(None), self.ranks[block]
+
+    def write(
+        self,
+        sums: Float[Array, "layers sums wanted"],
+        lanes: Lanes,
+        values: Float[Array, "lanes sums block"],
+    ) -> Float[Array, "layers sums wanted"]:
+        return sums.at[self._at(lanes)].set(jnp.swapaxes(values, 1, 2), mode="drop")
+
+    def read(
+        self, sums: Float[Array, "layers sums wanted"], lanes: Lanes
+    ) -> Float[Array, "lanes sums block"]:
+        """Read what `write` wrote; 0 for other points."""
+        return jnp.swapaxes(sums.at[self._at(lanes)].get(mode="fill", fill_value=0), 1, 2)
 
 
-class _Rule(eqx.Module):
-    """What all sweeps share."""
+class _Sweep(eqx.Module):
+    """What all sweeps share. Not differentiated."""
 
-    kernel: TruncatedGaussian
-    finish: Callable = eqx.field(static=True)
+    kernels: TruncatedGaussian
+    lists: Lists
+    wanted: Wanted
 
-    def finished(self, sums: Float[Array, "lanes rows points"], points):
-        return jax.vmap(self.finish)(sums, points)
+    def sweep(self, sweep, points, out):
+        """Apply `sweep(lanes, kernels of the lanes, points of the lanes, out)` to all lists."""
 
-    def weights(self, points, sources: SourceTable):
-        """Compute weights `[lanes, sources, points]`, minus their derivatives in the exponent,
-        and offsets.
-        """
-        dx, dy, dz = (
-            points[:, axis, None] - center[:, :, None]
-            for axis, center in enumerate(sources.centers)
-        )
-        squared = dx * dx + dy * dy + dz * dz
-        return *self.kernel(squared), (dx, dy, dz)
+        def with_points(lanes: Lanes, out):
+            layer = lanes.lists // len(self.wanted.ranks)
+            kernels = jax.tree.map(lambda leaf: leaf.at[layer].get(mode="clip"), self.kernels)
+            return sweep(lanes, kernels, lanes.read(points, FAR), out)
 
-    def sums(self, lists: Lists, lanes: PointBlocks, here, table):
-        """Sum over all that a sweep's points meet."""
+        return self.lists.sweep(with_points, out)
 
-        def add(ids, sums):
-            sources = table.gather(ids)
-            weights, *_ = self.weights(here, sources)
-            return sums + jnp.einsum("lrs,lsp->lrp", sources.rows_and_moments(), weights)
+    def sums(self, points, table: SourceTable, add):
+        """Sum over all that the points meet: `add(lanes, ids, kernels, points, sums)`."""
+        block = points.shape[2]
 
-        start = jnp.zeros((here.shape[0], table.count, here.shape[2]), here.dtype)
-        return lanes.each_row(lists, add, start)
+        def sweep(lanes: Lanes, kernels, here, out):
+            start = jnp.zeros((len(here), table.count, block), here.dtype)
+            found = lanes.each_row(
+                self.lists, lambda ids, sums: add(lanes, ids, kernels, here, sums), start
+            )
+            return self.wanted.write(out, lanes, found)
 
-
-def _forward(rule: _Rule, lists: Lists, points, table):
-    def sweep(lanes, out):
-        here = lanes.read(points, FAR)
-        return lanes.write(out, rule.finished(rule.sums(lists, lanes, here, table), here))
-
-    return lists.sweep(sweep, _empty(rule, points, table))
+        layers = len(self.kernels.largest)
+        out = zeros_after(table.rows, (layers, table.count, self.wanted.count), points.dtype)
+        return self.sweep(sweep, points, out)
 
 
-def _empty(rule: _Rule, points, table):
-    shape = points.shape[0], table.count, points.shape[2]
-    values = jax.eval_shape(rule.finished, jax.ShapeDtypeStruct(shape, points.dtype), points)
-    return zeros_after(table.rows, values.shape, values.dtype)
+def _weigh(kernels: TruncatedGaussian, points, sources: SourceTable):
+    """Compute weights `[lanes, sources, points]`, minus their derivatives in the exponent, and
+    offsets.
+    """
+    dx, dy, dz = (
+        points[:, axis, None] - center[:, :, None] for axis, center in enumerate(sources.centers)
+    )
+    return *kernels(dx * dx + dy * dy + dz * dz), (dx, dy, dz)
+
+
+def _forward(given: _Sweep, points, table: SourceTable):
+    def add(lanes, ids, kernels, here, sums):
+        sources = table.gather(ids)
+        weights, *_ = _weigh(kernels, here, sources)
+        return sums + jnp.einsum("lrs,lsp->lrp", sources.rows_and_moments(), weights)
+
+    return given.sums(points, table, add)
 
 
 def _derivative(residuals, moved):
-    """Compute the derivative of the values along a direction."""
-    (rule, lists, points, table, sums), (d_points, d_table) = residuals, moved
+    """Compute the derivative of the sums along a direction."""
+    (given, points, table), (d_points, d_table) = residuals, moved
 
-    def sweep(lanes, out):
-        here, d_here = lanes.read(points, FAR), lanes.read(d_points)
+    def add(lanes, ids, kernels, here, d_sums):
+        sources, d_sources, d_here = table.gather(ids), d_table.gather(ids), lanes.read(d_points)
+        weights, minus_slopes, offsets = _weigh(kernels, here, sources)
+        minus_half_change = sum(
+            offset * (center[:, :, None] - d_here[:, axis, None])
+            for axis, (offset, center) in enumerate(zip(offsets, d_sources.centers, strict=True))
+        )
+        rows, d_rows = jax.jvp(SourceTable.rows_and_moments, (sources,), (d_sources,))
+        d_sums += jnp.einsum("lrs,lsp->lrp", d_rows, weights)
+        return d_sums + jnp.einsum("lrs,lsp->lrp", rows, 2 * minus_slopes * minus_half_change)
 
-        def add(ids, d_sums):
-            sources, d_sources = table.gather(ids), d_table.gather(ids)
-            weights, minus_slopes, offsets = rule.weights(here, sources)
-            minus_half_change = sum(
-                offset * (center[:, :, None] - d_here[:, axis, None])
-                for axis, (offset, center) in enumerate(
-                    zip(offsets, d_sources.centers, strict=True)
-                )
-            )
-            rows, d_rows = jax.jvp(SourceTable.rows_and_moments, (sources,), (d_sources,))
-            d_sums += jnp.einsum("lrs,lsp->lrp", d_rows, weights)
-            return d_sums + jnp.einsum("lrs,lsp->lrp", rows, 2 * minus_slopes * minus_half_change)
-
-        total = lanes.read(sums)
-        d_total = lanes.each_row(lists, add, jnp.zeros_like(total))
-        return lanes.write(out, jax.jvp(rule.finished, (total, here), (d_total, d_here))[1])
-
-    return lists.sweep(sweep, _empty(rule, points, table))
+    return given.sums(points, table, add)
 
 
 def _backward(residuals, cotangents):
@@ -189,18 +200,16 @@ def _backward(residuals, cotangents):
     Both are moments of `g` over one side. Points and sources are counted from one of the sources,
     so that float32 does not cancel.
     """
-    rule, lists, points, table, sums = residuals
+    given, points, table = residuals
 
-    def sweep(lanes, carry):
+    def sweep(lanes: Lanes, kernels, here, carry):
         d_points, d_table = carry
-        here, total, cotangent = lanes.read(points, FAR), lanes.read(sums), lanes.read(cotangents)
-        _, pull = jax.vjp(rule.finished, total, here)
-        cotangent, d_finish = pull(cotangent)
+        cotangent = given.wanted.read(cotangents, lanes)
 
         def add(ids, carry):
             d_here, d_table = carry
             sources = table.gather(ids)
-            weights, minus_slopes, _ = rule.weights(here, sources)
+            weights, minus_slopes, _ = _weigh(kernels, here, sources)
             centers = jnp.stack(sources.centers, axis=1)
             origin = centers[:, :, :1]
             x, p = here - origin, centers - origin
@@ -222,48 +231,43 @@ def _backward(residuals, cotangents):
             d_here = d_here - 2 * (x * over_sources[:, :1] - over_sources[:, 1:])
             return d_here, d_table.scatter_add(ids, d_sources)
 
-        d_here, d_table = lanes.each_row(lists, add, (d_finish, d_table))
+        d_here, d_table = lanes.each_row(given.lists, add, (jnp.zeros_like(here), d_table))
         return lanes.write(d_points, d_here), d_table
 
     start = jax.tree.map(
         lambda each: zeros_after(cotangents, each.shape, each.dtype), (points, table)
     )
-    return lists.sweep(sweep, start)
+    return given.sweep(sweep, points, start)
 
 
 @jax.custom_jvp
-def _sums(rule: _Rule, lists: Lists, points, table):
-    return _forward(rule, lists, points, table)
+def _sums(given: _Sweep, points, table):
+    return _forward(given, points, table)
 
 
 @_sums.defjvp
 def _sums_jvp(primals, tangents):
-    rule, _, points, _ = primals
-    sums = _forward(_Rule(rule.kernel, identity), *primals[1:])
     # Linear in the direction, with a transpose of its own: forward and reverse mode.
-    given = (*primals, sums)
-    moved = jax.custom_derivatives.linear_call(_derivative, _backward, given, tangents[2:])
-    return rule.finished(sums, points), moved
+    moved = jax.custom_derivatives.linear_call(_derivative, _backward, primals, tangents[1:])
+    return _forward(*primals), moved
 
 
 def gaussian_sums(
-    points: Float[Array, "points_blocks 3 points"],
+    points: Float[Array, "layers points_blocks 3 block"],
     table: SourceTable,
     lists: Lists,
-    kernel: TruncatedGaussian,
-    finish: Callable[
-        [Float[Array, "rows points"], Float[Array, "3 points"]], Float[Array, "values points"]
-    ],
-) -> Float[Array, "points_blocks values points"]:
+    kernels: TruncatedGaussian,
+    wanted: Wanted,
+) -> Float[Array, "layers sums wanted"]:
     r"""Sum `rows_j exp(-|x - p_j|^2)` over the blocks of sources that every point meets.
 
     **Arguments:**
 
-    - `points`: `x`. Differentiable.
-    - `table`: `p_j` and `rows_j`. Differentiable.
-    - `kernel`: stands for `exp`; terms beyond its rim vanish, whatever the lists hold.
-    - `finish`: computes values from sums and points. Static.
-
-    **Returns:** the values; 0 for blocks of points without a list.
+    - `points`: `x`, in the unit of each layer. Differentiable.
+    - `table`: `p_j` and `rows_j` of all layers. Differentiable.
+    - `kernels`: of each layer; stand for `exp`. Terms beyond their rims vanish, whatever the lists
+      hold.
+    - `wanted`: at which points.
     """
-    return _sums(_Rule(kernel, finish), lists, points, table)
+    given = _Sweep(kernels, lists, wanted)
+    return _sums(given, points.reshape(-1, *points.shape[2:]), table)

@@ -33,27 +33,33 @@ class TruncatedGaussian(eqx.Module):
     exponential is the eighth power of a polynomial, within 4e-5 and at half the time, and its
     derivative is that of the polynomial.
 
-    **Attributes:** not differentiated
+    **Attributes:** of several kernels; not differentiated
 
     - `largest`: exponent.
     - `coefficients`: of the polynomial, highest power first.
     """
 
-    largest: Float[Array, ""]
-    coefficients: Float[Array, " powers"]
+    largest: Float[Array, " kernels"]
+    coefficients: Float[Array, "kernels powers"]
 
     @classmethod
-    def up_to(cls, largest: float) -> "TruncatedGaussian":
-        """Fit the polynomial whose eighth power is `exp(-x)` up to `largest`."""
-        x = np.polynomial.chebyshev.chebpts1(64) * largest / 2 + largest / 2
-        # Weighted between an even error of the weight and an even relative error.
-        fit = np.polynomial.Polynomial.fit(x, np.exp(-x / 8), _ROOT_DEGREE, w=np.exp(-3 * x / 8))
-        return cls(jnp.asarray(largest, float), jnp.asarray(fit.convert().coef[::-1], float))
+    def up_to(cls, largest: Float[np.ndarray, " kernels"]) -> "TruncatedGaussian":
+        """Fit the polynomials whose eighth power is `exp(-x)` up to `largest`."""
 
-    def __call__(self, exponent: Float[Array, "..."]) -> tuple[Float[Array, "..."], ...]:
+        def polynomial(largest: float) -> np.ndarray:
+            x = np.polynomial.chebyshev.chebpts1(64) * largest / 2 + largest / 2
+            # Weighted between an even error of the weight and an even relative error.
+            weight = np.exp(-3 * x / 8)
+            fit = np.polynomial.Polynomial.fit(x, np.exp(-x / 8), _ROOT_DEGREE, w=weight)
+            return fit.convert().coef[::-1]
+
+        powers = np.array([polynomial(each) for each in largest]).reshape(-1, _ROOT_DEGREE + 1)
+        return cls(jnp.asarray(largest, float), jnp.asarray(powers, float))
+
+    def __call__(self, exponent: Float[Array, "kernels ..."]) -> tuple[Float[Array, "..."], ...]:
         """Compute the weight, and minus its derivative in the exponent."""
         gaussian, minus_slope = self._gaussian(exponent)
-        largest = self.largest.astype(exponent.dtype)
+        largest = self._beside(self.largest, exponent)
         left = (largest - exponent) / _FADE
         fades = left < 1
         weight = jnp.where(fades, gaussian * left, gaussian)
@@ -61,19 +67,24 @@ class TruncatedGaussian(eqx.Module):
         inside = exponent < largest
         return jnp.where(inside, weight, 0.0), jnp.where(inside, minus_slope, 0.0)
 
+    def _beside(self, numbers: Float[Array, " kernels"], exponent) -> Float[Array, "kernels ..."]:
+        return numbers.astype(exponent.dtype).reshape(-1, *[1] * (exponent.ndim - 1))
+
     def _gaussian(self, exponent: Float[Array, "..."]) -> tuple[Float[Array, "..."], ...]:
         if exponent.dtype != jnp.float32:
             gaussian = jnp.exp(-exponent)
             return gaussian, gaussian
-        first, *others = self.coefficients.astype(exponent.dtype)
-        root, slope = jnp.full_like(exponent, first), jnp.zeros_like(exponent)
+        first, *others = (
+            self._beside(each, exponent) for each in jnp.unstack(self.coefficients, axis=-1)
+        )
+        root, slope = jnp.broadcast_to(first, exponent.shape), jnp.zeros_like(exponent)
         for coefficient in others:
             root, slope = root * exponent + coefficient, slope * exponent + root
         square = root * root
         fourth = square * square
         return fourth * fourth, -8 * fourth * square * root * slope
 
-    def integral(self, exponent: Float[Array, "..."]) -> Float[Array, "..."]:
+    def integral(self, exponent: Float[Array, " kernels"]) -> Float[Array, " kernels"]:
         """Integrate the weight from an exponent (below the fade) on: the kernel's integral over a
         plane, in units of that of the Gaussian.
         """
@@ -113,9 +124,9 @@ class AbstractDiffusionKernel(eqx.Module):
         truncated = max(0.5 * error / max(share, _LEAST_SHARE), _LEAST_TRUNCATED)
         return math.sqrt(2 * math.log(1 / min(truncated, _MOST_TRUNCATED)))
 
-    def truncated(self, support: float) -> TruncatedGaussian:
-        """Build the kernel that is zero beyond `support` standard deviations."""
-        return TruncatedGaussian.up_to(0.5 * support * support)
+    def truncated(self, supports: Float[np.ndarray, " kernels"]) -> TruncatedGaussian:
+        """Build the kernels that are zero beyond so many standard deviations."""
+        return TruncatedGaussian.up_to(0.5 * np.square(supports))
 
     def interval(self, unevenness: Float[Array, ""]) -> Float[Array, "2"]:
         """Compute between which standard deviations per spacing layers become resolved."""

@@ -1,9 +1,11 @@
 """Lists of the blocks of sources near each block of points: found once for a geometry; swept."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -12,8 +14,6 @@ from jaxtyping import Array, Bool, Float, Int
 
 from splatjax._chunking import with_spare
 
-SOURCES_PER_BLOCK = 8
-"""Sources of a block."""
 BLOCKS_PER_ROW = 16
 """Blocks of sources in a row of a list."""
 LANES = 128
@@ -24,60 +24,58 @@ _FAN = 4  # parts of a box of a coarser level
 
 
 class Lists(eqx.Module):
-    """Which blocks of sources the blocks of points meet. Not differentiated.
+    """Which blocks of sources the blocks of points meet in every layer. Not differentiated.
 
     **Attributes:**
 
     - `rows`: blocks of sources, so many to a row; the number of blocks, whose block is empty, in
       what is left of a row, and in the last row.
-    - `first`, `counts`: the rows of each block of points.
-    - `order`: of the blocks of points, those with the longest lists first.
+    - `first`, `counts`: the rows of each list: one for every block of points, layer after layer.
+    - `order`: of the lists, the longest first.
     """
 
     rows: Int[Array, "rows width"]
-    first: Int[Array, " points_blocks"]
-    counts: Int[Array, " points_blocks"]
-    order: Int[Array, " points_blocks"]
+    first: Int[Array, " lists"]
+    counts: Int[Array, " lists"]
+    order: Int[Array, " lists"]
 
-    def only(self, blocks: Int[Array, " some"]) -> "Lists":
+    def only(self, chosen: Bool[Array, " points_blocks"]) -> "Lists":
         """Leave out all other blocks of points."""
-        chosen = jnp.zeros(len(self.counts), bool).at[blocks].set(True, mode="drop")
-        counts = jnp.where(chosen, self.counts, 0)
-        # A stable sort: blocks without a list come last.
+        counts = jnp.where(chosen, self.counts.reshape(-1, len(chosen)), 0).reshape(-1)
+        # A stable sort: those without a row come last.
         order = self.order[jnp.argsort(counts[self.order] == 0)]
         return Lists(self.rows, self.first, counts, order)
 
     def sweep(self, sweep: Callable, out):
-        """Apply `sweep(lanes, out)` to all blocks with a list, `LANES` of them at a time."""
-        blocks = len(self.order)
-        lanes = min(LANES, blocks)
-        order = jnp.pad(self.order, (0, -blocks % lanes), constant_values=blocks)
+        """Apply `sweep(lanes, out)` to all lists with a row, `LANES` of them at a time."""
+        count = len(self.order)
+        lanes = min(LANES, count)
+        order = jnp.pad(self.order, (0, -count % lanes), constant_values=count)
         sweeps = (jnp.sum(self.counts > 0) + lanes - 1) // lanes
 
         def step(i, out):
-            blocks = lax.dynamic_slice_in_dim(order, i * lanes, lanes)
+            of_lanes = lax.dynamic_slice_in_dim(order, i * lanes, lanes)
             first, counts = (
-                each.at[blocks].get(mode="fill", fill_value=0) for each in (self.first, self.counts)
+                each.at[of_lanes].get(mode="fill", fill_value=0)
+                for each in (self.first, self.counts)
             )
-            return sweep(PointBlocks(blocks, first, counts), out)
+            return sweep(Lanes(of_lanes, first, counts), out)
 
         return lax.fori_loop(jnp.zeros_like(sweeps), sweeps, step, out)
 
 
-class PointBlocks(eqx.Module):
-    """Blocks of points that are swept together, and their lists; the number of blocks in a lane
-    without one.
-    """
+class Lanes(eqx.Module):
+    """Lists that are swept together; the number of lists in a lane without one."""
 
-    blocks: Int[Array, " lanes"]
+    lists: Int[Array, " lanes"]
     first: Int[Array, " lanes"]
     counts: Int[Array, " lanes"]
 
-    def read(self, rows: Float[Array, "points_blocks ..."], fill=0.0):
-        return rows.at[self.blocks].get(mode="fill", fill_value=fill)
+    def read(self, rows: Float[Array, "lists ..."], fill=0.0):
+        return rows.at[self.lists].get(mode="fill", fill_value=fill)
 
-    def write(self, rows: Float[Array, "points_blocks ..."], values):
-        return rows.at[self.blocks].set(values, mode="drop")
+    def write(self, rows: Float[Array, "lists ..."], values):
+        return rows.at[self.lists].set(values, mode="drop")
 
     def each_row(self, lists: Lists, add: Callable, start):
         """Apply `add(ids, carry)` to the blocks of sources `[lanes, width]` of row after row."""
@@ -106,64 +104,102 @@ class Boxes(eqx.Module):
         )
         return cls(jnp.min(low, axis=2).T, jnp.max(high, axis=2).T)
 
-    def beyond(self, planned: "Boxes") -> Float[Array, ""]:
-        """Measure how far (mm, along an axis) these boxes reach beyond those planned."""
+    def beyond(self, planned: "Boxes") -> Float[Array, " blocks"]:
+        """Measure how far (mm, along an axis) each box reaches beyond the one planned."""
         out = jnp.maximum(planned.low - self.low, self.high - planned.high)
-        out = jnp.where(self.low <= self.high, out, -jnp.inf)
-        return jnp.maximum(jnp.max(out, initial=-jnp.inf), 0)
+        return jnp.maximum(jnp.max(jnp.where(self.low <= self.high, out, 0), axis=1), 0)
 
 
 class Neighbors(eqx.Module):
-    """The blocks of sources within reach of every block of points, and what the search assumed."""
+    """The blocks of sources within reach of every block of points, and what the search assumed.
+
+    **Attributes:**
+
+    - `layers`: of the blocks of sources.
+    - `reaches`: of the layers, mm.
+    """
 
     lists: Lists
     points: Boxes
     sources: Boxes
-    reach: Float[Array, ""]
+    layers: Int[Array, " blocks"]
+    reaches: Float[Array, " layers"]
 
-    def needed(self, points: Boxes, sources: Boxes, reach: Float[Array, ""]) -> Float[Array, ""]:
-        """Compute a number above 1 if sources within `reach` (mm) of points may be missing."""
-        moved = points.beyond(self.points) + sources.beyond(self.sources)
-        return (reach + math.sqrt(3) * moved) / self.reach
+    def needed(
+        self, points: Boxes, sources: Boxes, reaches: Float[Array, " layers"]
+    ) -> Float[Array, ""]:
+        """Compute a number above 1 if sources within reach of points may be missing."""
+        moved = jax.ops.segment_max(sources.beyond(self.sources), self.layers, len(reaches))
+        moved = jnp.maximum(moved, 0) + jnp.max(points.beyond(self.points), initial=0)
+        return jnp.max((reaches + math.sqrt(3) * moved) / self.reaches)
 
 
 def find_neighbors(
-    points: Boxes, sources: Boxes, reach: float, parts: int = 1, least: int = 0
+    points: Boxes,
+    sources: Boxes,
+    layers: Int[np.ndarray, " blocks"],
+    reaches: Sequence[float],
+    parts: int = 1,
+    least: int = 0,
 ) -> Lists:
-    """Search for the blocks of sources within `reach` (mm) of every block of points.
+    """Search for the blocks of sources within reach of every block of points, layer by layer.
 
     The number of rows is rounded up, so that nearby geometries need no other program. Not for
     traced arrays.
 
     **Arguments:**
 
+    - `layers`: of the blocks of sources.
+    - `reaches`: of the layers, mm; nothing is in reach of a layer with 0.
     - `parts`: equal parts of the points, each with lists of its own, one after the other.
     - `least`: rows of each part.
     """
+    low, high = (np.asarray(each) for each in (sources.low, sources.high))
     corners = (np.split(np.asarray(corner), parts) for corner in (points.low, points.high))
-    found = [_list(low, high, sources, reach) for low, high in zip(*corners, strict=True)]
+    own = [np.flatnonzero(layers == layer) for layer in range(len(reaches))]
+
+    def search(part: tuple, layer: int):
+        """Find the pairs of a block of a part and a block of sources."""
+        of, near = _pairs_in_reach(part, (low[own[layer]], high[own[layer]]), reaches[layer])
+        return of, own[layer][near]
+
+    # Only NumPy computes in the threads, since JAX's precision may be set for one thread.
+    of_parts = list(zip(*corners, strict=True))
+    with ThreadPoolExecutor() as pool:
+        pairs = [
+            [pool.submit(search, part, layer) for layer in range(len(reaches))] for part in of_parts
+        ]
+    blocks = len(of_parts[0][0])
+    found = [_lists([each.result() for each in part], blocks, len(low)) for part in pairs]
     # At least one row, the last, stays empty: lanes whose list has ended read it.
     least = max(least, _ROWS * len(found[0][1]))
     count = max(least, *(with_spare(len(ids), 1, per_octave=2) for ids, *_ in found))
     padded = [
-        (np.pad(ids, ((0, count - len(ids)), (0, 0)), constant_values=len(sources.low)), *each)
+        (np.pad(ids, ((0, count - len(ids)), (0, 0)), constant_values=len(low)), *each)
         for ids, *each in found
     ]
     whole = (np.concatenate(each) for each in zip(*padded, strict=True))
     return Lists(*(jnp.asarray(each, jnp.int32) for each in whole))
 
 
-def _list(low: np.ndarray, high: np.ndarray, sources: Boxes, reach: float):
-    """Return the rows of blocks of sources; for every block of points its first row and their
-    number; and the order of the blocks.
+def _lists(pairs: Sequence[tuple[np.ndarray, np.ndarray]], blocks: int, empty: int):
+    """Return the rows of blocks of sources; for every list its first row and their number; and the
+    order of the lists.
+
+    **Arguments:**
+
+    - `pairs`: of each layer, the blocks of points and of sources that are in reach.
+    - `blocks`: of points.
+    - `empty`: stands for no block of sources.
     """
-    of, near = _pairs_in_reach((low, high), (sources.low, sources.high), reach)
-    by_block = np.argsort(of, kind="stable")
-    of, near = of[by_block], near[by_block]
-    lengths = np.bincount(of, minlength=len(low))
+    of = np.concatenate([layer * blocks + each for layer, (each, _) in enumerate(pairs)])
+    near = np.concatenate([each for _, each in pairs])
+    by_list = np.argsort(of, kind="stable")
+    of, near = of[by_list], near[by_list]
+    lengths = np.bincount(of, minlength=blocks * len(pairs))
     counts = -(-lengths // BLOCKS_PER_ROW)
     first, begins = (np.cumsum(each) - each for each in (counts, lengths))
-    ids = np.full((counts.sum(), BLOCKS_PER_ROW), len(sources.low), np.int32)
+    ids = np.full((counts.sum(), BLOCKS_PER_ROW), empty, np.int32)
     ids.reshape(-1)[(first * BLOCKS_PER_ROW - begins)[of] + np.arange(len(of))] = near
     return ids, first, counts, np.argsort(-counts, kind="stable")
 
@@ -188,6 +224,8 @@ def _pairs_in_reach(points: tuple, sources: tuple, reach: float) -> tuple[np.nda
     """Find the pairs of boxes, given by their corners, that are in reach of each other, from coarse
     to fine.
     """
+    if not reach:
+        return np.zeros(0, np.int32), np.zeros(0, np.int32)
     depth = math.ceil(math.log(max(len(points[0]), len(sources[0]), 2), _FAN))
     each = zip(_levels(points, depth), _levels(sources, depth), strict=True)
     levels = [(*of_points, *of_sources) for of_points, of_sources in each]

@@ -2,7 +2,6 @@
 to their sums, and is forgotten.
 """
 
-import math
 from collections.abc import Iterable, Iterator
 
 import equinox as eqx
@@ -13,24 +12,18 @@ from jaxtyping import Array, Bool, Float
 
 from splatjax._combination import PartByPart
 
-from ._clustered import ClusterDiffuser, layer_table, source_boxes, units_per_mm
-from ._clusters import POINTS_PER_BLOCK, ClusterTree, compact_order
+from ._clustered import (
+    ClusterDiffuser,
+    in_units,
+    per_flat_mass,
+    source_boxes,
+    source_table,
+)
+from ._clusters import LayerSources, SunkSources, compact_order
 from ._diffuser import Sources, divide_by_mass
-from ._gaussian_sums import FAR, gaussian_sums, identity
+from ._gaussian_sums import FAR, Wanted, gaussian_sums
 from ._kernel import AbstractDiffusionKernel, TruncatedGaussian
 from ._neighbors import Boxes, Lists, find_neighbors
-
-_SPARE = 1.3  # times the clusters of a part, so that one program serves nearly all parts
-
-
-class _Layer(eqx.Module):
-    """How one layer is summed."""
-
-    variance: Float[Array, ""]
-    depth: Float[Array, ""]
-    edge: float = eqx.field(static=True)
-    truncated: TruncatedGaussian
-    support: float = eqx.field(static=True)
 
 
 class StreamedDiffusion:
@@ -53,28 +46,23 @@ class StreamedDiffusion:
         exists: Bool[Array, "blocks block"],
     ):
         """Prepare for points in compact blocks; `spacing`, `fine` and `interval` as for
-        `ClusterDiffuser.choose_sources`.
+        `ClusterDiffuser.choose_layers`.
         """
-        sizes = np.asarray(variances, np.float64)
-        edges, supports = diffuser.choose_sources(sizes, spacing, fine, kernel, interval)
-        each = zip(
-            variances, kernel.depths(variances), edges.tolist(), supports.tolist(), strict=True
+        gaussians, sizes, edges, supports = diffuser.choose_layers(
+            np.asarray(variances, np.float64), spacing, fine, kernel, interval
         )
-        self.layers = [
-            _Layer(variance, depth, edge, kernel.truncated(support), support) if support else None
-            for variance, depth, edge, support in each
-        ]
-        self.cells = np.unique(edges[edges > 0]).tolist()
+        self.gaussians = jnp.asarray(gaussians, jnp.int32)
+        self.variances, self.edges = jnp.asarray(sizes, variances.dtype), edges.tolist()
+        self.depths, self.kernels = kernel.depths(self.variances), kernel.truncated(supports)
+        self.reaches = np.where(edges < np.inf, supports * np.sqrt(sizes), 0).tolist()
         self.points = jnp.where(exists[:, None], points, FAR)
         self.boxes = Boxes.around(
             jnp.moveaxis(self.points, 1, 0).reshape(3, -1), exists.reshape(-1), points.shape[2]
         )
-        self.cluster_capacity, self.list_capacity = (0,) * len(self.cells), [0] * len(self.layers)
+        self.source_capacity, self.list_capacity = 0, 0
 
-    def evaluate(
-        self, parts: Iterable[Sources]
-    ) -> tuple[Float[Array, "blocks values block"] | None, ...]:
-        """Sum over all parts: means and mass of each layer; `None` for one that is not resolved.
+    def evaluate(self, parts: Iterable[Sources]) -> Float[Array, "blocks layers values block"]:
+        """Sum over all parts: means and mass of each layer, in the order of `gaussians`.
 
         **Arguments:**
 
@@ -82,17 +70,15 @@ class StreamedDiffusion:
           bring nothing.
         """
         sums = PartByPart().total(self._sums(parts))
-        return tuple(
-            None if each is None else eqx.filter_jit(divide_by_mass)(each) for each in sums
-        )
+        return _finished(sums, self.variances, self.depths, self.kernels, self.points)
 
-    def _sums(self, parts: Iterable[Sources]) -> Iterator[list[Array | None]]:
+    def _sums(self, parts: Iterable[Sources]) -> Iterator[Float[Array, "layers values points"]]:
         """Iterate over the sums of each part that brings anything, after zeros."""
         for i, sources in enumerate(parts):
             if i == 0:
-                blocks, _, block = self.points.shape
-                dark = jnp.zeros((blocks, len(sources.irradiance) + 1, block), self.points.dtype)
-                yield [None if layer is None else dark for layer in self.layers]
+                count = self.points.shape[0] * self.points.shape[2]
+                rows = len(self.edges), len(sources.irradiance) + 1, count
+                yield jnp.zeros(rows, self.points.dtype)
             if self._in_reach(sources):
                 yield self._sum_part(sources)
 
@@ -105,45 +91,39 @@ class StreamedDiffusion:
         own_low, own_high = np.asarray(self.boxes.low), np.asarray(self.boxes.high)
         gaps = np.maximum(np.maximum(own_low - high, low - own_high), 0)
         # Sources lie below their splats.
-        reaches = [
-            each.support * math.sqrt(float(each.variance)) + float(each.depth)
-            for each in self.layers
-            if each is not None
-        ]
-        return bool(np.any(np.sum(gaps * gaps, axis=1) <= max(reaches, default=0.0) ** 2))
+        reach = np.max(self.reaches + np.asarray(self.depths, np.float64))
+        return bool(np.any(np.sum(gaps * gaps, axis=1) <= reach**2))
 
-    def _sum_part(self, sources: Sources) -> list[Array | None]:
+    def _sum_part(self, sources: Sources) -> Float[Array, "layers values points"]:
         order = compact_order(np.asarray(sources.centers.T))
         sources = jax.tree.map(lambda rows: rows[..., order], sources)
         arrays = (np.asarray(each.T) for each in (sources.centers, sources.normals))
-        tree = ClusterTree.build(*arrays, np.asarray(sources.areas) > 0, self.cells)
-        self.cluster_capacity = tuple(
-            had if count <= had else math.ceil(_SPARE * count / POINTS_PER_BLOCK) * POINTS_PER_BLOCK
-            for count, had in zip(tree.counts, self.cluster_capacity, strict=True)
-        )
-        levels = _levels(tree.with_capacity(self.cluster_capacity), sources)
-        return [
-            None if each is None else self._sum_layer(i, each, levels)
-            for i, each in enumerate(self.layers)
-        ]
-
-    def _sum_layer(self, i: int, layer: _Layer, levels: list[Sources]) -> Array:
-        clusters = levels[self.cells.index(layer.edge) + 1 if layer.edge else 0]
-        reach = layer.support * math.sqrt(float(layer.variance))
-        around = source_boxes(clusters.lowered(layer.depth))
-        lists = find_neighbors(self.boxes, around, reach, least=self.list_capacity[i])
-        self.list_capacity[i] = len(lists.rows)
-        return _sum(self.points, clusters, layer, lists)
+        exists = np.asarray(sources.areas) > 0
+        clusters = LayerSources.build(*arrays, exists, self.edges, self.source_capacity)
+        self.source_capacity = max(self.source_capacity, clusters.count)
+        below = _merge(clusters, sources, self.depths)
+        around, layers = source_boxes(below), np.asarray(clusters.layers)
+        lists = find_neighbors(self.boxes, around, layers, self.reaches, least=self.list_capacity)
+        self.list_capacity = len(lists.rows)
+        return _sum(self.points, below, clusters, self.variances, self.kernels, lists)
 
 
 @eqx.filter_jit
-def _levels(tree: ClusterTree, sources: Sources) -> list[Sources]:
-    return tree.levels(sources)
+def _merge(clusters: LayerSources, sources: Sources, depths) -> SunkSources:
+    return clusters.merged(sources, depths)
 
 
 @eqx.filter_jit
-def _sum(points, clusters: Sources, layer: _Layer, lists: Lists) -> Array:
-    below = clusters.lowered(layer.depth)
-    table = layer_table(below, layer.variance, layer.depth, layer.truncated, slopes=False)
-    blocks = points * units_per_mm(layer.variance)
-    return gaussian_sums(blocks, table, lists, layer.truncated, identity)
+def _sum(points, below: SunkSources, clusters: LayerSources, variances, kernels, lists: Lists):
+    table = source_table(below, variances, clusters.layers, moments=False)
+    blocks, _, block = points.shape
+    every = jnp.arange(blocks * block, dtype=jnp.int32).reshape(blocks, block)
+    wanted = Wanted(every, blocks * block)
+    return gaussian_sums(in_units(points, variances), table, lists, kernels, wanted)
+
+
+@eqx.filter_jit
+def _finished(sums, variances, depths, kernels: TruncatedGaussian, points):
+    rows = divide_by_mass(sums)
+    rows = rows.at[:, -1].multiply(per_flat_mass(kernels, variances, depths)[:, None])
+    return jnp.moveaxis(rows.reshape(*rows.shape[:2], points.shape[0], points.shape[2]), 2, 0)

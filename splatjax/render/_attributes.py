@@ -38,36 +38,30 @@ class SurfaceAttributes(eqx.Module):
     roughness: Float[Array, "1 points"] | None
     visibility: tuple[Float[Array, "_lights points"] | None, ...]
     centers: Float[Array, "3 points"] | None = None
-    layers: tuple[_diffusion.LayerValues | None, ...] = ()
-    derivative: tuple[_diffusion.LayerValues | None, ...] | None = None
+    layers: _diffusion.LayerValues | None = None
+    derivative: _diffusion.LayerValues | None = None
     added_source: Float[Array, "channels points"] | None = None
     extra: Any = None
 
     def with_layers(
         self,
-        layers: tuple[_diffusion.LayerValues | None, ...],
-        derivative: tuple[_diffusion.LayerValues | None, ...] | None,
+        layers: _diffusion.LayerValues,
+        derivative: _diffusion.LayerValues | None,
         added_source: Float[Array, "channels splats"] | None,
         centers: Float[Array, "3 splats"],
     ) -> "SurfaceAttributes":
         """Add the layers of the splats to what is blended."""
-
-        def prepared(layers):
-            return tuple(
-                layer and _diffusion.continue_from_splats(layer, centers) for layer in layers
-            )
-
         return dataclasses.replace(
             self,
             centers=centers,
-            layers=prepared(layers),
-            derivative=None if derivative is None else prepared(derivative),
+            layers=_diffusion.continue_from_splats(layers, centers),
+            derivative=derivative and _diffusion.continue_from_splats(derivative, centers),
             added_source=added_source,
         )
 
     def without_layers(self) -> "SurfaceAttributes":
         """Leave out the layers, once they are continued to the points seen."""
-        return dataclasses.replace(self, centers=None, layers=(), derivative=None)
+        return dataclasses.replace(self, centers=None, layers=None, derivative=None)
 
 
 class SurfaceSamples(eqx.Module):
@@ -79,8 +73,7 @@ class SurfaceSamples(eqx.Module):
     - `positions`: mm.
     - `depth`: mm along the camera's forward axis.
     - `covered`: where there is a surface.
-    - `layers`: of each Gaussian, means and mass at the positions; `None` for one that no splat
-      resolves.
+    - `layers`: means and mass at the positions; none before they are known.
     - `derivative`: of the layers in the logarithms of their variances; `None` where not asked for.
     """
 
@@ -88,8 +81,8 @@ class SurfaceSamples(eqx.Module):
     positions: Float[Array, "3 points"]
     depth: Float[Array, " points"]
     covered: Bool[Array, " points"]
-    layers: tuple[Float[Array, "values points"] | None, ...]
-    derivative: tuple[Float[Array, "values points"] | None, ...] | None
+    layers: Float[Array, "layers values points"]
+    derivative: Float[Array, "layers values points"] | None
 
 
 def stack_rows(rows: PyTree[Float[Array, "... points"]]) -> Float[Array, "all points"]:

@@ -139,12 +139,11 @@ def _picture_jacobian(
             added = samples.attributes.added_source
             if added is not None:
                 # The light that a weight lets in has layers of its own.
-                layers = tuple(
-                    None if layer is None else layer[len(added) :] for layer in samples.layers
-                )
+                layers = samples.layers[:, len(added) :]
                 samples = dataclasses.replace(samples, layers=layers, derivative=None)
+                planned = plan.diffusion.gaussians, plan.interval, settings.kernel
                 gained, _ = layers_at_points(
-                    scene, samples, samples.attributes, added, plan.interval, settings.kernel
+                    scene, samples, samples.attributes, added, *planned
                 ).weigh(*weighing)
                 weighted = material.gaussians.weights[:, :, None] * gained
                 of_weights = of_weights + jnp.sum(weighted, axis=0)[None]

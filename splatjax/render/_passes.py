@@ -43,8 +43,8 @@ class SplatLight(eqx.Module):
 
     visibility: list[Float[Array, "_lights splats"] | None]
     irradiance: Irradiance
-    layers: tuple[_diffusion.LayerValues | None, ...]
-    derivative: tuple[_diffusion.LayerValues | None, ...] | None
+    layers: _diffusion.LayerValues
+    derivative: _diffusion.LayerValues | None
     added_source: Float[Array, "channels splats"] | None
     needed: Float[Array, ""]
 
@@ -81,10 +81,11 @@ def light_splats(
         scene, source, settings, plan, combination, at, derivative
     )
     needed = jnp.maximum(needed, light.needed)
-    splat_light = SplatLight(light.visibility, irradiance, (), None, added, needed)
-    splat_light = splat_light if at is None else splat_light.take(at)
-    # The layers are already those at `at`: they are added after the others are taken.
-    return dataclasses.replace(splat_light, layers=layers, derivative=log_variance_derivative)
+    along_splats = light.visibility, irradiance, added
+    if at is not None:
+        along_splats = jax.tree.map(partial(take_points, chosen=at), along_splats)
+    visibility, irradiance, added = along_splats
+    return SplatLight(visibility, irradiance, layers, log_variance_derivative, added, needed)
 
 
 def _differentiated_irradiance(
@@ -174,7 +175,8 @@ def see_and_shade(
     # Pass 5: shade the points that are seen.
     def shade_and_read(samples: SurfaceSamples) -> Values:
         samples = jax.tree.map(in_a_row, samples)
-        shaded, layers = shade(scene, view.position, groups, samples, plan.interval, settings)
+        planned = plan.diffusion.gaussians, plan.interval
+        shaded, layers = shade(scene, view.position, groups, samples, *planned, settings)
         return read(shaded, layers, samples)
 
     sample = partial(sample_surfaces, visible, attributes, origin)
@@ -209,23 +211,22 @@ def sample_surfaces(
     attributes = split_rows(in_a_row(surface.attributes), like)
     positions = in_a_row(visible.points(tiles, surface.depth))
 
-    derivative = attributes.derivative
-    points = positions - origin
-    continued = [
-        (None, None)
-        if layer is None
-        else _diffusion.continue_to_points(
-            layer, derivative and derivative[i], attributes.centers, points, len(attributes.source)
+    layers, derivative = jnp.zeros((0, 1, positions.shape[1]), positions.dtype), None
+    if attributes.layers is not None:
+        layers, derivative = _diffusion.continue_to_points(
+            attributes.layers,
+            attributes.derivative,
+            attributes.centers,
+            positions - origin,
+            len(attributes.source),
         )
-        for i, layer in enumerate(attributes.layers)
-    ]
     return SurfaceSamples(
         attributes=attributes.without_layers(),
         positions=positions,
         depth=in_a_row(surface.depth),
         covered=in_a_row(surface.covered),
-        layers=tuple(layer for layer, _ in continued),
-        derivative=None if derivative is None else tuple(change for _, change in continued),
+        layers=layers,
+        derivative=derivative,
     )
 
 

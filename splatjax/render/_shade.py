@@ -2,7 +2,7 @@
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from splatjax import diffusion as _diffusion, shading as _shading, splatting as _splatting
 from splatjax.scene import Frame, Scene, StackedLights
@@ -42,6 +42,7 @@ def layers_at_points(
     samples: SurfaceSamples,
     attributes: SurfaceAttributes,
     source: Float[Array, "channels points"],
+    gaussians: Int[Array, " layers"],
     interval: Float[Array, "2"],
     kernel: _diffusion.AbstractDiffusionKernel,
 ) -> _diffusion.LayersAtPoints:
@@ -51,10 +52,12 @@ def layers_at_points(
 
     - `source`: the surface's own irradiance, for layers that the splats do not resolve; the layers
       of the samples begin with its channels.
+    - `gaussians`: of the layers, as in a plan.
     """
     albedo = attributes.albedo
     return _diffusion.LayersAtPoints.of(
         scene.material.gaussians.variances,
+        gaussians,
         samples.layers,
         samples.derivative,
         source,
@@ -70,11 +73,16 @@ def shade(
     eye: Float[Array, "3"],
     groups: list[StackedLights],
     samples: SurfaceSamples,
+    gaussians: Int[Array, " layers"],
     interval: Float[Array, "2"],
     settings: RenderSettings,
 ) -> tuple[ShadedSurface, _diffusion.LayersAtPoints]:
     """Shade the samples: the layers, the specular lobe, and single scattering. Also return what
     the layers were made of.
+
+    **Arguments:**
+
+    - `gaussians`, `interval`: of the layers, as in a plan.
     """
     material, covered = scene.material, samples.covered
     attributes = settings.lighting.at_pixels(scene, groups, samples)
@@ -91,8 +99,8 @@ def shade(
             for group, rows in zip(groups, attributes.visibility, strict=True)
         ],
     )
-    gaussians = material.gaussians
-    at = layers_at_points(scene, samples, attributes, attributes.source, interval, settings.kernel)
+    of_layers = attributes.source, gaussians, interval, settings.kernel
+    at = layers_at_points(scene, samples, attributes, *of_layers)
     albedo = at.albedo
     per_exitance = _shading.exit_transmission(points, f0)[None] / jnp.pi
     if attributes.albedo is not None:
@@ -103,7 +111,7 @@ def shade(
         single = jnp.where(covered[None], single, 0.0)
         if attributes.albedo is not None:
             single = single * _shading.albedo_root(albedo) ** 2
-    layers, resolved = at.weigh(gaussians, material.single_scattering_albedo())
+    layers, resolved = at.weigh(material.gaussians, material.single_scattering_albedo())
     layers = jnp.where(covered[None, None], per_exitance[None] * layers, 0.0)
     specular = _shading.reflected_radiance(points, groups, f0, material.channels)
     shadow = _shadows_in_order(attributes.visibility, groups, len(scene.lights), samples.depth)
@@ -116,7 +124,7 @@ def shade(
         irradiance=attributes.source if attributes.irradiance is None else attributes.irradiance,
         radiance_per_exitance=jnp.where(covered[None], per_exitance, 0.0),
         layers=layers,
-        diffuse=jnp.sum(gaussians.weights[:, :, None] * layers, axis=0),
+        diffuse=jnp.sum(material.gaussians.weights[:, :, None] * layers, axis=0),
         specular=jnp.where(covered[None], specular, 0.0),
         single_scattering=single,
         resolved=resolved,

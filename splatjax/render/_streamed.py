@@ -10,7 +10,7 @@ from typing import TypeAlias
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from splatjax import diffusion as _diffusion, splatting as _splatting
 from splatjax._chunking import take_points
@@ -164,7 +164,8 @@ def render_streamed(
     layers = diffusion.evaluate(sources())
 
     # Pass 5.
-    return _shade(first, view, groups, visible, samples, layers, interval, settings)
+    planned = diffusion.gaussians, interval
+    return _shade(first, view, groups, visible, samples, layers, *planned, settings)
 
 
 def _maps(
@@ -258,13 +259,14 @@ def _shade(
     groups: list[StackedLights],
     visible: _splatting.VisibleSurfaces,
     samples: SurfaceSamples,
-    layers: tuple[Float[Array, "places values pixels"] | None, ...],
+    layers: Float[Array, "places layers values pixels"],
+    gaussians: Int[Array, " layers"],
     interval: Float[Array, "2"],
     settings: RenderSettings,
 ) -> Frame:
     def shade_places(samples: SurfaceSamples, layers):
         samples, layers = jax.tree.map(in_a_row, (samples, layers))
         samples = dataclasses.replace(samples, layers=layers)
-        return shade(scene, view.position, groups, samples, interval, settings)[0]
+        return shade(scene, view.position, groups, samples, gaussians, interval, settings)[0]
 
     return compose(scene, map_places(shade_places, samples, layers), visible)

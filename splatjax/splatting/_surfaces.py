@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
-from splatjax._chunking import AT_ONCE
+from splatjax._chunking import AT_ONCE, zeros_after
 from splatjax._combination import AbstractCombination
 from splatjax.scene import Splats
 
@@ -144,7 +144,7 @@ class VisibleSurfaces(eqx.Module):
         self, values: Float[Array, "places *rows pixels"], fill: float = 0.0
     ) -> Float[Array, "height width *rows"]:
         """Join the picture of the front surface; `fill` where there is none."""
-        tiles = jnp.full((self.grid.count, *values.shape[1:]), fill, values.dtype)
+        tiles = self._blank(values) + fill
         place = jnp.where(self.in_front, self.tiles, self.grid.count)
         return self._joined(tiles.at[place].set(values, mode="drop"))
 
@@ -152,9 +152,14 @@ class VisibleSurfaces(eqx.Module):
         self, values: Float[Array, "places *rows pixels"]
     ) -> Float[Array, "height width *rows"]:
         """Lay the front over what shows behind it, premultiplied by coverage."""
-        tiles = jnp.zeros((self.grid.count, *values.shape[1:]), values.dtype)
         share = self.share.reshape(len(self.tiles), *[1] * (values.ndim - 2), -1)
-        return self._joined(tiles.at[self.tiles].add(share * values, mode="drop"))
+        return self._joined(self._blank(values).at[self.tiles].add(share * values, mode="drop"))
+
+    def _blank(
+        self, values: Float[Array, "places *rows pixels"]
+    ) -> Float[Array, "tiles *rows pixels"]:
+        shape = self.grid.count, *values.shape[1:]
+        return zeros_after((self.share, values), shape, values.dtype)
 
     def _joined(
         self, tiles: Float[Array, "tiles *rows pixels"]

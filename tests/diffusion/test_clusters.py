@@ -1,4 +1,4 @@
-"""Merged splats keep what the far field needs, and their tree is nested. The orders and lists of
+"""Merged splats keep what the far field needs, and their cells are nested. The orders and lists of
 blocks that sums over sources rest on.
 """
 
@@ -10,62 +10,59 @@ import numpy as np
 import pytest
 
 from splatjax.diffusion import POINTS_PER_BLOCK, Sources, _neighbors, compact_order
-from splatjax.diffusion._clusters import ClusterTree
-from splatjax.diffusion._neighbors import SOURCES_PER_BLOCK, Boxes, find_neighbors
+from splatjax.diffusion._clusters import SOURCES_PER_BLOCK, LayerSources
+from splatjax.diffusion._neighbors import Boxes, find_neighbors
 
-CELLS, COUNT = [2.0, 4.0, 16.0], 800
-levels_of = eqx.filter_jit(lambda tree, sources: tree.levels(sources))
+EDGES, COUNT = [0.0, 2.0, 4.0, 16.0], 800
+DEPTHS = [0.1, 0.0, 0.2, 0.3]
 
 
-def sources_and_tree(cells=CELLS):
+def sources_and_tree():
     body, rng = bodies.bumpy(COUNT), np.random.default_rng(2)
     irradiance = jnp.asarray(rng.uniform(size=(2, COUNT)), float)
     exists = np.arange(COUNT) % 16 > 0
     areas = jnp.where(exists, 0.01 * body.areas, 0.0)
     sources = Sources(body.centers.T, body.normals.T, areas, irradiance)
     given = np.asarray(body.centers), np.asarray(body.normals), exists
-    return sources, ClusterTree.build(*given, cells)
-
-
-def of_splats(tree):
-    place = np.arange(COUNT)
-    return [place := np.asarray(parents)[place] for parents in tree.parents]
+    return sources, LayerSources.build(*given, EDGES)
 
 
 def test_merging_keeps_areas_and_means():
-    sources, tree = sources_and_tree()
+    splats, layers = sources_and_tree()
     centers, normals, areas, irradiance = (
-        np.asarray(each, float) for each in jax.tree.leaves(sources)
+        np.asarray(each, float) for each in jax.tree.leaves(splats)
     )
-    splats, *levels = levels_of(tree, sources)
-    np.testing.assert_array_equal(splats.areas, sources.areas)
-    for clusters, place in zip(levels, of_splats(tree), strict=True):
-        area = np.bincount(place, areas, len(clusters.areas))
-        full = area > 0
+    merge = eqx.filter_jit(lambda *given: LayerSources.merged(*given))
+    merged = merge(layers, splats, jnp.asarray(DEPTHS))
+    total, owner = np.zeros(layers.count), np.repeat(np.asarray(layers.layers), SOURCES_PER_BLOCK)
+    for layer, (parents, depth) in enumerate(zip(np.asarray(layers.parents), DEPTHS, strict=True)):
+        area = np.bincount(parents, areas, layers.count)
+        full, total = area > 0, total + area
+        assert np.all(owner[full] == layer)
 
-        def mean(rows, place=place, area=area, full=full):
-            sums = [np.bincount(place, areas * row, len(area)) for row in rows]
+        def mean(rows, parents=parents, area=area, full=full):
+            sums = [np.bincount(parents, areas * row, len(area)) for row in rows]
             return np.asarray(sums)[:, full] / area[full]
 
-        np.testing.assert_allclose(clusters.areas, area, rtol=1e-5)
-        merged = clusters.centers, clusters.normals, clusters.irradiance
-        for ours, rows in zip(merged, (centers, normals, irradiance), strict=True):
+        own = (merged.centers, centers - depth * normals), (merged.irradiance, irradiance)
+        for ours, rows in own:
             np.testing.assert_allclose(ours[:, full], mean(rows), rtol=1e-3, atol=1e-4)
+    np.testing.assert_allclose(merged.areas, total, rtol=1e-5)
 
 
 def test_a_cluster_fills_no_more_than_its_cell_and_none_is_lost():
-    sources, tree = sources_and_tree()
+    sources, layers = sources_and_tree()
     centers, exists = np.asarray(sources.centers), np.asarray(sources.areas) > 0
     numbers = []
-    for place, count, level in zip(of_splats(tree), tree.counts, range(3), strict=True):
-        own = place[exists]
+    for layer, parents in enumerate(np.asarray(layers.parents)):
+        own = parents[exists]
         numbers.append(len(np.unique(own)))
-        assert numbers[-1] <= count <= 1.2 * numbers[-1] + POINTS_PER_BLOCK
-        edge = sum(CELLS[: level + 1])  # a cell takes in all of the clusters whose centers it holds
+        edge = sum(EDGES[: layer + 1])  # a cell takes in all of the clusters whose centers it holds
         for cluster in np.unique(own)[::7]:
             extent = np.ptp(centers[:, exists][:, own == cluster], axis=1)
             assert np.all(extent <= edge * (1 + 1e-5))
-    assert exists.sum() > numbers[0] > numbers[1] > numbers[2] >= 1
+    assert exists.sum() == numbers[0] > numbers[1] > numbers[2] > numbers[3] >= 1
+    assert layers.count <= 1.5 * sum(numbers) + COUNT
 
 
 def test_blocks_of_a_compact_order_are_small():
@@ -99,7 +96,12 @@ def test_neighbors_are_the_boxes_within_reach_each_once(at_once, monkeypatch):
         points.low[:, None] - sources.high[None], sources.low[None] - points.high[:, None]
     )
     expected = np.sum(np.maximum(gaps, 0) ** 2, axis=2) <= reach**2
-    lists = jax.tree.map(np.asarray, find_neighbors(points, sources, reach))
-    for block, near in enumerate(expected):
-        row = lists.rows[lists.first[block] :][: lists.counts[block]].reshape(-1)
-        np.testing.assert_array_equal(np.sort(row[row < len(near)]), np.flatnonzero(near))
+    # The blocks of sources belong to two layers; of a third nothing is in reach.
+    layers = np.where(np.arange(expected.shape[1]) < expected.shape[1] // 2, 0, 2)
+    found = find_neighbors(points, sources, layers, [reach, 0.0, reach])
+    lists = jax.tree.map(np.asarray, found)
+    for layer, block in np.ndindex(3, len(expected)):
+        near = np.flatnonzero(expected[block] & (layers == layer))
+        own = layer * len(expected) + block
+        row = lists.rows[lists.first[own] :][: lists.counts[own]].reshape(-1)
+        np.testing.assert_array_equal(np.sort(row[row < len(layers)]), near)

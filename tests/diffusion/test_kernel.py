@@ -68,9 +68,9 @@ WHITE = WEIGHTS / WEIGHTS.sum(axis=0)
 
 @pytest.mark.parametrize("support", [3.75, 4.5])
 def test_the_kernel_falls_to_zero_without_a_step(support, float64):
-    kernel = KERNEL.truncated(support)
+    kernel = KERNEL.truncated(np.array([support]))
     exponents = jnp.linspace(0, 12, 120_001)
-    weight, fall = (np.asarray(each) for each in kernel(exponents))
+    weight, fall = (np.asarray(each)[0] for each in kernel(exponents[None]))
     assert np.all(weight[exponents >= kernel.largest] == 0)
     assert np.all(np.diff(weight) <= 0)
     np.testing.assert_allclose(weight[:60_000], np.exp(-exponents[:60_000]), rtol=1e-12)
@@ -78,8 +78,8 @@ def test_the_kernel_falls_to_zero_without_a_step(support, float64):
     np.testing.assert_allclose(weight[0] - weight[1:], integral, atol=1e-5)
     # Its integral over a plane.
     power = np.sum(weight) * 1e-4
-    np.testing.assert_allclose(kernel.integral(jnp.zeros(())), power, rtol=1e-4)
-    in_float32 = kernel(exponents.astype(jnp.float32))
+    np.testing.assert_allclose(kernel.integral(jnp.zeros(1)), power, rtol=1e-4)
+    in_float32 = [each[0] for each in kernel(exponents[None].astype(jnp.float32))]
     bodies.assert_close(in_float32, (weight, fall), atol=IN_FLOAT32)
 
 
@@ -230,7 +230,7 @@ def test_a_thin_white_sheet_returns_what_it_receives_whatever_is_resolved(interv
     rows = sheet_at_origin(0.5, 10.0, spacing, (1.0, 1.0), variances, KERNEL)
     one, area = jnp.ones((1, 1)), jnp.full(1, spacing**2)
     given = one, area, one, jnp.asarray(interval), KERNEL
-    at = LayersAtPoints.of(variances, list(rows[:, :, None]), None, *given)
+    at = LayersAtPoints.of(variances, jnp.arange(3), rows[:, :, None], None, *given)
     _, resolved = at.weigh(SumOfGaussians(variances, weights), jnp.zeros(1))
     assert np.any(resolved > 0)
     white, grey = (at.exitance(SumOfGaussians(variances, w)) for w in (weights, 0.5 * weights))
@@ -316,10 +316,12 @@ def layers_at_points(kernel):
     slopes = rng.normal(size=(3, 3, 7))
     source, albedo = rng.uniform(0.2, 1.0, (2, 2, 7))
     area = rng.uniform(0.3, 1.0, 7)
-    layers, slopes = (list(jnp.asarray(each, float)) for each in (rows, slopes))
+    # In any order: the layers are sorted by their Gaussians.
+    order = jnp.asarray([1, 2, 0])
+    layers, slopes = (jnp.asarray(each, float)[order] for each in (rows, slopes))
     given = (jnp.asarray(each, float) for each in (source, area, albedo))
     interval = jnp.asarray([0.4, 2.2])
-    at = LayersAtPoints.of(variances, layers, slopes, *given, interval, kernel)
+    at = LayersAtPoints.of(variances, order, layers, slopes, *given, interval, kernel)
     return at, SumOfGaussians(variances, jnp.asarray(weights))
 
 

@@ -21,7 +21,7 @@ from hypothesis.extra.numpy import arrays
 from worlds import PLAIN, World, named, with_leaf
 
 import splatjax as sj
-from splatjax.diffusion._clustered import LayerPlan
+from splatjax.diffusion import ClusterPlan
 from splatjax.diffusion._neighbors import Boxes, Neighbors, find_neighbors
 from splatjax.splatting import ShadowSettings
 from splatjax.splatting._bins import BinCapacity
@@ -248,27 +248,29 @@ def roomy(plan: sj.Plan, shape: Shape) -> sj.Plan:
             room = _room(shape.splats, tiles, rasterizer.lanes, rasterizer.slots)
             places = SurfaceCapacity(tiles, tiles)
             return TilePlan(rasterizer, max(shape.splats, 1), BinCapacity(*room), places)
-        if isinstance(part, LayerPlan):
-            none, endless = jnp.zeros(()), jnp.full((), jnp.inf)
-            neighbors = far_reaching(part.neighbors)
-            return LayerPlan(part.level, none, endless, part.truncated, neighbors)
+        if isinstance(part, ClusterPlan):
+            return dataclasses.replace(
+                part,
+                margin=jnp.asarray(jnp.inf, part.margin.dtype),
+                neighbors=far_reaching(part.neighbors),
+            )
         return part
 
-    return jax.tree.map(widened, plan, is_leaf=lambda part: isinstance(part, TilePlan | LayerPlan))
+    parts = TilePlan | ClusterPlan
+    return jax.tree.map(widened, plan, is_leaf=lambda part: isinstance(part, parts))
 
 
 FARTHEST = 1e15  # mm, to which all is near
 
 
-def far_reaching(neighbors: Neighbors | None) -> Neighbors | None:
-    if neighbors is None:
-        return None
-
+def far_reaching(neighbors: Neighbors) -> Neighbors:
     def anywhere(boxes: Boxes) -> Boxes:
         return Boxes(jnp.full_like(boxes.low, -FARTHEST), jnp.full_like(boxes.high, FARTHEST))
 
-    boxes = anywhere(neighbors.points), anywhere(neighbors.sources)
-    return Neighbors(find_neighbors(*boxes, 10 * FARTHEST), *boxes, jnp.asarray(10 * FARTHEST))
+    boxes, reaches = (anywhere(neighbors.points), anywhere(neighbors.sources)), neighbors.reaches
+    far = np.where(np.isfinite(reaches), 10 * FARTHEST, 0.0)
+    lists = find_neighbors(*boxes, np.asarray(neighbors.layers), far.tolist())
+    return Neighbors(lists, *boxes, neighbors.layers, jnp.full_like(reaches, 10 * FARTHEST))
 
 
 def _room(items: int, tiles: int, lanes: int, slots: int) -> tuple[int, int, int]:

@@ -75,7 +75,10 @@ def _apart_on_eight(world: sj.Scene) -> dict:
     eye, mesh = camera(), jax.make_mesh((4, 2), ("hosts", "devices"))
     plans = [sj.make_plan(world, eye, SETTINGS), sj.make_plan(world, eye, SETTINGS, mesh=mesh)]
     # Layers that are not resolved, from single splats, from clusters.
-    assert [each.neighbors and each.level for each in plans[0].diffusion.layers] == [None, 0, 1]
+    diffusion = plans[0].diffusion
+    np.testing.assert_array_equal(diffusion.gaussians, [1, 2])
+    splats, clusters = (len(np.unique(each)) for each in np.asarray(diffusion.sources.parents))
+    assert splats == len(plans[0].order) > clusters
     one, many = (pictured(world, eye, plan) for plan in plans)
     assert many[1].overflow == 0
     # The derivative in the lobe's strength nearly vanishes here; the lobe's numbers are one kind.
@@ -127,7 +130,7 @@ def traffic() -> dict:
         )
     )
     found = counted(program.lower(world.splats).compile().as_text())
-    layers = sum(layer.neighbors is not None for layer in plan.diffusion.layers)
+    layers = len(plan.diffusion.gaussians)
     shadows = [each.raster for each in plan.shadows if each is not None]
     picture = Picture(
         camera=View(30, *_capacity(plan.raster)),

@@ -108,7 +108,7 @@ def test_a_beam_on_a_sheet_is_the_gaussian_of_each_layer_at_the_splats(kind, var
     inside = np.linalg.norm(np.asarray(placed.centers), axis=1) < 4 * deviation
     inside &= np.asarray(exists)
     squared = np.sum(np.asarray(placed.centers, np.float64) ** 2, axis=1)[inside]
-    layer = np.asarray(diffused.layers[0].values[0], np.float64)[inside]
+    layer = np.asarray(diffused.layers.values[0, 0], np.float64)[inside]
     assert error_of(layer, squared, variance) < BEAM_TOLERANCE
 
 

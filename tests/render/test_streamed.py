@@ -11,7 +11,7 @@ from bodies import PLAIN, apart, camera_over, joined, sheet, sphere, with_albedo
 
 import splatjax as sj
 from splatjax.diffusion import FINE_QUANTILE, DenseDiffuser
-from splatjax.diffusion._clusters import ClusterTree
+from splatjax.diffusion._clusters import LayerSources
 from splatjax.render._statistics import StreamStatistics
 from splatjax.splatting import ShadowSettings
 
@@ -71,10 +71,10 @@ def in_parts(splats, size):
 def test_parts_make_the_picture_of_all_at_once(splats, monkeypatch):
     settings = sj.RenderSettings(shadows=SHADOWS)
     whole = sj.render(sj.Scene(splats, LIGHTS, MATERIAL), CAMERA, settings)
-    build, built, done = ClusterTree.build, [], []
+    build, built, done = LayerSources.build, [], []
     counts = [300, 600, 900, 1200, 1500, 1800, 2100, 2200]
     monkeypatch.setattr(
-        ClusterTree, "build", lambda *given: built.append(len(given[0])) or build(*given)
+        LayerSources, "build", lambda *given: built.append(len(given[0])) or build(*given)
     )
     streamed = sj.render_streamed(
         in_parts(splats, 300),
