@@ -26,8 +26,9 @@ def filled_like(
     scene: Scene, plan: Plan, *given: PyTree
 ) -> tuple[Scene, Plan, Int[np.ndarray, " lights"]]:
     """Fill up the splats of a scene to the length of its plan, and the lights of each kind to a
-    power of two. NumPy does it, which compiles nothing. Where arrays of the scene or of what is
-    `given` with it are traced, and where splats are cut over devices, all stays as it is.
+    power of two. NumPy and `device_put` do it, which compile nothing. Where arrays of the scene or
+    of what is `given` with it are traced, and where splats are cut over devices, all stays as it
+    is.
 
     No entry of the plan's order stands for a splat of the filling. A light of the filling has no
     strength, and by the plan no shadow map. Where a light of the scene consists of several samples,
@@ -49,7 +50,7 @@ def filled_like(
         lights = [light for _, light in numbered]
         # One or two lights of a kind are never filled up, and need no count.
         shadows = tuple(
-            dataclasses.replace(shadow, lights=jnp.asarray(np.asarray(len(group), np.int32)))
+            dataclasses.replace(shadow, lights=jax.device_put(np.int32(len(group))))
             if shadow is not None and len(group) > 2
             else shadow
             for group, shadow in zip(groups, shadows, strict=True)
@@ -63,7 +64,7 @@ def _filling(
 ) -> list[tuple[int, AbstractLightSample]]:
     """Repeat the last light of a group, without its strength, up to a power of two."""
     last = group[-1][1]
-    none = jnp.asarray(np.zeros_like(getattr(last, last.strength)))
+    none = jax.device_put(np.zeros_like(getattr(last, last.strength)))
     dark = eqx.tree_at(lambda light: getattr(light, light.strength), last, none)
     return [(number, dark)] * ((1 << (len(group) - 1).bit_length()) - len(group))
 
@@ -78,7 +79,7 @@ def rows_at(
         return rows
     if isinstance(rows, Tracer):
         return jnp.take(rows, places, axis=0, mode="clip")
-    return jnp.asarray(np.take(np.asarray(rows), places, axis=0, mode="clip"))
+    return jax.device_put(np.take(np.asarray(rows), places, axis=0, mode="clip"))
 
 
 def on_devices(
