@@ -26,15 +26,14 @@ def filled_like(
     scene: Scene, plan: Plan, *given: PyTree
 ) -> tuple[Scene, Plan, Int[np.ndarray, " lights"]]:
     """Fill up the splats of a scene to the length of its plan, and the lights of each kind to a
-    power of two. NumPy and `device_put` do it, which compile nothing. Where arrays of the scene or
-    of what is `given` with it are traced, and where splats are cut over devices, all stays as it
-    is.
+    power of two, by NumPy and `device_put`, which compile nothing. Where the scene or what is
+    `given` with it is traced, and where splats are cut over devices, everything stays unchanged.
 
-    No entry of the plan's order stands for a splat of the filling. A light of the filling has no
-    strength, and by the plan no shadow map. Where a light of the scene consists of several samples,
-    or has no field for its strength, no light is added.
+    No entry of the plan's order stands for an added splat. An added light has no strength, and the
+    plan leaves out its shadow map. Where a light of the scene consists of several samples, or has
+    no field for its strength, no light is added.
 
-    **Returns:** the scene, its plan, and the place of each light, now sorted by kind.
+    **Returns:** the scene with its lights sorted by kind, its plan, and the place of each light.
     """
     count, places = scene.splats.count, np.arange(len(scene.lights))
     leaves = jax.tree.leaves((scene, given))
@@ -72,8 +71,8 @@ def _filling(
 def rows_at(
     rows: Shaped[Array, "rows ..."], places: Int[np.ndarray, " places"]
 ) -> Shaped[Array, "places ..."]:
-    """Take rows of an array, the last one for places beyond it; outside `jit` it compiles
-    nothing.
+    """Take rows of an array, the last one for places beyond it. Outside `jit` nothing is
+    compiled.
     """
     if np.array_equal(places, np.arange(len(rows))):
         return rows

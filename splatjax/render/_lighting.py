@@ -34,8 +34,8 @@ class ShadowPlan(eqx.Module):
     - `raster`: their capacity.
     - `cube`: whether they are the six faces of a cube, as a point light among the splats needs
       them. Static.
-    - `lights`: how many lights of the group exist: those that fill it up come last and have no
-      shadow map. `None` where all exist.
+    - `lights`: the number of lights of the group that exist; the others fill it up, come last and
+      have no shadow map. `None` where all exist.
     """
 
     raster: _splatting.AbstractRasterPlan
