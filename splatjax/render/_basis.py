@@ -13,9 +13,9 @@ from splatjax.scene import Camera, Scene
 from splatjax.splatting import invalid_factor
 
 from ._checks import in_one_dtype
-from ._devices import on_devices
+from ._devices import filled_like, on_devices
 from ._passes import in_a_row, light_splats, see_and_shade
-from ._plan import Plan, RenderSettings, filled_like, plan_unless_traced
+from ._plan import Plan, RenderSettings, plan_unless_traced
 from ._shade import ShadedSurface
 
 # Fields of `LayersAtPoints` that lie along the points.
@@ -92,7 +92,7 @@ def diffusion_basis(
             "scene.material has single scattering, beside which less light enters as the weights "
             "grow; render each material by itself, or give one with single_scattering=None"
         )
-    scene, plan = filled_like(scene, plan_unless_traced(scene, camera, settings, plan))
+    scene, plan, _ = filled_like(scene, plan_unless_traced(scene, camera, settings, plan), camera)
     return _diffusion_basis(scene, camera, settings, plan, derivative)
 
 

@@ -1,22 +1,84 @@
 """Where the passes run: on one device, or with the splats, or many pictures, cut over the devices
-of a mesh.
+of a mesh; and scenes filled up with what adds nothing, so that many share a program.
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
 from jax.sharding import Mesh, PartitionSpec
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float, Int, PyTree, Shaped
 
 from splatjax._combination import AbstractCombination, DeviceMesh, OneDevice, lay_out
-from splatjax.scene import Scene
+from splatjax.scene import AbstractLightSample, Scene, lights_by_kind
 
 from ._plan import Plan, arrange, fill_up, splats_per_device
 
 Result = TypeVar("Result", bound=PyTree)
+
+
+def filled_like(
+    scene: Scene, plan: Plan, *given: PyTree
+) -> tuple[Scene, Plan, Int[np.ndarray, " lights"]]:
+    """Fill up the splats of a scene to the length of its plan, and the lights of each kind to a
+    power of two, by NumPy and `device_put`, which compile nothing. Where the scene or what is
+    `given` with it is traced, and where splats are cut over devices, everything stays unchanged.
+
+    No entry of the plan's order stands for an added splat. An added light has no strength, and the
+    plan leaves out its shadow map. Where a light of the scene consists of several samples, or has
+    no field for its strength, no light is added.
+
+    **Returns:** the scene with its lights sorted by kind, its plan, and the place of each light.
+    """
+    count, places = scene.splats.count, np.arange(len(scene.lights))
+    leaves = jax.tree.leaves((scene, given))
+    if plan.mesh is not None or any(isinstance(leaf, Tracer) for leaf in leaves):
+        return scene, plan, places
+    splats, lights, shadows = scene.splats, scene.lights, plan.shadows
+    if 0 < count < len(plan.order):
+        splats = jax.tree.map(lambda leaf: rows_at(leaf, np.arange(len(plan.order))), splats)
+    if all(isinstance(light, AbstractLightSample) and light.strength for light in lights):
+        groups = lights_by_kind(lights)
+        numbered = [light for group in groups for light in group + _filling(group, len(lights))]
+        places = np.argsort([number for number, _ in numbered], stable=True)[: len(lights)]
+        lights = [light for _, light in numbered]
+        # One or two lights of a kind are never filled up, and need no count.
+        shadows = tuple(
+            dataclasses.replace(shadow, lights=jax.device_put(np.int32(len(group))))
+            if shadow is not None and len(group) > 2
+            else shadow
+            for group, shadow in zip(groups, shadows, strict=True)
+        )
+    filled = dataclasses.replace(plan, shadows=shadows, splats=splats.count)
+    return Scene(splats, lights, scene.material), filled, places
+
+
+def _filling(
+    group: list[tuple[int, AbstractLightSample]], number: int
+) -> list[tuple[int, AbstractLightSample]]:
+    """Repeat the last light of a group, without its strength, up to a power of two."""
+    last = group[-1][1]
+    none = jax.device_put(np.zeros_like(getattr(last, last.strength)))
+    dark = eqx.tree_at(lambda light: getattr(light, light.strength), last, none)
+    return [(number, dark)] * ((1 << (len(group) - 1).bit_length()) - len(group))
+
+
+def rows_at(
+    rows: Shaped[Array, "rows ..."], places: Int[np.ndarray, " places"]
+) -> Shaped[Array, "places ..."]:
+    """Take rows of an array, the last one for places beyond it. Outside `jit` nothing is
+    compiled.
+    """
+    if np.array_equal(places, np.arange(len(rows))):
+        return rows
+    if isinstance(rows, Tracer):
+        return jnp.take(rows, places, axis=0, mode="clip")
+    return jax.device_put(np.take(np.asarray(rows), places, axis=0, mode="clip"))
 
 
 def on_devices(

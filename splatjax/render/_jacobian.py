@@ -16,10 +16,10 @@ from splatjax.scene import Camera, Frame, Scene
 
 from ._attributes import SurfaceSamples
 from ._checks import in_one_dtype
-from ._devices import on_devices
+from ._devices import filled_like, on_devices, rows_at
 from ._lighting import LightAtSplats
 from ._passes import light_splats, see_and_shade
-from ._plan import Plan, RenderSettings, filled_like, plan_unless_traced
+from ._plan import Plan, RenderSettings, plan_unless_traced
 from ._shade import ShadedSurface, compose, layers_at_points
 
 Parameters = TypeVar("Parameters", bound=PyTree)
@@ -120,8 +120,12 @@ def picture_jacobian(
             "single scattering, which is differentiated at the splats alone; give "
             "lighting=LightAtSplats(), or a material without it"
         )
-    scene, plan = filled_like(scene, plan_unless_traced(scene, camera, settings, plan))
-    return _picture_jacobian(scene, camera, settings, plan)
+    scene, plan, places = filled_like(
+        scene, plan_unless_traced(scene, camera, settings, plan), camera
+    )
+    jacobian = _picture_jacobian(scene, camera, settings, plan)
+    shadow = rows_at(jacobian.frame.shadow, places)
+    return eqx.tree_at(lambda jacobian: jacobian.frame.shadow, jacobian, shadow)
 
 
 @eqx.filter_jit

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from splatjax import shading as _shading, splatting as _splatting
 from splatjax._combination import AbstractCombination
@@ -27,12 +27,20 @@ _NEARLY = 1.05  # bounding radii, from which on one frustum around all splats fi
 
 
 class ShadowPlan(eqx.Module):
-    """Shadow maps for one group of lights. A point light among the splats needs the six faces of a
-    cube.
+    """Shadow maps for one group of lights.
+
+    **Attributes:**
+
+    - `raster`: their capacity.
+    - `cube`: whether they are the six faces of a cube, as a point light among the splats needs
+      them. Static.
+    - `lights`: the number of lights of the group that exist; the others fill it up, come last and
+      have no shadow map. `None` where all exist.
     """
 
     raster: _splatting.AbstractRasterPlan
     cube: bool = eqx.field(static=True)
+    lights: Int[Array, ""] | None = None
 
     def closeness(self, light: AbstractLightSample, bounds: _splatting.Bounds) -> Float[Array, ""]:
         """Compute a number above 1 for a point light that was planned outside the splats' bounding
@@ -137,6 +145,7 @@ def cast_shadows(
     """
     splats, groups = scene.splats, stack_lights(scene.lights)
     visibility, needed = [], [jnp.zeros((), splats.centers.dtype)]
+    dark = jnp.zeros_like(splats.radii), needed[0]
     for group, plan in zip(groups, shadows, strict=True):
         if plan is None:
             visibility.append(None)
@@ -155,7 +164,16 @@ def cast_shadows(
             closeness = plan.closeness(light, bounds)
             return jnp.sum(visible, axis=0), jnp.maximum(jnp.max(needed), closeness)
 
-        visible, needed_by_light = jax.lax.map(of_light, group.lights)
+        def if_exists(numbered, plan=plan, of_light=of_light):
+            number, light = numbered
+            return jax.lax.cond(number < plan.lights, of_light, lambda _: dark, light)
+
+        numbered = jnp.arange(len(group.light_indices)), group.lights
+        visible, needed_by_light = (
+            jax.lax.map(of_light, group.lights)
+            if plan.lights is None
+            else jax.lax.map(if_exists, numbered)
+        )
         visibility.append(visible)
         needed.append(jnp.max(needed_by_light))
     return LightVisibility(groups, visibility, jnp.max(jnp.stack(needed)))

@@ -1,6 +1,5 @@
 """How a picture is made, and what `jit`, `grad` and loops need to know of shapes, found once."""
 
-import dataclasses
 from collections.abc import Sequence
 from typing import TypeVar
 
@@ -17,7 +16,14 @@ from splatjax import diffusion as _diffusion, splatting as _splatting
 from splatjax._chunking import rounded_up
 from splatjax._combination import DeviceMesh, OneDevice
 from splatjax.cache import kept
-from splatjax.scene import AbstractLight, Camera, Scene, Splats, StackedLights, stack_lights
+from splatjax.scene import (
+    AbstractLight,
+    AbstractLightSample,
+    Camera,
+    Scene,
+    Splats,
+    lights_by_kind,
+)
 
 from ._checks import check_scene, in_one_dtype
 from ._lighting import AbstractLighting, LightAtSplats, ShadowPlan, plan_views
@@ -159,25 +165,6 @@ def fill_up(splats: Splats, count: int) -> Splats:
     return arrange(splats, jnp.minimum(every, splats.count - 1), every < splats.count)
 
 
-def filled_like(scene: Scene, plan: Plan) -> tuple[Scene, Plan]:
-    """Fill up the splats of a scene to the length of its plan, so that bodies of about as many
-    splats share a program; no entry of the plan's order stands for the filling. Scenes that are
-    traced, or cut over devices, stay as they are.
-    """
-    lacking = len(plan.order) - scene.splats.count
-    leaves = jax.tree.leaves(scene.splats)
-    if plan.mesh is not None or lacking <= 0 or any(isinstance(leaf, Tracer) for leaf in leaves):
-        return scene, plan
-
-    def fill(leaf):
-        zeros = np.zeros((lacking, *leaf.shape[1:]), leaf.dtype)
-        return jnp.asarray(np.concatenate([np.asarray(leaf), zeros]))  # compiles nothing
-
-    splats = jax.tree.map(fill, scene.splats)
-    scene = eqx.tree_at(lambda scene: scene.splats, scene, splats)
-    return scene, dataclasses.replace(plan, splats=len(plan.order))
-
-
 def arrange(
     splats: Splats,
     order: Int[Array, " places"] | Int[np.ndarray, " places"],
@@ -293,12 +280,12 @@ def _measure(parts: Sequence[Splats], kernel: _diffusion.AbstractDiffusionKernel
     return _splatting.Bounds.of(splats, OneDevice()), interval
 
 
-def _groups(lights: Sequence[tuple[AbstractLight, ...]]) -> list[list[StackedLights]]:
-    """Return for each group of lights that are rendered together its lights in every scene."""
-    stacked = [stack_lights(of_scene) for of_scene in lights]
+def _groups(lights: Sequence[tuple[AbstractLight, ...]]) -> list[list[AbstractLightSample]]:
+    """Return for each group of lights that are rendered together its samples in every scene."""
+    by_kind = [lights_by_kind(of_scene) for of_scene in lights]
     kinds = [
-        [(jax.tree.structure(group.lights), group.light_indices) for group in groups]
-        for groups in stacked
+        [[(index, jax.tree.structure(sample)) for index, sample in group] for group in groups]
+        for groups in by_kind
     ]
     for i, kinds_of_scene in enumerate(kinds):
         if kinds_of_scene != kinds[0]:
@@ -306,18 +293,20 @@ def _groups(lights: Sequence[tuple[AbstractLight, ...]]) -> list[list[StackedLig
                 "scenes of one plan must have lights of the same kinds in the same order, and the "
                 f"lights of scenes[{i}] differ"
             )
-    return [list(group) for group in zip(*stacked, strict=True)]
+    return [
+        [sample for group in of_scenes for _, sample in group]
+        for of_scenes in zip(*by_kind, strict=True)
+    ]
 
 
 def _plan_shadows(
-    groups: Sequence[StackedLights],
+    lights: Sequence[AbstractLightSample],
     parts: Sequence[Splats],
     bounds: _splatting.Bounds,
     settings: RenderSettings,
 ) -> ShadowPlan | None:
-    if not groups[0].lights.cast_shadows:
+    if not lights[0].cast_shadows:
         return None
-    lights = [light for group in groups for light in group.apart()]
     of_lights, cube = plan_views(lights, bounds, settings.shadows)
     views = [view for views in of_lights for view in views]
     rasterizer = settings.rasterizer.for_shadows()

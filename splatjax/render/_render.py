@@ -6,24 +6,24 @@ from functools import partial
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Float
 
 from splatjax._chunking import take_points
 from splatjax._combination import lay_out
 from splatjax.cache import kept_jit
-from splatjax.scene import Camera, Frame, Scene
+from splatjax.scene import Camera, Frame, Scene, lights_by_kind
 from splatjax.splatting import Bounds
 
 from ._checks import check_channels, in_one_dtype
-from ._devices import on_devices
+from ._devices import filled_like, on_devices, rows_at
 from ._lighting import Irradiance, LightAtSplats, cast_shadows, irradiance_at_splats
 from ._passes import SplatLight, diffuse_splats, light_splats, see_and_shade
 from ._plan import (
     Plan,
     RenderSettings,
     check_plan,
-    filled_like,
     plan_unless_traced,
     splats_per_device,
 )
@@ -58,8 +58,18 @@ def render(
     **Raises:** `ValueError` when a plan is needed and not given, or is for another mesh or another
     number of splats, or when the scene's channels disagree.
     """
-    scene, plan = filled_like(scene, plan_unless_traced(scene, camera, settings, plan, mesh))
-    return _render(scene, camera, settings, plan, light)
+    scene, plan, places = filled_like(
+        scene, plan_unless_traced(scene, camera, settings, plan, mesh), camera, light
+    )
+    frame = _render(scene, camera, settings, plan, light and _fitted(light, scene))
+    return dataclasses.replace(frame, shadow=rows_at(frame.shadow, places))
+
+
+def _fitted(light: SplatLight, scene: Scene) -> SplatLight:
+    """Give each kind of lights a row of visibility for every sample that the scene has of it."""
+    groups = zip(light.visibility, lights_by_kind(scene.lights), strict=True)
+    visibility = [rows if rows is None else rows_at(rows, np.arange(len(g))) for rows, g in groups]
+    return dataclasses.replace(light, visibility=visibility)
 
 
 @kept_jit
@@ -102,7 +112,8 @@ def illuminate(scene: Scene, plan: Plan, settings: RenderSettings = RenderSettin
     """
     check_channels(scene)
     check_plan(plan, scene)
-    return _illuminate(*filled_like(scene, plan), settings)
+    filled, plan, _ = filled_like(scene, plan)
+    return _fitted(_illuminate(filled, plan, settings), scene)
 
 
 @kept_jit

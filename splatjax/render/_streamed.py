@@ -24,6 +24,7 @@ from splatjax.scene import (
     Scene,
     Splats,
     StackedLights,
+    lights_by_kind,
     stack_lights,
 )
 
@@ -115,7 +116,7 @@ def render_streamed(
     bounds, view = statistics.bounds(dtype), _splatting.PerspectiveView.of(camera)
 
     # Pass 1: the shadow maps.
-    maps = _maps(groups, bounds, settings)
+    maps = _maps(first.lights, bounds, settings)
     sums = _sum_views(
         scenes,
         "shadow maps",
@@ -169,12 +170,13 @@ def render_streamed(
 
 
 def _maps(
-    groups: Sequence[StackedLights], bounds: _splatting.Bounds, settings: RenderSettings
+    lights: tuple[AbstractLight, ...], bounds: _splatting.Bounds, settings: RenderSettings
 ) -> list[_Map]:
     maps = []
-    for i, group in enumerate(groups):
-        if group.lights.cast_shadows:
-            of_lights, cube = plan_views(group.apart(), bounds, settings.shadows)
+    for i, group in enumerate(lights_by_kind(lights)):
+        samples = [sample for _, sample in group]
+        if samples[0].cast_shadows:
+            of_lights, cube = plan_views(samples, bounds, settings.shadows)
             maps += [_Map(view, i, j, cube) for j, views in enumerate(of_lights) for view in views]
     return maps
 

@@ -6,6 +6,7 @@ from ._lights import (
     DirectionalLight as DirectionalLight,
     GaussianBeam as GaussianBeam,
     PointLight as PointLight,
+    lights_by_kind as lights_by_kind,
     stack_lights as stack_lights,
     StackedLights as StackedLights,
 )

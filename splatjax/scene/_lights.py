@@ -191,22 +191,22 @@ class StackedLights(eqx.Module):
             return rows
         return rows[jnp.asarray([self.distinct.index(index) for index in self.light_indices])]
 
-    def apart(self) -> list[AbstractLightSample]:
-        """Return the samples one by one."""
-        return [
-            jax.tree.map(lambda leaf, i=i: leaf[i], self.lights)
-            for i in range(len(self.light_indices))
-        ]
 
-
-def stack_lights(lights: tuple[AbstractLight, ...]) -> list[StackedLights]:
-    """Stack samples of equal kind, so that any number of them is computed by one loop."""
+def lights_by_kind(
+    lights: tuple[AbstractLight, ...],
+) -> list[list[tuple[int, AbstractLightSample]]]:
+    """List the samples of each kind of lights, each with the index of its light."""
     kinds: dict[object, list[tuple[int, AbstractLightSample]]] = {}
     for index, light in enumerate(lights):
         for sample in light.samples():
             kinds.setdefault(jax.tree.structure(sample), []).append((index, sample))
+    return list(kinds.values())
+
+
+def stack_lights(lights: tuple[AbstractLight, ...]) -> list[StackedLights]:
+    """Stack samples of equal kind, so that any number of them is computed by one loop."""
     groups = []
-    for members in kinds.values():
+    for members in lights_by_kind(lights):
         indices, samples = zip(*members, strict=True)
         stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *samples)
         groups.append(StackedLights(stacked, indices))

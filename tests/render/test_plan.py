@@ -13,7 +13,7 @@ from bodies import PLAIN, joined, sheet, sphere, two_gaussians
 
 import splatjax as sj
 from splatjax.diffusion import DenseDiffuser
-from splatjax.render import _checks
+from splatjax.render import _checks, _devices, _render
 from splatjax.render._checks import check_scene
 from splatjax.scene import AbstractLight, AbstractLightSample
 from splatjax.splatting import DenseRasterizer
@@ -31,6 +31,10 @@ def scene_under(*lights: AbstractLight, splats: sj.Splats | None = None) -> sj.S
 
 def lamp(*direction: float, cast_shadows: bool = True) -> sj.DirectionalLight:
     return sj.DirectionalLight(jnp.asarray(direction, float), jnp.ones(3), cast_shadows)
+
+
+def point(height: float) -> sj.PointLight:
+    return sj.PointLight([0.0, 0.0, height], 100 * jnp.ones(3), cast_shadows=False)
 
 
 CAMERA = sj.Camera.look_at([0, 0, 20], [0, 0, 0], width=8, height=8)
@@ -206,10 +210,12 @@ def test_a_picture_that_does_not_fit_is_refused_before_it_is_rendered(monkeypatc
 
 
 def test_other_bodies_lights_and_cameras_of_about_one_size_compile_nothing(compiled):
-    def render(body: sj.Splats, eye=(66, 4, 140), towards=(0.5, -0.5, -1.0)):
-        scene = sj.Scene(body, [lamp(*towards)], sj.load_material("skin"))
+    skin = sj.load_material("skin")
+    blue = eqx.tree_at(lambda m: m.gaussians.weights, skin, replace_fn=lambda w: w[:, ::-1])
+
+    def render(body: sj.Splats, eye=(66, 4, 140), lights=(lamp(0.5, -0.5, -1.0),), material=skin):
         camera = sj.Camera.look_at(eye, (0, -9, 0), fov=30, width=64, height=64)
-        return sj.render(scene, camera).beauty
+        return sj.render(sj.Scene(body, lights, material), camera).beauty
 
     bust, larger, fewer = sj.bust(4_000).scaled(0.2), sj.bust(4_000).scaled(0.21), sj.bust(3_970)
     fewer, first = fewer.scaled(0.2), render(bust)
@@ -218,7 +224,70 @@ def test_other_bodies_lights_and_cameras_of_about_one_size_compile_nothing(compi
         render(larger),
         render(fewer),
         render(bust, eye=(-60, 24, 140)),
-        render(bust, towards=(-0.5, -0.3, -1.0)),
+        render(bust, lights=[lamp(-0.5, -0.3, -1.0)]),
+        render(bust, material=blue),
     ]
     assert compiled == []
-    assert all(np.all(np.isfinite(other)) and not np.array_equal(other, first) for other in others)
+
+    # Lights of a kind are filled up to a power of two, and sorted by kind.
+    low, left, right = lamp(0.3, -0.2, -1.0), lamp(-0.5, -0.3, -1.0), lamp(0.5, -0.4, -0.9)
+    others.append(render(bust, lights=[left, low, right, low, point(40.0)]))
+    compiled.clear()
+    others += [
+        render(bust, lights=[low, point(30.0), left, right]),
+        render(bust, lights=[left, low, low, point(30.0)]),
+    ]
+    assert compiled == []
+    for i, other in enumerate(others):
+        assert np.all(np.isfinite(other))
+        assert not any(np.array_equal(other, before) for before in [first, *others[:i]])
+
+
+def test_lights_that_fill_up_a_kind_are_in_no_result():
+    splats, camera = joined(sheet(5.0, 1.0), sheet(1.0, 0.5)), CAMERA
+    lights = [lamp(0.0, 0.0, -1.0), point(20.0), lamp(0.6, 0.0, -0.8), lamp(-0.6, 0.1, -0.8)]
+    splats = eqx.tree_at(lambda s: s.centers, splats, replace_fn=lambda c: c.at[-9:, 2].set(2.0))
+    scene = scene_under(*lights, splats=splats)
+    plan = sj.make_plan(scene, camera, PLAIN)
+
+    def render(scene, light=None):
+        return sj.render(scene, camera, PLAIN, plan, light=light)
+
+    exact = jax.jit(render)(scene)  # traced scenes have the lights that they are given
+    light = sj.illuminate(scene, plan, PLAIN)
+    closed_over = jax.jit(lambda factor: factor * render(scene).shadow)(jnp.ones(()))
+    assert [len(rows) for rows in light.visibility if rows is not None] == [3]
+    assert exact.shadow.shape == closed_over.shape == (4, 8, 8)
+    assert float(jnp.min(jnp.max(jnp.abs(jnp.diff(exact.shadow, axis=0)), axis=(1, 2)))) > 0.1
+    for frame in (render(scene), render(scene, light), jax.jit(render)(scene, light)):
+        for left, right in zip(jax.tree.leaves(frame), jax.tree.leaves(exact), strict=True):
+            assert jnp.allclose(left, right, rtol=1e-5, atol=1e-6)
+    assert jnp.allclose(closed_over, exact.shadow, rtol=1e-5, atol=1e-6)
+    jacobian = sj.picture_jacobian(scene, camera, PLAIN, plan)
+    assert jnp.allclose(jacobian.frame.shadow, exact.shadow, rtol=1e-5, atol=1e-6)
+
+    # No map is made for what fills up: its visibility is 0.
+    filled, counted, places = _devices.filled_like(scene, plan)
+    assert places.tolist() == [0, 4, 1, 2]
+    rows = _render._illuminate(filled, counted, PLAIN).visibility[0]
+    assert not np.any(rows[3])
+    assert np.all(np.any(rows[:3] > 0, axis=1))
+
+
+def test_a_light_without_strength_has_its_shadow_and_its_derivative():
+    splats = joined(sheet(5.0, 1.0), sheet(1.0, 0.5))
+    directions = [(0.0, 0.0, -1.0), (0.6, 0.0, -0.8), (-0.6, 0.1, -0.8)]
+
+    def render(strength):
+        lamps = [lamp(*directions[0]), lamp(*directions[1])]
+        last = sj.DirectionalLight(directions[2], jnp.broadcast_to(strength, (3,)))
+        return sj.render(scene_under(*lamps, last, splats=splats), CAMERA, PLAIN, plan)
+
+    zero, one = jnp.zeros(()), jnp.ones(())
+    lights = [lamp(*direction) for direction in directions]
+    plan = sj.make_plan(scene_under(*lights, splats=splats), CAMERA, PLAIN)
+    dark, lit = render(zero), render(one)
+    assert np.array_equal(dark.shadow, lit.shadow)
+    change = jax.grad(lambda strength: jnp.sum(render(strength).beauty))(zero)
+    assert float(change) == pytest.approx(float(jnp.sum(lit.beauty - dark.beauty)), rel=1e-4)
+    assert float(change) > 1
