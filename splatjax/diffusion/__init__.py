@@ -18,7 +18,6 @@ from ._dense import (
 from ._diffuser import (
     AbstractDiffuser as AbstractDiffuser,
     AbstractDiffusionPlan as AbstractDiffusionPlan,
-    diffuse_with_derivative as diffuse_with_derivative,
     Diffused as Diffused,
     LayerValues as LayerValues,
     Sources as Sources,

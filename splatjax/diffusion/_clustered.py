@@ -128,7 +128,10 @@ class ClusterPlan(AbstractDiffusionPlan):
 
     - `sources`: of every layer: splats, or clusters of them.
     - `kernels`: of every layer.
-    - `variances`, `margin`: the plan serves variances within this factor of these, mm^2.
+    - `variances`, `margin`: the plan serves variances within this factor of these, mm^2, or of the
+      first of them.
+    - `forward_mode`: whether the layers are differentiable in forward mode, and not in reverse
+      mode. Static.
     """
 
     gaussians: Int[Array, " layers"]
@@ -137,9 +140,13 @@ class ClusterPlan(AbstractDiffusionPlan):
     neighbors: Neighbors
     variances: Float[Array, " gaussians"]
     margin: Float[Array, ""]
+    forward_mode: bool = eqx.field(static=True, default=False)
 
     def shares(self):
         return tuple(jax.tree.leaves((self.neighbors.lists, self.neighbors.points)))
+
+    def in_forward_mode(self):
+        return dataclasses.replace(self, forward_mode=True)
 
     def diffuse(
         self,
@@ -149,11 +156,6 @@ class ClusterPlan(AbstractDiffusionPlan):
         combination: AbstractCombination,
         at: Int[Array, " points"] | None = None,
     ) -> Diffused:
-        if variances.shape != self.variances.shape:
-            raise ValueError(
-                f"the plan is for {len(self.variances)} Gaussians, and the material has "
-                f"{len(variances)}; make another plan"
-            )
         # Every device gathers the sources of all, and evaluates the layers at its own splats.
         everywhere = combination.gather_last(sources)
         origin = stop_gradient(jnp.mean(everywhere.centers, axis=1))[:, None]
@@ -173,6 +175,7 @@ class ClusterPlan(AbstractDiffusionPlan):
             lists,
             self.kernels,
             wanted,
+            self.forward_mode,
         )
         per_mm = units_per_mm(own)[:, None]
         seen = points if at is None else take_points(points, at)
@@ -186,7 +189,8 @@ class ClusterPlan(AbstractDiffusionPlan):
         # What is needed of the plan.
         around = _target_boxes(points, sources.areas), source_boxes(below)
         reaches = jnp.sqrt(2 * self.kernels.largest * stop_gradient(own))
-        factors = jnp.maximum(self.variances / variances, variances / self.variances)
+        planned = self.variances[: len(variances)]
+        factors = jnp.maximum(planned / variances, variances / planned)
         varied = jnp.max(factors, initial=0) / (self.margin * (1 + 1e-6))
         needed = jnp.maximum(varied, self.neighbors.needed(*around, reaches))
         return Diffused(layers, combination.largest([needed.astype(variances.dtype)]))

@@ -53,8 +53,8 @@ class LayerSources(eqx.Module):
     ) -> "LayerSources":
         """Find the sources of layers.
 
-        The capacity is rounded up to halves of the number of splats, so that materials share a
-        program.
+        There is room for three quarters of the splats in every layer, more than most materials
+        need, so that they share a program.
 
         **Arguments:**
 
@@ -73,7 +73,7 @@ class LayerSources(eqx.Module):
             layers.append(np.full(blocks, layer, np.int32))
             count += blocks * SOURCES_PER_BLOCK
         half = -(-len(exists) // (2 * SOURCES_PER_BLOCK)) * SOURCES_PER_BLOCK
-        room = max(-(-count // half), len(edges)) * half
+        room = max(-(-count // half), -(-3 * len(edges) // 2)) * half
         layers.append(np.zeros((max(room, least) - count) // SOURCES_PER_BLOCK, np.int32))
         return cls(jnp.asarray(np.stack(parents)), jnp.asarray(np.concatenate(layers)))
 

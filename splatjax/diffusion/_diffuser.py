@@ -84,6 +84,27 @@ class AbstractDiffusionPlan(eqx.Module):
           from the number of splats on. All for `None`.
         """
 
+    def diffuse_with_derivative(
+        self,
+        sources: Sources,
+        variances: Float[Array, " gaussians"],
+        kernel: AbstractDiffusionKernel,
+        combination: AbstractCombination,
+        at: Int[Array, " points"] | None = None,
+    ) -> tuple[Diffused, Diffused]:
+        """Diffuse, and differentiate each layer in the logarithm of its own variance."""
+
+        def diffuse(variances):
+            plan = self.in_forward_mode()
+            return plan.diffuse(sources, variances, kernel, combination, at)
+
+        # Each layer depends on its own variance alone, so one direction holds all derivatives.
+        return jax.jvp(diffuse, (variances,), (variances,))
+
+    def in_forward_mode(self) -> "AbstractDiffusionPlan":
+        """Return a plan whose layers are differentiable in forward mode."""
+        return self
+
     def shares(self) -> tuple[Array, ...]:
         """Return the arrays of which every device has a share, along their first axis."""
         return ()
@@ -109,25 +130,6 @@ class AbstractDiffuser(eqx.Module):
           where several devices hold them.
         - `interval`: from `AbstractDiffusionKernel.interval`.
         """
-
-
-def diffuse_with_derivative(
-    plan: AbstractDiffusionPlan,
-    sources: Sources,
-    variances: Float[Array, " gaussians"],
-    kernel: AbstractDiffusionKernel,
-    combination: AbstractCombination,
-    at: Int[Array, " points"] | None = None,
-) -> tuple[Diffused, Diffused]:
-    """Diffuse, and differentiate each layer in the logarithm of its own variance.
-
-    Each layer depends on its own variance alone, so one direction holds all derivatives.
-    """
-
-    def diffuse(variances):
-        return plan.diffuse(sources, variances, kernel, combination, at)
-
-    return jax.jvp(diffuse, (variances,), (variances,))
 
 
 def divide_by_mass(

@@ -240,16 +240,25 @@ def _backward(residuals, cotangents):
     return given.sweep(sweep, points, start)
 
 
-@jax.custom_jvp
-def _sums(given: _Sweep, points, table):
+@jax.custom_vjp
+def _sums(given, points, table):
     return _forward(given, points, table)
 
 
-@_sums.defjvp
+_sums.defvjp(
+    lambda *given: (_forward(*given), given),
+    lambda residuals, cotangents: (None, *_backward(residuals, cotangents)),
+)
+
+
+@jax.custom_jvp
+def _sums_forward(given, points, table):
+    return _forward(given, points, table)
+
+
+@_sums_forward.defjvp
 def _sums_jvp(primals, tangents):
-    # Linear in the direction, with a transpose of its own: forward and reverse mode.
-    moved = jax.custom_derivatives.linear_call(_derivative, _backward, primals, tangents[1:])
-    return _forward(*primals), moved
+    return _forward(*primals), _derivative(primals, tangents[1:])
 
 
 def gaussian_sums(
@@ -258,6 +267,7 @@ def gaussian_sums(
     lists: Lists,
     kernels: TruncatedGaussian,
     wanted: Wanted,
+    forward_mode: bool = False,
 ) -> Float[Array, "layers sums wanted"]:
     r"""Sum `rows_j exp(-|x - p_j|^2)` over the blocks of sources that every point meets.
 
@@ -268,6 +278,8 @@ def gaussian_sums(
     - `kernels`: of each layer; stand for `exp`. Terms beyond their rims vanish, whatever the lists
       hold.
     - `wanted`: at which points.
+    - `forward_mode`: differentiable in forward mode alone, otherwise in reverse mode alone. Static.
     """
     given = _Sweep(kernels, lists, wanted)
-    return _sums(given, points.reshape(-1, *points.shape[2:]), table)
+    sums = _sums_forward if forward_mode else _sums
+    return sums(given, points.reshape(-1, *points.shape[2:]), table)

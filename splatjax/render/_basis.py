@@ -14,6 +14,7 @@ from splatjax.splatting import invalid_factor
 
 from ._checks import in_one_dtype
 from ._devices import filled_like, on_devices
+from ._filling import rows_at
 from ._passes import in_a_row, light_splats, see_and_shade
 from ._plan import Plan, RenderSettings, plan_unless_traced
 from ._shade import ShadedSurface
@@ -92,8 +93,17 @@ def diffusion_basis(
             "scene.material has single scattering, beside which less light enters as the weights "
             "grow; render each material by itself, or give one with single_scattering=None"
         )
-    scene, plan, _ = filled_like(scene, plan_unless_traced(scene, camera, settings, plan), camera)
-    return _diffusion_basis(scene, camera, settings, plan, derivative)
+    scene, plan, places = filled_like(
+        scene, plan_unless_traced(scene, camera, settings, plan), camera
+    )
+    basis = _diffusion_basis(scene, camera, settings, plan, derivative)
+
+    def of_gaussians(light: LayersAtPoints):
+        return light.variances, light.means, light.mass, light.derivative
+
+    rows = jax.tree.map(lambda each: rows_at(each, places.gaussians), of_gaussians(basis.light))
+    is_leaf = {"is_leaf": lambda leaf: leaf is None}
+    return eqx.tree_at(lambda basis: of_gaussians(basis.light), basis, rows, **is_leaf)
 
 
 @eqx.filter_jit

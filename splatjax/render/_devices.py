@@ -4,7 +4,7 @@ of a mesh; and scenes filled up with what adds nothing, so that many share a pro
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -12,30 +12,45 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jax.sharding import Mesh, PartitionSpec
-from jaxtyping import Array, Float, Int, PyTree, Shaped
+from jaxtyping import Array, Float, Int, PyTree
 
 from splatjax._combination import AbstractCombination, DeviceMesh, OneDevice, lay_out
-from splatjax.scene import AbstractLightSample, Scene, lights_by_kind
+from splatjax.scene import AbstractLightSample, Frame, Scene, lights_by_kind
 
-from ._plan import Plan, arrange, fill_up, splats_per_device
+from ._filling import arrange, fill_gaussians, fill_lights, fill_up, rows_at
+from ._plan import Plan, splats_per_device
 
 Result = TypeVar("Result", bound=PyTree)
 
 
-def filled_like(
-    scene: Scene, plan: Plan, *given: PyTree
-) -> tuple[Scene, Plan, Int[np.ndarray, " lights"]]:
-    """Fill up the splats of a scene to the length of its plan, and the lights of each kind to a
-    power of two, by NumPy and `device_put`, which compile nothing. Where the scene or what is
-    `given` with it is traced, and where splats are cut over devices, everything stays unchanged.
+class Places(NamedTuple):
+    """Where the lights and the Gaussians of a scene are in one that was filled up."""
+
+    lights: Int[np.ndarray, " lights"]
+    gaussians: Int[np.ndarray, " gaussians"]
+
+    def frame(self, frame: Frame) -> Frame:
+        """Leave out what was added."""
+        shadow = rows_at(frame.shadow, self.lights)
+        names = "layers", "weights", "unresolved_fraction"
+        rows = {name: rows_at(getattr(frame, name), self.gaussians) for name in names}
+        return dataclasses.replace(frame, shadow=shadow, **rows)
+
+
+def filled_like(scene: Scene, plan: Plan, *given: PyTree) -> tuple[Scene, Plan, Places]:
+    """Fill up the splats of a scene to the length of its plan, the lights of each kind to a power
+    of two, and the Gaussians, by NumPy and `device_put`, which compile nothing. Where the scene or
+    what is `given` with it is traced, and where splats are cut over devices, everything stays
+    unchanged.
 
     No entry of the plan's order stands for an added splat. An added light has no strength, and the
-    plan leaves out its shadow map. Where a light of the scene consists of several samples, or has
-    no field for its strength, no light is added.
+    plan leaves out its shadow map; an added Gaussian has no weight. Where a light of the scene
+    consists of several samples, or has no field for its strength, no light is added.
 
-    **Returns:** the scene with its lights sorted by kind, its plan, and the place of each light.
+    **Returns:** the scene with its lights sorted by kind, its plan, and where its own are.
     """
-    count, places = scene.splats.count, np.arange(len(scene.lights))
+    count, material = scene.splats.count, scene.material
+    places = Places(np.arange(len(scene.lights)), np.arange(plan.gaussians))
     leaves = jax.tree.leaves((scene, given))
     if plan.mesh is not None or any(isinstance(leaf, Tracer) for leaf in leaves):
         return scene, plan, places
@@ -44,8 +59,9 @@ def filled_like(
         splats = jax.tree.map(lambda leaf: rows_at(leaf, np.arange(len(plan.order))), splats)
     if all(isinstance(light, AbstractLightSample) and light.strength for light in lights):
         groups = lights_by_kind(lights)
-        numbered = [light for group in groups for light in group + _filling(group, len(lights))]
-        places = np.argsort([number for number, _ in numbered], stable=True)[: len(lights)]
+        numbered = [light for group in groups for light in group + fill_lights(group, len(lights))]
+        order = np.argsort([number for number, _ in numbered], stable=True)
+        places = places._replace(lights=order[: len(lights)])
         lights = [light for _, light in numbered]
         # One or two lights of a kind are never filled up, and need no count.
         shadows = tuple(
@@ -54,31 +70,11 @@ def filled_like(
             else shadow
             for group, shadow in zip(groups, shadows, strict=True)
         )
-    filled = dataclasses.replace(plan, shadows=shadows, splats=splats.count)
-    return Scene(splats, lights, scene.material), filled, places
-
-
-def _filling(
-    group: list[tuple[int, AbstractLightSample]], number: int
-) -> list[tuple[int, AbstractLightSample]]:
-    """Repeat the last light of a group, without its strength, up to a power of two."""
-    last = group[-1][1]
-    none = jax.device_put(np.zeros_like(getattr(last, last.strength)))
-    dark = eqx.tree_at(lambda light: getattr(light, light.strength), last, none)
-    return [(number, dark)] * ((1 << (len(group) - 1).bit_length()) - len(group))
-
-
-def rows_at(
-    rows: Shaped[Array, "rows ..."], places: Int[np.ndarray, " places"]
-) -> Shaped[Array, "places ..."]:
-    """Take rows of an array, the last one for places beyond it. Outside `jit` nothing is
-    compiled.
-    """
-    if np.array_equal(places, np.arange(len(rows))):
-        return rows
-    if isinstance(rows, Tracer):
-        return jnp.take(rows, places, axis=0, mode="clip")
-    return jax.device_put(np.take(np.asarray(rows), places, axis=0, mode="clip"))
+    gaussians = fill_gaussians(material.gaussians)
+    material = eqx.tree_at(lambda material: material.gaussians, material, gaussians)
+    counts = {"splats": splats.count, "gaussians": len(gaussians.variances)}
+    filled = dataclasses.replace(plan, shadows=shadows, **counts)
+    return Scene(splats, lights, material), filled, places
 
 
 def on_devices(

@@ -16,7 +16,8 @@ from splatjax.scene import Camera, Frame, Scene
 
 from ._attributes import SurfaceSamples
 from ._checks import in_one_dtype
-from ._devices import filled_like, on_devices, rows_at
+from ._devices import filled_like, on_devices
+from ._filling import rows_at
 from ._lighting import LightAtSplats
 from ._passes import light_splats, see_and_shade
 from ._plan import Plan, RenderSettings, plan_unless_traced
@@ -123,9 +124,9 @@ def picture_jacobian(
     scene, plan, places = filled_like(
         scene, plan_unless_traced(scene, camera, settings, plan), camera
     )
-    jacobian = _picture_jacobian(scene, camera, settings, plan)
-    shadow = rows_at(jacobian.frame.shadow, places)
-    return eqx.tree_at(lambda jacobian: jacobian.frame.shadow, jacobian, shadow)
+    found = _picture_jacobian(scene, camera, settings, plan)
+    rows = (rows_at(each, places.gaussians) for each in (found.weights, found.variances))
+    return PictureJacobian(places.frame(found.frame), *rows)
 
 
 @eqx.filter_jit

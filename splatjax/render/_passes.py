@@ -127,7 +127,7 @@ def diffuse_splats(
     if not derivative:
         diffused = plan.diffusion.diffuse(*given)
         return diffused.layers, None, diffused.needed
-    diffused, differentiated = _diffusion.diffuse_with_derivative(plan.diffusion, *given)
+    diffused, differentiated = plan.diffusion.diffuse_with_derivative(*given)
     return diffused.layers, differentiated.layers, diffused.needed
 
 

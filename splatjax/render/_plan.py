@@ -26,6 +26,7 @@ from splatjax.scene import (
 )
 
 from ._checks import check_scene, in_one_dtype
+from ._filling import arrange, fill_gaussians, fill_up
 from ._lighting import AbstractLighting, LightAtSplats, ShadowPlan, plan_views
 
 
@@ -73,7 +74,7 @@ class Plan(eqx.Module):
     - `interval`: standard deviations per spacing between which a layer becomes resolved.
     - `raster`: the capacity of what the cameras see.
     - `mesh`: the devices that hold the splats; `None` for one. Static.
-    - `splats`: how many it is for. Static.
+    - `splats`, `gaussians`: how many it is for. Static.
     """
 
     order: Int[Array, " places"]
@@ -84,6 +85,7 @@ class Plan(eqx.Module):
     raster: _splatting.AbstractRasterPlan
     mesh: Mesh | None = eqx.field(static=True)
     splats: int = eqx.field(static=True)
+    gaussians: int = eqx.field(static=True)
 
     def specs(self, combination: DeviceMesh) -> "Plan":
         """Specify which arrays every device has whole, and of which it has a share."""
@@ -126,7 +128,8 @@ def make_plan(
     views = [_splatting.PerspectiveView.of(camera) for camera in cameras]
     parts, order, exists = _cut_and_order(scene.splats, mesh)
     bounds, interval = _measure(parts, settings.kernel)
-    variances = scene.material.gaussians.variances
+    gaussians = scene.material.gaussians
+    variances = fill_gaussians(gaussians).variances
     raster = settings.rasterizer.make_plan(parts, views, settings.splatting)
     plan = Plan(
         order=order,
@@ -140,6 +143,7 @@ def make_plan(
         raster=raster.fitted(parts, views, settings.splatting),
         mesh=mesh,
         splats=scene.splats.count,
+        gaussians=len(gaussians.variances),
     )
     if mesh is None:
         return plan
@@ -155,40 +159,19 @@ def splats_per_device(count: int, mesh: Mesh | None) -> tuple[int, int]:
     return devices, max(-(-count // devices), 1)
 
 
-def fill_up(splats: Splats, count: int) -> Splats:
-    """Add splats that are invisible and bring no light, up to `count`."""
-    if splats.count == count:
-        return splats
-    if splats.count == 0:
-        return jax.tree.map(lambda leaf: jnp.zeros((count, *leaf.shape[1:]), leaf.dtype), splats)
-    every = jnp.arange(count, dtype=jnp.int32)
-    return arrange(splats, jnp.minimum(every, splats.count - 1), every < splats.count)
-
-
-def arrange(
-    splats: Splats,
-    order: Int[Array, " places"] | Int[np.ndarray, " places"],
-    exists: Bool[Array, " places"] | Bool[np.ndarray, " places"],
-) -> Splats:
-    """Put a device's splats in the order of a plan; repeated ones are invisible and dark."""
-    placed = jax.tree.map(lambda leaf: leaf[order], splats)
-
-    def masked(leaf):
-        where = np.where if isinstance(leaf, np.ndarray) else jnp.where
-        return where(exists.reshape(-1, *[1] * (leaf.ndim - 1)), leaf, 0)
-
-    return eqx.tree_at(
-        lambda splats: (splats.normals, splats.radii, splats.areas), placed, replace_fn=masked
-    )
-
-
 def check_plan(plan: Plan, scene: Scene, mesh: Mesh | None = None) -> None:
-    """Raise `ValueError` for a plan that was made for other splats or another mesh."""
-    if plan.splats != scene.splats.count:
-        raise ValueError(
-            f"the plan is for {plan.splats} splats, and the scene has {scene.splats.count}; make "
-            "another plan"
-        )
+    """Raise `ValueError` for a plan that was made for other splats, another number of Gaussians,
+    or another mesh.
+    """
+    gaussians = len(scene.material.gaussians.variances)
+    for what, planned, count in (
+        ("splats", plan.splats, scene.splats.count),
+        ("Gaussians", plan.gaussians, gaussians),
+    ):
+        if planned != count:
+            raise ValueError(
+                f"the plan is for {planned} {what}, and the scene has {count}; make another plan"
+            )
     if mesh is not None and plan.mesh != mesh:
         made_for = "one device" if plan.mesh is None else f"{plan.mesh}"
         raise ValueError(
@@ -259,7 +242,7 @@ def _cut_and_order(splats: Splats, mesh: Mesh | None) -> tuple[list[Splats], Arr
     and which of their entries exist, device after device.
     """
     devices, share = splats_per_device(splats.count, mesh)
-    places = rounded_up(share, _diffusion.POINTS_PER_BLOCK, per_octave=16)
+    places = rounded_up(share, _diffusion.POINTS_PER_BLOCK)
     filling = (0, places - share)
     whole = jax.tree.map(np.asarray, fill_up(splats, share * devices))
     parts, orders, exist = [], [], []

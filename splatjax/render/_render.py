@@ -17,7 +17,8 @@ from splatjax.scene import Camera, Frame, Scene, lights_by_kind
 from splatjax.splatting import Bounds
 
 from ._checks import check_channels, in_one_dtype
-from ._devices import filled_like, on_devices, rows_at
+from ._devices import filled_like, on_devices
+from ._filling import rows_at
 from ._lighting import Irradiance, LightAtSplats, cast_shadows, irradiance_at_splats
 from ._passes import SplatLight, diffuse_splats, light_splats, see_and_shade
 from ._plan import (
@@ -62,7 +63,7 @@ def render(
         scene, plan_unless_traced(scene, camera, settings, plan, mesh), camera, light
     )
     frame = _render(scene, camera, settings, plan, light and _fitted(light, scene))
-    return dataclasses.replace(frame, shadow=rows_at(frame.shadow, places))
+    return places.frame(frame)
 
 
 def _fitted(light: SplatLight, scene: Scene) -> SplatLight:

@@ -30,6 +30,7 @@ from splatjax.scene import (
 
 from ._attributes import SurfaceAttributes, SurfaceSamples, stack_rows
 from ._checks import check_channels, in_one_dtype
+from ._filling import fill_up
 from ._lighting import (
     Irradiance,
     LightVisibility,
@@ -38,7 +39,7 @@ from ._lighting import (
     plan_views,
 )
 from ._passes import in_a_row, map_places, sample_surfaces
-from ._plan import RenderSettings, fill_up
+from ._plan import RenderSettings
 from ._shade import compose, shade
 from ._statistics import ReplayableStream, StreamStatistics
 

@@ -43,6 +43,12 @@ class BinCapacity(eqx.Module):
             min(max(with_spare(chunks, -(-grid.half // 4)), grid.half), whole),
         )
 
+    def roomy(self, grid: TileGrid) -> "BinCapacity":
+        """Round up to the next powers of two, and to all chunks."""
+        whole = grid.padded_count // grid.lanes
+        pairs, blocks = (1 << each.bit_length() for each in (self.pairs, self.blocks))
+        return BinCapacity(pairs, blocks, whole)
+
 
 class Bins(eqx.Module):
     """Items per tile. An empty slot holds the number of items, which is no item."""

@@ -101,8 +101,13 @@ class TilePlan(AbstractRasterPlan):
         if len(parts) > 1:
             whole = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
             plan = self.rasterizer.make_plan([whole], views, settings)
-        most = max(int(_tiles_behind(whole, view, settings, plan)) for view in views)
-        step = -(-self.rasterizer.grid(views[0]).half // 8)
+        # With much room, so that other bodies and pictures of the size need no other program.
+        grid = self.rasterizer.grid(views[0])
+        bins = plan.bins.roomy(grid)
+        front = bins.chunks * grid.lanes
+        roomy = TilePlan(self.rasterizer, whole.count, bins, SurfaceCapacity(front, front))
+        most = max(int(_tiles_behind(whole, view, settings, roomy)) for view in views)
+        step = -(-grid.half // 8)
         grain = math.lcm(self.rasterizer.lanes * step, len(parts))
         behind = -(-int(_SPARE * most + 1) // grain) * grain
         return dataclasses.replace(self, places=SurfaceCapacity(self.places.front, behind))

@@ -22,7 +22,6 @@ from splatjax.diffusion import (
     Sources,
     compact_order,
     dense_layer,
-    diffuse_with_derivative,
 )
 from splatjax.scene import Splats
 
@@ -205,7 +204,7 @@ def test_gradients_are_those_of_the_plain_sum_over_the_sources_within_the_suppor
     for found, expected in zip(jax.tree.leaves(d_ours), jax.tree.leaves(d_theirs), strict=True):
         np.testing.assert_allclose(found, expected, atol=GRADIENT * float(jnp.max(abs(expected))))
     _, derivative = jax.jit(
-        lambda *given: diffuse_with_derivative(plan, *given, KERNEL, OneDevice())
+        lambda *given: plan.diffuse_with_derivative(*given, KERNEL, OneDevice())
     )(sources, variances)
     _, expected = jax.jvp(lambda v: within_support(sources, v), (variances,), (variances,))
     scale = GRADIENT * float(jnp.max(jnp.abs(expected)))

@@ -126,6 +126,20 @@ def write_evidence(title: str, world: World, name: str, way: jax.Array, step: fl
     return path
 
 
+@pytest.mark.parametrize("name", ["scene.splats.albedo", "scene.lights.0.intensity"])
+def test_a_gradient_may_be_asked_for_in_one_input_alone(name):
+    """What it is, the other tests show; that the layers' places and widths stay is not an error."""
+    world = WORLDS["lamp and maps"].make()
+    plan = sj.make_plan(world.scene, world.camera, FAST)
+
+    def value(leaf):
+        moved = with_leaf(world, name, leaf)
+        return loss(sj.render(moved.scene, moved.camera, FAST, plan))
+
+    leaf = named(world)[name]
+    assert jax.eval_shape(jax.grad(value), leaf).shape == leaf.shape
+
+
 @pytest.mark.parametrize(("world", "path", "name"), RECORDS)
 def test_gradient_is_that_of_central_differences(world, path, name):
     start, gradient, value = rendered(world, path)

@@ -14,7 +14,7 @@ import splatjax as sj
 from splatjax._combination import OneDevice
 from splatjax.diffusion import POINTS_PER_BLOCK, ClusterDiffuser, Sources, compact_order
 from splatjax.fitting import fit_medium
-from splatjax.render._plan import arrange
+from splatjax.render._filling import arrange
 from splatjax.scattering import measure_laser_dot
 
 EXACT = sj.RenderSettings(diffuser=ClusterDiffuser(error=0.0))
