@@ -84,16 +84,22 @@ def _render(
     return on_devices(passes, scene, plan, camera, placed=light)
 
 
-def illuminate(scene: Scene, plan: Plan, settings: RenderSettings = RenderSettings()) -> SplatLight:
+def illuminate(
+    scene: Scene,
+    plan: Plan,
+    settings: RenderSettings = RenderSettings(),
+    derivative: bool = False,
+) -> SplatLight:
     r"""Light a body and diffuse its light: passes 1 and 4, which no camera changes.
 
-    Give the result to `render` to look at the same body from several sides.
+    Give the result to `render` or `diffusion_basis` to look at the same body from several sides.
 
     **Arguments:**
 
     - `scene`: Differentiable.
     - `plan`: from `splatjax.make_plan`.
     - `settings`: those of the plan.
+    - `derivative`: as for `diffusion_basis`.
 
     **Returns:** the light on the splats, in the order of the plan.
 
@@ -102,16 +108,16 @@ def illuminate(scene: Scene, plan: Plan, settings: RenderSettings = RenderSettin
     """
     check_channels(scene)
     check_plan(plan, scene)
-    return _illuminate(*filled_like(scene, plan), settings)
+    return _illuminate(*filled_like(scene, plan), settings, derivative)
 
 
 @kept_jit
-def _illuminate(scene: Scene, plan: Plan, settings: RenderSettings) -> SplatLight:
+def _illuminate(scene: Scene, plan: Plan, settings: RenderSettings, derivative: bool) -> SplatLight:
     (scene,) = in_one_dtype(scene)
 
     def passes(combination, scene, plan):
         bounds = Bounds.of(scene.splats, combination)
-        return light_splats(scene, settings, plan, combination, bounds)
+        return light_splats(scene, settings, plan, combination, bounds, derivative=derivative)
 
     return on_devices(passes, scene, plan, by_splat=True)
 
