@@ -56,10 +56,11 @@ methods = {
     "deferred splatting": (opaque, baselines.deferred_splatting()),
     "with scattering": (sj.Scene(body, lights, skin), sj.RenderSettings()),
 }
-frames = {
-    name: [sj.render(scene, each, settings) for each in (camera, near)]
-    for name, (scene, settings) in methods.items()
-}
+frames = {}
+for name, (scene, settings) in methods.items():
+    plan = sj.make_plan(scene, (camera, near), settings)
+    light = sj.illuminate(scene, plan, settings)
+    frames[name] = [sj.render(scene, each, settings, plan, light=light) for each in (camera, near)]
 rows = [[frame.beauty for frame in line] for line in zip(*frames.values(), strict=True)]
 plot_pictures(rows, list(frames))
 

@@ -133,6 +133,7 @@ def kept_jit(function: Function) -> Function:
 
 def _compiled(path: Path, function: Callable, arguments: tuple) -> Callable:
     leaves, structure = jax.tree.flatten(arguments)
+    jax.monitoring.record_event("/splatjax/cache/compiling")
 
     # Of a list of arrays: a program that is loaded cannot make records of its arguments.
     of_leaves = jax.jit(lambda leaves: function(*jax.tree.unflatten(structure, leaves)))

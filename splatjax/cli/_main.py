@@ -22,7 +22,7 @@ from ._fit import Fit
 from ._materials import Export, Materials, Sample
 from ._recover import Recover
 from ._render import Render, Turntable
-from ._terminal import note
+from ._terminal import CONSOLE, note
 
 _COMMANDS = {
     "materials": Materials,
@@ -57,6 +57,7 @@ def main(args: Sequence[str] | None = None) -> int:
         with warnings.catch_warnings():
             warnings.showwarning = _show_warning  # ty: ignore[invalid-assignment]
             prepare_jax()
+            CONSOLE.quiet = getattr(command, "quiet", False)
             try:
                 command.run()
                 sys.stdout.flush()

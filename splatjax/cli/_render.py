@@ -13,8 +13,8 @@ import tyro
 
 import splatjax as sj
 
-from ._terminal import check_folder, check_options, check_output, complete, stage
-from ._view import ViewOptions, draw
+from ._terminal import check_folder, check_options, check_output, complete, preview, stage
+from ._view import ViewOptions, draw, rough_picture
 
 _LARGEST = 16_383  # pixels along a side of a WebP file
 _MOST_FRAMES = 10_000  # that four digits can name
@@ -60,10 +60,11 @@ class Render(ViewOptions):
         splats, material = self.load()
         camera = self.camera(lambda: [splats], self.azimuth)
         scene = sj.Scene(splats, self.lights(material, self.azimuth, self.light_azimuth), material)
-        with stage("planning"):
-            plan = sj.make_plan(scene, camera)
-        with stage(f"rendering {splats.count} splats at {self.width} x {self.height}"):
-            return draw(scene, camera, plan), material
+        with preview(lambda side: rough_picture(scene, camera, self.exposure, side)):
+            with stage("planning"):
+                plan = sj.make_plan(scene, camera)
+            with stage(f"rendering {splats.count} splats at {self.width} x {self.height}"):
+                return draw(scene, camera, plan), material
 
     def _streamed(self, path: Path) -> tuple[sj.Frame, sj.Material]:
         file = sj.SplatFile(path, self.stream, up=self.up)

@@ -26,7 +26,7 @@ UpAxis = Literal["y", "z"]
 Rules = dict[str, tuple[bool, str]]
 # Suffixes of drawings.
 FIGURES = (".png", ".pdf", ".svg")
-_CONSOLE = Console(stderr=True, highlight=False, soft_wrap=True)
+CONSOLE = Console(stderr=True, highlight=False, soft_wrap=True)
 
 
 def option_name(field: str) -> str:
@@ -71,7 +71,7 @@ def save_figure(figure: Any, path: Path) -> None:
 
 def note(what: str) -> None:
     """Print something the user should know."""
-    _CONSOLE.print(what, markup=False)
+    CONSOLE.print(what, markup=False)
 
 
 @contextlib.contextmanager
@@ -82,7 +82,7 @@ def stage(what: str, total: int = 0) -> Generator[Callable[..., None]]:
     that changes. Where stderr is no terminal, it prints a line at most once a second.
     """
     begin = last = time.perf_counter()
-    with _CONSOLE.status(what) as status:
+    with CONSOLE.status(what) as status:
 
         def report(done: int, what: str = what) -> None:
             nonlocal last
@@ -90,12 +90,54 @@ def stage(what: str, total: int = 0) -> Generator[Callable[..., None]]:
             left = (now - begin) / done * (total - done)
             line = f"{what}: {done} of {total}, {left:.0f} s left"
             status.update(line)
-            if not _CONSOLE.is_terminal and (done == total or now > last + 1):
+            if not CONSOLE.is_terminal and (done == total or now > last + 1):
                 last = now
                 note(line)
 
         yield report
     note(f"{what}: {time.perf_counter() - begin:.1f} s")
+
+
+# What JAX reports when its cache lacks a small program, and `splatjax.cache` before a picture's.
+_COMPILING = "/jax/compilation_cache/cache_misses", "/splatjax/cache/compiling"
+
+
+@contextlib.contextmanager
+def preview(draw: Callable[[int], list]) -> Generator[None]:
+    """Show a small picture as soon as something is compiled, once, where stderr is a terminal that
+    shows colors. Where all programs are kept, the picture that was asked for comes as soon.
+
+    **Arguments:**
+
+    - `draw`: from the most pixels that a side may have to the picture: an even number of rows of
+      red, green and blue up to 255.
+    """
+    pending = [draw]
+    jax.monitoring.register_event_listener(
+        listen := lambda event, **_: (
+            _show(pending.pop()) if pending and event in _COMPILING else None
+        )
+    )
+    try:
+        yield
+    finally:
+        jax.monitoring.unregister_event_listener(listen)
+
+
+def _show(draw: Callable[[int], list]) -> None:
+    if (
+        CONSOLE.quiet
+        or CONSOLE.no_color
+        or CONSOLE.color_system not in ("256", "truecolor")
+        or not CONSOLE.encoding.startswith("utf")
+        or not CONSOLE.file.isatty()
+    ):
+        return
+    note("a preview, without scattering, shadows and gloss; the picture is being compiled:")
+    pixels = draw(min(64, CONSOLE.width, 2 * CONSOLE.height - 8))  # a character shows two
+    colors = [[f"rgb({red},{green},{blue})" for red, green, blue in row] for row in pixels]
+    for above, below in zip(colors[::2], colors[1::2], strict=True):
+        CONSOLE.print("".join(f"[{a} on {b}]▀[/]" for a, b in zip(above, below, strict=True)))
 
 
 def print_table(rows: Sequence[Sequence[str]]) -> None:

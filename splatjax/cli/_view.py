@@ -19,7 +19,7 @@ from ._terminal import Rules, UpAxis, check_options, note, option_name, stage
 
 # Degrees: the fill stands beside the camera, on the side away from the light.
 _FILL_SIDE, _FILL_ELEVATION = 25.0, 10.0
-_NOT_IN_PICTURES = ("splats", "output", "fps")
+_NOT_IN_PICTURES = ("splats", "output", "fps", "quiet")
 _note_once = functools.cache(note)
 # Lower bounds of the memory needed: what does not fit by these does not fit.
 _BYTES_PER_SPLAT, _BYTES_PER_PIXEL = 1000.0, 500.0
@@ -68,6 +68,8 @@ class ViewOptions:
     scale: float = 1.0
     #: Upward axis of the PLY file.
     up: UpAxis = "y"
+    #: Print nothing but the files that are written, and errors.
+    quiet: bool = False
 
     def check(self, more_rules: Rules | None = None) -> None:
         """Raise `ValueError` for options that break a rule, for a material that no PNG file shows,
@@ -220,6 +222,33 @@ def draw(
             f"the plan's capacity is exceeded: {float(frame.overflow):.2f} times of it is needed"
         )
     return frame
+
+
+def rough_picture(scene: sj.Scene, camera: sj.Camera, exposure: float, side: int) -> list:
+    """Draw the centers of splats, matte and under directional lights, by NumPy alone, which
+    compiles nothing. The longer side has so many pixels at most, fewer for few splats; the height
+    is even. Return rows of red, green and blue up to 255.
+    """
+    scene, camera = jax.device_get((scene, camera))
+    # Of millions of splats some will do.
+    splats = jax.tree.map(lambda leaf: leaf[:: 1 + len(leaf) // 2**19], scene.splats)
+    lengths = np.asarray([camera.width, camera.height])
+    side = max(2, min(side, 0.5 * splats.count**0.5))  # so that few pixels have no splat
+    size = 2 * np.maximum(np.rint(side / 2 * lengths / lengths.max()), 1).astype(int)
+    albedo = 1.0 if splats.albedo is None else splats.albedo
+    color = (albedo * scene.material.gaussians.weights.sum(axis=0) / np.pi) * sum(
+        np.maximum(splats.normals @ -light.direction, 0)[:, None] * light.irradiance
+        for light in scene.lights
+    )
+    local = (splats.centers - camera.position) @ camera.rotation.T
+    # From far to near, without those that face away: nearer ones are drawn over farther ones.
+    order = np.argsort(-local[:, 2])
+    order = order[np.sum(local * (splats.normals @ camera.rotation.T), axis=1)[order] < 0]
+    place = camera.focal_length * size[1] * local[:, :2] / local[:, 2:] + size / 2
+    column, row = np.clip(place, 0, size - 1)[order].astype(int).T
+    picture = np.zeros((size[1], size[0], 3))
+    picture[row, column] = color[order]
+    return np.rint(255 * sj.io.linear_to_srgb(picture * 2.0**exposure)).astype(int).tolist()
 
 
 def direction_to(azimuth: float, elevation: float) -> np.ndarray:

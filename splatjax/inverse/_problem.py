@@ -15,7 +15,14 @@ from jaxtyping import Array, Bool, DTypeLike, Float, Int
 from splatjax.diffusion import resolved_fraction
 from splatjax.fitting import AbstractWeights, GivenVariances, fit_gaussians
 from splatjax.gaussians import AbstractProfile, SumOfGaussians
-from splatjax.render import DiffusionBasis, Plan, RenderSettings, diffusion_basis, make_plan
+from splatjax.render import (
+    DiffusionBasis,
+    Plan,
+    RenderSettings,
+    diffusion_basis,
+    illuminate,
+    make_plan,
+)
 from splatjax.scattering import Medium
 from splatjax.scene import Material, Splats
 
@@ -70,11 +77,26 @@ def render_layers(
     """
 
     def render(plans):
+        # By plan and lights of the pictures: three and more under the same lights are lit once. For
+        # two the compiler takes what it saves.
+        keys = [
+            (id(plan), *(leaf.tobytes() for leaf in jax.tree.leaves(jax.device_get(one.lights))))
+            for one, plan in zip(setups, plans, strict=True)
+        ]
+        lights = {
+            key: illuminate(one.scene(material), plan, settings, derivative)
+            for key, (one, plan) in dict(
+                zip(keys, zip(setups, plans, strict=True), strict=True)
+            ).items()
+            if keys.count(key) > 2
+        }
         return [
             jax.block_until_ready(
-                diffusion_basis(one.scene(material), one.camera, settings, plan, derivative)
+                diffusion_basis(
+                    one.scene(material), one.camera, settings, plan, derivative, lights.get(key)
+                )
             )
-            for one, plan in zip(setups, plans, strict=True)
+            for key, one, plan in zip(keys, setups, plans, strict=True)
         ]
 
     pictures = render(plans) if plans else []

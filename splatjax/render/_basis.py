@@ -15,8 +15,9 @@ from splatjax.splatting import invalid_factor
 from ._checks import in_one_dtype
 from ._devices import filled_like, on_devices
 from ._filling import rows_at
-from ._passes import in_a_row, light_splats, see_and_shade
+from ._passes import SplatLight, in_a_row, light_splats, see_and_shade
 from ._plan import Plan, RenderSettings, plan_unless_traced
+from ._render import fitted
 from ._shade import ShadedSurface
 
 # Fields of `LayersAtPoints` that lie along the points.
@@ -70,6 +71,7 @@ def diffusion_basis(
     settings: RenderSettings = RenderSettings(),
     plan: Plan | None = None,
     derivative: bool = False,
+    light: SplatLight | None = None,
 ) -> DiffusionBasis:
     r"""Render everything that the weights of the material do not change: the picture of all
     materials with its variances.
@@ -82,6 +84,8 @@ def diffusion_basis(
     - `derivative`: also differentiate the layers in their variances, for about one more pass 4. The
       picture then has the derivatives of `picture_jacobian`, by weights and variances that are made
       of anything.
+    - `light`: from `splatjax.illuminate` with the same scene, settings, plan and derivative, for
+      pictures of several cameras.
 
     **Returns:** a `DiffusionBasis`; NaN where the plan does not suffice.
 
@@ -94,9 +98,11 @@ def diffusion_basis(
             "grow; render each material by itself, or give one with single_scattering=None"
         )
     scene, plan, places = filled_like(
-        scene, plan_unless_traced(scene, camera, settings, plan), camera
+        scene, plan_unless_traced(scene, camera, settings, plan), camera, light
     )
-    basis = _diffusion_basis(scene, camera, settings, plan, derivative)
+    basis = _diffusion_basis(
+        scene, camera, settings, plan, derivative, light and fitted(light, scene)
+    )
 
     def of_gaussians(light: LayersAtPoints):
         return light.variances, light.means, light.mass, light.derivative
@@ -108,11 +114,16 @@ def diffusion_basis(
 
 @eqx.filter_jit
 def _diffusion_basis(
-    scene: Scene, camera: Camera, settings: RenderSettings, plan: Plan, derivative: bool
+    scene: Scene,
+    camera: Camera,
+    settings: RenderSettings,
+    plan: Plan,
+    derivative: bool,
+    light: SplatLight | None,
 ) -> DiffusionBasis:
     scene, camera = in_one_dtype(scene, camera)
 
-    def passes(combination, scene, plan, camera):
+    def passes(combination, scene, plan, camera, light=None):
         def read(shaded: ShadedSurface, at: LayersAtPoints, _):
             return (
                 {name: getattr(at, name) for name in _ALONG_POINTS},
@@ -122,10 +133,16 @@ def _diffusion_basis(
 
         light_at = partial(light_splats, scene, settings, plan, combination, derivative=derivative)
         (*rows, specular), visible = see_and_shade(
-            scene, camera, settings, plan, combination, light_at, read
+            scene,
+            camera,
+            settings,
+            plan,
+            combination,
+            light_at if light is None else lambda _, chosen: light.take(chosen),
+            read,
         )
         layers, per_exitance = jax.tree.map(in_a_row, rows)
-        light = LayersAtPoints(
+        basis = LayersAtPoints(
             variances=scene.material.gaussians.variances,
             interval=plan.interval,
             kernel=settings.kernel,
@@ -135,7 +152,7 @@ def _diffusion_basis(
         x, y = jnp.minimum(x, camera.width - 1), jnp.minimum(y, camera.height - 1)
         in_front = jnp.broadcast_to(visible.in_front[:, None], x.shape)
         return DiffusionBasis(
-            light=light,
+            light=basis,
             pixel_radiance_per_exitance=(
                 invalid_factor(visible.needed) * visible.share.reshape(1, -1) * per_exitance
             ),
@@ -146,4 +163,4 @@ def _diffusion_basis(
             overflow=visible.overflow,
         )
 
-    return on_devices(passes, scene, plan, camera)
+    return on_devices(passes, scene, plan, camera, placed=light)

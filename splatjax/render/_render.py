@@ -62,11 +62,11 @@ def render(
     scene, plan, places = filled_like(
         scene, plan_unless_traced(scene, camera, settings, plan, mesh), camera, light
     )
-    frame = _render(scene, camera, settings, plan, light and _fitted(light, scene))
+    frame = _render(scene, camera, settings, plan, light and fitted(light, scene))
     return places.frame(frame)
 
 
-def _fitted(light: SplatLight, scene: Scene) -> SplatLight:
+def fitted(light: SplatLight, scene: Scene) -> SplatLight:
     """Give each kind of lights a row of visibility for every sample that the scene has of it."""
     groups = zip(light.visibility, lights_by_kind(scene.lights), strict=True)
     visibility = [rows if rows is None else rows_at(rows, np.arange(len(g))) for rows, g in groups]
@@ -95,16 +95,22 @@ def _render(
     return on_devices(passes, scene, plan, camera, placed=light)
 
 
-def illuminate(scene: Scene, plan: Plan, settings: RenderSettings = RenderSettings()) -> SplatLight:
+def illuminate(
+    scene: Scene,
+    plan: Plan,
+    settings: RenderSettings = RenderSettings(),
+    derivative: bool = False,
+) -> SplatLight:
     r"""Light a body and diffuse its light: passes 1 and 4, which no camera changes.
 
-    Give the result to `render` to look at the same body from several sides.
+    Give the result to `render` or `diffusion_basis` to look at the same body from several sides.
 
     **Arguments:**
 
     - `scene`: Differentiable.
     - `plan`: from `splatjax.make_plan`.
     - `settings`: those of the plan.
+    - `derivative`: as for `diffusion_basis`.
 
     **Returns:** the light on the splats, in the order of the plan.
 
@@ -114,16 +120,16 @@ def illuminate(scene: Scene, plan: Plan, settings: RenderSettings = RenderSettin
     check_channels(scene)
     check_plan(plan, scene)
     filled, plan, _ = filled_like(scene, plan)
-    return _fitted(_illuminate(filled, plan, settings), scene)
+    return fitted(_illuminate(filled, plan, settings, derivative), scene)
 
 
 @kept_jit
-def _illuminate(scene: Scene, plan: Plan, settings: RenderSettings) -> SplatLight:
+def _illuminate(scene: Scene, plan: Plan, settings: RenderSettings, derivative: bool) -> SplatLight:
     (scene,) = in_one_dtype(scene)
 
     def passes(combination, scene, plan):
         bounds = Bounds.of(scene.splats, combination)
-        return light_splats(scene, settings, plan, combination, bounds)
+        return light_splats(scene, settings, plan, combination, bounds, derivative=derivative)
 
     return on_devices(passes, scene, plan, by_splat=True)
 

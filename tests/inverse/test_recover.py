@@ -3,6 +3,7 @@ known.
 """
 
 from functools import cache, partial
+from unittest import mock
 
 import bodies
 import equinox as eqx
@@ -124,6 +125,20 @@ class TestRecover:
         np.testing.assert_allclose(found.pictures[0][counted], again[counted], rtol=1e-6)
         for made, left, seen in zip(found.pictures, found.residuals, pictures, strict=True):
             np.testing.assert_allclose(left, made - seen, atol=1e-12)
+
+    def test_pictures_from_three_sides_under_one_light_are_lit_once_a_round(self, monkeypatch):
+        illuminate = mock.Mock(wraps=sj.illuminate)
+        monkeypatch.setattr("splatjax.inverse._problem.illuminate", illuminate)
+        scene = sj.Scene(taken()[0], lights()[0], without_noise().material)
+        views = [camera((x, 4.0, 40.0)) for x in (-20.0, 6.0, 20.0)]
+        seen = [
+            sj.inverse.Observation(sj.render(scene, view, PLAIN).beauty, view, lights()[0])
+            for view in views
+        ]
+        start = medium(*STARTS[0])
+        found = sj.inverse.recover(seen, taken()[0], start, count=COUNT, settings=PLAIN)
+        assert np.max(np.abs(errors(found))) < 2 * ROUNDS
+        assert illuminate.call_count == 1 + found.rounds
 
     def test_noise_stays_within_the_error_bars_and_compiles_nothing(self, compiled):
         truth, bars = taken()[1], []
