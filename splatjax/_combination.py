@@ -10,7 +10,6 @@ from typing import TypeVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.lax import stop_gradient
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float, PyTree, Shaped
 
@@ -66,7 +65,7 @@ class OneDevice(AbstractCombination):
 
     def largest(self, partials):
         (whole,) = partials
-        return jax.tree.map(stop_gradient, whole)
+        return jax.tree.map(jax.lax.stop_gradient, whole)
 
 
 class DeviceMesh(AbstractCombination):
@@ -92,7 +91,7 @@ class DeviceMesh(AbstractCombination):
 
     def largest(self, partials):
         (own,) = partials
-        return jax.tree.map(lambda leaf: jax.lax.pmax(stop_gradient(leaf), self.axes), own)
+        return jax.tree.map(lambda leaf: jax.lax.pmax(jax.lax.stop_gradient(leaf), self.axes), own)
 
     def own_share(self, rows):
         return jax.lax.psum_scatter(rows, self.axes, scatter_dimension=0, tiled=True)
@@ -140,7 +139,7 @@ def extreme(
         jnp.sum(equal, axis=0).astype(values.dtype),
     )
     total, count = combination.total([sums])
-    return largest + total / count - stop_gradient(total / count)
+    return largest + total / count - jax.lax.stop_gradient(total / count)
 
 
 def lay_out(mesh: Mesh, trees: Partial, specs: Partial) -> Partial:

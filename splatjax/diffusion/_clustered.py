@@ -8,7 +8,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.lax import stop_gradient
 from jaxtyping import Array, Float, Int
 
 from splatjax._chunking import take_points
@@ -158,7 +157,7 @@ class ClusterPlan(AbstractDiffusionPlan):
     ) -> Diffused:
         # Every device gathers the sources of all, and evaluates the layers at its own splats.
         everywhere = combination.gather_last(sources)
-        origin = stop_gradient(jnp.mean(everywhere.centers, axis=1))[:, None]
+        origin = jax.lax.stop_gradient(jnp.mean(everywhere.centers, axis=1))[:, None]
         centered = dataclasses.replace(everywhere, centers=everywhere.centers - origin)
         points = sources.centers - origin
         own = variances.at[self.gaussians].get(mode="fill", fill_value=1)
@@ -188,7 +187,7 @@ class ClusterPlan(AbstractDiffusionPlan):
 
         # What is needed of the plan.
         around = _target_boxes(points, sources.areas), source_boxes(below)
-        reaches = jnp.sqrt(2 * self.kernels.largest * stop_gradient(own))
+        reaches = jnp.sqrt(2 * self.kernels.largest * jax.lax.stop_gradient(own))
         planned = self.variances[: len(variances)]
         factors = jnp.maximum(planned / variances, variances / planned)
         varied = jnp.max(factors, initial=0) / (self.margin * (1 + 1e-6))

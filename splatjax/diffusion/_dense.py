@@ -4,7 +4,6 @@ derivative.
 
 import jax
 import jax.numpy as jnp
-from jax.lax import stop_gradient
 from jaxtyping import Array, Float, Int
 
 from splatjax._chunking import map_chunks, take_points
@@ -76,7 +75,7 @@ def dense_layer(
         squared = jnp.sum(offset * offset, axis=0)
         # Weigh the sources, A_j G(v, |x - q_j|), but for a factor per point, which the means do not
         # notice: the exponent of the nearest source is zero.
-        nearest = stop_gradient(jnp.min(squared, axis=1, keepdims=True))
+        nearest = jax.lax.stop_gradient(jnp.min(squared, axis=1, keepdims=True))
         weight = sources.areas[None] * jnp.exp(-0.5 * (squared - nearest) / variance)
         # Sum light and mass, and their first moments about the point; divide them.
         light = jnp.concatenate([sources.irradiance, jnp.ones_like(sources.areas)[None]])

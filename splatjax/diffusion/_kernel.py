@@ -9,7 +9,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.lax import stop_gradient
 from jaxtyping import Array, Float
 
 from splatjax._smooth import smooth_step
@@ -235,13 +234,13 @@ def unevenness(splats: Splats) -> Float[Array, ""]:
     if splats.count < 2:
         return jnp.zeros((), splats.centers.dtype)
     sampled = jnp.linspace(0, splats.count - 1, min(_SAMPLE, splats.count)).astype(jnp.int32)
-    centers = stop_gradient(splats.centers).T
+    centers = jax.lax.stop_gradient(splats.centers).T
 
     def nearest(i):
         offset = centers - centers[:, i][:, None]
         squared = jnp.where(splats.areas > 0, jnp.sum(offset * offset, axis=0), jnp.inf)
         squared = squared.at[i].set(jnp.inf)
-        return jnp.sqrt(jnp.min(squared) / stop_gradient(splats.areas[i]))
+        return jnp.sqrt(jnp.min(squared) / jax.lax.stop_gradient(splats.areas[i]))
 
     distance = jax.lax.map(nearest, sampled)
     counts = jnp.isfinite(distance)

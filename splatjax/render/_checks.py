@@ -7,7 +7,6 @@ from collections.abc import Iterator
 import equinox as eqx
 import jax
 import numpy as np
-from jax.core import Tracer
 
 from splatjax._memory import check_memory
 from splatjax.scene import Camera, Scene, Splats
@@ -42,7 +41,7 @@ def check_scene(scene: Scene, camera: Camera, is_lit: bool = True) -> None:
     """
     check_channels(scene)
     leaves = [leaf for leaf in jax.tree.leaves((scene, camera)) if isinstance(leaf, jax.Array)]
-    if any(isinstance(leaf, Tracer) or not leaf.is_fully_addressable for leaf in leaves):
+    if any(isinstance(leaf, jax.core.Tracer) or not leaf.is_fully_addressable for leaf in leaves):
         return
     count, pixels = scene.splats.count, camera.width * camera.height
     check_memory(

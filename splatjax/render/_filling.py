@@ -6,7 +6,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Bool, Int, Shaped
 
 from splatjax.gaussians import SumOfGaussians
@@ -55,7 +54,7 @@ def rows_at(
     """
     if np.array_equal(places, np.arange(len(rows))):
         return rows
-    if isinstance(rows, Tracer):
+    if isinstance(rows, jax.core.Tracer):
         return jnp.take(rows, places, axis=0, mode="clip")
     return jax.device_put(np.take(np.asarray(rows), places, axis=0, mode="clip"))
 

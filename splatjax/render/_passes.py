@@ -11,7 +11,6 @@ from typing import TypeVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.lax import stop_gradient
 from jaxtyping import Array, Float, Int, PyTree, Shaped
 
 from splatjax import diffusion as _diffusion, splatting as _splatting
@@ -161,7 +160,7 @@ def see_and_shade(
     shown = Scene(splats, scene.lights, scene.material)
     visibility = LightVisibility(groups, light.visibility, light.needed)
     attributes = settings.lighting.attributes(shown, visibility, light.irradiance)
-    origin = stop_gradient(bounds.center)[:, None]
+    origin = jax.lax.stop_gradient(bounds.center)[:, None]
     attributes = attributes.with_layers(
         light.layers, light.derivative, light.added_source, splats.centers.T - origin
     )

@@ -7,7 +7,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jax.experimental.multihost_utils import process_allgather
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Bool, Float, Int, PyTree
@@ -197,7 +196,7 @@ def plan_unless_traced(
     if plan is not None:
         check_plan(plan, scene, mesh)
         return plan
-    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((scene, camera))):
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((scene, camera))):
         raise ValueError(
             "plan is None, and under jit, grad or vmap a plan is needed: make one outside, "
             "plan=splatjax.make_plan(scene, camera, settings)"

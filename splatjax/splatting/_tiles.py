@@ -8,7 +8,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.lax import stop_gradient
 from jaxtyping import Array, Float, Int
 
 from splatjax._chunking import map_chunks, needed_over_planned, with_spare
@@ -154,7 +153,7 @@ class TilePlan(AbstractRasterPlan):
         return (
             Sweep(type(view), grid, settings.full_coverage, settings.filter_radius),
             bin_items(footprints.ranges(grid), grid, self.bins),
-            stop_gradient(footprints.shift),
+            jax.lax.stop_gradient(footprints.shift),
             tuple(getattr(footprints, name) for name in PLANES),
             attributes.T,
         )
