@@ -47,12 +47,8 @@ class AbstractCombination(eqx.Module):
         """Keep this device's share of rows that are the same on all devices."""
         return rows
 
-    def gather(self, share: Partial) -> Partial:
-        """Concatenate the shares of all devices along the first axis. Differentiable."""
-        return share
-
-    def gather_last(self, share: Partial) -> Partial:
-        """Concatenate the shares of all devices along the last axis. Differentiable."""
+    def gather(self, share: Partial, axis: int = 0) -> Partial:
+        """Concatenate the shares of all devices along an axis. Differentiable."""
         return share
 
 
@@ -100,14 +96,11 @@ class DeviceMesh(AbstractCombination):
         share = rows.shape[0] // self.count
         return jax.lax.dynamic_slice_in_dim(rows, jax.lax.axis_index(self.axes) * share, share)
 
-    def gather(self, share):
+    def gather(self, share, axis=0):
         return jax.tree.map(
-            lambda rows: jax.lax.all_gather(rows, self.axes, axis=0, tiled=True), share
+            lambda rows: jax.lax.all_gather(rows, self.axes, axis=axis % rows.ndim, tiled=True),
+            share,
         )
-
-    def gather_last(self, share):
-        turned = jax.tree.map(lambda rows: jnp.moveaxis(rows, -1, 0), share)
-        return jax.tree.map(lambda rows: jnp.moveaxis(rows, 0, -1), self.gather(turned))
 
 
 class PartByPart(AbstractCombination):

@@ -24,6 +24,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, DTypeLike
 
@@ -147,7 +148,7 @@ def check_values(
     **Raises:** `ValueError` with the number, or how many entries fail and the first of them.
     """
     kinds = jax.Array | np.ndarray | np.number | int | float
-    is_known = isinstance(values, kinds) and not isinstance(values, jax.core.Tracer)
+    is_known = isinstance(values, kinds) and not isinstance(values, Tracer)
     if not is_known or not np.size(values) or not getattr(values, "is_fully_addressable", True):
         return
 

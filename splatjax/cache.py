@@ -26,6 +26,7 @@ from typing import Any, TypeVar, cast
 import equinox as eqx
 import jax
 import jaxlib
+from jax.core import Tracer
 from jax.experimental.serialize_executable import deserialize_and_load, serialize
 from jax.tree_util import PyTreeDef
 
@@ -159,7 +160,7 @@ def _path(function: Any, arguments: Any, *, by_values: bool) -> Path | None:
         _folder is None
         or not jax.config.jax_enable_compilation_cache  # ty: ignore[missing-attribute]
         or len(arrays) + len(numbers) < len(leaves)
-        or any(isinstance(array, jax.core.Tracer) for array in arrays)
+        or any(isinstance(array, Tracer) for array in arrays)
         or len(devices := {device for array in arrays for device in array.devices()}) > 1
         or not all(kind.startswith(("builtins.", "splatjax.")) for kind in _kinds(structure))
         or "<" in str(structure)  # a static function or object, which its text does not describe

@@ -133,7 +133,6 @@ class ClusterPlan(AbstractDiffusionPlan):
       mode. Static.
     """
 
-    gaussians: Int[Array, " layers"]
     sources: LayerSources
     kernels: TruncatedGaussian
     neighbors: Neighbors
@@ -156,7 +155,7 @@ class ClusterPlan(AbstractDiffusionPlan):
         at: Int[Array, " points"] | None = None,
     ) -> Diffused:
         # Every device gathers the sources of all, and evaluates the layers at its own splats.
-        everywhere = combination.gather_last(sources)
+        everywhere = combination.gather(sources, axis=-1)
         origin = jax.lax.stop_gradient(jnp.mean(everywhere.centers, axis=1))[:, None]
         centered = dataclasses.replace(everywhere, centers=everywhere.centers - origin)
         points = sources.centers - origin
@@ -165,7 +164,8 @@ class ClusterPlan(AbstractDiffusionPlan):
 
         # Sink the sources and merge them; sum over those near each block of points.
         below = self.sources.merged(centered, depths)
-        wanted, lists = _wanted(at, points.shape[1]), self.neighbors.lists
+        wanted = Wanted.of(at, points.shape[1] // POINTS_PER_BLOCK, POINTS_PER_BLOCK)
+        lists = self.neighbors.lists
         if at is not None:
             lists = lists.only(jnp.any(wanted.ranks < wanted.count, axis=1))
         sums = gaussian_sums(
@@ -193,16 +193,6 @@ class ClusterPlan(AbstractDiffusionPlan):
         varied = jnp.max(factors, initial=0) / (self.margin * (1 + 1e-6))
         needed = jnp.maximum(varied, self.neighbors.needed(*around, reaches))
         return Diffused(layers, combination.largest([needed.astype(variances.dtype)]))
-
-
-def _wanted(at: Int[Array, " points"] | None, count: int) -> Wanted:
-    every = jnp.arange(count, dtype=jnp.int32)
-    if at is not None:
-        every, count = (
-            jnp.full_like(every, len(at)).at[at].set(every[: len(at)], mode="drop"),
-            len(at),
-        )
-    return Wanted(every.reshape(-1, POINTS_PER_BLOCK), count)
 
 
 def in_units(

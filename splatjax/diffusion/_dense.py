@@ -32,8 +32,6 @@ class DenseDiffuser(AbstractDiffuser):
 class DensePlan(AbstractDiffusionPlan):
     """What the plain diffuser needs to know: how many layers there are."""
 
-    gaussians: Int[Array, " layers"]
-
     def diffuse(
         self,
         sources: Sources,
@@ -42,7 +40,7 @@ class DensePlan(AbstractDiffusionPlan):
         combination: AbstractCombination,
         at: Int[Array, " points"] | None = None,
     ) -> Diffused:
-        everywhere = combination.gather_last(sources)
+        everywhere = combination.gather(sources, axis=-1)
         points = sources.centers if at is None else take_points(sources.centers, at)
         layers = dense_layers(everywhere, points, variances, kernel)
         return Diffused(layers, jnp.zeros((), sources.centers.dtype))

@@ -59,7 +59,7 @@ class AbstractDiffusionPlan(eqx.Module):
       fills up. Others are too narrow for nearly all splats.
     """
 
-    gaussians: eqx.AbstractVar[Int[Array, " layers"]]
+    gaussians: Int[Array, " layers"]
 
     @abc.abstractmethod
     def diffuse(

@@ -108,9 +108,9 @@ class AbstractDiffusionKernel(eqx.Module):
       and is fully resolved, on a regular grid and for scattered splats.
     """
 
-    depth: eqx.AbstractVar[float]
-    regular: eqx.AbstractVar[tuple[float, float]]
-    scattered: eqx.AbstractVar[tuple[float, float]]
+    depth: float = eqx.field(static=True, default=0.0)
+    regular: tuple[float, float] = eqx.field(static=True, default=(0.4, 0.8))
+    scattered: tuple[float, float] = eqx.field(static=True, default=(1.0, 2.0))
 
     def depths(self, variances: Float[Array, " gaussians"]) -> Float[Array, " gaussians"]:
         """Compute how far below its splat the source of each layer lies, mm."""
@@ -161,10 +161,6 @@ class PlainMean(AbstractDiffusionKernel):
     **Source:** Kim et al. 2010, section 4.2.
     """
 
-    depth: float = eqx.field(static=True, default=0.0)
-    regular: tuple[float, float] = eqx.field(static=True, default=(0.4, 0.8))
-    scattered: tuple[float, float] = eqx.field(static=True, default=(1.0, 2.0))
-
     def gain(self, mass, variances, energies, single_scattering_albedo):
         return jnp.ones_like(mass)
 
@@ -193,8 +189,6 @@ class EscapeNormalization(AbstractDiffusionKernel):
     """
 
     depth: float = eqx.field(static=True, default=0.75)
-    regular: tuple[float, float] = eqx.field(static=True, default=(0.4, 0.8))
-    scattered: tuple[float, float] = eqx.field(static=True, default=(1.0, 2.0))
 
     def gain(self, mass, variances, energies, single_scattering_albedo):
         energies = jnp.where(energies >= 0, energies, 0.0)

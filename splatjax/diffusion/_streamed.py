@@ -101,7 +101,7 @@ class StreamedDiffusion:
         exists = np.asarray(sources.areas) > 0
         clusters = LayerSources.build(*arrays, exists, self.edges, self.source_capacity)
         self.source_capacity = max(self.source_capacity, clusters.count)
-        below = _merge(clusters, sources, self.depths)
+        below = clusters.merged(sources, self.depths)
         around, layers = source_boxes(below), np.asarray(clusters.layers)
         lists = find_neighbors(self.boxes, around, layers, self.reaches, least=self.list_capacity)
         self.list_capacity = len(lists.rows)
@@ -109,16 +109,9 @@ class StreamedDiffusion:
 
 
 @eqx.filter_jit
-def _merge(clusters: LayerSources, sources: Sources, depths) -> SunkSources:
-    return clusters.merged(sources, depths)
-
-
-@eqx.filter_jit
 def _sum(points, below: SunkSources, clusters: LayerSources, variances, kernels, lists: Lists):
     table = source_table(below, variances, clusters.layers, moments=False)
-    blocks, _, block = points.shape
-    every = jnp.arange(blocks * block, dtype=jnp.int32).reshape(blocks, block)
-    wanted = Wanted(every, blocks * block)
+    wanted = Wanted.of(None, points.shape[0], points.shape[2])
     return gaussian_sums(in_units(points, variances), table, lists, kernels, wanted)
 
 

@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from splatjax._chunking import jit_unless_traced
@@ -46,7 +47,7 @@ class ErrorByCount(eqx.Module):
         **Raises:** `ValueError` if no number suffices, and inside `jit`, where the answer depends
         on values.
         """
-        if isinstance(self.error, jax.core.Tracer):
+        if isinstance(self.error, Tracer):
             raise ValueError(
                 "the least number of Gaussians depends on values; find it outside of jit and vmap"
             )

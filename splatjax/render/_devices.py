@@ -10,6 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Float, Int, PyTree
 
@@ -51,7 +52,7 @@ def filled_like(scene: Scene, plan: Plan, *given: PyTree) -> tuple[Scene, Plan, 
     count, material = scene.splats.count, scene.material
     places = Places(np.arange(len(scene.lights)), np.arange(plan.gaussians))
     leaves = jax.tree.leaves((scene, given))
-    if plan.mesh is not None or any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
+    if plan.mesh is not None or any(isinstance(leaf, Tracer) for leaf in leaves):
         return scene, plan, places
     splats, lights, shadows = scene.splats, scene.lights, plan.shadows
     if 0 < count < len(plan.order):

@@ -6,6 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Int, Shaped
 
 from splatjax.gaussians import SumOfGaussians
@@ -16,10 +17,7 @@ def fill_up(splats: Splats, count: int) -> Splats:
     """Add splats that are invisible and bring no light, up to `count`."""
     if splats.count == count:
         return splats
-    if splats.count == 0:
-        return jax.tree.map(lambda leaf: jnp.zeros((count, *leaf.shape[1:]), leaf.dtype), splats)
-    every = jnp.arange(count, dtype=jnp.int32)
-    return arrange(splats, jnp.minimum(every, splats.count - 1), every < splats.count)
+    return splats.take(jnp.arange(count, dtype=jnp.int32))
 
 
 def fill_gaussians(gaussians: SumOfGaussians) -> SumOfGaussians:
@@ -54,7 +52,7 @@ def rows_at(
     """
     if np.array_equal(places, np.arange(len(rows))):
         return rows
-    if isinstance(rows, jax.core.Tracer):
+    if isinstance(rows, Tracer):
         return jnp.take(rows, places, axis=0, mode="clip")
     return jax.device_put(np.take(np.asarray(rows), places, axis=0, mode="clip"))
 

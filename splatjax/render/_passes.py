@@ -6,7 +6,6 @@ splatting, diffusion and shading.
 import dataclasses
 from collections.abc import Callable
 from functools import partial
-from typing import TypeVar
 
 import equinox as eqx
 import jax
@@ -14,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PyTree, Shaped
 
 from splatjax import diffusion as _diffusion, splatting as _splatting
-from splatjax._chunking import map_chunks, take_points
+from splatjax._chunking import Result, map_chunks, take_points
 from splatjax._combination import AbstractCombination
 from splatjax.scene import Camera, Scene, stack_lights
 
@@ -22,8 +21,6 @@ from ._attributes import SurfaceAttributes, SurfaceSamples, split_rows, stack_ro
 from ._lighting import Irradiance, LightVisibility, cast_shadows, irradiance_at_splats
 from ._plan import Plan, RenderSettings
 from ._shade import ShadedSurface, shade
-
-Values = TypeVar("Values", bound=PyTree)
 
 
 class SplatLight(eqx.Module):
@@ -137,8 +134,8 @@ def see_and_shade(
     plan: Plan,
     combination: AbstractCombination,
     light_at: Callable[[_splatting.Bounds, Int[Array, " chosen"]], SplatLight],
-    read: Callable[[ShadedSurface, _diffusion.LayersAtPoints, SurfaceSamples], Values],
-) -> tuple[Values, _splatting.VisibleSurfaces]:
+    read: Callable[[ShadedSurface, _diffusion.LayersAtPoints, SurfaceSamples], Result],
+) -> tuple[Result, _splatting.VisibleSurfaces]:
     """Light the splats, see them, shade what is seen, and read what a picture needs: all passes.
 
     **Arguments:**
@@ -172,7 +169,7 @@ def see_and_shade(
     visible = dataclasses.replace(visible, needed=jnp.maximum(needed, visible.needed))
 
     # Pass 5: shade the points that are seen.
-    def shade_and_read(samples: SurfaceSamples) -> Values:
+    def shade_and_read(samples: SurfaceSamples) -> Result:
         samples = jax.tree.map(in_a_row, samples)
         planned = plan.diffusion.gaussians, plan.interval
         shaded, layers = shade(scene, view.position, groups, samples, *planned, settings)
@@ -181,7 +178,7 @@ def see_and_shade(
     sample = partial(sample_surfaces, visible, attributes, origin)
 
     # Apart, so that samples are materialized, and in large chunks, so that few of them are.
-    def sample_and_read(sums, tiles) -> Values:
+    def sample_and_read(sums, tiles) -> Result:
         return map_places(shade_and_read, map_places(sample, sums, tiles))
 
     at_once = 2 * _splatting.TILES_AT_ONCE
@@ -229,7 +226,7 @@ def sample_surfaces(
     )
 
 
-def map_places(function: Callable[..., Values], *given: PyTree) -> Values:
+def map_places(function: Callable[..., Result], *given: PyTree) -> Result:
     """Apply a pointwise function to chunks of places.
 
     **Arguments:**

@@ -1,18 +1,18 @@
 """How a picture is made, and what `jit`, `grad` and loops need to know of shapes, found once."""
 
 from collections.abc import Sequence
-from typing import TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jax.experimental.multihost_utils import process_allgather
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, Int
 
 from splatjax import diffusion as _diffusion, splatting as _splatting
-from splatjax._chunking import rounded_up
+from splatjax._chunking import Result, rounded_up
 from splatjax._combination import DeviceMesh, OneDevice
 from splatjax.cache import kept
 from splatjax.scene import (
@@ -50,9 +50,6 @@ class RenderSettings(eqx.Module):
     rasterizer: _splatting.AbstractRasterizer = _splatting.TileRasterizer()
     diffuser: _diffusion.AbstractDiffuser = _diffusion.ClusterDiffuser()
     lighting: AbstractLighting = LightAtSplats()
-
-
-Whole = TypeVar("Whole", bound=PyTree)
 
 
 class Plan(eqx.Module):
@@ -196,7 +193,7 @@ def plan_unless_traced(
     if plan is not None:
         check_plan(plan, scene, mesh)
         return plan
-    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((scene, camera))):
+    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((scene, camera))):
         raise ValueError(
             "plan is None, and under jit, grad or vmap a plan is needed: make one outside, "
             "plan=splatjax.make_plan(scene, camera, settings)"
@@ -222,7 +219,7 @@ def _check(scenes: list[Scene], cameras: list[Camera]) -> None:
             )
 
 
-def _on_one_device(tree: Whole) -> Whole:
+def _on_one_device(tree: Result) -> Result:
     """Gather what may lie on several devices, and on those of several processes, for planning."""
 
     def gathered(leaf):

@@ -13,7 +13,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from splatjax import diffusion as _diffusion, splatting as _splatting
-from splatjax._chunking import take_points
 from splatjax._combination import PartByPart
 from splatjax.scene import (
     AbstractLight,
@@ -207,19 +206,12 @@ def _sum_views(
         for scene in scenes(task):
             attributes = rows(scene)
             yield [
-                _part_sweep(plan, scene.splats, attributes, view, splatting)
+                plan.part_sweep(scene.splats, attributes, view, splatting)
                 for plan, view in zip(plans, views, strict=True)
             ]
 
     summed = _splatting.sum_parts(parts, [plan.places for plan in plans], PartByPart())
     return [sums for sums, _ in summed]
-
-
-@eqx.filter_jit
-def _part_sweep(plan: _splatting.TilePlan, splats: Splats, attributes, view, splatting):
-    chosen, _ = plan.choose(splats, view)
-    attributes = take_points(attributes, chosen)
-    return plan.part_sweep(splats.take(chosen), attributes, view, splatting)
 
 
 @eqx.filter_jit

@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
 from splatjax._chunking import take_points
@@ -81,7 +82,7 @@ class Camera(eqx.Module):
         points = as_floats([eye, target, up], name="eye, target and up")
         eye, target, up = points
         forward = target - eye
-        if not isinstance(points, jax.core.Tracer):
+        if not isinstance(points, Tracer):
             known, way = np.asarray(points, np.float64), np.asarray(forward, np.float64)
             check_values(
                 "eye, target and up",

@@ -104,13 +104,12 @@ class TileGrid(eqx.Module):
 
 
 class TileRanges(eqx.Module):
-    """The rectangle of tiles that each item touches."""
+    """The rectangle of tiles that each item touches; `down` is 0 for an item that touches none."""
 
     left: Int[Array, " items"]
     top: Int[Array, " items"]
     across: Int[Array, " items"]
     down: Int[Array, " items"]
-    """0 for an item that touches none."""
 
     @classmethod
     def of(

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from splatjax._chunking import map_chunks, needed_over_planned, with_spare
+from splatjax._chunking import map_chunks, needed_over_planned, take_points, with_spare
 from splatjax._combination import AbstractCombination, OneDevice
 from splatjax.scene import Splats
 
@@ -133,6 +133,7 @@ class TilePlan(AbstractRasterPlan):
         sweep, *binned = self._bin(splats, attributes, view, settings)
         return sum_tile_fragments(sweep, self.places, combination, *binned)
 
+    @eqx.filter_jit
     def part_sweep(
         self,
         splats: Splats,
@@ -140,8 +141,12 @@ class TilePlan(AbstractRasterPlan):
         view: AbstractView,
         settings: SplattingSettings,
     ) -> PartSweep:
-        """Prepare the stages of the sweep for one of several parts of the splats."""
-        sweep, bins, *binned = self._bin(splats, attributes, view, settings)
+        """Prepare the stages of the sweep for those of one of several parts of the splats that the
+        view may see.
+        """
+        chosen, _ = self.choose(splats, view)
+        seen = splats.take(chosen), take_points(attributes, chosen)
+        sweep, bins, *binned = self._bin(*seen, view, settings)
         return PartSweep(sweep, bins, Slots.gathered(*binned, bins))
 
     def _bin(self, splats: Splats, attributes, view: AbstractView, settings: SplattingSettings):

@@ -6,6 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float, Int, Key
 
 from splatjax._records import Numbers, as_floats, check_values
@@ -87,7 +88,7 @@ class LayeredMedia(eqx.Module):
         Under `jit` values are unknown, and each channel has its own walk.
         """
         geometry = (self.sigma_s, self.thickness, self.eta)
-        if any(isinstance(values, jax.core.Tracer) for values in geometry):
+        if any(isinstance(values, Tracer) for values in geometry):
             return [np.asarray([channel]) for channel in range(self.sigma_a.shape[1])]
         sigma_s, thickness, eta = (np.asarray(values) for values in geometry)
         unit = 1 / sigma_s[self.first]

@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
 from splatjax._chunking import jit_unless_traced
@@ -79,7 +80,7 @@ def finish(walk: Walk, progress: Callable[[int, int], None] | None) -> Tally:
     in between.
     """
     state = _start(walk)
-    if isinstance(state.started, jax.core.Tracer):
+    if isinstance(state.started, Tracer):
         return jax.lax.while_loop(
             lambda state: state.unfinished(walk), lambda state: _round(walk, state), state
         ).tally
