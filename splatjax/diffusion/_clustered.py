@@ -129,8 +129,6 @@ class ClusterPlan(AbstractDiffusionPlan):
     - `kernels`: of every layer.
     - `variances`, `margin`: the plan serves variances within this factor of these, mm^2, or of the
       first of them.
-    - `forward_mode`: whether the layers are differentiable in forward mode, and not in reverse
-      mode. Static.
     """
 
     sources: LayerSources
@@ -138,13 +136,9 @@ class ClusterPlan(AbstractDiffusionPlan):
     neighbors: Neighbors
     variances: Float[Array, " gaussians"]
     margin: Float[Array, ""]
-    forward_mode: bool = eqx.field(static=True, default=False)
 
     def shares(self):
         return tuple(jax.tree.leaves((self.neighbors.lists, self.neighbors.points)))
-
-    def in_forward_mode(self):
-        return dataclasses.replace(self, forward_mode=True)
 
     def diffuse(
         self,
