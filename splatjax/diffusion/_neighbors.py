@@ -158,7 +158,7 @@ def find_neighbors(
 
     def search(part: tuple, layer: int):
         """Find the pairs of a block of a part and a block of sources."""
-        of, near = _pairs_in_reach(part, (low[own[layer]], high[own[layer]]), reaches[layer])
+        of, near = pairs_in_reach(part, (low[own[layer]], high[own[layer]]), reaches[layer])
         return of, own[layer][near]
 
     # Only NumPy computes in the threads, since JAX's precision may be set for one thread.
@@ -218,7 +218,7 @@ def _levels(corners: tuple, depth: int) -> list[tuple[np.ndarray, np.ndarray]]:
     return levels
 
 
-def _pairs_in_reach(points: tuple, sources: tuple, reach: float) -> tuple[np.ndarray, np.ndarray]:
+def pairs_in_reach(points: tuple, sources: tuple, reach: float) -> tuple[np.ndarray, np.ndarray]:
     """Find the pairs of boxes, given by their corners, that are in reach of each other, from coarse
     to fine.
     """

@@ -23,7 +23,7 @@ from ._clusters import LayerSources, SunkSources, compact_order
 from ._diffuser import Sources, divide_by_mass
 from ._gaussian_sums import FAR, Wanted, gaussian_sums
 from ._kernel import AbstractDiffusionKernel, TruncatedGaussian
-from ._neighbors import Boxes, Lists, find_neighbors
+from ._neighbors import Boxes, Lists, find_neighbors, pairs_in_reach
 
 
 class StreamedDiffusion:
@@ -84,15 +84,13 @@ class StreamedDiffusion:
 
     def _in_reach(self, sources: Sources) -> bool:
         """Test whether a part may bring anything to any point, by boxes."""
-        centers, exists = np.asarray(sources.centers), np.asarray(sources.areas) > 0
-        if not exists.any():
-            return False
-        low, high = centers[:, exists].min(axis=1), centers[:, exists].max(axis=1)
-        own_low, own_high = np.asarray(self.boxes.low), np.asarray(self.boxes.high)
-        gaps = np.maximum(np.maximum(own_low - high, low - own_high), 0)
+        around = Boxes.around(sources.centers, sources.areas > 0, len(sources.areas))
         # Sources lie below their splats.
         reach = np.max(self.reaches + np.asarray(self.depths, np.float64))
-        return bool(np.any(np.sum(gaps * gaps, axis=1) <= reach**2))
+        corners = (
+            (np.asarray(boxes.low), np.asarray(boxes.high)) for boxes in (self.boxes, around)
+        )
+        return len(pairs_in_reach(*corners, reach)[0]) > 0
 
     def _sum_part(self, sources: Sources) -> Float[Array, "layers values points"]:
         order = compact_order(np.asarray(sources.centers.T))

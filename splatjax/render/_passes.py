@@ -158,8 +158,13 @@ def see_and_shade(
     visibility = LightVisibility(groups, light.visibility, light.needed)
     attributes = settings.lighting.attributes(shown, visibility, light.irradiance)
     origin = jax.lax.stop_gradient(bounds.center)[:, None]
-    attributes = attributes.with_layers(
-        light.layers, light.derivative, light.added_source, splats.centers.T - origin
+    centers = splats.centers.T - origin
+    attributes = dataclasses.replace(
+        attributes,
+        centers=centers,
+        layers=_diffusion.continue_from_splats(light.layers, centers),
+        derivative=light.derivative and _diffusion.continue_from_splats(light.derivative, centers),
+        added_source=light.added_source,
     )
     visible = _splatting.visible_surfaces(
         splats, stack_rows(attributes), view, settings.splatting, plan.raster, combination
@@ -217,7 +222,7 @@ def sample_surfaces(
             len(attributes.source),
         )
     return SurfaceSamples(
-        attributes=attributes.without_layers(),
+        attributes=dataclasses.replace(attributes, centers=None, layers=None, derivative=None),
         positions=positions,
         depth=in_a_row(surface.depth),
         covered=in_a_row(surface.covered),

@@ -5,7 +5,6 @@ leave only sums behind.
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from typing import TypeAlias
 
 import equinox as eqx
 import jax
@@ -42,8 +41,6 @@ from ._plan import RenderSettings
 from ._shade import compose, shade
 from ._statistics import ReplayableStream, StreamStatistics
 
-Report: TypeAlias = Callable[[str, int], None]
-
 
 class _Map(eqx.Module):
     """The view of one shadow map, and the light it belongs to."""
@@ -60,7 +57,7 @@ def render_streamed(
     material: Material,
     camera: Camera,
     settings: RenderSettings = RenderSettings(),
-    report: Report | None = None,
+    report: Callable[[str, int], None] | None = None,
 ) -> Frame:
     r"""Render splats that come a part at a time, in memory that does not grow with their number.
 
@@ -121,7 +118,8 @@ def render_streamed(
         scenes,
         "shadow maps",
         [shadow.view for shadow in maps],
-        settings,
+        rasterizer,
+        settings.splatting,
         lambda scene: jnp.zeros((0, scene.splats.count), dtype),
     )
     shadow_maps = [
@@ -138,7 +136,8 @@ def render_streamed(
         scenes,
         "what the camera sees",
         [view],
-        settings,
+        rasterizer,
+        settings.splatting,
         lambda scene: stack_rows(settings.lighting.attributes(scene, *light(scene))),
     )
     visible, samples = _sample(seen, view, settings, like, bounds.center)
@@ -185,14 +184,13 @@ def _sum_views(
     scenes: Callable[[str], Iterator[Scene]],
     task: str,
     views: Sequence[_splatting.AbstractView],
-    settings: RenderSettings,
+    rasterizer: _splatting.TileRasterizer,
+    splatting: _splatting.SplattingSettings,
     rows: Callable[[Scene], Array],
 ) -> list[_splatting.FragmentSums]:
     """Sum the fragments of all parts in some views."""
     if not views:
         return []
-    rasterizer, splatting = settings.rasterizer, settings.splatting
-    assert isinstance(rasterizer, _splatting.TileRasterizer)
     demands, count = [], 0
     for scene in scenes("planning"):
         count = scene.splats.count
