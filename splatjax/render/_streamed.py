@@ -42,15 +42,6 @@ from ._shade import compose, shade
 from ._statistics import ReplayableStream, StreamStatistics
 
 
-class _Map(eqx.Module):
-    """The view of one shadow map, and the light it belongs to."""
-
-    view: _splatting.AbstractView
-    group: int = eqx.field(static=True)
-    light: int = eqx.field(static=True)
-    cube: bool = eqx.field(static=True)
-
-
 def render_streamed(
     parts: Parts,
     lights: Sequence[AbstractLight],
@@ -110,24 +101,33 @@ def render_streamed(
     check_channels(first)
     (first, camera), groups = in_one_dtype(first, camera), stack_lights(first.lights)
     dtype = first.splats.centers.dtype
-    bounds, view = statistics.bounds(dtype), _splatting.PerspectiveView.of(camera)
+    middle, reach = (jnp.asarray(of, dtype) for of in (statistics.middle, statistics.reach))
+    bounds, view = _splatting.Bounds(middle, reach), _splatting.PerspectiveView.of(camera)
 
-    # Pass 1: the shadow maps.
-    maps = _maps(first.lights, bounds, settings)
+    # Pass 1: the shadow maps of each light that casts shadows, in its group.
+    of_lights = [
+        plan_views([sample for _, sample in group], bounds, settings.shadows)[0]
+        if group[0][1].cast_shadows
+        else None
+        for group in lights_by_kind(first.lights)
+    ]
+    views, structure = jax.tree.flatten(
+        of_lights, is_leaf=lambda leaf: isinstance(leaf, _splatting.AbstractView)
+    )
     sums = _sum_views(
         scenes,
         "shadow maps",
-        [shadow.view for shadow in maps],
+        part_size,
+        views,
         rasterizer,
         settings.splatting,
         lambda scene: jnp.zeros((0, scene.splats.count), dtype),
     )
-    shadow_maps = [
-        _splatting.ShadowMap.of(of_view, shadow.view, settings.splatting)
-        for of_view, shadow in zip(sums, maps, strict=True)
-    ]
-
-    light = partial(_light, groups=groups, maps=maps, shadow_maps=shadow_maps, settings=settings)
+    shadow_maps = structure.unflatten(
+        _splatting.ShadowMap.of(of_view, seen_from, settings.splatting)
+        for of_view, seen_from in zip(sums, views, strict=True)
+    )
+    light = partial(_light, groups=groups, shadow_maps=shadow_maps, settings=settings)
 
     # Passes 2 and 3: what the camera sees.
     like = settings.lighting.attributes(first, *light(first))
@@ -135,6 +135,7 @@ def render_streamed(
     (seen,) = _sum_views(
         scenes,
         "what the camera sees",
+        part_size,
         [view],
         rasterizer,
         settings.splatting,
@@ -168,21 +169,10 @@ def render_streamed(
     return _shade(first, view, groups, visible, samples, layers, *planned, settings)
 
 
-def _maps(
-    lights: tuple[AbstractLight, ...], bounds: _splatting.Bounds, settings: RenderSettings
-) -> list[_Map]:
-    maps = []
-    for i, group in enumerate(lights_by_kind(lights)):
-        samples = [sample for _, sample in group]
-        if samples[0].cast_shadows:
-            of_lights, cube = plan_views(samples, bounds, settings.shadows)
-            maps += [_Map(view, i, j, cube) for j, views in enumerate(of_lights) for view in views]
-    return maps
-
-
 def _sum_views(
     scenes: Callable[[str], Iterator[Scene]],
     task: str,
+    part_size: int,
     views: Sequence[_splatting.AbstractView],
     rasterizer: _splatting.TileRasterizer,
     splatting: _splatting.SplattingSettings,
@@ -191,12 +181,12 @@ def _sum_views(
     """Sum the fragments of all parts in some views."""
     if not views:
         return []
-    demands, count = [], 0
-    for scene in scenes("planning"):
-        count = scene.splats.count
-        demands.append([rasterizer.demand(scene.splats, view, splatting) for view in views])
+    demands = [
+        [rasterizer.demand(scene.splats, view, splatting) for view in views]
+        for scene in scenes("planning")
+    ]
     plans = [
-        rasterizer.plan_for([[part[k]] for part in demands], count, view)
+        rasterizer.plan_for([[part[k]] for part in demands], part_size, view)
         for k, view in enumerate(views)
     ]
 
@@ -216,19 +206,20 @@ def _sum_views(
 def _light(
     scene: Scene,
     groups: list[StackedLights],
-    maps: Sequence[_Map],
-    shadow_maps: Sequence[_splatting.ShadowMap],
+    shadow_maps: Sequence[Sequence[Sequence[_splatting.ShadowMap]] | None],
     settings: RenderSettings,
 ) -> tuple[LightVisibility, Irradiance]:
     """Look a part up in the shadow maps of all parts."""
-    visibility: list = [
-        [0.0] * len(group.light_indices) if group.lights.cast_shadows else None for group in groups
+
+    def of_light(maps: Sequence[_splatting.ShadowMap]):
+        cube = len(maps) > 1
+        return sum(map_visibility(scene, each, settings.shadows, cube) for each in maps)
+
+    visibility = [
+        None if of_group is None else jnp.stack([of_light(maps) for maps in of_group])
+        for of_group in shadow_maps
     ]
-    for shadow, shadow_map in zip(maps, shadow_maps, strict=True):
-        of_group = visibility[shadow.group]
-        of_group[shadow.light] += map_visibility(scene, shadow_map, settings.shadows, shadow.cube)
-    stacked = [None if of_group is None else jnp.stack(of_group) for of_group in visibility]
-    light = LightVisibility(groups, stacked, jnp.zeros((), scene.splats.centers.dtype))
+    light = LightVisibility(groups, visibility, jnp.zeros((), scene.splats.centers.dtype))
     return light, irradiance_at_splats(scene, light)
 
 
