@@ -2,7 +2,7 @@
 to their sums, and is forgotten.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 
 import equinox as eqx
 import jax
@@ -61,26 +61,25 @@ class StreamedDiffusion:
         )
         self.source_capacity, self.list_capacity = 0, 0
 
-    def evaluate(self, parts: Iterable[Sources]) -> Float[Array, "blocks layers values block"]:
+    def evaluate(
+        self, parts: Iterable[Sources], channels: int
+    ) -> Float[Array, "blocks layers values block"]:
         """Sum over all parts: means and mass of each layer, in the order of `gaussians`.
 
         **Arguments:**
 
         - `parts`: of one size, with centers from the origin of the points; sources without area
           bring nothing.
+        - `channels`: of their irradiance.
         """
-        sums = PartByPart().total(self._sums(parts))
-        return _finished(sums, self.variances, self.depths, self.kernels, self.points)
 
-    def _sums(self, parts: Iterable[Sources]) -> Iterator[Float[Array, "layers values points"]]:
-        """Iterate over the sums of each part that brings anything, after zeros."""
-        for i, sources in enumerate(parts):
-            if i == 0:
-                count = self.points.shape[0] * self.points.shape[2]
-                rows = len(self.edges), len(sources.irradiance) + 1, count
-                yield jnp.zeros(rows, self.points.dtype)
-            if self._in_reach(sources):
-                yield self._sum_part(sources)
+        def add(sums: Float[Array, "layers values points"], sources: Sources):
+            return sums + self._sum_part(sources) if self._in_reach(sources) else sums
+
+        count = self.points.shape[0] * self.points.shape[2]
+        zeros = jnp.zeros((len(self.edges), channels + 1, count), self.points.dtype)
+        sums = PartByPart().fold(add, zeros, parts)
+        return _finished(sums, self.variances, self.depths, self.kernels, self.points)
 
     def _in_reach(self, sources: Sources) -> bool:
         """Test whether a part may bring anything to any point, by boxes."""

@@ -162,7 +162,7 @@ def render_streamed(
             centers = splats.centers.T - bounds.center[:, None]
             yield _diffusion.Sources(centers, splats.normals.T, splats.areas, irradiance.source)
 
-    layers = diffusion.evaluate(sources())
+    layers = diffusion.evaluate(sources(), first.material.channels)
 
     # Pass 5.
     planned = diffusion.gaussians, interval
