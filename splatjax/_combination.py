@@ -10,7 +10,6 @@ from typing import TypeVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.lax import stop_gradient
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float, PyTree, Shaped
 
@@ -48,12 +47,8 @@ class AbstractCombination(eqx.Module):
         """Keep this device's share of rows that are the same on all devices."""
         return rows
 
-    def gather(self, share: Partial) -> Partial:
-        """Concatenate the shares of all devices along the first axis. Differentiable."""
-        return share
-
-    def gather_last(self, share: Partial) -> Partial:
-        """Concatenate the shares of all devices along the last axis. Differentiable."""
+    def gather(self, share: Partial, axis: int = 0) -> Partial:
+        """Concatenate the shares of all devices along an axis. Differentiable."""
         return share
 
 
@@ -66,7 +61,7 @@ class OneDevice(AbstractCombination):
 
     def largest(self, partials):
         (whole,) = partials
-        return jax.tree.map(stop_gradient, whole)
+        return jax.tree.map(jax.lax.stop_gradient, whole)
 
 
 class DeviceMesh(AbstractCombination):
@@ -92,7 +87,7 @@ class DeviceMesh(AbstractCombination):
 
     def largest(self, partials):
         (own,) = partials
-        return jax.tree.map(lambda leaf: jax.lax.pmax(stop_gradient(leaf), self.axes), own)
+        return jax.tree.map(lambda leaf: jax.lax.pmax(jax.lax.stop_gradient(leaf), self.axes), own)
 
     def own_share(self, rows):
         return jax.lax.psum_scatter(rows, self.axes, scatter_dimension=0, tiled=True)
@@ -101,14 +96,11 @@ class DeviceMesh(AbstractCombination):
         share = rows.shape[0] // self.count
         return jax.lax.dynamic_slice_in_dim(rows, jax.lax.axis_index(self.axes) * share, share)
 
-    def gather(self, share):
+    def gather(self, share, axis=0):
         return jax.tree.map(
-            lambda rows: jax.lax.all_gather(rows, self.axes, axis=0, tiled=True), share
+            lambda rows: jax.lax.all_gather(rows, self.axes, axis=axis % rows.ndim, tiled=True),
+            share,
         )
-
-    def gather_last(self, share):
-        turned = jax.tree.map(lambda rows: jnp.moveaxis(rows, -1, 0), share)
-        return jax.tree.map(lambda rows: jnp.moveaxis(rows, 0, -1), self.gather(turned))
 
 
 class PartByPart(AbstractCombination):
@@ -140,7 +132,7 @@ def extreme(
         jnp.sum(equal, axis=0).astype(values.dtype),
     )
     total, count = combination.total([sums])
-    return largest + total / count - stop_gradient(total / count)
+    return largest + total / count - jax.lax.stop_gradient(total / count)
 
 
 def lay_out(mesh: Mesh, trees: Partial, specs: Partial) -> Partial:

@@ -37,12 +37,14 @@ class AbstractProfile(eqx.Module):
 
     Lengths are in mm, `profile(r)` in 1/mm^2. Fresnel transmission at entry and exit is not part of
     it.
+
+    **Attributes:** (of the class)
+
+    - `singular`: whether the profile goes to infinity at the origin like 1/r, so that the integrals
+      of Eq. 3 and 4 need a cut.
     """
 
     singular: ClassVar[bool] = False
-    """Whether the profile goes to infinity at the origin like 1/r, so that the integrals of Eq. 3
-    and 4 need a cut.
-    """
 
     @abc.abstractmethod
     def __call__(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:

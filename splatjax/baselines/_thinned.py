@@ -8,7 +8,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int
 
 from splatjax._chunking import take_points
 from splatjax.diffusion import (
@@ -43,11 +42,10 @@ class ThinnedDiffuser(AbstractDiffuser):
 class ThinnedPlan(AbstractDiffusionPlan):
     """What sums over fewer splats need to know: how many are left out."""
 
-    gaussians: Int[Array, " layers"]
     keep: int = eqx.field(static=True)
 
     def diffuse(self, sources, variances, kernel, combination, at=None):
-        everywhere = combination.gather_last(sources)
+        everywhere = combination.gather(sources, axis=-1)
         group = np.arange(-(-everywhere.areas.shape[0] // self.keep))
         # The first of each group would lie at the same side of all groups.
         chosen = group * self.keep + (group * _GOLDEN % 1 * self.keep).astype(int)

@@ -13,7 +13,7 @@ import tyro
 
 import splatjax as sj
 from splatjax._memory import check_memory
-from splatjax.render import check_displayable
+from splatjax.render import BYTES_PER_PIXEL, BYTES_PER_SPLAT, check_displayable
 
 from ._terminal import Rules, UpAxis, check_options, note, option_name, stage
 
@@ -21,8 +21,6 @@ from ._terminal import Rules, UpAxis, check_options, note, option_name, stage
 _FILL_SIDE, _FILL_ELEVATION = 25.0, 10.0
 _NOT_IN_PICTURES = ("splats", "output", "fps", "quiet")
 _note_once = functools.cache(note)
-# Lower bounds of the memory needed: what does not fit by these does not fit.
-_BYTES_PER_SPLAT, _BYTES_PER_PIXEL = 1000.0, 500.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,7 +95,7 @@ class ViewOptions:
         count = 0 if self.splats else self.count
         check_memory(
             f"--width {self.width} --height {self.height}{f' --count {count}' if count else ''}",
-            _BYTES_PER_SPLAT * count + _BYTES_PER_PIXEL * self.width * self.height,
+            BYTES_PER_SPLAT * count + BYTES_PER_PIXEL * self.width * self.height,
             "take fewer pixels or splats",
         )
 

@@ -8,7 +8,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.lax import stop_gradient
 from jaxtyping import Array, Float, Int
 
 from splatjax._chunking import take_points
@@ -130,23 +129,16 @@ class ClusterPlan(AbstractDiffusionPlan):
     - `kernels`: of every layer.
     - `variances`, `margin`: the plan serves variances within this factor of these, mm^2, or of the
       first of them.
-    - `forward_mode`: whether the layers are differentiable in forward mode, and not in reverse
-      mode. Static.
     """
 
-    gaussians: Int[Array, " layers"]
     sources: LayerSources
     kernels: TruncatedGaussian
     neighbors: Neighbors
     variances: Float[Array, " gaussians"]
     margin: Float[Array, ""]
-    forward_mode: bool = eqx.field(static=True, default=False)
 
     def shares(self):
         return tuple(jax.tree.leaves((self.neighbors.lists, self.neighbors.points)))
-
-    def in_forward_mode(self):
-        return dataclasses.replace(self, forward_mode=True)
 
     def diffuse(
         self,
@@ -157,8 +149,8 @@ class ClusterPlan(AbstractDiffusionPlan):
         at: Int[Array, " points"] | None = None,
     ) -> Diffused:
         # Every device gathers the sources of all, and evaluates the layers at its own splats.
-        everywhere = combination.gather_last(sources)
-        origin = stop_gradient(jnp.mean(everywhere.centers, axis=1))[:, None]
+        everywhere = combination.gather(sources, axis=-1)
+        origin = jax.lax.stop_gradient(jnp.mean(everywhere.centers, axis=1))[:, None]
         centered = dataclasses.replace(everywhere, centers=everywhere.centers - origin)
         points = sources.centers - origin
         own = self.variances_of_layers(variances)
@@ -166,7 +158,8 @@ class ClusterPlan(AbstractDiffusionPlan):
 
         # Sink the sources and merge them; sum over those near each block of points.
         below = self.sources.merged(centered, depths)
-        wanted, lists = _wanted(at, points.shape[1]), self.neighbors.lists
+        wanted = Wanted.of(at, points.shape[1] // POINTS_PER_BLOCK, POINTS_PER_BLOCK)
+        lists = self.neighbors.lists
         if at is not None:
             lists = lists.only(jnp.any(wanted.ranks < wanted.count, axis=1))
         sums = gaussian_sums(
@@ -188,22 +181,12 @@ class ClusterPlan(AbstractDiffusionPlan):
 
         # What is needed of the plan.
         around = _target_boxes(points, sources.areas), source_boxes(below)
-        reaches = jnp.sqrt(2 * self.kernels.largest * stop_gradient(own))
+        reaches = jnp.sqrt(2 * self.kernels.largest * jax.lax.stop_gradient(own))
         planned = self.variances[: len(variances)]
         factors = jnp.maximum(planned / variances, variances / planned)
         varied = jnp.max(factors, initial=0) / (self.margin * (1 + 1e-6))
         needed = jnp.maximum(varied, self.neighbors.needed(*around, reaches))
         return Diffused(layers, combination.largest([needed.astype(variances.dtype)]))
-
-
-def _wanted(at: Int[Array, " points"] | None, count: int) -> Wanted:
-    every = jnp.arange(count, dtype=jnp.int32)
-    if at is not None:
-        every, count = (
-            jnp.full_like(every, len(at)).at[at].set(every[: len(at)], mode="drop"),
-            len(at),
-        )
-    return Wanted(every.reshape(-1, POINTS_PER_BLOCK), count)
 
 
 def in_units(

@@ -10,6 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from splatjax._chunking import jit_unless_traced
+
 from ._diffuser import Sources
 
 POINTS_PER_BLOCK = 32
@@ -82,6 +84,7 @@ class LayerSources(eqx.Module):
         """The number of sources."""
         return SOURCES_PER_BLOCK * len(self.layers)
 
+    @jit_unless_traced
     def merged(self, splats: Sources, depths: Float[Array, " layers"]) -> SunkSources:
         """Sink the splats below the surface by the depth of each layer, mm, and merge them. Area
         and energy are kept. Differentiable.

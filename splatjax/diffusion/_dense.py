@@ -4,7 +4,6 @@ derivative.
 
 import jax
 import jax.numpy as jnp
-from jax.lax import stop_gradient
 from jaxtyping import Array, Float, Int
 
 from splatjax._chunking import map_chunks, take_points
@@ -33,8 +32,6 @@ class DenseDiffuser(AbstractDiffuser):
 class DensePlan(AbstractDiffusionPlan):
     """What the plain diffuser needs to know: how many layers there are."""
 
-    gaussians: Int[Array, " layers"]
-
     def diffuse(
         self,
         sources: Sources,
@@ -43,7 +40,7 @@ class DensePlan(AbstractDiffusionPlan):
         combination: AbstractCombination,
         at: Int[Array, " points"] | None = None,
     ) -> Diffused:
-        everywhere = combination.gather_last(sources)
+        everywhere = combination.gather(sources, axis=-1)
         points = sources.centers if at is None else take_points(sources.centers, at)
         layers = dense_layers(everywhere, points, self.variances_of_layers(variances), kernel)
         return Diffused(layers, jnp.zeros((), sources.centers.dtype))
@@ -76,7 +73,7 @@ def dense_layer(
         squared = jnp.sum(offset * offset, axis=0)
         # Weigh the sources, A_j G(v, |x - q_j|), but for a factor per point, which the means do not
         # notice: the exponent of the nearest source is zero.
-        nearest = stop_gradient(jnp.min(squared, axis=1, keepdims=True))
+        nearest = jax.lax.stop_gradient(jnp.min(squared, axis=1, keepdims=True))
         weight = sources.areas[None] * jnp.exp(-0.5 * (squared - nearest) / variance)
         # Sum light and mass, and their first moments about the point; divide them.
         light = jnp.concatenate([sources.irradiance, jnp.ones_like(sources.areas)[None]])

@@ -1,6 +1,7 @@
 """The diffusion integral of the irradiance for every layer (pass 4, section 4.2)."""
 
 import abc
+import dataclasses
 
 import equinox as eqx
 import jax
@@ -57,9 +58,12 @@ class AbstractDiffusionPlan(eqx.Module):
 
     - `gaussians`: the Gaussian of each layer that is evaluated; their number for a layer that only
       fills up. Others are too narrow for nearly all splats.
+    - `forward_mode`: whether the layers are differentiable in forward mode, and not in reverse
+      mode, where a diffuser has no derivative of both. Static.
     """
 
-    gaussians: eqx.AbstractVar[Int[Array, " layers"]]
+    gaussians: Int[Array, " layers"]
+    forward_mode: bool = eqx.field(static=True, default=False, kw_only=True)
 
     def variances_of_layers(self, variances: Float[Array, " gaussians"]) -> Float[Array, " layers"]:
         """Take the variances of the layers from those of the Gaussians, mm^2; 1 for a layer that
@@ -100,16 +104,13 @@ class AbstractDiffusionPlan(eqx.Module):
     ) -> tuple[Diffused, Diffused]:
         """Diffuse, and differentiate each layer in the logarithm of its own variance."""
 
+        plan = dataclasses.replace(self, forward_mode=True)
+
         def diffuse(variances):
-            plan = self.in_forward_mode()
             return plan.diffuse(sources, variances, kernel, combination, at)
 
         # Each layer depends on its own variance alone, so one direction holds all derivatives.
         return jax.jvp(diffuse, (variances,), (variances,))
-
-    def in_forward_mode(self) -> "AbstractDiffusionPlan":
-        """Return a plan whose layers are differentiable in forward mode."""
-        return self
 
     def shares(self) -> tuple[Array, ...]:
         """Return the arrays of which every device has a share, along their first axis."""

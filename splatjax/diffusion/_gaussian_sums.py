@@ -99,6 +99,15 @@ class Wanted(eqx.Module):
     ranks: Int[Array, "points_blocks block"]
     count: int = eqx.field(static=True)
 
+    @classmethod
+    def of(cls, at: Int[Array, " wanted"] | None, blocks: int, block: int) -> "Wanted":
+        """Want the points `at` of all points in blocks, beyond all for none; all for `None`."""
+        every = jnp.arange(blocks * block, dtype=jnp.int32)
+        if at is None:
+            return cls(every.reshape(blocks, block), blocks * block)
+        ranks = jnp.full_like(every, len(at)).at[at].set(every[: len(at)], mode="drop")
+        return cls(ranks.reshape(blocks, block), len(at))
+
     def _at(self, lanes: Lanes) -> tuple:
         """Index the layer, all sums, and the points of each lane."""
         layer, block = jnp.divmod(lanes.lists, len(self.ranks))
@@ -240,25 +249,17 @@ def _backward(residuals, cotangents):
     return given.sweep(sweep, points, start)
 
 
-@jax.custom_vjp
-def _sums(given, points, table):
-    return _forward(given, points, table)
-
-
+_sums = jax.custom_vjp(_forward)
 _sums.defvjp(
     lambda *given: (_forward(*given), given),
     lambda residuals, cotangents: (None, *_backward(residuals, cotangents)),
 )
 
 
-@jax.custom_jvp
-def _sums_forward(given, points, table):
-    return _forward(given, points, table)
-
-
-@_sums_forward.defjvp
-def _sums_jvp(primals, tangents):
-    return _forward(*primals), _derivative(primals, tangents[1:])
+_sums_forward = jax.custom_jvp(_forward)
+_sums_forward.defjvp(
+    lambda primals, tangents: (_forward(*primals), _derivative(primals, tangents[1:]))
+)
 
 
 def gaussian_sums(

@@ -9,7 +9,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.lax import stop_gradient
 from jaxtyping import Array, Float
 
 from splatjax._smooth import smooth_step
@@ -109,9 +108,9 @@ class AbstractDiffusionKernel(eqx.Module):
       and is fully resolved, on a regular grid and for scattered splats.
     """
 
-    depth: eqx.AbstractVar[float]
-    regular: eqx.AbstractVar[tuple[float, float]]
-    scattered: eqx.AbstractVar[tuple[float, float]]
+    depth: float = eqx.field(static=True, default=0.0)
+    regular: tuple[float, float] = eqx.field(static=True, default=(0.4, 0.8))
+    scattered: tuple[float, float] = eqx.field(static=True, default=(1.0, 2.0))
 
     def depths(self, variances: Float[Array, " gaussians"]) -> Float[Array, " gaussians"]:
         """Compute how far below its splat the source of each layer lies, mm."""
@@ -162,10 +161,6 @@ class PlainMean(AbstractDiffusionKernel):
     **Source:** Kim et al. 2010, section 4.2.
     """
 
-    depth: float = eqx.field(static=True, default=0.0)
-    regular: tuple[float, float] = eqx.field(static=True, default=(0.4, 0.8))
-    scattered: tuple[float, float] = eqx.field(static=True, default=(1.0, 2.0))
-
     def gain(self, mass, variances, energies, single_scattering_albedo):
         return jnp.ones_like(mass)
 
@@ -194,8 +189,6 @@ class EscapeNormalization(AbstractDiffusionKernel):
     """
 
     depth: float = eqx.field(static=True, default=0.75)
-    regular: tuple[float, float] = eqx.field(static=True, default=(0.4, 0.8))
-    scattered: tuple[float, float] = eqx.field(static=True, default=(1.0, 2.0))
 
     def gain(self, mass, variances, energies, single_scattering_albedo):
         energies = jnp.where(energies >= 0, energies, 0.0)
@@ -235,13 +228,13 @@ def unevenness(splats: Splats) -> Float[Array, ""]:
     if splats.count < 2:
         return jnp.zeros((), splats.centers.dtype)
     sampled = jnp.linspace(0, splats.count - 1, min(_SAMPLE, splats.count)).astype(jnp.int32)
-    centers = stop_gradient(splats.centers).T
+    centers = jax.lax.stop_gradient(splats.centers).T
 
     def nearest(i):
         offset = centers - centers[:, i][:, None]
         squared = jnp.where(splats.areas > 0, jnp.sum(offset * offset, axis=0), jnp.inf)
         squared = squared.at[i].set(jnp.inf)
-        return jnp.sqrt(jnp.min(squared) / stop_gradient(splats.areas[i]))
+        return jnp.sqrt(jnp.min(squared) / jax.lax.stop_gradient(splats.areas[i]))
 
     distance = jax.lax.map(nearest, sampled)
     counts = jnp.isfinite(distance)

@@ -8,8 +8,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
-from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
 from splatjax._chunking import with_spare
@@ -54,14 +52,14 @@ class Lists(eqx.Module):
         sweeps = (jnp.sum(self.counts > 0) + lanes - 1) // lanes
 
         def step(i, out):
-            of_lanes = lax.dynamic_slice_in_dim(order, i * lanes, lanes)
+            of_lanes = jax.lax.dynamic_slice_in_dim(order, i * lanes, lanes)
             first, counts = (
                 each.at[of_lanes].get(mode="fill", fill_value=0)
                 for each in (self.first, self.counts)
             )
             return sweep(Lanes(of_lanes, first, counts), out)
 
-        return lax.fori_loop(jnp.zeros_like(sweeps), sweeps, step, out)
+        return jax.lax.fori_loop(jnp.zeros_like(sweeps), sweeps, step, out)
 
 
 class Lanes(eqx.Module):
@@ -84,7 +82,7 @@ class Lanes(eqx.Module):
             row = jnp.where(i < self.counts, self.first + i, len(lists.rows) - 1)
             return add(lists.rows.at[row].get(mode="promise_in_bounds"), carry)
 
-        return lax.fori_loop(0, jnp.max(self.counts), step, start)
+        return jax.lax.fori_loop(0, jnp.max(self.counts), step, start)
 
 
 class Boxes(eqx.Module):
@@ -98,7 +96,7 @@ class Boxes(eqx.Module):
         cls, points: Float[Array, "3 points"], exists: Bool[Array, " points"], block: int
     ) -> "Boxes":
         """Enclose the points that exist, `block` of them at a time. Not differentiated."""
-        points = stop_gradient(points)
+        points = jax.lax.stop_gradient(points)
         low, high = (
             jnp.where(exists, points, sign * jnp.inf).reshape(3, -1, block) for sign in (1, -1)
         )
@@ -160,7 +158,7 @@ def find_neighbors(
 
     def search(part: tuple, layer: int):
         """Find the pairs of a block of a part and a block of sources."""
-        of, near = _pairs_in_reach(part, (low[own[layer]], high[own[layer]]), reaches[layer])
+        of, near = pairs_in_reach(part, (low[own[layer]], high[own[layer]]), reaches[layer])
         return of, own[layer][near]
 
     # Only NumPy computes in the threads, since JAX's precision may be set for one thread.
@@ -220,7 +218,7 @@ def _levels(corners: tuple, depth: int) -> list[tuple[np.ndarray, np.ndarray]]:
     return levels
 
 
-def _pairs_in_reach(points: tuple, sources: tuple, reach: float) -> tuple[np.ndarray, np.ndarray]:
+def pairs_in_reach(points: tuple, sources: tuple, reach: float) -> tuple[np.ndarray, np.ndarray]:
     """Find the pairs of boxes, given by their corners, that are in reach of each other, from coarse
     to fine.
     """

@@ -2,7 +2,7 @@
 to their sums, and is forgotten.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 
 import equinox as eqx
 import jax
@@ -23,7 +23,7 @@ from ._clusters import LayerSources, SunkSources, compact_order
 from ._diffuser import Sources, divide_by_mass
 from ._gaussian_sums import FAR, Wanted, gaussian_sums
 from ._kernel import AbstractDiffusionKernel, TruncatedGaussian
-from ._neighbors import Boxes, Lists, find_neighbors
+from ._neighbors import Boxes, Lists, find_neighbors, pairs_in_reach
 
 
 class StreamedDiffusion:
@@ -61,38 +61,35 @@ class StreamedDiffusion:
         )
         self.source_capacity, self.list_capacity = 0, 0
 
-    def evaluate(self, parts: Iterable[Sources]) -> Float[Array, "blocks layers values block"]:
+    def evaluate(
+        self, parts: Iterable[Sources], channels: int
+    ) -> Float[Array, "blocks layers values block"]:
         """Sum over all parts: means and mass of each layer, in the order of `gaussians`.
 
         **Arguments:**
 
         - `parts`: of one size, with centers from the origin of the points; sources without area
           bring nothing.
+        - `channels`: of their irradiance.
         """
-        sums = PartByPart().total(self._sums(parts))
-        return _finished(sums, self.variances, self.depths, self.kernels, self.points)
 
-    def _sums(self, parts: Iterable[Sources]) -> Iterator[Float[Array, "layers values points"]]:
-        """Iterate over the sums of each part that brings anything, after zeros."""
-        for i, sources in enumerate(parts):
-            if i == 0:
-                count = self.points.shape[0] * self.points.shape[2]
-                rows = len(self.edges), len(sources.irradiance) + 1, count
-                yield jnp.zeros(rows, self.points.dtype)
-            if self._in_reach(sources):
-                yield self._sum_part(sources)
+        def add(sums: Float[Array, "layers values points"], sources: Sources):
+            return sums + self._sum_part(sources) if self._in_reach(sources) else sums
+
+        count = self.points.shape[0] * self.points.shape[2]
+        zeros = jnp.zeros((len(self.edges), channels + 1, count), self.points.dtype)
+        sums = PartByPart().fold(add, zeros, parts)
+        return _finished(sums, self.variances, self.depths, self.kernels, self.points)
 
     def _in_reach(self, sources: Sources) -> bool:
         """Test whether a part may bring anything to any point, by boxes."""
-        centers, exists = np.asarray(sources.centers), np.asarray(sources.areas) > 0
-        if not exists.any():
-            return False
-        low, high = centers[:, exists].min(axis=1), centers[:, exists].max(axis=1)
-        own_low, own_high = np.asarray(self.boxes.low), np.asarray(self.boxes.high)
-        gaps = np.maximum(np.maximum(own_low - high, low - own_high), 0)
+        around = Boxes.around(sources.centers, sources.areas > 0, len(sources.areas))
         # Sources lie below their splats.
         reach = np.max(self.reaches + np.asarray(self.depths, np.float64))
-        return bool(np.any(np.sum(gaps * gaps, axis=1) <= reach**2))
+        corners = (
+            (np.asarray(boxes.low), np.asarray(boxes.high)) for boxes in (self.boxes, around)
+        )
+        return len(pairs_in_reach(*corners, reach)[0]) > 0
 
     def _sum_part(self, sources: Sources) -> Float[Array, "layers values points"]:
         order = compact_order(np.asarray(sources.centers.T))
@@ -101,7 +98,7 @@ class StreamedDiffusion:
         exists = np.asarray(sources.areas) > 0
         clusters = LayerSources.build(*arrays, exists, self.edges, self.source_capacity)
         self.source_capacity = max(self.source_capacity, clusters.count)
-        below = _merge(clusters, sources, self.depths)
+        below = clusters.merged(sources, self.depths)
         around, layers = source_boxes(below), np.asarray(clusters.layers)
         lists = find_neighbors(self.boxes, around, layers, self.reaches, least=self.list_capacity)
         self.list_capacity = len(lists.rows)
@@ -109,16 +106,9 @@ class StreamedDiffusion:
 
 
 @eqx.filter_jit
-def _merge(clusters: LayerSources, sources: Sources, depths) -> SunkSources:
-    return clusters.merged(sources, depths)
-
-
-@eqx.filter_jit
 def _sum(points, below: SunkSources, clusters: LayerSources, variances, kernels, lists: Lists):
     table = source_table(below, variances, clusters.layers, moments=False)
-    blocks, _, block = points.shape
-    every = jnp.arange(blocks * block, dtype=jnp.int32).reshape(blocks, block)
-    wanted = Wanted(every, blocks * block)
+    wanted = Wanted.of(None, points.shape[0], points.shape[2])
     return gaussian_sums(in_units(points, variances), table, lists, kernels, wanted)
 
 

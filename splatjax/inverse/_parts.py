@@ -32,10 +32,13 @@ class AbstractPart(eqx.Module):
 
     An optimizer sees coordinates in steps, so that one learning rate serves all parts: Adam at a
     rate of 1 moves each by up to one step at a time.
+
+    **Attributes:** (of the class)
+
+    - `shared`: whether all pictures share the part; else each has its own.
     """
 
     shared: ClassVar[bool] = False
-    """Whether all pictures share the part; else each has its own."""
 
     def __check_init__(self):
         for field in dataclasses.fields(self):

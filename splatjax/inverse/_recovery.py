@@ -42,7 +42,7 @@ class Combination(eqx.Module):
 class AbstractEstimate(eqx.Module):
     """Coefficients, `medium` (1/mm), and their errors."""
 
-    medium: eqx.AbstractVar[Medium]
+    medium: Medium
 
     @abc.abstractmethod
     def covariance(self) -> Float[np.ndarray, "channels 2 2"]:
@@ -94,7 +94,6 @@ class AbstractEstimate(eqx.Module):
 class Estimate(AbstractEstimate):
     """Coefficients and the covariance of their logarithms, as `combined` returns them."""
 
-    medium: Medium
     covariance_of_logarithms: Float[np.ndarray, "channels 2 2"]
 
     def covariance(self) -> Float[np.ndarray, "channels 2 2"]:
@@ -178,7 +177,6 @@ class Recovery(AbstractEstimate):
     error that this leaves in the search is part of the bars.
     """
 
-    medium: Medium
     material: Material
     intensities: Float[Array, "pictures channels"]
     information: Float[Array, "all all"]

@@ -6,7 +6,12 @@ The formulas of the passes are in splatting, diffusion and shading.
 from ._attributes import SurfaceAttributes as SurfaceAttributes, SurfaceSamples as SurfaceSamples
 from ._basis import diffusion_basis as diffusion_basis, DiffusionBasis as DiffusionBasis
 from ._devices import map_over as map_over
-from ._checks import check_displayable as check_displayable, check_scene as check_scene
+from ._checks import (
+    BYTES_PER_PIXEL as BYTES_PER_PIXEL,
+    BYTES_PER_SPLAT as BYTES_PER_SPLAT,
+    check_displayable as check_displayable,
+    check_scene as check_scene,
+)
 from ._jacobian import picture_jacobian as picture_jacobian, PictureJacobian as PictureJacobian
 from ._lighting import (
     AbstractLighting as AbstractLighting,

@@ -1,6 +1,5 @@
 """What the splats carry into the picture, and what passes 4 and 5 read of it at the pixels."""
 
-import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -42,26 +41,6 @@ class SurfaceAttributes(eqx.Module):
     derivative: _diffusion.LayerValues | None = None
     added_source: Float[Array, "channels points"] | None = None
     extra: Any = None
-
-    def with_layers(
-        self,
-        layers: _diffusion.LayerValues,
-        derivative: _diffusion.LayerValues | None,
-        added_source: Float[Array, "channels splats"] | None,
-        centers: Float[Array, "3 splats"],
-    ) -> "SurfaceAttributes":
-        """Add the layers of the splats to what is blended."""
-        return dataclasses.replace(
-            self,
-            centers=centers,
-            layers=_diffusion.continue_from_splats(layers, centers),
-            derivative=derivative and _diffusion.continue_from_splats(derivative, centers),
-            added_source=added_source,
-        )
-
-    def without_layers(self) -> "SurfaceAttributes":
-        """Leave out the layers, once they are continued to the points seen."""
-        return dataclasses.replace(self, centers=None, layers=None, derivative=None)
 
 
 class SurfaceSamples(eqx.Module):

@@ -13,7 +13,7 @@ from splatjax._memory import check_memory
 from splatjax.scene import Camera, Scene, Splats
 
 # At least: a picture that needs more than is free by these does not fit.
-_BYTES_PER_SPLAT, _BYTES_PER_PIXEL = 1000.0, 500.0
+BYTES_PER_SPLAT, BYTES_PER_PIXEL = 1000.0, 500.0
 _SAMPLE = 4096  # splats, evenly picked, by which the shape of a body is judged
 # Sum of the normals of a closed body, by area, as a fraction of the area. An open neck leaves
 # 0.08, a hemisphere 0.5.
@@ -47,7 +47,7 @@ def check_scene(scene: Scene, camera: Camera, is_lit: bool = True) -> None:
     count, pixels = scene.splats.count, camera.width * camera.height
     check_memory(
         f"a picture of {camera.width} x {camera.height} pixels with {count} splats",
-        _BYTES_PER_SPLAT * count + _BYTES_PER_PIXEL * pixels,
+        BYTES_PER_SPLAT * count + BYTES_PER_PIXEL * pixels,
         "take fewer pixels, thin the splats, or render them by render_streamed",
         _device_memory(scene.splats),
     )

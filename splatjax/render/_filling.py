@@ -17,10 +17,7 @@ def fill_up(splats: Splats, count: int) -> Splats:
     """Add splats that are invisible and bring no light, up to `count`."""
     if splats.count == count:
         return splats
-    if splats.count == 0:
-        return jax.tree.map(lambda leaf: jnp.zeros((count, *leaf.shape[1:]), leaf.dtype), splats)
-    every = jnp.arange(count, dtype=jnp.int32)
-    return arrange(splats, jnp.minimum(every, splats.count - 1), every < splats.count)
+    return splats.take(jnp.arange(count, dtype=jnp.int32))
 
 
 def fill_gaussians(gaussians: SumOfGaussians) -> SumOfGaussians:

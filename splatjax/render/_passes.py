@@ -6,16 +6,14 @@ splatting, diffusion and shading.
 import dataclasses
 from collections.abc import Callable
 from functools import partial
-from typing import TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.lax import stop_gradient
 from jaxtyping import Array, Float, Int, PyTree, Shaped
 
 from splatjax import diffusion as _diffusion, splatting as _splatting
-from splatjax._chunking import map_chunks, take_points
+from splatjax._chunking import Result, map_chunks, take_points
 from splatjax._combination import AbstractCombination
 from splatjax.scene import Camera, Scene, stack_lights
 
@@ -23,8 +21,6 @@ from ._attributes import SurfaceAttributes, SurfaceSamples, split_rows, stack_ro
 from ._lighting import Irradiance, LightVisibility, cast_shadows, irradiance_at_splats
 from ._plan import Plan, RenderSettings
 from ._shade import ShadedSurface, shade
-
-Values = TypeVar("Values", bound=PyTree)
 
 
 class SplatLight(eqx.Module):
@@ -138,8 +134,8 @@ def see_and_shade(
     plan: Plan,
     combination: AbstractCombination,
     light_at: Callable[[_splatting.Bounds, Int[Array, " chosen"]], SplatLight],
-    read: Callable[[ShadedSurface, _diffusion.LayersAtPoints, SurfaceSamples], Values],
-) -> tuple[Values, _splatting.VisibleSurfaces]:
+    read: Callable[[ShadedSurface, _diffusion.LayersAtPoints, SurfaceSamples], Result],
+) -> tuple[Result, _splatting.VisibleSurfaces]:
     """Light the splats, see them, shade what is seen, and read what a picture needs: all passes.
 
     **Arguments:**
@@ -161,9 +157,14 @@ def see_and_shade(
     shown = Scene(splats, scene.lights, scene.material)
     visibility = LightVisibility(groups, light.visibility, light.needed)
     attributes = settings.lighting.attributes(shown, visibility, light.irradiance)
-    origin = stop_gradient(bounds.center)[:, None]
-    attributes = attributes.with_layers(
-        light.layers, light.derivative, light.added_source, splats.centers.T - origin
+    origin = jax.lax.stop_gradient(bounds.center)[:, None]
+    centers = splats.centers.T - origin
+    attributes = dataclasses.replace(
+        attributes,
+        centers=centers,
+        layers=_diffusion.continue_from_splats(light.layers, centers),
+        derivative=light.derivative and _diffusion.continue_from_splats(light.derivative, centers),
+        added_source=light.added_source,
     )
     visible = _splatting.visible_surfaces(
         splats, stack_rows(attributes), view, settings.splatting, plan.raster, combination
@@ -173,7 +174,7 @@ def see_and_shade(
     visible = dataclasses.replace(visible, needed=jnp.maximum(needed, visible.needed))
 
     # Pass 5: shade the points that are seen.
-    def shade_and_read(samples: SurfaceSamples) -> Values:
+    def shade_and_read(samples: SurfaceSamples) -> Result:
         samples = jax.tree.map(in_a_row, samples)
         planned = plan.diffusion.gaussians, plan.interval
         shaded, layers = shade(scene, view.position, groups, samples, *planned, settings)
@@ -182,7 +183,7 @@ def see_and_shade(
     sample = partial(sample_surfaces, visible, attributes, origin)
 
     # Apart, so that samples are materialized, and in large chunks, so that few of them are.
-    def sample_and_read(sums, tiles) -> Values:
+    def sample_and_read(sums, tiles) -> Result:
         return map_places(shade_and_read, map_places(sample, sums, tiles))
 
     at_once = 2 * _splatting.TILES_AT_ONCE
@@ -221,7 +222,7 @@ def sample_surfaces(
             len(attributes.source),
         )
     return SurfaceSamples(
-        attributes=attributes.without_layers(),
+        attributes=dataclasses.replace(attributes, centers=None, layers=None, derivative=None),
         positions=positions,
         depth=in_a_row(surface.depth),
         covered=in_a_row(surface.covered),
@@ -230,7 +231,7 @@ def sample_surfaces(
     )
 
 
-def map_places(function: Callable[..., Values], *given: PyTree) -> Values:
+def map_places(function: Callable[..., Result], *given: PyTree) -> Result:
     """Apply a pointwise function to chunks of places.
 
     **Arguments:**

@@ -1,7 +1,6 @@
 """How a picture is made, and what `jit`, `grad` and loops need to know of shapes, found once."""
 
 from collections.abc import Sequence
-from typing import TypeVar
 
 import equinox as eqx
 import jax
@@ -10,10 +9,10 @@ import numpy as np
 from jax.core import Tracer
 from jax.experimental.multihost_utils import process_allgather
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, Int
 
 from splatjax import diffusion as _diffusion, splatting as _splatting
-from splatjax._chunking import rounded_up
+from splatjax._chunking import Result, rounded_up
 from splatjax._combination import DeviceMesh, OneDevice
 from splatjax.cache import kept
 from splatjax.scene import (
@@ -51,9 +50,6 @@ class RenderSettings(eqx.Module):
     rasterizer: _splatting.AbstractRasterizer = _splatting.TileRasterizer()
     diffuser: _diffusion.AbstractDiffuser = _diffusion.ClusterDiffuser()
     lighting: AbstractLighting = LightAtSplats()
-
-
-Whole = TypeVar("Whole", bound=PyTree)
 
 
 class Plan(eqx.Module):
@@ -223,7 +219,7 @@ def _check(scenes: list[Scene], cameras: list[Camera]) -> None:
             )
 
 
-def _on_one_device(tree: Whole) -> Whole:
+def _on_one_device(tree: Result) -> Result:
     """Gather what may lie on several devices, and on those of several processes, for planning."""
 
     def gathered(leaf):

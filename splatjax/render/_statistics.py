@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from splatjax import diffusion as _diffusion, splatting as _splatting
+from splatjax import diffusion as _diffusion
 from splatjax.scene import Parts, Splats
 
 _CHANGED = (
@@ -109,7 +109,3 @@ class StreamStatistics:
             fine=float(np.interp(rank, np.arange(len(finest)), finest)) if count else math.inf,
             unevenness=uneven / max(count, 1),
         )
-
-    def bounds(self, dtype) -> _splatting.Bounds:
-        """Return the sphere around all discs."""
-        return _splatting.Bounds(jnp.asarray(self.middle, dtype), jnp.asarray(self.reach, dtype))

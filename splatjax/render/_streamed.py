@@ -5,7 +5,6 @@ leave only sums behind.
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from typing import TypeAlias
 
 import equinox as eqx
 import jax
@@ -13,7 +12,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from splatjax import diffusion as _diffusion, splatting as _splatting
-from splatjax._chunking import take_points
 from splatjax._combination import PartByPart
 from splatjax.scene import (
     AbstractLight,
@@ -43,17 +41,6 @@ from ._plan import RenderSettings
 from ._shade import compose, shade
 from ._statistics import ReplayableStream, StreamStatistics
 
-Report: TypeAlias = Callable[[str, int], None]
-
-
-class _Map(eqx.Module):
-    """The view of one shadow map, and the light it belongs to."""
-
-    view: _splatting.AbstractView
-    group: int = eqx.field(static=True)
-    light: int = eqx.field(static=True)
-    cube: bool = eqx.field(static=True)
-
 
 def render_streamed(
     parts: Parts,
@@ -61,7 +48,7 @@ def render_streamed(
     material: Material,
     camera: Camera,
     settings: RenderSettings = RenderSettings(),
-    report: Report | None = None,
+    report: Callable[[str, int], None] | None = None,
 ) -> Frame:
     r"""Render splats that come a part at a time, in memory that does not grow with their number.
 
@@ -114,23 +101,33 @@ def render_streamed(
     check_channels(first)
     (first, camera), groups = in_one_dtype(first, camera), stack_lights(first.lights)
     dtype = first.splats.centers.dtype
-    bounds, view = statistics.bounds(dtype), _splatting.PerspectiveView.of(camera)
+    middle, reach = (jnp.asarray(of, dtype) for of in (statistics.middle, statistics.reach))
+    bounds, view = _splatting.Bounds(middle, reach), _splatting.PerspectiveView.of(camera)
 
-    # Pass 1: the shadow maps.
-    maps = _maps(first.lights, bounds, settings)
+    # Pass 1: the shadow maps of each light that casts shadows, in its group.
+    of_lights = [
+        plan_views([sample for _, sample in group], bounds, settings.shadows)[0]
+        if group[0][1].cast_shadows
+        else None
+        for group in lights_by_kind(first.lights)
+    ]
+    views, structure = jax.tree.flatten(
+        of_lights, is_leaf=lambda leaf: isinstance(leaf, _splatting.AbstractView)
+    )
     sums = _sum_views(
         scenes,
         "shadow maps",
-        [shadow.view for shadow in maps],
-        settings,
+        part_size,
+        views,
+        rasterizer,
+        settings.splatting,
         lambda scene: jnp.zeros((0, scene.splats.count), dtype),
     )
-    shadow_maps = [
-        _splatting.ShadowMap.of(of_view, shadow.view, settings.splatting)
-        for of_view, shadow in zip(sums, maps, strict=True)
-    ]
-
-    light = partial(_light, groups=groups, maps=maps, shadow_maps=shadow_maps, settings=settings)
+    shadow_maps = structure.unflatten(
+        _splatting.ShadowMap.of(of_view, seen_from, settings.splatting)
+        for of_view, seen_from in zip(sums, views, strict=True)
+    )
+    light = partial(_light, groups=groups, shadow_maps=shadow_maps, settings=settings)
 
     # Passes 2 and 3: what the camera sees.
     like = settings.lighting.attributes(first, *light(first))
@@ -138,8 +135,10 @@ def render_streamed(
     (seen,) = _sum_views(
         scenes,
         "what the camera sees",
+        part_size,
         [view],
-        settings,
+        rasterizer,
+        settings.splatting,
         lambda scene: stack_rows(settings.lighting.attributes(scene, *light(scene))),
     )
     visible, samples = _sample(seen, view, settings, like, bounds.center)
@@ -163,43 +162,31 @@ def render_streamed(
             centers = splats.centers.T - bounds.center[:, None]
             yield _diffusion.Sources(centers, splats.normals.T, splats.areas, irradiance.source)
 
-    layers = diffusion.evaluate(sources())
+    layers = diffusion.evaluate(sources(), first.material.channels)
 
     # Pass 5.
     planned = diffusion.gaussians, interval
     return _shade(first, view, groups, visible, samples, layers, *planned, settings)
 
 
-def _maps(
-    lights: tuple[AbstractLight, ...], bounds: _splatting.Bounds, settings: RenderSettings
-) -> list[_Map]:
-    maps = []
-    for i, group in enumerate(lights_by_kind(lights)):
-        samples = [sample for _, sample in group]
-        if samples[0].cast_shadows:
-            of_lights, cube = plan_views(samples, bounds, settings.shadows)
-            maps += [_Map(view, i, j, cube) for j, views in enumerate(of_lights) for view in views]
-    return maps
-
-
 def _sum_views(
     scenes: Callable[[str], Iterator[Scene]],
     task: str,
+    part_size: int,
     views: Sequence[_splatting.AbstractView],
-    settings: RenderSettings,
+    rasterizer: _splatting.TileRasterizer,
+    splatting: _splatting.SplattingSettings,
     rows: Callable[[Scene], Array],
 ) -> list[_splatting.FragmentSums]:
     """Sum the fragments of all parts in some views."""
     if not views:
         return []
-    rasterizer, splatting = settings.rasterizer, settings.splatting
-    assert isinstance(rasterizer, _splatting.TileRasterizer)
-    demands, count = [], 0
-    for scene in scenes("planning"):
-        count = scene.splats.count
-        demands.append([rasterizer.demand(scene.splats, view, splatting) for view in views])
+    demands = [
+        [rasterizer.demand(scene.splats, view, splatting) for view in views]
+        for scene in scenes("planning")
+    ]
     plans = [
-        rasterizer.plan_for([[part[k]] for part in demands], count, view)
+        rasterizer.plan_for([[part[k]] for part in demands], part_size, view)
         for k, view in enumerate(views)
     ]
 
@@ -207,7 +194,7 @@ def _sum_views(
         for scene in scenes(task):
             attributes = rows(scene)
             yield [
-                _part_sweep(plan, scene.splats, attributes, view, splatting)
+                plan.part_sweep(scene.splats, attributes, view, splatting)
                 for plan, view in zip(plans, views, strict=True)
             ]
 
@@ -216,29 +203,23 @@ def _sum_views(
 
 
 @eqx.filter_jit
-def _part_sweep(plan: _splatting.TilePlan, splats: Splats, attributes, view, splatting):
-    chosen, _ = plan.choose(splats, view)
-    attributes = take_points(attributes, chosen)
-    return plan.part_sweep(splats.take(chosen), attributes, view, splatting)
-
-
-@eqx.filter_jit
 def _light(
     scene: Scene,
     groups: list[StackedLights],
-    maps: Sequence[_Map],
-    shadow_maps: Sequence[_splatting.ShadowMap],
+    shadow_maps: Sequence[Sequence[Sequence[_splatting.ShadowMap]] | None],
     settings: RenderSettings,
 ) -> tuple[LightVisibility, Irradiance]:
     """Look a part up in the shadow maps of all parts."""
-    visibility: list = [
-        [0.0] * len(group.light_indices) if group.lights.cast_shadows else None for group in groups
+
+    def of_light(maps: Sequence[_splatting.ShadowMap]):
+        cube = len(maps) > 1
+        return sum(map_visibility(scene, each, settings.shadows, cube) for each in maps)
+
+    visibility = [
+        None if of_group is None else jnp.stack([of_light(maps) for maps in of_group])
+        for of_group in shadow_maps
     ]
-    for shadow, shadow_map in zip(maps, shadow_maps, strict=True):
-        of_group = visibility[shadow.group]
-        of_group[shadow.light] += map_visibility(scene, shadow_map, settings.shadows, shadow.cube)
-    stacked = [None if of_group is None else jnp.stack(of_group) for of_group in visibility]
-    light = LightVisibility(groups, stacked, jnp.zeros((), scene.splats.centers.dtype))
+    light = LightVisibility(groups, visibility, jnp.zeros((), scene.splats.centers.dtype))
     return light, irradiance_at_splats(scene, light)
 
 

@@ -24,10 +24,14 @@ _EXPECTED = {
 
 
 class AbstractLight(eqx.Module):
-    """A light: a distribution of samples, which are points or directions."""
+    """A light: a distribution of samples, which are points or directions.
+
+    **Attributes:** (of the class)
+
+    - `strength`: the field with the power of each channel.
+    """
 
     strength: ClassVar[str] = ""
-    """The field with the power of each channel."""
 
     def __check_init__(self):
         for name in (field.name for field in dataclasses.fields(self)):

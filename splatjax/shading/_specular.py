@@ -7,7 +7,6 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Float
 
 from splatjax._chunking import map_chunks
@@ -158,7 +157,7 @@ def _chebyshev_basis(x: Float[Array, "*points"], count: int) -> Float[Array, "ba
         return rows.at[n].set(following)
 
     rows = jnp.zeros((count, *x.shape), x.dtype).at[0].set(1).at[1].set(x)
-    return lax.fori_loop(2, count, add, rows)
+    return jax.lax.fori_loop(2, count, add, rows)
 
 
 @_chebyshev_basis.defjvp

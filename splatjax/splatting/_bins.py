@@ -51,17 +51,22 @@ class BinCapacity(eqx.Module):
 
 
 class Bins(eqx.Module):
-    """Items per tile. An empty slot holds the number of items, which is no item."""
+    """Items per tile.
+
+    **Attributes:**
+
+    - `ids`: of items; an empty slot holds the number of items, which is no item.
+    - `order`: the tile of each lane, chunk after chunk.
+    - `first_block`: of each chunk; the last entry is the number of all blocks.
+    - `needed`: capacity needed over planned; above 1 the lists are incomplete.
+    - `planned_lanes`: capacity of the leading chunks, in lanes; the lists beyond are empty. Static.
+    """
 
     ids: Int[Array, "blocks lanes slots"]
     order: Int[Array, " tiles"]
-    """The tile of each lane, chunk after chunk."""
     first_block: Int[Array, " chunks_and_one"]
-    """Of each chunk; the last entry is the number of all blocks."""
     needed: Float[Array, ""]
-    """Capacity needed over planned; above 1 the lists are incomplete."""
     planned_lanes: int = eqx.field(static=True)
-    """Capacity of the leading chunks, in lanes; the lists beyond are empty."""
 
     @property
     def chunks(self) -> Int[Array, ""]:

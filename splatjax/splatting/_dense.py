@@ -4,7 +4,6 @@ every derivative.
 
 import jax
 import jax.numpy as jnp
-from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float
 
 from splatjax._combination import AbstractCombination
@@ -47,7 +46,7 @@ class DenseRasterPlan(AbstractRasterPlan):
         columns = jnp.arange(view.width, dtype=dtype) + 0.5
         # The weight that a fragment behind the front needs to decide where that surface is.
         conic = footprints.a, footprints.b, footprints.c, footprints.nearness
-        least = stop_gradient(least_weight(type(view), *conic, settings.filter_radius))
+        least = jax.lax.stop_gradient(least_weight(type(view), *conic, settings.filter_radius))
 
         def picture_row(y: Float[Array, ""]):
             # Intersect the ray of every pixel with the plane of every splat: nearness and rho^2 are
@@ -80,7 +79,7 @@ class DenseRasterPlan(AbstractRasterPlan):
             in_front = summed(front)
             # Behind it, in pixels that it leaves open: the same among all others, from the nearest
             # that weighs something.
-            is_open = stop_gradient(in_front[-1]) < settings.full_coverage
+            is_open = jax.lax.stop_gradient(in_front[-1]) < settings.full_coverage
             rest = inside & ~front & is_open[:, None]
             weighty = nearest(rest & (weight > least[None]))
             limit = jnp.where(weighty > -jnp.inf, weighty, nearest(rest))

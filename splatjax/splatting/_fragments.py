@@ -22,14 +22,19 @@ _EMPTY = (0.0, 0.0, 0.0, 0.0, 1e12, 0.0, 1e12, 1.0, 0.0)  # covers no pixel cent
 
 
 class Lanes(eqx.Module):
-    """Tiles that are swept together: where their lists begin in the slots, and their corners."""
+    """Tiles that are swept together: where their lists begin in the slots, and their corners.
+
+    **Attributes:**
+
+    - `row`: of the lane's first block in `Slots`, whose arrays are `[blocks * lanes, slots]`; block
+      b is at `row + b * stride`.
+    - `lengths`: of the lane's chunk, in blocks; the blocks after it belong to the next chunk.
+    - `blocks`: the largest of the lengths.
+    - `x`, `y`: corners, pixels.
+    """
 
     row: Int[Array, " lanes"]
-    """Row of the lane's first block in `Slots`, whose arrays are `[blocks * lanes, slots]`; block b
-    is at `row + b * stride`.
-    """
     lengths: Int[Array, " lanes"]
-    """Of the lane's chunk, in blocks; the blocks after it belong to the next chunk."""
     blocks: Int[Array, ""]
     x: Float[Array, "lanes 1"]
     y: Float[Array, "lanes 1"]
@@ -51,10 +56,14 @@ class Lanes(eqx.Module):
 
 
 class Sweep(eqx.Module):
-    """The settings of a sweep, and its inner loops over the blocks of some lanes."""
+    """The settings of a sweep, and its inner loops over the blocks of some lanes.
+
+    **Attributes:**
+
+    - `view`: its class: fragments need the formulas of a view, not where it stands. Static.
+    """
 
     view: type[AbstractView] = eqx.field(static=True)
-    """The view's class: fragments need its formulas, not where it stands."""
     grid: TileGrid
     full_coverage: float = eqx.field(static=True)
     filter_radius: float = eqx.field(static=True)

@@ -104,13 +104,12 @@ class TileGrid(eqx.Module):
 
 
 class TileRanges(eqx.Module):
-    """The rectangle of tiles that each item touches."""
+    """The rectangle of tiles that each item touches; `down` is 0 for an item that touches none."""
 
     left: Int[Array, " items"]
     top: Int[Array, " items"]
     across: Int[Array, " items"]
     down: Int[Array, " items"]
-    """0 for an item that touches none."""
 
     @classmethod
     def of(
@@ -123,9 +122,8 @@ class TileRanges(eqx.Module):
         grid: TileGrid,
     ) -> "TileRanges":
         """Find the tiles with a pixel center inside each box (pixels)."""
-        across, down = (0, grid.width - 1), (0, grid.height - 1)
-        i0, i1 = _first(left, *across) / TILE_SIDE, _last(right, *across) / TILE_SIDE
-        j0, j1 = _first(top, *down) / TILE_SIDE, _last(bottom, *down) / TILE_SIDE
+        i0, i1 = (pixel / TILE_SIDE for pixel in _between(left, right, grid.width))
+        j0, j1 = (pixel / TILE_SIDE for pixel in _between(top, bottom, grid.height))
         touched = visible & (i0 <= i1) & (j0 <= j1)
         i0, i1, j0, j1 = (jnp.floor(edge).astype(jnp.int32) for edge in (i0, i1, j0, j1))
         return cls(i0, j0, jnp.where(touched, i1 - i0 + 1, 0), jnp.where(touched, j1 - j0 + 1, 0))
@@ -153,11 +151,11 @@ class TileRanges(eqx.Module):
         return jnp.pad(counts, (0, grid.padded_count - counts.shape[0]))
 
 
-def _first(edge: Float[Array, " items"], first: int, last: int) -> Float[Array, " items"]:
-    """Return the first pixel whose center is not before an edge; `last + 1` if none is."""
-    return jnp.clip(jnp.ceil(edge - 0.5), first, last + 1)
-
-
-def _last(edge: Float[Array, " items"], first: int, last: int) -> Float[Array, " items"]:
-    """Return the last pixel whose center is not behind an edge; `first - 1` if none is."""
-    return jnp.clip(jnp.floor(edge - 0.5), first - 1, last)
+def _between(
+    low: Float[Array, " items"], high: Float[Array, " items"], count: int
+) -> tuple[Float[Array, " items"], Float[Array, " items"]]:
+    """Return the first and the last of `count` pixels whose centers are not outside of two edges;
+    the last comes before the first if there is none.
+    """
+    first = jnp.clip(jnp.ceil(low - 0.5), 0, count)
+    return first, jnp.clip(jnp.floor(high - 0.5), -1, count - 1)

@@ -20,12 +20,9 @@ from ._views import (
 
 
 class PerspectiveView(AbstractView):
-    """What a pinhole camera sees."""
+    """What a pinhole camera sees; `focal_length` is in pixels."""
 
-    position: Float[Array, "3"]
-    rotation: Float[Array, "3 3"]
     focal_length: Float[Array, ""]
-    """In pixels."""
     width: int = eqx.field(static=True)
     height: int = eqx.field(static=True)
     near: float = eqx.field(static=True)
@@ -178,13 +175,10 @@ class PerspectiveView(AbstractView):
 
 class OrthographicView(AbstractView):
     """What a light at infinity sees. `position` is seen at the center of the picture, at
-    depth 0.
+    depth 0; `scale` is in pixels per mm.
     """
 
-    position: Float[Array, "3"]
-    rotation: Float[Array, "3 3"]
     scale: Float[Array, ""]
-    """Pixels per mm."""
     width: int = eqx.field(static=True)
     height: int = eqx.field(static=True)
 

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.lax import stop_gradient
 from jaxtyping import Array, Float
 
 from splatjax._chunking import AT_ONCE, jit_unless_traced, map_chunks
@@ -79,7 +78,7 @@ def _rotation_towards(forward: Float[Array, "3"]) -> Float[Array, "3 3"]:
     not along an axis' flip.
     """
     up = jnp.where(
-        jnp.abs(stop_gradient(forward[1])) < 0.9,
+        jnp.abs(jax.lax.stop_gradient(forward[1])) < 0.9,
         jnp.asarray([0.0, 1.0, 0.0], forward.dtype),
         jnp.asarray([1.0, 0.0, 0.0], forward.dtype),
     )
@@ -232,7 +231,7 @@ def _compared(
 ) -> Float[Array, " splats"]:
     """Compare with depth and coverage of both surfaces of a map."""
     x, y, depth, slope_x, slope_y = landed
-    column, row = jnp.floor(stop_gradient(x)), jnp.floor(stop_gradient(y))
+    column, row = jnp.floor(jax.lax.stop_gradient(x)), jnp.floor(jax.lax.stop_gradient(y))
     tx, ty = x - column - 0.5, y - row - 0.5
 
     # Nine pixels around each splat, side by side: [across, down, splats].

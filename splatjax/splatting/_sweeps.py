@@ -13,7 +13,6 @@ from functools import partial
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from splatjax._chunking import jit_unless_traced, needed_over_planned, zeros_after
@@ -139,7 +138,7 @@ class PartSweep(eqx.Module):
             return limits.at[order[lane_numbers]].set(new, mode="drop")
 
         limits = zeros_after(self.slots.shift, (grid.count, TILE_SIDE**2), dtype) - jnp.inf
-        limits = lax.fori_loop(jnp.int32(0), self.bins.chunks, chunk, limits)
+        limits = jax.lax.fori_loop(jnp.int32(0), self.bins.chunks, chunk, limits)
         lengths = jnp.repeat(jnp.diff(self.bins.first_block), grid.lanes)
         return limits, jnp.zeros(grid.count, jnp.int32).at[order].set(lengths, mode="drop")
 
@@ -197,7 +196,7 @@ class PartSweep(eqx.Module):
         ends = jnp.arange(1, len(tiles) + 1, dtype=jnp.int32)
         last = jnp.max(jnp.where(tiles < grid.count, ends, 0), initial=0)
         rounds = -(-last // grid.lanes)
-        return lax.fori_loop(jnp.zeros_like(rounds), rounds, step, out)
+        return jax.lax.fori_loop(jnp.zeros_like(rounds), rounds, step, out)
 
 
 def sum_parts(
@@ -268,11 +267,11 @@ def _taken(whole: Array, places: Int[Array, " places"], fill) -> Array:
 
 def _sliced(whole, place, size: int):
     """Read so many rows from a place on."""
-    return jax.tree.map(lambda rows: lax.dynamic_slice_in_dim(rows, place, size), whole)
+    return jax.tree.map(lambda rows: jax.lax.dynamic_slice_in_dim(rows, place, size), whole)
 
 
 def _write(out, parts, place):
     """Write parts from a place on."""
     return jax.tree.map(
-        lambda whole, part: lax.dynamic_update_slice_in_dim(whole, part, place, 0), out, parts
+        lambda whole, part: jax.lax.dynamic_update_slice_in_dim(whole, part, place, 0), out, parts
     )

@@ -8,10 +8,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.lax import stop_gradient
 from jaxtyping import Array, Float, Int
 
-from splatjax._chunking import map_chunks, needed_over_planned, with_spare
+from splatjax._chunking import map_chunks, needed_over_planned, take_points, with_spare
 from splatjax._combination import AbstractCombination, OneDevice
 from splatjax.scene import Splats
 
@@ -134,6 +133,7 @@ class TilePlan(AbstractRasterPlan):
         sweep, *binned = self._bin(splats, attributes, view, settings)
         return sum_tile_fragments(sweep, self.places, combination, *binned)
 
+    @eqx.filter_jit
     def part_sweep(
         self,
         splats: Splats,
@@ -141,8 +141,12 @@ class TilePlan(AbstractRasterPlan):
         view: AbstractView,
         settings: SplattingSettings,
     ) -> PartSweep:
-        """Prepare the stages of the sweep for one of several parts of the splats."""
-        sweep, bins, *binned = self._bin(splats, attributes, view, settings)
+        """Prepare the stages of the sweep for those of one of several parts of the splats that the
+        view may see.
+        """
+        chosen, _ = self.choose(splats, view)
+        seen = splats.take(chosen), take_points(attributes, chosen)
+        sweep, bins, *binned = self._bin(*seen, view, settings)
         return PartSweep(sweep, bins, Slots.gathered(*binned, bins))
 
     def _bin(self, splats: Splats, attributes, view: AbstractView, settings: SplattingSettings):
@@ -154,7 +158,7 @@ class TilePlan(AbstractRasterPlan):
         return (
             Sweep(type(view), grid, settings.full_coverage, settings.filter_radius),
             bin_items(footprints.ranges(grid), grid, self.bins),
-            stop_gradient(footprints.shift),
+            jax.lax.stop_gradient(footprints.shift),
             tuple(getattr(footprints, name) for name in PLANES),
             attributes.T,
         )

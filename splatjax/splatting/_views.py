@@ -44,8 +44,15 @@ class SplattingSettings(eqx.Module):
 
 
 class Footprints(eqx.Module):
-    """The projected splats, one array per number. Pixels, origin top left, unless said
-    otherwise.
+    """The projected splats, one array per number. Pixels, origin top left, unless said otherwise.
+
+    **Attributes:**
+
+    - `shift`: how the surface is moved away by epsilon (3.1): a factor on nearness in perspective,
+      subtracted from it in an orthographic view. Not differentiated.
+    - `opacity`: what the screen filter leaves of the peak weight: 1 for large frontal splats, 0
+      edge on.
+    - `left`, `right`, `top`, `bottom`: the rim's bounding box. Not differentiated.
     """
 
     x: Float[Array, " splats"]
@@ -57,16 +64,11 @@ class Footprints(eqx.Module):
     c: Float[Array, " splats"]
     nearness: Float[Array, " splats"]
     shift: Float[Array, " splats"]
-    """How the surface is moved away by epsilon (3.1): a factor on nearness in perspective,
-    subtracted from it in an orthographic view. Not differentiated.
-    """
     opacity: Float[Array, " splats"]
-    """What the screen filter leaves of the peak weight: 1 for large frontal splats, 0 edge on."""
     left: Float[Array, " splats"]
     right: Float[Array, " splats"]
     top: Float[Array, " splats"]
     bottom: Float[Array, " splats"]
-    """The rim's bounding box. Not differentiated."""
     visible: Bool[Array, " splats"]
 
     def ranges(self, grid: TileGrid) -> TileRanges:
@@ -136,8 +138,16 @@ MARGIN = 8.0
 
 
 class AbstractView(eqx.Module):
-    """A projection of the world onto pixels."""
+    """A projection of the world onto pixels.
 
+    **Attributes:**
+
+    - `position`: mm.
+    - `rotation`: world to view; its rows are the right, down and forward axes.
+    """
+
+    position: Float[Array, "3"]
+    rotation: Float[Array, "3 3"]
     width: eqx.AbstractVar[int]
     height: eqx.AbstractVar[int]
 

@@ -74,13 +74,6 @@ class LayeredMedia(eqx.Module):
         first = next(number for number, layer in enumerate(layers) if isinstance(layer, Layer))
         return cls(sigma_a, sigma_s, thickness, jnp.concatenate([above, eta, below]), first)
 
-    @property
-    def unit(self) -> Float[Array, " channels"]:
-        """The free path between scatterings in the first layer that scatters, mm: the unit of
-        length of walks.
-        """
-        return 1 / self.sigma_s[self.first]
-
     def shared_walks(self) -> list[np.ndarray]:
         """Group the channels, by number, that differ in absorption and in scale alone: they share a
         walk.
@@ -300,7 +293,8 @@ def _walk_of(
     with_derivatives: bool,
 ) -> Walk:
     """Set up the walk of a group of channels, in the free paths of the first of them."""
-    unit = media.unit[group]
+    # The unit of length: the free path between scatterings in the first layer that scatters, mm.
+    unit = 1 / media.sigma_s[media.first, group]
     coefficients = media.sigma_a[:, group], media.sigma_s[:, group]
     thickness, eta = media.thickness[:, group[0]], media.eta[:, group[0]]
     stack = Stack(media.sigma_s[:, group[0]] * unit[0], thickness / unit[0], eta)
