@@ -21,10 +21,10 @@ from splatjax.geometry import Mesh, complexion
 from splatjax.splatting import PerspectiveView
 
 SIZE = 192
+# The wider first: layers keep the order of the Gaussians.
 TWO = sj.SumOfGaussians(
     jnp.asarray([3.0, 0.5], float), jnp.asarray([[0.5, 0.6, 0.7], [0.5, 0.4, 0.3]], float)
 )
-"""The wider first: layers keep the order of the Gaussians."""
 DULL = sj.Material(TWO, specular=0.0)
 FRONTAL = sj.DirectionalLight(jnp.asarray([0.0, 0.0, -1.0]), jnp.ones(3), cast_shadows=False)
 STILL = baselines.TextureSpaceSettings(

@@ -15,13 +15,13 @@ from stand_ins import lay_out
 from splatjax.cli import main
 from splatjax.cli._main import parsed
 
+# Options that make a command quick; the last one given counts.
 SMALL = {
     "render": ["--width", "32", "--height", "32"],
     "turntable": ["--width", "32", "--height", "32", "--frames", "2"],
     "sample": ["--count", "1500"],
     "recover": ["--count", "3", "--no-suggest"],
 }
-"""Options that make a command quick; the last one given counts."""
 
 NOT_RUN = {
     "make": (

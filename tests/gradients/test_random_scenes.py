@@ -42,12 +42,11 @@ class Shape:
 
     splats: int
     gaussians: int
+    # One letter each: d directional, s with shadow; p point, q with shadow, c with shadow among the
+    # splats; b beam.
     lights: str
-    """One letter each: d directional, s with shadow; p point, q with shadow, c with shadow among
-    the splats; b beam.
-    """
+    # a albedo, s specular, r roughness.
     maps: str = ""
-    """a albedo, s specular, r roughness."""
     channels: int = 1
     width: int = 9
     height: int = 8

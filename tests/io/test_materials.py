@@ -21,11 +21,11 @@ from splatjax.io import (
 from splatjax.scattering import Dipole, Film, Layer, LayeredMultipole, Medium, SingleScattering
 from splatjax.scene import Material
 
+# Eight digits are shipped; the rest is the freedom of an optimum.
 REPRODUCED = 1e-5
-"""Eight digits are shipped; the rest is the freedom of an optimum."""
 
+# Sums of weights with eight digits, in float32.
 HELD = 5e-7
-"""Sums of weights with eight digits, in float32."""
 
 FITTED = tuple(name for name in list_materials() if name not in ("skin", "marble_gems"))
 GOOD_MEDIUM = '[medium]\nunit = "1/mm"\nsigma_a = [0.1]\nsigma_s_prime = [1.0]\neta = 1.3\n'

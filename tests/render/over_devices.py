@@ -16,8 +16,8 @@ from benchmarks.communication import Picture, View, counted
 from splatjax.splatting import ShadowSettings
 
 SETTINGS = sj.RenderSettings(shadows=ShadowSettings(resolution=32))
+# mm; where the balls stand, away from the origin of all coordinates.
 PLACE = np.asarray([40.0, -25.0, 15.0])
-"""mm; where the balls stand, away from the origin of all coordinates."""
 
 
 def scene(count: int = 1501, variances=(0.1, 12.5, 100.0)) -> sj.Scene:

@@ -153,10 +153,10 @@ BEAM = 1.0
 HALF_WIDTH = 9.0
 PIXELS = 144
 COUNT = 3
+# A photograph has no error of ours; the error bars here are a thousandth of a coefficient.
 FINE = sj.RenderSettings(diffuser=ClusterDiffuser(error=2e-4))
-"""A photograph has no error of ours; the error bars here are a thousandth of a coefficient."""
+# Of a pixel, in shares of the peak, beside shot noise of the same size at the peak.
 NOISE = 1e-2
-"""Of a pixel, in shares of the peak, beside shot noise of the same size at the peak."""
 
 
 def photograph(medium: sj.Medium) -> np.ndarray:
