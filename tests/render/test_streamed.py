@@ -163,15 +163,14 @@ def test_what_cannot_be_streamed_is_refused(splats):
 VARIANCES = (0.01, 4.0, 60.0)
 
 
-def ball_over_sheet(gaussians, single=None) -> sj.Scene:
+def ball_over_sheet(gaussians) -> sj.Scene:
     """Before a sheet, so that one surface shows behind the other; one layer is narrower than the
     splats.
     """
     both = joined(sphere(200, 6.0, jitter=0.0), sheet(12.0, 2.0, center=(0.0, 0.0, -8.0)))
     albedo = np.random.default_rng(1).uniform(0.3, 0.9, (both.count, 2))
     light = sj.DirectionalLight([-0.5, -0.3, -1.0], [2.0, 3.0], cast_shadows=False)
-    material = sj.Material(gaussians, single_scattering=single)
-    return sj.Scene(with_albedo(both, albedo), (light,), material)
+    return sj.Scene(with_albedo(both, albedo), (light,), sj.Material(gaussians))
 
 
 def gaussians_of(weights) -> sj.SumOfGaussians:
@@ -222,13 +221,3 @@ def test_its_derivative_is_that_of_the_picture(planned):
     back = jax.vjp(beauty, gaussians)[1](picture)[0]
     along = sum(jax.tree.leaves(jax.tree.map(jnp.vdot, back, way)))
     np.testing.assert_allclose(along, jnp.vdot(picture, slope), rtol=1e-3)
-
-
-def test_single_scattering_is_refused():
-    medium = sj.Medium(jnp.asarray([0.1, 0.1]), jnp.asarray([1.0, 1.0]), jnp.asarray([1.3, 1.3]))
-    with pytest.raises(ValueError, match=r"scene\.material has single scattering"):
-        sj.diffusion_basis(
-            ball_over_sheet(gaussians_of(ONE), sj.SingleScattering(medium)),
-            camera_over(14.0, 24),
-            PLAIN,
-        )
