@@ -11,7 +11,6 @@ from bodies import PLAIN
 
 import splatjax as sj
 from splatjax.baselines import bust_with_textures
-from splatjax.fitting import GivenVariances
 from splatjax.inverse import Candidate, Observation
 from splatjax.render._checks import check_displayable
 from splatjax.transport import HenyeyGreenstein
@@ -65,7 +64,7 @@ RECORDS = {
     "Observation": lambda: Observation(np.ones((2, 2, 3)), camera(), [light()], deviation=0.01),
     "Candidate": lambda: Candidate("front", camera(), light()),
     "HenyeyGreenstein": lambda: HenyeyGreenstein([0.5, 0]),
-    "GivenVariances": lambda: GivenVariances((0.1, 2)),
+    "GivenVariances": lambda: sj.fitting.GivenVariances((0.1, 2)),
 }
 
 

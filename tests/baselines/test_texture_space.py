@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from bodies import camera_over, hits
 from jax.test_util import check_grads
 from planes import HALF, coordinates, gathered, painted, plane, splatted
 
@@ -46,7 +45,9 @@ def off_by(stretch: float, correction: baselines.AbstractStretch) -> float:
     """
     settings = dataclasses.replace(STILL, stretch=correction)
     mesh = baselines.TexturedMesh.of(plane(stretch), painted(stretch, SIZE))
-    plan = baselines.plan_texture_space(mesh, (FRONTAL,), DULL, camera_over(6.0, 8), settings)
+    plan = baselines.plan_texture_space(
+        mesh, (FRONTAL,), DULL, bodies.camera_over(6.0, 8), settings
+    )
     line = np.linspace(-HALF / 2, HALF / 2, 16)
     points = np.stack(np.meshgrid(line, line, [0.0]), axis=-1).reshape(-1, 3)
     ours, lost = diffused(mesh, settings, plan, jnp.asarray(coordinates(points, stretch), float))
@@ -78,7 +79,7 @@ def sheet():
         kernel=EscapeNormalization(),
     )
     lights = (dataclasses.replace(FRONTAL, cast_shadows=True),)
-    camera = camera_over(15.0, 32)
+    camera = bodies.camera_over(15.0, 32)
     plan = baselines.plan_texture_space(mesh, lights, DULL, camera, settings)
     return mesh, lights, camera, settings, plan
 
@@ -103,7 +104,7 @@ def test_constant_light_stays_constant_up_to_the_edges(sheet):
 @pytest.mark.once
 @pytest.mark.long
 def test_beyond_its_capacity_the_picture_is_nan():
-    mesh, camera = baselines.TexturedMesh.of(plane(1.0)), camera_over(15.0, 16)
+    mesh, camera = baselines.TexturedMesh.of(plane(1.0)), bodies.camera_over(15.0, 16)
     settings = dataclasses.replace(STILL, resolution=24)
     plan = baselines.plan_texture_space(mesh, (FRONTAL,), DULL, camera, settings)
     small = dataclasses.replace(plan, camera=10)
@@ -156,7 +157,7 @@ def test_through_a_slab_comes_what_comes_through_splats():
     settings = dataclasses.replace(
         settings, thin_parts=baselines.TranslucentShadowMap(), kernel=EscapeNormalization()
     )
-    mesh, camera = baselines.TexturedMesh.of(slab(thickness)), camera_over(3.0, 4)
+    mesh, camera = baselines.TexturedMesh.of(slab(thickness)), bodies.camera_over(3.0, 4)
     lights = (sj.DirectionalLight([0, 0, 1], jnp.ones(3)),)
     found = baselines.render_texture_space(mesh, lights, DULL, camera, settings).frame
     ours = np.pi * np.asarray(found.layers)[:, 2, 2]
@@ -178,7 +179,7 @@ def test_through_a_slab_comes_what_comes_through_splats():
 def test_a_picture_has_the_derivatives_that_differences_say(float64):
     settings = dataclasses.replace(STILL, resolution=40)
     mesh = baselines.TexturedMesh.of(plane(1.4), painted(1.4, 24))
-    camera = camera_over(6.0, 8)
+    camera = bodies.camera_over(6.0, 8)
     lights = (dataclasses.replace(FRONTAL, direction=jnp.asarray([0.3, 0.2, -1.0])),)
     plan = baselines.plan_texture_space(mesh, lights, DULL, camera, settings)
     pattern = jnp.sin(jnp.arange(8.0 * 8 * 3)).reshape(8, 8, 3)
@@ -221,7 +222,7 @@ def corners():
 def test_a_slanted_plane_is_seen_where_its_rays_meet_it_and_has_no_cracks(corners):
     landing, seen = seen_from(CAMERA, corners)
     positions = baselines.interpolate(corners, seen, baselines.barycentrics(landing, seen))
-    expected, covered = hits(CAMERA), np.asarray(seen.covered)
+    expected, covered = bodies.hits(CAMERA), np.asarray(seen.covered)
     assert np.array_equal(covered, np.abs(expected).max(axis=2) < 12)
     assert 0.5 < np.mean(covered) < 1
     np.testing.assert_allclose(np.asarray(positions)[covered], expected[covered], atol=2e-4)

@@ -14,6 +14,7 @@ import jax
 import numpy as np
 import pytest
 from commands import ball
+from processes import FINDS
 from rich.console import Console
 
 from splatjax.cli import _terminal
@@ -29,7 +30,7 @@ def start(words, cache):
     """Run a command whose stderr is a terminal; return the process and the terminal's other end."""
     seen, terminal = pty.openpty()
     environment = {key: os.environ[key] for key in os.environ.keys() - {"NO_COLOR"}}
-    environment |= {"XDG_CACHE_HOME": str(cache), "PYTHONPATH": str(SCRIPT.parents[2])}
+    environment |= FINDS | {"XDG_CACHE_HOME": str(cache)}
     process = subprocess.Popen(
         [sys.executable, SCRIPT, "render", *map(str, words)],
         env=environment | COLORS,

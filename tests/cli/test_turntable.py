@@ -172,7 +172,6 @@ def run_processes(command, count, **environment):
     their statuses, and what they print on stdout and stderr.
     """
     environment |= {
-        "PYTHONPATH": str(SCRIPT.parents[2]),
         "JAX_COORDINATOR_ADDRESS": f"127.0.0.1:{free_port()}",
         "JAX_NUM_PROCESSES": str(count),
     }

@@ -26,9 +26,6 @@ from splatjax.fitting import (
     relative_error,
 )
 from splatjax.fitting._problem import make_problem
-from splatjax.gaussians import SumOfGaussians
-from splatjax.inverse import wide_variances
-from splatjax.io import load_medium
 from splatjax.scattering import L2_QUADRATURE, Dipole, EganFresnel, Layer, Medium, Multipole
 
 # Asked of the derivative; central differences with steps of 1e-4 relative err by 1e-7.
@@ -107,7 +104,7 @@ def test_where_the_fit_is_perfect_the_derivative_is_the_identity(float64):
 
     def again(log_variances):
         return jnp.log(
-            fit_gaussians(SumOfGaussians(jnp.exp(log_variances), weights), 2).gaussians.variances
+            fit_gaussians(sj.SumOfGaussians(jnp.exp(log_variances), weights), 2).gaussians.variances
         )
 
     point = jnp.log(jnp.asarray([0.1, 2.0]))
@@ -132,7 +129,7 @@ LOG_VARIANCES = jnp.asarray([-3.2, -1.9, 0.1, 2.2])
 
 
 def marble() -> Dipole:
-    return Dipole(load_medium("marble"))
+    return Dipole(sj.load_medium("marble"))
 
 
 @pytest.mark.parametrize(
@@ -177,7 +174,7 @@ def test_covariance_is_that_of_a_fit_of_all_parameters(float64):
     r = jnp.sqrt(problem.squared_radii)
 
     def residuals(parameters):
-        gaussians = SumOfGaussians(parameters[:3], parameters[3:].reshape(3, 3).T)
+        gaussians = sj.SumOfGaussians(parameters[:3], parameters[3:].reshape(3, 3).T)
         values = jnp.stack([gaussians(r[channel])[:, channel] for channel in range(3)])
         return (problem.target - problem.root_weights * values / problem.norm[:, None]).ravel()
 
@@ -199,7 +196,7 @@ def test_held_weights_do_not_vary_together(float64):
 
 
 def test_the_variance_of_a_gaussian_without_weight_is_anything(float64):
-    one = SumOfGaussians(jnp.asarray([1.0]), jnp.asarray([[0.5]]))
+    one = sj.SumOfGaussians(jnp.asarray([1.0]), jnp.asarray([[0.5]]))
     problem = make_problem(one, NonNegativeWeights(), L2_QUADRATURE)
     # Next to the truth: what the second Gaussian would add is negative.
     _, _, covariance = problem.outcome(jnp.log(jnp.asarray([0.9, 0.4])))
@@ -285,7 +282,7 @@ def test_non_negative_weights_of_a_held_sum_are_the_best_of_all_subsets(float64,
 
 def test_a_fit_with_weights_at_zero_converges_and_has_the_derivative_of_refits(float64):
     """Ketchup's channels lie so far apart that some weights vanish."""
-    medium = load_medium("ketchup")
+    medium = sj.load_medium("ketchup")
 
     def fit(scale):
         moved = Medium(medium.sigma_a * scale, medium.sigma_s_prime, medium.eta)
@@ -320,7 +317,7 @@ def test_with_the_variances_of_a_fit_they_are_its_weights(float64):
 
 def test_wide_variances_serve_all_media_near(float64):
     near = sj.Medium([0.02, 0.2], [1.0, 0.7], 1.3)
-    variances = wide_variances(
+    variances = sj.inverse.wide_variances(
         [near], sj.Splats(jnp.asarray(np.eye(3) * 1e4), jnp.eye(3), jnp.ones(3), jnp.ones(3))
     )
     assert len(variances) < 20

@@ -2,14 +2,22 @@
 
 from functools import cache, partial
 
-import bodies
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from bodies import PLAIN, assert_close, lights_from_two_sides as lights, view, with_albedo
+from bodies import (
+    PLAIN,
+    assert_close,
+    bumpy,
+    joined,
+    lights_from_two_sides as lights,
+    sphere,
+    view,
+    with_albedo,
+)
 
 import splatjax as sj
 from splatjax.inverse import _fit_scene
@@ -37,8 +45,8 @@ def material() -> sj.Material:
 @cache
 def body() -> sj.Splats:
     """A bumpy ball with a map, and one on either side that no picture shows."""
-    aside = [bodies.sphere(18, 4.0, center=(x, 0.0, 0.0)) for x in (-60.0, 60.0)]
-    splats = bodies.joined(bodies.bumpy(160), *aside)
+    aside = [sphere(18, 4.0, center=(x, 0.0, 0.0)) for x in (-60.0, 60.0)]
+    splats = joined(bumpy(160), *aside)
     return with_albedo(splats, np.random.default_rng(2).uniform(0.3, 0.9, (splats.count, 2)))
 
 
@@ -214,7 +222,7 @@ def stand_in(monkeypatch, reach: float, spoiled: float = np.inf) -> list[float]:
     Gives the albedos for which plans are made.
     """
     made = []
-    splats = bodies.sphere(20)
+    splats = sphere(20)
     plan = sj.make_plan(sj.Scene(splats, lights()[0], material()), camera(), PLAIN)
 
     def make_plans(setups, material, settings):
@@ -239,7 +247,7 @@ def lifted(target: float, settings, spoilt=(), **more) -> tuple[sj.inverse.Fitte
 
     A part of the picture is masked, and of another part nothing is known; some rows may be spoilt.
     """
-    splats, said = with_albedo(bodies.sphere(20), np.full((20, 2), 0.5)), []
+    splats, said = with_albedo(sphere(20), np.full((20, 2), 0.5)), []
     picture = np.full((SIZE, SIZE, 2), target)
     picture[list(spoilt)] = 90.0
     picture[:5], picture[5, :, 1] = 90.0, np.nan
@@ -319,9 +327,9 @@ def test_pixels_that_a_body_does_not_fill_count_before_black_alone():
             {"parts": (sj.inverse.AlbedoMap(), sj.inverse.AlbedoMap(1.0))},
             "parts are AlbedoMap, AlbedoMap",
         ),
-        ({"splats": bodies.sphere(20)}, r"splats\.albedo is None, and AlbedoMap has nothing"),
+        ({"splats": sphere(20)}, r"splats\.albedo is None, and AlbedoMap has nothing"),
         (
-            {"splats": bodies.sphere(16), "parts": (sj.inverse.NormalOffsets(0.1, 1.0, 1.0),)},
+            {"splats": sphere(16), "parts": (sj.inverse.NormalOffsets(0.1, 1.0, 1.0),)},
             "number of splats must be at least 17 for NormalOffsets.*got 16",
         ),
         ({"channels": 3}, r"observations\[0\]\.picture has 3 channels, material has 2"),
@@ -338,7 +346,7 @@ def test_what_cannot_be_fitted_is_refused(change, said):
         "observations": [
             sj.inverse.Observation(picture, camera(), lights()[0], intensity=intensity)
         ],
-        "splats": with_albedo(bodies.sphere(20), np.full((20, 2), 0.5)),
+        "splats": with_albedo(sphere(20), np.full((20, 2), 0.5)),
         "parts": [sj.inverse.AlbedoMap()],
         "steps": 1,
     }

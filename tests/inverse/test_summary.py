@@ -7,12 +7,11 @@ import optimistix as optx
 import pytest
 
 import splatjax as sj
-from splatjax.inverse import Recovery
 
 
 def recovery(
     information, chi_squared=1.0, noise_is_known=True, channels=1, unresolved=0.0, width=None
-) -> Recovery:
+) -> sj.inverse.Recovery:
     """Make a recovery of which nothing else is known; `width` is the information about the width
     below which layers are unresolved.
     """
@@ -24,7 +23,7 @@ def recovery(
         )
     medium = sj.Medium(jnp.full(channels, 0.02), 1.5, 1.3)
     gaussians = sj.SumOfGaussians([1], jnp.full((1, channels), 0.5))
-    return Recovery(
+    return sj.inverse.Recovery(
         medium=medium,
         material=sj.Material(gaussians),
         intensities=jnp.ones((1, channels)),

@@ -13,9 +13,7 @@ from scipy.spatial import ConvexHull, Voronoi
 import splatjax as sj
 from splatjax._combination import OneDevice
 from splatjax.diffusion import POINTS_PER_BLOCK, ClusterDiffuser, Sources, compact_order
-from splatjax.fitting import fit_medium
 from splatjax.render._filling import arrange
-from splatjax.scattering import measure_laser_dot
 
 EXACT = sj.RenderSettings(diffuser=ClusterDiffuser(error=0.0))
 VARIANCES = [
@@ -182,9 +180,9 @@ def test_a_rendered_dot_gives_the_coefficients_back_within_their_error_bars():
     with jax.enable_x64(True):
         medium = sj.Medium(jnp.asarray([0.02]), jnp.asarray([1.2]), jnp.asarray([1.4]))
         image = photograph(medium)
-        dot = measure_laser_dot(image, 2 * HALF_WIDTH / PIXELS, power=POWER)
+        dot = sj.scattering.measure_laser_dot(image, 2 * HALF_WIDTH / PIXELS, power=POWER)
         start = sj.Medium(medium.sigma_a * 3, medium.sigma_s_prime / 2, medium.eta)
-        found = fit_medium(dot.profile, start, beam_variance=BEAM, count=COUNT)
+        found = sj.fitting.fit_medium(dot.profile, start, beam_variance=BEAM, count=COUNT)
     errors = np.sqrt(np.diagonal(np.asarray(found.covariance), axis1=1, axis2=2))
     truth, back = (np.stack([m.sigma_a, m.sigma_s_prime], axis=1) for m in (medium, found.medium))
     away = np.log(back / truth) / errors

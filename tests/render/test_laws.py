@@ -23,7 +23,6 @@ from bodies import (
 import splatjax as sj
 from splatjax.diffusion import ClusterDiffuser, DenseDiffuser
 from splatjax.render import _checks
-from splatjax.scattering import SingleScattering
 
 EXITANCE_TOLERANCE = 1e-3
 TILES = sj.RenderSettings(diffuser=DenseDiffuser())
@@ -208,7 +207,9 @@ COLORS = (0.25, 0.5, 1.0)
 def with_single_scattering(eta=1.3):
     medium = sj.Medium([0.1, 0.02, 0.5], [0.9, 0.98, 0.5], jnp.full(3, eta))
     gaussians = sj.SumOfGaussians([1.0, 4.0], [[0.1, 0.2, 0.05], [0.1, 0.3, 0.02]])
-    return sj.Material(gaussians, eta=eta, specular=0.0, single_scattering=SingleScattering(medium))
+    return sj.Material(
+        gaussians, eta=eta, specular=0.0, single_scattering=sj.SingleScattering(medium)
+    )
 
 
 def picture(with_single_scattering):
@@ -250,7 +251,7 @@ def test_no_more_leaves_than_came_however_the_light_grazes(eta):
     mu = jnp.asarray([1.0, 0.5, 0.2, 0.05, 0.0])
     for absorbing in (0.0, 0.002, 0.1):
         medium = sj.Medium([absorbing], [1 - absorbing], eta)
-        single = SingleScattering(medium)
+        single = sj.SingleScattering(medium)
         rest = (0.95 if absorbing else 1.0) * (1 - single.total_reflectance())
         lit = sj.Material(sj.SumOfGaussians([1.0], rest[None]), single_scattering=single)
         for each in (lit, lit.white()):
