@@ -29,6 +29,9 @@ FRONTAL = sj.DirectionalLight(jnp.asarray([0.0, 0.0, -1.0]), jnp.ones(3), cast_s
 STILL = baselines.TextureSpaceSettings(
     SIZE, baselines.StretchCorrected(), baselines.OpaqueParts(), PlainMean()
 )
+THIN = dataclasses.replace(
+    STILL, thin_parts=baselines.TranslucentShadowMap(), kernel=EscapeNormalization()
+)
 
 
 @eqx.filter_jit
@@ -72,12 +75,7 @@ def test_on_a_plane_it_is_splat_diffusion_if_stretch_is_corrected(stretch, corre
 @pytest.fixture(scope="module")
 def sheet():
     mesh = baselines.TexturedMesh.of(plane(2.0))
-    settings = dataclasses.replace(
-        STILL,
-        resolution=64,
-        thin_parts=baselines.TranslucentShadowMap(),
-        kernel=EscapeNormalization(),
-    )
+    settings = dataclasses.replace(THIN, resolution=64)
     lights = (dataclasses.replace(FRONTAL, cast_shadows=True),)
     camera = bodies.camera_over(15.0, 32)
     plan = baselines.plan_texture_space(mesh, lights, DULL, camera, settings)
@@ -153,10 +151,7 @@ def slab(thickness: float) -> Mesh:
 @pytest.mark.long
 def test_through_a_slab_comes_what_comes_through_splats():
     """Lit from behind: the share and the gain are those of two sheets of splats."""
-    thickness, settings = 1.5, dataclasses.replace(STILL, resolution=96)
-    settings = dataclasses.replace(
-        settings, thin_parts=baselines.TranslucentShadowMap(), kernel=EscapeNormalization()
-    )
+    thickness, settings = 1.5, dataclasses.replace(THIN, resolution=96)
     mesh, camera = baselines.TexturedMesh.of(slab(thickness)), bodies.camera_over(3.0, 4)
     lights = (sj.DirectionalLight([0, 0, 1], jnp.ones(3)),)
     found = baselines.render_texture_space(mesh, lights, DULL, camera, settings).frame

@@ -12,7 +12,7 @@ import numpy as np
 import optimistix as optx
 import pytest
 import trimesh
-from commands import failure, plate, run
+from commands import plate, run
 from jax.experimental.compilation_cache import compilation_cache
 from pictures import write_picture
 from PIL import Image
@@ -264,17 +264,3 @@ def test_interrupted_or_unsettled_it_continues_where_it_was(command, search, tmp
     assert str(record) in capsys.readouterr().err  # of another search
     assert len(calls[2][2]) == 2
     assert not record.exists()
-
-
-@pytest.mark.parametrize(
-    ("words", "named"),
-    [
-        (["--output", "mine.exr"], "mine.exr"),
-        (["--eta", 0.9], "--eta is 0.9"),
-        (["--start", "skin"], "[medium]"),
-    ],
-)
-def test_options_are_checked_before_the_search(words, named, command, search, tmp_path, capsys):
-    assert named in failure([*command, *words], capsys)
-    assert not search[0]
-    assert not (tmp_path / "mine.toml").exists()

@@ -41,6 +41,7 @@ weights = [[0.3, 0.4], [0.2, 0.5]]
 [surface]
 eta = 1.5
 """,
+    "media.csv": "name,sigma_a,sigma_s_prime,eta\na,0.002,2.6,1.5\n",
 }
 REFUSED = {
     # Inputs that are missing, or something else.
@@ -86,7 +87,14 @@ REFUSED = {
     "turntable plate.ply --material marbel": ["marbel"],
     "fit marble --count 13": ["--count", "13"],
     "fit marble --error -1": ["--error", "-1"],
+    "recover plate.ply missing.toml --output mine.exr": ["mine.exr"],
+    "recover plate.ply missing.toml --output mine.toml --eta 0.9": ["--eta is 0.9"],
+    "recover plate.ply missing.toml --output mine.toml --start skin": ["[medium]"],
+    "fit media.csv --all": ["--output"],
+    "fit media.csv --all --output nowhere/fits.csv": ["no folder"],
+    "fit media.csv --all --output fits.csv --count 9": ["--count is 9"],
     # Options that have no effect, or do not go together.
+    "fit media.csv --all --output fits.csv --error 0.1": ["leave the other options out"],
     "fit dot.csv --model monte-carlo": ["--model", "dot.csv"],
     "fit dot.csv --power 2": ["--power", "dot.csv"],
     "fit dot.exr --mm-per-pixel 1 --single-scattering": ["--single-scattering", "dot.exr"],

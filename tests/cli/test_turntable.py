@@ -53,11 +53,6 @@ def around(splats, tmp_path_factory):
     return folder
 
 
-@pytest.fixture
-def copied(around, tmp_path):
-    return shutil.copytree(around, tmp_path / "turn")
-
-
 def test_frames_and_animation_are_made_by_one_program(splats, tmp_path, drawn, capsys):
     folder = tmp_path / "turn"
     assert run(*command(splats, folder)) == 0
@@ -137,7 +132,8 @@ def test_interrupted_frames_are_whole_and_the_rest_follows(
         assert film.info["duration"] == 100
 
 
-def test_frames_of_something_else_are_refused(splats, copied, tmp_path, drawn, capsys):
+def test_frames_of_something_else_are_refused(splats, around, tmp_path, drawn, capsys):
+    copied = shutil.copytree(around, tmp_path / "turn")
     before = contents(copied)
     line = failure(command(splats, copied, "--exposure", 1, turn="light"), capsys)
     assert all(part in line for part in ("--turn is light", "--exposure is 1.0", "--output"))

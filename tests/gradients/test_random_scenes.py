@@ -343,20 +343,20 @@ DEGENERATE = {
 }
 
 
-@pytest.mark.parametrize("case", DEGENERATE)
-def test_gradients_are_finite_at_degenerate_places(case):
-    world = typical(SHAPE)
-    for name, value in DEGENERATE[case].items():
+@pytest.mark.parametrize(
+    ("shape", "changes"),
+    [pytest.param(SHAPE, changes, id=case) for case, changes in DEGENERATE.items()]
+    + [
+        pytest.param(Shape(count, 1, lights, fast=False), {}, marks=pytest.mark.long)
+        for count, lights in ((0, "d"), (0, "s"), (1, "s"))
+    ],
+)
+def test_gradients_are_finite_at_degenerate_places_and_with_one_splat_or_none(shape, changes):
+    world = typical(shape)
+    for name, value in changes.items():
         leaf = named(world)[name]
         world = with_leaf(world, name, jnp.broadcast_to(jnp.asarray(value, leaf.dtype), leaf.shape))
-    assert is_finite(SHAPE, world)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(("count", "lights"), [(0, "d"), (0, "s"), (1, "s")])
-def test_gradients_are_finite_with_one_splat_and_with_none(count, lights):
-    shape = Shape(count, 1, lights, fast=False)
-    assert is_finite(shape, typical(shape))
+    assert is_finite(shape, world)
 
 
 @pytest.mark.parametrize("above", [0.0, 1e-14, 1e-7, 1e-5])

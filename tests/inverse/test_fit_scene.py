@@ -73,11 +73,6 @@ def observations(shots=None, x=None, **more) -> list[sj.inverse.Observation]:
     ]
 
 
-def only(*kinds: type) -> optax.GradientTransformation:
-    """Let nothing else move: so all fits of this file run one compiled picture."""
-    return optax.stateless(lambda updates, params: chosen(kinds, updates))
-
-
 def chosen(kinds, coordinates):
     return tuple(
         own if isinstance(part, kinds) else jax.tree.map(jnp.zeros_like, own)
@@ -86,8 +81,12 @@ def chosen(kinds, coordinates):
 
 
 def fitted(*kinds: type, steps: int, seen=None, splats=None, **more) -> sj.inverse.FittedScene:
+    """Fit some kinds of parts. Nothing else moves: all fits of this file run one compiled
+    picture.
+    """
     optimizer = optax.chain(
-        optax.adam(optax.cosine_decay_schedule(2.0, steps), b2=0.9), only(*kinds)
+        optax.adam(optax.cosine_decay_schedule(2.0, steps), b2=0.9),
+        optax.stateless(lambda updates, params: chosen(kinds, updates)),
     )
     seen = observations() if seen is None else seen
     splats = body() if splats is None else splats

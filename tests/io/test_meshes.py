@@ -191,8 +191,8 @@ def test_normals_end_at_hard_edges(tmp_path, body, kind, rounded):
         mesh.vertex_normals = np.array(mesh.vertex_normals)
         path = export(mesh, tmp_path, kind.split()[1])
     else:
-        options = {"ply": {"vertex_normal": False}, "obj": {"include_normals": False}}
-        options |= {"glb": {"include_normals": False}, "gltf": {"include_normals": False}}
+        without = {"include_normals": False}
+        options = {"ply": {"vertex_normal": False}, "obj": without, "glb": without, "gltf": without}
         path = export(mesh, tmp_path, kind, **options.get(kind.split(".")[-1], {}))
     splats = sample_mesh(path, COUNT, mm_per_unit=1.0, rounded=rounded)
     angles, distances = angles_to_body(splats, body)

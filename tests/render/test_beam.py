@@ -3,7 +3,6 @@ Gaussians; and the photograph of a laser dot gives the coefficients back.
 """
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -176,13 +175,13 @@ def photograph(medium: sj.Medium) -> np.ndarray:
 @pytest.mark.slow
 @pytest.mark.once
 @pytest.mark.long
+@pytest.mark.usefixtures("double")
 def test_a_rendered_dot_gives_the_coefficients_back_within_their_error_bars():
-    with jax.enable_x64(True):
-        medium = sj.Medium(jnp.asarray([0.02]), jnp.asarray([1.2]), jnp.asarray([1.4]))
-        image = photograph(medium)
-        dot = sj.scattering.measure_laser_dot(image, 2 * HALF_WIDTH / PIXELS, power=POWER)
-        start = sj.Medium(medium.sigma_a * 3, medium.sigma_s_prime / 2, medium.eta)
-        found = sj.fitting.fit_medium(dot.profile, start, beam_variance=BEAM, count=COUNT)
+    medium = sj.Medium([0.02], [1.2], [1.4])
+    image = photograph(medium)
+    dot = sj.scattering.measure_laser_dot(image, 2 * HALF_WIDTH / PIXELS, power=POWER)
+    start = sj.Medium(medium.sigma_a * 3, medium.sigma_s_prime / 2, medium.eta)
+    found = sj.fitting.fit_medium(dot.profile, start, beam_variance=BEAM, count=COUNT)
     errors = np.sqrt(np.diagonal(np.asarray(found.covariance), axis1=1, axis2=2))
     truth, back = (np.stack([m.sigma_a, m.sigma_s_prime], axis=1) for m in (medium, found.medium))
     away = np.log(back / truth) / errors

@@ -20,7 +20,7 @@ pytestmark = pytest.mark.once
 ROUNDING = 3e-5  # of the largest number of its kind: sums of a thousand terms, in another order
 LAYERS = 2.5e-2  # 99% of the pixels; at points here and at splats there, with clusters of each part
 RIMS = 0.1  # where a pixel blends two surfaces, 0.07 measured
-SHADOWS = ShadowSettings(resolution=32)
+SETTINGS = sj.RenderSettings(shadows=ShadowSettings(resolution=32))
 FIELDS = (
     "coverage",
     "depth",
@@ -69,8 +69,7 @@ def in_parts(splats, size):
 
 
 def test_parts_make_the_picture_of_all_at_once(splats, monkeypatch):
-    settings = sj.RenderSettings(shadows=SHADOWS)
-    whole = sj.render(sj.Scene(splats, LIGHTS, MATERIAL), CAMERA, settings)
+    whole = sj.render(sj.Scene(splats, LIGHTS, MATERIAL), CAMERA, SETTINGS)
     build, built, done = LayerSources.build, [], []
     counts = [300, 600, 900, 1200, 1500, 1800, 2100, 2200]
     monkeypatch.setattr(
@@ -81,7 +80,7 @@ def test_parts_make_the_picture_of_all_at_once(splats, monkeypatch):
         LIGHTS,
         MATERIAL,
         CAMERA,
-        settings,
+        SETTINGS,
         lambda what, count: done.append((what, count)),
     )
     assert streamed.overflow == 0
@@ -135,9 +134,8 @@ def test_the_first_part_or_all_may_have_no_area(splats, are_all):
         hidden = jax.tree.map(lambda leaf: leaf[:300], cloud)
         hidden = eqx.tree_at(lambda cloud: cloud.radii, hidden, jnp.zeros(300))
         cloud = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), hidden, splats)
-    settings = sj.RenderSettings(shadows=SHADOWS)
-    whole = sj.render(sj.Scene(cloud, LIGHTS, MATERIAL), CAMERA, settings)
-    streamed = sj.render_streamed(in_parts(cloud, 300), LIGHTS, MATERIAL, CAMERA, settings)
+    whole = sj.render(sj.Scene(cloud, LIGHTS, MATERIAL), CAMERA, SETTINGS)
+    streamed = sj.render_streamed(in_parts(cloud, 300), LIGHTS, MATERIAL, CAMERA, SETTINGS)
     assert float(whole.unresolved_fraction[-1]) == are_all
     for ours, theirs in zip(streamed.layers, whole.layers, strict=True):
         error = np.abs(ours - theirs)[np.asarray(whole.coverage) > 0] / np.max(theirs)

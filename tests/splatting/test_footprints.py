@@ -40,17 +40,11 @@ def scattered(count=60, seed=3):
     return bodies.splats(rng.uniform(-9, 9, (count, 3)), normals, rng.uniform(0.5, 5.0, count))
 
 
-def footprints_of(view, body, settings=SplattingSettings()):
-    footprints = jax.jit(lambda body: view.footprints(body, settings))(body)
-    box = footprints.left, footprints.right, footprints.top, footprints.bottom
-    return footprints, np.stack([np.asarray(each, float) for each in box])
-
-
 def around(box, reach, steps):
     """Columns and rows in and around every box, `[splats, samples]`."""
     grid = np.linspace(-reach, reach, steps)
     u, v = (each.reshape(1, -1) for each in np.meshgrid(grid, grid))
-    left, right, top, bottom = box[:, :, None]
+    left, right, top, bottom = (np.asarray(each, float)[:, None] for each in box)
     return (left + right + (right - left) * u) / 2, (top + bottom + (bottom - top) * v) / 2
 
 
@@ -86,7 +80,8 @@ def at_depth(view, x, y, depth):
 @pytest.mark.parametrize("kind", VIEWS)
 def test_fragments_are_where_rays_meet_discs(kind, dtype):
     view, body = FINE_VIEWS[kind](), scattered()
-    footprints, box = footprints_of(view, body, NO_FILTER)
+    footprints = jax.jit(lambda body: view.footprints(body, NO_FILTER))(body)
+    box = footprints.left, footprints.right, footprints.top, footprints.bottom
     x, y = around(box, 1.25, 17)
     _, squared_radius, depth = (np.asarray(each) for each in fragments(footprints, view, x, y))
     start = at_depth(view, x, y, 0.0)
