@@ -8,12 +8,11 @@ import os
 import re
 import subprocess
 import sys
-from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
-from commands import ball
+from commands import SCRIPT, ball
 from processes import FINDS
 from rich.console import Console
 
@@ -21,7 +20,6 @@ from splatjax.cli import _terminal
 
 pty = pytest.importorskip("pty")
 
-SCRIPT = Path(__file__).parent / "one_process.py"
 COLORS = {"TERM": "xterm-256color", "COLORTERM": "truecolor", "COLUMNS": "80", "LINES": "40"}
 HALF = re.compile(r"\x1b\[38;2;(\d+);(\d+);(\d+);48;2;(\d+);(\d+);(\d+)m(▀+)")
 

@@ -12,7 +12,7 @@ from unittest import mock
 import bodies
 import numpy as np
 import pytest
-from commands import ball, contents, failure, frame_names, run
+from commands import SCRIPT, ball, contents, failure, frame_names, run
 from PIL import Image
 from processes import free_port, run_together
 
@@ -159,7 +159,6 @@ def test_an_orbit_under_lights_that_stand_still_is_lit_once(splats, tmp_path, mo
     np.testing.assert_allclose(*(np.asarray(frame.beauty) for frame in frames), atol=1e-5)
 
 
-SCRIPT = Path(__file__).parent / "one_process.py"
 SHARED_FRAMES = 6
 
 

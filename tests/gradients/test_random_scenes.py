@@ -244,9 +244,11 @@ def roomy(plan: sj.Plan, shape: Shape) -> sj.Plan:
             size = (shape.width, shape.height) if of_camera else (SHADOWS.resolution,) * 2
             rasterizer = part.rasterizer
             tiles = TileGrid(*size, rasterizer.lanes).padded_count
-            room = _room(shape.splats, tiles, rasterizer.lanes, rasterizer.slots)
-            places = SurfaceCapacity(tiles, tiles)
-            return TilePlan(rasterizer, max(shape.splats, 1), BinCapacity(*room), places)
+            chunks = -(-tiles // rasterizer.lanes)
+            pairs = max(1024, -(-shape.splats * tiles // 1024) * 1024)
+            blocks = chunks * max(-(-shape.splats // rasterizer.slots), 1)
+            bins, places = BinCapacity(pairs, blocks, chunks), SurfaceCapacity(tiles, tiles)
+            return TilePlan(rasterizer, max(shape.splats, 1), bins, places)
         if isinstance(part, ClusterPlan):
             return dataclasses.replace(
                 part,
@@ -270,11 +272,6 @@ def far_reaching(neighbors: Neighbors) -> Neighbors:
     far = np.where(np.isfinite(reaches), 10 * FARTHEST, 0.0)
     lists = find_neighbors(*boxes, np.asarray(neighbors.layers), far.tolist())
     return Neighbors(lists, *boxes, neighbors.layers, jnp.full_like(reaches, 10 * FARTHEST))
-
-
-def _room(items: int, tiles: int, lanes: int, slots: int) -> tuple[int, int, int]:
-    chunks = -(-tiles // lanes)
-    return max(1024, -(-items * tiles // 1024) * 1024), chunks * max(-(-items // slots), 1), chunks
 
 
 def is_finite(shape: Shape, world: World, factors=None) -> bool:
@@ -313,8 +310,7 @@ def test_gradients_of_a_finite_loss_are_finite(shape):
     with jax.enable_x64(shape.precision == "float64"):
         typical(shape)  # which is kept: beartype draws numbers of its own as it is made
         check()
-    print(f"{len(finite)} scenes, {np.mean(finite):.0%} with a finite loss")
-    assert np.mean(finite) > 0.9
+    assert np.mean(finite) > 0.9, f"{len(finite)} scenes, {np.mean(finite):.0%} with a finite loss"
 
 
 SHAPE = SHAPES[0]  # in float32, on the fast path, a point light with a shadow map

@@ -240,9 +240,11 @@ def stand_in(monkeypatch, reach: float, spoiled: float = np.inf) -> list[float]:
     return made
 
 
-def lifted(target: float, settings, spoilt=(), **more) -> tuple[sj.inverse.FittedScene, list[str]]:
-    """Fit a stand-in that starts at 0.5; settings tell stand-ins apart that are otherwise alike to
-    the compiler.
+def lifted(
+    target: float, resolution: int, spoilt=(), **more
+) -> tuple[sj.inverse.FittedScene, list[str]]:
+    """Fit a stand-in that starts at 0.5; resolutions of shadow maps tell stand-ins apart that are
+    otherwise alike to the compiler.
 
     A part of the picture is masked, and of another part nothing is known; some rows may be spoilt.
     """
@@ -261,7 +263,7 @@ def lifted(target: float, settings, spoilt=(), **more) -> tuple[sj.inverse.Fitte
         parts,
         optimizer,
         steps=40,
-        settings=settings,
+        settings=sj.RenderSettings(shadows=ShadowSettings(resolution=resolution)),
         progress=lambda s, loss: said.append(s),
         **more,
     )
@@ -270,7 +272,7 @@ def lifted(target: float, settings, spoilt=(), **more) -> tuple[sj.inverse.Fitte
 
 def test_a_scene_that_outgrows_its_plan_is_planned_anew(monkeypatch):
     made = stand_in(monkeypatch, reach=0.07)
-    found, said = lifted(0.8, sj.RenderSettings(shadows=ShadowSettings(resolution=101)))
+    found, said = lifted(0.8, 101)
     assert found.plans == len(made) > 2
     assert (
         sum("exceeds the capacity of its plan; planning again" in each for each in said)
@@ -287,26 +289,23 @@ def test_a_robust_loss_is_not_misled_by_rows_that_shine(monkeypatch):
     than a deviation.
     """
     stand_in(monkeypatch, reach=np.inf)
-    settings = sj.RenderSettings(shadows=ShadowSettings(resolution=105))
-    found, _ = lifted(0.8, settings, spoilt=(8, 13), loss=sj.inverse.HuberLoss())
+    found, _ = lifted(0.8, 105, spoilt=(8, 13), loss=sj.inverse.HuberLoss())
     np.testing.assert_allclose(found.splats.albedo, 0.8, atol=0.01)
-    misled, _ = lifted(0.8, settings, spoilt=(8, 13))
+    misled, _ = lifted(0.8, 105, spoilt=(8, 13))
     assert float(jnp.min(misled.splats.albedo)) > 0.85
 
 
 def test_what_is_no_number_ends_the_fit_at_the_best_before_it(monkeypatch):
     stand_in(monkeypatch, reach=np.inf, spoiled=0.6)
-    settings = sj.RenderSettings(shadows=ShadowSettings(resolution=102))
     with pytest.raises(RuntimeError, match="Nonfinite"):
-        lifted(0.8, settings)
-    found, _ = lifted(0.8, settings, throw=False)
+        lifted(0.8, 102)
+    found, _ = lifted(0.8, 102, throw=False)
     assert 2 < len(found.losses) == found.best + 2 < 40
     assert 0.5 < float(jnp.mean(found.splats.albedo)) <= 0.6
     assert np.all(np.isfinite(found.pictures[0][6:]))
     stand_in(monkeypatch, reach=np.inf, spoiled=0.1)
-    settings = sj.RenderSettings(shadows=ShadowSettings(resolution=103))
     with pytest.raises(ValueError, match="loss or gradient of the start is not finite"):
-        lifted(0.8, settings)
+        lifted(0.8, 103)
 
 
 def test_pixels_that_a_body_does_not_fill_count_before_black_alone():
@@ -355,6 +354,5 @@ def test_what_cannot_be_fitted_is_refused(change, said):
 
 def test_a_picture_none_of_whose_pixels_counts_is_refused(monkeypatch):
     stand_in(monkeypatch, reach=np.inf)
-    settings = sj.RenderSettings(shadows=ShadowSettings(resolution=104))
     with pytest.raises(ValueError, match=r"no pixel of observations\[0\] counts"):
-        lifted(np.nan, settings, spoilt=range(0))
+        lifted(np.nan, 104, spoilt=range(0))

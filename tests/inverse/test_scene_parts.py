@@ -35,10 +35,9 @@ def test_a_rotation_has_a_derivative_where_there_is_none():
 
 
 def test_lights_move_each_in_its_own_way():
-    camera = sj.Camera.look_at([0, 0, 9], [0, 0, 0], width=4, height=4)
     beam = sj.GaussianBeam([1, 2, 3], [0, 0, -2], power=[4, 5], variance=1)
     lights = sj.PointLight([1, 2, 3], intensity=[4, 5]), beam
-    setup = Setup(bodies.sphere(20), camera, lights)
+    setup = Setup(bodies.sphere(20), CAMERA, lights)
     places, strengths = (
         sj.inverse.LightPlaces(turn=0.1, shift=2.0),
         sj.inverse.LightStrengths(step=0.5),

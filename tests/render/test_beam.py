@@ -185,8 +185,7 @@ def test_a_rendered_dot_gives_the_coefficients_back_within_their_error_bars():
     errors = np.sqrt(np.diagonal(np.asarray(found.covariance), axis1=1, axis2=2))
     truth, back = (np.stack([m.sigma_a, m.sigma_s_prime], axis=1) for m in (medium, found.medium))
     away = np.log(back / truth) / errors
-    print("relative errors", errors, "away, in these", away, "chi squared", found.chi_squared)
-    assert np.all(errors < 0.05)
-    assert np.all(np.abs(away) < 3)
+    assert np.all(errors < 0.05), errors
+    assert np.all(np.abs(away) < 3), away
     np.testing.assert_allclose(found.chi_squared, 1, atol=0.6)
     np.testing.assert_allclose(dot.center, PIXELS / 2, atol=0.1)

@@ -63,16 +63,11 @@ def test_a_lamp_among_the_splats_in_one_scene_has_six_faces_in_all():
 
 
 SCENE, OTHER = (scene_under(lamp(0, 0, -1), splats=sheet(half, 1.0)) for half in (5.0, 4.0))
-TWO_LAYERS = SCENE.material.gaussians
 
 
 @cache
 def planned() -> sj.Plan:
     return sj.make_plan(SCENE, CAMERA, SETTINGS)
-
-
-def one_device() -> jax.sharding.Mesh:
-    return jax.make_mesh((1,), ("devices",))
 
 
 SPLATS = f"for {SCENE.splats.count} splats, and the scene has {OTHER.splats.count}"
@@ -93,7 +88,7 @@ REFUSED = [
         "a DenseRasterizer works on one device",
     ),
     (
-        lambda: sj.render(SCENE, CAMERA, SETTINGS, planned(), mesh=one_device()),
+        lambda: sj.render(SCENE, CAMERA, SETTINGS, planned(), mesh=jax.make_mesh((1,), ("views",))),
         "the plan is for one device",
     ),
     (lambda: sj.render(OTHER, CAMERA, SETTINGS, planned()), SPLATS),
@@ -106,7 +101,7 @@ REFUSED = [
     ),
     (
         lambda: sj.map_over(
-            one_device(),
+            jax.make_mesh((1,), ("views",)),
             lambda one, each: each["a"],
             jnp.zeros(()),
             {"a": jnp.zeros(4), "b": jnp.zeros(())},
@@ -123,7 +118,8 @@ REFUSED = [
                 SCENE.splats,
                 SCENE.lights,
                 sj.Material(
-                    TWO_LAYERS, single_scattering=sj.SingleScattering(sj.Medium([0.1] * 3, 1, 1.3))
+                    two_gaussians(),
+                    single_scattering=sj.SingleScattering(sj.Medium([0.1] * 3, 1, 1.3)),
                 ),
             ),
             CAMERA,

@@ -40,14 +40,6 @@ def scattered(count=60, seed=3):
     return bodies.splats(rng.uniform(-9, 9, (count, 3)), normals, rng.uniform(0.5, 5.0, count))
 
 
-def around(box, reach, steps):
-    """Columns and rows in and around every box, `[splats, samples]`."""
-    grid = np.linspace(-reach, reach, steps)
-    u, v = (each.reshape(1, -1) for each in np.meshgrid(grid, grid))
-    left, right, top, bottom = (np.asarray(each, float)[:, None] for each in box)
-    return (left + right + (right - left) * u) / 2, (top + bottom + (bottom - top) * v) / 2
-
-
 @eqx.filter_jit
 def fragments(footprints, view, x, y):
     """Return which are seen, rho^2 and depth at pixels `[splats, samples]`."""
@@ -82,7 +74,11 @@ def test_fragments_are_where_rays_meet_discs(kind, dtype):
     view, body = FINE_VIEWS[kind](), scattered()
     footprints = jax.jit(lambda body: view.footprints(body, NO_FILTER))(body)
     box = footprints.left, footprints.right, footprints.top, footprints.bottom
-    x, y = around(box, 1.25, 17)
+    left, right, top, bottom = (np.asarray(each, float)[:, None] for each in box)
+    # Columns and rows in and around every box, `[splats, samples]`.
+    grid = np.linspace(-1.25, 1.25, 17)
+    u, v = (each.reshape(1, -1) for each in np.meshgrid(grid, grid))
+    x, y = (left + right + (right - left) * u) / 2, (top + bottom + (bottom - top) * v) / 2
     _, squared_radius, depth = (np.asarray(each) for each in fragments(footprints, view, x, y))
     start = at_depth(view, x, y, 0.0)
     along = (at_depth(view, x, y, DISTANCE) - start) / DISTANCE
