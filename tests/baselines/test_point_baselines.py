@@ -163,7 +163,7 @@ def test_an_affine_projection_leaves_holes_near_the_eye_and_an_exact_one_leaves_
     sheet = dataclasses.replace(floor, radii=0.72 * jnp.sqrt(floor.areas))
     seen = camera((2.4, -30.0, 4.0), fov=75.0, target=(2.4, -18.0, 0.0))
     holes = {}
-    for name in ("ewa", "phong", "deferred"):
+    for name in BLENDING:
         covered = drawn(name, sheet, jnp.ones((1, sheet.count)), seen)[1][0]
         holes[name] = np.mean(covered[SIZE // 2 :] == 0)
     assert holes["phong"] == 0

@@ -132,9 +132,6 @@ def test_what_memory_cannot_hold_is_refused_with_what_it_could(words, folder, ca
     assert re.search(r"[\d.e+]+ GB .* GB are free; take fewer", line)
 
 
-FULL = OSError(28, "No space left on device", "a.exr")
-
-
 def check_in_compiled_code():
     check = eqx.filter_jit(lambda x: eqx.error_if(x, x > 0, "x is positive;\ngive a negative one"))
     check(jnp.ones(()))
@@ -144,7 +141,11 @@ def check_in_compiled_code():
     ("error", "status", "named"),
     [
         (ValueError("a.ply: is\nempty"), 2, "splatjax: a.ply: is empty\n"),
-        (FULL, 2, "splatjax: a.exr: No space left on device\n"),
+        (
+            OSError(28, "No space left on device", "a.exr"),
+            2,
+            "splatjax: a.exr: No space left on device\n",
+        ),
         (MemoryError(), 2, "more memory than there is"),
         (RuntimeError("RESOURCE_EXHAUSTED: Out of\nmemory"), 2, "more memory than there is"),
         (TypeError("no such\nthing"), 1, "TypeError: no such thing"),

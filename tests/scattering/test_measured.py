@@ -111,8 +111,7 @@ def test_a_total_that_is_known_is_held(float64):
 
 
 def test_a_photograph_gives_the_profile_and_its_noise(float64):
-    noise = 0.01
-    dot = measure_laser_dot(photograph(noise=noise), MM_PER_PIXEL, power=2.0)
+    dot = measure_laser_dot(photograph(noise=0.01), MM_PER_PIXEL, power=2.0)
     np.testing.assert_allclose(dot.center, [60.2, 61.3], atol=0.1)
     away = (dot.profile.values - TRUTH(dot.profile.radii)) / dot.profile.deviation
     assert np.max(np.abs(away)) < 4.5
