@@ -161,7 +161,7 @@ class ClusterPlan(AbstractDiffusionPlan):
         origin = stop_gradient(jnp.mean(everywhere.centers, axis=1))[:, None]
         centered = dataclasses.replace(everywhere, centers=everywhere.centers - origin)
         points = sources.centers - origin
-        own = variances.at[self.gaussians].get(mode="fill", fill_value=1)
+        own = self.variances_of_layers(variances)
         depths = kernel.depths(own)
 
         # Sink the sources and merge them; sum over those near each block of points.

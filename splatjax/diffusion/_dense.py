@@ -45,7 +45,7 @@ class DensePlan(AbstractDiffusionPlan):
     ) -> Diffused:
         everywhere = combination.gather_last(sources)
         points = sources.centers if at is None else take_points(sources.centers, at)
-        layers = dense_layers(everywhere, points, variances, kernel)
+        layers = dense_layers(everywhere, points, self.variances_of_layers(variances), kernel)
         return Diffused(layers, jnp.zeros((), sources.centers.dtype))
 
 

@@ -61,6 +61,12 @@ class AbstractDiffusionPlan(eqx.Module):
 
     gaussians: eqx.AbstractVar[Int[Array, " layers"]]
 
+    def variances_of_layers(self, variances: Float[Array, " gaussians"]) -> Float[Array, " layers"]:
+        """Take the variances of the layers from those of the Gaussians, mm^2; 1 for a layer that
+        only fills up.
+        """
+        return variances.at[self.gaussians].get(mode="fill", fill_value=1)
+
     @abc.abstractmethod
     def diffuse(
         self,

@@ -56,7 +56,6 @@ IN_FLOAT32 = 1.02
 
 FLOAT32_FLOOR = 1e-5
 
-QUICK = ("marble", "skin1", "ketchup")
 MARBLE_GREEN = Medium(0.0041, 2.62, 1.5)
 
 
@@ -194,7 +193,7 @@ def test_beyond_a_cut_a_photon_beam_is_fitted(float64):
 @pytest.mark.once
 def test_float32_reaches_its_floor_and_calls_it_success():
     with jax.enable_x64(False):
-        for name in QUICK:
+        for name in ("marble", "skin1", "ketchup"):
             best = np.asarray([error[5] for error in PER_CHANNEL[name]])
             fitted = fit_gaussians(media(name), 6, spread=VariancesPerChannel())
             assert fitted.error.dtype == jnp.float32

@@ -161,9 +161,6 @@ def test_what_cannot_be_streamed_is_refused(splats):
             sj.render_streamed(lambda c=coming: iter(next(c)), LIGHTS, MATERIAL, CAMERA, settings)
 
 
-VARIANCES = (0.01, 4.0, 60.0)
-
-
 def ball_over_sheet(gaussians) -> sj.Scene:
     """Before a sheet, so that one surface shows behind the other; one layer is narrower than the
     splats.
@@ -175,7 +172,7 @@ def ball_over_sheet(gaussians) -> sj.Scene:
 
 
 def gaussians_of(weights) -> sj.SumOfGaussians:
-    return sj.SumOfGaussians(jnp.asarray(VARIANCES), jnp.asarray(weights, float))
+    return sj.SumOfGaussians(jnp.asarray([0.01, 4.0, 60.0]), jnp.asarray(weights, float))
 
 
 ONE = [[0.1, 0.2], [0.3, 0.2], [0.2, 0.1]]

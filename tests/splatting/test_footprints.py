@@ -20,7 +20,6 @@ from splatjax.splatting import (
     fragment_weight,
 )
 
-NO_FILTER = SplattingSettings(filter_radius=1e-4)
 # In pixels so fine, the quarter pixel that keeps slopes finite is nothing.
 FINE = {"width": 40_000, "height": 32_000}
 # float64: that quarter pixel; float32: slanted discs cancel by the squared tangent.
@@ -72,7 +71,7 @@ def at_depth(view, x, y, depth):
 @pytest.mark.parametrize("kind", VIEWS)
 def test_fragments_are_where_rays_meet_discs(kind, dtype):
     view, body = FINE_VIEWS[kind](), scattered()
-    footprints = jax.jit(lambda body: view.footprints(body, NO_FILTER))(body)
+    footprints = eqx.filter_jit(view.footprints)(body, SplattingSettings(filter_radius=1e-4))
     box = footprints.left, footprints.right, footprints.top, footprints.bottom
     left, right, top, bottom = (np.asarray(each, float)[:, None] for each in box)
     # Columns and rows in and around every box, `[splats, samples]`.
