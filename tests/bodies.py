@@ -24,10 +24,10 @@ from splatjax.splatting import (
     coverage,
 )
 
+# Plain renderers, which compile in a third of the time.
 PLAIN = RenderSettings(
     shadows=ShadowSettings(resolution=32), rasterizer=DenseRasterizer(), diffuser=DenseDiffuser()
 )
-"""Plain renderers, which compile in a third of the time."""
 
 
 def unit(vectors) -> np.ndarray:

@@ -4,6 +4,11 @@ import os
 import socket
 import subprocess
 import sys
+from pathlib import Path
+
+TESTS = Path(__file__).parent
+# Where a program finds splatjax, and what tests share.
+FINDS = {"PYTHONPATH": os.pathsep.join([str(TESTS.parent), str(TESTS)])}
 
 
 def run_together(*programs):
@@ -12,7 +17,9 @@ def run_together(*programs):
     """
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     processes = [
-        subprocess.Popen([sys.executable, *map(str, words)], env=os.environ | added, **pipes)
+        subprocess.Popen(
+            [sys.executable, *map(str, words)], env=os.environ | FINDS | added, **pipes
+        )
         for words, added in programs
     ]
     printed = [process.communicate(timeout=600) for process in processes]

@@ -18,7 +18,6 @@ from kept_programs import made, squares, total
 from processes import run_together
 
 import splatjax as sj
-from splatjax import cache
 
 SCRIPT = Path(__file__).parent / "kept_programs.py"
 
@@ -27,13 +26,13 @@ SCRIPT = Path(__file__).parent / "kept_programs.py"
 def folder(tmp_path, monkeypatch, jax_settings):
     """Keep in a folder of the test, and forget what others made."""
     made.clear()
-    monkeypatch.setattr(cache, "_folder", None)
+    monkeypatch.setattr(sj.cache, "_folder", None)
     jax.config.update("jax_compilation_cache_dir", str(tmp_path / "jax"))
-    return cache.keep(tmp_path) / "kept"
+    return sj.cache.keep(tmp_path) / "kept"
 
 
 def results_of_a_start():
-    cache._programs.clear()
+    sj.cache._programs.clear()
     values = squares(jnp.arange(9.0))["squares"]
     return [*values.tolist(), float(total(values)["sum"])]
 
@@ -45,7 +44,7 @@ def test_a_second_start_makes_the_same_picture_and_compiles_nothing(folder, comp
     camera = sj.Camera.look_at([0, 0, 700.0], [0, 0, 0], width=8, height=8)
     frames = []
     for _ in range(2):
-        cache._programs.clear()
+        sj.cache._programs.clear()
         compiled.clear()
         scene = sj.Scene(sj.bust(50), [light], sj.Material(two_gaussians()))
         frames.append(sj.render(scene, camera, PLAIN, sj.make_plan(scene, camera, PLAIN)))
@@ -78,7 +77,7 @@ def test_a_damaged_or_foreign_file_is_replaced(damage, folder):
 def test_a_program_that_loads_but_does_not_run_is_compiled_again(monkeypatch):
     expected = results_of_a_start()
     fails = mock.Mock(side_effect=jax.errors.JaxRuntimeError("NOT_FOUND: a kernel"))
-    monkeypatch.setattr(cache, "deserialize_and_load", lambda *_: fails)
+    monkeypatch.setattr(sj.cache, "deserialize_and_load", lambda *_: fails)
     assert results_of_a_start() == expected
     assert made == ["squares", "total", "total"]
 
@@ -105,8 +104,8 @@ def test_every_value_and_every_shape_has_a_file_of_its_own(folder):
 
 CHANGED = {
     "jaxlib": partial(mock.patch.object, jaxlib, "__version__", "0.0.1"),
-    "source": partial(mock.patch.object, cache, "_source", lambda: b"another"),
-    "processor": partial(mock.patch.object, cache, "_processor", lambda: "another"),
+    "source": partial(mock.patch.object, sj.cache, "_source", lambda: b"another"),
+    "processor": partial(mock.patch.object, sj.cache, "_processor", lambda: "another"),
     "XLA_FLAGS": partial(mock.patch.dict, os.environ, XLA_FLAGS="--xla_cpu_enable_fast_math=true"),
     "settings": partial(jax.default_matmul_precision, "highest"),
 }
@@ -147,7 +146,7 @@ def test_what_was_not_used_for_longest_is_deleted(folder, monkeypatch):
     (old,) = files(1) - {used}
     for path, age in ((used, 300), (old, 200)):
         os.utime(path, (0, time.time() - age))
-    monkeypatch.setattr(cache, "_LARGEST", 44_000)
+    monkeypatch.setattr(sj.cache, "_LARGEST", 44_000)
     assert files(0) == files(2, 12) == {old, used}  # the second is more than a quarter
     files(3), files(4)
     left = files(5)
@@ -156,10 +155,10 @@ def test_what_was_not_used_for_longest_is_deleted(folder, monkeypatch):
 
 
 def test_a_folder_that_others_may_write_to_is_not_used(folder, tmp_path, monkeypatch):
-    monkeypatch.setattr(cache, "_folder", None)
+    monkeypatch.setattr(sj.cache, "_folder", None)
     folder.chmod(0o777)
     with pytest.raises(PermissionError, match="kept: others than you may write to it"):
-        cache.keep(tmp_path)
+        sj.cache.keep(tmp_path)
     squares(jnp.ones(3)), squares(jnp.ones(3))
     assert made == ["squares", "squares"]
     assert list(folder.iterdir()) == []
@@ -169,7 +168,7 @@ def test_the_default_is_the_cache_folder_of_the_user(tmp_path, monkeypatch):
     monkeypatch.setenv("HOME", str(tmp_path))
     for base, expected in (("relative", ".cache"), (str(tmp_path / "moved"), "moved")):
         monkeypatch.setenv("XDG_CACHE_HOME", base)
-        assert cache.keep().parent == tmp_path / expected / "splatjax" / "jax"
+        assert sj.cache.keep().parent == tmp_path / expected / "splatjax" / "jax"
 
 
 @pytest.mark.once

@@ -54,11 +54,11 @@ def test_public_names_are_few_and_submodules_documented():
 
 
 COPYLEFT = re.compile(r"\b(A|L)?GPL|General Public License", re.IGNORECASE)
+# Packages whose license mentions such a license without being one.
 MENTIONED = {
     "scipy": "BSD; its wheels hold libgfortran, under the GPL with an exception for libraries",
     "matplotlib": "PSF; its text compares itself with the GPL",
 }
-"""Packages whose license mentions such a license without being one."""
 
 
 @pytest.mark.once

@@ -12,6 +12,7 @@ import pytest
 from nbclient import NotebookClient
 
 NOTEBOOKS = Path(__file__).parents[1] / "notebooks"
+# They take a quarter of a minute or more: `make test-long` runs them, `make test` does not.
 LONG = {
     "gradients",
     "measured_material",
@@ -22,9 +23,8 @@ LONG = {
     "which_profile",
     *(f"figure_{number}" for number in (1, 4, 5, 6, 7, 8)),  # Figure 3 has no picture to render
 }
-"""They take a quarter of a minute or more: `make test-long` runs them, `make test` does not."""
+# They are compiled as users have it, whatever the shell says.
 RUN_LONGER_THAN_THEY_COMPILE = {"shape_from_shading", "which_profile"}
-"""They are compiled as users have it, whatever the shell says."""
 
 
 @pytest.fixture(scope="module")

@@ -10,8 +10,8 @@ import splatjax as sj
 from splatjax.diffusion import AbstractDiffusionKernel, PlainMean, Sources, dense_layer
 from splatjax.geometry import Mesh, Textures
 
+# mm, from the middle to the edges.
 HALF = 12.0
-"""mm, from the middle to the edges."""
 
 
 def plane(stretch: float, quads: int = 6, half: float = HALF) -> Mesh:

@@ -75,10 +75,10 @@ def drawn(name: str, splats: sj.Splats, rows, *cameras: sj.Camera):
     return np.moveaxis(attributes, 3, 1), coverage
 
 
-@pytest.fixture(scope="module")
-def far_checkers():
-    """Pictures of black and white squares smaller than a pixel, from cameras that shift by
-    fractions of a pixel.
+@pytest.mark.once
+def test_squares_smaller_than_a_pixel_are_gray_and_still_with_a_filter_and_alias_without():
+    """From cameras that shift by fractions of a pixel. The mean of the black and white squares is
+    gray, 1/2: all contrast is an alias, and so is all power below half of Nyquist.
     """
     sheet = bodies.sheet(11.0, 0.125)
     checkers = jnp.asarray(
@@ -87,18 +87,9 @@ def far_checkers():
     # 48 pixels of 0.42 mm: 1.7 squares, 3.3 splats along each
     shifts = np.linspace(0, 0.4, 3)
     cameras = [camera((s, 0.6 * s, 75.0), fov=15.2, target=(s, 0.6 * s, 0.0)) for s in shifts]
-    return {
+    pictures_by = {
         name: drawn(name, sheet, checkers, *cameras)[0][:, 0, 6:-6, 6:-6] for name in RASTERIZERS
     }
-
-
-@pytest.mark.once
-def test_squares_smaller_than_a_pixel_are_gray_and_still_with_a_filter_and_alias_without(
-    far_checkers,
-):
-    """The mean of the squares is gray, 1/2: all contrast is an alias, and so is all power below
-    half of Nyquist.
-    """
 
     def low(pictures):
         picture = pictures[0] - pictures[0].mean()
@@ -107,10 +98,10 @@ def test_squares_smaller_than_a_pixel_are_gray_and_still_with_a_filter_and_alias
         return power[(f[:, None] < 0.25) & (f[None] < 0.25)].sum()
 
     contrast, flicker, aliases = (
-        {name: measure(pictures) for name, pictures in far_checkers.items()}
+        {name: measure(pictures) for name, pictures in pictures_by.items()}
         for measure in (np.std, lambda pictures: np.mean(np.std(pictures, axis=0)), low)
     )
-    np.testing.assert_allclose(np.mean(far_checkers["ewa"]), 0.5, atol=0.02)
+    np.testing.assert_allclose(np.mean(pictures_by["ewa"]), 0.5, atol=0.02)
     assert contrast["elliptical"] > 0.45  # black and white, as if thrown by a coin: 1/2
     assert contrast["phong"] > 0.2
     assert contrast["ewa"] < contrast["deferred"] < 0.6 * contrast["phong"]
@@ -172,7 +163,7 @@ def test_an_affine_projection_leaves_holes_near_the_eye_and_an_exact_one_leaves_
     sheet = dataclasses.replace(floor, radii=0.72 * jnp.sqrt(floor.areas))
     seen = camera((2.4, -30.0, 4.0), fov=75.0, target=(2.4, -18.0, 0.0))
     holes = {}
-    for name in ("ewa", "phong", "deferred"):
+    for name in BLENDING:
         covered = drawn(name, sheet, jnp.ones((1, sheet.count)), seen)[1][0]
         holes[name] = np.mean(covered[SIZE // 2 :] == 0)
     assert holes["phong"] == 0
@@ -230,10 +221,7 @@ def test_a_baseline_renders_what_the_renderer_does_with_scattering_and_shadow():
     """Where splats are smaller than what bends it makes little matter whether irradiance is blended
     or found per pixel.
     """
-    body = bodies.sphere(1500, jitter=0.0)
-    body = dataclasses.replace(
-        body, albedo=jnp.broadcast_to(jnp.asarray([0.9, 0.6, 0.3]), (body.count, 3))
-    )
+    body = bodies.with_albedo(bodies.sphere(1500, jitter=0.0), np.tile([0.9, 0.6, 0.3], (1500, 1)))
     lamp = sj.DirectionalLight([0.4, -0.3, -1.0], [np.pi] * 3)
     scene = sj.Scene(body, (lamp,), sj.load_material("skin").white())
     seen = camera((0.0, 0.0, 60.0), fov=22.0)

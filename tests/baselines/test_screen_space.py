@@ -35,11 +35,6 @@ def flat(light: np.ndarray) -> sj.Frame:
     return sj.Frame(*given, none, none, jnp.zeros(1), jnp.zeros(()))
 
 
-def picture_of(function) -> np.ndarray:
-    points = hits(CAMERA)[..., :2].reshape(-1, 2)
-    return function(points).reshape(SIZE, SIZE, 3)
-
-
 def convolved(light: np.ndarray, gaussians: sj.SumOfGaussians) -> np.ndarray:
     """The two-dimensional convolution with the profile, over whole pixels; right but for what comes
     from beyond the picture.
@@ -70,39 +65,36 @@ def off_by(
     return float(np.max(np.abs(found - truth)[INSIDE, INSIDE]) / np.max(truth))
 
 
-@pytest.fixture(scope="module")
-def spotted():
-    return picture_of(spots)
+def edge(points: np.ndarray) -> np.ndarray:
+    return np.repeat((points[:, :1] > 0.7) * 1.0, 3, axis=1)
 
 
-@pytest.fixture(scope="module")
-def edge():
-    return picture_of(lambda points: np.repeat((points[:, :1] > 0.7) * 1.0, 3, axis=1))
-
-
+LIGHTS = {
+    light: light(hits(CAMERA)[..., :2].reshape(-1, 2)).reshape(SIZE, SIZE, 3)
+    for light in (spots, edge)
+}
 PASSES, SHIPPED = baselines.GaussianPasses(reach=32), baselines.ShippedKernel()
+PREINTEGRATED = baselines.PreintegratedKernel()
 
 
 @pytest.mark.once
-def test_gaussian_by_gaussian_it_is_the_convolution(spotted):
-    assert off_by(spotted, TWO, PASSES) < 2e-4  # 1.9e-5
-
-
-@pytest.mark.once
-def test_one_kernel_is_the_convolution_for_one_gaussian_alone(spotted):
-    """But for its taps, which end at twice the root of the mean squared distance."""
-    assert off_by(spotted, ONE, SHIPPED) < 5e-2  # 3.8e-2
-    assert off_by(spotted, TWO, SHIPPED) > 8e-2  # 9.0e-2
-
-
-@pytest.mark.once
-def test_a_preintegrated_kernel_is_right_along_straight_edges_and_the_shipped_one_is_not(
-    edge, spotted
+@pytest.mark.parametrize(
+    ("light", "gaussians", "kernel", "least", "most"),
+    [
+        pytest.param(spots, TWO, PASSES, 0, 2e-4, id="passes"),  # 1.9e-5
+        # The ends of its taps, at twice the root of the mean squared distance.
+        pytest.param(spots, ONE, SHIPPED, 0, 5e-2, id="shipped, of one"),  # 3.8e-2
+        pytest.param(spots, TWO, SHIPPED, 8e-2, 1, id="shipped, of two"),  # 9.0e-2
+        pytest.param(edge, TWO, PREINTEGRATED, 0, 4e-2, id="preintegrated, edge"),  # 3.5e-2
+        pytest.param(edge, TWO, SHIPPED, 6e-2, 1, id="shipped, edge"),  # 6.3e-2
+        pytest.param(spots, TWO, PREINTEGRATED, 6e-2, 1, id="preintegrated, spots"),  # 6.8e-2
+    ],
+)
+def test_passes_are_the_convolution_and_one_kernel_is_for_one_gaussian_or_along_edges_alone(
+    light, gaussians, kernel, least, most
 ):
-    preintegrated = baselines.PreintegratedKernel()
-    assert off_by(edge, TWO, preintegrated) < 4e-2  # 3.5e-2, the ends of its taps
-    assert off_by(edge, TWO, SHIPPED) > 6e-2  # 6.3e-2
-    assert off_by(spotted, TWO, preintegrated) > 6e-2  # 6.8e-2
+    """The shipped kernel is right for one Gaussian, the preintegrated one along straight edges."""
+    assert least < off_by(LIGHTS[light], gaussians, kernel) < most
 
 
 @pytest.mark.once

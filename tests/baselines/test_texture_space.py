@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from bodies import camera_over, hits
 from jax.test_util import check_grads
 from planes import HALF, coordinates, gathered, painted, plane, splatted
 
@@ -21,14 +20,17 @@ from splatjax.geometry import Mesh, complexion
 from splatjax.splatting import PerspectiveView
 
 SIZE = 192
+# The wider first: layers keep the order of the Gaussians.
 TWO = sj.SumOfGaussians(
     jnp.asarray([3.0, 0.5], float), jnp.asarray([[0.5, 0.6, 0.7], [0.5, 0.4, 0.3]], float)
 )
-"""The wider first: layers keep the order of the Gaussians."""
 DULL = sj.Material(TWO, specular=0.0)
 FRONTAL = sj.DirectionalLight(jnp.asarray([0.0, 0.0, -1.0]), jnp.ones(3), cast_shadows=False)
 STILL = baselines.TextureSpaceSettings(
     SIZE, baselines.StretchCorrected(), baselines.OpaqueParts(), PlainMean()
+)
+THIN = dataclasses.replace(
+    STILL, thin_parts=baselines.TranslucentShadowMap(), kernel=EscapeNormalization()
 )
 
 
@@ -46,7 +48,9 @@ def off_by(stretch: float, correction: baselines.AbstractStretch) -> float:
     """
     settings = dataclasses.replace(STILL, stretch=correction)
     mesh = baselines.TexturedMesh.of(plane(stretch), painted(stretch, SIZE))
-    plan = baselines.plan_texture_space(mesh, (FRONTAL,), DULL, camera_over(6.0, 8), settings)
+    plan = baselines.plan_texture_space(
+        mesh, (FRONTAL,), DULL, bodies.camera_over(6.0, 8), settings
+    )
     line = np.linspace(-HALF / 2, HALF / 2, 16)
     points = np.stack(np.meshgrid(line, line, [0.0]), axis=-1).reshape(-1, 3)
     ours, lost = diffused(mesh, settings, plan, jnp.asarray(coordinates(points, stretch), float))
@@ -71,14 +75,9 @@ def test_on_a_plane_it_is_splat_diffusion_if_stretch_is_corrected(stretch, corre
 @pytest.fixture(scope="module")
 def sheet():
     mesh = baselines.TexturedMesh.of(plane(2.0))
-    settings = dataclasses.replace(
-        STILL,
-        resolution=64,
-        thin_parts=baselines.TranslucentShadowMap(),
-        kernel=EscapeNormalization(),
-    )
+    settings = dataclasses.replace(THIN, resolution=64)
     lights = (dataclasses.replace(FRONTAL, cast_shadows=True),)
-    camera = camera_over(15.0, 32)
+    camera = bodies.camera_over(15.0, 32)
     plan = baselines.plan_texture_space(mesh, lights, DULL, camera, settings)
     return mesh, lights, camera, settings, plan
 
@@ -103,7 +102,7 @@ def test_constant_light_stays_constant_up_to_the_edges(sheet):
 @pytest.mark.once
 @pytest.mark.long
 def test_beyond_its_capacity_the_picture_is_nan():
-    mesh, camera = baselines.TexturedMesh.of(plane(1.0)), camera_over(15.0, 16)
+    mesh, camera = baselines.TexturedMesh.of(plane(1.0)), bodies.camera_over(15.0, 16)
     settings = dataclasses.replace(STILL, resolution=24)
     plan = baselines.plan_texture_space(mesh, (FRONTAL,), DULL, camera, settings)
     small = dataclasses.replace(plan, camera=10)
@@ -152,11 +151,8 @@ def slab(thickness: float) -> Mesh:
 @pytest.mark.long
 def test_through_a_slab_comes_what_comes_through_splats():
     """Lit from behind: the share and the gain are those of two sheets of splats."""
-    thickness, settings = 1.5, dataclasses.replace(STILL, resolution=96)
-    settings = dataclasses.replace(
-        settings, thin_parts=baselines.TranslucentShadowMap(), kernel=EscapeNormalization()
-    )
-    mesh, camera = baselines.TexturedMesh.of(slab(thickness)), camera_over(3.0, 4)
+    thickness, settings = 1.5, dataclasses.replace(THIN, resolution=96)
+    mesh, camera = baselines.TexturedMesh.of(slab(thickness)), bodies.camera_over(3.0, 4)
     lights = (sj.DirectionalLight([0, 0, 1], jnp.ones(3)),)
     found = baselines.render_texture_space(mesh, lights, DULL, camera, settings).frame
     ours = np.pi * np.asarray(found.layers)[:, 2, 2]
@@ -178,7 +174,7 @@ def test_through_a_slab_comes_what_comes_through_splats():
 def test_a_picture_has_the_derivatives_that_differences_say(float64):
     settings = dataclasses.replace(STILL, resolution=40)
     mesh = baselines.TexturedMesh.of(plane(1.4), painted(1.4, 24))
-    camera = camera_over(6.0, 8)
+    camera = bodies.camera_over(6.0, 8)
     lights = (dataclasses.replace(FRONTAL, direction=jnp.asarray([0.3, 0.2, -1.0])),)
     plan = baselines.plan_texture_space(mesh, lights, DULL, camera, settings)
     pattern = jnp.sin(jnp.arange(8.0 * 8 * 3)).reshape(8, 8, 3)
@@ -221,7 +217,7 @@ def corners():
 def test_a_slanted_plane_is_seen_where_its_rays_meet_it_and_has_no_cracks(corners):
     landing, seen = seen_from(CAMERA, corners)
     positions = baselines.interpolate(corners, seen, baselines.barycentrics(landing, seen))
-    expected, covered = hits(CAMERA), np.asarray(seen.covered)
+    expected, covered = bodies.hits(CAMERA), np.asarray(seen.covered)
     assert np.array_equal(covered, np.abs(expected).max(axis=2) < 12)
     assert 0.5 < np.mean(covered) < 1
     np.testing.assert_allclose(np.asarray(positions)[covered], expected[covered], atol=2e-4)

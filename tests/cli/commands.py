@@ -1,9 +1,13 @@
 """Files for the command line, and how tests run it."""
 
+from pathlib import Path
+
 from bodies import sheet, sphere
 
 import splatjax as sj
 from splatjax.cli import main
+
+SCRIPT = Path(__file__).with_name("one_process.py")
 
 
 def run(*words):

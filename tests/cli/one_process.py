@@ -7,16 +7,13 @@ import signal
 import sys
 from functools import partial
 
+from bodies import PLAIN
+
 import splatjax as sj
 from splatjax.cli import main
-from splatjax.diffusion import DenseDiffuser
-from splatjax.splatting import DenseRasterizer, ShadowSettings
 
-settings = sj.RenderSettings(
-    shadows=ShadowSettings(resolution=32), rasterizer=DenseRasterizer(), diffuser=DenseDiffuser()
-)
-sj.make_plan = partial(sj.make_plan, settings=settings)
-sj.render = partial(sj.render, settings=settings)
+sj.make_plan = partial(sj.make_plan, settings=PLAIN)
+sj.render = partial(sj.render, settings=PLAIN)
 write_png = sj.write_png
 
 

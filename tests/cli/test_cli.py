@@ -12,7 +12,7 @@ import numpy as np
 import optimistix as optx
 import pytest
 import trimesh
-from commands import failure, plate, run
+from commands import plate, run
 from jax.experimental.compilation_cache import compilation_cache
 from pictures import write_picture
 from PIL import Image
@@ -21,7 +21,6 @@ import splatjax as sj
 from splatjax.cli._main import prepare_jax
 from splatjax.cli._render import Render
 from splatjax.cli._view import direction_to
-from splatjax.io import read_manifest, read_record
 
 SMALL = ["--count", "1500", "--width", "64", "--height", "64"]
 
@@ -47,7 +46,7 @@ def test_export_writes_what_other_renderers_take(tmp_path, capsys):
     output = tmp_path / "skin.json"
     assert run("export", "skin", "--output", output) == 0
     assert capsys.readouterr().out == f"{output}\n"
-    sheet = read_record(output)
+    sheet = sj.io.read_record(output)
     assert sheet.keys() >= {"gpu_gems", "separable_kernel", "burley", "unity", "blender"}
     variances = [0.0064, 0.0484, 0.187, 0.567, 1.99, 7.41]
     np.testing.assert_allclose(sheet["gaussians"]["variances"], variances)
@@ -77,7 +76,7 @@ def test_render_shows_the_bust_and_its_manifest_makes_the_same_picture(plain, tm
     output, picture = tmp_path / "bust.exr", tmp_path / "bust.png"
     assert run("render", *SMALL, "--output", output) == 0
     assert capsys.readouterr().out.splitlines() == [str(output), str(picture)]
-    frame, manifest = sj.read_exr(output), read_manifest(output)
+    frame, manifest = sj.read_exr(output), sj.io.read_manifest(output)
     np.testing.assert_allclose(np.sum(np.asarray(frame.weights), axis=0), 1.0, rtol=1e-5)
     assert 0.1 < np.mean(np.asarray(frame.coverage)) < 0.9
     with Image.open(picture) as shown:
@@ -265,17 +264,3 @@ def test_interrupted_or_unsettled_it_continues_where_it_was(command, search, tmp
     assert str(record) in capsys.readouterr().err  # of another search
     assert len(calls[2][2]) == 2
     assert not record.exists()
-
-
-@pytest.mark.parametrize(
-    ("words", "named"),
-    [
-        (["--output", "mine.exr"], "mine.exr"),
-        (["--eta", 0.9], "--eta is 0.9"),
-        (["--start", "skin"], "[medium]"),
-    ],
-)
-def test_options_are_checked_before_the_search(words, named, command, search, tmp_path, capsys):
-    assert named in failure([*command, *words], capsys)
-    assert not search[0]
-    assert not (tmp_path / "mine.toml").exists()

@@ -8,19 +8,18 @@ import os
 import re
 import subprocess
 import sys
-from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
-from commands import ball
+from commands import SCRIPT, ball
+from processes import FINDS
 from rich.console import Console
 
 from splatjax.cli import _terminal
 
 pty = pytest.importorskip("pty")
 
-SCRIPT = Path(__file__).parent / "one_process.py"
 COLORS = {"TERM": "xterm-256color", "COLORTERM": "truecolor", "COLUMNS": "80", "LINES": "40"}
 HALF = re.compile(r"\x1b\[38;2;(\d+);(\d+);(\d+);48;2;(\d+);(\d+);(\d+)m(▀+)")
 
@@ -29,7 +28,7 @@ def start(words, cache):
     """Run a command whose stderr is a terminal; return the process and the terminal's other end."""
     seen, terminal = pty.openpty()
     environment = {key: os.environ[key] for key in os.environ.keys() - {"NO_COLOR"}}
-    environment |= {"XDG_CACHE_HOME": str(cache), "PYTHONPATH": str(SCRIPT.parents[2])}
+    environment |= FINDS | {"XDG_CACHE_HOME": str(cache)}
     process = subprocess.Popen(
         [sys.executable, SCRIPT, "render", *map(str, words)],
         env=environment | COLORS,

@@ -12,7 +12,7 @@ from unittest import mock
 import bodies
 import numpy as np
 import pytest
-from commands import ball, contents, failure, frame_names, run
+from commands import SCRIPT, ball, contents, failure, frame_names, run
 from PIL import Image
 from processes import free_port, run_together
 
@@ -51,11 +51,6 @@ def around(splats, tmp_path_factory):
     folder = tmp_path_factory.mktemp("around") / "turn"
     assert run(*command(splats, folder)) == 0
     return folder
-
-
-@pytest.fixture
-def copied(around, tmp_path):
-    return shutil.copytree(around, tmp_path / "turn")
 
 
 def test_frames_and_animation_are_made_by_one_program(splats, tmp_path, drawn, capsys):
@@ -137,7 +132,8 @@ def test_interrupted_frames_are_whole_and_the_rest_follows(
         assert film.info["duration"] == 100
 
 
-def test_frames_of_something_else_are_refused(splats, copied, tmp_path, drawn, capsys):
+def test_frames_of_something_else_are_refused(splats, around, tmp_path, drawn, capsys):
+    copied = shutil.copytree(around, tmp_path / "turn")
     before = contents(copied)
     line = failure(command(splats, copied, "--exposure", 1, turn="light"), capsys)
     assert all(part in line for part in ("--turn is light", "--exposure is 1.0", "--output"))
@@ -163,7 +159,6 @@ def test_an_orbit_under_lights_that_stand_still_is_lit_once(splats, tmp_path, mo
     np.testing.assert_allclose(*(np.asarray(frame.beauty) for frame in frames), atol=1e-5)
 
 
-SCRIPT = Path(__file__).parent / "one_process.py"
 SHARED_FRAMES = 6
 
 
@@ -172,7 +167,6 @@ def run_processes(command, count, **environment):
     their statuses, and what they print on stdout and stderr.
     """
     environment |= {
-        "PYTHONPATH": str(SCRIPT.parents[2]),
         "JAX_COORDINATOR_ADDRESS": f"127.0.0.1:{free_port()}",
         "JAX_NUM_PROCESSES": str(count),
     }

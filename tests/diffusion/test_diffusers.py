@@ -64,12 +64,8 @@ def planned(diffuser, body: Splats, variances=VARIANCES):
 @eqx.filter_jit
 def run(plan, sources, variances):
     diffused = plan.diffuse(sources, variances, KERNEL, OneDevice())
-    return resolved(diffused.layers, variances), diffused.needed
-
-
-def resolved(layers, variances):
-    """Leave out layers that only fill up; here all others are resolved."""
-    return jax.tree.map(lambda rows: rows[: len(variances)], layers)
+    # Without layers that only fill up; here all others are resolved.
+    return jax.tree.map(lambda rows: rows[: len(variances)], diffused.layers), diffused.needed
 
 
 def sources_per_layer(plan) -> list[int]:

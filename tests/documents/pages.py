@@ -39,11 +39,3 @@ def words(command: str) -> list[str]:
     """Give the words of a command after `splatjax`, without where its output is led to."""
     typed = shlex.split(command)[1:]
     return typed[: typed.index(">")] if ">" in typed else typed
-
-
-def named_files(page: Path) -> dict[str, str]:
-    """Give the files that a page says to write: fences that begin with their name, `#
-    name.toml`.
-    """
-    matches = [(re.match(r"# (\S+\.toml)\n", body), body) for body in fences(page, "toml")]
-    return {first[1]: body for first, body in matches if first}

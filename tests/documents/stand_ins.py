@@ -32,13 +32,9 @@ def _ball() -> trimesh.Trimesh:
     return ball
 
 
-def _mesh(path: Path) -> None:
-    _ball().export(path)
-
-
 def _splats(path: Path) -> None:
     mesh = path.with_name("ball.glb")
-    _mesh(mesh)
+    _ball().export(mesh)
     splats = sj.sample_mesh(mesh, 1500, mm_per_unit=53.0)
     mesh.unlink()
     sj.write_splats(path, dataclasses.replace(splats, albedo=jnp.full((1500, 3), 0.8)))
@@ -96,7 +92,7 @@ _MADE = {
     "head.ply": _splats,
     "head_40000.ply": _splats,
     "cloud.ply": _splats,
-    "head.glb": _mesh,
+    "head.glb": lambda path: _ball().export(path),
     "points.ply": _points,
     "color.jpg": _map,
     "albedo.jpg": _map,

@@ -9,19 +9,19 @@ import re
 import shlex
 
 import pytest
-from pages import PAGES, ROOT, commands, name, named_files, words
+from pages import PAGES, ROOT, commands, fences, name, words
 from stand_ins import lay_out
 
 from splatjax.cli import main
 from splatjax.cli._main import parsed
 
+# Options that make a command quick; the last one given counts.
 SMALL = {
     "render": ["--width", "32", "--height", "32"],
     "turntable": ["--width", "32", "--height", "32", "--frames", "2"],
     "sample": ["--count", "1500"],
     "recover": ["--count", "3", "--no-suggest"],
 }
-"""Options that make a command quick; the last one given counts."""
 
 NOT_RUN = {
     "make": (
@@ -113,8 +113,9 @@ def test_there_is_such_a_module_with_such_options(command):
 def test_the_commands_of_a_page_run_one_after_the_other(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     lay_out(tmp_path, page.read_text(encoding="utf-8"))
-    for file, text in named_files(page).items():
-        (tmp_path / file).write_text(text, encoding="utf-8")
+    for body in fences(page, "toml"):
+        if file := re.match(r"# (\S+\.toml)\n", body):  # a file that a page says to write
+            (tmp_path / file[1]).write_text(body, encoding="utf-8")
     for command in commands(page):
         given = words(command)
         if not command.startswith("splatjax") or given[0].startswith("-") or "--help" in given:

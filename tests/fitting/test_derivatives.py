@@ -26,9 +26,6 @@ from splatjax.fitting import (
     relative_error,
 )
 from splatjax.fitting._problem import make_problem
-from splatjax.gaussians import SumOfGaussians
-from splatjax.inverse import wide_variances
-from splatjax.io import load_medium
 from splatjax.scattering import L2_QUADRATURE, Dipole, EganFresnel, Layer, Medium, Multipole
 
 # Asked of the derivative; central differences with steps of 1e-4 relative err by 1e-7.
@@ -107,7 +104,7 @@ def test_where_the_fit_is_perfect_the_derivative_is_the_identity(float64):
 
     def again(log_variances):
         return jnp.log(
-            fit_gaussians(SumOfGaussians(jnp.exp(log_variances), weights), 2).gaussians.variances
+            fit_gaussians(sj.SumOfGaussians(jnp.exp(log_variances), weights), 2).gaussians.variances
         )
 
     point = jnp.log(jnp.asarray([0.1, 2.0]))
@@ -131,8 +128,7 @@ EXACT = 1e-12
 LOG_VARIANCES = jnp.asarray([-3.2, -1.9, 0.1, 2.2])
 
 
-def marble() -> Dipole:
-    return Dipole(load_medium("marble"))
+MARBLE = Dipole(sj.load_medium("marble"))
 
 
 @pytest.mark.parametrize(
@@ -140,7 +136,7 @@ def marble() -> Dipole:
 )
 @pytest.mark.parametrize("active", [None, (True, True, True, False)])
 def test_the_expansion_is_that_of_automatic_differentiation(float64, weights, active):
-    problem = make_problem(marble(), weights, L2_QUADRATURE)
+    problem = make_problem(MARBLE, weights, L2_QUADRATURE)
     active = None if active is None else jnp.asarray(active)
     point = LOG_VARIANCES.astype(float)
 
@@ -171,13 +167,13 @@ def test_covariance_is_that_of_a_fit_of_all_parameters(float64):
     """By Gauss and Newton: the inverse normal matrix of the Jacobian in variances and weights,
     times the sum of squares.
     """
-    profile = marble()
+    profile = MARBLE
     fitted = fit_gaussians(profile, 3)
     problem = make_problem(profile, FreeWeights(), L2_QUADRATURE)
     r = jnp.sqrt(problem.squared_radii)
 
     def residuals(parameters):
-        gaussians = SumOfGaussians(parameters[:3], parameters[3:].reshape(3, 3).T)
+        gaussians = sj.SumOfGaussians(parameters[:3], parameters[3:].reshape(3, 3).T)
         values = jnp.stack([gaussians(r[channel])[:, channel] for channel in range(3)])
         return (problem.target - problem.root_weights * values / problem.norm[:, None]).ravel()
 
@@ -191,7 +187,7 @@ def test_covariance_is_that_of_a_fit_of_all_parameters(float64):
 
 
 def test_held_weights_do_not_vary_together(float64):
-    fitted = fit_gaussians(marble(), 2, weights=FixedTotalReflectance())
+    fitted = fit_gaussians(MARBLE, 2, weights=FixedTotalReflectance())
     weights = np.asarray(fitted.covariance)[2:, 2:]
     of_sum = weights[:2, :2].sum()
     assert abs(of_sum) < 1e-12 * np.trace(weights)
@@ -199,7 +195,7 @@ def test_held_weights_do_not_vary_together(float64):
 
 
 def test_the_variance_of_a_gaussian_without_weight_is_anything(float64):
-    one = SumOfGaussians(jnp.asarray([1.0]), jnp.asarray([[0.5]]))
+    one = sj.SumOfGaussians(jnp.asarray([1.0]), jnp.asarray([[0.5]]))
     problem = make_problem(one, NonNegativeWeights(), L2_QUADRATURE)
     # Next to the truth: what the second Gaussian would add is negative.
     _, _, covariance = problem.outcome(jnp.log(jnp.asarray([0.9, 0.4])))
@@ -208,29 +204,29 @@ def test_the_variance_of_a_gaussian_without_weight_is_anything(float64):
 
 
 def test_the_least_count_that_reaches_an_error(float64):
-    by_count = error_by_count(marble(), 4)
+    by_count = error_by_count(MARBLE, 4)
     worst = np.max(np.asarray(by_count.error), axis=1)
     assert np.all(np.diff(worst) < 0)
     assert by_count.least(float(worst[2])) == 3
     wanted = 1.01 * float(worst[2])
-    fitted = fit_gaussians(marble(), LeastCount(wanted, largest=4))
+    fitted = fit_gaussians(MARBLE, LeastCount(wanted, largest=4))
     assert np.max(np.asarray(fitted.error)) <= wanted
     assert fitted.gaussians.variances.shape == (3,)
     np.testing.assert_allclose(
         np.linalg.norm(fitted.error), np.linalg.norm(by_count.error[2]), rtol=1e-4
     )
-    np.testing.assert_allclose(relative_error(marble(), fitted.gaussians), fitted.error, rtol=1e-9)
+    np.testing.assert_allclose(relative_error(MARBLE, fitted.gaussians), fitted.error, rtol=1e-9)
     for refused, message in (
         (lambda: by_count.least(1e-6), "an error of 1e-06 is not reached: 4 Gaussians leave"),
         (
-            lambda: fit_gaussians(marble(), LeastCount(wanted), start=by_count.start(3)),
+            lambda: fit_gaussians(MARBLE, LeastCount(wanted), start=by_count.start(3)),
             r"start is given, and LeastCount\(",
         ),
         (
             lambda: eqx.filter_jit(lambda found: found.least(0.1))(by_count),
             "depends on values; find it outside of jit",
         ),
-        (lambda: error_by_count(marble(), 0), "largest must be .* at least 1; got 0"),
+        (lambda: error_by_count(MARBLE, 0), "largest must be .* at least 1; got 0"),
     ):
         with pytest.raises(ValueError, match=message):
             refused()
@@ -285,7 +281,7 @@ def test_non_negative_weights_of_a_held_sum_are_the_best_of_all_subsets(float64,
 
 def test_a_fit_with_weights_at_zero_converges_and_has_the_derivative_of_refits(float64):
     """Ketchup's channels lie so far apart that some weights vanish."""
-    medium = load_medium("ketchup")
+    medium = sj.load_medium("ketchup")
 
     def fit(scale):
         moved = Medium(medium.sigma_a * scale, medium.sigma_s_prime, medium.eta)
@@ -320,7 +316,7 @@ def test_with_the_variances_of_a_fit_they_are_its_weights(float64):
 
 def test_wide_variances_serve_all_media_near(float64):
     near = sj.Medium([0.02, 0.2], [1.0, 0.7], 1.3)
-    variances = wide_variances(
+    variances = sj.inverse.wide_variances(
         [near], sj.Splats(jnp.asarray(np.eye(3) * 1e4), jnp.eye(3), jnp.ones(3), jnp.ones(3))
     )
     assert len(variances) < 20

@@ -56,7 +56,6 @@ IN_FLOAT32 = 1.02
 
 FLOAT32_FLOOR = 1e-5
 
-QUICK = ("marble", "skin1", "ketchup")
 MARBLE_GREEN = Medium(0.0041, 2.62, 1.5)
 
 
@@ -165,9 +164,9 @@ def test_one_to_eight_gaussians_reach_the_best_known_errors(float64, every):
         )(media)
         best = np.asarray(list(table.values())[::every])
         ratios[name] = np.max(np.sqrt(np.mean(np.square(found), axis=2)) / best, axis=0)
-    print("worst errors over the best known, for 1 to 8 Gaussians:", ratios)
-    assert np.max(ratios["per channel"]) < BAR
-    assert max(np.max(ratios["shared"]), np.max(ratios["shared, held"])) < SHARED_BAR
+    # The worst errors over the best known, for 1 to 8 Gaussians.
+    assert np.max(ratios["per channel"]) < BAR, ratios
+    assert max(np.max(ratios["shared"]), np.max(ratios["shared, held"])) < SHARED_BAR, ratios
 
 
 def test_layers_reach_the_best_known_errors(float64):
@@ -193,14 +192,13 @@ def test_beyond_a_cut_a_photon_beam_is_fitted(float64):
 
 @pytest.mark.once
 def test_float32_reaches_its_floor_and_calls_it_success():
-    for name in QUICK:
-        best = np.asarray([error[5] for error in PER_CHANNEL[name]])
-        with jax.enable_x64(False):
-            fitted = fit_gaussians(media(name), 6, spread=VariancesPerChannel())
-        assert fitted.error.dtype == jnp.float32
-        assert bool(fitted.result == optx.RESULTS.successful)
-        assert np.all(np.asarray(fitted.error) < IN_FLOAT32 * best + FLOAT32_FLOOR)
     with jax.enable_x64(False):
+        for name in ("marble", "skin1", "ketchup"):
+            best = np.asarray([error[5] for error in PER_CHANNEL[name]])
+            fitted = fit_gaussians(media(name), 6, spread=VariancesPerChannel())
+            assert fitted.error.dtype == jnp.float32
+            assert bool(fitted.result == optx.RESULTS.successful)
+            assert np.all(np.asarray(fitted.error) < IN_FLOAT32 * best + FLOAT32_FLOOR)
         fitted = fit_gaussians(media("marble"), 4, weights=FixedTotalReflectance())
     assert np.max(np.abs(fitted.energy_error)) < HELD_IN_FLOAT32
     assert np.all(np.diff(fitted.gaussians.variances) > 0)

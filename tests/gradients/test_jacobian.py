@@ -200,9 +200,3 @@ def test_the_fast_path_refuses_forward_mode_in_words():
     loss, point, (camera, _) = graph("fast")
     with pytest.raises(TypeError, match="forward-mode"):
         jax.jvp(lambda p: loss(p, camera), (point,), (point,))
-
-
-def test_a_traced_scene_needs_a_plan():
-    world = WORLDS["sun and beam"].make()
-    with pytest.raises(ValueError, match="a plan is needed"):
-        jax.grad(lambda c: jnp.mean(sj.render(world.scene, c).beauty))(world.camera)

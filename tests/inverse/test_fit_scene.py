@@ -2,14 +2,22 @@
 
 from functools import cache, partial
 
-import bodies
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from bodies import PLAIN, assert_close, lights_from_two_sides as lights, view, with_albedo
+from bodies import (
+    PLAIN,
+    assert_close,
+    bumpy,
+    joined,
+    lights_from_two_sides as lights,
+    sphere,
+    view,
+    with_albedo,
+)
 
 import splatjax as sj
 from splatjax.inverse import _fit_scene
@@ -37,8 +45,8 @@ def material() -> sj.Material:
 @cache
 def body() -> sj.Splats:
     """A bumpy ball with a map, and one on either side that no picture shows."""
-    aside = [bodies.sphere(18, 4.0, center=(x, 0.0, 0.0)) for x in (-60.0, 60.0)]
-    splats = bodies.joined(bodies.bumpy(160), *aside)
+    aside = [sphere(18, 4.0, center=(x, 0.0, 0.0)) for x in (-60.0, 60.0)]
+    splats = joined(bumpy(160), *aside)
     return with_albedo(splats, np.random.default_rng(2).uniform(0.3, 0.9, (splats.count, 2)))
 
 
@@ -65,11 +73,6 @@ def observations(shots=None, x=None, **more) -> list[sj.inverse.Observation]:
     ]
 
 
-def only(*kinds: type) -> optax.GradientTransformation:
-    """Let nothing else move: so all fits of this file run one compiled picture."""
-    return optax.stateless(lambda updates, params: chosen(kinds, updates))
-
-
 def chosen(kinds, coordinates):
     return tuple(
         own if isinstance(part, kinds) else jax.tree.map(jnp.zeros_like, own)
@@ -78,8 +81,12 @@ def chosen(kinds, coordinates):
 
 
 def fitted(*kinds: type, steps: int, seen=None, splats=None, **more) -> sj.inverse.FittedScene:
+    """Fit some kinds of parts. Nothing else moves: all fits of this file run one compiled
+    picture.
+    """
     optimizer = optax.chain(
-        optax.adam(optax.cosine_decay_schedule(2.0, steps), b2=0.9), only(*kinds)
+        optax.adam(optax.cosine_decay_schedule(2.0, steps), b2=0.9),
+        optax.stateless(lambda updates, params: chosen(kinds, updates)),
     )
     seen = observations() if seen is None else seen
     splats = body() if splats is None else splats
@@ -214,7 +221,7 @@ def stand_in(monkeypatch, reach: float, spoiled: float = np.inf) -> list[float]:
     Gives the albedos for which plans are made.
     """
     made = []
-    splats = bodies.sphere(20)
+    splats = sphere(20)
     plan = sj.make_plan(sj.Scene(splats, lights()[0], material()), camera(), PLAIN)
 
     def make_plans(setups, material, settings):
@@ -233,13 +240,15 @@ def stand_in(monkeypatch, reach: float, spoiled: float = np.inf) -> list[float]:
     return made
 
 
-def lifted(target: float, settings, spoilt=(), **more) -> tuple[sj.inverse.FittedScene, list[str]]:
-    """Fit a stand-in that starts at 0.5; settings tell stand-ins apart that are otherwise alike to
-    the compiler.
+def lifted(
+    target: float, resolution: int, spoilt=(), **more
+) -> tuple[sj.inverse.FittedScene, list[str]]:
+    """Fit a stand-in that starts at 0.5; resolutions of shadow maps tell stand-ins apart that are
+    otherwise alike to the compiler.
 
     A part of the picture is masked, and of another part nothing is known; some rows may be spoilt.
     """
-    splats, said = with_albedo(bodies.sphere(20), np.full((20, 2), 0.5)), []
+    splats, said = with_albedo(sphere(20), np.full((20, 2), 0.5)), []
     picture = np.full((SIZE, SIZE, 2), target)
     picture[list(spoilt)] = 90.0
     picture[:5], picture[5, :, 1] = 90.0, np.nan
@@ -254,7 +263,7 @@ def lifted(target: float, settings, spoilt=(), **more) -> tuple[sj.inverse.Fitte
         parts,
         optimizer,
         steps=40,
-        settings=settings,
+        settings=sj.RenderSettings(shadows=ShadowSettings(resolution=resolution)),
         progress=lambda s, loss: said.append(s),
         **more,
     )
@@ -263,7 +272,7 @@ def lifted(target: float, settings, spoilt=(), **more) -> tuple[sj.inverse.Fitte
 
 def test_a_scene_that_outgrows_its_plan_is_planned_anew(monkeypatch):
     made = stand_in(monkeypatch, reach=0.07)
-    found, said = lifted(0.8, sj.RenderSettings(shadows=ShadowSettings(resolution=101)))
+    found, said = lifted(0.8, 101)
     assert found.plans == len(made) > 2
     assert (
         sum("exceeds the capacity of its plan; planning again" in each for each in said)
@@ -280,26 +289,23 @@ def test_a_robust_loss_is_not_misled_by_rows_that_shine(monkeypatch):
     than a deviation.
     """
     stand_in(monkeypatch, reach=np.inf)
-    settings = sj.RenderSettings(shadows=ShadowSettings(resolution=105))
-    found, _ = lifted(0.8, settings, spoilt=(8, 13), loss=sj.inverse.HuberLoss())
+    found, _ = lifted(0.8, 105, spoilt=(8, 13), loss=sj.inverse.HuberLoss())
     np.testing.assert_allclose(found.splats.albedo, 0.8, atol=0.01)
-    misled, _ = lifted(0.8, settings, spoilt=(8, 13))
+    misled, _ = lifted(0.8, 105, spoilt=(8, 13))
     assert float(jnp.min(misled.splats.albedo)) > 0.85
 
 
 def test_what_is_no_number_ends_the_fit_at_the_best_before_it(monkeypatch):
     stand_in(monkeypatch, reach=np.inf, spoiled=0.6)
-    settings = sj.RenderSettings(shadows=ShadowSettings(resolution=102))
     with pytest.raises(RuntimeError, match="Nonfinite"):
-        lifted(0.8, settings)
-    found, _ = lifted(0.8, settings, throw=False)
+        lifted(0.8, 102)
+    found, _ = lifted(0.8, 102, throw=False)
     assert 2 < len(found.losses) == found.best + 2 < 40
     assert 0.5 < float(jnp.mean(found.splats.albedo)) <= 0.6
     assert np.all(np.isfinite(found.pictures[0][6:]))
     stand_in(monkeypatch, reach=np.inf, spoiled=0.1)
-    settings = sj.RenderSettings(shadows=ShadowSettings(resolution=103))
     with pytest.raises(ValueError, match="loss or gradient of the start is not finite"):
-        lifted(0.8, settings)
+        lifted(0.8, 103)
 
 
 def test_pixels_that_a_body_does_not_fill_count_before_black_alone():
@@ -319,9 +325,9 @@ def test_pixels_that_a_body_does_not_fill_count_before_black_alone():
             {"parts": (sj.inverse.AlbedoMap(), sj.inverse.AlbedoMap(1.0))},
             "parts are AlbedoMap, AlbedoMap",
         ),
-        ({"splats": bodies.sphere(20)}, r"splats\.albedo is None, and AlbedoMap has nothing"),
+        ({"splats": sphere(20)}, r"splats\.albedo is None, and AlbedoMap has nothing"),
         (
-            {"splats": bodies.sphere(16), "parts": (sj.inverse.NormalOffsets(0.1, 1.0, 1.0),)},
+            {"splats": sphere(16), "parts": (sj.inverse.NormalOffsets(0.1, 1.0, 1.0),)},
             "number of splats must be at least 17 for NormalOffsets.*got 16",
         ),
         ({"channels": 3}, r"observations\[0\]\.picture has 3 channels, material has 2"),
@@ -338,7 +344,7 @@ def test_what_cannot_be_fitted_is_refused(change, said):
         "observations": [
             sj.inverse.Observation(picture, camera(), lights()[0], intensity=intensity)
         ],
-        "splats": with_albedo(bodies.sphere(20), np.full((20, 2), 0.5)),
+        "splats": with_albedo(sphere(20), np.full((20, 2), 0.5)),
         "parts": [sj.inverse.AlbedoMap()],
         "steps": 1,
     }
@@ -348,6 +354,5 @@ def test_what_cannot_be_fitted_is_refused(change, said):
 
 def test_a_picture_none_of_whose_pixels_counts_is_refused(monkeypatch):
     stand_in(monkeypatch, reach=np.inf)
-    settings = sj.RenderSettings(shadows=ShadowSettings(resolution=104))
     with pytest.raises(ValueError, match=r"no pixel of observations\[0\] counts"):
-        lifted(np.nan, settings, spoilt=range(0))
+        lifted(np.nan, 104, spoilt=range(0))

@@ -25,23 +25,21 @@ from splatjax.inverse._observation import Evidence
 from splatjax.inverse._problem import RecoveryProblem, Unknowns, search, solution
 from splatjax.splatting import DenseRasterizer
 
+# Nearly all layers are resolved: pictures are made as they are searched, however coarse the splats.
 PLAIN = sj.RenderSettings(
     rasterizer=DenseRasterizer(),
     diffuser=DenseDiffuser(),
     kernel=EscapeNormalization(regular=(0.1, 0.2), scattered=(0.1, 0.2)),
 )
-"""Nearly all layers are resolved: pictures are made as they are searched, however coarse the
-splats.
-"""
 SIZE = 24
 camera = partial(bodies.view, size=SIZE)
 COUNT = 3
 HELD = sj.fitting.NonNegativeWeights(sj.fitting.FixedTotalReflectance())
+# The second light, than is given.
 STRONGER = 1.7
-"""The second light, than is given."""
 NOISE = 0.01
+# Rounds end when one moves nothing by more than 1e-3; 2e-4 measured.
 ROUNDS = 5e-4
-"""Rounds end when one moves nothing by more than 1e-3; 2e-4 measured."""
 
 
 def medium(times_a=1.0, times_s=1.0) -> sj.Medium:

@@ -35,10 +35,9 @@ def test_a_rotation_has_a_derivative_where_there_is_none():
 
 
 def test_lights_move_each_in_its_own_way():
-    camera = sj.Camera.look_at([0, 0, 9], [0, 0, 0], width=4, height=4)
     beam = sj.GaussianBeam([1, 2, 3], [0, 0, -2], power=[4, 5], variance=1)
     lights = sj.PointLight([1, 2, 3], intensity=[4, 5]), beam
-    setup = Setup(bodies.sphere(20), camera, lights)
+    setup = Setup(bodies.sphere(20), CAMERA, lights)
     places, strengths = (
         sj.inverse.LightPlaces(turn=0.1, shift=2.0),
         sj.inverse.LightStrengths(step=0.5),
@@ -89,17 +88,16 @@ def test_an_albedo_stays_between_0_and_1():
 
 
 def test_normals_and_areas_follow_a_paraboloid():
-    sheet = FLAT
-    x, y, _ = np.asarray(sheet.centers).T
+    x, y, _ = np.asarray(FLAT.centers).T
     heights = 0.3 + 0.1 * x - 0.05 * y + 0.02 * x * x + 0.03 * x * y - 0.01 * y * y
     slopes = np.stack([0.1 + 0.04 * x + 0.03 * y, -0.05 + 0.03 * x - 0.02 * y], axis=1)
     part = sj.inverse.NormalOffsets(step=1.0, smoothness=1e-3, deviation=1.0)  # next to no blur
-    moved = moved_by(part, sheet, jnp.asarray(heights, float))
+    moved = moved_by(part, FLAT, jnp.asarray(heights, float))
     stretch = np.sqrt(1 + np.sum(slopes**2, axis=1))
     normals = np.concatenate([-slopes, np.ones((len(x), 1))], axis=1) / stretch[:, None]
     np.testing.assert_allclose(moved.centers[:, 2], heights, atol=1e-6)
     np.testing.assert_allclose(moved.normals, normals, atol=1e-4)
-    np.testing.assert_allclose(moved.areas, np.asarray(sheet.areas) * stretch, rtol=1e-4)
+    np.testing.assert_allclose(moved.areas, np.asarray(FLAT.areas) * stretch, rtol=1e-4)
 
 
 def test_a_ball_that_grows_stays_a_ball():

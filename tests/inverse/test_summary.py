@@ -7,12 +7,11 @@ import optimistix as optx
 import pytest
 
 import splatjax as sj
-from splatjax.inverse import Recovery
 
 
 def recovery(
     information, chi_squared=1.0, noise_is_known=True, channels=1, unresolved=0.0, width=None
-) -> Recovery:
+) -> sj.inverse.Recovery:
     """Make a recovery of which nothing else is known; `width` is the information about the width
     below which layers are unresolved.
     """
@@ -24,7 +23,7 @@ def recovery(
         )
     medium = sj.Medium(jnp.full(channels, 0.02), 1.5, 1.3)
     gaussians = sj.SumOfGaussians([1], jnp.full((1, channels), 0.5))
-    return Recovery(
+    return sj.inverse.Recovery(
         medium=medium,
         material=sj.Material(gaussians),
         intensities=jnp.ones((1, channels)),
@@ -86,19 +85,20 @@ def test_a_summary_reports_what_matters(information, more, said, unsaid):
     assert np.all(np.isfinite(found.relative_errors())) == ("anything" not in found.summary())
 
 
+# The mean free path changes the picture as the width does, the other way round.
+OWN, PATH = along(1e-3, 1e-2, -np.pi / 4), np.asarray([1, 1]) / np.sqrt(2)
+WEIGHS = PATH @ OWN @ PATH
+WIDTH = np.append(-WEIGHS * PATH, WEIGHS)
+
+
 def test_what_only_the_width_shows_is_known_no_better_than_the_width():
-    """The mean free path changes the picture as the width does, the other way round: they
-    are known together.
-    """
-    own, path = along(1e-3, 1e-2, -np.pi / 4), np.asarray([1, 1]) / np.sqrt(2)
-    along_path = path @ own @ path
-    mixed = np.append(-along_path * path, along_path)
-    found = recovery(own, width=mixed, unresolved=1.0)
+    """The mean free path and the width are known together."""
+    found = recovery(OWN, width=WIDTH, unresolved=1.0)
     best, worst = found.combinations()[0]
     np.testing.assert_allclose(best.deviation, 1e-3, rtol=1e-3)
     np.testing.assert_allclose(worst.deviation, np.hypot(0.5 * np.log(2), 1e-2), rtol=1e-3)
     assert "not fixed by these pictures: sigma_a sigma_s', known to 35%" in found.summary()
-    np.testing.assert_allclose(found.noise_errors(), recovery(own).relative_errors(), rtol=1e-6)
+    np.testing.assert_allclose(found.noise_errors(), recovery(OWN).relative_errors(), rtol=1e-6)
     np.testing.assert_allclose(
         found.noise_errors(), np.full((2, 1), np.sqrt((1e-6 + 1e-4) / 2)), rtol=1e-3
     )
@@ -108,13 +108,11 @@ def test_a_picture_without_unresolved_layers_makes_up_for_one_with_as_far_as_it_
     """A search weighs pixels by their noise, whatever the width does to them: a weak close
     picture changes little.
     """
-    own, path = along(1e-3, 1e-2, -np.pi / 4), np.asarray([1, 1]) / np.sqrt(2)
-    weighs = path @ own @ path
-    found = recovery(own, width=np.append(-weighs * path, weighs))
+    found = recovery(OWN, width=WIDTH)
     for deviation in (1e-1, 1e-2, 1e-3):
         close = np.pad(along(deviation, deviation, 0.0), (0, 1))
-        share = weighs / (weighs + deviation**-2)
-        expected = np.hypot(0.5 * np.log(2) * share, 1 / np.sqrt(weighs + deviation**-2))
+        share = WEIGHS / (WEIGHS + deviation**-2)
+        expected = np.hypot(0.5 * np.log(2) * share, 1 / np.sqrt(WEIGHS + deviation**-2))
         np.testing.assert_allclose(
             np.sqrt(np.linalg.eigvalsh(found.covariance(close)[0])[-1]), expected, rtol=1e-4
         )

@@ -14,7 +14,6 @@ from PIL import Image
 from writers import some_frame
 
 import splatjax as sj
-from splatjax import io
 
 WORDS = (
     *(b"0", b"-1", b"1", b"255", b"65536", b"2147483647", b"4294967296", b"9223372036854775808"),
@@ -75,7 +74,10 @@ variances = [0.1, 2.0]
 weights = [[0.2], [0.3]]
 """
 TEXTS = {
-    "material": (".toml", [*(io.material_path(n).read_text() for n in ("skin", "marble")), SINGLE]),
+    "material": (
+        ".toml",
+        [*(sj.io.material_path(n).read_text() for n in ("skin", "marble")), SINGLE],
+    ),
     "observations": (".toml", [PICTURES]),
     "profile": (".csv", ["# measured\nr, red, green\n0.1, 1, 2\n0.2, 0.5, 1e-1\n0.4, 0.1, 0.01\n"]),
     "record": (".json", ['{"--width": 16, "splats": "a.ply", "turn": null, "x": [1.5, true]}\n']),
@@ -86,16 +88,16 @@ TEXTS = {
 READERS: dict[str, Callable[[Path], object]] = {
     "ply": sj.read_splats,
     **dict.fromkeys(
-        ("ply_mesh", "obj", "glb", "stl", "off"), partial(io.read_textured_mesh, mm_per_unit=1.0)
+        ("ply_mesh", "obj", "glb", "stl", "off"), partial(sj.io.read_textured_mesh, mm_per_unit=1.0)
     ),
-    "exr": lambda path: (io.read_picture(path), sj.read_exr(path)),
-    "picture": lambda path: io.read_textured_mesh(
+    "exr": lambda path: (sj.io.read_picture(path), sj.read_exr(path)),
+    "picture": lambda path: sj.io.read_textured_mesh(
         path.with_name("square.obj"), mm_per_unit=1.0, albedo=path
     ),
     "material": lambda path: (sj.load_profile(path), sj.load_material(path)),
     "observations": sj.io.read_observations,
     "profile": sj.io.read_profile,
-    "record": io.read_record,
+    "record": sj.io.read_record,
 }
 
 

@@ -21,11 +21,11 @@ from splatjax.io import (
 from splatjax.scattering import Dipole, Film, Layer, LayeredMultipole, Medium, SingleScattering
 from splatjax.scene import Material
 
+# Eight digits are shipped; the rest is the freedom of an optimum.
 REPRODUCED = 1e-5
-"""Eight digits are shipped; the rest is the freedom of an optimum."""
 
+# Sums of weights with eight digits, in float32.
 HELD = 5e-7
-"""Sums of weights with eight digits, in float32."""
 
 FITTED = tuple(name for name in list_materials() if name not in ("skin", "marble_gems"))
 GOOD_MEDIUM = '[medium]\nunit = "1/mm"\nsigma_a = [0.1]\nsigma_s_prime = [1.0]\neta = 1.3\n'
@@ -110,25 +110,27 @@ def test_shipped_fits_are_reproduced(every):
         )
 
 
-def profiles():
-    slab = Medium([1 / 7, 0.2], [3.0, 5.0], [1.4, 1.5])
-    ground = Medium([0.0, 1 / 7], [1.0, 1e5], [1.3, 1.1])
-    layers = [Film([0.1, 0.2]), Layer(slab, 2 / 3), Layer(ground, np.inf)]
-    return Dipole(ground), LayeredMultipole(layers)
+SLAB_MEDIUM = Medium([1 / 7, 0.2], [3.0, 5.0], [1.4, 1.5])
+GROUND = Medium([0.0, 1 / 7], [1.0, 1e5], [1.3, 1.1])
+PROFILES = {
+    "classical dipole": Dipole(GROUND),
+    "multipole of 3 layers": LayeredMultipole(
+        [Film([0.1, 0.2]), Layer(SLAB_MEDIUM, 2 / 3), Layer(GROUND, np.inf)]
+    ),
+}
 
 
-@pytest.mark.parametrize("kind", ["Dipole", "LayeredMultipole"])
-def test_a_saved_material_comes_back_bit_for_bit(tmp_path, kind):
+@pytest.mark.parametrize("model", PROFILES)
+def test_a_saved_material_comes_back_bit_for_bit(tmp_path, model):
     import colour  # noqa: F401  It makes NumPy print six digits.
 
     gaussians = SumOfGaussians([1e-5, 2 / 3], [[1 / 3, 1e-9], [0.1, -0.2]])
     once = SingleScattering(Medium([1 / 7, 0.2], 3.0, 1.4), [1 / 3, 1.0])
     material = Material(gaussians, 1.37, 0.1, roughness=1.0, single_scattering=once)
-    profile, path = profiles()[kind != "Dipole"], tmp_path / "a.toml"
+    profile, path = PROFILES[model], tmp_path / "a.toml"
     source, fit = {"citation": 'Me, "2024"'}, {"error": [0.1, 0.2], "count": 2}
     save_material(material, path, profile=profile, source=source, fit=fit)
     assert eqx.tree_equal((load_material(path), load_profile(path)), (material, profile))
-    model = "classical dipole" if kind == "Dipole" else "multipole of 3 layers"
     assert f'profile = "{model}, exact Fresnel moments"' in path.read_text()
 
 

@@ -20,8 +20,8 @@ import splatjax as sj
 from splatjax.io import read_textured_mesh, sample_mesh, srgb_to_linear
 
 MM = 2.0
+# Files hold some six digits.
 DIGITS = 2e-5
-"""Files hold some six digits."""
 BODIES = {
     "ball": trimesh.creation.icosphere(subdivisions=1, radius=3.0).apply_translation([1, 1, 1]),
     "tube": trimesh.creation.annulus(1.0, 2.0, 1.5, sections=8).apply_translation([-20, 0, 0]),
@@ -153,8 +153,8 @@ def test_examples_of_the_formats_own_texts(tmp_path, name):
 
 
 COUNT = 800
+# Degrees: round sides are of 48 facets, whose normals are this much off in the middle.
 FACET = 4.0
-"""Degrees: round sides are of 48 facets, whose normals are this much off in the middle."""
 
 
 HARD_BODIES = {
@@ -191,8 +191,8 @@ def test_normals_end_at_hard_edges(tmp_path, body, kind, rounded):
         mesh.vertex_normals = np.array(mesh.vertex_normals)
         path = export(mesh, tmp_path, kind.split()[1])
     else:
-        options = {"ply": {"vertex_normal": False}, "obj": {"include_normals": False}}
-        options |= {"glb": {"include_normals": False}, "gltf": {"include_normals": False}}
+        without = {"include_normals": False}
+        options = {"ply": {"vertex_normal": False}, "obj": without, "glb": without, "gltf": without}
         path = export(mesh, tmp_path, kind, **options.get(kind.split(".")[-1], {}))
     splats = sample_mesh(path, COUNT, mm_per_unit=1.0, rounded=rounded)
     angles, distances = angles_to_body(splats, body)

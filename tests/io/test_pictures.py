@@ -136,12 +136,6 @@ def test_decoding_is_that_of_colour_science():
     )
 
 
-def heights_and_reds(splats):
-    height = np.asarray(splats.centers)[:, 1] / np.asarray(splats.centers)[:, 1].max()
-    inner = np.abs(height - 0.5) < 0.48
-    return height[inner], linear_to_srgb(np.asarray(splats.albedo, float)[inner, 0])
-
-
 @pytest.fixture
 def folder(tmp_path):
     """The square with and without its texture, in formats that have v up and down."""
@@ -185,8 +179,11 @@ def test_maps_stand_upright(folder, name, v_up, rises):
     """
     albedo = None if name[0] in "tw" else folder / "ramp.png"
     splats = sample_mesh(folder / name, 300, mm_per_unit=5.0, albedo=albedo, v_up=v_up)
-    height, red = heights_and_reds(splats)
-    np.testing.assert_allclose(red, height if rises else 1 - height, atol=0.03)
+    height = np.asarray(splats.centers)[:, 1] / np.asarray(splats.centers)[:, 1].max()
+    inner = np.abs(height - 0.5) < 0.48
+    red = linear_to_srgb(np.asarray(splats.albedo, float)[:, 0])
+    expected = height if rises else 1 - height
+    np.testing.assert_allclose(red[inner], expected[inner], atol=0.03)
     np.testing.assert_allclose(float(splats.areas.sum()), 100, rtol=1e-5)
 
 

@@ -155,8 +155,8 @@ def test_points_that_cannot_be_read(tmp_path, data, value):
 
 
 def changed(names, value):
-    columns = columns_of(some_splats()) | dict.fromkeys(("specular", "red"), np.ones(50, "f4"))
-    columns |= dict.fromkeys(("green", "blue"), np.ones(50, "f4"))
+    ones = dict.fromkeys(("specular", "red", "green", "blue"), np.ones(50, "f4"))
+    columns = columns_of(some_splats()) | ones
     is_there = np.arange(50) == 7
     return columns | {name: np.where(is_there, value, columns[name]).astype("f4") for name in names}
 

@@ -34,9 +34,9 @@ def test_a_table_is_read_in_its_own_unit(tmp_path, dtype):
     np.testing.assert_allclose(profile.values, expected, rtol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("text", "value"),
-    [
+MEDIA = "name,sigma_a,sigma_s_prime,eta\nmilk, 0, 1.5, 1.3\n\n,0.1,2,1.4\n1,1,1,1\n"
+BAD = {
+    read_profile: [
         ("", "0 lines"),
         ("r,R\n0,1\n", "1 lines"),
         (GOOD.replace("2.0", "two"), "line 5: 0.1, two, 1.0"),
@@ -49,15 +49,26 @@ def test_a_table_is_read_in_its_own_unit(tmp_path, dtype):
         ("r (um), R\n0.1, 1\n0.2, 0.5\n", r"line 1 gives um.* mm_per_unit = 0.001 "),
         (b"\xff\xfe", "text"),
     ],
+    read_media: [
+        ("", "sigma_a"),
+        ("sigma_a,eta\n1,1\n", "sigma_s_prime"),
+        (MEDIA.split("\n")[0] + "\n", "0 rows"),
+        (MEDIA.replace("1.5", "0"), "line 2: milk, 0, 0,"),
+        (MEDIA.replace("0.1,", "-0.1,"), "line 4: , -0.1, 2"),
+        (MEDIA.replace("1.5", "many"), "line 2: milk, 0, many"),
+        (MEDIA.replace(",1.4", ""), "line 4: , 0.1, 2 must be name"),
+    ],
+}
+
+
+@pytest.mark.parametrize(
+    ("read", "text", "value"), [(read, *case) for read, cases in BAD.items() for case in cases]
 )
-def test_a_bad_profile_is_refused_with_its_line(tmp_path, text, value):
+def test_a_bad_table_is_refused_with_its_line(tmp_path, read, text, value):
     path = tmp_path / "bad.csv"
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
     with pytest.raises(ValueError, match=rf"bad.csv: .*{value}"):
-        read_profile(path)
-
-
-MEDIA = "name,sigma_a,sigma_s_prime,eta\nmilk, 0, 1.5, 1.3\n\n,0.1,2,1.4\n1,1,1,1\n"
+        read(path)
 
 
 def test_media_are_read_and_their_columns_come_back(tmp_path):
@@ -69,24 +80,6 @@ def test_media_are_read_and_their_columns_come_back(tmp_path):
     columns = read_columns(tmp_path / "back.csv")
     assert columns["name"] == tuple(names)
     np.testing.assert_array_equal(np.asarray(columns["eta"], float), media[:, 2] / 3)
-
-
-@pytest.mark.parametrize(
-    ("text", "value"),
-    [
-        ("", "sigma_a"),
-        ("sigma_a,eta\n1,1\n", "sigma_s_prime"),
-        (MEDIA.split("\n")[0] + "\n", "0 rows"),
-        (MEDIA.replace("1.5", "0"), "line 2: milk, 0, 0,"),
-        (MEDIA.replace("0.1,", "-0.1,"), "line 4: , -0.1, 2"),
-        (MEDIA.replace("1.5", "many"), "line 2: milk, 0, many"),
-        (MEDIA.replace(",1.4", ""), "line 4: , 0.1, 2 must be name"),
-    ],
-)
-def test_bad_media_are_refused_with_their_line(tmp_path, text, value):
-    (tmp_path / "bad.csv").write_text(text)
-    with pytest.raises(ValueError, match=rf"bad.csv: .*{value}"):
-        read_media(tmp_path / "bad.csv")
 
 
 def test_records_come_back_and_fingerprints_tell_contents_apart(tmp_path):

@@ -16,6 +16,7 @@ from splatjax.scene import Frame
 SQUARE = np.asarray([[0, 0, 0], [2, 0, 0], [2, 2, 0], [0, 2, 0]], np.float32)
 TRIANGLES = np.asarray([[0, 1, 2], [0, 2, 3]])
 UVS = SQUARE[:, :2] / 2  # v = 1 at the top of the square
+# Formats, and the options by which trimesh writes them with normals.
 SUFFIXES = {
     "ply": {"vertex_normal": True},
     "ascii.ply": {"vertex_normal": True, "encoding": "ascii"},
@@ -26,7 +27,6 @@ SUFFIXES = {
     "ascii.stl": {"file_type": "stl_ascii"},
     "off": {},
 }
-"""Formats, and the options by which trimesh writes them with normals."""
 _PLY_TYPES = {"u1": "uchar", "u2": "ushort", "i4": "int", "f4": "float", "f8": "double"}
 
 

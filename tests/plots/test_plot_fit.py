@@ -6,16 +6,12 @@ import numpy as np
 import pytest
 
 import splatjax as sj
-from splatjax.fitting import ErrorByCount
-from splatjax.gaussians import SumOfGaussians
-from splatjax.io import load_material, load_medium
 from splatjax.plots import plot_error_by_count, plot_fit
-from splatjax.scattering import Dipole, Tabulated
 
 
 def test_a_figure_has_names_units_error_and_energy_and_is_drawn_outside_of_pyplot(tmp_path):
-    gaussians = load_material("marble").gaussians
-    figure = plot_fit(Dipole(load_medium("marble")), gaussians, title="marble")
+    gaussians = sj.load_material("marble").gaussians
+    figure = plot_fit(sj.Dipole(sj.load_medium("marble")), gaussians, title="marble")
     assert [axes.get_xlabel() for axes in figure.axes] == ["r (mm)"] * 3
     assert "1/mm²" in figure.axes[1].get_ylabel()
     labels = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
@@ -28,8 +24,10 @@ def test_a_figure_has_names_units_error_and_energy_and_is_drawn_outside_of_pyplo
 
 
 def test_a_perfect_fit_of_one_channel_and_the_energy_that_another_misses(dtype):
-    gaussians = SumOfGaussians(jnp.asarray([0.1, 2.0], dtype), jnp.asarray([[0.3], [0.4]], dtype))
-    less = SumOfGaussians(gaussians.variances, 0.99 * gaussians.weights)
+    gaussians = sj.SumOfGaussians(
+        jnp.asarray([0.1, 2.0], dtype), jnp.asarray([[0.3], [0.4]], dtype)
+    )
+    less = sj.SumOfGaussians(gaussians.variances, 0.99 * gaussians.weights)
     perfect, misses = (plot_fit(gaussians, fit).axes for fit in (gaussians, less))
     np.testing.assert_array_equal(perfect[2].lines[0].get_ydata(), 0)
     label = misses[0].get_legend().get_texts()[0].get_text()
@@ -58,8 +56,8 @@ def test_what_was_not_fitted_is_shaded_and_not_counted(float64, dtype):
 def test_few_radii_are_marked_and_the_fit_is_drawn_between_them():
     radii = jnp.asarray([0.5, 1.0, 2.0, 4.0, 8.0])
     figure = plot_fit(
-        Tabulated(radii, jnp.exp(-radii)[:, None]),
-        SumOfGaussians(jnp.asarray([1.0]), jnp.ones((1, 1))),
+        sj.scattering.Tabulated(radii, jnp.exp(-radii)[:, None]),
+        sj.SumOfGaussians(jnp.asarray([1.0]), jnp.ones((1, 1))),
     )
     given, drawn = figure.axes[0].lines
     assert given.get_marker() == "o"
@@ -70,7 +68,9 @@ def test_few_radii_are_marked_and_the_fit_is_drawn_between_them():
 
 def test_every_count_and_channel_is_drawn_on_a_logarithmic_axis():
     error = jnp.asarray([[0.3, 0.2, 0.1], [0.03, 0.02, 0.01]])
-    axes = plot_error_by_count(ErrorByCount(error, jnp.ones((2, 2))), title="three").axes[0]
+    axes = plot_error_by_count(
+        sj.fitting.ErrorByCount(error, jnp.ones((2, 2))), title="three"
+    ).axes[0]
     assert axes.get_yscale() == "log"
     assert "E" in axes.get_ylabel()
     np.testing.assert_array_equal(axes.get_xticks(), [1, 2])

@@ -2,6 +2,7 @@
 
 import json
 import sys
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -16,8 +17,8 @@ from benchmarks.communication import Picture, View, counted
 from splatjax.splatting import ShadowSettings
 
 SETTINGS = sj.RenderSettings(shadows=ShadowSettings(resolution=32))
+# mm; where the balls stand, away from the origin of all coordinates.
 PLACE = np.asarray([40.0, -25.0, 15.0])
-"""mm; where the balls stand, away from the origin of all coordinates."""
 
 
 def scene(count: int = 1501, variances=(0.1, 12.5, 100.0)) -> sj.Scene:
@@ -162,25 +163,20 @@ def views_cut() -> dict:
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *cameras)
     mesh = jax.make_mesh((8,), ("views",))
 
-    def losses(frames):
-        return jnp.sum(frames.beauty**2) + jnp.sum(frames.coverage)
-
     def draw(scene, camera):
         return sj.render(scene, camera, PLAIN, plan)
 
-    def one_by_one(of):
-        frames = jax.lax.map(lambda camera: draw(of[0], camera), of[1])
-        return losses(frames), frames
+    def one_by_one(scene, cameras):
+        return jax.lax.map(lambda camera: draw(scene, camera), cameras)
 
-    def over_devices(of):
-        frames = sj.map_over(mesh, draw, *of)
-        return losses(frames), frames
+    def found(draw_all):
+        def loss(of):
+            frames = draw_all(*of)
+            return jnp.sum(frames.beauty**2) + jnp.sum(frames.coverage), frames
 
-    one, many = (
-        eqx.filter_jit(eqx.filter_grad(each, has_aux=True))((world, stacked))
-        for each in (one_by_one, over_devices)
-    )
-    return apart(one, many)
+        return eqx.filter_jit(eqx.filter_grad(loss, has_aux=True))((world, stacked))
+
+    return apart(found(one_by_one), found(partial(sj.map_over, mesh, draw)))
 
 
 def over_processes(what: str, index: str, count: str, port: str) -> dict:
@@ -211,11 +207,10 @@ def over_processes(what: str, index: str, count: str, port: str) -> dict:
         )(splats, plan)
 
     answer = found(splats, mesh)
+    rows = []
     if what == "gradients":
         rows = [shard.data.shape[0] for shard in answer.centers.addressable_shards]
         answer = process_allgather(answer, tiled=True)
-    else:
-        rows = []
     return {
         "devices": jax.device_count(),
         "rows": rows,

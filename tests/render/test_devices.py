@@ -22,7 +22,6 @@ def answers(commands, devices):
     environment = {
         "XLA_FLAGS": flags,
         "JAX_PLATFORMS": "cpu",
-        "PYTHONPATH": os.pathsep.join([str(HERE.parents[1]), str(HERE.parent)]),
     }
     statuses, printed, errors = run_together(*((words, environment) for words in commands))
     assert not any(statuses), errors

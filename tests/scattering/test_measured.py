@@ -16,12 +16,8 @@ from splatjax.scattering import (
     measure_laser_dot,
 )
 
-TRUTH = ([0.3, 2.0], [[0.3, 0.2], [0.4, 0.1]])
+TRUTH = SumOfGaussians([0.3, 2.0], [[0.3, 0.2], [0.4, 0.1]])
 MM_PER_PIXEL = 0.1
-
-
-def truth() -> SumOfGaussians:
-    return SumOfGaussians(*(jnp.asarray(each, float) for each in TRUTH))
 
 
 def photograph(
@@ -29,7 +25,7 @@ def photograph(
 ) -> np.ndarray:
     y, x = (np.mgrid[:pixels, :pixels] + 0.5) * MM_PER_PIXEL
     squared = (x - center[0] * MM_PER_PIXEL) ** 2 + (y - center[1] * MM_PER_PIXEL) ** 2
-    variances, weights = (np.asarray(each) for each in TRUTH)
+    variances, weights = (np.asarray(each, float) for each in (TRUTH.variances, TRUTH.weights))
     exitance = (np.exp(-squared[..., None] / (2 * variances)) / (2 * np.pi * variances)) @ weights
     image = power * exitance / np.pi
     return image + noise * image.max() * np.random.default_rng(3).normal(size=image.shape)
@@ -37,7 +33,7 @@ def photograph(
 
 def test_integrals_of_a_table_are_sums_over_its_radii(float64):
     r = jnp.linspace(0.1, 6.0, 300)
-    table = Tabulated(r, truth()(r))
+    table = Tabulated(r, TRUTH(r))
     np.testing.assert_allclose(integrated_reflectance(table), table.total_reflectance(), rtol=1e-3)
     beyond = L2_QUADRATURE.beyond(1.0)
     radii, weights = beyond.radii(table)
@@ -63,8 +59,8 @@ def test_a_table_is_fitted_over_its_own_radii_alone(float64):
     same.
     """
     r = jnp.linspace(0.05, 3.0, 60)
-    fitted = fit_gaussians(Tabulated(r, truth()(r)), 2)
-    assert_close(fitted.gaussians, truth(), rtol=1e-6)
+    fitted = fit_gaussians(Tabulated(r, TRUTH(r)), 2)
+    assert_close(fitted.gaussians, TRUTH, rtol=1e-6)
 
 
 def test_a_fit_weighed_by_its_errors_is_the_likeliest(float64):
@@ -72,7 +68,7 @@ def test_a_fit_weighed_by_its_errors_is_the_likeliest(float64):
     integral's weights.
     """
     r = jnp.linspace(0.05, 5.0, 80)
-    clean = np.asarray(truth()(r))[:, :1]
+    clean = np.asarray(TRUTH(r))[:, :1]
     deviation = jnp.asarray(0.03 * clean + 1e-5)
     noise = np.random.default_rng(1).normal(size=(200, 80, 1))
     values = jnp.asarray(clean + np.asarray(deviation) * noise)
@@ -96,30 +92,28 @@ def test_a_fit_weighed_by_its_errors_is_the_likeliest(float64):
 
 def test_weighing_needs_errors(float64):
     r = jnp.linspace(0.05, 5.0, 30)
-    with pytest.raises(ValueError, match="Tabulated has no standard errors"):
-        fit_gaussians(Tabulated(r, truth()(r)), 2, rule=InverseVariance())
-    with pytest.raises(ValueError, match="SumOfGaussians has no standard errors"):
-        fit_gaussians(truth(), 2, rule=InverseVariance())
+    for profile in (Tabulated(r, TRUTH(r)), TRUTH):
+        with pytest.raises(ValueError, match=f"{type(profile).__name__} has no standard errors"):
+            fit_gaussians(profile, 2, rule=InverseVariance())
     # Radii that nothing was counted at say nothing.
     deviation = jnp.where(r < 4, 1e-3, 0.0)
-    radii, weights = InverseVariance().radii(Tabulated(r, truth()(r)[:, 0], deviation))
+    radii, weights = InverseVariance().radii(Tabulated(r, TRUTH(r)[:, 0], deviation))
     np.testing.assert_array_equal(np.asarray(weights)[:, 0] > 0, np.asarray(r) < 4)
     np.testing.assert_allclose((weights * radii)[:5, 0], 1e6, rtol=1e-12)
 
 
 def test_a_total_that_is_known_is_held(float64):
     r = jnp.linspace(0.05, 2.0, 60)
-    table = Tabulated(r, truth()(r), total=truth().total_reflectance())
-    assert Tabulated(r, truth()(r)).total_reflectance()[0] < 0.85 * table.total_reflectance()[0]
+    table = Tabulated(r, TRUTH(r), total=TRUTH.total_reflectance())
+    assert Tabulated(r, TRUTH(r)).total_reflectance()[0] < 0.85 * table.total_reflectance()[0]
     fitted = fit_gaussians(table, 2, weights=FixedTotalReflectance())
-    np.testing.assert_allclose(fitted.gaussians.weights, truth().weights, rtol=1e-6)
+    np.testing.assert_allclose(fitted.gaussians.weights, TRUTH.weights, rtol=1e-6)
 
 
 def test_a_photograph_gives_the_profile_and_its_noise(float64):
-    noise = 0.01
-    dot = measure_laser_dot(photograph(noise=noise), MM_PER_PIXEL, power=2.0)
+    dot = measure_laser_dot(photograph(noise=0.01), MM_PER_PIXEL, power=2.0)
     np.testing.assert_allclose(dot.center, [60.2, 61.3], atol=0.1)
-    away = (dot.profile.values - truth()(dot.profile.radii)) / dot.profile.deviation
+    away = (dot.profile.values - TRUTH(dot.profile.radii)) / dot.profile.deviation
     assert np.max(np.abs(away)) < 4.5
     np.testing.assert_allclose(np.std(away), 1, atol=0.25)
 
@@ -140,7 +134,7 @@ def test_rings_end_at_the_nearest_edge(center):
         photograph(center=center), MM_PER_PIXEL, power=2.0, center=center, largest=1.0
     )
     assert 1.0 - 1.5 * MM_PER_PIXEL < float(shorter.profile.radii[-1]) < 1.0
-    np.testing.assert_allclose(dot.profile.values, truth()(dot.profile.radii), rtol=0.02, atol=1e-4)
+    np.testing.assert_allclose(dot.profile.values, TRUTH(dot.profile.radii), rtol=0.02, atol=1e-4)
 
 
 def test_a_ring_is_where_its_pixels_are_on_average(float64):
@@ -161,7 +155,7 @@ def test_saturated_rings_are_left_out(float64):
     image = photograph()
     limit = 0.5 * image.max()
     dot = measure_laser_dot(np.minimum(image, limit), MM_PER_PIXEL, power=2.0, saturation=limit)
-    np.testing.assert_allclose(dot.profile.values, truth()(dot.profile.radii), rtol=0.03)
+    np.testing.assert_allclose(dot.profile.values, TRUTH(dot.profile.radii), rtol=0.03)
     assert float(jnp.max(dot.profile.values)) < np.pi * limit / 2
     with pytest.raises(
         ValueError, match=r"rings, of \d+, that are not saturated must be at least 2.*got 0"

@@ -252,30 +252,3 @@ def test_distances_from_monte_carlo(float64, monte_carlo, run, coefficients, dis
         for number in range(1, 9):
             ratio = np.sum((r * found)[ring == number]) / np.sum((r * reference)[ring == number])
             assert abs(ratio - 1) < 0.05, (number, ratio)
-
-
-@pytest.mark.parametrize(
-    ("make", "field"),
-    [
-        (lambda x: Medium([x - 0.1], 1.0, 1.3), "Medium.sigma_a"),
-        (lambda x: Medium([0.1, x / x], 1.0, 1.3), "Medium.sigma_a"),
-        (lambda x: Medium(0.1, x, 1.3), "Medium.sigma_s_prime"),
-        (lambda x: Medium(0.1, 1 / (x + 1e-320), 1.3), "Medium.sigma_s_prime"),
-        (lambda x: Medium(0.1, 1.0, eta=x), "Medium.eta"),
-        (lambda x: Burley(x + 1.01, 1.0), "Burley.albedo"),
-        (lambda x: Burley(x - 0.01, 1.0), "Burley.albedo"),
-        (lambda x: Burley(0.5, x), "Burley.free_path"),
-        (lambda x: Film(x - 0.1), "Film.optical_depth"),
-        (lambda x: Layer(medium(), x - 1), "Layer.thickness"),
-        (lambda x: Tabulated([0, 1, 1 + x], [1, 1, 1]), "steps of Tabulated.radii"),
-        (lambda x: Tabulated([-1 + x, 1], [1, 1]), "Tabulated.radii"),
-        (lambda x: Tabulated([0, 1], [1.0, x / x]), "Tabulated.values"),
-        (lambda x: Tabulated([0, 1], [1.0 + x]), "Tabulated.values"),
-        (lambda x: Tabulated([x], [1.0]), "Tabulated.radii"),
-        (lambda x: LayeredMultipole([Film(x)]), "none of these 1 is a Layer"),
-        (lambda x: LayeredMultipole([Layer(medium(), jnp.inf)] * 2), "layer 1 of 2"),
-    ],
-)
-def test_numbers_beyond_physics_are_refused_by_the_name_of_their_field(make, field):
-    with np.errstate(all="ignore"), pytest.raises(ValueError, match=field):
-        make(np.float64(0))

@@ -47,20 +47,22 @@ def test_helmholtz_reciprocity(dtype):
     np.testing.assert_allclose(np.asarray(there), np.asarray(back), rtol=1e-5)
 
 
-def test_peak_is_that_of_the_formula(dtype):
-    # Head on, |wi + wo|^2 = 4 and cos a = 1: f = specular F0 / (4 pi m^2).
-    value = lobe_at(UP, UP, UP, dtype=dtype)
-    np.testing.assert_allclose(float(value[0]), 0.18 * 0.028 / (4 * np.pi * 0.09), rtol=1e-5)
+LOBES = {
+    # |wi + wo|^2 = 4 and cos a = 1: f = specular F0 / (4 pi m^2).
+    "head on": (UP, UP, 0.028, 0.18, 0.3, 0.18 * 0.028 / (4 * np.pi * 0.09)),
+    # A mirror pair at 60 degrees: H.V = 1/2 and H = N, and |wi + wo|^2 = 1.
+    "mirrored": (
+        *([[x, 0.0, 0.5]] for x in (0.75**0.5, -(0.75**0.5))),
+        *(0.04, 1.0, 0.5),
+        (0.04 + 0.96 * 0.5**5) / (np.pi * 0.25),
+    ),
+}
 
 
-def test_fresnel_is_evaluated_at_the_half_vector(dtype):
-    # A mirror pair at 60 degrees: H.V = 1/2 and H = N.
-    s, c = np.sin(np.pi / 3), np.cos(np.pi / 3)
-    value = lobe_at(
-        UP, [[s, 0, c]], [[-s, 0, c]], f0=0.04, specular=1.0, roughness=0.5, dtype=dtype
-    )
-    fresnel = 0.04 + 0.96 * 0.5**5
-    np.testing.assert_allclose(float(value[0]), fresnel / (np.pi * 0.25) / (4 * c * c), rtol=1e-5)
+@pytest.mark.parametrize("place", LOBES)
+def test_lobe_is_that_of_the_formula_with_fresnel_at_the_half_vector(place, dtype):
+    *given, expected = LOBES[place]
+    np.testing.assert_allclose(lobe_at(UP, *given, dtype=dtype), [expected], rtol=1e-5)
 
 
 DEGENERATE = {
@@ -164,18 +166,19 @@ def test_table_is_the_integral_of_the_lobe(f0, dtype):
     np.testing.assert_allclose(np.asarray(table), truth, atol=TABLE_ERROR, rtol=0)
 
 
-def test_published_albedos_of_skin(dtype):
-    # d'Eon and Luebke's shader leaves out the 1/pi of the lobe; its albedos, measured
-    # independently, are pi times ours.
-    mu = jnp.asarray([1.0, 0.7, 0.4, 0.1], dtype)
-    table = directional_albedo(mu, *arrays(dtype, 0.028, 1.0, 0.3))
-    np.testing.assert_allclose(np.asarray(table) * np.pi, [0.0801, 0.0908, 0.211, 0.763], atol=1e-3)
-
-
-def test_head_on_albedo_without_fresnel(dtype):
-    # int PH cos dH over half vectors within 45 degrees, in closed form at normal incidence.
-    table = directional_albedo(*arrays(dtype, 1.0, 1.0, 1.0, 0.3))
-    np.testing.assert_allclose(float(table), 0.910, atol=1e-3)
+@pytest.mark.parametrize(
+    ("mu", "f0", "scale", "expected"),
+    [
+        # d'Eon and Luebke's shader leaves out the 1/pi of the lobe; its albedos of skin, measured
+        # independently, are pi times ours.
+        ([1.0, 0.7, 0.4, 0.1], 0.028, np.pi, [0.0801, 0.0908, 0.211, 0.763]),
+        # int PH cos dH over half vectors within 45 degrees, in closed form at normal incidence.
+        (1.0, 1.0, 1.0, 0.910),
+    ],
+)
+def test_albedos_are_those_published_and_in_closed_form(mu, f0, scale, expected, dtype):
+    table = directional_albedo(*arrays(dtype, mu, f0, 1.0, 0.3))
+    np.testing.assert_allclose(np.asarray(table) * scale, expected, atol=1e-3)
 
 
 def test_never_more_than_all_light(dtype):
@@ -227,20 +230,17 @@ def test_slopes_agree_with_the_quadrature(float64):
         )
 
 
-@pytest.mark.parametrize("roughness", [0.3, [0.2, 0.5, 0.8]], ids=["one", "map"])
-def test_gradients_in_every_argument(float64, roughness):
-    arguments = arrays(None, [0.07, 0.4, 0.9], 0.05, 0.6, roughness)
-    check_grads(jax.jit(diffuse_transmission), arguments, order=1, rtol=1e-5)
-
-
-def test_second_derivative_in_the_cosine(float64):
-    parameters = arrays(None, 0.05, 0.6, 0.3)
-    check_grads(
-        jax.jit(lambda mu: directional_albedo(mu, *parameters)),
-        arrays(None, 0.4),
-        order=2,
-        rtol=1e-5,
-    )
+@pytest.mark.parametrize(
+    ("function", "arguments", "order"),
+    [
+        (diffuse_transmission, ([0.07, 0.4, 0.9], 0.05, 0.6, 0.3), 1),
+        (diffuse_transmission, ([0.07, 0.4, 0.9], 0.05, 0.6, [0.2, 0.5, 0.8]), 1),
+        (lambda mu: directional_albedo(mu, *arrays(None, 0.05, 0.6, 0.3)), (0.4,), 2),
+    ],
+    ids=["one roughness", "a map", "twice in the cosine"],
+)
+def test_gradients_in_every_argument(float64, function, arguments, order):
+    check_grads(jax.jit(function), arrays(None, *arguments), order=order, rtol=1e-5)
 
 
 VALUES_AND_SLOPES = [

@@ -20,7 +20,6 @@ from splatjax.splatting import (
     fragment_weight,
 )
 
-NO_FILTER = SplattingSettings(filter_radius=1e-4)
 # In pixels so fine, the quarter pixel that keeps slopes finite is nothing.
 FINE = {"width": 40_000, "height": 32_000}
 # float64: that quarter pixel; float32: slanted discs cancel by the squared tangent.
@@ -38,20 +37,6 @@ def scattered(count=60, seed=3):
     rng = np.random.default_rng(seed)
     normals = rng.normal(size=(count, 3)) + np.asarray([0, 0, 1.2])
     return bodies.splats(rng.uniform(-9, 9, (count, 3)), normals, rng.uniform(0.5, 5.0, count))
-
-
-def footprints_of(view, body, settings=SplattingSettings()):
-    footprints = jax.jit(lambda body: view.footprints(body, settings))(body)
-    box = footprints.left, footprints.right, footprints.top, footprints.bottom
-    return footprints, np.stack([np.asarray(each, float) for each in box])
-
-
-def around(box, reach, steps):
-    """Columns and rows in and around every box, `[splats, samples]`."""
-    grid = np.linspace(-reach, reach, steps)
-    u, v = (each.reshape(1, -1) for each in np.meshgrid(grid, grid))
-    left, right, top, bottom = box[:, :, None]
-    return (left + right + (right - left) * u) / 2, (top + bottom + (bottom - top) * v) / 2
 
 
 @eqx.filter_jit
@@ -86,8 +71,13 @@ def at_depth(view, x, y, depth):
 @pytest.mark.parametrize("kind", VIEWS)
 def test_fragments_are_where_rays_meet_discs(kind, dtype):
     view, body = FINE_VIEWS[kind](), scattered()
-    footprints, box = footprints_of(view, body, NO_FILTER)
-    x, y = around(box, 1.25, 17)
+    footprints = eqx.filter_jit(view.footprints)(body, SplattingSettings(filter_radius=1e-4))
+    box = footprints.left, footprints.right, footprints.top, footprints.bottom
+    left, right, top, bottom = (np.asarray(each, float)[:, None] for each in box)
+    # Columns and rows in and around every box, `[splats, samples]`.
+    grid = np.linspace(-1.25, 1.25, 17)
+    u, v = (each.reshape(1, -1) for each in np.meshgrid(grid, grid))
+    x, y = (left + right + (right - left) * u) / 2, (top + bottom + (bottom - top) * v) / 2
     _, squared_radius, depth = (np.asarray(each) for each in fragments(footprints, view, x, y))
     start = at_depth(view, x, y, 0.0)
     along = (at_depth(view, x, y, DISTANCE) - start) / DISTANCE

@@ -9,8 +9,6 @@ import pytest
 from media import balance, layer, reflectance
 
 import splatjax as sj
-from splatjax.scattering import ExactFresnel, SingleScattering
-from splatjax.transport import MonteCarlo
 from splatjax.transport._directions import fresnel
 from splatjax.transport._results import Sum, total
 from splatjax.transport._rounds import uniforms
@@ -130,7 +128,6 @@ def test_what_is_reported_adds_up(float32):
     found = sj.transport.monte_carlo(
         stack, 200_000, KEY, eta_below=1.5, incidence=sj.transport.DiffuseIncidence()
     )
-    assert isinstance(found, MonteCarlo)
     assert np.all(np.abs(balance(found)) < 1e-5)
     assert np.all(np.asarray(found.absorbed.value) > 0.01)
     few = sj.transport.monte_carlo(
@@ -186,7 +183,7 @@ def test_reflectance_has_the_moments_of_diffusion(float64, eta):
     reflectance, onward = fresnel(mu, jnp.full_like(mu, eta), jnp.ones_like(mu))
     moment = 2 * jnp.mean(mu * reflectance)
     np.testing.assert_allclose(
-        moment, ExactFresnel().first_moment(jnp.asarray([eta]))[0], atol=2e-6
+        moment, sj.scattering.ExactFresnel().first_moment(jnp.asarray([eta]))[0], atol=2e-6
     )
     # Snell's law, where light goes on.
     goes = np.asarray(reflectance) < 1
@@ -260,7 +257,7 @@ ETAS = (1.0, 1.4)
 
 
 def single(albedo=0.9, eta=1.0, channels=1):
-    return SingleScattering(sj.Medium([1 - albedo] * channels, albedo, eta))
+    return sj.SingleScattering(sj.Medium([1 - albedo] * channels, albedo, eta))
 
 
 @pytest.mark.parametrize("eta", ETAS)
@@ -354,7 +351,7 @@ def test_photon_beam_is_it_and_the_rest():
     beam = sj.scattering.PhotonBeam(
         sj.Medium(jnp.asarray([0.02]), jnp.asarray([0.8]), jnp.asarray([1.3]))
     )
-    rest, once = beam.multiply_scattered(), SingleScattering(beam.medium)
+    rest, once = beam.multiply_scattered(), sj.SingleScattering(beam.medium)
     r = jnp.asarray([0.2, 1.0, 4.0])
     np.testing.assert_allclose(np.asarray(rest(r) + once(r)), np.asarray(beam(r)), rtol=1e-5)
     total = rest.total_reflectance() + once.total_reflectance()
