@@ -26,10 +26,8 @@ from ._gaussian_sums import SourceTable, Wanted, gaussian_sums
 from ._kernel import AbstractDiffusionKernel, TruncatedGaussian, resolved_fraction
 from ._neighbors import Boxes, Neighbors, find_neighbors
 
+# Of the areas of the splats: a layer counts as resolved as far as splats of that area resolve it.
 FINE_QUANTILE = 0.01
-"""Quantile of the areas of the splats: a layer counts as resolved as far as splats of that area
-resolve it.
-"""
 _CELL = 0.6  # edge of the cells, in standard deviations, for an error of 2e-3; error ~ edge^3
 _LAYERS = 2  # to a multiple of which they are filled up, so that materials share a program
 _WORTHWHILE = 1.2  # edge of the cells, in spacings, from which on merging splats pays

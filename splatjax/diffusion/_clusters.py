@@ -14,10 +14,8 @@ from splatjax._chunking import jit_unless_traced
 
 from ._diffuser import Sources
 
-POINTS_PER_BLOCK = 32
-"""Points of one block; blocks, and their halves and quarters, are compact."""
+POINTS_PER_BLOCK = 32  # blocks, and their halves and quarters, are compact
 SOURCES_PER_BLOCK = 8
-"""Sources of a block."""
 _TOGETHER = 128 * POINTS_PER_BLOCK  # split side by side from here on
 
 

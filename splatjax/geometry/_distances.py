@@ -12,10 +12,9 @@ import numpy as np
 
 Point = tuple[np.ndarray, np.ndarray, np.ndarray]
 Size = float | int
+# A distance; or a primitive, the number of its view and its sizes; or a list of a part and rows of
+# an operation, its softness and another part.
 Part = np.ndarray | tuple[Any, ...] | list[Any]
-"""A distance; or a primitive, the number of its view and its sizes; or a list of a part and rows of
-an operation, its softness and another part.
-"""
 
 
 def model(part: Part, views: Sequence[Point]) -> np.ndarray:

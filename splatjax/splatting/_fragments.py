@@ -16,8 +16,8 @@ from ._kernel import fast_fragment_weight, fragment_weight_derivative
 from ._rasterizer import PixelSums, least_weight
 from ._views import AbstractView
 
+# Of the footprints, that sums depend on.
 PLANES = ("x", "y", "slope_x", "slope_y", "a", "b", "c", "nearness", "opacity")
-"""Of the footprints, that sums depend on."""
 _EMPTY = (0.0, 0.0, 0.0, 0.0, 1e12, 0.0, 1e12, 1.0, 0.0)  # covers no pixel center
 
 

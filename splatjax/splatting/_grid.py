@@ -5,8 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-TILE_SIDE = 8
-"""Pixels along a tile."""
+TILE_SIDE = 8  # pixels
 _HALF = 128
 TILE_BITS = 22  # in a sort key of 32, for the number of a tile
 

@@ -16,8 +16,7 @@ from ._kernel import coverage
 from ._rasterizer import AbstractRasterPlan, FragmentSums, PixelSums, invalid_factor
 from ._views import AbstractView, SplattingSettings
 
-TILES_AT_ONCE = AT_ONCE // TILE_SIDE**2
-"""Tiles of a chunk, for what is computed chunk by chunk."""
+TILES_AT_ONCE = AT_ONCE // TILE_SIDE**2  # of a chunk, for what is computed chunk by chunk
 
 
 def blend_fragments(

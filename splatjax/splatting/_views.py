@@ -18,8 +18,8 @@ from splatjax.scene import Splats
 
 from ._grid import TileGrid, TileRanges
 
+# Cosine to the line of sight, below which float32 does not know which side of a splat is seen.
 EDGE_ON = 1e-5
-"""Cosine to the line of sight, below which float32 does not know which side of a splat is seen."""
 _SLOPE_FILTER = 0.25  # pixels; see `widen_ellipse`
 
 
@@ -133,8 +133,7 @@ def epsilon_of(radii, filter_radius, cosine, settings: SplattingSettings):
     return settings.epsilon_z * reach / jnp.maximum(cosine, 1 / settings.largest_slope)
 
 
-MARGIN = 8.0
-"""Pixels around the picture; the screen filter reaches beyond a sphere."""
+MARGIN = 8.0  # pixels around the picture; the screen filter reaches beyond a sphere
 
 
 class AbstractView(eqx.Module):
