@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 from splatjax._chunking import with_spare
 
 BLOCKS_PER_ROW = 16  # blocks of sources in a row of a list
-LANES = 128  # blocks of points that are swept together
+LANES = 256  # blocks of points that are swept together
 _ROWS = 7  # for every block of points: more than most bodies need, so that they share a program
 _AT_ONCE = 1 << 13  # pairs of boxes whose parts are tested together: they stay in cache
 _FAN = 4  # parts of a box of a coarser level

@@ -238,7 +238,7 @@ def _cut_and_order(splats: Splats, mesh: Mesh | None) -> tuple[list[Splats], Arr
     and which of their entries exist, device after device.
     """
     devices, share = splats_per_device(splats.count, mesh)
-    places = rounded_up(share, _diffusion.POINTS_PER_BLOCK)
+    places = rounded_up(share, _diffusion.POINTS_PER_BLOCK, per_octave=16)
     filling = (0, places - share)
     whole = jax.tree.map(np.asarray, fill_up(splats, share * devices))
     parts, orders, exist = [], [], []

@@ -104,7 +104,8 @@ class TilePlan(AbstractRasterPlan):
         grid = self.rasterizer.grid(views[0])
         bins = plan.bins.roomy(grid)
         front = bins.chunks * grid.lanes
-        roomy = TilePlan(self.rasterizer, whole.count, bins, SurfaceCapacity(front, front))
+        seen = min(1 << plan.splats.bit_length(), whole.count)
+        roomy = TilePlan(self.rasterizer, seen, bins, SurfaceCapacity(front, front))
         most = max(int(_tiles_behind(whole, view, settings, roomy)) for view in views)
         step = -(-grid.half // 8)
         grain = math.lcm(self.rasterizer.lanes * step, len(parts))
