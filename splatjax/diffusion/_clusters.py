@@ -53,14 +53,14 @@ class LayerSources(eqx.Module):
     ) -> "LayerSources":
         """Find the sources of layers.
 
-        There is room for three quarters of the splats in every layer, more than most materials
+        The capacity is three quarters of the splats for every layer, more than most materials
         need, so that they share a program.
 
         **Arguments:**
 
         - `exists`: false for splats that fill a block.
         - `edges`: of the cells of each layer, mm; 0 for single splats, inf for none.
-        - `least`: sources for which there is room.
+        - `least`: capacity at least.
         """
         cells = sorted({edge for edge in edges if 0 < edge < np.inf})
         nested = dict(zip(cells, nested_cells(centers, normals, exists, cells), strict=True))
@@ -73,8 +73,8 @@ class LayerSources(eqx.Module):
             layers.append(np.full(blocks, layer, np.int32))
             count += blocks * SOURCES_PER_BLOCK
         half = -(-len(exists) // (2 * SOURCES_PER_BLOCK)) * SOURCES_PER_BLOCK
-        room = max(-(-count // half), -(-3 * len(edges) // 2)) * half
-        layers.append(np.zeros((max(room, least) - count) // SOURCES_PER_BLOCK, np.int32))
+        capacity = max(-(-count // half), -(-3 * len(edges) // 2)) * half
+        layers.append(np.zeros((max(capacity, least) - count) // SOURCES_PER_BLOCK, np.int32))
         return cls(jnp.asarray(np.stack(parents)), jnp.asarray(np.concatenate(layers)))
 
     @property

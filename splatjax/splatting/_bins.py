@@ -43,7 +43,7 @@ class BinCapacity(eqx.Module):
             min(max(with_spare(chunks, -(-grid.half // 4)), grid.half), whole),
         )
 
-    def roomy(self, grid: TileGrid) -> "BinCapacity":
+    def coarse(self, grid: TileGrid) -> "BinCapacity":
         """Round up to the next powers of two, and to all chunks."""
         whole = grid.padded_count // grid.lanes
         pairs, blocks = (1 << each.bit_length() for each in (self.pairs, self.blocks))

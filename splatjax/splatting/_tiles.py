@@ -100,13 +100,13 @@ class TilePlan(AbstractRasterPlan):
         if len(parts) > 1:
             whole = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
             plan = self.rasterizer.make_plan([whole], views, settings)
-        # With much room, so that other bodies and pictures of the size need no other program.
+        # Of coarse capacity, so that other bodies and pictures of the size need no other program.
         grid = self.rasterizer.grid(views[0])
-        bins = plan.bins.roomy(grid)
+        bins = plan.bins.coarse(grid)
         front = bins.chunks * grid.lanes
         seen = min(1 << plan.splats.bit_length(), whole.count)
-        roomy = TilePlan(self.rasterizer, seen, bins, SurfaceCapacity(front, front))
-        most = max(int(_tiles_behind(whole, view, settings, roomy)) for view in views)
+        coarse = TilePlan(self.rasterizer, seen, bins, SurfaceCapacity(front, front))
+        most = max(int(_tiles_behind(whole, view, settings, coarse)) for view in views)
         step = -(-grid.half // 8)
         grain = math.lcm(self.rasterizer.lanes * step, len(parts))
         behind = -(-int(_SPARE * most + 1) // grain) * grain
