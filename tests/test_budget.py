@@ -15,11 +15,11 @@ import pytest
 import splatjax as sj
 
 TABLE = Path(__file__).with_name("budget.json")
-SPARE = 1.01  # names and shapes of this body alone
+SPARE = 1.01  # so little is no decision
 
 
 def size_of(function, *given) -> dict[str, int]:
-    """Count the fusions of a program, each kind of them once, and the instructions of all."""
+    """Count the distinct computations of a compiled program, and the instructions of all."""
     text = jax.jit(function).lower(*given).compile().as_text()
     text = re.sub(r", metadata=\{[^}]*\}|[\w.\-]+(?=: )|%[\w.\-]+", "", text)
     fused = {body for body in text.split("\n\n") if "ROOT" in body and "ENTRY" not in body}
