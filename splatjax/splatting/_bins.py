@@ -78,19 +78,6 @@ def _occupied(first_block: Int[Array, " chunks_and_one"]) -> Int[Array, ""]:
     return jnp.sum(first_block[1:] > first_block[:-1], dtype=jnp.int32)
 
 
-def _running_max(values: Int[Array, " pairs"]) -> Int[Array, " pairs"]:
-    """Compute the running maximum: columns in sequence, side by side."""
-    columns = values.reshape(_ROW, -1).T
-
-    def step(carry, value):
-        carry = jnp.maximum(carry, value)
-        return carry, carry
-
-    last, columns = lax.scan(step, jnp.zeros(_ROW, values.dtype), columns)
-    before = jnp.concatenate([jnp.zeros(1, values.dtype), lax.cummax(last)[:-1]])
-    return jnp.maximum(columns, before[None]).T.reshape(-1)
-
-
 def _pairs(ranges: TileRanges, grid: TileGrid, capacity: int):
     """List all pairs of item and tile, item after item; `grid.padded_count` where there is none.
     Also compute the capacity needed over planned.
@@ -99,12 +86,7 @@ def _pairs(ranges: TileRanges, grid: TileGrid, capacity: int):
     ends = jnp.cumsum(counts)
     begins, total = ends - counts, ends[-1]
     items = jnp.arange(counts.shape[0], dtype=jnp.int32)
-    marks = (
-        jnp.zeros(capacity, jnp.int32)
-        .at[jnp.where(counts > 0, begins, capacity)]
-        .max(items, mode="drop")
-    )
-    item = _running_max(marks)
+    item = jnp.repeat(items, counts, total_repeat_length=capacity)
     pair = jnp.arange(capacity, dtype=jnp.int32)
 
     def of_item(values):
@@ -141,13 +123,8 @@ def _ranks(tile: Int[Array, " pairs"], tiles: int):
         [sorted_tile[:, 1:] != sorted_tile[:, :-1], jnp.ones((rows, 1), bool)], axis=1
     )
     column_after = jnp.arange(_ROW, dtype=jnp.int32)[None]
-
-    def earliest(carry, value):
-        carry = jnp.minimum(carry, value)
-        return carry, carry
-
-    candidates = jnp.where(ends, column_after, _ROW).T
-    run_end = lax.scan(earliest, jnp.full(rows, _ROW, jnp.int32), candidates, reverse=True)[1].T
+    candidates = jnp.where(ends, column_after, _ROW)
+    run_end = lax.cummin(candidates, axis=1, reverse=True)
 
     # Carry the counts from row to row. A rank is the count after the row, less the pairs of the
     # tile from here to the end of the row.
