@@ -108,9 +108,7 @@ class EwaKernel(AbstractSplatKernel):
         determinant = a * c - 0.25 * b * b
         x, y = stop_gradient(f.x), stop_gradient(f.y)
         across, down = jnp.sqrt(c / determinant), jnp.sqrt(a / determinant)
-        return dataclasses.replace(
-            f, left=x - across, right=x + across, top=y - down, bottom=y + down
-        )
+        return dataclasses.replace(f, box=(x - across, x + across, y - down, y + down))
 
     def squared_radius(self, f, view, dx, dy, nearness):
         a, b, c = self._quadric(f, view)
@@ -145,15 +143,18 @@ class DiscOrPixelKernel(AbstractSplatKernel):
     def footprints(self, splats, view, settings):
         f, reach = DiscKernel().footprints(splats, view, settings), self.pixel_radius
         x, y = stop_gradient(f.x), stop_gradient(f.y)
+        left, right, top, bottom = f.box
         wide = view.footprints(splats, dataclasses.replace(settings, filter_radius=reach))
         return dataclasses.replace(
             f,
             shift=wide.shift,
             opacity=jnp.where(f.visible, jnp.ones_like(f.opacity), 0.0),
-            left=jnp.minimum(f.left, x - reach),
-            right=jnp.maximum(f.right, x + reach),
-            top=jnp.minimum(f.top, y - reach),
-            bottom=jnp.maximum(f.bottom, y + reach),
+            box=(
+                jnp.minimum(left, x - reach),
+                jnp.maximum(right, x + reach),
+                jnp.minimum(top, y - reach),
+                jnp.maximum(bottom, y + reach),
+            ),
         )
 
     def nearness(self, f, view, dx, dy):

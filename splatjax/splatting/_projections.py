@@ -103,10 +103,12 @@ class PerspectiveView(AbstractView):
             nearness=inverse,
             shift=stop_gradient(1 / (1 + epsilon * inverse)),
             opacity=jnp.where(visible, root_determinant / ellipse.root_determinant, 0.0),
-            left=stop_gradient(x) + mid_x - half_x,
-            right=stop_gradient(x) + mid_x + half_x,
-            top=stop_gradient(y) + mid_y - half_y,
-            bottom=stop_gradient(y) + mid_y + half_y,
+            box=(
+                stop_gradient(x) + mid_x - half_x,
+                stop_gradient(x) + mid_x + half_x,
+                stop_gradient(y) + mid_y - half_y,
+                stop_gradient(y) + mid_y + half_y,
+            ),
             visible=visible,
         )
 
@@ -213,10 +215,7 @@ class OrthographicView(AbstractView):
             nearness=-pz,
             shift=stop_gradient(epsilon_of(splats.radii, filter_radius, -nz, settings)),
             opacity=jnp.where(visible, root_determinant / ellipse.root_determinant, 0.0),
-            left=stop_gradient(x - half_x),
-            right=stop_gradient(x + half_x),
-            top=stop_gradient(y - half_y),
-            bottom=stop_gradient(y + half_y),
+            box=stop_gradient((x - half_x, x + half_x, y - half_y, y + half_y)),
             visible=visible,
         )
 

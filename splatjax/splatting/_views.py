@@ -52,7 +52,7 @@ class Footprints(eqx.Module):
       subtracted from it in an orthographic view. Not differentiated.
     - `opacity`: what the screen filter leaves of the peak weight: 1 for large frontal splats, 0
       edge on.
-    - `left`, `right`, `top`, `bottom`: the rim's bounding box. Not differentiated.
+    - `box`: left, right, top and bottom of the rim. Not differentiated.
     """
 
     x: Float[Array, " splats"]
@@ -65,15 +65,12 @@ class Footprints(eqx.Module):
     nearness: Float[Array, " splats"]
     shift: Float[Array, " splats"]
     opacity: Float[Array, " splats"]
-    left: Float[Array, " splats"]
-    right: Float[Array, " splats"]
-    top: Float[Array, " splats"]
-    bottom: Float[Array, " splats"]
+    box: tuple[Float[Array, " splats"], ...]
     visible: Bool[Array, " splats"]
 
     def ranges(self, grid: TileGrid) -> TileRanges:
         """Find the tiles that each splat may touch."""
-        return TileRanges.of(self.left, self.right, self.top, self.bottom, self.visible, grid)
+        return TileRanges.of(*self.box, self.visible, grid)
 
 
 class FilteredEllipse(eqx.Module):

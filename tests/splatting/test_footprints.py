@@ -72,8 +72,7 @@ def at_depth(view, x, y, depth):
 def test_fragments_are_where_rays_meet_discs(kind, dtype):
     view, body = FINE_VIEWS[kind](), scattered()
     footprints = eqx.filter_jit(view.footprints)(body, SplattingSettings(filter_radius=1e-4))
-    box = footprints.left, footprints.right, footprints.top, footprints.bottom
-    left, right, top, bottom = (np.asarray(each, float)[:, None] for each in box)
+    left, right, top, bottom = (np.asarray(each, float)[:, None] for each in footprints.box)
     # Columns and rows in and around every box, `[splats, samples]`.
     grid = np.linspace(-1.25, 1.25, 17)
     u, v = (each.reshape(1, -1) for each in np.meshgrid(grid, grid))
