@@ -12,7 +12,6 @@ from splatjax.gaussians import SumOfGaussians
 from splatjax.scene import Camera, Scene
 from splatjax.splatting import invalid_factor
 
-from ._checks import in_one_dtype
 from ._devices import filled_like, on_devices
 from ._filling import rows_at
 from ._passes import SplatLight, in_a_row, light_splats, see_and_shade
@@ -121,8 +120,6 @@ def _diffusion_basis(
     derivative: bool,
     light: SplatLight | None,
 ) -> DiffusionBasis:
-    scene, camera = in_one_dtype(scene, camera)
-
     def passes(combination, scene, plan, camera, light=None):
         def read(shaded: ShadedSurface, at: LayersAtPoints, _):
             return (

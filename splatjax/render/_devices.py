@@ -17,6 +17,7 @@ from jaxtyping import Array, Float, Int, PyTree
 from splatjax._combination import AbstractCombination, DeviceMesh, OneDevice, lay_out
 from splatjax.scene import AbstractLightSample, Frame, Scene, lights_by_kind
 
+from ._checks import in_one_dtype
 from ._filling import arrange, fill_gaussians, fill_lights, fill_up, rows_at
 from ._plan import Plan, splats_per_device
 
@@ -86,8 +87,8 @@ def on_devices(
     placed: PyTree = None,
     by_splat: bool = False,
 ) -> Result:
-    """Run a function on the devices of a plan, each with its own splats in the order of the plan.
-    Gradients go back to where the splats are.
+    """Run a function on the devices of a plan, each with its own splats in the order of the plan;
+    all in the precision of the splats' centers. Gradients go back to where the splats are.
 
     **Arguments:**
 
@@ -99,6 +100,7 @@ def on_devices(
     - `by_splat`: the results lie along the splats, in the order of the plan; otherwise they are the
       same on all devices.
     """
+    scene, whole, rows = in_one_dtype(scene, whole, rows)
     count, share = splats_per_device(scene.splats.count, plan.mesh)
     filled = count * share
     scene = Scene(fill_up(scene.splats, filled), scene.lights, scene.material)

@@ -15,7 +15,6 @@ from splatjax.gaussians import SumOfGaussians
 from splatjax.scene import Camera, Frame, Scene
 
 from ._attributes import SurfaceSamples
-from ._checks import in_one_dtype
 from ._devices import filled_like, on_devices
 from ._filling import rows_at
 from ._lighting import LightAtSplats
@@ -133,8 +132,6 @@ def picture_jacobian(
 def _picture_jacobian(
     scene: Scene, camera: Camera, settings: RenderSettings, plan: Plan
 ) -> PictureJacobian:
-    scene, camera = in_one_dtype(scene, camera)
-
     def passes(combination, scene, plan, camera):
         material = scene.material
         weighing = material.gaussians, material.single_scattering_albedo()

@@ -16,7 +16,7 @@ from splatjax.cache import kept_jit
 from splatjax.scene import Camera, Frame, Scene, lights_by_kind
 from splatjax.splatting import Bounds
 
-from ._checks import check_channels, in_one_dtype
+from ._checks import check_channels
 from ._devices import filled_like, on_devices
 from ._filling import rows_at
 from ._lighting import Irradiance, LightAtSplats, cast_shadows, irradiance_at_splats
@@ -77,8 +77,6 @@ def fitted(light: SplatLight, scene: Scene) -> SplatLight:
 def _render(
     scene: Scene, camera: Camera, settings: RenderSettings, plan: Plan, light: SplatLight | None
 ) -> Frame:
-    scene, camera = in_one_dtype(scene, camera)
-
     def passes(combination, scene, plan, camera, light=None):
         light_at = partial(light_splats, scene, settings, plan, combination)
         shaded, visible = see_and_shade(
@@ -125,8 +123,6 @@ def illuminate(
 
 @kept_jit
 def _illuminate(scene: Scene, plan: Plan, settings: RenderSettings, derivative: bool) -> SplatLight:
-    (scene,) = in_one_dtype(scene)
-
     def passes(combination, scene, plan):
         bounds = Bounds.of(scene.splats, combination)
         return light_splats(scene, settings, plan, combination, bounds, derivative=derivative)
@@ -153,8 +149,6 @@ def compute_irradiance(
 
 @eqx.filter_jit
 def _compute_irradiance(scene: Scene, plan: Plan, settings: RenderSettings) -> Irradiance:
-    (scene,) = in_one_dtype(scene)
-
     def passes(combination, scene, plan):
         bounds = Bounds.of(scene.splats, combination)
         light = cast_shadows(
@@ -213,8 +207,6 @@ def diffuse_irradiance(
 def _diffuse_irradiance(
     scene: Scene, irradiance, camera: Camera, settings: RenderSettings, plan: Plan
 ):
-    scene, camera, irradiance = in_one_dtype(scene, camera, irradiance)
-
     dark = Scene(scene.splats, (), scene.material)
     plain = dataclasses.replace(settings, lighting=LightAtSplats())
 
