@@ -15,7 +15,7 @@ from splatjax.scattering import Dipole, Medium
 from splatjax.scene import AbstractLight, Camera, DirectionalLight, GaussianBeam, Splats
 
 from ._observation import AbstractIntensity, Evidence, KnownIntensity, Observation, SquaredLoss
-from ._parts import Setup
+from ._parts import PicturedScene
 from ._problem import RecoveryProblem, Unknowns, fit_near, render_layers, solution
 from ._recovery import Combination, Recovery, best_and_worst
 
@@ -90,8 +90,8 @@ def next_pictures(
         )
     medium, loss = recovery.medium, SquaredLoss()
     dtype = medium.eta.dtype
-    setups = [Setup(splats, one.camera, one.lights) for one in candidates]
-    pictures, _ = render_layers(setups, recovery.material, settings)
+    pictured_scenes = [PicturedScene(splats, one.camera, one.lights) for one in candidates]
+    pictures, _ = render_layers(pictured_scenes, recovery.material, settings)
     near = recovery.material.gaussians.variances.astype(dtype)
     fit = eqx.Partial(fit_near, near=near, weights=weights)
     noise = recovery.relative_noise * recovery.scale**0.5

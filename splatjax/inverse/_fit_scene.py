@@ -26,7 +26,7 @@ from ._observation import (
     check_counted,
     compared,
 )
-from ._parts import AbstractPart, Setup
+from ._parts import AbstractPart, PicturedScene
 from ._problem import make_plans
 
 # Of each part; where pictures do not share it, a tuple with those of each picture.
@@ -54,12 +54,12 @@ class MovableScene(eqx.Module):
     ) -> "MovableScene":
         return cls(material, tuple(parts), tuple(part.prepared(splats) for part in parts))
 
-    def start(self, setups: Sequence[Setup]) -> Coordinates:
+    def start(self, pictured_scenes: Sequence[PicturedScene]) -> Coordinates:
         """Return the coordinates of the start: zeros."""
         return tuple(
-            part.coordinates(setups[0])
+            part.coordinates(pictured_scenes[0])
             if part.shared
-            else tuple(part.coordinates(setup) for setup in setups)
+            else tuple(part.coordinates(pictured) for pictured in pictured_scenes)
             for part in self.parts
         )
 
@@ -76,10 +76,10 @@ class MovableScene(eqx.Module):
             for part, own in zip(self.parts, zip(*pictures, strict=True), strict=True)
         )
 
-    def moved(self, setup: Setup, x: Coordinates) -> Setup:
+    def moved(self, pictured: PicturedScene, x: Coordinates) -> PicturedScene:
         for part, own, prepared in zip(self.parts, x, self.prepared, strict=True):
-            setup = part.moved(setup, own, prepared)
-        return setup
+            pictured = part.moved(pictured, own, prepared)
+        return pictured
 
     def prior(self, x: Coordinates) -> Float[Array, ""] | float:
         return sum(
@@ -105,7 +105,7 @@ class Evaluation(eqx.Module):
 def evaluate(
     x: Coordinates,
     scene: MovableScene,
-    setup: Setup,
+    pictured: PicturedScene,
     evidence: Evidence,
     plan: Plan,
     settings: RenderSettings,
@@ -115,7 +115,7 @@ def evaluate(
     """Render a picture at its coordinates, and differentiate its loss."""
 
     def total_loss(x):
-        moved = scene.moved(setup, x)
+        moved = scene.moved(pictured, x)
         frame = render(moved.scene(scene.material), moved.camera, settings, plan)
         counted = evidence.counted(frame.coverage, background)
         residuals = evidence.residuals(frame.beauty, counted, loss)
@@ -232,21 +232,24 @@ def fit_scene(
     _check(observations, material, parts, steps)
     report = progress or (lambda stage, loss: None)
     dtype = splats.centers.dtype
-    setups, material = jax.tree.map(
+    pictured_scenes, material = jax.tree.map(
         lambda leaf: as_floats(np.asarray(leaf), dtype),
-        ([Setup(splats, one.camera, one.lights) for one in observations], material),
+        ([PicturedScene(splats, one.camera, one.lights) for one in observations], material),
     )
-    scene = MovableScene.of(setups[0].splats, material, parts)
+    scene = MovableScene.of(pictured_scenes[0].splats, material, parts)
     evidence = [Evidence.of(one, dtype) for one in observations]
-    x = scene.start(setups)
+    x = scene.start(pictured_scenes)
 
-    def moved(x: Coordinates) -> list[Setup]:
-        return [scene.moved(setup, scene.of_picture(x, i)) for i, setup in enumerate(setups)]
+    def moved(x: Coordinates) -> list[PicturedScene]:
+        return [
+            scene.moved(pictured, scene.of_picture(x, i))
+            for i, pictured in enumerate(pictured_scenes)
+        ]
 
     def evaluate_all(x: Coordinates, plans: list[Plan]) -> list[Evaluation]:
         return [
             evaluate(scene.of_picture(x, i), scene, *one, settings, loss, background)
-            for i, one in enumerate(zip(setups, evidence, plans, strict=True))
+            for i, one in enumerate(zip(pictured_scenes, evidence, plans, strict=True))
         ]
 
     report("planning", np.nan)
@@ -283,11 +286,11 @@ def fit_scene(
     pictures, residuals = compared(
         [one.beauty for one in kept], [one.counted for one in kept], evidence
     )
-    setups = moved(at)
+    pictured_scenes = moved(at)
     fitted = FittedScene(
-        splats=setups[0].splats,
-        cameras=tuple(one.camera for one in setups),
-        lights=tuple(one.lights for one in setups),
+        splats=pictured_scenes[0].splats,
+        cameras=tuple(one.camera for one in pictured_scenes),
+        lights=tuple(one.lights for one in pictured_scenes),
         material=material,
         losses=np.asarray(losses),
         pictures=pictures,

@@ -11,7 +11,7 @@ from splatjax._records import check_values
 from splatjax.geometry import tangent_frames
 from splatjax.scene import Splats
 
-from ._parts import AbstractPart, Setup
+from ._parts import AbstractPart, PicturedScene
 
 _REACH = 2.5  # of the blur, standard deviations
 _SLOPES = 17  # splats among which slopes are measured, itself included
@@ -93,12 +93,14 @@ class NormalOffsets(AbstractPart):
             jnp.asarray(np.sqrt(np.mean(np.sum(weights**2, axis=1))), dtype),
         )
 
-    def coordinates(self, setup: Setup) -> Float[Array, " splats"]:
-        return jnp.zeros_like(setup.splats.areas)
+    def coordinates(self, pictured: PicturedScene) -> Float[Array, " splats"]:
+        return jnp.zeros_like(pictured.splats.areas)
 
     @jit_unless_traced
-    def moved(self, setup: Setup, x: Float[Array, " splats"], prepared: OffsetTables) -> Setup:
-        splats = setup.splats
+    def moved(
+        self, pictured: PicturedScene, x: Float[Array, " splats"], prepared: OffsetTables
+    ) -> PicturedScene:
+        splats = pictured.splats
         offsets = self.step * jnp.sum(prepared.weights * x[prepared.blurred], axis=1)
         shifts = offsets[:, None] * splats.normals
         apart = shifts[prepared.around] - shifts[:, None]
@@ -114,7 +116,7 @@ class NormalOffsets(AbstractPart):
         )
         return eqx.tree_at(
             lambda s: (s.splats.centers, s.splats.normals, s.splats.areas, s.splats.radii),
-            setup,
+            pictured,
             moved,
         )
 

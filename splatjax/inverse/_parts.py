@@ -16,7 +16,7 @@ from splatjax.scene import AbstractLight, Camera, Material, Scene, Splats
 _BOUNDED = 1e-3
 
 
-class Setup(eqx.Module):
+class PicturedScene(eqx.Module):
     """The splats of a picture, its camera and its lights."""
 
     splats: Splats
@@ -54,11 +54,13 @@ class AbstractPart(eqx.Module):
         return None
 
     @abc.abstractmethod
-    def coordinates(self, setup: Setup) -> PyTree[Array]:
+    def coordinates(self, pictured: PicturedScene) -> PyTree[Array]:
         """Return the coordinates of the start: zeros. Raise `ValueError` without such a part."""
 
     @abc.abstractmethod
-    def moved(self, setup: Setup, x: PyTree[Array], prepared: PyTree[Array]) -> Setup:
+    def moved(
+        self, pictured: PicturedScene, x: PyTree[Array], prepared: PyTree[Array]
+    ) -> PicturedScene:
         """Move the part to coordinates. Differentiable."""
 
     def prior(self, x: PyTree[Array], prepared: PyTree[Array]) -> Float[Array, ""] | float:
@@ -87,18 +89,20 @@ class AlbedoMap(AbstractPart):
     step: float = eqx.field(static=True, default=0.1)
     deviation: float = eqx.field(static=True, default=3.0)
 
-    def coordinates(self, setup: Setup) -> Float[Array, "splats channels"]:
-        if setup.splats.albedo is None:
+    def coordinates(self, pictured: PicturedScene) -> Float[Array, "splats channels"]:
+        if pictured.splats.albedo is None:
             raise ValueError(
                 "splats.albedo is None, and AlbedoMap has nothing to move: start from a map, such "
                 "as 0.5 everywhere"
             )
-        return jnp.zeros_like(setup.splats.albedo)
+        return jnp.zeros_like(pictured.splats.albedo)
 
-    def moved(self, setup: Setup, x: Float[Array, "splats channels"], prepared: None) -> Setup:
-        start = jnp.clip(setup.splats.albedo, _BOUNDED, 1 - _BOUNDED)
+    def moved(
+        self, pictured: PicturedScene, x: Float[Array, "splats channels"], prepared: None
+    ) -> PicturedScene:
+        start = jnp.clip(pictured.splats.albedo, _BOUNDED, 1 - _BOUNDED)
         albedo = jax.nn.sigmoid(jax.scipy.special.logit(start) + self.step * x)
-        return eqx.tree_at(lambda s: s.splats.albedo, setup, albedo)
+        return eqx.tree_at(lambda s: s.splats.albedo, pictured, albedo)
 
     def prior(self, x: Float[Array, "splats channels"], prepared: None) -> Float[Array, ""]:
         return jnp.sum((self.step / self.deviation * x) ** 2)
@@ -115,20 +119,20 @@ class LightStrengths(AbstractPart):
 
     step: float = eqx.field(static=True, default=0.05)
 
-    def coordinates(self, setup: Setup) -> tuple[Float[Array, " channels"], ...]:
-        for light in setup.lights:
+    def coordinates(self, pictured: PicturedScene) -> tuple[Float[Array, " channels"], ...]:
+        for light in pictured.lights:
             if not light.strength:
                 raise ValueError(
                     f"{type(light).__name__}.strength names no field that LightStrengths may move"
                 )
-        return tuple(jnp.zeros_like(getattr(light, light.strength)) for light in setup.lights)
+        return tuple(jnp.zeros_like(getattr(light, light.strength)) for light in pictured.lights)
 
-    def moved(self, setup: Setup, x, prepared) -> Setup:
+    def moved(self, pictured: PicturedScene, x, prepared) -> PicturedScene:
         def move(light: AbstractLight, steps: Array) -> AbstractLight:
             strength = getattr(light, light.strength) * jnp.exp(self.step * steps)
             return dataclasses.replace(light, **{light.strength: strength})
 
-        return dataclasses.replace(setup, lights=tuple(map(move, setup.lights, x)))
+        return dataclasses.replace(pictured, lights=tuple(map(move, pictured.lights, x)))
 
 
 class LightPlaces(AbstractPart):
@@ -144,17 +148,17 @@ class LightPlaces(AbstractPart):
     turn: float = eqx.field(static=True, default=0.02)
     shift: float = eqx.field(static=True, default=1.0)
 
-    def coordinates(self, setup: Setup) -> tuple[dict[str, Float[Array, "3"]], ...]:
+    def coordinates(self, pictured: PicturedScene) -> tuple[dict[str, Float[Array, "3"]], ...]:
         return tuple(
             {
                 name: jnp.zeros_like(getattr(light, name))
                 for name in ("direction", "position", "origin")
                 if hasattr(light, name)
             }
-            for light in setup.lights
+            for light in pictured.lights
         )
 
-    def moved(self, setup: Setup, x, prepared) -> Setup:
+    def moved(self, pictured: PicturedScene, x, prepared) -> PicturedScene:
         def move(light: AbstractLight, steps: dict[str, Array]) -> AbstractLight:
             places = {
                 name: rotation(self.turn * step) @ getattr(light, name)
@@ -164,7 +168,7 @@ class LightPlaces(AbstractPart):
             }
             return dataclasses.replace(light, **places)
 
-        return dataclasses.replace(setup, lights=tuple(map(move, setup.lights, x)))
+        return dataclasses.replace(pictured, lights=tuple(map(move, pictured.lights, x)))
 
 
 class CameraPoses(AbstractPart):
@@ -185,15 +189,15 @@ class CameraPoses(AbstractPart):
     def prepared(self, splats: Splats) -> Float[Array, "3"]:
         return jnp.mean(splats.centers, axis=0)
 
-    def coordinates(self, setup: Setup) -> Float[Array, "2 3"]:
-        return jnp.zeros((2, 3), setup.camera.position.dtype)
+    def coordinates(self, pictured: PicturedScene) -> Float[Array, "2 3"]:
+        return jnp.zeros((2, 3), pictured.camera.position.dtype)
 
-    def moved(self, setup: Setup, x, prepared: Float[Array, "3"]) -> Setup:
-        middle, camera, turned = prepared, setup.camera, rotation(self.turn * x[0])
+    def moved(self, pictured: PicturedScene, x, prepared: Float[Array, "3"]) -> PicturedScene:
+        middle, camera, turned = prepared, pictured.camera, rotation(self.turn * x[0])
         position = middle + turned @ (camera.position - middle) + self.shift * x[1]
         return eqx.tree_at(
             lambda s: (s.camera.position, s.camera.rotation),
-            setup,
+            pictured,
             (position, camera.rotation @ turned.T),
         )
 

@@ -33,7 +33,7 @@ from ._observation import (
     UnknownBackground,
     check_counted,
 )
-from ._parts import Setup
+from ._parts import PicturedScene
 
 _STEPS = 64
 # Of a wide range: the ratio of neighboring variances. It leaves dipoles an error of 0.2%.
@@ -46,21 +46,26 @@ _GRID = math.log(1.15)
 _REACH = 10.0
 
 
-def make_plans(setups: Sequence[Setup], material: Material, settings: RenderSettings) -> list[Plan]:
+def make_plans(
+    pictured_scenes: Sequence[PicturedScene], material: Material, settings: RenderSettings
+) -> list[Plan]:
     """Make a plan for each picture. Pictures that may share one do, so that nothing is compiled
     twice.
     """
-    keys = [(one.camera.width, one.camera.height, jax.tree.structure(one.lights)) for one in setups]
+    keys = [
+        (one.camera.width, one.camera.height, jax.tree.structure(one.lights))
+        for one in pictured_scenes
+    ]
     plans = {}
     for key in dict.fromkeys(keys):
-        alike = [one for one, other in zip(setups, keys, strict=True) if other == key]
+        alike = [one for one, other in zip(pictured_scenes, keys, strict=True) if other == key]
         scenes, cameras = [one.scene(material) for one in alike], [one.camera for one in alike]
         plans[key] = make_plan(scenes, cameras, settings)
     return [plans[key] for key in keys]
 
 
 def render_layers(
-    setups: Sequence[Setup],
+    pictured_scenes: Sequence[PicturedScene],
     material: Material,
     settings: RenderSettings,
     plans: list[Plan] | None = None,
@@ -81,12 +86,12 @@ def render_layers(
         # two the compiler takes what it saves.
         keys = [
             (id(plan), *(leaf.tobytes() for leaf in jax.tree.leaves(jax.device_get(one.lights))))
-            for one, plan in zip(setups, plans, strict=True)
+            for one, plan in zip(pictured_scenes, plans, strict=True)
         ]
         lights = {
             key: illuminate(one.scene(material), plan, settings, derivative)
             for key, (one, plan) in dict(
-                zip(keys, zip(setups, plans, strict=True), strict=True)
+                zip(keys, zip(pictured_scenes, plans, strict=True), strict=True)
             ).items()
             if keys.count(key) > 2
         }
@@ -96,7 +101,7 @@ def render_layers(
                     one.scene(material), one.camera, settings, plan, derivative, lights.get(key)
                 )
             )
-            for key, one, plan in zip(keys, setups, plans, strict=True)
+            for key, one, plan in zip(keys, pictured_scenes, plans, strict=True)
         ]
 
     pictures = render(plans) if plans else []
@@ -105,7 +110,7 @@ def render_layers(
         # program.
         variances = jnp.round(jnp.log(material.gaussians.variances) / _GRID) * _GRID
         rounded = SumOfGaussians(jnp.exp(variances), material.gaussians.weights)
-        plans = make_plans(setups, material.surface_of(rounded), settings)
+        plans = make_plans(pictured_scenes, material.surface_of(rounded), settings)
         pictures = render(plans)
     return pictures, plans or []
 

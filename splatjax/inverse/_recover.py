@@ -32,7 +32,7 @@ from ._observation import (
     check_channels,
     compared,
 )
-from ._parts import Setup
+from ._parts import PicturedScene
 from ._problem import (
     RecoveryProblem,
     Unknowns,
@@ -115,7 +115,7 @@ def recover(
     _check(observations, splats, starts, surface)
     report = progress or (lambda stage, medium: None)
     eta, channels = starts[0].eta, starts[0].channels
-    setups = [Setup(splats, one.camera, one.lights) for one in observations]
+    pictured_scenes = [PicturedScene(splats, one.camera, one.lights) for one in observations]
     evidence = [Evidence.of(one, dtype) for one in observations]
     unknowns = Unknowns.of(eta, [one.intensity for one in observations])
     noise_is_known = all(one.deviation is not None for one in observations)
@@ -124,7 +124,7 @@ def recover(
 
     def problem_at(variances, fit, plans=None, derivative=True):
         material = surface.surface_of(_unweighed(variances, channels))
-        pictures, plans = render_layers(setups, material, settings, plans, derivative)
+        pictures, plans = render_layers(pictured_scenes, material, settings, plans, derivative)
         return RecoveryProblem.of(pictures, evidence, unknowns, fit, loss, model), plans
 
     report(f"rendering {len(wide)} layers of {counted(len(observations), 'picture')}", starts[0])

@@ -14,7 +14,7 @@ from splatjax.scattering import Film, Layer, check_stack
 
 from ._directions import AbstractIncidence, AbstractPhaseFunction, Isotropic, NormalIncidence
 from ._results import AbstractTallies, MonteCarlo, PathDerivatives, SampleMean, assemble
-from ._rounds import Setup, Walk, finish
+from ._rounds import Walk, WalkSettings, finish
 from ._walk import Optics, Stack
 
 _FLIGHTS = 20_000
@@ -138,7 +138,7 @@ def monte_carlo(
     **Source:** Wang, Jacques and Zheng 1995 (MCML); one walk for many absorptions: Kienle and
     Patterson 1996; path weights: Hayakawa et al. 2001.
     """
-    media, setup = _set_up(
+    media, settings = _set_up(
         layers,
         photons,
         key,
@@ -149,7 +149,7 @@ def monte_carlo(
         eta_below=eta_below,
         flights=flights,
     )
-    return _monte_carlo(media, setup, progress=progress)
+    return _monte_carlo(media, settings, progress=progress)
 
 
 def path_derivatives(
@@ -182,7 +182,7 @@ def _set_up(
     eta_above: Numbers = 1.0,
     eta_below: Numbers = 1.0,
     flights: int = _FLIGHTS,
-) -> tuple[LayeredMedia, Setup]:
+) -> tuple[LayeredMedia, WalkSettings]:
     """Check and complete the arguments of `monte_carlo`."""
     for name, number, least in (("photons", photons, 2), ("flights", flights, 1)):
         check_values(
@@ -202,7 +202,7 @@ def _set_up(
     check_values("the steps of edges", steps, "positive (mm): edges must ascend", lambda x: x > 0)
     numbers = jnp.asarray(photons, jnp.int32), jnp.asarray(flights, jnp.int32)
     lanes = max(_LEAST_LANES, 1 << (photons // _PHOTONS_A_LANE).bit_length())
-    return media, Setup(edges, incidence, phase, key, *numbers, min(_MOST_LANES, lanes))
+    return media, WalkSettings(edges, incidence, phase, key, *numbers, min(_MOST_LANES, lanes))
 
 
 @eqx.filter_jit
@@ -222,17 +222,17 @@ def _prepare(layers, phase: AbstractPhaseFunction, eta_above, eta_below, edges):
 
 
 @eqx.filter_custom_jvp
-def _monte_carlo(media: LayeredMedia, setup: Setup, *, progress) -> MonteCarlo:
-    return _walk_all(media, setup, False, progress)[0]
+def _monte_carlo(media: LayeredMedia, settings: WalkSettings, *, progress) -> MonteCarlo:
+    return _walk_all(media, settings, False, progress)[0]
 
 
 @_monte_carlo.def_jvp
 def _monte_carlo_jvp(primals, tangents, *, progress):
-    (media, setup), (media_dot, setup_dot) = primals, tangents
+    (media, settings), (media_dot, settings_dot) = primals, tangents
     for name, tangent in (
         ("thickness", media_dot.thickness),
         ("eta", media_dot.eta),
-        ("edges and phase", setup_dot),
+        ("edges and phase", settings_dot),
     ):
         if jax.tree.leaves(tangent):
             raise ValueError(
@@ -240,7 +240,7 @@ def _monte_carlo_jvp(primals, tangents, *, progress):
                 "or leave elsewhere; differentiate sigma_a and sigma_s_prime, or take differences "
                 "of results with the same key"
             )
-    result, by_absorption, by_scattering = _walk_all(media, setup, True, progress)
+    result, by_absorption, by_scattering = _walk_all(media, settings, True, progress)
     pairs = [(by_absorption, media_dot.sigma_a), (by_scattering, media_dot.sigma_s)]
     return result, _along(result, [pair for pair in pairs if pair[1] is not None])
 
@@ -265,12 +265,16 @@ def _along(
     )
 
 
-def _walk_all(media: LayeredMedia, setup: Setup, with_derivatives: bool, progress):
+def _walk_all(media: LayeredMedia, settings: WalkSettings, with_derivatives: bool, progress):
     """Walk each group of channels that share a walk, and put the channels in their order."""
     groups, tallies = media.shared_walks(), []
     for number, group in enumerate(groups):
         walk = _walk_of(
-            media, setup, jnp.asarray(number), jnp.asarray(group.astype(np.int32)), with_derivatives
+            media,
+            settings,
+            jnp.asarray(number),
+            jnp.asarray(group.astype(np.int32)),
+            with_derivatives,
         )
         report = progress and (
             lambda done, photons, before=number: progress(
@@ -279,15 +283,15 @@ def _walk_all(media: LayeredMedia, setup: Setup, with_derivatives: bool, progres
         )
         tallies.append(finish(walk, report))
     order = jnp.asarray(np.argsort(np.concatenate(groups)).astype(np.int32))
-    specular = setup.incidence.reflected(media.eta[1] / media.eta[0])
+    specular = settings.incidence.reflected(media.eta[1] / media.eta[0])
     layers = media.sigma_a.shape[0] if with_derivatives else 0
-    return assemble(tallies, order, setup.edges, setup.photons, specular, layers)
+    return assemble(tallies, order, settings.edges, settings.photons, specular, layers)
 
 
 @eqx.filter_jit
 def _walk_of(
     media: LayeredMedia,
-    setup: Setup,
+    settings: WalkSettings,
     number: Int[Array, ""],
     group: Int[Array, " group"],
     with_derivatives: bool,
@@ -298,10 +302,7 @@ def _walk_of(
     coefficients = media.sigma_a[:, group], media.sigma_s[:, group]
     thickness, eta = media.thickness[:, group[0]], media.eta[:, group[0]]
     stack = Stack(media.sigma_s[:, group[0]] * unit[0], thickness / unit[0], eta)
-
-    def optics(sigma_a, sigma_s):
-        return Optics.of(sigma_a, sigma_s, unit)
-
+    optics = eqx.Partial(Optics.of, unit=unit)
     # A direction for the absorption of each layer, then one for the scattering of each.
     layers = media.sigma_a.shape[0]
     slopes = 2 * layers if with_derivatives else 0
@@ -309,10 +310,10 @@ def _walk_of(
     directions = jnp.broadcast_to(directions, (slopes, 2, layers, len(group)))
     slopes = jax.vmap(lambda along: jax.jvp(optics, coefficients, tuple(along))[1])(directions)
     return Walk(
-        setup=setup,
-        key=jax.random.fold_in(setup.key, number),
+        settings=settings,
+        key=jax.random.fold_in(settings.key, number),
         stack=jax.lax.stop_gradient(stack),
         optics=optics(*coefficients),
         slopes=slopes,
-        edges=setup.edges[None] / jax.lax.stop_gradient(unit)[:, None],
+        edges=settings.edges[None] / jax.lax.stop_gradient(unit)[:, None],
     )

@@ -31,7 +31,7 @@ _UNWATCHED = 8
 _LEAST, _SURVIVING = 1e-4, 0.1
 
 
-class Setup(eqx.Module):
+class WalkSettings(eqx.Module):
     """The settings of walks. The number of photons is traced: it needs no program of its own."""
 
     edges: Float[Array, " edges"]
@@ -48,13 +48,13 @@ class Walk(eqx.Module):
 
     **Attributes:**
 
-    - `setup`: of all walks.
+    - `settings`: of all walks.
     - `key`: of this one.
     - `optics`: of the channels that walk along; `slopes` are its derivatives in each parameter.
     - `edges`: of the rings, in free paths of the stack, for each channel.
     """
 
-    setup: Setup
+    settings: WalkSettings
     key: Key[Array, ""]
     stack: Stack
     optics: Optics
@@ -72,7 +72,7 @@ class _State(eqx.Module):
 
     @jit_unless_traced
     def unfinished(self, walk: Walk) -> Bool[Array, ""]:
-        return (self.started < walk.setup.photons) | jnp.any(self.photons.place == INSIDE)
+        return (self.started < walk.settings.photons) | jnp.any(self.photons.place == INSIDE)
 
 
 def finish(walk: Walk, progress: Callable[[int, int], None] | None) -> Tally:
@@ -88,7 +88,7 @@ def finish(walk: Walk, progress: Callable[[int, int], None] | None) -> Tally:
         state = _advance(walk, state)
         if progress is not None:
             under_way = int(np.sum(np.asarray(state.photons.place) == INSIDE))
-            progress(int(state.started) - under_way, int(walk.setup.photons))
+            progress(int(state.started) - under_way, int(walk.settings.photons))
     return state.tally
 
 
@@ -96,11 +96,11 @@ def finish(walk: Walk, progress: Callable[[int, int], None] | None) -> Tally:
 def _start(walk: Walk) -> _State:
     dtype, (layers, channels) = walk.edges.dtype, walk.optics.absorption.shape
     parameters, rings = walk.slopes.absorption.shape[0], walk.edges.shape[1] - 1
-    zero, number = jnp.zeros(walk.setup.lanes, dtype), jnp.zeros(walk.setup.lanes, jnp.int32)
+    zero, number = jnp.zeros(walk.settings.lanes, dtype), jnp.zeros(walk.settings.lanes, jnp.int32)
     photons = Photons(zero, zero, zero, (zero, zero, zero + 1), zero, number, number + IDLE, number)
     weights = PathWeights(
-        jnp.zeros((channels, walk.setup.lanes), dtype),
-        jnp.zeros((layers, channels, walk.setup.lanes), dtype),
+        jnp.zeros((channels, walk.settings.lanes), dtype),
+        jnp.zeros((layers, channels, walk.settings.lanes), dtype),
     )
     slopes = jax.tree.map(lambda leaf: jnp.zeros((parameters, *leaf.shape), dtype), weights)
     moments = 2 + 2 * parameters
@@ -129,9 +129,9 @@ def _round(walk: Walk, state: _State) -> _State:
     def path(optics, weights):
         def flight(number, carry):
             photons, weights = carry
-            xi = uniforms(walk.key, draws + number, walk.setup.lanes, weights.carried.dtype)
-            photons, flown = fly(walk.stack, walk.setup.phase, photons, xi)
-            return photons, weigh(optics, weights, flown)
+            xi = uniforms(walk.key, draws + number, walk.settings.lanes, weights.carried.dtype)
+            moved, *flown = fly(walk.stack, walk.settings.phase, photons, xi)
+            return moved, weigh(optics, weights, photons.layer, *flown)
 
         photons, weights = jax.lax.fori_loop(0, _FLIGHTS, flight, (state.photons, weights))
         return weights, photons
@@ -149,7 +149,7 @@ def _round(walk: Walk, state: _State) -> _State:
 
     inside = photons.place == INSIDE
     faint = inside & (jnp.max(weights.carried, axis=0) < _LEAST)
-    chance = uniforms(walk.key, draws + _FLIGHTS, walk.setup.lanes, walk.edges.dtype)[0]
+    chance = uniforms(walk.key, draws + _FLIGHTS, walk.settings.lanes, walk.edges.dtype)[0]
     dropped = faint & (chance > _SURVIVING)
     boost = jnp.where(faint & ~dropped, 1 / _SURVIVING, jnp.ones_like(chance))
     weights, slopes = (
@@ -159,7 +159,7 @@ def _round(walk: Walk, state: _State) -> _State:
     done = (
         ((photons.place != INSIDE) & (photons.place != IDLE))
         | dropped
-        | (inside & (photons.flights >= walk.setup.flights))
+        | (inside & (photons.flights >= walk.settings.flights))
     )
     tally = state.tally.plus(photons, weights, slopes, done, dropped, walk.edges)
     after = _State(photons, weights, slopes, tally, state.started, state.round + 1)
@@ -170,12 +170,12 @@ def _launch(walk: Walk, state: _State, free: Bool[Array, " photons"]) -> _State:
     """Start photons in lanes that are free, as long as there are any left to start."""
     dtype = walk.edges.dtype
     turn = jnp.cumsum(free.astype(jnp.int32))
-    begins = free & (state.started + turn <= walk.setup.photons)
-    xi = uniforms(walk.key, state.round * (_FLIGHTS + 2) + _FLIGHTS + 1, walk.setup.lanes, dtype)
+    begins = free & (state.started + turn <= walk.settings.photons)
+    xi = uniforms(walk.key, state.round * (_FLIGHTS + 2) + _FLIGHTS + 1, walk.settings.lanes, dtype)
     spread = evenly(walk.key, state.started + turn, dtype)
-    direction, weight = walk.setup.incidence.enter(spread, xi[1], walk.stack.eta[:2])
+    direction, weight = walk.settings.incidence.enter(spread, xi[1], walk.stack.eta[:2])
 
-    zero, number = jnp.zeros(walk.setup.lanes, dtype), jnp.zeros(walk.setup.lanes, jnp.int32)
+    zero, number = jnp.zeros(walk.settings.lanes, dtype), jnp.zeros(walk.settings.lanes, jnp.int32)
     place = jnp.where(begins, INSIDE, IDLE)
     fresh = Photons(zero, zero, zero, direction, -jnp.log(xi[2]), number, place, number)
     photons = jax.tree.map(lambda new, old: jnp.where(free, new, old), fresh, state.photons)

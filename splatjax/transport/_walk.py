@@ -44,16 +44,6 @@ class Photons(eqx.Module):
     flights: Int[Array, " photons"]
 
 
-class Flight(eqx.Module):
-    """The effect of a flight on weights: its length in a layer, 0 for a photon that does not fly,
-    and how it ended.
-    """
-
-    length: Float[Array, " photons"]
-    layer: Int[Array, " photons"]
-    scattered: Bool[Array, " photons"]
-
-
 class PathWeights(eqx.Module):
     r"""What photons carry and have left, in each channel that walks along.
 
@@ -105,9 +95,10 @@ class Optics(eqx.Module):
 
 def fly(
     stack: Stack, phase: AbstractPhaseFunction, photons: Photons, xi: Float[Array, "four photons"]
-) -> tuple[Photons, Flight]:
+) -> tuple[Photons, Float[Array, " photons"], Bool[Array, " photons"]]:
     """Move photons by one flight. Uniform random numbers: cosine or reflection, angle, and the next
-    free path.
+    free path. Also return its length in the layer where it began, 0 for a photon that does not fly,
+    and whether it ended in a scattering.
     """
     ux, uy, uz = photons.direction
     layer, inside = photons.layer, photons.place == INSIDE
@@ -156,21 +147,28 @@ def fly(
         flights=photons.flights + 1,
     )
     moved = jax.tree.map(lambda new, old: jnp.where(inside, new, old), moved, photons)
-    return moved, Flight(length, layer, scattered & inside)
+    return moved, length, scattered & inside
 
 
-def weigh(optics: Optics, weights: PathWeights, flight: Flight) -> PathWeights:
-    """Carry weights along a flight: absorption on its way is its mean, not drawn."""
-    length = jnp.broadcast_to(flight.length, weights.carried.shape)
-    removal = of_layer(optics.removal, flight.layer) * length
-    taken = weights.carried * _taken(of_layer(optics.absorption, flight.layer) * length, removal)
-    scattered = jnp.broadcast_to(flight.scattered, weights.carried.shape)
-    ratio = jnp.where(scattered, of_layer(optics.ratio, flight.layer), 1.0)
+def weigh(
+    optics: Optics,
+    weights: PathWeights,
+    layer: Int[Array, " photons"],
+    length: Float[Array, " photons"],
+    scattered: Bool[Array, " photons"],
+) -> PathWeights:
+    """Carry weights along a flight of some length in a layer: absorption on its way is its mean,
+    not drawn.
+    """
+    length, scattered = (jnp.broadcast_to(x, weights.carried.shape) for x in (length, scattered))
+    removal = of_layer(optics.removal, layer) * length
+    taken = weights.carried * _taken(of_layer(optics.absorption, layer) * length, removal)
+    ratio = jnp.where(scattered, of_layer(optics.ratio, layer), 1.0)
     layers = jnp.broadcast_to(
         jnp.arange(weights.absorbed.shape[0], dtype=jnp.int32)[:, None, None],
         weights.absorbed.shape,
     )
-    here = jnp.broadcast_to(flight.layer, layers.shape) == layers
+    here = jnp.broadcast_to(layer, layers.shape) == layers
     return PathWeights(
         weights.carried * jnp.exp(-removal) * ratio,
         weights.absorbed + jnp.where(here, jnp.broadcast_to(taken, here.shape), 0.0),

@@ -23,7 +23,7 @@ import splatjax as sj
 from splatjax.inverse import _fit_scene
 from splatjax.inverse._fit_scene import MovableScene
 from splatjax.inverse._observation import Evidence
-from splatjax.inverse._parts import Setup, rotation
+from splatjax.inverse._parts import PicturedScene, rotation
 from splatjax.splatting import ShadowSettings
 
 SIZE = 16
@@ -52,13 +52,16 @@ def body() -> sj.Splats:
 
 def evaluate(splats: sj.Splats, light: sj.DirectionalLight, picture=0.0, x=None):
     """Evaluate a picture by the program that all fits of this file run."""
-    scene, setup = MovableScene.of(splats, material(), PARTS), Setup(splats, camera(), (light,))
+    scene, pictured = (
+        MovableScene.of(splats, material(), PARTS),
+        PicturedScene(splats, camera(), (light,)),
+    )
     picture = np.broadcast_to(picture, (SIZE, SIZE, 2))
     evidence = Evidence.of(sj.inverse.Observation(picture, camera(), light), jnp.zeros(()).dtype)
     plan = sj.make_plan(sj.Scene(splats, light, material()), camera(), PLAIN)
-    x = scene.of_picture(scene.start([setup]), 0) if x is None else x
+    x = scene.of_picture(scene.start([pictured]), 0) if x is None else x
     settings = PLAIN, sj.inverse.SquaredLoss(), sj.inverse.BlackBackground()
-    return _fit_scene.evaluate(x, scene, setup, evidence, plan, *settings)
+    return _fit_scene.evaluate(x, scene, pictured, evidence, plan, *settings)
 
 
 def observations(shots=None, x=None, **more) -> list[sj.inverse.Observation]:
@@ -185,10 +188,10 @@ class TestFitScene:
             np.testing.assert_allclose(ours.rotation @ ours.rotation.T, np.eye(3), atol=1e-12)
 
     def test_a_shape_comes_back(self):
-        part, setup = PARTS[1], Setup(body(), camera(), (lights()[0],))
-        zeros = MovableScene.of(body(), material(), PARTS).start([setup])
+        part, pictured = PARTS[1], PicturedScene(body(), camera(), (lights()[0],))
+        zeros = MovableScene.of(body(), material(), PARTS).start([pictured])
         x = jnp.asarray(40 * np.random.default_rng(4).normal(size=body().count))
-        dented = part.moved(setup, x, part.prepared(body())).splats
+        dented = part.moved(pictured, x, part.prepared(body())).splats
         own = (zeros[0], x, *(one[0] for one in zeros[2:]))
         found = fitted(sj.inverse.NormalOffsets, steps=60, seen=observations(x=own))
         before, after = (
@@ -224,9 +227,11 @@ def stand_in(monkeypatch, reach: float, spoiled: float = np.inf) -> list[float]:
     splats = sphere(20)
     plan = sj.make_plan(sj.Scene(splats, lights()[0], material()), camera(), PLAIN)
 
-    def make_plans(setups, material, settings):
-        made.append(float(jnp.mean(setups[0].splats.albedo)))
-        return [eqx.tree_at(lambda p: p.interval, plan, jnp.full(2, made[-1]))] * len(setups)
+    def make_plans(pictured_scenes, material, settings):
+        made.append(float(jnp.mean(pictured_scenes[0].splats.albedo)))
+        return [eqx.tree_at(lambda p: p.interval, plan, jnp.full(2, made[-1]))] * len(
+            pictured_scenes
+        )
 
     def render(scene, camera, settings, plan):
         mean = jnp.mean(scene.splats.albedo)

@@ -8,14 +8,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import splatjax as sj
-from splatjax.inverse._parts import Setup, rotation
+from splatjax.inverse._parts import PicturedScene, rotation
 
 FLAT = bodies.sheet(5.0, 0.5, jitter=0.2)
 CAMERA = sj.Camera.look_at([3, 0, 9], [1, 1, 0], width=4, height=4)
 
 
 def moved_by(part, splats: sj.Splats, x) -> sj.Splats:
-    return part.moved(Setup(splats, CAMERA, ()), x, part.prepared(splats)).splats
+    return part.moved(PicturedScene(splats, CAMERA, ()), x, part.prepared(splats)).splats
 
 
 @pytest.mark.parametrize("length", [0.0, 1e-9, 0.05, 0.0999, 0.1001, 1.0, 3.0])
@@ -37,20 +37,20 @@ def test_a_rotation_has_a_derivative_where_there_is_none():
 def test_lights_move_each_in_its_own_way():
     beam = sj.GaussianBeam([1, 2, 3], [0, 0, -2], power=[4, 5], variance=1)
     lights = sj.PointLight([1, 2, 3], intensity=[4, 5]), beam
-    setup = Setup(bodies.sphere(20), CAMERA, lights)
+    pictured = PicturedScene(bodies.sphere(20), CAMERA, lights)
     places, strengths = (
         sj.inverse.LightPlaces(turn=0.1, shift=2.0),
         sj.inverse.LightStrengths(step=0.5),
     )
-    x = jax.tree.map(jnp.ones_like, places.coordinates(setup))
-    lamp, beam = places.moved(setup, x, None).lights
+    x = jax.tree.map(jnp.ones_like, places.coordinates(pictured))
+    lamp, beam = places.moved(pictured, x, None).lights
     np.testing.assert_allclose(lamp.position, [3, 4, 5])
     np.testing.assert_allclose(beam.origin, [3, 4, 5])
     np.testing.assert_allclose(
         beam.direction, Rotation.from_rotvec([0.1, 0.1, 0.1]).apply([0, 0, -2]), rtol=1e-5
     )
     x = (jnp.asarray([0.0, 1.0]), jnp.asarray([2.0, 0.0]))
-    lamp, beam = strengths.moved(setup, x, None).lights
+    lamp, beam = strengths.moved(pictured, x, None).lights
     np.testing.assert_allclose(lamp.intensity, [4, 5 * np.exp(0.5)], rtol=1e-6)
     np.testing.assert_allclose(beam.power, [4 * np.exp(1), 5], rtol=1e-6)
 
@@ -58,14 +58,14 @@ def test_lights_move_each_in_its_own_way():
 def test_a_camera_turns_around_the_body():
     middle, part = jnp.asarray([0.5, -1.0, 0.3]), sj.inverse.CameraPoses(turn=0.2, shift=0.5)
 
-    def place(setup):
-        return setup.camera.rotation @ (middle - setup.camera.position)
+    def place(pictured):
+        return pictured.camera.rotation @ (middle - pictured.camera.position)
 
-    setup = Setup(bodies.sphere(20), CAMERA, ())
-    turned = part.moved(setup, jnp.asarray([[1.0, -2.0, 0.5], [0.0, 0.0, 0.0]]), middle)
+    pictured = PicturedScene(bodies.sphere(20), CAMERA, ())
+    turned = part.moved(pictured, jnp.asarray([[1.0, -2.0, 0.5], [0.0, 0.0, 0.0]]), middle)
     assert float(jnp.linalg.norm(turned.camera.position - CAMERA.position)) > 1
-    np.testing.assert_allclose(place(turned), place(setup), atol=1e-5)
-    shifted = part.moved(setup, jnp.asarray([[0.0, 0.0, 0.0], [1.0, 2.0, 3.0]]), middle)
+    np.testing.assert_allclose(place(turned), place(pictured), atol=1e-5)
+    shifted = part.moved(pictured, jnp.asarray([[0.0, 0.0, 0.0], [1.0, 2.0, 3.0]]), middle)
     np.testing.assert_allclose(shifted.camera.position - CAMERA.position, [0.5, 1, 1.5], atol=1e-6)
     np.testing.assert_allclose(shifted.camera.rotation, CAMERA.rotation, atol=1e-6)
 
