@@ -11,7 +11,7 @@ from splatjax.scene import Splats
 
 from ._mesh import Mesh, distinct, faces_beyond, morton_order, unit
 from ._normals import estimate_normals
-from ._scatter import Cells, Rounding, SurfacePoints, mirror_images, scatter, surface_cells
+from ._scatter import Rounding, SurfacePoints, mirror_images, scatter, surface_cells
 
 
 class Textures(eqx.Module):
@@ -153,9 +153,9 @@ def splats_at(
     normals = points.normals(mesh)
     spacing = float(np.sqrt(area / len(centers)))
     images = mirror_images(mesh, faces_beyond(mesh), centers, spacing)
-    cells = surface_cells(centers, normals, images, limit=spacing)
-    areas = cells.areas * (area / cells.areas.sum())
-    radii = _radii(areas, cells, images, spacing)
+    areas, reaches, _ = surface_cells(centers, normals, images, limit=spacing)
+    areas = areas * (area / areas.sum())
+    radii = _radii(areas, reaches, images, spacing)
     specular, roughness, tangent_space = (
         lookup_at(mesh, points, picture)
         for picture in (textures.specular, textures.roughness, textures.normal)
@@ -169,7 +169,7 @@ def splats_at(
 
 def _radii(
     areas: Float[np.ndarray, " n"],
-    cells: Cells,
+    reaches: Float[np.ndarray, " n"],
     images: Float[np.ndarray, "n images 3"] | None = None,
     spacing: float = 0.0,
 ) -> Float[np.ndarray, " n"]:
@@ -183,7 +183,7 @@ def _radii(
         gaps = 0.5 * np.linalg.norm(images, axis=-1)
         clearance = np.where(gaps > 0, gaps, np.inf).min(axis=1)
         radii = np.minimum(radii, (clearance + 0.5 * spacing) / 0.8)
-    return np.maximum(radii, 1.2 * cells.reaches)
+    return np.maximum(radii, 1.2 * reaches)
 
 
 _NEIGHBORS = 8
@@ -252,8 +252,8 @@ def _covered(centers: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.n
     """
     first, place = distinct(centers)
     places = centers[first]
-    cells = surface_cells(places, normals[first])
-    areas, radii = cells.areas, _radii(cells.areas, cells)
+    areas, reaches, _ = surface_cells(places, normals[first])
+    radii = _radii(areas, reaches)
     distances, near = scipy.spatial.KDTree(places).query(
         places, k=min(_NEIGHBORS, len(places) - 1) + 1, workers=-1
     )

@@ -15,16 +15,6 @@ _CHUNK = 1 << 11  # small enough to stay in cache
 _OPEN_END = 0.75
 
 
-class Cells(NamedTuple):
-    """Per point: the area of its cell (mm^2), its farthest corner (mm), and the way to its centroid
-    (mm).
-    """
-
-    areas: Float[np.ndarray, " n"]
-    reaches: Float[np.ndarray, " n"]
-    to_centroids: Float[np.ndarray, "n 3"]
-
-
 def tangent_frames(
     normals: Float[np.ndarray, "n 3"],
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
@@ -50,7 +40,7 @@ def surface_cells(
     neighbors: int = 16,
     directions: int = 32,
     limit: float | None = None,
-) -> Cells:
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
     r"""Measure the Voronoi cell of each point in its tangent plane.
 
     The border of a cell in the direction `u` lies at `r(u) = min_j |d_j|^2 / (2 d_j . u)` over the
@@ -69,12 +59,13 @@ def surface_cells(
     - `limit`: mm; `None`: 0.75 of the mean distance to the six nearest points.
     - `directions`: of the quadrature. With 32 the area is good to about 1 %.
 
-    **Returns:** the cells. On a closed surface sampled evenly the areas add up to its own within
-    about 1 %.
+    **Returns:** per point: the area of its cell (mm^2), its farthest corner (mm), and the way to
+    its centroid (mm). On a closed surface sampled evenly the areas add up to its own within about
+    1 %.
     """
     count = len(points)
     if count == 1:
-        return Cells(np.ones(1), np.ones(1), np.zeros((1, 3)))
+        return np.ones(1), np.ones(1), np.zeros((1, 3))
     single = normals.astype(np.float32)
     images = np.zeros((count, 0, 3), np.float32) if images is None else images
     neighbors = min(neighbors, count - 1)
@@ -84,7 +75,7 @@ def surface_cells(
     angles = (np.arange(directions) + 0.5) * step
     fan = np.stack([np.cos(angles), np.sin(angles)]).astype(np.float32)
 
-    def measure(start: int) -> Cells:
+    def measure(start: int) -> tuple[np.ndarray, ...]:
         part = slice(start, min(start + _CHUNK, count))
         others, own, mirrored = near[part, 1:], single[part], images[part]
         gaps = np.linalg.norm(mirrored, axis=-1)
@@ -106,12 +97,12 @@ def surface_cells(
         area = 0.5 * step * np.einsum("nd,nd->n", border, border)
         moment = (step / 3) * (border**3 @ fan.T) / np.maximum(area, 1e-30)[:, None]
         to_centroid = np.einsum("na,ani->ni", moment, axes)
-        return Cells(area / (1 + coincident.sum(axis=1)), border.max(axis=1), to_centroid)
+        return area / (1 + coincident.sum(axis=1)), border.max(axis=1), to_centroid
 
     with ThreadPoolExecutor() as pool:
-        return Cells(
-            *map(np.concatenate, zip(*pool.map(measure, range(0, count, _CHUNK)), strict=True))
-        )
+        measured = zip(*pool.map(measure, range(0, count, _CHUNK)), strict=True)
+        areas, reaches, to_centroids = map(np.concatenate, measured)
+        return areas, reaches, to_centroids
 
 
 _PLASTIC = 1.32471795724474602596  # of the R2 sequence
@@ -181,7 +172,7 @@ def scatter(mesh: Mesh, count: int, *, seed: int = 0, relaxations: int = 4) -> S
         spacing = float(np.sqrt(areas.sum() / count))
         for _ in range(relaxations):
             positions, normals = points.positions(mesh), points.normals(mesh)
-            cells = surface_cells(
+            *_, to_centroids = surface_cells(
                 positions,
                 normals,
                 mirror_images(mesh, beyond, positions, spacing),
@@ -189,7 +180,7 @@ def scatter(mesh: Mesh, count: int, *, seed: int = 0, relaxations: int = 4) -> S
                 directions=12,
                 limit=spacing,
             )
-            points = _settle(mesh, beyond, points.faces, positions + 1.3 * cells.to_centroids)
+            points = _settle(mesh, beyond, points.faces, positions + 1.3 * to_centroids)
     return points.take(
         morton_order(points.positions(mesh).astype(np.float32))
     )  # as it will be seen in single precision
