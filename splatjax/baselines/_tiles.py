@@ -82,10 +82,8 @@ class ListPlan(AbstractRasterPlan):
         block = jnp.arange(bins.ids.shape[0], dtype=jnp.int32)
         chunk = jnp.searchsorted(bins.first_block, block, side="right") - 1
         lists = Lists(footprints, bins, chunk.astype(jnp.int32), grid)
-        rows, within = self.rasterizer.front(lists, attributes, view), grid.within_picture()
-        if within is not None:
-            shown = jnp.asarray(within)[jnp.minimum(bins.order, grid.count - 1)]
-            rows = jnp.where(shown[:, None], rows, 0.0)
+        rows = self.rasterizer.front(lists, attributes, view)
+        rows = jnp.where(grid.within_picture(bins.order)[:, None], rows, 0.0)
         tiles = jnp.minimum(bins.order, grid.count)
         sums = PixelSums(rows[:, :-1], rows[:, -1])
         return FragmentSums(tiles, sums, bins.needed.astype(rows.dtype), len(rows))

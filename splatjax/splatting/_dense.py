@@ -86,13 +86,7 @@ class DenseRasterPlan(AbstractRasterPlan):
             return in_front, summed(rest & (nearness > limit[:, None]))
 
         both = jax.lax.map(picture_row, jnp.arange(view.height, dtype=dtype) + 0.5)
-        return _all_tiles(*(grid.cut(surface.transpose(1, 0, 2)) for surface in both))
-
-
-def _all_tiles(
-    front: Float[Array, "tiles rows pixels"], behind: Float[Array, "tiles rows pixels"]
-) -> FragmentSums:
-    tiles = jnp.arange(len(front), dtype=jnp.int32)
-    rows = jnp.concatenate([front, behind])
-    sums = PixelSums(rows[:, :-1], rows[:, -1])
-    return FragmentSums(jnp.tile(tiles, 2), sums, jnp.zeros((), front.dtype), len(front))
+        rows = jnp.concatenate([grid.cut(surface.transpose(1, 0, 2)) for surface in both])
+        tiles = jnp.tile(jnp.arange(grid.count, dtype=jnp.int32), 2)
+        sums = PixelSums(rows[:, :-1], rows[:, -1])
+        return FragmentSums(tiles, sums, jnp.zeros((), dtype), grid.count)

@@ -70,10 +70,9 @@ class Sweep(eqx.Module):
 
     def within_picture(self, sums: PixelSums, tiles: Int[Array, " lanes"]) -> PixelSums:
         """Set to zero what lies in a tile but beyond the picture."""
-        within = self.grid.within_picture()
-        if within is None:
+        if self.grid.width % TILE_SIDE == 0 and self.grid.height % TILE_SIDE == 0:
             return sums
-        within = jnp.asarray(within)[jnp.minimum(tiles, self.grid.count - 1)]
+        within = self.grid.within_picture(tiles)
         rows = jnp.where(within[:, None], sums.rows, 0.0)
         return PixelSums(rows, jnp.where(within, sums.weights, 0.0))
 

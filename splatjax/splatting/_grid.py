@@ -2,7 +2,6 @@
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 TILE_SIDE = 8  # pixels
@@ -90,16 +89,10 @@ class TileGrid(eqx.Module):
             + x % TILE_SIDE
         )
 
-    def within_picture(self) -> np.ndarray | None:
-        """Mark the pixels `[tiles, pixels]` that lie in the picture; None if all do."""
-        if self.width % TILE_SIDE == 0 and self.height % TILE_SIDE == 0:
-            return None
-        x, y = (
-            np.arange(self.across * TILE_SIDE) < self.width,
-            np.arange(self.down * TILE_SIDE) < self.height,
-        )
-        within = y.reshape(self.down, 1, TILE_SIDE, 1) & x.reshape(1, self.across, 1, TILE_SIDE)
-        return within.reshape(self.count, TILE_SIDE**2)
+    def within_picture(self, tiles: Int[Array, " some"]) -> Bool[Array, "some pixels"]:
+        """Mark the pixels of some tiles that lie in the picture."""
+        x, y = self.columns_and_rows(tiles)
+        return (x < self.width) & (y < self.height)
 
 
 class TileRanges(eqx.Module):

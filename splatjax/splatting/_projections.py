@@ -61,7 +61,7 @@ class PerspectiveView(AbstractView):
         yy = nx * nx * (1 + v * v) + tilt_y * tilt_y
         root_determinant, squared_radius = radius * facing, radius * radius
         # Slopes are relative here: those of nearness over the nearness of the center.
-        ellipse = widen_ellipse(
+        (a, b, c), (gx, gy), (xx, yy), filtered_determinant = widen_ellipse(
             xx,
             xy,
             yy,
@@ -80,7 +80,6 @@ class PerspectiveView(AbstractView):
         square = inverse * inverse
         # With the relative slope g, the rim is the conic d^T S^-1 d = (1 + g . d)^2: an ellipse
         # while 1 - g^T S g is positive, where the splat does not reach the plane of the pinhole.
-        (a, b, c), (gx, gy), (xx, yy) = ellipse.quadric, ellipse.slope, ellipse.diagonal
         s_gx, s_gy = xx * gx + xy * gy, xy * gx + yy * gy
         kappa = stop_gradient(1 - (gx * s_gx + gy * s_gy))
         bounded = kappa > 1e-3
@@ -102,7 +101,7 @@ class PerspectiveView(AbstractView):
             c=c * square,
             nearness=inverse,
             shift=stop_gradient(1 / (1 + epsilon * inverse)),
-            opacity=jnp.where(visible, root_determinant / ellipse.root_determinant, 0.0),
+            opacity=jnp.where(visible, root_determinant / filtered_determinant, 0.0),
             box=(
                 stop_gradient(x) + mid_x - half_x,
                 stop_gradient(x) + mid_x + half_x,
@@ -191,7 +190,7 @@ class OrthographicView(AbstractView):
         squared_radius = (splats.radii * self.scale) ** 2
         root_determinant, per_pixel = -squared_radius * nz, squared_radius / self.scale
         # Slopes are those of the depth, mm per pixel.
-        ellipse = widen_ellipse(
+        (a, b, c), depth_slopes, squares, filtered_determinant = widen_ellipse(
             squared_radius * (ny * ny + nz * nz),
             squared_radius * (-nx * ny),
             squared_radius * (nx * nx + nz * nz),
@@ -201,20 +200,19 @@ class OrthographicView(AbstractView):
             filter_radius=settings.filter_radius,
         )
         x, y = self.width / 2 + self.scale * px, self.height / 2 + self.scale * py
-        (a, b, c), (depth_slope_x, depth_slope_y) = ellipse.quadric, ellipse.slope
-        half_x, half_y = (jnp.sqrt(squared) for squared in ellipse.diagonal)
+        half_x, half_y = (jnp.sqrt(squared) for squared in squares)
         filter_radius = jnp.broadcast_to(settings.filter_radius / self.scale, splats.radii.shape)
         return Footprints(
             x=x,
             y=y,
-            slope_x=-depth_slope_x,
-            slope_y=-depth_slope_y,
+            slope_x=-depth_slopes[0],
+            slope_y=-depth_slopes[1],
             a=a,
             b=b,
             c=c,
             nearness=-pz,
             shift=stop_gradient(epsilon_of(splats.radii, filter_radius, -nz, settings)),
-            opacity=jnp.where(visible, root_determinant / ellipse.root_determinant, 0.0),
+            opacity=jnp.where(visible, root_determinant / filtered_determinant, 0.0),
             box=stop_gradient((x - half_x, x + half_x, y - half_y, y + half_y)),
             visible=visible,
         )

@@ -73,23 +73,6 @@ class Footprints(eqx.Module):
         return TileRanges.of(*self.box, self.visible, grid)
 
 
-class FilteredEllipse(eqx.Module):
-    """The rim's ellipse, widened by the screen filter (pixels).
-
-    **Attributes:**
-
-    - `quadric`: the numbers a, b, c of `a dx^2 + b dx dy + c dy^2`, which is 1 on the ellipse.
-    - `slope`: of the plane along x and y, in the unit of the slopes that were given.
-    - `diagonal`: xx and yy, the squares of half the width and half the height.
-    - `root_determinant`: the product of the ellipse's half axes.
-    """
-
-    quadric: tuple[Float[Array, " splats"], ...]
-    slope: tuple[Float[Array, " splats"], ...]
-    diagonal: tuple[Float[Array, " splats"], ...]
-    root_determinant: Float[Array, " splats"]
-
-
 def widen_ellipse(
     xx: Float[Array, " splats"],
     xy: Float[Array, " splats"],
@@ -99,13 +82,17 @@ def widen_ellipse(
     det_slope: tuple[Float[Array, " splats"], ...],
     s_slope: tuple[Float[Array, " splats"], ...],
     filter_radius: float,
-) -> FilteredEllipse:
+) -> tuple[tuple[Array, Array, Array], tuple[Array, ...], tuple[Array, Array], Array]:
     """Widen the ellipse `d^T S^-1 d = 1`, with `S = [[xx, xy], [xy, yy]]`, by the screen filter.
 
     The slope of the splat's plane is given as `det_slope`, which is `det S` times the slope, and
     `s_slope`, which is `S` times the slope: the slope itself is infinite edge on, so a quarter of a
     pixel is added to `S` before it is divided by it. Hits stay on the plane of every splat that a
     pixel can resolve. No term cancels another: float32 holds however slanted the splat.
+
+    **Returns:** the numbers a, b, c of `a dx^2 + b dx dy + c dy^2`, which is 1 on the ellipse; the
+    slope of the plane along x and y, in the unit of the slopes that were given; xx and yy, the
+    squares of half the width and half the height; and the product of the half axes.
     """
     determinant, trace, fine = root_determinant * root_determinant, xx + yy, _SLOPE_FILTER**2
     slanted = determinant + fine * (trace + fine)
@@ -114,11 +101,11 @@ def widen_ellipse(
     wide = filter_radius**2
     determinant = determinant + wide * (trace + wide)
     xx, yy = xx + wide, yy + wide
-    return FilteredEllipse(
-        quadric=(yy / determinant, -2 * xy / determinant, xx / determinant),
-        slope=tuple((of_det + fine * of_s) / slanted for of_det, of_s in slopes),
-        diagonal=(xx, yy),
-        root_determinant=jnp.sqrt(determinant),
+    return (
+        (yy / determinant, -2 * xy / determinant, xx / determinant),
+        tuple((of_det + fine * of_s) / slanted for of_det, of_s in slopes),
+        (xx, yy),
+        jnp.sqrt(determinant),
     )
 
 
