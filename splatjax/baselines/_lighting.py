@@ -15,7 +15,6 @@ from splatjax.render import (
     SurfaceAttributes,
     SurfaceSamples,
     irradiance_at_points,
-    surface_attributes,
 )
 from splatjax.scene import Scene, Splats, StackedLights
 from splatjax.shading import unit_normals
@@ -70,7 +69,7 @@ class NormalFields(AbstractLighting):
             )
         slopes = splats.slopes.reshape(-1, 3, 3)
         at_origin = splats.normals - jnp.einsum("sij,sj->si", slopes, splats.centers)
-        attributes = surface_attributes(scene, light, irradiance)
+        attributes = super().attributes(scene, light, irradiance)
         return dataclasses.replace(attributes, normals=at_origin.T, extra=splats.slopes.T)
 
     def at_pixels(self, scene, groups, samples):

@@ -20,7 +20,6 @@ from ._lighting import (
     irradiance_at_splats as irradiance_at_splats,
     LightAtSplats as LightAtSplats,
     LightVisibility as LightVisibility,
-    surface_attributes as surface_attributes,
 )
 from ._passes import SplatLight as SplatLight
 from ._plan import make_plan as make_plan, Plan as Plan, RenderSettings as RenderSettings

@@ -243,32 +243,25 @@ def surface_parameters(scene: Scene):
     return specular, roughness
 
 
-def surface_attributes(
-    scene: Scene, light: LightVisibility, irradiance: Irradiance
-) -> SurfaceAttributes:
-    """Collect what passes 2 and 3 blend, but for the layers of pass 4."""
-    splats = scene.splats
-    specular, roughness = surface_parameters(scene)
-    return SurfaceAttributes(
-        normals=splats.normals.T,
-        area=splats.areas[None],
-        source=irradiance.source,
-        albedo=None if splats.albedo is None else splats.albedo.T,
-        irradiance=None if splats.albedo is None else irradiance.entering,
-        specular=None if splats.specular is None else specular[None],
-        roughness=None if splats.roughness is None else roughness[None],
-        visibility=light.per_light(splats.centers, splats.normals),
-    )
-
-
 class AbstractLighting(eqx.Module):
     """What splats carry into the picture, and what pixels make of it before light is shaded."""
 
     def attributes(
         self, scene: Scene, light: LightVisibility, irradiance: Irradiance
     ) -> SurfaceAttributes:
-        """Collect what passes 2 and 3 blend: `surface_attributes`, or more in `extra`."""
-        return surface_attributes(scene, light, irradiance)
+        """Collect what passes 2 and 3 blend, but for the layers of pass 4: more in `extra`."""
+        splats = scene.splats
+        specular, roughness = surface_parameters(scene)
+        return SurfaceAttributes(
+            normals=splats.normals.T,
+            area=splats.areas[None],
+            source=irradiance.source,
+            albedo=None if splats.albedo is None else splats.albedo.T,
+            irradiance=None if splats.albedo is None else irradiance.entering,
+            specular=None if splats.specular is None else specular[None],
+            roughness=None if splats.roughness is None else roughness[None],
+            visibility=light.per_light(splats.centers, splats.normals),
+        )
 
     @abc.abstractmethod
     def at_pixels(
