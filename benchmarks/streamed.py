@@ -67,7 +67,8 @@ class Stages:
 
 
 def peak() -> float:
-    """Give the most memory that this process has held, GB."""
+    """Print the CPU time of this process, and give the most memory that it has held, GB."""
+    print(f"  {'in all':30}{time.process_time():9.0f} s of CPU time", flush=True)
     said = Path("/proc/self/status").read_text(encoding="ascii")
     return 1e-6 * float(said.split("VmHWM:")[1].split()[0])
 
@@ -75,7 +76,6 @@ def peak() -> float:
 def written(path: Path, body: str, splats: int) -> float:
     """Write the cloud; give the most memory that it took, GB."""
     write_cloud(path, *HEADS[body](), splats)
-    print(f"  {'in all':30}{time.process_time():9.0f} s of CPU time", flush=True)
     return peak()
 
 
@@ -91,7 +91,6 @@ def streamed(cloud: Path, out: Path, part: int, width: int) -> float:
         sj.render_streamed(file, (light,), sj.load_material("skin").white(), camera, report=stages),
     )
     stages("what the pixels show", file.count)
-    print(f"  {'in all':30}{time.process_time():9.0f} s of CPU time", flush=True)
     return peak()
 
 
@@ -100,7 +99,6 @@ def in_memory(cloud: Path, out: Path, part: int, width: int) -> float:
     light, camera = conditions(width)
     splats = jax.tree.map(lambda *parts: jnp.concatenate(parts), *sj.SplatFile(cloud, part)())
     save(out, sj.render(sj.Scene(splats, (light,), sj.load_material("skin").white()), camera))
-    print(f"  {'in all':30}{time.process_time():9.0f} s of CPU time", flush=True)
     return peak()
 
 
