@@ -28,10 +28,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import splatjax as sj
-from splatjax.fitting import fit_medium
-from splatjax.io import save_exports
 from splatjax.plots import plot_fit
-from splatjax.scattering import measure_laser_dot
 
 # %% [markdown]
 # Here is such a photograph, of something like potato, with the noise of a camera. The beam has a
@@ -60,9 +57,9 @@ figure  # noqa: B018
 
 # %%
 with jax.enable_x64(True):
-    dot = measure_laser_dot(photograph, mm_per_pixel, power=power)
+    dot = sj.scattering.measure_laser_dot(photograph, mm_per_pixel, power=power)
     guess = sj.Medium(jnp.asarray([0.05]), jnp.asarray([2.0]), potato.eta)
-    found = fit_medium(dot.profile, guess, beam_variance=beam_variance, count=3)
+    found = sj.fitting.fit_medium(dot.profile, guess, beam_variance=beam_variance, count=3)
     bars = np.sqrt(np.diagonal(np.asarray(found.covariance)[0]))
     values = np.asarray([found.medium.sigma_a[0], found.medium.sigma_s_prime[0]])
     chi_squared = float(found.chi_squared[0])
@@ -91,7 +88,7 @@ figure  # noqa: B018
 
 # %%
 with jax.enable_x64(True):
-    save_exports(sj.Material(fitted.gaussians, eta=1.3), "potato.json")
+    sj.io.save_exports(sj.Material(fitted.gaussians, eta=1.3), "potato.json")
 sheet = json.loads(Path("potato.json").read_text())
 for name in ("burley", "unity", "blender"):
     print(name, sheet[name])

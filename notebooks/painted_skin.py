@@ -28,7 +28,8 @@
 
 # %%
 # %matplotlib inline
-import equinox as eqx
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -44,18 +45,7 @@ HELD = sj.fitting.NonNegativeWeights(sj.fitting.FixedTotalReflectance())
 # Every splat at every pixel: for small pictures. Leave `settings` out for large ones.
 settings = sj.RenderSettings(rasterizer=DenseRasterizer(), diffuser=DenseDiffuser())
 
-
-def with_map(splats: sj.Splats, albedo) -> sj.Splats:
-    return eqx.tree_at(
-        lambda s: s.albedo,
-        splats,
-        jnp.asarray(albedo, jnp.float32),
-        is_leaf=lambda leaf: leaf is None,
-    )
-
-
-bust = sj.bust(SPLATS)
-figurine = sj.Splats(bust.centers / 16, bust.normals, bust.radii / 16, bust.areas / 256)
+figurine = sj.bust(SPLATS).scaled(1 / 16)
 x, y, _ = np.asarray(figurine.centers).T
 painted = y > np.quantile(y, 0.45)
 bands = np.stack(
@@ -81,7 +71,7 @@ with jax.enable_x64(True):
     gaussians = sj.fit_gaussians(sj.Dipole(skin), COUNT, weights=HELD).gaussians
     gaussians = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), gaussians)
     truth = sj.Material(gaussians, eta=float(skin.eta[0]), specular=0.0)
-scenes = [sj.Scene(with_map(figurine, paint), (lamp,), truth) for lamp in lamps]
+scenes = [sj.Scene(replace(figurine, albedo=paint), (lamp,), truth) for lamp in lamps]
 frames = [sj.render(scene, camera, settings) for scene in scenes]
 rendered = [np.asarray(frame.beauty, np.float64) for frame in frames]
 deviations = [np.full(picture.shape, NOISE * np.sqrt(np.mean(picture**2))) for picture in rendered]
@@ -108,7 +98,7 @@ def observed(mask) -> list[sj.inverse.Observation]:
     ]
 
 
-begin = with_map(figurine, np.where(painted[:, None], 0.5, 1.0) * np.ones(3))
+begin = replace(figurine, albedo=np.where(painted[:, None], 0.5, 1.0) * np.ones(3))
 with jax.enable_x64(True):
     start = sj.Medium(skin.sigma_a * 2, skin.sigma_s_prime / 2, skin.eta)
     found = sj.inverse.recover(observed(bare), begin, start, count=COUNT, settings=settings)
