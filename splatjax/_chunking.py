@@ -50,7 +50,7 @@ def map_chunks(function: Callable[..., Result], *arrays: PyTree, at_once: int = 
         return leaf.reshape(chunks, size, *leaf.shape[1:])
 
     def compute(chunk):
-        return jax.tree.map(_planes, function(*jax.tree.map(_vectors, chunk, is_leaf=_is_planes)))
+        return jax.tree.map(_planes, function(*_vectors(chunk)))
 
     results = jax.lax.map(
         jax.checkpoint(compute), jax.tree.map(split, jax.tree.map(_planes, arrays))
@@ -58,7 +58,7 @@ def map_chunks(function: Callable[..., Result], *arrays: PyTree, at_once: int = 
     joined = jax.tree.map(
         lambda leaf: leaf.reshape(chunks * size, *leaf.shape[2:])[:length], results
     )
-    return jax.tree.map(_vectors, joined, is_leaf=_is_planes)
+    return _vectors(joined)
 
 
 _LONGEST = 4  # of the vectors that are kept as planes
@@ -72,18 +72,18 @@ class _Planes(eqx.Module):
     planes: tuple[Array, ...]
 
 
-def _is_planes(leaf) -> bool:
-    return isinstance(leaf, _Planes)
-
-
 def _planes(leaf: Array):
     if leaf.ndim != 2 or leaf.shape[1] > _LONGEST:
         return leaf
     return _Planes(tuple(plane[:, 0] for plane in jax.lax.split(leaf, [1] * leaf.shape[1], axis=1)))
 
 
-def _vectors(leaf):
-    return jnp.stack(leaf.planes, axis=1) if isinstance(leaf, _Planes) else leaf
+def _vectors(tree: PyTree) -> PyTree:
+    return jax.tree.map(
+        lambda leaf: jnp.stack(leaf.planes, axis=1) if isinstance(leaf, _Planes) else leaf,
+        tree,
+        is_leaf=lambda leaf: isinstance(leaf, _Planes),
+    )
 
 
 def take_points(
