@@ -42,8 +42,9 @@ class PictureJacobian(eqx.Module):
 
     def along(self, change: SumOfGaussians) -> Float[Array, "height width channels"]:
         """Differentiate `beauty` along a change of weights and variances: a derivative picture."""
-        moved = jnp.tensordot(change.variances, self.variances, 1)
-        return moved + jnp.sum(change.weights[:, None, None] * self.weights, axis=0)
+        return jnp.einsum("k,khwc->hwc", change.variances, self.variances) + jnp.einsum(
+            "kc,khwc->hwc", change.weights, self.weights
+        )
 
     def through(
         self, gaussians_of: Callable[[Parameters], SumOfGaussians], parameters: Parameters
@@ -64,30 +65,19 @@ class PictureJacobian(eqx.Module):
         **Raises:** `ValueError` when `gaussians_of(parameters)` has other Gaussians than the
         picture.
         """
-        dtype = self.weights.dtype
-        made = gaussians_of(parameters)
         shape = self.weights.shape[0], self.weights.shape[3]
-        if made.weights.shape != shape:
-            raise ValueError(
-                f"gaussians_of(parameters) has {list(made.weights.shape)} Gaussians and channels, "
-                "the picture was made with "
-                f"{list(shape)}: give the function that made the picture's material"
-            )
-        jacobian = jax.jacfwd(gaussians_of)(parameters)
-        leaves, structure = jax.tree.flatten(parameters)
-        of_variances = structure.flatten_up_to(jacobian.variances)
-        of_weights = structure.flatten_up_to(jacobian.weights)
 
-        def chain(of_variances, of_weights, leaf):
-            of_variances = of_variances.reshape(shape[0], -1).astype(dtype)
-            of_weights = of_weights.reshape(*shape, -1).astype(dtype)
-            of_beauty = jnp.einsum("khwc,kp->hwcp", self.variances, of_variances)
-            of_beauty = of_beauty + jnp.einsum("khwc,kcp->hwcp", self.weights, of_weights)
-            return of_beauty.reshape(*of_beauty.shape[:3], *jnp.shape(leaf))
+        def linear_beauty(parameters):
+            made = gaussians_of(parameters)
+            if made.weights.shape != shape:
+                raise ValueError(
+                    f"gaussians_of(parameters) has {list(made.weights.shape)} Gaussians and "
+                    f"channels, the picture was made with {list(shape)}: give the function that "
+                    "made the picture's material"
+                )
+            return self.along(jax.tree.map(lambda leaf: leaf.astype(self.weights.dtype), made))
 
-        return structure.unflatten(
-            [chain(v, w, leaf) for v, w, leaf in zip(of_variances, of_weights, leaves, strict=True)]
-        )
+        return jax.jacfwd(linear_beauty)(parameters)
 
 
 def picture_jacobian(
