@@ -109,14 +109,11 @@ def perturbed_normals(
     return np.where(handedness == 0, normals, unit(x * tangent + y * bitangent + z * normals))
 
 
-_PLAIN = Textures()
-
-
 def sample_mesh(
     mesh: Mesh,
     count: int,
     *,
-    textures: Textures = _PLAIN,
+    textures: Textures = Textures(),
     seed: int = 0,
     rounded: bool = False,
 ) -> Splats:
@@ -143,7 +140,7 @@ def sample_mesh(
 
 
 def splats_at(
-    mesh: Mesh, points: SurfacePoints, textures: Textures = _PLAIN, *, rounded: bool = False
+    mesh: Mesh, points: SurfacePoints, textures: Textures = Textures(), *, rounded: bool = False
 ) -> Splats:
     """Make splats of points on a mesh, its textures baked in; otherwise as `sample_mesh`."""
     centers, area = points.positions(mesh), mesh.area()
