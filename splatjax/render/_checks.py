@@ -79,7 +79,9 @@ def _device_memory(splats: Splats) -> float | None:
 
 def _doubts(scene: Scene, camera: Camera, is_lit: bool) -> Iterator[str]:
     """Say what is hardly meant."""
-    if is_lit and not any(np.any(np.asarray(_strength(light)) != 0) for light in scene.lights):
+    # A light without a field for its strength counts as one.
+    strengths = [np.asarray(getattr(light, light.strength, 1.0)) for light in scene.lights]
+    if is_lit and not any(map(np.any, strengths)):
         yield "the scene has no light, and the picture will be black; add one to Scene.lights"
     if scene.splats.count == 0:
         return
@@ -113,10 +115,6 @@ def _doubts(scene: Scene, camera: Camera, is_lit: bool) -> Iterator[str]:
                 f"the body is {size:.3g} mm large, and light travels {reach:.3g} mm below its "
                 "surface; check the units (mm), or scale the body by Splats.scaled"
             )
-
-
-def _strength(light) -> jax.Array | float:
-    return getattr(light, light.strength, 1.0) if light.strength else 1.0
 
 
 def _winding_number(centers, normals, areas, camera: Camera) -> float:

@@ -160,7 +160,8 @@ def cast_shadows(
                 return visible, shadow_map.needed
 
             views = shadow_views(light, bounds, settings, plan.cube)
-            visible, needed = jax.lax.map(of_view, _splatting.stack_views(views))
+            stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *views)
+            visible, needed = jax.lax.map(of_view, stacked)
             closeness = plan.closeness(light, bounds)
             return jnp.sum(visible, axis=0), jnp.maximum(jnp.max(needed), closeness)
 
@@ -235,12 +236,13 @@ def irradiance_at_splats(scene: Scene, light: LightVisibility) -> Irradiance:
 def surface_parameters(scene: Scene):
     """Multiply the material's specular strength and roughness with the splats' own."""
     splats, material = scene.splats, scene.material
-    specular, roughness = material.specular, material.roughness
-    if splats.specular is not None:
-        specular = specular * splats.specular
-    if splats.roughness is not None:
-        roughness = roughness * splats.roughness
-    return specular, roughness
+
+    def product(factor, own):
+        return factor if own is None else factor * own
+
+    return product(material.specular, splats.specular), product(
+        material.roughness, splats.roughness
+    )
 
 
 class AbstractLighting(eqx.Module):

@@ -35,7 +35,6 @@ from ._shadows import (
     near_view as near_view,
     ShadowMap as ShadowMap,
     ShadowSettings as ShadowSettings,
-    stack_views as stack_views,
 )
 from ._surfaces import (
     blend_fragments as blend_fragments,

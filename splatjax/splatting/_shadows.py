@@ -2,8 +2,6 @@
 each splat.
 """
 
-from collections.abc import Sequence
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -261,8 +259,3 @@ def _compared(
     weights = _spline(tx)[:, None] * _spline(ty)[None]
     blocked = jnp.sum(weights * jnp.where(inside, blocked, 0.0), axis=(0, 1))
     return jnp.maximum(1 - blocked, 0)  # rounding must not make light negative
-
-
-def stack_views(views: Sequence[AbstractView]) -> AbstractView:
-    """Stack views of one kind and size, for `lax.map`."""
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *views)
