@@ -23,7 +23,7 @@ import splatjax as sj
 from splatjax import diffusion, splatting
 from splatjax._combination import OneDevice
 
-from .scenes import MATERIALS, add_body, columns, lit
+from .scenes import BODIES, MATERIALS, columns, lit
 
 QUANTILES = (0.5, 0.99, 1.0)
 
@@ -32,10 +32,15 @@ def arguments():
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.diffusion_error", description=__doc__
     )
-    add_body(parser, splats=683_549, width=1024)
+    parser.add_argument("--body", choices=BODIES, default="synthetic", help="(default %(default)s)")
     parser.add_argument(
         "--material", choices=MATERIALS, default="skin", help="(default %(default)s)"
     )
+    parser.add_argument(
+        "--splats", type=int, default=683_549, help="on the prototype's head (default %(default)s)"
+    )
+    size = "of the square picture, pixels (default %(default)s)"
+    parser.add_argument("--width", type=int, default=1024, help=size)
     zoom = "of the middle of the picture (default %(default)s)"
     parser.add_argument("--zoom", type=float, default=1.0, help=zoom)
     points = "random covered pixels, and random splats (default %(default)s)"

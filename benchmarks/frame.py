@@ -18,13 +18,20 @@ import splatjax as sj
 from splatjax import splatting
 from splatjax._combination import OneDevice
 
-from .scenes import add_body, columns, lit
+from .scenes import BODIES, columns, lit
 from .yardstick import Yardstick
 
 
 def arguments():
     parser = argparse.ArgumentParser(prog="python -m benchmarks.frame", description=__doc__)
-    add_body(parser, splats=683_549, width=1024)
+    parser.add_argument("--body", choices=BODIES, default="synthetic", help="(default %(default)s)")
+    parser.add_argument("--splats", type=int, default=683_549, help="(default %(default)s)")
+    parser.add_argument(
+        "--width",
+        type=int,
+        default=1024,
+        help="of the square picture, pixels (default %(default)s)",
+    )
     parser.add_argument(
         "--repeats", type=int, default=7, help="rounds; medians are given (default %(default)s)"
     )

@@ -16,7 +16,7 @@ import numpy as np
 import splatjax as sj
 
 from .frame import rasterization
-from .scenes import FOCAL_LENGTH, add_body, columns, lit
+from .scenes import BODIES, FOCAL_LENGTH, columns, lit
 
 try:
     import torch
@@ -34,7 +34,14 @@ _NEAREST = 8  # points listed for a pixel
 
 def arguments():
     parser = argparse.ArgumentParser(prog="python -m benchmarks.peers", description=__doc__)
-    add_body(parser, splats=683_549, width=1024)
+    parser.add_argument("--body", choices=BODIES, default="synthetic", help="(default %(default)s)")
+    parser.add_argument("--splats", type=int, default=683_549, help="(default %(default)s)")
+    parser.add_argument(
+        "--width",
+        type=int,
+        default=1024,
+        help="of the square picture, pixels (default %(default)s)",
+    )
     parser.add_argument(
         "--few", type=int, default=10_000, help="splats for PointsRasterizer (default %(default)s)"
     )

@@ -21,7 +21,7 @@ import splatjax as sj
 from splatjax.diffusion import ClusterDiffuser, DenseDiffuser
 from splatjax.splatting import DenseRasterizer
 
-from .scenes import add_body, columns, lit
+from .scenes import BODIES, columns, lit
 
 COMPILED = "/jax/core/compile/backend_compile_duration"
 WEIGHTS = sj.fitting.NonNegativeWeights(sj.fitting.FixedTotalReflectance())
@@ -37,7 +37,13 @@ LIGHTS = {"front": (0.5, 0.6, 0.65), "side": (-1.0, 0.15, 0.25), "behind": (0.6,
 
 def arguments():
     parser = argparse.ArgumentParser(prog="python -m benchmarks.recover", description=__doc__)
-    add_body(parser, splats=100_000, width=256)
+    parser.add_argument("--body", choices=BODIES, default="synthetic", help="(default %(default)s)")
+    parser.add_argument(
+        "--splats", type=int, default=100_000, help="on the prototype's head (default %(default)s)"
+    )
+    parser.add_argument(
+        "--width", type=int, default=256, help="of the square picture, pixels (default %(default)s)"
+    )
     parser.add_argument("--materials", nargs="+", default=["marble", "skin1", "wholemilk"])
     parser.add_argument(
         "--lights",

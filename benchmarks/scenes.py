@@ -1,7 +1,5 @@
 """What is rendered: heads and a thin sheet, under one light with a shadow map."""
 
-import argparse
-
 import jax.numpy as jnp
 import numpy as np
 
@@ -17,16 +15,6 @@ _SCAN = "data/lee_perry_smith"
 
 BODIES = ("synthetic", "scanned", "sheet")
 MATERIALS = ("skin", "marble")
-
-
-def add_body(parser: argparse.ArgumentParser, splats: int, width: int) -> None:
-    """Add the options of a body and its picture, with these defaults."""
-    parser.add_argument("--body", choices=BODIES, default="synthetic", help="(default %(default)s)")
-    parser.add_argument(
-        "--splats", type=int, default=splats, help="of the body (default %(default)s)"
-    )
-    size = "of the square picture, pixels (default %(default)s)"
-    parser.add_argument("--width", type=int, default=width, help=size)
 
 
 def columns(body: str, splats: int) -> dict[str, np.ndarray]:

@@ -18,14 +18,20 @@ import splatjax as sj
 from splatjax import diffusion
 
 from .diffusion_error import layers_of, seen_in_front, untruncated
-from .scenes import add_body, columns, lit
+from .scenes import BODIES, columns, lit
 
 VARIANCES = (4.0, 8.0, 16.0, 32.0)  # mm^2: what splats a millimeter apart carry
 
 
 def arguments():
     parser = argparse.ArgumentParser(prog="python -m benchmarks.shimmer", description=__doc__)
-    add_body(parser, splats=100_000, width=256)
+    parser.add_argument("--body", choices=BODIES, default="synthetic", help="(default %(default)s)")
+    parser.add_argument(
+        "--splats", type=int, default=100_000, help="on the prototype's head (default %(default)s)"
+    )
+    parser.add_argument(
+        "--width", type=int, default=256, help="of the square picture, pixels (default %(default)s)"
+    )
     parser.add_argument(
         "--steps", type=int, default=4, help="from frame to frame (default %(default)s)"
     )
