@@ -118,15 +118,13 @@ def main() -> None:
 
         # Pass 4 alone, of the splats that the camera may see and of all.
         placed = jax.tree.map(lambda rows, plan=plan: rows[..., plan.order], sources)
-        areas = jnp.where(plan.exists, placed.areas, 0)
-        placed = dataclasses.replace(placed, areas=areas)
+        placed = dataclasses.replace(placed, areas=jnp.where(plan.exists, placed.areas, 0))
         view, body = splatting.PerspectiveView.of(camera), splats.take(plan.order)
         body = eqx.tree_at(lambda s: s.radii, body, jnp.where(plan.exists, body.radii, 0))
         seen, _ = plan.raster.choose(body, view)
 
         def diffuse(placed, wanted, plan=plan):
-            own = gaussians.variances, kernel, OneDevice(), wanted
-            return plan.diffusion.diffuse(placed, *own)
+            return plan.diffusion.diffuse(placed, gaussians.variances, kernel, OneDevice(), wanted)
 
         _, seconds = timed(diffuse, placed, seen)
         diffused, all_seconds = timed(diffuse, placed, None)
@@ -159,13 +157,12 @@ def main() -> None:
         sources = [len(np.unique(plan.diffusion.sources.parents[layer])) for layer in layers]
         each = zip(resolved, sources, off, off_at_splats, strict=True)
         for k, count, at_pixels, means in each:
-            how = f"{count} sources"
             numbers = (
                 " ".join(f"{np.quantile(each, q):.1e}" for q in QUANTILES)
                 for each in (at_pixels, means)
             )
             width = float(gaussians.variances[k]) ** 0.5
-            print(f"  {width:5.2f} mm: {'; '.join(numbers)}  {how}", flush=True)
+            print(f"  {width:5.2f} mm: {'; '.join(numbers)}  {count} sources", flush=True)
     draw(np.max(off, axis=0), pixels, np.asarray(frame.coverage) > 0)
 
 
