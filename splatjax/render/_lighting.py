@@ -240,9 +240,8 @@ def surface_parameters(scene: Scene):
     def product(factor, own):
         return factor if own is None else factor * own
 
-    return product(material.specular, splats.specular), product(
-        material.roughness, splats.roughness
-    )
+    specular = product(material.specular, splats.specular)
+    return specular, product(material.roughness, splats.roughness)
 
 
 class AbstractLighting(eqx.Module):
@@ -251,7 +250,9 @@ class AbstractLighting(eqx.Module):
     def attributes(
         self, scene: Scene, light: LightVisibility, irradiance: Irradiance
     ) -> SurfaceAttributes:
-        """Collect what passes 2 and 3 blend, but for the layers of pass 4: more in `extra`."""
+        """Collect what passes 2 and 3 blend, but for the layers of pass 4. A subclass adds what it
+        needs as `extra`.
+        """
         splats = scene.splats
         specular, roughness = surface_parameters(scene)
         return SurfaceAttributes(
