@@ -51,6 +51,10 @@ def valid(
     return {"valid": (requirement, holds, finite)}
 
 
+LINEAR = {"linear": True}
+"""Metadata of a field of radiance, which refuses whole numbers."""
+
+
 def record(cls: Class) -> Class:
     r"""Convert the arguments of a class of records before its `__init__` sees them.
 
@@ -69,10 +73,11 @@ def record(cls: Class) -> Class:
     would be right.
     """
     initialize, signature = cls.__init__, inspect.signature(cls)
-    axes, classes, ranges = {}, {}, {}
+    axes, classes, ranges, linear = {}, {}, {}, []
     for field in dataclasses.fields(cls):  # ty: ignore[invalid-argument-type]
         if "valid" in field.metadata:
             ranges[field.name] = field.metadata["valid"]
+        linear += [field.name] * ("linear" in field.metadata)
         is_tuple = get_origin(field.type) is tuple
         annotation = get_args(field.type)[0] if is_tuple else field.type
         kinds = get_args(annotation) if isinstance(annotation, UnionType) else (annotation,)
@@ -89,6 +94,13 @@ def record(cls: Class) -> Class:
             raise TypeError(f"{error}; give {wanted}") from None
         given.apply_defaults()
         values, records = given.arguments, []
+        for name in linear:
+            kind = getattr(values[name], "dtype", np.dtype(float))
+            if not jnp.issubdtype(kind, jnp.floating):
+                raise ValueError(
+                    f"{cls.__name__}.{name} holds whole numbers ({kind}), as encoded for a "
+                    "display; give linear light in floating-point numbers"
+                )
         for name, (kinds, is_tuple) in classes.items():
             is_many = isinstance(values[name], list | tuple)
             parts = tuple(values[name]) if is_tuple and is_many else (values[name],)

@@ -121,16 +121,17 @@ class LightStrengths(AbstractPart):
 
     def coordinates(self, pictured: PicturedScene) -> tuple[Float[Array, " channels"], ...]:
         for light in pictured.lights:
-            if not light.strength:
+            if not light.strength_field:
                 raise ValueError(
-                    f"{type(light).__name__}.strength names no field that LightStrengths may move"
+                    f"{type(light).__name__}.strength_field names no field that LightStrengths may "
+                    "move"
                 )
-        return tuple(jnp.zeros_like(getattr(light, light.strength)) for light in pictured.lights)
+        return tuple(jnp.zeros_like(getattr(light, light.strength_field)) for light in pictured.lights)
 
     def moved(self, pictured: PicturedScene, x, prepared) -> PicturedScene:
         def move(light: AbstractLight, steps: Array) -> AbstractLight:
-            strength = getattr(light, light.strength) * jnp.exp(self.step * steps)
-            return dataclasses.replace(light, **{light.strength: strength})
+            strength = getattr(light, light.strength_field) * jnp.exp(self.step * steps)
+            return dataclasses.replace(light, **{light.strength_field: strength})
 
         return dataclasses.replace(pictured, lights=tuple(map(move, pictured.lights, x)))
 

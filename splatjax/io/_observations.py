@@ -106,11 +106,11 @@ def _light(table: Table, channels: int) -> AbstractLight:
     light, names = _LIGHTS[table.one_of("kind", _LIGHTS)]
     table = Table(table.path, table.name, table.entries, ("kind", *names))
     values: dict[str, Any] = {name: table.numbers(name) for name in names if name != "cast_shadows"}
-    strength = values[light.strength]
-    table.make(check_values, light.strength, strength, "at least 0", lambda x: x >= 0)
+    strength = values[light.strength_field]
+    table.make(check_values, light.strength_field, strength, "at least 0", lambda x: x >= 0)
     if strength.size not in (1, channels):
         raise ValueError(
-            f"{table.where} {light.strength} is {strength.tolist()}, for a picture of {channels} "
+            f"{table.where} {light.strength_field} is {strength.tolist()}, for a picture of {channels} "
             "channels; give one number, or one for each channel"
         )
     if "cast_shadows" in names:

@@ -10,7 +10,7 @@ import numpy as np
 from jax.core import Tracer
 
 from splatjax._memory import check_memory
-from splatjax.scene import Camera, Scene, Splats
+from splatjax.scene import Camera, Scene, Splats, lights_by_kind
 
 # At least: a picture that needs more than is free by these does not fit.
 BYTES_PER_SPLAT, BYTES_PER_PIXEL = 1000.0, 500.0
@@ -80,7 +80,7 @@ def _device_memory(splats: Splats) -> float | None:
 def _doubts(scene: Scene, camera: Camera, is_lit: bool) -> Iterator[str]:
     """Say what is hardly meant."""
     # A light without a field for its strength counts as one.
-    strengths = [np.asarray(getattr(light, light.strength, 1.0)) for light in scene.lights]
+    strengths = [np.asarray(getattr(light, light.strength_field, 1.0)) for light in scene.lights]
     if is_lit and not any(map(np.any, strengths)):
         yield "the scene has no light, and the picture will be black; add one to Scene.lights"
     if scene.splats.count == 0:
@@ -146,8 +146,8 @@ def check_channels(scene: Scene) -> None:
     if scene.splats.albedo is not None:
         counts["splats.albedo"] = scene.splats.albedo.shape[1]
     point = jax.ShapeDtypeStruct((1, 3), scene.splats.centers.dtype)
-    for i, light in enumerate(scene.lights):
-        for sample in light.samples():
+    for group in lights_by_kind(scene.lights):
+        for i, sample in dict(group).items():  # one of each light
             counts[f"lights[{i}]"] = eqx.filter_eval_shape(
                 lambda sample, x: sample.incidence(x)[1], sample, point
             ).shape[1]

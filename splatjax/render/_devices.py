@@ -58,7 +58,7 @@ def filled_like(scene: Scene, plan: Plan, *given: PyTree) -> tuple[Scene, Plan, 
     splats, lights, shadows = scene.splats, scene.lights, plan.shadows
     if 0 < count < len(plan.order):
         splats = jax.tree.map(lambda leaf: rows_at(leaf, np.arange(len(plan.order))), splats)
-    if all(isinstance(light, AbstractLightSample) and light.strength for light in lights):
+    if all(isinstance(light, AbstractLightSample) and light.strength_field for light in lights):
         groups = lights_by_kind(lights)
         numbered = [light for group in groups for light in group + fill_lights(group, len(lights))]
         order = np.argsort([number for number, _ in numbered], stable=True)

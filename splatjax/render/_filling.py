@@ -39,8 +39,8 @@ def fill_lights(
 ) -> list[tuple[int, AbstractLightSample]]:
     """Repeat the last light of a group, without its strength, up to a power of two."""
     last = group[-1][1]
-    none = jax.device_put(np.zeros_like(getattr(last, last.strength)))
-    dark = eqx.tree_at(lambda light: getattr(light, light.strength), last, none)
+    none = jax.device_put(np.zeros_like(getattr(last, last.strength_field)))
+    dark = eqx.tree_at(lambda light: getattr(light, light.strength_field), last, none)
     return [(number, dark)] * ((1 << (len(group) - 1).bit_length()) - len(group))
 
 

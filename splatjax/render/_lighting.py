@@ -13,6 +13,8 @@ from splatjax._combination import AbstractCombination
 from splatjax.scene import (
     AbstractLightSample,
     DirectionalLight,
+    DistantStratum,
+    EmitterStratum,
     GaussianBeam,
     Material,
     PointLight,
@@ -46,7 +48,7 @@ class ShadowPlan(eqx.Module):
         """Compute a number above 1 for a point light that was planned outside the splats' bounding
         sphere and has come into it.
         """
-        if self.cube or not isinstance(light, PointLight):
+        if self.cube or not isinstance(light, PointLight | EmitterStratum):
             return jnp.zeros_like(bounds.radius)
         distance = jnp.linalg.norm(light.position - bounds.center)
         return jax.lax.stop_gradient(bounds.radius / distance)
@@ -63,7 +65,7 @@ def plan_views(
     cube = any(
         float(jnp.linalg.norm(light.position - bounds.center)) < _NEARLY * float(bounds.radius)
         for light in lights
-        if isinstance(light, PointLight)
+        if isinstance(light, PointLight | EmitterStratum)
     )
     return [shadow_views(light, bounds, settings, cube) for light in lights], cube
 
@@ -75,9 +77,10 @@ def shadow_views(
     cube: bool,
 ) -> Sequence[_splatting.AbstractView]:
     """Return the views of a light's shadow maps: one of all splats, or the six faces of a cube."""
-    if isinstance(light, DirectionalLight | GaussianBeam):
+    settings = settings.for_strata() if light.is_stratum else settings
+    if isinstance(light, DirectionalLight | GaussianBeam | DistantStratum):
         return [_splatting.distant_view(light.direction, bounds, settings)]
-    if not isinstance(light, PointLight):
+    if not isinstance(light, PointLight | EmitterStratum):
         raise ValueError(
             f"{type(light).__name__} has no shadow map; give a light with cast_shadows=False"
         )

@@ -19,6 +19,7 @@ from splatjax.scene import (
     AbstractLight,
     AbstractLightSample,
     Camera,
+    DistantStratum,
     Scene,
     Splats,
     lights_by_kind,
@@ -28,6 +29,8 @@ from ._checks import check_scene, in_one_dtype
 from ._filling import arrange, fill_gaussians, fill_up
 from ._lighting import AbstractLighting, LightAtSplats, ShadowPlan, plan_views
 
+# Directions to all sides, for which the shadow maps of any environment are planned.
+_DIRECTIONS = [[x, y, z] for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if x or y or z]
 
 class RenderSettings(eqx.Module):
     r"""How each pass works.
@@ -110,8 +113,8 @@ def make_plan(
 
     **Returns:** a `Plan` that serves every scene with every camera, and scenes and materials near
     these: variances within a factor of 1.25, splats that have moved among each other by less than a
-    tenth of a layer's width, light of any strength and color. A light that casts shadows from
-    elsewhere may need more capacity.
+    tenth of a layer's width, light of any strength and color, and every environment. A light
+    that casts shadows from elsewhere may need more capacity.
 
     **Raises:** `ValueError` when cameras or scenes do not fit together, or when the rasterizer or
     diffuser of the settings does not work over a mesh.
@@ -286,6 +289,9 @@ def _plan_shadows(
 ) -> ShadowPlan | None:
     if not lights[0].cast_shadows:
         return None
+    if isinstance(lights[0], DistantStratum):
+        directions = jnp.asarray(_DIRECTIONS, lights[0].direction.dtype)
+        lights = [DistantStratum(each, lights[0].irradiance, True) for each in directions]
     of_lights, cube = plan_views(lights, bounds, settings.shadows)
     views = [view for views in of_lights for view in views]
     rasterizer = settings.rasterizer.for_shadows()

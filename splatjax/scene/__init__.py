@@ -1,9 +1,20 @@
 """Plain records: what is drawn, what with, and what comes out. No algorithms."""
 
+from ._area_lights import (
+    AbstractAreaLight as AbstractAreaLight,
+    DiskLight as DiskLight,
+    RectangleLight as RectangleLight,
+    SphereLight as SphereLight,
+)
+from ._environment import EnvironmentLight as EnvironmentLight
 from ._lights import (
+    AbstractExtendedLight as AbstractExtendedLight,
+    AbstractHighlight as AbstractHighlight,
     AbstractLight as AbstractLight,
     AbstractLightSample as AbstractLightSample,
     DirectionalLight as DirectionalLight,
+    DistantStratum as DistantStratum,
+    EmitterStratum as EmitterStratum,
     GaussianBeam as GaussianBeam,
     PointLight as PointLight,
     lights_by_kind as lights_by_kind,

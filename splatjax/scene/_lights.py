@@ -4,6 +4,7 @@ the light.
 
 import abc
 import dataclasses
+from collections.abc import Callable
 from typing import ClassVar
 
 import equinox as eqx
@@ -12,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from splatjax._chunking import jit_unless_traced
 from splatjax._records import check_values, numbers, record
 from splatjax.gaussians import gaussian
 
@@ -20,7 +22,37 @@ _TOUCHING = 1e-6  # mm
 _EXPECTED = {
     "direction": ("the way light travels, not zero", np.any),
     "variance": ("positive (mm^2)", lambda x: x > 0),
+    "up": ("the direction of the image's upper edge, not zero", np.any),
+    "radius": ("positive (mm)", lambda x: x > 0),
+    "count": ("1 or more samples", lambda x: x >= 1),
+    "image": (
+        "finite and at least 0: replace what is NaN, and clip what filters made negative",
+        lambda x: x >= 0,
+    ),
 }
+
+
+class AbstractHighlight(eqx.Module):
+    """What glossy surfaces mirror of an extended light, in the place of lobes of its samples."""
+
+    @abc.abstractmethod
+    def reflected(
+        self,
+        points: Float[Array, "*points 3"],
+        mirrored: Float[Array, "*points 3"],
+        roughness: Float[Array, "..."],
+        lobe: Callable[[Float[Array, "*points 3"]], Float[Array, "*points"]],
+        albedo: Float[Array, "*points"],
+    ) -> Float[Array, "channels *points"]:
+        """Compute the radiance that a specular lobe of strength 1 reflects, without shadows.
+
+        **Arguments:**
+
+        - `points`: mm.
+        - `mirrored`: the unit direction towards the eye, mirrored by the surface.
+        - `lobe`: the radiance towards the eye per irradiance of a surface that faces `wi`.
+        - `albedo`: the lobe's integral over all `wi`.
+        """
 
 
 class AbstractLight(eqx.Module):
@@ -28,10 +60,10 @@ class AbstractLight(eqx.Module):
 
     **Attributes:** (of the class)
 
-    - `strength`: the field with the power of each channel.
+    - `strength_field`: the name of the field with the power of each channel.
     """
 
-    strength: ClassVar[str] = ""
+    strength_field: ClassVar[str] = ""
 
     def __check_init__(self):
         for name in (field.name for field in dataclasses.fields(self)):
@@ -40,11 +72,11 @@ class AbstractLight(eqx.Module):
 
     def with_channels(self, channels: int) -> "AbstractLight":
         """Repeat the strength of a light of one channel for so many channels."""
-        strength = getattr(self, self.strength, None)
+        strength = getattr(self, self.strength_field, None)
         if strength is None or strength.shape != (1,):
             return self
         repeated = jnp.broadcast_to(strength, (channels,))
-        return eqx.tree_at(lambda light: getattr(light, light.strength), self, repeated)
+        return eqx.tree_at(lambda light: getattr(light, light.strength_field), self, repeated)
 
     @abc.abstractmethod
     def samples(self) -> tuple["AbstractLightSample", ...]:
@@ -54,6 +86,12 @@ class AbstractLight(eqx.Module):
         shadowed by the mean visibility of all, so that passes 2 and 3 blend one row per light.
         """
 
+    def highlight(self) -> AbstractHighlight | None:
+        """Prepare what glossy surfaces mirror, once for all points; `None` where it is the sum of
+        the lobes of all samples.
+        """
+        return None
+
 
 class AbstractLightSample(AbstractLight):
     """A light from one point or direction. Whether it casts shadows is static: a light that casts
@@ -61,6 +99,8 @@ class AbstractLightSample(AbstractLight):
     """
 
     cast_shadows: eqx.AbstractVar[bool]
+    is_stratum: ClassVar[bool] = False
+    """Whether it stands for a part of an extended light, whose shadow maps are small."""
 
     def samples(self) -> tuple["AbstractLightSample", ...]:
         """Return the light itself."""
@@ -73,6 +113,28 @@ class AbstractLightSample(AbstractLight):
         """Compute, at points in mm, the unit direction `wi` towards the light and the irradiance
         on a surface that faces it.
         """
+
+
+class AbstractExtendedLight(AbstractLight):
+    """A light that many samples stand for, with one highlight for all.
+
+    **Attributes:** (static)
+
+    - `count`: of samples.
+    - `cast_shadows`.
+    """
+
+    count: eqx.AbstractVar[int]
+    cast_shadows: eqx.AbstractVar[bool]
+
+    @abc.abstractmethod
+    def stacked_samples(self) -> AbstractLightSample:
+        """Return the samples, stacked along the first axis of every leaf."""
+
+    @jit_unless_traced
+    def samples(self) -> tuple[AbstractLightSample, ...]:
+        leaves, structure = jax.tree.flatten(self.stacked_samples())
+        return tuple(map(structure.unflatten, zip(*map(jnp.unstack, leaves), strict=True)))
 
 
 def _per_channel(
@@ -95,14 +157,27 @@ class DirectionalLight(AbstractLightSample):
 
     direction: Float[Array, "3"] = eqx.field(converter=numbers)
     irradiance: Float[Array, " channels"] = eqx.field(converter=numbers)
-    strength: ClassVar[str] = "irradiance"
+    strength_field: ClassVar[str] = "irradiance"
     cast_shadows: bool = eqx.field(static=True, default=True)
 
     def incidence(
         self, points: Float[Array, "*points 3"]
     ) -> tuple[Float[Array, "*points 3"], Float[Array, "*points channels"]]:
-        wi = -self.direction / jnp.linalg.norm(self.direction)
-        return jnp.broadcast_to(wi, points.shape), _per_channel(self.irradiance, points)
+        return _from_afar(self.direction, self.irradiance, points)
+
+
+def _from_afar(direction, irradiance, points):
+    wi = -direction / jnp.linalg.norm(direction)
+    return jnp.broadcast_to(wi, points.shape), _per_channel(irradiance, points)
+
+
+def _from_point(position, intensity, points):
+    to_light = jnp.broadcast_to(position, points.shape) - points
+    squared = jnp.sum(to_light * to_light, axis=-1, keepdims=True)
+    apart = squared > _TOUCHING**2
+    squared = jnp.where(apart, squared, 1.0)
+    wi = jnp.where(apart, to_light / jnp.sqrt(squared), 0.0)
+    return wi, jnp.where(apart, _per_channel(intensity, points) / squared, 0.0)
 
 
 @record
@@ -122,18 +197,53 @@ class PointLight(AbstractLightSample):
 
     position: Float[Array, "3"] = eqx.field(converter=numbers)
     intensity: Float[Array, " channels"] = eqx.field(converter=numbers)
-    strength: ClassVar[str] = "intensity"
+    strength_field: ClassVar[str] = "intensity"
     cast_shadows: bool = eqx.field(static=True, default=True)
 
     def incidence(
         self, points: Float[Array, "*points 3"]
     ) -> tuple[Float[Array, "*points 3"], Float[Array, "*points channels"]]:
-        to_light = jnp.broadcast_to(self.position, points.shape) - points
-        squared = jnp.sum(to_light * to_light, axis=-1, keepdims=True)
-        apart = squared > _TOUCHING**2
-        squared = jnp.where(apart, squared, 1.0)
-        wi = jnp.where(apart, to_light / jnp.sqrt(squared), 0.0)
-        return wi, jnp.where(apart, _per_channel(self.intensity, points) / squared, 0.0)
+        return _from_point(self.position, self.intensity, points)
+
+
+class DistantStratum(AbstractLightSample):
+    """A part of an environment, as parallel light: fields as of `DirectionalLight`."""
+
+    direction: Float[Array, "3"]
+    irradiance: Float[Array, " channels"]
+    strength_field: ClassVar[str] = "irradiance"
+    is_stratum: ClassVar[bool] = True
+    cast_shadows: bool = eqx.field(static=True)
+
+    def incidence(
+        self, points: Float[Array, "*points 3"]
+    ) -> tuple[Float[Array, "*points 3"], Float[Array, "*points channels"]]:
+        return _from_afar(self.direction, self.irradiance, points)
+
+
+class EmitterStratum(AbstractLightSample):
+    """A part of an area light, as a point: fields as of `PointLight`.
+
+    **Attributes:**
+
+    - `normal`: unit; the intensity is that along it, and falls off with the cosine. `None`: it is
+      the same on all sides.
+    """
+
+    position: Float[Array, "3"]
+    intensity: Float[Array, " channels"]
+    normal: Float[Array, "3"] | None
+    strength_field: ClassVar[str] = "intensity"
+    is_stratum: ClassVar[bool] = True
+    cast_shadows: bool = eqx.field(static=True)
+
+    def incidence(
+        self, points: Float[Array, "*points 3"]
+    ) -> tuple[Float[Array, "*points 3"], Float[Array, "*points channels"]]:
+        wi, irradiance = _from_point(self.position, self.intensity, points)
+        if self.normal is None:
+            return wi, irradiance
+        return wi, irradiance * jnp.maximum(-jnp.tensordot(wi, self.normal, 1), 0)[..., None]
 
 
 @record
@@ -152,7 +262,7 @@ class GaussianBeam(AbstractLightSample):
     origin: Float[Array, "3"] = eqx.field(converter=numbers)
     direction: Float[Array, "3"] = eqx.field(converter=numbers)
     power: Float[Array, " channels"] = eqx.field(converter=numbers)
-    strength: ClassVar[str] = "power"
+    strength_field: ClassVar[str] = "power"
     variance: Float[Array, ""] = eqx.field(converter=numbers)
     cast_shadows: bool = eqx.field(static=True, default=False, init=False)
 
@@ -168,11 +278,12 @@ class GaussianBeam(AbstractLightSample):
 
 class StackedLights(eqx.Module):
     """Samples of lights of one kind, their leaves stacked, and for each the index of its light in
-    the scene's tuple.
+    the scene's tuple. Of extended lights, also the highlight of each.
     """
 
     lights: AbstractLightSample
     light_indices: tuple[int, ...] = eqx.field(static=True)
+    highlights: tuple[AbstractHighlight, ...] = ()
 
     @property
     def distinct(self) -> tuple[int, ...]:
@@ -213,5 +324,6 @@ def stack_lights(lights: tuple[AbstractLight, ...]) -> list[StackedLights]:
     for members in lights_by_kind(lights):
         indices, samples = zip(*members, strict=True)
         stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *samples)
-        groups.append(StackedLights(stacked, indices))
+        highlights = [lights[index].highlight() for index in dict.fromkeys(indices)]
+        groups.append(StackedLights(stacked, indices, tuple(filter(None, highlights))))
     return groups

@@ -156,20 +156,43 @@ def reflected_radiance(
     points: SurfacePoints, groups: list[StackedLights], f0: Float[Array, ""], channels: int
 ) -> Float[Array, "channels *pixels"]:
     """Compute the specular radiance towards the eye: Kelemen / Szirmay-Kalos, each light in its own
-    shadow.
+    shadow. Extended lights have one highlight for all their samples.
     """
 
-    def lobe(wi, _):
+    def lobe(wi, specular=points.specular):
+        roughness = points.roughness
         return specular_lobe(
-            points.normals,
-            wi,
-            points.outgoing,
-            f0=f0,
-            specular=points.specular,
-            roughness=points.roughness,
-        )[None]
+            points.normals, wi, points.outgoing, f0=f0, specular=specular, roughness=roughness
+        )
 
-    return sum_received(points.positions, points.normals, groups, points.visibility, lobe, channels)
+    grouped = list(zip(groups, points.visibility, strict=True))
+    lamps = [each for each in grouped if not each[0].highlights]
+    radiance = sum_received(
+        points.positions,
+        points.normals,
+        [group for group, _ in lamps],
+        [visible for _, visible in lamps],
+        lambda wi, _: lobe(wi)[None],
+        channels,
+    )
+    if len(lamps) == len(groups):
+        return radiance
+    one, cosine = jnp.ones_like(f0), _cosine(points.normals, points.outgoing)
+    specular = jnp.broadcast_to(points.specular, cosine.shape)[None]
+    mirrored = 2 * cosine[..., None] * points.normals - points.outgoing
+    albedo = directional_albedo(cosine, f0, one, points.roughness)
+
+    def received(wi):
+        return lobe(wi, one) * _cosine(points.normals, wi)
+
+    for group, visible in (each for each in grouped if each[0].highlights):
+        for index, highlight in zip(group.distinct, group.highlights, strict=True):
+            reflected = specular * highlight.reflected(
+                points.positions, mirrored, points.roughness, received, albedo
+            )
+            row = None if visible is None else visible[group.light_indices.index(index)]
+            radiance += reflected if row is None else reflected * row[None]
+    return radiance
 
 
 def single_scattered_radiance(

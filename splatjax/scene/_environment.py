@@ -1,0 +1,254 @@
+"""Light from everywhere: an environment as an image of the whole sphere of directions."""
+
+import functools
+import math
+from typing import ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from splatjax._chunking import jit_unless_traced
+from splatjax._records import LINEAR, numbers, record
+
+from ._lights import AbstractExtendedLight, AbstractHighlight, AbstractLightSample, DistantStratum
+
+_CELLS = 128  # along a side of the grid of equal areas that is cut into strata; a power of two
+_EVEN = 0.1  # of the importance that all directions share, so that none is far from a sample
+_FAINT = 1e-3  # of the mean radiance, added where the mean direction of a stratum is computed
+_ROWS = 64  # of a blurred map, whose pixels are as large as the sharpest lobe is wide
+_ROUGHNESSES = np.geomspace(0.05, 1.0, 7)  # of the blurred maps
+
+
+@record
+class EnvironmentLight(AbstractExtendedLight):
+    r"""Light from infinitely far away on all sides, given by an image of all directions.
+
+    The image is a latitude-longitude map as OpenEXR defines it, with square pixels: the upper edge
+    is +y and the lower one -y; the middle is +z, a quarter of the width to the left of it is +x,
+    and both side edges are -z. So it looks to someone inside it.
+
+    It lights by `count` directional samples: the sphere is cut into strata of equal importance,
+    which is nine parts radiance times solid angle and one part solid angle. Each sample has the
+    irradiance of all pixels of its stratum, the mean direction of their radiance, and a shadow map.
+    What glossy surfaces mirror is not sampled: it is the image, blurred by the lobe.
+
+    **Attributes:**
+
+    - `image`: radiance, linear; twice as wide as high. Differentiable. Where the strata end has no
+      derivative.
+    - `rotation`: degrees about `up`, which moves +z towards +x. Differentiable.
+    - `strength`: a factor on each channel. Differentiable.
+    - `up`: the direction of the image's upper edge: (0, 0, 1) for a world whose z is up; the middle
+      of the image is then -y. Any length but zero. Differentiable.
+    - `count`: of samples. Static.
+    - `cast_shadows`: static.
+
+    **Raises:** `ValueError` for an image that is not twice as wide as high, holds whole numbers, or
+    radiance that is negative or not finite.
+    """
+
+    image: Float[Array, "height width channels"] = eqx.field(converter=numbers, metadata=LINEAR)
+    rotation: Float[Array, ""] = eqx.field(converter=numbers, default=0.0)
+    strength: Float[Array, " channels"] = eqx.field(converter=numbers, default=1.0)
+    up: Float[Array, "3"] = eqx.field(converter=numbers, default=(0.0, 1.0, 0.0))
+    strength_field: ClassVar[str] = "strength"
+    count: int = eqx.field(static=True, default=64)
+    cast_shadows: bool = eqx.field(static=True, default=True)
+
+    def __check_init__(self):
+        height, width = getattr(self.image, "shape", (1, 2))[:2]
+        if width != 2 * height:
+            raise ValueError(
+                f"EnvironmentLight.image has {height} rows and {width} columns; give a "
+                "latitude-longitude map, twice as wide as high"
+            )
+
+    def radiance(self) -> Float[Array, "height width channels"]:
+        return self.image * self.strength[None, None]
+
+    def to_world(self) -> Float[Array, "3 3"]:
+        """Compute the rotation from the directions of the image to those of the world: about +y,
+        and from there the shortest way to `up`.
+        """
+        angle = jnp.deg2rad(self.rotation)
+        cosine, sine, one = jnp.cos(angle), jnp.sin(angle), jnp.ones_like(angle)
+        zero = jnp.zeros_like(angle)
+        rows = [cosine, zero, sine, zero, one, zero, -sine, zero, cosine]
+        x, y, z = jnp.unstack(self.up / jnp.linalg.norm(self.up))
+        z = jnp.where(1 + y > 1e-6, z, 2e-6**0.5)  # straight down is half a turn about x
+        lean = 1 / jnp.maximum(1 + y, 1e-6)
+        tilt = [1 - x * x * lean, x, -x * z * lean, -x, y, -z, -x * z * lean, z, 1 - z * z * lean]
+        return jnp.stack(tilt).reshape(3, 3) @ jnp.stack(rows).reshape(3, 3)
+
+    def irradiance(self, normals: Float[Array, "*points 3"]) -> Float[Array, "*points channels"]:
+        """Compute the irradiance of unshadowed surfaces from all pixels, without samples."""
+        directions, solid_angles = pixel_directions(self.image.shape[0], normals.dtype)
+        flux = self.radiance() * solid_angles[..., None]
+        cosines = jnp.tensordot(normals @ self.to_world(), directions.reshape(-1, 3), (-1, -1))
+        return jnp.tensordot(jnp.maximum(cosines, 0), flux.reshape(-1, flux.shape[-1]), 1)
+
+    @jit_unless_traced
+    def stacked_samples(self) -> AbstractLightSample:
+        """Cut the sphere into strata along a Hilbert curve."""
+        height = self.image.shape[0]
+        directions, solid_angles = pixel_directions(height, self.image.dtype)
+        radiance = self.radiance()
+        brightness = jnp.mean(radiance, axis=-1)
+        mean = jnp.sum(brightness * solid_angles) / (4 * jnp.pi)
+        relative = brightness / jnp.where(mean > 0, mean, 1.0)
+        moments = [
+            radiance * solid_angles[..., None],
+            ((relative + _FAINT) * solid_angles)[..., None] * directions,
+            jnp.stack([relative * solid_angles, solid_angles], axis=-1),
+        ]
+
+        # Sum over cells of equal area, in the order of the curve.
+        along = np.arange(2 * height) * _CELLS // (2 * height)
+        middles = 0.5 * (1 - np.cos(np.pi * (np.arange(height) + 0.5) / height))
+        down = (middles * _CELLS).astype(int)
+        order = _hilbert_curve(_CELLS)[down[:, None], along[None]].reshape(-1)
+        moments = jnp.concatenate(moments, axis=-1).reshape(len(order), -1)
+        cells = jnp.zeros((_CELLS**2, moments.shape[1]), moments.dtype).at[order].add(moments)
+
+        # Cut the curve. No cell counts for more than a stratum: the next would have nothing left.
+        importance, even = jax.lax.stop_gradient(cells[:, -2:]).T
+        importance = (1 - _EVEN) * importance + _EVEN * even
+        for _ in range(8):
+            importance = jnp.minimum(importance / jnp.sum(importance), 1 / self.count)
+        middles = (jnp.cumsum(importance) - 0.5 * importance) / jnp.sum(importance)
+        stratum = jnp.minimum((middles * self.count).astype(jnp.int32), self.count - 1)
+        strata = jnp.zeros((self.count, cells.shape[1]), cells.dtype).at[stratum].add(cells)
+
+        towards, irradiance = strata[:, -5:-2], strata[:, :-5]
+        is_filled = jnp.sum(towards**2, axis=-1, keepdims=True) > 0
+        anywhere = jnp.asarray([[0.0, 1.0, 0.0]], towards.dtype)
+        towards = jnp.where(is_filled, towards, anywhere) @ self.to_world().T
+
+        def sample(towards, irradiance):
+            return DistantStratum(-towards, irradiance, self.cast_shadows)
+
+        return jax.vmap(sample)(towards, irradiance)
+
+    def highlight(self) -> "BlurredEnvironment":
+        return BlurredEnvironment(_blurred(self.radiance()), self.to_world())
+
+
+class BlurredEnvironment(AbstractHighlight):
+    """The mean radiance that lobes of several roughnesses see of an environment.
+
+    **Attributes:**
+
+    - `maps`: latitude-longitude, from the sharpest; one more pixel at every edge repeats what lies
+      beyond it.
+    - `rotation`: from the directions of the maps to those of the world.
+
+    **Source:** Karis 2013, "Real Shading in Unreal Engine 4": the split sum.
+    """
+
+    maps: Float[Array, "maps rows columns channels"]
+    rotation: Float[Array, "3 3"]
+
+    def reflected(self, points, mirrored, roughness, lobe, albedo):
+        return jnp.moveaxis(self.radiance(mirrored, roughness), -1, 0) * albedo[None]
+
+    def radiance(
+        self, directions: Float[Array, "*points 3"], roughness: Float[Array, "..."]
+    ) -> Float[Array, "*points channels"]:
+        """Interpolate in the logarithm of the roughness and between pixels; at the poles the
+        derivative in the direction is cut to 0.
+        """
+        x, y, z = jnp.unstack(directions @ self.rotation, axis=-1)
+        apart = x * x + z * z > 1e-12
+        x, z = jnp.where(apart, x, 0.0), jnp.where(apart, z, 1e-6)
+        height = self.maps.shape[1] - 2
+        row = jnp.arctan2(jnp.sqrt(x * x + z * z), y) * (height / jnp.pi) + 0.5
+        column = (jnp.pi - jnp.arctan2(x, z)) * (height / jnp.pi) + 0.5
+        lowest, highest = _ROUGHNESSES[[0, -1]].tolist()
+        step = math.log(highest / lowest) / (len(_ROUGHNESSES) - 1)
+        level = jnp.log(jnp.clip(roughness, lowest, highest) / lowest) / step
+        places = [(jnp.broadcast_to(level, row.shape), len(_ROUGHNESSES))]
+        places += [(row, height + 2), (column, 2 * height + 2)]
+        corners = [
+            jnp.clip(jax.lax.stop_gradient(jnp.floor(place)).astype(jnp.int32), 0, size - 2)
+            for place, size in places
+        ]
+        total = jnp.zeros((*row.shape, self.maps.shape[-1]), row.dtype)
+        for corner in np.ndindex(2, 2, 2):
+            index = [first + step for first, step in zip(corners, corner, strict=True)]
+            weight = jnp.ones_like(row)
+            for (place, _), pixel in zip(places, index, strict=True):
+                weight = weight * (1 - jnp.abs(place - pixel.astype(place.dtype)))
+            total += weight[..., None] * self.maps[tuple(index)]
+        return total
+
+
+def pixel_directions(
+    height: int, dtype=None
+) -> tuple[Float[Array, "height width 3"], Float[Array, "height width"]]:
+    """Compute the directions of the pixels of a latitude-longitude map, +y up, and their solid
+    angles.
+    """
+    latitude = jnp.pi * (0.5 - (jnp.arange(height, dtype=dtype) + 0.5) / height)
+    longitude = jnp.pi * (1 - (jnp.arange(2 * height, dtype=dtype) + 0.5) / height)
+    across, up = jnp.cos(latitude)[:, None], jnp.sin(latitude)[:, None]
+    sine, cosine = jnp.sin(longitude)[None], jnp.cos(longitude)[None]
+    directions = jnp.broadcast_arrays(across * sine, up, across * cosine)
+    # A strip of the sphere has the area of its height: 2 sin(a / 2) cos(latitude).
+    solid_angles = across * (2 * math.sin(0.5 * math.pi / height) * math.pi / height)
+    return jnp.stack(directions, axis=-1), jnp.broadcast_to(solid_angles, (height, 2 * height))
+
+
+@functools.cache
+def _hilbert_curve(side: int) -> np.ndarray:
+    """Number the cells of a square along a Hilbert curve; the side is a power of two."""
+    if side == 1:
+        return np.zeros((1, 1), int)
+    part = _hilbert_curve(side // 2)
+    count = part.size
+    upper = np.concatenate([part.T, 3 * count + part.T[::-1, ::-1]], axis=1)
+    return np.concatenate([upper, np.concatenate([count + part, 2 * count + part], axis=1)])
+
+
+def _overlaps(pixels: int, into: int, edges) -> np.ndarray:
+    """Compute which share of each of `into` pixels lies in each of other `pixels`."""
+    ours, theirs = edges(np.linspace(0, 1, into + 1)), edges(np.linspace(0, 1, pixels + 1))
+    low = np.maximum(ours[:-1, None], theirs[None, :-1])
+    overlap = np.maximum(np.minimum(ours[1:, None], theirs[None, 1:]) - low, 0)
+    return overlap / np.diff(ours)[:, None]
+
+
+def _blurred(radiance: Float[Array, "height width channels"]) -> Float[Array, "maps _ _ channels"]:
+    r"""Blur an environment by the specular lobe along the normal, for several roughnesses.
+
+    The lobe at the angle `2 a` from the mirrored direction is `exp(-tan^2 a / m^2) cos 2a / cos^6
+    a`, divided by its integral. In longitude it is a circular convolution.
+    """
+    height, dtype = radiance.shape[0], radiance.dtype
+    rows = _overlaps(height, _ROWS, lambda t: 0.5 * (1 - np.cos(np.pi * t)))
+    columns = _overlaps(2 * height, 2 * _ROWS, lambda t: t)
+    reduced = jnp.einsum(
+        "rh,cw,hwk->rck", jnp.asarray(rows, dtype), jnp.asarray(columns, dtype), radiance
+    )
+    _, solid_angles = pixel_directions(_ROWS, dtype)
+    spectrum = jnp.fft.rfft(reduced * solid_angles[..., None], axis=1)
+
+    polar = jnp.pi / _ROWS * (jnp.arange(_ROWS, dtype=dtype) + 0.5)
+    turn = jnp.cos(jnp.pi / _ROWS * jnp.arange(2 * _ROWS, dtype=dtype))
+    up, across = (each[:, None] * each[None] for each in (jnp.cos(polar), jnp.sin(polar)))
+    cosine = jnp.clip(up[..., None] + across[..., None] * turn[None, None], -0.99, 1.0)
+
+    def blur(roughness):
+        lobe = jnp.exp((cosine - 1) / ((1 + cosine) * roughness**2)) * jnp.maximum(cosine, 0)
+        kernel = jnp.real(jnp.fft.rfft(lobe / (1 + cosine) ** 3, axis=2))
+        blurred = jnp.einsum("rsf,sfk->rfk", kernel.astype(spectrum.dtype), spectrum)
+        whole = kernel[:, :, 0] @ solid_angles[:, 0]
+        return jnp.fft.irfft(blurred, axis=1) / whole[:, None, None]
+
+    # Behind a barrier, or the compiler would compute all kernels while it compiles.
+    maps = jax.lax.map(blur, jax.lax.optimization_barrier(jnp.asarray(_ROUGHNESSES, dtype)))
+    top, bottom = (jnp.roll(maps[:, row], _ROWS, axis=2) for row in (slice(1), slice(-1, None)))
+    maps = jnp.concatenate([top, maps, bottom], axis=1)
+    return jnp.concatenate([maps[:, :, -1:], maps, maps[:, :, :1]], axis=2)
