@@ -6,7 +6,8 @@ throughout. What most programs need has a name here; the rest is in submodules:
 - `scattering`: media, slabs and their profiles; `transport`: the Monte Carlo reference.
 - `fitting`: sums of Gaussians for a profile; `gaussians`: what a profile is.
 - `inverse`: materials and scenes from pictures.
-- `scene`, `geometry`: records and bodies; `io`: files; `exports`: fits for other renderers.
+- `scene`, `geometry`: records, area lights, skies; bodies; `io`: files; `exports`: fits for other
+  renderers.
 - `splatting`, `diffusion`, `shading`: the passes, and their settings.
 - `cache`: what a program keeps for its next start.
 
@@ -73,6 +74,7 @@ from .scattering import (
 from .scene import (
     Camera as Camera,
     DirectionalLight as DirectionalLight,
+    EnvironmentLight as EnvironmentLight,
     Frame as Frame,
     GaussianBeam as GaussianBeam,
     Material as Material,

@@ -51,10 +51,6 @@ def valid(
     return {"valid": (requirement, holds, finite)}
 
 
-LINEAR = {"linear": True}
-"""Metadata of a field of radiance, which refuses whole numbers."""
-
-
 def record(cls: Class) -> Class:
     r"""Convert the arguments of a class of records before its `__init__` sees them.
 
@@ -64,7 +60,8 @@ def record(cls: Class) -> Class:
       array that lacks its last axis `channels` has one channel.
     - Fields of `several` records become tuples.
     - Fields of records are refused when they are records of other classes, or numbers.
-    - Values that are not `valid` are refused.
+    - Values that are not `valid` are refused, and arrays of whole numbers for a field whose
+      metadata state that it is `linear` light.
 
     Traced values are converted like others. `None` and objects that are no numbers, such as the
     placeholders of JAX, pass unchanged. Records that JAX unflattens are not converted again.
@@ -95,11 +92,10 @@ def record(cls: Class) -> Class:
         given.apply_defaults()
         values, records = given.arguments, []
         for name in linear:
-            kind = getattr(values[name], "dtype", np.dtype(float))
-            if not jnp.issubdtype(kind, jnp.floating):
+            if jnp.issubdtype(getattr(values[name], "dtype", float), jnp.integer):
                 raise ValueError(
-                    f"{cls.__name__}.{name} holds whole numbers ({kind}), as encoded for a "
-                    "display; give linear light in floating-point numbers"
+                    f"{cls.__name__}.{name} holds whole numbers ({values[name].dtype}), as encoded "
+                    "for a display; give linear light in floating-point numbers"
                 )
         for name, (kinds, is_tuple) in classes.items():
             is_many = isinstance(values[name], list | tuple)

@@ -24,11 +24,11 @@ _MOST_FRAMES = 10_000  # that four digits can name
 class Render(ViewOptions):
     """Render splats, or the built-in bust: an EXR file with every layer, and a PNG file beside it.
 
-    They stand under a light and a weak fill. The camera looks at the middle of the splats from far
-    enough to see all of them. Angles are in degrees: azimuth turns about the vertical axis, 0 is
-    the front (+z) and 90 the side of +x; elevation rises above the horizon. If the splats carry
-    albedo, the weights of the material are divided by their sums, so that color comes from the
-    albedo alone; with --no-albedo it comes from the material alone.
+    They stand under a light and a weak fill, or in an --environment. The camera looks at the middle
+    of the splats from far enough to see all of them. Angles are in degrees: azimuth turns about the
+    vertical axis, 0 is the front (+z) and 90 the side of +x; elevation rises above the horizon. If
+    the splats carry albedo, the weights of the material are divided by their sums, so that color
+    comes from the albedo alone; with --no-albedo it comes from the material alone.
 
     Examples: splatjax render head.ply --material skin --azimuth 30 --width 1024 --height 1024
     --output head.exr
@@ -184,7 +184,7 @@ class Turntable(ViewOptions):
         with stage(f"planning {self.frames} frames"):
             plan = sj.make_plan(scenes, cameras)
         light = None
-        if self.turn == "camera" and self.fill == 0:
+        if self.turn == "camera" and (self.environment or self.fill == 0):
             # No light moves: passes 1 and 4 are the same in every frame.
             with stage("lighting the splats"):
                 light = jax.block_until_ready(sj.illuminate(scenes[0], plan))

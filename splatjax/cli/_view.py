@@ -19,6 +19,11 @@ from ._terminal import Rules, UpAxis, check_options, note, option_name, stage
 
 # Degrees: the fill stands beside the camera, on the side away from the light.
 _FILL_SIDE, _FILL_ELEVATION = 25.0, 10.0
+_ENVIRONMENTS = {
+    "studio": sj.scene.studio,
+    "overcast": sj.scene.overcast_sky,
+    "sun": sj.scene.sun_and_sky,
+}
 _NOT_IN_PICTURES = ("splats", "output", "fps", "quiet")
 _note_once = functools.cache(note)
 
@@ -52,6 +57,11 @@ class ViewOptions:
     #: Strength of a second light without shadows, beside the camera, relative to the first. 0 for
     #: none.
     fill: float = 0.1
+    #: Latitude-longitude map of linear radiance, in the place of both lights: an EXR or HDR file,
+    #: or the name of a built-in one: studio, overcast, sun.
+    environment: Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
+    #: Of the environment about the vertical axis; at 0 the middle of the map is the front.
+    environment_rotation: float = 0.0
     #: Of the PNG, in stops: each doubles its brightness. The EXR is never changed by it.
     exposure: float = 0.0
     #: Whether light spreads below the surface. Without, it leaves where it enters, in the same
@@ -80,6 +90,7 @@ class ViewOptions:
             "azimuth": (math.isfinite(self.azimuth), finite),
             "light_azimuth": (math.isfinite(self.light_azimuth), finite),
             "light_elevation": (math.isfinite(self.light_elevation), finite),
+            "environment_rotation": (math.isfinite(self.environment_rotation), finite),
             "exposure": (math.isfinite(self.exposure), finite),
             "width": (self.width >= 1, positive),
             "height": (self.height >= 1, positive),
@@ -134,10 +145,15 @@ class ViewOptions:
 
     def lights(
         self, material: sj.Material, azimuth: float, light_azimuth: float
-    ) -> tuple[sj.DirectionalLight, ...]:
+    ) -> tuple[sj.scene.AbstractLight, ...]:
         """Return the light, in the channels of a material, and the fill beside a camera at an
-        azimuth: always on the same side of it.
+        azimuth: always on the same side of it; or the environment, which turns with the light.
         """
+        if self.environment:
+            rotation = self.environment_rotation + light_azimuth - self.light_azimuth
+            if self.environment in _ENVIRONMENTS:
+                return (sj.EnvironmentLight(_ENVIRONMENTS[self.environment](), rotation),)
+            return (sj.io.load_environment(self.environment, rotation=rotation),)
         # The first light gives a white diffuser that faces it the radiance 1.
         irradiance = np.full(material.channels, np.pi)
         towards = -direction_to(light_azimuth, self.light_elevation)
@@ -187,6 +203,9 @@ class ViewOptions:
         }
         material = sj.io.material_path(self.material).read_text(encoding="utf-8")
         splats = f"{self.splats.name}, {sj.io.fingerprint(self.splats)}" if self.splats else None
+        if self.environment and self.environment not in _ENVIRONMENTS:
+            path = Path(self.environment)
+            options["environment"] = f"{path.name}, {sj.io.fingerprint(path)}"
         return options | {
             "splats": splats or "the built-in bust",
             "contents of --material": material,
@@ -227,7 +246,8 @@ def rough_picture(scene: sj.Scene, camera: sj.Camera, exposure: float, side: int
     compiles nothing. The longer side has so many pixels at most, fewer for few splats; the height
     is even. Return rows of red, green and blue up to 255.
     """
-    scene, camera = jax.device_get((scene, camera))
+    samples = [sample for light in scene.lights for sample in light.samples()]
+    scene, camera, lights = jax.device_get((scene, camera, samples))
     # Of millions of splats some will do.
     splats = jax.tree.map(lambda leaf: leaf[:: 1 + len(leaf) // 2**19], scene.splats)
     lengths = np.asarray([camera.width, camera.height])
@@ -236,7 +256,7 @@ def rough_picture(scene: sj.Scene, camera: sj.Camera, exposure: float, side: int
     albedo = 1.0 if splats.albedo is None else splats.albedo
     color = (albedo * scene.material.gaussians.weights.sum(axis=0) / np.pi) * sum(
         np.maximum(splats.normals @ -light.direction, 0)[:, None] * light.irradiance
-        for light in scene.lights
+        for light in lights
     )
     local = (splats.centers - camera.position) @ camera.rotation.T
     # From far to near, without those that face away: nearer ones are drawn over farther ones.

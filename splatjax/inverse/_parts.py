@@ -126,7 +126,9 @@ class LightStrengths(AbstractPart):
                     f"{type(light).__name__}.strength_field names no field that LightStrengths may "
                     "move"
                 )
-        return tuple(jnp.zeros_like(getattr(light, light.strength_field)) for light in pictured.lights)
+        return tuple(
+            jnp.zeros_like(getattr(light, light.strength_field)) for light in pictured.lights
+        )
 
     def moved(self, pictured: PicturedScene, x, prepared) -> PicturedScene:
         def move(light: AbstractLight, steps: Array) -> AbstractLight:

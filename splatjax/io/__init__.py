@@ -10,6 +10,7 @@ from ._files import (
 )
 from ._images import (
     linear_to_srgb as linear_to_srgb,
+    load_environment as load_environment,
     read_exr as read_exr,
     read_manifest as read_manifest,
     read_picture as read_picture,

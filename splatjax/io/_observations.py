@@ -7,7 +7,16 @@ import numpy as np
 
 from splatjax._records import check_values
 from splatjax.inverse import KnownIntensity, Observation, UnknownColor, UnknownIntensity
-from splatjax.scene import AbstractLight, Camera, DirectionalLight, GaussianBeam, PointLight
+from splatjax.scene import (
+    AbstractLight,
+    Camera,
+    DirectionalLight,
+    DiskLight,
+    GaussianBeam,
+    PointLight,
+    RectangleLight,
+    SphereLight,
+)
 
 from ._files import StrPath, naming
 from ._images import read_picture
@@ -18,6 +27,9 @@ _LIGHTS = {
     "directional": (DirectionalLight, ("direction", "irradiance", "cast_shadows")),
     "point": (PointLight, ("position", "intensity", "cast_shadows")),
     "beam": (GaussianBeam, ("origin", "direction", "power", "variance")),
+    "rectangle": (RectangleLight, ("center", "radiance", "edges", "cast_shadows")),
+    "disk": (DiskLight, ("center", "radiance", "direction", "radius", "cast_shadows")),
+    "sphere": (SphereLight, ("center", "radiance", "radius", "cast_shadows")),
 }
 _LIGHT_ENTRIES = {"kind"}.union(*(names for _, names in _LIGHTS.values()))
 
@@ -38,8 +50,9 @@ def read_observations(path: StrPath) -> list[Observation]:
         irradiance = [3.14, 3.14, 3.14]
 
     A camera may have `up`. Other kinds of lights are "point" (`position` in mm, `intensity`,
-    `cast_shadows`) and "beam" (`origin`, `direction`, `power`, `variance` in mm^2). Color is one
-    number per channel, or one for all.
+    `cast_shadows`), "beam" (`origin`, `direction`, `power`, `variance` in mm^2), and "rectangle",
+    "disk" and "sphere" (`center`, `radiance`; `edges`, or `direction` and `radius`, or `radius`;
+    `cast_shadows`). Color is one number per channel, or one for all.
 
     **Returns:** an `Observation` for each picture, in JAX's default precision.
 
@@ -110,8 +123,8 @@ def _light(table: Table, channels: int) -> AbstractLight:
     table.make(check_values, light.strength_field, strength, "at least 0", lambda x: x >= 0)
     if strength.size not in (1, channels):
         raise ValueError(
-            f"{table.where} {light.strength_field} is {strength.tolist()}, for a picture of {channels} "
-            "channels; give one number, or one for each channel"
+            f"{table.where} {light.strength_field} is {strength.tolist()}, for a picture of "
+            f"{channels} channels; give one number, or one for each channel"
         )
     if "cast_shadows" in names:
         values["cast_shadows"] = table.one_of("cast_shadows", (True, False), True)

@@ -77,7 +77,6 @@ def shadow_views(
     cube: bool,
 ) -> Sequence[_splatting.AbstractView]:
     """Return the views of a light's shadow maps: one of all splats, or the six faces of a cube."""
-    settings = settings.for_strata() if light.is_stratum else settings
     if isinstance(light, DirectionalLight | GaussianBeam | DistantStratum):
         return [_splatting.distant_view(light.direction, bounds, settings)]
     if not isinstance(light, PointLight | EmitterStratum):
@@ -167,6 +166,9 @@ def cast_shadows(
             visible, needed = jax.lax.map(of_view, stacked)
             closeness = plan.closeness(light, bounds)
             return jnp.sum(visible, axis=0), jnp.maximum(jnp.max(needed), closeness)
+
+        if group.highlights:  # many maps: in a gradient, each is made again
+            of_light = jax.checkpoint(of_light)  # ty: ignore[invalid-assignment]
 
         def if_exists(numbered, plan=plan, of_light=of_light):
             number, light = numbered

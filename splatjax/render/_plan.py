@@ -32,6 +32,7 @@ from ._lighting import AbstractLighting, LightAtSplats, ShadowPlan, plan_views
 # Directions to all sides, for which the shadow maps of any environment are planned.
 _DIRECTIONS = [[x, y, z] for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if x or y or z]
 
+
 class RenderSettings(eqx.Module):
     r"""How each pass works.
 
@@ -291,7 +292,10 @@ def _plan_shadows(
         return None
     if isinstance(lights[0], DistantStratum):
         directions = jnp.asarray(_DIRECTIONS, lights[0].direction.dtype)
-        lights = [DistantStratum(each, lights[0].irradiance, True) for each in directions]
+        lights = [
+            DistantStratum(direction=each, irradiance=lights[0].irradiance, cast_shadows=True)
+            for each in directions
+        ]
     of_lights, cube = plan_views(lights, bounds, settings.shadows)
     views = [view for views in of_lights for view in views]
     rasterizer = settings.rasterizer.for_shadows()

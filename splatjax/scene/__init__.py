@@ -21,6 +21,11 @@ from ._lights import (
     stack_lights as stack_lights,
     StackedLights as StackedLights,
 )
+from ._skies import (
+    overcast_sky as overcast_sky,
+    studio as studio,
+    sun_and_sky as sun_and_sky,
+)
 from ._scene import (
     Camera as Camera,
     Frame as Frame,

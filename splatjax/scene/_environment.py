@@ -8,10 +8,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jax.scipy.ndimage import map_coordinates
+from jaxtyping import Array, DTypeLike, Float
 
 from splatjax._chunking import jit_unless_traced
-from splatjax._records import LINEAR, numbers, record
+from splatjax._records import numbers, record
 
 from ._lights import AbstractExtendedLight, AbstractHighlight, AbstractLightSample, DistantStratum
 
@@ -50,13 +51,13 @@ class EnvironmentLight(AbstractExtendedLight):
     radiance that is negative or not finite.
     """
 
-    image: Float[Array, "height width channels"] = eqx.field(converter=numbers, metadata=LINEAR)
+    image: Float[Array, "height width channels"] = eqx.field(
+        converter=numbers, metadata={"linear": True}
+    )
     rotation: Float[Array, ""] = eqx.field(converter=numbers, default=0.0)
     strength: Float[Array, " channels"] = eqx.field(converter=numbers, default=1.0)
     up: Float[Array, "3"] = eqx.field(converter=numbers, default=(0.0, 1.0, 0.0))
     strength_field: ClassVar[str] = "strength"
-    count: int = eqx.field(static=True, default=64)
-    cast_shadows: bool = eqx.field(static=True, default=True)
 
     def __check_init__(self):
         height, width = getattr(self.image, "shape", (1, 2))[:2]
@@ -82,13 +83,6 @@ class EnvironmentLight(AbstractExtendedLight):
         lean = 1 / jnp.maximum(1 + y, 1e-6)
         tilt = [1 - x * x * lean, x, -x * z * lean, -x, y, -z, -x * z * lean, z, 1 - z * z * lean]
         return jnp.stack(tilt).reshape(3, 3) @ jnp.stack(rows).reshape(3, 3)
-
-    def irradiance(self, normals: Float[Array, "*points 3"]) -> Float[Array, "*points channels"]:
-        """Compute the irradiance of unshadowed surfaces from all pixels, without samples."""
-        directions, solid_angles = pixel_directions(self.image.shape[0], normals.dtype)
-        flux = self.radiance() * solid_angles[..., None]
-        cosines = jnp.tensordot(normals @ self.to_world(), directions.reshape(-1, 3), (-1, -1))
-        return jnp.tensordot(jnp.maximum(cosines, 0), flux.reshape(-1, flux.shape[-1]), 1)
 
     @jit_unless_traced
     def stacked_samples(self) -> AbstractLightSample:
@@ -128,7 +122,9 @@ class EnvironmentLight(AbstractExtendedLight):
         towards = jnp.where(is_filled, towards, anywhere) @ self.to_world().T
 
         def sample(towards, irradiance):
-            return DistantStratum(-towards, irradiance, self.cast_shadows)
+            return DistantStratum(
+                direction=-towards, irradiance=irradiance, cast_shadows=self.cast_shadows
+            )
 
         return jax.vmap(sample)(towards, irradiance)
 
@@ -169,24 +165,13 @@ class BlurredEnvironment(AbstractHighlight):
         lowest, highest = _ROUGHNESSES[[0, -1]].tolist()
         step = math.log(highest / lowest) / (len(_ROUGHNESSES) - 1)
         level = jnp.log(jnp.clip(roughness, lowest, highest) / lowest) / step
-        places = [(jnp.broadcast_to(level, row.shape), len(_ROUGHNESSES))]
-        places += [(row, height + 2), (column, 2 * height + 2)]
-        corners = [
-            jnp.clip(jax.lax.stop_gradient(jnp.floor(place)).astype(jnp.int32), 0, size - 2)
-            for place, size in places
-        ]
-        total = jnp.zeros((*row.shape, self.maps.shape[-1]), row.dtype)
-        for corner in np.ndindex(2, 2, 2):
-            index = [first + step for first, step in zip(corners, corner, strict=True)]
-            weight = jnp.ones_like(row)
-            for (place, _), pixel in zip(places, index, strict=True):
-                weight = weight * (1 - jnp.abs(place - pixel.astype(place.dtype)))
-            total += weight[..., None] * self.maps[tuple(index)]
-        return total
+        places = [jnp.broadcast_to(level, row.shape), row, column]
+        interpolate = functools.partial(map_coordinates, order=1, mode="nearest")
+        return jax.vmap(interpolate, (-1, None), -1)(self.maps, places)
 
 
 def pixel_directions(
-    height: int, dtype=None
+    height: int, dtype: DTypeLike = float
 ) -> tuple[Float[Array, "height width 3"], Float[Array, "height width"]]:
     """Compute the directions of the pixels of a latitude-longitude map, +y up, and their solid
     angles.
@@ -206,18 +191,9 @@ def _hilbert_curve(side: int) -> np.ndarray:
     """Number the cells of a square along a Hilbert curve; the side is a power of two."""
     if side == 1:
         return np.zeros((1, 1), int)
-    part = _hilbert_curve(side // 2)
-    count = part.size
-    upper = np.concatenate([part.T, 3 * count + part.T[::-1, ::-1]], axis=1)
-    return np.concatenate([upper, np.concatenate([count + part, 2 * count + part], axis=1)])
-
-
-def _overlaps(pixels: int, into: int, edges) -> np.ndarray:
-    """Compute which share of each of `into` pixels lies in each of other `pixels`."""
-    ours, theirs = edges(np.linspace(0, 1, into + 1)), edges(np.linspace(0, 1, pixels + 1))
-    low = np.maximum(ours[:-1, None], theirs[None, :-1])
-    overlap = np.maximum(np.minimum(ours[1:, None], theirs[None, 1:]) - low, 0)
-    return overlap / np.diff(ours)[:, None]
+    part, count = _hilbert_curve(side // 2), side * side // 4
+    upper = [part.T, 3 * count + part.T[::-1, ::-1]]
+    return np.block([upper, [count + part, 2 * count + part]])
 
 
 def _blurred(radiance: Float[Array, "height width channels"]) -> Float[Array, "maps _ _ channels"]:
@@ -226,12 +202,8 @@ def _blurred(radiance: Float[Array, "height width channels"]) -> Float[Array, "m
     The lobe at the angle `2 a` from the mirrored direction is `exp(-tan^2 a / m^2) cos 2a / cos^6
     a`, divided by its integral. In longitude it is a circular convolution.
     """
-    height, dtype = radiance.shape[0], radiance.dtype
-    rows = _overlaps(height, _ROWS, lambda t: 0.5 * (1 - np.cos(np.pi * t)))
-    columns = _overlaps(2 * height, 2 * _ROWS, lambda t: t)
-    reduced = jnp.einsum(
-        "rh,cw,hwk->rck", jnp.asarray(rows, dtype), jnp.asarray(columns, dtype), radiance
-    )
+    dtype, size = radiance.dtype, (_ROWS, 2 * _ROWS, radiance.shape[-1])
+    reduced = jax.image.resize(radiance, size, "linear")
     _, solid_angles = pixel_directions(_ROWS, dtype)
     spectrum = jnp.fft.rfft(reduced * solid_angles[..., None], axis=1)
 

@@ -99,8 +99,6 @@ class AbstractLightSample(AbstractLight):
     """
 
     cast_shadows: eqx.AbstractVar[bool]
-    is_stratum: ClassVar[bool] = False
-    """Whether it stands for a part of an extended light, whose shadow maps are small."""
 
     def samples(self) -> tuple["AbstractLightSample", ...]:
         """Return the light itself."""
@@ -120,12 +118,12 @@ class AbstractExtendedLight(AbstractLight):
 
     **Attributes:** (static)
 
-    - `count`: of samples.
+    - `count`: of samples, each with a shadow map.
     - `cast_shadows`.
     """
 
-    count: eqx.AbstractVar[int]
-    cast_shadows: eqx.AbstractVar[bool]
+    count: int = eqx.field(static=True, default=64, kw_only=True)
+    cast_shadows: bool = eqx.field(static=True, default=True, kw_only=True)
 
     @abc.abstractmethod
     def stacked_samples(self) -> AbstractLightSample:
@@ -212,7 +210,6 @@ class DistantStratum(AbstractLightSample):
     direction: Float[Array, "3"]
     irradiance: Float[Array, " channels"]
     strength_field: ClassVar[str] = "irradiance"
-    is_stratum: ClassVar[bool] = True
     cast_shadows: bool = eqx.field(static=True)
 
     def incidence(
@@ -234,7 +231,6 @@ class EmitterStratum(AbstractLightSample):
     intensity: Float[Array, " channels"]
     normal: Float[Array, "3"] | None
     strength_field: ClassVar[str] = "intensity"
-    is_stratum: ClassVar[bool] = True
     cast_shadows: bool = eqx.field(static=True)
 
     def incidence(

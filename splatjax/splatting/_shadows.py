@@ -2,8 +2,6 @@
 each splat.
 """
 
-import dataclasses
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -30,7 +28,6 @@ class ShadowSettings(eqx.Module):
     **Attributes:**
 
     - `resolution`: pixels along a side of each map.
-    - `stratum_resolution`: that of each sample of an environment or area light.
     - `bias`: a surface less than this far behind the map's, in mm, is still fully lit: keeps a
       surface from shadowing itself.
     - `softness`: over this many more mm the light fades; with it shadows have gradients in depth.
@@ -41,15 +38,9 @@ class ShadowSettings(eqx.Module):
     """
 
     resolution: int = eqx.field(static=True, default=1024)
-    stratum_resolution: int = eqx.field(static=True, default=256)
     bias: float = eqx.field(static=True, default=0.4)
     softness: float = eqx.field(static=True, default=0.8)
     largest_slope: float = eqx.field(static=True, default=8.0)
-
-    def for_strata(self) -> "ShadowSettings":
-        """Return the settings of the maps of environments and area lights."""
-        resolution = min(self.resolution, self.stratum_resolution)
-        return dataclasses.replace(self, resolution=resolution)
 
 
 class Bounds(eqx.Module):
