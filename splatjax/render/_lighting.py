@@ -25,6 +25,7 @@ from splatjax.scene import (
 
 from ._attributes import SurfaceAttributes, SurfaceSamples
 
+_GRAZING = 1e-3  # cosine
 _NEARLY = 1.05  # bounding radii, from which on one frustum around all splats fits
 
 
@@ -105,10 +106,13 @@ class LightVisibility(eqx.Module):
     def per_light(
         self, positions: Float[Array, "points 3"], normals: Float[Array, "points 3"]
     ) -> tuple[Float[Array, "_lights points"] | None, ...]:
-        """Average the visibility of each light's samples by the light that each would bring."""
+        """Average the visibility of each light's samples by the light that each would bring; where
+        none is above the horizon, as if all grazed the surface.
+        """
 
         def received(light):
-            return jnp.sum(_shading.received_light(light, None, positions, normals)[2], axis=0)
+            wi, irradiance = light.incidence(positions)
+            return jnp.maximum(jnp.sum(normals * wi, axis=-1), _GRAZING) * jnp.sum(irradiance, -1)
 
         def mean(group: StackedLights, rows):
             if rows is None or len(group.distinct) == len(group.light_indices):

@@ -14,6 +14,7 @@ from unittest import mock
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 import trimesh
 from commands import failure, plate, run
@@ -74,6 +75,9 @@ REFUSED = {
     "render missing.ply --height -3": ["--height", "-3"],
     "render missing.ply --count 0": ["--count", "0"],
     "render missing.ply --scale 0": ["--scale", "0"],
+    "render missing.ply --environment-rotation nan": ["--environment-rotation", "nan"],
+    "render plate.ply --environment missing.hdr": ["missing.hdr"],
+    "render plate.ply --environment map.png": ["map.png", "encoded for a display"],
     "render missing.ply --fill -1": ["--fill", "-1"],
     "render --stream 5": ["--stream", "5"],
     "turntable missing.ply --frames 0": ["--frames", "0"],
@@ -112,6 +116,7 @@ def folder(tmp_path, monkeypatch):
         (tmp_path / name).write_text(text)
     plate(tmp_path / "plate.ply")
     trimesh.creation.icosphere().export(tmp_path / "ball.obj")
+    sj.write_png(tmp_path / "map.png", np.ones((4, 8, 3)))
     for name in ("picture.png", "picture.ply"):
         (tmp_path / name).write_bytes(bytes(range(256)))
     return tmp_path

@@ -103,6 +103,19 @@ def scattered_once() -> World:
     return World(sj.Scene(_colored(bodies.bumpy(160)), (light,), material), view())
 
 
+def extended_lights() -> World:
+    """A body in its own shadow, under lights that are sampled, with a highlight each."""
+    image = np.random.default_rng(4).uniform(0.1, 2.0, (6, 12, 2))
+    lights = (
+        sj.EnvironmentLight(image, 40.0, [0.6, 0.5], (0.2, 1.0, 0.3), count=4),
+        sj.scene.RectangleLight([-14, 18, 25], [8, 5], [[6, 0, 5], [0, -7, 3]], count=2),
+        sj.scene.DiskLight([12, -9, 30], [6, 8], [-0.3, 0.3, -1], 4.0, count=2),
+        sj.scene.SphereLight([16, 14, 22], [9, 4], 3.0, count=2),
+    )
+    body = uneven(_colored(bodies.bumpy(160)))
+    return World(sj.Scene(body, lights, sj.Material(_gaussians(), roughness=0.4)), view())
+
+
 # The plain path is checked everywhere; the fast one where all its parts take part, and against the
 # plain one.
 WORLDS = {
@@ -111,6 +124,7 @@ WORLDS = {
     "lamp inside": Small(lamp_inside, {"plain": COARSE}),
     "ball over sheet": Small(ball_over_sheet),
     "scattered once": Small(scattered_once),
+    "extended lights": Small(extended_lights),
 }
 
 

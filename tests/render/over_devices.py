@@ -58,6 +58,28 @@ def splats_cut() -> dict:
     return _apart_on_eight(scene())
 
 
+def strata_cut() -> dict:
+    """Environment and area light, seen and differentiated in the light alone."""
+    image = np.random.default_rng(4).uniform(0.1, 2.0, (6, 12, 3))
+    place = PLACE + np.asarray([-60.0, 10.0, 20.0])
+    lights = (
+        sj.EnvironmentLight(image, count=5),
+        sj.scene.RectangleLight(place, 6.0, [[0, 0, 20], [0, 20, 0]], count=3),
+    )
+    bare, eye = scene(), camera()
+
+    def found(mesh):
+        plan = sj.make_plan(sj.Scene(bare.splats, lights, bare.material), eye, SETTINGS, mesh=mesh)
+
+        def loss(lights):
+            frame = sj.render(sj.Scene(bare.splats, lights, bare.material), eye, SETTINGS, plan)
+            return jnp.mean(frame.beauty**2), frame
+
+        return eqx.filter_jit(eqx.filter_grad(loss, has_aux=True))(lights)
+
+    return apart(found(None), found(jax.make_mesh((8,), ("splats",))))
+
+
 # Gradients without a shadow map: it takes half the time to compile.
 def light_and_unshadowed_splats_cut() -> dict:
     world, meshes = scene(), (None, jax.make_mesh((8,), ("splats",)))

@@ -32,6 +32,10 @@ FIELDS = (
     "specular",
     "unresolved_fraction",
 )
+STRATA = (
+    sj.EnvironmentLight(np.random.default_rng(4).uniform(0.1, 2.0, (6, 12, 3)), count=3),
+    sj.scene.SphereLight([-60, 10, 20], 4.0, 10.0, count=2),
+)
 LIGHTS = (
     sj.DirectionalLight(jnp.asarray([0.4, -0.5, -1.0], float), jnp.ones(3)),
     sj.PointLight(jnp.asarray([-60.0, 10.0, 20.0], float), 2000 * jnp.ones(3), cast_shadows=False),
@@ -92,6 +96,13 @@ def test_parts_make_the_picture_of_all_at_once(splats, monkeypatch):
     errors = layer_errors(streamed, whole)
     assert np.all(np.quantile(errors, 0.99, axis=(1, 2)) < LAYERS)
     assert np.max(errors) < RIMS
+
+
+def test_strata_of_lights_are_streamed_too(splats):
+    whole = sj.render(sj.Scene(splats, STRATA, MATERIAL), CAMERA, SETTINGS)
+    streamed = sj.render_streamed(in_parts(splats, 900), STRATA, MATERIAL, CAMERA, SETTINGS)
+    found = apart(*({name: getattr(frame, name) for name in FIELDS} for frame in (whole, streamed)))
+    assert max(found.values()) < ROUNDING, found
 
 
 def layer_errors(streamed, whole):

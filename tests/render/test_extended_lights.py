@@ -1,0 +1,221 @@
+"""Environments and area lights: what samples stand for them, against integrals in closed form."""
+
+import jax.numpy as jnp
+import numpy as np
+import OpenEXR
+import pytest
+from bodies import PLAIN, apart, camera_over, joined, sheet, sphere, two_gaussians, unit
+
+import splatjax as sj
+from splatjax.diffusion import DenseDiffuser
+from splatjax.scene import DiskLight, RectangleLight, SphereLight
+
+BARE = sj.Material(two_gaussians(), specular=0.0)
+GLOSSY = sj.Material(two_gaussians(), specular=1.0, roughness=0.4)
+CAMERA = sj.Camera.look_at([0, 0, 60], [0, 0, 0], fov=24, width=24, height=24)
+TILES = sj.RenderSettings(diffuser=DenseDiffuser())
+# Root mean square, and largest error of the irradiance over its largest value, by count.
+SAMPLED = {16: (0.05, 0.15), 64: (0.015, 0.045), 256: (0.004, 0.012)}
+BODY = joined(sphere(1500, 10.0), sphere(400, 3.0, (4.0, 6.0, 12.0)))
+
+
+def map_directions(rows: int) -> np.ndarray:
+    """The directions of the pixels as OpenEXR defines them."""
+    polar = np.pi * (np.arange(rows)[:, None] + 0.5) / rows
+    longitude = np.pi * (1 - (np.arange(2 * rows)[None] + 0.5) / rows)
+    x, z = np.sin(polar) * np.sin(longitude), np.sin(polar) * np.cos(longitude)
+    return np.stack(np.broadcast_arrays(x, np.cos(polar), z), axis=-1)
+
+
+def harmonics(rows: int = 64) -> np.ndarray:
+    """Radiance of the bands 0, 1 and 2, one in each channel."""
+    d = map_directions(rows)
+    first = 1 + d @ np.asarray([0.6, 0.5, -0.3])
+    return np.stack([np.ones(first.shape), first, 1 + d[..., 0] * d[..., 1]], axis=-1)
+
+
+def render(light, body: sj.Splats, material=BARE, camera=CAMERA, settings=PLAIN) -> sj.Frame:
+    return sj.render(sj.Scene(body, (light,), material), camera, settings)
+
+
+def irradiance(light, body: sj.Splats) -> np.ndarray:
+    scene = sj.Scene(body, (light,), BARE)
+    plan = sj.make_plan(scene, CAMERA, PLAIN)
+    return np.asarray(sj.compute_irradiance(scene, plan, PLAIN).entering.T, float)
+
+
+@pytest.mark.parametrize("count", SAMPLED)
+def test_irradiance_on_a_ball_is_that_of_the_harmonic_bands(count):
+    """pi, 2 pi / 3 and pi / 4 times the radiance of each band, to the sampling error."""
+    body = sphere(600)
+    light = sj.EnvironmentLight(harmonics(), count=count, cast_shadows=False)
+    n = np.asarray(body.normals, float)
+    first = np.pi + 2 * np.pi / 3 * n @ np.asarray([0.6, 0.5, -0.3])
+    exact = [np.full(len(n), np.pi), first, np.pi + np.pi / 4 * n[:, 0] * n[:, 1]]
+    error = (irradiance(light, body) - np.stack(exact, axis=-1)) / np.max(exact)
+    root_mean_square, largest = SAMPLED[count]
+    assert np.sqrt(np.mean(error**2)) < root_mean_square
+    assert np.max(np.abs(error)) < largest
+
+
+@pytest.mark.once
+def test_white_furnace_with_a_lobe():
+    white = sj.Material(two_gaussians().white(), specular=1.0, roughness=0.3)
+    camera = sj.Camera.look_at([0, 0, 400], [0, 0, 0], fov=16, width=32, height=32)
+    light = sj.EnvironmentLight(np.ones((8, 16, 3)), cast_shadows=False)
+    frame = render(light, sphere(4000, 50.0), white, camera)
+    covered = np.asarray(frame.coverage) > 0.999
+    beauty, specular = (np.asarray(each)[covered] for each in (frame.beauty, frame.specular))
+    assert covered.sum() > 600
+    assert np.max(np.abs(beauty - 1)) < 0.05
+    assert np.mean(beauty) == pytest.approx(1, abs=0.015)
+    assert np.max(specular) > 0.1
+
+
+def test_an_environment_of_one_pixel_is_a_directional_light():
+    image = np.zeros((32, 64, 3))
+    image[9, 40] = [100, 200, 300]
+    toward, strip = map_directions(32)[9, 40], np.diff(np.cos(np.pi * np.asarray([10, 9]) / 32))
+    lamp = sj.DirectionalLight(-toward, image[9, 40] * strip * np.pi / 32)
+    ours, lamps = (render(light, BODY, GLOSSY) for light in (sj.EnvironmentLight(image), lamp))
+    assert np.max(apart(ours.diffuse, lamps.diffuse)[""]) < 2e-3
+    ratio = np.sum(ours.specular) / np.sum(lamps.specular)
+    assert float(ratio) == pytest.approx(1, abs=0.05)
+    assert apart(ours.shadow, lamps.shadow)[""] < 5e-3
+
+
+@pytest.mark.once
+@pytest.mark.parametrize("up", [(0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0)])
+def test_a_turned_map_is_a_body_turned_back(up):
+    """Where z is up, the middle of the map is -y."""
+    sine, cosine = np.sin(np.radians(50)), np.cos(np.radians(50))
+    about_y = np.asarray([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])
+    y = np.asarray(up)
+    x = np.asarray([1.0, 0.0, 0.0])
+    rotation = np.stack([x, y, np.cross(x, y)], axis=1) @ about_y
+    normals = np.asarray(BODY.normals, float)
+    back = sj.Splats(BODY.centers, normals @ rotation, BODY.radii, BODY.areas)
+    turned = sj.EnvironmentLight(harmonics(), 50.0, up=up, cast_shadows=False)
+    straight = sj.EnvironmentLight(harmonics(), cast_shadows=False)
+    np.testing.assert_allclose(
+        irradiance(turned, BODY), irradiance(straight, back), rtol=1e-4, atol=1e-2
+    )
+
+
+PLACE, FACING = np.asarray([400.0, 300.0, 1200.0]), unit([-400.0, -300.0, -1200.0])
+ACROSS = np.cross(FACING, [0.0, 1.0, 0.0])
+FAR = {
+    "rectangle": RectangleLight(
+        PLACE, [1, 2, 3], [2 * unit(ACROSS), unit(np.cross(FACING, ACROSS))]
+    ),
+    "disk": DiskLight(PLACE, [1, 2, 3], FACING, 1.0),
+    "sphere": SphereLight(PLACE, [1, 2, 3], 1.0),
+}
+
+
+@pytest.mark.parametrize("kind", FAR)
+def test_a_far_area_light_is_a_point_light(kind):
+    area = 2 if kind == "rectangle" else np.pi
+    point = sj.PointLight(PLACE, area * np.asarray([1.0, 2.0, 3.0]))
+    area_light, lamp = (render(light, BODY, GLOSSY) for light in (FAR[kind], point))
+    assert apart(area_light.diffuse, lamp.diffuse)[""] < 2e-3
+    assert apart(area_light.specular, lamp.specular)[""] < 2e-2
+    assert np.max(lamp.specular) > 0.1 * np.max(lamp.diffuse)
+
+
+@pytest.mark.once
+def test_a_rectangle_that_fills_the_sky_is_mirrored_with_its_radiance():
+    """A sheet under it reflects as under an environment of that radiance."""
+    big = RectangleLight([0, 0, 100], 1.0, [[4e3, 0, 0], [0, -4e3, 0]], cast_shadows=False)
+    sky = sj.EnvironmentLight(np.ones((8, 16, 1)), cast_shadows=False)
+    camera = camera_over(2.0, 8, slant=20.0)
+    found, expected = (
+        np.asarray(render(light, sheet(5.0, 1.0), GLOSSY, camera).specular) for light in (big, sky)
+    )
+    np.testing.assert_allclose(found, expected, rtol=0.05)
+
+
+@pytest.mark.once
+def test_a_soft_shadow_is_the_fraction_of_the_rectangle_that_is_seen():
+    """Behind the edge x = 0 of a sheet 30 mm above, under a rectangle of 40 mm at 200 mm."""
+    body = joined(sheet(14.0, 0.25), sheet(8.0, 0.25, center=(-8.125, 0.0, 30.0)))
+    light = RectangleLight([0, 0, 200], 1.0, [[40, 0, 0], [0, -40, 0]])
+    camera = sj.Camera.look_at([25, 0, 20], [0, 0, 0], fov=10, width=48, height=48)
+    frame = render(light, body, settings=TILES, camera=camera)
+    x, shadow = np.asarray(frame.position)[24, :, 0], np.asarray(frame.shadow)[0, 24]
+    exact = np.clip((20 + x * (200 - 30) / 30) / 40, 0, 1)
+    assert np.min(exact) < 0.1 < 0.9 < np.max(exact)
+    assert np.max(np.abs(shadow - exact)) < 0.035  # a sheet ends a radius late
+
+
+@pytest.mark.once
+def test_another_environment_of_the_size_compiles_nothing_and_keeps_the_plan(compiled):
+    body, sun = sphere(2000), sj.scene.sun_and_sky(height=32)
+    first = sj.Scene(body, sj.EnvironmentLight(sun, count=8), BARE)
+    plan = sj.make_plan(first, CAMERA, TILES)
+    before = sj.render(first, CAMERA, TILES, plan)
+    dim, ways = sun * 0.1, np.linspace(10.0, 350.0, 7)
+    compiled.clear()
+    for way in ways:
+        scene = sj.Scene(body, sj.EnvironmentLight(dim, float(way), count=8), BARE)
+        frame = sj.render(scene, CAMERA, TILES, plan)
+        assert float(frame.overflow) == 0
+        assert not np.array_equal(frame.beauty, before.beauty)
+    assert [name for name in compiled if name not in ("multiply",)] == []
+
+
+@pytest.mark.once
+def test_skies_have_the_irradiance_that_they_say():
+    body = sheet(1.0, 1.0, normal=(0.0, 1.0, 0.0))
+    sky = sj.EnvironmentLight(sj.scene.overcast_sky(), count=1024, cast_shadows=False)
+    assert irradiance(sky, body) == pytest.approx(np.pi, rel=3e-3)
+    azimuth, height = np.radians(-40), np.radians(35)
+    sun = [np.sin(azimuth) * np.cos(height), np.sin(height), np.cos(azimuth) * np.cos(height)]
+    for image, most in ((sj.scene.studio(), 3.8), (sj.scene.sun_and_sky(), 3.8)):
+        light = sj.EnvironmentLight(image, cast_shadows=False)
+        towards = irradiance(light, sheet(1.0, 1.0, normal=sun))
+        assert np.all((towards > 2.5) & (towards < most))
+
+
+def environment(image, **fields):
+    return lambda: sj.EnvironmentLight(image, **fields)
+
+
+NAN = np.ones((2, 4, 3))
+NAN[1, 2, 0] = np.nan
+REFUSED = [
+    (environment(np.ones((4, 4, 3))), "EnvironmentLight.image has 4 rows and 4 columns"),
+    (environment(NAN), r"EnvironmentLight.image .*replace.* 1 of 24 .* nan at \[1, 2, 0\]"),
+    (environment(-np.ones((2, 4, 3))), "EnvironmentLight.image .*clip.* -1"),
+    (environment(np.ones((2, 4, 3), np.uint8)), "EnvironmentLight.image .*uint8.*floating"),
+    (environment(np.ones((2, 4, 3)), count=0), "EnvironmentLight.count .*got 0"),
+    (environment(np.ones((2, 4, 3)), up=(0, 0, 0)), "EnvironmentLight.up .*not zero"),
+    (lambda: RectangleLight([0] * 3, 1, [[1, 0, 0], [2, 0, 0]]), "RectangleLight.edges .*area"),
+    (lambda: SphereLight([0, 0, 0], 1, 0), "SphereLight.radius .*positive"),
+]
+
+
+@pytest.mark.once
+@pytest.mark.parametrize(("call", "said"), REFUSED)
+def test_lights_that_cannot_be_are_refused_by_name(call, said):
+    with pytest.raises(ValueError, match=said):
+        call()
+
+
+@pytest.mark.once
+def test_environments_are_read_and_large_ones_averaged(tmp_path):
+    def written(name, image):
+        planes = dict(zip("RGB", np.moveaxis(image.astype(np.float32), -1, 0), strict=True))
+        header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+        planes = {name: np.ascontiguousarray(plane) for name, plane in planes.items()}
+        with OpenEXR.File(header, planes) as file:
+            file.write(str(tmp_path / name))
+        return tmp_path / name
+
+    image = harmonics(1040)
+    light = sj.io.load_environment(written("map.exr", image), rotation=30.0, count=16)
+    assert light.image.shape == (520, 1040, 3) or light.image.shape == (260, 520, 3)
+    assert (float(light.rotation), light.count) == (30.0, 16)
+    assert float(jnp.mean(light.image)) == pytest.approx(np.mean(image), rel=1e-4)
+    with pytest.raises(ValueError, match="bad.exr: EnvironmentLight.image has 4 rows"):
+        sj.io.load_environment(written("bad.exr", np.ones((4, 6, 3))))
