@@ -103,12 +103,19 @@ class ViewOptions:
         }
         check_options(self, rules | (more_rules or {}))
         check_displayable(sj.load_material(self.material).channels)
+        _ = self._environment  # its file is read before anything is made
         count = 0 if self.splats else self.count
         check_memory(
             f"--width {self.width} --height {self.height}{f' --count {count}' if count else ''}",
             BYTES_PER_SPLAT * count + BYTES_PER_PIXEL * self.width * self.height,
             "take fewer pixels or splats",
         )
+
+    @functools.cached_property
+    def _environment(self) -> sj.EnvironmentLight | None:
+        if self.environment in _ENVIRONMENTS:
+            return sj.EnvironmentLight(_ENVIRONMENTS[self.environment]())
+        return sj.io.load_environment(self.environment) if self.environment else None
 
     def load(self) -> tuple[sj.Splats, sj.Material]:
         """Return the splats, and the material with which they are rendered."""
@@ -149,11 +156,9 @@ class ViewOptions:
         """Return the light, in the channels of a material, and the fill beside a camera at an
         azimuth: always on the same side of it; or the environment, which turns with the light.
         """
-        if self.environment:
+        if self._environment is not None:
             rotation = self.environment_rotation + light_azimuth - self.light_azimuth
-            if self.environment in _ENVIRONMENTS:
-                return (sj.EnvironmentLight(_ENVIRONMENTS[self.environment](), rotation),)
-            return (sj.io.load_environment(self.environment, rotation=rotation),)
+            return (replace(self._environment, rotation=rotation),)
         # The first light gives a white diffuser that faces it the radiance 1.
         irradiance = np.full(material.channels, np.pi)
         towards = -direction_to(light_azimuth, self.light_elevation)

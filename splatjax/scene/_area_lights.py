@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from splatjax._records import check_values, numbers, record
 
 from ._lights import AbstractExtendedLight, AbstractHighlight, AbstractLightSample, EmitterStratum
+from ._scene import rotation_towards
 
 _GRAZING = 1e-3  # cosine to an emitter's plane, below which a mirrored ray meets it far away
 _GOLDEN = (5**0.5 - 1) / 2
@@ -87,21 +88,18 @@ class AbstractAreaLight(AbstractExtendedLight, AbstractHighlight):
         hit = from_center + jnp.maximum(along, 0)[..., None] * mirrored
         axes = self.axes()
         nearest = jnp.tensordot(self.within(jnp.tensordot(hit, jnp.linalg.pinv(axes), 1)), axes, 1)
-        wi = _unit(nearest - from_center)
+        to_nearest = nearest - from_center
+        squared = jnp.sum(to_nearest * to_nearest, axis=-1, keepdims=True)
+        wi = to_nearest / jnp.sqrt(jnp.maximum(squared, 1e-12))
 
         distance = jnp.sqrt(jnp.maximum(jnp.sum(from_center**2, axis=-1), 1e-12))
         ahead = distance if normal is None else jnp.tensordot(from_center, normal, 1)
         solid_angle = area * jnp.maximum(ahead, 0) / distance**3
         middle = lobe(mirrored)
-        is_seen = middle > 0
+        is_seen = (middle > 0) & (albedo > 0)
         size = jnp.where(is_seen, albedo, 0.0) / jnp.where(is_seen, middle, 1.0)
         filled = -jnp.expm1(-solid_angle / jnp.where(is_seen, size, 1.0)) * size
         return self.radiance.reshape(-1, *[1] * filled.ndim) * (lobe(wi) * filled)[None]
-
-
-def _unit(vectors: Float[Array, "*points 3"]) -> Float[Array, "*points 3"]:
-    squared = jnp.sum(vectors * vectors, axis=-1, keepdims=True)
-    return vectors / jnp.sqrt(jnp.maximum(squared, 1e-12))
 
 
 @record
@@ -155,9 +153,9 @@ class DiskLight(AbstractAreaLight):
 
     def axes(self) -> Float[Array, "2 3"]:
         normal = self.direction / jnp.linalg.norm(self.direction)
-        least = jax.nn.one_hot(jnp.argmin(jnp.abs(normal)), 3, dtype=normal.dtype)
-        across = _unit(jnp.cross(normal, least))
-        return self.radius * jnp.stack([across, jnp.cross(normal, across)])
+        x, y = jnp.eye(3, dtype=normal.dtype)[:2]
+        up = jnp.where(jnp.abs(normal[1]) < 0.9, y, x)
+        return self.radius * rotation_towards(normal, up)[:2]
 
     def pattern(self) -> Float[np.ndarray, "samples 2"]:
         i = np.arange(self.count) + 0.5

@@ -217,5 +217,5 @@ def test_environments_are_read_and_large_ones_averaged(tmp_path):
     assert light.image.shape == (520, 1040, 3) or light.image.shape == (260, 520, 3)
     assert (float(light.rotation), light.count) == (30.0, 16)
     assert float(jnp.mean(light.image)) == pytest.approx(np.mean(image), rel=1e-4)
-    with pytest.raises(ValueError, match="bad.exr: EnvironmentLight.image has 4 rows"):
+    with pytest.raises(ValueError, match=r"bad\.exr: EnvironmentLight.image has 4 rows"):
         sj.io.load_environment(written("bad.exr", np.ones((4, 6, 3))))
