@@ -15,6 +15,7 @@ from jaxtyping import Float
 from PIL import Image
 
 from splatjax._memory import check_memory
+from splatjax._records import Numbers
 from splatjax.scene import EnvironmentLight, Frame
 
 from ._files import StrPath, atomic_path, existing_file, naming
@@ -75,14 +76,18 @@ def read_picture(path: StrPath) -> Float[np.ndarray, "height width channels"]:
     return values
 
 
-def load_environment(path: StrPath, **fields: Any) -> EnvironmentLight:
+def load_environment(
+    path: StrPath,
+    rotation: Numbers = 0.0,
+    strength: Numbers = 1.0,
+    up: Numbers = (0.0, 1.0, 0.0),
+    count: int = 64,
+) -> EnvironmentLight:
     r"""Read an environment light: a latitude-longitude map of OpenEXR, Radiance HDR or another
     format of floating-point numbers. Maps of more than 512 rows are averaged until they have no
     more, which changes neither samples nor highlights.
 
-    **Arguments:**
-
-    - `fields`: of `EnvironmentLight`, but for its image.
+    **Arguments:** the others as of `EnvironmentLight`.
 
     **Raises:** as `read_picture` does, and `ValueError` for a map that is not twice as wide as
     high, or has radiance that is negative or not finite.
@@ -91,7 +96,7 @@ def load_environment(path: StrPath, **fields: Any) -> EnvironmentLight:
     while len(image) > _MOST_ROWS and not np.any(np.mod(image.shape[:2], 2)):
         image = image.reshape(len(image) // 2, 2, image.shape[1] // 2, 2, -1).mean(axis=(1, 3))
     with naming(path):
-        return EnvironmentLight(image.astype(np.float32), **fields)
+        return EnvironmentLight(image.astype(np.float32), rotation, strength, up, count=count)
 
 
 def read_map(path: StrPath) -> Float[np.ndarray, "height width 3"]:

@@ -1,6 +1,7 @@
 """Lights of a size, near a body: rectangles, disks and balls of even radiance."""
 
 import abc
+from collections.abc import Sequence
 from typing import ClassVar
 
 import equinox as eqx
@@ -9,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from splatjax._records import check_values, numbers, record
+from splatjax._records import Numbers, check_values, numbers, record
 
 from ._lights import AbstractExtendedLight, AbstractHighlight, AbstractLightSample, EmitterStratum
 from ._scene import rotation_towards
@@ -124,6 +125,25 @@ class RectangleLight(AbstractAreaLight):
             requirement = "two that span an area; the area is 0"
             area = self.normal_and_area()[1]
             check_values("RectangleLight.edges", area, requirement, lambda x: x > 0)
+
+    @classmethod
+    def facing(
+        cls,
+        center: Sequence[float],
+        target: Sequence[float],
+        width: float,
+        height: float,
+        radiance: Numbers,
+        **settings,
+    ) -> "RectangleLight":
+        """Make a rectangle that faces a target, its lower edge level; neither above nor below it.
+
+        **Arguments:** mm; `settings` are `count` and `cast_shadows`.
+        """
+        towards = jnp.asarray(target, float) - jnp.asarray(center, float)
+        up = jnp.asarray([0.0, 1.0, 0.0], towards.dtype)
+        right, down, _ = rotation_towards(towards / jnp.linalg.norm(towards), up)
+        return cls(center, radiance, jnp.stack([width * right, height * down]), **settings)
 
     def axes(self) -> Float[Array, "2 3"]:
         return self.edges

@@ -82,8 +82,9 @@ class AbstractLight(eqx.Module):
     def samples(self) -> tuple["AbstractLightSample", ...]:
         """Return the points and directions from which the light comes.
 
-        Their light enters the surface, each with its own shadow. The specular lobe of each is
-        shadowed by the mean visibility of all, so that passes 2 and 3 blend one row per light.
+        Their light enters the surface, each with its own shadow. The specular lobe of each, or the
+        highlight of all, is shadowed by their mean visibility, so that passes 2 and 3 blend one
+        row per light.
         """
 
     def highlight(self) -> AbstractHighlight | None:
