@@ -3,7 +3,7 @@ capacities of arrays whose shapes are static.
 """
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from typing import TypeVar, cast
 
 import equinox as eqx
@@ -15,6 +15,7 @@ Result = TypeVar("Result", bound=PyTree)
 Function = TypeVar("Function", bound=Callable)
 
 AT_ONCE = 1 << 16
+_PLANNED: dict[Hashable, list[int]] = {}  # capacities, in this process
 
 
 def map_chunks(function: Callable[..., Result], *arrays: PyTree, at_once: int = AT_ONCE) -> Result:
@@ -112,9 +113,26 @@ def rounded_up(count: int, step: int, per_octave: int = 8) -> int:
     return -(-count // grain) * grain
 
 
-def with_spare(count: int, step: int, per_octave: int = 8) -> int:
-    """Plan the capacity for a count: 3% more and at least one more, rounded up."""
-    return rounded_up(int(count * 1.03) + 1, step, per_octave)
+def as_planned(kind: Hashable, least: int, capacity: int, most: float = 1.25) -> int:
+    """Return a capacity that was planned before in this process for the same kind of array, whose
+    program then serves again; the one given where none is at least `least` and at most `most` times
+    as large.
+    """
+    before = _PLANNED.setdefault(kind, [])
+    serving = [each for each in before if least <= each <= most * capacity]
+    if not serving:
+        before.append(capacity)
+    return (serving or [capacity])[0]
+
+
+def with_spare(
+    kind: Hashable, count: int, step: int, per_octave: int = 8, spare: float = 1.03
+) -> int:
+    """Plan the capacity of a kind of array for a count: `spare` times as many and at least one
+    more, rounded up; or one planned before that has 3% to spare.
+    """
+    capacity = rounded_up(int(count * spare) + 1, step, per_octave)
+    return as_planned((kind, step, per_octave, spare), int(count * 1.03) + 1, capacity)
 
 
 def needed_over_planned(needed: Int[Array, ""], planned: int) -> Float[Array, ""]:

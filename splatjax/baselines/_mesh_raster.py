@@ -98,7 +98,7 @@ def capacity_for(landing: Landing) -> int:
     motion.
     """
     _, _, across, down = landing.boxes()
-    return with_spare(9 * int(jnp.sum(across * down)) // 8, 1024)
+    return with_spare("fragments", 9 * int(jnp.sum(across * down)) // 8, 1024)
 
 
 def see_faces(landing: Landing, capacity: int) -> SeenFaces:

@@ -168,8 +168,9 @@ def find_neighbors(
     blocks = len(of_parts[0][0])
     found = [_lists([each.result() for each in part], blocks, len(low)) for part in pairs]
     # At least one row, the last, stays empty: lanes whose list has ended read it.
-    least = max(least, _ROWS * len(found[0][1]))
-    count = max(least, *(with_spare(len(ids), 1, per_octave=2) for ids, *_ in found))
+    lists = len(found[0][1])
+    rows = max(len(ids) for ids, *_ in found)
+    count = max(least, _ROWS * lists, with_spare(("rows", lists), rows, 1, per_octave=2))
     padded = [
         (np.pad(ids, ((0, count - len(ids)), (0, 0)), constant_values=len(low)), *each)
         for ids, *each in found

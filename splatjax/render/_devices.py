@@ -39,10 +39,10 @@ class Places(NamedTuple):
 
 
 def filled_like(scene: Scene, plan: Plan, *given: PyTree) -> tuple[Scene, Plan, Places]:
-    """Fill up the splats of a scene to the length of its plan, the lights of each kind to a power
-    of two, and the Gaussians, by NumPy and `device_put`, which compile nothing. Where the scene or
-    what is `given` with it is traced, and where splats are cut over devices, everything stays
-    unchanged.
+    """Fill up the splats of a scene to the length of its plan, the lights of each kind to four or a
+    larger power of two, and the Gaussians, by NumPy and `device_put`, which compile nothing. Where
+    the scene or what is `given` with it is traced, and where splats are cut over devices,
+    everything stays unchanged.
 
     No entry of the plan's order stands for an added splat. An added light has no strength, and the
     plan leaves out its shadow map; an added Gaussian has no weight. Where a light of the scene
@@ -64,11 +64,8 @@ def filled_like(scene: Scene, plan: Plan, *given: PyTree) -> tuple[Scene, Plan, 
         order = np.argsort([number for number, _ in numbered], stable=True)
         places = places._replace(lights=order[: len(lights)])
         lights = [light for _, light in numbered]
-        # One or two lights of a kind are never filled up, and need no count.
         shadows = tuple(
-            dataclasses.replace(shadow, lights=jax.device_put(np.int32(len(group))))
-            if shadow is not None and len(group) > 2
-            else shadow
+            shadow and dataclasses.replace(shadow, lights=jax.device_put(np.int32(len(group))))
             for group, shadow in zip(groups, shadows, strict=True)
         )
     gaussians = fill_gaussians(material.gaussians)

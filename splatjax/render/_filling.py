@@ -37,11 +37,13 @@ def fill_gaussians(gaussians: SumOfGaussians) -> SumOfGaussians:
 def fill_lights(
     group: list[tuple[int, AbstractLightSample]], number: int
 ) -> list[tuple[int, AbstractLightSample]]:
-    """Repeat the last light of a group, without its strength, up to a power of two."""
+    """Repeat the last light of a group, without its strength, up to four or a larger power of
+    two.
+    """
     last = group[-1][1]
     none = jax.device_put(np.zeros_like(getattr(last, last.strength_field)))
     dark = eqx.tree_at(lambda light: getattr(light, light.strength_field), last, none)
-    return [(number, dark)] * ((1 << (len(group) - 1).bit_length()) - len(group))
+    return [(number, dark)] * ((1 << max(len(group) - 1, 2).bit_length()) - len(group))
 
 
 def rows_at(

@@ -12,7 +12,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Bool, Float, Int
 
 from splatjax import diffusion as _diffusion, splatting as _splatting
-from splatjax._chunking import Result, rounded_up
+from splatjax._chunking import Result, as_planned, rounded_up
 from splatjax._combination import DeviceMesh, OneDevice
 from splatjax.cache import kept
 from splatjax.scene import (
@@ -31,6 +31,7 @@ from ._lighting import AbstractLighting, LightAtSplats, ShadowPlan, plan_views
 
 # Directions to all sides, for which the shadow maps of any environment are planned.
 _DIRECTIONS = [[x, y, z] for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if x or y or z]
+_MOST_SPLATS = 1.06  # times the splats of a scene, of those before that it is filled up to
 
 
 class RenderSettings(eqx.Module):
@@ -243,6 +244,7 @@ def _cut_and_order(splats: Splats, mesh: Mesh | None) -> tuple[list[Splats], Arr
     """
     devices, share = splats_per_device(splats.count, mesh)
     places = rounded_up(share, _diffusion.POINTS_PER_BLOCK, per_octave=16)
+    places = as_planned("splats", share, places, most=_MOST_SPLATS)
     filling = (0, places - share)
     whole = jax.tree.map(np.asarray, fill_up(splats, share * devices))
     parts, orders, exist = [], [], []

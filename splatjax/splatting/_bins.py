@@ -29,7 +29,9 @@ class BinCapacity(eqx.Module):
     chunks: int = eqx.field(static=True)
 
     @classmethod
-    def for_counts(cls, per_tile: Sequence[Int[Array, " tiles"]], grid: TileGrid) -> "BinCapacity":
+    def for_counts(
+        cls, per_tile: Sequence[Int[Array, " tiles"]], grid: TileGrid, spare: float = 1.03
+    ) -> "BinCapacity":
         """Choose the capacity for each of these numbers of items per tile."""
         pairs, blocks, chunks, whole = 1, 1, 1, grid.padded_count // grid.lanes
         for tiles in per_tile:
@@ -37,10 +39,11 @@ class BinCapacity(eqx.Module):
             longest = np.sort(-(-counts // grid.slots))[::-1][:: grid.lanes]
             pairs, blocks = max(pairs, int(counts.sum())), max(blocks, int(longest.sum()))
             chunks = max(chunks, int((longest > 0).sum()))
+        chunks = with_spare(("chunks", grid), chunks, -(-grid.half // 4), spare=spare)
         return cls(
-            with_spare(pairs, _ROW, per_octave=4),
-            with_spare(blocks, 4, per_octave=2),
-            min(max(with_spare(chunks, -(-grid.half // 4)), grid.half), whole),
+            with_spare(("pairs", grid), pairs, _ROW, per_octave=4, spare=spare),
+            with_spare(("blocks", grid), blocks, 4, per_octave=2, spare=spare),
+            min(max(chunks, grid.half), whole),
         )
 
     def coarse(self, grid: TileGrid) -> "BinCapacity":

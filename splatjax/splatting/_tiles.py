@@ -10,7 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from splatjax._chunking import map_chunks, needed_over_planned, take_points, with_spare
+from splatjax._chunking import (
+    as_planned,
+    map_chunks,
+    needed_over_planned,
+    take_points,
+    with_spare,
+)
 from splatjax._combination import AbstractCombination, OneDevice
 from splatjax.scene import Splats
 
@@ -31,10 +37,18 @@ class TileRasterizer(AbstractRasterizer):
     **Attributes:** (static)
 
     - `lanes`, `slots`: tiles swept together, and splats of each swept together.
+    - `spare`: times the capacity that planning found to be needed.
     """
 
     lanes: int = eqx.field(static=True, default=64)
     slots: int = eqx.field(static=True, default=32)
+    spare: float = eqx.field(static=True, default=1.03)
+
+    def for_shadows(self) -> "TileRasterizer":
+        """Return one that plans for a quarter more, so that other lights and bodies need no
+        other program: without attributes, capacity takes little memory and no time.
+        """
+        return dataclasses.replace(self, spare=1.25)
 
     def make_plan(
         self, parts: Sequence[Splats], views: Sequence[AbstractView], settings: SplattingSettings
@@ -58,9 +72,12 @@ class TileRasterizer(AbstractRasterizer):
     ) -> "TilePlan":
         """Make the plan for the demand of each part in each view, of so many splats at most."""
         grid = self.grid(view)
-        step = max(_STEP, splats // 32)
-        seen = with_spare(max(int(seen) for part in demands for seen, _ in part), step)
-        bins = BinCapacity.for_counts([tiles for part in demands for _, tiles in part], grid)
+        step = max(_STEP, splats // 8)
+        most = max(int(seen) for part in demands for seen, _ in part)
+        seen = with_spare(("seen", splats), most, step, spare=self.spare)
+        bins = BinCapacity.for_counts(
+            [tiles for part in demands for _, tiles in part], grid, self.spare
+        )
         front = bins.chunks * self.lanes
         if len(demands) > 1:
             # Places are shared by the parts: there is one for each tile that any part touches.
@@ -69,7 +86,7 @@ class TileRasterizer(AbstractRasterizer):
                 for of_view in zip(*demands, strict=True)
             ]
             grain = math.lcm(self.lanes, len(demands))
-            front = with_spare(max(int(np.sum(tiles)) for tiles in touched), grain)
+            front = with_spare(("front", grid), max(int(np.sum(tiles)) for tiles in touched), grain)
         return TilePlan(self, min(seen, splats), bins, SurfaceCapacity(front, front))
 
     def grid(self, view: AbstractView) -> TileGrid:
@@ -109,7 +126,8 @@ class TilePlan(AbstractRasterPlan):
         most = max(int(_tiles_behind(whole, view, settings, coarse)) for view in views)
         step = -(-grid.half // 8)
         grain = math.lcm(self.rasterizer.lanes * step, len(parts))
-        behind = -(-int(_SPARE * most + 1) // grain) * grain
+        kind = "behind", grid, grain
+        behind = as_planned(kind, most + 1, -(-int(_SPARE * most + 1) // grain) * grain)
         return dataclasses.replace(self, places=SurfaceCapacity(self.places.front, behind))
 
     def choose(

@@ -258,8 +258,9 @@ def test_other_bodies_lights_and_cameras_of_about_one_size_compile_nothing(compi
         camera = sj.Camera.look_at(eye, (0, -9, 0), fov=30, width=64, height=64)
         return sj.render(sj.Scene(body, lights, material), camera).beauty
 
-    bust, larger, fewer = sj.bust(4_000).scaled(0.2), sj.bust(4_000).scaled(0.21), sj.bust(3_970)
+    bust, larger, fewer = sj.bust(4_000).scaled(0.2), sj.bust(4_000).scaled(0.21), sj.bust(3_860)
     fewer, first = fewer.scaled(0.2), render(bust)
+    low, left, right = lamp(0.3, -0.2, -1.0), lamp(-0.5, -0.3, -1.0), lamp(0.5, -0.4, -0.9)
     compiled.clear()
     others = [
         render(larger),
@@ -267,11 +268,13 @@ def test_other_bodies_lights_and_cameras_of_about_one_size_compile_nothing(compi
         render(bust, eye=(-60, 24, 140)),
         render(bust, lights=[lamp(-0.5, -0.3, -1.0)]),
         render(bust, material=four),
+        render(bust, lights=[low, right]),
+        render(bust, lights=[low, left, right]),
+        render(bust, lights=[lamp(-1.0, 0.2, -0.4)]),
     ]
     assert compiled == []
 
-    # Lights of a kind are filled up to a power of two, and sorted by kind.
-    low, left, right = lamp(0.3, -0.2, -1.0), lamp(-0.5, -0.3, -1.0), lamp(0.5, -0.4, -0.9)
+    # Lights are sorted by kind.
     others.append(render(bust, lights=[left, low, right, low, point(40.0)]))
     compiled.clear()
     others += [
