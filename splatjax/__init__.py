@@ -53,6 +53,7 @@ from .render import (
     diffusion_basis as diffusion_basis,
     DiffusionBasis as DiffusionBasis,
     illuminate as illuminate,
+    transfer as transfer,
     make_plan as make_plan,
     map_over as map_over,
     picture_jacobian as picture_jacobian,

@@ -21,12 +21,13 @@ from ._lighting import (
     LightAtSplats as LightAtSplats,
     LightVisibility as LightVisibility,
 )
-from ._passes import SplatLight as SplatLight
+from ._passes import SplatLight as SplatLight, Transfer as Transfer
 from ._plan import make_plan as make_plan, Plan as Plan, RenderSettings as RenderSettings
 from ._render import (
     compute_irradiance as compute_irradiance,
     diffuse_irradiance as diffuse_irradiance,
     illuminate as illuminate,
     render as render,
+    transfer as transfer,
 )
 from ._streamed import render_streamed as render_streamed

@@ -23,6 +23,21 @@ from ._plan import Plan, RenderSettings
 from ._shade import ShadedSurface, shade
 
 
+class Transfer(eqx.Module):
+    """How much of every light reaches the splats: pass 1, which neither the strength nor the color
+    of a light changes.
+
+    **Attributes:**
+
+    - `visibility`: of each sample of lights of one kind, along the splats in the order of the plan;
+      `None` for lights that cast no shadows.
+    - `needed`: capacity needed over planned.
+    """
+
+    visibility: list[Float[Array, "_samples splats"] | None]
+    needed: Float[Array, ""]
+
+
 class SplatLight(eqx.Module):
     """Passes 1 and 4 on the splats, which do not depend on the camera.
 
@@ -57,6 +72,7 @@ def light_splats(
     bounds: _splatting.Bounds,
     at: Int[Array, " chosen"] | None = None,
     derivative: bool = False,
+    transfer: Transfer | None = None,
 ) -> SplatLight:
     """Light the splats, and diffuse their irradiance among them: passes 1 and 4.
 
@@ -65,10 +81,14 @@ def light_splats(
     - `bounds`: of the splats of all devices.
     - `at`: the splats whose light is returned, in ascending order; all for `None`.
     - `derivative`: also differentiate the layers in the material's Gaussians.
+    - `transfer`: in the place of pass 1.
     """
-    light = cast_shadows(
-        scene, bounds, plan.shadows, settings.splatting, settings.shadows, combination
-    )
+    if transfer is None:
+        light = cast_shadows(
+            scene, bounds, plan.shadows, settings.splatting, settings.shadows, combination
+        )
+    else:
+        light = LightVisibility(stack_lights(scene.lights), transfer.visibility, transfer.needed)
     irradiance, added = irradiance_at_splats(scene, light), None
     if derivative and scene.material.single_scattering is not None:
         irradiance, added = _differentiated_irradiance(scene, light)

@@ -2,6 +2,7 @@
 
 import dataclasses
 from functools import partial
+from typing import TypeVar
 
 import equinox as eqx
 import jax
@@ -11,7 +12,7 @@ from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Float
 
 from splatjax._chunking import take_points
-from splatjax._combination import lay_out
+from splatjax._combination import AbstractCombination, lay_out
 from splatjax.cache import kept_jit
 from splatjax.scene import Camera, Frame, Scene, lights_by_kind
 from splatjax.splatting import Bounds
@@ -19,8 +20,14 @@ from splatjax.splatting import Bounds
 from ._checks import check_channels
 from ._devices import filled_like, on_devices
 from ._filling import rows_at
-from ._lighting import Irradiance, LightAtSplats, cast_shadows, irradiance_at_splats
-from ._passes import SplatLight, diffuse_splats, light_splats, see_and_shade
+from ._lighting import (
+    Irradiance,
+    LightAtSplats,
+    LightVisibility,
+    cast_shadows,
+    irradiance_at_splats,
+)
+from ._passes import SplatLight, Transfer, diffuse_splats, light_splats, see_and_shade
 from ._plan import (
     Plan,
     RenderSettings,
@@ -29,6 +36,8 @@ from ._plan import (
     splats_per_device,
 )
 from ._shade import compose
+
+Kept = TypeVar("Kept", SplatLight, Transfer)
 
 
 def render(
@@ -66,7 +75,7 @@ def render(
     return places.frame(frame)
 
 
-def fitted(light: SplatLight, scene: Scene) -> SplatLight:
+def fitted(light: Kept, scene: Scene) -> Kept:
     """Give each kind of lights a row of visibility for every sample that the scene has of it."""
     groups = zip(light.visibility, lights_by_kind(scene.lights), strict=True)
     visibility = [rows if rows is None else rows_at(rows, np.arange(len(g))) for rows, g in groups]
@@ -98,6 +107,7 @@ def illuminate(
     plan: Plan,
     settings: RenderSettings = RenderSettings(),
     derivative: bool = False,
+    transfer: Transfer | None = None,
 ) -> SplatLight:
     r"""Light a body and diffuse its light: passes 1 and 4, which no camera changes.
 
@@ -109,6 +119,8 @@ def illuminate(
     - `plan`: from `splatjax.make_plan`.
     - `settings`: those of the plan.
     - `derivative`: as for `diffusion_basis`.
+    - `transfer`: from `splatjax.transfer` with the same splats, settings and plan, for lights of
+      the same kinds in the same order: no shadow map is made. Differentiable.
 
     **Returns:** the light on the splats, in the order of the plan.
 
@@ -117,17 +129,75 @@ def illuminate(
     """
     check_channels(scene)
     check_plan(plan, scene)
-    filled, plan, _ = filled_like(scene, plan)
-    return fitted(_illuminate(filled, plan, settings, derivative), scene)
+    filled, plan, _ = filled_like(scene, plan, transfer)
+    if transfer is not None:
+        transfer = fitted(transfer, filled)
+    return fitted(_illuminate(filled, plan, settings, derivative, transfer), scene)
 
 
 @kept_jit
-def _illuminate(scene: Scene, plan: Plan, settings: RenderSettings, derivative: bool) -> SplatLight:
-    def passes(combination, scene, plan):
+def _illuminate(
+    scene: Scene,
+    plan: Plan,
+    settings: RenderSettings,
+    derivative: bool,
+    transfer: Transfer | None,
+) -> SplatLight:
+    def passes(combination, scene, plan, transfer=None):
         bounds = Bounds.of(scene.splats, combination)
-        return light_splats(scene, settings, plan, combination, bounds, derivative=derivative)
+        return light_splats(
+            scene,
+            settings,
+            plan,
+            combination,
+            bounds,
+            derivative=derivative,
+            transfer=transfer,
+        )
+
+    return on_devices(passes, scene, plan, by_splat=True, placed=transfer)
+
+
+def transfer(scene: Scene, plan: Plan, settings: RenderSettings = RenderSettings()) -> Transfer:
+    r"""Make the shadow maps of all lights, and keep how much of each light reaches every splat.
+
+    Give the result to `illuminate`, for lights of other strengths and colors. An environment whose
+    `directions` are given may also have another image or rotation:
+
+        white = EnvironmentLight(np.ones((1, 2, 1)), directions=scene.even_directions(128))
+        kept = transfer(Scene(splats, [white], material), plan)
+        light = illuminate(Scene(splats, [environment], material), plan, transfer=kept)
+        frame = render(Scene(splats, [environment], material), camera, plan=plan, light=light)
+
+    **Arguments:** as for `illuminate`.
+
+    **Returns:** a `Transfer`: 4 bytes for each splat and sample in float32.
+
+    **Raises:** `ValueError` as `illuminate`.
+    """
+    check_channels(scene)
+    check_plan(plan, scene)
+    filled, plan, _ = filled_like(scene, plan)
+    return fitted(_transfer(filled, plan, settings), scene)
+
+
+@kept_jit
+def _transfer(scene: Scene, plan: Plan, settings: RenderSettings) -> Transfer:
+    def passes(combination, scene, plan):
+        light = cast_lights(scene, settings, plan, combination)
+        return Transfer(light.visibility, light.needed)
 
     return on_devices(passes, scene, plan, by_splat=True)
+
+
+def cast_lights(
+    scene: Scene, settings: RenderSettings, plan: Plan, combination: AbstractCombination
+) -> LightVisibility:
+    """Carry out pass 1 alone."""
+    bounds = Bounds.of(scene.splats, combination)
+    return cast_shadows(
+        scene, bounds, plan.shadows, settings.splatting, settings.shadows, combination
+    )
 
 
 def compute_irradiance(
@@ -150,11 +220,7 @@ def compute_irradiance(
 @eqx.filter_jit
 def _compute_irradiance(scene: Scene, plan: Plan, settings: RenderSettings) -> Irradiance:
     def passes(combination, scene, plan):
-        bounds = Bounds.of(scene.splats, combination)
-        light = cast_shadows(
-            scene, bounds, plan.shadows, settings.splatting, settings.shadows, combination
-        )
-        return irradiance_at_splats(scene, light)
+        return irradiance_at_splats(scene, cast_lights(scene, settings, plan, combination))
 
     placed = on_devices(passes, scene, plan, by_splat=True), plan.order, plan.exists
     if plan.mesh is not None:

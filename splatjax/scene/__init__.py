@@ -6,7 +6,10 @@ from ._area_lights import (
     RectangleLight as RectangleLight,
     SphereLight as SphereLight,
 )
-from ._environment import EnvironmentLight as EnvironmentLight
+from ._environment import (
+    EnvironmentLight as EnvironmentLight,
+    even_directions as even_directions,
+)
 from ._lights import (
     AbstractExtendedLight as AbstractExtendedLight,
     AbstractHighlight as AbstractHighlight,

@@ -44,7 +44,10 @@ class EnvironmentLight(AbstractExtendedLight):
     - `strength`: a factor on each channel. Differentiable.
     - `up`: the direction of the image's upper edge: (0, 0, 1) for a world whose z is up; the middle
       of the image is then -y. Any length but zero. Differentiable.
-    - `count`: of samples. Static.
+    - `directions`: where to the samples lie, in the world, any length but zero; `None` to lay them
+      out by the image. With directions that stay, what was kept of one environment's shadows holds
+      for all (`splatjax.transfer`). Each pixel lights along those near it.
+    - `count`: of samples that are laid out by the image. Static.
     - `cast_shadows`: static.
 
     **Raises:** `ValueError` for an image that is not twice as wide as high, holds whole numbers, or
@@ -57,6 +60,7 @@ class EnvironmentLight(AbstractExtendedLight):
     rotation: Float[Array, ""] = eqx.field(converter=numbers, default=0.0)
     strength: Float[Array, " channels"] = eqx.field(converter=numbers, default=1.0)
     up: Float[Array, "3"] = eqx.field(converter=numbers, default=(0.0, 1.0, 0.0))
+    directions: Float[Array, "samples 3"] | None = eqx.field(converter=numbers, default=None)
     strength_field: ClassVar[str] = "strength"
 
     def __check_init__(self):
@@ -86,35 +90,24 @@ class EnvironmentLight(AbstractExtendedLight):
 
     @jit_unless_traced
     def stacked_samples(self) -> AbstractLightSample:
-        """Cut the sphere into strata along a Hilbert curve."""
         height = self.image.shape[0]
         directions, solid_angles = pixel_directions(height, self.image.dtype)
         radiance = self.radiance()
         brightness = jnp.mean(radiance, axis=-1)
         mean = jnp.sum(brightness * solid_angles) / (4 * jnp.pi)
         relative = brightness / jnp.where(mean > 0, mean, 1.0)
-        moments = [
-            radiance * solid_angles[..., None],
-            ((relative + _FAINT) * solid_angles)[..., None] * directions,
-            jnp.stack([relative * solid_angles, solid_angles], axis=-1),
-        ]
-
-        # Sum over cells of equal area, in the order of the curve.
-        along = np.arange(2 * height) * _CELLS // (2 * height)
-        middles = 0.5 * (1 - np.cos(np.pi * (np.arange(height) + 0.5) / height))
-        down = (middles * _CELLS).astype(int)
-        order = _hilbert_curve(_CELLS)[down[:, None], along[None]].reshape(-1)
-        moments = jnp.concatenate(moments, axis=-1).reshape(len(order), -1)
-        cells = jnp.zeros((_CELLS**2, moments.shape[1]), moments.dtype).at[order].add(moments)
-
-        # Cut the curve. No cell counts for more than a stratum: the next would have nothing left.
-        importance, even = jax.lax.stop_gradient(cells[:, -2:]).T
-        importance = (1 - _EVEN) * importance + _EVEN * even
-        for _ in range(8):
-            importance = jnp.minimum(importance / jnp.sum(importance), 1 / self.count)
-        middles = (jnp.cumsum(importance) - 0.5 * importance) / jnp.sum(importance)
-        stratum = jnp.minimum((middles * self.count).astype(jnp.int32), self.count - 1)
-        strata = jnp.zeros((self.count, cells.shape[1]), cells.dtype).at[stratum].add(cells)
+        moments = jnp.concatenate(
+            [
+                radiance * solid_angles[..., None],
+                ((relative + _FAINT) * solid_angles)[..., None] * directions,
+                jnp.stack([relative * solid_angles, solid_angles], axis=-1),
+            ],
+            axis=-1,
+        )
+        if self.directions is None:
+            strata = self._cut(moments)
+        else:
+            strata = self._shared(directions, moments)
 
         towards, irradiance = strata[:, -5:-2], strata[:, :-5]
         is_filled = jnp.sum(towards**2, axis=-1, keepdims=True) > 0
@@ -127,6 +120,43 @@ class EnvironmentLight(AbstractExtendedLight):
             )
 
         return jax.vmap(sample)(towards, irradiance)
+
+    def _shared(
+        self, directions: Float[Array, "height width 3"], moments: Float[Array, "height width sums"]
+    ) -> Float[Array, "samples sums"]:
+        """Sum the moments of the pixels near each of the given directions: every pixel is shared
+        out by Gaussians half as wide as these are apart.
+        """
+        given = self.directions / jnp.linalg.norm(self.directions, axis=1, keepdims=True)
+        given = given @ self.to_world()
+        narrowness = len(given) / jnp.pi  # over the squared angle
+
+        def of_row(row):
+            towards, moments = row
+            shares = jax.nn.softmax(narrowness * towards @ given.T, axis=1)
+            return shares.T @ moments
+
+        return jnp.sum(jax.lax.map(of_row, (directions, moments)), axis=0)
+
+    def _cut(self, moments: Float[Array, "height width sums"]) -> Float[Array, "strata sums"]:
+        """Sum the moments over strata, which are cut from the sphere along a Hilbert curve."""
+        # Sum over cells of equal area, in the order of the curve.
+        height = len(moments)
+        along = np.arange(2 * height) * _CELLS // (2 * height)
+        middles = 0.5 * (1 - np.cos(np.pi * (np.arange(height) + 0.5) / height))
+        down = (middles * _CELLS).astype(int)
+        order = _hilbert_curve(_CELLS)[down[:, None], along[None]].reshape(-1)
+        moments = moments.reshape(len(order), -1)
+        cells = jnp.zeros((_CELLS**2, moments.shape[1]), moments.dtype).at[order].add(moments)
+
+        # Cut the curve. No cell counts for more than a stratum: the next would have nothing left.
+        importance, even = jax.lax.stop_gradient(cells[:, -2:]).T
+        importance = (1 - _EVEN) * importance + _EVEN * even
+        for _ in range(8):
+            importance = jnp.minimum(importance / jnp.sum(importance), 1 / self.count)
+        middles = (jnp.cumsum(importance) - 0.5 * importance) / jnp.sum(importance)
+        stratum = jnp.minimum((middles * self.count).astype(jnp.int32), self.count - 1)
+        return jnp.zeros((self.count, cells.shape[1]), cells.dtype).at[stratum].add(cells)
 
     def highlight(self) -> "BlurredEnvironment":
         return BlurredEnvironment(_blurred(self.radiance()), self.to_world())
@@ -168,6 +198,14 @@ class BlurredEnvironment(AbstractHighlight):
         places = [jnp.broadcast_to(level, row.shape), row, column]
         interpolate = functools.partial(map_coordinates, order=1, mode="nearest")
         return jax.vmap(interpolate, (-1, None), -1)(self.maps, places)
+
+
+def even_directions(count: int) -> Float[np.ndarray, "count 3"]:
+    """Spread directions evenly over the sphere, along a Fibonacci spiral."""
+    i = np.arange(count) + 0.5
+    height, angle = 1 - 2 * i / count, np.pi * (5**0.5 - 1) * i
+    across = np.sqrt(1 - height * height)
+    return np.stack([across * np.cos(angle), height, across * np.sin(angle)], axis=1)
 
 
 def pixel_directions(

@@ -22,6 +22,10 @@ _TOUCHING = 1e-6  # mm
 _EXPECTED = {
     "direction": ("the way light travels, not zero", np.any),
     "variance": ("positive (mm^2)", lambda x: x > 0),
+    "directions": (
+        "directions of the samples, none of them zero",
+        lambda x: np.all(np.any(x, axis=-1)),
+    ),
     "up": ("the direction of the image's upper edge, not zero", np.any),
     "radius": ("positive (mm)", lambda x: x > 0),
     "count": ("1 or more samples", lambda x: x >= 1),

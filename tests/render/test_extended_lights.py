@@ -1,14 +1,16 @@
 """Environments and area lights: what samples stand for them, against integrals in closed form."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import OpenEXR
 import pytest
 from bodies import PLAIN, apart, camera_over, joined, sheet, sphere, two_gaussians, unit
+from jax.test_util import check_grads
 
 import splatjax as sj
 from splatjax.diffusion import DenseDiffuser
-from splatjax.scene import DiskLight, RectangleLight, SphereLight
+from splatjax.scene import DiskLight, RectangleLight, SphereLight, even_directions
 
 BARE = sj.Material(two_gaussians(), specular=0.0)
 GLOSSY = sj.Material(two_gaussians(), specular=1.0, roughness=0.4)
@@ -44,11 +46,13 @@ def irradiance(light, body: sj.Splats) -> np.ndarray:
     return np.asarray(sj.compute_irradiance(scene, plan, PLAIN).entering.T, float)
 
 
+@pytest.mark.parametrize("is_even", [False, True])
 @pytest.mark.parametrize("count", SAMPLED)
-def test_irradiance_on_a_ball_is_that_of_the_harmonic_bands(count):
+def test_irradiance_on_a_ball_is_that_of_the_harmonic_bands(count, is_even):
     """pi, 2 pi / 3 and pi / 4 times the radiance of each band, to the sampling error."""
     body = sphere(600)
-    light = sj.EnvironmentLight(harmonics(), count=count, cast_shadows=False)
+    samples = {"directions": even_directions(count)} if is_even else {"count": count}
+    light = sj.EnvironmentLight(harmonics(), **samples, cast_shadows=False)
     n = np.asarray(body.normals, float)
     first = np.pi + 2 * np.pi / 3 * n @ np.asarray([0.6, 0.5, -0.3])
     exact = [np.full(len(n), np.pi), first, np.pi + np.pi / 4 * n[:, 0] * n[:, 1]]
@@ -100,6 +104,40 @@ def test_a_turned_map_is_a_body_turned_back(up):
     np.testing.assert_allclose(
         irradiance(turned, BODY), irradiance(straight, back), rtol=1e-4, atol=1e-2
     )
+
+
+EVEN = even_directions(24)
+
+
+def under_two(image, rotation=0.0, strength=1.0) -> sj.Scene:
+    sky = sj.EnvironmentLight(image, rotation, directions=EVEN)
+    return sj.Scene(BODY, (sky, sj.DirectionalLight([0.3, -0.2, -1], strength)), BARE)
+
+
+@pytest.mark.once
+def test_kept_shadows_serve_other_strengths_images_and_rotations():
+    first = under_two(np.ones((8, 16, 3)), strength=[1, 1, 1])
+    plan = sj.make_plan(first, CAMERA, PLAIN)
+    kept = sj.transfer(first, plan, PLAIN)
+    for image, rotation, most in ((np.full((8, 16, 3), 0.3), 0, 1e-5), (harmonics(), 70, 0.05)):
+        scene = under_two(image, rotation, [0.1, 2, 3])
+        light, exact = (sj.illuminate(scene, plan, PLAIN, transfer=given) for given in (kept, None))
+        apart_by = np.abs(light.irradiance.entering - exact.irradiance.entering)
+        assert np.max(apart_by) < most * np.max(exact.irradiance.entering)
+        frames = (sj.render(scene, CAMERA, PLAIN, plan, light=each) for each in (light, exact))
+        assert apart(*(frame.beauty for frame in frames))[""] < most
+
+
+def test_light_with_kept_shadows_has_its_derivatives(float64):
+    plan = sj.make_plan(under_two(harmonics(8)), CAMERA, PLAIN)
+    kept = sj.transfer(under_two(harmonics(8)), plan, PLAIN)
+    factors = np.random.default_rng(3).normal(size=(3, BODY.count))
+
+    def received(image, rotation):
+        light = sj.illuminate(under_two(image, rotation), plan, PLAIN, transfer=kept)
+        return jnp.vdot(factors, light.irradiance.entering[:, : BODY.count])
+
+    check_grads(jax.jit(received), (jnp.asarray(harmonics(8)), 20.0), 1, ["rev"], rtol=1e-6)
 
 
 PLACE, FACING = np.asarray([400.0, 300.0, 1200.0]), unit([-400.0, -300.0, -1200.0])
@@ -190,6 +228,7 @@ REFUSED = [
     (environment(np.ones((2, 4, 3), np.uint8)), "EnvironmentLight.image .*uint8.*floating"),
     (environment(np.ones((2, 4, 3)), count=0), "EnvironmentLight.count .*got 0"),
     (environment(np.ones((2, 4, 3)), up=(0, 0, 0)), "EnvironmentLight.up .*not zero"),
+    (environment(np.ones((2, 4, 3)), directions=[[0, 0, 0]]), "EnvironmentLight.directions .*zero"),
     (lambda: RectangleLight([0] * 3, 1, [[1, 0, 0], [2, 0, 0]]), "RectangleLight.edges .*area"),
     (lambda: SphereLight([0, 0, 0], 1, 0), "SphereLight.radius .*positive"),
 ]
