@@ -1,7 +1,5 @@
 """A picture for any weights: everything that they do not change is rendered once."""
 
-from functools import partial
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -14,7 +12,7 @@ from splatjax.splatting import invalid_factor
 
 from ._devices import filled_like, on_devices
 from ._filling import rows_at
-from ._passes import SplatLight, in_a_row, light_splats, see_and_shade
+from ._passes import SplatLight, Transfer, in_a_row, light_source, see_and_shade
 from ._plan import Plan, RenderSettings, plan_unless_traced
 from ._render import fitted
 from ._shade import ShadedSurface
@@ -70,7 +68,7 @@ def diffusion_basis(
     settings: RenderSettings = RenderSettings(),
     plan: Plan | None = None,
     derivative: bool = False,
-    light: SplatLight | None = None,
+    light: SplatLight | Transfer | None = None,
 ) -> DiffusionBasis:
     r"""Render everything that the weights of the material do not change: the picture of all
     materials with its variances.
@@ -83,8 +81,7 @@ def diffusion_basis(
     - `derivative`: also differentiate the layers in their variances, for about one more pass 4. The
       picture then has the derivatives of `picture_jacobian`, by weights and variances that are made
       of anything.
-    - `light`: from `splatjax.illuminate` with the same scene, settings, plan and derivative, for
-      pictures of several cameras.
+    - `light`: as for `render`; from `splatjax.illuminate` with the same derivative.
 
     **Returns:** a `DiffusionBasis`; NaN where the plan does not suffice.
 
@@ -118,7 +115,7 @@ def _diffusion_basis(
     settings: RenderSettings,
     plan: Plan,
     derivative: bool,
-    light: SplatLight | None,
+    light: SplatLight | Transfer | None,
 ) -> DiffusionBasis:
     def passes(combination, scene, plan, camera, light=None):
         def read(shaded: ShadedSurface, at: LayersAtPoints, _):
@@ -128,14 +125,13 @@ def _diffusion_basis(
                 shaded.specular,
             )
 
-        light_at = partial(light_splats, scene, settings, plan, combination, derivative=derivative)
         (*rows, specular), visible = see_and_shade(
             scene,
             camera,
             settings,
             plan,
             combination,
-            light_at if light is None else lambda _, chosen: light.take(chosen),
+            light_source(scene, settings, plan, combination, light, derivative),
             read,
         )
         layers, per_exitance = jax.tree.map(in_a_row, rows)

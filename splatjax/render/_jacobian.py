@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Callable
-from functools import partial
 from typing import TypeVar
 
 import equinox as eqx
@@ -18,7 +17,7 @@ from ._attributes import SurfaceSamples
 from ._devices import filled_like, on_devices
 from ._filling import rows_at
 from ._lighting import LightAtSplats
-from ._passes import light_splats, see_and_shade
+from ._passes import light_source, see_and_shade
 from ._plan import Plan, RenderSettings, plan_unless_traced
 from ._shade import ShadedSurface, compose, layers_at_points
 
@@ -142,7 +141,7 @@ def _picture_jacobian(
             per_exitance = shaded.radiance_per_exitance[None]
             return shaded, per_exitance * of_weights, per_exitance * of_variances
 
-        light_at = partial(light_splats, scene, settings, plan, combination, derivative=True)
+        light_at = light_source(scene, settings, plan, combination, None, derivative=True)
         (shaded, *derivatives), visible = see_and_shade(
             scene, camera, settings, plan, combination, light_at, read
         )

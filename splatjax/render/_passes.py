@@ -104,6 +104,24 @@ def light_splats(
     return SplatLight(visibility, irradiance, layers, log_variance_derivative, added, needed)
 
 
+def light_source(
+    scene: Scene,
+    settings: RenderSettings,
+    plan: Plan,
+    combination: AbstractCombination,
+    light: SplatLight | Transfer | None,
+    derivative: bool = False,
+) -> Callable[..., SplatLight]:
+    """Return what carries out passes 1 and 4 for `see_and_shade`, or takes them from what was
+    kept.
+    """
+    if isinstance(light, SplatLight):
+        return lambda _, chosen: light.take(chosen)
+    return partial(
+        light_splats, scene, settings, plan, combination, derivative=derivative, transfer=light
+    )
+
+
 def _differentiated_irradiance(
     scene: Scene, light: LightVisibility
 ) -> tuple[Irradiance, Float[Array, "channels splats"]]:
@@ -161,7 +179,7 @@ def see_and_shade(
     **Arguments:**
 
     - `light_at`: passes 1 and 4, of the bounds of all splats, for those that the camera may see:
-      `light_splats`.
+      `light_source`.
     - `read`: pointwise, along the last axis.
 
     **Returns:** what was read, for each place; and the places, with the capacity needed of all

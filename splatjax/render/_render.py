@@ -1,7 +1,6 @@
 """A picture with all its layers, the light of a body without a camera, and pass 4 alone."""
 
 import dataclasses
-from functools import partial
 from typing import TypeVar
 
 import equinox as eqx
@@ -27,7 +26,7 @@ from ._lighting import (
     cast_shadows,
     irradiance_at_splats,
 )
-from ._passes import SplatLight, Transfer, diffuse_splats, light_splats, see_and_shade
+from ._passes import SplatLight, Transfer, diffuse_splats, light_source, see_and_shade
 from ._plan import (
     Plan,
     RenderSettings,
@@ -37,7 +36,7 @@ from ._plan import (
 )
 from ._shade import compose
 
-Kept = TypeVar("Kept", SplatLight, Transfer)
+Kept = TypeVar("Kept", bound=SplatLight | Transfer)
 
 
 def render(
@@ -46,7 +45,7 @@ def render(
     settings: RenderSettings = RenderSettings(),
     plan: Plan | None = None,
     mesh: Mesh | None = None,
-    light: SplatLight | None = None,
+    light: SplatLight | Transfer | None = None,
 ) -> Frame:
     r"""Render a picture with all its layers: shadow maps, visibility, attributes, diffusion,
     shading.
@@ -59,8 +58,9 @@ def render(
     - `plan`: from `splatjax.make_plan`; needed under `jit`, `grad` and `vmap`, made here otherwise.
     - `mesh`: devices over which the splats are cut, whatever its axes: each holds a share, and
       their gradients (docs/devices.md). By default the mesh of the plan.
-    - `light`: from `splatjax.illuminate` with the same scene, settings and plan: passes 1 and 4,
-      which do not depend on the camera, are then not repeated. Differentiable.
+    - `light`: what was kept, for the same settings and plan: from `splatjax.illuminate` with the
+      same scene, passes 1 and 4, which do not depend on the camera; or from `splatjax.transfer`
+      with the same splats, pass 1, which does not depend on how strong a light is. Differentiable.
 
     **Returns:** a `Frame` in the dtype of `splats.centers`; the same on every device, and to
     rounding whatever the mesh.
@@ -84,17 +84,20 @@ def fitted(light: Kept, scene: Scene) -> Kept:
 
 @kept_jit
 def _render(
-    scene: Scene, camera: Camera, settings: RenderSettings, plan: Plan, light: SplatLight | None
+    scene: Scene,
+    camera: Camera,
+    settings: RenderSettings,
+    plan: Plan,
+    light: SplatLight | Transfer | None,
 ) -> Frame:
     def passes(combination, scene, plan, camera, light=None):
-        light_at = partial(light_splats, scene, settings, plan, combination)
         shaded, visible = see_and_shade(
             scene,
             camera,
             settings,
             plan,
             combination,
-            light_at if light is None else lambda _, chosen: light.take(chosen),
+            light_source(scene, settings, plan, combination, light),
             read=lambda shaded, *_: shaded,
         )
         return compose(scene, shaded, visible)
@@ -107,7 +110,7 @@ def illuminate(
     plan: Plan,
     settings: RenderSettings = RenderSettings(),
     derivative: bool = False,
-    transfer: Transfer | None = None,
+    light: Transfer | None = None,
 ) -> SplatLight:
     r"""Light a body and diffuse its light: passes 1 and 4, which no camera changes.
 
@@ -119,8 +122,8 @@ def illuminate(
     - `plan`: from `splatjax.make_plan`.
     - `settings`: those of the plan.
     - `derivative`: as for `diffusion_basis`.
-    - `transfer`: from `splatjax.transfer` with the same splats, settings and plan, for lights of
-      the same kinds in the same order: no shadow map is made. Differentiable.
+    - `light`: from `splatjax.transfer` with the same splats, settings and plan, for lights of the
+      same kinds in the same order: no shadow map is made. Differentiable.
 
     **Returns:** the light on the splats, in the order of the plan.
 
@@ -129,45 +132,32 @@ def illuminate(
     """
     check_channels(scene)
     check_plan(plan, scene)
-    filled, plan, _ = filled_like(scene, plan, transfer)
-    if transfer is not None:
-        transfer = fitted(transfer, filled)
-    return fitted(_illuminate(filled, plan, settings, derivative, transfer), scene)
+    filled, plan, _ = filled_like(scene, plan, light)
+    found = _illuminate(filled, plan, settings, derivative, light and fitted(light, filled))
+    return fitted(found, scene)
 
 
 @kept_jit
 def _illuminate(
-    scene: Scene,
-    plan: Plan,
-    settings: RenderSettings,
-    derivative: bool,
-    transfer: Transfer | None,
+    scene: Scene, plan: Plan, settings: RenderSettings, derivative: bool, light: Transfer | None
 ) -> SplatLight:
-    def passes(combination, scene, plan, transfer=None):
+    def passes(combination, scene, plan, light=None):
         bounds = Bounds.of(scene.splats, combination)
-        return light_splats(
-            scene,
-            settings,
-            plan,
-            combination,
-            bounds,
-            derivative=derivative,
-            transfer=transfer,
-        )
+        return light_source(scene, settings, plan, combination, light, derivative)(bounds, None)
 
-    return on_devices(passes, scene, plan, by_splat=True, placed=transfer)
+    return on_devices(passes, scene, plan, by_splat=True, placed=light)
 
 
 def transfer(scene: Scene, plan: Plan, settings: RenderSettings = RenderSettings()) -> Transfer:
     r"""Make the shadow maps of all lights, and keep how much of each light reaches every splat.
 
-    Give the result to `illuminate`, for lights of other strengths and colors. An environment whose
-    `directions` are given may also have another image or rotation:
+    Give the result to `render` or `illuminate`, for lights of other strengths and colors. An
+    environment whose `directions` are given may also have another image of the size, or another
+    rotation:
 
-        white = EnvironmentLight(np.ones((1, 2, 1)), directions=scene.even_directions(128))
+        white = EnvironmentLight(np.ones((64, 128, 3)), directions=even_directions(128))
         kept = transfer(Scene(splats, [white], material), plan)
-        light = illuminate(Scene(splats, [environment], material), plan, transfer=kept)
-        frame = render(Scene(splats, [environment], material), camera, plan=plan, light=light)
+        frame = render(Scene(splats, [environment], material), camera, plan=plan, light=kept)
 
     **Arguments:** as for `illuminate`.
 

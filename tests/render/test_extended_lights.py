@@ -121,10 +121,10 @@ def test_kept_shadows_serve_other_strengths_images_and_rotations():
     kept = sj.transfer(first, plan, PLAIN)
     for image, rotation, most in ((np.full((8, 16, 3), 0.3), 0, 1e-5), (harmonics(), 70, 0.05)):
         scene = under_two(image, rotation, [0.1, 2, 3])
-        light, exact = (sj.illuminate(scene, plan, PLAIN, transfer=given) for given in (kept, None))
+        light, exact = (sj.illuminate(scene, plan, PLAIN, light=given) for given in (kept, None))
         apart_by = np.abs(light.irradiance.entering - exact.irradiance.entering)
         assert np.max(apart_by) < most * np.max(exact.irradiance.entering)
-        frames = (sj.render(scene, CAMERA, PLAIN, plan, light=each) for each in (light, exact))
+        frames = (sj.render(scene, CAMERA, PLAIN, plan, light=each) for each in (kept, exact))
         assert apart(*(frame.beauty for frame in frames))[""] < most
 
 
@@ -134,7 +134,7 @@ def test_light_with_kept_shadows_has_its_derivatives(float64):
     factors = np.random.default_rng(3).normal(size=(3, BODY.count))
 
     def received(image, rotation):
-        light = sj.illuminate(under_two(image, rotation), plan, PLAIN, transfer=kept)
+        light = sj.illuminate(under_two(image, rotation), plan, PLAIN, light=kept)
         return jnp.vdot(factors, light.irradiance.entering[:, : BODY.count])
 
     check_grads(jax.jit(received), (jnp.asarray(harmonics(8)), 20.0), 1, ["rev"], rtol=1e-6)
