@@ -151,7 +151,8 @@ def test_a_soft_shadow_is_the_fraction_of_the_rectangle_that_is_seen():
 
 @pytest.mark.once
 def test_another_environment_of_the_size_compiles_nothing_and_keeps_the_plan(compiled):
-    body, sun = sphere(2000), sj.scene.sun_and_sky(height=32)
+    # Edge-on and face-on it needs other capacities.
+    body, sun = sheet(8.0, 0.25, normal=(1.0, 0.0, 0.2)), sj.scene.sun_and_sky(height=32)
     first = sj.Scene(body, sj.EnvironmentLight(sun, count=8), BARE)
     plan = sj.make_plan(first, CAMERA, TILES)
     before = sj.render(first, CAMERA, TILES, plan)
