@@ -217,7 +217,7 @@ def _compute_irradiance(scene: Scene, plan: Plan, settings: RenderSettings) -> I
         placed = lay_out(plan.mesh, placed, jax.tree.map(lambda _: PartitionSpec(), placed))
     irradiance, order, exists = placed
     devices, share = splats_per_device(scene.splats.count, plan.mesh)
-    device = jnp.repeat(jnp.arange(devices), len(order) // devices)
+    device = jnp.repeat(jnp.arange(devices, dtype=order.dtype), len(order) // devices)
     splat = jnp.where(exists, device * share + order, scene.splats.count)
 
     def in_scene_order(rows):

@@ -1,7 +1,6 @@
 """Lights of a size, near a body: rectangles, disks and balls of even radiance."""
 
 import abc
-from collections.abc import Sequence
 from typing import ClassVar
 
 import equinox as eqx
@@ -10,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from splatjax._records import Numbers, check_values, numbers, record
+from splatjax._records import Numbers, as_floats, check_values, numbers, record
 
 from ._lights import AbstractExtendedLight, AbstractHighlight, AbstractLightSample, EmitterStratum
 from ._scene import rotation_towards
@@ -129,10 +128,10 @@ class RectangleLight(AbstractAreaLight):
     @classmethod
     def facing(
         cls,
-        center: Sequence[float],
-        target: Sequence[float],
-        width: float,
-        height: float,
+        center: Numbers,
+        target: Numbers,
+        width: Numbers,
+        height: Numbers,
         radiance: Numbers,
         **settings,
     ) -> "RectangleLight":
@@ -140,7 +139,8 @@ class RectangleLight(AbstractAreaLight):
 
         **Arguments:** mm; `settings` are `count` and `cast_shadows`.
         """
-        towards = jnp.asarray(target, float) - jnp.asarray(center, float)
+        center = as_floats(center)
+        towards = as_floats(target) - center
         up = jnp.asarray([0.0, 1.0, 0.0], towards.dtype)
         right, down, _ = rotation_towards(towards / jnp.linalg.norm(towards), up)
         return cls(center, radiance, jnp.stack([width * right, height * down]), **settings)
