@@ -20,6 +20,9 @@ _LARGEST = 16_383  # pixels along a side of a WebP file
 _MOST_FRAMES = 10_000  # that four digits can name
 
 
+Rendered = tuple[sj.Frame, sj.Material, tuple[sj.scene.AbstractLight, ...], sj.Camera]
+
+
 @dataclass(frozen=True, kw_only=True)
 class Render(ViewOptions):
     """Render splats, or the built-in bust: an EXR file with every layer, and a PNG file beside it.
@@ -48,15 +51,13 @@ class Render(ViewOptions):
         is_valid = self.stream == 0 or (self.stream > 0 and self.splats is not None)
         expected = "be a number of splats of a PLY file, which must be named"
         check_options(self, {"stream": (is_valid, expected)})
-        frame, material = (
-            self._streamed(self.splats) if self.splats and self.stream else self._at_once()
-        )
-        self.note_unresolved_layers(frame, material)
+        rendered = self._streamed(self.splats) if self.splats and self.stream else self._at_once()
+        self.note_unresolved_layers(*rendered[:2])
         with stage(f"writing {self.output} and {self.output.with_suffix('.png')}"):
-            written = self.write(self.output, frame, material)
+            written = self.write(self.output, *rendered)
         print(*written, sep="\n")
 
-    def _at_once(self) -> tuple[sj.Frame, sj.Material]:
+    def _at_once(self) -> Rendered:
         splats, material = self.load()
         camera = self.camera(lambda: [splats], self.azimuth)
         scene = sj.Scene(splats, self.lights(material, self.azimuth, self.light_azimuth), material)
@@ -64,9 +65,9 @@ class Render(ViewOptions):
             with stage("planning"):
                 plan = sj.make_plan(scene, camera)
             with stage(f"rendering {splats.count} splats at {self.width} x {self.height}"):
-                return draw(scene, camera, plan), material
+                return draw(scene, camera, plan), material, scene.lights, camera
 
-    def _streamed(self, path: Path) -> tuple[sj.Frame, sj.Material]:
+    def _streamed(self, path: Path) -> Rendered:
         file = sj.SplatFile(path, self.stream, up=self.up)
 
         def parts() -> Iterable[sj.Splats]:
@@ -80,7 +81,7 @@ class Render(ViewOptions):
             frame = sj.render_streamed(
                 parts, lights, material, camera, report=lambda what, done: report(done, what)
             )
-        return frame, material
+        return frame, material, lights, camera
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -192,6 +193,6 @@ class Turntable(ViewOptions):
         def make(i: int) -> None:
             frame = draw(scenes[i], cameras[i], plan, light)
             self.note_unresolved_layers(frame, material)
-            self.write(paths[i][0], frame, material)
+            self.write(paths[i][0], frame, material, scenes[i].lights, cameras[i])
 
         return make

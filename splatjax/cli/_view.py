@@ -4,7 +4,7 @@ import functools
 import math
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -62,6 +62,9 @@ class ViewOptions:
     environment: Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
     #: Of the environment about the vertical axis; at 0 the middle of the map is the front.
     environment_rotation: float = 0.0
+    #: Of the PNG: black, transparent, or what the camera sees of the --environment. The EXR has the
+    #: coverage, and no background.
+    background: Literal["black", "transparent", "environment"] = "black"
     #: Of the PNG, in stops: each doubles its brightness. The EXR is never changed by it.
     exposure: float = 0.0
     #: Whether light spreads below the surface. Without, it leaves where it enters, in the same
@@ -92,6 +95,10 @@ class ViewOptions:
             "light_elevation": (math.isfinite(self.light_elevation), finite),
             "environment_rotation": (math.isfinite(self.environment_rotation), finite),
             "exposure": (math.isfinite(self.exposure), finite),
+            "background": (
+                self.background != "environment" or self.environment is not None,
+                "be black or transparent where there is no --environment",
+            ),
             "width": (self.width >= 1, positive),
             "height": (self.height >= 1, positive),
             "count": (self.count >= 1, positive),
@@ -189,12 +196,24 @@ class ViewOptions:
         eye = middle + radius / math.sin(half_angle) * direction_to(azimuth, self.elevation)
         return sj.Camera.look_at(eye, middle, fov=self.fov, width=self.width, height=self.height)
 
-    def write(self, path: Path, frame: sj.Frame, material: sj.Material) -> tuple[Path, Path]:
+    def write(
+        self,
+        path: Path,
+        frame: sj.Frame,
+        material: sj.Material,
+        lights: tuple[sj.scene.AbstractLight, ...],
+        camera: sj.Camera,
+    ) -> tuple[Path, Path]:
         """Write the picture with all its layers, and the PNG file beside it; return both paths."""
-        picture = path.with_suffix(".png")
+        picture, shown = path.with_suffix(".png"), np.asarray(frame.beauty)
         variances = material.gaussians.variances.tolist()
         sj.write_exr(path, frame, variances=variances, manifest=self.manifest())
-        sj.write_png(picture, frame, exposure=self.exposure)
+        if self.background == "environment" and isinstance(lights[0], sj.EnvironmentLight):
+            shown = np.asarray(lights[0].behind(frame, camera))
+        elif self.background == "transparent":
+            gray = np.repeat(shown, 3 // shown.shape[-1], axis=-1)
+            shown = np.concatenate([gray, np.asarray(frame.coverage)[..., None]], axis=-1)
+        sj.write_png(picture, shown, exposure=self.exposure)
         return path, picture
 
     def manifest(self) -> dict[str, Any]:

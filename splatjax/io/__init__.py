@@ -1,5 +1,6 @@
 """The only package that touches files: splats, meshes, pictures, materials."""
 
+from ._environments import load_environment as load_environment
 from ._files import (
     atomic_path as atomic_path,
     fingerprint as fingerprint,
@@ -10,7 +11,6 @@ from ._files import (
 )
 from ._images import (
     linear_to_srgb as linear_to_srgb,
-    load_environment as load_environment,
     read_exr as read_exr,
     read_manifest as read_manifest,
     read_picture as read_picture,

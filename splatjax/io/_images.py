@@ -15,12 +15,10 @@ from jaxtyping import Float
 from PIL import Image
 
 from splatjax._memory import check_memory
-from splatjax._records import Numbers
-from splatjax.scene import EnvironmentLight, Frame
+from splatjax.scene import Frame
 
 from ._files import StrPath, atomic_path, existing_file, naming
 
-_MOST_ROWS = 512  # of an environment
 _BYTES_PER_VALUE = 24.0  # in double precision, while they are decoded
 
 
@@ -74,29 +72,6 @@ def read_picture(path: StrPath) -> Float[np.ndarray, "height width channels"]:
     if not is_linear:
         raise ValueError(f"{path}: is encoded for a display; give linear light, such as OpenEXR")
     return values
-
-
-def load_environment(
-    path: StrPath,
-    rotation: Numbers = 0.0,
-    strength: Numbers = 1.0,
-    up: Numbers = (0.0, 1.0, 0.0),
-    count: int = 64,
-) -> EnvironmentLight:
-    r"""Read an environment light: a latitude-longitude map of OpenEXR, Radiance HDR or another
-    format of floating-point numbers. Maps of more than 512 rows are averaged until they have no
-    more, which changes neither samples nor highlights.
-
-    **Arguments:** the others as of `EnvironmentLight`.
-
-    **Raises:** as `read_picture` does, and `ValueError` for a map that is not twice as wide as
-    high, or has radiance that is negative or not finite.
-    """
-    image = read_picture(path)
-    while len(image) > _MOST_ROWS and not np.any(np.mod(image.shape[:2], 2)):
-        image = image.reshape(len(image) // 2, 2, image.shape[1] // 2, 2, -1).mean(axis=(1, 3))
-    with naming(path):
-        return EnvironmentLight(image.astype(np.float32), rotation, strength, up, count=count)
 
 
 def read_map(path: StrPath) -> Float[np.ndarray, "height width 3"]:

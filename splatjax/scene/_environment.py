@@ -15,6 +15,7 @@ from splatjax._chunking import jit_unless_traced
 from splatjax._records import numbers, record
 
 from ._lights import AbstractExtendedLight, AbstractHighlight, AbstractLightSample, DistantStratum
+from ._scene import Camera, Frame
 
 _CELLS = 128  # along a side of the grid of equal areas that is cut into strata; a power of two
 _EVEN = 0.1  # of the importance that all directions share, so that none is far from a sample
@@ -161,6 +162,17 @@ class EnvironmentLight(AbstractExtendedLight):
     def highlight(self) -> "BlurredEnvironment":
         return BlurredEnvironment(_blurred(self.radiance()), self.to_world())
 
+    def behind(self, frame: Frame, camera: Camera) -> Float[Array, "height width channels"]:
+        """Put the environment behind a picture: its `beauty`, and what the camera sees of the image
+        where that leaves room.
+        """
+        sides = reversed(frame.coverage.shape)
+        x, y = jnp.meshgrid(*(jnp.arange(n, dtype=self.image.dtype) + 0.5 - n / 2 for n in sides))
+        z = jnp.broadcast_to(camera.focal_length * len(x), x.shape)
+        sharp = BlurredEnvironment(_padded(self.radiance()[None]), self.to_world())
+        seen = sharp.radiance(jnp.stack([x, y, z], axis=-1) @ camera.rotation, jnp.zeros_like(z))
+        return frame.beauty + (1 - frame.coverage)[..., None] * seen
+
 
 class BlurredEnvironment(AbstractHighlight):
     """The mean radiance that lobes of several roughnesses see of an environment.
@@ -259,6 +271,12 @@ def _blurred(radiance: Float[Array, "height width channels"]) -> Float[Array, "m
 
     # Behind a barrier, or the compiler would compute all kernels while it compiles.
     maps = jax.lax.map(blur, jax.lax.optimization_barrier(jnp.asarray(_ROUGHNESSES, dtype)))
-    top, bottom = (jnp.roll(maps[:, row], _ROWS, axis=2) for row in (slice(1), slice(-1, None)))
+    return _padded(maps)
+
+
+def _padded(maps: Float[Array, "maps rows columns channels"]) -> Float[Array, "maps _ _ channels"]:
+    """Repeat beyond every edge what lies there on the sphere."""
+    half = maps.shape[2] // 2
+    top, bottom = (jnp.roll(maps[:, row], half, axis=2) for row in (slice(1), slice(-1, None)))
     maps = jnp.concatenate([top, maps, bottom], axis=1)
     return jnp.concatenate([maps[:, :, -1:], maps, maps[:, :, :1]], axis=2)

@@ -107,6 +107,23 @@ def test_a_turned_map_is_a_body_turned_back(up):
     )
 
 
+def test_the_camera_sees_the_map_behind_a_body():
+    """`1 + a . d` along the ray of every pixel, where the body leaves room."""
+    camera = sj.Camera.look_at([5, 40, 30], [0, 0, 0], fov=100, width=24, height=16)
+    light = sj.EnvironmentLight(harmonics(128), 50.0, cast_shadows=False)
+    frame = render(light, sphere(1500), camera=camera)
+    pixels = np.mgrid[:16, :24][::-1].reshape(2, -1).T + 0.5
+    rays = np.column_stack([(pixels - [12, 8]) / 16, np.full(384, float(camera.focal_length))])
+    x, y, z = unit(rays @ np.asarray(camera.rotation, float)).T
+    sine, cosine = np.sin(np.radians(50)), np.cos(np.radians(50))
+    turned = cosine * x - sine * z, y, sine * x + cosine * z
+    seen = (1 + np.asarray([0.6, 0.5, -0.3]) @ np.stack(turned)).reshape(16, 24)
+    open_share = 1 - np.asarray(frame.coverage)
+    assert 100 < np.sum(open_share > 0.99) < 380
+    found = (light.behind(frame, camera) - frame.beauty)[..., 1]
+    np.testing.assert_allclose(found, open_share * seen, atol=2e-3)
+
+
 EVEN = even_directions(24)
 
 
