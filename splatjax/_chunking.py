@@ -11,11 +11,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, DTypeLike, Float, Int, PyTree, Shaped
 
+from splatjax.cache import reuse_capacity
+
 Result = TypeVar("Result", bound=PyTree)
 Function = TypeVar("Function", bound=Callable)
 
 AT_ONCE = 1 << 16
-_PLANNED: dict[Hashable, list[int]] = {}  # capacities, in this process
+_LEAST_SPARE = 1.1
 
 
 def map_chunks(function: Callable[..., Result], *arrays: PyTree, at_once: int = AT_ONCE) -> Result:
@@ -113,26 +115,15 @@ def rounded_up(count: int, step: int, per_octave: int = 8) -> int:
     return -(-count // grain) * grain
 
 
-def as_planned(kind: Hashable, least: int, capacity: int, most: float = 1.25) -> int:
-    """Return a capacity that was planned before in this process for the same kind of array, whose
-    program then serves again; the one given where none is at least `least` and at most `most` times
-    as large.
-    """
-    before = _PLANNED.setdefault(kind, [])
-    serving = [each for each in before if least <= each <= most * capacity]
-    if not serving:
-        before.append(capacity)
-    return (serving or [capacity])[0]
-
-
 def with_spare(
     kind: Hashable, count: int, step: int, per_octave: int = 8, spare: float = 1.03
 ) -> int:
     """Plan the capacity of a kind of array for a count: `spare` times as many and at least one
-    more, rounded up; or one planned before that has 3% to spare.
+    more, rounded up; or one planned before that has at least 10% to spare, or as much as that.
     """
     capacity = rounded_up(int(count * spare) + 1, step, per_octave)
-    return as_planned((kind, step, per_octave, spare), int(count * 1.03) + 1, capacity)
+    least = int(count * min(spare, _LEAST_SPARE)) + 1
+    return reuse_capacity((kind, step, per_octave, spare), least, capacity)
 
 
 def needed_over_planned(needed: Int[Array, ""], planned: int) -> Float[Array, ""]:

@@ -18,7 +18,7 @@ import pickle
 import platform
 import re
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -45,6 +45,7 @@ _SETTINGS = {
 }
 _folder: Path | None = None
 _programs: dict[Path, Callable] = {}
+_capacities: dict[Hashable, list[int]] = {}
 
 
 def keep(folder: str | os.PathLike[str] | None = None) -> Path:
@@ -86,6 +87,22 @@ def keep(folder: str | os.PathLike[str] | None = None) -> Path:
     _source()  # now, since files may change while the program runs
     _folder = kept_folder
     return whole
+
+
+def reuse_capacity(kind: Hashable, least: int, capacity: int, most: float = 1.25) -> int:
+    """Return the smallest capacity that this process has planned for arrays of a kind, if it is at
+    least `least` and at most `most` times `capacity`, since programs of that size are compiled;
+    otherwise remember and return `capacity`.
+
+    Several processes, which must run the same programs, remember nothing.
+    """
+    if jax.process_count() > 1:
+        return capacity
+    planned = _capacities.setdefault(kind, [])
+    serving = [size for size in planned if least <= size <= most * capacity]
+    if not serving:
+        planned.append(capacity)
+    return min(serving, default=capacity)
 
 
 def kept(function: Function) -> Function:

@@ -4,7 +4,8 @@ layers, or to the frames of an animation, continued where it was interrupted.
 
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -18,6 +19,7 @@ from ._view import ViewOptions, draw, rough_picture
 
 _LARGEST = 16_383  # pixels along a side of a WebP file
 _MOST_FRAMES = 10_000  # that four digits can name
+_DIRECTIONS = 128  # of the shadows of an environment that turns about the body
 
 
 Rendered = tuple[sj.Frame, sj.Material, tuple[sj.scene.AbstractLight, ...], sj.Camera]
@@ -91,8 +93,9 @@ class Turntable(ViewOptions):
     Per frame an EXR file with every layer and a PNG file; in the end turntable.webp, which plays in
     a browser. Frames begin at --azimuth and --light-azimuth and go on in equal steps; a full turn
     ends one step before its beginning, so that it plays round and round. The splats are planned and
-    the program is compiled once for all frames; with --turn camera --fill 0 the light below the
-    surface is computed once too. Frames that are there are kept: after an
+    the program is compiled once for all frames. With --turn camera, and --fill 0 or an
+    --environment, the light below the surface is computed once too; shadow maps are made once for
+    an --environment that turns. Frames that are there are kept: after an
     interruption, run the same command again. A record in the folder, turntable.json, makes sure
     that frames with different options are not mixed. Where a launcher has started several processes
     (SLURM, Open MPI, or JAX_COORDINATOR_ADDRESS, JAX_NUM_PROCESSES and JAX_PROCESS_ID), they share
@@ -181,6 +184,10 @@ class Turntable(ViewOptions):
         places = [self.azimuths(i) for i in range(self.frames)]
         scenes = [sj.Scene(splats, self.lights(material, *place), material) for place in places]
         cameras = [self.camera(lambda: [splats], azimuth) for azimuth, _ in places]
+        keeps_shadows = self.environment is not None and self.turn != "camera"
+        if keeps_shadows:
+            even = partial(replace, directions=sj.scene.even_directions(_DIRECTIONS))
+            scenes = [replace(scene, lights=tuple(map(even, scene.lights))) for scene in scenes]
         # The plan is for all frames, so that an interruption changes none.
         with stage(f"planning {self.frames} frames"):
             plan = sj.make_plan(scenes, cameras)
@@ -189,6 +196,9 @@ class Turntable(ViewOptions):
             # No light moves: passes 1 and 4 are the same in every frame.
             with stage("lighting the splats"):
                 light = jax.block_until_ready(sj.illuminate(scenes[0], plan))
+        elif keeps_shadows:
+            with stage(f"making {_DIRECTIONS} shadow maps"):
+                light = jax.block_until_ready(sj.transfer(scenes[0], plan))
 
         def make(i: int) -> None:
             frame = draw(scenes[i], cameras[i], plan, light)

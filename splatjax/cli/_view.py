@@ -57,10 +57,11 @@ class ViewOptions:
     #: Strength of a second light without shadows, beside the camera, relative to the first. 0 for
     #: none.
     fill: float = 0.1
-    #: Latitude-longitude map of linear radiance, in the place of both lights: an EXR or HDR file,
-    #: or the name of a built-in one: studio, overcast, sun.
+    #: Latitude-longitude map of linear radiance, which replaces both lights: an EXR or HDR file, or
+    #: the name of a built-in one: studio, overcast, sun.
     environment: Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
-    #: Of the environment about the vertical axis; at 0 the middle of the map is the front.
+    #: Rotation of the environment about the vertical axis, degrees; at 0 the middle of the map is
+    #: the front (+z).
     environment_rotation: float = 0.0
     #: Of the PNG: black, transparent, or what the camera sees of the --environment. The EXR has the
     #: coverage, and no background.
@@ -165,7 +166,10 @@ class ViewOptions:
         """
         if self._environment is not None:
             rotation = self.environment_rotation + light_azimuth - self.light_azimuth
-            return (replace(self._environment, rotation=rotation),)
+            image = self._environment.image
+            if material.channels == 1:
+                image = jnp.mean(image, axis=-1, keepdims=True)
+            return (sj.EnvironmentLight(image, rotation),)
         # The first light gives a white diffuser that faces it the radiance 1.
         irradiance = np.full(material.channels, np.pi)
         towards = -direction_to(light_azimuth, self.light_elevation)
@@ -250,10 +254,8 @@ class ViewOptions:
             )
 
 
-def draw(
-    scene: sj.Scene, camera: sj.Camera, plan: sj.Plan, light: sj.SplatLight | None = None
-) -> sj.Frame:
-    """Render, and wait for the picture; by the light of `sj.illuminate`, if it is given.
+def draw(scene: sj.Scene, camera: sj.Camera, plan: sj.Plan, light=None) -> sj.Frame:
+    """Render, and wait for the picture; `light` as for `sj.render`.
 
     **Raises:** `ValueError` when the plan's capacity is exceeded.
     """

@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from splatjax._chunking import as_planned, jit_unless_traced
+from splatjax._chunking import jit_unless_traced
+from splatjax.cache import reuse_capacity
 
 from ._diffuser import Sources
 
@@ -74,7 +75,7 @@ class LayerSources(eqx.Module):
             count += blocks * SOURCES_PER_BLOCK
         half = -(-len(exists) // (2 * SOURCES_PER_BLOCK)) * SOURCES_PER_BLOCK
         capacity = max(-(-count // half), -(-3 * len(edges) // 2)) * half
-        capacity = as_planned(("sources", parents[0].shape, len(edges)), count, capacity)
+        capacity = reuse_capacity(("sources", parents[0].shape, len(edges)), count, capacity)
         layers.append(np.zeros((max(capacity, least) - count) // SOURCES_PER_BLOCK, np.int32))
         return cls(jnp.asarray(np.stack(parents)), jnp.asarray(np.concatenate(layers)))
 

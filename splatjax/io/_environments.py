@@ -14,8 +14,8 @@ _MOST_ROWS = 512
 
 def load_environment(path: StrPath, **fields: Any) -> EnvironmentLight:
     r"""Read an environment light: a latitude-longitude map of OpenEXR, Radiance HDR or another
-    format of floating-point numbers. Maps of more than 512 rows are averaged until they have no
-    more, which changes neither samples nor highlights.
+    format of floating-point numbers. Maps of more than 512 rows are halved, by averaging, while
+    both sides are even, which hardly changes samples and highlights.
 
     **Arguments:** `fields`: the others of `EnvironmentLight`, by name.
 

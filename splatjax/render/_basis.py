@@ -14,7 +14,7 @@ from ._devices import filled_like, on_devices
 from ._filling import rows_at
 from ._passes import SplatLight, Transfer, in_a_row, light_source, see_and_shade
 from ._plan import Plan, RenderSettings, plan_unless_traced
-from ._render import fitted
+from ._render import check_kept, fitted
 from ._shade import ShadedSurface
 
 # Fields of `LayersAtPoints` that lie along the points.
@@ -93,9 +93,9 @@ def diffusion_basis(
             "scene.material has single scattering, beside which less light enters as the weights "
             "grow; render each material by itself, or give one with single_scattering=None"
         )
-    scene, plan, places = filled_like(
-        scene, plan_unless_traced(scene, camera, settings, plan), camera, light
-    )
+    plan = plan_unless_traced(scene, camera, settings, plan)
+    check_kept(light, scene, plan)
+    scene, plan, places = filled_like(scene, plan, camera, light)
     basis = _diffusion_basis(
         scene, camera, settings, plan, derivative, light and fitted(light, scene)
     )

@@ -112,7 +112,7 @@ class LightVisibility(eqx.Module):
 
         def received(light):
             wi, irradiance = light.incidence(positions)
-            return jnp.maximum(jnp.sum(normals * wi, axis=-1), _GRAZING) * jnp.sum(irradiance, -1)
+            return jnp.maximum(jnp.sum(normals * wi, -1), _GRAZING) * jnp.sum(abs(irradiance), -1)
 
         def mean(group: StackedLights, rows):
             if rows is None or len(group.distinct) == len(group.light_indices):
@@ -171,14 +171,14 @@ def cast_shadows(
             closeness = plan.closeness(light, bounds)
             return jnp.sum(visible, axis=0), jnp.maximum(jnp.max(needed), closeness)
 
-        if group.highlights:  # many maps: in a gradient, each is made again
+        if len(group.light_indices) > len(group.distinct):  # in a gradient, maps are made again
             of_light = jax.checkpoint(of_light)  # ty: ignore[invalid-assignment]
 
         def if_exists(numbered, plan=plan, of_light=of_light):
             number, light = numbered
             return jax.lax.cond(number < plan.lights, of_light, lambda _: dark, light)
 
-        numbered = jnp.arange(len(group.light_indices)), group.lights
+        numbered = jnp.arange(len(group.light_indices), dtype=jnp.int32), group.lights
         visible, needed_by_light = (
             jax.lax.map(of_light, group.lights)
             if plan.lights is None

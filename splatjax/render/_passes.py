@@ -24,8 +24,8 @@ from ._shade import ShadedSurface, shade
 
 
 class Transfer(eqx.Module):
-    """How much of every light reaches the splats: pass 1, which neither the strength nor the color
-    of a light changes.
+    """Visibility of each light sample from each splat: pass 1, which does not depend on the
+    strength and color of a light.
 
     **Attributes:**
 
@@ -112,8 +112,8 @@ def light_source(
     light: SplatLight | Transfer | None,
     derivative: bool = False,
 ) -> Callable[..., SplatLight]:
-    """Return what carries out passes 1 and 4 for `see_and_shade`, or takes them from what was
-    kept.
+    """Return the function that computes passes 1 and 4 for `see_and_shade`, or reads a precomputed
+    result.
     """
     if isinstance(light, SplatLight):
         return lambda _, chosen: light.take(chosen)

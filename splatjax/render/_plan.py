@@ -12,9 +12,9 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Bool, Float, Int
 
 from splatjax import diffusion as _diffusion, splatting as _splatting
-from splatjax._chunking import Result, as_planned, rounded_up
+from splatjax._chunking import Result, rounded_up
 from splatjax._combination import DeviceMesh, OneDevice
-from splatjax.cache import kept
+from splatjax.cache import kept, reuse_capacity
 from splatjax.scene import (
     AbstractLight,
     AbstractLightSample,
@@ -244,7 +244,7 @@ def _cut_and_order(splats: Splats, mesh: Mesh | None) -> tuple[list[Splats], Arr
     """
     devices, share = splats_per_device(splats.count, mesh)
     places = rounded_up(share, _diffusion.POINTS_PER_BLOCK, per_octave=16)
-    places = as_planned("splats", share, places, most=_MOST_SPLATS)
+    places = reuse_capacity("splats", share, places, most=_MOST_SPLATS)
     filling = (0, places - share)
     whole = jax.tree.map(np.asarray, fill_up(splats, share * devices))
     parts, orders, exist = [], [], []

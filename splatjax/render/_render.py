@@ -58,19 +58,20 @@ def render(
     - `plan`: from `splatjax.make_plan`; needed under `jit`, `grad` and `vmap`, made here otherwise.
     - `mesh`: devices over which the splats are cut, whatever its axes: each holds a share, and
       their gradients (docs/devices.md). By default the mesh of the plan.
-    - `light`: what was kept, for the same settings and plan: from `splatjax.illuminate` with the
-      same scene, passes 1 and 4, which do not depend on the camera; or from `splatjax.transfer`
-      with the same splats, pass 1, which does not depend on how strong a light is. Differentiable.
+    - `light`: a precomputed result for the same settings and plan: from `splatjax.illuminate` with
+      the same scene, passes 1 and 4, which do not depend on the camera; or from `splatjax.transfer`
+      with the same splats, pass 1, which does not depend on the strength of lights. Differentiable.
 
     **Returns:** a `Frame` in the dtype of `splats.centers`; the same on every device, and to
     rounding whatever the mesh.
 
     **Raises:** `ValueError` when a plan is needed and not given, or is for another mesh or another
-    number of splats, or when the scene's channels disagree.
+    number of splats, when `light` is for other kinds of lights, or when the scene's channels
+    disagree.
     """
-    scene, plan, places = filled_like(
-        scene, plan_unless_traced(scene, camera, settings, plan, mesh), camera, light
-    )
+    plan = plan_unless_traced(scene, camera, settings, plan, mesh)
+    check_kept(light, scene, plan)
+    scene, plan, places = filled_like(scene, plan, camera, light)
     frame = _render(scene, camera, settings, plan, light and fitted(light, scene))
     return places.frame(frame)
 
@@ -80,6 +81,23 @@ def fitted(light: Kept, scene: Scene) -> Kept:
     groups = zip(light.visibility, lights_by_kind(scene.lights), strict=True)
     visibility = [rows if rows is None else rows_at(rows, np.arange(len(g))) for rows, g in groups]
     return dataclasses.replace(light, visibility=visibility)
+
+
+def check_kept(light: SplatLight | Transfer | None, scene: Scene, plan: Plan) -> None:
+    """Raise `ValueError` where what was kept is for other lights or another number of splats."""
+    if light is None:
+        return
+    groups = jax.eval_shape(
+        lambda lights: [[sample for _, sample in group] for group in lights_by_kind(lights)],
+        scene.lights,
+    )
+    shapes = [(len(g), len(plan.order)) if g[0].cast_shadows else None for g in groups]
+    kept = [rows if rows is None else rows.shape for rows in light.visibility]
+    if kept != shapes:
+        raise ValueError(
+            f"light holds visibility {kept}, of the samples of each kind of lights from each splat,"
+            f" and the scene with its plan has {shapes}; keep it again with lights of these kinds"
+        )
 
 
 @kept_jit
@@ -132,6 +150,7 @@ def illuminate(
     """
     check_channels(scene)
     check_plan(plan, scene)
+    check_kept(light, scene, plan)
     filled, plan, _ = filled_like(scene, plan, light)
     found = _illuminate(filled, plan, settings, derivative, light and fitted(light, filled))
     return fitted(found, scene)

@@ -94,7 +94,7 @@ class AbstractAreaLight(AbstractExtendedLight, AbstractHighlight):
 
         distance = jnp.sqrt(jnp.maximum(jnp.sum(from_center**2, axis=-1), 1e-12))
         ahead = distance if normal is None else jnp.tensordot(from_center, normal, 1)
-        solid_angle = area * jnp.maximum(ahead, 0) / distance**3
+        solid_angle = area / distance**2 * jnp.maximum(ahead / distance, 0)
         middle = lobe(mirrored)
         is_seen = (middle > 0) & (albedo > 0)
         size = jnp.where(is_seen, albedo, 0.0) / jnp.where(is_seen, middle, 1.0)
@@ -109,10 +109,10 @@ class RectangleLight(AbstractAreaLight):
     **Attributes:**
 
     - `center`: mm. Differentiable.
-    - `radiance`: on the side that emits. A white diffuser under nothing but such light shows it.
-      Differentiable.
-    - `edges`: two edges, mm: the rectangle reaches half of each to both sides. It emits in the
-      direction of their cross product. Differentiable.
+    - `radiance`: on the side that emits. A white diffuser under a whole sky of this radiance has
+      the same. Differentiable.
+    - `edges`: two edge vectors, perpendicular, mm: the rectangle extends by half of each to either
+      side of `center`. It emits in the direction of their cross product. Differentiable.
     - `count`, `cast_shadows`: static.
     """
 
@@ -135,14 +135,14 @@ class RectangleLight(AbstractAreaLight):
         radiance: Numbers,
         **settings,
     ) -> "RectangleLight":
-        """Make a rectangle that faces a target, its lower edge level; neither above nor below it.
+        """Make a rectangle that faces a target, with a horizontal lower edge; straight above or
+        below the target, its lower edge is along x.
 
         **Arguments:** mm; `settings` are `count` and `cast_shadows`.
         """
         center = as_floats(center)
         towards = as_floats(target) - center
-        up = jnp.asarray([0.0, 1.0, 0.0], towards.dtype)
-        right, down, _ = rotation_towards(towards / jnp.linalg.norm(towards), up)
+        right, down = _across(towards)
         return cls(center, radiance, jnp.stack([width * right, height * down]), **settings)
 
     def axes(self) -> Float[Array, "2 3"]:
@@ -162,8 +162,7 @@ class DiskLight(AbstractAreaLight):
 
     **Attributes:** as of `RectangleLight`, and
 
-    - `direction`: the way the disk faces, and its light travels, any length but zero.
-      Differentiable.
+    - `direction`: normal of the side that emits, any length but zero. Differentiable.
     - `radius`: mm. Differentiable.
     """
 
@@ -172,10 +171,7 @@ class DiskLight(AbstractAreaLight):
     fullness: ClassVar[float] = np.pi
 
     def axes(self) -> Float[Array, "2 3"]:
-        normal = self.direction / jnp.linalg.norm(self.direction)
-        x, y = jnp.eye(3, dtype=normal.dtype)[:2]
-        up = jnp.where(jnp.abs(normal[1]) < 0.9, y, x)
-        return self.radius * rotation_towards(normal, up)[:2]
+        return self.radius * _across(self.direction)
 
     def pattern(self) -> Float[np.ndarray, "samples 2"]:
         i = np.arange(self.count) + 0.5
@@ -190,8 +186,8 @@ class DiskLight(AbstractAreaLight):
 class SphereLight(AbstractAreaLight):
     r"""A ball whose surface has even radiance.
 
-    Its samples fill the ball so that they look like an even disk from every side. Points inside it
-    are lit by these, which means nothing.
+    Its samples fill the ball so that they look like an even disk from every side. The result is
+    meaningless for points inside it.
 
     **Attributes:** as of `RectangleLight`, and
 
@@ -215,3 +211,10 @@ class SphereLight(AbstractAreaLight):
         return s * np.stack([across * np.cos(angle), z, across * np.sin(angle)], axis=1)
 
     within = DiskLight.within
+
+
+def _across(direction: Float[Array, "3"]) -> Float[Array, "2 3"]:
+    """Compute two unit vectors across a direction, to the right and down as seen along it."""
+    forward = direction / jnp.linalg.norm(direction)
+    y, z = jnp.eye(3, dtype=forward.dtype)[1:]
+    return rotation_towards(forward, jnp.where(jnp.abs(forward[1]) < 0.999, y, z))[:2]

@@ -12,7 +12,7 @@ from jax.scipy.ndimage import map_coordinates
 from jaxtyping import Array, DTypeLike, Float
 
 from splatjax._chunking import jit_unless_traced
-from splatjax._records import numbers, record
+from splatjax._records import check_values, numbers, record
 
 from ._lights import AbstractExtendedLight, AbstractHighlight, AbstractLightSample, DistantStratum
 from ._scene import Camera, Frame
@@ -30,7 +30,7 @@ class EnvironmentLight(AbstractExtendedLight):
 
     The image is a latitude-longitude map as OpenEXR defines it, with square pixels: the upper edge
     is +y and the lower one -y; the middle is +z, a quarter of the width to the left of it is +x,
-    and both side edges are -z. So it looks to someone inside it.
+    and both side edges are -z. This is the view from inside the sphere.
 
     It lights by `count` directional samples: the sphere is cut into strata of equal importance,
     which is nine parts radiance times solid angle and one part solid angle. Each sample has the
@@ -39,15 +39,15 @@ class EnvironmentLight(AbstractExtendedLight):
 
     **Attributes:**
 
-    - `image`: radiance, linear; twice as wide as high. Differentiable. Where the strata end has no
-      derivative.
-    - `rotation`: degrees about `up`, which moves +z towards +x. Differentiable.
+    - `image`: radiance, linear; twice as wide as high. Differentiable. The boundaries of the strata
+      are not differentiated.
+    - `rotation`: degrees about `up`; a positive angle turns +z towards +x. Differentiable.
     - `strength`: a factor on each channel. Differentiable.
     - `up`: the direction of the image's upper edge: (0, 0, 1) for a world whose z is up; the middle
       of the image is then -y. Any length but zero. Differentiable.
-    - `directions`: where to the samples lie, in the world, any length but zero; `None` to lay them
-      out by the image. With directions that stay, what was kept of one environment's shadows holds
-      for all (`splatjax.transfer`). Each pixel lights along those near it.
+    - `directions`: world directions of the samples, any length but zero; `None` to lay the samples
+      out by the image. With fixed directions, visibility that was kept serves every image and
+      rotation (`splatjax.transfer`). Every pixel lights along those near it.
     - `count`: of samples that are laid out by the image. Static.
     - `cast_shadows`: static.
 
@@ -71,6 +71,11 @@ class EnvironmentLight(AbstractExtendedLight):
                 f"EnvironmentLight.image has {height} rows and {width} columns; give a "
                 "latitude-longitude map, twice as wide as high"
             )
+        if isinstance(self.directions, jax.Array):
+            lengths = jnp.linalg.norm(self.directions, axis=-1)
+            if lengths.size == 0:
+                raise ValueError("EnvironmentLight.directions is empty; give one or more")
+            check_values("EnvironmentLight.directions", lengths, "not zero", lambda x: x > 0)
 
     def radiance(self) -> Float[Array, "height width channels"]:
         return self.image * self.strength[None, None]
@@ -84,8 +89,10 @@ class EnvironmentLight(AbstractExtendedLight):
         zero = jnp.zeros_like(angle)
         rows = [cosine, zero, sine, zero, one, zero, -sine, zero, cosine]
         x, y, z = jnp.unstack(self.up / jnp.linalg.norm(self.up))
-        z = jnp.where(1 + y > 1e-6, z, 2e-6**0.5)  # straight down is half a turn about x
-        lean = 1 / jnp.maximum(1 + y, 1e-6)
+        is_down = (y < 0) & (x * x + z * z < 1e-12)  # half a turn about x
+        x, z = jnp.where(is_down, 0.0, x), jnp.where(is_down, 1e-6, z)
+        # 1 / (1 + y), without cancellation.
+        lean = jnp.where(y < 0, 1 - y, 1.0) / jnp.where(y < 0, x * x + z * z, 1 + y)
         tilt = [1 - x * x * lean, x, -x * z * lean, -x, y, -z, -x * z * lean, z, 1 - z * z * lean]
         return jnp.stack(tilt).reshape(3, 3) @ jnp.stack(rows).reshape(3, 3)
 
@@ -93,13 +100,12 @@ class EnvironmentLight(AbstractExtendedLight):
     def stacked_samples(self) -> AbstractLightSample:
         height = self.image.shape[0]
         directions, solid_angles = pixel_directions(height, self.image.dtype)
-        radiance = self.radiance()
-        brightness = jnp.mean(radiance, axis=-1)
+        brightness = jnp.mean(self.image, axis=-1)
         mean = jnp.sum(brightness * solid_angles) / (4 * jnp.pi)
         relative = brightness / jnp.where(mean > 0, mean, 1.0)
         moments = jnp.concatenate(
             [
-                radiance * solid_angles[..., None],
+                self.image * solid_angles[..., None],
                 ((relative + _FAINT) * solid_angles)[..., None] * directions,
                 jnp.stack([relative * solid_angles, solid_angles], axis=-1),
             ],
@@ -110,10 +116,10 @@ class EnvironmentLight(AbstractExtendedLight):
         else:
             strata = self._shared(directions, moments)
 
-        towards, irradiance = strata[:, -5:-2], strata[:, :-5]
+        towards, irradiance = strata[:, -5:-2], strata[:, :-5] * self.strength[None]
         is_filled = jnp.sum(towards**2, axis=-1, keepdims=True) > 0
-        anywhere = jnp.asarray([[0.0, 1.0, 0.0]], towards.dtype)
-        towards = jnp.where(is_filled, towards, anywhere) @ self.to_world().T
+        towards = jnp.where(is_filled, towards, jnp.asarray([[0.0, 1.0, 0.0]], towards.dtype))
+        towards = towards / jnp.linalg.norm(towards, axis=-1, keepdims=True) @ self.to_world().T
 
         def sample(towards, irradiance):
             return DistantStratum(
@@ -163,9 +169,7 @@ class EnvironmentLight(AbstractExtendedLight):
         return BlurredEnvironment(_blurred(self.radiance()), self.to_world())
 
     def behind(self, frame: Frame, camera: Camera) -> Float[Array, "height width channels"]:
-        """Put the environment behind a picture: its `beauty`, and what the camera sees of the image
-        where that leaves room.
-        """
+        """Composite the `beauty` of a frame over the environment as its camera sees it."""
         sides = reversed(frame.coverage.shape)
         x, y = jnp.meshgrid(*(jnp.arange(n, dtype=self.image.dtype) + 0.5 - n / 2 for n in sides))
         z = jnp.broadcast_to(camera.focal_length * len(x), x.shape)
@@ -252,8 +256,10 @@ def _blurred(radiance: Float[Array, "height width channels"]) -> Float[Array, "m
     The lobe at the angle `2 a` from the mirrored direction is `exp(-tan^2 a / m^2) cos 2a / cos^6
     a`, divided by its integral. In longitude it is a circular convolution.
     """
-    dtype, size = radiance.dtype, (_ROWS, 2 * _ROWS, radiance.shape[-1])
-    reduced = jax.image.resize(radiance, size, "linear")
+    dtype, size = radiance.dtype, (_ROWS, 6 * _ROWS, radiance.shape[-1])
+    # Side by side three times, since the map goes around.
+    reduced = jax.image.resize(jnp.tile(radiance, (1, 3, 1)), size, "linear")
+    reduced = reduced[:, 2 * _ROWS : 4 * _ROWS]
     _, solid_angles = pixel_directions(_ROWS, dtype)
     spectrum = jnp.fft.rfft(reduced * solid_angles[..., None], axis=1)
 

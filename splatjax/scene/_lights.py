@@ -22,15 +22,12 @@ _TOUCHING = 1e-6  # mm
 _EXPECTED = {
     "direction": ("the way light travels, not zero", np.any),
     "variance": ("positive (mm^2)", lambda x: x > 0),
-    "directions": (
-        "directions of the samples, none of them zero",
-        lambda x: np.all(np.any(x, axis=-1)),
-    ),
+    "strength": ("at least 0", lambda x: x >= 0),
     "up": ("the direction of the image's upper edge, not zero", np.any),
     "radius": ("positive (mm)", lambda x: x > 0),
     "count": ("1 or more samples", lambda x: x >= 1),
     "image": (
-        "finite and at least 0: replace what is NaN, and clip what filters made negative",
+        "finite and not negative; replace NaN, and clip what is negative",
         lambda x: x >= 0,
     ),
 }
@@ -279,7 +276,7 @@ class GaussianBeam(AbstractLightSample):
 
 class StackedLights(eqx.Module):
     """Samples of lights of one kind, their leaves stacked, and for each the index of its light in
-    the scene's tuple. Of extended lights, also the highlight of each.
+    the scene's tuple; also the highlight of each light, if it has one.
     """
 
     lights: AbstractLightSample
@@ -311,11 +308,14 @@ class StackedLights(eqx.Module):
 def lights_by_kind(
     lights: tuple[AbstractLight, ...],
 ) -> list[list[tuple[int, AbstractLightSample]]]:
-    """List the samples of each kind of lights, each with the index of its light."""
+    """List the samples of each kind of lights, each with the index of its light. Lights that have
+    one highlight for all their samples are apart from others.
+    """
     kinds: dict[object, list[tuple[int, AbstractLightSample]]] = {}
     for index, light in enumerate(lights):
+        has_lobes = type(light).highlight is AbstractLight.highlight
         for sample in light.samples():
-            kinds.setdefault(jax.tree.structure(sample), []).append((index, sample))
+            kinds.setdefault((jax.tree.structure(sample), has_lobes), []).append((index, sample))
     return list(kinds.values())
 
 

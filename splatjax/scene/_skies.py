@@ -57,7 +57,8 @@ def sun_and_sky(
 
     **Arguments:**
 
-    - `elevation`, `azimuth`: of the sun, degrees; azimuth 0 is +z, 90 is +x. Differentiable.
+    - `elevation`, `azimuth`: of the sun, degrees; azimuth 0 is +z, 90 is +x. A sun below the
+      horizon gives no light. Differentiable.
 
     **Returns:** radiance; a surface that faces the sun receives about 2.2 from it.
     """
@@ -66,13 +67,14 @@ def sun_and_sky(
     to_sun = jnp.tensordot(directions, _frame(azimuth, elevation)[2], 1)[..., None] - 1
     rise = jnp.sqrt(jnp.maximum(directions[..., 1:2], 1e-4))
     sky = horizon + (zenith - horizon) * rise + 0.5 * horizon * jnp.exp(6 * to_sun)
-    disk = jnp.exp(_CONCENTRATION * to_sun)
+    disk = jnp.exp(_CONCENTRATION * (to_sun - jnp.max(to_sun)))
     disk = disk / jnp.sum(disk * solid_angles[..., None])
+    disk = jnp.where(as_floats(elevation) > 0, disk, 0.0)
     return jnp.where(directions[..., 1:2] > 0, sky, 0.12) + disk * sun
 
 
 def _frame(azimuth: Numbers, elevation: Numbers) -> Float[Array, "3 3"]:
-    """Compute the directions to the right of a place of the sky, above it, and towards it."""
+    """Compute the directions along the horizon at a place of the sky, above it, and towards it."""
     turn, rise = (jnp.deg2rad(as_floats(each)) for each in (azimuth, elevation))
     (east, south), (high, across) = ((jnp.sin(a), jnp.cos(a)) for a in (turn, rise))
     right, up = [south, jnp.zeros_like(turn), -east], [-east * high, across, -south * high]

@@ -11,13 +11,13 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from splatjax._chunking import (
-    as_planned,
     map_chunks,
     needed_over_planned,
     take_points,
     with_spare,
 )
 from splatjax._combination import AbstractCombination, OneDevice
+from splatjax.cache import reuse_capacity
 from splatjax.scene import Splats
 
 from ._bins import BinCapacity, bin_items
@@ -45,8 +45,8 @@ class TileRasterizer(AbstractRasterizer):
     spare: float = eqx.field(static=True, default=1.03)
 
     def for_shadows(self) -> "TileRasterizer":
-        """Return one that plans for a quarter more, so that other lights and bodies need no
-        other program: without attributes, capacity takes little memory and no time.
+        """Return a rasterizer with 25% spare capacity, so that other lights and bodies reuse the
+        program: without attributes, capacity takes little memory and no time.
         """
         return dataclasses.replace(self, spare=1.25)
 
@@ -127,7 +127,8 @@ class TilePlan(AbstractRasterPlan):
         step = -(-grid.half // 8)
         grain = math.lcm(self.rasterizer.lanes * step, len(parts))
         kind = "behind", grid, grain
-        behind = as_planned(kind, most + 1, -(-int(_SPARE * most + 1) // grain) * grain)
+        capacity = -(-int(_SPARE * most + 1) // grain) * grain
+        behind = reuse_capacity(kind, int(1.25 * most) + 1, capacity)
         return dataclasses.replace(self, places=SurfaceCapacity(self.places.front, behind))
 
     def choose(

@@ -17,6 +17,7 @@ from PIL import Image
 from processes import free_port, run_together
 
 import splatjax as sj
+from splatjax.cli import _render
 from splatjax.cli._render import Turntable
 from splatjax.cli._terminal import process_index_and_count
 
@@ -157,6 +158,19 @@ def test_an_orbit_under_lights_that_stand_still_is_lit_once(splats, tmp_path, mo
     assert run("render", *still, "--output", alone) == 0
     frames = [sj.read_exr(path) for path in (folder / "frame_0001.exr", alone)]
     np.testing.assert_allclose(*(np.asarray(frame.beauty) for frame in frames), atol=1e-5)
+
+
+def test_an_environment_that_turns_about_the_body_has_its_shadow_maps_made_once(
+    splats, tmp_path, monkeypatch
+):
+    transfer = mock.Mock(wraps=sj.transfer)
+    monkeypatch.setattr(sj, "transfer", transfer)
+    monkeypatch.setattr(_render, "_DIRECTIONS", 6)
+    words = command(splats, tmp_path / "turn", "--environment", "sun", turn="light", frames=2)
+    assert run(*words) == 0
+    assert transfer.call_count == 1
+    first, second = (sj.read_exr(tmp_path / "turn" / f"frame_000{i}.exr").beauty for i in range(2))
+    assert np.max(first) > 1.1 * np.max(second) > 0  # the sun has gone behind
 
 
 SHARED_FRAMES = 6

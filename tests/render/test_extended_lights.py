@@ -144,6 +144,10 @@ def test_kept_shadows_serve_other_strengths_images_and_rotations():
         assert np.max(apart_by) < most * np.max(exact.irradiance.entering)
         frames = (sj.render(scene, CAMERA, PLAIN, plan, light=each) for each in (kept, exact))
         assert apart(*(frame.beauty for frame in frames))[""] < most
+    one = sj.Scene(BODY, first.lights[0], BARE)
+    for refused in (sj.render, sj.diffusion_basis):
+        with pytest.raises(ValueError, match=r"light holds visibility .* and the scene"):
+            refused(one, CAMERA, PLAIN, sj.make_plan(one, CAMERA, PLAIN), light=kept)
 
 
 def test_light_with_kept_shadows_has_its_derivatives(float64):
