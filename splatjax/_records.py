@@ -209,7 +209,7 @@ def _shaped(where: str, array: Array, axes: list[str], lengths: dict[str, int]) 
         return array
     if array.ndim == 0 and axes and all(axis in lengths for axis in axes):
         return jnp.broadcast_to(array, [lengths[axis] for axis in axes])
-    if array.ndim == len(axes) - 1 and axes[-1] == "channels":
+    if array.ndim == len(axes) - 1 and axes[-1].lstrip("#") == "channels":
         array = array[..., None]
     wanted = [int(axis) if axis.isdigit() else lengths.get(axis, axis) for axis in axes]
     # A string is an axis whose length no other field gives.

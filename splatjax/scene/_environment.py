@@ -39,8 +39,8 @@ class EnvironmentLight(AbstractExtendedLight):
 
     **Attributes:**
 
-    - `image`: radiance, linear; twice as wide as high. Differentiable. The boundaries of the strata
-      are not differentiated.
+    - `image`: radiance, linear; twice as wide as high, gray or in color. Differentiable; the
+      boundaries of the strata are held fixed.
     - `rotation`: degrees about `up`; a positive angle turns +z towards +x. Differentiable.
     - `strength`: a factor on each channel. Differentiable.
     - `up`: the direction of the image's upper edge: (0, 0, 1) for a world whose z is up; the middle
@@ -55,7 +55,7 @@ class EnvironmentLight(AbstractExtendedLight):
     radiance that is negative or not finite.
     """
 
-    image: Float[Array, "height width channels"] = eqx.field(
+    image: Float[Array, "height width #channels"] = eqx.field(
         converter=numbers, metadata={"linear": True}
     )
     rotation: Float[Array, ""] = eqx.field(converter=numbers, default=0.0)

@@ -137,7 +137,7 @@ def test_kept_shadows_serve_other_strengths_images_and_rotations():
     first = under_two(np.ones((8, 16, 3)), strength=[1, 1, 1])
     plan = sj.make_plan(first, CAMERA, PLAIN)
     kept = sj.transfer(first, plan, PLAIN)
-    for image, rotation, most in ((np.full((8, 16, 3), 0.3), 0, 1e-5), (harmonics(), 70, 0.05)):
+    for image, rotation, most in ((np.full((8, 16), 0.3), 0, 1e-5), (harmonics(), 70, 0.05)):
         scene = under_two(image, rotation, [0.1, 2, 3])
         light, exact = (sj.illuminate(scene, plan, PLAIN, light=given) for given in (kept, None))
         apart_by = np.abs(light.irradiance.entering - exact.irradiance.entering)
