@@ -111,6 +111,7 @@ def extended_lights() -> World:
         sj.scene.RectangleLight([-14, 18, 25], [8, 5], [[6, 0, 5], [0, -7, 3]], count=2),
         sj.scene.DiskLight([12, -9, 30], [6, 8], [-0.3, 0.3, -1], 4.0, count=2),
         sj.scene.SphereLight([16, 14, 22], [9, 4], 3.0, count=2),
+        sj.EnvironmentLight(image, -20.0, 0.4, directions=[[1, 2, 2], [-2, 1, 1], [0, -1, 3]]),
     )
     body = uneven(_colored(bodies.bumpy(160)))
     return World(sj.Scene(body, lights, sj.Material(_gaussians(), roughness=0.4)), view())
