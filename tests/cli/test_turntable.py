@@ -160,6 +160,7 @@ def test_an_orbit_under_lights_that_stand_still_is_lit_once(splats, tmp_path, mo
     np.testing.assert_allclose(*(np.asarray(frame.beauty) for frame in frames), atol=1e-5)
 
 
+@pytest.mark.long
 def test_an_environment_that_turns_about_the_body_has_its_shadow_maps_made_once(
     splats, tmp_path, monkeypatch
 ):

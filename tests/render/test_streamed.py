@@ -98,6 +98,7 @@ def test_parts_make_the_picture_of_all_at_once(splats, monkeypatch):
     assert np.max(errors) < RIMS
 
 
+@pytest.mark.long
 def test_strata_of_lights_are_streamed_too(splats):
     whole = sj.render(sj.Scene(splats, STRATA, MATERIAL), CAMERA, SETTINGS)
     streamed = sj.render_streamed(in_parts(splats, 900), STRATA, MATERIAL, CAMERA, SETTINGS)
