@@ -74,7 +74,8 @@ def record(cls: Class) -> Class:
     for field in dataclasses.fields(cls):  # ty: ignore[invalid-argument-type]
         if "valid" in field.metadata:
             ranges[field.name] = field.metadata["valid"]
-        linear += [field.name] * ("linear" in field.metadata)
+        if "linear" in field.metadata:
+            linear.append(field.name)
         is_tuple = get_origin(field.type) is tuple
         annotation = get_args(field.type)[0] if is_tuple else field.type
         kinds = get_args(annotation) if isinstance(annotation, UnionType) else (annotation,)

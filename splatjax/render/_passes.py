@@ -64,6 +64,25 @@ class SplatLight(eqx.Module):
         return jax.tree.map(lambda leaf: take_points(leaf, chosen) if leaf.ndim else leaf, self)
 
 
+def compute_visibility(
+    scene: Scene,
+    settings: RenderSettings,
+    plan: Plan,
+    combination: AbstractCombination,
+    bounds: _splatting.Bounds,
+    transfer: Transfer | None = None,
+) -> LightVisibility:
+    """Make the shadow maps and look up the splats in them (pass 1), or read a precomputed result.
+
+    **Arguments:** as for `light_splats`.
+    """
+    if transfer is not None:
+        return LightVisibility(stack_lights(scene.lights), transfer.visibility, transfer.needed)
+    return cast_shadows(
+        scene, bounds, plan.shadows, settings.splatting, settings.shadows, combination
+    )
+
+
 def light_splats(
     scene: Scene,
     settings: RenderSettings,
@@ -83,12 +102,7 @@ def light_splats(
     - `derivative`: also differentiate the layers in the material's Gaussians.
     - `transfer`: in the place of pass 1.
     """
-    if transfer is None:
-        light = cast_shadows(
-            scene, bounds, plan.shadows, settings.splatting, settings.shadows, combination
-        )
-    else:
-        light = LightVisibility(stack_lights(scene.lights), transfer.visibility, transfer.needed)
+    light = compute_visibility(scene, settings, plan, combination, bounds, transfer)
     irradiance, added = irradiance_at_splats(scene, light), None
     if derivative and scene.material.single_scattering is not None:
         irradiance, added = _differentiated_irradiance(scene, light)

@@ -295,8 +295,8 @@ def _plan_shadows(
     if isinstance(lights[0], DistantStratum):
         directions = jnp.asarray(_DIRECTIONS, lights[0].direction.dtype)
         lights = [
-            DistantStratum(direction=each, irradiance=lights[0].irradiance, cast_shadows=True)
-            for each in directions
+            DistantStratum(direction=way, irradiance=lights[0].irradiance, cast_shadows=True)
+            for way in directions
         ]
     of_lights, cube = plan_views(lights, bounds, settings.shadows)
     views = [view for views in of_lights for view in views]

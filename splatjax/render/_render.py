@@ -11,7 +11,7 @@ from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Float
 
 from splatjax._chunking import take_points
-from splatjax._combination import AbstractCombination, lay_out
+from splatjax._combination import lay_out
 from splatjax.cache import kept_jit
 from splatjax.scene import Camera, Frame, Scene, lights_by_kind
 from splatjax.splatting import Bounds
@@ -19,21 +19,16 @@ from splatjax.splatting import Bounds
 from ._checks import check_channels
 from ._devices import filled_like, on_devices
 from ._filling import rows_at
-from ._lighting import (
-    Irradiance,
-    LightAtSplats,
-    LightVisibility,
-    cast_shadows,
-    irradiance_at_splats,
+from ._lighting import Irradiance, LightAtSplats, irradiance_at_splats
+from ._passes import (
+    SplatLight,
+    Transfer,
+    compute_visibility,
+    diffuse_splats,
+    light_source,
+    see_and_shade,
 )
-from ._passes import SplatLight, Transfer, diffuse_splats, light_source, see_and_shade
-from ._plan import (
-    Plan,
-    RenderSettings,
-    check_plan,
-    plan_unless_traced,
-    splats_per_device,
-)
+from ._plan import Plan, RenderSettings, check_plan, plan_unless_traced, splats_per_device
 from ._shade import compose
 
 Kept = TypeVar("Kept", bound=SplatLight | Transfer)
@@ -152,8 +147,8 @@ def illuminate(
     check_plan(plan, scene)
     check_kept(light, scene, plan)
     filled, plan, _ = filled_like(scene, plan, light)
-    found = _illuminate(filled, plan, settings, derivative, light and fitted(light, filled))
-    return fitted(found, scene)
+    transfer = light and fitted(light, filled)
+    return fitted(_illuminate(filled, plan, settings, derivative, transfer), scene)
 
 
 @kept_jit
@@ -168,11 +163,11 @@ def _illuminate(
 
 
 def transfer(scene: Scene, plan: Plan, settings: RenderSettings = RenderSettings()) -> Transfer:
-    r"""Make the shadow maps of all lights, and keep how much of each light reaches every splat.
+    r"""Make the shadow maps of all lights, and return the visibility of each from every splat.
 
     Give the result to `render` or `illuminate`, for lights of other strengths and colors. An
-    environment whose `directions` are given may also have another image of the size, or another
-    rotation:
+    environment whose `directions` are given may also have another image of the same size, or
+    another rotation:
 
         white = EnvironmentLight(np.ones((64, 128, 3)), directions=even_directions(128))
         kept = transfer(Scene(splats, [white], material), plan)
@@ -193,20 +188,11 @@ def transfer(scene: Scene, plan: Plan, settings: RenderSettings = RenderSettings
 @kept_jit
 def _transfer(scene: Scene, plan: Plan, settings: RenderSettings) -> Transfer:
     def passes(combination, scene, plan):
-        light = cast_lights(scene, settings, plan, combination)
+        bounds = Bounds.of(scene.splats, combination)
+        light = compute_visibility(scene, settings, plan, combination, bounds)
         return Transfer(light.visibility, light.needed)
 
     return on_devices(passes, scene, plan, by_splat=True)
-
-
-def cast_lights(
-    scene: Scene, settings: RenderSettings, plan: Plan, combination: AbstractCombination
-) -> LightVisibility:
-    """Carry out pass 1 alone."""
-    bounds = Bounds.of(scene.splats, combination)
-    return cast_shadows(
-        scene, bounds, plan.shadows, settings.splatting, settings.shadows, combination
-    )
 
 
 def compute_irradiance(
@@ -229,7 +215,9 @@ def compute_irradiance(
 @eqx.filter_jit
 def _compute_irradiance(scene: Scene, plan: Plan, settings: RenderSettings) -> Irradiance:
     def passes(combination, scene, plan):
-        return irradiance_at_splats(scene, cast_lights(scene, settings, plan, combination))
+        bounds = Bounds.of(scene.splats, combination)
+        light = compute_visibility(scene, settings, plan, combination, bounds)
+        return irradiance_at_splats(scene, light)
 
     placed = on_devices(passes, scene, plan, by_splat=True), plan.order, plan.exists
     if plan.mesh is not None:

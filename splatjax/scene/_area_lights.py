@@ -28,7 +28,7 @@ class AbstractAreaLight(AbstractExtendedLight, AbstractHighlight):
     center: Float[Array, "3"] = eqx.field(converter=numbers)
     radiance: Float[Array, " channels"] = eqx.field(converter=numbers)
     strength_field: ClassVar[str] = "radiance"
-    fullness: eqx.AbstractClassVar[float]
+    area_factor: eqx.AbstractClassVar[float]
     """Area over that of the parallelogram of the first two axes."""
 
     @abc.abstractmethod
@@ -38,11 +38,11 @@ class AbstractAreaLight(AbstractExtendedLight, AbstractHighlight):
         """
 
     @abc.abstractmethod
-    def pattern(self) -> Float[np.ndarray, "samples axes"]:
+    def sample_offsets(self) -> Float[np.ndarray, "samples axes"]:
         """Lay out the samples, in units of the axes from the center."""
 
     @abc.abstractmethod
-    def within(self, places: Float[Array, "*places axes"]) -> Float[Array, "*places axes"]:
+    def nearest(self, places: Float[Array, "*places axes"]) -> Float[Array, "*places axes"]:
         """Find the nearest places on the light, in units of the axes from the center."""
 
     def normal_and_area(
@@ -54,11 +54,11 @@ class AbstractAreaLight(AbstractExtendedLight, AbstractHighlight):
         axes = self.axes()
         across = jnp.cross(axes[0], axes[1])
         area = jnp.linalg.norm(across)
-        return across / area if len(axes) == 2 else None, self.fullness * area
+        return across / area if len(axes) == 2 else None, self.area_factor * area
 
     def stacked_samples(self) -> AbstractLightSample:
         axes, (normal, area) = self.axes(), self.normal_and_area()
-        positions = self.center[None] + jnp.asarray(self.pattern(), axes.dtype) @ axes
+        positions = self.center[None] + jnp.asarray(self.sample_offsets(), axes.dtype) @ axes
 
         def sample(position):
             return EmitterStratum(
@@ -87,8 +87,8 @@ class AbstractAreaLight(AbstractExtendedLight, AbstractHighlight):
             along = jnp.tensordot(from_center, normal, 1) / approach
         hit = from_center + jnp.maximum(along, 0)[..., None] * mirrored
         axes = self.axes()
-        nearest = jnp.tensordot(self.within(jnp.tensordot(hit, jnp.linalg.pinv(axes), 1)), axes, 1)
-        to_nearest = nearest - from_center
+        closest = jnp.tensordot(self.nearest(jnp.tensordot(hit, jnp.linalg.pinv(axes), 1)), axes, 1)
+        to_nearest = closest - from_center
         squared = jnp.sum(to_nearest * to_nearest, axis=-1, keepdims=True)
         wi = to_nearest / jnp.sqrt(jnp.maximum(squared, 1e-12))
 
@@ -117,7 +117,7 @@ class RectangleLight(AbstractAreaLight):
     """
 
     edges: Float[Array, "2 3"] = eqx.field(converter=numbers)
-    fullness: ClassVar[float] = 1.0
+    area_factor: ClassVar[float] = 1.0
 
     def __check_init__(self):
         if isinstance(self.edges, jax.Array):
@@ -148,11 +148,11 @@ class RectangleLight(AbstractAreaLight):
     def axes(self) -> Float[Array, "2 3"]:
         return self.edges
 
-    def pattern(self) -> Float[np.ndarray, "samples 2"]:
+    def sample_offsets(self) -> Float[np.ndarray, "samples 2"]:
         i = np.arange(self.count) + 0.5
         return np.stack([i / self.count, i * _GOLDEN % 1], axis=1) - 0.5
 
-    def within(self, places: Float[Array, "*places 2"]) -> Float[Array, "*places 2"]:
+    def nearest(self, places: Float[Array, "*places 2"]) -> Float[Array, "*places 2"]:
         return jnp.clip(places, -0.5, 0.5)
 
 
@@ -168,17 +168,17 @@ class DiskLight(AbstractAreaLight):
 
     direction: Float[Array, "3"] = eqx.field(converter=numbers)
     radius: Float[Array, ""] = eqx.field(converter=numbers)
-    fullness: ClassVar[float] = np.pi
+    area_factor: ClassVar[float] = np.pi
 
     def axes(self) -> Float[Array, "2 3"]:
         return self.radius * _across(self.direction)
 
-    def pattern(self) -> Float[np.ndarray, "samples 2"]:
+    def sample_offsets(self) -> Float[np.ndarray, "samples 2"]:
         i = np.arange(self.count) + 0.5
         angle = 2 * np.pi * _GOLDEN * i
         return np.sqrt(i / self.count)[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
-    def within(self, places: Float[Array, "*places axes"]) -> Float[Array, "*places axes"]:
+    def nearest(self, places: Float[Array, "*places axes"]) -> Float[Array, "*places axes"]:
         return places / jnp.sqrt(jnp.maximum(jnp.sum(places**2, axis=-1, keepdims=True), 1.0))
 
 
@@ -195,12 +195,12 @@ class SphereLight(AbstractAreaLight):
     """
 
     radius: Float[Array, ""] = eqx.field(converter=numbers)
-    fullness: ClassVar[float] = np.pi
+    area_factor: ClassVar[float] = np.pi
 
     def axes(self) -> Float[Array, "3 3"]:
         return self.radius * jnp.eye(3, dtype=self.radius.dtype)
 
-    def pattern(self) -> Float[np.ndarray, "samples 3"]:
+    def sample_offsets(self) -> Float[np.ndarray, "samples 3"]:
         # Seen from any side, a density of 1 / sqrt(1 - s^2) is even.
         i = np.arange(self.count) + 0.5
         s = np.sin(np.linspace(0, np.pi / 2, 1000))
@@ -210,7 +210,7 @@ class SphereLight(AbstractAreaLight):
         across = np.sqrt(1 - z * z)
         return s * np.stack([across * np.cos(angle), z, across * np.sin(angle)], axis=1)
 
-    within = DiskLight.within
+    nearest = DiskLight.nearest
 
 
 def _across(direction: Float[Array, "3"]) -> Float[Array, "2 3"]:

@@ -112,9 +112,9 @@ class EnvironmentLight(AbstractExtendedLight):
             axis=-1,
         )
         if self.directions is None:
-            strata = self._cut(moments)
+            strata = self._stratify(moments)
         else:
-            strata = self._shared(directions, moments)
+            strata = self._distribute(directions, moments)
 
         towards, irradiance = strata[:, -5:-2], strata[:, :-5] * self.strength[None]
         is_filled = jnp.sum(towards**2, axis=-1, keepdims=True) > 0
@@ -128,24 +128,24 @@ class EnvironmentLight(AbstractExtendedLight):
 
         return jax.vmap(sample)(towards, irradiance)
 
-    def _shared(
+    def _distribute(
         self, directions: Float[Array, "height width 3"], moments: Float[Array, "height width sums"]
     ) -> Float[Array, "samples sums"]:
-        """Sum the moments of the pixels near each of the given directions: every pixel is shared
-        out by Gaussians half as wide as these are apart.
+        """Distribute the moments of every pixel over the given directions near it, by Gaussians
+        half as wide as the directions are apart.
         """
         given = self.directions / jnp.linalg.norm(self.directions, axis=1, keepdims=True)
         given = given @ self.to_world()
-        narrowness = len(given) / jnp.pi  # over the squared angle
+        concentration = len(given) / jnp.pi  # over the squared angle
 
         def of_row(row):
             towards, moments = row
-            shares = jax.nn.softmax(narrowness * towards @ given.T, axis=1)
+            shares = jax.nn.softmax(concentration * towards @ given.T, axis=1)
             return shares.T @ moments
 
         return jnp.sum(jax.lax.map(of_row, (directions, moments)), axis=0)
 
-    def _cut(self, moments: Float[Array, "height width sums"]) -> Float[Array, "strata sums"]:
+    def _stratify(self, moments: Float[Array, "height width sums"]) -> Float[Array, "strata sums"]:
         """Sum the moments over strata, which are cut from the sphere along a Hilbert curve."""
         # Sum over cells of equal area, in the order of the curve.
         height = len(moments)
@@ -165,20 +165,20 @@ class EnvironmentLight(AbstractExtendedLight):
         stratum = jnp.minimum((middles * self.count).astype(jnp.int32), self.count - 1)
         return jnp.zeros((self.count, cells.shape[1]), cells.dtype).at[stratum].add(cells)
 
-    def highlight(self) -> "BlurredEnvironment":
-        return BlurredEnvironment(_blurred(self.radiance()), self.to_world())
+    def highlight(self) -> "PrefilteredEnvironment":
+        return PrefilteredEnvironment(_prefiltered(self.radiance()), self.to_world())
 
     def behind(self, frame: Frame, camera: Camera) -> Float[Array, "height width channels"]:
         """Composite the `beauty` of a frame over the environment as its camera sees it."""
         sides = reversed(frame.coverage.shape)
         x, y = jnp.meshgrid(*(jnp.arange(n, dtype=self.image.dtype) + 0.5 - n / 2 for n in sides))
         z = jnp.broadcast_to(camera.focal_length * len(x), x.shape)
-        sharp = BlurredEnvironment(_padded(self.radiance()[None]), self.to_world())
+        sharp = PrefilteredEnvironment(_padded(self.radiance()[None]), self.to_world())
         seen = sharp.radiance(jnp.stack([x, y, z], axis=-1) @ camera.rotation, jnp.zeros_like(z))
         return frame.beauty + (1 - frame.coverage)[..., None] * seen
 
 
-class BlurredEnvironment(AbstractHighlight):
+class PrefilteredEnvironment(AbstractHighlight):
     """The mean radiance that lobes of several roughnesses see of an environment.
 
     **Attributes:**
@@ -250,8 +250,10 @@ def _hilbert_curve(side: int) -> np.ndarray:
     return np.block([upper, [count + part, 2 * count + part]])
 
 
-def _blurred(radiance: Float[Array, "height width channels"]) -> Float[Array, "maps _ _ channels"]:
-    r"""Blur an environment by the specular lobe along the normal, for several roughnesses.
+def _prefiltered(
+    radiance: Float[Array, "height width channels"],
+) -> Float[Array, "maps _ _ channels"]:
+    r"""Prefilter an environment by the specular lobe along the normal, for several roughnesses.
 
     The lobe at the angle `2 a` from the mirrored direction is `exp(-tan^2 a / m^2) cos 2a / cos^6
     a`, divided by its integral. In longitude it is a circular convolution.
@@ -265,7 +267,7 @@ def _blurred(radiance: Float[Array, "height width channels"]) -> Float[Array, "m
 
     polar = jnp.pi / _ROWS * (jnp.arange(_ROWS, dtype=dtype) + 0.5)
     turn = jnp.cos(jnp.pi / _ROWS * jnp.arange(2 * _ROWS, dtype=dtype))
-    up, across = (each[:, None] * each[None] for each in (jnp.cos(polar), jnp.sin(polar)))
+    up, across = (factor[:, None] * factor[None] for factor in (jnp.cos(polar), jnp.sin(polar)))
     cosine = jnp.clip(up[..., None] + across[..., None] * turn[None, None], -0.99, 1.0)
 
     def blur(roughness):

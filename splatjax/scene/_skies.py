@@ -19,7 +19,7 @@ _CONCENTRATION = 1500.0  # of the sun, whose light is spread over some 3 degrees
 
 
 def studio(height: int = 64) -> Float[Array, "height width 3"]:
-    """Make a dark room with a large softbox in front on the side of -x, a weak one on the side of
+    """Make a dark studio with a large softbox in front on the side of -x, a weak one on the side of
     +x, and a strip behind.
 
     **Arguments:**
@@ -63,7 +63,7 @@ def sun_and_sky(
     **Returns:** radiance; a surface that faces the sun receives about 2.2 from it.
     """
     directions, solid_angles = pixel_directions(height)
-    zenith, horizon, sun = (jnp.asarray(each)[None, None] for each in (_ZENITH, _HORIZON, _SUN))
+    zenith, horizon, sun = (jnp.asarray(rgb)[None, None] for rgb in (_ZENITH, _HORIZON, _SUN))
     to_sun = jnp.tensordot(directions, _frame(azimuth, elevation)[2], 1)[..., None] - 1
     rise = jnp.sqrt(jnp.maximum(directions[..., 1:2], 1e-4))
     sky = horizon + (zenith - horizon) * rise + 0.5 * horizon * jnp.exp(6 * to_sun)
@@ -75,7 +75,7 @@ def sun_and_sky(
 
 def _frame(azimuth: Numbers, elevation: Numbers) -> Float[Array, "3 3"]:
     """Compute the directions along the horizon at a place of the sky, above it, and towards it."""
-    turn, rise = (jnp.deg2rad(as_floats(each)) for each in (azimuth, elevation))
+    turn, rise = (jnp.deg2rad(as_floats(degrees)) for degrees in (azimuth, elevation))
     (east, south), (high, across) = ((jnp.sin(a), jnp.cos(a)) for a in (turn, rise))
     right, up = [south, jnp.zeros_like(turn), -east], [-east * high, across, -south * high]
     return jnp.stack([*right, *up, east * across, high, south * across]).reshape(3, 3)

@@ -165,17 +165,18 @@ def reflected_radiance(
             points.normals, wi, points.outgoing, f0=f0, specular=specular, roughness=roughness
         )
 
-    grouped = list(zip(groups, points.visibility, strict=True))
-    lamps = [each for each in grouped if not each[0].highlights]
+    pairs = list(zip(groups, points.visibility, strict=True))
+    with_lobes = [(group, visible) for group, visible in pairs if not group.highlights]
+    mirrored_lights = [(group, visible) for group, visible in pairs if group.highlights]
     radiance = sum_received(
         points.positions,
         points.normals,
-        [group for group, _ in lamps],
-        [visible for _, visible in lamps],
+        [group for group, _ in with_lobes],
+        [visible for _, visible in with_lobes],
         lambda wi, _: lobe(wi)[None],
         channels,
     )
-    if len(lamps) == len(groups):
+    if not mirrored_lights:
         return radiance
     one, cosine = jnp.ones_like(f0), _cosine(points.normals, points.outgoing)
     specular = jnp.broadcast_to(points.specular, cosine.shape)[None]
@@ -185,7 +186,7 @@ def reflected_radiance(
     def received(wi):
         return lobe(wi, one) * _cosine(points.normals, wi)
 
-    for group, visible in (each for each in grouped if each[0].highlights):
+    for group, visible in mirrored_lights:
         for index, highlight in zip(group.distinct, group.highlights, strict=True):
             reflected = specular * highlight.reflected(
                 points.positions, mirrored, points.roughness, received, albedo

@@ -10,12 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from splatjax._chunking import (
-    map_chunks,
-    needed_over_planned,
-    take_points,
-    with_spare,
-)
+from splatjax._chunking import map_chunks, needed_over_planned, take_points, with_spare
 from splatjax._combination import AbstractCombination, OneDevice
 from splatjax.cache import reuse_capacity
 from splatjax.scene import Splats
@@ -126,9 +121,8 @@ class TilePlan(AbstractRasterPlan):
         most = max(int(_tiles_behind(whole, view, settings, coarse)) for view in views)
         step = -(-grid.half // 8)
         grain = math.lcm(self.rasterizer.lanes * step, len(parts))
-        kind = "behind", grid, grain
         capacity = -(-int(_SPARE * most + 1) // grain) * grain
-        behind = reuse_capacity(kind, int(1.25 * most) + 1, capacity)
+        behind = reuse_capacity(("behind", grid, grain), int(1.25 * most) + 1, capacity)
         return dataclasses.replace(self, places=SurfaceCapacity(self.places.front, behind))
 
     def choose(
