@@ -93,6 +93,30 @@ def test_an_environment_of_one_pixel_is_a_directional_light():
 
 
 @pytest.mark.once
+def test_an_environment_is_the_sum_of_its_samples_in_every_layer():
+    """Its shadow is theirs, weighted by the light that each would bring to the sheet."""
+    body = joined(sheet(6.0, 0.4), sphere(150, 2.0, (-1.0, 2.0, 4.0)))
+    medium = sj.Medium([0.1, 0.02, 0.5], [0.9, 0.98, 0.5], 1.3)
+    material = sj.Material(
+        two_gaussians(), specular=0.0, single_scattering=sj.SingleScattering(medium)
+    )
+    image = np.random.default_rng(1).uniform(size=(4, 8, 3)) ** 4
+    sky = sj.EnvironmentLight(image, count=6)
+    lamps = [sj.DirectionalLight(each.direction, each.irradiance) for each in sky.samples()]
+    camera = sj.Camera.look_at([0, -30, 30], [0, 0, 0], fov=14, width=24, height=24)
+    ours, theirs = (
+        sj.render(sj.Scene(body, lights, material), camera, PLAIN) for lights in (sky, lamps)
+    )
+    for layer in ("diffuse", "single_scattering", "irradiance", "albedo", "beauty"):
+        assert apart(getattr(ours, layer), getattr(theirs, layer))[""] < 1e-5
+    brought = [max(-float(s.direction[2]), 0) * float(np.sum(s.irradiance)) for s in sky.samples()]
+    shadow = np.tensordot(brought, theirs.shadow, 1) / np.sum(brought)
+    is_sheet = np.asarray((ours.normal[..., 2] > 0.999) & (ours.position[..., 2] < 0.1))
+    np.testing.assert_allclose(ours.shadow[0][is_sheet], shadow[is_sheet], atol=1e-2)
+    assert np.min(shadow[is_sheet]) < 0.5 < 0.99 < np.max(shadow[is_sheet])
+
+
+@pytest.mark.once
 @pytest.mark.parametrize("up", [(0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0)])
 def test_a_turned_map_is_a_body_turned_back(up):
     """Where z is up, the middle of the map is -y."""
