@@ -112,7 +112,7 @@ class LightVisibility(eqx.Module):
 
         def received(light):
             wi, irradiance = light.incidence(positions)
-            return jnp.maximum(jnp.sum(normals * wi, -1), _GRAZING) * jnp.sum(abs(irradiance), -1)
+            return jnp.maximum(jnp.sum(normals * wi, -1), _GRAZING) * light.weight(irradiance)
 
         def mean(group: StackedLights, rows):
             if rows is None or len(group.distinct) == len(group.light_indices):

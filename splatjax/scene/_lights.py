@@ -114,6 +114,10 @@ class AbstractLightSample(AbstractLight):
         on a surface that faces it.
         """
 
+    def weight(self, irradiance: Float[Array, "*points channels"]) -> Float[Array, "*points"]:
+        """Weigh the sample in the mean visibility of its light, by the irradiance it may bring."""
+        return jnp.sum(abs(irradiance), axis=-1)
+
 
 class AbstractExtendedLight(AbstractLight):
     """A light that many samples stand for, with one highlight for all.

@@ -6,7 +6,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from bodies import PLAIN, apart, camera_over, joined, sheet, sphere, two_gaussians, unit
+from bodies import (
+    PLAIN,
+    apart,
+    camera_over,
+    joined,
+    map_directions,
+    sheet,
+    sphere,
+    two_gaussians,
+    unit,
+)
 from jax.test_util import check_grads
 from pictures import write_picture
 
@@ -22,14 +32,6 @@ TILES = sj.RenderSettings(diffuser=DenseDiffuser(), shadows=ShadowSettings(resol
 # Root mean square, and largest error of the irradiance over its largest value, by count.
 SAMPLED = {16: (0.05, 0.15), 64: (0.015, 0.045), 256: (0.004, 0.012)}
 BODY = joined(sphere(1500, 10.0), sphere(400, 3.0, (4.0, 6.0, 12.0)))
-
-
-def map_directions(rows: int) -> np.ndarray:
-    """The directions of the pixels as OpenEXR defines them."""
-    polar = np.pi * (np.arange(rows)[:, None] + 0.5) / rows
-    longitude = np.pi * (1 - (np.arange(2 * rows)[None] + 0.5) / rows)
-    x, z = np.sin(polar) * np.sin(longitude), np.sin(polar) * np.cos(longitude)
-    return np.stack(np.broadcast_arrays(x, np.cos(polar), z), axis=-1)
 
 
 def harmonics(rows: int = 64) -> np.ndarray:
