@@ -64,7 +64,6 @@ from .render import (
     render as render,
     render_streamed as render_streamed,
     RenderSettings as RenderSettings,
-    SplatLight as SplatLight,
 )
 from .scattering import (
     Dipole as Dipole,
