@@ -59,10 +59,11 @@ from .render import (
     picture_jacobian as picture_jacobian,
     PictureJacobian as PictureJacobian,
     Plan as Plan,
+    relighting_basis as relighting_basis,
+    RelightingBasis as RelightingBasis,
     render as render,
     render_streamed as render_streamed,
     RenderSettings as RenderSettings,
-    SplatLight as SplatLight,
 )
 from .scattering import (
     Dipole as Dipole,

@@ -152,6 +152,14 @@ def hits(camera: Camera) -> np.ndarray:
     return eye - ways * (eye[2] / ways[..., 2:])
 
 
+def map_directions(rows: int) -> np.ndarray:
+    """The directions of the pixels as OpenEXR defines them."""
+    polar = np.pi * (np.arange(rows)[:, None] + 0.5) / rows
+    longitude = np.pi * (1 - (np.arange(2 * rows)[None] + 0.5) / rows)
+    x, z = np.sin(polar) * np.sin(longitude), np.sin(polar) * np.cos(longitude)
+    return np.stack(np.broadcast_arrays(x, np.cos(polar), z), axis=-1)
+
+
 def two_gaussians() -> SumOfGaussians:
     """A material of two layers, for laws that hold for any number: each more takes its time to
     compile.

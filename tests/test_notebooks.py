@@ -19,6 +19,7 @@ LONG = {
     "new_material",
     "painted_skin",
     "recover_marble",
+    "relight",
     "shape_from_shading",
     "which_profile",
     *(f"figure_{number}" for number in (1, 4, 5, 6, 7, 8)),  # Figure 3 has no picture to render

@@ -60,7 +60,7 @@ class NormalFields(AbstractLighting):
     **Source:** Botsch et al. 2004, "Phong Splatting".
     """
 
-    def attributes(self, scene, light, irradiance):
+    def attributes(self, scene, light, irradiance, eye):
         splats = scene.splats
         if not isinstance(splats, PhongSplats):
             raise ValueError(
@@ -69,7 +69,7 @@ class NormalFields(AbstractLighting):
             )
         slopes = splats.slopes.reshape(-1, 3, 3)
         at_origin = splats.normals - jnp.einsum("sij,sj->si", slopes, splats.centers)
-        attributes = super().attributes(scene, light, irradiance)
+        attributes = super().attributes(scene, light, irradiance, eye)
         return dataclasses.replace(attributes, normals=at_origin.T, extra=splats.slopes.T)
 
     def at_pixels(self, scene, groups, samples):

@@ -23,6 +23,7 @@ from ._lighting import (
 )
 from ._passes import SplatLight as SplatLight, Transfer as Transfer
 from ._plan import make_plan as make_plan, Plan as Plan, RenderSettings as RenderSettings
+from ._relighting import relighting_basis as relighting_basis, RelightingBasis as RelightingBasis
 from ._render import (
     compute_irradiance as compute_irradiance,
     diffuse_irradiance as diffuse_irradiance,

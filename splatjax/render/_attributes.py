@@ -22,6 +22,8 @@ class SurfaceAttributes(eqx.Module):
     - `albedo`, `irradiance`, `specular`, `roughness`: `None` where the splats carry none;
       `irradiance` is then `source`.
     - `visibility`: per group of samples, of each light; `None` for lights that cast no shadows.
+    - `single_scattering`: radiance towards the eye, without the albedo; `None` where the material
+      has none.
     - `layers`, `derivative`: the layers of pass 4 as `continue_from_splats` prepares them, and
       their derivatives; `centers` are the splats', mm from an origin.
     - `added_source`: the derivative of `source` in a weight of the Gaussians, where it has one.
@@ -36,6 +38,7 @@ class SurfaceAttributes(eqx.Module):
     specular: Float[Array, "1 points"] | None
     roughness: Float[Array, "1 points"] | None
     visibility: tuple[Float[Array, "_lights points"] | None, ...]
+    single_scattering: Float[Array, "channels points"] | None = None
     centers: Float[Array, "3 points"] | None = None
     layers: _diffusion.LayerValues | None = None
     derivative: _diffusion.LayerValues | None = None

@@ -112,7 +112,7 @@ class LightVisibility(eqx.Module):
 
         def received(light):
             wi, irradiance = light.incidence(positions)
-            return jnp.maximum(jnp.sum(normals * wi, -1), _GRAZING) * jnp.sum(abs(irradiance), -1)
+            return jnp.maximum(jnp.sum(normals * wi, -1), _GRAZING) * light.weight(irradiance)
 
         def mean(group: StackedLights, rows):
             if rows is None or len(group.distinct) == len(group.light_indices):
@@ -242,6 +242,20 @@ def irradiance_at_splats(scene: Scene, light: LightVisibility) -> Irradiance:
     return irradiance_at_points(scene.material, light, *points, *surface_parameters(scene))
 
 
+def single_scattering_at_splats(
+    scene: Scene, light: LightVisibility, eye: Float[Array, "3"]
+) -> Float[Array, "channels splats"] | None:
+    """Compute the radiance of light that scatters once, each light sample in its own shadow."""
+    splats, single = scene.splats, scene.material.single_scattering
+    if single is None:
+        return None
+    outgoing = _shading.unit_normals(eye[None] - splats.centers)
+    geometry = splats.centers, splats.normals, outgoing
+    points = _shading.SurfacePoints(*geometry, *surface_parameters(scene), light.visibility)
+    f0 = _shading.fresnel_f0(scene.material.eta)
+    return _shading.single_scattered_radiance(points, light.groups, f0, single)
+
+
 def surface_parameters(scene: Scene):
     """Multiply the material's specular strength and roughness with the splats' own."""
     splats, material = scene.splats, scene.material
@@ -257,7 +271,11 @@ class AbstractLighting(eqx.Module):
     """What splats carry into the picture, and what pixels make of it before light is shaded."""
 
     def attributes(
-        self, scene: Scene, light: LightVisibility, irradiance: Irradiance
+        self,
+        scene: Scene,
+        light: LightVisibility,
+        irradiance: Irradiance,
+        eye: Float[Array, "3"],
     ) -> SurfaceAttributes:
         """Collect what passes 2 and 3 blend, but for the layers of pass 4. A subclass adds what it
         needs as `extra`.
@@ -273,6 +291,7 @@ class AbstractLighting(eqx.Module):
             specular=None if splats.specular is None else specular[None],
             roughness=None if splats.roughness is None else roughness[None],
             visibility=light.per_light(splats.centers, splats.normals),
+            single_scattering=single_scattering_at_splats(scene, light, eye),
         )
 
     @abc.abstractmethod

@@ -208,7 +208,7 @@ def see_and_shade(
     splats = scene.splats.take(chosen)
     shown = Scene(splats, scene.lights, scene.material)
     visibility = LightVisibility(groups, light.visibility, light.needed)
-    attributes = settings.lighting.attributes(shown, visibility, light.irradiance)
+    attributes = settings.lighting.attributes(shown, visibility, light.irradiance, view.position)
     origin = jax.lax.stop_gradient(bounds.center)[:, None]
     centers = splats.centers.T - origin
     attributes = dataclasses.replace(

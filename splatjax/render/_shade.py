@@ -106,9 +106,8 @@ def shade(
     if attributes.albedo is not None:
         per_exitance = per_exitance * _shading.albedo_root(albedo)
     single = None
-    if material.single_scattering is not None:
-        single = _shading.single_scattered_radiance(points, groups, f0, material.single_scattering)
-        single = jnp.where(covered[None], single, 0.0)
+    if attributes.single_scattering is not None:
+        single = jnp.where(covered[None], attributes.single_scattering, 0.0)
         if attributes.albedo is not None:
             single = single * _shading.albedo_root(albedo) ** 2
     layers, resolved = at.weigh(material.gaussians, material.single_scattering_albedo())

@@ -130,7 +130,7 @@ def render_streamed(
     light = partial(_light, groups=groups, shadow_maps=shadow_maps, settings=settings)
 
     # Passes 2 and 3: what the camera sees.
-    like = settings.lighting.attributes(first, *light(first))
+    like = settings.lighting.attributes(first, *light(first), view.position)
 
     (seen,) = _sum_views(
         scenes,
@@ -139,7 +139,7 @@ def render_streamed(
         [view],
         rasterizer,
         settings.splatting,
-        lambda scene: stack_rows(settings.lighting.attributes(scene, *light(scene))),
+        lambda scene: stack_rows(settings.lighting.attributes(scene, *light(scene), view.position)),
     )
     visible, samples = _sample(seen, view, settings, like, bounds.center)
 

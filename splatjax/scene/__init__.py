@@ -10,6 +10,10 @@ from ._environment import (
     EnvironmentLight as EnvironmentLight,
     even_directions as even_directions,
 )
+from ._harmonics import (
+    HarmonicLight as HarmonicLight,
+    spherical_harmonics as spherical_harmonics,
+)
 from ._lights import (
     AbstractExtendedLight as AbstractExtendedLight,
     AbstractHighlight as AbstractHighlight,

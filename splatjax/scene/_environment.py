@@ -166,7 +166,7 @@ class EnvironmentLight(AbstractExtendedLight):
         return jnp.zeros((self.count, cells.shape[1]), cells.dtype).at[stratum].add(cells)
 
     def highlight(self) -> "PrefilteredEnvironment":
-        return PrefilteredEnvironment(_prefiltered(self.radiance()), self.to_world())
+        return PrefilteredEnvironment(prefilter(self.radiance()), self.to_world())
 
     def behind(self, frame: Frame, camera: Camera) -> Float[Array, "height width channels"]:
         """Composite the `beauty` of a frame over the environment as its camera sees it."""
@@ -250,7 +250,7 @@ def _hilbert_curve(side: int) -> np.ndarray:
     return np.block([upper, [count + part, 2 * count + part]])
 
 
-def _prefiltered(
+def prefilter(
     radiance: Float[Array, "height width channels"],
 ) -> Float[Array, "maps _ _ channels"]:
     r"""Prefilter an environment by the specular lobe along the normal, for several roughnesses.

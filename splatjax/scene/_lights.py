@@ -26,10 +26,7 @@ _EXPECTED = {
     "up": ("the direction of the image's upper edge, not zero", np.any),
     "radius": ("positive (mm)", lambda x: x > 0),
     "count": ("1 or more samples", lambda x: x >= 1),
-    "image": (
-        "finite and not negative; replace NaN, and clip what is negative",
-        lambda x: x >= 0,
-    ),
+    "image": ("finite and not negative; replace NaN, clip what is negative", lambda x: x >= 0),
 }
 
 
@@ -113,6 +110,10 @@ class AbstractLightSample(AbstractLight):
         """Compute, at points in mm, the unit direction `wi` towards the light and the irradiance
         on a surface that faces it.
         """
+
+    def weight(self, irradiance: Float[Array, "*points channels"]) -> Float[Array, "*points"]:
+        """Weigh the sample in the mean visibility of its light, by the irradiance it may bring."""
+        return jnp.sum(abs(irradiance), axis=-1)
 
 
 class AbstractExtendedLight(AbstractLight):
@@ -225,8 +226,7 @@ class EmitterStratum(AbstractLightSample):
 
     **Attributes:**
 
-    - `normal`: unit; the intensity is that along it, and falls off with the cosine. `None`: it is
-      the same on all sides.
+    - `normal`: unit; the intensity falls off with the cosine to it. `None`: even on all sides.
     """
 
     position: Float[Array, "3"]

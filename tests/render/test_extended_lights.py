@@ -6,7 +6,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from bodies import PLAIN, apart, camera_over, joined, sheet, sphere, two_gaussians, unit
+from bodies import (
+    PLAIN,
+    apart,
+    camera_over,
+    joined,
+    map_directions,
+    sheet,
+    sphere,
+    two_gaussians,
+    unit,
+)
 from jax.test_util import check_grads
 from pictures import write_picture
 
@@ -22,14 +32,6 @@ TILES = sj.RenderSettings(diffuser=DenseDiffuser(), shadows=ShadowSettings(resol
 # Root mean square, and largest error of the irradiance over its largest value, by count.
 SAMPLED = {16: (0.05, 0.15), 64: (0.015, 0.045), 256: (0.004, 0.012)}
 BODY = joined(sphere(1500, 10.0), sphere(400, 3.0, (4.0, 6.0, 12.0)))
-
-
-def map_directions(rows: int) -> np.ndarray:
-    """The directions of the pixels as OpenEXR defines them."""
-    polar = np.pi * (np.arange(rows)[:, None] + 0.5) / rows
-    longitude = np.pi * (1 - (np.arange(2 * rows)[None] + 0.5) / rows)
-    x, z = np.sin(polar) * np.sin(longitude), np.sin(polar) * np.cos(longitude)
-    return np.stack(np.broadcast_arrays(x, np.cos(polar), z), axis=-1)
 
 
 def harmonics(rows: int = 64) -> np.ndarray:
@@ -90,6 +92,30 @@ def test_an_environment_of_one_pixel_is_a_directional_light():
     ratio = np.sum(ours.specular) / np.sum(lamps.specular)
     assert float(ratio) == pytest.approx(1, abs=0.05)
     assert apart(ours.shadow, lamps.shadow)[""] < 5e-3
+
+
+@pytest.mark.once
+def test_an_environment_is_the_sum_of_its_samples_in_every_layer():
+    """Its shadow is theirs, weighted by the light that each would bring to the sheet."""
+    body = joined(sheet(6.0, 0.4), sphere(150, 2.0, (-1.0, 2.0, 4.0)))
+    medium = sj.Medium([0.1, 0.02, 0.5], [0.9, 0.98, 0.5], 1.3)
+    material = sj.Material(
+        two_gaussians(), specular=0.0, single_scattering=sj.SingleScattering(medium)
+    )
+    image = np.random.default_rng(1).uniform(size=(4, 8, 3)) ** 4
+    sky = sj.EnvironmentLight(image, count=6)
+    lamps = [sj.DirectionalLight(each.direction, each.irradiance) for each in sky.samples()]
+    camera = sj.Camera.look_at([0, -30, 30], [0, 0, 0], fov=14, width=24, height=24)
+    ours, theirs = (
+        sj.render(sj.Scene(body, lights, material), camera, PLAIN) for lights in (sky, lamps)
+    )
+    for layer in ("diffuse", "single_scattering", "irradiance", "albedo", "beauty"):
+        assert apart(getattr(ours, layer), getattr(theirs, layer))[""] < 1e-5
+    brought = [max(-float(s.direction[2]), 0) * float(np.sum(s.irradiance)) for s in sky.samples()]
+    shadow = np.tensordot(brought, theirs.shadow, 1) / np.sum(brought)
+    is_sheet = np.asarray((ours.normal[..., 2] > 0.999) & (ours.position[..., 2] < 0.1))
+    np.testing.assert_allclose(ours.shadow[0][is_sheet], shadow[is_sheet], atol=1e-2)
+    assert np.min(shadow[is_sheet]) < 0.5 < 0.99 < np.max(shadow[is_sheet])
 
 
 @pytest.mark.once
