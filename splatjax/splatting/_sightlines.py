@@ -13,13 +13,14 @@ from splatjax._combination import AbstractCombination
 from splatjax._records import check_values
 from splatjax.scene import Splats, even_directions
 
-_MOST_GROUPS = 100_000
+_MOST_GROUPS = 50_000
 _LARGEST_GROUP = 32  # splats, a block of the plan's order
 _CELL = 1.5  # edge of a cell, in spacings
 _SPARSE = 0.9  # quantile of the splats' areas by which cells are measured
 _CLEARANCE = 0.5  # height of either end of a line above the plane of the other, in spacings
 _CANDIDATES = 4  # ends that are tried on every line
-_AT_ONCE = 1 << 13  # splats
+_LEAST_NORMAL = 1e-3  # length of the mean normal of a group
+_AT_ONCE = 1 << 19  # pairs of splat and direction
 
 
 class SightlineSettings(eqx.Module):
@@ -30,7 +31,7 @@ class SightlineSettings(eqx.Module):
     - `directions`: an even number, over the sphere; the same for all splats.
     """
 
-    directions: int = eqx.field(static=True, default=64)
+    directions: int = eqx.field(static=True, default=256)
 
     def __check_init__(self):
         expected = "an even number of 2 or more"
@@ -40,7 +41,8 @@ class SightlineSettings(eqx.Module):
 class Sightlines(eqx.Module):
     r"""What splats see of the body, in directions that are even over the sphere.
 
-    Groups of splats that follow each other in a compact order share the view of their first one.
+    Splats that follow each other in a compact order are grouped: a group has one view, and the
+    exitance of its first splat.
 
     **Attributes:** not differentiated
 
@@ -72,19 +74,28 @@ class Sightlines(eqx.Module):
         while size < _LARGEST_GROUP and sum(part.count for part in parts) > _MOST_GROUPS * size:
             size *= 2
         centers, normals, areas = (
-            np.concatenate([np.asarray(getattr(part, name))[::size] for part in parts])
+            np.concatenate([np.asarray(getattr(part, name)) for part in parts])
             for name in ("centers", "normals", "areas")
         )
-        exists = areas > 0
-        spacing = np.sqrt(size * np.quantile(areas[exists], _SPARSE)) if exists.any() else 1.0
+        exists = areas.reshape(-1, size).sum(axis=1) > 0
+        if not exists.any():
+            exists[:1] = True
+        areas = areas.reshape(-1, size)[exists]
+        total = np.maximum(areas.sum(axis=1), np.finfo(areas.dtype).tiny)
+        centers, normals = (
+            np.einsum("gs,gsi->gi", areas / total[:, None], rows.reshape(-1, size, 3)[exists])
+            for rows in (centers, normals)
+        )
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), _LEAST_NORMAL)
+        spacing = np.sqrt(np.quantile(total, _SPARSE))
         count = settings.directions
         lines = even_directions(count)[: count // 2]
-        seen = np.full((count, len(centers)), len(centers), np.int32)
-        which = np.flatnonzero(exists)
-        given = centers[exists] - centers[exists].mean(axis=0), normals[exists], spacing
+        seen = np.full((count, len(exists)), len(exists), np.int32)
+        which = np.append(np.flatnonzero(exists), len(exists))
         for i, line in enumerate(lines):
-            for j, ends in zip((i, i + count // 2), _ends(line, *given), strict=True):
-                seen[j, which] = np.append(which, len(centers))[ends]
+            ends = _ends(line, centers - centers.mean(axis=0), normals, spacing)
+            for j, seen_along in zip((i, i + count // 2), ends, strict=True):
+                seen[j, which[:-1]] = which[seen_along]
         directions = np.concatenate([lines, -lines]).astype(centers.dtype)
         return cls(jnp.asarray(directions), jnp.asarray(seen.T), size)
 
@@ -93,7 +104,7 @@ class Sightlines(eqx.Module):
         return len(self.seen)
 
     def first_splats(self) -> Int[Array, " groups"]:
-        """Return the splat of each group whose view they share, of this device."""
+        """Return the first splat of each group of this device."""
         return jnp.arange(self.groups, dtype=jnp.int32) * self.size
 
     def irradiance(
@@ -124,7 +135,8 @@ class Sightlines(eqx.Module):
             return received.reshape(len(seen), -1)
 
         rows = normals.reshape(self.groups, 3 * self.size)
-        received = map_chunks(of_groups, rows, self.seen, at_once=_AT_ONCE // self.size)
+        at_once = max(_AT_ONCE // (self.size * len(self.directions)), 1)
+        received = map_chunks(of_groups, rows, self.seen, at_once=at_once)
         return received.reshape(-1, len(exitance)).T
 
 
