@@ -16,6 +16,7 @@ from splatjax.cache import kept_jit
 from splatjax.scene import Camera, Frame, Scene, lights_by_kind
 from splatjax.splatting import Bounds
 
+from ._bounces import bounced_irradiance, diffuse_splats
 from ._checks import check_channels
 from ._devices import filled_like, on_devices
 from ._filling import rows_at
@@ -23,9 +24,7 @@ from ._lighting import Irradiance, LightAtSplats
 from ._passes import (
     SplatLight,
     Transfer,
-    bounced_irradiance,
     compute_visibility,
-    diffuse_splats,
     light_source,
     see_and_shade,
 )
