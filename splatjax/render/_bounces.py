@@ -51,35 +51,37 @@ def bounced_irradiance(
     area, albedo = splats.areas[at], splats.albedo
     root = jnp.ones_like(direct.source) if albedo is None else albedo_root(albedo.T)
     specular, roughness = surface_parameters(scene)
-    enters = 1 - average_albedo(fresnel_f0(material.eta), specular, roughness)
-    # The Gaussians also stand for light that scatters once.
+    reflected = average_albedo(fresnel_f0(material.eta), specular, roughness)
+    enters = jnp.broadcast_to(1 - reflected, splats.radii.shape)[None]
+    # The Gaussians also stand for light that scatters once: of light from the lights where it
+    # leaves, of light from the body where it enters.
     whole, diffused = material.total_reflectance(), gaussians.total_reflectance()
-    once = (whole / jnp.where(diffused > 0, diffused, 1.0))[:, None]
+    added = (whole / jnp.where(diffused > 0, diffused, 1.0))[:, None]
 
     def bounce(so_far, _):
-        irradiance, needed = so_far
-        layers, _, bounce_needed = diffuse_splats(
-            scene, irradiance.source, settings, plan, combination, at
-        )
+        bounced, needed = so_far
+        source = (added * direct.entering + bounced) * root
+        layers, _, bounce_needed = diffuse_splats(scene, source, settings, plan, combination, at)
         weighed, _ = _diffusion.LayersAtPoints.of(
             gaussians.variances,
             plan.diffusion.gaussians,
             layers.values,
             None,
-            irradiance.source[:, at],
+            source[:, at],
             jnp.where(area > 0, area, 1.0),
             root[:, at] ** 2,
             plan.interval,
             settings.kernel,
         ).weigh(gaussians, material.single_scattering_albedo())
         exitance = root[:, at] * jnp.sum(gaussians.weights[:, :, None] * weighed, axis=0)
-        received = sightlines.irradiance(once * exitance, splats.normals, combination)
-        entering = direct.entering + once * enters * received
-        # Where splats carry no albedo, both are one.
-        irradiance = Irradiance(entering, entering * root)
-        return (irradiance, jnp.maximum(needed, bounce_needed)), None
+        received = sightlines.irradiance(exitance, splats.normals, combination)
+        return (added * enters * received, jnp.maximum(needed, bounce_needed)), None
 
-    return jax.lax.scan(bounce, (direct, none), None, length=settings.bounces)[0]
+    start = jnp.zeros_like(direct.entering), none
+    (bounced, needed), _ = jax.lax.scan(bounce, start, None, length=settings.bounces)
+    # Where splats carry no albedo, its root is one.
+    entering = direct.entering + bounced
+    return Irradiance(entering, entering * root), needed
 
 
 def diffuse_splats(

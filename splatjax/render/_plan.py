@@ -62,7 +62,7 @@ class RenderSettings(eqx.Module):
     lighting: AbstractLighting = LightAtSplats()
 
     def __check_init__(self):
-        check_values("bounces", self.bounces, "a whole number of 0 or more", lambda n: n >= 0)
+        check_values("bounces", self.bounces, "0 or more", lambda n: n >= 0)
         if self.bounces and not isinstance(self.lighting, LightAtSplats):
             raise ValueError(
                 f"bounces is {self.bounces} and lighting is {type(self.lighting).__name__}; light "
