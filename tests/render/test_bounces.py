@@ -114,13 +114,13 @@ def test_a_convex_body_receives_nothing_of_itself():
 @pytest.mark.once
 def test_opposite_squares_receive_by_their_form_factor():
     """Two squares of 20 mm, 20 mm apart: 0.1998 of what leaves one arrives at the other."""
-    lower, upper = sheet(9.8, 0.4), sheet(9.8, 0.4, (0.0, 0.0, -1.0), (0.0, 0.0, 20.0))
+    lower, upper = sheet(9.75, 0.5), sheet(9.75, 0.5, (0.0, 0.0, -1.0), (0.0, 0.0, 20.0))
     lamp = sj.DirectionalLight([0, 0, 1], [1, 2, 3], cast_shadows=False)
     scene = sj.Scene(joined(lower, upper), lamp, MATTE)
     direct, bounced = irradiance(scene, 0), irradiance(scene, 1)
     received = (bounced - direct)[:, : lower.count].mean(axis=1)
     exact = 0.1998 * np.asarray(MATTE.total_reflectance()) * direct[:, lower.count :].mean(axis=1)
-    np.testing.assert_allclose(received, exact, rtol=0.06)  # rims end half a spacing late
+    np.testing.assert_allclose(received, exact, rtol=0.07)  # rims end half a spacing late
     assert np.max(np.abs(bounced - direct)[:, lower.count :]) < 1e-6
 
 
