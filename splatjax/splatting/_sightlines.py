@@ -14,7 +14,7 @@ from splatjax.scene import Splats, even_directions
 
 _MOST_GROUPS = 50_000
 _LARGEST_GROUP = 32  # splats, a block of the plan's order
-_CELL = 1.5  # edge of a cell, in spacings
+_CELL = 1.35  # edge of a cell, in spacings: smaller ones leak, larger ones widen rims
 _SPARSE = 0.9  # quantile of the splats' areas by which cells are measured
 _CLEARANCE = 0.5  # height of either end of a line above the plane of the other, in spacings
 _CANDIDATES = 4  # ends that are tried on every line

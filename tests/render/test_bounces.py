@@ -151,7 +151,7 @@ def test_derivatives_in_light_material_and_albedo(float64):
 
     gaussians, albedo = MATTE.gaussians, jnp.full((body.count, 3), 0.6)
     given = jnp.ones(3), gaussians.weights, gaussians.variances, albedo, body.normals
-    check_grads(jax.jit(received), given, 1, ["rev"], rtol=1e-5)
+    check_grads(jax.jit(received), given, 1, ["fwd", "rev"], rtol=1e-5)
 
 
 @pytest.mark.once
