@@ -12,7 +12,7 @@ from splatjax._combination import AbstractCombination
 from splatjax._records import check_values
 from splatjax.scene import Splats, even_directions
 
-_MOST_GROUPS = 50_000
+_MOST_GROUPS = 90_000
 _LARGEST_GROUP = 32  # splats, a block of the plan's order
 _CELL = 1.35  # edge of a cell, in spacings: smaller ones leak, larger ones widen rims
 _SPARSE = 0.9  # quantile of the splats' areas by which cells are measured
