@@ -52,7 +52,8 @@ class Render(ViewOptions):
         self.check()
         is_valid = self.stream == 0 or (self.stream > 0 and self.splats is not None)
         expected = "be a number of splats of a PLY file, which must be named"
-        check_options(self, {"stream": (is_valid, expected)})
+        bounces = self.stream == 0 or self.bounces == 0, "be 0 with --stream"
+        check_options(self, {"stream": (is_valid, expected), "bounces": bounces})
         rendered = self._streamed(self.splats) if self.splats and self.stream else self._at_once()
         self.note_unresolved_layers(*rendered[:2])
         with stage(f"writing {self.output} and {self.output.with_suffix('.png')}"):
@@ -65,9 +66,9 @@ class Render(ViewOptions):
         scene = sj.Scene(splats, self.lights(material, self.azimuth, self.light_azimuth), material)
         with preview(lambda side: rough_picture(scene, camera, self.exposure, side)):
             with stage("planning"):
-                plan = sj.make_plan(scene, camera)
+                plan = sj.make_plan(scene, camera, self.settings)
             with stage(f"rendering {splats.count} splats at {self.width} x {self.height}"):
-                return draw(scene, camera, plan), material, scene.lights, camera
+                return draw(scene, camera, self.settings, plan), material, scene.lights, camera
 
     def _streamed(self, path: Path) -> Rendered:
         file = sj.SplatFile(path, self.stream, up=self.up)
@@ -181,7 +182,7 @@ class Turntable(ViewOptions):
     def _prepare(self, paths: list[tuple[Path, Path]]) -> Callable[[int], None]:
         """Load and plan; return the function that renders and writes frame i."""
         splats, material = self.load()
-        places = [self.azimuths(i) for i in range(self.frames)]
+        settings, places = self.settings, [self.azimuths(i) for i in range(self.frames)]
         scenes = [sj.Scene(splats, self.lights(material, *place), material) for place in places]
         cameras = [self.camera(lambda: [splats], azimuth) for azimuth, _ in places]
         keeps_shadows = self.environment is not None and self.turn != "camera"
@@ -190,18 +191,18 @@ class Turntable(ViewOptions):
             scenes = [replace(scene, lights=tuple(map(even, scene.lights))) for scene in scenes]
         # The plan is for all frames, so that an interruption changes none.
         with stage(f"planning {self.frames} frames"):
-            plan = sj.make_plan(scenes, cameras)
+            plan = sj.make_plan(scenes, cameras, settings)
         light = None
         if self.turn == "camera" and (self.environment or self.fill == 0):
             # No light moves: passes 1 and 4 are the same in every frame.
             with stage("lighting the splats"):
-                light = jax.block_until_ready(sj.illuminate(scenes[0], plan))
+                light = jax.block_until_ready(sj.illuminate(scenes[0], plan, settings))
         elif keeps_shadows:
             with stage(f"making {_DIRECTIONS} shadow maps"):
-                light = jax.block_until_ready(sj.transfer(scenes[0], plan))
+                light = jax.block_until_ready(sj.transfer(scenes[0], plan, settings))
 
         def make(i: int) -> None:
-            frame = draw(scenes[i], cameras[i], plan, light)
+            frame = draw(scenes[i], cameras[i], settings, plan, light)
             self.note_unresolved_layers(frame, material)
             self.write(paths[i][0], frame, material, scenes[i].lights, cameras[i])
 

@@ -63,6 +63,8 @@ class ViewOptions:
     #: Rotation of the environment about the vertical axis, degrees; at 0 the middle of the map is
     #: the front (+z).
     environment_rotation: float = 0.0
+    #: How many times light that has left the body may enter it again: 1 or 2 brighten folds.
+    bounces: int = 0
     #: Of the PNG: black, transparent, or what the camera sees of the --environment. The EXR has the
     #: coverage, and no background.
     background: Literal["black", "transparent", "environment"] = "black"
@@ -100,6 +102,7 @@ class ViewOptions:
                 self.background != "environment" or self.environment is not None,
                 "be black or transparent where there is no --environment",
             ),
+            "bounces": (self.bounces >= 0, "be 0 or more"),
             "width": (self.width >= 1, positive),
             "height": (self.height >= 1, positive),
             "count": (self.count >= 1, positive),
@@ -124,6 +127,10 @@ class ViewOptions:
         if self.environment in _ENVIRONMENTS:
             return sj.EnvironmentLight(_ENVIRONMENTS[self.environment]())
         return sj.io.load_environment(self.environment) if self.environment else None
+
+    @property
+    def settings(self) -> sj.RenderSettings:
+        return sj.RenderSettings(bounces=self.bounces)
 
     def load(self) -> tuple[sj.Splats, sj.Material]:
         """Return the splats, and the material with which they are rendered."""
@@ -254,12 +261,14 @@ class ViewOptions:
             )
 
 
-def draw(scene: sj.Scene, camera: sj.Camera, plan: sj.Plan, light=None) -> sj.Frame:
-    """Render, and wait for the picture; `light` as for `sj.render`.
+def draw(
+    scene: sj.Scene, camera: sj.Camera, settings: sj.RenderSettings, plan: sj.Plan, light=None
+) -> sj.Frame:
+    """Render, and wait for the picture; the arguments are those of `sj.render`.
 
     **Raises:** `ValueError` when the plan's capacity is exceeded.
     """
-    frame = jax.block_until_ready(sj.render(scene, camera, plan=plan, light=light))
+    frame = jax.block_until_ready(sj.render(scene, camera, settings, plan, light=light))
     if not frame.overflow <= 0:
         raise ValueError(
             f"the plan's capacity is exceeded: {float(frame.overflow):.2f} times of it is needed"

@@ -10,6 +10,7 @@ from splatjax.gaussians import SumOfGaussians
 from splatjax.scene import Camera, Scene
 from splatjax.splatting import invalid_factor
 
+from ._bounces import check_no_bounces
 from ._devices import filled_like, on_devices
 from ._filling import rows_at
 from ._passes import SplatLight, Transfer, in_a_row, light_source, see_and_shade
@@ -85,8 +86,8 @@ def diffusion_basis(
 
     **Returns:** a `DiffusionBasis`; NaN where the plan does not suffice.
 
-    **Raises:** `ValueError` as `render`, and for a material with single scattering, beside which
-    the light that enters depends on the weights.
+    **Raises:** `ValueError` as `render`, and for a material with single scattering and for bounces,
+    with which the light that enters depends on the weights.
     """
     if scene.material.single_scattering is not None:
         raise ValueError(
@@ -94,6 +95,7 @@ def diffusion_basis(
             "grow; render each material by itself, or give one with single_scattering=None"
         )
     plan = plan_unless_traced(scene, camera, settings, plan)
+    check_no_bounces(settings)
     check_kept(light, scene, plan)
     scene, plan, places = filled_like(scene, plan, camera, light)
     basis = _diffusion_basis(

@@ -14,6 +14,7 @@ from splatjax.gaussians import SumOfGaussians
 from splatjax.scene import Camera, Frame, Scene
 
 from ._attributes import SurfaceSamples
+from ._bounces import check_no_bounces
 from ._devices import filled_like, on_devices
 from ._filling import rows_at
 from ._lighting import LightAtSplats
@@ -99,7 +100,7 @@ def picture_jacobian(
     **Returns:** a `PictureJacobian`; NaN where the plan does not suffice.
 
     **Raises:** `ValueError` as `render`, and for a material with single scattering under light that
-    is not found at the splats.
+    is not found at the splats; and for bounces.
     """
     if scene.material.single_scattering is not None and not isinstance(
         settings.lighting, LightAtSplats
@@ -109,6 +110,7 @@ def picture_jacobian(
             "single scattering, which is differentiated at the splats alone; give "
             "lighting=LightAtSplats(), or a material without it"
         )
+    check_no_bounces(settings)
     scene, plan, places = filled_like(
         scene, plan_unless_traced(scene, camera, settings, plan), camera
     )

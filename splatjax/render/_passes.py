@@ -18,6 +18,7 @@ from splatjax._combination import AbstractCombination
 from splatjax.scene import Camera, Scene, stack_lights
 
 from ._attributes import SurfaceAttributes, SurfaceSamples, split_rows, stack_rows
+from ._bounces import bounced_irradiance, diffuse_splats
 from ._lighting import Irradiance, LightVisibility, cast_shadows, irradiance_at_splats
 from ._plan import Plan, RenderSettings
 from ._shade import ShadedSurface, shade
@@ -103,14 +104,15 @@ def light_splats(
     - `transfer`: in the place of pass 1.
     """
     light = compute_visibility(scene, settings, plan, combination, bounds, transfer)
-    irradiance, added = irradiance_at_splats(scene, light), None
+    irradiance, bounce_needed = bounced_irradiance(scene, settings, plan, combination, light)
+    added = None
     if derivative and scene.material.single_scattering is not None:
         irradiance, added = _differentiated_irradiance(scene, light)
     source = irradiance.source if added is None else jnp.concatenate([irradiance.source, added])
     layers, log_variance_derivative, needed = diffuse_splats(
         scene, source, settings, plan, combination, at, derivative
     )
-    needed = jnp.maximum(needed, light.needed)
+    needed = jnp.maximum(needed, jnp.maximum(light.needed, bounce_needed))
     along_splats = light.visibility, irradiance, added
     if at is not None:
         along_splats = jax.tree.map(partial(take_points, chosen=at), along_splats)
@@ -155,28 +157,6 @@ def _differentiated_irradiance(
     zero, one = jnp.zeros_like(weights[0]), jnp.ones_like(weights[0])
     value, derivative = jax.jvp(irradiance, (zero,), (one,))
     return value, derivative.source
-
-
-def diffuse_splats(
-    scene: Scene,
-    source: Float[Array, "channels splats"],
-    settings: RenderSettings,
-    plan: Plan,
-    combination: AbstractCombination,
-    at: Int[Array, " chosen"] | None = None,
-    derivative: bool = False,
-):
-    """Diffuse (pass 4): return the layers of the splats, their derivatives in the logarithms of
-    the variances, and the capacity needed.
-    """
-    splats, variances = scene.splats, scene.material.gaussians.variances
-    sources = _diffusion.Sources(splats.centers.T, splats.normals.T, splats.areas, source)
-    given = sources, variances, settings.kernel, combination, at
-    if not derivative:
-        diffused = plan.diffusion.diffuse(*given)
-        return diffused.layers, None, diffused.needed
-    diffused, differentiated = plan.diffusion.diffuse_with_derivative(*given)
-    return diffused.layers, differentiated.layers, diffused.needed
 
 
 def see_and_shade(

@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 from splatjax import diffusion as _diffusion, splatting as _splatting
 from splatjax._chunking import Result, rounded_up
 from splatjax._combination import DeviceMesh, OneDevice
+from splatjax._records import check_values
 from splatjax.cache import kept, reuse_capacity
 from splatjax.scene import (
     AbstractLight,
@@ -41,6 +42,8 @@ class RenderSettings(eqx.Module):
 
     - `splatting`: passes 2 and 3: epsilon-z, the screen filter.
     - `shadows`: pass 1: resolution and bias of shadow maps.
+    - `bounces`: how many times light that has left the body may enter it again. Static.
+    - `sightlines`: in how many directions each splat sees the body, for these.
     - `kernel`: pass 4: how a layer spreads, is normalized, and when the splats resolve it:
       `EscapeNormalization()`, or `PlainMean()`, the paper's.
     - `rasterizer`: `TileRasterizer()`, or `DenseRasterizer()`, the plain reference.
@@ -51,10 +54,20 @@ class RenderSettings(eqx.Module):
 
     splatting: _splatting.SplattingSettings = _splatting.SplattingSettings()
     shadows: _splatting.ShadowSettings = _splatting.ShadowSettings()
+    bounces: int = eqx.field(static=True, default=0)
+    sightlines: _splatting.SightlineSettings = _splatting.SightlineSettings()
     kernel: _diffusion.AbstractDiffusionKernel = _diffusion.EscapeNormalization()
     rasterizer: _splatting.AbstractRasterizer = _splatting.TileRasterizer()
     diffuser: _diffusion.AbstractDiffuser = _diffusion.ClusterDiffuser()
     lighting: AbstractLighting = LightAtSplats()
+
+    def __check_init__(self):
+        check_values("bounces", self.bounces, "0 or more", lambda n: n >= 0)
+        if self.bounces and not isinstance(self.lighting, LightAtSplats):
+            raise ValueError(
+                f"bounces is {self.bounces} and lighting is {type(self.lighting).__name__}; light "
+                "bounces between splats alone: give bounces=0, or lighting=LightAtSplats()"
+            )
 
 
 class Plan(eqx.Module):
@@ -74,6 +87,7 @@ class Plan(eqx.Module):
     - `diffusion`: the clusters and neighbors of the splats.
     - `interval`: standard deviations per spacing between which a layer becomes resolved.
     - `raster`: the capacity of what the cameras see.
+    - `sightlines`: which splats see which; `None` without bounces.
     - `mesh`: the devices that hold the splats; `None` for one. Static.
     - `splats`, `gaussians`: how many it is for. Static.
     """
@@ -84,6 +98,7 @@ class Plan(eqx.Module):
     diffusion: _diffusion.AbstractDiffusionPlan
     interval: Float[Array, "2"]
     raster: _splatting.AbstractRasterPlan
+    sightlines: _splatting.Sightlines | None
     mesh: Mesh | None = eqx.field(static=True)
     splats: int = eqx.field(static=True)
     gaussians: int = eqx.field(static=True)
@@ -91,7 +106,10 @@ class Plan(eqx.Module):
     def specs(self, combination: DeviceMesh) -> "Plan":
         """Specify which arrays every device has whole, and of which it has a share."""
         return eqx.tree_at(
-            lambda plan: (plan.order, plan.exists, *plan.diffusion.shares()),
+            lambda plan: (
+                *(plan.order, plan.exists, *plan.diffusion.shares()),
+                *([] if plan.sightlines is None else [plan.sightlines.seen]),
+            ),
             jax.tree.map(lambda _: PartitionSpec(), self),
             replace_fn=lambda _: combination.shares,
         )
@@ -142,6 +160,9 @@ def make_plan(
         diffusion=settings.diffuser.make_plan(parts, variances, settings.kernel, interval),
         interval=interval,
         raster=raster.fitted(parts, views, settings.splatting),
+        sightlines=_splatting.Sightlines.build(parts, settings.sightlines)
+        if settings.bounces
+        else None,
         mesh=mesh,
         splats=scene.splats.count,
         gaussians=len(gaussians.variances),

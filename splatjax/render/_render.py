@@ -16,15 +16,15 @@ from splatjax.cache import kept_jit
 from splatjax.scene import Camera, Frame, Scene, lights_by_kind
 from splatjax.splatting import Bounds
 
+from ._bounces import bounced_irradiance, diffuse_splats
 from ._checks import check_channels
 from ._devices import filled_like, on_devices
 from ._filling import rows_at
-from ._lighting import Irradiance, LightAtSplats, irradiance_at_splats
+from ._lighting import Irradiance, LightAtSplats
 from ._passes import (
     SplatLight,
     Transfer,
     compute_visibility,
-    diffuse_splats,
     light_source,
     see_and_shade,
 )
@@ -217,7 +217,7 @@ def _compute_irradiance(scene: Scene, plan: Plan, settings: RenderSettings) -> I
     def passes(combination, scene, plan):
         bounds = Bounds.of(scene.splats, combination)
         light = compute_visibility(scene, settings, plan, combination, bounds)
-        return irradiance_at_splats(scene, light)
+        return bounced_irradiance(scene, settings, plan, combination, light)[0]
 
     placed = on_devices(passes, scene, plan, by_splat=True), plan.order, plan.exists
     if plan.mesh is not None:

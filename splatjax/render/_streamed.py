@@ -68,6 +68,11 @@ def render_streamed(
     **Raises:** `ValueError` when there are no splats, parts differ in size, are not the same each
     time, or the settings cannot be streamed.
     """
+    if settings.bounces:
+        raise ValueError(
+            f"settings.bounces is {settings.bounces}, and splats that are streamed do not see each "
+            "other; give bounces=0, or render them at once, over a mesh if need be"
+        )
     rasterizer, diffuser = settings.rasterizer, settings.diffuser
     if not isinstance(rasterizer, _splatting.TileRasterizer) or not isinstance(
         diffuser, _diffusion.ClusterDiffuser

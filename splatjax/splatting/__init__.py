@@ -36,6 +36,7 @@ from ._shadows import (
     ShadowMap as ShadowMap,
     ShadowSettings as ShadowSettings,
 )
+from ._sightlines import Sightlines as Sightlines, SightlineSettings as SightlineSettings
 from ._surfaces import (
     blend_fragments as blend_fragments,
     Surface as Surface,

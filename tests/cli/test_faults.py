@@ -80,6 +80,8 @@ REFUSED = {
     "render plate.ply --background environment": ["--background", "no --environment"],
     "render plate.ply --environment map.png": ["map.png", "encoded for a display"],
     "render missing.ply --fill -1": ["--fill", "-1"],
+    "render missing.ply --bounces -1": ["--bounces", "-1"],
+    "render plate.ply --bounces 1 --stream 5": ["--bounces", "0 with --stream"],
     "render --stream 5": ["--stream", "5"],
     "turntable missing.ply --frames 0": ["--frames", "0"],
     "turntable missing.ply --frames 10001": ["--frames", "10001"],

@@ -2,6 +2,7 @@
 
 import json
 import sys
+from dataclasses import replace
 from functools import partial
 
 import equinox as eqx
@@ -130,7 +131,12 @@ def more_than_pictures_cut() -> dict:
         gathered = sj.diffusion_basis(world, eye, SETTINGS, plan, derivative=True)
         diffused = sj.diffuse_irradiance(world, light.source.T, eye, SETTINGS, plan)
         jacobian = sj.picture_jacobian(world, eye, SETTINGS, plan)
-        return light, diffused, gathered.beauty(other), gathered.coverage, jacobian
+        bounces = replace(SETTINGS, bounces=1)
+        bounced = sj.compute_irradiance(
+            world, sj.make_plan(world, eye, bounces, mesh=mesh), bounces
+        )
+        assert not np.allclose(bounced.entering, light.entering, rtol=1e-3)
+        return light, bounced, diffused, gathered.beauty(other), gathered.coverage, jacobian
 
     return apart(found(None), found(mesh))
 

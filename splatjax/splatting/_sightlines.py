@@ -1,0 +1,181 @@
+"""Which splats see which: bundles of parallel lines, laid through all splats at once."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from splatjax._chunking import map_chunks
+from splatjax._combination import AbstractCombination
+from splatjax._records import check_values
+from splatjax.scene import Splats, even_directions
+
+_MOST_GROUPS = 90_000
+_LARGEST_GROUP = 32  # splats, a block of the plan's order
+_CELL = 1.35  # edge of a cell, in spacings: smaller ones leak, larger ones widen rims
+_SPARSE = 0.9  # quantile of the splats' areas by which cells are measured
+_CLEARANCE = 0.5  # height of either end of a line above the plane of the other, in spacings
+_CANDIDATES = 4  # ends that are tried on every line
+_LEAST_NORMAL = 1e-3  # length of the mean normal of a group
+_AT_ONCE = 1 << 19  # pairs of splat and direction
+
+
+class SightlineSettings(eqx.Module):
+    r"""How it is found what each splat sees of the body. Static.
+
+    **Attributes:**
+
+    - `directions`: an even number, over the sphere; the same for all splats.
+    """
+
+    directions: int = eqx.field(static=True, default=256)
+
+    def __check_init__(self):
+        expected = "an even number of 2 or more"
+        check_values("directions", self.directions, expected, lambda n: (n >= 2) & (n % 2 == 0))
+
+
+class Sightlines(eqx.Module):
+    r"""What splats see of the body, in directions that are even over the sphere.
+
+    Splats that follow each other in a compact order are grouped: a group has one view, and the
+    exitance of its first splat.
+
+    **Attributes:** not differentiated
+
+    - `directions`: unit.
+    - `seen`: the group that the splats of each group see in each direction; the number of groups
+      where they see none.
+    - `size`: splats in each group. Static.
+
+    **Source:** Sbert 1993, "An integral geometry based method for fast form-factor computation".
+    """
+
+    directions: Float[Array, "directions 3"]
+    seen: Int[Array, "groups directions"]
+    size: int = eqx.field(static=True)
+
+    @classmethod
+    def build(cls, parts: Sequence[Splats], settings: SightlineSettings) -> "Sightlines":
+        """Find what the splats of all parts see, by NumPy.
+
+        For every line, splats are sorted into cells across it, and by their depth along it. A splat
+        sees the next one of its cell whose front faces it. Each must lie in front of the other's
+        plane, by half a spacing, so that a rough surface does not see itself.
+
+        **Arguments:**
+
+        - `parts`: concrete, in the order of a plan; those without area only fill it.
+        """
+        size = 1
+        while size < _LARGEST_GROUP and sum(part.count for part in parts) > _MOST_GROUPS * size:
+            size *= 2
+        centers, normals, areas = (
+            np.concatenate([np.asarray(getattr(part, name)) for part in parts])
+            for name in ("centers", "normals", "areas")
+        )
+        exists = areas.reshape(-1, size).sum(axis=1) > 0
+        if not exists.any():
+            exists[:1] = True
+        areas = areas.reshape(-1, size)[exists]
+        total = np.maximum(areas.sum(axis=1), np.finfo(areas.dtype).tiny)
+        centers, normals = (
+            np.einsum("gs,gsi->gi", areas / total[:, None], rows.reshape(-1, size, 3)[exists])
+            for rows in (centers, normals)
+        )
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), _LEAST_NORMAL)
+        spacing = np.sqrt(np.quantile(total, _SPARSE))
+        count = settings.directions
+        lines = even_directions(count)[: count // 2]
+        seen = np.full((count, len(exists)), len(exists), np.int32)
+        which = np.append(np.flatnonzero(exists), len(exists))
+        for i, line in enumerate(lines):
+            ends = _ends(line, centers - centers.mean(axis=0), normals, spacing)
+            for j, seen_along in zip((i, i + count // 2), ends, strict=True):
+                seen[j, which[:-1]] = which[seen_along]
+        directions = np.concatenate([lines, -lines]).astype(centers.dtype)
+        return cls(jnp.asarray(directions), jnp.asarray(seen.T), size)
+
+    @property
+    def groups(self) -> int:
+        return len(self.seen)
+
+    def first_splats(self) -> Int[Array, " groups"]:
+        """Return the first splat of each group of this device."""
+        return jnp.arange(self.groups, dtype=jnp.int32) * self.size
+
+    def irradiance(
+        self,
+        exitance: Float[Array, "channels groups"],
+        normals: Float[Array, "splats 3"],
+        combination: AbstractCombination,
+    ) -> Float[Array, "channels splats"]:
+        r"""Compute the irradiance from a body that radiates evenly to all sides,
+
+            E(x) = sum_d max(n . d, 0) M(y_d) / sum_d max(n . d, 0)
+
+        where `y_d` is what x sees along d. In a closed cavity of one exitance it is that.
+
+        **Arguments:**
+
+        - `exitance`: of the first splat of each group of this device. Differentiable.
+        - `normals`: unit, or zero for splats that fill a part. Differentiable.
+        """
+        everywhere = combination.gather(exitance.T)
+
+        def of_groups(normals, seen):
+            normals = normals.reshape(len(seen), self.size, 3)
+            cosines = jnp.maximum(normals @ self.directions.T, 0)
+            total = jnp.sum(cosines, axis=-1, keepdims=True)
+            light = everywhere.at[seen].get(mode="fill", fill_value=0)
+            received = cosines / jnp.where(total > 0, total, 1.0) @ light
+            return received.reshape(len(seen), -1)
+
+        rows = normals.reshape(self.groups, 3 * self.size)
+        at_once = max(_AT_ONCE // (self.size * len(self.directions)), 1)
+        received = map_chunks(of_groups, rows, self.seen, at_once=at_once)
+        return received.reshape(-1, len(exitance)).T
+
+
+def _ends(line, centers, normals, spacing):
+    """Return for each splat the one that it sees along a line, and against it; their number for
+    none.
+    """
+    # Number the cells of a grid across the line, and sort by cell and depth.
+    count = len(centers)
+    across = np.cross(line, np.eye(3)[np.argmin(np.abs(line))])
+    across /= np.linalg.norm(across)
+    axes = np.stack([across, np.cross(line, across)], axis=1).astype(centers.dtype)
+    cells = np.floor(centers @ axes / (_CELL * spacing)).astype(np.int64)
+    cells -= cells.min(axis=0)
+    numbered = cells[:, 0] * (cells[:, 1].max() + 1) + cells[:, 1]
+    depth = centers @ line.astype(centers.dtype)
+    depth = (depth - depth.min()) / max(np.ptp(depth), spacing)
+    order = np.argsort(numbered + 0.999 * depth.astype(np.float64))
+    cosine = (normals @ line.astype(centers.dtype))[order]
+    cell, centers, normals = numbered[order], centers[order], normals[order]
+    for sign in (1, -1):
+        if sign < 0:
+            order, cosine, cell = order[::-1], -cosine[::-1], cell[::-1]
+            centers, normals = centers[::-1], normals[::-1]
+        # From each place of the sequence on, the next splat that faces back.
+        places = np.where(cosine < 0, np.arange(count), count)
+        following = np.append(np.minimum.accumulate(places[::-1])[::-1], [count, count])
+        ends = np.full(count + 1, count)
+        start = np.flatnonzero(cosine > 0)
+        end = following[start + 1]
+        for _ in range(_CANDIDATES):
+            inside = end < count
+            start, end = start[inside], end[inside]
+            inside = cell[start] == cell[end]
+            start, end = start[inside], end[inside]
+            between = centers[end] - centers[start]
+            above = np.minimum(
+                np.sum(between * normals[start], axis=1), -np.sum(between * normals[end], axis=1)
+            )
+            clear = above > _CLEARANCE * spacing
+            ends[order[start[clear]]] = order[end[clear]]
+            start, end = start[~clear], following[end[~clear] + 1]
+        yield ends[:count]
