@@ -38,7 +38,7 @@ _COEFFICIENTS, _PROFILE, _PHOTOGRAPH = "coefficients", "a measured profile", "a 
 _KINDS = {".csv": _PROFILE, ".exr": _PHOTOGRAPH}
 # Options that have an effect on one kind of input alone.
 _OPTIONS = {
-    _COEFFICIENTS: ("model", "photons", "single_scattering"),
+    _COEFFICIENTS: ("model", "photons", "g", "single_scattering"),
     _PROFILE: ("mm_per_unit",),
     _PHOTOGRAPH: ("mm_per_pixel", "power"),
 }
@@ -54,8 +54,9 @@ class Fit:
     energy. To measured profiles, whose totals are not known, weights are fitted freely, but not
     below zero.
 
-    A medium is taken for what --model says: the dipole, which publications use, or one that comes
-    nearer to the truth, or the truth itself (docs/which_profile.md).
+    A medium is taken for what --model says: the photon beam with the total and the angles of light
+    transport; the dipole, which publications use; or the truth itself, by Monte Carlo
+    (docs/which_profile.md).
 
     Examples: splatjax fit marble --count 6 --output marble.toml --plot marble.png
               splatjax fit media.csv --all --output fits.csv
@@ -74,9 +75,12 @@ class Fit:
     #: Take the least number of Gaussians, up to 12, that leaves no channel a larger error (Eq. 4),
     #: instead of --count.
     error: OptionalFloat = None
-    #: Of coefficients: what makes a profile of them. The layers of a material are multipoles, or
-    #: are walked by Monte Carlo.
-    model: Model = "dipole"
+    #: Of coefficients: what makes a profile of them; the photon beam unless given. The layers of a
+    #: material are multipoles ("dipole"), or are walked by Monte Carlo.
+    model: Model | None = None
+    #: Of photon beams and Monte Carlo: the mean cosine of the phase function, which is Henyey and
+    #: Greenstein's.
+    g: float = 0.0
     #: Of Monte Carlo: how many walk.
     photons: int = 1_000_000
     #: Of photon beams and Monte Carlo: keep light that scatters once as a term of its own, and fit
@@ -109,6 +113,7 @@ class Fit:
         rules = {
             "count": (1 <= self.count <= most, f"lie between 1 and {most}"),
             "error": (self.error is None or self.error > 0, "be positive, such as 0.01"),
+            "g": (abs(self.g) <= 0.95, "lie between -0.95 and 0.95"),
         }
         check_options(self, rules)
         with jax.enable_x64(True):
@@ -177,7 +182,9 @@ class Fit:
                     f"{counted(self.count, 'Gaussian')} apart: give a smaller --count"
                 )
         else:
-            target = reference(coefficients, self.model, self.photons, self.single_scattering)
+            target = reference(
+                coefficients, self.model, self.photons, self.g, self.single_scattering
+            )
         fitted = self._fitted(target)
         _print(fitted)
         total = fitted.gaussians.total_reflectance()
@@ -260,7 +267,9 @@ class Fit:
         )
         provenance = "; ".join(filter(None, [source.get("provenance"), fitted_by]))
         sj.save_material(
-            sj.Material(fitted.gaussians, **surface, single_scattering=target.single),
+            sj.Material(
+                fitted.gaussians, **surface, single_scattering=target.single, angles=target.angles
+            ),
             output,
             profile=target.profile if target.description is None else known,
             source=source | {"provenance": provenance},
