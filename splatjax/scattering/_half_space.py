@@ -73,12 +73,11 @@ class AngularLaw(eqx.Module):
 class HalfSpace(eqx.Module):
     r"""How a half space reflects the light that has entered it, by light transport.
 
-    Adding and doubling: the reflection and transmission between discrete cosines of two equal
-    layers give those of both, until the layer is as thick as a half space; then the surface is
-    added, which reflects from inside, totally beyond the critical angle. Since the half space is the
-    same whatever layers it is cut into, the first one may be thick. The phase function is
-    Henyey and Greenstein's, with the forward peak beyond its twelfth moment taken as unscattered
-    (delta-M).
+    Adding and doubling: the reflection and transmission of a layer between discrete cosines give
+    those of two such layers, and so on to a half space; then the surface is added, which reflects
+    from inside, totally beyond the critical angle. The half space is the same whatever layers it
+    is cut into, so the first one may be thick. The phase function is Henyey and Greenstein's, with
+    the forward peak beyond its twelfth moment taken as unscattered (delta-M).
 
     **Attributes:** (differentiable)
 
@@ -107,7 +106,7 @@ class HalfSpace(eqx.Module):
     @jit_unless_traced
     def directional_albedo(self) -> Float[Array, "angles channels"]:
         """Compute the fraction of the light entering under each of `cosines` that leaves, within
-        1e-3.
+        3e-4; in single precision within 6e-3 where nothing is absorbed.
         """
         medium = self.medium
         fraction = jax.vmap(_directional_albedo)(medium.albedo_prime, medium.eta, self.g)
@@ -218,10 +217,10 @@ def _redistribution(mu, weights, albedo_prime, g):
         polynomials.append(((2 * n + 1) * mu * polynomials[n] - n * polynomials[n - 1]) / (n + 1))
     legendre = jnp.stack(polynomials)
     peak = g**_MOMENTS
-    moments = (2 * order + 1) * (jnp.cumprod(jnp.append(1.0, jnp.full(_MOMENTS - 1, g))) - peak)
-    moments = moments.astype(mu.dtype) / (1 - peak)
+    powers = jnp.concatenate([jnp.ones(1, mu.dtype), jnp.broadcast_to(g, (_MOMENTS - 1,))])
+    moments = jnp.asarray(2 * order + 1, mu.dtype) * (jnp.cumprod(powers) - peak) / (1 - peak)
     even, odd = (
-        (legendre * jnp.where(order % 2 == parity, moments, 0)[:, None]).T @ (legendre * weights)
+        (legendre * jnp.where(order % 2 == parity, moments, 0)[:, None]).T @ (legendre * weights[None])
         for parity in (0, 1)
     )
     even = even / jnp.sum(even, axis=1, keepdims=True)  # nothing is lost to rounding
