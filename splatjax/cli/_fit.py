@@ -7,19 +7,16 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated
 
-import equinox as eqx
 import jax
-import jax.numpy as jnp
-import numpy as np
 import optimistix as optx
 import tyro
-from jaxtyping import Array, Float
 
 import splatjax as sj
 from splatjax._format import channel_names, counted
 from splatjax.io import fingerprint, read_columns, read_media, write_columns
 
-from ._models import MEDIUM_WEIGHTS, Model, Reference, reference
+from ._batch import BATCH, fit_batch
+from ._models import Model, Reference, reference
 from ._terminal import (
     FIGURES,
     OptionalFloat,
@@ -129,13 +126,13 @@ class Fit:
             raise ValueError("--all fits dipoles by --count alone; leave the other options out")
         names, coefficients = read_media(Path(self.medium))
         path = self.output.with_name(f"{self.output.name}.parts")
-        begins = range(0, len(names), _BATCH)
+        begins = range(0, len(names), BATCH)
         parts = [path / f"from_{begin:08}.csv" for begin in begins]
 
         def fit(i: int) -> None:
-            batch = slice(begins[i], begins[i] + _BATCH)
+            batch = slice(begins[i], begins[i] + BATCH)
             write_columns(
-                parts[i], {"name": names[batch]} | _fit_batch(coefficients[batch], self.count)
+                parts[i], {"name": names[batch]} | fit_batch(coefficients[batch], self.count)
             )
 
         done = complete(
@@ -149,7 +146,7 @@ class Fit:
             [(part,) for part in parts],
             lambda: fit,
             name="batches",
-            what=f"fitting {self.count} Gaussians to {len(names)} media, {_BATCH} at a time",
+            what=f"fitting {self.count} Gaussians to {len(names)} media, {BATCH} at a time",
         )
         if len(done) < len(parts):
             return
@@ -304,35 +301,3 @@ def _print(fitted: sj.fitting.FitResult) -> None:
 
 def _numbers(values: jax.Array, form: str) -> str:
     return "  ".join(f"{float(value):{form}}" for value in values)
-
-
-_BATCH = 500  # media in one call
-
-
-@eqx.filter_jit
-def _fit_each(coefficients: Float[Array, "media 3"], starts: sj.fitting.DipoleStarts, count: int):
-    def fit(row):
-        medium = sj.Medium(row[0:1], row[1:2], row[2:3])
-        start = sj.fitting.GivenVariances(starts(medium, count).variances[0])
-        fitted = sj.fit_gaussians(
-            sj.Dipole(medium), count, start=start, weights=MEDIUM_WEIGHTS, throw=False
-        )
-        return fitted, fitted.result == optx.RESULTS.successful
-
-    return eqx.filter_vmap(fit)(coefficients)
-
-
-def _fit_batch(coefficients: np.ndarray, count: int) -> dict[str, np.ndarray]:
-    """Return the columns of a batch. A smaller batch is padded, so that one program serves all."""
-    given = len(coefficients)
-    padded = np.pad(coefficients, ((0, _BATCH - given), (0, 0)), mode="edge")
-    fitted, converged = _fit_each(jnp.asarray(padded), sj.io.dipole_starts(), count)
-    columns = {
-        **dict(zip(("sigma_a", "sigma_s_prime", "eta"), padded.T, strict=True)),
-        **{f"variance_{i + 1}": fitted.gaussians.variances[:, i] for i in range(count)},
-        **{f"weight_{i + 1}": fitted.gaussians.weights[:, i, 0] for i in range(count)},
-        "error": fitted.error[:, 0],
-        "energy_error": fitted.energy_error[:, 0],
-        "converged": converged.astype(float),
-    }
-    return {name: np.asarray(column)[:given] for name, column in columns.items()}

@@ -211,17 +211,20 @@ def _redistribution(mu, weights, albedo_prime, g):
     """Return the phase function's even and odd moments, between all cosines and times their
     weights; and the albedo, the forward peak taken as unscattered.
     """
-    order = np.arange(_MOMENTS)
     polynomials = [jnp.ones_like(mu), mu]
     for n in range(1, _MOMENTS - 1):
         polynomials.append(((2 * n + 1) * mu * polynomials[n] - n * polynomials[n - 1]) / (n + 1))
     legendre = jnp.stack(polynomials)
     peak = g**_MOMENTS
     powers = jnp.concatenate([jnp.ones(1, mu.dtype), jnp.broadcast_to(g, (_MOMENTS - 1,))])
-    moments = jnp.asarray(2 * order + 1, mu.dtype) * (jnp.cumprod(powers) - peak) / (1 - peak)
+    moments = (
+        jnp.asarray(2 * np.arange(_MOMENTS) + 1, mu.dtype)
+        * (jnp.cumprod(powers) - peak)
+        / (1 - peak)
+    )
+    by_moment = legendre * moments[:, None]
     even, odd = (
-        (legendre * jnp.where(order % 2 == parity, moments, 0)[:, None]).T @ (legendre * weights[None])
-        for parity in (0, 1)
+        by_moment[parity::2].T @ (legendre[parity::2] * weights[None]) for parity in (0, 1)
     )
     even = even / jnp.sum(even, axis=1, keepdims=True)  # nothing is lost to rounding
     scattered = albedo_prime * (1 - peak) / (1 - g)
