@@ -16,7 +16,7 @@ Model: TypeAlias = Literal["dipole", "better-dipole", "photon-beam", "monte-carl
 MEDIUM_WEIGHTS = sj.fitting.NonNegativeWeights(sj.fitting.FixedTotalReflectance())
 # Radii for profiles that are infinite at the origin: from half a mean free path on, which splats
 # hardly resolve, and weighted for the tail, so that shadows are right where they are deep.
-_BEYOND = sj.scattering.L2_QUADRATURE.beyond(0.5, tail=3)
+_BEYOND = sj.scattering.L2_QUADRATURE.beyond(0.5, tail=3.0)
 
 
 @dataclass(frozen=True)
