@@ -173,9 +173,10 @@ def diffuse_on_screen(
         material.roughness,
         [],
     )
-    transmission = _shading.exit_transmission(surface, _shading.fresnel_f0(material.eta))
-    per_exitance = frame.coverage * transmission / jnp.pi
-    layers = (per_exitance[..., None] * root)[None] * layers.transpose(0, 2, 3, 1)
+    f0 = _shading.fresnel_f0(material.eta)
+    transmission = jnp.moveaxis(_shading.exit_transmission(surface, f0, material.angles), 0, -1)
+    per_exitance = frame.coverage[..., None] * transmission / jnp.pi
+    layers = (per_exitance * root)[None] * layers.transpose(0, 2, 3, 1)
     diffuse = jnp.sum(weights[:, None, None] * layers, axis=0)
     beauty = frame.beauty - frame.diffuse + diffuse
     return eqx.tree_at(

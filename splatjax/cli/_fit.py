@@ -7,19 +7,16 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated
 
-import equinox as eqx
 import jax
-import jax.numpy as jnp
-import numpy as np
 import optimistix as optx
 import tyro
-from jaxtyping import Array, Float
 
 import splatjax as sj
 from splatjax._format import channel_names, counted
 from splatjax.io import fingerprint, read_columns, read_media, write_columns
 
-from ._models import MEDIUM_WEIGHTS, Model, Reference, reference
+from ._batch import BATCH, fit_batch
+from ._models import Model, Reference, reference
 from ._terminal import (
     FIGURES,
     OptionalFloat,
@@ -38,7 +35,7 @@ _COEFFICIENTS, _PROFILE, _PHOTOGRAPH = "coefficients", "a measured profile", "a 
 _KINDS = {".csv": _PROFILE, ".exr": _PHOTOGRAPH}
 # Options that have an effect on one kind of input alone.
 _OPTIONS = {
-    _COEFFICIENTS: ("model", "photons", "single_scattering"),
+    _COEFFICIENTS: ("model", "photons", "g", "single_scattering"),
     _PROFILE: ("mm_per_unit",),
     _PHOTOGRAPH: ("mm_per_pixel", "power"),
 }
@@ -54,8 +51,9 @@ class Fit:
     energy. To measured profiles, whose totals are not known, weights are fitted freely, but not
     below zero.
 
-    A medium is taken for what --model says: the dipole, which publications use, or one that comes
-    nearer to the truth, or the truth itself (docs/which_profile.md).
+    A medium is taken for what --model says: the photon beam with the total and the angles of light
+    transport; the dipole, which publications use; or the truth itself, by Monte Carlo
+    (docs/which_profile.md).
 
     Examples: splatjax fit marble --count 6 --output marble.toml --plot marble.png
               splatjax fit media.csv --all --output fits.csv
@@ -74,9 +72,12 @@ class Fit:
     #: Take the least number of Gaussians, up to 12, that leaves no channel a larger error (Eq. 4),
     #: instead of --count.
     error: OptionalFloat = None
-    #: Of coefficients: what makes a profile of them. The layers of a material are multipoles, or
-    #: are walked by Monte Carlo.
-    model: Model = "dipole"
+    #: Of coefficients: what makes a profile of them; the photon beam unless given. The layers of a
+    #: material are multipoles ("dipole"), or are walked by Monte Carlo.
+    model: Model | None = None
+    #: Of photon beams and Monte Carlo: the mean cosine of the phase function, which is Henyey and
+    #: Greenstein's.
+    g: float = 0.0
     #: Of Monte Carlo: how many walk.
     photons: int = 1_000_000
     #: Of photon beams and Monte Carlo: keep light that scatters once as a term of its own, and fit
@@ -109,6 +110,7 @@ class Fit:
         rules = {
             "count": (1 <= self.count <= most, f"lie between 1 and {most}"),
             "error": (self.error is None or self.error > 0, "be positive, such as 0.01"),
+            "g": (abs(self.g) <= 0.95, "lie between -0.95 and 0.95"),
         }
         check_options(self, rules)
         with jax.enable_x64(True):
@@ -124,13 +126,13 @@ class Fit:
             raise ValueError("--all fits dipoles by --count alone; leave the other options out")
         names, coefficients = read_media(Path(self.medium))
         path = self.output.with_name(f"{self.output.name}.parts")
-        begins = range(0, len(names), _BATCH)
+        begins = range(0, len(names), BATCH)
         parts = [path / f"from_{begin:08}.csv" for begin in begins]
 
         def fit(i: int) -> None:
-            batch = slice(begins[i], begins[i] + _BATCH)
+            batch = slice(begins[i], begins[i] + BATCH)
             write_columns(
-                parts[i], {"name": names[batch]} | _fit_batch(coefficients[batch], self.count)
+                parts[i], {"name": names[batch]} | fit_batch(coefficients[batch], self.count)
             )
 
         done = complete(
@@ -144,7 +146,7 @@ class Fit:
             [(part,) for part in parts],
             lambda: fit,
             name="batches",
-            what=f"fitting {self.count} Gaussians to {len(names)} media, {_BATCH} at a time",
+            what=f"fitting {self.count} Gaussians to {len(names)} media, {BATCH} at a time",
         )
         if len(done) < len(parts):
             return
@@ -177,7 +179,9 @@ class Fit:
                     f"{counted(self.count, 'Gaussian')} apart: give a smaller --count"
                 )
         else:
-            target = reference(coefficients, self.model, self.photons, self.single_scattering)
+            target = reference(
+                coefficients, self.model, self.photons, self.g, self.single_scattering
+            )
         fitted = self._fitted(target)
         _print(fitted)
         total = fitted.gaussians.total_reflectance()
@@ -260,7 +264,9 @@ class Fit:
         )
         provenance = "; ".join(filter(None, [source.get("provenance"), fitted_by]))
         sj.save_material(
-            sj.Material(fitted.gaussians, **surface, single_scattering=target.single),
+            sj.Material(
+                fitted.gaussians, **surface, single_scattering=target.single, angles=target.angles
+            ),
             output,
             profile=target.profile if target.description is None else known,
             source=source | {"provenance": provenance},
@@ -295,35 +301,3 @@ def _print(fitted: sj.fitting.FitResult) -> None:
 
 def _numbers(values: jax.Array, form: str) -> str:
     return "  ".join(f"{float(value):{form}}" for value in values)
-
-
-_BATCH = 500  # media in one call
-
-
-@eqx.filter_jit
-def _fit_each(coefficients: Float[Array, "media 3"], starts: sj.fitting.DipoleStarts, count: int):
-    def fit(row):
-        medium = sj.Medium(row[0:1], row[1:2], row[2:3])
-        start = sj.fitting.GivenVariances(starts(medium, count).variances[0])
-        fitted = sj.fit_gaussians(
-            sj.Dipole(medium), count, start=start, weights=MEDIUM_WEIGHTS, throw=False
-        )
-        return fitted, fitted.result == optx.RESULTS.successful
-
-    return eqx.filter_vmap(fit)(coefficients)
-
-
-def _fit_batch(coefficients: np.ndarray, count: int) -> dict[str, np.ndarray]:
-    """Return the columns of a batch. A smaller batch is padded, so that one program serves all."""
-    given = len(coefficients)
-    padded = np.pad(coefficients, ((0, _BATCH - given), (0, 0)), mode="edge")
-    fitted, converged = _fit_each(jnp.asarray(padded), sj.io.dipole_starts(), count)
-    columns = {
-        **dict(zip(("sigma_a", "sigma_s_prime", "eta"), padded.T, strict=True)),
-        **{f"variance_{i + 1}": fitted.gaussians.variances[:, i] for i in range(count)},
-        **{f"weight_{i + 1}": fitted.gaussians.weights[:, i, 0] for i in range(count)},
-        "error": fitted.error[:, 0],
-        "energy_error": fitted.energy_error[:, 0],
-        "converged": converged.astype(float),
-    }
-    return {name: np.asarray(column)[:given] for name, column in columns.items()}

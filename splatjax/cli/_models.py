@@ -5,6 +5,7 @@ from typing import Literal, TypeAlias
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 import splatjax as sj
 
@@ -13,8 +14,9 @@ from ._terminal import stage
 Model: TypeAlias = Literal["dipole", "better-dipole", "photon-beam", "monte-carlo"]
 # Weights of the fit to a medium: the picture keeps its energy.
 MEDIUM_WEIGHTS = sj.fitting.NonNegativeWeights(sj.fitting.FixedTotalReflectance())
-# Radii for profiles that are infinite at the origin: from so many mean free paths on.
-_BEYOND = sj.scattering.L2_QUADRATURE.beyond(0.2)
+# Radii for profiles that are infinite at the origin: from half a mean free path on, which splats
+# hardly resolve, and weighted for the tail, so that shadows are right where they are deep.
+_BEYOND = sj.scattering.L2_QUADRATURE.beyond(0.5, tail=3.0)
 
 
 @dataclass(frozen=True)
@@ -25,6 +27,7 @@ class Reference:
 
     - `single`: light that scatters once, where it is kept apart from the profile.
     - `description`: of a profile that coefficients alone do not give back.
+    - `angles`: by which its light depends on those of entry and exit.
     - `weights`: those that the fit may choose from.
     """
 
@@ -32,51 +35,70 @@ class Reference:
     rule: sj.scattering.AbstractRadialRule = sj.scattering.L2_QUADRATURE
     single: sj.SingleScattering | None = None
     description: str | None = None
+    angles: sj.scattering.AngularLaw | None = None
     weights: sj.fitting.AbstractWeights = MEDIUM_WEIGHTS
 
 
 def reference(
     coefficients: sj.Dipole | sj.LayeredMultipole,
-    model: Model,
+    model: Model | None,
     photons: int,
+    g: float,
     single_scattering: bool,
 ) -> Reference:
     """Return the profile of a medium or of layers by a model.
 
     **Arguments:**
 
+    - `model`: `None` is the photon beam with the total of light transport, or the multipole of
+      layers.
+    - `g`: mean cosine of the phase function.
     - `single_scattering`: whether light that scatters once is taken out of the profile.
 
     **Raises:** `ValueError` for options that do not go with the model or with layers.
     """
-    option = f"--model {model}{' with --single-scattering' if single_scattering else ''}"
-    if single_scattering and model not in ("photon-beam", "monte-carlo"):
-        raise ValueError(f"{option} is not possible; take photon-beam or monte-carlo")
     is_layered = isinstance(coefficients, sj.LayeredMultipole)
+    model = model or ("dipole" if is_layered else "photon-beam")
+    option = f"--model {model}{' with --single-scattering' if single_scattering else ''}"
+    if (single_scattering or g) and model not in ("photon-beam", "monte-carlo"):
+        option = option if single_scattering else f"{option} with --g {g}"
+        raise ValueError(f"{option} is not possible; take photon-beam or monte-carlo")
     if is_layered and (single_scattering or model not in ("dipole", "monte-carlo")):
         raise ValueError(
             f"{option} is for a half space, and this material has layers; take --model dipole or "
             "monte-carlo without --single-scattering"
         )
     if model == "monte-carlo":
-        return _walked(coefficients, photons, single_scattering)
+        return _walked(coefficients, photons, g, single_scattering)
     if is_layered or model == "dipole":
         return Reference(coefficients)
     if model == "better-dipole":
         return Reference(sj.scattering.BetterDipole(coefficients.medium))
-    beam = sj.scattering.PhotonBeam(coefficients.medium)
+    half_space = sj.scattering.HalfSpace(coefficients.medium, g)
+    beam = sj.scattering.PhotonBeam(coefficients.medium).with_total(half_space.total_reflectance())
+    description = "photon beam with the total of light transport"
+    single, angles = _parted(half_space, single_scattering)
+    if single is None:
+        return Reference(beam, _BEYOND, None, description, angles)
+    description += ", without single scattering"
+    return Reference(beam.multiply_scattered(), _BEYOND, single, description, angles)
+
+
+def _parted(
+    half_space: sj.scattering.HalfSpace, single_scattering: bool
+) -> tuple[sj.SingleScattering | None, sj.scattering.AngularLaw]:
+    """Return the single scattering to keep apart, and the angles of the rest."""
     if not single_scattering:
-        return Reference(beam, _BEYOND)
-    return Reference(
-        beam.multiply_scattered(),
-        single=sj.SingleScattering(coefficients.medium),
-        description="photon beam, without single scattering",
-    )
+        return None, half_space.angular_law()
+    single = sj.SingleScattering(half_space.medium)
+    cosines = jnp.asarray(half_space.cosines())
+    return single, half_space.angular_law(single.directional_albedo(cosines))
 
 
 def _walked(
     coefficients: sj.Dipole | sj.LayeredMultipole,
     photons: int,
+    g: float,
     single_scattering: bool,
 ) -> Reference:
     """Walk in single precision, which suffices for photons; the profile is fitted in double."""
@@ -85,12 +107,19 @@ def _walked(
     layers_32 = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), list(layers))
     with stage("walking photons", photons) as report:
         walk = sj.transport.monte_carlo(
-            layers_32, photons, jax.random.key(0), progress=lambda done, _: report(done)
+            layers_32,
+            photons,
+            jax.random.key(0),
+            phase=sj.transport.HenyeyGreenstein(np.float32(g)),
+            progress=lambda done, _: report(done),
         )
     profile = jax.tree.map(lambda leaf: leaf.astype(jnp.float64), walk.profile())
     description = f"Monte Carlo, {photons} photons"
-    if is_layered or not single_scattering:
+    if is_layered:
         return Reference(profile, _BEYOND, None, description)
-    single = sj.SingleScattering(coefficients.medium)
+    half_space = sj.scattering.HalfSpace(coefficients.medium, g)
+    single, angles = _parted(half_space, single_scattering)
+    if single is None:
+        return Reference(profile, _BEYOND, None, description, angles)
     description += ", without single scattering"
-    return Reference(profile.without(single), _BEYOND, single, description)
+    return Reference(profile.without(single), _BEYOND, single, description, angles)

@@ -17,6 +17,7 @@ from splatjax.exports import plain_numbers
 from splatjax.fitting import DipoleStarts
 from splatjax.gaussians import AbstractProfile, SumOfGaussians
 from splatjax.scattering import (
+    AngularLaw,
     BetterDipole,
     Dipole,
     ExactFresnel,
@@ -34,7 +35,7 @@ from ._tables import Table, nearest, read_toml
 
 COEFFICIENT_UNIT, VARIANCE_UNIT, THICKNESS_UNIT = "1/mm", "mm^2", "mm"
 _COEFFICIENTS = ("unit", "sigma_a", "sigma_s_prime", "eta")
-_TABLES = ("medium", "layers", "surface", "single_scattering", "source", "fit")
+_TABLES = ("medium", "layers", "surface", "single_scattering", "angles", "source", "fit")
 _SURFACE = ("eta", "specular", "roughness")
 # What [fit] calls a profile whose coefficients the file holds.
 _MODELS: dict[type, str] = {
@@ -108,7 +109,13 @@ def load_material(name_or_path: StrPath) -> Material:
     if "single_scattering" in tables.entries:
         table = tables.table("single_scattering", (*_COEFFICIENTS, "strength"))
         single = table.make(SingleScattering, _medium(table), table.numbers("strength", 1.0))
-    return fit.make(Material, gaussians, **_surface(tables), single_scattering=single)
+    angles = None
+    if "angles" in tables.entries:
+        table = tables.table("angles", ("coefficients",))
+        angles = table.make(AngularLaw, table.numbers("coefficients"))
+    return fit.make(
+        Material, gaussians, **_surface(tables), single_scattering=single, angles=angles
+    )
 
 
 def surface_and_source(
@@ -195,6 +202,8 @@ def save_material(
             **_plain_medium(single.medium),
             "strength": plain_numbers(single.strength),
         }
+    if material.angles is not None:
+        tables["angles"] = {"coefficients": plain_numbers(material.angles.coefficients)}
     tables |= {
         "surface": {name: plain_numbers(getattr(material, name)) for name in _SURFACE},
         "source": dict(source or {}),

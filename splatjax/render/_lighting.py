@@ -223,7 +223,7 @@ def irradiance_at_points(
 
     def enters(_, cosine):
         fraction = 1 - _shading.directional_albedo(cosine, f0, specular, roughness)
-        if material.single_scattering is None:
+        if material.single_scattering is None and material.angles is None:
             return fraction[None]
         return fraction[None] * material.diffuse_fraction(cosine).T
 

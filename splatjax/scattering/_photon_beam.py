@@ -165,15 +165,28 @@ class PhotonBeam(AbstractHalfSpace):
 
     - `medium`: its coefficients, [channels]; scattering is isotropic with the reduced coefficient.
     - `fresnel`: the diffuse Fresnel moments of the surface that diffuse light meets.
+    - `strength`: a factor on what scatters more than once, [channels]; 1 as published,
+      `with_total` holds the total.
 
     **Source:** Habel, Christensen and Jarosz 2013, "Photon beam diffusion".
     """
+
+    strength: Float[Array, " channels"] = eqx.field(converter=numbers, default=1.0)
 
     singular: ClassVar[bool] = True
 
     @jit_unless_traced
     def __call__(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
         return self.multiply_scattered()(r) + SingleScattering(self.medium)(r)
+
+    @jit_unless_traced
+    def with_total(self, total: Float[Array, " channels"]) -> "PhotonBeam":
+        """Scale what scatters more than once, so that the total reflectance is `total`: that of
+        light transport (`HalfSpace`), from which the model's is 1 to 6% off.
+        """
+        single = SingleScattering(self.medium).total_reflectance()
+        multiple = self.multiply_scattered().total_reflectance() / self.strength
+        return PhotonBeam(self.medium, self.fresnel, (total - single) / multiple)
 
     @jit_unless_traced
     def total_reflectance(self) -> Float[Array, " channels"]:
@@ -189,10 +202,13 @@ class PhotonBeam(AbstractHalfSpace):
         """Return the light scattered more than once as a profile, finite at `r = 0`: for a material
         with a `SingleScattering` of its own.
         """
-        return _MultipleScattering(self.medium, self.fresnel)
+        return _MultipleScattering(self.medium, self.fresnel, self.strength)
 
 
+@record
 class _MultipleScattering(AbstractHalfSpace):
+    strength: Float[Array, " channels"] = eqx.field(converter=numbers, default=1.0)
+
     @jit_unless_traced
     def __call__(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
         shape = (_NODES, *r.shape, self.medium.channels)
@@ -204,7 +220,8 @@ class _MultipleScattering(AbstractHalfSpace):
         kappa = -jnp.expm1(-2 * sigma_t_prime * (distance + depth))
         exitance = BetterDipole(self.medium, self.fresnel).exitance(depth, squared_radius)
         total = jnp.sum(weight * kappa * exitance, axis=0)
-        return jnp.broadcast_to(self.medium.albedo_prime**2, total.shape) * total
+        factor = self.strength * self.medium.albedo_prime**2
+        return jnp.broadcast_to(factor, total.shape) * total
 
     def total_reflectance(self):
         return integrated_reflectance(self)

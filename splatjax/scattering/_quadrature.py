@@ -44,22 +44,25 @@ class RadialRule(AbstractRadialRule):
     - `smallest`, `largest`: ends of the logarithmic panel, in length scales.
     - `count`: its number of nodes.
     - `near`: number of nodes of the linear panel; 0 leaves it out.
+    - `tail`: a further power of r in the weights, which turns a fit towards large distances: 0 is
+      Eq. 3.
     """
 
     smallest: float = eqx.field(static=True)
     largest: float = eqx.field(static=True)
     count: int = eqx.field(static=True)
     near: int = eqx.field(static=True, default=8)
+    tail: float = eqx.field(static=True, default=0.0)
 
-    def beyond(self, cut: float) -> "RadialRule":
+    def beyond(self, cut: float, tail: float = 0.0) -> "RadialRule":
         """Return the rule that starts at `cut` length scales: for profiles that are infinite or
-        unknown at the origin.
+        unknown at the origin, and for what splats do not resolve.
 
         **Raises:** `ValueError` unless `cut` lies between 0 and the largest radius.
         """
         if not 0 < cut < self.largest:
             raise ValueError(f"cut must be between 0 and {self.largest} length scales; got {cut}")
-        return RadialRule(float(cut), self.largest, self.count, near=0)
+        return RadialRule(float(cut), self.largest, self.count, near=0, tail=float(tail))
 
     @property
     def reaches_origin(self) -> bool:
@@ -83,10 +86,10 @@ class RadialRule(AbstractRadialRule):
         )
         scale = jnp.broadcast_to(scale, shape)
         if known is None:
-            return radii * scale, weights * scale
+            return radii * scale, weights * scale * radii**self.tail
         first = 0.0 if self.near else self.smallest
         inside = (radii >= first * scale) & (radii <= self.largest * scale)
-        return radii, jnp.where(inside, weights, 0.0)
+        return radii, jnp.where(inside, weights * (radii / scale) ** self.tail, 0.0)
 
 
 L2_QUADRATURE = RadialRule(smallest=1e-3, largest=1e4, count=192)

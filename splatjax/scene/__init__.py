@@ -28,6 +28,7 @@ from ._lights import (
     stack_lights as stack_lights,
     StackedLights as StackedLights,
 )
+from ._material import Material as Material
 from ._skies import (
     overcast_sky as overcast_sky,
     studio as studio,
@@ -36,7 +37,6 @@ from ._skies import (
 from ._scene import (
     Camera as Camera,
     Frame as Frame,
-    Material as Material,
     Parts as Parts,
     rotation_towards as rotation_towards,
     Scene as Scene,

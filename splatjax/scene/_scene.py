@@ -13,10 +13,9 @@ from jaxtyping import Array, Float, Int
 
 from splatjax._chunking import take_points
 from splatjax._records import Numbers, as_floats, check_values, numbers, record, several, valid
-from splatjax.gaussians import SumOfGaussians
-from splatjax.scattering import SingleScattering
 
 from ._lights import AbstractLight
+from ._material import Material
 
 _PARALLEL = 1e-6  # sine of an angle that single precision does not resolve
 _FARTHEST = 1e15  # single precision can square such a number, and multiply the square once more
@@ -178,94 +177,6 @@ class Splats(eqx.Module):
 
 Parts: TypeAlias = Callable[[], Iterable[Splats]]
 """A function that returns all splats part by part, the same ones at every call."""
-
-
-_NARROW = 1e-6  # mm^2: far below any splat, so that the layer is unresolved
-
-
-@record
-class Material(eqx.Module):
-    r"""A translucent material: how light spreads below the surface, and how the surface itself
-    reflects.
-
-    **Attributes:** (all differentiable)
-
-    - `gaussians`: the diffusion profile; the picture's diffuse reflectance is the sum of its
-      weights.
-    - `eta`: index of refraction relative to air, for the Fresnel term of the specular lobe.
-    - `specular`: strength of the specular lobe (rho_s).
-    - `roughness`: of the specular lobe (m, root mean square slope), at least 0.
-    - `single_scattering`: light that scatters once, as a term of its own; the Gaussians then stand
-      for the rest. `None`: they stand for all.
-
-    **Raises:** `ValueError` for a value out of range, and for single scattering of another number
-    of channels than the Gaussians have.
-    """
-
-    gaussians: SumOfGaussians
-    eta: Float[Array, ""] = eqx.field(
-        converter=numbers, default=1.4, metadata=valid("positive", lambda x: x > 0)
-    )
-    specular: Float[Array, ""] = eqx.field(
-        converter=numbers, default=0.18, metadata=valid("at least 0", lambda x: x >= 0)
-    )
-    roughness: Float[Array, ""] = eqx.field(
-        converter=numbers, default=0.3, metadata=valid("at least 0", lambda x: x >= 0)
-    )
-    single_scattering: SingleScattering | None = None
-
-    def __check_init__(self):
-        single = self.single_scattering
-        if single is not None and single.channels != self.channels:
-            raise ValueError(
-                f"Material.single_scattering has {single.channels} channels, Material.gaussians "
-                f"has {self.channels}; give both the same"
-            )
-
-    @property
-    def channels(self) -> int:
-        return self.gaussians.channels
-
-    def total_reflectance(self) -> Float[Array, " channels"]:
-        """Compute the fraction of the light entering a flat piece along its normal that leaves."""
-        return self.gaussians.total_reflectance() + self.single_scattering_albedo()
-
-    def single_scattering_albedo(self) -> Float[Array, " channels"]:
-        """Compute the part of the total reflectance that is light scattered once."""
-        if self.single_scattering is None:
-            return jnp.zeros_like(self.gaussians.weights, shape=self.channels)
-        return self.single_scattering.total_reflectance()
-
-    def diffuse_fraction(self, mu_i: Float[Array, "*points"]) -> Float[Array, "*points channels"]:
-        """Compute the factor on the Gaussians for light that enters under the cosine `mu_i`; 1
-        along the normal.
-
-        Grazing light leaves after one scattering more often than light along the normal. Where that
-        and the total reflectance of the Gaussians would exceed 1, the Gaussians are scaled to the
-        difference.
-        """
-        if self.single_scattering is None:
-            return jnp.ones((*mu_i.shape, self.channels), mu_i.dtype)
-        left = jnp.maximum(1 - self.single_scattering.directional_albedo(mu_i), 0)
-        total = jnp.broadcast_to(self.gaussians.total_reflectance(), left.shape)
-        return jnp.where(left < total, left / jnp.where(left < total, total, 1.0), 1.0)
-
-    def surface_of(self, gaussians: SumOfGaussians) -> "Material":
-        """Return a material of other Gaussians with this surface, without single scattering."""
-        return Material(gaussians, self.eta, self.specular, self.roughness)
-
-    def opaque(self) -> "Material":
-        """Replace scattering by one Gaussian, narrower than any splat, of the total reflectance."""
-        variances = jnp.full_like(self.gaussians.variances, _NARROW, shape=(1,))
-        return self.surface_of(SumOfGaussians(variances, self.total_reflectance()[None]))
-
-    def white(self) -> "Material":
-        """Scale the total reflectance to 1 per channel, so that an albedo map alone has color."""
-        total, single = self.total_reflectance(), self.single_scattering
-        gaussians = SumOfGaussians(self.gaussians.variances, self.gaussians.weights / total[None])
-        if single is not None:
-            single = SingleScattering(single.medium, single.strength / total)
-        return Material(gaussians, self.eta, self.specular, self.roughness, single)
 
 
 @record

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from splatjax.scattering import SingleScattering
+from splatjax.scattering import AngularLaw, SingleScattering
 from splatjax.scene import AbstractLightSample, StackedLights
 
 from ._specular import average_albedo, directional_albedo, specular_lobe
@@ -23,23 +23,42 @@ def diffuse_transmission(
     f0: Float[Array, "..."],
     specular: Float[Array, "..."],
     roughness: Float[Array, "..."],
+    angles: AngularLaw | None = None,
 ) -> Float[Array, "..."]:
-    r"""Compute the angular factor of diffuse light that leaves, `(1 - rho(mu)) / (1 - rho_avg)`.
+    r"""Compute the angular factor of diffuse light that leaves: `e(mu) (1 - rho(mu))` over its
+    average, weighted with `2 mu`.
 
     The radiance of a surface of radiant exitance `M` is `M diffuse_transmission(mu_o) / pi`. Since
-    the factor's average, weighted with `2 mu`, is one, the light that leaves is exactly `M`.
+    the average is one, the light that leaves is exactly `M`.
 
     **Arguments:** as in `directional_albedo`; `mu` is the cosine of the direction towards the
     camera.
 
-    **Returns:** at least 0. `1 - rho_avg` is kept above 1e-4 (gradient 0 below): a surface that
-    reflects everything lets nothing in, so that `M` is 0 there.
+    - `angles`: `e`, of a material; 1 for `None`.
 
-    **Source:** d'Eon and Luebke 2007 (GPU Gems 3, chapter 14).
+    **Returns:** at least 0, with the channels of `angles` as first axis. The average is kept above
+    1e-4 (gradient 0 below): a surface that reflects everything lets nothing in, so that `M` is 0
+    there.
+
+    **Source:** d'Eon and Luebke 2007 (GPU Gems 3, chapter 14), with `e = 1`.
     """
     share = 1 - directional_albedo(mu, f0, specular, roughness)
-    average = 1 - average_albedo(f0, specular, roughness)
-    return share / jnp.maximum(average, _LEAST_SHARE)
+    if angles is None:
+        average = 1 - average_albedo(f0, specular, roughness)
+        return share / jnp.maximum(average, _LEAST_SHARE)
+    leaves = jnp.moveaxis(angles(mu), -1, 0) * share[None]
+    average = jnp.tensordot(
+        angles.coefficients.T,
+        jnp.stack(
+            [
+                2 / (2 + power) - average_albedo(f0, specular, roughness, power)
+                for power in range(len(angles.coefficients))
+            ]
+        ),
+        1,
+    )
+    average = average.reshape(*average.shape, *[1] * (leaves.ndim - average.ndim))
+    return leaves / jnp.maximum(average, _LEAST_SHARE)
 
 
 def albedo_root(albedo: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -144,12 +163,15 @@ def sum_received(
     return total
 
 
-def exit_transmission(points: SurfacePoints, f0: Float[Array, ""]) -> Float[Array, "*pixels"]:
-    """Compute the factor on diffuse light that leaves towards the eye, `(1 - rho(wo)) / (1 -
-    rho_avg)`: on average 1.
+def exit_transmission(
+    points: SurfacePoints, f0: Float[Array, ""], angles: AngularLaw | None
+) -> Float[Array, "#channels *pixels"]:
+    """Compute the factor on diffuse light that leaves towards the eye, on average 1:
+    `diffuse_transmission`.
     """
     cosine = _cosine(points.normals, points.outgoing)
-    return diffuse_transmission(cosine, f0, points.specular, points.roughness)
+    factor = diffuse_transmission(cosine, f0, points.specular, points.roughness, angles)
+    return factor[None] if angles is None else factor
 
 
 def reflected_radiance(

@@ -19,6 +19,7 @@ _LEAST_HALF_COSINE = 1e-4  # of N.(L+V): below it the lobe's pole is cut
 # and 1.2e-4 (b) for every mu and m in range.
 _MU_NODES = 18
 _ROUGHNESS_NODES = 12
+_POWERS = 8  # of the cosine, whose averages with the albedo are tabulated
 _LEAST_MU = 1e-5
 _AT_ONCE = 1 << 14  # points whose polynomials are in memory
 
@@ -131,8 +132,8 @@ def _lobe_quadrature(
 
 @functools.cache
 def _tables() -> tuple[np.ndarray, np.ndarray]:
-    """Compute the Chebyshev coefficients of (a, b) over sqrt(mu) and log m, and those of their
-    averages over log m.
+    """Compute the Chebyshev coefficients of (a, b) over sqrt(mu) and log m, and those over log m of
+    their averages with powers of mu.
     """
     mu = ((1 + _nodes(_MU_NODES)) / 2) ** 2
     low, high = np.log(ROUGHNESS_RANGE)
@@ -144,8 +145,9 @@ def _tables() -> tuple[np.ndarray, np.ndarray]:
     coefficients = to_mu @ values @ to_roughness.T
     # 2 mu dmu = 4 u^3 du with u = sqrt(mu): the average is exactly that of the interpolant.
     x, weights = np.polynomial.legendre.leggauss(_MU_NODES)
-    average = (2 * weights * ((1 + x) / 2) ** 3) @ chebvander(x, _MU_NODES - 1)
-    return coefficients, np.einsum("i,tij->tj", average, coefficients)
+    powers = ((1 + x) / 2) ** (3 + 2 * np.arange(_POWERS)[:, None])
+    average = (2 * weights * powers) @ chebvander(x, _MU_NODES - 1)
+    return coefficients, np.einsum("pi,tij->tpj", average, coefficients)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(1,))
@@ -226,20 +228,23 @@ def directional_albedo(
 
 
 def average_albedo(
-    f0: Float[Array, "..."], specular: Float[Array, "..."], roughness: Float[Array, "..."]
+    f0: Float[Array, "..."],
+    specular: Float[Array, "..."],
+    roughness: Float[Array, "..."],
+    power: int = 0,
 ) -> Float[Array, "..."]:
     r"""Compute the fraction of uniform light that the specular lobe reflects, `2 int_0^1 rho(mu) mu
-    dmu`.
+    dmu`, or with `mu^power` as a further factor.
 
     It is the exact integral of the series that `directional_albedo` evaluates, so that nothing is
     lost between the two.
 
-    **Arguments:** as in `directional_albedo`.
+    **Arguments:** as in `directional_albedo`; `power` is at most 7.
 
-    **Returns:** in [0, 1].
+    **Returns:** in [0, 2 / (2 + power)], which is the value for `rho = 1`.
     """
-    coefficients = _with_fresnel(_tables()[1], f0)
+    coefficients = _with_fresnel(_tables()[1][:, power], f0)
     share = map_chunks(
         lambda each: coefficients @ _roughness_basis(each), roughness.reshape(-1), at_once=_AT_ONCE
     )
-    return jnp.clip(specular * share.reshape(roughness.shape), 0.0, 1.0)
+    return jnp.clip(specular * share.reshape(roughness.shape), 0.0, 2 / (2 + power))

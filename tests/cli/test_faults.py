@@ -106,7 +106,9 @@ REFUSED = {
     "fit dot.csv --power 2": ["--power", "dot.csv"],
     "fit dot.exr --mm-per-pixel 1 --single-scattering": ["--single-scattering", "dot.exr"],
     "fit marble --mm-per-unit 10": ["--mm-per-unit", "marble"],
-    "fit skin1 --single-scattering": ["--single-scattering", "dipole"],
+    "fit skin1 --single-scattering --model dipole": ["--single-scattering", "dipole"],
+    "fit skin1 --g 0.8 --model dipole": ["--g 0.8", "dipole"],
+    "fit skin1 --g 1": ["--g", "1"],
     "fit skin_layers --single-scattering --model monte-carlo": ["--single-scattering", "layers"],
     "fit skin_layers --model photon-beam": ["photon-beam", "layers"],
 }

@@ -1,0 +1,174 @@
+"""A half space by adding and doubling, and the law of angles: published values, limits, Monte
+Carlo, energy, reciprocity, derivatives, and what a picture makes of them.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+
+import splatjax as sj
+from splatjax.scattering import AngularLaw, HalfSpace, PhotonBeam, SingleScattering
+from splatjax.shading import diffuse_transmission, directional_albedo
+
+COSINES = HalfSpace.cosines()
+
+
+def half_space(albedo, eta=1.0, g=0.0) -> HalfSpace:
+    albedo = jnp.atleast_1d(jnp.asarray(albedo, float))
+    return HalfSpace(sj.Medium(2 * (1 - albedo), 2 * albedo, eta), g)
+
+
+def test_published_totals():
+    """Indices matched: Chandrasekhar, 1 - H(1) sqrt(1 - albedo). Index 1.5: Giovanelli 1955, with
+    what the surface itself reflects.
+    """
+    matched = half_space([0.2, 0.5, 0.9, 0.95]).total_reflectance()
+    np.testing.assert_allclose(matched, [0.03523052, 0.11522588, 0.41494748, 0.53554099], atol=3e-5)
+    glass = half_space(0.9, 1.5).total_reflectance()
+    np.testing.assert_allclose(0.04 + 0.96 * glass, 0.2600, atol=2e-4)
+
+
+@pytest.mark.once
+@pytest.mark.long
+def test_monte_carlo_with_forward_scattering(float32):
+    medium = sj.Medium([0.1, 0.02], [0.9, 0.98], 1.4)
+    walk = sj.transport.monte_carlo(
+        [sj.Layer(medium, jnp.inf)],
+        200_000,
+        jax.random.key(1),
+        edges=jnp.asarray([0.0, 1.0]),
+        phase=sj.transport.HenyeyGreenstein(0.8),
+    )
+    found, by_similarity = (HalfSpace(medium, g).total_reflectance() for g in (0.8, 0.0))
+    off = np.asarray(found - walk.total_reflectance.value) / walk.total_reflectance.deviation
+    assert np.all(np.abs(off) < 4), off
+    assert np.all(np.asarray(by_similarity) > np.asarray(found) * [1.03, 1.01])
+
+
+@pytest.mark.parametrize("eta", [1.0, 1.4])
+def test_limits(eta):
+    """All light leaves where nothing is absorbed. The little that leaves of a dark medium has
+    scattered once. Grazing light leaves most; where indices match, `1 - sqrt(1 - albedo)` of it
+    (Chandrasekhar).
+    """
+    fraction = np.asarray(half_space([1.0, 0.01, 0.9], eta, 0.0).directional_albedo())
+    allowed = 3e-4 if fraction.dtype == np.float64 else 6e-3  # as the docstring says
+    np.testing.assert_allclose(fraction[:, 0], 1, atol=allowed)
+    dark = SingleScattering(sj.Medium([0.99], [0.01], eta)).directional_albedo(jnp.asarray(COSINES))
+    np.testing.assert_allclose(fraction[1:, 1], np.asarray(dark)[1:, 0], rtol=0.03)
+    assert np.all(np.diff(fraction[:, 2]) < 1e-6)
+    if eta == 1:
+        np.testing.assert_allclose(fraction[0, 2], 1 - 0.1**0.5, atol=2e-4)
+
+
+@pytest.mark.parametrize("eta", [1.0, 1.3])
+def test_energy_of_a_material_under_every_angle(eta):
+    """Gaussians by their law and single scattering by its own are together what transport says
+    leaves, and never more than came.
+    """
+    space = half_space([0.9, 0.99], eta)
+    single = SingleScattering(space.medium)
+    separate = single.directional_albedo(jnp.asarray(COSINES, space.medium.eta.dtype))
+    law = space.angular_law(separate)
+    rest = space.total_reflectance() - separate[-1]
+    material = sj.Material(
+        sj.SumOfGaussians([1.0], rest[None]), single_scattering=single, angles=law
+    )
+    mu = jnp.asarray(COSINES, space.medium.eta.dtype)
+    leaving = separate + rest[None] * material.diffuse_fraction(mu)
+    allowed = 2e-3 if eta > 1 else 0.02  # with matched indices no polynomial is right at grazing
+    np.testing.assert_allclose(leaving[4:], space.directional_albedo()[4:], atol=allowed)
+    assert np.all(np.asarray(leaving) <= 1)
+
+
+@pytest.mark.parametrize("roughness", [0.3, [0.2] * 64])
+def test_light_leaves_whole_and_reciprocally(roughness, dtype):
+    x, weights = np.polynomial.legendre.leggauss(64)
+    mu = jnp.asarray((1 + x) / 2, dtype)
+    law = AngularLaw(jnp.asarray([[0.7, 1.3], [0.2, -0.4], [0.1, 0.1]], dtype))
+    surface = [jnp.asarray(each, dtype) for each in (0.028, 0.6, roughness)]
+    leaves = diffuse_transmission(mu, *surface, law)
+    np.testing.assert_allclose(leaves @ (weights * mu), 1, atol=1e-4)
+    enters = law(mu).T * (1 - directional_albedo(mu, *surface))[None]
+    ratio = np.asarray(leaves / enters)
+    np.testing.assert_allclose(ratio, np.broadcast_to(ratio[:, :1], ratio.shape), rtol=1e-5)
+
+
+def test_gradients(float64):
+    def total(albedo, eta, g):
+        return HalfSpace(sj.Medium(1 - albedo, albedo, eta), g).directional_albedo()[::4]
+
+    given = (jnp.asarray([0.95]), jnp.asarray([1.3]), jnp.asarray([0.4]))
+    check_grads(jax.jit(total), given, order=1, modes=["rev"], rtol=1e-5)
+    law = jnp.asarray([[0.8], [0.3], [-0.1]])
+    surface = tuple(jnp.asarray(each) for each in (0.028, 0.6, 0.3))
+
+    def leaves(coefficients, *surface):
+        return diffuse_transmission(jnp.asarray([0.2, 0.7]), *surface, AngularLaw(coefficients))
+
+    check_grads(jax.jit(leaves), (law, *surface), order=1, rtol=1e-5)
+
+
+def test_a_photon_beam_takes_the_total_of_transport():
+    space = half_space([0.9, 0.99], 1.3)
+    beam = PhotonBeam(space.medium)
+    held = beam.with_total(space.total_reflectance())
+    np.testing.assert_allclose(held.total_reflectance(), space.total_reflectance(), rtol=1e-5)
+    assert np.all(
+        np.abs(np.asarray(beam.total_reflectance() / held.total_reflectance()) - 1) > 0.01
+    )
+    r = jnp.asarray([0.5, 2.0])
+    single = SingleScattering(space.medium)(r)
+    ratio = np.asarray((held(r) - single) / (beam(r) - single))
+    np.testing.assert_allclose(ratio[0], ratio[1], rtol=1e-4)
+
+
+def test_a_flat_piece_sends_back_what_the_law_says():
+    """Under light and eye at an angle it is `e(mu_i) e(mu_o) / average` times as bright as a
+    diffuser.
+    """
+    side = np.linspace(-20, 20, 41)
+    centers = np.stack([*np.meshgrid(side, side), np.zeros((41, 41))], -1).reshape(-1, 3)
+    normals = np.broadcast_to([0, 0, 1.0], centers.shape)
+    splats = sj.Splats(centers, normals, np.full(41**2, 1.0), np.full(41**2, 1.0))
+    law = AngularLaw([[1.4], [0.1], [-0.5]])
+    gaussians = sj.SumOfGaussians([1.0], [[0.6]])
+    light = sj.DirectionalLight((-1, 0, -0.75), [1.0])  # cosine 0.6
+    camera = sj.Camera.look_at((0, 60, 80), (0, 0, 0), fov=2, width=8, height=8)  # cosine 0.8
+    material = sj.Material(gaussians, eta=1.0, specular=0, angles=law)
+    radiance = sj.render(sj.Scene(splats, light, material), camera).diffuse[4, 4, 0]
+
+    def e(mu):
+        return 1.4 + 0.1 * mu - 0.5 * mu**2
+
+    average = 1.4 + 0.1 * 2 / 3 - 0.5 / 2
+    plain = 0.6 * 0.6 / np.pi  # total reflectance, cosine
+    np.testing.assert_allclose(radiance, plain * e(0.6) * e(0.8) / average, rtol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: AngularLaw([[0.5], [0.4]]), "1: the factor of light along the normal"),
+        (lambda: AngularLaw([[-0.5], [1.5]]), "positive"),
+        (lambda: half_space(0.9, 0.8), "at least 1"),
+        (lambda: half_space(0.9, 1.3, 0.99), "between -0.95 and 0.95"),
+        (
+            lambda: sj.Material(sj.SumOfGaussians([1.0], [[0.5] * 3]), angles=AngularLaw([[1.0]])),
+            "Material.angles has 1 channels",
+        ),
+    ],
+)
+def test_what_is_wrong_is_said(make, words):
+    with pytest.raises(ValueError, match=words):
+        make()
+
+
+def test_a_file_keeps_the_angles(tmp_path):
+    law = half_space([0.9, 0.99], 1.3).angular_law()
+    material = sj.Material(sj.SumOfGaussians([1.0], [[0.4, 0.8]]), angles=law)
+    sj.save_material(material, tmp_path / "stone.toml")
+    read = sj.load_material(tmp_path / "stone.toml").angles
+    np.testing.assert_array_equal(read.coefficients, law.coefficients)
