@@ -35,7 +35,7 @@ SIZE, COUNT, NOISE = 40, 4, 0.01
 HELD = sj.fitting.NonNegativeWeights(sj.fitting.FixedTotalReflectance())
 # Every splat at every pixel, and coarse shadows: for small pictures. Leave `settings` out for large
 # ones.
-shadows = ShadowSettings(resolution=48, bias=1.0, softness=2.0)
+shadows = ShadowSettings(resolution=48, bias=0.35, softness=0.7)
 settings = sj.RenderSettings(
     shadows=shadows, rasterizer=DenseRasterizer(), diffuser=DenseDiffuser()
 )

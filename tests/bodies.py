@@ -26,7 +26,10 @@ from splatjax.splatting import (
 
 # Plain renderers, which compile in a third of the time.
 PLAIN = RenderSettings(
-    shadows=ShadowSettings(resolution=32), rasterizer=DenseRasterizer(), diffuser=DenseDiffuser()
+    shadows=ShadowSettings(resolution=32),
+    sample_shadows=ShadowSettings(resolution=32),
+    rasterizer=DenseRasterizer(),
+    diffuser=DenseDiffuser(),
 )
 
 

@@ -29,11 +29,11 @@ Rendered = tuple[sj.Frame, sj.Material, tuple[sj.scene.AbstractLight, ...], sj.C
 class Render(ViewOptions):
     """Render splats, or the built-in bust: an EXR file with every layer, and a PNG file beside it.
 
-    They stand under a light and a weak fill, or in an --environment. The camera looks at the middle
-    of the splats from far enough to see all of them. Angles are in degrees: azimuth turns about the
-    vertical axis, 0 is the front (+z) and 90 the side of +x; elevation rises above the horizon. If
-    the splats carry albedo, the weights of the material are divided by their sums, so that color
-    comes from the albedo alone; with --no-albedo it comes from the material alone.
+    They stand in a studio, an --environment, or under a single light and a weak fill. The camera
+    looks at the middle of the splats from far enough to see all of them. Angles are in degrees:
+    azimuth turns about the vertical axis, 0 is the front (+z) and 90 the side of +x; elevation
+    rises above the horizon. If the splats carry albedo, the weights of the material are divided by
+    their sums, so that color comes from the albedo alone; with --no-albedo from the material alone.
 
     Examples: splatjax render head.ply --material skin --azimuth 30 --width 1024 --height 1024
     --output head.exr
@@ -63,7 +63,9 @@ class Render(ViewOptions):
     def _at_once(self) -> Rendered:
         splats, material = self.load()
         camera = self.camera(lambda: [splats], self.azimuth)
-        scene = sj.Scene(splats, self.lights(material, self.azimuth, self.light_azimuth), material)
+        scene = sj.Scene(
+            splats, self.lights(material, self.azimuth, self.single_light[0]), material
+        )
         with preview(lambda side: rough_picture(scene, camera, self.exposure, side)):
             with stage("planning"):
                 plan = sj.make_plan(scene, camera, self.settings)
@@ -79,7 +81,7 @@ class Render(ViewOptions):
         with stage(f"looking at {file.count} splats"):
             camera = self.camera(parts, self.azimuth)
         material = self.material_for(next(iter(parts())))
-        lights = self.lights(material, self.azimuth, self.light_azimuth)
+        lights = self.lights(material, self.azimuth, self.single_light[0])
         with stage("rendering the stream", file.count) as report:
             frame = sj.render_streamed(
                 parts, lights, material, camera, report=lambda what, done: report(done, what)
@@ -92,13 +94,13 @@ class Turntable(ViewOptions):
     """Render the frames of an animation around splats, or the built-in bust.
 
     Per frame an EXR file with every layer and a PNG file; in the end turntable.webp, which plays in
-    a browser. Frames begin at --azimuth and --light-azimuth and go on in equal steps; a full turn
-    ends one step before its beginning, so that it plays round and round. The splats are planned and
-    the program is compiled once for all frames. With --turn camera, and --fill 0 or an
-    --environment, the light below the surface is computed once too; shadow maps are made once for
-    an --environment that turns. Frames that are there are kept: after an
-    interruption, run the same command again. A record in the folder, turntable.json, makes sure
-    that frames with different options are not mixed. Where a launcher has started several processes
+    a browser. Frames begin at --azimuth and the light's azimuth and go on in equal steps; a full
+    turn ends one step before its beginning, so that it plays round and round. The splats are
+    planned and the program is compiled once for all frames. With --turn camera, unless there is a
+    fill, the light below the surface is computed once too; shadow maps are made once for an
+    environment that turns. Frames that are there are kept: after an interruption, run the same
+    command again. A record in the folder, turntable.json, makes sure that frames with different
+    options are not mixed. Where a launcher has started several processes
     (SLURM, Open MPI, or JAX_COORDINATOR_ADDRESS, JAX_NUM_PROCESSES and JAX_PROCESS_ID), they share
     the frames of one folder that all of them see.
 
@@ -176,7 +178,7 @@ class Turntable(ViewOptions):
         turned = self.degrees * frame / self.frames
         return (
             self.azimuth + (0 if self.turn == "light" else turned),
-            self.light_azimuth + (0 if self.turn == "camera" else turned),
+            self.single_light[0] + (0 if self.turn == "camera" else turned),
         )
 
     def _prepare(self, paths: list[tuple[Path, Path]]) -> Callable[[int], None]:
@@ -185,7 +187,7 @@ class Turntable(ViewOptions):
         settings, places = self.settings, [self.azimuths(i) for i in range(self.frames)]
         scenes = [sj.Scene(splats, self.lights(material, *place), material) for place in places]
         cameras = [self.camera(lambda: [splats], azimuth) for azimuth, _ in places]
-        keeps_shadows = self.environment is not None and self.turn != "camera"
+        keeps_shadows = self.environment_name is not None and self.turn != "camera"
         if keeps_shadows:
             even = partial(replace, directions=sj.scene.even_directions(_DIRECTIONS))
             scenes = [replace(scene, lights=tuple(map(even, scene.lights))) for scene in scenes]
@@ -193,7 +195,7 @@ class Turntable(ViewOptions):
         with stage(f"planning {self.frames} frames"):
             plan = sj.make_plan(scenes, cameras, settings)
         light = None
-        if self.turn == "camera" and (self.environment or self.fill == 0):
+        if self.turn == "camera" and (self.environment_name is not None or self.fill == 0):
             # No light moves: passes 1 and 4 are the same in every frame.
             with stage("lighting the splats"):
                 light = jax.block_until_ready(sj.illuminate(scenes[0], plan, settings))

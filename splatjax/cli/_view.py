@@ -19,18 +19,20 @@ from ._terminal import Rules, UpAxis, check_options, note, option_name, stage
 
 # Degrees: the fill stands beside the camera, on the side away from the light.
 _FILL_SIDE, _FILL_ELEVATION = 25.0, 10.0
+_SINGLE_LIGHT = -20.0, 30.0, 0.1  # azimuth, elevation, and strength of the fill
 _ENVIRONMENTS = {
     "studio": sj.scene.studio,
     "overcast": sj.scene.overcast_sky,
     "sun": sj.scene.sun_and_sky,
 }
+Number = Annotated[float | None, tyro.conf.arg(metavar="FLOAT", help_behavior_hint="")]
 _NOT_IN_PICTURES = ("splats", "output", "fps", "quiet")
 _note_once = functools.cache(note)
 
 
 @dataclass(frozen=True, kw_only=True)
 class ViewOptions:
-    """Splats of one material, a camera that sees all of them, a light and a weak fill."""
+    """Splats of one material, a camera that sees all of them, and their light."""
 
     #: PLY file of splats, in mm (`splatjax sample` makes one). Without it, the built-in bust.
     splats: Annotated[
@@ -50,15 +52,16 @@ class ViewOptions:
     elevation: float = 0.0
     #: Vertical field of view.
     fov: float = 25.0
-    #: Of the place the light comes from; beyond 90 it stands behind.
-    light_azimuth: float = -20.0
-    #: Of the place the light comes from.
-    light_elevation: float = 30.0
-    #: Strength of a second light without shadows, beside the camera, relative to the first. 0 for
-    #: none.
-    fill: float = 0.1
-    #: Latitude-longitude map of linear radiance, which replaces both lights: an EXR or HDR file, or
-    #: the name of a built-in one: studio, overcast, sun.
+    #: Of the place that a single light comes from, in the place of the studio; beyond 90 it stands
+    #: behind. -20 where only the elevation or the fill is given.
+    light_azimuth: Number = None
+    #: Of the place that a single light comes from; 30 where it is not given.
+    light_elevation: Number = None
+    #: Strength of a second light without shadows, beside the camera, relative to a single first
+    #: one. 0 for none; 0.1 where it is not given.
+    fill: Number = None
+    #: Latitude-longitude map of linear radiance, in the place of single lights: an EXR or HDR file,
+    #: or the name of a built-in one: studio, overcast, sun. The studio where no light is given.
     environment: Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
     #: Rotation of the environment about the vertical axis, degrees; at 0 the middle of the map is
     #: the front (+z).
@@ -90,17 +93,18 @@ class ViewOptions:
         and for more memory than there is.
         """
         finite, positive = "be a finite number", "be 1 or more"
+        azimuth, elevation, fill = self.single_light
         rules: Rules = {
-            "fill": (0 <= self.fill < math.inf, "be 0 or more"),
+            "fill": (0 <= fill < math.inf, "be 0 or more"),
             "scale": (0 < self.scale < math.inf, "be a positive factor"),
             "azimuth": (math.isfinite(self.azimuth), finite),
-            "light_azimuth": (math.isfinite(self.light_azimuth), finite),
-            "light_elevation": (math.isfinite(self.light_elevation), finite),
+            "light_azimuth": (math.isfinite(azimuth), finite),
+            "light_elevation": (math.isfinite(elevation), finite),
             "environment_rotation": (math.isfinite(self.environment_rotation), finite),
             "exposure": (math.isfinite(self.exposure), finite),
             "background": (
-                self.background != "environment" or self.environment is not None,
-                "be black or transparent where there is no --environment",
+                self.background != "environment" or self.environment_name is not None,
+                "be black or transparent where single lights are given and no --environment",
             ),
             "bounces": (self.bounces >= 0, "be 0 or more"),
             "width": (self.width >= 1, positive),
@@ -122,11 +126,29 @@ class ViewOptions:
             "take fewer pixels or splats",
         )
 
+    @property
+    def single_light(self) -> tuple[float, float, float]:
+        """Return azimuth and elevation of the single light, and the strength of its fill."""
+        given = self.light_azimuth, self.light_elevation, self.fill
+        azimuth, elevation, fill = (
+            usual if value is None else value
+            for value, usual in zip(given, _SINGLE_LIGHT, strict=True)
+        )
+        return azimuth, elevation, fill
+
+    @property
+    def environment_name(self) -> str | None:
+        """Return the environment, the studio where no light is given; `None` for single lights."""
+        given = self.light_azimuth, self.light_elevation, self.fill
+        is_lit = any(value is not None for value in given)
+        return self.environment or (None if is_lit else "studio")
+
     @functools.cached_property
     def _environment(self) -> sj.EnvironmentLight | None:
-        if self.environment in _ENVIRONMENTS:
-            return sj.EnvironmentLight(_ENVIRONMENTS[self.environment]())
-        return sj.io.load_environment(self.environment) if self.environment else None
+        name = self.environment_name
+        if name in _ENVIRONMENTS:
+            return sj.EnvironmentLight(_ENVIRONMENTS[name]())
+        return sj.io.load_environment(name) if name else None
 
     @property
     def settings(self) -> sj.RenderSettings:
@@ -171,23 +193,22 @@ class ViewOptions:
         """Return the light, in the channels of a material, and the fill beside a camera at an
         azimuth: always on the same side of it; or the environment, which turns with the light.
         """
+        first_azimuth, elevation, fill = self.single_light
         if self._environment is not None:
-            rotation = self.environment_rotation + light_azimuth - self.light_azimuth
+            rotation = self.environment_rotation + light_azimuth - first_azimuth
             image = self._environment.image
             if material.channels == 1:
                 image = jnp.mean(image, axis=-1, keepdims=True)
             return (sj.EnvironmentLight(image, rotation),)
         # The first light gives a white diffuser that faces it the radiance 1.
         irradiance = np.full(material.channels, np.pi)
-        towards = -direction_to(light_azimuth, self.light_elevation)
+        towards = -direction_to(light_azimuth, elevation)
         light = sj.DirectionalLight(direction=towards, irradiance=irradiance)
-        side = math.copysign(_FILL_SIDE, math.remainder(self.azimuth - self.light_azimuth, 360))
-        fill = sj.DirectionalLight(
-            direction=-direction_to(azimuth + side, _FILL_ELEVATION),
-            irradiance=self.fill * irradiance,
-            cast_shadows=False,
-        )
-        return (light, fill) if self.fill else (light,)
+        side = math.copysign(_FILL_SIDE, math.remainder(self.azimuth - first_azimuth, 360))
+        if not fill:
+            return (light,)
+        towards = -direction_to(azimuth + side, _FILL_ELEVATION)
+        return light, sj.DirectionalLight(towards, fill * irradiance, cast_shadows=False)
 
     def camera(self, parts: sj.scene.Parts, azimuth: float) -> sj.Camera:
         """Place a camera at an azimuth so that the bounding sphere of the splats, which come in

@@ -35,14 +35,18 @@ class ShadowPlan(eqx.Module):
     **Attributes:**
 
     - `raster`: their capacity.
+    - `settings`: how they are made and compared.
     - `cube`: whether they are the six faces of a cube, as a point light among the splats needs
       them. Static.
+    - `splats_per_disc`: how many splats are merged into each disc in the maps. Static.
     - `lights`: the number of lights of the group that exist; the others fill it up, come last and
       have no shadow map. `None` where all exist.
     """
 
     raster: _splatting.AbstractRasterPlan
+    settings: _splatting.ShadowSettings
     cube: bool = eqx.field(static=True)
+    splats_per_disc: int = eqx.field(static=True)
     lights: Int[Array, ""] | None = None
 
     def closeness(self, light: AbstractLightSample, bounds: _splatting.Bounds) -> Float[Array, ""]:
@@ -140,7 +144,6 @@ def cast_shadows(
     bounds: _splatting.Bounds,
     shadows: tuple[ShadowPlan | None, ...],
     splatting: _splatting.SplattingSettings,
-    settings: _splatting.ShadowSettings,
     combination: AbstractCombination,
 ) -> LightVisibility:
     """Make the shadow maps of all lights (4.1) and look up the splats in them.
@@ -157,15 +160,18 @@ def cast_shadows(
             visibility.append(None)
             continue
 
-        def of_light(light, plan=plan):
+        per_disc = plan.splats_per_disc
+        discs = splats if per_disc == 1 else _splatting.merge_splats(splats, per_disc)
+
+        def of_light(light, plan=plan, discs=discs):
             def of_view(view):
                 shadow_map = _splatting.make_shadow_map(
-                    splats, view, splatting, plan.raster, combination
+                    discs, view, splatting, plan.raster, combination, plan.splats_per_disc
                 )
-                visible = map_visibility(scene, shadow_map, settings, plan.cube)
+                visible = map_visibility(scene, shadow_map, plan.settings, plan.cube)
                 return visible, shadow_map.needed
 
-            views = shadow_views(light, bounds, settings, plan.cube)
+            views = shadow_views(light, bounds, plan.settings, plan.cube)
             stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *views)
             visible, needed = jax.lax.map(of_view, stacked)
             closeness = plan.closeness(light, bounds)

@@ -79,9 +79,7 @@ def compute_visibility(
     """
     if transfer is not None:
         return LightVisibility(stack_lights(scene.lights), transfer.visibility, transfer.needed)
-    return cast_shadows(
-        scene, bounds, plan.shadows, settings.splatting, settings.shadows, combination
-    )
+    return cast_shadows(scene, bounds, plan.shadows, settings.splatting, combination)
 
 
 def light_splats(

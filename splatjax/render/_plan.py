@@ -21,6 +21,7 @@ from splatjax.scene import (
     AbstractLightSample,
     Camera,
     DistantStratum,
+    EmitterStratum,
     Scene,
     Splats,
     lights_by_kind,
@@ -42,6 +43,8 @@ class RenderSettings(eqx.Module):
 
     - `splatting`: passes 2 and 3: epsilon-z, the screen filter.
     - `shadows`: pass 1: resolution and bias of shadow maps.
+    - `sample_shadows`: those of the maps of the samples of extended lights: many, so that each is
+      coarser. `ShadowSettings()` makes them like those of other lights.
     - `bounces`: how many times light that has left the body may enter it again. Static.
     - `sightlines`: in how many directions each splat sees the body, for these.
     - `kernel`: pass 4: how a layer spreads, is normalized, and when the splats resolve it:
@@ -54,6 +57,9 @@ class RenderSettings(eqx.Module):
 
     splatting: _splatting.SplattingSettings = _splatting.SplattingSettings()
     shadows: _splatting.ShadowSettings = _splatting.ShadowSettings()
+    sample_shadows: _splatting.ShadowSettings = _splatting.ShadowSettings(
+        resolution=512, compared=2, merged_spacing=4.0
+    )
     bounces: int = eqx.field(static=True, default=0)
     sightlines: _splatting.SightlineSettings = _splatting.SightlineSettings()
     kernel: _diffusion.AbstractDiffusionKernel = _diffusion.EscapeNormalization()
@@ -68,6 +74,11 @@ class RenderSettings(eqx.Module):
                 f"bounces is {self.bounces} and lighting is {type(self.lighting).__name__}; light "
                 "bounces between splats alone: give bounces=0, or lighting=LightAtSplats()"
             )
+
+    def shadows_of(self, light: AbstractLightSample) -> _splatting.ShadowSettings:
+        """Return the settings of the shadow maps of a light or sample."""
+        is_sample = isinstance(light, DistantStratum | EmitterStratum)
+        return self.sample_shadows if is_sample else self.shadows
 
 
 class Plan(eqx.Module):
@@ -319,7 +330,12 @@ def _plan_shadows(
             DistantStratum(direction=way, irradiance=lights[0].irradiance, cast_shadows=True)
             for way in directions
         ]
-    of_lights, cube = plan_views(lights, bounds, settings.shadows)
+    shadows = settings.shadows_of(lights[0])
+    merged = shadows.splats_per_disc(parts, bounds)
+    if merged > 1:
+        parts = [_splatting.merge_splats(part, merged) for part in parts]
+    of_lights, cube = plan_views(lights, bounds, shadows)
     views = [view for views in of_lights for view in views]
     rasterizer = settings.rasterizer.for_shadows()
-    return ShadowPlan(rasterizer.make_plan(parts, views, settings.splatting), cube)
+    raster = rasterizer.make_plan(parts, views, settings.splatting)
+    return ShadowPlan(raster, shadows, cube, merged)

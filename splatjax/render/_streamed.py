@@ -111,7 +111,7 @@ def render_streamed(
 
     # Pass 1: the shadow maps of each light that casts shadows, in its group.
     of_lights = [
-        plan_views([sample for _, sample in group], bounds, settings.shadows)[0]
+        plan_views([sample for _, sample in group], bounds, settings.shadows_of(group[0][1]))[0]
         if group[0][1].cast_shadows
         else None
         for group in lights_by_kind(first.lights)
@@ -216,13 +216,13 @@ def _light(
 ) -> tuple[LightVisibility, Irradiance]:
     """Look a part up in the shadow maps of all parts."""
 
-    def of_light(maps: Sequence[_splatting.ShadowMap]):
-        cube = len(maps) > 1
-        return sum(map_visibility(scene, each, settings.shadows, cube) for each in maps)
+    def of_light(group: StackedLights, maps: Sequence[_splatting.ShadowMap]):
+        shadows, cube = settings.shadows_of(group.lights), len(maps) > 1
+        return sum(map_visibility(scene, each, shadows, cube) for each in maps)
 
     visibility = [
-        None if of_group is None else jnp.stack([of_light(maps) for maps in of_group])
-        for of_group in shadow_maps
+        None if of_group is None else jnp.stack([of_light(group, maps) for maps in of_group])
+        for group, of_group in zip(groups, shadow_maps, strict=True)
     ]
     light = LightVisibility(groups, visibility, jnp.zeros((), scene.splats.centers.dtype))
     return light, irradiance_at_splats(scene, light)

@@ -10,9 +10,9 @@ from ._environment import pixel_directions
 
 # Softboxes: azimuth and elevation in degrees, half of width and height over distance, radiance.
 _SOFTBOXES = (
-    (-40.0, 35.0, 0.5, 0.6, (3.6, 3.4, 3.1)),
-    (70.0, 5.0, 0.6, 0.9, (0.35, 0.4, 0.5)),
-    (155.0, 30.0, 0.2, 0.8, (4.0, 4.2, 4.5)),
+    (-30.0, 35.0, 0.5, 0.6, (3.9, 3.65, 3.3)),
+    (75.0, 5.0, 0.6, 0.9, (0.33, 0.38, 0.48)),
+    (150.0, 25.0, 0.25, 0.9, (7.0, 7.4, 8.0)),
 )
 _ZENITH, _HORIZON, _SUN = (0.12, 0.22, 0.48), (0.45, 0.5, 0.55), (2.4, 2.2, 1.9)
 _CONCENTRATION = 1500.0  # of the sun, whose light is spread over some 3 degrees

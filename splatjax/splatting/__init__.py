@@ -25,6 +25,7 @@ from ._rasterizer import (
     invalid_factor as invalid_factor,
     PixelSums as PixelSums,
 )
+from ._merging import merge_splats as merge_splats
 from ._shadows import (
     Bounds as Bounds,
     compute_visibility as compute_visibility,

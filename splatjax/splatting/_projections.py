@@ -163,8 +163,11 @@ class PerspectiveView(AbstractView):
     def depth_slope(self, x, y, depth, normals):
         nx, ny, nz = jnp.tensordot(self.rotation, normals, 1)
         u, v = (x - self.width / 2) / self.focal_length, (y - self.height / 2) / self.focal_length
-        mm = jnp.where(depth > self.near, depth, 1.0) / self.focal_length
+        mm = self.pixel_size(depth)
         return nx * mm, ny * mm, -(nz + nx * u + ny * v)
+
+    def pixel_size(self, depth):
+        return jnp.where(depth > self.near, depth, 1.0) / self.focal_length
 
     def unproject(self, x, y, depth):
         u, v = (x - self.width / 2) / self.focal_length, (y - self.height / 2) / self.focal_length
@@ -255,6 +258,9 @@ class OrthographicView(AbstractView):
     def depth_slope(self, x, y, depth, normals):
         nx, ny, nz = jnp.tensordot(self.rotation, normals, 1)
         return nx / self.scale, ny / self.scale, -nz
+
+    def pixel_size(self, depth):
+        return 1 / self.scale
 
     def unproject(self, x, y, depth):
         along = jnp.stack(

@@ -2,9 +2,12 @@
 each splat.
 """
 
+from collections.abc import Sequence
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from splatjax._chunking import AT_ONCE, jit_unless_traced, map_chunks
@@ -14,11 +17,15 @@ from splatjax.scene import Splats, rotation_towards
 
 from ._grid import TILE_SIDE, TileGrid
 from ._kernel import coverage
+from ._merging import MERGED_COUNTS
 from ._projections import OrthographicView, PerspectiveView
 from ._rasterizer import AbstractRasterPlan, FragmentSums, invalid_factor
 from ._surfaces import Surface
 from ._views import AbstractView, SplattingSettings
 
+# Times the weight sum from which on a surface covers a pixel of a picture: discs extend beyond an
+# open edge, and its shadow less.
+_LESS_COVERED = 2.0
 _NEAR = 1e-2  # mm: nearer, a splat is so large in pixels that float32 overflows
 
 
@@ -28,19 +35,37 @@ class ShadowSettings(eqx.Module):
     **Attributes:**
 
     - `resolution`: pixels along a side of each map.
-    - `bias`: a surface less than this far behind the map's, in mm, is still fully lit: keeps a
-      surface from shadowing itself.
-    - `softness`: over this many more mm the light fades; with it shadows have gradients in depth.
-      Across the shadow's edge, light fades over about two pixels of the map.
+    - `bias`: a surface less than this far behind the map's is still fully lit: keeps a surface from
+      shadowing itself. Its unit is the reach of the splat in the map, the root of the sum of the
+      squares of its radius and of a pixel's diagonal.
+    - `softness`: over this many more reaches the light fades; with it shadows have gradients in
+      depth. Across the shadow's edge, light fades over about two pixels of the map.
+    - `compared`: a splat is compared with a square of pixels, 2 or 3 along a side.
+    - `merged_spacing`: splats are merged into discs that are this many pixels of the map apart at
+      most; 0 to merge none. Eight to 32 splats make one disc, so that splats that are farther apart
+      than a third of it stay alone.
     - `largest_slope`: the slope up to which the receiver's own plane is followed from pixel to
       pixel of the map. Measured on heads: 4 leaves terraces where light grazes, beyond 8 nothing is
       gained.
     """
 
     resolution: int = eqx.field(static=True, default=1024)
-    bias: float = eqx.field(static=True, default=0.4)
-    softness: float = eqx.field(static=True, default=0.8)
+    bias: float = eqx.field(static=True, default=0.2)
+    softness: float = eqx.field(static=True, default=0.4)
     largest_slope: float = eqx.field(static=True, default=8.0)
+    compared: int = eqx.field(static=True, default=3)
+    merged_spacing: float = eqx.field(static=True, default=0.0)
+
+    def __check_init__(self):
+        if self.compared not in (2, 3):
+            raise ValueError(f"ShadowSettings.compared is {self.compared}; give 2 or 3 pixels")
+
+    def splats_per_disc(self, parts: Sequence[Splats], bounds: "Bounds") -> int:
+        """Return how many splats of a body are merged into one disc; not for traced arrays."""
+        areas = np.concatenate([np.asarray(part.areas) for part in parts])
+        spacing = np.sqrt(np.median(areas[areas > 0])) if np.any(areas > 0) else np.inf
+        largest = self.merged_spacing * 2 * float(bounds.radius) / self.resolution
+        return max((n for n in MERGED_COUNTS if n**0.5 * spacing <= largest), default=1)
 
 
 class Bounds(eqx.Module):
@@ -148,24 +173,37 @@ def in_cube_face(
 
 
 class ShadowMap(eqx.Module):
-    """Depth (mm) and coverage of the front surface and of the one behind it, `[tiles, pixels]`."""
+    """Depth (mm) and coverage of the front surface and of the one behind it, `[tiles, pixels]`.
+
+    **Attributes:**
+
+    - `splats_per_disc`: how many splats each disc in it stands for. Static.
+    """
 
     view: AbstractView
     planes: Float[Array, "4 tiles pixels"]
     needed: Float[Array, ""]
+    splats_per_disc: int = eqx.field(static=True, default=1)
 
     @classmethod
-    def of(cls, sums: FragmentSums, view: AbstractView, settings: SplattingSettings) -> "ShadowMap":
+    def of(
+        cls,
+        sums: FragmentSums,
+        view: AbstractView,
+        settings: SplattingSettings,
+        splats_per_disc: int = 1,
+    ) -> "ShadowMap":
         """Blend the sums of all parts."""
         surface = Surface.of(sums.sums, view, sums.needed)
-        covered = coverage(sums.sums.weights, settings.full_coverage)
+        covered = coverage(sums.sums.weights, _LESS_COVERED * settings.full_coverage)
         of_places = jnp.stack([surface.depth, covered])
         empty = jnp.zeros((2, TileGrid(view.width, view.height).count, TILE_SIDE**2), covered.dtype)
         planes = [
             empty.at[:, sums.tiles[places]].set(of_places[:, places], mode="drop")
             for places in (slice(sums.front), slice(sums.front, None))
         ]
-        return cls(view, invalid_factor(sums.needed) * jnp.concatenate(planes), sums.needed)
+        planes = invalid_factor(sums.needed) * jnp.concatenate(planes)
+        return cls(view, planes, sums.needed, splats_per_disc)
 
 
 def make_shadow_map(
@@ -174,22 +212,31 @@ def make_shadow_map(
     splatting: SplattingSettings,
     plan: AbstractRasterPlan,
     combination: AbstractCombination,
+    splats_per_disc: int = 1,
 ) -> ShadowMap:
-    """Make a shadow map (4.1): the surfaces that a light sees, by passes 2 and 3 of the camera."""
+    """Make a shadow map (4.1): the surfaces that a light sees, by passes 2 and 3 of the camera.
+
+    **Arguments:**
+
+    - `splats`: or discs into which they were merged, so many into one (`merge_splats`).
+    """
     chosen, needed = plan.choose(splats, view)
     no_rows = jnp.zeros((0, len(chosen)), splats.centers.dtype)
     sums = plan.sum_fragments(splats.take(chosen), no_rows, view, splatting, combination)
     needed = combination.largest([jnp.maximum(needed, sums.needed)])
     total = combination.total([sums.sums])
     sums = eqx.tree_at(lambda sums: (sums.sums, sums.needed), sums, (total, needed))
-    return ShadowMap.of(sums, view, splatting)
+    return ShadowMap.of(sums, view, splatting, splats_per_disc)
 
 
-def _spline(t: Float[Array, " splats"]) -> Float[Array, "3 splats"]:
-    """Compute the quadratic B-spline's weights of the three pixels around a place; `t` in [-1/2,
-    1/2] from the middle one.
+def _spline(away: Float[Array, "pixels ..."]) -> Float[Array, "pixels ..."]:
+    """Compute the weights of two pixels by a linear B-spline or of three by a quadratic one; `away`
+    is their distance from the place in the middle, in pixels.
     """
-    return jnp.stack([0.5 * (0.5 - t) ** 2, 0.75 - t * t, 0.5 * (0.5 + t) ** 2])
+    if len(away) == 2:
+        return 1 - jnp.abs(away)
+    sides, middle = 0.5 * (1.5 - jnp.abs(away[::2])) ** 2, 0.75 - away[1] ** 2
+    return jnp.stack([sides[0], middle, sides[1]])
 
 
 def compute_visibility(
@@ -198,7 +245,7 @@ def compute_visibility(
     r"""Compute the fraction of a light that reaches each splat, by soft comparison with its shadow
     map.
 
-    Nine pixels are compared and averaged with a smooth spline; at each, the splat's depth is
+    Nine pixels, or four, are compared and averaged with a spline; at each, the splat's depth is
     continued along its own plane. Light is blocked by the front surface with its coverage, and by
     the one behind it with what is left.
 
@@ -207,55 +254,55 @@ def compute_visibility(
     view = shadow_map.view
     flat = shadow_map.planes.reshape(4, -1).T
 
-    def land(centers, normals):
+    def land(centers, normals, radii):
         x, y, depth = view.project(centers.T)
         across, down, facing = view.depth_slope(x, y, depth, normals.T)
         facing = jnp.maximum(facing, 1 / settings.largest_slope)
-        return jnp.stack([x, y, depth, across / facing, down / facing], axis=1)
+        reach = jnp.sqrt(shadow_map.splats_per_disc * radii**2 + 2 * view.pixel_size(depth) ** 2)
+        return x, y, depth, across / facing, down / facing, reach
 
-    # Where splats land is kept: each of nine comparisons, and each of their derivatives, reads it.
-    landed = map_chunks(land, splats.centers, splats.normals)
+    # Where splats land is kept: each comparison, and each of their derivatives, reads it.
+    landed = map_chunks(land, splats.centers, splats.normals, splats.radii)
     # Few large parts: backward, each adds into an array as large as the map.
     return map_chunks(
-        lambda part: _compared(part.T, view, flat, settings), landed, at_once=4 * AT_ONCE
+        lambda *part: _compared(part, view, flat, settings), *landed, at_once=4 * AT_ONCE
     )
 
 
 def _compared(
-    landed: Float[Array, "5 splats"],
+    landed: tuple[Float[Array, " splats"], ...],
     view: AbstractView,
     flat: Float[Array, "pixels 4"],
     settings: ShadowSettings,
 ) -> Float[Array, " splats"]:
     """Compare with depth and coverage of both surfaces of a map."""
-    x, y, depth, slope_x, slope_y = landed
-    column, row = jnp.floor(jax.lax.stop_gradient(x)), jnp.floor(jax.lax.stop_gradient(y))
-    tx, ty = x - column - 0.5, y - row - 0.5
-
-    # Nine pixels around each splat, side by side: [across, down, splats].
-    step = jnp.arange(-1, 2, dtype=jnp.int32)
-    step_x, step_y = step[:, None, None], step[None, :, None]
+    x, y, depth, slope_x, slope_y, reach = landed
+    half = (settings.compared - 1) / 2
+    column, row = (jnp.floor(jax.lax.stop_gradient(each) - half) for each in (x, y))
+    # Pixels around each splat, side by side: [across, down, splats].
+    step = jnp.arange(settings.compared, dtype=jnp.int32)[:, None]
     at_x, at_y = (
-        column.astype(jnp.int32)[None, None] + step_x,
-        row.astype(jnp.int32)[None, None] + step_y,
+        (column.astype(jnp.int32)[None] + step)[:, None],
+        (row.astype(jnp.int32)[None] + step)[None],
     )
     index = TileGrid(view.width, view.height).pixel(
         jnp.clip(at_x, 0, view.width - 1), jnp.clip(at_y, 0, view.height - 1)
     )
     inside = (at_x >= 0) & (at_y >= 0) & (at_x < view.width) & (at_y < view.height)
-    across = slope_x[None, None] * (step_x.astype(x.dtype) - tx[None, None])
-    down = slope_y[None, None] * (step_y.astype(x.dtype) - ty[None, None])
+    middle = step.astype(x.dtype) + 0.5
+    away_x, away_y = (column - x)[None] + middle, (row - y)[None] + middle
+    across, down = (slope_x[None] * away_x)[:, None], (slope_y[None] * away_y)[None]
     here = depth[None, None] + across + down
 
     def hidden(map_depth, map_coverage):
-        beyond = here - map_depth - settings.bias
-        return map_coverage * smooth_step(beyond, 0, settings.softness)
+        beyond = (here - map_depth) / reach[None, None]
+        return map_coverage * smooth_step(beyond - settings.bias, 0, settings.softness)
 
     front_depth, front_coverage, behind_depth, behind_coverage = jnp.unstack(
         flat.at[index].get(mode="promise_in_bounds"), axis=-1
     )
     behind = (1 - front_coverage) * hidden(behind_depth, behind_coverage)
     blocked = hidden(front_depth, front_coverage) + behind
-    weights = _spline(tx)[:, None] * _spline(ty)[None]
+    weights = _spline(away_x)[:, None] * _spline(away_y)[None]
     blocked = jnp.sum(weights * jnp.where(inside, blocked, 0.0), axis=(0, 1))
     return jnp.maximum(1 - blocked, 0)  # rounding must not make light negative

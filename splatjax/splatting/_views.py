@@ -197,6 +197,10 @@ class AbstractView(eqx.Module):
         """
 
     @abc.abstractmethod
+    def pixel_size(self, depth: Float[Array, "*points"]) -> Float[Array, "..."]:
+        """Compute the width of a pixel at a depth, mm."""
+
+    @abc.abstractmethod
     def unproject(
         self, x: Float[Array, "*points"], y: Float[Array, "*points"], depth: Float[Array, "*points"]
     ) -> Float[Array, "3 *points"]:

@@ -22,7 +22,7 @@ from splatjax.cli._main import prepare_jax
 from splatjax.cli._render import Render
 from splatjax.cli._view import direction_to
 
-SMALL = ["--count", "1500", "--width", "64", "--height", "64"]
+SMALL = ["--count", "1500", "--width", "64", "--height", "64", "--light-azimuth", "-20"]
 
 
 def test_materials_lists_the_library_with_its_sources(capsys):
@@ -119,6 +119,23 @@ def test_render_without_scattering_is_lambertian(tmp_path):
     # takes and gives a few per cent.
     np.testing.assert_allclose(np.asarray(frame.diffuse)[16, 16], 0.5 * total, rtol=0.03)
     np.testing.assert_allclose(np.asarray(frame.weights), total[None], rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("given", "kinds"),
+    [
+        ({}, ["EnvironmentLight"]),
+        ({"fill": 0.0}, ["DirectionalLight"]),
+        ({"light_elevation": 60.0}, ["DirectionalLight", "DirectionalLight"]),
+        ({"environment": "sun", "fill": 0.5}, ["EnvironmentLight"]),
+    ],
+)
+def test_a_studio_lights_where_no_light_is_given(given, kinds):
+    lights = Render(**given).lights(sj.load_material("marble"), 25.0, -20.0)
+    assert [type(light).__name__ for light in lights] == kinds
+    if not given:
+        np.testing.assert_array_equal(lights[0].image, sj.scene.studio())
+        assert float(lights[0].rotation) == 0
 
 
 @pytest.mark.parametrize(("width", "height"), [(64, 64), (128, 64), (64, 128)])

@@ -77,7 +77,7 @@ REFUSED = {
     "render missing.ply --scale 0": ["--scale", "0"],
     "render missing.ply --environment-rotation nan": ["--environment-rotation", "nan"],
     "render plate.ply --environment missing.hdr": ["missing.hdr"],
-    "render plate.ply --background environment": ["--background", "no --environment"],
+    "render plate.ply --background environment --fill 0": ["--background", "no --environment"],
     "render plate.ply --environment map.png": ["map.png", "encoded for a display"],
     "render missing.ply --fill -1": ["--fill", "-1"],
     "render missing.ply --bounces -1": ["--bounces", "-1"],

@@ -32,7 +32,7 @@ def splats(tmp_path_factory):
 
 
 def command(splats, folder, *more, turn="camera", frames=FRAMES):
-    size = ("--width", 16, "--height", 16, "--no-scattering", "--material", "marble")
+    size = ("--width", 16, "--height", 16, "--no-scattering", "--material", "marble", "--fill", 0.1)
     return [
         "turntable",
         splats,
@@ -90,7 +90,7 @@ def test_camera_keeps_its_distance_and_the_fill_its_place_beside_it():
     places = np.random.default_rng(3).normal(size=(50, 3)) * np.asarray([30.0, 10.0, 5.0]) + 20
     splats = bodies.splats(places, np.ones((50, 3)), 1.0)
     middle = (places.min(axis=0) + places.max(axis=0)) / 2
-    options, marble = Turntable(elevation=20.0), sj.load_material("marble")
+    options, marble = Turntable(elevation=20.0, fill=0.1), sj.load_material("marble")
     azimuths = np.arange(0.0, 360.0, 40.0).tolist()
     cameras = [options.camera(lambda: [splats], azimuth) for azimuth in azimuths]
     distances = [np.linalg.norm(np.asarray(camera.position) - middle) for camera in cameras]

@@ -117,8 +117,9 @@ def lay_out_frame(folder: Path, text: str) -> None:
     """Write the picture that a page's programs read and its commands would have made."""
     if "head.exr" in text:
         _splats(folder / "head.ply")
-        options = ["--width", "32", "--height", "32", "--output", str(folder / "head.exr")]
-        assert main(["render", str(folder / "head.ply"), *options]) == 0
+        options = ["--width", "32", "--height", "32", "--light-elevation", "30"]
+        output = ["--output", str(folder / "head.exr")]
+        assert main(["render", str(folder / "head.ply"), *options, *output]) == 0
 
 
 WITH_CONTEXT = {

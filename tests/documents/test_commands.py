@@ -17,8 +17,8 @@ from splatjax.cli._main import parsed
 
 # Options that make a command quick; the last one given counts.
 SMALL = {
-    "render": ["--width", "32", "--height", "32"],
-    "turntable": ["--width", "32", "--height", "32", "--frames", "2"],
+    "render": ["--width", "32", "--height", "32", "--light-elevation", "30"],
+    "turntable": ["--width", "32", "--height", "32", "--frames", "2", "--light-elevation", "30"],
     "sample": ["--count", "1500"],
     "recover": ["--count", "3", "--no-suggest"],
 }

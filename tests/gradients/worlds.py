@@ -15,9 +15,11 @@ from bodies import view
 import splatjax as sj
 from splatjax.splatting import ShadowSettings, TileRasterizer
 
-SHADOWS = ShadowSettings(resolution=32, bias=1.5, softness=3.0)
-FAST = sj.RenderSettings(shadows=SHADOWS, rasterizer=TileRasterizer(lanes=8, slots=16))
-PLAIN = dataclasses.replace(bodies.PLAIN, shadows=SHADOWS)
+SHADOWS = ShadowSettings(resolution=32, bias=0.4, softness=0.8)
+FAST = sj.RenderSettings(
+    shadows=SHADOWS, sample_shadows=SHADOWS, rasterizer=TileRasterizer(lanes=8, slots=16)
+)
+PLAIN = dataclasses.replace(bodies.PLAIN, shadows=SHADOWS, sample_shadows=SHADOWS)
 COARSE = dataclasses.replace(PLAIN, shadows=dataclasses.replace(SHADOWS, resolution=16))
 
 

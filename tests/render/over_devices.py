@@ -17,7 +17,8 @@ import splatjax as sj
 from benchmarks.communication import Picture, View, counted
 from splatjax.splatting import ShadowSettings
 
-SETTINGS = sj.RenderSettings(shadows=ShadowSettings(resolution=32))
+SHADOWS = ShadowSettings(resolution=32)
+SETTINGS = sj.RenderSettings(shadows=SHADOWS, sample_shadows=SHADOWS)
 # mm; where the balls stand, away from the origin of all coordinates.
 PLACE = np.asarray([40.0, -25.0, 15.0])
 

@@ -28,7 +28,8 @@ from splatjax.splatting import ShadowSettings
 BARE = sj.Material(two_gaussians(), specular=0.0)
 GLOSSY = sj.Material(two_gaussians(), specular=1.0, roughness=0.4)
 CAMERA = sj.Camera.look_at([0, 0, 60], [0, 0, 0], fov=24, width=24, height=24)
-TILES = sj.RenderSettings(diffuser=DenseDiffuser(), shadows=ShadowSettings(resolution=512))
+SHADOWS = ShadowSettings(resolution=512)
+TILES = sj.RenderSettings(diffuser=DenseDiffuser(), shadows=SHADOWS, sample_shadows=SHADOWS)
 # Root mean square, and largest error of the irradiance over its largest value, by count.
 SAMPLED = {16: (0.05, 0.15), 64: (0.015, 0.045), 256: (0.004, 0.012)}
 BODY = joined(sphere(1500, 10.0), sphere(400, 3.0, (4.0, 6.0, 12.0)))

@@ -20,7 +20,8 @@ pytestmark = pytest.mark.once
 ROUNDING = 3e-5  # of the largest number of its kind: sums of a thousand terms, in another order
 LAYERS = 2.5e-2  # 99% of the pixels; at points here and at splats there, with clusters of each part
 RIMS = 0.1  # where a pixel blends two surfaces, 0.07 measured
-SETTINGS = sj.RenderSettings(shadows=ShadowSettings(resolution=32))
+SHADOWS = ShadowSettings(resolution=32)
+SETTINGS = sj.RenderSettings(shadows=SHADOWS, sample_shadows=SHADOWS)
 FIELDS = (
     "coverage",
     "depth",

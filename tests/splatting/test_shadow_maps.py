@@ -13,6 +13,7 @@ import pytest
 from jax.test_util import check_grads
 
 from splatjax._combination import OneDevice
+from splatjax.scene import Splats
 from splatjax.splatting import (
     TILE_SIDE,
     Bounds,
@@ -26,6 +27,7 @@ from splatjax.splatting import (
     distant_view,
     in_cube_face,
     make_shadow_map,
+    merge_splats,
     near_view,
 )
 
@@ -103,7 +105,8 @@ def test_each_surface_blocks_what_reaches_it():
     less of it beyond the edge.
     """
     size, front, behind, covers, covers_behind = 32, 3.0, 4.5, 0.6, 0.25
-    settings = ShadowSettings(resolution=size, bias=0.4, softness=0.8)
+    settings = ShadowSettings(resolution=size, bias=0.5, softness=1.0)
+    reach = np.hypot(0.1, 2**0.5 * 0.5)  # a radius, and the diagonal of a pixel
     view = OrthographicView(jnp.zeros(3), jnp.eye(3), jnp.asarray(2.0), size, size)
     planes = jnp.asarray([front, covers, behind, covers_behind])[:, None, None]
     planes = jnp.broadcast_to(planes, (4, (size // TILE_SIDE) ** 2, TILE_SIDE**2))
@@ -114,8 +117,8 @@ def test_each_surface_blocks_what_reaches_it():
     row = np.linspace(-0.4, 31.9, column.size)[::-1]
     centers = np.stack([(column - size / 2) / 2, (row - size / 2) / 2, depth], axis=1)
     body = bodies.splats(centers, np.tile([0.0, 0.0, -1.0], (len(depth), 1)), 0.1)
-    blocked = covers * smooth_step((depth - front - 0.4) / 0.8)
-    blocked += (1 - covers) * covers_behind * smooth_step((depth - behind - 0.4) / 0.8)
+    blocked = covers * smooth_step((depth - front) / reach - 0.5)
+    blocked += (1 - covers) * covers_behind * smooth_step((depth - behind) / reach - 0.5)
 
     def share_inside(place):
         """Of a quadratic spline around a place, what lies on the map: the integral of a hat of one
@@ -153,6 +156,21 @@ def test_umbra_is_dark_and_the_rest_is_lit(kind):
     assert np.max(visible[:floor][umbra]) < 1e-6
     assert np.min(visible[:floor][outside]) > 1 - 1e-6
     assert np.min(visible[floor:]) > 1 - 1e-6, "the disc shadows itself"
+
+
+@pytest.mark.once
+def test_the_shadow_of_an_open_edge_ends_within_half_a_spacing():
+    spacing, height = 0.25, 5.0
+    blocker = bodies.sheet(3.0, spacing, center=(-3.0 - spacing / 2, 0.0, height))  # to x = 0
+    line = np.linspace(-2, 2, 161)
+    x, y = (each.reshape(-1) for each in np.meshgrid(line, np.arange(-2.0, 2.0, 0.2)))
+    floor = np.stack([x, y, np.zeros_like(x)], axis=1)
+    floor = bodies.splats(floor, np.tile([0.0, 0.0, 1.0], (len(x), 1)), 1.5 * spacing)
+    body, settings = bodies.joined(blocker, floor), ShadowSettings(resolution=256)
+    view = distant_view(jnp.asarray([0.0, 0.0, -1.0]), bounds_of(body), settings)
+    visible = visibility(body, view, plan_for(view, body), settings)[blocker.count :]
+    edge = 2 - np.trapezoid(np.mean(np.reshape(visible, (-1, len(line))), axis=0), line)
+    assert 0 < edge < 0.5 * spacing  # 0.6 if discs block light as they cover pixels
 
 
 @pytest.mark.once
@@ -213,3 +231,31 @@ def test_edge_has_the_gradient_of_central_differences(float64):
         return jnp.dot(visibility(moved, view, plan)[:floor], weights)
 
     check_grads(total, start, 1, ["rev"], atol=1e-5, rtol=1e-5, eps=1e-6)
+
+
+def test_merged_splats_have_the_area_of_each_side():
+    """Two sides of a thin sheet, in one group or another: no disc lies between them."""
+    upper = bodies.sheet(3.9, 0.5, center=(0.0, 0.0, 0.1))
+    lower = bodies.sheet(3.9, 0.5, normal=(0.0, 0.0, -1.0), center=(0.0, 0.0, -0.1))
+    body = bodies.joined(upper, lower)
+    order = np.random.default_rng(0).permutation(body.count)
+    discs = merge_splats(jax.tree.map(lambda leaf: leaf[order], body), 8)
+    up = np.asarray(discs.normals, float)[:, 2]
+    exists = np.asarray(discs.radii) > 0
+    np.testing.assert_allclose(np.asarray(discs.centers)[:, 2], 0.1 * up, atol=1e-6)
+    assert np.all(np.abs(up) == exists)
+    for side, own in ((upper, up > 0), (lower, up < 0)):
+        for total in (lambda s: s.areas, lambda s: s.radii**2):
+            whole = np.sum(np.asarray(total(discs), float)[own])
+            np.testing.assert_allclose(whole, np.sum(total(side)), rtol=1e-5)
+
+
+def test_merged_splats_are_differentiable(float64):
+    body = bodies.bumpy(32)
+    exists = jnp.asarray(np.arange(32) // 8 != 1, float)  # a group without any
+
+    def sums(centers, normals, radii, areas):
+        discs = merge_splats(Splats(centers, normals, exists * radii, exists * areas), 8)
+        return discs.centers, discs.normals, discs.radii, discs.areas
+
+    check_grads(jax.jit(sums), (body.centers, body.normals, body.radii, body.areas), 1)
