@@ -52,13 +52,11 @@ class ViewOptions:
     elevation: float = 0.0
     #: Vertical field of view.
     fov: float = 25.0
-    #: Of the place that a single light comes from, in the place of the studio; beyond 90 it stands
-    #: behind. -20 where only the elevation or the fill is given.
+    #: Of a single light, in the place of the studio; beyond 90 it stands behind. Or -20.
     light_azimuth: Number = None
-    #: Of the place that a single light comes from; 30 where it is not given.
+    #: Of the single light; or 30.
     light_elevation: Number = None
-    #: Strength of a second light without shadows, beside the camera, relative to a single first
-    #: one. 0 for none; 0.1 where it is not given.
+    #: Strength of a light without shadows beside the camera, over that of the single light; or 0.1.
     fill: Number = None
     #: Latitude-longitude map of linear radiance, in the place of single lights: an EXR or HDR file,
     #: or the name of a built-in one: studio, overcast, sun. The studio where no light is given.

@@ -22,7 +22,8 @@ from ._lighting import (
     LightVisibility as LightVisibility,
 )
 from ._passes import SplatLight as SplatLight, Transfer as Transfer
-from ._plan import make_plan as make_plan, Plan as Plan, RenderSettings as RenderSettings
+from ._plan import make_plan as make_plan, Plan as Plan
+from ._settings import RenderSettings as RenderSettings
 from ._relighting import relighting_basis as relighting_basis, RelightingBasis as RelightingBasis
 from ._render import (
     compute_irradiance as compute_irradiance,

@@ -14,8 +14,9 @@ from ._bounces import check_no_bounces
 from ._devices import filled_like, on_devices
 from ._filling import rows_at
 from ._passes import SplatLight, Transfer, in_a_row, light_source, see_and_shade
-from ._plan import Plan, RenderSettings, plan_unless_traced
+from ._plan import Plan, plan_unless_traced
 from ._render import check_kept, fitted
+from ._settings import RenderSettings
 from ._shade import ShadedSurface
 
 # Fields of `LayersAtPoints` that lie along the points.

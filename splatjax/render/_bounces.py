@@ -10,7 +10,8 @@ from splatjax.scene import Scene
 from splatjax.shading import albedo_root, average_albedo, fresnel_f0
 
 from ._lighting import Irradiance, LightVisibility, irradiance_at_splats, surface_parameters
-from ._plan import Plan, RenderSettings
+from ._plan import Plan
+from ._settings import RenderSettings
 
 
 def check_no_bounces(settings: RenderSettings) -> None:

@@ -19,7 +19,8 @@ from ._devices import filled_like, on_devices
 from ._filling import rows_at
 from ._lighting import LightAtSplats
 from ._passes import light_source, see_and_shade
-from ._plan import Plan, RenderSettings, plan_unless_traced
+from ._plan import Plan, plan_unless_traced
+from ._settings import RenderSettings
 from ._shade import ShadedSurface, compose, layers_at_points
 
 Parameters = TypeVar("Parameters", bound=PyTree)

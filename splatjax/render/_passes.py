@@ -20,7 +20,8 @@ from splatjax.scene import Camera, Scene, stack_lights
 from ._attributes import SurfaceAttributes, SurfaceSamples, split_rows, stack_rows
 from ._bounces import bounced_irradiance, diffuse_splats
 from ._lighting import Irradiance, LightVisibility, cast_shadows, irradiance_at_splats
-from ._plan import Plan, RenderSettings
+from ._plan import Plan
+from ._settings import RenderSettings
 from ._shade import ShadedSurface, shade
 
 

@@ -14,14 +14,12 @@ from jaxtyping import Array, Bool, Float, Int
 from splatjax import diffusion as _diffusion, splatting as _splatting
 from splatjax._chunking import Result, rounded_up
 from splatjax._combination import DeviceMesh, OneDevice
-from splatjax._records import check_values
 from splatjax.cache import kept, reuse_capacity
 from splatjax.scene import (
     AbstractLight,
     AbstractLightSample,
     Camera,
     DistantStratum,
-    EmitterStratum,
     Scene,
     Splats,
     lights_by_kind,
@@ -29,56 +27,12 @@ from splatjax.scene import (
 
 from ._checks import check_scene, in_one_dtype
 from ._filling import arrange, fill_gaussians, fill_up
-from ._lighting import AbstractLighting, LightAtSplats, ShadowPlan, plan_views
+from ._lighting import ShadowPlan, plan_views
+from ._settings import RenderSettings
 
 # Directions to all sides, for which the shadow maps of any environment are planned.
 _DIRECTIONS = [[x, y, z] for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if x or y or z]
 _MOST_SPLATS = 1.06  # times the splats of a scene, of those before that it is filled up to
-
-
-class RenderSettings(eqx.Module):
-    r"""How each pass works.
-
-    **Attributes:**
-
-    - `splatting`: passes 2 and 3: epsilon-z, the screen filter.
-    - `shadows`: pass 1: resolution and bias of shadow maps.
-    - `sample_shadows`: those of the maps of the samples of extended lights: many, so that each is
-      coarser. `ShadowSettings()` makes them like those of other lights.
-    - `bounces`: how many times light that has left the body may enter it again. Static.
-    - `sightlines`: in how many directions each splat sees the body, for these.
-    - `kernel`: pass 4: how a layer spreads, is normalized, and when the splats resolve it:
-      `EscapeNormalization()`, or `PlainMean()`, the paper's.
-    - `rasterizer`: `TileRasterizer()`, or `DenseRasterizer()`, the plain reference.
-    - `diffuser`: `ClusterDiffuser()`, or `DenseDiffuser()`, the plain reference.
-    - `lighting`: what the splats carry into the picture: `LightAtSplats()` blends their irradiance;
-      `splatjax.baselines` has others.
-    """
-
-    splatting: _splatting.SplattingSettings = _splatting.SplattingSettings()
-    shadows: _splatting.ShadowSettings = _splatting.ShadowSettings()
-    sample_shadows: _splatting.ShadowSettings = _splatting.ShadowSettings(
-        resolution=512, compared=2, merged_spacing=4.0
-    )
-    bounces: int = eqx.field(static=True, default=0)
-    sightlines: _splatting.SightlineSettings = _splatting.SightlineSettings()
-    kernel: _diffusion.AbstractDiffusionKernel = _diffusion.EscapeNormalization()
-    rasterizer: _splatting.AbstractRasterizer = _splatting.TileRasterizer()
-    diffuser: _diffusion.AbstractDiffuser = _diffusion.ClusterDiffuser()
-    lighting: AbstractLighting = LightAtSplats()
-
-    def __check_init__(self):
-        check_values("bounces", self.bounces, "0 or more", lambda n: n >= 0)
-        if self.bounces and not isinstance(self.lighting, LightAtSplats):
-            raise ValueError(
-                f"bounces is {self.bounces} and lighting is {type(self.lighting).__name__}; light "
-                "bounces between splats alone: give bounces=0, or lighting=LightAtSplats()"
-            )
-
-    def shadows_of(self, light: AbstractLightSample) -> _splatting.ShadowSettings:
-        """Return the settings of the shadow maps of a light or sample."""
-        is_sample = isinstance(light, DistantStratum | EmitterStratum)
-        return self.sample_shadows if is_sample else self.shadows
 
 
 class Plan(eqx.Module):

@@ -12,8 +12,9 @@ from splatjax.splatting import Bounds
 
 from ._devices import filled_like, on_devices
 from ._passes import Transfer, compute_visibility, light_source, see_and_shade
-from ._plan import Plan, RenderSettings, plan_unless_traced
+from ._plan import Plan, plan_unless_traced
 from ._render import check_kept, fitted
+from ._settings import RenderSettings
 from ._shade import compose
 
 

@@ -28,7 +28,8 @@ from ._passes import (
     light_source,
     see_and_shade,
 )
-from ._plan import Plan, RenderSettings, check_plan, plan_unless_traced, splats_per_device
+from ._plan import Plan, check_plan, plan_unless_traced, splats_per_device
+from ._settings import RenderSettings
 from ._shade import compose
 
 Kept = TypeVar("Kept", bound=SplatLight | Transfer)

@@ -8,7 +8,7 @@ from splatjax import diffusion as _diffusion, shading as _shading, splatting as 
 from splatjax.scene import Frame, Scene, StackedLights
 
 from ._attributes import SurfaceAttributes, SurfaceSamples
-from ._plan import RenderSettings
+from ._settings import RenderSettings
 
 
 class ShadedSurface(eqx.Module):

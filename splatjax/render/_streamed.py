@@ -37,7 +37,7 @@ from ._lighting import (
     plan_views,
 )
 from ._passes import in_a_row, map_places, sample_surfaces
-from ._plan import RenderSettings
+from ._settings import RenderSettings
 from ._shade import compose, shade
 from ._statistics import ReplayableStream, StreamStatistics
 
