@@ -7,7 +7,7 @@ from jaxtyping import Array, Float, Int
 from splatjax import diffusion as _diffusion
 from splatjax._combination import AbstractCombination
 from splatjax.scene import Scene
-from splatjax.shading import albedo_root, average_albedo, fresnel_f0
+from splatjax.shading import albedo_root, average_transmission, fresnel_f0
 
 from ._lighting import Irradiance, LightVisibility, irradiance_at_splats, surface_parameters
 from ._plan import Plan
@@ -52,8 +52,8 @@ def bounced_irradiance(
     area, albedo = splats.areas[at], splats.albedo
     root = jnp.ones_like(direct.source) if albedo is None else albedo_root(albedo.T)
     specular, roughness = surface_parameters(scene)
-    reflected = average_albedo(fresnel_f0(material.eta), specular, roughness)
-    enters = jnp.broadcast_to(1 - reflected, splats.radii.shape)[None]
+    enters = average_transmission(fresnel_f0(material.eta), specular, roughness, material.angles)
+    enters = enters.reshape(1 if material.angles is None else material.channels, -1)
     # The Gaussians also stand for light that scatters once: of light from the lights where it
     # leaves, of light from the body where it enters.
     whole, diffused = material.total_reflectance(), gaussians.total_reflectance()

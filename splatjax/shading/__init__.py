@@ -2,6 +2,7 @@
 
 from ._deferred import (
     albedo_root as albedo_root,
+    average_transmission as average_transmission,
     diffuse_transmission as diffuse_transmission,
     exit_transmission as exit_transmission,
     received_light as received_light,

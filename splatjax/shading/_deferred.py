@@ -43,22 +43,33 @@ def diffuse_transmission(
     **Source:** d'Eon and Luebke 2007 (GPU Gems 3, chapter 14), with `e = 1`.
     """
     share = 1 - directional_albedo(mu, f0, specular, roughness)
+    average = jnp.maximum(average_transmission(f0, specular, roughness, angles), _LEAST_SHARE)
     if angles is None:
-        average = 1 - average_albedo(f0, specular, roughness)
-        return share / jnp.maximum(average, _LEAST_SHARE)
+        return share / average
     leaves = jnp.moveaxis(angles(mu), -1, 0) * share[None]
-    average = jnp.tensordot(
-        angles.coefficients.T,
-        jnp.stack(
-            [
-                2 / (2 + power) - average_albedo(f0, specular, roughness, power)
-                for power in range(len(angles.coefficients))
-            ]
-        ),
-        1,
-    )
-    average = average.reshape(*average.shape, *[1] * (leaves.ndim - average.ndim))
-    return leaves / jnp.maximum(average, _LEAST_SHARE)
+    return leaves / average.reshape(*average.shape, *[1] * (leaves.ndim - average.ndim))
+
+
+def average_transmission(
+    f0: Float[Array, "..."],
+    specular: Float[Array, "..."],
+    roughness: Float[Array, "..."],
+    angles: AngularLaw | None = None,
+) -> Float[Array, "..."]:
+    """Compute the average of `e(mu) (1 - rho(mu))`, weighted with `2 mu`: of even light, the
+    fraction that enters, over that of light along the normal.
+
+    **Arguments:** as of `diffuse_transmission`.
+
+    **Returns:** with the channels of `angles` as first axis.
+    """
+    if angles is None:
+        return 1 - average_albedo(f0, specular, roughness)
+    averages = [
+        2 / (2 + power) - average_albedo(f0, specular, roughness, power)
+        for power in range(len(angles.coefficients))
+    ]
+    return jnp.tensordot(angles.coefficients.T, jnp.stack(averages), 1)
 
 
 def albedo_root(albedo: Float[Array, "..."]) -> Float[Array, "..."]:
