@@ -60,7 +60,6 @@ from .render import (
     PictureJacobian as PictureJacobian,
     Plan as Plan,
     relighting_basis as relighting_basis,
-    RelightingBasis as RelightingBasis,
     render as render,
     render_streamed as render_streamed,
     RenderSettings as RenderSettings,

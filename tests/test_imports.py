@@ -47,7 +47,7 @@ assert before == jax.config.values
 
 def test_public_names_are_few_and_submodules_documented():
     public = {name: value for name, value in vars(splatjax).items() if not name.startswith("_")}
-    assert sum(not isinstance(value, ModuleType) for value in public.values()) <= 46
+    assert sum(not isinstance(value, ModuleType) for value in public.values()) <= 45
     packages = {each.name for each in pkgutil.iter_modules(splatjax.__path__)}
     described = {name for name in packages if f"{name}`" in splatjax.__doc__}
     assert {name for name in packages - described if name[0] != "_"} == {"cli", "render"}
