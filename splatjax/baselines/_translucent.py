@@ -116,6 +116,6 @@ class TranslucentShadowMap(AbstractThinParts):
         opposite = jnp.clip(-jnp.sum(entered[2:].T * normals, axis=1), 0, 1)
         thickness = way + opposite * (jnp.clip(-cosine, 0, 1) * way - way)
         # In diagonals of a pixel: texels have no extent.
-        bias *= 2**0.5 * view.pixel_size(depth)
-        is_far = lit & (cosine < 0) & (depth > front[tile, pixel] + bias)
+        least = bias * 2**0.5 * view.pixel_size(depth)
+        is_far = lit & (cosine < 0) & (depth > front[tile, pixel] + least)
         return entered[:2].T, jnp.where(is_far, jnp.exp(-thickness / scale), 0.0)

@@ -1,5 +1,6 @@
 """Environments and area lights: what samples stand for them, against integrals in closed form."""
 
+import dataclasses
 from functools import partial
 
 import jax
@@ -254,6 +255,22 @@ def test_another_environment_of_the_size_compiles_nothing_and_keeps_the_plan(com
         assert float(frame.overflow) == 0
         assert not np.array_equal(frame.beauty, before.beauty)
     assert compiled == []
+
+
+@pytest.mark.once
+def test_maps_of_merged_splats_let_in_the_light_that_full_maps_do():
+    """A small ball beside a large one: eight splats to a disc, and a sixteenth of the pixels."""
+    scene = sj.Scene(BODY, sj.EnvironmentLight(harmonics(), count=16), BARE)
+    coarse = ShadowSettings(resolution=64, compared=2, merged_spacing=6.0)
+    entering = []
+    for shadows in (ShadowSettings(resolution=256), coarse):
+        settings = dataclasses.replace(PLAIN, sample_shadows=shadows)
+        plan = sj.make_plan(scene, CAMERA, settings)
+        entering.append(np.asarray(sj.compute_irradiance(scene, plan, settings).entering, float))
+    assert plan.shadows[0].splats_per_disc == 8
+    full, found = entering
+    assert np.sqrt(np.mean((found - full) ** 2)) < 0.04 * np.mean(full)
+    assert np.mean(found) == pytest.approx(np.mean(full), rel=0.02)
 
 
 @pytest.mark.once
