@@ -15,7 +15,7 @@ import splatjax as sj
 from splatjax._format import channel_names, counted
 from splatjax.io import fingerprint, read_columns, read_media, write_columns
 
-from ._batch import BATCH, fit_batch
+from . import _batch
 from ._models import Model, Reference, reference
 from ._terminal import (
     FIGURES,
@@ -126,13 +126,13 @@ class Fit:
             raise ValueError("--all fits dipoles by --count alone; leave the other options out")
         names, coefficients = read_media(Path(self.medium))
         path = self.output.with_name(f"{self.output.name}.parts")
-        begins = range(0, len(names), BATCH)
+        begins = range(0, len(names), _batch.BATCH)
         parts = [path / f"from_{begin:08}.csv" for begin in begins]
 
         def fit(i: int) -> None:
-            batch = slice(begins[i], begins[i] + BATCH)
+            batch = slice(begins[i], begins[i] + _batch.BATCH)
             write_columns(
-                parts[i], {"name": names[batch]} | fit_batch(coefficients[batch], self.count)
+                parts[i], {"name": names[batch]} | _batch.fit_batch(coefficients[batch], self.count)
             )
 
         done = complete(
@@ -146,7 +146,7 @@ class Fit:
             [(part,) for part in parts],
             lambda: fit,
             name="batches",
-            what=f"fitting {self.count} Gaussians to {len(names)} media, {BATCH} at a time",
+            what=f"fitting {self.count} Gaussians to {len(names)} media, {_batch.BATCH} at a time",
         )
         if len(done) < len(parts):
             return
