@@ -206,9 +206,7 @@ class ViewOptions:
         if not fill:
             return (light,)
         towards = -direction_to(azimuth + side, _FILL_ELEVATION)
-        return light, sj.DirectionalLight(
-            direction=towards, irradiance=fill * irradiance, cast_shadows=False
-        )
+        return light, sj.DirectionalLight(towards, fill * irradiance, False)
 
     def camera(self, parts: sj.scene.Parts, azimuth: float) -> sj.Camera:
         """Place a camera at an azimuth so that the bounding sphere of the splats, which come in

@@ -16,7 +16,7 @@ from pictures import write_picture
 from PIL import Image
 
 import splatjax as sj
-from splatjax.cli import _batch, _models
+from splatjax.cli import _batch, _fit, _models
 
 pytestmark = pytest.mark.once
 
