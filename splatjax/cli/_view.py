@@ -66,13 +66,11 @@ class ViewOptions:
     environment_rotation: float = 0.0
     #: How many times light that has left the body may enter it again: 1 or 2 brighten folds.
     bounces: int = 0
-    #: Of the PNG: black, transparent, or what the camera sees of the --environment. The EXR has the
-    #: coverage, and no background.
+    #: Of the PNG: black, transparent, or the environment. The EXR has the coverage, and none.
     background: Literal["black", "transparent", "environment"] = "black"
     #: Of the PNG, in stops: each doubles its brightness. The EXR is never changed by it.
     exposure: float = 0.0
-    #: Whether light spreads below the surface. Without, it leaves where it enters, in the same
-    #: color.
+    #: Whether light spreads below the surface. Without, it leaves where it enters.
     scattering: bool = True
     #: Whether to use the albedo of the splats, which the built-in bust has. Without, color is the
     #: material's own.
@@ -206,7 +204,9 @@ class ViewOptions:
         if not fill:
             return (light,)
         towards = -direction_to(azimuth + side, _FILL_ELEVATION)
-        return light, sj.DirectionalLight(towards, fill * irradiance, False)
+        return light, sj.DirectionalLight(
+            direction=towards, irradiance=fill * irradiance, cast_shadows=False
+        )
 
     def camera(self, parts: sj.scene.Parts, azimuth: float) -> sj.Camera:
         """Place a camera at an azimuth so that the bounding sphere of the splats, which come in
