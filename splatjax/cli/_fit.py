@@ -72,8 +72,8 @@ class Fit:
     #: Take the least number of Gaussians, up to 12, that leaves no channel a larger error (Eq. 4),
     #: instead of --count.
     error: OptionalFloat = None
-    #: Of coefficients, what makes a profile of them: photon-beam unless given, dipole, better-dipole
-    #: or monte-carlo. The layers of a material are multipoles, or are walked by monte-carlo.
+    #: What makes a profile of coefficients: photon-beam unless given, dipole, better-dipole or
+    #: monte-carlo. The layers of a material are multipoles, or are walked by monte-carlo.
     model: Annotated[Model | None, tyro.conf.arg(metavar="MODEL", help_behavior_hint="")] = None
     #: Of photon beams and Monte Carlo: the mean cosine of the phase function, which is Henyey and
     #: Greenstein's.
