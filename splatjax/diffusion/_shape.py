@@ -1,21 +1,25 @@
 """The diffusion equation on the body itself, as an integral equation over its splats."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
-from splatjax._chunking import map_chunks
-from splatjax._records import record
+from splatjax._chunking import map_chunks, take_points
+from splatjax.gaussians import SumOfGaussians
 from splatjax.scattering import ExactFresnel, Medium
-from splatjax.scene import Splats
+from splatjax.scene import Material, Splats
 
+from ._diffuser import AbstractDiffuser, AbstractDiffusionPlan, Diffused, LayerValues
 from ._screened import ScreenedKernel
 
 _AT_ONCE = 64  # points
 _FINER = 2  # octaves: the light in the body varies faster than that on its surface
+_WIDE = 1e12  # mm^2: resolved everywhere
 _DEPTHS = 8  # along each beam
 _OVERLAP = 1.5  # radius of a splat over the root of its area
 _GRAZING = 1e-3  # cosine
@@ -25,7 +29,6 @@ _MILNE = 0.710446  # extrapolation distance of the Milne problem, mean free path
 _HOPF = (0.08948, 2.11533), (0.04361, 16.63774)
 
 
-@record
 class Beams(eqx.Module):
     """Light that enters a body, one beam for each splat: of many lights their sum, with the mean
     of their directions.
@@ -41,8 +44,7 @@ class Beams(eqx.Module):
     directions: Float[Array, "channels splats 3"]
 
 
-@record
-class ShapeDiffuser(eqx.Module):
+class ShapeDiffuser(AbstractDiffuser):
     r"""Solves the diffusion equation in the body that closed splats bound, where the other
     diffusers lay the profile of a flat half-space over its surface. With the fluence `phi`,
     `G = exp(-kappa r) / (4 pi r)`, `D = 1 / (3 sigma_t')` and `kappa^2 = sigma_a / D`, for every
@@ -81,7 +83,7 @@ class ShapeDiffuser(eqx.Module):
         - `count`: of Gaussians that make the kernel, from `count_gaussians`; needed under `jit`.
         """
         count = self.count_gaussians(splats) if count is None else count
-        spread = jnp.sqrt(jnp.mean(splats.areas))
+        spread = jnp.sqrt(jnp.sum(splats.areas**2) / jnp.sum(splats.areas))
         share = map_chunks(_share(splats, spread, count), splats.centers, at_once=_AT_ONCE)
 
         def of_channel(channel):
@@ -89,6 +91,14 @@ class ShapeDiffuser(eqx.Module):
             return self._solve(splats, medium, irradiance, directions, spread, share, count)
 
         return jax.lax.map(of_channel, (_coefficients(medium), beams.irradiance, beams.directions))
+
+    def make_plan(self, parts, variances, kernel, interval):
+        if len(parts) > 1:
+            raise ValueError(
+                f"ShapeDiffuser works on one device, not on {len(parts)}; make the plan without a "
+                "mesh, or render with ClusterDiffuser"
+            )
+        return ShapePlan(jnp.zeros(1, jnp.int32), self, self.count_gaussians(parts[0]))
 
     def count_gaussians(self, splats: Splats) -> int:
         """Check that the splats bound a body, and count the Gaussians. Not for traced arrays.
@@ -131,10 +141,51 @@ class ShapeDiffuser(eqx.Module):
 
             return phi + map_chunks(at, splats.centers, at_once=_AT_ONCE) / diagonal
 
-        operator = lx.FunctionLinearOperator(product, jax.eval_shape(lambda: source))
-        solver = lx.GMRES(rtol=self.error, atol=1e-30)
-        phi = lx.linear_solve(operator, source / diagonal, solver).value
+        right = source / diagonal
+        operator = lx.FunctionLinearOperator(product, jax.eval_shape(lambda: right))
+        # Five products reach about 1e-3; the second five show it.
+        size = jax.lax.stop_gradient(jnp.max(jnp.abs(right)))
+        smallest = jnp.finfo(right.dtype).tiny
+        solver = lx.GMRES(rtol=self.error, atol=self.error * size + smallest, restart=5)
+        phi = lx.linear_solve(operator, right, solver).value
         return medium.diffusion_coefficient / medium.z_e * phi + leaving
+
+
+class ShapePlan(AbstractDiffusionPlan):
+    """What solving on one body needs. The solved light is one layer, of weight 1."""
+
+    diffuser: ShapeDiffuser
+    count: int = eqx.field(static=True)
+
+    def material(self, material: Material) -> Material:
+        """Return a material of one Gaussian of weight 1, which every splat resolves.
+
+        **Raises:** `ValueError` for a material without coefficients, or of other channels.
+        """
+        if material.medium is None or material.medium.channels != material.channels:
+            raise ValueError(
+                f"Material.medium is {material.medium}, and ShapeDiffuser solves for a Medium of "
+                f"{material.channels} channels; give one, or render with ClusterDiffuser"
+            )
+        weights = jnp.ones_like(material.gaussians.weights[:1])
+        variances = jnp.full_like(material.gaussians.variances[:1], _WIDE)
+        shown = material.surface_of(SumOfGaussians(variances, weights))
+        return dataclasses.replace(shown, medium=material.medium)
+
+    def solve(
+        self, splats: Splats, medium: Medium, beams: Beams, at: Int[Array, " points"] | None
+    ) -> LayerValues:
+        """Return the solved light of some splats as a layer."""
+        rows = self.diffuser.radiant_exitance(splats, medium, beams, self.count)
+        values = jnp.concatenate([rows, jnp.ones_like(rows[:1])])[None]
+        values = values if at is None else take_points(values, at)
+        return LayerValues(values, jnp.zeros((*values.shape[:2], 3, values.shape[2]), rows.dtype))
+
+    def diffuse(self, sources, variances, kernel, combination, at=None) -> Diffused:
+        raise ValueError(
+            "ShapeDiffuser solves for the light of a scene, without derivatives by Gaussians; "
+            "render with ClusterDiffuser"
+        )
 
 
 class _Coefficients(eqx.Module):
@@ -214,7 +265,7 @@ def _leaves_early(tau: Float[Array, "*points"], medium: _Coefficients) -> Float[
 
 
 def beam_lengths(
-    splats: Splats, directions: Float[Array, "splats 3"], is_lit: Float[Array, " splats"]
+    splats: Splats, directions: Float[Array, "splats 3"], is_lit: Bool[Array, " splats"]
 ) -> Float[Array, " splats"]:
     """Compute how far each beam goes from its splat to the first one that it leaves the body by,
     in lengths of its direction; 0 where there is none.

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from splatjax import shading as _shading, splatting as _splatting
+from splatjax import diffusion as _diffusion, shading as _shading, splatting as _splatting
 from splatjax._combination import AbstractCombination
 from splatjax.scene import (
     AbstractLightSample,
@@ -240,6 +240,34 @@ def irradiance_at_splats(scene: Scene, light: LightVisibility) -> Irradiance:
     splats = scene.splats
     points = splats.centers, splats.normals, splats.albedo
     return irradiance_at_points(scene.material, light, *points, *surface_parameters(scene))
+
+
+def beams_at_splats(
+    scene: Scene, light: LightVisibility, irradiance: Irradiance
+) -> _diffusion.Beams:
+    """Refract the light that enters every splat, and sum it to one beam for each.
+
+    **Arguments:**
+
+    - `irradiance`: from `irradiance_at_splats`.
+    """
+    splats, material = scene.splats, scene.material
+    f0 = _shading.fresnel_f0(material.eta)
+
+    def along(axis: int):
+        def enters(wi, cosine):
+            fraction = 1 - _shading.directional_albedo(cosine, f0, *surface_parameters(scene))
+            sine = jnp.minimum((1 - cosine * cosine) / (material.eta * material.eta), 1 - _GRAZING)
+            inward = jnp.sqrt(1 - sine) - cosine / material.eta
+            return (-fraction * (wi[:, axis] / material.eta + inward * splats.normals[:, axis]))[None]
+
+        given = splats.centers, splats.normals, light.groups, light.visibility
+        return _shading.sum_received(*given, enters, material.channels)
+
+    entering = irradiance.entering
+    directions = jnp.stack([along(axis) for axis in range(3)], axis=-1)
+    directions = directions / jnp.where(entering > 0, entering, 1.0)[..., None]
+    return _diffusion.Beams(irradiance.source, directions)
 
 
 def surface_parameters(scene: Scene):

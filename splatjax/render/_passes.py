@@ -18,7 +18,13 @@ from splatjax._combination import AbstractCombination
 from splatjax.scene import Camera, Scene, stack_lights
 
 from ._attributes import SurfaceAttributes, SurfaceSamples, split_rows, stack_rows
-from ._lighting import Irradiance, LightVisibility, cast_shadows, irradiance_at_splats
+from ._lighting import (
+    Irradiance,
+    LightVisibility,
+    beams_at_splats,
+    cast_shadows,
+    irradiance_at_splats,
+)
 from ._plan import Plan, RenderSettings
 from ._shade import ShadedSurface, shade
 
@@ -107,9 +113,14 @@ def light_splats(
     if derivative and scene.material.single_scattering is not None:
         irradiance, added = _differentiated_irradiance(scene, light)
     source = irradiance.source if added is None else jnp.concatenate([irradiance.source, added])
-    layers, log_variance_derivative, needed = diffuse_splats(
-        scene, source, settings, plan, combination, at, derivative
-    )
+    if isinstance(plan.diffusion, _diffusion.ShapePlan) and not derivative:
+        beams = beams_at_splats(scene, light, irradiance)
+        layers = plan.diffusion.solve(scene.splats, scene.material.medium, beams, at)
+        log_variance_derivative, needed = None, light.needed
+    else:
+        layers, log_variance_derivative, needed = diffuse_splats(
+            scene, source, settings, plan, combination, at, derivative
+        )
     needed = jnp.maximum(needed, light.needed)
     along_splats = light.visibility, irradiance, added
     if at is not None:

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int
 from splatjax._chunking import take_points
 from splatjax._records import Numbers, as_floats, check_values, numbers, record, several, valid
 from splatjax.gaussians import SumOfGaussians
-from splatjax.scattering import SingleScattering
+from splatjax.scattering import Medium, SingleScattering
 
 from ._lights import AbstractLight
 
@@ -197,6 +197,8 @@ class Material(eqx.Module):
     - `roughness`: of the specular lobe (m, root mean square slope), at least 0.
     - `single_scattering`: light that scatters once, as a term of its own; the Gaussians then stand
       for the rest. `None`: they stand for all.
+    - `medium`: the coefficients below the surface, for `ShapeDiffuser`, which reads them in the
+      place of Gaussians and single scattering; `None` where they are unknown.
 
     **Raises:** `ValueError` for a value out of range, and for single scattering of another number
     of channels than the Gaussians have.
@@ -213,6 +215,7 @@ class Material(eqx.Module):
         converter=numbers, default=0.3, metadata=valid("at least 0", lambda x: x >= 0)
     )
     single_scattering: SingleScattering | None = None
+    medium: Medium | None = None
 
     def __check_init__(self):
         single = self.single_scattering
@@ -265,7 +268,7 @@ class Material(eqx.Module):
         gaussians = SumOfGaussians(self.gaussians.variances, self.gaussians.weights / total[None])
         if single is not None:
             single = SingleScattering(single.medium, single.strength / total)
-        return Material(gaussians, self.eta, self.specular, self.roughness, single)
+        return Material(gaussians, self.eta, self.specular, self.roughness, single, self.medium)
 
 
 @record
