@@ -41,7 +41,7 @@ class Beams(eqx.Module):
     """
 
     irradiance: Float[Array, "channels splats"]
-    directions: Float[Array, "channels splats 3"]
+    directions: Float[Array, "channels 3 splats"]
 
 
 class ShapeDiffuser(AbstractDiffuser):
@@ -90,7 +90,8 @@ class ShapeDiffuser(AbstractDiffuser):
             medium, irradiance, directions = channel
             return self._solve(splats, medium, irradiance, directions, spread, share, count)
 
-        return jax.lax.map(of_channel, (_coefficients(medium), beams.irradiance, beams.directions))
+        directions = jnp.swapaxes(beams.directions, 1, 2)
+        return jax.lax.map(of_channel, (_coefficients(medium), beams.irradiance, directions))
 
     def make_plan(self, parts, variances, kernel, interval):
         if len(parts) > 1:
@@ -175,11 +176,64 @@ class ShapePlan(AbstractDiffusionPlan):
     def solve(
         self, splats: Splats, medium: Medium, beams: Beams, at: Int[Array, " points"] | None
     ) -> LayerValues:
-        """Return the solved light of some splats as a layer."""
-        rows = self.diffuser.radiant_exitance(splats, medium, beams, self.count)
-        values = jnp.concatenate([rows, jnp.ones_like(rows[:1])])[None]
-        values = values if at is None else take_points(values, at)
-        return LayerValues(values, jnp.zeros((*values.shape[:2], 3, values.shape[2]), rows.dtype))
+        """Return the radiant exitance of some splats as a layer, with its slopes."""
+        exitance = self.diffuser.radiant_exitance(splats, medium, beams, self.count)
+        values = jnp.concatenate([exitance, jnp.ones_like(exitance[:1])])
+        layer = LayerValues(values[None], _slopes(splats, values)[None])
+        return layer if at is None else jax.tree.map(lambda row: take_points(row, at), layer)
+
+    def towards(
+        self,
+        eye: Float[Array, "3"],
+        splats: Splats,
+        material: Material,
+        layer: LayerValues,
+        beams: Beams,
+    ) -> LayerValues:
+        r"""Replace the radiant exitance M of splats by `pi` times the radiance towards the eye, for
+        an even surface: the source integral along the refracted ray `w`,
+
+            L = int (sigma_s' phi + Q) / (4 pi) exp(-sigma_t' s) ds = f M / pi
+                - (sigma_s' / sigma_t'^2) w . grad_t phi / (4 pi)
+
+        `f`, 1 on average, is that of a half-space with this `phi` on its surface and these beams.
+        Along the surface `phi` is linear. Light is seen from the side on which there is less of it
+        as brighter, and from the lit side as darker.
+
+        **Arguments:** `layer` and `beams` of these splats.
+        """
+        to_eye = eye[:, None] - splats.centers.T
+        to_eye = to_eye / jnp.sqrt(jnp.sum(to_eye * to_eye, axis=0))
+        cosine = jnp.maximum(jnp.sum(to_eye * splats.normals.T, axis=0), _GRAZING)
+        along = (to_eye - cosine * splats.normals.T) / material.eta
+        medium = _coefficients(material.medium)
+        albedo, z_e = medium.albedo[:, None], medium.z_e[:, None]
+        exitance, slopes = layer.values[0, :-1], layer.slopes[0, :-1]
+        entering = jnp.maximum(-jnp.sum(beams.directions * splats.normals.T, axis=1), 0)
+        phi = 3 * z_e * medium.sigma_t[:, None] * exitance
+        bend = 3 * (1 - albedo)
+        bend = bend / (1 + bend)  # below 1 for every albedo
+        # Particular solution of the beams, P exp(-tau / entering); phi - P is a line from z_e.
+        start = -3 * albedo * beams.irradiance / (1 - bend * entering * entering)
+        level, rise = phi - start * entering, exitance * 3 + start
+
+        def radiance(cosine):
+            squared = (1 - cosine * cosine) / (material.eta * material.eta)
+            mu = jnp.sqrt(jnp.maximum(1 - squared, _GRAZING))
+            beam = albedo * (start * entering * entering + beams.irradiance) / (entering + mu)
+            return albedo * (level + rise * mu) / (1 - bend * mu * mu) + beam
+
+        nodes, weights = np.polynomial.legendre.leggauss(_DEPTHS)
+        nodes, weights = (nodes + 1) / 2, weights / 2
+        mean = sum(
+            2 * w * c * radiance(jnp.full_like(cosine, c))
+            for c, w in zip(nodes.tolist(), weights.tolist(), strict=True)
+        )
+        shape = radiance(cosine) / jnp.where(mean > 0, mean, 1.0)
+        shape = jnp.where(mean > 0, jnp.clip(shape, 0, 2), 1.0)
+        across = 0.75 * albedo * z_e * jnp.sum(slopes * along, axis=1)
+        seen = jnp.maximum(exitance * shape - across, 0)
+        return LayerValues(jnp.concatenate([seen, layer.values[0, -1:]])[None], layer.slopes)
 
     def diffuse(self, sources, variances, kernel, combination, at=None) -> Diffused:
         raise ValueError(
@@ -213,6 +267,35 @@ def _pairs(kernel: ScreenedKernel, x: Float[Array, "points 3"], splats: Splats):
     offset = [splats.centers[None, :, i] - x[:, None, i] for i in range(3)]
     value, slope = kernel(sum(each * each for each in offset))
     return value, slope, sum(splats.normals[None, :, i] * offset[i] for i in range(3))
+
+
+def _slopes(
+    splats: Splats, values: Float[Array, "rows splats"]
+) -> Float[Array, "rows 3 splats"]:
+    """Fit the slopes of values along the surface, 1/mm, over about two spacings."""
+    spread = jnp.sum(splats.areas**2) / jnp.sum(splats.areas)
+    count = len(values)
+
+    def at(here):
+        x, normals = here
+        offset = [splats.centers[None, :, i] - x[:, None, i] for i in range(3)]
+        facing = jnp.maximum(normals @ splats.normals.T, 0)
+        squared = sum(each * each for each in offset)
+        weight = splats.areas * facing * facing * jnp.exp(-0.5 * squared / spread)
+        total = jnp.maximum(jnp.sum(weight, axis=1), jnp.finfo(weight.dtype).tiny)
+        mean = (weight @ values.T) / total[:, None]
+        moments = [weight * each for each in offset]
+        centers = jnp.stack([jnp.sum(each, axis=1) for each in moments], axis=1)
+        products = jnp.stack([each @ values.T for each in moments], axis=1)
+        products = products - centers[:, :, None] * mean[:, None]
+        centers_squared = jnp.sum(centers * centers, axis=1) / total
+        variance = (jnp.sum(weight * squared, axis=1) - centers_squared) / 2
+        slopes = products / jnp.where(variance > 0, variance, 1.0)[:, None, None]
+        across = jnp.sum(slopes * normals[:, :, None], axis=1, keepdims=True)
+        return (slopes - across * normals[:, :, None]).reshape(-1, 3 * count)
+
+    rows = map_chunks(at, (splats.centers, splats.normals), at_once=_AT_ONCE)
+    return jnp.moveaxis(rows.reshape(-1, 3, count), 0, -1).swapaxes(0, 1)
 
 
 def _share(splats: Splats, spread, count: int):

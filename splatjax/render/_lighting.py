@@ -265,8 +265,8 @@ def beams_at_splats(
         return _shading.sum_received(*given, enters, material.channels)
 
     entering = irradiance.entering
-    directions = jnp.stack([along(axis) for axis in range(3)], axis=-1)
-    directions = directions / jnp.where(entering > 0, entering, 1.0)[..., None]
+    directions = jnp.stack([along(axis) for axis in range(3)], axis=1)
+    directions = directions / jnp.where(entering > 0, entering, 1.0)[:, None]
     return _diffusion.Beams(irradiance.source, directions)
 
 

@@ -56,6 +56,7 @@ class SplatLight(eqx.Module):
     - `added_source`: the derivative of the spreading irradiance in a weight of the Gaussians;
       `None` where it has none. Its own layers follow those of the irradiance, channel by channel.
     - `needed`: capacity needed over planned.
+    - `beams`: the light that enters, where the layers were solved for it; otherwise `None`.
     """
 
     visibility: list[Float[Array, "_lights splats"] | None]
@@ -64,6 +65,7 @@ class SplatLight(eqx.Module):
     derivative: _diffusion.LayerValues | None
     added_source: Float[Array, "channels splats"] | None
     needed: Float[Array, ""]
+    beams: _diffusion.Beams | None = None
 
     def take(self, chosen: Int[Array, " chosen"]) -> "SplatLight":
         """Return the light of some splats."""
@@ -109,7 +111,7 @@ def light_splats(
     - `transfer`: in the place of pass 1.
     """
     light = compute_visibility(scene, settings, plan, combination, bounds, transfer)
-    irradiance, added = irradiance_at_splats(scene, light), None
+    irradiance, added, beams = irradiance_at_splats(scene, light), None, None
     if derivative and scene.material.single_scattering is not None:
         irradiance, added = _differentiated_irradiance(scene, light)
     source = irradiance.source if added is None else jnp.concatenate([irradiance.source, added])
@@ -122,11 +124,12 @@ def light_splats(
             scene, source, settings, plan, combination, at, derivative
         )
     needed = jnp.maximum(needed, light.needed)
-    along_splats = light.visibility, irradiance, added
+    along_splats = light.visibility, irradiance, added, beams
     if at is not None:
         along_splats = jax.tree.map(partial(take_points, chosen=at), along_splats)
-    visibility, irradiance, added = along_splats
-    return SplatLight(visibility, irradiance, layers, log_variance_derivative, added, needed)
+    visibility, irradiance, added, beams = along_splats
+    derivatives = log_variance_derivative, added
+    return SplatLight(visibility, irradiance, layers, *derivatives, needed, beams)
 
 
 def light_source(
@@ -218,6 +221,10 @@ def see_and_shade(
     # Passes 2 and 3: blend the attributes and layers of the splats that may be seen.
     splats = scene.splats.take(chosen)
     shown = Scene(splats, scene.lights, scene.material)
+    layers = light.layers
+    if light.beams is not None:
+        given = camera.position, splats, scene.material, layers, light.beams
+        layers = plan.diffusion.towards(*given)
     visibility = LightVisibility(groups, light.visibility, light.needed)
     attributes = settings.lighting.attributes(shown, visibility, light.irradiance)
     origin = jax.lax.stop_gradient(bounds.center)[:, None]
@@ -225,7 +232,7 @@ def see_and_shade(
     attributes = dataclasses.replace(
         attributes,
         centers=centers,
-        layers=_diffusion.continue_from_splats(light.layers, centers),
+        layers=_diffusion.continue_from_splats(layers, centers),
         derivative=light.derivative and _diffusion.continue_from_splats(light.derivative, centers),
         added_source=light.added_source,
     )
