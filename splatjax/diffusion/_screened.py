@@ -3,6 +3,7 @@
 import math
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -72,5 +73,8 @@ class ScreenedKernel(eqx.Module):
     def plane_integral(self, height: Float[Array, "*points"]) -> Float[Array, "*points"]:
         """Integrate the part that is not summed over a plane at this height, mm."""
         squared, weights = self._gaussians(np.arange(-_NARROW, 0))
-        gaussians = jnp.exp(-squared * (height * height)[..., None])
-        return jnp.sum(jnp.pi * weights / squared * gaussians, axis=-1)
+
+        def integral(squared, weight):
+            return jnp.pi * weight / squared * jnp.exp(-squared * height * height)
+
+        return jnp.sum(jax.vmap(integral)(squared, weights), axis=0)

@@ -259,7 +259,9 @@ def beams_at_splats(
             fraction = 1 - _shading.directional_albedo(cosine, f0, *surface_parameters(scene))
             sine = jnp.minimum((1 - cosine * cosine) / (material.eta * material.eta), 1 - _GRAZING)
             inward = jnp.sqrt(1 - sine) - cosine / material.eta
-            return (-fraction * (wi[:, axis] / material.eta + inward * splats.normals[:, axis]))[None]
+            return (-fraction * (wi[:, axis] / material.eta + inward * splats.normals[:, axis]))[
+                None
+            ]
 
         given = splats.centers, splats.normals, light.groups, light.visibility
         return _shading.sum_received(*given, enters, material.channels)

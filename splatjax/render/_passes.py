@@ -115,9 +115,10 @@ def light_splats(
     if derivative and scene.material.single_scattering is not None:
         irradiance, added = _differentiated_irradiance(scene, light)
     source = irradiance.source if added is None else jnp.concatenate([irradiance.source, added])
-    if isinstance(plan.diffusion, _diffusion.ShapePlan) and not derivative:
+    medium = scene.material.medium
+    if isinstance(plan.diffusion, _diffusion.ShapePlan) and medium and not derivative:
         beams = beams_at_splats(scene, light, irradiance)
-        layers = plan.diffusion.solve(scene.splats, scene.material.medium, beams, at)
+        layers = plan.diffusion.solve(scene.splats, medium, beams, at)
         log_variance_derivative, needed = None, light.needed
     else:
         layers, log_variance_derivative, needed = diffuse_splats(
@@ -221,10 +222,9 @@ def see_and_shade(
     # Passes 2 and 3: blend the attributes and layers of the splats that may be seen.
     splats = scene.splats.take(chosen)
     shown = Scene(splats, scene.lights, scene.material)
-    layers = light.layers
-    if light.beams is not None:
-        given = camera.position, splats, scene.material, layers, light.beams
-        layers = plan.diffusion.towards(*given)
+    layers, given = light.layers, (camera.position, splats, scene.material, light.layers)
+    if light.beams and isinstance(plan.diffusion, _diffusion.ShapePlan):
+        layers = plan.diffusion.towards(*given, light.beams)
     visibility = LightVisibility(groups, light.visibility, light.needed)
     attributes = settings.lighting.attributes(shown, visibility, light.irradiance)
     origin = jax.lax.stop_gradient(bounds.center)[:, None]

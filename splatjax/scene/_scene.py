@@ -195,13 +195,11 @@ class Material(eqx.Module):
     - `eta`: index of refraction relative to air, for the Fresnel term of the specular lobe.
     - `specular`: strength of the specular lobe (rho_s).
     - `roughness`: of the specular lobe (m, root mean square slope), at least 0.
-    - `single_scattering`: light that scatters once, as a term of its own; the Gaussians then stand
-      for the rest. `None`: they stand for all.
-    - `medium`: the coefficients below the surface, for `ShapeDiffuser`, which reads them in the
-      place of Gaussians and single scattering; `None` where they are unknown.
+    - `single_scattering`: light that scatters once, as a term of its own, the Gaussians being the
+      rest. `None`: they stand for all.
+    - `medium`: coefficients, which `ShapeDiffuser` reads in the place of the former; or `None`.
 
-    **Raises:** `ValueError` for a value out of range, and for single scattering of another number
-    of channels than the Gaussians have.
+    **Raises:** `ValueError` for a value out of range, and for single scattering of other channels.
     """
 
     gaussians: SumOfGaussians
