@@ -253,7 +253,7 @@ class Fit:
             # The index of a surface is that of the medium it bounds, unless the file gives it.
             top = known if isinstance(known, sj.Dipole) else known.top
             surface, source = sj.io.surface_and_source(self.medium)
-            surface = {"eta": top.medium.eta[0]} | surface
+            surface.setdefault("eta", top.medium.eta[0])
         fitted_by = (
             f"fitted by splatjax {sj.__version__} to the "
             f"{'profile' if known is None else 'coefficients'} of {self.medium}"

@@ -44,7 +44,8 @@ class RenderSettings(eqx.Module):
     - `kernel`: pass 4: how a layer spreads, is normalized, and when the splats resolve it:
       `EscapeNormalization()`, or `PlainMean()`, the paper's.
     - `rasterizer`: `TileRasterizer()`, or `DenseRasterizer()`, the plain reference.
-    - `diffuser`: `ClusterDiffuser()`, or `DenseDiffuser()`, the plain reference.
+    - `diffuser`: `ClusterDiffuser()`; `DenseDiffuser()`, the plain reference; or `ShapeDiffuser()`,
+      which solves the diffusion equation in the body itself.
     - `lighting`: what the splats carry into the picture: `LightAtSplats()` blends their irradiance;
       `splatjax.baselines` has others.
     """

@@ -26,8 +26,8 @@ BANDS = np.asarray(
         [0.48609, 0.40593, 0.22693, 0.02800, 0.00299, 0.00126],
     ]
 )
-OF_TRANSPORT = np.asarray([0.015, 0.01, 0.025, 0.07, 0.06, 0.06])
-OF_SERIES = 3e-3  # of 3,000 splats, over the brightest; up to 80 degrees from the light
+OF_TRANSPORT = np.asarray([0.006, 0.01, 0.03, 0.06, 0.08, 0.08])
+OF_SERIES = 2e-3  # of 2,000 splats, over the brightest
 
 
 def medium(albedo=ALBEDO, eta: float = 1.0) -> Medium:
@@ -56,14 +56,18 @@ def sphere() -> sj.Splats:
     return bodies.sphere(SPLATS, RADIUS, jitter=0.0)
 
 
-def test_a_sphere_shines_as_in_light_transport(sphere):
-    exitance = np.asarray(solved(sphere, medium(), beams(sphere)))
+@pytest.fixture(scope="module")
+def exitance(sphere) -> np.ndarray:
+    return np.asarray(solved(sphere, medium(), beams(sphere)))
+
+
+def test_a_sphere_shines_as_in_light_transport(sphere, exitance):
     band = np.minimum((angles(sphere) / 30).astype(int), 5)
     means = np.stack([np.bincount(band, row) / np.bincount(band) for row in exitance])
     off = np.abs(means / BANDS - 1)
     assert np.all(off < OF_TRANSPORT[None]), off
     total = exitance @ np.asarray(sphere.areas) / (np.pi * RADIUS**2)
-    np.testing.assert_allclose(total, [0.98209, 0.68486], rtol=5e-3)
+    np.testing.assert_allclose(total, [0.98209, 0.68486], rtol=0.01)
 
 
 def test_a_sphere_that_absorbs_nothing_loses_what_it_does_not_scatter(sphere):
@@ -74,14 +78,11 @@ def test_a_sphere_that_absorbs_nothing_loses_what_it_does_not_scatter(sphere):
     np.testing.assert_allclose(total, 1 - 2 / across**2, rtol=5e-3)
 
 
-def test_the_size_of_body_and_coefficients_does_not_matter(sphere):
-    expected = solved(sphere, medium(), beams(sphere))
-    larger = sphere.scaled(1e4)
-    thinner = medium()
-    thinner = Medium(thinner.sigma_a / 1e4, thinner.sigma_s_prime / 1e4, thinner.eta)
-    np.testing.assert_allclose(
-        solved(larger, thinner, beams(larger)), expected, atol=2e-4 * float(jnp.max(expected))
-    )
+def test_the_size_of_body_and_coefficients_does_not_matter(sphere, exitance):
+    larger, usual = sphere.scaled(1e4), medium()
+    thinner = Medium(usual.sigma_a / 1e4, usual.sigma_s_prime / 1e4, usual.eta)
+    found = solved(larger, thinner, beams(larger))
+    np.testing.assert_allclose(found, exitance, atol=2e-4 * exitance.max())
 
 
 def diffused_on_sphere(albedo: float, angle: np.ndarray) -> np.ndarray:
@@ -122,8 +123,10 @@ def test_the_solution_on_a_sphere_converges_to_the_series():
         splats = bodies.sphere(count, RADIUS, jitter=0.0)
         exitance = np.asarray(solved(splats, medium(), beams(splats), 1e-6))
         series = np.stack([diffused_on_sphere(a, np.radians(angles(splats))) for a in ALBEDO])
-        errors.append(np.abs(exitance - series)[:, angles(splats) < 80].max() / series.max())
-    assert errors[1] < OF_SERIES and errors[1] < errors[0] / 2, errors
+        is_even = np.abs(angles(splats) - 50) < 30  # away from the points' poles and the terminator
+        errors.append(np.abs(exitance - series)[:, is_even].max() / series.max())
+    assert errors[1] < OF_SERIES
+    assert errors[1] < errors[0] / 2
 
 
 def test_every_derivative_is_that_of_differences():
@@ -168,7 +171,8 @@ def test_refused_bodies_and_materials(sphere):
         ShapeDiffuser().count_gaussians(turned)
 
 
-def test_pictures_show_the_solved_light(sphere):
+def test_pictures_show_the_solved_light():
+    sphere = bodies.sphere(200, RADIUS, jitter=0.0)
     gaussians = SumOfGaussians([1.0], np.ones((1, 2)))
     of_body = medium(np.asarray([0.998, 0.9]))
     material = sj.Material(gaussians, eta=1.0, specular=0.0, medium=of_body)
@@ -178,9 +182,10 @@ def test_pictures_show_the_solved_light(sphere):
     camera = sj.Camera.look_at([0, 0, 60], [0, 0, 0], fov=3, width=8, height=8)
     plan = sj.make_plan(scene, camera, settings)
     frame = sj.render(scene, camera, settings, plan)
-    # Light transport sees 0.6969 here, and M is 0.684.
+    # What light transport sees of the lit pole.
     middle = np.pi * np.asarray(frame.diffuse).mean((0, 1))
-    np.testing.assert_allclose(middle[0], 0.6969, rtol=0.03)
+    np.testing.assert_allclose(middle, [0.6969, 0.3721], rtol=0.06)
     np.testing.assert_array_equal(frame.layers[0], frame.diffuse)
+    other = sj.Scene(sphere, [light], sj.Material(gaussians))
     with pytest.raises(ValueError, match=r"Material\.medium is None"):
-        sj.render(dataclasses.replace(scene, material=sj.Material(gaussians)), camera, settings, plan)
+        sj.render(other, camera, settings, plan)
