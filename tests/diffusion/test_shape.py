@@ -145,7 +145,10 @@ def test_every_derivative_is_that_of_differences():
     slopes, random = jax.jit(jax.grad(value))(given), np.random.default_rng(0)
     is_lit = given[2].irradiance > 0
     step = 1e-6 if jax.config.jax_enable_x64 else 1e-2
-    for name in ("centers", "normals", "areas", "sigma_a", "sigma_s_prime", "eta", "irradiance"):
+    names = ["sigma_a", "sigma_s_prime", "eta", "irradiance"]
+    if jax.config.jax_enable_x64:  # steps that float32 resolves let beams leave by other splats
+        names += ["centers", "normals", "areas", "directions"]
+    for name in names:
         tree = next(i for i, part in enumerate(given) if hasattr(part, name))
 
         def where(given, tree=tree, name=name):
@@ -158,7 +161,7 @@ def test_every_derivative_is_that_of_differences():
             value(eqx.tree_at(where, given, leaf + sign * step * way)) for sign in (1, -1)
         )
         slope = float(jnp.sum(where(slopes) * way))
-        tolerance = 1e-6 if jax.config.jax_enable_x64 else 0.05
+        tolerance = 1e-6 if jax.config.jax_enable_x64 else 0.01
         np.testing.assert_allclose(slope, (ahead - behind) / (2 * step), rtol=tolerance)
 
 
