@@ -5,7 +5,7 @@ a batch at a time: finished batches are kept, and become one table in the end.
 import shutil
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import jax
 import optimistix as optx
@@ -252,12 +252,12 @@ class Fit:
         fitted: sj.fitting.FitResult,
     ) -> None:
         known = None if isinstance(coefficients, sj.scattering.Tabulated) else coefficients
-        surface, source = {}, {}
+        surface, source = dict[str, Any](), dict[str, Any]()
         if known is not None:
             # The index of a surface is that of the medium it bounds, unless the file gives it.
             top = known if isinstance(known, sj.Dipole) else known.top
             surface, source = sj.io.surface_and_source(self.medium)
-            surface = {"eta": top.medium.eta[0]} | surface
+            surface.setdefault("eta", top.medium.eta[0])
         fitted_by = (
             f"fitted by splatjax {sj.__version__} to the "
             f"{'profile' if known is None else 'coefficients'} of {self.medium}"

@@ -29,5 +29,7 @@ from ._kernel import (
     resolved_fraction as resolved_fraction,
     unevenness as unevenness,
 )
+from ._beams import Beams as Beams
+from ._shape import ShapeDiffuser as ShapeDiffuser, ShapePlan as ShapePlan
 from ._streamed import StreamedDiffusion as StreamedDiffusion
 from ._clusters import POINTS_PER_BLOCK as POINTS_PER_BLOCK, compact_order as compact_order

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from splatjax._combination import AbstractCombination
-from splatjax.scene import Splats
+from splatjax.scene import Material, Splats
 
 from ._kernel import AbstractDiffusionKernel
 
@@ -70,6 +70,10 @@ class AbstractDiffusionPlan(eqx.Module):
         only fills up.
         """
         return variances.at[self.gaussians].get(mode="fill", fill_value=1)
+
+    def material(self, material: Material) -> Material:
+        """Return the material whose weights the layers have."""
+        return material
 
     @abc.abstractmethod
     def diffuse(

@@ -120,7 +120,7 @@ def load_material(name_or_path: StrPath) -> Material:
 
 def surface_and_source(
     name_or_path: StrPath,
-) -> tuple[dict[str, Array], dict[str, Any]]:
+) -> tuple[dict[str, Any], dict[str, Any]]:
     r"""Return what a file says of a material besides its coefficients: its surface, as `Material`
     takes it, and its [source].
 

@@ -50,8 +50,10 @@ def filled_like(scene: Scene, plan: Plan, *given: PyTree) -> tuple[Scene, Plan, 
 
     **Returns:** the scene with its lights sorted by kind, its plan, and where its own are.
     """
-    count, material = scene.splats.count, scene.material
-    places = Places(np.arange(len(scene.lights)), np.arange(plan.gaussians))
+    count, material = scene.splats.count, plan.diffusion.material(scene.material)
+    scene = Scene(scene.splats, scene.lights, material)
+    shown = np.arange(min(plan.gaussians, len(material.gaussians.variances)))
+    places = Places(np.arange(len(scene.lights)), shown)
     leaves = jax.tree.leaves((scene, given))
     if plan.mesh is not None or any(isinstance(leaf, Tracer) for leaf in leaves):
         return scene, plan, places

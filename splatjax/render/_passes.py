@@ -18,6 +18,7 @@ from splatjax._combination import AbstractCombination
 from splatjax.scene import Camera, Scene, stack_lights
 
 from ._attributes import SurfaceAttributes, SurfaceSamples, split_rows, stack_rows
+from ._beams import beams_at_splats
 from ._bounces import bounced_irradiance, diffuse_splats
 from ._lighting import Irradiance, LightVisibility, cast_shadows, irradiance_at_splats
 from ._plan import Plan
@@ -52,6 +53,7 @@ class SplatLight(eqx.Module):
     - `added_source`: the derivative of the spreading irradiance in a weight of the Gaussians;
       `None` where it has none. Its own layers follow those of the irradiance, channel by channel.
     - `needed`: capacity needed over planned.
+    - `beams`: the light that enters, where the layers were solved for it; otherwise `None`.
     """
 
     visibility: list[Float[Array, "_lights splats"] | None]
@@ -60,6 +62,7 @@ class SplatLight(eqx.Module):
     derivative: _diffusion.LayerValues | None
     added_source: Float[Array, "channels splats"] | None
     needed: Float[Array, ""]
+    beams: _diffusion.Beams | None = None
 
     def take(self, chosen: Int[Array, " chosen"]) -> "SplatLight":
         """Return the light of some splats."""
@@ -104,19 +107,25 @@ def light_splats(
     """
     light = compute_visibility(scene, settings, plan, combination, bounds, transfer)
     irradiance, bounce_needed = bounced_irradiance(scene, settings, plan, combination, light)
-    added = None
+    added, beams, medium = None, None, scene.material.medium
     if derivative and scene.material.single_scattering is not None:
         irradiance, added = _differentiated_irradiance(scene, light)
     source = irradiance.source if added is None else jnp.concatenate([irradiance.source, added])
-    layers, log_variance_derivative, needed = diffuse_splats(
-        scene, source, settings, plan, combination, at, derivative
-    )
+    if isinstance(plan.diffusion, _diffusion.ShapePlan) and medium and not derivative:
+        beams = beams_at_splats(scene, light, irradiance)
+        layers = plan.diffusion.solve(scene.splats, medium, beams, at)
+        log_variance_derivative, needed = None, light.needed
+    else:
+        layers, log_variance_derivative, needed = diffuse_splats(
+            scene, source, settings, plan, combination, at, derivative
+        )
     needed = jnp.maximum(needed, jnp.maximum(light.needed, bounce_needed))
-    along_splats = light.visibility, irradiance, added
+    along_splats = light.visibility, irradiance, added, beams
     if at is not None:
         along_splats = jax.tree.map(partial(take_points, chosen=at), along_splats)
-    visibility, irradiance, added = along_splats
-    return SplatLight(visibility, irradiance, layers, log_variance_derivative, added, needed)
+    visibility, irradiance, added, beams = along_splats
+    derivatives = log_variance_derivative, added
+    return SplatLight(visibility, irradiance, layers, *derivatives, needed, beams)
 
 
 def light_source(
@@ -186,6 +195,9 @@ def see_and_shade(
     # Passes 2 and 3: blend the attributes and layers of the splats that may be seen.
     splats = scene.splats.take(chosen)
     shown = Scene(splats, scene.lights, scene.material)
+    layers, given = light.layers, (camera.position, splats, scene.material, light.layers)
+    if light.beams and isinstance(plan.diffusion, _diffusion.ShapePlan):
+        layers = plan.diffusion.towards(*given, light.beams)
     visibility = LightVisibility(groups, light.visibility, light.needed)
     attributes = settings.lighting.attributes(shown, visibility, light.irradiance, view.position)
     origin = jax.lax.stop_gradient(bounds.center)[:, None]
@@ -193,7 +205,7 @@ def see_and_shade(
     attributes = dataclasses.replace(
         attributes,
         centers=centers,
-        layers=_diffusion.continue_from_splats(light.layers, centers),
+        layers=_diffusion.continue_from_splats(layers, centers),
         derivative=light.derivative and _diffusion.continue_from_splats(light.derivative, centers),
         added_source=light.added_source,
     )

@@ -23,7 +23,8 @@ class RenderSettings(eqx.Module):
     - `kernel`: pass 4: how a layer spreads, is normalized, and when the splats resolve it:
       `EscapeNormalization()`, or `PlainMean()`, the paper's.
     - `rasterizer`: `TileRasterizer()`, or `DenseRasterizer()`, the plain reference.
-    - `diffuser`: `ClusterDiffuser()`, or `DenseDiffuser()`, the plain reference.
+    - `diffuser`: `ClusterDiffuser()`; `DenseDiffuser()`, the plain reference; or `ShapeDiffuser()`,
+      which solves the diffusion equation in the body itself.
     - `lighting`: what the splats carry into the picture: `LightAtSplats()` blends their irradiance;
       `splatjax.baselines` has others.
     """
@@ -46,6 +47,11 @@ class RenderSettings(eqx.Module):
             raise ValueError(
                 f"bounces is {self.bounces} and lighting is {type(self.lighting).__name__}; light "
                 "bounces between splats alone: give bounces=0, or lighting=LightAtSplats()"
+            )
+        if self.bounces and isinstance(self.diffuser, _diffusion.ShapeDiffuser):
+            raise ValueError(
+                f"bounces is {self.bounces} and diffuser is ShapeDiffuser, which has none; give "
+                "bounces=0, or diffuser=ClusterDiffuser()"
             )
 
     def shadows_of(self, light: AbstractLightSample) -> _splatting.ShadowSettings:

@@ -6,7 +6,7 @@ from jaxtyping import Array, Float
 
 from splatjax._records import numbers, record, valid
 from splatjax.gaussians import SumOfGaussians
-from splatjax.scattering import AngularLaw, SingleScattering
+from splatjax.scattering import AngularLaw, Medium, SingleScattering
 
 _NARROW = 1e-6  # mm^2: far below any splat, so that the layer is unresolved
 
@@ -27,6 +27,8 @@ class Material(eqx.Module):
       for the rest. `None`: they stand for all.
     - `angles`: how the light of the Gaussians depends on the angles under which it enters and
       leaves. `None`: not at all.
+    - `medium`: coefficients, which `ShapeDiffuser` reads in the place of Gaussians, single
+      scattering and angles; or `None`.
 
     **Raises:** `ValueError` for a value out of range, and for single scattering or angles of
     another number of channels than the Gaussians have.
@@ -44,6 +46,7 @@ class Material(eqx.Module):
     )
     single_scattering: SingleScattering | None = None
     angles: AngularLaw | None = None
+    medium: Medium | None = None
 
     def __check_init__(self):
         for name in ("single_scattering", "angles"):
@@ -101,4 +104,6 @@ class Material(eqx.Module):
         gaussians = SumOfGaussians(self.gaussians.variances, self.gaussians.weights / total[None])
         if single is not None:
             single = SingleScattering(single.medium, single.strength / total)
-        return Material(gaussians, self.eta, self.specular, self.roughness, single)
+        return Material(
+            gaussians, self.eta, self.specular, self.roughness, single, medium=self.medium
+        )

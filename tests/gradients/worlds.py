@@ -13,6 +13,7 @@ import numpy as np
 from bodies import view
 
 import splatjax as sj
+from splatjax.diffusion import ShapeDiffuser
 from splatjax.splatting import ShadowSettings, TileRasterizer
 
 SHADOWS = ShadowSettings(resolution=32, bias=0.4, softness=0.8)
@@ -21,6 +22,8 @@ FAST = sj.RenderSettings(
 )
 PLAIN = dataclasses.replace(bodies.PLAIN, shadows=SHADOWS, sample_shadows=SHADOWS)
 COARSE = dataclasses.replace(PLAIN, shadows=dataclasses.replace(SHADOWS, resolution=16))
+
+SOLVED = dataclasses.replace(PLAIN, diffuser=ShapeDiffuser(error=1e-12))
 
 
 class World(eqx.Module):
@@ -105,6 +108,13 @@ def scattered_once() -> World:
     return World(sj.Scene(_colored(bodies.bumpy(160)), (light,), material), view())
 
 
+def solved_body() -> World:
+    medium = sj.Medium([0.02, 0.05], [0.9, 1.2], [1.3, 1.5])
+    light = sj.DirectionalLight([-1.0, -0.2, -0.6], [2.0, 3.0], cast_shadows=False)
+    body = uneven(_colored(bodies.sphere(80, 4.0)))
+    return World(sj.Scene(body, (light,), sj.Material(_gaussians(), medium=medium)), view())
+
+
 def extended_lights() -> World:
     """A body in its own shadow, under lights that are sampled, with a highlight each."""
     image = np.random.default_rng(4).uniform(0.1, 2.0, (6, 12, 2))
@@ -127,6 +137,7 @@ WORLDS = {
     "lamp inside": Small(lamp_inside, {"plain": COARSE}),
     "ball over sheet": Small(ball_over_sheet),
     "scattered once": Small(scattered_once),
+    "solved body": Small(solved_body, {"solved": SOLVED}),
     "extended lights": Small(extended_lights),
 }
 
