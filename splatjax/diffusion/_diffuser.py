@@ -72,8 +72,10 @@ class AbstractDiffusionPlan(eqx.Module):
         return variances.at[self.gaussians].get(mode="fill", fill_value=1)
 
     def material(self, material: Material) -> Material:
-        """Return the material whose weights the layers have."""
-        return material
+        """Return the material whose weights the layers have, without what they do not depend on."""
+        if material.medium is None:
+            return material
+        return dataclasses.replace(material, medium=None)
 
     @abc.abstractmethod
     def diffuse(

@@ -88,7 +88,7 @@ def load_material(name_or_path: StrPath) -> Material:
     **Raises:** `ValueError` for an unknown name, and for a file that is no material: what is wrong,
     and what would be right.
     """
-    tables, _ = _read(name_or_path)
+    tables, profile = _read(name_or_path)
     if "fit" not in tables.entries:
         path, fitted = tables.path, tables.path.with_name(f"{tables.path.stem}_fitted.toml")
         raise ValueError(
@@ -113,9 +113,9 @@ def load_material(name_or_path: StrPath) -> Material:
     if "angles" in tables.entries:
         table = tables.table("angles", ("coefficients",))
         angles = table.make(AngularLaw, table.numbers("coefficients"))
-    return fit.make(
-        Material, gaussians, **_surface(tables), single_scattering=single, angles=angles
-    )
+    medium = profile.medium if isinstance(profile, Dipole) else None
+    terms = {"single_scattering": single, "angles": angles, "medium": medium}
+    return fit.make(Material, gaussians, **_surface(tables), **terms)
 
 
 def surface_and_source(
@@ -179,8 +179,8 @@ def save_material(
     - `material`: one material (no batch); written with the digits it needs to be read back as it
       was.
     - `path`: of the file; its folder must exist.
-    - `profile`: what the Gaussians were fitted to; its coefficients are written, and in [fit] what
-      it is.
+    - `profile`: what the Gaussians were fitted to; its coefficients are written in the place of the
+      material's `medium`, and in [fit] what it is.
     - `source`: where the numbers come from: `citation`, `provenance`, ...
     - `fit`: more to be kept in [fit]: `error`, `energy_error`, ...
 
@@ -196,6 +196,8 @@ def save_material(
         tables["layers"] = [_plain_layer(layer) for layer in profile.layers]
     elif profile is not None:
         tables["medium"] = _plain_medium(profile.medium)
+    elif material.medium is not None:
+        tables["medium"] = _plain_medium(material.medium)
     single, gaussians = material.single_scattering, material.gaussians
     if single is not None:
         tables["single_scattering"] = {
