@@ -1,12 +1,10 @@
 """The command line is run in process: its settings are those of the whole process."""
 
-from functools import partial
-
 import pytest
 from bodies import PLAIN
 
 import splatjax as sj
-from splatjax.cli import _render
+from splatjax.cli import _render, _view
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -22,8 +20,7 @@ def own_cache(tmp_path_factory, jax_settings):
 def plain():
     """Plain renderers, whose program is small: what is tested here does not depend on them."""
     with pytest.MonkeyPatch.context() as patch:
-        for name in ("make_plan", "illuminate", "render"):
-            patch.setattr(sj, name, partial(getattr(sj, name), settings=PLAIN))
+        patch.setattr(_view.ViewOptions, "settings", PLAIN)
         yield
 
 
@@ -34,8 +31,8 @@ def drawn(monkeypatch, compiled):
     """
     seen, draw = [], _render.draw
 
-    def watched(scene, camera, plan, light):
-        frame = draw(scene, camera, plan, light)
+    def watched(scene, camera, settings, plan, light):
+        frame = draw(scene, camera, settings, plan, light)
         seen.append((plan, len(compiled)))
         return frame
 

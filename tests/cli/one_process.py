@@ -5,15 +5,13 @@ it is told to be.
 import os
 import signal
 import sys
-from functools import partial
 
 from bodies import PLAIN
 
 import splatjax as sj
-from splatjax.cli import main
+from splatjax.cli import _view, main
 
-sj.make_plan = partial(sj.make_plan, settings=PLAIN)
-sj.render = partial(sj.render, settings=PLAIN)
+_view.ViewOptions.settings = PLAIN
 write_png = sj.write_png
 
 

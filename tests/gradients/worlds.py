@@ -104,7 +104,8 @@ def scattered_once() -> World:
     single = sj.SingleScattering(medium, [0.9, 1.0])
     gaussians = sj.SumOfGaussians([4.0, 30.0], [[0.4, 0.5], [0.3, 0.3]])
     light = sj.DirectionalLight([-1.0, -0.2, 0.1], [2.0, 3.0], cast_shadows=False)
-    material = sj.Material(gaussians, single_scattering=single)
+    angles = sj.scattering.AngularLaw([[0.9, 1.2], [0.2, -0.3], [-0.1, 0.1]])
+    material = sj.Material(gaussians, single_scattering=single, angles=angles)
     return World(sj.Scene(_colored(bodies.bumpy(160)), (light,), material), view())
 
 
