@@ -44,6 +44,8 @@ LONG = {
     ("lamp inside", "plain"),
     ("sun and beam", "plain"),
     ("ball over sheet", "plain"),
+    ("solved body", "solved"),
+    ("harmonic light", "plain"),
 }  # what they add to the others, long tests show
 RECORDS = [
     pytest.param(world, path, name, marks=[pytest.mark.long] if (world, path) in LONG else [])

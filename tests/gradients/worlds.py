@@ -130,6 +130,13 @@ def extended_lights() -> World:
     return World(sj.Scene(body, lights, sj.Material(_gaussians(), roughness=0.4)), view())
 
 
+def harmonic_light() -> World:
+    coefficients = [[3.0, 2.0], [0.3, -0.2], [0.5, 0.4], [-0.2, 0.6]]
+    light = sj.scene.HarmonicLight(coefficients, count=4)
+    body = uneven(_colored(bodies.bumpy(160)))
+    return World(sj.Scene(body, (light,), sj.Material(_gaussians(), roughness=0.4)), view())
+
+
 # The plain path is checked everywhere; the fast one where all its parts take part, and against the
 # plain one.
 WORLDS = {
@@ -140,6 +147,7 @@ WORLDS = {
     "scattered once": Small(scattered_once),
     "solved body": Small(solved_body, {"solved": SOLVED}),
     "extended lights": Small(extended_lights),
+    "harmonic light": Small(harmonic_light),
 }
 
 

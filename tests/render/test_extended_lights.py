@@ -205,7 +205,10 @@ FAR = {
 
 
 @pytest.mark.once
-@pytest.mark.parametrize("kind", FAR)
+@pytest.mark.parametrize(
+    "kind",
+    ["rectangle", *(pytest.param(each, marks=pytest.mark.long) for each in ("disk", "sphere"))],
+)
 def test_a_far_area_light_is_a_point_light(kind):
     area = 2 if kind == "rectangle" else np.pi
     point = sj.PointLight(PLACE, area * np.asarray([1.0, 2.0, 3.0]))
@@ -241,6 +244,7 @@ def test_a_soft_shadow_is_the_fraction_of_the_rectangle_that_is_seen():
 
 
 @pytest.mark.once
+@pytest.mark.long
 def test_another_environment_of_the_size_compiles_nothing_and_keeps_the_plan(compiled):
     # Edge-on and face-on it needs other capacities.
     body, sun = sheet(8.0, 0.25, normal=(1.0, 0.0, 0.2)), sj.scene.sun_and_sky(height=32)

@@ -125,6 +125,7 @@ def test_a_photon_beam_takes_the_total_of_transport():
     np.testing.assert_allclose(ratio[0], ratio[1], rtol=1e-4)
 
 
+@pytest.mark.once
 def test_a_flat_piece_sends_back_what_the_law_says():
     """Under light and eye at an angle it is `e(mu_i) e(mu_o) / average` times as bright as a
     diffuser.
