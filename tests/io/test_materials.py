@@ -126,8 +126,9 @@ def test_a_saved_material_comes_back_bit_for_bit(tmp_path, model):
 
     gaussians = SumOfGaussians([1e-5, 2 / 3], [[1 / 3, 1e-9], [0.1, -0.2]])
     once = SingleScattering(Medium([1 / 7, 0.2], 3.0, 1.4), [1 / 3, 1.0])
-    material = Material(gaussians, 1.37, 0.1, roughness=1.0, single_scattering=once)
     profile, path = PROFILES[model], tmp_path / "a.toml"
+    medium = profile.medium if isinstance(profile, Dipole) else None
+    material = Material(gaussians, 1.37, 0.1, 1.0, single_scattering=once, medium=medium)
     source, fit = {"citation": 'Me, "2024"'}, {"error": [0.1, 0.2], "count": 2}
     save_material(material, path, profile=profile, source=source, fit=fit)
     assert eqx.tree_equal((load_material(path), load_profile(path)), (material, profile))
