@@ -46,6 +46,7 @@ LONG = {
     ("ball over sheet", "plain"),
     ("solved body", "solved"),
     ("harmonic light", "plain"),
+    ("extended lights", "plain"),
 }  # what they add to the others, long tests show
 RECORDS = [
     pytest.param(world, path, name, marks=[pytest.mark.long] if (world, path) in LONG else [])
