@@ -72,7 +72,12 @@ def test_it_prints_and_writes_a_material_that_loads(tmp_path, capsys):
     [
         ("--model dipole", "classical dipole, exact", 0.15),
         pytest.param("--model better-dipole", "better dipole, exact", 0.12, marks=pytest.mark.long),
-        ("--model photon-beam --single-scattering", "without single scattering", 0.1),
+        pytest.param(
+            "--model photon-beam --single-scattering",
+            "without single scattering",
+            0.1,
+            marks=pytest.mark.long,
+        ),
         pytest.param(
             "--model monte-carlo --photons 20000",
             "Monte Carlo, 20000 photons",

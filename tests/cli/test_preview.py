@@ -61,6 +61,7 @@ def pixels(shown):
     return np.asarray(rows)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.once
 def test_a_terminal_shows_a_preview_while_the_picture_compiles_and_only_then(tmp_path):

@@ -129,6 +129,7 @@ def test_the_solution_on_a_sphere_converges_to_the_series():
     assert errors[1] < errors[0] / 2
 
 
+@pytest.mark.long
 def test_every_derivative_is_that_of_differences(float64):
     splats = bodies.sphere(60, 2.0, jitter=0.0)
     squeezed = splats.centers * jnp.asarray([[1, 0.8, 0.6]], float)
@@ -171,6 +172,7 @@ def test_refused_bodies_and_materials(sphere):
         ShapeDiffuser().count_gaussians(turned)
 
 
+@pytest.mark.long
 @pytest.mark.once
 def test_pictures_show_the_solved_light():
     sphere = bodies.sphere(200, RADIUS, jitter=0.0)

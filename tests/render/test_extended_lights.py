@@ -83,6 +83,7 @@ def test_white_furnace_with_a_lobe():
     assert np.max(specular) > 0.1
 
 
+@pytest.mark.long
 @pytest.mark.once
 def test_an_environment_of_one_pixel_is_a_directional_light():
     image = np.zeros((32, 64, 3))
@@ -163,6 +164,7 @@ def under_two(image, rotation=0.0, strength=1.0) -> sj.Scene:
     return sj.Scene(BODY, (sky, sj.DirectionalLight([0.3, -0.2, -1], strength)), BARE)
 
 
+@pytest.mark.long
 @pytest.mark.once
 def test_kept_shadows_serve_other_strengths_images_and_rotations():
     first = under_two(np.ones((8, 16, 3)), strength=[1, 1, 1])
@@ -204,6 +206,7 @@ FAR = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.once
 @pytest.mark.parametrize(
     "kind",
@@ -230,6 +233,7 @@ def test_a_rectangle_that_fills_the_sky_is_mirrored_with_its_radiance():
     np.testing.assert_allclose(found, expected, rtol=0.05)
 
 
+@pytest.mark.long
 @pytest.mark.once
 def test_a_soft_shadow_is_the_fraction_of_the_rectangle_that_is_seen():
     """Behind the edge x = 0 of a sheet 30 mm above, under a rectangle of 40 mm at 200 mm."""

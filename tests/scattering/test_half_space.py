@@ -47,6 +47,7 @@ def test_monte_carlo_with_forward_scattering(float32):
     assert np.all(np.asarray(by_similarity) > np.asarray(found) * [1.03, 1.005])
 
 
+@pytest.mark.once
 @pytest.mark.parametrize("eta", [1.0, 1.4])
 def test_limits(eta):
     """All light leaves where nothing is absorbed. The little that leaves of a dark medium has
@@ -63,6 +64,7 @@ def test_limits(eta):
         np.testing.assert_allclose(fraction[0, 2], 1 - 0.1**0.5, atol=2e-4)
 
 
+@pytest.mark.once
 @pytest.mark.parametrize("eta", [1.0, 1.3])
 def test_energy_of_a_material_under_every_angle(eta):
     """Gaussians by their law and single scattering by its own are together what transport says
@@ -111,6 +113,7 @@ def test_gradients(float64):
     check_grads(jax.jit(leaves), (law, *surface), order=1, rtol=1e-5)
 
 
+@pytest.mark.once
 def test_a_photon_beam_takes_the_total_of_transport():
     space = half_space([0.9, 0.99], 1.3)
     beam = PhotonBeam(space.medium)
@@ -125,6 +128,7 @@ def test_a_photon_beam_takes_the_total_of_transport():
     np.testing.assert_allclose(ratio[0], ratio[1], rtol=1e-4)
 
 
+@pytest.mark.long
 @pytest.mark.once
 def test_a_flat_piece_sends_back_what_the_law_says():
     """Under light and eye at an angle it is `e(mu_i) e(mu_o) / average` times as bright as a

@@ -93,6 +93,7 @@ def test_solid_angles_have_derivatives(float64):
         check_grads(angles, (jnp.asarray(SEEN_FROM[2:]),), 1, rtol=1e-5)
 
 
+@pytest.mark.once
 def test_the_highlight_below_the_end_of_a_tube_is_that_of_its_samples():
     """The point that is mirrored is near, and the center far away. One point stands for all that
     the lobe sees: a third too bright.
