@@ -195,8 +195,8 @@ def _directions(eta: Float[Array, ""]):
     beyond, beyond_weights = (jnp.asarray(each, eta.dtype) for each in unit_legendre(_BEYOND))
     squared = eta * eta
     inside = jnp.sqrt(jnp.maximum(squared - 1 + outside * outside, _LEAST_COSINE**2)) / eta
-    room = squared > 1
-    critical = jnp.where(room, jnp.sqrt(jnp.where(room, squared - 1, 1.0)) / eta, 0.0)
+    is_denser = squared > 1
+    critical = jnp.where(is_denser, jnp.sqrt(jnp.where(is_denser, squared - 1, 1.0)) / eta, 0.0)
     mu = jnp.concatenate([inside, jnp.maximum(critical * beyond, _LEAST_COSINE)])
     weights = jnp.concatenate(
         [outside_weights * outside / (squared * inside), critical * beyond_weights]
