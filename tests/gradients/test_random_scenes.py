@@ -32,7 +32,7 @@ from splatjax.splatting._tiles import TilePlan
 pytestmark = [pytest.mark.slow, pytest.mark.once]
 
 SCENES = int(os.environ.get("SPLATJAX_RANDOM_SCENES", "200"))
-IN_SUITE = 2
+IN_SUITE = 1
 SHADOWS = ShadowSettings(resolution=12, bias=0.4, softness=0.8)
 
 

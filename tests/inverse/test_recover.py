@@ -124,6 +124,7 @@ class TestRecover:
         for made, left, seen in zip(found.pictures, found.residuals, pictures, strict=True):
             np.testing.assert_allclose(left, made - seen, atol=1e-12)
 
+    @pytest.mark.long
     def test_pictures_from_three_sides_under_one_light_are_lit_once_a_round(self, monkeypatch):
         illuminate = mock.Mock(wraps=sj.illuminate)
         monkeypatch.setattr("splatjax.inverse._problem.illuminate", illuminate)

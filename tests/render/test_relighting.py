@@ -47,6 +47,7 @@ def test_a_kept_view_is_the_picture_with_its_gradient():
         basis.beauty(HarmonicLight(np.zeros((16, 3))))
 
 
+@pytest.mark.once
 @pytest.mark.parametrize("count", HARMONIC)
 def test_irradiance_on_a_ball_is_that_of_its_bands(count):
     """pi, 2 pi / 3, pi / 4 and 0 times the radiance, for each harmonic up to the third band."""

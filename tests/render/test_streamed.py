@@ -144,7 +144,7 @@ def test_splats_without_area_do_not_count(splats, begins_bare):
     assert 0 < statistics.unevenness < 1
 
 
-@pytest.mark.parametrize("are_all", [False, True])
+@pytest.mark.parametrize("are_all", [pytest.param(False, marks=pytest.mark.long, id="first"), True])
 def test_the_first_part_or_all_may_have_no_area(splats, are_all):
     """The picture is that of all at once, up to the clusters of the parts."""
     cloud = without_area(splats, np.ones(splats.count, bool))
