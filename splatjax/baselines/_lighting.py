@@ -127,7 +127,6 @@ def _lit(
         samples.positions.T,
         unit_normals(normals.T),
         None if blended.albedo is None else blended.albedo.T,
-        material.specular if blended.specular is None else blended.specular[0],
         material.roughness if blended.roughness is None else blended.roughness[0],
     )
     irradiance = None if blended.irradiance is None else entering.entering

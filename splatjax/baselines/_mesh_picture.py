@@ -164,7 +164,9 @@ def _shaded(
     )
     covered = seen.seen.covered
     drawn = jnp.where(needed <= 1, 1.0, jnp.nan) * covered.reshape(-1, 1).astype(depth.dtype)
-    per_exitance = drawn * _shading.exit_transmission(surface, f0, material.angles).T / jnp.pi
+    per_exitance = (
+        drawn * _shading.exit_transmission(surface, f0, material.angular_law()).T / jnp.pi
+    )
     albedo = (
         jnp.ones((len(points.centers), channels), depth.dtype)
         if points.albedo is None

@@ -174,7 +174,9 @@ def diffuse_on_screen(
         [],
     )
     f0 = _shading.fresnel_f0(material.eta)
-    transmission = jnp.moveaxis(_shading.exit_transmission(surface, f0, material.angles), 0, -1)
+    transmission = jnp.moveaxis(
+        _shading.exit_transmission(surface, f0, material.angular_law()), 0, -1
+    )
     per_exitance = frame.coverage[..., None] * transmission / jnp.pi
     layers = (per_exitance * root)[None] * layers.transpose(0, 2, 3, 1)
     diffuse = jnp.sum(weights[:, None, None] * layers, axis=0)

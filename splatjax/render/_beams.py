@@ -20,11 +20,11 @@ def beams_at_splats(
     - `irradiance`: from `irradiance_at_splats`.
     """
     splats, material = scene.splats, scene.material
-    f0 = _shading.fresnel_f0(material.eta)
+    f0, (_, roughness) = _shading.fresnel_f0(material.eta), surface_parameters(scene)
 
     def along(axis: int):
         def enters(wi, cosine):
-            fraction = 1 - _shading.directional_albedo(cosine, f0, *surface_parameters(scene))
+            fraction = 1 - _shading.directional_albedo(cosine, f0, roughness)
             sine = jnp.minimum((1 - cosine * cosine) / (material.eta * material.eta), 1 - _GRAZING)
             inward = jnp.sqrt(1 - sine) - cosine / material.eta
             return (-fraction * (wi[:, axis] / material.eta + inward * splats.normals[:, axis]))[

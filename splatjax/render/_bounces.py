@@ -51,9 +51,9 @@ def bounced_irradiance(
     splats, gaussians = scene.splats, material.gaussians
     area, albedo = splats.areas[at], splats.albedo
     root = jnp.ones_like(direct.source) if albedo is None else albedo_root(albedo.T)
-    specular, roughness = surface_parameters(scene)
-    enters = average_transmission(fresnel_f0(material.eta), specular, roughness, material.angles)
-    enters = enters.reshape(1 if material.angles is None else material.channels, -1)
+    _, roughness = surface_parameters(scene)
+    enters = average_transmission(fresnel_f0(material.eta), roughness, material.angular_law())
+    enters = enters.reshape(material.channels, -1)
     # The Gaussians also stand for light that scatters once: of light from the lights where it
     # leaves, of light from the body where it enters.
     whole, diffused = material.total_reflectance(), gaussians.total_reflectance()

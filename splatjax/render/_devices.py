@@ -40,9 +40,9 @@ class Places(NamedTuple):
 
 def filled_like(scene: Scene, plan: Plan, *given: PyTree) -> tuple[Scene, Plan, Places]:
     """Fill up the splats of a scene to the length of its plan, the lights of each kind to four or a
-    larger power of two, and the Gaussians, by NumPy and `device_put`, which compile nothing. Where
-    the scene or what is `given` with it is traced, and where splats are cut over devices,
-    everything stays unchanged.
+    larger power of two, the Gaussians and the angles, by NumPy and `device_put`, which compile
+    nothing. Where the scene or what is `given` with it is traced, and where splats are cut over
+    devices, everything stays unchanged.
 
     No entry of the plan's order stands for an added splat. An added light has no strength, and the
     plan leaves out its shadow map; an added Gaussian has no weight. Where a light of the scene
@@ -71,7 +71,12 @@ def filled_like(scene: Scene, plan: Plan, *given: PyTree) -> tuple[Scene, Plan, 
             for group, shadow in zip(groups, shadows, strict=True)
         )
     gaussians = fill_gaussians(material.gaussians)
-    material = eqx.tree_at(lambda material: material.gaussians, material, gaussians)
+    material = eqx.tree_at(
+        lambda material: (material.gaussians, material.angles),
+        material,
+        (gaussians, material.angular_law()),
+        is_leaf=lambda leaf: leaf is None,
+    )
     counts = {"splats": splats.count, "gaussians": len(gaussians.variances)}
     filled = dataclasses.replace(plan, shadows=shadows, **counts)
     return Scene(splats, lights, material), filled, places

@@ -215,7 +215,6 @@ def irradiance_at_points(
     positions: Float[Array, "points 3"],
     normals: Float[Array, "points 3"],
     albedo: Float[Array, "points channels"] | None,
-    specular: Float[Array, " points"] | Float[Array, ""],
     roughness: Float[Array, " points"] | Float[Array, ""],
 ) -> Irradiance:
     """Compute the light that enters at points of the surface.
@@ -228,9 +227,7 @@ def irradiance_at_points(
     f0 = _shading.fresnel_f0(material.eta)
 
     def enters(_, cosine):
-        fraction = 1 - _shading.directional_albedo(cosine, f0, specular, roughness)
-        if material.single_scattering is None and material.angles is None:
-            return fraction[None]
+        fraction = 1 - _shading.directional_albedo(cosine, f0, roughness)
         return fraction[None] * material.diffuse_fraction(cosine).T
 
     irradiance = _shading.sum_received(
@@ -245,7 +242,7 @@ def irradiance_at_splats(scene: Scene, light: LightVisibility) -> Irradiance:
     """Compute the light that enters every splat."""
     splats = scene.splats
     points = splats.centers, splats.normals, splats.albedo
-    return irradiance_at_points(scene.material, light, *points, *surface_parameters(scene))
+    return irradiance_at_points(scene.material, light, *points, surface_parameters(scene)[1])
 
 
 def single_scattering_at_splats(

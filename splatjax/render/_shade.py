@@ -102,7 +102,7 @@ def shade(
     of_layers = attributes.source, gaussians, interval, settings.kernel
     at = layers_at_points(scene, samples, attributes, *of_layers)
     albedo = at.albedo
-    per_exitance = _shading.exit_transmission(points, f0, material.angles) / jnp.pi
+    per_exitance = _shading.exit_transmission(points, f0, material.angular_law()) / jnp.pi
     if attributes.albedo is not None:
         per_exitance = per_exitance * _shading.albedo_root(albedo)
     single = None

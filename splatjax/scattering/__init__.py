@@ -20,7 +20,11 @@ from ._fresnel import (
     moment_outside as moment_outside,
     reflectance as reflectance,
 )
-from ._half_space import AngularLaw as AngularLaw, HalfSpace as HalfSpace
+from ._half_space import (
+    ANGULAR_POWERS as ANGULAR_POWERS,
+    AngularLaw as AngularLaw,
+    HalfSpace as HalfSpace,
+)
 from ._medium import check_stack as check_stack, Film as Film, Layer as Layer, Medium as Medium
 from ._photon_beam import PhotonBeam as PhotonBeam, SingleScattering as SingleScattering
 from ._quadrature import (

@@ -1,12 +1,15 @@
 """Translucent materials: their Gaussians, their surface, and the angles of their light."""
 
+import dataclasses
+
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from splatjax._records import numbers, record, valid
 from splatjax.gaussians import SumOfGaussians
-from splatjax.scattering import AngularLaw, Medium, SingleScattering
+from splatjax.scattering import ANGULAR_POWERS, AngularLaw, Medium, SingleScattering
 
 _NARROW = 1e-6  # mm^2: far below any splat, so that the layer is unresolved
 
@@ -20,8 +23,9 @@ class Material(eqx.Module):
 
     - `gaussians`: the diffusion profile; the picture's diffuse reflectance is the sum of its
       weights.
-    - `eta`: index of refraction relative to air, for the Fresnel term of the specular lobe.
-    - `specular`: strength of the specular lobe (rho_s).
+    - `eta`: index of refraction relative to air: of the specular lobe, and, whatever the lobe's
+      strength, of the light that enters and leaves. With 1 the surface reflects nothing.
+    - `specular`: strength of the specular lobe (rho_s); of 1 it reflects what does not enter.
     - `roughness`: of the specular lobe (m, root mean square slope), at least 0.
     - `single_scattering`: light that scatters once, as a term of its own; the Gaussians then stand
       for the rest. `None`: they stand for all.
@@ -71,6 +75,15 @@ class Material(eqx.Module):
             return jnp.zeros_like(self.gaussians.weights, shape=self.channels)
         return self.single_scattering.total_reflectance()
 
+    def angular_law(self) -> AngularLaw:
+        """Return `angles`, or the law that is 1 for every angle, with as many powers as those of
+        `HalfSpace`.
+        """
+        if self.angles is not None:
+            return self.angles
+        one = np.eye(ANGULAR_POWERS, 1).repeat(self.channels, 1)
+        return AngularLaw(jnp.asarray(one, self.gaussians.weights.dtype))
+
     def diffuse_fraction(self, mu_i: Float[Array, "*points"]) -> Float[Array, "*points channels"]:
         """Compute the factor on the Gaussians for light that enters under the cosine `mu_i`; 1
         along the normal.
@@ -78,14 +91,11 @@ class Material(eqx.Module):
         Grazing light leaves after one scattering more often than light along the normal. Where that
         and the light of the Gaussians would exceed 1, the Gaussians are scaled to the difference.
         """
-        shape = (*mu_i.shape, self.channels)
-        factor = jnp.ones(shape, mu_i.dtype)
-        if self.angles is not None:
-            factor = jnp.broadcast_to(self.angles(mu_i), shape)
+        factor = self.angular_law()(mu_i)
         if self.single_scattering is None:
             return factor
         left = jnp.maximum(1 - self.single_scattering.directional_albedo(mu_i), 0)
-        total = jnp.broadcast_to(self.gaussians.total_reflectance(), shape)
+        total = jnp.broadcast_to(self.gaussians.total_reflectance(), factor.shape)
         is_over = left < factor * total
         return jnp.where(is_over, left / jnp.where(is_over, total, 1.0), factor)
 
@@ -104,6 +114,4 @@ class Material(eqx.Module):
         gaussians = SumOfGaussians(self.gaussians.variances, self.gaussians.weights / total[None])
         if single is not None:
             single = SingleScattering(single.medium, single.strength / total)
-        return Material(
-            gaussians, self.eta, self.specular, self.roughness, single, medium=self.medium
-        )
+        return dataclasses.replace(self, gaussians=gaussians, single_scattering=single, angles=None)

@@ -21,12 +21,12 @@ _ALBEDO_FLOOR = 1e-4
 def diffuse_transmission(
     mu: Float[Array, "..."],
     f0: Float[Array, "..."],
-    specular: Float[Array, "..."],
     roughness: Float[Array, "..."],
-    angles: AngularLaw | None = None,
-) -> Float[Array, "..."]:
+    angles: AngularLaw,
+) -> Float[Array, "channels ..."]:
     r"""Compute the angular factor of diffuse light that leaves: `e(mu) (1 - rho(mu))` over its
-    average, weighted with `2 mu`.
+    average, weighted with `2 mu`. The index and the roughness alone decide what enters and leaves;
+    the strength of the specular lobe does not.
 
     The radiance of a surface of radiant exitance `M` is `M diffuse_transmission(mu_o) / pi`. Since
     the average is one, the light that leaves is exactly `M`.
@@ -34,7 +34,7 @@ def diffuse_transmission(
     **Arguments:** as in `directional_albedo`; `mu` is the cosine of the direction towards the
     camera.
 
-    - `angles`: `e`, of a material; 1 for `None`.
+    - `angles`: `e`, of a material.
 
     **Returns:** at least 0, with the channels of `angles` as first axis. The average is kept above
     1e-4 (gradient 0 below): a surface that reflects everything lets nothing in, so that `M` is 0
@@ -42,20 +42,17 @@ def diffuse_transmission(
 
     **Source:** d'Eon and Luebke 2007 (GPU Gems 3, chapter 14), with `e = 1`.
     """
-    share = 1 - directional_albedo(mu, f0, specular, roughness)
-    average = jnp.maximum(average_transmission(f0, specular, roughness, angles), _LEAST_SHARE)
-    if angles is None:
-        return share / average
+    share = 1 - directional_albedo(mu, f0, roughness)
+    average = jnp.maximum(average_transmission(f0, roughness, angles), _LEAST_SHARE)
     leaves = jnp.moveaxis(angles(mu), -1, 0) * share[None]
     return leaves / average.reshape(*average.shape, *[1] * (leaves.ndim - average.ndim))
 
 
 def average_transmission(
     f0: Float[Array, "..."],
-    specular: Float[Array, "..."],
     roughness: Float[Array, "..."],
-    angles: AngularLaw | None = None,
-) -> Float[Array, "..."]:
+    angles: AngularLaw,
+) -> Float[Array, "channels ..."]:
     """Compute the average of `e(mu) (1 - rho(mu))`, weighted with `2 mu`: of even light, the
     fraction that enters, over that of light along the normal.
 
@@ -63,13 +60,11 @@ def average_transmission(
 
     **Returns:** with the channels of `angles` as first axis.
     """
-    if angles is None:
-        return 1 - average_albedo(f0, specular, roughness)
-    averages = [
-        2 / (2 + power) - average_albedo(f0, specular, roughness, power)
-        for power in range(len(angles.coefficients))
-    ]
-    return jnp.tensordot(angles.coefficients.T, jnp.stack(averages), 1)
+    reflected = average_albedo(f0, roughness, angles.coefficients)
+    whole = angles.coefficients.T @ jnp.asarray(
+        [2 / (2 + power) for power in range(len(angles.coefficients))], reflected.dtype
+    )
+    return whole.reshape(-1, *[1] * roughness.ndim) - reflected
 
 
 def albedo_root(albedo: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -175,14 +170,13 @@ def sum_received(
 
 
 def exit_transmission(
-    points: SurfacePoints, f0: Float[Array, ""], angles: AngularLaw | None
-) -> Float[Array, "#channels *pixels"]:
+    points: SurfacePoints, f0: Float[Array, ""], angles: AngularLaw
+) -> Float[Array, "channels *pixels"]:
     """Compute the factor on diffuse light that leaves towards the eye, on average 1:
     `diffuse_transmission`.
     """
     cosine = _cosine(points.normals, points.outgoing)
-    factor = diffuse_transmission(cosine, f0, points.specular, points.roughness, angles)
-    return factor[None] if angles is None else factor
+    return diffuse_transmission(cosine, f0, points.roughness, angles)
 
 
 def reflected_radiance(
@@ -214,7 +208,7 @@ def reflected_radiance(
     one, cosine = jnp.ones_like(f0), _cosine(points.normals, points.outgoing)
     specular = jnp.broadcast_to(points.specular, cosine.shape)[None]
     mirrored = 2 * cosine[..., None] * points.normals - points.outgoing
-    albedo = directional_albedo(cosine, f0, one, points.roughness)
+    albedo = directional_albedo(cosine, f0, points.roughness)
 
     def received(wi):
         return lobe(wi, one) * _cosine(points.normals, wi)
@@ -238,13 +232,13 @@ def single_scattered_radiance(
     """Compute the radiance of light that entered where it leaves and scattered once, each light in
     its own shadow.
 
-    What the specular lobe reflects does not enter. The surface counts as flat and evenly lit over a
+    What the interface reflects does not enter. The surface counts as flat and evenly lit over a
     mean free path.
     """
     to_eye = _cosine(points.normals, points.outgoing)
 
     def scattered(_, cosine):
-        enters = 1 - directional_albedo(cosine, f0, points.specular, points.roughness)
+        enters = 1 - directional_albedo(cosine, f0, points.roughness)
         return jnp.moveaxis(single.reflected(cosine, to_eye), -1, 0) * enters[None]
 
     return sum_received(

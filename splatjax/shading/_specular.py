@@ -21,6 +21,7 @@ _MU_NODES = 18
 _ROUGHNESS_NODES = 12
 _POWERS = 8  # of the cosine, whose averages with the albedo are tabulated
 _LEAST_MU = 1e-5
+_LEAST_F0 = 0.02  # of surfaces that reflect all light at grazing incidence
 _AT_ONCE = 1 << 14  # points whose polynomials are in memory
 
 
@@ -35,6 +36,17 @@ def fresnel_f0(eta: Float[Array, "..."]) -> Float[Array, "..."]:
     """
     ratio = (eta - 1) / (eta + 1)
     return ratio * ratio
+
+
+def grazing_reflectance(f0: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Compute the reflectance at grazing incidence that stands for 1 in Schlick's term: 1 from 0.02
+    on (water), less below, so that a surface without change of index reflects nothing. The fraction
+    of uniform light that is reflected is then within 0.007 of Fresnel's for every index up to 2.
+
+    **Source:** as a step in f0, Lagarde and de Rousiers 2014, Moving Frostbite to PBR.
+    """
+    left = jnp.maximum(1 - f0 / _LEAST_F0, 0)
+    return 1 - left * left * left
 
 
 def clamped_roughness(roughness: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -54,7 +66,8 @@ def specular_lobe(
     r"""Compute the reflectance of a rough interface, `f = specular PH F(H.V) / |wi + wo|^2`.
 
     With `a` the angle between the normal and the half vector, `PH = exp(-tan^2 a / m^2) / (pi m^2
-    cos^4 a)`; the half vector `wi + wo` is not normalized in the quotient. `F` is Schlick's. The
+    cos^4 a)`; the half vector `wi + wo` is not normalized in the quotient. `F` is Schlick's, with
+    `grazing_reflectance` in the place of 1. The
     outgoing radiance is `f (N.wi)` times the irradiance of a surface that faces the light. The
     factor `1 / pi`, which some published shaders lack, is part of it, so that the lobe never
     reflects more than it receives (`directional_albedo`).
@@ -89,8 +102,7 @@ def specular_lobe(
     squared_slope = slope * slope
     spread = jnp.exp((1 - ratio) / squared_slope) / (jnp.pi * squared_slope)
     half_cosine = 0.5 * jnp.sqrt(squared_length)  # H.V, the same for wi and wo
-    grazing = (1 - half_cosine) ** 5
-    fresnel = f0 + (1 - f0) * grazing
+    fresnel = f0 + (grazing_reflectance(f0) - f0) * (1 - half_cosine) ** 5
     return jnp.where(seen, specular * fresnel * spread * ratio / squared_cosine, 0.0)
 
 
@@ -180,18 +192,19 @@ def _roughness_basis(roughness: Float[Array, "*points"]) -> Float[Array, "basis 
 def _with_fresnel(tables: np.ndarray, f0: Float[Array, ""]) -> Float[Array, "..."]:
     """Combine the coefficients of tables (a, b) by Schlick's term."""
     constant, grazing = jnp.asarray(tables, f0.dtype)
-    return f0 * constant + (1 - f0) * grazing
+    return f0 * constant + (grazing_reflectance(f0) - f0) * grazing
 
 
 def directional_albedo(
     mu: Float[Array, "..."],
     f0: Float[Array, "..."],
-    specular: Float[Array, "..."],
     roughness: Float[Array, "..."],
 ) -> Float[Array, "..."]:
-    r"""Compute the fraction of light from one direction that the specular lobe reflects, `rho(mu)`.
+    r"""Compute the fraction of light from one direction that a rough interface reflects, `rho(mu)`:
+    what a specular lobe of strength 1 does.
 
-    `rho = specular (f0 a(mu, m) + (1 - f0) b(mu, m))`: Schlick's term splits the integral of
+    `rho = f0 a(mu, m) + (g - f0) b(mu, m)`, g the `grazing_reflectance`: Schlick's term splits the
+    integral of
     `specular_lobe` over the hemisphere into two tables, computed once by quadrature and kept as
     Chebyshev series in `sqrt(mu)` and `log m`.
 
@@ -200,12 +213,9 @@ def directional_albedo(
     - `mu`: cosine of the direction with the normal, clamped to [1e-5, 1]. Differentiable; the slope
       at `mu = 0` diverges like `log mu` and is cut to 0 below 1e-5.
     - `f0`: reflectance at normal incidence. Differentiable.
-    - `specular`: strength rho_s. Differentiable.
     - `roughness`: m, clamped to [0.05, 1] as in the lobe. Differentiable.
 
-    **Returns:** in [0, 1], within 2e-4 of the integral (times `specular`). With `specular <= 1` the
-    integral never exceeds one; where a larger `specular` would make it, rho is cut to 1 with
-    gradient 0: then nothing enters, and the lobe makes energy.
+    **Returns:** in [0, 1], within 2e-4 of the integral.
 
     **Source:** the lobe of Kelemen and Szirmay-Kalos 2001, as normalized in `specular_lobe`.
     """
@@ -224,27 +234,23 @@ def directional_albedo(
     else:
         mu, roughness = jnp.broadcast_arrays(mu, roughness)
         share = map_chunks(mapped, mu.reshape(-1), roughness.reshape(-1), at_once=_AT_ONCE)
-    return jnp.clip(specular * share.reshape(mu.shape), 0.0, 1.0)
+    return jnp.clip(share.reshape(mu.shape), 0.0, 1.0)
 
 
 def average_albedo(
-    f0: Float[Array, "..."],
-    specular: Float[Array, "..."],
-    roughness: Float[Array, "..."],
-    power: int = 0,
-) -> Float[Array, "..."]:
-    r"""Compute the fraction of uniform light that the specular lobe reflects, `2 int_0^1 rho(mu) mu
-    dmu`, or with `mu^power` as a further factor.
+    f0: Float[Array, "..."], roughness: Float[Array, "..."], factor: Float[Array, "powers channels"]
+) -> Float[Array, "channels ..."]:
+    r"""Compute the fraction of uniform light that a rough interface reflects, with a factor
+    `e(mu) = sum_k c_k mu^k`: `2 int_0^1 rho(mu) e(mu) mu dmu`.
 
     It is the exact integral of the series that `directional_albedo` evaluates, so that nothing is
     lost between the two.
 
-    **Arguments:** as in `directional_albedo`; `power` is at most 7.
+    **Arguments:** as in `directional_albedo`.
 
-    **Returns:** in [0, 2 / (2 + power)], which is the value for `rho = 1`.
+    - `factor`: `c_k`, at most 8 powers.
     """
-    coefficients = _with_fresnel(_tables()[1][:, power], f0)
-    share = map_chunks(
-        lambda each: coefficients @ _roughness_basis(each), roughness.reshape(-1), at_once=_AT_ONCE
-    )
-    return jnp.clip(specular * share.reshape(roughness.shape), 0.0, 2 / (2 + power))
+    series = factor.T @ _with_fresnel(_tables()[1][:, : len(factor)], f0)
+    along = roughness.reshape(-1)
+    averages = map_chunks(lambda each: (series @ _roughness_basis(each)).T, along, at_once=_AT_ONCE)
+    return averages.T.reshape(-1, *roughness.shape)

@@ -177,7 +177,7 @@ def lit_ball(settings: sj.RenderSettings, count: int):
     """
     middle = np.asarray([7.0, -4.0, 3.0])
     lamp = sj.DirectionalLight([0.4, -0.3, -1.0], [np.pi], cast_shadows=False)
-    material = sj.Material(sj.SumOfGaussians([1e-6], [[1.0]]), specular=0.0)
+    material = sj.Material(sj.SumOfGaussians([1e-6], [[1.0]]), eta=1.0, specular=0.0)
     body = PhongSplats.of(bodies.sphere(count, 10.0, middle, jitter=0.0))
     scene, seen = (
         sj.Scene(body, (lamp,), material),

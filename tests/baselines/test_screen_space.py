@@ -53,7 +53,7 @@ def convolved(light: np.ndarray, gaussians: sj.SumOfGaussians) -> np.ndarray:
 
 @eqx.filter_jit
 def exitance(frame, gaussians, kernel):
-    material = sj.Material(gaussians, specular=0.0)
+    material = sj.Material(gaussians, eta=1.0, specular=0.0)
     return jnp.pi * baselines.diffuse_on_screen(frame, CAMERA, material, kernel).diffuse
 
 

@@ -24,7 +24,7 @@ SIZE = 192
 TWO = sj.SumOfGaussians(
     jnp.asarray([3.0, 0.5], float), jnp.asarray([[0.5, 0.6, 0.7], [0.5, 0.4, 0.3]], float)
 )
-DULL = sj.Material(TWO, specular=0.0)
+DULL = sj.Material(TWO, eta=1.0, specular=0.0)
 FRONTAL = sj.DirectionalLight(jnp.asarray([0.0, 0.0, -1.0]), jnp.ones(3), cast_shadows=False)
 STILL = baselines.TextureSpaceSettings(
     SIZE, baselines.StretchCorrected(), baselines.OpaqueParts(), PlainMean()

@@ -165,7 +165,7 @@ def photograph(medium: sj.Medium) -> np.ndarray:
         jnp.full(channels, POWER),
         jnp.asarray(BEAM),
     )
-    scene = sj.Scene(sheet(0.25, 24.0), (beam,), sj.Material(gaussians, specular=0.0))
+    scene = sj.Scene(sheet(0.25, 24.0), (beam,), sj.Material(gaussians, eta=1.0, specular=0.0))
     image = np.asarray(sj.render(scene, camera_over(HALF_WIDTH, PIXELS), FINE).diffuse, np.float64)
     noise = np.random.default_rng(0).normal(size=image.shape)
     peak = image.max(axis=(0, 1))

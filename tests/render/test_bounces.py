@@ -28,7 +28,7 @@ from splatjax.splatting import SightlineSettings
 
 RADIUS = 10.0
 CAMERA = sj.Camera.look_at([0, 0, 60], [0, 0, 0], fov=24, width=16, height=16)
-MATTE = sj.Material(two_gaussians(), specular=0.0)
+MATTE = sj.Material(two_gaussians(), eta=1.0, specular=0.0)
 # Of a form factor: rims end half a spacing late, and what lies within half a spacing of a splat's
 # plane is not seen.
 FORM_FACTOR = 0.03
@@ -59,7 +59,7 @@ SINGLE = sj.SingleScattering(sj.Medium([0.2, 0.5, 1.0], [1.0, 1.0, 1.0], eta=1.4
 MATERIALS = {
     "matte": MATTE,
     "glossy": sj.Material(two_gaussians(), specular=1.0, roughness=0.4),
-    "with single scattering": sj.Material(two_gaussians(), specular=0.0, single_scattering=SINGLE),
+    "with single scattering": sj.Material(two_gaussians(), eta=1.0, specular=0.0, single_scattering=SINGLE),
 }
 
 
@@ -72,7 +72,7 @@ def test_a_cup_has_the_exact_series(material, angle):
     material = MATERIALS[material]
     mu, weights = np.polynomial.legendre.leggauss(32)
     mu, weights = jnp.asarray(0.5 + 0.5 * mu, float), jnp.asarray(0.5 * weights, float)
-    surface = fresnel_f0(material.eta), material.specular, jnp.full_like(mu, material.roughness)
+    surface = fresnel_f0(material.eta), jnp.full_like(mu, material.roughness)
     enters = 1 - 2 * jnp.sum(weights * mu * directional_albedo(mu, *surface))
     body = with_albedo(cup(angle), np.full((COUNT, 3), [0.9, 0.5, 0.7]))
     share = (1 - np.cos(np.radians(angle))) / 2

@@ -26,7 +26,7 @@ from splatjax.diffusion import DenseDiffuser
 from splatjax.scene import DiskLight, RectangleLight, SphereLight, even_directions
 from splatjax.splatting import ShadowSettings
 
-BARE = sj.Material(two_gaussians(), specular=0.0)
+BARE = sj.Material(two_gaussians(), eta=1.0, specular=0.0)
 GLOSSY = sj.Material(two_gaussians(), specular=1.0, roughness=0.4)
 CAMERA = sj.Camera.look_at([0, 0, 60], [0, 0, 0], fov=24, width=24, height=24)
 SHADOWS = ShadowSettings(resolution=512)
@@ -104,7 +104,7 @@ def test_an_environment_is_the_sum_of_its_samples_in_every_layer():
     body = joined(sheet(6.0, 0.4), sphere(150, 2.0, (-1.0, 2.0, 4.0)))
     medium = sj.Medium([0.1, 0.02, 0.5], [0.9, 0.98, 0.5], 1.3)
     material = sj.Material(
-        two_gaussians(), specular=0.0, single_scattering=sj.SingleScattering(medium)
+        two_gaussians(), eta=1.0, specular=0.0, single_scattering=sj.SingleScattering(medium)
     )
     image = np.random.default_rng(1).uniform(size=(4, 8, 3)) ** 4
     sky = sj.EnvironmentLight(image, count=6)

@@ -39,7 +39,7 @@ def lamp(
 
 # Materials without a lobe, the colors of their albedo maps, and the share of light that returns.
 MARBLE, WHITE = (
-    sj.Material(gaussians, specular=0.0)
+    sj.Material(gaussians, eta=1.0, specular=0.0)
     for gaussians in (sj.load_material("marble").gaussians, two_gaussians().white())
 )
 REFLECTANCES = {
@@ -72,7 +72,7 @@ def test_white_furnace():
     count = 512
     # radiance 1 from everywhere: each light stands for its share of the sphere
     lights = tuple(lamp((4 * np.pi / count,) * 3, way) for way in directions(count, jitter=0.0))
-    scene = sj.Scene(sphere(4000, 50.0), lights, sj.Material(two_gaussians().white()))
+    scene = sj.Scene(sphere(4000, 50.0), lights, sj.Material(two_gaussians().white(), specular=1.0))
     camera = sj.Camera.look_at([0, 0, 400], [0, 0, 0], fov=16, width=32, height=32)
     frame = sj.render(scene, camera, PLAIN)
     covered = np.asarray(frame.coverage) > 0.999
@@ -101,7 +101,7 @@ def test_energy_does_not_depend_on_how_finely_half_the_sheet_is_splatted():
     camera = camera_over(5.0, 32)
     pictures = []
     for splats in (coarse, mixed):
-        scene = sj.Scene(splats, (beam,), sj.Material(gaussians, specular=0.0))
+        scene = sj.Scene(splats, (beam,), sj.Material(gaussians, eta=1.0, specular=0.0))
         pictures.append(np.asarray(sj.render(scene, camera, EXACT).diffuse)[..., 0])
     seen = pictures[0] > 1e-2 * pictures[0].max()
     assert np.max(np.abs(pictures[1] / pictures[0] - 1)[seen]) < 0.01
@@ -120,6 +120,24 @@ def test_light_is_added_linearly_and_layers_add_up_to_the_picture():
         np.testing.assert_allclose(frame.diffuse, total, atol=1e-6)
         np.testing.assert_allclose(frame.beauty, frame.diffuse + frame.specular, atol=1e-6)
     np.testing.assert_allclose(pictures[0], pictures[1] + pictures[2], atol=2e-6)
+
+
+@pytest.mark.once
+def test_the_index_and_not_the_lobe_decides_what_enters_and_leaves():
+    splats, light = sheet(16.0, 1.0), lamp((np.pi,) * 3, (0.0, -0.8, -0.6))
+
+    def diffuse(**surface):
+        scene = sj.Scene(splats, (light,), sj.Material(two_gaussians(), **surface))
+        return np.asarray(sj.render(scene, camera_over(6.0, 8), PLAIN).diffuse)[4, 4]
+
+    bare = diffuse(eta=1.5, specular=0.0)
+    np.testing.assert_array_equal(diffuse(eta=1.5, specular=1.0), bare)
+    # Smooth, the sheet takes in what Fresnel's term leaves and sends back more along the normal.
+    reflected, mean = 0.04 + 0.96 * 0.4**5, 0.04 + 0.96 / 21
+    expected = (1 - reflected) * 0.96 / (1 - mean)
+    smooth = diffuse(eta=1.5, roughness=0.05) / diffuse(eta=1.0)
+    np.testing.assert_allclose(smooth, expected, rtol=5e-3)
+    assert np.all(bare < 0.99 * diffuse(eta=1.0, specular=0.0))
 
 
 @pytest.mark.once

@@ -56,7 +56,7 @@ def test_irradiance_on_a_ball_is_that_of_its_bands(count):
     exact = factor * np.asarray(spherical_harmonics(body.normals, 3))
     gaussians = sj.SumOfGaussians([1.0], np.ones((1, 16)))
     light = HarmonicLight(np.eye(16), count=count, cast_shadows=False)  # one for each channel
-    scene = sj.Scene(body, light, sj.Material(gaussians, specular=0.0))
+    scene = sj.Scene(body, light, sj.Material(gaussians, eta=1.0, specular=0.0))
     plan = sj.make_plan(scene, CAMERA, PLAIN)
     received = np.asarray(sj.compute_irradiance(scene, plan, PLAIN).entering.T)
     assert np.max(np.abs(received - exact)) < HARMONIC[count]
