@@ -14,27 +14,42 @@ BATCH = 500  # media in one call
 
 
 @eqx.filter_jit
-def _fit_each(coefficients: Float[Array, "media 3"], starts: sj.fitting.DipoleStarts, count: int):
+def _fit_each(
+    coefficients: Float[Array, "media 3"],
+    starts: sj.fitting.DipoleStarts,
+    count: int,
+    model: sj.fitting.AbstractModel,
+):
     def fit(row):
         medium = sj.Medium(row[0:1], row[1:2], row[2:3])
-        start = sj.fitting.GivenVariances(starts(medium, count).variances[0])
         fitted = sj.fit_gaussians(
-            sj.Dipole(medium), count, start=start, weights=MEDIUM_WEIGHTS, throw=False
+            model.profile(medium),
+            count,
+            start=sj.fitting.GivenVariances(starts(medium, count).variances[0]),
+            weights=MEDIUM_WEIGHTS,
+            rule=model.rule,
+            throw=False,
         )
-        return fitted, fitted.result == optx.RESULTS.successful
+        return fitted, model.angles(medium), fitted.result == optx.RESULTS.successful
 
     return eqx.filter_vmap(fit)(coefficients)
 
 
-def fit_batch(coefficients: np.ndarray, count: int) -> dict[str, np.ndarray]:
-    """Return the columns of a batch. A smaller batch is padded, so that one program serves all."""
+def fit_batch(
+    coefficients: np.ndarray, count: int, model: sj.fitting.AbstractModel
+) -> dict[str, np.ndarray]:
+    """Return the columns of a batch. A smaller batch is padded, so that one program serves all.
+    Where fits to dipoles start, those to other models of the same media end soon.
+    """
     given = len(coefficients)
     padded = np.pad(coefficients, ((0, BATCH - given), (0, 0)), mode="edge")
-    fitted, converged = _fit_each(jnp.asarray(padded), sj.io.dipole_starts(), count)
+    fitted, angles, converged = _fit_each(jnp.asarray(padded), sj.io.dipole_starts(), count, model)
+    powers = [] if angles is None else angles.coefficients[..., 0].T
     columns = {
         **dict(zip(("sigma_a", "sigma_s_prime", "eta"), padded.T, strict=True)),
         **{f"variance_{i + 1}": fitted.gaussians.variances[:, i] for i in range(count)},
         **{f"weight_{i + 1}": fitted.gaussians.weights[:, i, 0] for i in range(count)},
+        **{f"angles_{power}": column for power, column in enumerate(powers)},
         "error": fitted.error[:, 0],
         "energy_error": fitted.energy_error[:, 0],
         "converged": converged.astype(float),

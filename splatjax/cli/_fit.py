@@ -16,7 +16,7 @@ from splatjax._format import channel_names, counted
 from splatjax.io import fingerprint, read_columns, read_media, write_columns
 
 from . import _batch
-from ._models import Model, Reference, reference
+from ._models import Model, Reference, model_by_name, reference
 from ._terminal import (
     FIGURES,
     OptionalFloat,
@@ -117,13 +117,18 @@ class Fit:
             self._run_all() if self.all else self._run()
 
     def _run_all(self) -> None:
-        """Fit the dipoles of the media of a table, in batches that lie in a folder until all are
-        there: the processes of a launcher share them.
+        """Fit the media of a table, in batches that lie in a folder until all are there: the
+        processes of a launcher share them.
         """
         if self.output is None:
             raise ValueError("--all needs --output, a CSV file for what is fitted")
-        if self != Fit(medium=self.medium, all=True, count=self.count, output=self.output):
-            raise ValueError("--all fits dipoles by --count alone; leave the other options out")
+        kept = {name: getattr(self, name) for name in ("medium", "count", "model", "g", "output")}
+        if self != Fit(all=True, **kept) or self.model == "monte-carlo":
+            raise ValueError(
+                "--all takes --count, --g, and --model photon-beam, dipole or better-dipole; leave "
+                "the other options out"
+            )
+        model = model_by_name(self.model, self.g)
         names, coefficients = read_media(Path(self.medium))
         path = self.output.with_name(f"{self.output.name}.parts")
         begins = range(0, len(names), _batch.BATCH)
@@ -132,7 +137,8 @@ class Fit:
         def fit(i: int) -> None:
             batch = slice(begins[i], begins[i] + _batch.BATCH)
             write_columns(
-                parts[i], {"name": names[batch]} | _batch.fit_batch(coefficients[batch], self.count)
+                parts[i],
+                {"name": names[batch]} | _batch.fit_batch(coefficients[batch], self.count, model),
             )
 
         done = complete(
@@ -140,6 +146,8 @@ class Fit:
             {
                 "media": fingerprint(self.medium),
                 "--count": self.count,
+                "--model": self.model,
+                "--g": self.g,
                 "splatjax": sj.__version__,
                 "jax": jax.__version__,
             },
@@ -262,7 +270,8 @@ class Fit:
             f"fitted by splatjax {sj.__version__} to the "
             f"{'profile' if known is None else 'coefficients'} of {self.medium}"
         )
-        provenance = "; ".join(filter(None, [source.get("provenance"), fitted_by]))
+        before = source.get("provenance", "").split("; fitted by splatjax")[0]
+        provenance = "; ".join(filter(None, [before, fitted_by]))
         sj.save_material(
             sj.Material(
                 fitted.gaussians, **surface, single_scattering=target.single, angles=target.angles

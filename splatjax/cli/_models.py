@@ -14,9 +14,14 @@ from ._terminal import stage
 Model: TypeAlias = Literal["dipole", "better-dipole", "photon-beam", "monte-carlo"]
 # Weights of the fit to a medium: the picture keeps its energy.
 MEDIUM_WEIGHTS = sj.fitting.NonNegativeWeights(sj.fitting.FixedTotalReflectance())
-# Radii for profiles that are infinite at the origin: from half a mean free path on, which splats
-# hardly resolve, and weighted for the tail, so that shadows are right where they are deep.
-_BEYOND = sj.scattering.L2_QUADRATURE.beyond(0.5, tail=3.0)
+_BEYOND = sj.fitting.TransportModel.rule
+
+
+def model_by_name(model: Model | None, g: float) -> sj.fitting.AbstractModel:
+    """Return the model of a half space that an option names; light transport unless given."""
+    if model == "better-dipole":
+        return sj.fitting.DiffusionModel(sj.scattering.BetterDipole)
+    return sj.fitting.DiffusionModel() if model == "dipole" else sj.fitting.TransportModel(g)
 
 
 @dataclass(frozen=True)
@@ -70,18 +75,16 @@ def reference(
         )
     if model == "monte-carlo":
         return _walked(coefficients, photons, g, single_scattering)
-    if is_layered or model == "dipole":
+    if is_layered:
         return Reference(coefficients)
-    if model == "better-dipole":
-        return Reference(sj.scattering.BetterDipole(coefficients.medium))
-    half_space = sj.scattering.HalfSpace(coefficients.medium, g)
-    beam = sj.scattering.PhotonBeam(coefficients.medium).with_total(half_space.total_reflectance())
-    description = "photon beam with the total of light transport"
-    single, angles = _parted(half_space, single_scattering)
-    if single is None:
-        return Reference(beam, _BEYOND, None, description, angles)
-    description += ", without single scattering"
-    return Reference(beam.multiply_scattered(), _BEYOND, single, description, angles)
+    chosen, medium = model_by_name(model, g), coefficients.medium
+    profile, description = chosen.profile(medium), chosen.description
+    if not single_scattering:
+        return Reference(profile, chosen.rule, None, description, chosen.angles(medium))
+    assert isinstance(profile, sj.scattering.PhotonBeam)
+    single, angles = _parted(sj.scattering.HalfSpace(medium, g), single_scattering)
+    description = f"{description}, without single scattering"
+    return Reference(profile.multiply_scattered(), _BEYOND, single, description, angles)
 
 
 def _parted(

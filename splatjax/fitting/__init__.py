@@ -9,6 +9,11 @@ from ._fit import (
     LeastCount as LeastCount,
 )
 from ._medium import fit_medium as fit_medium, MediumFit as MediumFit
+from ._models import (
+    AbstractModel as AbstractModel,
+    DiffusionModel as DiffusionModel,
+    TransportModel as TransportModel,
+)
 from ._problem import relative_error as relative_error, squared_error as squared_error
 from ._search import (
     AbstractStart as AbstractStart,

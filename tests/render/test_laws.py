@@ -23,6 +23,7 @@ from bodies import (
 import splatjax as sj
 from splatjax.diffusion import ClusterDiffuser, DenseDiffuser
 from splatjax.render import _checks
+from splatjax.shading import directional_albedo, fresnel_f0
 
 EXITANCE_TOLERANCE = 1e-3
 TILES = sj.RenderSettings(diffuser=DenseDiffuser())
@@ -72,7 +73,7 @@ def test_white_furnace():
     count = 512
     # radiance 1 from everywhere: each light stands for its share of the sphere
     lights = tuple(lamp((4 * np.pi / count,) * 3, way) for way in directions(count, jitter=0.0))
-    scene = sj.Scene(sphere(4000, 50.0), lights, sj.Material(two_gaussians().white(), specular=1.0))
+    scene = sj.Scene(sphere(4000, 50.0), lights, sj.Material(two_gaussians().white(), specular=1.0, roughness=0.6))
     camera = sj.Camera.look_at([0, 0, 400], [0, 0, 0], fov=16, width=32, height=32)
     frame = sj.render(scene, camera, PLAIN)
     covered = np.asarray(frame.coverage) > 0.999
@@ -245,7 +246,8 @@ def test_it_is_its_formula_and_part_of_the_beauty():
     lit, entered = with_single_scattering(), 0.8 * np.asarray([1.0, 2.0, 3.0])
     frame = picture(lit)
     reflected = lit.single_scattering.reflected(jnp.asarray(0.8), jnp.asarray(0.8))
-    expected = np.asarray(reflected) * entered * COLORS
+    enters = 1 - directional_albedo(jnp.asarray(0.8), fresnel_f0(lit.eta), lit.roughness)
+    expected = np.asarray(reflected * enters) * entered * COLORS
     np.testing.assert_allclose(frame.single_scattering[2, 2], expected, rtol=1e-3)
     parts = frame.diffuse + frame.specular + frame.single_scattering
     np.testing.assert_allclose(frame.beauty, parts, rtol=1e-6)

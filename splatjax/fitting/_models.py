@@ -1,0 +1,85 @@
+"""What a picture is made of, given a medium: the profile, the radii at which its fit counts, and
+the angles of its light.
+"""
+
+import abc
+from collections.abc import Callable
+from typing import ClassVar
+
+import equinox as eqx
+from jaxtyping import Array, Float
+
+from splatjax._records import numbers, record
+from splatjax.gaussians import AbstractProfile
+from splatjax.scattering import (
+    L2_QUADRATURE,
+    AbstractRadialRule,
+    AngularLaw,
+    Dipole,
+    HalfSpace,
+    Medium,
+    PhotonBeam,
+)
+
+
+class AbstractModel(eqx.Module):
+    """A model of light in a half space.
+
+    **Attributes:** (of the class)
+
+    - `rule`: the radii at which a fit to its profiles counts.
+    - `description`: of its profile, for files; `None` where coefficients alone give it back.
+    """
+
+    rule: ClassVar[AbstractRadialRule] = L2_QUADRATURE
+    description: ClassVar[str | None] = None
+
+    @abc.abstractmethod
+    def profile(self, medium: Medium) -> AbstractProfile:
+        """Compute the profile of a medium. Differentiable."""
+
+    def angles(self, medium: Medium) -> AngularLaw | None:
+        """Compute how the light depends on the angles of entry and exit; `None`: not at all."""
+        return None
+
+
+class DiffusionModel(AbstractModel):
+    r"""A closed form alone: `Dipole`, as in publications, or `BetterDipole`.
+
+    **Attributes:**
+
+    - `kind`: from a medium to a profile that is finite at the origin. Static.
+    """
+
+    kind: Callable[[Medium], AbstractProfile] = eqx.field(static=True, default=Dipole)
+
+    def profile(self, medium: Medium) -> AbstractProfile:
+        return self.kind(medium)
+
+
+@record
+class TransportModel(AbstractModel):
+    r"""Light transport: the photon beam with the total reflectance and the angles of a `HalfSpace`.
+
+    A fit counts from half a mean free path on, which splats hardly resolve, and by the fourth
+    power of the radius, so that shadows are right where they are deep.
+
+    **Attributes:**
+
+    - `g`: mean cosine of the phase function; one for all channels.
+    """
+
+    g: Float[Array, ""] = eqx.field(converter=numbers, default=0.0)
+
+    rule: ClassVar[AbstractRadialRule] = L2_QUADRATURE.beyond(0.5, tail=3.0)
+    description: ClassVar[str | None] = "photon beam with the total of light transport"
+
+    def half_space(self, medium: Medium) -> HalfSpace:
+        return HalfSpace(medium, self.g.astype(medium.eta.dtype))
+
+    def profile(self, medium: Medium) -> PhotonBeam:
+        total = self.half_space(medium).total_reflectance()
+        return PhotonBeam(medium).with_total(total)
+
+    def angles(self, medium: Medium) -> AngularLaw:
+        return self.half_space(medium).angular_law()
