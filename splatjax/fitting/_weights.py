@@ -21,6 +21,7 @@ from lineax.internal import (
     unravel_solution,
 )
 
+_UNSEEN = 1e-12  # squared norm of a Gaussian whose own is 1
 _ROUNDING = 100.0
 _EXCHANGES = 64
 
@@ -146,7 +147,10 @@ class FreeWeights(AbstractWeights):
     """
 
     def solve(self, basis, target, energies, total):
-        inverse = invert(basis.T @ basis)
+        # Gaussians narrower than the first radius have no norm there: of what they may hold, the
+        # shortest coefficients.
+        ridge = _UNSEEN * jnp.eye(basis.shape[1], dtype=basis.dtype)
+        inverse = invert(basis.T @ basis + ridge)
         return least_squares(basis, target, inverse), inverse
 
 
