@@ -61,7 +61,7 @@ class DiffusionModel(AbstractModel):
 class TransportModel(AbstractModel):
     r"""Light transport: the photon beam with the total reflectance and the angles of a `HalfSpace`.
 
-    A fit counts from half a mean free path on, which splats hardly resolve, and by the fourth
+    A fit counts from half a mean free path on, which splats hardly resolve, and by the fifth
     power of the radius, so that shadows are right where they are deep.
 
     **Attributes:**
@@ -71,7 +71,7 @@ class TransportModel(AbstractModel):
 
     g: Float[Array, ""] = eqx.field(converter=numbers, default=0.0)
 
-    rule: ClassVar[AbstractRadialRule] = L2_QUADRATURE.beyond(0.5, tail=3.0)
+    rule: ClassVar[AbstractRadialRule] = L2_QUADRATURE.beyond(0.5, tail=4.0)
     description: ClassVar[str | None] = "photon beam with the total of light transport"
 
     def half_space(self, medium: Medium) -> HalfSpace:

@@ -216,9 +216,12 @@ def test_a_table_of_media_becomes_a_table_of_fits_and_is_continued(
     with jax.enable_x64(True):
         medium = sj.Medium(*(jnp.asarray([value]) for value in (0.03, 0.7, 1.2)))
         weights = sj.fitting.NonNegativeWeights(sj.fitting.FixedTotalReflectance())
-        alone = sj.fit_gaussians(sj.Dipole(medium), 2, weights=weights)
+        model = sj.fitting.TransportModel()
+        alone = sj.fit_gaussians(model.profile(medium), 2, weights=weights, rule=model.rule)
         expected = [*alone.gaussians.variances, *alone.gaussians.weights[:, 0], alone.error[0]]
+        expected += [*model.angles(medium).coefficients[:, 0]]
         columns = ("variance_1", "variance_2", "weight_1", "weight_2", "error")
+        columns += tuple(f"angles_{power}" for power in range(5))
         found = [float(rows[3][column]) for column in columns]
         np.testing.assert_allclose(found, np.asarray(expected), rtol=1e-6)
 

@@ -39,12 +39,12 @@ def lamp(
 
 
 # Materials without a lobe, the colors of their albedo maps, and the share of light that returns.
-MARBLE, WHITE = (
+SKIN, WHITE = (
     sj.Material(gaussians, eta=1.0, specular=0.0)
-    for gaussians in (sj.load_material("marble").gaussians, two_gaussians().white())
+    for gaussians in (sj.load_material("skin1").gaussians, two_gaussians().white())
 )
 REFLECTANCES = {
-    "marble": (MARBLE, None, MARBLE.gaussians.total_reflectance()),
+    "skin1": (SKIN, None, SKIN.gaussians.total_reflectance()),
     "white with an albedo": (WHITE, [0.8, 0.4, 0.1], [0.8, 0.4, 0.1]),
     "white": (WHITE, [1.0, 1.0, 1.0], [1.0, 1.0, 1.0]),
 }
