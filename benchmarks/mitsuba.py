@@ -233,7 +233,7 @@ class Splatted:
             time.process_time(),
         )
         return sj.inverse.recover(
-            [seen], self.splats, starts(medium, away), model=model, throw=False
+            [seen], self.splats, starts(medium, away), model=model
         ), time.process_time() - begin
 
 

@@ -14,6 +14,7 @@ import tyro
 import splatjax as sj
 from splatjax._format import counted
 
+from ._models import model_by_name
 from ._terminal import (
     FIGURES,
     OptionalFloat,
@@ -28,7 +29,6 @@ from ._terminal import (
 # Of any translucent solid: diamond has 2.4.
 _LARGEST_ETA = 3.0
 _COEFFICIENTS = ("sigma_a", "sigma_s_prime")
-_MODELS = {"dipole": sj.Dipole, "better-dipole": sj.scattering.BetterDipole}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,8 +77,10 @@ class Recover:
     output: Path = Path("recovered.toml")
     #: Picture to write of what was seen, what was recovered and what is left: .png, .pdf or .svg.
     report: OptionalPath = None
-    #: What makes a profile of the coefficients.
-    model: Literal["dipole", "better-dipole"] = "dipole"
+    #: What makes a profile of the coefficients: docs/which_profile.md.
+    model: Literal["photon-beam", "dipole", "better-dipole"] = "photon-beam"
+    #: Of photon beams: the mean cosine of the phase function.
+    g: float = 0.0
     #: Number of Gaussians.
     count: int = 6
     #: Let pixels that are far off count less: highlights, dust, what the model does not know.
@@ -99,7 +101,8 @@ class Recover:
                 "eta": (
                     self.eta is None or 1 <= self.eta <= _LARGEST_ETA,
                     f"lie between 1 and {_LARGEST_ETA:g}: marble has 1.5, skin 1.4",
-                )
+                ),
+                "g": (abs(self.g) <= 0.95, "lie between -0.95 and 0.95"),
             },
         )
         if not self.start:
@@ -123,6 +126,7 @@ class Recover:
         dependencies = {
             "files": [sj.io.fingerprint(file) for file in files],
             "model": self.model,
+            "g": self.g,
             "count": self.count,
             "robust": self.robust,
             "eta": self.eta,
@@ -145,24 +149,27 @@ class Recover:
             splats,
             starts,
             surface=sj.Material(gaussians, starts[0].eta[0], self.specular, self.roughness),
-            model=_MODELS[self.model],
+            model=model_by_name(self.model, self.g),
             count=self.count,
             loss=sj.inverse.HuberLoss() if self.robust else sj.inverse.SquaredLoss(),
             progress=report,
-            throw=False,
         )
+        settled = recovery.result == optx.RESULTS.successful
         effort = f"{counted(recovery.rounds, 'round')} and {counted(recovery.steps, 'step')}"
-        if recovery.result != optx.RESULTS.successful:
-            raise ValueError(
-                f"{self.pictures}: the search did not settle in {effort}; the same command goes on "
-                "where it stopped, or --start names materials that are nearer"
+        ended = "found" if settled else "ended"
+        note(f"{time.perf_counter() - begin:6.1f} s  {ended}, after {effort}")
+        if not settled:
+            report("kept", recovery.medium)
+            note(
+                f"{self.pictures}: the search did not settle, and this is its best round; the same "
+                "command goes on there, or --start names materials that are nearer"
             )
-        note(f"{time.perf_counter() - begin:6.1f} s  found, after {effort}")
         print(recovery.summary())
         if self.suggest:
             self._suggest(recovery, observations, splats)
         self._save(recovery)
-        search.unlink(missing_ok=True)
+        if settled:
+            search.unlink(missing_ok=True)
         print(self.output)
         if self.report is not None:
             from splatjax.plots import plot_recovery  # loads matplotlib
@@ -202,17 +209,17 @@ class Recover:
         candidates = sj.inverse.default_candidates(splats, first.camera, first.picture.shape[2])
         with stage(f"looking at {len(candidates)} pictures that could be taken next"):
             predictions = sj.inverse.next_pictures(
-                recovery, splats, candidates, model=_MODELS[self.model]
+                recovery, splats, candidates, model=model_by_name(self.model, self.g)
             )
         print("what one more picture would do, the best first:")
         print(*(f"  {prediction}" for prediction in predictions), sep="\n")
 
     def _save(self, recovery: sj.inverse.Recovery) -> None:
-        errors = recovery.relative_errors()
+        errors, model = recovery.relative_errors(), model_by_name(self.model, self.g)
         sj.save_material(
             recovery.material,
             self.output,
-            profile=_MODELS[self.model](recovery.medium),
+            profile=model.profile(recovery.medium),
             source={
                 "provenance": (
                     f"recovered by splatjax {sj.__version__} from the pictures of "
@@ -223,6 +230,7 @@ class Recover:
                 "chi_squared": float(recovery.chi_squared),
             },
             fit={
+                **({} if model.description is None else {"profile": model.description}),
                 "variances_of": "all channels",
                 "weights_of": "non-negative, sum held to the total reflectance",
             },

@@ -7,9 +7,7 @@ from collections.abc import Callable
 from typing import ClassVar
 
 import equinox as eqx
-from jaxtyping import Array, Float
 
-from splatjax._records import numbers, record
 from splatjax.gaussians import AbstractProfile
 from splatjax.scattering import (
     L2_QUADRATURE,
@@ -57,7 +55,6 @@ class DiffusionModel(AbstractModel):
         return self.kind(medium)
 
 
-@record
 class TransportModel(AbstractModel):
     r"""Light transport: the photon beam with the total reflectance and the angles of a `HalfSpace`.
 
@@ -66,16 +63,16 @@ class TransportModel(AbstractModel):
 
     **Attributes:**
 
-    - `g`: mean cosine of the phase function; one for all channels.
+    - `g`: mean cosine of the phase function; one for all channels, or one for each. Static.
     """
 
-    g: Float[Array, ""] = eqx.field(converter=numbers, default=0.0)
+    g: float | tuple[float, ...] = eqx.field(static=True, default=0.0)
 
     rule: ClassVar[AbstractRadialRule] = L2_QUADRATURE.beyond(0.5, tail=4.0)
     description: ClassVar[str | None] = "photon beam with the total of light transport"
 
     def half_space(self, medium: Medium) -> HalfSpace:
-        return HalfSpace(medium, self.g.astype(medium.eta.dtype))
+        return HalfSpace(medium, self.g)
 
     def profile(self, medium: Medium) -> PhotonBeam:
         total = self.half_space(medium).total_reflectance()

@@ -1,6 +1,6 @@
 """Which picture to take next, by what it would do to the error bars."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import equinox as eqx
 import numpy as np
@@ -8,10 +8,14 @@ from jaxtyping import Float
 
 from splatjax._format import percent
 from splatjax._records import record, several
-from splatjax.fitting import AbstractWeights, FixedTotalReflectance, NonNegativeWeights
-from splatjax.gaussians import AbstractProfile
+from splatjax.fitting import (
+    AbstractModel,
+    AbstractWeights,
+    FixedTotalReflectance,
+    NonNegativeWeights,
+    TransportModel,
+)
 from splatjax.render import RenderSettings
-from splatjax.scattering import Dipole, Medium
 from splatjax.scene import AbstractLight, Camera, DirectionalLight, GaussianBeam, Splats
 
 from ._observation import AbstractIntensity, Evidence, KnownIntensity, Observation, SquaredLoss
@@ -60,7 +64,7 @@ def next_pictures(
     splats: Splats,
     candidates: Sequence[Candidate],
     *,
-    model: Callable[[Medium], AbstractProfile] = Dipole,
+    model: AbstractModel = TransportModel(),
     weights: AbstractWeights = NonNegativeWeights(FixedTotalReflectance()),
     settings: RenderSettings = RenderSettings(),
 ) -> list[Prediction]:
@@ -93,7 +97,7 @@ def next_pictures(
     pictured_scenes = [PicturedScene(splats, one.camera, one.lights) for one in candidates]
     pictures, _ = render_layers(pictured_scenes, recovery.material, settings)
     near = recovery.material.gaussians.variances.astype(dtype)
-    fit = eqx.Partial(fit_near, near=near, weights=weights)
+    fit = eqx.Partial(fit_near, near=near, weights=weights, rule=model.rule)
     noise = recovery.relative_noise * recovery.scale**0.5
     predictions = []
     for candidate, picture in zip(candidates, pictures, strict=True):

@@ -13,7 +13,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, DTypeLike, Float, Int
 
 from splatjax.diffusion import resolved_fraction
-from splatjax.fitting import AbstractWeights, GivenVariances, fit_gaussians
+from splatjax.fitting import AbstractModel, AbstractWeights, GivenVariances, fit_gaussians
 from splatjax.gaussians import AbstractProfile, SumOfGaussians
 from splatjax.render import (
     DiffusionBasis,
@@ -23,7 +23,7 @@ from splatjax.render import (
     illuminate,
     make_plan,
 )
-from splatjax.scattering import Medium
+from splatjax.scattering import AbstractRadialRule, Medium
 from splatjax.scene import Material, Splats
 
 from ._observation import (
@@ -172,11 +172,14 @@ class Unknowns(eqx.Module):
 
 
 def fit_near(
-    profile: AbstractProfile, near: Float[Array, " gaussians"], weights: AbstractWeights
+    profile: AbstractProfile,
+    near: Float[Array, " gaussians"],
+    weights: AbstractWeights,
+    rule: AbstractRadialRule,
 ) -> SumOfGaussians:
     """Fit Gaussians whose variances lie near given ones, and move as the profile does."""
     return fit_gaussians(
-        profile, len(near), weights=weights, start=GivenVariances(near), throw=False
+        profile, len(near), weights=weights, start=GivenVariances(near), rule=rule, throw=False
     ).gaussians
 
 
@@ -196,7 +199,7 @@ class RecoveryProblem(eqx.Module):
     unknowns: Unknowns
     fit: Callable[[AbstractProfile], SumOfGaussians]
     loss: AbstractLoss
-    model: Callable[[Medium], AbstractProfile] = eqx.field(static=True)
+    model: AbstractModel
 
     @classmethod
     def of(
@@ -206,7 +209,7 @@ class RecoveryProblem(eqx.Module):
         unknowns: Unknowns,
         fit: Callable[[AbstractProfile], SumOfGaussians],
         loss: AbstractLoss,
-        model: Callable[[Medium], AbstractProfile],
+        model: AbstractModel,
     ) -> "RecoveryProblem":
         """Compare rendered pictures with the observed ones, at the pixels that the body fills."""
         dtype, background, kept, counted = unknowns.eta.dtype, UnknownBackground(), [], []
@@ -224,7 +227,7 @@ class RecoveryProblem(eqx.Module):
         return int(sum(np.sum(counted) for counted in self.counted))
 
     def gaussians(self, point: Float[Array, " unknowns"]) -> SumOfGaussians:
-        return self.fit(self.model(self.unknowns.medium(point)))
+        return self.fit(self.model.profile(self.unknowns.medium(point)))
 
     def radiance(
         self, point: Float[Array, " unknowns"]
@@ -258,7 +261,8 @@ def search(
     problem: RecoveryProblem, start: Float[Array, " unknowns"]
 ) -> tuple[Float[Array, " unknowns"], Float[Array, ""], Int[Array, ""], Bool[Array, ""]]:
     """Minimize the loss from a start by the Levenberg-Marquardt method: where it ends, the loss
-    there, the number of steps, and whether it has converged.
+    there, the number of steps, and whether it has converged. It never ends where the loss is larger
+    or unknown.
     """
     tolerance = 1e-4 if start.dtype == jnp.float32 else 1e-7
     # In units of the start's own residual, so that damping and tolerances mean the same for any
@@ -271,8 +275,10 @@ def search(
     solver = optx.LevenbergMarquardt(rtol=tolerance, atol=tolerance)
     end = optx.least_squares(residuals, solver, start, problem, max_steps=_STEPS, throw=False)
     cost = jnp.sum(problem.residuals(end.value) ** 2)
-    converged = (end.result == optx.RESULTS.successful) & jnp.isfinite(cost)
-    return end.value, cost, jnp.asarray(end.stats["num_steps"]), converged
+    is_better = cost <= unit * unit
+    converged = (end.result == optx.RESULTS.successful) & is_better
+    best = jnp.where(is_better, end.value, start), jnp.where(is_better, cost, unit * unit)
+    return *best, jnp.asarray(end.stats["num_steps"]), converged
 
 
 class Solution(eqx.Module):

@@ -1,5 +1,6 @@
 """From pictures of a known shape to the coefficients of its material."""
 
+import warnings
 from collections.abc import Callable, Sequence
 
 import equinox as eqx
@@ -13,15 +14,17 @@ from splatjax._format import counted
 from splatjax._records import check_values
 from splatjax.diffusion import ClusterDiffuser
 from splatjax.fitting import (
+    AbstractModel,
     AbstractWeights,
     FixedTotalReflectance,
     NonNegativeWeights,
+    TransportModel,
     fit_gaussians,
     fit_weights,
 )
-from splatjax.gaussians import AbstractProfile, SumOfGaussians
+from splatjax.gaussians import SumOfGaussians
 from splatjax.render import RenderSettings
-from splatjax.scattering import Dipole, Medium
+from splatjax.scattering import Medium
 from splatjax.scene import Material, Splats
 
 from ._observation import (
@@ -60,13 +63,12 @@ def recover(
     starts: Medium | Sequence[Medium],
     *,
     surface: Material | None = None,
-    model: Callable[[Medium], AbstractProfile] = Dipole,
+    model: AbstractModel = TransportModel(),
     count: int = 6,
     weights: AbstractWeights = NonNegativeWeights(FixedTotalReflectance()),
     loss: AbstractLoss = SquaredLoss(),
     settings: RenderSettings = _FINE,
     progress: Callable[[str, Medium], None] | None = None,
-    throw: bool = True,
 ) -> Recovery:
     r"""Find the absorption and scattering that explain pictures of a known shape: weighted least
     squares on all pixels at once.
@@ -77,7 +79,8 @@ def recover(
     compiled between steps, nor between starts. At first the variances are fixed: those of
     `wide_variances` serve all coefficients within a factor of three of the starts. Then, in rounds,
     they are those of the fit to the coefficients, and layers move along their slopes as the fit
-    does, until a round changes nothing. The final picture is the one that `render` makes of
+    does, until a round changes nothing; the angles of the light are those of the coefficients with
+    which the round begins. The final picture is the one that `render` makes of
     `Recovery.material`, with the derivatives of `picture_jacobian`.
 
     **Arguments:**
@@ -89,7 +92,7 @@ def recover(
       several, the best end is kept.
     - `surface`: its specular strength and roughness are known, and its index, which is that of the
       starts; its Gaussians do not matter. By default there is no specular lobe.
-    - `model`: from a medium to a profile that is finite at the origin.
+    - `model`: `TransportModel()`, by default, or `DiffusionModel()`, the classical dipole.
     - `count`: number of Gaussians.
     - `weights`: how they are fitted; by default not negative and with a fixed sum, as in the
       materials that come with the package.
@@ -98,14 +101,15 @@ def recover(
       `render`: where much light comes back, a picture that is off by 0.1% means an absorption that
       is off by 2%.
     - `progress`: called with a description of each stage, and the best medium so far.
-    - `throw`: raise if a search has not converged; otherwise `result` reports it.
 
     **Returns:** a `Recovery` in JAX's default precision: under `jax.enable_x64` small errors show,
-    the pictures stay as they are.
+    the pictures stay as they are. If the rounds have not settled it is that of the round with the
+    least loss, with its error bars: `result` reports it, and a `RuntimeWarning`. To go on, start
+    from its `medium`.
 
     **Raises:** `ValueError` for no observation or start, for channels that disagree, for starts
     without absorption, for different indices of surface and starts, and for a picture none of whose
-    pixels counts; an error with the message of `result` if `throw`.
+    pixels counts.
     """
     dtype, observations = jnp.result_type(float), list(observations)
     starts = [
@@ -122,14 +126,14 @@ def recover(
     wide = wide_variances(starts, splats)
     surface = surface or Material(_unweighed(wide, channels), eta=eta[0], specular=0)
 
-    def problem_at(variances, fit, plans=None, derivative=True):
-        material = surface.surface_of(_unweighed(variances, channels))
+    def problem_at(medium, variances, fit, plans=None, derivative=True):
+        material = surface.surface_of(_unweighed(variances, channels), model.angles(medium))
         pictures, plans = render_layers(pictured_scenes, material, settings, plans, derivative)
         return RecoveryProblem.of(pictures, evidence, unknowns, fit, loss, model), plans
 
     report(f"rendering {len(wide)} layers of {counted(len(observations), 'picture')}", starts[0])
-    fit = eqx.Partial(fit_weights, variances=wide, weights=weights)
-    problem, _ = problem_at(wide, fit, derivative=False)
+    fit = eqx.Partial(fit_weights, variances=wide, weights=weights, rule=model.rule)
+    problem, _ = problem_at(starts[0], wide, fit, derivative=False)
     report(
         f"searching from {counted(len(starts), 'start')} among {problem.pixels} pixels", starts[0]
     )
@@ -137,7 +141,7 @@ def recover(
     points, costs, steps, _ = zip(*ends, strict=True)
     costs = np.nan_to_num(np.asarray(costs, float), nan=np.inf)
     point, steps = points[int(np.argmin(costs))], sum(map(int, steps))
-    settled, plans, rounds = False, None, 0
+    settled, plans, rounds, best = False, None, 0, None
     while not settled and rounds < _ROUNDS:
         rounds += 1
         medium = unknowns.medium(point)
@@ -150,9 +154,12 @@ def recover(
             f"sigma_a {sigma_a}, sigma_s' {sigma_s_prime}",
             medium,
         )
-        fitted = fit_gaussians(model(medium), count, weights=weights, throw=False).gaussians
-        fit = eqx.Partial(fit_near, near=fitted.variances, weights=weights)
-        problem, plans = problem_at(fitted.variances, fit, plans)
+        profile, rule = model.profile(medium), model.rule
+        variances = fit_gaussians(
+            profile, count, weights=weights, rule=rule, throw=False
+        ).gaussians.variances
+        fit = eqx.Partial(fit_near, near=variances, weights=weights, rule=rule)
+        problem, plans = problem_at(medium, variances, fit, plans)
         before = point
         point, cost, more, converged = search(problem, before)
         steps += int(more)
@@ -163,27 +170,38 @@ def recover(
         deviations = scale * np.sqrt(np.diagonal(covariance))
         moved = np.abs(point - before)
         settled = bool(converged) and np.all(moved <= np.maximum(_SETTLED, 0.1 * deviations))
-    pictures, residuals = compared(reached.radiance, problem.counted, evidence)
-    recovery = Recovery(
-        medium=unknowns.medium(point),
-        material=surface.surface_of(reached.gaussians),
-        intensities=unknowns.intensities(point),
-        information=reached.information,
-        unresolved=reached.unresolved,
-        chi_squared=chi_squared,
-        pictures=pictures,
-        residuals=residuals,
-        ends=tuple(map(unknowns.medium, points)),
-        costs=jnp.asarray(costs, dtype),
-        result=optx.RESULTS.where(
-            jnp.asarray(settled), optx.RESULTS.successful, optx.RESULTS.nonlinear_max_steps_reached
-        ),
-        noise_is_known=noise_is_known,
-        relative_noise=float(np.mean([one.relative_noise for one in evidence])),
-        steps=steps,
-        rounds=rounds,
-    )
-    return recovery.result.error_if(recovery, True) if throw and not settled else recovery
+        if settled or best is None or float(chi_squared) <= float(best.chi_squared):
+            pictures, residuals = compared(reached.radiance, problem.counted, evidence)
+            best = Recovery(
+                medium=unknowns.medium(point),
+                material=surface.surface_of(reached.gaussians, model.angles(medium)),
+                intensities=unknowns.intensities(point),
+                information=reached.information,
+                unresolved=reached.unresolved,
+                chi_squared=chi_squared,
+                pictures=pictures,
+                residuals=residuals,
+                ends=tuple(map(unknowns.medium, points)),
+                costs=jnp.asarray(costs, dtype),
+                result=optx.RESULTS.where(
+                    jnp.asarray(settled),
+                    optx.RESULTS.successful,
+                    optx.RESULTS.nonlinear_max_steps_reached,
+                ),
+                noise_is_known=noise_is_known,
+                relative_noise=float(np.mean([one.relative_noise for one in evidence])),
+                steps=steps,
+                rounds=rounds,
+            )
+    assert best is not None
+    if not settled:
+        warnings.warn(
+            f"the coefficients still moved in round {rounds}, the last; this is the round with the "
+            "least loss: start from its medium to go on",
+            RuntimeWarning,
+            stacklevel=2,
+        )
+    return best
 
 
 def _check(

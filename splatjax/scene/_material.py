@@ -99,9 +99,9 @@ class Material(eqx.Module):
         is_over = left < factor * total
         return jnp.where(is_over, left / jnp.where(is_over, total, 1.0), factor)
 
-    def surface_of(self, gaussians: SumOfGaussians) -> "Material":
-        """Return a material of other Gaussians with this surface, without single scattering."""
-        return Material(gaussians, self.eta, self.specular, self.roughness)
+    def surface_of(self, gaussians: SumOfGaussians, angles: AngularLaw | None = None) -> "Material":
+        """Return a material of other light with this surface, without single scattering."""
+        return Material(gaussians, self.eta, self.specular, self.roughness, angles=angles)
 
     def opaque(self) -> "Material":
         """Replace scattering by one Gaussian, narrower than any splat, of the total reflectance."""

@@ -10,6 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix as optx
 import pytest
 from bodies import lights_from_two_sides as lights
 
@@ -34,6 +35,7 @@ PLAIN = sj.RenderSettings(
 SIZE = 24
 camera = partial(bodies.view, size=SIZE)
 COUNT = 3
+DIPOLE = sj.fitting.DiffusionModel()
 HELD = sj.fitting.NonNegativeWeights(sj.fitting.FixedTotalReflectance())
 # The second light, than is given.
 STRONGER = 1.7
@@ -77,7 +79,12 @@ def recovered(pictures, starts, deviation=None, **more) -> sj.inverse.Recovery:
         jax.tree.map(lambda leaf: leaf.astype(jnp.float32), medium(*off)) for off in starts
     ]  # as they are loaded elsewhere
     return sj.inverse.recover(
-        observations(pictures, deviation), taken()[0], media, count=COUNT, settings=PLAIN, **more
+        observations(pictures, deviation),
+        taken()[0],
+        media,
+        count=COUNT,
+        settings=PLAIN,
+        **({"model": DIPOLE} | more),
     )
 
 
@@ -135,7 +142,9 @@ class TestRecover:
             for view in views
         ]
         start = medium(*STARTS[0])
-        found = sj.inverse.recover(seen, taken()[0], start, count=COUNT, settings=PLAIN)
+        found = sj.inverse.recover(
+            seen, taken()[0], start, count=COUNT, settings=PLAIN, model=DIPOLE
+        )
         assert np.max(np.abs(errors(found))) < 2 * ROUNDS
         assert illuminate.call_count == 1 + found.rounds
 
@@ -161,12 +170,37 @@ class TestRecover:
         assert np.mean(np.abs(pulls) < 2) > 0.85
 
     @pytest.mark.long
+    def test_light_transport_comes_back_with_its_angles(self):
+        model, splats = sj.fitting.TransportModel(), taken()[0]
+        profile = model.profile(medium())
+        light = sj.fit_gaussians(profile, COUNT, weights=HELD, rule=model.rule).gaussians
+        material = sj.Material(light, eta=1.3, specular=0.0, angles=model.angles(medium()))
+        pictures = [
+            sj.render(sj.Scene(splats, lamp, material), camera(), PLAIN).beauty * factor
+            for lamp, factor in zip(lights(), (1.0, STRONGER), strict=True)
+        ]
+        found = recovered(pictures, [(1.5, 0.8)], model=model)
+        assert np.max(np.abs(errors(found))) < 2 * ROUNDS
+        angles = found.material.angles.coefficients
+        np.testing.assert_allclose(angles, material.angles.coefficients, atol=1e-3)
+
+    def test_unsettled_it_returns_its_best_round_with_bars(self, monkeypatch):
+        monkeypatch.setattr("splatjax.inverse._recover._ROUNDS", 1)
+        with pytest.warns(RuntimeWarning, match="still moved in round 1"):
+            found = recovered(taken()[1], STARTS[:1])
+        assert found.result != optx.RESULTS.successful
+        assert np.all(np.isfinite(found.relative_errors()))
+        assert np.max(np.abs(errors(found))) < 0.1
+
+    @pytest.mark.long
     def test_one_picture_of_unknown_strength_does_not_fix_both_coefficients_and_a_second_one_does(
         self,
     ):
         noise = 2.5 * NOISE
         (_, alone), splats = observations(taken()[1], noise), taken()[0]
-        found = sj.inverse.recover([alone], splats, medium(1.5, 0.7), count=COUNT, settings=PLAIN)
+        found = sj.inverse.recover(
+            [alone], splats, medium(1.5, 0.7), count=COUNT, settings=PLAIN, model=DIPOLE
+        )
         assert "not fixed by these pictures" in found.summary()
         dot = sj.GaussianBeam(
             camera().position, -camera().position, jnp.full(2, 20.0), jnp.asarray(2.0)
@@ -176,7 +210,7 @@ class TestRecover:
             sj.inverse.Candidate("dot", camera(), (dot,)),
             sj.inverse.Candidate("color", camera(), (lights()[0],), sj.inverse.UnknownColor()),
         ]
-        ranked = sj.inverse.next_pictures(found, splats, candidates, settings=PLAIN)
+        ranked = sj.inverse.next_pictures(found, splats, candidates, settings=PLAIN, model=DIPOLE)
         left = {one.candidate.name: one.worst.deviation for one in ranked}
         assert list(left.values()) == sorted(left.values())
         now = max(worst.deviation for _, worst in found.combinations())
@@ -221,7 +255,7 @@ def half_resolved():
     seen = sj.inverse.Observation(noise, view, lights(), deviation=noise)
     unknowns = Unknowns.of(medium().eta, [sj.inverse.KnownIntensity()])
     fit = eqx.Partial(sj.fitting.fit_weights, variances=light.variances, weights=HELD)
-    settings = unknowns, fit, sj.inverse.SquaredLoss(), sj.Dipole
+    settings = unknowns, fit, sj.inverse.SquaredLoss(), DIPOLE
     problem = RecoveryProblem.of([picture], [Evidence.of(seen, light.area.dtype)], *settings)
     return problem, unknowns.start(medium())
 

@@ -59,7 +59,9 @@ SINGLE = sj.SingleScattering(sj.Medium([0.2, 0.5, 1.0], [1.0, 1.0, 1.0], eta=1.4
 MATERIALS = {
     "matte": MATTE,
     "glossy": sj.Material(two_gaussians(), specular=1.0, roughness=0.4),
-    "with single scattering": sj.Material(two_gaussians(), eta=1.0, specular=0.0, single_scattering=SINGLE),
+    "with single scattering": sj.Material(
+        two_gaussians(), eta=1.0, specular=0.0, single_scattering=SINGLE
+    ),
 }
 
 

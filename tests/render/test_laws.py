@@ -73,7 +73,11 @@ def test_white_furnace():
     count = 512
     # radiance 1 from everywhere: each light stands for its share of the sphere
     lights = tuple(lamp((4 * np.pi / count,) * 3, way) for way in directions(count, jitter=0.0))
-    scene = sj.Scene(sphere(4000, 50.0), lights, sj.Material(two_gaussians().white(), specular=1.0, roughness=0.6))
+    scene = sj.Scene(
+        sphere(4000, 50.0),
+        lights,
+        sj.Material(two_gaussians().white(), specular=1.0, roughness=0.6),
+    )
     camera = sj.Camera.look_at([0, 0, 400], [0, 0, 0], fov=16, width=32, height=32)
     frame = sj.render(scene, camera, PLAIN)
     covered = np.asarray(frame.coverage) > 0.999
