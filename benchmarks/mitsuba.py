@@ -29,7 +29,11 @@ EYE, FOV = (0.0, 0.0, 80.0), 17.0
 WAY = (-1.0, -1.0, -1.0)
 IRRADIANCE = float(np.pi)
 DEPTH = 4000  # of paths; Russian roulette from a tenth of it on
-MODELS = {"dipole": sj.Dipole, "better dipole": sj.scattering.BetterDipole}
+MODELS = {
+    "transport": sj.fitting.TransportModel(),
+    "dipole": sj.fitting.DiffusionModel(),
+    "better dipole": sj.fitting.DiffusionModel(sj.scattering.BetterDipole),
+}
 PHOTONS = 300_000
 RATE = 0.1  # Adam's, in logarithms of coefficients: from afar to nearly nothing by a cosine
 
@@ -217,10 +221,10 @@ class Splatted:
             jnp.asarray(EYE), jnp.zeros(3), fov=FOV, width=width, height=width
         )
 
-    def picture(self, profile, rule=None) -> np.ndarray:
+    def picture(self, profile, rule=None, angles=None) -> np.ndarray:
         more = {} if rule is None else {"rule": rule}
         gaussians = sj.fit_gaussians(profile, 6, weights=WEIGHTS, **more).gaussians
-        material = sj.Material(gaussians, eta=1.0, specular=0.0)
+        material = sj.Material(gaussians, eta=1.0, specular=0.0, angles=angles)
         frame = sj.render(sj.Scene(self.splats, (self.light,), material), self.camera)
         filled = np.asarray(frame.coverage)[..., None] > 0.999
         return np.where(filled, np.asarray(frame.beauty, float), np.nan)
@@ -285,7 +289,8 @@ def recovered(splatted: Splatted, medium: sj.Medium, truth: np.ndarray, options)
         jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf), float), walks), rule
     )
     made = {"Monte Carlo": by_walks} | {
-        title: splatted.picture(model(medium)) for title, model in chosen.items()
+        title: splatted.picture(model.profile(medium), model.rule, model.angles(medium))
+        for title, model in chosen.items()
     }
     rows = []
     for title, picture in made.items():

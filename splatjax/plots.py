@@ -20,6 +20,8 @@ _RGB = ("#c0392b", "#27853f", "#2c5aa0")
 _POINTS = 400
 # Share of its peak down to which a profile is drawn.
 _TAIL = 1e-7
+# Of light by logarithmic radius, over its peak, from which on errors are drawn.
+_LEAST = 1e-2
 # Radii of a measurement, up to which each is marked.
 _FEW = 60
 # Relative error of the energy that is rounding.
@@ -35,8 +37,8 @@ def plot_fit(
     rule: AbstractRadialRule = L2_QUADRATURE,
     title: str | None = None,
 ) -> Figure:
-    r"""Draw a profile and its fit, on linear and on logarithmic axes, and the difference between
-    them.
+    r"""Draw a profile and its fit, on linear and on logarithmic axes, and the relative error of the
+    fit by distance.
 
     Three channels are drawn in red, green and blue; the single
     Gaussians of the fit, with the mean weight of the channels, in gray. Of a measurement each
@@ -57,7 +59,11 @@ def plot_fit(
     error = np.asarray(relative_error(profile, gaussians, rule))
     energy = np.asarray(gaussians.total_reflectance() / profile.total_reflectance() - 1)
     radii = np.asarray(r)
-    left = radii[:, None] * (fitted - reference) / np.max(radii[:, None] * reference, axis=0)
+    ring = radii[:, None] ** 2 * reference
+    # Where hardly any light is, the line ends.
+    left = np.where(
+        ring > _LEAST * ring.max(axis=0), fitted / np.maximum(reference, 1e-300) - 1, np.nan
+    )
 
     figure = Figure(figsize=(10, 7.5), layout="constrained")
     panels = figure.subplot_mosaic(
@@ -94,8 +100,8 @@ def plot_fit(
     log.set(xlabel="r (mm)", ylabel="R(r) (1/mm²)", xlim=ends, ylim=heights)
     log.set_title("logarithmic, with each Gaussian (gray)", fontsize="medium")
     residual.axhline(0, color="0.6", linewidth=0.8)
-    residual.set(xlabel="r (mm)", ylabel="r (fit - R) / max r R", xlim=ends)
-    residual.set_title("residual", fontsize="medium")
+    residual.set(xlabel="r (mm)", ylabel="fit / R - 1", xlim=ends)
+    residual.set_title("relative error, to a hundredth of the light's density", fontsize="medium")
     if not rule.reaches_origin:
         nodes, weights = (np.asarray(each) for each in rule.radii(profile))
         begin = float(nodes[weights > 0].min())
@@ -109,8 +115,8 @@ def plot_fit(
             transform=residual.get_xaxis_transform(),
             fontsize="small",
         )
-        counts = left[radii >= begin]
-        residual.set_ylim(1.3 * min(counts.min(), -1e-3), 1.3 * max(counts.max(), 1e-3))
+        most = 1.3 * max(float(np.nanmax(np.abs(left[radii >= begin]))), 1e-3)
+        residual.set_ylim(-most, most)
     for axis in (log.xaxis, residual.xaxis):
         axis.set_minor_formatter(NullFormatter())  # within a decade their labels would overlap
     figure.suptitle(title or "")

@@ -12,10 +12,11 @@ import optimistix as optx
 import tyro
 
 import splatjax as sj
-from splatjax._format import channel_names, counted
+from splatjax._format import counted
 from splatjax.io import fingerprint, read_columns, read_media, write_columns
 
 from . import _batch
+from ._fit_report import format_numbers, print_fit
 from ._models import Model, Reference, model_by_name, reference
 from ._terminal import (
     FIGURES,
@@ -26,12 +27,12 @@ from ._terminal import (
     complete,
     note,
     option_name,
-    print_table,
     save_figure,
     stage,
 )
 
 _COEFFICIENTS, _PROFILE, _PHOTOGRAPH = "coefficients", "a measured profile", "a photograph"
+_LARGE, _APART = 0.05, 3.0  # errors, and ratios of widths, of channels that share badly
 _KINDS = {".csv": _PROFILE, ".exr": _PHOTOGRAPH}
 # Options that have an effect on one kind of input alone.
 _OPTIONS = {
@@ -191,11 +192,12 @@ class Fit:
                 coefficients, self.model, self.photons, self.g, self.single_scattering
             )
         fitted = self._fitted(target)
-        _print(fitted)
+        print_fit(fitted, target)
+        self._note_spread(target, fitted)
         total = fitted.gaussians.total_reflectance()
         if float(total.max()) > 1 + 1e-3:
             note(
-                f"{self.medium} sends back {_numbers(total, '.3g')} times the light it is given: "
+                f"{self.medium} sends back {format_numbers(total, '.3g')} times the light it is given: "
                 "are its unit and power right?"
             )
         if self.output is not None:
@@ -207,6 +209,17 @@ class Fit:
             title = f"{self.medium}, {counted(len(fitted.gaussians.variances), 'Gaussian')}"
             figure = plot_fit(target.profile, fitted.gaussians, rule=target.rule, title=title)
             save_figure(figure, self.plot)
+
+    def _note_spread(self, target: Reference, fitted: sj.fitting.FitResult) -> None:
+        """Note channels whose widths are too far apart for the variances that they share."""
+        scales, count = target.profile.length_scale(), len(fitted.gaussians.variances)
+        error, ratio = float(fitted.error.max()), float(scales.max() / scales.min())
+        if error > _LARGE and ratio > _APART:
+            note(
+                f"{self.medium}: the widths of its channels differ by a factor of {ratio:.2g}, too far "
+                f"apart for {count} variances that all share (error {error:.2g}); give a larger "
+                f"--count, or --error {_LARGE}"
+            )
 
     def _coefficients(self) -> sj.Dipole | sj.LayeredMultipole | sj.scattering.Tabulated:
         """Read the input; refuse options that have no effect on its kind."""
@@ -291,22 +304,3 @@ class Fit:
                 "energy_error": fitted.energy_error,
             },
         )
-
-
-def _print(fitted: sj.fitting.FitResult) -> None:
-    gaussians = fitted.gaussians
-    names = ", ".join(channel_names(gaussians.weights.shape[1]))
-    pairs = zip(gaussians.variances, gaussians.weights, strict=True)
-    print_table(
-        [
-            ("variance, mm^2", f"weights ({names})"),
-            *((f"{float(variance):.6g}", _numbers(row, ".5f")) for variance, row in pairs),
-            ("sum", _numbers(gaussians.total_reflectance(), ".5f")),
-            ("error (Eq. 4)", _numbers(fitted.error, ".2e")),
-            ("energy error", _numbers(fitted.energy_error, ".2e")),
-        ]
-    )
-
-
-def _numbers(values: jax.Array, form: str) -> str:
-    return "  ".join(f"{float(value):{form}}" for value in values)
