@@ -4,7 +4,12 @@ The formulas of the passes are in splatting, diffusion and shading.
 """
 
 from ._attributes import SurfaceAttributes as SurfaceAttributes, SurfaceSamples as SurfaceSamples
-from ._basis import diffusion_basis as diffusion_basis, DiffusionBasis as DiffusionBasis
+from ._basis import (
+    diffusion_basis as diffusion_basis,
+    DiffusionBasis as DiffusionBasis,
+    relighting_basis as relighting_basis,
+    RelightingBasis as RelightingBasis,
+)
 from ._devices import map_over as map_over
 from ._checks import (
     BYTES_PER_PIXEL as BYTES_PER_PIXEL,
@@ -24,7 +29,6 @@ from ._lighting import (
 from ._passes import SplatLight as SplatLight, Transfer as Transfer
 from ._plan import make_plan as make_plan, Plan as Plan
 from ._settings import RenderSettings as RenderSettings
-from ._relighting import relighting_basis as relighting_basis, RelightingBasis as RelightingBasis
 from ._render import (
     compute_irradiance as compute_irradiance,
     diffuse_irradiance as diffuse_irradiance,

@@ -1,13 +1,17 @@
-"""A picture for any weights: everything that they do not change is rendered once."""
+"""A picture for any weights, or for any distant light: everything that these do not change is
+rendered once.
+"""
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
+from splatjax.cache import kept_jit
 from splatjax.diffusion import LayersAtPoints
 from splatjax.gaussians import SumOfGaussians
-from splatjax.scene import Camera, Scene
+from splatjax.scene import Camera, HarmonicLight, Scene
 from splatjax.splatting import invalid_factor
 
 from ._bounces import check_no_bounces
@@ -15,7 +19,7 @@ from ._devices import filled_like, on_devices
 from ._filling import rows_at
 from ._passes import SplatLight, Transfer, in_a_row, light_source, see_and_shade
 from ._plan import Plan, plan_unless_traced
-from ._render import check_kept, fitted
+from ._render import render, transfer
 from ._settings import RenderSettings
 from ._shade import ShadedSurface
 
@@ -97,11 +101,8 @@ def diffusion_basis(
         )
     plan = plan_unless_traced(scene, camera, settings, plan)
     check_no_bounces(settings)
-    check_kept(light, scene, plan)
-    scene, plan, places = filled_like(scene, plan, camera, light)
-    basis = _diffusion_basis(
-        scene, camera, settings, plan, derivative, light and fitted(light, scene)
-    )
+    scene, plan, light, places = filled_like(scene, plan, light, camera)
+    basis = _diffusion_basis(scene, camera, settings, plan, derivative, light)
 
     def of_gaussians(light: LayersAtPoints):
         return light.variances, light.means, light.mass, light.derivative
@@ -160,3 +161,113 @@ def _diffusion_basis(
         )
 
     return on_devices(passes, scene, plan, camera, placed=light)
+
+
+class RelightingBasis(eqx.Module):
+    r"""A picture for distant light that is still to come.
+
+    **Attributes:**
+
+    - `pictures`: radiance, premultiplied by coverage, under every harmonic of
+      `splatjax.scene.spherical_harmonics`.
+    - `coverage`: in [0, 1].
+    - `overflow`: as in a `Frame`; where it is above 0, pictures are NaN.
+
+    **Source:** Sloan, Kautz and Snyder 2002, "Precomputed Radiance Transfer": here for the pixels
+    of one view.
+    """
+
+    pictures: Float[Array, "harmonics height width channels"]
+    coverage: Float[Array, "height width"]
+    overflow: Float[Array, ""]
+
+    @eqx.filter_jit
+    def beauty(self, light: HarmonicLight) -> Float[Array, "height width channels"]:
+        """Compute the picture that `render` makes under a light: a sum over its harmonics.
+        Differentiable in every mode.
+
+        **Arguments:**
+
+        - `light`: of the order of the basis or a lower one, such as `HarmonicLight.of(environment,
+          order)`.
+
+        **Raises:** `ValueError` for a light of a higher order.
+        """
+        count, harmonics = len(light.coefficients), len(self.pictures)
+        if count > harmonics:
+            raise ValueError(
+                f"light has {count} harmonics, and the basis was rendered for {harmonics}; give a "
+                "light of a lower order, or render a basis of a higher one"
+            )
+
+        def add(picture, harmonic):
+            coefficients, under = harmonic
+            return picture + coefficients[None, None] * under, None
+
+        # One after the other: a fifteenth of the time of `einsum` on a CPU.
+        dark = jnp.zeros_like(self.pictures[0])
+        return jax.lax.scan(add, dark, (light.coefficients, self.pictures[:count]))[0]
+
+
+def relighting_basis(
+    scene: Scene,
+    camera: Camera,
+    settings: RenderSettings = RenderSettings(),
+    plan: Plan | None = None,
+    light: Transfer | None = None,
+) -> RelightingBasis:
+    r"""Render a view under every spherical harmonic: the picture of all smooth environments.
+
+        white = HarmonicLight(np.zeros((25, 3)), count=128)
+        basis = relighting_basis(Scene(splats, white, material), camera)
+        picture = basis.beauty(HarmonicLight.of(environment))
+
+    It takes about as long as so many pictures with kept shadows, one after the other; then light
+    changes at once, and a picture is linear in it. The shadow maps are made once.
+
+    **Arguments:** as for `render`.
+
+    - `scene`: its only light is a `HarmonicLight`, whose coefficients do not matter, but for their
+      number.
+    - `light`: from `splatjax.transfer` with the same scene, settings and plan.
+
+    **Returns:** a `RelightingBasis`; NaN where the plan does not suffice.
+
+    **Raises:** `ValueError` as `render`, and for other lights.
+    """
+    kinds = [type(given).__name__ for given in scene.lights]
+    if kinds != ["HarmonicLight"]:
+        raise ValueError(
+            f"scene.lights are {', '.join(kinds) or 'none'}; give one HarmonicLight, and render "
+            "other lights by themselves: pictures add up"
+        )
+    plan = plan_unless_traced(scene, camera, settings, plan)
+    scene, plan, light, _ = filled_like(scene, plan, light, camera)
+    return _relighting_basis(scene, camera, settings, plan, light)
+
+
+@kept_jit
+def _relighting_basis(
+    scene: Scene, camera: Camera, settings: RenderSettings, plan: Plan, light: Transfer | None
+) -> RelightingBasis:
+    def coefficients(scene):
+        return scene.lights[0].coefficients
+
+    given = coefficients(scene)
+    kept = transfer(scene, plan, settings) if light is None else light
+
+    def under(harmonics: Float[Array, " harmonics"]):
+        gray = jnp.broadcast_to(harmonics[:, None], given.shape)
+        lit = eqx.tree_at(coefficients, scene, gray)
+        frame = render(lit, camera, settings, plan, light=kept)
+        return frame.beauty, frame.coverage, frame.overflow
+
+    # Each harmonic on so much even light that their sum is nowhere negative: where layers of pass 4
+    # do not carry to a pixel, they are limited at zero.
+    count = len(given)
+    even = np.sqrt(2 * np.floor(np.sqrt(np.arange(count))) + 1) * (np.arange(count) > 0)
+    even = jnp.asarray(even, given.dtype)
+    lights = jnp.eye(count, dtype=given.dtype).at[:, 0].add(even)
+    pictures, coverage, overflow = jax.lax.map(under, lights)
+    pictures = pictures - even[:, None, None, None] * pictures[:1]
+    return RelightingBasis(pictures, coverage[0], overflow[0])

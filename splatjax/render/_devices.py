@@ -19,9 +19,11 @@ from splatjax.scene import AbstractLightSample, Frame, Scene, lights_by_kind
 
 from ._checks import in_one_dtype
 from ._filling import arrange, fill_gaussians, fill_lights, fill_up, rows_at
+from ._passes import SplatLight, Transfer
 from ._plan import Plan, splats_per_device
 
 Result = TypeVar("Result", bound=PyTree)
+Kept = TypeVar("Kept", bound=SplatLight | Transfer)
 
 
 class Places(NamedTuple):
@@ -38,7 +40,9 @@ class Places(NamedTuple):
         return dataclasses.replace(frame, shadow=shadow, **rows)
 
 
-def filled_like(scene: Scene, plan: Plan, *given: PyTree) -> tuple[Scene, Plan, Places]:
+def filled_like(
+    scene: Scene, plan: Plan, light: Kept | None = None, *given: PyTree
+) -> tuple[Scene, Plan, Kept | None, Places]:
     """Fill up the splats of a scene to the length of its plan, the lights of each kind to four or a
     larger power of two, the Gaussians and the angles, by NumPy and `device_put`, which compile
     nothing. Where the scene or what is `given` with it is traced, and where splats are cut over
@@ -48,15 +52,24 @@ def filled_like(scene: Scene, plan: Plan, *given: PyTree) -> tuple[Scene, Plan, 
     plan leaves out its shadow map; an added Gaussian has no weight. Where a light of the scene
     consists of several samples, or has no field for its strength, no light is added.
 
-    **Returns:** the scene with its lights sorted by kind, its plan, and where its own are.
+    **Arguments:**
+
+    - `light`: what was kept of the scene, filled up as its lights are.
+
+    **Returns:** the scene with its lights sorted by kind, its plan, what was kept, and where its
+    own lights and Gaussians are.
+
+    **Raises:** `ValueError` where what was kept is for other lights or another number of splats.
     """
+    if light is not None:
+        _check_kept(light, scene, plan)
     count, material = scene.splats.count, plan.diffusion.material(scene.material)
     scene = Scene(scene.splats, scene.lights, material)
     shown = np.arange(min(plan.gaussians, len(material.gaussians.variances)))
     places = Places(np.arange(len(scene.lights)), shown)
-    leaves = jax.tree.leaves((scene, given))
+    leaves = jax.tree.leaves((scene, light, given))
     if plan.mesh is not None or any(isinstance(leaf, Tracer) for leaf in leaves):
-        return scene, plan, places
+        return scene, plan, light and fitted(light, scene), places
     splats, lights, shadows = scene.splats, scene.lights, plan.shadows
     if 0 < count < len(plan.order):
         splats = jax.tree.map(lambda leaf: rows_at(leaf, np.arange(len(plan.order))), splats)
@@ -79,7 +92,30 @@ def filled_like(scene: Scene, plan: Plan, *given: PyTree) -> tuple[Scene, Plan, 
     )
     counts = {"splats": splats.count, "gaussians": len(gaussians.variances)}
     filled = dataclasses.replace(plan, shadows=shadows, **counts)
-    return Scene(splats, lights, material), filled, places
+    scene = Scene(splats, lights, material)
+    return scene, filled, light and fitted(light, scene), places
+
+
+def fitted(light: Kept, scene: Scene) -> Kept:
+    """Give each kind of lights a row of visibility for every sample that the scene has of it."""
+    groups = zip(light.visibility, lights_by_kind(scene.lights), strict=True)
+    visibility = [rows if rows is None else rows_at(rows, np.arange(len(g))) for rows, g in groups]
+    return dataclasses.replace(light, visibility=visibility)
+
+
+def _check_kept(light: SplatLight | Transfer, scene: Scene, plan: Plan) -> None:
+    """Raise `ValueError` where what was kept is for other lights or another number of splats."""
+    groups = jax.eval_shape(
+        lambda lights: [[sample for _, sample in group] for group in lights_by_kind(lights)],
+        scene.lights,
+    )
+    shapes = [(len(g), len(plan.order)) if g[0].cast_shadows else None for g in groups]
+    kept = [rows if rows is None else rows.shape for rows in light.visibility]
+    if kept != shapes:
+        raise ValueError(
+            f"light holds visibility {kept}, of the samples of each kind of lights from each splat,"
+            f" and the scene with its plan has {shapes}; keep it again with lights of these kinds"
+        )
 
 
 def on_devices(

@@ -112,9 +112,8 @@ def picture_jacobian(
             "lighting=LightAtSplats(), or a material without it"
         )
     check_no_bounces(settings)
-    scene, plan, places = filled_like(
-        scene, plan_unless_traced(scene, camera, settings, plan), camera
-    )
+    plan = plan_unless_traced(scene, camera, settings, plan)
+    scene, plan, _, places = filled_like(scene, plan, None, camera)
     found = _picture_jacobian(scene, camera, settings, plan)
     rows = (rows_at(each, places.gaussians) for each in (found.weights, found.variances))
     return PictureJacobian(places.frame(found.frame), *rows)

@@ -153,20 +153,18 @@ def cast_shadows(
     - `bounds`: of the splats of all devices.
     """
     splats, groups = scene.splats, stack_lights(scene.lights)
-    visibility, needed = [], [jnp.zeros((), splats.centers.dtype)]
-    dark = jnp.zeros_like(splats.radii), needed[0]
-    for group, plan in zip(groups, shadows, strict=True):
-        if plan is None:
-            visibility.append(None)
-            continue
+    zero = jnp.zeros((), splats.centers.dtype)
 
+    def of_group(group: StackedLights, plan: ShadowPlan | None):
+        if plan is None:
+            return None, zero
         per_disc = plan.splats_per_disc
         discs = splats if per_disc == 1 else _splatting.merge_splats(splats, per_disc)
 
-        def of_light(light, plan=plan, discs=discs):
+        def of_light(light):
             def of_view(view):
                 shadow_map = _splatting.make_shadow_map(
-                    discs, view, splatting, plan.raster, combination, plan.splats_per_disc
+                    discs, view, splatting, plan.raster, combination, per_disc
                 )
                 visible = map_visibility(scene, shadow_map, plan.settings, plan.cube)
                 return visible, shadow_map.needed
@@ -180,19 +178,20 @@ def cast_shadows(
         if len(group.light_indices) > len(group.distinct):  # in a gradient, maps are made again
             of_light = jax.checkpoint(of_light)  # ty: ignore[invalid-assignment]
 
-        def if_exists(numbered, plan=plan, of_light=of_light):
+        def if_exists(numbered):
             number, light = numbered
+            if plan.lights is None:
+                return of_light(light)
+            dark = jnp.zeros_like(splats.radii), zero
             return jax.lax.cond(number < plan.lights, of_light, lambda _: dark, light)
 
-        numbered = jnp.arange(len(group.light_indices), dtype=jnp.int32), group.lights
-        visible, needed_by_light = (
-            jax.lax.map(of_light, group.lights)
-            if plan.lights is None
-            else jax.lax.map(if_exists, numbered)
-        )
-        visibility.append(visible)
-        needed.append(jnp.max(needed_by_light))
-    return LightVisibility(groups, visibility, jnp.max(jnp.stack(needed)))
+        numbers = jnp.arange(len(group.light_indices), dtype=jnp.int32)
+        visible, needed = jax.lax.map(if_exists, (numbers, group.lights))
+        return visible, jnp.max(needed)
+
+    of_groups = [of_group(*pair) for pair in zip(groups, shadows, strict=True)]
+    needed = jnp.max(jnp.stack([zero, *(needed for _, needed in of_groups)]))
+    return LightVisibility(groups, [visible for visible, _ in of_groups], needed)
 
 
 def map_visibility(

@@ -1,25 +1,22 @@
 """A picture with all its layers, the light of a body without a camera, and pass 4 alone."""
 
 import dataclasses
-from typing import TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Float
 
 from splatjax._chunking import take_points
 from splatjax._combination import lay_out
 from splatjax.cache import kept_jit
-from splatjax.scene import Camera, Frame, Scene, lights_by_kind
+from splatjax.scene import Camera, Frame, Scene
 from splatjax.splatting import Bounds
 
 from ._bounces import bounced_irradiance, diffuse_splats
 from ._checks import check_channels
-from ._devices import filled_like, on_devices
-from ._filling import rows_at
+from ._devices import filled_like, fitted, on_devices
 from ._lighting import Irradiance, LightAtSplats
 from ._passes import (
     SplatLight,
@@ -31,8 +28,6 @@ from ._passes import (
 from ._plan import Plan, check_plan, plan_unless_traced, splats_per_device
 from ._settings import RenderSettings
 from ._shade import compose
-
-Kept = TypeVar("Kept", bound=SplatLight | Transfer)
 
 
 def render(
@@ -66,34 +61,8 @@ def render(
     disagree.
     """
     plan = plan_unless_traced(scene, camera, settings, plan, mesh)
-    check_kept(light, scene, plan)
-    scene, plan, places = filled_like(scene, plan, camera, light)
-    frame = _render(scene, camera, settings, plan, light and fitted(light, scene))
-    return places.frame(frame)
-
-
-def fitted(light: Kept, scene: Scene) -> Kept:
-    """Give each kind of lights a row of visibility for every sample that the scene has of it."""
-    groups = zip(light.visibility, lights_by_kind(scene.lights), strict=True)
-    visibility = [rows if rows is None else rows_at(rows, np.arange(len(g))) for rows, g in groups]
-    return dataclasses.replace(light, visibility=visibility)
-
-
-def check_kept(light: SplatLight | Transfer | None, scene: Scene, plan: Plan) -> None:
-    """Raise `ValueError` where what was kept is for other lights or another number of splats."""
-    if light is None:
-        return
-    groups = jax.eval_shape(
-        lambda lights: [[sample for _, sample in group] for group in lights_by_kind(lights)],
-        scene.lights,
-    )
-    shapes = [(len(g), len(plan.order)) if g[0].cast_shadows else None for g in groups]
-    kept = [rows if rows is None else rows.shape for rows in light.visibility]
-    if kept != shapes:
-        raise ValueError(
-            f"light holds visibility {kept}, of the samples of each kind of lights from each splat,"
-            f" and the scene with its plan has {shapes}; keep it again with lights of these kinds"
-        )
+    scene, plan, light, places = filled_like(scene, plan, light, camera)
+    return places.frame(_render(scene, camera, settings, plan, light))
 
 
 @kept_jit
@@ -146,10 +115,8 @@ def illuminate(
     """
     check_channels(scene)
     check_plan(plan, scene)
-    check_kept(light, scene, plan)
-    filled, plan, _ = filled_like(scene, plan, light)
-    transfer = light and fitted(light, filled)
-    return fitted(_illuminate(filled, plan, settings, derivative, transfer), scene)
+    filled, plan, light, _ = filled_like(scene, plan, light)
+    return fitted(_illuminate(filled, plan, settings, derivative, light), scene)
 
 
 @kept_jit
@@ -182,7 +149,7 @@ def transfer(scene: Scene, plan: Plan, settings: RenderSettings = RenderSettings
     """
     check_channels(scene)
     check_plan(plan, scene)
-    filled, plan, _ = filled_like(scene, plan)
+    filled, plan, *_ = filled_like(scene, plan)
     return fitted(_transfer(filled, plan, settings), scene)
 
 
