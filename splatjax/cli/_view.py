@@ -15,7 +15,7 @@ import splatjax as sj
 from splatjax._memory import check_memory
 from splatjax.render import BYTES_PER_PIXEL, BYTES_PER_SPLAT, check_displayable
 
-from ._terminal import Rules, UpAxis, check_options, note, option_name, stage
+from ._terminal import OptionalFloat, Rules, UpAxis, check_options, note, option_name, stage
 
 # Degrees: the fill stands beside the camera, on the side away from the light.
 _FILL_SIDE, _FILL_ELEVATION = 25.0, 10.0
@@ -25,7 +25,6 @@ _ENVIRONMENTS = {
     "overcast": sj.scene.overcast_sky,
     "sun": sj.scene.sun_and_sky,
 }
-Number = Annotated[float | None, tyro.conf.arg(metavar="FLOAT", help_behavior_hint="")]
 _NOT_IN_PICTURES = ("splats", "output", "fps", "quiet")
 _note_once = functools.cache(note)
 
@@ -53,11 +52,11 @@ class ViewOptions:
     #: Vertical field of view.
     fov: float = 25.0
     #: Of a single light, in the place of the studio; beyond 90 it stands behind. Or -20.
-    light_azimuth: Number = None
+    light_azimuth: OptionalFloat = None
     #: Of the single light; or 30.
-    light_elevation: Number = None
+    light_elevation: OptionalFloat = None
     #: Strength of a light without shadows beside the camera, over that of the single light; or 0.1.
-    fill: Number = None
+    fill: OptionalFloat = None
     #: Latitude-longitude map of linear radiance, in the place of single lights: an EXR or HDR file,
     #: or the name of a built-in one: studio, overcast, sun. The studio where no light is given.
     environment: Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None

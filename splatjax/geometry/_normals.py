@@ -6,7 +6,10 @@ import numpy as np
 import scipy  # its parts are loaded where they are used, which takes a third of a second
 from jaxtyping import Float, Int
 
+from splatjax.scene import even_directions
+
 from ._mesh import distinct, morton_order
+from ._scatter import tangent_frames
 
 _CHUNK = 1 << 16
 _BEYOND = 1.05  # of the distance of the farthest neighbor, so that it counts a little
@@ -145,20 +148,14 @@ def _votes(points: np.ndarray, normals: np.ndarray, pixel: float) -> tuple[Signs
     A point is seen where nothing lies more than a pixel before it and the pixels around. A view
     counts by its squared cosine.
     """
-    index = np.arange(_VIEWS) + 0.5  # on a spiral around the sphere
-    height, angle = 1 - 2 * index / _VIEWS, index * np.pi * (3 - np.sqrt(5))
+    directions = even_directions(_VIEWS)
+    frames = np.stack([*tangent_frames(directions), directions], axis=1).astype(np.float32)
     low, high = points.min(axis=0), points.max(axis=0)
     pixel = max(pixel, float((high - low).max()) / 4096, 1e-30)
     single, facing = (points - 0.5 * (low + high)).astype(np.float32), normals.astype(np.float32)
     votes, cast = np.zeros(len(points), np.float32), np.zeros(len(points), np.float32)
-    for z, turn in zip(height, angle, strict=True):
-        r = np.sqrt(1 - z * z)
-        frame = [
-            [-np.sin(turn), np.cos(turn), 0],
-            [-z * np.cos(turn), -z * np.sin(turn), r],
-            [r * np.cos(turn), r * np.sin(turn), z],
-        ]
-        across, up, towards = np.asarray(frame, np.float32) @ single.T
+    for frame in frames:
+        across, up, towards = frame @ single.T
         columns, rows = (
             np.floor((each - each.min()) / pixel).astype(np.int64) for each in (across, up)
         )

@@ -141,18 +141,13 @@ class Irradiance(eqx.Module):
 
 def cast_shadows(
     scene: Scene,
-    bounds: _splatting.Bounds,
     shadows: tuple[ShadowPlan | None, ...],
     splatting: _splatting.SplattingSettings,
     combination: AbstractCombination,
 ) -> LightVisibility:
-    """Make the shadow maps of all lights (4.1) and look up the splats in them.
-
-    **Arguments:**
-
-    - `bounds`: of the splats of all devices.
-    """
+    """Make the shadow maps of all lights (4.1) and look up the splats in them."""
     splats, groups = scene.splats, stack_lights(scene.lights)
+    bounds = _splatting.Bounds.of(splats, combination)
     zero = jnp.zeros((), splats.centers.dtype)
 
     def of_group(group: StackedLights, plan: ShadowPlan | None):

@@ -69,12 +69,11 @@ class SplatLight(eqx.Module):
         return jax.tree.map(lambda leaf: take_points(leaf, chosen) if leaf.ndim else leaf, self)
 
 
-def compute_visibility(
+def light_visibility(
     scene: Scene,
     settings: RenderSettings,
     plan: Plan,
     combination: AbstractCombination,
-    bounds: _splatting.Bounds,
     transfer: Transfer | None = None,
 ) -> LightVisibility:
     """Make the shadow maps and look up the splats in them (pass 1), or read a precomputed result.
@@ -83,7 +82,7 @@ def compute_visibility(
     """
     if transfer is not None:
         return LightVisibility(stack_lights(scene.lights), transfer.visibility, transfer.needed)
-    return cast_shadows(scene, bounds, plan.shadows, settings.splatting, combination)
+    return cast_shadows(scene, plan.shadows, settings.splatting, combination)
 
 
 def light_splats(
@@ -91,7 +90,6 @@ def light_splats(
     settings: RenderSettings,
     plan: Plan,
     combination: AbstractCombination,
-    bounds: _splatting.Bounds,
     at: Int[Array, " chosen"] | None = None,
     derivative: bool = False,
     transfer: Transfer | None = None,
@@ -100,12 +98,11 @@ def light_splats(
 
     **Arguments:**
 
-    - `bounds`: of the splats of all devices.
     - `at`: the splats whose light is returned, in ascending order; all for `None`.
     - `derivative`: also differentiate the layers in the material's Gaussians.
     - `transfer`: in the place of pass 1.
     """
-    light = compute_visibility(scene, settings, plan, combination, bounds, transfer)
+    light = light_visibility(scene, settings, plan, combination, transfer)
     irradiance, bounce_needed = bounced_irradiance(scene, settings, plan, combination, light)
     added, beams, medium = None, None, scene.material.medium
     if derivative and scene.material.single_scattering is not None:
@@ -140,7 +137,7 @@ def light_source(
     result.
     """
     if isinstance(light, SplatLight):
-        return lambda _, chosen: light.take(chosen)
+        return light.take
     return partial(
         light_splats, scene, settings, plan, combination, derivative=derivative, transfer=light
     )
@@ -173,15 +170,14 @@ def see_and_shade(
     settings: RenderSettings,
     plan: Plan,
     combination: AbstractCombination,
-    light_at: Callable[[_splatting.Bounds, Int[Array, " chosen"]], SplatLight],
+    light_at: Callable[[Int[Array, " chosen"]], SplatLight],
     read: Callable[[ShadedSurface, _diffusion.LayersAtPoints, SurfaceSamples], Result],
 ) -> tuple[Result, _splatting.VisibleSurfaces]:
     """Light the splats, see them, shade what is seen, and read what a picture needs: all passes.
 
     **Arguments:**
 
-    - `light_at`: passes 1 and 4, of the bounds of all splats, for those that the camera may see:
-      `light_source`.
+    - `light_at`: passes 1 and 4, for the splats that the camera may see: `light_source`.
     - `read`: pointwise, along the last axis.
 
     **Returns:** what was read, for each place; and the places, with the capacity needed of all
@@ -189,8 +185,7 @@ def see_and_shade(
     """
     view, groups = _splatting.PerspectiveView.of(camera), stack_lights(scene.lights)
     chosen, chosen_needed = plan.raster.choose(scene.splats, view)
-    bounds = _splatting.Bounds.of(scene.splats, combination)
-    light = light_at(bounds, chosen)
+    light = light_at(chosen)
 
     # Passes 2 and 3: blend the attributes and layers of the splats that may be seen.
     splats = scene.splats.take(chosen)
@@ -200,6 +195,7 @@ def see_and_shade(
         layers = plan.diffusion.towards(*given, light.beams)
     visibility = LightVisibility(groups, light.visibility, light.needed)
     attributes = settings.lighting.attributes(shown, visibility, light.irradiance, view.position)
+    bounds = _splatting.Bounds.of(scene.splats, combination)
     origin = jax.lax.stop_gradient(bounds.center)[:, None]
     centers = splats.centers.T - origin
     attributes = dataclasses.replace(

@@ -12,7 +12,6 @@ from splatjax._chunking import take_points
 from splatjax._combination import lay_out
 from splatjax.cache import kept_jit
 from splatjax.scene import Camera, Frame, Scene
-from splatjax.splatting import Bounds
 
 from ._bounces import bounced_irradiance, diffuse_splats
 from ._checks import check_channels
@@ -21,8 +20,8 @@ from ._lighting import Irradiance, LightAtSplats
 from ._passes import (
     SplatLight,
     Transfer,
-    compute_visibility,
     light_source,
+    light_visibility,
     see_and_shade,
 )
 from ._plan import Plan, check_plan, plan_unless_traced, splats_per_device
@@ -124,8 +123,7 @@ def _illuminate(
     scene: Scene, plan: Plan, settings: RenderSettings, derivative: bool, light: Transfer | None
 ) -> SplatLight:
     def passes(combination, scene, plan, light=None):
-        bounds = Bounds.of(scene.splats, combination)
-        return light_source(scene, settings, plan, combination, light, derivative)(bounds, None)
+        return light_source(scene, settings, plan, combination, light, derivative)(None)
 
     return on_devices(passes, scene, plan, by_splat=True, placed=light)
 
@@ -156,8 +154,7 @@ def transfer(scene: Scene, plan: Plan, settings: RenderSettings = RenderSettings
 @kept_jit
 def _transfer(scene: Scene, plan: Plan, settings: RenderSettings) -> Transfer:
     def passes(combination, scene, plan):
-        bounds = Bounds.of(scene.splats, combination)
-        light = compute_visibility(scene, settings, plan, combination, bounds)
+        light = light_visibility(scene, settings, plan, combination)
         return Transfer(light.visibility, light.needed)
 
     return on_devices(passes, scene, plan, by_splat=True)
@@ -183,8 +180,7 @@ def compute_irradiance(
 @eqx.filter_jit
 def _compute_irradiance(scene: Scene, plan: Plan, settings: RenderSettings) -> Irradiance:
     def passes(combination, scene, plan):
-        bounds = Bounds.of(scene.splats, combination)
-        light = compute_visibility(scene, settings, plan, combination, bounds)
+        light = light_visibility(scene, settings, plan, combination)
         return bounced_irradiance(scene, settings, plan, combination, light)[0]
 
     placed = on_devices(passes, scene, plan, by_splat=True), plan.order, plan.exists
@@ -244,7 +240,7 @@ def _diffuse_irradiance(
     def passes(combination, scene, plan, camera, irradiance):
         source = irradiance.T
 
-        def light_at(_, chosen):
+        def light_at(chosen):
             layers, _, needed = diffuse_splats(
                 scene, source, settings, plan, combination, at=chosen
             )

@@ -164,21 +164,8 @@ class DirectionalLight(AbstractLightSample):
     def incidence(
         self, points: Float[Array, "*points 3"]
     ) -> tuple[Float[Array, "*points 3"], Float[Array, "*points channels"]]:
-        return _from_afar(self.direction, self.irradiance, points)
-
-
-def _from_afar(direction, irradiance, points):
-    wi = -direction / jnp.linalg.norm(direction)
-    return jnp.broadcast_to(wi, points.shape), _per_channel(irradiance, points)
-
-
-def _from_point(position, intensity, points):
-    to_light = jnp.broadcast_to(position, points.shape) - points
-    squared = jnp.sum(to_light * to_light, axis=-1, keepdims=True)
-    apart = squared > _TOUCHING**2
-    squared = jnp.where(apart, squared, 1.0)
-    wi = jnp.where(apart, to_light / jnp.sqrt(squared), 0.0)
-    return wi, jnp.where(apart, _per_channel(intensity, points) / squared, 0.0)
+        wi = -self.direction / jnp.linalg.norm(self.direction)
+        return jnp.broadcast_to(wi, points.shape), _per_channel(self.irradiance, points)
 
 
 @record
@@ -204,7 +191,12 @@ class PointLight(AbstractLightSample):
     def incidence(
         self, points: Float[Array, "*points 3"]
     ) -> tuple[Float[Array, "*points 3"], Float[Array, "*points channels"]]:
-        return _from_point(self.position, self.intensity, points)
+        to_light = jnp.broadcast_to(self.position, points.shape) - points
+        squared = jnp.sum(to_light * to_light, axis=-1, keepdims=True)
+        apart = squared > _TOUCHING**2
+        squared = jnp.where(apart, squared, 1.0)
+        wi = jnp.where(apart, to_light / jnp.sqrt(squared), 0.0)
+        return wi, jnp.where(apart, _per_channel(self.intensity, points) / squared, 0.0)
 
 
 class DistantStratum(AbstractLightSample):
@@ -214,11 +206,7 @@ class DistantStratum(AbstractLightSample):
     irradiance: Float[Array, " channels"]
     strength_field: ClassVar[str] = "irradiance"
     cast_shadows: bool = eqx.field(static=True)
-
-    def incidence(
-        self, points: Float[Array, "*points 3"]
-    ) -> tuple[Float[Array, "*points 3"], Float[Array, "*points channels"]]:
-        return _from_afar(self.direction, self.irradiance, points)
+    incidence = DirectionalLight.incidence
 
 
 class EmitterStratum(AbstractLightSample):
@@ -238,7 +226,7 @@ class EmitterStratum(AbstractLightSample):
     def incidence(
         self, points: Float[Array, "*points 3"]
     ) -> tuple[Float[Array, "*points 3"], Float[Array, "*points channels"]]:
-        wi, irradiance = _from_point(self.position, self.intensity, points)
+        wi, irradiance = PointLight.incidence(self, points)  # ty: ignore[invalid-argument-type]
         if self.normal is None:
             return wi, irradiance
         return wi, irradiance * jnp.maximum(-jnp.tensordot(wi, self.normal, 1), 0)[..., None]

@@ -47,16 +47,9 @@ class Camera(eqx.Module):
     focal_length: Float[Array, ""] = eqx.field(
         converter=numbers, metadata=valid("positive", lambda x: x > 0)
     )
-    width: int = eqx.field(static=True)
-    height: int = eqx.field(static=True)
+    width: int = eqx.field(static=True, metadata=valid("at least 1 (pixels)", lambda x: x >= 1))
+    height: int = eqx.field(static=True, metadata=valid("at least 1 (pixels)", lambda x: x >= 1))
     near: float = eqx.field(static=True, default=1e-2)
-
-    def __check_init__(self):
-        if self.width < 1 or self.height < 1:
-            raise ValueError(
-                f"a picture of {self.width} x {self.height} pixels has no pixel; width and height "
-                "must be at least 1"
-            )
 
     @classmethod
     def look_at(
