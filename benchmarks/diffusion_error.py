@@ -79,7 +79,8 @@ def layers_of(
     light: diffusion.LayersAtPoints, picked, gaussians: sj.SumOfGaussians, exact
 ) -> tuple[np.ndarray, np.ndarray]:
     """Compute `L_k` at some of the points, and by exact means and mass there."""
-    own = eqx.tree_at(lambda each: each.rows, light, [row[..., picked] for row in light.rows])
+    along = {name: getattr(light, name) for name in light.ALONG_POINTS}
+    own = dataclasses.replace(light, **jax.tree.map(lambda row: row[..., picked], along))
     means, mass = (jnp.asarray(each) for each in exact)
     truth, none = dataclasses.replace(own, means=means, mass=mass), jnp.zeros(means.shape[1])
     return tuple(np.asarray(each.weigh(gaussians, none)[0]) for each in (own, truth))

@@ -2,6 +2,8 @@
 Gaussians.
 """
 
+from typing import ClassVar
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -105,6 +107,9 @@ class LayersAtPoints(eqx.Module):
         tuple[Float[Array, "gaussians channels points"], Float[Array, "gaussians points"]] | None
     )
 
+    # Fields that lie along the points.
+    ALONG_POINTS: ClassVar = ("means", "mass", "irradiance", "area", "albedo", "derivative")
+
     @classmethod
     def of(
         cls,
@@ -146,12 +151,6 @@ class LayersAtPoints(eqx.Module):
             kernel=kernel,
             derivative=None if derivative is None else by_gaussian(derivative),
         )
-
-    @property
-    def rows(self) -> tuple:
-        """What lies along the points: means, mass, irradiance, area, albedo; and the derivative."""
-        own = self.means, self.mass, self.irradiance, self.area, self.albedo
-        return own if self.derivative is None else (*own, *self.derivative)
 
     def weigh(
         self, gaussians: SumOfGaussians, single_scattering_albedo: Float[Array, " channels"]

@@ -10,11 +10,10 @@ from splatjax._smooth import smooth_step
 from splatjax.cache import kept
 from splatjax.scene import Splats
 
-from ._distances import Part, above, bump, carve, ellipsoid, join, keep, limb, model
+from ._clay import Part, above, bump, carve, ellipsoid, join, keep, limb, model, surface_nets
 from ._mesh import Mesh
 from ._sample import splats_at
 from ._scatter import scatter
-from ._surface_nets import surface_nets
 
 LOW, HIGH = (-140.0, -226.0, -125.0), (140.0, 124.0, 125.0)
 # Where a primitive lies: as it is, on both sides, or on both without a crease down the middle.

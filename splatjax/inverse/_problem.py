@@ -247,7 +247,10 @@ class RecoveryProblem(eqx.Module):
 def _with_points(picture: DiffusionBasis, kept: np.ndarray, dtype: DTypeLike) -> DiffusionBasis:
     """Keep some points of a picture, in the precision of a search."""
     picture = eqx.tree_at(
-        lambda p: (*p.light.rows, p.pixel_radiance_per_exitance, p.in_front, p.pixels),
+        lambda p: (
+            *jax.tree.leaves([getattr(p.light, name) for name in p.light.ALONG_POINTS]),
+            *(p.pixel_radiance_per_exitance, p.in_front, p.pixels),
+        ),
         picture,
         replace_fn=lambda leaf: leaf[..., kept],
     )

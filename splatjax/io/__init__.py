@@ -1,6 +1,5 @@
 """The only package that touches files: splats, meshes, pictures, materials."""
 
-from ._environments import load_environment as load_environment
 from ._files import (
     atomic_path as atomic_path,
     fingerprint as fingerprint,
@@ -37,7 +36,11 @@ from ._tables import (
     write_columns as write_columns,
 )
 from ._meshes import read_textured_mesh as read_textured_mesh, sample_mesh as sample_mesh
-from ._observations import picture_paths as picture_paths, read_observations as read_observations
+from ._lights import (
+    load_environment as load_environment,
+    picture_paths as picture_paths,
+    read_observations as read_observations,
+)
 from ._ply import (
     SplatFile as SplatFile,
     read_splats as read_splats,

@@ -23,9 +23,6 @@ from ._render import render, transfer
 from ._settings import RenderSettings
 from ._shade import ShadedSurface
 
-# Fields of `LayersAtPoints` that lie along the points.
-_ALONG_POINTS = ("means", "mass", "irradiance", "area", "albedo", "derivative")
-
 
 class DiffusionBasis(eqx.Module):
     r"""A picture for weights that are still to come.
@@ -124,7 +121,7 @@ def _diffusion_basis(
     def passes(combination, scene, plan, camera, light=None):
         def read(shaded: ShadedSurface, at: LayersAtPoints, _):
             return (
-                {name: getattr(at, name) for name in _ALONG_POINTS},
+                {name: getattr(at, name) for name in at.ALONG_POINTS},
                 shaded.radiance_per_exitance,
                 shaded.specular,
             )

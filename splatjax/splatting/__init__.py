@@ -16,16 +16,16 @@ from ._views import (
     SplattingSettings as SplattingSettings,
 )
 from ._grid import TILE_SIDE as TILE_SIDE, TileGrid as TileGrid, TileRanges as TileRanges
-from ._kernel import coverage as coverage, fragment_weight as fragment_weight
 from ._projections import OrthographicView as OrthographicView, PerspectiveView as PerspectiveView
 from ._rasterizer import (
     AbstractRasterizer as AbstractRasterizer,
     AbstractRasterPlan as AbstractRasterPlan,
+    coverage as coverage,
+    fragment_weight as fragment_weight,
     FragmentSums as FragmentSums,
     invalid_factor as invalid_factor,
     PixelSums as PixelSums,
 )
-from ._merging import merge_splats as merge_splats
 from ._shadows import (
     Bounds as Bounds,
     compute_visibility as compute_visibility,
@@ -37,7 +37,11 @@ from ._shadows import (
     ShadowMap as ShadowMap,
     ShadowSettings as ShadowSettings,
 )
-from ._sightlines import Sightlines as Sightlines, SightlineSettings as SightlineSettings
+from ._groups import (
+    merge_splats as merge_splats,
+    Sightlines as Sightlines,
+    SightlineSettings as SightlineSettings,
+)
 from ._surfaces import (
     blend_fragments as blend_fragments,
     Surface as Surface,

@@ -10,12 +10,12 @@ from splatjax._combination import AbstractCombination
 from splatjax.scene import Splats
 
 from ._grid import TileGrid
-from ._kernel import fragment_weight
 from ._rasterizer import (
     AbstractRasterizer,
     AbstractRasterPlan,
     FragmentSums,
     PixelSums,
+    fragment_weight,
     least_weight,
 )
 from ._views import AbstractView, SplattingSettings

@@ -12,8 +12,12 @@ from jaxtyping import Array, Float, Int, Shaped
 
 from ._bins import Bins, slot_plane
 from ._grid import TILE_SIDE, TileGrid
-from ._kernel import fast_fragment_weight, fragment_weight_derivative
-from ._rasterizer import PixelSums, least_weight
+from ._rasterizer import (
+    PixelSums,
+    fast_fragment_weight,
+    fragment_weight_derivative,
+    least_weight,
+)
 from ._views import AbstractView
 
 # Of the footprints, that sums depend on.
@@ -163,7 +167,8 @@ class Sweep(eqx.Module):
         """
         x, y, sx, sy, _, _, _, e, _ = splats
         nearness = jnp.stack([e - sx * x - sy * y, sx, sy, jnp.ones_like(e)], axis=2)
-        return jnp.concatenate([slots.rows(ids), nearness], axis=2)
+        attributes = slots.attributes.at[ids].get(mode="fill", fill_value=0)
+        return jnp.concatenate([attributes, nearness], axis=2)
 
     def sums(self, slots: "Slots", lanes: Lanes, far_limit, near_limit) -> PixelSums:
         """Sum over the fragments between two limits."""
@@ -275,10 +280,6 @@ class Slots(eqx.Module):
             shift=slots(shift, 0.0),
             attributes=attributes,
         )
-
-    def rows(self, ids: Int[Array, "lanes slots"]) -> Float[Array, "lanes slots attributes"]:
-        """Read the attributes of some slots; 0 in empty ones."""
-        return self.attributes.at[ids].get(mode="fill", fill_value=0)
 
 
 def _plane_cotangents(splats, quad, near):

@@ -16,10 +16,9 @@ from splatjax._smooth import smooth_step
 from splatjax.scene import Splats, rotation_towards
 
 from ._grid import TILE_SIDE, TileGrid
-from ._kernel import coverage
-from ._merging import MERGED_COUNTS
+from ._groups import MERGED_COUNTS
 from ._projections import OrthographicView, PerspectiveView
-from ._rasterizer import AbstractRasterPlan, FragmentSums, invalid_factor
+from ._rasterizer import AbstractRasterPlan, FragmentSums, coverage, invalid_factor
 from ._surfaces import Surface
 from ._views import AbstractView, SplattingSettings
 

@@ -12,8 +12,7 @@ from splatjax._combination import AbstractCombination
 from splatjax.scene import Splats
 
 from ._grid import TILE_SIDE, TileGrid
-from ._kernel import coverage
-from ._rasterizer import AbstractRasterPlan, FragmentSums, PixelSums, invalid_factor
+from ._rasterizer import AbstractRasterPlan, FragmentSums, PixelSums, coverage, invalid_factor
 from ._views import AbstractView, SplattingSettings
 
 TILES_AT_ONCE = AT_ONCE // TILE_SIDE**2  # of a chunk, for what is computed chunk by chunk

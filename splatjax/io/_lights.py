@@ -1,4 +1,6 @@
-"""Pictures that were taken, and how: a TOML file that names them, with cameras and lights."""
+"""Lights from files: environments, and pictures that were taken under lights, with their cameras,
+as a TOML file names them.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -12,6 +14,7 @@ from splatjax.scene import (
     Camera,
     DirectionalLight,
     DiskLight,
+    EnvironmentLight,
     GaussianBeam,
     PointLight,
     RectangleLight,
@@ -22,6 +25,7 @@ from ._files import StrPath, naming
 from ._images import read_picture
 from ._tables import Table, read_toml
 
+_MOST_ROWS = 512  # of an environment
 _INTENSITIES = {"known": KnownIntensity, "unknown": UnknownIntensity, "unknown color": UnknownColor}
 _LIGHTS = {
     "directional": (DirectionalLight, ("direction", "irradiance", "cast_shadows")),
@@ -32,6 +36,23 @@ _LIGHTS = {
     "sphere": (SphereLight, ("center", "radiance", "radius", "cast_shadows")),
 }
 _LIGHT_ENTRIES = {"kind"}.union(*(names for _, names in _LIGHTS.values()))
+
+
+def load_environment(path: StrPath, **fields: Any) -> EnvironmentLight:
+    r"""Read an environment light: a latitude-longitude map of OpenEXR, Radiance HDR or another
+    format of floating-point numbers. Maps of more than 512 rows are halved, by averaging, while
+    both sides are even, which hardly changes samples and highlights.
+
+    **Arguments:** `fields`: the others of `EnvironmentLight`, by name.
+
+    **Raises:** as `read_picture` does, and `ValueError` for a map that is not twice as wide as
+    high, or has radiance that is negative or not finite.
+    """
+    image = read_picture(path)
+    while len(image) > _MOST_ROWS and not np.any(np.mod(image.shape[:2], 2)):
+        image = image.reshape(len(image) // 2, 2, image.shape[1] // 2, 2, -1).mean(axis=(1, 3))
+    with naming(path):
+        return EnvironmentLight(image.astype(np.float32), **fields)
 
 
 def read_observations(path: StrPath) -> list[Observation]:
