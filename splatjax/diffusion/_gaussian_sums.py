@@ -180,26 +180,8 @@ def _forward(given: _Sweep, points, table: SourceTable):
     return given.sums(points, table, add)
 
 
-def _derivative(residuals, moved):
-    """Compute the derivative of the sums along a direction."""
-    (given, points, table), (d_points, d_table) = residuals, moved
-
-    def add(lanes, ids, kernels, here, d_sums):
-        sources, d_sources, d_here = table.gather(ids), d_table.gather(ids), lanes.read(d_points)
-        weights, minus_slopes, offsets = _weigh(kernels, here, sources)
-        minus_half_change = sum(
-            offset * (center[:, :, None] - d_here[:, axis, None])
-            for axis, (offset, center) in enumerate(zip(offsets, d_sources.centers, strict=True))
-        )
-        rows, d_rows = jax.jvp(SourceTable.rows_and_moments, (sources,), (d_sources,))
-        d_sums += jnp.einsum("lrs,lsp->lrp", d_rows, weights)
-        return d_sums + jnp.einsum("lrs,lsp->lrp", rows, 2 * minus_slopes * minus_half_change)
-
-    return given.sums(points, table, add)
-
-
 def _backward(residuals, cotangents):
-    """Compute the transpose of `_derivative`.
+    """Compute the cotangents of points and sources from those of the sums.
 
     With `e = |x - p|^2` and `g = -dw / de * (rows_and_moments . cotangent)` for every pair of a
     point x and a source at p:
@@ -256,12 +238,6 @@ _sums.defvjp(
 )
 
 
-_sums_forward = jax.custom_jvp(_forward)
-_sums_forward.defjvp(
-    lambda primals, tangents: (_forward(*primals), _derivative(primals, tangents[1:]))
-)
-
-
 def gaussian_sums(
     points: Float[Array, "layers points_blocks 3 block"],
     table: SourceTable,
@@ -282,5 +258,7 @@ def gaussian_sums(
     - `forward_mode`: differentiable in forward mode alone, otherwise in reverse mode alone. Static.
     """
     given = _Sweep(kernels, lists, wanted)
-    sums = _sums_forward if forward_mode else _sums
+    sums = (
+        _forward if forward_mode else _sums
+    )  # loops have derivatives in forward mode of their own
     return sums(given, points.reshape(-1, *points.shape[2:]), table)
