@@ -22,7 +22,7 @@ from ._diffuser import (
     Sources,
     layer_values,
 )
-from ._gaussian_sums import SourceTable, Wanted, gaussian_sums
+from ._gaussian_sums import SourceTable, Targets, gaussian_sums
 from ._kernel import AbstractDiffusionKernel, TruncatedGaussian, resolved_fraction
 from ._neighbors import Boxes, Neighbors, find_neighbors
 
@@ -156,22 +156,22 @@ class ClusterPlan(AbstractDiffusionPlan):
 
         # Sink the sources and merge them; sum over those near each block of points.
         below = self.sources.merged(centered, depths)
-        wanted = Wanted.of(at, points.shape[1] // POINTS_PER_BLOCK, POINTS_PER_BLOCK)
+        targets = Targets.of(at, points.shape[1] // POINTS_PER_BLOCK, POINTS_PER_BLOCK)
         lists = self.neighbors.lists
         if at is not None:
-            lists = lists.only(jnp.any(wanted.ranks < wanted.count, axis=1))
+            lists = lists.only(jnp.any(targets.ranks < targets.count, axis=1))
         sums = gaussian_sums(
             in_units(points.reshape(3, -1, POINTS_PER_BLOCK).swapaxes(0, 1), own),
             source_table(below, own, self.sources.layers),
             lists,
             self.kernels,
-            wanted,
+            targets,
             self.forward_mode,
         )
         per_mm = units_per_mm(own)[:, None]
         seen = points if at is None else take_points(points, at)
         layers = jax.checkpoint(layer_values)(  # keeps the sums alone for the derivative
-            sums.reshape(len(own), -1, 4, wanted.count),
+            sums.reshape(len(own), -1, 4, targets.count),
             per_mm[:, None] * seen[None],
             2 * per_mm,  # slopes are moments in mm over v, and moments are in units of sqrt(2 v)
             per_flat_mass(self.kernels, own, depths)[:, None],

@@ -87,8 +87,8 @@ class SourceTable(eqx.Module):
         return jax.tree.map(added, self, cotangents)
 
 
-class Wanted(eqx.Module):
-    """The points at which sums are wanted.
+class Targets(eqx.Module):
+    """The points at which sums are computed.
 
     **Attributes:**
 
@@ -100,8 +100,8 @@ class Wanted(eqx.Module):
     count: int = eqx.field(static=True)
 
     @classmethod
-    def of(cls, at: Int[Array, " wanted"] | None, blocks: int, block: int) -> "Wanted":
-        """Want the points `at` of all points in blocks, beyond all for none; all for `None`."""
+    def of(cls, at: Int[Array, " targets"] | None, blocks: int, block: int) -> "Targets":
+        """Choose the points `at` of all points in blocks, beyond all for none; all for `None`."""
         every = jnp.arange(blocks * block, dtype=jnp.int32)
         if at is None:
             return cls(every.reshape(blocks, block), blocks * block)
@@ -115,14 +115,14 @@ class Wanted(eqx.Module):
 
     def write(
         self,
-        sums: Float[Array, "layers sums wanted"],
+        sums: Float[Array, "layers sums targets"],
         lanes: Lanes,
         values: Float[Array, "lanes sums block"],
-    ) -> Float[Array, "layers sums wanted"]:
+    ) -> Float[Array, "layers sums targets"]:
         return sums.at[self._at(lanes)].set(jnp.swapaxes(values, 1, 2), mode="drop")
 
     def read(
-        self, sums: Float[Array, "layers sums wanted"], lanes: Lanes
+        self, sums: Float[Array, "layers sums targets"], lanes: Lanes
     ) -> Float[Array, "lanes sums block"]:
         """Read what `write` wrote; 0 for other points."""
         return jnp.swapaxes(sums.at[self._at(lanes)].get(mode="fill", fill_value=0), 1, 2)
@@ -133,13 +133,13 @@ class _Sweep(eqx.Module):
 
     kernels: TruncatedGaussian
     lists: Lists
-    wanted: Wanted
+    targets: Targets
 
     def sweep(self, sweep, points, out):
         """Apply `sweep(lanes, kernels of the lanes, points of the lanes, out)` to all lists."""
 
         def with_points(lanes: Lanes, out):
-            layer = lanes.lists // len(self.wanted.ranks)
+            layer = lanes.lists // len(self.targets.ranks)
             kernels = jax.tree.map(lambda leaf: leaf.at[layer].get(mode="clip"), self.kernels)
             return sweep(lanes, kernels, lanes.read(points, FAR), out)
 
@@ -154,10 +154,10 @@ class _Sweep(eqx.Module):
             found = lanes.each_row(
                 self.lists, lambda ids, sums: add(lanes, ids, kernels, here, sums), start
             )
-            return self.wanted.write(out, lanes, found)
+            return self.targets.write(out, lanes, found)
 
         layers = len(self.kernels.largest)
-        out = zeros_after(table.rows, (layers, table.count, self.wanted.count), points.dtype)
+        out = zeros_after(table.rows, (layers, table.count, self.targets.count), points.dtype)
         return self.sweep(sweep, points, out)
 
 
@@ -195,7 +195,7 @@ def _backward(residuals, cotangents):
 
     def sweep(lanes: Lanes, kernels, here, carry):
         d_points, d_table = carry
-        cotangent = given.wanted.read(cotangents, lanes)
+        cotangent = given.targets.read(cotangents, lanes)
 
         def add(ids, carry):
             d_here, d_table = carry
@@ -243,9 +243,9 @@ def gaussian_sums(
     table: SourceTable,
     lists: Lists,
     kernels: TruncatedGaussian,
-    wanted: Wanted,
+    targets: Targets,
     forward_mode: bool = False,
-) -> Float[Array, "layers sums wanted"]:
+) -> Float[Array, "layers sums targets"]:
     r"""Sum `rows_j exp(-|x - p_j|^2)` over the blocks of sources that every point meets.
 
     **Arguments:**
@@ -254,11 +254,10 @@ def gaussian_sums(
     - `table`: `p_j` and `rows_j` of all layers. Differentiable.
     - `kernels`: of each layer; stand for `exp`. Terms beyond their rims vanish, whatever the lists
       hold.
-    - `wanted`: at which points.
+    - `targets`: at which points.
     - `forward_mode`: differentiable in forward mode alone, otherwise in reverse mode alone. Static.
     """
-    given = _Sweep(kernels, lists, wanted)
-    sums = (
-        _forward if forward_mode else _sums
-    )  # loops have derivatives in forward mode of their own
+    given = _Sweep(kernels, lists, targets)
+    # The loops have derivatives in forward mode of their own.
+    sums = _forward if forward_mode else _sums
     return sums(given, points.reshape(-1, *points.shape[2:]), table)

@@ -21,7 +21,7 @@ from ._clustered import (
 )
 from ._clusters import LayerSources, SunkSources, compact_order
 from ._diffuser import Sources, divide_by_mass
-from ._gaussian_sums import FAR, Wanted, gaussian_sums
+from ._gaussian_sums import FAR, Targets, gaussian_sums
 from ._kernel import AbstractDiffusionKernel, TruncatedGaussian
 from ._neighbors import Boxes, Lists, find_neighbors, pairs_in_reach
 
@@ -108,8 +108,8 @@ class StreamedDiffusion:
 @eqx.filter_jit
 def _sum(points, below: SunkSources, clusters: LayerSources, variances, kernels, lists: Lists):
     table = source_table(below, variances, clusters.layers, moments=False)
-    wanted = Wanted.of(None, points.shape[0], points.shape[2])
-    return gaussian_sums(in_units(points, variances), table, lists, kernels, wanted)
+    targets = Targets.of(None, points.shape[0], points.shape[2])
+    return gaussian_sums(in_units(points, variances), table, lists, kernels, targets)
 
 
 @eqx.filter_jit

@@ -15,9 +15,9 @@ from splatjax.scene import Camera, HarmonicLight, Scene
 from splatjax.splatting import invalid_factor
 
 from ._bounces import check_no_bounces
-from ._devices import filled_like, on_devices
+from ._devices import fill_scene, on_devices
 from ._filling import rows_at
-from ._passes import SplatLight, Transfer, in_a_row, light_source, see_and_shade
+from ._passes import SplatLight, Transfer, in_a_row, make_light_at, see_and_shade
 from ._plan import Plan, plan_unless_traced
 from ._render import render, transfer
 from ._settings import RenderSettings
@@ -98,13 +98,13 @@ def diffusion_basis(
         )
     plan = plan_unless_traced(scene, camera, settings, plan)
     check_no_bounces(settings)
-    scene, plan, light, places = filled_like(scene, plan, light, camera)
+    scene, plan, light, own = fill_scene(scene, plan, light, camera)
     basis = _diffusion_basis(scene, camera, settings, plan, derivative, light)
 
     def of_gaussians(light: LayersAtPoints):
         return light.variances, light.means, light.mass, light.derivative
 
-    rows = jax.tree.map(lambda each: rows_at(each, places.gaussians), of_gaussians(basis.light))
+    rows = jax.tree.map(lambda each: rows_at(each, own.gaussians), of_gaussians(basis.light))
     is_leaf = {"is_leaf": lambda leaf: leaf is None}
     return eqx.tree_at(lambda basis: of_gaussians(basis.light), basis, rows, **is_leaf)
 
@@ -132,7 +132,7 @@ def _diffusion_basis(
             settings,
             plan,
             combination,
-            light_source(scene, settings, plan, combination, light, derivative),
+            make_light_at(scene, settings, plan, combination, light, derivative),
             read,
         )
         layers, per_exitance = jax.tree.map(in_a_row, rows)
@@ -239,7 +239,7 @@ def relighting_basis(
             "other lights by themselves: pictures add up"
         )
     plan = plan_unless_traced(scene, camera, settings, plan)
-    scene, plan, light, _ = filled_like(scene, plan, light, camera)
+    scene, plan, light, _ = fill_scene(scene, plan, light, camera)
     return _relighting_basis(scene, camera, settings, plan, light)
 
 

@@ -26,7 +26,7 @@ Result = TypeVar("Result", bound=PyTree)
 Kept = TypeVar("Kept", bound=SplatLight | Transfer)
 
 
-class Places(NamedTuple):
+class OwnRows(NamedTuple):
     """Where the lights and the Gaussians of a scene are in one that was filled up."""
 
     lights: Int[np.ndarray, " lights"]
@@ -40,9 +40,9 @@ class Places(NamedTuple):
         return dataclasses.replace(frame, shadow=shadow, **rows)
 
 
-def filled_like(
+def fill_scene(
     scene: Scene, plan: Plan, light: Kept | None = None, *given: PyTree
-) -> tuple[Scene, Plan, Kept | None, Places]:
+) -> tuple[Scene, Plan, Kept | None, OwnRows]:
     """Fill up the splats of a scene to the length of its plan, the lights of each kind to four or a
     larger power of two, the Gaussians and the angles, by NumPy and `device_put`, which compile
     nothing. Where the scene or what is `given` with it is traced, and where splats are cut over
@@ -66,10 +66,10 @@ def filled_like(
     count, material = scene.splats.count, plan.diffusion.material(scene.material)
     scene = Scene(scene.splats, scene.lights, material)
     shown = np.arange(min(plan.gaussians, len(material.gaussians.variances)))
-    places = Places(np.arange(len(scene.lights)), shown)
+    own = OwnRows(np.arange(len(scene.lights)), shown)
     leaves = jax.tree.leaves((scene, light, given))
     if plan.mesh is not None or any(isinstance(leaf, Tracer) for leaf in leaves):
-        return scene, plan, light and fitted(light, scene), places
+        return scene, plan, light and resize_visibility(light, scene), own
     splats, lights, shadows = scene.splats, scene.lights, plan.shadows
     if 0 < count < len(plan.order):
         splats = jax.tree.map(lambda leaf: rows_at(leaf, np.arange(len(plan.order))), splats)
@@ -77,7 +77,7 @@ def filled_like(
         groups = lights_by_kind(lights)
         numbered = [light for group in groups for light in group + fill_lights(group, len(lights))]
         order = np.argsort([number for number, _ in numbered], stable=True)
-        places = places._replace(lights=order[: len(lights)])
+        own = own._replace(lights=order[: len(lights)])
         lights = [light for _, light in numbered]
         shadows = tuple(
             shadow and dataclasses.replace(shadow, lights=jax.device_put(np.int32(len(group))))
@@ -93,11 +93,11 @@ def filled_like(
     counts = {"splats": splats.count, "gaussians": len(gaussians.variances)}
     filled = dataclasses.replace(plan, shadows=shadows, **counts)
     scene = Scene(splats, lights, material)
-    return scene, filled, light and fitted(light, scene), places
+    return scene, filled, light and resize_visibility(light, scene), own
 
 
-def fitted(light: Kept, scene: Scene) -> Kept:
-    """Give each kind of lights a row of visibility for every sample that the scene has of it."""
+def resize_visibility(light: Kept, scene: Scene) -> Kept:
+    """Fill up or cut the rows of visibility of each kind of lights to the samples of a scene."""
     groups = zip(light.visibility, lights_by_kind(scene.lights), strict=True)
     visibility = [rows if rows is None else rows_at(rows, np.arange(len(g))) for rows, g in groups]
     return dataclasses.replace(light, visibility=visibility)

@@ -15,10 +15,10 @@ from splatjax.scene import Camera, Frame, Scene
 
 from ._attributes import SurfaceSamples
 from ._bounces import check_no_bounces
-from ._devices import filled_like, on_devices
+from ._devices import fill_scene, on_devices
 from ._filling import rows_at
 from ._lighting import LightAtSplats
-from ._passes import light_source, see_and_shade
+from ._passes import make_light_at, see_and_shade
 from ._plan import Plan, plan_unless_traced
 from ._settings import RenderSettings
 from ._shade import ShadedSurface, compose, layers_at_points
@@ -113,10 +113,10 @@ def picture_jacobian(
         )
     check_no_bounces(settings)
     plan = plan_unless_traced(scene, camera, settings, plan)
-    scene, plan, _, places = filled_like(scene, plan, None, camera)
+    scene, plan, _, own = fill_scene(scene, plan, None, camera)
     found = _picture_jacobian(scene, camera, settings, plan)
-    rows = (rows_at(each, places.gaussians) for each in (found.weights, found.variances))
-    return PictureJacobian(places.frame(found.frame), *rows)
+    rows = (rows_at(each, own.gaussians) for each in (found.weights, found.variances))
+    return PictureJacobian(own.frame(found.frame), *rows)
 
 
 @eqx.filter_jit
@@ -143,7 +143,7 @@ def _picture_jacobian(
             per_exitance = shaded.radiance_per_exitance[None]
             return shaded, per_exitance * of_weights, per_exitance * of_variances
 
-        light_at = light_source(scene, settings, plan, combination, None, derivative=True)
+        light_at = make_light_at(scene, settings, plan, combination, None, derivative=True)
         (shaded, *derivatives), visible = see_and_shade(
             scene, camera, settings, plan, combination, light_at, read
         )

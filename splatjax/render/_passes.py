@@ -125,7 +125,7 @@ def light_splats(
     return SplatLight(visibility, irradiance, layers, *derivatives, needed, beams)
 
 
-def light_source(
+def make_light_at(
     scene: Scene,
     settings: RenderSettings,
     plan: Plan,
@@ -177,7 +177,7 @@ def see_and_shade(
 
     **Arguments:**
 
-    - `light_at`: passes 1 and 4, for the splats that the camera may see: `light_source`.
+    - `light_at`: passes 1 and 4, for the splats that the camera may see: `make_light_at`.
     - `read`: pointwise, along the last axis.
 
     **Returns:** what was read, for each place; and the places, with the capacity needed of all

@@ -15,13 +15,13 @@ from splatjax.scene import Camera, Frame, Scene
 
 from ._bounces import bounced_irradiance, diffuse_splats
 from ._checks import check_channels
-from ._devices import filled_like, fitted, on_devices
+from ._devices import fill_scene, on_devices, resize_visibility
 from ._lighting import Irradiance, LightAtSplats
 from ._passes import (
     SplatLight,
     Transfer,
-    light_source,
     light_visibility,
+    make_light_at,
     see_and_shade,
 )
 from ._plan import Plan, check_plan, plan_unless_traced, splats_per_device
@@ -60,8 +60,8 @@ def render(
     disagree.
     """
     plan = plan_unless_traced(scene, camera, settings, plan, mesh)
-    scene, plan, light, places = filled_like(scene, plan, light, camera)
-    return places.frame(_render(scene, camera, settings, plan, light))
+    scene, plan, light, own = fill_scene(scene, plan, light, camera)
+    return own.frame(_render(scene, camera, settings, plan, light))
 
 
 @kept_jit
@@ -79,7 +79,7 @@ def _render(
             settings,
             plan,
             combination,
-            light_source(scene, settings, plan, combination, light),
+            make_light_at(scene, settings, plan, combination, light),
             read=lambda shaded, *_: shaded,
         )
         return compose(scene, shaded, visible)
@@ -114,8 +114,8 @@ def illuminate(
     """
     check_channels(scene)
     check_plan(plan, scene)
-    filled, plan, light, _ = filled_like(scene, plan, light)
-    return fitted(_illuminate(filled, plan, settings, derivative, light), scene)
+    filled, plan, light, _ = fill_scene(scene, plan, light)
+    return resize_visibility(_illuminate(filled, plan, settings, derivative, light), scene)
 
 
 @kept_jit
@@ -123,7 +123,7 @@ def _illuminate(
     scene: Scene, plan: Plan, settings: RenderSettings, derivative: bool, light: Transfer | None
 ) -> SplatLight:
     def passes(combination, scene, plan, light=None):
-        return light_source(scene, settings, plan, combination, light, derivative)(None)
+        return make_light_at(scene, settings, plan, combination, light, derivative)(None)
 
     return on_devices(passes, scene, plan, by_splat=True, placed=light)
 
@@ -147,8 +147,8 @@ def transfer(scene: Scene, plan: Plan, settings: RenderSettings = RenderSettings
     """
     check_channels(scene)
     check_plan(plan, scene)
-    filled, plan, *_ = filled_like(scene, plan)
-    return fitted(_transfer(filled, plan, settings), scene)
+    filled, plan, *_ = fill_scene(scene, plan)
+    return resize_visibility(_transfer(filled, plan, settings), scene)
 
 
 @kept_jit

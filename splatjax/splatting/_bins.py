@@ -36,6 +36,7 @@ class BinCapacity(eqx.Module):
         pairs, blocks, chunks, whole = 1, 1, 1, grid.padded_count // grid.lanes
         for tiles in per_tile:
             counts = np.asarray(tiles, np.int64)
+            # Blocks of the longest list of each chunk: the lists of a chunk take as many each.
             longest = np.sort(-(-counts // grid.slots))[::-1][:: grid.lanes]
             pairs, blocks = max(pairs, int(counts.sum())), max(blocks, int(longest.sum()))
             chunks = max(chunks, int((longest > 0).sum()))

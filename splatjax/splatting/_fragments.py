@@ -64,10 +64,10 @@ class Sweep(eqx.Module):
 
     **Attributes:**
 
-    - `view`: its class: fragments need the formulas of a view, not where it stands. Static.
+    - `view_class`: fragments need the formulas of a view, not where it stands. Static.
     """
 
-    view: type[AbstractView] = eqx.field(static=True)
+    view_class: type[AbstractView] = eqx.field(static=True)
     grid: TileGrid
     full_coverage: float = eqx.field(static=True)
     filter_radius: float = eqx.field(static=True)
@@ -121,10 +121,12 @@ class Sweep(eqx.Module):
         # These lanes are one chunk: their lists have equal length, so none ends early.
         def nearest(block, limit):
             nearness, quadric = self.fragments(self.splats(slots.planes, block, lanes))
-            shifted = self.view.shifted(nearness, lanes.read(slots.shift, block)[:, :, None])
+            shifted = self.view_class.shifted(nearness, lanes.read(slots.shift, block)[:, :, None])
             return jnp.maximum(
                 limit,
-                jnp.max(jnp.where(self.view.inside(nearness, quadric), shifted, -jnp.inf), axis=1),
+                jnp.max(
+                    jnp.where(self.view_class.inside(nearness, quadric), shifted, -jnp.inf), axis=1
+                ),
             )
 
         return lax.fori_loop(jnp.int32(0), lanes.blocks, nearest, self._no_limit(lanes))
@@ -137,11 +139,11 @@ class Sweep(eqx.Module):
         def nearest(block, limits):
             splats = self.splats(slots.planes, block, lanes)
             nearness, quadric = self.fragments(splats)
-            shifted = self.view.shifted(nearness, lanes.read(slots.shift, block)[:, :, None])
+            shifted = self.view_class.shifted(nearness, lanes.read(slots.shift, block)[:, :, None])
             far_limit = lanes.until_end(jnp.full_like(open_limit, -jnp.inf), block)
             squared_radius = self.squared_radii(nearness, quadric, far_limit, open_limit)
             weight = splats[-1][:, :, None] * fast_fragment_weight(squared_radius)
-            least = least_weight(self.view, *splats[4:8], self.filter_radius)
+            least = least_weight(self.view_class, *splats[4:8], self.filter_radius)
             chosen = weight > least[:, :, None], squared_radius < 1
             new = (jnp.max(jnp.where(which, shifted, -jnp.inf), axis=1) for which in chosen)
             return tuple(jnp.maximum(*pair) for pair in zip(limits, new, strict=True))
@@ -158,8 +160,8 @@ class Sweep(eqx.Module):
         for all others.
         """
         between = (nearness > far_limit[:, None]) & (nearness <= near_limit[:, None])
-        chosen = self.view.inside(nearness, quadric) & between
-        return jnp.where(chosen, self.view.squared_radius(nearness, quadric), 1.0)
+        chosen = self.view_class.inside(nearness, quadric) & between
+        return jnp.where(chosen, self.view_class.squared_radius(nearness, quadric), 1.0)
 
     def rows(self, slots: "Slots", ids, splats):
         """Return `[lanes, slots, rows]`: attributes, the plane of nearness over the tile (three
@@ -229,7 +231,7 @@ class Sweep(eqx.Module):
             d_weight = opacity[:, :, None] * jnp.einsum("tsr,trp->tsp", rows, of_rows)
             d_squared = fragment_weight_derivative(squared_radius, weight) * d_weight
             nearness = jnp.where(squared_radius < 1, nearness, 1.0)
-            d_nearness, d_quadric = self.view.squared_radius_vjp(
+            d_nearness, d_quadric = self.view_class.squared_radius_vjp(
                 nearness, squared_radius, d_squared
             )
             # Both are polynomials in the pixel: their moments over the tile suffice.

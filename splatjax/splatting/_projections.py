@@ -150,16 +150,6 @@ class PerspectiveView(AbstractView):
     def depth(nearness):
         return 1 / nearness
 
-    def project(self, points):
-        offset = points - self.position.reshape(3, *[1] * (points.ndim - 1))
-        x, y, z = jnp.tensordot(self.rotation, offset, 1)
-        safe = jnp.where(z > self.near, z, 1.0)
-        column, row = (
-            self.width / 2 + self.focal_length * x / safe,
-            self.height / 2 + self.focal_length * y / safe,
-        )
-        return column, row, z
-
     def depth_slope(self, x, y, depth, normals):
         nx, ny, nz = jnp.tensordot(self.rotation, normals, 1)
         u, v = (x - self.width / 2) / self.focal_length, (y - self.height / 2) / self.focal_length
@@ -168,13 +158,6 @@ class PerspectiveView(AbstractView):
 
     def pixel_size(self, depth):
         return jnp.where(depth > self.near, depth, 1.0) / self.focal_length
-
-    def unproject(self, x, y, depth):
-        u, v = (x - self.width / 2) / self.focal_length, (y - self.height / 2) / self.focal_length
-        along = jnp.stack([u * depth, v * depth, depth])
-        return jnp.tensordot(self.rotation.T, along, 1) + self.position.reshape(
-            3, *[1] * depth.ndim
-        )
 
 
 class OrthographicView(AbstractView):
@@ -250,22 +233,9 @@ class OrthographicView(AbstractView):
     def depth(nearness):
         return -nearness
 
-    def project(self, points):
-        offset = points - self.position.reshape(3, *[1] * (points.ndim - 1))
-        x, y, z = jnp.tensordot(self.rotation, offset, 1)
-        return self.width / 2 + self.scale * x, self.height / 2 + self.scale * y, z
-
     def depth_slope(self, x, y, depth, normals):
         nx, ny, nz = jnp.tensordot(self.rotation, normals, 1)
         return nx / self.scale, ny / self.scale, -nz
 
     def pixel_size(self, depth):
         return 1 / self.scale
-
-    def unproject(self, x, y, depth):
-        along = jnp.stack(
-            [(x - self.width / 2) / self.scale, (y - self.height / 2) / self.scale, depth]
-        )
-        return jnp.tensordot(self.rotation.T, along, 1) + self.position.reshape(
-            3, *[1] * depth.ndim
-        )

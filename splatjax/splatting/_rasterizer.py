@@ -78,7 +78,7 @@ LEAST_WEIGHT = 0.06  # of a fragment that decides where the surface behind the f
 
 
 def least_weight(
-    view: type[AbstractView],
+    view_class: type[AbstractView],
     a: Float[Array, "*splats"],
     b: Float[Array, "*splats"],
     c: Float[Array, "*splats"],
@@ -89,7 +89,7 @@ def least_weight(
     makes them that much fainter.
     """
     # Disc and filter together have axes whose squares add up to r^2 (1 + cos^2) + 2 f^2.
-    determinant = (a * c - 0.25 * b * b) * view.squared_radius(nearness, jnp.ones_like(a))
+    determinant = (a * c - 0.25 * b * b) * view_class.squared_radius(nearness, jnp.ones_like(a))
     axes = (a + c) / jnp.where(determinant > 0, determinant, 1.0)
     # In float32 the determinant may vanish, for splats much larger than a pixel.
     return LEAST_WEIGHT * jnp.where(

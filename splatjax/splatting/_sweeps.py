@@ -214,7 +214,7 @@ def sum_parts(
 
     **Returns:** for each view the sums on this device, and over what.
     """
-    first, views = next(iter(parts())), range(len(capacities))
+    first, views = next(iter(parts())), range(len(capacities))  # by their numbers
     # Stage 1: where the front ends in any part.
     limits = combination.largest([sweep.limits() for sweep in part] for part in parts())
     fronts = [Spans.front(*limits[k], capacities[k].front) for k in views]

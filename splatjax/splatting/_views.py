@@ -177,9 +177,12 @@ class AbstractView(eqx.Module):
     def depth(nearness: Float[Array, "..."]) -> Float[Array, "..."]:
         """Compute the depth (mm along the forward axis) of a nearness."""
 
-    @abc.abstractmethod
     def project(self, points: Float[Array, "3 *points"]) -> tuple[Float[Array, "*points"], ...]:
         """Compute column, row (pixels) and depth (mm) of points."""
+        offset = points - self.position.reshape(3, *[1] * (points.ndim - 1))
+        x, y, depth = jnp.tensordot(self.rotation, offset, 1)
+        mm = self.pixel_size(depth)
+        return self.width / 2 + x / mm, self.height / 2 + y / mm, depth
 
     @abc.abstractmethod
     def depth_slope(
@@ -200,11 +203,15 @@ class AbstractView(eqx.Module):
     def pixel_size(self, depth: Float[Array, "*points"]) -> Float[Array, "..."]:
         """Compute the width of a pixel at a depth, mm."""
 
-    @abc.abstractmethod
     def unproject(
         self, x: Float[Array, "*points"], y: Float[Array, "*points"], depth: Float[Array, "*points"]
     ) -> Float[Array, "3 *points"]:
         """Compute the point in the world at a depth under a pixel."""
+        mm = self.pixel_size(depth)
+        along = jnp.stack([(x - self.width / 2) * mm, (y - self.height / 2) * mm, depth])
+        return jnp.tensordot(self.rotation.T, along, 1) + self.position.reshape(
+            3, *[1] * depth.ndim
+        )
 
 
 def rotate(

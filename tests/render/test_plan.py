@@ -311,8 +311,8 @@ def test_lights_and_gaussians_that_fill_up_are_in_no_result():
     assert jnp.allclose(beauty, exact.beauty, rtol=1e-5, atol=1e-6)
 
     # No map is made for what fills up: its visibility is 0.
-    filled, counted, _, places = _devices.filled_like(scene, plan)
-    assert places.lights.tolist() == [0, 4, 1, 2]
+    filled, counted, _, own = _devices.fill_scene(scene, plan)
+    assert own.lights.tolist() == [0, 4, 1, 2]
     rows = _render._illuminate(filled, counted, PLAIN, False, None).visibility[0]
     assert not np.any(rows[3])
     assert np.all(np.any(rows[:3] > 0, axis=1))
