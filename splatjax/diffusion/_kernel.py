@@ -14,7 +14,16 @@ from jaxtyping import Array, Float
 from splatjax._smooth import smooth_step
 from splatjax.scene import Splats
 
-_ROOT_DEGREE = 4
+# The eighth root of exp(-x) as a polynomial, highest power first: the eighth power is within 2e-6,
+# and hardly grows beyond the largest exponent in use, 10.13.
+_ROOT = (
+    -1.5162319954e-07,
+    9.31495647343e-06,
+    -3.22219821163e-04,
+    7.80700544689e-03,
+    -0.124996893065,
+    0.999999743205,
+)
 _FADE = 0.5  # the last part of the exponent, over which the kernel fades to zero
 _LEAST_TRUNCATED, _MOST_TRUNCATED = 4e-5, 0.1  # of the power: 4.5 and 2.1 standard deviations
 _LEAST_SHARE = 1e-3  # of the diffusion integral in a layer that counts at all
@@ -29,36 +38,20 @@ class TruncatedGaussian(eqx.Module):
     """`exp(-exponent)`, faded linearly to zero in the last `_FADE` before the largest exponent.
 
     A step has no derivative that automatic differentiation sees; the fade has one. In float32 the
-    exponential is the eighth power of a polynomial, within 4e-5 and at half the time, and its
+    exponential is the eighth power of a polynomial, within 2e-6 and at half the time, and its
     derivative is that of the polynomial.
 
-    **Attributes:** of several kernels; not differentiated
+    **Attributes:** not differentiated
 
-    - `largest`: exponent.
-    - `coefficients`: of the polynomial, highest power first.
+    - `largest`: exponent of each kernel.
     """
 
     largest: Float[Array, " kernels"]
-    coefficients: Float[Array, "kernels powers"]
-
-    @classmethod
-    def up_to(cls, largest: Float[np.ndarray, " kernels"]) -> "TruncatedGaussian":
-        """Fit the polynomials whose eighth power is `exp(-x)` up to `largest`."""
-
-        def polynomial(largest: float) -> np.ndarray:
-            x = np.polynomial.chebyshev.chebpts1(64) * largest / 2 + largest / 2
-            # Weighted between an even error of the weight and an even relative error.
-            weight = np.exp(-3 * x / 8)
-            fit = np.polynomial.Polynomial.fit(x, np.exp(-x / 8), _ROOT_DEGREE, w=weight)
-            return fit.convert().coef[::-1]
-
-        powers = np.array([polynomial(each) for each in largest]).reshape(-1, _ROOT_DEGREE + 1)
-        return cls(jnp.asarray(largest, float), jnp.asarray(powers, float))
 
     def __call__(self, exponent: Float[Array, "kernels ..."]) -> tuple[Float[Array, "..."], ...]:
         """Compute the weight, and minus its derivative in the exponent."""
         gaussian, minus_slope = self._gaussian(exponent)
-        largest = self._beside(self.largest, exponent)
+        largest = self.largest.astype(exponent.dtype).reshape(-1, *[1] * (exponent.ndim - 1))
         left = (largest - exponent) / _FADE
         fades = left < 1
         weight = jnp.where(fades, gaussian * left, gaussian)
@@ -66,18 +59,12 @@ class TruncatedGaussian(eqx.Module):
         inside = exponent < largest
         return jnp.where(inside, weight, 0.0), jnp.where(inside, minus_slope, 0.0)
 
-    def _beside(self, numbers: Float[Array, " kernels"], exponent) -> Float[Array, "kernels ..."]:
-        return numbers.astype(exponent.dtype).reshape(-1, *[1] * (exponent.ndim - 1))
-
     def _gaussian(self, exponent: Float[Array, "..."]) -> tuple[Float[Array, "..."], ...]:
         if exponent.dtype != jnp.float32:
             gaussian = jnp.exp(-exponent)
             return gaussian, gaussian
-        first, *others = (
-            self._beside(each, exponent) for each in jnp.unstack(self.coefficients, axis=-1)
-        )
-        root, slope = jnp.broadcast_to(first, exponent.shape), jnp.zeros_like(exponent)
-        for coefficient in others:
+        root, slope = jnp.full_like(exponent, _ROOT[0]), jnp.zeros_like(exponent)
+        for coefficient in _ROOT[1:]:
             root, slope = root * exponent + coefficient, slope * exponent + root
         square = root * root
         fourth = square * square
@@ -125,7 +112,7 @@ class AbstractDiffusionKernel(eqx.Module):
 
     def truncated(self, supports: Float[np.ndarray, " kernels"]) -> TruncatedGaussian:
         """Build the kernels that are zero beyond so many standard deviations."""
-        return TruncatedGaussian.up_to(0.5 * np.square(supports))
+        return TruncatedGaussian(jnp.asarray(0.5 * np.square(supports), float))
 
     def interval(self, unevenness: Float[Array, ""]) -> Float[Array, "2"]:
         """Compute between which standard deviations per spacing layers become resolved."""

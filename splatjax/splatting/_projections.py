@@ -159,6 +159,13 @@ class PerspectiveView(AbstractView):
     def pixel_size(self, depth):
         return jnp.where(depth > self.near, depth, 1.0) / self.focal_length
 
+    def unproject(self, x, y, depth):
+        u, v = (x - self.width / 2) / self.focal_length, (y - self.height / 2) / self.focal_length
+        along = jnp.stack([u * depth, v * depth, depth])
+        return jnp.tensordot(self.rotation.T, along, 1) + self.position.reshape(
+            3, *[1] * depth.ndim
+        )
+
 
 class OrthographicView(AbstractView):
     """What a light at infinity sees. `position` is seen at the center of the picture, at
@@ -239,3 +246,11 @@ class OrthographicView(AbstractView):
 
     def pixel_size(self, depth):
         return 1 / self.scale
+
+    def unproject(self, x, y, depth):
+        along = jnp.stack(
+            [(x - self.width / 2) / self.scale, (y - self.height / 2) / self.scale, depth]
+        )
+        return jnp.tensordot(self.rotation.T, along, 1) + self.position.reshape(
+            3, *[1] * depth.ndim
+        )

@@ -203,15 +203,11 @@ class AbstractView(eqx.Module):
     def pixel_size(self, depth: Float[Array, "*points"]) -> Float[Array, "..."]:
         """Compute the width of a pixel at a depth, mm."""
 
+    @abc.abstractmethod
     def unproject(
         self, x: Float[Array, "*points"], y: Float[Array, "*points"], depth: Float[Array, "*points"]
     ) -> Float[Array, "3 *points"]:
         """Compute the point in the world at a depth under a pixel."""
-        mm = self.pixel_size(depth)
-        along = jnp.stack([(x - self.width / 2) * mm, (y - self.height / 2) * mm, depth])
-        return jnp.tensordot(self.rotation.T, along, 1) + self.position.reshape(
-            3, *[1] * depth.ndim
-        )
 
 
 def rotate(
