@@ -162,7 +162,11 @@ def weigh(
     """
     length, scattered = (jnp.broadcast_to(x, weights.carried.shape) for x in (length, scattered))
     removal = of_layer(optics.removal, layer) * length
-    taken = weights.carried * _taken(of_layer(optics.absorption, layer) * length, removal)
+    # The mean of exp(-removal) on the way; a series where the quotient has no derivative.
+    short = removal < 1e-4
+    mean = -jnp.expm1(-removal) / jnp.where(short, 1.0, removal)
+    mean = jnp.where(short, 1 - 0.5 * removal, mean)
+    taken = weights.carried * of_layer(optics.absorption, layer) * length * mean
     ratio = jnp.where(scattered, of_layer(optics.ratio, layer), 1.0)
     layers = jnp.broadcast_to(
         jnp.arange(weights.absorbed.shape[0], dtype=jnp.int32)[:, None, None],
@@ -173,22 +177,3 @@ def weigh(
         weights.carried * jnp.exp(-removal) * ratio,
         weights.absorbed + jnp.where(here, jnp.broadcast_to(taken, here.shape), 0.0),
     )
-
-
-@jax.custom_jvp
-def _taken(
-    absorption: Float[Array, "channels photons"], removal: Float[Array, "channels photons"]
-) -> Float[Array, "channels photons"]:
-    """Compute `(1 - exp(-removal)) absorption / removal`, where both are equal in value, as they
-    are on the path drawn.
-    """
-    return -jnp.expm1(-absorption)
-
-
-@_taken.defjvp
-def _taken_jvp(primals, tangents):
-    absorption, _ = primals
-    absorbing, removing = tangents
-    taken = -jnp.expm1(-absorption)
-    mean = jnp.where(absorption > 0, taken / jnp.where(absorption > 0, absorption, 1.0), 1.0)
-    return taken, jnp.exp(-absorption) * removing + mean * (absorbing - removing)
