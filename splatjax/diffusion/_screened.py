@@ -1,4 +1,4 @@
-"""The Green's function of the diffusion equation as a sum of Gaussians."""
+"""The Green's function of the diffusion equation, softened within the spacing of splats."""
 
 import math
 
@@ -8,73 +8,62 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-_STEP = math.log(2) / 2  # of the trapezoid rule in log s: right to 2e-6
-_NARROW, _REST = 40, 60  # Gaussians beyond those that are summed: below 1e-6 is left out
-_SQUARINGS = 3  # after which rounding counts
-_FLAT = 0.15  # widest exponent that a parabola stands for, as a root
+_TERMS, _SMALL = 8, 0.1  # of the series of the softening near 0
+_NODES, _REACH = 12, 4.0  # of the integral of what is left out, and its end in softening lengths
+_SCALE = 2 / math.sqrt(math.pi)
 
 
 class ScreenedKernel(eqx.Module):
-    r"""`exp(-kappa r) / (4 pi r)`, split by the width of its Gaussians:
+    r"""`G = exp(-kappa r) / (4 pi r)`, with the distance softened:
 
-        exp(-kappa r) / r = (2 / sqrt(pi)) int_0^inf exp(-r^2 s^2 - kappa^2 / (4 s^2)) ds
+        r_s = r / erf(r / length)
 
-    Points of a surface resolve the Gaussians that are at least as wide as `spread`. Narrower ones
-    see a plane around each point, and are integrated over it in closed form.
+    It is smooth, points of a surface at most `length` apart resolve it, and it is `G` beyond three
+    lengths. What the softening leaves out is integrated over a plane through each point.
 
     **Attributes:** (differentiable)
 
-    - `squared_kappa`: 1/mm^2; smooth at 0.
-    - `spread`: mm. The narrowest Gaussian that is summed is `exp(-(r / spread)^2)`, and each next
-      one has twice the variance.
-    - `count`: of the Gaussians that are summed. Static.
+    - `kappa`: 1/mm.
+    - `length`: mm.
     """
 
-    squared_kappa: Float[Array, ""]
-    spread: Float[Array, ""]
-    count: int = eqx.field(static=True)
-
-    @staticmethod
-    def count_for(reach: float, spread: float) -> int:
-        """Return how many Gaussians distances up to `reach` need; wider ones are parabolas."""
-        return max(math.ceil(2 * math.log2(reach / spread / _FLAT)), 1)
-
-    def finer(self, octaves: int) -> "ScreenedKernel":
-        """Sum Gaussians down to variances smaller by `2^octaves`."""
-        spread = self.spread * 2 ** (-octaves / 2)
-        return ScreenedKernel(self.squared_kappa, spread, self.count + octaves)
-
-    def _gaussians(self, numbers: np.ndarray):
-        """Return `s^2` and the weight of some Gaussians; the narrowest that is summed is 0."""
-        squared = jnp.asarray(0.5**numbers, self.spread.dtype) / (self.spread * self.spread)
-        scale = 2 / math.sqrt(math.pi) * _STEP / (4 * math.pi)
-        return squared, scale * jnp.sqrt(squared) * jnp.exp(-self.squared_kappa / (4 * squared))
+    kappa: Float[Array, ""]
+    length: Float[Array, ""]
 
     def __call__(
         self, squared_distances: Float[Array, "*pairs"]
     ) -> tuple[Float[Array, "*pairs"], Float[Array, "*pairs"]]:
-        """Compute the part that is summed, 1/mm, and `-1/r` times its derivative in `r`, 1/mm^3."""
-        squared, weights = self._gaussians(np.arange(self.count))
-        # Gaussians wider than the body, by the first two terms of their series.
-        wide, of_wide = self._gaussians(np.arange(self.count, self.count + _REST))
-        curvature = jnp.sum(wide * of_wide)
-        value = jnp.sum(of_wide) - curvature * squared_distances
-        slope = jnp.full_like(squared_distances, 2) * curvature
-        gaussian = squared_distances
-        for i in range(self.count - 1, -1, -1):
-            if (self.count - 1 - i) % (_SQUARINGS + 1) == 0:
-                gaussian = jnp.exp(-squared[i] * squared_distances)
-            else:
-                gaussian = gaussian * gaussian
-            value = value + weights[i] * gaussian
-            slope = slope + 2 * squared[i] * weights[i] * gaussian
-        return value, slope
+        """Compute the softened kernel, 1/mm, and `-1/r` times its derivative in `r`, 1/mm^3."""
+        inverse, fall = self._softening(squared_distances)
+        exponent = self.kappa / inverse
+        screened = jnp.exp(-exponent) / (4 * math.pi)
+        return inverse * screened, fall * (1 + exponent) * screened
+
+    def _softening(self, squared_distances):
+        """Compute `1 / r_s`, and `-1/r` times its derivative in `r`."""
+        q = squared_distances / (self.length * self.length)
+        near = q < _SMALL
+        away = jnp.where(near, 1.0, q)
+        root, small = jnp.sqrt(away), jnp.where(near, q, 0.0)
+        ratio = jax.scipy.special.erf(root) / root
+        fall = (ratio - _SCALE * jnp.exp(-away)) / away
+        by_series, fall_by_series = jnp.zeros_like(q), jnp.zeros_like(q)
+        for n in range(_TERMS, -1, -1):
+            term = _SCALE * (-1) ** n / (math.factorial(n) * (2 * n + 1))
+            by_series = by_series * small + term
+            if n:
+                fall_by_series = fall_by_series * small - 2 * n * term
+        ratio = jnp.where(near, by_series, ratio)
+        fall = jnp.where(near, fall_by_series, fall)
+        return ratio / self.length, fall / self.length**3
 
     def plane_integral(self, height: Float[Array, "*points"]) -> Float[Array, "*points"]:
-        """Integrate the part that is not summed over a plane at this height, mm."""
-        squared, weights = self._gaussians(np.arange(-_NARROW, 0))
-
-        def integral(squared, weight):
-            return jnp.pi * weight / squared * jnp.exp(-squared * height * height)
-
-        return jnp.sum(jax.vmap(integral)(squared, weights), axis=0)
+        """Integrate what the softening leaves out over a plane at this height, mm."""
+        nodes, weights = np.polynomial.legendre.leggauss(_NODES)
+        span = jnp.maximum(_REACH * self.length - jnp.abs(height), 0)
+        total = jnp.zeros_like(height)
+        for node, weight in zip(nodes.tolist(), weights.tolist(), strict=True):
+            r = _REACH * self.length - span * (1 - node) / 2
+            left_out = jnp.exp(-self.kappa * r) - 4 * math.pi * r * self(r * r)[0]
+            total = total + weight / 4 * span * left_out
+        return total
