@@ -4,10 +4,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from splatjax._chunking import map_chunks
 from splatjax.scene import Material, Splats
 
-from ._beams import AT_ONCE, GRAZING, Beams, DiffusionCoefficients, dot, offsets
+from ._beams import Beams, DiffusionCoefficients
+from ._surface_sums import GRAZING
 
 _COSINES = 8  # over which a law of angles is averaged
 _BRIGHTEST = 2.0  # times an even surface
@@ -71,32 +71,3 @@ def radiance_towards(
 def _medium(material: Material):
     assert material.medium is not None
     return material.medium
-
-
-def slopes_along_surface(
-    splats: Splats, values: Float[Array, "rows splats"]
-) -> Float[Array, "rows 3 splats"]:
-    """Fit the slopes of values along the surface, 1/mm, over about two spacings."""
-    spread, count = jnp.sum(splats.areas**2) / jnp.sum(splats.areas), len(values)
-
-    def at(here):
-        x, normals = here
-        offset = offsets(x, splats.centers)
-        squared = dot(offset, offset)
-        facing = jnp.maximum(normals @ splats.normals.T, 0)
-        weight = splats.areas[None] * facing * facing * jnp.exp(-0.5 * squared / spread)
-        total = jnp.sum(weight, axis=1, keepdims=True)
-        total = jnp.where(total > 0, total, 1.0)
-        mean = (weight @ values.T) / total
-        moments = [weight * each for each in offset]
-        center = jnp.stack([jnp.sum(each, axis=1) for each in moments], axis=1)
-        products = jnp.stack([each @ values.T for each in moments], axis=1)
-        products = products - center[:, :, None] * mean[:, None]
-        # Twice the variance along the surface.
-        variance = jnp.sum(weight * squared, axis=1) - jnp.sum(center * center / total, axis=1)
-        slopes = products / jnp.where(variance > 0, 0.5 * variance, 1.0)[:, None, None]
-        across = jnp.sum(slopes * normals[:, :, None], axis=1, keepdims=True)
-        return (slopes - across * normals[:, :, None]).reshape(-1, 3 * count)
-
-    rows = map_chunks(at, (splats.centers, splats.normals), at_once=AT_ONCE)
-    return jnp.moveaxis(rows.reshape(-1, 3, count), (0, 1, 2), (2, 1, 0))

@@ -27,17 +27,37 @@ class ScreenedKernel(eqx.Module):
     - `length`: mm.
     """
 
-    kappa: Float[Array, ""]
+    kappa: Float[Array, "channels"]
     length: Float[Array, ""]
 
-    def __call__(
-        self, squared_distances: Float[Array, "*pairs"]
-    ) -> tuple[Float[Array, "*pairs"], Float[Array, "*pairs"]]:
-        """Compute the softened kernel, 1/mm, and `-1/r` times its derivative in `r`, 1/mm^3."""
+    def near(self, squared_distances: Float[Array, "*pairs"]) -> list[tuple]:
+        """Compute the softened kernel of every channel, 1/mm, and `-1/r` times its derivative in
+        `r`, 1/mm^3.
+        """
         inverse, fall = self._softening(squared_distances)
-        exponent = self.kappa / inverse
-        screened = jnp.exp(-exponent) / (4 * math.pi)
-        return inverse * screened, fall * (1 + exponent) * screened
+        distance, inverse, fall = 1 / inverse, inverse / (4 * math.pi), fall / (4 * math.pi)
+
+        def of_channel(kappa):
+            exponent = kappa * distance
+            screened = jnp.exp(-exponent)
+            return inverse * screened, fall * (1 + exponent) * screened
+
+        return [of_channel(kappa) for kappa in self.kappa]
+
+    def far(self, squared_distances: Float[Array, "*pairs"]) -> list[tuple]:
+        """Compute the kernel beyond three lengths, and apply `-1/r d/dr` once and twice, 1/mm^5.
+        Where the distance is 0, all are finite.
+        """
+        inverse = jax.lax.rsqrt(jnp.where(squared_distances > 0, squared_distances, 1.0))
+        distance, squared = squared_distances * inverse, inverse * inverse
+
+        def of_channel(kappa):
+            exponent = kappa * distance
+            value = jnp.exp(-exponent) * inverse / (4 * math.pi)
+            once, twice = 1 + exponent, 3 + exponent * (3 + exponent)
+            return value, value * squared * once, value * squared * squared * twice
+
+        return [of_channel(kappa) for kappa in self.kappa]
 
     def _softening(self, squared_distances):
         """Compute `1 / r_s`, and `-1/r` times its derivative in `r`."""
@@ -57,13 +77,15 @@ class ScreenedKernel(eqx.Module):
         fall = jnp.where(near, fall_by_series, fall)
         return ratio / self.length, fall / self.length**3
 
-    def plane_integral(self, height: Float[Array, "*points"]) -> Float[Array, "*points"]:
+    def plane_integral(self, height: Float[Array, "channels *points"]) -> Float[Array, "..."]:
         """Integrate what the softening leaves out over a plane at this height, mm."""
         nodes, weights = np.polynomial.legendre.leggauss(_NODES)
-        span = jnp.maximum(_REACH * self.length - jnp.abs(height), 0)
-        total = jnp.zeros_like(height)
+        kappa = self.kappa.reshape(-1, *[1] * (height.ndim - 1))
+        end, total = _REACH * self.length, jnp.zeros_like(height)
+        span = jnp.maximum(end - jnp.abs(height), 0)
         for node, weight in zip(nodes.tolist(), weights.tolist(), strict=True):
-            r = _REACH * self.length - span * (1 - node) / 2
-            left_out = jnp.exp(-self.kappa * r) - 4 * math.pi * r * self(r * r)[0]
+            r = end - span * (1 - node) / 2
+            inverse, _ = self._softening(r * r)
+            left_out = jnp.exp(-kappa * r) - r * inverse * jnp.exp(-kappa / inverse)
             total = total + weight / 4 * span * left_out
         return total

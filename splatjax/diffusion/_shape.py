@@ -9,17 +9,21 @@ import lineax as lx
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from splatjax._chunking import map_chunks, take_points
+from splatjax._chunking import take_points
 from splatjax.gaussians import SumOfGaussians
 from splatjax.scattering import Medium
 from splatjax.scene import Material, Splats
 
-from ._beams import AT_ONCE, Beams, DiffusionCoefficients, dot, offsets, scattered_once
+from ._beams import Beams, DiffusionCoefficients, scattered_once
 from ._diffuser import AbstractDiffuser, AbstractDiffusionPlan, Diffused, LayerValues
-from ._emission import radiance_towards, slopes_along_surface
+from ._emission import radiance_towards
+from ._hierarchy import Hierarchy, padded_count
 from ._screened import ScreenedKernel
+from ._surface_sums import SurfaceSums
 
-_FINER = 1  # octaves
+_SOFTENING = 2**-0.25  # length over the spacing
+_FINER = 2**-0.5  # softening of the sources, over that on the surface
+_LEAST_KAPPA = 1e-3  # over the root of the area
 _OPEN = 0.05  # sum of the normals, by area, over the area: an open neck leaves 0.08
 _WIDE = 1e12  # mm^2: resolved everywhere
 
@@ -46,15 +50,18 @@ class ShapeDiffuser(AbstractDiffuser):
     **Attributes:**
 
     - `error`: of the solution of the linear equations, over its maximum. Static.
+    - `opening`: radius of the clusters that far splats are merged into, over their distance, at
+      most. The sums err by 1.5e-3; with 0 nothing is merged: the plain reference. Static.
 
     **Source:** Case and Zweifel 1967, "Linear Transport Theory" (Milne problem); Zhu, Pine and
     Weitz 1991, "Internal reflection of diffusive light in random media" (`z_e`).
     """
 
-    error: float = eqx.field(static=True, default=1e-4)
+    error: float = eqx.field(static=True, default=1e-3)
+    opening: float = eqx.field(static=True, default=0.8)
 
     def radiant_exitance(
-        self, splats: Splats, medium: Medium, beams: Beams, count: int | None = None
+        self, splats: Splats, medium: Medium, beams: Beams, hierarchy: Hierarchy | None = None
     ) -> Float[Array, "channels splats"]:
         """Solve for the light that leaves every splat, in the unit of the irradiance; light that
         crosses the body without scattering is left out. Differentiable in everything; which splat
@@ -62,57 +69,50 @@ class ShapeDiffuser(AbstractDiffuser):
 
         **Arguments:**
 
-        - `count`: of Gaussians that make the kernel, from `count_gaussians`; needed under `jit`.
+        - `hierarchy`: from `find_hierarchy`; needed under `jit`.
 
-        **Raises:** `ValueError` as `count_gaussians`, where no count is given.
+        **Raises:** `ValueError` as `find_hierarchy`, where none is given.
         """
-        count = self.count_gaussians(splats) if count is None else count
-        spread = jnp.sqrt(jnp.sum(splats.areas**2) / jnp.sum(splats.areas))
-        kernel = ScreenedKernel(jnp.zeros_like(spread), spread, count)
+        hierarchy = self.find_hierarchy(splats) if hierarchy is None else hierarchy
+        return self._solve(SurfaceSums.of(splats, hierarchy), medium, beams)[:, : splats.count]
 
-        def body_share(x):
-            _, slope, across = _pairs(kernel, x, splats)
-            return (slope * across) @ splats.areas
+    def _solve(self, surface: SurfaceSums, medium: Medium, beams: Beams):
+        coefficients, area = DiffusionCoefficients.of(medium), jnp.sum(surface.areas)
+        spread = jnp.sqrt(jnp.sum(surface.areas**2) / area)
+        # What does not absorb is one kappa's limit: the square of this fraction is left out.
+        kappa = jnp.sqrt(coefficients.squared_kappa + _LEAST_KAPPA**2 / area)
+        kernel = ScreenedKernel(kappa, _SOFTENING * spread)
+        finer = ScreenedKernel(kappa, _FINER * kernel.length)
+        more = ((0, 0), (0, len(surface.areas) - beams.irradiance.shape[1]))
+        beams = jnp.pad(beams.irradiance, more), jnp.pad(beams.directions, ((0, 0), *more))
+        source, leaving = scattered_once(surface, coefficients, finer, *beams)
 
-        share = map_chunks(body_share, splats.centers, at_once=AT_ONCE)
-
-        def of_channel(channel):
-            coefficients, irradiance, directions = channel
-            of_medium = dataclasses.replace(kernel, squared_kappa=coefficients.squared_kappa)
-            beams = irradiance, directions.T
-            return self._solve(splats, coefficients, of_medium, share, *beams)
-
-        given = DiffusionCoefficients.of(medium), beams.irradiance, beams.directions
-        return jax.lax.map(of_channel, given)
-
-    def _solve(self, splats, medium, kernel, share, irradiance, directions):
-        """Solve for one channel."""
-        beams = irradiance, directions
-        source, leaving = scattered_once(splats, medium, kernel.finer(_FINER), *beams)
-        # Gaussians too narrow to be summed see phi as it is on their own splat.
-        own = kernel.plane_integral(jnp.zeros_like(kernel.spread)) / medium.z_e
-        diagonal = share + own
+        one, z_e = jnp.ones_like(surface.areas)[None], coefficients.z_e
+        share = -surface.layers(ScreenedKernel(jnp.zeros(1, z_e.dtype), kernel.length), [0.0], one)
+        # What the softening leaves out sees phi as it is on its own splat.
+        own = kernel.plane_integral(jnp.zeros_like(z_e)[:, None])
+        diagonal = share + own / z_e[:, None]
+        diagonal = jnp.where(surface.areas > 0, diagonal, 1.0)
 
         def product(phi):
-            strength = splats.areas * phi
+            return phi + surface.layers(kernel, list(1 / z_e), phi) / diagonal
 
-            def at(x):
-                value, slope, across = _pairs(kernel, x, splats)
-                return (value / medium.z_e - slope * across) @ strength
-
-            return phi + map_chunks(at, splats.centers, at_once=AT_ONCE) / diagonal
-
-        right = source / diagonal
-        largest = jax.lax.stop_gradient(jnp.max(jnp.abs(right)))
+        right = jnp.where(surface.areas > 0, source / diagonal, 0.0)
+        largest = jax.lax.stop_gradient(jnp.max(jnp.abs(right), axis=1, keepdims=True))
         largest = jnp.where(largest > 0, largest, 1.0)
         operator = lx.FunctionLinearOperator(product, jax.eval_shape(lambda: right))
         # Five products reach about 1e-3; five more show that.
         solver = lx.GMRES(rtol=self.error, atol=self.error, restart=5)
         phi = largest * lx.linear_solve(operator, right / largest, solver).value
-        return medium.diffusion_coefficient / medium.z_e * phi + leaving
+        return (coefficients.diffusion_coefficient / z_e)[:, None] * phi + leaving
 
-    def count_gaussians(self, splats: Splats) -> int:
-        """Check that the splats bound a body, and count the Gaussians. Not for traced arrays.
+    def find_hierarchy(self, splats: Splats) -> Hierarchy:
+        """Check that the splats bound a body, and find which are near each other. Not for traced
+        arrays.
+
+        **Arguments:**
+
+        - `splats`: in any order; a compact one, as of a plan, is faster.
 
         **Raises:** `ValueError` for splats without area, for open bodies, and for normals that
         point inward.
@@ -138,8 +138,9 @@ class ShapeDiffuser(AbstractDiffuser):
             raise ValueError(
                 f"the normals of the splats bound a volume of {volume:.3g} mm^3; turn them around"
             )
-        reach = float(np.linalg.norm(np.ptp(centers[areas > 0], axis=0)))
-        return ScreenedKernel.count_for(reach, float(np.sqrt(areas @ areas / area)))
+        more = padded_count(len(areas)) - len(areas)
+        exists = np.pad(areas > 0, (0, more))
+        return Hierarchy.build(np.pad(centers, ((0, more), (0, 0))), exists, self.opening)
 
     def make_plan(self, parts, variances, kernel, interval):
         if len(parts) > 1:
@@ -147,7 +148,7 @@ class ShapeDiffuser(AbstractDiffuser):
                 f"ShapeDiffuser works on one device, not on {len(parts)}; make the plan without a "
                 "mesh, or render with ClusterDiffuser"
             )
-        return ShapePlan(jnp.zeros(1, jnp.int32), self, self.count_gaussians(parts[0]))
+        return ShapePlan(jnp.zeros(1, jnp.int32), self, self.find_hierarchy(parts[0]))
 
 
 class ShapePlan(AbstractDiffusionPlan):
@@ -155,11 +156,11 @@ class ShapePlan(AbstractDiffusionPlan):
 
     **Attributes:**
 
-    - `count`: of the Gaussians that make the kernel. Static.
+    - `hierarchy`: which splats are near each other.
     """
 
     diffuser: ShapeDiffuser
-    count: int = eqx.field(static=True)
+    hierarchy: Hierarchy
 
     def material(self, material: Material) -> Material:
         """Return a material of one Gaussian of weight 1, which all splats resolve.
@@ -181,9 +182,12 @@ class ShapePlan(AbstractDiffusionPlan):
         self, splats: Splats, medium: Medium, beams: Beams, at: Int[Array, " points"] | None
     ) -> LayerValues:
         """Return the radiant exitance of some splats as a layer, with its slopes."""
-        exitance = self.diffuser.radiant_exitance(splats, medium, beams, self.count)
+        exitance = self.diffuser.radiant_exitance(splats, medium, beams, self.hierarchy)
         values = jnp.concatenate([exitance, jnp.ones_like(exitance[:1])])
-        layer = LayerValues(values[None], slopes_along_surface(splats, values)[None])
+        surface = SurfaceSums.of(splats, self.hierarchy)
+        rows = jnp.pad(exitance, ((0, 0), (0, len(surface.areas) - splats.count)))
+        slopes = jnp.pad(surface.slopes(rows)[..., : splats.count], ((0, 1), (0, 0), (0, 0)))
+        layer = LayerValues(values[None], slopes[None])
         return layer if at is None else jax.tree.map(lambda row: take_points(row, at), layer)
 
     def towards(
@@ -207,10 +211,3 @@ class ShapePlan(AbstractDiffusionPlan):
             "ShapeDiffuser solves for the light of a scene, without derivatives by Gaussians; "
             "render with ClusterDiffuser"
         )
-
-
-def _pairs(kernel: ScreenedKernel, x: Float[Array, "points 3"], splats: Splats):
-    """Evaluate the kernel, its slope, and `(y - x) . n_y`, of all splats `y` at some points."""
-    offset = offsets(x, splats.centers)
-    value, slope = kernel(dot(offset, offset))
-    return value, slope, dot(offset, [splats.normals[None, :, axis] for axis in range(3)])
