@@ -58,7 +58,7 @@ class ShapeDiffuser(AbstractDiffuser):
     """
 
     error: float = eqx.field(static=True, default=1e-3)
-    opening: float = eqx.field(static=True, default=0.8)
+    opening: float = eqx.field(static=True, default=0.5)
 
     def radiant_exitance(
         self, splats: Splats, medium: Medium, beams: Beams, hierarchy: Hierarchy | None = None

@@ -132,7 +132,7 @@ class SurfaceSums(eqx.Module):
             beam, first = beam[:2], beam[2]
             is_hit, t, missed, size = crossing(beam, discs)
             is_near = is_hit & (t < first + size)
-            weight = jnp.where(is_near, jnp.exp(-2 * jnp.where(is_near, missed, 0.0)), 0.0)
+            weight = jnp.where(is_near, jnp.exp(-6 * jnp.where(is_near, missed, 0.0)), 0.0)
             return jnp.sum(weight, axis=1), jnp.sum(weight * t, axis=1)
 
         facing = tuple(self.areas * axis for axis in self.normals)
