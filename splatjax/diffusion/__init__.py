@@ -18,6 +18,7 @@ from ._dense import (
 from ._diffuser import (
     AbstractDiffuser as AbstractDiffuser,
     AbstractDiffusionPlan as AbstractDiffusionPlan,
+    Beams as Beams,
     Diffused as Diffused,
     LayerValues as LayerValues,
     Sources as Sources,
@@ -29,7 +30,6 @@ from ._kernel import (
     resolved_fraction as resolved_fraction,
     unevenness as unevenness,
 )
-from ._beams import Beams as Beams
 from ._shape import ShapeDiffuser as ShapeDiffuser, ShapePlan as ShapePlan
 from ._streamed import StreamedDiffusion as StreamedDiffusion
 from ._clusters import POINTS_PER_BLOCK as POINTS_PER_BLOCK, compact_order as compact_order

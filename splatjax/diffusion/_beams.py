@@ -11,25 +11,10 @@ from splatjax.scattering import ExactFresnel, Medium
 from ._screened import ScreenedKernel
 from ._surface_sums import SurfaceSums
 
-_DEPTHS = 8  # along each beam
+_DEPTHS = 6  # along each beam
 _MILNE = 0.710446  # extrapolation distance of the Milne problem, mean free paths
 # Hopf's q(tau) = _MILNE - sum_i a_i exp(-b_i tau), within 0.0024.
 _HOPF = (0.08948, 2.11533), (0.04361, 16.63774)
-
-
-class Beams(eqx.Module):
-    """Light that enters a body, one beam for each splat: of many lights their sum, with the mean
-    of their directions.
-
-    **Attributes:** (differentiable)
-
-    - `irradiance`: that enters, after the loss at the surface.
-    - `directions`: in which it travels inside, by which the place of its first scattering moves
-      per mean free path: unit for one light, shorter for several.
-    """
-
-    irradiance: Float[Array, "channels splats"]
-    directions: Float[Array, "channels 3 splats"]
 
 
 class DiffusionCoefficients(eqx.Module):
@@ -110,7 +95,9 @@ def scattered_once(
             charges, places = plane
             return total + surface.potential(own, charges, tuple(places)), None
 
-        return jax.lax.scan(jax.checkpoint(add), jnp.zeros_like(surface.areas), (charges, places))[0]
+        return jax.lax.scan(jax.checkpoint(add), jnp.zeros_like(surface.areas), (charges, places))[
+            0
+        ]
 
     summed = jax.lax.map(of_channel, (kernel.kappa, surface.areas * scattered, places))
     total = summed + jnp.sum(unseen, axis=1)

@@ -2,6 +2,7 @@
 
 import abc
 import dataclasses
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -21,6 +22,21 @@ class Sources(eqx.Module):
     normals: Float[Array, "3 sources"]
     areas: Float[Array, " sources"]
     irradiance: Float[Array, "channels sources"]
+
+
+class Beams(eqx.Module):
+    """Light that enters a body, one beam for each splat: of many lights their sum, with the mean
+    of their directions.
+
+    **Attributes:** (differentiable)
+
+    - `irradiance`: that enters, after the loss at the surface.
+    - `directions`: in which it travels inside, by which the place of its first scattering moves
+      per mean free path: unit for one light, shorter for several.
+    """
+
+    irradiance: Float[Array, "channels splats"]
+    directions: Float[Array, "channels 3 splats"]
 
 
 class LayerValues(eqx.Module):
@@ -99,6 +115,44 @@ class AbstractDiffusionPlan(eqx.Module):
         - `at`: the splats at which the layers are evaluated, in ascending order; there are none
           from the number of splats on. All for `None`.
         """
+
+    def light(
+        self,
+        splats: Splats,
+        material: Material,
+        source: Float[Array, "channels splats"],
+        beams: Callable[[], Beams],
+        kernel: AbstractDiffusionKernel,
+        combination: AbstractCombination,
+        at: Int[Array, " points"] | None = None,
+    ) -> tuple[Diffused, Beams | None]:
+        """Evaluate the layers of lit splats: diffuse their irradiance, or solve for the light of
+        the beams that enter them.
+
+        **Arguments:** as for `diffuse`.
+
+        - `source`: the irradiance that spreads.
+        - `beams`: computes the beams, where a plan needs them.
+
+        **Returns:** the layers, and the beams they were solved for.
+        """
+        sources = Sources(splats.centers.T, splats.normals.T, splats.areas, source)
+        variances = material.gaussians.variances
+        return self.diffuse(sources, variances, kernel, combination, at), None
+
+    def towards(
+        self,
+        eye: Float[Array, "3"],
+        splats: Splats,
+        material: Material,
+        layers: LayerValues,
+        beams: Beams | None,
+    ) -> LayerValues:
+        """Return the layers as an eye sees them: unchanged where light leaves evenly.
+
+        **Arguments:** the splats that may be seen, and from `light` their layers and beams.
+        """
+        return layers
 
     def diffuse_with_derivative(
         self,

@@ -6,7 +6,8 @@ from jaxtyping import Array, Float
 
 from splatjax.scene import Material, Splats
 
-from ._beams import Beams, DiffusionCoefficients
+from ._beams import DiffusionCoefficients
+from ._diffuser import Beams
 from ._surface_sums import GRAZING
 
 _COSINES = 8  # over which a law of angles is averaged

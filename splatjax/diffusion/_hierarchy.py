@@ -1,6 +1,5 @@
 """Sums over all splats of a body at every splat: near ones one by one, far ones in clusters."""
 
-import math
 from collections.abc import Callable
 
 import equinox as eqx

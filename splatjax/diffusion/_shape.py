@@ -3,21 +3,20 @@
 import dataclasses
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
-import lineax as lx
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from splatjax._chunking import take_points
 from splatjax.gaussians import SumOfGaussians
 from splatjax.scattering import Medium
 from splatjax.scene import Material, Splats
 
-from ._beams import Beams, DiffusionCoefficients, scattered_once
-from ._diffuser import AbstractDiffuser, AbstractDiffusionPlan, Diffused, LayerValues
+from ._beams import DiffusionCoefficients, scattered_once
+from ._diffuser import AbstractDiffuser, AbstractDiffusionPlan, Beams, Diffused, LayerValues
 from ._emission import radiance_towards
 from ._hierarchy import Hierarchy, padded_count
+from ._krylov import solve
 from ._screened import ScreenedKernel
 from ._surface_sums import SurfaceSums
 
@@ -49,7 +48,7 @@ class ShapeDiffuser(AbstractDiffuser):
 
     **Attributes:**
 
-    - `error`: of the solution of the linear equations, over its maximum. Static.
+    - `error`: residual of the linear equations over their right side, root mean squares. Static.
     - `opening`: radius of the clusters that far splats are merged into, over their distance, at
       most. The sums err by 1.5e-3; with 0 nothing is merged: the plain reference. Static.
 
@@ -57,7 +56,7 @@ class ShapeDiffuser(AbstractDiffuser):
     Weitz 1991, "Internal reflection of diffusive light in random media" (`z_e`).
     """
 
-    error: float = eqx.field(static=True, default=1e-3)
+    error: float = eqx.field(static=True, default=1e-4)
     opening: float = eqx.field(static=True, default=0.5)
 
     def radiant_exitance(
@@ -84,8 +83,8 @@ class ShapeDiffuser(AbstractDiffuser):
         kernel = ScreenedKernel(kappa, _SOFTENING * spread)
         finer = ScreenedKernel(kappa, _FINER * kernel.length)
         more = ((0, 0), (0, len(surface.areas) - beams.irradiance.shape[1]))
-        beams = jnp.pad(beams.irradiance, more), jnp.pad(beams.directions, ((0, 0), *more))
-        source, leaving = scattered_once(surface, coefficients, finer, *beams)
+        entering = jnp.pad(beams.irradiance, more), jnp.pad(beams.directions, ((0, 0), *more))
+        source, leaving = scattered_once(surface, coefficients, finer, *entering)
 
         one, z_e = jnp.ones_like(surface.areas)[None], coefficients.z_e
         share = -surface.layers(ScreenedKernel(jnp.zeros(1, z_e.dtype), kernel.length), [0.0], one)
@@ -98,12 +97,7 @@ class ShapeDiffuser(AbstractDiffuser):
             return phi + surface.layers(kernel, list(1 / z_e), phi) / diagonal
 
         right = jnp.where(surface.areas > 0, source / diagonal, 0.0)
-        largest = jax.lax.stop_gradient(jnp.max(jnp.abs(right), axis=1, keepdims=True))
-        largest = jnp.where(largest > 0, largest, 1.0)
-        operator = lx.FunctionLinearOperator(product, jax.eval_shape(lambda: right))
-        # Five products reach about 1e-3; five more show that.
-        solver = lx.GMRES(rtol=self.error, atol=self.error, restart=5)
-        phi = largest * lx.linear_solve(operator, right / largest, solver).value
+        phi = solve(product, right, self.error)
         return (coefficients.diffusion_coefficient / z_e)[:, None] * phi + leaving
 
     def find_hierarchy(self, splats: Splats) -> Hierarchy:
@@ -178,35 +172,27 @@ class ShapePlan(AbstractDiffusionPlan):
         shown = material.surface_of(SumOfGaussians(variances, weights))
         return dataclasses.replace(shown, medium=material.medium)
 
-    def solve(
-        self, splats: Splats, medium: Medium, beams: Beams, at: Int[Array, " points"] | None
-    ) -> LayerValues:
-        """Return the radiant exitance of some splats as a layer, with its slopes."""
-        exitance = self.diffuser.radiant_exitance(splats, medium, beams, self.hierarchy)
-        values = jnp.concatenate([exitance, jnp.ones_like(exitance[:1])])
+    def light(self, splats, material, source, beams, kernel, combination, at=None):
+        medium, entering = material.medium, beams()
+        assert medium is not None
         surface = SurfaceSums.of(splats, self.hierarchy)
-        rows = jnp.pad(exitance, ((0, 0), (0, len(surface.areas) - splats.count)))
-        slopes = jnp.pad(surface.slopes(rows)[..., : splats.count], ((0, 1), (0, 0), (0, 0)))
-        layer = LayerValues(values[None], slopes[None])
-        return layer if at is None else jax.tree.map(lambda row: take_points(row, at), layer)
+        exitance = self.diffuser._solve(surface, medium, entering)
+        values = jnp.concatenate([exitance, jnp.ones_like(exitance[:1])])
+        slopes = jnp.pad(surface.slopes(exitance), ((0, 1), (0, 0), (0, 0)))
+        rows = values[None, :, : splats.count], slopes[None, ..., : splats.count]
+        layers = LayerValues(*(rows if at is None else (take_points(row, at) for row in rows)))
+        return Diffused(layers, jnp.zeros_like(exitance[0, 0])), entering
 
-    def towards(
-        self,
-        eye: Float[Array, "3"],
-        splats: Splats,
-        material: Material,
-        layer: LayerValues,
-        beams: Beams,
-    ) -> LayerValues:
+    def towards(self, eye, splats, material, layers, beams):
         """Replace the radiant exitance of splats by that of an even surface as bright as they are
         from the eye.
         """
-        exitance, slopes = layer.values[0, :-1], layer.slopes[0, :-1]
+        exitance, slopes = layers.values[0, :-1], layers.slopes[0, :-1]
         seen = radiance_towards(eye, splats, material, exitance, slopes, beams)
-        values = jnp.concatenate([seen, layer.values[0, -1:]])
-        return LayerValues(values[None], layer.slopes)
+        values = jnp.concatenate([seen, layers.values[0, -1:]])
+        return LayerValues(values[None], layers.slopes)
 
-    def diffuse(self, sources, variances, kernel, combination, at=None) -> Diffused:
+    def diffuse(self, sources, variances, kernel, combination, at=None):
         raise ValueError(
             "ShapeDiffuser solves for the light of a scene, without derivatives by Gaussians; "
             "render with ClusterDiffuser"

@@ -40,7 +40,7 @@ class SurfaceSums(eqx.Module):
         strengths: Float[Array, "channels splats"],
     ) -> Float[Array, "channels splats"]:
         """Compute `int (c G + dG/dn_y) f dA`, of every channel with its own c, 1/mm."""
-        strengths = list(self.areas * strengths)
+        powers = jnp.unstack(self.areas * strengths)
 
         def near(x, sources):
             strengths, normals, y = sources
@@ -69,7 +69,7 @@ class SurfaceSums(eqx.Module):
 
         centers, moments = clusters(self.centers, self.areas)
         totals, dipoles = [], []
-        for charge, strength in zip(charges, strengths, strict=True):
+        for charge, strength in zip(charges, powers, strict=True):
             total = charge * cluster_totals(strength)
             totals.append(total)
             dipoles.append(
@@ -78,7 +78,7 @@ class SurfaceSums(eqx.Module):
                     for x, n, center in zip(self.centers, self.normals, centers, strict=True)
                 )
             )
-        given = strengths, self.normals, self.centers
+        given = powers, self.normals, self.centers
         nearby = self.hierarchy.near.reduce(near, self.centers, given)
         beyond = self.hierarchy.far.reduce(far, self.centers, (totals, dipoles, centers, moments))
         return jnp.stack(nearby) + jnp.stack(beyond)
@@ -167,7 +167,7 @@ class SurfaceSums(eqx.Module):
             products = [[total(axis * row) for axis in offset] for row in rows]
             return *sums, [total(row) for row in rows], products
 
-        given = self.centers, self.normals, self.areas, list(rows)
+        given = self.centers, self.normals, self.areas, jnp.unstack(rows)
         total, center, squared, means, products = self.hierarchy.near.reduce(
             moments, (self.centers, self.normals), given
         )
@@ -210,7 +210,9 @@ def clusters(
         offsets = [axis - mean[:, None] for axis, mean in zip(members, means, strict=True)]
         return means, [0.5 * jnp.sum(mass * offsets[i] * offsets[j], axis=1) for i, j in _AXES]
 
-    means, moments = jax.tree.map(lambda *levels: jnp.concatenate(levels), *map(of_level, SIZES[1:]))
+    means, moments = jax.tree.map(
+        lambda *levels: jnp.concatenate(levels), *map(of_level, SIZES[1:])
+    )
     return tuple(means), moments
 
 

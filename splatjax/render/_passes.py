@@ -104,18 +104,25 @@ def light_splats(
     """
     light = light_visibility(scene, settings, plan, combination, transfer)
     irradiance, bounce_needed = bounced_irradiance(scene, settings, plan, combination, light)
-    added, beams, medium = None, None, scene.material.medium
+    added, beams, log_variance_derivative = None, None, None
     if derivative and scene.material.single_scattering is not None:
         irradiance, added = _differentiated_irradiance(scene, light)
     source = irradiance.source if added is None else jnp.concatenate([irradiance.source, added])
-    if isinstance(plan.diffusion, _diffusion.ShapePlan) and medium and not derivative:
-        beams = beams_at_splats(scene, light, irradiance)
-        layers = plan.diffusion.solve(scene.splats, medium, beams, at)
-        log_variance_derivative, needed = None, light.needed
-    else:
+    if derivative:
         layers, log_variance_derivative, needed = diffuse_splats(
             scene, source, settings, plan, combination, at, derivative
         )
+    else:
+        diffused, beams = plan.diffusion.light(
+            scene.splats,
+            scene.material,
+            source,
+            partial(beams_at_splats, scene, light, irradiance),
+            settings.kernel,
+            combination,
+            at,
+        )
+        layers, needed = diffused.layers, diffused.needed
     needed = jnp.maximum(needed, jnp.maximum(light.needed, bounce_needed))
     along_splats = light.visibility, irradiance, added, beams
     if at is not None:
@@ -190,9 +197,9 @@ def see_and_shade(
     # Passes 2 and 3: blend the attributes and layers of the splats that may be seen.
     splats = scene.splats.take(chosen)
     shown = Scene(splats, scene.lights, scene.material)
-    layers, given = light.layers, (camera.position, splats, scene.material, light.layers)
-    if light.beams and isinstance(plan.diffusion, _diffusion.ShapePlan):
-        layers = plan.diffusion.towards(*given, light.beams)
+    layers = plan.diffusion.towards(
+        camera.position, splats, scene.material, light.layers, light.beams
+    )
     visibility = LightVisibility(groups, light.visibility, light.needed)
     attributes = settings.lighting.attributes(shown, visibility, light.irradiance, view.position)
     bounds = _splatting.Bounds.of(scene.splats, combination)
