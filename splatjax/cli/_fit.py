@@ -77,8 +77,8 @@ class Fit:
     #: monte-carlo. The layers of a material are multipoles, or are walked by monte-carlo.
     model: Annotated[Model | None, tyro.conf.arg(metavar="MODEL", help_behavior_hint="")] = None
     #: Of photon beams and Monte Carlo: the mean cosine of the phase function, which is Henyey and
-    #: Greenstein's.
-    g: float = 0.0
+    #: Greenstein's. That of the file, or 0.
+    g: OptionalFloat = None
     #: Of Monte Carlo: how many walk.
     photons: int = 1_000_000
     #: Of photon beams and Monte Carlo: keep light that scatters once as a term of its own, and fit
@@ -111,7 +111,7 @@ class Fit:
         rules = {
             "count": (1 <= self.count <= most, f"lie between 1 and {most}"),
             "error": (self.error is None or self.error > 0, "be positive, such as 0.01"),
-            "g": (abs(self.g) <= 0.95, "lie between -0.95 and 0.95"),
+            "g": (self.g is None or abs(self.g) <= 0.95, "lie between -0.95 and 0.95"),
         }
         check_options(self, rules)
         with jax.enable_x64(True):
@@ -129,7 +129,7 @@ class Fit:
                 "--all takes --count, --g, and --model photon-beam, dipole or better-dipole; leave "
                 "the other options out"
             )
-        model = model_by_name(self.model, self.g)
+        model = model_by_name(self.model, self.g or 0.0)
         names, coefficients = read_media(Path(self.medium))
         path = self.output.with_name(f"{self.output.name}.parts")
         begins = range(0, len(names), _batch.BATCH)
@@ -188,17 +188,19 @@ class Fit:
                     f"{counted(self.count, 'Gaussian')} apart: give a smaller --count"
                 )
         else:
-            target = reference(
-                coefficients, self.model, self.photons, self.g, self.single_scattering
-            )
+            g = self.g
+            if g is None:  # the reduced coefficients are all that a dipole knows
+                knows = self.model not in ("dipole", "better-dipole")
+                g = sj.io.load_mean_cosine(self.medium) if knows else 0.0
+            target = reference(coefficients, self.model, self.photons, g, self.single_scattering)
         fitted = self._fitted(target)
         print_fit(fitted, target)
         self._note_spread(target, fitted)
         total = fitted.gaussians.total_reflectance()
         if float(total.max()) > 1 + 1e-3:
             note(
-                f"{self.medium} sends back {format_numbers(total, '.3g')} times the light it is given: "
-                "are its unit and power right?"
+                f"{self.medium} sends back {format_numbers(total, '.3g')} times the light it is "
+                "given: are its unit and power right?"
             )
         if self.output is not None:
             self._save(self.output, coefficients, target, fitted)
@@ -216,9 +218,9 @@ class Fit:
         error, ratio = float(fitted.error.max()), float(scales.max() / scales.min())
         if error > _LARGE and ratio > _APART:
             note(
-                f"{self.medium}: the widths of its channels differ by a factor of {ratio:.2g}, too far "
-                f"apart for {count} variances that all share (error {error:.2g}); give a larger "
-                f"--count, or --error {_LARGE}"
+                f"{self.medium}: the widths of its channels differ by a factor of {ratio:.2g}, "
+                f"too far apart for {count} variances that all share (error {error:.2g}); give a "
+                f"larger --count, or --error {_LARGE}"
             )
 
     def _coefficients(self) -> sj.Dipole | sj.LayeredMultipole | sj.scattering.Tabulated:

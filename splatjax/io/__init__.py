@@ -22,6 +22,7 @@ from ._materials import (
     dipole_starts as dipole_starts,
     list_materials as list_materials,
     load_material as load_material,
+    load_mean_cosine as load_mean_cosine,
     load_medium as load_medium,
     load_profile as load_profile,
     material_path as material_path,

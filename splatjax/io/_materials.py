@@ -21,8 +21,6 @@ from splatjax.scattering import (
     BetterDipole,
     Dipole,
     ExactFresnel,
-    Film,
-    Layer,
     LayeredMultipole,
     Medium,
     PhotonBeam,
@@ -31,10 +29,10 @@ from splatjax.scattering import (
 from splatjax.scene import Material
 
 from ._files import StrPath, atomic_path, naming
+from ._media import LAYER_ENTRIES, MEDIUM_ENTRIES, layer_of, medium_of, plain_layer, plain_medium
 from ._tables import Table, nearest, read_toml
 
-COEFFICIENT_UNIT, VARIANCE_UNIT, THICKNESS_UNIT = "1/mm", "mm^2", "mm"
-_COEFFICIENTS = ("unit", "sigma_a", "sigma_s_prime", "eta")
+VARIANCE_UNIT = "mm^2"
 _TABLES = ("medium", "layers", "surface", "single_scattering", "angles", "source", "fit")
 _SURFACE = ("eta", "specular", "roughness")
 # What [fit] calls a profile whose coefficients the file holds.
@@ -107,8 +105,8 @@ def load_material(name_or_path: StrPath) -> Material:
     )
     single = None
     if "single_scattering" in tables.entries:
-        table = tables.table("single_scattering", (*_COEFFICIENTS, "strength"))
-        single = table.make(SingleScattering, _medium(table), table.numbers("strength", 1.0))
+        table = tables.table("single_scattering", (*MEDIUM_ENTRIES, "strength"))
+        single = table.make(SingleScattering, medium_of(table), table.numbers("strength", 1.0))
     angles = None
     if "angles" in tables.entries:
         table = tables.table("angles", ("coefficients",))
@@ -147,6 +145,17 @@ def load_medium(name_or_path: StrPath) -> Medium:
         return profile.medium
     have = "layers (`load_profile`)" if profile else "Gaussians (`load_material`)"
     raise ValueError(f"{tables.path}: has no [medium]; known are only its {have}")
+
+
+def load_mean_cosine(name_or_path: StrPath) -> float:
+    r"""Load `g`, the mean cosine of a material's phase function: 0 where its file has none.
+
+    **Raises:** `ValueError` as `load_material` does.
+    """
+    tables, profile = _read(name_or_path)
+    if not isinstance(profile, Dipole):
+        return 0.0
+    return tables.table("medium", MEDIUM_ENTRIES).number("g", 0.0)
 
 
 def load_profile(name_or_path: StrPath) -> Dipole | LayeredMultipole:
@@ -193,15 +202,15 @@ def save_material(
         )
     tables: dict[str, Any] = {}
     if isinstance(profile, LayeredMultipole):
-        tables["layers"] = [_plain_layer(layer) for layer in profile.layers]
+        tables["layers"] = [plain_layer(layer) for layer in profile.layers]
     elif profile is not None:
-        tables["medium"] = _plain_medium(profile.medium)
+        tables["medium"] = plain_medium(profile.medium)
     elif material.medium is not None:
-        tables["medium"] = _plain_medium(material.medium)
+        tables["medium"] = plain_medium(material.medium)
     single, gaussians = material.single_scattering, material.gaussians
     if single is not None:
         tables["single_scattering"] = {
-            **_plain_medium(single.medium),
+            **plain_medium(single.medium),
             "strength": plain_numbers(single.strength),
         }
     if material.angles is not None:
@@ -245,11 +254,10 @@ def _read(name_or_path: StrPath) -> tuple[Table, Dipole | LayeredMultipole | Non
         raise ValueError(f"{path}: has {has}; a material has one of them")
     _surface(tables)
     if "medium" in kinds:
-        return tables, Dipole(_medium(tables.table("medium", (*_COEFFICIENTS, "sigma_s"))))
+        return tables, Dipole(medium_of(tables.table("medium", MEDIUM_ENTRIES)))
     if not kinds:
         return tables, None
-    known = (*_COEFFICIENTS, "optical_depth", "thickness", "thickness_unit")
-    layers = [_layer(each) for each in tables.tables("layers", known)]
+    layers = [layer_of(each) for each in tables.tables("layers", LAYER_ENTRIES)]
     with naming(f"{path}: [[layers]]"):
         return tables, LayeredMultipole(layers)
 
@@ -270,46 +278,10 @@ def _surface(tables: Table) -> dict[str, Array]:
     return surface
 
 
-def _layer(table: Table) -> Layer | Film:
-    if "optical_depth" in table.entries:
-        return table.make(Film, table.numbers("optical_depth"))
-    table.one_of("thickness_unit", [THICKNESS_UNIT])
-    layer = table.make(Layer, _medium(table), table.numbers("thickness"))
-    table.make(layer.check_diffusion)
-    return layer
-
-
-def _medium(table: Table) -> Medium:
-    if "sigma_s" in table.entries:
-        raise ValueError(
-            f"{table.where} has sigma_s = {table.entries['sigma_s']}; give sigma_s_prime = (1 - g) "
-            "sigma_s, with the mean cosine g"
-        )
-    table.one_of("unit", [COEFFICIENT_UNIT])
-    return table.make(Medium, *(table.numbers(name) for name in _COEFFICIENTS[1:]))
-
-
 def _description(profile: Dipole | BetterDipole | PhotonBeam | LayeredMultipole) -> str:
     layers = f" of {len(profile.layers)} layers" if isinstance(profile, LayeredMultipole) else ""
     moments = "exact" if isinstance(profile.fresnel, ExactFresnel) else "fitted"
     return f"{_MODELS[type(profile)]}{layers}, {moments} Fresnel moments"
-
-
-def _plain_medium(medium: Medium) -> dict[str, Any]:
-    return {
-        "unit": COEFFICIENT_UNIT,
-        **{name: plain_numbers(getattr(medium, name)) for name in _COEFFICIENTS[1:]},
-    }
-
-
-def _plain_layer(layer: Layer | Film) -> dict[str, Any]:
-    if isinstance(layer, Film):
-        return {"optical_depth": plain_numbers(layer.optical_depth)}
-    return {
-        "thickness": plain_numbers(layer.thickness),
-        "thickness_unit": THICKNESS_UNIT,
-        **_plain_medium(layer.medium),
-    }
 
 
 def dipole_starts() -> DipoleStarts:

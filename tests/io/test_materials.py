@@ -15,6 +15,7 @@ from splatjax.gaussians import SumOfGaussians
 from splatjax.io import (
     list_materials,
     load_material,
+    load_mean_cosine,
     load_medium,
     load_profile,
     profiles_folder,
@@ -164,6 +165,21 @@ def layered(*tables: str) -> str:
     return "".join(f"[[layers]]\n{table}" for table in tables)
 
 
+COLOR = '[medium]\nunit = "mm"\ncolor = [0.8, 0.3]\nmean_free_path = 0.5\neta = 1.4\ng = 0.5\n'
+
+
+def test_a_medium_may_be_given_in_other_ways(tmp_path):
+    path = tmp_path / "wax.toml"
+    path.write_text(GOOD_MEDIUM.replace("1/mm", "1/cm").replace("_prime", "") + "g = 0.75\n")
+    medium = load_medium(path)
+    np.testing.assert_allclose(medium.sigma_a, 0.01, rtol=1e-6)
+    np.testing.assert_allclose(medium.sigma_s_prime, 0.025, rtol=1e-6)
+    assert load_mean_cosine(path) == 0.75
+    path.write_text(COLOR)
+    found = HalfSpace(load_medium(path), load_mean_cosine(path))
+    np.testing.assert_allclose(found.color(), [0.8, 0.3], atol=5e-3)
+
+
 SLAB = 'thickness = 2.0\nthickness_unit = "mm"\n' + GOOD_MEDIUM.removeprefix("[medium]\n").replace(
     "eta = 1.3", "eta = [1.3]"
 )
@@ -184,9 +200,15 @@ BAD = [
     (GOOD_MEDIUM.replace("[1.0]", '["1"]'), r"\[medium\] sigma_s_prime .*\['1'\]"),
     (GOOD_MEDIUM.replace("[1.0]", "[true]"), r"\[medium\] sigma_s_prime .*\[True\]"),
     (GOOD_MEDIUM.replace("[1.0]", "[1.0, 2.0]"), r"\[medium\].*sigma_s_prime .*\[2\].*= \[1\]"),
-    (GOOD_MEDIUM.replace("_prime", ""), r"\[medium\] has sigma_s = \[1.0\]"),
-    (GOOD_MEDIUM.replace("1/mm", "1/cm"), r"\[medium\] unit must be '1/mm'; it is '1/cm'"),
-    (GOOD_MEDIUM.replace('unit = "1/mm"\n', ""), r"\[medium\] unit must be '1/mm'; it is None"),
+    (
+        GOOD_MEDIUM.replace("_prime", ""),
+        r"\[medium\] has sigma_a, sigma_s; give .* and g, or",
+    ),
+    (GOOD_MEDIUM + "color = 0.5\n", r"\[medium\] has color, sigma_a, sigma_s_prime; give"),
+    (COLOR.replace("0.8", "1.8"), r"\[medium\].*color must be between .* 1.8"),
+    (COLOR.replace('"mm"', '"1/mm"'), r"\[medium\] unit must be 'mm'; it is '1/mm'"),
+    (GOOD_MEDIUM.replace("1/mm", "mm"), r"\[medium\] unit must be '1/mm' or '1/cm'; it is 'mm'"),
+    (GOOD_MEDIUM.replace('unit = "1/mm"\n', ""), r"\[medium\] unit must be .*; it is None"),
     (GOOD_MEDIUM.replace("eta = 1.3\n", ""), r"\[medium\] eta .* missing"),
     (GOOD_MEDIUM, r"has no \[fit\]"),
     (GOOD_MEDIUM.replace("eta", "=eta"), r"is no TOML file"),

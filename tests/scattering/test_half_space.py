@@ -30,6 +30,47 @@ def test_published_totals():
     np.testing.assert_allclose(0.04 + 0.96 * glass, 0.2600, atol=2e-4)
 
 
+@pytest.mark.parametrize("eta", [1.0, 1.3, 1.6])
+@pytest.mark.parametrize("g", [-0.5, 0.0, 0.9])
+def test_a_color_comes_back(eta, g, float64):
+    color = jnp.asarray([0.001, 0.05, 0.3, 0.8, 0.98, 1.0])
+    found = HalfSpace.of_color(color, 0.5, eta, g)
+    white = half_space(1.0, eta, g).color()
+    np.testing.assert_allclose(found.color() / white, color, atol=1e-4)
+    np.testing.assert_allclose(white, 1, atol=3e-3)
+    sigma_t = found.medium.sigma_a + found.medium.sigma_s_prime / (1 - g)
+    np.testing.assert_allclose(sigma_t, 2.0, rtol=1e-9)
+
+
+def test_colors_are_those_of_openpbr(float64):
+    """Where indices match, up to the error of its formula (OpenPBR 1.1, "Subsurface")."""
+    color = np.asarray([0.05, 0.2, 0.5, 0.8, 0.98])
+    s = 4.09712 + 4.20863 * color - np.sqrt(9.59217 + 41.6808 * color + 17.7126 * color**2)
+    for g in (0.0, 0.5):
+        albedo = (1 - s**2) / (1 - g * s**2)
+        medium = sj.Medium(1 - albedo, (1 - g) * albedo, 1.0)
+        np.testing.assert_allclose(HalfSpace(medium, g).color(), color, atol=6e-3)
+
+
+def test_the_coefficients_of_a_color_have_its_derivative(float64):
+    def coefficients(color, mean_free_path):
+        medium = HalfSpace.of_color(color, mean_free_path, 1.4, 0.3).medium
+        return medium.sigma_a, medium.sigma_s_prime
+
+    given = jnp.asarray([0.3, 0.6, 0.9]), jnp.asarray([1.0, 2.0, 3.0])
+    check_grads(coefficients, given, order=1, modes=["rev"], eps=1e-3, rtol=1e-2)
+
+
+@pytest.mark.once
+def test_colors_that_no_medium_has_are_refused():
+    for color, length, message in (
+        (1.2, 1.0, "color must be between"),
+        (0.5, 0.0, "mean_free_path"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            HalfSpace.of_color(color, length)
+
+
 @pytest.mark.once
 @pytest.mark.long
 def test_monte_carlo_with_forward_scattering(float32):

@@ -1,0 +1,71 @@
+"""The tables [medium] and [[layers]] of materials: optical coefficients, or a color and a mean free
+path.
+"""
+
+from typing import Any
+
+from splatjax.exports import plain_numbers
+from splatjax.scattering import Film, HalfSpace, Layer, Medium
+
+from ._tables import Table
+
+COEFFICIENT_UNIT, THICKNESS_UNIT = "1/mm", "mm"
+_PER_MM = {COEFFICIENT_UNIT: 1.0, "1/cm": 0.1}
+_WAYS = (
+    {"sigma_a", "sigma_s_prime"},
+    {"sigma_a", "sigma_s", "g"},
+    {"color", "mean_free_path"},
+)
+MEDIUM_ENTRIES = ("unit", "eta", "sigma_a", "sigma_s_prime", "sigma_s", "g", "color")
+MEDIUM_ENTRIES += ("mean_free_path",)
+LAYER_ENTRIES = (*MEDIUM_ENTRIES, "optical_depth", "thickness", "thickness_unit")
+
+
+def medium_of(table: Table) -> Medium:
+    """Make the medium of a table, which gives reduced scattering; or scattering and its mean
+    cosine; or a color and a mean free path.
+    """
+    given = (table.entries.keys() & set().union(*_WAYS)) - {"g"}
+    if given not in [way - {"g"} for way in _WAYS] or ("sigma_s" in given) > ("g" in table.entries):
+        raise ValueError(
+            f"{table.where} has {', '.join(sorted(given)) or 'no coefficients'}; give sigma_a and "
+            "sigma_s_prime, or sigma_a, sigma_s and g, or color and mean_free_path"
+        )
+    eta, g = table.numbers("eta"), table.number("g", 0.0)
+    if "color" in given:
+        table.one_of("unit", [THICKNESS_UNIT])
+        both = table.numbers("color"), table.numbers("mean_free_path")
+        return table.make(HalfSpace.of_color, *both, eta, g).medium
+    per_mm, reduced = _PER_MM[table.one_of("unit", _PER_MM)], "sigma_s_prime"
+    sigma_a, factor = per_mm * table.numbers("sigma_a"), per_mm
+    if "sigma_s" in given:
+        reduced, factor = "sigma_s", per_mm * (1 - g)
+    return table.make(Medium, sigma_a, factor * table.numbers(reduced), eta)
+
+
+def layer_of(table: Table) -> Layer | Film:
+    """Make the layer or film of a table."""
+    if "optical_depth" in table.entries:
+        return table.make(Film, table.numbers("optical_depth"))
+    table.one_of("thickness_unit", [THICKNESS_UNIT])
+    layer = table.make(Layer, medium_of(table), table.numbers("thickness"))
+    table.make(layer.check_diffusion)
+    return layer
+
+
+def plain_medium(medium: Medium) -> dict[str, Any]:
+    coefficients = ("sigma_a", "sigma_s_prime", "eta")
+    return {
+        "unit": COEFFICIENT_UNIT,
+        **{name: plain_numbers(getattr(medium, name)) for name in coefficients},
+    }
+
+
+def plain_layer(layer: Layer | Film) -> dict[str, Any]:
+    if isinstance(layer, Film):
+        return {"optical_depth": plain_numbers(layer.optical_depth)}
+    return {
+        "thickness": plain_numbers(layer.thickness),
+        "thickness_unit": THICKNESS_UNIT,
+        **plain_medium(layer.medium),
+    }
