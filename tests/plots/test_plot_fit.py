@@ -9,7 +9,9 @@ import splatjax as sj
 from splatjax.plots import plot_error_by_count, plot_fit
 
 
-def test_a_figure_has_names_units_error_and_energy_and_is_drawn_outside_of_pyplot(float64, tmp_path):
+def test_a_figure_has_names_units_error_and_energy_and_is_drawn_outside_of_pyplot(
+    float64, tmp_path
+):
     gaussians = sj.load_material("marble").gaussians
     figure = plot_fit(sj.Dipole(sj.load_medium("marble")), gaussians, title="marble")
     assert [axes.get_xlabel() for axes in figure.axes] == ["r (mm)"] * 3
