@@ -187,7 +187,10 @@ def main() -> None:
             for case in cases:
                 begin = time.perf_counter()
                 found = sj.inverse.recover(
-                    [seen[title] for title in case], ours, starts(medium, options.off)
+                    [seen[title] for title in case],
+                    ours,
+                    starts(medium, options.off),
+                    model=sj.fitting.DiffusionModel(),
                 )
                 print(f"\n{name} from {' and '.join(case)}, {time.perf_counter() - begin:.0f} s:")
                 rows.append(told(found, medium, name, case))

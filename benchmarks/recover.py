@@ -170,7 +170,7 @@ def main() -> None:
             for picture, light, sd in together
         ]
         before, start = compiled.count, time.perf_counter()
-        found = sj.inverse.recover(observations, splats, begin)
+        found = sj.inverse.recover(observations, splats, begin, model=sj.fitting.DiffusionModel())
         return found, time.perf_counter() - start, compiled.count - before
 
     def tell(name, case, found, seconds, programs, medium):

@@ -101,7 +101,14 @@ def observed(mask) -> list[sj.inverse.Observation]:
 begin = replace(figurine, albedo=np.where(painted[:, None], 0.5, 1.0) * np.ones(3))
 with jax.enable_x64(True):
     start = sj.Medium(skin.sigma_a * 2, skin.sigma_s_prime / 2, skin.eta)
-    found = sj.inverse.recover(observed(bare), begin, start, count=COUNT, settings=settings)
+    found = sj.inverse.recover(
+        observed(bare),
+        begin,
+        start,
+        count=COUNT,
+        settings=settings,
+        model=sj.fitting.DiffusionModel(),
+    )
 off = [
     np.asarray(getattr(found.medium, name)) / np.asarray(getattr(skin, name)) - 1
     for name in ("sigma_a", "sigma_s_prime")

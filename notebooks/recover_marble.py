@@ -32,6 +32,7 @@ from splatjax.plots import plot_recovery
 from splatjax.splatting import DenseRasterizer, ShadowSettings
 
 SIZE, COUNT, NOISE = 40, 4, 0.01
+DIPOLE = sj.fitting.DiffusionModel()
 HELD = sj.fitting.NonNegativeWeights(sj.fitting.FixedTotalReflectance())
 # Every splat at every pixel, and coarse shadows: for small pictures. Leave `settings` out for large
 # ones.
@@ -56,7 +57,7 @@ lamp = sj.DirectionalLight(jnp.asarray([-1.0, -0.3, -0.4]), jnp.full(3, np.pi))
 # %%
 with jax.enable_x64(True):
     marble = sj.load_medium("marble")
-    gaussians = sj.fit_gaussians(sj.Dipole(marble), COUNT, weights=HELD).gaussians
+    gaussians = sj.fit_gaussians(DIPOLE.profile(marble), COUNT, weights=HELD).gaussians
     material = sj.Material(gaussians, eta=1.5, specular=0.0)
     rendered = np.asarray(sj.render(sj.Scene(splats, (lamp,), material), camera, settings).beauty)
     deviation = NOISE * np.sqrt(np.mean(rendered**2))
@@ -76,7 +77,7 @@ with jax.enable_x64(True):
     taken = sj.inverse.Observation(
         photograph, camera, (lamp,), deviation=np.full(photograph.shape, deviation)
     )
-    found = sj.inverse.recover([taken], splats, start, count=COUNT, settings=settings)
+    found = sj.inverse.recover([taken], splats, start, count=COUNT, settings=settings, model=DIPOLE)
 print(found.summary())
 print(f"{found.rounds} rounds, {found.steps} steps; chi-squared {float(found.chi_squared):.3f}")
 
@@ -112,7 +113,11 @@ print(
 )
 with jax.enable_x64(True):
     predictions = sj.inverse.next_pictures(
-        found, splats, sj.inverse.default_candidates(splats, camera), settings=settings
+        found,
+        splats,
+        sj.inverse.default_candidates(splats, camera),
+        settings=settings,
+        model=DIPOLE,
     )
 for prediction in predictions:
     print(prediction)

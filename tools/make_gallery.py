@@ -216,7 +216,11 @@ def inverse(_: sj.Splats, side: int) -> np.ndarray:
     with jax.enable_x64(True):
         observation = sj.inverse.Observation(photograph, camera, lights, deviation=deviation)
         recovery = sj.inverse.recover(
-            [observation], splats, start, progress=lambda what, _: print(what)
+            [observation],
+            splats,
+            start,
+            model=sj.fitting.DiffusionModel(),
+            progress=lambda what, _: print(what),
         )
     print(recovery.summary())
     for name in ("sigma_a", "sigma_s_prime"):

@@ -133,7 +133,7 @@ def context() -> dict[str, Any]:
     camera = sj.Camera.look_at([8, 0, 70], [0, -3.5, 0], fov=32.0, width=_SIDE, height=_SIDE)
     lights = (sj.DirectionalLight([-1, -0.3, -0.4], jnp.full(3, jnp.pi)),)
     marble = sj.load_material("marble")
-    material = sj.Material(marble.gaussians, eta=1.5, specular=0.0)
+    material = dataclasses.replace(marble, specular=0.0)
     scene = sj.Scene(splats, lights, material)
     plan = sj.make_plan(scene, camera)
     picture = np.asarray(sj.render(scene, camera, plan=plan).beauty)
