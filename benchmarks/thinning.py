@@ -14,7 +14,7 @@ import numpy as np
 import splatjax as sj
 from splatjax import diffusion
 from splatjax.baselines import layer_contrast
-from splatjax.diffusion._clusters import ClusterTree
+from splatjax.diffusion._clusters import LayerSources
 
 from .scenes import columns
 
@@ -117,16 +117,15 @@ def errors(splats: sj.Splats) -> list[tuple[str, float, float]]:
                     continue
                 exists = np.ones(splats.count, bool)
                 geometry = np.asarray(splats.centers), np.asarray(splats.normals), exists
-                tree = ClusterTree.build(*geometry, [cell * width])
+                tree = LayerSources.build(*geometry, [cell * width])
                 sources = diffusion.Sources(
                     (splats.centers - middle[None]).T, splats.normals.T, splats.areas, source.T
                 )
-                clusters = tree.levels(sources)[1]
-                kept = float(jnp.sum(clusters.areas > 0)) / splats.count
-                lowered = clusters.lowered(DEPTH * jnp.sqrt(variance)).centers.T
-                given = lowered, clusters.areas, clusters.irradiance.T, variance
-                merged = layer(points - middle[None], *given)
-                record("merged", kept, [error(merged)], 1.75)
+                clusters = tree.merged(sources, DEPTH * jnp.sqrt(variance)[None])
+                own = np.flatnonzero(clusters.areas > 0)
+                given = clusters.centers.T[own], clusters.areas[own], clusters.irradiance.T[own]
+                merged = layer(points - middle[None], *given, variance)
+                record("merged", len(own) / splats.count, [error(merged)], 1.75)
     return found
 
 
