@@ -1,6 +1,9 @@
 """The five passes, wired: plan what shapes they need, then render.
 
-The formulas of the passes are in splatting, diffusion and shading.
+The formulas of the passes are in splatting, diffusion and shading. Read `see_and_shade` in
+`_passes.py` first: every picture is one call of it, with what lights the splats (`light_at`) and
+what is read of the shaded points (`read`). `_render.py` has the simplest, `_devices.py` where it
+runs.
 """
 
 from ._attributes import SurfaceAttributes as SurfaceAttributes, SurfaceSamples as SurfaceSamples
