@@ -49,7 +49,7 @@ class Spans(eqx.Module):
         """
         order = jnp.argsort(-lengths)
         shown = jnp.any(limits > -jnp.inf, axis=1)
-        tiles = _taken(order.astype(jnp.int32), listed(shown[order], size), len(order))
+        tiles = _taken(order.astype(jnp.int32), _listed(shown[order], size), len(order))
         far_limit = _taken(limits, tiles, jnp.inf)
         far_limit = jnp.where(far_limit > -jnp.inf, far_limit, jnp.inf)
         needed = needed_over_planned(jnp.sum(shown), size).astype(limits.dtype)
@@ -63,11 +63,11 @@ class Spans(eqx.Module):
         """
         is_open &= self.far_limit < jnp.inf
         chosen = jnp.any(is_open, axis=1)
-        places = listed(chosen, size)
-        near_limit = _taken(self.far_limit, places, -jnp.inf)
-        open_limit = jnp.where(_taken(is_open, places, False), near_limit, -jnp.inf)
+        listed = _listed(chosen, size)
+        near_limit = _taken(self.far_limit, listed, -jnp.inf)
+        open_limit = jnp.where(_taken(is_open, listed, False), near_limit, -jnp.inf)
         needed = needed_over_planned(jnp.sum(chosen), size).astype(near_limit.dtype)
-        return _taken(self.tiles, places, none), near_limit, open_limit, needed
+        return _taken(self.tiles, listed, none), near_limit, open_limit, needed
 
     def followed_by(self, behind: "Spans") -> "Spans":
         """Append the places of the surface behind."""
@@ -256,8 +256,8 @@ def sum_parts(
     return results
 
 
-def listed(chosen: Bool[Array, " all"], size: int) -> Int[Array, " size"]:
-    """List the indices of the chosen ones, in order; the number of all for empty places."""
+def _listed(chosen: Bool[Array, " all"], size: int) -> Int[Array, " size"]:
+    """List the indices of the chosen ones; their number for empty places."""
     return jnp.nonzero(chosen, size=size, fill_value=len(chosen))[0].astype(jnp.int32)
 
 

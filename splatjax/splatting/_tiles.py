@@ -19,7 +19,7 @@ from ._bins import BinCapacity, bin_items
 from ._fragments import PLANES, Slots, Sweep
 from ._grid import TileGrid
 from ._rasterizer import AbstractRasterizer, AbstractRasterPlan, FragmentSums, SurfaceCapacity
-from ._sweeps import PartSweep, listed, sum_tile_fragments
+from ._sweeps import PartSweep, sum_tile_fragments
 from ._views import AbstractView, SplattingSettings
 
 _STEP = 1024  # of the planned number of splats
@@ -129,8 +129,12 @@ class TilePlan(AbstractRasterPlan):
         self, splats: Splats, view: AbstractView
     ) -> tuple[Int[Array, " chosen"], Float[Array, ""]]:
         may_be_seen = view.may_see(splats)
-        needed = needed_over_planned(jnp.sum(may_be_seen), self.splats)
-        return listed(may_be_seen, self.splats), needed.astype(splats.centers.dtype)
+        ends = jnp.cumsum(may_be_seen.astype(jnp.int32))
+        every = jnp.arange(splats.count, dtype=jnp.int32)
+        listed = jnp.full(self.splats, splats.count, jnp.int32)
+        listed = listed.at[jnp.where(may_be_seen, ends - 1, self.splats)].set(every, mode="drop")
+        needed = needed_over_planned(ends[-1], self.splats)
+        return listed, needed.astype(splats.centers.dtype)
 
     def sum_fragments(
         self,
