@@ -10,12 +10,13 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import jax
+import numpy as np
 import tyro
 
 import splatjax as sj
 
 from ._terminal import check_folder, check_options, check_output, complete, preview, stage
-from ._view import ViewOptions, draw, rough_picture
+from ._view import ViewOptions, draw
 
 _LARGEST = 16_383  # pixels along a side of a WebP file
 _MOST_FRAMES = 10_000  # that four digits can name
@@ -53,7 +54,9 @@ class Render(ViewOptions):
         is_valid = self.stream == 0 or (self.stream > 0 and self.splats is not None)
         expected = "be a number of splats of a PLY file, which must be named"
         bounces = self.stream == 0 or self.bounces == 0, "be 0 with --stream"
-        check_options(self, {"stream": (is_valid, expected), "bounces": bounces})
+        diffusion = self.stream == 0 or self.diffusion == "clusters", "be clusters with --stream"
+        rules = {"stream": (is_valid, expected), "bounces": bounces, "diffusion": diffusion}
+        check_options(self, rules)
         rendered = self._streamed(self.splats) if self.splats and self.stream else self._at_once()
         self.note_unresolved_layers(*rendered[:2])
         with stage(f"writing {self.output} and {self.output.with_suffix('.png')}"):
@@ -209,3 +212,31 @@ class Turntable(ViewOptions):
             self.write(paths[i][0], frame, material, scenes[i].lights, cameras[i])
 
         return make
+
+
+def rough_picture(scene: sj.Scene, camera: sj.Camera, exposure: float, side: int) -> list:
+    """Draw the centers of splats, matte and under directional lights, by NumPy alone, which
+    compiles nothing. The longer side has so many pixels at most, fewer for few splats; the height
+    is even. Return rows of red, green and blue up to 255.
+    """
+    samples = [sample for light in scene.lights for sample in light.samples()]
+    scene, camera, lights = jax.device_get((scene, camera, samples))
+    # Of millions of splats some will do.
+    splats = jax.tree.map(lambda leaf: leaf[:: 1 + len(leaf) // 2**19], scene.splats)
+    lengths = np.asarray([camera.width, camera.height])
+    side = max(2, min(side, 0.5 * splats.count**0.5))  # so that few pixels have no splat
+    size = 2 * np.maximum(np.rint(side / 2 * lengths / lengths.max()), 1).astype(int)
+    albedo = 1.0 if splats.albedo is None else splats.albedo
+    color = (albedo * scene.material.gaussians.weights.sum(axis=0) / np.pi) * sum(
+        np.maximum(splats.normals @ -light.direction, 0)[:, None] * light.irradiance
+        for light in lights
+    )
+    local = (splats.centers - camera.position) @ camera.rotation.T
+    # From far to near, without those that face away: nearer ones are drawn over farther ones.
+    order = np.argsort(-local[:, 2])
+    order = order[np.sum(local * (splats.normals @ camera.rotation.T), axis=1)[order] < 0]
+    place = camera.focal_length * size[1] * local[:, :2] / local[:, 2:] + size / 2
+    column, row = np.clip(place, 0, size - 1)[order].astype(int).T
+    picture = np.zeros((size[1], size[0], 3))
+    picture[row, column] = color[order]
+    return np.rint(255 * sj.io.linear_to_srgb(picture * 2.0**exposure)).astype(int).tolist()

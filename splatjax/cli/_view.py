@@ -63,6 +63,9 @@ class ViewOptions:
     #: Rotation of the environment about the vertical axis, degrees; at 0 the middle of the map is
     #: the front (+z).
     environment_rotation: float = 0.0
+    #: How light spreads below the surface: by the profile of a flat piece (clusters), or by the
+    #: diffusion equation in the closed body itself, from the coefficients of the material (shape).
+    diffusion: Literal["clusters", "shape"] = "clusters"
     #: How many times light that has left the body may enter it again: 1 or 2 brighten folds.
     bounces: int = 0
     #: Of the PNG: black, transparent, or the environment. The EXR has the coverage, and none.
@@ -101,7 +104,15 @@ class ViewOptions:
                 self.background != "environment" or self.environment_name is not None,
                 "be black or transparent where single lights are given and no --environment",
             ),
-            "bounces": (self.bounces >= 0, "be 0 or more"),
+            "bounces": (
+                self.bounces == 0 or (self.bounces > 0 and self.diffusion == "clusters"),
+                "be 0 or more, and 0 with --diffusion shape",
+            ),
+            "diffusion": (
+                self.diffusion == "clusters"
+                or (self.scattering and sj.load_material(self.material).medium is not None),
+                f"be clusters without scattering, or where {self.material} has no [medium]",
+            ),
             "width": (self.width >= 1, positive),
             "height": (self.height >= 1, positive),
             "count": (self.count >= 1, positive),
@@ -147,6 +158,8 @@ class ViewOptions:
 
     @property
     def settings(self) -> sj.RenderSettings:
+        if self.diffusion == "shape":
+            return sj.RenderSettings(diffuser=sj.diffusion.ShapeDiffuser())
         return sj.RenderSettings(bounces=self.bounces)
 
     def load(self) -> tuple[sj.Splats, sj.Material]:
@@ -161,6 +174,11 @@ class ViewOptions:
     def material_for(self, splats: sj.Splats) -> sj.Material:
         material = sj.load_material(self.material)
         if splats.albedo is not None:
+            if self.diffusion == "shape":
+                raise ValueError(
+                    "--diffusion shape computes color from the coefficients of the material, and "
+                    "the splats carry albedo; give --no-albedo"
+                )
             material = material.white()
             note(
                 f"color is the splats' own albedo, and {self.material} only spreads the light; "
@@ -168,12 +186,11 @@ class ViewOptions:
             )
         if material.channels == 1:  # the same weights for red, green and blue
             weights = jnp.tile(material.gaussians.weights, 3)
+            gaussians = sj.SumOfGaussians(material.gaussians.variances, weights)
+            terms = material.single_scattering, material.medium
+            single, medium = jax.tree.map(lambda leaf: jnp.tile(leaf, 3), terms)
             material = replace(
-                material,
-                gaussians=sj.SumOfGaussians(material.gaussians.variances, weights),
-                single_scattering=jax.tree.map(
-                    lambda leaf: jnp.tile(leaf, 3), material.single_scattering
-                ),
+                material, gaussians=gaussians, single_scattering=single, medium=medium
             )
         return material if self.scattering else material.opaque()
 
@@ -292,34 +309,6 @@ def draw(
             f"the plan's capacity is exceeded: {float(frame.overflow):.2f} times of it is needed"
         )
     return frame
-
-
-def rough_picture(scene: sj.Scene, camera: sj.Camera, exposure: float, side: int) -> list:
-    """Draw the centers of splats, matte and under directional lights, by NumPy alone, which
-    compiles nothing. The longer side has so many pixels at most, fewer for few splats; the height
-    is even. Return rows of red, green and blue up to 255.
-    """
-    samples = [sample for light in scene.lights for sample in light.samples()]
-    scene, camera, lights = jax.device_get((scene, camera, samples))
-    # Of millions of splats some will do.
-    splats = jax.tree.map(lambda leaf: leaf[:: 1 + len(leaf) // 2**19], scene.splats)
-    lengths = np.asarray([camera.width, camera.height])
-    side = max(2, min(side, 0.5 * splats.count**0.5))  # so that few pixels have no splat
-    size = 2 * np.maximum(np.rint(side / 2 * lengths / lengths.max()), 1).astype(int)
-    albedo = 1.0 if splats.albedo is None else splats.albedo
-    color = (albedo * scene.material.gaussians.weights.sum(axis=0) / np.pi) * sum(
-        np.maximum(splats.normals @ -light.direction, 0)[:, None] * light.irradiance
-        for light in lights
-    )
-    local = (splats.centers - camera.position) @ camera.rotation.T
-    # From far to near, without those that face away: nearer ones are drawn over farther ones.
-    order = np.argsort(-local[:, 2])
-    order = order[np.sum(local * (splats.normals @ camera.rotation.T), axis=1)[order] < 0]
-    place = camera.focal_length * size[1] * local[:, :2] / local[:, 2:] + size / 2
-    column, row = np.clip(place, 0, size - 1)[order].astype(int).T
-    picture = np.zeros((size[1], size[0], 3))
-    picture[row, column] = color[order]
-    return np.rint(255 * sj.io.linear_to_srgb(picture * 2.0**exposure)).astype(int).tolist()
 
 
 def direction_to(azimuth: float, elevation: float) -> np.ndarray:
