@@ -252,7 +252,8 @@ class ViewOptions:
     ) -> tuple[Path, Path]:
         """Write the picture with all its layers, and the PNG file beside it; return both paths."""
         picture, shown = path.with_suffix(".png"), np.asarray(frame.beauty)
-        variances = material.gaussians.variances.tolist()
+        solved = self.diffusion == "shape"  # whose one layer is of no Gaussian
+        variances = None if solved else material.gaussians.variances.tolist()
         sj.write_exr(path, frame, variances=variances, manifest=self.manifest())
         if self.background == "environment" and isinstance(lights[0], sj.EnvironmentLight):
             shown = np.asarray(lights[0].behind(frame, camera))
@@ -286,6 +287,8 @@ class ViewOptions:
 
     def note_unresolved_layers(self, frame: sj.Frame, material: sj.Material) -> None:
         """Name the layers that are narrower than the splats."""
+        if self.diffusion == "shape":
+            return
         unresolved = np.asarray(frame.unresolved_fraction) > 0.5
         widths = np.sqrt(np.asarray(material.gaussians.variances))[unresolved]
         if self.scattering and len(widths):

@@ -72,7 +72,7 @@ def scattered_once(
     is_through = jnp.isfinite(length)
     stopped = jnp.where(is_through, -jnp.expm1(-sigma_t * jnp.where(is_through, length, 0.0)), 1.0)
     normals, centers = jnp.stack(surface.normals), jnp.stack(surface.centers)
-    cosines = -jnp.sum(directions * normals, axis=1)
+    cosines = -jnp.sum(directions * normals[None], axis=1)
 
     def at_depth(u, share):
         # The place before which a part u of what a beam scatters is scattered.
@@ -80,7 +80,7 @@ def scattered_once(
         scattered = share * stopped * albedo * irradiance
         depth = along * cosines
         early = _leaves_early(depth * sigma_t, medium)
-        places = centers + along[:, None] * directions
+        places = centers[None] + along[:, None] * directions
         # The others see the plane of beams below each splat.
         unseen = scattered * (1 - early) * kernel.plane_integral(depth)
         return early * scattered, (1 - early) * scattered, places, unseen
@@ -99,7 +99,7 @@ def scattered_once(
             0
         ]
 
-    summed = jax.lax.map(of_channel, (kernel.kappa, surface.areas * scattered, places))
+    summed = jax.lax.map(of_channel, (kernel.kappa, surface.areas[None, None] * scattered, places))
     total = summed + jnp.sum(unseen, axis=1)
     return total / medium.diffusion_coefficient[:, None], jnp.sum(leaving, axis=1)
 

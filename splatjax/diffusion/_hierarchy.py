@@ -17,7 +17,7 @@ SIZES = 1, *(SOURCES_PER_BLOCK << level for level in range(9))
 _WIDTH = 128  # sources in a row
 _ROWS = 16  # at once
 
-Planes = tuple[Float[Array, " points"], Float[Array, " points"], Float[Array, " points"]]
+Planes = tuple[Float[Array, "_"], Float[Array, "_"], Float[Array, "_"]]
 
 
 class Interactions(eqx.Module):
@@ -58,10 +58,10 @@ class Interactions(eqx.Module):
     def reduce(
         self,
         function: Callable,
-        points: PyTree[Float[Array, " points"]],
-        sources: PyTree[Float[Array, " sources"]],
+        points: PyTree[Array],
+        sources: PyTree[Array],
         combine: Callable = jax.ops.segment_sum,
-    ) -> PyTree[Float[Array, " points"]]:
+    ) -> PyTree[Array]:
         """Apply a function to points `[rows, 1, points]` and sources `[rows, sources, 1]`, and
         combine what it makes of each row, `[rows, points]`. Absent sources are 0.
         """

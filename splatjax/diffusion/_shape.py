@@ -86,17 +86,18 @@ class ShapeDiffuser(AbstractDiffuser):
         entering = jnp.pad(beams.irradiance, more), jnp.pad(beams.directions, ((0, 0), *more))
         source, leaving = scattered_once(surface, coefficients, finer, *entering)
 
+        exists = (surface.areas > 0)[None]
         one, z_e = jnp.ones_like(surface.areas)[None], coefficients.z_e
         share = -surface.layers(ScreenedKernel(jnp.zeros(1, z_e.dtype), kernel.length), [0.0], one)
         # What the softening leaves out sees phi as it is on its own splat.
         own = kernel.plane_integral(jnp.zeros_like(z_e)[:, None])
         diagonal = share + own / z_e[:, None]
-        diagonal = jnp.where(surface.areas > 0, diagonal, 1.0)
+        diagonal = jnp.where(exists, diagonal, 1.0)
 
         def product(phi):
             return phi + surface.layers(kernel, list(1 / z_e), phi) / diagonal
 
-        right = jnp.where(surface.areas > 0, source / diagonal, 0.0)
+        right = jnp.where(exists, source / diagonal, 0.0)
         phi = solve(product, right, self.error)
         return (coefficients.diffusion_coefficient / z_e)[:, None] * phi + leaving
 

@@ -40,7 +40,7 @@ class SurfaceSums(eqx.Module):
         strengths: Float[Array, "channels splats"],
     ) -> Float[Array, "channels splats"]:
         """Compute `int (c G + dG/dn_y) f dA`, of every channel with its own c, 1/mm."""
-        powers = jnp.unstack(self.areas * strengths)
+        powers = jnp.unstack(self.areas[None] * strengths)
 
         def near(x, sources):
             strengths, normals, y = sources
