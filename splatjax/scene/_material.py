@@ -3,6 +3,7 @@
 import dataclasses
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -81,8 +82,8 @@ class Material(eqx.Module):
         """
         if self.angles is not None:
             return self.angles
-        one = np.eye(ANGULAR_POWERS, 1).repeat(self.channels, 1)
-        return AngularLaw(jnp.asarray(one, self.gaussians.weights.dtype))
+        one = np.eye(ANGULAR_POWERS, 1, dtype=self.gaussians.weights.dtype)
+        return AngularLaw(jax.device_put(one.repeat(self.channels, 1)))
 
     def diffuse_fraction(self, mu_i: Float[Array, "*points"]) -> Float[Array, "*points channels"]:
         """Compute the factor on the Gaussians for light that enters under the cosine `mu_i`; 1
