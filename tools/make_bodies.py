@@ -5,9 +5,12 @@ The path-traced pictures are made once, by `python tools/path_traced_bodies.py o
 needs Mitsuba 3.
 """
 
+import dataclasses
+import functools
 import os
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -23,9 +26,9 @@ from splatjax.geometry import Mesh, sample_mesh, vertex_normals
 from splatjax.io import linear_to_srgb
 from splatjax.splatting import SplattingSettings
 
-SIZE = 192
+SIZE = 128
 """Pixels along a side."""
-SAMPLES, PASSES = 256, 9
+SAMPLES, PASSES = 128, 4
 """Paths per pixel of a pass, and passes."""
 ALBEDO = (0.9, 0.98, 0.998)
 SIGMA_T = 1.0
@@ -35,14 +38,15 @@ Place = tuple[float, float, float]
 
 
 class Body(NamedTuple):
-    """A body under one directional light. Lengths are mm, and mean free paths.
+    """A body under one light. Lengths are mm, and mean free paths.
 
     The blocker is a black rectangle that faces +z: its center, width and height.
     """
 
     name: str
     what: str
-    light: Place
+    shape: Callable[[], trimesh.Trimesh]
+    light: sj.scene.AbstractLight
     eye: Place
     target: Place
     fov: float
@@ -50,21 +54,83 @@ class Body(NamedTuple):
     blocker: tuple[Place, tuple[float, float]] | None = None
 
 
-SHADOW = (15, 0, 45), (30, 50)
-SPHERE = "sphere of radius 10, lit from the side"
-BLOCK = "block of 40 x 40 x 20 with a shadow's edge"
-SHEET = "sheet of 40 x 40 x 2, lit from behind"
-HEAD, EAR = "scanned head, lit from the front", "its ear, lit from behind"
-BODIES = [
-    Body("sphere", SPHERE, (-1, -1, -1), (0, 0, 80), (0, 0, 0), 18, 150_000),
-    Body("block", BLOCK, (0, 0, -1), (0, 70, 40), (0, 0, -5), 32, 200_000, SHADOW),
-    Body("sheet", SHEET, (0, 0, 1), (30, 20, 80), (0, 0, 0), 30, 150_000),
-    Body("head", HEAD, (-0.7, -0.5, -1), (250, 100, 800), (0, 70, 0), 19, 683_549),
-    Body("ear", EAR, (-0.45, -0.25, 1), (450, 80, 300), (60, 60, 0), 9, 683_549),
-]
-"""The head is Lee Perry-Smith's (CC-BY 3.0), from the folder that SPLATJAX_SHARED names."""
+def head() -> trimesh.Trimesh:
+    """Load Lee Perry-Smith's head (CC-BY 3.0), from the folder that SPLATJAX_SHARED names."""
+    path = Path("data", "lee_perry_smith", "LeePerrySmith_closed.ply")
+    if "SPLATJAX_SHARED" not in os.environ:
+        raise ValueError(f"SPLATJAX_SHARED is not set; the head needs the folder with {path}")
+    mesh = trimesh.load(Path(os.environ["SPLATJAX_SHARED"]) / path, process=False)
+    return mesh.apply_scale(MM_PER_UNIT)
+
+
+def box(depth: float) -> trimesh.Trimesh:
+    """Make a box of 40 x 40 mm whose front is z = 0."""
+    return trimesh.creation.box([40, 40, depth]).apply_translation([0, 0, -depth / 2])
+
+
+def lamp(*direction: float) -> sj.DirectionalLight:
+    return sj.DirectionalLight(direction, irradiance=[IRRADIANCE] * len(ALBEDO))
+
+
 MM_PER_UNIT = 53.0
-PHOTONS = 4_000_000
+SPHERE, HEAD = "sphere of radius 10", "scanned head"
+sphere = functools.partial(trimesh.creation.icosphere, 6, 10.0)
+FROM_SPHERE = (0, 0, 80), (0, 0, 0), 18, 150_000
+FROM_SHEET = (30, 20, 80), (0, 0, -1), 30, 150_000
+FROM_HEAD = (250, 100, 800), (0, 70, 0), 19, 683_549
+STUDIO = sj.EnvironmentLight(sj.scene.studio())
+SOFTBOX = sj.scene.RectangleLight.facing
+BODIES = [
+    Body("sphere", f"{SPHERE}, lit from the side", sphere, lamp(-1, -1, -1), *FROM_SPHERE),
+    Body("sphere_studio", f"{SPHERE} in the studio", sphere, STUDIO, *FROM_SPHERE),
+    Body(
+        "sphere_softbox",
+        f"{SPHERE} beside a square light of 40 x 40",
+        sphere,
+        SOFTBOX([35, 35, 35], [0, 0, 0], 40, 40, [10.0] * 3),
+        *FROM_SPHERE,
+    ),
+    Body(
+        "block",
+        "block of 40 x 40 x 20 with a shadow's edge",
+        functools.partial(box, 20),
+        lamp(0, 0, -1),
+        (0, 70, 40),
+        (0, 0, -5),
+        32,
+        200_000,
+        ((15, 0, 45), (30, 50)),
+    ),
+    *(
+        Body(
+            f"sheet{depth}",
+            f"sheet of 40 x 40 x {depth}, lit from behind",
+            functools.partial(box, depth),
+            lamp(0, 0, 1),
+            *FROM_SHEET,
+        )
+        for depth in (2, 4, 8)
+    ),
+    Body("head", f"{HEAD}, lit from the front", head, lamp(-0.7, -0.5, -1), *FROM_HEAD),
+    Body("head_studio", f"{HEAD} in the studio", head, STUDIO, *FROM_HEAD),
+    Body(
+        "head_softbox",
+        f"{HEAD} beside a square light of 300 x 300",
+        head,
+        SOFTBOX([250, 250, 350], [0, 70, 0], 300, 300, [10.0] * 3),
+        *FROM_HEAD,
+    ),
+    Body(
+        "ear",
+        "its ear, lit from behind",
+        head,
+        lamp(-0.45, -0.25, 1),
+        (450, 80, 300),
+        (60, 60, 0),
+        9,
+        683_549,
+    ),
+]
 EVEN = 1.0
 """Full coverage of splats as evenly spread as these; outlines then lie within 0.2 pixels of the
 truth, with the default 0.7.
@@ -74,21 +140,6 @@ PAGE = Path(__file__).parents[1] / "docs" / "bodies.md"
 BEGIN, END = "<!-- table: tools/make_bodies.py -->", "<!-- end of table -->"
 TITLES = ("body", "model", "red off by", "green", "blue", "FLIP", "seconds")
 TITLES += ("path tracer's seconds to the same error",)
-
-
-def mesh_of(body: Body) -> trimesh.Trimesh:
-    """Return the closed mesh of a body, mm; sharp edges have vertices of their own."""
-    if body.name == "sphere":
-        return trimesh.creation.icosphere(6, 10.0)
-    if body.name == "block":
-        return trimesh.creation.box([40, 40, 20]).apply_translation([0, 0, -10])
-    if body.name == "sheet":
-        return trimesh.creation.box([40, 40, 2])
-    head = Path("data", "lee_perry_smith", "LeePerrySmith_closed.ply")
-    if "SPLATJAX_SHARED" not in os.environ:
-        raise ValueError(f"SPLATJAX_SHARED is not set; the head needs the folder with {head}")
-    mesh = trimesh.load(Path(os.environ["SPLATJAX_SHARED"]) / head, process=False)
-    return mesh.apply_scale(MM_PER_UNIT)
 
 
 class Truth(NamedTuple):
@@ -124,39 +175,43 @@ def models() -> dict[str, tuple[sj.Material, sj.RenderSettings]]:
     """Return what is compared: material and settings, by name."""
     albedo = jnp.asarray(ALBEDO)
     medium = sj.Medium(SIGMA_T * (1 - albedo), SIGMA_T * albedo, jnp.ones(len(ALBEDO)))
-    half_space = [sj.Layer(medium, jnp.asarray(jnp.inf))]
-    profile = sj.transport.monte_carlo(half_space, PHOTONS, jax.random.key(4)).profile()
-    single = sj.SingleScattering(medium)
-    whole, parted = material(profile), material(profile.without(single), single)
-    even = SplattingSettings(full_coverage=EVEN)
-    plain = sj.RenderSettings(even, kernel=PlainMean())
+    model, single = sj.fitting.TransportModel(), sj.SingleScattering(medium)
+    half_space, beam = model.half_space(medium), model.profile(medium)
+    apart = single.directional_albedo(jnp.asarray(half_space.cosines()))
+    flat = fitted(beam)
+    whole = dataclasses.replace(flat, angles=model.angles(medium))
+    parted = dataclasses.replace(
+        fitted(beam.multiply_scattered()),
+        single_scattering=single,
+        angles=half_space.angular_law(apart),
+    )
+    even = sj.RenderSettings(SplattingSettings(full_coverage=EVEN))
     return {
-        "the paper's mean": (whole, plain),
-        "escape normalization": (whole, sj.RenderSettings(even)),
-        "and single scattering": (parted, sj.RenderSettings(even)),
+        "the paper's mean": (flat, dataclasses.replace(even, kernel=PlainMean())),
+        "escape normalization and angles": (whole, even),
+        "and single scattering": (parted, even),
+        "and a bounce": (parted, dataclasses.replace(even, bounces=1)),
     }
 
 
-def material(
-    profile: sj.scattering.Tabulated, single: sj.SingleScattering | None = None
-) -> sj.Material:
-    """Fit six Gaussians to a reflectance, its total held; the surface itself reflects nothing."""
+def fitted(profile: sj.gaussians.AbstractProfile) -> sj.Material:
+    """Fit six Gaussians as `splatjax fit` does; the surface itself reflects nothing."""
     weights = sj.fitting.NonNegativeWeights(sj.fitting.FixedTotalReflectance())
+    rule = sj.fitting.TransportModel.rule
     with jax.enable_x64(True):
         profile = jax.tree.map(lambda leaf: leaf.astype(jnp.float64), profile)
-        rule = sj.scattering.L2_QUADRATURE.beyond(0.2 / SIGMA_T)
         gaussians = sj.fit_gaussians(profile, 6, weights=weights, rule=rule).gaussians
     gaussians = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), gaussians)
-    return sj.Material(gaussians, eta=1.0, specular=0.0, single_scattering=single)
+    return sj.Material(gaussians, eta=1.0, specular=0.0)
 
 
 def splats_of(body: Body) -> sj.Splats:
     """Cover a body, its edges kept sharp, and its blocker: black splats so far away that no light
     spreads to the body.
     """
-    mesh = mesh_of(body)
+    mesh = body.shape()
     vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces)
-    if body.name in ("block", "sheet"):
+    if len(faces) == 12:  # of a box
         vertices, faces = vertices[faces].reshape(-1, 3), np.arange(3 * len(faces)).reshape(-1, 3)
     splats = covered(vertices, faces, body.count)
     if body.blocker is None:
@@ -175,10 +230,8 @@ def splatted(
     body: Body, splats: sj.Splats, material: sj.Material, settings: sj.RenderSettings
 ) -> tuple[np.ndarray, float]:
     """Return the picture, and the seconds that it takes once compiled."""
-    light = sj.DirectionalLight(jnp.asarray(body.light, float), jnp.full(len(ALBEDO), IRRADIANCE))
-    eye, target = (jnp.asarray(place, float) for place in (body.eye, body.target))
-    camera = sj.Camera.look_at(eye, target, fov=body.fov, width=SIZE, height=SIZE)
-    scene = sj.Scene(splats, (light,), material)
+    camera = sj.Camera.look_at(body.eye, body.target, fov=body.fov, width=SIZE, height=SIZE)
+    scene = sj.Scene(splats, (body.light,), material)
     plan = sj.make_plan(scene, camera, settings)
     for _ in range(2):
         start = time.perf_counter()

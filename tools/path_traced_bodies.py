@@ -1,5 +1,5 @@
 """Path-trace the bodies of `tools/make_bodies.py` with Mitsuba 3: `python
-tools/path_traced_bodies.py FOLDER`.
+tools/path_traced_bodies.py FOLDER [NAME ...]`.
 
 Needs `mitsuba` (the dependency group `truth`). A body whose file FOLDER/NAME.npz is there already
 is kept: remove the file to trace it again. The time in it is that of the fastest pass.
@@ -10,15 +10,16 @@ import time
 from pathlib import Path
 
 import numpy as np
-from make_bodies import ALBEDO, BODIES, IRRADIANCE, PASSES, SAMPLES, SIGMA_T, SIZE, Body, mesh_of
+from make_bodies import ALBEDO, BODIES, PASSES, SAMPLES, SIGMA_T, SIZE, Body
 from rich.progress import track
 
+import splatjax as sj
 from splatjax.io import atomic_path
 
 
 def scene(mi, body: Body, mesh: Path):
     """Describe a medium inside a boundary that neither reflects nor bends; isotropic scattering;
-    one directional light.
+    lights are not seen themselves.
     """
     transform = mi.ScalarTransform4f
     medium = {
@@ -31,7 +32,12 @@ def scene(mi, body: Body, mesh: Path):
     film = {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}}
     description = {
         "type": "scene",
-        "integrator": {"type": "volpath", "max_depth": 4000, "rr_depth": 400},
+        "integrator": {
+            "type": "volpath",
+            "max_depth": 4000,
+            "rr_depth": 400,
+            "hide_emitters": True,
+        },
         "body": {
             "type": "ply",
             "filename": str(mesh),
@@ -39,11 +45,7 @@ def scene(mi, body: Body, mesh: Path):
             "bsdf": {"type": "null"},
             "interior": medium,
         },
-        "light": {
-            "type": "directional",
-            "direction": list(body.light),
-            "irradiance": {"type": "rgb", "value": [IRRADIANCE] * len(ALBEDO)},
-        },
+        "light": emitter(mi, body.light),
         "camera": {
             "type": "perspective",
             "fov": body.fov,
@@ -63,10 +65,29 @@ def scene(mi, body: Body, mesh: Path):
     return mi.load_dict(description)
 
 
+def emitter(mi, light: sj.scene.AbstractLight) -> dict:
+    """Describe a light; the latitude-longitude maps of both renderers are the same."""
+    if isinstance(light, sj.DirectionalLight):
+        irradiance = {"type": "rgb", "value": np.asarray(light.irradiance).tolist()}
+        direction = np.asarray(light.direction).tolist()
+        return {"type": "directional", "direction": direction, "irradiance": irradiance}
+    if isinstance(light, sj.EnvironmentLight):
+        return {"type": "envmap", "bitmap": mi.Bitmap(np.array(light.radiance(), np.float32))}
+    across, down = np.asarray(light.edges) / 2
+    matrix = np.eye(4)
+    matrix[:3] = np.stack([across, down, np.cross(across, down), light.center], axis=1)
+    radiance = {"type": "rgb", "value": np.asarray(light.radiance).tolist()}
+    return {
+        "type": "rectangle",
+        "to_world": mi.ScalarTransform4f(matrix),
+        "emitter": {"type": "area", "radiance": radiance},
+    }
+
+
 def trace(mi, body: Body, path: Path) -> None:
     """Write the sums of the passes and of their squares."""
     mesh = path.with_suffix(".ply")
-    mesh_of(body).export(mesh)
+    body.shape().export(mesh)
     described, total, squares, seconds = scene(mi, body, mesh), 0.0, 0.0, np.inf
     for number in track(range(PASSES), description=body.name):
         start = time.perf_counter()
@@ -86,6 +107,8 @@ def main() -> None:
     folder = Path(sys.argv[1] if len(sys.argv) > 1 else "out/bodies")
     folder.mkdir(parents=True, exist_ok=True)
     for body in BODIES:
+        if sys.argv[2:] and body.name not in sys.argv[2:]:
+            continue
         path = folder / f"{body.name}.npz"
         if not path.exists():
             trace(mi, body, path)
