@@ -82,6 +82,7 @@ REFUSED = {
     "render missing.ply --fill -1": ["--fill", "-1"],
     "render missing.ply --bounces -1": ["--bounces", "-1"],
     "render plate.ply --bounces 1 --stream 5": ["--bounces", "0 with --stream"],
+    "render plate.ply --diffusion shape": ["--diffusion", "skin has no [medium]"],
     "render --stream 5": ["--stream", "5"],
     "turntable missing.ply --frames 0": ["--frames", "0"],
     "turntable missing.ply --frames 10001": ["--frames", "10001"],
