@@ -110,7 +110,8 @@ class SurfaceSums(eqx.Module):
         self, directions: Planes, is_lit: Bool[Array, " splats"]
     ) -> Float[Array, " splats"]:
         """Compute how far a beam goes from each splat to the first one that it leaves the body by,
-        in lengths of its direction; infinite where there is none. Which one is discontinuous.
+        in lengths of its direction: infinite where there is none, 0 without light. Which one is
+        discontinuous.
         """
 
         def crossing(beam, discs):
@@ -147,7 +148,8 @@ class SurfaceSums(eqx.Module):
         start = jax.lax.stop_gradient(jnp.minimum(*over(first, beams, jax.ops.segment_min)))
         weight, total = jax.tree.map(jnp.add, *over(blend, (*beams, start)))
         is_hit = is_lit & (weight > 0)
-        return jnp.where(is_hit, total / jnp.where(is_hit, weight, 1.0), jnp.inf)
+        length = total / jnp.where(is_hit, weight, 1.0)
+        return jnp.where(is_hit, length, jnp.where(is_lit, jnp.inf, 0.0))
 
     def slopes(self, rows: Float[Array, "rows splats"]) -> Float[Array, "rows 3 splats"]:
         """Fit the slopes of rows along the surface, 1/mm, over about two spacings."""

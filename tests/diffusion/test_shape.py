@@ -101,6 +101,7 @@ def test_merged_sums_are_those_of_all_splats_in_value_and_gradient():
     assert off(merged, of_all) < MERGED
     for name in ("centers", "normals", "areas"):
         assert off(getattr(merged_slopes[0], name), getattr(slopes[0], name)) < OF_SLOPES
+    assert off(merged_slopes[2].irradiance, slopes[2].irradiance) < OF_SLOPES
     for name in ("sigma_a", "sigma_s_prime", "eta"):
         assert off(getattr(merged_slopes[1], name), getattr(slopes[1], name)) < OF_SLOPES
 
