@@ -218,9 +218,9 @@ class Fit:
         error, ratio = float(fitted.error.max()), float(scales.max() / scales.min())
         if error > _LARGE and ratio > _APART:
             note(
-                f"{self.medium}: the widths of its channels differ by a factor of {ratio:.2g}, "
-                f"too far apart for {count} variances that all share (error {error:.2g}); give a "
-                f"larger --count, or --error {_LARGE}"
+                f"{self.medium}: the widths of its channels differ by a factor of {ratio:.2g}, too "
+                f"far apart to share {count} variances (error {error:.2g}); give a larger --count, "
+                f"or --error {_LARGE}"
             )
 
     def _coefficients(self) -> sj.Dipole | sj.LayeredMultipole | sj.scattering.Tabulated:

@@ -57,6 +57,7 @@ def test_it_prints_and_writes_a_material_that_loads(tmp_path, capsys):
     assert run("fit", "skin1", "--count", "1", "--output", output, "--plot", plot) == 0
     printed = capsys.readouterr().out
     assert "error (Eq. 4)" in printed
+    assert "fit over profile, less 1" in printed
     assert printed.splitlines()[-2:] == [str(output), str(plot)]
     with Image.open(plot) as picture:
         assert min(picture.size) > 400
@@ -144,6 +145,13 @@ def test_it_notes_too_much_light_and_too_few_radii(
     assert run("fit", tmp_path / "few.csv", "--count", count) == 0
     notes = [line for line in capsys.readouterr().err.splitlines() if "few.csv " in line]
     assert (noted is None and not notes) or any(noted in line for line in notes)
+
+
+def test_it_notes_channels_too_far_apart(fits_end_as, capsys):
+    fits_end_as(optx.RESULTS.successful)
+    for name, noted in (("ketchup", True), ("marble", False)):
+        assert run("fit", name, "--model", "dipole") == 0
+        assert ("--error 0.05" in capsys.readouterr().err) == noted
 
 
 @pytest.mark.parametrize(

@@ -13,11 +13,13 @@ def test_a_figure_has_names_units_error_and_energy_and_is_drawn_outside_of_pyplo
     float64, tmp_path
 ):
     gaussians = sj.load_material("marble").gaussians
-    figure = plot_fit(sj.Dipole(sj.load_medium("marble")), gaussians, title="marble")
+    model = sj.fitting.TransportModel()
+    profile = model.profile(sj.load_medium("marble"))
+    figure = plot_fit(profile, gaussians, rule=model.rule, title="marble")
     assert [axes.get_xlabel() for axes in figure.axes] == ["r (mm)"] * 3
     assert "1/mm²" in figure.axes[1].get_ylabel()
     labels = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
-    assert labels[0].startswith("red: E = 4.2")
+    assert labels[0].startswith("red: E = 2.7")
     assert [label.partition(":")[0] for label in labels] == ["red", "green", "blue"]
     assert all(label.endswith("energy held") for label in labels)
     assert matplotlib.pyplot.get_fignums() == []
