@@ -104,7 +104,7 @@ def test_shipped_weights_are_not_negative_and_sum_to_the_total_reflectance(name)
 
 @pytest.mark.once
 @pytest.mark.slow
-@pytest.mark.parametrize("every", [4, pytest.param(1, marks=pytest.mark.long)])
+@pytest.mark.parametrize("every", [8, pytest.param(1, marks=pytest.mark.long)])
 def test_shipped_files_are_what_the_command_writes(every, tmp_path):
     """All in one test: they share what is compiled."""
     tool = runpy.run_path(str(Path(__file__).parents[2] / "tools" / "make_profiles.py"))
