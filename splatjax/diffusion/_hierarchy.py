@@ -98,6 +98,7 @@ class Hierarchy(eqx.Module):
         centers: Float[np.ndarray, "splats 3"],
         exists: Bool[np.ndarray, " splats"],
         opening: float,
+        least: float,
     ) -> "Hierarchy":
         """Find them. Not for traced arrays.
 
@@ -106,6 +107,8 @@ class Hierarchy(eqx.Module):
         - `centers`: in a compact order, `padded_count` of them.
         - `exists`: false for what fills up.
         - `opening`: radius of a cluster over its distance, at most; with 0 all splats are near.
+        - `least`: distance of a cluster, mm: nearer ones are in the reach of the softening, however
+          small they are.
         """
         levels, first = [], 0
         for size in SIZES[1:]:
@@ -122,7 +125,7 @@ class Hierarchy(eqx.Module):
             own, other = own[keep], other[keep]
             gap = np.maximum(low[other] - high_x[own], low_x[own] - high[other])
             squared = np.sum(np.square(np.maximum(gap, 0)), axis=1)
-            is_far = radii[other] ** 2 < opening**2 * squared
+            is_far = (radii[other] ** 2 < opening**2 * squared) & (squared > least**2)
             far.append((own[is_far], begin + other[is_far]))
             own, other = own[~is_far], other[~is_far]
             if level:

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 _TERMS, _SMALL = 8, 0.1  # of the series of the softening near 0
 _NODES, _REACH = 12, 4.0  # of the integral of what is left out, and its end in softening lengths
 _SCALE = 2 / math.sqrt(math.pi)
+SOFTENED = 3.0  # softening lengths, beyond which the kernel is as without
 
 
 class ScreenedKernel(eqx.Module):

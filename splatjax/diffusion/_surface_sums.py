@@ -86,7 +86,12 @@ class SurfaceSums(eqx.Module):
     def potential(
         self, kernel: ScreenedKernel, charges: Float[Array, " splats"], places: Planes
     ) -> Float[Array, " splats"]:
-        """Compute `sum_j q_j G` of charges below the splats, for a kernel of one channel."""
+        """Compute `sum_j q_j G` of charges below the splats, for a kernel of one channel, 1/mm.
+
+        **Arguments:**
+
+        - `places`: of the charges, mm.
+        """
 
         def near(x, sources):
             charges, y = sources
@@ -98,8 +103,10 @@ class SurfaceSums(eqx.Module):
             totals, y, moments = sources
             offset = _offset(x, y)
             trace, along = _second_moments(moments, offset)
-            ((value, once, twice),) = kernel.far(dot(offset, offset))
-            return jnp.sum(totals * (value + along * twice - trace * once), axis=1)
+            # In thin parts light scatters nearer to the far side than its splats are: the trace,
+            # added to the squared distance, keeps sums finite and positive.
+            ((value, _, twice),) = kernel.far(dot(offset, offset) + 2 * trace)
+            return jnp.sum(totals * (value + along * twice), axis=1)
 
         merged = cluster_totals(charges), *clusters(places, charges)
         return self.hierarchy.near.reduce(
