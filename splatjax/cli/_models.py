@@ -18,7 +18,12 @@ _BEYOND = sj.fitting.TransportModel.rule
 
 
 def model_by_name(model: Model | None, g: float) -> sj.fitting.AbstractModel:
-    """Return the model of a half space that an option names; light transport unless given."""
+    """Return the model of a half space that an option names; light transport unless given.
+
+    **Raises:** `ValueError` for a mean cosine that the model does not take.
+    """
+    if g and model in ("dipole", "better-dipole"):
+        raise ValueError(f"--model {model} with --g {g} is not possible; take photon-beam")
     if model == "better-dipole":
         return sj.fitting.DiffusionModel(sj.scattering.BetterDipole)
     return sj.fitting.DiffusionModel() if model == "dipole" else sj.fitting.TransportModel(g)

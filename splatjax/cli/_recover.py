@@ -105,10 +105,11 @@ class Recover:
                 "g": (abs(self.g) <= 0.95, "lie between -0.95 and 0.95"),
             },
         )
+        model_by_name(self.model, self.g)  # reports faults before the pictures are read
         if not self.start:
             raise ValueError("--start names no material; give one or more (`splatjax materials`)")
         for name in self.start:
-            sj.load_medium(name)  # reports faults before the pictures are read
+            sj.load_medium(name)
         with stage(f"reading {self.splats} and {self.pictures}"):
             observations = sj.io.read_observations(self.pictures)
             splats = sj.read_splats(self.splats)
