@@ -187,11 +187,10 @@ class ViewOptions:
         if material.channels == 1:  # the same weights for red, green and blue
             weights = jnp.tile(material.gaussians.weights, 3)
             gaussians = sj.SumOfGaussians(material.gaussians.variances, weights)
-            terms = material.single_scattering, material.medium
-            single, medium = jax.tree.map(lambda leaf: jnp.tile(leaf, 3), terms)
-            material = replace(
-                material, gaussians=gaussians, single_scattering=single, medium=medium
-            )
+            names = "single_scattering", "angles", "medium"
+            terms = {name: getattr(material, name) for name in names}
+            terms = jax.tree.map(lambda leaf: jnp.tile(leaf, 3), terms)
+            material = replace(material, gaussians=gaussians, **terms)
         return material if self.scattering else material.opaque()
 
     def adjusted(self, splats: sj.Splats) -> sj.Splats:
