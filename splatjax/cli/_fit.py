@@ -188,10 +188,9 @@ class Fit:
                     f"{counted(self.count, 'Gaussian')} apart: give a smaller --count"
                 )
         else:
-            g = self.g
-            if g is None:  # the reduced coefficients are all that a dipole knows
-                knows = self.model not in ("dipole", "better-dipole")
-                g = sj.io.load_mean_cosine(self.medium) if knows else 0.0
+            # The reduced coefficients are all that a dipole knows.
+            knows = self.g is not None or self.model not in ("dipole", "better-dipole")
+            g = self._mean_cosine() if knows else 0.0
             target = reference(coefficients, self.model, self.photons, g, self.single_scattering)
         fitted = self._fitted(target)
         print_fit(fitted, target)
@@ -305,4 +304,8 @@ class Fit:
                 "error": fitted.error,
                 "energy_error": fitted.energy_error,
             },
+            g=self._mean_cosine() if isinstance(known, sj.Dipole) else 0.0,
         )
+
+    def _mean_cosine(self) -> float:
+        return sj.io.load_mean_cosine(self.medium) if self.g is None else self.g

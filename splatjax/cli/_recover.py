@@ -235,4 +235,5 @@ class Recover:
                 "variances_of": "all channels",
                 "weights_of": "non-negative, sum held to the total reflectance",
             },
+            g=self.g,
         )

@@ -180,6 +180,7 @@ def save_material(
     profile: AbstractProfile | None = None,
     source: Mapping[str, Any] | None = None,
     fit: Mapping[str, Any] | None = None,
+    g: float = 0.0,
 ) -> None:
     r"""Write a material to a TOML file, whole or not at all.
 
@@ -192,6 +193,7 @@ def save_material(
       material's `medium`, and in [fit] what it is.
     - `source`: where the numbers come from: `citation`, `provenance`, ...
     - `fit`: more to be kept in [fit]: `error`, `energy_error`, ...
+    - `g`: mean cosine of the phase function, kept in [medium].
 
     **Raises:** `OSError` if the file cannot be written, `ValueError` for another kind of profile.
     """
@@ -207,6 +209,8 @@ def save_material(
         tables["medium"] = plain_medium(profile.medium)
     elif material.medium is not None:
         tables["medium"] = plain_medium(material.medium)
+    if g and "medium" in tables:
+        tables["medium"]["g"] = g
     single, gaussians = material.single_scattering, material.gaussians
     if single is not None:
         tables["single_scattering"] = {

@@ -140,8 +140,9 @@ def test_a_saved_material_comes_back_bit_for_bit(tmp_path, model):
     medium = profile.medium if isinstance(profile, Dipole) else None
     material = Material(gaussians, 1.37, 0.1, 1.0, single_scattering=once, medium=medium)
     source, fit = {"citation": 'Me, "2024"'}, {"error": [0.1, 0.2], "count": 2}
-    save_material(material, path, profile=profile, source=source, fit=fit)
+    save_material(material, path, profile=profile, source=source, fit=fit, g=0.75)
     assert eqx.tree_equal((load_material(path), load_profile(path)), (material, profile))
+    assert load_mean_cosine(path) == (0.0 if medium is None else 0.75)
     assert f'profile = "{model}, exact Fresnel moments"' in path.read_text()
 
 
