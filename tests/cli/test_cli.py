@@ -105,6 +105,14 @@ def test_color_is_of_the_albedo_or_of_the_material(albedo, tmp_path, capsys):
     assert ("--no-albedo" in capsys.readouterr().err) == albedo
 
 
+def test_a_material_of_one_channel_has_three(tmp_path):
+    marble, path = sj.load_material("marble"), tmp_path / "gray.toml"
+    gray = jax.tree.map(lambda leaf: leaf[..., :1] if leaf.shape[-1:] == (3,) else leaf, marble)
+    sj.save_material(gray, path)
+    _, material = Render(splats=plate(tmp_path / "plate.ply"), material=str(path)).load()
+    assert material.channels == material.angles.channels == material.medium.channels == 3
+
+
 @pytest.mark.slow
 @pytest.mark.once
 @pytest.mark.long

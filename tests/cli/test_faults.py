@@ -110,6 +110,8 @@ REFUSED = {
     "fit skin1 --single-scattering --model dipole": ["--single-scattering", "dipole"],
     "fit skin1 --g 0.8 --model dipole": ["--g 0.8", "dipole"],
     "fit skin1 --g 1": ["--g", "1"],
+    "fit media.csv --all --output fits.csv --g 0.8 --model dipole": ["--g 0.8", "dipole"],
+    "recover plate.ply missing.toml --output mine.toml --g 0.8 --model dipole": ["--g 0.8"],
     "fit skin_layers --single-scattering --model monte-carlo": ["--single-scattering", "layers"],
     "fit skin_layers --model photon-beam": ["photon-beam", "layers"],
 }
