@@ -42,7 +42,7 @@ class Interactions(eqx.Module):
         blocks: int,
         block: int,
     ) -> "Interactions":
-        """Sort pairs into rows; `blocks` counts those of points."""
+        """Sort pairs of blocks into rows; `blocks` is the number of blocks of points."""
         order, width = np.argsort(points, kind="stable"), _WIDTH // block
         points, sources = points[order], sources[order]
         lengths = np.bincount(points, minlength=blocks)
@@ -100,7 +100,8 @@ class Hierarchy(eqx.Module):
         opening: float,
         least: float,
     ) -> "Hierarchy":
-        """Find them. Not for traced arrays.
+        """Find the splats and the clusters that every block of splats sums over. Not for traced
+        arrays.
 
         **Arguments:**
 

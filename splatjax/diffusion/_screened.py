@@ -46,8 +46,8 @@ class ScreenedKernel(eqx.Module):
         return [of_channel(kappa) for kappa in self.kappa]
 
     def far(self, squared_distances: Float[Array, "*pairs"]) -> list[tuple]:
-        """Compute the kernel beyond three lengths, and apply `-1/r d/dr` once and twice, 1/mm^5.
-        Where the distance is 0, all are finite.
+        """Compute the kernel beyond three lengths, 1/mm, and apply `-1/r d/dr` once, 1/mm^3, and
+        twice, 1/mm^5. Where the distance is 0, all are finite.
         """
         inverse = jax.lax.rsqrt(jnp.where(squared_distances > 0, squared_distances, 1.0))
         distance, squared = squared_distances * inverse, inverse * inverse
@@ -79,7 +79,12 @@ class ScreenedKernel(eqx.Module):
         return ratio / self.length, fall / self.length**3
 
     def plane_integral(self, height: Float[Array, "channels *points"]) -> Float[Array, "..."]:
-        """Integrate what the softening leaves out over a plane at this height, mm."""
+        """Integrate what the softening leaves out over a plane, mm.
+
+        **Arguments:**
+
+        - `height`: of the point over the plane, mm.
+        """
         nodes, weights = np.polynomial.legendre.leggauss(_NODES)
         kappa = self.kappa.reshape(-1, *[1] * (height.ndim - 1))
         end, total = _REACH * self.length, jnp.zeros_like(height)

@@ -196,6 +196,6 @@ class ShapePlan(AbstractDiffusionPlan):
 
     def diffuse(self, sources, variances, kernel, combination, at=None):
         raise ValueError(
-            "ShapeDiffuser solves for the light of a scene, without derivatives by Gaussians; "
-            "render with ClusterDiffuser"
+            "ShapeDiffuser solves for the lights of a scene, not for a given irradiance, nor for "
+            "derivatives by Gaussians; render with ClusterDiffuser"
         )
