@@ -129,11 +129,10 @@ class HalfSpace(eqx.Module):
         color, mean_free_path, eta, g = jnp.broadcast_arrays(*given)
         check_values("color", color, "between 0.001 and 1", lambda x: (x >= 1e-3) & (x <= 1))
         check_values("mean_free_path", mean_free_path, "positive (mm)", lambda x: x > 0)
-        albedo = 1 - _similarity_of_color(color, eta, g) ** 2
-        # From the reduced albedo to that of the medium as it is.
-        scattered = albedo / (1 - g + g * albedo)
-        sigma_s_prime = (1 - g) * scattered / mean_free_path
-        return cls(Medium((1 - scattered) / mean_free_path, sigma_s_prime, eta), g)
+        absorbed = _similarity_of_color(color, eta, g) ** 2  # 1 - albedo'
+        # From the reduced albedo to that of the medium as it is, without a difference that rounds.
+        per_mm = (1 - g) / (1 - g * absorbed) / mean_free_path
+        return cls(Medium(per_mm * absorbed, per_mm * (1 - absorbed), eta), g)
 
     @staticmethod
     def cosines() -> Float[np.ndarray, " angles"]:

@@ -42,6 +42,11 @@ def test_a_color_comes_back(eta, g, float64):
     np.testing.assert_allclose(sigma_t, 2.0, rtol=1e-9)
 
 
+def test_white_absorbs_nothing_in_single_precision():
+    found = HalfSpace.of_color(np.ones(64), 1.0, np.linspace(1, 2, 64), np.linspace(-0.9, 0.9, 64))
+    assert np.all(found.medium.sigma_a < 1e-4)
+
+
 def test_colors_are_those_of_openpbr(float64):
     """Where indices match, up to the error of its formula (OpenPBR 1.1, "Subsurface")."""
     color = np.asarray([0.05, 0.2, 0.5, 0.8, 0.98])
