@@ -132,8 +132,8 @@ BODIES = [
     ),
 ]
 EVEN = 1.0
-"""Full coverage of splats as evenly spread as these; outlines then lie within 0.2 pixels of the
-truth, with the default 0.7.
+"""Full coverage of splats as evenly spread as these, whose discs then hardly reach beyond the
+outline.
 """
 
 PAGE = Path(__file__).parents[1] / "docs" / "bodies.md"

@@ -24,25 +24,43 @@ from splatjax.io import linear_to_srgb
 
 FOLDER = Path(__file__).resolve().parents[1] / "out" / "gallery"
 HELD = sj.fitting.NonNegativeWeights(sj.fitting.FixedTotalReflectance())
-WARM, BLUE = (1.0, 0.97, 0.92), (0.8, 0.9, 1.0)
 
 
-def sun(x, y, z, strength=1.0, tint=(1.0, 1.0, 1.0), cast_shadows=True) -> sj.DirectionalLight:
+STUDIO = sj.scene.studio()
+
+
+def dim(strength, image=STUDIO) -> sj.EnvironmentLight:
+    """Return a studio, or another environment, of some strength."""
+    return sj.EnvironmentLight(image, strength=strength)
+
+
+def sun(x, y, z, strength=1.0, tint=(1.0, 1.0, 1.0)) -> sj.DirectionalLight:
     """Return a light that comes from a direction; of strength 1 it shows a white diffuser with
     radiance 1.
     """
     irradiance = jnp.asarray(tint, float) * (strength * jnp.pi)
     towards = -jnp.asarray([x, y, z], float)
-    return sj.DirectionalLight(towards, irradiance, cast_shadows=cast_shadows)
-
-
-fill = partial(sun, cast_shadows=False)
+    return sj.DirectionalLight(towards, irradiance)
 
 
 def fitted(profile: sj.gaussians.AbstractProfile, eta: float, specular: float, roughness: float):
     """Return a material whose Gaussians are fitted to a profile."""
     gaussians = sj.fit_gaussians(profile, 6, weights=HELD).gaussians
     return sj.Material(gaussians, eta=eta, specular=specular, roughness=roughness)
+
+
+def transported(medium: sj.Medium, specular: float, roughness: float) -> sj.Material:
+    """Return a material fitted to light transport, as `splatjax fit` makes it."""
+    model = sj.fitting.TransportModel()
+    with jax.enable_x64(True):
+        medium = jax.tree.map(lambda leaf: leaf.astype(jnp.float64), medium)
+        profile, angles = model.profile(medium), model.angles(medium)
+        gaussians = sj.fit_gaussians(profile, 6, weights=HELD, rule=model.rule).gaussians
+        eta = medium.eta[0]
+        made = sj.Material(
+            gaussians, eta=eta, specular=specular, roughness=roughness, angles=angles
+        )
+    return jax.tree.map(lambda leaf: leaf.astype(jnp.float32), made)
 
 
 def medium(sigma_a, sigma_s_prime, eta: float) -> sj.Medium:
@@ -110,13 +128,8 @@ def marble_bust(_: sj.Splats, side: int) -> np.ndarray:
     """The bust in marble's own color, without its map."""
     bust = sj.bust(250_000)
     plain = sj.Splats(bust.centers, bust.normals, bust.radii, bust.areas)
-    lights = (
-        sun(-0.8, 0.7, 0.6, 1.1, (1.0, 0.96, 0.9)),
-        sun(0.9, 0.2, -0.7, 0.7, (0.75, 0.86, 1.0)),
-        fill(0.5, 0, 1, 0.08),
-    )
     marble = sj.load_material("marble")
-    return picture(plain, lights, marble, (230, 20, 640), (0, -40, 0), 30.0, side, 0.2)
+    return picture(plain, [dim(1.0)], marble, (230, 20, 640), (0, -40, 0), 30.0, side, -0.3)
 
 
 def milk_glass(_: sj.Splats, side: int) -> np.ndarray:
@@ -132,9 +145,9 @@ def milk_glass(_: sj.Splats, side: int) -> np.ndarray:
     angle = np.arctan2(vertices[:, 0], vertices[:, 2])
     vertices[:, [0, 2]] *= (1 + 0.03 * np.cos(14 * angle))[:, None]
     glass = medium([0.0015, 0.002, 0.0028], [1.6, 1.9, 2.3], 1.5)
-    opal = fitted(sj.scattering.BetterDipole(glass), 1.5, 1.0, 0.07)
+    opal = transported(glass, 1.0, 0.07)
     lamp = sj.PointLight(jnp.asarray([0.0, 60.0, 0.0]), jnp.asarray([7000.0, 4000.0, 1800.0]))
-    lights = lamp, sun(-0.9, 0.6, 0.5, 0.45, (0.75, 0.88, 1.0)), fill(0.6, 0.1, 0.8, 0.04)
+    lights = lamp, dim([0.3, 0.36, 0.42])
     splats = covered(vertices, faces, 300_000)
     return picture(splats, lights, opal, (70, 130, 330), (0, 56, 0), 24.0, side)
 
@@ -166,8 +179,8 @@ def jade(_: sj.Splats, side: int) -> np.ndarray:
     material = fitted(sj.LayeredMultipole([crust, stone]), 1.6, 0.9, 0.12)
     lights = (
         sun(0.5, 0.5, -1.0, 3.0, (1.0, 0.95, 0.85)),
-        sun(-0.9, 0.8, 0.5, 0.8),
-        fill(0.7, -0.4, 1, 0.06),
+        sun(-0.9, 0.8, 0.5, 0.7),
+        dim(0.12),
     )
     splats = covered(vertices, faces[:, ::-1], 400_000)
     return picture(splats, lights, material, (-60, 40, 230), (0, 0, 0), 25.0, side, 0.2)
@@ -182,10 +195,9 @@ def wax(_: sj.Splats, side: int) -> np.ndarray:
     rim = sum(height * np.sin(number * angle + phase) for height, number, phase in waves)
     vertices[:, 1] += np.clip((vertices[:, 1] - 50) / 30, 0, 1) * rim
     candle = medium([0.0006, 0.0022, 0.009], [0.9, 1.0, 1.15], 1.44)
-    paraffin = fitted(sj.scattering.BetterDipole(candle), 1.44, 0.6, 0.2)
+    paraffin = transported(candle, 0.6, 0.2)
     flame = sj.PointLight(jnp.asarray([0.0, 69.0, 0.0]), jnp.asarray([5200.0, 3400.0, 1700.0]))
-    dusk = (0.6, 0.75, 1.0)
-    lights = flame, sun(-0.8, 0.5, -0.9, 0.25, dusk), sun(0.8, 0.5, 0.8, 0.05, dusk)
+    lights = flame, dim([0.06, 0.075, 0.1])
     splats = covered(vertices, faces, 300_000)
     return picture(splats, lights, paraffin, (60, 92, 260), (0, 42, 0), 23.0, side, 0.3)
 
@@ -232,22 +244,15 @@ def inverse(_: sj.Splats, side: int) -> np.ndarray:
     return np.concatenate(shown, axis=1)
 
 
-FAR = partial(
-    skin,
-    eye=(1.1, 0.1, 2.4),
-    lights=(sun(-0.9, 0.7, 0.9, 1.0, WARM), sun(1.0, 0.1, -0.3, 0.5, BLUE), fill(0.8, 0, 1, 0.06)),
-)
+KEY = sun(-0.95, 0.55, 0.75, 0.8, (1.0, 0.97, 0.92)), dim(0.3)
+FAR = partial(skin, eye=(1.1, 0.1, 2.4), lights=KEY)
 FACE = partial(
     skin,
     eye=(0.62, 0.02, 2.1),
     target=(0.07, -0.07, -0.08),
     fov=10.0,
     exposure=0.5,
-    lights=(
-        sun(-0.95, 0.55, 0.75, 1.0, WARM),
-        sun(1.0, 0.15, -0.45, 0.7, BLUE),
-        fill(0.8, 0, 1, 0.05),
-    ),
+    lights=KEY,
 )
 EAR = partial(
     skin,
@@ -255,11 +260,7 @@ EAR = partial(
     target=(0.305, -0.02, -0.46),
     fov=7.6,
     exposure=0.3,
-    lights=(
-        sun(0.22, 0.25, -1.0, 3.0, (1.0, 0.95, 0.88)),
-        sun(-0.5, 0.4, 1.0, 0.3, BLUE),
-        fill(1, 0.1, 0.7, 0.11),
-    ),
+    lights=(sun(0.22, 0.25, -1.0, 3.0, (1.0, 0.95, 0.88)), dim(0.2)),
 )
 PICTURES: dict[str, Callable[[sj.Splats, int], np.ndarray]] = {
     "skin_far": partial(FAR, target=(0, 0, -0.3), fov=21.0),

@@ -13,8 +13,9 @@ def solve(
     product: Callable, right: Float[Array, "systems unknowns"], error: float
 ) -> Float[Array, "systems unknowns"]:
     """Solve independent systems of linear equations until every residual is at most `error` times
-    the right side, root mean squares compared, or for 24 products. Differentiable by the implicit
-    function theorem.
+    the right side, root mean squares compared. Differentiable by the implicit function theorem.
+
+    **Returns:** the unknowns; NaN in a system that 24 products do not solve.
 
     **Source:** Saad and Schultz 1986, "GMRES".
     """
@@ -56,5 +57,6 @@ def _gmres(product, right, error):
 
     begin = jnp.int32(0), basis, hessenberg, jnp.max(start)
     _, basis, hessenberg, _ = jax.lax.while_loop(is_wanted, step, begin)
-    shares, _ = fit(hessenberg)
+    shares, left = fit(hessenberg)
+    shares = jnp.where((left <= error)[:, None], shares, jnp.nan)
     return scale[:, None] * jnp.einsum("msu,sm->su", basis[:-1], shares)

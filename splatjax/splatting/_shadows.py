@@ -23,7 +23,7 @@ from ._surfaces import Surface
 from ._views import AbstractView, SplattingSettings
 
 # Times the weight sum from which on a surface covers a pixel of a picture: discs extend beyond an
-# open edge, and its shadow less.
+# open edge, and its shadow less. A sum of 1 always does: evenly spread splats exceed it.
 _LESS_COVERED = 2.0
 _NEAR = 1e-2  # mm: nearer, a splat is so large in pixels that float32 overflows
 
@@ -194,7 +194,7 @@ class ShadowMap(eqx.Module):
     ) -> "ShadowMap":
         """Blend the sums of all parts."""
         surface = Surface.of(sums.sums, view, sums.needed)
-        covered = coverage(sums.sums.weights, _LESS_COVERED * settings.full_coverage)
+        covered = coverage(sums.sums.weights, min(_LESS_COVERED * settings.full_coverage, 1.0))
         of_places = jnp.stack([surface.depth, covered])
         empty = jnp.zeros((2, TileGrid(view.width, view.height).count, TILE_SIDE**2), covered.dtype)
         planes = [
