@@ -57,9 +57,9 @@ def plan_for(view, body, rasterizer=TileRasterizer(lanes=8, slots=16)):
 
 
 @eqx.filter_jit
-def visibility(body, view, plan, settings=SETTINGS):
+def visibility(body, view, plan, settings=SETTINGS, splatting=SPLATTING):
     """Compute how much of the light each splat gets; NaN where the plan's capacity is exceeded."""
-    shadow_map = make_shadow_map(body, view, SPLATTING, plan, OneDevice())
+    shadow_map = make_shadow_map(body, view, splatting, plan, OneDevice())
     return compute_visibility(body, shadow_map, settings)
 
 
@@ -138,11 +138,12 @@ def test_each_surface_blocks_what_reaches_it():
 
 
 @pytest.mark.once
-@pytest.mark.parametrize("kind", LIGHTS)
-def test_umbra_is_dark_and_the_rest_is_lit(kind):
+@pytest.mark.parametrize(("kind", "full"), [("distant", 0.15), ("distant", 1.0), ("near", 0.15)])
+def test_umbra_is_dark_and_the_rest_is_lit(kind, full):
     body, floor = scene()
-    view = LIGHTS[kind](bounds_of(body))
-    visible = np.asarray(visibility(body, view, plan_for(view, body)))
+    view, splatting = LIGHTS[kind](bounds_of(body)), SplattingSettings(full_coverage=full)
+    plan = TileRasterizer(lanes=8, slots=16).make_plan([body], [view], splatting)
+    visible = np.asarray(visibility(body, view, plan, splatting=splatting))
     middle, radius = np.asarray([0.3, 0.1]) * HEIGHT, RADIUS
     if kind == "near":
         eye = np.asarray(view.position, float)
