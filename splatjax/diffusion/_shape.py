@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from splatjax._chunking import take_points
+from splatjax._records import check_values
 from splatjax.gaussians import SumOfGaussians
 from splatjax.scattering import Medium
 from splatjax.scene import Material, Splats
@@ -58,6 +59,11 @@ class ShapeDiffuser(AbstractDiffuser):
 
     error: float = eqx.field(static=True, default=1e-4)
     opening: float = eqx.field(static=True, default=0.5)
+
+    def __check_init__(self):
+        check_values("ShapeDiffuser.error", self.error, "positive", lambda x: x > 0)
+        between = "between 0 and 1", lambda x: (x >= 0) & (x <= 1)
+        check_values("ShapeDiffuser.opening", self.opening, *between)
 
     def radiant_exitance(
         self, splats: Splats, medium: Medium, beams: Beams, hierarchy: Hierarchy | None = None

@@ -204,6 +204,9 @@ def test_refused_bodies_and_materials(sphere):
     turned = dataclasses.replace(sphere, normals=-sphere.normals)
     with pytest.raises(ValueError, match="turn them around"):
         ShapeDiffuser().find_hierarchy(turned)
+    for name, value in (("error", 0.0), ("opening", -0.5)):
+        with pytest.raises(ValueError, match=f"ShapeDiffuser.{name} must be .*{value:g}"):
+            ShapeDiffuser(**{name: value})
 
 
 @pytest.mark.long
