@@ -79,7 +79,6 @@ FROM_SPHERE = (0, 0, 80), (0, 0, 0), 18, 150_000
 FROM_SHEET = (30, 20, 80), (0, 0, -1), 30, 150_000
 FROM_HEAD = (250, 100, 800), (0, 70, 0), 19, 683_549
 STUDIO = sj.EnvironmentLight(sj.scene.studio())
-SOFTBOX = sj.scene.RectangleLight.facing
 BODIES = [
     Body("sphere", f"{SPHERE}, lit from the side", sphere, lamp(-1, -1, -1), *FROM_SPHERE),
     Body("sphere_studio", f"{SPHERE} in the studio", sphere, STUDIO, *FROM_SPHERE),
@@ -87,7 +86,7 @@ BODIES = [
         "sphere_softbox",
         f"{SPHERE} beside a square light of 40 x 40",
         sphere,
-        SOFTBOX([35, 35, 35], [0, 0, 0], 40, 40, [10.0] * 3),
+        sj.scene.RectangleLight.facing([35, 35, 35], [0, 0, 0], 40, 40, [10.0] * 3),
         *FROM_SPHERE,
     ),
     Body(
@@ -117,7 +116,7 @@ BODIES = [
         "head_softbox",
         f"{HEAD} beside a square light of 300 x 300",
         head,
-        SOFTBOX([250, 250, 350], [0, 70, 0], 300, 300, [10.0] * 3),
+        sj.scene.RectangleLight.facing([250, 250, 350], [0, 70, 0], 300, 300, [10.0] * 3),
         *FROM_HEAD,
     ),
     Body(
@@ -294,6 +293,7 @@ def main() -> None:
             rows.append(row(body, name, truth, pictures[name], seconds))
             print(rows[-1], flush=True)
         shown.append((truth, pictures))
+        jax.clear_caches()  # the programs of all bodies are more than one process may hold
     draw(shown, folder / "bodies.png")
     if chosen == BODIES:
         before, rest = PAGE.read_text(encoding="utf-8").split(BEGIN)
