@@ -1,6 +1,4 @@
-"""Coefficients in, residuals out: what the least squares solver sees, made of pictures with all
-their layers, which serve many materials.
-"""
+"""From coefficients to residuals, by pictures with all their layers, which serve many materials."""
 
 import math
 from collections.abc import Callable, Sequence
