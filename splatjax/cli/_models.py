@@ -87,17 +87,15 @@ def reference(
     if not single_scattering:
         return Reference(profile, chosen.rule, None, description, chosen.angles(medium))
     assert isinstance(profile, sj.scattering.PhotonBeam)
-    single, angles = _parted(sj.scattering.HalfSpace(medium, g), single_scattering)
+    single, angles = _parted(sj.scattering.HalfSpace(medium, g))
     description = f"{description}, without single scattering"
     return Reference(profile.multiply_scattered(), _BEYOND, single, description, angles)
 
 
 def _parted(
-    half_space: sj.scattering.HalfSpace, single_scattering: bool
-) -> tuple[sj.SingleScattering | None, sj.scattering.AngularLaw]:
+    half_space: sj.scattering.HalfSpace,
+) -> tuple[sj.SingleScattering, sj.scattering.AngularLaw]:
     """Return the single scattering to keep apart, and the angles of the rest."""
-    if not single_scattering:
-        return None, half_space.angular_law()
     single = sj.SingleScattering(half_space.medium)
     cosines = jnp.asarray(half_space.cosines())
     return single, half_space.angular_law(single.directional_albedo(cosines))
@@ -126,8 +124,8 @@ def _walked(
     if is_layered:
         return Reference(profile, _BEYOND, None, description)
     half_space = sj.scattering.HalfSpace(coefficients.medium, g)
-    single, angles = _parted(half_space, single_scattering)
-    if single is None:
-        return Reference(profile, _BEYOND, None, description, angles)
+    if not single_scattering:
+        return Reference(profile, _BEYOND, None, description, half_space.angular_law())
+    single, angles = _parted(half_space)
     description += ", without single scattering"
     return Reference(profile.without(single), _BEYOND, single, description, angles)
