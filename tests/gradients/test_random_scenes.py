@@ -18,7 +18,7 @@ import pytest
 from bodies import unit
 from hypothesis import HealthCheck, Phase, given, settings, strategies as st
 from hypothesis.extra.numpy import arrays
-from worlds import PLAIN, World, named, with_leaf
+from worlds import FAST, PLAIN, World, named, with_leaf
 
 import splatjax as sj
 from splatjax.diffusion import ClusterPlan
@@ -182,7 +182,7 @@ LAYERS = (
 
 @cache
 def loss_and_gradient(shape: Shape):
-    settings = dataclasses.replace(sj.RenderSettings() if shape.fast else PLAIN, shadows=SHADOWS)
+    settings = dataclasses.replace(FAST if shape.fast else PLAIN, shadows=SHADOWS)
     start = typical(shape)
     plan = roomy(sj.make_plan(start.scene, start.camera, settings), shape)
 
