@@ -17,11 +17,12 @@ from splatjax.diffusion import DenseDiffuser
 from splatjax.render import _checks, _devices, _render
 from splatjax.render._checks import check_scene
 from splatjax.scene import AbstractLight, AbstractLightSample
-from splatjax.splatting import DenseRasterizer
+from splatjax.splatting import DenseRasterizer, ShadowSettings
 
 pytestmark = pytest.mark.once
 
 SETTINGS = sj.RenderSettings(diffuser=DenseDiffuser())  # which needs no plan
+SMALL_MAPS = sj.RenderSettings(shadows=ShadowSettings(resolution=64))
 
 
 def scene_under(*lights: AbstractLight, splats: sj.Splats | None = None) -> sj.Scene:
@@ -256,7 +257,7 @@ def test_other_bodies_lights_and_cameras_of_about_one_size_compile_nothing(compi
 
     def render(body: sj.Splats, eye=(66, 4, 140), lights=(lamp(0.5, -0.5, -1.0),), material=skin):
         camera = sj.Camera.look_at(eye, (0, -9, 0), fov=30, width=64, height=64)
-        return sj.render(sj.Scene(body, lights, material), camera).beauty
+        return sj.render(sj.Scene(body, lights, material), camera, SMALL_MAPS).beauty
 
     bust = sj.bust(2_000).scaled(0.2)
     larger, fewer = bust.scaled(1.05), jax.tree.map(lambda leaf: leaf[:1_930], bust)
