@@ -13,16 +13,10 @@ from jaxtyping import Array, Float
 from splatjax._chunking import jit_unless_traced
 from splatjax._records import Numbers, as_floats, check_values, numbers, record, valid
 
-from ._fresnel import reflectance
-from ._medium import Medium
-from ._quadrature import unit_legendre
+from ._doubling import diffuse_albedo, directional_albedo, outside_cosines
+from ._medium import Layer, Medium
 
-_OUTSIDE, _BEYOND = 12, 8  # cosines: refracted, and beyond the critical angle
 ANGULAR_POWERS = 5  # of the law that is fitted
-_MOMENTS = 12  # of the phase function
-_LEAST_COSINE = 1e-4
-_DEPTH = 0.05  # of the first layer, in mean free paths
-_DOUBLINGS = 18
 _HALVINGS = 24  # of the interval in which a similarity parameter lies
 
 
@@ -87,6 +81,8 @@ class HalfSpace(eqx.Module):
 
     - `medium`: its coefficients, [channels]; `eta` at least 1.
     - `g`: mean cosine of the phase function, [channels]; `sigma_s = sigma_s' / (1 - g)`.
+    - `cover`: a layer on the half space, thin or thick, or `None`; its index and mean cosine are
+      taken to be those of the half space.
 
     **Source:** Van de Hulst 1980 (doubling); Prahl, Van Gemert and Welch 1993 (adding the
     surface); Wiscombe 1977 (delta-M).
@@ -98,6 +94,7 @@ class HalfSpace(eqx.Module):
         default=0.0,
         metadata=valid("between -0.95 and 0.95", lambda x: abs(x) <= 0.95),
     )
+    cover: Layer | None = None
 
     def __check_init__(self):
         check_values("HalfSpace.medium.eta", self.medium.eta, "at least 1", lambda x: x >= 1)
@@ -137,7 +134,7 @@ class HalfSpace(eqx.Module):
     @staticmethod
     def cosines() -> Float[np.ndarray, " angles"]:
         """Return the cosines outside, ascending to 1, at which reflectances are computed."""
-        return np.append(unit_legendre(_OUTSIDE)[0] ** 2, 1.0)
+        return outside_cosines()
 
     @jit_unless_traced
     def directional_albedo(self) -> Float[Array, "angles channels"]:
@@ -145,7 +142,9 @@ class HalfSpace(eqx.Module):
         3e-4; in single precision within 6e-3 where nothing is absorbed.
         """
         medium = self.medium
-        fraction = jax.vmap(_directional_albedo)(medium.albedo_prime, medium.eta, self.g)
+        fraction = jax.vmap(directional_albedo)(
+            medium.albedo_prime, medium.eta, self.g, self._cover()
+        )
         return fraction.T
 
     def total_reflectance(self) -> Float[Array, " channels"]:
@@ -158,7 +157,14 @@ class HalfSpace(eqx.Module):
         flat piece sends back in a white furnace, besides the reflection of its surface.
         """
         medium = self.medium
-        return jax.vmap(_color)(medium.albedo_prime, medium.eta, self.g)
+        return jax.vmap(diffuse_albedo)(medium.albedo_prime, medium.eta, self.g, self._cover())
+
+    def _cover(self) -> "tuple[Float[Array, ' channels'], Float[Array, ' channels']] | None":
+        """Return the reduced albedo of the cover and its reduced optical depth."""
+        if self.cover is None:
+            return None
+        medium = self.cover.medium
+        return medium.albedo_prime, medium.sigma_t_prime * self.cover.thickness
 
     @jit_unless_traced
     def angular_law(self, separate: Float[Array, "angles channels"] | None = None) -> AngularLaw:
@@ -188,53 +194,6 @@ class HalfSpace(eqx.Module):
         return AngularLaw(jnp.asarray(exchange, fitted.dtype) @ jnp.concatenate([one, fitted]))
 
 
-def _directional_albedo(
-    albedo_prime: Float[Array, ""], eta: Float[Array, ""], g: Float[Array, ""]
-) -> Float[Array, " angles"]:
-    mu, weights, reflected = _directions(eta)
-    scattering, albedo = _redistribution(mu, weights, albedo_prime, g)
-    even, odd = scattering
-
-    # One layer, with the mean of its two sides in the place of the light within: what enters from
-    # both sides alike is attenuated by `with_even`, the difference by `with_odd`.
-    identity, half_depth = jnp.eye(len(mu), dtype=mu.dtype), 0.5 * _DEPTH / mu[:, None]
-    with_even, with_odd = (
-        jnp.linalg.solve(identity + loss, identity - loss)
-        for loss in (
-            half_depth * (identity - albedo * even),
-            half_depth * (identity - albedo * odd),
-        )
-    )
-    layer = 0.5 * (with_even + with_odd), 0.5 * (with_even - with_odd)
-
-    # Doubling.
-    def double(_, layer):
-        transmitted, reflected = layer
-        between = jnp.linalg.solve(
-            identity - reflected @ reflected,
-            jnp.concatenate([transmitted, reflected @ transmitted], axis=1),
-        )
-        direct, back = jnp.split(between, 2, axis=1)
-        return transmitted @ direct, reflected + transmitted @ back
-
-    _, half_space = jax.lax.fori_loop(0, _DOUBLINGS, double, layer)
-
-    # Adding the surface: by reciprocity, what leaves of light from one direction is what leaves in
-    # that direction of light from all.
-    leaving = jnp.linalg.solve(
-        identity - half_space * reflected[None], half_space @ (1 - reflected)[:, None]
-    )
-    return leaving[: _OUTSIDE + 1, 0]
-
-
-def _color(
-    albedo_prime: Float[Array, ""], eta: Float[Array, ""], g: Float[Array, ""]
-) -> Float[Array, ""]:
-    mu, weights, reflected = (each[: _OUTSIDE + 1] for each in _directions(eta))
-    entering = mu * weights * (1 - reflected)
-    return jnp.vdot(entering, _directional_albedo(albedo_prime, eta, g)) / jnp.sum(entering)
-
-
 @jit_unless_traced
 def _similarity_of_color(
     color: Float[Array, " channels"], eta: Float[Array, " channels"], g: Float[Array, " channels"]
@@ -247,10 +206,10 @@ def _similarity_of_color(
     def solve(color, eta, g):
         def excess(similarity, given):
             color, eta, g, white = given
-            return _color(1 - similarity * similarity, eta, g) / white - color
+            return diffuse_albedo(1 - similarity * similarity, eta, g) / white - color
 
         # White is 1 but for rounding.
-        white = _color(jnp.ones_like(color), eta, g)
+        white = diffuse_albedo(jnp.ones_like(color), eta, g)
         ends = {"lower": jnp.zeros_like(color), "upper": jnp.full_like(color, 1 - 1e-6)}
         given = color, eta, g, white
         found = optx.root_find(
@@ -259,49 +218,3 @@ def _similarity_of_color(
         return found.value
 
     return jax.vmap(solve)(color, eta, g)
-
-
-def _directions(eta: Float[Array, ""]):
-    """Return cosines inside, their weights, and the reflectance of the surface met from inside:
-    refracted ones, of `HalfSpace.cosines`, and those beyond the critical angle.
-    """
-    nodes, node_weights = unit_legendre(_OUTSIDE)
-    outside = jnp.asarray(HalfSpace.cosines(), eta.dtype)
-    outside_weights = jnp.asarray(np.append(2 * nodes * node_weights, 0), eta.dtype)
-    beyond, beyond_weights = (jnp.asarray(each, eta.dtype) for each in unit_legendre(_BEYOND))
-    squared = eta * eta
-    inside = jnp.sqrt(jnp.maximum(squared - 1 + outside * outside, _LEAST_COSINE**2)) / eta
-    is_denser = squared > 1
-    critical = jnp.where(is_denser, jnp.sqrt(jnp.where(is_denser, squared - 1, 1.0)) / eta, 0.0)
-    mu = jnp.concatenate([inside, jnp.maximum(critical * beyond, _LEAST_COSINE)])
-    weights = jnp.concatenate(
-        [outside_weights * outside / (squared * inside), critical * beyond_weights]
-    )
-    reflected = jnp.concatenate(
-        [reflectance(inside, outside, jnp.broadcast_to(eta, inside.shape)), jnp.ones_like(beyond)]
-    )
-    return mu, weights / jnp.sum(weights), reflected
-
-
-def _redistribution(mu, weights, albedo_prime, g):
-    """Return the phase function's even and odd moments, between all cosines and times their
-    weights; and the albedo, the forward peak taken as unscattered.
-    """
-    polynomials = [jnp.ones_like(mu), mu]
-    for n in range(1, _MOMENTS - 1):
-        polynomials.append(((2 * n + 1) * mu * polynomials[n] - n * polynomials[n - 1]) / (n + 1))
-    legendre = jnp.stack(polynomials)
-    peak = g**_MOMENTS
-    powers = jnp.concatenate([jnp.ones(1, mu.dtype), jnp.broadcast_to(g, (_MOMENTS - 1,))])
-    moments = (
-        jnp.asarray(2 * np.arange(_MOMENTS) + 1, mu.dtype)
-        * (jnp.cumprod(powers) - peak)
-        / (1 - peak)
-    )
-    by_moment = legendre * moments[:, None]
-    even, odd = (
-        by_moment[parity::2].T @ (legendre[parity::2] * weights[None]) for parity in (0, 1)
-    )
-    even = even / jnp.sum(even, axis=1, keepdims=True)  # nothing is lost to rounding
-    scattered = albedo_prime * (1 - peak) / (1 - g)
-    return (even, odd), scattered / (scattered + 1 - albedo_prime)
