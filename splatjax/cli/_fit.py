@@ -64,8 +64,8 @@ class Fit:
         tyro.conf.Positional[str],
         tyro.conf.arg(
             help="Name of a material (`splatjax materials`), or path: of a TOML file with a "
-            "[medium] or [[layers]], of a CSV file with radii and a column per channel, or of an "
-            "EXR file with a linear photograph of a laser dot."
+            "[medium], [[layers]] or [skin], of a CSV file with radii and a column per channel, or "
+            "of an EXR file with a linear photograph of a laser dot."
         ),
     ]
     #: Number of Gaussians.
@@ -222,7 +222,9 @@ class Fit:
                 f"or --error {_LARGE}"
             )
 
-    def _coefficients(self) -> sj.Dipole | sj.LayeredMultipole | sj.scattering.Tabulated:
+    def _coefficients(
+        self,
+    ) -> sj.Dipole | sj.LayeredMultipole | sj.scattering.Skin | sj.scattering.Tabulated:
         """Read the input; refuse options that have no effect on its kind."""
         kind = _KINDS.get(Path(self.medium).suffix.lower(), _COEFFICIENTS)
         given = {field.name for field in fields(self) if getattr(self, field.name) != field.default}
@@ -269,7 +271,10 @@ class Fit:
     def _save(
         self,
         output: Path,
-        coefficients: sj.Dipole | sj.LayeredMultipole | sj.scattering.Tabulated,
+        coefficients: sj.Dipole
+        | sj.LayeredMultipole
+        | sj.scattering.Skin
+        | sj.scattering.Tabulated,
         target: Reference,
         fitted: sj.fitting.FitResult,
     ) -> None:
@@ -277,9 +282,10 @@ class Fit:
         surface, source = dict[str, Any](), dict[str, Any]()
         if known is not None:
             # The index of a surface is that of the medium it bounds, unless the file gives it.
-            top = known if isinstance(known, sj.Dipole) else known.top
+            top = known.top if isinstance(known, sj.LayeredMultipole) else known
+            eta = top.eta if isinstance(top, sj.scattering.Skin) else top.medium.eta[0]
             surface, source = sj.io.surface_and_source(self.medium)
-            surface.setdefault("eta", top.medium.eta[0])
+            surface.setdefault("eta", eta)
         fitted_by = (
             f"fitted by splatjax {sj.__version__} to the "
             f"{'profile' if known is None else 'coefficients'} of {self.medium}"

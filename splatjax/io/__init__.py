@@ -30,6 +30,7 @@ from ._materials import (
     save_material as save_material,
     surface_and_source as surface_and_source,
 )
+from ._spectra import spectrum_to_rgb as spectrum_to_rgb
 from ._tables import (
     read_columns as read_columns,
     read_media as read_media,

@@ -25,15 +25,26 @@ from splatjax.scattering import (
     Medium,
     PhotonBeam,
     SingleScattering,
+    Skin,
 )
 from splatjax.scene import Material
 
 from ._files import StrPath, atomic_path, naming
-from ._media import LAYER_ENTRIES, MEDIUM_ENTRIES, layer_of, medium_of, plain_layer, plain_medium
+from ._media import (
+    LAYER_ENTRIES,
+    MEDIUM_ENTRIES,
+    SKIN_ENTRIES,
+    layer_of,
+    medium_of,
+    plain_layer,
+    plain_medium,
+    plain_skin,
+    skin_of,
+)
 from ._tables import Table, nearest, read_toml
 
 VARIANCE_UNIT = "mm^2"
-_TABLES = ("medium", "layers", "surface", "single_scattering", "angles", "source", "fit")
+_TABLES = ("medium", "layers", "skin", "surface", "single_scattering", "angles", "source", "fit")
 _SURFACE = ("eta", "specular", "roughness")
 # What [fit] calls a profile whose coefficients the file holds.
 _MODELS: dict[type, str] = {
@@ -143,7 +154,7 @@ def load_medium(name_or_path: StrPath) -> Medium:
     tables, profile = _read(name_or_path)
     if isinstance(profile, Dipole):
         return profile.medium
-    have = "layers (`load_profile`)" if profile else "Gaussians (`load_material`)"
+    have = "layers or pigments (`load_profile`)" if profile else "Gaussians (`load_material`)"
     raise ValueError(f"{tables.path}: has no [medium]; known are only its {have}")
 
 
@@ -158,15 +169,16 @@ def load_mean_cosine(name_or_path: StrPath) -> float:
     return tables.table("medium", MEDIUM_ENTRIES).number("g", 0.0)
 
 
-def load_profile(name_or_path: StrPath) -> Dipole | LayeredMultipole:
-    r"""Load the coefficients of a material as the profile that its Gaussians stand for.
+def load_profile(name_or_path: StrPath) -> Dipole | LayeredMultipole | Skin:
+    r"""Load the coefficients of a material as the profile that its Gaussians stand for, or its
+    pigments.
 
     **Arguments:**
 
     - `name_or_path`: one of `list_materials()`, or the path of a TOML file.
 
-    **Returns:** the `Dipole` of a [medium], or the `LayeredMultipole` of [[layers]], in JAX's
-    default precision.
+    **Returns:** the `Dipole` of a [medium], the `LayeredMultipole` of [[layers]], or the `Skin` of
+    a [skin], in JAX's default precision.
 
     **Raises:** `ValueError` as `load_medium` does.
     """
@@ -177,7 +189,7 @@ def save_material(
     material: Material,
     path: StrPath,
     *,
-    profile: AbstractProfile | None = None,
+    profile: AbstractProfile | Skin | None = None,
     source: Mapping[str, Any] | None = None,
     fit: Mapping[str, Any] | None = None,
     g: float = 0.0,
@@ -197,13 +209,15 @@ def save_material(
 
     **Raises:** `OSError` if the file cannot be written, `ValueError` for another kind of profile.
     """
-    if not isinstance(profile, Dipole | BetterDipole | PhotonBeam | LayeredMultipole | None):
+    if not isinstance(profile, Dipole | BetterDipole | PhotonBeam | LayeredMultipole | Skin | None):
         raise ValueError(
-            f"profile must be a Dipole, BetterDipole, PhotonBeam or LayeredMultipole, which a file "
-            f"can hold; got {type(profile).__name__}"
+            f"profile must be a Dipole, BetterDipole, PhotonBeam, LayeredMultipole or Skin, "
+            f"which a file can hold; got {type(profile).__name__}"
         )
     tables: dict[str, Any] = {}
-    if isinstance(profile, LayeredMultipole):
+    if isinstance(profile, Skin):
+        tables["skin"] = plain_skin(profile)
+    elif isinstance(profile, LayeredMultipole):
         tables["layers"] = [plain_layer(layer) for layer in profile.layers]
     elif profile is not None:
         tables["medium"] = plain_medium(profile.medium)
@@ -243,7 +257,7 @@ def save_material(
         temporary.write_text(text, encoding="utf-8")
 
 
-def _read(name_or_path: StrPath) -> tuple[Table, Dipole | LayeredMultipole | None]:
+def _read(name_or_path: StrPath) -> tuple[Table, Dipole | LayeredMultipole | Skin | None]:
     """Read and check all tables of a material, and its coefficients."""
     path = material_path(name_or_path)
     tables = Table(
@@ -252,15 +266,19 @@ def _read(name_or_path: StrPath) -> tuple[Table, Dipole | LayeredMultipole | Non
         read_toml(path, "check the path, or name a material (`list_materials()`)"),
         _TABLES,
     )
-    kinds = {"medium", "layers"} & tables.entries.keys()
+    kinds = [kind for kind in ("medium", "layers", "skin") if kind in tables.entries]
     if len(kinds) > 1 or not (kinds or "fit" in tables.entries):
-        has = "both [medium] and [[layers]]" if kinds else "no [medium], [[layers]] or [fit]"
+        has = (
+            " and ".join(f"[{kind}]" for kind in kinds) or "no [medium], [[layers]], [skin], [fit]"
+        )
         raise ValueError(f"{path}: has {has}; a material has one of them")
     _surface(tables)
     if "medium" in kinds:
         return tables, Dipole(medium_of(tables.table("medium", MEDIUM_ENTRIES)))
     if not kinds:
         return tables, None
+    if "skin" in kinds:
+        return tables, skin_of(tables.table("skin", SKIN_ENTRIES))
     layers = [layer_of(each) for each in tables.tables("layers", LAYER_ENTRIES)]
     with naming(f"{path}: [[layers]]"):
         return tables, LayeredMultipole(layers)
@@ -282,7 +300,9 @@ def _surface(tables: Table) -> dict[str, Array]:
     return surface
 
 
-def _description(profile: Dipole | BetterDipole | PhotonBeam | LayeredMultipole) -> str:
+def _description(profile: Dipole | BetterDipole | PhotonBeam | LayeredMultipole | Skin) -> str:
+    if isinstance(profile, Skin):
+        return "photon beams of dermis and epidermis with the total of light transport"
     layers = f" of {len(profile.layers)} layers" if isinstance(profile, LayeredMultipole) else ""
     moments = "exact" if isinstance(profile.fresnel, ExactFresnel) else "fitted"
     return f"{_MODELS[type(profile)]}{layers}, {moments} Fresnel moments"

@@ -1,11 +1,12 @@
-"""The tables [medium] and [[layers]] of materials: optical coefficients, or a color and a mean free
-path.
+"""The tables [medium], [[layers]] and [skin] of materials: optical coefficients, a color and a mean
+free path, or pigments.
 """
 
+from dataclasses import fields
 from typing import Any
 
 from splatjax.exports import plain_numbers
-from splatjax.scattering import Film, HalfSpace, Layer, Medium
+from splatjax.scattering import Film, HalfSpace, Layer, Medium, Skin
 
 from ._tables import Table
 
@@ -18,6 +19,7 @@ _WAYS = (
 )
 MEDIUM_ENTRIES = ("unit", "eta", "sigma_a", "sigma_s_prime", "sigma_s", "g", "color")
 MEDIUM_ENTRIES += ("mean_free_path",)
+SKIN_ENTRIES = tuple(field.name for field in fields(Skin))
 LAYER_ENTRIES = (*MEDIUM_ENTRIES, "optical_depth", "thickness", "thickness_unit")
 
 
@@ -69,3 +71,15 @@ def plain_layer(layer: Layer | Film) -> dict[str, Any]:
         "thickness_unit": THICKNESS_UNIT,
         **plain_medium(layer.medium),
     }
+
+
+def skin_of(table: Table) -> Skin:
+    """Make the skin of a table; what it leaves out has the default of `Skin`."""
+    numbers = {name: table.number(name) for name in table.entries if name != "wavelengths"}
+    if "wavelengths" in table.entries:
+        return table.make(Skin, **numbers, wavelengths=table.numbers("wavelengths"))
+    return table.make(Skin, **numbers)
+
+
+def plain_skin(skin: Skin) -> dict[str, Any]:
+    return {name: plain_numbers(getattr(skin, name)) for name in SKIN_ENTRIES}

@@ -59,6 +59,12 @@ class AngularLaw(eqx.Module):
     def channels(self) -> int:
         return self.coefficients.shape[1]
 
+    def projected(
+        self, total: Float[Array, " channels"], matrix: Float[Array, "channels colors"]
+    ) -> "AngularLaw":
+        """Return the law of sums over the channels, weighted by their total reflectance."""
+        return AngularLaw((self.coefficients * total[None]) @ matrix / (total @ matrix)[None])
+
     def __call__(self, mu: Float[Array, "*points"]) -> Float[Array, "*points channels"]:
         """Compute `e(mu)`; `mu` is the cosine outside, in [0, 1]."""
         value = jnp.zeros((*mu.shape, self.channels), mu.dtype)

@@ -1,0 +1,113 @@
+"""Where spectra become color: white, illuminants, the skin locus, and pictures of spectra."""
+
+import equinox as eqx
+import numpy as np
+import pytest
+from bodies import sphere, view
+
+import splatjax as sj
+from splatjax.io import spectrum_to_rgb
+from splatjax.scattering import Skin
+
+WAVELENGTHS = np.arange(400, 701, 10)
+# Median lightness of each band of ten, and the 5th and 95th percentile of a* and b* under D65: 5500
+# spectra of hands, arms and foreheads in the International Skin Spectra Archive (Lu et al. 2025,
+# Scientific Data, doi 10.1038/s41597-025-04857-5).
+LIGHTNESS = [28.7, 35.5, 46.9, 56.3, 63.1, 70.7]
+LOCUS = {
+    "a": ([4.8, 7.3, 7.9, 6.8, 4.5, 3.7], [7.8, 12.3, 13.9, 14.8, 12.9, 7.5]),
+    "b": ([4.8, 7.6, 14.9, 14.5, 12.0, 10.0], [8.7, 17.3, 22.1, 22.5, 20.5, 15.8]),
+}
+NEAR = 3.5  # the darkest is 3.1 units of b* too yellow; the eye sees a difference of one or two
+SURFACE = (0.4 / 2.4) ** 2  # what an index of 1.4 reflects along the normal
+SIX = [0.02, 0.04, 0.07, 0.11, 0.17, 0.26]  # melanin from light to dark
+
+
+@pytest.mark.parametrize("illuminant", ["D65", "A", "FL11"])
+def test_white_is_white_and_red_is_red(illuminant):
+    matrix = spectrum_to_rgb(WAVELENGTHS, illuminant)
+    np.testing.assert_allclose(np.full(31, 0.3) @ matrix, 0.3, rtol=1e-12)
+    red = (WAVELENGTHS > 600) @ matrix
+    assert red[0] > 0.6 > 0.2 > red[1]
+
+
+def test_colors_are_those_of_colour_science():
+    import colour
+
+    shape = colour.SpectralShape(380, 780, 1)
+    spectrum = colour.SDS_COLOURCHECKERS["ISO 17321-1"]["light skin"]
+    aligned, observer, daylight = (
+        each.copy().align(shape)
+        for each in (
+            spectrum,
+            colour.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"],
+            colour.SDS_ILLUMINANTS["D65"],
+        )
+    )
+    xyz = colour.sd_to_XYZ(aligned, observer, daylight, method="Integration") / 100
+    expected = colour.XYZ_to_sRGB(xyz, apply_cctf_encoding=False)
+    found = spectrum.values @ spectrum_to_rgb(spectrum.wavelengths)
+    np.testing.assert_allclose(found, expected, rtol=5e-3)
+
+
+def test_six_skins_descend_along_the_locus():
+    import colour
+
+    spectra = np.stack([Skin(melanin).half_space().total_reflectance() for melanin in SIX])
+    rgb = (SURFACE + (1 - SURFACE) * spectra) @ spectrum_to_rgb(WAVELENGTHS)
+    assert np.all(np.diff(rgb, axis=0) < 0)
+    assert np.all(np.diff(rgb, axis=1) < 0)  # red above green above blue
+    lab = colour.XYZ_to_Lab(colour.sRGB_to_XYZ(rgb, apply_cctf_decoding=False))
+    for found, bounds in zip(lab.T[1:], LOCUS.values(), strict=True):
+        low, high = (np.interp(lab[:, 0], LIGHTNESS, bound) for bound in bounds)
+        np.testing.assert_allclose(found, np.clip(found, low, high), rtol=0, atol=NEAR)
+
+
+@pytest.mark.once
+def test_a_projected_picture_is_the_picture_of_projected_weights():
+    """Where the kernel has gain 1."""
+    body, matrix = sphere(200), spectrum_to_rgb(WAVELENGTHS)
+    weights = 0.2 * np.random.default_rng(0).random((2, 31))
+    settings = sj.RenderSettings(kernel=sj.diffusion.PlainMean())
+    light = sj.DirectionalLight([-0.5, -0.4, -1.0], 3.0)
+
+    def picture(weights):
+        material = sj.Material(sj.SumOfGaussians([0.5, 9.0], weights), specular=0.0)
+        return np.asarray(sj.render(sj.Scene(body, light, material), view(), settings).beauty)
+
+    many, three = picture(weights), picture(weights @ matrix)
+    assert three.max() > 0.1
+    np.testing.assert_allclose(many @ matrix, three, atol=1e-5)
+
+
+def test_an_unknown_illuminant_is_named():
+    with pytest.raises(ValueError, match="illuminant 'D66' is unknown; known are A, B"):
+        spectrum_to_rgb(WAVELENGTHS, "D66")
+    with pytest.raises(ValueError, match="wavelengths must be positive"):
+        spectrum_to_rgb([500, 450])
+
+
+def test_a_skin_in_a_file_comes_back(tmp_path):
+    path = tmp_path / "skin.toml"
+    path.write_text("[skin]\nmelanin = 0.1\nwavelengths = [450, 550, 650]\n")
+    skin = sj.load_profile(path)
+    assert eqx.tree_equal(skin, Skin(0.1, wavelengths=[450, 550, 650]))
+    material = sj.Material(sj.SumOfGaussians([1.0], [[0.4, 0.2, 0.1]]))
+    sj.save_material(material, tmp_path / "fitted.toml", profile=skin)
+    assert eqx.tree_equal(sj.load_profile(tmp_path / "fitted.toml"), skin)
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("melanin = 2.0", r"\[skin\]: Skin.melanin must be between 0 and 1; got 2"),
+        ("melanine = 0.1", r"\[skin\] has an unknown entry 'melanine'; did you mean 'melanin'"),
+        ("blood = [0.1, 0.2]", r"\[skin\] blood must be one number"),
+    ],
+)
+def test_a_fault_in_a_skin_is_named(tmp_path, line, message):
+    path = tmp_path / "skin.toml"
+    path.write_text(f"[skin]\n{line}\n")
+    with pytest.raises(ValueError, match=message) as raised:
+        sj.load_profile(path)
+    assert str(path) in str(raised.value)
