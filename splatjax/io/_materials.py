@@ -266,10 +266,12 @@ def _read(name_or_path: StrPath) -> tuple[Table, Dipole | LayeredMultipole | Ski
         read_toml(path, "check the path, or name a material (`list_materials()`)"),
         _TABLES,
     )
-    kinds = [kind for kind in ("medium", "layers", "skin") if kind in tables.entries]
+    names = {"medium": "[medium]", "layers": "[[layers]]", "skin": "[skin]"}
+    kinds = [kind for kind in names if kind in tables.entries]
     if len(kinds) > 1 or not (kinds or "fit" in tables.entries):
         has = (
-            " and ".join(f"[{kind}]" for kind in kinds) or "no [medium], [[layers]], [skin], [fit]"
+            " and ".join(names[kind] for kind in kinds)
+            or f"no {', '.join(names.values())} or [fit]"
         )
         raise ValueError(f"{path}: has {has}; a material has one of them")
     _surface(tables)
