@@ -131,9 +131,9 @@ class SkinProfile(AbstractProfile):
     rest, each a photon beam scaled to its total.
 
     The epidermis attenuates the light of the dermis wherever it leaves. Infinite at the origin like
-    1/r. Against Monte Carlo, in rings up to 3 mm: within 5% for light skin, but for 9% in rings
-    that hold 2% of the light; in dark skin, 30% of melanin, within 30% up to 1 mm where more than a
-    fifth of the light leaves the dermis, and there alone.
+    1/r. Against Monte Carlo, light in rings up to 3 mm: within 5% for 0.02 of melanin (9% in rings
+    that hold a hundredth of the light); for 0.3 of melanin at 620 nm within 26% up to 1.5 mm, and
+    up to 60% too large beyond, where a ninth of the light leaves. The total is that of transport.
 
     **Attributes:** (differentiable)
 
