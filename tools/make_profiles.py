@@ -51,7 +51,7 @@ def main(names: list[str]) -> None:
     for name in names or sj.io.list_materials():
         path = profiles_folder() / f"{name}.toml"
         text = path.read_text(encoding="utf-8")
-        if "[medium]" in text or "[[layers]]" in text:
+        if any(table in text for table in ("[medium]", "[[layers]]", "[skin]")):
             write(name, path)
 
 

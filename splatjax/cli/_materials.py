@@ -69,8 +69,8 @@ class Export:
 def _row(name: str) -> tuple[str, ...]:
     material, (_, source) = sj.load_material(name), sj.io.surface_and_source(name)
     try:
-        layered = isinstance(sj.load_profile(name), sj.LayeredMultipole)
-        known = "layers" if layered else "coefficients"
+        kinds = {sj.LayeredMultipole: "layers", sj.scattering.Skin: "pigments"}
+        known = kinds.get(type(sj.load_profile(name)), "coefficients")
     except ValueError:
         known = "Gaussians"
     authors, year = re.findall(r"^(.+?) (\d{4})", source["citation"])[0]

@@ -20,6 +20,7 @@ from splatjax.io import (
     load_profile,
     profiles_folder,
     save_material,
+    spectrum_to_rgb,
 )
 from splatjax.scattering import (
     Dipole,
@@ -28,7 +29,9 @@ from splatjax.scattering import (
     Layer,
     LayeredMultipole,
     Medium,
+    Projected,
     SingleScattering,
+    Skin,
 )
 from splatjax.scene import Material
 
@@ -39,6 +42,7 @@ REPRODUCED = 1e-5
 HELD = 6e-3
 
 FITTED = tuple(name for name in list_materials() if name not in ("skin", "marble_gems"))
+PIGMENTED = "skin_brown", "skin_dark", "skin_light"
 GOOD_MEDIUM = '[medium]\nunit = "1/mm"\nsigma_a = [0.1]\nsigma_s_prime = [1.0]\neta = 1.3\n'
 GOOD_FIT = '[fit]\nunit = "mm^2"\nvariances = [0.1, 2.0]\nweights = [[0.2], [0.3]]\n'
 
@@ -51,9 +55,8 @@ def test_jensens_and_narasimhans_media_and_skin_are_shipped():
     narasimhan = """cappuccino_powder espresso lemon_tea_powder lowfat_chocolate_milk lowfat_milk
         lowfat_soy_milk reduced_milk
         regular_chocolate_milk regular_milk regular_soy_milk shampoo white_grapefruit_juice"""
-    assert list_materials() == tuple(
-        sorted([*jensen.split(), *narasimhan.split(), "marble_gems", "skin", "skin_layers"])
-    )
+    others = ["marble_gems", "skin", "skin_layers", *PIGMENTED]
+    assert list_materials() == tuple(sorted([*jensen.split(), *narasimhan.split(), *others]))
 
 
 def test_coefficients_are_those_published(tmp_path):
@@ -74,8 +77,9 @@ def test_every_material_loads_and_has_its_source(dtype, name):
     published = name == "marble_gems"  # four Gaussians of its green channel
     count = 4 if published else 8 if name in ("cream", "spectralon") else 6
     assert material.gaussians.weights.shape == (count, 1 if published else 3)
-    has_medium = name in FITTED and name != "skin_layers"
-    assert has_medium == (material.medium is not None) == (material.angles is not None)
+    has_angles = name in FITTED and name != "skin_layers"
+    assert has_angles == (material.angles is not None)
+    assert (has_angles and name not in PIGMENTED) == (material.medium is not None)
     assert {leaf.dtype for leaf in jax.tree.leaves(material)} == {jnp.dtype(dtype)}
     text = (profiles_folder() / f"{name}.toml").read_text(encoding="utf-8")
     assert "citation = " in text
@@ -97,6 +101,8 @@ def test_shipped_weights_are_not_negative_and_sum_to_the_total_reflectance(name)
     material, profile = load_material(name), load_profile(name)
     if isinstance(profile, Dipole):
         profile = HalfSpace(profile.medium)
+    elif isinstance(profile, Skin):
+        profile = Projected(profile.profile(), spectrum_to_rgb(profile.wavelengths))
     assert np.all(material.gaussians.weights >= 0)
     total = material.total_reflectance()
     np.testing.assert_allclose(total, profile.total_reflectance(), atol=HELD)
