@@ -104,10 +104,7 @@ class ViewOptions:
                 self.background != "environment" or self.environment_name is not None,
                 "be black or transparent where single lights are given and no --environment",
             ),
-            "bounces": (
-                self.bounces == 0 or (self.bounces > 0 and self.diffusion == "clusters"),
-                "be 0 or more, and 0 with --diffusion shape",
-            ),
+            "bounces": (self.bounces >= 0, "be 0 or more"),
             "diffusion": (
                 self.diffusion == "clusters"
                 or (self.scattering and sj.load_material(self.material).medium is not None),
@@ -158,9 +155,9 @@ class ViewOptions:
 
     @property
     def settings(self) -> sj.RenderSettings:
-        if self.diffusion == "shape":
-            return sj.RenderSettings(diffuser=sj.diffusion.ShapeDiffuser())
-        return sj.RenderSettings(bounces=self.bounces)
+        clusters, shape = sj.diffusion.ClusterDiffuser(), sj.diffusion.ShapeDiffuser()
+        diffuser = shape if self.diffusion == "shape" else clusters
+        return sj.RenderSettings(bounces=self.bounces, diffuser=diffuser)
 
     def load(self) -> tuple[sj.Splats, sj.Material]:
         """Return the splats, and the material with which they are rendered."""

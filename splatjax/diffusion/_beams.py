@@ -26,19 +26,21 @@ class DiffusionCoefficients(eqx.Module):
     - `albedo`: reduced.
     - `squared_kappa`: of the effective transport coefficient, 1/mm^2.
     - `z_e`: extrapolation distance, mm.
+    - `inward`: fluence over the irradiance of even light that enters, where both are in balance.
     """
 
     sigma_t: Float[Array, "*channels"]
     albedo: Float[Array, "*channels"]
     squared_kappa: Float[Array, "*channels"]
     z_e: Float[Array, "*channels"]
+    inward: Float[Array, "*channels"]
 
     @classmethod
     def of(cls, medium: Medium) -> "DiffusionCoefficients":
         fresnel, sigma_t = ExactFresnel(), medium.sigma_t_prime
-        boundary = (1 + fresnel.second_moment(medium.eta)) / (1 - fresnel.first_moment(medium.eta))
-        z_e = _MILNE * boundary / sigma_t
-        return cls(sigma_t, medium.albedo_prime, medium.squared_sigma_tr, z_e)
+        inward = 4 / (1 - fresnel.first_moment(medium.eta))
+        z_e = _MILNE / 4 * (1 + fresnel.second_moment(medium.eta)) * inward / sigma_t
+        return cls(sigma_t, medium.albedo_prime, medium.squared_sigma_tr, z_e, inward)
 
     @property
     def diffusion_coefficient(self):
@@ -66,7 +68,7 @@ def scattered_once(
 
     def lengths(beam):
         irradiance, directions = beam
-        return surface.path_lengths(tuple(directions), irradiance > 0)
+        return surface.first_exits(tuple(directions), irradiance > 0)[0]
 
     length = jax.lax.map(lengths, (irradiance, directions))
     is_through = jnp.isfinite(length)

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PyTree
 
 from splatjax._combination import AbstractCombination
 from splatjax.scene import Material, Splats
@@ -125,7 +125,8 @@ class AbstractDiffusionPlan(eqx.Module):
         kernel: AbstractDiffusionKernel,
         combination: AbstractCombination,
         at: Int[Array, " points"] | None = None,
-    ) -> tuple[Diffused, Beams | None]:
+        bounced: Float[Array, "channels splats"] | None = None,
+    ) -> tuple[Diffused, PyTree]:
         """Evaluate the layers of lit splats: diffuse their irradiance, or solve for the light of
         the beams that enter them.
 
@@ -133,8 +134,10 @@ class AbstractDiffusionPlan(eqx.Module):
 
         - `source`: the irradiance that spreads.
         - `beams`: computes the beams, where a plan needs them.
+        - `bounced`: the part of the source that comes evenly from other parts of the body, and not
+          with the beams.
 
-        **Returns:** the layers, and the beams they were solved for.
+        **Returns:** the layers, and what `towards` needs of a solution on all splats.
         """
         sources = Sources(splats.centers.T, splats.normals.T, splats.areas, source)
         variances = material.gaussians.variances
@@ -146,11 +149,12 @@ class AbstractDiffusionPlan(eqx.Module):
         splats: Splats,
         material: Material,
         layers: LayerValues,
-        beams: Beams | None,
+        solved: PyTree,
+        at: Int[Array, " points"],
     ) -> LayerValues:
         """Return the layers as an eye sees them: unchanged where light leaves evenly.
 
-        **Arguments:** the splats that may be seen, and from `light` their layers and beams.
+        **Arguments:** all splats, and from `light` the layers at `at` and what was solved.
         """
         return layers
 

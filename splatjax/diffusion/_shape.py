@@ -15,7 +15,7 @@ from splatjax.scene import Material, Splats
 
 from ._beams import DiffusionCoefficients, scattered_once
 from ._diffuser import AbstractDiffuser, AbstractDiffusionPlan, Beams, Diffused, LayerValues
-from ._emission import radiance_towards
+from ._emission import SolvedLight, radiance_towards
 from ._hierarchy import Hierarchy, padded_count
 from ._krylov import solve
 from ._screened import SOFTENED, ScreenedKernel
@@ -41,6 +41,8 @@ class ShapeDiffuser(AbstractDiffuser):
     - `z_e = 0.7104 (1 + 3 C2) / (1 - 2 C1) / sigma_t'`, of the internal reflectance.
     - Q is light scattered once along the beams, each as long as its way through the body. A part of
       it leaves before it diffuses: that by which Hopf's function falls short of its limit.
+    - Light `J` that enters again after a bounce comes from all sides, so that the fluence and its
+      slope on the surface are `phi + z_e dphi/dn = 4 J / (1 - 2 C1)`.
 
     The material needs a `Medium`, whose light is solved for; its Gaussians and single scattering do
     not matter. The splats should be spread evenly, and lie at most about a mean free path apart.
@@ -81,7 +83,7 @@ class ShapeDiffuser(AbstractDiffuser):
         hierarchy = self.find_hierarchy(splats) if hierarchy is None else hierarchy
         return self._solve(SurfaceSums.of(splats, hierarchy), medium, beams)[:, : splats.count]
 
-    def _solve(self, surface: SurfaceSums, medium: Medium, beams: Beams):
+    def _solve(self, surface: SurfaceSums, medium: Medium, beams: Beams, bounced=None):
         coefficients, area = DiffusionCoefficients.of(medium), jnp.sum(surface.areas)
         spread = jnp.sqrt(jnp.sum(surface.areas**2) / area)
         # What does not absorb is one kappa's limit: the square of this fraction is left out.
@@ -103,9 +105,18 @@ class ShapeDiffuser(AbstractDiffuser):
         def product(phi):
             return phi + surface.layers(kernel, list(1 / z_e), phi) / diagonal
 
+        if bounced is not None:
+            inward = jnp.pad((coefficients.inward / z_e)[:, None] * bounced, more)
+            unseen = kernel.plane_integral(jnp.zeros_like(inward))
+            single_layer = surface.layers(kernel, [1.0] * len(z_e), inward, dipole=0.0)
+            source = source + single_layer + unseen * inward
         right = jnp.where(exists, source / diagonal, 0.0)
         phi = solve(product, right, self.error)
-        return (coefficients.diffusion_coefficient / z_e)[:, None] * phi + leaving
+        flux = (coefficients.diffusion_coefficient / z_e)[:, None]
+        exitance = flux * phi + leaving
+        if bounced is not None:
+            exitance = exitance + jnp.pad((1 - flux * coefficients.inward[:, None]) * bounced, more)
+        return exitance
 
     def find_hierarchy(self, splats: Splats) -> Hierarchy:
         """Check that the splats bound a body, and find which are near each other. Not for traced
@@ -180,23 +191,24 @@ class ShapePlan(AbstractDiffusionPlan):
         shown = material.surface_of(SumOfGaussians(variances, weights))
         return dataclasses.replace(shown, medium=material.medium)
 
-    def light(self, splats, material, source, beams, kernel, combination, at=None):
+    def light(self, splats, material, source, beams, kernel, combination, at=None, bounced=None):
         medium, entering = material.medium, beams()
         assert medium is not None
         surface = SurfaceSums.of(splats, self.hierarchy)
-        exitance = self.diffuser._solve(surface, medium, entering)
+        exitance = self.diffuser._solve(surface, medium, entering, bounced)
+        solved = SolvedLight.of(surface, medium, exitance, entering, bounced)
         values = jnp.concatenate([exitance, jnp.ones_like(exitance[:1])])
-        slopes = jnp.pad(surface.slopes(exitance), ((0, 1), (0, 0), (0, 0)))
-        rows = values[None, :, : splats.count], slopes[None, ..., : splats.count]
-        layers = LayerValues(*(rows if at is None else (take_points(row, at) for row in rows)))
-        return Diffused(layers, jnp.zeros_like(exitance[0, 0])), entering
+        rows = values[None], jnp.pad(solved.slopes, ((0, 1), (0, 0), (0, 0)))[None]
+        at = jnp.arange(splats.count) if at is None else at
+        layers = LayerValues(*(take_points(row, at) for row in rows))
+        return Diffused(layers, jnp.zeros_like(exitance[0, 0])), solved
 
-    def towards(self, eye, splats, material, layers, beams):
+    def towards(self, eye, splats, material, layers, solved, at):
         """Replace the radiant exitance of splats by that of an even surface as bright as they are
         from the eye.
         """
-        exitance, slopes = layers.values[0, :-1], layers.slopes[0, :-1]
-        seen = radiance_towards(eye, splats, material, exitance, slopes, beams)
+        surface = SurfaceSums.of(splats, self.hierarchy)
+        seen = take_points(radiance_towards(eye, surface, material.medium, solved), at)
         values = jnp.concatenate([seen, layers.values[0, -1:]])
         return LayerValues(values[None], layers.slopes)
 

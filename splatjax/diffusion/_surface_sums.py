@@ -38,8 +38,12 @@ class SurfaceSums(eqx.Module):
         kernel: ScreenedKernel,
         charges: Sequence[Float[Array, ""] | float],
         strengths: Float[Array, "channels splats"],
+        dipole: float = 1.0,
     ) -> Float[Array, "channels splats"]:
-        """Compute `int (c G + dG/dn_y) f dA`, of every channel with its own c, 1/mm."""
+        """Compute `int (c G + d dG/dn_y) f dA`, of every channel with its own c, 1/mm, and d the
+        strength of the dipole.
+        """
+        facing = tuple(dipole * axis for axis in self.normals)
         powers = jnp.unstack(self.areas[None] * strengths)
 
         def near(x, sources):
@@ -75,10 +79,10 @@ class SurfaceSums(eqx.Module):
             dipoles.append(
                 tuple(
                     cluster_totals(strength * (charge * x + n)) - total * center
-                    for x, n, center in zip(self.centers, self.normals, centers, strict=True)
+                    for x, n, center in zip(self.centers, facing, centers, strict=True)
                 )
             )
-        given = powers, self.normals, self.centers
+        given = powers, facing, self.centers
         nearby = self.hierarchy.near.reduce(near, self.centers, given)
         beyond = self.hierarchy.far.reduce(far, self.centers, (totals, dipoles, centers, moments))
         return jnp.stack(nearby) + jnp.stack(beyond)
@@ -113,16 +117,26 @@ class SurfaceSums(eqx.Module):
             near, self.centers, (charges, places)
         ) + self.hierarchy.far.reduce(far, self.centers, merged)
 
-    def path_lengths(
-        self, directions: Planes, is_lit: Bool[Array, " splats"]
-    ) -> Float[Array, " splats"]:
-        """Compute how far a beam goes from each splat to the first one that it leaves the body by,
-        in lengths of its direction: infinite where there is none, 0 without light. Which one is
+    def first_exits(
+        self,
+        directions: Planes,
+        starts: Bool[Array, " splats"],
+        rows: Sequence[Float[Array, " splats"]] = (),
+    ) -> tuple[Float[Array, " splats"], Float[Array, " splats"], list[Float[Array, " splats"]]]:
+        """Follow a ray from each splat to the first one by which it leaves the body. Which one is
         discontinuous.
+
+        **Arguments:**
+
+        - `starts`: where there is a ray.
+        - `rows`: what is read there.
+
+        **Returns:** the length, in lengths of the direction, infinite where there is no exit and 0
+        without a ray; the cosine of the exit; and the rows there.
         """
 
-        def crossing(beam, discs):
-            (x, way), (y, facing) = beam, discs
+        def crossing(ray, discs):
+            (x, way), (y, facing) = ray, discs
             cosine, squared_area = dot(way, facing), dot(facing, facing)
             area = jnp.sqrt(jnp.where(squared_area > 0, squared_area, 1.0))
             is_outward = (cosine > GRAZING * area) & (squared_area > 0)
@@ -130,33 +144,37 @@ class SurfaceSums(eqx.Module):
             t = dot(offset, facing) / jnp.where(is_outward, cosine, 1.0)
             miss = [o - t * w for o, w in zip(offset, way, strict=True)]
             missed = dot(miss, miss) / area
-            return is_outward & (t > 0) & (missed < _OVERLAP**2), t, missed, jnp.sqrt(area)
+            return is_outward & (t > 0) & (missed < _OVERLAP**2), t, missed, area, cosine / area
 
-        def first(beam, discs):
-            is_hit, t, *_ = crossing(beam, discs)
+        def first(ray, discs):
+            is_hit, t, *_ = crossing(ray, discs)
             return jnp.min(jnp.where(is_hit, t, jnp.inf), axis=1)
 
-        def blend(beam, discs):
-            beam, first = beam[:2], beam[2]
-            is_hit, t, missed, size = crossing(beam, discs)
-            is_near = is_hit & (t < first + size)
+        def blend(ray, discs):
+            ray, first, (discs, rows) = ray[:2], ray[2], discs
+            is_hit, t, missed, area, cosine = crossing(ray, discs)
+            is_near = is_hit & (t < first + jnp.sqrt(area))
             weight = jnp.where(is_near, jnp.exp(-6 * jnp.where(is_near, missed, 0.0)), 0.0)
-            return jnp.sum(weight, axis=1), jnp.sum(weight * t, axis=1)
+            return [jnp.sum(weight * row, axis=1) for row in (1.0, t, cosine, *rows)]
 
         facing = tuple(self.areas * axis for axis in self.normals)
         centers, _ = clusters(self.centers, self.areas)
         discs = (self.centers, facing), (centers, tuple(map(cluster_totals, facing)))
-        beams = self.centers, directions
+        total = cluster_totals(self.areas)
+        means = [cluster_totals(self.areas * row) / jnp.where(total > 0, total, 1) for row in rows]
+        rays = self.centers, directions
 
-        def over(function, beams, *combine):
-            parts = zip((self.hierarchy.near, self.hierarchy.far), discs, strict=True)
-            return [part.reduce(function, beams, given, *combine) for part, given in parts]
+        def over(function, rays, given, *combine):
+            parts = zip((self.hierarchy.near, self.hierarchy.far), given, strict=True)
+            return [part.reduce(function, rays, sources, *combine) for part, sources in parts]
 
-        start = jax.lax.stop_gradient(jnp.minimum(*over(first, beams, jax.ops.segment_min)))
-        weight, total = jax.tree.map(jnp.add, *over(blend, (*beams, start)))
-        is_hit = is_lit & (weight > 0)
-        length = total / jnp.where(is_hit, weight, 1.0)
-        return jnp.where(is_hit, length, jnp.where(is_lit, jnp.inf, 0.0))
+        start = jax.lax.stop_gradient(jnp.minimum(*over(first, rays, discs, jax.ops.segment_min)))
+        given = tuple(zip(discs, (list(rows), means), strict=True))
+        weight, *sums = jax.tree.map(jnp.add, *over(blend, (*rays, start), given))
+        is_hit = starts & (weight > 0)
+        length, cosine, *read = (row / jnp.where(is_hit, weight, 1.0) for row in sums)
+        length = jnp.where(is_hit, length, jnp.where(starts, jnp.inf, 0.0))
+        return length, cosine, read
 
     def slopes(self, rows: Float[Array, "rows splats"]) -> Float[Array, "rows 3 splats"]:
         """Fit the slopes of rows along the surface, 1/mm, over about two spacings."""

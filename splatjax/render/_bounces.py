@@ -1,5 +1,7 @@
 """Pass 4 on the splats, and light that leaves the body and enters it again."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
@@ -9,6 +11,7 @@ from splatjax._combination import AbstractCombination
 from splatjax.scene import Scene
 from splatjax.shading import albedo_root, average_transmission, fresnel_f0
 
+from ._beams import beams_at_splats
 from ._lighting import Irradiance, LightVisibility, irradiance_at_splats, surface_parameters
 from ._plan import Plan
 from ._settings import RenderSettings
@@ -29,18 +32,21 @@ def bounced_irradiance(
     plan: Plan,
     combination: AbstractCombination,
     light: LightVisibility,
-) -> tuple[Irradiance, Float[Array, ""]]:
+) -> tuple[Irradiance, Float[Array, "channels splats"] | None, Float[Array, ""]]:
     r"""Compute the light that enters every splat, straight from the lights and after bounces,
 
         E_n = E_0 + t F M(E_(n - 1))
 
     where `M(E)` is the radiant exitance of diffused light, `F M` the irradiance that the body
     receives from itself, and t the fraction of it that enters. Light that scatters once counts as
-    diffused. Also return the capacity needed of pass 4.
+    diffused.
+
+    **Returns:** the light, that part of what spreads that has bounced, and the capacity needed of
+    pass 4.
     """
     direct, none = irradiance_at_splats(scene, light), jnp.zeros_like(light.needed)
     if not settings.bounces:
-        return direct, none
+        return direct, None, none
     sightlines, material = plan.sightlines, scene.material
     if sightlines is None:
         raise ValueError(
@@ -62,11 +68,13 @@ def bounced_irradiance(
     def bounce(so_far, _):
         bounced, needed = so_far
         source = (added * direct.entering + bounced) * root
-        layers, _, bounce_needed = diffuse_splats(scene, source, settings, plan, combination, at)
+        diffused, _ = light_layers(
+            scene, source, bounced * root, light, direct, settings, plan, combination, at
+        )
         weighed, _ = _diffusion.LayersAtPoints.of(
             gaussians.variances,
             plan.diffusion.gaussians,
-            layers.values,
+            diffused.layers.values,
             None,
             source[:, at],
             jnp.where(area > 0, area, 1.0),
@@ -76,13 +84,37 @@ def bounced_irradiance(
         ).weigh(gaussians, material.single_scattering_albedo())
         exitance = root[:, at] * jnp.sum(gaussians.weights[:, :, None] * weighed, axis=0)
         received = sightlines.irradiance(exitance, splats.normals, combination)
-        return (added * enters * received, jnp.maximum(needed, bounce_needed)), None
+        return (added * enters * received, jnp.maximum(needed, diffused.needed)), None
 
     start = jnp.zeros_like(direct.entering), none
     (bounced, needed), _ = jax.lax.scan(bounce, start, None, length=settings.bounces)
     # Where splats carry no albedo, its root is one.
     entering = direct.entering + bounced
-    return Irradiance(entering, entering * root), needed
+    return Irradiance(entering, entering * root), bounced * root, needed
+
+
+def light_layers(
+    scene: Scene,
+    source: Float[Array, "channels splats"],
+    bounced: Float[Array, "channels splats"] | None,
+    light: LightVisibility,
+    direct: Irradiance,
+    settings: RenderSettings,
+    plan: Plan,
+    combination: AbstractCombination,
+    at: Int[Array, " chosen"] | None,
+):
+    """Evaluate the layers of lit splats (pass 4)."""
+    return plan.diffusion.light(
+        scene.splats,
+        scene.material,
+        source,
+        partial(beams_at_splats, scene, light, direct),
+        settings.kernel,
+        combination,
+        at,
+        bounced,
+    )
 
 
 def diffuse_splats(

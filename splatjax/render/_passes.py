@@ -18,8 +18,7 @@ from splatjax._combination import AbstractCombination
 from splatjax.scene import Camera, Scene, stack_lights
 
 from ._attributes import SurfaceAttributes, SurfaceSamples, split_rows, stack_rows
-from ._beams import beams_at_splats
-from ._bounces import bounced_irradiance, diffuse_splats
+from ._bounces import bounced_irradiance, diffuse_splats, light_layers
 from ._lighting import Irradiance, LightVisibility, cast_shadows, irradiance_at_splats
 from ._plan import Plan
 from ._settings import RenderSettings
@@ -53,7 +52,7 @@ class SplatLight(eqx.Module):
     - `added_source`: the derivative of the spreading irradiance in a weight of the Gaussians;
       `None` where it has none. Its own layers follow those of the irradiance, channel by channel.
     - `needed`: capacity needed over planned.
-    - `beams`: the light that enters, where the layers were solved for it; otherwise `None`.
+    - `solved`: of a diffuser that solves for the light of all splats.
     """
 
     visibility: list[Float[Array, "_lights splats"] | None]
@@ -62,11 +61,13 @@ class SplatLight(eqx.Module):
     derivative: _diffusion.LayerValues | None
     added_source: Float[Array, "channels splats"] | None
     needed: Float[Array, ""]
-    beams: _diffusion.Beams | None = None
+    solved: PyTree | None = None
 
     def take(self, chosen: Int[Array, " chosen"]) -> "SplatLight":
         """Return the light of some splats."""
-        return jax.tree.map(lambda leaf: take_points(leaf, chosen) if leaf.ndim else leaf, self)
+        along = dataclasses.replace(self, solved=None)
+        taken = jax.tree.map(lambda leaf: take_points(leaf, chosen) if leaf.ndim else leaf, along)
+        return dataclasses.replace(taken, solved=self.solved)
 
 
 def light_visibility(
@@ -103,8 +104,10 @@ def light_splats(
     - `transfer`: in the place of pass 1.
     """
     light = light_visibility(scene, settings, plan, combination, transfer)
-    irradiance, bounce_needed = bounced_irradiance(scene, settings, plan, combination, light)
-    added, beams, log_variance_derivative = None, None, None
+    irradiance, bounced, bounce_needed = bounced_irradiance(
+        scene, settings, plan, combination, light
+    )
+    added, solved, log_variance_derivative = None, None, None
     if derivative and scene.material.single_scattering is not None:
         irradiance, added = _differentiated_irradiance(scene, light)
     source = irradiance.source if added is None else jnp.concatenate([irradiance.source, added])
@@ -113,23 +116,18 @@ def light_splats(
             scene, source, settings, plan, combination, at, derivative
         )
     else:
-        diffused, beams = plan.diffusion.light(
-            scene.splats,
-            scene.material,
-            source,
-            partial(beams_at_splats, scene, light, irradiance),
-            settings.kernel,
-            combination,
-            at,
+        direct = irradiance if bounced is None else irradiance_at_splats(scene, light)
+        diffused, solved = light_layers(
+            scene, source, bounced, light, direct, settings, plan, combination, at
         )
         layers, needed = diffused.layers, diffused.needed
     needed = jnp.maximum(needed, jnp.maximum(light.needed, bounce_needed))
-    along_splats = light.visibility, irradiance, added, beams
+    along_splats = light.visibility, irradiance, added
     if at is not None:
         along_splats = jax.tree.map(partial(take_points, chosen=at), along_splats)
-    visibility, irradiance, added, beams = along_splats
+    visibility, irradiance, added = along_splats
     derivatives = log_variance_derivative, added
-    return SplatLight(visibility, irradiance, layers, *derivatives, needed, beams)
+    return SplatLight(visibility, irradiance, layers, *derivatives, needed, solved)
 
 
 def make_light_at(
@@ -198,7 +196,7 @@ def see_and_shade(
     splats = scene.splats.take(chosen)
     shown = Scene(splats, scene.lights, scene.material)
     layers = plan.diffusion.towards(
-        camera.position, splats, scene.material, light.layers, light.beams
+        camera.position, scene.splats, scene.material, light.layers, light.solved, chosen
     )
     visibility = LightVisibility(groups, light.visibility, light.needed)
     attributes = settings.lighting.attributes(shown, visibility, light.irradiance, view.position)

@@ -48,11 +48,6 @@ class RenderSettings(eqx.Module):
                 f"bounces is {self.bounces} and lighting is {type(self.lighting).__name__}; light "
                 "bounces between splats alone: give bounces=0, or lighting=LightAtSplats()"
             )
-        if self.bounces and isinstance(self.diffuser, _diffusion.ShapeDiffuser):
-            raise ValueError(
-                f"bounces is {self.bounces} and diffuser is ShapeDiffuser, which has none; give "
-                "bounces=0, or diffuser=ClusterDiffuser()"
-            )
 
     def shadows_of(self, light: AbstractLightSample) -> _splatting.ShadowSettings:
         """Return the settings of the shadow maps of a light or sample."""
