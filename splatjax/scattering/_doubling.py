@@ -67,19 +67,30 @@ def _doubled(mu, weights, albedo_prime, g, optical_depth=None):
             half_depth * (identity - albedo * odd),
         )
     )
-    layer = 0.5 * (with_even + with_odd), 0.5 * (with_even - with_odd)
+    # What it absorbs of even light from both sides, as a sum of positive terms.
+    absorbed = jnp.linalg.solve(
+        identity + half_depth * (identity - albedo * even), 2 * half_depth * (1 - albedo)
+    )
+    layer = 0.5 * (with_even + with_odd), 0.5 * (with_even - with_odd), absorbed
 
-    # Doubling.
+    # Doubling; the rest leaves, whatever rounding makes of it.
     def double(_, layer):
-        transmitted, reflected = layer
+        transmitted, reflected, absorbed = layer
         between = jnp.linalg.solve(
             identity - reflected @ reflected,
-            jnp.concatenate([transmitted, reflected @ transmitted], axis=1),
+            jnp.concatenate(
+                [transmitted, reflected @ transmitted, absorbed + reflected @ absorbed], axis=1
+            ),
         )
-        direct, back = jnp.split(between, 2, axis=1)
-        return transmitted @ direct, reflected + transmitted @ back
+        count = len(identity)
+        direct, back, below = jnp.split(between, [count, 2 * count], axis=1)
+        transmitted, reflected = transmitted @ direct, reflected + transmitted @ back
+        absorbed = absorbed + layer[0] @ below
+        scale = (1 - absorbed) / jnp.sum(transmitted + reflected, axis=1, keepdims=True)
+        return scale * transmitted, scale * reflected, absorbed
 
-    return jax.lax.fori_loop(0, doublings, double, layer)
+    transmitted, reflected, _ = jax.lax.fori_loop(0, doublings, double, layer)
+    return transmitted, reflected
 
 
 def diffuse_albedo(
