@@ -68,7 +68,12 @@ class ShapeDiffuser(AbstractDiffuser):
         check_values("ShapeDiffuser.opening", self.opening, *between)
 
     def radiant_exitance(
-        self, splats: Splats, medium: Medium, beams: Beams, hierarchy: Hierarchy | None = None
+        self,
+        splats: Splats,
+        medium: Medium,
+        beams: Beams,
+        hierarchy: Hierarchy | None = None,
+        bounced: Float[Array, "channels splats"] | None = None,
     ) -> Float[Array, "channels splats"]:
         """Solve for the light that leaves every splat, in the unit of the irradiance; light that
         crosses the body without scattering is left out. Differentiable in everything; which splat
@@ -77,11 +82,13 @@ class ShapeDiffuser(AbstractDiffuser):
         **Arguments:**
 
         - `hierarchy`: from `find_hierarchy`; needed under `jit`.
+        - `bounced`: irradiance of light from all sides that enters beside the beams.
 
         **Raises:** `ValueError` as `find_hierarchy`, where none is given.
         """
         hierarchy = self.find_hierarchy(splats) if hierarchy is None else hierarchy
-        return self._solve(SurfaceSums.of(splats, hierarchy), medium, beams)[:, : splats.count]
+        exitance = self._solve(SurfaceSums.of(splats, hierarchy), medium, beams, bounced)
+        return exitance[:, : splats.count]
 
     def _solve(self, surface: SurfaceSums, medium: Medium, beams: Beams, bounced=None):
         coefficients, area = DiffusionCoefficients.of(medium), jnp.sum(surface.areas)

@@ -197,6 +197,17 @@ def test_every_derivative_is_that_of_differences(float64):
         np.testing.assert_allclose(slope, (ahead - behind) / (2 * step), rtol=1e-6)
 
 
+@pytest.mark.once
+def test_a_white_body_returns_even_light(sphere):
+    none, even = jax.tree.map(jnp.zeros_like, beams(sphere)), jnp.ones((2, SPLATS))
+    diffuser = ShapeDiffuser()
+    given = sphere, medium(np.asarray([1.0, 0.95]), 1.4), none, diffuser.find_hierarchy(sphere)
+    white, dark = np.asarray(eqx.filter_jit(diffuser.radiant_exitance)(*given, even))
+    np.testing.assert_allclose(white, 1, atol=2e-3)
+    assert np.all(dark < 1)
+    assert np.ptp(dark) < 0.01
+
+
 def test_refused_bodies_and_materials(sphere):
     half = jax.tree.map(lambda leaf: leaf[: SPLATS // 2], sphere)
     with pytest.raises(ValueError, match="close the mesh"):
