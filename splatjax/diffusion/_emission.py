@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from splatjax.scattering import Medium
+from splatjax.scene import Material
 
 from ._beams import DiffusionCoefficients
 from ._diffuser import Beams
@@ -15,7 +15,8 @@ from ._surface_sums import GRAZING, SurfaceSums, dot
 _COSINES = 8  # over which a law of angles is averaged
 _BRIGHTEST = 2.0  # times an even surface
 _LONGEST = 60.0  # ray, mean free paths
-_SMALL = 1e-6  # exponent
+_ENDLESS = 1e9  # mm: the length of a ray without an end
+_SMALL = 1e-3  # exponent
 
 
 class SurfaceLight(eqx.Module):
@@ -37,7 +38,7 @@ class SurfaceLight(eqx.Module):
 
     def at_exits(self, surface: SurfaceSums, way: Planes):
         """Follow rays into the body: return the light at their ends, none where they do not end,
-        the cosine of the exit, and the length of the ray, mm.
+        the cosine of the exit, and the length of the ray, mm, finite for its derivative.
         """
         parts = self.fluence, self.flux, self.irradiance, self.entering, self.direction
         length, cosine, read = surface.first_exits(
@@ -46,7 +47,11 @@ class SurfaceLight(eqx.Module):
         ends = jnp.isfinite(length)
         read = jnp.where(ends, jnp.stack(read), 0.0)
         rows = jnp.split(read, np.cumsum([len(part) for part in parts])[:-1])
-        return SurfaceLight(*rows), jnp.where(ends, cosine, 1.0), length
+        return (
+            SurfaceLight(*rows),
+            jnp.where(ends, cosine, 1.0),
+            jnp.where(ends, length, _ENDLESS),
+        )
 
 
 class SolvedLight(eqx.Module):
@@ -69,8 +74,8 @@ class SolvedLight(eqx.Module):
     def of(
         cls,
         surface: SurfaceSums,
-        medium: Medium,
-        exitance: Float[Array, "channels splats"],
+        material: Material,
+        exitance: Float[Array, "channels filled_up"],
         beams: Beams,
         bounced: Float[Array, "channels splats"] | None,
     ) -> "SolvedLight":
@@ -78,7 +83,7 @@ class SolvedLight(eqx.Module):
 
         **Arguments:** as for `AbstractDiffusionPlan.light`.
         """
-        coefficients, normals = DiffusionCoefficients.of(medium), jnp.stack(surface.normals)
+        coefficients, normals = _coefficients(material), jnp.stack(surface.normals)
         more = (0, exitance.shape[1] - beams.irradiance.shape[1])
         directions = jnp.pad(beams.directions, ((0, 0), (0, 0), more))
         fluence = flux = exitance
@@ -98,14 +103,14 @@ class SolvedLight(eqx.Module):
         mean = jnp.zeros_like(exitance)
         for node, weight in zip(nodes, weights, strict=True):
             cosine = (node + 1) / 2
-            mu = _inside(jnp.full_like(thickness, cosine), medium.eta[0])
+            mu = _inside(jnp.full_like(thickness, cosine), material.eta)
             seen = source_integral(light, far, mu, mu, thickness / mu, coefficients)
             mean = mean + weight * cosine * seen
         return cls(exitance, surface.slopes(exitance), light, mean)
 
 
 def radiance_towards(
-    eye: Float[Array, "3"], surface: SurfaceSums, medium: Medium, light: SolvedLight
+    eye: Float[Array, "3"], surface: SurfaceSums, material: Material, light: SolvedLight
 ) -> Float[Array, "channels splats"]:
     r"""Compute `pi` times the radiance of splats towards an eye, but for Fresnel's loss: the source
     integral along the refracted ray `w` to where it leaves the body, over its mean,
@@ -115,10 +120,11 @@ def radiance_towards(
     Along the surface `phi` is a line: what is seen from the lit side is darker than M, what is seen
     from the dark side brighter, by half beyond the terminator of a sphere.
     """
-    coefficients, normals, eta = DiffusionCoefficients.of(medium), surface.normals, medium.eta[0]
+    coefficients, normals, eta = _coefficients(material), surface.normals, material.eta
     to_eye = [e - c for e, c in zip(eye, surface.centers, strict=True)]
-    distance = jnp.sqrt(dot(to_eye, to_eye))
-    to_eye = [axis / distance for axis in to_eye]
+    # What fills up lies at the origin, where an eye may be.
+    squared = jnp.where(surface.areas > 0, dot(to_eye, to_eye), 1.0)
+    to_eye = [axis / jnp.sqrt(squared) for axis in to_eye]
     cosine = jnp.maximum(dot(to_eye, normals), GRAZING)
     along = [(e - cosine * n) / eta for e, n in zip(to_eye, normals, strict=True)]
     mu = _inside(cosine, eta)
@@ -127,7 +133,7 @@ def radiance_towards(
     seen = source_integral(light.surface, far, mu, far_mu, length, coefficients)
     shape = seen / jnp.where(light.mean > 0, light.mean, 1.0)
     shape = jnp.where(light.mean > 0, jnp.clip(shape, 0, _BRIGHTEST), 1.0)
-    optical = jnp.minimum(length * coefficients.sigma_t[:, None], _LONGEST)
+    optical = jnp.minimum(length[None] * coefficients.sigma_t[:, None], _LONGEST)
     slope = jnp.sum(light.slopes * jnp.stack(along)[None], axis=1)
     depth = 0.75 * (coefficients.albedo * coefficients.z_e)[:, None]
     sideways = depth * slope * (1 - (1 + optical) * jnp.exp(-optical))
@@ -153,9 +159,10 @@ def source_integral(
 
     - `near`, `far`: light at the ends.
     - `mu`, `far_mu`: cosines of the ray inside, there.
-    - `length`: of the ray, mm; infinite where it does not end.
+    - `length`: of the ray, mm.
     """
     albedo, z_e = medium.albedo[:, None], (medium.z_e * medium.sigma_t)[:, None]
+    mu, far_mu, length = mu[None], far_mu[None], length[None]
     s = jnp.minimum(length * medium.sigma_t[:, None], _LONGEST)
     bend = 3 * (1 - albedo)
     bend = bend / (1 + bend) * mu * mu  # below 1 for every albedo
@@ -171,10 +178,17 @@ def source_integral(
     near_part, far_part = s - alike * (s - cut), s - alike * cut
     beams = near.irradiance / (entering + mu) * -jnp.expm1(-near_part * (1 + rate))
     exponent = (1 - far_rate) * far_part
-    size = jnp.maximum(jnp.abs(exponent), _SMALL)
-    shape = jnp.exp(jnp.maximum(exponent, 0) - s) * -jnp.expm1(-size) / size
-    beams = beams + far.irradiance / far_entering * far_part * shape
+    size = jnp.abs(exponent)
+    is_small, safe = size < _SMALL, jnp.maximum(size, _SMALL)
+    mean = jnp.where(is_small, 1 - 0.5 * size, -jnp.expm1(-safe) / safe)
+    mean = mean * jnp.exp(jnp.maximum(exponent, 0) - s)
+    beams = beams + far.irradiance / far_entering * far_part * mean
     return diffused + albedo * beams * (1 - 3 * albedo * mu * mu / (1 - bend))
+
+
+def _coefficients(material: Material) -> DiffusionCoefficients:
+    assert material.medium is not None
+    return DiffusionCoefficients.of(material.medium)
 
 
 def _inside(cosine: Float[Array, " splats"], eta: Float[Array, ""]) -> Float[Array, " splats"]:

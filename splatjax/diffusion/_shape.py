@@ -203,7 +203,7 @@ class ShapePlan(AbstractDiffusionPlan):
         assert medium is not None
         surface = SurfaceSums.of(splats, self.hierarchy)
         exitance = self.diffuser._solve(surface, medium, entering, bounced)
-        solved = SolvedLight.of(surface, medium, exitance, entering, bounced)
+        solved = SolvedLight.of(surface, material, exitance, entering, bounced)
         values = jnp.concatenate([exitance, jnp.ones_like(exitance[:1])])
         rows = values[None], jnp.pad(solved.slopes, ((0, 1), (0, 0), (0, 0)))[None]
         at = jnp.arange(splats.count) if at is None else at
@@ -215,7 +215,7 @@ class ShapePlan(AbstractDiffusionPlan):
         from the eye.
         """
         surface = SurfaceSums.of(splats, self.hierarchy)
-        seen = take_points(radiance_towards(eye, surface, material.medium, solved), at)
+        seen = take_points(radiance_towards(eye, surface, material, solved), at)
         values = jnp.concatenate([seen, layers.values[0, -1:]])
         return LayerValues(values[None], layers.slopes)
 

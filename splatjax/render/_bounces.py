@@ -1,6 +1,6 @@
 """Pass 4 on the splats, and light that leaves the body and enters it again."""
 
-from functools import partial
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -11,8 +11,7 @@ from splatjax._combination import AbstractCombination
 from splatjax.scene import Scene
 from splatjax.shading import albedo_root, average_transmission, fresnel_f0
 
-from ._beams import beams_at_splats
-from ._lighting import Irradiance, LightVisibility, irradiance_at_splats, surface_parameters
+from ._lighting import Irradiance, surface_parameters
 from ._plan import Plan
 from ._settings import RenderSettings
 
@@ -31,7 +30,8 @@ def bounced_irradiance(
     settings: RenderSettings,
     plan: Plan,
     combination: AbstractCombination,
-    light: LightVisibility,
+    direct: Irradiance,
+    beams: Callable[[], _diffusion.Beams],
 ) -> tuple[Irradiance, Float[Array, "channels splats"] | None, Float[Array, ""]]:
     r"""Compute the light that enters every splat, straight from the lights and after bounces,
 
@@ -41,10 +41,14 @@ def bounced_irradiance(
     receives from itself, and t the fraction of it that enters. Light that scatters once counts as
     diffused.
 
-    **Returns:** the light, that part of what spreads that has bounced, and the capacity needed of
-    pass 4.
+    **Arguments:**
+
+    - `direct`: `E_0`; and `beams`, which computes its beams for `AbstractDiffusionPlan.light`.
+
+    **Returns:** the irradiance, the part of its source that has bounced, `None` without bounces,
+    and the capacity needed of pass 4.
     """
-    direct, none = irradiance_at_splats(scene, light), jnp.zeros_like(light.needed)
+    none = jnp.zeros((), direct.entering.dtype)
     if not settings.bounces:
         return direct, None, none
     sightlines, material = plan.sightlines, scene.material
@@ -68,9 +72,8 @@ def bounced_irradiance(
     def bounce(so_far, _):
         bounced, needed = so_far
         source = (added * direct.entering + bounced) * root
-        diffused, _ = light_layers(
-            scene, source, bounced * root, light, direct, settings, plan, combination, at
-        )
+        given = splats, material, source, beams, settings.kernel, combination, at
+        diffused, _ = plan.diffusion.light(*given, bounced * root)
         weighed, _ = _diffusion.LayersAtPoints.of(
             gaussians.variances,
             plan.diffusion.gaussians,
@@ -91,30 +94,6 @@ def bounced_irradiance(
     # Where splats carry no albedo, its root is one.
     entering = direct.entering + bounced
     return Irradiance(entering, entering * root), bounced * root, needed
-
-
-def light_layers(
-    scene: Scene,
-    source: Float[Array, "channels splats"],
-    bounced: Float[Array, "channels splats"] | None,
-    light: LightVisibility,
-    direct: Irradiance,
-    settings: RenderSettings,
-    plan: Plan,
-    combination: AbstractCombination,
-    at: Int[Array, " chosen"] | None,
-):
-    """Evaluate the layers of lit splats (pass 4)."""
-    return plan.diffusion.light(
-        scene.splats,
-        scene.material,
-        source,
-        partial(beams_at_splats, scene, light, direct),
-        settings.kernel,
-        combination,
-        at,
-        bounced,
-    )
 
 
 def diffuse_splats(

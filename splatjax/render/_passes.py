@@ -18,7 +18,8 @@ from splatjax._combination import AbstractCombination
 from splatjax.scene import Camera, Scene, stack_lights
 
 from ._attributes import SurfaceAttributes, SurfaceSamples, split_rows, stack_rows
-from ._bounces import bounced_irradiance, diffuse_splats, light_layers
+from ._beams import beams_at_splats
+from ._bounces import bounced_irradiance, diffuse_splats
 from ._lighting import Irradiance, LightVisibility, cast_shadows, irradiance_at_splats
 from ._plan import Plan
 from ._settings import RenderSettings
@@ -52,7 +53,7 @@ class SplatLight(eqx.Module):
     - `added_source`: the derivative of the spreading irradiance in a weight of the Gaussians;
       `None` where it has none. Its own layers follow those of the irradiance, channel by channel.
     - `needed`: capacity needed over planned.
-    - `solved`: of a diffuser that solves for the light of all splats.
+    - `solved`: what a diffuser that solves for the light keeps, along all splats; otherwise `None`.
     """
 
     visibility: list[Float[Array, "_lights splats"] | None]
@@ -104,8 +105,10 @@ def light_splats(
     - `transfer`: in the place of pass 1.
     """
     light = light_visibility(scene, settings, plan, combination, transfer)
+    direct = irradiance_at_splats(scene, light)
+    beams = partial(beams_at_splats, scene, light, direct)
     irradiance, bounced, bounce_needed = bounced_irradiance(
-        scene, settings, plan, combination, light
+        scene, settings, plan, combination, direct, beams
     )
     added, solved, log_variance_derivative = None, None, None
     if derivative and scene.material.single_scattering is not None:
@@ -116,10 +119,8 @@ def light_splats(
             scene, source, settings, plan, combination, at, derivative
         )
     else:
-        direct = irradiance if bounced is None else irradiance_at_splats(scene, light)
-        diffused, solved = light_layers(
-            scene, source, bounced, light, direct, settings, plan, combination, at
-        )
+        given = scene.splats, scene.material, source, beams, settings.kernel, combination, at
+        diffused, solved = plan.diffusion.light(*given, bounced)
         layers, needed = diffused.layers, diffused.needed
     needed = jnp.maximum(needed, jnp.maximum(light.needed, bounce_needed))
     along_splats = light.visibility, irradiance, added

@@ -1,6 +1,7 @@
 """A picture with all its layers, the light of a body without a camera, and pass 4 alone."""
 
 import dataclasses
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -13,10 +14,11 @@ from splatjax._combination import lay_out
 from splatjax.cache import kept_jit
 from splatjax.scene import Camera, Frame, Scene
 
+from ._beams import beams_at_splats
 from ._bounces import bounced_irradiance, diffuse_splats
 from ._checks import check_channels
 from ._devices import fill_scene, on_devices, resize_visibility
-from ._lighting import Irradiance, LightAtSplats
+from ._lighting import Irradiance, LightAtSplats, irradiance_at_splats
 from ._passes import (
     SplatLight,
     Transfer,
@@ -181,7 +183,9 @@ def compute_irradiance(
 def _compute_irradiance(scene: Scene, plan: Plan, settings: RenderSettings) -> Irradiance:
     def passes(combination, scene, plan):
         light = light_visibility(scene, settings, plan, combination)
-        return bounced_irradiance(scene, settings, plan, combination, light)[0]
+        direct = irradiance_at_splats(scene, light)
+        beams = partial(beams_at_splats, scene, light, direct)
+        return bounced_irradiance(scene, settings, plan, combination, direct, beams)[0]
 
     placed = on_devices(passes, scene, plan, by_splat=True), plan.order, plan.exists
     if plan.mesh is not None:

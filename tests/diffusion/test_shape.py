@@ -240,3 +240,34 @@ def test_pictures_show_the_solved_light():
     other = sj.Scene(sphere, [light], sj.Material(gaussians))
     with pytest.raises(ValueError, match=r"Material\.medium is None"):
         sj.render(other, camera, settings, plan)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("bounces", [0, 1])
+def test_derivatives_of_a_picture_are_those_of_differences(float64, bounces):
+    """In the coefficients, in the index of refraction, and in the place of the eye."""
+    sphere = bodies.sphere(200, 3.0, jitter=0.0)
+    light = sj.DirectionalLight([-0.3, -0.5, -1.0], [1.0, 1.0], cast_shadows=False)
+    settings = dataclasses.replace(bodies.PLAIN, diffuser=ShapeDiffuser(1e-11), bounces=bounces)
+    camera = sj.Camera.look_at([0, 0, 60], [0, 0, 0], fov=7, width=8, height=8)
+    gaussians = SumOfGaussians([1.0], np.ones((1, 2)))
+
+    def scene(sigma_a, sigma_s, eta):
+        of_body = Medium(sigma_a, sigma_s, jnp.broadcast_to(eta, 2))
+        material = sj.Material(gaussians, eta=eta, specular=0.0, medium=of_body)
+        return sj.Scene(sphere, [light], material)
+
+    def mean(eye, *coefficients):
+        moved = dataclasses.replace(camera, position=eye)
+        return jnp.mean(sj.render(scene(*coefficients), moved, settings, plan).beauty)
+
+    body = jnp.asarray([0.02, 0.15]), jnp.asarray([1.4, 1.2]), jnp.asarray(1.3)
+    plan = sj.make_plan(scene(*body), camera, settings)
+    given, step = (camera.position, *body), 1e-5
+    slopes = jax.jit(jax.grad(mean, argnums=range(4)))(*given)
+    for i, slope in enumerate(slopes):
+        way = jnp.arange(1.0, 1.0 + slope.size).reshape(slope.shape)
+        moved = ([*given[:i], given[i] + sign * step * way, *given[i + 1 :]] for sign in (1, -1))
+        ahead, behind = (float(jax.jit(mean)(*each)) for each in moved)
+        expected = (ahead - behind) / (2 * step)
+        np.testing.assert_allclose(float(jnp.sum(slope * way)), expected, rtol=1e-6)
