@@ -88,8 +88,7 @@ def record(cls: Class) -> Class:
         try:
             given = signature.bind(*args, **kwargs)
         except TypeError as error:
-            wanted = f"{cls.__name__}{inspect.signature(cls)}"
-            raise TypeError(f"{error}; give {wanted}") from None
+            raise TypeError(f"{error}; give {_call(cls)}") from None
         given.apply_defaults()
         values, records = given.arguments, []
         for name in linear:
@@ -103,11 +102,9 @@ def record(cls: Class) -> Class:
             parts = tuple(values[name]) if is_tuple and is_many else (values[name],)
             for part in parts:
                 if not isinstance(part, kinds) and not _is_placeholder(part):
-                    wanted = " or ".join(
-                        f"{kind.__name__}{inspect.signature(kind)}" for kind in kinds
-                    )
+                    expected = " or ".join(_call(kind) for kind in kinds)
                     raise ValueError(
-                        f"{cls.__name__}.{name} must be {wanted}; got {type(part).__name__}"
+                        f"{cls.__name__}.{name} must be {expected}; got {type(part).__name__}"
                     )
             values[name] = parts if is_tuple else parts[0]
             records += parts
@@ -121,6 +118,12 @@ def record(cls: Class) -> Class:
     __init__.__signature__ = inspect.Signature([own, *others])  # ty: ignore[missing-attribute]
     cls.__init__ = __init__  # ty: ignore[invalid-assignment]
     return cls
+
+
+def _call(cls: type) -> str:
+    """Write out a call of a class with the names of its arguments; an abstract one has none."""
+    parameters = ", ".join(inspect.signature(cls).parameters)
+    return f"{cls.__name__}({parameters})" if parameters else cls.__name__
 
 
 def as_floats(values: Numbers, dtype: DTypeLike | None = None, name: str = "values") -> Array:

@@ -1,8 +1,9 @@
-"""From words on a command line to a command, and from an error to one line; and what only a program
-may decide, never a library: where compiled code is kept, and which device computes.
+"""Parse the command line, run a command, and report an error in one line; and decide what a library
+leaves to its program: where compiled code is kept, which device computes, how memory is reused.
 """
 
 import contextlib
+import ctypes
 import functools
 import operator
 import os
@@ -39,6 +40,8 @@ Lengths are in mm.
 `splatjax COMMAND --help` explains a command. With --debug, an error shows where it arose.
 `splatjax --version` says which version this is."""
 _DEBUG = "--debug"
+# Of glibc, from malloc.h: one arena, nothing mapped separately, nothing returned to the system.
+_MALLOPT = {"M_ARENA_MAX": (-8, 1), "M_MMAP_MAX": (-4, 0), "M_TRIM_THRESHOLD": (-1, 2**31 - 1)}
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -56,6 +59,7 @@ def main(args: Sequence[str] | None = None) -> int:
         command = parsed([word for word in words if word != _DEBUG])
         with warnings.catch_warnings():
             warnings.showwarning = _show_warning  # ty: ignore[invalid-assignment]
+            keep_freed_memory()
             prepare_jax()
             CONSOLE.quiet = getattr(command, "quiet", False)
             try:
@@ -129,6 +133,16 @@ def _show_warning(message: Warning | str, category: type[Warning], *_: Any, **__
     """Print a warning for users in one line; print none for developers."""
     if issubclass(category, UserWarning):
         note(" ".join(str(message).split()))
+
+
+def keep_freed_memory() -> None:
+    """Let the C library keep the memory of one picture for the next, where it is glibc.
+
+    Otherwise the system maps, and clears, the buffers of every picture again.
+    """
+    with contextlib.suppress(AttributeError, OSError, TypeError):  # another C library
+        for parameter, value in _MALLOPT.values():
+            ctypes.CDLL(None).mallopt(parameter, value)
 
 
 def prepare_jax() -> None:

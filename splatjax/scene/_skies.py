@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from splatjax._chunking import jit_unless_traced
 from splatjax._records import Numbers, as_floats
 
 from ._environment import pixel_directions
@@ -18,6 +19,7 @@ _ZENITH, _HORIZON, _SUN = (0.12, 0.22, 0.48), (0.45, 0.5, 0.55), (2.4, 2.2, 1.9)
 _CONCENTRATION = 1500.0  # of the sun, whose light is spread over some 3 degrees
 
 
+@jit_unless_traced
 def studio(height: int = 64) -> Float[Array, "height width 3"]:
     """Make a dark studio with a large softbox in front on the side of -x, a weak one on the side of
     +x, and a strip behind.
@@ -38,6 +40,7 @@ def studio(height: int = 64) -> Float[Array, "height width 3"]:
     return image
 
 
+@jit_unless_traced
 def overcast_sky(height: int = 64) -> Float[Array, "height width 3"]:
     """Make the overcast sky of the CIE, `L = L_zenith (1 + 2 sin(elevation)) / 3`, over a ground
     that reflects a fifth.
