@@ -24,7 +24,7 @@ class SurfaceLight(eqx.Module):
 
     **Attributes:**
 
-    - `fluence`: times `1 / (3 sigma_t)`, over `z_e`.
+    - `fluence`: times `D / z_e`.
     - `flux`: net, outward.
     - `irradiance`: of the beam that enters, and `entering`, the cosine of it inside: 0 without one.
     - `direction`: of the beam, mean over the channels.
@@ -135,7 +135,8 @@ def radiance_towards(
     shape = jnp.where(light.mean > 0, jnp.clip(shape, 0, _BRIGHTEST), 1.0)
     optical = jnp.minimum(length[None] * coefficients.sigma_t[:, None], _LONGEST)
     slope = jnp.sum(light.slopes * jnp.stack(along)[None], axis=1)
-    depth = 0.75 * (coefficients.albedo * coefficients.z_e)[:, None]
+    spread = 4 * coefficients.diffusion_coefficient * coefficients.sigma_t
+    depth = (coefficients.albedo * coefficients.z_e / spread)[:, None]
     sideways = depth * slope * (1 - (1 + optical) * jnp.exp(-optical))
     return jnp.maximum(light.exitance * shape - sideways, 0)
 
@@ -164,10 +165,10 @@ def source_integral(
     albedo, z_e = medium.albedo[:, None], (medium.z_e * medium.sigma_t)[:, None]
     mu, far_mu, length = mu[None], far_mu[None], length[None]
     s = jnp.minimum(length * medium.sigma_t[:, None], _LONGEST)
-    bend = 3 * (1 - albedo)
-    bend = bend / (1 + bend) * mu * mu  # below 1 for every albedo
+    spread = (medium.diffusion_coefficient * medium.sigma_t)[:, None]
+    bend = (1 - albedo) / spread * mu * mu  # below 1: a solution decays slower than a beam
     at_near, at_far = z_e * near.fluence + mu * near.flux, z_e * far.fluence - far_mu * far.flux
-    diffused = 3 * albedo * (at_near - jnp.exp(-s) * at_far) / (1 - bend)
+    diffused = albedo / spread * (at_near - jnp.exp(-s) * at_far) / (1 - bend)
     # A beam that enters at one end gets darker towards the other, at these rates along the ray.
     entering, far_entering = (jnp.maximum(x.entering, GRAZING) for x in (near, far))
     rate, far_rate = mu / entering, far_mu / far_entering
@@ -183,7 +184,7 @@ def source_integral(
     mean = jnp.where(is_small, 1 - 0.5 * size, -jnp.expm1(-safe) / safe)
     mean = mean * jnp.exp(jnp.maximum(exponent, 0) - s)
     beams = beams + far.irradiance / far_entering * far_part * mean
-    return diffused + albedo * beams * (1 - 3 * albedo * mu * mu / (1 - bend))
+    return diffused + albedo * beams * (1 - albedo / spread * mu * mu / (1 - bend))
 
 
 def _coefficients(material: Material) -> DiffusionCoefficients:
