@@ -122,7 +122,7 @@ def methods(body: Body, light, camera, material: sj.Material, kernel) -> dict[st
         )  # its buffers, but for the layers, are those of any way of spreading light
     for name, blur in (
         ("screen space, Gaussian by Gaussian", baselines.GaussianPasses()),
-        ("screen space, the kernel that ships", baselines.ShippedKernel()),
+        ("screen space, shipped kernel", baselines.ShippedKernel()),
     ):
         on_screen = jax.jit(
             lambda frame, blur=blur: baselines.diffuse_on_screen(frame, camera, material, blur)
