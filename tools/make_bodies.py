@@ -137,7 +137,7 @@ outline.
 
 PAGE = Path(__file__).parents[1] / "docs" / "bodies.md"
 BEGIN, END = "<!-- table: tools/make_bodies.py -->", "<!-- end of table -->"
-TITLES = ("body", "model", "red off by", "green", "blue", "FLIP", "seconds")
+TITLES = ("body", "model", "error: red", "green", "blue", "FLIP", "seconds")
 TITLES += ("path tracer's seconds to the same error",)
 
 
