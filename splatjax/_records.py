@@ -94,7 +94,7 @@ def record(cls: Class) -> Class:
         for name in linear:
             if jnp.issubdtype(getattr(values[name], "dtype", float), jnp.integer):
                 raise ValueError(
-                    f"{cls.__name__}.{name} holds whole numbers ({values[name].dtype}), as encoded "
+                    f"{cls.__name__}.{name} has integer dtype {values[name].dtype}, as encoded "
                     "for a display; give linear light in floating-point numbers"
                 )
         for name, (kinds, is_tuple) in classes.items():
@@ -171,7 +171,7 @@ def check_values(
     if not np.all(is_good(np.stack([known.min(), known.max()]))):
         good = is_good(known)
         place = tuple(np.argwhere(~good)[0].tolist())
-        found = f"{np.sum(~good)} of {known.size} entries are not, the first is" if place else "got"
+        found = f"{np.sum(~good)} of {known.size} entries are not; the first is" if place else "got"
         raise ValueError(
             f"{name} must be {requirement}; {found} {known[place]:g}"
             f"{f' at {list(place)}' if place else ''}"

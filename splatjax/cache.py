@@ -83,7 +83,7 @@ def keep(folder: str | os.PathLike[str] | None = None) -> Path:
     if jax.config.jax_compilation_cache_dir is None:  # ty: ignore[missing-attribute]
         jax.config.update("jax_compilation_cache_dir", str(whole))
     if not _is_private(kept_folder):  # or the system does not show whose it is
-        raise PermissionError(f"{kept_folder}: others than you may write to it; delete it")
+        raise PermissionError(f"{kept_folder}: other users may write to this folder; delete it")
     _source()  # now, since files may change while the program runs
     _folder = kept_folder
     return whole

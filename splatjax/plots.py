@@ -236,7 +236,7 @@ def plot_recovery(recovery: Recovery, *, title: str | None = None) -> Figure:
         reach = float(np.nanquantile(np.abs(share), 0.99)) or 1.0
         image = line[2].imshow(share, cmap="RdBu_r", vmin=-reach, vmax=reach)
         line[2].set_facecolor("0.8")
-        line[2].set_title("recovered less seen")
+        line[2].set_title("recovered less input")
         figure.colorbar(image, ax=line[2], label="% of the picture", shrink=0.8)
         for ax in line:
             ax.set(xticks=[], yticks=[])

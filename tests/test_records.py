@@ -189,7 +189,7 @@ def test_traced_values_and_placeholders_pass_through_transformations():
         (lambda: sj.scattering.Tabulated([0, 1], [1.0, np.nan]), "Tabulated.values"),
         (lambda: sj.scattering.Tabulated([0, 1], [1.0]), "Tabulated.values"),
         (lambda: sj.scattering.Tabulated([0.0], [1.0]), "Tabulated.radii"),
-        (lambda: sj.LayeredMultipole([sj.Film(0.0)]), "none of these 1 is a Layer"),
+        (lambda: sj.LayeredMultipole([sj.Film(0.0)]), "none of these 1"),
         (lambda: sj.LayeredMultipole([sj.Layer(medium(), np.inf)] * 2), "layer 1 of 2"),
         (lambda: sj.SumOfGaussians([0, 1], [1, 1]), "SumOfGaussians.variances"),
         (lambda: Observation(np.ones((3, 2, 3)), camera(), light()), "picture has 3 x 2 pixels"),
@@ -235,7 +235,7 @@ def test_traced_values_and_placeholders_pass_through_transformations():
             lambda: sj.Material(
                 material().gaussians, single_scattering=sj.SingleScattering(sj.Medium([1, 1], 1, 1))
             ),
-            r"Material\.single_scattering has 2 channels, Material\.gaussians has 3",
+            r"Material\.single_scattering has 2 channels, .* has 3",
         ),
         (
             lambda: sj.LayeredMultipole(

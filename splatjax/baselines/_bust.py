@@ -29,7 +29,7 @@ def bust_with_textures(texels: int) -> tuple[Mesh, Textures]:
     **Raises:** `ValueError` for no texels.
     """
     if texels < 1:
-        raise ValueError(f"texels is {texels}; a texture has at least 1 along each edge")
+        raise ValueError(f"texels is {texels}; give at least 1 along each edge")
     mesh = cut_below(bust_mesh(), _NECK)
     assert mesh.uvs is not None
     low, high = mesh.uvs.min(axis=(0, 1)), mesh.uvs.max(axis=(0, 1))

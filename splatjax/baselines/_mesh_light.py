@@ -75,8 +75,7 @@ def light_views(
             views.append(_splatting.near_view(light.position, bounds, settings))
         else:
             raise ValueError(
-                f"{type(light).__name__}: no shadow map of a mesh is known for it; give one with "
-                "cast_shadows=False"
+                f"{type(light).__name__} has no shadow map for a mesh; give cast_shadows=False"
             )
     return views
 
@@ -95,9 +94,9 @@ def shadow_capacities(
             distance = float(jnp.linalg.norm(light.position - bounds.center))
             if distance < 1.05 * float(bounds.radius):
                 raise ValueError(
-                    f"lights[{i}] stands {distance:g} mm from the middle of the mesh, within its "
-                    "bounding sphere of radius "
-                    f"{float(bounds.radius):g} mm; move it out, or let it cast no shadows"
+                    f"lights[{i}] is {distance:g} mm from the middle of the mesh, inside its "
+                    f"bounding sphere of radius {float(bounds.radius):g} mm; move it outside, "
+                    "or give cast_shadows=False"
                 )
     corners, views = mesh.corners(), light_views(mesh, lights, settings)
     return tuple(

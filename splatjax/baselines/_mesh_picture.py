@@ -102,8 +102,8 @@ def render_texture_space(
             isinstance(leaf, Tracer) for leaf in jax.tree.leaves((mesh, lights, material, camera))
         ):
             raise ValueError(
-                "under jit, grad or vmap a plan is needed: plan=plan_texture_space(...), made "
-                "outside"
+                "plan is None, and under jit, grad or vmap a plan is needed; make it outside, "
+                "plan=plan_texture_space(...)"
             )
         plan = plan_texture_space(mesh, lights, material, camera, settings)
     return _render(mesh, lights, material, camera, settings, plan)

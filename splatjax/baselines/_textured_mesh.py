@@ -44,15 +44,14 @@ class TexturedMesh(eqx.Module):
         """
         if mesh.uvs is None:
             raise ValueError(
-                "the mesh has no texture coordinates, so light has no texture to be diffused in; "
-                "give one with UVs"
+                "the mesh has no texture coordinates, which texture-space diffusion needs; "
+                "give a mesh with UVs"
             )
         low, high = float(mesh.uvs.min()), float(mesh.uvs.max())
         if low < -_OUTSIDE or high > 1 + _OUTSIDE:
             raise ValueError(
-                f"the mesh's texture coordinates reach from {low:g} to {high:g}; light is diffused "
-                "in the unit square alone: "
-                "scale or move the charts into it"
+                f"the texture coordinates of the mesh range from {low:g} to {high:g}, and "
+                "light is diffused only in the unit square; scale or move the charts into it"
             )
 
         def on_device(values):

@@ -34,7 +34,7 @@ from ._terminal import (
 _COEFFICIENTS, _PROFILE, _PHOTOGRAPH = "coefficients", "a measured profile", "a photograph"
 _LARGE, _APART = 0.05, 3.0  # errors, and ratios of widths, of channels that share badly
 _KINDS = {".csv": _PROFILE, ".exr": _PHOTOGRAPH}
-# Options that have an effect on one kind of input alone.
+# Options that affect only one kind of input.
 _OPTIONS = {
     _COEFFICIENTS: ("model", "photons", "g", "single_scattering"),
     _PROFILE: ("mm_per_unit",),
@@ -46,14 +46,13 @@ _OPTIONS = {
 class Fit:
     """Fit a sum of Gaussians to a diffusion profile, and print it with its errors.
 
-    The profile is that of a medium, that of layers, a measured one, or that of a laser dot in a
-    photograph. Double precision. Variances are shared by the channels. Weights are not negative,
-    and their sum is held at the total reflectance of the profile, so that the picture keeps its
-    energy. To measured profiles, whose totals are not known, weights are fitted freely, but not
-    below zero.
+    The profile is that of a medium, of layers, of a measurement, or of a laser dot in a photograph.
+    The fit uses double precision. All channels share the variances. Weights are non-negative, and
+    their sum equals the total reflectance of the profile, so that the picture keeps its energy. The
+    total of a measured profile is unknown, so its weights are only non-negative.
 
-    A medium is taken for what --model says: the photon beam with the total and the angles of light
-    transport; the dipole, which publications use; or the truth itself, by Monte Carlo
+    --model selects the profile of a medium: the photon beam with the total and the angles of light
+    transport; the dipole, which publications use; or light transport itself, by Monte Carlo
     (docs/which_profile.md).
 
     Examples: splatjax fit marble --count 6 --output marble.toml --plot marble.png
@@ -70,38 +69,39 @@ class Fit:
     ]
     #: Number of Gaussians.
     count: int = 6
-    #: Take the least number of Gaussians, up to 12, that leaves no channel a larger error (Eq. 4),
-    #: instead of --count.
+    #: Largest error (Eq. 4) of any channel: use the least number of Gaussians, up to 12, that
+    #: reaches it, instead of --count.
     error: OptionalFloat = None
-    #: What makes a profile of coefficients: photon-beam unless given, dipole, better-dipole or
-    #: monte-carlo. The layers of a material are multipoles, or are walked by monte-carlo.
+    #: Model of the profile of coefficients: photon-beam (default), dipole, better-dipole or
+    #: monte-carlo. Layers use the multipole, or monte-carlo.
     model: Annotated[Model | None, tyro.conf.arg(metavar="MODEL", help_behavior_hint="")] = None
-    #: Of photon beams and Monte Carlo: the mean cosine of the phase function, which is Henyey and
-    #: Greenstein's. That of the file, or 0.
+    #: Mean cosine of Henyey and Greenstein's phase function, for photon beams and Monte Carlo. By
+    #: default that of the file, or 0.
     g: OptionalFloat = None
-    #: Of Monte Carlo: how many walk.
+    #: Number of photons for Monte Carlo.
     photons: int = 1_000_000
-    #: Of photon beams and Monte Carlo: keep light that scatters once as a term of its own, and fit
-    #: Gaussians to the rest.
+    #: Keep light that scatters once as a separate term, and fit Gaussians to the rest, for photon
+    #: beams and Monte Carlo.
     single_scattering: bool = False
-    #: Of a CSV file: its unit of length, mm.
+    #: Unit of length of a CSV file, mm.
     mm_per_unit: float = 1.0
-    #: Of a photograph: the size of a pixel on the surface, mm.
+    #: Size of a pixel of a photograph on the surface, mm.
     mm_per_pixel: OptionalFloat = None
-    #: Of a photograph: the light that enters the material, in W if the picture is in W/(mm^2 sr).
+    #: Power that enters the material in a photograph, in W if the picture is in W/(mm^2 sr).
     power: float = 1.0
     all: Annotated[
         bool,
         tyro.conf.arg(
-            help="Fit all media of a CSV file, whose columns are sigma_a, sigma_s_prime (1/mm), "
-            "eta, and a name if you like; --output is a CSV file then. Batches that are finished "
-            "stay: after an interruption, run the same command again. Where a launcher has started "
-            "several processes (docs/devices.md), they share the work."
+            help="Fit all media of a CSV file, with the columns sigma_a, sigma_s_prime "
+            "(1/mm), eta, and optionally a name; --output is then a CSV file. Finished "
+            "batches are kept: after an interruption, run the same command again. If a "
+            "launcher has started several processes (docs/devices.md), they share the "
+            "work."
         ),
     ] = False
     #: TOML file to write the material to.
     output: OptionalPath = None
-    #: Picture to write of profile, fit and error: .png, .pdf or .svg.
+    #: Plot to write of profile, fit and error: .png, .pdf or .svg.
     plot: OptionalPath = None
 
     def run(self) -> None:
@@ -122,7 +122,7 @@ class Fit:
         processes of a launcher share them.
         """
         if self.output is None:
-            raise ValueError("--all needs --output, a CSV file for what is fitted")
+            raise ValueError("--all needs --output, a CSV file for the fits")
         kept = {name: getattr(self, name) for name in ("medium", "count", "model", "g", "output")}
         if self != Fit(all=True, **kept) or self.model == "monte-carlo":
             raise ValueError(
@@ -184,8 +184,8 @@ class Fit:
             radii = len(coefficients.radii)
             if self.error is None and 2 * self.count > radii:
                 note(
-                    f"{self.medium} has {radii} radii, too few to tell "
-                    f"{counted(self.count, 'Gaussian')} apart: give a smaller --count"
+                    f"{self.medium} has {radii} radii, too few to determine "
+                    f"{counted(self.count, 'Gaussian')}; give a smaller --count"
                 )
         else:
             # The reduced coefficients are all that a dipole knows.
@@ -198,8 +198,8 @@ class Fit:
         total = fitted.gaussians.total_reflectance()
         if float(total.max()) > 1 + 1e-3:
             note(
-                f"{self.medium} sends back {format_numbers(total, '.3g')} times the light it is "
-                "given: are its unit and power right?"
+                f"{self.medium} reflects {format_numbers(total, '.3g')} times the light that "
+                "it receives; check its unit and power"
             )
         if self.output is not None:
             self._save(self.output, coefficients, target, fitted)
@@ -232,8 +232,8 @@ class Fit:
             without_effect = [name for name in names if other != kind and name in given]
             if without_effect:
                 raise ValueError(
-                    f"{option_name(without_effect[0])} is for {other}, and {self.medium} is taken "
-                    f"for {kind}; leave it out"
+                    f"{option_name(without_effect[0])} is for {other}, and {self.medium} is "
+                    f"read as {kind}; leave it out"
                 )
         if kind == _PROFILE:
             return sj.io.read_profile(self.medium, mm_per_unit=self.mm_per_unit)
@@ -241,7 +241,7 @@ class Fit:
             return sj.load_profile(self.medium)
         if self.mm_per_pixel is None:
             raise ValueError(
-                f"{self.medium}: how large is a pixel on the surface? give --mm-per-pixel"
+                f"{self.medium}: the size of a pixel on the surface is unknown; give --mm-per-pixel"
             )
         image = sj.io.read_picture(self.medium)
         with sj.io.naming(self.medium):
@@ -263,8 +263,8 @@ class Fit:
                 more = f"more --photons than {self.photons}, or "
                 raise ValueError(
                     f"{self.medium}: the search for "
-                    f"{counted(len(fitted.gaussians.variances), 'Gaussian')} did not settle; give "
-                    f"{more if self.model == 'monte-carlo' else ''}a smaller --count"
+                    f"{counted(len(fitted.gaussians.variances), 'Gaussian')} did not converge; "
+                    f"give {more if self.model == 'monte-carlo' else ''}a smaller --count"
                 )
         return fitted
 

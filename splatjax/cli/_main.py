@@ -34,11 +34,11 @@ _COMMANDS = {
     "turntable": Turntable,
     "recover": Recover,
 }
-_DESCRIPTION = """Render translucent materials, and find the sums of Gaussians that stand for them.
+_DESCRIPTION = """Render translucent materials, and fit the sums of Gaussians that represent them.
 Lengths are in mm.
 
-`splatjax COMMAND --help` explains a command. With --debug, an error shows where it arose.
-`splatjax --version` says which version this is."""
+`splatjax COMMAND --help` explains a command. --debug adds the traceback to an error.
+`splatjax --version` prints the version."""
 _DEBUG = "--debug"
 # Of glibc, from malloc.h: one arena, nothing mapped separately, nothing returned to the system.
 _MALLOPT = {"M_ARENA_MAX": (-8, 1), "M_MMAP_MAX": (-4, 0), "M_TRIM_THRESHOLD": (-1, 2**31 - 1)}
@@ -119,12 +119,12 @@ def _message(error: Exception) -> tuple[str, int]:
     if isinstance(error, OSError) and error.strerror and error.filename is not None:
         return f"{error.filename}: {error.strerror}", 2
     if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in line:
-        return "this takes more memory than there is; take fewer splats, or a smaller picture", 2
+        return "not enough memory is available; take fewer splats, or a smaller picture", 2
     if isinstance(error, ValueError | OSError | eqx.EquinoxRuntimeError):
         return line or type(error).__name__, 2
     return (
-        f"a fault of splatjax itself: {type(error).__name__}: {line}; please report it with what "
-        f"{_DEBUG} shows",
+        f"a fault of splatjax: {type(error).__name__}: {line}; please report it with the "
+        f"output of {_DEBUG}",
         1,
     )
 

@@ -20,8 +20,8 @@ from ._terminal import OptionalFloat, OptionalPath, UpAxis, check_output, note, 
 class Materials:
     """List the materials of the library, or print one.
 
-    Their names serve `splatjax render --material` and, where coefficients or layers are known,
-    `splatjax fit`.
+    `splatjax render --material` takes their names, and so does `splatjax fit` if coefficients or
+    layers are known.
 
     Example: splatjax materials marble > mine.toml
     """
@@ -30,8 +30,8 @@ class Materials:
         tyro.conf.Positional[str | None],
         tyro.conf.arg(
             metavar="[MATERIAL]",
-            help="Print the file of this one: coefficients, source, Gaussians. A beginning of "
-            "one's own. Without it, list all.",
+            help="Print the file of this material (coefficients, source, Gaussians), as a "
+            "starting point for your own. Without it, list all materials.",
             help_behavior_hint="",
         ),
     ] = None
@@ -48,7 +48,7 @@ class Materials:
 class Export:
     """Write a material's Gaussians as JSON for other renderers.
 
-    Each entry with formula, unit and source: GPU Gems weights, a kernel for separable subsurface
+    Each entry has its formula, unit and source: GPU Gems weights, a kernel for separable subsurface
     scattering, Burley's d, the shape parameter of Unity's HDRP, Blender's radius.
 
     Example: splatjax export skin --output skin.json
@@ -87,7 +87,7 @@ def _row(name: str) -> tuple[str, ...]:
 
 @dataclass(frozen=True, kw_only=True)
 class Sample:
-    """Cover a mesh with splats that carry its maps, and write them as PLY, in mm.
+    """Sample splats with maps from a mesh, and write them as PLY, in mm.
 
     The mesh is a GLB, glTF, OBJ, PLY, STL or OFF file.
 
@@ -97,26 +97,25 @@ class Sample:
 
     #: The file of the mesh.
     mesh: tyro.conf.Positional[Path]
-    #: Length of the file's unit, mm: 1000 for meters.
+    #: Length of the file's unit in mm: 1000 for meters.
     mm_per_unit: float
     #: The PLY file to write.
     output: Path
     #: Number of splats.
     count: int = 200_000
-    #: Another spread of the same quality.
+    #: Seed of the random positions.
     seed: int = 0
-    #: Put splats on the surface that bends as the mesh's normals do; otherwise on its flat
+    #: Place splats on a curved surface that follows the normals of the mesh, instead of on its flat
     #: triangles.
     rounded: bool = True
     #: Upward axis of the file; splats have +y up.
     up: UpAxis = "y"
-    #: Degrees: edges are hard where triangles differ by more, and the file has no normals or
+    #: Angle between triangles above which an edge is hard, degrees, if the file has no normals or
     #: smooth ones.
     crease_angle: float = 40.0
-    #: Map of the mesh's diffuse color, sRGB. Without it, the texture that the file itself carries,
-    #: if any.
+    #: Map of the mesh's diffuse color, sRGB. By default the texture of the file, if any.
     albedo: OptionalPath = None
-    #: Gray map: factor on the material's specular strength.
+    #: Gray map of factors on the material's specular strength.
     specular: OptionalPath = None
     #: Tangent-space normal map; green points up.
     normal: OptionalPath = None
@@ -124,12 +123,13 @@ class Sample:
         bool | None,
         tyro.conf.arg(
             metavar="{True,False}",
-            help="Whether v = 0 is the lower edge of a map. Without it, as the format prescribes: "
-            "OBJ yes, glTF and GLB no. If lips land on the chin, say True.",
+            help="Whether v = 0 is the lower edge of a map. By default as the format "
+            "prescribes: OBJ yes, glTF and GLB no. If the texture is upside down, give "
+            "True.",
             help_behavior_hint="",
         ),
     ] = None
-    #: Cut off what lies below this height, in the file's unit.
+    #: Remove the mesh below this height, in the file's unit.
     crop_min_y: OptionalFloat = None
 
     def run(self) -> None:

@@ -35,9 +35,9 @@ _COEFFICIENTS = ("sigma_a", "sigma_s_prime")
 class Recover:
     """Find the absorption and scattering of a material from pictures of a known shape.
 
-    Both come with error bars, with what the pictures do not fix, and with which one to take next.
-    The pictures are listed in a TOML file, each with its camera, its lights, and what is known of
-    noise and intensity:
+    The result has error bars, the combinations that the pictures do not determine, and the picture
+    to take next. A TOML file lists the pictures, each with its camera, its lights, and optionally
+    its noise and intensity:
 
         [[pictures]]
         file = "left.exr"
@@ -52,7 +52,7 @@ class Recover:
     A light is also of kind "point" (position, intensity) or "beam" (origin, direction, power,
     variance).
 
-    Albedo of the splats is not used: the coefficients carry all color. After an interruption the
+    The albedo of the splats is not used: the coefficients give all color. After an interruption the
     same command continues from the best medium so far.
 
     Example: splatjax recover head.ply pictures.toml --start skin1 marble --output mine.toml
@@ -67,29 +67,29 @@ class Recover:
         tuple[str, ...],
         tyro.conf.arg(
             metavar="MATERIAL [MATERIAL ...]",
-            help="Materials to start from, within a factor of three in both coefficients: names, "
-            "or paths of TOML files. The best end counts.",
+            help="Materials to start from, within a factor of three in both coefficients: "
+            "names, or paths of TOML files. The best result counts.",
         ),
     ] = ("skin1", "marble")
-    #: Index of refraction, which is not searched. Without it, that of the first start.
+    #: Index of refraction, which is not searched. By default that of the first start.
     eta: OptionalFloat = None
     #: TOML file to write the material to.
     output: Path = Path("recovered.toml")
-    #: Picture to write of what was seen, what was recovered and what is left: .png, .pdf or .svg.
+    #: Plot to write of the input, the recovered picture and the residual: .png, .pdf or .svg.
     report: OptionalPath = None
-    #: What makes a profile of the coefficients: docs/which_profile.md.
+    #: Model of the profile of the coefficients (docs/which_profile.md).
     model: Literal["photon-beam", "dipole", "better-dipole"] = "photon-beam"
-    #: Of photon beams: the mean cosine of the phase function.
+    #: Mean cosine of the phase function, for photon beams.
     g: float = 0.0
     #: Number of Gaussians.
     count: int = 6
-    #: Let pixels that are far off count less: highlights, dust, what the model does not know.
+    #: Reduce the weight of outliers: highlights, dust, effects outside of the model.
     robust: bool = False
     #: Strength of the specular lobe, if the pictures show one.
     specular: float = 0.0
-    #: Of the specular lobe.
+    #: Roughness of the specular lobe.
     roughness: float = 0.3
-    #: Say which picture would tell most, of some that could be taken from where the first was.
+    #: Report the picture to take next, among some with the camera of the first.
     suggest: bool = True
 
     def run(self) -> None:
@@ -107,7 +107,9 @@ class Recover:
         )
         model_by_name(self.model, self.g)  # reports faults before the pictures are read
         if not self.start:
-            raise ValueError("--start names no material; give one or more (`splatjax materials`)")
+            raise ValueError(
+                "--start is empty; give one or more materials (`splatjax materials` lists them)"
+            )
         for name in self.start:
             sj.load_medium(name)
         with stage(f"reading {self.splats} and {self.pictures}"):
@@ -162,8 +164,8 @@ class Recover:
         if not settled:
             report("kept", recovery.medium)
             note(
-                f"{self.pictures}: the search did not settle, and this is its best round; the same "
-                "command goes on there, or --start names materials that are nearer"
+                f"{self.pictures}: the search did not converge, and this is its best round; "
+                "run the same command again to resume, or give nearer materials as --start"
             )
         print(recovery.summary())
         if self.suggest:
@@ -187,7 +189,7 @@ class Recover:
             if medium.eta.shape[0] != channels:
                 raise ValueError(
                     f"--start {name} has {medium.eta.shape[0]} channels, the pictures have "
-                    f"{channels}; name another"
+                    f"{channels}; give another material"
                 )
         eta = media[0].eta if self.eta is None else jnp.full_like(media[0].eta, self.eta)
         starts = [sj.Medium(medium.sigma_a, medium.sigma_s_prime, eta) for medium in media]
@@ -195,9 +197,9 @@ class Recover:
             return starts
         record = sj.io.read_record(search)
         if record.get("made of") != dependencies:
-            note(f"{search}: is of another search, and is not used")
+            note(f"{search}: belongs to another search, and is not used")
             return starts
-        note(f"{search}: an interrupted search goes on")
+        note(f"{search}: resuming an interrupted search")
         return [sj.Medium(*(jnp.asarray(record[name]) for name in _COEFFICIENTS), eta)]
 
     def _suggest(
@@ -208,11 +210,11 @@ class Recover:
     ) -> None:
         first = observations[0]
         candidates = sj.inverse.default_candidates(splats, first.camera, first.picture.shape[2])
-        with stage(f"looking at {len(candidates)} pictures that could be taken next"):
+        with stage(f"evaluating {len(candidates)} pictures that could be taken next"):
             predictions = sj.inverse.next_pictures(
                 recovery, splats, candidates, model=model_by_name(self.model, self.g)
             )
-        print("what one more picture would do, the best first:")
+        print("predicted gain of one more picture, the best first:")
         print(*(f"  {prediction}" for prediction in predictions), sep="\n")
 
     def _save(self, recovery: sj.inverse.Recovery) -> None:

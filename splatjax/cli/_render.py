@@ -30,29 +30,30 @@ Rendered = tuple[sj.Frame, sj.Material, tuple[sj.scene.AbstractLight, ...], sj.C
 class Render(ViewOptions):
     """Render splats, or the built-in bust: an EXR file with every layer, and a PNG file beside it.
 
-    They stand in a studio, an --environment, or under a single light and a weak fill. The camera
-    looks at the middle of the splats from far enough to see all of them. Angles are in degrees:
-    azimuth turns about the vertical axis, 0 is the front (+z) and 90 the side of +x; elevation
-    rises above the horizon. If the splats carry albedo, the weights of the material are divided by
-    their sums, so that color comes from the albedo alone; with --no-albedo from the material alone.
+    The light is a studio, an --environment, or a single light with a weak fill. The camera looks at
+    the middle of the splats from a distance at which all of them are visible. Angles are in
+    degrees: azimuth turns about the vertical axis, 0 is the front (+z) and 90 the side of +x;
+    elevation is measured from the horizon. If the splats have albedo, the weights of the material
+    are divided by their sums, so that the albedo alone gives the color; with --no-albedo the
+    material gives it.
 
     Examples: splatjax render head.ply --material skin --azimuth 30 --width 1024 --height 1024
     --output head.exr
               splatjax render --material marble --no-albedo --output marble.exr
     """
 
-    #: The EXR file to write; the PNG file has the same name but for its end.
+    #: The EXR file to write; the PNG file has the same name with another suffix.
     output: Path = Path("out.exr")
 
-    #: Read so many splats of the file at a time, and forget them: for files that are larger than
-    #: memory. 0: all at once.
+    #: Number of splats to read at a time, for files that are larger than memory. 0 reads all at
+    #: once.
     stream: int = 0
 
     def run(self) -> None:
         check_output(self.output, (".exr",))
         self.check()
         is_valid = self.stream == 0 or (self.stream > 0 and self.splats is not None)
-        expected = "be a number of splats of a PLY file, which must be named"
+        expected = "be a number of splats, with a PLY file as input"
         bounces = self.stream == 0 or self.bounces == 0, "be 0 with --stream"
         diffusion = self.stream == 0 or self.diffusion == "clusters", "be clusters with --stream"
         rules = {"stream": (is_valid, expected), "bounces": bounces, "diffusion": diffusion}
@@ -81,7 +82,7 @@ class Render(ViewOptions):
         def parts() -> Iterable[sj.Splats]:
             return map(self.adjusted, file())
 
-        with stage(f"looking at {file.count} splats"):
+        with stage(f"reading {file.count} splats"):
             camera = self.camera(parts, self.azimuth)
         material = self.material_for(next(iter(parts())))
         lights = self.lights(material, self.azimuth, self.single_light[0])
@@ -96,44 +97,43 @@ class Render(ViewOptions):
 class Turntable(ViewOptions):
     """Render the frames of an animation around splats, or the built-in bust.
 
-    Per frame an EXR file with every layer and a PNG file; in the end turntable.webp, which plays in
-    a browser. Frames begin at --azimuth and the light's azimuth and go on in equal steps; a full
-    turn ends one step before its beginning, so that it plays round and round. The splats are
-    planned and the program is compiled once for all frames. With --turn camera, unless there is a
-    fill, the light below the surface is computed once too; shadow maps are made once for an
-    environment that turns. Frames that are there are kept: after an interruption, run the same
-    command again. A record in the folder, turntable.json, makes sure that frames with different
-    options are not mixed. Where a launcher has started several processes
-    (SLURM, Open MPI, or JAX_COORDINATOR_ADDRESS, JAX_NUM_PROCESSES and JAX_PROCESS_ID), they share
-    the frames of one folder that all of them see.
+    Each frame is an EXR file with every layer and a PNG file; the animation turntable.webp plays in
+    a browser. Frames start at --azimuth and the light's azimuth and continue in equal steps; a full
+    turn ends one step before its start, so that it can repeat. The splats are planned and the
+    program is compiled once for all frames. With --turn camera and no fill, the light below the
+    surface is computed once too; for an environment that turns, shadow maps are rendered once.
+    Existing frames are kept: after an interruption, run the same command again. A record in the
+    folder, turntable.json, prevents that frames with different options are mixed. If a launcher has
+    started several processes (SLURM, Open MPI, or JAX_COORDINATOR_ADDRESS, JAX_NUM_PROCESSES and
+    JAX_PROCESS_ID), they share the frames of one folder that all of them can access.
 
     Example: splatjax turntable head.ply --material skin --frames 72 --output head
     """
 
-    #: The folder to write to; it is made where its parent exists.
+    #: The folder to write to. It is created if its parent exists.
     output: Path = Path("turntable")
     #: Number of frames.
     frames: int = 36
     turn: Annotated[
         Literal["object", "camera", "light"],
         tyro.conf.arg(
-            help="What turns: the camera around object and light, the light around object and "
-            "camera, or the object before both, which is the same as camera and light together "
-            "around it. The fill keeps beside the camera."
+            help="The part that turns: the camera around object and light, the light around "
+            "object and camera, or the object (camera and light together around it). The "
+            "fill stays beside the camera."
         ),
     ] = "object"
     degrees: Annotated[
         float,
         tyro.conf.arg(
-            help="How far camera and light go around in all: to greater azimuths, or to smaller "
-            "ones if negative. What stands before both seems to turn the other way."
+            help="Total angle by which camera and light turn: to greater azimuths, or to "
+            "smaller ones if negative. An object seems to turn the other way."
         ),
     ] = 360.0
     #: Frames per second of turntable.webp, from 0.1 to 60.
     fps: float = 24.0
 
     def run(self) -> None:
-        in_webp = f"be {_LARGEST} at most in turntable.webp"
+        in_webp = f"be at most {_LARGEST} in turntable.webp"
         self.check(
             {
                 "frames": (
@@ -200,10 +200,10 @@ class Turntable(ViewOptions):
         light = None
         if self.turn == "camera" and (self.environment_name is not None or self.fill == 0):
             # No light moves: passes 1 and 4 are the same in every frame.
-            with stage("lighting the splats"):
+            with stage("computing the light at the splats"):
                 light = jax.block_until_ready(sj.illuminate(scenes[0], plan, settings))
         elif keeps_shadows:
-            with stage(f"making {_DIRECTIONS} shadow maps"):
+            with stage(f"rendering {_DIRECTIONS} shadow maps"):
                 light = jax.block_until_ready(sj.transfer(scenes[0], plan, settings))
 
         def make(i: int) -> None:

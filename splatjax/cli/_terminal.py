@@ -180,7 +180,7 @@ def complete(
     _check_record(record_path, record, items)
     missing, folder = _missing(items), record_path.parent
     if len(missing) < len(items):
-        note(f"{len(items) - len(missing)} of {len(items)} {name} are there already, and are kept")
+        note(f"{len(items) - len(missing)} of {len(items)} {name} exist already, and are kept")
     index, processes = process_index_and_count()
     own = missing[index::processes]
     if own:
@@ -193,13 +193,13 @@ def complete(
                     make(i)
                     report(number)
         except (KeyboardInterrupt, OSError):
-            note(f"the {name} in {folder} are whole; run the same command again to continue")
+            note(f"the {name} in {folder} are complete; run the same command again to continue")
             raise
     left = _missing(items)
     if left and folder.exists():
         note(
-            f"other processes are still at work on {len(left)} {name}; the last of them joins all, "
-            "or the same command does when it is run again"
+            f"other processes still compute {len(left)} {name}; the last of them joins all, or "
+            "run the same command again"
         )
     return own if left else range(len(items))
 
@@ -209,11 +209,11 @@ def _missing(items: Sequence[tuple[Path, ...]]) -> list[int]:
 
 
 def _check_record(path: Path, record: Mapping[str, Any], items: Sequence[tuple[Path, ...]]) -> None:
-    remedy = "name another --output, or delete that folder"
+    remedy = "give another --output, or delete that folder"
     if not path.exists():
         files = [file for item in items for file in item if file.exists()]
         if files:
-            raise ValueError(f"{files[0]}: has no record of what it is made of; {remedy}")
+            raise ValueError(f"{files[0]}: has no record of its settings; {remedy}")
         return
     before = read_record(path)
     changes = [
@@ -245,9 +245,9 @@ def process_index_and_count() -> tuple[int, int]:
         jax.distributed.initialize(**numbers)
     except (ValueError, TypeError) as error:
         raise ValueError(
-            f"several processes were started, but not all of them is known: {error} Set "
-            "JAX_COORDINATOR_ADDRESS, JAX_NUM_PROCESSES"
-            " and JAX_PROCESS_ID, or JAX_NUM_PROCESSES=1 for a process of its own"
+            f"several processes were started, but their settings are incomplete: {error} Set "
+            "JAX_COORDINATOR_ADDRESS, JAX_NUM_PROCESSES and JAX_PROCESS_ID, or "
+            "JAX_NUM_PROCESSES=1 for a single process"
         ) from None
     place = jax.process_index(), jax.process_count()
     jax.distributed.shutdown()

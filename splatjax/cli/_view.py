@@ -45,50 +45,54 @@ class ViewOptions:
     width: int = 512
     #: Height of the picture, pixels.
     height: int = 512
-    #: Of the camera, seen from the middle of the splats.
+    #: Azimuth of the camera around the middle of the splats.
     azimuth: float = 25.0
-    #: Of the camera; between -90 and 90, both excluded.
+    #: Elevation of the camera, between -90 and 90, both excluded.
     elevation: float = 0.0
     #: Vertical field of view.
     fov: float = 25.0
-    #: Of a single light, in the place of the studio; beyond 90 it stands behind. Or -20.
+    #: Azimuth of a single light that replaces the studio; beyond 90 it is behind. Default with
+    #: another option of the single light: -20.
     light_azimuth: OptionalFloat = None
-    #: Of the single light; or 30.
+    #: Elevation of the single light. Default with another option of the single light: 30.
     light_elevation: OptionalFloat = None
-    #: Strength of a light without shadows beside the camera, over that of the single light; or 0.1.
+    #: Strength of a light without shadows beside the camera, relative to the single light. Default
+    #: with another option of the single light: 0.1.
     fill: OptionalFloat = None
-    #: Latitude-longitude map of linear radiance, in the place of single lights: an EXR or HDR file,
-    #: or the name of a built-in one: studio, overcast, sun. The studio where no light is given.
+    #: Latitude-longitude map of linear radiance, instead of single lights: an EXR or HDR file, or
+    #: the name of a built-in one (studio, overcast, sun). Without any light option, the studio.
     environment: Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
     #: Rotation of the environment about the vertical axis, degrees; at 0 the middle of the map is
     #: the front (+z).
     environment_rotation: float = 0.0
-    #: How light spreads below the surface: by the profile of a flat piece (clusters), or by the
-    #: diffusion equation in the closed body itself, from the coefficients of the material (shape).
+    #: Model of the light below the surface: the profile of a flat surface (clusters), or the
+    #: diffusion equation in the closed body, from the coefficients of the material (shape).
     diffusion: Literal["clusters", "shape"] = "clusters"
-    #: How many times light that has left the body may enter it again: 1 or 2 brighten folds.
+    #: Number of times that light may leave the body and enter it again: 1 or 2 brighten folds.
     bounces: int = 0
-    #: Of the PNG: black, transparent, or the environment. The EXR has the coverage, and none.
+    #: Background of the PNG: black, transparent, or the environment. The EXR has coverage and no
+    #: background.
     background: Literal["black", "transparent", "environment"] = "black"
-    #: Of the PNG, in stops: each doubles its brightness. The EXR is never changed by it.
+    #: Exposure of the PNG, in stops: each doubles its brightness. The EXR does not depend on it.
     exposure: float = 0.0
-    #: Whether light spreads below the surface. Without, it leaves where it enters.
+    #: Let light spread below the surface. Without scattering it leaves where it enters.
     scattering: bool = True
-    #: Whether to use the albedo of the splats, which the built-in bust has. Without, color is the
-    #: material's own.
+    #: Use the albedo of the splats (the built-in bust has one). Without it, the color is that of
+    #: the material.
     albedo: bool = True
     #: Number of splats of the built-in bust.
     count: int = 200_000
-    #: Size of the body: at 0.2 the bust is 7 cm tall, and light goes five times as far in it.
+    #: Size of the body: at 0.2 the bust is 7 cm tall, and light travels five times as far relative
+    #: to it.
     scale: float = 1.0
     #: Upward axis of the PLY file.
     up: UpAxis = "y"
-    #: Print nothing but the files that are written, and errors.
+    #: Print only the files that are written, and errors.
     quiet: bool = False
 
     def check(self, more_rules: Rules | None = None) -> None:
-        """Raise `ValueError` for options that break a rule, for a material that no PNG file shows,
-        and for more memory than there is.
+        """Raise `ValueError` for options that break a rule, for a material that a PNG file cannot
+        show, and for too little memory.
         """
         finite, positive = "be a finite number", "be 1 or more"
         azimuth, elevation, fill = self.single_light
@@ -102,13 +106,13 @@ class ViewOptions:
             "exposure": (math.isfinite(self.exposure), finite),
             "background": (
                 self.background != "environment" or self.environment_name is not None,
-                "be black or transparent where single lights are given and no --environment",
+                "be black or transparent with single lights and no --environment",
             ),
             "bounces": (self.bounces >= 0, "be 0 or more"),
             "diffusion": (
                 self.diffusion == "clusters"
                 or (self.scattering and sj.load_material(self.material).medium is not None),
-                f"be clusters without scattering, or where {self.material} has no [medium]",
+                f"be clusters without scattering, or if {self.material} has no [medium]",
             ),
             "width": (self.width >= 1, positive),
             "height": (self.height >= 1, positive),
@@ -162,7 +166,7 @@ class ViewOptions:
     def load(self) -> tuple[sj.Splats, sj.Material]:
         """Return the splats, and the material with which they are rendered."""
         with stage(
-            f"reading {self.splats}" if self.splats else f"making the bust with {self.count} splats"
+            f"reading {self.splats}" if self.splats else f"making the bust of {self.count} splats"
         ):
             whole = sj.read_splats(self.splats, up=self.up) if self.splats else sj.bust(self.count)
             splats = self.adjusted(whole)
@@ -178,8 +182,8 @@ class ViewOptions:
                 )
             material = material.white()
             note(
-                f"color is the splats' own albedo, and {self.material} only spreads the light; "
-                "--no-albedo shows its own color"
+                f"the color is the albedo of the splats, and {self.material} only spreads the "
+                "light; --no-albedo gives the color of the material"
             )
         if material.channels == 1:  # the same weights for red, green and blue
             weights = jnp.tile(material.gaussians.weights, 3)
@@ -289,9 +293,9 @@ class ViewOptions:
         widths = np.sqrt(np.asarray(material.gaussians.variances))[unresolved]
         if self.scattering and len(widths):
             _note_once(
-                "narrower than the splats, so that the surface's own light stands for them: "
-                f"Gaussians of standard deviations {', '.join(f'{w:.3g}' for w in widths)} mm; "
-                "more splats show them, or a smaller body (--scale)"
+                "unresolved, because they are narrower than the splats: Gaussians of standard "
+                f"deviations {', '.join(f'{w:.3g}' for w in widths)} mm; more splats resolve "
+                "them, or a smaller body (--scale)"
             )
 
 
@@ -305,7 +309,8 @@ def draw(
     frame = jax.block_until_ready(sj.render(scene, camera, settings, plan, light=light))
     if not frame.overflow <= 0:
         raise ValueError(
-            f"the plan's capacity is exceeded: {float(frame.overflow):.2f} times of it is needed"
+            f"the plan's capacity is exceeded: {float(frame.overflow):.2f} times the capacity "
+            "is needed"
         )
     return frame
 

@@ -147,9 +147,9 @@ class ShapeDiffuser(AbstractDiffuser):
         opening = np.linalg.norm(areas @ normals) / area
         if opening > _OPEN:
             raise ValueError(
-                f"the normals of the splats, weighted by area, sum to {opening:.2g} of the area, "
-                "and those of a closed body to 0; close the mesh for ShapeDiffuser, or render with "
-                "ClusterDiffuser"
+                f"the normals of the splats, weighted by area, sum to {opening:.2g} of the "
+                "area instead of 0, so the body is open; close the mesh for ShapeDiffuser, or "
+                "render with ClusterDiffuser"
             )
         middle = areas @ centers / area
         volume = areas @ np.sum(normals * (centers - middle), axis=1) / 3

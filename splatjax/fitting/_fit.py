@@ -49,13 +49,14 @@ class ErrorByCount(eqx.Module):
         """
         if isinstance(self.error, Tracer):
             raise ValueError(
-                "the least number of Gaussians depends on values; find it outside of jit and vmap"
+                "the least number of Gaussians depends on values; compute it outside of jit "
+                "and vmap"
             )
         worst = np.max(np.asarray(self.error), axis=1)
         if not error > 0 or not np.any(worst <= error):
             raise ValueError(
-                f"an error of {error:g} is not reached: {len(worst)} Gaussians leave "
-                f"{worst[-1]:.2e} (worst channel); ask for that, or allow more Gaussians"
+                f"error is {error:g}, and {len(worst)} Gaussians reach {worst[-1]:.2e} (worst "
+                "channel); give a larger error, or allow more Gaussians"
             )
         return int(np.argmax(worst <= error)) + 1
 
@@ -195,8 +196,8 @@ def fit_gaussians(
     if isinstance(count, LeastCount):
         if not isinstance(start, GreedyInsertion):
             raise ValueError(
-                f"start is given, and {count}, which finds its own; leave start out, or give a "
-                "count"
+                f"start is given together with {count}, which computes its own start; leave "
+                "start out, or give a count"
             )
         by_count = error_by_count(profile, count.largest, spread=spread, weights=weights, rule=rule)
         # Finishing a fit of shared variances may move error from one channel to another.

@@ -20,8 +20,8 @@ def norm_radii(
     """Compute radii and weights of integrals of `r R^2`, where the integral exists."""
     if profile.singular and rule.reaches_origin:
         raise ValueError(
-            f"{type(profile).__name__} goes to infinity like 1/r, so that the integral of r R^2 "
-            "from 0 (Eq. 3) does not exist; state where it starts, in length scales of the "
+            f"{type(profile).__name__} diverges like 1/r, so the integral of r R^2 from 0 (Eq. "
+            "3) does not exist; give the radius where it starts, in length scales of the "
             "profile: rule=L2_QUADRATURE.beyond(1.0)"
         )
     return rule.radii(profile)

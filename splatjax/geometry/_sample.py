@@ -47,8 +47,8 @@ def lookup_at(
         return None
     if mesh.uvs is None:
         raise ValueError(
-            "the mesh has no texture coordinates, so no texture can be laid on it; give a mesh "
-            "with UVs, or no textures"
+            "the mesh has no texture coordinates, which textures need; give a mesh with UVs, "
+            "or no textures"
         )
     u, v = np.einsum("nc,nci->in", points.barycentrics, mesh.uvs[points.faces])
     height, width = picture.shape[:2]
@@ -262,10 +262,9 @@ def _covered(centers: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.n
             np.median(each[near[alone]], axis=1) for each in (areas, radii)
         )
         warnings.warn(
-            f"{alone.sum()} of {len(centers)} points lie alone, one of them "
-            f"{distances[alone].max():.3g} mm from its neighbors;"
-            " they are kept, as specks as large as those: remove them if they are noise of a "
-            "scanner",
+            f"{alone.sum()} of {len(centers)} points are isolated, one of them "
+            f"{distances[alone].max():.3g} mm from its neighbors; they are kept with the size "
+            "of those, so remove them if they are noise of a scanner",
             stacklevel=3,
         )
     return (areas / np.bincount(place))[place], radii[place]

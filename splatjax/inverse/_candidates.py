@@ -54,8 +54,8 @@ class Prediction(eqx.Module):
 
     def __str__(self) -> str:
         return (
-            f"{self.candidate.name}: the worst known, {self.worst},"
-            f" then to {percent(self.worst.deviation)}"
+            f"{self.candidate.name}: the least known combination, {self.worst}, would be known "
+            f"to {percent(self.worst.deviation)}"
         )
 
 
@@ -89,7 +89,7 @@ def next_pictures(
     candidates = list(candidates)
     if not candidates:
         raise ValueError(
-            "candidates is empty: name a picture that could be taken, or take "
+            "candidates is empty; give a picture that could be taken, or "
             "default_candidates(splats, camera)"
         )
     medium, loss = recovery.medium, SquaredLoss()

@@ -280,7 +280,7 @@ def fit_scene(
         x = ahead
     if best is None:
         raise ValueError(
-            "loss or gradient of the start is not finite: look for NaN in splats, lights and "
+            "loss or gradient of the start is not finite; check for NaN in splats, lights and "
             "cameras, and for splats at a light"
         )
     pictures, residuals = compared(
@@ -307,8 +307,8 @@ def _check(
 ) -> None:
     if not observations or not parts or steps < 1:
         raise ValueError(
-            f"one observation, one part and one step are needed at least; got {len(observations)}, "
-            f"{len(parts)} and {steps}"
+            "at least one observation, one part and one step are needed; got "
+            f"{len(observations)}, {len(parts)} and {steps}"
         )
     kinds = [type(part).__name__ for part in parts]
     if len(set(kinds)) < len(kinds):
@@ -317,6 +317,7 @@ def _check(
     for i, observation in enumerate(observations):
         if not isinstance(observation.intensity, KnownIntensity):
             raise ValueError(
-                f"observations[{i}].intensity is {type(observation.intensity).__name__}(): that is "
-                "for recover; here LightStrengths among the parts lets lights be of any strength"
+                f"observations[{i}].intensity is {type(observation.intensity).__name__}(), "
+                "which is for recover; for unknown strengths of lights, add LightStrengths to "
+                "parts"
             )

@@ -233,8 +233,8 @@ def check_counted(counted: Sequence[Float[Array, "height width"]]) -> None:
     for i, pixels in enumerate(counted):
         if not np.any(pixels):
             raise ValueError(
-                f"no pixel of observations[{i}] counts: none is filled by the splats, left by the "
-                "mask and of known color; check camera, mask and NaN"
+                f"no pixel of observations[{i}] counts: none is covered by the splats, kept by "
+                "the mask and finite; check camera, mask and NaN"
             )
 
 

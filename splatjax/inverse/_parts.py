@@ -92,8 +92,8 @@ class AlbedoMap(AbstractPart):
     def coordinates(self, pictured: PicturedScene) -> Float[Array, "splats channels"]:
         if pictured.splats.albedo is None:
             raise ValueError(
-                "splats.albedo is None, and AlbedoMap has nothing to move: start from a map, such "
-                "as 0.5 everywhere"
+                "splats.albedo is None, and AlbedoMap needs a start; give a map, such as 0.5 "
+                "everywhere"
             )
         return jnp.zeros_like(pictured.splats.albedo)
 
@@ -123,8 +123,8 @@ class LightStrengths(AbstractPart):
         for light in pictured.lights:
             if not light.strength_field:
                 raise ValueError(
-                    f"{type(light).__name__}.strength_field names no field that LightStrengths may "
-                    "move"
+                    f"{type(light).__name__}.strength_field names no field that LightStrengths "
+                    "can change"
                 )
         return tuple(
             jnp.zeros_like(getattr(light, light.strength_field)) for light in pictured.lights

@@ -150,8 +150,8 @@ def recover(
             for values in (medium.sigma_a, medium.sigma_s_prime)
         )
         report(
-            f"round {rounds}, of {_ROUNDS} at most: rendering the {count} layers of "
-            f"sigma_a {sigma_a}, sigma_s' {sigma_s_prime}",
+            f"round {rounds} of at most {_ROUNDS}: rendering the {count} layers of sigma_a "
+            f"{sigma_a}, sigma_s' {sigma_s_prime}",
             medium,
         )
         profile, rule = model.profile(medium), model.rule
@@ -196,8 +196,8 @@ def recover(
     assert best is not None
     if not settled:
         warnings.warn(
-            f"the coefficients still moved in round {rounds}, the last; this is the round with the "
-            "least loss: start from its medium to go on",
+            f"the coefficients still changed in the last round ({rounds}), and this is the "
+            "round with the least loss; start from its medium to continue",
             RuntimeWarning,
             stacklevel=2,
         )
@@ -212,26 +212,26 @@ def _check(
 ) -> None:
     if not observations or not starts:
         raise ValueError(
-            f"one observation and one start are needed at least; got {len(observations)} and "
+            f"at least one observation and one start are needed; got {len(observations)} and "
             f"{len(starts)}"
         )
     eta = starts[0].eta
     for i, start in enumerate(starts):
         if not np.array_equal(start.eta, eta):
             raise ValueError(
-                f"starts[{i}].eta is {start.eta.tolist()}, that of the first {eta.tolist()}: the "
-                "index is known, hence one"
+                f"starts[{i}].eta is {start.eta.tolist()}, and that of the first "
+                f"{eta.tolist()}; give all the same index"
             )
         check_values(
             f"starts[{i}].sigma_a",
             start.sigma_a,
-            "above 0, since logarithms are searched: 1e-4 is little",
+            "above 0, because logarithms are searched; use 1e-4 for a small one",
             lambda x: x > 0,
         )
     if surface is not None and not np.allclose(surface.eta, eta, rtol=_SAME_INDEX):
         raise ValueError(
-            f"surface.eta is {float(surface.eta):g}, starts[0].eta {eta.tolist()}: a material has "
-            "one index of refraction, which recover takes as known; give it to both"
+            f"surface.eta is {float(surface.eta):g}, starts[0].eta {eta.tolist()}: recover "
+            "needs one known index of refraction; give both the same"
         )
     check_channels(observations, starts[0].channels, "starts")
     if splats.albedo is not None and splats.albedo.shape[1] != starts[0].channels:

@@ -241,18 +241,16 @@ class Recovery(AbstractEstimate):
             summary += lines
             if unresolved > _MOST:
                 summary.append(
-                    f"  {percent(unresolved)} of its light spreads less than the splats are "
-                    "apart, and hardly shows how far; take more splats, or a smaller piece from "
-                    "closer up"
+                    f"  {percent(unresolved)} of its light spreads less than the spacing of "
+                    "the splats, so its width is hardly determined; take more splats, or a "
+                    "closer picture"
                 )
         if not self.noise_is_known:
-            summary.append(
-                "error bars are those of the residuals, as if their pixels were independent"
-            )
+            summary.append("error bars follow from the residuals, with independent pixels")
         elif float(self.chi_squared) > _TOO_LARGE:
             summary.append(
-                f"the residuals are {float(self.chi_squared) ** 0.5:.2g} times the noise: the "
-                "model lacks something, and the error bars are too small"
+                f"the residuals are {float(self.chi_squared) ** 0.5:.2g} times the noise; the "
+                "model is incomplete, and the error bars are too small"
             )
         return "\n".join(summary)
 
@@ -277,13 +275,13 @@ def combined(recoveries: Sequence[Recovery]) -> Estimate:
     **Raises:** `ValueError` for no recovery, and for channels or indices of refraction that differ.
     """
     if not recoveries:
-        raise ValueError("recoveries is empty; give one at least")
+        raise ValueError("recoveries is empty; give at least one")
     eta = recoveries[0].medium.eta
     for i, recovery in enumerate(recoveries):
         if not np.array_equal(recovery.medium.eta, eta):
             raise ValueError(
-                f"recoveries[{i}].medium.eta is {recovery.medium.eta.tolist()}, that of the first "
-                f"{eta.tolist()}: they are of different materials"
+                f"recoveries[{i}].medium.eta is {recovery.medium.eta.tolist()}, and that of "
+                f"the first {eta.tolist()}; combine recoveries of one material"
             )
     points = np.log(
         [np.stack([one.medium.sigma_a, one.medium.sigma_s_prime], axis=-1) for one in recoveries]

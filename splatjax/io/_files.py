@@ -29,7 +29,7 @@ def existing_file(path: StrPath) -> Path:
     if "\0" in str(path) or not path.exists():
         raise FileNotFoundError(f"{path}: there is no such file; check the path")
     if path.is_dir():
-        raise IsADirectoryError(f"{path}: is a folder; name a file")
+        raise IsADirectoryError(f"{path}: is a folder; give a file")
     return path
 
 
@@ -46,7 +46,7 @@ def check_units(path: StrPath, mm_per_unit: float, up: str = "y") -> None:
     """Refuse a length of the unit (mm), or an upward axis, that cannot be."""
     if not 0 < mm_per_unit < np.inf:
         raise ValueError(
-            f"{path}: mm_per_unit is {mm_per_unit}; it must be the positive length of the file's "
+            f"{path}: mm_per_unit is {mm_per_unit}; give the positive length of the file's "
             "unit in mm"
         )
     if up not in ("y", "z"):
@@ -73,7 +73,7 @@ def atomic_path(path: StrPath) -> Generator[Path, None, None]:
     folder = path.parent
     if not folder.is_dir():
         raise FileNotFoundError(
-            f"{path}: there is no folder {folder}; make it first, or name another"
+            f"{path}: there is no folder {folder}; make it first, or give another"
         )
     temporary = folder / f".{path.stem}-{secrets.token_hex(8)}{path.suffix}"
     try:
@@ -88,7 +88,7 @@ def atomic_path(path: StrPath) -> Generator[Path, None, None]:
         reason = error.strerror or " ".join(str(error).split())
         raise type(error)(
             error.errno,
-            f"cannot be written: {reason}; what stood there before is untouched",
+            f"cannot be written: {reason}; an existing file is unchanged",
             str(path),
         ) from error
     finally:
@@ -124,10 +124,10 @@ def read_record(path: StrPath) -> dict[str, Any]:
         record = json.loads(Path(path).read_text(encoding="utf-8"))
     except ValueError as error:
         raise ValueError(
-            f"{path}: is no JSON file ({error}); delete it, or name another folder"
+            f"{path}: is not a JSON file ({error}); delete it, or give another folder"
         ) from None
     if not isinstance(record, dict):
-        raise ValueError(f"{path}: is no record; delete it, or name another folder")
+        raise ValueError(f"{path}: is not a record; delete it, or give another folder")
     return record
 
 

@@ -52,8 +52,8 @@ def read_planes(
     if pixels is None or fault:
         fault = " ".join(fault.replace(f'"{path}"', "").split())
         raise ValueError(
-            f"{path}: cannot be read as a picture ({fault}); give a whole JPEG, PNG, TIFF or "
-            "OpenEXR"
+            f"{path}: cannot be read as a picture ({fault}); give a complete JPEG, PNG, TIFF "
+            "or OpenEXR file"
         )
     planes = dict(zip(spec.channelnames, np.moveaxis(pixels, -1, 0), strict=True))
     attributes = {each.name: each.value for each in spec.extra_attribs}
@@ -87,7 +87,7 @@ def read_color(path: StrPath) -> Float[np.ndarray, "height width 3"]:
     """
     values, is_linear = _colors(path)
     if not ((values >= 0) & (values <= 1)).all():
-        raise ValueError(f"{path}: has an albedo outside [0, 1]; scale it, or remove what is NaN")
+        raise ValueError(f"{path}: has an albedo outside [0, 1]; scale it, and remove NaN")
     return np.broadcast_to(values if is_linear else srgb_to_linear(values), (*values.shape[:2], 3))
 
 
@@ -164,8 +164,8 @@ def write_animation(
     """
     if not frames or not 0.1 <= frames_per_second <= 60:
         raise ValueError(
-            f"{path}: {len(frames)} frames at {frames_per_second:g} per second cannot be shown; "
-            "give one at least, and a number from 0.1 to 60"
+            f"{path}: {len(frames)} frames at {frames_per_second:g} per second cannot be "
+            "written; give at least one frame, and 0.1 to 60 per second"
         )
     # Whole milliseconds, but every frame begins when it should.
     begins = [round(1000 * i / frames_per_second) for i in range(len(frames) + 1)]
@@ -187,8 +187,8 @@ class _Film(Image.Image):
             image.load()
             if self.size not in ((0, 0), image.size):
                 raise ValueError(
-                    f"{self._frames[frame]}: is {image.size} pixels, but the first is {self.size}; "
-                    "give one size"
+                    f"{self._frames[frame]}: is {image.size} pixels, and the first is "
+                    f"{self.size}; give all the same size"
                 )
             self.im, self._mode, self._size = image.im, image.mode, image.size
 
@@ -283,8 +283,8 @@ def read_exr(path: StrPath) -> Frame:
             arrays[field] = values if field == "shadow" else np.moveaxis(values, names.ndim - 1, -1)
     except (KeyError, ValueError) as error:
         raise ValueError(
-            f"{path}: lacks {' '.join(str(error).split())}, so it is no frame; give a file written "
-            "by write_exr"
+            f"{path}: lacks {' '.join(str(error).split())}, so it is not a frame; give a file "
+            "written by write_exr"
         ) from None
     return Frame(**{name: jnp.asarray(array, jnp.float32) for name, array in arrays.items()})
 
@@ -298,7 +298,7 @@ def read_manifest(path: StrPath) -> dict[str, Any]:
     _, header, _ = read_planes(path)
     if not isinstance(header.get(_MANIFEST), str):
         remedy = "give a picture that `splatjax render` wrote"
-        raise ValueError(f"{path}: does not record what it was made of; {remedy}")
+        raise ValueError(f"{path}: has no record of its settings; {remedy}")
     with naming(path):
         return json.loads(header[_MANIFEST])
 

@@ -80,8 +80,8 @@ def material_path(name_or_path: StrPath) -> Path:
     if name_or_path in list_materials():
         return profiles_folder() / f"{name_or_path}.toml"
     raise ValueError(
-        f"{name_or_path}: is no known material; {nearest(name_or_path, list_materials())} (a file "
-        f"is named by its path: ./{name_or_path}.toml)"
+        f"{name_or_path}: is not a known material; {nearest(name_or_path, list_materials())} "
+        f"(a file is named by its path: ./{name_or_path}.toml)"
     )
 
 
@@ -101,8 +101,7 @@ def load_material(name_or_path: StrPath) -> Material:
     if "fit" not in tables.entries:
         path, fitted = tables.path, tables.path.with_name(f"{tables.path.stem}_fitted.toml")
         raise ValueError(
-            f"{path}: has no [fit]; take what `splatjax fit {path} --output {fitted}` makes of its "
-            "coefficients"
+            f"{path}: has no [fit]; fit its coefficients by `splatjax fit {path} --output {fitted}`"
         )
     fit = tables.table("fit", tables.entries["fit"])
     fit.one_of("unit", [VARIANCE_UNIT])
@@ -155,7 +154,9 @@ def load_medium(name_or_path: StrPath) -> Medium:
     if isinstance(profile, Dipole):
         return profile.medium
     have = "layers or pigments (`load_profile`)" if profile else "Gaussians (`load_material`)"
-    raise ValueError(f"{tables.path}: has no [medium]; known are only its {have}")
+    raise ValueError(
+        f"{tables.path}: has no [medium], only its {have}; give a material with coefficients"
+    )
 
 
 def load_mean_cosine(name_or_path: StrPath) -> float:
@@ -211,8 +212,8 @@ def save_material(
     """
     if not isinstance(profile, Dipole | BetterDipole | PhotonBeam | LayeredMultipole | Skin | None):
         raise ValueError(
-            f"profile must be a Dipole, BetterDipole, PhotonBeam, LayeredMultipole or Skin, "
-            f"which a file can hold; got {type(profile).__name__}"
+            "profile must be a Dipole, BetterDipole, PhotonBeam, LayeredMultipole or Skin, "
+            f"which a file can store; got {type(profile).__name__}"
         )
     tables: dict[str, Any] = {}
     if isinstance(profile, Skin):
@@ -263,7 +264,7 @@ def _read(name_or_path: StrPath) -> tuple[Table, Dipole | LayeredMultipole | Ski
     tables = Table(
         path,
         "",
-        read_toml(path, "check the path, or name a material (`list_materials()`)"),
+        read_toml(path, "check the path, or give a material (`list_materials()`)"),
         _TABLES,
     )
     names = {"medium": "[medium]", "layers": "[[layers]]", "skin": "[skin]"}
@@ -273,7 +274,7 @@ def _read(name_or_path: StrPath) -> tuple[Table, Dipole | LayeredMultipole | Ski
             " and ".join(names[kind] for kind in kinds)
             or f"no {', '.join(names.values())} or [fit]"
         )
-        raise ValueError(f"{path}: has {has}; a material has one of them")
+        raise ValueError(f"{path}: has {has}; give one of them")
     _surface(tables)
     if "medium" in kinds:
         return tables, Dipole(medium_of(tables.table("medium", MEDIUM_ENTRIES)))

@@ -137,8 +137,8 @@ def read_textured_mesh(
     has_maps = any(name is not None for name in (albedo, specular, normal))
     if has_maps and (mesh.uvs is None or np.isnan(mesh.uvs).any()):
         raise ValueError(
-            f"{path}: has no texture coordinates, so no map can be laid on it; give a mesh with "
-            "UVs (in glTF, with a material), or no maps"
+            f"{path}: has no texture coordinates, which maps need; give a mesh with UVs (in "
+            "glTF, with a material), or no maps"
         )
     if albedo is not None:
         mesh = Mesh(mesh.vertices, mesh.faces, mesh.normals, mesh.uvs)
@@ -146,8 +146,8 @@ def read_textured_mesh(
         top = mesh.vertices[:, 1].max() / mm_per_unit
         if not crop_min_y < top:
             raise ValueError(
-                f"{path}: crop_min_y = {crop_min_y:g} leaves nothing; the mesh ends at y = {top:g} "
-                "in the file's unit"
+                f"{path}: crop_min_y is {crop_min_y:g}, which removes the whole mesh; the mesh "
+                f"ends at y = {top:g} in the file's unit"
             )
         mesh = cut_below(mesh, crop_min_y * mm_per_unit)
     return mesh, textures
@@ -161,7 +161,7 @@ def _read_pieces(path: Path, up: str) -> list[Piece]:
     """
     kind = path.suffix[1:].lower()
     if kind not in FORMATS:
-        raise ValueError(f"{path}: is of no mesh format known here; give {', '.join(FORMATS)}")
+        raise ValueError(f"{path}: is not a known mesh format; give {', '.join(FORMATS)}")
     with one_sentence(path):
         found = load_with_trimesh(path, kind)
         pieces = {
@@ -181,7 +181,7 @@ def _read_pieces(path: Path, up: str) -> list[Piece]:
                 placed.append((pieces[node["geometry"]], matrix))
         if not placed:
             raise ValueError(
-                f"{path}: holds no triangle; give a triangle mesh, or read points with read_splats"
+                f"{path}: has no triangle; give a triangle mesh, or read points with read_splats"
             )
         corners = sum(3 * len(each.mesh.faces) + len(each.mesh.vertices) for each, _ in placed)
         check_memory(
@@ -235,15 +235,15 @@ def _placed(piece: Piece, matrix: Float[np.ndarray, "4 4"], up: str, repeats: bo
     beyond = np.abs(uvs - 0.5).max() - 0.5 if has_uvs else 0.0
     ends = beyond > _BORDER and not repeats
     faults = {
-        f"vertices that are not finite, or reach {_FARTHEST:g}": not (
+        f"vertices that are not finite, or beyond {_FARTHEST:g}": not (
             np.abs(vertices) < _FARTHEST
         ).all(),
-        f"faces of other vertices than its {len(vertices)}": not (
+        f"faces with indices beyond its {len(vertices)} vertices": not (
             (faces >= 0) & (faces < len(vertices))
         ).all(),
         "normals that are not finite": not np.isfinite(normals).all(),
         "colors outside [0, 1]": ((mesh.colors < 0) | (mesh.colors > 1)).any(),
-        f"texture coordinates that are not finite, or reach {_MOST_TILES:g}": not (
+        f"texture coordinates that are not finite, or beyond {_MOST_TILES:g}": not (
             beyond < _MOST_TILES
         ),
         "a texture on faces without texture coordinates": piece.texture and not has_uvs,

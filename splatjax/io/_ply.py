@@ -18,7 +18,7 @@ from ._trimesh import FORMATS, load_with_trimesh, one_sentence
 
 _SHORTEST, _LONGEST = 1e-9, 1e9  # mm: beyond, single precision loses areas
 _COVER = (
-    "cover it with splats first: `splatjax sample {} --mm-per-unit ... --output ...`, or "
+    "sample splats from it first: `splatjax sample {} --mm-per-unit ... --output ...`, or "
     "sample_mesh"
 )
 _COMPLETE = (
@@ -90,8 +90,7 @@ def read_splats(path: StrPath, *, mm_per_unit: float = 1.0, up: str = "y") -> Sp
     _check_places(path, centers, estimated=fields["radii"] is None or fields["areas"] is None)
     if fields["radii"] is None and columns.get("face"):
         warnings.warn(
-            f"{path}: has faces, and only their corners are taken, as points; "
-            f"{_COVER.format(path)}",
+            f"{path}: has faces, and only their corners are read, as points; {_COVER.format(path)}",
             stacklevel=2,
         )
     with naming(path):
@@ -114,7 +113,7 @@ def write_splats(path: StrPath, splats: Splats) -> None:
             table = np.asarray(values, "<f4").reshape(splats.count, -1)
             if table.shape[1] != len(aliases[0]):
                 raise ValueError(
-                    f"{path}: {field} has {table.shape[1]} channels; a PLY holds "
+                    f"{path}: {field} has {table.shape[1]} channels; a PLY file stores "
                     f"{', '.join(aliases[0])}"
                 )
             names += aliases[0]
@@ -162,7 +161,7 @@ class SplatFile:
         self.path, self.part, self.mm_per_unit, self.up = existing_file(path), part, mm_per_unit, up
         check_units(self.path, mm_per_unit, up)
         if part < 1:
-            raise ValueError(f"{path}: part is {part}; it must be at least one splat")
+            raise ValueError(f"{path}: part is {part}; give at least one splat")
         with one_sentence(self.path), open(path, "rb") as file:
             from trimesh.exchange.ply import _parse_header  # only where it is needed
 
@@ -170,7 +169,7 @@ class SplatFile:
             name, vertices = next(iter(elements.items()))
             kinds = vertices["properties"]
             if is_text or name != "vertex" or any("LIST" in kind for kind in kinds.values()):
-                raise ValueError("its vertices do not stand first, as binary without lists")
+                raise ValueError("its vertices are not the first element, in binary without lists")
             self.count, self._offset = vertices["length"], file.tell()
             self._names, self._columns = tuple(kinds), np.dtype(list(kinds.items()))
             self._rows(0, self.count)  # raises where the file is cut short
@@ -216,9 +215,9 @@ def _splat_fields(
     """
     if columns.keys() >= _GAUSSIAN_SPLATTING:
         raise ValueError(
-            f"{path}: is a Gaussian-splatting scene (f_dc, scale, rot, opacity): its fuzzy "
-            "ellipsoids carry baked radiance and no surface; give a PLY of surface points (x y z, "
-            "and nx ny nz, radius, red green blue where known)"
+            f"{path}: is a Gaussian-splatting scene (f_dc, scale, rot, opacity): its "
+            "ellipsoids have baked radiance and no surface; give a PLY of surface points (x y "
+            "z, and nx ny nz, radius, red green blue where known)"
         )
     single = {
         name: column
@@ -234,7 +233,7 @@ def _splat_fields(
         elif single.keys() & set(names) or field == "centers":
             raise ValueError(
                 f"{path}: its vertices have {', '.join(single) or 'no rows'}, and not all of "
-                f"{' '.join(names)}: write all of them"
+                f"{' '.join(names)}; write all of them"
             )
     fields["centers"] = with_y_up(fields["centers"], up)
     if fields["normals"] is not None:
@@ -249,13 +248,14 @@ def _check_places(path: Path, centers: Float[np.ndarray, "n 3"], *, estimated: b
     resolved = float(jnp.finfo(jnp.result_type(float)).eps) * reach
     if estimated and extent < 1e3 * _SHORTEST:
         raise ValueError(
-            f"{path}: its points lie within {extent:.3g} mm; give its unit (mm_per_unit), or scale "
-            "it"
+            f"{path}: the extent of its points is {extent:.3g} mm; give its unit "
+            "(mm_per_unit), or scale it"
         )
     if 0 < extent < 1e4 * resolved:
         raise ValueError(
-            f"{path}: its points lie {reach:.3g} mm from the origin, where single precision tells "
-            f"{resolved:.2g} mm apart, and it is {extent:.3g} mm large; move it to the origin"
+            f"{path}: its points are {reach:.3g} mm from the origin, where single precision "
+            f"resolves {resolved:.2g} mm, and their extent is {extent:.3g} mm; move them to "
+            "the origin"
         )
 
 
@@ -273,8 +273,8 @@ def _values(
     if len(bad):
         raise ValueError(
             f"{path}: {' '.join(columns)} of vertex {bad[0]} is "
-            f"{' '.join(f'{value:g}' for value in values[:, bad[0]])} ({len(bad)} such vertices); "
-            f"it must be finite and {expected}: fix it, or leave it out"
+            f"{' '.join(f'{value:g}' for value in values[:, bad[0]])} ({len(bad)} such "
+            f"vertices); it must be finite and {expected}; fix it, or remove it"
         )
     if field == "normals":
         values = values / np.abs(values).max(axis=0)

@@ -33,7 +33,7 @@ def read_toml(path: Path, remedy: str) -> dict[str, Any]:
     except OSError as error:
         raise ValueError(f"{path}: cannot be read ({error.strerror}); {remedy}") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: is no TOML file: {error}") from None
+        raise ValueError(f"{path}: is not a TOML file: {error}") from None
 
 
 class Table:
@@ -148,11 +148,11 @@ def read_profile(path: StrPath, *, mm_per_unit: float = 1.0) -> Tabulated:
             is_named = re.search(rf"(?<![A-Za-z]){unit}(?![A-Za-z])", ",".join(names))
             if is_named and not np.isclose(size, mm_per_unit, rtol=1e-6, atol=0):
                 raise ValueError(
-                    f"{where} gives {unit}, and lengths are taken as {mm_per_unit:g} mm; give "
-                    f"mm_per_unit = {size:g} (--mm-per-unit {size:g}), or name the right unit"
+                    f"{where} gives the unit {unit}, and mm_per_unit is {mm_per_unit:g}; give "
+                    f"mm_per_unit = {size:g} (--mm-per-unit {size:g}), or correct the unit"
                 )
     if len(rows) < 2:
-        raise ValueError(f"{path}: has {len(rows)} lines of numbers; a profile needs two radii")
+        raise ValueError(f"{path}: has {len(rows)} lines of numbers; give at least two radii")
     table, count = [], len(rows[0][1])
     for where, cells in rows:
         table.append([_number(cell) for cell in cells])
@@ -184,7 +184,9 @@ def read_media(path: StrPath) -> tuple[list[str], Float[np.ndarray, "media 3"]]:
     contents = f"media are a CSV of {', '.join(_COLUMNS)}"
     (_, head), *rows = _read_rows(path, contents) or [("", [])]
     if not set(head) >= set(_COLUMNS) or not rows:
-        raise ValueError(f"{path}: names {', '.join(head)}, with {len(rows)} rows; {contents}")
+        raise ValueError(
+            f"{path}: has the columns {', '.join(head)}, with {len(rows)} rows; {contents}"
+        )
     names, media = [], []
     for where, cells in rows:
         entries = dict(zip(head, cells, strict=False))
@@ -227,7 +229,7 @@ def _read_rows(path: StrPath, contents: str) -> list[tuple[str, list[str]]]:
     try:
         lines = existing_file(path).read_text(encoding="utf-8-sig").splitlines()
     except UnicodeDecodeError as error:
-        raise ValueError(f"{path}: is no text file: {error}; {contents}") from None
+        raise ValueError(f"{path}: is not a text file: {error}; {contents}") from None
     rows = csv.reader(lines)
     return [
         (f"{path}: line {rows.line_num}", [cell.strip() for cell in row])

@@ -106,8 +106,8 @@ def one_sentence(path: Path) -> Generator[None, None, None]:
             raise
         kind = "" if isinstance(error, ValueError) else f"{type(error).__name__} "
         raise ValueError(
-            f"{path}: cannot be read ({kind}{' '.join(str(error).split())[:200]}); it is cut "
-            "short, or of a kind that is not read: export it again"
+            f"{path}: cannot be read ({kind}{' '.join(str(error).split())[:200]}); it is "
+            "truncated, or of an unsupported kind; re-export it"
         ) from None
     finally:
         log.setLevel(before)
@@ -135,7 +135,7 @@ def load_with_trimesh(path: Path, kind: str) -> dict[str, Any]:
         for name, element in found.get("metadata", {}).get("_ply_raw", {}).items()
     }
     for fault in folder.faults:
-        warnings.warn(f"{path}: {fault}, and its colors are left out", stacklevel=2)
+        warnings.warn(f"{path}: {fault}, and its colors are ignored", stacklevel=2)
     return found | {"triangles": count, "contents": data, "columns": columns}
 
 
@@ -149,7 +149,7 @@ def _columns(name: str, element: dict[str, Any]) -> dict[str, np.ndarray]:
             if np.ptp(sizes):
                 raise ValueError(f"{key} are lists of several lengths, such as mixed polygons")
         if len(column) != element["length"]:
-            raise ValueError(f"its header promises {element['length']} rows of {name}")
+            raise ValueError(f"its header announces {element['length']} rows of {name}")
         columns[key] = column[:, 0] if column.shape[1:] == (1,) else column
     return columns
 

@@ -93,8 +93,8 @@ def diffusion_basis(
     """
     if scene.material.single_scattering is not None:
         raise ValueError(
-            "scene.material has single scattering, beside which less light enters as the weights "
-            "grow; render each material by itself, or give one with single_scattering=None"
+            "scene.material has single scattering, with which the light that enters depends "
+            "on the weights; render each material separately, or give single_scattering=None"
         )
     plan = plan_unless_traced(scene, camera, settings, plan)
     check_no_bounces(settings)
@@ -235,8 +235,8 @@ def relighting_basis(
     kinds = [type(given).__name__ for given in scene.lights]
     if kinds != ["HarmonicLight"]:
         raise ValueError(
-            f"scene.lights are {', '.join(kinds) or 'none'}; give one HarmonicLight, and render "
-            "other lights by themselves: pictures add up"
+            f"scene.lights are {', '.join(kinds) or 'none'}; give one HarmonicLight, and "
+            "render other lights separately, since pictures add up"
         )
     plan = plan_unless_traced(scene, camera, settings, plan)
     scene, plan, light, _ = fill_scene(scene, plan, light, camera)

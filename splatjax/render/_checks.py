@@ -98,11 +98,11 @@ def _doubts(scene: Scene, camera: Camera, is_lit: bool) -> Iterator[str]:
     sphere = area**1.5 / (6 * np.sqrt(np.pi))
     if is_closed and volume < -_SOLID * sphere:
         yield (
-            "the normals of the splats point into the body; turn them around, or its surface is "
-            "seen and lit from behind"
+            "the normals of the splats point into the body, so its surface is seen and lit "
+            "from behind; turn them around"
         )
     elif is_closed and _winding_number(centers, normals, areas, camera) > 0.5:
-        yield "the camera is inside the body, and sees its surface from behind; move it outside"
+        yield "the camera is inside the body and sees its surface from behind; move it outside"
     gaussians = scene.material.gaussians
     variances, weights = (
         np.asarray(x, np.float64) for x in (gaussians.variances, gaussians.weights)
@@ -112,8 +112,8 @@ def _doubts(scene: Scene, camera: Camera, is_lit: bool) -> Iterator[str]:
         size = np.linalg.norm(np.ptp(centers, axis=0))
         if reach > _OPAQUE and not 1 / _RATIO < size / reach < _RATIO:
             yield (
-                f"the body is {size:.3g} mm large, and light travels {reach:.3g} mm below its "
-                "surface; check the units (mm), or scale the body by Splats.scaled"
+                f"the size of the body is {size:.3g} mm, and light travels {reach:.3g} mm "
+                "below its surface; check the units (mm), or scale the body by Splats.scaled"
             )
 
 

@@ -113,8 +113,8 @@ def _check_kept(light: SplatLight | Transfer, scene: Scene, plan: Plan) -> None:
     kept = [rows if rows is None else rows.shape for rows in light.visibility]
     if kept != shapes:
         raise ValueError(
-            f"light holds visibility {kept}, of the samples of each kind of lights from each splat,"
-            f" and the scene with its plan has {shapes}; keep it again with lights of these kinds"
+            f"light has visibility {kept} (samples of each kind of lights, splats), and the "
+            f"scene with its plan has {shapes}; compute it again with lights of these kinds"
         )
 
 
@@ -220,7 +220,7 @@ def map_over(
     single = [jax.tree_util.keystr(path) for path, leaf in arrays if leaf.ndim == 0]
     if single:
         raise ValueError(
-            f"a batch is stacked along a first axis, and {', '.join(single)} has none; stack it, "
+            f"{', '.join(single)} has no first axis, along which a batch is stacked; stack it, "
             "or share it"
         )
     counts = sorted({leaf.shape[0] for _, leaf in arrays})

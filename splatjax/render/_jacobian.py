@@ -73,8 +73,8 @@ class PictureJacobian(eqx.Module):
             if made.weights.shape != shape:
                 raise ValueError(
                     f"gaussians_of(parameters) has {list(made.weights.shape)} Gaussians and "
-                    f"channels, the picture was made with {list(shape)}: give the function that "
-                    "made the picture's material"
+                    f"channels, and the picture was made with {list(shape)}; give the function "
+                    "that made its material"
                 )
             return self.along(jax.tree.map(lambda leaf: leaf.astype(self.weights.dtype), made))
 
@@ -108,7 +108,7 @@ def picture_jacobian(
     ):
         raise ValueError(
             f"settings.lighting is {type(settings.lighting).__name__}, and scene.material has "
-            "single scattering, which is differentiated at the splats alone; give "
+            "single scattering, which is differentiated only at the splats; give "
             "lighting=LightAtSplats(), or a material without it"
         )
     check_no_bounces(settings)

@@ -195,12 +195,12 @@ def plan_unless_traced(
 def _check(scenes: list[Scene], cameras: list[Camera]) -> None:
     if not cameras or not scenes:
         raise ValueError(
-            "a plan needs at least one scene and one camera, not "
-            f"{len(scenes)} scenes and {len(cameras)} cameras"
+            f"a plan needs at least one scene and one camera; got {len(scenes)} scenes and "
+            f"{len(cameras)} cameras"
         )
     sizes = sorted({(camera.width, camera.height) for camera in cameras})
     if len(sizes) != 1:
-        raise ValueError(f"cameras of one plan must have pictures of one size, not {sizes}")
+        raise ValueError(f"cameras of one plan must have pictures of one size; got {sizes}")
     first = scenes[0]
     for i, scene in enumerate(scenes[1:], 1):
         if not eqx.tree_equal((first.splats, first.material), (scene.splats, scene.material)):

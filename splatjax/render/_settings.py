@@ -45,8 +45,9 @@ class RenderSettings(eqx.Module):
         check_values("bounces", self.bounces, "0 or more", lambda n: n >= 0)
         if self.bounces and not isinstance(self.lighting, LightAtSplats):
             raise ValueError(
-                f"bounces is {self.bounces} and lighting is {type(self.lighting).__name__}; light "
-                "bounces between splats alone: give bounces=0, or lighting=LightAtSplats()"
+                f"bounces is {self.bounces} and lighting is {type(self.lighting).__name__}; "
+                "light bounces only between splats; give bounces=0, or "
+                "lighting=LightAtSplats()"
             )
 
     def shadows_of(self, light: AbstractLightSample) -> _splatting.ShadowSettings:

@@ -12,9 +12,7 @@ from jaxtyping import Array, Float
 from splatjax import diffusion as _diffusion
 from splatjax.scene import Parts, Splats
 
-_CHANGED = (
-    "parts must be the same each time that they are called; give the same splats in the same order"
-)
+_CHANGED = "parts must return the same splats in the same order at each call"
 
 
 class ReplayableStream:
@@ -88,8 +86,8 @@ class StreamStatistics:
             raise ValueError("parts has no splats; give at least one")
         if any(size != sizes[0] for size in sizes[:-1]) or sizes[-1] > sizes[0]:
             raise ValueError(
-                "parts must be of one size, but the last, which may be smaller; these have "
-                f"{sizes} splats"
+                f"parts must have one size, except for a smaller last one; these have {sizes} "
+                "splats"
             )
         # How far the farthest splat is, the finest areas, and how evenly splats are spread.
         middle = (np.min(low, axis=0) + np.max(high, axis=0)) / 2

@@ -70,8 +70,8 @@ def render_streamed(
     """
     if settings.bounces:
         raise ValueError(
-            f"settings.bounces is {settings.bounces}, and splats that are streamed do not see each "
-            "other; give bounces=0, or render them at once, over a mesh if need be"
+            f"settings.bounces is {settings.bounces}, and a stream does not support bounces; "
+            "give bounces=0, or use splatjax.render, over a mesh if memory requires it"
         )
     rasterizer, diffuser = settings.rasterizer, settings.diffuser
     if not isinstance(rasterizer, _splatting.TileRasterizer) or not isinstance(

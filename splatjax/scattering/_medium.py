@@ -82,8 +82,8 @@ class Layer(eqx.Module):
         check_values(
             "thickness * sigma_t' of a Layer",
             self.thickness * self.medium.sigma_t_prime,
-            "at least 1 in every channel: diffusion does not hold in a thinner layer; monte_carlo "
-            "does, and a Film absorbs without scattering",
+            "at least 1 in every channel, because diffusion is invalid in a thinner layer; "
+            "use monte_carlo, or a Film, which absorbs without scattering",
             lambda x: x >= 1 - 1e-6,
             finite=False,
         )
@@ -116,12 +116,12 @@ def check_stack(layers: tuple[Layer | Film, ...]) -> None:
     scattering = {layer.channels for layer in layers if isinstance(layer, Layer)}
     if not scattering:
         raise ValueError(
-            f"layers must contain one that scatters; none of these {len(layers)} is a Layer"
+            f"layers must contain a scattering Layer; none of these {len(layers)} is one"
         )
     films = {layer.optical_depth.shape[-1] for layer in layers if isinstance(layer, Film)}
     counts = scattering | (films - {1})
     if len(counts) > 1:
-        raise ValueError(f"layers have {sorted(counts)} channels; give one count to all")
+        raise ValueError(f"layers have {sorted(counts)} channels; give all the same number")
     for number, layer in enumerate(layers[:-1], start=1):
         thickness = layer.thickness if isinstance(layer, Layer) else 0.0
         if not isinstance(thickness, Tracer) and np.isinf(thickness):

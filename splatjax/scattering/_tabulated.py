@@ -57,7 +57,7 @@ class Tabulated(AbstractProfile):
         check_values(
             "the steps of Tabulated.radii",
             jnp.diff(self.radii),
-            "positive (mm): radii ascend, each once",
+            "positive (mm), with strictly ascending radii",
             lambda x: x > 0,
         )
 
@@ -71,7 +71,8 @@ class Tabulated(AbstractProfile):
         """Subtract a profile: single scattering, for a fit of the rest."""
         if profile.singular:
             requirement = (
-                f"above 0, since {type(profile).__name__} is infinite at r = 0: leave that row out"
+                f"above 0, because {type(profile).__name__} is infinite at r = 0; leave that "
+                "row out"
             )
             check_values("Tabulated.radii", self.radii, requirement, lambda x: x > 0)
         total = None if self.total is None else self.total - profile.total_reflectance()
@@ -161,7 +162,7 @@ def measure_laser_dot(
     """
     pixels = np.asarray(image, np.float64)
     entering = np.broadcast_to(np.asarray(power, np.float64), pixels.shape[2:])
-    check_values("image", pixels, "finite: crop such pixels away", lambda x: x == x)
+    check_values("image", pixels, "finite; crop such pixels", lambda x: x == x)
     check_values("mm_per_pixel", mm_per_pixel, "positive", lambda x: x > 0)
     check_values("power", entering, "positive", lambda x: x > 0)
     check_values("step", step, "at least 1 pixel", lambda x: x >= 1 - 1e-9)

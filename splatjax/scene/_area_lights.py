@@ -123,7 +123,7 @@ class RectangleLight(AbstractAreaLight):
 
     def __check_init__(self):
         if isinstance(self.edges, jax.Array):
-            requirement = "two that span an area; the area is 0"
+            requirement = "two vectors that span an area; the area is 0"
             area = self.normal_and_area()[1]
             check_values("RectangleLight.edges", area, requirement, lambda x: x > 0)
 

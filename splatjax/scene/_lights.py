@@ -26,7 +26,7 @@ _EXPECTED = {
     "up": ("the direction of the image's upper edge, not zero", np.any),
     "radius": ("positive (mm)", lambda x: x > 0),
     "count": ("1 or more samples", lambda x: x >= 1),
-    "image": ("finite and not negative; replace NaN, clip what is negative", lambda x: x >= 0),
+    "image": ("finite and not negative; replace NaN, and clip negative values", lambda x: x >= 0),
 }
 
 

@@ -58,8 +58,8 @@ class Material(eqx.Module):
             term = getattr(self, name)
             if term is not None and term.channels != self.channels:
                 raise ValueError(
-                    f"Material.{name} has {term.channels} channels, Material.gaussians has "
-                    f"{self.channels}; give both the same"
+                    f"Material.{name} has {term.channels} channels, and Material.gaussians has "
+                    f"{self.channels}; give both the same number"
                 )
 
     @property

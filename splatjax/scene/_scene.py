@@ -103,7 +103,7 @@ def rotation_towards(forward: Float[Array, "3"], up: Float[Array, "3"]) -> Float
 
 
 _ROUNDING = 1e-5  # by which an albedo may leave [0, 1]
-_FINITE = valid("finite: drop such splats before rendering")
+_FINITE = valid("finite; remove such splats before rendering")
 _NOT_NEGATIVE = valid("finite and at least 0", lambda x: x >= 0)
 
 

@@ -116,7 +116,7 @@ class HenyeyGreenstein(AbstractPhaseFunction):
 
     g: Float[Array, "*layers"] = eqx.field(
         converter=numbers,
-        metadata=valid("between -1 and 1, neither included", lambda x: abs(x) < 1),
+        metadata=valid("between -1 and 1, both excluded", lambda x: abs(x) < 1),
     )
 
     def anisotropy(self, layers, dtype):

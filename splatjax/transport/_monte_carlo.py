@@ -199,7 +199,9 @@ def _set_up(
     media, edges = _prepare(layers, phase, above, below, edges)
     check_values("edges", edges, "at least two, from 0 mm on", lambda x: (x >= 0) & (len(x) > 1))
     steps = jnp.diff(edges)
-    check_values("the steps of edges", steps, "positive (mm): edges must ascend", lambda x: x > 0)
+    check_values(
+        "the steps of edges", steps, "positive (mm), with ascending edges", lambda x: x > 0
+    )
     numbers = jnp.asarray(photons, jnp.int32), jnp.asarray(flights, jnp.int32)
     lanes = max(_LEAST_LANES, 1 << (photons // _PHOTONS_A_LANE).bit_length())
     return media, WalkSettings(edges, incidence, phase, key, *numbers, min(_MOST_LANES, lanes))
@@ -236,9 +238,9 @@ def _monte_carlo_jvp(primals, tangents, *, progress):
     ):
         if jax.tree.leaves(tangent):
             raise ValueError(
-                f"monte_carlo has no derivative in {name}: photons would fly in other directions "
-                "or leave elsewhere; differentiate sigma_a and sigma_s_prime, or take differences "
-                "of results with the same key"
+                f"monte_carlo has no derivative in {name}, which changes the paths of photons; "
+                "differentiate sigma_a and sigma_s_prime, or take differences of results with "
+                "the same key"
             )
     result, by_absorption, by_scattering = _walk_all(media, settings, True, progress)
     pairs = [(by_absorption, media_dot.sigma_a), (by_scattering, media_dot.sigma_s)]

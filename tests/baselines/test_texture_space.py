@@ -129,7 +129,7 @@ def test_bad_input_is_refused(sheet):
         ),
         (
             lambda: baselines.plan_texture_space(mesh, (lamp,), DULL, camera, settings),
-            r"lights\[0\] stands 2 mm",
+            r"lights\[0\] is 2 mm",
         ),
         (lambda: render(mesh), "plan"),
     ):

@@ -281,7 +281,7 @@ def test_interrupted_or_unsettled_it_continues_where_it_was(command, search, tmp
         assert record.exists()
         assert output.exists() == (number == 1)  # its best round
         assert len(calls[number][2]) == 2 - number
-    assert "did not settle" in capsys.readouterr().err
+    assert "--start" in capsys.readouterr().err
     np.testing.assert_allclose(calls[1][2][0].sigma_a, FOUND)
     (tmp_path / "pictures.toml").write_text(PICTURES.format(more="noise = 0.01"))
     assert run(*command) == 0

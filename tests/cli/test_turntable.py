@@ -206,7 +206,7 @@ def test_processes_share_a_turntable_and_one_that_is_killed_costs_no_finished_fr
     assert statuses == [0, -signal.SIGKILL, 0, 0], err
     finished = {name for name in names if name[6:10] not in ("0001", "0005")}
     assert contents(four).keys() == finished | {"frame_0001.exr", "turntable.json"}
-    assert ["still at work" in text for text in err] == [True, False, True, True]
+    assert ["other processes" in text for text in err] == [True, False, True, True]
     statuses, _, err = run_processes(shared(four), 2)
     assert statuses == [0, 0], err
     assert f"4 of {SHARED_FRAMES} frames" in err[0]

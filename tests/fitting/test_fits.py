@@ -178,7 +178,7 @@ def test_layers_reach_the_best_known_errors(float64):
 def test_a_profile_without_a_norm_is_refused(dtype):
     """Single scattering is infinite at the origin: Eq. 3 needs to be told where to start."""
     for function in (fit_gaussians, lambda beam: relative_error(beam, SumOfGaussians([1], [1]))):
-        with pytest.raises(ValueError, match=r"PhotonBeam goes to infinity.*L2_QUADRATURE.beyond"):
+        with pytest.raises(ValueError, match=r"PhotonBeam .*L2_QUADRATURE.beyond"):
             function(PhotonBeam(MARBLE_GREEN))
 
 

@@ -72,7 +72,7 @@ def test_what_is_not_fixed_is_reported():
         (along(0.01, 0.02, 0.3), {"unresolved": 0.97}, "97% of its light", "not fixed"),
         (along(0.01, 0.02, 0.3), {"unresolved": 0.5}, "+-", "splats"),
         (along(0.01, 0.02, 0.3), {"chi_squared": 9.0}, "3 times the noise", "not fixed"),
-        (along(0.01, 0.02, 0.3), {"noise_is_known": False}, "of the residuals", "times"),
+        (along(0.01, 0.02, 0.3), {"noise_is_known": False}, "the residuals", "times"),
         (np.zeros((2, 2)), {}, "anything", "nan"),
         (np.full((2, 2), np.nan), {}, "anything", "nan"),
         (np.diag([4.0, 0.0]), {}, "anything", "nan"),
@@ -183,7 +183,7 @@ def test_a_model_that_leaves_much_counts_for_less():
 def test_what_does_not_belong_together_is_refused():
     one = recovery(along(0.01, 0.02, 0.3))
     other = eqx.tree_at(lambda r: r.medium.eta, one, one.medium.eta + 0.1)
-    with pytest.raises(ValueError, match=r"recoveries\[1\].medium.eta is .* different materials"):
+    with pytest.raises(ValueError, match=r"recoveries\[1\].medium.eta is"):
         sj.inverse.combined([one, other])
     splats = sj.Splats([[0, 0, 0]], [[0, 0, 1]], 1, 1)
     with pytest.raises(ValueError, match="candidates is empty"):

@@ -155,12 +155,12 @@ def test_a_saved_material_comes_back_bit_for_bit(tmp_path, model):
 @pytest.mark.parametrize(
     ("load", "name", "value"),
     [
-        (load_material, "marbel", "marbel: is no known material; did you mean 'marble'"),
-        (load_material, "Skin", "Skin: is no known material; did you mean 'skin'"),
-        (load_material, "xyzzy", "xyzzy: is no known material; known are apple, cappuccino_powder"),
+        (load_material, "marbel", "marbel: .* did you mean 'marble'"),
+        (load_material, "Skin", "Skin: .* did you mean 'skin'"),
+        (load_material, "xyzzy", "xyzzy: .* known are apple, cappuccino_powder"),
         (load_material, Path("none.toml"), r"none.toml: cannot be read \(No such file"),
         (load_medium, "skin", r"skin.toml: has no \[medium\]"),
-        (load_medium, "skin_layers", r"has no \[medium\]; known are only its layers"),
+        (load_medium, "skin_layers", r"has no \[medium\], only its layers"),
     ],
 )
 def test_what_is_not_there(load, name, value):
@@ -198,7 +198,7 @@ BAD = [
     (layered(SLAB.replace("2.0", "inf"), SLAB), r"\[\[layers\]\]: layer 1 of 2"),
     (layered(SLAB, "optical_depth = [0.1, 0.2]\n"), r"\[1, 2\] channels"),
     (layered("optical_depth = [-0.1]\n", SLAB), r"\[layers 1\].*optical_depth .* -0\.1 at"),
-    (layered("optical_depth = [0.1]\n"), r"none of these 1 is a Layer"),
+    (layered("optical_depth = [0.1]\n"), r"none of these 1"),
     (GOOD_MEDIUM + layered(SLAB), r"has \[medium\] and \[\[layers\]\]"),
     ("layers = 3\n", r"layers must be one table or more; it is 3"),
     (GOOD_MEDIUM.replace("[0.1]", "[-0.1]"), r"\[medium\].*sigma_a .* -0\.1 at"),
@@ -218,7 +218,7 @@ BAD = [
     (GOOD_MEDIUM.replace('unit = "1/mm"\n', ""), r"\[medium\] unit must be .*; it is None"),
     (GOOD_MEDIUM.replace("eta = 1.3\n", ""), r"\[medium\] eta .* missing"),
     (GOOD_MEDIUM, r"has no \[fit\]"),
-    (GOOD_MEDIUM.replace("eta", "=eta"), r"is no TOML file"),
+    (GOOD_MEDIUM.replace("eta", "=eta"), r"TOML file"),
     (NO_FIT, r"has no \[medium\], \[\[layers\]\], \[skin\] or \[fit\]"),
     ("medium = 3\n", r"\[medium\] must be a table; it is 3"),
     (GOOD_FIT + "[surfaces]\n", r"unknown entry 'surfaces'.*'surface'"),
@@ -234,7 +234,7 @@ BAD = [
         + GOOD_MEDIUM.replace("medium", "single_scattering")
         .replace("[", "[1, ")
         .replace("[1, s", "[s"),
-        r"single_scattering has 2 channels, Material.gaussians has 1",
+        r"single_scattering has 2 channels, .* has 1",
     ),
     (GOOD_FIT + "[surface]\nroughness = 1.5\n", r"\[surface\].*roughness .* 1\.5$"),
 ]

@@ -164,7 +164,7 @@ def test_what_cannot_be_streamed_is_refused(splats):
     for passes, settings, said in (
         ([[small]], plain, "DenseDiffuser"),
         ([[]], default, "no splats"),
-        ([[small, large]], default, "of one size"),
+        ([[small, large]], default, "parts must have one size"),
         ([[small, small], [large, small]], default, "must be the same each time"),
         ([[small, small], [small]], default, "must be the same each time"),
         ([[small, small], [small, small, small]], default, "must be the same each time"),

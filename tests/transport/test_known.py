@@ -241,7 +241,7 @@ def test_progress_is_told(float32):
     ("layers", "settings", "message"),
     [
         (HALF_SPACE * 2, {}, "layer 1 of 2 is infinitely thick"),
-        ([sj.Film(0.0)], {}, "none of these 1 is a Layer"),
+        ([sj.Film(0.0)], {}, "none of these 1"),
         (HALF_SPACE, {"photons": 1}, "photons must be at least 2"),
         (HALF_SPACE, {"photons": 2**30}, "photons must be .* below 2\\^30"),
         (HALF_SPACE, {"edges": [0.0, 1.0, 1.0]}, "steps of edges"),
