@@ -117,7 +117,6 @@ with jax.enable_x64(True):
         splats,
         sj.inverse.default_candidates(splats, camera),
         settings=settings,
-        model=DIPOLE,
     )
 for prediction in predictions:
     print(prediction)

@@ -211,14 +211,12 @@ class Recover:
         first = observations[0]
         candidates = sj.inverse.default_candidates(splats, first.camera, first.picture.shape[2])
         with stage(f"evaluating {len(candidates)} pictures that could be taken next"):
-            predictions = sj.inverse.next_pictures(
-                recovery, splats, candidates, model=model_by_name(self.model, self.g)
-            )
+            predictions = sj.inverse.next_pictures(recovery, splats, candidates)
         print("predicted gain of one more picture, the best first:")
         print(*(f"  {prediction}" for prediction in predictions), sep="\n")
 
     def _save(self, recovery: sj.inverse.Recovery) -> None:
-        errors, model = recovery.relative_errors(), model_by_name(self.model, self.g)
+        errors, model = recovery.relative_errors(), recovery.model
         sj.save_material(
             recovery.material,
             self.output,

@@ -8,13 +8,6 @@ from jaxtyping import Float
 
 from splatjax._format import percent
 from splatjax._records import record, several
-from splatjax.fitting import (
-    AbstractModel,
-    AbstractWeights,
-    FixedTotalReflectance,
-    NonNegativeWeights,
-    TransportModel,
-)
 from splatjax.render import RenderSettings
 from splatjax.scene import AbstractLight, Camera, DirectionalLight, GaussianBeam, Splats
 
@@ -64,8 +57,6 @@ def next_pictures(
     splats: Splats,
     candidates: Sequence[Candidate],
     *,
-    model: AbstractModel = TransportModel(),
-    weights: AbstractWeights = NonNegativeWeights(FixedTotalReflectance()),
     settings: RenderSettings = RenderSettings(),
 ) -> list[Prediction]:
     r"""Rank pictures that could be taken by the error bars of the coefficients with each of them.
@@ -74,9 +65,9 @@ def next_pictures(
     fraction of its brightness as in the pictures before. Information adds up, and its inverse is
     the covariance.
 
-    **Arguments:** `model` and `weights` as in `recover`.
+    **Arguments:**
 
-    - `recovery`: from the pictures before.
+    - `recovery`: from the pictures before, with its model and weights.
     - `splats`: of the body.
     - `candidates`: at least one; `default_candidates` gives some.
     - `settings`: of the renderer. By default those of `render`: a prediction needs no layers as
@@ -97,7 +88,7 @@ def next_pictures(
     pictured_scenes = [PicturedScene(splats, one.camera, one.lights) for one in candidates]
     pictures, _ = render_layers(pictured_scenes, recovery.material, settings)
     near = recovery.material.gaussians.variances.astype(dtype)
-    fit = eqx.Partial(fit_near, near=near, weights=weights, rule=model.rule)
+    fit = eqx.Partial(fit_near, near=near, weights=recovery.weights, rule=recovery.model.rule)
     noise = recovery.relative_noise * recovery.scale**0.5
     predictions = []
     for candidate, picture in zip(candidates, pictures, strict=True):
@@ -105,7 +96,7 @@ def next_pictures(
         observation = Observation(dark, candidate.camera, candidate.lights, deviation=1)
         evidence = Evidence.of(observation, dtype)
         unknowns = Unknowns.of(medium.eta, [candidate.intensity])
-        problem = RecoveryProblem.of([picture], [evidence], unknowns, fit, loss, model)
+        problem = RecoveryProblem.of([picture], [evidence], unknowns, fit, loss, recovery.model)
         at_point = solution(problem, unknowns.start(medium))
         radiance = np.asarray(at_point.radiance[0])[np.asarray(problem.counted[0]) > 0]
         bright = float(np.sqrt(np.mean(radiance**2)))

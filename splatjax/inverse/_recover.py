@@ -116,6 +116,8 @@ def recover(
         jax.tree.map(lambda leaf: leaf.astype(dtype), start)
         for start in ([starts] if isinstance(starts, Medium) else starts)
     ]
+    if not isinstance(model, AbstractModel):
+        raise ValueError(f"model is {model!r}; give TransportModel() or DiffusionModel(profile)")
     _check(observations, splats, starts, surface)
     report = progress or (lambda stage, medium: None)
     eta, channels = starts[0].eta, starts[0].channels
@@ -192,6 +194,8 @@ def recover(
                 relative_noise=float(np.mean([one.relative_noise for one in evidence])),
                 steps=steps,
                 rounds=rounds,
+                model=model,
+                weights=weights,
             )
     assert best is not None
     if not settled:

@@ -12,6 +12,13 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from splatjax._format import channel_names, percent
+from splatjax.fitting import (
+    AbstractModel,
+    AbstractWeights,
+    FixedTotalReflectance,
+    NonNegativeWeights,
+    TransportModel,
+)
 from splatjax.scattering import Medium
 from splatjax.scene import Material
 
@@ -169,6 +176,7 @@ class Recovery(AbstractEstimate):
     - `ends`, `costs`: where the search from each start ended in the first round, and the sum of its
       losses.
     - `steps`, `rounds`: of all searches. Static.
+    - `model`, `weights`: with which the pictures were explained.
     - `result`: the outcome of the search, as a message (`optimistix.RESULTS`).
 
     Error bars assume that model and shape are right and that the noise of pixels is independent:
@@ -191,6 +199,8 @@ class Recovery(AbstractEstimate):
     relative_noise: float = eqx.field(static=True)
     steps: int = eqx.field(static=True)
     rounds: int = eqx.field(static=True)
+    model: AbstractModel = TransportModel()
+    weights: AbstractWeights = NonNegativeWeights(FixedTotalReflectance())
 
     @property
     def scale(self) -> float:

@@ -210,7 +210,7 @@ class TestRecover:
             sj.inverse.Candidate("dot", camera(), (dot,)),
             sj.inverse.Candidate("color", camera(), (lights()[0],), sj.inverse.UnknownColor()),
         ]
-        ranked = sj.inverse.next_pictures(found, splats, candidates, settings=PLAIN, model=DIPOLE)
+        ranked = sj.inverse.next_pictures(found, splats, candidates, settings=PLAIN)
         left = {one.candidate.name: one.worst.deviation for one in ranked}
         assert list(left.values()) == sorted(left.values())
         now = max(worst.deviation for _, worst in found.combinations())
