@@ -1,9 +1,9 @@
-"""The five passes, wired: plan what shapes they need, then render.
+"""The five passes: plan the sizes of their arrays, then render.
 
 The formulas of the passes are in splatting, diffusion and shading. Read `see_and_shade` in
-`_passes.py` first: every picture is one call of it, with what lights the splats (`light_at`) and
-what is read of the shaded points (`read`). `_render.py` has the simplest, `_devices.py` where it
-runs.
+`_passes.py` first: every picture is one call of it. Its arguments are the function that lights the
+splats (`light_at`) and the function that reads the shaded points (`read`). `_render.py` has the
+simplest pictures, and `_devices.py` the distribution over devices.
 """
 
 from ._attributes import SurfaceAttributes as SurfaceAttributes, SurfaceSamples as SurfaceSamples

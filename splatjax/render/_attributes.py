@@ -1,4 +1,4 @@
-"""What the splats carry into the picture, and what passes 4 and 5 read of it at the pixels."""
+"""Attributes of the splats, and the samples of the visible surface that passes 4 and 5 read."""
 
 from typing import Any
 
@@ -12,22 +12,22 @@ from splatjax import diffusion as _diffusion
 
 class SurfaceAttributes(eqx.Module):
     """Rows that passes 2 and 3 blend (Eq. 1), along the last axis of every array: of the splats, or
-    of the points that the pixels see.
+    of the visible points.
 
     **Attributes:**
 
     - `normals`: of the splats; blended ones are not of unit length.
     - `area`: per splat, mm^2.
     - `source`: irradiance that spreads below the surface.
-    - `albedo`, `irradiance`, `specular`, `roughness`: `None` where the splats carry none;
-      `irradiance` is then `source`.
+    - `albedo`, `irradiance`, `specular`, `roughness`: `None` if the splats have none; `irradiance`
+      is then `source`.
     - `visibility`: per group of samples, of each light; `None` for lights that cast no shadows.
-    - `single_scattering`: radiance towards the eye, without the albedo; `None` where the material
-      has none.
+    - `single_scattering`: radiance towards the eye, without the albedo; `None` if the material has
+      none.
     - `layers`, `derivative`: the layers of pass 4 as `continue_from_splats` prepares them, and
       their derivatives; `centers` are the splats', mm from an origin.
-    - `added_source`: the derivative of `source` in a weight of the Gaussians, where it has one.
-    - `extra`: what another `AbstractLighting` needs.
+    - `added_source`: the derivative of `source` in a weight of the Gaussians, if it is not zero.
+    - `extra`: attributes of another `AbstractLighting`.
     """
 
     normals: Float[Array, "3 points"]
@@ -47,16 +47,16 @@ class SurfaceAttributes(eqx.Module):
 
 
 class SurfaceSamples(eqx.Module):
-    """What the pixels of some tiles see, along the last axis.
+    """The visible surface in the pixels of some tiles, along the last axis.
 
     **Attributes:**
 
     - `attributes`: blended.
     - `positions`: mm.
     - `depth`: mm along the camera's forward axis.
-    - `covered`: where there is a surface.
-    - `layers`: means and mass at the positions; none before they are known.
-    - `derivative`: of the layers in the logarithms of their variances; `None` where not asked for.
+    - `covered`: whether a surface is visible.
+    - `layers`: means and mass at the positions; none before they are computed.
+    - `derivative`: of the layers in the logarithms of their variances; `None` if not requested.
     """
 
     attributes: SurfaceAttributes
@@ -74,7 +74,7 @@ def stack_rows(rows: PyTree[Float[Array, "... points"]]) -> Float[Array, "all po
 
 
 def split_rows(stacked: Float[Array, "all points"], like: PyTree) -> PyTree:
-    """Undo `stack_rows`, for a tree of arrays that differs from `like` in its last axis alone."""
+    """Undo `stack_rows`, for a tree of arrays that differs from `like` only in its last axis."""
     leaves, structure = jax.tree.flatten(like)
     sizes = [leaf.size // leaf.shape[-1] for leaf in leaves]
     parts = jax.lax.split(stacked, sizes, axis=0)

@@ -1,4 +1,4 @@
-"""A picture for any weights, or for any distant light: everything that these do not change is
+"""Pictures for any weights, or for any distant light: the part that does not depend on these is
 rendered once.
 """
 
@@ -25,17 +25,17 @@ from ._shade import ShadedSurface
 
 
 class DiffusionBasis(eqx.Module):
-    r"""A picture for weights that are still to come.
+    r"""A picture as a function of the weights.
 
-    Its points are those that the pixels see: of the surface in front, and of the one that shows
-    behind its silhouettes.
+    Its points are the visible ones: of the surface in front, and of the surface behind its
+    silhouettes.
 
     **Attributes:**
 
     - `light`: the layers at every point.
-    - `pixel_radiance_per_exitance`: towards the eye, with the point's share of the pixel; 0 where
-      no point is.
-    - `pixels`: the pixel of each point, counted row by row.
+    - `pixel_radiance_per_exitance`: towards the eye, times the point's fraction of the pixel; 0
+      without a point.
+    - `pixels`: the index of the pixel of each point, row by row.
     - `in_front`: 1 for a point of the surface in front, else 0.
     - `specular`: radiance, premultiplied.
     - `coverage`: in [0, 1].
@@ -55,8 +55,8 @@ class DiffusionBasis(eqx.Module):
 
         **Arguments:**
 
-        - `gaussians`: the variances count as those that were rendered; with the derivative they may
-          be a little off, to first order.
+        - `gaussians`: the variances are assumed to be those that were rendered; with the derivative
+          they may differ a little, to first order.
         """
         radiance = self.pixel_radiance_per_exitance * self.light.exitance(gaussians)
         height, width, channels = self.specular.shape
@@ -73,23 +73,22 @@ def diffusion_basis(
     derivative: bool = False,
     light: SplatLight | Transfer | None = None,
 ) -> DiffusionBasis:
-    r"""Render everything that the weights of the material do not change: the picture of all
-    materials with its variances.
+    r"""Render the part of a picture that does not depend on the weights of the material.
 
-    It costs about as much as the picture. Many materials can then be looked at, differentiated or
-    fitted in a moment each.
+    It costs about as much as the picture. The pictures of many materials of the same variances, and
+    their derivatives, are then cheap.
 
     **Arguments:** as for `render`; the weights of `scene.material` do not matter.
 
     - `derivative`: also differentiate the layers in their variances, for about one more pass 4. The
-      picture then has the derivatives of `picture_jacobian`, by weights and variances that are made
-      of anything.
+      picture then has the derivatives of `picture_jacobian`, in weights, variances and their
+      parameters.
     - `light`: as for `render`; from `splatjax.illuminate` with the same derivative.
 
     **Returns:** a `DiffusionBasis`; NaN where the plan does not suffice.
 
-    **Raises:** `ValueError` as `render`, and for a material with single scattering and for bounces,
-    with which the light that enters depends on the weights.
+    **Raises:** `ValueError` as `render`, and for single scattering and bounces, with which the
+    light that enters depends on the weights.
     """
     if scene.material.single_scattering is not None:
         raise ValueError(
@@ -161,7 +160,7 @@ def _diffusion_basis(
 
 
 class RelightingBasis(eqx.Module):
-    r"""A picture for distant light that is still to come.
+    r"""A picture as a function of distant light.
 
     **Attributes:**
 
@@ -170,7 +169,7 @@ class RelightingBasis(eqx.Module):
     - `coverage`: in [0, 1].
     - `overflow`: as in a `Frame`; where it is above 0, pictures are NaN.
 
-    **Source:** Sloan, Kautz and Snyder 2002, "Precomputed Radiance Transfer": here for the pixels
+    **Source:** Sloan, Kautz and Snyder 2002, "Precomputed Radiance Transfer": applied to the pixels
     of one view.
     """
 
@@ -201,7 +200,7 @@ class RelightingBasis(eqx.Module):
             coefficients, under = harmonic
             return picture + coefficients[None, None] * under, None
 
-        # One after the other: a fifteenth of the time of `einsum` on a CPU.
+        # A loop takes a fifteenth of the time of `einsum` on a CPU.
         dark = jnp.zeros_like(self.pictures[0])
         return jax.lax.scan(add, dark, (light.coefficients, self.pictures[:count]))[0]
 
@@ -213,19 +212,18 @@ def relighting_basis(
     plan: Plan | None = None,
     light: Transfer | None = None,
 ) -> RelightingBasis:
-    r"""Render a view under every spherical harmonic: the picture of all smooth environments.
+    r"""Render a view under every spherical harmonic, for pictures under all smooth environments.
 
         white = HarmonicLight(np.zeros((25, 3)), count=128)
         basis = relighting_basis(Scene(splats, white, material), camera)
         picture = basis.beauty(HarmonicLight.of(environment))
 
-    It takes about as long as so many pictures with kept shadows, one after the other; then light
-    changes at once, and a picture is linear in it. The shadow maps are made once.
+    It takes about as long as one picture per harmonic with kept shadows; the shadow maps are
+    rendered once. Pictures under other light are then cheap, and linear in it.
 
     **Arguments:** as for `render`.
 
-    - `scene`: its only light is a `HarmonicLight`, whose coefficients do not matter, but for their
-      number.
+    - `scene`: its only light is a `HarmonicLight`; only the number of its coefficients matters.
     - `light`: from `splatjax.transfer` with the same scene, settings and plan.
 
     **Returns:** a `RelightingBasis`; NaN where the plan does not suffice.
@@ -259,8 +257,8 @@ def _relighting_basis(
         frame = render(lit, camera, settings, plan, light=kept)
         return frame.beauty, frame.coverage, frame.overflow
 
-    # Each harmonic on so much even light that their sum is nowhere negative: where layers of pass 4
-    # do not carry to a pixel, they are limited at zero.
+    # Add uniform light to each harmonic so that the sum is nowhere negative: layers of pass 4 are
+    # limited at zero where they do not reach a pixel.
     count = len(given)
     even = np.sqrt(2 * np.floor(np.sqrt(np.arange(count))) + 1) * (np.arange(count) > 0)
     even = jnp.asarray(even, given.dtype)

@@ -1,4 +1,4 @@
-"""The beams that enter the splats, for the diffusion equation on a body."""
+"""The beams that enter the splats, for the diffusion equation in a body."""
 
 import jax.numpy as jnp
 

@@ -33,13 +33,13 @@ def bounced_irradiance(
     direct: Irradiance,
     beams: Callable[[], _diffusion.Beams],
 ) -> tuple[Irradiance, Float[Array, "channels splats"] | None, Float[Array, ""]]:
-    r"""Compute the light that enters every splat, straight from the lights and after bounces,
+    r"""Compute the light that enters every splat, directly from the lights and after bounces,
 
         E_n = E_0 + t F M(E_(n - 1))
 
     where `M(E)` is the radiant exitance of diffused light, `F M` the irradiance that the body
-    receives from itself, and t the fraction of it that enters. Light that scatters once counts as
-    diffused.
+    receives from itself, and t the fraction of it that enters. Light that scatters once is treated
+    as diffused.
 
     **Arguments:**
 
@@ -64,8 +64,8 @@ def bounced_irradiance(
     _, roughness = surface_parameters(scene)
     enters = average_transmission(fresnel_f0(material.eta), roughness, material.angular_law())
     enters = enters.reshape(material.channels, -1)
-    # The Gaussians also stand for light that scatters once: of light from the lights where it
-    # leaves, of light from the body where it enters.
+    # The Gaussians also represent light that scatters once: for direct light where it leaves, for
+    # bounced light where it enters.
     whole, diffused = material.total_reflectance(), gaussians.total_reflectance()
     added = (whole / jnp.where(diffused > 0, diffused, 1.0))[:, None]
 
@@ -91,7 +91,7 @@ def bounced_irradiance(
 
     start = jnp.zeros_like(direct.entering), none
     (bounced, needed), _ = jax.lax.scan(bounce, start, None, length=settings.bounces)
-    # Where splats carry no albedo, its root is one.
+    # Without albedo its root is one.
     entering = direct.entering + bounced
     return Irradiance(entering, entering * root), bounced * root, needed
 

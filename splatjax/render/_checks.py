@@ -1,4 +1,4 @@
-"""What every picture asks of its inputs, and warnings about scenes that nobody means."""
+"""Checks of the inputs of every picture, and warnings about unintended scenes."""
 
 import functools
 import warnings
@@ -12,30 +12,30 @@ from jax.core import Tracer
 from splatjax._memory import check_memory
 from splatjax.scene import Camera, Scene, Splats, lights_by_kind
 
-# At least: a picture that needs more than is free by these does not fit.
+# Lower bounds: a picture that needs more than the free memory by these does not fit.
 BYTES_PER_SPLAT, BYTES_PER_PIXEL = 1000.0, 500.0
-_SAMPLE = 4096  # splats, evenly picked, by which the shape of a body is judged
+_SAMPLE = 4096  # evenly chosen splats, from which the shape of a body is estimated
 # Sum of the normals of a closed body, by area, as a fraction of the area. An open neck leaves
 # 0.08, a hemisphere 0.5.
 _CLOSED = 0.15
-_SOLID = 0.05  # volume of a body that is no sheet, as a fraction of that of a sphere of its area
-# Millimeters below which a material is meant to be opaque, as `Material.opaque` makes it.
+_SOLID = 0.05  # least volume of a body (not a sheet), over that of a sphere of its area
+# Millimeters below which a material is opaque on purpose, as by `Material.opaque`.
 _OPAQUE = 2e-3
 # Size of a body over the distance that light travels below its surface, or the inverse.
 _RATIO = 1000.0
 
 
 def check_scene(scene: Scene, camera: Camera, is_lit: bool = True) -> None:
-    r"""Refuse a picture whose channels disagree or that does not fit into memory, and warn of what
-    makes it black or meaningless: no light, inverted normals, a camera inside the body, a body a
-    thousand times larger or smaller than the length scale of its material.
+    r"""Raise for channels that disagree or too little memory, and warn of causes of black or
+    meaningless pictures: no light, inverted normals, a camera inside the body, a body a thousand
+    times larger or smaller than the length scale of its material.
 
-    Of traced scenes, and of those spread over several processes, only the channels are checked.
+    For traced scenes, and scenes distributed over several processes, only the channels are checked.
     Each warning is shown once.
 
     **Arguments:**
 
-    - `is_lit`: false where the irradiance is given and the lights do not matter.
+    - `is_lit`: false if the irradiance is given and the lights are not used.
 
     **Raises:** `ValueError` when the channels disagree, or the memory of the device does not
     suffice.
@@ -56,7 +56,7 @@ def check_scene(scene: Scene, camera: Camera, is_lit: bool = True) -> None:
 
 
 def check_displayable(channels: int) -> None:
-    """Raise `ValueError` for a number of channels that no PNG file shows, before rendering it."""
+    """Raise `ValueError` for a number of channels that a PNG file cannot show, before rendering."""
     if channels not in (1, 3):
         raise ValueError(
             f"a picture of {channels} channels has no colors for a PNG file; convert the material "
@@ -66,7 +66,7 @@ def check_displayable(channels: int) -> None:
 
 @functools.cache
 def _warn_once(message: str) -> None:
-    """Warn, unless it has been done: Python itself forgets whenever a library changes filters."""
+    """Warn once per message: Python's own record is reset whenever a library changes filters."""
     warnings.warn(message, stacklevel=4)
 
 
@@ -78,7 +78,7 @@ def _device_memory(splats: Splats) -> float | None:
 
 
 def _doubts(scene: Scene, camera: Camera, is_lit: bool) -> Iterator[str]:
-    """Say what is hardly meant."""
+    """List the warnings about a scene."""
     # A light without a field for its strength counts as one.
     strengths = [np.asarray(getattr(light, light.strength_field, 1.0)) for light in scene.lights]
     if is_lit and not any(map(np.any, strengths)):
@@ -118,13 +118,11 @@ def _doubts(scene: Scene, camera: Camera, is_lit: bool) -> Iterator[str]:
 
 
 def _winding_number(centers, normals, areas, camera: Camera) -> float:
-    """Add up the solid angles, over 4 pi, under which a point sees the outside of splats from
-    within: 1 inside a closed body, 0 outside.
-    """
+    """Compute the winding number of splats around a point: 1 inside a closed body, 0 outside."""
     offsets = centers - np.asarray(camera.position, np.float64)
     squared = np.maximum(np.sum(offsets * offsets, axis=1), np.finfo(float).tiny)
     cosines = np.sum(normals * offsets, axis=1) / np.sqrt(squared)
-    # No splat is seen under more than half of all directions.
+    # The solid angle of a splat is at most half of all directions.
     angles = np.minimum(areas / squared, 2 * np.pi)
     return float(cosines @ angles) / (4 * np.pi)
 

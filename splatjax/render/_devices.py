@@ -1,5 +1,5 @@
-"""Where the passes run: on one device, or with the splats, or many pictures, cut over the devices
-of a mesh; and scenes filled up with what adds nothing, so that many share a program.
+"""Distribution of the passes: on one device, or with splats or pictures divided over the devices of
+a mesh; and padding of scenes, so that many share a program.
 """
 
 import dataclasses
@@ -27,13 +27,13 @@ Kept = TypeVar("Kept", bound=SplatLight | Transfer)
 
 
 class OwnRows(NamedTuple):
-    """Where the lights and the Gaussians of a scene are in one that was filled up."""
+    """The indices of a scene's lights and Gaussians in its padded scene."""
 
     lights: Int[np.ndarray, " lights"]
     gaussians: Int[np.ndarray, " gaussians"]
 
     def frame(self, frame: Frame) -> Frame:
-        """Leave out what was added."""
+        """Remove the padding from a frame."""
         shadow = rows_at(frame.shadow, self.lights)
         names = "layers", "weights", "unresolved_fraction"
         rows = {name: rows_at(getattr(frame, name), self.gaussians) for name in names}
@@ -43,23 +43,22 @@ class OwnRows(NamedTuple):
 def fill_scene(
     scene: Scene, plan: Plan, light: Kept | None = None, *given: PyTree
 ) -> tuple[Scene, Plan, Kept | None, OwnRows]:
-    """Fill up the splats of a scene to the length of its plan, the lights of each kind to four or a
-    larger power of two, the Gaussians and the angles, by NumPy and `device_put`, which compile
-    nothing. Where the scene or what is `given` with it is traced, and where splats are cut over
-    devices, everything stays unchanged.
+    """Pad the splats of a scene to the length of its plan, the lights of each kind to four or a
+    larger power of two, the Gaussians and the angles. NumPy and `device_put` do this, which compile
+    nothing. If the scene or `given` is traced, or splats are divided over devices, nothing changes.
 
-    No entry of the plan's order stands for an added splat. An added light has no strength, and the
-    plan leaves out its shadow map; an added Gaussian has no weight. Where a light of the scene
-    consists of several samples, or has no field for its strength, no light is added.
+    The plan's order has no entry for a padding splat. A padding light has no strength and no shadow
+    map; a padding Gaussian has no weight. If a light of the scene consists of several samples, or
+    has no field for its strength, no light is added.
 
     **Arguments:**
 
-    - `light`: what was kept of the scene, filled up as its lights are.
+    - `light`: a precomputed result of the scene, padded like its lights.
 
-    **Returns:** the scene with its lights sorted by kind, its plan, what was kept, and where its
-    own lights and Gaussians are.
+    **Returns:** the scene with its lights sorted by kind, its plan, the precomputed result, and the
+    indices of its own lights and Gaussians.
 
-    **Raises:** `ValueError` where what was kept is for other lights or another number of splats.
+    **Raises:** `ValueError` for a precomputed result of other lights or another number of splats.
     """
     if light is not None:
         _check_kept(light, scene, plan)
@@ -97,14 +96,14 @@ def fill_scene(
 
 
 def resize_visibility(light: Kept, scene: Scene) -> Kept:
-    """Fill up or cut the rows of visibility of each kind of lights to the samples of a scene."""
+    """Pad or cut the rows of visibility of each kind of lights to the samples of a scene."""
     groups = zip(light.visibility, lights_by_kind(scene.lights), strict=True)
     visibility = [rows if rows is None else rows_at(rows, np.arange(len(g))) for rows, g in groups]
     return dataclasses.replace(light, visibility=visibility)
 
 
 def _check_kept(light: SplatLight | Transfer, scene: Scene, plan: Plan) -> None:
-    """Raise `ValueError` where what was kept is for other lights or another number of splats."""
+    """Raise `ValueError` for a precomputed result of other lights or another number of splats."""
     groups = jax.eval_shape(
         lambda lights: [[sample for _, sample in group] for group in lights_by_kind(lights)],
         scene.lights,
@@ -128,16 +127,16 @@ def on_devices(
     by_splat: bool = False,
 ) -> Result:
     """Run a function on the devices of a plan, each with its own splats in the order of the plan;
-    all in the precision of the splats' centers. Gradients go back to where the splats are.
+    all in the precision of the splats' centers. Gradients are on the devices of the splats.
 
     **Arguments:**
 
     - `function`: of the combination, scene and plan of a device, then of `whole`, `rows` and, if
       given, `placed`.
-    - `whole`: what every device has whole.
-    - `rows`: one for each splat, in the order of the scene.
-    - `placed`: what an earlier call computed along the splats, in the order of the plan.
-    - `by_splat`: the results lie along the splats, in the order of the plan; otherwise they are the
+    - `whole`: replicated on every device.
+    - `rows`: one row per splat, in the order of the scene.
+    - `placed`: results of an earlier call along the splats, in the order of the plan.
+    - `by_splat`: the results are along the splats, in the order of the plan; otherwise they are the
       same on all devices.
     """
     scene, whole, rows = in_one_dtype(scene, whole, rows)
@@ -171,8 +170,7 @@ def on_devices(
         shapes = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), given)
         results = jax.eval_shape(lambda given: run(OneDevice(), *given), shapes)
         out_specs = along_splats(results, devices)
-    # Without a check of what varies over devices: custom derivatives and loops have no rules for
-    # it.
+    # The check of varying axes is off: custom derivatives and loops have no rules for it.
     mapped = jax.shard_map(
         lambda *given: run(devices, *given),
         mesh=plan.mesh,
@@ -184,7 +182,7 @@ def on_devices(
 
 
 def along_splats(tree: PyTree, devices: DeviceMesh) -> PyTree:
-    """Specify that arrays are cut along their last axis, and that numbers are the same."""
+    """Specify that arrays are divided along their last axis, and that numbers are replicated."""
     return jax.tree.map(
         lambda leaf: (
             PartitionSpec(*[None] * (leaf.ndim - 1), devices.axes) if leaf.ndim else PartitionSpec()
@@ -196,25 +194,24 @@ def along_splats(tree: PyTree, devices: DeviceMesh) -> PyTree:
 def map_over(
     mesh: Mesh, function: Callable[[Any, Any], PyTree], shared: PyTree, batch: PyTree
 ) -> PyTree:
-    r"""Apply a function to each of a batch, a share of them on each device of a mesh, one after the
-    other.
+    r"""Apply a function to each element of a batch, one after the other, with a share of the batch
+    on each device of a mesh.
 
         frames = map_over(mesh, lambda scene, camera: render(scene, camera, plan=plan), scene,
         cameras)
 
     **Arguments:**
 
-    - `mesh`: whatever its axes; all its devices take part.
-    - `function`: of `shared` and of one element. Pure; where it is the same function again, nothing
-      is compiled again.
-    - `shared`: what every device has whole. Differentiable.
-    - `batch`: a tree of arrays, their elements along the first axis, of any number; static parts
-      belong to all. Differentiable.
+    - `mesh`: of any axes; all its devices are used.
+    - `function`: of `shared` and of one element. Pure; the same function is compiled once.
+    - `shared`: replicated on every device. Differentiable.
+    - `batch`: a tree of arrays with the elements along the first axis, any number; static parts are
+      shared. Differentiable.
 
-    **Returns:** what the function gives, stacked along a first axis, which is cut over the devices
-    if they divide it.
+    **Returns:** the results, stacked along a first axis, which is divided over the devices if their
+    number divides it.
 
-    **Raises:** `ValueError` when the batch is empty, or its arrays are not of one length.
+    **Raises:** `ValueError` if the batch is empty, or its arrays have different lengths.
     """
     arrays = jax.tree_util.tree_leaves_with_path(eqx.filter(batch, eqx.is_array))
     single = [jax.tree_util.keystr(path) for path, leaf in arrays if leaf.ndim == 0]

@@ -1,6 +1,4 @@
-"""Scenes filled up with what adds nothing, so that many share a program; and put in the order of a
-plan.
-"""
+"""Padding of scenes, so that many share a program, and sorting in the order of a plan."""
 
 import equinox as eqx
 import jax
@@ -14,7 +12,7 @@ from splatjax.scene import AbstractLightSample, Splats
 
 
 def fill_up(splats: Splats, count: int) -> Splats:
-    """Add splats that are invisible and bring no light, up to `count`."""
+    """Add invisible splats without light, up to `count`."""
     if splats.count == count:
         return splats
     return splats.take(jnp.arange(count, dtype=jnp.int32))
@@ -37,9 +35,7 @@ def fill_gaussians(gaussians: SumOfGaussians) -> SumOfGaussians:
 def fill_lights(
     group: list[tuple[int, AbstractLightSample]], number: int
 ) -> list[tuple[int, AbstractLightSample]]:
-    """Repeat the last light of a group, without its strength, up to four or a larger power of
-    two.
-    """
+    """Repeat the last light of a group with zero strength, up to four or a power of two."""
     last = group[-1][1]
     none = jax.device_put(np.zeros_like(getattr(last, last.strength_field)))
     dark = eqx.tree_at(lambda light: getattr(light, light.strength_field), last, none)
@@ -49,9 +45,7 @@ def fill_lights(
 def rows_at(
     rows: Shaped[Array, "rows ..."], places: Int[np.ndarray, " places"]
 ) -> Shaped[Array, "places ..."]:
-    """Take rows of an array, the last one for places beyond it. Outside `jit` nothing is
-    compiled.
-    """
+    """Take rows, the last one for indices beyond them. Outside `jit` nothing is compiled."""
     if np.array_equal(places, np.arange(len(rows))):
         return rows
     if isinstance(rows, Tracer):
@@ -64,7 +58,7 @@ def arrange(
     order: Int[Array, " places"] | Int[np.ndarray, " places"],
     exists: Bool[Array, " places"] | Bool[np.ndarray, " places"],
 ) -> Splats:
-    """Put a device's splats in the order of a plan; repeated ones are invisible and dark."""
+    """Sort a device's splats in the order of a plan; repeated ones are invisible and dark."""
     placed = jax.tree.map(lambda leaf: leaf[order], splats)
 
     def masked(leaf):

@@ -27,13 +27,13 @@ Parameters = TypeVar("Parameters", bound=PyTree)
 
 
 class PictureJacobian(eqx.Module):
-    r"""What every pixel of `beauty` does per change of the material's Gaussians.
+    r"""The derivatives of every pixel of `beauty` in the material's Gaussians.
 
     **Attributes:**
 
-    - `frame`: the picture at which it was taken.
+    - `frame`: the picture itself.
     - `weights`: derivative of channel c in weight `[k, c]`, premultiplied by coverage as `beauty`
-      is. The weights of other channels do not matter to a channel.
+      is. A channel does not depend on the weights of other channels.
     - `variances`: derivative of every channel in variance k, radiance per mm^2.
     """
 
@@ -42,7 +42,9 @@ class PictureJacobian(eqx.Module):
     variances: Float[Array, "gaussians height width channels"]
 
     def along(self, change: SumOfGaussians) -> Float[Array, "height width channels"]:
-        """Differentiate `beauty` along a change of weights and variances: a derivative picture."""
+        """Differentiate `beauty` along a change of weights and variances; return a derivative
+        picture.
+        """
         return jnp.einsum("k,khwc->hwc", change.variances, self.variances) + jnp.einsum(
             "kc,khwc->hwc", change.weights, self.weights
         )
@@ -50,8 +52,8 @@ class PictureJacobian(eqx.Module):
     def through(
         self, gaussians_of: Callable[[Parameters], SumOfGaussians], parameters: Parameters
     ) -> Parameters:
-        r"""Compute the Jacobian in what the Gaussians were made of: coefficients, thicknesses,
-        anything.
+        r"""Compute the Jacobian in the parameters of the Gaussians, such as coefficients and
+        thicknesses.
 
         **Arguments:**
 
@@ -90,18 +92,18 @@ def picture_jacobian(
     r"""Render, and differentiate every pixel of `beauty` in the weights and variances of the
     material.
 
-    The derivative of the picture that `render` computes, with its approximations, as reverse mode
-    computes it one pixel at a time. It costs about one more pass 4: less than two and a half
-    frames, whatever the number of pixels or parameters. With a least squares solver this is the
-    Jacobian of Gauss and Newton; from it `through` gives those in optical coefficients.
+    The result is the derivative of the picture that `render` computes, with its approximations, and
+    equals reverse mode for each pixel. It costs about one more pass 4: less than two and a half
+    frames, for any number of pixels or parameters. It is the Jacobian of Gauss and Newton's method
+    for least squares; `through` computes the Jacobian in optical coefficients.
 
     **Arguments:** as for `render`; under `jit` a plan is needed. With `ClusterDiffuser`, it cannot
     be differentiated again.
 
     **Returns:** a `PictureJacobian`; NaN where the plan does not suffice.
 
-    **Raises:** `ValueError` as `render`, and for a material with single scattering under light that
-    is not found at the splats; and for bounces.
+    **Raises:** `ValueError` as `render`, for a material with single scattering unless lighting is
+    `LightAtSplats`, and for bounces.
     """
     if scene.material.single_scattering is not None and not isinstance(
         settings.lighting, LightAtSplats
@@ -131,7 +133,7 @@ def _picture_jacobian(
             of_weights, of_variances = at.exitance_jacobian(*weighing)
             added = samples.attributes.added_source
             if added is not None:
-                # The light that a weight lets in has layers of its own.
+                # The light that depends on a weight has separate layers.
                 layers = samples.layers[:, len(added) :]
                 samples = dataclasses.replace(samples, layers=layers, derivative=None)
                 planned = plan.diffusion.gaussians, plan.interval, settings.kernel

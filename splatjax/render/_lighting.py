@@ -1,4 +1,4 @@
-"""Pass 1, and the light that enters the surface: at the splats, or at what the pixels see."""
+"""Pass 1, and the light that enters the surface: at the splats, or at the visible points."""
 
 import abc
 from collections.abc import Sequence
@@ -35,12 +35,12 @@ class ShadowPlan(eqx.Module):
     **Attributes:**
 
     - `raster`: their capacity.
-    - `settings`: how they are made and compared.
-    - `cube`: whether they are the six faces of a cube, as a point light among the splats needs
-      them. Static.
+    - `settings`: of the maps and their comparison.
+    - `cube`: whether the maps are the six faces of a cube, for a point light among the splats.
+      Static.
     - `splats_per_disc`: how many splats are merged into each disc in the maps. Static.
-    - `lights`: the number of lights of the group that exist; the others fill it up, come last and
-      have no shadow map. `None` where all exist.
+    - `lights`: the number of lights of the group that exist; the others are padding, come last and
+      have no shadow map. `None` if all exist.
     """
 
     raster: _splatting.AbstractRasterPlan
@@ -50,8 +50,8 @@ class ShadowPlan(eqx.Module):
     lights: Int[Array, ""] | None = None
 
     def closeness(self, light: AbstractLightSample, bounds: _splatting.Bounds) -> Float[Array, ""]:
-        """Compute a number above 1 for a point light that was planned outside the splats' bounding
-        sphere and has come into it.
+        """Compute a number above 1 for a point light that was outside the splats' bounding sphere
+        when planned, and is now inside.
         """
         if self.cube or not isinstance(light, PointLight | EmitterStratum):
             return jnp.zeros_like(bounds.radius)
@@ -65,7 +65,7 @@ def plan_views(
     settings: _splatting.ShadowSettings,
 ) -> tuple[list[Sequence[_splatting.AbstractView]], bool]:
     """Return the views of the shadow maps of each light of a group, and whether they are faces of
-    cubes: all are where one light is among the splats, or nearly so. Not for traced arrays.
+    cubes: all are if one light is among the splats, or near them. Not for traced arrays.
     """
     cube = any(
         float(jnp.linalg.norm(light.position - bounds.center)) < _NEARLY * float(bounds.radius)
@@ -110,8 +110,8 @@ class LightVisibility(eqx.Module):
     def per_light(
         self, positions: Float[Array, "points 3"], normals: Float[Array, "points 3"]
     ) -> tuple[Float[Array, "_lights points"] | None, ...]:
-        """Average the visibility of each light's samples by the light that each would bring; where
-        none is above the horizon, as if all grazed the surface.
+        """Average the visibility of each light's samples, weighted by their unshadowed light; if
+        all are below the horizon, as if all grazed the surface.
         """
 
         def received(light):
@@ -127,7 +127,7 @@ class LightVisibility(eqx.Module):
 
 
 class Irradiance(eqx.Module):
-    """Light below the surface of splats, or of points that the pixels see.
+    """Light below the surface, at splats or at visible points.
 
     **Attributes:**
 
@@ -145,7 +145,7 @@ def cast_shadows(
     splatting: _splatting.SplattingSettings,
     combination: AbstractCombination,
 ) -> LightVisibility:
-    """Make the shadow maps of all lights (4.1) and look up the splats in them."""
+    """Render the shadow maps of all lights (4.1) and look up the splats in them."""
     splats, groups = scene.splats, stack_lights(scene.lights)
     bounds = _splatting.Bounds.of(splats, combination)
     zero = jnp.zeros((), splats.centers.dtype)
@@ -170,7 +170,7 @@ def cast_shadows(
             closeness = plan.closeness(light, bounds)
             return jnp.sum(visible, axis=0), jnp.maximum(jnp.max(needed), closeness)
 
-        if len(group.light_indices) > len(group.distinct):  # in a gradient, maps are made again
+        if len(group.light_indices) > len(group.distinct):  # in a gradient, maps are rendered again
             of_light = jax.checkpoint(of_light)  # ty: ignore[invalid-assignment]
 
         def if_exists(numbered):
@@ -242,7 +242,7 @@ def irradiance_at_splats(scene: Scene, light: LightVisibility) -> Irradiance:
 def single_scattering_at_splats(
     scene: Scene, light: LightVisibility, eye: Float[Array, "3"]
 ) -> Float[Array, "channels splats"] | None:
-    """Compute the radiance of light that scatters once, each light sample in its own shadow."""
+    """Compute the radiance of light that scatters once, each sample with its own shadow."""
     splats, single = scene.splats, scene.material.single_scattering
     if single is None:
         return None
@@ -265,7 +265,9 @@ def surface_parameters(scene: Scene):
 
 
 class AbstractLighting(eqx.Module):
-    """What splats carry into the picture, and what pixels make of it before light is shaded."""
+    """The attributes that splats bring into the picture, and their use at the pixels before
+    shading.
+    """
 
     def attributes(
         self,
@@ -274,8 +276,8 @@ class AbstractLighting(eqx.Module):
         irradiance: Irradiance,
         eye: Float[Array, "3"],
     ) -> SurfaceAttributes:
-        """Collect what passes 2 and 3 blend, but for the layers of pass 4. A subclass adds what it
-        needs as `extra`.
+        """Collect the attributes that passes 2 and 3 blend, except for the layers of pass 4. A
+        subclass adds its own as `extra`.
         """
         splats = scene.splats
         specular, roughness = surface_parameters(scene)
@@ -295,11 +297,11 @@ class AbstractLighting(eqx.Module):
     def at_pixels(
         self, scene: Scene, groups: list[StackedLights], samples: SurfaceSamples
     ) -> SurfaceAttributes:
-        """Compute what passes 4 and 5 read from what was blended at the pixels."""
+        """Compute the inputs of passes 4 and 5 from the attributes blended at the pixels."""
 
 
 class LightAtSplats(AbstractLighting):
-    """The irradiance of the splats, blended like all they carry."""
+    """The irradiance of the splats, blended like all attributes."""
 
     def at_pixels(self, scene, groups, samples):
         return samples.attributes

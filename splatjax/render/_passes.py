@@ -1,6 +1,5 @@
-"""The five passes, wired once: what differs between pictures is what is read of the surface
-samples, and between devices how partial results are combined. The formulas of the passes are in
-splatting, diffusion and shading.
+"""The five passes. Pictures differ in the values read from the surface samples, and devices in the
+combination of partial results. The formulas of the passes are in splatting, diffusion and shading.
 """
 
 import dataclasses
@@ -47,13 +46,14 @@ class SplatLight(eqx.Module):
     **Attributes:** along the splats, in the order of the plan
 
     - `visibility`: of each light.
-    - `irradiance`: that enters, and that spreads.
+    - `irradiance`: the irradiance that enters, and the part that spreads.
     - `layers`: of pass 4.
-    - `derivative`: of the layers in the logarithms of their variances; `None` where not asked for.
+    - `derivative`: of the layers in the logarithms of their variances; `None` if not requested.
     - `added_source`: the derivative of the spreading irradiance in a weight of the Gaussians;
-      `None` where it has none. Its own layers follow those of the irradiance, channel by channel.
+      `None` if it is zero. Its layers follow those of the irradiance, channel by channel.
     - `needed`: capacity needed over planned.
-    - `solved`: what a diffuser that solves for the light keeps, along all splats; otherwise `None`.
+    - `solved`: the state of a diffuser that solves for the light, along all splats; otherwise
+      `None`.
     """
 
     visibility: list[Float[Array, "_lights splats"] | None]
@@ -78,7 +78,7 @@ def light_visibility(
     combination: AbstractCombination,
     transfer: Transfer | None = None,
 ) -> LightVisibility:
-    """Make the shadow maps and look up the splats in them (pass 1), or read a precomputed result.
+    """Render the shadow maps and look up the splats in them (pass 1), or read a precomputed result.
 
     **Arguments:** as for `light_splats`.
     """
@@ -96,13 +96,13 @@ def light_splats(
     derivative: bool = False,
     transfer: Transfer | None = None,
 ) -> SplatLight:
-    """Light the splats, and diffuse their irradiance among them: passes 1 and 4.
+    """Compute the light at the splats, and diffuse their irradiance: passes 1 and 4.
 
     **Arguments:**
 
     - `at`: the splats whose light is returned, in ascending order; all for `None`.
     - `derivative`: also differentiate the layers in the material's Gaussians.
-    - `transfer`: in the place of pass 1.
+    - `transfer`: replaces pass 1.
     """
     light = light_visibility(scene, settings, plan, combination, transfer)
     direct = irradiance_at_splats(scene, light)
@@ -154,8 +154,8 @@ def _differentiated_irradiance(
 ) -> tuple[Irradiance, Float[Array, "channels splats"]]:
     """Compute the irradiance, and also differentiate the source in the weights.
 
-    With single scattering, less light is left for the Gaussians where it grazes; this depends only
-    on the sum of the weights, so one weight is moved.
+    With single scattering, less light is left for the Gaussians at grazing angles. This depends
+    only on the sum of the weights, so the derivative is taken in one weight.
     """
     weights = scene.material.gaussians.weights
 
@@ -179,21 +179,21 @@ def see_and_shade(
     light_at: Callable[[Int[Array, " chosen"]], SplatLight],
     read: Callable[[ShadedSurface, _diffusion.LayersAtPoints, SurfaceSamples], Result],
 ) -> tuple[Result, _splatting.VisibleSurfaces]:
-    """Light the splats, see them, shade what is seen, and read what a picture needs: all passes.
+    """Run all passes: light the splats, find and shade the visible surface, and read the results.
 
     **Arguments:**
 
     - `light_at`: passes 1 and 4, for the splats that the camera may see: `make_light_at`.
-    - `read`: pointwise, along the last axis.
+    - `read`: computes the results of a picture from shaded points, pointwise along the last axis.
 
-    **Returns:** what was read, for each place; and the places, with the capacity needed of all
-    passes.
+    **Returns:** the results for each place, and the places, with the capacity that all passes
+    needed.
     """
     view, groups = _splatting.PerspectiveView.of(camera), stack_lights(scene.lights)
     chosen, chosen_needed = plan.raster.choose(scene.splats, view)
     light = light_at(chosen)
 
-    # Passes 2 and 3: blend the attributes and layers of the splats that may be seen.
+    # Passes 2 and 3: blend the attributes and layers of the splats that may be visible.
     splats = scene.splats.take(chosen)
     shown = Scene(splats, scene.lights, scene.material)
     layers = plan.diffusion.towards(
@@ -218,7 +218,7 @@ def see_and_shade(
     needed = combination.largest([jnp.maximum(chosen_needed, light.needed)])
     visible = dataclasses.replace(visible, needed=jnp.maximum(needed, visible.needed))
 
-    # Pass 5: shade the points that are seen.
+    # Pass 5: shade the visible points.
     def shade_and_read(samples: SurfaceSamples) -> Result:
         samples = jax.tree.map(in_a_row, samples)
         planned = plan.diffusion.gaussians, plan.interval
@@ -227,7 +227,7 @@ def see_and_shade(
 
     sample = partial(sample_surfaces, visible, attributes, origin)
 
-    # Apart, so that samples are materialized, and in large chunks, so that few of them are.
+    # A separate call, so that samples are materialized; large chunks, so that few are at a time.
     def sample_and_read(sums, tiles) -> Result:
         return map_places(shade_and_read, map_places(sample, sums, tiles))
 
@@ -243,13 +243,13 @@ def sample_surfaces(
     sums: _splatting.PixelSums,
     tiles: Int[Array, " places"],
 ) -> SurfaceSamples:
-    """Blend the sums of some places, and continue the layers of the splats to the points seen.
+    """Blend the sums of some places, and continue the layers of the splats to the visible points.
 
     **Arguments:**
 
     - `visible`: of all places.
     - `like`: the attributes whose rows were summed.
-    - `origin`: from which the splats' centers among them are counted.
+    - `origin`: of the splats' centers among the attributes.
     - `sums`, `tiles`: those of `visible`, of these places.
     """
     like = jax.eval_shape(lambda: like)

@@ -1,4 +1,4 @@
-"""How a picture is made, and what `jit`, `grad` and loops need to know of shapes, found once."""
+"""Plans: the static sizes and orders that `jit`, `grad` and loops need, computed once."""
 
 from collections.abc import Sequence
 
@@ -30,31 +30,31 @@ from ._filling import arrange, fill_gaussians, fill_up
 from ._lighting import ShadowPlan, plan_views
 from ._settings import RenderSettings
 
-# Directions to all sides, for which the shadow maps of any environment are planned.
+# Directions on the whole sphere, for which the shadow maps of any environment are planned.
 _DIRECTIONS = [[x, y, z] for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if x or y or z]
-_MOST_SPLATS = 1.06  # times the splats of a scene, of those before that it is filled up to
+_MOST_SPLATS = 1.06  # largest ratio of an earlier count, to which a scene is padded, to its own
 
 
 class Plan(eqx.Module):
-    r"""What `jit`, `grad` and loops need to know of shapes; made by `make_plan` from concrete
-    arrays.
+    r"""The static sizes and orders that `jit`, `grad` and loops need; made by `make_plan` from
+    concrete arrays.
 
-    Capacities are static, indices are arrays. A picture that needs more than its plan holds is NaN,
-    and `overflow` is the need.
+    Capacities are static, indices are arrays. A picture that exceeds a capacity is NaN, and
+    `overflow` is the ratio of needed to planned capacity.
 
     **Attributes:**
 
-    - `order`: the compact order in which the splats of each device are rendered; the last is
-      repeated to fill a block.
+    - `order`: the compact order in which the splats of each device are rendered; the last one is
+      repeated to complete a block.
     - `exists`: false for these repetitions.
-    - `shadows`: for each group of lights of a kind the capacity of its shadow maps; `None` for
-      lights that cast no shadows.
+    - `shadows`: the capacity of the shadow maps of each group of lights of a kind; `None` for
+      lights without shadows.
     - `diffusion`: the clusters and neighbors of the splats.
     - `interval`: standard deviations per spacing between which a layer becomes resolved.
-    - `raster`: the capacity of what the cameras see.
-    - `sightlines`: which splats see which; `None` without bounces.
-    - `mesh`: the devices that hold the splats; `None` for one. Static.
-    - `splats`, `gaussians`: how many it is for. Static.
+    - `raster`: the capacity for the views of the cameras.
+    - `sightlines`: the visibility between splats; `None` without bounces.
+    - `mesh`: the devices of the splats; `None` for one. Static.
+    - `splats`, `gaussians`: their numbers. Static.
     """
 
     order: Int[Array, " places"]
@@ -69,7 +69,7 @@ class Plan(eqx.Module):
     gaussians: int = eqx.field(static=True)
 
     def specs(self, combination: DeviceMesh) -> "Plan":
-        """Specify which arrays every device has whole, and of which it has a share."""
+        """Specify the arrays that are replicated, and those that are divided over the devices."""
         return eqx.tree_at(
             lambda plan: (
                 *(plan.order, plan.exists, *plan.diffusion.shares()),
@@ -87,22 +87,22 @@ def make_plan(
     settings: RenderSettings = RenderSettings(),
     mesh: Mesh | None = None,
 ) -> Plan:
-    r"""Find the capacities and orders that rendering a scene with these cameras needs.
+    r"""Compute the capacities and orders for rendering a scene with these cameras.
 
     **Arguments:** concrete, not traced.
 
     - `scenes`: one, or several that differ only in their lights: the same splats and material,
       lights of the same kinds in the same order.
     - `cameras`: all have pictures of one size.
-    - `mesh`: devices over which the splats are cut when rendering; planned on one.
+    - `mesh`: devices over which the splats are divided for rendering; planned on one.
 
-    **Returns:** a `Plan` that serves every scene with every camera, and scenes and materials near
-    these: variances within a factor of 1.25, splats that have moved among each other by less than a
-    tenth of a layer's width, light of any strength and color, and every environment. A light
-    that casts shadows from elsewhere may need more capacity.
+    **Returns:** a `Plan` for every scene with every camera, and for scenes and materials near
+    these: variances within a factor of 1.25, relative movements of splats below a tenth of a
+    layer's width, light of any strength and color, and every environment. A light that casts
+    shadows from elsewhere may need more capacity.
 
-    **Raises:** `ValueError` when cameras or scenes do not fit together, or when the rasterizer or
-    diffuser of the settings does not work over a mesh.
+    **Raises:** `ValueError` for incompatible cameras or scenes, or a rasterizer or diffuser that
+    does not work over a mesh.
     """
     cameras = [cameras] if isinstance(cameras, Camera) else list(cameras)
     scenes = [scenes] if isinstance(scenes, Scene) else list(scenes)
@@ -141,7 +141,7 @@ def make_plan(
 
 
 def splats_per_device(count: int, mesh: Mesh | None) -> tuple[int, int]:
-    """Return the number of devices, and how many of `count` splats each has: at least one."""
+    """Return the number of devices, and the number of splats of each, at least one."""
     devices = 1 if mesh is None else mesh.size
     return devices, max(-(-count // devices), 1)
 
@@ -175,7 +175,7 @@ def plan_unless_traced(
     mesh: Mesh | None = None,
     is_lit: bool = True,
 ) -> Plan:
-    """Check the scene and the plan, or make one where none is given.
+    """Check the scene and the plan, or make a plan if none is given.
 
     **Raises:** `ValueError` for a plan of other splats or another mesh, or when none is given under
     `jit`, `grad` or `vmap`.
@@ -211,7 +211,7 @@ def _check(scenes: list[Scene], cameras: list[Camera]) -> None:
 
 
 def _on_one_device(tree: Result) -> Result:
-    """Gather what may lie on several devices, and on those of several processes, for planning."""
+    """Gather arrays from several devices and processes, for planning."""
 
     def gathered(leaf):
         if not isinstance(leaf, jax.Array) or isinstance(
@@ -225,8 +225,8 @@ def _on_one_device(tree: Result) -> Result:
 
 
 def _cut_and_order(splats: Splats, mesh: Mesh | None) -> tuple[list[Splats], Array, Array]:
-    """Cut the splats into a part for each device, each in a compact order; also return the orders
-    and which of their entries exist, device after device.
+    """Divide the splats into a part for each device, in a compact order; also return the orders,
+    and whether their entries exist, device after device.
     """
     devices, share = splats_per_device(splats.count, mesh)
     places = rounded_up(share, _diffusion.POINTS_PER_BLOCK, per_octave=16)
@@ -245,14 +245,14 @@ def _cut_and_order(splats: Splats, mesh: Mesh | None) -> tuple[list[Splats], Arr
 
 @eqx.filter_jit
 def _measure(parts: Sequence[Splats], kernel: _diffusion.AbstractDiffusionKernel):
-    """Compute the bounds of the splats, and from which width they resolve a layer."""
+    """Compute the bounds of the splats, and the least width of a layer that they resolve."""
     splats = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
     interval = kernel.interval(_diffusion.unevenness(splats))
     return _splatting.Bounds.of(splats, OneDevice()), interval
 
 
 def _groups(lights: Sequence[tuple[AbstractLight, ...]]) -> list[list[AbstractLightSample]]:
-    """Return for each group of lights that are rendered together its samples in every scene."""
+    """Return the samples in every scene, for each group of lights that are rendered together."""
     by_kind = [lights_by_kind(of_scene) for of_scene in lights]
     kinds = [
         [[(index, jax.tree.structure(sample)) for index, sample in group] for group in groups]

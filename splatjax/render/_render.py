@@ -1,4 +1,4 @@
-"""A picture with all its layers, the light of a body without a camera, and pass 4 alone."""
+"""Pictures with all layers, the light of a body without a camera, and pass 4 alone."""
 
 import dataclasses
 from functools import partial
@@ -44,18 +44,20 @@ def render(
 
     **Arguments:**
 
-    - `scene`: splats (mm), lights and material. Differentiable; which splats are visible is not.
+    - `scene`: splats (mm), lights and material. Differentiable; the choice of visible splats is
+      not.
     - `camera`: Differentiable.
-    - `settings`: how each pass works.
-    - `plan`: from `splatjax.make_plan`; needed under `jit`, `grad` and `vmap`, made here otherwise.
-    - `mesh`: devices over which the splats are cut, whatever its axes: each holds a share, and
-      their gradients (docs/devices.md). By default the mesh of the plan.
+    - `settings`: of each pass.
+    - `plan`: from `splatjax.make_plan`; required under `jit`, `grad` and `vmap`, otherwise made
+      here.
+    - `mesh`: devices over which the splats and their gradients are divided, of any axes
+      (docs/devices.md). By default the mesh of the plan.
     - `light`: a precomputed result for the same settings and plan: from `splatjax.illuminate` with
       the same scene, passes 1 and 4, which do not depend on the camera; or from `splatjax.transfer`
       with the same splats, pass 1, which does not depend on the strength of lights. Differentiable.
 
-    **Returns:** a `Frame` in the dtype of `splats.centers`; the same on every device, and to
-    rounding whatever the mesh.
+    **Returns:** a `Frame` in the dtype of `splats.centers`. It is the same on every device, and for
+    every mesh to rounding.
 
     **Raises:** `ValueError` when a plan is needed and not given, or is for another mesh or another
     number of splats, when `light` is for other kinds of lights, or when the scene's channels
@@ -96,9 +98,10 @@ def illuminate(
     derivative: bool = False,
     light: Transfer | None = None,
 ) -> SplatLight:
-    r"""Light a body and diffuse its light: passes 1 and 4, which no camera changes.
+    r"""Compute the light of a body and diffuse it: passes 1 and 4, which do not depend on the
+    camera.
 
-    Give the result to `render` or `diffusion_basis` to look at the same body from several sides.
+    Pass the result to `render` or `diffusion_basis` to render the same body with several cameras.
 
     **Arguments:**
 
@@ -107,7 +110,7 @@ def illuminate(
     - `settings`: those of the plan.
     - `derivative`: as for `diffusion_basis`.
     - `light`: from `splatjax.transfer` with the same splats, settings and plan, for lights of the
-      same kinds in the same order: no shadow map is made. Differentiable.
+      same kinds in the same order; no shadow map is rendered. Differentiable.
 
     **Returns:** the light on the splats, in the order of the plan.
 
@@ -131,11 +134,12 @@ def _illuminate(
 
 
 def transfer(scene: Scene, plan: Plan, settings: RenderSettings = RenderSettings()) -> Transfer:
-    r"""Make the shadow maps of all lights, and return the visibility of each from every splat.
+    r"""Render the shadow maps of all lights, and return the visibility of each light from every
+    splat.
 
-    Give the result to `render` or `illuminate`, for lights of other strengths and colors. An
-    environment whose `directions` are given may also have another image of the same size, or
-    another rotation:
+    Pass the result to `render` or `illuminate`, for lights of other strengths and colors. An
+    environment with given `directions` may also have another image of the same size, or another
+    rotation:
 
         white = EnvironmentLight(np.ones((64, 128, 3)), directions=even_directions(128))
         kept = transfer(Scene(splats, [white], material), plan)
@@ -169,8 +173,8 @@ def compute_irradiance(
 
     **Arguments:** as for `illuminate`.
 
-    **Returns:** the irradiance, and that which spreads, `[channels, splats]` in the order of the
-    scene: `source.T` is what `diffuse_irradiance` takes.
+    **Returns:** the irradiance, and the part that spreads, `[channels, splats]` in the order of the
+    scene: `source.T` is the argument of `diffuse_irradiance`.
 
     **Raises:** `ValueError` as `illuminate`.
     """
@@ -212,14 +216,14 @@ def diffuse_irradiance(
     r"""Diffuse any irradiance of the splats below the surface: pass 4 alone, the plain layers `L_k`
     (section 4.2).
 
-    **Arguments:** as for `render`; of the scene only the splats' geometry and albedo and the
-    material's Gaussians matter.
+    **Arguments:** as for `render`; only the splats' geometry and albedo and the material's
+    Gaussians are used.
 
-    - `irradiance`: that enters at each splat, in the channels of the material's weights.
+    - `irradiance`: the light that enters each splat, in the channels of the material's weights.
       Differentiable.
 
-    **Returns:** one layer per Gaussian on the front surface, 0 where there is none; NaN where the
-    plan does not suffice. Weighted by `material.gaussians.weights` and summed they are the radiant
+    **Returns:** one layer per Gaussian on the front surface, 0 where no surface is visible, and NaN
+    if the plan does not suffice. Their sum weighted by `material.gaussians.weights` is the radiant
     exitance.
 
     **Raises:** `ValueError` when a plan is needed and not given, or when the channels disagree.

@@ -16,17 +16,17 @@ class RenderSettings(eqx.Module):
 
     - `splatting`: passes 2 and 3: epsilon-z, the screen filter.
     - `shadows`: pass 1: resolution and bias of shadow maps.
-    - `sample_shadows`: those of the maps of the samples of extended lights: many, so that each is
-      coarser. `ShadowSettings()` makes them like those of other lights.
-    - `bounces`: how many times light that has left the body may enter it again. Static.
-    - `sightlines`: in how many directions each splat sees the body, for these.
-    - `kernel`: pass 4: how a layer spreads, is normalized, and when the splats resolve it:
+    - `sample_shadows`: the same for the samples of extended lights, which are many, so each map is
+      coarser. `ShadowSettings()` makes them as fine as those of other lights.
+    - `bounces`: number of times that light may leave the body and enter it again. Static.
+    - `sightlines`: the directions in which each splat sees the body, for bounces.
+    - `kernel`: pass 4: source depth, normalization, and resolution of a layer:
       `EscapeNormalization()`, or `PlainMean()`, the paper's.
     - `rasterizer`: `TileRasterizer()`, or `DenseRasterizer()`, the plain reference.
     - `diffuser`: `ClusterDiffuser()`; `DenseDiffuser()`, the plain reference; or `ShapeDiffuser()`,
-      which solves the diffusion equation in the body itself.
-    - `lighting`: what the splats carry into the picture: `LightAtSplats()` blends their irradiance;
-      `splatjax.baselines` has others.
+      which solves the diffusion equation in the body.
+    - `lighting`: `LightAtSplats()` blends the irradiance of the splats; `splatjax.baselines` has
+      others.
     """
 
     splatting: _splatting.SplattingSettings = _splatting.SplattingSettings()

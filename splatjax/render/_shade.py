@@ -1,4 +1,4 @@
-"""Pass 5: the surface samples shaded, and laid together to a frame."""
+"""Pass 5: shade the surface samples, and compose them to a frame."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -16,9 +16,9 @@ class ShadedSurface(eqx.Module):
 
     **Attributes:**
 
-    - `radiance_per_exitance`: towards the eye, `sqrt(albedo) exit_transmission / pi`; 0 where there
-      is no surface.
-    - `layers`: of each Gaussian, times `radiance_per_exitance`, Gaussian by Gaussian.
+    - `radiance_per_exitance`: towards the eye, `sqrt(albedo) exit_transmission / pi`; 0 without a
+      surface.
+    - `layers`: of each Gaussian, times `radiance_per_exitance`.
     - `diffuse`: their weighted sum.
     - `resolved`: the fraction of each layer that is the diffusion integral.
     """
@@ -46,7 +46,7 @@ def layers_at_points(
     interval: Float[Array, "2"],
     kernel: _diffusion.AbstractDiffusionKernel,
 ) -> _diffusion.LayersAtPoints:
-    """Collect what makes the layers of the samples.
+    """Collect the inputs of the layers of the samples.
 
     **Arguments:**
 
@@ -77,8 +77,8 @@ def shade(
     interval: Float[Array, "2"],
     settings: RenderSettings,
 ) -> tuple[ShadedSurface, _diffusion.LayersAtPoints]:
-    """Shade the samples: the layers, the specular lobe, and single scattering. Also return what
-    the layers were made of.
+    """Shade the samples: the layers, the specular lobe, and single scattering. Also return the
+    inputs of the layers.
 
     **Arguments:**
 
@@ -136,7 +136,8 @@ def compose(
     shaded: ShadedSurface,
     visible: _splatting.VisibleSurfaces,
 ) -> Frame:
-    """Lay the front over what shows behind it; all is NaN where the plan does not suffice.
+    """Composite the front surface over the one behind it; all values are NaN if the plan does not
+    suffice.
 
     **Arguments:**
 
@@ -170,7 +171,7 @@ def compose(
 def _shadows_in_order(
     visibility, groups: list[StackedLights], lights: int, depth: Float[Array, " points"]
 ) -> Float[Array, "lights points"]:
-    """Sort the visibility of the lights into the scene's order; 1 where a light casts none."""
+    """Sort the visibility of the lights in the scene's order; 1 if a light casts no shadows."""
     planes = [jnp.ones_like(depth)] * lights
     for group, rows in zip(groups, visibility, strict=True):
         if rows is not None:

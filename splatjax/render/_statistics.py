@@ -1,4 +1,4 @@
-"""What must be known of all splats before a picture of a stream can be begun."""
+"""Statistics of all splats of a stream, which a picture needs first."""
 
 import math
 from collections.abc import Iterator
@@ -16,7 +16,9 @@ _CHANGED = "parts must return the same splats in the same order at each call"
 
 
 class ReplayableStream:
-    """Parts that must be the same each time: what is known of one is used when it comes again."""
+    """Parts that must be the same at each iteration, because results of one iteration serve the
+    next.
+    """
 
     def __init__(self, parts: Parts):
         self.parts, self.marks = parts, None
@@ -24,7 +26,7 @@ class ReplayableStream:
     def __call__(self) -> Iterator[Splats]:
         """Iterate over all splats from the beginning.
 
-        **Raises:** `ValueError` when a part differs from the first time, or there are fewer or
+        **Raises:** `ValueError` if a part differs from the first iteration, or there are fewer or
         more.
         """
         marks = []
@@ -46,15 +48,16 @@ def _mark(splats: Splats) -> Float[Array, " leaves"]:
 
 @dataclass(frozen=True)
 class StreamStatistics:
-    """Numbers of all splats of a stream. Lengths in mm.
+    """Statistics of all splats of a stream. Lengths in mm.
 
     **Attributes:**
 
     - `part_size`: splats in every part but the last.
-    - `middle`, `reach`: of the box around all centers, and from there to the farthest rim.
+    - `middle`, `reach`: the middle of the box around all centers, and the distance to the farthest
+      rim.
     - `spacing`, `fine`: root of the mean area of the splats that have one, and the area that one in
       a hundred of these is finer than; infinite where none has.
-    - `unevenness`: the mean over the same splats of that of their part.
+    - `unevenness`: the mean of the unevenness of the parts, weighted by their splats.
     """
 
     part_size: int
@@ -66,7 +69,7 @@ class StreamStatistics:
 
     @classmethod
     def of(cls, parts: Parts) -> "StreamStatistics":
-        """Look at all parts twice, and keep the areas of the finest.
+        """Read all parts twice, and keep the areas of the finest splats.
 
         **Raises:** `ValueError` when there are no splats, or a part is larger than the first, or
         smaller and not the last.
@@ -89,7 +92,7 @@ class StreamStatistics:
                 f"parts must have one size, except for a smaller last one; these have {sizes} "
                 "splats"
             )
-        # How far the farthest splat is, the finest areas, and how evenly splats are spread.
+        # Distance of the farthest splat, finest areas, and unevenness.
         middle = (np.min(low, axis=0) + np.max(high, axis=0)) / 2
         farthest, finest, uneven = 0.0, np.zeros(0), 0.0
         rank = _diffusion.FINE_QUANTILE * max(count - 1, 0)

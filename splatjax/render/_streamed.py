@@ -1,5 +1,5 @@
-"""A picture of more splats than memory holds: they come a part at a time, several times over, and
-leave only sums behind.
+"""Pictures of more splats than fit into memory: parts are read one at a time, several times, and
+only sums are kept.
 """
 
 import dataclasses
@@ -50,20 +50,21 @@ def render_streamed(
     settings: RenderSettings = RenderSettings(),
     report: Callable[[str, int], None] | None = None,
 ) -> Frame:
-    r"""Render splats that come a part at a time, in memory that does not grow with their number.
+    r"""Render splats part by part, in memory that does not grow with their number.
 
     **Arguments:**
 
-    - `parts`: iterates over all splats from the beginning whenever it is called, in complete parts
-      of one size but the last, that are near in memory where they are near in space:
-      `splatjax.SplatFile`, for one.
+    - `parts`: each call iterates over all splats from the beginning, in parts of one size except
+      for a smaller last one, such as `splatjax.SplatFile`. Splats near in space must be near in
+      memory.
     - `lights`, `material`, `camera`, `settings`: as for `render`, with the default rasterizer and
       diffuser.
-    - `report`: called after each part with what is being done, and how many splats are done.
+    - `report`: called after each part with the name of the stage, and the number of finished
+      splats.
 
-    **Returns:** the frame of `render`, to rounding but for pass 4: its clusters are those of each
-    part, and layers are evaluated at the points that the pixels see, so that it differs by less
-    than the error of the diffuser. Without gradients.
+    **Returns:** the frame of `render`, to rounding except for pass 4. There clusters are those of
+    each part, and layers are evaluated at the visible points, so the difference is below the error
+    of the diffuser. There are no gradients.
 
     **Raises:** `ValueError` when there are no splats, parts differ in size, are not the same each
     time, or the settings cannot be streamed.
@@ -134,7 +135,7 @@ def render_streamed(
     )
     light = partial(_light, groups=groups, shadow_maps=shadow_maps, settings=settings)
 
-    # Passes 2 and 3: what the camera sees.
+    # Passes 2 and 3: the view of the camera.
     like = settings.lighting.attributes(first, *light(first), view.position)
 
     (seen,) = _sum_views(
@@ -148,7 +149,7 @@ def render_streamed(
     )
     visible, samples = _sample(seen, view, settings, like, bounds.center)
 
-    # Pass 4, at the points that the pixels see.
+    # Pass 4, at the visible points.
     interval = settings.kernel.interval(jnp.asarray(statistics.unevenness, dtype))
     diffusion = _diffusion.StreamedDiffusion(
         diffuser,

@@ -1,4 +1,4 @@
-"""Plain records: what is drawn, what with, and what comes out. No algorithms."""
+"""Plain records of scenes, cameras, lights, materials and frames. No algorithms."""
 
 from ._area_lights import (
     AbstractAreaLight as AbstractAreaLight,

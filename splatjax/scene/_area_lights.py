@@ -1,4 +1,4 @@
-"""Lights of a size, near a body: rectangles, disks and balls of even radiance."""
+"""Area lights near a body: rectangles, disks and balls of uniform radiance."""
 
 import abc
 from typing import ClassVar
@@ -20,8 +20,8 @@ _GOLDEN = (5**0.5 - 1) / 2
 
 
 class AbstractAreaLight(AbstractExtendedLight, AbstractHighlight):
-    r"""A surface of even radiance. A glossy surface mirrors a single point of it, the one nearest
-    to the mirrored ray.
+    r"""A surface of uniform radiance. A glossy surface reflects the point of it that is nearest to
+    the mirrored ray.
 
     **Source:** Karis 2013, "Real Shading in Unreal Engine 4": the representative point.
     """
@@ -40,11 +40,11 @@ class AbstractAreaLight(AbstractExtendedLight, AbstractHighlight):
 
     @abc.abstractmethod
     def sample_offsets(self) -> Float[np.ndarray, "samples axes"]:
-        """Lay out the samples, in units of the axes from the center."""
+        """Compute the positions of the samples, in units of the axes from the center."""
 
     @abc.abstractmethod
     def nearest(self, places: Float[Array, "*places axes"]) -> Float[Array, "*places axes"]:
-        """Find the nearest places on the light, in units of the axes from the center."""
+        """Find the nearest points on the light, in units of the axes from the center."""
 
     @abc.abstractmethod
     def solid_angle(self, from_center: Float[Array, "*points 3"]) -> Float[Array, "*points"]:
@@ -53,9 +53,7 @@ class AbstractAreaLight(AbstractExtendedLight, AbstractHighlight):
     def normal_and_area(
         self,
     ) -> tuple[Float[Array, "3"] | None, Float[Array, ""]]:
-        """Compute the unit normal of a flat light, and the area that is seen from far ahead,
-        mm^2.
-        """
+        """Compute the unit normal of a flat light, and its area along the normal, mm^2."""
         axes = self.axes()
         across = jnp.cross(axes[0], axes[1])
         area = jnp.linalg.norm(across)
@@ -79,10 +77,10 @@ class AbstractAreaLight(AbstractExtendedLight, AbstractHighlight):
         return self
 
     def reflected(self, points, mirrored, roughness, lobe, albedo):
-        r"""Take the lobe, with the solid angle `s = albedo / lobe(mirrored)`, for a Gaussian.
+        r"""Approximate the lobe, with the solid angle `s = albedo / lobe(mirrored)`, by a Gaussian.
 
         A light of the solid angle `w` in its middle then fills `1 - exp(-w / s)` of it: a small
-        light is a point, and a large one is seen with its radiance.
+        light acts as a point, and a large one is reflected with its radiance.
         """
         normal, _ = self.normal_and_area()
         from_center = points - jnp.broadcast_to(self.center, points.shape)
@@ -106,13 +104,13 @@ class AbstractAreaLight(AbstractExtendedLight, AbstractHighlight):
 
 @record
 class RectangleLight(AbstractAreaLight):
-    r"""A rectangle of even radiance that emits to one side, such as a softbox.
+    r"""A rectangle of uniform radiance that emits to one side, such as a softbox.
 
     **Attributes:**
 
     - `center`: mm. Differentiable.
-    - `radiance`: on the side that emits. A white diffuser under a whole sky of this radiance has
-      the same. Differentiable.
+    - `radiance`: of the emitting side. A white diffuser under a whole sky of this radiance has the
+      same radiance. Differentiable.
     - `edges`: two edge vectors, perpendicular, mm: the rectangle extends by half of each to either
       side of `center`. It emits in the direction of their cross product. Differentiable.
     - `count`, `cast_shadows`: static.
@@ -179,7 +177,7 @@ class RectangleLight(AbstractAreaLight):
 
 @record
 class DiskLight(AbstractAreaLight):
-    r"""A disk of even radiance that emits to one side.
+    r"""A disk of uniform radiance that emits to one side.
 
     **Attributes:** as of `RectangleLight`, and
 
@@ -204,8 +202,8 @@ class DiskLight(AbstractAreaLight):
 
     def solid_angle(self, from_center: Float[Array, "*points 3"]) -> Float[Array, "*points"]:
         r"""Integrate along the rim, `(r^2 - q . x) / (s (s + h))` at `q` for a point `x` at the
-        height `h` and the distance `s` from `q`, by the trapezoidal rule: farther
-        than a fifth of the radius from the disk to 0.02.
+        height `h` and the distance `s` from `q`, by the trapezoidal rule. Farther than a fifth of
+        the radius from the disk, the error is at most 0.02.
         """
         angle = 2 * np.pi * np.arange(_RIM) / _RIM
         around = np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -220,10 +218,10 @@ class DiskLight(AbstractAreaLight):
 
 @record
 class SphereLight(AbstractAreaLight):
-    r"""A ball whose surface has even radiance.
+    r"""A ball whose surface has uniform radiance.
 
-    Its samples fill the ball so that they look like an even disk from every side. The result is
-    meaningless for points inside it.
+    Its samples fill the ball so that from every side they have the distribution of a uniform disk.
+    The result is invalid for points inside the ball.
 
     **Attributes:** as of `RectangleLight`, and
 
@@ -237,7 +235,7 @@ class SphereLight(AbstractAreaLight):
         return self.radius * jnp.eye(3, dtype=self.radius.dtype)
 
     def sample_offsets(self) -> Float[np.ndarray, "samples 3"]:
-        # Seen from any side, a density of 1 / sqrt(1 - s^2) is even.
+        # A density of 1 / sqrt(1 - s^2) is uniform when projected along any direction.
         i = np.arange(self.count) + 0.5
         s = np.sin(np.linspace(0, np.pi / 2, 1000))
         within = 2 / np.pi * (np.arcsin(s) - s * np.sqrt(1 - s * s))

@@ -1,4 +1,4 @@
-"""Light from everywhere: an environment as an image of the whole sphere of directions."""
+"""Environments: distant light given by an image of the whole sphere of directions."""
 
 import functools
 import math
@@ -18,41 +18,42 @@ from ._lights import AbstractExtendedLight, AbstractHighlight, AbstractLightSamp
 from ._scene import Camera, Frame
 
 _CELLS = 128  # along a side of the grid of equal areas that is cut into strata; a power of two
-_EVEN = 0.1  # of the importance that all directions share, so that none is far from a sample
+_EVEN = 0.1  # fraction of uniform importance, so that no direction is far from a sample
 _FAINT = 1e-3  # of the mean radiance, added where the mean direction of a stratum is computed
-_ROWS = 64  # of a blurred map, whose pixels are as large as the sharpest lobe is wide
+_ROWS = 64  # height of a blurred map, whose pixels have the width of the sharpest lobe
 _ROUGHNESSES = np.geomspace(0.05, 1.0, 7)  # of the blurred maps
 
 
 @record
 class EnvironmentLight(AbstractExtendedLight):
-    r"""Light from infinitely far away on all sides, given by an image of all directions.
+    r"""Distant light from all directions, given by an image.
 
     The image is a latitude-longitude map as OpenEXR defines it, with square pixels: the upper edge
     is +y and the lower one -y; the middle is +z, a quarter of the width to the left of it is +x,
     and both side edges are -z. This is the view from inside the sphere.
 
-    It lights by `count` directional samples: the sphere is cut into strata of equal importance,
+    It is sampled by `count` directions. The sphere is divided into strata of equal importance,
     which is nine parts radiance times solid angle and one part solid angle. Each sample has the
     irradiance of all pixels of its stratum, the mean direction of their radiance, and a shadow map.
-    What glossy surfaces mirror is not sampled: it is the image, blurred by the lobe.
+    Highlights are not sampled: glossy surfaces reflect the image, blurred by the lobe.
 
     **Attributes:**
 
     - `image`: radiance, linear; twice as wide as high, gray or in color. Differentiable; the
-      boundaries of the strata are held fixed.
+      boundaries of the strata are constants.
     - `rotation`: degrees about `up`; a positive angle turns +z towards +x. Differentiable.
     - `strength`: a factor on each channel. Differentiable.
     - `up`: the direction of the image's upper edge: (0, 0, 1) for a world whose z is up; the middle
       of the image is then -y. Any length but zero. Differentiable.
-    - `directions`: world directions of the samples, any length but zero; `None` to lay the samples
-      out by the image. With fixed directions, visibility that was kept serves every image and
-      rotation (`splatjax.transfer`). Every pixel lights along those near it.
-    - `count`: of samples that are laid out by the image. Static.
+    - `directions`: world directions of the samples, any length but zero; `None` to choose the
+      samples by the image. With given directions, a kept visibility is valid for every image and
+      rotation (`splatjax.transfer`). The light of every pixel is distributed to the directions near
+      it.
+    - `count`: number of samples that are chosen by the image. Static.
     - `cast_shadows`: static.
 
-    **Raises:** `ValueError` for an image that is not twice as wide as high, holds whole numbers, or
-    radiance that is negative or not finite.
+    **Raises:** `ValueError` for an image that is not twice as wide as high, or has integers, or
+    negative or infinite radiance.
     """
 
     image: Float[Array, "height width #channels"] = eqx.field(
@@ -82,7 +83,7 @@ class EnvironmentLight(AbstractExtendedLight):
 
     def to_world(self) -> Float[Array, "3 3"]:
         """Compute the rotation from the directions of the image to those of the world: about +y,
-        and from there the shortest way to `up`.
+        then the shortest rotation from +y to `up`.
         """
         angle = jnp.deg2rad(self.rotation)
         cosine, sine, one = jnp.cos(angle), jnp.sin(angle), jnp.ones_like(angle)
@@ -131,8 +132,8 @@ class EnvironmentLight(AbstractExtendedLight):
     def _distribute(
         self, directions: Float[Array, "height width 3"], moments: Float[Array, "height width sums"]
     ) -> Float[Array, "samples sums"]:
-        """Distribute the moments of every pixel over the given directions near it, by Gaussians
-        half as wide as the directions are apart.
+        """Distribute the moments of every pixel to the given directions near it, by Gaussians half
+        as wide as the spacing of the directions.
         """
         given = self.directions / jnp.linalg.norm(self.directions, axis=1, keepdims=True)
         given = given @ self.to_world()
@@ -146,7 +147,7 @@ class EnvironmentLight(AbstractExtendedLight):
         return jnp.sum(jax.lax.map(of_row, (directions, moments)), axis=0)
 
     def _stratify(self, moments: Float[Array, "height width sums"]) -> Float[Array, "strata sums"]:
-        """Sum the moments over strata, which are cut from the sphere along a Hilbert curve."""
+        """Sum the moments over strata, which divide the sphere along a Hilbert curve."""
         # Sum over cells of equal area, in the order of the curve.
         height = len(moments)
         along = np.arange(2 * height) * _CELLS // (2 * height)
@@ -156,7 +157,8 @@ class EnvironmentLight(AbstractExtendedLight):
         moments = moments.reshape(len(order), -1)
         cells = jnp.zeros((_CELLS**2, moments.shape[1]), moments.dtype).at[order].add(moments)
 
-        # Cut the curve. No cell counts for more than a stratum: the next would have nothing left.
+        # Divide the curve. No cell counts more than one stratum, or the next stratum would be
+        # empty.
         importance, even = jax.lax.stop_gradient(cells[:, -2:]).T
         importance = (1 - _EVEN) * importance + _EVEN * even
         for _ in range(8):
@@ -169,7 +171,7 @@ class EnvironmentLight(AbstractExtendedLight):
         return PrefilteredEnvironment(prefilter(self.radiance()), self.to_world())
 
     def behind(self, frame: Frame, camera: Camera) -> Float[Array, "height width channels"]:
-        """Composite the `beauty` of a frame over the environment as its camera sees it."""
+        """Composite the `beauty` of a frame over the environment behind it, for its camera."""
         sides = reversed(frame.coverage.shape)
         x, y = jnp.meshgrid(*(jnp.arange(n, dtype=self.image.dtype) + 0.5 - n / 2 for n in sides))
         z = jnp.broadcast_to(camera.focal_length * len(x), x.shape)
@@ -179,11 +181,11 @@ class EnvironmentLight(AbstractExtendedLight):
 
 
 class PrefilteredEnvironment(AbstractHighlight):
-    """The mean radiance that lobes of several roughnesses see of an environment.
+    """The mean radiance of an environment over lobes of several roughnesses.
 
     **Attributes:**
 
-    - `maps`: latitude-longitude, from the sharpest; one more pixel at every edge repeats what lies
+    - `maps`: latitude-longitude, the sharpest first; one more pixel at every edge repeats the pixel
       beyond it.
     - `rotation`: from the directions of the maps to those of the world.
 
@@ -199,8 +201,8 @@ class PrefilteredEnvironment(AbstractHighlight):
     def radiance(
         self, directions: Float[Array, "*points 3"], roughness: Float[Array, "..."]
     ) -> Float[Array, "*points channels"]:
-        """Interpolate in the logarithm of the roughness and between pixels; at the poles the
-        derivative in the direction is cut to 0.
+        """Interpolate in the logarithm of the roughness and between pixels. At the poles the
+        derivative in the direction is set to 0.
         """
         x, y, z = jnp.unstack(directions @ self.rotation, axis=-1)
         apart = x * x + z * z > 1e-12
@@ -259,7 +261,7 @@ def prefilter(
     a`, divided by its integral. In longitude it is a circular convolution.
     """
     dtype, size = radiance.dtype, (_ROWS, 6 * _ROWS, radiance.shape[-1])
-    # Side by side three times, since the map goes around.
+    # Three copies side by side, because the map is periodic.
     reduced = jax.image.resize(jnp.tile(radiance, (1, 3, 1)), size, "linear")
     reduced = reduced[:, 2 * _ROWS : 4 * _ROWS]
     _, solid_angles = pixel_directions(_ROWS, dtype)
@@ -277,13 +279,13 @@ def prefilter(
         whole = kernel[:, :, 0] @ solid_angles[:, 0]
         return jnp.fft.irfft(blurred, axis=1) / whole[:, None, None]
 
-    # Behind a barrier, or the compiler would compute all kernels while it compiles.
+    # The barrier prevents constant folding: the compiler would otherwise compute all kernels.
     maps = jax.lax.map(blur, jax.lax.optimization_barrier(jnp.asarray(_ROUGHNESSES, dtype)))
     return _padded(maps)
 
 
 def _padded(maps: Float[Array, "maps rows columns channels"]) -> Float[Array, "maps _ _ channels"]:
-    """Repeat beyond every edge what lies there on the sphere."""
+    """Pad the map by its neighbors on the sphere."""
     half = maps.shape[2] // 2
     top, bottom = (jnp.roll(maps[:, row], half, axis=2) for row in (slice(1), slice(-1, None)))
     maps = jnp.concatenate([top, maps, bottom], axis=1)

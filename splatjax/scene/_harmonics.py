@@ -23,17 +23,16 @@ _ROWS = 64  # of the map that is mirrored
 
 @record
 class HarmonicLight(AbstractExtendedLight):
-    r"""Light from infinitely far away on all sides, as a sum of spherical harmonics.
+    r"""Distant light from all directions, as a sum of spherical harmonics.
 
-    It lights by `count` directions that are spread evenly (`even_directions`), whose visibility
-    serves all coefficients (`splatjax.transfer`, `splatjax.relighting_basis`). A picture is linear
-    in the coefficients: its highlight and its layer `shadow` are occluded by how much of an even
-    light arrives.
+    It is sampled by `count` even directions (`even_directions`), whose visibility is valid for all
+    coefficients (`splatjax.transfer`, `splatjax.relighting_basis`). A picture is linear in the
+    coefficients: its highlight and its layer `shadow` use the visibility of uniform light.
 
     **Attributes:**
 
-    - `coefficients`: radiance, those of `spherical_harmonics` in the world; the sum may be negative
-      in some directions, as that of a few harmonics of a small sun is. Differentiable.
+    - `coefficients`: radiance, of `spherical_harmonics` in world space. The sum may be negative in
+      some directions, for example for a small sun with few harmonics. Differentiable.
     - `count`, `cast_shadows`: static.
 
     **Raises:** `ValueError` for another number of coefficients than 1, 4, 9, 16, 25, ...
@@ -52,7 +51,7 @@ class HarmonicLight(AbstractExtendedLight):
     @classmethod
     def of(cls, environment: EnvironmentLight, order: int = 4, **settings) -> "HarmonicLight":
         """Project an environment, in its rotation, onto the harmonics up to an order.
-        Differentiable in all that the environment is.
+        Differentiable in every field of the environment.
 
         **Arguments:** `settings` are `count` and `cast_shadows`.
         """
@@ -88,7 +87,7 @@ class HarmonicLight(AbstractExtendedLight):
 
 
 class HarmonicStratum(DistantStratum):
-    """A direction of a `HarmonicLight`, of either sign; all weigh the same."""
+    """A direction of a `HarmonicLight`, of either sign; all have the same weight."""
 
     def weight(self, irradiance: Float[Array, "*points channels"]) -> Float[Array, "*points"]:
         return jnp.ones_like(irradiance[..., 0])
@@ -99,8 +98,8 @@ def spherical_harmonics(
 ) -> Float[Array, "*points harmonics"]:
     r"""Evaluate the real spherical harmonics up to an order.
 
-    They are orthonormal over the sphere; `Y_lm` stands at `l (l + 1) + m`. The pole is +z, and the
-    first band is `sqrt(3 / (4 pi)) (y, z, x)`.
+    They are orthonormal over the sphere; the index of `Y_lm` is `l (l + 1) + m`. The pole is +z,
+    and the first band is `sqrt(3 / (4 pi)) (y, z, x)`.
 
     **Arguments:**
 

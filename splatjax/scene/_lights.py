@@ -1,5 +1,5 @@
-"""Lights. Directions point the way the light travels; `wi` points back, from the surface towards
-the light.
+"""Lights. Directions point in the direction in which the light travels; `wi` points from the
+surface towards the light.
 """
 
 import abc
@@ -18,7 +18,7 @@ from splatjax._records import check_values, numbers, record
 from splatjax.gaussians import gaussian
 
 _TOUCHING = 1e-6  # mm
-# Of fields of lights: what they must be, and whether they are. All others must be finite.
+# Requirements of fields of lights: the description and the check. All other fields must be finite.
 _EXPECTED = {
     "direction": ("the way light travels, not zero", np.any),
     "variance": ("positive (mm^2)", lambda x: x > 0),
@@ -31,7 +31,7 @@ _EXPECTED = {
 
 
 class AbstractHighlight(eqx.Module):
-    """What glossy surfaces mirror of an extended light, in the place of lobes of its samples."""
+    """The reflection of an extended light by glossy surfaces, in place of its samples' lobes."""
 
     @abc.abstractmethod
     def reflected(
@@ -69,7 +69,7 @@ class AbstractLight(eqx.Module):
             check_values(f"{type(self).__name__}.{name}", getattr(self, name), *expected)
 
     def with_channels(self, channels: int) -> "AbstractLight":
-        """Repeat the strength of a light of one channel for so many channels."""
+        """Repeat the strength of a light of one channel for all channels."""
         strength = getattr(self, self.strength_field, None)
         if strength is None or strength.shape != (1,):
             return self
@@ -80,21 +80,21 @@ class AbstractLight(eqx.Module):
     def samples(self) -> tuple["AbstractLightSample", ...]:
         """Return the points and directions from which the light comes.
 
-        Their light enters the surface, each with its own shadow. The specular lobe of each, or the
-        highlight of all, is shadowed by their mean visibility, so that passes 2 and 3 blend one
+        The light of each sample enters the surface with its own shadow. The specular lobes, or the
+        common highlight, use the mean visibility of the samples, so that passes 2 and 3 blend one
         row per light.
         """
 
     def highlight(self) -> AbstractHighlight | None:
-        """Prepare what glossy surfaces mirror, once for all points; `None` where it is the sum of
-        the lobes of all samples.
+        """Prepare the highlight once for all points; `None` if it is the sum of the lobes of all
+        samples.
         """
         return None
 
 
 class AbstractLightSample(AbstractLight):
-    """A light from one point or direction. Whether it casts shadows is static: a light that casts
-    none costs no shadow map.
+    """A light from one point or direction. `cast_shadows` is static: a light without shadows needs
+    no shadow map.
     """
 
     cast_shadows: eqx.AbstractVar[bool]
@@ -112,16 +112,16 @@ class AbstractLightSample(AbstractLight):
         """
 
     def weight(self, irradiance: Float[Array, "*points channels"]) -> Float[Array, "*points"]:
-        """Weigh the sample in the mean visibility of its light, by the irradiance it may bring."""
+        """Compute the weight of the sample in the mean visibility of its light: its irradiance."""
         return jnp.sum(abs(irradiance), axis=-1)
 
 
 class AbstractExtendedLight(AbstractLight):
-    """A light that many samples stand for, with one highlight for all.
+    """A light that is represented by many samples, with one highlight for all.
 
     **Attributes:** (static)
 
-    - `count`: of samples, each with a shadow map.
+    - `count`: number of samples, each with a shadow map.
     - `cast_shadows`.
     """
 
@@ -146,7 +146,7 @@ def _per_channel(
 
 @record
 class DirectionalLight(AbstractLightSample):
-    r"""Parallel light from infinitely far away.
+    r"""Parallel light of a distant source.
 
     **Attributes:**
 
@@ -170,10 +170,10 @@ class DirectionalLight(AbstractLightSample):
 
 @record
 class PointLight(AbstractLightSample):
-    r"""Light from a point, falling off with the square of the distance.
+    r"""Light from a point, with inverse-square falloff.
 
-    A point within 1e-6 mm of the light receives none: the limit diverges, so value and gradient are
-    cut to zero there.
+    A surface point within 1e-6 mm of the light receives no light: the limit diverges, so value and
+    gradient are set to zero there.
 
     **Attributes:**
 
@@ -273,7 +273,7 @@ class StackedLights(eqx.Module):
 
     @property
     def distinct(self) -> tuple[int, ...]:
-        """List the indices of the lights, each once."""
+        """List the distinct indices of the lights."""
         return tuple(dict.fromkeys(self.light_indices))
 
     def mean_per_light(
@@ -296,8 +296,8 @@ class StackedLights(eqx.Module):
 def lights_by_kind(
     lights: tuple[AbstractLight, ...],
 ) -> list[list[tuple[int, AbstractLightSample]]]:
-    """List the samples of each kind of lights, each with the index of its light. Lights that have
-    one highlight for all their samples are apart from others.
+    """List the samples of each kind of lights, each with the index of its light. Lights with one
+    highlight for all samples are listed separately.
     """
     kinds: dict[object, list[tuple[int, AbstractLightSample]]] = {}
     for index, light in enumerate(lights):
@@ -308,7 +308,7 @@ def lights_by_kind(
 
 
 def stack_lights(lights: tuple[AbstractLight, ...]) -> list[StackedLights]:
-    """Stack samples of equal kind, so that any number of them is computed by one loop."""
+    """Stack samples of equal kind, so that one loop computes any number of them."""
     groups = []
     for members in lights_by_kind(lights):
         indices, samples = zip(*members, strict=True)

@@ -17,23 +17,23 @@ _NARROW = 1e-6  # mm^2: far below any splat, so that the layer is unresolved
 
 @record
 class Material(eqx.Module):
-    r"""A translucent material: how light spreads below the surface, and how the surface itself
-    reflects.
+    r"""A translucent material: the diffusion below the surface, and the reflection at the surface.
 
     **Attributes:** (all differentiable)
 
     - `gaussians`: the diffusion profile; the picture's diffuse reflectance is the sum of its
       weights.
-    - `eta`: index of refraction relative to air: of the specular lobe, and, whatever the lobe's
-      strength, of the light that enters and leaves. With 1 the surface reflects nothing.
-    - `specular`: strength of the specular lobe (rho_s); of 1 it reflects what does not enter.
+    - `eta`: index of refraction relative to air, of the specular lobe and of the light that enters
+      and leaves (at any strength of the lobe). With 1 the surface reflects nothing.
+    - `specular`: strength of the specular lobe (rho_s). With 1 it reflects exactly the light that
+      does not enter.
     - `roughness`: of the specular lobe (m, root mean square slope), at least 0.
-    - `single_scattering`: light that scatters once, as a term of its own; the Gaussians then stand
-      for the rest. `None`: they stand for all.
-    - `angles`: how the light of the Gaussians depends on the angles under which it enters and
-      leaves. `None`: not at all.
-    - `medium`: coefficients, which `ShapeDiffuser` reads in the place of Gaussians, single
-      scattering and angles; or `None`.
+    - `single_scattering`: light that scatters once, as a separate term; the Gaussians then
+      represent the rest. `None`: they represent all light.
+    - `angles`: the dependence of the light of the Gaussians on the angles at which it enters and
+      leaves. `None`: no dependence.
+    - `medium`: coefficients, which `ShapeDiffuser` uses instead of Gaussians, single scattering and
+      angles; or `None`.
 
     **Raises:** `ValueError` for a value out of range, and for single scattering or angles of
     another number of channels than the Gaussians have.
@@ -67,30 +67,28 @@ class Material(eqx.Module):
         return self.gaussians.channels
 
     def total_reflectance(self) -> Float[Array, " channels"]:
-        """Compute the fraction of the light entering a flat piece along its normal that leaves."""
+        """Compute the diffuse reflectance of a flat surface for light along its normal."""
         return self.gaussians.total_reflectance() + self.single_scattering_albedo()
 
     def single_scattering_albedo(self) -> Float[Array, " channels"]:
-        """Compute the part of the total reflectance that is light scattered once."""
+        """Compute the part of the total reflectance due to light scattered once."""
         if self.single_scattering is None:
             return jnp.zeros_like(self.gaussians.weights, shape=self.channels)
         return self.single_scattering.total_reflectance()
 
     def angular_law(self) -> AngularLaw:
-        """Return `angles`, or the law that is 1 for every angle, with as many powers as those of
-        `HalfSpace`.
-        """
+        """Return `angles`, or the law of value 1 at every angle, with the powers of `HalfSpace`."""
         if self.angles is not None:
             return self.angles
         one = np.eye(ANGULAR_POWERS, 1, dtype=self.gaussians.weights.dtype)
         return AngularLaw(jax.device_put(one.repeat(self.channels, 1)))
 
     def diffuse_fraction(self, mu_i: Float[Array, "*points"]) -> Float[Array, "*points channels"]:
-        """Compute the factor on the Gaussians for light that enters under the cosine `mu_i`; 1
-        along the normal.
+        """Compute the factor on the Gaussians for light that enters at the cosine `mu_i`; 1 along
+        the normal.
 
-        Grazing light leaves after one scattering more often than light along the normal. Where that
-        and the light of the Gaussians would exceed 1, the Gaussians are scaled to the difference.
+        Grazing light leaves after one scattering more often than light along the normal. If the sum
+        of both exceeds 1, the Gaussians are scaled to the difference.
         """
         factor = self.angular_law()(mu_i)
         if self.single_scattering is None:
@@ -101,16 +99,18 @@ class Material(eqx.Module):
         return jnp.where(is_over, left / jnp.where(is_over, total, 1.0), factor)
 
     def surface_of(self, gaussians: SumOfGaussians, angles: AngularLaw | None = None) -> "Material":
-        """Return a material of other light with this surface, without single scattering."""
+        """Return a material with other Gaussians and this surface, without single scattering."""
         return Material(gaussians, self.eta, self.specular, self.roughness, angles=angles)
 
     def opaque(self) -> "Material":
-        """Replace scattering by one Gaussian, narrower than any splat, of the total reflectance."""
+        """Replace scattering by one Gaussian of the total reflectance, narrower than any splat."""
         variances = jnp.full_like(self.gaussians.variances, _NARROW, shape=(1,))
         return self.surface_of(SumOfGaussians(variances, self.total_reflectance()[None]))
 
     def white(self) -> "Material":
-        """Scale the total reflectance to 1 per channel, so that an albedo map alone has color."""
+        """Scale the total reflectance to 1 per channel, so that an albedo map alone gives the
+        color.
+        """
         total, single = self.total_reflectance(), self.single_scattering
         gaussians = SumOfGaussians(self.gaussians.variances, self.gaussians.weights / total[None])
         if single is not None:

@@ -1,4 +1,4 @@
-"""What is drawn, splats of a material under lights; the camera; and the finished picture."""
+"""Scenes (splats of a material under lights), cameras, and rendered frames."""
 
 import math
 from collections.abc import Callable, Iterable
@@ -25,8 +25,8 @@ _FARTHEST = 1e15  # single precision can square such a number, and multiply the 
 class Camera(eqx.Module):
     r"""A pinhole camera.
 
-    Pixel centers lie at half integers, the origin of the picture is its top left corner. In camera
-    coordinates x goes right, y goes down, z goes into the picture.
+    Pixel centers are at half integers; the origin of the picture is its top left corner. In camera
+    coordinates x points right, y down, and z into the picture.
 
     **Attributes:**
 
@@ -36,7 +36,7 @@ class Camera(eqx.Module):
     - `focal_length`: in heights of the picture: `1 / (2 tan(fov / 2))` for a vertical field of view
       `fov`. Differentiable.
     - `width`, `height`: of the picture, pixels. Static.
-    - `near`: splats whose center is nearer than this, along the forward axis, are not drawn; mm.
+    - `near`: splats with a center nearer than this along the forward axis are not rendered; mm.
       Static.
 
     **Raises:** `ValueError` for a picture without pixels, and for numbers that are not finite.
@@ -111,8 +111,8 @@ _NOT_NEGATIVE = valid("finite and at least 0", lambda x: x >= 0)
 class Splats(eqx.Module):
     r"""A surface as a set of discs, one row per splat; mm, right-handed, +y up.
 
-    Nearby splats should be near in memory (`read_splats` and `sample_mesh` sort them so); the
-    picture does not depend on the order, only the time it takes.
+    Nearby splats should be near in memory, as `read_splats` and `sample_mesh` sort them. The order
+    changes the time, not the picture.
 
     **Attributes:** (all differentiable unless said otherwise)
 
@@ -120,9 +120,9 @@ class Splats(eqx.Module):
     - `normals`: unit vectors, outward.
     - `radii`: mm, positive. Discs overlap so that they leave no hole: about 1.5 times the root of
       the area.
-    - `areas`: the area of the surface that each splat stands for, mm^2. They add up to the
-      surface's area. (The discs overlap, so `pi r^2` is not the area.)
-    - `albedo`: diffuse color, linear, in [0, 1]; `None` where the material's weights alone carry
+    - `areas`: the area of the surface that each splat represents, mm^2. They add up to the area of
+      the surface. (The discs overlap, so `pi r^2` is not the area.)
+    - `albedo`: diffuse color, linear, in [0, 1]; `None` if the material's weights alone give the
       color.
     - `specular`: factor on the material's specular strength; `None` for 1.
     - `roughness`: factor on the material's roughness; `None` for 1.
@@ -155,28 +155,28 @@ class Splats(eqx.Module):
         return self.centers.shape[0]
 
     def scaled(self, factor: Float[Array, ""] | float) -> "Splats":
-        """Scale the body about the origin. Light travels as far as before, so that a smaller body
-        is more translucent.
+        """Scale the body about the origin. The distance that light travels does not change, so a
+        smaller body is more translucent.
         """
         scaled = self.centers * factor, self.radii * factor, self.areas * (factor * factor)
         return eqx.tree_at(lambda body: (body.centers, body.radii, body.areas), self, scaled)
 
     def take(self, chosen: Int[Array, " chosen"]) -> "Splats":
-        """Return the splats of these indices, in ascending order; splats that are invisible and
-        bring no light for indices from the number of splats on.
+        """Return the splats of these ascending indices. Indices beyond the number of splats give
+        invisible splats without light.
         """
         return jax.tree.map(lambda leaf: take_points(leaf.T, chosen).T, self)
 
 
 Parts: TypeAlias = Callable[[], Iterable[Splats]]
-"""A function that returns all splats part by part, the same ones at every call."""
+"""A function that returns all splats part by part, the same parts at every call."""
 
 
 @record
 class Scene(eqx.Module):
     """Splats of one material under some lights. Lights of one kind are computed together.
 
-    `lights` may be given as a list or as a single light. A light of one channel shines in every
+    `lights` may be given as a list or as a single light. A light of one channel applies to every
     channel of the material.
     """
 
@@ -199,21 +199,21 @@ class Frame(eqx.Module):
 
     - `beauty`: `diffuse + specular`, and `single_scattering` where there is one; radiance.
     - `coverage`: in [0, 1].
-    - `depth`: along the camera's forward axis, mm; inf where there is nothing.
-    - `position`: world space, mm; 0 where there is nothing.
-    - `normal`: world space, unit; 0 where there is nothing.
-    - `albedo`: of the splats; 1 where they carry none.
-    - `shadow`: per light, 1 lit and 0 in shadow, not premultiplied; 1 where there is nothing.
-    - `irradiance`: that enters the surface: cosine, shadow and the loss to the specular lobe
-      included.
+    - `depth`: along the camera's forward axis, mm; inf where no surface is visible.
+    - `position`: world space, mm; 0 where no surface is visible.
+    - `normal`: world space, unit; 0 where no surface is visible.
+    - `albedo`: of the splats; 1 if they have none.
+    - `shadow`: per light, 1 lit and 0 in shadow, not premultiplied; 1 where no surface is visible.
+    - `irradiance`: the irradiance that enters the surface, including cosine, shadow and the loss to
+      the specular lobe.
     - `layers`: one per Gaussian, `sqrt(albedo) exit_transmission / pi * L_k`.
-    - `weights`: those the picture was made with.
+    - `weights`: of the Gaussians of the picture.
     - `diffuse`, `specular`: radiance.
-    - `unresolved_fraction`: per Gaussian, the fraction of the covered pixels for which the splats
-      are too far apart to resolve the layer, so that it is the surface's own irradiance.
+    - `unresolved_fraction`: per Gaussian, the fraction of the covered pixels in which the splats do
+      not resolve the layer, so that the surface's own irradiance replaces it.
     - `single_scattering`: radiance, premultiplied; `None` when the material has none.
-    - `overflow`: what the plan lacks: 0 when the picture fits, else the largest of needed over
-      planned, and the picture is NaN.
+    - `overflow`: 0 if the capacity of the plan suffices; otherwise the largest ratio of needed to
+      planned capacity, and the picture is NaN.
     """
 
     beauty: Float[Array, "height width channels"]

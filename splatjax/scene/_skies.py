@@ -77,7 +77,7 @@ def sun_and_sky(
 
 
 def _frame(azimuth: Numbers, elevation: Numbers) -> Float[Array, "3 3"]:
-    """Compute the directions along the horizon at a place of the sky, above it, and towards it."""
+    """Compute the directions along the horizon at a point of the sky, above it, and towards it."""
     turn, rise = (jnp.deg2rad(as_floats(degrees)) for degrees in (azimuth, elevation))
     (east, south), (high, across) = ((jnp.sin(a), jnp.cos(a)) for a in (turn, rise))
     right, up = [south, jnp.zeros_like(turn), -east], [-east * high, across, -south * high]

@@ -1,4 +1,6 @@
-"""The light that a surface receives, and pass 5: what the rough interface does with it."""
+"""The light that a surface receives, and pass 5: reflection and transmission at the rough
+interface.
+"""
 
 from ._deferred import (
     albedo_root as albedo_root,

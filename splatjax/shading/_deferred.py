@@ -1,5 +1,5 @@
-"""The light that a surface receives, and pass 5: deferred shading (section 4.1). What the rough
-interface reflects, how the diffuse light leaves through it, and how a map of albedo colors that.
+"""The light that a surface receives, and pass 5: deferred shading (section 4.1), which computes the
+reflection of the rough interface, the transmission of diffuse light, and the color by the albedo.
 """
 
 from collections.abc import Callable
@@ -25,8 +25,8 @@ def diffuse_transmission(
     angles: AngularLaw,
 ) -> Float[Array, "channels ..."]:
     r"""Compute the angular factor of diffuse light that leaves: `e(mu) (1 - rho(mu))` over its
-    average, weighted with `2 mu`. The index and the roughness alone decide what enters and leaves;
-    the strength of the specular lobe does not.
+    average, weighted with `2 mu`. The transmission depends only on index and roughness, not on the
+    strength of the specular lobe.
 
     The radiance of a surface of radiant exitance `M` is `M diffuse_transmission(mu_o) / pi`. Since
     the average is one, the light that leaves is exactly `M`.
@@ -37,8 +37,7 @@ def diffuse_transmission(
     - `angles`: `e`, of a material.
 
     **Returns:** at least 0, with the channels of `angles` as first axis. The average is kept above
-    1e-4 (gradient 0 below): a surface that reflects everything lets nothing in, so that `M` is 0
-    there.
+    1e-4 (gradient 0 below): a surface that reflects all light transmits none, so `M` is 0 there.
 
     **Source:** d'Eon and Luebke 2007 (GPU Gems 3, chapter 14), with `e = 1`.
     """
@@ -53,8 +52,8 @@ def average_transmission(
     roughness: Float[Array, "..."],
     angles: AngularLaw,
 ) -> Float[Array, "channels ..."]:
-    """Compute the average of `e(mu) (1 - rho(mu))`, weighted with `2 mu`: of even light, the
-    fraction that enters, over that of light along the normal.
+    """Compute the average of `e(mu) (1 - rho(mu))`, weighted with `2 mu`: the transmitted fraction
+    of uniform light, over that of light along the normal.
 
     **Arguments:** as of `diffuse_transmission`.
 
@@ -68,7 +67,8 @@ def average_transmission(
 
 
 def albedo_root(albedo: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Compute `sqrt(max(albedo, 1e-4))`: half of the color acts before light spreads, half after.
+    """Compute `sqrt(max(albedo, 1e-4))`: half of the color is applied before the light spreads,
+    half after.
 
     **Arguments:**
 
@@ -76,7 +76,7 @@ def albedo_root(albedo: Float[Array, "..."]) -> Float[Array, "..."]:
       sqrt(albedo))` above the floor and 0 at and below it, since that of the root itself diverges
       at a black texel.
 
-    **Returns:** at least 0.01; its square is the albedo, but for texels darker than 1e-4.
+    **Returns:** at least 0.01; its square is the albedo, except for texels darker than 1e-4.
 
     **Source:** d'Eon and Luebke 2007 (GPU Gems 3, chapter 14): pre- and post-scatter texturing in
     equal parts.
@@ -85,14 +85,14 @@ def albedo_root(albedo: Float[Array, "..."]) -> Float[Array, "..."]:
 
 
 class SurfacePoints(eqx.Module):
-    r"""What the pixels see of one surface: blended attributes, ready to be shaded.
+    r"""The visible points of one surface: blended attributes, ready for shading.
 
     **Attributes:**
 
     - `normals`: unit, or zero where there is no surface.
     - `outgoing`: `wo`, unit, towards the eye.
-    - `visibility`: per group the fraction of each light that arrives; `None` for lights that cast
-      no shadows.
+    - `visibility`: per group, the fraction of each light that arrives; `None` for lights without
+      shadows.
     """
 
     positions: Float[Array, "*pixels 3"]
@@ -104,9 +104,7 @@ class SurfacePoints(eqx.Module):
 
 
 def unit_normals(normals: Float[Array, "*pixels 3"]) -> Float[Array, "*pixels 3"]:
-    """Scale blended normals to unit length; zero stays zero, with a zero gradient: no direction is
-    better than another.
-    """
+    """Scale blended normals to unit length; zero stays zero, with a zero gradient."""
     squared = jnp.sum(normals * normals, axis=-1, keepdims=True)
     is_surface = squared > 0
     return jnp.where(is_surface, normals / jnp.sqrt(jnp.where(is_surface, squared, 1.0)), 0.0)
@@ -145,15 +143,15 @@ def sum_received(
     channels: int,
 ) -> Float[Array, "channels *pixels"]:
     r"""Sum the light that a surface receives, `sum_lights irradiance max(n . wi, 0) visibility
-    factor(wi, n . wi)`: light after light, each recomputed backward.
+    factor(wi, n . wi)`, one light at a time; the backward pass recomputes each.
 
     **Arguments:**
 
     - `normals`: unit.
     - `visibility`: for each group the fraction of each light that reaches each point; `None` for
       lights that cast no shadows.
-    - `factor`: what becomes of the light: the fraction that is left to diffuse, or the reflectance
-      towards the eye; one row for all channels, or one for each.
+    - `factor`: the diffuse fraction of the light, or the reflectance towards the eye; one row for
+      all channels, or one for each.
 
     **Returns:** linear in the lights. Differentiable in everything; the horizon is a kink.
     """
@@ -182,8 +180,8 @@ def exit_transmission(
 def reflected_radiance(
     points: SurfacePoints, groups: list[StackedLights], f0: Float[Array, ""], channels: int
 ) -> Float[Array, "channels *pixels"]:
-    """Compute the specular radiance towards the eye: Kelemen / Szirmay-Kalos, each light in its own
-    shadow. Extended lights have one highlight for all their samples.
+    """Compute the specular radiance towards the eye: Kelemen / Szirmay-Kalos, each light with its
+    own shadow. Extended lights have one highlight for all their samples.
     """
 
     def lobe(wi, specular=points.specular):
@@ -229,11 +227,11 @@ def single_scattered_radiance(
     f0: Float[Array, ""],
     single: SingleScattering,
 ) -> Float[Array, "channels *pixels"]:
-    """Compute the radiance of light that entered where it leaves and scattered once, each light in
+    """Compute the radiance of light that scatters once and leaves where it entered, each light with
     its own shadow.
 
-    What the interface reflects does not enter. The surface counts as flat and evenly lit over a
-    mean free path.
+    Light that the interface reflects does not enter. The surface is assumed flat and evenly lit
+    over a mean free path.
     """
     to_eye = _cosine(points.normals, points.outgoing)
 

@@ -1,5 +1,5 @@
-"""The specular lobe of Kelemen and Szirmay-Kalos, its Fresnel term, and how much light it takes:
-its directional and its average albedo, tabulated.
+"""The specular lobe of Kelemen and Szirmay-Kalos, its Fresnel term, and its tabulated directional
+and average albedo.
 """
 
 import functools
@@ -39,9 +39,10 @@ def fresnel_f0(eta: Float[Array, "..."]) -> Float[Array, "..."]:
 
 
 def grazing_reflectance(f0: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Compute the reflectance at grazing incidence that stands for 1 in Schlick's term: 1 from 0.02
-    on (water), less below, so that a surface without change of index reflects nothing. The fraction
-    of uniform light that is reflected is then within 0.007 of Fresnel's for every index up to 2.
+    """Compute the reflectance at grazing incidence, which replaces 1 in Schlick's term: 1 from an
+    f0 of 0.02 on (water), less below, so that a surface without change of index reflects nothing.
+    The fraction of uniform light that is reflected is then within 0.007 of Fresnel's for every
+    index up to 2.
 
     **Source:** as a step in f0, Lagarde and de Rousiers 2014, Moving Frostbite to PBR.
     """
@@ -67,10 +68,9 @@ def specular_lobe(
 
     With `a` the angle between the normal and the half vector, `PH = exp(-tan^2 a / m^2) / (pi m^2
     cos^4 a)`; the half vector `wi + wo` is not normalized in the quotient. `F` is Schlick's, with
-    `grazing_reflectance` in the place of 1. The
-    outgoing radiance is `f (N.wi)` times the irradiance of a surface that faces the light. The
-    factor `1 / pi`, which some published shaders lack, is part of it, so that the lobe never
-    reflects more than it receives (`directional_albedo`).
+    `grazing_reflectance` instead of 1. The outgoing radiance is `f (N.wi)` times the irradiance of
+    a surface that faces the light. The factor `1 / pi`, which some published shaders lack, is part
+    of it, so that the lobe never reflects more than it receives (`directional_albedo`).
 
     **Arguments:** directions have equal rank and broadcast; the others are scalars or broadcast
     against their leading axes.
@@ -85,15 +85,14 @@ def specular_lobe(
     opposite directions is cut at `N.(wi + wo) = 1e-4`.
 
     **Source:** Kelemen and Szirmay-Kalos 2001; d'Eon and Luebke 2007 (GPU Gems 3, chapter 14),
-    which leaves out the 1/pi.
+    which omits the 1/pi.
     """
     cos_i = jnp.sum(normal * wi, axis=-1)
     cos_o = jnp.sum(normal * wo, axis=-1)
     half_vector = wi + wo
     squared_length = jnp.sum(half_vector * half_vector, axis=-1)
     seen = (cos_i > 0) & (cos_o > 0)
-    # Where the lobe is not seen, harmless numbers stand in, so that no infinity enters the
-    # derivative.
+    # Outside of the lobe's domain, finite placeholders keep infinities out of the derivative.
     squared_length = jnp.maximum(jnp.where(seen, squared_length, 2.0), _LEAST_HALF_COSINE**2)
     cosine = jnp.maximum(jnp.where(seen, cos_i + cos_o, 1.0), _LEAST_HALF_COSINE)
     squared_cosine = cosine * cosine
@@ -118,8 +117,8 @@ def _lobe_quadrature(
 
     In the slopes p of the half vector the integral is that of a Gaussian, `exp(-p^2 / m^2) / (pi
     m^2)`, times `2 - mu (1 + p^2) / (mu - p_x sin)`, over the disc of radius `1 / mu` around
-    `(-tan, 0)`, whose rim are the directions that graze the surface. Nodes crowd at the rim near
-    the origin; beyond five m the Gaussian is nothing.
+    `(-tan, 0)`, whose rim are the directions that graze the surface. Nodes are dense at the rim
+    near the origin; beyond five m the Gaussian is negligible.
     """
     mu, roughness = (x[..., None, None] for x in np.broadcast_arrays(mu, roughness))
     sine = np.sqrt(1 - mu * mu)
@@ -200,15 +199,15 @@ def directional_albedo(
     f0: Float[Array, "..."],
     roughness: Float[Array, "..."],
 ) -> Float[Array, "..."]:
-    r"""Compute the fraction of light from one direction that a rough interface reflects, `rho(mu)`:
-    what a specular lobe of strength 1 does.
+    r"""Compute the fraction of light from one direction that a rough interface reflects, `rho(mu)`,
+    by a specular lobe of strength 1.
 
     `rho = f0 a(mu, m) + (g - f0) b(mu, m)`, g the `grazing_reflectance`: Schlick's term splits the
     integral of
     `specular_lobe` over the hemisphere into two tables, computed once by quadrature and kept as
     Chebyshev series in `sqrt(mu)` and `log m`.
 
-    **Arguments:** scalars, or arrays that broadcast; a scalar `roughness` makes it cheapest.
+    **Arguments:** scalars, or arrays that broadcast; a scalar `roughness` is cheapest.
 
     - `mu`: cosine of the direction with the normal, clamped to [1e-5, 1]. Differentiable; the slope
       at `mu = 0` diverges like `log mu` and is cut to 0 below 1e-5.
@@ -243,8 +242,8 @@ def average_albedo(
     r"""Compute the fraction of uniform light that a rough interface reflects, with a factor
     `e(mu) = sum_k c_k mu^k`: `2 int_0^1 rho(mu) e(mu) mu dmu`.
 
-    It is the exact integral of the series that `directional_albedo` evaluates, so that nothing is
-    lost between the two.
+    It is the exact integral of the series that `directional_albedo` evaluates, so that both are
+    consistent.
 
     **Arguments:** as in `directional_albedo`.
 

@@ -330,7 +330,7 @@ def test_pixels_that_a_body_does_not_fill_count_before_black_alone():
             {"parts": (sj.inverse.AlbedoMap(), sj.inverse.AlbedoMap(1.0))},
             "parts are AlbedoMap, AlbedoMap",
         ),
-        ({"splats": sphere(20)}, r"splats\.albedo is None, and AlbedoMap has nothing"),
+        ({"splats": sphere(20)}, r"splats\.albedo is None, and AlbedoMap"),
         (
             {"splats": sphere(16), "parts": (sj.inverse.NormalOffsets(0.1, 1.0, 1.0),)},
             "number of splats must be at least 17 for NormalOffsets.*got 16",

@@ -165,9 +165,9 @@ def test_what_cannot_be_streamed_is_refused(splats):
         ([[small]], plain, "DenseDiffuser"),
         ([[]], default, "no splats"),
         ([[small, large]], default, "parts must have one size"),
-        ([[small, small], [large, small]], default, "must be the same each time"),
-        ([[small, small], [small]], default, "must be the same each time"),
-        ([[small, small], [small, small, small]], default, "must be the same each time"),
+        ([[small, small], [large, small]], default, "parts must return the same"),
+        ([[small, small], [small]], default, "parts must return the same"),
+        ([[small, small], [small, small, small]], default, "parts must return the same"),
     ):
         coming = iter(passes)
         with pytest.raises(ValueError, match=said):
