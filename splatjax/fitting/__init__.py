@@ -1,4 +1,4 @@
-"""From a profile to a sum of Gaussians: Eq. 3 and Eq. 4."""
+"""Fits of sums of Gaussians to profiles: Eq. 3 and Eq. 4."""
 
 from ._fit import (
     error_by_count as error_by_count,

@@ -1,4 +1,4 @@
-"""From a profile to a sum of Gaussians, and how many of them it needs."""
+"""Fits of sums of Gaussians to a profile, and the number of Gaussians that it needs."""
 
 import equinox as eqx
 import jax
@@ -33,7 +33,7 @@ class ErrorByCount(eqx.Module):
 
     **Attributes:**
 
-    - `error`: of the best sums of 1, 2, ... Gaussians.
+    - `error`: error of the best sums of 1, 2, ... Gaussians.
     - `variances`: of these sums, mm^2, ascending; the unused last ones are infinite. With
       `VariancesPerChannel`, for each channel.
     """
@@ -61,7 +61,7 @@ class ErrorByCount(eqx.Module):
         return int(np.argmax(worst <= error)) + 1
 
     def start(self, count: int) -> GivenVariances:
-        """Return the start of a fit of so many Gaussians, which finishes this search."""
+        """Return the start of a fit of `count` Gaussians, which completes this search."""
         return GivenVariances(self.variances[..., count - 1, :count])
 
 
@@ -76,14 +76,14 @@ def error_by_count(
 ) -> ErrorByCount:
     r"""Find the best sums of 1, 2, ... Gaussians in one search, and the error of each.
 
-    One compilation serves all of them; their sums of squares are those of the best fits to about
+    One compilation serves all counts. The sums of squares equal those of the best fits to about
     1e-5.
 
     **Arguments:** as for `fit_gaussians`.
 
     - `largest`: number of Gaussians, at least 1.
 
-    **Returns:** an `ErrorByCount`; no derivative goes through it.
+    **Returns:** an `ErrorByCount`, which has no derivative.
 
     **Raises:** `ValueError` as `fit_gaussians` does.
     """
@@ -126,20 +126,20 @@ def check_count(name: str, count: int) -> None:
 
 
 class FitResult(eqx.Module):
-    r"""A sum of Gaussians and how well it stands for its profile.
+    r"""A fitted sum of Gaussians, and its errors.
 
     **Attributes:**
 
     - `gaussians`: variances ascend. With `VariancesPerChannel`, one of a single channel for each
       channel, batched.
     - `error`: Eq. 4 of each channel.
-    - `energy_error`: sum of the weights over the profile's total reflectance, minus 1; 0 if the sum
-      was held.
-    - `result`: what became of the search, as a message (`optimistix.RESULTS`).
+    - `energy_error`: sum of the weights over the profile's total reflectance, minus 1; 0 for a
+      fixed sum.
+    - `result`: the outcome of the search, as a message (`optimistix.RESULTS`).
     - `covariance`: of the variances, and then of the weights of one channel after the other, by
       Gauss and Newton; with `VariancesPerChannel`, for each channel. Within its ellipsoid Eq. 3 at
-      most doubles. Where the residuals are noise of equal size at N independent nodes of Eq. 3,
-      divide by N less the number of parameters.
+      most doubles. If the residuals are noise of equal size at N independent nodes of Eq. 3, divide
+      it by N less the number of parameters.
     """
 
     gaussians: SumOfGaussians
@@ -159,33 +159,33 @@ def fit_gaussians(
     rule: AbstractRadialRule = L2_QUADRATURE,
     throw: bool = True,
 ) -> FitResult:
-    r"""Fit a sum of Gaussians to a profile: the least Eq. 3 over variances and weights.
+    r"""Fit a sum of Gaussians to a profile: minimize Eq. 3 over variances and weights.
 
-    Variable projection: for given variances the best weights are a linear problem, solved inside;
-    Levenberg and Marquardt's method moves the logarithms of the variances. Unless told otherwise, a
-    fit with one Gaussian more starts from the best fit before, with a Gaussian inserted in each gap
+    Variable projection: for given variances the best weights are the solution of a linear problem,
+    and Levenberg and Marquardt's method searches the logarithms of the variances. By default a fit
+    with one more Gaussian starts from the previous best fit, with a Gaussian inserted in each gap
     and at both ends. Compiles once for each count and kind of profile.
 
-    The result is differentiable in every float of the profile, by the implicit function theorem
-    with the full Hessian of Eq. 3, in forward and reverse mode; to first order. The precision
+    The result is differentiable in every parameter of the profile, by the implicit function theorem
+    with the full Hessian of Eq. 3, in forward and reverse mode, to first order. The precision
     follows the profile. In float32 errors below about 1e-5 are rounding, and reaching that floor
     counts as success.
 
     **Arguments:**
 
     - `profile`: 1/mm^2; the integral of `r R(r)^2` must exist. Differentiable.
-    - `count`: number of Gaussians, at least 1; or `LeastCount(error)`, the least that leaves no
-      more than that.
+    - `count`: number of Gaussians, at least 1; or `LeastCount(error)`, the least number that
+      reaches the error.
     - `spread`: `SharedVariances()` (default) or `VariancesPerChannel()`.
     - `weights`: `FreeWeights()` (default), `FixedTotalReflectance()`, or `NonNegativeWeights()`
       among either.
     - `start`: `GreedyInsertion()` (default), which finds the best fit; or `GivenVariances(...)`
-      near it, which is fast. Of a given count alone: the least one is found by inserting.
+      near it, which is fast, only for a given count.
     - `rule`: radii of the integral, in length scales of the profile; or `InverseVariance()`, for
       one with standard errors.
-    - `throw`: raise if the search has not converged; otherwise `result` says so.
+    - `throw`: raise if the search has not converged; otherwise `result` reports it.
 
-    **Returns:** a `FitResult`; neither `error` nor `weights` depends on the unit of length.
+    **Returns:** a `FitResult`; `error` and `weights` do not depend on the unit of length.
 
     **Raises:** `ValueError` for a count below 1, for an error that no count reaches, for a `start`
     without a count, and for a profile that is infinite at the origin unless the rule starts beyond
@@ -242,12 +242,12 @@ def fit_weights(
     weights: AbstractWeights = FreeWeights(),
     rule: AbstractRadialRule = L2_QUADRATURE,
 ) -> SumOfGaussians:
-    r"""Fit the weights of Gaussians of given variances to a profile: the least Eq. 3 over the
-    weights alone.
+    r"""Fit the weights of Gaussians of given variances to a profile: minimize Eq. 3 over the
+    weights.
 
-    No search, hence fast. Variances that ascend by a factor of 3 over all widths of the dipoles of
-    many media leave each an error (Eq. 4) of about 0.2%, by a factor of 2 of 0.002%: layers that
-    are rendered once serve all of these media.
+    It needs no search, and is fast. Variances that ascend by a factor of 3 over all widths of the
+    dipoles of many media give each an error (Eq. 4) of about 0.2%, by a factor of 2 of 0.002%.
+    Layers that are rendered once therefore serve all of these media.
 
     **Arguments:**
 
@@ -257,8 +257,8 @@ def fit_weights(
       among either.
     - `rule`: radii of the integral, in length scales of the profile.
 
-    **Returns:** the Gaussians, in the profile's precision; with the variances of a fit they are
-    those of the fit.
+    **Returns:** the Gaussians, in the profile's precision. With the variances of a fit, the weights
+    are those of the fit.
 
     **Raises:** `ValueError` for a profile that is infinite at the origin unless the rule starts
     beyond it.

@@ -1,4 +1,4 @@
-"""From a measured profile back to optical coefficients."""
+"""Fits of optical coefficients to a measured profile."""
 
 from collections.abc import Callable
 
@@ -21,17 +21,17 @@ _STEPS = 64
 
 
 class MediumFit(eqx.Module):
-    r"""A medium that explains a measured profile, and how well it is known.
+    r"""A medium fitted to a measured profile, and its covariance.
 
     **Attributes:**
 
     - `medium`: the most likely one.
     - `covariance`: of the logarithms of `sigma_a` and `sigma_s_prime`, per channel: its diagonal
-      holds squared relative errors.
+      has squared relative errors.
     - `chi_squared`: sum of the squared residuals over their deviations, per degree of freedom:
       about 1 if the model holds and the deviations are right; above, the error bars are too small
       by its root.
-    - `result`: what became of the search, as a message (`optimistix.RESULTS`).
+    - `result`: the outcome of the search, as a message (`optimistix.RESULTS`).
     """
 
     medium: Medium
@@ -50,8 +50,7 @@ def fit_medium(
     gaussians_start: AbstractStart = GreedyInsertion(),
     throw: bool = True,
 ) -> MediumFit:
-    r"""Find the absorption and scattering that explain a measured profile: weighted least squares
-    on its samples.
+    r"""Fit absorption and scattering to a measured profile: weighted least squares on its samples.
 
     The model is that of the picture: coefficients, profile, sum of Gaussians, the variance of the
     beam added to each; it is differentiated as a whole. Channels are independent. Use double
@@ -61,11 +60,11 @@ def fit_medium(
 
     - `measured`: with its scale, exitance per unit power entering, 1/mm^2, and with the standard
       errors of its samples, positive.
-    - `start`: where the search starts, within a factor of some ten; its `eta` is taken as known.
+    - `start`: start of the search, within a factor of about ten; its `eta` is assumed known.
     - `beam_variance`: of the beam that made the dot, per axis, mm^2.
     - `model`: from a medium to its profile.
     - `count`: number of Gaussians.
-    - `gaussians_start`: where their fits start.
+    - `gaussians_start`: start of the fits of Gaussians.
     - `throw`: raise if the search has not converged; otherwise `result` reports it.
 
     **Returns:** a `MediumFit`.

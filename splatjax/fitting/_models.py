@@ -1,5 +1,5 @@
-"""What a picture is made of, given a medium: the profile, the radii at which its fit counts, and
-the angles of its light.
+"""Models of the light of a medium: the profile, the quadrature of its fit, and the angles of its
+light.
 """
 
 import abc
@@ -25,8 +25,8 @@ class AbstractModel(eqx.Module):
 
     **Attributes:** (of the class)
 
-    - `rule`: the radii at which a fit to its profiles counts.
-    - `description`: of its profile, for files; `None` where coefficients alone give it back.
+    - `rule`: the quadrature of a fit to its profiles.
+    - `description`: of its profile, for files; `None` if coefficients alone define it.
     """
 
     rule: ClassVar[AbstractRadialRule] = L2_QUADRATURE
@@ -37,12 +37,12 @@ class AbstractModel(eqx.Module):
         """Compute the profile of a medium. Differentiable."""
 
     def angles(self, medium: Medium) -> AngularLaw | None:
-        """Compute how the light depends on the angles of entry and exit; `None`: not at all."""
+        """Compute the dependence of the light on the angles of entry and exit; `None` for none."""
         return None
 
 
 class DiffusionModel(AbstractModel):
-    r"""A closed form alone: `Dipole`, as in publications, or `BetterDipole`.
+    r"""A profile in closed form: `Dipole`, as in publications, or `BetterDipole`.
 
     **Attributes:**
 
@@ -58,8 +58,8 @@ class DiffusionModel(AbstractModel):
 class TransportModel(AbstractModel):
     r"""Light transport: the photon beam with the total reflectance and the angles of a `HalfSpace`.
 
-    A fit counts from half a mean free path on, which splats hardly resolve, and by the fifth
-    power of the radius, so that shadows are right where they are deep.
+    A fit uses radii from half a mean free path on, because splats hardly resolve smaller ones. It
+    weights them by the fifth power of the radius, so that deep shadows are right.
 
     **Attributes:**
 

@@ -1,5 +1,5 @@
-"""What a fit minimizes (Eq. 3) and reports (Eq. 4); and the fit as a function of the logarithms of
-the variances alone: the weights are solved inside (variable projection).
+"""The errors that a fit minimizes (Eq. 3) and reports (Eq. 4), and the fit as a function of the
+logarithms of the variances: the weights are solved inside (variable projection).
 """
 
 import equinox as eqx
@@ -17,7 +17,7 @@ from ._weights import AbstractWeights, invert_moving
 def norm_radii(
     profile: AbstractProfile, rule: AbstractRadialRule
 ) -> tuple[Float[Array, "nodes channels"], Float[Array, "nodes channels"]]:
-    """Compute radii and weights of integrals of `r R^2`, where the integral exists."""
+    """Compute radii and weights for integrals of `r R^2`; raise if the integral does not exist."""
     if profile.singular and rule.reaches_origin:
         raise ValueError(
             f"{type(profile).__name__} diverges like 1/r, so the integral of r R^2 from 0 (Eq. "
@@ -59,12 +59,13 @@ def relative_error(
     r"""Compute the relative error of a fit: the root of Eq. 3 over that of the integral of `r R^2`
     (Eq. 4).
 
-    It weights the core of a profile, hardly its tail: see `FitResult.energy_error` for the energy.
+    It depends on the core of a profile, and little on its tail: see `FitResult.energy_error` for
+    the energy.
 
     **Arguments:** as for `squared_error`. Differentiable where the fit is not perfect.
 
-    **Returns:** [channels], at least 0; it depends on neither the unit of length nor the scale of
-    the profile.
+    **Returns:** [channels], at least 0; independent of the unit of length and the scale of the
+    profile.
 
     **Source:** Kim et al. 2010, Eq. 4.
     """
@@ -97,9 +98,9 @@ class FitProblem(eqx.Module):
     r"""Eq. 3 of all channels that share their variances, each divided by its norm, at the nodes of
     a radial rule.
 
-    Variances are counted in the square of one length, the geometric mean of the `scales` of the
-    channels, so that nothing depends on the unit of length. Differentiable in `target` and `total`;
-    nodes and scales are constants.
+    Variances are in units of the square of one length, the geometric mean of the `scales` of the
+    channels, so that results do not depend on the unit of length. Differentiable in `target` and
+    `total`; nodes and scales are constants.
     """
 
     squared_radii: Float[Array, "*batch channels nodes"]
@@ -119,7 +120,7 @@ class FitProblem(eqx.Module):
         return jnp.exp(log_variances) * self.squared_unit
 
     def log_variances(self, variances: Float[Array, " gaussians"]) -> Float[Array, " gaussians"]:
-        """Take the logarithms of given variances, mm^2, which are constants of every derivative."""
+        """Compute the logarithms of given variances, mm^2; they are constants of derivatives."""
         variances = jax.lax.stop_gradient(variances).astype(self.target.dtype)
         return jnp.log(variances / self.squared_unit)
 
@@ -169,7 +170,8 @@ class FitProblem(eqx.Module):
         """Compute the sum of squared residuals and its derivatives in closed form."""
         basis, coefficients, response, residuals = self.solve(log_variances, active)
         slopes, curved, moved = self._slopes(log_variances, basis, coefficients, response)
-        # How the best coefficients follow: the first term is that of a basis without residuals.
+        # The derivative of the best coefficients; the first term is that of a basis without
+        # residuals.
         along = jnp.einsum("cnk,cn->ck", slopes, residuals)
         follow = moved + response * along[:, None, :]
         steep = slopes * coefficients[:, None, :]
@@ -213,8 +215,8 @@ class FitProblem(eqx.Module):
         return SumOfGaussians(variances, (coefficients * scale).T), jnp.sqrt(squared), covariance
 
     def _slopes(self, log_variances, basis, coefficients, response):
-        """Compute the first and second derivative of the basis at fixed weights, and how the
-        coefficients follow if there are no residuals.
+        """Compute the first and second derivative of the basis at fixed weights, and the derivative
+        of the coefficients without residuals.
         """
         variances = self.variances(log_variances)[None, None]
         growth = 0.5 * self.squared_radii[..., None] / variances - 1

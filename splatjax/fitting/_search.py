@@ -1,5 +1,5 @@
-"""The search for the best variances: where it starts, how Newton's method finishes it, and the
-derivative of where it ends.
+"""The search for the best variances: starts, Newton's method for the last steps, and the derivative
+of the optimum.
 """
 
 import abc
@@ -22,12 +22,12 @@ from ._weights import NormalEquations, invert_moving
 # Log variances, in squared length scales, between which a single Gaussian starts.
 _FIRST = (-3.0, 4.0)
 
-# How far, in log variance, a Gaussian starts outside the previous ones: neighbors lie 1.4 to 2.2
-# apart.
+# Distance in log variance at which a Gaussian starts outside the previous ones; neighbors are 1.4
+# to 2.2 apart.
 _OUTWARD = 1.5
 
 _TOLERANCE = 1e-3
-# Enough to tell the starts apart, and for Newton's method to finish from the best of them.
+# Enough to compare the starts, and for Newton's method to converge from the best one.
 _STEPS = 64
 
 # A fit has converged when a step of Gauss and Newton would lower the sum of squares by less than
@@ -39,22 +39,20 @@ _GAIN = 1e-6
 _FLOOR = 100.0
 
 _NEWTON_STEPS = 32
-# A step in log variance below this many units of rounding is none.
+# A step in log variance below this many units of rounding counts as zero.
 _STEP = 10.0
 
 
 class AbstractStart(eqx.Module):
-    """Where the search for the variances starts."""
+    """The start of the search for the variances."""
 
     @abc.abstractmethod
     def search(self, problem: FitProblem, count: int) -> Float[Array, " gaussians"]:
-        """Find nearly the best log variances, ascending, of a problem in JAX's default
-        precision.
-        """
+        """Find nearly optimal log variances, ascending, of a problem in JAX's default precision."""
 
 
 class GreedyInsertion(AbstractStart):
-    """From the best fit with one Gaussian fewer, and so on down to one: a Gaussian is inserted in
+    """Starts from the best fit with one Gaussian fewer, recursively: a Gaussian is inserted in
     every gap and at both ends, and the best result is kept.
     """
 
@@ -64,9 +62,9 @@ class GreedyInsertion(AbstractStart):
 
 @record
 class GivenVariances(AbstractStart):
-    r"""From the variances of a fit of nearly the same profile.
+    r"""Starts from the variances of a fit of a similar profile.
 
-    One descent, hence fast; it finds the nearest optimum.
+    It needs one descent, and finds the nearest optimum.
 
     **Attributes:**
 
@@ -89,7 +87,7 @@ class DipoleStarts(eqx.Module):
     r"""Variances of the best fits to dipoles, per channel, over reduced albedo and index of
     refraction.
 
-    Counted in squared mean free paths they depend on nothing else. They are tabulated over `sqrt(1
+    In units of squared mean free paths they depend only on these. They are tabulated over `sqrt(1
     - alpha')`, in which they are smooth, and interpolated linearly in their logarithms; beyond the
     table's ends the last entry serves.
 
@@ -142,7 +140,7 @@ def constant(problem: FitProblem) -> FitProblem:
 
 
 def greedy_path(problem: FitProblem, largest: int) -> Float[Array, "counts gaussians"]:
-    """Find nearly the best log variances of 1, 2, ... Gaussians, each ascending and followed by
+    """Find nearly optimal log variances of 1, 2, ... Gaussians, each ascending and followed by
     zeros.
     """
 
@@ -175,9 +173,9 @@ def _insert(
 def _descend(
     problem: FitProblem, start: Float[Array, " gaussians"], active: Bool[Array, " gaussians"] | None
 ) -> tuple[Float[Array, " gaussians"], Float[Array, ""]]:
-    """Descend from a start: the end, and the sum of squares there."""
-    # In units of the start's own residual, so that damping and tolerances mean the same for a good
-    # fit as for a poor one.
+    """Descend from a start; return the end, and its sum of squares."""
+    # In units of the start's residual, so that damping and tolerances have the same effect for good
+    # and poor fits.
     unit = jnp.sqrt(_cost(problem.residuals(start, active)))
 
     def residuals(point, _):
@@ -226,7 +224,7 @@ class AbstractSpread(eqx.Module):
 
 
 class SharedVariances(AbstractSpread):
-    r"""One set of variances for all channels, as the renderer needs it: it draws one layer for
+    r"""One set of variances for all channels, as the renderer needs: it computes one layer for
     each.
 
     The fit minimizes the sum over the channels of the square of Eq. 4.
@@ -283,8 +281,8 @@ def refine(
         best, newton, _, steps = state
         trial = best[0] - newton
         expansion = problem.expand(trial)
-        # Steps of the size of rounding have gains and losses of that size: they end the search and
-        # are not taken.
+        # Steps of the size of rounding have gains and losses of that size. They end the search and
+        # are rejected.
         moved = (steps == 0) | (
             jnp.max(jnp.abs(newton)) > _STEP * float(jnp.finfo(trial.dtype).eps)
         )
@@ -303,7 +301,7 @@ def refine(
 
 
 def _gain(expansion: Expansion) -> Float[Array, ""]:
-    """Compute by how much the sum of squares would fall if the residuals were linear: accurate in
+    """Compute the predicted decrease of the sum of squares for linear residuals; it is accurate in
     float32, where the Hessian is not.
     """
     normal = jnp.einsum("cni,cnj->ij", expansion.jacobian, expansion.jacobian)

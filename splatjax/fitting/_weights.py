@@ -1,10 +1,10 @@
-"""Linear least squares with a handful of unknowns, in plain array operations; and the weights of a
-fit that they find when the variances are given.
+"""Linear least squares with few unknowns, in plain array operations, and the weights of a fit for
+given variances.
 
-The fit solves thousands of tiny systems at once inside a loop. Batched LAPACK calls there were seen
-to wait for each other for good on a machine of two cores; elimination in six columns needs none.
-Columns are scaled to unit length, so that the normal equations are benign (their condition number
-stays below 2000 for eight Gaussians), and one step of refinement makes up for having squared it.
+The fit solves thousands of tiny systems at once inside a loop. Batched LAPACK calls inside the loop
+can deadlock on two cores; elimination of six columns avoids them. Columns are scaled to unit
+length, so that the condition number of the normal equations stays below 2000 for eight Gaussians,
+and one step of refinement restores the precision.
 """
 
 import abc
@@ -32,7 +32,7 @@ def invert(matrix: Float[Array, "columns columns"]) -> Float[Array, "columns col
 
     def eliminate(column, matrix):
         here = jnp.arange(matrix.shape[0]) == column
-        # The unit vector takes the place of the column, and turns into that of the inverse.
+        # The unit vector replaces the column, and becomes that of the inverse.
         replaced = jnp.where(here[None], here[:, None].astype(matrix.dtype), matrix)
         row = replaced[column] / matrix[column, column]
         reduced = replaced - matrix[:, column][:, None] * row[None]
@@ -50,9 +50,7 @@ def _invert_jvp(primals, tangents):
 def invert_moving(
     hessian: Float[Array, "gaussians gaussians"],
 ) -> Float[Array, "gaussians gaussians"]:
-    """Invert a Hessian; a Gaussian of weight zero in all channels stays where it
-    is.
-    """
+    """Invert a Hessian; a Gaussian of weight zero in all channels does not move."""
     still = jnp.diagonal(hessian) == 0
     return invert(hessian + jnp.diag(still.astype(hessian.dtype)))
 
@@ -95,7 +93,7 @@ class NormalEquations(lx.AbstractLinearSolver):
 
 
 class AbstractWeights(eqx.Module):
-    """The weights that a fit may choose from: a set that does not depend on the variances."""
+    """The set of weights that a fit allows; it does not depend on the variances."""
 
     @abc.abstractmethod
     def solve(
@@ -142,21 +140,21 @@ class AbstractWeights(eqx.Module):
 
 
 class FreeWeights(AbstractWeights):
-    """Any weights: the least error of Eq. 3. Their sum may miss the profile's total reflectance by
-    some per cent.
+    """Any weights, for the least error of Eq. 3. Their sum may differ from the profile's total
+    reflectance by some per cent.
     """
 
     def solve(self, basis, target, energies, total):
-        # Gaussians narrower than the first radius have no norm there: of what they may hold, the
-        # shortest coefficients.
+        # Gaussians narrower than the first radius have no norm there: their coefficients are the
+        # shortest solution.
         ridge = _UNSEEN * jnp.eye(basis.shape[1], dtype=basis.dtype)
         inverse = invert(basis.T @ basis + ridge)
         return least_squares(basis, target, inverse), inverse
 
 
 class FixedTotalReflectance(AbstractWeights):
-    """Weights whose sum is the total reflectance of the profile: the picture keeps its energy, at a
-    somewhat larger error.
+    """Weights whose sum is the total reflectance of the profile: the picture keeps its energy, with
+    a slightly larger error.
     """
 
     def solve(self, basis, target, energies, total):
@@ -169,10 +167,10 @@ class FixedTotalReflectance(AbstractWeights):
 
 
 class NonNegativeWeights(AbstractWeights):
-    """No weight below zero, as in a mixture; otherwise as `among`.
+    """Non-negative weights, as in a mixture; otherwise as `among`.
 
-    Fits of single channels of a dipole have no negative weights anyway. Where variances are shared,
-    some may become 0.
+    Fits of single channels of a dipole have no negative weights anyway. With shared variances, some
+    may become 0.
 
     **Attributes:**
 

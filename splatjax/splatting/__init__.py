@@ -1,4 +1,4 @@
-"""Passes 1 to 3 of the paper: shadow maps, visibility and attributes (Eq. 1). Knows nothing of
+"""Passes 1 to 3 of the paper: shadow maps, visibility and attributes (Eq. 1). Independent of
 scattering.
 """
 

@@ -1,8 +1,8 @@
-"""Lists of items per tile of the picture, laid out so that sweeps over them read contiguous memory.
+"""Lists of items per tile of the picture, stored so that sweeps over them read contiguous memory.
 
 Tiles are ordered by the length of their list and swept `lanes` at a time, a *chunk*; the lists of a
-chunk are stored as *blocks* of `[lanes, slots]`. Nothing is dropped: the only limits are the
-planned numbers of pairs and of blocks, and needing more than either is reported.
+chunk are stored as *blocks* of `[lanes, slots]`. No item is dropped: the only limits are the
+planned numbers of pairs and of blocks, and exceeding either is reported.
 """
 
 from collections.abc import Sequence
@@ -59,7 +59,7 @@ class Bins(eqx.Module):
 
     **Attributes:**
 
-    - `ids`: of items; an empty slot holds the number of items, which is no item.
+    - `ids`: of items; an empty slot contains the number of items.
     - `order`: the tile of each lane, chunk after chunk.
     - `first_block`: of each chunk; the last entry is the number of all blocks.
     - `needed`: capacity needed over planned; above 1 the lists are incomplete.
@@ -74,7 +74,7 @@ class Bins(eqx.Module):
 
     @property
     def chunks(self) -> Int[Array, ""]:
-        """Count the chunks with anything in them: longer lists come first, so these lead."""
+        """Count the chunks that are not empty, which come first: lists are sorted by length."""
         return jnp.minimum(_occupied(self.first_block), self.planned_lanes // self.ids.shape[1])
 
 
@@ -83,8 +83,8 @@ def _occupied(first_block: Int[Array, " chunks_and_one"]) -> Int[Array, ""]:
 
 
 def _pairs(ranges: TileRanges, grid: TileGrid, capacity: int):
-    """List all pairs of item and tile, item after item; `grid.padded_count` where there is none.
-    Also compute the capacity needed over planned.
+    """List all pairs of item and tile, item after item, padded by `grid.padded_count`. Also compute
+    the capacity needed over planned.
     """
     counts = ranges.across * ranges.down
     ends = jnp.cumsum(counts)
@@ -144,7 +144,7 @@ def _ranks(tile: Int[Array, " pairs"], tiles: int):
 
 
 def bin_items(ranges: TileRanges, grid: TileGrid, capacity: BinCapacity) -> Bins:
-    """List the items of every tile, in their order. Not differentiated."""
+    """List the items of every tile, in order. Not differentiated."""
     items, lanes, slots, tiles = ranges.left.shape[0], grid.lanes, grid.slots, grid.padded_count
     size = capacity.blocks * lanes * slots
     # List the pairs item after item, and number the pairs of each tile.
@@ -157,7 +157,7 @@ def bin_items(ranges: TileRanges, grid: TileGrid, capacity: BinCapacity) -> Bins
     order = jnp.argsort(-lengths, stable=True).astype(jnp.int32)
     first_block = jnp.concatenate([jnp.zeros(1, jnp.int32), jnp.cumsum(lengths[order[::lanes]])])
 
-    # Where each tile begins among the slots, and from there the slot of every pair.
+    # Compute the first slot of each tile, and from it the slot of every pair.
     lane = jnp.arange(tiles, dtype=jnp.int32)
     begins = first_block[lane // lanes] * (lanes * slots) + (lane % lanes) * slots
     begin_of_tile = jnp.full(tiles + 1, size, jnp.int32).at[order].set(begins)
@@ -168,7 +168,7 @@ def bin_items(ranges: TileRanges, grid: TileGrid, capacity: BinCapacity) -> Bins
     )
     ids = jnp.full(size, items, jnp.int32).at[target.reshape(-1)].set(item.reshape(-1), mode="drop")
 
-    # What was needed, of what was planned.
+    # Compute the needed over the planned capacity.
     blocks = needed_over_planned(first_block[-1], capacity.blocks)
     chunks = needed_over_planned(_occupied(first_block), capacity.chunks)
     needed = jnp.maximum(pairs, jnp.maximum(blocks, chunks))
@@ -184,7 +184,7 @@ def bin_items(ranges: TileRanges, grid: TileGrid, capacity: BinCapacity) -> Bins
 def slot_plane(
     plane: Float[Array, " items"], fill: float, bins: Bins
 ) -> Float[Array, "blocks lanes slots"]:
-    """Gather a number of the items into their slots; `fill` in empty slots."""
+    """Gather a value of each item into its slots; `fill` in empty slots."""
     return plane.at[bins.ids].get(mode="fill", fill_value=fill)
 
 

@@ -1,5 +1,5 @@
-"""The plain rasterizer: every splat against every pixel, a row at a time. The reference; it has
-every derivative.
+"""The plain rasterizer: every splat at every pixel, a row at a time. It is the reference, and
+supports every derivative.
 """
 
 import jax
@@ -22,7 +22,7 @@ from ._views import AbstractView, SplattingSettings
 
 
 class DenseRasterizer(AbstractRasterizer):
-    """Tries every splat at every pixel. Slow and plain; forward mode and second order work."""
+    """Evaluates every splat at every pixel. Slow; supports forward mode and second order."""
 
     def make_plan(self, parts, views, settings):
         if len(parts) > 1:
@@ -44,7 +44,7 @@ class DenseRasterPlan(AbstractRasterPlan):
         dtype, footprints = attributes.dtype, view.footprints(splats, settings)
         grid = TileGrid(view.width, view.height)
         columns = jnp.arange(view.width, dtype=dtype) + 0.5
-        # The weight that a fragment behind the front needs to decide where that surface is.
+        # The least weight of a fragment that determines the surface behind the front.
         conic = footprints.a, footprints.b, footprints.c, footprints.nearness
         least = jax.lax.stop_gradient(least_weight(type(view), *conic, settings.filter_radius))
 

@@ -1,5 +1,5 @@
-"""The fragments of splats in the pixels of tiles: what is found of them along a tile's list, and
-the cotangents of the splats.
+"""The fragments of splats in the pixels of tiles: sums along a tile's list, and the cotangents of
+the splats.
 
 Fragments are computed relative to their tile, so that float32 suffices at any resolution.
 """
@@ -20,13 +20,13 @@ from ._rasterizer import (
 )
 from ._views import AbstractView
 
-# Of the footprints, that sums depend on.
+# Fields of the footprints on which sums depend.
 PLANES = ("x", "y", "slope_x", "slope_y", "a", "b", "c", "nearness", "opacity")
 _EMPTY = (0.0, 0.0, 0.0, 0.0, 1e12, 0.0, 1e12, 1.0, 0.0)  # covers no pixel center
 
 
 class Lanes(eqx.Module):
-    """Tiles that are swept together: where their lists begin in the slots, and their corners.
+    """Tiles that are swept together: the starts of their lists in the slots, and their corners.
 
     **Attributes:**
 
@@ -64,7 +64,7 @@ class Sweep(eqx.Module):
 
     **Attributes:**
 
-    - `view_class`: fragments need the formulas of a view, not where it stands. Static.
+    - `view_class`: fragments need the formulas of a view, not its position. Static.
     """
 
     view_class: type[AbstractView] = eqx.field(static=True)
@@ -73,7 +73,7 @@ class Sweep(eqx.Module):
     filter_radius: float = eqx.field(static=True)
 
     def within_picture(self, sums: PixelSums, tiles: Int[Array, " lanes"]) -> PixelSums:
-        """Set to zero what lies in a tile but beyond the picture."""
+        """Set pixels of a tile beyond the picture to zero."""
         if self.grid.width % TILE_SIDE == 0 and self.grid.height % TILE_SIDE == 0:
             return sums
         within = self.grid.within_picture(tiles)
@@ -81,8 +81,8 @@ class Sweep(eqx.Module):
         return PixelSums(rows, jnp.where(within, sums.weights, 0.0))
 
     def pixels(self, dtype) -> tuple[np.ndarray, np.ndarray]:
-        """Pixel centers of a tile, from its corner. Constants: made by NumPy, or the compiler
-        computes them per fragment.
+        """Pixel centers of a tile, from its corner. They are NumPy constants; the compiler would
+        otherwise compute them per fragment.
         """
         side = np.arange(TILE_SIDE, dtype=dtype) + np.asarray(0.5, dtype)
         return np.tile(side, TILE_SIDE), np.repeat(side, TILE_SIDE)
@@ -132,8 +132,8 @@ class Sweep(eqx.Module):
         return lax.fori_loop(jnp.int32(0), lanes.blocks, nearest, self._no_limit(lanes))
 
     def limits_behind(self, slots: "Slots", lanes: Lanes, open_limit):
-        """Find the same for what lies behind the front, whose far limit is `open_limit` in open
-        pixels and -inf in others: of the fragments that weigh something, and of any.
+        """Find the same behind the front, whose far limit is `open_limit` in open pixels and -inf
+        in others: for the fragments of sufficient weight, and for all.
         """
 
         def nearest(block, limits):
@@ -182,7 +182,7 @@ class Sweep(eqx.Module):
             )
             weight = splats[-1][:, :, None] * fast_fragment_weight(squared_radius)
             rows = self.rows(slots, lanes.read(slots.ids, block), splats)
-            # Turned in memory, which costs less than it saves in the product.
+            # The transpose in memory costs less than it saves in the product.
             rows = lax.optimization_barrier(jnp.swapaxes(rows, 1, 2))
             return sums + jnp.einsum("trs,tsp->trp", rows, weight)
 
@@ -253,8 +253,8 @@ class Sweep(eqx.Module):
 
 
 class Slots(eqx.Module):
-    """What the sweeps read: planes gathered into slots, in rows of one lane each, and attributes
-    splat by splat, which are too many to be kept in slots.
+    """The input of the sweeps: planes gathered into slots, in rows of one lane each, and attributes
+    per splat, which are too many for slots.
     """
 
     ids: Int[Array, "rows slots"]
@@ -285,7 +285,7 @@ class Slots(eqx.Module):
 
 
 def _plane_cotangents(splats, quad, near):
-    """Turn moments of the cotangents over the pixels into cotangents of a splat's numbers."""
+    """Convert moments of the cotangents over the pixels to cotangents of a splat's numbers."""
     x, y, sx, sy, a, b, c, _, _ = splats
     m, mx, my, mxx, mxy, myy = quad
     n, nx, ny = near
@@ -301,8 +301,8 @@ def _plane_cotangents(splats, quad, near):
 def second_limits(
     weighty: Float[Array, "places pixels"], of_any: Float[Array, "places pixels"]
 ) -> Float[Array, "places pixels"]:
-    """Choose where the surface behind ends, from the largest of both in all parts; inf where there
-    is none.
+    """Choose the end of the surface behind, from the largest of both over all parts; inf where
+    there is none.
     """
     limits = jnp.where(weighty > -jnp.inf, weighty, of_any)
     return jnp.where(limits > -jnp.inf, limits, jnp.inf)

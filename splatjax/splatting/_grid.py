@@ -1,4 +1,4 @@
-"""A picture cut into tiles, and the tiles that rectangles touch."""
+"""A picture divided into tiles, and the tiles that rectangles touch."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -10,7 +10,7 @@ TILE_BITS = 22  # in a sort key of 32, for the number of a tile
 
 
 class TileGrid(eqx.Module):
-    """A picture cut into square tiles, row by row; the last ones may reach beyond it."""
+    """A picture divided into square tiles, row by row; the last ones may extend beyond it."""
 
     width: int = eqx.field(static=True)
     height: int = eqx.field(static=True)
@@ -44,13 +44,13 @@ class TileGrid(eqx.Module):
 
     @property
     def half(self) -> int:
-        """Chunks of half of the picture, or of a picture of 1024 x 1024 pixels where it is larger:
-        capacities are planned in parts of it, so that many bodies share a program.
+        """Chunks of half of the picture, or of 1024 x 1024 pixels if it is larger. Capacities are
+        planned in parts of this number, so that many bodies share a program.
         """
         return min(-(-self.padded_count // (2 * self.lanes)), _HALF)
 
     def cut(self, picture: Float[Array, "rows height width"]) -> Float[Array, "tiles rows pixels"]:
-        """Cut a picture into tiles; 0 beyond its edges."""
+        """Divide a picture into tiles; 0 beyond its edges."""
         rows, height, width = picture.shape
         whole = jnp.pad(
             picture,
@@ -63,7 +63,7 @@ class TileGrid(eqx.Module):
         )
 
     def join(self, tiles: Float[Array, "tiles rows pixels"]) -> Float[Array, "rows height width"]:
-        """Put a picture together from its tiles."""
+        """Join the tiles of a picture."""
         rows = tiles.shape[1]
         whole = tiles.reshape(self.down, self.across, rows, TILE_SIDE, TILE_SIDE).transpose(
             2, 0, 3, 1, 4
@@ -90,7 +90,7 @@ class TileGrid(eqx.Module):
         )
 
     def within_picture(self, tiles: Int[Array, " some"]) -> Bool[Array, "some pixels"]:
-        """Mark the pixels of some tiles that lie in the picture."""
+        """Mark the pixels of some tiles that are inside the picture."""
         x, y = self.columns_and_rows(tiles)
         return (x < self.width) & (y < self.height)
 
@@ -146,8 +146,8 @@ class TileRanges(eqx.Module):
 def _between(
     low: Float[Array, " items"], high: Float[Array, " items"], count: int
 ) -> tuple[Float[Array, " items"], Float[Array, " items"]]:
-    """Return the first and the last of `count` pixels whose centers are not outside of two edges;
-    the last comes before the first if there is none.
+    """Return the first and the last of `count` pixels with centers between two edges; the last is
+    before the first if there is none.
     """
     first = jnp.clip(jnp.ceil(low - 0.5), 0, count)
     return first, jnp.clip(jnp.floor(high - 0.5), -1, count - 1)

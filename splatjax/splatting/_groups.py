@@ -1,5 +1,5 @@
-"""Groups of splats that follow each other: merged into discs, which cast shadows into coarse maps;
-and which of them see which, by bundles of parallel lines through all splats at once.
+"""Groups of consecutive splats: merging into discs for coarse shadow maps, and the visibility
+between groups, by bundles of parallel lines.
 """
 
 from collections.abc import Sequence
@@ -22,12 +22,12 @@ def merge_splats(splats: Splats, count: int) -> Splats:
     """Merge each `count` consecutive splats into one disc for each side of the surface: at the
     mean of their centers over area, with their mean normal and the sum of their areas.
 
-    Splats of a group that face away from its first one are on the other side. Without any, a disc
-    has no extent and no normal.
+    Splats of a group that face away from its first one belong to the other side. A disc without
+    splats has no extent and no normal.
 
     **Arguments:**
 
-    - `splats`: in a compact order, a multiple of `count`. Differentiable; the sides are held fixed.
+    - `splats`: in a compact order, a multiple of `count`. Differentiable; the sides are constants.
 
     **Returns:** twice as many discs as there are groups, without maps.
     """
@@ -71,11 +71,11 @@ _AT_ONCE = 1 << 19  # pairs of splat and direction
 
 
 class SightlineSettings(eqx.Module):
-    r"""How it is found what each splat sees of the body. Static.
+    r"""Settings of the visibility between splats. Static.
 
     **Attributes:**
 
-    - `directions`: an even number, over the sphere; the same for all splats.
+    - `directions`: number of directions over the sphere, even; the same for all splats.
     """
 
     directions: int = eqx.field(static=True, default=256)
@@ -86,16 +86,16 @@ class SightlineSettings(eqx.Module):
 
 
 class Sightlines(eqx.Module):
-    r"""What splats see of the body, in directions that are even over the sphere.
+    r"""The visibility between splats, in directions evenly distributed over the sphere.
 
-    Splats that follow each other in a compact order are grouped: a group has one view, and the
-    exitance of its first splat.
+    Consecutive splats in a compact order form groups. A group has one view, and the exitance of its
+    first splat.
 
     **Attributes:** not differentiated
 
     - `directions`: unit.
-    - `seen`: the group that the splats of each group see in each direction; the number of groups
-      where they see none.
+    - `seen`: the visible group from each group in each direction; the number of groups if there is
+      none.
     - `size`: splats in each group. Static.
 
     **Source:** Sbert 1993, "An integral geometry based method for fast form-factor computation".
@@ -107,15 +107,15 @@ class Sightlines(eqx.Module):
 
     @classmethod
     def build(cls, parts: Sequence[Splats], settings: SightlineSettings) -> "Sightlines":
-        """Find what the splats of all parts see, by NumPy.
+        """Compute the visibility between the splats of all parts, by NumPy.
 
-        For every line, splats are sorted into cells across it, and by their depth along it. A splat
-        sees the next one of its cell whose front faces it. Each must lie in front of the other's
-        plane, by half a spacing, so that a rough surface does not see itself.
+        For every line, splats are sorted into cells across it, and by depth along it. A splat sees
+        the next one in its cell that faces it. Each must be in front of the other's plane by half a
+        spacing, so that a rough surface does not see itself.
 
         **Arguments:**
 
-        - `parts`: concrete, in the order of a plan; those without area only fill it.
+        - `parts`: concrete, in the order of a plan; splats without area are padding.
         """
         size = 1
         while size < _LARGEST_GROUP and sum(part.count for part in parts) > _MOST_GROUPS * size:
@@ -160,16 +160,17 @@ class Sightlines(eqx.Module):
         normals: Float[Array, "splats 3"],
         combination: AbstractCombination,
     ) -> Float[Array, "channels splats"]:
-        r"""Compute the irradiance from a body that radiates evenly to all sides,
+        r"""Compute the irradiance from a body that radiates equally in all directions,
 
             E(x) = sum_d max(n . d, 0) M(y_d) / sum_d max(n . d, 0)
 
-        where `y_d` is what x sees along d. In a closed cavity of one exitance it is that.
+        where `y_d` is the point that x sees along d. In a closed cavity of constant exitance the
+        irradiance equals the exitance.
 
         **Arguments:**
 
         - `exitance`: of the first splat of each group of this device. Differentiable.
-        - `normals`: unit, or zero for splats that fill a part. Differentiable.
+        - `normals`: unit, or zero for padding. Differentiable.
         """
         everywhere = combination.gather(exitance.T)
 
@@ -188,8 +189,8 @@ class Sightlines(eqx.Module):
 
 
 def _ends(line, centers, normals, spacing):
-    """Return for each splat the one that it sees along a line, and against it; their number for
-    none.
+    """Return for each splat the visible splat along a line, and against it; the number of splats if
+    there is none.
     """
     # Number the cells of a grid across the line, and sort by cell and depth.
     count = len(centers)
@@ -208,7 +209,7 @@ def _ends(line, centers, normals, spacing):
         if sign < 0:
             order, cosine, cell = order[::-1], -cosine[::-1], cell[::-1]
             centers, normals = centers[::-1], normals[::-1]
-        # From each place of the sequence on, the next splat that faces back.
+        # From each position of the sequence on, the next splat that faces back.
         places = np.where(cosine < 0, np.arange(count), count)
         following = np.append(np.minimum.accumulate(places[::-1])[::-1], [count, count])
         ends = np.full(count + 1, count)

@@ -1,4 +1,4 @@
-"""What a camera or a near light sees, and what a light at infinity sees."""
+"""Views of cameras and near lights (perspective), and of distant lights (orthographic)."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -20,7 +20,7 @@ from ._views import (
 
 
 class PerspectiveView(AbstractView):
-    """What a pinhole camera sees; `focal_length` is in pixels."""
+    """The view of a pinhole camera; `focal_length` is in pixels."""
 
     focal_length: Float[Array, ""]
     width: int = eqx.field(static=True)
@@ -43,8 +43,8 @@ class PerspectiveView(AbstractView):
         in_sight = self._in_sight(px, py, pz, splats.radii)
         pz = jnp.where(in_sight, pz, 1.0)
         u, v, scale = px / pz, py / pz, self.focal_length / pz
-        # All below is homogeneous in the normal and the radius r (pixels): the normal n is taken
-        # that long.
+        # All below is homogeneous in the normal and the radius r (pixels), so the normal n is
+        # scaled to this length.
         radius = splats.radii * self.focal_length / pz
         nx, ny, nz = (
             n * splats.radii * self.focal_length / pz
@@ -117,8 +117,8 @@ class PerspectiveView(AbstractView):
         return self._in_sight(px, py, pz, splats.radii) & (nx * px + ny * py + nz * pz < 0)
 
     def _in_sight(self, x, y, z, radii):
-        """Mark the spheres that touch the pyramid of the picture. Others, far to the side, are
-        beyond what float32 projects.
+        """Mark the spheres that touch the pyramid of the picture. Float32 cannot project others far
+        to the side.
         """
 
         def beside(offset, size):
@@ -168,8 +168,8 @@ class PerspectiveView(AbstractView):
 
 
 class OrthographicView(AbstractView):
-    """What a light at infinity sees. `position` is seen at the center of the picture, at
-    depth 0; `scale` is in pixels per mm.
+    """The view of a distant light. `position` is at the center of the picture, at depth 0; `scale`
+    is in pixels per mm.
     """
 
     scale: Float[Array, ""]

@@ -23,8 +23,8 @@ def fragment_weight(squared_radius: Float[Array, "..."]) -> Float[Array, "..."]:
     r"""Compute the Gaussian weight of a fragment in object space, `exp(-4 rho^2)`, tapered at the
     rim.
 
-    Its tangent at the rim is taken off, `exp(-4 q) - exp(-4) (5 - 4 q)` with `q = rho^2`, so that
-    value and derivative reach zero there, and the weight is positive inside.
+    Its tangent at the rim is subtracted, `exp(-4 q) - exp(-4) (5 - 4 q)` with `q = rho^2`, so that
+    value and derivative are zero there, and the weight is positive inside.
 
     **Arguments:** `squared_radius`: `rho^2` in units of the splat's radius, in [0, 1].
     Differentiable.
@@ -85,8 +85,8 @@ def least_weight(
     nearness: Float[Array, "*splats"],
     filter_radius: float,
 ) -> Float[Array, "*splats"]:
-    """Compute `LEAST_WEIGHT`, and in proportion less for splats smaller than a pixel: the filter
-    makes them that much fainter.
+    """Compute `LEAST_WEIGHT`, reduced for splats smaller than a pixel as the filter reduces their
+    weight.
     """
     # Disc and filter together have axes whose squares add up to r^2 (1 + cos^2) + 2 f^2.
     determinant = (a * c - 0.25 * b * b) * view_class.squared_radius(nearness, jnp.ones_like(a))
@@ -105,13 +105,13 @@ class SurfaceCapacity(eqx.Module):
 
 
 class PixelSums(eqx.Module):
-    """Sums over the fragments of pixels; 0 where there is none, and beyond the picture.
+    """Sums over the fragments of pixels; 0 without fragments, and beyond the picture.
 
     **Attributes:**
 
-    - `rows`: of weights times attributes, and last of weights times the nearness of the ray's hits
-      with the planes of the splats.
-    - `weights`: of weights.
+    - `rows`: sums of weights times attributes, followed by those of weights times the nearness of
+      the ray's hits with the planes of the splats.
+    - `weights`: sums of weights.
     """
 
     rows: Float[Array, "places rows pixels"]
@@ -137,18 +137,18 @@ class FragmentSums(eqx.Module):
 
 
 def invalid_factor(needed: Float[Array, ""]) -> Float[Array, ""]:
-    """Compute the factor of what is made of sums: 1, or NaN where the plan did not suffice."""
+    """Compute the factor on results of sums: 1, or NaN if the plan did not suffice."""
     return jnp.where(needed <= 1, 1.0, jnp.nan).astype(needed.dtype)
 
 
 class AbstractRasterPlan(eqx.Module):
-    """A rasterizer with the capacity that some splats need in some views."""
+    """A rasterizer with its planned capacity."""
 
     def choose(
         self, splats: Splats, view: AbstractView
     ) -> tuple[Int[Array, " chosen"], Float[Array, ""]]:
-        """List the splats that a view may see, in order; the number of splats in what is left of
-        the capacity. Also compute the capacity needed over planned.
+        """List the splats that a view may see, in order, padded by the number of splats. Also
+        compute the capacity needed over planned.
         """
         every = jnp.arange(splats.count, dtype=jnp.int32)
         return every, jnp.zeros((), splats.centers.dtype)
@@ -169,15 +169,15 @@ class AbstractRasterPlan(eqx.Module):
         *Behind* are, in pixels that the front does not cover in full, the fragments nearer than
         that minimum over those that are not in front and have a weight of at least 0.06 (less for
         splats smaller than a pixel, `least_weight`): the rims of splats seen nearly edge on do not
-        hide the surface behind them. Where no fragment has that weight, the minimum is over all
-        that are not in front.
+        hide the surface behind them. If no fragment has that weight, the minimum is over all that
+        are not in front.
 
-        Which fragments are chosen is piecewise constant: it has no derivative.
+        The choice of fragments is piecewise constant: it has no derivative.
 
         **Arguments:**
 
         - `splats`, `attributes`: those of this device, at least one. Differentiable.
-        - `combination`: of the parts of the splats that several devices hold.
+        - `combination`: combines the parts of the splats of several devices.
 
         **Returns:** the sums over the splats of this device.
         """
@@ -185,14 +185,15 @@ class AbstractRasterPlan(eqx.Module):
     def fitted(
         self, parts: Sequence[Splats], views: Sequence[AbstractView], settings: SplattingSettings
     ) -> "AbstractRasterPlan":
-        """Return a plan with no more capacity for the surface behind than these views need, with
-        some to spare: where attributes are many, it is most of the memory. Not for traced arrays.
+        """Return a plan with the capacity for the surface behind reduced to the need of these
+        views, with some to spare. With many attributes it is most of the memory. Not for traced
+        arrays.
         """
         return self
 
 
 class AbstractRasterizer(eqx.Module):
-    """A way to carry out passes 2 and 3; a setting."""
+    """An implementation of passes 2 and 3; a setting."""
 
     @abc.abstractmethod
     def make_plan(
@@ -201,14 +202,14 @@ class AbstractRasterizer(eqx.Module):
         views: Sequence[AbstractView],
         settings: SplattingSettings,
     ) -> AbstractRasterPlan:
-        """Find the capacity for these splats in each of these views. Not for traced arrays.
+        """Compute the capacity for these splats in each of these views. Not for traced arrays.
 
         **Arguments:**
 
-        - `parts`: of one size; several where several devices hold them.
+        - `parts`: of one size; one for each device.
         - `views`: of one size.
         """
 
     def for_shadows(self) -> "AbstractRasterizer":
-        """Return the rasterizer of the shadow maps: itself, unless it serves pictures alone."""
+        """Return the rasterizer of the shadow maps: itself, unless it supports only pictures."""
         return self

@@ -1,6 +1,4 @@
-"""Pass 1: shadow maps. The scene's surfaces as a light sees them, and how much of the light reaches
-each splat.
-"""
+"""Pass 1: shadow maps, and the fraction of a light that reaches each splat."""
 
 from collections.abc import Sequence
 
@@ -22,30 +20,28 @@ from ._rasterizer import AbstractRasterPlan, FragmentSums, coverage, invalid_fac
 from ._surfaces import Surface
 from ._views import AbstractView, SplattingSettings
 
-# Times the weight sum from which on a surface covers a pixel of a picture: discs extend beyond an
-# open edge, and its shadow less. A sum of 1 always does: evenly spread splats exceed it.
+# Factor on the weight sum of full coverage in pictures. Discs extend beyond an open edge; a larger
+# sum makes its shadow extend less. Evenly spread splats always exceed a sum of 1.
 _LESS_COVERED = 2.0
 _NEAR = 1e-2  # mm: nearer, a splat is so large in pixels that float32 overflows
 
 
 class ShadowSettings(eqx.Module):
-    r"""How shadow maps are made and compared. All static.
+    r"""Settings of shadow maps and of the comparison with them. All static.
 
     **Attributes:**
 
     - `resolution`: pixels along a side of each map.
-    - `bias`: a surface less than this far behind the map's is still fully lit: keeps a surface from
-      shadowing itself. Its unit is the reach of the splat in the map, the root of the sum of the
-      squares of its radius and of a pixel's diagonal.
-    - `softness`: over this many more reaches the light fades; with it shadows have gradients in
-      depth. Across the shadow's edge, light fades over about two pixels of the map.
-    - `compared`: a splat is compared with a square of pixels, 2 or 3 along a side.
-    - `merged_spacing`: splats are merged into discs that are this many pixels of the map apart at
-      most; 0 to merge none. Eight to 32 splats make one disc, so that splats that are farther apart
-      than a third of it stay alone.
-    - `largest_slope`: the slope up to which the receiver's own plane is followed from pixel to
-      pixel of the map. Measured on heads: 4 leaves terraces where light grazes, beyond 8 nothing is
-      gained.
+    - `bias`: a surface less than this distance behind that of the map is fully lit, so that a
+      surface does not shadow itself. The unit is the reach of the splat in the map: the root of the
+      sum of the squares of its radius and of a pixel's diagonal.
+    - `softness`: the number of further reaches over which the light fades, so that shadows have
+      gradients in depth. Across the edge of a shadow, light fades over about two pixels of the map.
+    - `compared`: the side of the square of pixels with which a splat is compared, 2 or 3.
+    - `merged_spacing`: the largest spacing of merged discs, in pixels of the map; 0 to merge none.
+      A disc has eight to 32 splats, so splats of more than a third of this spacing are not merged.
+    - `largest_slope`: the slope up to which the receiver's plane is continued from pixel to pixel
+      of the map. On heads, 4 leaves steps at grazing light, and more than 8 has no effect.
     """
 
     resolution: int = eqx.field(static=True, default=1024)
@@ -60,7 +56,7 @@ class ShadowSettings(eqx.Module):
             raise ValueError(f"ShadowSettings.compared is {self.compared}; give 2 or 3 pixels")
 
     def splats_per_disc(self, parts: Sequence[Splats], bounds: "Bounds") -> int:
-        """Return how many splats of a body are merged into one disc; not for traced arrays."""
+        """Return the number of splats in each merged disc. Not for traced arrays."""
         areas = np.concatenate([np.asarray(part.areas) for part in parts])
         spacing = np.sqrt(np.median(areas[areas > 0])) if np.any(areas > 0) else np.inf
         largest = self.merged_spacing * 2 * float(bounds.radius) / self.resolution
@@ -68,9 +64,7 @@ class ShadowSettings(eqx.Module):
 
 
 class Bounds(eqx.Module):
-    """A sphere around all discs. Shadow maps are laid around it, so it is differentiated as they
-    are.
-    """
+    """A sphere around all discs. It determines the shadow maps, so it is differentiated with them."""
 
     center: Float[Array, "3"]
     radius: Float[Array, ""]
@@ -78,7 +72,7 @@ class Bounds(eqx.Module):
     @classmethod
     @jit_unless_traced
     def of(cls, splats: Splats, combination: AbstractCombination) -> "Bounds":
-        """Enclose the splats of all parts. Those without a radius fill a part and do not count."""
+        """Enclose the splats of all parts. Splats without a radius are padding and do not count."""
         exists = splats.radii > 0
         high, low = (
             sign * extreme(jnp.where(exists[:, None], sign * splats.centers, -jnp.inf), combination)
@@ -110,7 +104,7 @@ def _rotation_towards(forward: Float[Array, "3"]) -> Float[Array, "3 3"]:
 def distant_view(
     direction: Float[Array, "3"], bounds: Bounds, settings: ShadowSettings
 ) -> OrthographicView:
-    """Make the view of what a directional light sees: the bounding sphere, in parallel."""
+    """Make the view of a directional light: the bounding sphere in parallel projection."""
     size = settings.resolution
     scale = 0.5 * (size - 4) / bounds.radius
     rotation = _rotation_towards(direction / jnp.linalg.norm(direction))
@@ -122,9 +116,7 @@ def distant_view(
 def near_view(
     position: Float[Array, "3"], bounds: Bounds, settings: ShadowSettings
 ) -> PerspectiveView:
-    """Make the view of what a point light outside the bounding sphere sees: a frustum around the
-    sphere.
-    """
+    """Make the view of a point light outside the bounding sphere: a frustum around the sphere."""
     to_center = bounds.center - position
     distance = jnp.linalg.norm(to_center)
     closest = distance * distance - bounds.radius * bounds.radius
@@ -141,7 +133,7 @@ def near_view(
 
 
 def cube_views(position: Float[Array, "3"], settings: ShadowSettings) -> list[PerspectiveView]:
-    """Make the view of what a point light inside the bounding sphere sees: six faces of a cube."""
+    """Make the views of a point light inside the bounding sphere: six faces of a cube."""
     size, dtype = settings.resolution, position.dtype
     axes = jnp.concatenate([jnp.eye(3, dtype=dtype), -jnp.eye(3, dtype=dtype)])
     focal_length = jnp.asarray(
@@ -176,7 +168,7 @@ class ShadowMap(eqx.Module):
 
     **Attributes:**
 
-    - `splats_per_disc`: how many splats each disc in it stands for. Static.
+    - `splats_per_disc`: the number of splats of each disc. Static.
     """
 
     view: AbstractView
@@ -213,11 +205,12 @@ def make_shadow_map(
     combination: AbstractCombination,
     splats_per_disc: int = 1,
 ) -> ShadowMap:
-    """Make a shadow map (4.1): the surfaces that a light sees, by passes 2 and 3 of the camera.
+    """Render a shadow map (4.1): the surfaces visible from a light, by passes 2 and 3 of the
+    camera.
 
     **Arguments:**
 
-    - `splats`: or discs into which they were merged, so many into one (`merge_splats`).
+    - `splats`: splats, or discs of merged splats (`merge_splats`).
     """
     chosen, needed = plan.choose(splats, view)
     no_rows = jnp.zeros((0, len(chosen)), splats.centers.dtype)
@@ -230,7 +223,7 @@ def make_shadow_map(
 
 def _spline(away: Float[Array, "pixels ..."]) -> Float[Array, "pixels ..."]:
     """Compute the weights of two pixels by a linear B-spline or of three by a quadratic one; `away`
-    is their distance from the place in the middle, in pixels.
+    is their distance from the middle, in pixels.
     """
     if len(away) == 2:
         return 1 - jnp.abs(away)
@@ -245,8 +238,8 @@ def compute_visibility(
     map.
 
     Nine pixels, or four, are compared and averaged with a spline; at each, the splat's depth is
-    continued along its own plane. Light is blocked by the front surface with its coverage, and by
-    the one behind it with what is left.
+    continued along its own plane. The front surface blocks light with its coverage, and the one
+    behind it with the remaining coverage.
 
     **Returns:** in [0, 1]; 1 outside the map. Differentiable in the splats, the view and the map.
     """
@@ -260,9 +253,9 @@ def compute_visibility(
         reach = jnp.sqrt(shadow_map.splats_per_disc * radii**2 + 2 * view.pixel_size(depth) ** 2)
         return x, y, depth, across / facing, down / facing, reach
 
-    # Where splats land is kept: each comparison, and each of their derivatives, reads it.
+    # The projected positions are stored: each comparison, and each derivative, reads them.
     landed = map_chunks(land, splats.centers, splats.normals, splats.radii)
-    # Few large parts: backward, each adds into an array as large as the map.
+    # Few large parts, because each adds into an array as large as the map in the backward pass.
     return map_chunks(
         lambda *part: _compared(part, view, flat, settings), *landed, at_once=4 * AT_ONCE
     )

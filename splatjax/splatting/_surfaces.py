@@ -21,8 +21,8 @@ TILES_AT_ONCE = AT_ONCE // TILE_SIDE**2  # of a chunk, for what is computed chun
 def blend_fragments(
     sums: Float[Array, "tiles *rows pixels"], weights: Float[Array, "tiles *#rows pixels"]
 ) -> Float[Array, "..."]:
-    r"""Blend the fragments of each pixel, `c(f) = sum_i w_i c_i / sum_i w_i` (Eq. 1); 0 where there
-    is none.
+    r"""Blend the fragments of each pixel, `c(f) = sum_i w_i c_i / sum_i w_i` (Eq. 1); 0 without
+    fragments.
 
     **Arguments:** `sums`, `weights`: of `w_i c_i` and of `w_i`. Differentiable.
 
@@ -33,7 +33,7 @@ def blend_fragments(
 
 
 class Surface(eqx.Module):
-    """What the pixels of some tiles see: of each, the front surface or the one behind it.
+    """The visible surface in the pixels of some tiles: the front one or the one behind it.
 
     **Attributes:**
 
@@ -48,9 +48,7 @@ class Surface(eqx.Module):
 
     @classmethod
     def of(cls, sums: PixelSums, view: AbstractView, needed: Float[Array, ""]) -> "Surface":
-        """Blend sums. Where more capacity was needed than planned, all is NaN, and so are
-        derivatives.
-        """
+        """Blend sums. If more capacity was needed than planned, values and derivatives are NaN."""
         nearness, weights = sums.rows[:, -1], sums.weights * invalid_factor(needed)
         covered = stop_gradient(weights) > 0
         blended = jnp.where(weights != 0, blend_fragments(nearness, weights), 1.0)
@@ -59,14 +57,15 @@ class Surface(eqx.Module):
 
 
 class VisibleSurfaces(eqx.Module):
-    """What a view sees, in tiles: the surface in front, and what shows behind where it ends.
+    """The visible surfaces of a view, in tiles: the one in front, and the one behind it at
+    silhouettes.
 
     **Attributes:**
 
     - `tiles`: the tile of each place of this device; the number of tiles in an empty place.
-    - `in_front`: whether a place is of the surface in front, and not of the one behind.
+    - `in_front`: whether a place belongs to the surface in front, or to the one behind.
     - `sums`: of the fragments.
-    - `before`: the coverage of what lies in front of the surface behind; 0 for the front.
+    - `before`: the coverage in front of the surface behind; 0 for the front.
     - `needed`: capacity needed over planned. Above 1 every picture is NaN, and so are its
       derivatives.
     """
@@ -91,7 +90,7 @@ class VisibleSurfaces(eqx.Module):
         count = TileGrid(view.width, view.height).count
         in_front = jnp.arange(len(sums.tiles)) < sums.front
         share, tiles = combination.own_share(sums.sums), combination.own_rows(sums.tiles)
-        # What the front covers of the tiles, wherever it was shaded.
+        # The coverage of the front, gathered from all devices.
         covered = coverage(combination.gather(share.weights), settings.full_coverage)
         front = jnp.zeros((count, TILE_SIDE**2), covered.dtype)
         front = front.at[sums.tiles[: sums.front]].set(covered[: sums.front], mode="drop")
@@ -109,7 +108,7 @@ class VisibleSurfaces(eqx.Module):
 
     @property
     def overflow(self) -> Float[Array, ""]:
-        """The capacity needed over planned where that does not suffice, else 0."""
+        """The needed over the planned capacity if that does not suffice, else 0."""
         return jnp.where(self.needed <= 1, 0.0, self.needed)
 
     @property
@@ -118,7 +117,9 @@ class VisibleSurfaces(eqx.Module):
 
     @property
     def share(self) -> Float[Array, "places pixels"]:
-        """Compute how much of its pixel each surface covers: behind, of what the front leaves."""
+        """Compute the fraction of its pixel that each surface covers; behind, of the part that the
+        front leaves.
+        """
         return coverage(self.sums.weights, self.full_coverage) * (1 - self.before)
 
     def gathered(self, combination: AbstractCombination) -> "VisibleSurfaces":
@@ -149,7 +150,7 @@ class VisibleSurfaces(eqx.Module):
     def picture(
         self, values: Float[Array, "places *rows pixels"]
     ) -> Float[Array, "height width *rows"]:
-        """Lay the front over what shows behind it, premultiplied by coverage."""
+        """Composite the front over the surface behind it, premultiplied by coverage."""
         share = self.share.reshape(len(self.tiles), *[1] * (values.ndim - 2), -1)
         return self._joined(self._blank(values).at[self.tiles].add(share * values, mode="drop"))
 
@@ -182,12 +183,12 @@ def visible_surfaces(
 
     **Arguments:**
 
-    - `splats`: differentiable; which fragments count is not.
+    - `splats`: differentiable; the choice of fragments is not.
     - `attributes`: one row per attribute. Differentiable.
     - `view`: differentiable.
     - `plan`: from an `AbstractRasterizer`.
 
-    **Returns:** the surfaces; where the capacity of the plan is exceeded, `needed` is above 1 and
+    **Returns:** the surfaces; if the capacity of the plan is exceeded, `needed` is above 1 and
     every picture is NaN.
     """
     sums = plan.sum_fragments(splats, attributes, view, settings, combination)

@@ -2,8 +2,8 @@
 the weights.
 
 A tile is swept twice: for the depth at which the front ends, then for its sums. Tiles with a pixel
-that the front leaves open are swept twice more for the surface behind. Each of these stages must
-know what the one before found in all parts of the splats. The backward sweep needs only the depths
+that the front leaves open are swept twice more for the surface behind. Each of these stages needs
+the result of the one before over all parts of the splats. The backward sweep needs only the depths
 at which the surfaces end.
 """
 
@@ -25,13 +25,13 @@ from ._rasterizer import FragmentSums, PixelSums, SurfaceCapacity
 
 
 class Spans(eqx.Module):
-    """Which fragments are summed, in the pixels of some tiles: those between two depths, with
-    `far_limit < nearness <= near_limit`.
+    """The range of summed fragments in the pixels of some tiles: `far_limit < nearness <=
+    near_limit`.
 
     **Attributes:**
 
     - `tiles`: the tile at each place; the number of tiles in an empty place.
-    - `far_limit`, `near_limit`: nearness. `far_limit` is inf where there is no fragment.
+    - `far_limit`, `near_limit`: nearness. `far_limit` is inf without fragments.
     - `needed`: places needed over planned.
     """
 
@@ -44,8 +44,8 @@ class Spans(eqx.Module):
     def front(
         cls, limits: Float[Array, "tiles pixels"], lengths: Int[Array, " tiles"], size: int
     ) -> "Spans":
-        """Choose the places of the front. Longer lists come first: tiles that are swept together
-        have lists of about one length.
+        """Choose the places of the front. Longer lists come first, so that tiles that are swept
+        together have lists of similar length.
         """
         order = jnp.argsort(-lengths)
         shown = jnp.any(limits > -jnp.inf, axis=1)
@@ -58,8 +58,8 @@ class Spans(eqx.Module):
     def opened(self, is_open: Bool[Array, "places pixels"], size: int, none: int):
         """Choose the places with pixels that the front leaves open.
 
-        Returns their tiles, the near limit of the surface behind, the same in open pixels alone
-        and -inf in others, and the places needed over planned.
+        Returns their tiles, the near limit of the surface behind, the same in open pixels and -inf
+        in others, and the places needed over planned.
         """
         is_open &= self.far_limit < jnp.inf
         chosen = jnp.any(is_open, axis=1)
@@ -119,8 +119,8 @@ sum_tile_fragments.defvjp(_sum_fwd, _sum_bwd)
 
 
 class PartSweep(eqx.Module):
-    """The stages of the sweep one by one, for splats that may be one part of many: the splats of
-    another part may lie in front.
+    """The separate stages of the sweep, for splats that may be one of several parts: splats of
+    another part may be in front.
     """
 
     sweep: Sweep
@@ -129,7 +129,7 @@ class PartSweep(eqx.Module):
 
     @jit_unless_traced
     def limits(self) -> tuple[Float[Array, "tiles pixels"], Int[Array, " tiles"]]:
-        """Find where the front ends, -inf where there is none; and the length of each list."""
+        """Compute the end of the front, -inf without one; and the length of each list."""
         grid, order, dtype = self.sweep.grid, self.bins.order, self.slots.shift.dtype
 
         def chunk(i, limits):
@@ -167,8 +167,8 @@ class PartSweep(eqx.Module):
     def limits_behind(
         self, tiles: Int[Array, " places"], open_limit: Float[Array, "places pixels"]
     ) -> tuple[Float[Array, "places pixels"], Float[Array, "places pixels"]]:
-        """Find where the surface behind ends, of the fragments of some weight and of any;
-        `open_limit` is where the front ends in open pixels, -inf in others.
+        """Compute the end of the surface behind, for the fragments of sufficient weight and for
+        all; `open_limit` is the end of the front in open pixels, and -inf in others.
         """
 
         def look(i, lanes: Lanes, open_limit, limits):
@@ -178,8 +178,8 @@ class PartSweep(eqx.Module):
         return self.each_round(tiles, (open_limit,), look, (none, none))
 
     def each_round(self, tiles: Int[Array, " places"], given, function: Callable, out):
-        """Apply `function(first place, lanes, *given, out)` to as many places at a time as there
-        are lanes, up to the last tile.
+        """Apply `function(first place, lanes, *given, out)` to the places, as many at a time as
+        there are lanes, up to the last tile.
         """
         grid, bins, dtype = self.sweep.grid, self.bins, self.slots.shift.dtype
         planned = bins.planned_lanes
@@ -204,18 +204,17 @@ def sum_parts(
     capacities: Sequence[SurfaceCapacity],
     combination: AbstractCombination,
 ) -> list[tuple[FragmentSums, Spans]]:
-    """Sum the fragments of splats that are several parts, in several views at once.
+    """Sum the fragments of several parts of splats, in several views at once.
 
     **Arguments:**
 
-    - `parts`: iterates over the parts on this device whenever it is called; of each, the sweep of
-      every view.
+    - `parts`: each call iterates over the parts on this device, and gives the sweep of every view.
     - `capacities`: of each view.
 
-    **Returns:** for each view the sums on this device, and over what.
+    **Returns:** for each view the sums on this device, and their spans.
     """
     first, views = next(iter(parts())), range(len(capacities))  # by their numbers
-    # Stage 1: where the front ends in any part.
+    # Stage 1: the end of the front over all parts.
     limits = combination.largest([sweep.limits() for sweep in part] for part in parts())
     fronts = [Spans.front(*limits[k], capacities[k].front) for k in views]
 
@@ -225,7 +224,7 @@ def sum_parts(
 
     empty_sums = [first[k].empty_sums(fronts[k], capacities[k]) for k in views]
     sums = combination.fold(add_front, empty_sums, parts())
-    # Stage 3: where the surface behind ends, in pixels that the front leaves open.
+    # Stage 3: the end of the surface behind, in pixels that the front leaves open.
     weights = combination.total([[sums[k].weights[: capacities[k].front] for k in views]])
     opened = []
     for k, capacity in enumerate(capacities):
@@ -248,7 +247,7 @@ def sum_parts(
     results = []
     for k, capacity in enumerate(capacities):
         spans = fronts[k].followed_by(behind[k])
-        # Of the first part alone: a device has one, or it streams parts for which the capacity of
+        # Only of the first part: a device has one, or it streams parts for which the capacity of
         # the lists was planned.
         lists = first[k].bins.needed.astype(spans.needed.dtype)
         needed = combination.largest([jnp.maximum(spans.needed, lists)])

@@ -1,4 +1,4 @@
-"""The fast rasterizer: tile by tile, only the splats that touch the tile."""
+"""The fast rasterizer: each tile sweeps only the splats that touch it."""
 
 import dataclasses
 import math
@@ -32,7 +32,7 @@ class TileRasterizer(AbstractRasterizer):
     **Attributes:** (static)
 
     - `lanes`, `slots`: tiles swept together, and splats of each swept together.
-    - `spare`: times the capacity that planning found to be needed.
+    - `spare`: factor on the needed capacity.
     """
 
     lanes: int = eqx.field(static=True, default=64)
@@ -55,7 +55,7 @@ class TileRasterizer(AbstractRasterizer):
     def demand(
         self, splats: Splats, view: AbstractView, settings: SplattingSettings
     ) -> tuple[Array, Int[Array, " tiles"]]:
-        """Count the splats that may be seen, and the splats of every tile."""
+        """Count the splats that may be visible, and the splats of every tile."""
         ranges = view.footprints(splats, settings).ranges(self.grid(view))
         return jnp.sum(view.may_see(splats)), ranges.per_tile(self.grid(view))
 
@@ -90,12 +90,12 @@ class TileRasterizer(AbstractRasterizer):
 
 
 class TilePlan(AbstractRasterPlan):
-    """The capacity of a `TileRasterizer`: splats that may be seen, and their lists.
+    """The capacity of a `TileRasterizer`: splats that may be visible, and their lists.
 
     **Attributes:** (static)
 
     - `rasterizer`: its setting.
-    - `splats`: splats that may be seen.
+    - `splats`: number of splats that may be visible.
     - `bins`: capacity of the lists.
     - `places`: capacity for the tiles with a surface.
     """
@@ -112,7 +112,7 @@ class TilePlan(AbstractRasterPlan):
         if len(parts) > 1:
             whole = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
             plan = self.rasterizer.make_plan([whole], views, settings)
-        # Of coarse capacity, so that other bodies and pictures of the size need no other program.
+        # Coarse capacities, so that other bodies and pictures of the size share the program.
         grid = self.rasterizer.grid(views[0])
         bins = plan.bins.coarse(grid)
         front = bins.chunks * grid.lanes
@@ -164,8 +164,8 @@ class TilePlan(AbstractRasterPlan):
         return PartSweep(sweep, bins, Slots.gathered(*binned, bins))
 
     def _bin(self, splats: Splats, attributes, view: AbstractView, settings: SplattingSettings):
-        """Project the splats, and list them by tile. Returns what a sweep reads: its settings, the
-        lists, and the shifts, planes and attributes of the splats.
+        """Project the splats, and list them by tile. Returns the input of a sweep: its settings,
+        the lists, and the shifts, planes and attributes of the splats.
         """
         grid = self.rasterizer.grid(view)
         footprints = map_chunks(lambda part: view.footprints(part, settings), splats)
@@ -180,7 +180,7 @@ class TilePlan(AbstractRasterPlan):
 
 @eqx.filter_jit
 def _tiles_behind(splats: Splats, view: AbstractView, settings: SplattingSettings, plan: TilePlan):
-    """Count the tiles in which a surface shows behind the front."""
+    """Count the tiles in which a surface is visible behind the front."""
     chosen, _ = plan.choose(splats, view)
     no_rows = jnp.zeros((0, len(chosen)), splats.centers.dtype)
     sums = plan.sum_fragments(splats.take(chosen), no_rows, view, settings, OneDevice())

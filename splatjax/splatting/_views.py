@@ -18,19 +18,18 @@ from splatjax.scene import Splats
 
 from ._grid import TileGrid, TileRanges
 
-# Cosine to the line of sight, below which float32 does not know which side of a splat is seen.
+# Cosine to the line of sight, below which float32 cannot determine the visible side of a splat.
 EDGE_ON = 1e-5
 _SLOPE_FILTER = 0.25  # pixels; see `widen_ellipse`
 
 
 class SplattingSettings(eqx.Module):
-    r"""How splats become a surface. All static.
+    r"""Settings of the surface that splats form. All static.
 
     **Attributes:**
 
-    - `filter_radius`: of the screen filter, pixels, positive. At the root of 2 the weights of a
-      splat smaller than a pixel add up to the same over the pixels, wherever it lies between them,
-      to 4%.
+    - `filter_radius`: of the screen filter, pixels, positive. At the root of 2, the sum of a small
+      splat's weights over the pixels is independent of its position between them, to 4%.
     - `epsilon_z`: fragments within this many radii behind the front belong to it (3.1).
     - `largest_slope`: slanted splats have epsilon lengthened by `1 / cos`, up to this factor.
     - `full_coverage`: weight sum from which on a pixel is covered. Splats whose radius is 1.5 times
@@ -48,10 +47,10 @@ class Footprints(eqx.Module):
 
     **Attributes:**
 
-    - `shift`: how the surface is moved away by epsilon (3.1): a factor on nearness in perspective,
+    - `shift`: moves the surface away by epsilon (3.1): a factor on nearness in perspective,
       subtracted from it in an orthographic view. Not differentiated.
-    - `opacity`: what the screen filter leaves of the peak weight: 1 for large frontal splats, 0
-      edge on.
+    - `opacity`: the fraction of the peak weight after the screen filter: 1 for large frontal
+      splats, 0 edge on.
     - `box`: left, right, top and bottom of the rim. Not differentiated.
     """
 
@@ -88,7 +87,7 @@ def widen_ellipse(
     The slope of the splat's plane is given as `det_slope`, which is `det S` times the slope, and
     `s_slope`, which is `S` times the slope: the slope itself is infinite edge on, so a quarter of a
     pixel is added to `S` before it is divided by it. Hits stay on the plane of every splat that a
-    pixel can resolve. No term cancels another: float32 holds however slanted the splat.
+    pixel can resolve. No terms cancel, so float32 suffices for every slant.
 
     **Returns:** the numbers a, b, c of `a dx^2 + b dx dy + c dy^2`, which is 1 on the ellipse; the
     slope of the plane along x and y, in the unit of the slopes that were given; xx and yy, the
@@ -136,20 +135,20 @@ class AbstractView(eqx.Module):
 
     @abc.abstractmethod
     def footprints(self, splats: Splats, settings: SplattingSettings) -> Footprints:
-        """Project splats. Splats that face away or are seen edge on, or lie before the near plane,
-        are not visible.
+        """Project splats. Splats that face away, are edge on, or are before the near plane are not
+        visible.
         """
 
     @abc.abstractmethod
     def may_see(self, splats: Splats) -> Bool[Array, " splats"]:
-        """Mark the splats that face the eye and whose spheres touch the picture: cheap, and never
-        too few.
+        """Mark the splats that face the eye and whose spheres touch the picture: a cheap,
+        conservative test.
         """
 
     @staticmethod
     @abc.abstractmethod
     def inside(nearness: Float[Array, "..."], quadric: Float[Array, "..."]) -> Bool[Array, "..."]:
-        """Test whether a fragment lies within the rim."""
+        """Test whether a fragment is within the rim."""
 
     @staticmethod
     @abc.abstractmethod
@@ -196,7 +195,7 @@ class AbstractView(eqx.Module):
         numerators and denominator `(across, down, facing)`: `d depth / dx = across / facing`,
         `d depth / dy = down / facing`, mm per pixel.
 
-        `facing` vanishes where the plane is seen edge on, so the caller limits it before dividing.
+        `facing` vanishes for a plane seen edge on, so the caller limits it before dividing.
         """
 
     @abc.abstractmethod
