@@ -1,6 +1,4 @@
-"""From pictures back to optical coefficients, with error bars, and to albedo, lights, cameras and
-shape.
-"""
+"""Optical coefficients from pictures, with error bars; also albedo, lights, cameras and shape."""
 
 from ._candidates import (
     Candidate as Candidate,

@@ -1,4 +1,4 @@
-"""Which picture to take next, by what it would do to the error bars."""
+"""Pictures to take next, ranked by the error bars with them."""
 
 from collections.abc import Sequence
 
@@ -59,23 +59,23 @@ def next_pictures(
     *,
     settings: RenderSettings = RenderSettings(),
 ) -> list[Prediction]:
-    r"""Rank pictures that could be taken by the error bars of the coefficients with each of them.
+    r"""Rank pictures that could be taken, by the error bars of the coefficients with each of them.
 
-    Each is rendered once, of the recovered material, and differentiated; its noise is the same
-    fraction of its brightness as in the pictures before. Information adds up, and its inverse is
+    Each is rendered once with the recovered material, and differentiated. Its noise is the same
+    fraction of its brightness as in the earlier pictures. Information adds up, and its inverse is
     the covariance.
 
     **Arguments:**
 
-    - `recovery`: from the pictures before, with its model and weights.
+    - `recovery`: from the earlier pictures, with its model and weights.
     - `splats`: of the body.
-    - `candidates`: at least one; `default_candidates` gives some.
-    - `settings`: of the renderer. By default those of `render`: a prediction needs no layers as
-      fine as a search does.
+    - `candidates`: at least one; see `default_candidates`.
+    - `settings`: of the renderer. By default those of `render`: a prediction needs less fine layers
+      than a search.
 
     **Returns:** predictions; first the one with the least error of its worst combination.
 
-    **Raises:** `ValueError` for no candidate, and for one that shows nothing of the body.
+    **Raises:** `ValueError` for no candidate, and for one in which the body is not visible.
     """
     candidates = list(candidates)
     if not candidates:
@@ -109,7 +109,7 @@ def next_pictures(
 
 def _marginal(information: np.ndarray, channels: int, size: int) -> np.ndarray:
     """Eliminate the factors of a picture from its information about coefficients and the transition
-    to unresolved layers, and leave room for the factors of other pictures.
+    to unresolved layers, and add zeros for the factors of other pictures.
     """
     kept = np.r_[: 2 * channels, -channels:0]  # whatever the number of factors between them
     factors = np.arange(2 * channels, len(information) - channels)
@@ -127,7 +127,7 @@ def default_candidates(splats: Splats, camera: Camera, channels: int = 3) -> lis
     **Arguments:**
 
     - `splats`: of the body, mm.
-    - `camera`: where it stands.
+    - `camera`: of all pictures.
     - `channels`: of the pictures.
     """
     right, down, forward = np.asarray(camera.rotation, float)

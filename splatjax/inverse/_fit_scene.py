@@ -29,7 +29,7 @@ from ._observation import (
 from ._parts import AbstractPart, PicturedScene
 from ._problem import make_plans
 
-# Of each part; where pictures do not share it, a tuple with those of each picture.
+# Coordinates of each part; a tuple with those of each picture if pictures do not share the part.
 Coordinates = tuple[PyTree[Array], ...]
 
 
@@ -147,20 +147,20 @@ def advance(
 
 
 class FittedScene(eqx.Module):
-    r"""The best that a fit came by.
+    r"""The best scene of a fit.
 
     **Attributes:**
 
     - `splats`: the body.
     - `cameras`, `lights`: of each picture.
-    - `material`: as it was given.
-    - `losses`: at the start and after each step: sum of the losses of all pixels and of what the
-      priors add, over the number of values that count. About 1 where what is left is noise.
-    - `best`: the step with the least of them, which all else here is of. Static.
-    - `plans`: how many times was planned, once for the start. Static.
-    - `pictures`: what the renderer makes of it; NaN where a pixel does not count.
-    - `residuals`: pictures less what was observed.
-    - `result`: what became of it, as a message (`optimistix.RESULTS`).
+    - `material`: the given one.
+    - `losses`: at the start and after each step: the sum of the losses of all pixels and of the
+      priors, over the number of values that count. About 1 if the residual is noise.
+    - `best`: the step with the least loss, to which the other fields belong. Static.
+    - `plans`: number of plans, including that of the start. Static.
+    - `pictures`: rendered; NaN where a pixel does not count.
+    - `residuals`: rendered less observed pictures.
+    - `result`: the outcome, as a message (`optimistix.RESULTS`).
     """
 
     splats: Splats
@@ -189,33 +189,32 @@ def fit_scene(
     progress: Callable[[str, float], None] | None = None,
     throw: bool = True,
 ) -> FittedScene:
-    r"""Move parts of a scene along the gradient of its pictures until they match the observed
-    pictures.
+    r"""Fit parts of a scene to observed pictures, along the gradient of the rendered ones.
 
-    Each part has unbounded coordinates that count its steps; the optimizer sees nothing else, so
-    that one learning rate serves all. The fit minimizes
+    Each part has unbounded coordinates in units of its step. The optimizer works on these, so that
+    one learning rate serves all parts. The fit minimizes
 
         sum_pixels loss((rendered - observed) / deviation) + sum_coordinates (moved / expected)^2
 
     over the number of values of pixels, the second sum over parts with a prior. Nothing is compiled
-    between steps. Where the scene outgrows its plan, a new plan is made.
+    between steps. If the scene exceeds the capacity of its plan, a new plan is made.
 
     **Arguments:**
 
     - `observations`: one or more; `CameraPoses`, `LightStrengths` and `LightPlaces` start from
-      their cameras and lights, which are right if these do not move. A deviation of the noise that
-      is not given is 1% of the root mean square of the picture.
+      their cameras and lights, which are otherwise assumed right. Without a deviation, the noise is
+      1% of the root mean square of the picture.
     - `splats`: the body, mm; `AlbedoMap` and `NormalOffsets` start from it.
     - `material`: known. `recover` finds coefficients.
-    - `parts`: what may move, each kind once.
-    - `optimizer`: any of optax whose update needs gradients alone. Its rate is in steps:
-      `optax.adam(1.0)` first moves each coordinate by one step at a time. With a rate that falls to
-      zero, such as `optax.cosine_decay_schedule(1.0, steps)`, the fit comes to rest.
-    - `steps`: how many.
+    - `parts`: the parts that may change, each kind once.
+    - `optimizer`: any of optax whose update needs only gradients. Its rate is in steps:
+      `optax.adam(1.0)` first moves each coordinate by one step at a time. With a rate that decays
+      to zero, such as `optax.cosine_decay_schedule(1.0, steps)`, the fit converges.
+    - `steps`: their number.
     - `loss`: `SquaredLoss()`, or `HuberLoss()` where the model does not explain some pixels.
-    - `background`: `UnknownBackground()`: only pixels that the body fills count.
-      `BlackBackground()`: all pixels that masks leave count, which determines cameras and outlines
-      much better.
+    - `background`: with `UnknownBackground()` only pixels that the body fills count. With
+      `BlackBackground()` all unmasked pixels count, which determines cameras and outlines much
+      better.
     - `settings`: of the renderer.
     - `progress`: called with a description of each stage, and the loss.
     - `throw`: raise when a loss or gradient is not finite; otherwise `result` reports it, and the
@@ -223,10 +222,10 @@ def fit_scene(
 
     **Returns:** a `FittedScene`: the best of all steps, in the precision of the splats.
 
-    **Raises:** `ValueError` for no observation, part or step, for parts given twice or with nothing
-    to move, for channels that disagree, for lights of unknown intensity (say `LightStrengths`
-    instead), and for a picture none of whose pixels counts; an error with the message of `result`
-    if `throw`.
+    **Raises:** `ValueError` for no observation, part or step, for parts given twice or without
+    anything to change, for channels that disagree, for lights of unknown intensity (use
+    `LightStrengths`), and for a picture without a pixel that counts; an error with the message of
+    `result` if `throw`.
     """
     observations, parts = list(observations), list(parts)
     _check(observations, material, parts, steps)
@@ -254,7 +253,7 @@ def fit_scene(
 
     report("planning", np.nan)
     plans, times = make_plans(moved(x), material, settings), 1
-    # Optimizers are written for JAX's default rules, whatever the user has set.
+    # Optimizers need JAX's default rules of promotion.
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
         state = optimizer.init(x)
     best, at, losses, result = None, x, [], optx.RESULTS.successful

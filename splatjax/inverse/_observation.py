@@ -1,4 +1,4 @@
-"""A picture that was taken and how, which of its pixels count, and how much their residuals do."""
+"""Observed pictures, the pixels that count, and the loss of their residuals."""
 
 import abc
 from collections.abc import Sequence
@@ -11,25 +11,25 @@ from jaxtyping import Array, Bool, DTypeLike, Float
 from splatjax._records import numbers, record, several, valid
 from splatjax.scene import AbstractLight, Camera
 
-# Coverage of a pixel behind which nothing else is seen.
+# Coverage from which a pixel shows nothing behind the body.
 _FILLED = 0.999
-# Deviation of pictures that come without one, as a fraction of their brightness: error bars do not
+# Deviation of pictures without a given one, as a fraction of their brightness. Error bars do not
 # depend on it.
 _UNKNOWN_NOISE = 0.01
 
 
 class AbstractIntensity(eqx.Module):
-    """Factors on all light of a picture: which channels share one that is to be found."""
+    """Unknown factors on all light of a picture, and the channels that share them."""
 
     @abc.abstractmethod
     def groups(self, channels: int) -> np.ndarray:
-        """Return for each channel the number of its factor among those of the picture; -1 where it
-        is known to be 1.
+        """Return for each channel the index of its factor among those of the picture; -1 if it is
+        known to be 1.
         """
 
 
 class KnownIntensity(AbstractIntensity):
-    """The lights are as strong as they say."""
+    """The strengths of the lights are known."""
 
     def groups(self, channels: int) -> np.ndarray:
         return np.full(channels, -1)
@@ -45,8 +45,8 @@ class UnknownIntensity(AbstractIntensity):
 
 
 class UnknownColor(AbstractIntensity):
-    """A factor for each channel. The only evidence of the material is then how the light is spread
-    over the picture.
+    """A factor for each channel. Only the distribution of light over the picture then determines
+    the material.
     """
 
     def groups(self, channels: int) -> np.ndarray:
@@ -59,15 +59,15 @@ class Observation(eqx.Module):
 
     **Attributes:**
 
-    - `picture`: radiance, as `Frame.beauty`; NaN where a pixel is unknown.
+    - `picture`: radiance, like `Frame.beauty`; NaN where a pixel is unknown.
     - `camera`: with as many pixels.
     - `lights`: all of them.
-    - `mask`: which pixels count; `None` for all. Those that the body does not fill never do: the
-      background is unknown.
+    - `mask`: the pixels that count; `None` for all. Pixels that the body does not fill never count,
+      because the background is unknown.
     - `deviation`: standard deviation of the noise, for each pixel and channel or one number.
-      `None`: it is unknown and the same in the whole picture; error bars then come from the
-      residuals. Pictures without one count alike, each by its own brightness.
-    - `intensity`: `KnownIntensity()`, or what is unknown of the strength of the lights.
+      `None`: it is unknown and uniform; error bars then follow from the residuals. Pictures without
+      a deviation have equal weight, each relative to its brightness.
+    - `intensity`: `KnownIntensity()`, or the unknown factors on the strength of the lights.
 
     **Raises:** `ValueError` for pictures, masks and deviations of other sizes than the camera's,
     and for deviations that are not positive.
@@ -106,9 +106,7 @@ class AbstractLoss(eqx.Module):
 
 
 class SquaredLoss(AbstractLoss):
-    """The square: right for noise that is normal, misled by every highlight that the model does not
-    know.
-    """
+    """The square: right for normal noise, sensitive to highlights outside of the model."""
 
     def root(self, residuals: Float[Array, "..."]) -> Float[Array, "..."]:
         return residuals
@@ -140,7 +138,7 @@ class HuberLoss(AbstractLoss):
 
 
 class AbstractBackground(eqx.Module):
-    """Which pixels count, by how much of them the body covers."""
+    """The pixels that count, by their coverage."""
 
     @abc.abstractmethod
     def counts(self, coverage: Float[Array, "height width"]) -> Float[Array, "height width"]:
@@ -148,8 +146,8 @@ class AbstractBackground(eqx.Module):
 
 
 class UnknownBackground(AbstractBackground):
-    """Anything: pixels that the body does not fill do not count. A silhouette then shows
-    nothing.
+    """An unknown background: pixels that the body does not fill do not count, so silhouettes give
+    no information.
     """
 
     def counts(self, coverage: Float[Array, "height width"]) -> Float[Array, "height width"]:
@@ -157,8 +155,8 @@ class UnknownBackground(AbstractBackground):
 
 
 class BlackBackground(AbstractBackground):
-    """Nothing that sends light: all pixels count, and where the body ends is what shows most of a
-    camera's pose.
+    """A black background: all pixels count, and the outline of the body gives most of the
+    information about a camera's pose.
     """
 
     def counts(self, coverage: Float[Array, "height width"]) -> Float[Array, "height width"]:
@@ -172,7 +170,7 @@ class Evidence(eqx.Module):
 
     - `picture`: 0 where it is unknown.
     - `deviation`: of its noise.
-    - `known`: which pixels may count.
+    - `known`: pixels that may count.
     - `relative_noise`: the deviation of a typical pixel over the brightness of the picture.
     """
 
@@ -243,9 +241,7 @@ def compared(
     counted: Sequence[Float[Array, "_ _"]],
     evidence: Sequence[Evidence],
 ) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
-    """Return the pictures, NaN where pixels do not count, and what is left of them without the
-    observed ones.
-    """
+    """Return the pictures, NaN where pixels do not count, and their residuals."""
     made = tuple(
         np.where(np.asarray(pixels)[..., None] > 0, picture, np.nan)
         for picture, pixels in zip(pictures, counted, strict=True)

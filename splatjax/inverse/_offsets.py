@@ -1,4 +1,4 @@
-"""Splats that move along their normals, smoothly: a displacement map as a part of a scene."""
+"""Smooth offsets of splats along their normals: a displacement map as a part of a scene."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ from ._parts import AbstractPart, PicturedScene
 
 _REACH = 2.5  # of the blur, standard deviations
 _SLOPES = 17  # splats among which slopes are measured, itself included
-# Tables hold a multiple of so many neighbors: one program serves bodies that are nearly alike.
+# Tables have a multiple of this number of neighbors, so that similar bodies share a program.
 _ROUNDED = 16
 _SAME_SIDE = 0.3  # least cosine between normals of splats that belong together
 
@@ -25,8 +25,8 @@ class OffsetTables(eqx.Module):
 
     **Attributes:**
 
-    - `blurred`, `weights`: those that its offset is blurred over, and the weights of their mean.
-    - `around`: those among which its slope is measured.
+    - `blurred`, `weights`: the neighbors over which its offset is averaged, and their weights.
+    - `around`: the neighbors from which its slope is computed.
     - `slopes`: sums of values times these are derivatives along the `tangents`, exact for quadratic
       functions of them.
     - `gain`: root mean square of blurred noise of root mean square 1.
@@ -41,23 +41,22 @@ class OffsetTables(eqx.Module):
 
 
 class NormalOffsets(AbstractPart):
-    r"""The distance that each splat has moved along its normal at the start: a displacement map, no
-    finer than `smoothness`.
+    r"""The offset of each splat along its initial normal: a displacement map, no finer than
+    `smoothness`.
 
         offset = step blur(x),   center = start + offset normal
 
-    The blur is a Gaussian over the surface that takes means, so that an offset moves by no more
-    than its coordinates do. Normals, areas and radii follow from the slopes of the offsets among
-    the neighbors of each splat: a bump is lit by its normals. A splat farther than 2.5 `smoothness`
-    from all that the pictures show stays exactly where it is.
+    The blur is a Gaussian mean over the surface, so an offset changes by no more than its
+    coordinates do. Normals, areas and radii follow from the slopes of the offsets among the
+    neighbors of each splat. A splat farther than 2.5 `smoothness` from all visible ones does not
+    move.
 
     **Attributes:** (static)
 
     - `step`: mm.
     - `smoothness`: standard deviation of the blur, mm; some spacings of the splats. Finer bumps
       are not searched.
-    - `deviation`: how large an offset is expected to be, one standard deviation of a normal prior,
-      mm.
+    - `deviation`: expected size of an offset, one standard deviation of a normal prior, mm.
     """
 
     shared = True
@@ -104,7 +103,7 @@ class NormalOffsets(AbstractPart):
         offsets = self.step * jnp.sum(prepared.weights * x[prepared.blurred], axis=1)
         shifts = offsets[:, None] * splats.normals
         apart = shifts[prepared.around] - shifts[:, None]
-        # The tangents of the start, and how the offsets of the splats change along them.
+        # The tangents of the start, and the slopes of the offsets along them.
         along = prepared.tangents + jnp.sum(prepared.slopes[..., None] * apart[:, :, None], axis=1)
         across = jnp.cross(along[:, 0], along[:, 1])
         stretch = jnp.sqrt(jnp.sum(across * across, axis=1))

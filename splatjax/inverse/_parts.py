@@ -50,7 +50,7 @@ class AbstractPart(eqx.Module):
             )
 
     def prepared(self, splats: Splats) -> PyTree[Array]:
-        """Compute what depends on the splats at the start alone."""
+        """Compute data that depend only on the initial splats."""
         return None
 
     @abc.abstractmethod
@@ -61,12 +61,10 @@ class AbstractPart(eqx.Module):
     def moved(
         self, pictured: PicturedScene, x: PyTree[Array], prepared: PyTree[Array]
     ) -> PicturedScene:
-        """Move the part to coordinates. Differentiable."""
+        """Apply coordinates to the part. Differentiable."""
 
     def prior(self, x: PyTree[Array], prepared: PyTree[Array]) -> Float[Array, ""] | float:
-        """Compute what the prior adds to the loss: squares of the coordinates over their expected
-        deviations.
-        """
+        """Compute the loss of the prior: squares of coordinates over their expected deviations."""
         return 0.0
 
 
@@ -78,11 +76,10 @@ class AlbedoMap(AbstractPart):
     **Attributes:** (static)
 
     - `step`: of the logit: 0.1 moves an albedo of 0.5 by 0.025.
-    - `deviation`: how far from the start a logit is expected, one standard deviation of a normal
-      prior. A splat that no picture shows keeps its albedo; one that they hardly show keeps nearly
-      its albedo.
+    - `deviation`: expected distance of a logit from its start, one standard deviation of a normal
+      prior. An invisible splat keeps its albedo; a hardly visible one nearly keeps it.
 
-    Albedos that start below 0.001 or above 0.999 start there.
+    Initial albedos are clamped to [0.001, 0.999].
     """
 
     shared = True
@@ -139,8 +136,8 @@ class LightStrengths(AbstractPart):
 
 
 class LightPlaces(AbstractPart):
-    """The place of each light of each picture: directions turn, and point lights and the origins of
-    beams shift.
+    """The position of each light of each picture: directions rotate, and point lights and the
+    origins of beams shift.
 
     **Attributes:** (static)
 
@@ -175,10 +172,11 @@ class LightPlaces(AbstractPart):
 
 
 class CameraPoses(AbstractPart):
-    r"""Position and rotation of each camera: it turns around the middle of the splats, and shifts.
+    r"""Position and rotation of each camera, which rotates around the middle of the splats, and
+    shifts.
 
-    A turn around the body changes which side is seen, a shift where the body is in the picture: the
-    two are not mistaken for each other, as they would be in turns around the pinhole.
+    A rotation around the body changes the visible side, and a shift the position of the body in the
+    picture. Rotations around the pinhole would be nearly equivalent to shifts.
 
     **Attributes:** (static)
 

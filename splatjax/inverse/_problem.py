@@ -1,4 +1,6 @@
-"""From coefficients to residuals, by pictures with all their layers, which serve many materials."""
+"""Residuals as a function of coefficients, by pictures with all their layers, which serve many
+materials.
+"""
 
 import math
 from collections.abc import Callable, Sequence
@@ -36,9 +38,9 @@ from ._parts import PicturedScene
 _STEPS = 64
 # Of a wide range: the ratio of neighboring variances. It leaves dipoles an error of 0.2%.
 _LARGER = 3.0
-# Squared mean free paths: where the Gaussians of a dipole's fit lie, and beyond.
+# Squared mean free paths: the range of the Gaussians of a dipole's fit, and beyond.
 _NARROWEST, _WIDEST = 0.05, 200.0
-# Between the log variances that plans are made for; a plan holds for more than that.
+# Spacing of the log variances for which plans are made; a plan is valid over a wider range.
 _GRID = math.log(1.15)
 # In variance: of coefficients that are off by a factor of three at the start.
 _REACH = 10.0
@@ -47,8 +49,8 @@ _REACH = 10.0
 def make_plans(
     pictured_scenes: Sequence[PicturedScene], material: Material, settings: RenderSettings
 ) -> list[Plan]:
-    """Make a plan for each picture. Pictures that may share one do, so that nothing is compiled
-    twice.
+    """Make a plan for each picture. Pictures share plans where possible, so that nothing is
+    compiled twice.
     """
     keys = [
         (one.camera.width, one.camera.height, jax.tree.structure(one.lights))
@@ -69,19 +71,19 @@ def render_layers(
     plans: list[Plan] | None = None,
     derivative: bool = True,
 ) -> tuple[list[DiffusionBasis], list[Plan]]:
-    """Render all that weights do not change, one picture after the other.
+    """Render the part that does not depend on weights, one picture after the other.
 
     **Arguments:**
 
     - `plans`: used if they suffice.
-    - `derivative`: whether variances may be a little off those of the material.
+    - `derivative`: whether variances may differ slightly from those of the material.
 
-    **Returns:** the pictures, and the plans that they were rendered with.
+    **Returns:** the pictures, and their plans.
     """
 
     def render(plans):
-        # By plan and lights of the pictures: three and more under the same lights are lit once. For
-        # two the compiler takes what it saves.
+        # By plan and lights of the pictures: for three or more under the same lights, the light is
+        # computed once. For two, compilation costs more than this saves.
         keys = [
             (id(plan), *(leaf.tobytes() for leaf in jax.tree.leaves(jax.device_get(one.lights))))
             for one, plan in zip(pictured_scenes, plans, strict=True)
@@ -104,7 +106,7 @@ def render_layers(
 
     pictures = render(plans) if plans else []
     if not pictures or any(float(picture.overflow) > 0 for picture in pictures):
-        # On a coarse grid, so that nearly equal materials have plans of the same shapes, and one
+        # On a coarse grid, so that similar materials have plans of the same shapes, and one
         # program.
         variances = jnp.round(jnp.log(material.gaussians.variances) / _GRID) * _GRID
         rounded = SumOfGaussians(jnp.exp(variances), material.gaussians.weights)
@@ -116,8 +118,8 @@ def render_layers(
 def wide_variances(media: Sequence[Medium], splats: Splats) -> Float[Array, " gaussians"]:
     r"""Choose variances (mm^2) that serve all media near some: each three times the one before.
 
-    They hold what coefficients up to three times as large, or as small, make of a dipole. None is
-    much wider than the body.
+    They cover the dipoles of coefficients up to three times as large or as small. None is much
+    wider than the body.
     """
     paths = np.concatenate([1 / np.asarray(medium.sigma_t_prime, np.float64) for medium in media])
     root = np.concatenate([np.asarray(medium.squared_sigma_tr, np.float64) for medium in media])
@@ -175,18 +177,18 @@ def fit_near(
     weights: AbstractWeights,
     rule: AbstractRadialRule,
 ) -> SumOfGaussians:
-    """Fit Gaussians whose variances lie near given ones, and move as the profile does."""
+    """Fit Gaussians whose variances are near given ones, and follow the profile."""
     return fit_gaussians(
         profile, len(near), weights=weights, start=GivenVariances(near), rule=rule, throw=False
     ).gaussians
 
 
 class RecoveryProblem(eqx.Module):
-    """Observed pictures, and how pictures are made from coefficients.
+    """Observed pictures, and the model of pictures as a function of coefficients.
 
     **Attributes:**
 
-    - `pictures`: of all materials, with the points alone that light pixels that count.
+    - `pictures`: of all materials, restricted to the points of pixels that count.
     - `counted`: 1 for pixels that count, else 0.
     - `fit`: the Gaussians of a profile. Differentiable.
     """
@@ -243,7 +245,7 @@ class RecoveryProblem(eqx.Module):
 
 
 def _with_points(picture: DiffusionBasis, kept: np.ndarray, dtype: DTypeLike) -> DiffusionBasis:
-    """Keep some points of a picture, in the precision of a search."""
+    """Select some points of a picture, in the precision of a search."""
     picture = eqx.tree_at(
         lambda p: (
             *jax.tree.leaves([getattr(p.light, name) for name in p.light.ALONG_POINTS]),
@@ -261,9 +263,9 @@ def _with_points(picture: DiffusionBasis, kept: np.ndarray, dtype: DTypeLike) ->
 def search(
     problem: RecoveryProblem, start: Float[Array, " unknowns"]
 ) -> tuple[Float[Array, " unknowns"], Float[Array, ""], Int[Array, ""], Bool[Array, ""]]:
-    """Minimize the loss from a start by the Levenberg-Marquardt method: where it ends, the loss
-    there, the number of steps, and whether it has converged. It never ends where the loss is larger
-    or unknown.
+    """Minimize the loss from a start by the Levenberg-Marquardt method. Return the end, its loss,
+    the number of steps, and whether it has converged. The loss at the end is finite and not larger
+    than at the start.
     """
     tolerance = 1e-4 if start.dtype == jnp.float32 else 1e-7
     # In units of the start's own residual, so that damping and tolerances mean the same for any
@@ -283,7 +285,7 @@ def search(
 
 
 class Solution(eqx.Module):
-    """The solution at a point, and how well it is known.
+    """The solution at a point, and its information.
 
     **Attributes:**
 

@@ -1,4 +1,4 @@
-"""From pictures of a known shape to the coefficients of its material."""
+"""Coefficients of a material from pictures of a known shape."""
 
 import warnings
 from collections.abc import Callable, Sequence
@@ -47,13 +47,13 @@ from ._problem import (
 )
 from ._recovery import Recovery, inverse
 
-# Layers eight times finer than a picture needs: where much light comes back, 0.1% of it is 2% of
-# the absorption.
+# Layers eight times finer than a picture needs: for bright materials, 0.1% of the light corresponds
+# to 2% of the absorption.
 _FINE = RenderSettings(diffuser=ClusterDiffuser(error=2.5e-4))
 
 _ROUNDS = 8
 _SAME_INDEX = 1e-4
-# Rounds end when no coefficient moves by more than this, or by a tenth of its error bar.
+# Rounds end when no coefficient changes by more than this, or by a tenth of its error bar.
 _SETTLED = 1e-3
 
 
@@ -70,46 +70,46 @@ def recover(
     settings: RenderSettings = _FINE,
     progress: Callable[[str, Medium], None] | None = None,
 ) -> Recovery:
-    r"""Find the absorption and scattering that explain pictures of a known shape: weighted least
-    squares on all pixels at once.
+    r"""Fit absorption and scattering to pictures of a known shape: weighted least squares on all
+    pixels at once.
 
     The search differentiates the whole graph: coefficients, profile, Gaussians, layers, picture.
-    The layers, which are expensive, depend on the variances of the Gaussians alone: rendered once,
-    they serve many steps of the Levenberg-Marquardt method, which reads no splat; nothing is
-    compiled between steps, nor between starts. At first the variances are fixed: those of
-    `wide_variances` serve all coefficients within a factor of three of the starts. Then, in rounds,
-    they are those of the fit to the coefficients, and layers move along their slopes as the fit
-    does, until a round changes nothing; the angles of the light are those of the coefficients with
-    which the round begins. The final picture is the one that `render` makes of
-    `Recovery.material`, with the derivatives of `picture_jacobian`.
+    The layers, which are expensive, depend only on the variances of the Gaussians. They are
+    rendered once for many steps of the Levenberg-Marquardt method; nothing is compiled between
+    steps or starts. At first the variances are fixed: those of `wide_variances` serve all
+    coefficients within a factor of three of the starts. In each following round they are those of
+    the fit to the coefficients, and layers change along their slopes with the fit, until a round
+    changes nothing. The angles of the light are those of the coefficients at the start of the
+    round. The final picture is the one that `render` makes of `Recovery.material`, with the
+    derivatives of `picture_jacobian`.
 
     **Arguments:**
 
     - `observations`: one or more.
-    - `splats`: of the body, mm. Its albedo is taken as known; without one the coefficients alone
-      carry color.
-    - `starts`: where to search from; their `eta` is taken as known and must be the same. Of
-      several, the best end is kept.
+    - `splats`: of the body, mm. Its albedo is assumed known; without one the coefficients alone
+      give the color.
+    - `starts`: starts of the search; their `eta` is assumed known and must be the same. Of several,
+      the best end is kept.
     - `surface`: its specular strength and roughness are known, and its index, which is that of the
-      starts; its Gaussians do not matter. By default there is no specular lobe.
+      starts; its Gaussians are not used. By default there is no specular lobe.
     - `model`: `TransportModel()`, by default, or `DiffusionModel()`, the classical dipole.
     - `count`: number of Gaussians.
-    - `weights`: how they are fitted; by default not negative and with a fixed sum, as in the
-      materials that come with the package.
+    - `weights`: the constraint of the weights; by default non-negative and with a fixed sum, as in
+      the materials of the library.
     - `loss`: `SquaredLoss()`, or `HuberLoss()` where the model does not explain some pixels.
     - `settings`: of the renderer. By default its layers are eight times finer than those of
-      `render`: where much light comes back, a picture that is off by 0.1% means an absorption that
-      is off by 2%.
+      `render`: for bright materials, an error of 0.1% of a picture is an error of 2% of the
+      absorption.
     - `progress`: called with a description of each stage, and the best medium so far.
 
-    **Returns:** a `Recovery` in JAX's default precision: under `jax.enable_x64` small errors show,
-    the pictures stay as they are. If the rounds have not settled it is that of the round with the
-    least loss, with its error bars: `result` reports it, and a `RuntimeWarning`. To go on, start
-    from its `medium`.
+    **Returns:** a `Recovery` in JAX's default precision: `jax.enable_x64` resolves small errors,
+    and does not change the pictures. If the rounds have not converged it is that of the round with
+    the least loss, with its error bars, and `result` and a `RuntimeWarning` report it. To continue,
+    start from its `medium`.
 
     **Raises:** `ValueError` for no observation or start, for channels that disagree, for starts
-    without absorption, for different indices of surface and starts, and for a picture none of whose
-    pixels counts.
+    without absorption, for different indices of surface and starts, and for a picture without a
+    pixel that counts.
     """
     dtype, observations = jnp.result_type(float), list(observations)
     starts = [

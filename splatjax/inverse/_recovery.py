@@ -1,5 +1,5 @@
-"""Coefficients with error bars, and which of their combinations are unknown: the result of a
-recovery, and of several.
+"""Results of one or several recoveries: coefficients with error bars, and their undetermined
+combinations.
 """
 
 import abc
@@ -114,7 +114,7 @@ def best_and_worst(covariance: Float[np.ndarray, "2 2"]) -> tuple[Combination, C
     values, axes = np.linalg.eigh(covariance)
     largest = np.take_along_axis(axes, np.argmax(np.abs(axes), axis=0)[None], axis=0)
     axes = axes / largest
-    # The larger power is 1, and that of sigma_a is positive unless it is next to nothing.
+    # The larger power is 1, and that of sigma_a is positive unless it is tiny.
     axes = np.where((axes[0] > 0.05) | (axes[1] > 0.95), axes, -axes)
     deviations = np.sqrt(np.maximum(values, 0.0))
     best, worst = (
@@ -132,7 +132,7 @@ def inverse(
     if not np.all(np.isfinite(information)) or np.any(lengths == 0):
         return np.full_like(information, np.inf)
     values, axes = np.linalg.eigh(information / np.outer(lengths, lengths))
-    # Rounding leaves a little information along directions in which nothing changes.
+    # Rounding gives small spurious information along directions of no change.
     values = np.maximum(values, np.finfo(np.float64).eps * len(values))
     return (axes / values) @ axes.T / np.outer(lengths, lengths)
 
@@ -142,13 +142,13 @@ def _power(name: str, power: float) -> str:
 
 
 # Standard deviation of the logarithm of the width below which a layer is unresolved: twice as many
-# splats move it by as much, and that of regular ones lies a factor of 2.5 below that of scattered
+# splats change it by as much, and for regular splats it is a factor of 2.5 below that for scattered
 # ones.
 _RESOLUTION = 0.5 * np.log(2.0)
-# Chi-squared per degree of freedom of a model that lacks something.
+# Chi-squared per degree of freedom above which the model is incomplete.
 _TOO_LARGE = 1.5
-# Of the light: marble on a head of 100,000 splats has 0.6 and comes back within 1.4%, the blue of
-# skin 1.0 and does not.
+# Fraction of the light: marble on a head of 100,000 splats has 0.6 and is recovered within 1.4%,
+# the blue of skin has 1.0 and is not.
 _MOST = 0.8
 
 
@@ -158,31 +158,30 @@ class Recovery(AbstractEstimate):
     **Attributes:**
 
     - `medium`: its coefficients, 1/mm.
-    - `material`: its Gaussians, with the surface that was taken as known.
+    - `material`: its Gaussians, with the known surface.
     - `intensities`: factors on the light of each picture; 1 where the light was known.
     - `information`: inverse of the covariance that the given noise leaves: of the logarithms of
       `sigma_a`, channel by channel, of those of `sigma_s_prime`, of the unknown factors, and,
-      channel by channel, of the width below which a layer is unresolved because the splats are too
-      far apart to carry it.
-    - `unresolved`: the fraction of the light of each channel that spreads less than the splats are
-      apart. A picture shows how much of it there is, not how far it goes.
-    - `chi_squared`: squared residuals over the noise, per degree of freedom. About 1 where model
-      and noise are right; far above, the model lacks something, and error bars are too small.
-    - `noise_is_known`: whether all pictures came with deviations; where not, error bars are those
-      of the residuals. Static.
+      channel by channel, of the width below which the splats do not resolve a layer.
+    - `unresolved`: the fraction of the light of each channel that spreads less than the spacing of
+      the splats. A picture determines its amount, not its distance.
+    - `chi_squared`: squared residuals over the noise, per degree of freedom. About 1 if model and
+      noise are right; far above, the model is incomplete, and error bars are too small.
+    - `noise_is_known`: whether all pictures have deviations; if not, error bars follow from the
+      residuals. Static.
     - `relative_noise`: deviation of a typical pixel over the brightness of its picture. Static.
     - `pictures`: rendered with the coefficients; NaN where a pixel does not count.
-    - `residuals`: pictures less the observed ones.
-    - `ends`, `costs`: where the search from each start ended in the first round, and the sum of its
+    - `residuals`: rendered less observed pictures.
+    - `ends`, `costs`: the end of the search from each start in the first round, and the sum of its
       losses.
     - `steps`, `rounds`: of all searches. Static.
     - `model`, `weights`: with which the pictures were explained.
     - `result`: the outcome of the search, as a message (`optimistix.RESULTS`).
 
     Error bars assume that model and shape are right and that the noise of pixels is independent:
-    they are of precision, not of accuracy. They do not assume that an unresolved layer looks as the
-    renderer makes it look: the width of the transition counts as known to a factor of 1.4, and the
-    error that this leaves in the search is part of the bars.
+    they describe precision, not accuracy. They include the error of unresolved layers: the width of
+    the transition is assumed known to a factor of 1.4, and the resulting error of the search is
+    part of the bars.
     """
 
     material: Material
@@ -211,16 +210,16 @@ class Recovery(AbstractEstimate):
         self, more: Float[np.ndarray, "all all"] | float = 0.0, resolution: float = _RESOLUTION
     ) -> Float[np.ndarray, "channels 2 2"]:
         """Compute the covariance of the logarithms of `sigma_a` and `sigma_s_prime` of each
-        channel, whatever the other unknowns are.
+        channel, marginalized over the other unknowns.
 
-        It is that of the noise, and the square of the error of the search if the transition to
-        unresolved layers is off by its deviation.
+        It is the sum of that of the noise, and of the squared error of the search for an error of
+        the transition to unresolved layers by its deviation.
 
         **Arguments:**
 
         - `more`: information that another picture would add.
         - `resolution`: the deviation of the logarithm of the width below which a layer is
-          unresolved; 0 for a renderer that is right about it.
+          unresolved; 0 for an exact one.
         """
         channels, scale = self.medium.channels, max(self.scale, np.finfo(np.float64).tiny)
         information = np.asarray(self.information, np.float64) / scale + more
@@ -234,8 +233,8 @@ class Recovery(AbstractEstimate):
         return covariance[pairs[:, :, None], pairs[:, None]]
 
     def noise_errors(self) -> tuple[Float[np.ndarray, " channels"], Float[np.ndarray, " channels"]]:
-        """Compute the errors that noise alone leaves: how far searches of pictures that are taken
-        again would scatter.
+        """Compute the errors due to noise alone: the scatter of searches if the pictures were taken
+        again.
         """
         return Estimate(self.medium, self.covariance(resolution=0.0)).relative_errors()
 
@@ -269,16 +268,16 @@ def combined(recoveries: Sequence[Recovery]) -> Estimate:
     r"""Combine recoveries from separate pictures: the mean of the logarithms, weighted by their
     information.
 
-    A search of all pictures at once weights their pixels by noise alone. Many pixels that do not
-    show how far light goes, because its layers are unresolved, then outvote a few that do. Apart,
-    the error bars of each picture tell which combination of the coefficients it determines, and
-    only that is used: a coarse picture of a body for the reflectance, a close one under a laser dot
-    for how far light goes.
+    A search of all pictures at once weights their pixels by noise alone. Many pixels with
+    unresolved layers, which do not determine the distance of light, then outweigh a few that do. In
+    separate searches, the error bars of each picture give the combination of coefficients that it
+    determines, and only that is used: a coarse picture of a body for the reflectance, a close one
+    under a laser dot for the distance.
 
     **Arguments:**
 
-    - `recoveries`: of one material, with independent errors. Where residuals exceed the noise, the
-      error bars of a recovery are stretched by the root of its `chi_squared`.
+    - `recoveries`: of one material, with independent errors. If residuals exceed the noise, the
+      error bars of a recovery are scaled by the root of its `chi_squared`.
 
     **Returns:** an `Estimate`.
 

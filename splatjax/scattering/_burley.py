@@ -21,8 +21,8 @@ class AbstractBurleyScaling(eqx.Module):
 
 
 class Searchlight(AbstractBurleyScaling):
-    """For light that enters as a beam; lengths are counted in mean free paths. **Source:**
-    Christensen and Burley 2015.
+    """For light that enters as a beam; lengths are in mean free paths. **Source:** Christensen and
+    Burley 2015.
     """
 
     def __call__(self, albedo):
@@ -30,8 +30,8 @@ class Searchlight(AbstractBurleyScaling):
 
 
 class DiffuseTransmission(AbstractBurleyScaling):
-    """For light that enters diffusely; lengths are counted in mean free paths. **Source:**
-    Christensen and Burley 2015, Eq. 6.
+    """For light that enters diffusely; lengths are in mean free paths. **Source:** Christensen and
+    Burley 2015, Eq. 6.
     """
 
     def __call__(self, albedo):
@@ -49,17 +49,17 @@ class DiffuseMeanFreePath(AbstractBurleyScaling):
 
 @record
 class Burley(AbstractProfile):
-    r"""Two exponentials that follow Monte Carlo profiles, single scattering included.
+    r"""Two exponentials that approximate Monte Carlo profiles, single scattering included.
 
         R(r) = A (exp(-r / d) + exp(-r / 3d)) / (8 pi d r),  d = free_path / s(A)
 
-    Infinite at the origin like 1/r: Eq. 3 is taken beyond a cut. Differentiable for `r > 0`.
+    It diverges like 1/r at the origin: Eq. 3 is computed beyond a cut. Differentiable for `r > 0`.
 
     **Attributes:**
 
     - `albedo`: surface albedo A, the total reflectance, in [0, 1].
     - `free_path`: mm, positive.
-    - `scaling`: the kind of free path, and how light enters: `Searchlight()` by default.
+    - `scaling`: the kind of free path, and the entry of light: `Searchlight()` by default.
 
     **Source:** Christensen and Burley 2015, "Approximate reflectance profiles for efficient
     subsurface scattering".

@@ -1,4 +1,4 @@
-"""The classical dipole, and one that counts fluence and flux."""
+"""The classical dipole, and the better dipole, with fluence and flux."""
 
 import abc
 
@@ -41,14 +41,16 @@ class AbstractDipole(AbstractHalfSpace):
 
     with `s = sigma_tr` and `d^2 = r^2 + z^2`.
 
-    Fresnel transmission at entry and exit is not part of it. Differentiable in every coefficient
-    and in `r`; the derivatives at `r = 0` and, for the profile, at `sigma_a = 0` equal the
-    one-sided limits.
+    Fresnel transmission at entry and exit is not included. Differentiable in every coefficient and
+    in `r`; the derivatives at `r = 0` and, for the profile, at `sigma_a = 0` equal the one-sided
+    limits.
     """
 
     @abc.abstractmethod
     def boundary(self) -> tuple[Array, Array, Array, Array | None]:
-        """Compute `sigma_tr^2`, `h`, `C_E`, and `C_phi / D`: None where fluence does not count."""
+        """Compute `sigma_tr^2`, `h`, `C_E`, and `C_phi / D`, which is None for a model without
+        fluence.
+        """
 
     @jit_unless_traced
     def __call__(self, r: Float[Array, "*radii"]) -> Float[Array, "*radii channels"]:
@@ -119,8 +121,8 @@ class Dipole(AbstractDipole):
 
 @record
 class BetterDipole(AbstractDipole):
-    r"""The dipole of d'Eon, with Grosjean's diffusion coefficient and an exitance that counts
-    fluence and flux: closer to light transport than the classical one where absorption is strong.
+    r"""The dipole of d'Eon, with Grosjean's diffusion coefficient and an exitance of fluence and
+    flux. It is more accurate than the classical one at strong absorption.
 
     With `D = (2 sigma_a + sigma_s') / (3 sigma_t'^2)`, `sigma_tr^2 = sigma_a / D`, `A = (1 + 3 C2)
     / (1 - 2 C1)`, `z_r = 1 / sigma_t'`, `z_v = z_r + 4 A D`, `C_phi = (1 - 2 C1) / 4` and `C_E = (1
@@ -147,7 +149,7 @@ def screening(y: Float[Array, "..."]) -> Float[Array, "..."]:
     r"""Compute `(1 + sqrt y) exp(-sqrt y)`, where `y = (sigma_tr d)^2` is at least 0; its
     derivative is `-exp(-sqrt y) / 2`.
 
-    The derivative rule serves `y = 0`, where the infinite derivatives of the square roots cancel.
+    The derivative rule is for `y = 0`, where the infinite derivatives of the square roots cancel.
     """
     root = jnp.sqrt(y)
     return (1 + root) * jnp.exp(-root)
@@ -173,7 +175,7 @@ def fluence_difference(
     r"""Compute `exp(-sqrt(u near)) / sqrt(near) - exp(-sqrt(u far)) / sqrt(far)`, where near and
     far are squared distances.
 
-    The derivative rule serves `u = 0`, where the infinite derivatives of the two terms cancel.
+    The derivative rule is for `u = 0`, where the infinite derivatives of the two terms cancel.
     """
     s, a, b = jnp.sqrt(u), jnp.sqrt(near), jnp.sqrt(far)
     return jnp.exp(-s * a) / a - jnp.exp(-s * b) / b

@@ -1,5 +1,5 @@
-"""Adding and doubling: how layers reflect and transmit light between discrete cosines, and how much
-a half space sends back.
+"""Adding and doubling: reflection and transmission of layers between discrete cosines, and the
+reflectance of a half space.
 """
 
 import jax
@@ -28,8 +28,8 @@ def directional_albedo(
     g: Float[Array, ""],
     cover: tuple[Float[Array, ""], Float[Array, ""]] | None = None,
 ) -> Float[Array, " angles"]:
-    """Compute the fraction of the light entering under each of `outside_cosines` that leaves a half
-    space; of its cover, the reduced albedo and the reduced optical depth.
+    """Compute the fraction of light, entering at each of `outside_cosines`, that leaves a half
+    space. The cover is given by its reduced albedo and reduced optical depth.
     """
     mu, weights, reflected = _directions(eta)
     half_space = _doubled(mu, weights, albedo_prime, g)[1]
@@ -40,8 +40,8 @@ def directional_albedo(
         between = jnp.linalg.solve(identity - back @ half_space, transmitted)
         half_space = back + transmitted @ half_space @ between
 
-    # Adding the surface: by reciprocity, what leaves of light from one direction is what leaves in
-    # that direction of light from all.
+    # Adding the surface: by reciprocity, the fraction that leaves of light from one direction is
+    # the fraction of light from all directions that leaves in that direction.
     leaving = jnp.linalg.solve(
         identity - half_space * reflected[None], half_space @ (1 - reflected)[:, None]
     )
@@ -57,8 +57,8 @@ def _doubled(mu, weights, albedo_prime, g, optical_depth=None):
     doublings = _DOUBLINGS if optical_depth is None else _COVER_DOUBLINGS
     depth = _DEPTH if optical_depth is None else optical_depth * extinction / 2**doublings
 
-    # One layer, with the mean of its two sides in the place of the light within: what enters from
-    # both sides alike is attenuated by `with_even`, the difference by `with_odd`.
+    # One layer, with the mean of its two sides for the light within: the even part of the light
+    # from both sides is attenuated by `with_even`, the odd part by `with_odd`.
     identity, half_depth = jnp.eye(len(mu), dtype=mu.dtype), 0.5 * depth / mu[:, None]
     with_even, with_odd = (
         jnp.linalg.solve(identity + loss, identity - loss)
@@ -67,13 +67,13 @@ def _doubled(mu, weights, albedo_prime, g, optical_depth=None):
             half_depth * (identity - albedo * odd),
         )
     )
-    # What it absorbs of even light from both sides, as a sum of positive terms.
+    # Absorption of equal light from both sides, as a sum of positive terms.
     absorbed = jnp.linalg.solve(
         identity + half_depth * (identity - albedo * even), 2 * half_depth * (1 - albedo)
     )
     layer = 0.5 * (with_even + with_odd), 0.5 * (with_even - with_odd), absorbed
 
-    # Doubling; the rest leaves, whatever rounding makes of it.
+    # Doubling; energy is conserved to rounding.
     def double(_, layer):
         transmitted, reflected, absorbed = layer
         between = jnp.linalg.solve(
@@ -99,7 +99,7 @@ def diffuse_albedo(
     g: Float[Array, ""],
     cover: tuple[Float[Array, ""], Float[Array, ""]] | None = None,
 ) -> Float[Array, ""]:
-    """Compute the fraction of evenly diffuse light that leaves, of what has entered."""
+    """Compute the fraction that leaves of diffuse light that has entered."""
     mu, weights, reflected = (each[: _OUTSIDE + 1] for each in _directions(eta))
     entering = mu * weights * (1 - reflected)
     return jnp.vdot(entering, directional_albedo(albedo_prime, eta, g, cover)) / jnp.sum(entering)

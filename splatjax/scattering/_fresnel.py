@@ -1,6 +1,4 @@
-"""The Fresnel reflectance, its diffuse moments met from inside, and what diffusion makes of
-them.
-"""
+"""The Fresnel reflectance, its diffuse moments from inside, and the boundary of diffusion."""
 
 import abc
 
@@ -46,10 +44,10 @@ class ExactFresnel(AbstractFresnel):
     Differentiable in `eta`. At `eta = 1` the moments are 0 and have a kink; the derivative there is
     the limit from above (7/3 for the first moment; from below it is -1/3).
 
-    The integral over the cosine outside, `mu_o`, is taken in `s = r_s`, the reflection coefficient
-    of the wave polarized across the plane of incidence: then `mu_o^2 = (eta^2 - 1)(1 - s)^2 / 4s`
-    and `r_p = (s - b) / (1 - b s)` with `b = (eta^2 - 1) / (eta^2 + 1)`, so that a power of
-    `eta^2 - 1` stands before an integral that is finite at `eta = 1`.
+    The integral over the cosine outside, `mu_o`, is computed in `s = r_s`, the reflection
+    coefficient of the wave polarized across the plane of incidence: then `mu_o^2 = (eta^2 - 1)(1 -
+    s)^2 / 4s` and `r_p = (s - b) / (1 - b s)` with `b = (eta^2 - 1) / (eta^2 + 1)`, so that a power
+    of `eta^2 - 1` multiplies an integral that is finite at `eta = 1`.
     """
 
     @jit_unless_traced
@@ -71,11 +69,11 @@ class ExactFresnel(AbstractFresnel):
 
 
 class EganFresnel(AbstractFresnel):
-    r"""The polynomial fits that published profiles were computed with.
+    r"""The polynomial fits with which published profiles were computed.
 
     The first moment is that of Egan and Hilgeman as Donner and Jensen print it, the second that of
-    d'Eon and Irving. Made for `eta` between about 0.5 and 2. Differentiable except at `eta = 1`,
-    where the fits step by 0.0017; there the moments are set to 0, so that A = 1.
+    d'Eon and Irving. They are valid for `eta` between about 0.5 and 2. Differentiable except at
+    `eta = 1`, where the fits step by 0.0017; there the moments are set to 0, so that A = 1.
 
     **Source:** Egan and Hilgeman 1979; Donner and Jensen 2005; d'Eon and Irving 2011.
     """
@@ -111,17 +109,15 @@ def _polynomial(x: Float[Array, " channels"], *coefficients: float) -> Float[Arr
 
 
 def moment_outside(eta: Float[Array, " channels"]) -> Float[Array, " channels"]:
-    """Compute twice the integral of `mu F(mu)` over the cosine on the rarer side of the interface;
-    nothing is reflected totally.
+    """Compute twice the integral of `mu F(mu)` over the cosine on the rarer side of the interface,
+    where there is no total reflection.
     """
     ratio = _denser_over_rarer(eta)
     return (ratio * ratio - 1) / 8 * _over_reflections(ratio, jnp.ones_like)
 
 
 def _denser_over_rarer(eta: Float[Array, " channels"]) -> Float[Array, " channels"]:
-    """The index of the denser side over that of the rarer; its derivative at 1 is the one from
-    above.
-    """
+    """The index of the denser over that of the rarer side; its derivative at 1 is that from above."""
     rarer_inside = eta < 1
     return jnp.where(rarer_inside, 1 / jnp.where(rarer_inside, eta, jnp.ones_like(eta)), eta)
 

@@ -1,5 +1,5 @@
-"""Light transport in a half space by adding and doubling: how much light leaves, by the angle under
-which it entered; and the law of angles that this gives a material.
+"""Light transport in a half space by adding and doubling: the fraction of light that leaves, by the
+angle of entry, and the law of angles of a material.
 """
 
 import equinox as eqx
@@ -22,11 +22,11 @@ _HALVINGS = 24  # of the interval in which a similarity parameter lies
 
 @record
 class AngularLaw(eqx.Module):
-    r"""How diffused light depends on the angles under which it enters and leaves.
+    r"""The dependence of diffused light on the angles of entry and exit.
 
-    A profile is that of light along the normal. Light that enters under the cosine `mu` is
-    multiplied by `e(mu) = sum_k c_k mu^k`, and by reciprocity light leaves in proportion to
-    `e(mu)`, besides what the surface reflects.
+    A profile describes light along the normal. Light that enters at the cosine `mu` is multiplied
+    by `e(mu) = sum_k c_k mu^k`, and by reciprocity light leaves in proportion to `e(mu)`.
+    Reflection at the surface is separate.
 
     **Attributes:**
 
@@ -75,20 +75,20 @@ class AngularLaw(eqx.Module):
 
 @record
 class HalfSpace(eqx.Module):
-    r"""How a half space reflects the light that has entered it, by light transport.
+    r"""The reflection by a half space of the light that has entered it, by light transport.
 
     Adding and doubling: the reflection and transmission of a layer between discrete cosines give
-    those of two such layers, and so on to a half space; then the surface is added, which reflects
-    from inside, totally beyond the critical angle. The half space is the same whatever layers it
-    is cut into, so the first one may be thick. The phase function is Henyey and Greenstein's, with
-    the forward peak beyond its twelfth moment taken as unscattered (delta-M).
+    those of two such layers, and so on to a half space. The surface is added last; it reflects from
+    inside, totally beyond the critical angle. The result does not depend on the division into
+    layers, so the first layer may be thick. The phase function is Henyey and Greenstein's; the
+    forward peak beyond its twelfth moment counts as unscattered (delta-M).
 
     **Attributes:** (differentiable)
 
     - `medium`: its coefficients, [channels]; `eta` at least 1.
     - `g`: mean cosine of the phase function, [channels]; `sigma_s = sigma_s' / (1 - g)`.
     - `cover`: a layer on the half space, thin or thick, or `None`; its index and mean cosine are
-      taken to be those of the half space.
+      those of the half space.
 
     **Source:** Van de Hulst 1980 (doubling); Prahl, Van Gemert and Welch 1993 (adding the
     surface); Wiscombe 1977 (delta-M).
@@ -109,7 +109,7 @@ class HalfSpace(eqx.Module):
     def of_color(
         cls, color: Numbers, mean_free_path: Numbers, eta: Numbers = 1.4, g: Numbers = 0.0
     ) -> "HalfSpace":
-        r"""Find the half space of a color, for materials of other renderers: the inverse of the
+        r"""Compute the half space of a color, for materials of other renderers: the inverse of the
         method `color`.
 
         For OpenPBR, `color` is `subsurface_color`, `mean_free_path` the product of
@@ -123,8 +123,8 @@ class HalfSpace(eqx.Module):
         - `mean_free_path`: `1 / sigma_t`, mm, positive.
         - `eta`, `g`: as in the attributes.
 
-        **Returns:** a half space whose color, over that of white, is within 1e-4 of what is given;
-        in single precision within 2e-2.
+        **Returns:** a half space whose color, over that of white, is within 1e-4 of the given
+        color; in single precision within 2e-2.
 
         **Raises:** `ValueError` for a number out of its range.
         """
@@ -133,7 +133,7 @@ class HalfSpace(eqx.Module):
         check_values("color", color, "between 0.001 and 1", lambda x: (x >= 1e-3) & (x <= 1))
         check_values("mean_free_path", mean_free_path, "positive (mm)", lambda x: x > 0)
         absorbed = _similarity_of_color(color, eta, g) ** 2  # 1 - albedo'
-        # From the reduced albedo to that of the medium as it is, without a difference that rounds.
+        # From the reduced albedo to that of the unreduced medium, without cancellation.
         per_mm = (1 - g) / (1 - g * absorbed) / mean_free_path
         return cls(Medium(per_mm * absorbed, per_mm * (1 - absorbed), eta), g)
 
@@ -144,8 +144,8 @@ class HalfSpace(eqx.Module):
 
     @jit_unless_traced
     def directional_albedo(self) -> Float[Array, "angles channels"]:
-        """Compute the fraction of the light entering under each of `cosines` that leaves, within
-        3e-4. Energy is kept by construction.
+        """Compute the fraction of light, entering at each of `cosines`, that leaves, within 3e-4.
+        Energy is conserved by construction.
         """
         medium = self.medium
         fraction = jax.vmap(directional_albedo)(
@@ -159,8 +159,8 @@ class HalfSpace(eqx.Module):
 
     @jit_unless_traced
     def color(self) -> Float[Array, " channels"]:
-        """Compute the fraction of evenly diffuse light that leaves, of what has entered: what a
-        flat piece sends back in a white furnace, besides the reflection of its surface.
+        """Compute the fraction that leaves of diffuse light that has entered: the color of a flat
+        surface in a white furnace, without the reflection of its surface.
         """
         medium = self.medium
         return jax.vmap(diffuse_albedo)(medium.albedo_prime, medium.eta, self.g, self._cover())
@@ -178,14 +178,14 @@ class HalfSpace(eqx.Module):
 
         **Arguments:**
 
-        - `separate`: what leaves under a law of its own, at `cosines`, as
+        - `separate`: the light that leaves by a separate law, at `cosines`, as
           `SingleScattering.directional_albedo` computes it.
         """
         fraction = self.directional_albedo()
         if separate is not None:
             fraction = fraction - separate
         mu, degree = self.cosines(), ANGULAR_POWERS - 1
-        # Least squares in the powers of 1 - mu, weighted as light falls on the surface.
+        # Least squares in the powers of 1 - mu, weighted by the irradiance of uniform light.
         powers = (1 - mu[:, None]) ** np.arange(1, degree + 1)
         weight = np.sqrt(mu)[:, None]
         inverse = np.linalg.pinv(weight * powers) * weight.T
@@ -214,7 +214,7 @@ def _similarity_of_color(
             color, eta, g, white = given
             return diffuse_albedo(1 - similarity * similarity, eta, g) / white - color
 
-        # White is 1 but for rounding.
+        # White is 1 to rounding.
         white = diffuse_albedo(jnp.ones_like(color), eta, g)
         ends = {"lower": jnp.zeros_like(color), "upper": jnp.full_like(color, 1 - 1e-6)}
         given = color, eta, g, white

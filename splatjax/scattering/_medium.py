@@ -76,8 +76,8 @@ class Layer(eqx.Module):
         return self.medium.channels
 
     def check_diffusion(self) -> None:
-        """Raise `ValueError` for a slab thinner than a mean free path, whose sources would lie
-        outside of it. A traced one passes.
+        """Raise `ValueError` for a slab thinner than a mean free path, whose sources would be
+        outside of it. Traced values are not checked.
         """
         check_values(
             "thickness * sigma_t' of a Layer",
@@ -91,10 +91,10 @@ class Layer(eqx.Module):
 
 @record
 class Film(eqx.Module):
-    r"""A layer that absorbs and does not scatter, thinner than any distance that light spreads.
+    r"""A layer that absorbs and does not scatter, of negligible thickness.
 
-    A beam from outside keeps `exp(-t)` of its power, diffuse light `2 E3(t)`, with t the optical
-    depth.
+    It transmits `exp(-t)` of a beam from outside, and `2 E3(t)` of diffuse light, with t the
+    optical depth.
 
     **Attributes:**
 
@@ -110,8 +110,8 @@ class Film(eqx.Module):
 
 def check_stack(layers: tuple[Layer | Film, ...]) -> None:
     """Raise `ValueError` for a stack without a layer that scatters, for numbers of channels that
-    differ (a film of one channel serves all), and for an infinite layer above another. Traced
-    thicknesses pass.
+    differ (a film may have one channel), and for an infinite layer above another. Traced
+    thicknesses are not checked.
     """
     scattering = {layer.channels for layer in layers if isinstance(layer, Layer)}
     if not scattering:

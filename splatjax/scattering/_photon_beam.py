@@ -1,4 +1,4 @@
-"""Light that scatters once, and a beam of sources for the rest."""
+"""Single scattering, and photon beam diffusion."""
 
 import functools
 from typing import ClassVar
@@ -39,7 +39,7 @@ class SingleScattering(AbstractProfile):
     **Attributes:**
 
     - `medium`: its coefficients, [channels].
-    - `strength`: a factor on all of it, [channels]; 1 but for materials made white.
+    - `strength`: a factor, [channels]; 1 except for materials made white.
 
     **Source:** Habel, Christensen and Jarosz 2013 (profile); Hanrahan and Krueger 1993 (radiance).
     """
@@ -78,7 +78,7 @@ class SingleScattering(AbstractProfile):
         self, mu_i: Float[Array, "*points"], mu_o: Float[Array, "*points"]
     ) -> Float[Array, "*points channels"]:
         r"""Compute the radiance towards `wo` per irradiance that has entered from `wi`, of a flat
-        and evenly lit piece:
+        and evenly lit surface:
 
             alpha' / 4 pi * (1 - F(mu_o)) / (eta^2 (mu_i' + mu_o')),
 
@@ -104,7 +104,7 @@ class SingleScattering(AbstractProfile):
 
     @jit_unless_traced
     def directional_albedo(self, mu_i: Float[Array, "*points"]) -> Float[Array, "*points channels"]:
-        """Compute the fraction of the light entering under the cosine `mu_i` that leaves after one
+        """Compute the fraction of light, entering at the cosine `mu_i`, that leaves after one
         scattering, with an error of 1e-3.
         """
         total = jnp.zeros((*mu_i.shape, self.channels), mu_i.dtype)
@@ -133,9 +133,9 @@ class SingleScattering(AbstractProfile):
             jnp.sqrt(cosine**2 + (1 - scale**2) * sine**2) for scale in (inside, outside)
         )
         reflected, weights = reflectance(cos_in, cos_out, eta), 0.5 * jnp.pi * weights * cosine
-        # As eta goes to 1, light is reflected at grazing angles alone, which get infinitely few
-        # nodes: the quadrature keeps its value and loses its derivative. One more node, at the
-        # grazing angle, restores the closed form.
+        # As eta goes to 1, light is reflected only at grazing angles, which the nodes do not
+        # resolve: the quadrature has the right value and the wrong derivative. One more node, at
+        # the grazing angle, restores the closed form.
         missed = jnp.sum(weights * reflected * sine, axis=0) - 0.5 * moment_outside(self.medium.eta)
         grazing = stop_gradient(inside[0] / (1 + jnp.sqrt(1 - inside[0] ** 2)))
         half_angle = jnp.concatenate([inside * sine / (1 + cos_in), grazing[None]])
@@ -150,9 +150,9 @@ class PhotonBeam(AbstractHalfSpace):
     single scattering.
 
     Light enters as a beam along the normal and is scattered at depth z with density `sigma_t'
-    exp(-sigma_t' z)`. What scatters more than once is `alpha'^2 kappa E(z, r)`, with E the exitance
-    above a point source and the correction `kappa = 1 - exp(-2 sigma_t' (d_r + z))`. What scatters
-    once, isotropically, is followed to the surface, attenuated, and through it with the Fresnel
+    exp(-sigma_t' z)`. Multiple scattering is `alpha'^2 kappa E(z, r)`, with E the exitance above a
+    point source and the correction `kappa = 1 - exp(-2 sigma_t' (d_r + z))`. Single scattering,
+    isotropic, is attenuated on its way to the surface and transmitted with the Fresnel
     transmittance; with theta the angle inside,
 
         R1(r) = alpha' sigma_t' / (4 pi r) * integral of exp(-sigma_t' r cot(theta / 2)) (1 - F)
@@ -165,8 +165,7 @@ class PhotonBeam(AbstractHalfSpace):
 
     - `medium`: its coefficients, [channels]; scattering is isotropic with the reduced coefficient.
     - `fresnel`: the diffuse Fresnel moments of the surface that diffuse light meets.
-    - `strength`: a factor on what scatters more than once, [channels]; 1 as published,
-      `with_total` holds the total.
+    - `strength`: a factor on multiple scattering, [channels]; 1 as published; `with_total` sets it.
 
     **Source:** Habel, Christensen and Jarosz 2013, "Photon beam diffusion".
     """
@@ -181,8 +180,8 @@ class PhotonBeam(AbstractHalfSpace):
 
     @jit_unless_traced
     def with_total(self, total: Float[Array, " channels"]) -> "PhotonBeam":
-        """Scale what scatters more than once, so that the total reflectance is `total`: that of
-        light transport (`HalfSpace`), from which the model's is 1 to 6% off.
+        """Scale multiple scattering so that the total reflectance is `total`, such as that of light
+        transport (`HalfSpace`), from which the model's own differs by 1 to 6%.
         """
         single = SingleScattering(self.medium).total_reflectance()
         multiple = self.multiply_scattered().total_reflectance() / self.strength
@@ -200,7 +199,7 @@ class PhotonBeam(AbstractHalfSpace):
 
     def multiply_scattered(self) -> AbstractProfile:
         """Return the light scattered more than once as a profile, finite at `r = 0`: for a material
-        with a `SingleScattering` of its own.
+        with a separate `SingleScattering`.
         """
         return _MultipleScattering(self.medium, self.fresnel, self.strength)
 

@@ -1,4 +1,4 @@
-"""What skin is colored by: absorption spectra of its pigments.
+"""Absorption spectra of the pigments of skin.
 
 Columns of the table, from 380 to 780 nm in steps of 5 nm:
 

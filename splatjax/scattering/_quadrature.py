@@ -1,5 +1,5 @@
-"""Radial integrals of profiles by one rule in units of a profile's own length, the same for every
-medium; and the inverse Hankel transform by a digital filter.
+"""Radial integrals of profiles by one rule in units of the profile's length, and the inverse Hankel
+transform by a digital filter.
 """
 
 import abc
@@ -37,15 +37,14 @@ class RadialRule(AbstractRadialRule):
     `length_scale()`.
 
     One Gauss-Legendre panel in log r from `smallest` to `largest`, and a linear one from 0 to
-    `smallest`. Equally spaced radii are useless here: a profile changes over five decades.
+    `smallest`. Equally spaced radii are unsuitable, because a profile changes over five decades.
 
     **Attributes:**
 
     - `smallest`, `largest`: ends of the logarithmic panel, in length scales.
     - `count`: its number of nodes.
-    - `near`: number of nodes of the linear panel; 0 leaves it out.
-    - `tail`: a further power of r in the weights, which turns a fit towards large distances: 0 is
-      Eq. 3.
+    - `near`: number of nodes of the linear panel; 0 omits it.
+    - `tail`: a further power of r in the weights, for a better fit at large distances: 0 is Eq. 3.
     """
 
     smallest: float = eqx.field(static=True)
@@ -56,9 +55,9 @@ class RadialRule(AbstractRadialRule):
 
     def beyond(self, cut: float, tail: float = 0.0) -> "RadialRule":
         """Return the rule that starts at `cut` length scales: for profiles that are infinite or
-        unknown at the origin, and for what splats do not resolve.
+        unknown at the origin, and for radii that splats do not resolve.
 
-        **Raises:** `ValueError` unless `cut` lies between 0 and the largest radius.
+        **Raises:** `ValueError` unless `cut` is between 0 and the largest radius.
         """
         if not 0 < cut < self.largest:
             raise ValueError(f"cut must be between 0 and {self.largest} length scales; got {cut}")
@@ -73,7 +72,7 @@ class RadialRule(AbstractRadialRule):
         self, profile: AbstractProfile
     ) -> tuple[Float[Array, "nodes channels"], Float[Array, "nodes channels"]]:
         """Compute the radii and weights for each channel, mm. They are constants of every
-        derivative: an integral has no nodes.
+        derivative.
 
         A measured profile has its own radii; those outside of the rule have weight 0.
         """
@@ -111,11 +110,11 @@ class InverseVariance(AbstractRadialRule):
     sums of `f^2 / deviation^2`.
 
     A fit with this rule has the least chi-squared, and its `error` is the root of chi-squared over
-    the sum of `(R / deviation)^2`. Radii without an error, which no photon reached, are left out.
+    the sum of `(R / deviation)^2`. Radii without an error, which no photon reached, are omitted.
 
     **Attributes:**
 
-    - `among`: which radii count, in length scales of the profile: by default all,
+    - `among`: the rule that selects radii, in length scales of the profile: by default all,
       `L2_QUADRATURE.beyond(1.0)` for a cut.
 
     **Raises:** `ValueError`, when used, for a profile that has no `deviation`.
@@ -155,7 +154,7 @@ def unit_interval() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Compute nodes x of the interval (0, 1), 1 - x without loss of digits, and weights: for
     integrands rough at either end.
 
-    Takahasi and Mori's double exponential formula; analytic integrands leave about 1e-15.
+    Takahasi and Mori's double exponential formula; the error of analytic integrands is about 1e-15.
     """
     t, step = np.linspace(-3.1, 3.1, 81, retstep=True)
     u = 0.5 * np.pi * np.sinh(t)
@@ -221,8 +220,8 @@ def inverse_hankel_transform(
 
     In the logarithm of the radius the transform is a convolution. The Mellin transform of the
     kernel has modulus 1, and `F` is analytic in a strip, so that sampling both at equal steps of
-    the logarithm leaves errors of rounding only, whatever the shape. The result is a plain sum over
-    samples of `F`, which differentiates.
+    the logarithm has only rounding errors, for every shape. The result is a plain, differentiable
+    sum over samples of `F`.
 
     **Arguments:**
 
@@ -232,7 +231,7 @@ def inverse_hankel_transform(
     - `decay`: mm, positive: places the nodes near the origin. Not differentiated.
 
     **Returns:** 1/mm^2. Its error is about 1e-15 of the value at `r = 0` or, farther out, of `1 /
-    (decay r)`: a tail that has fallen below that is rounding.
+    (decay r)`: a smaller tail is rounding.
 
     **Source:** Johansen and Soerensen 1979, "Fast Hankel transforms"; the filter is our own.
     """

@@ -29,9 +29,9 @@ def _amount(default: float, most: float = 1.0, least: float = 0.0, unit: str = "
 class Skin(eqx.Module):
     r"""Skin as a thin epidermis with melanin on a deep dermis with blood, by wavelength.
 
-    Absorption is the sum over what each layer contains; bloodless tissue fills the rest. Scattering
-    is that of both layers, `scattering * (l / 500 nm)^-scattering_power`. All but the wavelengths
-    are numbers, and differentiable; `jax.vmap` makes many skins.
+    Absorption is the sum over the contents of each layer; the rest is bloodless tissue. Scattering
+    is that of both layers, `scattering * (l / 500 nm)^-scattering_power`. All parameters except the
+    wavelengths are numbers, and differentiable; use `jax.vmap` for many skins.
 
     **Attributes:**
 
@@ -42,7 +42,7 @@ class Skin(eqx.Module):
     - `eumelanin`: fraction of the melanin; the rest is pheomelanin.
     - `carotene`, `bilirubin`: g/l, the one in both layers, the other in the dermis.
     - `water`: fraction of both layers.
-    - `vessel_radius`: mm: blood in vessels shades itself, which flattens its bands.
+    - `vessel_radius`: mm. Blood in vessels shadows itself, which flattens its absorption bands.
     - `thickness`: of the epidermis, mm; it may be thinner than a mean free path.
     - `scattering`: reduced coefficient at 500 nm, 1/mm, and `scattering_power`.
     - `eta`: index of refraction; `g`: mean cosine of the phase function.
@@ -89,7 +89,7 @@ class Skin(eqx.Module):
         blood = oxygenation * pure["oxygenated"] + (1 - oxygenation) * pure["deoxygenated"]
         other = self.water * pure["water"] + self.carotene * pure["carotene"]
         epidermis = self.melanin * melanin + (1 - self.melanin) * pure["baseline"]
-        # (1 - exp(-x)) / x is 1 where nothing is absorbed.
+        # (1 - exp(-x)) / x is 1 without absorption.
         x = 2 * self.vessel_radius * blood
         is_thin = x < 1e-3
         safe = jnp.where(is_thin, 1.0, x)
@@ -127,13 +127,14 @@ class Skin(eqx.Module):
 
 @record
 class SkinProfile(AbstractProfile):
-    r"""The profile of a dermis under a thin epidermis: what the epidermis alone sends back, and the
-    rest, each a photon beam scaled to its total.
+    r"""The profile of a dermis under a thin epidermis: the reflectance of the epidermis alone, and
+    the rest, each a photon beam scaled to its total.
 
-    The epidermis attenuates the light of the dermis wherever it leaves. Infinite at the origin like
-    1/r. Against Monte Carlo, light in rings up to 3 mm: within 5% for 0.02 of melanin (9% in rings
-    that hold a hundredth of the light); for 0.3 of melanin at 620 nm within 26% up to 1.5 mm, and
-    up to 60% too large beyond, where a ninth of the light leaves. The total is that of transport.
+    The epidermis attenuates the light of the dermis at its exit. The profile diverges like 1/r at
+    the origin. Against Monte Carlo, light in rings up to 3 mm is within 5% for 0.02 of melanin (9%
+    in rings with a hundredth of the light); for 0.3 of melanin at 620 nm within 26% up to 1.5 mm,
+    and up to 60% too large beyond, where a ninth of the light leaves. The total is that of
+    transport.
 
     **Attributes:** (differentiable)
 

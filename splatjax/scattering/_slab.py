@@ -1,5 +1,5 @@
-"""Profiles of slabs and of stacks of layers: how layers reflect and transmit in the Hankel domain,
-frequency by frequency, and how two become one.
+"""Profiles of slabs and of stacks of layers: reflection and transmission in the Hankel domain, and
+adding of layers.
 """
 
 import abc
@@ -27,7 +27,7 @@ class Response(eqx.Module):
     transmittance_up: Float[Array, "*shape"]
 
     def over(self, lower: "Response") -> "Response":
-        """Lay this on another: the geometric series of reflections between them is summed.
+        """Add this layer on top of another: sum the geometric series of reflections between them.
 
         **Source:** Donner and Jensen 2005 (adding, after Kubelka).
         """
@@ -43,8 +43,8 @@ class Response(eqx.Module):
 
 
 def film_response(film: Film, lit_by_beam: bool, shape: tuple[int, ...]) -> Response:
-    """Compute the response of a film; `lit_by_beam` where no layer above has scattered the light
-    that comes down.
+    """Compute the response of a film; `lit_by_beam` if no layer above has scattered the incident
+    light.
     """
     depth = jnp.broadcast_to(film.optical_depth, shape)
     diffuse = diffuse_transmittance(depth)
@@ -130,7 +130,7 @@ def hyperbolic_ratio(
     derivatives. `a` and `height` may be infinite together; then it is `exp(-s fall) (1 + exp(-2 s
     b)) / 2`. So may `fall` and `height`; then it is 0.
     """
-    finite = ~jnp.isinf(height)  # NaN is to stay
+    finite = ~jnp.isinf(height)  # NaN must stay
     reach = jnp.where(finite, height, 1.0)
     small = finite & (u * reach * reach < _SMALL)
     width = jnp.where(finite, a, 1.0)
@@ -154,7 +154,7 @@ def _log_sinhc(y):
     return y * (1 / 6 - y * (1 / 180 - y * (1 / 2835 - y / 37800)))
 
 
-# Mean free paths: the quadrature does not resolve a source nearer to the surface.
+# In mean free paths; the quadrature does not resolve a source nearer to the surface.
 _SHALLOWEST = 1e-3
 
 
@@ -215,7 +215,7 @@ class AbstractSlabProfile(AbstractProfile):
             depth = 1 / layer.medium.sigma_t_prime
             beneath = jnp.maximum(layer.thickness - depth, _SHALLOWEST * depth)
             reflected.append(depth)
-            # An infinite layer transmits nothing, and any length serves.
+            # An infinite layer transmits nothing; any length is valid.
             transmitted.append(jnp.where(jnp.isfinite(beneath), beneath, depth))
         return reduce(jnp.minimum, reflected), sum(transmitted[1:], start=transmitted[0])
 
@@ -249,7 +249,7 @@ class AbstractSlabProfile(AbstractProfile):
 
 
 class Transmitted(AbstractProfile):
-    """The light that leaves a slab on the far side, as a profile, to be fitted like any other."""
+    """The light that leaves a slab on the far side, as a profile."""
 
     slab: AbstractSlabProfile
 
@@ -279,7 +279,8 @@ class Multipole(AbstractSlabProfile):
     - `eta_above`, `eta_below`, `fresnel`: as `AbstractSlabProfile` has them.
 
     **Raises:** `ValueError` for a layer thinner than one mean free path `1 / sigma_t'` in any
-    channel: its sources would lie outside of it. Under `jit` that is unknown, and the profile NaN.
+    channel: its sources would be outside of it. Under `jit` this cannot be checked, and the profile
+    is NaN.
 
     **Source:** Donner and Jensen 2005, "Light diffusion in multi-layered translucent materials".
     """
@@ -295,10 +296,10 @@ class Multipole(AbstractSlabProfile):
 class LayeredMultipole(AbstractSlabProfile):
     r"""Any number of layers, each a multipole, added in the Hankel domain.
 
-    Between two scattering layers the interface has the ratio of their indices; a film has none of
-    its own. Light comes from above as a narrow beam. Each slab keeps its own extrapolated
-    boundaries, so that cutting one in two, indices matched, is not neutral: a few per cent at four
-    mean free paths.
+    Between two scattering layers the interface has the ratio of their indices; a film has no
+    interface. Light enters from above as a narrow beam. Each slab has its own extrapolated
+    boundaries, so dividing one in two, with matched indices, changes the result: by a few per cent
+    at four mean free paths.
 
     Differentiable in every coefficient and thickness, and in `r`.
 
@@ -310,7 +311,7 @@ class LayeredMultipole(AbstractSlabProfile):
 
     **Raises:** `ValueError` for no scattering layer, for numbers of channels that differ, for an
     infinite layer with another below it, and for a layer thinner than one mean free path `1 /
-    sigma_t'` in any channel. Under `jit` that is unknown, and the profile NaN.
+    sigma_t'` in any channel. Under `jit` this cannot be checked, and the profile is NaN.
 
     **Source:** Donner and Jensen 2005, "Light diffusion in multi-layered translucent materials".
     """

@@ -21,17 +21,17 @@ class Tabulated(AbstractProfile):
     r"""A profile given at radii, linear in between: constant within the first radius, 0 beyond the
     last.
 
-    Nothing is invented: what leaves beyond the last radius is not in the total unless that is
-    given, and integrals of the profile, those of a fit as well, are sums over its radii.
+    There is no extrapolation: light beyond the last radius is not part of the total unless the
+    total is given, and integrals of the profile, also those of a fit, are sums over its radii.
     Differentiable in values, radii, `r`, and the total.
 
     **Attributes:**
 
     - `radii`: mm, at least two; they ascend from at least 0.
-    - `values`: 1/mm^2, one row per radius. May be negative, as noise is.
-    - `deviation`: standard errors of the values, of their shape, or None where they are unknown.
+    - `values`: 1/mm^2, one row per radius. Noise may make them negative.
+    - `deviation`: standard errors of the values, of their shape, or None if they are unknown.
       Constants of every derivative.
-    - `total`: the total reflectance of each channel, or None: then it is the integral of the lines.
+    - `total`: the total reflectance of each channel; None for the integral of the straight lines.
 
     **Raises:** `ValueError` for radii that do not ascend, for values that are not finite, and for
     shapes that do not match.
@@ -92,8 +92,8 @@ class Tabulated(AbstractProfile):
 
     @jit_unless_traced
     def length_scale(self) -> Float[Array, " channels"]:
-        """Compute the radius, mm, within which half of the integral of `r |R|` lies, by the steps
-        of the table.
+        """Compute the radius, mm, within which half of the integral of `r |R|` is, by the steps of
+        the table.
         """
         rings = self.radii * jnp.diff(self.radii, append=self.radii[-1:])
         within = jnp.cumsum(jnp.abs(self.values) * rings[:, None], axis=0)
@@ -101,8 +101,8 @@ class Tabulated(AbstractProfile):
         return jnp.maximum(self.radii[index], self.radii[1])
 
     def known_radii(self) -> tuple[Float[Array, " samples"], Float[Array, " samples"]]:
-        """Return the radii and the weights of the trapezoidal rule; the first radius also stands
-        for the disc within it.
+        """Return the radii and the weights of the trapezoidal rule; the first radius also
+        represents the disc within it.
         """
         steps = jnp.diff(self.radii)
         weights = 0.5 * (jnp.append(steps, 0.0) + jnp.insert(steps, 0, self.radii[0]))
@@ -137,9 +137,8 @@ def measure_laser_dot(
     r"""Measure the profile in a photograph of a laser dot: means over rings, with their standard
     errors.
 
-    The picture is taken from straight above, with a long lens, of a flat and homogeneous piece; a
-    dark frame is subtracted, and specular reflection is kept away from the camera. Exitance is `pi`
-    times radiance.
+    The picture shows a flat and homogeneous sample from straight above, with a long lens, a dark
+    frame subtracted, and without specular reflection. Exitance is `pi` times radiance.
 
     **Arguments:**
 
@@ -148,13 +147,13 @@ def measure_laser_dot(
     - `power`: entering the material, positive, for all channels or for each: in W if the image is
       in W/(mm^2 sr). It scales the profile, and with it the total reflectance.
     - `center`: x and y in pixels; by default the centroid of the pixels above a fifth of the peak.
-    - `saturation`: the value at which pixels saturate; a ring with such a pixel is left out.
+    - `saturation`: the value at which pixels saturate; a ring with such a pixel is omitted.
     - `largest`: radius of the last ring, mm; by default that of the largest circle inside the
       picture.
     - `step`: width of a ring, pixels, at least 1.
 
     **Returns:** a `LaserDot`. The radius of a ring is the root mean square of those of its pixels,
-    as the middle of a profile is flat; its standard error does not count the scatter due to the
+    because the middle of a profile is flat. Its standard error excludes the scatter due to the
     slope across the ring. Rings of fewer than twelve pixels are joined to the next.
 
     **Raises:** `ValueError` for pixels that are not finite, a length or power that is not positive,

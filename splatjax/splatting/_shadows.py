@@ -64,7 +64,7 @@ class ShadowSettings(eqx.Module):
 
 
 class Bounds(eqx.Module):
-    """A sphere around all discs. It determines the shadow maps, so it is differentiated with them."""
+    """A sphere around all discs. It determines the shadow maps, and is differentiated with them."""
 
     center: Float[Array, "3"]
     radius: Float[Array, ""]
