@@ -1,18 +1,19 @@
 """splatjax: a differentiable renderer for translucent materials.
 
-From a few optical coefficients to a translucent picture, and back; lengths in millimeters
-throughout. What most programs need has a name here; the rest is in submodules:
+It computes pictures of translucent bodies from optical coefficients, and coefficients from
+pictures. All lengths are in millimeters. The most used names are here; the others are in
+submodules:
 
 - `scattering`: media, slabs and their profiles; `transport`: the Monte Carlo reference.
-- `fitting`: sums of Gaussians for a profile; `gaussians`: what a profile is.
+- `fitting`: fits of sums of Gaussians; `gaussians`: profiles and sums of Gaussians.
 - `inverse`: materials and scenes from pictures.
 - `scene`, `geometry`: records, area lights, skies; bodies; `io`: files; `exports`: fits for other
   renderers.
 - `splatting`, `diffusion`, `shading`: the passes, and their settings.
-- `cache`: what a program keeps for its next start.
+- `cache`: cached results for the next start of a program.
 
-`splatjax.baselines` (methods to compare with) and `splatjax.plots` (which needs matplotlib) are
-imported by their names.
+`splatjax.baselines` (methods to compare with) and `splatjax.plots` (which needs matplotlib) must be
+imported explicitly.
 """
 
 from . import (

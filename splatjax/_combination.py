@@ -1,5 +1,5 @@
-"""How partial results of parts of the splats are combined: on one device there is one part, over a
-mesh each device holds one, and a stream brings one after the other.
+"""Combination of partial results of parts of the splats: one device has one part, a mesh one part
+per device, and a stream a sequence of parts.
 """
 
 import abc
@@ -18,9 +18,9 @@ Partial = TypeVar("Partial", bound=PyTree)
 
 
 class AbstractCombination(eqx.Module):
-    """Combines what was computed for each part. Static.
+    """Combines the results of parts. Static.
 
-    Partial results are given one after the other, one for each part that this process holds.
+    Partial results are given one after the other, one for each part of this process.
     """
 
     @abc.abstractmethod
@@ -34,8 +34,8 @@ class AbstractCombination(eqx.Module):
     def fold(
         self, add: Callable[[Partial, Part], Partial], start: Partial, parts: Iterable[Part]
     ) -> Partial:
-        """Add the parts on this device to what is there, one after the other: `add(so_far, part)`
-        returns the sum. Differentiable.
+        """Add the parts on this device to an initial value, one after the other: `add(so_far,
+        part)` returns the sum. Differentiable.
         """
         return functools.reduce(add, parts, start)
 
@@ -53,7 +53,7 @@ class AbstractCombination(eqx.Module):
 
 
 class OneDevice(AbstractCombination):
-    """There is one part, and it is the whole."""
+    """There is one part."""
 
     def total(self, partials):
         (whole,) = partials
@@ -65,8 +65,8 @@ class OneDevice(AbstractCombination):
 
 
 class DeviceMesh(AbstractCombination):
-    """Each device of a mesh holds one part, whatever the axes of the mesh: inside `jax.shard_map`,
-    by the collectives of JAX.
+    """Each device of a mesh, of any axes, has one part; inside `jax.shard_map`, by the collectives
+    of JAX.
     """
 
     axes: tuple[str, ...] = eqx.field(static=True)
@@ -104,7 +104,7 @@ class DeviceMesh(AbstractCombination):
 
 
 class PartByPart(AbstractCombination):
-    """Parts come one after the other, and nothing is kept of a part but its result."""
+    """Parts are computed one after the other, and only their results are kept."""
 
     def total(self, partials):
         return self._combine(jnp.add, partials)
@@ -117,7 +117,7 @@ class PartByPart(AbstractCombination):
         return self.fold(functools.partial(jax.tree.map, operation), next(others), others)
 
     def fold(self, add, start, parts):
-        # Parts that are read ahead of the computation would pile up.
+        # Wait, because parts that are read ahead of the computation would accumulate.
         return functools.reduce(lambda *given: jax.block_until_ready(add(*given)), parts, start)
 
 
@@ -136,7 +136,7 @@ def extreme(
 
 
 def lay_out(mesh: Mesh, trees: Partial, specs: Partial) -> Partial:
-    """Lay arrays out over a mesh with explicit axes; `shard_map` itself does so for others."""
+    """Distribute arrays over a mesh with explicit axes; for others `shard_map` itself does so."""
     if AxisType.Explicit not in mesh.axis_types:
         return trees
     return jax.tree.map(

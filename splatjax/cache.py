@@ -1,14 +1,14 @@
-"""What takes long at the start of a program, kept for the next start in a folder of the user's own:
-the bust, plans, and compiled pictures.
+"""A cache of results for the next start of a program, in a folder of the user: the bust, plans, and
+compiled pictures.
 
     import splatjax as sj
 
     sj.cache.keep()
 
-Nothing is kept before this call. A file is used again only where everything that it depends on is
-the same: inputs, the source of splatjax, the versions of JAX and others, JAX's settings, and the
+Nothing is cached before this call. A file is used only if everything that it depends on is the
+same: inputs, the source of splatjax, the versions of JAX and others, JAX's settings, and the
 processor. Files are pickled: the folder must belong to the user, and nobody else may write to it.
-What is damaged or foreign there is ignored and replaced.
+Damaged or foreign files are ignored and replaced.
 """
 
 import functools
@@ -49,27 +49,27 @@ _capacities: dict[Hashable, list[int]] = {}
 
 
 def keep(folder: str | os.PathLike[str] | None = None) -> Path:
-    r"""Keep what takes long at the start of a program, and take it from there at the next start.
+    r"""Enable the cache: store expensive results, and read them at the next start.
 
     `splatjax.bust`, `splatjax.make_plan`, `splatjax.illuminate` and `splatjax.render`, called
-    outside `jit`, `grad` and `vmap` on one device, are then quick from the second start on. What
-    JAX compiles for other programs, gradients among them, is kept by its own compilation cache in
-    the same folder. To be called once, before anything is computed.
+    outside `jit`, `grad` and `vmap` on one device, are then fast from the second start on. JAX's
+    own compilation cache in the same folder stores other programs, gradients among them. Call it
+    once, before any computation.
 
-    It sets `jax_compilation_cache_dir` where nothing has set it, and
-    `jax_persistent_cache_min_compile_time_secs` and `jax_logging_level` where no environment
-    variable does. With `JAX_ENABLE_COMPILATION_CACHE=0`, nothing is kept.
+    It sets `jax_compilation_cache_dir` if it is not set, and
+    `jax_persistent_cache_min_compile_time_secs` and `jax_logging_level` unless environment
+    variables set them. With `JAX_ENABLE_COMPILATION_CACHE=0`, nothing is cached.
 
     **Arguments:**
 
-    - `folder`: made where it is missing. By default that of the command line: `splatjax/jax` in
-      the absolute path `XDG_CACHE_HOME`, or in `~/.cache`. It may be deleted at any time; besides
-      JAX's own files it takes 1 GB at most.
+    - `folder`: created if missing. By default that of the command line: `splatjax/jax` in the
+      absolute path `XDG_CACHE_HOME`, or in `~/.cache`. It may be deleted at any time; besides JAX's
+      own files it takes 1 GB at most.
 
     **Returns:** the folder in it for this kind of processor.
 
     **Raises:** `OSError` when it cannot be made; `PermissionError` when `kept` in it belongs to
-    another user, or others may write to it: then JAX's cache alone is used.
+    another user, or others may write to it; then only JAX's cache is used.
     """
     global _folder
     for name, value in _SETTINGS.items():
@@ -94,7 +94,7 @@ def reuse_capacity(kind: Hashable, least: int, capacity: int, most: float = 1.25
     least `least` and at most `most` times `capacity`, since programs of that size are compiled;
     otherwise remember and return `capacity`.
 
-    Several processes, which must run the same programs, remember nothing.
+    With several processes, which must run the same programs, nothing is remembered.
     """
     if jax.process_count() > 1:
         return capacity
@@ -106,7 +106,7 @@ def reuse_capacity(kind: Hashable, least: int, capacity: int, most: float = 1.25
 
 
 def kept(function: Function) -> Function:
-    """Let `keep` keep the results of a function of arrays and numbers, by the values of these."""
+    """Cache the results of a function of arrays and numbers, by the values of its arguments."""
 
     @functools.wraps(function)
     def called(*arguments, **named):
@@ -122,8 +122,8 @@ def kept(function: Function) -> Function:
 
 
 def kept_jit(function: Function) -> Function:
-    """Compile a function of arrays, as `eqx.filter_jit` does, and let `keep` keep its programs, by
-    the structure and the shapes of the arguments, so that nothing is traced.
+    """Compile a function of arrays, like `eqx.filter_jit`, and cache its programs by the structure
+    and the shapes of the arguments, so that nothing is traced.
     """
     compiled = eqx.filter_jit(function)
 
@@ -155,7 +155,7 @@ def _compiled(path: Path, function: Callable, arguments: tuple) -> Callable:
     # Of a list of arrays: a program that is loaded cannot make records of its arguments.
     of_leaves = jax.jit(lambda leaves: function(*jax.tree.unflatten(structure, leaves)))
     with ExitStack() as stack:
-        # Not in JAX's cache as well: what is taken from there and serialized again lacks kernels.
+        # JAX's cache is off here: an executable read from it and serialized again lacks kernels.
         stack.callback(jax.config.update, _LEAST_TIME, jax.config.values[_LEAST_TIME])
         jax.config.update(_LEAST_TIME, float("inf"))
         program = of_leaves.lower(leaves).compile()

@@ -1,4 +1,4 @@
-"""A bust made of formulas, and the colors of its skin: what is shown when no scan is given.
+"""A procedural bust with the colors of skin, the default body.
 
 Its head is modeled in clay: serene, eyes closed; mm, +y up, facing +z, eyes near y = 0.
 """
@@ -160,8 +160,7 @@ def bust_mesh(*, spacing: float = 1.4) -> Mesh:
 
     **Arguments:**
 
-    - `spacing`: of the grid that the mesh is made on, mm: about the length of its edges, from 0.5
-      to 1.6.
+    - `spacing`: of the grid of the mesh, mm: about the length of its edges, from 0.5 to 1.6.
 
     **Returns:** the mesh, with normals and texture coordinates: u is the longitude around the
     vertical axis (0.5 the face, the seam at the back), v the angle from the bottom, both seen from
@@ -188,12 +187,12 @@ def bust(count: int = 200_000, *, seed: int = 0) -> Splats:
 
     **Arguments:**
 
-    - `count`: of splats, at least 1.
-    - `seed`: another spread of the same quality; the same seed gives the same splats.
+    - `count`: number of splats, at least 1.
+    - `seed`: of the random positions; the same seed gives the same splats.
 
     **Returns:** splats in Morton order with albedo, specular and roughness, in JAX's default
     precision; their areas add up to that of the mesh. `splatjax.geometry.sample_mesh` describes
-    how they are spread.
+    their distribution.
 
     **Raises:** `ValueError` when `count` is below 1.
     """

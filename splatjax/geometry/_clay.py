@@ -1,5 +1,5 @@
-"""Clay: primitives and soft ways to join them, as signed distances, negative inside, of arrays of
-one shape; and the zero level of a distance as a closed triangle mesh.
+"""Modeling by signed distances, negative inside: primitives, smooth operations, and the zero level
+of a distance as a closed triangle mesh.
 
 Parts are tables for `model`: a list begins with a part, and the rows after it join another part to
 it, carve it away or keep what both have in common, each over a softness.
@@ -71,17 +71,17 @@ def join(a: np.ndarray, b: np.ndarray, softness: Size) -> np.ndarray:
 
 
 def carve(a: np.ndarray, b: np.ndarray, softness: Size) -> np.ndarray:
-    """Take the second body away from the first; the edge is rounded over `softness`."""
+    """Subtract the second body from the first; the edge is rounded over `softness`."""
     return -join(-a, b, softness)
 
 
 def keep(a: np.ndarray, b: np.ndarray, softness: Size) -> np.ndarray:
-    """Keep what two bodies have in common; the edge is rounded over `softness`."""
+    """Intersect two bodies; the edge is rounded over `softness`."""
     return -join(-a, -b, softness)
 
 
 def bump(x: np.ndarray, center: Size | np.ndarray, width: Size | np.ndarray) -> np.ndarray:
-    """Compute `exp(-(x - center)^2 / width^2)`: clay put on, or taken off."""
+    """Compute `exp(-(x - center)^2 / width^2)`, to add or remove material."""
     return np.exp(-(((x - center) / width) ** 2))
 
 
@@ -142,13 +142,13 @@ def surface_nets(distance: Distance, low, high, spacing: float, *, slack: float 
     r"""Mesh the zero level of a distance: one vertex per grid cell and sheet of it
     that crosses the cell, one quadrilateral per grid edge.
 
-    Cells are sought from coarse to fine, so that only those near the surface are looked at; the
-    vertices are then drawn onto the surface by Newton's method, and their normals are its gradient.
+    Cells are searched from coarse to fine, so that only those near the surface are evaluated.
+    Newton's method then moves the vertices onto the surface, and their normals are its gradient.
 
     **Arguments:**
 
     - `distance`: negative inside; off by at most `slack` and a factor 1.5 from the true distance.
-    - `low`, `high`: corners of a box that holds the surface, mm.
+    - `low`, `high`: corners of a box that contains the surface, mm.
     - `spacing`: of the finest grid, mm.
 
     **Returns:** a closed mesh without texture coordinates, its triangles counterclockwise seen from

@@ -1,6 +1,4 @@
-"""A triangle mesh, as geometry sees it (host arrays, mm): its edges, which of them are hard, and
-cuts by a plane.
-"""
+"""Triangle meshes (host arrays, mm): edges, hard edges, and cuts by a plane."""
 
 from typing import Any
 
@@ -73,7 +71,7 @@ def unit(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
     return np.where(length > 0, vectors / np.where(length > 0, length, 1), up)
 
 
-# Normals of two triangles at one place that differ by more make their edge hard.
+# Difference of two triangles' normals at one place above which their edge is hard.
 _SOFT = np.cos(np.radians(10))
 
 
@@ -97,7 +95,7 @@ def shared_edges(places: Int[np.ndarray, "faces 3"]) -> Int[np.ndarray, "n 2 2"]
 def hard_edges(
     mesh: Mesh, places: Int[np.ndarray, "faces 3"]
 ) -> tuple[Int[np.ndarray, "n 2 2"], Bool[np.ndarray, " n"]]:
-    """Find shared edges, and which are hard: those where the normals of two triangles differ."""
+    """Find shared edges, and mark hard ones, where the normals of two triangles differ."""
     corners = shared_edges(places)
     normals = mesh.normals[mesh.faces].reshape(-1, 3)[corners]
     cosines = np.einsum("nei,nei->ne", normals[:, :, 0], normals[:, :, 1])
@@ -119,12 +117,12 @@ def faces_beyond(mesh: Mesh) -> Int[np.ndarray, "faces 3"]:
 
 
 def split_creases(mesh: Mesh, degrees: float) -> Mesh:
-    """Estimate normals that a mesh lacks, and replace those that are off, so that edges are hard
+    """Estimate missing normals of a mesh, and replace inconsistent ones, so that edges are hard
     where triangles differ by more than an angle.
 
     Around each vertex, triangles that are joined by soft edges share a normal, the mean of theirs
-    by their angles there. A vertex keeps its normal where that lies within the given angle of all
-    its triangles.
+    weighted by their angles there. A vertex keeps its normal if that is within the given angle of
+    all its triangles.
 
     **Arguments:**
 
@@ -173,8 +171,8 @@ def split_creases(mesh: Mesh, degrees: float) -> Mesh:
 
 
 def cut_below(mesh: Mesh, height: float) -> Mesh:
-    """Return what lies above `y = height` (mm), triangles across the plane cut along it; the border
-    stays open. Each triangle has vertices of its own.
+    """Return the mesh above `y = height` (mm), with triangles cut along the plane; the border stays
+    open. Triangles do not share vertices.
     """
     y = mesh.corners()[..., 1] - height
     is_above = y >= 0

@@ -1,4 +1,4 @@
-"""Normals of raw points, and which side of their surface is outside."""
+"""Normals of raw points, and their orientation."""
 
 from collections.abc import Sequence
 
@@ -20,19 +20,19 @@ _FLAT = 1e-3  # of a window's squared size: planes that are off by less are as g
 def estimate_normals(
     points: Float[np.ndarray, "n 3"], *, neighbors: int = 12
 ) -> Float[np.ndarray, "n 3"]:
-    r"""Estimate unit normals of points on a surface, all on its outer side.
+    r"""Estimate outward unit normals of points on a surface.
 
-    Around each point there is a plane in which the nearest ones vary least (principal components,
-    of which near ones count more). A point's normal is the mean of those of its own plane and its
-    neighbors', each by how little it is off its own points and this one: at an edge the planes of
-    one side remain, at a second sheet close by those of the point's own, and where there is noise
-    many count. What can be seen from outside faces whoever sees it; what is hidden follows its
+    A plane is fitted to the nearest points of each point (principal components, weighted by
+    distance). The normal of a point is the mean of those of its own and its neighbors' planes, each
+    weighted by its fit to its own points and to this point. At an edge the planes of one side
+    dominate, near a second sheet those of the point's own sheet, and noise is averaged over many
+    planes. Points that are visible from outside face the viewer; hidden ones follow their
     neighbors, and a surface open to both sides faces away from its middle at the farthest point.
 
     **Arguments:**
 
     - `points`: mm, at least 4 at different places. Those at one place have one normal.
-    - `neighbors`: whose planes count.
+    - `neighbors`: number of neighbors in the mean.
 
     **Source:** Hoppe et al. 1992, "Surface Reconstruction from Unorganized Points", sections 3.2
     and 3.3; weights of Pauly et al. 2003, "Shape Modeling with Point-Sampled Geometry"; planes of
@@ -105,21 +105,21 @@ def outward_signs(
     near: Int[np.ndarray, "n k"],
     reaches: Float[np.ndarray, " n"],
 ) -> Signs:
-    r"""Find the signs that turn normals outward.
+    r"""Compute the signs that orient normals outward.
 
-    The points are looked at from all around. Where a point and its neighbors are seen from one side
-    alone, it is the outer one. From there signs are carried along a minimum spanning tree of the
-    neighborhood graph. Neighbors at `p_i` and `p_j` agree as far as one normal is the mirror image
-    of the other in the plane between the points, as on a circle, around an edge and across a thin
-    sheet, and the cost of an edge is `1.001 - |agreement|`. A part that is seen from both sides
-    alike, or not at all, is turned away from its middle at its farthest point. What hides within a
-    body is a hollow (`_turn_cavities`).
+    The points are viewed from all around. If a point and its neighbors are visible from only one
+    side, that is the outer one. From there signs are propagated along a minimum spanning tree of
+    the neighborhood graph. Neighbors at `p_i` and `p_j` agree as far as one normal is the mirror
+    image of the other in the plane between the points, as on a circle, around an edge and across a
+    thin sheet, and the cost of an edge is `1.001 - |agreement|`. A part that is equally visible
+    from both sides, or invisible, faces away from its middle at its farthest point. Hidden parts
+    inside a body are cavities (`_turn_cavities`).
 
     **Arguments:**
 
     - `normals`: unit, of either sign.
     - `near`: neighbors of each point, without itself, each at another place.
-    - `reaches`: mm, how far away the last of them is.
+    - `reaches`: distance of the last of them, mm.
 
     **Source:** Hoppe et al. 1992, section 3.3; König and Gumhold 2009, "Consistent Propagation of
     Normal Orientations in Point Clouds", for agreement around edges.
@@ -142,10 +142,10 @@ def outward_signs(
 
 
 def _votes(points: np.ndarray, normals: np.ndarray, pixel: float) -> tuple[Signs, Signs]:
-    """Count in how many views each normal points to the viewer less those where it points away, and
-    how many see it at all.
+    """Count for each normal the views that it faces, less those that it faces away from, and the
+    views in which it is visible.
 
-    A point is seen where nothing lies more than a pixel before it and the pixels around. A view
+    A point is visible if nothing is more than a pixel in front of it and the pixels around. A view
     counts by its squared cosine.
     """
     directions = even_directions(_VIEWS)
@@ -183,8 +183,8 @@ def _agreement(
 def _carried(
     points: np.ndarray, normals: np.ndarray, near: np.ndarray, sure: np.ndarray, signs: Signs
 ) -> tuple[Signs, list[np.ndarray]]:
-    """Carry signs from points that are sure of theirs to all others; return also which of these
-    hang together smoothly.
+    """Propagate signs from points with certain signs to all others; also return the smoothly
+    connected patches of the others.
     """
     count, neighbors = near.shape
     free = np.setdiff1d(np.arange(count), sure, assume_unique=True)
@@ -195,7 +195,7 @@ def _carried(
     agreement = _agreement(points, normals, low, high)
     cost = 1.001 - np.minimum(np.abs(agreement), 1.0)
     parts = _components(cost, low, high, count)
-    # Each part without a sure point has its farthest one turned away from its middle.
+    # In each part without a certain point, the farthest point faces away from the middle.
     sizes = np.bincount(parts)
     middles = np.stack([np.bincount(parts, axis) / sizes for axis in points.T], axis=-1)
     outward = points - middles[parts]
@@ -206,7 +206,7 @@ def _carried(
     farthest = farthest[farthest >= 0]
     facing = np.einsum("ni,ni->n", normals[farthest], outward[farthest])
     signs[farthest] = np.where(facing < 0, -1.0, 1.0)
-    # All roots hang on one more node; each other point follows the one ahead of it in the tree.
+    # One more node is the parent of all roots; each other point follows its parent in the tree.
     roots = np.concatenate([sure, farthest])
     ends = np.concatenate([low, roots]), np.concatenate([high, np.full(len(roots), count)])
     costs = np.concatenate([cost, np.full(len(roots), _ROOT)])
@@ -241,7 +241,7 @@ def _turn_cavities(
     patches: Sequence[Int[np.ndarray, " _"]],
     signs: Float[np.ndarray, " n"],
 ) -> None:
-    r"""Turn patches around, in place, that would make a body within a body.
+    r"""Reverse, in place, patches that would form a body inside a body.
 
     The winding number of a surface is 0 outside, 1 inside and on the surface itself their mean,
     1/2. A patch is turned when that brings the number on it, of everything else and of itself,

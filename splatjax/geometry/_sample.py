@@ -1,4 +1,4 @@
-"""Splats: of a triangle mesh with its textures, or of points that lack normals, radii or areas."""
+"""Splats from a triangle mesh with textures, or from points without normals, radii or areas."""
 
 import warnings
 
@@ -38,8 +38,7 @@ class Textures(eqx.Module):
 def lookup_at(
     mesh: Mesh, points: SurfacePoints, picture: Float[np.ndarray, "h w *channels"] | None
 ) -> Float[np.ndarray, "n *channels"] | None:
-    """Look a picture up at points on a mesh, bilinearly between the centers of its pixels,
-    repeating it; `None` for no picture.
+    """Look up a picture at points on a mesh, bilinearly and periodically; `None` for no picture.
 
     **Raises:** `ValueError` when the mesh has no texture coordinates.
     """
@@ -64,7 +63,7 @@ def albedo_at(
     textures: Textures, mesh: Mesh, points: SurfacePoints
 ) -> Float[np.ndarray, "n channels"] | None:
     """Return the albedo of points on a mesh: of its textures, times the colors of its vertices;
-    `None` where it has neither.
+    `None` if it has neither.
     """
     if isinstance(textures.albedo, tuple):
         assert mesh.parts is not None
@@ -117,7 +116,7 @@ def sample_mesh(
     seed: int = 0,
     rounded: bool = False,
 ) -> Splats:
-    r"""Cover a mesh with splats, spread evenly, its textures baked in.
+    r"""Sample evenly spread splats from a mesh, with its textures.
 
     **Arguments:**
 
@@ -125,13 +124,13 @@ def sample_mesh(
     - `count`: of splats, at least 1.
     - `textures`: looked up bilinearly at every splat.
     - `seed`: another spread of the same quality; the same seed gives the same splats.
-    - `rounded`: put them where the surface is that bends as the mesh's normals do, instead of on
+    - `rounded`: place splats on a curved surface that follows the mesh's normals, instead of on
       flat triangles.
 
     **Returns:** splats in Morton order, in JAX's default precision. Their areas are those of their
     Voronoi cells on the surface, all scaled by one factor so that they add up to the surface's
-    area; their radii are `1.5 sqrt(area)`, and at least 1.2 times the way to the farthest corner of
-    the cell, so that the discs leave no hole.
+    area; their radii are `1.5 sqrt(area)`, and at least 1.2 times the distance of the farthest
+    corner of the cell, so that the discs leave no hole.
 
     **Raises:** `ValueError` for a count below 1, a mesh without area, or textures on a mesh without
     UVs.
@@ -142,7 +141,7 @@ def sample_mesh(
 def splats_at(
     mesh: Mesh, points: SurfacePoints, textures: Textures = Textures(), *, rounded: bool = False
 ) -> Splats:
-    """Make splats of points on a mesh, its textures baked in; otherwise as `sample_mesh`."""
+    """Make splats from points on a mesh, with its textures, like `sample_mesh`."""
     centers, area = points.positions(mesh), mesh.area()
     if rounded:
         rounding = Rounding(mesh)
@@ -170,7 +169,7 @@ def _radii(
     images: Float[np.ndarray, "n images 3"] | None = None,
     spacing: float = 0.0,
 ) -> Float[np.ndarray, " n"]:
-    """Choose radii that leave no hole, and reach little beyond the borders of the surface.
+    """Choose radii that leave no hole, and extend little beyond the borders of the surface.
 
     A splat is seen up to about 0.8 of its radius; a third of a spacing beyond a border, these lie
     in a straight line, and the border itself is covered in full.
@@ -197,23 +196,22 @@ def complete_splats(
     specular: Float[np.ndarray, " splats"] | None = None,
     roughness: Float[np.ndarray, " splats"] | None = None,
 ) -> Splats:
-    """Make splats of points, estimating what is not given, and put them in Morton order.
+    """Make splats from points, estimate missing fields, and sort them in Morton order.
 
     **Arguments:**
 
     - `centers`: mm, at least one.
     - `normals`: unit; `None`: from neighbors (`estimate_normals`).
     - `areas`: mm^2; `None`: those of the Voronoi cells in the tangent planes.
-    - `radii`: mm; `None`: as large as the cells ask for, so that no hole is left.
-    - `albedo`, `specular`, `roughness`: as `Splats` has them; never estimated.
+    - `radii`: mm; `None`: as large as the cells require, so that no hole is left.
+    - `albedo`, `specular`, `roughness`: as in `Splats`; never estimated.
 
-    Points that lie alone are kept, estimated as large as their neighbors are, and a warning states
-    how many there are. Points at one place share their area.
+    Isolated points are kept with the size of their neighbors, and a warning reports their number.
+    Points at one place share their area.
 
     **Returns:** as many splats as points, in JAX's default precision.
 
-    **Raises:** `ValueError` when something must be estimated and there are fewer than four points
-    at different places.
+    **Raises:** `ValueError` if a field must be estimated from fewer than four distinct points.
     """
     estimated = normals is None or areas is None or radii is None
     if estimated and (count := len(distinct(centers)[0])) < 4:
@@ -237,15 +235,15 @@ def complete_splats(
 
 
 def _covered(centers: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    r"""Compute areas and radii; those of points that lie alone are their neighbors', lest their
-    discs hide everything.
+    r"""Compute areas and radii; isolated points get those of their neighbors, so that their discs
+    do not hide the body.
 
-    A point lies alone when it is much farther from its neighbors than these are from their own, and
-    no one's neighbor: so neither a place where all points are sparse holds one, nor the border
-    between dense and sparse.
+    A point is isolated if it is much farther from its neighbors than these are from their own, and
+    is no other point's neighbor. Sparse regions and borders between dense and sparse regions
+    therefore have no isolated points.
 
-    **Source:** after Breunig et al. 2000, "LOF: Identifying Density-Based Local Outliers", medians
-    in the place of means.
+    **Source:** after Breunig et al. 2000, "LOF: Identifying Density-Based Local Outliers", with
+    medians instead of means.
     """
     first, place = distinct(centers)
     places = centers[first]

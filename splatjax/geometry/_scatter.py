@@ -1,5 +1,5 @@
-"""Points spread evenly over a triangle mesh, on its triangles or where its normals round it; and
-the share of the surface that belongs to each: Voronoi cells in their tangent planes.
+"""Points spread evenly over a triangle mesh, on its triangles or on a curved surface, and their
+Voronoi cells in the tangent planes.
 """
 
 from concurrent.futures import ThreadPoolExecutor
@@ -43,25 +43,25 @@ def surface_cells(
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
     r"""Measure the Voronoi cell of each point in its tangent plane.
 
-    The border of a cell in the direction `u` lies at `r(u) = min_j |d_j|^2 / (2 d_j . u)` over the
+    The border of a cell in the direction `u` is at `r(u) = min_j |d_j|^2 / (2 d_j . u)` over the
     neighbors at `d_j`; its area is `1/2` the integral of `r^2` over all directions and its centroid
     `1/3` that of `r^3 u`, divided by the area. Neighbors that face away (the other side of a thin
-    sheet) do not count. Where the surface ends, a cell ends at `limit`. Points that coincide share
-    a cell.
+    sheet) do not count. At the border of the surface, a cell ends at `limit`. Coincident points
+    share a cell.
 
     **Arguments:**
 
-    - `points`: mm; fast when they come in Morton order.
+    - `points`: mm; fastest in Morton order.
     - `normals`: unit.
-    - `images`: ways from each point to its mirror images at the borders of the surface, where its
-      cell ends; zero for none.
-    - `neighbors`: how many nearest points are looked at.
+    - `images`: vectors from each point to its mirror images at the borders of the surface; zero for
+      none.
+    - `neighbors`: number of nearest points to consider.
     - `limit`: mm; `None`: 0.75 of the mean distance to the six nearest points.
     - `directions`: of the quadrature. With 32 the area is good to about 1 %.
 
-    **Returns:** per point: the area of its cell (mm^2), its farthest corner (mm), and the way to
-    its centroid (mm). On a closed surface sampled evenly the areas add up to its own within about
-    1 %.
+    **Returns:** per point: the area of its cell (mm^2), its farthest corner (mm), and the vector to
+    its centroid (mm). On a closed surface sampled evenly the areas add up to its own within about 1
+    %.
     """
     count = len(points)
     if count == 1:
@@ -135,17 +135,17 @@ class SurfacePoints(NamedTuple):
 
 
 def scatter(mesh: Mesh, count: int, *, seed: int = 0, relaxations: int = 4) -> SurfacePoints:
-    r"""Spread points over a mesh, one density everywhere, each far from its neighbors (blue noise).
+    r"""Spread points over a mesh with uniform density and blue noise.
 
-    Points are dealt out evenly along a Morton curve of the triangles, by a low-discrepancy sequence
-    inside each, then moved `relaxations` times to the centroids of their Voronoi cells (Lloyd),
-    along the surface.
+    Points are distributed evenly along a Morton curve of the triangles, by a low-discrepancy
+    sequence inside each, then moved `relaxations` times to the centroids of their Voronoi cells
+    (Lloyd), along the surface.
 
     **Arguments:**
 
     - `mesh`: with positive area.
-    - `count`: of points, at least 1.
-    - `seed`: another spread of the same quality; the same seed gives the same points.
+    - `count`: number of points, at least 1.
+    - `seed`: of the random positions; the same seed gives the same points.
 
     **Returns:** the points, in Morton order.
 
@@ -194,7 +194,7 @@ def mirror_images(
 ) -> Float[np.ndarray, "n images 3"]:
     """Mirror each point at the borders of a mesh within about a spacing of it.
 
-    **Returns:** the way to each image; zero where there is none.
+    **Returns:** the vector to each image; zero if there is none.
     """
     faces, corners = np.nonzero(beyond < 0)
     if not len(faces):
@@ -230,7 +230,7 @@ def _barycentrics(mesh: Mesh, faces: np.ndarray, points: np.ndarray) -> np.ndarr
 
 
 def _settle(mesh: Mesh, beyond: np.ndarray, faces: np.ndarray, points: np.ndarray) -> SurfacePoints:
-    """Put points that left their faces back onto the mesh, by walking across edges towards them."""
+    """Move points that left their faces back onto the mesh, by walking across edges."""
     faces = faces.copy()
     barycentrics = _barycentrics(mesh, faces, points)
     outside = np.flatnonzero(barycentrics.min(axis=1) < -_EDGE_TOLERANCE)
@@ -252,7 +252,7 @@ _QUARTERS = np.asarray([[0, 3, 5], [1, 4, 3], [2, 5, 4], [3, 4, 5]])
 
 
 class Rounding:
-    r"""The surface that bends as the normals of a mesh do, instead of its flat triangles.
+    r"""A curved surface that follows the normals of a mesh.
 
     Flat triangles under smooth normals shade themselves where the normals still face the light,
     triangle by triangle: a ragged edge between light and shadow. The surface through the vertices

@@ -1,4 +1,4 @@
-"""The only package that touches files: splats, meshes, pictures, materials."""
+"""Reads and writes files of splats, meshes, pictures and materials."""
 
 from ._files import (
     atomic_path as atomic_path,

@@ -1,5 +1,5 @@
-"""What is checked before a file is opened: that it exists, and has a unit; files that are written
-whole or not at all; and records as JSON, of what a file is made of.
+"""Checks before a file is opened (existence, unit), atomic writing, and JSON records of the
+settings of a file.
 """
 
 import hashlib
@@ -35,7 +35,7 @@ def existing_file(path: StrPath) -> Path:
 
 @contextmanager
 def naming(where: StrPath) -> Generator[None, None, None]:
-    """Let errors name the file, or the place in it, whose contents they refuse."""
+    """Add the file, or the place in it, to errors about its contents."""
     try:
         yield
     except (ValueError, FileNotFoundError) as error:
@@ -43,7 +43,7 @@ def naming(where: StrPath) -> Generator[None, None, None]:
 
 
 def check_units(path: StrPath, mm_per_unit: float, up: str = "y") -> None:
-    """Refuse a length of the unit (mm), or an upward axis, that cannot be."""
+    """Raise `ValueError` for an invalid length of the unit (mm) or an invalid upward axis."""
     if not 0 < mm_per_unit < np.inf:
         raise ValueError(
             f"{path}: mm_per_unit is {mm_per_unit}; give the positive length of the file's "
@@ -54,17 +54,17 @@ def check_units(path: StrPath, mm_per_unit: float, up: str = "y") -> None:
 
 
 def with_y_up(vectors: Float[np.ndarray, "n 3"], up: str) -> Float[np.ndarray, "n 3"]:
-    """Turn vectors of a file by a quarter around x, so that its upward axis becomes +y."""
+    """Rotate vectors of a file by 90 degrees around x, so that its upward axis becomes +y."""
     return vectors if up == "y" else vectors[:, [0, 2, 1]] * [1, 1, -1]
 
 
 @contextmanager
 def atomic_path(path: StrPath) -> Generator[Path, None, None]:
-    """Yield a temporary path beside `path`, with its suffix, to write to; it takes the name `path`
-    when the block ends well.
+    """Yield a temporary path beside `path`, with its suffix; it is renamed to `path` if the block
+    succeeds.
 
-    When the block raises, the temporary file is removed and what stood at `path` before is
-    untouched. Only a process that is killed leaves it behind.
+    If the block raises, the temporary file is removed and an existing file at `path` is unchanged.
+    Only a killed process leaves the temporary file.
 
     **Raises:** `FileNotFoundError` when the folder does not exist, another `OSError` that names
     `path` when it cannot be written, such as `IsADirectoryError`.
@@ -97,7 +97,7 @@ def atomic_path(path: StrPath) -> Generator[Path, None, None]:
 
 
 def fingerprint(path: StrPath) -> str:
-    """Return what distinguishes the contents of a file: its size and its SHA-256.
+    """Return the size and the SHA-256 of a file.
 
     **Raises:** `OSError` when the file cannot be read.
     """
@@ -107,7 +107,7 @@ def fingerprint(path: StrPath) -> str:
 
 
 def write_record(path: StrPath, record: Mapping[str, Any]) -> None:
-    """Write a record as JSON, whole or not at all.
+    """Write a record as JSON, completely or not at all.
 
     **Raises:** `FileNotFoundError` when the folder does not exist.
     """
@@ -116,9 +116,9 @@ def write_record(path: StrPath, record: Mapping[str, Any]) -> None:
 
 
 def read_record(path: StrPath) -> dict[str, Any]:
-    """Read what `write_record` wrote.
+    """Read a record that `write_record` wrote.
 
-    **Raises:** `FileNotFoundError`, or `ValueError` when the file is no record.
+    **Raises:** `FileNotFoundError`, or `ValueError` if the file is not a record.
     """
     try:
         record = json.loads(Path(path).read_text(encoding="utf-8"))
@@ -132,11 +132,11 @@ def read_record(path: StrPath) -> dict[str, Any]:
 
 
 def save_exports(material: Material, path: StrPath) -> None:
-    r"""Write a material's Gaussians in the terms of other renderers to a JSON file
-    (`splatjax.exports.data_sheet`), whole or not at all.
+    r"""Write a material's Gaussians as parameters of other renderers to a JSON file
+    (`splatjax.exports.data_sheet`), completely or not at all.
 
-    **Raises:** `ValueError` for a material with single scattering as a term of its own, which other
-    renderers have no number for; `OSError` if the file cannot be written.
+    **Raises:** `ValueError` for a material with separate single scattering, for which other
+    renderers have no parameter; `OSError` if the file cannot be written.
     """
     if material.single_scattering is not None:
         raise ValueError(

@@ -1,6 +1,6 @@
 """Pictures of every format that OpenImageIO reads, as arrays with row 0 at the top; PNG and WebP
-for the screen, and the sRGB transfer function (IEC 61966-2-1), both ways; a frame with all its
-layers in one OpenEXR file.
+for displays; the sRGB transfer function (IEC 61966-2-1) and its inverse; frames with all layers as
+OpenEXR.
 """
 
 import errno
@@ -25,10 +25,11 @@ _BYTES_PER_VALUE = 24.0  # in double precision, while they are decoded
 def read_planes(
     path: StrPath,
 ) -> tuple[dict[str, Float[np.ndarray, "height width"]], dict[str, Any], bool]:
-    """Read the channels of a picture by name; whole numbers become shares of the greatest that
-    their type holds. Nothing is decoded, and alpha is not multiplied in.
+    """Read the channels of a picture by name. Integers are divided by the maximum of their type.
+    Nothing is decoded, and alpha is not multiplied.
 
-    **Returns:** channels, attributes of the file, and whether it holds floating-point numbers.
+    **Returns:** channels, attributes of the file, and whether its values are floating-point
+    numbers.
 
     **Raises:** `FileNotFoundError`, or `ValueError` when the file cannot be read, is cut short or
     does not fit into memory.
@@ -66,7 +67,7 @@ def read_picture(path: StrPath) -> Float[np.ndarray, "height width channels"]:
     **Returns:** R, G and B, or Y alone, as in the file.
 
     **Raises:** `FileNotFoundError`, or `ValueError` when the file cannot be read, has neither R, G
-    and B nor Y, or holds whole numbers, which are encoded for a display.
+    and B nor Y, or has integers, which are encoded for a display.
     """
     values, is_linear = _colors(path)
     if not is_linear:
@@ -75,13 +76,13 @@ def read_picture(path: StrPath) -> Float[np.ndarray, "height width channels"]:
 
 
 def read_map(path: StrPath) -> Float[np.ndarray, "height width 3"]:
-    """Read a map that holds no color: three channels, not decoded."""
+    """Read a map of data other than color: three channels, not decoded."""
     values, _ = _colors(path)
     return np.broadcast_to(values, (*values.shape[:2], 3))
 
 
 def read_color(path: StrPath) -> Float[np.ndarray, "height width 3"]:
-    """Read an albedo in linear light: whole numbers are sRGB, floating-point numbers are linear.
+    """Read an albedo in linear light: integers are sRGB, floating-point numbers are linear.
 
     **Raises:** as `read_picture` does, and `ValueError` for values outside [0, 1].
     """
@@ -117,15 +118,15 @@ def write_png(
     *,
     exposure: float = 0.0,
 ) -> None:
-    r"""Write a picture for an sRGB display, 8 bits, whole or not at all.
+    r"""Write a picture for an sRGB display, 8 bits, completely or not at all.
 
     **Arguments:**
 
-    - `picture`: a frame, whose beauty over black is shown; or linear values of 1 (gray), 3 (RGB) or
-      4 channels (RGB premultiplied by the alpha that follows, which is written as PNG wants it: not
-      premultiplied, encoded color).
-    - `exposure`: in stops: the values are multiplied by `2^exposure` before they are encoded. What
-      exceeds 1 is clipped.
+    - `picture`: a frame, whose beauty over black is written; or linear values of 1 (gray), 3 (RGB)
+      or 4 channels (RGB premultiplied by alpha, and alpha; written without premultiplication, as
+      PNG requires).
+    - `exposure`: in stops: the values are multiplied by `2^exposure` before they are encoded.
+      Values above 1 are clipped.
 
     **Raises:** `ValueError` for another number of channels or an exposure that is not finite,
     `FileNotFoundError` when the folder does not exist.
@@ -150,14 +151,14 @@ def write_png(
 def write_animation(
     path: StrPath, frames: Sequence[StrPath], *, frames_per_second: float = 24.0
 ) -> None:
-    r"""Join pictures to one animated WebP file that begins again for ever, whole or not at all.
+    r"""Join pictures to one endlessly repeating animated WebP file, completely or not at all.
 
-    Nothing is lost: it has the frames' own colors. Every browser plays it.
+    It is lossless, and plays in every browser.
 
     **Arguments:**
 
-    - `frames`: PNG files, in their order: one at least, all of one size.
-    - `frames_per_second`: from 0.1 to 60; browsers slow down what is faster.
+    - `frames`: PNG files in order, at least one, all of one size.
+    - `frames_per_second`: from 0.1 to 60; browsers slow down faster ones.
 
     **Raises:** `ValueError` for no frames, frames of several sizes, and a speed out of range;
     `OSError` when a frame cannot be read, or the folder does not exist.
@@ -205,7 +206,8 @@ def write_exr(
     variances: Sequence[float] | None = None,
     manifest: Mapping[str, Any] | None = None,
 ) -> None:
-    r"""Write a frame and all its layers to an OpenEXR file, single precision, whole or not at all.
+    r"""Write a frame and all its layers to an OpenEXR file, single precision, completely or not at
+    all.
 
     | channels | what they are |
     | --- | --- |
@@ -218,10 +220,10 @@ def write_exr(
     | `diffusion.1.R G B`, ... | per Gaussian: `diffuse = sum_k weights_k diffusion.k` |
 
     Pictures of another number of channels than 3 have `beauty.1`, `beauty.2`, ..., `albedo.1`, ...
-    instead of R G B. The header holds the weights of the Gaussians (`splatjax.weights.1`, ...: a
-    value per channel), their variances (mm^2) when given, and the color space: linear, Rec. 709
-    primaries, D65; and, as JSON in `splatjax.manifest`, what the picture was made of, when that is
-    given (`read_manifest`).
+    instead of R G B. The header contains the weights of the Gaussians (`splatjax.weights.1`, ...: a
+    value per channel), their variances (mm^2) if given, the color space (linear, Rec. 709
+    primaries, D65), and, if given, the settings of the picture as JSON in `splatjax.manifest`
+    (`read_manifest`).
 
     **Raises:** `FileNotFoundError` when the folder does not exist.
     """
@@ -260,7 +262,7 @@ def write_exr(
 
 
 def read_exr(path: StrPath) -> Frame:
-    r"""Read a frame that `write_exr` wrote: what was single precision comes back bit by bit.
+    r"""Read a frame that `write_exr` wrote; single precision is restored exactly.
 
     **Raises:** `FileNotFoundError`, or `ValueError` when the file cannot be read or lacks the
     layers of a frame.
@@ -290,7 +292,7 @@ def read_exr(path: StrPath) -> Frame:
 
 
 def read_manifest(path: StrPath) -> dict[str, Any]:
-    r"""Read what a picture was made of, as the command line records it: settings, material.
+    r"""Read the manifest of a picture, as the command line records it: settings, material.
 
     **Raises:** `FileNotFoundError`, or `ValueError` when the file cannot be read or has no such
     record.

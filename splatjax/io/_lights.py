@@ -1,6 +1,4 @@
-"""Lights from files: environments, and pictures that were taken under lights, with their cameras,
-as a TOML file names them.
-"""
+"""Environments from files, and TOML files that list pictures with their cameras and lights."""
 
 from pathlib import Path
 from typing import Any
@@ -41,7 +39,7 @@ _LIGHT_ENTRIES = {"kind"}.union(*(names for _, names in _LIGHTS.values()))
 def load_environment(path: StrPath, **fields: Any) -> EnvironmentLight:
     r"""Read an environment light: a latitude-longitude map of OpenEXR, Radiance HDR or another
     format of floating-point numbers. Maps of more than 512 rows are halved, by averaging, while
-    both sides are even, which hardly changes samples and highlights.
+    both sides are even, with little effect on samples and highlights.
 
     **Arguments:** `fields`: the others of `EnvironmentLight`, by name.
 
@@ -56,7 +54,7 @@ def load_environment(path: StrPath, **fields: Any) -> EnvironmentLight:
 
 
 def read_observations(path: StrPath) -> list[Observation]:
-    r"""Read which pictures were taken, and how.
+    r"""Read a list of pictures with their cameras and lights.
 
         [[pictures]]
         file = "left.exr"           # linear light: R, G and B, or Y; beside this file
@@ -77,8 +75,8 @@ def read_observations(path: StrPath) -> list[Observation]:
 
     **Returns:** an `Observation` for each picture, in JAX's default precision.
 
-    **Raises:** `ValueError` for a file that is none of these: what is wrong, and what would be
-    right; `FileNotFoundError` for a picture that is missing.
+    **Raises:** `ValueError` for any other content, with the fault and the remedy;
+    `FileNotFoundError` for a missing picture.
     """
     path = Path(path)
     file = Table(path, "", read_toml(path, "name one that lists pictures"), ["pictures"])
@@ -87,7 +85,7 @@ def read_observations(path: StrPath) -> list[Observation]:
 
 
 def picture_paths(path: StrPath) -> list[Path]:
-    """Return the files that the observations of a file are read from, itself first."""
+    """Return the files of the observations of a file, itself first."""
     path = Path(path)
     pictures = read_toml(path, "name one that lists pictures")["pictures"]
     return [path] + [

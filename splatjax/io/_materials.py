@@ -1,6 +1,4 @@
-"""Materials as TOML files: optical coefficients, where they come from, and the Gaussians fitted to
-them.
-"""
+"""Materials as TOML files: optical coefficients, their source, and the Gaussians fitted to them."""
 
 import re
 from collections.abc import Mapping
@@ -46,7 +44,7 @@ from ._tables import Table, nearest, read_toml
 VARIANCE_UNIT = "mm^2"
 _TABLES = ("medium", "layers", "skin", "surface", "single_scattering", "angles", "source", "fit")
 _SURFACE = ("eta", "specular", "roughness")
-# What [fit] calls a profile whose coefficients the file holds.
+# Names in [fit] of profiles whose coefficients are in the file.
 _MODELS: dict[type, str] = {
     Dipole: "classical dipole",
     BetterDipole: "better dipole",
@@ -70,7 +68,7 @@ def list_materials() -> tuple[str, ...]:
 
 
 def material_path(name_or_path: StrPath) -> Path:
-    """Return the file behind what `load_material` takes: that of a name, or the path itself.
+    """Return the file of an argument of `load_material`: that of a name, or the path itself.
 
     **Raises:** `ValueError` for an unknown name.
     """
@@ -94,8 +92,8 @@ def load_material(name_or_path: StrPath) -> Material:
 
     **Returns:** a `Material` in JAX's default precision; variances in mm^2, ascending.
 
-    **Raises:** `ValueError` for an unknown name, and for a file that is no material: what is wrong,
-    and what would be right.
+    **Raises:** `ValueError` for an unknown name, and for a file that is not a material, with the
+    fault and the remedy.
     """
     tables, profile = _read(name_or_path)
     if "fit" not in tables.entries:
@@ -129,8 +127,7 @@ def load_material(name_or_path: StrPath) -> Material:
 def surface_and_source(
     name_or_path: StrPath,
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    r"""Return what a file says of a material besides its coefficients: its surface, as `Material`
-    takes it, and its [source].
+    r"""Return the surface of a material's file, as arguments of `Material`, and its [source].
 
     **Raises:** `ValueError` as `load_material` does.
     """
@@ -160,7 +157,7 @@ def load_medium(name_or_path: StrPath) -> Medium:
 
 
 def load_mean_cosine(name_or_path: StrPath) -> float:
-    r"""Load `g`, the mean cosine of a material's phase function: 0 where its file has none.
+    r"""Load `g`, the mean cosine of a material's phase function: 0 if its file has none.
 
     **Raises:** `ValueError` as `load_material` does.
     """
@@ -171,7 +168,7 @@ def load_mean_cosine(name_or_path: StrPath) -> float:
 
 
 def load_profile(name_or_path: StrPath) -> Dipole | LayeredMultipole | Skin:
-    r"""Load the coefficients of a material as the profile that its Gaussians stand for, or its
+    r"""Load the coefficients of a material as the profile that its Gaussians approximate, or its
     pigments.
 
     **Arguments:**
@@ -195,17 +192,16 @@ def save_material(
     fit: Mapping[str, Any] | None = None,
     g: float = 0.0,
 ) -> None:
-    r"""Write a material to a TOML file, whole or not at all.
+    r"""Write a material to a TOML file, completely or not at all.
 
     **Arguments:**
 
-    - `material`: one material (no batch); written with the digits it needs to be read back as it
-      was.
+    - `material`: one material (no batch); written with enough digits to be restored exactly.
     - `path`: of the file; its folder must exist.
-    - `profile`: what the Gaussians were fitted to; its coefficients are written in the place of the
-      material's `medium`, and in [fit] what it is.
-    - `source`: where the numbers come from: `citation`, `provenance`, ...
-    - `fit`: more to be kept in [fit]: `error`, `energy_error`, ...
+    - `profile`: the profile of the fit; its coefficients are written instead of the material's
+      `medium`, and its kind in [fit].
+    - `source`: source of the numbers: `citation`, `provenance`, ...
+    - `fit`: further entries of [fit]: `error`, `energy_error`, ...
     - `g`: mean cosine of the phase function, kept in [medium].
 
     **Raises:** `OSError` if the file cannot be written, `ValueError` for another kind of profile.
@@ -312,8 +308,7 @@ def _description(profile: Dipole | BetterDipole | PhotonBeam | LayeredMultipole 
 
 
 def dipole_starts() -> DipoleStarts:
-    r"""Read where fits of 1 to 8 Gaussians to dipoles start: one descent then finds what a search
-    would.
+    r"""Read the starts of fits of 1 to 8 Gaussians to dipoles; one descent then replaces a search.
 
         fit_gaussians(Dipole(medium), 6, spread=VariancesPerChannel(), start=dipole_starts()(medium,
         6))

@@ -24,8 +24,8 @@ LAYER_ENTRIES = (*MEDIUM_ENTRIES, "optical_depth", "thickness", "thickness_unit"
 
 
 def medium_of(table: Table) -> Medium:
-    """Make the medium of a table, which gives reduced scattering; or scattering and its mean
-    cosine; or a color and a mean free path.
+    """Make the medium of a table of reduced scattering, of scattering and its mean cosine, or of a
+    color and a mean free path.
     """
     given = (table.entries.keys() & set().union(*_WAYS)) - {"g"}
     if given not in [way - {"g"} for way in _WAYS] or ("sigma_s" in given) > ("g" in table.entries):
@@ -74,7 +74,7 @@ def plain_layer(layer: Layer | Film) -> dict[str, Any]:
 
 
 def skin_of(table: Table) -> Skin:
-    """Make the skin of a table; what it leaves out has the default of `Skin`."""
+    """Make the skin of a table; missing entries have the defaults of `Skin`."""
     numbers = {name: table.number(name) for name in table.entries if name != "wavelengths"}
     if "wavelengths" in table.entries:
         return table.make(Skin, **numbers, wavelengths=table.numbers("wavelengths"))

@@ -1,5 +1,5 @@
-"""Meshes from files, with their maps, and splats that cover them: their triangles as trimesh reads
-them, checked once, whatever the format.
+"""Meshes from files, with their maps, and splats sampled from them. trimesh reads the triangles;
+they are checked once for all formats.
 """
 
 import re
@@ -37,9 +37,9 @@ _ENDS = re.compile(rb'"wrap[ST]" *: *(33071|33648)')  # a texture of glTF that d
 class Piece(NamedTuple):
     """Triangles of one material, in the file's unit.
 
-    Normals are zero where they are to be estimated. Texture coordinates and colors of vertices are
-    NaN where there are none. Colors of vertices, the material's `color` and the `texture`, an
-    encoded picture, are multiplied.
+    Zero normals will be estimated. Missing texture coordinates and colors of vertices are NaN.
+    Colors of vertices, the material's `color` and the `texture`, an encoded picture, are
+    multiplied.
     """
 
     mesh: Any  # a `Mesh` with all its arrays
@@ -62,30 +62,30 @@ def sample_mesh(
     seed: int = 0,
     rounded: bool = True,
 ) -> Splats:
-    r"""Cover the mesh in a file (GLB, glTF, OBJ, PLY, STL, OFF) with splats, its maps and the
-    colors of its vertices baked in.
+    r"""Sample splats from the mesh in a file (GLB, glTF, OBJ, PLY, STL, OFF), with its maps and the
+    colors of its vertices.
 
     **Arguments:**
 
-    - `count`: of splats.
+    - `count`: number of splats.
     - `mm_per_unit`: length of the file's unit, mm. glTF prescribes meters (1000), yet many scans
       ignore that.
-    - `albedo`: picture, sRGB, or linear if it holds floating-point numbers; `None`: the base color
-      textures that the file itself carries, if any.
+    - `albedo`: picture, sRGB, or linear for floating-point numbers; `None`: the base color textures
+      of the file, if any.
     - `specular`: gray picture, not decoded: factor on the material's specular strength.
     - `normal`: tangent-space normal map, not decoded; green points up.
-    - `v_up`: whether v = 0 is the *lower* edge of a map. `None` means what the format prescribes:
-      yes for all but glTF and GLB. Files converted without care need `True`: with the wrong choice
-      the lips land on the chin.
+    - `v_up`: whether v = 0 is the *lower* edge of a map. `None` uses the rule of the format: yes
+      for all except glTF and GLB. Wrongly converted files need `True`: otherwise the texture is
+      upside down.
     - `up`: the file's upward axis, `"y"` or `"z"`; splats have +y up.
-    - `crop_min_y`: what lies below this height, in the file's unit, is cut off.
+    - `crop_min_y`: the mesh below this height, in the file's unit, is removed.
     - `crease_angle`: degrees from 0 to 180. Edges between triangles that differ by more are hard,
-      where the file has no normals, or normals that are more than this off their triangles.
-    - `seed`: another spread of the same quality.
-    - `rounded`: put splats on the surface that bends as the mesh's normals do; otherwise on its
-      flat triangles, whose edges show where light ends. Hard edges stay straight.
+      if the file has no normals, or normals that differ by more than this from their triangles.
+    - `seed`: of the random positions.
+    - `rounded`: place splats on a curved surface that follows the mesh's normals, instead of on its
+      flat triangles, whose edges are visible at the edge of light. Hard edges stay straight.
 
-    **Returns:** splats in mm; `splatjax.geometry.sample_mesh` describes how they are spread.
+    **Returns:** splats in mm; `splatjax.geometry.sample_mesh` describes their distribution.
 
     **Raises:** `FileNotFoundError`, or `ValueError` that names the file, the fault and the
     remedy.
@@ -157,7 +157,7 @@ def _read_pieces(path: Path, up: str) -> list[Piece]:
     """Read the triangles of a file, a piece for each material and place, with +y up.
 
     **Raises:** `ValueError` when the file cannot be read, has no triangle, values that are not
-    finite or faces that name vertices it does not have; or does not fit into memory.
+    finite or faces of missing vertices; or does not fit into memory.
     """
     kind = path.suffix[1:].lower()
     if kind not in FORMATS:
@@ -172,7 +172,7 @@ def _read_pieces(path: Path, up: str) -> list[Piece]:
         read = sum(len(piece.mesh.faces) for piece in pieces.values())
         if found["triangles"] not in (None, read):
             raise ValueError(f"{found['triangles']} triangles were expected, and {read} were read")
-        # Nodes come after those that they hang on.
+        # Parents come before their children.
         world, placed = {found.get("base_frame"): np.eye(4)}, []
         for node in found.get("graph", [{"geometry": name} for name in pieces]):
             matrix = world[node.get("frame_from")] @ node.get("matrix", np.eye(4))
@@ -205,7 +205,7 @@ def _piece(table: dict[str, Any], kind: str, columns: dict[str, Any]) -> Piece:
         material = visual.material
         image = getattr(material, "image", getattr(material, "baseColorTexture", None))
         texture = image.fp.getvalue() if hasattr(image, "fp") else None
-        # Programs that lay a map leave a gray Kd behind.
+        # Exporters write a gray Kd beside a map.
         plain = {} if texture else getattr(material, "kwargs", {})
         factor = getattr(material, "baseColorFactor", None)
         color = color * plain.get("kd", 1.0) if factor is None else factor[:3] / 255
@@ -224,8 +224,8 @@ def _piece(table: dict[str, Any], kind: str, columns: dict[str, Any]) -> Piece:
 
 
 def _placed(piece: Piece, matrix: Float[np.ndarray, "4 4"], up: str, repeats: bool) -> Piece:
-    """Move a piece to its place in the scene, turn it so that +y is up, and validate it. A mirror
-    turns its triangles around, so that they face outward again.
+    """Transform a piece to its place in the scene, with +y up, and validate it. After a reflection
+    its triangles are reversed, so that they face outward.
     """
     mesh, linear = piece.mesh, matrix[:3, :3]
     turn = slice(None, None, -1 if np.linalg.det(linear) < 0 else 1)

@@ -1,4 +1,4 @@
-"""Splats in PLY files, read at once or, of files that are larger than memory, a part at a time."""
+"""Splats in PLY files, read at once or, for files that are larger than memory, part by part."""
 
 import warnings
 from collections.abc import Iterator, Mapping
@@ -26,7 +26,7 @@ _COMPLETE = (
     "estimates normals, radii and areas, and `splatjax sample` of a mesh writes them"
 )
 _GAUSSIAN_SPLATTING = {"f_dc_0", "scale_0", "rot_0"}
-# Columns of the vertices of a PLY file, by the fields of splats that they stand for.
+# Columns of the vertices of a PLY file, by the corresponding fields of splats.
 _COLUMNS = {
     "centers": [("x", "y", "z")],
     "normals": [("nx", "ny", "nz")],
@@ -65,8 +65,7 @@ def read_splats(path: StrPath, *, mm_per_unit: float = 1.0, up: str = "y") -> Sp
     | `red green blue` | albedo: integers are sRGB up to the type's maximum, floats are linear |
     | `specular`, `roughness` | factors on the material's |
 
-    Other properties and elements are left alone; where there are faces and no radii, a warning says
-    so.
+    Other properties and elements are ignored; faces without radii cause a warning.
 
     **Arguments:**
 
@@ -75,8 +74,8 @@ def read_splats(path: StrPath, *, mm_per_unit: float = 1.0, up: str = "y") -> Sp
 
     **Returns:** splats in mm, in JAX's default precision and in Morton order.
 
-    **Raises:** `FileNotFoundError`, or `ValueError` when the file is no PLY, is cut short, has no
-    points, values that are not finite, radii or areas that are not positive, or holds a
+    **Raises:** `FileNotFoundError`, or `ValueError` if the file is not PLY, is truncated, has no
+    points, has values that are not finite or radii or areas that are not positive, or is a
     Gaussian-splatting scene.
     """
     path = existing_file(path)
@@ -98,7 +97,7 @@ def read_splats(path: StrPath, *, mm_per_unit: float = 1.0, up: str = "y") -> Sp
 
 
 def write_splats(path: StrPath, splats: Splats) -> None:
-    r"""Write splats to a binary PLY file, in mm, as float32, whole or not at all.
+    r"""Write splats to a binary PLY file, in mm, as float32, completely or not at all.
 
     Albedo of three channels is written as linear `red green blue` floats (no loss), so that
     `read_splats` gives it back.
@@ -132,8 +131,7 @@ def write_splats(path: StrPath, splats: Splats) -> None:
 
 
 class SplatFile:
-    r"""Complete splats in a binary PLY file, read a part at a time: what `splatjax.render_streamed`
-    asks for.
+    r"""Complete splats in a binary PLY file, read part by part, for `splatjax.render_streamed`.
 
     Their order is that of the file: splats that are near in space should be near in it
     (`read_splats` sorts, a stream cannot).
@@ -141,12 +139,12 @@ class SplatFile:
     **Arguments:**
 
     - `path`: a PLY file whose vertices have `x y z`, `nx ny nz`, `radius` and `area`, as
-      `read_splats` reads them, stand first, and have no lists.
-    - `part`: splats of a part; about 1 kB of memory each.
+      `read_splats` reads them, are the first element, and have no lists.
+    - `part`: number of splats of a part; about 1 kB of memory each.
     - `mm_per_unit`: length of the file's unit, mm.
     - `up`: the file's upward axis, `"y"` or `"z"`.
 
-    **Raises:** `FileNotFoundError`, or `ValueError` when the file is no binary PLY, is cut short,
+    **Raises:** `FileNotFoundError`, or `ValueError` if the file is not a binary PLY, is truncated,
     or lacks one of these.
     """
 
@@ -182,10 +180,10 @@ class SplatFile:
 
     def __call__(self) -> Iterator[Splats]:
         """Yield all splats from the beginning, in mm and in JAX's default precision, in parts of
-        one size but the last.
+        one size except for a smaller last one.
 
         **Raises:** `ValueError` when numbers are not finite, or not as `read_splats` reads them;
-        how large the whole is turns out at the end.
+        the size of the whole is checked at the end.
         """
         corners = []
         for begin in range(0, self.count, self.part):
@@ -201,7 +199,7 @@ class SplatFile:
         _check_places(self.path, np.stack(corners), estimated=False)
 
     def _rows(self, begin: int, count: int) -> np.memmap:
-        """Map a part alone: pages of a larger map that were read would count as memory."""
+        """Map only one part: the read pages of a larger map would count as memory."""
         offset = self._offset + begin * self._columns.itemsize
         return np.memmap(self.path, self._columns, "r", offset, count)
 
@@ -211,7 +209,7 @@ def _splat_fields(
 ) -> dict[str, Any]:
     """Return the fields of splats that columns hold, in mm and with +y up; `None` for others.
 
-    **Raises:** `ValueError` for values that are not finite, or that no splat may have.
+    **Raises:** `ValueError` for values that are not finite, or invalid for splats.
     """
     if columns.keys() >= _GAUSSIAN_SPLATTING:
         raise ValueError(
@@ -242,7 +240,7 @@ def _splat_fields(
 
 
 def _check_places(path: Path, centers: Float[np.ndarray, "n 3"], *, estimated: bool) -> None:
-    """Refuse points that lie where numbers of JAX's default precision cannot tell them apart."""
+    """Raise `ValueError` for points that JAX's default precision does not resolve."""
     low, high = centers.min(axis=0), centers.max(axis=0)
     reach, extent = float(np.abs([low, high]).max()), float((high - low).max())
     resolved = float(jnp.finfo(jnp.result_type(float)).eps) * reach

@@ -1,4 +1,4 @@
-"""Where spectra become color: by illuminant and observer."""
+"""Conversion of spectra to color, by illuminant and observer."""
 
 import numpy as np
 from jaxtyping import Float
@@ -16,8 +16,8 @@ def spectrum_to_rgb(
     r"""Compute the matrix from a spectrum to linear sRGB: `spectrum @ matrix`.
 
     The spectrum is linear between the wavelengths and constant beyond them. A surface that reflects
-    all light has the color (1, 1, 1) under every illuminant: the color of the light belongs to the
-    light of a scene.
+    all light has the color (1, 1, 1) under every illuminant; the color of the light is a property
+    of the lights of a scene.
 
     **Arguments:**
 

@@ -1,5 +1,5 @@
-"""Tables in files: TOML, with errors that say what an entry must be; measured profiles, and many
-media, as CSV.
+"""Tables in files: TOML, with errors that name the valid entries; measured profiles and media as
+CSV.
 """
 
 import csv
@@ -39,7 +39,8 @@ def read_toml(path: Path, remedy: str) -> dict[str, Any]:
 class Table:
     """A table of a TOML file, whose entries are checked as they are read.
 
-    **Raises:** `ValueError` for what is no table, and for an entry that is not among the `known`.
+    **Raises:** `ValueError` for anything but a table, and for an entry that is not among the
+    `known`.
     """
 
     def __init__(self, path: Path, name: str, entries: Any, known: Iterable[str]):
@@ -78,7 +79,7 @@ class Table:
     def numbers(self, name: str, default: float | None = None) -> Array:
         """Return a number, a list of numbers or rows of them, in JAX's default precision.
 
-        Ranges and shapes are checked by the records that are made of them (`make`).
+        The records made from them (`make`) check ranges and shapes.
         """
         given = self.entries.get(name, default)
         kinds = {type(leaf) for leaf in jax.tree.leaves(given)}
@@ -97,7 +98,7 @@ class Table:
         return float(values)
 
     def make(self, make: Callable[..., Made], *args: Any, **named: Any) -> Made:
-        """Make a record of entries; errors that it raises name the table."""
+        """Make a record from entries; its errors name the table."""
         with naming(self.where):
             return make(*args, **named)
 
@@ -110,14 +111,12 @@ def nearest(name: str, known: Iterable[str]) -> str:
 
 
 def rounded(values: Any) -> np.ndarray:
-    """Round numbers to JAX's default precision: what is too large becomes infinite, what is too
-    small 0.
-    """
+    """Round numbers to JAX's default precision; too large ones become infinite, small ones 0."""
     with np.errstate(over="ignore", under="ignore"):
         return np.asarray(values, np.float64).astype(jnp.result_type(float))
 
 
-# Units of length that the names of a table's columns may give.
+# Units of length in the names of a table's columns.
 _MM = {"mm": 1.0, "cm": 10.0, "um": 1e-3, "µm": 1e-3}
 _COLUMNS = "sigma_a", "sigma_s_prime", "eta"
 
@@ -126,14 +125,14 @@ def read_profile(path: StrPath, *, mm_per_unit: float = 1.0) -> Tabulated:
     r"""Read a measured profile from a CSV file: a column of radii, and one of values for each
     channel.
 
-    Empty lines and those that begin with `#` are left out; a first line of names may stand above.
-    If it gives a unit of length, that must be `mm_per_unit`. Radii ascend.
+    Empty lines and lines that begin with `#` are ignored. The first line may contain names; a unit
+    of length in it must agree with `mm_per_unit`. Radii ascend.
 
     **Arguments:**
 
     - `path`: of the file.
-    - `mm_per_unit`: of the file's unit of length, in which the radii are; values are counted in one
-      over its square.
+    - `mm_per_unit`: length of the file's unit, mm. Radii are in this unit, and values in one over
+      its square.
 
     **Returns:** a `Tabulated` in JAX's default precision, mm and 1/mm^2.
 
@@ -202,7 +201,8 @@ def read_media(path: StrPath) -> tuple[list[str], Float[np.ndarray, "media 3"]]:
 
 
 def write_columns(path: StrPath, columns: Mapping[str, Iterable]) -> None:
-    """Write a CSV table, whole or not at all; numbers so that they are read back as they are.
+    """Write a CSV table, completely or not at all, with enough digits to restore the numbers
+    exactly.
 
     **Raises:** `FileNotFoundError` when the folder does not exist.
     """
@@ -222,9 +222,9 @@ def read_columns(path: StrPath) -> dict[str, tuple[str, ...]]:
 
 
 def _read_rows(path: StrPath, contents: str) -> list[tuple[str, list[str]]]:
-    """Read the rows of a CSV file and where they stand; empty ones and comments (`#`) are left out.
+    """Read the rows of a CSV file and their line numbers, without empty ones and comments (`#`).
 
-    **Raises:** `FileNotFoundError`, or `ValueError` when it is no text.
+    **Raises:** `FileNotFoundError`, or `ValueError` if it is not text.
     """
     try:
         lines = existing_file(path).read_text(encoding="utf-8-sig").splitlines()

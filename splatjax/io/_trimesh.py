@@ -1,5 +1,5 @@
-"""Files read by trimesh: what it would misread in silence is refused before, what it raises becomes
-one sentence, and what it leaves out a warning.
+"""Files read by trimesh. Contents that it would misread are detected first, its exceptions become
+one sentence, and ignored contents a warning.
 """
 
 import json
@@ -71,7 +71,7 @@ _COUNTS = {"obj": _count_obj, "off": _count_off, "gltf": _check_gltf}
 
 
 def _count_triangles(kind: str, data: bytes) -> int | None:
-    """Refuse what trimesh would misread, and return how many triangles the file promises."""
+    """Raise for contents that trimesh would misread; return the announced number of triangles."""
     if kind == "glb":
         kind, text = "gltf", data[20:][: int.from_bytes(data[12:16], "little")]
     elif kind == "stl" and len(data) == 84 + 50 * int.from_bytes(data[80:84], "little"):
@@ -90,7 +90,7 @@ def _count_triangles(kind: str, data: bytes) -> int | None:
 
 @contextmanager
 def one_sentence(path: Path) -> Generator[None, None, None]:
-    """Turn whatever a library raises into an error that names the file, the reason and the remedy.
+    """Convert exceptions of a library to an error that names the file, the reason and the remedy.
 
     **Raises:** `ValueError`; errors that already name the file pass.
     """
@@ -116,7 +116,7 @@ def one_sentence(path: Path) -> Generator[None, None, None]:
 def load_with_trimesh(path: Path, kind: str) -> dict[str, Any]:
     """Read a file of some kind by trimesh.
 
-    Pictures and materials that are missing or unreadable are left out, with a warning.
+    Missing or unreadable pictures and materials are ignored with a warning.
 
     **Returns:** the arguments of its meshes, as the file has them; its `contents`; `triangles`,
     how many it promises, where it does; and of a PLY file `columns`, the properties of each

@@ -117,7 +117,7 @@ def moment_outside(eta: Float[Array, " channels"]) -> Float[Array, " channels"]:
 
 
 def _denser_over_rarer(eta: Float[Array, " channels"]) -> Float[Array, " channels"]:
-    """The index of the denser over that of the rarer side; its derivative at 1 is that from above."""
+    """Return the index of the denser over the rarer side; at 1 the derivative is from above."""
     rarer_inside = eta < 1
     return jnp.where(rarer_inside, 1 / jnp.where(rarer_inside, eta, jnp.ones_like(eta)), eta)
 
