@@ -11,10 +11,10 @@
 # ---
 
 # %% [markdown]
-# # Figure 1: splats, the surface they make, and light below it
+# # Figure 1: splats, their surface, and light below it
 #
 # "Subsurface scattering using splat-based diffusion in point-based rendering", Figure 1, from the
-# built-in bust. `make figures` writes the picture; `docs/figures.md` says what to see.
+# built-in bust. `make figures` writes the picture; `docs/figures.md` describes it.
 
 # %%
 # %matplotlib inline
@@ -29,8 +29,8 @@ from splatjax import baselines
 from splatjax.plots import plot_pictures
 
 # %% [markdown]
-# A bust of a third of life size, so that few splats resolve what light does in skin, under a light
-# with shadows and a weak one without.
+# The bust has a third of life size, so that few splats resolve the diffusion of light in skin. One
+# light casts shadows, and a weak one does not.
 
 # %%
 body = sj.bust(40_000).scaled(0.3)
@@ -44,9 +44,9 @@ lights = (
 skin = sj.load_material("skin").white()
 
 # %% [markdown]
-# Left some of the splats, as discs with gaps between them. In the middle the surface that all
-# splats make, where light leaves the skin at the point where it enters. Right the same surface with
-# scattering.
+# Left: some of the splats, as discs with gaps between them. Middle: the surface of all splats
+# without scattering, where light leaves the skin at its point of entry. Right: the same surface
+# with scattering.
 
 # %%
 step = body.count // 3000
@@ -63,8 +63,8 @@ plot_pictures(
 )
 
 # %% [markdown]
-# In numbers: how much more light leaves the skin where the first light does not reach it. Red
-# travels farthest into the shadow.
+# The numbers are the ratios of the light that leaves the skin in the shadow of the first light,
+# with and without scattering. Red travels farthest into the shadow.
 
 # %%
 shadow = (np.asarray(middle.coverage) > 0.99) & (np.asarray(middle.shadow)[0] < 1e-3)

@@ -11,10 +11,10 @@
 # ---
 
 # %% [markdown]
-# # Figure 3: a Gaussian on each splat, and the profile they add up to
+# # Figure 3: a Gaussian on each splat, and their sum, the profile
 #
 # "Subsurface scattering using splat-based diffusion in point-based rendering", Figure 3. `make
-# figures` writes the picture; `docs/figures.md` says what to see.
+# figures` writes the picture; `docs/figures.md` describes it.
 
 # %%
 # %matplotlib inline
@@ -26,9 +26,9 @@ from matplotlib.figure import Figure
 import splatjax as sj
 
 # %% [markdown]
-# Above, the Gaussian of each layer as it lies on a splat, all to one scale and over five decades of
-# brightness, with the weights of red, green and blue. Below, the profile of each channel, and the
-# layers that add up to it.
+# Top: the Gaussian of each layer on a splat, all at one scale and over five decades of brightness,
+# with the weights of red, green and blue. Bottom: the profile of each channel, and the layers whose
+# sum it is.
 
 # %%
 skin = sj.load_material("skin").gaussians
@@ -53,7 +53,7 @@ axes.set(xlabel="r (mm)", ylabel="R(r) (1/mm²)", yscale="log", xlim=(0, reach),
 figure  # noqa: B018
 
 # %% [markdown]
-# In numbers: how far light goes, as the root mean square of the distance in each channel. Red goes
+# The numbers are the root mean square distances that light travels in each channel. Red travels
 # farthest.
 
 # %%

@@ -14,7 +14,7 @@
 # # Figure 4: the layers of a picture
 #
 # "Subsurface scattering using splat-based diffusion in point-based rendering", Figure 4, from the
-# built-in bust. `make figures` writes the picture; `docs/figures.md` says what to see.
+# built-in bust. `make figures` writes the picture; `docs/figures.md` describes it.
 
 # %%
 # %matplotlib inline
@@ -27,8 +27,8 @@ import splatjax as sj
 from splatjax.plots import plot_pictures
 
 # %% [markdown]
-# A bust of a seventh of life size, so that few splats resolve what light does in skin, under a
-# light with shadows and a weak one without.
+# The bust has a seventh of life size, so that few splats resolve the diffusion of light in skin.
+# One light casts shadows, and a weak one does not.
 
 # %%
 body = sj.bust(40_000).scaled(0.15)
@@ -42,8 +42,8 @@ lights = (
 skin = sj.load_material("skin").white()
 
 # %% [markdown]
-# Above the layers, the narrowest first; below what each adds to the picture, by its weights for
-# red, green and blue. Blue and green stay where they enter, red travels.
+# Top: the layers, the narrowest first. Bottom: the contribution of each to the picture, by its
+# weights for red, green and blue. Blue and green stay near their entry, red travels farther.
 
 # %%
 frame = sj.render(sj.Scene(body, lights, skin), camera)
@@ -52,7 +52,7 @@ titles = [f"{float(variance) ** 0.5:.2g} mm" for variance in skin.gaussians.vari
 plot_pictures([layers, weights[:, None, None] * layers], titles, ["layer", "what it adds"])
 
 # %% [markdown]
-# In numbers: how rough each layer is, as the mean step from pixel to pixel inside the body.
+# The numbers are the roughness of each layer: the mean step from pixel to pixel inside the body.
 
 # %%
 inside = np.asarray(frame.coverage) > 0.99

@@ -11,7 +11,7 @@
 # ---
 
 # %% [markdown]
-# # Figure 5: the wider the splats, the fewer of them do
+# # Figure 5: wider splats, fewer splats
 #
 # "Subsurface scattering using splat-based diffusion in point-based rendering", Figure 5, from the
 # built-in bust. `make figures` writes the picture; `docs/figures.md` has the law of these errors.
@@ -27,8 +27,8 @@ from splatjax.diffusion import PlainMean
 from splatjax.plots import plot_pictures
 
 # %% [markdown]
-# A bust under a light with shadows and a weak one without. Its layers are two, four and eight times
-# as wide as its splats are apart.
+# The bust is lit by one light with shadows and a weak one without. Its layers are two, four and
+# eight times as wide as the spacing of its splats.
 
 # %%
 body = sj.bust(20_000)
@@ -45,9 +45,10 @@ gaussians = sj.SumOfGaussians((amplified * spacing) ** 2, jnp.full((3, 3), 1 / 3
 scene = sj.Scene(body, lights, sj.Material(gaussians, specular=0.0))
 
 # %% [markdown]
-# To the right the radius grows, downwards splats are left out. Along a diagonal the quality stays:
-# a radius twice as large allows a quarter of the splats. In numbers: errors, as root mean squares
-# over that of the layer, and what the law expects with one fitted factor.
+# The radius increases to the right, and the number of splats decreases downwards. The quality is
+# constant along a diagonal: a radius twice as large allows a quarter of the splats. The numbers are
+# root mean square errors over that of the layer, and the prediction of the law with one fitted
+# factor.
 
 # %%
 settings = [

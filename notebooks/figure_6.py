@@ -14,7 +14,7 @@
 # # Figure 6: other materials
 #
 # "Subsurface scattering using splat-based diffusion in point-based rendering", Figure 6, from the
-# built-in bust. `make figures` writes the picture; `docs/figures.md` says what to see.
+# built-in bust. `make figures` writes the picture; `docs/figures.md` describes it.
 
 # %%
 # %matplotlib inline
@@ -27,8 +27,8 @@ import splatjax as sj
 from splatjax.plots import plot_pictures
 
 # %% [markdown]
-# A bust of a third of life size, so that few splats resolve what light does in skin, under a light
-# with shadows and a weak one without.
+# The bust has a third of life size, so that few splats resolve the diffusion of light in skin. One
+# light casts shadows, and a weak one does not.
 
 # %%
 body = sj.bust(40_000).scaled(0.3)
@@ -42,8 +42,8 @@ lights = (
 materials = {name: sj.load_material(name) for name in ("marble", "ketchup", "wholemilk")}
 
 # %% [markdown]
-# Skin is drawn with the map of the body's color, the others in their own. Every picture has its own
-# exposure.
+# Skin has the color of the body's albedo map, the other materials have their own. Every picture has
+# its own exposure.
 
 # %%
 plain = replace(body, albedo=None)
@@ -53,8 +53,7 @@ pictures = [frame.beauty / jnp.quantile(frame.beauty, 0.995) for frame in frames
 plot_pictures([pictures], ["skin", *materials], white=1.0, inches=3.0)
 
 # %% [markdown]
-# In numbers: the color of each material, red over blue, as its profile has it and as the picture
-# shows it.
+# The numbers are the color of each material, red over blue, of its profile and of the picture.
 
 # %%
 totals = [np.asarray(frame.diffuse).sum(axis=(0, 1)) for frame in frames[1:]]

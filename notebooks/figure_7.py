@@ -14,7 +14,7 @@
 # # Figure 7: earlier point-based methods and this one
 #
 # "Subsurface scattering using splat-based diffusion in point-based rendering", Figure 7, from the
-# built-in bust. `make figures` writes the picture; `docs/figures.md` says what to see.
+# built-in bust. `make figures` writes the picture; `docs/figures.md` describes it.
 
 # %%
 # %matplotlib inline
@@ -26,8 +26,8 @@ from splatjax import baselines
 from splatjax.plots import plot_pictures
 
 # %% [markdown]
-# A bust of a third of life size, so that few splats resolve what light does in skin, under a light
-# with shadows and a weak one without.
+# The bust has a third of life size, so that few splats resolve the diffusion of light in skin. One
+# light casts shadows, and a weak one does not.
 
 # %%
 body = sj.bust(40_000).scaled(0.3)
@@ -44,8 +44,8 @@ near = sj.Camera.look_at(
 skin = sj.load_material("skin").white()
 
 # %% [markdown]
-# Elliptical points are flat, splats that are blended are smooth, scattering is soft. Below, the
-# same from near.
+# Elliptical points look flat, blended splats look smooth, and scattering looks soft. The lower row
+# is a close-up.
 
 # %%
 opaque = sj.Scene(baselines.PhongSplats.of(body), lights, skin.opaque())
@@ -65,7 +65,7 @@ rows = [[frame.beauty for frame in line] for line in zip(*frames.values(), stric
 plot_pictures(rows, list(frames))
 
 # %% [markdown]
-# In numbers: how rough the light is, as the mean step from pixel to pixel inside the body.
+# The numbers are the roughness of the light: the mean step from pixel to pixel inside the body.
 
 # %%
 roughness = {}

@@ -14,8 +14,8 @@
 # # Figure 8: half by texture-space diffusion, half by splats
 #
 # "Subsurface scattering using splat-based diffusion in point-based rendering", Figure 8, from the
-# built-in bust. `make figures` writes the picture; `docs/figures.md` says what to see, and how a
-# mesh with texture coordinates takes the place of the bust.
+# built-in bust. `make figures` writes the picture; `docs/figures.md` describes it, and shows how to
+# replace the bust by a mesh with texture coordinates.
 
 # %%
 # %matplotlib inline
@@ -32,7 +32,7 @@ from splatjax.plots import plot_pictures
 
 # %% [markdown]
 # The head of the bust at a third of life size. Its chart is longitude and latitude seen from
-# inside, and its ears overlap there.
+# inside, in which its ears overlap the head.
 
 # %%
 SCALE, SIZE = 0.3, 256
@@ -47,8 +47,9 @@ light = sj.DirectionalLight(jnp.asarray([0.5, -0.4, -0.75]), jnp.full(3, jnp.pi)
 skin = sj.load_material("skin").white()
 
 # %% [markdown]
-# Left of the middle triangles with texture-space diffusion, four samples a pixel; right of it
-# splats. Beside it the difference, splats less triangles, enlarged eight times around middle gray.
+# The left half is rendered as triangles with texture-space diffusion, four samples a pixel, the
+# right half as splats. Beside it is the difference, splats less triangles, enlarged eight times
+# around middle gray.
 
 # %%
 ours = sj.render(sj.Scene(splats, (light,), skin), camera)
@@ -69,7 +70,7 @@ plot_pictures(
 )
 
 # %% [markdown]
-# In numbers: how far the two are apart inside the head, of the picture's root mean square.
+# The number is the difference inside the head, relative to the root mean square of the picture.
 
 # %%
 inside = (np.asarray(ours.coverage) > 0.99) & (coverage[..., 0] > 0.99)

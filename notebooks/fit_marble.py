@@ -13,9 +13,10 @@
 # %% [markdown]
 # # Marble as a sum of Gaussians
 #
-# Light that enters marble leaves it some millimeters away. How much leaves at distance $r$ is the
-# profile $R(r)$, in 1/mm². The renderer wants it as a sum of Gaussians, $R(r) \approx \sum_i w_i\,
-# G(v_i, r)$: one blurred layer for each. Here we fit one.
+# Light that enters marble leaves it some millimeters away. The profile $R(r)$, in 1/mm², is the
+# fraction that leaves at distance $r$, per area. The renderer represents it by a sum of Gaussians,
+# $R(r) \approx \sum_i w_i\, G(v_i, r)$, with one blurred layer for each. This notebook fits such a
+# sum.
 
 # %%
 # %matplotlib inline
@@ -26,9 +27,9 @@ import splatjax as sj
 from splatjax.plots import plot_fit
 
 # %% [markdown]
-# The coefficients were measured by Jensen and others in 2001; splatjax ships them, in 1/mm, with
-# their source. A `Dipole` turns them into a profile. Double precision lets the fit show its error
-# rather than rounding.
+# Jensen and others measured the coefficients in 2001. splatjax contains them, in 1/mm, with their
+# source. A `Dipole` computes a profile from them. In double precision the error is that of the fit,
+# not of rounding.
 
 # %%
 with jax.enable_x64(True):
@@ -46,9 +47,9 @@ with jax.enable_x64(True):
 figure  # noqa: B018
 
 # %% [markdown]
-# The error $E$ (Eq. 4 of the paper) hardly sees the tail, and the free fit misses a few per cent of
-# the red energy there. Holding the sum of the weights to the total reflectance keeps the energy,
-# for a little more error. Materials are shipped that way.
+# The error $E$ (Eq. 4 of the paper) depends little on the tail, and the unconstrained fit misses a
+# few per cent of the red energy there. Fixing the sum of the weights to the total reflectance keeps
+# the energy, for a slightly larger error. The materials of the library are fitted in this way.
 
 # %%
 print("total reflectance ", np.asarray(profile.total_reflectance()).round(4))
@@ -61,8 +62,8 @@ for name, fit in (("free", six), ("sum held", held)):
     )
 
 # %% [markdown]
-# Green marble alone, with four Gaussians, was published in GPU Gems 3 (chapter 14): variances .036,
-# .14, .91, 7.0 mm² and weights .070, .18, .21, .29. The same numbers come out here.
+# GPU Gems 3 (chapter 14) published the fit of green marble with four Gaussians: variances .036,
+# .14, .91, 7.0 mm² and weights .070, .18, .21, .29. This fit gives the same numbers.
 
 # %%
 with jax.enable_x64(True):

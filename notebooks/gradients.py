@@ -11,11 +11,11 @@
 # ---
 
 # %% [markdown]
-# # Gradients one can check, and see
+# # Checking and viewing gradients
 #
-# A picture here is a differentiable function: of optical coefficients, of every splat, of lights
-# and camera. First we check the diffusion pass against finite differences. Then we look at a
-# derivative: what a little more absorption does to each pixel.
+# A picture is a differentiable function of optical coefficients, of every splat, of lights and
+# camera. The first part checks the diffusion pass against finite differences. The second part shows
+# a derivative picture: the change of each pixel for a little more absorption.
 
 # %%
 # %matplotlib inline
@@ -57,10 +57,10 @@ camera = sj.Camera.look_at(
 # %% [markdown]
 # ## The diffusion pass, checked
 #
-# `sj.diffuse_irradiance` is pass 4 alone: from the light below the surface of every splat to one
-# layer per Gaussian. In double precision, along a random direction of each input, its reverse mode
-# must agree with central differences. Where splats are moved, the step must be so small that none
-# comes to the front or vanishes behind another: which splats are seen has no derivative.
+# `sj.diffuse_irradiance` is pass 4 alone: it computes one layer per Gaussian from the light below
+# the surface of every splat. In double precision, along a random direction of each input, its
+# reverse mode must agree with central differences. If splats move, the step must be so small that
+# no splat becomes visible or hidden: visibility has no derivative.
 
 # %%
 with jax.enable_x64(True):
@@ -100,9 +100,9 @@ with jax.enable_x64(True):
 # %% [markdown]
 # ## A derivative picture
 #
-# `sj.picture_jacobian` renders and gives the derivative of every pixel in every weight and
-# variance, at the price of about one more frame, however many pixels there are. `through` takes it
-# on to what the Gaussians were made of: here the coefficients of marble.
+# `sj.picture_jacobian` renders a picture and computes the derivative of every pixel in every weight
+# and variance. It costs about one more frame, for any number of pixels. `through` continues the
+# derivative to the parameters of the Gaussians, here the coefficients of marble.
 
 # %%
 with jax.enable_x64(True):
@@ -139,12 +139,11 @@ for ax, (name, title) in zip(others, titles.items(), strict=True):
 figure  # noqa: B018
 
 # %% [markdown]
-# More absorption darkens everything; the share of its light that a pixel loses is greatest where
-# that light has come a long way, beyond the edge of the shadow. More scattering lets light turn
-# back sooner: what is lit gains, and what lies in shadow loses.
+# More absorption darkens all pixels. The relative loss is greatest where light has traveled far,
+# beyond the edge of the shadow. With more scattering light returns sooner: lit parts become
+# brighter, and shadows darker.
 #
-# The same picture by finite differences takes a fit and a frame for each side, for every
-# coefficient:
+# Finite differences need a fit and a frame on each side, for every coefficient:
 
 # %%
 pictures = []

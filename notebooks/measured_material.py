@@ -13,9 +13,9 @@
 # %% [markdown]
 # # A material from a measurement
 #
-# A profile $R(r)$ that was measured is a table of radii and values. A photograph of a laser dot,
-# linear and from straight above, is as good: means over rings around its center are the profile,
-# and their scatter says how well it is known.
+# A measured profile $R(r)$ is a table of radii and values. A photograph of a laser dot, linear and
+# from straight above, also gives one: the profile is the mean over rings around the center of the
+# dot, and the scatter in the rings gives its error.
 
 # %%
 # %matplotlib inline
@@ -31,9 +31,9 @@ import splatjax as sj
 from splatjax.plots import plot_fit
 
 # %% [markdown]
-# Here is such a photograph, of something like potato, with the noise of a camera. The beam has a
-# variance of 0.25 mm² along each axis, so that what is seen is the profile blurred by it: the
-# variances add.
+# This is a synthetic photograph of a material like potato, with the noise of a camera. The beam has
+# a variance of 0.25 mm² along each axis, so the photograph shows the profile blurred by the beam:
+# the variances add.
 
 # %%
 with jax.enable_x64(True):
@@ -51,9 +51,9 @@ axes.imshow(np.log10(np.maximum(photograph[..., 0], 1e-4)), cmap="magma", extent
 figure  # noqa: B018
 
 # %% [markdown]
-# Which absorption and scattering explain it? `fit_medium` goes the way of the picture, from
-# coefficients to Gaussians to the blurred profile, and back along its derivatives. The error bars
-# come from the scatter of the pixels.
+# `fit_medium` finds the absorption and scattering. It computes Gaussians from coefficients, and the
+# blurred profile from the Gaussians, and minimizes the residual along its derivatives. The error
+# bars follow from the scatter of the pixels.
 
 # %%
 with jax.enable_x64(True):
@@ -68,9 +68,8 @@ for name, value, bar in zip(("sigma_a ", "sigma_s'"), values, bars, strict=True)
 print(f"chi squared per degree of freedom {chi_squared:.2f}")
 
 # %% [markdown]
-# Where no model is wanted, the table itself is fitted, over its own radii and no further. In a file
-# it is a CSV of radii and a column for each channel; `splatjax fit potato.csv --output potato.toml`
-# does the same.
+# Without a model, the table itself can be fitted, over its own radii only. As a CSV file of radii
+# and a column for each channel, `splatjax fit potato.csv --output potato.toml` fits it.
 
 # %%
 with jax.enable_x64(True):
@@ -83,8 +82,8 @@ with jax.enable_x64(True):
 figure  # noqa: B018
 
 # %% [markdown]
-# Colleagues with other renderers get the same material as JSON, each number with its formula and
-# source.
+# For other renderers, export the same material as JSON, with the formula and the source of each
+# number.
 
 # %%
 with jax.enable_x64(True):

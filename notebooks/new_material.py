@@ -13,9 +13,9 @@
 # %% [markdown]
 # # A new material from coefficients, or from layers
 #
-# All it takes is the absorption coefficient $\sigma_a$ and the reduced scattering coefficient
-# $\sigma_s'$ of each channel, in 1/mm, and the index of refraction. Here: a jade-like stone, and
-# the same stone under a thin red glaze.
+# A material needs the absorption coefficient $\sigma_a$ and the reduced scattering coefficient
+# $\sigma_s'$ of each channel, in 1/mm, and the index of refraction. This notebook fits a jade-like
+# stone, and the same stone under a thin red glaze.
 
 # %%
 # %matplotlib inline
@@ -40,12 +40,12 @@ with jax.enable_x64(True):
 figure  # noqa: B018
 
 # %% [markdown]
-# Each further Gaussian divides the error by two to three. One layer is drawn for each, so take as
-# many as the picture deserves: the least, say, that leaves no channel more than two hundredths.
-# (`fit_gaussians(profile, LeastCount(0.02))` does it at once.) The sum of the weights is held at
-# the total reflectance, which keeps the energy of the picture. (Where channels differ more, some
-# weights come out slightly negative; `NonNegativeWeights(FixedTotalReflectance())` forbids it: the
-# library is fitted so.)
+# Each further Gaussian divides the error by two to three, and costs one more layer. Choose the
+# least number that reaches a required error in every channel, here 0.02. (`fit_gaussians(profile,
+# LeastCount(0.02))` does this in one call.) The sum of the weights is fixed to the total
+# reflectance, which keeps the energy of the picture. (If the channels differ more, some weights
+# become slightly negative; `NonNegativeWeights(FixedTotalReflectance())` prevents it, as in the
+# materials of the library.)
 
 # %%
 with jax.enable_x64(True):
@@ -56,18 +56,18 @@ with jax.enable_x64(True):
 figure  # noqa: B018
 
 # %% [markdown]
-# How well determined is it? `covariance` holds variances first, then the weights of red, green and
-# blue. Within its ellipsoid the error of Eq. 3 at most doubles: a relative deviation above 1 would
-# say that a Gaussian may as well be left out.
+# `covariance` describes how well the fit is determined. It contains the variances, then the weights
+# of red, green and blue. Within its ellipsoid the error of Eq. 3 at most doubles: a relative
+# deviation above 1 would mean that a Gaussian can be omitted.
 
 # %%
 print("variances (mm²)", variances.round(4))
 print("  known to     ", (np.sqrt(np.diag(covariance))[:count] / variances).round(3))
 
 # %% [markdown]
-# A glaze, half a millimeter thick, changes the core of the profile and hardly the tail: light that
-# travels far travels below it. A scattering layer must be thicker than a mean free path, here $1 /
-# (4 + 0.3)$ mm; thinner ones are refused.
+# A glaze of half a millimeter changes the core of the profile and hardly its tail, because light
+# that travels far travels below the glaze. A scattering layer must be thicker than a mean free
+# path, here $1 / (4 + 0.3)$ mm; thinner ones raise an error.
 
 # %%
 with jax.enable_x64(True):
@@ -80,9 +80,9 @@ with jax.enable_x64(True):
 figure  # noqa: B018
 
 # %% [markdown]
-# A material is these Gaussians and a surface. `save_material` writes it with its layers, unit and
-# source as a TOML file, which `splatjax render --material glazed.toml` takes, as `load_material`
-# does.
+# A material consists of these Gaussians and a surface. `save_material` writes it with its layers,
+# unit and source as a TOML file, which `splatjax render --material glazed.toml` and `load_material`
+# read.
 
 # %%
 with jax.enable_x64(True):

@@ -13,18 +13,18 @@
 # %% [markdown]
 # # Painted skin, from pictures under three lights
 #
-# A figurine the size of a fingertip, with the optical coefficients of skin, wears paint in bands.
-# We know its shape, camera and lights, and that there is no paint below its chin. What are the
-# coefficients, and what is the paint?
+# A figurine the size of a fingertip has the optical coefficients of skin, and bands of paint. Its
+# shape, the camera and the lights are known, and there is no paint below its chin. The coefficients
+# and the paint are unknown.
 #
-# A picture tells the product of the map and of what the coefficients send back. So something must
-# be known: here the map where the skin is bare, 1. There `recover` finds the coefficients, all
-# pixels at once, with error bars. Then `fit_scene` moves the albedo of every splat along the
-# gradient of the renderer. We do not move both at once: six coefficients are found by least
-# squares, which knows how they depend on each other, in steps that look at no splat; first-order
-# steps would have to follow them with thousands of albedos in tow. Paint near the border takes
-# light from bare skin, which moves the coefficients by a per cent; to be rid of that too, let the
-# two take turns, with the paint that was found.
+# A picture determines only the product of the albedo map and the reflectance of the coefficients,
+# so one factor must be known: here the map is 1 where the skin is bare. `recover` finds the
+# coefficients from the pixels there, with error bars. Then `fit_scene` fits the albedo of every
+# splat along the gradient of the renderer. The two fits are separate: least squares finds six
+# coefficients in a few cheap steps, because it uses their correlations, and a first-order method
+# would need many steps with thousands of albedos. Paint near the border takes light from bare skin,
+# which changes the coefficients by a per cent. To remove this error, alternate both fits, starting
+# from the fitted paint.
 
 # %%
 # %matplotlib inline
@@ -86,7 +86,7 @@ bare = np.asarray(frames[0].position)[..., 1] < border - 0.3
 # %% [markdown]
 # ## First the skin, then the paint
 #
-# We start with coefficients that are off by a factor of two, and with paint of an even gray.
+# The start is coefficients with an error of a factor of two, and a uniform gray paint.
 
 
 # %%
@@ -142,8 +142,8 @@ plot_pictures(
 )
 
 # %% [markdown]
-# The photographs are soft where light has spread; the map is not. Where no picture tells of a
-# splat, at the back, it stays as it was.
+# The photographs are soft where light has spread; the map is sharp. Splats that no picture shows,
+# at the back, keep their initial albedo.
 
 # %%
 assert np.max(np.abs(off)) < 0.05

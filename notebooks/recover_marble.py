@@ -13,12 +13,12 @@
 # %% [markdown]
 # # Marble from one photograph
 #
-# A figurine of marble, three centimeters tall, stands under a lamp from the side. We know its
-# shape, where camera and lamp are, and how strong the lamp is. What are the absorption and the
-# scattering of the stone, and how well does one photograph tell?
+# A lamp lights a figurine of marble, three centimeters tall, from the side. Its shape, the
+# positions of camera and lamp, and the strength of the lamp are known. The absorption and the
+# scattering of the stone, and their errors, are to be found from one photograph.
 #
-# The photograph is rendered here, from the coefficients that Jensen and others measured in 2001, so
-# that we know what should come out; noise of 1% is added.
+# The photograph is rendered from the coefficients that Jensen and others measured in 2001, so that
+# the true values are known. Noise of 1% is added.
 
 # %%
 # %matplotlib inline
@@ -42,7 +42,7 @@ settings = sj.RenderSettings(
 )
 
 
-# The bust, eight times smaller, without its map: color comes from the coefficients alone.
+# The bust, eight times smaller, without its albedo: only the coefficients give the color.
 def figurine(count: int) -> sj.Splats:
     bust = sj.bust(count)
     return sj.Splats(bust.centers / 8, bust.normals, bust.radii / 8, bust.areas / 64)
@@ -64,11 +64,12 @@ with jax.enable_x64(True):
     photograph = rendered + deviation * np.random.default_rng(0).normal(size=rendered.shape)
 
 # %% [markdown]
-# ## The coefficients behind it
+# ## The coefficients
 #
-# The search starts at skin, which is some tens of times more absorbing. It finds the logarithms of
-# both coefficients of red, green and blue by least squares on all pixels at once. What of a picture
-# does not depend on the weights of its layers is rendered once, so that a step looks at no splat.
+# The search starts from skin, which absorbs some tens of times more. It finds the logarithms of
+# both coefficients of red, green and blue by least squares on all pixels at once. The part of a
+# picture that does not depend on the weights of its layers is rendered once, so a step evaluates no
+# splats.
 
 # %%
 with jax.enable_x64(True):
@@ -86,7 +87,8 @@ figure = plot_recovery(found, title="marble, recovered")
 figure  # noqa: B018
 
 # %% [markdown]
-# What is left is noise. Now the truth, and by how many error bars we miss it:
+# The residual is noise. The next cell prints the true values, and the errors in units of the error
+# bars:
 
 # %%
 pulls = []
@@ -101,10 +103,9 @@ for name, bars in zip(("sigma_a", "sigma_s_prime"), found.relative_errors(), str
 # %% [markdown]
 # ## Which picture to take next
 #
-# A picture fixes best how much light comes back, and worse how far it goes: the coefficients are
-# known along one direction much better than across it. Each of these pictures, rendered of the
-# material that was found, would add information; the inverse of the sum is what would be known
-# then.
+# A picture determines the amount of returning light best, and its distance worse: one combination
+# of the coefficients is known much better than the other. Each of these pictures, rendered with the
+# recovered material, would add information; the inverse of the sum is the predicted covariance.
 
 # %%
 best, worst = found.combinations()[0]

@@ -13,9 +13,9 @@
 # %% [markdown]
 # # New light on a kept view
 #
-# A picture is linear in its light. We render a bust once under each of 25 spherical harmonics;
-# then its picture under any smooth environment is a sum, which takes milliseconds. The same sum
-# read backwards finds the environment from one photograph of a known body.
+# A picture is linear in its light. This notebook renders a bust once under each of 25 spherical
+# harmonics. Its picture under any smooth environment is then a sum, which takes milliseconds. The
+# inverse problem finds the environment from one photograph of a known body.
 
 # %%
 # %matplotlib inline
@@ -31,8 +31,8 @@ camera = sj.Camera.look_at((60, -20, 620), (0, -40, 0), fov=30, width=128, heigh
 # %% [markdown]
 # ## Under a turning environment
 #
-# The coefficients of the light are zero here: the basis is rendered for all of them. Light comes
-# from 64 directions, whose shadow maps are made once.
+# The coefficients of the light are zero here, because the basis is rendered for all of them. Light
+# comes from 64 directions, whose shadow maps are rendered once.
 
 # %%
 scene = sj.Scene(splats, HarmonicLight(np.zeros((25, 3))), material)
@@ -52,8 +52,8 @@ figure  # noqa: B018
 # %% [markdown]
 # ## The environment of a photograph
 #
-# Two photographs, made by the renderer, with noise of 1%: one under a soft studio of nine
-# harmonics, one under the whole studio, which has many.
+# The renderer makes two photographs with noise of 1%: one under a soft studio of nine harmonics,
+# one under the full studio, which has many.
 
 # %%
 whole = sj.EnvironmentLight(sj.scene.studio(), 60, directions=even_directions(64))
@@ -73,9 +73,9 @@ noisy = {
 }
 
 # %% [markdown]
-# The coefficients of each channel follow by linear least squares from all pixels. What is left over
-# estimates the noise, and with it the error bars: nine unknowns for the soft studio, all 25 for the
-# whole one, of which we look at the first nine.
+# The coefficients of each channel follow by linear least squares from all pixels. The residual
+# gives the noise and the error bars. There are nine unknowns for the soft studio, and 25 for the
+# full one, of which the first nine are shown.
 
 
 # %%
@@ -111,9 +111,9 @@ for (name, (ours, bars, left)), picture, plot in zip(
 figure  # noqa: B018
 
 # %% [markdown]
-# Under the soft studio the truth lies within the error bars. The whole studio has light that no sum
-# of 25 harmonics has. More is left over than noise, which warns that the error bars are too small;
-# the nine coefficients are still right to some percent.
+# For the soft studio the true values are within the error bars. The full studio has light that a
+# sum of 25 harmonics cannot represent. Its residual is larger than the noise, which indicates that
+# the error bars are too small; the nine coefficients are still right to some percent.
 
 # %%
 assert np.max(np.abs(found["soft"][0] - true) / found["soft"][1]) < 4

@@ -11,14 +11,14 @@
 # ---
 
 # %% [markdown]
-# # Bumps found again from their shading
+# # Bumps recovered from shading
 #
-# A ball of two centimeters has bumps and dents of half a millimeter and more. We are given the ball
-# without them, and pictures of the true one under three lights, with noise of 1%. Each splat may
-# move along its normal; its normal then follows from how its neighbors have moved. Where light
-# spreads below the surface it fills the dark side of each bump: shading tells less. We do it for a
-# material in which light hardly spreads, and for one in which it spreads as far as the bumps are
-# wide.
+# A ball of two centimeters has bumps and dents of half a millimeter and more. Given are the smooth
+# ball, and pictures of the true one under three lights, with noise of 1%. Each splat may move along
+# its normal, and its normal follows from the offsets of its neighbors. Light that spreads below the
+# surface fills the dark side of each bump, so shading contains less information. The notebook
+# compares a material in which light hardly spreads with one in which it spreads over the width of
+# the bumps.
 
 # %%
 # %matplotlib inline
@@ -64,7 +64,7 @@ def degrees(a, b) -> np.ndarray:
 smooth = ball()
 as_given = sj.inverse.NormalOffsets(
     step=1.0, smoothness=1e-3, deviation=1.0
-)  # no blur: heights are what they are
+)  # no blur: the heights themselves
 bumpy = as_given.moved(
     smooth, jnp.asarray(heights(np.asarray(smooth.normals)), jnp.float32), as_given.prepared(smooth)
 )
@@ -79,7 +79,7 @@ lamps = [
 weights = jnp.asarray([[0.35, 0.35, 0.4], [0.3, 0.25, 0.2], [0.2, 0.15, 0.1]])
 
 
-# Light spreads by so many times 0.5, 1.2 and 2.8 mm.
+# Factors on the widths of 0.5, 1.2 and 2.8 mm by which light spreads.
 def material(wider: float) -> sj.Material:
     return sj.Material(
         sj.SumOfGaussians(wider**2 * jnp.asarray([0.3, 1.5, 8.0]), weights), eta=1.5, specular=0.0
@@ -87,10 +87,10 @@ def material(wider: float) -> sj.Material:
 
 
 # %% [markdown]
-# ## Found along the gradient
+# ## Fit along the gradient
 #
-# Offsets are blurred over 1 mm, about as far as the splats are apart: what is finer is not looked
-# for. Outlines are left out, since only pixels that the body fills count.
+# Offsets are blurred over 1 mm, about the spacing of the splats, so finer bumps are not searched.
+# Outlines are not used, since only pixels that the body fills count.
 
 
 # %%

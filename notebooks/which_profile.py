@@ -13,11 +13,10 @@
 # %% [markdown]
 # # Which profile for which material
 #
-# Every model below turns the same coefficients into a profile. They differ near the source, where
-# diffusion is a poor picture of light, and they agree far away. The dots are the truth: photons,
-# walked by `sj.transport.monte_carlo`, with their standard errors. All is drawn over radii counted
-# in mean free paths, $r \sigma_t'$. [The page](../docs/which_profile.md) has the numbers for many
-# media.
+# Every model below computes a profile from the same coefficients. The models differ near the
+# source, where diffusion is a poor approximation, and agree at large distances. The dots are the
+# reference, `sj.transport.monte_carlo`, with standard errors. Radii are in mean free paths, $r
+# \sigma_t'$. [Which profile when](../docs/which_profile.md) has the numbers for many media.
 
 # %%
 # %matplotlib inline
@@ -81,21 +80,21 @@ with jax.enable_x64(True):
 figure  # noqa: B018
 
 # %% [markdown]
-# - **Dipole** (Jensen 2001): what most published fits and coefficients were made with. It puts too
-#   much light between one and two mean free paths and, where absorption is strong, loses the tail.
-#   Take it to compare with the literature.
-# - **BetterDipole** (d'Eon 2012): the same cost, the best totals, and right to some ten per cent
-#   beyond one mean free path where little is absorbed.
-# - **PhotonBeam** (Habel 2013): adds single scattering, which is infinite at the origin like $1/r$.
-#   Beyond one mean free path it lies within a few per cent of the truth for marble. Take it, with a
-#   cut, when in doubt.
-# - **Burley** (Christensen 2015): a curve fitted to Monte Carlo, known by its color and one length.
-#   It is what film renderers exchange. The index of refraction is not in it: for marble, whose
-#   surface sends much of the light back, it falls too early.
+# - **Dipole** (Jensen 2001): the model of most published fits and coefficients. It has too much
+#   light between one and two mean free paths, and too little in the tail at strong absorption. Use
+#   it to compare with the literature.
+# - **BetterDipole** (d'Eon 2012): the same cost, the best totals, and an error of some ten per cent
+#   beyond one mean free path at weak absorption.
+# - **PhotonBeam** (Habel 2013): adds single scattering, which diverges like $1/r$ at the origin.
+#   Beyond one mean free path its error for marble is a few per cent. Use it, with a cut, when in
+#   doubt.
+# - **Burley** (Christensen 2015): a curve fitted to Monte Carlo, with a color and one length as
+#   parameters. Film renderers exchange these. It does not include the index of refraction: for
+#   marble, whose surface reflects much of the light back inside, it decays too early.
 # - **Multipole** and **LayeredMultipole** (Donner 2005): slabs and layers, for skin, leaves and
 #   paper; four mean free paths thick and more.
 #
-# The totals differ as well: what leaves at all.
+# The total reflectances differ as well.
 
 # %%
 for name in media:
@@ -109,8 +108,8 @@ for name in media:
 
 # %% [markdown]
 # Profiles with a $1/r$ core have no integral of $r R^2$ at the origin. Their Gaussians are fitted
-# beyond a cut, stated in length scales of the profile; the narrowest Gaussians of a material stand
-# for what lies within.
+# beyond a cut, given in length scales of the profile; the narrowest Gaussians of a material
+# represent the part within.
 
 # %%
 with jax.enable_x64(True):
@@ -120,8 +119,8 @@ with jax.enable_x64(True):
 print("E beyond one mean free path", round(error, 4))
 
 # %% [markdown]
-# The truth itself can be fitted, weighed by its errors; the sum of the weights is then held at the
-# true total.
+# The reference itself can be fitted, weighted by its errors, with the sum of the weights fixed to
+# the true total.
 
 # %%
 photons = truth["marble, green"]
