@@ -1,5 +1,3 @@
-"""The command line, `splatjax COMMAND`: a file for a few commands. It calls the public interface
-alone.
-"""
+"""The command line, `splatjax COMMAND`. It uses only the public interface."""
 
 from ._main import main as main

@@ -1,4 +1,4 @@
-"""Fits of many media by one program: what `splatjax fit --all` repeats."""
+"""Fits of many media by one program, for `splatjax fit --all`."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -38,8 +38,8 @@ def _fit_each(
 def fit_batch(
     coefficients: np.ndarray, count: int, model: sj.fitting.AbstractModel
 ) -> dict[str, np.ndarray]:
-    """Return the columns of a batch. A smaller batch is padded, so that one program serves all.
-    Where fits to dipoles start, those to other models of the same media end soon.
+    """Return the columns of a batch. A smaller batch is padded, so that one program serves all. The
+    starts of fits to dipoles are near the optima of other models of the same media.
     """
     given = len(coefficients)
     padded = np.pad(coefficients, ((0, BATCH - given), (0, 0)), mode="edge")

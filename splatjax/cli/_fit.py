@@ -1,5 +1,5 @@
-"""`splatjax fit`: from optical coefficients to a sum of Gaussians; with --all, those of many media,
-a batch at a time: finished batches are kept, and become one table in the end.
+"""`splatjax fit`: sums of Gaussians from optical coefficients; with --all, for many media in
+batches. Finished batches are kept, and are joined to one table at the end.
 """
 
 import shutil
@@ -118,7 +118,7 @@ class Fit:
             self._run_all() if self.all else self._run()
 
     def _run_all(self) -> None:
-        """Fit the media of a table, in batches that lie in a folder until all are there: the
+        """Fit the media of a table, in batches that are kept in a folder until all exist; the
         processes of a launcher share them.
         """
         if self.output is None:
@@ -188,7 +188,7 @@ class Fit:
                     f"{counted(self.count, 'Gaussian')}; give a smaller --count"
                 )
         else:
-            # The reduced coefficients are all that a dipole knows.
+            # A dipole depends only on the reduced coefficients.
             knows = self.g is not None or self.model not in ("dipole", "better-dipole")
             g = self._mean_cosine() if knows else 0.0
             target = reference(coefficients, self.model, self.photons, g, self.single_scattering)
@@ -212,7 +212,7 @@ class Fit:
             save_figure(figure, self.plot)
 
     def _note_spread(self, target: Reference, fitted: sj.fitting.FitResult) -> None:
-        """Note channels whose widths are too far apart for the variances that they share."""
+        """Note channels whose widths differ too much for shared variances."""
         scales, count = target.profile.length_scale(), len(fitted.gaussians.variances)
         error, ratio = float(fitted.error.max()), float(scales.max() / scales.min())
         if error > _LARGE and ratio > _APART:
@@ -225,7 +225,7 @@ class Fit:
     def _coefficients(
         self,
     ) -> sj.Dipole | sj.LayeredMultipole | sj.scattering.Skin | sj.scattering.Tabulated:
-        """Read the input; refuse options that have no effect on its kind."""
+        """Read the input; raise for options without effect on its kind."""
         kind = _KINDS.get(Path(self.medium).suffix.lower(), _COEFFICIENTS)
         given = {field.name for field in fields(self) if getattr(self, field.name) != field.default}
         for other, names in _OPTIONS.items():

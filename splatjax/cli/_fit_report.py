@@ -1,4 +1,4 @@
-"""What `splatjax fit` prints of a fit."""
+"""The report of `splatjax fit`."""
 
 import jax
 import jax.numpy as jnp

@@ -1,5 +1,5 @@
-"""`splatjax render` and `splatjax turntable`: from splats and a material to a picture with all its
-layers, or to the frames of an animation, continued where it was interrupted.
+"""`splatjax render` and `splatjax turntable`: a picture with all layers, or the frames of an
+animation, which resume after an interruption.
 """
 
 import math

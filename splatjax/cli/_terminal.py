@@ -1,8 +1,8 @@
-"""What commands share: types of options as help shows them, checks of options and outputs before
-the work begins; messages while it lasts, on stderr, so that results on stdout stay clean; and long
-commands that write many files, which several processes share, and the same command continues.
+"""Common parts of the commands: types of options for the help; checks of options and outputs at the
+start; messages on stderr, with results on stdout; and long commands that write many files, which
+several processes share and the same command continues.
 
-What takes more than a line to explain is a `help`: breaks in docstrings are kept.
+Explanations of more than a line are in `help`, because breaks in docstrings are kept.
 """
 
 import contextlib
@@ -22,7 +22,7 @@ from splatjax.io import atomic_path, read_record, write_record
 OptionalPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="")]
 OptionalFloat = Annotated[float | None, tyro.conf.arg(metavar="FLOAT", help_behavior_hint="")]
 UpAxis = Literal["y", "z"]
-# By field of a command, whether its value is valid, and what it must do.
+# By field of a command: whether its value is valid, and the requirement.
 Rules = dict[str, tuple[bool, str]]
 # Suffixes of drawings.
 FIGURES = (".png", ".pdf", ".svg")
@@ -30,7 +30,7 @@ CONSOLE = Console(stderr=True, highlight=False, soft_wrap=True)
 
 
 def option_name(field: str) -> str:
-    """Return how a field of a command is typed: `light_azimuth` is `--light-azimuth`."""
+    """Return the option of a field of a command: `light_azimuth` is `--light-azimuth`."""
     return f"--{field.replace('_', '-')}"
 
 
@@ -44,8 +44,8 @@ def check_options(command: Any, rules: Rules) -> None:
 
 
 def check_output(path: Path | None, suffixes: tuple[str, ...]) -> None:
-    """Raise `ValueError` for a name with another suffix or a folder in its place,
-    `FileNotFoundError` for a missing folder; nothing for no output.
+    """Raise `ValueError` for a name with another suffix or an existing folder of this name, and
+    `FileNotFoundError` for a missing folder.
     """
     if path is None:
         return
@@ -57,29 +57,29 @@ def check_output(path: Path | None, suffixes: tuple[str, ...]) -> None:
 
 
 def check_folder(path: Path) -> None:
-    """Raise `FileNotFoundError` where the folder of an output is missing."""
+    """Raise `FileNotFoundError` if the folder of an output is missing."""
     if not path.parent.is_dir():
         raise FileNotFoundError(f"{path}: there is no folder {path.parent}; make it first")
 
 
 def save_figure(figure: Any, path: Path) -> None:
-    """Write a drawing of matplotlib, whole or not at all, and print its path."""
+    """Write a figure of matplotlib, completely or not at all, and print its path."""
     with atomic_path(path) as temporary:
         figure.savefig(temporary, format=path.suffix[1:].lower())
     print(path)
 
 
 def note(what: str) -> None:
-    """Print something the user should know."""
+    """Print a message to the user."""
     CONSOLE.print(what, markup=False)
 
 
 @contextlib.contextmanager
 def stage(what: str, total: int = 0) -> Generator[Callable[..., None]]:
-    """Show that something is being done, and afterwards how long it took.
+    """Report a stage of the work, and afterwards its time.
 
-    Yields the function to call with the steps done of a total, and with what is being done where
-    that changes. Where stderr is no terminal, it prints a line at most once a second.
+    Yields the function to call with the finished steps of a total, and with the name of the stage
+    if it changes. If stderr is not a terminal, it prints a line at most once a second.
     """
     begin = last = time.perf_counter()
     with CONSOLE.status(what) as status:
@@ -104,13 +104,13 @@ _COMPILING = "/jax/compilation_cache/cache_misses", "/splatjax/cache/compiling"
 
 @contextlib.contextmanager
 def preview(draw: Callable[[int], list]) -> Generator[None]:
-    """Show a small picture as soon as something is compiled, once, where stderr is a terminal that
-    shows colors. Where all programs are kept, the picture that was asked for comes as soon.
+    """Show a small picture when the first compilation starts, once, if stderr is a terminal with
+    colors. If all programs are cached, the requested picture is ready as soon.
 
     **Arguments:**
 
-    - `draw`: from the most pixels that a side may have to the picture: an even number of rows of
-      red, green and blue up to 255.
+    - `draw`: computes the picture from the largest number of pixels of a side: an even number of
+      rows of red, green and blue up to 255.
     """
     pending = [draw]
     jax.monitoring.register_event_listener(
@@ -148,7 +148,7 @@ def print_table(rows: Sequence[Sequence[str]]) -> None:
         print("  ".join(cells).rstrip())
 
 
-# Variables that hold how many processes a launcher has started; the first that is set counts.
+# Variables with the number of processes of a launcher; the first that is set counts.
 _COUNTS = "JAX_NUM_PROCESSES", "SLURM_STEP_NUM_TASKS", "OMPI_COMM_WORLD_SIZE"
 
 
@@ -161,21 +161,21 @@ def complete(
     name: str,
     what: str,
 ) -> Sequence[int]:
-    """Make the missing items that are this process's. All processes wait until each has seen the
-    same ones missing.
+    """Make this process's share of the missing items. All processes first agree on the missing
+    ones.
 
     **Arguments:**
 
     - `record_path`: of the record, in the folder of the files.
-    - `record`: what the files depend on.
+    - `record`: the settings on which the files depend.
     - `items`: the files of each item.
-    - `prepare`: called where an item is missing; returns the function that makes item i.
+    - `prepare`: called if an item is missing; returns the function that makes item i.
     - `name`: of the items, in messages.
-    - `what`: is done, for the message.
+    - `what`: the name of the work, for the message.
 
-    **Returns:** all items; where other processes are still at work, those of this one.
+    **Returns:** all items, or those of this process if others are still at work.
 
-    **Raises:** `ValueError` when the folder holds files that are made of something else.
+    **Raises:** `ValueError` if the folder contains files of other settings.
     """
     _check_record(record_path, record, items)
     missing, folder = _missing(items), record_path.parent
@@ -226,13 +226,14 @@ def _check_record(path: Path, record: Mapping[str, Any], items: Sequence[tuple[P
 
 
 def process_index_and_count() -> tuple[int, int]:
-    """Wait until all processes of a launcher have come this far; return which of how many this is.
+    """Wait for all processes of a launcher; return the index of this process and their number.
 
-    JAX finds out under SLURM and Open MPI; elsewhere `JAX_COORDINATOR_ADDRESS`, `JAX_NUM_PROCESSES`
-    and `JAX_PROCESS_ID` give it. From then on each goes on alone: one that fails stops no other. To
-    be called before anything is computed.
+    JAX detects SLURM and Open MPI; elsewhere `JAX_COORDINATOR_ADDRESS`, `JAX_NUM_PROCESSES` and
+    `JAX_PROCESS_ID` give it. Afterwards each continues alone: a failure of one does not stop the
+    others. Call it before any computation.
 
-    **Raises:** `ValueError` when the environment names several processes, and not which this is.
+    **Raises:** `ValueError` if the environment specifies several processes without the index of
+    this one.
     """
     counts = [os.environ[name] for name in _COUNTS if name in os.environ]
     if not counts or counts[0] in ("0", "1"):

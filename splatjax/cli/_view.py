@@ -17,7 +17,7 @@ from splatjax.render import BYTES_PER_PIXEL, BYTES_PER_SPLAT, check_displayable
 
 from ._terminal import OptionalFloat, Rules, UpAxis, check_options, note, option_name, stage
 
-# Degrees: the fill stands beside the camera, on the side away from the light.
+# Degrees: the fill is beside the camera, on the side away from the light.
 _FILL_SIDE, _FILL_ELEVATION = 25.0, 10.0
 _SINGLE_LIGHT = -20.0, 30.0, 0.1  # azimuth, elevation, and strength of the fill
 _ENVIRONMENTS = {
@@ -145,7 +145,7 @@ class ViewOptions:
 
     @property
     def environment_name(self) -> str | None:
-        """Return the environment, the studio where no light is given; `None` for single lights."""
+        """Return the environment, by default the studio; `None` for single lights."""
         given = self.light_azimuth, self.light_elevation, self.fill
         is_lit = any(value is not None for value in given)
         return self.environment or (None if is_lit else "studio")
@@ -225,8 +225,8 @@ class ViewOptions:
         )
 
     def camera(self, parts: sj.scene.Parts, azimuth: float) -> sj.Camera:
-        """Place a camera at an azimuth so that the bounding sphere of the splats, which come in
-        parts, just fits the narrower side of the picture.
+        """Place a camera at an azimuth so that the bounding sphere of the splats, given in parts,
+        just fits the narrower side of the picture.
         """
         bodies = (np.asarray(part.centers) for part in parts())
         boxes = [(np.min(body, axis=0), np.max(body, axis=0)) for body in bodies]
@@ -264,8 +264,8 @@ class ViewOptions:
         return path, picture
 
     def manifest(self) -> dict[str, Any]:
-        """Return all that the pictures depend on: options by their names, contents of the files
-        they name, and versions.
+        """Return everything on which the pictures depend: options by name, contents of their files,
+        and versions.
         """
         options = {
             option_name(field): value
@@ -286,7 +286,7 @@ class ViewOptions:
         }
 
     def note_unresolved_layers(self, frame: sj.Frame, material: sj.Material) -> None:
-        """Name the layers that are narrower than the splats."""
+        """Print the layers that are narrower than the splats."""
         if self.diffusion == "shape":
             return
         unresolved = np.asarray(frame.unresolved_fraction) > 0.5

@@ -1,4 +1,4 @@
-"""Light that enters a body: its way through, and what it scatters once."""
+"""Light that enters a body: its path, and single scattering along it."""
 
 import equinox as eqx
 import jax
@@ -32,7 +32,7 @@ class DiffusionCoefficients(eqx.Module):
     - `diffusion_coefficient`: `D`, mm.
     - `squared_kappa`: 1/mm^2.
     - `z_e`: extrapolation distance, mm.
-    - `inward`: fluence over the irradiance of even light that enters, where both are in balance.
+    - `inward`: fluence over the irradiance of uniform light that enters, in equilibrium.
 
     **Source:** Case and Zweifel 1967, "Linear Transport Theory".
     """
@@ -64,12 +64,12 @@ def scattered_once(
     irradiance: Float[Array, "channels splats"],
     directions: Float[Array, "channels 3 splats"],
 ) -> tuple[Float[Array, "channels splats"], Float[Array, "channels splats"]]:
-    """Integrate what the beams scatter once: `(1 / D) int G Q dV` at every splat, and the light
-    that leaves before it diffuses.
+    """Integrate the single scattering of the beams: `(1 / D) int G Q dV` at every splat, and the
+    light that leaves before it diffuses.
 
     **Arguments:**
 
-    - `kernel`: softened less than on the surface, since the beams get dark faster.
+    - `kernel`: softened less than on the surface, since the beams decay faster.
     """
     nodes = np.polynomial.legendre.leggauss(_DEPTHS)
     u, shares = (jnp.asarray(each / 2, irradiance.dtype) for each in (nodes[0] + 1, nodes[1]))
@@ -119,8 +119,9 @@ def _leaves_early(
     tau: Float[Array, "channels splats"], medium: DiffusionCoefficients
 ) -> Float[Array, "channels splats"]:
     """Compute the fraction of light first scattered at optical depth `tau` that leaves before it
-    diffuses: seen from deep below, an isotropic source shines as `tau + q(tau)`, and diffuses as
-    `tau + q(inf)`. Where light is absorbed, less, so that the Bond albedo of a half-space is right.
+    diffuses. Deep below an isotropic source, its light is proportional to `tau + q(tau)`, and that
+    of diffusion to `tau + q(inf)`. With absorption the fraction is reduced, so that the Bond albedo
+    of a half space is right.
     """
     lost = jnp.sqrt(jnp.maximum(1 - medium.albedo, 1e-12))
     # Fitted to Chandrasekhar's H for albedos from 0.6 to 0.9999, eta 1.

@@ -26,7 +26,7 @@ from ._gaussian_sums import SourceTable, Targets, gaussian_sums
 from ._kernel import AbstractDiffusionKernel, TruncatedGaussian, resolved_fraction
 from ._neighbors import Boxes, Neighbors, find_neighbors
 
-# Of the areas of the splats: a layer counts as resolved as far as splats of that area resolve it.
+# Quantile of the areas of the splats: a layer is resolved as far as splats of that area resolve it.
 FINE_QUANTILE = 0.01
 _CELL = 0.6  # edge of the cells, in standard deviations, for an error of 2e-3; error ~ edge^3
 _LAYERS = 2  # to a multiple of which they are filled up, so that materials share a program
@@ -43,7 +43,7 @@ class ClusterDiffuser(AbstractDiffuser):
       for light that varies within the layer's width; the 99th percentile is five times as large.
       Half of it is spent on truncation. With 0, nothing is merged and 4e-5 of the power is
       truncated.
-    - `margin`: a plan holds while the variances stay within this factor of those it was made for.
+    - `margin`: factor on the planned variances within which a plan is valid.
     """
 
     error: float = eqx.field(static=True, default=2e-3)
@@ -94,7 +94,7 @@ class ClusterDiffuser(AbstractDiffuser):
         kernel: AbstractDiffusionKernel,
         interval: Float[Array, "2"],
     ) -> tuple[np.ndarray, ...]:
-        """Choose the layers that are evaluated, filled up by some without sources.
+        """Choose the layers that are evaluated, padded by layers without sources.
 
         **Arguments:**
 
@@ -125,8 +125,8 @@ class ClusterPlan(AbstractDiffusionPlan):
 
     - `sources`: of every layer: splats, or clusters of them.
     - `kernels`: of every layer.
-    - `variances`, `margin`: the plan serves variances within this factor of these, mm^2, or of the
-      first of them.
+    - `variances`, `margin`: the plan is valid for variances within this factor of these, mm^2, or
+      of the first of them.
     """
 
     sources: LayerSources
@@ -177,7 +177,7 @@ class ClusterPlan(AbstractDiffusionPlan):
             per_flat_mass(self.kernels, own, depths)[:, None],
         )
 
-        # What is needed of the plan.
+        # The needed over the planned capacity.
         around = _target_boxes(points, sources.areas), source_boxes(below)
         reaches = jnp.sqrt(2 * self.kernels.largest * jax.lax.stop_gradient(own))
         planned = self.variances[: len(variances)]
@@ -200,9 +200,7 @@ def source_table(
     layers: Int[Array, " blocks"],
     moments: bool = True,
 ) -> SourceTable:
-    """Lay out the sources of all layers: light and mass, with their first moments if those are
-    asked for.
-    """
+    """Arrange the sources of all layers: light and mass, with their first moments if requested."""
     units = units_per_mm(variances)[layers][None, :, None]
     centers = below.centers.reshape(3, -1, SOURCES_PER_BLOCK) * units
     light = below.areas[None] * jnp.pad(below.irradiance, ((0, 1), (0, 0)), constant_values=1)
@@ -213,12 +211,12 @@ def source_table(
 def per_flat_mass(
     kernels: TruncatedGaussian, variances: Float[Array, " layers"], depths: Float[Array, " layers"]
 ) -> Float[Array, " layers"]:
-    """Compute the factor after which a flat sheet has mass 1."""
+    """Compute the factor that gives a flat sheet the mass 1."""
     return 1 / (2 * jnp.pi * variances * kernels.integral(0.5 * depths * depths / variances))
 
 
 def units_per_mm(variances: Float[Array, " layers"]) -> Float[Array, " layers"]:
-    """Compute how many units of length of `gaussian_sums`, `sqrt(2 v)`, are in a millimeter."""
+    """Compute the number of length units of `gaussian_sums`, `sqrt(2 v)`, per millimeter."""
     return jnp.sqrt(0.5 / variances)
 
 
@@ -236,8 +234,8 @@ def _enclose(
     margin: float,
     kernel: AbstractDiffusionKernel,
 ) -> tuple[Boxes, Boxes, Float[Array, " layers"]]:
-    """Enclose the blocks of points, and the blocks of sources of all layers; also compute how much
-    deeper the sources of the widest layer lie for which a plan holds, mm.
+    """Enclose the blocks of points, and the blocks of sources of all layers; also compute the
+    additional depth of the sources of the widest layer for which a plan is valid, mm.
     """
     centers = splats.centers - jnp.mean(splats.centers, axis=1)[:, None]
     depths = kernel.depths(variances)
@@ -248,5 +246,5 @@ def _enclose(
 
 @eqx.filter_jit
 def source_boxes(below: SunkSources) -> Boxes:
-    """Enclose the sources of layers, sunk below their splats. Not differentiated."""
+    """Enclose the sources of layers below their splats. Not differentiated."""
     return Boxes.around(below.centers, below.areas > 0, SOURCES_PER_BLOCK)

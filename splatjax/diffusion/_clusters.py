@@ -21,8 +21,8 @@ _TOGETHER = 128 * POINTS_PER_BLOCK  # split side by side from here on
 
 
 class SunkSources(eqx.Module):
-    """The sources of all layers: means over the areas of their splats, which are sunk below the
-    surface; and sums of the areas. A source without splats has none.
+    """The sources of all layers: means over their splats below the surface, weighted by area, and
+    sums of the areas, 0 without splats.
     """
 
     centers: Float[Array, "3 sources"]
@@ -31,12 +31,12 @@ class SunkSources(eqx.Module):
 
 
 class LayerSources(eqx.Module):
-    """The sources of every layer: its splats sunk below the surface, or clusters of them.
+    """The sources of every layer: its splats below the surface, or clusters of them.
 
-    **Attributes:** which splats share a cluster is not differentiated
+    **Attributes:** the choice of clusters is not differentiated
 
-    - `parents`: for each layer the source that each splat is part of, beyond all for none; those of
-      all layers are counted in one sequence.
+    - `parents`: for each layer the source of each splat, an index beyond all for none; the sources
+      of all layers form one sequence.
     - `layers`: the layer of every block of sources.
     """
 
@@ -52,10 +52,10 @@ class LayerSources(eqx.Module):
         edges: Sequence[float],
         least: int = 0,
     ) -> "LayerSources":
-        """Find the sources of layers.
+        """Choose the sources of layers.
 
-        The capacity is three quarters of the splats for every layer, more than most materials
-        need, so that they share a program.
+        The capacity is three quarters of the splats for every layer. Most materials need less, and
+        so share a program.
 
         **Arguments:**
 
@@ -114,7 +114,7 @@ def nested_cells(
 ) -> list[tuple[Int[np.ndarray, " splats"], int]]:
     """Sort splats into cells by their centers, and these into larger cells by theirs.
 
-    A cell holds only splats that face one way: the two sides of a thin sheet are apart.
+    A cell contains only splats of one orientation: the two sides of a thin sheet are separate.
 
     **Arguments:**
 
@@ -128,7 +128,7 @@ def nested_cells(
     positions, facing = centers[exists], normals[exists]
     members, of_splats = np.ones(len(positions)), np.arange(len(positions))
     for cell in cells:
-        # Cells are numbered along a grid, then split by side, then sorted into a compact order.
+        # Number cells along a grid, split them by side, and sort them in a compact order.
         index = np.floor((positions - positions.min(axis=0)) / cell).astype(np.int64)
         extent = index.max(axis=0) + 1
         key = (index[:, 0] * extent[1] + index[:, 1]) * extent[2] + index[:, 2]
@@ -154,8 +154,8 @@ def _sums(groups: np.ndarray, rows: np.ndarray) -> np.ndarray:
 
 
 def _split_by_side(groups: np.ndarray, facing: np.ndarray) -> np.ndarray:
-    """Split each group whose members face both ways, by the side of its main axis that they face;
-    number without gaps.
+    """Split each group with members of both orientations, by the side of its main axis that they
+    face; number without gaps.
     """
     backs = np.sum(facing * _sums(groups, facing)[groups], axis=1) <= 0
     is_split = np.zeros(groups.max() + 1, bool)
@@ -179,7 +179,7 @@ def compact_order(points: np.ndarray) -> np.ndarray:
 
     **Arguments:** `points`: `[points, 3]`.
     """
-    # Turned together with the order: what is compared next is near in memory.
+    # Sorted together with the order, so that the next comparison reads contiguous memory.
     order, coordinates = np.arange(len(points)), np.array(points.T, np.float32, order="C")
     todo = [(0, len(points))]
     while todo:

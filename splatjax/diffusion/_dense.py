@@ -1,5 +1,5 @@
-"""The plain diffuser: every splat against every point, untruncated. The reference; it has every
-derivative.
+"""The plain diffuser: every splat at every point, untruncated. It is the reference, and supports
+every derivative.
 """
 
 import jax
@@ -23,14 +23,14 @@ _AT_ONCE = 64  # points
 
 
 class DenseDiffuser(AbstractDiffuser):
-    """Sums over every splat at every splat. Slow and plain."""
+    """Sums over every splat at every splat. Slow."""
 
     def make_plan(self, parts, variances, kernel, interval):
         return DensePlan(jnp.arange(len(variances), dtype=jnp.int32))
 
 
 class DensePlan(AbstractDiffusionPlan):
-    """What the plain diffuser needs to know: how many layers there are."""
+    """The plan of the plain diffuser: the number of layers."""
 
     def diffuse(
         self,
@@ -71,8 +71,8 @@ def dense_layer(
         # Squared distances of all points from all sources.
         offset = below[:, None] - points.T[:, :, None]
         squared = jnp.sum(offset * offset, axis=0)
-        # Weigh the sources, A_j G(v, |x - q_j|), but for a factor per point, which the means do not
-        # notice: the exponent of the nearest source is zero.
+        # Weight the sources by A_j G(v, |x - q_j|), up to a factor per point, which the means
+        # cancel: the exponent of the nearest source is zero.
         nearest = jax.lax.stop_gradient(jnp.min(squared, axis=1, keepdims=True))
         weight = sources.areas[None] * jnp.exp(-0.5 * (squared - nearest) / variance)
         # Sum light and mass, and their first moments about the point; divide them.

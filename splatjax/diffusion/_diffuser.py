@@ -25,14 +25,14 @@ class Sources(eqx.Module):
 
 
 class Beams(eqx.Module):
-    """Light that enters a body, one beam for each splat: of many lights their sum, with the mean
-    of their directions.
+    """Light that enters a body, one beam for each splat: the sum of all lights, with the mean of
+    their directions.
 
     **Attributes:** (differentiable)
 
     - `irradiance`: that enters, after the loss at the surface.
-    - `directions`: in which it travels inside, by which the place of its first scattering moves
-      per mean free path: unit for one light, shorter for several.
+    - `directions`: of the light inside, the mean displacement of the first scattering per mean free
+      path: unit for one light, shorter for several.
     """
 
     irradiance: Float[Array, "channels splats"]
@@ -44,9 +44,9 @@ class LayerValues(eqx.Module):
 
     **Attributes:**
 
-    - `values`: of each channel the weighted mean of the irradiance around, which keeps constants,
-      lies between the least and the greatest irradiance, and is linear in it; and last the mass of
-      the kernel on the surface, 1 on a flat sheet.
+    - `values`: for each channel the weighted mean of the irradiance nearby, which keeps constants,
+      is between the least and the greatest irradiance, and is linear in it; last the mass of the
+      kernel on the surface, 1 on a flat sheet.
     - `slopes`: of the values in space, 1/mm.
     """
 
@@ -68,27 +68,27 @@ class Diffused(eqx.Module):
 
 
 class AbstractDiffusionPlan(eqx.Module):
-    """A diffuser with everything that one geometry needs.
+    """A diffuser with its plan for one geometry.
 
     **Attributes:**
 
-    - `gaussians`: the Gaussian of each layer that is evaluated; their number for a layer that only
-      fills up. Others are too narrow for nearly all splats.
-    - `forward_mode`: whether the layers are differentiable in forward mode, and not in reverse
-      mode, where a diffuser has no derivative of both. Static.
+    - `gaussians`: the Gaussian of each evaluated layer; their number for a padding layer. The
+      others are too narrow for nearly all splats.
+    - `forward_mode`: for a diffuser without derivatives in both modes, whether the layers are
+      differentiable in forward mode instead of reverse mode. Static.
     """
 
     gaussians: Int[Array, " layers"]
     forward_mode: bool = eqx.field(static=True, default=False, kw_only=True)
 
     def variances_of_layers(self, variances: Float[Array, " gaussians"]) -> Float[Array, " layers"]:
-        """Take the variances of the layers from those of the Gaussians, mm^2; 1 for a layer that
-        only fills up.
+        """Look up the variances of the layers among those of the Gaussians, mm^2; 1 for a padding
+        layer.
         """
         return variances.at[self.gaussians].get(mode="fill", fill_value=1)
 
     def material(self, material: Material) -> Material:
-        """Return the material whose weights the layers have, without what they do not depend on."""
+        """Return the material of the layers, reduced to the parameters on which they depend."""
         if material.medium is None:
             return material
         return dataclasses.replace(material, medium=None)
@@ -102,8 +102,8 @@ class AbstractDiffusionPlan(eqx.Module):
         combination: AbstractCombination,
         at: Int[Array, " points"] | None = None,
     ) -> Diffused:
-        r"""Evaluate the layers at the splats, from all splats near each in object space, whichever
-        way they face:
+        r"""Evaluate the layers at the splats, from all nearby splats in object space, of any
+        orientation:
 
             mean_k(x) = sum_j A_j G(v_k, |x - q_j|) E_j / sum_j A_j G(v_k, |x - q_j|)
 
@@ -111,9 +111,9 @@ class AbstractDiffusionPlan(eqx.Module):
 
         - `sources`: in the order of the plan. Differentiable.
         - `variances`: mm^2. Differentiable.
-        - `combination`: of the parts of the splats that several devices hold.
-        - `at`: the splats at which the layers are evaluated, in ascending order; there are none
-          from the number of splats on. All for `None`.
+        - `combination`: combines the parts of the splats of several devices.
+        - `at`: the splats at which the layers are evaluated, in ascending order, padded by the
+          number of splats. All for `None`.
         """
 
     def light(
@@ -133,11 +133,11 @@ class AbstractDiffusionPlan(eqx.Module):
         **Arguments:** as for `diffuse`.
 
         - `source`: the irradiance that spreads.
-        - `beams`: computes the beams, where a plan needs them.
-        - `bounced`: the part of the source that comes evenly from other parts of the body, and not
-          with the beams.
+        - `beams`: computes the beams, if a plan needs them.
+        - `bounced`: the part of the source that comes from other parts of the body, uniformly, and
+          not from the beams.
 
-        **Returns:** the layers, and what `towards` needs of a solution on all splats.
+        **Returns:** the layers, and the solution on all splats that `towards` needs.
         """
         sources = Sources(splats.centers.T, splats.normals.T, splats.areas, source)
         variances = material.gaussians.variances

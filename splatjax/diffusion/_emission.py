@@ -112,17 +112,17 @@ class SolvedLight(eqx.Module):
 def radiance_towards(
     eye: Float[Array, "3"], surface: SurfaceSums, material: Material, light: SolvedLight
 ) -> Float[Array, "channels splats"]:
-    r"""Compute `pi` times the radiance of splats towards an eye, but for Fresnel's loss: the source
-    integral along the refracted ray `w` to where it leaves the body, over its mean,
+    r"""Compute `pi` times the radiance of splats towards an eye, without the Fresnel loss: the
+    source integral along the refracted ray `w` up to its exit from the body, over its mean,
 
         L = f M / pi - sigma_s' / (4 pi sigma_t'^2) w . grad phi
 
-    Along the surface `phi` is a line: what is seen from the lit side is darker than M, what is seen
-    from the dark side brighter, by half beyond the terminator of a sphere.
+    Along the surface `phi` is linear: seen from the lit side a splat is darker than M, and from the
+    dark side brighter, by half beyond the terminator of a sphere.
     """
     coefficients, normals, eta = _coefficients(material), surface.normals, material.eta
     to_eye = [e - c for e, c in zip(eye, surface.centers, strict=True)]
-    # What fills up lies at the origin, where an eye may be.
+    # Padding is at the origin, where an eye may be.
     squared = jnp.where(surface.areas > 0, dot(to_eye, to_eye), 1.0)
     to_eye = [axis / jnp.sqrt(squared) for axis in to_eye]
     cosine = jnp.maximum(dot(to_eye, normals), GRAZING)
@@ -149,12 +149,13 @@ def source_integral(
     length: Float[Array, " splats"],
     medium: DiffusionCoefficients,
 ) -> Float[Array, "channels splats"]:
-    r"""Integrate what is scattered towards the near end of a ray, `pi` times the radiance,
+    r"""Integrate the light scattered towards the near end of a ray, `pi` times the radiance,
 
         (1 / 4) int (sigma_s' phi + Q) exp(-sigma_t' s) ds
 
-    Where the faces at its ends are parallel, `phi` fulfills the diffusion equation in between, and
-    integration by parts leaves its values and slopes at the ends, and `Q`, in closed form.
+    If the faces at its ends are parallel, `phi` fulfills the diffusion equation in between, and
+    integration by parts gives the integral in closed form by its values and slopes at the ends, and
+    `Q`.
 
     **Arguments:**
 
@@ -169,10 +170,10 @@ def source_integral(
     bend = (1 - albedo) / spread * mu * mu  # below 1: a solution decays slower than a beam
     at_near, at_far = z_e * near.fluence + mu * near.flux, z_e * far.fluence - far_mu * far.flux
     diffused = albedo / spread * (at_near - jnp.exp(-s) * at_far) / (1 - bend)
-    # A beam that enters at one end gets darker towards the other, at these rates along the ray.
+    # A beam that enters at one end decays towards the other, at these rates along the ray.
     entering, far_entering = (jnp.maximum(x.entering, GRAZING) for x in (near, far))
     rate, far_rate = mu / entering, far_mu / far_entering
-    # Light of one direction enters every place once: through the end that is nearer along it.
+    # Light of one direction reaches every point through one end: the nearer one along it.
     alike = jnp.clip(jnp.sum(near.direction * far.direction, axis=0), 0, 1)
     alike = jnp.where((near.entering > 0) & (far.entering > 0), alike, 0.0)
     cut = s * far_rate / (rate + far_rate)

@@ -1,9 +1,9 @@
 """Sums of Gaussians around blocks of sources at blocks of points, for all layers in one sweep, with
 derivatives in forward and reverse mode that recompute the weights.
 
-In every layer, a block of points has a list of the blocks of sources near it. Lists of about one
-length are swept together, one per *lane*; in a step each lane meets the sources of the next row of
-its list. The unit of length is the layer's standard deviation times the root of 2.
+In every layer, a block of points has a list of the blocks of sources near it. Lists of similar
+length are swept together, one per *lane*; in a step each lane processes the sources of the next row
+of its list. The unit of length is the layer's standard deviation times the root of 2.
 """
 
 import equinox as eqx
@@ -20,11 +20,11 @@ FAR = -1e6  # from anything, in any unit in use here, yet with a square that flo
 
 
 class SourceTable(eqx.Module):
-    """Sources in blocks; or those that each lane of a sweep meets.
+    """Sources in blocks, or those of each lane of a sweep.
 
     **Attributes:**
 
-    - `centers`: apart by axis, which is quicker.
+    - `centers`: one array per axis, which is faster.
     - `rows`: to be summed.
     - `moments`: whether first moments are summed too: each row is then followed by itself times x,
       y and z. Static.
@@ -40,7 +40,7 @@ class SourceTable(eqx.Module):
         return self.rows.shape[1] * (4 if self.moments else 1)
 
     def rows_and_moments(self) -> Float[Array, "blocks sums block"]:
-        """Compute what is summed."""
+        """Compute the summed rows and moments."""
         if not self.moments:
             return self.rows
         each = jnp.stack(
@@ -49,7 +49,7 @@ class SourceTable(eqx.Module):
         return each.reshape(len(each), -1, each.shape[-1])
 
     def gather(self, ids: Int[Array, "lanes width"]) -> "SourceTable":
-        """Read the blocks that each lane meets, `[lanes, sources]` and `[lanes, rows, sources]`."""
+        """Read the blocks of each lane, `[lanes, sources]` and `[lanes, rows, sources]`."""
         x, y, z, rows = (
             each.at[ids].get(mode="fill", fill_value=0) for each in (*self.centers, self.rows)
         )
@@ -60,7 +60,7 @@ class SourceTable(eqx.Module):
     def scatter_add(
         self, ids: Int[Array, "lanes width"], cotangents: "SourceTable"
     ) -> "SourceTable":
-        """Add to the sources that each lane meets: the transpose of `gather`."""
+        """Add to the sources of each lane: the transpose of `gather`."""
 
         def added(table, part):
             part = part.reshape(*part.shape[:-1], ids.shape[1], -1)
@@ -74,7 +74,7 @@ class Targets(eqx.Module):
 
     **Attributes:**
 
-    - `ranks`: of every point among them, in any order; their number for all others.
+    - `ranks`: index of every point among them, in any order; their number for all others.
     - `count`: their number. Static.
     """
 
@@ -106,12 +106,12 @@ class Targets(eqx.Module):
     def read(
         self, sums: Float[Array, "layers sums targets"], lanes: Lanes
     ) -> Float[Array, "lanes sums block"]:
-        """Read what `write` wrote; 0 for other points."""
+        """Read the values that `write` wrote; 0 for other points."""
         return jnp.swapaxes(sums.at[self._at(lanes)].get(mode="fill", fill_value=0), 1, 2)
 
 
 class _Sweep(eqx.Module):
-    """What all sweeps share. Not differentiated."""
+    """The common state of all sweeps. Not differentiated."""
 
     kernels: TruncatedGaussian
     lists: Lists
@@ -128,7 +128,7 @@ class _Sweep(eqx.Module):
         return self.lists.sweep(with_points, out)
 
     def sums(self, points, table: SourceTable, add):
-        """Sum over all that the points meet: `add(lanes, ids, kernels, points, sums)`."""
+        """Sum over all sources of the points: `add(lanes, ids, kernels, points, sums)`."""
         block = points.shape[2]
 
         def sweep(lanes: Lanes, kernels, here, out):
@@ -170,8 +170,8 @@ def _backward(residuals, cotangents):
 
         d x = -2 sum_p g (x - p),    d p = 2 sum_x g (x - p)
 
-    Both are moments of `g` over one side. Points and sources are counted from one of the sources,
-    so that float32 does not cancel.
+    Both are moments of `g` over one side. Points and sources are relative to one of the sources, so
+    that float32 does not cancel.
     """
     given, points, table = residuals
 
@@ -228,18 +228,17 @@ def gaussian_sums(
     targets: Targets,
     forward_mode: bool = False,
 ) -> Float[Array, "layers sums targets"]:
-    r"""Sum `rows_j exp(-|x - p_j|^2)` over the blocks of sources that every point meets.
+    r"""Sum `rows_j exp(-|x - p_j|^2)` over the blocks of sources in the list of every point.
 
     **Arguments:**
 
     - `points`: `x`, in the unit of each layer. Differentiable.
     - `table`: `p_j` and `rows_j` of all layers. Differentiable.
-    - `kernels`: of each layer; stand for `exp`. Terms beyond their rims vanish, whatever the lists
-      hold.
-    - `targets`: at which points.
-    - `forward_mode`: differentiable in forward mode alone, otherwise in reverse mode alone. Static.
+    - `kernels`: of each layer; they replace `exp`. Terms beyond their rims vanish for any list.
+    - `targets`: the points of the sums.
+    - `forward_mode`: differentiable only in forward mode, otherwise only in reverse mode. Static.
     """
     given = _Sweep(kernels, lists, targets)
-    # The loops have derivatives in forward mode of their own.
+    # The loops have their own derivatives in forward mode.
     sums = _forward if forward_mode else _sums
     return sums(given, points.reshape(-1, *points.shape[2:]), table)

@@ -12,7 +12,8 @@ from splatjax._chunking import map_chunks, with_spare
 
 from ._clusters import POINTS_PER_BLOCK, SOURCES_PER_BLOCK
 
-# Splats of the clusters of each level: runs of the compact order, which halves down to the first.
+# Number of splats in the clusters of each level: runs of the compact order, which is halved down to
+# the first level.
 SIZES = 1, *(SOURCES_PER_BLOCK << level for level in range(9))
 _WIDTH = 128  # sources in a row
 _ROWS = 16  # at once
@@ -63,7 +64,7 @@ class Interactions(eqx.Module):
         combine: Callable = jax.ops.segment_sum,
     ) -> PyTree[Array]:
         """Apply a function to points `[rows, 1, points]` and sources `[rows, sources, 1]`, and
-        combine what it makes of each row, `[rows, points]`. Absent sources are 0.
+        combine its results for each row, `[rows, points]`. Absent sources are 0.
         """
         blocks = jax.tree.leaves(points)[0].shape[0] // POINTS_PER_BLOCK
 
@@ -100,16 +101,15 @@ class Hierarchy(eqx.Module):
         opening: float,
         least: float,
     ) -> "Hierarchy":
-        """Find the splats and the clusters that every block of splats sums over. Not for traced
+        """Choose the splats and the clusters over which every block of splats sums. Not for traced
         arrays.
 
         **Arguments:**
 
         - `centers`: in a compact order, `padded_count` of them.
-        - `exists`: false for what fills up.
+        - `exists`: false for padding.
         - `opening`: radius of a cluster over its distance, at most; with 0 all splats are near.
-        - `least`: distance of a cluster, mm: nearer ones are in the reach of the softening, however
-          small they are.
+        - `least`: least distance of a cluster, mm: nearer ones are within reach of the softening.
         """
         levels, first = [], 0
         for size in SIZES[1:]:
@@ -137,12 +137,12 @@ class Hierarchy(eqx.Module):
 
 
 def padded_count(count: int) -> int:
-    """Fill up a number of splats to whole clusters of all levels."""
+    """Pad a number of splats to complete clusters of all levels."""
     return -(-count // SIZES[-1]) * SIZES[-1]
 
 
 def cluster_totals(plane: Float[Array, " splats"]) -> Float[Array, " clusters"]:
-    """Sum over the clusters of every level but the first."""
+    """Sum over the clusters of every level except the first."""
     return jnp.concatenate([jnp.sum(plane.reshape(-1, size), axis=1) for size in SIZES[1:]])
 
 

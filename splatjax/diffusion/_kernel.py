@@ -1,5 +1,5 @@
-"""The kernel of splat-based diffusion: how light spreads in a layer, where that is cut off, by what
-the gathered light is divided, and which layers the splats are too far apart to resolve.
+"""The kernel of splat-based diffusion: spreading of light in a layer, truncation, normalization,
+and resolution by the splats.
 """
 
 import abc
@@ -37,8 +37,8 @@ _SAMPLE = 64  # splats whose neighbors are measured to find how evenly all are s
 class TruncatedGaussian(eqx.Module):
     """`exp(-exponent)`, faded linearly to zero in the last `_FADE` before the largest exponent.
 
-    A step has no derivative that automatic differentiation sees; the fade has one. In float32 the
-    exponential is the eighth power of a polynomial, within 2e-6 and at half the time, and its
+    Automatic differentiation does not see the derivative of a step; the fade has one. In float32
+    the exponential is the eighth power of a polynomial, within 2e-6 and at half the time, and its
     derivative is that of the polynomial.
 
     **Attributes:** not differentiated
@@ -79,7 +79,7 @@ class TruncatedGaussian(eqx.Module):
 
 
 class AbstractDiffusionKernel(eqx.Module):
-    r"""How one layer of light spreads from splats at `p_j` with normals `n_j` to a point `x`:
+    r"""The spreading of one layer of light from splats at `p_j` with normals `n_j` to a point `x`:
 
         L_k(x) = gain_k(x) sum_j A_j G(v_k, |x - q_j|) E_j / sum_j A_j G(v_k, |x - q_j|)
         q_j = p_j - depth sqrt(v_k) n_j
@@ -90,9 +90,9 @@ class AbstractDiffusionKernel(eqx.Module):
 
     **Attributes:** (static)
 
-    - `depth`: how far below its splat the source of a layer lies, in standard deviations.
-    - `regular`, `scattered`: standard deviations per spacing at which a layer begins to be resolved
-      and is fully resolved, on a regular grid and for scattered splats.
+    - `depth`: depth of the source of a layer below its splat, in standard deviations.
+    - `regular`, `scattered`: standard deviations per spacing at which the resolution of a layer
+      starts and is complete, on a regular grid and for scattered splats.
     """
 
     depth: float = eqx.field(static=True, default=0.0)
@@ -100,22 +100,22 @@ class AbstractDiffusionKernel(eqx.Module):
     scattered: tuple[float, float] = eqx.field(static=True, default=(1.0, 2.0))
 
     def depths(self, variances: Float[Array, " gaussians"]) -> Float[Array, " gaussians"]:
-        """Compute how far below its splat the source of each layer lies, mm."""
+        """Compute the depth of the source of each layer below its splat, mm."""
         return self.depth * jnp.sqrt(variances)
 
     def support(self, error: float, share: float) -> float:
         """Choose the radius, in standard deviations, beyond which half of `error` of a layer's
-        power lies, when the diffusion integral is only a `share` of the layer.
+        power is, if the diffusion integral is only a `share` of the layer.
         """
         truncated = max(0.5 * error / max(share, _LEAST_SHARE), _LEAST_TRUNCATED)
         return math.sqrt(2 * math.log(1 / min(truncated, _MOST_TRUNCATED)))
 
     def truncated(self, supports: Float[np.ndarray, " kernels"]) -> TruncatedGaussian:
-        """Build the kernels that are zero beyond so many standard deviations."""
+        """Build kernels that are zero beyond a number of standard deviations."""
         return TruncatedGaussian(jnp.asarray(0.5 * np.square(supports), float))
 
     def interval(self, unevenness: Float[Array, ""]) -> Float[Array, "2"]:
-        """Compute between which standard deviations per spacing layers become resolved."""
+        """Compute the standard deviations per spacing between which layers become resolved."""
         regular, scattered = (
             jnp.asarray(each, unevenness.dtype) for each in (self.regular, self.scattered)
         )
@@ -129,7 +129,7 @@ class AbstractDiffusionKernel(eqx.Module):
         energies: Float[Array, "gaussians channels *points"],
         single_scattering_albedo: Float[Array, "channels *points"],
     ) -> Float[Array, "gaussians #channels *points"]:
-        r"""Compute the factor of each layer on the mean over the splats around a point.
+        r"""Compute the factor of each layer on the mean over the splats near a point.
 
         **Arguments:**
 
@@ -137,13 +137,13 @@ class AbstractDiffusionKernel(eqx.Module):
           flat sheet: 1 there, 2 in a sheet much thinner than the layer is wide, less at open edges.
         - `variances`: mm^2; only their order counts.
         - `energies`: weights times the albedo at the point: the fraction of the light that leaves a
-          flat piece as each layer.
+          flat surface as each layer.
         - `single_scattering_albedo`: the fraction that leaves as single scattering.
         """
 
 
 class PlainMean(AbstractDiffusionKernel):
-    """The kernel of the paper: the mean over the splats around. Constants are kept on any shape.
+    """The kernel of the paper: the mean over nearby splats. Constants are kept on any shape.
 
     **Source:** Kim et al. 2010, section 4.2.
     """
@@ -153,24 +153,23 @@ class PlainMean(AbstractDiffusionKernel):
 
 
 class EscapeNormalization(AbstractDiffusionKernel):
-    r"""A kernel whose light escapes sooner where a part is thin or convex, so that less is
-    absorbed.
+    r"""A kernel for which light escapes sooner from thin or convex parts, so that less is absorbed.
 
     Light spreads from layer to layer, the narrow ones first. Of the light still inside, the
     fraction `p_k = w_k / (W_k + 1 - W)` leaves a flat surface as layer k, where `W_k` is the energy
     of the layers as wide or wider and `W` that of all layers and of single scattering, each times
-    the albedo. Where the surface holds `S_k` times the kernel mass of a flat sheet, the odds
-    `p_k / (1 - p_k)` grow S_k-fold, and the wider layers share what is left:
+    the albedo. If the kernel mass on the surface is `S_k` times that of a flat sheet, the odds `p_k
+    / (1 - p_k)` are multiplied by `S_k`, and the wider layers share the rest:
 
         gain_k = S_k / prod_(j <= k) (1 + p_j (S_j - 1))    where S > 1; S counts as 1 elsewhere
 
-    The gain is 1 on flat pieces and at open edges. For non-negative weights with a sum of at most
-    one, no more light leaves than entered, `sum_k w_k gain_k <= 1`, and all of it leaves when
-    nothing is absorbed (`W = 1`). Negative weights, which a free fit may have, count as zero. The
-    corner at `S = 1` is rounded over 0.05.
+    The gain is 1 on flat surfaces and at open edges. For non-negative weights with a sum of at most
+    one, no more light leaves than entered, `sum_k w_k gain_k <= 1`, and all of it leaves without
+    absorption (`W = 1`). Negative weights of an unconstrained fit count as zero. The corner at `S =
+    1` is rounded over 0.05.
 
-    The source lies below its splat, since the light that leaves has been inside: a part facing away
-    is nearer through thin material, and a part across an air gap is farther.
+    The source is below its splat, because the light that leaves has been inside. This makes a splat
+    on the other side of a thin part nearer, and one across an air gap farther.
 
     **Source:** fitted to path tracing: docs/bodies.md.
     """
@@ -180,7 +179,7 @@ class EscapeNormalization(AbstractDiffusionKernel):
     def gain(self, mass, variances, energies, single_scattering_albedo):
         energies = jnp.where(energies >= 0, energies, 0.0)
         absorbed = 1 - jnp.sum(energies, axis=0) - single_scattering_albedo
-        # White is white to rounding: its derivative must not be taken at a corner.
+        # White is exact only to rounding, so its derivative must not be at a corner.
         absorbed = jnp.where(absorbed >= -_SLACK, absorbed, 0.0)[None]
         # Row k of `not_wider` marks the layers that are as narrow as layer k or narrower.
         rank = jnp.argsort(jnp.argsort(variances))
@@ -196,7 +195,8 @@ class EscapeNormalization(AbstractDiffusionKernel):
 def resolved_fraction(
     variance: Float[Array, "..."], area: Float[Array, "..."], interval: Float[Array, "2"]
 ) -> Float[Array, "..."]:
-    """Compute how much of a layer is the diffusion integral, and not the surface's own irradiance.
+    """Compute the fraction of a layer that is the diffusion integral, instead of the surface's own
+    irradiance.
 
     A smooth step of variance over the area of a splat; `interval` is from
     `AbstractDiffusionKernel.interval`.
@@ -206,11 +206,10 @@ def resolved_fraction(
 
 @eqx.filter_jit
 def unevenness(splats: Splats) -> Float[Array, ""]:
-    r"""Measure how unevenly the splats are spread: 0 on a regular grid, about 0.5 at random.
+    r"""Measure the unevenness of the splats: 0 on a regular grid, about 0.5 at random.
 
     It is the relative standard deviation, over 64 splats, of the distance to the nearest splat over
-    the root of the area. Splats without area do not count. A number of the geometry; not
-    differentiated.
+    the root of the area. Splats without area do not count. Not differentiated.
     """
     if splats.count < 2:
         return jnp.zeros((), splats.centers.dtype)

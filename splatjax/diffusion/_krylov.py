@@ -35,7 +35,7 @@ def _gmres(product, right, error):
     start = jnp.zeros((systems, _MOST + 1), right.dtype).at[:, 0].set((norm > 0).astype(norm.dtype))
 
     def fit(hessenberg):
-        # Columns that are still 0 get no share.
+        # Columns that are still 0 get the coefficient 0.
         inverse = jnp.linalg.pinv(hessenberg)
         shares = jnp.einsum("skm,sm->sk", inverse, start)
         left = start - jnp.einsum("smk,sk->sm", hessenberg, shares)

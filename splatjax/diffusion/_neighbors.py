@@ -1,4 +1,4 @@
-"""Lists of the blocks of sources near each block of points: found once for a geometry; swept."""
+"""Lists of the blocks of sources near each block of points: search (once a geometry) and sweep."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -20,12 +20,13 @@ _FAN = 4  # parts of a box of a coarser level
 
 
 class Lists(eqx.Module):
-    """Which blocks of sources the blocks of points meet in every layer. Not differentiated.
+    """The blocks of sources in the lists of the blocks of points, for every layer. Not
+    differentiated.
 
     **Attributes:**
 
-    - `rows`: blocks of sources, so many to a row; the number of blocks, whose block is empty, in
-      what is left of a row, and in the last row.
+    - `rows`: blocks of sources in rows of fixed length, padded by the number of blocks, whose block
+      is empty; so is the last row.
     - `first`, `counts`: the rows of each list: one for every block of points, layer after layer.
     - `order`: of the lists, the longest first.
     """
@@ -36,7 +37,7 @@ class Lists(eqx.Module):
     order: Int[Array, " lists"]
 
     def only(self, chosen: Bool[Array, " points_blocks"]) -> "Lists":
-        """Leave out all other blocks of points."""
+        """Remove all other blocks of points."""
         counts = jnp.where(chosen, self.counts.reshape(-1, len(chosen)), 0).reshape(-1)
         # A stable sort: those without a row come last.
         order = self.order[jnp.argsort(counts[self.order] == 0)]
@@ -101,13 +102,14 @@ class Boxes(eqx.Module):
         return cls(jnp.min(low, axis=2).T, jnp.max(high, axis=2).T)
 
     def beyond(self, planned: "Boxes") -> Float[Array, " blocks"]:
-        """Measure how far (mm, along an axis) each box reaches beyond the one planned."""
+        """Measure the distance (mm, along an axis) by which each box exceeds the planned one."""
         out = jnp.maximum(planned.low - self.low, self.high - planned.high)
         return jnp.maximum(jnp.max(jnp.where(self.low <= self.high, out, 0), axis=1), 0)
 
 
 class Neighbors(eqx.Module):
-    """The blocks of sources within reach of every block of points, and what the search assumed.
+    """The blocks of sources within reach of every block of points, and the assumptions of the
+    search.
 
     **Attributes:**
 
@@ -140,14 +142,14 @@ def find_neighbors(
 ) -> Lists:
     """Search for the blocks of sources within reach of every block of points, layer by layer.
 
-    The number of rows is rounded up, so that nearby geometries need no other program. Not for
-    traced arrays.
+    The number of rows is rounded up, so that similar geometries share a program. Not for traced
+    arrays.
 
     **Arguments:**
 
     - `layers`: of the blocks of sources.
     - `reaches`: of the layers, mm; nothing is in reach of a layer with 0.
-    - `parts`: equal parts of the points, each with lists of its own, one after the other.
+    - `parts`: equal parts of the points, each with separate lists, one after the other.
     - `least`: rows of each part.
     """
     low, high = (np.asarray(each) for each in (sources.low, sources.high))

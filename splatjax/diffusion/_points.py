@@ -1,4 +1,4 @@
-"""Continue the layers from splats to points of the surface, and weigh them with a material's
+"""Continue the layers from splats to points of the surface, and weight them by a material's
 Gaussians.
 """
 
@@ -17,7 +17,7 @@ from ._kernel import AbstractDiffusionKernel, resolved_fraction
 
 
 def continue_from_splats(layers: LayerValues, centers: Float[Array, "3 splats"]) -> LayerValues:
-    """Prepare layers of the splats for blending (Eq. 1): half of each slope goes into the mean.
+    """Prepare layers of the splats for blending (Eq. 1): half of each slope is added to the mean.
 
     `continue_to_points` computes the layer at points from the blended rows.
     """
@@ -27,7 +27,7 @@ def continue_from_splats(layers: LayerValues, centers: Float[Array, "3 splats"])
 def _along_slopes(
     layers: LayerValues, offsets: Float[Array, "3 points"]
 ) -> Float[Array, "*layers values points"]:
-    # Written out, so that it is fused with what reads it: a third of the time of a reduction.
+    # Written out, so that XLA fuses it into its readers: a third of the time of a reduction.
     slopes, above = layers.slopes, range(layers.slopes.ndim - 2)
     along = slopes * jnp.expand_dims(offsets, tuple(above))
     x, y, z = jax.lax.split(along, (1, 1, 1), axis=slopes.ndim - 2)
@@ -43,20 +43,21 @@ def continue_to_points(
 ) -> tuple[Float[Array, "*layers values points"], Float[Array, "*layers values points"] | None]:
     r"""Continue blended layers, and their derivatives, to points of the surface.
 
-    Each splat is continued along half its slope: the full slope errs as much as none, with the
-    opposite sign, so that the error is of third order in the spacing. Splats lie unevenly around a
-    point; the other half of their mean slope, from their mean center, makes up for that:
+    Each splat is continued along half its slope: the error of the full slope equals that of no
+    slope with the opposite sign, so the error is of third order in the spacing. The other half of
+    the mean slope, from the mean center, corrects for the uneven positions of splats around a
+    point:
 
         L(x) = sum w_i (L_i + s_i (x - p_i) / 2) / W + (sum w_i s_i / W) (x - sum w_i p_i / W) / 2
 
-    Where that is no neighborhood, as where a pixel blends two surfaces, the slope does not carry:
-    light and mass stay between 0 and twice what they are at the mean center.
+    Where a pixel blends two surfaces the slope is invalid: light and mass are limited to between 0
+    and twice their value at the mean center.
 
     **Arguments:**
 
     - `blended`: from the rows of `continue_from_splats`: means of each channel, perhaps those of
       the derivative of the source, and mass.
-    - `derivative`: of the same rows; `None` where it is not asked for.
+    - `derivative`: of the same rows; `None` if not requested.
     - `centers`: blended centers of the splats, mm, from the same origin as `points`.
     """
 
@@ -80,19 +81,18 @@ def continue_to_points(
 
 
 class LayersAtPoints(eqx.Module):
-    r"""The light that every layer brings to points of the surface, whatever the layers weigh.
+    r"""The light of every layer at points of the surface, independent of the weights.
 
-    Weights enter after this, point by point: no splat is looked at again, and derivatives of every
-    kind and order exist.
+    Weights are applied afterwards, point by point, without evaluating splats again; derivatives of
+    every kind and order exist.
 
     **Attributes:**
 
     - `variances`: of the layers, mm^2.
     - `means`, `mass`: of every layer; 0 for layers that no splat resolves.
     - `irradiance`, `area`, `albedo`: of the surface itself; area per splat in mm^2.
-    - `interval`, `kernel`: from which width layers are resolved, and how they are normalized.
-    - `derivative`: of means and mass in the logarithm of the variance; `None` where it was not
-      asked for.
+    - `interval`, `kernel`: of the resolution and normalization of layers.
+    - `derivative`: of means and mass in the logarithm of the variance; `None` if not requested.
     """
 
     variances: Float[Array, " gaussians"]
@@ -129,7 +129,7 @@ class LayersAtPoints(eqx.Module):
 
         - `gaussians`: of the layers, as in a plan.
         - `layers`: means of the channels first, the mass last; those beyond the channels of
-          `irradiance` are left out.
+          `irradiance` are omitted.
         """
         count, channels = len(variances), len(irradiance)
         layer = jnp.full(count, len(gaussians), jnp.int32)
@@ -155,17 +155,18 @@ class LayersAtPoints(eqx.Module):
     def weigh(
         self, gaussians: SumOfGaussians, single_scattering_albedo: Float[Array, " channels"]
     ) -> tuple[Float[Array, "gaussians channels points"], Float[Array, "gaussians points"]]:
-        r"""Compute the layers `L_k` at every point, and how much of each is the diffusion integral.
+        r"""Compute the layers `L_k` at every point, and the fraction of each that is the diffusion
+        integral.
 
-        The rest, where the splats are too far apart, is the surface's own irradiance. Constants are
-        kept, and `min E <= L_k <= max E`, where the gain of the kernel is 1: everywhere for
-        `PlainMean`; for `EscapeNormalization` on flat pieces and at open edges.
+        The rest, which the splats do not resolve, is the surface's own irradiance. Where the gain
+        of the kernel is 1, constants are kept and `min E <= L_k <= max E`: everywhere for
+        `PlainMean`; on flat surfaces and at open edges for `EscapeNormalization`.
 
         **Arguments:**
 
-        - `gaussians`: the weights tell the kernel how much light is absorbed; the layers are not
+        - `gaussians`: the kernel computes absorption from the weights; the layers are not
           multiplied by them.
-        - `single_scattering_albedo`: the fraction that leaves a flat piece as single scattering.
+        - `single_scattering_albedo`: the fraction that leaves a flat surface as single scattering.
         """
         weights, variances = gaussians.weights[:, :, None], self.variances[:, None, None]
         given = weights, variances, single_scattering_albedo, self.means, self.mass[:, None]
@@ -176,7 +177,7 @@ class LayersAtPoints(eqx.Module):
         resolved = resolved_fraction(variances, self.area[None, None], self.interval)
         resolved = jnp.where(mass > 0, resolved, 0.0)
         own = self.irradiance[None]
-        # Splats too far apart to resolve a layer do not tell its mass either.
+        # Splats that do not resolve a layer do not determine its mass either.
         gain = self.kernel.gain(
             1 + resolved * (mass - 1),
             self.variances,
@@ -191,8 +192,8 @@ class LayersAtPoints(eqx.Module):
 
         **Arguments:**
 
-        - `gaussians`: with the derivative, their variances may be a little off those of the layers;
-          without it they do not matter.
+        - `gaussians`: with the derivative, their variances may differ slightly from those of the
+          layers; without it the variances are not used.
         """
         weights, variances = gaussians.weights[:, :, None], gaussians.variances[:, None, None]
         return self._exitance(weights, variances, jnp.zeros_like(weights[0, :, 0]))
@@ -221,7 +222,7 @@ class LayersAtPoints(eqx.Module):
         """
         if self.derivative is None:
             raise ValueError("derivative is None; compute the layers with derivative=True")
-        # Every point and channel has numbers of its own, so that one derivative is that of all.
+        # Points and channels are independent, so one derivative gives those of all.
         own = gaussians.weights[:, :, None], gaussians.variances[:, None, None]
         own = tuple(jnp.broadcast_to(each, self.means.shape) for each in own)
 

@@ -20,7 +20,7 @@ class ScreenedKernel(eqx.Module):
         r_s = r / erf(r / length)
 
     It is smooth, points of a surface at most `length` apart resolve it, and it is `G` beyond three
-    lengths. What the softening leaves out is integrated over a plane through each point.
+    lengths. The part that softening removes is integrated over a plane through each point.
 
     **Attributes:** (differentiable)
 
@@ -47,7 +47,7 @@ class ScreenedKernel(eqx.Module):
 
     def far(self, squared_distances: Float[Array, "*pairs"]) -> list[tuple]:
         """Compute the kernel beyond three lengths, 1/mm, and apply `-1/r d/dr` once, 1/mm^3, and
-        twice, 1/mm^5. Where the distance is 0, all are finite.
+        twice, 1/mm^5. All are finite at distance 0.
         """
         inverse = jax.lax.rsqrt(jnp.where(squared_distances > 0, squared_distances, 1.0))
         distance, squared = squared_distances * inverse, inverse * inverse
@@ -79,7 +79,7 @@ class ScreenedKernel(eqx.Module):
         return ratio / self.length, fall / self.length**3
 
     def plane_integral(self, height: Float[Array, "channels *points"]) -> Float[Array, "..."]:
-        """Integrate what the softening leaves out over a plane, mm.
+        """Integrate the part that softening removes over a plane, mm.
 
         **Arguments:**
 

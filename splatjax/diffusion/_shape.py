@@ -1,4 +1,4 @@
-"""The diffusion equation on the body itself, as an integral equation over its splats."""
+"""The diffusion equation in a body, as an integral equation over its splats."""
 
 import dataclasses
 
@@ -44,16 +44,16 @@ class ShapeDiffuser(AbstractDiffuser):
     - Light `J` that enters again after a bounce comes from all sides, so that the fluence and its
       slope on the surface are `phi + z_e dphi/dn = 4 J / (1 - 2 C1)`.
 
-    The material needs a `Medium`, whose light is solved for; its Gaussians and single scattering do
-    not matter. The splats should be spread evenly, and lie at most about a mean free path apart.
-    Time grows in proportion to their number: 65 microseconds for each and three channels.
+    The material needs a `Medium`; its Gaussians and single scattering are not used. The splats
+    should be spread evenly, at most about a mean free path apart. The time is proportional to their
+    number: 65 microseconds for each and three channels.
 
     **Attributes:**
 
     - `error`: residual of the linear equations over their right side, root mean squares. Static.
-    - `opening`: radius of the clusters that far splats are merged into, over their distance, at
-      most. Exitance errs by 3e-3, and by 1e-2 behind a sheet of two mean free paths; with 0 nothing
-      is merged: the plain reference. Static.
+    - `opening`: largest radius of the clusters of far splats, over their distance. The error of
+      exitance is 3e-3, and 1e-2 behind a sheet of two mean free paths; with 0 nothing is merged,
+      for reference. Static.
 
     **Source:** Case and Zweifel 1967, "Linear Transport Theory" (Milne problem); Zhu, Pine and
     Weitz 1991, "Internal reflection of diffusive light in random media" (`z_e`).
@@ -76,15 +76,15 @@ class ShapeDiffuser(AbstractDiffuser):
         bounced: Float[Array, "channels splats"] | None = None,
     ) -> Float[Array, "channels splats"]:
         """Solve for the light that leaves every splat, in the unit of the irradiance; light that
-        crosses the body without scattering is left out. Differentiable in everything; which splat
-        a beam leaves by is discontinuous.
+        crosses the body without scattering is omitted. Differentiable in everything; the exit of a
+        beam is discontinuous.
 
         **Arguments:**
 
         - `hierarchy`: from `find_hierarchy`; needed under `jit`.
-        - `bounced`: irradiance of light from all sides that enters beside the beams.
+        - `bounced`: irradiance of uniform light that enters beside the beams.
 
-        **Raises:** `ValueError` as `find_hierarchy`, where none is given.
+        **Raises:** `ValueError` as `find_hierarchy`, if none is given.
         """
         hierarchy = self.find_hierarchy(splats) if hierarchy is None else hierarchy
         exitance = self._solve(SurfaceSums.of(splats, hierarchy), medium, beams, bounced)
@@ -93,7 +93,8 @@ class ShapeDiffuser(AbstractDiffuser):
     def _solve(self, surface: SurfaceSums, medium: Medium, beams: Beams, bounced=None):
         coefficients, area = DiffusionCoefficients.of(medium), jnp.sum(surface.areas)
         spread = jnp.sqrt(jnp.sum(surface.areas**2) / area)
-        # What does not absorb is one kappa's limit: the square of this fraction is left out.
+        # A medium without absorption is the limit of a small kappa: the square of this fraction is
+        # neglected.
         kappa = jnp.sqrt(coefficients.squared_kappa + _LEAST_KAPPA**2 / area)
         kernel = ScreenedKernel(kappa, _SOFTENING * spread)
         finer = ScreenedKernel(kappa, _FINER * kernel.length)
@@ -104,7 +105,7 @@ class ShapeDiffuser(AbstractDiffuser):
         exists = (surface.areas > 0)[None]
         one, z_e = jnp.ones_like(surface.areas)[None], coefficients.z_e
         share = -surface.layers(ScreenedKernel(jnp.zeros(1, z_e.dtype), kernel.length), [0.0], one)
-        # What the softening leaves out sees phi as it is on its own splat.
+        # The part that softening removes uses phi of its own splat.
         own = kernel.plane_integral(jnp.zeros_like(z_e)[:, None])
         diagonal = share + own / z_e[:, None]
         diagonal = jnp.where(exists, diagonal, 1.0)
@@ -126,7 +127,7 @@ class ShapeDiffuser(AbstractDiffuser):
         return exitance
 
     def find_hierarchy(self, splats: Splats) -> Hierarchy:
-        """Check that the splats bound a body, and find which are near each other. Not for traced
+        """Check that the splats bound a body, and choose near splats and clusters. Not for traced
         arrays.
 
         **Arguments:**
@@ -172,11 +173,11 @@ class ShapeDiffuser(AbstractDiffuser):
 
 
 class ShapePlan(AbstractDiffusionPlan):
-    """What solving on one body needs. The solved light is one layer, of weight 1.
+    """The plan for solving in one body. The solved light is one layer, of weight 1.
 
     **Attributes:**
 
-    - `hierarchy`: which splats are near each other.
+    - `hierarchy`: near splats, and clusters of far ones.
     """
 
     diffuser: ShapeDiffuser
@@ -211,8 +212,8 @@ class ShapePlan(AbstractDiffusionPlan):
         return Diffused(layers, jnp.zeros_like(exitance[0, 0])), solved
 
     def towards(self, eye, splats, material, layers, solved, at):
-        """Replace the radiant exitance of splats by that of an even surface as bright as they are
-        from the eye.
+        """Replace the radiant exitance of splats by that of a Lambertian surface of their radiance
+        towards the eye.
         """
         surface = SurfaceSums.of(splats, self.hierarchy)
         seen = take_points(radiance_towards(eye, surface, material, solved), at)

@@ -1,5 +1,5 @@
-"""Pass 4 with splats that come a part at a time, at the points that the pixels see: each part adds
-to their sums, and is forgotten.
+"""Pass 4 with splats that are read part by part, at the visible points: each part adds to their
+sums, and is released.
 """
 
 from collections.abc import Iterable
@@ -27,11 +27,11 @@ from ._neighbors import Boxes, Lists, find_neighbors, pairs_in_reach
 
 
 class StreamedDiffusion:
-    """Evaluates the layers at points, from sources that come in parts.
+    """Evaluates the layers at points, from sources in parts.
 
-    The cells of a part are its own, so that one which two parts share counts as two: never coarser
-    than the cells of all splats together. Only the sums are kept, which do not grow with the number
-    of splats.
+    Each part has its own cells, so a cell that two parts share counts as two, and cells are never
+    coarser than those of all splats together. Only the sums are kept, which do not grow with the
+    number of splats.
     """
 
     def __init__(
@@ -68,8 +68,8 @@ class StreamedDiffusion:
 
         **Arguments:**
 
-        - `parts`: of one size, with centers from the origin of the points; sources without area
-          bring nothing.
+        - `parts`: of one size, with centers from the origin of the points; sources without area do
+          not count.
         - `channels`: of their irradiance.
         """
 
@@ -82,9 +82,9 @@ class StreamedDiffusion:
         return _finished(sums, self.variances, self.depths, self.kernels, self.points)
 
     def _in_reach(self, sources: Sources) -> bool:
-        """Test whether a part may bring anything to any point, by boxes."""
+        """Test by boxes whether a part may contribute to any point."""
         around = Boxes.around(sources.centers, sources.areas > 0, len(sources.areas))
-        # Sources lie below their splats.
+        # Sources are below their splats.
         reach = np.max(self.reaches + np.asarray(self.depths, np.float64))
         corners = (
             (np.asarray(boxes.low), np.asarray(boxes.high)) for boxes in (self.boxes, around)

@@ -18,7 +18,7 @@ _AXES = (0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)  # of second moments
 
 
 class SurfaceSums(eqx.Module):
-    """The splats of a body as planes, filled up, and which of them are near each other."""
+    """The splats of a body as planes, padded, and their near splats and clusters."""
 
     hierarchy: Hierarchy
     centers: Planes
@@ -123,16 +123,16 @@ class SurfaceSums(eqx.Module):
         starts: Bool[Array, " splats"],
         rows: Sequence[Float[Array, " splats"]] = (),
     ) -> tuple[Float[Array, " splats"], Float[Array, " splats"], list[Float[Array, " splats"]]]:
-        """Follow a ray from each splat to the first one by which it leaves the body. Which one is
+        """Follow a ray from each splat to its exit from the body. The choice of the exit splat is
         discontinuous.
 
         **Arguments:**
 
-        - `starts`: where there is a ray.
-        - `rows`: what is read there.
+        - `starts`: the splats with a ray.
+        - `rows`: values to read at the exit.
 
-        **Returns:** the length, in lengths of the direction, infinite where there is no exit and 0
-        without a ray; the cosine of the exit; and the rows there.
+        **Returns:** the length, in lengths of the direction, infinite without an exit and 0 without
+        a ray; the cosine of the exit; and the rows there.
         """
 
         def crossing(ray, discs):
