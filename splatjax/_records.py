@@ -1,4 +1,4 @@
-"""Records that take what people type: numbers, lists, tuples and NumPy arrays.
+"""Records that convert their arguments: numbers, lists, tuples and NumPy arrays.
 
     @record
     class Medium(eqx.Module):
@@ -35,7 +35,7 @@ Numbers: TypeAlias = ArrayLike | Sequence[Any] | jax.ShapeDtypeStruct
 
 
 def numbers(values: Numbers | None) -> Any:
-    """Mark, as the converter of a field, that it takes numbers of any kind."""
+    """Mark a field, as its converter, as taking numbers of any kind."""
     return values
 
 
@@ -47,7 +47,7 @@ def several(values: Item | Sequence[Item]) -> Any:
 def valid(
     requirement: str, holds: Callable[[np.ndarray], Any] = lambda x: x == x, finite: bool = True
 ) -> dict[str, Any]:
-    """State, as the metadata of a field, which values it may have, as `check_values` takes it."""
+    """State the valid values of a field, as metadata for `check_values`."""
     return {"valid": (requirement, holds, finite)}
 
 

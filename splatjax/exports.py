@@ -1,5 +1,5 @@
-"""A sum of Gaussians in the terms of other renderers: one length that stands for the whole profile,
-blurs of screen space, and everything at once as plain numbers and words.
+"""A sum of Gaussians as parameters of other renderers: a single length, kernels for screen space,
+and all of them as plain numbers and text.
 """
 
 from typing import Any
@@ -14,8 +14,8 @@ from splatjax.scattering import DiffuseTransmission
 
 
 def burley_distance(gaussians: SumOfGaussians) -> Float[Array, " channels"]:
-    r"""Compute the `d` of normalized diffusion, `(exp(-r/d) + exp(-r/3d)) / (8 pi d r)`, that sends
-    light as far on average. It is the scattering distance of Unity's High Definition Render
+    r"""Compute the `d` of normalized diffusion, `(exp(-r/d) + exp(-r/3d)) / (8 pi d r)`, that has
+    the same mean distance. It is the scattering distance of Unity's High Definition Render
     Pipeline, whose shape parameter is `1 / d`.
 
     Its mean distance is `2.5 d`; that of the Gaussians is `sum_i w_i sqrt(pi v_i / 2) / sum_i w_i`.
@@ -38,7 +38,7 @@ def blender_radius(gaussians: SumOfGaussians) -> Float[Array, " channels"]:
     r"""Compute the radius for Blender's method Christensen-Burley, at scale 1: `4 pi s(A) d`, where
     A is the total reflectance.
 
-    Cycles takes a quarter of the radius over pi for the mean free path l, and then `d = l / s(A)`
+    Cycles uses a quarter of the radius over pi as the mean free path l, and then `d = l / s(A)`
     with the curve for diffuse transmission.
 
     **Returns:** mm; in Blender's unit of length, the meter, a thousandth of that.
@@ -94,8 +94,8 @@ def separable_kernel(
 
 
 def data_sheet(gaussians: SumOfGaussians) -> dict[str, Any]:
-    r"""Express a sum of Gaussians in all the terms of this package, each with its formula, unit and
-    source: lists, numbers and text.
+    r"""Compute all exports of a sum of Gaussians, each with its formula, unit and source: lists,
+    numbers and text.
 
     **Returns:** a dictionary that JSON can hold, with the entries `gaussians`, `gpu_gems`,
     `separable_kernel`, `burley`, `unity` and `blender`.

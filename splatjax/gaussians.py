@@ -1,6 +1,4 @@
-"""The normalized Gaussian, profiles, and the one sum of Gaussians that fitter and renderer
-share.
-"""
+"""The normalized Gaussian, profiles, and the sum of Gaussians, which fits and renderer share."""
 
 import abc
 from typing import ClassVar
@@ -18,7 +16,7 @@ def gaussian(
 ) -> Float[Array, "..."]:
     r"""Compute the normalized two-dimensional Gaussian of Eq. 2, `exp(-r^2 / 2v) / (2 pi v)`.
 
-    It is a function of the squared radius, so that gradients in positions pass no square root.
+    It is a function of the squared radius, so that no square root is differentiated in positions.
 
     **Arguments:**
 
@@ -35,13 +33,13 @@ def gaussian(
 class AbstractProfile(eqx.Module):
     """A radial profile: radiant exitance per unit power entering at the origin of a flat surface.
 
-    Lengths are in mm, `profile(r)` in 1/mm^2. Fresnel transmission at entry and exit is not part of
-    it.
+    Lengths are in mm, `profile(r)` in 1/mm^2. Fresnel transmission at entry and exit is not
+    included.
 
     **Attributes:** (of the class)
 
-    - `singular`: whether the profile goes to infinity at the origin like 1/r, so that the integrals
-      of Eq. 3 and 4 need a cut.
+    - `singular`: whether the profile diverges like 1/r at the origin, so that the integrals of Eq.
+      3 and 4 need a cut.
     """
 
     singular: ClassVar[bool] = False
@@ -73,7 +71,7 @@ class AbstractProfile(eqx.Module):
 class SumOfGaussians(AbstractProfile):
     r"""A profile as a sum of Gaussians, `sum_i w_i G(v_i, r)` (Eq. 2).
 
-    The variances are shared by all channels, since one set of layers serves them all.
+    All channels share the variances, because one set of layers is rendered for all.
 
     **Attributes:**
 

@@ -1,4 +1,4 @@
-"""Drawings of profiles, fits, errors and pictures, by matplotlib."""
+"""Figures of profiles, fits, errors and pictures, by matplotlib."""
 
 from collections.abc import Sequence
 
@@ -206,8 +206,7 @@ def plot_pictures(
 
 
 def plot_recovery(recovery: Recovery, *, title: str | None = None) -> Figure:
-    r"""Draw for each picture what was observed, the recovered material in its place, and the
-    difference.
+    r"""Draw each observed picture, the recovered one, and the difference.
 
     Pixels that do not count are gray. The difference is the mean of the channels, over the
     picture's root mean square.

@@ -1,4 +1,4 @@
-"""The methods that splat-based diffusion is measured against, and by what they are compared."""
+"""Methods to compare splat-based diffusion with, and measures of the comparison."""
 
 from ._bust import bust_with_textures as bust_with_textures
 from ._blending import BlendingRasterizer as BlendingRasterizer

@@ -1,4 +1,4 @@
-"""Blended splats, by any kernel: what the fragments of the front carry, normalized (Eq. 1)."""
+"""Blended splats, by any kernel: attributes of the fragments of the front, normalized (Eq. 1)."""
 
 import jax
 import jax.numpy as jnp
@@ -14,12 +14,12 @@ from ._tiles import AbstractListRasterizer, Lists
 class BlendingRasterizer(AbstractListRasterizer):
     r"""Blends the fragments within epsilon of the nearest one.
 
-    A pixel with any fragment is covered whole, one with none not at all: silhouettes are hard, and
-    holes are holes. Which fragments count, and coverage, have no derivative.
+    A pixel with a fragment is fully covered, and one without is not covered: silhouettes are hard,
+    and holes stay open. The choice of fragments and coverage have no derivative.
 
     **Attributes:**
 
-    - `kernel`: what a splat leaves in a pixel.
+    - `kernel`: the contribution of a splat to a pixel.
     """
 
     kernel: AbstractSplatKernel

@@ -1,4 +1,4 @@
-"""Gaussian blurs of pictures along one axis, as wide at each pixel as is said there."""
+"""Gaussian blurs of pictures along one axis, with a width per pixel."""
 
 from collections.abc import Callable
 
@@ -43,15 +43,15 @@ def blur_along(
     r"""Gather along one axis by Gaussian weights, `sum_s exp(-s^2 / 2 variance) trust(guide(x + s))
     values(x + s)`.
 
-    Taps lie on whole pixels, so that no detail of the picture falls between them. Of a Gaussian
-    narrower than a pixel the sampled weights would have too small a variance; theirs is as asked
-    for.
+    Taps are on whole pixels, so that they miss no detail of the picture. Sampled weights of a
+    Gaussian narrower than a pixel have too small a variance; these are corrected to the given one.
 
     **Arguments:**
 
     - `axis`: 0 gathers from above and below, 1 from the left and the right. Static.
     - `values`: Differentiable.
-    - `guide`: a picture that tells how much a tap counts; beyond the picture it is 0.
+    - `guide`: a picture from which `trust` computes the weight of a tap; beyond the picture it is
+      0.
     - `trust`: of the guide at the tap, in [0, 1]; it must give 0 for a guide of 0.
     - `variance`: at each pixel, pixels^2, not negative. Differentiable but at 1/2, where it jumps
       by 0.4%.

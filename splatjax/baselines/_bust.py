@@ -1,4 +1,4 @@
-"""The bust as methods that work in textures need it."""
+"""The bust with texture coordinates, for methods that work in textures."""
 
 import numpy as np
 
@@ -13,15 +13,14 @@ _RIM = 0.002  # of the texture, that stays free along its edges
 
 
 def bust_with_textures(texels: int) -> tuple[Mesh, Textures]:
-    r"""Make the head of the bust as a mesh whose colors lie in textures, laid out by its own
-    coordinates.
+    r"""Make the head of the bust as a mesh with textures, in its own texture coordinates.
 
     These are longitude and latitude seen from inside the head: the ears, the nostrils and the neck
     overlap in them, and the nearest texel's color there is that of one of the parts.
 
     **Arguments:**
 
-    - `texels`: along each edge of the textures.
+    - `texels`: number of texels along each edge of the textures.
 
     **Returns:** the mesh as `splatjax.geometry.bust_mesh` makes it, cut off at the neck (mm), and
     its albedo (linear), specular and roughness (factors), `[texels, texels, ...]`.

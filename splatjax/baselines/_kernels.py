@@ -1,4 +1,4 @@
-"""What a splat leaves in the pixels around it: where its fragments lie, and what they weigh."""
+"""The contribution of a splat to the pixels around it: positions and weights of its fragments."""
 
 import abc
 import dataclasses
@@ -24,15 +24,15 @@ class Fragments(eqx.Module):
 
 
 class AbstractSplatKernel(eqx.Module):
-    """The footprint of a splat. All weigh their fragments by `splatjax.splatting.fragment_weight`,
-    of a squared radius each.
+    """The footprint of a splat. All use the weight `splatjax.splatting.fragment_weight`, of a
+    squared radius.
     """
 
     @abc.abstractmethod
     def footprints(
         self, splats: Splats, view: AbstractView, settings: SplattingSettings
     ) -> Footprints:
-        """Project splats; the boxes hold all fragments."""
+        """Project splats; the boxes contain all fragments."""
 
     @abc.abstractmethod
     def squared_radius(
@@ -67,8 +67,8 @@ class AbstractSplatKernel(eqx.Module):
 
 
 class DiscKernel(AbstractSplatKernel):
-    """The disc itself, seen in exact perspective: no filter. What is smaller than a pixel is
-    missed, or stands for all of it.
+    """The disc itself, in exact perspective, without a filter. A disc smaller than a pixel is
+    missed, or fills the pixel.
 
     **Source:** Zwicker et al. 2004, "Perspective Accurate Splatting"; Botsch et al. 2004, "Phong
     Splatting".
@@ -86,8 +86,8 @@ class EwaKernel(AbstractSplatKernel):
     center, blurred by the pixel's.
 
     In the picture the kernel is `exp(-d^T (J V J^T + I)^-1 d / 2)` and its like, with the pixel's
-    filter of variance `I`, cut where the renderer's kernel ends. The projection is exact at the
-    center alone: large splats near the eye may part, and leave holes.
+    filter of variance `I`, cut where the renderer's kernel ends. The projection is exact only at
+    the center: large splats near the eye may leave holes.
 
     **Attributes:**
 
@@ -125,7 +125,7 @@ class EwaKernel(AbstractSplatKernel):
 
 class DiscOrPixelKernel(AbstractSplatKernel):
     r"""The disc in exact perspective, or a circle of a pixel's size around its center, whichever
-    weighs more.
+    has the larger weight.
 
     `rho^2 = min(rho_disc^2, d^2 / 2)`: an approximation of the elliptical weighted average that
     leaves no splat smaller than a pixel, at the price of weights that are not those of a
@@ -158,8 +158,8 @@ class DiscOrPixelKernel(AbstractSplatKernel):
         )
 
     def nearness(self, f, view, dx, dy):
-        """What lies beyond the disc is as near as the disc's rim: planes seen edge on would come
-        too close.
+        """Beyond the disc the nearness is that of its rim: planes seen edge on would otherwise be
+        too near.
         """
         plane = super().nearness(f, view, dx, dy)
         squared = _in_perspective(f, view, dx, dy, plane)

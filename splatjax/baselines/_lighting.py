@@ -1,4 +1,4 @@
-"""Deferred shading: the light is found at what the pixels see, by the normal there."""
+"""Deferred shading: light is computed at the visible points, by their normals."""
 
 import dataclasses
 
@@ -24,7 +24,8 @@ _LEAST_SPREAD = 1e-3  # of the neighbors' mean squared distance: below it a dire
 
 
 class LightAtPixels(AbstractLighting):
-    """Blends normals and all else that splats carry, and lights each pixel by what was blended.
+    """Blends normals and all other attributes of splats, and lights each pixel by the blended
+    attributes.
 
     **Source:** Botsch et al. 2005, "High-Quality Surface Splatting on Today's GPUs", section 4; so
     did Zwicker et al. 2001.
@@ -35,11 +36,11 @@ class LightAtPixels(AbstractLighting):
 
 
 class PhongSplats(Splats):
-    """Splats whose normals vary: `n_i + slopes_i (x - p_i)` at a place `x`, not unit.
+    """Splats whose normals vary: `n_i + slopes_i (x - p_i)` at a point `x`, not unit.
 
     **Attributes:**
 
-    - `slopes`: how the normal of each splat turns, 1/mm: row by row a matrix of 3 x 3. From
+    - `slopes`: derivative of the normal of each splat, 1/mm, a matrix of 3 x 3. From
       `normal_slopes`, or of the surface's curvature. Differentiable.
     """
 
@@ -54,8 +55,8 @@ class PhongSplats(Splats):
 class NormalFields(AbstractLighting):
     r"""Lights each pixel by the normals of `PhongSplats` there.
 
-    The fields of a pixel's splats are blended, then shaded; the originals were shaded, then
-    blended, which is the same to second order in how much they disagree there.
+    The fields of a pixel's splats are blended, then shaded. The original method shades, then
+    blends, which is equal to second order in their differences.
 
     **Source:** Botsch et al. 2004, "Phong Splatting".
     """
@@ -80,8 +81,8 @@ class NormalFields(AbstractLighting):
 
 
 def normal_slopes(splats: Splats, neighbors: int = _NEIGHBORS) -> Float[Array, "splats 3 3"]:
-    r"""Fit how normals turn around each splat, by least squares over its neighbors in the plane of
-    the splat, 1/mm.
+    r"""Fit the slopes of the normals around each splat, by least squares over its neighbors in the
+    plane of the splat, 1/mm.
 
     **Arguments:**
 
@@ -114,7 +115,7 @@ def _lit(
     samples: SurfaceSamples,
     normals: Float[Array, "3 points"],
 ) -> SurfaceAttributes:
-    """Compute the light that enters where the pixels look, by the normals there."""
+    """Compute the light that enters at the visible points, by their normals."""
     material, blended = scene.material, samples.attributes
     lit = [
         None if rows is None else group.per_sample(rows)

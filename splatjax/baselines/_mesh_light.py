@@ -1,5 +1,5 @@
-"""Light on a mesh: shadow maps of its faces, compared as those of splats are, and what enters the
-surface.
+"""Light on a mesh: shadow maps of its faces, with the comparison of splats, and the light that
+enters.
 """
 
 import equinox as eqx
@@ -32,9 +32,7 @@ class MeshShadow(eqx.Module):
 
 
 class MeshLight(eqx.Module):
-    """Lights, and their shadow maps: `None` for one that casts no shadows. In the order of the
-    scene.
-    """
+    """Lights in the order of the scene, and their shadow maps, `None` for none."""
 
     lights: tuple[AbstractLightSample, ...]
     shadows: tuple[MeshShadow | None, ...]
@@ -63,7 +61,7 @@ class MeshLight(eqx.Module):
 def light_views(
     mesh: TexturedMesh, lights: tuple[AbstractLightSample, ...], settings: _splatting.ShadowSettings
 ) -> list[_splatting.AbstractView | None]:
-    """Return the view of each light; `None` for one that casts no shadows."""
+    """Return the view of each light; `None` for a light without shadows."""
     bounds = mesh.bounds()
     views: list[_splatting.AbstractView | None] = []
     for light in lights:
@@ -110,8 +108,8 @@ def mesh_light(
     settings: _splatting.ShadowSettings,
     capacities: tuple[int | None, ...],
 ) -> MeshLight:
-    r"""Make the shadow maps of a mesh (4.1, of triangles). Differentiable in depth, not in what
-    hides what.
+    r"""Make the shadow maps of a mesh (4.1, of triangles). Differentiable in depth, not in
+    visibility.
 
     **Arguments:**
 

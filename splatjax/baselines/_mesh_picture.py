@@ -29,8 +29,8 @@ _SETTINGS = TextureSpaceSettings()
 
 
 class TexturePlan(eqx.Module):
-    """What `jit`, `grad` and loops need to know of shapes; made by `plan_texture_space` from
-    concrete arrays. Static.
+    """The static sizes that `jit`, `grad` and loops need; made by `plan_texture_space` from
+    concrete arrays.
     """
 
     texture: int = eqx.field(static=True)
@@ -46,8 +46,8 @@ def plan_texture_space(
     camera: Camera,
     settings: TextureSpaceSettings = _SETTINGS,
 ) -> TexturePlan:
-    """Find the capacities that rendering a mesh needs, and how far its blurs reach; all concrete,
-    not traced.
+    """Compute the capacities for rendering a mesh, and the reaches of its blurs. Arguments are
+    concrete, not traced.
 
     **Raises:** `ValueError` for a point light within the mesh's bounding sphere.
     """
@@ -80,13 +80,12 @@ def render_texture_space(
     r"""Render a mesh with texture-space diffusion: shadow maps, irradiance map, blurs, far side,
     and the picture.
 
-    Light, interface, material, normalization and shading are those of `splatjax.render`; what
-    differs is how light spreads, and that triangles are drawn: one sample per pixel, so that edges
-    are not smoothed.
+    Light, interface, material, normalization and shading are those of `splatjax.render`. Diffusion
+    differs, and triangles are drawn with one sample per pixel, so edges are not smoothed.
 
     **Arguments:**
 
-    - `mesh`: mm. Differentiable but for what is visible.
+    - `mesh`: mm. Differentiable except for visibility.
     - `lights`, `material`, `camera`: as for `splatjax.render`. Differentiable.
     - `plan`: from `plan_texture_space`; needed under `jit`, `grad` and `vmap`, made here otherwise.
 

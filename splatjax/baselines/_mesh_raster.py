@@ -1,5 +1,5 @@
-"""A small rasterizer of triangles: which face every pixel sees, and what the face's corners carry,
-interpolated.
+"""A small rasterizer of triangles: the visible face of every pixel, and interpolated attributes of
+its corners.
 
 A corner lands at `(x, y)` pixels with a weight `w`: its depth in perspective, 1 otherwise. Seen
 from a pixel center `p` it lies at `q_i = w_i ((x_i, y_i) - p)`, which is linear on the face, so
@@ -7,7 +7,7 @@ that the barycentric coordinates of what the pixel sees are
 
     b_i = (q_j x q_k) / sum of all three,    sum_i b_i q_i = 0
 
-perspective-correct, and with derivatives in every corner. Which face is seen has none.
+perspective-correct, and with derivatives in every corner. The choice of the face has none.
 """
 
 import equinox as eqx
@@ -30,7 +30,7 @@ class Landing(eqx.Module):
 
     - `x`, `y`: pixels, origin top left.
     - `w`: depth in perspective, 1 otherwise.
-    - `depth`: mm; of several faces the one of the least is seen.
+    - `depth`: mm; the face of the least depth is visible.
     - `shown`: whether the face is drawn at all.
     - `width`, `height`: of the picture, pixels. Static.
     """
@@ -142,10 +142,10 @@ def see_faces(landing: Landing, capacity: int) -> SeenFaces:
 
 
 def barycentrics(landing: Landing, seen: SeenFaces) -> Float[Array, "height width 3"]:
-    """Compute the perspective-correct coordinates of what every pixel center sees, adding up to 1.
+    """Compute the perspective-correct barycentric coordinates at every pixel center, with sum 1.
     Differentiable in the landing.
 
-    Where a pixel sees nothing they are those of a face's middle.
+    Without a visible face they are those of a face's middle.
     """
     row, column = jnp.indices((landing.height, landing.width), dtype=jnp.int32)
     interpolated = _barycentrics(
@@ -161,7 +161,7 @@ def barycentrics(landing: Landing, seen: SeenFaces) -> Float[Array, "height widt
 def interpolate(
     values: Float[Array, "faces 3 rows"], seen: SeenFaces, shares: Float[Array, "height width 3"]
 ) -> Float[Array, "height width rows"]:
-    """Interpolate what the corners of faces carry; 0 where a pixel sees nothing. Differentiable in
+    """Interpolate attributes of the corners of faces; 0 without a visible face. Differentiable in
     the values and the shares.
     """
     interpolated = jnp.sum(values[seen.faces] * shares[..., None], axis=2)

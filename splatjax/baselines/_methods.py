@@ -1,6 +1,4 @@
-"""The point-based methods that the paper measures itself against, each as settings of this
-renderer.
-"""
+"""The point-based methods with which the paper compares itself, as settings of this renderer."""
 
 from dataclasses import replace
 
@@ -66,10 +64,10 @@ def deferred_splatting(settings: RenderSettings = _DEFAULTS) -> RenderSettings:
 
 
 def exitance(frame: Frame) -> Float[Array, "height width channels"]:
-    """Compute the radiant exitance of a picture before the albedo colors what leaves; of a surface
-    that reflects nothing itself.
+    """Compute the radiant exitance of a picture before the exit half of the albedo, for a surface
+    without specular reflection.
 
-    What is left is how light has spread: the weighted layers `L_k`; 0 where there is nothing.
+    It is the weighted sum of the layers `L_k`; 0 where no surface is visible.
     """
     is_covered = frame.coverage > 0
     share = jnp.where(is_covered, frame.coverage, 1.0)[..., None]

@@ -23,9 +23,7 @@ _FOLLOWED = (
 
 
 class AbstractScreenKernel(eqx.Module):
-    """How light is blurred on the screen. What differs in depth is not trusted: the pixel's own
-    light stands for it.
-    """
+    """A blur in screen space. The pixel's own light replaces that at pixels of another depth."""
 
     @abc.abstractmethod
     def diffuse(
@@ -35,18 +33,18 @@ class AbstractScreenKernel(eqx.Module):
         pixels_per_mm: Float[Array, "height width"],
         gaussians: SumOfGaussians,
     ) -> tuple[Float[Array, "layers channels height width"], Float[Array, "layers channels"]]:
-        """Compute layers, and the weights with which they add up to the radiant exitance.
+        """Compute layers, and the weights with which their sum is the radiant exitance.
         Differentiable in the light's colors.
         """
 
 
 class GaussianPasses(AbstractScreenKernel):
-    """Every Gaussian by itself: a blur along rows, then one along columns; on a frontal plane
-    exactly the sum of Gaussians.
+    """A separate blur for every Gaussian, along rows and along columns; on a frontal plane exactly
+    the sum of Gaussians.
 
     **Attributes:**
 
-    - `reach`: the farthest tap, pixels; what is wider is narrowed to it. Static.
+    - `reach`: the farthest tap, pixels; wider blurs are limited to it. Static.
 
     **Source:** Jimenez, Sundstedt and Gutierrez 2009, the follow-surface test of Jimenez et al.
     2015.
@@ -106,8 +104,8 @@ class ShippedKernel(AbstractOneKernel):
 
 
 class PreintegratedKernel(AbstractOneKernel):
-    """The profile summed along one axis, at the same taps: light that changes along one axis only
-    is diffused as it should be.
+    """The profile summed along one axis, at the same taps: it is right for light that changes along
+    one axis only.
 
     **Source:** Jimenez et al. 2015, section 3.2.
     """
@@ -136,19 +134,17 @@ def diffuse_on_screen(
     material: Material,
     kernel: AbstractScreenKernel = _GAUSSIAN_PASSES,
 ) -> Frame:
-    r"""Replace the diffused light of a picture by what a blur on the screen makes of its
-    irradiance.
+    r"""Replace the diffused light of a picture by a blur of its irradiance in screen space.
 
-    Light that the camera does not see is not there: it does not come from behind silhouettes, nor
-    through thin parts.
+    Light outside of the camera's view is missing: behind silhouettes, and through thin parts.
 
     **Arguments:**
 
     - `frame`: from `splatjax.render` or `render_texture_space`; its irradiance, albedo, depth,
       normal and position are read. Differentiable.
-    - `camera`, `material`: those of the frame. The surface is taken to shine as the material does:
-      maps of `specular` and `roughness` are not among the buffers.
-    - `kernel`: how light is blurred.
+    - `camera`, `material`: those of the frame. Specular parameters are those of the material: maps
+      of `specular` and `roughness` are not among the buffers.
+    - `kernel`: of the blur.
 
     **Returns:** the frame with other `layers`, `weights`, `diffuse` and `beauty`.
 

@@ -25,7 +25,7 @@ _SUPPORT = 3.75  # standard deviations
 
 
 class AbstractStretch(eqx.Module):
-    """How many mm of the surface a texel is."""
+    """The extent of a texel on the surface, mm."""
 
     @abc.abstractmethod
     def millimeters(
@@ -53,14 +53,14 @@ class Uncorrected(AbstractStretch):
 
 
 class TextureSpaceSettings(eqx.Module):
-    r"""How texture-space diffusion is done.
+    r"""Settings of texture-space diffusion.
 
     **Attributes:**
 
     - `resolution`: texels along an edge of the irradiance map. Static.
     - `stretch`: `StretchCorrected()` or `Uncorrected()`.
     - `thin_parts`: `TranslucentShadowMap()` or `OpaqueParts()`.
-    - `kernel`: as in pass 4; how deep the sources lie counts for the far side alone.
+    - `kernel`: as in pass 4; the depth of the sources affects only the far side.
     - `shadows`: of the lights' shadow maps.
     """
 
@@ -79,10 +79,9 @@ class TextureLayers(eqx.Module):
     - `layers`: one per Gaussian, as `L_k` of pass 4; 0 between the charts.
     - `valid`: 1 on the charts.
     - `entering`: the light before it spreads.
-    - `renormalized`: per Gaussian, the share of its weight that fell between the charts and beyond
-      the texture, on average over the texels: light is not lost there, but neither does it cross a
-      seam.
-    - `needed`: what the plan lacks, above 1.
+    - `renormalized`: per Gaussian, the mean fraction of its weight between the charts and beyond
+      the texture. Light is not lost there, and does not cross seams.
+    - `needed`: needed over planned capacity; above 1 the plan does not suffice.
     """
 
     layers: Float[Array, "gaussians height width channels"]
@@ -114,8 +113,8 @@ def reaches_of(
     extents: Float[Array, "2 height width"],
     valid: Float[Array, "height width"],
 ) -> tuple[int, ...]:
-    """Compute how far each step of the blurs must reach, texels, for concrete variances and
-    extents; per step first u, then v.
+    """Compute the reach of each step of the blurs, texels, for concrete variances and extents; per
+    step first u, then v.
     """
     widths = np.sqrt(np.diff(np.sort(np.asarray(variances, np.float64)), prepend=0.0))
     on_chart = np.asarray(extents)[:, np.asarray(valid) > 0]
@@ -136,7 +135,7 @@ def diffuse_in_texture(
 
     The irradiance map is blurred along u and along v by what one variance has more than the one
     before, so that layer k is blurred by all of `v_k`; the stretch map is blurred with it. Weights
-    are divided by what of them lies on the charts.
+    are divided by their sum on the charts.
 
     **Arguments:**
 

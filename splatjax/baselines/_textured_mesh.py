@@ -1,4 +1,4 @@
-"""A triangle mesh with its textures, on the device: what mesh-based baselines draw."""
+"""Triangle meshes with textures on the device, for mesh-based baselines."""
 
 from dataclasses import replace
 
@@ -68,7 +68,7 @@ class TexturedMesh(eqx.Module):
         return self.vertices[self.faces]
 
     def bounds(self) -> Bounds:
-        """Find the sphere around it that shadow maps are laid around."""
+        """Compute the bounding sphere, which determines the shadow maps."""
         corners = self.corners().reshape(-1, 3)  # a mesh that was cut has vertices without faces
         center = 0.5 * (jnp.min(corners, axis=0) + jnp.max(corners, axis=0))
         offset = corners - center[None]
@@ -101,7 +101,7 @@ class TexturedMesh(eqx.Module):
 
 
 class SurfaceTexels(eqx.Module):
-    """What a picture sees of a textured mesh, point by point, row by row."""
+    """The visible points of a textured mesh, row by row."""
 
     points: Splats
     """As splats without extent: positions, unit normals, albedo, specular and roughness."""
@@ -170,8 +170,8 @@ def look_up(
 def look_up_charts(
     picture: Float[Array, "h w channels"], valid: Float[Array, "h w"], uvs: Float[Array, "points 2"]
 ) -> Float[Array, "points channels"]:
-    """Look a picture up that is known on the charts alone (`valid` 1, not 0): by the texels that
-    are; 0 where none is.
+    """Look up a picture that is valid only on the charts (`valid` 1, not 0), by its valid texels; 0
+    without any.
     """
     height, width = picture.shape[:2]
     weights, rows, columns = _four(uvs, height, width)

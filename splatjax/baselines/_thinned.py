@@ -1,6 +1,4 @@
-"""Layers from fewer splats, as the paper has it: the others are left out, and those that stay stand
-for them.
-"""
+"""Layers from fewer splats, as in the paper: some are omitted, and the others represent them."""
 
 import dataclasses
 
@@ -21,10 +19,11 @@ _GOLDEN = (5**0.5 - 1) / 2
 
 
 class ThinnedDiffuser(AbstractDiffuser):
-    r"""Sums over one splat of every `keep` alone, for all splats. What is kept lies evenly: a
-    plan puts splats that are near in space near in memory.
+    r"""Sums over one of every `keep` splats, at all splats. The kept ones are evenly spread,
+    because a plan sorts splats by position.
 
-    The renderer's own `ClusterDiffuser` merges splats instead, which errs far less for as many.
+    The renderer's own `ClusterDiffuser` merges splats instead, with a far smaller error for the
+    same number.
 
     **Attributes:**
 
@@ -40,14 +39,14 @@ class ThinnedDiffuser(AbstractDiffuser):
 
 
 class ThinnedPlan(AbstractDiffusionPlan):
-    """What sums over fewer splats need to know: how many are left out."""
+    """The plan of sums over fewer splats: the number of omitted ones."""
 
     keep: int = eqx.field(static=True)
 
     def diffuse(self, sources, variances, kernel, combination, at=None):
         everywhere = combination.gather(sources, axis=-1)
         group = np.arange(-(-everywhere.areas.shape[0] // self.keep))
-        # The first of each group would lie at the same side of all groups.
+        # The first of each group would be on the same side of all groups.
         chosen = group * self.keep + (group * _GOLDEN % 1 * self.keep).astype(int)
         chosen = np.minimum(chosen, everywhere.areas.shape[0] - 1)
         kept = jax.tree.map(lambda rows: rows[..., chosen], everywhere)

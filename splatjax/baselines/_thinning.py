@@ -1,6 +1,4 @@
-"""The law of Figure 5: how much a layer errs when it is made of fewer splats, and how many are
-enough.
-"""
+"""The law of Figure 5: the error of a layer from fewer splats, and the number that suffices."""
 
 import jax
 import jax.numpy as jnp
@@ -19,26 +17,27 @@ def thinning_error(
     ratio: Float[Array, "..."],
     contrast: Float[Array, "..."],
 ) -> Float[Array, "..."]:
-    r"""Estimate the error of a layer that is made of a part of the splats, spread evenly: root mean
-    square, of the layer's own.
+    r"""Estimate the error of a layer from a part of the splats, evenly spread: root mean square,
+    relative to that of the layer.
 
         E = 0.2 s x^(3/2) (1 - q)^(1/2),    x = (h / sigma) q^(-1/2)
 
-    What counts is `x`, the spacing of the splats that stay in widths of the layer: where a radius
-    is amplified a-fold, `1 / a^2` of the splats serve as well, as Figure 5 shows. A layer averages
-    over `4 pi / x^2` of them. Were splats left out at random, each would err by `s`, and the mean
-    by `s x (1 - q)^(1/2) / (2 sqrt(pi))`, with nothing to fit. Evenly spread, each stands for a
-    cell around it and errs chiefly where an edge of light crosses the cell. That is a share of `x`
-    of the cells, so that the error falls by another `x^(1/2)`; the factor is fitted.
+    The error depends on `x`, the spacing of the kept splats over the width of the layer: for a
+    radius amplified a-fold, `1 / a^2` of the splats suffice, as Figure 5 shows. A layer averages
+    over `4 pi / x^2` of them. For splats omitted at random, the error of each is `s`, and that of
+    the mean `s x (1 - q)^(1/2) / (2 sqrt(pi))`, without a fitted factor. An evenly spread splat
+    represents a cell around it, and its error is large where an edge of light crosses the cell.
+    Edges cross a fraction `x` of the cells, so the error decreases by another `x^(1/2)`; the factor
+    is fitted.
 
     **Arguments:**
 
     - `width`: of the layer, the root of its variance, mm.
     - `spacing`: of all splats, the root of their mean area, mm.
-    - `ratio`: of the splats that stay, in (0, 1].
+    - `ratio`: of kept splats, in (0, 1].
     - `contrast`: `s`, from `layer_contrast`.
 
-    **Returns:** within a factor of 1.5 of what is measured, in 99% of 234 layers with `x` up to 2.2
+    **Returns:** within a factor of 1.5 of measurements, in 99% of 234 layers with `x` up to 2.2
     (docs/figures.md).
 
     **Source:** fitted; Kim et al. 2010, Figure 5, which it explains.
@@ -53,10 +52,9 @@ def splats_that_suffice(
     error: Float[Array, "..."],
     contrast: Float[Array, "..."],
 ) -> Float[Array, "..."]:
-    r"""Find the ratio of the splats of which a layer errs by no more than `error`: the inverse of
-    `thinning_error`.
+    r"""Compute the ratio of splats for an error of a layer: the inverse of `thinning_error`.
 
-    To the root `(1 - q)^(1/2)`, which counts as 1: a little too many, where most of them stay.
+    The root `(1 - q)^(1/2)` is replaced by 1, so the ratio is slightly too large if most are kept.
 
     **Arguments:** as in `thinning_error`.
 
@@ -70,7 +68,8 @@ def splats_that_suffice(
 def layer_contrast(
     splats: Splats, source: Float[Array, "splats channels"], variance: Float[Array, ""]
 ) -> Float[Array, ""]:
-    r"""Measure how uneven light is within a layer's width: `s`, of the layer's root mean square.
+    r"""Measure the variation of light within a layer's width: `s`, relative to the layer's root
+    mean square.
 
     The standard deviation of the light under `G(v / 2, r)`, which is the square of the layer's
     Gaussian; root mean square over 512 splats, evenly chosen, and over the channels.
@@ -80,7 +79,7 @@ def layer_contrast(
     - `source`: the light that spreads, as `splatjax.render.compute_irradiance` gives it.
     - `variance`: of the layer, mm^2.
 
-    **Returns:** 0 under even light.
+    **Returns:** 0 for uniform light.
     """
     count = min(_POINTS, splats.count) // _AT_ONCE * _AT_ONCE
     if count == 0:

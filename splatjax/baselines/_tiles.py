@@ -1,6 +1,4 @@
-"""Lists of splats per tile, walked block by block in the plainest way: nothing is kept back, and
-every derivative is there.
-"""
+"""Lists of splats per tile, processed block by block in the plainest way, with every derivative."""
 
 import abc
 from collections.abc import Callable
@@ -34,7 +32,7 @@ Result = TypeVar("Result", bound=PyTree)
 
 class AbstractListRasterizer(AbstractRasterizer):
     """Passes 2 and 3 by a kernel, over lists of splats. Shadow maps are the renderer's: baselines
-    differ in the picture alone.
+    differ only in the picture.
     """
 
     kernel: eqx.AbstractVar[AbstractSplatKernel]
@@ -61,8 +59,8 @@ class AbstractListRasterizer(AbstractRasterizer):
 
 
 class ListPlan(AbstractRasterPlan):
-    """The capacity of the lists of an `AbstractListRasterizer`. Nothing is shown behind the
-    front.
+    """The capacity of the lists of an `AbstractListRasterizer`. No surface behind the front is
+    rendered.
     """
 
     rasterizer: AbstractListRasterizer

@@ -1,6 +1,4 @@
-"""What a texture-space method knows of the far side of thin parts: nothing, or what a translucent
-shadow map tells.
-"""
+"""The far side of thin parts in texture space: ignored, or by a translucent shadow map."""
 
 import abc
 
@@ -20,7 +18,7 @@ _APART = 6.0
 
 
 class FarSide(eqx.Module):
-    """For each texel, and each light with a shadow map, where the light went in on the far side."""
+    """For each texel, and each light with a shadow map, the entry of light on the far side."""
 
     uvs: Float[Array, "lights points 2"]
     nearness: Float[Array, "lights points"]
@@ -48,7 +46,7 @@ class FarSide(eqx.Module):
 
 
 class AbstractThinParts(eqx.Module):
-    """How light comes through thin parts."""
+    """The transmission of light through thin parts."""
 
     @abc.abstractmethod
     def far_side(
@@ -64,21 +62,21 @@ class AbstractThinParts(eqx.Module):
 
 
 class OpaqueParts(AbstractThinParts):
-    """Light does not come through: the texture alone is blurred."""
+    """No transmission: only the texture is blurred."""
 
     def far_side(self, texels, light, widest, millimeters):
         return None
 
 
 class TranslucentShadowMap(AbstractThinParts):
-    r"""A shadow map that tells where in the texture the light went in, and how far away that is
-    (modified, of d'Eon and Luebke).
+    r"""A shadow map with the texture coordinates and the distance of the entry of light (modified,
+    of d'Eon and Luebke).
 
-    A Gaussian is separable in depth too: what comes through is the light of the far side, already
-    blurred there, times `exp(-d^2 / 2v)`. The thickness `d` is measured along the light, shortened
-    by the cosine where the two sides face apart, and blurred with the light; texels that face the
-    light, or that are lit as far as the shadow map can tell, have no far side. Where the far side
-    is close in the texture the blur has brought its light already.
+    A Gaussian is separable in depth too: the transmitted light is the blurred light of the far side
+    times `exp(-d^2 / 2v)`. The thickness `d` is measured along the light, reduced by the cosine
+    where the two sides face apart, and blurred with the light. Texels that face the light, or are
+    lit by the shadow map, have no far side. If the far side is close in the texture, the blur
+    already includes its light.
 
     **Source:** d'Eon and Luebke 2007 (GPU Gems 3, chapter 14.5), after Dachsbacher and Stamminger
     2003.

@@ -1,4 +1,4 @@
-"""Directions of photons: how they enter, are refracted, and are scattered."""
+"""Directions of photons: entry, refraction and scattering."""
 
 import abc
 import math
@@ -17,7 +17,9 @@ Direction = tuple[Float[Array, " photons"], Float[Array, " photons"], Float[Arra
 
 
 class AbstractIncidence(eqx.Module):
-    """A narrow beam's directions, as they are inside the surface. Powers count what enters."""
+    """The directions of a narrow beam inside the surface. Powers are relative to the entering
+    power.
+    """
 
     @abc.abstractmethod
     def enter(
@@ -49,7 +51,7 @@ class NormalIncidence(AbstractIncidence):
 
 
 class DiffuseIncidence(AbstractIncidence):
-    """From all directions above, equally bright: a white sky."""
+    """Uniform radiance from all directions above: a white sky."""
 
     def enter(self, xi_cosine, xi_angle, eta):
         outside, inside = (jnp.broadcast_to(each, xi_cosine.shape) for each in eta)
@@ -85,7 +87,7 @@ class AbstractPhaseFunction(eqx.Module):
 
 
 class Isotropic(AbstractPhaseFunction):
-    """All directions are equally likely. By similarity it stands for any phase function, with
+    """All directions are equally likely. By similarity it represents any phase function, with
     `sigma_s'` for `sigma_s`.
     """
 
@@ -110,8 +112,8 @@ class HenyeyGreenstein(AbstractPhaseFunction):
 
     **Raises:** `ValueError` for a `g` out of this range.
 
-    **Source:** Henyey and Greenstein 1941; the inverse of its distribution is written so that
-    nothing is singular at `g = 0`.
+    **Source:** Henyey and Greenstein 1941; the inverse of its distribution is written without a
+    singularity at `g = 0`.
     """
 
     g: Float[Array, "*layers"] = eqx.field(
@@ -158,11 +160,11 @@ def fresnel(
     eta_from: Float[Array, " photons"],
     eta_to: Float[Array, " photons"],
 ) -> tuple[Float[Array, " photons"], Float[Array, " photons"]]:
-    """Compute the reflectance for unpolarized light that arrives under `cosine` (0 to 1), and the
+    """Compute the reflectance for unpolarized light that arrives at `cosine` (0 to 1), and the
     cosine of the transmitted light.
 
-    Total internal reflection is 1, with a cosine of 0. Between equal indices nothing is reflected
-    or bent, exactly.
+    Total internal reflection is 1, with a cosine of 0. Between equal indices there is exactly no
+    reflection or refraction.
     """
     ratio = eta_from / eta_to
     squared = 1 - ratio * ratio * (1 - cosine * cosine)

@@ -19,11 +19,11 @@ from ._walk import Optics, Stack
 
 _FLIGHTS = 20_000
 
-# Photons on their way at once: their state stays in the cache of a core or two, and few lanes wait
-# for the last photon.
+# Number of simultaneous photons: their state stays in the cache of a core or two, and few lanes
+# wait for the last photon.
 _MOST_LANES, _LEAST_LANES, _PHOTONS_A_LANE = 16384, 1024, 8
 
-# In free paths of the first layer that scatters: so thin that no light moves sideways in a film.
+# In free paths of the first scattering layer: so thin that light does not move sideways in a film.
 _FILM_THICKNESS = 1e-6
 
 
@@ -53,7 +53,7 @@ class LayeredMedia(eqx.Module):
         eta_above: Float[Array, "*channels"],
         eta_below: Float[Array, "*channels"],
     ) -> "LayeredMedia":
-        """Lay out layers from the top. A film has the index of the next scattering layer below it,
+        """Convert layers, from the top. A film has the index of the next scattering layer below it,
         or else of the last one above.
         """
         scattering = [layer for layer in layers if isinstance(layer, Layer)]
@@ -78,7 +78,7 @@ class LayeredMedia(eqx.Module):
         """Group the channels, by number, that differ in absorption and in scale alone: they share a
         walk.
 
-        Under `jit` values are unknown, and each channel has its own walk.
+        Under `jit`, where values are unknown, each channel has its own walk.
         """
         geometry = (self.sigma_s, self.thickness, self.eta)
         if any(isinstance(values, Tracer) for values in geometry):
@@ -107,9 +107,9 @@ def monte_carlo(
     r"""Walk photons through layers and count where they leave, without the limits of diffusion on
     thickness and absorption.
 
-    Photons fly from scattering to scattering; absorption lessens what they carry; interfaces
-    reflect or refract them by Fresnel's formulas. Channels that differ in absorption alone, or in
-    scale alone (a half space of one index), share their walks, and hence their errors.
+    Photons fly from one scattering event to the next; absorption reduces their weight; interfaces
+    reflect or refract them by Fresnel's formulas. Channels that differ only in absorption, or only
+    in scale (a half space of one index), share their walks, and therefore their errors.
 
     Differentiable in `sigma_a`, `sigma_s_prime` and the optical depth of films, in forward and
     reverse mode, by the likelihood of each path. The standard errors are constants; those of
@@ -118,15 +118,15 @@ def monte_carlo(
     **Arguments:**
 
     - `layers`: from the top; only the lowest may be infinite.
-    - `photons`: how many for each walk; errors fall with its root.
+    - `photons`: number of photons for each walk; errors decrease with its root.
     - `key`: of `jax.random`; the same key gives the same numbers.
     - `edges`: of the rings, mm; ascending. By default 128 rings whose widths grow in proportion,
       from a fiftieth of a mean free path.
     - `incidence`: `NormalIncidence()` or `DiffuseIncidence()`.
     - `phase`: `Isotropic()` or `HenyeyGreenstein(g)`; `sigma_s = sigma_s' / (1 - g)`.
     - `eta_above`, `eta_below`: indices of the neighbors relative to air.
-    - `flights`: from event to event, at most so many for each photon; the power that it then
-      carries is `unfinished`.
+    - `flights`: largest number of flights from event to event for each photon; its power after them
+      is `unfinished`.
     - `progress`: called from time to time with the number of photons done and that of all.
 
     **Returns:** a `MonteCarlo`.
@@ -160,8 +160,8 @@ def path_derivatives(
     progress: Callable[[int, int], None] | None = None,
     **settings,
 ) -> tuple[MonteCarlo, PathDerivatives, PathDerivatives]:
-    r"""Compute what `monte_carlo` does, and its derivatives in `sigma_a` and `sigma_s` (1/mm) of
-    each layer, with standard errors.
+    r"""Compute the results of `monte_carlo`, and their derivatives in `sigma_a` and `sigma_s`
+    (1/mm) of each layer, with standard errors.
 
     **Arguments:** those of `monte_carlo`.
 

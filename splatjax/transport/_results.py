@@ -1,4 +1,4 @@
-"""Where photons end, and what a walk of many reports: means, standard errors, and derivatives."""
+"""Counts of ended photons, and the results of walks: means, standard errors, and derivatives."""
 
 import equinox as eqx
 import jax
@@ -17,8 +17,8 @@ _AT_ONCE = 32
 
 
 class Sum(eqx.Module):
-    """A running sum and what rounding left out of it: exact to the precision of its terms after any
-    number of them.
+    """A running sum with its rounding error: exact to the precision of its terms after any number
+    of them.
 
     **Source:** Neumaier 1974.
     """
@@ -85,8 +85,8 @@ class Tally(eqx.Module):
         dropped: Bool[Array, " photons"],
         edges: Float[Array, "channels edges"],
     ) -> "Tally":
-        """Add the photons that are done. Those `dropped` were given up for having too little to
-        carry, and leave nothing.
+        """Add the photons that are done. Those `dropped` were terminated at a tiny weight, and do
+        not count.
         """
         rings = edges.shape[1] - 1
         radius = jnp.sqrt(photons.x * photons.x + photons.y * photons.y)
@@ -137,7 +137,7 @@ class SampleMean(eqx.Module):
 
 
 class AbstractTallies(eqx.Module):
-    r"""Where the light goes that enters; powers are fractions of it.
+    r"""The distribution of the light that enters; powers are fractions of it.
 
     **Attributes:**
 
@@ -146,7 +146,7 @@ class AbstractTallies(eqx.Module):
     - `total_reflectance`, `total_transmittance`: all light that leaves, at any distance;
       [channels].
     - `absorbed`: in each layer; [layers, channels].
-    - `unfinished`: carried by photons after the last flight that they were allowed; [channels].
+    - `unfinished`: of photons after their last allowed flight; [channels].
     """
 
     reflected: SampleMean

@@ -1,5 +1,5 @@
-"""Photons by the lane: each lane takes the next photon when it is done with one. Uniform random
-numbers by counting.
+"""Photons by lanes: each lane takes the next photon when its photon has ended. Counter-based
+uniform random numbers.
 """
 
 from collections.abc import Callable
@@ -123,7 +123,7 @@ def _advance(walk: Walk, state: _State) -> _State:
 
 
 def _round(walk: Walk, state: _State) -> _State:
-    """Fly, find who is done, count them, and start others in their places."""
+    """Fly, count the photons that have ended, and start others in their lanes."""
     draws = state.round * (_FLIGHTS + 2)
 
     def path(optics, weights):
@@ -167,7 +167,7 @@ def _round(walk: Walk, state: _State) -> _State:
 
 
 def _launch(walk: Walk, state: _State, free: Bool[Array, " photons"]) -> _State:
-    """Start photons in lanes that are free, as long as there are any left to start."""
+    """Start photons in free lanes, as long as there are any left."""
     dtype = walk.edges.dtype
     turn = jnp.cumsum(free.astype(jnp.int32))
     begins = free & (state.started + turn <= walk.settings.photons)

@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ._directions import AbstractPhaseFunction, Direction, fresnel, of_layer
 
-# Where a photon is; one that is idle is not on its way at all.
+# States of a photon; an idle one does not fly.
 INSIDE, ABOVE, BELOW, IDLE = 0, 1, 2, 3
 
 
@@ -30,8 +30,8 @@ class Stack(eqx.Module):
 
 
 class Photons(eqx.Module):
-    """Where photons are, in free paths of the stack; depth counts from the top of their layer. No
-    derivative passes here.
+    """Positions of photons, in free paths of the stack; depth is from the top of their layer. Not
+    differentiated.
     """
 
     x: Float[Array, " photons"]
@@ -45,12 +45,12 @@ class Photons(eqx.Module):
 
 
 class PathWeights(eqx.Module):
-    r"""What photons carry and have left, in each channel that walks along.
+    r"""Carried and absorbed weights of photons, in each channel of the walk.
 
     **Attributes:**
 
     - `carried`: the share of the entering power; 1 at the start, on average.
-    - `absorbed`: what each layer has taken of it.
+    - `absorbed`: the share that each layer has absorbed.
 
     Derivatives of both have a leading axis.
     """
@@ -60,8 +60,8 @@ class PathWeights(eqx.Module):
 
 
 class Optics(eqx.Module):
-    r"""What turns flights into weights, per free path of the stack. Differentiable: the only place
-    where coefficients are.
+    r"""The coefficients that determine weights, per free path of the stack. Only these are
+    differentiable.
 
     **Attributes:**
 
@@ -157,9 +157,7 @@ def weigh(
     length: Float[Array, " photons"],
     scattered: Bool[Array, " photons"],
 ) -> PathWeights:
-    """Carry weights along a flight of some length in a layer: absorption on its way is its mean,
-    not drawn.
-    """
+    """Update weights along a flight in a layer: absorption is its mean, not sampled."""
     length, scattered = (jnp.broadcast_to(x, weights.carried.shape) for x in (length, scattered))
     removal = of_layer(optics.removal, layer) * length
     # The mean of exp(-removal) on the way; a series where the quotient has no derivative.
