@@ -83,8 +83,8 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 def parsed(words: list[str]) -> Any:
-    """Return the command that words stand for; raise `SystemExit` where they ask for help or the
-    version, or stand for none.
+    """Return the command of some words; raise `SystemExit` if they ask for help or the version, or
+    are not a command.
 
     Only the command of the first word is parsed, so that help and errors are about it alone.
     """

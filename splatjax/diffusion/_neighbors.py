@@ -189,7 +189,7 @@ def _lists(pairs: Sequence[tuple[np.ndarray, np.ndarray]], blocks: int, empty: i
 
     - `pairs`: of each layer, the blocks of points and of sources that are in reach.
     - `blocks`: of points.
-    - `empty`: stands for no block of sources.
+    - `empty`: the index for no block of sources.
     """
     of = np.concatenate([layer * blocks + each for layer, (each, _) in enumerate(pairs)])
     near = np.concatenate([each for _, each in pairs])

@@ -29,20 +29,21 @@ _WIDE = 1e12  # mm^2: resolved everywhere
 
 
 class ShapeDiffuser(AbstractDiffuser):
-    r"""Solves the diffusion equation in the body that closed splats bound, where the other
-    diffusers lay the profile of a flat half-space over its surface. With the fluence `phi`,
-    `G = exp(-kappa r) / (4 pi r)`, kappa at which light transport decays, and
-    `D = sigma_a / kappa^2`, about `1 / (3 sigma_t')`, for every point x of the surface
+    r"""Solves the diffusion equation in the body that closed splats bound; the other diffusers
+    apply the profile of a flat half space to its surface. With the fluence `phi`, `G = exp(-kappa
+    r) / (4 pi r)`, kappa the decay rate of light transport, and `D = sigma_a / kappa^2`, about `1 /
+    (3 sigma_t')`, for every point x of the surface
 
         share(x) phi + int (G / z_e + dG/dn_y) phi dA = (1 / D) int G Q dV,    M = D phi / z_e
 
-    - `share` is 1/2 where the surface is smooth and the solid angle's share of the body at creases:
-      a constant solves the equation of the same splats for `kappa = 0`, without source and escape.
+    - `share` is 1/2 where the surface is smooth, and the body's fraction of the solid angle at
+      creases: a constant solves the equation of the same splats for `kappa = 0`, without source and
+      escape.
     - `z_e = 0.7104 (1 + 3 C2) / (1 - 2 C1) / sigma_s'`, of the internal reflectance.
-    - Q is light scattered once along the beams, each as long as its way through the body. A part of
-      it leaves before it diffuses: that by which Hopf's function falls short of its limit.
-    - Light `J` that enters again after a bounce comes from all sides, so that the fluence and its
-      slope on the surface are `phi + z_e dphi/dn = 4 J / (1 - 2 C1)`.
+    - Q is light scattered once along the beams, each as long as its path through the body. A part
+      of it leaves before it diffuses: the difference of Hopf's function from its limit.
+    - Light `J` that enters again after a bounce is uniform, so the fluence and its slope on the
+      surface are `phi + z_e dphi/dn = 4 J / (1 - 2 C1)`.
 
     The material needs a `Medium`; its Gaussians and single scattering are not used. The splats
     should be spread evenly, at most about a mean free path apart. The time is proportional to their

@@ -1,6 +1,4 @@
-"""Residuals as a function of coefficients, by pictures with all their layers, which serve many
-materials.
-"""
+"""Residuals as a function of coefficients, by layers that serve many materials."""
 
 import math
 from collections.abc import Callable, Sequence

@@ -1,6 +1,5 @@
 """Pictures of every format that OpenImageIO reads, as arrays with row 0 at the top; PNG and WebP
-for displays; the sRGB transfer function (IEC 61966-2-1) and its inverse; frames with all layers as
-OpenEXR.
+for displays; the sRGB transfer function (IEC 61966-2-1); frames with all layers as OpenEXR.
 """
 
 import errno
@@ -28,8 +27,7 @@ def read_planes(
     """Read the channels of a picture by name. Integers are divided by the maximum of their type.
     Nothing is decoded, and alpha is not multiplied.
 
-    **Returns:** channels, attributes of the file, and whether its values are floating-point
-    numbers.
+    **Returns:** channels, attributes of the file, and whether its values are floats.
 
     **Raises:** `FileNotFoundError`, or `ValueError` when the file cannot be read, is cut short or
     does not fit into memory.

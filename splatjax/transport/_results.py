@@ -92,7 +92,8 @@ class Tally(eqx.Module):
         radius = jnp.sqrt(photons.x * photons.x + photons.y * photons.y)
 
         def leave(carried, slope, edges):
-            # Within the first edge and beyond the last is farther out too: no ring knows it.
+            # Photons within the first edge and beyond the last are in no ring, and count as farther
+            # out.
             ring = jnp.searchsorted(edges, radius, side="right", method="scan_unrolled") - 1
             ring = jnp.where((ring < 0) | (ring >= rings), rings, ring)
             ring = jnp.where(
