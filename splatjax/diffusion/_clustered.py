@@ -147,7 +147,7 @@ class ClusterPlan(AbstractDiffusionPlan):
         at: Int[Array, " points"] | None = None,
     ) -> Diffused:
         # Every device gathers the sources of all, and evaluates the layers at its own splats.
-        everywhere = combination.gather(sources, axis=-1)
+        everywhere = combination.gather(sources, axis=-1).of_layers(self.gaussians)
         origin = jax.lax.stop_gradient(jnp.mean(everywhere.centers, axis=1))[:, None]
         centered = dataclasses.replace(everywhere, centers=everywhere.centers - origin)
         points = sources.centers - origin

@@ -101,7 +101,10 @@ class LayerSources(eqx.Module):
             centers=jnp.stack([totals(splats.areas[None] * row) * inverse for row in sunk]),
             areas=areas,
             irradiance=jnp.stack(
-                [totals((splats.areas * row)[None]) * inverse for row in splats.irradiance]
+                [
+                    totals(splats.areas[None] * jnp.atleast_2d(row)) * inverse
+                    for row in splats.irradiance
+                ]
             ),
         )
 

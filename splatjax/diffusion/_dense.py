@@ -2,6 +2,8 @@
 every derivative.
 """
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
@@ -40,7 +42,7 @@ class DensePlan(AbstractDiffusionPlan):
         combination: AbstractCombination,
         at: Int[Array, " points"] | None = None,
     ) -> Diffused:
-        everywhere = combination.gather(sources, axis=-1)
+        everywhere = combination.gather(sources, axis=-1).of_layers(self.gaussians)
         points = sources.centers if at is None else take_points(sources.centers, at)
         layers = dense_layers(everywhere, points, self.variances_of_layers(variances), kernel)
         return Diffused(layers, jnp.zeros((), sources.centers.dtype))
@@ -53,8 +55,14 @@ def dense_layers(
     kernel: AbstractDiffusionKernel,
 ) -> LayerValues:
     """Evaluate layers at any points, untruncated."""
-    given = variances, kernel.depths(variances)
-    return jax.lax.map(lambda layer: dense_layer(sources, points, *layer), given)
+
+    def evaluate(layer):
+        *given, light = layer
+        own = sources if light is None else dataclasses.replace(sources, irradiance=light)
+        return dense_layer(own, points, *given)
+
+    lights = sources.irradiance.swapaxes(0, 1) if sources.irradiance.ndim == 3 else None
+    return jax.lax.map(evaluate, (variances, kernel.depths(variances), lights))
 
 
 def dense_layer(

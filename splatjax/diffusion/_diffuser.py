@@ -10,18 +10,39 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PyTree
 
 from splatjax._combination import AbstractCombination
+from splatjax._smooth import albedo_root
 from splatjax.scene import Material, Splats
 
 from ._kernel import AbstractDiffusionKernel
 
 
 class Sources(eqx.Module):
-    """The splats as sources of diffused light."""
+    """The splats as sources of diffused light.
+
+    **Attributes:**
+
+    - `irradiance`: of all layers, or of each.
+    - `weights`: factors of the splats on the weights of the material; `None` for 1.
+    """
 
     centers: Float[Array, "3 sources"]
     normals: Float[Array, "3 sources"]
     areas: Float[Array, " sources"]
-    irradiance: Float[Array, "channels sources"]
+    irradiance: Float[Array, "channels *layers sources"]
+    weights: Float[Array, "gaussians channels sources"] | None = None
+
+    @classmethod
+    def of(cls, splats: Splats, irradiance: Float[Array, "channels splats"]) -> "Sources":
+        weights = None if splats.weights is None else splats.weights.transpose(1, 2, 0)
+        return cls(splats.centers.T, splats.normals.T, splats.areas, irradiance, weights)
+
+    def of_layers(self, gaussians: Int[Array, " layers"]) -> "Sources":
+        """Multiply the irradiance of every layer by the root of the factor on its weight."""
+        if self.weights is None:
+            return self
+        roots = albedo_root(self.weights).at[gaussians].get(mode="fill", fill_value=0)
+        light = self.irradiance[:, None] * roots.swapaxes(0, 1)
+        return Sources(self.centers, self.normals, self.areas, light)
 
 
 class Beams(eqx.Module):
@@ -139,9 +160,8 @@ class AbstractDiffusionPlan(eqx.Module):
 
         **Returns:** the layers, and the solution on all splats that `towards` needs.
         """
-        sources = Sources(splats.centers.T, splats.normals.T, splats.areas, source)
-        variances = material.gaussians.variances
-        return self.diffuse(sources, variances, kernel, combination, at), None
+        given = Sources.of(splats, source), material.gaussians.variances, kernel, combination, at
+        return self.diffuse(*given), None
 
     def towards(
         self,

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from splatjax._smooth import albedo_root
 from splatjax.gaussians import SumOfGaussians
 
 from ._diffuser import LayerValues
@@ -93,6 +94,7 @@ class LayersAtPoints(eqx.Module):
     - `irradiance`, `area`, `albedo`: of the surface itself; area per splat in mm^2.
     - `interval`, `kernel`: of the resolution and normalization of layers.
     - `derivative`: of means and mass in the logarithm of the variance; `None` if not requested.
+    - `factors`: on the weights of the material; `None` for 1.
     """
 
     variances: Float[Array, " gaussians"]
@@ -106,9 +108,18 @@ class LayersAtPoints(eqx.Module):
     derivative: (
         tuple[Float[Array, "gaussians channels points"], Float[Array, "gaussians points"]] | None
     )
+    factors: Float[Array, "gaussians channels points"] | None = None
 
     # Fields that lie along the points.
-    ALONG_POINTS: ClassVar = ("means", "mass", "irradiance", "area", "albedo", "derivative")
+    ALONG_POINTS: ClassVar = (
+        "means",
+        "mass",
+        "irradiance",
+        "area",
+        "albedo",
+        "derivative",
+        "factors",
+    )
 
     @classmethod
     def of(
@@ -122,6 +133,7 @@ class LayersAtPoints(eqx.Module):
         albedo: Float[Array, "channels points"],
         interval: Float[Array, "2"],
         kernel: AbstractDiffusionKernel,
+        factors: Float[Array, "gaussians channels points"] | None = None,
     ) -> "LayersAtPoints":
         """Sort layers at points by their Gaussians.
 
@@ -150,6 +162,7 @@ class LayersAtPoints(eqx.Module):
             interval=interval,
             kernel=kernel,
             derivative=None if derivative is None else by_gaussian(derivative),
+            factors=factors,
         )
 
     def weigh(
@@ -176,7 +189,10 @@ class LayersAtPoints(eqx.Module):
     def _weigh(self, weights, variances, single_scattering_albedo, means, mass):
         resolved = resolved_fraction(variances, self.area[None, None], self.interval)
         resolved = jnp.where(mass > 0, resolved, 0.0)
-        own = self.irradiance[None]
+        own, root = self.irradiance[None], 1.0
+        if self.factors is not None:
+            root = albedo_root(self.factors)
+            own, weights = own * root, weights * root**2
         # Splats that do not resolve a layer do not determine its mass either.
         gain = self.kernel.gain(
             1 + resolved * (mass - 1),
@@ -184,7 +200,7 @@ class LayersAtPoints(eqx.Module):
             weights * self.albedo[None],
             single_scattering_albedo[:, None] * self.albedo,
         )
-        return gain * (own + resolved * (means - own)), resolved
+        return root * gain * (own + resolved * (means - own)), resolved
 
     def exitance(self, gaussians: SumOfGaussians) -> Float[Array, "channels points"]:
         """Compute the radiant exitance `sum_k w_k L_k` of a material without single scattering.

@@ -27,6 +27,11 @@ class SurfaceSums(eqx.Module):
 
     @classmethod
     def of(cls, splats: Splats, hierarchy: Hierarchy) -> "SurfaceSums":
+        if splats.weights is not None:
+            raise ValueError(
+                "splats.weights has factors on Gaussians, which ShapeDiffuser does not read; give "
+                "weights=None, or render with ClusterDiffuser"
+            )
         more = padded_count(splats.count) - splats.count
         centers, normals = (
             tuple(jnp.pad(rows, ((0, more), (0, 0))).T) for rows in (splats.centers, splats.normals)

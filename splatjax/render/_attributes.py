@@ -21,6 +21,7 @@ class SurfaceAttributes(eqx.Module):
     - `source`: irradiance that spreads below the surface.
     - `albedo`, `irradiance`, `specular`, `roughness`: `None` if the splats have none; `irradiance`
       is then `source`.
+    - `weights`: factors on the weights of the material; `None` if the splats have none.
     - `visibility`: per group of samples, of each light; `None` for lights that cast no shadows.
     - `single_scattering`: radiance towards the eye, without the albedo; `None` if the material has
       none.
@@ -39,6 +40,7 @@ class SurfaceAttributes(eqx.Module):
     roughness: Float[Array, "1 points"] | None
     visibility: tuple[Float[Array, "_lights points"] | None, ...]
     single_scattering: Float[Array, "channels points"] | None = None
+    weights: Float[Array, "gaussians channels points"] | None = None
     centers: Float[Array, "3 points"] | None = None
     layers: _diffusion.LayerValues | None = None
     derivative: _diffusion.LayerValues | None = None

@@ -101,7 +101,7 @@ def diffusion_basis(
     basis = _diffusion_basis(scene, camera, settings, plan, derivative, light)
 
     def of_gaussians(light: LayersAtPoints):
-        return light.variances, light.means, light.mass, light.derivative
+        return light.variances, light.means, light.mass, light.derivative, light.factors
 
     rows = jax.tree.map(lambda each: rows_at(each, own.gaussians), of_gaussians(basis.light))
     is_leaf = {"is_leaf": lambda leaf: leaf is None}

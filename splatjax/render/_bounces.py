@@ -62,6 +62,7 @@ def bounced_irradiance(
     area, albedo = splats.areas[at], splats.albedo
     root = jnp.ones_like(direct.source) if albedo is None else albedo_root(albedo.T)
     _, roughness = surface_parameters(scene)
+    weights = _diffusion.Sources.of(splats, direct.source).weights
     enters = average_transmission(fresnel_f0(material.eta), roughness, material.angular_law())
     enters = enters.reshape(material.channels, -1)
     # The Gaussians also represent light that scatters once: for direct light where it leaves, for
@@ -84,6 +85,7 @@ def bounced_irradiance(
             root[:, at] ** 2,
             plan.interval,
             settings.kernel,
+            None if weights is None else weights[..., at],
         ).weigh(gaussians, material.single_scattering_albedo())
         exitance = root[:, at] * jnp.sum(gaussians.weights[:, :, None] * weighed, axis=0)
         received = sightlines.irradiance(exitance, splats.normals, combination)
@@ -108,8 +110,10 @@ def diffuse_splats(
     """Diffuse (pass 4): return the layers of the splats, their derivatives in the logarithms of
     the variances, and the capacity needed.
     """
-    splats, variances = scene.splats, scene.material.gaussians.variances
-    sources = _diffusion.Sources(splats.centers.T, splats.normals.T, splats.areas, source)
+    sources, variances = (
+        _diffusion.Sources.of(scene.splats, source),
+        scene.material.gaussians.variances,
+    )
     given = sources, variances, settings.kernel, combination, at
     if not derivative:
         diffused = plan.diffusion.diffuse(*given)

@@ -138,9 +138,23 @@ def in_one_dtype(scene: Scene, *rest):
 
 
 def check_channels(scene: Scene) -> None:
-    """Raise `ValueError` unless albedo and lights have the material's channels."""
-    channels = scene.material.gaussians.weights.shape[1]
-    counts = {}
+    """Raise `ValueError` unless albedo and lights have the material's channels, and the factors on
+    its weights its Gaussians, and no single scattering beside them.
+    """
+    gaussians, channels = scene.material.gaussians.weights.shape
+    counts, factors = {}, scene.splats.weights
+    if factors is not None:
+        counts["splats.weights"] = factors.shape[2]
+        if factors.shape[1] != gaussians:
+            raise ValueError(
+                f"splats.weights has factors on {factors.shape[1]} Gaussians, scene.material has "
+                f"{gaussians}; give both the same number, or weights=None"
+            )
+        if scene.material.single_scattering is not None:
+            raise ValueError(
+                "scene.material has single scattering, and splats.weights no factor on it; give "
+                "one with single_scattering=None, or weights=None"
+            )
     if scene.splats.albedo is not None:
         counts["splats.albedo"] = scene.splats.albedo.shape[1]
     point = jax.ShapeDtypeStruct((1, 3), scene.splats.centers.dtype)

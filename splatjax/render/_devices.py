@@ -83,6 +83,10 @@ def fill_scene(
             for group, shadow in zip(groups, shadows, strict=True)
         )
     gaussians = fill_gaussians(material.gaussians)
+    if splats.weights is not None:
+        known = np.arange(len(gaussians.variances))
+        weights = rows_at(splats.weights.swapaxes(0, 1), known).swapaxes(0, 1)
+        splats = dataclasses.replace(splats, weights=weights)
     material = eqx.tree_at(
         lambda material: (material.gaussians, material.angles),
         material,

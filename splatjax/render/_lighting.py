@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from splatjax import shading as _shading, splatting as _splatting
+from splatjax import diffusion as _diffusion, shading as _shading, splatting as _splatting
 from splatjax._combination import AbstractCombination
 from splatjax.scene import (
     AbstractLightSample,
@@ -291,6 +291,7 @@ class AbstractLighting(eqx.Module):
             roughness=None if splats.roughness is None else roughness[None],
             visibility=light.per_light(splats.centers, splats.normals),
             single_scattering=single_scattering_at_splats(scene, light, eye),
+            weights=_diffusion.Sources.of(splats, irradiance.source).weights,
         )
 
     @abc.abstractmethod

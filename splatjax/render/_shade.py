@@ -65,6 +65,7 @@ def layers_at_points(
         jnp.ones_like(source) if albedo is None else albedo,
         interval,
         kernel,
+        attributes.weights,
     )
 
 

@@ -165,8 +165,8 @@ def render_streamed(
     def sources() -> Iterator[_diffusion.Sources]:
         for scene in scenes("diffusion"):
             splats, (_, irradiance) = scene.splats, light(scene)
-            centers = splats.centers.T - bounds.center[:, None]
-            yield _diffusion.Sources(centers, splats.normals.T, splats.areas, irradiance.source)
+            centered = dataclasses.replace(splats, centers=splats.centers - bounds.center[None])
+            yield _diffusion.Sources.of(centered, irradiance.source)
 
     layers = diffusion.evaluate(sources(), first.material.channels)
 

@@ -126,9 +126,11 @@ class Splats(eqx.Module):
       color.
     - `specular`: factor on the material's specular strength; `None` for 1.
     - `roughness`: factor on the material's roughness; `None` for 1.
+    - `weights`: factor on the material's weights, for each Gaussian and channel: of freckles, lips
+      or veins. `None` for 1.
 
     **Raises:** `ValueError` for arrays of different lengths, for entries that are not finite, for
-    negative radii and areas, and for an albedo outside [0, 1].
+    negative radii, areas and factors, and for an albedo outside [0, 1].
     """
 
     centers: Float[Array, "splats 3"] = eqx.field(converter=numbers, metadata=_FINITE)
@@ -147,6 +149,9 @@ class Splats(eqx.Module):
         converter=numbers, default=None, metadata=_NOT_NEGATIVE
     )
     roughness: Float[Array, " splats"] | None = eqx.field(
+        converter=numbers, default=None, metadata=_NOT_NEGATIVE
+    )
+    weights: Float[Array, "splats gaussians channels"] | None = eqx.field(
         converter=numbers, default=None, metadata=_NOT_NEGATIVE
     )
 

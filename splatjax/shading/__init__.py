@@ -2,8 +2,9 @@
 interface.
 """
 
+from splatjax._smooth import albedo_root as albedo_root
+
 from ._deferred import (
-    albedo_root as albedo_root,
     average_transmission as average_transmission,
     diffuse_transmission as diffuse_transmission,
     exit_transmission as exit_transmission,

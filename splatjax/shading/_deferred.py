@@ -15,7 +15,6 @@ from splatjax.scene import AbstractLightSample, StackedLights
 from ._specular import average_albedo, directional_albedo, specular_lobe
 
 _LEAST_SHARE = 1e-4
-_ALBEDO_FLOOR = 1e-4
 
 
 def diffuse_transmission(
@@ -64,24 +63,6 @@ def average_transmission(
         [2 / (2 + power) for power in range(len(angles.coefficients))], reflected.dtype
     )
     return whole.reshape(-1, *[1] * roughness.ndim) - reflected
-
-
-def albedo_root(albedo: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Compute `sqrt(max(albedo, 1e-4))`: half of the color is applied before the light spreads,
-    half after.
-
-    **Arguments:**
-
-    - `albedo`: diffuse color, linear, in [0, 1]. Differentiable; the gradient is `1 / (2
-      sqrt(albedo))` above the floor and 0 at and below it, since that of the root itself diverges
-      at a black texel.
-
-    **Returns:** at least 0.01; its square is the albedo, except for texels darker than 1e-4.
-
-    **Source:** d'Eon and Luebke 2007 (GPU Gems 3, chapter 14): pre- and post-scatter texturing in
-    equal parts.
-    """
-    return jnp.sqrt(jnp.where(albedo > _ALBEDO_FLOOR, albedo, _ALBEDO_FLOOR))
 
 
 class SurfacePoints(eqx.Module):

@@ -64,7 +64,9 @@ def lamp_and_maps() -> World:
     """
     body = _colored(bodies.bumpy(240))
     maps = jnp.asarray(np.random.default_rng(3).uniform(0.5, 1.5, (2, body.count)))
-    splats = dataclasses.replace(body, specular=maps[0], roughness=maps[1])
+    weights = jnp.asarray(np.random.default_rng(7).uniform(0.3, 1.5, (body.count, 2, 2)))
+    given = {"specular": maps[0], "roughness": maps[1], "weights": weights}
+    splats = dataclasses.replace(body, **given)
     lights = (sj.PointLight([-14.0, 18.0, 25.0], [9e3, 5e3]),)
     return World(sj.Scene(splats, lights, sj.Material(_gaussians())), view())
 

@@ -2,6 +2,8 @@
 what `render` makes of them, and its derivative.
 """
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -62,7 +64,9 @@ def splats():
         sphere(300, 6.0, (-8.0, 6.0, 30.0), jitter=0.0),
         sphere(500, 6.0, (-25.0, -7.0, -97.0), jitter=0.0),
     )
-    return with_albedo(cloud, 0.6 + 0.3 * jnp.sin(cloud.centers / 5))
+    colored = with_albedo(cloud, 0.6 + 0.3 * jnp.sin(cloud.centers / 5))
+    factors = 0.7 + 0.3 * jnp.cos(cloud.centers / 7)[:, None] * jnp.asarray([[[1.0], [0], [-1]]])
+    return dataclasses.replace(colored, weights=factors)
 
 
 def in_parts(splats, size):
