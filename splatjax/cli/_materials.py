@@ -117,6 +117,11 @@ class Sample:
     albedo: OptionalPath = None
     #: Gray map of factors on the material's specular strength.
     specular: OptionalPath = None
+    #: Gray map: how much of the surface is of --second, from black for none to white for all.
+    share: OptionalPath = None
+    #: With --share: the material that the splats will be rendered with, and the other one.
+    material: str = "skin_light"
+    second: str | None = None
     #: Tangent-space normal map; green points up.
     normal: OptionalPath = None
     v_up: Annotated[
@@ -134,14 +139,21 @@ class Sample:
 
     def run(self) -> None:
         check_output(self.output, (".ply",))
-        options = {key: vars(self)[key] for key in vars(self).keys() - {"mesh", "count", "output"}}
+        if (self.share is None) != (self.second is None):
+            raise ValueError("give --share, a map, and --second, a material, or neither")
+        own = {"mesh", "count", "output", "material", "second"}
+        options = {key: vars(self)[key] for key in vars(self).keys() - own}
+        if self.second is not None:
+            with jax.enable_x64(True):
+                both = [sj.load_material(name).gaussians for name in (self.material, self.second)]
+                options["factors"] = sj.fitting.weight_factors(*both)
         with stage(f"sampling {self.mesh} with {self.count} splats"):
             splats = sj.sample_mesh(self.mesh, self.count, **options)
         with stage(f"writing {self.output}"):
             sj.write_splats(self.output, splats)
         carried = [
             name
-            for name in ("albedo", "specular", "roughness")
+            for name in ("albedo", "specular", "roughness", "weights")
             if getattr(splats, name) is not None
         ]
         size = np.ptp(np.asarray(splats.centers), axis=0)

@@ -13,6 +13,7 @@ from ._models import (
     AbstractModel as AbstractModel,
     DiffusionModel as DiffusionModel,
     TransportModel as TransportModel,
+    weight_factors as weight_factors,
 )
 from ._problem import relative_error as relative_error, squared_error as squared_error
 from ._search import (

@@ -7,8 +7,11 @@ from collections.abc import Callable
 from typing import ClassVar
 
 import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
 
-from splatjax.gaussians import AbstractProfile
+from splatjax.gaussians import AbstractProfile, SumOfGaussians
 from splatjax.scattering import (
     L2_QUADRATURE,
     AbstractRadialRule,
@@ -18,6 +21,9 @@ from splatjax.scattering import (
     Medium,
     PhotonBeam,
 )
+
+from ._fit import fit_weights
+from ._weights import FixedTotalReflectance, NonNegativeWeights
 
 
 class AbstractModel(eqx.Module):
@@ -80,3 +86,21 @@ class TransportModel(AbstractModel):
 
     def angles(self, medium: Medium) -> AngularLaw:
         return self.half_space(medium).angular_law()
+
+
+def weight_factors(
+    gaussians: SumOfGaussians, other: SumOfGaussians
+) -> Float[Array, "gaussians channels"]:
+    """Fit the factors on the weights of Gaussians that make another profile of them, of its total
+    reflectance: `Splats.weights` where the body is of the other material. Not for traced arrays.
+
+    A Gaussian without weight in a channel keeps none: the material with the wider profile should be
+    the first.
+    """
+    weights, rule = np.asarray(gaussians.weights), TransportModel.rule
+    held, factors = NonNegativeWeights(FixedTotalReflectance()), np.ones_like(weights)
+    for channel, own in enumerate((weights > 0).T):
+        profile = SumOfGaussians(other.variances, other.weights[:, channel, None])
+        fitted = fit_weights(profile, gaussians.variances[own], weights=held, rule=rule).weights
+        factors[own, channel] = fitted[:, 0] / weights[own, channel]
+    return jnp.asarray(factors)

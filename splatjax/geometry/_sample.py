@@ -25,6 +25,8 @@ class Textures(eqx.Module):
     - `roughness`: factor on the material's roughness.
     - `normal`: tangent-space normals in [-1, 1]: x along u, y along v (*up*), z outward; of any
       positive length.
+    - `share`: how much of the surface is of another material, from 0 to 1, whose weights are
+      `factors` times those of the material.
     """
 
     albedo: (
@@ -33,6 +35,8 @@ class Textures(eqx.Module):
     specular: Float[np.ndarray, "h2 w2"] | None = None
     roughness: Float[np.ndarray, "h3 w3"] | None = None
     normal: Float[np.ndarray, "h4 w4 3"] | None = None
+    share: Float[np.ndarray, "h5 w5"] | None = None
+    factors: Float[np.ndarray, "gaussians channels"] | float = 1.0
 
 
 def lookup_at(
@@ -152,15 +156,17 @@ def splats_at(
     areas, reaches, _ = surface_cells(centers, normals, images, limit=spacing)
     areas = areas * (area / areas.sum())
     radii = _radii(areas, reaches, images, spacing)
-    specular, roughness, tangent_space = (
-        lookup_at(mesh, points, picture)
-        for picture in (textures.specular, textures.roughness, textures.normal)
+    specular, roughness, share, tangent_space = (
+        lookup_at(mesh, points, getattr(textures, name))
+        for name in ("specular", "roughness", "share", "normal")
     )
+    weights = None
+    if share is not None:
+        weights = 1 + share[:, None, None] * (np.asarray(textures.factors) - 1)[None]
     if tangent_space is not None:
         normals = perturbed_normals(mesh, points, normals, tangent_space)
-    return Splats(
-        centers, normals, radii, areas, albedo_at(textures, mesh, points), specular, roughness
-    )
+    albedo = albedo_at(textures, mesh, points)
+    return Splats(centers, normals, radii, areas, albedo, specular, roughness, weights)
 
 
 def _radii(
@@ -195,6 +201,7 @@ def complete_splats(
     albedo: Float[np.ndarray, "splats channels"] | None = None,
     specular: Float[np.ndarray, " splats"] | None = None,
     roughness: Float[np.ndarray, " splats"] | None = None,
+    weights: Float[np.ndarray, "splats gaussians channels"] | None = None,
 ) -> Splats:
     """Make splats from points, estimate missing fields, and sort them in Morton order.
 
@@ -204,7 +211,7 @@ def complete_splats(
     - `normals`: unit; `None`: from neighbors (`estimate_normals`).
     - `areas`: mm^2; `None`: those of the Voronoi cells in the tangent planes.
     - `radii`: mm; `None`: as large as the cells require, so that no hole is left.
-    - `albedo`, `specular`, `roughness`: as in `Splats`; never estimated.
+    - `albedo`, `specular`, `roughness`, `weights`: as in `Splats`; never estimated.
 
     Isolated points are kept with the size of their neighbors, and a warning reports their number.
     Points at one place share their area.
@@ -221,9 +228,9 @@ def complete_splats(
         )
     order = morton_order(centers.astype(np.float32))
     centers = centers[order].astype(np.float64)
-    normals, radii, areas, albedo, specular, roughness = (
+    normals, radii, areas, *carried = (
         None if array is None else array[order]
-        for array in (normals, radii, areas, albedo, specular, roughness)
+        for array in (normals, radii, areas, albedo, specular, roughness, weights)
     )
     if normals is None:
         normals = estimate_normals(centers)
@@ -231,7 +238,7 @@ def complete_splats(
         cell_areas, cell_radii = _covered(centers, normals)
         areas = cell_areas if areas is None else areas
         radii = cell_radii if radii is None else radii
-    return Splats(centers, normals, radii, areas, albedo, specular, roughness)
+    return Splats(centers, normals, radii, areas, *carried)
 
 
 def _covered(centers: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -9,7 +9,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from splatjax._memory import check_memory
 from splatjax.geometry import (
@@ -55,6 +55,8 @@ def sample_mesh(
     albedo: StrPath | None = None,
     specular: StrPath | None = None,
     normal: StrPath | None = None,
+    share: StrPath | None = None,
+    factors: Float[Array, "gaussians channels"] | None = None,
     v_up: bool | None = None,
     up: str = "y",
     crop_min_y: float | None = None,
@@ -74,6 +76,8 @@ def sample_mesh(
       of the file, if any.
     - `specular`: gray picture, not decoded: factor on the material's specular strength.
     - `normal`: tangent-space normal map, not decoded; green points up.
+    - `share`: gray picture, not decoded: how much of the surface is of another material, whose
+      weights are `factors` times those of the material (`splatjax.fitting.weight_factors`).
     - `v_up`: whether v = 0 is the *lower* edge of a map. `None` uses the rule of the format: yes
       for all except glTF and GLB. Wrongly converted files need `True`: otherwise the texture is
       upside down.
@@ -97,6 +101,8 @@ def sample_mesh(
         albedo=albedo,
         specular=specular,
         normal=normal,
+        share=share,
+        factors=factors,
         v_up=v_up,
         up=up,
         crop_min_y=crop_min_y,
@@ -113,6 +119,8 @@ def read_textured_mesh(
     albedo: StrPath | None = None,
     specular: StrPath | None = None,
     normal: StrPath | None = None,
+    share: StrPath | None = None,
+    factors: Float[Array, "gaussians channels"] | None = None,
     v_up: bool | None = None,
     up: str = "y",
     crop_min_y: float | None = None,
@@ -133,8 +141,12 @@ def read_textured_mesh(
         albedo=_own_albedo(path, pieces) if albedo is None else read_color(albedo),
         specular=None if specular is None else read_map(specular) @ _LUMA,
         normal=None if normal is None else 2 * read_map(normal) - 1,
+        share=None if share is None else read_map(share) @ _LUMA,
+        factors=1.0 if factors is None else np.asarray(factors, float),
     )
-    has_maps = any(name is not None for name in (albedo, specular, normal))
+    if (share is None) != (factors is None):
+        raise ValueError(f"{path}: share is {share}, factors are {factors}; give both, or neither")
+    has_maps = any(name is not None for name in (albedo, specular, normal, share))
     if has_maps and (mesh.uvs is None or np.isnan(mesh.uvs).any()):
         raise ValueError(
             f"{path}: has no texture coordinates, which maps need; give a mesh with UVs (in "

@@ -1,5 +1,6 @@
 """Splats in PLY files, read at once or, for files that are larger than memory, part by part."""
 
+import re
 import warnings
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -40,6 +41,7 @@ _COLUMNS = {
     "specular": [("specular",)],
     "roughness": [("roughness",)],
 }
+_WEIGHT = re.compile(r"weight_[1-9]\d{0,3}_[1-9]\d{0,3}")
 _POWERS = {"centers": 1, "radii": 1, "areas": 2}  # of the unit of length
 _VALID = {
     "centers": (lambda x: np.abs(x) <= _LONGEST, "within 1e9 mm (what is mm_per_unit?)"),
@@ -49,6 +51,7 @@ _VALID = {
     "albedo": (lambda c: (c >= 0) & (c <= 1), "in [0, 1]; floats are linear, integers sRGB"),
     "specular": (lambda f: (f >= 0) & (f <= 1e6), "a factor on the material's, from 0 to 1e6"),
     "roughness": (lambda f: (f >= 0) & (f <= 1e6), "a factor on the material's, from 0 to 1e6"),
+    "weights": (lambda f: (f >= 0) & (f <= 1e6), "factors on the material's, from 0 to 1e6"),
 }
 
 
@@ -64,6 +67,7 @@ def read_splats(path: StrPath, *, mm_per_unit: float = 1.0, up: str = "y") -> Sp
     | `area` (or `areas`) | in the file's unit squared; from the local density when absent |
     | `red green blue` | albedo: integers are sRGB up to the type's maximum, floats are linear |
     | `specular`, `roughness` | factors on the material's |
+    | `weight_1_1`, `weight_1_2`, ... | factors on the material's weights: Gaussian, channel |
 
     Other properties and elements are ignored; faces without radii cause a warning.
 
@@ -117,6 +121,11 @@ def write_splats(path: StrPath, splats: Splats) -> None:
                 )
             names += aliases[0]
             columns.append(table)
+    if splats.weights is not None:
+        names += map(
+            "weight_{}_{}".format, *(1 + np.indices(splats.weights.shape[1:])).reshape(2, -1)
+        )
+        columns.append(np.asarray(splats.weights, "<f4").reshape(splats.count, -1))
     header = [
         "ply",
         "format binary_little_endian 1.0",
@@ -233,6 +242,19 @@ def _splat_fields(
                 f"{path}: its vertices have {', '.join(single) or 'no rows'}, and not all of "
                 f"{' '.join(names)}; write all of them"
             )
+    factors = sorted(
+        (tuple(map(int, name.split("_")[1:])), name) for name in single if _WEIGHT.fullmatch(name)
+    )
+    fields["weights"] = None
+    if factors:
+        shape = factors[-1][0]
+        if [place for place, _ in factors] != [(k + 1, c + 1) for k, c in np.ndindex(shape)]:
+            raise ValueError(
+                f"{path}: its vertices have {', '.join(name for _, name in factors)}, and not one "
+                "for each Gaussian and channel: write all of them"
+            )
+        values = _values(path, "weights", {name: single[name] for _, name in factors}, 1.0)
+        fields["weights"] = values.reshape(-1, *shape)
     fields["centers"] = with_y_up(fields["centers"], up)
     if fields["normals"] is not None:
         fields["normals"] = with_y_up(fields["normals"], up)

@@ -70,6 +70,25 @@ def test_sample_covers_a_mesh_that_may_have_z_up(tmp_path, capsys):
     assert np.ptp(np.asarray(lying.centers), axis=0).argmax() == 2
 
 
+@pytest.mark.once
+def test_sample_reads_the_share_of_another_material_from_a_map(tmp_path):
+    """Skin that is dark where the map is white, on the right half of a square."""
+    mesh, output, spots = tmp_path / "a.obj", tmp_path / "a.ply", tmp_path / "spots.png"
+    corners = [(0, 0), (1, 0), (1, 1), (0, 1)]
+    lines = [f"v {x} {y} 0\nvt {x} {y}" for x, y in corners]
+    mesh.write_text("\n".join([*lines, "f 1/1 2/2 3/3", "f 1/1 3/3 4/4\n"]), encoding="utf-8")
+    Image.fromarray(np.uint8([[0] * 8 + [255] * 8] * 4)).save(spots)
+    given = "--mm-per-unit", "40", "--count", "300", "--share", spots, "--second", "skin_dark"
+    assert run("sample", mesh, *given, "--output", output) == 0
+    splats = sj.read_splats(output)
+    x, light = np.asarray(splats.centers)[:, 0], sj.load_material("skin_light").gaussians
+    assert splats.weights is not None
+    np.testing.assert_array_equal(splats.weights[(x > 3) & (x < 17)], 1.0)
+    dark = np.asarray(light.weights)[None] * splats.weights[(x > 23) & (x < 37)]
+    totals = sj.load_material("skin_dark").gaussians.total_reflectance()
+    np.testing.assert_allclose(dark.sum(1) - totals[None], 0, atol=1e-4)
+
+
 @pytest.mark.slow
 @pytest.mark.once
 def test_render_shows_the_bust_and_its_manifest_makes_the_same_picture(plain, tmp_path, capsys):

@@ -49,6 +49,7 @@ REFUSED = {
     "render missing.ply": ["missing.ply"],
     "render picture.ply --stream 5": ["picture.ply", "cannot be read"],
     "sample missing.glb --mm-per-unit 1 --output o.ply": ["missing.glb"],
+    "sample ball.obj --mm-per-unit 1 --share picture.png --output o.ply": ["--share", "--second"],
     "fit missing.toml": ["missing.toml"],
     "render ball.obj": ["ball.obj", "splatjax sample"],
     "fit picture.png": ["picture.png", "TOML"],

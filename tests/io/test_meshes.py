@@ -3,6 +3,7 @@ have hard edges, normals end there, and splats do too. Splats in PLY files, at o
 time.
 """
 
+import dataclasses
 import functools
 
 import jax
@@ -222,6 +223,8 @@ def assert_same(one, other):
 
 def test_splats_come_back_at_once_and_in_parts(tmp_path):
     splats, path = some_splats(), tmp_path / "a.ply"
+    weights = np.random.default_rng(2).uniform(0.1, 2.0, (splats.count, 12, 3))
+    splats = dataclasses.replace(splats, weights=weights)
     sj.write_splats(path, splats)
     assert_same(splats, sj.read_splats(path))
     vertices = meshio.read(path)
