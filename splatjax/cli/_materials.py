@@ -12,8 +12,22 @@ import numpy as np
 import tyro
 
 import splatjax as sj
+from splatjax.plots import plot_pictures
 
-from ._terminal import OptionalFloat, OptionalPath, UpAxis, check_output, note, print_table, stage
+from ._render import Render
+from ._terminal import (
+    OptionalFloat,
+    OptionalPath,
+    UpAxis,
+    check_output,
+    note,
+    print_table,
+    save_figure,
+    stage,
+)
+
+_ACROSS = 8  # pictures on a sheet
+_WHITE = 1.0  # radiance
 
 
 @dataclass(frozen=True)
@@ -23,7 +37,8 @@ class Materials:
     `splatjax render --material` takes their names, and so does `splatjax fit` if coefficients or
     layers are known.
 
-    Example: splatjax materials marble > mine.toml
+    Examples: splatjax materials marble > mine.toml
+              splatjax materials --pictures materials.jpg
     """
 
     material: Annotated[
@@ -35,13 +50,27 @@ class Materials:
             help_behavior_hint="",
         ),
     ] = None
+    #: Also render each on the built-in bust, 7 cm tall, in the studio, and write them onto this
+    #: sheet, PNG or JPEG.
+    pictures: OptionalPath = None
 
     def run(self) -> None:
+        if self.pictures is not None:
+            check_output(self.pictures, (".png", ".jpg"))
         if self.material is not None:
             print(sj.io.material_path(self.material).read_text(encoding="utf-8"), end="")
             return
         titles = ("material", "known", "total reflectance", "widest, mm", "eta", "source")
-        print_table([titles, *map(_row, sj.list_materials())])
+        rows = [_row(name) for name in sj.list_materials()]
+        print_table([titles, *rows])
+        if self.pictures is not None:
+            drawn = [_picture(name) for name, *_ in rows]
+            drawn += [np.zeros_like(drawn[0])] * (-len(drawn) % _ACROSS)
+            lines = [drawn[i : i + _ACROSS] for i in range(0, len(drawn), _ACROSS)]
+            figure = plot_pictures(lines, [""] * _ACROSS, white=_WHITE, inches=1.6)
+            for axes, (name, *_, source) in zip(figure.axes, rows, strict=False):
+                axes.set_title(f"{name}\n{source}", fontsize=6)
+            save_figure(figure, self.pictures)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,7 +102,8 @@ def _row(name: str) -> tuple[str, ...]:
         known = kinds.get(type(sj.load_profile(name)), "coefficients")
     except ValueError:
         known = "Gaussians"
-    authors, year = re.findall(r"^(.+?) (\d{4})", source["citation"])[0]
+    citation = source["citation"]
+    authors, year = (re.findall(r"^(.+?) (\d{4})", citation) or [(citation, "")])[0]
     first, *others = re.split(r", | and ", authors)
     return (
         name,
@@ -81,8 +111,17 @@ def _row(name: str) -> tuple[str, ...]:
         "  ".join(f"{float(total):.3f}" for total in material.total_reflectance()),
         f"{float(material.gaussians.variances.max()) ** 0.5:.3g}",
         f"{float(material.eta):.3g}",
-        f"{first}{' et al.' if others else ''} {year}",
+        f"{first}{' et al.' if others else ''} {year}".rstrip(),
     )
+
+
+def _picture(name: str) -> np.ndarray:
+    """Render a material on the bust, in its own color."""
+    view = Render(material=name, albedo=False, count=20_000, scale=0.2, width=120, height=120)
+    splats, material = view.load()
+    camera = view.camera(lambda: [splats], view.azimuth)
+    scene = sj.Scene(splats, view.lights(material, view.azimuth, view.single_light[0]), material)
+    return np.asarray(sj.render(scene, camera, view.settings).beauty)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -70,6 +70,21 @@ def test_sample_covers_a_mesh_that_may_have_z_up(tmp_path, capsys):
     assert np.ptp(np.asarray(lying.centers), axis=0).argmax() == 2
 
 
+@pytest.mark.long
+@pytest.mark.once
+def test_materials_draws_all_of_them_on_one_sheet(monkeypatch, tmp_path):
+    """Ketchup is red and milk white; the other six places stay black."""
+    monkeypatch.setattr(sj, "list_materials", lambda: ("ketchup", "wholemilk"))
+    assert run("materials", "--pictures", tmp_path / "sheet.png") == 0
+    sheet = np.asarray(Image.open(tmp_path / "sheet.png"), float)[..., :3]
+    height, width, _ = sheet.shape
+    row, steps = int(0.6 * height), np.arange(8) * width // 8 + width // 16
+    places = [sheet[row - 4 : row + 5, at - 4 : at + 5].mean((0, 1)) for at in steps]
+    assert places[0][0] > 3 * places[0][1]
+    assert places[1].min() > 100
+    assert max(place.max() for place in places[2:]) == 0
+
+
 @pytest.mark.once
 def test_sample_reads_the_share_of_another_material_from_a_map(tmp_path):
     """Skin that is dark where the map is white, on the right half of a square."""
