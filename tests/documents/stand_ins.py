@@ -95,6 +95,7 @@ _MADE = {
     "head.glb": lambda path: _ball().export(path),
     "points.ply": _points,
     "color.jpg": _map,
+    "freckles.png": _map,
     "albedo.jpg": _map,
     "shine.jpg": _map,
     "normals.jpg": _map,
