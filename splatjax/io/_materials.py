@@ -31,18 +31,21 @@ from ._files import StrPath, atomic_path, naming
 from ._media import (
     LAYER_ENTRIES,
     MEDIUM_ENTRIES,
+    OPENPBR_ENTRIES,
     SKIN_ENTRIES,
     layer_of,
     medium_of,
     plain_layer,
     plain_medium,
+    plain_openpbr,
     plain_skin,
     skin_of,
 )
 from ._tables import Table, nearest, read_toml
 
 VARIANCE_UNIT = "mm^2"
-_TABLES = ("medium", "layers", "skin", "surface", "single_scattering", "angles", "source", "fit")
+_KINDS = {"medium": "[medium]", "openpbr": "[openpbr]", "layers": "[[layers]]", "skin": "[skin]"}
+_TABLES = (*_KINDS, "surface", "single_scattering", "angles", "source", "fit")
 _SURFACE = ("eta", "specular", "roughness")
 # Names in [fit] of profiles whose coefficients are in the file.
 _MODELS: dict[type, str] = {
@@ -257,22 +260,19 @@ def save_material(
 def _read(name_or_path: StrPath) -> tuple[Table, Dipole | LayeredMultipole | Skin | None]:
     """Read and check all tables of a material, and its coefficients."""
     path = material_path(name_or_path)
-    tables = Table(
-        path,
-        "",
-        read_toml(path, "check the path, or give a material (`list_materials()`)"),
-        _TABLES,
-    )
-    names = {"medium": "[medium]", "layers": "[[layers]]", "skin": "[skin]"}
-    kinds = [kind for kind in names if kind in tables.entries]
+    entries = read_toml(path, "check the path, or give a material (`list_materials()`)")
+    tables = Table(path, "", entries, _TABLES)
+    kinds = [kind for kind in _KINDS if kind in tables.entries]
     if len(kinds) > 1 or not (kinds or "fit" in tables.entries):
         has = (
-            " and ".join(names[kind] for kind in kinds)
-            or f"no {', '.join(names.values())} or [fit]"
+            " and ".join(_KINDS[kind] for kind in kinds)
+            or f"no {', '.join(_KINDS.values())} or [fit]"
         )
         raise ValueError(f"{path}: has {has}; give one of them")
     _surface(tables)
-    if "medium" in kinds:
+    if "openpbr" in kinds:
+        entries["medium"] = plain_openpbr(tables.table("openpbr", OPENPBR_ENTRIES))
+    if "medium" in entries:
         return tables, Dipole(medium_of(tables.table("medium", MEDIUM_ENTRIES)))
     if not kinds:
         return tables, None

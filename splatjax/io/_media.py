@@ -17,6 +17,16 @@ _WAYS = (
     {"sigma_a", "sigma_s", "g"},
     {"color", "mean_free_path"},
 )
+_MM = {THICKNESS_UNIT: 1.0, "cm": 10.0, "m": 1000.0}
+# Of the subsurface of an OpenPBR material, with the defaults of OpenPBR 1.1.
+_OPENPBR: dict[str, Any] = {
+    "subsurface_color": 0.8,
+    "subsurface_radius": 1.0,
+    "subsurface_radius_scale": [1.0, 0.5, 0.25],
+    "specular_ior": 1.5,
+    "subsurface_scatter_anisotropy": 0.0,
+}
+OPENPBR_ENTRIES = "unit", *_OPENPBR
 MEDIUM_ENTRIES = ("unit", "eta", "sigma_a", "sigma_s_prime", "sigma_s", "g", "color")
 MEDIUM_ENTRIES += ("mean_free_path",)
 SKIN_ENTRIES = tuple(field.name for field in fields(Skin))
@@ -43,6 +53,14 @@ def medium_of(table: Table) -> Medium:
     if "sigma_s" in given:
         reduced, factor = "sigma_s", per_mm * (1 - g)
     return table.make(Medium, sigma_a, factor * table.numbers(reduced), eta)
+
+
+def plain_openpbr(table: Table) -> dict[str, Any]:
+    """Translate the table of an OpenPBR material to a [medium]."""
+    per_unit = _MM[table.one_of("unit", _MM)]
+    color, radius, scale, eta, g = (table.numbers(*entry) for entry in _OPENPBR.items())
+    given = {"color": color, "mean_free_path": per_unit * radius * scale, "eta": eta, "g": g}
+    return {"unit": THICKNESS_UNIT, **{name: values.tolist() for name, values in given.items()}}
 
 
 def layer_of(table: Table) -> Layer | Film:

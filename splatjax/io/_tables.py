@@ -76,7 +76,7 @@ class Table:
             )
         return value
 
-    def numbers(self, name: str, default: float | None = None) -> Array:
+    def numbers(self, name: str, default: float | list[float] | None = None) -> Array:
         """Return a number, a list of numbers or rows of them, in JAX's default precision.
 
         The records made from them (`make`) check ranges and shapes.

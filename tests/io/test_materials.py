@@ -220,7 +220,7 @@ BAD = [
     (GOOD_MEDIUM.replace("eta = 1.3\n", ""), r"\[medium\] eta .* missing"),
     (GOOD_MEDIUM, r"has no \[fit\]"),
     (GOOD_MEDIUM.replace("eta", "=eta"), r"TOML file"),
-    (NO_FIT, r"has no \[medium\], \[\[layers\]\], \[skin\] or \[fit\]"),
+    (NO_FIT, r"has no \[medium\], \[openpbr\], \[\[layers\]\], \[skin\] or \[fit\]"),
     ("medium = 3\n", r"\[medium\] must be a table; it is 3"),
     (GOOD_FIT + "[surfaces]\n", r"unknown entry 'surfaces'.*'surface'"),
     (GOOD_MEDIUM.replace("_a", "_A"), r"\[medium\] has an unknown entry 'sigma_A'.*'sigma_a'"),
@@ -248,3 +248,22 @@ def test_a_bad_file_is_refused_by_table_entry_and_value(tmp_path, text, value):
     with pytest.raises(ValueError, match=rf"bad.toml: .*{value}") as raised:
         load_material(path)
     assert "\n" not in str(raised.value)
+
+
+def test_the_subsurface_of_openpbr_comes_in_with_its_defaults_and_its_color_goes_out(tmp_path):
+    path, color = tmp_path / "wax.toml", [0.05, 0.6, 0.98]
+    text = f'[openpbr]\nunit = "cm"\nsubsurface_color = {color}\nsubsurface_radius = 0.2\n'
+    path.write_text(text + "subsurface_scatter_anisotropy = 0.5\n", encoding="utf-8")
+    medium, g = load_medium(path), load_mean_cosine(path)
+    assert g == 0.5
+    np.testing.assert_allclose(medium.eta, 1.5)
+    sigma_t = medium.sigma_a + medium.sigma_s_prime / (1 - g)
+    np.testing.assert_allclose(1 / sigma_t, [2.0, 1.0, 0.5], rtol=1e-5)
+    found, white = (
+        HalfSpace(Medium(sigma_a, medium.sigma_s_prime, medium.eta), g * jnp.ones(3)).color()
+        for sigma_a in (medium.sigma_a, 0 * medium.sigma_a)
+    )
+    np.testing.assert_allclose(found / white, color, rtol=2e-2)  # of float32
+    path.write_text(text.replace("0.2", "-0.2"), encoding="utf-8")
+    with pytest.raises(ValueError, match=r"wax.toml.*mean_free_path.*-2"):
+        load_medium(path)
