@@ -158,9 +158,10 @@ class Sample:
     specular: OptionalPath = None
     #: Gray map: how much of the surface is of --second, from black for none to white for all.
     share: OptionalPath = None
-    #: With --share: the material that the splats will be rendered with, and the other one.
-    material: str = "skin_light"
-    second: str | None = None
+    #: With --share, the material that the splats will be rendered with.
+    material: Annotated[str, tyro.conf.arg(metavar="MATERIAL")] = "skin_light"
+    #: With --share, the other material.
+    second: Annotated[str | None, tyro.conf.arg(metavar="MATERIAL", help_behavior_hint="")] = None
     #: Tangent-space normal map; green points up.
     normal: OptionalPath = None
     v_up: Annotated[
