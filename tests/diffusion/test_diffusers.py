@@ -20,6 +20,7 @@ from splatjax.diffusion import (
     DenseDiffuser,
     EscapeNormalization,
     Sources,
+    _neighbors,
     compact_order,
     dense_layer,
 )
@@ -84,32 +85,48 @@ def errors(ours, theirs) -> np.ndarray:
     return np.abs(ours - theirs) / np.sqrt(np.mean(theirs**2))
 
 
-def test_plain_integral_is_the_formula(dtype):
-    _, sources = scene()
-    centers, normals, areas, light = (np.asarray(each, float) for each in jax.tree.leaves(sources))
-    x = centers[:, ::97]
-    for k, variance in enumerate(VARIANCES):
-        depth = KERNEL.depth * np.sqrt(variance)
-        offset = x[:, :, None] - (centers - depth * normals)[:, None]
-        weight = areas * np.exp(-np.sum(offset**2, axis=0) / (2 * variance))
-        total = weight.sum(1)
-        mean = light @ weight.T / total
-        flat = 2 * np.pi * variance * np.exp(-(KERNEL.depth**2) / 2)
-        found = plain().values[k, :, ::97]
-        np.testing.assert_allclose(found[:-1], mean, rtol=1e-5, atol=1e-5)
-        np.testing.assert_allclose(found[-1], total / flat, rtol=1e-5)
-        # Slopes, by the quotient rule.
-        falls = -weight * offset / variance
-        d_total = falls.sum(2)
-        d_mean = (np.einsum("cs,aps->cap", light, falls) - mean[:, None] * d_total) / total
-        expected = np.concatenate([d_mean, d_total[None] / flat])
-        slopes = plain().slopes[k, :, :, ::97]
-        np.testing.assert_allclose(slopes, expected, atol=2e-5 * np.abs(expected).max())
+def stacked(layers):
+    return jnp.concatenate([layers.values[:, :, None], layers.slopes], axis=2)
 
 
-@pytest.mark.parametrize("error", [0.0, 2e-3])
-def test_fast_diffuser_is_the_plain_one_within_its_stated_error(error):
-    """And both keep constants, are linear, and lie between the least and the greatest light."""
+def by_formula(sources, variances, largest):
+    """Compute values and slopes of layers at the splats, over the sources up to the largest
+    exponents.
+    """
+    found = []
+    light = jnp.concatenate([sources.irradiance, jnp.ones((1, len(sources.areas)))])
+    for end, variance in zip(largest, variances, strict=True):
+        depth = KERNEL.depth * jnp.sqrt(variance)
+        below = sources.centers - depth * sources.normals
+        offset = below[:, None] - sources.centers[:, :, None]
+        exponent = 0.5 * jnp.sum(offset * offset, axis=0) / variance
+        # Fading over the last half of an exponent.
+        fade = jnp.clip(2 * (end - exponent), 0, 1)
+        weight = jnp.exp(-exponent) * fade * sources.areas[None]
+        cut = 2 * jnp.exp(-end) * np.expm1(0.5)
+        flat = 2 * jnp.pi * variance * (jnp.exp(-0.5 * depth**2 / variance) - cut)
+        sums, pulls = light @ weight.T, jnp.einsum("cj,aij,ij->cai", light, offset, weight)
+        means = sums[:-1] / sums[-1:]
+        # By the quotient rule.
+        slopes = (pulls[:-1] - means[:, None] * pulls[-1:]) / sums[-1][None, None]
+        values = jnp.concatenate([means, sums[-1:] / flat])
+        slopes = jnp.concatenate([slopes, pulls[-1:] / flat]) / variance
+        found.append(jnp.concatenate([values[:, None], slopes], axis=1))
+    return jnp.stack(found)
+
+
+def test_plain_integral_is_the_formula():
+    expected = by_formula(scene()[1], jnp.asarray(VARIANCES), jnp.full(3, jnp.inf))
+    scale = np.max(np.abs(expected), axis=(1, 3), keepdims=True)
+    np.testing.assert_allclose(stacked(plain()) / scale, expected / scale, atol=2e-5)
+
+
+@pytest.mark.parametrize(("error", "at_once"), [(0.0, 40), (2e-3, 1 << 13)])
+def test_fast_diffuser_is_the_plain_one_within_its_stated_error(error, at_once, monkeypatch):
+    """And both keep constants, are linear, and lie between the least and the greatest light. What
+    is near is sought among all at once, or among a few.
+    """
+    monkeypatch.setattr(_neighbors, "_AT_ONCE", at_once)
     body, sources = scene()
     plan = planned(ClusterDiffuser(error=error), body)
     first, second, third = sources_per_layer(plan)
@@ -164,32 +181,11 @@ def test_gradients_are_those_of_the_plain_sum_over_the_sources_within_the_suppor
     rng = np.random.default_rng(4)
     factors = jnp.asarray(rng.normal(size=(2, 5, 4, body.count)))
 
-    def stacked(layers):
-        return jnp.concatenate([layers.values[:, :, None], layers.slopes], axis=2)
-
     def fast(sources, variances, plan=plan):
         return stacked(plan.diffuse(sources, variances, KERNEL, OneDevice()).layers)
 
     def within_support(sources, variances):
-        found = []
-        light = jnp.concatenate([sources.irradiance, jnp.ones((1, body.count))])
-        for largest, variance in zip(plan.kernels.largest, variances, strict=True):
-            depth = KERNEL.depth * jnp.sqrt(variance)
-            below = sources.centers - depth * sources.normals
-            offset = below[:, None] - sources.centers[:, :, None]
-            exponent = 0.5 * jnp.sum(offset * offset, axis=0) / variance
-            # Fading over the last half of an exponent.
-            fade = jnp.clip(2 * (largest - exponent), 0, 1)
-            weight = jnp.exp(-exponent) * fade * sources.areas[None]
-            cut = 2 * jnp.exp(-largest) * np.expm1(0.5)
-            flat = 2 * jnp.pi * variance * (jnp.exp(-0.5 * depth**2 / variance) - cut)
-            sums, pulls = light @ weight.T, jnp.einsum("cj,aij,ij->cai", light, offset, weight)
-            means = sums[:-1] / sums[-1:]
-            slopes = (pulls[:-1] - means[:, None] * pulls[-1:]) / sums[-1][None, None]
-            values = jnp.concatenate([means, sums[-1:] / flat])
-            slopes = jnp.concatenate([slopes, pulls[-1:] / flat]) / variance
-            found.append(jnp.concatenate([values[:, None], slopes], axis=1))
-        return jnp.stack(found)
+        return by_formula(sources, variances, plan.kernels.largest)
 
     def both(function):
         total = lambda *given: (jnp.vdot(factors, value := function(*given)), value)  # noqa: E731
@@ -251,3 +247,15 @@ def test_outside_its_plan_the_diffuser_reports_it():
         assert needed(*inside) <= 1, inside
     for outside in ((1.4, 1.0), (0.7, 1.0), (1.0, 1.2)):
         assert needed(*outside) > 1, outside
+
+
+def test_blocks_of_a_compact_order_are_small():
+    points = bodies.unit(np.random.default_rng(1).normal(size=(4000, 3)))
+    order = compact_order(points)
+    np.testing.assert_array_equal(np.sort(order), np.arange(4000))
+    for size in (int(POINTS_PER_BLOCK * share) for share in (2, 1, 0.5, 0.25)):
+        blocks = points[order[: 4000 // size * size]].reshape(-1, size, 3)
+        extent = np.max(np.ptp(blocks, axis=1), axis=1)
+        even = np.sqrt(4 * np.pi * size / 4000)  # edge of a square with its share of the sphere
+        assert np.median(extent) < 2 * even
+        assert np.max(extent) < 5 * even

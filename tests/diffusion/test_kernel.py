@@ -2,8 +2,6 @@
 against Monte Carlo. Layers of the splats, blended and continued to points of the surface.
 """
 
-from functools import cache
-
 import bodies
 import equinox as eqx
 import jax
@@ -25,7 +23,6 @@ from splatjax.diffusion import (
 )
 from splatjax.gaussians import SumOfGaussians
 from splatjax.scattering import Medium, SingleScattering
-from splatjax.splatting import DenseRasterizer, SplattingSettings
 
 KERNEL = EscapeNormalization()
 IN_FLOAT32 = 5e-4  # of the polynomial, at the widest support
@@ -236,53 +233,6 @@ def test_a_thin_white_sheet_returns_what_it_receives_whatever_is_resolved(interv
     white, grey = (at.exitance(SumOfGaussians(variances, w)) for w in (weights, 0.5 * weights))
     np.testing.assert_allclose(white, 1, rtol=1e-4)
     assert 0.5 < float(grey[0, 0]) < 1
-
-
-COUNT, RADIUS, SIZE = 3000, 10.0, 24
-SPACING = RADIUS * (4 * np.pi / COUNT) ** 0.5
-# Median, 99th percentile and maximum of the error of a blended layer, of its root mean square.
-GOAL = 2e-3, 1e-2, 3e-2
-
-
-@cache
-def blended_and_exact():
-    """Return a function of a variance: the layer blended at the pixels of a picture, and computed
-    there.
-    """
-    body = bodies.sphere(COUNT, RADIUS, jitter=0.0)
-    view = bodies.perspective(fov=20.0, width=SIZE, height=SIZE)
-    settings = SplattingSettings()
-    plan = DenseRasterizer().make_plan([body], [view], settings)
-    x, y, z = body.centers.T
-    shadowed = jnp.where(x + 2 * jnp.sin(y) > 0, jnp.maximum(z / RADIUS, 0), 0)
-    light = jnp.stack([shadowed, 0.7 + 0.3 * jnp.sin(1.5 * x) * jnp.sin(y)])
-    sources = Sources(body.centers.T, body.normals.T, body.areas, light)
-
-    @jax.jit
-    def evaluate(variance):
-        depth = EscapeNormalization().depth * jnp.sqrt(variance)
-        layer = dense_layer(sources, sources.centers, variance, depth)
-        rows = continue_from_splats(layer, sources.centers)
-        rows = jnp.concatenate([rows.values, rows.slopes.reshape(9, -1), sources.centers])
-        front = bodies.drawn(body, rows, view, settings, plan).front
-        pixels = jnp.mgrid[:SIZE, :SIZE][::-1].astype(rows.dtype) + 0.5
-        points = view.unproject(*pixels, front.depth).reshape(3, -1)
-        values, slopes, centers = jnp.split(front.attributes.reshape(15, -1), [3, 12])
-        blended = LayerValues(values, slopes.reshape(3, 3, -1))
-        exact = dense_layer(sources, points, variance, depth)
-        found, _ = continue_to_points(blended, None, centers, points, channels=2)
-        return found, exact.values
-
-    return evaluate
-
-
-@pytest.mark.parametrize("width", [1.4, 2.0, 3.7])
-def test_blended_layers_of_evenly_spread_splats_meet_the_goal(width):
-    both = blended_and_exact()(jnp.asarray((width * SPACING) ** 2))
-    for ours, theirs in zip(*(np.asarray(each) for each in both), strict=True):
-        error = np.abs(ours - theirs) / np.sqrt(np.mean(theirs**2))
-        found = *np.quantile(error, [0.5, 0.99]), error.max()
-        assert np.all(np.asarray(found) < GOAL), (width, found)
 
 
 def test_a_linear_layer_is_continued_exactly_whatever_the_weights():

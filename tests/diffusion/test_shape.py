@@ -165,41 +165,6 @@ def test_the_solution_on_a_sphere_converges_to_the_series():
     assert errors[1] < errors[0] / 2
 
 
-@pytest.mark.long
-def test_every_derivative_is_that_of_differences(float64):
-    splats = bodies.sphere(60, 2.0, jitter=0.0)
-    squeezed = splats.centers * jnp.asarray([[1, 0.8, 0.6]], float)
-    splats = eqx.tree_at(lambda splats: splats.centers, splats, squeezed)
-    given = splats, medium(eta=1.3), beams(splats, bodies.unit([0.3, 0.2, -1.0]))
-    weights = jnp.cos(jnp.arange(120.0, dtype=float)).reshape(2, 60)
-    solver = ShapeDiffuser(1e-12)
-    hierarchy = solver.find_hierarchy(splats)
-
-    @jax.jit
-    def value(given):
-        return jnp.sum(weights * solver.radiant_exitance(*given, hierarchy))
-
-    slopes, random = jax.jit(jax.grad(value))(given), np.random.default_rng(0)
-    is_lit = given[2].irradiance > 0
-    step = 1e-6
-    names = ["sigma_a", "sigma_s_prime", "eta", "irradiance"]
-    names += ["centers", "normals", "areas", "directions"]
-    for name in names:
-        tree = next(i for i, part in enumerate(given) if hasattr(part, name))
-
-        def where(given, tree=tree, name=name):
-            return getattr(given[tree], name)
-
-        leaf = where(given)
-        way = jnp.asarray(random.normal(size=leaf.shape), float) * jnp.mean(jnp.abs(leaf))
-        way = jnp.where(is_lit, way, 0) if name == "irradiance" else way
-        ahead, behind = (
-            value(eqx.tree_at(where, given, leaf + sign * step * way)) for sign in (1, -1)
-        )
-        slope = float(jnp.sum(where(slopes) * way))
-        np.testing.assert_allclose(slope, (ahead - behind) / (2 * step), rtol=1e-6)
-
-
 @pytest.mark.once
 def test_a_white_body_returns_even_light(sphere):
     none, even = jax.tree.map(jnp.zeros_like, beams(sphere)), jnp.ones((2, SPLATS))
@@ -246,12 +211,13 @@ def test_pictures_show_the_solved_light():
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("bounces", [0, 1])
-def test_derivatives_of_a_picture_are_those_of_differences(float64, bounces):
-    """In the coefficients, in the index of refraction, and in the place of the eye."""
+def test_derivatives_of_a_picture_are_those_of_differences(float64):
+    """In the coefficients, in the index of refraction, and in the place of the eye. What is seen
+    without bounces, tests of every float show.
+    """
     sphere = bodies.sphere(200, 3.0, jitter=0.0)
     light = sj.DirectionalLight([-0.3, -0.5, -1.0], [1.0, 1.0], cast_shadows=False)
-    settings = dataclasses.replace(bodies.PLAIN, diffuser=ShapeDiffuser(1e-11), bounces=bounces)
+    settings = dataclasses.replace(bodies.PLAIN, diffuser=ShapeDiffuser(1e-11), bounces=1)
     camera = sj.Camera.look_at([0, 0, 60], [0, 0, 0], fov=7, width=8, height=8)
     gaussians = SumOfGaussians([1.0], np.ones((1, 2)))
 
