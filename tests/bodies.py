@@ -1,5 +1,7 @@
 """Bodies and views to splat, shared by all tests: normals and areas are those of the surface."""
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -8,8 +10,8 @@ import numpy as np
 from splatjax._combination import OneDevice
 from splatjax.diffusion import DenseDiffuser
 from splatjax.gaussians import SumOfGaussians
-from splatjax.render import RenderSettings
-from splatjax.scene import Camera, DirectionalLight, Splats
+from splatjax.render import RenderSettings, compute_irradiance, make_plan
+from splatjax.scene import Camera, DirectionalLight, Scene, Splats
 from splatjax.splatting import (
     AbstractRasterPlan,
     AbstractView,
@@ -21,16 +23,17 @@ from splatjax.splatting import (
     SplattingSettings,
     Surface,
     TileGrid,
+    TileRasterizer,
     coverage,
 )
 
-# Plain renderers, which compile in a third of the time.
-PLAIN = RenderSettings(
-    shadows=ShadowSettings(resolution=32),
-    sample_shadows=ShadowSettings(resolution=32),
-    rasterizer=DenseRasterizer(),
-    diffuser=DenseDiffuser(),
+SHADOWS = ShadowSettings(resolution=32)
+# Tiles by the few: with the least optimization, a tenth of the time of the default.
+TILED = RenderSettings(
+    shadows=SHADOWS, sample_shadows=SHADOWS, rasterizer=TileRasterizer(lanes=8, slots=16)
 )
+# Plain renderers, which compile in a third of the time.
+PLAIN = replace(TILED, rasterizer=DenseRasterizer(), diffuser=DenseDiffuser())
 
 
 def unit(vectors) -> np.ndarray:
@@ -136,6 +139,12 @@ def view(eye=(6.0, 4.0, 40.0), fov=32.0, size=20) -> Camera:
 def lights_from_two_sides() -> list[DirectionalLight]:
     ways = [-1.0, -0.4, -0.3], [0.8, -0.2, -0.6]
     return [DirectionalLight(way, [2.0, 3.0], cast_shadows=False) for way in ways]
+
+
+def irradiance(scene: Scene, settings: RenderSettings = PLAIN) -> np.ndarray:
+    """Compute the light that enters every splat: `[channels, splats]`."""
+    plan = make_plan(scene, view(), settings)
+    return np.asarray(compute_irradiance(scene, plan, settings).entering, float)
 
 
 def camera_over(half_view: float, pixels: int, slant: float = 0.0) -> Camera:

@@ -1,9 +1,11 @@
 """Where spectra become color: white, illuminants, the skin locus, and pictures of spectra."""
 
+from dataclasses import replace
+
 import equinox as eqx
 import numpy as np
 import pytest
-from bodies import sphere, view
+from bodies import PLAIN, sphere, view
 
 import splatjax as sj
 from splatjax.io import spectrum_to_rgb
@@ -68,7 +70,7 @@ def test_a_projected_picture_is_the_picture_of_projected_weights():
     """Where the kernel has gain 1."""
     body, matrix = sphere(200), spectrum_to_rgb(WAVELENGTHS)
     weights = 0.2 * np.random.default_rng(0).random((2, 31))
-    settings = sj.RenderSettings(kernel=sj.diffusion.PlainMean())
+    settings = replace(PLAIN, kernel=sj.diffusion.PlainMean())
     light = sj.DirectionalLight([-0.5, -0.4, -1.0], 3.0)
 
     def picture(weights):

@@ -9,16 +9,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from bodies import PLAIN, apart, joined, sphere, with_albedo
+from bodies import PLAIN, TILED, apart, joined, sphere, with_albedo
 from jax.experimental.multihost_utils import process_allgather
 from jax.sharding import NamedSharding, PartitionSpec
 
 import splatjax as sj
 from benchmarks.communication import Picture, View, counted
-from splatjax.splatting import ShadowSettings
 
-SHADOWS = ShadowSettings(resolution=32)
-SETTINGS = sj.RenderSettings(shadows=SHADOWS, sample_shadows=SHADOWS)
 # mm; where the balls stand, away from the origin of all coordinates.
 PLACE = np.asarray([40.0, -25.0, 15.0])
 
@@ -48,7 +45,7 @@ def camera(angle: float = 0.0) -> sj.Camera:
 @eqx.filter_jit
 def pictured(scene: sj.Scene, camera: sj.Camera, plan: sj.Plan):
     def loss(of):
-        frame = sj.render(*of, SETTINGS, plan)
+        frame = sj.render(*of, TILED, plan)
         wave = jnp.sin(jnp.arange(frame.beauty.size, dtype=float)).reshape(frame.beauty.shape)
         total = jnp.sum(wave * (frame.beauty + 1e-3 * frame.position))
         return total + jnp.sum(frame.coverage**2), frame
@@ -71,10 +68,10 @@ def strata_cut() -> dict:
     bare, eye = scene(), camera()
 
     def found(mesh):
-        plan = sj.make_plan(sj.Scene(bare.splats, lights, bare.material), eye, SETTINGS, mesh=mesh)
+        plan = sj.make_plan(sj.Scene(bare.splats, lights, bare.material), eye, TILED, mesh=mesh)
 
         def loss(lights):
-            frame = sj.render(sj.Scene(bare.splats, lights, bare.material), eye, SETTINGS, plan)
+            frame = sj.render(sj.Scene(bare.splats, lights, bare.material), eye, TILED, plan)
             return jnp.mean(frame.beauty**2), frame
 
         return eqx.filter_jit(eqx.filter_grad(loss, has_aux=True))(lights)
@@ -87,9 +84,7 @@ def light_and_unshadowed_splats_cut() -> dict:
     world, meshes = scene(), (None, jax.make_mesh((8,), ("splats",)))
     light = apart(
         *(
-            sj.compute_irradiance(
-                world, sj.make_plan(world, camera(), SETTINGS, mesh=mesh), SETTINGS
-            )
+            sj.compute_irradiance(world, sj.make_plan(world, camera(), TILED, mesh=mesh), TILED)
             for mesh in meshes
         )
     )
@@ -98,7 +93,7 @@ def light_and_unshadowed_splats_cut() -> dict:
 
 def _apart_on_eight(world: sj.Scene) -> dict:
     eye, mesh = camera(), jax.make_mesh((4, 2), ("hosts", "devices"))
-    plans = [sj.make_plan(world, eye, SETTINGS), sj.make_plan(world, eye, SETTINGS, mesh=mesh)]
+    plans = [sj.make_plan(world, eye, TILED), sj.make_plan(world, eye, TILED, mesh=mesh)]
     # Layers that are not resolved, from single splats, from clusters.
     diffusion = plans[0].diffusion
     np.testing.assert_array_equal(diffusion.gaussians, [1, 2])
@@ -127,12 +122,12 @@ def more_than_pictures_cut() -> dict:
     )
 
     def found(mesh):
-        plan = sj.make_plan(world, eye, SETTINGS, mesh=mesh)
-        light = sj.compute_irradiance(world, plan, SETTINGS)
-        gathered = sj.diffusion_basis(world, eye, SETTINGS, plan, derivative=True)
-        diffused = sj.diffuse_irradiance(world, light.source.T, eye, SETTINGS, plan)
-        jacobian = sj.picture_jacobian(world, eye, SETTINGS, plan)
-        bounces = replace(SETTINGS, bounces=1)
+        plan = sj.make_plan(world, eye, TILED, mesh=mesh)
+        light = sj.compute_irradiance(world, plan, TILED)
+        gathered = sj.diffusion_basis(world, eye, TILED, plan, derivative=True)
+        diffused = sj.diffuse_irradiance(world, light.source.T, eye, TILED, plan)
+        jacobian = sj.picture_jacobian(world, eye, TILED, plan)
+        bounces = replace(TILED, bounces=1)
         bounced = sj.compute_irradiance(
             world, sj.make_plan(world, eye, bounces, mesh=mesh), bounces
         )
@@ -148,7 +143,7 @@ def traffic() -> dict:
     """
     mesh = jax.make_mesh((8,), ("splats",))
     world = scene(1504)
-    plan = sj.make_plan(world, camera(), SETTINGS, mesh=mesh)
+    plan = sj.make_plan(world, camera(), TILED, mesh=mesh)
     world = eqx.tree_at(
         lambda each: each.splats,
         world,
@@ -156,7 +151,7 @@ def traffic() -> dict:
     )
     program = jax.jit(
         lambda splats: sj.render(
-            sj.Scene(splats, world.lights, world.material), camera(), SETTINGS, plan
+            sj.Scene(splats, world.lights, world.material), camera(), TILED, plan
         )
     )
     found = counted(program.lower(world.splats).compile().as_text())
@@ -224,10 +219,10 @@ def over_processes(what: str, index: str, count: str, port: str) -> dict:
 
     def found(splats, mesh):
         cut_scene = sj.Scene(splats, world.lights, world.material)
-        plan = sj.make_plan(cut_scene, eye, SETTINGS, mesh=mesh)
+        plan = sj.make_plan(cut_scene, eye, TILED, mesh=mesh)
 
         def draw(splats, plan):
-            return sj.render(sj.Scene(splats, world.lights, world.material), eye, SETTINGS, plan)
+            return sj.render(sj.Scene(splats, world.lights, world.material), eye, TILED, plan)
 
         if what == "picture":
             return draw(splats, plan)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from bodies import (
     PLAIN,
+    irradiance,
     joined,
     sheet,
     sphere,
@@ -47,10 +48,8 @@ def cup(angle: float, count: int = COUNT) -> sj.Splats:
     return splats(RADIUS * u, -u, 1.5 * np.sqrt(area), np.full(count, area))
 
 
-def irradiance(scene: sj.Scene, bounces: int, **settings) -> np.ndarray:
-    settings = replace(PLAIN, bounces=bounces, kernel=PlainMean(), **settings)
-    plan = sj.make_plan(scene, CAMERA, settings)
-    return np.asarray(sj.compute_irradiance(scene, plan, settings).entering, float)
+def received(scene: sj.Scene, bounces: int) -> np.ndarray:
+    return irradiance(scene, replace(PLAIN, bounces=bounces, kernel=PlainMean()))
 
 
 LAMP = sj.PointLight([0, 0, 0], [100, 200, 300], cast_shadows=False)
@@ -80,10 +79,10 @@ def test_a_cup_has_the_exact_series(material, angle):
     share = (1 - np.cos(np.radians(angle))) / 2
     returned = np.asarray(enters * material.total_reflectance() * body.albedo[0]) * share
     scene = sj.Scene(body, LAMP, material)
-    before, term = irradiance(scene, 0).mean(axis=1), 1.0
+    before, term = received(scene, 0).mean(axis=1), 1.0
     first, added = before, material.total_reflectance() / material.gaussians.total_reflectance()
     for bounces in (1, 2) if material.single_scattering is None else (1,):
-        after, term = irradiance(scene, bounces).mean(axis=1), term * returned
+        after, term = received(scene, bounces).mean(axis=1), term * returned
         error = bounces * FORM_FACTOR
         np.testing.assert_allclose((after - before) / first, added * term, rtol=error)
         before = after
@@ -93,23 +92,23 @@ def test_a_cup_has_the_exact_series(material, angle):
 def test_in_an_open_cup_the_first_bounce_is_even():
     """Under parallel light too: the mean exitance times the form factor."""
     body = cup(70)
-    direct, bounced = (irradiance(sj.Scene(body, SUN, MATTE), bounces) for bounces in (0, 1))
-    received = bounced - direct
+    direct, bounced = (received(sj.Scene(body, SUN, MATTE), bounces) for bounces in (0, 1))
+    gained = bounced - direct
     share = (1 - np.cos(np.radians(70))) / 2
     exact = np.asarray(MATTE.total_reflectance()) * direct.mean(axis=1) * share
-    np.testing.assert_allclose(received.mean(axis=1), exact, rtol=0.05)  # a long rim
-    assert np.all(np.std(received, axis=1) < 0.05 * exact)
+    np.testing.assert_allclose(gained.mean(axis=1), exact, rtol=0.05)  # a long rim
+    assert np.all(np.std(gained, axis=1) < 0.05 * exact)
 
 
 @pytest.mark.once
 def test_a_convex_body_receives_nothing_of_itself():
     body = sphere(COUNT)
     scene = sj.Scene(body, (SUN, LAMP), MATTE)
-    np.testing.assert_array_equal(irradiance(scene, 2), irradiance(scene, 0))
+    np.testing.assert_array_equal(received(scene, 2), received(scene, 0))
     # A rough one little: its splats face each other, and are no higher than their neighbors.
     rough = body.normals + 0.2 * np.random.default_rng(1).normal(size=(COUNT, 3))
     scene = sj.Scene(replace(body, normals=unit(rough)), SUN, MATTE)
-    direct, bounced = irradiance(scene, 0), irradiance(scene, 1)
+    direct, bounced = received(scene, 0), received(scene, 1)
     assert np.mean(bounced - direct) < 0.01 * np.mean(direct)
 
 
@@ -119,10 +118,10 @@ def test_opposite_squares_receive_by_their_form_factor():
     lower, upper = sheet(9.75, 0.5), sheet(9.75, 0.5, (0.0, 0.0, -1.0), (0.0, 0.0, 20.0))
     lamp = sj.DirectionalLight([0, 0, 1], [1, 2, 3], cast_shadows=False)
     scene = sj.Scene(joined(lower, upper), lamp, MATTE)
-    direct, bounced = irradiance(scene, 0), irradiance(scene, 1)
-    received = (bounced - direct)[:, : lower.count].mean(axis=1)
+    direct, bounced = received(scene, 0), received(scene, 1)
+    gained = (bounced - direct)[:, : lower.count].mean(axis=1)
     exact = 0.1998 * np.asarray(MATTE.total_reflectance()) * direct[:, lower.count :].mean(axis=1)
-    np.testing.assert_allclose(received, exact, rtol=0.07)  # rims end half a spacing late
+    np.testing.assert_allclose(gained, exact, rtol=0.07)  # rims end half a spacing late
     assert np.max(np.abs(bounced - direct)[:, lower.count :]) < 1e-6
 
 
@@ -130,11 +129,11 @@ def test_opposite_squares_receive_by_their_form_factor():
 def test_bounces_are_linear_in_the_lights_and_the_same_at_every_scale():
     body = cup(120)
     of_sun, of_lamp, of_both = (
-        irradiance(sj.Scene(body, lights, MATTE), 2) for lights in (SUN, LAMP, (SUN, LAMP))
+        received(sj.Scene(body, lights, MATTE), 2) for lights in (SUN, LAMP, (SUN, LAMP))
     )
     np.testing.assert_allclose(of_both, of_sun + of_lamp, rtol=1e-5)
     wide = sj.SumOfGaussians(64 * MATTE.gaussians.variances, MATTE.gaussians.weights)
-    large = irradiance(sj.Scene(body.scaled(8.0), SUN, MATTE.surface_of(wide)), 2)
+    large = received(sj.Scene(body.scaled(8.0), SUN, MATTE.surface_of(wide)), 2)
     np.testing.assert_allclose(large, of_sun, rtol=1e-5)
 
 
@@ -144,7 +143,7 @@ def test_derivatives_in_light_material_and_albedo(float64):
     plan = sj.make_plan(sj.Scene(body, SUN, MATTE), CAMERA, settings)
     factors = np.random.default_rng(3).normal(size=(3, body.count))
 
-    def received(strength, weights, variances, albedo, normals):
+    def weighed(strength, weights, variances, albedo, normals):
         material = sj.Material(sj.SumOfGaussians(variances, weights))
         lit = replace(with_albedo(body, albedo), normals=normals)
         lamp = sj.DirectionalLight([0, 0, -1], strength, cast_shadows=False)
@@ -153,7 +152,7 @@ def test_derivatives_in_light_material_and_albedo(float64):
 
     gaussians, albedo = MATTE.gaussians, jnp.full((body.count, 3), 0.6)
     given = jnp.ones(3), gaussians.weights, gaussians.variances, albedo, body.normals
-    check_grads(jax.jit(received), given, 1, ["fwd", "rev"], rtol=1e-5)
+    check_grads(jax.jit(weighed), given, 1, ["fwd", "rev"], rtol=1e-5)
 
 
 @pytest.mark.once

@@ -14,7 +14,7 @@ from bodies import PLAIN, assert_close, joined, sheet, sphere, two_gaussians
 
 import splatjax as sj
 from splatjax.diffusion import DenseDiffuser
-from splatjax.render import _checks, _devices, _render
+from splatjax.render import _checks
 from splatjax.render._checks import check_scene
 from splatjax.scene import AbstractLight, AbstractLightSample
 from splatjax.splatting import DenseRasterizer, ShadowSettings
@@ -143,6 +143,10 @@ REFUSED = [
             PLAIN,
         ),
         r"scene\.material has single scattering",
+    ),
+    (
+        lambda: sj.relighting_basis(SCENE, CAMERA, PLAIN),
+        "scene.lights are DirectionalLight; give one HarmonicLight",
     ),
     (
         lambda: sj.render(
@@ -311,13 +315,6 @@ def test_lights_and_gaussians_that_fill_up_are_in_no_result():
     assert jacobian.weights.shape == jacobian.variances.shape == exact.layers.shape
     beauty = sj.diffusion_basis(scene, CAMERA, PLAIN, plan).beauty(scene.material.gaussians)
     assert jnp.allclose(beauty, exact.beauty, rtol=1e-5, atol=1e-6)
-
-    # No map is made for what fills up: its visibility is 0.
-    filled, counted, _, own = _devices.fill_scene(scene, plan)
-    assert own.lights.tolist() == [0, 4, 1, 2]
-    rows = _render._illuminate(filled, counted, PLAIN, False, None).visibility[0]
-    assert not np.any(rows[3])
-    assert np.all(np.any(rows[:3] > 0, axis=1))
 
 
 def test_a_light_without_strength_has_its_shadow_and_its_derivative():

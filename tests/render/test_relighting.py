@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from bodies import PLAIN, apart, joined, map_directions, sphere, two_gaussians
+from bodies import PLAIN, apart, irradiance, joined, map_directions, sphere, two_gaussians
 
 import splatjax as sj
 from splatjax.scene import HarmonicLight, spherical_harmonics
@@ -57,9 +57,7 @@ def test_irradiance_on_a_ball_is_that_of_its_bands(count):
     gaussians = sj.SumOfGaussians([1.0], np.ones((1, 16)))
     light = HarmonicLight(np.eye(16), count=count, cast_shadows=False)  # one for each channel
     scene = sj.Scene(body, light, sj.Material(gaussians, eta=1.0, specular=0.0))
-    plan = sj.make_plan(scene, CAMERA, PLAIN)
-    received = np.asarray(sj.compute_irradiance(scene, plan, PLAIN).entering.T)
-    assert np.max(np.abs(received - exact)) < HARMONIC[count]
+    assert np.max(np.abs(irradiance(scene).T - exact)) < HARMONIC[count]
 
 
 def test_an_environment_of_one_harmonic_has_its_coefficient():
@@ -72,20 +70,3 @@ def test_an_environment_of_one_harmonic_has_its_coefficient():
         np.testing.assert_allclose(
             light.coefficients, even + np.pad(expected, ((0, 5), (0, 0))), atol=2e-3
         )
-
-
-SCENE = sj.Scene(BODY, sj.PointLight([0, 0, 9], 1.0), MATERIAL)
-REFUSED = [
-    (lambda: HarmonicLight(np.zeros((5, 3))), "HarmonicLight.coefficients has 5 rows"),
-    (
-        lambda: sj.relighting_basis(SCENE, CAMERA, PLAIN),
-        "scene.lights are PointLight; give one HarmonicLight",
-    ),
-]
-
-
-@pytest.mark.once
-@pytest.mark.parametrize(("call", "said"), REFUSED)
-def test_lights_that_are_no_harmonics_are_refused(call, said):
-    with pytest.raises(ValueError, match=said):
-        call()

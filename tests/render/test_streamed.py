@@ -9,21 +9,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from bodies import PLAIN, apart, camera_over, joined, sheet, sphere, with_albedo
+from bodies import PLAIN, TILED, apart, camera_over, joined, sheet, sphere, with_albedo
 
 import splatjax as sj
 from splatjax.diffusion import FINE_QUANTILE, DenseDiffuser
 from splatjax.diffusion._clusters import LayerSources
 from splatjax.render._statistics import StreamStatistics
-from splatjax.splatting import ShadowSettings
 
 pytestmark = pytest.mark.once
 
 ROUNDING = 3e-5  # of the largest number of its kind: sums of a thousand terms, in another order
 LAYERS = 2.5e-2  # 99% of the pixels; at points here and at splats there, with clusters of each part
 RIMS = 0.1  # where a pixel blends two surfaces, 0.07 measured
-SHADOWS = ShadowSettings(resolution=32)
-SETTINGS = sj.RenderSettings(shadows=SHADOWS, sample_shadows=SHADOWS)
 FIELDS = (
     "coverage",
     "depth",
@@ -78,7 +75,7 @@ def in_parts(splats, size):
 
 
 def test_parts_make_the_picture_of_all_at_once(splats, monkeypatch):
-    whole = sj.render(sj.Scene(splats, LIGHTS, MATERIAL), CAMERA, SETTINGS)
+    whole = sj.render(sj.Scene(splats, LIGHTS, MATERIAL), CAMERA, TILED)
     build, built, done = LayerSources.build, [], []
     counts = [300, 600, 900, 1200, 1500, 1800, 2100, 2200]
     monkeypatch.setattr(
@@ -89,7 +86,7 @@ def test_parts_make_the_picture_of_all_at_once(splats, monkeypatch):
         LIGHTS,
         MATERIAL,
         CAMERA,
-        SETTINGS,
+        TILED,
         lambda what, count: done.append((what, count)),
     )
     assert streamed.overflow == 0
@@ -105,8 +102,8 @@ def test_parts_make_the_picture_of_all_at_once(splats, monkeypatch):
 
 @pytest.mark.long
 def test_strata_of_lights_are_streamed_too(splats):
-    whole = sj.render(sj.Scene(splats, STRATA, MATERIAL), CAMERA, SETTINGS)
-    streamed = sj.render_streamed(in_parts(splats, 900), STRATA, MATERIAL, CAMERA, SETTINGS)
+    whole = sj.render(sj.Scene(splats, STRATA, MATERIAL), CAMERA, TILED)
+    streamed = sj.render_streamed(in_parts(splats, 900), STRATA, MATERIAL, CAMERA, TILED)
     found = apart(*({name: getattr(frame, name) for name in FIELDS} for frame in (whole, streamed)))
     assert max(found.values()) < ROUNDING, found
 
@@ -117,47 +114,30 @@ def layer_errors(streamed, whole):
     return errors / np.max(whole.layers, axis=(1, 2, 3))[:, None, None]
 
 
-@pytest.mark.parametrize("size", [70, 2200])
-def test_how_fine_the_splats_are_is_found_of_all(splats, size):
-    """By it a layer is carried or handed over, here and in `render` alike."""
-    areas = jnp.asarray(
-        np.random.default_rng(3).permutation(np.geomspace(0.1, 10.0, splats.count)), float
-    )
-    splats = eqx.tree_at(lambda each: each.areas, splats, areas)
-    fine = StreamStatistics.of(in_parts(splats, size)).fine
-    assert fine == pytest.approx(
-        np.quantile(np.asarray(areas, np.float64), FINE_QUANTILE), rel=1e-6
-    )
-
-
-def without_area(splats, bare):
-    """The splats with areas of zero where `bare`, still seen."""
-    areas = jnp.where(jnp.asarray(bare), 0.0, splats.areas)
-    return eqx.tree_at(lambda cloud: cloud.areas, splats, areas)
-
-
-@pytest.mark.parametrize("begins_bare", [False, True])
-def test_splats_without_area_do_not_count(splats, begins_bare):
-    """They bring no light, in a part of their own or not: sizes are those of the other splats."""
+@pytest.mark.parametrize(("size", "begins_bare"), [(70, False), (300, True), (2200, False)])
+def test_sizes_are_those_of_all_splats_that_have_an_area(splats, size, begins_bare):
+    """By them a layer is resolved or not, here and in `render` alike."""
     index = np.arange(splats.count)
     bare = index < 300 if begins_bare else index % 10 == 0
-    cloud, rest = without_area(splats, bare), jax.tree.map(lambda leaf: leaf[~bare], splats)
-    statistics, of_rest = (StreamStatistics.of(in_parts(s, 300)) for s in (cloud, rest))
-    assert statistics.spacing == pytest.approx(of_rest.spacing, rel=1e-5)
-    assert statistics.fine == pytest.approx(of_rest.fine, rel=1e-5)
-    assert 0 < statistics.unevenness < 1
+    areas = np.random.default_rng(3).permutation(np.geomspace(0.1, 10.0, splats.count))
+    given = jnp.asarray(np.where(bare, 0.0, areas), float)
+    cloud = eqx.tree_at(lambda each: each.areas, splats, given)
+    found = StreamStatistics.of(in_parts(cloud, size))
+    assert found.fine == pytest.approx(np.quantile(areas[~bare], FINE_QUANTILE), rel=1e-5)
+    assert found.spacing == pytest.approx(np.mean(areas[~bare]) ** 0.5, rel=1e-5)
+    assert 0 < found.unevenness < 1
 
 
 @pytest.mark.parametrize("are_all", [pytest.param(False, marks=pytest.mark.long, id="first"), True])
 def test_the_first_part_or_all_may_have_no_area(splats, are_all):
     """The picture is that of all at once, up to the clusters of the parts."""
-    cloud = without_area(splats, np.ones(splats.count, bool))
+    cloud = eqx.tree_at(lambda cloud: cloud.areas, splats, jnp.zeros(splats.count))
     if not are_all:  # a part that is not seen, before the splats
         hidden = jax.tree.map(lambda leaf: leaf[:300], cloud)
         hidden = eqx.tree_at(lambda cloud: cloud.radii, hidden, jnp.zeros(300))
         cloud = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), hidden, splats)
-    whole = sj.render(sj.Scene(cloud, LIGHTS, MATERIAL), CAMERA, SETTINGS)
-    streamed = sj.render_streamed(in_parts(cloud, 300), LIGHTS, MATERIAL, CAMERA, SETTINGS)
+    whole = sj.render(sj.Scene(cloud, LIGHTS, MATERIAL), CAMERA, TILED)
+    streamed = sj.render_streamed(in_parts(cloud, 300), LIGHTS, MATERIAL, CAMERA, TILED)
     assert float(whole.unresolved_fraction[-1]) == are_all
     assert np.all(np.quantile(layer_errors(streamed, whole), 0.99, axis=(1, 2)) < LAYERS)
 

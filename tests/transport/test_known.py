@@ -6,12 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.extend.random import threefry_2x32
 from media import balance, layer, reflectance
 
 import splatjax as sj
-from splatjax.transport._directions import fresnel
-from splatjax.transport._results import Sum, total
-from splatjax.transport._rounds import uniforms
+from splatjax.transport._rounds import threefry
 
 KEY = jax.random.key(2026)
 # Standard errors by which an estimate may be off.
@@ -141,19 +140,11 @@ KEY_OF_PARTS = jax.random.key(5)
 HALF_SPACE = [layer([0.1, 0.1], 1.0, 1.0)]
 
 
-def test_uniforms_are_uniform_and_independent(dtype):
-    numbers = np.concatenate(
-        [uniforms(KEY_OF_PARTS, jnp.asarray(n), 4096, dtype) for n in range(50)], axis=1
-    )
-    assert numbers.dtype == dtype
-    assert numbers.min() > 0
-    assert numbers.max() <= 1
-    counts = np.stack([np.histogram(row, 64, (0, 1))[0] for row in numbers])
-    expected = numbers.shape[1] / 64
-    chi = np.sum((counts - expected) ** 2 / expected, axis=1)
-    assert np.all(np.abs(chi - 63) < 5 * np.sqrt(2 * 63))
-    correlation = np.corrcoef(np.concatenate([numbers[:, 1:], numbers[:, :-1]]))
-    assert np.all(np.abs(correlation - np.eye(8)) < 5 / np.sqrt(numbers.shape[1]))
+@pytest.mark.once
+def test_random_words_are_those_of_jax():
+    words = jax.random.bits(KEY_OF_PARTS, (4, 100), jnp.uint32)
+    expected = threefry_2x32(words[:2, 0], words[2:].reshape(-1))
+    np.testing.assert_array_equal(jnp.concatenate(threefry(*words[:2, 0], *words[2:])), expected)
 
 
 @pytest.mark.parametrize("g", [-0.6, 0.0, 1e-6, 0.5, 0.95])
@@ -175,42 +166,6 @@ def test_henyey_and_greensteins_angles(float64, g):
         # No direction about the axis is preferred.
         across = np.stack([np.asarray(each) for each in after]).mean(axis=1)
         np.testing.assert_allclose(across, g * np.asarray(start), atol=1e-4)
-
-
-@pytest.mark.parametrize("eta", [1.3, 1.0, 1 / 1.5])
-def test_reflectance_has_the_moments_of_diffusion(float64, eta):
-    mu = (jnp.arange(400_000.0) + 0.5) / 400_000
-    reflectance, onward = fresnel(mu, jnp.full_like(mu, eta), jnp.ones_like(mu))
-    moment = 2 * jnp.mean(mu * reflectance)
-    np.testing.assert_allclose(
-        moment, sj.scattering.ExactFresnel().first_moment(jnp.asarray([eta]))[0], atol=2e-6
-    )
-    # Snell's law, where light goes on.
-    goes = np.asarray(reflectance) < 1
-    np.testing.assert_allclose((1 - onward**2)[goes], (eta**2 * (1 - mu**2))[goes], atol=1e-12)
-
-
-@pytest.mark.parametrize("eta", [1.0, 1.4, 1 / 1.3])
-def test_diffuse_light_enters_with_unit_power(float64, eta):
-    xi = (jnp.arange(400_000.0) + 0.5) / 400_000
-    (x, _, z), weight = sj.transport.DiffuseIncidence().enter(xi, xi, jnp.asarray([1.0, eta]))
-    np.testing.assert_allclose(jnp.mean(weight), 1, atol=2e-6)
-    assert np.all(np.asarray(z) >= 0)
-    assert np.max(np.abs(x)) <= min(1, 1 / eta) + 1e-9
-
-
-def test_sums_keep_what_rounding_takes(dtype):
-    term = jnp.asarray(0.1, jnp.float32)
-    added = jax.lax.fori_loop(
-        0, 300_000, lambda _, each: each.plus(term), Sum.zeros((), jnp.float32)
-    )
-    np.testing.assert_allclose(added.over(300_000), np.float32(0.1), rtol=1e-7)
-    naive = jax.lax.fori_loop(0, 300_000, lambda _, each: each + term, jnp.zeros((), jnp.float32))
-    assert abs(float(naive) / 30_000 - 1) > 1e-4
-    values = jnp.full((8192, 2), 0.1, jnp.float32)
-    np.testing.assert_allclose(
-        total(jnp.ones(8192, jnp.float32), values), 8192 * np.float32(0.1), rtol=2e-6
-    )
 
 
 def test_rings_are_where_they_say(dtype):
