@@ -7,11 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+import splatjax as sj
 from splatjax._combination import OneDevice
-from splatjax.diffusion import DenseDiffuser
-from splatjax.gaussians import SumOfGaussians
 from splatjax.render import RenderSettings, compute_irradiance, make_plan
-from splatjax.scene import Camera, DirectionalLight, Scene, Splats
 from splatjax.splatting import (
     AbstractRasterPlan,
     AbstractView,
@@ -33,7 +31,7 @@ TILED = RenderSettings(
     shadows=SHADOWS, sample_shadows=SHADOWS, rasterizer=TileRasterizer(lanes=8, slots=16)
 )
 # Plain renderers, which compile in a third of the time.
-PLAIN = replace(TILED, rasterizer=DenseRasterizer(), diffuser=DenseDiffuser())
+PLAIN = replace(TILED, rasterizer=DenseRasterizer(), diffuser=sj.diffusion.DenseDiffuser())
 
 
 def unit(vectors) -> np.ndarray:
@@ -41,11 +39,11 @@ def unit(vectors) -> np.ndarray:
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
-def splats(centers, normals, radii, areas=None) -> Splats:
+def splats(centers, normals, radii, areas=None) -> sj.Splats:
     normals = unit(normals)
     radii = np.broadcast_to(np.asarray(radii, float), len(normals))
     areas = (radii / 1.5) ** 2 if areas is None else areas
-    return Splats(*(jnp.asarray(each, float) for each in (centers, normals, radii, areas)))
+    return sj.Splats(*(jnp.asarray(each, float) for each in (centers, normals, radii, areas)))
 
 
 def directions(count: int, jitter: float = 0.35, seed: int = 0) -> np.ndarray:
@@ -60,13 +58,13 @@ def directions(count: int, jitter: float = 0.35, seed: int = 0) -> np.ndarray:
 
 def sphere(
     count: int, radius: float = 10.0, center=(0.0, 0.0, 0.0), jitter: float = 0.35, seed: int = 0
-) -> Splats:
+) -> sj.Splats:
     u = directions(count, jitter, seed)
     area = 4 * np.pi * radius**2 / count
     return splats(np.asarray(center) + radius * u, u, 1.5 * np.sqrt(area), np.full(count, area))
 
 
-def bumpy(count: int, radius: float = 10.0, seed: int = 0) -> Splats:
+def bumpy(count: int, radius: float = 10.0, seed: int = 0) -> sj.Splats:
     """A closed body with bumps, its normals from the tangents of the surface."""
 
     def surface(u):
@@ -90,12 +88,12 @@ def bumpy(count: int, radius: float = 10.0, seed: int = 0) -> Splats:
     return splats(surface(u), normal, 1.5 * np.sqrt(areas), areas)
 
 
-def with_albedo(body: Splats, albedo) -> Splats:
+def with_albedo(body: sj.Splats, albedo) -> sj.Splats:
     albedo = jnp.asarray(albedo, float)
     return eqx.tree_at(lambda s: s.albedo, body, albedo, is_leaf=lambda leaf: leaf is None)
 
 
-def joined(*bodies: Splats) -> Splats:
+def joined(*bodies: sj.Splats) -> sj.Splats:
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *bodies)
 
 
@@ -105,7 +103,7 @@ def sheet(
     normal=(0.0, 0.0, 1.0),
     center=(0.0, 0.0, 0.0),
     jitter: float = 0.0,
-) -> Splats:
+) -> sj.Splats:
     """A flat sheet of splats on a grid, off it by up to `jitter` in spacings."""
     normal = unit(normal)
     a = unit(np.cross(normal, [1.0, 0, 0] if abs(normal[0]) < 0.9 else [0, 1.0, 0]))
@@ -121,7 +119,7 @@ def perspective(
     eye=(0.0, 0.0, 40.0), target=(0.0, 0.0, 0.0), fov=35.0, width=40, height=32
 ) -> PerspectiveView:
     eye, target = (jnp.asarray(each, float) for each in (eye, target))
-    return PerspectiveView.of(Camera.look_at(eye, target, fov=fov, width=width, height=height))
+    return PerspectiveView.of(sj.Camera.look_at(eye, target, fov=fov, width=width, height=height))
 
 
 def orthographic(scale=1.2, width=40, height=32) -> OrthographicView:
@@ -132,30 +130,30 @@ def orthographic(scale=1.2, width=40, height=32) -> OrthographicView:
     return OrthographicView(jnp.zeros(3), rotation, jnp.asarray(scale, float), width, height)
 
 
-def view(eye=(6.0, 4.0, 40.0), fov=32.0, size=20) -> Camera:
-    return Camera.look_at(jnp.asarray(eye), jnp.zeros(3), fov=fov, width=size, height=size)
+def view(eye=(6.0, 4.0, 40.0), fov=32.0, size=20) -> sj.Camera:
+    return sj.Camera.look_at(jnp.asarray(eye), jnp.zeros(3), fov=fov, width=size, height=size)
 
 
-def lights_from_two_sides() -> list[DirectionalLight]:
+def lights_from_two_sides() -> list[sj.DirectionalLight]:
     ways = [-1.0, -0.4, -0.3], [0.8, -0.2, -0.6]
-    return [DirectionalLight(way, [2.0, 3.0], cast_shadows=False) for way in ways]
+    return [sj.DirectionalLight(way, [2.0, 3.0], cast_shadows=False) for way in ways]
 
 
-def irradiance(scene: Scene, settings: RenderSettings = PLAIN) -> np.ndarray:
+def irradiance(scene: sj.Scene, settings: RenderSettings = PLAIN) -> np.ndarray:
     """Compute the light that enters every splat: `[channels, splats]`."""
     plan = make_plan(scene, view(), settings)
     return np.asarray(compute_irradiance(scene, plan, settings).entering, float)
 
 
-def camera_over(half_view: float, pixels: int, slant: float = 0.0) -> Camera:
+def camera_over(half_view: float, pixels: int, slant: float = 0.0) -> sj.Camera:
     """A camera far above the origin that sees `half_view` mm to each side; `slant` in degrees."""
     distance, angle = 40 * half_view, np.radians(slant)
     eye = [0.0, -distance * np.sin(angle), distance * np.cos(angle)]
     fov = 2 * np.degrees(np.arctan(1 / 40))
-    return Camera.look_at(eye, [0, 0, 0], fov=fov, width=pixels, height=pixels)
+    return sj.Camera.look_at(eye, [0, 0, 0], fov=fov, width=pixels, height=pixels)
 
 
-def hits(camera: Camera) -> np.ndarray:
+def hits(camera: sj.Camera) -> np.ndarray:
     """Where the rays through the pixels meet z = 0: `[height, width, 3]`."""
     y, x = np.indices((camera.height, camera.width)) + 0.5
     eye = np.asarray(camera.position, float)
@@ -172,11 +170,11 @@ def map_directions(rows: int) -> np.ndarray:
     return np.stack(np.broadcast_arrays(x, np.cos(polar), z), axis=-1)
 
 
-def two_gaussians() -> SumOfGaussians:
+def two_gaussians() -> sj.SumOfGaussians:
     """A material of two layers, for laws that hold for any number: each more takes its time to
     compile.
     """
-    return SumOfGaussians([0.5, 3.0], [[0.3, 0.2, 0.1], [0.4, 0.3, 0.2]])
+    return sj.SumOfGaussians([0.5, 3.0], [[0.3, 0.2, 0.1], [0.4, 0.3, 0.2]])
 
 
 def apart(one, other) -> dict[str, float]:
@@ -219,7 +217,7 @@ class Drawn(eqx.Module):
 
 
 def drawn(
-    body: Splats,
+    body: sj.Splats,
     rows: jax.Array,
     view: AbstractView,
     settings: SplattingSettings,

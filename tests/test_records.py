@@ -1,5 +1,5 @@
 """Records take numbers, lists and tuples, and convert them once; nonsense is refused by name, by
-records and functions alike.
+records and functions alike. The camera: directions, field of view, and views along up.
 """
 
 import equinox as eqx
@@ -13,7 +13,6 @@ import splatjax as sj
 from splatjax.baselines import bust_with_textures
 from splatjax.inverse import Candidate, Observation
 from splatjax.render._checks import check_displayable
-from splatjax.transport import HenyeyGreenstein
 
 CENTERS = [[0, 0, 0], [1, 0, 0]]
 NORMALS = ((0, 0, 1), (0, 0, 1))
@@ -63,7 +62,7 @@ RECORDS = {
     "Scene": lambda: sj.Scene(splats(), light(), material()),
     "Observation": lambda: Observation(np.ones((2, 2, 3)), camera(), [light()], deviation=0.01),
     "Candidate": lambda: Candidate("front", camera(), light()),
-    "HenyeyGreenstein": lambda: HenyeyGreenstein([0.5, 0]),
+    "HenyeyGreenstein": lambda: sj.transport.HenyeyGreenstein([0.5, 0]),
     "GivenVariances": lambda: sj.fitting.GivenVariances((0.1, 2)),
 }
 
@@ -195,7 +194,10 @@ def test_traced_values_and_placeholders_pass_through_transformations():
         (lambda: Observation(np.ones((3, 2, 3)), camera(), light()), "picture has 3 x 2 pixels"),
         (lambda: Observation(np.ones((2, 2, 3)), camera(), light(), deviation=0), "deviation"),
         (lambda: sj.scattering.Multipole(medium(), -1.0), "too many positional arguments"),
-        (lambda: HenyeyGreenstein(1.0), r"HenyeyGreenstein\.g must be between -1 and 1"),
+        (
+            lambda: sj.transport.HenyeyGreenstein(1.0),
+            r"HenyeyGreenstein\.g must be between -1 and 1",
+        ),
         (
             lambda: sj.scattering.Tabulated([0, 1], [1, 1]).without(
                 sj.SingleScattering(sj.Medium(0.1, 0.9, 1.0))
@@ -275,3 +277,33 @@ def test_numbers_of_any_type_compile_a_picture_once(compiled):
     for scene in scenes:
         sj.render(scene, camera(), PLAIN, plan)
     assert compiled == []
+
+
+EYE, TARGET = np.asarray([30.0, 20.0, 50.0]), np.asarray([1.0, -2.0, 3.0])
+
+
+def test_it_looks_at_the_target_upright():
+    camera = sj.Camera.look_at(EYE, TARGET, fov=40.0, width=300, height=100)
+    right, down, forward = np.asarray(camera.rotation)
+    np.testing.assert_allclose(camera.rotation @ camera.rotation.T, np.eye(3), atol=1e-6)
+    np.testing.assert_allclose(np.linalg.det(camera.rotation), 1, rtol=1e-6)
+    np.testing.assert_allclose(forward * np.linalg.norm(TARGET - EYE), TARGET - EYE, rtol=1e-5)
+    assert abs(right[1]) < 1e-7
+    assert down[1] < 0
+    # The field of view is that of the height.
+    np.testing.assert_allclose(2 * camera.focal_length * np.tan(np.radians(20)), 1, rtol=1e-6)
+    traced = jax.jit(lambda eye: sj.Camera.look_at(eye, TARGET))(jnp.asarray(EYE))
+    np.testing.assert_allclose(traced.rotation, camera.rotation, atol=1e-6)
+
+
+@pytest.mark.parametrize("straight", [[0.0, -1.0, 0.0], [0.0, 7.0, 0.0]])
+def test_a_view_along_up_needs_another_up(straight):
+    with pytest.raises(ValueError, match=r"up is \[0.0, 1.0, 0.0\]"):
+        sj.Camera.look_at(EYE, EYE + straight)
+    camera = sj.Camera.look_at(EYE, EYE + straight, up=[0, 0, -1])
+    assert np.all(np.isfinite(camera.rotation))
+
+
+@pytest.mark.parametrize("size", [1e-10, 1e12])
+def test_any_distance_that_single_precision_can_square_is_a_view(size):
+    assert np.all(np.isfinite(sj.Camera.look_at(size * EYE, [0, 0, 0]).rotation))

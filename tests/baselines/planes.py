@@ -8,13 +8,12 @@ import numpy as np
 
 import splatjax as sj
 from splatjax.diffusion import AbstractDiffusionKernel, PlainMean, Sources, dense_layer
-from splatjax.geometry import Mesh, Textures
 
 # mm, from the middle to the edges.
 HALF = 12.0
 
 
-def plane(stretch: float, quads: int = 6, half: float = HALF) -> Mesh:
+def plane(stretch: float, quads: int = 6, half: float = HALF) -> sj.geometry.Mesh:
     """A square at z = 0 that faces +z; `stretch` times as many mm along u as along v, its chart in
     the middle of the texture.
     """
@@ -30,7 +29,7 @@ def plane(stretch: float, quads: int = 6, half: float = HALF) -> Mesh:
     )
     vertices = np.column_stack([half * flat, np.zeros(len(flat))])
     normals = np.tile([0.0, 0.0, 1.0], (len(flat), 1))
-    return Mesh(vertices, faces, normals, coordinates(vertices, stretch, half)[faces])
+    return sj.geometry.Mesh(vertices, faces, normals, coordinates(vertices, stretch, half)[faces])
 
 
 def coordinates(points: np.ndarray, stretch: float, half: float = HALF) -> np.ndarray:
@@ -48,11 +47,11 @@ def spots(points: np.ndarray) -> np.ndarray:
     return 0.1 + 0.85 * np.stack([fine, bars, disc], axis=1)
 
 
-def painted(stretch: float, size: int) -> Textures:
+def painted(stretch: float, size: int) -> sj.geometry.Textures:
     row, column = np.indices((size, size)).reshape(2, -1)
     uvs = np.stack([(column + 0.5) / size, 1 - (row + 0.5) / size], axis=1)
     points = (uvs - 0.5) / 0.45 * HALF * np.asarray([stretch, 1.0])
-    return Textures(albedo=spots(points).reshape(size, size, 3))
+    return sj.geometry.Textures(albedo=spots(points).reshape(size, size, 3))
 
 
 def splatted(points: np.ndarray, gaussians: sj.SumOfGaussians, spacing: float = 0.3) -> np.ndarray:

@@ -33,7 +33,6 @@ from splatjax.baselines import (
     splats_that_suffice,
     thinning_error,
 )
-from splatjax.diffusion import DenseDiffuser, PlainMean
 from splatjax.splatting import PerspectiveView, SplattingSettings, Surface, visible_surfaces
 
 SETTINGS = SplattingSettings()
@@ -308,7 +307,7 @@ def test_the_law_holds_on_a_head_it_was_not_fitted_on():
     ]
     scenes = [sj.Scene(head, (lamp,), skin.white()) for lamp in lamps]
     camera = sj.Camera.look_at(jnp.asarray([0.0, 0.0, 900.0]), jnp.zeros(3), width=16, height=16)
-    plan = sj.make_plan(scenes, camera, sj.RenderSettings(diffuser=DenseDiffuser()))
+    plan = sj.make_plan(scenes, camera, sj.RenderSettings(diffuser=sj.diffusion.DenseDiffuser()))
     sources = [np.asarray(sj.compute_irradiance(scene, plan).source.T) for scene in scenes]
     ratios = factors(head, sources)
     assert np.max(np.abs(np.log(ratios))) < np.log(FACTOR), ratios
@@ -346,8 +345,10 @@ def test_layers_of_fewer_splats_keep_constants_and_those_of_all_are_the_plain_on
     material = sj.Material(sj.SumOfGaussians([4.0, 9.0], [[0.5], [0.5]]))
     scene = sj.Scene(body, (), material)
     camera = sj.Camera.look_at([0, 0, 60], [0, 0, 0], fov=25, width=16, height=16)
-    diffusers = DenseDiffuser(), ThinnedDiffuser(1), ThinnedDiffuser(7)
-    settings = [sj.RenderSettings(diffuser=each, kernel=PlainMean()) for each in diffusers]
+    diffusers = sj.diffusion.DenseDiffuser(), ThinnedDiffuser(1), ThinnedDiffuser(7)
+    settings = [
+        sj.RenderSettings(diffuser=each, kernel=sj.diffusion.PlainMean()) for each in diffusers
+    ]
     light = 0.5 + 0.5 * body.normals[:, :1]
 
     def layers(light, settings):

@@ -15,9 +15,6 @@ from planes import HALF, coordinates, gathered, painted, plane, splatted
 
 import splatjax as sj
 from splatjax import baselines
-from splatjax.diffusion import EscapeNormalization, PlainMean, Sources
-from splatjax.geometry import Mesh, complexion
-from splatjax.splatting import PerspectiveView
 
 SIZE = 192
 # The wider first: layers keep the order of the Gaussians.
@@ -27,10 +24,10 @@ TWO = sj.SumOfGaussians(
 DULL = sj.Material(TWO, eta=1.0, specular=0.0)
 FRONTAL = sj.DirectionalLight(jnp.asarray([0.0, 0.0, -1.0]), jnp.ones(3), cast_shadows=False)
 STILL = baselines.TextureSpaceSettings(
-    SIZE, baselines.StretchCorrected(), baselines.OpaqueParts(), PlainMean()
+    SIZE, baselines.StretchCorrected(), baselines.OpaqueParts(), sj.diffusion.PlainMean()
 )
 THIN = dataclasses.replace(
-    STILL, thin_parts=baselines.TranslucentShadowMap(), kernel=EscapeNormalization()
+    STILL, thin_parts=baselines.TranslucentShadowMap(), kernel=sj.diffusion.EscapeNormalization()
 )
 
 
@@ -120,7 +117,9 @@ def test_bad_input_is_refused(sheet):
     render = jax.jit(lambda mesh: baselines.render_texture_space(mesh, lights, DULL, camera))
     for refused, said in (
         (
-            lambda: baselines.TexturedMesh.of(Mesh(bare.vertices, bare.faces, bare.normals)),
+            lambda: baselines.TexturedMesh.of(
+                sj.geometry.Mesh(bare.vertices, bare.faces, bare.normals)
+            ),
             "no texture coordinates",
         ),
         (
@@ -137,14 +136,16 @@ def test_bad_input_is_refused(sheet):
             refused()
 
 
-def slab(thickness: float) -> Mesh:
+def slab(thickness: float) -> sj.geometry.Mesh:
     front = plane(1.0)
     turn = np.asarray([-1.0, 1.0, -1.0])
     vertices = np.concatenate([front.vertices, front.vertices * turn - [0.0, 0.0, thickness]])
     faces = np.concatenate([front.faces, front.faces + len(front.vertices)])
     halved = front.uvs * np.asarray([0.5, 1.0])
     uvs = np.concatenate([halved, halved + np.asarray([0.5, 0.0])])
-    return Mesh(vertices, faces, np.concatenate([front.normals, front.normals * turn]), uvs)
+    return sj.geometry.Mesh(
+        vertices, faces, np.concatenate([front.normals, front.normals * turn]), uvs
+    )
 
 
 @pytest.mark.once
@@ -158,9 +159,9 @@ def test_through_a_slab_comes_what_comes_through_splats():
     ours = np.pi * np.asarray(found.layers)[:, 2, 2]
 
     faces = bodies.sheet(11.7, 0.6), bodies.sheet(11.7, 0.6, (0, 0, -1), (0, 0, -thickness))
-    body, kernel = bodies.joined(*faces), EscapeNormalization()
+    body, kernel = bodies.joined(*faces), sj.diffusion.EscapeNormalization()
     light = jnp.maximum(jnp.tile(-body.normals[:, 2], (3, 1)), 0)
-    sources = Sources(body.centers.T, body.normals.T, body.areas, light)
+    sources = sj.diffusion.Sources(body.centers.T, body.normals.T, body.areas, light)
     means, mass = gathered(sources, TWO.variances, kernel, np.zeros((1, 3)))
     mass, weights = jnp.asarray(mass[:, None]), TWO.weights[..., None]
     gain = kernel.gain(mass, TWO.variances, weights, jnp.zeros((3, 1)))
@@ -204,7 +205,7 @@ CAMERA = sj.Camera.look_at(
 
 
 def seen_from(camera, corners):
-    landing = baselines.Landing.in_view(corners, PerspectiveView.of(camera))
+    landing = baselines.Landing.in_view(corners, sj.splatting.PerspectiveView.of(camera))
     return landing, baselines.see_faces(landing, baselines.capacity_for(landing))
 
 
@@ -255,7 +256,7 @@ def test_attributes_have_the_derivatives_that_differences_say(float64, corners):
     @jax.jit
     def picture(corners, values, focal_length):
         camera = sj.Camera(CAMERA.position, CAMERA.rotation, focal_length, PIXELS, PIXELS)
-        landing = baselines.Landing.in_view(corners, PerspectiveView.of(camera))
+        landing = baselines.Landing.in_view(corners, sj.splatting.PerspectiveView.of(camera))
         return jnp.sum(
             jnp.sin(baselines.interpolate(values, seen, baselines.barycentrics(landing, seen)))
         )
@@ -279,7 +280,7 @@ def test_the_face_of_the_bust_has_its_colors_in_textures():
     face = (middles[:, 2] > 40) & (np.abs(middles[:, 0]) < 50)  # what nothing overlaps
     uvs = jnp.asarray(mesh.uvs[face].mean(axis=1), float)
     found = np.asarray(baselines.look_up(triangles.albedo, uvs))
-    expected, specular, roughness = complexion(middles[face])
+    expected, specular, roughness = sj.geometry.complexion(middles[face])
     off = np.abs(found - expected).max(axis=1)
     assert np.median(off) < 0.01
     assert np.quantile(off, 0.95) < 0.05

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import splatjax as sj
 from splatjax.diffusion import (
     EscapeNormalization,
     LayersAtPoints,
@@ -21,8 +22,6 @@ from splatjax.diffusion import (
     resolved_fraction,
     unevenness,
 )
-from splatjax.gaussians import SumOfGaussians
-from splatjax.scattering import Medium, SingleScattering
 
 KERNEL = EscapeNormalization()
 IN_FLOAT32 = 5e-4  # of the polynomial, at the widest support
@@ -127,7 +126,7 @@ def test_flat_pieces_and_open_edges_keep_their_mean(mass):
 def test_what_absorbs_nothing_returns_all_whatever_the_shape():
     for mass in (3.0, np.linspace(1.1, 2.5, 6)):
         np.testing.assert_allclose(returned(mass, WHITE), 1, rtol=1e-5)
-    single = SingleScattering(Medium([0.0], [1.0], 1.4))
+    single = sj.SingleScattering(sj.Medium([0.0], [1.0], 1.4))
     once = float(single.total_reflectance()[0])
     rest = (1 - once) * np.asarray([[0.4], [0.6]])
     np.testing.assert_allclose(returned(2.5, rest, [1.0, 4.0], once), 1 - once, rtol=1e-5)
@@ -228,9 +227,9 @@ def test_a_thin_white_sheet_returns_what_it_receives_whatever_is_resolved(interv
     one, area = jnp.ones((1, 1)), jnp.full(1, spacing**2)
     given = one, area, one, jnp.asarray(interval), KERNEL
     at = LayersAtPoints.of(variances, jnp.arange(3), rows[:, :, None], None, *given)
-    _, resolved = at.weigh(SumOfGaussians(variances, weights), jnp.zeros(1))
+    _, resolved = at.weigh(sj.SumOfGaussians(variances, weights), jnp.zeros(1))
     assert np.any(resolved > 0)
-    white, grey = (at.exitance(SumOfGaussians(variances, w)) for w in (weights, 0.5 * weights))
+    white, grey = (at.exitance(sj.SumOfGaussians(variances, w)) for w in (weights, 0.5 * weights))
     np.testing.assert_allclose(white, 1, rtol=1e-4)
     assert 0.5 < float(grey[0, 0]) < 1
 
@@ -272,7 +271,7 @@ def layers_at_points(kernel):
     given = (jnp.asarray(each, float) for each in (source, area, albedo))
     interval = jnp.asarray([0.4, 2.2])
     at = LayersAtPoints.of(variances, order, layers, slopes, *given, interval, kernel)
-    return at, SumOfGaussians(variances, jnp.asarray(weights))
+    return at, sj.SumOfGaussians(variances, jnp.asarray(weights))
 
 
 def test_unresolved_layers_are_the_irradiance_of_the_surface():

@@ -13,8 +13,6 @@ from scipy.special import eval_legendre, spherical_in
 
 import splatjax as sj
 from splatjax.diffusion import Beams, ShapeDiffuser, compact_order
-from splatjax.gaussians import SumOfGaussians
-from splatjax.scattering import Medium
 
 DOWN = np.asarray([0.0, 0.0, -1.0])
 RADIUS, SIGMA_T, ALBEDO = 6.0, 1.5, np.asarray([0.999, 0.95])
@@ -32,8 +30,8 @@ MERGED, OF_SLOPES = 3e-3, 0.06  # merged sums and their gradients, root mean squ
 OF_SERIES = 2e-3  # of 2,000 splats, over the brightest
 
 
-def medium(albedo=ALBEDO, eta: float = 1.0) -> Medium:
-    return Medium(SIGMA_T * (1 - albedo), SIGMA_T * albedo, np.full(len(albedo), eta))
+def medium(albedo=ALBEDO, eta: float = 1.0) -> sj.Medium:
+    return sj.Medium(SIGMA_T * (1 - albedo), SIGMA_T * albedo, np.full(len(albedo), eta))
 
 
 def beams(splats: sj.Splats, direction=DOWN, channels: int = 2) -> Beams:
@@ -44,7 +42,7 @@ def beams(splats: sj.Splats, direction=DOWN, channels: int = 2) -> Beams:
     return Beams(jnp.tile(irradiance, (channels, 1)), directions)
 
 
-def solved(splats: sj.Splats, medium: Medium, beams: Beams, error: float = 1e-4, opening=0.0):
+def solved(splats: sj.Splats, medium: sj.Medium, beams: Beams, error: float = 1e-4, opening=0.0):
     diffuser = ShapeDiffuser(error, opening)
     given = splats, medium, beams, diffuser.find_hierarchy(splats)
     return eqx.filter_jit(diffuser.radiant_exitance)(*given)
@@ -114,7 +112,7 @@ def off(found, expected) -> float:
 
 def test_the_size_of_body_and_coefficients_does_not_matter(sphere, exitance):
     larger, usual = sphere.scaled(1e4), medium()
-    thinner = Medium(usual.sigma_a / 1e4, usual.sigma_s_prime / 1e4, usual.eta)
+    thinner = sj.Medium(usual.sigma_a / 1e4, usual.sigma_s_prime / 1e4, usual.eta)
     found = solved(larger, thinner, beams(larger))
     np.testing.assert_allclose(found, exitance, atol=2e-4 * exitance.max())
 
@@ -192,7 +190,7 @@ def test_refused_bodies_and_materials(sphere):
 @pytest.mark.once
 def test_pictures_show_the_solved_light():
     sphere = bodies.sphere(200, RADIUS, jitter=0.0)
-    gaussians = SumOfGaussians([1.0], np.ones((1, 2)))
+    gaussians = sj.SumOfGaussians([1.0], np.ones((1, 2)))
     of_body = medium(np.asarray([0.998, 0.9]))
     material = sj.Material(gaussians, eta=1.0, specular=0.0, medium=of_body)
     light = sj.DirectionalLight(DOWN, [1.0, 1.0], cast_shadows=False)
@@ -219,10 +217,10 @@ def test_derivatives_of_a_picture_are_those_of_differences(float64):
     light = sj.DirectionalLight([-0.3, -0.5, -1.0], [1.0, 1.0], cast_shadows=False)
     settings = dataclasses.replace(bodies.PLAIN, diffuser=ShapeDiffuser(1e-11), bounces=1)
     camera = sj.Camera.look_at([0, 0, 60], [0, 0, 0], fov=7, width=8, height=8)
-    gaussians = SumOfGaussians([1.0], np.ones((1, 2)))
+    gaussians = sj.SumOfGaussians([1.0], np.ones((1, 2)))
 
     def scene(sigma_a, sigma_s, eta):
-        of_body = Medium(sigma_a, sigma_s, jnp.broadcast_to(eta, 2))
+        of_body = sj.Medium(sigma_a, sigma_s, jnp.broadcast_to(eta, 2))
         material = sj.Material(gaussians, eta=eta, specular=0.0, medium=of_body)
         return sj.Scene(sphere, [light], material)
 

@@ -5,19 +5,18 @@ import json
 import jax.numpy as jnp
 import numpy as np
 
+import splatjax as sj
 from splatjax.exports import (
     blender_radius,
     burley_distance,
     data_sheet,
     separable_kernel,
 )
-from splatjax.gaussians import SumOfGaussians
-from splatjax.io import load_material
 from splatjax.scattering import Burley, DiffuseTransmission
 
 
 def test_burley_distance_matches_the_mean_distance(float64):
-    gaussians = load_material("marble").gaussians
+    gaussians = sj.load_material("marble").gaussians
     d = burley_distance(gaussians)
     burley = Burley(jnp.ones(3), d * DiffuseTransmission()(jnp.ones(3)), DiffuseTransmission())
     np.testing.assert_allclose(burley.length_scale(), d, rtol=1e-12)
@@ -29,8 +28,8 @@ def test_burley_distance_matches_the_mean_distance(float64):
 
 
 def test_lengths_scale_and_stay_related(dtype):
-    gaussians = load_material("skin1").gaussians
-    larger = SumOfGaussians(gaussians.variances * 4, gaussians.weights)
+    gaussians = sj.load_material("skin1").gaussians
+    larger = sj.SumOfGaussians(gaussians.variances * 4, gaussians.weights)
     np.testing.assert_allclose(burley_distance(larger), 2 * burley_distance(gaussians), rtol=1e-6)
     np.testing.assert_allclose(blender_radius(larger), 2 * blender_radius(gaussians), rtol=1e-6)
     unity = np.asarray(data_sheet(gaussians)["unity"]["shape_parameter"])
@@ -54,7 +53,7 @@ def test_separable_kernel_is_the_published_one(float64):
         0.0208333: 0.0211412,
     }
     variances = np.asarray([0.0484, 0.187, 0.567, 1.99, 7.41])
-    narrowed = SumOfGaussians(variances * 1.001**2, [0.100, 0.118, 0.113, 0.358, 0.078])
+    narrowed = sj.SumOfGaussians(variances * 1.001**2, [0.100, 0.118, 0.113, 0.358, 0.078])
     offsets, weights = (np.asarray(each) for each in separable_kernel(narrowed, 25, 3.0))
     for offset, weight in published.items():
         at = int(np.argmin(np.abs(offsets - offset)))
@@ -66,7 +65,7 @@ def test_separable_kernel_is_the_published_one(float64):
 
 def test_separable_kernel_of_one_gaussian_is_its_blur(float64):
     offsets, weights = separable_kernel(
-        SumOfGaussians(jnp.asarray([2.0]), jnp.asarray([[0.3]])), 201, 9.0
+        sj.SumOfGaussians(jnp.asarray([2.0]), jnp.asarray([[0.3]])), 201, 9.0
     )
     np.testing.assert_allclose(jnp.sum(weights), 1, rtol=1e-12)
     np.testing.assert_allclose(jnp.sum(weights[:, 0] * offsets**2), 2.0, rtol=1e-3)
@@ -74,7 +73,7 @@ def test_separable_kernel_of_one_gaussian_is_its_blur(float64):
 
 
 def test_the_sheet_is_json_with_formulas_and_sources(dtype):
-    gaussians = load_material("skin").gaussians
+    gaussians = sj.load_material("skin").gaussians
     sheet = json.loads(json.dumps(data_sheet(gaussians)))
     assert set(sheet) == {"gaussians", "gpu_gems", "separable_kernel", "burley", "unity", "blender"}
     for entry in sheet.values():

@@ -21,9 +21,7 @@ from hypothesis.extra.numpy import arrays
 from worlds import FAST, PLAIN, World, named, with_leaf
 
 import splatjax as sj
-from splatjax.diffusion import ClusterPlan
 from splatjax.diffusion._neighbors import Boxes, Neighbors, find_neighbors
-from splatjax.splatting import ShadowSettings
 from splatjax.splatting._bins import BinCapacity
 from splatjax.splatting._grid import TileGrid
 from splatjax.splatting._rasterizer import SurfaceCapacity
@@ -33,7 +31,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.once]
 
 SCENES = int(os.environ.get("SPLATJAX_RANDOM_SCENES", "200"))
 IN_SUITE = 1
-SHADOWS = ShadowSettings(resolution=12, bias=0.4, softness=0.8)
+SHADOWS = sj.splatting.ShadowSettings(resolution=12, bias=0.4, softness=0.8)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -249,7 +247,7 @@ def roomy(plan: sj.Plan, shape: Shape) -> sj.Plan:
             blocks = chunks * max(-(-shape.splats // rasterizer.slots), 1)
             bins, places = BinCapacity(pairs, blocks, chunks), SurfaceCapacity(tiles, tiles)
             return TilePlan(rasterizer, max(shape.splats, 1), bins, places)
-        if isinstance(part, ClusterPlan):
+        if isinstance(part, sj.diffusion.ClusterPlan):
             return dataclasses.replace(
                 part,
                 margin=jnp.asarray(jnp.inf, part.margin.dtype),
@@ -257,7 +255,7 @@ def roomy(plan: sj.Plan, shape: Shape) -> sj.Plan:
             )
         return part
 
-    parts = TilePlan | ClusterPlan
+    parts = TilePlan | sj.diffusion.ClusterPlan
     return jax.tree.map(widened, plan, is_leaf=lambda part: isinstance(part, parts))
 
 

@@ -13,17 +13,17 @@ import numpy as np
 from bodies import view
 
 import splatjax as sj
-from splatjax.diffusion import ShapeDiffuser
-from splatjax.splatting import ShadowSettings, TileRasterizer
 
-SHADOWS = ShadowSettings(resolution=32, bias=0.4, softness=0.8)
+SHADOWS = sj.splatting.ShadowSettings(resolution=32, bias=0.4, softness=0.8)
 FAST = sj.RenderSettings(
-    shadows=SHADOWS, sample_shadows=SHADOWS, rasterizer=TileRasterizer(lanes=8, slots=16)
+    shadows=SHADOWS,
+    sample_shadows=SHADOWS,
+    rasterizer=sj.splatting.TileRasterizer(lanes=8, slots=16),
 )
 PLAIN = dataclasses.replace(bodies.PLAIN, shadows=SHADOWS, sample_shadows=SHADOWS)
 COARSE = dataclasses.replace(PLAIN, shadows=dataclasses.replace(SHADOWS, resolution=16))
 
-SOLVED = dataclasses.replace(PLAIN, diffuser=ShapeDiffuser(error=1e-12))
+SOLVED = dataclasses.replace(PLAIN, diffuser=sj.diffusion.ShapeDiffuser(error=1e-12))
 
 
 class World(eqx.Module):

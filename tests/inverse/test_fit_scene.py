@@ -24,7 +24,6 @@ from splatjax.inverse import _fit_scene
 from splatjax.inverse._fit_scene import MovableScene
 from splatjax.inverse._observation import Evidence
 from splatjax.inverse._parts import PicturedScene, rotation
-from splatjax.splatting import ShadowSettings
 
 SIZE = 16
 camera = partial(view, size=SIZE)
@@ -268,7 +267,7 @@ def lifted(
         parts,
         optimizer,
         steps=40,
-        settings=sj.RenderSettings(shadows=ShadowSettings(resolution=resolution)),
+        settings=sj.RenderSettings(shadows=sj.splatting.ShadowSettings(resolution=resolution)),
         progress=lambda s, loss: said.append(s),
         **more,
     )

@@ -24,11 +24,10 @@ from splatjax.diffusion import (
 )
 from splatjax.inverse._observation import Evidence
 from splatjax.inverse._problem import RecoveryProblem, Unknowns, search, solution
-from splatjax.splatting import DenseRasterizer
 
 # Nearly all layers are resolved: pictures are made as they are searched, however coarse the splats.
 PLAIN = sj.RenderSettings(
-    rasterizer=DenseRasterizer(),
+    rasterizer=sj.splatting.DenseRasterizer(),
     diffuser=DenseDiffuser(),
     kernel=EscapeNormalization(regular=(0.1, 0.2), scattered=(0.1, 0.2)),
 )

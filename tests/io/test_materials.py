@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from bodies import assert_close
 
-from splatjax.gaussians import SumOfGaussians
+import splatjax as sj
 from splatjax.io import (
     list_materials,
     load_material,
@@ -23,6 +23,7 @@ from splatjax.io import (
     spectrum_to_rgb,
 )
 from splatjax.scattering import (
+    AngularLaw,
     Dipole,
     Film,
     HalfSpace,
@@ -33,7 +34,6 @@ from splatjax.scattering import (
     SingleScattering,
     Skin,
 )
-from splatjax.scene import Material
 
 # The rest is the freedom of an optimum.
 REPRODUCED = 1e-5
@@ -141,11 +141,13 @@ PROFILES = {
 def test_a_saved_material_comes_back_bit_for_bit(tmp_path, model):
     import colour  # noqa: F401  It makes NumPy print six digits.
 
-    gaussians = SumOfGaussians([1e-5, 2 / 3], [[1 / 3, 1e-9], [0.1, -0.2]])
+    gaussians = sj.SumOfGaussians([1e-5, 2 / 3], [[1 / 3, 1e-9], [0.1, -0.2]])
     once = SingleScattering(Medium([1 / 7, 0.2], 3.0, 1.4), [1 / 3, 1.0])
     profile, path = PROFILES[model], tmp_path / "a.toml"
     medium = profile.medium if isinstance(profile, Dipole) else None
-    material = Material(gaussians, 1.37, 0.1, 1.0, single_scattering=once, medium=medium)
+    optional = {"single_scattering": once, "medium": medium}
+    angles = AngularLaw([[1 / 3, 1.3], [0.2, -0.4], [0.1, 1e-9]])
+    material = sj.Material(gaussians, 1.37, 0.1, 1.0, angles=angles, **optional)
     source, fit = {"citation": 'Me, "2024"'}, {"error": [0.1, 0.2], "count": 2}
     save_material(material, path, profile=profile, source=source, fit=fit, g=0.75)
     assert eqx.tree_equal((load_material(path), load_profile(path)), (material, profile))

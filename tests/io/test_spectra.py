@@ -9,7 +9,6 @@ from bodies import PLAIN, sphere, view
 
 import splatjax as sj
 from splatjax.io import spectrum_to_rgb
-from splatjax.scattering import Skin
 
 WAVELENGTHS = np.arange(400, 701, 10)
 # Median lightness of each band of ten, and the 5th and 95th percentile of a* and b* under D65: 5500
@@ -55,7 +54,9 @@ def test_colors_are_those_of_colour_science():
 def test_six_skins_descend_along_the_locus():
     import colour
 
-    spectra = np.stack([Skin(melanin).half_space().total_reflectance() for melanin in SIX])
+    spectra = np.stack(
+        [sj.scattering.Skin(melanin).half_space().total_reflectance() for melanin in SIX]
+    )
     rgb = (SURFACE + (1 - SURFACE) * spectra) @ spectrum_to_rgb(WAVELENGTHS)
     assert np.all(np.diff(rgb, axis=0) < 0)
     assert np.all(np.diff(rgb, axis=1) < 0)  # red above green above blue
@@ -93,7 +94,7 @@ def test_a_skin_in_a_file_comes_back(tmp_path):
     path = tmp_path / "skin.toml"
     path.write_text("[skin]\nmelanin = 0.1\nwavelengths = [450, 550, 650]\n")
     skin = sj.load_profile(path)
-    assert eqx.tree_equal(skin, Skin(0.1, wavelengths=[450, 550, 650]))
+    assert eqx.tree_equal(skin, sj.scattering.Skin(0.1, wavelengths=[450, 550, 650]))
     material = sj.Material(sj.SumOfGaussians([1.0], [[0.4, 0.2, 0.1]]))
     sj.save_material(material, tmp_path / "fitted.toml", profile=skin)
     assert eqx.tree_equal(sj.load_profile(tmp_path / "fitted.toml"), skin)

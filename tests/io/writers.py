@@ -10,8 +10,7 @@ import trimesh
 from bodies import unit
 from PIL import Image
 
-from splatjax.geometry import complete_splats
-from splatjax.scene import Frame
+import splatjax as sj
 
 SQUARE = np.asarray([[0, 0, 0], [2, 0, 0], [2, 2, 0], [0, 2, 0]], np.float32)
 TRIANGLES = np.asarray([[0, 1, 2], [0, 2, 3]])
@@ -73,10 +72,10 @@ def some_splats(count=50):
     normals = unit(random.normal(size=(count, 3)))
     shares = random.uniform(size=(7, count))
     fields = dict(zip(("radii", "areas", "specular", "roughness"), 0.5 + shares, strict=False))
-    return complete_splats(20 * normals, normals=normals, albedo=shares[4:].T, **fields)
+    return sj.geometry.complete_splats(20 * normals, normals=normals, albedo=shares[4:].T, **fields)
 
 
-def some_frame(channels=3, gaussians=4, lights=2, height=6, width=5) -> Frame:
+def some_frame(channels=3, gaussians=4, lights=2, height=6, width=5) -> sj.Frame:
     """A frame of noise whose diffuse part is the weighted sum of its layers."""
     random = np.random.default_rng(3)
 
@@ -86,7 +85,7 @@ def some_frame(channels=3, gaussians=4, lights=2, height=6, width=5) -> Frame:
     size, colors = (height, width), (height, width, channels)
     layers, weights = noise(gaussians, *colors), noise(gaussians, channels)
     diffuse, specular = (layers * weights[:, None, None]).sum(axis=0), noise(*colors)
-    return Frame(
+    return sj.Frame(
         beauty=diffuse + specular,
         coverage=noise(*size),
         depth=noise(*size).at[0, 0].set(jnp.inf),

@@ -10,9 +10,8 @@ from bodies import camera_over, hits, splats
 from scipy.spatial import ConvexHull, Voronoi
 
 import splatjax as sj
-from splatjax.diffusion import ClusterDiffuser
 
-EXACT = sj.RenderSettings(diffuser=ClusterDiffuser(error=0.0))
+EXACT = sj.RenderSettings(diffuser=sj.diffusion.ClusterDiffuser(error=0.0))
 SLANTS = (0.0, 50.0)
 KINDS = ["jittered", pytest.param("grid", marks=pytest.mark.long)]
 PEAK_SHARE = 1e-3  # a layer is compared where it exceeds this share of its peak
@@ -111,7 +110,7 @@ HALF_WIDTH = 9.0
 PIXELS = 144
 COUNT = 3
 # A photograph has no error of ours; the error bars here are a thousandth of a coefficient.
-FINE = sj.RenderSettings(diffuser=ClusterDiffuser(error=2e-4))
+FINE = sj.RenderSettings(diffuser=sj.diffusion.ClusterDiffuser(error=2e-4))
 # Of a pixel, in shares of the peak, beside shot noise of the same size at the peak.
 NOISE = 1e-2
 

@@ -23,9 +23,6 @@ from jax.test_util import check_grads
 
 import splatjax as sj
 from splatjax.baselines import LightAtPixels
-from splatjax.diffusion import PlainMean
-from splatjax.shading import directional_albedo, fresnel_f0
-from splatjax.splatting import SightlineSettings
 
 RADIUS = 10.0
 CAMERA = sj.Camera.look_at([0, 0, 60], [0, 0, 0], fov=24, width=16, height=16)
@@ -49,7 +46,7 @@ def cup(angle: float, count: int = COUNT) -> sj.Splats:
 
 
 def received(scene: sj.Scene, bounces: int) -> np.ndarray:
-    return irradiance(scene, replace(PLAIN, bounces=bounces, kernel=PlainMean()))
+    return irradiance(scene, replace(PLAIN, bounces=bounces, kernel=sj.diffusion.PlainMean()))
 
 
 LAMP = sj.PointLight([0, 0, 0], [100, 200, 300], cast_shadows=False)
@@ -73,8 +70,8 @@ def test_a_cup_has_the_exact_series(material, angle):
     material = MATERIALS[material]
     mu, weights = np.polynomial.legendre.leggauss(32)
     mu, weights = jnp.asarray(0.5 + 0.5 * mu, float), jnp.asarray(0.5 * weights, float)
-    surface = fresnel_f0(material.eta), jnp.full_like(mu, material.roughness)
-    enters = 1 - 2 * jnp.sum(weights * mu * directional_albedo(mu, *surface))
+    surface = sj.shading.fresnel_f0(material.eta), jnp.full_like(mu, material.roughness)
+    enters = 1 - 2 * jnp.sum(weights * mu * sj.shading.directional_albedo(mu, *surface))
     body = with_albedo(cup(angle), np.full((COUNT, 3), [0.9, 0.5, 0.7]))
     share = (1 - np.cos(np.radians(angle))) / 2
     returned = np.asarray(enters * material.total_reflectance() * body.albedo[0]) * share
@@ -139,7 +136,7 @@ def test_bounces_are_linear_in_the_lights_and_the_same_at_every_scale():
 
 def test_derivatives_in_light_material_and_albedo(float64):
     body = cup(120, 160)
-    settings = replace(PLAIN, bounces=2, sightlines=SightlineSettings(32))
+    settings = replace(PLAIN, bounces=2, sightlines=sj.splatting.SightlineSettings(32))
     plan = sj.make_plan(sj.Scene(body, SUN, MATTE), CAMERA, settings)
     factors = np.random.default_rng(3).normal(size=(3, body.count))
 
@@ -157,7 +154,7 @@ def test_derivatives_in_light_material_and_albedo(float64):
 
 @pytest.mark.once
 def test_a_picture_shows_light_that_was_kept_with_its_bounces():
-    body, settings = cup(90), replace(PLAIN, bounces=1, kernel=PlainMean())
+    body, settings = cup(90), replace(PLAIN, bounces=1, kernel=sj.diffusion.PlainMean())
     scene = sj.Scene(body, SUN, MATTE)
     plan = sj.make_plan(scene, CAMERA, settings)
     kept = sj.illuminate(scene, plan, settings)
@@ -172,7 +169,7 @@ BALL = sj.Scene(sphere(64), SUN, MATTE)
 ONCE = replace(PLAIN, bounces=1)
 REFUSED = {
     "negative": (lambda: sj.RenderSettings(bounces=-1), "bounces .*-1"),
-    "odd": (lambda: SightlineSettings(63), "directions .*even.*63"),
+    "odd": (lambda: sj.splatting.SightlineSettings(63), "directions .*even.*63"),
     "at pixels": (lambda: replace(ONCE, lighting=LightAtPixels()), "bounces is 1.*LightAtPixels"),
     "plan": (
         lambda: sj.render(BALL, CAMERA, ONCE, sj.make_plan(BALL, CAMERA, PLAIN)),

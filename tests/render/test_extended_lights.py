@@ -23,15 +23,15 @@ from jax.test_util import check_grads
 from pictures import write_picture
 
 import splatjax as sj
-from splatjax.diffusion import DenseDiffuser
 from splatjax.scene import DiskLight, HarmonicLight, RectangleLight, SphereLight, even_directions
-from splatjax.splatting import ShadowSettings
 
 BARE = sj.Material(two_gaussians(), eta=1.0, specular=0.0)
 GLOSSY = sj.Material(two_gaussians(), specular=1.0, roughness=0.4)
 CAMERA = sj.Camera.look_at([0, 0, 60], [0, 0, 0], fov=24, width=24, height=24)
-SHADOWS = ShadowSettings(resolution=512)
-TILES = sj.RenderSettings(diffuser=DenseDiffuser(), shadows=SHADOWS, sample_shadows=SHADOWS)
+SHADOWS = sj.splatting.ShadowSettings(resolution=512)
+TILES = sj.RenderSettings(
+    diffuser=sj.diffusion.DenseDiffuser(), shadows=SHADOWS, sample_shadows=SHADOWS
+)
 # Root mean square, and largest error of the irradiance over its largest value, by count.
 SAMPLED = {16: (0.05, 0.15), 64: (0.015, 0.045), 256: (0.004, 0.012)}
 BODY = joined(sphere(1500, 10.0), sphere(400, 3.0, (4.0, 6.0, 12.0)))
@@ -255,9 +255,9 @@ def test_another_environment_of_the_size_compiles_nothing_and_keeps_the_plan(com
 def test_maps_of_merged_splats_let_in_the_light_that_full_maps_do():
     """A small ball beside a large one: eight splats to a disc, and a sixteenth of the pixels."""
     scene = sj.Scene(BODY, sj.EnvironmentLight(harmonics(), count=8), BARE)
-    coarse = ShadowSettings(resolution=64, compared=2, merged_spacing=6.0)
+    coarse = sj.splatting.ShadowSettings(resolution=64, compared=2, merged_spacing=6.0)
     entering = []
-    for shadows in (ShadowSettings(resolution=256), coarse):
+    for shadows in (sj.splatting.ShadowSettings(resolution=256), coarse):
         settings = dataclasses.replace(TILES, sample_shadows=shadows)
         entering.append(irradiance(scene, settings))
     plan = sj.make_plan(scene, CAMERA, settings)

@@ -23,13 +23,11 @@ from bodies import (
 )
 
 import splatjax as sj
-from splatjax.diffusion import ClusterDiffuser, DenseDiffuser
 from splatjax.render import _checks
-from splatjax.shading import directional_albedo, fresnel_f0
 
 EXITANCE_TOLERANCE = 1e-3
-TILES = dataclasses.replace(TILED, diffuser=DenseDiffuser())
-EXACT = dataclasses.replace(TILED, diffuser=ClusterDiffuser(error=0.0))
+TILES = dataclasses.replace(TILED, diffuser=sj.diffusion.DenseDiffuser())
+EXACT = dataclasses.replace(TILED, diffuser=sj.diffusion.ClusterDiffuser(error=0.0))
 
 
 def lamp(
@@ -257,7 +255,9 @@ def test_it_is_its_formula_and_part_of_the_beauty():
     lit, entered = with_single_scattering(), 0.8 * np.asarray([1.0, 2.0, 3.0])
     frame = picture(lit)
     reflected = lit.single_scattering.reflected(jnp.asarray(0.8), jnp.asarray(0.8))
-    enters = 1 - directional_albedo(jnp.asarray(0.8), fresnel_f0(lit.eta), lit.roughness)
+    enters = 1 - sj.shading.directional_albedo(
+        jnp.asarray(0.8), sj.shading.fresnel_f0(lit.eta), lit.roughness
+    )
     expected = np.asarray(reflected * enters) * entered * COLORS
     np.testing.assert_allclose(frame.single_scattering[2, 2], expected, rtol=1e-3)
     parts = frame.diffuse + frame.specular + frame.single_scattering

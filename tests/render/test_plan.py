@@ -13,19 +13,16 @@ import pytest
 from bodies import PLAIN, assert_close, joined, sheet, sphere, two_gaussians
 
 import splatjax as sj
-from splatjax.diffusion import DenseDiffuser
 from splatjax.render import _checks
 from splatjax.render._checks import check_scene
-from splatjax.scene import AbstractLight, AbstractLightSample
-from splatjax.splatting import DenseRasterizer, ShadowSettings
 
 pytestmark = pytest.mark.once
 
-SETTINGS = sj.RenderSettings(diffuser=DenseDiffuser())  # which needs no plan
-SMALL_MAPS = sj.RenderSettings(shadows=ShadowSettings(resolution=64))
+SETTINGS = sj.RenderSettings(diffuser=sj.diffusion.DenseDiffuser())  # which needs no plan
+SMALL_MAPS = sj.RenderSettings(shadows=sj.splatting.ShadowSettings(resolution=64))
 
 
-def scene_under(*lights: AbstractLight, splats: sj.Splats | None = None) -> sj.Scene:
+def scene_under(*lights: sj.scene.AbstractLight, splats: sj.Splats | None = None) -> sj.Scene:
     return sj.Scene(
         sheet(5.0, 1.0) if splats is None else splats, lights, sj.Material(two_gaussians())
     )
@@ -104,7 +101,9 @@ REFUSED = [
         r"lights of the same kinds.*scenes\[2\]",
     ),
     (
-        lambda: DenseRasterizer().make_plan([SCENE.splats] * 2, [], SETTINGS.splatting),
+        lambda: sj.splatting.DenseRasterizer().make_plan(
+            [SCENE.splats] * 2, [], SETTINGS.splatting
+        ),
         "a DenseRasterizer works on one device",
     ),
     (
@@ -163,7 +162,7 @@ def test_what_cannot_be_planned_or_rendered_is_refused_by_name(call, said):
         call()
 
 
-class Sky(AbstractLightSample):
+class Sky(sj.scene.AbstractLightSample):
     """A light of someone's own: the same from every side."""
 
     radiance: jax.Array
@@ -180,7 +179,7 @@ def test_a_light_of_ones_own_shines_without_shadows():
     assert jnp.allclose(shown.beauty, 2 * lit.beauty, rtol=1e-5)
 
 
-class Sun(AbstractLight):
+class Sun(sj.scene.AbstractLight):
     directions: jax.Array
     irradiance: jax.Array
 

@@ -12,7 +12,6 @@ import pytest
 from bodies import PLAIN, TILED, apart, camera_over, joined, sheet, sphere, with_albedo
 
 import splatjax as sj
-from splatjax.diffusion import FINE_QUANTILE, DenseDiffuser
 from splatjax.diffusion._clusters import LayerSources
 from splatjax.render._statistics import StreamStatistics
 
@@ -123,7 +122,9 @@ def test_sizes_are_those_of_all_splats_that_have_an_area(splats, size, begins_ba
     given = jnp.asarray(np.where(bare, 0.0, areas), float)
     cloud = eqx.tree_at(lambda each: each.areas, splats, given)
     found = StreamStatistics.of(in_parts(cloud, size))
-    assert found.fine == pytest.approx(np.quantile(areas[~bare], FINE_QUANTILE), rel=1e-5)
+    assert found.fine == pytest.approx(
+        np.quantile(areas[~bare], sj.diffusion.FINE_QUANTILE), rel=1e-5
+    )
     assert found.spacing == pytest.approx(np.mean(areas[~bare]) ** 0.5, rel=1e-5)
     assert 0 < found.unevenness < 1
 
@@ -144,7 +145,7 @@ def test_the_first_part_or_all_may_have_no_area(splats, are_all):
 
 def test_what_cannot_be_streamed_is_refused(splats):
     small, large = (jax.tree.map(lambda leaf, size=size: leaf[:size], splats) for size in (10, 20))
-    plain, default = sj.RenderSettings(diffuser=DenseDiffuser()), sj.RenderSettings()
+    plain, default = sj.RenderSettings(diffuser=sj.diffusion.DenseDiffuser()), sj.RenderSettings()
     for passes, settings, said in (
         ([[small]], plain, "DenseDiffuser"),
         ([[]], default, "no splats"),

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from splatjax.io import load_medium
+import splatjax as sj
 from splatjax.scattering import (
     L1_QUADRATURE,
+    L2_QUADRATURE,
     BetterDipole,
     Burley,
     DiffuseMeanFreePath,
@@ -155,7 +156,7 @@ PRINTED_TOTALS = {
 @pytest.mark.parametrize("fresnel", [ExactFresnel(), EganFresnel()])
 @pytest.mark.parametrize("name", PRINTED_TOTALS)
 def test_closed_form_total_is_the_integral(float64, name, fresnel):
-    profile = Dipole(load_medium(name), fresnel)
+    profile = Dipole(sj.load_medium(name), fresnel)
     total = integrated_reflectance(profile)
     if name == "spectralon":
         # Without absorption R falls as r^-3 beyond the last node: the rest of the integral of 2 pi
@@ -167,7 +168,7 @@ def test_closed_form_total_is_the_integral(float64, name, fresnel):
 
 @pytest.mark.parametrize("name", PRINTED_TOTALS)
 def test_totals_are_those_printed(name):
-    difference = np.asarray(Dipole(load_medium(name)).total_reflectance()) - np.asarray(
+    difference = np.asarray(Dipole(sj.load_medium(name)).total_reflectance()) - np.asarray(
         PRINTED_TOTALS[name]
     )
     if name == "chicken1":
@@ -252,3 +253,38 @@ def test_distances_from_monte_carlo(float64, monte_carlo, run, coefficients, dis
         for number in range(1, 9):
             ratio = np.sum((r * found)[ring == number]) / np.sum((r * reference)[ring == number])
             assert abs(ratio - 1) < 0.05, (number, ratio)
+
+
+def test_gaussian_is_smooth_at_the_origin(dtype):
+    offset = jnp.zeros(3, dtype)
+    gradient = jax.grad(lambda x: sj.gaussians.gaussian(jnp.asarray(0.5, dtype), jnp.sum(x * x)))(
+        offset
+    )
+    np.testing.assert_array_equal(np.asarray(gradient), 0.0)
+
+
+def test_sum_of_gaussians_is_a_profile_whose_weights_are_energies(dtype):
+    profile = sj.SumOfGaussians([0.04, 1.0], [[0.2, 0.1], [0.5, 0.3]])
+    assert profile(jnp.zeros((4, 5), dtype)).shape == (4, 5, 2)
+    np.testing.assert_allclose(np.asarray(profile.total_reflectance()), [0.7, 0.4], rtol=1e-6)
+    np.testing.assert_allclose(np.asarray(profile.white().total_reflectance()), 1.0, rtol=1e-6)
+    r = np.asarray([[0.0, 0.1], [0.5, 2.0]])
+    for wider in (0.0, 0.3):
+        expected = sum(
+            np.exp(-(r**2) / (2 * v))[..., None] / (2 * np.pi * v) * np.asarray(weights)
+            for v, weights in ((0.04 + wider, [0.2, 0.1]), (1.0 + wider, [0.5, 0.3]))
+        )
+        np.testing.assert_allclose(
+            profile.blurred(wider)(jnp.asarray(r, dtype)), expected, rtol=1e-5
+        )
+    np.testing.assert_allclose(np.asarray(profile.length_scale()), [0.2, 0.2], rtol=1e-6)
+
+
+def test_the_norm_of_a_gaussian_is_integrated_whatever_its_width(float64):
+    """The integral of r G(v, r)^2 is 1 / (8 pi^2 v), beside a Gaussian of any other scale."""
+    for narrow in (1e-6, 1e-2, 1.0):
+        profile = sj.SumOfGaussians([narrow, 1.0], [0.0, 1.0])
+        r, dr = L2_QUADRATURE.radii(profile)
+        norm = jnp.sum(dr * r * at_own_radii(profile, r) ** 2)
+        np.testing.assert_allclose(norm, 1 / (8 * np.pi**2), rtol=1e-12)
+        np.testing.assert_allclose(integrated_reflectance(profile), 1, rtol=1e-12)

@@ -10,6 +10,7 @@ from jax.extend.random import threefry_2x32
 from media import balance, layer, reflectance
 
 import splatjax as sj
+from splatjax.transport._results import Sum, total
 from splatjax.transport._rounds import threefry
 
 KEY = jax.random.key(2026)
@@ -166,6 +167,20 @@ def test_henyey_and_greensteins_angles(float64, g):
         # No direction about the axis is preferred.
         across = np.stack([np.asarray(each) for each in after]).mean(axis=1)
         np.testing.assert_allclose(across, g * np.asarray(start), atol=1e-4)
+
+
+def test_sums_keep_what_rounding_takes(dtype):
+    term = jnp.asarray(0.1, jnp.float32)
+    added = jax.lax.fori_loop(
+        0, 300_000, lambda _, each: each.plus(term), Sum.zeros((), jnp.float32)
+    )
+    np.testing.assert_allclose(added.over(300_000), np.float32(0.1), rtol=1e-7)
+    naive = jax.lax.fori_loop(0, 300_000, lambda _, each: each + term, jnp.zeros((), jnp.float32))
+    assert abs(float(naive) / 30_000 - 1) > 1e-4
+    values = jnp.full((8192, 2), 0.1, jnp.float32)
+    np.testing.assert_allclose(
+        total(jnp.ones(8192, jnp.float32), values), 8192 * np.float32(0.1), rtol=2e-6
+    )
 
 
 def test_rings_are_where_they_say(dtype):
