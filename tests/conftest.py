@@ -113,7 +113,7 @@ def _left_out(item) -> bool:
 
 
 # Beside tests marked `once`: what JAX has little part in.
-ONCE = ("io/test_corpus", "io/test_atomic", "geometry/test_raw_points", "test_imports")
+ONCE = ("io/test_corpus", "geometry/test_raw_points", "test_imports")
 
 
 @pytest.hookimpl(tryfirst=True)  # before pytest chooses by marks

@@ -8,7 +8,6 @@ import shlex
 import subprocess
 import sys
 import warnings
-from dataclasses import fields
 from unittest import mock
 
 import equinox as eqx
@@ -226,24 +225,6 @@ def printed(monkeypatch, capsys):
     return run
 
 
-def test_help_lists_every_command_in_one_line_each(printed):
-    listed = re.findall(r"• (\w+) +(.*?) *│? *\n", printed("--help"))
-    assert [name for name, _ in listed] == list(_COMMANDS)
-    assert all(summary.endswith(".") and len(summary) < 100 for _, summary in listed)
-    assert printed() == printed("--help")
-
-
-@pytest.mark.parametrize("command", _COMMANDS)
-def test_help_of_a_command_explains_every_option_in_whole_sentences(command, printed):
-    text = printed(command, "--help")
-    assert not [word for word in ("None", "STR", "{None}", "|FLOAT") if word in text]
-    lines = [line.strip("│ ") for line in text.partition("-h, --help")[2].splitlines()[1:]]
-    lines = [line for line in lines if line and line[0] not in "╭╰"]
-    broken = [line for line in lines if line[-1] not in ".)" and ("  " in line or line[:2] != "--")]
-    assert not broken
-    assert len(lines) >= len(fields(_COMMANDS[command])) - text.count("positional arguments")
-
-
 def test_a_misspelt_word_is_named_with_what_would_be_right(printed):
     text = printed("render", "--widht", "3", status=2)
     assert "--widht" in text
@@ -251,5 +232,7 @@ def test_a_misspelt_word_is_named_with_what_would_be_right(printed):
     assert all(command in printed("rendr", status=2) for command in _COMMANDS)
 
 
-def test_it_prints_its_version(printed):
+def test_help_lists_every_command_and_the_version_is_printed(printed):
+    assert re.findall(r"• (\w+) +[A-Z]", printed("--help")) == list(_COMMANDS)
+    assert printed() == printed("--help")
     assert printed("--version") == f"splatjax {sj.__version__}, jax {jax.__version__}\n"

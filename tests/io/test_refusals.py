@@ -1,6 +1,10 @@
 """Files that are cut short, that trimesh would misread, or that hold what cannot be: refused in one
-sentence that names the file, the value and the remedy.
+sentence that names the file, the value and the remedy. Files are written whole or not at all.
 """
+
+import resource
+import sys
+from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -15,14 +19,18 @@ from writers import (
     export,
     gltf,
     ramp,
+    some_frame,
     some_splats,
     square,
     write_ply,
     xyz,
 )
 
+from splatjax.geometry import complete_splats
 from splatjax.io import (
     SplatFile,
+    atomic_path,
+    load_material,
     read_exr,
     read_manifest,
     read_picture,
@@ -31,8 +39,11 @@ from splatjax.io import (
     read_splats,
     read_textured_mesh,
     sample_mesh,
+    save_material,
     write_animation,
+    write_exr,
     write_png,
+    write_record,
     write_splats,
 )
 from splatjax.io._images import read_color
@@ -319,3 +330,68 @@ def test_textures_are_taken_from_the_files_own_folder_alone(tmp_path):
     (inner / "coat.mtl").unlink()
     with pytest.warns(UserWarning, match=r"'coat.mtl', which is not beside it"):
         assert read(path)[1].albedo is None
+
+
+WRITERS = {
+    "a.exr": lambda path: write_exr(path, some_frame(height=40, width=40)),
+    "a.png": lambda path: write_png(path, np.random.default_rng(0).uniform(size=(60, 60, 3))),
+    "a.ply": lambda path: write_splats(
+        path, complete_splats(np.random.default_rng(0).normal(size=(400, 3)))
+    ),
+    "a.toml": lambda path: save_material(
+        load_material("skin"), path, source={"citation": 9000 * "x"}
+    ),
+    "a.json": lambda path: write_record(path, {"x": 9000 * "x"}),
+}
+
+
+@pytest.fixture
+def small_files(monkeypatch):
+    """No file may grow beyond 4 kB: what a full disk does, without one. Python would keep half of a
+    module's bytecode and never read it again.
+    """
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, before[1]))
+    yield
+    resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+@pytest.mark.once
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_full_disk_leaves_what_stood_there_and_no_litter(tmp_path, name, small_files):
+    target = tmp_path / name
+    target.write_text("before")
+    for path in (target, Path("/sys", name)):  # nobody may write to the second
+        with pytest.raises(OSError, match=r"cannot be written: .* there before is") as caught:
+            WRITERS[name](path)
+        assert caught.value.filename == str(path)
+    assert target.read_text() == "before"
+    assert list(tmp_path.iterdir()) == [target]
+
+
+def _write_half(path):
+    with atomic_path(path) as temporary:
+        assert (temporary.parent, temporary.suffix) == (path.parent, "")
+        temporary.write_text("ha")
+        if path.name == "file":
+            raise RuntimeError(path)
+
+
+@pytest.mark.once
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        ("nowhere/a", FileNotFoundError),
+        ("file/a", FileNotFoundError),
+        ("folder", IsADirectoryError),
+        ("file", RuntimeError),
+    ],
+)
+def test_a_file_takes_its_name_only_when_the_block_ends_well(tmp_path, name, kind):
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "file").write_text("before")
+    with pytest.raises(kind, match=name):
+        _write_half(tmp_path / name)
+    assert (tmp_path / "file").read_text() == "before"
+    assert len(list(tmp_path.iterdir())) == 2

@@ -15,7 +15,6 @@ from bodies import (
     bumpy,
     camera_over,
     directions,
-    joined,
     sheet,
     sphere,
     two_gaussians,
@@ -27,7 +26,6 @@ from splatjax.render import _checks
 
 EXITANCE_TOLERANCE = 1e-3
 TILES = dataclasses.replace(TILED, diffuser=sj.diffusion.DenseDiffuser())
-EXACT = dataclasses.replace(TILED, diffuser=sj.diffusion.ClusterDiffuser(error=0.0))
 
 
 def lamp(
@@ -90,31 +88,6 @@ def test_white_furnace(lights):
     assert least < radiance.min() < radiance.max() < most
     assert np.mean(radiance) == pytest.approx(1, abs=0.015)
     assert np.max(frame.specular) > 0.1
-
-
-@pytest.mark.slow
-@pytest.mark.once
-@pytest.mark.long
-def test_energy_does_not_depend_on_how_finely_half_the_sheet_is_splatted():
-    coarse, fine = sheet(16.0, 0.4), sheet(16.0, 0.2)
-    # cells of the coarse sheet end at x = 0.2, and there those of the shifted fine one begin
-    fine = eqx.tree_at(
-        lambda s: s.centers, fine, fine.centers + jnp.asarray([[0.1, 0.1, 0.0]], float)
-    )
-    left, right = np.asarray(coarse.centers)[:, 0] < 0.1, np.asarray(fine.centers)[:, 0] > 0.25
-    mixed = joined(
-        jax.tree.map(lambda leaf: leaf[left], coarse),
-        jax.tree.map(lambda leaf: leaf[right], fine),
-    )
-    gaussians = sj.SumOfGaussians([2.0, 5.0], [[0.5], [0.5]])
-    beam = sj.GaussianBeam([0, 0, 10], [0, 0, -1], jnp.ones(1), 1)
-    camera = camera_over(5.0, 32)
-    pictures = []
-    for splats in (coarse, mixed):
-        scene = sj.Scene(splats, (beam,), sj.Material(gaussians, eta=1.0, specular=0.0))
-        pictures.append(np.asarray(sj.render(scene, camera, EXACT).diffuse)[..., 0])
-    seen = pictures[0] > 1e-2 * pictures[0].max()
-    assert np.max(np.abs(pictures[1] / pictures[0] - 1)[seen]) < 0.01
 
 
 @pytest.mark.once

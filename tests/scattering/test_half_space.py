@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from bodies import PLAIN, sheet
 from jax.test_util import check_grads
 
 import splatjax as sj
@@ -170,16 +171,14 @@ def test_a_flat_piece_sends_back_what_the_law_says():
     """Under light and eye at an angle it is `e(mu_i) e(mu_o) / average` times as bright as a
     diffuser.
     """
-    side = np.linspace(-20, 20, 41)
-    centers = np.stack([*np.meshgrid(side, side), np.zeros((41, 41))], -1).reshape(-1, 3)
-    normals = np.broadcast_to([0, 0, 1.0], centers.shape)
-    splats = sj.Splats(centers, normals, np.full(41**2, 1.0), np.full(41**2, 1.0))
     law = AngularLaw([[1.4], [0.1], [-0.5]])
     gaussians = sj.SumOfGaussians([1.0], [[0.6]])
     light = sj.DirectionalLight((-1, 0, -0.75), [1.0])  # cosine 0.6
     camera = sj.Camera.look_at((0, 60, 80), (0, 0, 0), fov=2, width=8, height=8)  # cosine 0.8
     material = sj.Material(gaussians, eta=1.0, specular=0, angles=law)
-    radiance = sj.render(sj.Scene(splats, light, material), camera).diffuse[4, 4, 0]
+    radiance = sj.render(sj.Scene(sheet(20.0, 1.0), light, material), camera, PLAIN).diffuse[
+        4, 4, 0
+    ]
 
     def e(mu):
         return 1.4 + 0.1 * mu - 0.5 * mu**2

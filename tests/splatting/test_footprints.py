@@ -208,17 +208,6 @@ def seen_sphere(view, radius, share):
     return tangent < share * radius / np.sqrt(DISTANCE**2 - radius**2)
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
-def test_coverage_is_one_inside_a_closed_surface(seed):
-    view, radius = bodies.perspective(width=48, height=48), 11.0
-    surfaces = drawn(view, bodies.sphere(1500, radius, seed=seed))
-    inside, outside = seen_sphere(view, radius, 0.93), ~seen_sphere(view, radius, 1.15)
-    front = np.asarray(surfaces.front.coverage)
-    assert inside.sum() > 600
-    assert np.min(front[inside]) == 1
-    assert np.max(front[outside]) == 0
-
-
 @pytest.mark.once
 @pytest.mark.parametrize("rasterizer", RASTERIZERS)
 def test_inner_silhouettes_leave_no_gap(rasterizer):

@@ -10,6 +10,7 @@ from jax.extend.random import threefry_2x32
 from media import balance, layer, reflectance
 
 import splatjax as sj
+from splatjax.transport._directions import fresnel
 from splatjax.transport._results import Sum, total
 from splatjax.transport._rounds import threefry
 
@@ -167,6 +168,19 @@ def test_henyey_and_greensteins_angles(float64, g):
         # No direction about the axis is preferred.
         across = np.stack([np.asarray(each) for each in after]).mean(axis=1)
         np.testing.assert_allclose(across, g * np.asarray(start), atol=1e-4)
+
+
+@pytest.mark.parametrize("eta", [1.3, 1.0, 1 / 1.5])
+def test_reflectance_has_the_moments_of_diffusion(float64, eta):
+    mu = (jnp.arange(400_000.0) + 0.5) / 400_000
+    reflectance, onward = fresnel(mu, jnp.full_like(mu, eta), jnp.ones_like(mu))
+    moment = 2 * jnp.mean(mu * reflectance)
+    np.testing.assert_allclose(
+        moment, sj.scattering.ExactFresnel().first_moment(jnp.asarray([eta]))[0], atol=2e-6
+    )
+    # Snell's law, where light goes on.
+    goes = np.asarray(reflectance) < 1
+    np.testing.assert_allclose((1 - onward**2)[goes], (eta**2 * (1 - mu**2))[goes], atol=1e-12)
 
 
 def test_sums_keep_what_rounding_takes(dtype):
