@@ -132,6 +132,8 @@ def pytest_collection_modifyitems(config, items):
         "tests/render",
         "tests/cli",
         "tests/baselines",
+        "test_budget",
+        "tests/documents",
     )
     items.sort(
         key=lambda item: next(

@@ -42,6 +42,7 @@ weights = [[0.3, 0.4], [0.2, 0.5]]
 eta = 1.5
 """,
     "media.csv": "name,sigma_a,sigma_s_prime,eta\na,0.002,2.6,1.5\n",
+    "dark.toml": "[skin]\nmelanin = 0.15\n",
 }
 REFUSED = {
     # Inputs that are missing, or something else.
@@ -110,6 +111,7 @@ REFUSED = {
     "fit skin1 --single-scattering --model dipole": ["--single-scattering", "dipole"],
     "fit skin1 --g 0.8 --model dipole": ["--g 0.8", "dipole"],
     "fit skin1 --g 1": ["--g", "1"],
+    "fit dark.toml --model dipole": ["leave --model"],
     "fit media.csv --all --output fits.csv --g 0.8 --model dipole": ["--g 0.8", "dipole"],
     "recover plate.ply missing.toml --output mine.toml --g 0.8 --model dipole": ["--g 0.8"],
     "fit skin_layers --single-scattering --model monte-carlo": ["--single-scattering", "layers"],

@@ -68,19 +68,6 @@ def test_it_prints_and_writes_a_material_that_loads(tmp_path, capsys):
     assert np.all(grazing > 1.03)
 
 
-@pytest.mark.once
-def test_it_takes_the_pigments_of_skin(tmp_path, capsys):
-    path, output = tmp_path / "dark.toml", tmp_path / "fitted.toml"
-    path.write_text("[skin]\nmelanin = 0.15\nwavelengths = [450, 620]\n")
-    assert run("fit", path, "--count", "2", "--output", output) == 0
-    material, skin = sj.load_material(output), sj.load_profile(output)
-    matrix = sj.io.spectrum_to_rgb(skin.wavelengths)
-    rgb = skin.half_space().total_reflectance() @ matrix
-    np.testing.assert_allclose(material.total_reflectance(), rgb, rtol=1e-3)
-    assert run("fit", path, "--model", "dipole") != 0
-    assert "leave --model" in capsys.readouterr().err
-
-
 @pytest.mark.parametrize(
     ("words", "description", "rtol"),
     [
