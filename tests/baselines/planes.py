@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 
 import splatjax as sj
-from splatjax.diffusion import AbstractDiffusionKernel, PlainMean, Sources, dense_layer
 
 # mm, from the middle to the edges.
 HALF = 12.0
@@ -60,18 +59,21 @@ def splatted(points: np.ndarray, gaussians: sj.SumOfGaussians, spacing: float = 
     """
     body = bodies.sheet(HALF - spacing / 2, spacing)
     light = jnp.asarray(np.sqrt(spots(np.asarray(body.centers))).T, float)
-    sources = Sources(body.centers.T, body.normals.T, body.areas, light)
-    means, _ = gathered(sources, gaussians.variances, PlainMean(), points)
+    sources = sj.diffusion.Sources(body.centers.T, body.normals.T, body.areas, light)
+    means, _ = gathered(sources, gaussians.variances, sj.diffusion.PlainMean(), points)
     return means.transpose(0, 2, 1)
 
 
 @eqx.filter_jit
 def gathered(
-    sources: Sources, variances, kernel: AbstractDiffusionKernel, points: np.ndarray
+    sources: sj.diffusion.Sources,
+    variances,
+    kernel: sj.diffusion.AbstractDiffusionKernel,
+    points: np.ndarray,
 ) -> tuple[jax.Array, jax.Array]:
     places = jnp.asarray(points.T, float)
     layers = [
-        dense_layer(sources, places, variance, depth)
+        sj.diffusion.dense_layer(sources, places, variance, depth)
         for variance, depth in zip(variances, kernel.depths(variances), strict=True)
     ]
     return jnp.stack([each.values[:-1] for each in layers]), jnp.stack(

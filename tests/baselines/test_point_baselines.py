@@ -33,9 +33,8 @@ from splatjax.baselines import (
     splats_that_suffice,
     thinning_error,
 )
-from splatjax.splatting import PerspectiveView, SplattingSettings, Surface, visible_surfaces
 
-SETTINGS = SplattingSettings()
+SETTINGS = sj.splatting.SplattingSettings()
 RASTERIZERS = {
     "elliptical": NearestRasterizer(),
     "ewa": BlendingRasterizer(EwaKernel()),
@@ -50,15 +49,15 @@ def camera(eye, fov: float = 30.0, target=(0.0, 0.0, 0.0)) -> sj.Camera:
     return sj.Camera.look_at(eye, target, fov=fov, width=SIZE, height=SIZE)
 
 
-def seen_by(name: str, splats: sj.Splats, *views: PerspectiveView):
+def seen_by(name: str, splats: sj.Splats, *views: sj.splatting.PerspectiveView):
     """Return how any of the views draws the splats, moved by less than a plan can hold, with rows
     of attributes: pictures of the rows, of coverage and of depth.
     """
     plan = RASTERIZERS[name].make_plan([splats], views, SETTINGS)
 
     def draw(splats, rows, view):
-        visible = visible_surfaces(splats, rows, view, SETTINGS, plan, OneDevice())
-        surface = Surface.of(visible.sums, view, visible.needed)
+        visible = sj.splatting.visible_surfaces(splats, rows, view, SETTINGS, plan, OneDevice())
+        surface = sj.splatting.Surface.of(visible.sums, view, visible.needed)
         depth = jnp.where(surface.covered, surface.depth, 0.0)
         pictures = surface.attributes, visible.share, depth
         return tuple(visible.front_picture(each) for each in pictures)
@@ -67,7 +66,7 @@ def seen_by(name: str, splats: sj.Splats, *views: PerspectiveView):
 
 
 def drawn(name: str, splats: sj.Splats, rows, *cameras: sj.Camera):
-    views = [PerspectiveView.of(each) for each in cameras]
+    views = [sj.splatting.PerspectiveView.of(each) for each in cameras]
     draw = seen_by(name, splats, *views)
     found = [draw(splats, rows, view)[:2] for view in views]
     attributes, coverage = (np.stack(pictures) for pictures in zip(*found, strict=True))
@@ -114,7 +113,7 @@ def test_squares_smaller_than_a_pixel_are_gray_and_still_with_a_filter_and_alias
 def test_a_plane_of_one_color_has_exactly_that_color_and_lies_where_it_lies(name):
     sheet, color = bodies.sheet(9.0, 0.8, jitter=0.3), 0.7
     seen = camera((4.0, -9.0, 14.0), fov=20.0)
-    view = PerspectiveView.of(seen)
+    view = sj.splatting.PerspectiveView.of(seen)
     rows = jnp.full((1, sheet.count), color)
     attributes, coverage, depth = seen_by(name, sheet, view)(sheet, rows, view)
     inside = np.asarray(coverage) > 0
@@ -239,7 +238,7 @@ def test_what_is_blended_has_derivatives(name, float64):
     differences.
     """
     sheet = bodies.sheet(2.0, 0.7, jitter=0.2)
-    view = PerspectiveView.of(camera((1.0, 2.0, 12.0), fov=15.0))
+    view = sj.splatting.PerspectiveView.of(camera((1.0, 2.0, 12.0), fov=15.0))
     draw = seen_by(name, sheet, view)
     rows = jnp.asarray(np.random.default_rng(1).uniform(size=(1, sheet.count)))
     turn = jnp.asarray(np.random.default_rng(2).normal(size=(SIZE, SIZE)))

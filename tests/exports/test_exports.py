@@ -6,19 +6,16 @@ import jax.numpy as jnp
 import numpy as np
 
 import splatjax as sj
-from splatjax.exports import (
-    blender_radius,
-    burley_distance,
-    data_sheet,
-    separable_kernel,
-)
-from splatjax.scattering import Burley, DiffuseTransmission
 
 
 def test_burley_distance_matches_the_mean_distance(float64):
     gaussians = sj.load_material("marble").gaussians
-    d = burley_distance(gaussians)
-    burley = Burley(jnp.ones(3), d * DiffuseTransmission()(jnp.ones(3)), DiffuseTransmission())
+    d = sj.exports.burley_distance(gaussians)
+    burley = sj.scattering.Burley(
+        jnp.ones(3),
+        d * sj.scattering.DiffuseTransmission()(jnp.ones(3)),
+        sj.scattering.DiffuseTransmission(),
+    )
     np.testing.assert_allclose(burley.length_scale(), d, rtol=1e-12)
     r = np.linspace(1e-4, 80, 400_000)
     for profile in (gaussians.white(), burley):
@@ -30,14 +27,22 @@ def test_burley_distance_matches_the_mean_distance(float64):
 def test_lengths_scale_and_stay_related(dtype):
     gaussians = sj.load_material("skin1").gaussians
     larger = sj.SumOfGaussians(gaussians.variances * 4, gaussians.weights)
-    np.testing.assert_allclose(burley_distance(larger), 2 * burley_distance(gaussians), rtol=1e-6)
-    np.testing.assert_allclose(blender_radius(larger), 2 * blender_radius(gaussians), rtol=1e-6)
-    unity = np.asarray(data_sheet(gaussians)["unity"]["shape_parameter"])
-    np.testing.assert_allclose(unity * burley_distance(gaussians), 1, rtol=1e-6)
+    np.testing.assert_allclose(
+        sj.exports.burley_distance(larger), 2 * sj.exports.burley_distance(gaussians), rtol=1e-6
+    )
+    np.testing.assert_allclose(
+        sj.exports.blender_radius(larger), 2 * sj.exports.blender_radius(gaussians), rtol=1e-6
+    )
+    unity = np.asarray(sj.exports.data_sheet(gaussians)["unity"]["shape_parameter"])
+    np.testing.assert_allclose(unity * sj.exports.burley_distance(gaussians), 1, rtol=1e-6)
     # As Cycles reads it: a quarter of the radius over pi is the mean free path.
-    path = 0.25 * blender_radius(gaussians) / np.pi
-    burley = Burley(gaussians.total_reflectance(), path, DiffuseTransmission())
-    np.testing.assert_allclose(burley.length_scale(), burley_distance(gaussians), rtol=1e-5)
+    path = 0.25 * sj.exports.blender_radius(gaussians) / np.pi
+    burley = sj.scattering.Burley(
+        gaussians.total_reflectance(), path, sj.scattering.DiffuseTransmission()
+    )
+    np.testing.assert_allclose(
+        burley.length_scale(), sj.exports.burley_distance(gaussians), rtol=1e-5
+    )
 
 
 def test_separable_kernel_is_the_published_one(float64):
@@ -54,7 +59,7 @@ def test_separable_kernel_is_the_published_one(float64):
     }
     variances = np.asarray([0.0484, 0.187, 0.567, 1.99, 7.41])
     narrowed = sj.SumOfGaussians(variances * 1.001**2, [0.100, 0.118, 0.113, 0.358, 0.078])
-    offsets, weights = (np.asarray(each) for each in separable_kernel(narrowed, 25, 3.0))
+    offsets, weights = (np.asarray(each) for each in sj.exports.separable_kernel(narrowed, 25, 3.0))
     for offset, weight in published.items():
         at = int(np.argmin(np.abs(offsets - offset)))
         np.testing.assert_allclose(offsets[at], offset, atol=1e-5)
@@ -64,7 +69,7 @@ def test_separable_kernel_is_the_published_one(float64):
 
 
 def test_separable_kernel_of_one_gaussian_is_its_blur(float64):
-    offsets, weights = separable_kernel(
+    offsets, weights = sj.exports.separable_kernel(
         sj.SumOfGaussians(jnp.asarray([2.0]), jnp.asarray([[0.3]])), 201, 9.0
     )
     np.testing.assert_allclose(jnp.sum(weights), 1, rtol=1e-12)
@@ -74,7 +79,7 @@ def test_separable_kernel_of_one_gaussian_is_its_blur(float64):
 
 def test_the_sheet_is_json_with_formulas_and_sources(dtype):
     gaussians = sj.load_material("skin").gaussians
-    sheet = json.loads(json.dumps(data_sheet(gaussians)))
+    sheet = json.loads(json.dumps(sj.exports.data_sheet(gaussians)))
     assert set(sheet) == {"gaussians", "gpu_gems", "separable_kernel", "burley", "unity", "blender"}
     for entry in sheet.values():
         assert {"formula", "unit", "source"} < set(entry)

@@ -15,21 +15,14 @@ import pytest
 from bodies import lights_from_two_sides as lights
 
 import splatjax as sj
-from splatjax.diffusion import (
-    DenseDiffuser,
-    EscapeNormalization,
-    LayersAtPoints,
-    PlainMean,
-    resolved_fraction,
-)
 from splatjax.inverse._observation import Evidence
 from splatjax.inverse._problem import RecoveryProblem, Unknowns, search, solution
 
 # Nearly all layers are resolved: pictures are made as they are searched, however coarse the splats.
 PLAIN = sj.RenderSettings(
     rasterizer=sj.splatting.DenseRasterizer(),
-    diffuser=DenseDiffuser(),
-    kernel=EscapeNormalization(regular=(0.1, 0.2), scattered=(0.1, 0.2)),
+    diffuser=sj.diffusion.DenseDiffuser(),
+    kernel=sj.diffusion.EscapeNormalization(regular=(0.1, 0.2), scattered=(0.1, 0.2)),
 )
 SIZE = 24
 camera = partial(bodies.view, size=SIZE)
@@ -229,7 +222,7 @@ def half_resolved():
     are unresolved in part.
     """
     rng, points = np.random.default_rng(6), 40
-    light = LayersAtPoints(
+    light = sj.diffusion.LayersAtPoints(
         variances=jnp.asarray([1.5, 2.5, 9.0]),
         means=jnp.asarray(rng.uniform(0.5, 1.0, (3, 2, points))),
         mass=jnp.ones((3, points)),
@@ -237,7 +230,7 @@ def half_resolved():
         area=jnp.ones(points),
         albedo=jnp.ones((2, points)),
         interval=jnp.asarray([1.0, 2.0]),
-        kernel=PlainMean(),
+        kernel=sj.diffusion.PlainMean(),
         derivative=None,
     )
     picture = sj.DiffusionBasis(
@@ -282,7 +275,7 @@ class TestUnresolvedLayers:
         np.testing.assert_allclose(own, np.diag(jnp.sum(slopes**2, axis=0)), rtol=1e-6, atol=1e-6)
         assert np.min(np.diagonal(own)) > 1
         light, gaussians = problem.pictures[0].light, found.gaussians
-        resolved = resolved_fraction(light.variances, jnp.ones(3), light.interval)
+        resolved = sj.diffusion.resolved_fraction(light.variances, jnp.ones(3), light.interval)
         assert 0.05 < float(resolved[0]) < float(resolved[1]) < 0.6
         expected = (1 - resolved) @ gaussians.weights / gaussians.total_reflectance()
         np.testing.assert_allclose(found.unresolved, expected, rtol=1e-6)

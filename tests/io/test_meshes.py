@@ -18,7 +18,6 @@ from scipy.spatial import KDTree
 from writers import SUFFIXES, columns_of, export, some_splats, write_ply, xyz
 
 import splatjax as sj
-from splatjax.io import read_textured_mesh, sample_mesh, srgb_to_linear
 
 MM = 2.0
 # Files hold some six digits.
@@ -47,7 +46,7 @@ def described(vertices, faces):
 
 def compare(path, vertices, faces, normals=None, colors=None, **options):
     """Read a file and compare its triangles; normals and linear colors vertex by vertex."""
-    mesh, textures = read_textured_mesh(path, mm_per_unit=MM, crease_angle=180.0, **options)
+    mesh, textures = sj.io.read_textured_mesh(path, mm_per_unit=MM, crease_angle=180.0, **options)
     expected, tolerance = MM * np.asarray(vertices, float), DIGITS * MM * np.abs(vertices).max()
     assert len(mesh.faces) == len(faces)
     distance, _ = KDTree(described(mesh.vertices, mesh.faces)).query(described(expected, faces))
@@ -67,7 +66,7 @@ def test_files_of_trimesh(tmp_path, suffix, body):
     is_bare = suffix.endswith(("stl", "off"))
     mesh = trimesh.Trimesh(vertices, faces, vertex_normals=normals, process=False)
     mesh.visual = mesh.visual if is_bare else trimesh.visual.ColorVisuals(vertex_colors=colors)
-    linear = colors / 255 if suffix in ("glb", "gltf") else srgb_to_linear(colors / 255)
+    linear = colors / 255 if suffix in ("glb", "gltf") else sj.io.srgb_to_linear(colors / 255)
     path, linear = export(mesh, tmp_path, suffix), None if is_bare else linear
     compare(path, vertices, faces, None if is_bare else normals, linear)
     compare(path, vertices[:, [0, 2, 1]] * [1, 1, -1], faces, None, linear, up="z")
@@ -94,7 +93,9 @@ def test_ply_of_any_order_and_type(tmp_path, text, order, color):
     columns["ny"] = normals[:, 1].astype("f4")
     lists = {"vertex_indices": faces.astype("i4")}
     path = write_ply(tmp_path / "a.ply", columns, lists, text=text, order=order)
-    compare(path, vertices, faces, normals, shares if color == "f4" else srgb_to_linear(shares))
+    compare(
+        path, vertices, faces, normals, shares if color == "f4" else sj.io.srgb_to_linear(shares)
+    )
 
 
 def test_scenes_keep_their_places_and_their_textures(tmp_path):
@@ -146,7 +147,7 @@ EXAMPLES = {
 def test_examples_of_the_formats_own_texts(tmp_path, name):
     """Of OBJ, one side is two triangles: polygons may be mixed."""
     (tmp_path / name).write_bytes(EXAMPLES[name].encode())
-    mesh, _ = read_textured_mesh(tmp_path / name, mm_per_unit=MM)
+    mesh, _ = sj.io.read_textured_mesh(tmp_path / name, mm_per_unit=MM)
     np.testing.assert_allclose(
         (len(mesh.faces), trimesh.Trimesh(mesh.vertices, mesh.faces).volume, mesh.area()),
         (12, MM**3, 6 * MM**2),
@@ -195,7 +196,7 @@ def test_normals_end_at_hard_edges(tmp_path, body, kind, rounded):
         without = {"include_normals": False}
         options = {"ply": {"vertex_normal": False}, "obj": without, "glb": without, "gltf": without}
         path = export(mesh, tmp_path, kind, **options.get(kind.split(".")[-1], {}))
-    splats = sample_mesh(path, COUNT, mm_per_unit=1.0, rounded=rounded)
+    splats = sj.sample_mesh(path, COUNT, mm_per_unit=1.0, rounded=rounded)
     angles, distances = angles_to_body(splats, body)
     assert angles.max() < (0.1 if body == "box" else FACET)
     assert distances.max() < 0.5
@@ -205,7 +206,7 @@ def test_normals_end_at_hard_edges(tmp_path, body, kind, rounded):
 def test_splats_reach_little_beyond_hard_edges(tmp_path):
     """Seen up to 0.8 of their radius, at most 0.7 spacings; at corners too."""
     path = export(HARD_BODIES["box"], tmp_path, "off")
-    splats = sample_mesh(path, COUNT, mm_per_unit=1.0)
+    splats = sj.sample_mesh(path, COUNT, mm_per_unit=1.0)
     centers, normals = np.asarray(splats.centers), np.asarray(splats.normals)
     spacing = (HARD_BODIES["box"].area / COUNT) ** 0.5
     beyond = np.abs(centers) + 0.8 * np.asarray(splats.radii)[:, None] - [10, 12, 8]

@@ -26,7 +26,7 @@ from writers import (
     xyz,
 )
 
-from splatjax.geometry import complete_splats
+import splatjax as sj
 from splatjax.io import (
     SplatFile,
     atomic_path,
@@ -47,7 +47,6 @@ from splatjax.io import (
     write_splats,
 )
 from splatjax.io._images import read_color
-from splatjax.scene import Splats
 
 
 def read(path):
@@ -205,7 +204,7 @@ def film(frames, speed=24.0):
     )
 
 
-TWO_CHANNELS = Splats(*(jnp.ones((4, *shape)) for shape in ((3,), (3,), (), (), (2,))))
+TWO_CHANNELS = sj.Splats(*(jnp.ones((4, *shape)) for shape in ((3,), (3,), (), (), (2,))))
 CALLS = [
     ("none.obj", sampled(), "no such file"),
     ("none.exr", read_exr, "no such file"),
@@ -336,7 +335,7 @@ WRITERS = {
     "a.exr": lambda path: write_exr(path, some_frame(height=40, width=40)),
     "a.png": lambda path: write_png(path, np.random.default_rng(0).uniform(size=(60, 60, 3))),
     "a.ply": lambda path: write_splats(
-        path, complete_splats(np.random.default_rng(0).normal(size=(400, 3)))
+        path, sj.geometry.complete_splats(np.random.default_rng(0).normal(size=(400, 3)))
     ),
     "a.toml": lambda path: save_material(
         load_material("skin"), path, source={"citation": 9000 * "x"}

@@ -8,7 +8,6 @@ import pytest
 from bodies import PLAIN, sphere, view
 
 import splatjax as sj
-from splatjax.io import spectrum_to_rgb
 
 WAVELENGTHS = np.arange(400, 701, 10)
 # Median lightness of each band of ten, and the 5th and 95th percentile of a* and b* under D65: 5500
@@ -26,7 +25,7 @@ SIX = [0.02, 0.04, 0.07, 0.11, 0.17, 0.26]  # melanin from light to dark
 
 @pytest.mark.parametrize("illuminant", ["D65", "A", "FL11"])
 def test_white_is_white_and_red_is_red(illuminant):
-    matrix = spectrum_to_rgb(WAVELENGTHS, illuminant)
+    matrix = sj.io.spectrum_to_rgb(WAVELENGTHS, illuminant)
     np.testing.assert_allclose(np.full(31, 0.3) @ matrix, 0.3, rtol=1e-12)
     red = (WAVELENGTHS > 600) @ matrix
     assert red[0] > 0.6 > 0.2 > red[1]
@@ -47,7 +46,7 @@ def test_colors_are_those_of_colour_science():
     )
     xyz = colour.sd_to_XYZ(aligned, observer, daylight, method="Integration") / 100
     expected = colour.XYZ_to_sRGB(xyz, apply_cctf_encoding=False)
-    found = spectrum.values @ spectrum_to_rgb(spectrum.wavelengths)
+    found = spectrum.values @ sj.io.spectrum_to_rgb(spectrum.wavelengths)
     np.testing.assert_allclose(found, expected, rtol=5e-3)
 
 
@@ -57,7 +56,7 @@ def test_six_skins_descend_along_the_locus():
     spectra = np.stack(
         [sj.scattering.Skin(melanin).half_space().total_reflectance() for melanin in SIX]
     )
-    rgb = (SURFACE + (1 - SURFACE) * spectra) @ spectrum_to_rgb(WAVELENGTHS)
+    rgb = (SURFACE + (1 - SURFACE) * spectra) @ sj.io.spectrum_to_rgb(WAVELENGTHS)
     assert np.all(np.diff(rgb, axis=0) < 0)
     assert np.all(np.diff(rgb, axis=1) < 0)  # red above green above blue
     lab = colour.XYZ_to_Lab(colour.sRGB_to_XYZ(rgb, apply_cctf_decoding=False))
@@ -69,7 +68,7 @@ def test_six_skins_descend_along_the_locus():
 @pytest.mark.once
 def test_a_projected_picture_is_the_picture_of_projected_weights():
     """Where the kernel has gain 1."""
-    body, matrix = sphere(200), spectrum_to_rgb(WAVELENGTHS)
+    body, matrix = sphere(200), sj.io.spectrum_to_rgb(WAVELENGTHS)
     weights = 0.2 * np.random.default_rng(0).random((2, 31))
     settings = replace(PLAIN, kernel=sj.diffusion.PlainMean())
     light = sj.DirectionalLight([-0.5, -0.4, -1.0], 3.0)
@@ -85,9 +84,9 @@ def test_a_projected_picture_is_the_picture_of_projected_weights():
 
 def test_an_unknown_illuminant_is_named():
     with pytest.raises(ValueError, match="illuminant 'D66' is unknown; known are A, B"):
-        spectrum_to_rgb(WAVELENGTHS, "D66")
+        sj.io.spectrum_to_rgb(WAVELENGTHS, "D66")
     with pytest.raises(ValueError, match="wavelengths must be positive"):
-        spectrum_to_rgb([500, 450])
+        sj.io.spectrum_to_rgb([500, 450])
 
 
 def test_a_skin_in_a_file_comes_back(tmp_path):

@@ -11,23 +11,13 @@ import pytest
 from pictures import write_picture
 
 import splatjax as sj
-from splatjax.io import (
-    fingerprint,
-    picture_paths,
-    read_columns,
-    read_media,
-    read_profile,
-    read_record,
-    write_columns,
-    write_record,
-)
 
 GOOD = "r,red,green\n# measured in cm\n0.0, 4.0, 3.0\n\n0.1, 2.0, 1.0\n0.3, 0.5, 0.25\n"
 
 
 def test_a_table_is_read_in_its_own_unit(tmp_path, dtype):
     (tmp_path / "milk.csv").write_text(GOOD)
-    profile = read_profile(tmp_path / "milk.csv", mm_per_unit=10.0)
+    profile = sj.io.read_profile(tmp_path / "milk.csv", mm_per_unit=10.0)
     assert profile.radii.dtype == jnp.result_type(float)
     np.testing.assert_allclose(profile.radii, [0, 1, 3], rtol=1e-6)
     expected = np.asarray([[4, 3], [2, 1], [0.5, 0.25]]) / 100
@@ -36,7 +26,7 @@ def test_a_table_is_read_in_its_own_unit(tmp_path, dtype):
 
 MEDIA = "name,sigma_a,sigma_s_prime,eta\nmilk, 0, 1.5, 1.3\n\n,0.1,2,1.4\n1,1,1,1\n"
 BAD = {
-    read_profile: [
+    sj.io.read_profile: [
         ("", "0 lines"),
         ("r,R\n0,1\n", "1 lines"),
         (GOOD.replace("2.0", "two"), "line 5: 0.1, two, 1.0"),
@@ -49,7 +39,7 @@ BAD = {
         ("r (um), R\n0.1, 1\n0.2, 0.5\n", r"line 1 .* um.* mm_per_unit = 0.001 "),
         (b"\xff\xfe", "text"),
     ],
-    read_media: [
+    sj.io.read_media: [
         ("", "sigma_a"),
         ("sigma_a,eta\n1,1\n", "sigma_s_prime"),
         (MEDIA.split("\n")[0] + "\n", "0 rows"),
@@ -73,23 +63,23 @@ def test_a_bad_table_is_refused_with_its_line(tmp_path, read, text, value):
 
 def test_media_are_read_and_their_columns_come_back(tmp_path):
     (tmp_path / "media.csv").write_text(MEDIA)
-    names, media = read_media(tmp_path / "media.csv")
+    names, media = sj.io.read_media(tmp_path / "media.csv")
     assert names == ["milk", "2", "1"]
     np.testing.assert_array_equal(media, [[0, 1.5, 1.3], [0.1, 2, 1.4], [1, 1, 1]])
-    write_columns(tmp_path / "back.csv", {"name": names, "eta": media[:, 2] / 3})
-    columns = read_columns(tmp_path / "back.csv")
+    sj.io.write_columns(tmp_path / "back.csv", {"name": names, "eta": media[:, 2] / 3})
+    columns = sj.io.read_columns(tmp_path / "back.csv")
     assert columns["name"] == tuple(names)
     np.testing.assert_array_equal(np.asarray(columns["eta"], float), media[:, 2] / 3)
 
 
 def test_records_come_back_and_fingerprints_tell_contents_apart(tmp_path):
     record, path = {"--frames": 12, "--fill": 0.1, "splats": None}, tmp_path / "record.json"
-    write_record(path, record)
-    assert read_record(path) == record == json.loads(path.read_text())
+    sj.io.write_record(path, record)
+    assert sj.io.read_record(path) == record == json.loads(path.read_text())
     path.write_bytes(b"abc")
-    assert fingerprint(path).startswith("3 bytes, SHA-256 ba7816bf")
+    assert sj.io.fingerprint(path).startswith("3 bytes, SHA-256 ba7816bf")
     path.write_bytes(b"abd")
-    assert not fingerprint(path).endswith("ba7816bf")
+    assert not sj.io.fingerprint(path).endswith("ba7816bf")
 
 
 PICTURES = """[[pictures]]
@@ -130,7 +120,7 @@ def path(tmp_path):
 
 def test_what_is_written_is_read(path):
     path.write_text(PICTURES)
-    names = [each.name for each in picture_paths(path)]
+    names = [each.name for each in sj.io.picture_paths(path)]
     assert names == ["pictures.toml", "one.exr", "mask.exr", "one.exr"]
     picture = np.arange(12.0).reshape(3, 4, 1) + np.arange(3)
     mask = picture[..., 0] > 5

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from bodies import assert_close
 
-from splatjax.fitting import FixedTotalReflectance, fit_gaussians
-from splatjax.gaussians import SumOfGaussians
+import splatjax as sj
 from splatjax.scattering import (
     L2_QUADRATURE,
     InverseVariance,
@@ -16,7 +15,7 @@ from splatjax.scattering import (
     measure_laser_dot,
 )
 
-TRUTH = SumOfGaussians([0.3, 2.0], [[0.3, 0.2], [0.4, 0.1]])
+TRUTH = sj.SumOfGaussians([0.3, 2.0], [[0.3, 0.2], [0.4, 0.1]])
 MM_PER_PIXEL = 0.1
 
 
@@ -59,7 +58,7 @@ def test_a_table_is_fitted_over_its_own_radii_alone(float64):
     same.
     """
     r = jnp.linspace(0.05, 3.0, 60)
-    fitted = fit_gaussians(Tabulated(r, TRUTH(r)), 2)
+    fitted = sj.fit_gaussians(Tabulated(r, TRUTH(r)), 2)
     assert_close(fitted.gaussians, TRUTH, rtol=1e-6)
 
 
@@ -74,7 +73,7 @@ def test_a_fit_weighed_by_its_errors_is_the_likeliest(float64):
     values = jnp.asarray(clean + np.asarray(deviation) * noise)
 
     def fit(values, rule):
-        return fit_gaussians(Tabulated(r, values, deviation), 2, rule=rule, throw=False)
+        return sj.fit_gaussians(Tabulated(r, values, deviation), 2, rule=rule, throw=False)
 
     fits = eqx.filter_jit(eqx.filter_vmap(fit, in_axes=(0, None)))
     found, plain = fits(values, InverseVariance()), fits(values, L2_QUADRATURE)
@@ -94,7 +93,7 @@ def test_weighing_needs_errors(float64):
     r = jnp.linspace(0.05, 5.0, 30)
     for profile in (Tabulated(r, TRUTH(r)), TRUTH):
         with pytest.raises(ValueError, match=f"{type(profile).__name__} has no standard errors"):
-            fit_gaussians(profile, 2, rule=InverseVariance())
+            sj.fit_gaussians(profile, 2, rule=InverseVariance())
     # Radii that nothing was counted at say nothing.
     deviation = jnp.where(r < 4, 1e-3, 0.0)
     radii, weights = InverseVariance().radii(Tabulated(r, TRUTH(r)[:, 0], deviation))
@@ -106,7 +105,7 @@ def test_a_total_that_is_known_is_held(float64):
     r = jnp.linspace(0.05, 2.0, 60)
     table = Tabulated(r, TRUTH(r), total=TRUTH.total_reflectance())
     assert Tabulated(r, TRUTH(r)).total_reflectance()[0] < 0.85 * table.total_reflectance()[0]
-    fitted = fit_gaussians(table, 2, weights=FixedTotalReflectance())
+    fitted = sj.fit_gaussians(table, 2, weights=sj.fitting.FixedTotalReflectance())
     np.testing.assert_allclose(fitted.gaussians.weights, TRUTH.weights, rtol=1e-6)
 
 

@@ -12,16 +12,7 @@ import pytest
 from bodies import unit
 from jax.test_util import check_grads
 
-from splatjax.scattering import AngularLaw
-from splatjax.scene import (
-    DirectionalLight,
-    DiskLight,
-    GaussianBeam,
-    PointLight,
-    RectangleLight,
-    SphereLight,
-    stack_lights,
-)
+import splatjax as sj
 from splatjax.shading import (
     SurfacePoints,
     albedo_root,
@@ -168,7 +159,9 @@ def arrays(dtype, *values):
 
 
 def leaving(mu, f0, roughness):
-    return diffuse_transmission(mu, f0, roughness, AngularLaw(jnp.ones((1, 1), mu.dtype)))[0]
+    return diffuse_transmission(
+        mu, f0, roughness, sj.scattering.AngularLaw(jnp.ones((1, 1), mu.dtype))
+    )[0]
 
 
 def random_places(count, seed):
@@ -286,12 +279,12 @@ def test_irradiance_is_the_sum_of_the_formulas(count, dtype):
     """Large ones too: jaxlib 0.10.2 gets these sums wrong on CPUs at many counts, in float32."""
     body = bodies.bumpy(count)
     centers, normals = np.asarray(body.centers, float), np.asarray(body.normals, float)
-    groups = stack_lights(
+    groups = sj.scene.stack_lights(
         (
-            DirectionalLight(DIRECTIONS[0], STRENGTHS[0]),
-            GaussianBeam(ORIGIN, AXIS, STRENGTHS[3], 9.0),
-            PointLight(PLACE, STRENGTHS[2]),
-            DirectionalLight(DIRECTIONS[1], STRENGTHS[1]),
+            sj.DirectionalLight(DIRECTIONS[0], STRENGTHS[0]),
+            sj.GaussianBeam(ORIGIN, AXIS, STRENGTHS[3], 9.0),
+            sj.PointLight(PLACE, STRENGTHS[2]),
+            sj.DirectionalLight(DIRECTIONS[1], STRENGTHS[1]),
         )
     )
     rng, visible, shares = np.random.default_rng(0), [], {}
@@ -327,8 +320,8 @@ RINGS = np.stack([np.outer(np.sqrt(EVEN), f(2 * np.pi * EVEN)).ravel() for f in 
 RINGS = np.pad(RINGS, ((0, 1), (0, 0))).T
 SEEN_FROM = np.asarray([[0, 0, 0.3], [0.9, 0.1, 0.25], [1.3, 0.8, 0.3], [-4, 3, 1], [1, 2, 90.0]])
 LIGHTS = {
-    "rectangle": (RectangleLight([0] * 3, 1, EDGES), 6, SQUARES, 1e-4),
-    "disk": (DiskLight([0] * 3, 1, [0, 0, 1], 1), np.pi, RINGS, 0.01),
+    "rectangle": (sj.scene.RectangleLight([0] * 3, 1, EDGES), 6, SQUARES, 1e-4),
+    "disk": (sj.scene.DiskLight([0] * 3, 1, [0, 0, 1], 1), np.pi, RINGS, 0.01),
 }
 
 
@@ -339,13 +332,13 @@ def test_the_solid_angle_is_the_sum_over_its_area(kind, dtype):
     exact = area * np.mean(offset[..., 2] / np.linalg.norm(offset, axis=-1) ** 3, axis=1)
     np.testing.assert_allclose(light.solid_angle(jnp.asarray(SEEN_FROM, dtype)), exact, rtol=most)
     assert np.all(light.solid_angle(jnp.asarray(-SEEN_FROM, dtype)) == 0)
-    ball = SphereLight([0] * 3, 1, 1.0).solid_angle(jnp.asarray(SEEN_FROM[3:], dtype))
+    ball = sj.scene.SphereLight([0] * 3, 1, 1.0).solid_angle(jnp.asarray(SEEN_FROM[3:], dtype))
     cone = np.sqrt(1 - 1 / np.sum(SEEN_FROM[3:] ** 2, axis=1))
     np.testing.assert_allclose(ball, 2 * np.pi * (1 - cone), rtol=1e-4)
 
 
 def test_solid_angles_have_derivatives(float64):
-    for light in (LIGHTS["rectangle"][0], LIGHTS["disk"][0], SphereLight([0] * 3, 1, 1.0)):
+    for light in (LIGHTS["rectangle"][0], LIGHTS["disk"][0], sj.scene.SphereLight([0] * 3, 1, 1.0)):
         angles = jax.jit(lambda x, light=light: light.solid_angle(x))
         check_grads(angles, (jnp.asarray(SEEN_FROM[2:]),), 1, rtol=1e-5)
 
@@ -355,13 +348,13 @@ def test_the_highlight_below_the_end_of_a_tube_is_that_of_its_samples():
     """The point that is mirrored is near, and the center far away. One point stands for all that
     the lobe sees: a third too bright.
     """
-    tube = RectangleLight([0, 0, 100], 1, [[1000, 0, 0], [0, -20, 0]], count=200)
-    samples = stack_lights(tube.samples())
+    tube = sj.scene.RectangleLight([0, 0, 100], 1, [[1000, 0, 0], [0, -20, 0]], count=200)
+    samples = sj.scene.stack_lights(tube.samples())
     one, up = jnp.ones(2), jnp.asarray([[0, 0, 1.0]] * 2)
     points = jnp.asarray([[450.0, 0, 0], [460.0, 5, 0]]), up, jnp.asarray(unit([[0.3, 0, 1]] * 2))
     surface = SurfacePoints(*points, one, 0.3 * one, [None])
     ours, exact = (
         reflected_radiance(surface, groups, jnp.asarray(0.03), 1)
-        for groups in (stack_lights((tube,)), samples)
+        for groups in (sj.scene.stack_lights((tube,)), samples)
     )
     np.testing.assert_allclose(ours / exact, 1.37, atol=0.1)

@@ -11,8 +11,7 @@ import bodies
 import jax.numpy as jnp
 import numpy as np
 
-from splatjax.scene import Splats
-from splatjax.splatting import AbstractView, OrthographicView, PerspectiveView, SplattingSettings
+import splatjax as sj
 
 KINDS = (
     "plain",
@@ -42,7 +41,9 @@ def seeds(in_suite: int) -> range:
     return range(max(in_suite, ALL // 20))
 
 
-def sight(rng: np.random.Generator, perspective: bool, width: int, height: int) -> AbstractView:
+def sight(
+    rng: np.random.Generator, perspective: bool, width: int, height: int
+) -> sj.splatting.AbstractView:
     rotation, _ = np.linalg.qr(rng.normal(size=(3, 3)))
     rotation[2] *= np.linalg.det(rotation)
     focal_length = height / (2 * np.tan(np.radians(rng.uniform(10, 50))))  # in pixels
@@ -50,13 +51,13 @@ def sight(rng: np.random.Generator, perspective: bool, width: int, height: int) 
     given = rng.normal(size=3) * 10, rotation, focal_length if perspective else scale
     given = (jnp.asarray(each, float) for each in given)
     if perspective:
-        return PerspectiveView(*given, width, height, NEAR)
-    return OrthographicView(*given, width, height)
+        return sj.splatting.PerspectiveView(*given, width, height, NEAR)
+    return sj.splatting.OrthographicView(*given, width, height)
 
 
 def random_body(
     seed: int, count: int, perspective: bool, width: int, height: int
-) -> tuple[Splats, AbstractView]:
+) -> tuple[sj.Splats, sj.splatting.AbstractView]:
     rng = np.random.default_rng([seed, count, perspective])
     seen = sight(rng, perspective, width, height)
     kinds = (
@@ -85,8 +86,12 @@ def disagreement(found, expected) -> float:
     return float(np.max(np.abs(found - expected) / (size + typical), initial=0.0))
 
 
-def _drawn(kind: str, rng: np.random.Generator, count: int, seen: AbstractView):
-    width, height, perspective = seen.width, seen.height, isinstance(seen, PerspectiveView)
+def _drawn(kind: str, rng: np.random.Generator, count: int, seen: sj.splatting.AbstractView):
+    width, height, perspective = (
+        seen.width,
+        seen.height,
+        isinstance(seen, sj.splatting.PerspectiveView),
+    )
     pixels = float(seen.focal_length if perspective else seen.scale)
     x, y = rng.uniform(0, width, count), rng.uniform(0, height, count)
     depth = np.exp(rng.uniform(np.log(4.0), np.log(rng.choice([5.0, 40.0])), count))
@@ -140,7 +145,7 @@ def _drawn(kind: str, rng: np.random.Generator, count: int, seen: AbstractView):
     normals = bodies.unit(normals)
     radii = size * np.abs(mm)
     if kind == "two sheets":
-        settings = SplattingSettings()
+        settings = sj.splatting.SplattingSettings()
         radii = np.full(count, radii[0])
         normals = -rays
         reach = np.hypot(radii, settings.filter_radius * mm)
