@@ -1,11 +1,13 @@
 """Bodies and views to splat, shared by all tests: normals and areas are those of the surface."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import splatjax as sj
 from splatjax._combination import OneDevice
@@ -197,6 +199,12 @@ def assert_close(found, expected, **tolerance) -> None:
     """Compare two trees, leaf by leaf."""
     for ours, theirs in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
         np.testing.assert_allclose(ours, theirs, **tolerance)
+
+
+def assert_refused(call: Callable[[], object], message: str) -> None:
+    """Check that a call raises an error of bad input with a message, given as a pattern."""
+    with pytest.raises(ValueError, match=message):
+        call()
 
 
 class Pictures(eqx.Module):
