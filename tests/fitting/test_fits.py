@@ -182,7 +182,7 @@ def test_a_profile_without_a_norm_is_refused(dtype):
     for function in (fit_gaussians, lambda beam: relative_error(beam, sj.SumOfGaussians([1], [1]))):
         assert_refused(
             partial(function, PhotonBeam(MARBLE_GREEN)),
-            r"PhotonBeam goes to infinity.*L2_QUADRATURE.beyond",
+            r"PhotonBeam .*L2_QUADRATURE.beyond",
         )
 
 

@@ -186,7 +186,7 @@ def test_what_does_not_belong_together_is_refused():
     other = eqx.tree_at(lambda r: r.medium.eta, one, one.medium.eta + 0.1)
     assert_refused(
         lambda: sj.inverse.combined([one, other]),
-        r"recoveries\[1\].medium.eta is .* different materials",
+        r"recoveries\[1\].medium.eta is",
     )
     splats = sj.Splats([[0, 0, 0]], [[0, 0, 1]], 1, 1)
     assert_refused(lambda: sj.inverse.next_pictures(one, splats, []), "candidates is empty")

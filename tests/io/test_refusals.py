@@ -362,7 +362,7 @@ def test_a_full_disk_leaves_what_stood_there_and_no_litter(tmp_path, name, small
     target = tmp_path / name
     target.write_text("before")
     for path in (target, Path("/sys", name)):  # nobody may write to the second
-        with pytest.raises(OSError, match=r"cannot be written: .* there before is") as caught:
+        with pytest.raises(OSError, match="cannot be written: ") as caught:
             WRITERS[name](path)
         assert caught.value.filename == str(path)
     assert target.read_text() == "before"
