@@ -16,7 +16,6 @@ from splatjax.splatting import (
     AbstractRasterPlan,
     AbstractView,
     DenseRasterizer,
-    FragmentSums,
     OrthographicView,
     PerspectiveView,
     ShadowSettings,
@@ -231,11 +230,8 @@ def drawn(
     settings: SplattingSettings,
     plan: AbstractRasterPlan,
 ) -> Drawn:
-    return pictures(plan.sum_fragments(body, rows, view, settings, OneDevice()), view, settings)
-
-
-def pictures(sums: FragmentSums, view: AbstractView, settings: SplattingSettings) -> Drawn:
-    """Join the tiles of both surfaces; where there is no surface all is 0, but the depth 1."""
+    """Draw both surfaces; where there is none all is 0, but the depth 1."""
+    sums = plan.sum_fragments(body, rows, view, settings, OneDevice())
     grid, surface = TileGrid(view.width, view.height), Surface.of(sums.sums, view, sums.needed)
     weights = sums.sums.weights
     planes = jnp.stack([surface.depth - 1, weights, coverage(weights, settings.full_coverage)], 1)
@@ -243,11 +239,7 @@ def pictures(sums: FragmentSums, view: AbstractView, settings: SplattingSettings
 
     def join(places: slice) -> Pictures:
         tiles = jnp.zeros((grid.count, *planes.shape[1:]), planes.dtype)
-        *attributes, depth, weight_sum, covered = grid.join(
-            tiles.at[sums.tiles[places]].set(planes[places], mode="drop")
-        )
-        empty = jnp.zeros((0, view.height, view.width), planes.dtype)
-        attributes = jnp.stack(attributes) if attributes else empty
-        return Pictures(attributes, depth + 1, weight_sum, covered)
+        joined = grid.join(tiles.at[sums.tiles[places]].set(planes[places], mode="drop"))
+        return Pictures(joined[:-3], joined[-3] + 1, joined[-2], joined[-1])
 
     return Drawn(join(slice(sums.front)), join(slice(sums.front, None)), sums.needed)

@@ -30,7 +30,7 @@ def console(monkeypatch):
             monkeypatch.delenv(name, raising=False)
         for name, value in (COLORS | variables).items():
             monkeypatch.setenv(name, value)
-        console = Console(file=file)
+        console = Console(file=file, quiet="QUIET" in variables)
         for module in (_terminal, _main):
             monkeypatch.setattr(module, "CONSOLE", console)
         return file
@@ -40,12 +40,12 @@ def console(monkeypatch):
 
 @pytest.mark.once
 def test_a_preview_is_shown_while_the_picture_compiles_and_only_then(plain, console, tmp_path):
-    splats, output = ball(tmp_path / "ball.ply"), tmp_path / "ball.exr"
-    options = ["--material", "marble", "--no-scattering", "--output", output]
+    splats, output, size = ball(tmp_path / "ball.ply"), tmp_path / "ball.exr", ("--width", 16)
+    options = [*size, "--height", 24, "--material", "marble", "--no-scattering", "--output", output]
     shown = []
-    for height, more in ((24, []), (24, []), (23, ["--quiet"])):
+    for more in ([], [], ["--quiet"]):
         file = console(Terminal())
-        assert run("render", splats, "--width", 16, "--height", height, *options, *more) == 0
+        assert run("render", splats, *options, *more) == 0
         shown.append("▀" in file.getvalue())
     assert shown == [True, False, False]
     assert file.getvalue() == ""
@@ -72,6 +72,7 @@ def test_a_preview_is_upright_and_lit_from_where_the_light_is():
         (Terminal, {"TERM": "xterm-256color", "COLORTERM": ""}, True),
         (Terminal, {"NO_COLOR": "1"}, False),
         (Terminal, {"TERM": "dumb"}, False),
+        (Terminal, {"QUIET": "1"}, False),
         (io.StringIO, {"FORCE_COLOR": "1"}, False),
     ],
 )
