@@ -182,7 +182,7 @@ REFUSED = {
         lambda: sj.render_streamed(
             lambda: [BALL.splats], BALL.lights, MATTE, CAMERA, sj.RenderSettings(bounces=1)
         ),
-        "settings.bounces is 1.*streamed",
+        "settings.bounces is 1.*stream",
     ),
 }
 
