@@ -146,7 +146,7 @@ def test_a_saved_material_comes_back_bit_for_bit(tmp_path, model):
     profile, path = PROFILES[model], tmp_path / "a.toml"
     medium = profile.medium if isinstance(profile, Dipole) else None
     optional = {"single_scattering": once, "medium": medium}
-    angles = AngularLaw([[1 / 3, 1.3], [0.2, -0.4], [0.1, 1e-9]])
+    angles = AngularLaw([[0.7, 1.3], [0.2, -0.4], [0.1, 0.1]])
     material = sj.Material(gaussians, 1.37, 0.1, 1.0, angles=angles, **optional)
     source, fit = {"citation": 'Me, "2024"'}, {"error": [0.1, 0.2], "count": 2}
     save_material(material, path, profile=profile, source=source, fit=fit, g=0.75)
