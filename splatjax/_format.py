@@ -1,6 +1,8 @@
-"""Format counts, errors and channel names for people to read."""
+"""Format counts, numbers, errors and channel names for people to read."""
 
 import math
+from collections.abc import Iterable
+from typing import Any
 
 
 def channel_names(count: int) -> tuple[str, ...]:
@@ -13,6 +15,11 @@ def channel_names(count: int) -> tuple[str, ...]:
 def counted(count: int, noun: str) -> str:
     """Format a count of things with a noun whose plural ends in s."""
     return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
+def format_numbers(values: Iterable[Any], form: str) -> str:
+    """Format numbers in one line."""
+    return "  ".join(f"{float(value):{form}}" for value in values)
 
 
 def percent(fraction: float) -> str:

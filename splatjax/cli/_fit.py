@@ -12,11 +12,11 @@ import optimistix as optx
 import tyro
 
 import splatjax as sj
-from splatjax._format import counted
+from splatjax._format import counted, format_numbers
 from splatjax.io import fingerprint, read_columns, read_media, write_columns
 
 from . import _batch
-from ._fit_report import format_numbers, print_fit
+from ._fit_report import print_fit
 from ._models import Model, Reference, model_by_name, reference
 from ._terminal import (
     FIGURES,

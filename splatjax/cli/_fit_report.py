@@ -1,11 +1,9 @@
 """The report of `splatjax fit`."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 import splatjax as sj
-from splatjax._format import channel_names
 
 from ._models import Reference
 from ._terminal import print_table
@@ -15,18 +13,11 @@ _DISTANCES = 7
 
 def print_fit(fitted: sj.fitting.FitResult, target: Reference) -> None:
     """Print the Gaussians of a fit, their errors, and the relative error by distance."""
-    gaussians = fitted.gaussians
-    names = ", ".join(channel_names(gaussians.weights.shape[1]))
-    pairs = zip(gaussians.variances, gaussians.weights, strict=True)
     print_table(
         [
-            ("variance, mm^2", f"weights ({names})"),
-            *((f"{float(variance):.6g}", format_numbers(row, ".5f")) for variance, row in pairs),
-            ("sum", format_numbers(gaussians.total_reflectance(), ".5f")),
-            ("error (Eq. 4)", format_numbers(fitted.error, ".2e")),
-            ("energy error", format_numbers(fitted.energy_error, ".2e")),
+            *fitted.table(),
             ("at r, mm", "fit over profile, less 1"),
-            *_errors_by_distance(target.profile, gaussians, target.rule),
+            *_errors_by_distance(target.profile, fitted.gaussians, target.rule),
         ]
     )
 
@@ -58,8 +49,3 @@ def _errors_by_distance(
         )
         for i in places
     ]
-
-
-def format_numbers(values: jax.Array, form: str) -> str:
-    """Format numbers in one line."""
-    return "  ".join(f"{float(value):{form}}" for value in values)

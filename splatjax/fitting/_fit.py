@@ -9,6 +9,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from splatjax._chunking import jit_unless_traced
+from splatjax._format import channel_names, format_numbers
 from splatjax._records import Numbers, as_floats
 from splatjax.gaussians import AbstractProfile, SumOfGaussians
 from splatjax.scattering import L2_QUADRATURE, AbstractRadialRule
@@ -147,6 +148,28 @@ class FitResult(eqx.Module):
     energy_error: Float[Array, " channels"]
     result: optx.RESULTS
     covariance: Float[Array, "*channels parameters parameters"]
+
+    def table(self) -> list[tuple[str, str]]:
+        """Return the Gaussians and their errors as rows of a name and of numbers, a number per
+        channel; the first row is the heading. With `VariancesPerChannel`, the Gaussians of one
+        channel after the other.
+        """
+        weights = self.gaussians.weights.reshape(-1, self.gaussians.channels)
+        names = ", ".join(channel_names(len(self.error)))
+        pairs = zip(self.gaussians.variances.ravel(), weights, strict=True)
+        total = jnp.sum(self.gaussians.weights, axis=-2).ravel()
+        return [
+            ("variance, mm^2", f"weights ({names})"),
+            *((f"{float(variance):.6g}", format_numbers(row, ".5f")) for variance, row in pairs),
+            ("sum", format_numbers(total, ".5f")),
+            ("error (Eq. 4)", format_numbers(self.error, ".2e")),
+            ("energy error", format_numbers(self.energy_error, ".2e")),
+        ]
+
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows: the table."""
+        rows = "".join(f"<tr><td>{name}</td><td>{row}</td></tr>" for name, row in self.table())
+        return f"<table>{rows}</table>"
 
 
 def fit_gaussians(

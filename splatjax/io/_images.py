@@ -1,5 +1,5 @@
 """Pictures of every format that OpenImageIO reads, as arrays with row 0 at the top; PNG and WebP
-for displays; the sRGB transfer function (IEC 61966-2-1); frames with all layers as OpenEXR.
+for displays; frames with all layers as OpenEXR.
 """
 
 import errno
@@ -13,6 +13,7 @@ import OpenEXR  # ty: ignore[import-not-found]
 from jaxtyping import Float
 from PIL import Image
 
+from splatjax._display import linear_to_srgb as linear_to_srgb, png_of, to_display
 from splatjax._memory import check_memory
 from splatjax.scene import Frame
 
@@ -104,12 +105,6 @@ def srgb_to_linear(encoded: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
     return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
 
 
-def linear_to_srgb(linear: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-    """Encode linear light for an sRGB display; values beyond [0, 1] are clipped, NaN becomes 0."""
-    shown = np.where(np.isnan(linear), 0.0, np.clip(linear, 0.0, 1.0))
-    return np.where(shown <= 0.0031308, 12.92 * shown, 1.055 * shown ** (1 / 2.4) - 0.055)
-
-
 def write_png(
     path: StrPath,
     picture: Frame | Float[np.ndarray, "height width channels"],
@@ -129,21 +124,11 @@ def write_png(
     **Raises:** `ValueError` for another number of channels or an exposure that is not finite,
     `FileNotFoundError` when the folder does not exist.
     """
-    values = np.asarray(picture.beauty if isinstance(picture, Frame) else picture, np.float64)
-    channels = values.shape[-1]
-    if channels not in (1, 3, 4):
-        raise ValueError(
-            f"{path}: a picture of {channels} channels cannot be shown; give 1, 3 or 4"
-        )
-    if not np.isfinite(exposure):
-        raise ValueError(f"{path}: exposure is {exposure}; it must be a finite number of stops")
-    color, alpha = values[..., :3], np.clip(values[..., 3:], 0, 1)
-    if channels == 4:
-        color = np.where(alpha > 0, color / np.where(alpha > 0, alpha, 1), 0)
-    encoded = np.concatenate([linear_to_srgb(color * 2.0**exposure), alpha], axis=-1)
-    image = np.rint(255 * encoded).astype(np.uint8)
+    values = picture.beauty if isinstance(picture, Frame) else picture
+    with naming(path):
+        content = png_of(to_display(np.asarray(values), exposure))
     with atomic_path(path) as temporary:
-        Image.fromarray(image[..., 0] if channels == 1 else image).save(temporary, format="PNG")
+        temporary.write_bytes(content)
 
 
 def write_animation(

@@ -12,6 +12,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
 from splatjax._chunking import take_points
+from splatjax._display import png_of, to_display
 from splatjax._records import Numbers, as_floats, check_values, numbers, record, several, valid
 
 from ._lights import AbstractLight
@@ -236,3 +237,11 @@ class Frame(eqx.Module):
     unresolved_fraction: Float[Array, " gaussians"]
     overflow: Float[Array, ""]
     single_scattering: Float[Array, "height width channels"] | None = None
+
+    def _repr_png_(self) -> bytes | None:
+        """Return what a notebook shows: the picture as `splatjax.write_png` writes it; `None` for a
+        batch, and for channels that no display has.
+        """
+        if self.beauty.ndim != 3 or self.beauty.shape[-1] not in (1, 3):
+            return None
+        return png_of(to_display(np.asarray(self.beauty)))

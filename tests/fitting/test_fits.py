@@ -56,6 +56,9 @@ IN_FLOAT32 = 1.02
 
 FLOAT32_FLOOR = 1e-5
 
+# Half of the fifth decimal.
+SHOWN = 5e-6
+
 MARBLE_GREEN = Medium(0.0041, 2.62, 1.5)
 
 
@@ -115,6 +118,12 @@ def test_held_energy_is_held_at_little_cost(float64):
     assert together(free.error) < together(held.error) < 1.5 * together(free.error)
     own = fit_gaussians(profile, 4, spread=VariancesPerChannel())
     assert np.all(np.asarray(own.error) < np.asarray(free.error))
+    # A notebook shows the numbers of the fit.
+    rows = [[float(number) for number in row.split()] for _, row in free.table()[1:]]
+    np.testing.assert_allclose(rows[:4], free.gaussians.weights, atol=SHOWN)
+    np.testing.assert_allclose(rows[5], free.error, rtol=0.01)
+    counts = [fitted._repr_html_().count("<tr>") for fitted in (free, own)]
+    assert counts == [1 + 4 + 3, 1 + 3 * 4 + 3]
     # Each channel stands alone: green is fitted as if there were no other.
     thrice = jax.tree.map(lambda leaf: jnp.full_like(leaf, leaf[1]), profile)
     green = fit_gaussians(thrice, 4).gaussians

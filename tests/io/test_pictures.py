@@ -74,6 +74,14 @@ def test_png_encodes_for_the_display(tmp_path, name):
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
 
 
+def test_a_notebook_shows_a_frame_as_png_writes_it(tmp_path):
+    frame, spectral = some_frame(), some_frame(channels=12)
+    write_png(tmp_path / "a.png", frame)
+    assert frame._repr_png_() == (tmp_path / "a.png").read_bytes()
+    assert spectral._repr_png_() is None
+    assert jax.tree.map(lambda leaf: leaf[None], frame)._repr_png_() is None
+
+
 def test_animation_keeps_the_colors_and_the_time(tmp_path):
     """Three frames of noise; the third ends at 125 ms."""
     pictures = np.random.default_rng(0).integers(0, 256, (3, 6, 5, 3), np.uint8)
