@@ -12,8 +12,8 @@ submodules:
 - `splatting`, `diffusion`, `shading`: the passes, and their settings.
 - `cache`: cached results for the next start of a program.
 
-`splatjax.baselines` (methods to compare with) and `splatjax.plots` (which needs matplotlib) must be
-imported explicitly.
+`splatjax.baselines` (methods to compare with), `splatjax.plots` (which needs matplotlib) and
+`splatjax.studio` (a scene that changes live) must be imported explicitly.
 """
 
 from . import (

@@ -23,6 +23,7 @@ from ._fit import Fit
 from ._materials import Export, Materials, Sample
 from ._recover import Recover
 from ._render import Render, Turntable
+from ._studio import Studio
 from ._terminal import CONSOLE, note
 
 _COMMANDS = {
@@ -32,6 +33,7 @@ _COMMANDS = {
     "sample": Sample,
     "render": Render,
     "turntable": Turntable,
+    "studio": Studio,
     "recover": Recover,
 }
 _DESCRIPTION = """Render translucent materials, and fit the sums of Gaussians that represent them.

@@ -20,7 +20,7 @@ from ._terminal import OptionalFloat, Rules, UpAxis, check_options, note, option
 # Degrees: the fill is beside the camera, on the side away from the light.
 _FILL_SIDE, _FILL_ELEVATION = 25.0, 10.0
 _SINGLE_LIGHT = -20.0, 30.0, 0.1  # azimuth, elevation, and strength of the fill
-_ENVIRONMENTS = {
+ENVIRONMENTS = {
     "studio": sj.scene.studio,
     "overcast": sj.scene.overcast_sky,
     "sun": sj.scene.sun_and_sky,
@@ -153,8 +153,8 @@ class ViewOptions:
     @functools.cached_property
     def _environment(self) -> sj.EnvironmentLight | None:
         name = self.environment_name
-        if name in _ENVIRONMENTS:
-            return sj.EnvironmentLight(_ENVIRONMENTS[name]())
+        if name in ENVIRONMENTS:
+            return sj.EnvironmentLight(ENVIRONMENTS[name]())
         return sj.io.load_environment(name) if name else None
 
     @property
@@ -274,7 +274,7 @@ class ViewOptions:
         }
         material = sj.io.material_path(self.material).read_text(encoding="utf-8")
         splats = f"{self.splats.name}, {sj.io.fingerprint(self.splats)}" if self.splats else None
-        if self.environment and self.environment not in _ENVIRONMENTS:
+        if self.environment and self.environment not in ENVIRONMENTS:
             path = Path(self.environment)
             options["environment"] = f"{path.name}, {sj.io.fingerprint(path)}"
         return options | {

@@ -1,0 +1,89 @@
+"""`splatjax studio`: a scene in the browser, to turn and to change."""
+
+import threading
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import splatjax as sj
+from splatjax.studio import Page, Session
+
+from ._terminal import check_folder
+from ._view import ENVIRONMENTS, ViewOptions
+
+_DIRECTIONS = 64  # of the shadows of an environment
+
+
+@dataclass(frozen=True, kw_only=True)
+class Studio(ViewOptions):
+    """Show splats, or the built-in bust, in a page of the browser, to turn and to change.
+
+    It needs viser: pip install 'splatjax[studio]'. The address of the page is printed; Ctrl-C ends
+    it. Coefficients can be changed of a material that has a [medium]. The page saves the material,
+    pictures, and the program that makes a picture.
+
+    Example: splatjax studio --material marble --no-albedo --scale 0.2
+    """
+
+    #: The folder for what is saved; it is made where its parent exists.
+    output: Path = Path("studio")
+    #: Number of splats of the built-in bust.
+    count: int = 100_000
+    #: The address to listen at. With another one than 127.0.0.1, whoever reaches it can change the
+    #: scene and save.
+    host: str = "127.0.0.1"
+    #: The port, or the next one that is free.
+    port: int = 8080
+
+    def run(self) -> None:
+        self.check(
+            {
+                "bounces": (self.bounces == 0, "be 0 in the studio"),
+                "diffusion": (self.diffusion == "clusters", "be clusters in the studio"),
+                "background": (self.background == "black", "be black in the studio"),
+                "port": (1 <= self.port <= 65_535, "lie between 1 and 65535"),
+            }
+        )
+        check_folder(self.output)
+        splats, material = self.load()
+        camera = self.camera(lambda: [splats], self.azimuth)
+        middle = (splats.centers.min(axis=0) + splats.centers.max(axis=0)) / 2
+        scene = sj.Scene(splats, self._lights(material), material)
+        session = Session(scene, camera, middle, exposure=self.exposure)
+        self.output.mkdir(exist_ok=True)
+        place = {"host": self.host, "port": self.port}
+        page = Page(session, self.output, self._recipe(session.own.lights), **place)
+        print(page.url, flush=True)
+        try:
+            threading.Event().wait()
+        finally:
+            page.close()
+
+    def _lights(self, material: sj.Material) -> list[sj.scene.AbstractLight]:
+        lights = self.lights(material, self.azimuth, self.single_light[0])
+        directions = sj.scene.even_directions(_DIRECTIONS)
+        return [
+            replace(light, directions=directions)
+            if isinstance(light, sj.EnvironmentLight)
+            else light
+            for light in lights
+        ]
+
+    def _recipe(self, lights: tuple[sj.scene.AbstractLight, ...]) -> dict[str, str]:
+        """Return expressions that make the splats and the lights."""
+        path = self.splats and str(self.splats.absolute())
+        splats = f"sj.read_splats({path!r}, up={self.up!r})" if path else f"sj.bust({self.count})"
+        splats = splats if self.scale == 1 else f"{splats}.scaled({self.scale})"
+        splats = splats if self.albedo else f"dataclasses.replace({splats}, albedo=None)"
+        return {"splats": splats, "lights": f"[{', '.join(map(self._made, lights))}]"}
+
+    def _made(self, light: sj.scene.AbstractLight) -> str:
+        if isinstance(light, sj.DirectionalLight):
+            given = f"{light.direction.tolist()}, {light.irradiance.tolist()}"
+            return f"sj.DirectionalLight({given}, cast_shadows={light.cast_shadows})"
+        assert isinstance(light, sj.EnvironmentLight)
+        name = self.environment_name or ""
+        image = f"sj.io.load_environment({str(Path(name).absolute())!r}).image"
+        if name in ENVIRONMENTS:
+            image = f"sj.scene.{ENVIRONMENTS[name].__name__}()"
+        directions = f"sj.scene.even_directions({_DIRECTIONS})"
+        return f"sj.EnvironmentLight({image}, {float(light.rotation)}, directions={directions})"

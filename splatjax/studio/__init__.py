@@ -1,0 +1,8 @@
+"""A scene seen live: what a change does not touch is kept. `Page` shows it in a browser, by viser
+(the extra `studio`).
+"""
+
+from ._controls import Controls as Controls, turned as turned
+from ._page import Page as Page
+from ._saving import save as save
+from ._session import Session as Session

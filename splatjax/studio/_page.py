@@ -1,0 +1,189 @@
+"""The page of a studio, by viser: sliders, and the picture behind them. One thread computes, in
+which programs are also compiled, so that the page answers meanwhile.
+"""
+
+import contextlib
+import dataclasses
+import io
+import threading
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from PIL import Image, ImageOps
+
+from splatjax._format import channel_names, format_numbers
+
+from ._controls import LAYERS, Controls
+from ._saving import save
+from ._session import Session
+
+_STILL = 0.15  # s without a change, after which the whole picture is computed
+_NEAR = 1e-5  # relative, of cameras that are the same
+_QUALITY = 92  # of JPEG
+_COMPILING = "/jax/compilation_cache/cache_misses", "/splatjax/cache/compiling"
+_SLIDERS = {
+    "turn": ("turn lights, °", -180.0, 180.0),
+    "exposure": ("exposure, stops", -8.0, 8.0),
+    "scale": ("diffuse", 0.0, 1.0),
+    "specular": ("specular", 0.0, 1.0),
+    "roughness": ("roughness", 0.05, 1.0),
+    "eta": ("eta", 1.0, 2.5),
+}
+_FACTORS = {"sigma_a": "absorption", "sigma_s_prime": "scattering"}
+_COLORS = ("#c0392b", "#27853f", "#2c5aa0")
+
+
+class Page:
+    """A session in a browser. All pages that are open show one picture; the last camera that moves
+    is that of all.
+
+    **Arguments:**
+
+    - `folder`: the only one to which the page writes, under names of its own.
+    - `recipe`: as for `save`.
+    - `host`: the address to listen at: by default no other computer reaches it.
+    - `port`: or a higher one that is free.
+
+    **Attributes:**
+
+    - `url`: its address.
+
+    **Raises:** `ValueError` where viser is not installed.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        folder: Path,
+        recipe: Mapping[str, str],
+        *,
+        host: str = "127.0.0.1",
+        port: int = 8080,
+    ):
+        try:
+            import viser  # ty: ignore[import-not-found]
+        except ImportError:
+            raise ValueError(
+                "the page of the studio needs viser; install it: pip install 'splatjax[studio]'"
+            ) from None
+        self._session, self._where, self._saves = session, (folder, recipe), list[str]()
+        self._place = np.asarray([session.start.eye, session.start.target])
+        self._image = Image.new("RGB", (1, 1))
+        self._changed, self._closed = threading.Event(), threading.Event()
+        with contextlib.redirect_stdout(io.StringIO()):  # it prints an address of its own
+            self._server = server = viser.ViserServer(host, port, "splatjax", verbose=False)
+        # Viser would give the page a public address on a server of others.
+        server.request_share_url = lambda verbose=True: None
+        self.url = f"http://{host}:{server.get_port()}"
+        server.scene.set_up_direction("+y")
+        camera = server.initial_camera
+        camera.position, camera.look_at = session.start.eye, session.start.target
+        camera.fov = float(np.radians(session.fov))
+        self._add_controls(server.gui)
+        server.on_client_connect(lambda client: client.camera.on_update(self._look))
+        jax.monitoring.register_event_listener(self._note_compiling)
+        self._worker = threading.Thread(target=self._work, daemon=True)
+        self._change()
+        self._worker.start()
+
+    def close(self) -> None:
+        """End the server, once what is being computed is done."""
+        self._closed.set()
+        self._change()
+        self._worker.join()
+        jax.monitoring.unregister_event_listener(self._note_compiling)
+        self._server.stop()
+
+    def _add_controls(self, gui: Any) -> None:
+        start, curves = self._session.start, self._session.curves(self._session.start)
+        gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True)
+        self._status = gui.add_markdown("starting ...")
+        self._handles = handles = {"layer": gui.add_dropdown("layer", LAYERS)}
+        for name, (label, low, high) in _SLIDERS.items():
+            value = getattr(start, name)
+            low, high = min(low, value), max(high, value)
+            handles[name] = gui.add_slider(label, low, high, 0.01, value)
+        names = ("all", *channel_names(len(start.sigma_a))) if start.sigma_a else ()
+        for field, label in _FACTORS.items():
+            for number, name in enumerate(names):
+                slider = gui.add_slider(f"{label}, {name}: 2^", -4.0, 4.0, 0.05, 0.0)
+                handles[f"{field} {number}"] = slider
+        for handle in handles.values():
+            handle.on_update(lambda _: self._change())
+        self._numbers = gui.add_markdown("")
+        channels = self._session.own.material.channels
+        profiles = len(curves) - 1 - channels  # drawn wide
+        series = [
+            {"label": "", "stroke": _COLORS[i % channels % 3], "width": 5 if i < profiles else 1}
+            for i in range(profiles + channels)
+        ]
+        title = "r R(r) over r in mm, and the fit (narrow)"
+        lines = [{"label": "r"}, *series]
+        self._plot = gui.add_uplot(tuple(curves), tuple(lines), title=title, aspect=1.4)
+        buttons = gui.add_button_group("save", ("TOML", "PNG", "EXR", "Python"))
+        buttons.on_click(lambda event: self._change(event.target.value))
+
+    def _change(self, *saves: str) -> None:
+        self._saves += saves
+        self._changed.set()
+
+    def _controls(self) -> Controls:
+        values = {name: handle.value for name, handle in self._handles.items()}
+        start, (eye, target) = self._session.start, self._place.tolist()
+        changed = {name: value for name, value in values.items() if " " not in name}
+        for field in _FACTORS:
+            changed[field] = tuple(
+                number * 2 ** (values[f"{field} 0"] + values[f"{field} {channel}"])
+                for channel, number in enumerate(getattr(start, field), 1)
+            )
+        return dataclasses.replace(start, eye=tuple(eye), target=tuple(target), **changed)
+
+    def _look(self, camera: Any) -> None:
+        place = np.asarray([camera.position, camera.look_at])
+        self._send(camera.client)  # whose window is new, or has another shape
+        if np.max(np.abs(place - self._place)) > _NEAR * np.linalg.norm(place[0] - place[1]):
+            self._place = place
+            self._change()
+
+    def _send(self, client: Any) -> None:
+        """Show the picture in the middle of a window of any shape."""
+        (width, height), aspect = self._image.size, client.camera.aspect
+        size = max(width, round(height * aspect)), max(height, round(width / aspect))
+        canvas = np.asarray(ImageOps.pad(self._image, size))
+        client.scene.set_background_image(canvas, "jpeg", jpeg_quality=_QUALITY)
+
+    def _show(self, image: np.ndarray) -> None:
+        self._image = Image.fromarray(image)
+        for client in self._server.get_clients().values():
+            self._send(client)
+
+    def _note_compiling(self, event: str, **_: Any) -> None:
+        if event in _COMPILING and threading.current_thread() is self._worker:
+            self._status.content = "compiling, which the next start has at once ..."
+
+    def _work(self) -> None:
+        while not self._closed.is_set():
+            self._changed.wait()
+            self._changed.clear()
+            try:
+                self._status.content = self._update(self._controls())
+            except Exception as error:
+                self._status.content = f"{type(error).__name__}: {error}"
+
+    def _update(self, controls: Controls) -> str:
+        """Show a state, and write what is to be saved; return what to report."""
+        session, written = self._session, list[Path]()
+        self._show(session.draft(controls))
+        self._plot.data = tuple(session.curves(controls))
+        rows = {label: getattr(controls, field) for field, label in _FACTORS.items()}
+        shown = [f"{label}: {format_numbers(row, '.4g')} /mm" for label, row in rows.items() if row]
+        self._numbers.content = "  \n".join(shown)
+        if not self._saves and self._changed.wait(_STILL):
+            return ""
+        self._show(session.picture(controls))
+        while self._saves:
+            written += save(session, controls, *self._where, self._saves.pop(0))
+        return f"saved {', '.join(path.name for path in written)}" if written else ""

@@ -1,0 +1,304 @@
+"""A scene whose parts are kept, each until something that it depends on changes."""
+
+import dataclasses
+from collections.abc import Callable, Hashable
+from typing import Any, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, UInt8
+
+from splatjax import fitting as _fitting
+from splatjax._display import to_display
+from splatjax._records import Numbers
+from splatjax.gaussians import SumOfGaussians
+from splatjax.render import (
+    DiffusionBasis,
+    Plan,
+    SplatLight,
+    diffusion_basis,
+    illuminate,
+    make_plan,
+    render,
+    transfer,
+)
+from splatjax.scattering import AngularLaw, Medium
+from splatjax.scene import Camera, EnvironmentLight, Frame, Scene, Splats
+
+from ._controls import SURFACE, Controls, rotation_about_y, turned
+
+Kept = TypeVar("Kept")
+_WEIGHTS = _fitting.NonNegativeWeights(_fitting.FixedTotalReflectance())
+_MERGED = 4  # splats of the body, for which one stands while it moves
+_PLANNED = 1.2  # by which variances may differ from those of a plan
+_QUARTERS = (0.0, 90.0, 180.0, 270.0)  # degrees
+_DISTANCES = (1.0, 0.5)  # that are planned for, over that of the first camera
+# How much of diffuse and of specular light a layer shows.
+_SHARES = {"beauty": (1.0, 1.0), "diffuse": (1.0, 0.0), "specular": (0.0, 1.0)}
+
+
+class _Body:
+    """Splats, the size of their picture, and what was computed of them last, one of each kind."""
+
+    def __init__(self, splats: Splats, width: int, height: int):
+        self.splats, self.size = splats, {"width": width, "height": height}
+        self.kept: dict[str, tuple[Hashable, Any]] = {}
+
+    def has(self, kind: str, depends_on: Hashable) -> bool:
+        return self.kept.get(kind, (None,))[0] == depends_on
+
+    def keep(self, kind: str, depends_on: Hashable, make: Callable[[], Kept]) -> Kept:
+        if not self.has(kind, depends_on):
+            self.kept.pop(kind, None)  # before there are two
+            self.kept[kind] = depends_on, jax.block_until_ready(make())
+        return self.kept[kind][1]
+
+
+class Session:
+    r"""A scene under changing controls.
+
+    Of each kind one result is kept: the visibility of the lights, the light on the splats, and the
+    layers of the view (`splatjax.DiffusionBasis`). While coefficients move, the variances of the
+    Gaussians are held, their weights are fitted, and the kept layers are blended. Where nothing is
+    kept for a state, `draft` shows a quarter of the splats in half the width and height.
+
+    **Arguments:**
+
+    - `scene`: a material without single scattering. Where the splats have an albedo, color is that
+      alone. To turn an environment quickly, give it fixed `directions`.
+    - `camera`: of the first picture.
+    - `target`: at which it looks, mm.
+    - `model`: of coefficients that were changed.
+
+    **Attributes:**
+
+    - `start`: the `Controls` of the first picture.
+
+    **Raises:** `ValueError` for a material with single scattering.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        camera: Camera,
+        target: Numbers,
+        *,
+        exposure: float = 0.0,
+        model: _fitting.AbstractModel = _fitting.TransportModel(),
+    ):
+        material, medium = scene.material, scene.material.medium
+        if material.single_scattering is not None:
+            raise ValueError(
+                "the material has single scattering, beside which less light enters as the "
+                "weights grow; fit it without --single-scattering"
+            )
+        coefficients = () if medium is None else (medium.sigma_a, medium.sigma_s_prime)
+        absorption, scattering = map(_plain, coefficients or ((), ()))
+        eta, specular, roughness = (float(getattr(material, name)) for name in SURFACE)
+        places = _plain(camera.position), _plain(target)
+        self.start = Controls(
+            *places, absorption, scattering, eta, specular, roughness, exposure=exposure
+        )
+        self.own, self.model = scene, model
+        self.fov = float(np.degrees(2 * np.arctan(0.5 / camera.focal_length)))
+        few = jax.tree.map(lambda leaf: leaf[::_MERGED], scene.splats)
+        larger = {"radii": few.radii * _MERGED**0.5, "areas": few.areas * _MERGED}
+        few = dataclasses.replace(few, **larger)
+        self._coarse = _Body(few, -(-camera.width // 2), -(-camera.height // 2))
+        self._full = _Body(scene.splats, camera.width, camera.height)
+        self._keeps_shadows = all(
+            isinstance(light, EnvironmentLight) and light.directions is not None
+            for light in scene.lights
+        )
+        self._variances = self._planned = material.gaussians.variances
+        self._angles, self._settled, self._fits = material.angles, self.start.coefficients, 0
+
+    def picture(self, controls: Controls) -> UInt8[np.ndarray, "height width 3"]:
+        """Compute the picture that `splatjax.render` makes of `scene(controls)`, for a display.
+        Before, variances and angles follow the coefficients.
+        """
+        self._settle(controls)
+        return self._show(self._full, controls)
+
+    def draft(self, controls: Controls) -> UInt8[np.ndarray, "height width 3"]:
+        """Compute a picture at once: of the layers that are kept, with the variances and angles of
+        the last `picture`; or a coarse one.
+        """
+        is_kept = self._full.has("basis", self._keys(controls))
+        return self._show(self._full if is_kept else self._coarse, controls)
+
+    def frame(self, controls: Controls, body: _Body | None = None) -> Frame:
+        """Render the scene with all its layers."""
+        body = body or self._full
+        self._basis(body, controls)  # so that the plan suffices
+        scene, camera = self.scene(controls, body), self.camera(controls, body)
+        plan, light = self._plan(body, controls), self._light(body, controls)
+        return render(scene, camera, plan=plan, light=light)
+
+    def scene(self, controls: Controls, body: _Body | None = None, **surface: float) -> Scene:
+        """Return the scene of a state: after `picture`, that of the picture."""
+        surface = {name: getattr(controls, name) for name in SURFACE} | surface
+        material = dataclasses.replace(
+            self.own.material,
+            gaussians=self._gaussians(controls),
+            angles=self._angles,
+            medium=self._medium(controls),
+            **surface,
+        )
+        lights = turned(self.own.lights, controls.turn)
+        return Scene((body or self._full).splats, lights, material)
+
+    def camera(self, controls: Controls, body: _Body | None = None) -> Camera:
+        """Return the camera of a state."""
+        size = (body or self._full).size
+        return Camera.look_at(controls.eye, controls.target, fov=self.fov, **size)
+
+    def curves(self, controls: Controls) -> list[np.ndarray]:
+        """Compute what a drawing of the profile shows.
+
+        **Returns:** radii (mm); of each channel the profile times the radius, 1/mm, where there are
+        coefficients; and the same of the Gaussians.
+        """
+        medium, gaussians = self._medium(controls), self._fitted(controls)
+        widest = 3 * np.sqrt(np.max(self.own.material.gaussians.variances))
+        radii = jnp.asarray(np.linspace(0, widest, 121)[1:], self._variances.dtype)
+        rows = _curves(self.model, medium, gaussians, radii)
+        return [np.asarray(row, np.float64) for row in (radii, *rows)]
+
+    def _medium(self, controls: Controls) -> Medium | None:
+        own = self.own.material.medium
+        if own is None or controls.coefficients == self.start.coefficients:
+            return own
+        rows = controls.sigma_a, controls.sigma_s_prime, [controls.eta] * own.channels
+        return Medium(*(jnp.asarray(row, self._variances.dtype) for row in rows))
+
+    def _fitted(self, controls: Controls) -> SumOfGaussians:
+        """Return the material's own Gaussians, or those that stand for changed coefficients."""
+        own, medium = self.own.material, self._medium(controls)
+        if medium is None or (medium is own.medium and self._variances is own.gaussians.variances):
+            return own.gaussians
+        return _fit_weights(self.model, medium, self._variances)
+
+    def _gaussians(self, controls: Controls) -> SumOfGaussians:
+        gaussians = self._fitted(controls)
+        gaussians = gaussians if self._has_color else gaussians.white()
+        return SumOfGaussians(gaussians.variances, gaussians.weights * controls.scale)
+
+    @property
+    def _has_color(self) -> bool:
+        return self.own.splats.albedo is None
+
+    def _settle(self, controls: Controls) -> None:
+        """Let variances and angles follow the coefficients."""
+        if controls.coefficients == self._settled:
+            return
+        own, medium = self.own.material, self._medium(controls)
+        held, self._angles, self._variances = self._variances, own.angles, own.gaussians.variances
+        if medium is not None and medium is not own.medium:
+            self._variances, angles = _fit(self.model, medium, held)
+            self._angles = angles if self._has_color else None
+        self._settled, self._fits = controls.coefficients, self._fits + 1
+        if np.max(np.abs(np.log(self._variances / self._planned))) > np.log(_PLANNED):
+            self._planned = self._variances
+
+    def _keys(self, controls: Controls) -> tuple[Hashable, Hashable]:
+        """Return what the light on the splats depends on, and what the view does besides."""
+        light = controls.turn, controls.eta, controls.roughness, self._fits
+        return light, (controls.eye, controls.target)
+
+    def _plan(self, body: _Body, controls: Controls) -> Plan:
+        """Plan for cameras and lights all around."""
+
+        def make() -> Plan:
+            start, scene = self.start, self.scene(controls, body)
+            offset = np.subtract(start.eye, start.target)
+            offsets = [d * rotation_about_y(t) @ offset for t in _QUARTERS for d in _DISTANCES]
+            eyes = [_plain(np.add(start.target, offset)) for offset in offsets]
+            states = [controls, *(dataclasses.replace(start, eye=eye) for eye in eyes)]
+            turns = [0.0] if self._keeps_shadows else _QUARTERS
+            scenes = [dataclasses.replace(scene, lights=turned(scene.lights, t)) for t in turns]
+            return make_plan(scenes, [self.camera(state, body) for state in states])
+
+        return body.keep("plan", _plain(self._planned), make)
+
+    def _light(self, body: _Body, controls: Controls) -> SplatLight:
+        plan, turn = self._plan(body, controls), None if self._keeps_shadows else controls.turn
+
+        def make() -> SplatLight:
+            scene = self.scene(controls, body)
+            visible = body.keep("visibility", (turn,), lambda: transfer(scene, plan))
+            return illuminate(scene, plan, light=visible)
+
+        return body.keep("light", self._keys(controls)[0], make)
+
+    def _basis(self, body: _Body, controls: Controls) -> DiffusionBasis:
+        def make() -> DiffusionBasis:
+            scene, camera = self.scene(controls, body, specular=1.0), self.camera(controls, body)
+            plan, light = self._plan(body, controls), self._light(body, controls)
+            return diffusion_basis(scene, camera, plan=plan, light=light)
+
+        basis = body.keep("basis", self._keys(controls), make)
+        if basis.overflow > 0:
+            body.kept.clear()  # to plan for this state too
+            basis = body.keep("basis", self._keys(controls), make)
+        return basis
+
+    def _show(self, body: _Body, controls: Controls) -> UInt8[np.ndarray, "height width 3"]:
+        basis, keys = self._basis(body, controls), self._keys(controls)
+        if controls.layer in _SHARES:
+            diffuse, specular = _SHARES[controls.layer]
+            shares = jnp.asarray([diffuse, specular * controls.specular], basis.specular.dtype)
+            values = _blend(basis, self._gaussians(controls), shares)
+        else:
+            frame = body.keep("frame", keys, lambda: self.frame(controls, body))
+            shadow = jnp.mean(frame.shadow, axis=0)[..., None]
+            values = shadow if controls.layer == "shadow" else getattr(frame, controls.layer)
+        image = to_display(np.asarray(values), controls.exposure)
+        return np.broadcast_to(image, (*image.shape[:2], 3))
+
+
+def _plain(values: Numbers) -> tuple[float, ...]:
+    return tuple(np.asarray(values, np.float64).tolist())
+
+
+@eqx.filter_jit
+def _blend(
+    basis: DiffusionBasis, gaussians: SumOfGaussians, shares: Float[Array, "2"]
+) -> Float[Array, "height width channels"]:
+    return shares[0] * (basis.beauty(gaussians) - basis.specular) + shares[1] * basis.specular
+
+
+@eqx.filter_jit
+def _fit_weights(
+    model: _fitting.AbstractModel, medium: Medium, variances: Float[Array, " gaussians"]
+) -> SumOfGaussians:
+    profile = model.profile(medium)
+    return _fitting.fit_weights(profile, variances, weights=_WEIGHTS, rule=model.rule)
+
+
+@eqx.filter_jit
+def _fit(
+    model: _fitting.AbstractModel, medium: Medium, variances: Float[Array, " gaussians"]
+) -> tuple[Float[Array, " gaussians"], AngularLaw | None]:
+    """Find variances near given ones, which stay where none better is found; and the angles."""
+    profile, start = model.profile(medium), _fitting.GivenVariances(variances)
+    found = _fitting.fit_gaussians(
+        profile, len(variances), weights=_WEIGHTS, start=start, rule=model.rule, throw=False
+    )
+    held = _fitting.fit_weights(profile, variances, weights=_WEIGHTS, rule=model.rule)
+    error = _fitting.relative_error(profile, held, model.rule)
+    is_better = jnp.max(found.error) < jnp.max(error)
+    return jnp.where(is_better, found.gaussians.variances, variances), model.angles(medium)
+
+
+@eqx.filter_jit
+def _curves(
+    model: _fitting.AbstractModel,
+    medium: Medium | None,
+    gaussians: SumOfGaussians,
+    radii: Float[Array, " radii"],
+) -> list[Float[Array, " radii"]]:
+    profiles = [gaussians] if medium is None else [model.profile(medium), gaussians]
+    return [radii * row for profile in profiles for row in profile(radii).T]
