@@ -17,7 +17,7 @@ from PIL import Image, ImageOps
 from splatjax._format import channel_names, format_numbers
 
 from ._controls import LAYERS, Controls
-from ._saving import save
+from ._saving import SUFFIXES, save
 from ._session import Session
 
 _STILL = 0.15  # s without a change, after which the whole picture is computed
@@ -69,9 +69,13 @@ class Page:
             raise ValueError(
                 "the page of the studio needs viser; install it: pip install 'splatjax[studio]'"
             ) from None
-        self._session, self._where, self._saves = session, (folder, recipe), list[str]()
+        self._session, self._where, self._saves = (
+            session,
+            (folder, recipe),
+            list[tuple[str, Controls]](),
+        )
         self._place = np.asarray([session.start.eye, session.start.target])
-        self._image = Image.new("RGB", (1, 1))
+        self._image, self._joined = Image.new("RGB", (1, 1)), list[Any]()
         self._changed, self._closed = threading.Event(), threading.Event()
         with contextlib.redirect_stdout(io.StringIO()):  # it prints an address of its own
             self._server = server = viser.ViserServer(host, port, "splatjax", verbose=False)
@@ -84,6 +88,9 @@ class Page:
         camera.fov = float(np.radians(session.fov))
         self._add_controls(server.gui)
         server.on_client_connect(lambda client: client.camera.on_update(self._look))
+        server.on_client_disconnect(
+            lambda client: self._joined.remove(client) if client in self._joined else None
+        )
         jax.monitoring.register_event_listener(self._note_compiling)
         self._worker = threading.Thread(target=self._work, daemon=True)
         self._change()
@@ -106,28 +113,33 @@ class Page:
             value = getattr(start, name)
             low, high = min(low, value), max(high, value)
             handles[name] = gui.add_slider(label, low, high, 0.01, value)
-        names = ("all", *channel_names(len(start.sigma_a))) if start.sigma_a else ()
-        for field, label in _FACTORS.items():
-            for number, name in enumerate(names):
-                slider = gui.add_slider(f"{label}, {name}: 2^", -4.0, 4.0, 0.05, 0.0)
-                handles[f"{field} {number}"] = slider
+        channels = self._session.own.material.channels
+        names = ("all", *channel_names(channels)) if start.sigma_a else ()
+        for field, label in _FACTORS.items() if names else ():
+            with gui.add_folder(f"{label}, by powers of 2", expand_by_default=False):
+                for number, name in enumerate(names):
+                    handles[f"{field} {number}"] = gui.add_slider(name, -4.0, 4.0, 0.05, 0.0)
         for handle in handles.values():
             handle.on_update(lambda _: self._change())
         self._numbers = gui.add_markdown("")
-        channels = self._session.own.material.channels
-        profiles = len(curves) - 1 - channels  # drawn wide
+        profiles, hidden = len(curves) - 1 - channels, {"points": {"show": False}}
         series = [
-            {"label": "", "stroke": _COLORS[i % channels % 3], "width": 5 if i < profiles else 1}
+            {"stroke": _COLORS[i % channels % 3], "width": 5 if i < profiles else 1, **hidden}
             for i in range(profiles + channels)
         ]
-        title = "r R(r) over r in mm, and the fit (narrow)"
-        lines = [{"label": "r"}, *series]
-        self._plot = gui.add_uplot(tuple(curves), tuple(lines), title=title, aspect=1.4)
-        buttons = gui.add_button_group("save", ("TOML", "PNG", "EXR", "Python"))
+        self._plot = gui.add_uplot(
+            tuple(curves),
+            ({"label": "r"}, *series),
+            title="r R(r) over r in mm, and its fit (narrow)",
+            scales={"x": {"time": False}},
+            legend={"show": False},
+            aspect=1.4,
+        )
+        buttons = gui.add_button_group("save", tuple(SUFFIXES))
         buttons.on_click(lambda event: self._change(event.target.value))
 
     def _change(self, *saves: str) -> None:
-        self._saves += saves
+        self._saves += [(kind, self._controls()) for kind in saves]
         self._changed.set()
 
     def _controls(self) -> Controls:
@@ -142,11 +154,19 @@ class Page:
         return dataclasses.replace(start, eye=tuple(eye), target=tuple(target), **changed)
 
     def _look(self, camera: Any) -> None:
-        place = np.asarray([camera.position, camera.look_at])
-        self._send(camera.client)  # whose window is new, or has another shape
-        if np.max(np.abs(place - self._place)) > _NEAR * np.linalg.norm(place[0] - place[1]):
+        place, start = np.asarray([camera.position, camera.look_at]), self._session.start
+        near = _NEAR * np.linalg.norm(place[0] - place[1])
+        if camera.client not in self._joined:
+            # Its first cameras are viser's own, and then the first of all.
+            if np.max(np.abs(place - [start.eye, start.target])) < near:
+                self._joined.append(camera.client)
+                camera.position, camera.look_at = self._place
+            self._send(camera.client)
+        elif np.max(np.abs(place - self._place)) > near:
             self._place = place
             self._change()
+        else:  # its window may have another shape
+            self._send(camera.client)
 
     def _send(self, client: Any) -> None:
         """Show the picture in the middle of a window of any shape."""
@@ -185,5 +205,6 @@ class Page:
             return ""
         self._show(session.picture(controls))
         while self._saves:
-            written += save(session, controls, *self._where, self._saves.pop(0))
+            kind, asked = self._saves.pop(0)
+            written += save(session, asked, *self._where, kind)
         return f"saved {', '.join(path.name for path in written)}" if written else ""

@@ -8,6 +8,8 @@ from splatjax.io import atomic_path, save_material, write_exr, write_png
 from ._controls import Controls
 from ._session import Session
 
+# By what is written.
+SUFFIXES = {"TOML": [".toml"], "PNG": [".png"], "EXR": [".exr"], "Python": [".toml", ".py"]}
 _PROGRAM = '''"""Render {name}.png of the material in {name}.toml, beside this file."""
 
 import dataclasses
@@ -39,7 +41,7 @@ def save(
 
     **Returns:** the paths of the files.
 
-    **Raises:** `OSError` when they cannot be written.
+    **Raises:** `KeyError` for anything else, `OSError` where files cannot be written.
     """
     session.picture(controls)  # whose variances and angles are those of the coefficients
     material, camera = session.scene(controls).material, session.camera(controls)
@@ -47,8 +49,7 @@ def save(
     name = next(name for n in range(len(taken) + 1) if (name := f"studio_{n:03}") not in taken)
     size = {"fov": session.fov, "width": camera.width, "height": camera.height}
     program = _PROGRAM.format(name=name, **vars(controls), **size, **recipe)
-    suffixes = {"Python": (".toml", ".py")}.get(kind, (f".{kind.lower()}",))
-    paths = [folder / f"{name}{suffix}" for suffix in suffixes]
+    paths = [folder / f"{name}{suffix}" for suffix in SUFFIXES[kind]]
     if kind == "PNG":
         write_png(paths[0], session.frame(controls), exposure=controls.exposure)
     elif kind == "EXR":

@@ -96,7 +96,7 @@ class Session:
             )
         coefficients = () if medium is None else (medium.sigma_a, medium.sigma_s_prime)
         absorption, scattering = map(_plain, coefficients or ((), ()))
-        eta, specular, roughness = (float(getattr(material, name)) for name in SURFACE)
+        eta, specular, roughness = (round(float(getattr(material, name)), 6) for name in SURFACE)
         places = _plain(camera.position), _plain(target)
         self.start = Controls(
             *places, absorption, scattering, eta, specular, roughness, exposure=exposure
