@@ -131,7 +131,7 @@ class Page:
             tuple(curves),
             ({"label": "r"}, *series),
             title="r R(r) over r in mm, and its fit (narrow)",
-            scales={"x": {"time": False}},
+            scales={"x": {"time": False, "auto": True, "distr": 3}},
             legend={"show": False},
             aspect=1.4,
         )

@@ -163,7 +163,7 @@ class Session:
         """
         medium, gaussians = self._medium(controls), self._fitted(controls)
         widest = 3 * np.sqrt(np.max(self.own.material.gaussians.variances))
-        radii = jnp.asarray(np.linspace(0, widest, 121)[1:], self._variances.dtype)
+        radii = jnp.asarray(np.geomspace(0.01 * widest, widest, 120), self._variances.dtype)
         rows = _curves(self.model, medium, gaussians, radii)
         return [np.asarray(row, np.float64) for row in (radii, *rows)]
 
