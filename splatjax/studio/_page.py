@@ -123,15 +123,23 @@ class Page:
             handle.on_update(lambda _: self._change())
         self._numbers = gui.add_markdown("")
         profiles, hidden = len(curves) - 1 - channels, {"points": {"show": False}}
+        pens = ("60", 6), ("", 1.5)  # opacity and width
         series = [
-            {"stroke": _COLORS[i % channels % 3], "width": 5 if i < profiles else 1, **hidden}
+            {"stroke": _COLORS[i % channels % 3] + opacity, "width": width, **hidden}
             for i in range(profiles + channels)
+            for opacity, width in [pens[i >= profiles]]
         ]
         self._plot = gui.add_uplot(
             tuple(curves),
             ({"label": "r"}, *series),
             title="r R(r) over r in mm, and its fit (narrow)",
-            scales={"x": {"time": False, "auto": True, "distr": 3}},
+            scales={
+                "x": {
+                    "time": False,
+                    "distr": 3,
+                    "range": (float(curves[0][0]), float(curves[0][-1])),
+                }
+            },
             legend={"show": False},
             aspect=1.4,
         )
