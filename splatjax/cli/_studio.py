@@ -3,6 +3,9 @@
 import threading
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated
+
+import tyro
 
 import splatjax as sj
 from splatjax.studio import Page, Session
@@ -30,7 +33,7 @@ class Studio(ViewOptions):
     count: int = 100_000
     #: The address to listen at. With another one than 127.0.0.1, whoever reaches it can change the
     #: scene and save.
-    host: str = "127.0.0.1"
+    host: Annotated[str, tyro.conf.arg(metavar="ADDRESS")] = "127.0.0.1"
     #: The port, or the next one that is free.
     port: int = 8080
 
