@@ -21,7 +21,7 @@ import numpy as np
 import trimesh
 
 import splatjax as sj
-from splatjax.diffusion import PlainMean
+from splatjax.diffusion import PlainMean, ShapeDiffuser
 from splatjax.geometry import Mesh, sample_mesh, vertex_normals
 from splatjax.io import linear_to_srgb
 from splatjax.splatting import SplattingSettings
@@ -72,7 +72,7 @@ def lamp(*direction: float) -> sj.DirectionalLight:
     return sj.DirectionalLight(direction, irradiance=[IRRADIANCE] * len(ALBEDO))
 
 
-MM_PER_UNIT = 53.0
+MM_PER_UNIT, BLOCKER_DEPTH = 53.0, 0.2
 SPHERE, HEAD = "sphere of radius 10", "scanned head"
 sphere = functools.partial(trimesh.creation.icosphere, 6, 10.0)
 FROM_SPHERE = (0, 0, 80), (0, 0, 0), 18, 150_000
@@ -178,7 +178,10 @@ def models() -> dict[str, tuple[sj.Material, sj.RenderSettings]]:
     half_space, beam = model.half_space(medium), model.profile(medium)
     apart = single.directional_albedo(jnp.asarray(half_space.cosines()))
     flat = fitted(beam)
-    whole = dataclasses.replace(flat, angles=model.angles(medium))
+    whole, solved = (
+        dataclasses.replace(flat, angles=model.angles(medium)),
+        dataclasses.replace(flat, medium=medium),
+    )
     parted = dataclasses.replace(
         fitted(beam.multiply_scattered()),
         single_scattering=single,
@@ -190,6 +193,11 @@ def models() -> dict[str, tuple[sj.Material, sj.RenderSettings]]:
         "escape normalization and angles": (whole, even),
         "and single scattering": (parted, even),
         "and a bounce": (parted, dataclasses.replace(even, bounces=1)),
+        "the diffusion equation": (solved, dataclasses.replace(even, diffuser=ShapeDiffuser())),
+        "the same and a bounce": (
+            solved,
+            dataclasses.replace(even, diffuser=ShapeDiffuser(), bounces=1),
+        ),
     }
 
 
@@ -205,23 +213,22 @@ def fitted(profile: sj.gaussians.AbstractProfile) -> sj.Material:
 
 
 def splats_of(body: Body) -> sj.Splats:
-    """Cover a body, its edges kept sharp, and its blocker: black splats so far away that no light
-    spreads to the body.
-    """
-    mesh = body.shape()
-    vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces)
-    if len(faces) == 12:  # of a box
-        vertices, faces = vertices[faces].reshape(-1, 3), np.arange(3 * len(faces)).reshape(-1, 3)
-    splats = covered(vertices, faces, body.count)
+    """Cover a body and its blocker: black splats so far away that no light spreads to the body."""
+    splats = covered(body.shape(), body.count)
     if body.blocker is None:
         return splats
     center, size = body.blocker
-    corners = np.asarray([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * (*size, 0) / 2
-    blocker = covered(corners + center, np.asarray([[0, 1, 2], [0, 2, 3]]), body.count // 4)
-    return jax.tree.map(lambda *parts: jnp.concatenate(parts), splats, blocker)
+    blocker = trimesh.creation.box([*size, BLOCKER_DEPTH]).apply_translation(center)
+    return jax.tree.map(
+        lambda *parts: jnp.concatenate(parts), splats, covered(blocker, body.count // 4)
+    )
 
 
-def covered(vertices: np.ndarray, faces: np.ndarray, count: int) -> sj.Splats:
+def covered(mesh: trimesh.Trimesh, count: int) -> sj.Splats:
+    """Cover a mesh, the edges of a box kept sharp."""
+    vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces)
+    if len(faces) == 12:  # of a box
+        vertices, faces = vertices[faces].reshape(-1, 3), np.arange(3 * len(faces)).reshape(-1, 3)
     return sample_mesh(Mesh(vertices, faces, vertex_normals(vertices, faces)), count)
 
 
