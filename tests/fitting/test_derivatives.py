@@ -224,7 +224,7 @@ def test_the_least_count_that_reaches_an_error(float64):
         (lambda: by_count.least(1e-6), "error is 1e-06, and 4 Gaussians"),
         (
             lambda: fit_gaussians(MARBLE, LeastCount(wanted), start=by_count.start(3)),
-            r"start is given, and LeastCount\(",
+            r"start is given .*LeastCount\(",
         ),
         (
             lambda: eqx.filter_jit(lambda found: found.least(0.1))(by_count),
