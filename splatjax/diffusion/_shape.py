@@ -41,7 +41,8 @@ class ShapeDiffuser(AbstractDiffuser):
       escape.
     - `z_e = 0.7104 (1 + 3 C2) / (1 - 2 C1) / sigma_s'`, of the internal reflectance.
     - Q is light scattered once along the beams, each as long as its path through the body. A part
-      of it leaves before it diffuses: the difference of Hopf's function from its limit.
+      of it leaves before it diffuses, at either end: the difference of Hopf's function from its
+      limit. With absorption another part is absorbed before it diffuses.
     - Light `J` that enters again after a bounce is uniform, so the fluence and its slope on the
       surface are `phi + z_e dphi/dn = 4 J / (1 - 2 C1)`.
 

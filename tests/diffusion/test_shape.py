@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import trimesh
 from scipy.optimize import brentq
 from scipy.special import eval_legendre, spherical_in
 
@@ -26,7 +27,7 @@ BANDS = np.asarray(
         [0.48609, 0.40593, 0.22693, 0.02800, 0.00299, 0.00126],
     ]
 )
-OF_TRANSPORT = np.asarray([0.004, 0.004, 0.025, 0.04, 0.08, 0.09])
+OF_TRANSPORT = np.asarray([0.006, 0.007, 0.025, 0.055, 0.065, 0.07])
 MERGED, OF_SLOPES = 3e-3, 0.06  # merged sums and their gradients, root mean squares
 OF_SERIES = 2e-3  # of 2,000 splats, over the brightest
 
@@ -69,7 +70,30 @@ def test_a_sphere_shines_as_in_light_transport(sphere, exitance):
     off = np.abs(means / BANDS - 1)
     assert np.all(off < OF_TRANSPORT[None]), off
     total = exitance @ np.asarray(sphere.areas) / (np.pi * RADIUS**2)
-    np.testing.assert_allclose(total, [0.98209, 0.68486], rtol=0.008)
+    assert np.all(np.abs(total / [0.98209, 0.68486] - 1) < [1e-3, 0.0125])
+
+
+# Of slabs of 2 and 4 mean free paths under perpendicular light, albedo 0.98 and 0.9: what they
+# return, and let through scattered; by the integral equation of Milne, 800 layers.
+SLABS = {2.0: [[0.4787, 0.3616], [0.3148, 0.2212]], 4.0: [[0.6054, 0.4081], [0.2293, 0.1102]]}
+
+
+@pytest.mark.once
+@pytest.mark.parametrize("depth", [2.0, 4.0])
+def test_a_slab_returns_and_lets_through_what_light_transport_does(depth):
+    box = trimesh.creation.box([20, 20, depth])
+    vertices = np.asarray(box.vertices)[box.faces].reshape(-1, 3)
+    faces = np.arange(len(vertices)).reshape(-1, 3)
+    normals = sj.geometry.vertex_normals(vertices, faces)
+    splats = sj.geometry.sample_mesh(sj.geometry.Mesh(vertices, faces, normals), 4000)
+    splats = splats.take(jnp.asarray(compact_order(np.asarray(splats.centers))))
+    albedo = np.asarray([0.98, 0.9])
+    of_slab = sj.Medium(1 - albedo, albedo, np.ones(2))
+    exitance = np.asarray(solved(splats, of_slab, beams(splats), opening=0.25))
+    is_inner = np.all(np.abs(splats.centers[:, :2]) < 3, axis=1)
+    for side, expected in zip((1, -1), SLABS[depth], strict=True):
+        mean = exitance[:, is_inner & (side * splats.normals[:, 2] > 0.5)].mean(axis=1)
+        np.testing.assert_allclose(mean, expected, rtol=0.025)
 
 
 def test_a_sphere_that_absorbs_nothing_loses_what_it_does_not_scatter(sphere):
@@ -124,8 +148,15 @@ def diffused_on_sphere(albedo: float, angle: np.ndarray) -> np.ndarray:
 
     def early(tau):
         hopf = 0.08948 * np.exp(-2.11533 * tau) + 0.04361 * np.exp(-16.63774 * tau)
-        held = np.polyval([21.05, -26.29, 18.23, -6.38, 1], lost)
+        held = np.polyval([25.38, -24.39, 13.76, 0, 1], lost)
         return held * hopf / (tau + z_e)
+
+    def leaving(way, cosine):
+        """Light of one beam that leaves at its entry, and there or at its exit."""
+        length = 2 * RADIUS * cosine
+        bend = np.clip(1 - 2 * cosine**2, 0, 1)  # the normals at both ends, multiplied
+        at_entry = early(SIGMA_T * way * cosine * (1 - bend * way / length))
+        return at_entry, at_entry + (1 - bend) * early(SIGMA_T * (length - way) * cosine)
 
     x, of_x = np.polynomial.legendre.leggauss(200)
     u = (1 - x) / 2
@@ -134,7 +165,8 @@ def diffused_on_sphere(albedo: float, angle: np.ndarray) -> np.ndarray:
     entry = np.sqrt(RADIUS**2 - r[:, None] ** 2 * (1 - mu**2))  # R mu_0
     way = entry - r[:, None] * mu
     source = SIGMA_T * albedo * np.exp(-SIGMA_T * way)
-    source = source * (1 - early(SIGMA_T * way * entry / RADIUS))
+    source = source * (1 - leaving(way, entry / RADIUS)[1])
+    source = source * (1 - lost**2 * (0.53 + 0.265 * lost**2))
     # Case's discrete eigenvalue.
     kappa = SIGMA_T * brentq(lambda k: albedo * np.arctanh(k) - k, lost, 1 - 1e-9)
     exitance = np.zeros_like(angle)
@@ -147,7 +179,8 @@ def diffused_on_sphere(albedo: float, angle: np.ndarray) -> np.ndarray:
     # What leaves at once.
     cosine = np.maximum(np.cos(angle), 0)[:, None]
     t = RADIUS * cosine * (x + 1)
-    at_once = SIGMA_T * albedo * np.exp(-SIGMA_T * t) * early(SIGMA_T * t * cosine)
+    at_once = SIGMA_T * albedo * np.exp(-SIGMA_T * t)
+    at_once = at_once * leaving(t, np.maximum(cosine, 1e-9))[0]
     return exitance + (at_once * of_x * RADIUS * cosine**2).sum(1)
 
 
@@ -158,7 +191,7 @@ def test_the_solution_on_a_sphere_converges_to_the_series():
         splats = bodies.sphere(count, RADIUS, jitter=0.0)
         exitance = np.asarray(solved(splats, medium(), beams(splats), 1e-6))
         series = np.stack([diffused_on_sphere(a, np.radians(angles(splats))) for a in ALBEDO])
-        is_even = np.abs(angles(splats) - 50) < 30  # away from the points' poles and the terminator
+        is_even = np.abs(angles(splats) - 45) < 25  # away from the points' poles and the terminator
         errors.append(np.abs(exitance - series)[:, is_even].max() / series.max())
     assert errors[1] < OF_SERIES
     assert errors[1] < errors[0] / 2
