@@ -70,6 +70,8 @@ class Materials:
             figure = plot_pictures(lines, [""] * _ACROSS, white=_WHITE, inches=1.6)
             for axes, (name, *_, source) in zip(figure.axes, rows, strict=False):
                 axes.set_title(f"{name}\n{source}", fontsize=6)
+            for axes in figure.axes[len(rows) :]:
+                axes.set_visible(False)
             save_figure(figure, self.pictures)
 
 
