@@ -179,7 +179,8 @@ class ClusterPlan(AbstractDiffusionPlan):
 
         # The needed over the planned capacity.
         around = _target_boxes(points, sources.areas), source_boxes(below)
-        reaches = jnp.sqrt(2 * self.kernels.largest * jax.lax.stop_gradient(own))
+        largest = self.kernels.largest.astype(own.dtype)
+        reaches = jnp.sqrt(2 * largest * jax.lax.stop_gradient(own))
         planned = self.variances[: len(variances)]
         factors = jnp.maximum(planned / variances, variances / planned)
         varied = jnp.max(factors, initial=0) / (self.margin * (1 + 1e-6))
