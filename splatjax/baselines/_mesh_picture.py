@@ -90,7 +90,7 @@ def render_texture_space(
     - `plan`: from `plan_texture_space`; needed under `jit`, `grad` and `vmap`, made here otherwise.
 
     **Returns:** a `TextureSpacePicture` in the dtype of `mesh.vertices`; NaN where the plan does
-    not suffice, and its frame's `overflow` says so.
+    not suffice, and `overflow` of its frame is above 0.
 
     **Raises:** `ValueError` when a plan is needed and not given, or as `plan_texture_space` does.
 
