@@ -41,7 +41,7 @@ _COLUMNS = {
     "specular": [("specular",)],
     "roughness": [("roughness",)],
 }
-_WEIGHT = re.compile(r"weight_[1-9]\d{0,3}_[1-9]\d{0,3}")
+_WEIGHT = re.compile(r"weight_([1-9]\d{0,3})_([1-9]\d{0,3})")
 _POWERS = {"centers": 1, "radii": 1, "areas": 2}  # of the unit of length
 _VALID = {
     "centers": (lambda x: np.abs(x) <= _LONGEST, "within 1e9 mm (what is mm_per_unit?)"),
@@ -242,9 +242,8 @@ def _splat_fields(
                 f"{path}: its vertices have {', '.join(single) or 'no rows'}, and not all of "
                 f"{' '.join(names)}; write all of them"
             )
-    factors = sorted(
-        (tuple(map(int, name.split("_")[1:])), name) for name in single if _WEIGHT.fullmatch(name)
-    )
+    matches = [match for match in map(_WEIGHT.fullmatch, single) if match]
+    factors = sorted((tuple(map(int, match.groups())), match[0]) for match in matches)
     fields["weights"] = None
     if factors:
         shape = factors[-1][0]
