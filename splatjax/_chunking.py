@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, DTypeLike, Float, Int, PyTree, Shaped
 
+from splatjax._precision import full_precision
 from splatjax.cache import reuse_capacity
 
 Result = TypeVar("Result", bound=PyTree)
@@ -168,6 +169,7 @@ def jit_unless_traced(function: Function) -> Function:
     compiled = eqx.filter_jit(function, inline=True)  # ty: ignore[no-matching-overload]
 
     @functools.wraps(function)
+    @full_precision
     def called(*arguments, **named):  # a plain function, so that classes bind it as a method
         return compiled(*arguments, **named)
 

@@ -30,6 +30,8 @@ from jax.core import Tracer
 from jax.experimental.serialize_executable import deserialize_and_load, serialize
 from jax.tree_util import PyTreeDef
 
+from splatjax._precision import full_precision
+
 Function = TypeVar("Function", bound=Callable)
 
 _LARGEST = 1 << 30  # bytes in the folder, beyond which what was not used for longest is deleted
@@ -128,6 +130,7 @@ def kept_jit(function: Function) -> Function:
     compiled = eqx.filter_jit(function)
 
     @functools.wraps(function)
+    @full_precision
     def called(*arguments):
         path = _path(function, arguments, by_values=False)
         if path is None:

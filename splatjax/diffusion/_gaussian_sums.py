@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from splatjax._chunking import zeros_after
+from splatjax._precision import full_precision
 
 from ._kernel import TruncatedGaussian
 from ._neighbors import Lanes, Lists
@@ -162,6 +163,7 @@ def _forward(given: _Sweep, points, table: SourceTable):
     return given.sums(points, table, add)
 
 
+@full_precision
 def _backward(residuals, cotangents):
     """Compute the cotangents of points and sources from those of the sums.
 

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from splatjax._combination import PartByPart
+from splatjax._precision import full_precision
 
 from ._clustered import (
     ClusterDiffuser,
@@ -105,6 +106,7 @@ class StreamedDiffusion:
         return _sum(self.points, below, clusters, self.variances, self.kernels, lists)
 
 
+@full_precision
 @eqx.filter_jit
 def _sum(points, below: SunkSources, clusters: LayerSources, variances, kernels, lists: Lists):
     table = source_table(below, variances, clusters.layers, moments=False)

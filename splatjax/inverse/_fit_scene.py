@@ -10,6 +10,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float, PyTree
 
+from splatjax._precision import full_precision
 from splatjax._records import as_floats
 from splatjax.render import Plan, RenderSettings, render
 from splatjax.scene import AbstractLight, Camera, Material, Splats
@@ -101,6 +102,7 @@ class Evaluation(eqx.Module):
     counted: Float[Array, "height width"]
 
 
+@full_precision
 @eqx.filter_jit
 def evaluate(
     x: Coordinates,
@@ -125,6 +127,7 @@ def evaluate(
     return Evaluation(value, gradient, frame.overflow, frame.beauty, counted)
 
 
+@full_precision
 @eqx.filter_jit
 def advance(
     x: Coordinates,

@@ -10,6 +10,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, DTypeLike, Float, Int
 
+from splatjax._precision import full_precision
 from splatjax.diffusion import resolved_fraction
 from splatjax.fitting import AbstractModel, AbstractWeights, GivenVariances, fit_gaussians
 from splatjax.gaussians import AbstractProfile, SumOfGaussians
@@ -257,6 +258,7 @@ def _with_points(picture: DiffusionBasis, kept: np.ndarray, dtype: DTypeLike) ->
     )
 
 
+@full_precision
 @eqx.filter_jit
 def search(
     problem: RecoveryProblem, start: Float[Array, " unknowns"]
@@ -300,6 +302,7 @@ class Solution(eqx.Module):
     unresolved: Float[Array, " channels"]
 
 
+@full_precision
 @eqx.filter_jit
 def solution(problem: RecoveryProblem, point: Float[Array, " unknowns"]) -> Solution:
     """Compute the pictures at a point, and the information about each unknown and the transition to

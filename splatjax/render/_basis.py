@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from splatjax._precision import full_precision
 from splatjax.cache import kept_jit
 from splatjax.diffusion import LayersAtPoints
 from splatjax.gaussians import SumOfGaussians
@@ -108,6 +109,7 @@ def diffusion_basis(
     return eqx.tree_at(lambda basis: of_gaussians(basis.light), basis, rows, **is_leaf)
 
 
+@full_precision
 @eqx.filter_jit
 def _diffusion_basis(
     scene: Scene,
@@ -177,6 +179,7 @@ class RelightingBasis(eqx.Module):
     coverage: Float[Array, "height width"]
     overflow: Float[Array, ""]
 
+    @full_precision
     @eqx.filter_jit
     def beauty(self, light: HarmonicLight) -> Float[Array, "height width channels"]:
         """Compute the picture that `render` makes under a light: a sum over its harmonics.

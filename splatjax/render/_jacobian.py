@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
+from splatjax._precision import full_precision
 from splatjax.diffusion import LayersAtPoints
 from splatjax.gaussians import SumOfGaussians
 from splatjax.scene import Camera, Frame, Scene
@@ -121,6 +122,7 @@ def picture_jacobian(
     return PictureJacobian(own.frame(found.frame), *rows)
 
 
+@full_precision
 @eqx.filter_jit
 def _picture_jacobian(
     scene: Scene, camera: Camera, settings: RenderSettings, plan: Plan

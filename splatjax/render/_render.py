@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from splatjax._chunking import take_points
 from splatjax._combination import lay_out
+from splatjax._precision import full_precision
 from splatjax.cache import kept_jit
 from splatjax.scene import Camera, Frame, Scene
 
@@ -183,6 +184,7 @@ def compute_irradiance(
     return _compute_irradiance(scene, plan, settings)
 
 
+@full_precision
 @eqx.filter_jit
 def _compute_irradiance(scene: Scene, plan: Plan, settings: RenderSettings) -> Irradiance:
     def passes(combination, scene, plan):
@@ -238,6 +240,7 @@ def diffuse_irradiance(
     return _diffuse_irradiance(scene, irradiance, camera, settings, plan)
 
 
+@full_precision
 @eqx.filter_jit
 def _diffuse_irradiance(
     scene: Scene, irradiance, camera: Camera, settings: RenderSettings, plan: Plan

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float, Int
 
 from splatjax import diffusion as _diffusion, splatting as _splatting
 from splatjax._combination import PartByPart
+from splatjax._precision import full_precision
 from splatjax.scene import (
     AbstractLight,
     Camera,
@@ -208,6 +209,7 @@ def _sum_views(
     return [sums for sums, _ in summed]
 
 
+@full_precision
 @eqx.filter_jit
 def _light(
     scene: Scene,
@@ -229,6 +231,7 @@ def _light(
     return light, irradiance_at_splats(scene, light)
 
 
+@full_precision
 @eqx.filter_jit
 def _sample(
     sums: _splatting.FragmentSums,
@@ -242,6 +245,7 @@ def _sample(
     return visible, map_places(sample, visible.sums, visible.tiles)
 
 
+@full_precision
 @eqx.filter_jit
 def _shade(
     scene: Scene,

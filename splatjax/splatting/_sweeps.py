@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from splatjax._chunking import jit_unless_traced, needed_over_planned, zeros_after
 from splatjax._combination import AbstractCombination
+from splatjax._precision import full_precision
 
 from ._bins import Bins, scatter_slots
 from ._fragments import Lanes, Slots, Sweep, second_limits
@@ -99,6 +100,7 @@ def _sum_fwd(sweep, capacity, combination, bins, shift, planes, attributes):
     return sums, (bins, shift, planes, attributes, spans)
 
 
+@full_precision
 def _sum_bwd(sweep: Sweep, capacity: SurfaceCapacity, combination, residuals, cotangent):
     bins, shift, planes, attributes, spans = residuals
     part = PartSweep(sweep, bins, Slots.gathered(shift, planes, attributes, bins))

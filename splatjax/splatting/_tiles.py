@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, Int
 
 from splatjax._chunking import map_chunks, needed_over_planned, take_points, with_spare
 from splatjax._combination import AbstractCombination, OneDevice
+from splatjax._precision import full_precision
 from splatjax.cache import reuse_capacity
 from splatjax.scene import Splats
 
@@ -147,6 +148,7 @@ class TilePlan(AbstractRasterPlan):
         sweep, *binned = self._bin(splats, attributes, view, settings)
         return sum_tile_fragments(sweep, self.places, combination, *binned)
 
+    @full_precision
     @eqx.filter_jit
     def part_sweep(
         self,

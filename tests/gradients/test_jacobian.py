@@ -170,3 +170,24 @@ def test_the_fast_path_refuses_forward_mode_in_words():
     loss, point, (camera, _) = graph("fast")
     with pytest.raises(TypeError, match="forward-mode"):
         jax.jvp(lambda p: loss(p, camera), (point,), (point,))
+
+
+@pytest.mark.once
+@pytest.mark.parametrize("derivative", ["reverse", "jacobian"])
+def test_products_are_in_full_precision_on_every_device(derivative):
+    """The default of GPUs, 11 bits, makes a picture wrong by 2% and a derivative by all of it."""
+    start, camera = scene(single=False), view(*CAMERA)
+    plan = sj.make_plan(start, camera)
+    arrays, static = eqx.partition(start, eqx.is_inexact_array)
+
+    def loss(arrays):
+        return jnp.mean(sj.render(eqx.combine(arrays, static), camera, plan=plan).beauty)
+
+    def jacobian(arrays):
+        rows = sj.picture_jacobian(eqx.combine(arrays, static), camera, plan=plan)
+        return eqx.filter(rows, eqx.is_array)
+
+    program = jax.make_jaxpr(jax.grad(loss) if derivative == "reverse" else jacobian)(arrays)
+    products = str(program).count("dot_general[")
+    assert products > 5
+    assert str(program).count("precision=(Precision.HIGHEST, Precision.HIGHEST)") == products
