@@ -9,7 +9,7 @@ WORKERS ?= 2
 PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 LEAST_OPTIMIZATION := --xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false \
     --xla_cpu_parallel_codegen_split_count=1
-# Every worker of every run imports the same modules, with their shapes checked: whatever the shell says, bytecode is kept.
+# Every worker of every run imports the same modules, with their shapes checked: whatever the shell sets, bytecode is kept.
 unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: setup demo test test-float32 test-x64 test-once test-long random-scenes fuzz mutants lint bench lock docs figures notebooks \
@@ -38,6 +38,7 @@ lint: setup
 	$(BIN)/ruff format --check .
 	$(BIN)/ty check
 	$(BIN)/lint-imports
+	$(BIN)/typos
 
 test-float32: setup
 	$(PYTEST) -m "not once and not long"
@@ -81,7 +82,7 @@ bench: setup
 	$(BIN)/python -m benchmarks.shimmer
 
 # The site, in out/site: pages, the API from its docstrings, and the notebooks with what they print and draw. Notebooks are run
-# anew when they or the code have changed, which takes some minutes; `make -j2 docs` runs two at once. Most of that is XLA's, so
+# again when they or the code have changed, which takes some minutes; `make -j2 docs` runs two at once. Most of that is XLA's, so
 # they are compiled as in the tests: those that run longer than they compile as users have it.
 NOTEBOOKS := $(wildcard notebooks/*.py)
 SOURCES := $(shell find splatjax profiles -name '*.py' -o -name '*.toml')
@@ -130,7 +131,7 @@ release-check: setup
 	$(BIN)/hatchling build --target sdist --target wheel
 	$(BIN)/python tools/release_check.py
 
-# Written anew when dependencies change; hashes, no addresses. What docs and notebooks need besides is in locks of its own, so that
+# Rewritten when dependencies change; hashes, no addresses. What docs and notebooks need besides is in locks of its own, so that
 # setting up stays quick.
 COMPILE := $(BIN)/uv pip compile --python-version 3.11 --universal --generate-hashes --no-emit-index-url --no-emit-find-links \
     --no-annotate --no-header

@@ -93,10 +93,10 @@ def main() -> None:
             str(width),
         ]
         command += ["--repeats", str(options.repeats), *(["--frame-only"] if frame_only else [])]
-        *said, last = subprocess.run(
+        *lines, last = subprocess.run(
             command, stdout=subprocess.PIPE, text=True, check=True
         ).stdout.splitlines()
-        print("\n".join(said), end="\n" if said else "")
+        print("\n".join(lines), end="\n" if lines else "")
         found = [
             row | {"goal": GOALS.get((row["name"], splats, width))} for row in json.loads(last)
         ]

@@ -50,7 +50,7 @@ def arguments():
     parser.add_argument(
         "--refine",
         action="store_true",
-        help="also integrate with twice the samples, and tell the change",
+        help="also integrate with twice the samples, and print the change",
     )
     return parser.parse_args()
 
@@ -104,10 +104,10 @@ def methods(body: Body, light, camera, material: sj.Material, kernel) -> dict[st
         ),
     ):
         how = baselines.TextureSpaceSettings(MAP, stretch, thin, kernel)
-        room = baselines.plan_texture_space(body.mesh, (light,), material, camera, how)
+        texture_plan = baselines.plan_texture_space(body.mesh, (light,), material, camera, how)
         picture, seconds = timed(
-            lambda how=how, room=room: baselines.render_texture_space(
-                body.mesh, (light,), material, camera, how, room
+            lambda how=how, texture_plan=texture_plan: baselines.render_texture_space(
+                body.mesh, (light,), material, camera, how, texture_plan
             )
         )
         keep(name, picture.frame, seconds)
@@ -116,7 +116,7 @@ def methods(body: Body, light, camera, material: sj.Material, kernel) -> dict[st
             f"  weights that fell between the charts: {', '.join(f'{each:.1e}' for each in lost)}"
         )
         if float(picture.frame.overflow) > 0:
-            raise SystemExit("the plan does not hold its own scene")
+            raise SystemExit("the plan's capacity is exceeded by its own scene")
         frame = (
             picture.frame
         )  # its buffers, but for the layers, are those of any way of spreading light

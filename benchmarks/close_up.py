@@ -68,7 +68,7 @@ def arguments():
         "--noise",
         type=float,
         default=0.01,
-        help="over a picture's root mean square, told (default %(default)s)",
+        help="over a picture's root mean square, printed (default %(default)s)",
     )
     parser.add_argument(
         "--otherwise",
@@ -128,7 +128,7 @@ def cameras(
     return whole, close
 
 
-def told(
+def print_row(
     found: sj.inverse.Recovery | sj.inverse.Estimate,
     medium: sj.Medium,
     name: str,
@@ -193,7 +193,7 @@ def main() -> None:
                     model=sj.fitting.DiffusionModel(),
                 )
                 print(f"\n{name} from {' and '.join(case)}, {time.perf_counter() - begin:.0f} s:")
-                rows.append(told(found, medium, name, case))
+                rows.append(print_row(found, medium, name, case))
                 if len(case) == 1:
                     apart[case[0]] = found
                 Path("out/close_up.json").write_text(json.dumps(rows, indent=1) + "\n")
@@ -201,7 +201,7 @@ def main() -> None:
                 closest = [title for title in (HEAD, LASER, LAMP) if title in apart][:2]
                 print(f"\n{name} from {' and '.join(closest)}, each searched apart, combined:")
                 rows.append(
-                    told(
+                    print_row(
                         sj.inverse.combined([apart[title] for title in closest]),
                         medium,
                         name,

@@ -22,7 +22,7 @@ def write_cloud(path: Path, mesh: Mesh, textures: Textures, count: int) -> None:
     """Write splats that cover a mesh, of one area and with its albedo, neighbors near each other,
     as `SplatFile` reads them.
 
-    Triangles go along a Morton curve, and each gives as many splats as its area asks for. The order
+    Triangles go along a Morton curve, and each gives as many splats as its area needs. The order
     within it is that of the cuts. Splats lie on the mesh bent along its normals: they are so small
     that they would show its flat triangles. Memory does not grow with their number.
     """

@@ -50,7 +50,7 @@ class View:
 
     tiles: int
     front: int
-    """Tiles with a surface in front that a plan has room for."""
+    """Tiles with a surface in front that fit into a plan."""
     behind: int
     """Tiles in which a surface shows behind the front."""
 

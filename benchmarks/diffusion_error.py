@@ -124,8 +124,8 @@ def main() -> None:
         body = eqx.tree_at(lambda s: s.radii, body, jnp.where(plan.exists, body.radii, 0))
         seen, _ = plan.raster.choose(body, view)
 
-        def diffuse(placed, wanted, plan=plan):
-            return plan.diffusion.diffuse(placed, gaussians.variances, kernel, OneDevice(), wanted)
+        def diffuse(placed, targets, plan=plan):
+            return plan.diffusion.diffuse(placed, gaussians.variances, kernel, OneDevice(), targets)
 
         _, seconds = timed(diffuse, placed, seen)
         diffused, all_seconds = timed(diffuse, placed, None)

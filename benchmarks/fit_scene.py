@@ -81,7 +81,7 @@ def main() -> None:
         optimizer = optax.adam(optax.cosine_decay_schedule(2.0, options.steps), b2=0.9)
         times, programs = [], []
 
-        def progress(said, loss):
+        def progress(message, loss):
             times.append(time.perf_counter())
             programs.append(compiled.count)
 

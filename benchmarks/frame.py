@@ -47,7 +47,7 @@ def rasterization(scene: sj.Scene, camera: sj.Camera, plan: sj.Plan, settings: s
     """Passes 2 and 3 with normals and albedo, and the gradient of the picture's mean square in all
     that they read.
 
-    The picture is what the yardstick makes, and coverage: the front laid over what shows behind it.
+    The picture is what the yardstick makes, and coverage: the front over what shows behind it.
     """
     areas = scene.splats.areas
 

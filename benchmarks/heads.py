@@ -47,7 +47,7 @@ def scanned() -> tuple[Mesh, Textures]:
 
 
 def bust() -> tuple[Mesh, Textures]:
-    """Give the bust's head, its colors laid out by its own coordinates."""
+    """Give the bust's head, its colors placed by its own coordinates."""
     mesh, textures = baselines.bust_with_textures(MAP)
     return before_the_camera(mesh), textures
 

@@ -329,7 +329,7 @@ def tell_descent(descent: list[list[dict]], pairs: np.ndarray) -> None:
     there.
     """
     for reach in (0.2, 0.1, 0.05, 0.03):
-        said = []
+        times = []
         for paths, (a, s) in zip(descent, pairs, strict=True):
             for path in paths:
                 wrong = [
@@ -337,10 +337,10 @@ def tell_descent(descent: list[list[dict]], pairs: np.ndarray) -> None:
                 ]
                 outside = [i for i, each in enumerate(wrong) if each > reach]
                 last = outside[-1] + 1 if outside else 0
-                said.append(f"{path[last]['seconds']:.0f} s" if last < len(path) else "never")
+                times.append(f"{path[last]['seconds']:.0f} s" if last < len(path) else "never")
         print(
             f"  prbvolpath within {100 * reach:.0f}% (red, red, green, green, blue, blue from both "
-            f"starts): {', '.join(said)}"
+            f"starts): {', '.join(times)}"
         )
     for c, paths in enumerate(descent):
         for path in paths:

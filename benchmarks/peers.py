@@ -3,7 +3,7 @@
 Pulsar blends spheres of the splats' radii and colors by depth, with no normals, no attributes and
 no light: less than passes 2 and 3 do here. `PointsRasterizer` lists the nearest points of every
 pixel and blends nothing; on a CPU it tries every point in every pixel, so it gets fewer splats and
-pixels. Both are differentiable. Told beside each time is how much of the picture is covered: about
+pixels. Both are differentiable. Beside each time is how much of the picture is covered: about
 the same, or it is not the same picture.
 """
 
@@ -51,7 +51,7 @@ def arguments():
     return parser.parse_args()
 
 
-def tell(name: str, run, coverage) -> None:
+def report(name: str, run, coverage) -> None:
     """Run twice, and time the second: the first compiles, or finds its memory."""
     run()
     start = time.perf_counter()
@@ -68,7 +68,7 @@ def splatjax(data: dict[str, np.ndarray], width: int) -> None:
     plan = sj.make_plan(scene, camera)
     forward, _, inputs = rasterization(scene, camera, plan, sj.RenderSettings())
     compiled = jax.jit(forward).lower(*inputs).compile()
-    tell(
+    report(
         f"splatjax, passes 2+3 with normals and albedo, {len(data['p'])} splats at {width}^2",
         lambda: jax.block_until_ready(compiled(*inputs)),
         lambda found: np.mean(np.asarray(found[-1]) > 0.5),
@@ -83,7 +83,7 @@ def pulsar(data: dict[str, np.ndarray], width: int) -> None:
     )  # position, rotation, focal length, sensor's width
     spheres = [torch.from_numpy(data[name]) for name in ("p", "col", "r")]
     farthest = float(data["p"][:, 2].max()) + 10
-    tell(
+    report(
         f"Pulsar, colors, {count} spheres at {width}^2",
         lambda: renderer(*spheres, camera, _GAMMA, farthest),
         lambda picture: (picture.sum(dim=-1) > 0).float().mean().item(),
@@ -97,7 +97,7 @@ def points(data: dict[str, np.ndarray], width: int) -> None:
     )  # x to the left, y up, edges at 1
     cloud = Pointclouds([torch.from_numpy(places)])
     radii = torch.from_numpy(data["r"] * scale[:, 0])
-    tell(
+    report(
         f"PointsRasterizer, {_NEAREST} nearest of each pixel, {len(places)} points at {width}^2",
         lambda: rasterize_points(cloud, width, radii, _NEAREST),
         lambda found: (found[0][..., 0] >= 0).float().mean().item(),

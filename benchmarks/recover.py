@@ -173,7 +173,7 @@ def main() -> None:
         found = sj.inverse.recover(observations, splats, begin, model=sj.fitting.DiffusionModel())
         return found, time.perf_counter() - start, compiled.count - before
 
-    def tell(name, case, found, seconds, programs, medium):
+    def report(name, case, found, seconds, programs, medium):
         off, bars = errors(found, medium), np.stack(found.relative_errors())
         a, s = (
             ", ".join(
@@ -213,12 +213,12 @@ def main() -> None:
             pictures = rendered(splats, camera, lights, medium, 6, FINE)
             begin = starts(medium, options.off)
             found, *cost = recover(pictures, begin)
-            tell(name, "same path", found, *cost, medium)
+            report(name, "same path", found, *cost, medium)
             for path in options.otherwise:
                 others, _ = white(options.body, 2 * options.splats, options.width)
                 seen = rendered(others, camera, lights, medium, 8, OTHERWISE[path])
                 found, *cost = recover(seen, begin)
-                tell(name, f"{path}, twice the splats, eight Gaussians", found, *cost, medium)
+                report(name, f"{path}, twice the splats, eight Gaussians", found, *cost, medium)
             rng, pulls, seconds, programs, steps = np.random.default_rng(0), [], [], [], []
             for draw in range(options.draws):
                 sizes = [options.noise * np.sqrt(np.mean(picture**2)) for picture in pictures]
@@ -243,10 +243,10 @@ def main() -> None:
                         ]
                     )
                 )
-                said = np.array2string(pulls[-1][0], precision=1, separator=" ").replace("\n", "")
+                pull = np.array2string(pulls[-1][0], precision=1, separator=" ").replace("\n", "")
                 print(
                     f"{name}, draw {draw + 1}: {cost[0]:.1f} s, {cost[1]} programs; off by "
-                    f"deviations {said}",
+                    f"deviations {pull}",
                     flush=True,
                 )
             if pulls:

@@ -53,7 +53,7 @@ def arguments():
 
 
 class Stages:
-    """CPU time by what is done, of all threads: `render_streamed` tells."""
+    """CPU time by what is done, of all threads: as `render_streamed` reports it."""
 
     def __init__(self, total: int):
         self.total, self.seconds, self.mark = total, {}, time.process_time()
@@ -69,8 +69,8 @@ class Stages:
 def peak() -> float:
     """Print the CPU time of this process, and give the most memory that it has held, GB."""
     print(f"  {'in all':30}{time.process_time():9.0f} s of CPU time", flush=True)
-    said = Path("/proc/self/status").read_text(encoding="ascii")
-    return 1e-6 * float(said.split("VmHWM:")[1].split()[0])
+    text = Path("/proc/self/status").read_text(encoding="ascii")
+    return 1e-6 * float(text.split("VmHWM:")[1].split()[0])
 
 
 def written(path: Path, body: str, splats: int) -> float:
@@ -128,8 +128,8 @@ def compare(one: Path, other: Path) -> None:
         for i, (x, y) in enumerate(zip(whole["layers"], parts["layers"], strict=True), 1):
             lit = np.any(x > 0, axis=2)
             off = np.abs(x - y).max(axis=2)[lit] / np.sqrt(np.mean(x[lit] ** 2))
-            said = ", ".join(f"{np.quantile(off, share):.1e}" for share in (0.5, 0.99, 1.0))
-            print(f"  layer {i}: half of its pixels, 99% and all differ by less than {said}")
+            quantiles = ", ".join(f"{np.quantile(off, share):.1e}" for share in (0.5, 0.99, 1.0))
+            print(f"  layer {i}: half of its pixels, 99% and all differ by less than {quantiles}")
 
 
 def alone(task: Callable[..., float], *inputs) -> float:

@@ -1,8 +1,8 @@
 """How much a layer errs that is made of fewer splats: `python -m benchmarks.thinning`.
 
 Splats are left out evenly, at random, or merged into clusters; of the bust and of the scanned head,
-under three lights with shadows. The factor of each law is fitted on the bust alone. Told is how far
-it is off on both.
+under three lights with shadows. The factor of each law is fitted on the bust alone. Printed is its
+error on both.
 """
 
 import argparse

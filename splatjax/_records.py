@@ -215,16 +215,16 @@ def _shaped(where: str, array: Array, axes: list[str], lengths: dict[str, int]) 
         return jnp.broadcast_to(array, [lengths[axis] for axis in axes])
     if array.ndim == len(axes) - 1 and axes[-1].lstrip("#") == "channels":
         array = array[..., None]
-    wanted = [int(axis) if axis.isdigit() else lengths.get(axis, axis) for axis in axes]
+    required = [int(axis) if axis.isdigit() else lengths.get(axis, axis) for axis in axes]
     # A string is an axis whose length no other field gives.
     matches = [
         own == length or isinstance(length, str)
-        for own, length in zip(array.shape, wanted, strict=False)
+        for own, length in zip(array.shape, required, strict=False)
     ]
     if array.ndim != len(axes) or not all(matches):
         raise ValueError(
             f"{where} has shape {list(array.shape)}; give it [{', '.join(axes)}] = "
-            f"[{', '.join(map(str, wanted))}], like the other fields"
+            f"[{', '.join(map(str, required))}], like the other fields"
             f"{' (make batches by jax.vmap)' if array.ndim > len(axes) else ''}"
         )
     lengths |= dict(zip(axes, array.shape, strict=True))

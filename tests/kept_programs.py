@@ -1,5 +1,5 @@
 """Two functions that are kept, and a list of what is made. As a program, both are called with the
-folder it is given; killed before its first file has a name, where it is told to be.
+folder it is given; killed before its first file has a name, at a given moment.
 """
 
 import os

@@ -1,5 +1,5 @@
 """How large the programs are that a user waits for: planning, a picture and its gradient. To grow
-beyond the committed table is a decision: `SPLATJAX_BUDGET=write` writes it anew.
+beyond the committed table is a decision: `SPLATJAX_BUDGET=write` rewrites it.
 """
 
 import json
@@ -47,7 +47,7 @@ def test_programs_are_within_the_committed_budget(compiled):
     if os.environ.get("SPLATJAX_BUDGET") == "write":
         TABLE.write_text(json.dumps({"jaxlib": version("jaxlib"), **found}, indent=2) + "\n")
     table = json.loads(TABLE.read_text())
-    # Where another jaxlib is locked, the table is written anew.
+    # Where another jaxlib is locked, the table is rewritten.
     assert f"jaxlib=={table['jaxlib']} " in LOCK.read_text(), "count again: SPLATJAX_BUDGET=write"
     if table["jaxlib"] != version("jaxlib"):
         pytest.skip(f"the budget was counted with jaxlib {table['jaxlib']}")

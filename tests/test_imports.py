@@ -39,10 +39,10 @@ print(json.dumps(sorted(sys.modules)))
 import splatjax.cli
 assert before == jax.config.values
 """
-    said = subprocess.run(
+    output = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, check=True
     ).stdout
-    assert [name for name in LATER if name in json.loads(said)] == []
+    assert [name for name in LATER if name in json.loads(output)] == []
 
 
 def test_public_names_are_few_and_submodules_documented():

@@ -24,7 +24,7 @@ LONG = {
     "which_profile",
     *(f"figure_{number}" for number in (1, 4, 5, 6, 7, 8)),  # Figure 3 has no picture to render
 }
-# They are compiled as users have it, whatever the shell says.
+# They are compiled as users have it, whatever the shell sets.
 RUN_LONGER_THAN_THEY_COMPILE = {"shape_from_shading", "which_profile"}
 
 

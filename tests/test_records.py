@@ -125,7 +125,7 @@ def test_traced_values_and_placeholders_pass_through_transformations():
 
 
 @pytest.mark.parametrize(
-    ("make", "said"),
+    ("make", "message"),
     [
         (
             lambda: sj.scattering.Multipole(medium()),
@@ -261,9 +261,9 @@ def test_traced_values_and_placeholders_pass_through_transformations():
         ),
     ],
 )
-def test_nonsense_is_refused_by_name_and_value(make, said):
-    kind = TypeError if "positional" in said else ValueError
-    with pytest.raises(kind, match=said):
+def test_nonsense_is_refused_by_name_and_value(make, message):
+    kind = TypeError if "positional" in message else ValueError
+    with pytest.raises(kind, match=message):
         make()
 
 

@@ -1,8 +1,8 @@
 """Make the pictures of docs/gallery.md: `python tools/make_gallery.py [name ...] [--head
 head.ply]`, all of them by default.
 
-They land in out/gallery. Those of skin show a scanned head where one is given (docs/gallery.md says
-how it is sampled), and the built-in bust otherwise.
+They land in out/gallery. Those of skin show a scanned head where one is given (docs/gallery.md
+describes how it is sampled), and the built-in bust otherwise.
 """
 
 import argparse

@@ -86,9 +86,7 @@ def blur_along(
 
 
 def _rate(variance: Float[Array, "height width"]) -> Float[Array, "height width"]:
-    """Find the `rate` of weights `exp(-rate s^2)` on whole pixels whose variance is as asked
-    for.
-    """
+    """Find the `rate` of weights `exp(-rate s^2)` on whole pixels that have a given variance."""
     narrow = variance < 0.5
     v = jnp.where(narrow, variance, 0.25)
     q = v / (2 * (1 - v))  # exp(-rate): of three taps the variance is 2 q / (1 + 2 q)

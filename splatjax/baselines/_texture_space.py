@@ -19,7 +19,7 @@ from ._mesh_raster import Landing, see_faces
 from ._textured_mesh import SurfaceTexels, TexturedMesh, look_up_charts, surface_texels
 from ._translucent import AbstractThinParts, FarSide, TranslucentShadowMap
 
-# share of the texels whose blur is as wide as asked for; what is wider than theirs is cut
+# share of the texels whose blur is as wide as required; what is wider than theirs is cut
 _WIDEST = 0.995
 _SUPPORT = 3.75  # standard deviations
 

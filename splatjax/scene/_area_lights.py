@@ -34,7 +34,7 @@ class AbstractAreaLight(AbstractExtendedLight, AbstractHighlight):
 
     @abc.abstractmethod
     def axes(self) -> Float[Array, "axes 3"]:
-        """Compute the axes along which the samples are laid out, mm: two of a flat light, which
+        """Compute the axes along which the samples are placed, mm: two of a flat light, which
         emits in the direction of their cross product, or three.
         """
 

@@ -115,7 +115,7 @@ class Splats(eqx.Module):
     Nearby splats should be near in memory, as `read_splats` and `sample_mesh` sort them. The order
     changes the time, not the picture.
 
-    **Attributes:** (all differentiable unless said otherwise)
+    **Attributes:** (all differentiable unless stated otherwise)
 
     - `centers`: mm. Visibility is discontinuous in them; coverage and shading are smooth.
     - `normals`: unit vectors, outward.

@@ -43,7 +43,7 @@ class SplattingSettings(eqx.Module):
 
 
 class Footprints(eqx.Module):
-    """The projected splats, one array per number. Pixels, origin top left, unless said otherwise.
+    """The projected splats, one array per number. Pixels, origin top left, unless stated otherwise.
 
     **Attributes:**
 

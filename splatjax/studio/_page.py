@@ -213,6 +213,6 @@ class Page:
             return ""
         self._show(session.picture(controls))
         while self._saves:
-            kind, asked = self._saves.pop(0)
-            written += save(session, asked, *self._where, kind)
+            kind, saved = self._saves.pop(0)
+            written += save(session, saved, *self._where, kind)
         return f"saved {', '.join(path.name for path in written)}" if written else ""

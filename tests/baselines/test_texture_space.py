@@ -115,7 +115,7 @@ def test_bad_input_is_refused(sheet):
     bare, lamp = plane(1.0), sj.PointLight(jnp.asarray([0.0, 0.0, 2.0]), jnp.ones(3))
     beyond = bare.uvs * [1.0, 2.0] + [0.0, 0.05]
     render = jax.jit(lambda mesh: baselines.render_texture_space(mesh, lights, DULL, camera))
-    for refused, said in (
+    for refused, message in (
         (
             lambda: baselines.TexturedMesh.of(
                 sj.geometry.Mesh(bare.vertices, bare.faces, bare.normals)
@@ -132,7 +132,7 @@ def test_bad_input_is_refused(sheet):
         ),
         (lambda: render(mesh), "plan"),
     ):
-        bodies.assert_refused(refused, said)
+        bodies.assert_refused(refused, message)
 
 
 def slab(thickness: float) -> sj.geometry.Mesh:

@@ -1,5 +1,5 @@
 """`splatjax` with plain renderers, as test_processes.py starts it several times over; killed where
-it is told to be.
+at a given moment.
 """
 
 import os

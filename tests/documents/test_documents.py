@@ -97,8 +97,8 @@ others = sorted(
 @pytest.mark.parametrize("command", typed)
 def test_the_command_line_understands(command):
     given = words(command)
-    said = {"--help", "--version", "--tyro-print-completion"} & set(given)
-    with pytest.raises(SystemExit) if said else contextlib.nullcontext() as stopped:
+    stopping = {"--help", "--version", "--tyro-print-completion"} & set(given)
+    with pytest.raises(SystemExit) if stopping else contextlib.nullcontext() as stopped:
         parsed(given)
     assert stopped is None or not stopped.value.code
 
@@ -110,10 +110,10 @@ targets = set(
 
 @pytest.mark.parametrize("command", [command for command in others if command.startswith("make")])
 def test_make_has_such_a_target(command):
-    asked = [
+    used = [
         word for word in shlex.split(command)[1:] if not word.startswith("-") and "=" not in word
     ]
-    assert set(asked) <= targets
+    assert set(used) <= targets
 
 
 @pytest.mark.parametrize(
@@ -121,12 +121,12 @@ def test_make_has_such_a_target(command):
 )
 def test_a_workflow_makes_what_there_is(workflow):
     text = workflow.read_text(encoding="utf-8")
-    asked = set(re.findall(r"run: make ([a-z-]+)$", text, re.MULTILINE))
-    asked |= {
+    used = set(re.findall(r"run: make ([a-z-]+)$", text, re.MULTILINE))
+    used |= {
         target for several in re.findall(r"suite: \[(.*)\]", text) for target in several.split(", ")
     }
-    assert asked
-    assert asked <= targets
+    assert used
+    assert used <= targets
 
 
 @pytest.mark.parametrize("command", [command for command in others if command.startswith("python")])
@@ -156,7 +156,7 @@ def test_the_commands_of_a_page_run_one_after_the_other(page, tmp_path, monkeypa
     monkeypatch.chdir(tmp_path)
     lay_out(tmp_path, page.read_text(encoding="utf-8"))
     for body in fences(page, "toml"):
-        if file := re.match(r"# (\S+\.toml)\n", body):  # a file that a page says to write
+        if file := re.match(r"# (\S+\.toml)\n", body):  # a file that a page lists
             (tmp_path / file[1]).write_text(body, encoding="utf-8")
     for command in commands(page):
         given = words(command)

@@ -28,7 +28,7 @@ from splatjax.fitting import (
 from splatjax.fitting._problem import make_problem
 from splatjax.scattering import L2_QUADRATURE, Dipole, EganFresnel, Layer, Medium, Multipole
 
-# Asked of the derivative; central differences with steps of 1e-4 relative err by 1e-7.
+# Required of the derivative; central differences with steps of 1e-4 relative err by 1e-7.
 REFITS = 1e-4
 
 STEP = 1e-4
@@ -212,9 +212,9 @@ def test_the_least_count_that_reaches_an_error(float64):
     worst = np.max(np.asarray(by_count.error), axis=1)
     assert np.all(np.diff(worst) < 0)
     assert by_count.least(float(worst[2])) == 3
-    wanted = 1.01 * float(worst[2])
-    fitted = fit_gaussians(MARBLE, LeastCount(wanted, largest=4))
-    assert np.max(np.asarray(fitted.error)) <= wanted
+    required = 1.01 * float(worst[2])
+    fitted = fit_gaussians(MARBLE, LeastCount(required, largest=4))
+    assert np.max(np.asarray(fitted.error)) <= required
     assert fitted.gaussians.variances.shape == (3,)
     np.testing.assert_allclose(
         np.linalg.norm(fitted.error), np.linalg.norm(by_count.error[2]), rtol=1e-4
@@ -223,7 +223,7 @@ def test_the_least_count_that_reaches_an_error(float64):
     for refused, message in (
         (lambda: by_count.least(1e-6), "error is 1e-06, and 4 Gaussians"),
         (
-            lambda: fit_gaussians(MARBLE, LeastCount(wanted), start=by_count.start(3)),
+            lambda: fit_gaussians(MARBLE, LeastCount(required), start=by_count.start(3)),
             r"start is given .*LeastCount\(",
         ),
         (

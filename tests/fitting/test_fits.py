@@ -187,7 +187,7 @@ def test_layers_reach_the_best_known_errors(float64):
 
 
 def test_a_profile_without_a_norm_is_refused(dtype):
-    """Single scattering is infinite at the origin: Eq. 3 needs to be told where to start."""
+    """Single scattering is infinite at the origin: Eq. 3 needs a start radius."""
     for function in (fit_gaussians, lambda beam: relative_error(beam, sj.SumOfGaussians([1], [1]))):
         assert_refused(
             partial(function, PhotonBeam(MARBLE_GREEN)),

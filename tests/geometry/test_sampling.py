@@ -168,9 +168,9 @@ def test_normal_map_tilts_along_u_and_v(mirrored):
         np.asarray([0.6, 0.0, 0.8]) * np.ones((2, 2, 1)),
         np.asarray([0.0, 0.6, 0.8]) * np.ones((2, 2, 1)),
     )
-    worn = dataclasses.replace(mesh, uvs=mesh.uvs * [-1 if mirrored else 1, 1])
+    mapped = dataclasses.replace(mesh, uvs=mesh.uvs * [-1 if mirrored else 1, 1])
     along_u, along_v = (
-        np.asarray(sample_mesh(worn, 20, textures=Textures(normal=n)).normals) for n in tilt
+        np.asarray(sample_mesh(mapped, 20, textures=Textures(normal=n)).normals) for n in tilt
     )
     np.testing.assert_allclose(
         along_u, np.tile([-0.6 if mirrored else 0.6, 0, 0.8], (20, 1)), atol=1e-6
@@ -179,15 +179,15 @@ def test_normal_map_tilts_along_u_and_v(mirrored):
 
 
 @pytest.mark.parametrize(
-    ("mesh", "count", "textures", "said"),
+    ("mesh", "count", "textures", "message"),
     [
         (sphere(), 0, Textures(), "count is 0"),
         (FLAT, 10, Textures(), "no area"),
         (sphere(), 10, Textures(albedo=np.ones((2, 2, 3))), "no texture coordinates"),
     ],
 )
-def test_what_cannot_be_sampled_is_refused(mesh, count, textures, said):
-    assert_refused(lambda: sample_mesh(mesh, count, textures=textures), said)
+def test_what_cannot_be_sampled_is_refused(mesh, count, textures, message):
+    assert_refused(lambda: sample_mesh(mesh, count, textures=textures), message)
 
 
 def anywhere(mesh: Mesh, each: int = 20) -> SurfacePoints:

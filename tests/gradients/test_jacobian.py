@@ -17,7 +17,7 @@ import splatjax as sj
 pytestmark = [pytest.mark.slow, pytest.mark.once, pytest.mark.usefixtures("double")]
 
 SIZE = 32
-ROW_BY_ROW = 1e-5  # asked; 1e-12 measured
+ROW_BY_ROW = 1e-5  # required; 1e-12 measured
 
 
 def scene(single: bool) -> sj.Scene:

@@ -1,4 +1,4 @@
-"""What was moved comes back: albedo, lights, cameras, shape. What no picture tells of stays."""
+"""What was moved comes back: albedo, lights, cameras, shape. What no picture shows stays."""
 
 from functools import cache, partial
 
@@ -65,7 +65,7 @@ def evaluate(splats: sj.Splats, light: sj.DirectionalLight, picture=0.0, x=None)
 
 
 def observations(shots=None, x=None, **more) -> list[sj.inverse.Observation]:
-    """Pictures of the body, or of it at coordinates, under each light; said to be taken otherwise,
+    """Pictures of the body, or of it at coordinates, under each light; declared as taken otherwise,
     if that is given.
     """
     pictures = [np.asarray(evaluate(body(), light, x=x).beauty) for light in lights()]
@@ -205,7 +205,9 @@ class TestFitScene:
     def test_nothing_is_compiled_between_steps(self, compiled):
         counts = []
         fitted(
-            sj.inverse.AlbedoMap, steps=4, progress=lambda said, loss: counts.append(len(compiled))
+            sj.inverse.AlbedoMap,
+            steps=4,
+            progress=lambda message, loss: counts.append(len(compiled)),
         )
         assert counts[0] < counts[2]  # the listener hears what the first step compiles
         assert counts[2] == counts[-1]
@@ -248,12 +250,12 @@ def stand_in(monkeypatch, reach: float, spoiled: float = np.inf) -> list[float]:
 def lifted(
     target: float, resolution: int, spoilt=(), **more
 ) -> tuple[sj.inverse.FittedScene, list[str]]:
-    """Fit a stand-in that starts at 0.5; resolutions of shadow maps tell stand-ins apart that are
+    """Fit a stand-in that starts at 0.5; resolutions of shadow maps distinguish stand-ins that are
     otherwise alike to the compiler.
 
     A part of the picture is masked, and of another part nothing is known; some rows may be spoilt.
     """
-    splats, said = with_albedo(sphere(20), np.full((20, 2), 0.5)), []
+    splats, messages = with_albedo(sphere(20), np.full((20, 2), 0.5)), []
     picture = np.full((SIZE, SIZE, 2), target)
     picture[list(spoilt)] = 90.0
     picture[:5], picture[5, :, 1] = 90.0, np.nan
@@ -269,18 +271,18 @@ def lifted(
         optimizer,
         steps=40,
         settings=sj.RenderSettings(shadows=sj.splatting.ShadowSettings(resolution=resolution)),
-        progress=lambda s, loss: said.append(s),
+        progress=lambda s, loss: messages.append(s),
         **more,
     )
-    return found, said
+    return found, messages
 
 
 def test_a_scene_that_outgrows_its_plan_is_planned_anew(monkeypatch):
     made = stand_in(monkeypatch, reach=0.07)
-    found, said = lifted(0.8, 101)
+    found, messages = lifted(0.8, 101)
     assert found.plans == len(made) > 2
     assert (
-        sum("exceeds the capacity of its plan; planning again" in each for each in said)
+        sum("exceeds the capacity of its plan; planning again" in each for each in messages)
         == found.plans - 1
     )
     assert np.all(np.isfinite(found.losses))
@@ -321,7 +323,7 @@ def test_pixels_that_a_body_does_not_fill_count_before_black_alone():
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ({"parts": ()}, "got 1, 0 and 1"),
         ({"observations": (), "steps": 0}, "got 0, 1 and 0"),
@@ -341,7 +343,7 @@ def test_pixels_that_a_body_does_not_fill_count_before_black_alone():
         ),
     ],
 )
-def test_what_cannot_be_fitted_is_refused(change, said):
+def test_what_cannot_be_fitted_is_refused(change, message):
     picture = np.ones((SIZE, SIZE, change.pop("channels", 2)))
     intensity = change.pop("intensity", sj.inverse.KnownIntensity())
     arguments = {
@@ -356,7 +358,7 @@ def test_what_cannot_be_fitted_is_refused(change, said):
         lambda: sj.inverse.fit_scene(
             material=material(), optimizer=optax.adam(1.0), **(arguments | change)
         ),
-        said,
+        message,
     )
 
 

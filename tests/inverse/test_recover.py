@@ -307,7 +307,7 @@ def test_the_smooth_loss_bends():
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ({"observations": []}, "got 0 and 1"),
         ({"starts": [medium(), sj.Medium([0.1, 0.1], 1.0, 1.5)]}, r"starts\[1\]\.eta is \[1\.5"),
@@ -319,9 +319,9 @@ def test_the_smooth_loss_bends():
         ),
     ],
 )
-def test_what_cannot_be_recovered_is_refused(change, said):
+def test_what_cannot_be_recovered_is_refused(change, message):
     light = sj.DirectionalLight([0, 0, -1], [1, 1], cast_shadows=False)
     picture = np.ones((SIZE, SIZE, change.pop("channels", 2)))
     seen = [sj.inverse.Observation(picture, camera(), light)]
     arguments = {"observations": seen, "splats": bodies.sphere(60), "starts": medium()}
-    assert_refused(lambda: sj.inverse.recover(**(arguments | change)), said)
+    assert_refused(lambda: sj.inverse.recover(**(arguments | change)), message)

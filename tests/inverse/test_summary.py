@@ -66,7 +66,7 @@ def test_what_is_not_fixed_is_reported():
 
 
 @pytest.mark.parametrize(
-    ("information", "more", "said", "unsaid"),
+    ("information", "more", "present", "absent"),
     [
         (along(0.01, 1.5, -np.pi / 4), {"unresolved": 0.998}, "known to 150%", "anything"),
         (along(0.01, 1.5, -np.pi / 4), {"unresolved": 0.998}, "+- 110%", "anything"),
@@ -79,10 +79,10 @@ def test_what_is_not_fixed_is_reported():
         (np.diag([4.0, 0.0]), {}, "anything", "nan"),
     ],
 )
-def test_a_summary_reports_what_matters(information, more, said, unsaid):
+def test_a_summary_reports_what_matters(information, more, present, absent):
     found = recovery(information, **more)
-    assert said in found.summary()
-    assert unsaid not in found.summary()
+    assert present in found.summary()
+    assert absent not in found.summary()
     assert np.all(np.isfinite(found.relative_errors())) == ("anything" not in found.summary())
 
 

@@ -246,7 +246,7 @@ CALLS = [
 
 @pytest.fixture
 def folder(tmp_path):
-    """Files that are whole, and yet not what is asked for."""
+    """Files that are whole, and yet not what is needed."""
     (tmp_path / "folder").mkdir()
     export(square(), tmp_path, "obj").rename(tmp_path / "square.obj")
     write_splats(tmp_path / "splats.ply", some_splats())
@@ -308,7 +308,7 @@ def test_no_file_that_is_cut_short_is_read_in_silence(tmp_path, suffix):
 
 
 def test_textures_are_taken_from_the_files_own_folder_alone(tmp_path):
-    """A texture elsewhere is sought by its name in this folder; without it, a warning tells."""
+    """A texture elsewhere is sought by its name in this folder; without it, there is a warning."""
     Image.new("RGB", (2, 2), (255, 0, 0)).save(tmp_path / "secret.png")
     inner = tmp_path / "inner"
     inner.mkdir()

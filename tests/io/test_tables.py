@@ -1,5 +1,5 @@
 """Measured profiles and media as CSV, exports and records as JSON. Which pictures were taken, and
-how: what a file says is what is read, and what it may not say.
+how: what a file contains is what is read, and what it must not contain.
 """
 
 import json
@@ -78,7 +78,7 @@ def test_records_come_back_and_fingerprints_tell_contents_apart(tmp_path):
     assert sj.io.read_record(path) == record == json.loads(path.read_text())
     path.write_bytes(b"abc")
     assert sj.io.fingerprint(path).startswith("3 bytes, SHA-256 ba7816bf")
-    path.write_bytes(b"abd")
+    path.write_bytes(b"xyz")
     assert not sj.io.fingerprint(path).endswith("ba7816bf")
 
 

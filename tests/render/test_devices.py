@@ -1,5 +1,5 @@
-"""Eight devices give what one gives, and send each other what the model says. They need a process
-of their own. Same input, same bits: in another process, on another number of processors.
+"""Eight devices give what one gives, and send each other what the model predicts. They need their
+own process. Same input, same bits: in another process, on another number of processors.
 """
 
 import json

@@ -309,9 +309,9 @@ REFUSED = [
 
 
 @pytest.mark.once
-@pytest.mark.parametrize(("call", "said"), REFUSED)
-def test_lights_that_cannot_be_are_refused_by_name(call, said):
-    assert_refused(call, said)
+@pytest.mark.parametrize(("call", "message"), REFUSED)
+def test_lights_that_cannot_be_are_refused_by_name(call, message):
+    assert_refused(call, message)
 
 
 @pytest.mark.once

@@ -110,7 +110,7 @@ REFUSED = [
         lambda: sj.render(SCENE, CAMERA, SETTINGS, planned(), mesh=jax.make_mesh((1,), ("views",))),
         "the plan is for one device",
     ),
-    *((partial(call, scene), said) for call in NEED_THE_PLAN for scene, said in NOT_PLANNED),
+    *((partial(call, scene), message) for call in NEED_THE_PLAN for scene, message in NOT_PLANNED),
     (
         lambda: jax.grad(lambda camera: jnp.mean(sj.render(SCENE, camera).beauty))(CAMERA),
         "a plan is needed",
@@ -156,9 +156,9 @@ REFUSED = [
 ]
 
 
-@pytest.mark.parametrize(("call", "said"), REFUSED)
-def test_what_cannot_be_planned_or_rendered_is_refused_by_name(call, said):
-    assert_refused(call, said)
+@pytest.mark.parametrize(("call", "message"), REFUSED)
+def test_what_cannot_be_planned_or_rendered_is_refused_by_name(call, message):
+    assert_refused(call, message)
 
 
 class Sky(sj.scene.AbstractLightSample):
@@ -213,7 +213,7 @@ FLIPPED = eqx.tree_at(lambda splats: splats.normals, sphere(2000), replace_fn=la
 
 
 @pytest.mark.parametrize(
-    ("wrong", "distance", "said"),
+    ("wrong", "distance", "message"),
     [
         (scene(lights=[]), 50, "no light"),
         (scene(lights=[sj.PointLight([0, 0, 50], 0)]), 50, "no light"),
@@ -223,13 +223,13 @@ FLIPPED = eqx.tree_at(lambda splats: splats.normals, sphere(2000), replace_fn=la
         (scene(sphere(2000, 20_000.0)), 50_000, "check the units"),
     ],
 )
-def test_a_scene_that_nobody_means_is_warned_of_once(wrong, distance, said):
+def test_a_scene_that_nobody_means_is_warned_of_once(wrong, distance, message):
     _checks._warn_once.cache_clear()
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         for _ in range(3):
             check_scene(wrong, camera(distance))
-    assert [said in str(warning.message) for warning in caught] == [True]
+    assert [message in str(warning.message) for warning in caught] == [True]
 
 
 @pytest.mark.parametrize(

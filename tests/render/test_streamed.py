@@ -76,7 +76,7 @@ def splats():
     return dataclasses.replace(colored, weights=factors)
 
 
-def in_parts(splats, size):
+def streamed_in_parts(splats, size):
     def parts():
         for begin in range(0, splats.count, size):
             yield jax.tree.map(lambda leaf: leaf[begin : begin + size], splats)  # noqa: B023
@@ -92,7 +92,7 @@ def test_parts_make_the_picture_of_all_at_once(splats, monkeypatch):
         LayerSources, "build", lambda *given: built.append(len(given[0])) or build(*given)
     )
     streamed = sj.render_streamed(
-        in_parts(splats, 300),
+        streamed_in_parts(splats, 300),
         LIGHTS,
         MATERIAL,
         CAMERA,
@@ -113,7 +113,7 @@ def test_parts_make_the_picture_of_all_at_once(splats, monkeypatch):
 @pytest.mark.long
 def test_strata_of_lights_are_streamed_too(splats):
     whole = sj.render(sj.Scene(splats, STRATA, MATERIAL), CAMERA, TILED)
-    streamed = sj.render_streamed(in_parts(splats, 900), STRATA, MATERIAL, CAMERA, TILED)
+    streamed = sj.render_streamed(streamed_in_parts(splats, 900), STRATA, MATERIAL, CAMERA, TILED)
     found = apart(*({name: getattr(frame, name) for name in FIELDS} for frame in (whole, streamed)))
     assert max(found.values()) < ROUNDING, found
 
@@ -132,7 +132,7 @@ def test_sizes_are_those_of_all_splats_that_have_an_area(splats, size, begins_ba
     areas = np.random.default_rng(3).permutation(np.geomspace(0.1, 10.0, splats.count))
     given = jnp.asarray(np.where(bare, 0.0, areas), float)
     cloud = eqx.tree_at(lambda each: each.areas, splats, given)
-    found = StreamStatistics.of(in_parts(cloud, size))
+    found = StreamStatistics.of(streamed_in_parts(cloud, size))
     assert found.fine == pytest.approx(
         np.quantile(areas[~bare], sj.diffusion.FINE_QUANTILE), rel=1e-5
     )
@@ -149,7 +149,7 @@ def test_the_first_part_or_all_may_have_no_area(splats, are_all):
         hidden = eqx.tree_at(lambda cloud: cloud.radii, hidden, jnp.zeros(300))
         cloud = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), hidden, splats)
     whole = sj.render(sj.Scene(cloud, LIGHTS, MATERIAL), CAMERA, TILED)
-    streamed = sj.render_streamed(in_parts(cloud, 300), LIGHTS, MATERIAL, CAMERA, TILED)
+    streamed = sj.render_streamed(streamed_in_parts(cloud, 300), LIGHTS, MATERIAL, CAMERA, TILED)
     assert float(whole.unresolved_fraction[-1]) == are_all
     assert np.all(np.quantile(layer_errors(streamed, whole), 0.99, axis=(1, 2)) < LAYERS)
 
@@ -157,7 +157,7 @@ def test_the_first_part_or_all_may_have_no_area(splats, are_all):
 def test_what_cannot_be_streamed_is_refused(splats):
     small, large = (jax.tree.map(lambda leaf, size=size: leaf[:size], splats) for size in (10, 20))
     plain, default = sj.RenderSettings(diffuser=sj.diffusion.DenseDiffuser()), sj.RenderSettings()
-    for passes, settings, said in (
+    for passes, settings, message in (
         ([[small]], plain, "DenseDiffuser"),
         ([[]], default, "no splats"),
         ([[small, large]], default, "parts must have one size"),
@@ -166,7 +166,7 @@ def test_what_cannot_be_streamed_is_refused(splats):
         ([[small, small], [small, small, small]], default, "parts must return the same"),
     ):
         given = partial(next, iter(passes)), LIGHTS, MATERIAL, CAMERA, settings
-        assert_refused(partial(sj.render_streamed, *given), said)
+        assert_refused(partial(sj.render_streamed, *given), message)
 
 
 def ball_over_sheet(gaussians) -> sj.Scene:

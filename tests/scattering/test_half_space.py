@@ -102,8 +102,8 @@ def test_limits(eta):
 @pytest.mark.once
 @pytest.mark.parametrize("eta", [1.0, 1.3])
 def test_energy_of_a_material_under_every_angle(eta):
-    """Gaussians by their law and single scattering by its own are together what transport says
-    leaves, and never more than came.
+    """Gaussians by their law and single scattering by its own are together what leaves by
+    transport, and never more than came.
     """
     space = half_space([0.9, 0.99], eta)
     single = SingleScattering(space.medium)

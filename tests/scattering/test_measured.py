@@ -56,7 +56,7 @@ def test_half_of_a_table_lies_within_its_length_scale(float64):
 
 
 def test_a_table_is_fitted_over_its_own_radii_alone(float64):
-    """A table that ends early says nothing of the tail: the Gaussians behind it come back all the
+    """A table that ends early does not contain the tail: the Gaussians behind it come back all the
     same.
     """
     r = jnp.linspace(0.05, 3.0, 60)

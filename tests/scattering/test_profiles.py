@@ -133,7 +133,7 @@ def test_flat_at_the_axis(dtype, name):
     np.testing.assert_array_equal(slope, 0)
 
 
-CLOSED_FORM = 1e-9  # of a total against quadrature: what is asked; 1e-15 is reached
+CLOSED_FORM = 1e-9  # of a total against quadrature: required; 1e-15 is reached
 PRINTED = 0.012  # Jensen's table prints two digits of coefficients and totals
 
 # Jensen et al. 2001, Table 1, diffuse reflectance.

@@ -120,7 +120,7 @@ def test_root_of_albedo_and_its_floor(dtype):
     np.testing.assert_allclose(np.asarray(slopes), [0, 0, 0, 1.0, 0.5], rtol=1e-6)
 
 
-TABLE_ERROR = 2e-4  # of the series, as its docstring states; the design asks for 1e-3
+TABLE_ERROR = 2e-4  # of the series, as its docstring states; the design requires 1e-3
 SLOPE_ERROR = 0.02
 NODES = 96  # of the hemisphere's quadrature, per axis
 

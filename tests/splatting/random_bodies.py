@@ -36,7 +36,7 @@ ALL = int(os.environ.get("SPLATJAX_RANDOM_SCENES", "0"))
 
 def seeds(in_suite: int) -> range:
     """Seeds of the scenes to try: some dozens in the suite, a twentieth of SPLATJAX_RANDOM_SCENES
-    where it asks for more.
+    where that is more.
     """
     return range(max(in_suite, ALL // 20))
 

@@ -260,9 +260,7 @@ def limb(pixel: float, radius: float):
 @pytest.mark.parametrize("rasterizer", RASTERIZERS)
 @pytest.mark.parametrize("kind", VIEWS)
 def test_an_edge_hides_nothing_behind_it_however_small_the_splats(kind, rasterizer):
-    """Fragments of splats smaller than a pixel weigh less than those that the surface behind an
-    edge is told by.
-    """
+    """Fragments of splats smaller than a pixel weigh less than the surface behind an edge."""
     width, height, pixel = 24, 4, 0.02
     if kind == "perspective":
         view = bodies.perspective(

@@ -19,7 +19,7 @@ KEY = jax.random.key(2026)
 ERRORS = 3
 # As many as the rings of the other program have at most: one number of rings is one program.
 EDGES = 400
-# Where totals alone are asked for: sorting photons into rings takes a third of the time.
+# Where totals alone are needed: sorting photons into rings takes a third of the time.
 ONE_RING = jnp.asarray([0.0, 1.0])
 
 
@@ -212,13 +212,13 @@ def test_rings_are_where_they_say(dtype):
 
 
 def test_progress_is_told(float32):
-    told = []
+    reports = []
     sj.transport.monte_carlo(
-        HALF_SPACE, 2_000_000, KEY_OF_PARTS, progress=lambda *progress: told.append(progress)
+        HALF_SPACE, 2_000_000, KEY_OF_PARTS, progress=lambda *progress: reports.append(progress)
     )
-    assert len(told) > 1
-    assert told == sorted(told)
-    assert told[-1] == (2_000_000, 2_000_000)
+    assert len(reports) > 1
+    assert reports == sorted(reports)
+    assert reports[-1] == (2_000_000, 2_000_000)
 
 
 @pytest.mark.parametrize(
