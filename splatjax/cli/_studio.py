@@ -10,7 +10,7 @@ import tyro
 import splatjax as sj
 from splatjax.studio import Page, Session
 
-from ._terminal import check_folder
+from ._terminal import OptionalPath, check_folder
 from ._view import ENVIRONMENTS, ViewOptions
 
 _DIRECTIONS = 64  # of the shadows of an environment
@@ -31,6 +31,9 @@ class Studio(ViewOptions):
     output: Path = Path("studio")
     #: Number of splats of the built-in bust.
     count: int = 100_000
+    #: TOML file that lists pictures, as for `splatjax recover`: the page takes the camera and the
+    #: lights of the first, and offers to recover the material.
+    pictures: OptionalPath = None
     #: The address to listen at. With another one than 127.0.0.1, whoever reaches it can change the
     #: scene and save.
     host: Annotated[str, tyro.conf.arg(metavar="ADDRESS")] = "127.0.0.1"
@@ -48,13 +51,19 @@ class Studio(ViewOptions):
         )
         check_folder(self.output)
         splats, material = self.load()
-        camera = self.camera(lambda: [splats], self.azimuth)
         middle = (splats.centers.min(axis=0) + splats.centers.max(axis=0)) / 2
-        scene = sj.Scene(splats, self._lights(material), material)
+        observations = [] if self.pictures is None else sj.io.read_observations(self.pictures)
+        if observations:
+            camera, lights = observations[0].camera, observations[0].lights
+            along = (middle - camera.position) @ camera.rotation[2]
+            middle = camera.position + along * camera.rotation[2]
+        else:
+            camera, lights = self.camera(lambda: [splats], self.azimuth), self._lights(material)
+        scene = sj.Scene(splats, lights, material)
         session = Session(scene, camera, middle, exposure=self.exposure)
-        self.output.mkdir(exist_ok=True)
+        recipe = self._recipe(session.own.lights)
         place = {"host": self.host, "port": self.port}
-        page = Page(session, self.output, self._recipe(session.own.lights), **place)
+        page = Page(session, self.output, recipe, observations=observations, **place)
         print(page.url, flush=True)
         try:
             threading.Event().wait()
@@ -77,7 +86,10 @@ class Studio(ViewOptions):
         splats = f"sj.read_splats({path!r}, up={self.up!r})" if path else f"sj.bust({self.count})"
         splats = splats if self.scale == 1 else f"{splats}.scaled({self.scale})"
         splats = splats if self.albedo else f"dataclasses.replace({splats}, albedo=None)"
-        return {"splats": splats, "lights": f"[{', '.join(map(self._made, lights))}]"}
+        if self.pictures is None:
+            return {"splats": splats, "lights": f"[{', '.join(map(self._made, lights))}]"}
+        pictures = str(self.pictures.absolute())
+        return {"splats": splats, "lights": f"sj.io.read_observations({pictures!r})[0].lights"}
 
     def _made(self, light: sj.scene.AbstractLight) -> str:
         if isinstance(light, sj.DirectionalLight):

@@ -1,8 +1,9 @@
 """A scene seen live: what a change does not touch is kept. `Page` shows it in a browser, by viser
-(the extra `studio`).
+(the extra `studio`), and in a cell of a notebook.
 """
 
 from ._controls import Controls as Controls, turned as turned
 from ._page import Page as Page
 from ._saving import save as save
+from ._search import Search as Search
 from ._session import Session as Session

@@ -6,7 +6,7 @@ import contextlib
 import dataclasses
 import io
 import threading
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,15 +14,20 @@ import jax
 import numpy as np
 from PIL import Image, ImageOps
 
+from splatjax._display import to_display
 from splatjax._format import channel_names, format_numbers
+from splatjax.inverse import Observation
+from splatjax.scattering import Medium
 
 from ._controls import LAYERS, Controls
 from ._saving import SUFFIXES, save
+from ._search import Search
 from ._session import Session
 
 _STILL = 0.15  # s without a change, after which the whole picture is computed
 _NEAR = 1e-5  # relative, of cameras that are the same
 _QUALITY = 92  # of JPEG
+_MOST = 4.0  # powers of 2
 _COMPILING = "/jax/compilation_cache/cache_misses", "/splatjax/cache/compiling"
 _SLIDERS = {
     "turn": ("turn lights, °", -180.0, 180.0),
@@ -37,13 +42,15 @@ _COLORS = ("#c0392b", "#27853f", "#2c5aa0")
 
 
 class Page:
-    """A session in a browser. All pages that are open show one picture; the last camera that moves
-    is that of all.
+    """A session in a browser, or at the end of a notebook's cell. All pages that are open show one
+    picture; the last camera that moves is that of all.
 
     **Arguments:**
 
-    - `folder`: the only one to which the page writes, under names of its own.
-    - `recipe`: as for `save`.
+    - `folder`: the only one to which the page writes, under names of its own; made if missing.
+    - `recipe`: as for `save`. Without it the page does not offer the program of a picture.
+    - `observations`: pictures of the body, the first of which has the session's camera and lights.
+      The page then offers to recover the material, and shows how the search proceeds.
     - `host`: the address to listen at: by default no other computer reaches it.
     - `port`: or a higher one that is free.
 
@@ -57,9 +64,10 @@ class Page:
     def __init__(
         self,
         session: Session,
-        folder: Path,
-        recipe: Mapping[str, str],
+        folder: Path = Path("studio"),
+        recipe: Mapping[str, str] | None = None,
         *,
+        observations: Sequence[Observation] = (),
         host: str = "127.0.0.1",
         port: int = 8080,
     ):
@@ -69,11 +77,10 @@ class Page:
             raise ValueError(
                 "the page of the studio needs viser; install it: pip install 'splatjax[studio]'"
             ) from None
-        self._session, self._where, self._saves = (
-            session,
-            (folder, recipe),
-            list[tuple[str, Controls]](),
-        )
+        folder.mkdir(exist_ok=True)
+        self._session, self._where = session, (folder, recipe or {})
+        self._saves = list[tuple[str, Controls]]()
+        self._observations = observations
         self._place = np.asarray([session.start.eye, session.start.target])
         self._image, self._joined = Image.new("RGB", (1, 1)), list[Any]()
         self._changed, self._closed = threading.Event(), threading.Event()
@@ -98,6 +105,9 @@ class Page:
 
     def close(self) -> None:
         """End the server, once what is being computed is done."""
+        if self._observations:
+            self._search.stop()
+            self._search.join()
         self._closed.set()
         self._change()
         self._worker.join()
@@ -118,7 +128,7 @@ class Page:
         for field, label in _FACTORS.items() if names else ():
             with gui.add_folder(f"{label}, by powers of 2", expand_by_default=False):
                 for number, name in enumerate(names):
-                    handles[f"{field} {number}"] = gui.add_slider(name, -4.0, 4.0, 0.05, 0.0)
+                    handles[f"{field} {number}"] = gui.add_slider(name, -_MOST, _MOST, 0.01, 0.0)
         for handle in handles.values():
             handle.on_update(lambda _: self._change())
         self._numbers = gui.add_markdown("")
@@ -143,8 +153,45 @@ class Page:
             legend={"show": False},
             aspect=1.4,
         )
-        buttons = gui.add_button_group("save", tuple(SUFFIXES))
+        kinds = tuple(kind for kind in SUFFIXES if kind != "Python" or self._where[1])
+        buttons = gui.add_button_group("save", kinds)
         buttons.on_click(lambda event: self._change(event.target.value))
+        if self._observations:
+            self._add_search(gui)
+
+    def _add_search(self, gui: Any) -> None:
+        self._search = Search(self._session, self._observations, self._follow)
+        with gui.add_folder("material of the pictures"):
+            buttons = gui.add_button_group("search", ("start", "stop"))
+            self._stage = gui.add_markdown("")
+            self._target = to_display(np.asarray(self._observations[0].picture))
+            label = "first picture; the page's less it (gray: the same)"
+            self._compared = gui.add_image(self._target, label=label)
+
+        def press(event: Any) -> None:
+            if event.target.value == "start":
+                self._search.start(self._controls())
+            else:
+                self._search.stop()
+
+        buttons.on_click(press)
+
+    def _follow(self, stage: str, medium: Medium | None) -> None:
+        """Show a stage of the search: sliders and picture become those of its medium."""
+        self._stage.content = f"```\n{stage}\n```"
+        for field in _FACTORS if medium is not None else ():
+            start = np.asarray(getattr(self._session.start, field))
+            powers = np.log2(np.asarray(getattr(medium, field)) / start)
+            for number, power in enumerate([0.0, *np.clip(powers, -_MOST, _MOST).tolist()]):
+                self._handles[f"{field} {number}"].value = power
+
+    def _compare(self, picture: np.ndarray) -> None:
+        """Show the first picture, and half the difference of another of the same camera to it."""
+        difference = 128 + (picture.astype(int) - self._target) // 2
+        self._compared.image = np.hstack([self._target, difference.astype(np.uint8)])
+
+    def _repr_html_(self) -> str:
+        return f'<iframe src="{self.url}" style="width: 100%; height: 600px; border: 0"></iframe>'
 
     def _change(self, *saves: str) -> None:
         self._saves += [(kind, self._controls()) for kind in saves]
@@ -211,7 +258,12 @@ class Page:
         self._numbers.content = "  \n".join(shown)
         if not self._saves and self._changed.wait(_STILL):
             return ""
-        self._show(session.picture(controls))
+        picture = session.picture(controls)
+        self._show(picture)
+        if self._observations and np.allclose(
+            self._place, [session.start.eye, session.start.target], rtol=_NEAR
+        ):
+            self._compare(picture)
         while self._saves:
             kind, saved = self._saves.pop(0)
             written += save(session, saved, *self._where, kind)

@@ -64,6 +64,34 @@ def test_only_this_computer_reaches_the_page_and_it_writes_to_one_folder(page, t
     wait_until(lambda: page._status.content == "")
 
 
+def test_it_shows_itself_in_a_notebook(page):
+    assert page.url in page._repr_html_()
+
+
+@pytest.mark.long
+def test_the_material_of_pictures_is_found_live_and_again_after_a_stop(page, tmp_path):
+    """Of a picture of the page's own, by which the search is exact."""
+    session = page._session
+    start = session.start
+    darker = tuple(1.5 * number for number in start.sigma_a)
+    target = session.frame(dataclasses.replace(start, sigma_a=darker)).beauty
+    camera, lights = session.camera(start), session.own.lights
+    observation = sj.inverse.Observation(target, camera, lights)
+    searching = Page(session, tmp_path, observations=[observation], port=18_090)
+    press = searching._search.start
+    press(searching._controls())
+    searching._search.stop()
+    wait_until(lambda: "stopped" in searching._stage.content)
+    press(searching._controls())
+    wait_until(lambda: "error bars" in searching._stage.content)
+    powers = [searching._handles[f"sigma_a {channel}"].value for channel in (1, 2, 3)]
+    np.testing.assert_allclose(powers, np.log2(1.5), atol=0.02)
+    wait_until(lambda: searching._status.content == "")
+    difference = searching._compared.image[:, SIDE:].astype(int) - 128
+    assert np.abs(difference).max() <= 1
+    searching.close()
+
+
 def test_a_browser_orbits_drags_and_saves(page, tmp_path):
     playwright = pytest.importorskip("playwright.sync_api")
     chromium = shutil.which("chromium")

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 import splatjax as sj
-from splatjax.studio import Session, save, turned
+from splatjax.studio import Search, Session, save, turned
 
 pytestmark = pytest.mark.once
 
@@ -151,6 +151,14 @@ def test_lights_turn_about_the_vertical_axis():
     assert float(environment.rotation) == 100.0
     with pytest.raises(ValueError, match="HarmonicLight cannot be turned"):
         turned([sj.scene.HarmonicLight(np.zeros((4, 3)))], 1.0)
+
+
+def test_a_search_needs_coefficients_to_start_from(studio):
+    material = dataclasses.replace(studio.own.material, medium=None)
+    scene = dataclasses.replace(studio.own, material=material)
+    session = Session(scene, studio.camera(studio.start), [0, 0, 0])
+    with pytest.raises(ValueError, match=r"add \[medium\]"):
+        Search(session, [], print)
 
 
 def test_single_scattering_is_refused(studio):

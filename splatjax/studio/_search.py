@@ -1,0 +1,89 @@
+"""The search for a material behind a page: `splatjax.inverse.recover` in a thread of its own."""
+
+import threading
+from collections.abc import Callable, Sequence
+
+import jax
+import jax.numpy as jnp
+
+from splatjax.inverse import Observation, recover
+from splatjax.scattering import Medium
+from splatjax.scene import Material, Splats
+
+from ._controls import Controls
+from ._session import Session
+
+
+class _Stopped(Exception):
+    """The search is to end."""
+
+
+class Search:
+    r"""A recovery of the material of a session from pictures of its body. It ends between two
+    rounds of the search when it is stopped, and may start again from what it has found.
+
+    **Arguments:**
+
+    - `observations`: the pictures, at least one.
+    - `report`: called from the thread of the search with a description of each stage and the best
+      medium so far; at last with the summary, or with an error and no medium.
+
+    **Raises:** `ValueError` for a material without a medium.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        observations: Sequence[Observation],
+        report: Callable[[str, Medium | None], None],
+    ):
+        if not session.start.sigma_a:
+            raise ValueError(
+                "the material has no medium to start the search from; add [medium] with sigma_a "
+                "and sigma_s_prime to its file"
+            )
+        self._session, self._observations, self._report = session, observations, report
+        self._thread, self._stopped = threading.Thread(), threading.Event()
+
+    def start(self, controls: Controls) -> None:
+        """Search from the coefficients of a state, unless a search runs."""
+        if not self._thread.is_alive():
+            self._stopped.clear()
+            material = self._session.scene(controls).material
+            self._thread = threading.Thread(target=self._run, args=[material], daemon=True)
+            self._thread.start()
+
+    def stop(self) -> None:
+        """End the search at its next stage."""
+        self._stopped.set()
+
+    def join(self) -> None:
+        """Wait until no search runs."""
+        if self._thread.is_alive():
+            self._thread.join()
+
+    def _run(self, material: Material) -> None:
+        def progress(stage: str, medium: Medium) -> None:
+            if self._stopped.is_set():
+                raise _Stopped
+            self._report(stage, medium)
+
+        own = self._session.own.splats
+        splats = Splats(own.centers, own.normals, own.radii, own.areas)  # coefficients give color
+        try:
+            with jax.enable_x64(True):
+                surface = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), material)
+                medium, model = surface.medium, self._session.model
+                recovery = recover(
+                    self._observations,
+                    splats,
+                    medium,
+                    surface=surface,
+                    model=model,
+                    progress=progress,
+                )
+                self._report(recovery.summary(), recovery.medium)
+        except _Stopped:
+            self._report("stopped", None)
+        except Exception as error:
+            self._report(f"{type(error).__name__}: {error}", None)
