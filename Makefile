@@ -12,8 +12,8 @@ LEAST_OPTIMIZATION := --xla_backend_optimization_level=0 --xla_cpu_use_fusion_em
 # Every worker of every run imports the same modules, with their shapes checked: whatever the shell sets, bytecode is kept.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: setup demo test test-float32 test-x64 test-once test-long random-scenes fuzz mutants lint bench lock docs figures notebooks \
-    gallery release-check
+.PHONY: setup demo test test-float32 test-x64 test-once test-long random-scenes fuzz mutants coverage lint bench lock sbom docs \
+    always figures notebooks gallery release-check release-check-lowest
 
 setup: $(VENV)/ready
 
@@ -76,33 +76,55 @@ mutants: setup
 	$(BIN)/cosmic-ray exec out/mutants.toml out/mutants.sqlite
 	$(BIN)/cr-report --show-diff out/mutants.sqlite | grep -A 30 SURVIVED || echo every fault was noticed
 
+# Which statements and branches of the package the float32 suite executes: a table in out/coverage.txt. Tracing makes the suite
+# slower, so this is not part of `make test`.
+coverage: setup
+	rm -f out/.coverage*
+	XLA_FLAGS="$(LEAST_OPTIMIZATION) $$XLA_FLAGS" $(BIN)/coverage run -m pytest -q -n $(WORKERS) --dist loadfile -m "not long"
+	$(BIN)/coverage combine --quiet
+	$(BIN)/coverage report | tee out/coverage.txt
+
 bench: setup
 	$(BIN)/python -m benchmarks
 	$(BIN)/python -m benchmarks.diffusion_error
 	$(BIN)/python -m benchmarks.shimmer
 
-# The site, in out/site: pages, the API from its docstrings, and the notebooks with what they print and draw. Notebooks are run
-# again when they or the code have changed, which takes some minutes; `make -j2 docs` runs two at once. Most of that is XLA's, so
-# they are compiled as in the tests: those that run longer than they compile as users have it.
+# The site, in out/site: pages, the API from its docstrings, and the notebooks with what they print and draw. Executed notebooks
+# are kept, and run again when the content of their program, of the code or of the lock has changed, which takes some minutes;
+# `make -j2 docs` runs two at once. Most of that is XLA's, so they are compiled as in the tests: those that run longer than they
+# compile as users have it.
 NOTEBOOKS := $(wildcard notebooks/*.py)
-SOURCES := $(shell find splatjax profiles -name '*.py' -o -name '*.toml')
+SOURCES := $(sort $(shell find splatjax profiles -name '*.py' -o -name '*.toml')) requirements.lock
+KEYS := $(NOTEBOOKS:notebooks/%.py=out/notebooks/%.key)
 
 docs: $(VENV)/docs $(NOTEBOOKS:notebooks/%.py=out/notebooks/%.ipynb)
-	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet
-	$(BIN)/python tools/check_site.py out/site
+	@echo 'building pages into out/site, half a minute'
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet
+	@echo 'checking links'
+	@$(BIN)/python tools/check_site.py out/site
 	@echo out/site/index.html
+
+# A digest of what a notebook depends on; the file changes only if that does.
+$(KEYS): out/notebooks/%.key: notebooks/%.py always
+	@mkdir -p out/notebooks
+	@cat $< $(SOURCES) | sha256sum > $@.new
+	@if cmp -s $@.new $@; then rm $@.new; else mv $@.new $@; fi
+
+always:
 
 out/notebooks/%.ipynb: COMPILED := $(LEAST_OPTIMIZATION)
 out/notebooks/shape_from_shading.ipynb out/notebooks/which_profile.ipynb: COMPILED :=
 
-out/notebooks/%.ipynb: notebooks/%.py $(SOURCES) | $(VENV)/docs
-	mkdir -p out/notebooks/running
-	$(BIN)/jupytext --quiet --to ipynb --output out/notebooks/running/$*.ipynb $<
-	cd out/notebooks/running && XLA_FLAGS="$(COMPILED)$${XLA_FLAGS:+ $$XLA_FLAGS}" $(abspath $(BIN))/jupyter-execute --inplace --timeout 3600 $*.ipynb
-	mv out/notebooks/running/$*.ipynb $@
+out/notebooks/%.ipynb: out/notebooks/%.key | $(VENV)/docs
+	@echo 'running notebooks/$*.py, up to two minutes'
+	@mkdir -p out/notebooks/running
+	@$(BIN)/jupytext --quiet --to ipynb --output out/notebooks/running/$*.ipynb notebooks/$*.py
+	@cd out/notebooks/running && XLA_FLAGS="$(COMPILED)$${XLA_FLAGS:+ $$XLA_FLAGS}" $(abspath $(BIN))/jupyter-execute --inplace --timeout 3600 $*.ipynb
+	@mv out/notebooks/running/$*.ipynb $@
 
 # The paper's figures, into out/figures.
 figures: $(patsubst notebooks/%.py,out/notebooks/%.ipynb,$(wildcard notebooks/figure_*.py))
+	mkdir -p out/figures
 	$(BIN)/python tools/docs_pages.py out/figures $^
 
 $(VENV)/docs: requirements-docs.lock $(VENV)/ready
@@ -125,11 +147,21 @@ $(VENV)/notebooks: requirements-notebooks.lock $(VENV)/ready
 gallery: setup
 	$(BIN)/python tools/make_gallery.py $(if $(HEAD),--head $(HEAD))
 
-# Wheel and sdist, into dist; and whether they work where there is no checkout.
+# Wheel and sdist, into dist; and whether they work where there is no checkout, with the newest or the lowest versions of what
+# they need.
 release-check: setup
 	rm -rf dist
 	$(BIN)/hatchling build --target sdist --target wheel
-	$(BIN)/python tools/release_check.py
+	$(BIN)/python tools/release_check.py $(LOWEST)
+
+release-check-lowest: LOWEST := --lowest
+release-check-lowest: release-check
+
+# What the locked environment consists of, by CycloneDX: out/sbom.json. Of cyclonedx-bom (Apache-2.0) only this target has need.
+sbom: setup
+	mkdir -p out
+	VIRTUAL_ENV=$(abspath $(VENV)) $(BIN)/uvx --quiet --from cyclonedx-bom cyclonedx-py requirements --output-reproducible \
+	    --output-file out/sbom.json requirements.lock
 
 # Rewritten when dependencies change; hashes, no addresses. What docs and notebooks need besides is in locks of its own, so that
 # setting up stays quick.

@@ -6,15 +6,20 @@ repository, so that they can be read there too; here links are led to where the 
 site. `python tools/docs_pages.py FOLDER NOTEBOOK...` writes the pictures of executed notebooks.
 """
 
-import ast
 import base64
+import dataclasses
+import importlib
+import inspect
 import json
+import pkgutil
 import posixpath
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
+import griffe
 from latex2mathml.converter import convert
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
@@ -29,25 +34,40 @@ MOVED = {
     "CITATION.cff": "citation.cff",
     "notebooks": "notebooks/index.md",
 }
+# In the order in which a user needs them.
 PACKAGES = (
-    "gaussians",
-    "scattering",
-    "fitting",
-    "transport",
     "scene",
+    "io",
     "geometry",
+    "render",
+    "scattering",
+    "gaussians",
+    "fitting",
+    "inverse",
     "splatting",
     "diffusion",
     "shading",
-    "render",
-    "inverse",
-    "baselines",
     "exports",
-    "io",
-    "cache",
     "plots",
+    "cache",
+    "transport",
+    "baselines",
 )
+GROUPS = {
+    "Bodies": "bust sample_mesh read_splats write_splats Splats",
+    "Materials": "list_materials load_material save_material Material",
+    "Camera, lights and scene": "Camera DirectionalLight PointLight GaussianBeam EnvironmentLight "
+    "Scene",
+    "Pictures": "render RenderSettings Frame write_png write_exr read_exr",
+    "Many pictures of one scene": "make_plan Plan illuminate transfer relighting_basis",
+    "Fit a material": "load_medium Medium Layer Film load_profile Dipole LayeredMultipole "
+    "SingleScattering fit_gaussians SumOfGaussians",
+    "Derivatives and parts of a picture": "picture_jacobian PictureJacobian diffusion_basis "
+    "DiffusionBasis compute_irradiance diffuse_irradiance",
+    "Large scenes": "map_over render_streamed SplatFile",
+}
 _LINK = re.compile(r"(\]\()([^)#\s]+)(#[^)\s]*)?(\))")
+_NOTEBOOK = re.compile(r"^(notebooks/.*)\.py$")
 _MATHS = re.compile(r"\$([^$\n]+)\$")
 _NAME = re.compile(r"(?<!\[)`(splatjax(?:\.\w+)+)`(?!\])")
 
@@ -75,30 +95,23 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
         return markdown
     sources = {place: source for source, place in MOVED.items()}
     source = here if here.startswith("notebooks/") else sources.get(here, f"docs/{here}")
-    names = _documented()
+    names = {f"splatjax.{each}.{name}" for each in PACKAGES for name in _public(f"splatjax.{each}")}
 
     def led(match: re.Match) -> str:
         opened, target, anchor, closed = match.groups()
         place = posixpath.normpath(posixpath.join(posixpath.dirname(source), target))
-        own_picture = here.startswith("notebooks/") and not place.startswith("docs/")
-        if "://" in target or own_picture:
-            return match.group()
-        path = posixpath.relpath(_place(place), posixpath.dirname(here) or ".")
+        if "://" in target or (here.startswith("notebooks/") and not place.startswith("docs/")):
+            return match.group()  # of another site, or a picture of the notebook's own
+        page = MOVED.get(place, _NOTEBOOK.sub(r"\1.md", place).removeprefix("docs/"))
+        path = posixpath.relpath(page, posixpath.dirname(here) or ".")
         return f"{opened}{path}{anchor or ''}{closed}"
 
-    def named(match: re.Match) -> str:
-        return f"[{match[0]}][{match[1]}]" if match[1] in names else match[0]
-
     parts = re.split(r"(^```.*?^```$)", _LINK.sub(led, markdown), flags=re.MULTILINE | re.DOTALL)
-    parts[::2] = [_NAME.sub(named, part) for part in parts[::2]]
+    parts[::2] = [
+        _NAME.sub(lambda m: f"[{m[0]}][{m[1]}]" if m[1] in names else m[0], part)
+        for part in parts[::2]
+    ]
     return "".join(parts)
-
-
-def _place(source: str) -> str:
-    """Return the place on the site of a file of the repository."""
-    is_notebook = source.startswith("notebooks/")
-    page = source.removesuffix(".py") + ".md" if is_notebook else source.removeprefix("docs/")
-    return MOVED.get(source, page)
 
 
 def _notebook_pages() -> Iterator[tuple[str, str | bytes]]:
@@ -125,8 +138,7 @@ def _notebook(path: Path) -> tuple[str, dict[str, bytes]]:
         if cell["cell_type"] == "markdown":  # browsers show MathML without a script
             parts.append(_MATHS.sub(lambda m: convert(m[1]), source))
             continue
-        lines = [line for line in source.splitlines() if not line.startswith("%")]
-        code = "\n".join(line.removesuffix("  # noqa: B018") for line in lines)
+        code = re.sub(r"^%.*\n?|  # noqa: B018$", "", source, flags=re.MULTILINE)
         parts.append(f"```python\n{code}\n```")
         for output in cell["outputs"]:
             data = output.get("data", {})
@@ -142,48 +154,70 @@ def _notebook(path: Path) -> tuple[str, dict[str, bytes]]:
 
 def _api_pages() -> Iterator[tuple[str, str]]:
     """Yield a page for each package, and a list of what `import splatjax` gives."""
-    rows = []
-    for node in ast.parse((ROOT / "splatjax" / "__init__.py").read_text(encoding="utf-8")).body:
-        if isinstance(node, ast.ImportFrom) and node.module:
-            rows += [(name.name, f"splatjax.{node.module}", node.module) for name in node.names]
-    known = _documented()
-    lines = ["| | package |", "| --- | --- |"]
-    for name, package, module in sorted(rows):
-        link = f"[`{name}`][{package}.{name}]" if f"{package}.{name}" in known else f"`{name}`"
-        lines.append(f"| {link} | [`{package}`]({module}.md) |")
-    intro = "What `import splatjax as sj` gives. These names are stable; everything else may move."
-    more = ", ".join(f"[`{package}`]({package}.md)" for package in PACKAGES)
-    table = "\n".join(lines)
-    yield "api/index.md", f"# API\n\n{intro} Packages hold more: {more}.\n\n{table}\n"
+    order = " ".join(GROUPS.values()).split()
+    others = [name for name in _public("splatjax") if name not in order]
+    lines = [
+        "# API",
+        "What `import splatjax as sj` gives. These names are stable; others may change.",
+    ]
+    for title, words in (*GROUPS.items(), *([("Others", " ".join(others))] if others else [])):
+        lines += [f"## {title}", _table("splatjax", words.split())]
+    lines += ["## Packages", _table("splatjax", PACKAGES)]
+    yield "api/index.md", "\n\n".join(lines) + "\n"
     for package in PACKAGES:
-        names = "\n".join(f"::: splatjax.{package}.{name}\n" for name in _exports(package))
-        text = ast.get_docstring(ast.parse(_source(package).read_text(encoding="utf-8")))
-        yield f"api/{package}.md", f"# `splatjax.{package}`\n\n{text}\n\n{names}"
+        home = f"splatjax.{package}"
+        rank = {name: place for place, name in enumerate([*order, *others])}
+        names = sorted(_public(home), key=lambda each: (rank.get(each, 99), each[:8] == "Abstract"))
+        text = inspect.getdoc(importlib.import_module(home))
+        full = "\n".join(f"::: {home}.{name}\n" for name in names)
+        yield f"api/{package}.md", f"# `{home}`\n\n{text}\n\n{_table(home, names)}\n\n{full}"
 
 
-def _documented() -> set[str]:
-    return {f"splatjax.{package}.{name}" for package in PACKAGES for name in _exports(package)}
+def _table(home: str, names: Iterable[str]) -> str:
+    """Return a table of names of a module, each with the first sentence of its documentation."""
+    rows = ["| | |", "| --- | --- |"]
+    for name in names:
+        value = pkgutil.resolve_name(f"{home}.{name}")
+        sentence = re.split(r"(?<!Eq)\.(?:\s|$)|\n\n", inspect.getdoc(value) or "")[0]
+        package = getattr(value, "__module__", "").split(".")[1:2] if home == "splatjax" else []
+        link = f"[{'.'.join([home, *package, name])}]" if callable(value) else f"({name}.md)"
+        rows.append(f"| [`{name}`]{link} | {' '.join(sentence.split())} |")
+    return "\n".join(rows)
 
 
-def _source(package: str) -> Path:
-    path = ROOT / "splatjax" / package
-    return path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
+def _public(module: str) -> dict[str, Any]:
+    """Return the public functions and classes of a module, in the order of its exports."""
+    return {
+        name: value
+        for name, value in vars(importlib.import_module(module)).items()
+        if callable(value) and name[0] != "_" and value.__module__.startswith("splatjax")
+    }
 
 
-def _exports(package: str) -> list[str]:
-    """Return the public names of a package, in the order in which it exports or defines them."""
-    names, path = [], _source(package)
-    for node in ast.parse(path.read_text(encoding="utf-8")).body:
-        if isinstance(node, ast.ImportFrom) and node.level and path.name == "__init__.py":
-            names += [name.asname for name in node.names if name.asname]
-        elif isinstance(node, ast.FunctionDef | ast.ClassDef):
-            names.append(node.name)
-    return [name for name in names if not name.startswith("_") and not name.isupper()]
+class Constructors(griffe.Extension):
+    """Adds the constructors of records, which equinox makes of their fields."""
+
+    def on_class(self, *, cls: griffe.Class, **_: Any) -> None:
+        record = pkgutil.resolve_name(cls.path)
+        if "__init__" in cls.members or not dataclasses.is_dataclass(record):
+            return
+        parameters = [griffe.Parameter("self")]
+        for name, given in inspect.signature(record).parameters.items():
+            field = next(each.members[name] for each in [cls, *cls.mro()] if name in each.members)
+            value = repr(given.default) if "field(" in str(field.value) else field.value
+            parameters.append(
+                griffe.Parameter(
+                    name,
+                    annotation=field.annotation,
+                    kind=griffe.ParameterKind(given.kind.description),
+                    default=None if given.default is given.empty else value,
+                )
+            )
+        made = griffe.Parameters(*parameters)
+        cls.set_member("__init__", griffe.Function("__init__", parameters=made, parent=cls))
 
 
 if __name__ == "__main__":
-    folder = Path(sys.argv[1])
-    folder.mkdir(parents=True, exist_ok=True)
     for executed in sys.argv[2:]:
-        for name, data in _notebook(Path(executed))[1].items():
-            (folder / name).write_bytes(data)
+        for picture, content in _notebook(Path(executed))[1].items():
+            Path(sys.argv[1], picture).write_bytes(content)

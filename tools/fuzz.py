@@ -18,9 +18,9 @@ from spoiled_files import outcome, seeds, spoiled
 
 
 def main(name: str, examples: str = "20000") -> None:
-    folder = Path(tempfile.mkdtemp())
-    paths = seeds(name, folder)
-    file = folder / f"input{paths[0].suffix}"
+    corpus = Path(tempfile.mkdtemp())
+    paths = seeds(name, Path(tempfile.mkdtemp()))
+    file = paths[0].with_stem("input")
     print(f"the last file read is {file}")
 
     @given(spoiled([path.read_bytes() for path in paths]))
@@ -31,8 +31,6 @@ def main(name: str, examples: str = "20000") -> None:
     for module in [sys.modules[key] for key in sys.modules if key.startswith("splatjax.io.")]:
         for value in filter(inspect.isfunction, vars(module).values()):
             value.__code__ = atheris.instrument_func(value).__code__
-    corpus = folder / "corpus"
-    corpus.mkdir()
     for number in range(16):  # bytes from which Hypothesis draws
         (corpus / str(number)).write_bytes(random.Random(number).randbytes(2048))
     flags = [f"-runs={examples}", "-max_len=4096", "-len_control=0", str(corpus)]

@@ -1,7 +1,9 @@
 """Try what would be released: `make release-check` builds it into dist/ and runs this.
 
-The wheel is installed in a bare environment, in an empty folder with no checkout near; there the
-program of the README and the command line must run.
+The sdist must make the same wheel, byte for byte. The wheel is installed in a bare environment, in
+an empty folder with no checkout near, with the newest versions of what it needs, or by `--lowest`
+with the lowest that pyproject.toml permits. There the program of the README and the command line
+must run.
 """
 
 import os
@@ -48,8 +50,8 @@ def check_contents(wheel: Path, sdist: Path, folder: Path) -> None:
         archive.extractall(folder, filter="data")
     source = folder / sdist.name.removesuffix(".tar.gz")
     run(_BIN / "hatchling", "build", "--target", "wheel", "--directory", folder, cwd=source)
-    again = set(zipfile.ZipFile(folder / wheel.name).namelist())
-    check(again == names, f"{sdist.name} makes another wheel than the checkout")
+    is_same = (folder / wheel.name).read_bytes() == wheel.read_bytes()
+    check(is_same, f"{sdist.name} makes another wheel than the checkout")
 
 
 def main() -> None:
@@ -60,7 +62,9 @@ def main() -> None:
         check_contents(wheel, sdist, Path(name))
         run(_BIN / "uv", "venv", "--quiet", "--python", sys.executable, environment, cwd=empty)
         python, splatjax = environment / "bin" / "python", environment / "bin" / "splatjax"
-        run(_BIN / "uv", "pip", "install", "--quiet", "--python", python, wheel, cwd=empty)
+        least = ["--resolution", "lowest-direct", "--requirements", ROOT / "pyproject.toml"]
+        choice = least if "--lowest" in sys.argv else []
+        run(_BIN / "uv", "pip", "install", "--quiet", "--python", python, wheel, *choice, cwd=empty)
         program = "import splatjax; print(splatjax.__file__, splatjax.__version__)"
         file, version = run(python, "-c", program, cwd=empty).split()
         installed = Path(file).is_relative_to(environment) and version == wheel.name.split("-")[1]
