@@ -30,6 +30,7 @@ MOVED = {
     "README.md": "index.md",
     "CHANGELOG.md": "changelog.md",
     "CONTRIBUTING.md": "contributing.md",
+    "SECURITY.md": "security.md",
     "LICENSE": "license.txt",
     "CITATION.cff": "citation.cff",
     "notebooks": "notebooks/index.md",
@@ -89,7 +90,7 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
     documentation.
     """
     here = page.file.src_uri
-    if here in ("index.md", "tour.md", "gallery.md"):
+    if here in ("index.md", "installation.md", "tour.md", "gallery.md"):
         page.meta["hide"] = ["navigation"]  # a page alone in its tab
     if here.startswith("api/") or here == MOVED["notebooks"]:
         return markdown
