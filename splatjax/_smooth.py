@@ -1,4 +1,4 @@
-"""The smooth step, and the root of an albedo."""
+"""The smooth step, the root of an albedo, and the mean of an exponential."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -29,3 +29,13 @@ def albedo_root(albedo: Float[Array, "..."]) -> Float[Array, "..."]:
     equal parts.
     """
     return jnp.sqrt(jnp.where(albedo > _ALBEDO_FLOOR, albedo, _ALBEDO_FLOOR))
+
+
+def mean_decay(x: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Compute `(1 - exp(-x)) / x`, the mean of `exp(-t)` from 0 to x: 1 at 0, with the derivative
+    -1/2.
+    """
+    is_small = x < 1e-2
+    small, large = jnp.where(is_small, x, 0.0), jnp.where(is_small, 1.0, x)
+    series = 1 - small / 2 * (1 - small / 3 * (1 - small / 4 * (1 - small / 5 * (1 - small / 6))))
+    return jnp.where(is_small, series, -jnp.expm1(-large) / large)

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from splatjax._chunking import jit_unless_traced
 from splatjax.gaussians import SumOfGaussians
-from splatjax.scattering import DiffuseTransmission
+from splatjax.scattering import diffuse_scaling
 
 
 def burley_distance(gaussians: SumOfGaussians) -> Float[Array, " channels"]:
@@ -46,12 +46,7 @@ def blender_radius(gaussians: SumOfGaussians) -> Float[Array, " channels"]:
     **Source:** Blender Foundation, Cycles, `kernel/closure/bssrdf.h`; Christensen and Burley 2015,
     Eq. 6.
     """
-    return (
-        4
-        * jnp.pi
-        * DiffuseTransmission()(gaussians.total_reflectance())
-        * burley_distance(gaussians)
-    )
+    return 4 * jnp.pi * diffuse_scaling(gaussians.total_reflectance()) * burley_distance(gaussians)
 
 
 @jit_unless_traced

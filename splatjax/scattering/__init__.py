@@ -1,31 +1,31 @@
 """Media, interfaces, layers and reference profiles."""
 
-from ._burley import (
-    AbstractBurleyScaling as AbstractBurleyScaling,
-    Burley as Burley,
-    DiffuseMeanFreePath as DiffuseMeanFreePath,
-    DiffuseTransmission as DiffuseTransmission,
-    Searchlight as Searchlight,
-)
 from ._dipole import (
     AbstractDipole as AbstractDipole,
     AbstractHalfSpace as AbstractHalfSpace,
     BetterDipole as BetterDipole,
+    Burley as Burley,
+    diffuse_mean_free_path_scaling as diffuse_mean_free_path_scaling,
+    diffuse_scaling as diffuse_scaling,
     Dipole as Dipole,
-)
-from ._fresnel import (
-    AbstractFresnel as AbstractFresnel,
-    EganFresnel as EganFresnel,
-    ExactFresnel as ExactFresnel,
-    moment_outside as moment_outside,
-    reflectance as reflectance,
+    searchlight_scaling as searchlight_scaling,
 )
 from ._half_space import (
     ANGULAR_POWERS as ANGULAR_POWERS,
     AngularLaw as AngularLaw,
     HalfSpace as HalfSpace,
 )
-from ._medium import check_stack as check_stack, Film as Film, Layer as Layer, Medium as Medium
+from ._medium import (
+    AbstractFresnel as AbstractFresnel,
+    check_stack as check_stack,
+    EganFresnel as EganFresnel,
+    ExactFresnel as ExactFresnel,
+    Film as Film,
+    Layer as Layer,
+    Medium as Medium,
+    moment_outside as moment_outside,
+    reflectance as reflectance,
+)
 from ._photon_beam import PhotonBeam as PhotonBeam, SingleScattering as SingleScattering
 from ._quadrature import (
     AbstractRadialRule as AbstractRadialRule,

@@ -1,6 +1,9 @@
-"""Light transport in a half space by adding and doubling: the fraction of light that leaves, by the
-angle of entry, and the law of angles of a material.
+"""Light transport in a half space by adding and doubling, reflection and transmission of layers
+between discrete cosines: the fraction of light that leaves, by the angle of entry, and the law of
+angles of a material.
 """
+
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -13,11 +16,16 @@ from jaxtyping import Array, Float
 from splatjax._chunking import jit_unless_traced
 from splatjax._records import Numbers, as_floats, check_values, numbers, record, valid
 
-from ._doubling import diffuse_albedo, directional_albedo, outside_cosines
-from ._medium import Layer, Medium
+from ._medium import Layer, Medium, reflectance
+from ._quadrature import unit_legendre
 
 ANGULAR_POWERS = 5  # of the law that is fitted
 _HALVINGS = 24  # of the interval in which a similarity parameter lies
+_OUTSIDE, _BEYOND = 12, 8  # cosines: refracted, and beyond the critical angle
+_MOMENTS = 12  # of the phase function
+_LEAST_COSINE = 1e-4
+_DEPTH = 0.05  # of the first layer of a half space, in mean free paths
+_DOUBLINGS, _COVER_DOUBLINGS = 18, 8
 
 
 @record
@@ -67,10 +75,8 @@ class AngularLaw(eqx.Module):
 
     def __call__(self, mu: Float[Array, "*points"]) -> Float[Array, "*points channels"]:
         """Compute `e(mu)`; `mu` is the cosine outside, in [0, 1]."""
-        value = jnp.zeros((*mu.shape, self.channels), mu.dtype)
-        for coefficient in self.coefficients[::-1]:
-            value = value * mu[..., None] + jnp.broadcast_to(coefficient, value.shape)
-        return value
+        powers = self.coefficients[::-1].reshape(-1, *[1] * mu.ndim, self.channels)
+        return jnp.polyval(powers, mu[..., None], unroll=len(powers))
 
 
 @record
@@ -132,7 +138,7 @@ class HalfSpace(eqx.Module):
         color, mean_free_path, eta, g = jnp.broadcast_arrays(*given)
         check_values("color", color, "between 0.001 and 1", lambda x: (x >= 1e-3) & (x <= 1))
         check_values("mean_free_path", mean_free_path, "positive (mm)", lambda x: x > 0)
-        absorbed = _similarity_of_color(color, eta, g) ** 2  # 1 - albedo'
+        absorbed = jax.vmap(_similarity_of_color)(color, eta, g) ** 2  # 1 - albedo'
         # From the reduced albedo to that of the unreduced medium, without cancellation.
         per_mm = (1 - g) / (1 - g * absorbed) / mean_free_path
         return cls(Medium(per_mm * absorbed, per_mm * (1 - absorbed), eta), g)
@@ -140,18 +146,14 @@ class HalfSpace(eqx.Module):
     @staticmethod
     def cosines() -> Float[np.ndarray, " angles"]:
         """Return the cosines outside, ascending to 1, at which reflectances are computed."""
-        return outside_cosines()
+        return np.append(unit_legendre(_OUTSIDE)[0] ** 2, 1.0)
 
     @jit_unless_traced
     def directional_albedo(self) -> Float[Array, "angles channels"]:
         """Compute the fraction of light, entering at each of `cosines`, that leaves, within 3e-4.
         Energy is conserved by construction.
         """
-        medium = self.medium
-        fraction = jax.vmap(directional_albedo)(
-            medium.albedo_prime, medium.eta, self.g, self._cover()
-        )
-        return fraction.T
+        return self._by_channel(_directional_albedo).T
 
     def total_reflectance(self) -> Float[Array, " channels"]:
         """Compute the fraction of the light entering along the normal that leaves."""
@@ -162,15 +164,13 @@ class HalfSpace(eqx.Module):
         """Compute the fraction that leaves of diffuse light that has entered: the color of a flat
         surface in a white furnace, without the reflection of its surface.
         """
-        medium = self.medium
-        return jax.vmap(diffuse_albedo)(medium.albedo_prime, medium.eta, self.g, self._cover())
+        return self._by_channel(_diffuse_albedo)
 
-    def _cover(self) -> "tuple[Float[Array, ' channels'], Float[Array, ' channels']] | None":
-        """Return the reduced albedo of the cover and its reduced optical depth."""
-        if self.cover is None:
-            return None
-        medium = self.cover.medium
-        return medium.albedo_prime, medium.sigma_t_prime * self.cover.thickness
+    def _by_channel(self, fraction: Callable[..., Array]) -> Float[Array, "channels *angles"]:
+        """Compute a fraction by reduced albedo, index, g, and the cover's albedo and depth."""
+        medium, cover = self.medium, self.cover
+        layer = cover and (cover.medium.albedo_prime, cover.medium.sigma_t_prime * cover.thickness)
+        return jax.vmap(fraction)(medium.albedo_prime, medium.eta, self.g, layer)
 
     @jit_unless_traced
     def angular_law(self, separate: Float[Array, "angles channels"] | None = None) -> AngularLaw:
@@ -184,43 +184,141 @@ class HalfSpace(eqx.Module):
         fraction = self.directional_albedo()
         if separate is not None:
             fraction = fraction - separate
-        mu, degree = self.cosines(), ANGULAR_POWERS - 1
-        # Least squares in the powers of 1 - mu, weighted by the irradiance of uniform light.
-        powers = (1 - mu[:, None]) ** np.arange(1, degree + 1)
-        weight = np.sqrt(mu)[:, None]
+        # Least squares in mu^k - 1, weighted by the irradiance of uniform light.
+        mu = self.cosines()[:, None]
+        powers, weight = mu ** np.arange(1, ANGULAR_POWERS) - 1, np.sqrt(mu)
         inverse = np.linalg.pinv(weight * powers) * weight.T
         fitted = jnp.asarray(inverse, fraction.dtype) @ (fraction / fraction[-1:] - 1)
-        # From powers of 1 - mu to powers of mu.
-        expansion = np.polynomial.polynomial.polyvander
-        grid = np.linspace(0, 1, degree + 1)
-        exchange = np.linalg.solve(
-            expansion(grid, degree), (1 - grid[:, None]) ** np.arange(degree + 1)
-        )
-        one = jnp.ones_like(fitted[:1])
-        return AngularLaw(jnp.asarray(exchange, fitted.dtype) @ jnp.concatenate([one, fitted]))
+        return AngularLaw(jnp.concatenate([1 - jnp.sum(fitted, axis=0, keepdims=True), fitted]))
 
 
 @jit_unless_traced
 def _similarity_of_color(
-    color: Float[Array, " channels"], eta: Float[Array, " channels"], g: Float[Array, " channels"]
-) -> Float[Array, " channels"]:
+    color: Float[Array, ""], eta: Float[Array, ""], g: Float[Array, ""]
+) -> Float[Array, ""]:
     """Find the similarity parameter, the root of `1 - albedo'`, in which a color is almost
     linear.
     """
-    solver = optx.Bisection(rtol=0, atol=0)
 
-    def solve(color, eta, g):
-        def excess(similarity, given):
-            color, eta, g, white = given
-            return diffuse_albedo(1 - similarity * similarity, eta, g) / white - color
+    def excess(similarity, given):
+        color, eta, g, white = given
+        return _diffuse_albedo(1 - similarity * similarity, eta, g) / white - color
 
-        # White is 1 to rounding.
-        white = diffuse_albedo(jnp.ones_like(color), eta, g)
-        ends = {"lower": jnp.zeros_like(color), "upper": jnp.full_like(color, 1 - 1e-6)}
-        given = color, eta, g, white
-        found = optx.root_find(
-            excess, solver, 0.5 * ends["upper"], given, ends, max_steps=_HALVINGS, throw=False
+    # White is 1 to rounding.
+    given = color, eta, g, _diffuse_albedo(jnp.ones_like(color), eta, g)
+    ends = {"lower": jnp.zeros_like(color), "upper": jnp.full_like(color, 1 - 1e-6)}
+    solver, start = optx.Bisection(rtol=0, atol=0), 0.5 * ends["upper"]
+    root = optx.root_find(excess, solver, start, given, ends, max_steps=_HALVINGS, throw=False)
+    return root.value
+
+
+def _directional_albedo(albedo_prime, eta, g, cover=None) -> Float[Array, " angles"]:
+    """Compute the fraction of light, entering at each of `HalfSpace.cosines`, that leaves a half
+    space. The cover is given by its reduced albedo and reduced optical depth.
+    """
+    mu, weights, reflected = _directions(eta)
+    half_space = _doubled(mu, weights, albedo_prime, g)[1]
+    identity = jnp.eye(len(mu), dtype=mu.dtype)
+    if cover is not None:
+        # Adding the cover.
+        transmitted, back = _doubled(mu, weights, cover[0], g, cover[1])
+        between = jnp.linalg.solve(identity - back @ half_space, transmitted)
+        half_space = back + transmitted @ half_space @ between
+
+    # Adding the surface: by reciprocity, the fraction that leaves of light from one direction is
+    # the fraction of light from all directions that leaves in that direction.
+    leaving = jnp.linalg.solve(
+        identity - half_space * reflected[None], half_space @ (1 - reflected)[:, None]
+    )
+    return leaving[: _OUTSIDE + 1, 0]
+
+
+def _doubled(mu, weights, albedo_prime, g, optical_depth=None):
+    """Return the transmission and reflection, between all cosines, of a layer of a reduced optical
+    depth, or of a half space.
+    """
+    even, odd, albedo, extinction = _redistribution(mu, weights, albedo_prime, g)
+    doublings = _DOUBLINGS if optical_depth is None else _COVER_DOUBLINGS
+    depth = _DEPTH if optical_depth is None else optical_depth * extinction / 2**doublings
+
+    # One layer, with the mean of its two sides for the light within: the even part of the light
+    # from both sides is attenuated by `with_even`, the odd part by `with_odd`.
+    identity, half_depth = jnp.eye(len(mu), dtype=mu.dtype), 0.5 * depth / mu[:, None]
+    losses = [half_depth * (identity - albedo * part) for part in (even, odd)]
+    with_even, with_odd = (jnp.linalg.solve(identity + loss, identity - loss) for loss in losses)
+    # Absorption of equal light from both sides, as a sum of positive terms.
+    absorbed = jnp.linalg.solve(identity + losses[0], 2 * half_depth * (1 - albedo))
+    layer = 0.5 * (with_even + with_odd), 0.5 * (with_even - with_odd), absorbed
+
+    # Doubling; energy is conserved to rounding.
+    def double(_, layer):
+        transmitted, reflected, absorbed = layer
+        between = jnp.linalg.solve(
+            identity - reflected @ reflected,
+            jnp.concatenate(
+                [transmitted, reflected @ transmitted, absorbed + reflected @ absorbed], axis=1
+            ),
         )
-        return found.value
+        count = len(identity)
+        direct, back, below = jnp.split(between, [count, 2 * count], axis=1)
+        transmitted, reflected = transmitted @ direct, reflected + transmitted @ back
+        absorbed = absorbed + layer[0] @ below
+        scale = (1 - absorbed) / jnp.sum(transmitted + reflected, axis=1, keepdims=True)
+        return scale * transmitted, scale * reflected, absorbed
 
-    return jax.vmap(solve)(color, eta, g)
+    transmitted, reflected, _ = jax.lax.fori_loop(0, doublings, double, layer)
+    return transmitted, reflected
+
+
+def _diffuse_albedo(albedo_prime, eta, g, cover=None) -> Float[Array, ""]:
+    """Compute the fraction that leaves of diffuse light that has entered."""
+    mu, weights, reflected = (each[: _OUTSIDE + 1] for each in _directions(eta))
+    entering = mu * weights * (1 - reflected)
+    return jnp.vdot(entering, _directional_albedo(albedo_prime, eta, g, cover)) / jnp.sum(entering)
+
+
+def _directions(eta: Float[Array, ""]):
+    """Return cosines inside, their weights, and the reflectance of the surface met from inside:
+    refracted ones, of `HalfSpace.cosines`, and those beyond the critical angle.
+    """
+    nodes, node_weights = unit_legendre(_OUTSIDE)
+    outside = jnp.asarray(HalfSpace.cosines(), eta.dtype)
+    outside_weights = jnp.asarray(np.append(2 * nodes * node_weights, 0), eta.dtype)
+    beyond, beyond_weights = (jnp.asarray(each, eta.dtype) for each in unit_legendre(_BEYOND))
+    squared = eta * eta
+    inside = jnp.sqrt(jnp.maximum(squared - 1 + outside * outside, _LEAST_COSINE**2)) / eta
+    is_denser = squared > 1
+    critical = jnp.where(is_denser, jnp.sqrt(jnp.where(is_denser, squared - 1, 1.0)) / eta, 0.0)
+    mu = jnp.concatenate([inside, jnp.maximum(critical * beyond, _LEAST_COSINE)])
+    weights = jnp.concatenate(
+        [outside_weights * outside / (squared * inside), critical * beyond_weights]
+    )
+    reflected = jnp.concatenate(
+        [reflectance(inside, outside, jnp.broadcast_to(eta, inside.shape)), jnp.ones_like(beyond)]
+    )
+    return mu, weights / jnp.sum(weights), reflected
+
+
+def _redistribution(mu, weights, albedo_prime, g):
+    """Return the phase function's even and odd moments, between all cosines and times their
+    weights; and the albedo and the reduced extinction, the forward peak taken as unscattered.
+    """
+    polynomials = [jnp.ones_like(mu), mu]
+    for n in range(1, _MOMENTS - 1):
+        polynomials.append(((2 * n + 1) * mu * polynomials[n] - n * polynomials[n - 1]) / (n + 1))
+    legendre = jnp.stack(polynomials)
+    peak = g**_MOMENTS
+    powers = jnp.concatenate([jnp.ones(1, mu.dtype), jnp.broadcast_to(g, (_MOMENTS - 1,))])
+    moments = (
+        jnp.asarray(2 * np.arange(_MOMENTS) + 1, mu.dtype)
+        * (jnp.cumprod(powers) - peak)
+        / (1 - peak)
+    )
+    by_moment = legendre * moments[:, None]
+    even, odd = (
+        by_moment[parity::2].T @ (legendre[parity::2] * weights[None]) for parity in (0, 1)
+    )
+    even = even / jnp.sum(even, axis=1, keepdims=True)  # nothing is lost to rounding
+    scattered = albedo_prime * (1 - peak) / (1 - g)
+    extinction = scattered + 1 - albedo_prime
+    return even, odd, scattered / extinction, extinction

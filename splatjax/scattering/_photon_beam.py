@@ -14,8 +14,7 @@ from splatjax._records import numbers, record
 from splatjax.gaussians import AbstractProfile
 
 from ._dipole import AbstractHalfSpace, BetterDipole
-from ._fresnel import moment_outside, reflectance
-from ._medium import Medium
+from ._medium import Medium, moment_outside, reflectance
 from ._quadrature import along_first_axis, integrated_reflectance, unit_interval, unit_legendre
 
 _NODES = 128

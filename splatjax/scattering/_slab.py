@@ -13,8 +13,7 @@ from splatjax._chunking import jit_unless_traced
 from splatjax._records import numbers, record, several
 from splatjax.gaussians import AbstractProfile
 
-from ._fresnel import AbstractFresnel, ExactFresnel
-from ._medium import Film, Layer, check_stack
+from ._medium import AbstractFresnel, ExactFresnel, Film, Layer, check_stack
 from ._quadrature import inverse_hankel_transform, unit_interval
 
 

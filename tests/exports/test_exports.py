@@ -13,8 +13,8 @@ def test_burley_distance_matches_the_mean_distance(float64):
     d = sj.exports.burley_distance(gaussians)
     burley = sj.scattering.Burley(
         jnp.ones(3),
-        d * sj.scattering.DiffuseTransmission()(jnp.ones(3)),
-        sj.scattering.DiffuseTransmission(),
+        d * sj.scattering.diffuse_scaling(jnp.ones(3)),
+        sj.scattering.diffuse_scaling,
     )
     np.testing.assert_allclose(burley.length_scale(), d, rtol=1e-12)
     r = np.linspace(1e-4, 80, 400_000)
@@ -38,7 +38,7 @@ def test_lengths_scale_and_stay_related(dtype):
     # As Cycles reads it: a quarter of the radius over pi is the mean free path.
     path = 0.25 * sj.exports.blender_radius(gaussians) / np.pi
     burley = sj.scattering.Burley(
-        gaussians.total_reflectance(), path, sj.scattering.DiffuseTransmission()
+        gaussians.total_reflectance(), path, sj.scattering.diffuse_scaling
     )
     np.testing.assert_allclose(
         burley.length_scale(), sj.exports.burley_distance(gaussians), rtol=1e-5
