@@ -62,7 +62,6 @@ RECORDS = {
         np.ones((2, 2, 3)), camera(), [light()], deviation=0.01
     ),
     "Candidate": lambda: sj.inverse.Candidate("front", camera(), light()),
-    "HenyeyGreenstein": lambda: sj.transport.HenyeyGreenstein([0.5, 0]),
     "GivenVariances": lambda: sj.fitting.GivenVariances((0.1, 2)),
 }
 
@@ -202,10 +201,6 @@ def test_traced_values_and_placeholders_pass_through_transformations():
             "deviation",
         ),
         (lambda: sj.scattering.Multipole(medium(), -1.0), "too many positional arguments"),
-        (
-            lambda: sj.transport.HenyeyGreenstein(1.0),
-            r"HenyeyGreenstein\.g must be between -1 and 1",
-        ),
         (
             lambda: sj.scattering.Tabulated([0, 1], [1, 1]).without(
                 sj.SingleScattering(sj.Medium(0.1, 0.9, 1.0))

@@ -5,7 +5,6 @@ from typing import Literal, TypeAlias
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 import splatjax as sj
 
@@ -132,7 +131,7 @@ def _walked(
             layers_32,
             photons,
             jax.random.key(0),
-            phase=sj.transport.HenyeyGreenstein(np.float32(g)),
+            g=g,
             progress=lambda done, _: report(done),
         )
     profile = jax.tree.map(lambda leaf: leaf.astype(jnp.float64), walk.profile())

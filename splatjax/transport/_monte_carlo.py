@@ -12,10 +12,9 @@ from jaxtyping import Array, Float, Int, Key
 from splatjax._records import Numbers, as_floats, check_values
 from splatjax.scattering import Film, Layer, check_stack
 
-from ._directions import AbstractIncidence, AbstractPhaseFunction, Isotropic, NormalIncidence
-from ._results import AbstractTallies, MonteCarlo, PathDerivatives, SampleMean, assemble
+from ._results import MonteCarlo, assemble
 from ._rounds import Walk, WalkSettings, finish
-from ._walk import Optics, Stack
+from ._walk import AbstractIncidence, NormalIncidence, Optics, Stack
 
 _FLIGHTS = 20_000
 
@@ -36,6 +35,7 @@ class LayeredMedia(eqx.Module):
       thickness.
     - `thickness`: mm.
     - `eta`: indices relative to air, those of the neighbors above and below included.
+    - `g`: mean cosines of the phase function.
     - `first`: number of the uppermost layer that scatters.
     """
 
@@ -43,13 +43,14 @@ class LayeredMedia(eqx.Module):
     sigma_s: Float[Array, "layers channels"]
     thickness: Float[Array, "layers channels"]
     eta: Float[Array, "layers_and_neighbors channels"]
+    g: Float[Array, " layers"]
     first: int = eqx.field(static=True)
 
     @classmethod
     def of(
         cls,
         layers: Sequence[Layer | Film],
-        anisotropy: Float[Array, " layers"],
+        g: Float[Array, " layers"],
         eta_above: Float[Array, "*channels"],
         eta_below: Float[Array, "*channels"],
     ) -> "LayeredMedia":
@@ -66,13 +67,13 @@ class LayeredMedia(eqx.Module):
             if isinstance(layer, Film):
                 rows.append((layer.optical_depth / thin, jnp.zeros_like(like), thin, medium.eta))
             else:
-                sigma_s = medium.sigma_s_prime / (1 - anisotropy[number])
+                sigma_s = medium.sigma_s_prime / (1 - g[number])
                 thickness = jnp.broadcast_to(layer.thickness, like.shape)
                 rows.append((medium.sigma_a, sigma_s, thickness, medium.eta))
         sigma_a, sigma_s, thickness, eta = (jnp.stack(column) for column in zip(*rows, strict=True))
         above, below = (jnp.broadcast_to(edge, (1, len(like))) for edge in (eta_above, eta_below))
         first = next(number for number, layer in enumerate(layers) if isinstance(layer, Layer))
-        return cls(sigma_a, sigma_s, thickness, jnp.concatenate([above, eta, below]), first)
+        return cls(sigma_a, sigma_s, thickness, jnp.concatenate([above, eta, below]), g, first)
 
     def shared_walks(self) -> list[np.ndarray]:
         """Group the channels, by number, that differ in absorption and in scale alone: they share a
@@ -98,7 +99,7 @@ def monte_carlo(
     *,
     edges: Numbers | None = None,
     incidence: AbstractIncidence = NormalIncidence(),
-    phase: AbstractPhaseFunction = Isotropic(),
+    g: Numbers = 0.0,
     eta_above: Numbers = 1.0,
     eta_below: Numbers = 1.0,
     flights: int = _FLIGHTS,
@@ -112,8 +113,7 @@ def monte_carlo(
     in scale (a half space of one index), share their walks, and therefore their errors.
 
     Differentiable in `sigma_a`, `sigma_s_prime` and the optical depth of films, in forward and
-    reverse mode, by the likelihood of each path. The standard errors are constants; those of
-    derivatives: `path_derivatives`.
+    reverse mode, by the likelihood of each path. The standard errors are constants.
 
     **Arguments:**
 
@@ -123,7 +123,8 @@ def monte_carlo(
     - `edges`: of the rings, mm; ascending. By default 128 rings whose widths grow in proportion,
       from a fiftieth of a mean free path.
     - `incidence`: `NormalIncidence()` or `DiffuseIncidence()`.
-    - `phase`: `Isotropic()` or `HenyeyGreenstein(g)`; `sigma_s = sigma_s' / (1 - g)`.
+    - `g`: mean cosine of Henyey and Greenstein's phase function, between -1 and 1; one for all
+      layers, or one for each. `sigma_s = sigma_s' / (1 - g)`.
     - `eta_above`, `eta_below`: indices of the neighbors relative to air.
     - `flights`: largest number of flights from event to event for each photon; its power after them
       is `unfinished`.
@@ -132,58 +133,12 @@ def monte_carlo(
     **Returns:** a `MonteCarlo`.
 
     **Raises:** `ValueError` for no scattering layer, for numbers of channels that differ, for an
-    infinite layer above another, for a number of photons below 2 or not below 2^30, for edges that
-    do not ascend, and for derivatives in other arguments.
+    infinite layer above another, for a number of photons below 2 or not below 2^30, for a `g` out
+    of its range, for edges that do not ascend, and for derivatives in other arguments.
 
     **Source:** Wang, Jacques and Zheng 1995 (MCML); one walk for many absorptions: Kienle and
     Patterson 1996; path weights: Hayakawa et al. 2001.
     """
-    media, settings = _set_up(
-        layers,
-        photons,
-        key,
-        edges=edges,
-        incidence=incidence,
-        phase=phase,
-        eta_above=eta_above,
-        eta_below=eta_below,
-        flights=flights,
-    )
-    return _monte_carlo(media, settings, progress=progress)
-
-
-def path_derivatives(
-    layers: Sequence[Layer | Film],
-    photons: int,
-    key: Key[Array, ""],
-    *,
-    progress: Callable[[int, int], None] | None = None,
-    **settings,
-) -> tuple[MonteCarlo, PathDerivatives, PathDerivatives]:
-    r"""Compute the results of `monte_carlo`, and their derivatives in `sigma_a` and `sigma_s`
-    (1/mm) of each layer, with standard errors.
-
-    **Arguments:** those of `monte_carlo`.
-
-    **Returns:** the results, and their derivatives by absorption and by scattering. The absorption
-    coefficient of a film is its optical depth over its thickness, a millionth of a free path.
-    """
-    return _walk_all(*_set_up(layers, photons, key, **settings), True, progress)
-
-
-def _set_up(
-    layers: Sequence[Layer | Film],
-    photons: int,
-    key: Key[Array, ""],
-    *,
-    edges: Numbers | None = None,
-    incidence: AbstractIncidence = NormalIncidence(),
-    phase: AbstractPhaseFunction = Isotropic(),
-    eta_above: Numbers = 1.0,
-    eta_below: Numbers = 1.0,
-    flights: int = _FLIGHTS,
-) -> tuple[LayeredMedia, WalkSettings]:
-    """Check and complete the arguments of `monte_carlo`."""
     for name, number, least in (("photons", photons, 2), ("flights", flights, 1)):
         check_values(
             name,
@@ -194,9 +149,14 @@ def _set_up(
     layers = tuple(layers)
     check_stack(layers)
     dtype = next(layer.medium.sigma_a.dtype for layer in layers if isinstance(layer, Layer))
-    above, below = as_floats(eta_above, dtype), as_floats(eta_below, dtype)
+    above, below, g = (as_floats(values, dtype) for values in (eta_above, eta_below, g))
+    check_values("g", g, "between -1 and 1, both excluded", lambda x: abs(x) < 1)
+    if g.shape not in ((), (len(layers),)):
+        raise ValueError(
+            f"g must be one number, or one for each of the {len(layers)} layers; got {g.shape[0]}"
+        )
     edges = None if edges is None else as_floats(edges, dtype)
-    media, edges = _prepare(layers, phase, above, below, edges)
+    media, edges = _prepare(layers, g, above, below, edges)
     check_values("edges", edges, "at least two, from 0 mm on", lambda x: (x >= 0) & (len(x) > 1))
     steps = jnp.diff(edges)
     check_values(
@@ -204,15 +164,16 @@ def _set_up(
     )
     numbers = jnp.asarray(photons, jnp.int32), jnp.asarray(flights, jnp.int32)
     lanes = max(_LEAST_LANES, 1 << (photons // _PHOTONS_A_LANE).bit_length())
-    return media, WalkSettings(edges, incidence, phase, key, *numbers, min(_MOST_LANES, lanes))
+    settings = WalkSettings(edges, incidence, key, *numbers, min(_MOST_LANES, lanes))
+    moments = _walk_all(media, settings, progress=progress)
+    specular = incidence.reflected(media.eta[1] / media.eta[0])
+    return assemble(moments, edges, settings.photons, specular)
 
 
 @eqx.filter_jit
-def _prepare(layers, phase: AbstractPhaseFunction, eta_above, eta_below, edges):
+def _prepare(layers, g, eta_above, eta_below, edges):
     """Lay out the media, and, unless there are others, rings as far as light leaves."""
-    media = LayeredMedia.of(
-        layers, phase.anisotropy(len(layers), eta_above.dtype), eta_above, eta_below
-    )
+    media = LayeredMedia.of(layers, jnp.broadcast_to(g, len(layers)), eta_above, eta_below)
     if edges is not None:
         return media, edges
     top = jax.lax.stop_gradient(layers[media.first].medium)
@@ -224,17 +185,20 @@ def _prepare(layers, phase: AbstractPhaseFunction, eta_above, eta_below, edges):
 
 
 @eqx.filter_custom_jvp
-def _monte_carlo(media: LayeredMedia, settings: WalkSettings, *, progress) -> MonteCarlo:
-    return _walk_all(media, settings, False, progress)[0]
+def _walk_all(
+    media: LayeredMedia, settings: WalkSettings, *, progress
+) -> Float[Array, "channels places two"]:
+    """Compute the means of weights and of their squares, by channel and place."""
+    return _mean_moments(media, settings, False, progress)
 
 
-@_monte_carlo.def_jvp
-def _monte_carlo_jvp(primals, tangents, *, progress):
+@_walk_all.def_jvp
+def _walk_all_jvp(primals, tangents, *, progress):
     (media, settings), (media_dot, settings_dot) = primals, tangents
     for name, tangent in (
         ("thickness", media_dot.thickness),
         ("eta", media_dot.eta),
-        ("edges and phase", settings_dot),
+        ("edges and g", (media_dot.g, settings_dot)),
     ):
         if jax.tree.leaves(tangent):
             raise ValueError(
@@ -242,52 +206,28 @@ def _monte_carlo_jvp(primals, tangents, *, progress):
                 "differentiate sigma_a and sigma_s_prime, or take differences of results with "
                 "the same key"
             )
-    result, by_absorption, by_scattering = _walk_all(media, settings, True, progress)
-    pairs = [(by_absorption, media_dot.sigma_a), (by_scattering, media_dot.sigma_s)]
-    return result, _along(result, [pair for pair in pairs if pair[1] is not None])
+    moments = _mean_moments(media, settings, True, progress)
+    none = jnp.zeros_like(media.sigma_a)
+    along = [none if dot is None else dot for dot in (media_dot.sigma_a, media_dot.sigma_s)]
+    slope = jnp.einsum("crp,pc->cr", moments[..., 2:], jnp.concatenate(along))
+    return moments[..., :2], jnp.stack([slope, jnp.zeros_like(slope)], axis=-1)
 
 
-@eqx.filter_jit
-def _along(
-    result: MonteCarlo, pairs: list[tuple[PathDerivatives, Float[Array, "layers channels"]]]
-) -> MonteCarlo:
-    """Compute the derivative of a result along tangents of coefficients."""
-
-    def tangent_of(name: str) -> SampleMean:
-        zero = jnp.zeros_like(getattr(result, name).value)
-        slopes = (
-            jnp.einsum("l...c,lc->...c", getattr(by, name).value, tangent) for by, tangent in pairs
-        )
-        return SampleMean(sum(slopes, start=zero), zero)
-
-    return MonteCarlo(
-        edges=jnp.zeros_like(result.edges),
-        specular=jnp.zeros_like(result.specular),
-        **{name: tangent_of(name) for name in AbstractTallies.__dataclass_fields__},
-    )
-
-
-def _walk_all(media: LayeredMedia, settings: WalkSettings, with_derivatives: bool, progress):
+def _mean_moments(media: LayeredMedia, settings: WalkSettings, with_slopes: bool, progress):
     """Walk each group of channels that share a walk, and put the channels in their order."""
-    groups, tallies = media.shared_walks(), []
+    groups, means = media.shared_walks(), []
+    count = settings.photons.astype(settings.edges.dtype)
     for number, group in enumerate(groups):
-        walk = _walk_of(
-            media,
-            settings,
-            jnp.asarray(number),
-            jnp.asarray(group.astype(np.int32)),
-            with_derivatives,
-        )
+        channels = jnp.asarray(group.astype(np.int32))
+        walk = _walk_of(media, settings, jnp.asarray(number), channels, with_slopes)
         report = progress and (
             lambda done, photons, before=number: progress(
                 before * photons + done, len(groups) * photons
             )
         )
-        tallies.append(finish(walk, report))
+        means.append(finish(walk, report).over(count))
     order = jnp.asarray(np.argsort(np.concatenate(groups)).astype(np.int32))
-    specular = settings.incidence.reflected(media.eta[1] / media.eta[0])
-    layers = media.sigma_a.shape[0] if with_derivatives else 0
-    return assemble(tallies, order, settings.edges, settings.photons, specular, layers)
+    return jnp.concatenate(means)[order]
 
 
 @eqx.filter_jit
@@ -296,26 +236,27 @@ def _walk_of(
     settings: WalkSettings,
     number: Int[Array, ""],
     group: Int[Array, " group"],
-    with_derivatives: bool,
+    with_slopes: bool,
 ) -> Walk:
     """Set up the walk of a group of channels, in the free paths of the first of them."""
+    sigma_a, sigma_s, first = media.sigma_a[:, group], media.sigma_s[:, group], group[0]
     # The unit of length: the free path between scatterings in the first layer that scatters, mm.
-    unit = 1 / media.sigma_s[media.first, group]
-    coefficients = media.sigma_a[:, group], media.sigma_s[:, group]
-    thickness, eta = media.thickness[:, group[0]], media.eta[:, group[0]]
-    stack = Stack(media.sigma_s[:, group[0]] * unit[0], thickness / unit[0], eta)
-    optics = eqx.Partial(Optics.of, unit=unit)
-    # A direction for the absorption of each layer, then one for the scattering of each.
-    layers = media.sigma_a.shape[0]
-    slopes = 2 * layers if with_derivatives else 0
-    directions = jnp.eye(slopes, 2 * layers, dtype=unit.dtype).reshape(slopes, 2, layers, 1)
-    directions = jnp.broadcast_to(directions, (slopes, 2, layers, len(group)))
-    slopes = jax.vmap(lambda along: jax.jvp(optics, coefficients, tuple(along))[1])(directions)
+    unit = 1 / sigma_s[media.first]
+    stack = Stack(
+        sigma_s[:, 0] * unit[0], media.thickness[:, first] / unit[0], media.eta[:, first], media.g
+    )
+    absorption = sigma_a * unit[None]
+    # Slopes in the absorption of each layer, and in the scattering of each.
+    layers = len(sigma_a)
+    own = jnp.broadcast_to(jnp.eye(layers, dtype=unit.dtype)[..., None], (layers, *sigma_a.shape))
+    length, none = own * unit[None, None], jnp.zeros_like(own)
+    ratio = own / jnp.where(sigma_s > 0, sigma_s, jnp.inf)[None]
+    slopes = Optics(*map(jnp.concatenate, ([length, none], [length, length], [none, ratio])))
     return Walk(
         settings=settings,
         key=jax.random.fold_in(settings.key, number),
-        stack=jax.lax.stop_gradient(stack),
-        optics=optics(*coefficients),
-        slopes=slopes,
-        edges=settings.edges[None] / jax.lax.stop_gradient(unit)[:, None],
+        stack=stack,
+        optics=Optics(absorption, absorption, jnp.ones_like(absorption)),
+        slopes=slopes if with_slopes else jax.tree.map(lambda leaf: leaf[:0], slopes),
+        edges=settings.edges[None] / unit[:, None],
     )

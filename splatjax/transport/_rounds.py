@@ -13,9 +13,18 @@ from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
 from splatjax._chunking import jit_unless_traced
 
-from ._directions import AbstractIncidence, AbstractPhaseFunction
-from ._results import Sum, Tally
-from ._walk import IDLE, INSIDE, Optics, PathWeights, Photons, Stack, fly, weigh
+from ._results import Sum, photon_moments
+from ._walk import (
+    IDLE,
+    INSIDE,
+    AbstractIncidence,
+    Optics,
+    PathWeights,
+    Photons,
+    Stack,
+    fly,
+    weigh,
+)
 
 # Flights between two looks at who is done.
 _FLIGHTS = 4
@@ -36,7 +45,6 @@ class WalkSettings(eqx.Module):
 
     edges: Float[Array, " edges"]
     incidence: AbstractIncidence
-    phase: AbstractPhaseFunction
     key: Key[Array, ""]
     photons: Int[Array, ""]
     flights: Int[Array, ""]
@@ -50,7 +58,8 @@ class Walk(eqx.Module):
 
     - `settings`: of all walks.
     - `key`: of this one.
-    - `optics`: of the channels that walk along; `slopes` are its derivatives in each parameter.
+    - `optics`: of the channels that walk along; `slopes` are its derivatives in the absorption of
+      each layer, then in the scattering of each; or none.
     - `edges`: of the rings, in free paths of the stack, for each channel.
     """
 
@@ -66,7 +75,7 @@ class _State(eqx.Module):
     photons: Photons
     weights: PathWeights
     slopes: PathWeights
-    tally: Tally
+    tally: Sum
     started: Int[Array, ""]
     round: Int[Array, ""]
 
@@ -75,7 +84,7 @@ class _State(eqx.Module):
         return (self.started < walk.settings.photons) | jnp.any(self.photons.place == INSIDE)
 
 
-def finish(walk: Walk, progress: Callable[[int, int], None] | None) -> Tally:
+def finish(walk: Walk, progress: Callable[[int, int], None] | None) -> Sum:
     """Walk all photons to their end. Under `jit` in one loop, else call by call, reporting progress
     in between.
     """
@@ -103,11 +112,7 @@ def _start(walk: Walk) -> _State:
         jnp.zeros((layers, channels, walk.settings.lanes), dtype),
     )
     slopes = jax.tree.map(lambda leaf: jnp.zeros((parameters, *leaf.shape), dtype), weights)
-    moments = 2 + 2 * parameters
-    tally = Tally(
-        Sum.zeros((channels, 2 * (rings + 1) + 1, moments), dtype),
-        Sum.zeros((layers, channels, moments), dtype),
-    )
+    tally = Sum.zeros((channels, 2 * rings + 3 + layers, 2 + parameters), dtype)
     state = _State(photons, weights, slopes, tally, number[0], number[0])
     return _launch(walk, state, photons.place == IDLE)
 
@@ -130,7 +135,7 @@ def _round(walk: Walk, state: _State) -> _State:
         def flight(number, carry):
             photons, weights = carry
             xi = uniforms(walk.key, draws + number, walk.settings.lanes, weights.carried.dtype)
-            moved, *flown = fly(walk.stack, walk.settings.phase, photons, xi)
+            moved, *flown = fly(walk.stack, photons, xi)
             return moved, weigh(optics, weights, photons.layer, *flown)
 
         photons, weights = jax.lax.fori_loop(0, _FLIGHTS, flight, (state.photons, weights))
@@ -161,7 +166,8 @@ def _round(walk: Walk, state: _State) -> _State:
         | dropped
         | (inside & (photons.flights >= walk.settings.flights))
     )
-    tally = state.tally.plus(photons, weights, slopes, done, dropped, walk.edges)
+    ended = photon_moments(photons, weights, slopes, done, dropped, walk.edges)
+    tally = state.tally.plus(ended)
     after = _State(photons, weights, slopes, tally, state.started, state.round + 1)
     return _launch(walk, after, done | (photons.place == IDLE))
 

@@ -1,13 +1,125 @@
 """One flight of many photons: to the next scattering or to the next interface, whichever comes
-first.
+first; their entry, refraction and scattering.
 """
+
+import abc
+import math
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ._directions import AbstractPhaseFunction, Direction, fresnel, of_layer
+from splatjax._smooth import mean_decay
+from splatjax.scattering import moment_outside, reflectance
+
+_SINE = [(-1) ** n * math.pi ** (2 * n + 1) / math.factorial(2 * n + 1) for n in range(8)]
+_COSINE = [(-1) ** n * math.pi ** (2 * n) / math.factorial(2 * n) for n in range(9)]
+
+Direction = tuple[Float[Array, " photons"], Float[Array, " photons"], Float[Array, " photons"]]
+
+
+class AbstractIncidence(eqx.Module):
+    """The directions of a narrow beam inside the surface. Powers are relative to the entering
+    power.
+    """
+
+    @abc.abstractmethod
+    def enter(
+        self,
+        xi_cosine: Float[Array, " photons"],
+        xi_angle: Float[Array, " photons"],
+        eta: Float[Array, " two"],
+    ) -> tuple[Direction, Float[Array, " photons"]]:
+        """Draw directions inside and weights, of mean 1, by uniform numbers and the indices outside
+        and inside.
+        """
+
+    @abc.abstractmethod
+    def reflected(self, eta: Float[Array, " channels"]) -> Float[Array, " channels"]:
+        """Compute the fraction of the arriving power that does not enter, by the index inside over
+        outside.
+        """
+
+
+class NormalIncidence(AbstractIncidence):
+    """Along the normal."""
+
+    def enter(self, xi_cosine, xi_angle, eta):
+        zero, one = jnp.zeros_like(xi_cosine), jnp.ones_like(xi_cosine)
+        return (zero, zero, one), one
+
+    def reflected(self, eta):
+        return ((eta - 1) / (eta + 1)) ** 2
+
+
+class DiffuseIncidence(AbstractIncidence):
+    """Uniform radiance from all directions above: a white sky."""
+
+    def enter(self, xi_cosine, xi_angle, eta):
+        outside, inside = (jnp.broadcast_to(each, xi_cosine.shape) for each in eta)
+        reflectance, cosine = fresnel(jnp.sqrt(xi_cosine), outside, inside)
+        sine = jnp.sqrt(jnp.maximum(1 - cosine * cosine, 0.0))
+        weight = (1 - reflectance) / jnp.broadcast_to(
+            1 - self.reflected(eta[1:] / eta[:1])[0], xi_cosine.shape
+        )
+        x, y = on_circle(xi_angle)
+        return (sine * x, sine * y, cosine), weight
+
+    def reflected(self, eta):
+        """Compute twice the integral of `mu F(mu)` over the cosine outside."""
+        return jnp.where(eta < 1, 1 - (1 - moment_outside(eta)) * eta * eta, moment_outside(eta))
+
+
+def fresnel(
+    cosine: Float[Array, " photons"],
+    eta_from: Float[Array, " photons"],
+    eta_to: Float[Array, " photons"],
+) -> tuple[Float[Array, " photons"], Float[Array, " photons"]]:
+    """Compute the reflectance for unpolarized light that arrives at `cosine` (0 to 1), and the
+    cosine of the transmitted light.
+
+    Total internal reflection is 1, with a cosine of 0. Between equal indices there is exactly no
+    reflection or refraction.
+    """
+    ratio = eta_from / eta_to
+    squared = 1 - ratio * ratio * (1 - cosine * cosine)
+    matched = eta_from == eta_to
+    onward = jnp.where(matched, cosine, jnp.sqrt(jnp.maximum(squared, 0.0)))
+    reflected = jnp.where(squared > 0, reflectance(cosine, onward, ratio), 1.0)
+    return jnp.where(matched, 0.0, reflected), onward
+
+
+def on_circle(
+    xi: Float[Array, " photons"],
+) -> tuple[Float[Array, " photons"], Float[Array, " photons"]]:
+    """Compute a point of the unit circle for each number in (0, 1]; right to 1e-10.
+
+    Series for a quarter of a turn, and the double angle: a library's sine is made for arguments of
+    any size, and slow.
+    """
+    half_turns = xi - 0.5
+    squared = half_turns * half_turns
+    sine, cosine = (
+        jnp.polyval(jnp.asarray(series[::-1], xi.dtype), squared) for series in (_SINE, _COSINE)
+    )
+    sine = sine * half_turns
+    return (cosine - sine) * (cosine + sine), 2 * sine * cosine
+
+
+def of_layer(
+    table: Float[Array, "layers *channels"], layer: Int[Array, " photons"]
+) -> Float[Array, "*channels photons"]:
+    """Look up the entry of each photon's layer: by selections, which vectorize as a gather does
+    not.
+    """
+    shape = (*table.shape[1:], *layer.shape)
+    entry = jnp.broadcast_to(table[0][..., None], shape)
+    for number in range(1, table.shape[0]):
+        here = jnp.broadcast_to(layer == number, shape)
+        entry = jnp.where(here, jnp.broadcast_to(table[number][..., None], shape), entry)
+    return entry
+
 
 # States of a photon; an idle one does not fly.
 INSIDE, ABOVE, BELOW, IDLE = 0, 1, 2, 3
@@ -22,11 +134,13 @@ class Stack(eqx.Module):
     - `sigma_s`: scattering coefficients; 0 in a film.
     - `thickness`: of each layer.
     - `eta`: indices relative to air, those of the neighbors above and below included.
+    - `g`: mean cosines of the phase function.
     """
 
     sigma_s: Float[Array, " layers"]
     thickness: Float[Array, " layers"]
     eta: Float[Array, " layers_and_neighbors"]
+    g: Float[Array, " layers"]
 
 
 class Photons(eqx.Module):
@@ -77,24 +191,43 @@ class Optics(eqx.Module):
     removal: Float[Array, "*slopes layers channels"]
     ratio: Float[Array, "*slopes layers channels"]
 
-    @classmethod
-    def of(
-        cls,
-        sigma_a: Float[Array, "layers channels"],
-        sigma_s: Float[Array, "layers channels"],
-        unit,
-    ) -> "Optics":
-        """State coefficients (1/mm) in free paths of `unit` mm, [channels]."""
-        drawn, unit = jax.lax.stop_gradient(sigma_s), jax.lax.stop_gradient(unit)[None]
-        return cls(
-            sigma_a * unit,
-            sigma_a * unit + (sigma_s - drawn) * unit,
-            jnp.where(drawn > 0, sigma_s / jnp.where(drawn > 0, drawn, 1.0), 1.0),
-        )
+
+def scatter(
+    direction: Direction,
+    g: Float[Array, " photons"],
+    xi_cosine: Float[Array, " photons"],
+    xi_angle: Float[Array, " photons"],
+) -> Direction:
+    """Draw new unit directions by the phase function of the mean cosine `g`, and two uniform random
+    numbers in (0, 1) each.
+
+    **Source:** Henyey and Greenstein 1941; the inverse of the distribution is written without a
+    singularity at `g = 0`.
+    """
+    x, y, z = direction
+    s = 2 * xi_cosine - 1
+    cosine = (s + 0.5 * g * (3 + s * s) + g * g * (s + 0.5 * g * (s * s - 1))) / (
+        (1 + g * s) * (1 + g * s)
+    )
+    sine = jnp.sqrt(jnp.maximum(1 - cosine * cosine, 0.0))
+    along, across = (sine * each for each in on_circle(xi_angle))
+    # An orthonormal basis about the direction (Duff et al. 2017).
+    sign = jnp.where(z < 0, -jnp.ones_like(z), jnp.ones_like(z))
+    a = -1 / (sign + z)
+    b = x * y * a
+    turned = (
+        along * (1 + sign * x * x * a) + across * b + cosine * x,
+        along * sign * b + across * (sign + y * y * a) + cosine * y,
+        -along * sign * x - across * y + cosine * z,
+    )
+    # One step of Newton's method for the inverse root keeps the length at 1.
+    squared = turned[0] * turned[0] + turned[1] * turned[1] + turned[2] * turned[2]
+    scale = 1.5 - 0.5 * squared
+    return turned[0] * scale, turned[1] * scale, turned[2] * scale
 
 
 def fly(
-    stack: Stack, phase: AbstractPhaseFunction, photons: Photons, xi: Float[Array, "four photons"]
+    stack: Stack, photons: Photons, xi: Float[Array, "four photons"]
 ) -> tuple[Photons, Float[Array, " photons"], Bool[Array, " photons"]]:
     """Move photons by one flight. Uniform random numbers: cosine or reflection, angle, and the next
     free path. Also return its length in the layer where it began, 0 for a photon that does not fly,
@@ -112,7 +245,7 @@ def fly(
     scattered = to_scatter < to_interface
     length = jnp.where(inside, jnp.minimum(to_scatter, to_interface), 0.0)
 
-    turned = phase.scatter(photons.direction, layer, xi[0], xi[1])
+    turned = scatter(photons.direction, of_layer(stack.g, layer), xi[0], xi[1])
     from_eta, to_eta = (
         of_layer(stack.eta[1:-1], layer),
         jnp.where(down, of_layer(stack.eta[2:], layer), of_layer(stack.eta[:-2], layer)),
@@ -160,11 +293,7 @@ def weigh(
     """Update weights along a flight in a layer: absorption is its mean, not sampled."""
     length, scattered = (jnp.broadcast_to(x, weights.carried.shape) for x in (length, scattered))
     removal = of_layer(optics.removal, layer) * length
-    # The mean of exp(-removal) on the way; a series where the quotient has no derivative.
-    short = removal < 1e-4
-    mean = -jnp.expm1(-removal) / jnp.where(short, 1.0, removal)
-    mean = jnp.where(short, 1 - 0.5 * removal, mean)
-    taken = weights.carried * of_layer(optics.absorption, layer) * length * mean
+    taken = weights.carried * of_layer(optics.absorption, layer) * length * mean_decay(removal)
     ratio = jnp.where(scattered, of_layer(optics.ratio, layer), 1.0)
     layers = jnp.broadcast_to(
         jnp.arange(weights.absorbed.shape[0], dtype=jnp.int32)[:, None, None],

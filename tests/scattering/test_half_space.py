@@ -75,7 +75,7 @@ def test_monte_carlo_with_forward_scattering(float32):
         200_000,
         jax.random.key(1),
         edges=jnp.asarray([0.0, 1.0]),
-        phase=sj.transport.HenyeyGreenstein(0.8),
+        g=0.8,
     )
     found, by_similarity = (HalfSpace(medium, g).total_reflectance() for g in (0.8, 0.0))
     off = np.asarray(found - walk.total_reflectance.value) / walk.total_reflectance.deviation

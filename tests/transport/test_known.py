@@ -10,9 +10,9 @@ from jax.extend.random import threefry_2x32
 from media import balance, layer, reflectance
 
 import splatjax as sj
-from splatjax.transport._directions import fresnel
 from splatjax.transport._results import Sum, total
 from splatjax.transport._rounds import threefry
+from splatjax.transport._walk import fresnel, scatter
 
 KEY = jax.random.key(2026)
 # Standard errors by which an estimate may be off.
@@ -37,9 +37,7 @@ def within(estimate, reference, deviation) -> None:
 def test_van_de_hulsts_slab(float32, score):
     """Albedo 0.9, g 0.75, optical thickness 2, indices matched: van de Hulst 1980, table 35."""
     slab = layer(1.0, 9 * 0.25, 1.0, 0.2)
-    found = sj.transport.monte_carlo(
-        [slab], score * 625_000, KEY, edges=ONE_RING, phase=sj.transport.HenyeyGreenstein(0.75)
-    )
+    found = sj.transport.monte_carlo([slab], score * 625_000, KEY, edges=ONE_RING, g=0.75)
     within(found.total_reflectance, 0.09739, 4e-4 / score**0.5)
     within(found.total_transmittance, 0.66096, 4e-4 / score**0.5)
 
@@ -158,9 +156,7 @@ def test_henyey_and_greensteins_angles(float64, g):
     for start in ((0.0, 0.0, 1.0), (0.6, 0.0, -0.8), (0.0, 0.0, -1.0)):
         before = tuple(jnp.full_like(xi, each) for each in start)
         angle = (xi * 7919) % 1.0
-        after = sj.transport.HenyeyGreenstein(jnp.asarray(g)).scatter(
-            before, jnp.zeros(xi.shape, jnp.int32), xi, angle
-        )
+        after = scatter(before, jnp.full_like(xi, g), xi, angle)
         np.testing.assert_allclose(sum(each * each for each in after), 1, rtol=1e-12)
         cosine = np.asarray(sum(a * b for a, b in zip(before, after, strict=True)))
         np.testing.assert_allclose(cosine.mean(), g, atol=1e-6)
@@ -229,7 +225,8 @@ def test_progress_is_told(float32):
         (HALF_SPACE, {"photons": 1}, "photons must be at least 2"),
         (HALF_SPACE, {"photons": 2**30}, "photons must be .* below 2\\^30"),
         (HALF_SPACE, {"edges": [0.0, 1.0, 1.0]}, "steps of edges"),
-        (HALF_SPACE, {"phase": sj.transport.HenyeyGreenstein([0, 0])}, "of the 1 layers; got 2"),
+        (HALF_SPACE, {"g": [0, 0]}, "of the 1 layers; got 2"),
+        (HALF_SPACE, {"g": 1.0}, "g must be between -1 and 1"),
     ],
 )
 def test_bad_arguments_are_refused(layers, settings, message):
