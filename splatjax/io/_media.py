@@ -67,6 +67,11 @@ def layer_of(table: Table) -> Layer | Film:
     """Make the layer or film of a table."""
     if "optical_depth" in table.entries:
         return table.make(Film, table.numbers("optical_depth"))
+    if {"g", "sigma_s_prime"} <= table.entries.keys():
+        raise ValueError(
+            f"{table.where} has g and sigma_s_prime, and layers have reduced scattering alone; "
+            "leave g out, or give sigma_s and g"
+        )
     table.one_of("thickness_unit", [THICKNESS_UNIT])
     layer = table.make(Layer, medium_of(table), table.numbers("thickness"))
     table.make(layer.check_diffusion)

@@ -197,6 +197,7 @@ BAD = [
     (layered(SLAB.replace("2.0", "0.1")), r"\[layers 1\].*at least 1 in every channel.*0\.11"),
     (layered(SLAB.replace("2.0", "-1")), r"\[layers 1\].*thickness .* -1$"),
     (layered(SLAB, SLAB.replace('"mm"', '"cm"')), r"\[layers 2\] thickness_unit .*'cm'"),
+    (layered(SLAB + "g = 0.9\n"), r"\[layers 1\].* has g and sigma_s_prime"),
     (layered(SLAB.replace("2.0", "inf"), SLAB), r"\[\[layers\]\]: layer 1 of 2"),
     (layered(SLAB, "optical_depth = [0.1, 0.2]\n"), r"\[1, 2\] channels"),
     (layered("optical_depth = [-0.1]\n", SLAB), r"\[layers 1\].*optical_depth .* -0\.1 at"),
