@@ -107,7 +107,7 @@ class Fit:
     def run(self) -> None:
         check_output(self.output, (".csv",) if self.all else (".toml",))
         check_output(self.plot, FIGURES)
-        most = 8 if self.all else sj.fitting.LeastCount.largest
+        most = 8 if self.all else sj.fitting.LeastCount.max_count
         rules = {
             "count": (1 <= self.count <= most, f"lie between 1 and {most}"),
             "error": (self.error is None or self.error > 0, "be positive, such as 0.01"),

@@ -8,19 +8,18 @@ from ._fit import (
     FitResult as FitResult,
     LeastCount as LeastCount,
 )
-from ._medium import fit_medium as fit_medium, MediumFit as MediumFit
 from ._models import (
     AbstractModel as AbstractModel,
     DiffusionModel as DiffusionModel,
+    fit_medium as fit_medium,
+    MediumFit as MediumFit,
     TransportModel as TransportModel,
     weight_factors as weight_factors,
 )
 from ._problem import relative_error as relative_error, squared_error as squared_error
 from ._search import (
-    AbstractStart as AbstractStart,
     DipoleStarts as DipoleStarts,
     GivenVariances as GivenVariances,
-    GreedyInsertion as GreedyInsertion,
     AbstractSpread as AbstractSpread,
     SharedVariances as SharedVariances,
     VariancesPerChannel as VariancesPerChannel,

@@ -17,9 +17,7 @@ from splatjax.scattering import L2_QUADRATURE, AbstractRadialRule
 from ._problem import FitProblem, make_problem
 from ._search import (
     AbstractSpread,
-    AbstractStart,
     GivenVariances,
-    GreedyInsertion,
     SharedVariances,
     constant,
     greedy_path,
@@ -69,7 +67,7 @@ class ErrorByCount(eqx.Module):
 @jit_unless_traced
 def error_by_count(
     profile: AbstractProfile,
-    largest: int = 8,
+    max_count: int = 8,
     *,
     spread: AbstractSpread = SharedVariances(),
     weights: AbstractWeights = FreeWeights(),
@@ -82,27 +80,27 @@ def error_by_count(
 
     **Arguments:** as for `fit_gaussians`.
 
-    - `largest`: number of Gaussians, at least 1.
+    - `max_count`: number of Gaussians, at least 1.
 
     **Returns:** an `ErrorByCount`, which has no derivative.
 
     **Raises:** `ValueError` as `fit_gaussians` does.
     """
-    check_count("largest", largest)
+    check_count("max_count", max_count)
 
     def search(problem: FitProblem, _):
         def summarize(point, count):
-            active = jnp.arange(largest) < count
+            active = jnp.arange(max_count) < count
             residuals = problem.residuals(point, active)
             error = jnp.sqrt(jnp.sum(residuals * residuals, axis=1))
             return error, jnp.where(active, problem.variances(point), jnp.inf)
 
-        return jax.vmap(summarize)(greedy_path(problem, largest), jnp.arange(1, largest + 1))
+        return jax.vmap(summarize)(greedy_path(problem, max_count), jnp.arange(1, max_count + 1))
 
     problem = make_problem(profile, weights, rule)
     error, variances = (
         values.astype(problem.target.dtype)
-        for values in spread.over(search, constant(problem), GreedyInsertion())
+        for values in spread.over(search, constant(problem), None)
     )
     return ErrorByCount(error[..., 0].T if error.ndim == 3 else error, variances)
 
@@ -113,11 +111,11 @@ class LeastCount(eqx.Module):
     **Attributes:**
 
     - `error`: Eq. 4 that no channel may exceed, positive.
-    - `largest`: number of Gaussians to try.
+    - `max_count`: number of Gaussians to try.
     """
 
     error: float
-    largest: int = 12
+    max_count: int = 12
 
 
 def check_count(name: str, count: int) -> None:
@@ -178,7 +176,7 @@ def fit_gaussians(
     *,
     spread: AbstractSpread = SharedVariances(),
     weights: AbstractWeights = FreeWeights(),
-    start: AbstractStart = GreedyInsertion(),
+    start: GivenVariances | None = None,
     rule: AbstractRadialRule = L2_QUADRATURE,
     throw: bool = True,
 ) -> FitResult:
@@ -202,8 +200,8 @@ def fit_gaussians(
     - `spread`: `SharedVariances()` (default) or `VariancesPerChannel()`.
     - `weights`: `FreeWeights()` (default), `FixedTotalReflectance()`, or `NonNegativeWeights()`
       among either.
-    - `start`: `GreedyInsertion()` (default), which finds the best fit; or `GivenVariances(...)`
-      near it, which is fast, only for a given count.
+    - `start`: `GivenVariances(...)` near the best fit, which is fast, only for a given count; by
+      default it is found without.
     - `rule`: radii of the integral, in length scales of the profile; or `InverseVariance()`, for
       one with standard errors.
     - `throw`: raise if the search has not converged; otherwise `result` reports it.
@@ -217,14 +215,16 @@ def fit_gaussians(
     **Source:** Kim et al. 2010, Eq. 3; variable projection: Golub and Pereyra 1973.
     """
     if isinstance(count, LeastCount):
-        if not isinstance(start, GreedyInsertion):
+        if start is not None:
             raise ValueError(
                 f"start is given together with {count}, which computes its own start; leave "
                 "start out, or give a count"
             )
-        by_count = error_by_count(profile, count.largest, spread=spread, weights=weights, rule=rule)
+        by_count = error_by_count(
+            profile, count.max_count, spread=spread, weights=weights, rule=rule
+        )
         # Finishing a fit of shared variances may move error from one channel to another.
-        for enough in range(by_count.least(count.error), count.largest + 1):
+        for enough in range(by_count.least(count.error), count.max_count + 1):
             fitted = _fit_compiled(profile, enough, spread, weights, rule, by_count.start(enough))
             if float(jnp.max(fitted.error)) <= count.error:
                 break
@@ -242,11 +242,12 @@ def _fit_compiled(
     spread: AbstractSpread,
     weights: AbstractWeights,
     rule: AbstractRadialRule,
-    start: AbstractStart,
+    start: GivenVariances | None,
 ) -> FitResult:
-    def fit(problem: FitProblem, start: AbstractStart):
-        near = start.search(constant(problem), count).astype(problem.target.dtype)
-        optimum, converged = refine(problem, near)
+    def fit(problem: FitProblem, start: GivenVariances | None):
+        searched = constant(problem)
+        near = start.search(searched, count) if start else greedy_path(searched, count)[-1]
+        optimum, converged = refine(problem, near.astype(problem.target.dtype))
         return problem.outcome(stationary(problem, optimum)), converged
 
     problem = make_problem(profile, weights, rule)

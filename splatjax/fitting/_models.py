@@ -1,5 +1,5 @@
 """Models of the light of a medium: the profile, the quadrature of its fit, and the angles of its
-light.
+light; and fits of optical coefficients to a measured profile.
 """
 
 import abc
@@ -7,10 +7,13 @@ from collections.abc import Callable
 from typing import ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix as optx
 from jaxtyping import Array, Float
 
+from splatjax._records import as_floats, check_values
 from splatjax.gaussians import AbstractProfile, SumOfGaussians
 from splatjax.scattering import (
     L2_QUADRATURE,
@@ -20,10 +23,15 @@ from splatjax.scattering import (
     HalfSpace,
     Medium,
     PhotonBeam,
+    Tabulated,
 )
 
-from ._fit import fit_weights
-from ._weights import FixedTotalReflectance, NonNegativeWeights
+from ._fit import fit_gaussians, fit_weights
+from ._search import GivenVariances, VariancesPerChannel
+from ._weights import FixedTotalReflectance, NonNegativeWeights, NormalEquations, invert
+
+_TOLERANCE = 1e-7
+_STEPS = 64
 
 
 class AbstractModel(eqx.Module):
@@ -104,3 +112,113 @@ def weight_factors(
         fitted = fit_weights(profile, gaussians.variances[own], weights=held, rule=rule).weights
         factors[own, channel] = fitted[:, 0] / weights[own, channel]
     return jnp.asarray(factors)
+
+
+class MediumFit(eqx.Module):
+    r"""A medium fitted to a measured profile, and its covariance.
+
+    **Attributes:**
+
+    - `medium`: the most likely one.
+    - `covariance`: of the logarithms of `sigma_a` and `sigma_s_prime`, per channel: its diagonal
+      has squared relative errors.
+    - `chi_squared`: sum of the squared residuals over their deviations, per degree of freedom:
+      about 1 if the model holds and the deviations are right; above, the error bars are too small
+      by its root.
+    - `result`: the outcome of the search, as a message (`optimistix.RESULTS`).
+    """
+
+    medium: Medium
+    covariance: Float[Array, "channels 2 2"]
+    chi_squared: Float[Array, " channels"]
+    result: optx.RESULTS
+
+
+def fit_medium(
+    measured: Tabulated,
+    start: Medium,
+    *,
+    beam_variance: float = 0.0,
+    model: Callable[[Medium], AbstractProfile] = Dipole,
+    count: int = 6,
+    gaussians_start: GivenVariances | None = None,
+    throw: bool = True,
+) -> MediumFit:
+    r"""Fit absorption and scattering to a measured profile: weighted least squares on its samples.
+
+    The model is that of the picture: coefficients, profile, sum of Gaussians, the variance of the
+    beam added to each; it is differentiated as a whole. Channels are independent. Use double
+    precision.
+
+    **Arguments:**
+
+    - `measured`: with its scale, exitance per unit power entering, 1/mm^2, and with the standard
+      errors of its samples, positive.
+    - `start`: start of the search, within a factor of about ten; its `eta` is assumed known.
+    - `beam_variance`: of the beam that made the dot, per axis, mm^2.
+    - `model`: from a medium to its profile.
+    - `count`: number of Gaussians.
+    - `gaussians_start`: start of the fits of Gaussians, as for `fit_gaussians`.
+    - `throw`: raise if the search has not converged; otherwise `result` reports it.
+
+    **Returns:** a `MediumFit`.
+
+    **Raises:** `ValueError` for deviations that are missing or not positive, and for channels that
+    do not match; an error with the message of `result` if `throw`.
+    """
+    channels = measured.values.shape[1]
+    if measured.deviation is None or start.channels != channels:
+        raise ValueError(
+            "fit_medium needs measured.deviation, the standard errors of its samples, and a start "
+            f"of {channels} channels; got {measured.deviation} and {start.channels} channels"
+        )
+    check_values("measured.deviation", measured.deviation, "positive", lambda x: x > 0)
+    fitted = _fit_compiled(
+        measured,
+        start,
+        as_floats(beam_variance, measured.values.dtype),
+        model,
+        count,
+        gaussians_start,
+    )
+    failed = fitted.result != optx.RESULTS.successful
+    return fitted.result.error_if(fitted, failed) if throw else fitted
+
+
+@eqx.filter_jit
+def _fit_compiled(measured, start, beam_variance, model, count, gaussians_start) -> MediumFit:
+    def fit_channel(values, deviation, sigma_a, sigma_s_prime, eta):
+        def residuals(point, _):
+            fitted = fit_gaussians(
+                model(Medium(*jnp.exp(point), eta)),
+                count,
+                spread=VariancesPerChannel(),
+                start=gaussians_start,
+                throw=False,
+            )
+            gaussians = jax.tree.map(lambda leaf: leaf[0], fitted.gaussians)
+            return (gaussians.blurred(beam_variance)(measured.radii)[:, 0] - values) / deviation
+
+        solver = optx.LevenbergMarquardt(
+            rtol=_TOLERANCE, atol=_TOLERANCE, linear_solver=NormalEquations()
+        )
+        point = jnp.log(jnp.stack([sigma_a, sigma_s_prime]))
+        end = optx.least_squares(residuals, solver, point, max_steps=_STEPS, throw=False)
+        slopes, left = jax.jacfwd(lambda point: (residuals(point, None),) * 2, has_aux=True)(
+            end.value
+        )
+        chi_squared = left @ left / max(len(values) - len(point), 1)
+        return (
+            jnp.exp(end.value),
+            invert(slopes.T @ slopes),
+            chi_squared,
+            end.result == optx.RESULTS.successful,
+        )
+
+    coefficients, covariance, chi_squared, converged = jax.vmap(fit_channel)(
+        measured.values.T, measured.deviation.T, start.sigma_a, start.sigma_s_prime, start.eta
+    )
+    result = optx.RESULTS.where(
+        jnp.all(converged), optx.RESULTS.successful, optx.RESULTS.nonlinear_max_steps_reached
+    )
+    return MediumFit(Medium(*coefficients.T, start.eta), covariance, chi_squared, result)

@@ -43,26 +43,9 @@ _NEWTON_STEPS = 32
 _STEP = 10.0
 
 
-class AbstractStart(eqx.Module):
-    """The start of the search for the variances."""
-
-    @abc.abstractmethod
-    def search(self, problem: FitProblem, count: int) -> Float[Array, " gaussians"]:
-        """Find nearly optimal log variances, ascending, of a problem in JAX's default precision."""
-
-
-class GreedyInsertion(AbstractStart):
-    """Starts from the best fit with one Gaussian fewer, recursively: a Gaussian is inserted in
-    every gap and at both ends, and the best result is kept.
-    """
-
-    def search(self, problem: FitProblem, count: int) -> Float[Array, " gaussians"]:
-        return greedy_path(problem, count)[-1]
-
-
 @record
-class GivenVariances(AbstractStart):
-    r"""Starts from the variances of a fit of a similar profile.
+class GivenVariances(eqx.Module):
+    r"""The start of a search from the variances of a fit of a similar profile.
 
     It needs one descent, and finds the nearest optimum.
 
@@ -75,6 +58,7 @@ class GivenVariances(AbstractStart):
     variances: Float[Array, "*channels gaussians"] = eqx.field(converter=numbers)
 
     def search(self, problem: FitProblem, count: int) -> Float[Array, " gaussians"]:
+        """Find nearly optimal log variances, ascending, of a problem in JAX's default precision."""
         if self.variances.shape != (count,):
             raise ValueError(
                 f"GivenVariances.variances must be {count}, one for each Gaussian and shared by "
@@ -139,35 +123,36 @@ def constant(problem: FitProblem) -> FitProblem:
     )
 
 
-def greedy_path(problem: FitProblem, largest: int) -> Float[Array, "counts gaussians"]:
+def greedy_path(problem: FitProblem, max_count: int) -> Float[Array, "counts gaussians"]:
     """Find nearly optimal log variances of 1, 2, ... Gaussians, each ascending and followed by
-    zeros.
+    zeros. Each search starts from the best one with a Gaussian fewer: one is inserted in every gap
+    and at both ends, and the best result is kept.
     """
 
     def step(best, active_count):
-        active = jnp.arange(largest) < active_count
-        starts = jax.vmap(lambda place: _insert(best, active_count, place))(jnp.arange(largest))
+        active = jnp.arange(max_count) < active_count
+        starts = jax.vmap(lambda place: _insert(best, active_count, place))(jnp.arange(max_count))
         points, costs = jax.vmap(lambda start: _descend(problem, start, active))(starts)
         ordered = jnp.sort(jnp.where(active, points[jnp.argmin(costs)], jnp.inf))
         best = jnp.where(active, ordered, 0.0)
         return best, best
 
-    start = jnp.zeros(largest, problem.target.dtype)
-    return jax.lax.scan(step, start, jnp.arange(1, largest + 1))[1]
+    start = jnp.zeros(max_count, problem.target.dtype)
+    return jax.lax.scan(step, start, jnp.arange(1, max_count + 1))[1]
 
 
 def _insert(
     best: Float[Array, " gaussians"], active_count: Int[Array, ""], place: Int[Array, ""]
 ) -> Float[Array, " gaussians"]:
-    """Insert one log variance at a place among the first `active_count - 1`, which ascend."""
-    index, last = jnp.arange(best.shape[0]), active_count - 1
+    """Append a log variance between two of the first `active_count - 1`, which ascend, or beyond
+    them.
+    """
+    last = active_count - 1
     place = jnp.minimum(place, last)
-    below, above = best[jnp.maximum(place - 1, 0)], best[place]
-    outer = jnp.where(place == 0, above - _OUTWARD, below + _OUTWARD)
-    value = jnp.where((place == 0) | (place == last), outer, 0.5 * (below + above))
-    inserted = jnp.where(index < place, best, jnp.where(index == place, value, jnp.roll(best, 1)))
+    below = jnp.where(place > 0, best[place - 1], best[0] - 2 * _OUTWARD)
+    above = jnp.where(place < last, best[place], best[last - 1] + 2 * _OUTWARD)
     first = jnp.linspace(*_FIRST, best.shape[0], dtype=best.dtype)[place]
-    return jnp.where(active_count == 1, first, inserted)
+    return best.at[last].set(jnp.where(last == 0, first, 0.5 * (below + above)))
 
 
 def _descend(
@@ -214,9 +199,9 @@ class AbstractSpread(eqx.Module):
     @abc.abstractmethod
     def over(
         self,
-        function: Callable[[FitProblem, AbstractStart], Any],
+        function: Callable[[FitProblem, GivenVariances | None], Any],
         problem: FitProblem,
-        start: AbstractStart,
+        start: GivenVariances | None,
     ) -> Any:
         """Apply a function to each problem and its start; with a leading axis where there are
         several.

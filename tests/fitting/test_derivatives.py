@@ -213,7 +213,7 @@ def test_the_least_count_that_reaches_an_error(float64):
     assert np.all(np.diff(worst) < 0)
     assert by_count.least(float(worst[2])) == 3
     required = 1.01 * float(worst[2])
-    fitted = fit_gaussians(MARBLE, LeastCount(required, largest=4))
+    fitted = fit_gaussians(MARBLE, LeastCount(required, max_count=4))
     assert np.max(np.asarray(fitted.error)) <= required
     assert fitted.gaussians.variances.shape == (3,)
     np.testing.assert_allclose(
@@ -230,7 +230,7 @@ def test_the_least_count_that_reaches_an_error(float64):
             lambda: eqx.filter_jit(lambda found: found.least(0.1))(by_count),
             "depends on values",
         ),
-        (lambda: error_by_count(MARBLE, 0), "largest must be .* at least 1; got 0"),
+        (lambda: error_by_count(MARBLE, 0), "max_count must be .* at least 1; got 0"),
     ):
         with pytest.raises(ValueError, match=message):
             refused()
