@@ -1,7 +1,7 @@
 """Fit a scene to pictures along the gradient of the renderer: albedo, shape, lights and cameras."""
 
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -21,25 +21,18 @@ from ._observation import (
     Evidence,
     KnownIntensity,
     Observation,
+    PicturedScene,
     SquaredLoss,
     UnknownBackground,
     check_channels,
     check_counted,
     compared,
 )
-from ._parts import AbstractPart, PicturedScene
+from ._parts import AbstractPart
 from ._problem import make_plans
 
 # Coordinates of each part; a tuple with those of each picture if pictures do not share the part.
 Coordinates = tuple[PyTree[Array], ...]
-
-
-@runtime_checkable
-class GradientTransformation(Protocol):
-    """An optimizer of optax: a pair of functions."""
-
-    init: Callable[..., Any]
-    update: Callable[..., Any]
 
 
 class MovableScene(eqx.Module):
@@ -134,7 +127,7 @@ def advance(
     state: PyTree,
     evaluations: Sequence[Evaluation],
     scene: MovableScene,
-    optimizer: GradientTransformation,
+    optimizer: Any,
 ):
     """Take a step; also return the loss before it, and whether loss and gradient are finite."""
     prior, prior_gradient = jax.value_and_grad(lambda x: jnp.asarray(scene.prior(x)))(x)
@@ -183,7 +176,7 @@ def fit_scene(
     splats: Splats,
     material: Material,
     parts: Sequence[AbstractPart],
-    optimizer: GradientTransformation,
+    optimizer: Any,
     *,
     steps: int,
     loss: AbstractLoss = SquaredLoss(),

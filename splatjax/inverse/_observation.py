@@ -1,4 +1,6 @@
-"""Observed pictures, the pixels that count, and the loss of their residuals."""
+"""Observed pictures and those that could be taken, the pixels that count, and the loss of their
+residuals.
+"""
 
 import abc
 from collections.abc import Sequence
@@ -9,7 +11,15 @@ import numpy as np
 from jaxtyping import Array, Bool, DTypeLike, Float
 
 from splatjax._records import numbers, record, several, valid
-from splatjax.scene import AbstractLight, Camera
+from splatjax.scene import (
+    AbstractLight,
+    Camera,
+    DirectionalLight,
+    GaussianBeam,
+    Material,
+    Scene,
+    Splats,
+)
 
 # Coverage from which a pixel shows nothing behind the body.
 _FILLED = 0.999
@@ -93,6 +103,59 @@ class Observation(eqx.Module):
                     f"Observation.{name} has {value.shape[0]} x {value.shape[1]} pixels, its "
                     f"camera {size[0]} x {size[1]} (height, width)"
                 )
+
+
+@record
+class Candidate(eqx.Module):
+    """A picture that could be taken: its name, camera and lights, whose strength may be unknown."""
+
+    name: str = eqx.field(static=True)
+    camera: Camera
+    lights: tuple[AbstractLight, ...] = eqx.field(converter=several)
+    intensity: AbstractIntensity = KnownIntensity()
+
+
+def default_candidates(splats: Splats, camera: Camera, channels: int = 3) -> list[Candidate]:
+    r"""Propose pictures that one could take with a camera: parallel light from the front, left,
+    right, above and behind, and a laser dot in the middle of the picture, as wide as a few splats.
+
+    **Arguments:**
+
+    - `splats`: of the body, mm.
+    - `camera`: of all pictures.
+    - `channels`: of the pictures.
+    """
+    right, down, forward = np.asarray(camera.rotation, float)
+    directions = {
+        "light from the front": forward,
+        "light from the left": right + 0.3 * forward,
+        "light from the right": -right + 0.3 * forward,
+        "light from above": down + 0.3 * forward,
+        "light from behind": -forward + 0.5 * down,
+    }
+    strength, eye = np.full(channels, np.pi), np.asarray(camera.position, float)
+    squared_spacing = float(np.mean(splats.areas))
+    # To the splat nearest to the middle of the picture.
+    to_splats = np.asarray(splats.centers, float) - eye
+    cosines = to_splats @ forward / np.linalg.norm(to_splats, axis=1)
+    spot = to_splats[np.argmax(cosines)]
+    beam = GaussianBeam(eye, spot, strength * squared_spacing, 4 * squared_spacing)
+    lights = {
+        name: DirectionalLight(direction=direction, irradiance=strength)
+        for name, direction in directions.items()
+    } | {"a laser dot in the middle": beam}
+    return [Candidate(name, camera, light) for name, light in lights.items()]
+
+
+class PicturedScene(eqx.Module):
+    """The splats of a picture, its camera and its lights."""
+
+    splats: Splats
+    camera: Camera
+    lights: tuple[AbstractLight, ...]
+
+    def scene(self, material: Material) -> Scene:
+        return Scene(self.splats, self.lights, material)
 
 
 class AbstractLoss(eqx.Module):

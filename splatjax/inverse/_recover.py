@@ -1,4 +1,6 @@
-"""Coefficients of a material from pictures of a known shape."""
+"""Coefficients of a material from pictures of a known shape; and pictures to take next, ranked by
+the error bars with them.
+"""
 
 import warnings
 from collections.abc import Callable, Sequence
@@ -10,7 +12,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from splatjax._format import counted
+from splatjax._format import counted, format_numbers, percent
 from splatjax._records import check_values
 from splatjax.diffusion import ClusterDiffuser
 from splatjax.fitting import (
@@ -29,13 +31,14 @@ from splatjax.scene import Material, Splats
 
 from ._observation import (
     AbstractLoss,
+    Candidate,
     Evidence,
     Observation,
+    PicturedScene,
     SquaredLoss,
     check_channels,
     compared,
 )
-from ._parts import PicturedScene
 from ._problem import (
     RecoveryProblem,
     Unknowns,
@@ -45,10 +48,8 @@ from ._problem import (
     solution,
     wide_variances,
 )
-from ._recovery import Recovery, inverse
+from ._recovery import Combination, Recovery, best_and_worst, inverse
 
-# Layers eight times finer than a picture needs: for bright materials, 0.1% of the light corresponds
-# to 2% of the absorption.
 _FINE = RenderSettings(diffuser=ClusterDiffuser(error=2.5e-4))
 
 _ROUNDS = 8
@@ -147,21 +148,16 @@ def recover(
     while not settled and rounds < _ROUNDS:
         rounds += 1
         medium = unknowns.medium(point)
-        sigma_a, sigma_s_prime = (
-            "  ".join(f"{float(value):.3g}" for value in values)
-            for values in (medium.sigma_a, medium.sigma_s_prime)
-        )
         report(
             f"round {rounds} of at most {_ROUNDS}: rendering the {count} layers of sigma_a "
-            f"{sigma_a}, sigma_s' {sigma_s_prime}",
+            f"{format_numbers(medium.sigma_a, '.3g')}, sigma_s' "
+            f"{format_numbers(medium.sigma_s_prime, '.3g')}",
             medium,
         )
         profile, rule = model.profile(medium), model.rule
-        variances = fit_gaussians(
-            profile, count, weights=weights, rule=rule, throw=False
-        ).gaussians.variances
-        fit = eqx.Partial(fit_near, near=variances, weights=weights, rule=rule)
-        problem, plans = problem_at(medium, variances, fit, plans)
+        near = fit_gaussians(profile, count, weights=weights, rule=rule, throw=False).gaussians
+        fit = eqx.Partial(fit_near, near=near.variances, weights=weights, rule=rule)
+        problem, plans = problem_at(medium, near.variances, fit, plans)
         before = point
         point, cost, more, converged = search(problem, before)
         steps += int(more)
@@ -208,12 +204,7 @@ def recover(
     return best
 
 
-def _check(
-    observations: list[Observation],
-    splats: Splats,
-    starts: list[Medium],
-    surface: Material | None,
-) -> None:
+def _check(observations: list[Observation], splats, starts: list[Medium], surface) -> None:
     if not observations or not starts:
         raise ValueError(
             f"at least one observation and one start are needed; got {len(observations)} and "
@@ -247,3 +238,92 @@ def _check(
 def _unweighed(variances: Float[Array, " gaussians"], channels: int) -> SumOfGaussians:
     """Make Gaussians whose weights are still unknown."""
     return SumOfGaussians(variances, jnp.zeros((len(variances), channels), variances.dtype))
+
+
+class Prediction(eqx.Module):
+    r"""The error bars with another picture.
+
+    **Attributes:**
+
+    - `candidate`: the picture.
+    - `covariance`: of the logarithms of `sigma_a` and `sigma_s_prime` of each channel, with it.
+    """
+
+    candidate: Candidate
+    covariance: Float[np.ndarray, "channels 2 2"]
+
+    @property
+    def worst(self) -> Combination:
+        """The combination with the largest error, of all channels."""
+        worst = [best_and_worst(covariance)[1] for covariance in self.covariance]
+        return max(worst, key=lambda combination: combination.deviation)
+
+    def __str__(self) -> str:
+        name, known = self.candidate.name, percent(self.worst.deviation)
+        return f"{name}: the least known combination, {self.worst}, would be known to {known}"
+
+
+def next_pictures(
+    recovery: Recovery,
+    splats: Splats,
+    candidates: Sequence[Candidate],
+    *,
+    settings: RenderSettings = RenderSettings(),
+) -> list[Prediction]:
+    r"""Rank pictures that could be taken, by the error bars of the coefficients with each of them.
+
+    Each is rendered once with the recovered material, and differentiated. Its noise is the same
+    fraction of its brightness as in the earlier pictures. Information adds up, and its inverse is
+    the covariance.
+
+    **Arguments:**
+
+    - `recovery`: from the earlier pictures, with its model and weights.
+    - `splats`: of the body.
+    - `candidates`: at least one; see `default_candidates`.
+    - `settings`: of the renderer. By default those of `render`: a prediction needs less fine layers
+      than a search.
+
+    **Returns:** predictions; first the one with the least error of its worst combination.
+
+    **Raises:** `ValueError` for no candidate, and for one in which the body is not visible.
+    """
+    candidates = list(candidates)
+    if not candidates:
+        raise ValueError("candidates is empty; give some, or default_candidates(splats, camera)")
+    medium, dtype = recovery.medium, recovery.medium.eta.dtype
+    pictured_scenes = [PicturedScene(splats, one.camera, one.lights) for one in candidates]
+    pictures, _ = render_layers(pictured_scenes, recovery.material, settings)
+    near = recovery.material.gaussians.variances.astype(dtype)
+    fit = eqx.Partial(fit_near, near=near, weights=recovery.weights, rule=recovery.model.rule)
+    noise = recovery.relative_noise * recovery.scale**0.5
+    predictions = []
+    for candidate, picture in zip(candidates, pictures, strict=True):
+        dark = np.zeros(picture.specular.shape)
+        observation = Observation(dark, candidate.camera, candidate.lights, deviation=1)
+        evidence = Evidence.of(observation, dtype)
+        unknowns = Unknowns.of(medium.eta, [candidate.intensity])
+        problem = RecoveryProblem.of(
+            [picture], [evidence], unknowns, fit, SquaredLoss(), recovery.model
+        )
+        at_point = solution(problem, unknowns.start(medium))
+        radiance = np.asarray(at_point.radiance[0])[np.asarray(problem.counted[0]) > 0]
+        bright = float(np.sqrt(np.mean(radiance**2)))
+        scale = max(noise * (bright or 1.0), np.finfo(float).tiny) ** -2
+        information = np.asarray(at_point.information, float) * scale
+        more = _marginal(information, medium.channels, len(recovery.information))
+        predictions.append(Prediction(candidate, recovery.covariance(more)))
+    return sorted(predictions, key=lambda prediction: prediction.worst.deviation)
+
+
+def _marginal(information: np.ndarray, channels: int, size: int) -> np.ndarray:
+    """Eliminate the factors of a picture from its information about coefficients and the transition
+    to unresolved layers, and add zeros for the factors of other pictures.
+    """
+    kept = np.r_[: 2 * channels, -channels:0]  # whatever the number of factors between them
+    factors = np.arange(2 * channels, len(information) - channels)
+    mixed = information[np.ix_(kept, factors)]
+    pseudo_inverse = np.linalg.pinv(information[np.ix_(factors, factors)])
+    marginal, corner = np.zeros((size, size)), np.ix_(kept, kept)
+    marginal[corner] = information[corner] - mixed @ pseudo_inverse @ mixed.T
+    return marginal

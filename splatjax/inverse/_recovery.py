@@ -207,7 +207,10 @@ class Recovery(AbstractEstimate):
         return 1.0 if self.noise_is_known else float(self.chi_squared)
 
     def covariance(
-        self, more: Float[np.ndarray, "all all"] | float = 0.0, resolution: float = _RESOLUTION
+        self,
+        more: Float[np.ndarray, "all all"] | float = 0.0,
+        resolution: float = _RESOLUTION,
+        stretch: float = 1.0,
     ) -> Float[np.ndarray, "channels 2 2"]:
         """Compute the covariance of the logarithms of `sigma_a` and `sigma_s_prime` of each
         channel, marginalized over the other unknowns.
@@ -220,8 +223,9 @@ class Recovery(AbstractEstimate):
         - `more`: information that another picture would add.
         - `resolution`: the deviation of the logarithm of the width below which a layer is
           unresolved; 0 for an exact one.
+        - `stretch`: a factor on the covariance of the noise.
         """
-        channels, scale = self.medium.channels, max(self.scale, np.finfo(np.float64).tiny)
+        channels, scale = self.medium.channels, max(self.scale * stretch, np.finfo(float).tiny)
         information = np.asarray(self.information, np.float64) / scale + more
         unknowns = len(information) - channels
         covariance = inverse(information[:unknowns, :unknowns])
@@ -308,7 +312,6 @@ def combined(recoveries: Sequence[Recovery]) -> Estimate:
 def _stretched_information(recovery: Recovery) -> Float[np.ndarray, "channels 2 2"]:
     """Invert the covariance of each channel; residuals above the noise count as noise."""
     stretch = max(float(recovery.chi_squared), 1.0) if recovery.noise_is_known else 1.0
-    stretched = eqx.tree_at(lambda r: r.information, recovery, recovery.information / stretch)
-    covariance = stretched.covariance()
-    is_known = np.isfinite(covariance).all(axis=(1, 2))[:, None, None]
+    covariance = recovery.covariance(stretch=stretch)
+    is_known = np.all(np.isfinite(covariance), axis=(1, 2))[:, None, None]
     return np.where(is_known, [inverse(one) for one in covariance], 0.0)

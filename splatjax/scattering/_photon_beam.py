@@ -106,12 +106,12 @@ class SingleScattering(AbstractProfile):
         """Compute the fraction of light, entering at the cosine `mu_i`, that leaves after one
         scattering, with an error of 1e-3.
         """
-        total = jnp.zeros((*mu_i.shape, self.channels), mu_i.dtype)
-        for node, weight in zip(*unit_legendre(_COSINES), strict=True):
-            # mu = t^2: the radiance has a root at grazing angles.
-            radiance = self.reflected(mu_i, jnp.full_like(mu_i, node * node))
-            total = total + float(4 * np.pi * weight * node**3) * radiance
-        return total
+        # mu = t^2: the radiance has a root at grazing angles.
+        parts = [
+            float(4 * np.pi * weight * t**3) * self.reflected(mu_i, jnp.full_like(mu_i, t * t))
+            for t, weight in zip(*unit_legendre(_COSINES), strict=True)
+        ]
+        return functools.reduce(jnp.add, parts)
 
     def _escaping(self) -> tuple[Float[Array, "angles channels"], Float[Array, "angles channels"]]:
         """Compute `tan(theta / 2)` of the angles at which light leaves, and their weights `(1 - F)

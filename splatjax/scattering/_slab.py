@@ -209,14 +209,17 @@ class AbstractSlabProfile(AbstractProfile):
         """Compute lengths `a` (mm) such that reflectance and transmittance fall like `exp(-a k)` or
         faster: the depths of the sources from either side.
         """
-        reflected, transmitted = [], []
-        for layer in self._scattering():
-            depth = 1 / layer.medium.sigma_t_prime
-            beneath = jnp.maximum(layer.thickness - depth, _SHALLOWEST * depth)
-            reflected.append(depth)
-            # An infinite layer transmits nothing; any length is valid.
-            transmitted.append(jnp.where(jnp.isfinite(beneath), beneath, depth))
-        return reduce(jnp.minimum, reflected), sum(transmitted[1:], start=transmitted[0])
+        depths = [1 / layer.medium.sigma_t_prime for layer in self._scattering()]
+        # An infinite layer transmits nothing; any length is valid.
+        beneath = [
+            jnp.where(
+                jnp.isfinite(layer.thickness),
+                jnp.maximum(layer.thickness - depth, _SHALLOWEST * depth),
+                depth,
+            )
+            for layer, depth in zip(self._scattering(), depths, strict=True)
+        ]
+        return reduce(jnp.minimum, depths), reduce(jnp.add, beneath)
 
     def length_scale(self) -> Float[Array, " channels"]:
         """Return the mean free path of the uppermost layer that scatters, mm."""

@@ -23,8 +23,8 @@ from bodies import (
 import splatjax as sj
 from splatjax.inverse import _fit_scene
 from splatjax.inverse._fit_scene import MovableScene
-from splatjax.inverse._observation import Evidence
-from splatjax.inverse._parts import PicturedScene, rotation
+from splatjax.inverse._observation import Evidence, PicturedScene
+from splatjax.inverse._parts import rotation
 
 SIZE = 16
 camera = partial(view, size=SIZE)

@@ -8,7 +8,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import splatjax as sj
-from splatjax.inverse._parts import PicturedScene, rotation
+from splatjax.inverse._observation import PicturedScene
+from splatjax.inverse._parts import rotation
 
 FLAT = bodies.sheet(5.0, 0.5, jitter=0.2)
 CAMERA = sj.Camera.look_at([3, 0, 9], [1, 1, 0], width=4, height=4)
