@@ -21,6 +21,7 @@ import tempfile
 from collections.abc import Callable, Hashable
 from contextlib import ExitStack, suppress
 from pathlib import Path
+from types import NoneType
 from typing import Any, TypeVar, cast
 
 import equinox as eqx
@@ -125,7 +126,7 @@ def kept(function: Function) -> Function:
 
 def kept_jit(function: Function) -> Function:
     """Compile a function of arrays, like `eqx.filter_jit`, and cache its programs by the structure
-    and the shapes of the arguments, so that nothing is traced.
+    and the shapes of the arguments, so that nothing is traced. Numbers are static.
     """
     compiled = eqx.filter_jit(function)
 
@@ -135,7 +136,7 @@ def kept_jit(function: Function) -> Function:
         path = _path(function, arguments, by_values=False)
         if path is None:
             return compiled(*arguments)
-        leaves = jax.tree.leaves(arguments)
+        leaves = jax.tree.leaves(eqx.filter(arguments, eqx.is_array))
         if path not in _programs:
             with suppress(Exception):  # whatever is wrong with a file, it is made again
                 content, returned = _read(path)
@@ -152,16 +153,19 @@ def kept_jit(function: Function) -> Function:
 
 
 def _compiled(path: Path, function: Callable, arguments: tuple) -> Callable:
-    leaves, structure = jax.tree.flatten(arguments)
+    arrays, static = eqx.partition(arguments, eqx.is_array)
+    leaves, structure = jax.tree.flatten(arrays)
     jax.monitoring.record_event("/splatjax/cache/compiling")
 
     # Of a list of arrays: a program that is loaded cannot make records of its arguments.
-    of_leaves = jax.jit(lambda leaves: function(*jax.tree.unflatten(structure, leaves)))
+    def of_leaves(leaves):
+        return function(*eqx.combine(jax.tree.unflatten(structure, leaves), static))
+
     with ExitStack() as stack:
         # JAX's cache is off here: an executable read from it and serialized again lacks kernels.
         stack.callback(jax.config.update, _LEAST_TIME, jax.config.values[_LEAST_TIME])
         jax.config.update(_LEAST_TIME, float("inf"))
-        program = of_leaves.lower(leaves).compile()
+        program = jax.jit(of_leaves).lower(leaves).compile()
     with suppress(Exception):  # not every program can be serialized
         content, _, returned = serialize(program)
         _write(path, (content, jax.tree.unflatten(returned, range(returned.num_leaves))))
@@ -175,11 +179,11 @@ def _path(function: Any, arguments: Any, *, by_values: bool) -> Path | None:
     """
     leaves, structure = jax.tree.flatten(arguments)
     arrays = [leaf for leaf in leaves if isinstance(leaf, jax.Array)]
-    numbers = [leaf for leaf in leaves if by_values and type(leaf) in (bool, int, float)]
+    numbers = [None if isinstance(leaf, jax.Array) else leaf for leaf in leaves]
     if (
         _folder is None
         or not jax.config.jax_enable_compilation_cache  # ty: ignore[missing-attribute]
-        or len(arrays) + len(numbers) < len(leaves)
+        or not {type(number) for number in numbers} <= {NoneType, bool, int, float}
         or any(isinstance(array, Tracer) for array in arrays)
         or len(devices := {device for array in arrays for device in array.devices()}) > 1
         or not all(kind.startswith(("builtins.", "splatjax.")) for kind in _kinds(structure))

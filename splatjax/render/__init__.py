@@ -1,12 +1,11 @@
 """The five passes: plan the sizes of their arrays, then render.
 
-The formulas of the passes are in splatting, diffusion and shading. Read `see_and_shade` in
-`_passes.py` first: every picture is one call of it. Its arguments are the function that lights the
+The formulas of the passes are in splatting, diffusion and shading. Read `Passes` in `_passes.py`
+first: every picture is one call of `Passes.picture`. Its arguments are the function that lights the
 splats (`light_at`) and the function that reads the shaded points (`read`). `_render.py` has the
 simplest pictures, and `_devices.py` the distribution over devices.
 """
 
-from ._attributes import SurfaceAttributes as SurfaceAttributes, SurfaceSamples as SurfaceSamples
 from ._basis import (
     diffusion_basis as diffusion_basis,
     DiffusionBasis as DiffusionBasis,
@@ -22,16 +21,20 @@ from ._checks import (
 )
 from ._jacobian import picture_jacobian as picture_jacobian, PictureJacobian as PictureJacobian
 from ._lighting import (
-    AbstractLighting as AbstractLighting,
     Irradiance as Irradiance,
     irradiance_at_points as irradiance_at_points,
     irradiance_at_splats as irradiance_at_splats,
-    LightAtSplats as LightAtSplats,
     LightVisibility as LightVisibility,
+    Transfer as Transfer,
 )
-from ._passes import SplatLight as SplatLight, Transfer as Transfer
+from ._passes import SplatLight as SplatLight
 from ._plan import make_plan as make_plan, Plan as Plan
-from ._settings import RenderSettings as RenderSettings
+from ._settings import (
+    AbstractLighting as AbstractLighting,
+    LightAtSplats as LightAtSplats,
+    RenderSettings as RenderSettings,
+)
+from ._surface import SurfaceAttributes as SurfaceAttributes, SurfaceSamples as SurfaceSamples
 from ._render import (
     compute_irradiance as compute_irradiance,
     diffuse_irradiance as diffuse_irradiance,

@@ -2,6 +2,9 @@
 rendered once.
 """
 
+import dataclasses
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -15,14 +18,13 @@ from splatjax.gaussians import SumOfGaussians
 from splatjax.scene import Camera, HarmonicLight, Scene
 from splatjax.splatting import invalid_factor
 
-from ._bounces import check_no_bounces
-from ._devices import fill_scene, on_devices
-from ._filling import rows_at
-from ._passes import SplatLight, Transfer, in_a_row, make_light_at, see_and_shade
+from ._devices import on_devices, pad_scene
+from ._lighting import Transfer
+from ._passes import SplatLight
 from ._plan import Plan, plan_unless_traced
 from ._render import render, transfer
-from ._settings import RenderSettings
-from ._shade import ShadedSurface
+from ._settings import RenderSettings, check_no_bounces
+from ._surface import ShadedSurface, in_a_row
 
 
 class DiffusionBasis(eqx.Module):
@@ -98,19 +100,13 @@ def diffusion_basis(
         )
     plan = plan_unless_traced(scene, camera, settings, plan)
     check_no_bounces(settings)
-    scene, plan, light, own = fill_scene(scene, plan, light, camera)
+    scene, plan, light, own = pad_scene(scene, plan, light, camera)
     basis = _diffusion_basis(scene, camera, settings, plan, derivative, light)
-
-    def of_gaussians(light: LayersAtPoints):
-        return light.variances, light.means, light.mass, light.derivative, light.factors
-
-    rows = jax.tree.map(lambda each: rows_at(each, own.gaussians), of_gaussians(basis.light))
-    is_leaf = {"is_leaf": lambda leaf: leaf is None}
-    return eqx.tree_at(lambda basis: of_gaussians(basis.light), basis, rows, **is_leaf)
+    layers = own.of(basis.light, "variances", "means", "mass", "derivative", "factors")
+    return dataclasses.replace(basis, light=layers)
 
 
-@full_precision
-@eqx.filter_jit
+@kept_jit
 def _diffusion_basis(
     scene: Scene,
     camera: Camera,
@@ -119,7 +115,7 @@ def _diffusion_basis(
     derivative: bool,
     light: SplatLight | Transfer | None,
 ) -> DiffusionBasis:
-    def passes(combination, scene, plan, camera, light=None):
+    def layers(passes, camera, light=None):
         def read(shaded: ShadedSurface, at: LayersAtPoints, _):
             return (
                 {name: getattr(at, name) for name in at.ALONG_POINTS},
@@ -127,19 +123,12 @@ def _diffusion_basis(
                 shaded.specular,
             )
 
-        (*rows, specular), visible = see_and_shade(
-            scene,
-            camera,
-            settings,
-            plan,
-            combination,
-            make_light_at(scene, settings, plan, combination, light, derivative),
-            read,
-        )
+        light_at = partial(passes.light, kept=light, derivative=derivative)
+        (*rows, specular), visible = passes.picture(camera, light_at, read)
         layers, per_exitance = jax.tree.map(in_a_row, rows)
         basis = LayersAtPoints(
-            variances=scene.material.gaussians.variances,
-            interval=plan.interval,
+            variances=passes.scene.material.gaussians.variances,
+            interval=passes.plan.interval,
             kernel=settings.kernel,
             **layers,
         )
@@ -158,7 +147,7 @@ def _diffusion_basis(
             overflow=visible.overflow,
         )
 
-    return on_devices(passes, scene, plan, camera, placed=light)
+    return on_devices(layers, scene, settings, plan, camera, placed=light)
 
 
 class RelightingBasis(eqx.Module):
@@ -240,7 +229,7 @@ def relighting_basis(
             "render other lights separately, since pictures add up"
         )
     plan = plan_unless_traced(scene, camera, settings, plan)
-    scene, plan, light, _ = fill_scene(scene, plan, light, camera)
+    scene, plan, light, _ = pad_scene(scene, plan, light, camera)
     return _relighting_basis(scene, camera, settings, plan, light)
 
 

@@ -12,17 +12,19 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jax.sharding import Mesh, PartitionSpec
-from jaxtyping import Array, Float, Int, PyTree
+from jaxtyping import Array, Float, Int, PyTree, Shaped
 
 from splatjax._combination import AbstractCombination, DeviceMesh, OneDevice, lay_out
 from splatjax.scene import AbstractLightSample, Frame, Scene, lights_by_kind
 
 from ._checks import in_one_dtype
-from ._filling import arrange, fill_gaussians, fill_lights, fill_up, rows_at
-from ._passes import SplatLight, Transfer
-from ._plan import Plan, splats_per_device
+from ._lighting import Transfer
+from ._passes import Passes, SplatLight
+from ._plan import Plan, arrange, pad_gaussians, pad_splats, splats_per_device
+from ._settings import RenderSettings
 
 Result = TypeVar("Result", bound=PyTree)
+Record = TypeVar("Record", bound=eqx.Module)
 Kept = TypeVar("Kept", bound=SplatLight | Transfer)
 
 
@@ -32,15 +34,20 @@ class OwnRows(NamedTuple):
     lights: Int[np.ndarray, " lights"]
     gaussians: Int[np.ndarray, " gaussians"]
 
+    def of(self, record: Record, *names: str) -> Record:
+        """Remove the padding Gaussians from fields of a record."""
+        padded = {name: getattr(record, name) for name in names}
+        rows = jax.tree.map(lambda rows: take_rows(rows, self.gaussians), padded)
+        return dataclasses.replace(record, **rows)
+
     def frame(self, frame: Frame) -> Frame:
         """Remove the padding from a frame."""
-        shadow = rows_at(frame.shadow, self.lights)
-        names = "layers", "weights", "unresolved_fraction"
-        rows = {name: rows_at(getattr(frame, name), self.gaussians) for name in names}
-        return dataclasses.replace(frame, shadow=shadow, **rows)
+        shadow = take_rows(frame.shadow, self.lights)
+        shown = self.of(frame, "layers", "weights", "unresolved_fraction")
+        return dataclasses.replace(shown, shadow=shadow)
 
 
-def fill_scene(
+def pad_scene(
     scene: Scene, plan: Plan, light: Kept | None = None, *given: PyTree
 ) -> tuple[Scene, Plan, Kept | None, OwnRows]:
     """Pad the splats of a scene to the length of its plan, the lights of each kind to four or a
@@ -62,7 +69,7 @@ def fill_scene(
     """
     if light is not None:
         _check_kept(light, scene, plan)
-    count, material = scene.splats.count, plan.diffusion.material(scene.material)
+    material = plan.diffusion.material(scene.material)
     scene = Scene(scene.splats, scene.lights, material)
     shown = np.arange(min(plan.gaussians, len(material.gaussians.variances)))
     own = OwnRows(np.arange(len(scene.lights)), shown)
@@ -70,11 +77,11 @@ def fill_scene(
     if plan.mesh is not None or any(isinstance(leaf, Tracer) for leaf in leaves):
         return scene, plan, light and resize_visibility(light, scene), own
     splats, lights, shadows = scene.splats, scene.lights, plan.shadows
-    if 0 < count < len(plan.order):
-        splats = jax.tree.map(lambda leaf: rows_at(leaf, np.arange(len(plan.order))), splats)
+    if 0 < splats.count < len(plan.order):
+        splats = jax.tree.map(lambda leaf: take_rows(leaf, np.arange(len(plan.order))), splats)
     if all(isinstance(light, AbstractLightSample) and light.strength_field for light in lights):
         groups = lights_by_kind(lights)
-        numbered = [light for group in groups for light in group + fill_lights(group, len(lights))]
+        numbered = [light for group in groups for light in group + _pad_lights(group, len(lights))]
         order = np.argsort([number for number, _ in numbered], stable=True)
         own = own._replace(lights=order[: len(lights)])
         lights = [light for _, light in numbered]
@@ -82,10 +89,10 @@ def fill_scene(
             shadow and dataclasses.replace(shadow, lights=jax.device_put(np.int32(len(group))))
             for group, shadow in zip(groups, shadows, strict=True)
         )
-    gaussians = fill_gaussians(material.gaussians)
+    gaussians = pad_gaussians(material.gaussians)
     if splats.weights is not None:
         known = np.arange(len(gaussians.variances))
-        weights = rows_at(splats.weights.swapaxes(0, 1), known).swapaxes(0, 1)
+        weights = take_rows(splats.weights.swapaxes(0, 1), known).swapaxes(0, 1)
         splats = dataclasses.replace(splats, weights=weights)
     material = eqx.tree_at(
         lambda material: (material.gaussians, material.angles),
@@ -94,15 +101,38 @@ def fill_scene(
         is_leaf=lambda leaf: leaf is None,
     )
     counts = {"splats": splats.count, "gaussians": len(gaussians.variances)}
-    filled = dataclasses.replace(plan, shadows=shadows, **counts)
+    plan = dataclasses.replace(plan, shadows=shadows, **counts)
     scene = Scene(splats, lights, material)
-    return scene, filled, light and resize_visibility(light, scene), own
+    return scene, plan, light and resize_visibility(light, scene), own
+
+
+def _pad_lights(
+    group: list[tuple[int, AbstractLightSample]], number: int
+) -> list[tuple[int, AbstractLightSample]]:
+    """Repeat the last light of a group with zero strength, up to four or a power of two."""
+    last = group[-1][1]
+    none = jax.device_put(np.zeros_like(getattr(last, last.strength_field)))
+    dark = eqx.tree_at(lambda light: getattr(light, light.strength_field), last, none)
+    return [(number, dark)] * ((1 << max(len(group) - 1, 2).bit_length()) - len(group))
+
+
+def take_rows(
+    rows: Shaped[Array, "rows ..."], places: Int[np.ndarray, " places"]
+) -> Shaped[Array, "places ..."]:
+    """Take rows, the last one for indices beyond them. Outside `jit` nothing is compiled."""
+    if np.array_equal(places, np.arange(len(rows))):
+        return rows
+    if isinstance(rows, Tracer):
+        return jnp.take(rows, places, axis=0, mode="clip")
+    return jax.device_put(np.take(np.asarray(rows), places, axis=0, mode="clip"))
 
 
 def resize_visibility(light: Kept, scene: Scene) -> Kept:
     """Pad or cut the rows of visibility of each kind of lights to the samples of a scene."""
     groups = zip(light.visibility, lights_by_kind(scene.lights), strict=True)
-    visibility = [rows if rows is None else rows_at(rows, np.arange(len(g))) for rows, g in groups]
+    visibility = [
+        rows if rows is None else take_rows(rows, np.arange(len(g))) for rows, g in groups
+    ]
     return dataclasses.replace(light, visibility=visibility)
 
 
@@ -124,6 +154,7 @@ def _check_kept(light: SplatLight | Transfer, scene: Scene, plan: Plan) -> None:
 def on_devices(
     function: Callable[..., Result],
     scene: Scene,
+    settings: RenderSettings,
     plan: Plan,
     *whole: PyTree,
     rows: tuple[PyTree[Float[Array, "splats ..."]], ...] = (),
@@ -135,8 +166,7 @@ def on_devices(
 
     **Arguments:**
 
-    - `function`: of the combination, scene and plan of a device, then of `whole`, `rows` and, if
-      given, `placed`.
+    - `function`: of the passes of a device, then of `whole`, `rows` and, if given, `placed`.
     - `whole`: replicated on every device.
     - `rows`: one row per splat, in the order of the scene.
     - `placed`: results of an earlier call along the splats, in the order of the plan.
@@ -144,39 +174,40 @@ def on_devices(
       same on all devices.
     """
     scene, whole, rows = in_one_dtype(scene, whole, rows)
-    count, share = splats_per_device(scene.splats.count, plan.mesh)
-    filled = count * share
-    scene = Scene(fill_up(scene.splats, filled), scene.lights, scene.material)
-    rows = jax.tree.map(lambda row: jnp.pad(row, ((0, filled - len(row)), (0, 0))), rows)
+    devices, per_device = splats_per_device(scene.splats.count, plan.mesh)
+    count = devices * per_device
+    scene = Scene(pad_splats(scene.splats, count), scene.lights, scene.material)
+    rows = jax.tree.map(lambda row: jnp.pad(row, ((0, count - len(row)), (0, 0))), rows)
     extra = () if placed is None else (placed,)
 
     def run(combination: AbstractCombination, scene: Scene, plan: Plan, whole, rows, extra):
         splats = arrange(scene.splats, plan.order, plan.exists)
         scene = Scene(splats, scene.lights, scene.material)
         rows = jax.tree.map(lambda row: row[plan.order], rows)
-        return function(combination, scene, plan, *whole, *rows, *extra)
+        passes = Passes(scene, settings, plan, combination)
+        return function(passes, *whole, *rows, *extra)
 
     given = scene, plan, whole, rows, extra
     if plan.mesh is None:
         return run(OneDevice(), *given)
-    devices = DeviceMesh.of(plan.mesh)
+    mesh = DeviceMesh.of(plan.mesh)
     of_scene, of_whole = jax.tree.map(lambda _: PartitionSpec(), (scene, whole))
-    of_splats, of_rows = jax.tree.map(lambda _: devices.shares, (scene.splats, rows))
+    of_splats, of_rows = jax.tree.map(lambda _: mesh.shares, (scene.splats, rows))
     specs = (
         eqx.tree_at(lambda scene: scene.splats, of_scene, of_splats),
-        plan.specs(devices),
+        plan.specs(mesh),
         of_whole,
         of_rows,
-        along_splats(extra, devices),
+        along_splats(extra, mesh),
     )
     out_specs = PartitionSpec()
     if by_splat:
         shapes = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), given)
         results = jax.eval_shape(lambda given: run(OneDevice(), *given), shapes)
-        out_specs = along_splats(results, devices)
+        out_specs = along_splats(results, mesh)
     # The check of varying axes is off: custom derivatives and loops have no rules for it.
     mapped = jax.shard_map(
-        lambda *given: run(devices, *given),
+        lambda *given: run(mesh, *given),
         mesh=plan.mesh,
         in_specs=specs,
         out_specs=out_specs,

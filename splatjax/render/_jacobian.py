@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 from typing import TypeVar
 
 import equinox as eqx
@@ -14,15 +15,10 @@ from splatjax.diffusion import LayersAtPoints
 from splatjax.gaussians import SumOfGaussians
 from splatjax.scene import Camera, Frame, Scene
 
-from ._attributes import SurfaceSamples
-from ._bounces import check_no_bounces
-from ._devices import fill_scene, on_devices
-from ._filling import rows_at
-from ._lighting import LightAtSplats
-from ._passes import make_light_at, see_and_shade
+from ._devices import on_devices, pad_scene
 from ._plan import Plan, plan_unless_traced
-from ._settings import RenderSettings
-from ._shade import ShadedSurface, compose, layers_at_points
+from ._settings import LightAtSplats, RenderSettings, check_no_bounces
+from ._surface import ShadedSurface, SurfaceSamples, compose, layers_at_points
 
 Parameters = TypeVar("Parameters", bound=PyTree)
 
@@ -116,10 +112,9 @@ def picture_jacobian(
         )
     check_no_bounces(settings)
     plan = plan_unless_traced(scene, camera, settings, plan)
-    scene, plan, _, own = fill_scene(scene, plan, None, camera)
-    found = _picture_jacobian(scene, camera, settings, plan)
-    rows = (rows_at(each, own.gaussians) for each in (found.weights, found.variances))
-    return PictureJacobian(own.frame(found.frame), *rows)
+    scene, plan, _, own = pad_scene(scene, plan, None, camera)
+    jacobian = own.of(_picture_jacobian(scene, camera, settings, plan), "weights", "variances")
+    return dataclasses.replace(jacobian, frame=own.frame(jacobian.frame))
 
 
 @full_precision
@@ -127,8 +122,8 @@ def picture_jacobian(
 def _picture_jacobian(
     scene: Scene, camera: Camera, settings: RenderSettings, plan: Plan
 ) -> PictureJacobian:
-    def passes(combination, scene, plan, camera):
-        material = scene.material
+    def differentiated(passes, camera):
+        scene, plan, material = passes.scene, passes.plan, passes.scene.material
         weighing = material.gaussians, material.single_scattering_albedo()
 
         def read(shaded: ShadedSurface, at: LayersAtPoints, samples: SurfaceSamples):
@@ -147,11 +142,9 @@ def _picture_jacobian(
             per_exitance = shaded.radiance_per_exitance[None]
             return shaded, per_exitance * of_weights, per_exitance * of_variances
 
-        light_at = make_light_at(scene, settings, plan, combination, None, derivative=True)
-        (shaded, *derivatives), visible = see_and_shade(
-            scene, camera, settings, plan, combination, light_at, read
-        )
+        light_at = partial(passes.light, derivative=True)
+        (shaded, *derivatives), visible = passes.picture(camera, light_at, read)
         pictures = [jnp.moveaxis(visible.picture(values), 2, 0) for values in derivatives]
         return PictureJacobian(compose(scene, shaded, visible), *pictures)
 
-    return on_devices(passes, scene, plan, camera)
+    return on_devices(differentiated, scene, settings, plan, camera)

@@ -1,6 +1,5 @@
 """Pass 1, and the light that enters the surface: at the splats, or at the visible points."""
 
-import abc
 from collections.abc import Sequence
 
 import equinox as eqx
@@ -22,8 +21,6 @@ from splatjax.scene import (
     StackedLights,
     stack_lights,
 )
-
-from ._attributes import SurfaceAttributes, SurfaceSamples
 
 _GRAZING = 1e-3  # cosine
 _NEARLY = 1.05  # bounding radii, from which on one frustum around all splats fits
@@ -91,6 +88,21 @@ def shadow_views(
     if cube:
         return _splatting.cube_views(light.position, settings)
     return [_splatting.near_view(light.position, bounds, settings)]
+
+
+class Transfer(eqx.Module):
+    """Visibility of each light sample from each splat: pass 1, which does not depend on the
+    strength and color of a light.
+
+    **Attributes:**
+
+    - `visibility`: of each sample of lights of one kind, along the splats in the order of the plan;
+      `None` for lights that cast no shadows.
+    - `needed`: capacity needed over planned.
+    """
+
+    visibility: list[Float[Array, "_samples splats"] | None]
+    needed: Float[Array, ""]
 
 
 class LightVisibility(eqx.Module):
@@ -253,56 +265,39 @@ def single_scattering_at_splats(
     return _shading.single_scattered_radiance(points, light.groups, f0, single)
 
 
-def surface_parameters(scene: Scene):
+def surface_parameters(
+    scene: Scene,
+) -> tuple[Float[Array, "*splats"], Float[Array, "*splats"]]:
     """Multiply the material's specular strength and roughness with the splats' own."""
-    splats, material = scene.splats, scene.material
-
-    def product(factor, own):
-        return factor if own is None else factor * own
-
-    specular = product(material.specular, splats.specular)
-    return specular, product(material.roughness, splats.roughness)
+    material, splats = scene.material, scene.splats
+    specular = material.specular if splats.specular is None else material.specular * splats.specular
+    own = splats.roughness
+    return specular, material.roughness if own is None else material.roughness * own
 
 
-class AbstractLighting(eqx.Module):
-    """The attributes that splats bring into the picture, and their use at the pixels before
-    shading.
+def beams_at_splats(
+    scene: Scene, light: LightVisibility, irradiance: Irradiance
+) -> _diffusion.Beams:
+    """Refract the light that enters every splat, and sum it to one beam for each.
+
+    **Arguments:**
+
+    - `irradiance`: from `irradiance_at_splats`.
     """
+    splats, material = scene.splats, scene.material
+    f0, roughness = _shading.fresnel_f0(material.eta), surface_parameters(scene)[1]
 
-    def attributes(
-        self,
-        scene: Scene,
-        light: LightVisibility,
-        irradiance: Irradiance,
-        eye: Float[Array, "3"],
-    ) -> SurfaceAttributes:
-        """Collect the attributes that passes 2 and 3 blend, except for the layers of pass 4. A
-        subclass adds its own as `extra`.
-        """
-        splats = scene.splats
-        specular, roughness = surface_parameters(scene)
-        return SurfaceAttributes(
-            normals=splats.normals.T,
-            area=splats.areas[None],
-            source=irradiance.source,
-            albedo=None if splats.albedo is None else splats.albedo.T,
-            irradiance=None if splats.albedo is None else irradiance.entering,
-            specular=None if splats.specular is None else specular[None],
-            roughness=None if splats.roughness is None else roughness[None],
-            visibility=light.per_light(splats.centers, splats.normals),
-            single_scattering=single_scattering_at_splats(scene, light, eye),
-            weights=_diffusion.Sources.of(splats, irradiance.source).weights,
-        )
+    def along(axis: int):
+        def enters(wi, cosine):
+            fraction = 1 - _shading.directional_albedo(cosine, f0, roughness)
+            sine = jnp.minimum((1 - cosine * cosine) / (material.eta * material.eta), 1 - _GRAZING)
+            inward = jnp.sqrt(1 - sine) - cosine / material.eta
+            inside = wi[:, axis] / material.eta + inward * splats.normals[:, axis]
+            return -(fraction * inside)[None]
 
-    @abc.abstractmethod
-    def at_pixels(
-        self, scene: Scene, groups: list[StackedLights], samples: SurfaceSamples
-    ) -> SurfaceAttributes:
-        """Compute the inputs of passes 4 and 5 from the attributes blended at the pixels."""
+        given = splats.centers, splats.normals, light.groups, light.visibility
+        return _shading.sum_received(*given, enters, material.channels)
 
-
-class LightAtSplats(AbstractLighting):
-    """The irradiance of the splats, blended like all attributes."""
-
-    def at_pixels(self, scene, groups, samples):
-        return samples.attributes
+    directions = jnp.stack([along(axis) for axis in range(3)], axis=1)
+    entering = jnp.where(irradiance.entering > 0, irradiance.entering, 1.0)
+    return _diffusion.Beams(irradiance.source, directions / entering[:, None])

@@ -9,35 +9,34 @@ from functools import partial
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, PyTree, Shaped
+from jaxtyping import Array, Float, Int, PyTree
 
-from splatjax import diffusion as _diffusion, splatting as _splatting
+from splatjax import diffusion as _diffusion, shading as _shading, splatting as _splatting
 from splatjax._chunking import Result, map_chunks, take_points
 from splatjax._combination import AbstractCombination
 from splatjax.scene import Camera, Scene, stack_lights
 
-from ._attributes import SurfaceAttributes, SurfaceSamples, split_rows, stack_rows
-from ._beams import beams_at_splats
-from ._bounces import bounced_irradiance, diffuse_splats
-from ._lighting import Irradiance, LightVisibility, cast_shadows, irradiance_at_splats
+from ._lighting import (
+    Irradiance,
+    LightVisibility,
+    Transfer,
+    beams_at_splats,
+    cast_shadows,
+    irradiance_at_splats,
+    surface_parameters,
+)
 from ._plan import Plan
 from ._settings import RenderSettings
-from ._shade import ShadedSurface, shade
-
-
-class Transfer(eqx.Module):
-    """Visibility of each light sample from each splat: pass 1, which does not depend on the
-    strength and color of a light.
-
-    **Attributes:**
-
-    - `visibility`: of each sample of lights of one kind, along the splats in the order of the plan;
-      `None` for lights that cast no shadows.
-    - `needed`: capacity needed over planned.
-    """
-
-    visibility: list[Float[Array, "_samples splats"] | None]
-    needed: Float[Array, ""]
+from ._surface import (
+    ShadedSurface,
+    SurfaceAttributes,
+    SurfaceSamples,
+    in_a_row,
+    map_places,
+    shade,
+    split_rows,
+    stack_rows,
+)
 
 
 class SplatLight(eqx.Module):
@@ -71,169 +70,224 @@ class SplatLight(eqx.Module):
         return dataclasses.replace(taken, solved=self.solved)
 
 
-def light_visibility(
-    scene: Scene,
-    settings: RenderSettings,
-    plan: Plan,
-    combination: AbstractCombination,
-    transfer: Transfer | None = None,
-) -> LightVisibility:
-    """Render the shadow maps and look up the splats in them (pass 1), or read a precomputed result.
+class Passes(eqx.Module):
+    """The passes over the splats of one device.
 
-    **Arguments:** as for `light_splats`.
+    **Attributes:**
+
+    - `scene`: its splats in the order of the plan.
+    - `combination`: of the partial results of all devices.
     """
-    if transfer is not None:
-        return LightVisibility(stack_lights(scene.lights), transfer.visibility, transfer.needed)
-    return cast_shadows(scene, plan.shadows, settings.splatting, combination)
 
+    scene: Scene
+    settings: RenderSettings
+    plan: Plan
+    combination: AbstractCombination
 
-def light_splats(
-    scene: Scene,
-    settings: RenderSettings,
-    plan: Plan,
-    combination: AbstractCombination,
-    at: Int[Array, " chosen"] | None = None,
-    derivative: bool = False,
-    transfer: Transfer | None = None,
-) -> SplatLight:
-    """Compute the light at the splats, and diffuse their irradiance: passes 1 and 4.
+    def visibility(self, transfer: Transfer | None = None) -> LightVisibility:
+        """Render the shadow maps and look up the splats in them (pass 1), or read a result."""
+        scene = self.scene
+        if transfer is not None:
+            return LightVisibility(stack_lights(scene.lights), transfer.visibility, transfer.needed)
+        return cast_shadows(scene, self.plan.shadows, self.settings.splatting, self.combination)
 
-    **Arguments:**
+    def light(
+        self,
+        at: Int[Array, " chosen"] | None = None,
+        *,
+        kept: SplatLight | Transfer | None = None,
+        derivative: bool = False,
+    ) -> SplatLight:
+        """Compute the light at the splats, and diffuse their irradiance: passes 1 and 4.
 
-    - `at`: the splats whose light is returned, in ascending order; all for `None`.
-    - `derivative`: also differentiate the layers in the material's Gaussians.
-    - `transfer`: replaces pass 1.
-    """
-    light = light_visibility(scene, settings, plan, combination, transfer)
-    direct = irradiance_at_splats(scene, light)
-    beams = partial(beams_at_splats, scene, light, direct)
-    irradiance, bounced, bounce_needed = bounced_irradiance(
-        scene, settings, plan, combination, direct, beams
-    )
-    added, solved, log_variance_derivative = None, None, None
-    if derivative and scene.material.single_scattering is not None:
-        irradiance, added = _differentiated_irradiance(scene, light)
-    source = irradiance.source if added is None else jnp.concatenate([irradiance.source, added])
-    if derivative:
-        layers, log_variance_derivative, needed = diffuse_splats(
-            scene, source, settings, plan, combination, at, derivative
+        **Arguments:**
+
+        - `at`: the splats whose light is returned, in ascending order; all for `None`.
+        - `kept`: a precomputed result, which replaces both passes or pass 1.
+        - `derivative`: also differentiate the layers in the material's Gaussians.
+        """
+        if isinstance(kept, SplatLight):
+            return kept if at is None else kept.take(at)
+        splats, material = self.scene.splats, self.scene.material
+        light = self.visibility(kept)
+        irradiance, bounced, beams, bounce_needed = self.irradiance(light)
+        source, added, slopes, solved = irradiance.source, None, None, None
+        given = self.settings.kernel, self.combination, at
+        if derivative:
+            if material.single_scattering is not None:
+                added = _source_derivative(self.scene, light)
+                source = jnp.concatenate([source, added])
+            sources = _diffusion.Sources.of(splats, source)
+            diffused, differentiated = self.plan.diffusion.diffuse_with_derivative(
+                sources, material.gaussians.variances, *given
+            )
+            slopes = differentiated.layers
+        else:
+            diffused, solved = self.plan.diffusion.light(
+                splats, material, source, beams, *given, bounced
+            )
+        needed = jnp.maximum(light.needed, jnp.maximum(bounce_needed, diffused.needed))
+        along_splats = light.visibility, irradiance, added
+        if at is not None:
+            along_splats = jax.tree.map(partial(take_points, chosen=at), along_splats)
+        visibility, irradiance, added = along_splats
+        return SplatLight(visibility, irradiance, diffused.layers, slopes, added, needed, solved)
+
+    def irradiance(
+        self, light: LightVisibility
+    ) -> tuple[
+        Irradiance,
+        Float[Array, "channels splats"] | None,
+        Callable[[], _diffusion.Beams],
+        Float[Array, ""],
+    ]:
+        r"""Compute the light that enters every splat, directly from the lights and after bounces,
+
+            E_n = E_0 + t F M(E_(n - 1))
+
+        where `M(E)` is the radiant exitance of diffused light, `F M` the irradiance that the body
+        receives from itself, and t the fraction of it that enters. Light that scatters once is
+        treated as diffused.
+
+        **Returns:** the irradiance; the part of its source that has bounced, `None` without
+        bounces; the beams of `E_0`, for `AbstractDiffusionPlan.light`; and the capacity needed of
+        pass 4.
+        """
+        direct = irradiance_at_splats(self.scene, light)
+        beams = partial(beams_at_splats, self.scene, light, direct)
+        none = jnp.zeros((), direct.entering.dtype)
+        if not self.settings.bounces:
+            return direct, None, beams, none
+        sightlines, material = self.plan.sightlines, self.scene.material
+        if sightlines is None:
+            raise ValueError(
+                f"settings.bounces is {self.settings.bounces}, and the plan was made with 0; "
+                "make it with the same settings"
+            )
+        at = sightlines.first_splats()
+        splats, gaussians = self.scene.splats, material.gaussians
+        area, albedo = splats.areas[at], splats.albedo
+        root = jnp.ones_like(direct.source) if albedo is None else _shading.albedo_root(albedo.T)
+        _, roughness = surface_parameters(self.scene)
+        weights = _diffusion.Sources.of(splats, direct.source).weights
+        f0 = _shading.fresnel_f0(material.eta)
+        enters = _shading.average_transmission(f0, roughness, material.angular_law())
+        enters = enters.reshape(material.channels, -1)
+        # The Gaussians also represent light that scatters once: for direct light where it leaves,
+        # for bounced light where it enters.
+        whole, diffused = material.total_reflectance(), gaussians.total_reflectance()
+        added = (whole / jnp.where(diffused > 0, diffused, 1.0))[:, None]
+
+        def bounce(so_far, _):
+            bounced, needed = so_far
+            source = (added * direct.entering + bounced) * root
+            given = splats, material, source, beams, self.settings.kernel, self.combination, at
+            diffused, _ = self.plan.diffusion.light(*given, bounced * root)
+            weighed, _ = _diffusion.LayersAtPoints.of(
+                gaussians.variances,
+                self.plan.diffusion.gaussians,
+                diffused.layers.values,
+                None,
+                source[:, at],
+                jnp.where(area > 0, area, 1.0),
+                root[:, at] ** 2,
+                self.plan.interval,
+                self.settings.kernel,
+                None if weights is None else weights[..., at],
+            ).weigh(gaussians, material.single_scattering_albedo())
+            exitance = root[:, at] * jnp.sum(gaussians.weights[:, :, None] * weighed, axis=0)
+            received = sightlines.irradiance(exitance, splats.normals, self.combination)
+            return (added * enters * received, jnp.maximum(needed, diffused.needed)), None
+
+        start = jnp.zeros_like(direct.entering), none
+        (bounced, needed), _ = jax.lax.scan(bounce, start, None, length=self.settings.bounces)
+        # Without albedo its root is one.
+        entering = direct.entering + bounced
+        return Irradiance(entering, entering * root), bounced * root, beams, needed
+
+    def picture(
+        self,
+        camera: Camera,
+        light_at: Callable[[Int[Array, " chosen"]], SplatLight],
+        read: Callable[[ShadedSurface, _diffusion.LayersAtPoints, SurfaceSamples], Result],
+    ) -> tuple[Result, _splatting.VisibleSurfaces]:
+        """Run all passes: light the splats, find and shade the visible surface, and read the
+        results.
+
+        **Arguments:**
+
+        - `light_at`: passes 1 and 4, for the splats that the camera may see: `light`.
+        - `read`: computes the results of a picture from shaded points, pointwise along the last
+          axis.
+
+        **Returns:** the results for each place, and the places, with the capacity that all passes
+        needed.
+        """
+        scene, settings, plan = self.scene, self.settings, self.plan
+        view, groups = _splatting.PerspectiveView.of(camera), stack_lights(scene.lights)
+        chosen, chosen_needed = plan.raster.choose(scene.splats, view)
+        light = light_at(chosen)
+
+        # Passes 2 and 3: blend the attributes and layers of the splats that may be visible.
+        splats = scene.splats.take(chosen)
+        shown = Scene(splats, scene.lights, scene.material)
+        layers = plan.diffusion.towards(
+            camera.position, scene.splats, scene.material, light.layers, light.solved, chosen
         )
-    else:
-        given = scene.splats, scene.material, source, beams, settings.kernel, combination, at
-        diffused, solved = plan.diffusion.light(*given, bounced)
-        layers, needed = diffused.layers, diffused.needed
-    needed = jnp.maximum(needed, jnp.maximum(light.needed, bounce_needed))
-    along_splats = light.visibility, irradiance, added
-    if at is not None:
-        along_splats = jax.tree.map(partial(take_points, chosen=at), along_splats)
-    visibility, irradiance, added = along_splats
-    derivatives = log_variance_derivative, added
-    return SplatLight(visibility, irradiance, layers, *derivatives, needed, solved)
+        visibility = LightVisibility(groups, light.visibility, light.needed)
+        attributes = settings.lighting.attributes(
+            shown, visibility, light.irradiance, view.position
+        )
+        origin = _splatting.Bounds.of(scene.splats, self.combination).center[:, None]
+        origin = jax.lax.stop_gradient(origin)
+        centers = splats.centers.T - origin
+        attributes = dataclasses.replace(
+            attributes,
+            centers=centers,
+            layers=_diffusion.continue_from_splats(layers, centers),
+            derivative=light.derivative
+            and _diffusion.continue_from_splats(light.derivative, centers),
+            added_source=light.added_source,
+        )
+        visible = _splatting.visible_surfaces(
+            splats, stack_rows(attributes), view, settings.splatting, plan.raster, self.combination
+        )
+
+        needed = self.combination.largest([jnp.maximum(chosen_needed, light.needed)])
+        visible = dataclasses.replace(visible, needed=jnp.maximum(needed, visible.needed))
+
+        # Pass 5: shade the visible points.
+        def shade_and_read(samples: SurfaceSamples) -> Result:
+            samples = jax.tree.map(in_a_row, samples)
+            attributes = settings.lighting.at_pixels(scene, groups, samples)
+            planned = plan.diffusion.gaussians, plan.interval, settings.kernel
+            shaded, layers = shade(scene, view.position, groups, samples, attributes, *planned)
+            return read(shaded, layers, samples)
+
+        sample = partial(sample_surfaces, visible, attributes, origin)
+
+        # A separate call, so that samples are materialized; large chunks, so that few are at once.
+        def sample_and_read(sums, tiles) -> Result:
+            return map_places(shade_and_read, map_places(sample, sums, tiles))
+
+        at_once = 2 * _splatting.TILES_AT_ONCE
+        values = map_chunks(sample_and_read, visible.sums, visible.tiles, at_once=at_once)
+        return self.combination.gather(values), visible.gathered(self.combination)
 
 
-def make_light_at(
-    scene: Scene,
-    settings: RenderSettings,
-    plan: Plan,
-    combination: AbstractCombination,
-    light: SplatLight | Transfer | None,
-    derivative: bool = False,
-) -> Callable[..., SplatLight]:
-    """Return the function that computes passes 1 and 4 for `see_and_shade`, or reads a precomputed
-    result.
-    """
-    if isinstance(light, SplatLight):
-        return light.take
-    return partial(
-        light_splats, scene, settings, plan, combination, derivative=derivative, transfer=light
-    )
-
-
-def _differentiated_irradiance(
-    scene: Scene, light: LightVisibility
-) -> tuple[Irradiance, Float[Array, "channels splats"]]:
-    """Compute the irradiance, and also differentiate the source in the weights.
+def _source_derivative(scene: Scene, light: LightVisibility) -> Float[Array, "channels splats"]:
+    """Differentiate the source in the weights.
 
     With single scattering, less light is left for the Gaussians at grazing angles. This depends
     only on the sum of the weights, so the derivative is taken in one weight.
     """
+
+    def source(weights: Float[Array, "gaussians channels"]):
+        changed = eqx.tree_at(lambda s: s.material.gaussians.weights, scene, weights)
+        return irradiance_at_splats(changed, light).source
+
     weights = scene.material.gaussians.weights
-
-    def irradiance(change: Float[Array, " channels"]):
-        moved = weights.at[0].add(change)
-        return irradiance_at_splats(
-            eqx.tree_at(lambda s: s.material.gaussians.weights, scene, moved), light
-        )
-
-    zero, one = jnp.zeros_like(weights[0]), jnp.ones_like(weights[0])
-    value, derivative = jax.jvp(irradiance, (zero,), (one,))
-    return value, derivative.source
-
-
-def see_and_shade(
-    scene: Scene,
-    camera: Camera,
-    settings: RenderSettings,
-    plan: Plan,
-    combination: AbstractCombination,
-    light_at: Callable[[Int[Array, " chosen"]], SplatLight],
-    read: Callable[[ShadedSurface, _diffusion.LayersAtPoints, SurfaceSamples], Result],
-) -> tuple[Result, _splatting.VisibleSurfaces]:
-    """Run all passes: light the splats, find and shade the visible surface, and read the results.
-
-    **Arguments:**
-
-    - `light_at`: passes 1 and 4, for the splats that the camera may see: `make_light_at`.
-    - `read`: computes the results of a picture from shaded points, pointwise along the last axis.
-
-    **Returns:** the results for each place, and the places, with the capacity that all passes
-    needed.
-    """
-    view, groups = _splatting.PerspectiveView.of(camera), stack_lights(scene.lights)
-    chosen, chosen_needed = plan.raster.choose(scene.splats, view)
-    light = light_at(chosen)
-
-    # Passes 2 and 3: blend the attributes and layers of the splats that may be visible.
-    splats = scene.splats.take(chosen)
-    shown = Scene(splats, scene.lights, scene.material)
-    layers = plan.diffusion.towards(
-        camera.position, scene.splats, scene.material, light.layers, light.solved, chosen
-    )
-    visibility = LightVisibility(groups, light.visibility, light.needed)
-    attributes = settings.lighting.attributes(shown, visibility, light.irradiance, view.position)
-    bounds = _splatting.Bounds.of(scene.splats, combination)
-    origin = jax.lax.stop_gradient(bounds.center)[:, None]
-    centers = splats.centers.T - origin
-    attributes = dataclasses.replace(
-        attributes,
-        centers=centers,
-        layers=_diffusion.continue_from_splats(layers, centers),
-        derivative=light.derivative and _diffusion.continue_from_splats(light.derivative, centers),
-        added_source=light.added_source,
-    )
-    visible = _splatting.visible_surfaces(
-        splats, stack_rows(attributes), view, settings.splatting, plan.raster, combination
-    )
-
-    needed = combination.largest([jnp.maximum(chosen_needed, light.needed)])
-    visible = dataclasses.replace(visible, needed=jnp.maximum(needed, visible.needed))
-
-    # Pass 5: shade the visible points.
-    def shade_and_read(samples: SurfaceSamples) -> Result:
-        samples = jax.tree.map(in_a_row, samples)
-        planned = plan.diffusion.gaussians, plan.interval
-        shaded, layers = shade(scene, view.position, groups, samples, *planned, settings)
-        return read(shaded, layers, samples)
-
-    sample = partial(sample_surfaces, visible, attributes, origin)
-
-    # A separate call, so that samples are materialized; large chunks, so that few are at a time.
-    def sample_and_read(sums, tiles) -> Result:
-        return map_places(shade_and_read, map_places(sample, sums, tiles))
-
-    at_once = 2 * _splatting.TILES_AT_ONCE
-    values = map_chunks(sample_and_read, visible.sums, visible.tiles, at_once=at_once)
-    return combination.gather(values), visible.gathered(combination)
+    return jax.jvp(source, (weights,), (jnp.zeros_like(weights).at[0].set(1),))[1]
 
 
 def sample_surfaces(
@@ -252,7 +306,6 @@ def sample_surfaces(
     - `origin`: of the splats' centers among the attributes.
     - `sums`, `tiles`: those of `visible`, of these places.
     """
-    like = jax.eval_shape(lambda: like)
     surface = _splatting.Surface.of(sums, visible.view, visible.needed)
     attributes = split_rows(in_a_row(surface.attributes), like)
     positions = in_a_row(visible.points(tiles, surface.depth))
@@ -274,32 +327,3 @@ def sample_surfaces(
         layers=layers,
         derivative=derivative,
     )
-
-
-def map_places(function: Callable[..., Result], *given: PyTree) -> Result:
-    """Apply a pointwise function to chunks of places.
-
-    **Arguments:**
-
-    - `function`: returns arrays `[*rows, points]`, the pixels of its places in a row.
-    - `given`: arrays along the places.
-
-    **Returns:** the same arrays, `[places, *rows, pixels]`.
-    """
-
-    return map_chunks(
-        lambda *given: jax.tree.map(_by_place, function(*given)),
-        *given,
-        at_once=_splatting.TILES_AT_ONCE,
-    )
-
-
-def in_a_row(values: Shaped[Array, "places *rows pixels"]) -> Shaped[Array, "*rows points"]:
-    rows = jnp.moveaxis(values, 0, -2)
-    return rows.reshape(*rows.shape[:-2], rows.shape[-2] * rows.shape[-1])
-
-
-def _by_place(values: Shaped[Array, "*rows points"]) -> Shaped[Array, "places *rows pixels"]:
-    pixels = _splatting.TILE_SIDE**2
-    rows = values.reshape(*values.shape[:-1], values.shape[-1] // pixels, pixels)
-    return jnp.moveaxis(rows, -2, 0)

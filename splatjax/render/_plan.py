@@ -8,13 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jax.experimental.multihost_utils import process_allgather
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jax.sharding import Mesh, NamedSharding, PartitionSpec, SingleDeviceSharding
 from jaxtyping import Array, Bool, Float, Int
 
 from splatjax import diffusion as _diffusion, splatting as _splatting
 from splatjax._chunking import Result, rounded_up
 from splatjax._combination import DeviceMesh, OneDevice
 from splatjax.cache import kept, reuse_capacity
+from splatjax.gaussians import SumOfGaussians
 from splatjax.scene import (
     AbstractLight,
     AbstractLightSample,
@@ -26,7 +27,6 @@ from splatjax.scene import (
 )
 
 from ._checks import check_scene, in_one_dtype
-from ._filling import arrange, fill_gaussians, fill_up
 from ._lighting import ShadowPlan, plan_views
 from ._settings import RenderSettings
 
@@ -113,7 +113,7 @@ def make_plan(
     parts, order, exists = _cut_and_order(scene.splats, mesh)
     bounds, interval = _measure(parts, settings.kernel)
     gaussians = scene.material.gaussians
-    variances = fill_gaussians(gaussians).variances
+    variances = pad_gaussians(gaussians).variances
     raster = settings.rasterizer.make_plan(parts, views, settings.splatting)
     plan = Plan(
         order=order,
@@ -150,10 +150,9 @@ def check_plan(plan: Plan, scene: Scene, mesh: Mesh | None = None) -> None:
     """Raise `ValueError` for a plan that was made for other splats, another number of Gaussians,
     or another mesh.
     """
-    gaussians = len(scene.material.gaussians.variances)
     for what, planned, count in (
         ("splats", plan.splats, scene.splats.count),
-        ("Gaussians", plan.gaussians, gaussians),
+        ("Gaussians", plan.gaussians, len(scene.material.gaussians.variances)),
     ):
         if planned != count:
             raise ValueError(
@@ -214,9 +213,7 @@ def _on_one_device(tree: Result) -> Result:
     """Gather arrays from several devices and processes, for planning."""
 
     def gathered(leaf):
-        if not isinstance(leaf, jax.Array) or isinstance(
-            leaf.sharding, jax.sharding.SingleDeviceSharding
-        ):
+        if not isinstance(leaf, jax.Array) or isinstance(leaf.sharding, SingleDeviceSharding):
             return leaf
         whole = leaf if leaf.is_fully_addressable else process_allgather(leaf, tiled=True)
         return jnp.asarray(np.asarray(whole))
@@ -228,19 +225,57 @@ def _cut_and_order(splats: Splats, mesh: Mesh | None) -> tuple[list[Splats], Arr
     """Divide the splats into a part for each device, in a compact order; also return the orders,
     and whether their entries exist, device after device.
     """
-    devices, share = splats_per_device(splats.count, mesh)
-    places = rounded_up(share, _diffusion.POINTS_PER_BLOCK, per_octave=16)
-    places = reuse_capacity("splats", share, places, most=_MOST_SPLATS)
-    filling = (0, places - share)
-    whole = jax.tree.map(np.asarray, fill_up(splats, share * devices))
+    devices, per_device = splats_per_device(splats.count, mesh)
+    places = rounded_up(per_device, _diffusion.POINTS_PER_BLOCK, per_octave=16)
+    places = reuse_capacity("splats", per_device, places, most=_MOST_SPLATS)
+    repeated = (0, places - per_device)
+    whole = jax.tree.map(np.asarray, pad_splats(splats, per_device * devices))
     parts, orders, exist = [], [], []
-    for i in range(devices):
-        part = jax.tree.map(lambda leaf, i=i: leaf[i * share : (i + 1) * share], whole)
+    for first in range(0, per_device * devices, per_device):
+        part = jax.tree.map(lambda leaf, i=first: leaf[i : i + per_device], whole)
         order = _diffusion.compact_order(part.centers).astype(np.int32)
-        exist.append(np.pad(i * share + order < splats.count, filling))
-        orders.append(np.pad(order, filling, mode="edge"))
+        exist.append(np.pad(first + order < splats.count, repeated))
+        orders.append(np.pad(order, repeated, mode="edge"))
         parts.append(jax.tree.map(jnp.asarray, arrange(part, orders[-1], exist[-1])))
     return parts, jnp.asarray(np.concatenate(orders)), jnp.asarray(np.concatenate(exist))
+
+
+def pad_splats(splats: Splats, count: int) -> Splats:
+    """Add invisible splats without light, up to `count`."""
+    if splats.count == count:
+        return splats
+    return splats.take(jnp.arange(count, dtype=jnp.int32))
+
+
+def pad_gaussians(gaussians: SumOfGaussians) -> SumOfGaussians:
+    """Add Gaussians without weight, too narrow to be resolved, beyond three up to a multiple of
+    three. Not for traced arrays; nothing is compiled.
+    """
+    count = len(gaussians.variances)
+    lacking = -count % 3 if count > 3 else 0
+    if not lacking:
+        return gaussians
+    variances = np.pad(gaussians.variances, (0, lacking))
+    variances[count:] = 1e-6 * variances[:count].min()
+    weights = np.pad(gaussians.weights, ((0, lacking), (0, 0)))
+    return SumOfGaussians(jax.device_put(variances), jax.device_put(weights))
+
+
+def arrange(
+    splats: Splats,
+    order: Int[Array, " places"] | Int[np.ndarray, " places"],
+    exists: Bool[Array, " places"] | Bool[np.ndarray, " places"],
+) -> Splats:
+    """Sort a device's splats in the order of a plan; repeated ones are invisible and dark."""
+    placed = jax.tree.map(lambda leaf: leaf[order], splats)
+
+    def masked(leaf):
+        where = np.where if isinstance(leaf, np.ndarray) else jnp.where
+        return where(exists.reshape(-1, *[1] * (leaf.ndim - 1)), leaf, 0)
+
+    return eqx.tree_at(
+        lambda splats: (splats.normals, splats.radii, splats.areas), placed, replace_fn=masked
+    )
 
 
 @eqx.filter_jit
@@ -290,6 +325,5 @@ def _plan_shadows(
         parts = [_splatting.merge_splats(part, merged) for part in parts]
     of_lights, cube = plan_views(lights, bounds, shadows)
     views = [view for views in of_lights for view in views]
-    rasterizer = settings.rasterizer.for_shadows()
-    raster = rasterizer.make_plan(parts, views, settings.splatting)
+    raster = settings.rasterizer.for_shadows().make_plan(parts, views, settings.splatting)
     return ShadowPlan(raster, shadows, cube, merged)

@@ -13,23 +13,16 @@ from splatjax._chunking import take_points
 from splatjax._combination import lay_out
 from splatjax._precision import full_precision
 from splatjax.cache import kept_jit
+from splatjax.diffusion import Sources
 from splatjax.scene import Camera, Frame, Scene
 
-from ._beams import beams_at_splats
-from ._bounces import bounced_irradiance, diffuse_splats
 from ._checks import check_channels
-from ._devices import fill_scene, on_devices, resize_visibility
-from ._lighting import Irradiance, LightAtSplats, irradiance_at_splats
-from ._passes import (
-    SplatLight,
-    Transfer,
-    light_visibility,
-    make_light_at,
-    see_and_shade,
-)
+from ._devices import on_devices, pad_scene, resize_visibility
+from ._lighting import Irradiance, Transfer
+from ._passes import SplatLight
 from ._plan import Plan, check_plan, plan_unless_traced, splats_per_device
-from ._settings import RenderSettings
-from ._shade import compose
+from ._settings import LightAtSplats, RenderSettings
+from ._surface import compose
 
 
 def render(
@@ -65,7 +58,7 @@ def render(
     disagree.
     """
     plan = plan_unless_traced(scene, camera, settings, plan, mesh)
-    scene, plan, light, own = fill_scene(scene, plan, light, camera)
+    scene, plan, light, own = pad_scene(scene, plan, light, camera)
     return own.frame(_render(scene, camera, settings, plan, light))
 
 
@@ -77,19 +70,12 @@ def _render(
     plan: Plan,
     light: SplatLight | Transfer | None,
 ) -> Frame:
-    def passes(combination, scene, plan, camera, light=None):
-        shaded, visible = see_and_shade(
-            scene,
-            camera,
-            settings,
-            plan,
-            combination,
-            make_light_at(scene, settings, plan, combination, light),
-            read=lambda shaded, *_: shaded,
-        )
-        return compose(scene, shaded, visible)
+    def picture(passes, camera, light=None):
+        light_at = partial(passes.light, kept=light)
+        shaded, visible = passes.picture(camera, light_at, lambda shaded, *_: shaded)
+        return compose(passes.scene, shaded, visible)
 
-    return on_devices(passes, scene, plan, camera, placed=light)
+    return on_devices(picture, scene, settings, plan, camera, placed=light)
 
 
 def illuminate(
@@ -120,7 +106,7 @@ def illuminate(
     """
     check_channels(scene)
     check_plan(plan, scene)
-    filled, plan, light, _ = fill_scene(scene, plan, light)
+    filled, plan, light, _ = pad_scene(scene, plan, light)
     return resize_visibility(_illuminate(filled, plan, settings, derivative, light), scene)
 
 
@@ -128,10 +114,10 @@ def illuminate(
 def _illuminate(
     scene: Scene, plan: Plan, settings: RenderSettings, derivative: bool, light: Transfer | None
 ) -> SplatLight:
-    def passes(combination, scene, plan, light=None):
-        return make_light_at(scene, settings, plan, combination, light, derivative)(None)
+    def lit(passes, light=None):
+        return passes.light(kept=light, derivative=derivative)
 
-    return on_devices(passes, scene, plan, by_splat=True, placed=light)
+    return on_devices(lit, scene, settings, plan, by_splat=True, placed=light)
 
 
 def transfer(scene: Scene, plan: Plan, settings: RenderSettings = RenderSettings()) -> Transfer:
@@ -154,17 +140,17 @@ def transfer(scene: Scene, plan: Plan, settings: RenderSettings = RenderSettings
     """
     check_channels(scene)
     check_plan(plan, scene)
-    filled, plan, *_ = fill_scene(scene, plan)
+    filled, plan, *_ = pad_scene(scene, plan)
     return resize_visibility(_transfer(filled, plan, settings), scene)
 
 
 @kept_jit
 def _transfer(scene: Scene, plan: Plan, settings: RenderSettings) -> Transfer:
-    def passes(combination, scene, plan):
-        light = light_visibility(scene, settings, plan, combination)
+    def shadows(passes):
+        light = passes.visibility()
         return Transfer(light.visibility, light.needed)
 
-    return on_devices(passes, scene, plan, by_splat=True)
+    return on_devices(shadows, scene, settings, plan, by_splat=True)
 
 
 def compute_irradiance(
@@ -187,25 +173,23 @@ def compute_irradiance(
 @full_precision
 @eqx.filter_jit
 def _compute_irradiance(scene: Scene, plan: Plan, settings: RenderSettings) -> Irradiance:
-    def passes(combination, scene, plan):
-        light = light_visibility(scene, settings, plan, combination)
-        direct = irradiance_at_splats(scene, light)
-        beams = partial(beams_at_splats, scene, light, direct)
-        return bounced_irradiance(scene, settings, plan, combination, direct, beams)[0]
+    _, per_device = splats_per_device(scene.splats.count, plan.mesh)
 
-    placed = on_devices(passes, scene, plan, by_splat=True), plan.order, plan.exists
+    def entering(passes):
+        irradiance, *_ = passes.irradiance(passes.visibility())
+        splat = jnp.where(passes.plan.exists, passes.plan.order, per_device)
+
+        def in_scene_order(rows):
+            dark = jnp.zeros((len(rows), per_device), rows.dtype)
+            return dark.at[:, splat].set(rows, mode="drop")
+
+        return jax.tree.map(in_scene_order, irradiance)
+
+    irradiance = on_devices(entering, scene, settings, plan, by_splat=True)
     if plan.mesh is not None:
-        placed = lay_out(plan.mesh, placed, jax.tree.map(lambda _: PartitionSpec(), placed))
-    irradiance, order, exists = placed
-    devices, share = splats_per_device(scene.splats.count, plan.mesh)
-    device = jnp.repeat(jnp.arange(devices, dtype=order.dtype), len(order) // devices)
-    splat = jnp.where(exists, device * share + order, scene.splats.count)
-
-    def in_scene_order(rows):
-        empty = jnp.zeros((rows.shape[0], scene.splats.count), rows.dtype)
-        return empty.at[:, splat].set(rows, mode="drop")
-
-    return jax.tree.map(in_scene_order, irradiance)
+        whole = jax.tree.map(lambda _: PartitionSpec(), irradiance)
+        irradiance = lay_out(plan.mesh, irradiance, whole)
+    return jax.tree.map(lambda rows: rows[:, : scene.splats.count], irradiance)
 
 
 def diffuse_irradiance(
@@ -248,24 +232,23 @@ def _diffuse_irradiance(
     dark = Scene(scene.splats, (), scene.material)
     plain = dataclasses.replace(settings, lighting=LightAtSplats())
 
-    def passes(combination, scene, plan, camera, irradiance):
-        source = irradiance.T
+    def diffuse(passes, camera, irradiance):
+        splats, material = passes.scene.splats, passes.scene.material
+        source, gaussians = irradiance.T, material.gaussians
 
         def light_at(chosen):
-            layers, _, needed = diffuse_splats(
-                scene, source, settings, plan, combination, at=chosen
-            )
+            sources, given = Sources.of(splats, source), (settings.kernel, passes.combination)
+            diffusion = passes.plan.diffusion
+            diffused = diffusion.diffuse(sources, gaussians.variances, *given, chosen)
             seen = take_points(source, chosen)
             irradiance = Irradiance(entering=seen, source=seen)
-            return SplatLight([], irradiance, layers, None, None, needed)
+            return SplatLight([], irradiance, diffused.layers, None, None, diffused.needed)
 
         def read(shaded, layers, samples):
-            return layers.weigh(
-                scene.material.gaussians, scene.material.single_scattering_albedo()
-            )[0]
+            return layers.weigh(gaussians, material.single_scattering_albedo())[0]
 
-        layers, visible = see_and_shade(scene, camera, plain, plan, combination, light_at, read)
+        layers, visible = passes.picture(camera, light_at, read)
         return visible.front_picture(layers)
 
-    picture = on_devices(passes, dark, plan, camera, rows=(irradiance,))
+    picture = on_devices(diffuse, dark, plain, plan, camera, rows=(irradiance,))
     return jnp.moveaxis(picture, 2, 0)

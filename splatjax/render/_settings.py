@@ -1,12 +1,71 @@
-"""How each pass works."""
+"""How each pass works, and where the light enters: at the splats, unless a subclass decides."""
+
+import abc
 
 import equinox as eqx
+from jaxtyping import Array, Float
 
 from splatjax import diffusion as _diffusion, splatting as _splatting
 from splatjax._records import check_values
-from splatjax.scene import AbstractLightSample, DistantStratum, EmitterStratum
+from splatjax.scene import (
+    AbstractLightSample,
+    DistantStratum,
+    EmitterStratum,
+    Scene,
+    StackedLights,
+)
 
-from ._lighting import AbstractLighting, LightAtSplats
+from ._lighting import (
+    Irradiance,
+    LightVisibility,
+    single_scattering_at_splats,
+    surface_parameters,
+)
+from ._surface import SurfaceAttributes, SurfaceSamples
+
+
+class AbstractLighting(eqx.Module):
+    """The attributes that splats bring into the picture, and their use at the pixels before
+    shading.
+    """
+
+    def attributes(
+        self,
+        scene: Scene,
+        light: LightVisibility,
+        irradiance: Irradiance,
+        eye: Float[Array, "3"],
+    ) -> SurfaceAttributes:
+        """Collect the attributes that passes 2 and 3 blend, except for the layers of pass 4. A
+        subclass adds its own as `extra`.
+        """
+        splats = scene.splats
+        specular, roughness = surface_parameters(scene)
+        return SurfaceAttributes(
+            normals=splats.normals.T,
+            area=splats.areas[None],
+            source=irradiance.source,
+            albedo=None if splats.albedo is None else splats.albedo.T,
+            irradiance=None if splats.albedo is None else irradiance.entering,
+            specular=None if splats.specular is None else specular[None],
+            roughness=None if splats.roughness is None else roughness[None],
+            visibility=light.per_light(splats.centers, splats.normals),
+            single_scattering=single_scattering_at_splats(scene, light, eye),
+            weights=_diffusion.Sources.of(splats, irradiance.source).weights,
+        )
+
+    @abc.abstractmethod
+    def at_pixels(
+        self, scene: Scene, groups: list[StackedLights], samples: SurfaceSamples
+    ) -> SurfaceAttributes:
+        """Compute the inputs of passes 4 and 5 from the attributes blended at the pixels."""
+
+
+class LightAtSplats(AbstractLighting):
+    """The irradiance of the splats, blended like all attributes."""
+
+    def at_pixels(self, scene, groups, samples):
+        return samples.attributes
 
 
 class RenderSettings(eqx.Module):
@@ -54,3 +113,12 @@ class RenderSettings(eqx.Module):
         """Return the settings of the shadow maps of a light or sample."""
         is_sample = isinstance(light, DistantStratum | EmitterStratum)
         return self.sample_shadows if is_sample else self.shadows
+
+
+def check_no_bounces(settings: RenderSettings) -> None:
+    """Raise `ValueError` for bounces, with which a picture is not linear in the weights."""
+    if settings.bounces:
+        raise ValueError(
+            f"settings.bounces is {settings.bounces}, and each bounce depends on the material's "
+            "weights; give bounces=0, or differentiate splatjax.render in reverse mode"
+        )

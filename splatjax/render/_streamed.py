@@ -27,9 +27,7 @@ from splatjax.scene import (
     stack_lights,
 )
 
-from ._attributes import SurfaceAttributes, SurfaceSamples, stack_rows
 from ._checks import check_channels, in_one_dtype
-from ._filling import fill_up
 from ._lighting import (
     Irradiance,
     LightVisibility,
@@ -37,10 +35,19 @@ from ._lighting import (
     map_visibility,
     plan_views,
 )
-from ._passes import in_a_row, map_places, sample_surfaces
+from ._passes import sample_surfaces
+from ._plan import pad_splats
 from ._settings import RenderSettings
-from ._shade import compose, shade
 from ._statistics import ReplayableStream, StreamStatistics
+from ._surface import (
+    SurfaceAttributes,
+    SurfaceSamples,
+    compose,
+    in_a_row,
+    map_places,
+    shade,
+    stack_rows,
+)
 
 
 def render_streamed(
@@ -101,7 +108,7 @@ def render_streamed(
 
     def scenes(task: str) -> Iterator[Scene]:
         for part in reported(task):
-            whole = Scene(fill_up(part, part_size), tuple(lights), material)
+            whole = Scene(pad_splats(part, part_size), tuple(lights), material)
             yield in_one_dtype(whole)[0]
 
     first = next(iter(scenes("looking")))
@@ -261,6 +268,8 @@ def _shade(
     def shade_places(samples: SurfaceSamples, layers):
         samples, layers = jax.tree.map(in_a_row, (samples, layers))
         samples = dataclasses.replace(samples, layers=layers)
-        return shade(scene, view.position, groups, samples, gaussians, interval, settings)[0]
+        attributes = settings.lighting.at_pixels(scene, groups, samples)
+        planned = gaussians, interval, settings.kernel
+        return shade(scene, view.position, groups, samples, attributes, *planned)[0]
 
     return compose(scene, map_places(shade_places, samples, layers), visible)

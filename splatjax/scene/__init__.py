@@ -10,9 +10,12 @@ from ._environment import (
     EnvironmentLight as EnvironmentLight,
     even_directions as even_directions,
 )
-from ._harmonics import (
+from ._formulas import (
     HarmonicLight as HarmonicLight,
+    overcast_sky as overcast_sky,
     spherical_harmonics as spherical_harmonics,
+    studio as studio,
+    sun_and_sky as sun_and_sky,
 )
 from ._lights import (
     AbstractExtendedLight as AbstractExtendedLight,
@@ -29,11 +32,6 @@ from ._lights import (
     StackedLights as StackedLights,
 )
 from ._material import Material as Material
-from ._skies import (
-    overcast_sky as overcast_sky,
-    studio as studio,
-    sun_and_sky as sun_and_sky,
-)
 from ._scene import (
     Camera as Camera,
     Frame as Frame,

@@ -8,7 +8,6 @@ from ._deferred import (
     average_transmission as average_transmission,
     diffuse_transmission as diffuse_transmission,
     exit_transmission as exit_transmission,
-    received_light as received_light,
     reflected_radiance as reflected_radiance,
     single_scattered_radiance as single_scattered_radiance,
     sum_received as sum_received,

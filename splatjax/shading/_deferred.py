@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from splatjax.scattering import AngularLaw, SingleScattering
-from splatjax.scene import AbstractLightSample, StackedLights
+from splatjax.scene import StackedLights
 
 from ._specular import average_albedo, directional_albedo, specular_lobe
 
@@ -98,21 +98,6 @@ def _cosine(
     return jnp.maximum(jnp.sum(normals * directions, axis=-1), 0)
 
 
-def received_light(
-    light: AbstractLightSample,
-    visibility: Float[Array, "*pixels"] | None,
-    points: Float[Array, "*pixels 3"],
-    normals: Float[Array, "*pixels 3"],
-) -> tuple[Float[Array, "*pixels 3"], Float[Array, "*pixels"], Float[Array, "channels *pixels"]]:
-    """Compute `wi`, the cosine `n . wi`, and the irradiance that the surface receives from a light:
-    cosine and visibility included.
-    """
-    wi, irradiance = light.incidence(points)
-    cosine = _cosine(normals, wi)
-    received = cosine if visibility is None else cosine * visibility
-    return wi, cosine, jnp.moveaxis(irradiance, -1, 0) * received[None]
-
-
 def sum_received(
     points: Float[Array, "*pixels 3"],
     normals: Float[Array, "*pixels 3"],
@@ -139,8 +124,11 @@ def sum_received(
 
     @jax.checkpoint
     def add(total, light_and_visibility):
-        wi, cosine, received = received_light(*light_and_visibility, points, normals)
-        return total + received * factor(wi, cosine), None
+        light, visible = light_and_visibility
+        wi, irradiance = light.incidence(points)
+        cosine = _cosine(normals, wi)
+        received = cosine if visible is None else cosine * visible
+        return total + jnp.moveaxis(irradiance, -1, 0) * received[None] * factor(wi, cosine), None
 
     total = jnp.zeros((channels, *points.shape[:-1]), points.dtype)
     for group, visible in zip(groups, visibility, strict=True):

@@ -1,14 +1,95 @@
-"""Pass 5: shade the surface samples, and compose them to a frame."""
+"""The visible surface: its attributes, which passes 2 and 3 blend; and pass 5, which shades samples
+of it and composes them to a frame.
+"""
+
+from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree, Shaped
 
 from splatjax import diffusion as _diffusion, shading as _shading, splatting as _splatting
+from splatjax._chunking import Result, map_chunks
 from splatjax.scene import Frame, Scene, StackedLights
 
-from ._attributes import SurfaceAttributes, SurfaceSamples
-from ._settings import RenderSettings
+
+class SurfaceAttributes(eqx.Module):
+    """Rows that passes 2 and 3 blend (Eq. 1), along the last axis of every array: of the splats, or
+    of the visible points.
+
+    **Attributes:**
+
+    - `normals`: of the splats; blended ones are not of unit length.
+    - `area`: per splat, mm^2.
+    - `source`: irradiance that spreads below the surface.
+    - `albedo`, `irradiance`, `specular`, `roughness`: `None` if the splats have none; `irradiance`
+      is then `source`.
+    - `weights`: factors on the weights of the material; `None` if the splats have none.
+    - `visibility`: per group of samples, of each light; `None` for lights that cast no shadows.
+    - `single_scattering`: radiance towards the eye, without the albedo; `None` if the material has
+      none.
+    - `layers`, `derivative`: the layers of pass 4 as `continue_from_splats` prepares them, and
+      their derivatives; `centers` are the splats', mm from an origin.
+    - `added_source`: the derivative of `source` in a weight of the Gaussians, if it is not zero.
+    - `extra`: attributes of another `AbstractLighting`.
+    """
+
+    normals: Float[Array, "3 points"]
+    area: Float[Array, "1 points"]
+    source: Float[Array, "channels points"]
+    albedo: Float[Array, "channels points"] | None
+    irradiance: Float[Array, "channels points"] | None
+    specular: Float[Array, "1 points"] | None
+    roughness: Float[Array, "1 points"] | None
+    visibility: tuple[Float[Array, "_lights points"] | None, ...]
+    single_scattering: Float[Array, "channels points"] | None = None
+    weights: Float[Array, "gaussians channels points"] | None = None
+    centers: Float[Array, "3 points"] | None = None
+    layers: _diffusion.LayerValues | None = None
+    derivative: _diffusion.LayerValues | None = None
+    added_source: Float[Array, "channels points"] | None = None
+    extra: Any = None
+
+
+class SurfaceSamples(eqx.Module):
+    """The visible surface in the pixels of some tiles, along the last axis.
+
+    **Attributes:**
+
+    - `attributes`: blended.
+    - `positions`: mm.
+    - `depth`: mm along the camera's forward axis.
+    - `covered`: whether a surface is visible.
+    - `layers`: means and mass at the positions; none before they are computed.
+    - `derivative`: of the layers in the logarithms of their variances; `None` if not requested.
+    """
+
+    attributes: SurfaceAttributes
+    positions: Float[Array, "3 points"]
+    depth: Float[Array, " points"]
+    covered: Bool[Array, " points"]
+    layers: Float[Array, "layers values points"]
+    derivative: Float[Array, "layers values points"] | None
+
+
+def stack_rows(rows: PyTree[Float[Array, "... points"]]) -> Float[Array, "all points"]:
+    """Stack the rows of a tree of arrays."""
+    leaves = jax.tree.leaves(rows)
+    return jnp.concatenate([leaf.reshape(-1, leaf.shape[-1]) for leaf in leaves])
+
+
+def split_rows(stacked: Float[Array, "all points"], like: PyTree) -> PyTree:
+    """Undo `stack_rows`, for a tree of arrays that differs from `like` only in its last axis."""
+    leaves, structure = jax.tree.flatten(like)
+    sizes = [leaf.size // leaf.shape[-1] for leaf in leaves]
+    parts = jax.lax.split(stacked, sizes, axis=0)
+    points = stacked.shape[1]
+    split = [
+        part.reshape(*leaf.shape[:-1], points) for part, leaf in zip(parts, leaves, strict=True)
+    ]
+    return structure.unflatten(split)
 
 
 class ShadedSurface(eqx.Module):
@@ -74,25 +155,25 @@ def shade(
     eye: Float[Array, "3"],
     groups: list[StackedLights],
     samples: SurfaceSamples,
+    attributes: SurfaceAttributes,
     gaussians: Int[Array, " layers"],
     interval: Float[Array, "2"],
-    settings: RenderSettings,
+    kernel: _diffusion.AbstractDiffusionKernel,
 ) -> tuple[ShadedSurface, _diffusion.LayersAtPoints]:
     """Shade the samples: the layers, the specular lobe, and single scattering. Also return the
     inputs of the layers.
 
     **Arguments:**
 
+    - `attributes`: from `AbstractLighting.at_pixels`.
     - `gaussians`, `interval`: of the layers, as in a plan.
     """
     material, covered = scene.material, samples.covered
-    attributes = settings.lighting.at_pixels(scene, groups, samples)
     f0 = _shading.fresnel_f0(material.eta)
-    to_eye = eye[:, None] - samples.positions
     points = _shading.SurfacePoints(
         positions=samples.positions.T,
         normals=_shading.unit_normals(attributes.normals.T),
-        outgoing=(to_eye / jnp.sqrt(jnp.sum(to_eye * to_eye, axis=0, keepdims=True))).T,
+        outgoing=_shading.unit_normals((eye[:, None] - samples.positions).T),
         specular=material.specular if attributes.specular is None else attributes.specular[0],
         roughness=material.roughness if attributes.roughness is None else attributes.roughness[0],
         visibility=[
@@ -100,29 +181,26 @@ def shade(
             for group, rows in zip(groups, attributes.visibility, strict=True)
         ],
     )
-    of_layers = attributes.source, gaussians, interval, settings.kernel
-    at = layers_at_points(scene, samples, attributes, *of_layers)
-    albedo = at.albedo
-    per_exitance = _shading.exit_transmission(points, f0, material.angular_law()) / jnp.pi
-    if attributes.albedo is not None:
-        per_exitance = per_exitance * _shading.albedo_root(albedo)
-    single = None
-    if attributes.single_scattering is not None:
-        single = jnp.where(covered[None], attributes.single_scattering, 0.0)
-        if attributes.albedo is not None:
-            single = single * _shading.albedo_root(albedo) ** 2
+    source = attributes.source
+    at = layers_at_points(scene, samples, attributes, source, gaussians, interval, kernel)
+    root = _shading.albedo_root(at.albedo)
+    per_exitance = root * _shading.exit_transmission(points, f0, material.angular_law()) / jnp.pi
+    per_exitance = jnp.where(covered[None], per_exitance, 0.0)
+    single = attributes.single_scattering
+    if single is not None:
+        single = jnp.where(covered[None], root**2 * single, 0.0)
     layers, resolved = at.weigh(material.gaussians, material.single_scattering_albedo())
-    layers = jnp.where(covered[None, None], per_exitance[None] * layers, 0.0)
+    layers = per_exitance[None] * layers
     specular = _shading.reflected_radiance(points, groups, f0, material.channels)
     shadow = _shadows_in_order(attributes.visibility, groups, len(scene.lights), samples.depth)
     shaded = ShadedSurface(
         depth=jnp.where(covered, samples.depth, jnp.inf),
         positions=jnp.where(covered[None], samples.positions, 0.0),
         normals=points.normals.T,
-        albedo=albedo,
+        albedo=at.albedo,
         shadow=jnp.where(covered[None], shadow, 1.0),
-        irradiance=attributes.source if attributes.irradiance is None else attributes.irradiance,
-        radiance_per_exitance=jnp.where(covered[None], per_exitance, 0.0),
+        irradiance=source if attributes.irradiance is None else attributes.irradiance,
+        radiance_per_exitance=per_exitance,
         layers=layers,
         diffuse=jnp.sum(material.gaussians.weights[:, :, None] * layers, axis=0),
         specular=jnp.where(covered[None], specular, 0.0),
@@ -179,3 +257,32 @@ def _shadows_in_order(
             for index, row in zip(group.distinct, rows, strict=True):
                 planes[index] = row
     return jnp.stack(planes) if planes else jnp.zeros((0, *depth.shape), depth.dtype)
+
+
+def map_places(function: Callable[..., Result], *given: PyTree) -> Result:
+    """Apply a pointwise function to chunks of places.
+
+    **Arguments:**
+
+    - `function`: returns arrays `[*rows, points]`, the pixels of its places in a row.
+    - `given`: arrays along the places.
+
+    **Returns:** the same arrays, `[places, *rows, pixels]`.
+    """
+
+    return map_chunks(
+        lambda *given: jax.tree.map(_by_place, function(*given)),
+        *given,
+        at_once=_splatting.TILES_AT_ONCE,
+    )
+
+
+def in_a_row(values: Shaped[Array, "places *rows pixels"]) -> Shaped[Array, "*rows points"]:
+    rows = jnp.moveaxis(values, 0, -2)
+    return rows.reshape(*rows.shape[:-2], rows.shape[-2] * rows.shape[-1])
+
+
+def _by_place(values: Shaped[Array, "*rows points"]) -> Shaped[Array, "places *rows pixels"]:
+    pixels = _splatting.TILE_SIDE**2
+    rows = values.reshape(*values.shape[:-1], values.shape[-1] // pixels, pixels)
+    return jnp.moveaxis(rows, -2, 0)
