@@ -51,7 +51,7 @@ def check_scene(scene: Scene, camera: Camera, is_lit: bool = True) -> None:
         "take fewer pixels, thin the splats, or render them by render_streamed",
         _device_memory(scene.splats),
     )
-    for message in _doubts(scene, camera, is_lit):
+    for message in _warnings(scene, camera, is_lit):
         _warn_once(message)
 
 
@@ -72,13 +72,12 @@ def _warn_once(message: str) -> None:
 
 def _device_memory(splats: Splats) -> float | None:
     """Read the free memory of an accelerator; `None` on a CPU."""
-    device = next(iter(splats.centers.devices()))
-    stats = None if device.platform == "cpu" else device.memory_stats()
+    stats = next(iter(splats.centers.devices())).memory_stats()
     return None if not stats else float(stats["bytes_limit"] - stats["bytes_in_use"])
 
 
-def _doubts(scene: Scene, camera: Camera, is_lit: bool) -> Iterator[str]:
-    """List the warnings about a scene."""
+def _warnings(scene: Scene, camera: Camera, is_lit: bool) -> Iterator[str]:
+    """List what may be unintended in a scene."""
     # A light without a field for its strength counts as one.
     strengths = [np.asarray(getattr(light, light.strength_field, 1.0)) for light in scene.lights]
     if is_lit and not any(map(np.any, strengths)):

@@ -76,15 +76,14 @@ class StreamStatistics:
         """
         # Sizes, extent and areas.
         sizes, low, high, area, count, radius = [], [], [], 0.0, 0, 0.0
-        for part in parts():
-            if part.count:
-                centers = np.asarray(part.centers)
-                sizes.append(part.count)
-                count += np.count_nonzero(np.asarray(part.areas))
-                low.append([axis.min() for axis in centers.T])  # quicker than over an axis of three
-                high.append([axis.max() for axis in centers.T])
-                area += float(np.asarray(part.areas).sum(dtype=np.float64))
-                radius = max(radius, float(part.radii.max()))
+        for part in filter(lambda part: part.count, parts()):
+            axes, areas = np.asarray(part.centers).T, np.asarray(part.areas)
+            sizes.append(part.count)
+            count += np.count_nonzero(areas)
+            low.append([axis.min() for axis in axes])  # quicker than over an axis of three
+            high.append([axis.max() for axis in axes])
+            area += float(areas.sum(dtype=np.float64))
+            radius = max(radius, float(part.radii.max()))
         if not sizes:
             raise ValueError("parts has no splats; give at least one")
         if any(size != sizes[0] for size in sizes[:-1]) or sizes[-1] > sizes[0]:
@@ -96,12 +95,11 @@ class StreamStatistics:
         middle = (np.min(low, axis=0) + np.max(high, axis=0)) / 2
         farthest, finest, uneven = 0.0, np.zeros(0), 0.0
         rank = _diffusion.FINE_QUANTILE * max(count - 1, 0)
-        for part in parts():
-            if part.count:
-                away, areas = (np.asarray(part.centers) - middle).T, np.asarray(part.areas)
-                farthest = max(farthest, float(np.max(sum(axis * axis for axis in away))))
-                finest = np.sort(np.concatenate([finest, areas[areas > 0]]))[: int(rank) + 2]
-                uneven += np.count_nonzero(areas) * float(_diffusion.unevenness(part))
+        for part in filter(lambda part: part.count, parts()):
+            away, areas = (np.asarray(part.centers) - middle).T, np.asarray(part.areas)
+            farthest = max(farthest, float(np.max(sum(axis * axis for axis in away))))
+            finest = np.sort(np.concatenate([finest, areas[areas > 0]]))[: int(rank) + 2]
+            uneven += np.count_nonzero(areas) * float(_diffusion.unevenness(part))
         return cls(
             part_size=sizes[0],
             middle=middle,

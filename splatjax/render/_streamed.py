@@ -114,9 +114,9 @@ def render_streamed(
     first = next(iter(scenes("looking")))
     check_channels(first)
     (first, camera), groups = in_one_dtype(first, camera), stack_lights(first.lights)
-    dtype = first.splats.centers.dtype
+    dtype, view = first.splats.centers.dtype, _splatting.PerspectiveView.of(camera)
     middle, reach = (jnp.asarray(of, dtype) for of in (statistics.middle, statistics.reach))
-    bounds, view = _splatting.Bounds(middle, reach), _splatting.PerspectiveView.of(camera)
+    bounds = _splatting.Bounds(middle, reach)
 
     # Pass 1: the shadow maps of each light that casts shadows, in its group.
     of_lights = [
@@ -179,8 +179,17 @@ def render_streamed(
     layers = diffusion.evaluate(sources(), first.material.channels)
 
     # Pass 5.
-    planned = diffusion.gaussians, interval
-    return _shade(first, view, groups, visible, samples, layers, *planned, settings)
+    return _shade(
+        first,
+        view,
+        groups,
+        visible,
+        samples,
+        layers,
+        diffusion.gaussians,
+        interval,
+        settings,
+    )
 
 
 def _sum_views(

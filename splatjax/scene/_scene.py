@@ -58,20 +58,19 @@ class Camera(eqx.Module):
         eye: Numbers,
         target: Numbers,
         *,
-        up: Numbers | None = None,
+        up: Numbers = (0.0, 1.0, 0.0),
         fov: float | int = 30.0,
         width: int = 512,
         height: int = 512,
         near: float | int = 1e-2,
     ) -> "Camera":
         """Place a camera at `eye` (mm) that looks at `target` (mm), with vertical field of view
-        `fov` in degrees; `up` is y unless given.
+        `fov` in degrees.
 
         **Raises:** `ValueError` when the field of view or the size of the picture is out of range,
         and, unless they are traced, for an eye, a target and an `up` on one line.
         """
         check_values("fov", fov, "between 0 and 180 degrees", lambda x: (x > 0) & (x < 180))
-        up = (0.0, 1.0, 0.0) if up is None else up
         points = as_floats([eye, target, up], name="eye, target and up")
         eye, target, up = points
         forward = target - eye

@@ -229,11 +229,11 @@ def directional_albedo(
 
     if roughness.ndim == 0:
         along_mu = (coefficients @ _roughness_basis(roughness))[:, None]
-        share = map_chunks(lambda mu: over_mu(mu, along_mu), mu.reshape(-1), at_once=_AT_ONCE)
+        albedo = map_chunks(lambda mu: over_mu(mu, along_mu), mu.reshape(-1), at_once=_AT_ONCE)
     else:
         mu, roughness = jnp.broadcast_arrays(mu, roughness)
-        share = map_chunks(mapped, mu.reshape(-1), roughness.reshape(-1), at_once=_AT_ONCE)
-    return jnp.clip(share.reshape(mu.shape), 0.0, 1.0)
+        albedo = map_chunks(mapped, mu.reshape(-1), roughness.reshape(-1), at_once=_AT_ONCE)
+    return jnp.clip(albedo.reshape(mu.shape), 0.0, 1.0)
 
 
 def average_albedo(
