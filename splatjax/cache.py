@@ -54,10 +54,10 @@ _capacities: dict[Hashable, list[int]] = {}
 def keep(folder: str | os.PathLike[str] | None = None) -> Path:
     r"""Enable the cache: store expensive results, and read them at the next start.
 
-    `splatjax.bust`, `splatjax.make_plan`, `splatjax.illuminate` and `splatjax.render`, called
-    outside `jit`, `grad` and `vmap` on one device, are then fast from the second start on. JAX's
-    own compilation cache in the same folder stores other programs, gradients among them. Call it
-    once, before any computation.
+    `splatjax.bust`, `splatjax.make_plan`, `splatjax.render` and the other functions of pictures and
+    light, called outside `jit`, `grad` and `vmap` on one device, are then fast from the second
+    start on. JAX's own compilation cache in the same folder stores other programs, gradients among
+    them. Call it once, before any computation.
 
     It sets `jax_compilation_cache_dir` if it is not set, and
     `jax_persistent_cache_min_compile_time_secs` and `jax_logging_level` unless environment

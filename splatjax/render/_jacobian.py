@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from splatjax._precision import full_precision
+from splatjax.cache import kept_jit
 from splatjax.diffusion import LayersAtPoints
 from splatjax.gaussians import SumOfGaussians
 from splatjax.scene import Camera, Frame, Scene
@@ -117,8 +117,7 @@ def picture_jacobian(
     return dataclasses.replace(jacobian, frame=own.frame(jacobian.frame))
 
 
-@full_precision
-@eqx.filter_jit
+@kept_jit
 def _picture_jacobian(
     scene: Scene, camera: Camera, settings: RenderSettings, plan: Plan
 ) -> PictureJacobian:

@@ -3,7 +3,6 @@
 import dataclasses
 from functools import partial
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh, PartitionSpec
@@ -11,7 +10,6 @@ from jaxtyping import Array, Float
 
 from splatjax._chunking import take_points
 from splatjax._combination import lay_out
-from splatjax._precision import full_precision
 from splatjax.cache import kept_jit
 from splatjax.diffusion import Sources
 from splatjax.scene import Camera, Frame, Scene
@@ -170,8 +168,7 @@ def compute_irradiance(
     return _compute_irradiance(scene, plan, settings)
 
 
-@full_precision
-@eqx.filter_jit
+@kept_jit
 def _compute_irradiance(scene: Scene, plan: Plan, settings: RenderSettings) -> Irradiance:
     _, per_device = splats_per_device(scene.splats.count, plan.mesh)
 
@@ -224,8 +221,7 @@ def diffuse_irradiance(
     return _diffuse_irradiance(scene, irradiance, camera, settings, plan)
 
 
-@full_precision
-@eqx.filter_jit
+@kept_jit
 def _diffuse_irradiance(
     scene: Scene, irradiance, camera: Camera, settings: RenderSettings, plan: Plan
 ):

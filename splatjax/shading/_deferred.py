@@ -40,9 +40,9 @@ def diffuse_transmission(
 
     **Source:** d'Eon and Luebke 2007 (GPU Gems 3, chapter 14), with `e = 1`.
     """
-    share = 1 - directional_albedo(mu, f0, roughness)
+    transmitted = 1 - directional_albedo(mu, f0, roughness)
     average = jnp.maximum(average_transmission(f0, roughness, angles), _LEAST_SHARE)
-    leaves = jnp.moveaxis(angles(mu), -1, 0) * share[None]
+    leaves = jnp.moveaxis(angles(mu), -1, 0) * transmitted[None]
     return leaves / average.reshape(*average.shape, *[1] * (leaves.ndim - average.ndim))
 
 
