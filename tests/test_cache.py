@@ -99,7 +99,10 @@ def test_every_value_and_every_shape_has_a_file_of_its_own(folder):
     assert made[2:] == 3 * ["squares"]
     total((values,)), total(jnp.arange(5.0)), total(jnp.arange(4))
     assert made[5:] == 3 * ["total"]
-    assert len(list(folder.iterdir())) == 8
+    for _ in range(2):  # numbers are part of a program
+        total((values, 2)), total((values, 3)), total((2, values))
+    assert made[8:] == 3 * ["total"]
+    assert len(list(folder.iterdir())) == 11
 
 
 CHANGED = {

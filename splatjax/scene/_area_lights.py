@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from splatjax._records import Numbers, as_floats, check_values, numbers, record
 
+from ._environment import even_directions
 from ._lights import AbstractExtendedLight, AbstractHighlight, AbstractLightSample, EmitterStratum
 from ._scene import rotation_towards
 
@@ -239,10 +240,8 @@ class SphereLight(AbstractAreaLight):
         i = np.arange(self.count) + 0.5
         s = np.sin(np.linspace(0, np.pi / 2, 1000))
         within = 2 / np.pi * (np.arcsin(s) - s * np.sqrt(1 - s * s))
-        s = np.interp(i * 2**0.5 % 1, within, s)[:, None]
-        z, angle = 1 - 2 * i / self.count, 2 * np.pi * _GOLDEN * i
-        across = np.sqrt(1 - z * z)
-        return s * np.stack([across * np.cos(angle), z, across * np.sin(angle)], axis=1)
+        s = np.interp(i * 2**0.5 % 1, within, s)
+        return s[:, None] * even_directions(self.count)
 
     nearest = DiskLight.nearest
 
