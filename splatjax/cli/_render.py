@@ -235,7 +235,8 @@ def rough_picture(scene: sj.Scene, camera: sj.Camera, exposure: float, side: int
     # From far to near, without those that face away: nearer ones are drawn over farther ones.
     order = np.argsort(-local[:, 2])
     order = order[np.sum(local * (splats.normals @ camera.rotation.T), axis=1)[order] < 0]
-    place = camera.focal_length * size[1] * local[:, :2] / local[:, 2:] + size / 2
+    middle = size * np.asarray(camera.principal_pixel) / lengths
+    place = camera.focal_length * size[1] * local[:, :2] / local[:, 2:] + middle
     column, row = np.clip(place, 0, size - 1)[order].astype(int).T
     picture = np.zeros((size[1], size[0], 3))
     picture[row, column] = color[order]

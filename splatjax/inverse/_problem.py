@@ -52,8 +52,7 @@ def make_plans(
     compiled twice.
     """
     keys = [
-        (one.camera.width, one.camera.height, jax.tree.structure(one.lights))
-        for one in pictured_scenes
+        (jax.tree.structure(one.camera), jax.tree.structure(one.lights)) for one in pictured_scenes
     ]
     plans = {}
     for key in dict.fromkeys(keys):

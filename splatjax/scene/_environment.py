@@ -172,8 +172,8 @@ class EnvironmentLight(AbstractExtendedLight):
 
     def behind(self, frame: Frame, camera: Camera) -> Float[Array, "height width channels"]:
         """Composite the `beauty` of a frame over the environment behind it, for its camera."""
-        sides = reversed(frame.coverage.shape)
-        x, y = jnp.meshgrid(*(jnp.arange(n, dtype=self.image.dtype) + 0.5 - n / 2 for n in sides))
+        sides = zip(reversed(frame.coverage.shape), camera.principal_pixel, strict=True)
+        x, y = jnp.meshgrid(*(jnp.arange(n, dtype=self.image.dtype) + 0.5 - c for n, c in sides))
         z = jnp.broadcast_to(camera.focal_length * len(x), x.shape)
         sharp = PrefilteredEnvironment(_padded(self.radiance()[None]), self.to_world())
         seen = sharp.radiance(jnp.stack([x, y, z], axis=-1) @ camera.rotation, jnp.zeros_like(z))

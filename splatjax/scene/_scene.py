@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterable
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
@@ -39,6 +39,8 @@ class Camera(eqx.Module):
     - `width`, `height`: of the picture, pixels. Static.
     - `near`: splats with a center nearer than this along the forward axis are not rendered; mm.
       Static.
+    - `principal_point`: where the forward axis meets the picture: its column over `width` and its
+      row over `height`. `None`: the middle, `[0.5, 0.5]`. Differentiable.
 
     **Raises:** `ValueError` for a picture without pixels, and for numbers that are not finite.
     """
@@ -51,6 +53,15 @@ class Camera(eqx.Module):
     width: int = eqx.field(static=True, metadata=valid("at least 1 (pixels)", lambda x: x >= 1))
     height: int = eqx.field(static=True, metadata=valid("at least 1 (pixels)", lambda x: x >= 1))
     near: float = eqx.field(static=True, default=1e-2)
+    principal_point: Float[Array, "2"] | None = eqx.field(
+        converter=numbers, default=None, metadata=valid("finite (over width and height)")
+    )
+
+    @property
+    def principal_pixel(self) -> tuple[Any, Any]:
+        """Return column and row, in pixels, where the forward axis meets the picture."""
+        x, y = (0.5, 0.5) if self.principal_point is None else self.principal_point
+        return x * self.width, y * self.height
 
     @classmethod
     def look_at(

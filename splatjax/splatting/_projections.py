@@ -20,12 +20,15 @@ from ._views import (
 
 
 class PerspectiveView(AbstractView):
-    """The view of a pinhole camera; `focal_length` is in pixels."""
+    """The view of a pinhole camera; `focal_length` is in pixels, and so is `principal_pixel`, where
+    the forward axis meets the picture; `None` for the middle.
+    """
 
     focal_length: Float[Array, ""]
     width: int = eqx.field(static=True)
     height: int = eqx.field(static=True)
     near: float = eqx.field(static=True)
+    principal_pixel: tuple[Float[Array, ""], Float[Array, ""]] | None = None
 
     @classmethod
     def of(cls, camera: Camera) -> "PerspectiveView":
@@ -36,7 +39,12 @@ class PerspectiveView(AbstractView):
             width=camera.width,
             height=camera.height,
             near=camera.near,
+            principal_pixel=None if camera.principal_point is None else camera.principal_pixel,
         )
+
+    @property
+    def axis_pixel(self):
+        return super().axis_pixel if self.principal_pixel is None else self.principal_pixel
 
     def footprints(self, splats: Splats, settings: SplattingSettings) -> Footprints:
         px, py, pz = rotate(self.rotation, (splats.centers - self.position[None]).T)
@@ -84,7 +92,8 @@ class PerspectiveView(AbstractView):
         kappa = stop_gradient(1 - (gx * s_gx + gy * s_gy))
         bounded = kappa > 1e-3
         kappa = jnp.where(bounded, kappa, 1.0)
-        x, y = self.width / 2 + self.focal_length * u, self.height / 2 + self.focal_length * v
+        middle_x, middle_y = self.axis_pixel
+        x, y = middle_x + self.focal_length * u, middle_y + self.focal_length * v
         mid_x, mid_y = stop_gradient(s_gx / kappa), stop_gradient(s_gy / kappa)
         squared_x, squared_y = (xx + s_gx * mid_x) / kappa, (yy + s_gy * mid_y) / kappa
         half_x = stop_gradient(jnp.sqrt(jnp.where(bounded, squared_x, jnp.inf)))
@@ -121,13 +130,19 @@ class PerspectiveView(AbstractView):
         to the side.
         """
 
-        def beside(offset, size):
-            half = 0.5 * size + MARGIN
+        def beside(offset, size, middle):
+            half = MARGIN + (
+                0.5 * size
+                if self.principal_pixel is None
+                else jnp.where(offset > 0, size - middle, middle)
+            )
             return jnp.abs(offset) * self.focal_length - z * half < radii * jnp.sqrt(
                 self.focal_length**2 + half**2
             )
 
-        return (z > self.near) & beside(x, self.width) & beside(y, self.height)
+        middle_x, middle_y = self.axis_pixel
+        beside_x, beside_y = beside(x, self.width, middle_x), beside(y, self.height, middle_y)
+        return (z > self.near) & beside_x & beside_y
 
     @staticmethod
     def inside(nearness, quadric):
@@ -152,15 +167,19 @@ class PerspectiveView(AbstractView):
 
     def depth_slope(self, x, y, depth, normals):
         nx, ny, nz = jnp.tensordot(self.rotation, normals, 1)
-        u, v = (x - self.width / 2) / self.focal_length, (y - self.height / 2) / self.focal_length
+        u, v = self._slopes(x, y)
         mm = self.pixel_size(depth)
         return nx * mm, ny * mm, -(nz + nx * u + ny * v)
+
+    def _slopes(self, x, y):
+        middle_x, middle_y = self.axis_pixel
+        return (x - middle_x) / self.focal_length, (y - middle_y) / self.focal_length
 
     def pixel_size(self, depth):
         return jnp.where(depth > self.near, depth, 1.0) / self.focal_length
 
     def unproject(self, x, y, depth):
-        u, v = (x - self.width / 2) / self.focal_length, (y - self.height / 2) / self.focal_length
+        u, v = self._slopes(x, y)
         along = jnp.stack([u * depth, v * depth, depth])
         return jnp.tensordot(self.rotation.T, along, 1) + self.position.reshape(
             3, *[1] * depth.ndim

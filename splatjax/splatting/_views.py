@@ -9,6 +9,7 @@ so that the surface in front has the largest nearness and no fragment needs a sq
 """
 
 import abc
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -176,12 +177,17 @@ class AbstractView(eqx.Module):
     def depth(nearness: Float[Array, "..."]) -> Float[Array, "..."]:
         """Compute the depth (mm along the forward axis) of a nearness."""
 
+    @property
+    def axis_pixel(self) -> tuple[Any, Any]:
+        """Return column and row of the forward axis in the picture."""
+        return self.width / 2, self.height / 2
+
     def project(self, points: Float[Array, "3 *points"]) -> tuple[Float[Array, "*points"], ...]:
         """Compute column, row (pixels) and depth (mm) of points."""
         offset = points - self.position.reshape(3, *[1] * (points.ndim - 1))
         x, y, depth = jnp.tensordot(self.rotation, offset, 1)
-        mm = self.pixel_size(depth)
-        return self.width / 2 + x / mm, self.height / 2 + y / mm, depth
+        mm, (middle_x, middle_y) = self.pixel_size(depth), self.axis_pixel
+        return middle_x + x / mm, middle_y + y / mm, depth
 
     @abc.abstractmethod
     def depth_slope(

@@ -111,6 +111,7 @@ EVENLY = {
     "sigma_s_prime": (1e-3, 2),
     "strength": (0, 1),
     "focal_length": (0.3, 3.3),
+    "principal_point": (0, 1),
 }
 IN_ORDERS = {
     "radii": (1e-3, 30),
@@ -232,6 +233,7 @@ def typical(shape: Shape) -> World:
     single = sj.SingleScattering(medium, ones(channels)) if shape.single else None
     material = sj.Material(gaussians, single_scattering=single)
     camera = sj.Camera.look_at(20 * ones(3), 0 * ones(3), width=shape.width, height=shape.height)
+    camera = dataclasses.replace(camera, principal_point=0.5 * ones(2))
     return World(sj.Scene(splats, tuple(map(light, shape.lights)), material), camera)
 
 

@@ -138,10 +138,11 @@ def test_a_turned_map_is_a_body_turned_back(up):
 def test_the_camera_sees_the_map_behind_a_body():
     """`1 + a . d` along the ray of every pixel, where the body does not cover it."""
     camera = sj.Camera.look_at([5, 40, 30], [0, 0, 0], fov=100, width=24, height=16)
+    camera = dataclasses.replace(camera, principal_point=[0.625, 0.375])
     light = sj.EnvironmentLight(harmonics(128), 50.0, cast_shadows=False)
     frame = render(light, sphere(1500), camera=camera)
     pixels = np.mgrid[:16, :24][::-1].reshape(2, -1).T + 0.5
-    rays = np.column_stack([(pixels - [12, 8]) / 16, np.full(384, float(camera.focal_length))])
+    rays = np.column_stack([(pixels - [15, 6]) / 16, np.full(384, float(camera.focal_length))])
     x, y, z = unit(rays @ np.asarray(camera.rotation, float)).T
     sine, cosine = np.sin(np.radians(50)), np.cos(np.radians(50))
     turned = cosine * x - sine * z, y, sine * x + cosine * z

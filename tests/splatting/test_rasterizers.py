@@ -130,21 +130,29 @@ def test_in_float32_too(perspective):
     compare(24, perspective, off, (VALUE32, GRADIENT32))
 
 
-def test_a_picture_is_the_middle_of_a_larger_one(float64):
-    """Which splats are left out for lying beside the picture is common to both rasterizers."""
+def test_a_picture_is_a_part_of_a_larger_one(float64):
+    """Its middle, or beside it with an off-center principal point. Which splats are left out for
+    lying beside the picture is common to both rasterizers.
+    """
     border, plan = 20, DenseRasterizer().make_plan([], [], SETTINGS)
+    right, down = 13, -17
 
     @jax.jit
     def weights(body, view):
         larger = dataclasses.replace(view, width=WIDTH + 2 * border, height=HEIGHT + 2 * border)
+        middle = jnp.asarray(WIDTH / 2 - right), jnp.asarray(HEIGHT / 2 - down)
+        beside = dataclasses.replace(view, principal_pixel=middle)
         nothing = jnp.zeros((0, body.count))
-        both = (bodies.drawn(body, nothing, each, SETTINGS, plan) for each in (view, larger))
-        return [(each.front.weight_sum, each.behind.weight_sum) for each in both]
+        views = view, beside, larger
+        drawn = (bodies.drawn(body, nothing, each, SETTINGS, plan) for each in views)
+        return [(each.front.weight_sum, each.behind.weight_sum) for each in drawn]
 
     for seed in seeds(IN_SUITE):
-        small, large = weights(*random_body(seed, 24, True, WIDTH, HEIGHT))
-        for ours, theirs in zip(small, large, strict=True):
+        small, beside, large = weights(*random_body(seed, 24, True, WIDTH, HEIGHT))
+        for ours, other, theirs in zip(small, beside, large, strict=True):
             assert disagreement(ours, theirs[border:-border, border:-border]) < VALUE, seed
+            rows, columns = (slice(border + s, s - border) for s in (down, right))
+            assert disagreement(other, theirs[rows, columns]) < VALUE, seed
 
 
 @pytest.mark.once
