@@ -37,6 +37,8 @@ from ._tables import (
     read_profile as read_profile,
     write_columns as write_columns,
 )
+from ._cameras import load_cameras as load_cameras
+from ._gltf import load_lights as load_lights
 from ._meshes import read_textured_mesh as read_textured_mesh, sample_mesh as sample_mesh
 from ._lights import (
     load_environment as load_environment,
