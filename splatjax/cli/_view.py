@@ -73,6 +73,8 @@ class ViewOptions:
     #: Background of the PNG: black, transparent, or the environment. The EXR has coverage and no
     #: background.
     background: Literal["black", "transparent", "environment"] = "black"
+    #: Write the EXR in half precision, except for depth and position.
+    half: bool = False
     #: Exposure of the PNG, in stops: each doubles its brightness. The EXR does not depend on it.
     exposure: float = 0.0
     #: Let light spread below the surface. Without scattering it leaves where it enters.
@@ -254,7 +256,8 @@ class ViewOptions:
         picture, shown = path.with_suffix(".png"), np.asarray(frame.beauty)
         solved = self.diffusion == "shape"  # whose one layer is of no Gaussian
         variances = None if solved else material.gaussians.variances.tolist()
-        sj.write_exr(path, frame, variances=variances, manifest=self.manifest())
+        record = {"variances": variances, "manifest": self.manifest()}
+        sj.write_exr(path, frame, **record, camera=camera, half=self.half)
         if self.background == "environment" and isinstance(lights[0], sj.EnvironmentLight):
             shown = np.asarray(lights[0].behind(frame, camera))
         elif self.background == "transparent":

@@ -8,14 +8,16 @@ from ._files import (
     save_exports as save_exports,
     write_record as write_record,
 )
-from ._images import (
-    linear_to_srgb as linear_to_srgb,
+from ._frames import (
     read_exr as read_exr,
     read_manifest as read_manifest,
+    write_exr as write_exr,
+)
+from ._images import (
+    linear_to_srgb as linear_to_srgb,
     read_picture as read_picture,
     srgb_to_linear as srgb_to_linear,
     write_animation as write_animation,
-    write_exr as write_exr,
     write_png as write_png,
 )
 from ._materials import (

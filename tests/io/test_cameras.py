@@ -3,11 +3,16 @@
 """
 
 import json
+import shutil
+from functools import partial
 from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from bodies import unit
+from scipy.spatial.transform import Rotation
+from test_refusals import refused, write_any
 
 import splatjax as sj
 from splatjax.io import load_cameras, load_lights
@@ -36,8 +41,7 @@ def pixels(camera, points, mm=MM):
     return np.stack([x, y], axis=-1)
 
 
-def with_z_up(vectors):
-    return np.asarray(vectors)[..., [0, 2, 1]] * [1, -1, 1]
+in_mm = partial(load_cameras, mm_per_unit=1.0)
 
 
 @pytest.fixture
@@ -45,77 +49,64 @@ def transforms(tmp_path):
     """The first image of COLMAP as colmap2nerf.py of instant-ngp writes it: camera to world, with
     the columns of down and forward reversed.
     """
-    cameras = load_cameras(FILES / "colmap", mm_per_unit=1.0)
+    camera = load_cameras(FILES / "colmap", mm_per_unit=1.0)["left 1.png"]
     pose = np.eye(4)
-    pose[:3, :3] = np.asarray(cameras["left 1.png"].rotation, float).T * [1, -1, -1]
-    pose[:3, 3] = cameras["left 1.png"].position
+    pose[:3] = np.column_stack([np.asarray(camera.rotation).T * [1, -1, -1], camera.position])
     content = {"w": 640, "h": 480.0, "fl_x": 600.5, "fl_y": 600.5, "cx": 310.25, "cy": 251.5}
-    content |= {"k1": 0.0, "p2": 0, "is_fisheye": False, "camera_angle_x": 9.0, "aabb_scale": 4}
+    content |= {"k1": 0.0, "p2": 0, "is_fisheye": False, "aabb_scale": 4}
     content["frames"] = [{"file_path": "left 1.png", "transform_matrix": pose.tolist()}]
-    path = tmp_path / "transforms.json"
-    path.write_text(json.dumps(content))
-    return path, content
+
+    def write(removed="", **changes):
+        text = json.dumps(
+            {n: v for n, v in (content | changes).items() if n not in removed.split()}
+        )
+        return write_any(tmp_path / "transforms.json", text)
+
+    return write
 
 
 @pytest.mark.parametrize("suffix", ["txt", "bin"])
 def test_cameras_of_colmap_show_what_colmap_shows(double, tmp_path, suffix):
-    for name in ("cameras", "images"):
-        data = (FILES / "colmap" / f"{name}.{suffix}").read_bytes()
-        (tmp_path / f"{name}.{suffix}").write_bytes(data)
+    for path in FILES.glob(f"colmap/*.{suffix}"):
+        shutil.copy(path, tmp_path)
     cameras = load_cameras(tmp_path, mm_per_unit=MM)
     assert list(cameras) == list(COLMAP)
     for name, expected in COLMAP.items():
         np.testing.assert_allclose(pixels(cameras[name], POINTS), expected, atol=PIXELS)
     tall = cameras["tall.png"]
     assert (tall.width, tall.height, tall.principal_point) == (100, 200, None)
-    turned = load_cameras(tmp_path / f"images.{suffix}", mm_per_unit=MM, up="z")["left 1.png"]
+    turned = load_cameras(tmp_path, mm_per_unit=MM, up="z")["left 1.png"]
     upright = POINTS[:, [0, 2, 1]] * [1, 1, -1]
     np.testing.assert_allclose(pixels(turned, upright), COLMAP["left 1.png"], atol=PIXELS)
 
 
 def test_cameras_of_nerf_have_the_axes_of_opengl(double, transforms):
-    path, content = transforms
-    camera = load_cameras(path, mm_per_unit=MM)["left 1.png"]
+    camera = load_cameras(transforms(), mm_per_unit=MM)["left 1.png"]
     np.testing.assert_allclose(pixels(camera, POINTS), COLMAP["left 1.png"], atol=PIXELS)
-    for name in ("fl_x", "fl_y", "cx", "cy", "w", "h"):
-        del content[name]
-    content["camera_angle_x"] = 2 * np.arctan(320 / 600.5)
-    path.write_text(json.dumps(content))
-    sj.write_png(path.with_name("left 1.png"), np.zeros((480, 640, 1)))
-    camera = load_cameras(path, mm_per_unit=MM)["left 1.png"]
+    half = transforms("fl_x fl_y cx cy", camera_angle_x=2 * np.arctan(320 / 600.5))
+    camera = load_cameras(half, mm_per_unit=MM)["left 1.png"]
     expected = np.asarray(COLMAP["left 1.png"]) - [310.25 - 320, 251.5 - 240]
     np.testing.assert_allclose(pixels(camera, POINTS), expected, atol=PIXELS)
 
 
 @pytest.mark.parametrize("suffix", ["gltf", "glb"])
 def test_cameras_of_gltf_have_its_projection(double, suffix):
-    """Against the infinite projection matrix of the specification, with the node's matrices
-    multiplied out.
-    """
+    """Against the projection matrix of the specification, with the matrices of the nodes."""
     with pytest.warns(UserWarning, match="'plan' is orthographic"):
         cameras = load_cameras(FILES / f"stage.{suffix}", mm_per_unit=MM)
-    assert list(cameras) == ["left", "right"]
-    root = 0.5**0.5
-    rig = np.asarray([[root, 0, root], [0, 1, 0], [-root, 0, root]])
-    w, x, y, z = np.asarray([4, 1, 2, 3]) / 30**0.5
-    left = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
-    right = [[0, 0, 1], [0, 1, 0], [-1, 0, 0]]
-    places = {"left": ([0.5, 0.0, 2.0], left, 0.7, 1.5), "right": ([1.5, 0.25, 0.5], right, 0.9, 1)}
-    for name, (offset, axes, yfov, aspect) in places.items():
-        eye = [0.1, 0.2, -0.3] + rig @ (2 * np.asarray(offset))
-        points = eye + [[0.3, -0.2, -3.0], [-0.4, 0.1, -2.0]] @ (rig @ np.asarray(axes)).T
-        depth = np.asarray([3.0, 2.0])
-        clip = np.asarray([[0.3, -0.2], [-0.4, 0.1]]) / [
-            aspect * np.tan(yfov / 2),
-            np.tan(yfov / 2),
-        ]
-        size = np.asarray([round(512 * aspect), 512])
-        expected = (clip / depth[:, None] * [1, -1] + 1) / 2 * size
-        np.testing.assert_allclose(pixels(cameras[name], points), expected, atol=PIXELS)
+    rig = Rotation.from_rotvec([0, np.pi / 4, 0])
+    left, right = Rotation.from_quat([1, 2, 3, 4]), Rotation.from_rotvec([0, np.pi / 2, 0])
+    lenses = {"left": ([0.5, 0, 2], left, 0.7, 1.5), "right": ([1.5, 0.25, 0.5], right, 0.9, 1)}
+    for (name, camera), (place, turn, yfov, aspect) in zip(
+        cameras.items(), lenses.values(), strict=True
+    ):
+        near = np.asarray([[0.3, -0.2, -3.0], [-0.4, 0.1, -2.0]])
+        world = np.asarray([0.1, 0.2, -0.3]) + rig.apply(2 * np.asarray(place) + turn.apply(near))
+        tangents = np.tan(yfov / 2) * np.asarray([aspect, 1])
+        device = near[:, :2] / tangents / -near[:, 2:]
+        size = np.asarray([512 * aspect, 512])
+        expected = (device * [1, -1] + 1) / 2 * size
+        np.testing.assert_allclose(pixels(camera, world), expected, atol=PIXELS, err_msg=name)
 
 
 def test_lights_of_gltf_keep_what_a_surface_receives(double):
@@ -123,62 +114,54 @@ def test_lights_of_gltf_keep_what_a_surface_receives(double):
     with pytest.warns(UserWarning, match="'beamer' is a spot"):
         sun, bulb, spot = load_lights(FILES / "stage.gltf", mm_per_unit=MM, lux=0.5)
     np.testing.assert_allclose(sun.irradiance, [1.5, 0.75, 0.375])
-    root = 0.5**0.5
-    np.testing.assert_allclose(sun.direction / jnp.linalg.norm(sun.direction), [0, 1, 0], atol=1e-9)
-    place = np.asarray([0.1, 0.2, -0.3]) + 2 * np.asarray([4 * root, 2, 2 * root])
+    np.testing.assert_allclose(unit(sun.direction), [0, 1, 0], atol=1e-9)
+    place = np.asarray([0.1, 0.2, -0.3]) + Rotation.from_rotvec([0, np.pi / 4, 0]).apply([2, 4, 6])
     np.testing.assert_allclose(bulb.position, MM * place)
-    wi, received = bulb.incidence(bulb.position + jnp.asarray([0, -MM, 0]))
+    _, received = bulb.incidence(bulb.position + jnp.asarray([0, -MM, 0]))
     np.testing.assert_allclose(received, [10, 9, 8])
-    np.testing.assert_allclose(wi, [0, 1, 0])
     assert isinstance(spot, sj.PointLight)
 
 
-CHANGES = [
-    ({"k1": 0.1}, "k1 = 0.1"),
-    ({"is_fisheye": True}, "is_fisheye"),
-    ({"camera_model": "OPENCV_FISHEYE"}, "OPENCV_FISHEYE"),
-    ({"fl_y": 590.0}, "fl_y is 590"),
-    ({"fl_x": -1.0, "fl_y": -1.0}, "focal_length"),
-    ({"fl_x": None}, "transforms.json"),
-    ({"w": None}, "transforms.json"),
-    ({"frames": []}, "no perspective camera"),
-    ({"frames": [{"transform_matrix": np.diag([1.0, 2, 1, 1]).tolist()}]}, "sheared"),
-    ({"frames": [{"transform_matrix": np.diag([1.0, -1, 1, 1]).tolist()}]}, "mirrored"),
-    ({"frames": [{"transform_matrix": [[1, 2]]}]}, "transforms.json"),
-]
+FOV = "1 FOV 640 480 600.5 310.25 251.5 0.9\n7 PINHOLE 100 200 150 150 50 100\n"
+STRETCHED, MIRRORED = ([{"transform_matrix": np.diag([1.0, n, 1, 1]).tolist()}] for n in (2, -1))
 
 
-@pytest.mark.parametrize(("changes", "value"), CHANGES)
+@pytest.mark.parametrize(
+    ("changes", "value"),
+    [
+        ({"k1": 0.1}, "k1 = 0.1"),
+        ({"is_fisheye": True}, "is_fisheye"),
+        ({"camera_model": "OPENCV_FISHEYE"}, "OPENCV_FISHEYE"),
+        ({"fl_y": 590.0}, "fl_y is 590"),
+        ({"fl_x": -1.0, "fl_y": -1.0}, "focal_length"),
+        ({"fl_x": None}, "transforms.json"),
+        ({"removed": "w h"}, "add w, h"),
+        ({"frames": []}, "no perspective camera"),
+        ({"frames": STRETCHED}, "sheared"),
+        ({"frames": MIRRORED}, "mirrored"),
+        ({"frames": [{"transform_matrix": [[1, 2]]}]}, "transforms.json"),
+    ],
+)
 def test_cameras_that_cannot_be_ours(transforms, changes, value):
-    path, content = transforms
-    path.write_text(json.dumps(content | changes))
-    with pytest.raises(ValueError, match=value) as caught:
-        load_cameras(path, mm_per_unit=1.0)
-    assert str(path) in str(caught.value)
+    refused(transforms(**changes), value, read=in_mm)
 
 
-def test_files_without_cameras_name_the_remedy(tmp_path, transforms):
-    path, content = transforms
-    path.write_text(json.dumps({name: content[name] for name in content if name not in "wh"}))
-    with pytest.raises(ValueError, match="add w and h"):
-        load_cameras(path, mm_per_unit=1.0)
-    with pytest.raises(FileNotFoundError, match=r"cameras\.bin"):
-        load_cameras(tmp_path, mm_per_unit=1.0)
-    text = (FILES / "colmap" / "cameras.txt").read_text().replace("SIMPLE_PINHOLE", "FOV")
-    (tmp_path / "cameras.txt").write_text(text)
-    (tmp_path / "images.txt").write_text((FILES / "colmap" / "images.txt").read_text())
-    with pytest.raises(ValueError, match=r"FOV.*undistort"):
-        load_cameras(tmp_path, mm_per_unit=1.0)
-    with pytest.raises(ValueError, match="not a file of cameras"):
-        load_cameras(tmp_path / "cameras.txt", mm_per_unit=1.0)
-    (tmp_path / "empty.gltf").write_text("{}")
-    for read in (load_cameras, load_lights):
-        with pytest.raises(ValueError, match=r"empty\.gltf: has no .*export"):
-            read(tmp_path / "empty.gltf", mm_per_unit=1.0)
-        with pytest.raises(ValueError, match="mm_per_unit is 0"):
-            read(tmp_path / "empty.gltf", mm_per_unit=0.0)
-    (tmp_path / "circle.gltf").write_text(
-        '{"nodes": [{"children": [0]}], "scenes": [{"nodes": [0]}]}'
-    )
-    with pytest.raises(ValueError, match=r"circle\.gltf.*child"):
-        load_cameras(tmp_path / "circle.gltf", mm_per_unit=1.0)
+@pytest.mark.parametrize(
+    ("name", "text", "value"),
+    [
+        ("cameras.txt", FOV, "not a file of cameras"),
+        ("none.json", None, "no such file"),
+        ("circle.gltf", '{"nodes": [{"children": [0]}], "scenes": [{"nodes": [0]}]}', "Recursion"),
+        ("empty.gltf", '{"scenes": [{}]}', "export it with its cameras"),
+    ],
+)
+def test_files_without_cameras(tmp_path, name, text, value):
+    path = tmp_path / name
+    if text:
+        write_any(path, text)
+    refused(path, value, in_mm, (ValueError, OSError))
+
+
+def test_a_lens_of_colmap_with_distortion(tmp_path):
+    shutil.copy(FILES / "colmap" / "images.txt", tmp_path)
+    refused(write_any(tmp_path / "cameras.txt", FOV), "FOV", lambda path: in_mm(path.parent))

@@ -2,8 +2,13 @@
 where the texture coordinates of each format say.
 """
 
+import dataclasses
+import re
+from collections import Counter
+
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 import OpenEXR
 import OpenImageIO as oiio
@@ -13,8 +18,10 @@ from pictures import write_picture
 from PIL import Image
 from writers import SQUARE, TRIANGLES, UVS, ramp, some_frame, square, write_ply, xyz
 
+import splatjax as sj
 from splatjax.io import (
     linear_to_srgb,
+    load_cameras,
     read_exr,
     read_manifest,
     read_picture,
@@ -25,6 +32,7 @@ from splatjax.io import (
     write_png,
 )
 from splatjax.io._images import read_color, read_map
+from splatjax.splatting import PerspectiveView
 
 
 @pytest.mark.parametrize(("channels", "lights", "gaussians"), [(3, 2, 11), (1, 0, 1), (12, 1, 3)])
@@ -43,14 +51,66 @@ def test_other_readers_rebuild_diffuse_from_layers_and_header_alone(tmp_path):
         header = dict(file.header())
         planes = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
     weights = [header[f"splatjax.weights.{k}"] for k in (1, 2, 3, 4)]
-    rebuilt = sum(weights[k - 1] * planes[f"diffusion.{k}"] for k in (1, 2, 3, 4))
+    rebuilt = sum(weights[k - 1] * planes[f"diffusion{k}"] for k in (1, 2, 3, 4))
     np.testing.assert_allclose(rebuilt, planes["diffuse"], rtol=1e-6)
     np.testing.assert_allclose(header["splatjax.variances"], variances, rtol=1e-7)
     np.testing.assert_allclose(np.ravel(header["chromaticities"])[:2], [0.64, 0.33], rtol=1e-6)
     assert all(plane.dtype == np.float32 for plane in planes.values())
     assert read_manifest(path) == manifest
     names = oiio.ImageInput.open(str(path)).spec().channelnames
-    assert {"R", "A", "Z", "position.X", "albedo.R", "shadow.2", "diffusion.4.G"} <= {*names}
+    assert {"R", "A", "Z", "position.X", "albedo.R", "shadow2.Y", "diffusion4.G"} <= {*names}
+
+
+def test_every_channel_has_a_name_that_other_programs_parse(tmp_path):
+    """Nuke and Blender read `layer.channel`, and Blender only the channels R, G, B, A, X, Y, Z."""
+    write_exr(tmp_path / "frame.exr", some_frame())
+    names = oiio.ImageInput.open(str(tmp_path / "frame.exr")).spec().channelnames
+    assert all(re.fullmatch(r"(\w+\.)?[RGBAXYZ]", name) for name in names)
+    layers = Counter(name.rpartition(".")[0] for name in names)
+    assert layers["diffusion4"] == layers["diffuse"] == 3
+    assert layers["shadow1"] == layers["shadow2"] == 1
+
+
+def test_half_precision_but_for_lengths(tmp_path):
+    frame = some_frame()
+    frame = eqx.tree_at(lambda frame: frame.specular, frame, 1e6 * frame.specular)
+    write_exr(tmp_path / "half.exr", frame, half=True)
+    with OpenEXR.File(str(tmp_path / "half.exr")) as file:
+        kinds = {name: channel.pixels.dtype for name, channel in file.channels().items()}
+    single = {name.partition(".")[0] for name, kind in kinds.items() if kind != np.float16}
+    assert single == {"Z", "position"}
+    again = read_exr(tmp_path / "half.exr")
+    np.testing.assert_allclose(again.diffuse, frame.diffuse, rtol=2**-11)
+    np.testing.assert_array_equal(again.position, frame.position)
+    assert float(again.specular.max()) == 65504
+    assert not np.isnan(again.beauty).any()
+
+
+def test_the_camera_of_a_picture_comes_back_from_its_matrices(tmp_path, double):
+    """Matrices of row vectors, as OpenEXR and RenderMan define them: camera coordinates are right,
+    up and forward, and the corners of the picture are (0, 0) and (1, 1).
+    """
+    camera = sj.Camera.look_at([30.0, 40, 200], [1, -2, 3], fov=35, width=50, height=60)
+    camera = dataclasses.replace(camera, principal_point=[0.4, 0.55])
+    path = tmp_path / "frame.exr"
+    write_exr(path, some_frame(height=60, width=50), camera=camera)
+    with OpenEXR.File(str(path)) as file:
+        header = dict(file.header())
+    point = np.asarray([5.0, 7.0, -3.0])
+    column, row, depth = (float(n) for n in PerspectiveView.of(camera).project(jnp.asarray(point)))
+    x, y, z, w = np.append(point, 1) @ np.asarray(header["worldToCamera"], float)
+    focal = 60 * float(camera.focal_length)
+    np.testing.assert_allclose([z, w], [depth, 1], rtol=1e-5)
+    np.testing.assert_allclose([20 + focal * x / z, 33 - focal * y / z], [column, row], atol=1e-3)
+    x, y, z, w = np.append(point, 1) @ np.asarray(header["worldToNDC"], float)
+    np.testing.assert_allclose([50 * x / w, 60 * y / w], [column, row], atol=1e-3)
+    assert 0 < z / w < 1
+    (again,) = load_cameras(path, mm_per_unit=1.0).values()
+    for name, value in vars(camera).items():
+        np.testing.assert_allclose(getattr(again, name), value, rtol=1e-5, atol=1e-6, err_msg=name)
+    write_exr(path, some_frame())
+    with pytest.raises(ValueError, match=r"frame\.exr: has no worldToCamera"):
+        load_cameras(path, mm_per_unit=1.0)
 
 
 ENCODED = {
