@@ -14,6 +14,7 @@ from splatjax.geometry import complete_splats, unit
 from splatjax.scene import Splats
 
 from ._files import StrPath, atomic_path, check_units, existing_file, naming, with_y_up
+from ._gaussian_scenes import GAUSSIAN_COLUMNS, surface_columns
 from ._images import srgb_to_linear
 from ._trimesh import FORMATS, load_with_trimesh, one_sentence
 
@@ -55,7 +56,9 @@ _VALID = {
 }
 
 
-def read_splats(path: StrPath, *, mm_per_unit: float = 1.0, up: str = "y") -> Splats:
+def read_splats(
+    path: StrPath, *, mm_per_unit: float = 1.0, up: str = "y", opacity: float = 0.5
+) -> Splats:
     r"""Read splats from the vertices of a PLY file: ASCII or binary of either byte order,
     properties in any order.
 
@@ -71,16 +74,20 @@ def read_splats(path: StrPath, *, mm_per_unit: float = 1.0, up: str = "y") -> Sp
 
     Other properties and elements are ignored; faces without radii cause a warning.
 
+    The ellipsoids of a Gaussian-splatting scene (`f_dc_0`, `scale_0`, `rot_0`, ...) become discs:
+    the flattest axis is the normal, and the two others give the radius. A warning reports that
+    their colors contain the light of the scene.
+
     **Arguments:**
 
     - `mm_per_unit`: length of the file's unit, mm.
     - `up`: the file's upward axis, `"y"` or `"z"`; splats have +y up.
+    - `opacity`: ellipsoids below it are left out.
 
     **Returns:** splats in mm, in JAX's default precision and in Morton order.
 
     **Raises:** `FileNotFoundError`, or `ValueError` if the file is not PLY, is truncated, has no
-    points, has values that are not finite or radii or areas that are not positive, or is a
-    Gaussian-splatting scene.
+    points, or has values that are not finite or radii or areas that are not positive.
     """
     path = existing_file(path)
     check_units(path, mm_per_unit, up)
@@ -88,7 +95,10 @@ def read_splats(path: StrPath, *, mm_per_unit: float = 1.0, up: str = "y") -> Sp
         raise ValueError(f"{path}: is a mesh; {_COVER.format(path)}")
     with one_sentence(path):
         columns = load_with_trimesh(path, "ply")["columns"]
-        fields = _splat_fields(path, columns.get("vertex", {}), mm_per_unit, up)
+        vertices = columns.get("vertex", {})
+        if vertices.keys() >= GAUSSIAN_COLUMNS:
+            vertices = surface_columns(path, vertices, opacity)
+        fields = _splat_fields(path, vertices, mm_per_unit, up)
     centers = fields.pop("centers")
     _check_places(path, centers, estimated=fields["radii"] is None or fields["areas"] is None)
     if fields["radii"] is None and columns.get("face"):
@@ -222,9 +232,9 @@ def _splat_fields(
     """
     if columns.keys() >= _GAUSSIAN_SPLATTING:
         raise ValueError(
-            f"{path}: is a Gaussian-splatting scene (f_dc, scale, rot, opacity): its "
-            "ellipsoids have baked radiance and no surface; give a PLY of surface points (x y "
-            "z, and nx ny nz, radius, red green blue where known)"
+            f"{path}: is a Gaussian-splatting scene, and lacks some of f_dc_0 to f_dc_2, scale_0 "
+            "to scale_2, rot_0 to rot_3 and opacity, or is read in parts; give all of them to "
+            "read_splats"
         )
     single = {
         name: column

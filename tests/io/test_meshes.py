@@ -5,6 +5,8 @@ time.
 
 import dataclasses
 import functools
+import shutil
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -275,3 +277,20 @@ def test_raw_points_are_completed_and_faces_without_radii_are_told(tmp_path):
     assert (np.asarray(splats.normals) * outward).sum(axis=1).min() > 0.99
     np.testing.assert_allclose(np.asarray(splats.areas).sum(), 4 * np.pi * 400, rtol=0.01)
     assert (np.asarray(splats.radii) > np.sqrt(np.asarray(splats.areas))).all()
+
+
+def test_ellipsoids_of_a_gaussian_splatting_scene_become_discs(tmp_path):
+    """A ball of radius 2, written by gsply 0.4.6: any local axis is the flattest and points either
+    way, quaternions are not of unit length, and every tenth ellipsoid is faint.
+    """
+    path = shutil.copy(Path(__file__).with_name("gaussians.ply"), tmp_path)
+    with pytest.warns(UserWarning, match="12 of 120 Gaussians are below an opacity of 0.5"):
+        ball = sj.read_splats(path, mm_per_unit=10.0)
+    np.testing.assert_allclose(ball.normals, unit(ball.centers), atol=1e-5)
+    np.testing.assert_allclose(ball.radii, 20 * np.sqrt(0.2 * 0.3), rtol=1e-5)
+    np.testing.assert_allclose(ball.albedo, np.tile([0.21404, 0.05088, 1], (108, 1)), atol=1e-5)
+    np.testing.assert_allclose(ball.areas.sum(), 4 * np.pi * 20**2, rtol=0.1)
+    with pytest.warns(UserWarning, match="0 of 120"):
+        assert sj.read_splats(path, opacity=0.1).count == 120
+    with pytest.raises(ValueError, match=r"no Gaussian has an opacity of 0\.9"):
+        sj.read_splats(path, opacity=0.9)

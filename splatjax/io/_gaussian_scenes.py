@@ -1,0 +1,54 @@
+"""Surfaces of Gaussian-splatting scenes, whose ellipsoids become discs."""
+
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from splatjax.geometry import estimate_normals
+
+from ._images import srgb_to_linear
+
+_PLACES, _COLORS = ("x", "y", "z"), ("f_dc_0", "f_dc_1", "f_dc_2")
+_SCALES = ("scale_0", "scale_1", "scale_2")
+_TURNS = ("rot_1", "rot_2", "rot_3", "rot_0")  # the real part last
+GAUSSIAN_COLUMNS = {*_PLACES, *_COLORS, *_SCALES, *_TURNS, "opacity"}
+_HARMONIC = 0.5 / np.pi**0.5  # of degree 0
+_RADIUS = 2.0  # standard deviations: a disc of this radius has the variance of the Gaussian
+
+
+def surface_columns(
+    path: Path, columns: Mapping[str, np.ndarray], opacity: float
+) -> dict[str, np.ndarray]:
+    """Convert the columns of ellipsoids to those of splats, in the unit of the file.
+
+    Ellipsoids below an opacity are left out. The normal is the flattest axis, the radius that of a
+    disc of the variance along the two other axes, and the albedo the mean color, decoded from sRGB.
+    """
+    from scipy.spatial.transform import Rotation  # takes a third of a second
+
+    with np.errstate(over="ignore"):
+        is_kept = 1 / (1 + np.exp(-columns["opacity"].astype(float))) >= opacity
+        centers, colors, scales, turns = (
+            np.stack([columns[name][is_kept] for name in names], axis=1).astype(float)
+            for names in (_PLACES, _COLORS, _SCALES, _TURNS)
+        )
+        scales = np.exp(scales)
+    if not is_kept.any():
+        raise ValueError(f"{path}: no Gaussian has an opacity of {opacity:g}; give a lower opacity")
+    axes = Rotation.from_quat(turns).as_matrix()
+    normals = axes[np.arange(len(axes)), :, scales.argmin(axis=1)]
+    is_inward = np.sum(normals * estimate_normals(centers), axis=1) < 0
+    normals = np.where(is_inward[:, None], -normals, normals)
+    warnings.warn(
+        f"{path}: is a Gaussian-splatting scene, whose colors contain the light of its pictures; "
+        f"{np.sum(~is_kept)} of {len(is_kept)} Gaussians are below an opacity of {opacity:g}, and "
+        "are left out",
+        stacklevel=3,
+    )
+    albedo = srgb_to_linear(np.clip(0.5 + _HARMONIC * colors, 0, 1))
+    names = *_PLACES, "nx", "ny", "nz", "red", "green", "blue", "radius"
+    radii = _RADIUS * np.sqrt(np.prod(np.sort(scales, axis=1)[:, 1:], axis=1))
+    table = np.column_stack([centers, normals, albedo, radii])
+    return dict(zip(names, table.T, strict=True))
